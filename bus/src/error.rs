@@ -1,0 +1,66 @@
+//! The error of the bus: a kind to match on, what happened, and to which channel or path.
+
+use core::fmt;
+
+/// What went wrong, for callers that decide on it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum ErrorKind {
+    /// A rig, camera or stream name breaks the rules of [`crate::Name`].
+    BadName,
+    /// Nobody publishes the channel.
+    NotFound,
+    /// Another process holds what can be held once.
+    InUse,
+    /// The two sides speak different versions of the bus.
+    VersionMismatch,
+    /// Too little shared memory, or no free slot in it.
+    NoSpace,
+    /// This user may not open the rig's files.
+    PermissionDenied,
+    /// A limit of the channel was reached (subscribers, held samples, sample size).
+    LimitReached,
+    /// The operating system or iceoryx2 refused for another reason.
+    Other,
+}
+
+/// An error of the bus.
+#[derive(Debug)]
+pub struct Error {
+    kind: ErrorKind,
+    message: String,
+    source: Option<Box<dyn std::error::Error + Send + Sync>>,
+}
+
+/// The result of a bus call.
+pub type Result<T, E = Error> = core::result::Result<T, E>;
+
+impl Error {
+    /// An error of `kind` whose message says what happened, to what, and what to do.
+    pub fn new(kind: ErrorKind, message: impl Into<String>) -> Self {
+        Self { kind, message: message.into(), source: None }
+    }
+
+    /// The same error with the error that caused it.
+    pub fn with_source(mut self, source: impl std::error::Error + Send + Sync + 'static) -> Self {
+        self.source = Some(Box::new(source));
+        self
+    }
+
+    /// What went wrong, for callers that decide on it.
+    pub const fn kind(&self) -> ErrorKind {
+        self.kind
+    }
+}
+
+impl fmt::Display for Error {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.message)
+    }
+}
+
+impl std::error::Error for Error {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        self.source.as_deref().map(|s| s as _)
+    }
+}

@@ -1,0 +1,309 @@
+//! What a frame says of itself: a fixed, versioned, self-sufficient header in shared memory.
+//!
+//! The layout is the contract with every other process. A field is never moved or given another meaning
+//! within one [`HEADER_VERSION`]; new fields take space from `reserved`. Every field lies at a multiple of
+//! its size, so there is no hidden padding, and [`FIELDS`] lists them for mirrors in other languages.
+
+use crate::{DropCounts, Intrinsics, PixelFormat, Pose, StreamId};
+use core::fmt;
+use iceoryx2::prelude::ZeroCopySend;
+
+mod fields;
+pub use fields::{FIELDS, Field};
+
+/// The version of the layout; a subscriber of another version is refused when it opens the channel.
+pub const HEADER_VERSION: u16 = 1;
+/// The value of the channel attribute `schema`, checked on open.
+pub const SCHEMA: &str = "depthrig.frame/1";
+/// Bytes of a [`FrameHeader`].
+pub const HEADER_SIZE: usize = 768;
+const MAGIC: [u8; 4] = *b"DRFH";
+
+/// The header of one frame.
+///
+/// Times are nanoseconds on the host's `CLOCK_MONOTONIC` (see [`crate::clock`]). A replayed frame keeps the
+/// times of its recording and carries [`FrameFlags::REPLAYED`].
+#[repr(C)]
+#[derive(Clone, Copy, PartialEq, ZeroCopySend)]
+#[type_name("depthrig.FrameHeader.v1")]
+pub struct FrameHeader {
+    /// The bytes `DRFH`.
+    pub magic: [u8; 4],
+    /// [`HEADER_VERSION`].
+    pub version: u16,
+    /// [`HEADER_SIZE`].
+    pub size: u16,
+    /// Number of this frame on its channel: 1, 2, 3, … without a gap as published. A subscriber that sees a
+    /// gap was too slow.
+    pub sequence: u64,
+    /// The device's own frame counter, unwrapped.
+    pub device_sequence: u64,
+    /// The frame set this frame belongs to; 0 on the live path, where sets are made after publishing.
+    pub set_id: u64,
+    /// Raw device time in ticks, unwrapped to 64 bits.
+    pub device_time: u64,
+    /// Nanoseconds per device tick.
+    pub device_tick_ns: f64,
+    /// Middle of the exposure on the host clock.
+    pub capture_time_ns: i64,
+    /// The capture time is right within this much, nanoseconds.
+    pub capture_uncertainty_ns: u64,
+    /// When the last byte of the frame had arrived.
+    pub arrival_time_ns: i64,
+    /// When the frame was published on this channel.
+    pub publish_time_ns: i64,
+    /// Exposure time, nanoseconds; 0 when unknown.
+    pub exposure_ns: u64,
+    /// Frames the device has captured on this stream so far, this one included:
+    /// `captured = sequence + Σ dropped`.
+    pub captured: u64,
+    /// Frames lost so far, indexed by [`crate::DropReason`].
+    pub dropped: [u64; 8],
+    /// For a derived stream, `sequence` of the frame that it was made from; else 0.
+    pub source_sequence: u64,
+    /// Metres per unit of depth; 0 when the pixels are no depth.
+    pub depth_unit_m: f64,
+    /// Intrinsics of this picture at this size.
+    pub intrinsics: Intrinsics,
+    /// Pose of this stream's optical frame on the mount: `p_mount = R p_camera + t`.
+    pub pose: Pose,
+    /// Which clock the capture time comes from: a [`ClockDomain`] code.
+    pub clock_domain: u32,
+    /// Number of the clock map in force; it changes whenever the map is restarted.
+    pub clock_epoch: u32,
+    /// [`FrameFlags`] bits.
+    pub flags: u32,
+    /// [`PixelFormat`] code.
+    pub format: u32,
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Bytes from one row to the next.
+    pub stride: u32,
+    /// Bytes of the payload.
+    pub payload_len: u32,
+    /// Sensor gain as the device reports it; 0 when unknown.
+    pub gain: f32,
+    /// Sensor temperature in °C; NaN when unknown.
+    pub temperature_c: f32,
+    /// Name of the rig, zero-padded UTF-8.
+    pub rig: [u8; 32],
+    /// Name of the camera, zero-padded UTF-8.
+    pub camera: [u8; 32],
+    /// Name of the stream, zero-padded UTF-8.
+    pub stream: [u8; 32],
+    /// Camera model, zero-padded UTF-8.
+    pub model: [u8; 32],
+    /// Camera serial number, zero-padded UTF-8.
+    pub serial: [u8; 32],
+    /// Zero; space for later fields of this version.
+    pub reserved: [u64; 29],
+}
+
+const _: () = assert!(size_of::<FrameHeader>() == HEADER_SIZE, "the header's size is part of the contract");
+const _: () = assert!(align_of::<FrameHeader>() == 8);
+
+impl Default for FrameHeader {
+    fn default() -> Self {
+        Self {
+            magic: MAGIC,
+            version: HEADER_VERSION,
+            size: HEADER_SIZE as u16,
+            sequence: 0,
+            device_sequence: 0,
+            set_id: 0,
+            device_time: 0,
+            device_tick_ns: 1.0,
+            capture_time_ns: 0,
+            capture_uncertainty_ns: 0,
+            arrival_time_ns: 0,
+            publish_time_ns: 0,
+            exposure_ns: 0,
+            captured: 0,
+            dropped: [0; 8],
+            source_sequence: 0,
+            depth_unit_m: 0.0,
+            intrinsics: Intrinsics::default(),
+            pose: Pose::IDENTITY,
+            clock_domain: ClockDomain::Arrival as u32,
+            clock_epoch: 0,
+            flags: 0,
+            format: 0,
+            width: 0,
+            height: 0,
+            stride: 0,
+            payload_len: 0,
+            gain: 0.0,
+            temperature_c: f32::NAN,
+            rig: [0; 32],
+            camera: [0; 32],
+            stream: [0; 32],
+            model: [0; 32],
+            serial: [0; 32],
+            reserved: [0; 29],
+        }
+    }
+}
+
+impl FrameHeader {
+    /// Whether this is a header of the version that this build speaks.
+    pub fn is_valid(&self) -> bool {
+        self.magic == MAGIC && self.version == HEADER_VERSION && self.size as usize == HEADER_SIZE
+    }
+
+    /// The pixel format, if this version knows it.
+    pub fn pixel_format(&self) -> Option<PixelFormat> {
+        PixelFormat::from_code(self.format)
+    }
+
+    /// Sets format, size, a stride without padding, and the payload length of such a picture.
+    pub fn set_picture(&mut self, format: PixelFormat, width: u32, height: u32) {
+        self.format = format as u32;
+        (self.width, self.height) = (width, height);
+        self.stride = format.row_bytes(width);
+        self.payload_len = format.frame_bytes(width, height) as u32;
+    }
+
+    /// Frames lost so far, by reason.
+    pub const fn drops(&self) -> DropCounts {
+        DropCounts(self.dropped)
+    }
+
+    /// Whether all bits of `flag` are set.
+    pub const fn has(&self, flag: FrameFlags) -> bool {
+        self.flags & flag.0 == flag.0
+    }
+
+    /// The stream this frame is of, if the names are valid ones.
+    pub fn stream_id(&self) -> Option<StreamId> {
+        StreamId::new(text(&self.camera), text(&self.stream)).ok()
+    }
+
+    /// Writes the names of rig and stream.
+    pub fn set_names(&mut self, rig: &str, id: &StreamId) {
+        set_text(&mut self.rig, rig);
+        set_text(&mut self.camera, id.camera.as_str());
+        set_text(&mut self.stream, id.stream.as_str());
+    }
+
+    /// Writes model and serial number; what does not fit in 31 bytes is cut at a character boundary.
+    pub fn set_device(&mut self, model: &str, serial: &str) {
+        set_text(&mut self.model, model);
+        set_text(&mut self.serial, serial);
+    }
+
+    /// The rig's name.
+    pub fn rig(&self) -> &str {
+        text(&self.rig)
+    }
+
+    /// The camera's name.
+    pub fn camera(&self) -> &str {
+        text(&self.camera)
+    }
+
+    /// The stream's name.
+    pub fn stream(&self) -> &str {
+        text(&self.stream)
+    }
+
+    /// The camera's model.
+    pub fn model(&self) -> &str {
+        text(&self.model)
+    }
+
+    /// The camera's serial number.
+    pub fn serial(&self) -> &str {
+        text(&self.serial)
+    }
+}
+
+impl fmt::Debug for FrameHeader {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "FrameHeader({}/{} #{} {}x{} {} capture {} ns ±{} flags {:#x})",
+            self.camera(),
+            self.stream(),
+            self.sequence,
+            self.width,
+            self.height,
+            self.pixel_format().map_or("?", PixelFormat::name),
+            self.capture_time_ns,
+            self.capture_uncertainty_ns,
+            self.flags
+        )
+    }
+}
+
+/// Text in a zero-padded field; an invalid tail is left out.
+fn text(field: &[u8; 32]) -> &str {
+    let len = field.iter().position(|b| *b == 0).unwrap_or(field.len());
+    match core::str::from_utf8(&field[..len]) {
+        Ok(s) => s,
+        Err(e) => core::str::from_utf8(&field[..e.valid_up_to()]).unwrap_or_default(),
+    }
+}
+
+fn set_text(field: &mut [u8; 32], s: &str) {
+    let end = s.floor_char_boundary(field.len() - 1);
+    *field = [0; 32];
+    field[..end].copy_from_slice(&s.as_bytes()[..end]);
+}
+
+/// Facts about a frame, one bit each.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct FrameFlags(pub u32);
+
+impl FrameFlags {
+    /// Published by a replay; the times are those of the recording.
+    pub const REPLAYED: Self = Self(1);
+    /// The capture time may be wrong by more than its uncertainty: a clock restart is being decided.
+    pub const TIME_UNCERTAIN: Self = Self(1 << 1);
+    /// The clock map has less than 5 s of history.
+    pub const CLOCK_WARMUP: Self = Self(1 << 2);
+    /// First frame of a new clock epoch.
+    pub const EPOCH_CHANGED: Self = Self(1 << 3);
+    /// Made from other frames, not captured.
+    pub const DERIVED: Self = Self(1 << 4);
+    /// Captured on a hardware trigger.
+    pub const HARDWARE_TRIGGERED: Self = Self(1 << 5);
+    /// Arrived more than two frame periods after its capture.
+    pub const LATE: Self = Self(1 << 6);
+    /// Made by a simulated camera.
+    pub const SYNTHETIC: Self = Self(1 << 7);
+
+    /// Every flag with its name.
+    pub const ALL: [(&'static str, Self); 8] = [
+        ("replayed", Self::REPLAYED),
+        ("time_uncertain", Self::TIME_UNCERTAIN),
+        ("clock_warmup", Self::CLOCK_WARMUP),
+        ("epoch_changed", Self::EPOCH_CHANGED),
+        ("derived", Self::DERIVED),
+        ("hardware_triggered", Self::HARDWARE_TRIGGERED),
+        ("late", Self::LATE),
+        ("synthetic", Self::SYNTHETIC),
+    ];
+
+    /// Both sets of flags together.
+    pub const fn with(self, other: Self) -> Self {
+        Self(self.0 | other.0)
+    }
+}
+
+/// Where a capture time comes from. The discriminant is part of the wire format.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[repr(u32)]
+#[non_exhaustive]
+pub enum ClockDomain {
+    /// The host's clock when the bytes arrived: late by the transport's latency.
+    Arrival = 0,
+    /// The device's clock, mapped to the host's.
+    Device = 1,
+    /// A stamp that the kernel took.
+    Kernel = 2,
+}
+
+#[cfg(test)]
+mod tests;

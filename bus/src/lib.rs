@@ -1,0 +1,22 @@
+//! The frame bus: the vocabulary of depthrig and its channels in shared memory.
+//!
+//! Floor 1. Everything else speaks in the types of this crate; it knows no camera, no file and no model.
+//! Start at [`FrameHeader`] (what a frame says of itself), [`Bus`] (open a rig), [`Publisher`] and
+//! [`Subscriber`] (write and read a channel).
+#![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
+
+pub mod clock;
+mod drops;
+mod error;
+mod format;
+mod geometry;
+mod header;
+mod ids;
+
+pub use clock::{HostTime, UtcPair};
+pub use drops::{DropCounts, DropReason};
+pub use error::{Error, ErrorKind, Result};
+pub use format::PixelFormat;
+pub use geometry::{Distortion, Intrinsics, Pose};
+pub use header::{ClockDomain, FIELDS, Field, FrameFlags, FrameHeader, HEADER_SIZE, HEADER_VERSION, SCHEMA};
+pub use ids::{CameraName, Name, RigName, StreamId, StreamName};
