@@ -5,6 +5,7 @@
 //! [`Subscriber`] (write and read a channel).
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
+mod channel;
 pub mod clock;
 mod drops;
 mod error;
@@ -12,6 +13,12 @@ mod format;
 mod geometry;
 mod header;
 mod ids;
+mod node;
+mod publisher;
+pub mod runtime;
+mod sets;
+pub mod shm;
+mod subscriber;
 
 pub use clock::{HostTime, UtcPair};
 pub use drops::{DropCounts, DropReason};
@@ -20,3 +27,8 @@ pub use format::PixelFormat;
 pub use geometry::{Distortion, Intrinsics, Pose};
 pub use header::{ClockDomain, FIELDS, Field, FrameFlags, FrameHeader, HEADER_SIZE, HEADER_VERSION, SCHEMA};
 pub use ids::{CameraName, Name, RigName, StreamId, StreamName};
+pub use node::Bus;
+pub use publisher::{FrameMut, Publisher};
+pub use runtime::RuntimeDir;
+pub use sets::{MemberRecord, SetFrame, SetHeader, SetPublisher, SetSubscriber};
+pub use subscriber::{Frame, Subscriber};

@@ -1,0 +1,195 @@
+//! A process's place on the bus: opens the channels of one rig.
+
+use crate::channel::{Channel, IoxService};
+use crate::runtime::RuntimeDir;
+use crate::{
+    Error, ErrorKind, FrameHeader, HostTime, Publisher, Result, RigName, SetHeader, SetPublisher,
+    SetSubscriber, StreamId, Subscriber,
+};
+use core::time::Duration;
+use iceoryx2::prelude::*;
+
+/// Names of shared memory begin with this, so that one sees whose they are; Python uses the same.
+const PREFIX: &str = "depthrig_";
+
+/// A process's place on the bus of one rig.
+#[derive(Debug)]
+pub struct Bus {
+    node: Node<IoxService>,
+    rig: RigName,
+    runtime: RuntimeDir,
+}
+
+impl Bus {
+    /// Joins the bus of `rig` below `runtime`. It makes no channel and needs no daemon to be running.
+    ///
+    /// # Errors
+    /// [`ErrorKind::PermissionDenied`] when the folder is another user's, [`ErrorKind::Other`] when iceoryx2
+    /// cannot make its files.
+    pub fn open(runtime: &RuntimeDir, rig: &RigName) -> Result<Self> {
+        // iceoryx2 writes its own log to stderr; its errors come back as errors and are logged once, by us.
+        set_log_level(LogLevel::Fatal);
+        let config = config(runtime)?;
+        let node = NodeBuilder::new()
+            .signal_handling_mode(SignalHandlingMode::Disabled) // signals belong to the process, not to a library
+            .config(&config)
+            .create::<IoxService>()
+            .map_err(|e| {
+                let path = runtime.path().display();
+                let kind = match e {
+                    iceoryx2::node::NodeCreationFailure::InsufficientPermissions => {
+                        ErrorKind::PermissionDenied
+                    }
+                    _ => ErrorKind::Other,
+                };
+                Error::new(kind, format!("the bus of rig \"{rig}\" could not be joined in {path}"))
+                    .with_source(e)
+            })?;
+        Ok(Self { node, rig: rig.clone(), runtime: runtime.clone() })
+    }
+
+    /// The rig's name.
+    pub const fn rig(&self) -> &RigName {
+        &self.rig
+    }
+
+    /// The folder that the rig lives in.
+    pub const fn runtime(&self) -> &RuntimeDir {
+        &self.runtime
+    }
+
+    /// Opens the channel of `id` for writing frames of at most `max_bytes` bytes, with `slots` slots of
+    /// shared memory.
+    ///
+    /// # Errors
+    /// [`ErrorKind::VersionMismatch`] or [`ErrorKind::InUse`] when another process holds the channel in
+    /// another form (it is named), [`ErrorKind::LimitReached`] when it has its publishers already,
+    /// [`ErrorKind::NoSpace`] or [`ErrorKind::Other`] when the memory cannot be made.
+    pub fn publisher(&self, id: &StreamId, max_bytes: usize, slots: usize) -> Result<Publisher> {
+        let channel = self.stream_channel(id);
+        Ok(Publisher::new(channel.sender(&self.node, max_bytes, slots)?))
+    }
+
+    /// Opens the channel of `id` for reading.
+    ///
+    /// # Errors
+    /// [`ErrorKind::NotFound`] when nobody has made it (with the streams that there are),
+    /// [`ErrorKind::VersionMismatch`], [`ErrorKind::LimitReached`] when it has all its subscribers.
+    pub fn subscriber(&self, id: &StreamId) -> Result<Subscriber> {
+        let channel = self.stream_channel(id);
+        let receiver = channel.receiver(&self.node).map_err(|e| self.name_streams(e))?;
+        Ok(Subscriber::new(receiver))
+    }
+
+    /// Like [`Self::subscriber`], waiting up to `patience` for the channel to be made.
+    ///
+    /// # Errors
+    /// As [`Self::subscriber`], [`ErrorKind::NotFound`] after `patience`.
+    pub fn subscriber_within(&self, id: &StreamId, patience: Duration) -> Result<Subscriber> {
+        let deadline = HostTime::now().plus(patience);
+        loop {
+            match self.subscriber(id) {
+                Err(e) if e.kind() == ErrorKind::NotFound && !deadline.from_now().is_zero() => {
+                    std::thread::sleep(Duration::from_millis(10));
+                }
+                other => return other,
+            }
+        }
+    }
+
+    /// Opens the rig's channel of frame sets for writing.
+    ///
+    /// # Errors
+    /// As [`Self::publisher`].
+    pub fn set_publisher(&self) -> Result<SetPublisher> {
+        let channel = self.set_channel();
+        Ok(SetPublisher::new(channel.sender(&self.node, SetPublisher::MAX_BYTES, SetPublisher::SLOTS)?))
+    }
+
+    /// Opens the rig's channel of frame sets for reading.
+    ///
+    /// # Errors
+    /// As [`Self::subscriber`].
+    pub fn set_subscriber(&self) -> Result<SetSubscriber> {
+        Ok(SetSubscriber::new(self.set_channel().receiver(&self.node)?))
+    }
+
+    /// The streams of this rig that somebody publishes or reads now, sorted.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Other`] when the channels cannot be listed.
+    pub fn streams(&self) -> Result<Vec<StreamId>> {
+        let prefix = format!("depthrig/{}/", self.rig);
+        let mut found = Vec::new();
+        IoxService::list(self.node.config(), |service| {
+            let details = &service.static_details;
+            if let (
+                iceoryx2::service::static_config::messaging_pattern::MessagingPattern::PublishSubscribe(_),
+                Some(rest),
+            ) = (details.messaging_pattern(), details.name().as_str().strip_prefix(&prefix))
+            {
+                found.extend(rest.parse::<StreamId>());
+            }
+            CallbackProgression::Continue
+        })
+        .map_err(|e| {
+            Error::new(ErrorKind::Other, "the channels of the bus could not be listed").with_source(e)
+        })?;
+        found.sort();
+        Ok(found)
+    }
+
+    /// Frees what killed processes left behind; the daemon calls this once a second. Returns how many dead
+    /// processes were cleaned up.
+    pub fn clean_dead(&self) -> u64 {
+        self.node.try_cleanup_dead_nodes().cleanups
+    }
+
+    fn stream_channel(&self, id: &StreamId) -> Result<Channel<FrameHeader>> {
+        Ok(Channel::new(
+            format!("depthrig/{}/{id}", self.rig),
+            format!("stream {id} of rig \"{}\"", self.rig),
+        ))
+    }
+
+    fn set_channel(&self) -> Channel<SetHeader> {
+        Channel::new(format!("depthrig/{}/sets", self.rig), format!("the frame sets of rig \"{}\"", self.rig))
+    }
+
+    /// Adds to a "not found" what could have been meant.
+    fn name_streams(&self, e: Error) -> Error {
+        if e.kind() != ErrorKind::NotFound {
+            return e;
+        }
+        let streams = self.streams().unwrap_or_default();
+        let rig = &self.rig;
+        let hint = if !streams.is_empty() {
+            let names: Vec<_> = streams.iter().map(ToString::to_string).collect();
+            format!("the rig has: {}", names.join(", "))
+        } else if self.runtime.holder(rig).is_some() {
+            "the rig is running but has no stream yet".to_owned()
+        } else {
+            let others: Vec<_> = self.runtime.running_rigs().iter().map(ToString::to_string).collect();
+            let others = if others.is_empty() { "none".to_owned() } else { others.join(", ") };
+            format!("no rig \"{rig}\" runs in {}; running: {others}", self.runtime.path().display())
+        };
+        Error::new(ErrorKind::NotFound, format!("{e}; {hint}"))
+    }
+}
+
+/// The configuration that every process of a user's rigs shares. It is set in code, because iceoryx2 would
+/// otherwise read `config/iceoryx2.toml` of whatever folder the process was started in.
+fn config(runtime: &RuntimeDir) -> Result<Config> {
+    let unusable = |e: &dyn core::fmt::Debug| {
+        let path = runtime.path().display();
+        Error::new(ErrorKind::Other, format!("{path} cannot be the runtime folder: {e:?}"))
+    };
+    let text = runtime.path().join("iox2").to_string_lossy().into_owned();
+    let root = Path::new(text.as_bytes()).map_err(|e| unusable(&e))?;
+    let mut config = Config::default();
+    config.global.set_root_path(&root);
+    config.global.prefix = FileName::new(PREFIX.as_bytes()).map_err(|e| unusable(&e))?;
+    // How long an opener waits for a creator that is half done; a publisher may wait as long for a broken reader.
+    config.global.creation_timeout = Duration::from_millis(500);
+    Ok(config)
+}

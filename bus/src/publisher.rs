@@ -1,0 +1,68 @@
+//! Publishing: write a frame once, into the slot that subscribers will read.
+
+use crate::channel::{self, Loan, Sender};
+use crate::{FrameHeader, HostTime, Result};
+
+/// The writing end of a stream's channel.
+///
+/// It never blocks on a subscriber: a slow one loses its oldest unread frames, one that holds frames keeps
+/// their slots and no others, a dead one is cleaned up by [`crate::Bus::clean_dead`].
+#[derive(Debug)]
+pub struct Publisher {
+    sender: Sender<FrameHeader>,
+}
+
+impl Publisher {
+    pub(crate) const fn new(sender: Sender<FrameHeader>) -> Self {
+        Self { sender }
+    }
+
+    /// A free slot for a frame of `len` bytes with arbitrary contents, and a default header.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::NoSpace`] when subscribers hold every slot: drop the frame and count it.
+    /// [`crate::ErrorKind::LimitReached`] when `len` is larger than the channel's frames or two frames are on
+    /// loan already.
+    pub fn loan(&self, len: usize) -> Result<FrameMut> {
+        let mut loan = self.sender.loan(len)?;
+        *loan.user_header_mut() = FrameHeader { payload_len: len as u32, ..FrameHeader::default() };
+        Ok(FrameMut { loan })
+    }
+
+    /// Publishes `frame`, stamping its publish time; returns how many subscribers it went to.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::Other`] when iceoryx2 cannot deliver it.
+    pub fn send(&self, mut frame: FrameMut) -> Result<usize> {
+        frame.header_mut().publish_time_ns = HostTime::now().ns();
+        self.sender.send(frame.loan)
+    }
+}
+
+/// A slot on loan: the frame being written. Dropping it gives the slot back unpublished.
+pub struct FrameMut {
+    loan: Loan<FrameHeader>,
+}
+
+impl FrameMut {
+    /// The header, for reading.
+    pub fn header(&self) -> &FrameHeader {
+        self.loan.user_header()
+    }
+
+    /// The header, for writing.
+    pub fn header_mut(&mut self) -> &mut FrameHeader {
+        self.loan.user_header_mut()
+    }
+
+    /// The pixels, for writing.
+    pub fn pixels_mut(&mut self) -> &mut [u8] {
+        channel::bytes_mut(&mut self.loan)
+    }
+}
+
+impl core::fmt::Debug for FrameMut {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_tuple("FrameMut").field(self.header()).finish()
+    }
+}

@@ -1,0 +1,177 @@
+//! Where a user's rigs keep their files: one private folder, and one lock per rig.
+//!
+//! Policy: the daemon and all its subscribers run as **one user**. The folder is mode 0700 and everything of
+//! iceoryx2 lives below it or is named after it, so that no other user's process can stall a camera and
+//! depthrig never gets in the way of other iceoryx2 applications of the machine.
+
+use crate::{Error, ErrorKind, Result, RigName};
+use rustix::fs::{FlockOperation, Mode, OFlags, flock};
+use std::io::{Read, Seek, Write};
+use std::path::{Path, PathBuf};
+
+/// The environment variable that moves the runtime folder.
+pub const RUNTIME_DIR_VARIABLE: &str = "DEPTHRIG_RUNTIME_DIR";
+/// iceoryx2 puts Unix sockets below the folder, and their paths have at most 107 bytes.
+const MAX_PATH_LEN: usize = 40;
+
+/// The private folder of a user's rigs.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RuntimeDir(PathBuf);
+
+impl RuntimeDir {
+    /// The user's folder: `$DEPTHRIG_RUNTIME_DIR`, else `$XDG_RUNTIME_DIR/depthrig`, else
+    /// `/tmp/depthrig-<uid>`. It is made when missing.
+    ///
+    /// # Errors
+    /// As [`Self::at`].
+    pub fn of_user() -> Result<Self> {
+        let session = std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from).filter(|d| d.is_dir());
+        let path = match (std::env::var_os(RUNTIME_DIR_VARIABLE), session) {
+            (Some(dir), _) => PathBuf::from(dir),
+            (None, Some(dir)) => dir.join("depthrig"),
+            (None, None) => PathBuf::from(format!("/tmp/depthrig-{}", rustix::process::getuid().as_raw())),
+        };
+        Self::at(&path)
+    }
+
+    /// The folder `path`, made with mode 0700 when missing.
+    ///
+    /// # Errors
+    /// [`ErrorKind::PermissionDenied`] when it belongs to another user or cannot be made,
+    /// [`ErrorKind::LimitReached`] when its path is too long for the sockets below it.
+    pub fn at(path: &Path) -> Result<Self> {
+        let path = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+        let shown = path.display();
+        if path.as_os_str().len() > MAX_PATH_LEN {
+            return Err(Error::new(
+                ErrorKind::LimitReached,
+                format!(
+                    "runtime folder {shown}: the path is longer than {MAX_PATH_LEN} bytes, which leaves no room for \
+                     the sockets below it; set {RUNTIME_DIR_VARIABLE} to a shorter one"
+                ),
+            ));
+        }
+        let denied = |what: &str| {
+            Error::new(
+                ErrorKind::PermissionDenied,
+                format!("runtime folder {shown}: {what}; set {RUNTIME_DIR_VARIABLE} to a folder of your own"),
+            )
+        };
+        std::fs::create_dir_all(&path).map_err(|e| denied("it cannot be made").with_source(e))?;
+        let stat = rustix::fs::stat(&path).map_err(|e| denied("it cannot be read").with_source(e))?;
+        let uid = rustix::process::getuid().as_raw();
+        if stat.st_uid != uid {
+            return Err(denied(&format!(
+                "it belongs to user {}, you are user {uid}, and a rig and its subscribers run as one user",
+                stat.st_uid
+            )));
+        }
+        rustix::fs::chmod(&path, Mode::RWXU).map_err(|e| denied("its mode cannot be set").with_source(e))?;
+        Ok(Self(path))
+    }
+
+    /// The folder's path.
+    pub fn path(&self) -> &Path {
+        &self.0
+    }
+
+    /// The control socket of `rig`.
+    pub fn socket_path(&self, rig: &RigName) -> PathBuf {
+        self.0.join(format!("{rig}.sock"))
+    }
+
+    /// Rigs that run now: those whose lock is held.
+    pub fn running_rigs(&self) -> Vec<RigName> {
+        let Ok(entries) = std::fs::read_dir(&self.0) else { return Vec::new() };
+        let mut rigs: Vec<_> = entries
+            .filter_map(|e| {
+                e.ok()?.file_name().to_str()?.strip_suffix(".lock").and_then(|n| RigName::new(n).ok())
+            })
+            .filter(|rig| self.holder(rig).is_some())
+            .collect();
+        rigs.sort();
+        rigs
+    }
+
+    /// Who runs `rig` now, as that process described itself.
+    pub fn holder(&self, rig: &RigName) -> Option<String> {
+        let mut file = std::fs::File::open(self.lock_path(rig)).ok()?;
+        if flock(&file, FlockOperation::NonBlockingLockShared).is_ok() {
+            return None;
+        }
+        let mut text = String::new();
+        file.read_to_string(&mut text).ok()?;
+        Some(text)
+    }
+
+    /// Takes the lock of `rig` until the returned value is dropped; the process's end frees it, however it
+    /// ends. `who` is shown to others that want it.
+    ///
+    /// # Errors
+    /// [`ErrorKind::InUse`] naming the holder, [`ErrorKind::PermissionDenied`] when the file cannot be opened.
+    pub fn lock(&self, rig: &RigName, who: &str) -> Result<RigLock> {
+        let path = self.lock_path(rig);
+        let flags = OFlags::RDWR | OFlags::CREATE | OFlags::CLOEXEC;
+        let fd = rustix::fs::open(&path, flags, Mode::RUSR | Mode::WUSR).map_err(|e| {
+            Error::new(ErrorKind::PermissionDenied, format!("{}: cannot be opened", path.display()))
+                .with_source(e)
+        })?;
+        let mut file = std::fs::File::from(fd);
+        if flock(&file, FlockOperation::NonBlockingLockExclusive).is_err() {
+            let holder = self.holder(rig).unwrap_or_else(|| "another process".to_owned());
+            return Err(Error::new(
+                ErrorKind::InUse,
+                format!(
+                    "rig \"{rig}\" is running already, held by {holder}; stop it first, or give this rig another name"
+                ),
+            ));
+        }
+        let written =
+            file.set_len(0).and_then(|()| file.rewind()).and_then(|()| file.write_all(who.as_bytes()));
+        written.map_err(|e| {
+            Error::new(ErrorKind::Other, format!("{}: cannot be written", path.display())).with_source(e)
+        })?;
+        Ok(RigLock { _file: file })
+    }
+
+    fn lock_path(&self, rig: &RigName) -> PathBuf {
+        self.0.join(format!("{rig}.lock"))
+    }
+}
+
+/// The right to run a rig; dropping it frees the rig.
+#[derive(Debug)]
+pub struct RigLock {
+    _file: std::fs::File,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rig_is_held_once_and_its_holder_is_named() {
+        let tmp = tempfile::tempdir().unwrap();
+        let dir = RuntimeDir::at(tmp.path()).unwrap();
+        let rig = RigName::new("mount").unwrap();
+        assert_eq!(dir.holder(&rig), None);
+        let lock = dir.lock(&rig, "process 42 (rig.toml)").unwrap();
+        let e = dir.lock(&rig, "me").unwrap_err();
+        assert_eq!(e.kind(), ErrorKind::InUse);
+        assert!(e.to_string().contains("process 42 (rig.toml)"), "{e}");
+        assert_eq!(dir.running_rigs(), vec![rig.clone()]);
+        drop(lock);
+        assert!(dir.running_rigs().is_empty());
+        dir.lock(&rig, "me").unwrap();
+    }
+
+    #[test]
+    fn the_folder_is_private_and_short() {
+        let tmp = tempfile::tempdir().unwrap();
+        let path = tmp.path().join("r");
+        RuntimeDir::at(&path).unwrap();
+        assert_eq!(rustix::fs::stat(&path).unwrap().st_mode & 0o777, 0o700);
+        let e = RuntimeDir::at(&path.join("x".repeat(60))).unwrap_err();
+        assert_eq!(e.kind(), ErrorKind::LimitReached);
+    }
+}
