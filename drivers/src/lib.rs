@@ -1,1 +1,21 @@
-//! Camera drivers.
+//! Camera drivers: one folder per camera family behind the [`Backend`] → [`Device`] → [`Stream`] traits.
+//!
+//! Floor 3. A driver knows its device and nothing else: no rig configuration, no channel, no other camera.
+//! It hands every frame to a [`Gate`], which keeps the accounts (captured = delivered + Σ dropped), maps the
+//! device's clock and asks a [`FrameSink`] for the memory that the pixels are written into, once.
+#![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
+
+pub mod capture;
+pub mod clock;
+mod device;
+mod error;
+pub mod files;
+mod gate;
+mod sink;
+
+pub use device::{
+    Backend, Device, DeviceClock, DeviceInfo, Poll, Stream, StreamProfile, StreamRequest, choose_profiles,
+};
+pub use error::{Error, ErrorKind, Result};
+pub use gate::{Gate, Outcome, RawFrame};
+pub use sink::{FrameMeta, FrameSink, MemorySink};

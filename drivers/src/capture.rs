@@ -1,0 +1,219 @@
+//! One thread per camera: opens it, polls it, and can be given up when the device makes it hang.
+//!
+//! Whatever a device does, [`Capture::stop`] returns within its patience. A thread that does not end by then
+//! is *abandoned*: it is left behind, and if it ever wakes, nothing that it still holds is published.
+
+use crate::{DeviceInfo, Error, ErrorKind, FrameMeta, FrameSink, Poll, Result, Stream};
+use core::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use core::time::Duration;
+use depthrig_bus::{DropReason, HostTime};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::thread::JoinHandle;
+
+/// How long one poll waits; also how late a stop request is noticed at the most.
+const POLL_TIMEOUT: Duration = Duration::from_millis(50);
+
+/// What the opening step of a camera thread yields.
+pub struct Session {
+    /// What the device says of itself.
+    pub info: DeviceInfo,
+    /// The running device.
+    pub stream: Box<dyn Stream>,
+    /// Where its frames go.
+    pub sink: Box<dyn FrameSink>,
+}
+
+/// How a camera thread came to its end by itself or on request.
+#[derive(Debug)]
+pub enum End {
+    /// It was asked to stop.
+    Stopped,
+    /// The source has no more frames.
+    Finished,
+    /// The device failed.
+    Failed(Error),
+}
+
+/// What [`Capture::stop`] came to.
+#[derive(Debug)]
+pub enum StopOutcome {
+    /// The thread is gone.
+    Ended(End),
+    /// The device made the thread hang; it was left behind and may publish nothing any more.
+    Abandoned,
+}
+
+/// A running camera thread.
+#[derive(Debug)]
+pub struct Capture {
+    name: String,
+    thread: Option<JoinHandle<()>>,
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    stop: AtomicBool,
+    abandoned: AtomicBool,
+    heartbeat_ns: AtomicI64,
+    last_frame_ns: AtomicI64,
+    end: Mutex<Option<End>>,
+    ended: Condvar,
+}
+
+impl Capture {
+    /// Starts the thread `name`. `open` runs on it, and so may take as long as the device likes.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Io`] when the system refuses a thread.
+    pub fn spawn(name: &str, open: impl FnOnce() -> Result<Session> + Send + 'static) -> Result<Self> {
+        let shared = Arc::new(Shared::default());
+        shared.beat();
+        let theirs = Arc::clone(&shared);
+        let label = name.to_owned();
+        let thread = std::thread::Builder::new()
+            .name(format!("cam-{name}"))
+            .spawn(move || {
+                let end = catch_unwind(AssertUnwindSafe(|| run(open, &theirs))).unwrap_or_else(|panic| {
+                    let what = panic
+                        .downcast_ref::<String>()
+                        .map(String::as_str)
+                        .or_else(|| panic.downcast_ref::<&str>().copied())
+                        .unwrap_or("no message");
+                    End::Failed(Error::new(ErrorKind::Protocol, format!("{label}: the driver panicked: {what}")))
+                });
+                *theirs.end.lock().unwrap_or_else(PoisonError::into_inner) = Some(end);
+                theirs.ended.notify_all();
+            })
+            .map_err(|e| {
+                Error::new(ErrorKind::Io, format!("{name}: no thread for the camera could be started")).with_source(e)
+            })?;
+        Ok(Self { name: name.to_owned(), thread: Some(thread), shared })
+    }
+
+    /// The camera's name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// When the thread last came back from the device.
+    pub fn heartbeat(&self) -> HostTime {
+        HostTime::from_ns(self.shared.heartbeat_ns.load(Ordering::Relaxed))
+    }
+
+    /// When a frame was last delivered or dropped; `None` before the first.
+    pub fn last_frame(&self) -> Option<HostTime> {
+        match self.shared.last_frame_ns.load(Ordering::Relaxed) {
+            0 => None,
+            ns => Some(HostTime::from_ns(ns)),
+        }
+    }
+
+    /// Whether the thread has come to its end.
+    pub fn has_ended(&self) -> bool {
+        self.shared.end.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+    }
+
+    /// Asks the thread to end, without waiting. Stop all cameras with this before [`Self::stop`] on each.
+    pub fn request_stop(&self) {
+        self.shared.stop.store(true, Ordering::Relaxed);
+    }
+
+    /// Ends the thread, waiting for at most `patience`.
+    pub fn stop(mut self, patience: Duration) -> StopOutcome {
+        self.request_stop();
+        let deadline = HostTime::now().plus(patience);
+        let mut end = self.shared.end.lock().unwrap_or_else(PoisonError::into_inner);
+        while end.is_none() {
+            let left = deadline.from_now();
+            if left.is_zero() {
+                // Set under the lock that commits of the thread take, so none can slip through.
+                self.shared.abandoned.store(true, Ordering::SeqCst);
+                return StopOutcome::Abandoned;
+            }
+            end = self.shared.ended.wait_timeout(end, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+        let end = end.take().unwrap_or(End::Stopped);
+        if let Some(thread) = self.thread.take() {
+            // The thread has stored its end, so it is past all that could block or panic.
+            let _ = thread.join();
+        }
+        StopOutcome::Ended(end)
+    }
+}
+
+impl Drop for Capture {
+    fn drop(&mut self) {
+        self.request_stop();
+    }
+}
+
+impl Shared {
+    fn beat(&self) {
+        self.heartbeat_ns.store(HostTime::now().ns(), Ordering::Relaxed);
+    }
+}
+
+fn run(open: impl FnOnce() -> Result<Session>, shared: &Shared) -> End {
+    let Session { mut stream, mut sink, .. } = match open() {
+        Ok(session) => session,
+        Err(e) => return End::Failed(e),
+    };
+    let mut guarded = Guarded { sink: sink.as_mut(), shared };
+    while !shared.stop.load(Ordering::Relaxed) {
+        shared.beat();
+        match stream.poll(POLL_TIMEOUT, &mut guarded) {
+            Ok(Poll::Frame | Poll::Idle) => {}
+            Ok(Poll::End) => return End::Finished,
+            Err(e) => return End::Failed(e),
+        }
+    }
+    End::Stopped
+}
+
+/// The sink of a camera thread: notes when frames come, and shuts when the thread was abandoned.
+struct Guarded<'a> {
+    sink: &'a mut dyn FrameSink,
+    shared: &'a Shared,
+}
+
+impl Guarded<'_> {
+    fn is_abandoned(&self) -> bool {
+        self.shared.abandoned.load(Ordering::SeqCst)
+    }
+
+    fn note_frame(&self) {
+        self.shared.last_frame_ns.store(HostTime::now().ns(), Ordering::Relaxed);
+    }
+}
+
+impl FrameSink for Guarded<'_> {
+    fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]> {
+        if self.is_abandoned() { None } else { self.sink.loan(stream, len) }
+    }
+
+    fn commit(&mut self, stream: usize, meta: &FrameMeta) {
+        self.note_frame();
+        let _no_abandoning_meanwhile = self.shared.end.lock().unwrap_or_else(PoisonError::into_inner);
+        if self.is_abandoned() {
+            self.sink.discard(stream);
+            self.sink.dropped(stream, DropReason::Abandoned, 1);
+        } else {
+            self.sink.commit(stream, meta);
+        }
+    }
+
+    fn discard(&mut self, stream: usize) {
+        self.sink.discard(stream);
+    }
+
+    fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
+        self.note_frame();
+        let reason = if self.is_abandoned() { DropReason::Abandoned } else { reason };
+        self.sink.dropped(stream, reason, n);
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,118 @@
+//! A camera thread ends in time, whatever its device does.
+
+use super::*;
+use crate::StreamProfile;
+
+/// A device that behaves as `act` says at every poll.
+struct Act<F>(F);
+
+impl<F: FnMut(Duration, &mut dyn FrameSink) -> Result<Poll> + Send> Stream for Act<F> {
+    fn profiles(&self) -> &[StreamProfile] {
+        &[]
+    }
+    fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
+        (self.0)(timeout, sink)
+    }
+}
+
+/// Counts commits and remembers what was dropped.
+#[derive(Clone, Default)]
+struct Counting(Arc<Mutex<(u64, Vec<DropReason>)>>);
+
+impl FrameSink for Counting {
+    fn loan(&mut self, _: usize, _: usize) -> Option<&mut [u8]> {
+        Some(&mut [])
+    }
+    fn commit(&mut self, _: usize, _: &FrameMeta) {
+        self.0.lock().unwrap().0 += 1;
+    }
+    fn discard(&mut self, _: usize) {}
+    fn dropped(&mut self, _: usize, reason: DropReason, _: u64) {
+        self.0.lock().unwrap().1.push(reason);
+    }
+}
+
+fn start(
+    sink: &Counting,
+    act: impl FnMut(Duration, &mut dyn FrameSink) -> Result<Poll> + Send + 'static,
+) -> Capture {
+    let sink = sink.clone();
+    Capture::spawn("cam", move || {
+        Ok(Session { info: DeviceInfo::default(), stream: Box::new(Act(act)), sink: Box::new(sink) })
+    })
+    .unwrap()
+}
+
+fn meta() -> FrameMeta {
+    FrameMeta {
+        device_sequence: 0,
+        device_time: 0,
+        capture_time: HostTime::now(),
+        capture_uncertainty_ns: 0,
+        clock_epoch: 0,
+        clock_domain: depthrig_bus::ClockDomain::Arrival,
+        arrival: HostTime::now(),
+        flags: depthrig_bus::FrameFlags(0),
+        captured: 1,
+        exposure_ns: 0,
+        gain: 0.0,
+        temperature_c: f32::NAN,
+    }
+}
+
+#[test]
+fn a_quiet_device_stops_at_once() {
+    let capture = start(&Counting::default(), |timeout, _| {
+        std::thread::sleep(timeout);
+        Ok(Poll::Idle)
+    });
+    assert!(matches!(capture.stop(Duration::from_secs(5)), StopOutcome::Ended(End::Stopped)));
+}
+
+#[test]
+fn a_failing_and_a_panicking_driver_end_with_their_reason() {
+    for panics in [false, true] {
+        let capture = start(&Counting::default(), move |_, _| {
+            assert!(!panics, "impossible header");
+            Err(Error::new(ErrorKind::Disconnected, "cam: unplugged"))
+        });
+        while !capture.has_ended() {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let StopOutcome::Ended(End::Failed(e)) = capture.stop(Duration::from_secs(5)) else { panic!() };
+        let wanted = if panics { "the driver panicked: impossible header" } else { "cam: unplugged" };
+        assert!(e.to_string().contains(wanted), "{e}");
+    }
+}
+
+#[test]
+fn a_hung_device_is_abandoned_and_publishes_nothing_when_it_wakes() {
+    let sink = Counting::default();
+    let wake = Arc::new(AtomicBool::new(false));
+    let woken = Arc::clone(&wake);
+    let capture = start(&sink, move |_, sink| {
+        while !woken.load(Ordering::SeqCst) {
+            std::thread::sleep(Duration::from_millis(1)); // ignores its timeout, as a stuck ioctl does
+        }
+        sink.commit(0, &meta());
+        Ok(Poll::Frame)
+    });
+    let began = HostTime::now();
+    assert!(matches!(capture.stop(Duration::from_millis(100)), StopOutcome::Abandoned));
+    assert!(began.elapsed() < Duration::from_secs(2));
+    wake.store(true, Ordering::SeqCst);
+    while sink.0.lock().unwrap().1.is_empty() {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    assert_eq!(*sink.0.lock().unwrap(), (0, vec![DropReason::Abandoned]));
+}
+
+#[test]
+fn opening_may_hang_too() {
+    let capture = Capture::spawn("cam", || {
+        std::thread::sleep(Duration::from_secs(2));
+        Err(Error::new(ErrorKind::NotFound, "never seen"))
+    })
+    .unwrap();
+    assert!(matches!(capture.stop(Duration::from_millis(50)), StopOutcome::Abandoned));
+}

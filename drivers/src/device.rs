@@ -1,0 +1,220 @@
+//! The traits that every camera family implements, and what a device says of itself.
+
+use crate::{Error, ErrorKind, FrameSink, Result};
+use core::time::Duration;
+use depthrig_bus::{ClockDomain, Intrinsics, PixelFormat, Pose, StreamName};
+
+/// A camera family: finds devices and opens them.
+pub trait Backend: Send {
+    /// The family's name as used in rig configurations: `synthetic`, `files`, …
+    fn name(&self) -> &'static str;
+
+    /// The devices that could be opened now.
+    ///
+    /// # Errors
+    /// [`ErrorKind::PermissionDenied`] or [`ErrorKind::Io`] when the system cannot be asked.
+    fn discover(&self) -> Result<Vec<DeviceInfo>>;
+
+    /// Opens the device with the serial number `serial`; `None` means the only one there is.
+    ///
+    /// # Errors
+    /// [`ErrorKind::NotFound`] (also when `None` is ambiguous, naming the candidates), [`ErrorKind::Busy`],
+    /// [`ErrorKind::PermissionDenied`], [`ErrorKind::BadInput`], [`ErrorKind::Io`].
+    fn open(&self, serial: Option<&str>) -> Result<Box<dyn Device>>;
+}
+
+/// An open camera that is not streaming.
+pub trait Device: Send {
+    /// What the device says of itself.
+    fn info(&self) -> &DeviceInfo;
+
+    /// Every stream mode the device can deliver.
+    fn profiles(&self) -> &[StreamProfile];
+
+    /// Starts the requested streams together; an empty request means the default mode of every stream.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Unsupported`] naming the modes there are, [`ErrorKind::Disconnected`],
+    /// [`ErrorKind::Busy`], [`ErrorKind::Io`].
+    fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>>;
+}
+
+/// A streaming camera. Dropping it stops the device.
+pub trait Stream: Send {
+    /// What is being delivered; the index into this list is the `stream` of every [`FrameSink`] call.
+    fn profiles(&self) -> &[StreamProfile];
+
+    /// Waits at most `timeout` for the device, then hands every frame that is ready to `sink`.
+    ///
+    /// A driver returns within `timeout` plus what writing one frame takes. A device that makes it hang all
+    /// the same is given up by [`crate::capture::Capture`].
+    ///
+    /// # Errors
+    /// [`ErrorKind::Disconnected`], [`ErrorKind::Protocol`], [`ErrorKind::Io`], [`ErrorKind::BadInput`]:
+    /// after any of them the stream is of no more use and must be dropped. A damaged frame is no error, it is
+    /// a counted drop.
+    fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll>;
+}
+
+/// What a [`Stream::poll`] came back with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Poll {
+    /// At least one frame came, delivered or dropped.
+    Frame,
+    /// Nothing came in time.
+    Idle,
+    /// The source is at its end and will deliver no more (recorded files that are not looped).
+    End,
+}
+
+/// What a device says of itself.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct DeviceInfo {
+    /// Name of its [`Backend`].
+    pub backend: &'static str,
+    /// Model, such as `D435`.
+    pub model: String,
+    /// Serial number; what tells two cameras of a model apart.
+    pub serial: String,
+    /// Firmware version; empty when there is none.
+    pub firmware: String,
+    /// Where it is attached: USB port path, folder, …
+    pub port: String,
+    /// Where its calibration comes from: `factory`, `simulated`, `file …`, `none`.
+    pub calibration: String,
+}
+
+/// One stream mode: what the frames are and which clock stamps them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StreamProfile {
+    /// `color`, `depth`, …
+    pub stream: StreamName,
+    /// Pixel format.
+    pub format: PixelFormat,
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Nominal frame rate.
+    pub rate_hz: f64,
+    /// Metres per unit of depth; 0 when the pixels are no depth.
+    pub depth_unit_m: f64,
+    /// Intrinsics at this size.
+    pub intrinsics: Intrinsics,
+    /// Pose of this stream's optical frame in the device's frame.
+    pub pose_in_device: Pose,
+    /// The clock behind its time stamps.
+    pub clock: DeviceClock,
+    /// Width of the device's frame counter in bits.
+    pub sequence_bits: u32,
+}
+
+impl StreamProfile {
+    /// Bytes of one frame; for MJPEG the most that one may have.
+    pub const fn frame_bytes(&self) -> usize {
+        self.format.frame_bytes(self.width, self.height)
+    }
+
+    /// Nominal time between two frames, nanoseconds.
+    pub fn period_ns(&self) -> u64 {
+        (1e9 / self.rate_hz).round() as u64
+    }
+
+    /// `depth 1280x720 z16 30 Hz`, for messages.
+    pub fn describe(&self) -> String {
+        let Self { stream, width, height, rate_hz, .. } = self;
+        format!("{stream} {width}x{height} {} {rate_hz} Hz", self.format.name())
+    }
+}
+
+/// A device's clock as its counter presents it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DeviceClock {
+    /// Width of the counter in bits.
+    pub counter_bits: u32,
+    /// Nanoseconds per tick, as picoseconds so that it stays exact.
+    pub tick_ps: u64,
+    /// [`ClockDomain::Device`] when the counter is the device's own; with the other domains the counter is
+    /// host time in nanoseconds and is used as it is.
+    pub domain: ClockDomain,
+}
+
+impl DeviceClock {
+    /// A device counter of `counter_bits` bits that ticks every microsecond, as most cameras have.
+    pub const fn microseconds(counter_bits: u32) -> Self {
+        Self { counter_bits, tick_ps: 1_000_000, domain: ClockDomain::Device }
+    }
+
+    /// Nanoseconds per tick.
+    pub const fn tick_ns(&self) -> f64 {
+        self.tick_ps as f64 / 1000.0
+    }
+}
+
+/// A wish for one stream; what is `None` is left to the device's default.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StreamRequest {
+    /// Which stream.
+    pub stream: StreamName,
+    /// Width and height in pixels.
+    pub size: Option<(u32, u32)>,
+    /// Frame rate.
+    pub rate_hz: Option<f64>,
+    /// Pixel format.
+    pub format: Option<PixelFormat>,
+}
+
+impl StreamRequest {
+    /// A wish for `stream` in its default mode.
+    pub const fn any(stream: StreamName) -> Self {
+        Self { stream, size: None, rate_hz: None, format: None }
+    }
+
+    fn fits(&self, p: &StreamProfile) -> bool {
+        self.stream == p.stream
+            && self.size.is_none_or(|s| s == (p.width, p.height))
+            && self.rate_hz.is_none_or(|r| (r - p.rate_hz).abs() < 0.01)
+            && self.format.is_none_or(|f| f == p.format)
+    }
+}
+
+/// Picks one profile for every request out of `available` (the first that fits is the default mode); an
+/// empty request picks the first mode of every stream.
+///
+/// # Errors
+/// [`ErrorKind::Unsupported`] naming `device` and the modes that the stream has.
+pub fn choose_profiles(
+    device: &str,
+    available: &[StreamProfile],
+    requests: &[StreamRequest],
+) -> Result<Vec<StreamProfile>> {
+    let mut chosen: Vec<StreamProfile> = Vec::new();
+    if requests.is_empty() {
+        for p in available {
+            if chosen.iter().all(|c| c.stream != p.stream) {
+                chosen.push(p.clone());
+            }
+        }
+        return Ok(chosen);
+    }
+    for r in requests {
+        let profile = available.iter().find(|p| r.fits(p)).ok_or_else(|| {
+            let same: Vec<_> = available.iter().filter(|p| p.stream == r.stream).collect();
+            let shown = if same.is_empty() { available.iter().collect() } else { same };
+            let modes: Vec<_> = shown.into_iter().map(StreamProfile::describe).collect();
+            let stream = &r.stream;
+            Error::new(
+                ErrorKind::Unsupported,
+                format!("{device} has no such mode of \"{stream}\"; it has: {}", modes.join(", ")),
+            )
+        })?;
+        if chosen.iter().any(|c| c.stream == profile.stream) {
+            return Err(Error::new(
+                ErrorKind::Unsupported,
+                format!("{device}: stream \"{}\" was asked for twice", r.stream),
+            ));
+        }
+        chosen.push(profile.clone());
+    }
+    Ok(chosen)
+}

@@ -1,0 +1,256 @@
+//! The gate that every frame of every driver passes: accounts, checks, clock, one write of the pixels.
+//!
+//! Invariants, per stream:
+//! - `captured = delivered + Σ dropped(reason)` after every call, where `captured` counts each frame that
+//!   the device announced since the gate was made: those seen and those that its frame counter skipped;
+//! - delivered frames have strictly rising unwrapped device sequence numbers within one clock epoch;
+//! - capture times never go back within one clock epoch, and never lie after the arrival.
+
+use crate::clock::{ClockConfig, ClockMap};
+use crate::{FrameMeta, FrameSink, StreamProfile};
+use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameFlags, HostTime, PixelFormat};
+
+/// A frame as the device announces it, before its pixels are written anywhere.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RawFrame {
+    /// The device's frame counter as it came.
+    pub device_sequence: u64,
+    /// The device's clock at mid-exposure as it came.
+    pub device_ticks: u64,
+    /// When the last byte had arrived.
+    pub arrival: HostTime,
+    /// Bytes that arrived, of the pixels as the device sends them, scaled to the delivered format: a driver
+    /// that converts on the way reports `frame_bytes()` when the source was whole.
+    pub bytes: usize,
+    /// The device or the transport flagged the frame as damaged.
+    pub damaged: bool,
+    /// Exposure time; 0 when unknown.
+    pub exposure_ns: u64,
+    /// Sensor gain; 0 when unknown.
+    pub gain: f32,
+    /// Sensor temperature in °C; NaN when unknown.
+    pub temperature_c: f32,
+    /// Facts that the driver knows (hardware trigger, synthetic).
+    pub flags: FrameFlags,
+}
+
+impl RawFrame {
+    /// A whole, undamaged frame of `bytes` bytes about which nothing else is known.
+    pub const fn new(device_sequence: u64, device_ticks: u64, arrival: HostTime, bytes: usize) -> Self {
+        Self {
+            device_sequence,
+            device_ticks,
+            arrival,
+            bytes,
+            damaged: false,
+            exposure_ns: 0,
+            gain: 0.0,
+            temperature_c: f32::NAN,
+            flags: FrameFlags(0),
+        }
+    }
+}
+
+/// What became of a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Outcome {
+    /// Published.
+    Delivered,
+    /// Dropped and counted.
+    Dropped(DropReason),
+    /// It came after its successor and had been counted as [`DropReason::DeviceGap`] already.
+    AlreadyCounted,
+}
+
+/// How far back a frame counter may step and still be a late or repeated frame rather than a restart.
+const REORDER_WINDOW: u64 = 64;
+
+/// The gate of one stream.
+#[derive(Debug)]
+pub struct Gate {
+    stream: usize,
+    format: PixelFormat,
+    frame_bytes: usize,
+    sequence_bits: u32,
+    domain: ClockDomain,
+    clock: ClockMap,
+    /// Newest unwrapped sequence number, and which of the 64 before it were seen (bit 0 = the newest).
+    newest: Option<(u64, u64)>,
+    captured: u64,
+    delivered: u64,
+    drops: DropCounts,
+    last_capture: HostTime,
+}
+
+impl Gate {
+    /// The gate of stream number `stream`, delivering as `profile` says.
+    pub fn new(stream: usize, profile: &StreamProfile) -> Self {
+        let clock = ClockConfig::new(profile.clock.counter_bits, profile.clock.tick_ns(), profile.period_ns());
+        Self {
+            stream,
+            format: profile.format,
+            frame_bytes: profile.frame_bytes(),
+            sequence_bits: profile.sequence_bits,
+            domain: profile.clock.domain,
+            clock: ClockMap::new(clock),
+            newest: None,
+            captured: 0,
+            delivered: 0,
+            drops: DropCounts::default(),
+            last_capture: HostTime::from_ns(i64::MIN),
+        }
+    }
+
+    /// Frames captured since the gate was made, delivered or not.
+    pub const fn captured(&self) -> u64 {
+        self.captured
+    }
+
+    /// Frames delivered since the gate was made.
+    pub const fn delivered(&self) -> u64 {
+        self.delivered
+    }
+
+    /// Frames lost since the gate was made.
+    pub const fn drops(&self) -> DropCounts {
+        self.drops
+    }
+
+    /// The stream's clock map, for its quality and for two-way probes.
+    pub const fn clock(&mut self) -> &mut ClockMap {
+        &mut self.clock
+    }
+
+    /// Passes one frame: checks and counts it, maps its time, and has `fill` write the pixels into memory on
+    /// loan from `sink`. `fill` returns the number of bytes it wrote, which matters for MJPEG alone, or the
+    /// reason for which the frame cannot be delivered.
+    pub fn deliver(
+        &mut self,
+        raw: &RawFrame,
+        sink: &mut dyn FrameSink,
+        fill: impl FnOnce(&mut [u8]) -> Result<(), DropReason>,
+    ) -> Outcome {
+        let Some(device_sequence) = self.account(raw, sink) else {
+            return Outcome::AlreadyCounted;
+        };
+        let outcome = match device_sequence {
+            Err(reason) => Err(reason),
+            Ok(sequence) => self.pass(raw, sequence, sink, fill),
+        };
+        match outcome {
+            Ok(()) => {
+                self.delivered += 1;
+                Outcome::Delivered
+            }
+            Err(reason) => {
+                self.lose(reason, 1, sink);
+                Outcome::Dropped(reason)
+            }
+        }
+    }
+
+    /// Checks, stamps and writes a frame whose number is already accounted for.
+    fn pass(
+        &mut self,
+        raw: &RawFrame,
+        device_sequence: u64,
+        sink: &mut dyn FrameSink,
+        fill: impl FnOnce(&mut [u8]) -> Result<(), DropReason>,
+    ) -> Result<(), DropReason> {
+        if raw.damaged {
+            return Err(DropReason::DeviceError);
+        }
+        let varies = self.format == PixelFormat::Mjpeg;
+        if raw.bytes > self.frame_bytes || raw.bytes == 0 {
+            return Err(if raw.bytes == 0 { DropReason::Incomplete } else { DropReason::WrongSize });
+        }
+        if raw.bytes < self.frame_bytes && !varies {
+            return Err(DropReason::Incomplete);
+        }
+        let mut meta = self.stamp(raw, device_sequence);
+        let memory = sink.loan(self.stream, raw.bytes).ok_or(DropReason::NoSlot)?;
+        if let Err(reason) = fill(memory) {
+            sink.discard(self.stream);
+            return Err(reason);
+        }
+        meta.captured = self.captured;
+        sink.commit(self.stream, &meta);
+        Ok(())
+    }
+
+    /// Maps the frame's time.
+    fn stamp(&mut self, raw: &RawFrame, device_sequence: u64) -> FrameMeta {
+        let mut meta = FrameMeta {
+            device_sequence,
+            device_time: raw.device_ticks,
+            capture_time: raw.arrival,
+            capture_uncertainty_ns: 0,
+            clock_epoch: 0,
+            clock_domain: self.domain,
+            arrival: raw.arrival,
+            flags: raw.flags,
+            captured: self.captured,
+            exposure_ns: raw.exposure_ns,
+            gain: raw.gain,
+            temperature_c: raw.temperature_c,
+        };
+        if self.domain == ClockDomain::Device {
+            let mapped = self.clock.observe(raw.device_ticks, device_sequence, raw.arrival);
+            meta.device_time = mapped.device_time;
+            meta.capture_time = mapped.capture_time;
+            meta.capture_uncertainty_ns = mapped.uncertainty_ns;
+            meta.clock_epoch = mapped.epoch;
+            meta.flags = meta.flags.with(mapped.flags);
+        } else if self.domain == ClockDomain::Kernel {
+            // The counter is the kernel's monotonic stamp in nanoseconds, taken as it is.
+            meta.capture_time = HostTime::from_ns(raw.device_ticks as i64).min(raw.arrival).max(self.last_capture);
+        }
+        self.last_capture = meta.capture_time;
+        meta
+    }
+
+    /// Unwraps the frame counter and counts the frames that it skipped. `None`: counted before; `Err`: not
+    /// to be delivered.
+    fn account(&mut self, raw: &RawFrame, sink: &mut dyn FrameSink) -> Option<Result<u64, DropReason>> {
+        let Some((newest, seen)) = self.newest else {
+            self.newest = Some((raw.device_sequence, 1));
+            self.captured += 1;
+            return Some(Ok(raw.device_sequence));
+        };
+        let bits = self.sequence_bits.clamp(1, 64);
+        let shift = 64 - bits;
+        // Signed distance on the counter's own circle.
+        let step = ((raw.device_sequence << shift).wrapping_sub(newest << shift) as i64) >> shift;
+        if step > 0 {
+            let step = step as u64;
+            self.captured += step;
+            self.lose(DropReason::DeviceGap, step - 1, sink);
+            let seen = if step >= 64 { 1 } else { (seen << step) | 1 };
+            self.newest = Some((newest + step, seen));
+            return Some(Ok(newest + step));
+        }
+        let back = step.unsigned_abs();
+        if back < REORDER_WINDOW && back <= newest {
+            if seen & (1 << back) == 0 {
+                self.newest = Some((newest, seen | (1 << back)));
+                return None;
+            }
+            self.captured += 1;
+            return Some(Err(DropReason::OutOfOrder));
+        }
+        // The counter restarted: the device was reset. How many frames it lost meanwhile nobody knows.
+        self.captured += 1;
+        self.newest = Some((raw.device_sequence, 1));
+        Some(Ok(raw.device_sequence))
+    }
+
+    fn lose(&mut self, reason: DropReason, n: u64, sink: &mut dyn FrameSink) {
+        if n > 0 {
+            self.drops.add(reason, n);
+            sink.dropped(self.stream, reason, n);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,107 @@
+//! Where a driver's frames go: memory on loan, written once, then committed or given back.
+
+use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameFlags, HostTime};
+
+/// The receiver of a camera's frames. `stream` is the index into [`crate::Stream::profiles`].
+///
+/// On the live path the memory is a free slot of the stream's shared-memory channel, so that what a driver
+/// writes is what every subscriber reads.
+pub trait FrameSink {
+    /// Memory for the next frame of `stream`, exactly `len` bytes, with arbitrary contents; `None` when there
+    /// is none free, and the frame must be dropped.
+    fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]>;
+
+    /// Publishes the memory lent last for `stream`.
+    fn commit(&mut self, stream: usize, meta: &FrameMeta);
+
+    /// Takes back the memory lent last for `stream`, unpublished.
+    fn discard(&mut self, stream: usize);
+
+    /// Says that `n` frames of `stream` were lost.
+    fn dropped(&mut self, stream: usize, reason: DropReason, n: u64);
+}
+
+/// What is known of one frame besides its pixels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FrameMeta {
+    /// The device's frame counter, unwrapped.
+    pub device_sequence: u64,
+    /// Device time in ticks, unwrapped.
+    pub device_time: u64,
+    /// Middle of the exposure on the host clock.
+    pub capture_time: HostTime,
+    /// The capture time is right within this much.
+    pub capture_uncertainty_ns: u64,
+    /// Number of the clock map in force.
+    pub clock_epoch: u32,
+    /// Where the capture time comes from.
+    pub clock_domain: ClockDomain,
+    /// When the last byte had arrived.
+    pub arrival: HostTime,
+    /// Facts about the frame.
+    pub flags: FrameFlags,
+    /// Frames captured so far on this stream, this one included.
+    pub captured: u64,
+    /// Exposure time; 0 when unknown.
+    pub exposure_ns: u64,
+    /// Sensor gain; 0 when unknown.
+    pub gain: f32,
+    /// Sensor temperature in °C; NaN when unknown.
+    pub temperature_c: f32,
+}
+
+/// A sink that keeps everything in memory, for tests and tools.
+#[derive(Debug, Default)]
+pub struct MemorySink {
+    /// Committed frames: stream, facts, pixels.
+    pub frames: Vec<(usize, FrameMeta, Vec<u8>)>,
+    /// Drops by stream.
+    pub drops: Vec<DropCounts>,
+    /// Number of loans from now on that are refused, as if no slot were free.
+    pub refuse: usize,
+    buffers: Vec<Vec<u8>>,
+}
+
+impl MemorySink {
+    fn at<T: Default>(list: &mut Vec<T>, i: usize) -> &mut T {
+        while list.len() <= i {
+            list.push(T::default());
+        }
+        &mut list[i]
+    }
+
+    /// Frames delivered on `stream`.
+    pub fn delivered(&self, stream: usize) -> u64 {
+        self.frames.iter().filter(|f| f.0 == stream).count() as u64
+    }
+
+    /// Drops of `stream`.
+    pub fn drops_of(&self, stream: usize) -> DropCounts {
+        self.drops.get(stream).copied().unwrap_or_default()
+    }
+}
+
+impl FrameSink for MemorySink {
+    fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]> {
+        if self.refuse > 0 {
+            self.refuse -= 1;
+            return None;
+        }
+        let buffer = Self::at(&mut self.buffers, stream);
+        *buffer = vec![0xA5; len]; // not zero: a driver that leaves a byte unwritten shows
+        Some(buffer)
+    }
+
+    fn commit(&mut self, stream: usize, meta: &FrameMeta) {
+        let pixels = core::mem::take(Self::at(&mut self.buffers, stream));
+        self.frames.push((stream, *meta, pixels));
+    }
+
+    fn discard(&mut self, stream: usize) {
+        Self::at(&mut self.buffers, stream).clear();
+    }
+
+    fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
+        Self::at(&mut self.drops, stream).add(reason, n);
+    }
+}
