@@ -1,0 +1,95 @@
+//! The error of the daemon: a kind to match on (exit code, HTTP status), what happened and what to do.
+
+use core::fmt;
+
+/// What went wrong, for callers that decide on it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum ErrorKind {
+    /// The configuration or a request is not what it must be.
+    BadInput,
+    /// What was asked for does not exist.
+    NotFound,
+    /// Somebody else holds it, or it is running already.
+    InUse,
+    /// The rig is in no state for this (stop without a recording, say).
+    WrongState,
+    /// Not enough memory or disk.
+    NoSpace,
+    /// This user may not.
+    PermissionDenied,
+    /// No daemon answers.
+    Unreachable,
+    /// Another reason.
+    Other,
+}
+
+/// An error of the daemon.
+#[derive(Debug)]
+pub struct Error {
+    kind: ErrorKind,
+    message: String,
+    source: Option<Box<dyn std::error::Error + Send + Sync>>,
+}
+
+/// The result of a call of the daemon.
+pub type Result<T, E = Error> = core::result::Result<T, E>;
+
+impl Error {
+    /// An error of `kind` whose message says what happened, to what, and what to do.
+    pub fn new(kind: ErrorKind, message: impl Into<String>) -> Self {
+        Self { kind, message: message.into(), source: None }
+    }
+
+    /// The same error with the error that caused it.
+    pub fn with_source(mut self, source: impl std::error::Error + Send + Sync + 'static) -> Self {
+        self.source = Some(Box::new(source));
+        self
+    }
+
+    /// What went wrong, for callers that decide on it.
+    pub const fn kind(&self) -> ErrorKind {
+        self.kind
+    }
+}
+
+impl fmt::Display for Error {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.message)
+    }
+}
+
+impl std::error::Error for Error {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        self.source.as_deref().map(|s| s as _)
+    }
+}
+
+impl From<depthrig_bus::Error> for Error {
+    fn from(e: depthrig_bus::Error) -> Self {
+        use depthrig_bus::ErrorKind as Bus;
+        let kind = match e.kind() {
+            Bus::BadName => ErrorKind::BadInput,
+            Bus::NotFound => ErrorKind::NotFound,
+            Bus::InUse => ErrorKind::InUse,
+            Bus::NoSpace => ErrorKind::NoSpace,
+            Bus::PermissionDenied => ErrorKind::PermissionDenied,
+            _ => ErrorKind::Other,
+        };
+        Self::new(kind, e.to_string()).with_source(e)
+    }
+}
+
+impl From<depthrig_drivers::Error> for Error {
+    fn from(e: depthrig_drivers::Error) -> Self {
+        use depthrig_drivers::ErrorKind as Driver;
+        let kind = match e.kind() {
+            Driver::NotFound => ErrorKind::NotFound,
+            Driver::Busy => ErrorKind::InUse,
+            Driver::PermissionDenied => ErrorKind::PermissionDenied,
+            Driver::BadInput | Driver::Unsupported => ErrorKind::BadInput,
+            _ => ErrorKind::Other,
+        };
+        Self::new(kind, e.to_string()).with_source(e)
+    }
+}

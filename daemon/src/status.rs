@@ -1,0 +1,240 @@
+//! What the daemon says of itself: the one structure behind `status`, `top`, `/v1/status` and `/metrics`.
+
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// The whole rig at one moment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RigStatus {
+    /// The rig's name.
+    pub rig: String,
+    /// Version of depthrig.
+    pub version: String,
+    /// The daemon's process.
+    pub pid: u32,
+    /// How long it has run, seconds.
+    pub uptime_s: f64,
+    /// The moment of this status, nanoseconds since 1970 UTC.
+    pub utc_ns: i64,
+    /// Cameras in the order of the configuration.
+    pub cameras: Vec<CameraStatus>,
+    /// The set assembler.
+    pub sets: SetStatus,
+    /// The recording in progress, or the last one.
+    pub recording: Option<RecordingStatus>,
+    /// Shared memory.
+    pub shared_memory: SharedMemoryStatus,
+    /// CPU that the daemon used over the last second or so, in cores.
+    pub cpu_cores: f64,
+}
+
+/// The state of a camera's supervisor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[non_exhaustive]
+pub enum CameraState {
+    /// Being opened for the first time.
+    Opening,
+    /// Frames come.
+    Streaming,
+    /// Open, but no frame has come for too long.
+    Stalled,
+    /// Lost; it is being opened again, with growing pauses.
+    Reconnecting,
+    /// Given up: its configuration cannot work (the message says why).
+    Failed,
+    /// Its source came to its end (files that are not looped).
+    Finished,
+    /// Stopped with the rig.
+    Stopped,
+}
+
+impl CameraState {
+    /// Every state.
+    pub const ALL: [Self; 7] = [
+        Self::Opening,
+        Self::Streaming,
+        Self::Stalled,
+        Self::Reconnecting,
+        Self::Failed,
+        Self::Finished,
+        Self::Stopped,
+    ];
+
+    /// The name used in reports, metrics and JSON.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Opening => "opening",
+            Self::Streaming => "streaming",
+            Self::Stalled => "stalled",
+            Self::Reconnecting => "reconnecting",
+            Self::Failed => "failed",
+            Self::Finished => "finished",
+            Self::Stopped => "stopped",
+        }
+    }
+}
+
+/// One camera.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CameraStatus {
+    /// Its name in the rig.
+    pub name: String,
+    /// Its driver.
+    pub backend: String,
+    /// Model as the device says.
+    pub model: String,
+    /// Serial number as the device says.
+    pub serial: String,
+    /// Firmware as the device says.
+    pub firmware: String,
+    /// Where its calibration comes from.
+    pub calibration: String,
+    /// State of its supervisor.
+    pub state: CameraState,
+    /// How long it has been in this state, seconds.
+    pub state_for_s: f64,
+    /// Why it is in a state other than streaming.
+    pub message: Option<String>,
+    /// Times it was lost and came back.
+    pub reconnects: u64,
+    /// Its streams.
+    pub streams: Vec<StreamStatus>,
+}
+
+/// One stream. `captured = delivered + Σ dropped`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StreamStatus {
+    /// `camera/stream`.
+    pub id: String,
+    /// Pixel format.
+    pub format: String,
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Rate asked of the device, Hz.
+    pub nominal_hz: f64,
+    /// Rate delivered over the last seconds, Hz.
+    pub rate_hz: f64,
+    /// Frames the device captured.
+    pub captured: u64,
+    /// Frames published.
+    pub delivered: u64,
+    /// Frames lost, by reason; reasons without a loss are left out.
+    pub dropped: BTreeMap<String, u64>,
+    /// Milliseconds since the last frame; `None` before the first.
+    pub last_frame_age_ms: Option<f64>,
+    /// Capture to published, median over the last frames, milliseconds.
+    pub latency_p50_ms: f64,
+    /// Capture to published, 99th percentile, milliseconds.
+    pub latency_p99_ms: f64,
+    /// The clock map.
+    pub clock: ClockStatus,
+    /// What became of its delivered frames in the set assembler.
+    pub in_sets: SetAccount,
+}
+
+/// Quality of a stream's clock map.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct ClockStatus {
+    /// `device`, `kernel` or `arrival`.
+    pub domain: String,
+    /// Number of the map in force.
+    pub epoch: u32,
+    /// Device clock rate against the host's, parts per million.
+    pub rate_ppm: f64,
+    /// Stated uncertainty of the newest capture time, microseconds.
+    pub uncertainty_us: f64,
+    /// How late arrivals are against the map, median, microseconds.
+    pub residual_p50_us: f64,
+    /// 99th percentile, microseconds.
+    pub residual_p99_us: f64,
+    /// Frames flagged `time_uncertain`.
+    pub uncertain_frames: u64,
+}
+
+/// What became of a stream's frames in the set assembler:
+/// `delivered = used + decimated + late + out_of_order + overflow + missed + pending`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct SetAccount {
+    /// Became part of a set.
+    pub used: u64,
+    /// Between two ticks, as most frames are.
+    pub decimated: u64,
+    /// Came after their set had been sent.
+    pub late: u64,
+    /// Stamped not after their predecessor.
+    pub out_of_order: u64,
+    /// Pushed out by newer ones while waiting.
+    pub overflow: u64,
+    /// Replaced on the channel before the assembler read them.
+    pub missed: u64,
+    /// Waiting for their set now.
+    pub pending: u64,
+}
+
+/// The set assembler.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct SetStatus {
+    /// Rate asked for, Hz.
+    pub nominal_hz: f64,
+    /// Sets sent.
+    pub sent: u64,
+    /// Sets sent that miss a stream.
+    pub incomplete: u64,
+    /// Spread of a set (latest minus earliest capture time), median, milliseconds.
+    pub spread_p50_ms: f64,
+    /// 95th percentile.
+    pub spread_p95_ms: f64,
+    /// 99th percentile.
+    pub spread_p99_ms: f64,
+    /// Greatest.
+    pub spread_max_ms: f64,
+}
+
+/// Shared memory of the bus.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct SharedMemoryStatus {
+    /// Bytes still free in `/dev/shm`.
+    pub free_bytes: u64,
+    /// Slots of each stream.
+    pub slots: usize,
+    /// Bytes of all slots of all streams.
+    pub reserved_bytes: u64,
+}
+
+/// A recording.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct RecordingStatus {
+    /// Whether it is still going on.
+    pub active: bool,
+    /// The dataset's folder.
+    pub path: String,
+    /// Session name.
+    pub name: String,
+    /// Scene label.
+    pub scene: String,
+    /// Who records.
+    pub operator: String,
+    /// Start, nanoseconds since 1970 UTC.
+    pub started_utc_ns: i64,
+    /// Length so far, seconds.
+    pub duration_s: f64,
+    /// Sets written.
+    pub sets: u64,
+    /// Sets lost, by reason.
+    pub dropped: BTreeMap<String, u64>,
+    /// Frames written.
+    pub frames: u64,
+    /// Bytes written.
+    pub bytes: u64,
+    /// Segments begun.
+    pub segments: u64,
+    /// Why it ended early or lost something.
+    pub error: Option<String>,
+    /// Bytes free on its disk.
+    pub disk_free_bytes: u64,
+    /// Seconds left at the present rate; `None` before a rate is known.
+    pub disk_seconds_left: Option<f64>,
+}
