@@ -145,11 +145,8 @@ impl Bus {
         self.node.try_cleanup_dead_nodes().cleanups
     }
 
-    fn stream_channel(&self, id: &StreamId) -> Result<Channel<FrameHeader>> {
-        Ok(Channel::new(
-            format!("depthrig/{}/{id}", self.rig),
-            format!("stream {id} of rig \"{}\"", self.rig),
-        ))
+    fn stream_channel(&self, id: &StreamId) -> Channel<FrameHeader> {
+        Channel::new(format!("depthrig/{}/{id}", self.rig), format!("stream {id} of rig \"{}\"", self.rig))
     }
 
     fn set_channel(&self) -> Channel<SetHeader> {
