@@ -240,7 +240,7 @@ fn helper_process() {
             held.extend(subscriber.next_timeout(WAIT).unwrap());
         }
         println!("holding");
-        std::thread::sleep(Duration::from_secs(60));
+        std::thread::park(); // until it is killed
     }
 }
 

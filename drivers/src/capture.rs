@@ -3,6 +3,7 @@
 //! Whatever a device does, [`Capture::stop`] returns within its patience. A thread that does not end by then
 //! is *abandoned*: it is left behind, and if it ever wakes, nothing that it still holds is published.
 
+use crate::clock::ClockQuality;
 use crate::{DeviceInfo, Error, ErrorKind, FrameMeta, FrameSink, Poll, Result, Stream};
 use core::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use core::time::Duration;
@@ -81,13 +82,17 @@ impl Capture {
                         .map(String::as_str)
                         .or_else(|| panic.downcast_ref::<&str>().copied())
                         .unwrap_or("no message");
-                    End::Failed(Error::new(ErrorKind::Protocol, format!("{label}: the driver panicked: {what}")))
+                    End::Failed(Error::new(
+                        ErrorKind::Protocol,
+                        format!("{label}: the driver panicked: {what}"),
+                    ))
                 });
                 *theirs.end.lock().unwrap_or_else(PoisonError::into_inner) = Some(end);
                 theirs.ended.notify_all();
             })
             .map_err(|e| {
-                Error::new(ErrorKind::Io, format!("{name}: no thread for the camera could be started")).with_source(e)
+                Error::new(ErrorKind::Io, format!("{name}: no thread for the camera could be started"))
+                    .with_source(e)
             })?;
         Ok(Self { name: name.to_owned(), thread: Some(thread), shared })
     }
@@ -212,6 +217,14 @@ impl FrameSink for Guarded<'_> {
         self.note_frame();
         let reason = if self.is_abandoned() { DropReason::Abandoned } else { reason };
         self.sink.dropped(stream, reason, n);
+    }
+
+    fn captured(&mut self, stream: usize, n: u64) {
+        self.sink.captured(stream, n);
+    }
+
+    fn clock_quality(&mut self, stream: usize, quality: &ClockQuality) {
+        self.sink.clock_quality(stream, quality);
     }
 }
 

@@ -80,12 +80,15 @@ pub struct Gate {
     delivered: u64,
     drops: DropCounts,
     last_capture: HostTime,
+    /// Frames between two reports of the clock's quality: about a second's worth.
+    report_every: u64,
 }
 
 impl Gate {
     /// The gate of stream number `stream`, delivering as `profile` says.
     pub fn new(stream: usize, profile: &StreamProfile) -> Self {
-        let clock = ClockConfig::new(profile.clock.counter_bits, profile.clock.tick_ns(), profile.period_ns());
+        let clock =
+            ClockConfig::new(profile.clock.counter_bits, profile.clock.tick_ns(), profile.period_ns());
         Self {
             stream,
             format: profile.format,
@@ -98,6 +101,7 @@ impl Gate {
             delivered: 0,
             drops: DropCounts::default(),
             last_capture: HostTime::from_ns(i64::MIN),
+            report_every: (profile.rate_hz.ceil() as u64).max(1),
         }
     }
 
@@ -122,8 +126,8 @@ impl Gate {
     }
 
     /// Passes one frame: checks and counts it, maps its time, and has `fill` write the pixels into memory on
-    /// loan from `sink`. `fill` returns the number of bytes it wrote, which matters for MJPEG alone, or the
-    /// reason for which the frame cannot be delivered.
+    /// loan from `sink`. `fill` writes every byte of it or returns the reason for which the frame cannot be
+    /// delivered.
     pub fn deliver(
         &mut self,
         raw: &RawFrame,
@@ -175,6 +179,9 @@ impl Gate {
         }
         meta.captured = self.captured;
         sink.commit(self.stream, &meta);
+        if self.domain == ClockDomain::Device && self.delivered.is_multiple_of(self.report_every) {
+            sink.clock_quality(self.stream, &self.clock.quality());
+        }
         Ok(())
     }
 
@@ -203,7 +210,8 @@ impl Gate {
             meta.flags = meta.flags.with(mapped.flags);
         } else if self.domain == ClockDomain::Kernel {
             // The counter is the kernel's monotonic stamp in nanoseconds, taken as it is.
-            meta.capture_time = HostTime::from_ns(raw.device_ticks as i64).min(raw.arrival).max(self.last_capture);
+            meta.capture_time =
+                HostTime::from_ns(raw.device_ticks as i64).min(raw.arrival).max(self.last_capture);
         }
         self.last_capture = meta.capture_time;
         meta
@@ -214,7 +222,7 @@ impl Gate {
     fn account(&mut self, raw: &RawFrame, sink: &mut dyn FrameSink) -> Option<Result<u64, DropReason>> {
         let Some((newest, seen)) = self.newest else {
             self.newest = Some((raw.device_sequence, 1));
-            self.captured += 1;
+            self.capture(1, sink);
             return Some(Ok(raw.device_sequence));
         };
         let bits = self.sequence_bits.clamp(1, 64);
@@ -223,7 +231,7 @@ impl Gate {
         let step = ((raw.device_sequence << shift).wrapping_sub(newest << shift) as i64) >> shift;
         if step > 0 {
             let step = step as u64;
-            self.captured += step;
+            self.capture(step, sink);
             self.lose(DropReason::DeviceGap, step - 1, sink);
             let seen = if step >= 64 { 1 } else { (seen << step) | 1 };
             self.newest = Some((newest + step, seen));
@@ -235,13 +243,18 @@ impl Gate {
                 self.newest = Some((newest, seen | (1 << back)));
                 return None;
             }
-            self.captured += 1;
+            self.capture(1, sink);
             return Some(Err(DropReason::OutOfOrder));
         }
         // The counter restarted: the device was reset. How many frames it lost meanwhile nobody knows.
-        self.captured += 1;
+        self.capture(1, sink);
         self.newest = Some((raw.device_sequence, 1));
         Some(Ok(raw.device_sequence))
+    }
+
+    fn capture(&mut self, n: u64, sink: &mut dyn FrameSink) {
+        self.captured += n;
+        sink.captured(self.stream, n);
     }
 
     fn lose(&mut self, reason: DropReason, n: u64, sink: &mut dyn FrameSink) {

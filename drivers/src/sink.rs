@@ -1,5 +1,6 @@
 //! Where a driver's frames go: memory on loan, written once, then committed or given back.
 
+use crate::clock::ClockQuality;
 use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameFlags, HostTime};
 
 /// The receiver of a camera's frames. `stream` is the index into [`crate::Stream::profiles`].
@@ -19,6 +20,12 @@ pub trait FrameSink {
 
     /// Says that `n` frames of `stream` were lost.
     fn dropped(&mut self, stream: usize, reason: DropReason, n: u64);
+
+    /// Says that the device captured `n` more frames on `stream`; each of them is committed or dropped next.
+    fn captured(&mut self, stream: usize, n: u64);
+
+    /// Says how the clock map of `stream` is doing, about once a second.
+    fn clock_quality(&mut self, stream: usize, quality: &ClockQuality);
 }
 
 /// What is known of one frame besides its pixels.
@@ -57,6 +64,8 @@ pub struct MemorySink {
     pub frames: Vec<(usize, FrameMeta, Vec<u8>)>,
     /// Drops by stream.
     pub drops: Vec<DropCounts>,
+    /// Frames captured by stream.
+    pub captured: Vec<u64>,
     /// Number of loans from now on that are refused, as if no slot were free.
     pub refuse: usize,
     buffers: Vec<Vec<u8>>,
@@ -104,4 +113,10 @@ impl FrameSink for MemorySink {
     fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
         Self::at(&mut self.drops, stream).add(reason, n);
     }
+
+    fn captured(&mut self, stream: usize, n: u64) {
+        *Self::at(&mut self.captured, stream) += n;
+    }
+
+    fn clock_quality(&mut self, _: usize, _: &ClockQuality) {}
 }

@@ -30,6 +30,8 @@ impl FrameSink for Counting {
     fn dropped(&mut self, _: usize, reason: DropReason, _: u64) {
         self.0.lock().unwrap().1.push(reason);
     }
+    fn captured(&mut self, _: usize, _: u64) {}
+    fn clock_quality(&mut self, _: usize, _: &ClockQuality) {}
 }
 
 fn start(
