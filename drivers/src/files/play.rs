@@ -1,0 +1,211 @@
+//! Playing the pictures: decode ahead, wait for the moment, copy once into the sink's memory.
+
+use super::picture::{Info, decode};
+use super::source::{Playing, SourceStream};
+use crate::{Error, ErrorKind, FrameSink, Gate, Poll, RawFrame, Result, Stream, StreamProfile};
+use core::time::Duration;
+use depthrig_bus::{DropReason, HostTime};
+use rayon::prelude::*;
+use std::path::PathBuf;
+
+/// A playing folder.
+pub(super) struct Player {
+    name: String,
+    profiles: Vec<StreamProfile>,
+    tracks: Vec<Track>,
+    /// Pictures per stream.
+    count: usize,
+    looped: bool,
+    /// Bytes that may still be kept decoded.
+    cache_left: u64,
+    /// Running number of the next frame.
+    next: u64,
+    /// Its pictures are decoded.
+    ready: bool,
+    pace: Pace,
+}
+
+/// One stream of it.
+struct Track {
+    picture: Info,
+    paths: Vec<PathBuf>,
+    /// Decoded pictures that are kept.
+    kept: Vec<Option<Box<[u8]>>>,
+    /// The decoded next picture, when it is not kept.
+    passing: Vec<u8>,
+    gate: Gate,
+}
+
+impl Track {
+    /// Decodes picture `i`, for good or for once.
+    fn decode(&mut self, i: usize, keep: bool) -> Result<()> {
+        let bytes = self.picture.bytes() as usize;
+        if keep {
+            let mut pixels = vec![0; bytes].into_boxed_slice();
+            decode(&self.paths[i], &self.picture, &mut pixels)?;
+            self.kept[i] = Some(pixels);
+            Ok(())
+        } else {
+            self.passing.resize(bytes, 0);
+            decode(&self.paths[i], &self.picture, &mut self.passing)
+        }
+    }
+}
+
+impl Player {
+    /// A player at its first picture, which is decoded already.
+    pub(super) fn new(name: String, streams: Vec<SourceStream>, playing: Playing) -> Result<Self> {
+        let count = streams.first().map_or(0, |s| s.paths.len());
+        let profiles: Vec<_> = streams.iter().map(|s| s.profile.clone()).collect();
+        let tracks = streams.into_iter().enumerate().map(|(i, s)| Track {
+            gate: Gate::new(i, &s.profile),
+            picture: s.picture,
+            kept: s.paths.iter().map(|_| None).collect(),
+            paths: s.paths,
+            passing: Vec::new(),
+        });
+        let mut player = Self {
+            name,
+            profiles,
+            tracks: tracks.collect(),
+            count,
+            looped: playing.looped,
+            cache_left: playing.cache_bytes,
+            next: 0,
+            ready: false,
+            pace: Pace::new(playing.rate_hz),
+        };
+        player.prepare()?;
+        Ok(player)
+    }
+
+    fn picture(&self) -> usize {
+        (self.next % (self.count as u64).max(1)) as usize
+    }
+
+    /// Decodes the pictures of the next frame, unless they are kept.
+    fn prepare(&mut self) -> Result<()> {
+        let i = self.picture();
+        if !self.ready && self.tracks.iter().any(|t| t.kept[i].is_none()) {
+            let bytes = self.tracks.iter().map(|t| t.picture.bytes()).sum();
+            let left = self.cache_left.checked_sub(bytes);
+            self.tracks.par_iter_mut().try_for_each(|t| t.decode(i, left.is_some())).map_err(|e| {
+                // A file that was there on opening and is not now: no other camera could be meant.
+                let kind = if e.kind() == ErrorKind::BadInput { ErrorKind::BadInput } else { ErrorKind::Io };
+                Error::new(kind, format!("{}: {e}", self.name)).with_source(e)
+            })?;
+            self.cache_left = left.unwrap_or(self.cache_left);
+        }
+        self.ready = true;
+        Ok(())
+    }
+}
+
+impl Stream for Player {
+    fn profiles(&self) -> &[StreamProfile] {
+        &self.profiles
+    }
+
+    fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
+        if !self.looped && self.next >= self.count as u64 {
+            return Ok(Poll::End);
+        }
+        let deadline = HostTime::now().plus(timeout);
+        self.prepare()?;
+        let now = HostTime::now();
+        let due = self.pace.due(self.next, now);
+        std::thread::sleep(due.min(deadline).from_now());
+        if due > deadline.max(now) {
+            return Ok(Poll::Idle);
+        }
+        let i = self.picture();
+        for track in &mut self.tracks {
+            let pixels: &[u8] = track.kept[i].as_deref().unwrap_or(&track.passing);
+            let ticks = u64::try_from(due.ns()).unwrap_or(0);
+            let raw = RawFrame::new(self.next, ticks, HostTime::now(), pixels.len());
+            track.gate.deliver(&raw, sink, |memory| {
+                if memory.len() != pixels.len() {
+                    return Err(DropReason::WrongSize);
+                }
+                memory.copy_from_slice(pixels);
+                Ok(())
+            });
+        }
+        self.next += 1;
+        self.ready = false;
+        Ok(Poll::Frame)
+    }
+}
+
+/// When each frame is due: `origin + (k - first) periods`, without accumulating error.
+struct Pace {
+    period_ns: f64,
+    /// A moment, and the number of the frame that is due then.
+    origin: Option<(HostTime, u64)>,
+    /// Times that the schedule had to move.
+    moved: u64,
+}
+
+impl Pace {
+    fn new(rate_hz: f64) -> Self {
+        Self { period_ns: 1e9 / rate_hz, origin: None, moved: 0 }
+    }
+
+    /// When frame `k` is due. A host that is more than a period late moves the schedule rather than lose
+    /// pictures or send them in a burst.
+    fn due(&mut self, k: u64, now: HostTime) -> HostTime {
+        let (origin, first) = *self.origin.get_or_insert((now, k));
+        let due = origin.plus_ns(((k - first) as f64 * self.period_ns).round() as i64);
+        if now.since_ns(due) as f64 <= self.period_ns {
+            return due;
+        }
+        self.moved += 1;
+        if self.moved.is_power_of_two() {
+            tracing::warn!(
+                "pictures play late: frame {k} was due {:.1} ms ago (the {}. time); a lower rate_hz or a larger \
+                 cache_mb helps",
+                now.since_ns(due) as f64 / 1e6,
+                self.moved
+            );
+        }
+        self.origin = Some((now, k));
+        now
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const T0: HostTime = HostTime::from_ns(1_000_000_000);
+
+    #[test]
+    fn frames_are_due_on_an_exact_grid() {
+        let mut pace = Pace::new(30.0);
+        assert_eq!(pace.due(0, T0), T0);
+        for k in [1u64, 2, 3, 1_000_000, 3_000_000_000] {
+            let exact = T0.ns() + (k as i128 * 1_000_000_000 / 30) as i64;
+            let late = HostTime::from_ns(exact + 30_000_000);
+            assert!((pace.due(k, late).ns() - exact).abs() <= 1, "frame {k}");
+        }
+        assert_eq!(pace.moved, 0);
+    }
+
+    #[test]
+    fn a_late_host_moves_the_schedule() {
+        let mut pace = Pace::new(10.0);
+        pace.due(0, T0);
+        let late = T0.plus_ns(250_000_000);
+        assert_eq!(pace.due(1, late), late, "150 ms after its time");
+        assert_eq!(pace.due(2, late), late.plus_ns(100_000_000), "the next ones follow from there");
+        assert_eq!(pace.moved, 1);
+    }
+
+    #[test]
+    fn asking_twice_changes_nothing() {
+        let mut pace = Pace::new(10.0);
+        pace.due(0, T0);
+        let first = pace.due(1, T0);
+        assert_eq!(pace.due(1, first.plus_ns(-1)), first);
+    }
+}
