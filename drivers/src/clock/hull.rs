@@ -4,12 +4,16 @@
 //! ones know the clock. The textbook one-pass hull forgets each point that another one shadows, and cannot bring
 //! it back when that other one leaves the window: after a clock moved up, one old low point would rule for ever.
 //! So the lowest point of each slice of the window is kept beside the hull, and the hull is built again from
-//! those whenever its first vertex leaves: 256 steps, once per slice of 1/256 of the window.
+//! those when the oldest leave, eight slices together: some 256 steps, 32 times in a window.
 
 use std::collections::VecDeque;
 
 /// Slices of the window whose lowest point is kept.
 const SLICES: i64 = 256;
+/// Slices that leave together.
+const BATCH: i64 = 8;
+/// Slices at most: the window, the batch and what a pause keeps.
+const MAX_SLICES: usize = 2 * SLICES as usize;
 /// Vertices at most. A window of real frames has under a hundred; this bounds memory for input that is not.
 const MAX_VERTICES: usize = 4096;
 
@@ -116,30 +120,37 @@ impl Hull {
 
     fn expire(&mut self, now: i64) {
         let oldest = now - self.window_ns;
+        let limit = oldest - BATCH * self.slice_ns;
+        if self.slices.front().is_none_or(|s| s.lowest.x >= limit) && self.slices.len() <= MAX_SLICES {
+            self.bound();
+            return;
+        }
+        let before = self.slices.len();
         // The slice after the front one is what would remain; it must still reach back far enough.
         while self.slices.len() > 1
             && (self.slices[0].lowest.x < oldest && now - self.slices[1].lowest.x >= self.keep_ns
-                || self.slices.len() > 2 * SLICES as usize)
+                || self.slices.len() > MAX_SLICES)
         {
             self.count -= self.slices.pop_front().map_or(0, |s| s.count);
         }
-        let first_kept = self.slices.front().map_or(now, |s| s.index.saturating_mul(self.slice_ns));
-        if self.vertices.front().is_some_and(|v| v.x < first_kept) {
-            self.rebuild(first_kept);
+        if self.slices.len() < before {
+            self.rebuild();
         }
+        self.bound();
+    }
+
+    fn bound(&mut self) {
         while self.vertices.len() > MAX_VERTICES {
             self.vertices.pop_front();
         }
     }
 
     /// The hull of the slices' lowest points and of the newest point, which is always a vertex.
-    fn rebuild(&mut self, first_kept: i64) {
+    fn rebuild(&mut self) {
         let newest = self.vertices.back().copied();
         self.vertices.clear();
         for slice in &self.slices {
-            if slice.lowest.x >= first_kept {
-                append(&mut self.vertices, slice.lowest);
-            }
+            append(&mut self.vertices, slice.lowest);
         }
         if let Some(p) = newest
             && self.vertices.back().is_none_or(|v| v.x < p.x)
@@ -229,7 +240,9 @@ mod tests {
                 x += 10 + 170 * skip;
                 points.push(Point { x, d });
                 hull.push(Point { x, d }, 0.0);
-                points.retain(|p| p.x >= x - 2560);
+                if points[0].x < x - 2560 - 10 * BATCH {
+                    points.retain(|p| p.x >= x - 2560);
+                }
                 prop_assert_eq!(hull.vertices.iter().copied().collect::<Vec<_>>(), slow(&points));
                 prop_assert_eq!(hull.count(), points.len() as u64);
             }
@@ -244,7 +257,7 @@ mod tests {
             hull.push(Point { x: i * 33, d }, 0.0);
         }
         assert_eq!(hull.support(0.0).unwrap().d0, 100);
-        assert!(hull.span_ns() <= 60_000);
+        assert!(hull.span_ns() <= 62_000);
     }
 
     #[test]

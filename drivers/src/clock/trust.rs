@@ -63,11 +63,11 @@ impl Residuals {
 }
 
 /// Time between two self-checks, nanoseconds of device time.
-const CHECK_EVERY_NS: i64 = 500_000_000;
+const CHECK_EVERY_NS: i64 = 1_000_000_000;
 /// Self-checks remembered: two minutes.
-const CHECKS: usize = 240;
+const CHECKS: usize = 120;
 /// Self-checks needed before they replace the arithmetic.
-const CHECKS_NEEDED: usize = 60;
+const CHECKS_NEEDED: usize = 30;
 /// Stamps waiting for their self-check: half a window of 120 s at most.
 const MAX_WAITING: usize = 128;
 
@@ -90,7 +90,7 @@ impl Trust {
         }
     }
 
-    /// The published line stood at `d` over `x`; remembered twice a second.
+    /// The published line stood at `d` over `x`; remembered once a second.
     pub(super) fn published(&mut self, x: i64, d: f64) {
         if self.waiting.back().is_none_or(|last| x - last.0 >= CHECK_EVERY_NS) {
             if self.waiting.len() == MAX_WAITING {
