@@ -1,0 +1,220 @@
+//! How good depth is against a reference: L1, RMSE, `AbsRel`, δ0.5, δ1, what is missing, and the fill rate.
+//!
+//! With reference depth `d*` and predicted depth `d`, both in metres:
+//! - a reference pixel *counts* when `d*` is finite, above 0 and within the [`DepthRange`];
+//! - it is *valid* when `d` is finite and above 0 as well; there are `N` valid pixels;
+//! - L1 = 1/N Σ|d − d*|, RMSE = √(1/N Σ(d − d*)²), `AbsRel` = 1/N Σ|d − d*|/d*;
+//! - δt = 1/N #{max(d/d*, d*/d) < 1.25^t}, for t = 0.5 (1.118034) and t = 1 (1.25), strictly below;
+//! - *strict* δt divides by the pixels that count: a prediction that is missing is a failure. Raw sensors have
+//!   holes and models have none, so that comparing on valid pixels alone flatters the sensor; for the same
+//!   reason `missing_percent` stands beside the others.
+//!
+//! A measure over no pixels at all is NaN and [`DepthMetrics::is_empty`] says so; it is never 0, which would be
+//! perfect. Everything is summed in `f64`.
+//!
+//! Over a dataset, the *mean of pictures* and the *pixel-pooled* value differ; [`Dataset`] gives both by name.
+
+use crate::{Error, ErrorKind, Result};
+
+mod dataset;
+
+pub use dataset::{Dataset, DatasetMetrics};
+
+/// 1.25^0.5, the threshold of δ0.5.
+const DELTA_05: f64 = 1.118_033_988_749_894_9;
+/// The threshold of δ1.
+const DELTA_1: f64 = 1.25;
+
+/// A depth picture, row by row without padding.
+#[derive(Debug, Clone, Copy)]
+pub enum Depth<'a> {
+    /// 16-bit depth in units of `unit_m` metres; 0 is a hole.
+    Units {
+        /// The pixels.
+        pixels: &'a [u16],
+        /// Metres per unit.
+        unit_m: f64,
+    },
+    /// Metres; NaN, infinity and what is not above 0 are holes.
+    Metres(&'a [f32]),
+}
+
+impl Depth<'_> {
+    /// Number of pixels, holes included.
+    pub const fn len(&self) -> usize {
+        match self {
+            Self::Units { pixels, .. } => pixels.len(),
+            Self::Metres(pixels) => pixels.len(),
+        }
+    }
+
+    /// Whether there are no pixels at all.
+    pub const fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Metres at pixel `i`; `None` in a hole and outside.
+    pub fn metres(&self, i: usize) -> Option<f64> {
+        let d = match self {
+            Self::Units { pixels, unit_m } => f64::from(*pixels.get(i)?) * unit_m,
+            Self::Metres(pixels) => f64::from(*pixels.get(i)?),
+        };
+        (d.is_finite() && d > 0.0).then_some(d)
+    }
+
+    fn check(&self, what: &str) -> Result<()> {
+        match self {
+            Self::Units { unit_m, .. } if !(unit_m.is_finite() && *unit_m > 0.0) => Err(Error::new(
+                ErrorKind::BadInput,
+                format!("{what}: {unit_m} metres is no unit of depth; it must be above 0, such as 0.001"),
+            )),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Share of the pixels that have a depth, 0 to 1; NaN when there are no pixels.
+pub fn fill_rate(depth: &Depth<'_>) -> f64 {
+    let filled = (0..depth.len()).filter(|i| depth.metres(*i).is_some()).count();
+    filled as f64 / depth.len() as f64
+}
+
+/// The reference depths that count, metres, both ends included.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DepthRange {
+    /// The nearest.
+    pub min_m: f64,
+    /// The farthest.
+    pub max_m: f64,
+}
+
+impl DepthRange {
+    /// Every depth there is.
+    pub const ALL: Self = Self { min_m: 0.0, max_m: f64::INFINITY };
+}
+
+/// Depth against a reference. Fractions are 0 to 1; NaN when there is nothing to divide by.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DepthMetrics {
+    /// Reference pixels that count.
+    pub counted: u64,
+    /// Of these, the ones where the prediction has a depth: the `N` of the plain measures.
+    pub valid: u64,
+    /// Mean absolute error, metres.
+    pub l1_m: f64,
+    /// Root of the mean squared error, metres.
+    pub rmse_m: f64,
+    /// Mean absolute error relative to the reference.
+    pub abs_rel: f64,
+    /// Share of valid pixels within a factor of 1.25^0.5.
+    pub delta_05: f64,
+    /// Share of valid pixels within a factor of 1.25.
+    pub delta_1: f64,
+    /// As `delta_05`, over the pixels that count.
+    pub strict_delta_05: f64,
+    /// As `delta_1`, over the pixels that count.
+    pub strict_delta_1: f64,
+    /// Pixels that count and have no prediction, percent.
+    pub missing_percent: f64,
+}
+
+impl DepthMetrics {
+    /// Whether no pixel could be compared, so that the plain measures are NaN.
+    pub const fn is_empty(&self) -> bool {
+        self.valid == 0
+    }
+}
+
+/// Compares `prediction` with `reference` where the reference lies in `range`.
+///
+/// # Errors
+/// [`ErrorKind::SizeMismatch`] when they differ in the number of pixels, [`ErrorKind::BadInput`] for a unit or a
+/// range that is none.
+pub fn compare(prediction: &Depth<'_>, reference: &Depth<'_>, range: DepthRange) -> Result<DepthMetrics> {
+    Ok(Sums::of(prediction, reference, range)?.metrics())
+}
+
+/// The sums that every measure is made of; those of several pictures add up.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+struct Sums {
+    counted: u64,
+    valid: u64,
+    within_05: u64,
+    within_1: u64,
+    abs_m: f64,
+    square_m2: f64,
+    relative: f64,
+}
+
+impl Sums {
+    fn of(prediction: &Depth<'_>, reference: &Depth<'_>, range: DepthRange) -> Result<Self> {
+        if prediction.len() != reference.len() {
+            let (p, r) = (prediction.len(), reference.len());
+            let message =
+                format!("the prediction has {p} pixels and its reference {r}; compare pictures of one size");
+            return Err(Error::new(ErrorKind::SizeMismatch, message));
+        }
+        prediction.check("prediction")?;
+        reference.check("reference")?;
+        // Written so that NaN is refused too.
+        if !(range.min_m <= range.max_m) {
+            let DepthRange { min_m, max_m } = range;
+            let message = format!("{min_m} m to {max_m} m is no range of depth; the nearest comes first");
+            return Err(Error::new(ErrorKind::BadInput, message));
+        }
+        let mut sums = Self::default();
+        for i in 0..reference.len() {
+            let Some(truth) = reference.metres(i).filter(|d| range.min_m <= *d && *d <= range.max_m) else {
+                continue;
+            };
+            sums.counted += 1;
+            if let Some(seen) = prediction.metres(i) {
+                sums.add(seen, truth);
+            }
+        }
+        Ok(sums)
+    }
+
+    fn add(&mut self, seen: f64, truth: f64) {
+        let error = (seen - truth).abs();
+        let factor = (seen / truth).max(truth / seen);
+        self.valid += 1;
+        self.abs_m += error;
+        self.square_m2 += error * error;
+        self.relative += error / truth;
+        self.within_05 += u64::from(factor < DELTA_05);
+        self.within_1 += u64::from(factor < DELTA_1);
+    }
+
+    fn plus(self, other: Self) -> Self {
+        Self {
+            counted: self.counted + other.counted,
+            valid: self.valid + other.valid,
+            within_05: self.within_05 + other.within_05,
+            within_1: self.within_1 + other.within_1,
+            abs_m: self.abs_m + other.abs_m,
+            square_m2: self.square_m2 + other.square_m2,
+            relative: self.relative + other.relative,
+        }
+    }
+
+    /// Division by no pixels is 0/0, and that is NaN as it should be.
+    fn metrics(&self) -> DepthMetrics {
+        let (n, counted) = (self.valid as f64, self.counted as f64);
+        DepthMetrics {
+            counted: self.counted,
+            valid: self.valid,
+            l1_m: self.abs_m / n,
+            rmse_m: (self.square_m2 / n).sqrt(),
+            abs_rel: self.relative / n,
+            delta_05: self.within_05 as f64 / n,
+            delta_1: self.within_1 as f64 / n,
+            strict_delta_05: self.within_05 as f64 / counted,
+            strict_delta_1: self.within_1 as f64 / counted,
+            missing_percent: 100.0 * (self.counted - self.valid) as f64 / counted,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,97 @@
+//! The measures over many pictures: their mean, and all pixels pooled.
+
+use super::{Depth, DepthMetrics, DepthRange, Sums};
+use crate::Result;
+
+/// Collects pictures one at a time; memory does not grow with their number.
+#[derive(Debug, Clone)]
+pub struct Dataset {
+    range: DepthRange,
+    pooled: Sums,
+    /// Sums over the pictures of the plain measures, and over those that have a strict one.
+    plain: [f64; 5],
+    strict: [f64; 3],
+    pictures: u64,
+    compared: u64,
+    counted: u64,
+}
+
+/// What a [`Dataset`] came to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DatasetMetrics {
+    /// Mean over pictures of each picture's value; `counted` and `valid` are sums. A picture without a valid
+    /// pixel takes no part in the plain measures, one without a pixel that counts in none.
+    pub mean_of_pictures: DepthMetrics,
+    /// As if all pictures were one: every pixel weighs the same.
+    pub pixel_pooled: DepthMetrics,
+    /// Pictures that were added.
+    pub pictures: u64,
+    /// Of these, the ones in which no pixel could be compared.
+    pub empty_pictures: u64,
+}
+
+impl Dataset {
+    /// No pictures yet; `range` as in [`super::compare`].
+    pub fn new(range: DepthRange) -> Self {
+        Self {
+            range,
+            pooled: Sums::default(),
+            plain: [0.0; 5],
+            strict: [0.0; 3],
+            pictures: 0,
+            compared: 0,
+            counted: 0,
+        }
+    }
+
+    /// Adds one picture and returns its own measures.
+    ///
+    /// # Errors
+    /// Those of [`super::compare`]; the picture is left out then.
+    pub fn add(&mut self, prediction: &Depth<'_>, reference: &Depth<'_>) -> Result<DepthMetrics> {
+        let sums = Sums::of(prediction, reference, self.range)?;
+        let m = sums.metrics();
+        self.pooled = self.pooled.plus(sums);
+        self.pictures += 1;
+        if m.valid > 0 {
+            self.compared += 1;
+            for (sum, value) in
+                self.plain.iter_mut().zip([m.l1_m, m.rmse_m, m.abs_rel, m.delta_05, m.delta_1])
+            {
+                *sum += value;
+            }
+        }
+        if m.counted > 0 {
+            self.counted += 1;
+            let values = [m.strict_delta_05, m.strict_delta_1, m.missing_percent];
+            for (sum, value) in self.strict.iter_mut().zip(values) {
+                *sum += value;
+            }
+        }
+        Ok(m)
+    }
+
+    /// The measures so far.
+    pub fn metrics(&self) -> DatasetMetrics {
+        let pixel_pooled = self.pooled.metrics();
+        let [l1_m, rmse_m, abs_rel, delta_05, delta_1] = self.plain.map(|s| s / self.compared as f64);
+        let [strict_delta_05, strict_delta_1, missing_percent] = self.strict.map(|s| s / self.counted as f64);
+        DatasetMetrics {
+            mean_of_pictures: DepthMetrics {
+                counted: pixel_pooled.counted,
+                valid: pixel_pooled.valid,
+                l1_m,
+                rmse_m,
+                abs_rel,
+                delta_05,
+                delta_1,
+                strict_delta_05,
+                strict_delta_1,
+                missing_percent,
+            },
+            pixel_pooled,
+            pictures: self.pictures,
+            empty_pictures: self.pictures - self.compared,
+        }
+    }
+}
