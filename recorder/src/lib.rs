@@ -1,1 +1,39 @@
-//! Datasets.
+//! Datasets: writing, reading and verifying them. `docs/dataset-format.md` is the format; this crate opens no
+//! camera and knows no bus channel, it is handed frames.
+//!
+//! A dataset is a folder: `session.toml` and MCAP segments of profile `ros2`. Start at [`Recorder`] (write),
+//! [`Dataset`] (read) and [`verify`] (prove).
+//!
+//! ```text
+//! push ──▶ encode workers (JPEG, zstd) ──▶ one writer thread ──▶ seg_0000.mcap.part ──▶ seg_0000.mcap
+//!  │ never blocks; a refused set is counted       │ owns the file; sets in order; sync each second
+//! ```
+//!
+//! A set is written as one chunk per picture and then one chunk with all that describes them, which ends in
+//! the set's commit mark (`FrameSet`). A set without its mark does not count, so no crash leaves half a set.
+#![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
+
+pub mod bench;
+mod cdr;
+mod container;
+mod dataset;
+mod encode;
+mod error;
+mod frame;
+pub mod fs;
+mod msgs;
+mod options;
+mod recorder;
+mod session;
+mod verify;
+
+pub use dataset::{
+    Dataset, DatasetFrame, DatasetInfo, DatasetSet, PixelMode, SetRange, Sets, SpreadStats, StreamInfo,
+};
+pub use error::{Error, ErrorKind, Result};
+pub use frame::{Pixels, PushError, RecordFrame, RecordSet, SetDrop};
+pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
+pub use options::{ColorCodec, Compression, RecorderOptions};
+pub use recorder::{Progress, Recorder, Summary};
+pub use session::{FORMAT, Note, Outcome, SESSION_FILE, Session, StreamRecord};
+pub use verify::{Finding, Severity, VerifyOptions, VerifyReport, verify, verify_with};

@@ -1,0 +1,258 @@
+//! One segment file: `seg_0003.mcap.part` while it grows, `seg_0003.mcap` once it is whole and durable.
+//!
+//! Invariant: what the index lists is what lies before `len`. A group of chunks is listed after all of it was
+//! written; when a write fails, the file is cut back to `len`, and index and data agree again.
+
+use super::MAGIC;
+use super::chunk::Chunk;
+use super::record::{self, AttachmentIndex, Channel, ChunkIndex, Statistics, op};
+use crate::fs::{self, Fs, WriteFile};
+use crate::msgs::schemas::Schema;
+use crate::{Error, Result};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// The MCAP profile of every segment.
+pub(crate) const PROFILE: &str = "ros2";
+
+pub(crate) fn file_name(index: u32) -> String {
+    format!("seg_{index:04}.mcap")
+}
+
+/// What stands at the head of each segment so that it stands alone.
+#[derive(Debug, Clone)]
+pub(crate) struct Preamble {
+    pub(crate) channels: Vec<Channel>,
+    pub(crate) metadata: Vec<(String, BTreeMap<String, String>)>,
+    /// Time, name, media type and bytes.
+    pub(crate) attachments: Vec<(u64, String, String, Vec<u8>)>,
+}
+
+pub(crate) struct Segment {
+    file: Box<dyn WriteFile>,
+    part: PathBuf,
+    path: PathBuf,
+    len: u64,
+    crc: crc32fast::Hasher,
+    /// Schema and channel records, repeated in the summary.
+    schemas: Vec<u8>,
+    channels: Vec<u8>,
+    chunks: Vec<ChunkIndex>,
+    attachments: Vec<AttachmentIndex>,
+    metadata: Vec<(u64, u64, String)>,
+    stats: Statistics,
+    /// Bytes beyond `len` may lie in the file.
+    torn: bool,
+}
+
+impl Segment {
+    /// Creates `seg_<index>.mcap.part` with everything that comes before the first chunk.
+    pub(crate) fn create(fs: &dyn Fs, dir: &Path, index: u32, preamble: &Preamble) -> Result<Self> {
+        let path = dir.join(file_name(index));
+        let part = path.with_extension("mcap.part");
+        let file = fs.create_new(&part).map_err(|e| Error::io("create", &part, e))?;
+        let mut segment = Self {
+            file,
+            part,
+            path,
+            len: 0,
+            crc: crc32fast::Hasher::new(),
+            schemas: Vec::new(),
+            channels: Vec::new(),
+            chunks: Vec::new(),
+            attachments: Vec::new(),
+            metadata: Vec::new(),
+            stats: Statistics::default(),
+            torn: false,
+        };
+        for s in Schema::ALL {
+            record::schema(&mut segment.schemas, s.id(), s.name(), "ros2msg", s.text().as_bytes());
+        }
+        for c in &preamble.channels {
+            record::channel(&mut segment.channels, c);
+        }
+        segment.stats.schemas = Schema::ALL.len() as u16;
+        segment.stats.channels = preamble.channels.len() as u32;
+        let mut head = MAGIC.to_vec();
+        record::header(&mut head, PROFILE, concat!("depthrig ", env!("CARGO_PKG_VERSION")));
+        head.extend_from_slice(&segment.schemas);
+        head.extend_from_slice(&segment.channels);
+        for (name, map) in &preamble.metadata {
+            let at = head.len() as u64;
+            record::metadata(&mut head, name, map);
+            segment.metadata.push((at, head.len() as u64 - at, name.clone()));
+        }
+        for (time, name, media_type, data) in &preamble.attachments {
+            let at = head.len() as u64;
+            record::attachment(&mut head, *time, name, media_type, data);
+            segment.attachments.push(AttachmentIndex {
+                offset: at,
+                length: head.len() as u64 - at,
+                time: *time,
+                size: data.len() as u64,
+                name: name.clone(),
+                media_type: media_type.clone(),
+            });
+        }
+        segment.stats.metadata = segment.metadata.len() as u32;
+        segment.stats.attachments = segment.attachments.len() as u32;
+        segment.append(&[(&head, crc32fast::hash(&head))])?;
+        fs.sync_dir(dir).map_err(|e| Error::io("sync the folder", dir, e))?;
+        Ok(segment)
+    }
+
+    /// Bytes of the file so far.
+    pub(crate) const fn len(&self) -> u64 {
+        self.len
+    }
+
+    /// The file's present name.
+    pub(crate) fn part(&self) -> &Path {
+        &self.part
+    }
+
+    /// Log time of the first and the last message.
+    pub(crate) const fn times(&self) -> Option<(u64, u64)> {
+        self.stats.times
+    }
+
+    /// Appends chunks with their message indexes: all of them, or none.
+    ///
+    /// # Errors
+    /// As the file system says; the file is then as before the call if it could be cut back.
+    pub(crate) fn append_chunks(&mut self, chunks: &[Chunk]) -> Result<()> {
+        let mut at = self.len;
+        let mut entries = Vec::with_capacity(chunks.len());
+        let mut indexes = Vec::with_capacity(chunks.len());
+        for chunk in chunks {
+            let mut per_channel: BTreeMap<u16, Vec<(u64, u64)>> = BTreeMap::new();
+            for (channel, time, offset) in &chunk.messages {
+                per_channel.entry(*channel).or_default().push((*time, *offset));
+            }
+            let length = chunk.bytes().len() as u64;
+            let mut index = Vec::new();
+            let mut offsets = Vec::with_capacity(per_channel.len());
+            for (channel, times) in &per_channel {
+                offsets.push((*channel, at + length + index.len() as u64));
+                record::message_index(&mut index, *channel, times);
+            }
+            entries.push(ChunkIndex {
+                start_time: chunk.start_time,
+                end_time: chunk.end_time,
+                offset: at,
+                length,
+                message_indexes: offsets,
+                message_index_length: index.len() as u64,
+                compression: chunk.compression,
+                compressed_size: chunk.compressed_size,
+                uncompressed_size: chunk.uncompressed_size,
+            });
+            at += length + index.len() as u64;
+            indexes.push(index);
+        }
+        let mut parts: Vec<(&[u8], u32)> = Vec::with_capacity(2 * chunks.len());
+        for (chunk, index) in chunks.iter().zip(&indexes) {
+            parts.push((chunk.bytes(), chunk.crc));
+            parts.push((index, crc32fast::hash(index)));
+        }
+        self.append(&parts)?;
+        self.chunks.extend(entries);
+        for chunk in chunks {
+            self.stats.chunks += 1;
+            for (channel, time, _) in &chunk.messages {
+                *self.stats.messages.entry(*channel).or_default() += 1;
+                let (first, last) = self.stats.times.unwrap_or((*time, *time));
+                self.stats.times = Some((first.min(*time), last.max(*time)));
+            }
+        }
+        Ok(())
+    }
+
+    /// Appends metadata.
+    pub(crate) fn append_metadata(&mut self, name: &str, map: &BTreeMap<String, String>) -> Result<()> {
+        let mut bytes = Vec::new();
+        record::metadata(&mut bytes, name, map);
+        let at = self.len;
+        self.append(&[(&bytes, crc32fast::hash(&bytes))])?;
+        self.metadata.push((at, bytes.len() as u64, name.to_owned()));
+        self.stats.metadata += 1;
+        Ok(())
+    }
+
+    /// Makes what was appended durable.
+    pub(crate) fn sync(&mut self) -> Result<()> {
+        self.file.sync_data().map_err(|e| Error::io("sync", &self.part, e))
+    }
+
+    /// Writes index and footer, makes the file durable and gives it its final name.
+    pub(crate) fn finish(mut self, fs: &dyn Fs) -> Result<PathBuf> {
+        let tail = self.tail();
+        self.append(&[(&tail, 0)])?;
+        self.file.sync_all().map_err(|e| Error::io("sync", &self.part, e))?;
+        let Self { file, part, path, .. } = self;
+        drop(file);
+        fs.rename(&part, &path).map_err(|e| Error::io("rename", &part, e))?;
+        let dir = path.parent().unwrap_or(Path::new("."));
+        fs.sync_dir(dir).map_err(|e| Error::io("sync the folder", dir, e))?;
+        Ok(path)
+    }
+
+    /// Everything after the data: `DataEnd`, summary, summary offsets, footer, magic.
+    fn tail(&self) -> Vec<u8> {
+        let mut b = Vec::new();
+        record::data_end(&mut b, self.crc.clone().finalize());
+        let summary = b.len();
+        let base = self.len;
+        let mut groups: Vec<(u8, usize, usize)> = Vec::new();
+        let mut group = |b: &mut Vec<u8>, opcode: u8, fill: &dyn Fn(&mut Vec<u8>)| {
+            let start = b.len();
+            fill(b);
+            if b.len() > start {
+                groups.push((opcode, start, b.len() - start));
+            }
+        };
+        group(&mut b, op::SCHEMA, &|b| b.extend_from_slice(&self.schemas));
+        group(&mut b, op::CHANNEL, &|b| b.extend_from_slice(&self.channels));
+        group(&mut b, op::STATISTICS, &|b| record::statistics(b, &self.stats));
+        group(&mut b, op::CHUNK_INDEX, &|b| self.chunks.iter().for_each(|c| record::chunk_index(b, c)));
+        group(&mut b, op::ATTACHMENT_INDEX, &|b| {
+            self.attachments.iter().for_each(|a| record::attachment_index(b, a));
+        });
+        group(&mut b, op::METADATA_INDEX, &|b| {
+            self.metadata.iter().for_each(|(at, len, name)| record::metadata_index(b, *at, *len, name));
+        });
+        let offsets = b.len();
+        for (opcode, start, len) in groups {
+            record::summary_offset(&mut b, opcode, base + start as u64, len as u64);
+        }
+        // The CRC of the summary covers the footer up to the CRC itself.
+        b.push(op::FOOTER);
+        record::put_le!(b, 20u64, base + summary as u64, base + offsets as u64);
+        let crc = crc32fast::hash(&b[summary..]);
+        record::put_le!(b, crc);
+        b.extend_from_slice(&MAGIC);
+        b
+    }
+
+    /// Appends parts with their CRCs: all or, after cutting back, none.
+    fn append(&mut self, parts: &[(&[u8], u32)]) -> Result<()> {
+        if self.torn {
+            // An earlier cut failed; nothing may follow a torn record.
+            let cut = self.file.truncate(self.len);
+            cut.map_err(|e| Error::io("cut back", &self.part, e))?;
+            self.torn = false;
+        }
+        let mut len = self.len;
+        let mut crc = self.crc.clone();
+        for (bytes, part_crc) in parts {
+            if let Err(e) = fs::write_all(&mut *self.file, bytes) {
+                self.torn = self.file.truncate(self.len).is_err();
+                return Err(Error::io("write", &self.part, e));
+            }
+            len += bytes.len() as u64;
+            crc.combine(&crc32fast::Hasher::new_with_initial_len(*part_crc, bytes.len() as u64));
+        }
+        (self.len, self.crc) = (len, crc);
+        Ok(())
+    }
+}

@@ -1,0 +1,152 @@
+//! Reading a dataset: its session, its sets in order and in constant memory, and what is in it.
+
+use crate::container::scan::SegmentReader;
+use crate::fs::{Fs, RealFs};
+use crate::recorder::topics::SESSION_METADATA;
+use crate::{Error, ErrorKind, Result, SESSION_FILE, Session};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+mod decode;
+mod info;
+mod sets;
+
+pub(crate) use decode::decode_stored;
+pub use info::{DatasetInfo, SpreadStats, StreamInfo};
+pub use sets::{DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};
+pub(crate) use sets::{Kind, kinds};
+
+/// A dataset opened for reading: a folder, or one segment of one.
+#[derive(Debug, Clone)]
+pub struct Dataset {
+    fs: Arc<dyn Fs>,
+    path: PathBuf,
+    session: Session,
+    segments: Vec<PathBuf>,
+}
+
+impl Dataset {
+    /// Opens the dataset `path`, a folder or a single segment file.
+    ///
+    /// # Errors
+    /// [`ErrorKind::NotFound`], [`ErrorKind::NotADataset`], [`ErrorKind::Foreign`] for an MCAP file of
+    /// somebody else, [`ErrorKind::Version`] for a dataset of a later version.
+    pub fn open(path: &Path) -> Result<Self> {
+        Self::open_with(Arc::new(RealFs), path)
+    }
+
+    /// The same on another file system.
+    ///
+    /// # Errors
+    /// As [`Dataset::open`].
+    pub fn open_with(fs: Arc<dyn Fs>, path: &Path) -> Result<Self> {
+        let entries = match fs.read_dir(path) {
+            Ok(entries) => entries,
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound && fs.open(path).is_err() => {
+                return Err(Error::io("open", path, e));
+            }
+            // A file: one segment on its own.
+            Err(_) => {
+                let session = session_of(&*fs, path)?;
+                return Ok(Self { fs, path: path.to_owned(), session, segments: vec![path.to_owned()] });
+            }
+        };
+        let names = entries.into_iter().filter(|e| !e.is_dir).map(|e| e.name);
+        let (mut has_session, mut segments) = (false, Vec::new());
+        for name in names {
+            has_session |= name == SESSION_FILE;
+            if is_segment(&name) {
+                segments.push(path.join(name));
+            }
+        }
+        let session = match (has_session, segments.first()) {
+            (true, _) => Session::load(&*fs, path)?,
+            (false, Some(first)) => session_of(&*fs, first)?,
+            (false, None) => {
+                return Err(Error::new(
+                    ErrorKind::NotADataset,
+                    format!(
+                        "{} is no dataset: it holds neither {SESSION_FILE} nor seg_0000.mcap",
+                        path.display()
+                    ),
+                ));
+            }
+        };
+        Ok(Self { fs, path: path.to_owned(), session, segments })
+    }
+
+    /// What was recorded, by whom, with which rig.
+    pub const fn session(&self) -> &Session {
+        &self.session
+    }
+
+    /// The path it was opened by.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The segment files in order; one that ends in `.part` was not finished.
+    pub fn segments(&self) -> &[PathBuf] {
+        &self.segments
+    }
+
+    /// The sets within `range` in order, with decoded pixels.
+    pub fn sets(&self, range: SetRange) -> Sets {
+        Sets::new(self, range, PixelMode::Decoded)
+    }
+
+    /// The sets within `range` in order, pixels as `mode` says.
+    pub fn sets_with(&self, range: SetRange, mode: PixelMode) -> Sets {
+        Sets::new(self, range, mode)
+    }
+
+    /// Counts, rates, spread, drops. Reads no pictures, so it is fast on datasets of any length.
+    ///
+    /// # Errors
+    /// As reading the segments does.
+    pub fn info(&self) -> Result<DatasetInfo> {
+        info::gather(self)
+    }
+
+    pub(crate) fn open_segment(&self, index: usize) -> Option<Result<SegmentReader>> {
+        let path = self.segments.get(index)?;
+        Some(SegmentReader::open(&*self.fs, path).and_then(|r| ours(&r).map(|()| r)))
+    }
+}
+
+/// Whether a name in a dataset's folder is that of a segment.
+pub(crate) fn is_segment(name: &str) -> bool {
+    let stem = name.strip_suffix(".part").unwrap_or(name).strip_suffix(".mcap");
+    let digits = stem.and_then(|s| s.strip_prefix("seg_"));
+    digits.is_some_and(|d| d.len() >= 4 && d.bytes().all(|b| b.is_ascii_digit()))
+}
+
+/// Refuses MCAP files that depthrig did not write.
+fn ours(reader: &SegmentReader) -> Result<()> {
+    if reader.metadata(SESSION_METADATA).is_some() {
+        return Ok(());
+    }
+    if let (Some((offset, why)), true) = (&reader.cut, reader.metadata.is_empty()) {
+        return Err(Error::new(
+            ErrorKind::Truncated,
+            format!("{} was cut before its first set, at byte {offset}: {why}", reader.path.display()),
+        ));
+    }
+    Err(Error::new(
+        ErrorKind::Foreign,
+        format!(
+            "{} is an MCAP file, but not one of depthrig: it has no metadata record \"{SESSION_METADATA}\"; \
+             look at it with a general MCAP viewer",
+            reader.path.display()
+        ),
+    ))
+}
+
+/// The session as a segment tells it.
+fn session_of(fs: &dyn Fs, segment: &Path) -> Result<Session> {
+    let reader = SegmentReader::open(fs, segment)?;
+    ours(&reader)?;
+    let text = reader.metadata(SESSION_METADATA).and_then(|m| m.get("session_toml"));
+    let text = text.map(String::as_str).unwrap_or_default();
+    Session::from_toml(text, segment)
+}

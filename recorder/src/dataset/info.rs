@@ -1,0 +1,215 @@
+//! What is in a dataset, without reading a picture.
+
+use super::{Dataset, PixelMode, SetRange};
+use crate::msgs::accounts;
+use crate::msgs::schemas::Schema;
+use crate::{ErrorKind, Result, SetCounts, StreamAccount};
+use serde::Serialize;
+use std::path::PathBuf;
+
+/// What is in a dataset.
+#[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
+pub struct DatasetInfo {
+    /// Where it is.
+    pub path: PathBuf,
+    /// The session's name.
+    pub name: String,
+    /// The rig's name.
+    pub rig: String,
+    /// What was in front of the cameras.
+    pub scene: String,
+    /// Who recorded it.
+    pub operator: String,
+    /// When it began, UTC nanoseconds since 1970.
+    pub started_utc_ns: i64,
+    /// Time from the first set to the last, nanoseconds.
+    pub duration_ns: i64,
+    /// Sets in it.
+    pub sets: u64,
+    /// Sets that lack a frame of some stream.
+    pub incomplete_sets: u64,
+    /// Bytes of its segments.
+    pub bytes: u64,
+    /// Its segments.
+    pub segments: u32,
+    /// Segments that were not finished, by file name.
+    pub unfinished: Vec<String>,
+    /// What could not be read.
+    pub problems: Vec<String>,
+    /// Latest minus earliest capture time over the sets.
+    pub spread: SpreadStats,
+    /// Per stream.
+    pub streams: Vec<StreamInfo>,
+    /// The last account of the sets in the file.
+    pub set_counts: Option<SetCounts>,
+    /// The last account of each stream in the file.
+    pub accounts: Vec<StreamAccount>,
+}
+
+/// How far apart the frames of a set are, nanoseconds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct SpreadStats {
+    /// Half of the sets are within.
+    pub p50_ns: i64,
+    /// 95 % of the sets are within.
+    pub p95_ns: i64,
+    /// All sets are within.
+    pub max_ns: i64,
+}
+
+impl SpreadStats {
+    fn of(mut spreads: Vec<i64>) -> Self {
+        spreads.sort_unstable();
+        // Nearest rank: the smallest value that at least this share does not exceed.
+        let rank = |percent: usize| spreads.len().saturating_mul(percent).div_ceil(100).saturating_sub(1);
+        let at = |percent| spreads.get(rank(percent)).copied().unwrap_or(0);
+        Self { p50_ns: at(50), p95_ns: at(95), max_ns: at(100) }
+    }
+}
+
+/// One stream of a dataset.
+#[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
+pub struct StreamInfo {
+    /// `camera/stream`.
+    pub stream: String,
+    /// Camera model.
+    pub model: String,
+    /// Pixel format on the channel.
+    pub format: &'static str,
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// How pixels are stored; empty when there is no frame.
+    pub codec: &'static str,
+    /// Metres per unit of depth; 0 when it is no depth.
+    pub depth_unit_m: f64,
+    /// Frames in the dataset.
+    pub frames: u64,
+    /// Sets without a frame of this stream.
+    pub missing: u64,
+    /// Bytes of its pictures before the chunks are packed.
+    pub bytes: u64,
+    /// Bytes that its pixels have on the channel.
+    pub raw_bytes: u64,
+    /// Frames per second between its first and its last frame, by capture time.
+    pub rate_hz: f64,
+}
+
+pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
+    let session = dataset.session();
+    let mut info = DatasetInfo {
+        path: dataset.path().to_owned(),
+        name: session.name.clone(),
+        rig: session.rig.clone(),
+        scene: session.scene.clone(),
+        operator: session.operator.clone(),
+        started_utc_ns: session.started_utc_ns,
+        duration_ns: 0,
+        sets: 0,
+        incomplete_sets: 0,
+        bytes: 0,
+        segments: dataset.segments().len() as u32,
+        unfinished: Vec::new(),
+        problems: Vec::new(),
+        spread: SpreadStats::default(),
+        streams: Vec::new(),
+        set_counts: None,
+        accounts: Vec::new(),
+    };
+    for s in &session.streams {
+        info.streams.push(StreamInfo {
+            stream: s.id.to_string(),
+            model: s.model.clone(),
+            format: s.format.name(),
+            width: s.width,
+            height: s.height,
+            codec: "",
+            depth_unit_m: s.depth_unit_m,
+            frames: 0,
+            missing: 0,
+            bytes: 0,
+            raw_bytes: 0,
+            rate_hz: 0.0,
+        });
+    }
+    let mut spreads = Vec::new();
+    let mut ticks = None;
+    let mut captures = vec![None; info.streams.len()];
+    for set in dataset.sets_with(SetRange::ALL, PixelMode::None) {
+        let set = match set {
+            Ok(set) => set,
+            Err(e) if e.kind() == ErrorKind::Io => return Err(e),
+            Err(e) => {
+                info.problems.push(e.to_string());
+                continue;
+            }
+        };
+        info.sets += 1;
+        info.incomplete_sets += u64::from(!set.missing.is_empty());
+        spreads.push(set.spread_ns);
+        let (first, _) = ticks.unwrap_or((set.tick, set.tick));
+        ticks = Some((first, set.tick));
+        for s in set.missing {
+            info.streams[s].missing += 1;
+        }
+        for f in set.frames {
+            let s = &mut info.streams[f.stream];
+            s.frames += 1;
+            s.bytes += f.stored_bytes;
+            s.raw_bytes += u64::from(f.header.payload_len);
+            s.codec = f.codec;
+            let t = f.header.capture_time_ns;
+            let (first, _) = captures[f.stream].unwrap_or((t, t));
+            captures[f.stream] = Some((first, t));
+        }
+    }
+    for (s, times) in info.streams.iter_mut().zip(captures) {
+        let span = times.map_or(0, |(first, last)| last.saturating_sub(first));
+        if span > 0 {
+            s.rate_hz = (s.frames - 1) as f64 * 1e9 / span as f64;
+        }
+    }
+    info.spread = SpreadStats::of(spreads);
+    info.duration_ns = ticks.map_or(0, |(first, last)| last.since_ns(first));
+    for i in 0..dataset.segments().len() {
+        // What cannot be opened is among the problems already.
+        let Some(Ok(reader)) = dataset.open_segment(i) else { continue };
+        info.bytes += reader.size;
+        if !reader.finished {
+            let name = reader.path.file_name().map(|n| n.to_string_lossy().into_owned());
+            info.unfinished.extend(name);
+        }
+        let channel = reader.channels.iter().find(|(_, c)| c.schema == Schema::Accounts.name());
+        let Some((channel, _)) = channel else { continue };
+        let last = reader.chunks.iter().rev().find(|c| c.channels.contains(channel));
+        let Some(entry) = last else { continue };
+        let read = reader.messages(entry, |m| {
+            if m.channel == *channel {
+                let (sets, streams) = accounts::read(m.data)?;
+                (info.set_counts, info.accounts) = (Some(sets), streams);
+            }
+            Ok(())
+        });
+        if let Err(e) = read {
+            info.problems.push(e.to_string());
+        }
+    }
+    Ok(info)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn percentiles_are_nearest_rank() {
+        let s = SpreadStats::of((1..=100).rev().collect());
+        assert_eq!((s.p50_ns, s.p95_ns, s.max_ns), (50, 95, 100));
+        let s = SpreadStats::of(vec![7]);
+        assert_eq!((s.p50_ns, s.p95_ns, s.max_ns), (7, 7, 7));
+        assert_eq!(SpreadStats::of(Vec::new()), SpreadStats::default());
+    }
+}

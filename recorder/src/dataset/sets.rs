@@ -1,0 +1,300 @@
+//! The sets of a dataset one after the other.
+
+use super::{Dataset, decode};
+use crate::container::scan::{ChunkEntry, SegmentReader};
+use crate::encode::Codec;
+use crate::msgs::frame_info;
+use crate::msgs::frame_set::FrameSetMsg;
+use crate::msgs::schemas::Schema;
+use crate::{Error, ErrorKind, Result};
+use depthrig_bus::{FrameHeader, HostTime, StreamId};
+use std::collections::{BTreeMap, VecDeque};
+use std::ops::{Bound, RangeBounds};
+
+/// Which sets: by their log time, UTC nanoseconds since 1970, both ends included.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SetRange {
+    /// Not before.
+    pub from_utc_ns: i64,
+    /// Not after.
+    pub to_utc_ns: i64,
+}
+
+impl SetRange {
+    /// Every set.
+    pub const ALL: Self = Self { from_utc_ns: i64::MIN, to_utc_ns: i64::MAX };
+}
+
+impl Default for SetRange {
+    fn default() -> Self {
+        Self::ALL
+    }
+}
+
+impl<R: RangeBounds<i64>> From<R> for SetRange {
+    fn from(range: R) -> Self {
+        let from_utc_ns = match range.start_bound() {
+            Bound::Included(t) => *t,
+            Bound::Excluded(t) => t.saturating_add(1),
+            Bound::Unbounded => i64::MIN,
+        };
+        let to_utc_ns = match range.end_bound() {
+            Bound::Included(t) => *t,
+            Bound::Excluded(t) => t.saturating_sub(1),
+            Bound::Unbounded => i64::MAX,
+        };
+        Self { from_utc_ns, to_utc_ns }
+    }
+}
+
+/// What to do about pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PixelMode {
+    /// Deliver them as the camera's channel did.
+    Decoded,
+    /// Deliver what is stored: the JPEG, or the pixels of a picture stored losslessly.
+    Stored,
+    /// Deliver none; the pictures are not even read.
+    None,
+}
+
+/// A set read from a dataset.
+#[derive(Debug, Clone)]
+#[non_exhaustive]
+pub struct DatasetSet {
+    /// Its number.
+    pub id: u64,
+    /// The moment it stands for.
+    pub tick: HostTime,
+    /// Its log time: UTC of the tick, nanoseconds since 1970, strictly increasing over a dataset.
+    pub utc_ns: i64,
+    /// Added to a monotonic time of its headers this gives UTC.
+    pub utc_offset_ns: i64,
+    /// Latest minus earliest capture time, nanoseconds.
+    pub spread_ns: i64,
+    /// Its frames, in the order in which they were handed to the recorder.
+    pub frames: Vec<DatasetFrame>,
+    /// Indices of the streams without a frame.
+    pub missing: Vec<usize>,
+}
+
+/// A frame read from a dataset.
+#[derive(Debug, Clone)]
+#[non_exhaustive]
+pub struct DatasetFrame {
+    /// Index of its stream in `Session::streams`.
+    pub stream: usize,
+    /// The header as it was on the channel, bit by bit, with `set_id` filled in.
+    pub header: FrameHeader,
+    /// How the pixels are stored: `raw`, `jpeg` or `mjpeg`.
+    pub codec: &'static str,
+    /// Bytes of the stored message.
+    pub stored_bytes: u64,
+    /// The payload, as [`PixelMode`] says.
+    pub pixels: Vec<u8>,
+}
+
+/// Iterator over the sets of a dataset; it holds one set in memory.
+///
+/// A set that cannot be read is an error of its own and the next one follows. A file that was cut delivers
+/// what is whole, then the error.
+pub struct Sets {
+    dataset: Dataset,
+    range: SetRange,
+    mode: PixelMode,
+    next_segment: usize,
+    segment: Option<Open>,
+    ready: VecDeque<Result<DatasetSet>>,
+}
+
+/// A segment being read.
+struct Open {
+    reader: SegmentReader,
+    kinds: BTreeMap<u16, Kind>,
+    next_chunk: usize,
+    partial: Partial,
+}
+
+/// What a channel carries, of what sets are made of.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Kind {
+    Picture(StreamId),
+    Info(StreamId),
+    Set,
+}
+
+/// The messages since the last set's end.
+#[derive(Default)]
+struct Partial {
+    pictures: BTreeMap<StreamId, (u64, Vec<u8>)>,
+    infos: BTreeMap<StreamId, (u64, Vec<u8>)>,
+}
+
+impl Sets {
+    pub(super) fn new(dataset: &Dataset, range: SetRange, mode: PixelMode) -> Self {
+        Self { dataset: dataset.clone(), range, mode, next_segment: 0, segment: None, ready: VecDeque::new() }
+    }
+
+    /// Reads on until something is ready; `None` at the end.
+    fn advance(&mut self) -> Option<()> {
+        let Some(open) = &mut self.segment else {
+            let opened = self.dataset.open_segment(self.next_segment)?;
+            self.next_segment += 1;
+            match opened {
+                Ok(reader) => {
+                    let kinds = kinds(&reader);
+                    self.segment = Some(Open { reader, kinds, next_chunk: 0, partial: Partial::default() });
+                }
+                Err(e) => self.ready.push_back(Err(e)),
+            }
+            return Some(());
+        };
+        let Some(entry) = open.reader.chunks.get(open.next_chunk).cloned() else {
+            if let Some((offset, why)) = &open.reader.cut {
+                let what =
+                    format!("{why}; the sets before it are whole: run `depthrig recover` to mend the file");
+                self.ready.push_back(Err(open.reader.error(ErrorKind::Truncated, *offset, what)));
+            }
+            self.segment = None;
+            return Some(());
+        };
+        open.next_chunk += 1;
+        let outside = (entry.end_time as i64) < self.range.from_utc_ns
+            || (entry.start_time as i64) > self.range.to_utc_ns;
+        let wanted = |id: &u16| match open.kinds.get(id) {
+            Some(Kind::Picture(_)) => self.mode != PixelMode::None,
+            Some(_) => true,
+            None => false,
+        };
+        // A chunk without message indexes says nothing of its channels: look into it.
+        if outside || !(entry.channels.is_empty() || entry.channels.iter().any(wanted)) {
+            return Some(());
+        }
+        let read = open.read_chunk(&entry, self.mode, &self.dataset, self.range, &mut self.ready);
+        if let Err(e) = read {
+            self.ready.push_back(Err(e));
+        }
+        Some(())
+    }
+}
+
+impl Iterator for Sets {
+    type Item = Result<DatasetSet>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        while self.ready.is_empty() {
+            self.advance()?;
+        }
+        self.ready.pop_front()
+    }
+}
+
+impl Open {
+    fn read_chunk(
+        &mut self,
+        entry: &ChunkEntry,
+        mode: PixelMode,
+        dataset: &Dataset,
+        range: SetRange,
+        ready: &mut VecDeque<Result<DatasetSet>>,
+    ) -> Result<()> {
+        let Self { reader, kinds, partial, .. } = self;
+        reader.messages(entry, |m| {
+            match kinds.get(&m.channel) {
+                Some(Kind::Picture(id)) if mode != PixelMode::None => {
+                    partial.pictures.insert(id.clone(), (m.log_time, m.data.to_vec()));
+                }
+                Some(Kind::Info(id)) => {
+                    partial.infos.insert(id.clone(), (m.log_time, m.data.to_vec()));
+                }
+                Some(Kind::Set) => {
+                    let partial = std::mem::take(partial);
+                    let inside = (range.from_utc_ns..=range.to_utc_ns).contains(&(m.log_time as i64));
+                    if inside {
+                        ready.push_back(assemble(m.data, m.log_time, partial, mode, dataset).map_err(|e| {
+                            let what = format!("a set cannot be read: {e}");
+                            reader.error(e.kind(), entry.offset, what)
+                        }));
+                    }
+                }
+                _ => {}
+            }
+            Ok(())
+        })
+    }
+}
+
+/// Puts a set together from its commit mark and the messages before it.
+fn assemble(
+    message: &[u8],
+    log_time: u64,
+    mut partial: Partial,
+    mode: PixelMode,
+    dataset: &Dataset,
+) -> Result<DatasetSet> {
+    let set = FrameSetMsg::read(message)?;
+    let streams = &dataset.session().streams;
+    let index = |name: &str| {
+        streams.iter().position(|s| s.id.to_string() == name).ok_or_else(|| {
+            let what = format!("set {} has stream {name}, which the session does not", set.id);
+            Error::new(ErrorKind::Corrupt, what)
+        })
+    };
+    let lacks = |name: &str, what: &str| {
+        Error::new(ErrorKind::Corrupt, format!("set {} lacks the {what} of {name}", set.id))
+    };
+    let mut frames = Vec::with_capacity(set.members.len());
+    for member in &set.members {
+        let stream = index(&member.stream)?;
+        let id = &streams[stream].id;
+        let info = partial.infos.remove(id).filter(|(t, _)| *t == log_time);
+        let (_, info) = info.ok_or_else(|| lacks(&member.stream, "frame_info"))?;
+        let (header, extra) = frame_info::read(&info)?;
+        let codec = Codec::from_name(extra.codec).ok_or_else(|| {
+            let what = format!("{} is stored with codec \"{}\", unknown here", member.stream, extra.codec);
+            Error::new(ErrorKind::Version, what)
+        })?;
+        let pixels = if mode == PixelMode::None {
+            Vec::new()
+        } else {
+            let picture = partial.pictures.remove(id).filter(|(t, _)| *t == log_time);
+            let (_, picture) = picture.ok_or_else(|| lacks(&member.stream, "picture"))?;
+            if crc32fast::hash(&picture) != member.message_crc32 {
+                return Err(lacks(&member.stream, "right picture: another one is in its place, that"));
+            }
+            let stored = decode::stored(&picture, codec)?;
+            match mode {
+                PixelMode::Decoded => decode::decode(stored, codec, &header)?,
+                _ => stored.to_vec(),
+            }
+        };
+        let stored_bytes = member.message_bytes;
+        frames.push(DatasetFrame { stream, header, codec: codec.name(), stored_bytes, pixels });
+    }
+    Ok(DatasetSet {
+        id: set.id,
+        tick: HostTime::from_ns(set.tick_ns),
+        utc_ns: log_time as i64,
+        utc_offset_ns: set.utc_offset_ns,
+        spread_ns: set.spread_ns,
+        frames,
+        missing: set.missing.iter().map(|name| index(name)).collect::<Result<_>>()?,
+    })
+}
+
+/// What the channels of a segment carry, by type and by the `stream` in their metadata.
+pub(crate) fn kinds(reader: &SegmentReader) -> BTreeMap<u16, Kind> {
+    let mut kinds = BTreeMap::new();
+    for (id, channel) in &reader.channels {
+        let stream = channel.metadata.get("stream").and_then(|s| s.parse().ok());
+        let is = |s: Schema| channel.schema == s.name();
+        let kind = match stream {
+            Some(stream) if is(Schema::Image) || is(Schema::CompressedImage) => Kind::Picture(stream),
+            Some(stream) if is(Schema::FrameInfo) => Kind::Info(stream),
+            _ if is(Schema::FrameSet) => Kind::Set,
+            _ => continue,
+        };
+        kinds.insert(*id, kind);
+    }
+    kinds
+}

@@ -1,0 +1,98 @@
+//! The error of the recorder: a kind to match on, what happened to which file, and what to do about it.
+
+use core::fmt;
+use std::io;
+use std::path::Path;
+
+/// What went wrong, for callers that decide on it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+#[non_exhaustive]
+pub enum ErrorKind {
+    /// The folder already holds a dataset or other files.
+    AlreadyExists,
+    /// The path does not exist.
+    NotFound,
+    /// The path is no dataset of depthrig.
+    NotADataset,
+    /// An MCAP file that depthrig did not write.
+    Foreign,
+    /// The file ends in the middle: it was cut, or its writer was killed.
+    Truncated,
+    /// A checksum or an index does not agree with the data.
+    Corrupt,
+    /// The dataset was written by a later version.
+    Version,
+    /// The disk is full.
+    DiskFull,
+    /// The folder cannot be written by this user, or its file system is read-only.
+    PermissionDenied,
+    /// What the caller handed over cannot be recorded as it is.
+    BadInput,
+    /// Pixels could not be encoded or decoded.
+    Codec,
+    /// The operating system refused for another reason.
+    Io,
+}
+
+/// An error of the recorder.
+#[derive(Debug)]
+pub struct Error {
+    kind: ErrorKind,
+    message: String,
+    source: Option<Box<dyn std::error::Error + Send + Sync>>,
+}
+
+/// The result of a recorder call.
+pub type Result<T, E = Error> = core::result::Result<T, E>;
+
+impl Error {
+    /// An error of `kind` whose message says what happened, to what, and what to do.
+    pub fn new(kind: ErrorKind, message: impl Into<String>) -> Self {
+        Self { kind, message: message.into(), source: None }
+    }
+
+    /// The same error with the error that caused it.
+    pub fn with_source(mut self, source: impl std::error::Error + Send + Sync + 'static) -> Self {
+        self.source = Some(Box::new(source));
+        self
+    }
+
+    /// A failed operation on `path`; `what` reads as in "cannot {what} {path}".
+    pub(crate) fn io(what: &str, path: &Path, e: io::Error) -> Self {
+        let (kind, advice) = match e.kind() {
+            io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
+                (ErrorKind::DiskFull, ": the disk is full; free some space or record to another disk")
+            }
+            io::ErrorKind::PermissionDenied => {
+                (ErrorKind::PermissionDenied, ": permission denied; choose a folder that this user may write")
+            }
+            io::ErrorKind::ReadOnlyFilesystem => {
+                (ErrorKind::PermissionDenied, ": the file system is read-only; choose another folder")
+            }
+            io::ErrorKind::NotFound => (ErrorKind::NotFound, ": it does not exist"),
+            io::ErrorKind::AlreadyExists => (ErrorKind::AlreadyExists, ": it exists already"),
+            io::ErrorKind::UnexpectedEof => (ErrorKind::Truncated, ": it ends too early"),
+            _ => (ErrorKind::Io, ""),
+        };
+        let detail = if advice.is_empty() { format!(": {e}") } else { advice.to_owned() };
+        Self::new(kind, format!("cannot {what} {}{detail}", path.display())).with_source(e)
+    }
+
+    /// What went wrong, for callers that decide on it.
+    pub const fn kind(&self) -> ErrorKind {
+        self.kind
+    }
+}
+
+impl fmt::Display for Error {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.message)
+    }
+}
+
+impl std::error::Error for Error {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        self.source.as_deref().map(|s| s as _)
+    }
+}

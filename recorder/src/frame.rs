@@ -1,0 +1,104 @@
+//! What is handed to the recorder: a set of frames whose pixels still lie in shared memory.
+
+use depthrig_bus::{FrameHeader, HostTime, UtcPair};
+
+/// The pixels of a frame, wherever they lie. The recorder drops the box as soon as it has encoded them.
+pub trait Pixels: Send {
+    /// The payload: at least `FrameHeader::payload_len` bytes.
+    fn bytes(&self) -> &[u8];
+}
+
+impl Pixels for Vec<u8> {
+    fn bytes(&self) -> &[u8] {
+        self
+    }
+}
+
+impl Pixels for std::sync::Arc<[u8]> {
+    fn bytes(&self) -> &[u8] {
+        self
+    }
+}
+
+/// One frame of a set.
+pub struct RecordFrame {
+    /// Index of the stream in `Session::streams`.
+    pub stream: usize,
+    /// Its header; `set_id` is filled in by the recorder.
+    pub header: FrameHeader,
+    /// Its pixels.
+    pub pixels: Box<dyn Pixels>,
+}
+
+/// One set: at most one frame of each stream, all of about the same moment.
+pub struct RecordSet {
+    /// Number of the set; each is greater than the one before.
+    pub id: u64,
+    /// The moment the set stands for.
+    pub tick: HostTime,
+    /// A recent reading of both clocks. The first set's reading places the whole recording in UTC, so that a
+    /// step of the wall clock never makes recorded times jump; the later ones are stored as they are.
+    pub utc: UtcPair,
+    /// The frames.
+    pub frames: Vec<RecordFrame>,
+    /// Indices of the streams that have no frame in this set.
+    pub missing: Vec<usize>,
+    /// Latest minus earliest capture time, nanoseconds.
+    pub spread_ns: i64,
+}
+
+/// Why a whole set was not recorded. The discriminant is the index into `SetCounts::dropped` and part of
+/// the file format.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+#[repr(usize)]
+#[non_exhaustive]
+pub enum SetDrop {
+    /// As many sets as allowed wait to be encoded: too little CPU for this rate.
+    EncoderBusy = 0,
+    /// As many encoded bytes as allowed wait to be written: the disk is too slow.
+    DiskSlow = 1,
+    /// The recording had ended after a failed write or for want of disk space.
+    WriteFailed = 2,
+    /// A picture of the set could not be encoded.
+    EncodeFailed = 3,
+    /// The set contradicts itself or the session: unknown stream, wrong size, id not greater than the last.
+    BadSet = 4,
+    /// The recorder was being closed.
+    Ended = 5,
+}
+
+impl SetDrop {
+    /// Every reason, in the order of the file format.
+    pub const ALL: [Self; 6] =
+        [Self::EncoderBusy, Self::DiskSlow, Self::WriteFailed, Self::EncodeFailed, Self::BadSet, Self::Ended];
+
+    /// The name used in reports, metrics and JSON.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::EncoderBusy => "encoder_busy",
+            Self::DiskSlow => "disk_slow",
+            Self::WriteFailed => "write_failed",
+            Self::EncodeFailed => "encode_failed",
+            Self::BadSet => "bad_set",
+            Self::Ended => "ended",
+        }
+    }
+}
+
+/// A set that was refused; it is counted already.
+#[derive(Debug)]
+pub struct PushError {
+    /// Why.
+    pub reason: SetDrop,
+    /// The same in words, with the numbers.
+    pub message: String,
+}
+
+impl core::fmt::Display for PushError {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str(&self.message)
+    }
+}
+
+impl std::error::Error for PushError {}

@@ -1,0 +1,116 @@
+//! `sensor_msgs` images and camera information.
+
+use crate::cdr::{Reader, Writer};
+use crate::{Error, ErrorKind, Result};
+use depthrig_bus::{Distortion, FrameHeader, PixelFormat};
+
+/// The `encoding` of `sensor_msgs/msg/Image` for a format; `None` for pictures that are stored compressed.
+pub(crate) const fn encoding(format: PixelFormat) -> Option<&'static str> {
+    Some(match format {
+        PixelFormat::Rgb8 => "rgb8",
+        PixelFormat::Bgr8 => "bgr8",
+        PixelFormat::Mono8 | PixelFormat::Confidence8 => "mono8",
+        PixelFormat::Mono16 => "mono16",
+        PixelFormat::Z16 => "16UC1",
+        PixelFormat::DepthF32 => "32FC1",
+        PixelFormat::Yuyv => "yuv422_yuy2",
+        PixelFormat::Uyvy => "yuv422",
+        PixelFormat::Nv12 => "nv12",
+        _ => return None,
+    })
+}
+
+pub(crate) fn write_image(
+    buf: &mut Vec<u8>,
+    stamp_utc_ns: i64,
+    frame_id: &str,
+    h: &FrameHeader,
+    encoding: &str,
+    pixels: &[u8],
+) {
+    buf.reserve(pixels.len() + 128);
+    let mut w = Writer::new(buf);
+    w.header(stamp_utc_ns, frame_id).u32(h.height).u32(h.width).str(encoding).u8(0).u32(h.stride);
+    w.bytes(pixels);
+}
+
+/// The pixels of an `Image` or the picture file in a `CompressedImage`.
+pub(crate) fn read_data(message: &[u8], compressed: bool) -> Result<&[u8]> {
+    let mut r = Reader::new(message)?;
+    r.time()?;
+    r.str()?;
+    if compressed {
+        r.str()?;
+    } else {
+        r.u32()?;
+        r.u32()?;
+        r.str()?;
+        r.u8()?;
+        r.u32()?;
+    }
+    r.bytes()
+}
+
+/// Appends a `CompressedImage` whose JPEG `fill` writes; returns the JPEG's length.
+pub(crate) fn write_compressed(
+    buf: &mut Vec<u8>,
+    stamp_utc_ns: i64,
+    frame_id: &str,
+    fill: impl FnOnce(&mut Vec<u8>) -> Result<()>,
+) -> Result<usize> {
+    Writer::new(buf).header(stamp_utc_ns, frame_id).str("jpeg").bytes_with(fill)
+}
+
+pub(crate) fn write_camera_info(buf: &mut Vec<u8>, stamp_utc_ns: i64, frame_id: &str, h: &FrameHeader) {
+    let i = &h.intrinsics;
+    let (model, n) = match i.distortion() {
+        Distortion::Unknown => ("", 0),
+        Distortion::KannalaBrandt4 => ("equidistant", 4),
+        Distortion::Rational => ("rational_polynomial", 8),
+        // No viewer knows the inverse model; where it distorts nothing it is the plain one.
+        Distortion::InverseBrownConrady if i.coeffs.iter().any(|c| *c != 0.0) => ("inverse_brown_conrady", 5),
+        _ => ("plumb_bob", 5),
+    };
+    let mut w = Writer::new(buf);
+    w.header(stamp_utc_ns, frame_id).u32(h.height).u32(h.width).str(model).u32(n as u32);
+    w.f64s(&i.coeffs[..n]);
+    let one = f64::from(u8::from(i.is_known()));
+    w.f64s(&[i.fx, 0.0, i.cx, 0.0, i.fy, i.cy, 0.0, 0.0, one]);
+    w.f64s(&[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
+    w.f64s(&[i.fx, 0.0, i.cx, 0.0, 0.0, i.fy, i.cy, 0.0, 0.0, 0.0, one, 0.0]);
+    w.u32(0).u32(0);
+    w.u32(0).u32(0).u32(0).u32(0).u8(0);
+}
+
+/// What is wrong with a picture of `len` bytes under this header, if anything.
+pub(crate) fn check_picture(h: &FrameHeader, len: usize) -> Result<PixelFormat> {
+    let bad = |why: String| {
+        Err(Error::new(
+            ErrorKind::BadInput,
+            format!("frame {} of {}/{} cannot be recorded: {why}", h.sequence, h.camera(), h.stream()),
+        ))
+    };
+    let Some(format) = h.pixel_format() else {
+        return bad(format!("pixel format code {} is unknown", h.format));
+    };
+    if len < h.payload_len as usize {
+        return bad(format!("its header promises {} bytes, {len} are there", h.payload_len));
+    }
+    if format == PixelFormat::Mjpeg {
+        return if h.payload_len == 0 { bad("it is empty".into()) } else { Ok(format) };
+    }
+    let row = u64::from(format.row_bytes(1)) * u64::from(h.width);
+    let rows = u64::from(h.height) + if format == PixelFormat::Nv12 { u64::from(h.height) / 2 } else { 0 };
+    let whole = u64::from(h.stride) * rows;
+    if h.width == 0 || h.height == 0 || u64::from(h.stride) < row || u64::from(h.payload_len) != whole {
+        return bad(format!(
+            "{}x{} {} with {} bytes per row takes {whole} bytes, its header says {}",
+            h.width,
+            h.height,
+            format.name(),
+            h.stride,
+            h.payload_len
+        ));
+    }
+    Ok(format)
+}

@@ -1,0 +1,253 @@
+//! The schema texts, in the `ros2msg` form: the definition, then each definition it uses after a `====` line.
+//! The standard ones follow `common_interfaces` and `rcl_interfaces` (Apache-2.0), without their comments.
+
+use depthrig_bus::{DropReason, FIELDS};
+use std::borrow::Cow;
+use std::fmt::Write;
+
+/// A message type of the file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Schema {
+    Image,
+    CompressedImage,
+    CameraInfo,
+    TfMessage,
+    DiagnosticArray,
+    Log,
+    FrameInfo,
+    FrameSet,
+    ClockPair,
+    Accounts,
+}
+
+impl Schema {
+    pub(crate) const ALL: [Self; 10] = [
+        Self::Image,
+        Self::CompressedImage,
+        Self::CameraInfo,
+        Self::TfMessage,
+        Self::DiagnosticArray,
+        Self::Log,
+        Self::FrameInfo,
+        Self::FrameSet,
+        Self::ClockPair,
+        Self::Accounts,
+    ];
+
+    /// The id of the schema record: 1, 2, … in the order of [`Self::ALL`].
+    pub(crate) const fn id(self) -> u16 {
+        self as u16 + 1
+    }
+
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Image => "sensor_msgs/msg/Image",
+            Self::CompressedImage => "sensor_msgs/msg/CompressedImage",
+            Self::CameraInfo => "sensor_msgs/msg/CameraInfo",
+            Self::TfMessage => "tf2_msgs/msg/TFMessage",
+            Self::DiagnosticArray => "diagnostic_msgs/msg/DiagnosticArray",
+            Self::Log => "rcl_interfaces/msg/Log",
+            Self::FrameInfo => "depthrig_msgs/msg/FrameInfo",
+            Self::FrameSet => "depthrig_msgs/msg/FrameSet",
+            Self::ClockPair => "depthrig_msgs/msg/ClockPair",
+            Self::Accounts => "depthrig_msgs/msg/Accounts",
+        }
+    }
+
+    /// The text of the definition with all that it uses.
+    pub(crate) fn text(self) -> String {
+        match self {
+            Self::Image => with(IMAGE, &[HEADER_DEP, TIME_DEP]),
+            Self::CompressedImage => with(COMPRESSED_IMAGE, &[HEADER_DEP, TIME_DEP]),
+            Self::CameraInfo => with(CAMERA_INFO, &[HEADER_DEP, TIME_DEP, ROI_DEP]),
+            Self::TfMessage => with(
+                "geometry_msgs/TransformStamped[] transforms\n",
+                &[TRANSFORM_STAMPED_DEP, HEADER_DEP, TIME_DEP, TRANSFORM_DEP, VECTOR3_DEP, QUATERNION_DEP],
+            ),
+            Self::DiagnosticArray => with(
+                "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status\n",
+                &[HEADER_DEP, TIME_DEP, STATUS_DEP, KEY_VALUE_DEP],
+            ),
+            Self::Log => with(LOG, &[TIME_DEP]),
+            Self::FrameInfo => with(&frame_info(), &[TIME_DEP]),
+            Self::FrameSet => with(FRAME_SET, &[TIME_DEP, MEMBER_DEP]),
+            Self::ClockPair => with(CLOCK_PAIR, &[TIME_DEP]),
+            Self::Accounts => with(&accounts(), &[TIME_DEP, STREAM_ACCOUNT_DEP]),
+        }
+    }
+}
+
+/// A definition that others use: its name and its text.
+type Dep = (&'static str, &'static str);
+
+fn with(text: &str, deps: &[Dep]) -> String {
+    let rule = "=".repeat(80);
+    let mut all = text.to_owned();
+    for (name, text) in deps {
+        let _ = write!(all, "{rule}\nMSG: {name}\n{text}");
+    }
+    all
+}
+
+const TIME_DEP: Dep = ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n");
+const HEADER_DEP: Dep = ("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n");
+const ROI_DEP: Dep = (
+    "sensor_msgs/RegionOfInterest",
+    "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify\n",
+);
+const VECTOR3_DEP: Dep = ("geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z\n");
+const QUATERNION_DEP: Dep =
+    ("geometry_msgs/Quaternion", "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n");
+const TRANSFORM_DEP: Dep =
+    ("geometry_msgs/Transform", "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n");
+const TRANSFORM_STAMPED_DEP: Dep = (
+    "geometry_msgs/TransformStamped",
+    "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n",
+);
+const KEY_VALUE_DEP: Dep = ("diagnostic_msgs/KeyValue", "string key\nstring value\n");
+const STATUS_DEP: Dep = (
+    "diagnostic_msgs/DiagnosticStatus",
+    "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\n\
+     byte level\nstring name\nstring message\nstring hardware_id\ndiagnostic_msgs/KeyValue[] values\n",
+);
+
+const IMAGE: &str = "\
+std_msgs/Header header
+uint32 height
+uint32 width
+string encoding
+uint8 is_bigendian
+uint32 step
+uint8[] data
+";
+
+const COMPRESSED_IMAGE: &str = "\
+std_msgs/Header header
+string format
+uint8[] data
+";
+
+const CAMERA_INFO: &str = "\
+std_msgs/Header header
+uint32 height
+uint32 width
+string distortion_model
+float64[] d
+float64[9] k
+float64[9] r
+float64[12] p
+uint32 binning_x
+uint32 binning_y
+sensor_msgs/RegionOfInterest roi
+";
+
+const LOG: &str = "\
+byte DEBUG=10
+byte INFO=20
+byte WARN=30
+byte ERROR=40
+byte FATAL=50
+builtin_interfaces/Time stamp
+uint8 level
+string name
+string msg
+string file
+string function
+uint32 line
+";
+
+const FRAME_SET: &str = "\
+# The last message of a set: a set without it was not recorded whole and does not count.
+# The tick on the host's CLOCK_MONOTONIC, as UTC.
+builtin_interfaces/Time stamp
+uint64 id
+int64 tick_ns
+# stamp - tick, nanoseconds: what was added to every monotonic time of this set.
+int64 utc_offset_ns
+# Latest minus earliest capture time among the members, nanoseconds.
+int64 spread_ns
+# Sets handed to the recorder so far, this one included: offered = recorded + sum(dropped).
+uint64 sets_offered
+depthrig_msgs/FrameMember[] members
+# Streams (camera/stream) that have no frame in this set.
+string[] missing
+";
+
+const MEMBER_DEP: Dep = (
+    "depthrig_msgs/FrameMember",
+    "# camera/stream\nstring stream\nuint64 sequence\nint64 capture_time_ns\n\
+     # Size and CRC-32 of the image message of this member.\nuint64 message_bytes\nuint32 message_crc32\n",
+);
+
+const CLOCK_PAIR: &str = "\
+# One reading of both clocks of the host, about once a second.
+builtin_interfaces/Time stamp
+int64 monotonic_ns
+int64 utc_ns
+# The two were read within this, nanoseconds.
+int64 width_ns
+";
+
+const STREAM_ACCOUNT_DEP: Dep = (
+    "depthrig_msgs/StreamAccount",
+    "# captured = delivered + sum(dropped) since the stream began; dropped by reason as in FrameInfo.\n\
+     string stream\nuint64 captured\nuint64 delivered\nuint64[8] dropped\n",
+);
+
+/// The definition of `FrameInfo`, made from the layout of the header so that the two cannot differ.
+fn frame_info() -> String {
+    let mut text = "# Every field of depthrig's frame header, bit by bit, in its order.\n".to_owned();
+    let reasons: Vec<_> = DropReason::ALL.iter().map(|r| r.name()).collect();
+    let _ = writeln!(text, "# dropped[i]: {}.", reasons.join(", "));
+    for f in FIELDS {
+        let kind: Cow<str> = match f.kind {
+            "f32" => "float32".into(),
+            "f64" => "float64".into(),
+            "i64" => "int64".into(),
+            unsigned => unsigned.replace('u', "uint").into(),
+        };
+        let array = if f.count > 1 { format!("[{}]", f.count) } else { String::new() };
+        let _ = writeln!(text, "{kind}{array} {}", f.name.replace('.', "_"));
+    }
+    text.push_str(
+        "# Capture time as UTC, and the name of the optical frame.\nbuiltin_interfaces/Time stamp\n\
+         string frame_id\n# How the pixels are stored: raw, jpeg or mjpeg.\nstring codec\n",
+    );
+    text
+}
+
+fn accounts() -> String {
+    let reasons: Vec<_> = crate::SetDrop::ALL.iter().map(|r| r.name()).collect();
+    format!(
+        "# Cumulated numbers, about once a second and at the end of each segment.\n\
+         builtin_interfaces/Time stamp\n\
+         # sets_offered = sets_recorded + sum(sets_dropped); sets_dropped[i]: {}.\n\
+         uint64 sets_offered\nuint64 sets_recorded\nuint64[{}] sets_dropped\n\
+         depthrig_msgs/StreamAccount[] streams\n",
+        reasons.join(", "),
+        reasons.len()
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_type_in_a_definition_is_defined_in_it() {
+        for schema in Schema::ALL {
+            let text = schema.text();
+            for line in text.lines().filter(|l| l.contains('/') && !l.starts_with(['#', 'M'])) {
+                let used = line.split([' ', '[']).next().unwrap();
+                assert!(text.contains(&format!("MSG: {used}\n")), "{}: {used} is missing", schema.name());
+            }
+        }
+    }
+
+    #[test]
+    fn ids_are_the_places_in_the_list() {
+        for (i, s) in Schema::ALL.into_iter().enumerate() {
+            assert_eq!(s.id() as usize, i + 1);
+        }
+    }
+}

@@ -1,0 +1,71 @@
+//! How a dataset is written.
+
+use serde::{Deserialize, Serialize};
+
+/// How colour pictures are stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ColorCodec {
+    /// JPEG 4:4:4 of `RecorderOptions::jpeg_quality`.
+    #[default]
+    Jpeg,
+    /// Every bit, as `rgb8`.
+    Raw,
+}
+
+/// How pictures that are not JPEG are packed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Compression {
+    /// Zstandard at level 1: lossless, about a quarter of the size for depth.
+    #[default]
+    Zstd1,
+    /// Not at all.
+    None,
+}
+
+/// How a dataset is written.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct RecorderOptions {
+    /// JPEG quality, 1 to 100.
+    pub jpeg_quality: u8,
+    /// How RGB and BGR pictures are stored; all others are stored losslessly.
+    pub color: ColorCodec,
+    /// How losslessly stored pictures are packed.
+    pub compression: Compression,
+    /// A segment is closed before the set that would begin beyond this size, bytes.
+    pub segment_max_bytes: u64,
+    /// A segment is closed before the set that begins this long after its first one, nanoseconds.
+    pub segment_max_ns: i64,
+    /// Threads that encode.
+    pub workers: usize,
+    /// Sets that may wait to be encoded; their samples in shared memory stay in use meanwhile.
+    pub queue_sets: usize,
+    /// Encoded bytes that may wait to be written: 256 MiB carry seven cameras over a disk that stalls for 5 s.
+    pub backlog_max_bytes: u64,
+    /// How often the file is made durable, nanoseconds: what a power cut can take.
+    pub sync_interval_ns: i64,
+    /// The recording ends cleanly when the disk has less than this left, bytes.
+    pub min_free_bytes: u64,
+    /// Size of a file that is deleted to make room for the index when the disk is full nevertheless, bytes.
+    pub reserve_bytes: u64,
+}
+
+impl Default for RecorderOptions {
+    fn default() -> Self {
+        Self {
+            jpeg_quality: 95,
+            color: ColorCodec::Jpeg,
+            compression: Compression::Zstd1,
+            segment_max_bytes: 1 << 30,
+            segment_max_ns: 60_000_000_000,
+            workers: std::thread::available_parallelism().map_or(2, |n| n.get().clamp(1, 4)),
+            queue_sets: 4,
+            backlog_max_bytes: 256 << 20,
+            sync_interval_ns: 1_000_000_000,
+            min_free_bytes: 256 << 20,
+            reserve_bytes: 2 << 20,
+        }
+    }
+}

@@ -1,0 +1,424 @@
+//! Writing a dataset while cameras run.
+//!
+//! Invariants: [`Recorder::push`] does a bounded amount of work and never waits for the disk or an encoder;
+//! `offered = recorded + Σ dropped(reason)` once nothing is in flight; sets reach the file in the order in
+//! which they were pushed; the file is touched by the writer thread alone.
+
+use crate::frame::{PushError, RecordSet, SetDrop};
+use crate::fs::{self, Fs};
+use crate::msgs::{Diagnostic, SetCounts, StreamAccount};
+use crate::{Error, ErrorKind, RecorderOptions, Result, Session};
+use crossbeam::channel::{Sender, bounded};
+use depthrig_bus::{HostTime, UtcPair};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+
+mod ticket;
+pub(crate) mod topics;
+mod worker;
+mod writer;
+
+use ticket::{Job, Load, Ticket};
+use topics::Topics;
+use writer::Writer;
+
+/// The file whose space is given up for the index when the disk is full.
+const RESERVE_FILE: &str = ".reserve";
+/// Encoded sets that may wait to be written, beside the limit on their bytes.
+const BACKLOG_MAX_SETS: usize = 4096;
+/// Notes that may wait for the writer.
+const NOTES_MAX: usize = 256;
+
+/// A dataset being recorded. Threads end with [`Recorder::finish`]; dropping it without that leaves the last
+/// segment as `.part`, as a crash would.
+pub struct Recorder {
+    shared: Arc<Shared>,
+    threads: Vec<JoinHandle<()>>,
+    writer: Option<JoinHandle<Summary>>,
+}
+
+/// What the threads share.
+struct Shared {
+    fs: Arc<dyn Fs>,
+    dir: PathBuf,
+    options: RecorderOptions,
+    topics: Topics,
+    state: Mutex<State>,
+    load: Arc<Load>,
+    /// The writer leaves the segment unfinished.
+    abandoned: AtomicBool,
+}
+
+struct State {
+    counts: SetCounts,
+    frames: u64,
+    bytes: u64,
+    segments: u32,
+    last_id: Option<u64>,
+    /// Places the recording in UTC.
+    anchor: Option<UtcPair>,
+    last_log_time: i64,
+    first_tick: Option<HostTime>,
+    last_tick: Option<HostTime>,
+    /// Why no more sets are taken.
+    ended: Option<SetDrop>,
+    error: Option<Arc<Error>>,
+    session: Session,
+    session_changed: bool,
+    pending_notes: Vec<crate::Note>,
+    accounts: Vec<StreamAccount>,
+    diagnostics: Option<Vec<Diagnostic>>,
+    tickets: Option<Sender<Arc<Ticket>>>,
+    jobs: Option<Sender<Job>>,
+}
+
+/// How a recording stands.
+#[derive(Debug, Clone, serde::Serialize)]
+#[non_exhaustive]
+pub struct Progress {
+    /// Sets offered, recorded and dropped by reason; the difference is in flight.
+    pub sets: SetCounts,
+    /// Frames written.
+    pub frames: u64,
+    /// Bytes written.
+    pub bytes: u64,
+    /// Segments begun.
+    pub segments: u32,
+    /// Sets that wait to be encoded.
+    pub encode_queue: usize,
+    /// Encoded bytes that wait to be written.
+    pub backlog_bytes: u64,
+    /// Time from the first set to the last, nanoseconds.
+    pub duration_ns: i64,
+    /// Why the recording ended before its time, if it did.
+    #[serde(serialize_with = "as_text")]
+    pub error: Option<Arc<Error>>,
+}
+
+#[allow(clippy::ref_option)] // the signature that serde asks for
+fn as_text<S: serde::Serializer>(e: &Option<Arc<Error>>, s: S) -> Result<S::Ok, S::Error> {
+    match e {
+        Some(e) => s.serialize_some(&e.to_string()),
+        None => s.serialize_none(),
+    }
+}
+
+/// What a finished recording holds.
+#[derive(Debug, Clone, serde::Serialize)]
+#[non_exhaustive]
+pub struct Summary {
+    /// The dataset's folder.
+    pub path: PathBuf,
+    /// Sets offered, recorded and dropped by reason.
+    pub sets: SetCounts,
+    /// Frames in the dataset.
+    pub frames: u64,
+    /// Bytes of its segments.
+    pub bytes: u64,
+    /// Its segments.
+    pub segments: u32,
+    /// Time from the first set to the last, nanoseconds.
+    pub duration_ns: i64,
+    /// Whether every set handed over is there and every segment is whole.
+    pub complete: bool,
+    /// What was lost, in words; empty when `complete`.
+    pub lost: Vec<String>,
+}
+
+impl Recorder {
+    /// Creates the dataset `dir` and starts to record into it.
+    ///
+    /// # Errors
+    /// [`ErrorKind::AlreadyExists`] when `dir` holds anything, [`ErrorKind::PermissionDenied`] or
+    /// [`ErrorKind::DiskFull`] when it cannot take a dataset, [`ErrorKind::BadInput`] when the session names
+    /// no rig or no streams, [`ErrorKind::Io`] otherwise.
+    pub fn create(fs: Arc<dyn Fs>, dir: &Path, session: Session, options: RecorderOptions) -> Result<Self> {
+        session.check()?;
+        let topics = Topics::new(&session, &options);
+        prepare_folder(&*fs, dir, &options)?;
+        let made = make_reserve(&*fs, dir, options.reserve_bytes)
+            .and_then(|()| session.save(&*fs, dir))
+            .and_then(|()| {
+                let preamble = topics.preamble(&session, 0)?;
+                crate::container::segment::Segment::create(&*fs, dir, 0, &preamble)
+            });
+        let segment = made.inspect_err(|_| {
+            // Leave nothing behind that would make the next try say "there is a dataset already".
+            for name in [RESERVE_FILE, crate::SESSION_FILE, "session.tmp", "seg_0000.mcap.part"] {
+                let _ = fs.remove_file(&dir.join(name));
+            }
+        })?;
+
+        let workers = options.workers.max(1);
+        let queue_sets = options.queue_sets.max(1);
+        let (jobs, job_queue) = bounded(queue_sets * session.streams.len());
+        let (tickets, ticket_queue) = bounded(queue_sets + BACKLOG_MAX_SETS);
+        let shared = Arc::new(Shared {
+            fs,
+            dir: dir.to_owned(),
+            options,
+            topics,
+            state: Mutex::new(State {
+                counts: SetCounts::default(),
+                frames: 0,
+                bytes: 0,
+                segments: 1,
+                last_id: None,
+                anchor: None,
+                last_log_time: i64::MIN,
+                first_tick: None,
+                last_tick: None,
+                ended: None,
+                error: None,
+                session,
+                session_changed: false,
+                pending_notes: Vec::new(),
+                accounts: Vec::new(),
+                diagnostics: None,
+                tickets: Some(tickets),
+                jobs: Some(jobs),
+            }),
+            load: Arc::default(),
+            abandoned: AtomicBool::new(false),
+        });
+        let mut recorder = Self { shared: Arc::clone(&shared), threads: Vec::new(), writer: None };
+        let no_thread = |e| Error::new(ErrorKind::Io, "cannot start a thread of the recorder").with_source(e);
+        for i in 0..workers {
+            let (shared, queue) = (Arc::clone(&shared), job_queue.clone());
+            let thread = std::thread::Builder::new().name(format!("rec-enc-{i}"));
+            let run = move || worker::run(&shared, &queue);
+            recorder.threads.push(thread.spawn(run).map_err(no_thread)?);
+        }
+        let thread = std::thread::Builder::new().name("rec-write".into());
+        let writer = Writer::new(shared, ticket_queue, segment);
+        recorder.writer = Some(thread.spawn(move || writer.run()).map_err(no_thread)?);
+        Ok(recorder)
+    }
+
+    /// Hands over a set. Never blocks: a set that finds no room is refused, counted, and the count goes into
+    /// the file.
+    ///
+    /// # Errors
+    /// The reason, as counted.
+    pub fn push(&self, set: RecordSet) -> Result<(), PushError> {
+        let mut state = self.shared.lock();
+        state.counts.offered += 1;
+        let refused = |state: &mut State, reason: SetDrop, message: String| {
+            state.counts.dropped[reason as usize] += 1;
+            Err(PushError { reason, message: format!("set {} was not recorded: {message}", set.id) })
+        };
+        if let Some(reason) = state.ended {
+            let why = match &state.error {
+                Some(e) => format!("the recording had ended: {e}"),
+                None => "the recorder is being closed".to_owned(),
+            };
+            return refused(&mut state, reason, why);
+        }
+        if let Err(why) = self.shared.topics.check(&set, state.last_id) {
+            return refused(&mut state, SetDrop::BadSet, why);
+        }
+        let options = &self.shared.options;
+        let load = &self.shared.load;
+        let unencoded = load.unencoded.load(Ordering::Relaxed);
+        if unencoded >= options.queue_sets.max(1) {
+            let why = format!("{unencoded} sets wait to be encoded already");
+            return refused(&mut state, SetDrop::EncoderBusy, why);
+        }
+        let backlog = load.backlog_bytes.load(Ordering::Relaxed);
+        let slow = format!("the disk is too slow, {backlog} bytes wait to be written already");
+        if backlog >= options.backlog_max_bytes {
+            return refused(&mut state, SetDrop::DiskSlow, slow);
+        }
+        let (Some(tickets), Some(jobs)) = (state.tickets.clone(), state.jobs.clone()) else {
+            return refused(&mut state, SetDrop::Ended, "the recorder is being closed".into());
+        };
+
+        let anchor = *state.anchor.get_or_insert(set.utc);
+        // Strictly later than the set before, so that a log time names one set whatever the tick does.
+        let log_time = anchor.utc_ns(set.tick).max(state.last_log_time.saturating_add(1)).max(0);
+        let (ticket, frames) = Ticket::new(set, &anchor, log_time, state.counts.offered, load);
+        let ticket = Arc::new(ticket);
+        if tickets.try_send(Arc::clone(&ticket)).is_err() {
+            state.counts.dropped[SetDrop::DiskSlow as usize] += 1;
+            return Err(PushError { reason: SetDrop::DiskSlow, message: slow });
+        }
+        state.last_id = Some(ticket.id);
+        state.last_log_time = log_time;
+        state.first_tick.get_or_insert(ticket.tick);
+        state.last_tick = Some(ticket.tick);
+        if !frames.is_empty() {
+            load.unencoded.fetch_add(1, Ordering::Relaxed);
+        }
+        for (slot, frame) in frames.into_iter().enumerate() {
+            // The queue has room for every frame of every set that `queue_sets` admits; a job that is dropped
+            // all the same marks its slot as failed.
+            drop(jobs.try_send(Job::new(Arc::clone(&ticket), slot, frame)));
+        }
+        Ok(())
+    }
+
+    /// Adds a note of the operator, stamped now; it goes into the file and into `session.toml`.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] when more notes wait to be written than anybody types.
+    pub fn add_note(&self, text: impl Into<String>) -> Result<()> {
+        let note = crate::Note { utc_ns: UtcPair::sample().utc_ns, text: text.into() };
+        let mut state = self.shared.lock();
+        if state.pending_notes.len() >= NOTES_MAX {
+            let message = format!("{NOTES_MAX} notes wait to be written already; try again in a second");
+            return Err(Error::new(ErrorKind::BadInput, message));
+        }
+        state.pending_notes.push(note.clone());
+        state.session.notes.push(note);
+        state.session_changed = true;
+        Ok(())
+    }
+
+    /// Hands over the present account of each stream; the last one given is written each second and at the
+    /// end of each segment.
+    pub fn update_accounts(&self, accounts: Vec<StreamAccount>) {
+        self.shared.lock().accounts = accounts;
+    }
+
+    /// Hands over the state of the rig; the last one given is written each second, on `/diagnostics`.
+    pub fn diagnostics(&self, statuses: Vec<Diagnostic>) {
+        self.shared.lock().diagnostics = Some(statuses);
+    }
+
+    /// The dataset's folder.
+    pub fn path(&self) -> &Path {
+        &self.shared.dir
+    }
+
+    /// How the recording stands.
+    pub fn progress(&self) -> Progress {
+        let s = self.shared.lock();
+        Progress {
+            sets: s.counts,
+            frames: s.frames,
+            bytes: s.bytes,
+            segments: s.segments,
+            encode_queue: self.shared.load.unencoded.load(Ordering::Relaxed),
+            backlog_bytes: self.shared.load.backlog_bytes.load(Ordering::Relaxed),
+            duration_ns: s.duration_ns(),
+            error: s.error.clone(),
+        }
+    }
+
+    /// Writes what was handed over, closes the dataset and says what it holds. A recording that had ended
+    /// before its time is reported in [`Summary::lost`].
+    ///
+    /// # Errors
+    /// [`ErrorKind::Io`] when the writer thread died, which is a defect of the recorder.
+    pub fn finish(mut self) -> Result<Summary> {
+        self.shared.close();
+        for thread in self.threads.drain(..) {
+            let _ = thread.join();
+        }
+        let writer = self.writer.take().map(JoinHandle::join);
+        match writer {
+            Some(Ok(summary)) => Ok(summary),
+            _ => Err(Error::new(
+                ErrorKind::Io,
+                format!("the writer of {} died; run `depthrig verify` on it", self.shared.dir.display()),
+            )),
+        }
+    }
+}
+
+impl Drop for Recorder {
+    fn drop(&mut self) {
+        if self.writer.is_none() {
+            return;
+        }
+        self.shared.abandoned.store(true, Ordering::Release);
+        self.shared.close();
+        for thread in self.threads.drain(..) {
+            let _ = thread.join();
+        }
+        if let Some(writer) = self.writer.take() {
+            let _ = writer.join();
+        }
+    }
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes no more sets; the threads end when the queues are empty.
+    fn close(&self) {
+        let mut state = self.lock();
+        state.ended.get_or_insert(SetDrop::Ended);
+        state.tickets = None;
+        state.jobs = None;
+    }
+}
+
+impl State {
+    fn duration_ns(&self) -> i64 {
+        self.last_tick.zip(self.first_tick).map_or(0, |(last, first)| last.since_ns(first))
+    }
+}
+
+/// Creates the folder, or finds it empty, and checks that it can take a dataset.
+fn prepare_folder(fs: &dyn Fs, dir: &Path, options: &RecorderOptions) -> Result<()> {
+    match fs.read_dir(dir) {
+        Ok(entries) => {
+            let names: Vec<_> = entries.iter().map(|e| e.name.as_str()).collect();
+            if names.contains(&crate::SESSION_FILE) {
+                let message = format!("{} holds a dataset already; choose another name", dir.display());
+                return Err(Error::new(ErrorKind::AlreadyExists, message));
+            }
+            if let Some(first) = names.first() {
+                return Err(Error::new(
+                    ErrorKind::AlreadyExists,
+                    format!("{} is not empty (it holds {first}); choose a new folder", dir.display()),
+                ));
+            }
+        }
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
+            fs.create_dir_all(dir).map_err(|e| Error::io("create the folder", dir, e))?;
+            if let Some(parent) = dir.parent() {
+                fs.sync_dir(parent).map_err(|e| Error::io("sync the folder", parent, e))?;
+            }
+        }
+        Err(e) => return Err(Error::io("use the folder", dir, e)),
+    }
+    let free = fs.available_space(dir).map_err(|e| Error::io("ask for the free space of", dir, e))?;
+    let needed = options.min_free_bytes.saturating_add(options.reserve_bytes);
+    if free < needed {
+        return Err(Error::new(
+            ErrorKind::DiskFull,
+            format!(
+                "{} has {} MB left, a recording stops at {} MB: free some space or record to another disk",
+                dir.display(),
+                free / 1_000_000,
+                needed / 1_000_000
+            ),
+        ));
+    }
+    Ok(())
+}
+
+/// Writes the reserve file, really, so that its blocks are there to be given back.
+fn make_reserve(fs: &dyn Fs, dir: &Path, bytes: u64) -> Result<()> {
+    if bytes == 0 {
+        return Ok(());
+    }
+    let path = dir.join(RESERVE_FILE);
+    let write = || {
+        let mut file = fs.create_new(&path)?;
+        let mut left = bytes;
+        while left > 0 {
+            let n = left.min(1 << 20);
+            fs::write_all(&mut *file, &vec![0; n as usize])?;
+            left -= n;
+        }
+        file.sync_all()
+    };
+    write().map_err(|e| Error::io("write", &path, e))
+}

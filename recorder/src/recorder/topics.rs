@@ -1,0 +1,207 @@
+//! Which topic, channel and frame name a stream has in the file.
+
+use crate::container::record::Channel;
+use crate::container::segment::Preamble;
+use crate::encode::Codec;
+use crate::frame::RecordSet;
+use crate::msgs::image;
+use crate::msgs::schemas::Schema;
+use crate::msgs::tf::{mount_frame, optical_frame};
+use crate::{RecorderOptions, Result, Session};
+use std::collections::BTreeMap;
+
+/// The metadata record that makes an MCAP file one of ours.
+pub(crate) const SESSION_METADATA: &str = "depthrig.session";
+/// The metadata record at the end of a segment.
+pub(crate) const SEGMENT_METADATA: &str = "depthrig.segment";
+/// The attachment with the rig's configuration.
+const RIG_ATTACHMENT: &str = "rig.toml";
+
+/// Channels that a file has once.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Global {
+    FrameSet,
+    Clock,
+    Accounts,
+    Notes,
+    TfStatic,
+    Diagnostics,
+}
+
+impl Global {
+    const ALL: [Self; 6] =
+        [Self::FrameSet, Self::Clock, Self::Accounts, Self::Notes, Self::TfStatic, Self::Diagnostics];
+
+    pub(crate) const fn channel(self) -> u16 {
+        self as u16 + 1
+    }
+
+    const fn schema(self) -> Schema {
+        match self {
+            Self::FrameSet => Schema::FrameSet,
+            Self::Clock => Schema::ClockPair,
+            Self::Accounts => Schema::Accounts,
+            Self::Notes => Schema::Log,
+            Self::TfStatic => Schema::TfMessage,
+            Self::Diagnostics => Schema::DiagnosticArray,
+        }
+    }
+
+    fn topic(self, rig: &str) -> String {
+        match self {
+            Self::FrameSet => format!("/{rig}/frame_set"),
+            Self::Clock => format!("/{rig}/clock"),
+            Self::Accounts => format!("/{rig}/accounts"),
+            Self::Notes => format!("/{rig}/notes"),
+            Self::TfStatic => "/tf_static".to_owned(),
+            Self::Diagnostics => "/diagnostics".to_owned(),
+        }
+    }
+}
+
+/// The picture channel of the stream of this index; its camera information and frame information follow.
+pub(crate) const fn image_channel(stream: usize) -> u16 {
+    (Global::ALL.len() + 1 + 3 * stream) as u16
+}
+
+pub(super) struct Topics {
+    frame_ids: Vec<String>,
+    /// Picture formats as announced, with width and height.
+    formats: Vec<depthrig_bus::PixelFormat>,
+    names: Vec<String>,
+    codecs: Vec<Codec>,
+}
+
+impl Topics {
+    pub(super) fn new(session: &Session, options: &RecorderOptions) -> Self {
+        let streams = &session.streams;
+        Self {
+            frame_ids: streams.iter().map(|s| optical_frame(&s.id)).collect(),
+            formats: streams.iter().map(|s| s.format).collect(),
+            names: streams.iter().map(|s| s.id.to_string()).collect(),
+            codecs: streams.iter().map(|s| Codec::of(s.format, options.color)).collect(),
+        }
+    }
+
+    pub(super) fn frame_id(&self, stream: usize) -> &str {
+        &self.frame_ids[stream]
+    }
+
+    pub(super) fn name(&self, stream: usize) -> &str {
+        &self.names[stream]
+    }
+
+    pub(super) fn codec(&self, stream: usize) -> Codec {
+        self.codecs[stream]
+    }
+
+    /// What makes a set impossible to record, in words.
+    pub(super) fn check(&self, set: &RecordSet, last_id: Option<u64>) -> Result<(), String> {
+        if last_id.is_some_and(|last| set.id <= last) {
+            return Err(format!("its id is not greater than that of the set before, {last_id:?}"));
+        }
+        let mut seen = vec![false; self.names.len()];
+        for stream in set.frames.iter().map(|f| f.stream).chain(set.missing.iter().copied()) {
+            match seen.get_mut(stream) {
+                None => return Err(format!("stream number {stream} is not in the session")),
+                Some(true) => return Err(format!("stream {} is in it twice", self.names[stream])),
+                Some(seen) => *seen = true,
+            }
+        }
+        for f in &set.frames {
+            let format =
+                image::check_picture(&f.header, f.pixels.bytes().len()).map_err(|e| e.to_string())?;
+            let announced = self.formats[f.stream];
+            if format != announced {
+                return Err(format!(
+                    "{} sent {} pixels, the session announced {}",
+                    self.names[f.stream],
+                    format.name(),
+                    announced.name()
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// Everything that a segment says before its first chunk.
+    pub(super) fn preamble(&self, session: &Session, segment: u32) -> Result<Preamble> {
+        let rig = &session.rig;
+        let mut channels: Vec<Channel> = Global::ALL
+            .into_iter()
+            .map(|g| Channel {
+                id: g.channel(),
+                schema: g.schema().id(),
+                topic: g.topic(rig),
+                metadata: BTreeMap::from([qos(g == Global::TfStatic)]),
+            })
+            .collect();
+        for (i, s) in session.streams.iter().enumerate() {
+            let base = format!("/{rig}/{}/{}", s.id.camera, s.id.stream);
+            // One folder per stream: viewers match a picture with the camera_info beside it.
+            let (picture, schema) = match self.codecs[i] {
+                Codec::Raw => ("image_raw", Schema::Image),
+                Codec::Jpeg | Codec::Mjpeg => ("image_compressed", Schema::CompressedImage),
+            };
+            let facts = [
+                ("stream", s.id.to_string()),
+                ("model", s.model.clone()),
+                ("serial", s.serial.clone()),
+                ("format", s.format.name().to_owned()),
+                ("codec", self.codecs[i].name().to_owned()),
+                ("depth_unit_m", s.depth_unit_m.to_string()),
+                ("rate_hz", s.rate_hz.to_string()),
+                ("frame_id", self.frame_ids[i].clone()),
+                ("parent_frame_id", mount_frame(rig)),
+                ("calibration", s.calibration.clone()),
+            ];
+            let mut metadata: BTreeMap<_, _> = facts.map(|(k, v)| (k.to_owned(), v)).into();
+            metadata.extend([qos(false)]);
+            let id = image_channel(i);
+            let topics =
+                [(picture, schema), ("camera_info", Schema::CameraInfo), ("frame_info", Schema::FrameInfo)];
+            for (k, (name, schema)) in topics.into_iter().enumerate() {
+                channels.push(Channel {
+                    id: id + k as u16,
+                    schema: schema.id(),
+                    topic: format!("{base}/{name}"),
+                    metadata: metadata.clone(),
+                });
+            }
+        }
+        let facts = [
+            ("format", session.format.clone()),
+            ("name", session.name.clone()),
+            ("rig", rig.clone()),
+            ("scene", session.scene.clone()),
+            ("operator", session.operator.clone()),
+            ("host", session.host.clone()),
+            ("started_utc_ns", session.started_utc_ns.to_string()),
+            ("depthrig_version", session.depthrig_version.clone()),
+            ("segment", segment.to_string()),
+            ("session_toml", session.to_toml()?),
+        ];
+        let time = u64::try_from(session.started_utc_ns).unwrap_or(0);
+        let config = session.rig_config.clone().into_bytes();
+        Ok(Preamble {
+            channels,
+            metadata: vec![(SESSION_METADATA.to_owned(), facts.map(|(k, v)| (k.to_owned(), v)).into())],
+            attachments: vec![(time, RIG_ATTACHMENT.to_owned(), "application/toml".to_owned(), config)],
+        })
+    }
+}
+
+/// The QoS profile that profile `ros2` demands, as rosbag2 writes it: keep the last ten, reliable, volatile;
+/// or transient local, which gives `/tf_static` to who comes late.
+fn qos(latched: bool) -> (String, String) {
+    let durability = if latched { 1 } else { 2 };
+    let forever = "\n    sec: 9223372036\n    nsec: 854775807\n";
+    (
+        "offered_qos_profiles".to_owned(),
+        format!(
+            "- history: 1\n  depth: 10\n  reliability: 1\n  durability: {durability}\n  deadline:{forever}  \
+             lifespan:{forever}  liveliness: 1\n  liveliness_lease_duration:{forever}  \
+             avoid_ros_namespace_conventions: false\n"
+        ),
+    )
+}

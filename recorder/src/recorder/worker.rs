@@ -1,0 +1,37 @@
+//! The encode threads: they turn frames into chunks at a lower priority than capture has.
+
+use super::Shared;
+use super::ticket::Job;
+use super::topics::image_channel;
+use crate::encode::{FrameEncoder, FrameJob};
+use crossbeam::channel::Receiver;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+
+/// Encoding may wait for capture, not the other way round.
+const NICE: i32 = 5;
+
+pub(super) fn run(shared: &Shared, queue: &Receiver<Job>) {
+    // On Linux this is the calling thread. Being refused costs nothing but the politeness.
+    let _ = rustix::process::setpriority_process(None, NICE);
+    let mut encoder = FrameEncoder::new(&shared.options);
+    while let Ok(job) = queue.recv() {
+        let ticket = Arc::clone(job.ticket());
+        let encode = AssertUnwindSafe(|| {
+            job.run(|frame| {
+                encoder.encode(&FrameJob {
+                    frame,
+                    channel: image_channel(frame.stream),
+                    frame_id: shared.topics.frame_id(frame.stream),
+                    log_time: u64::try_from(ticket.log_time).unwrap_or(0),
+                    stamp_utc_ns: ticket.utc_ns(frame.header.capture_time_ns),
+                })
+            });
+        });
+        // A picture that makes an encoder panic must cost one set, not the recording.
+        if catch_unwind(encode).is_err() {
+            encoder = FrameEncoder::new(&shared.options);
+            tracing::error!(set = ticket.id, "an encoder panicked; the set is lost");
+        }
+    }
+}

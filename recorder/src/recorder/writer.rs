@@ -1,0 +1,424 @@
+//! The writer thread: it alone owns the file.
+
+use super::ticket::Ticket;
+use super::topics::{Global, SEGMENT_METADATA, image_channel};
+use super::{RESERVE_FILE, Shared, Summary};
+use crate::container::chunk::{Chunk, ChunkBuilder, MessageHead};
+use crate::container::segment::Segment;
+use crate::encode::EncodedFrame;
+use crate::frame::SetDrop;
+use crate::msgs::frame_info::{self, Extra};
+use crate::msgs::frame_set::{self, FrameSetMsg, Member};
+use crate::msgs::{accounts, diagnostics, image, tf};
+use crate::{Error, ErrorKind, Outcome, Result};
+use crossbeam::channel::{Receiver, RecvTimeoutError};
+use depthrig_bus::{HostTime, UtcPair};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+pub(super) struct Writer {
+    shared: Arc<Shared>,
+    tickets: Receiver<Arc<Ticket>>,
+    segment: Option<Segment>,
+    /// Index of the present segment, or of the next one.
+    index: u32,
+    /// Sets in the present segment, with the ids of the first and the last.
+    in_segment: Option<(u64, u64, u64)>,
+    builder: ChunkBuilder,
+    sequence: u32,
+    last_log_time: Option<i64>,
+    next_sync: HostTime,
+    /// Something was written that is not durable yet.
+    dirty: bool,
+    /// The recording ended before its time; nothing more is written.
+    failed: bool,
+    unfinished: Vec<String>,
+}
+
+impl Writer {
+    pub(super) fn new(shared: Arc<Shared>, tickets: Receiver<Arc<Ticket>>, segment: Segment) -> Self {
+        shared.lock().bytes = segment.len();
+        let next_sync = HostTime::now().plus_ns(shared.options.sync_interval_ns);
+        Self {
+            shared,
+            tickets,
+            segment: Some(segment),
+            index: 0,
+            in_segment: None,
+            builder: ChunkBuilder::new(),
+            sequence: 0,
+            last_log_time: None,
+            next_sync,
+            dirty: true,
+            failed: false,
+            unfinished: Vec::new(),
+        }
+    }
+
+    pub(super) fn run(mut self) -> Summary {
+        loop {
+            match self.tickets.recv_timeout(self.next_sync.from_now()) {
+                Ok(ticket) => self.take(&ticket),
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+            self.sync_when_due();
+        }
+        if self.shared.abandoned.load(Ordering::Acquire) {
+            self.try_io(|w| w.segment.as_mut().map_or(Ok(()), Segment::sync));
+        } else {
+            self.try_io(Self::close_segment);
+        }
+        self.summary()
+    }
+
+    /// Waits for a set's frames and writes it, or counts why not.
+    fn take(&mut self, ticket: &Ticket) {
+        let encoded = loop {
+            let patience = self.next_sync.from_now();
+            match ticket.wait(patience) {
+                Some(encoded) => break encoded,
+                None => self.sync_when_due(),
+            }
+        };
+        let bytes = ticket.taken_bytes();
+        let dropped = match encoded {
+            _ if self.failed => Some(SetDrop::WriteFailed),
+            Ok(frames) => {
+                let n = frames.len() as u64;
+                self.try_io(|w| w.write_set(ticket, frames));
+                if self.failed {
+                    Some(SetDrop::WriteFailed)
+                } else {
+                    let mut state = self.shared.lock();
+                    state.counts.recorded += 1;
+                    state.frames += n;
+                    None
+                }
+            }
+            Err(e) => {
+                tracing::error!(set = ticket.id, "a set was not recorded: {e}");
+                Some(SetDrop::EncodeFailed)
+            }
+        };
+        self.shared.load.backlog_bytes.fetch_sub(bytes, Ordering::Relaxed);
+        if let Some(reason) = dropped {
+            self.shared.lock().counts.dropped[reason as usize] += 1;
+        }
+    }
+
+    /// Writes a set whole: its pictures, then the chunk that describes them and ends in the commit mark.
+    fn write_set(&mut self, ticket: &Ticket, frames: Vec<EncodedFrame>) -> Result<()> {
+        let options = &self.shared.options;
+        let full = self.segment.as_ref().is_some_and(|s| {
+            let began = s.times().map_or(ticket.log_time, |(first, _)| first as i64);
+            s.times().is_some()
+                && (s.len() >= options.segment_max_bytes
+                    || ticket.log_time.saturating_sub(began) >= options.segment_max_ns)
+        });
+        if full {
+            self.close_segment()?;
+        }
+        let mut chunks = Vec::with_capacity(frames.len() + 2);
+        if self.in_segment.is_none() {
+            chunks.push(self.head_chunk(ticket)?);
+        }
+        let (members, pictures): (Vec<_>, Vec<_>) =
+            frames.into_iter().map(|f| ((f.message_bytes, f.message_crc32), f.chunk)).unzip();
+        chunks.extend(pictures);
+        chunks.push(self.commit_chunk(ticket, &members)?);
+        if self.segment.is_none() {
+            self.open_segment()?;
+        }
+        self.append(&chunks)?;
+        self.last_log_time = Some(ticket.log_time);
+        let (n, first, _) = self.in_segment.unwrap_or((0, ticket.id, 0));
+        self.in_segment = Some((n + 1, first, ticket.id));
+        Ok(())
+    }
+
+    fn open_segment(&mut self) -> Result<()> {
+        let session = self.shared.lock().session.clone();
+        let preamble = self.shared.topics.preamble(&session, self.index)?;
+        let segment = Segment::create(&*self.shared.fs, &self.shared.dir, self.index, &preamble)?;
+        let mut state = self.shared.lock();
+        state.segments += 1;
+        state.bytes += segment.len();
+        drop(state);
+        self.segment = Some(segment);
+        Ok(())
+    }
+
+    fn append(&mut self, chunks: &[Chunk]) -> Result<()> {
+        let Some(segment) = &mut self.segment else { return Ok(()) };
+        let before = segment.len();
+        segment.append_chunks(chunks)?;
+        self.shared.lock().bytes += segment.len() - before;
+        self.dirty = true;
+        Ok(())
+    }
+
+    /// What a segment must say once, at the time of its first set.
+    fn head_chunk(&mut self, ticket: &Ticket) -> Result<Chunk> {
+        let session = self.shared.lock().session.clone();
+        let log_time = ticket.log_time;
+        self.message(Global::TfStatic, log_time, log_time, |b| {
+            tf::write(b, log_time, &session.rig, session.streams.iter().map(|s| (&s.id, &s.pose)));
+        });
+        self.clock_pair(log_time, ticket.utc_ns(ticket.utc.mono.ns()), &ticket.utc);
+        self.builder.pack(true)
+    }
+
+    fn commit_chunk(&mut self, ticket: &Ticket, members: &[(u64, u32)]) -> Result<Chunk> {
+        let shared = Arc::clone(&self.shared);
+        let topics = &shared.topics;
+        let mut set = FrameSetMsg {
+            stamp_utc_ns: ticket.log_time,
+            id: ticket.id,
+            tick_ns: ticket.tick.ns(),
+            utc_offset_ns: ticket.utc_offset_ns,
+            spread_ns: ticket.spread_ns,
+            sets_offered: ticket.offered,
+            members: Vec::with_capacity(members.len()),
+            missing: ticket.missing.iter().map(|s| topics.name(*s).to_owned()).collect(),
+        };
+        for ((stream, h), (message_bytes, message_crc32)) in ticket.frames.iter().zip(members) {
+            let stamp_utc_ns = ticket.utc_ns(h.capture_time_ns);
+            let frame_id = topics.frame_id(*stream);
+            let extra = Extra { stamp_utc_ns, frame_id, codec: topics.codec(*stream).name() };
+            let head = |channel| MessageHead {
+                channel,
+                sequence: h.sequence as u32,
+                log_time: ticket.log_time as u64,
+                publish_time: u64::try_from(stamp_utc_ns).unwrap_or(0),
+            };
+            let channel = image_channel(*stream);
+            self.builder.message(head(channel + 1), |b| {
+                image::write_camera_info(b, stamp_utc_ns, frame_id, h);
+                Ok::<_, Error>(())
+            })?;
+            self.builder.message(head(channel + 2), |b| {
+                frame_info::write(b, h, &extra);
+                Ok::<_, Error>(())
+            })?;
+            set.members.push(Member {
+                stream: topics.name(*stream).to_owned(),
+                sequence: h.sequence,
+                capture_time_ns: h.capture_time_ns,
+                message_bytes: *message_bytes,
+                message_crc32: *message_crc32,
+            });
+        }
+        self.message(Global::FrameSet, ticket.log_time, ticket.log_time, |b| set.write(b));
+        self.builder.pack(true)
+    }
+
+    fn message(&mut self, what: Global, log_time: i64, publish_time: i64, fill: impl FnOnce(&mut Vec<u8>)) {
+        self.sequence = self.sequence.wrapping_add(1);
+        let head = MessageHead {
+            channel: what.channel(),
+            sequence: self.sequence,
+            log_time: log_time as u64,
+            publish_time: u64::try_from(publish_time).unwrap_or(0),
+        };
+        let filled = self.builder.message(head, |b| {
+            fill(b);
+            Ok::<_, std::convert::Infallible>(())
+        });
+        match filled {
+            Ok(_) => {}
+            Err(never) => match never {},
+        }
+    }
+
+    fn clock_pair(&mut self, log_time: i64, stamp: i64, pair: &UtcPair) {
+        self.message(Global::Clock, log_time, stamp, |b| frame_set::write_clock_pair(b, stamp, pair));
+    }
+
+    /// The accounts of what has been settled: sets in flight are not in them.
+    fn accounts(&mut self, log_time: i64) {
+        let state = self.shared.lock();
+        let (mut counts, streams) = (state.counts, state.accounts.clone());
+        drop(state);
+        counts.offered = counts.recorded + counts.dropped_total();
+        self.message(Global::Accounts, log_time, log_time, |b| {
+            accounts::write(b, log_time, &counts, &streams);
+        });
+    }
+
+    fn sync_when_due(&mut self) {
+        let now = HostTime::now();
+        if now < self.next_sync {
+            return;
+        }
+        self.next_sync = now.plus_ns(self.shared.options.sync_interval_ns.max(1_000_000));
+        self.try_io(Self::each_second);
+        self.save_session_if_changed();
+    }
+
+    /// Clock, accounts, diagnostics and notes; then everything so far is made durable.
+    fn each_second(&mut self) -> Result<()> {
+        let Some(log_time) = self.last_log_time.filter(|_| self.in_segment.is_some()) else { return Ok(()) };
+        let pair = UtcPair::sample();
+        self.clock_pair(log_time, pair.utc_ns, &pair);
+        self.accounts(log_time);
+        self.diagnostics_and_notes(log_time);
+        let chunk = self.builder.pack(true)?;
+        self.append(&[chunk])?;
+        if let Some(segment) = self.segment.as_mut().filter(|_| self.dirty) {
+            segment.sync()?;
+            self.dirty = false;
+        }
+        let (dir, least) = (&self.shared.dir, self.shared.options.min_free_bytes);
+        let free = self.shared.fs.available_space(dir);
+        let free = free.map_err(|e| Error::io("ask for the free space of", dir, e))?;
+        if free < least {
+            return Err(Error::new(
+                ErrorKind::DiskFull,
+                format!(
+                    "the recording {} was ended with {} MB left on the disk (the limit is {} MB); what was \
+                     recorded is whole; free some space and start a new one",
+                    dir.display(),
+                    free / 1_000_000,
+                    least / 1_000_000
+                ),
+            ));
+        }
+        Ok(())
+    }
+
+    fn diagnostics_and_notes(&mut self, log_time: i64) {
+        let mut state = self.shared.lock();
+        let statuses = state.diagnostics.take();
+        let notes = std::mem::take(&mut state.pending_notes);
+        drop(state);
+        if let Some(statuses) = statuses {
+            self.message(Global::Diagnostics, log_time, log_time, |b| {
+                diagnostics::write(b, log_time, &statuses);
+            });
+        }
+        for note in notes {
+            self.message(Global::Notes, log_time, note.utc_ns, |b| {
+                diagnostics::write_note(b, note.utc_ns, &note.text);
+            });
+        }
+    }
+
+    /// Ends the present segment with its accounts and index, under its final name.
+    fn close_segment(&mut self) -> Result<()> {
+        let sets = self.in_segment.take();
+        if let Some(log_time) = self.last_log_time.filter(|_| sets.is_some()) {
+            let pair = UtcPair::sample();
+            self.clock_pair(log_time, pair.utc_ns, &pair);
+            self.accounts(log_time);
+            self.diagnostics_and_notes(log_time);
+            let chunk = self.builder.pack(true)?;
+            self.append(&[chunk])?;
+        }
+        self.finish_file(sets)
+    }
+
+    fn finish_file(&mut self, sets: Option<(u64, u64, u64)>) -> Result<()> {
+        let Some(mut segment) = self.segment.take() else { return Ok(()) };
+        let (n, first, last) = sets.unwrap_or_default();
+        let counts = self.shared.lock().counts;
+        let mut facts = BTreeMap::from([
+            ("segment".to_owned(), self.index.to_string()),
+            ("sets".to_owned(), n.to_string()),
+            ("first_set".to_owned(), first.to_string()),
+            ("last_set".to_owned(), last.to_string()),
+            ("sets_recorded_so_far".to_owned(), counts.recorded.to_string()),
+        ]);
+        for (reason, n) in counts.dropped_by_reason() {
+            facts.insert(format!("sets_dropped_{}", reason.name()), n.to_string());
+        }
+        if let Some(e) = &self.shared.lock().error {
+            facts.insert("error".to_owned(), e.to_string());
+        }
+        let part = segment.part().display().to_string();
+        let done =
+            segment.append_metadata(SEGMENT_METADATA, &facts).and_then(|()| segment.finish(&*self.shared.fs));
+        self.index += 1;
+        self.dirty = false;
+        if let Err(e) = done {
+            self.unfinished.push(part);
+            return Err(e);
+        }
+        Ok(())
+    }
+
+    /// Runs an operation on the file unless the recording has failed; its first failure ends the recording.
+    fn try_io(&mut self, operation: impl FnOnce(&mut Self) -> Result<()>) {
+        if self.failed {
+            return;
+        }
+        let Err(e) = operation(self) else { return };
+        self.failed = true;
+        self.builder = ChunkBuilder::new();
+        tracing::error!(dataset = %self.shared.dir.display(), "the recording ended: {e}");
+        let mut state = self.shared.lock();
+        state.ended = Some(SetDrop::WriteFailed);
+        state.error = Some(Arc::new(e));
+        drop(state);
+        // The reserve makes room for the index; what was cut back is a whole number of sets.
+        let _ = self.shared.fs.remove_file(&self.shared.dir.join(RESERVE_FILE));
+        let sets = self.in_segment.take();
+        if let Err(e) = self.finish_file(sets) {
+            tracing::error!(dataset = %self.shared.dir.display(), "its last segment has no index: {e}");
+        }
+    }
+
+    fn save_session_if_changed(&mut self) {
+        let mut state = self.shared.lock();
+        if !std::mem::take(&mut state.session_changed) {
+            return;
+        }
+        let session = state.session.clone();
+        drop(state);
+        if let Err(e) = session.save(&*self.shared.fs, &self.shared.dir) {
+            tracing::error!("the notes are not in session.toml yet: {e}");
+            self.shared.lock().session_changed = true;
+        }
+    }
+
+    /// Removes the reserve, writes the outcome into `session.toml` and reports.
+    fn summary(mut self) -> Summary {
+        let abandoned = self.shared.abandoned.load(Ordering::Acquire);
+        let mut state = self.shared.lock();
+        let mut lost: Vec<String> = Vec::new();
+        if let Some(e) = &state.error {
+            lost.push(format!("the recording ended before its time: {e}"));
+        }
+        let counts = state.counts;
+        for (reason, n) in counts.dropped_by_reason() {
+            lost.push(format!("{n} of {} sets were not recorded: {}", counts.offered, reason.name()));
+        }
+        for part in &self.unfinished {
+            lost.push(format!("{part} has no index: only its data up to the error can be read"));
+        }
+        let ended = self.last_log_time.unwrap_or(state.session.started_utc_ns);
+        state.session.outcome = Some(Outcome::new(ended, &counts, lost.clone()));
+        let session = state.session.clone();
+        drop(state);
+        if !abandoned {
+            let _ = self.shared.fs.remove_file(&self.shared.dir.join(RESERVE_FILE));
+            if let Err(e) = session.save(&*self.shared.fs, &self.shared.dir) {
+                tracing::error!("the outcome is not in session.toml: {e}");
+                lost.push(format!("the outcome could not be written: {e}"));
+            }
+        }
+        self.unfinished.clear();
+        let state = self.shared.lock();
+        Summary {
+            path: self.shared.dir.clone(),
+            sets: counts,
+            frames: state.frames,
+            bytes: state.bytes,
+            segments: state.segments,
+            duration_ns: state.duration_ns(),
+            complete: lost.is_empty(),
+            lost,
+        }
+    }
+}

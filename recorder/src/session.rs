@@ -1,0 +1,248 @@
+//! `session.toml`: who recorded what with which rig, and how it was calibrated.
+
+use crate::fs::{self, Fs};
+use crate::{Error, ErrorKind, Result, SetCounts};
+use depthrig_bus::{Distortion, Intrinsics, Name, PixelFormat, Pose, StreamId};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// The value of `Session::format` that this version writes and reads.
+pub const FORMAT: &str = "depthrig.dataset/1";
+/// The name of the session file in a dataset.
+pub const SESSION_FILE: &str = "session.toml";
+
+/// What `session.toml` says.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Session {
+    /// [`FORMAT`].
+    #[serde(default = "format")]
+    pub format: String,
+    /// Name of the session, usually the folder's.
+    pub name: String,
+    /// Name of the rig: the first part of each topic.
+    pub rig: String,
+    /// What was in front of the cameras.
+    #[serde(default)]
+    pub scene: String,
+    /// Who recorded it.
+    #[serde(default)]
+    pub operator: String,
+    /// When the recording began, UTC nanoseconds since 1970.
+    pub started_utc_ns: i64,
+    /// The version of depthrig that recorded it.
+    #[serde(default)]
+    pub depthrig_version: String,
+    /// The computer's name.
+    #[serde(default)]
+    pub host: String,
+    /// The rig's configuration, TOML text.
+    #[serde(default)]
+    pub rig_config: String,
+    /// How it ended; absent while it runs and when it was cut off.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub outcome: Option<Outcome>,
+    /// What the operator noted.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub notes: Vec<Note>,
+    /// The recorded streams; a frame names its stream by the index here.
+    pub streams: Vec<StreamRecord>,
+}
+
+/// A note of the operator.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Note {
+    /// When, UTC nanoseconds since 1970.
+    pub utc_ns: i64,
+    /// What.
+    pub text: String,
+}
+
+/// How a recording ended.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Outcome {
+    /// When the last set was taken, UTC nanoseconds since 1970.
+    pub ended_utc_ns: i64,
+    /// Whether every set handed over is in the dataset.
+    pub complete: bool,
+    /// Sets handed to the recorder.
+    pub sets_offered: u64,
+    /// Sets in the dataset.
+    pub sets_recorded: u64,
+    /// Sets lost, by reason.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub sets_dropped: BTreeMap<String, u64>,
+    /// What was lost or went wrong, in words.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub lost: Vec<String>,
+}
+
+impl Outcome {
+    pub(crate) fn new(ended_utc_ns: i64, sets: &SetCounts, lost: Vec<String>) -> Self {
+        Self {
+            ended_utc_ns,
+            complete: lost.is_empty(),
+            sets_offered: sets.offered,
+            sets_recorded: sets.recorded,
+            sets_dropped: sets.dropped_by_reason().map(|(r, n)| (r.name().to_owned(), n)).collect(),
+            lost,
+        }
+    }
+}
+
+/// One recorded stream.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StreamRecord {
+    /// Its name, `camera/stream`.
+    pub id: StreamId,
+    /// Camera model.
+    #[serde(default)]
+    pub model: String,
+    /// Camera serial number.
+    #[serde(default)]
+    pub serial: String,
+    /// Pixel format as the camera's channel carries it.
+    pub format: PixelFormat,
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Nominal frame rate of the live stream, Hz.
+    #[serde(default)]
+    pub rate_hz: f64,
+    /// Metres per unit of depth; 0 when it is no depth.
+    #[serde(default)]
+    pub depth_unit_m: f64,
+    /// Where the calibration comes from: factory, file and date, none.
+    #[serde(default)]
+    pub calibration: String,
+    /// Intrinsics at this size.
+    #[serde(with = "intrinsics")]
+    pub intrinsics: Intrinsics,
+    /// Pose of the optical frame on the mount.
+    pub pose: Pose,
+}
+
+fn format() -> String {
+    FORMAT.to_owned()
+}
+
+/// Intrinsics in TOML: the model by name, and only the coefficients.
+mod intrinsics {
+    use super::{Deserialize, Distortion, Intrinsics, Serialize};
+    use serde::{Deserializer, Serializer};
+
+    #[derive(Serialize, Deserialize)]
+    struct Repr {
+        fx: f64,
+        fy: f64,
+        cx: f64,
+        cy: f64,
+        #[serde(default)]
+        model: Distortion,
+        #[serde(default)]
+        coeffs: [f64; 8],
+    }
+
+    pub(super) fn serialize<S: Serializer>(i: &Intrinsics, s: S) -> Result<S::Ok, S::Error> {
+        Repr { fx: i.fx, fy: i.fy, cx: i.cx, cy: i.cy, model: i.distortion(), coeffs: i.coeffs }.serialize(s)
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(d: D) -> Result<Intrinsics, D::Error> {
+        let r = Repr::deserialize(d)?;
+        let model = r.model as u32;
+        Ok(Intrinsics { fx: r.fx, fy: r.fy, cx: r.cx, cy: r.cy, coeffs: r.coeffs, model, reserved: 0 })
+    }
+}
+
+impl Session {
+    /// A session that begins now, without streams.
+    pub fn new(name: impl Into<String>, rig: impl Into<String>) -> Self {
+        Self {
+            format: format(),
+            name: name.into(),
+            rig: rig.into(),
+            scene: String::new(),
+            operator: String::new(),
+            started_utc_ns: depthrig_bus::UtcPair::sample().utc_ns,
+            depthrig_version: env!("CARGO_PKG_VERSION").to_owned(),
+            host: rustix::system::uname().nodename().to_string_lossy().into_owned(),
+            rig_config: String::new(),
+            outcome: None,
+            notes: Vec::new(),
+            streams: Vec::new(),
+        }
+    }
+
+    /// Checks what the topics and the file are made from.
+    pub(crate) fn check(&self) -> Result<()> {
+        let bad = |why: String| Error::new(ErrorKind::BadInput, format!("session \"{}\": {why}", self.name));
+        Name::new(self.rig.as_str()).map_err(|e| bad(format!("the rig's name: {e}")))?;
+        if self.streams.is_empty() {
+            return Err(bad("it has no streams to record".to_owned()));
+        }
+        for (i, s) in self.streams.iter().enumerate() {
+            if self.streams[..i].iter().any(|other| other.id == s.id) {
+                return Err(bad(format!("stream {} is there twice", s.id)));
+            }
+        }
+        Ok(())
+    }
+
+    /// The text of `session.toml`.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] when a value cannot be written as TOML.
+    pub fn to_toml(&self) -> Result<String> {
+        toml::to_string_pretty(self).map_err(|e| {
+            Error::new(
+                ErrorKind::BadInput,
+                format!("session \"{}\" cannot be written as TOML: {e}", self.name),
+            )
+            .with_source(e)
+        })
+    }
+
+    /// Reads the text of a `session.toml`; `path` is for the message.
+    pub(crate) fn from_toml(text: &str, path: &Path) -> Result<Self> {
+        let session: Self = toml::from_str(text).map_err(|e| {
+            let message = format!("{} cannot be read as a session: {e}", path.display());
+            Error::new(ErrorKind::Corrupt, message).with_source(e)
+        })?;
+        if session.format != FORMAT {
+            return Err(Error::new(
+                ErrorKind::Version,
+                format!(
+                    "{} has format \"{}\"; this depthrig reads \"{FORMAT}\": use a later version",
+                    path.display(),
+                    session.format
+                ),
+            ));
+        }
+        Ok(session)
+    }
+
+    /// Writes `session.toml` into `dir`, replacing it in one step.
+    pub(crate) fn save(&self, fs: &dyn Fs, dir: &Path) -> Result<()> {
+        let path = dir.join(SESSION_FILE);
+        let text = self.to_toml()?;
+        fs::replace(fs, &path, text.as_bytes()).map_err(|e| Error::io("write", &path, e))
+    }
+
+    /// Reads `session.toml` in `dir`.
+    pub(crate) fn load(fs: &dyn Fs, dir: &Path) -> Result<Self> {
+        let path = dir.join(SESSION_FILE);
+        let read = || {
+            let file = fs.open(&path)?;
+            // A session with every note of a long day is some kilobytes.
+            let mut bytes = vec![0; usize::try_from(file.size()?.min(64 << 20)).unwrap_or(0)];
+            file.read_exact_at(&mut bytes, 0)?;
+            Ok(bytes)
+        };
+        let bytes = read().map_err(|e: std::io::Error| Error::io("read", &path, e))?;
+        let text = String::from_utf8(bytes).map_err(|e| {
+            Error::new(ErrorKind::Corrupt, format!("{} is not text", path.display())).with_source(e)
+        })?;
+        Self::from_toml(&text, &path)
+    }
+}

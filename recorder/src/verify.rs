@@ -1,0 +1,203 @@
+//! Proves that a dataset is whole, or says where it is not.
+//!
+//! Checked are: checksums of chunks, data, summary and attachments; the index against the data; that every
+//! set has what its commit mark lists and that the mark lists or excuses every stream; order and times; the
+//! accounts; that segments follow each other; calibration; and on request that every picture decodes.
+
+use crate::dataset::is_segment;
+use crate::fs::{Fs, RealFs};
+use crate::{Dataset, ErrorKind, Result, SESSION_FILE, Session};
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+mod segment;
+use segment::Walk;
+
+/// What to check beyond the usual.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct VerifyOptions {
+    /// Decode every picture as well.
+    pub decode: bool,
+    /// Report sets whose frames are further apart than this, nanoseconds.
+    pub max_spread_ns: Option<i64>,
+}
+
+/// How bad a finding is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Severity {
+    /// Good to know; nothing is wrong with the data.
+    Note,
+    /// The dataset says itself that something was not recorded.
+    Lost,
+    /// The dataset is not what it says it is.
+    Broken,
+}
+
+/// One thing that was found.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Finding {
+    /// How bad it is.
+    pub severity: Severity,
+    /// In which file, by name.
+    pub file: String,
+    /// At which byte, where there is one.
+    pub offset: Option<u64>,
+    /// What it is.
+    pub message: String,
+}
+
+/// What a verification found and how much it looked at.
+#[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
+pub struct VerifyReport {
+    /// The dataset.
+    pub path: PathBuf,
+    /// What was found, worst first.
+    pub findings: Vec<Finding>,
+    /// Whole sets.
+    pub sets: u64,
+    /// Their frames.
+    pub frames: u64,
+    /// Bytes read.
+    pub bytes: u64,
+    /// Segments read.
+    pub segments: u32,
+    /// Whether the pictures were decoded.
+    pub decoded: bool,
+}
+
+impl VerifyReport {
+    /// The worst that was found; `None` when there is nothing at all.
+    pub fn worst(&self) -> Option<Severity> {
+        self.findings.iter().map(|f| f.severity).max()
+    }
+
+    /// Whether the dataset is what it says it is and lost nothing.
+    pub fn is_whole(&self) -> bool {
+        self.worst() < Some(Severity::Lost)
+    }
+}
+
+/// Verifies the dataset `path`.
+///
+/// # Errors
+/// As [`Dataset::open`]: what is no dataset cannot be verified. Damage is a finding, not an error.
+pub fn verify(path: &Path, options: &VerifyOptions) -> Result<VerifyReport> {
+    let fs: Arc<dyn Fs> = Arc::new(RealFs);
+    verify_with(&fs, path, options)
+}
+
+/// The same on another file system.
+///
+/// # Errors
+/// As [`verify`].
+pub fn verify_with(fs: &Arc<dyn Fs>, path: &Path, options: &VerifyOptions) -> Result<VerifyReport> {
+    let mut findings = Findings::default();
+    let (session, segments, outcome) = open(fs, path, &mut findings)?;
+    check_session(&session, &mut findings);
+    check_names(&segments, path, &mut findings);
+    let mut walk = Walk::new(&session, *options);
+    for segment in &segments {
+        walk.segment(&**fs, segment, &mut findings);
+    }
+    walk.finish(outcome.then_some(&session), &mut findings);
+    findings.0.sort_by_key(|f| std::cmp::Reverse(f.severity));
+    Ok(VerifyReport {
+        path: path.to_owned(),
+        findings: findings.0,
+        sets: walk.sets,
+        frames: walk.frames,
+        bytes: walk.bytes,
+        segments: segments.len() as u32,
+        decoded: options.decode,
+    })
+}
+
+#[derive(Default)]
+struct Findings(Vec<Finding>);
+
+impl Findings {
+    fn add(&mut self, severity: Severity, file: &str, offset: Option<u64>, message: impl Into<String>) {
+        let message = message.into();
+        if severity == Severity::Broken {
+            tracing::debug!(file, "{message}");
+        }
+        self.0.push(Finding { severity, file: file.to_owned(), offset, message });
+    }
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned())
+}
+
+/// Session, segments, and whether the session is that of the whole dataset rather than of one segment.
+fn open(fs: &Arc<dyn Fs>, path: &Path, findings: &mut Findings) -> Result<(Session, Vec<PathBuf>, bool)> {
+    let error = match Dataset::open_with(Arc::clone(fs), path) {
+        Ok(d) => {
+            let is_folder = d.segments() != [path];
+            if is_folder && fs.open(&path.join(SESSION_FILE)).is_err() {
+                findings.add(
+                    Severity::Broken,
+                    SESSION_FILE,
+                    None,
+                    format!("{SESSION_FILE} is missing; the segments tell what was in it"),
+                );
+                return Ok((d.session().clone(), d.segments().to_vec(), false));
+            }
+            return Ok((d.session().clone(), d.segments().to_vec(), is_folder));
+        }
+        Err(e) => e,
+    };
+    // A damaged session.toml must not hide what the segments hold.
+    let segments: Vec<_> = match fs.read_dir(path) {
+        Ok(entries) => entries.iter().filter(|e| is_segment(&e.name)).map(|e| path.join(&e.name)).collect(),
+        Err(_) => return Err(error),
+    };
+    if error.kind() != ErrorKind::Corrupt {
+        return Err(error);
+    }
+    for segment in &segments {
+        if let Ok(d) = Dataset::open_with(Arc::clone(fs), segment) {
+            findings.add(Severity::Broken, SESSION_FILE, None, error.to_string());
+            return Ok((d.session().clone(), segments, false));
+        }
+    }
+    Err(error)
+}
+
+fn check_session(session: &Session, findings: &mut Findings) {
+    for s in &session.streams {
+        if s.format.is_depth() && s.depth_unit_m <= 0.0 {
+            let what = format!("{} is depth without a unit: its numbers mean nothing", s.id);
+            findings.add(Severity::Broken, SESSION_FILE, None, what);
+        }
+        if !s.intrinsics.is_known() {
+            let what = format!("{} has no calibration", s.id);
+            findings.add(Severity::Note, SESSION_FILE, None, what);
+        } else if s.calibration.is_empty() {
+            let what = format!("{} does not say where its calibration comes from", s.id);
+            findings.add(Severity::Note, SESSION_FILE, None, what);
+        }
+    }
+}
+
+/// Segments must be numbered without a gap and be finished.
+fn check_names(segments: &[PathBuf], path: &Path, findings: &mut Findings) {
+    if segments == [path] {
+        return;
+    }
+    if segments.is_empty() {
+        findings.add(Severity::Broken, &file_name(path), None, "there are no segments");
+    }
+    for (i, segment) in segments.iter().enumerate() {
+        let name = file_name(segment);
+        let expected = crate::container::segment::file_name(i as u32);
+        if name.strip_suffix(".part").unwrap_or(&name) != expected {
+            let what = format!("{expected} is missing, {name} is in its place");
+            findings.add(Severity::Broken, &expected, None, what);
+            break;
+        }
+    }
+}

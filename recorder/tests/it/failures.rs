@@ -1,0 +1,1 @@
+//! What goes wrong is said, counted and survived.

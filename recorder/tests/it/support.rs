@@ -1,0 +1,175 @@
+//! A small rig whose pictures and headers follow from the set's number.
+
+use depthrig_bus::{FrameFlags, FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
+use depthrig_recorder::fs::{Fs, MemFs};
+use depthrig_recorder::{
+    Dataset, DatasetSet, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamRecord, Summary,
+};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+/// UTC of the first set.
+pub const T0: i64 = 1_700_000_000_000_000_000;
+/// Monotonic time of the first set.
+pub const M0: i64 = 5_000_000_000;
+/// Time from set to set.
+pub const PERIOD: i64 = 200_000_000;
+
+pub fn dir() -> PathBuf {
+    PathBuf::from("/data/session")
+}
+
+/// Nothing reserved, nothing limited: what a test on a small file system wants.
+pub fn options() -> RecorderOptions {
+    RecorderOptions { workers: 2, queue_sets: 8, min_free_bytes: 0, reserve_bytes: 0, ..Default::default() }
+}
+
+pub fn stream(id: &str, format: PixelFormat, width: u32, height: u32) -> StreamRecord {
+    let depth = format.is_depth();
+    StreamRecord {
+        id: id.parse().unwrap(),
+        model: "Test 1".into(),
+        serial: "0042".into(),
+        format,
+        width,
+        height,
+        rate_hz: 30.0,
+        depth_unit_m: if depth { 0.0001 } else { 0.0 },
+        calibration: "made up".into(),
+        intrinsics: Intrinsics::pinhole(600.0, 601.0, f64::from(width) / 2.0, f64::from(height) / 2.0),
+        pose: Pose { translation_m: [0.1, -0.2, 0.3], ..Pose::IDENTITY },
+    }
+}
+
+pub fn session() -> Session {
+    let mut s = Session::new("session", "rig");
+    s.scene = "a table".into();
+    s.operator = "nobody".into();
+    s.started_utc_ns = T0;
+    s.rig_config = "[rig]\nname = \"rig\"\n".into();
+    s.streams = vec![
+        stream("front/color", PixelFormat::Rgb8, 64, 48),
+        stream("front/depth", PixelFormat::Z16, 64, 48),
+        stream("side/ir_left", PixelFormat::Mono8, 40, 30),
+    ];
+    s
+}
+
+/// Smooth pictures with an edge, as a camera gives them, different for each set.
+pub fn pixels(format: PixelFormat, width: u32, height: u32, n: u64) -> Vec<u8> {
+    let mut out = Vec::with_capacity(format.frame_bytes(width, height));
+    for y in 0..height {
+        for x in 0..width {
+            let edge = if x > width / 2 { 60 } else { 0 };
+            let v = (x + 2 * y + edge + n as u32) as u16;
+            match format {
+                PixelFormat::Rgb8 => out.extend([v as u8, (v / 2) as u8, 255 - v as u8]),
+                PixelFormat::Z16 => {
+                    out.extend((if (x + y) % 17 == 0 { 0 } else { 400 + 3 * v }).to_le_bytes());
+                }
+                PixelFormat::DepthF32 => out.extend((f32::from(v) / 100.0).to_le_bytes()),
+                PixelFormat::Mono16 => out.extend((v * 7).to_le_bytes()),
+                _ => out.push(v as u8),
+            }
+        }
+    }
+    out.resize(format.frame_bytes(width, height), 9);
+    out
+}
+
+pub fn header(s: &StreamRecord, n: u64) -> FrameHeader {
+    let mut h = FrameHeader::default();
+    h.set_names("rig", &s.id);
+    h.set_device(&s.model, &s.serial);
+    h.set_picture(s.format, s.width, s.height);
+    h.sequence = 6 * n + 1;
+    h.device_sequence = 6 * n + 100;
+    h.device_time = 123_456 * n;
+    h.device_tick_ns = 1000.0;
+    h.capture_time_ns = M0 + n as i64 * PERIOD + s.id.to_string().len() as i64;
+    h.capture_uncertainty_ns = 15_000;
+    h.arrival_time_ns = h.capture_time_ns + 8_000_000;
+    h.publish_time_ns = h.capture_time_ns + 8_100_000;
+    h.captured = h.sequence + 2;
+    h.dropped[1] = 2;
+    h.depth_unit_m = s.depth_unit_m;
+    h.intrinsics = s.intrinsics;
+    h.pose = s.pose;
+    h.clock_domain = 1;
+    h.clock_epoch = 3;
+    h.flags = FrameFlags::SYNTHETIC.0;
+    h.gain = 1.5;
+    h
+}
+
+pub fn set_of(session: &Session, n: u64, streams: &[usize]) -> RecordSet {
+    let frames: Vec<_> = streams
+        .iter()
+        .map(|i| {
+            let s = &session.streams[*i];
+            let pixels = pixels(s.format, s.width, s.height, n);
+            RecordFrame { stream: *i, header: header(s, n), pixels: Box::new(pixels) }
+        })
+        .collect();
+    let times: Vec<_> = frames.iter().map(|f| f.header.capture_time_ns).collect();
+    RecordSet {
+        id: n + 1,
+        tick: HostTime::from_ns(M0 + n as i64 * PERIOD),
+        utc: UtcPair { mono: HostTime::from_ns(M0), utc_ns: T0, width_ns: 100 },
+        spread_ns: times.iter().max().unwrap_or(&0) - times.iter().min().unwrap_or(&0),
+        missing: (0..session.streams.len()).filter(|i| !streams.contains(i)).collect(),
+        frames,
+    }
+}
+
+pub fn set(session: &Session, n: u64) -> RecordSet {
+    set_of(session, n, &(0..session.streams.len()).collect::<Vec<_>>())
+}
+
+pub fn recorder(fs: &MemFs, options: RecorderOptions) -> Recorder {
+    Recorder::create(Arc::new(fs.clone()), &dir(), session(), options).unwrap()
+}
+
+/// Waits until everything pushed is settled.
+pub fn settle(r: &Recorder) {
+    for _ in 0..2000 {
+        let p = r.progress();
+        if p.sets.offered == p.sets.recorded + p.sets.dropped_total() {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    panic!("sets are in flight for ten seconds: {:?}", r.progress());
+}
+
+/// Records sets one at a time, so that none is refused for want of room.
+pub fn record(fs: &MemFs, sets: u64, options: RecorderOptions) -> Summary {
+    let r = recorder(fs, options);
+    for n in 0..sets {
+        r.push(set(&session(), n)).unwrap();
+        settle(&r);
+    }
+    r.finish().unwrap()
+}
+
+pub fn open(fs: &MemFs) -> Dataset {
+    Dataset::open_with(Arc::new(fs.clone()), &dir()).unwrap()
+}
+
+pub fn read_all(fs: &MemFs) -> Vec<DatasetSet> {
+    open(fs).sets(depthrig_recorder::SetRange::ALL).map(Result::unwrap).collect()
+}
+
+pub fn names(fs: &MemFs) -> Vec<String> {
+    fs.read_dir(&dir()).unwrap().into_iter().map(|e| e.name).collect()
+}
+
+
+pub fn segment(index: u32) -> PathBuf {
+    dir().join(format!("seg_{index:04}.mcap"))
+}
+
+pub fn contents(fs: &MemFs, path: &Path) -> Vec<u8> {
+    fs.contents(path).unwrap_or_else(|| panic!("{} is not there: {:?}", path.display(), names(fs)))
+}
