@@ -21,7 +21,7 @@ mod dataset;
 pub use dataset::{Dataset, DatasetMetrics};
 
 /// 1.25^0.5, the threshold of δ0.5.
-const DELTA_05: f64 = 1.118_033_988_749_894_9;
+const DELTA_05: f64 = 1.118_033_988_749_895;
 /// The threshold of δ1.
 const DELTA_1: f64 = 1.25;
 
@@ -156,9 +156,8 @@ impl Sums {
         }
         prediction.check("prediction")?;
         reference.check("reference")?;
-        // Written so that NaN is refused too.
-        if !(range.min_m <= range.max_m) {
-            let DepthRange { min_m, max_m } = range;
+        let DepthRange { min_m, max_m } = range;
+        if min_m.is_nan() || max_m.is_nan() || min_m > max_m {
             let message = format!("{min_m} m to {max_m} m is no range of depth; the nearest comes first");
             return Err(Error::new(ErrorKind::BadInput, message));
         }

@@ -169,7 +169,7 @@ impl Loaded {
         let Some(p) = &stream.get_ref().pose_in_device else { return Ok(Pose::IDENTITY) };
         let norm = p.rotation_xyzw.iter().map(|q| q * q).sum::<f64>().sqrt();
         let finite = p.translation_m.iter().all(|t| t.is_finite());
-        if !finite || !((norm - 1.0).abs() < 1e-3) {
+        if !finite || !norm.is_finite() || (norm - 1.0).abs() > 1e-3 {
             let name = &stream.get_ref().name;
             let what = format!(
                 "pose_in_device of stream \"{name}\": rotation_xyzw must be a quaternion of length 1 (it has \
