@@ -192,6 +192,9 @@ impl Walk {
             crc.update(&body);
             offset += 9 + body.len() as u64;
         }
+        if reader.finished {
+            pass.findings.add(Severity::Broken, &pass.file, None, "the data has no end record");
+        }
         Ok(chunks)
     }
 

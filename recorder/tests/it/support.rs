@@ -165,6 +165,10 @@ pub fn names(fs: &MemFs) -> Vec<String> {
     fs.read_dir(&dir()).unwrap().into_iter().map(|e| e.name).collect()
 }
 
+/// A file system that shares nothing with `fs` and holds the same files.
+pub fn copy(fs: &MemFs) -> MemFs {
+    fs.after_crash(|n| n)
+}
 
 pub fn segment(index: u32) -> PathBuf {
     dir().join(format!("seg_{index:04}.mcap"))

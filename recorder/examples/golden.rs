@@ -1,0 +1,182 @@
+//! Writes a short dataset that is always the same, and the pixels that readers must find in it:
+//! `cargo run --example golden -- DATASET EXPECTED`.
+//!
+//! `EXPECTED/index.json` lists each picture: topic, log time, size, encoding, the file with its pixels, how
+//! they are to be compared (`exact` or `jpeg`) and the intrinsics. The files hold bare pixels, row by row.
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
+
+use depthrig_bus::{DropCounts, FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
+use depthrig_recorder::fs::RealFs;
+use depthrig_recorder::{
+    ColorCodec, Dataset, Diagnostic, Level, RecordFrame, RecordSet, Recorder, RecorderOptions, Session,
+    SetRange, StreamAccount, StreamRecord,
+};
+use serde_json::json;
+use std::path::Path;
+use std::sync::Arc;
+
+const SETS: u64 = 6;
+const PERIOD_NS: i64 = 200_000_000;
+const UTC_NS: i64 = 1_700_000_000_000_000_000;
+const MONO_NS: i64 = 1_000_000_000;
+
+fn stream(id: &str, format: PixelFormat, w: u32, h: u32, unit: f64) -> StreamRecord {
+    let mut intrinsics =
+        Intrinsics::pinhole(1.1 * f64::from(w), 1.1 * f64::from(w), 0.5 * f64::from(w), 0.5 * f64::from(h));
+    intrinsics.model = 2;
+    intrinsics.coeffs[..5].copy_from_slice(&[0.01, -0.02, 0.001, 0.0005, 0.003]);
+    StreamRecord {
+        id: id.parse().unwrap(),
+        model: "Golden".into(),
+        serial: "1".into(),
+        format,
+        width: w,
+        height: h,
+        rate_hz: 30.0,
+        depth_unit_m: unit,
+        calibration: "made up for the golden dataset".into(),
+        intrinsics,
+        pose: Pose { translation_m: [0.25, 0.0, 0.5], rotation_xyzw: [0.5, -0.5, 0.5, -0.5] },
+    }
+}
+
+fn pixels(s: &StreamRecord, n: u64) -> Vec<u8> {
+    let mut out = Vec::new();
+    for y in 0..s.height {
+        for x in 0..s.width {
+            let v = x + 2 * y + 5 * n as u32 + if x > s.width / 2 { 90 } else { 0 };
+            match s.format {
+                PixelFormat::Rgb8 => out.extend([v as u8, (v / 3) as u8, 255 - (v / 2) as u8]),
+                // Every bit of the sixteen is in use, and there are holes.
+                PixelFormat::Z16 => out.extend(if (x + y) % 13 == 0 {
+                    [0, 0]
+                } else {
+                    (v as u16).wrapping_mul(67).to_le_bytes()
+                }),
+                _ => out.push(v as u8),
+            }
+        }
+    }
+    out
+}
+
+fn write(dir: &Path, color: ColorCodec) -> Session {
+    let mut session = Session::new(dir.file_name().unwrap().to_string_lossy(), "golden");
+    (session.scene, session.started_utc_ns) = ("a gradient with an edge".into(), UTC_NS);
+    session.rig_config = "# the golden rig\n".into();
+    session.streams = vec![
+        stream("front/color", PixelFormat::Rgb8, 160, 120, 0.0),
+        stream("front/depth", PixelFormat::Z16, 160, 120, 0.001),
+        stream("front/ir_left", PixelFormat::Mono8, 96, 64, 0.0),
+        stream("near/depth", PixelFormat::Z16, 128, 72, 0.0001),
+    ];
+    // Two segments, and room on any disk.
+    let options = RecorderOptions {
+        color,
+        segment_max_ns: 4 * PERIOD_NS,
+        min_free_bytes: 0,
+        queue_sets: SETS as usize,
+        ..RecorderOptions::default()
+    };
+    let recorder = Recorder::create(Arc::new(RealFs), dir, session.clone(), options).unwrap();
+    recorder.add_note("the golden note").unwrap();
+    recorder.diagnostics(vec![Diagnostic {
+        level: Level::Ok,
+        name: "golden/front".into(),
+        message: "streaming".into(),
+        hardware_id: "1".into(),
+        values: vec![("drift_ppm".into(), "1.5".into())],
+    }]);
+    recorder.update_accounts(vec![StreamAccount {
+        stream: "front/depth".parse().unwrap(),
+        captured: 40,
+        delivered: 38,
+        dropped: DropCounts([2, 0, 0, 0, 0, 0, 0, 0]),
+    }]);
+    for n in 0..SETS {
+        let tick = MONO_NS + n as i64 * PERIOD_NS;
+        let frames: Vec<_> = session
+            .streams
+            .iter()
+            .enumerate()
+            // The third set lacks a camera.
+            .filter(|(i, _)| !(n == 2 && *i == 3))
+            .map(|(stream, s)| {
+                let mut header = FrameHeader::default();
+                header.set_names("golden", &s.id);
+                header.set_device(&s.model, &s.serial);
+                header.set_picture(s.format, s.width, s.height);
+                header.sequence = 6 * n + 1;
+                header.captured = header.sequence;
+                header.capture_time_ns = tick - 4_000_000 + 1_000_000 * stream as i64;
+                header.depth_unit_m = s.depth_unit_m;
+                header.intrinsics = s.intrinsics;
+                header.pose = s.pose;
+                RecordFrame { stream, header, pixels: Box::new(pixels(s, n)) }
+            })
+            .collect();
+        let times: Vec<_> = frames.iter().map(|f| f.header.capture_time_ns).collect();
+        let set = RecordSet {
+            id: n + 1,
+            tick: HostTime::from_ns(tick),
+            utc: UtcPair { mono: HostTime::from_ns(MONO_NS), utc_ns: UTC_NS, width_ns: 200 },
+            spread_ns: times.iter().max().unwrap() - times.iter().min().unwrap(),
+            missing: if n == 2 { vec![3] } else { Vec::new() },
+            frames,
+        };
+        recorder.push(set).unwrap();
+    }
+    let summary = recorder.finish().unwrap();
+    assert!(summary.complete, "{:?}", summary.lost);
+    session
+}
+
+/// Writes what our own reader finds; where pixels are stored losslessly that is checked against the source.
+fn expect(dir: &Path, expected: &Path, session: &Session) {
+    std::fs::create_dir_all(expected).unwrap();
+    let mut pictures = Vec::new();
+    for set in Dataset::open(dir).unwrap().sets(SetRange::ALL) {
+        let set = set.unwrap();
+        for f in set.frames {
+            let s = &session.streams[f.stream];
+            let exact = f.codec == "raw";
+            assert!(!exact || f.pixels == pixels(s, set.id - 1));
+            let file = format!("{}_{}_{}.bin", set.id, s.id.camera, s.id.stream);
+            std::fs::write(expected.join(&file), &f.pixels).unwrap();
+            let (encoding, last) = match (s.format, exact) {
+                (PixelFormat::Z16, _) => ("16UC1", "image_raw"),
+                (PixelFormat::Rgb8, true) => ("rgb8", "image_raw"),
+                (PixelFormat::Rgb8, false) => ("rgb8", "image_compressed"),
+                _ => ("mono8", "image_raw"),
+            };
+            let base = format!("/golden/{}/{}", s.id.camera, s.id.stream);
+            let i = &f.header.intrinsics;
+            pictures.push(json!({
+                "topic": format!("{base}/{last}"), "base": base, "set": set.id, "file": file,
+                // As text: 64-bit times do not survive JavaScript's numbers.
+                "log_time": set.utc_ns.to_string(),
+                "stamp": (f.header.capture_time_ns + set.utc_offset_ns).to_string(),
+                "width": s.width, "height": s.height, "encoding": encoding,
+                "compare": if exact { "exact" } else { "jpeg" },
+                "sequence": f.header.sequence, "depth_unit_m": f.header.depth_unit_m,
+                "k": [i.fx, 0.0, i.cx, 0.0, i.fy, i.cy, 0.0, 0.0, 1.0], "d": i.coeffs[..5],
+            }));
+        }
+    }
+    let index = json!({ "rig": "golden", "sets": SETS, "note": "the golden note", "pictures": pictures });
+    std::fs::write(expected.join("index.json"), serde_json::to_vec_pretty(&index).unwrap()).unwrap();
+}
+
+fn main() {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    let (dataset, expected, color) = match args.as_slice() {
+        [d, e] => (d, e, ColorCodec::Jpeg),
+        [d, e, raw] if raw == "raw" => (d, e, ColorCodec::Raw),
+        _ => {
+            println!("usage: golden DATASET EXPECTED [raw]");
+            std::process::exit(2);
+        }
+    };
+    let session = write(Path::new(dataset), color);
+    expect(Path::new(dataset), Path::new(expected), &session);
+}
