@@ -10,7 +10,9 @@ use core::time::Duration;
 use iceoryx2::prelude::*;
 
 /// Names of shared memory begin with this, so that one sees whose they are; Python uses the same.
-const PREFIX: &str = "depthrig_";
+pub const SHM_PREFIX: &str = "depthrig_";
+/// The folder below the runtime folder that holds the files of iceoryx2.
+pub const IOX_FOLDER: &str = "iox2";
 
 /// A process's place on the bus of one rig.
 #[derive(Debug)]
@@ -181,11 +183,11 @@ fn config(runtime: &RuntimeDir) -> Result<Config> {
         let path = runtime.path().display();
         Error::new(ErrorKind::Other, format!("{path} cannot be the runtime folder: {e:?}"))
     };
-    let text = runtime.path().join("iox2").to_string_lossy().into_owned();
+    let text = runtime.path().join(IOX_FOLDER).to_string_lossy().into_owned();
     let root = Path::new(text.as_bytes()).map_err(|e| unusable(&e))?;
     let mut config = Config::default();
     config.global.set_root_path(&root);
-    config.global.prefix = FileName::new(PREFIX.as_bytes()).map_err(|e| unusable(&e))?;
+    config.global.prefix = FileName::new(SHM_PREFIX.as_bytes()).map_err(|e| unusable(&e))?;
     // How long an opener waits for a creator that is half done; a publisher may wait as long for a broken reader.
     config.global.creation_timeout = Duration::from_millis(500);
     Ok(config)

@@ -9,7 +9,8 @@ use iceoryx2::prelude::ZeroCopySend;
 
 /// Streams that one set can have at most.
 pub const MAX_MEMBERS: usize = 64;
-const RECORD_BYTES: usize = 96;
+/// Bytes of one [`MemberRecord`] in the payload of a set message.
+pub const RECORD_BYTES: usize = 96;
 
 /// The header of a frame set.
 #[repr(C)]

@@ -1,0 +1,57 @@
+"""Subscribe to the streams of a depthrig camera rig: read-only NumPy arrays in shared memory, without a copy.
+
+>>> import depthrig
+>>> with depthrig.Stream("d435/depth") as stream:
+...     frame = stream.next(timeout=1.0)
+...     print(frame.header.sequence, frame.array.shape, frame.depth_m().max())
+"""
+
+from __future__ import annotations
+
+from ._frame import Frame
+from ._header import Header, Intrinsics, Pose
+from ._layout import ClockDomain, Distortion, DropReason, FrameFlags, PixelFormat
+from ._runtime import running_rigs
+from ._sets import FrameSet, Sets
+from ._stream import Stream, streams
+from .errors import (
+    AmbiguousRig,
+    BadFrame,
+    BusError,
+    DepthrigError,
+    HoldingTooMany,
+    RigNotRunning,
+    StreamGone,
+    StreamNotFound,
+    Timeout,
+    VersionMismatch,
+)
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "AmbiguousRig",
+    "BadFrame",
+    "BusError",
+    "ClockDomain",
+    "DepthrigError",
+    "Distortion",
+    "DropReason",
+    "Frame",
+    "FrameFlags",
+    "FrameSet",
+    "Header",
+    "HoldingTooMany",
+    "Intrinsics",
+    "PixelFormat",
+    "Pose",
+    "RigNotRunning",
+    "Sets",
+    "Stream",
+    "StreamGone",
+    "StreamNotFound",
+    "Timeout",
+    "VersionMismatch",
+    "running_rigs",
+    "streams",
+]

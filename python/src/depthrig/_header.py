@@ -1,0 +1,201 @@
+"""What a frame says of itself, as an object. The layout itself is generated: see _layout.py."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from . import _layout
+from ._layout import ClockDomain, Distortion, DropReason, FrameFlags, HeaderFields, PixelFormat
+from .errors import VersionMismatch
+
+_CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "i64": "q", "f32": "f", "f64": "d"}
+
+
+class Intrinsics(_layout.IntrinsicsFields):
+    """Camera intrinsics for the size of the frame: pixels, the centre of the top-left pixel at (0, 0)."""
+
+    __slots__ = ()
+
+    @property
+    def distortion(self) -> Distortion:
+        """The distortion model; models of later versions read as UNKNOWN."""
+        return Distortion(self.model) if self.model in list(Distortion) else Distortion.UNKNOWN
+
+    @property
+    def is_known(self) -> bool:
+        """Whether a calibration is known at all."""
+        return self.fx > 0
+
+    def matrix(self) -> npt.NDArray[np.float64]:
+        """Return the 3x3 camera matrix K."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+
+class Pose(_layout.PoseFields):
+    """Pose of the stream's optical frame on the mount: `p_mount = R p_camera + t`."""
+
+    __slots__ = ()
+
+    def matrix(self) -> npt.NDArray[np.float64]:
+        """Return the 4x4 matrix that takes points of the camera to points of the mount, metres."""
+        x, y, z, w = self.rotation_xyzw
+        pose = np.eye(4)
+        pose[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+        pose[:3, 3] = self.translation_m
+        return pose
+
+
+class Header(HeaderFields):
+    """The header of a frame: every field as an attribute, and what follows from them.
+
+    It is a copy of the 768 bytes in shared memory and stays valid without the frame. Times are nanoseconds on
+    CLOCK_MONOTONIC, the clock of :func:`time.monotonic_ns`.
+    """
+
+    __slots__ = ()
+
+    def __init__(self, raw: bytes) -> None:
+        if len(raw) != _layout.HEADER_SIZE:
+            raise ValueError(f"a header has {_layout.HEADER_SIZE} bytes, not {len(raw)}")
+        super().__init__(raw)
+
+    def check_version(self, what: str) -> None:
+        """Raise VersionMismatch unless this is a header of the version that this package reads."""
+        if (self.magic, self.version, self.size) != (
+            _layout.HEADER_MAGIC,
+            _layout.HEADER_VERSION,
+            _layout.HEADER_SIZE,
+        ):
+            raise VersionMismatch(
+                f"{what}: a frame has header version {self.version} ({self.magic!r}, {self.size} bytes), this "
+                f"package reads version {_layout.HEADER_VERSION}; install the `depthrig` package of the "
+                "daemon's version"
+            )
+
+    @property
+    def pixel_format(self) -> PixelFormat | None:
+        """How the pixels are stored; None for a format of a later version."""
+        code = self.format
+        return PixelFormat(code) if code in list(PixelFormat) else None
+
+    @property
+    def format_name(self) -> str:
+        """Name of the pixel format, as configuration and reports write it."""
+        pixel_format = self.pixel_format
+        return f"unknown format {self.format}" if pixel_format is None else pixel_format.name.lower()
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether the pixels are depth."""
+        return self.format in (PixelFormat.Z16, PixelFormat.DEPTH_F32)
+
+    @property
+    def stream_id(self) -> str:
+        """CAMERA/STREAM, as :class:`depthrig.Stream` takes it."""
+        return f"{self.camera}/{self.stream}"
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Intrinsics of this picture at this size."""
+        return Intrinsics(*self._intrinsics())
+
+    @property
+    def pose(self) -> Pose:
+        """Pose of this stream's optical frame on the mount."""
+        return Pose(*self._pose())
+
+    @property
+    def drops(self) -> dict[str, int]:
+        """Frames lost so far, by reason; `captured = sequence + sum(drops.values())`."""
+        return {reason.name.lower(): n for reason, n in zip(DropReason, self.dropped)}
+
+    @property
+    def clock(self) -> ClockDomain | None:
+        """Where the capture time comes from; None for a domain of a later version."""
+        code = self.clock_domain
+        return ClockDomain(code) if code in list(ClockDomain) else None
+
+    @property
+    def flags(self) -> FrameFlags:
+        """Facts about the frame, as bits."""
+        return FrameFlags(super().flags)
+
+    @property
+    def flag_names(self) -> frozenset[str]:
+        """Facts about the frame, as names: `"replayed" in header.flag_names`."""
+        flags = self.flags
+        return frozenset(f.name.lower() for f in FrameFlags if f in flags and f.name is not None)
+
+    @property
+    def replayed(self) -> bool:
+        """Published by a replay: the times are those of the recording."""
+        return FrameFlags.REPLAYED in self.flags
+
+    @property
+    def derived(self) -> bool:
+        """Made from other frames, not captured."""
+        return FrameFlags.DERIVED in self.flags
+
+    @property
+    def synthetic(self) -> bool:
+        """Made by a simulated camera."""
+        return FrameFlags.SYNTHETIC in self.flags
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since the middle of the exposure. Of a replayed frame it is the age of the recording."""
+        return (time.monotonic_ns() - self.capture_time_ns) / 1e9
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return every field of the layout by its name; nested ones are written `intrinsics.fx`."""
+        values: dict[str, Any] = {}
+        for name, _, _, _ in _layout.FIELDS:
+            part: Any = self
+            for attribute in name.split("."):
+                part = getattr(part, attribute)
+            values[name] = int(part) if name == "flags" else part
+        return values
+
+    @classmethod
+    def pack(cls, values: Mapping[str, Any]) -> bytes:
+        """Return the bytes of a header with these values, named as :meth:`to_dict` names them."""
+        raw = bytearray(_layout.HEADER_SIZE)
+        for name, offset, kind, count in _layout.FIELDS:
+            value = values[name]
+            if isinstance(value, (str, bytes)):
+                value = value.encode() if isinstance(value, str) else value
+                struct.pack_into(f"<{count}s", raw, offset, value)
+            else:
+                parts = value if isinstance(value, (tuple, list)) else (value,)
+                struct.pack_into(f"<{count}{_CODES[kind]}", raw, offset, *parts)
+        return bytes(raw)
+
+    @property
+    def raw(self) -> bytes:
+        """The bytes as they lay in shared memory."""
+        return self._raw
+
+    def __eq__(self, other: object) -> bool:
+        return self._raw == other._raw if isinstance(other, Header) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._raw)
+
+    def __repr__(self) -> str:
+        flags = f" [{', '.join(sorted(self.flag_names))}]" if self.flags else ""
+        lost = {reason: n for reason, n in self.drops.items() if n}
+        return (
+            f"<Header {self.stream_id} #{self.sequence} {self.width}x{self.height} {self.format_name}, "
+            f"captured at {self.capture_time_ns} ns ±{self.capture_uncertainty_ns / 1e6:.3g} ms"
+            f"{f', dropped {lost}' if lost else ''}{flags}>"
+        )

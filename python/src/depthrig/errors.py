@@ -1,0 +1,43 @@
+"""What can go wrong; every message says what happened, to which stream, and what to do."""
+
+from __future__ import annotations
+
+
+class DepthrigError(Exception):
+    """Any error of this package."""
+
+
+class RigNotRunning(DepthrigError):
+    """The rig is not running; the message names those that are."""
+
+
+class AmbiguousRig(DepthrigError):
+    """Several rigs run and none was named."""
+
+
+class StreamNotFound(DepthrigError):
+    """The rig has no such stream; the message names those that it has."""
+
+
+class StreamGone(DepthrigError):
+    """Nobody publishes the stream any more. The same object goes on when somebody does again."""
+
+
+class Timeout(DepthrigError, TimeoutError):
+    """No frame came in time, although somebody publishes the stream."""
+
+
+class HoldingTooMany(DepthrigError):
+    """This subscriber holds as many frames as it may; delete some, or work on copies."""
+
+
+class VersionMismatch(DepthrigError):
+    """The two sides speak different versions of depthrig or iceoryx2."""
+
+
+class BadFrame(DepthrigError):
+    """A frame's header contradicts its pixels."""
+
+
+class BusError(DepthrigError):
+    """The shared memory cannot be used: permissions, limits, or a failure of iceoryx2."""

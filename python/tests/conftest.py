@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from rig import Publisher, build_publisher
+
+
+@pytest.fixture(scope="session")
+def binary() -> str:
+    return build_publisher()
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """A runtime folder: short, because sockets live below it."""
+    path = Path(tempfile.mkdtemp(prefix="rig", dir="/tmp"))
+    yield path
+    shutil.rmtree(path, ignore_errors=True)
+
+
+@pytest.fixture
+def start(binary: str, folder: Path) -> Iterator[Callable[..., Publisher]]:
+    """Starts publishers in `folder`; they are ended with the test."""
+    started: list[Publisher] = []
+
+    def start(*options: str, rig: str = "example") -> Publisher:
+        started.append(Publisher(binary, folder, *options, rig=rig))
+        return started[-1]
+
+    yield start
+    for publisher in started:
+        publisher.kill()
