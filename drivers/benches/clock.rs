@@ -14,7 +14,7 @@ fn frame(i: u64, stalls: bool) -> (u64, HostTime) {
     let time_ns = i * PERIOD_NS;
     let raw = ((time_ns + time_ns / 20_000) / 1000) & 0xffff_ffff;
     let random = i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32;
-    let arrival = time_ns + 3_000_000 + (random * random >> 32) * 2_000_000 / 0xffff_ffff;
+    let arrival = time_ns + 3_000_000 + ((random * random) >> 32) * 2_000_000 / 0xffff_ffff;
     let stall = if stalls && i % 30 < 4 { (4 - i % 30) * PERIOD_NS } else { 0 };
     (raw, HostTime::from_ns((arrival + stall) as i64))
 }
