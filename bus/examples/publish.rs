@@ -7,8 +7,9 @@
 //! Every pixel format given becomes the stream `pattern/<format>`; `--formats all` makes one of each. After every
 //! round of frames the rig's frame set is published, with the stream `pattern/missing` absent. `--pad` appends bytes
 //! to each row. `--step` waits for a number on stdin, publishes that many frames, prints the last sequence number, and
-//! so on until stdin ends. `--dump` only writes a header with a distinct value in every field: the bytes as they lie
-//! in shared memory, and as JSON; mirrors in other languages are tested with it.
+//! so on until stdin ends; times are invented then, and every field of the header is filled. `--dump` publishes
+//! nothing and writes a header with a distinct value in every field: the bytes as they lie in shared memory, and as
+//! JSON; mirrors in other languages are tested with it.
 
 #![recursion_limit = "256"] // one JSON object with 42 fields
 
@@ -53,13 +54,14 @@ fn main() -> Result<(), Box<dyn Error>> {
         .collect::<Result<Vec<_>, depthrig_bus::Error>>()?;
     let sets = bus.set_publisher()?;
     let publish = |sequence: u64| -> Result<(), Box<dyn Error>> {
+        let capture_ns = if options.step { step_ns(sequence) } else { HostTime::now().ns() };
         let mut members = vec![missing()?];
         for (id, format, publisher) in &streams {
-            members.push(send(&options, id, *format, publisher, sequence)?);
+            members.push(send(&options, (id, *format, publisher), sequence, capture_ns)?);
         }
         let header = SetHeader {
             set_id: sequence,
-            tick_ns: capture_ns(sequence),
+            tick_ns: capture_ns,
             spread_ns: 1_234,
             incomplete: sequence,
             ..SetHeader::default()
@@ -95,28 +97,31 @@ fn main() -> Result<(), Box<dyn Error>> {
 /// Publishes frame `sequence` of one stream.
 fn send(
     options: &Options,
-    id: &StreamId,
-    format: PixelFormat,
-    publisher: &Publisher,
+    (id, format, publisher): (&StreamId, PixelFormat, &Publisher),
     sequence: u64,
+    capture_ns: i64,
 ) -> Result<MemberRecord, depthrig_bus::Error> {
-    let header = picture(options, format);
+    let mut header = picture(options, format);
+    if !options.step {
+        (header.flags, header.dropped) = (FrameFlags::SYNTHETIC.0, [0; 8]);
+    }
     let mut frame = publisher.loan(header.payload_len as usize)?;
     *frame.header_mut() = header;
     frame.header_mut().set_names(options.rig.as_str(), id);
     frame.header_mut().sequence = sequence;
     frame.header_mut().captured = sequence + header.drops().total();
-    frame.header_mut().capture_time_ns = capture_ns(sequence);
+    frame.header_mut().capture_time_ns = capture_ns;
     fill(format, &header, sequence, frame.pixels_mut());
     publisher.send(frame)?;
-    Ok(MemberRecord { id: id.clone(), sequence: Some(sequence), capture_time_ns: capture_ns(sequence) })
+    Ok(MemberRecord { id: id.clone(), sequence: Some(sequence), capture_time_ns: capture_ns })
 }
 
 fn missing() -> Result<MemberRecord, depthrig_bus::Error> {
     Ok(MemberRecord { id: StreamId::new("pattern", "missing")?, sequence: None, capture_time_ns: 0 })
 }
 
-const fn capture_ns(sequence: u64) -> i64 {
+/// Capture time of a frame that is published with `--step`: 30 Hz from the first second on.
+const fn step_ns(sequence: u64) -> i64 {
     1_000_000_000 + sequence as i64 * 33_333_333
 }
 

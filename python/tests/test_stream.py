@@ -214,7 +214,9 @@ def test_views_may_die_in_other_threads(start: Start, folder: Path) -> None:
 
 def run(code: str, folder: Path, **more: object) -> subprocess.CompletedProcess[str]:
     """Runs `code` in a fresh interpreter, where a crash is an exit status."""
-    program = f"import depthrig, numpy as np\nS = lambda n: depthrig.Stream(n, runtime_dir={str(folder)!r}, timeout=20)\n"
+    program = (
+        f"import depthrig, numpy as np\nS = lambda n: depthrig.Stream(n, runtime_dir={str(folder)!r}, timeout=20)\n"
+    )
     command = [sys.executable, "-c", program + textwrap.dedent(code)]
     return subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S * 2, check=False, **more)  # type: ignore[call-overload,no-any-return]
 
