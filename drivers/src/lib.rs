@@ -12,6 +12,7 @@ mod error;
 pub mod files;
 mod gate;
 mod sink;
+pub mod synthetic;
 
 pub use device::{
     Backend, Device, DeviceClock, DeviceInfo, Poll, Stream, StreamProfile, StreamRequest, choose_profiles,

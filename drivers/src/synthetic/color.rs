@@ -1,0 +1,214 @@
+//! The colour picture: one lamp with a soft shadow, light from all around, mirrors, glass, and the noise of a
+//! real sensor.
+
+use super::noise::{Rolls, normal_of};
+use super::scene::{LAMP, Met, Spot, World};
+use super::texture::Surface;
+use super::view::{Ball, NOTHING, TILE, Tile, View, between};
+use glam::Vec3;
+use rayon::prelude::*;
+
+/// How often light is followed through mirrors and glass.
+const BOUNCES: u32 = 3;
+/// Standard deviation of the sensor's noise in steps of 256 in the mid-tones.
+const NOISE: f32 = 1.3;
+
+/// Renders an RGB8 picture.
+pub(crate) fn render(world: &World, view: &View<'_>, white: [f32; 3], seed: u64) -> Vec<u8> {
+    let mets = view.cast(world);
+    let (w, h) = (view.rays.width, view.rays.height);
+    let mut picture = vec![0; w * h * 3];
+    let tone = Tone::new(white);
+    picture.par_chunks_mut(w * TILE * 3).enumerate().for_each(|(band, out)| {
+        for tile in view.tiles(band * TILE) {
+            let Some(shader) = Shader::new(world, view, &mets, &tile) else { continue };
+            for y in tile.ys.clone() {
+                for x in tile.xs.clone() {
+                    let met = mets[y * w + x];
+                    if met != NOTHING {
+                        let light = shader.pixel(&mets, x, y, met);
+                        let at = ((y - band * TILE) * w + x) * 3;
+                        let rolls = Rolls::new(seed, x as u32, y as u32, 0).bits(0);
+                        out[at..at + 3].copy_from_slice(&tone.develop(light, rolls));
+                    }
+                }
+            }
+        }
+    });
+    picture
+}
+
+struct Shader<'a> {
+    world: &'a World,
+    view: &'a View<'a>,
+    /// The solids that this tile's rays can meet, that can shade it, and that are near it.
+    seen: Vec<u16>,
+    shading: Vec<u16>,
+    near: Vec<u16>,
+    all: Vec<u16>,
+}
+
+/// Whose shadows and contacts matter at a spot.
+#[derive(Clone, Copy)]
+struct Around<'a> {
+    shading: &'a [u16],
+    near: &'a [u16],
+}
+
+impl<'a> Shader<'a> {
+    fn new(world: &'a World, view: &'a View<'a>, mets: &[Met], tile: &Tile) -> Option<Self> {
+        let extent = view.extent(mets, tile)?;
+        let lamp = Ball { center: LAMP.0, radius: LAMP.1 };
+        let reach = Ball { center: extent.center, radius: extent.radius + 0.17 };
+        Some(Self {
+            world,
+            view,
+            seen: view.in_sight(world, tile),
+            shading: between(world, extent, lamp),
+            near: between(world, reach, reach),
+            all: world.all(),
+        })
+    }
+
+    /// The light that a pixel gets; with four rays where the picture has an edge.
+    fn pixel(&self, mets: &[Met], x: usize, y: usize, met: Met) -> Vec3 {
+        let (eye, dir) = (self.view.eye, self.view.dir(x, y));
+        let spot = self.world.spot(eye, dir, met);
+        let (w, h) = (self.view.rays.width, self.view.rays.height);
+        let key = |x: usize, y: usize| mets[y * w + x].key;
+        let is_edge = (x > 0 && key(x - 1, y) != met.key)
+            || (x + 1 < w && key(x + 1, y) != met.key)
+            || (y > 0 && key(x, y - 1) != met.key)
+            || (y + 1 < h && key(x, y + 1) != met.key);
+        let around = Around { shading: &self.shading, near: &self.near };
+        let phase = (x & 1) | ((y & 1) << 1);
+        if !(is_edge || spot.paint.is_sharp()) || w < 2 || h < 2 {
+            return self.light(&spot, dir, met.t, around, phase, BOUNCES);
+        }
+        let mut sum = Vec3::ZERO;
+        for (i, (dx, dy)) in
+            [(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)].into_iter().enumerate()
+        {
+            let dir = self.view.dir_between(x, y, dx, dy);
+            let met = self.world.meet(&self.seen, eye, dir);
+            let spot = self.world.spot(eye, dir, met);
+            // The spots between pixels of an edge may lie outside what the tile's lists were made for.
+            let around = if is_edge { Around { shading: &self.all, near: &self.near } } else { around };
+            // Bright spots are cut before the mean, or the edge of a highlight would stay jagged.
+            sum += self.light(&spot, dir, met.t, around, i, BOUNCES).min(Vec3::splat(1.5));
+        }
+        sum * 0.25
+    }
+
+    /// The light that leaves `spot` against `dir`.
+    fn light(&self, spot: &Spot, dir: Vec3, t: f32, around: Around<'_>, phase: usize, bounces: u32) -> Vec3 {
+        let forward = dir.normalize();
+        let facing = (-spot.n.dot(forward)).clamp(0.0, 1.0);
+        let fresnel = (1.0 - facing).powi(5);
+        match spot.paint.surface() {
+            Surface::Mirror => {
+                self.follow(spot, forward.reflect(spot.n), bounces) * Vec3::new(0.86, 0.88, 0.87)
+            }
+            Surface::Glass => {
+                let part = 0.06 + 0.94 * fresnel;
+                let behind = self.follow(spot, forward, bounces) * Vec3::new(0.90, 0.965, 0.94);
+                let rim = spot.normal_local.y.abs() < 0.5;
+                let behind = if rim { behind * 0.35 + Vec3::new(0.10, 0.26, 0.20) } else { behind };
+                behind * (1.0 - part) + self.follow(spot, forward.reflect(spot.n), bounces) * part
+            }
+            surface => {
+                let color = spot.paint.color(spot.local, spot.normal_local, t * self.view.rays.pixel_rad);
+                let open = self.world.openness(around.near, spot);
+                let to_lamp = LAMP.0 - spot.p;
+                let lit = self.lit(spot, around.shading, phase);
+                let half = (to_lamp.normalize() - forward).normalize_or(spot.n);
+                let fall = 1.9 / to_lamp.length_squared();
+                let key =
+                    Vec3::new(1.0, 0.93, 0.82) * (lit * fall * spot.n.dot(to_lamp.normalize()).max(0.0));
+                // From above the sky through a window, from below what the floor sends back.
+                let up = spot.n.z * 0.5 + 0.5;
+                let fill = Vec3::new(0.30, 0.245, 0.20).lerp(Vec3::new(0.43, 0.47, 0.53), up) * open;
+                let body = color * (key + fill);
+                let shine = |power: f32| spot.n.dot(half).max(0.0).powf(power) * lit * fall;
+                match surface {
+                    Surface::Shiny => {
+                        let mirror = self.follow(spot, forward.reflect(spot.n), bounces);
+                        body * 0.35 + mirror * color * (0.8 + 0.2 * fresnel) + Vec3::splat(shine(180.0) * 1.2)
+                    }
+                    Surface::Glossy => {
+                        let part = 0.035 + 0.5 * fresnel;
+                        let mirror = if part > 0.06 {
+                            self.follow(spot, forward.reflect(spot.n), bounces)
+                        } else {
+                            fill
+                        };
+                        body * (1.0 - part) + mirror * part + Vec3::splat(shine(70.0) * 0.22)
+                    }
+                    _ => body,
+                }
+            }
+        }
+    }
+
+    /// What comes along a ray that leaves a spot.
+    fn follow(&self, spot: &Spot, dir: Vec3, bounces: u32) -> Vec3 {
+        if bounces == 0 {
+            return Vec3::new(0.3, 0.3, 0.3);
+        }
+        let from = spot.p + dir * 2e-4;
+        let met = self.world.meet(&self.all, from, dir);
+        let next = self.world.spot(from, dir, met);
+        self.light(&next, dir, met.t, Around { shading: &self.all, near: &self.all }, 0, bounces - 1)
+    }
+
+    /// The part of the lamp that a spot sees, 0..1.
+    fn lit(&self, spot: &Spot, shading: &[u16], phase: usize) -> f32 {
+        let to_lamp = LAMP.0 - spot.p;
+        if spot.n.dot(to_lamp) <= 0.0 {
+            return 0.0;
+        }
+        if shading.is_empty() {
+            return 1.0;
+        }
+        // Neighbouring pixels try other places on the lamp, which blurs the steps of the shadow's rim.
+        let (u, v) = to_lamp.normalize().any_orthonormal_pair();
+        let from = spot.p + spot.n * 3e-4;
+        let mut seen = 0;
+        for i in 0..4 {
+            let (sin, cos) = ((i * 4 + phase) as f32 * (core::f32::consts::TAU / 16.0) * 2.76).sin_cos();
+            let radius = LAMP.1 * (0.35 + 0.2 * i as f32);
+            seen += u32::from(!self.world.is_blocked(shading, from, LAMP.0 + (u * cos + v * sin) * radius));
+        }
+        seen as f32 / 4.0
+    }
+}
+
+/// From light to bytes.
+struct Tone {
+    white: Vec3,
+    /// sRGB's curve with a shoulder for what is too bright, over 0..4 in 4096 steps.
+    curve: Vec<f32>,
+}
+
+impl Tone {
+    fn new(white: [f32; 3]) -> Self {
+        let curve = (0..4096).map(|i| {
+            let x = i as f32 / 1023.75;
+            // The filmic curve fitted by Narkowicz (2015), then sRGB (IEC 61966-2-1).
+            let film = (x * (2.51 * x + 0.03)) / (x * (2.43 * x + 0.59) + 0.14);
+            let srgb = if film <= 0.003_130_8 { 12.92 * film } else { 1.055 * film.powf(1.0 / 2.4) - 0.055 };
+            srgb.clamp(0.0, 1.0) * 255.0
+        });
+        Self { white: white.into(), curve: curve.collect() }
+    }
+
+    fn develop(&self, light: Vec3, rolls: u64) -> [u8; 3] {
+        let light = light * self.white * 0.78;
+        core::array::from_fn(|c| {
+            let at = (light[c] * 1023.75).clamp(0.0, 4095.0) as usize;
+            // One draw serves three channels: bits are taken at other places, and eyes do not mind.
+            let noise = normal_of(rolls.rotate_left(c as u32 * 21).wrapping_mul(0x9E37_79B9_7F4A_7C15));
+            (self.curve[at] + noise * NOISE + 0.5).clamp(0.0, 255.0) as u8
+        })
+    }
+}
