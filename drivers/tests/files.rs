@@ -3,6 +3,7 @@
 
 use core::time::Duration;
 use depthrig_bus::{ClockDomain, Distortion, PixelFormat};
+use depthrig_drivers::capture::{Capture, Session, StopOutcome};
 use depthrig_drivers::files::{EXAMPLE_MANIFEST, FilesBackend, FilesConfig};
 use depthrig_drivers::{Backend, Error, ErrorKind, MemorySink, Poll, Stream, StreamRequest};
 use image::{ExtendedColorType, ImageFormat};
@@ -190,6 +191,28 @@ fn a_picture_that_changes_its_size_while_playing_is_named() {
     assert_eq!(error.kind(), ErrorKind::BadInput);
     for word in ["color_1.png", "was 4x3 8-bit colour", "is 5x3 8-bit colour now"] {
         assert!(error.to_string().contains(word), "{error}");
+    }
+}
+
+#[test]
+fn a_slow_camera_stops_at_once_and_one_at_its_end_says_so() {
+    for (looped, wanted) in [(true, "Stopped"), (false, "Finished")] {
+        let dir = folder(&manifest("", &[COLOR, DEPTH]), 1);
+        let rate_hz = Some(if looped { 0.01 } else { 500.0 });
+        let config = FilesConfig { rate_hz, looped: Some(looped), ..FilesConfig::new(dir.path()) };
+        let capture = Capture::spawn("cam", move || {
+            let device = FilesBackend::new(config).open(None)?;
+            let info = device.info().clone();
+            Ok(Session { info, stream: device.start(&[])?, sink: Box::new(MemorySink::default()) })
+        })
+        .unwrap();
+        while capture.last_frame().is_none() || (!looped && !capture.has_ended()) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        match capture.stop(Duration::from_secs(1)) {
+            StopOutcome::Ended(end) => assert_eq!(format!("{end:?}"), wanted),
+            StopOutcome::Abandoned => panic!("it was waiting for its next picture and could not be stopped"),
+        }
     }
 }
 
