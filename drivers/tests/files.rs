@@ -1,4 +1,6 @@
 //! The `files` backend: what it plays, and what it says about folders that cannot be played.
+//!
+//! Longer than most files: every test builds its folder with the same few helpers.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use core::time::Duration;
