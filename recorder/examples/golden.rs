@@ -160,6 +160,7 @@ fn expect(dir: &Path, expected: &Path, session: &Session) {
                 "compare": if exact { "exact" } else { "jpeg" },
                 "sequence": f.header.sequence, "depth_unit_m": f.header.depth_unit_m,
                 "k": [i.fx, 0.0, i.cx, 0.0, i.fy, i.cy, 0.0, 0.0, 1.0], "d": i.coeffs[..5],
+                "translation": s.pose.translation_m, "rotation": s.pose.rotation_xyzw,
             }));
         }
     }

@@ -197,7 +197,7 @@ fn steady(options: &BenchOptions, pool: &pictures::Pool) -> Result<Steady> {
     let sets = (options.seconds * options.rate_hz).round().max(1.0) as u64;
     let (begin, cpu, utc) = (HostTime::now(), process_cpu_ns(), UtcPair::sample());
     let mut push_max_ns = 0;
-    let summary = record(&options.dir, &sources, options.recorder.clone(), |recorder| {
+    let measured = record(&options.dir, &sources, options.recorder.clone(), |recorder| {
         for n in 0..sets {
             let due = begin.plus(period.saturating_mul(n as u32));
             std::thread::sleep(due.from_now());
@@ -209,8 +209,8 @@ fn steady(options: &BenchOptions, pool: &pictures::Pool) -> Result<Steady> {
         }
         std::thread::sleep(begin.plus(period.saturating_mul(sets as u32)).from_now());
     })?;
-    let wall = begin.elapsed().as_secs_f64();
-    let cpu = (process_cpu_ns() - cpu) as f64 / 1e9;
+    let Measured { summary, end, end_cpu_ns } = measured;
+    let (wall, cpu) = (end.since_ns(begin) as f64 / 1e9, (end_cpu_ns - cpu) as f64 / 1e9);
     let raw: usize = sources.iter().map(|s| s.pictures[0].len()).sum();
     let mb = summary.bytes as f64 / 1e6;
     let pairs = summary.sets.recorded * options.cameras as u64;
@@ -247,7 +247,7 @@ fn throughput(options: &BenchOptions) -> Result<Throughput> {
     };
     let sets = options.writer_bytes.div_ceil((PAYLOAD * STREAMS) as u64).max(1);
     let (begin, cpu, utc) = (HostTime::now(), process_cpu_ns(), UtcPair::sample());
-    let summary = record(&options.dir, &sources, recorder, |recorder| {
+    let measured = record(&options.dir, &sources, recorder, |recorder| {
         for n in 0..sets {
             let tick = begin.plus_ns(n as i64 * 1_000_000);
             while recorder.progress().encode_queue >= 2 || recorder.progress().backlog_bytes > 64 << 20 {
@@ -256,7 +256,8 @@ fn throughput(options: &BenchOptions) -> Result<Throughput> {
             drop(recorder.push(set(&sources, n + 1, tick, utc)));
         }
     })?;
-    let (wall, cpu) = (begin.elapsed().as_secs_f64(), (process_cpu_ns() - cpu) as f64 / 1e9);
+    let Measured { summary, end, end_cpu_ns } = measured;
+    let (wall, cpu) = (end.since_ns(begin) as f64 / 1e9, (end_cpu_ns - cpu) as f64 / 1e9);
     if summary.sets.recorded != sets {
         let message = format!("the throughput cannot be measured: {}", summary.lost.join("; "));
         return Err(Error::new(ErrorKind::Io, message));
@@ -265,19 +266,27 @@ fn throughput(options: &BenchOptions) -> Result<Throughput> {
     Ok(Throughput { mb_per_cpu_s: mb / cpu, mb_per_s: mb / wall, mb, payload_bytes: PAYLOAD })
 }
 
+/// A finished recording and when it was finished, before it was removed.
+struct Measured {
+    summary: Summary,
+    end: HostTime,
+    end_cpu_ns: i64,
+}
+
 /// Records into a new folder below `dir` and removes it.
 fn record(
     dir: &Path,
     sources: &[Source],
     options: RecorderOptions,
     feed: impl FnOnce(&Recorder),
-) -> Result<Summary> {
+) -> Result<Measured> {
     let dir = dir.join(format!("depthrig-bench-{}", std::process::id()));
     let mut session = Session::new("bench", "bench");
     session.streams = sources.iter().map(|s| s.record.clone()).collect();
     let recorder = Recorder::create(Arc::new(RealFs), &dir, session, options)?;
     feed(&recorder);
     let summary = recorder.finish();
-    let removed = std::fs::remove_dir_all(&dir).map_err(|e| Error::io("remove", &dir, e));
-    summary.and_then(|s| removed.map(|()| s))
+    let (end, end_cpu_ns) = (HostTime::now(), process_cpu_ns());
+    std::fs::remove_dir_all(&dir).map_err(|e| Error::io("remove", &dir, e))?;
+    Ok(Measured { summary: summary?, end, end_cpu_ns })
 }

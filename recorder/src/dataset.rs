@@ -1,7 +1,7 @@
 //! Reading a dataset: its session, its sets in order and in constant memory, and what is in it.
 
 use crate::container::scan::SegmentReader;
-use crate::fs::{Fs, RealFs};
+use crate::fs::{DirEntry, Fs, RealFs};
 use crate::recorder::topics::SESSION_METADATA;
 use crate::{Error, ErrorKind, Result, SESSION_FILE, Session};
 use std::path::{Path, PathBuf};
@@ -51,14 +51,8 @@ impl Dataset {
                 return Ok(Self { fs, path: path.to_owned(), session, segments: vec![path.to_owned()] });
             }
         };
-        let names = entries.into_iter().filter(|e| !e.is_dir).map(|e| e.name);
-        let (mut has_session, mut segments) = (false, Vec::new());
-        for name in names {
-            has_session |= name == SESSION_FILE;
-            if is_segment(&name) {
-                segments.push(path.join(name));
-            }
-        }
+        let has_session = entries.iter().any(|e| !e.is_dir && e.name == SESSION_FILE);
+        let segments = segments_in(&entries, path);
         let session = match (has_session, segments.first()) {
             (true, _) => Session::load(&*fs, path)?,
             (false, Some(first)) => session_of(&*fs, first)?,
@@ -114,11 +108,20 @@ impl Dataset {
     }
 }
 
-/// Whether a name in a dataset's folder is that of a segment.
-pub(crate) fn is_segment(name: &str) -> bool {
-    let stem = name.strip_suffix(".part").unwrap_or(name).strip_suffix(".mcap");
-    let digits = stem.and_then(|s| s.strip_prefix("seg_"));
-    digits.is_some_and(|d| d.len() >= 4 && d.bytes().all(|b| b.is_ascii_digit()))
+/// The number of a segment by its name; `None` when it is the name of something else.
+pub(crate) fn segment_number(name: &str) -> Option<u32> {
+    let digits = name.strip_suffix(".part").unwrap_or(name).strip_suffix(".mcap")?.strip_prefix("seg_")?;
+    let plain = digits.len() >= 4 && digits.bytes().all(|b| b.is_ascii_digit());
+    plain.then(|| digits.parse().ok()).flatten()
+}
+
+/// The segments among the files of a folder, in the order of their numbers: `seg_9999` before `seg_10000`.
+pub(crate) fn segments_in(entries: &[DirEntry], dir: &Path) -> Vec<PathBuf> {
+    let files = entries.iter().filter(|e| !e.is_dir);
+    let mut found: Vec<_> =
+        files.filter_map(|e| Some((segment_number(&e.name)?, dir.join(&e.name)))).collect();
+    found.sort();
+    found.into_iter().map(|(_, path)| path).collect()
 }
 
 /// Refuses MCAP files that depthrig did not write.
@@ -149,4 +152,24 @@ fn session_of(fs: &dyn Fs, segment: &Path) -> Result<Session> {
     let text = reader.metadata(SESSION_METADATA).and_then(|m| m.get("session_toml"));
     let text = text.map(String::as_str).unwrap_or_default();
     Session::from_toml(text, segment)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn segments_are_ordered_by_number() {
+        let names = [
+            "notes.txt",
+            "seg_00.mcap",
+            "seg_0001.mcap",
+            "seg_10000.mcap",
+            "seg_9999.mcap",
+            "seg_10001.mcap.part",
+        ];
+        let entries = names.map(|n| DirEntry { name: n.to_owned(), len: 1, is_dir: false });
+        let expected = ["seg_0001.mcap", "seg_9999.mcap", "seg_10000.mcap", "seg_10001.mcap.part"];
+        assert_eq!(segments_in(&entries, Path::new("")), expected.map(PathBuf::from));
+    }
 }

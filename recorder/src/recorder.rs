@@ -330,7 +330,7 @@ impl Recorder {
 
 impl Drop for Recorder {
     fn drop(&mut self) {
-        if self.writer.is_none() {
+        if self.writer.is_none() && self.threads.is_empty() {
             return;
         }
         self.shared.abandoned.store(true, Ordering::Release);

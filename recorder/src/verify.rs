@@ -4,7 +4,7 @@
 //! set has what its commit mark lists and that the mark lists or excuses every stream; order and times; the
 //! accounts; that segments follow each other; calibration; and on request that every picture decodes.
 
-use crate::dataset::is_segment;
+use crate::dataset::segments_in;
 use crate::fs::{Fs, RealFs};
 use crate::{Dataset, ErrorKind, Result, SESSION_FILE, Session};
 use serde::Serialize;
@@ -152,7 +152,7 @@ fn open(fs: &Arc<dyn Fs>, path: &Path, findings: &mut Findings) -> Result<(Sessi
     };
     // A damaged session.toml must not hide what the segments hold.
     let segments: Vec<_> = match fs.read_dir(path) {
-        Ok(entries) => entries.iter().filter(|e| is_segment(&e.name)).map(|e| path.join(&e.name)).collect(),
+        Ok(entries) => segments_in(&entries, path),
         Err(_) => return Err(error),
     };
     if error.kind() != ErrorKind::Corrupt {

@@ -37,6 +37,8 @@ pub(crate) struct ChunkBuilder {
     /// Room for the chunk's head (longest form), then the message records.
     buf: Vec<u8>,
     messages: Vec<(u16, u64, u64)>,
+    /// Of the message records so far. Each byte is hashed once; the other checksums are combined from that.
+    crc: crc32fast::Hasher,
     zstd: Option<zstd::bulk::Compressor<'static>>,
     /// Where the compressor writes; the record is copied out of it at its true size.
     packed: Vec<u8>,
@@ -71,7 +73,10 @@ impl ChunkBuilder {
         let len = (self.buf.len() - at - 9) as u64;
         self.buf[at + 1..at + 9].copy_from_slice(&len.to_le_bytes());
         self.messages.push((head.channel, head.log_time, (at - ROOM) as u64));
-        Ok(((self.buf.len() - data) as u64, crc32fast::hash(&self.buf[data..])))
+        let (data_len, data_crc) = ((self.buf.len() - data) as u64, crc32fast::hash(&self.buf[data..]));
+        self.crc.update(&self.buf[at..data]);
+        self.crc.combine(&crc32fast::Hasher::new_with_initial_len(data_crc, data_len));
+        Ok((data_len, data_crc))
     }
 
     /// Packs what was collected and begins anew.
@@ -83,7 +88,8 @@ impl ChunkBuilder {
         self.buf.resize(self.buf.len().max(ROOM), 0);
         let records = &self.buf[ROOM..];
         let uncompressed_size = records.len() as u64;
-        let uncompressed_crc = crc32fast::hash(records);
+        let records_crc = std::mem::take(&mut self.crc);
+        let uncompressed_crc = records_crc.clone().finalize();
         let start_time = messages.iter().map(|m| m.1).min().unwrap_or(0);
         let end_time = messages.iter().map(|m| m.1).max().unwrap_or(0);
         let packed = if compress && records.len() >= SMALL { self.compress()? } else { None };
@@ -103,10 +109,16 @@ impl ChunkBuilder {
         put_str(&mut head, compression);
         put_le!(head, compressed_size);
         record[spare..ROOM].copy_from_slice(&head);
-        let crc = crc32fast::hash(&record[spare..]);
+        let mut crc = crc32fast::Hasher::new();
+        if compression.is_empty() {
+            crc.update(&head);
+            crc.combine(&records_crc);
+        } else {
+            crc.update(&record[spare..]);
+        }
         Ok(Chunk {
             record,
-            crc,
+            crc: crc.finalize(),
             start_time,
             end_time,
             compression,

@@ -151,8 +151,7 @@ impl Sets {
         };
         let Some(entry) = open.reader.chunks.get(open.next_chunk).cloned() else {
             if let Some((offset, why)) = &open.reader.cut {
-                let what =
-                    format!("{why}; the sets before it are whole: run `depthrig recover` to mend the file");
+                let what = format!("{why}; the sets before it are whole");
                 self.ready.push_back(Err(open.reader.error(ErrorKind::Truncated, *offset, what)));
             }
             self.segment = None;

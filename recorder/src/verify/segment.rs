@@ -93,7 +93,7 @@ impl Walk {
         }
         if index.is_ok() && !reader.finished {
             let (offset, why) = reader.cut.clone().unwrap_or_default();
-            let what = format!("unfinished: {why}; run `depthrig recover` to mend it");
+            let what = format!("unfinished: {why}; its whole sets can still be read");
             findings.add(Severity::Broken, file, Some(offset), what);
         }
         let find = |schema: Schema| {

@@ -2,6 +2,7 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 mod failures;
+mod kill;
 mod round_trip;
 mod support;
 mod verify;

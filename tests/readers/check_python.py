@@ -1,0 +1,195 @@
+"""A dataset read with Python readers that are not ours: mcap, rosbags and rerun.
+
+usage: python check_python.py DATASET EXPECTED
+
+DATASET is a dataset of depthrig, EXPECTED a folder with index.json and bare pixels as
+`recorder/examples/golden.rs` writes it. Each reader must find every picture: lossless ones bit by bit, JPEGs
+within 40 dB of what depthrig itself decodes. Exits with 1 and says which picture differs otherwise.
+"""
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from mcap.reader import NonSeekingReader, make_reader
+from mcap_ros2.decoder import DecoderFactory
+from PIL import Image
+from rerun.chunk import McapReader
+from rosbags.highlevel import AnyReader
+
+DTYPES = {"16UC1": np.dtype("<u2"), "mono8": np.dtype("u1"), "rgb8": np.dtype("u1")}
+
+
+def shape(picture):
+    size = (picture["height"], picture["width"])
+    return (*size, 3) if picture["encoding"] == "rgb8" else size
+
+
+def load(expected):
+    """The expected pictures by (topic, log time in nanoseconds)."""
+    index = json.loads((expected / "index.json").read_text())
+    pictures = {}
+    for p in index["pictures"]:
+        data = (expected / p["file"]).read_bytes()
+        p["pixels"] = np.frombuffer(data, DTYPES[p["encoding"]]).reshape(shape(p))
+        pictures[p["topic"], int(p["log_time"])] = p
+    return index, pictures
+
+
+def compare(reader, picture, got):
+    want, name = picture["pixels"], f"{reader}: {picture['topic']} of set {picture['set']}"
+    assert got.shape == want.shape, f"{name}: shape {got.shape}, expected {want.shape}"
+    if picture["compare"] == "exact":
+        wrong = np.count_nonzero(got != want)
+        assert wrong == 0, f"{name}: {wrong} of {want.size} values differ"
+        return
+    error = np.mean((got.astype(float) - want.astype(float)) ** 2)
+    psnr = 10 * np.log10(255**2 / max(error, 1e-12))
+    assert psnr > 40, f"{name}: {psnr:.1f} dB from what depthrig decodes"
+
+
+def decode_jpeg(data):
+    return np.asarray(Image.open(io.BytesIO(bytes(data))).convert("RGB"))
+
+
+def from_message(picture, message):
+    """The pixels in a decoded sensor_msgs Image or CompressedImage."""
+    if picture["compare"] == "jpeg":
+        assert message.format == "jpeg", message.format
+        return decode_jpeg(message.data)
+    assert message.encoding == picture["encoding"], f"{picture['topic']}: encoding {message.encoding}"
+    assert not message.is_bigendian
+    return np.frombuffer(bytes(message.data), DTYPES[message.encoding]).reshape(shape(picture))
+
+
+def nanoseconds(stamp):
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
+
+
+def check_poses(transforms, index):
+    """Every stream's optical frame is on the mount, where the session says."""
+    poses = {t.child_frame_id: t for t in transforms}
+    for p in index["pictures"]:
+        _, _, camera, stream = p["base"].split("/")
+        t = poses[f"{camera}_{stream}_optical_frame"]
+        assert t.header.frame_id == f"{index['rig']}_mount", t.header.frame_id
+        v, q = t.transform.translation, t.transform.rotation
+        assert [v.x, v.y, v.z] == p["translation"] and [q.x, q.y, q.z, q.w] == p["rotation"]
+
+
+def check_mcap(segments, index, pictures):
+    """mcap + mcap-ros2-support: through the index and as a stream, with every checksum."""
+    for kind in (make_reader, NonSeekingReader):
+        seen, infos, sets, notes, frames = set(), {}, [], [], set()
+        for segment in segments:
+            with segment.open("rb") as f:
+                reader = kind(f, decoder_factories=[DecoderFactory()], validate_crcs=True)
+                if kind is make_reader:
+                    assert reader.get_header().profile == "ros2"
+                for _, channel, message, ros in reader.iter_decoded_messages():
+                    topic, key = channel.topic, (channel.topic, message.log_time)
+                    if key in pictures:
+                        p = pictures[key]
+                        compare("mcap", p, from_message(p, ros))
+                        assert nanoseconds(ros.header.stamp) == message.publish_time == int(p["stamp"])
+                        assert float(channel.metadata["depth_unit_m"]) == p["depth_unit_m"]
+                        seen.add(key)
+                    elif topic.endswith("/camera_info"):
+                        infos[topic.removesuffix("/camera_info"), message.log_time] = ros
+                    elif topic.endswith("/frame_info"):
+                        frames.add((topic.removesuffix("/frame_info"), message.log_time, ros.sequence, ros.set_id))
+                    elif topic.endswith("/frame_set"):
+                        sets.append(ros)
+                    elif topic.endswith("/notes"):
+                        notes.append(ros.msg)
+                    elif topic == "/tf_static":
+                        check_poses(ros.transforms, index)
+                    elif topic == "/diagnostics":
+                        (status,) = ros.status
+                        assert status.level == 0 and status.message == "streaming", status
+                        assert [(v.key, v.value) for v in status.values] == [("drift_ppm", "1.5")]
+        assert seen == pictures.keys(), f"mcap: {len(pictures.keys() - seen)} pictures are missing"
+        assert len(sets) == index["sets"] and notes == [index["note"]], (len(sets), notes)
+        for (_, time), p in pictures.items():
+            assert list(infos[p["base"], time].k) == p["k"], f"intrinsics of {p['base']}"
+            assert list(infos[p["base"], time].d) == p["d"], f"distortion of {p['base']}"
+            assert (p["base"], time, p["sequence"], p["set"]) in frames, f"frame_info of {p['base']}"
+        print(f"mcap {kind.__name__}: {len(seen)} pictures agree")
+
+
+def check_rosbags(segments, pictures):
+    """rosbags: ROS 2 types, our own included, taken from the file alone."""
+    seen, ours = set(), 0
+    for segment in segments:
+        with AnyReader([segment]) as reader:
+            for connection, time, raw in reader.messages():
+                message = reader.deserialize(raw, connection.msgtype)
+                ours += connection.msgtype.startswith("depthrig_msgs/")
+                key = (connection.topic, time)
+                if key in pictures:
+                    compare("rosbags", pictures[key], from_message(pictures[key], message))
+                    seen.add(key)
+    assert seen == pictures.keys(), f"rosbags: {len(pictures.keys() - seen)} pictures are missing"
+    assert ours > 0
+    print(f"rosbags: {len(seen)} pictures agree, {ours} messages of our own types")
+
+
+def check_rerun(segments, pictures):
+    """rerun's MCAP loader: depth must be a DepthImage in front of a Pinhole, not just numbers."""
+    seen, pinholes = set(), set()
+    for segment in segments:
+        for chunk in McapReader(str(segment)).stream():
+            batch, entity = chunk.to_record_batch(), str(chunk.entity_path)
+            columns = set(batch.schema.names)
+            if "Pinhole:image_from_camera" in columns:
+                pinholes.add(entity.removesuffix("/camera_info"))
+            for kind in ("DepthImage:buffer", "EncodedImage:blob", "Image:buffer"):
+                if kind not in columns:
+                    continue
+                times = batch.column("message_log_time").cast("int64").to_pylist()
+                for time, data in zip(times, batch.column(kind), strict=True):
+                    p = pictures[entity, time]
+                    data = data.values[0].values.to_numpy()
+                    if p["compare"] == "jpeg":
+                        assert kind == "EncodedImage:blob", kind
+                        got = decode_jpeg(data)
+                    else:
+                        if p["encoding"] == "16UC1":
+                            assert kind == "DepthImage:buffer", f"{entity} is a {kind}, not depth"
+                        got = np.frombuffer(data.tobytes(), DTYPES[p["encoding"]]).reshape(shape(p))
+                    compare("rerun", p, got)
+                    seen.add((entity, time))
+    assert seen == pictures.keys(), f"rerun: {len(pictures.keys() - seen)} pictures are missing"
+    bases = {p["base"] for p in pictures.values()}
+    assert pinholes == bases, f"rerun: no Pinhole for {bases - pinholes}"
+    print(f"rerun: {len(seen)} pictures agree, {len(pinholes)} cameras are pinholes")
+    # The command line's converter takes the file as well.
+    command = shutil.which("rerun", path=str(Path(sys.executable).parent)) or shutil.which("rerun")
+    with tempfile.TemporaryDirectory() as folder:
+        for i, segment in enumerate(segments):
+            out = Path(folder) / f"{i}.rrd"
+            subprocess.run([command, "mcap", "convert", str(segment), "-o", str(out)], check=True, capture_output=True)
+            printed = subprocess.run([command, "rrd", "print", "-v", str(out)], check=True, capture_output=True, text=True)
+            assert "@DepthImage:buffer" in printed.stdout and "@Pinhole:image_from_camera" in printed.stdout
+    print("rerun mcap convert: depth images and pinholes")
+
+
+def main():
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
+    dataset, expected = map(Path, sys.argv[1:])
+    segments = sorted(dataset.glob("seg_*.mcap"))
+    assert segments, f"{dataset} has no segments"
+    index, pictures = load(expected)
+    check_mcap(segments, index, pictures)
+    check_rosbags(segments, pictures)
+    check_rerun(segments, pictures)
+
+
+if __name__ == "__main__":
+    main()
