@@ -111,10 +111,10 @@ fn shoot(stream: usize, period: i64, phase: i64, shots: &[Shot], out: &mut Vec<(
         let mut stamp = (phase + i as i64 * period) * MS + jitter * period * MS / 100;
         let active = |active| Event::Active { stream, active };
         match kind {
-            0 | 1 => continue,                                   // lost
-            2 => stamp = last,                                   // the same stamp again
-            3 => stamp -= 3 * period * MS,                       // back in time
-            4 => stalled = stamp + (delivery * 9 + period) * MS, // nothing arrives for a while
+            0 | 1 => continue,                                    // lost
+            2 => stamp = last,                                    // the same stamp again
+            3 => stamp -= 3 * period * MS,                        // back in time
+            4 => stalled = stamp + (delivery * 40 + period) * MS, // nothing arrives for a while
             5 => out.push((stamp, stream, active(false))),
             6 => out.push((stamp, stream, active(true))),
             7 => stamp = (stamp + 100 * MS) / (200 * MS) * (200 * MS), // exactly on a tick

@@ -45,6 +45,8 @@ pub struct Scenario {
     pub walk_ppm_per_sqrt_s: f64,
     pub base_ns: f64,
     pub jitter_ns: f64,
+    /// Exponentials that the jitter is the sum of: with two, hardly a frame is as fast as can be.
+    pub hops: u32,
     pub stall_share: f64,
     pub counter_bits: u32,
     pub tick_ns: f64,
@@ -61,6 +63,7 @@ pub const NOMINAL: Scenario = Scenario {
     walk_ppm_per_sqrt_s: 0.003,
     base_ns: 3e6,
     jitter_ns: 0.4e6,
+    hops: 1,
     stall_share: 0.002,
     counter_bits: 32,
     tick_ns: 1000.0,
@@ -101,7 +104,9 @@ pub fn generate(s: &Scenario, seed: u64) -> Vec<Sample> {
         };
         walk += rng.normal() * s.walk_ppm_per_sqrt_s * (1.0 / s.fps).sqrt();
         device_ns += period_ns * (1.0 + (s.rate_ppm + s.thermal_ppm * thermal + walk) * 1e-6);
-        let mut arrival = truth + s.base_ns + rng.exponential(s.jitter_ns);
+        let hops = s.hops.max(1);
+        let jitter: f64 = (0..hops).map(|_| rng.exponential(s.jitter_ns / f64::from(hops))).sum();
+        let mut arrival = truth + s.base_ns + jitter;
         if rng.uniform() < s.stall_share {
             stalled_until = truth + 20e6 + 180e6 * rng.uniform();
         }
