@@ -5,6 +5,7 @@
 //! depthrig never gets in the way of other iceoryx2 applications of the machine.
 
 use crate::{Error, ErrorKind, Result, RigName};
+use core::time::Duration;
 use rustix::fs::{FlockOperation, Mode, OFlags, flock};
 use std::io::{Read, Seek, Write};
 use std::path::{Path, PathBuf};
@@ -13,6 +14,8 @@ use std::path::{Path, PathBuf};
 pub const RUNTIME_DIR_VARIABLE: &str = "DEPTHRIG_RUNTIME_DIR";
 /// iceoryx2 puts Unix sockets below the folder, and their paths have at most 107 bytes.
 const MAX_PATH_LEN: usize = 40;
+const LOCK_ATTEMPTS: u32 = 20;
+const LOCK_PAUSE: Duration = Duration::from_millis(5);
 
 /// The private folder of a user's rigs.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -117,7 +120,14 @@ impl RuntimeDir {
                 .with_source(e)
         })?;
         let mut file = std::fs::File::from(fd);
-        if flock(&file, FlockOperation::NonBlockingLockExclusive).is_err() {
+        // Who looks whether the rig runs holds the lock for an instant, so one refusal proves nothing.
+        let taken = (0..LOCK_ATTEMPTS).any(|attempt| {
+            if attempt > 0 {
+                std::thread::sleep(LOCK_PAUSE);
+            }
+            flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok()
+        });
+        if !taken {
             let holder = self.holder(rig).unwrap_or_else(|| "another process".to_owned());
             return Err(Error::new(
                 ErrorKind::InUse,
@@ -163,6 +173,24 @@ mod tests {
         drop(lock);
         assert!(dir.running_rigs().is_empty());
         dir.lock(&rig, "me").unwrap();
+    }
+
+    #[test]
+    fn those_who_look_do_not_keep_a_rig_from_starting() {
+        let tmp = tempfile::tempdir().unwrap();
+        let dir = RuntimeDir::at(tmp.path()).unwrap();
+        let rig = RigName::new("mount").unwrap();
+        let done = std::sync::atomic::AtomicBool::new(false);
+        std::thread::scope(|s| {
+            s.spawn(|| {
+                while !done.load(std::sync::atomic::Ordering::Relaxed) {
+                    dir.running_rigs();
+                }
+            });
+            let taken: Vec<_> = (0..500).map(|_| dir.lock(&rig, "me").map(drop)).collect();
+            done.store(true, std::sync::atomic::Ordering::Relaxed);
+            assert!(taken.iter().all(Result::is_ok), "{:?}", taken.iter().find(|t| t.is_err()));
+        });
     }
 
     #[test]
