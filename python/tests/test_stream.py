@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig import WAIT_S, Publisher, assert_pixels
 
 import depthrig
 from depthrig import Frame, PixelFormat, Stream
+from rig import WAIT_S, Publisher, assert_pixels
 
 Start = Callable[..., Publisher]
 

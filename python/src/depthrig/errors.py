@@ -24,7 +24,7 @@ class StreamGone(DepthrigError):
 
 
 class Timeout(DepthrigError, TimeoutError):
-    """No frame came in time, although somebody publishes the stream."""
+    """No frame came in time."""
 
 
 class HoldingTooMany(DepthrigError):
