@@ -3,7 +3,7 @@
 use super::{Findings, Severity, VerifyOptions, file_name};
 use crate::container::record::op;
 use crate::container::scan::{ChunkEntry, Message, SegmentReader};
-use crate::dataset::{Kind, decode_stored, kinds};
+use crate::dataset::{Kind, check_stored, kinds};
 use crate::encode::Codec;
 use crate::fs::Fs;
 use crate::msgs::frame_set::FrameSetMsg;
@@ -331,7 +331,7 @@ impl Walk {
             } else if let (true, Some(Ok((h, extra)))) = (self.options.decode, &header) {
                 let codec = Codec::from_name(extra.codec)
                     .ok_or_else(|| Error::new(ErrorKind::Version, format!("unknown codec {}", extra.codec)));
-                if let Err(e) = codec.and_then(|codec| decode_stored(&picture.message, codec, h)) {
+                if let Err(e) = codec.and_then(|codec| check_stored(&picture.message, codec, h)) {
                     problems.push(e.to_string());
                 }
             }

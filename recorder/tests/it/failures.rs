@@ -353,6 +353,26 @@ fn a_recorder_dropped_unfinished_leaves_a_readable_part() {
     assert!(found.iter().any(|m| m.contains("the recording was not closed")), "{found:?}");
 }
 
+/// What a power cut takes is bounded by the sync interval: once that has passed, all is durable.
+#[test]
+fn written_sets_become_durable_without_closing_anything() {
+    let fs = MemFs::new();
+    let r = recorder(&fs, RecorderOptions { sync_interval_ns: 5_000_000, ..options() });
+    for n in 0..3 {
+        r.push(set(&session(), n)).unwrap();
+    }
+    settle(&r);
+    let durable = || readable(&fs.after_crash(|_unsynced| 0)).0.len();
+    for _ in 0..2000 {
+        if durable() == 3 {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert_eq!(durable(), 3, "{:?}", fs.log());
+    r.finish().unwrap();
+}
+
 /// SQLite's method: fail the first operation, the second, … of a recording that rolls its segments.
 #[test]
 fn whichever_operation_fails_the_rest_is_whole() {

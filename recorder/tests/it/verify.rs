@@ -1,9 +1,11 @@
 //! What verification finds.
 
 use crate::support::*;
-use depthrig_bus::DropCounts;
+use depthrig_bus::{DropCounts, PixelFormat};
 use depthrig_recorder::fs::{Fs, MemFs};
-use depthrig_recorder::{RecorderOptions, Severity, StreamAccount, VerifyOptions, VerifyReport, verify_with};
+use depthrig_recorder::{
+    Recorder, RecorderOptions, Severity, StreamAccount, VerifyOptions, VerifyReport, verify_with,
+};
 use proptest::prelude::*;
 use std::sync::Arc;
 
@@ -220,4 +222,38 @@ fn a_damaged_session_file_does_not_hide_the_rest() {
     let report = check(&fs, &VerifyOptions::default());
     assert!(report.findings[0].message.contains("session.toml is missing"), "{:?}", report.findings);
     assert_eq!(report.sets, 2);
+}
+
+#[test]
+fn a_cameras_damaged_jpeg_is_found_when_pictures_are_decoded() {
+    let jpeg = {
+        let mut out = Vec::new();
+        let rgb = pixels(PixelFormat::Rgb8, 64, 48, 1);
+        jpeg_encoder::Encoder::new(&mut out, 90).encode(&rgb, 64, 48, jpeg_encoder::ColorType::Rgb).unwrap();
+        out
+    };
+    // The second one is of another size than its header says, the third one no JPEG at all.
+    for (height, damage, expected) in
+        [(48, false, None), (32, false, Some("its JPEG is 64x48")), (48, true, Some("its JPEG is damaged"))]
+    {
+        let fs = MemFs::new();
+        let mut session = session();
+        session.streams = vec![stream("cam/color", PixelFormat::Mjpeg, 64, height)];
+        let r = Recorder::create(Arc::new(fs.clone()), &dir(), session.clone(), options()).unwrap();
+        let mut pushed = set(&session, 0);
+        let mut bytes = jpeg.clone();
+        if damage {
+            bytes[..4].fill(0);
+        }
+        (pushed.frames[0].header.payload_len, pushed.frames[0].header.stride) = (bytes.len() as u32, 0);
+        pushed.frames[0].pixels = Box::new(bytes);
+        r.push(pushed).unwrap();
+        r.finish().unwrap();
+        assert_eq!(found(&fs), Vec::<String>::new(), "without decoding it is as good as it came");
+        let findings = check(&fs, &VerifyOptions { decode: true, ..Default::default() }).findings;
+        match expected {
+            None => assert_eq!(findings, []),
+            Some(what) => assert!(findings.len() == 1 && findings[0].message.contains(what), "{findings:?}"),
+        }
+    }
 }
