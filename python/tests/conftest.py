@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from depthrig._bus import Bus
 from rig import Publisher, build_publisher
 
 
@@ -20,6 +22,10 @@ def folder() -> Iterator[Path]:
     """A runtime folder: short, because sockets live below it."""
     path = Path(tempfile.mkdtemp(prefix="rig", dir="/tmp"))
     yield path
+    # Killed publishers leave shared memory behind, which can be found only while this folder exists.
+    gc.collect()
+    Bus.at(str(path)).clean_dead()
+    gc.collect()
     shutil.rmtree(path, ignore_errors=True)
 
 
@@ -34,4 +40,4 @@ def start(binary: str, folder: Path) -> Iterator[Callable[..., Publisher]]:
 
     yield start
     for publisher in started:
-        publisher.kill()
+        publisher.stop()  # a killed one would leave its shared memory behind

@@ -69,7 +69,7 @@ class Publisher:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.kill()
+        self.stop()
 
 
 def pattern_rows(header: Header) -> np.ndarray:

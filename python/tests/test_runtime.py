@@ -76,7 +76,7 @@ def test_the_folder_is_found_as_the_daemon_does(monkeypatch: pytest.MonkeyPatch,
     assert _runtime.runtime_dir("/elsewhere") == "/elsewhere"
 
 
-def test_a_folder_of_another_user_is_refused(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+def test_a_folder_of_another_user_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "getuid", lambda: 12345)
     with pytest.raises(depthrig.BusError, match="belongs to user .* run as the daemon's user"):
         depthrig.Stream("cam/depth", runtime_dir=folder, timeout=0)
@@ -90,7 +90,7 @@ def test_a_bad_name_is_named(folder: Path, name: str) -> None:
 
 @pytest.mark.parametrize("version", ["0.9.3", "0.11.0", "1.0.0", "0.1"])
 def test_another_wheel_is_refused_with_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, folder: Path, version: str
+    folder: Path, monkeypatch: pytest.MonkeyPatch, version: str
 ) -> None:
     monkeypatch.setattr(_bus, "wheel_version", lambda: version)
     with pytest.raises(depthrig.VersionMismatch, match=rf"{version}, .* needs 0\.10: pip install 'iceoryx2==0\.10"):

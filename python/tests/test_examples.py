@@ -1,0 +1,72 @@
+"""The example, the benchmark and the README's lines are run, not only shown."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import depthrig
+from rig import ROOT, WAIT_S, pattern_rows
+
+PYTHON = ROOT / "python"
+
+
+@pytest.fixture
+def live(binary: str, folder: Path) -> Iterator[Path]:
+    """A publisher at 100 Hz."""
+    process = subprocess.Popen([binary, str(folder), "--fps", "100", "--pad", "2"], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.readline()
+    yield folder
+    process.kill()
+    process.wait()
+    process.stdout.close()
+
+
+def run(folder: Path, *arguments: str) -> str:
+    env = {**os.environ, "DEPTHRIG_RUNTIME_DIR": str(folder)}
+    done = subprocess.run(
+        [sys.executable, *arguments], env=env, capture_output=True, text=True, timeout=WAIT_S * 2, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+@pytest.mark.parametrize(("stream", "dtype", "shape"), [("z16", np.uint16, (48, 64)), ("rgb8", np.uint8, (48, 64, 3))])
+def test_the_viewer_saves_the_pixels(live: Path, tmp_path: Path, stream: str, dtype: type, shape: tuple) -> None:
+    path = tmp_path / "last.png"
+    out = run(live, str(PYTHON / "examples" / "view.py"), f"pattern/{stream}", "--count", "3", "--png", str(path))
+    sequences = [int(n) for n in re.findall(rf"<Header pattern/{stream} #(\d+) 64x48", out)]
+    assert len(sequences) == 3
+    picture = np.asarray(Image.open(path)).astype(dtype)
+    assert picture.shape == shape
+    # The header as far as the pattern depends on it, for the frame that was saved.
+    with depthrig.Stream(f"pattern/{stream}", runtime_dir=live, timeout=WAIT_S) as s:
+        values = s.next(WAIT_S).header.to_dict() | {"sequence": sequences[-1]}
+    expected = pattern_rows(depthrig.Header(depthrig.Header.pack(values)))
+    np.testing.assert_array_equal(picture.view(np.uint8).reshape(48, -1), expected)
+
+
+def test_the_benchmark_prints_json(live: Path) -> None:
+    script = str(PYTHON / "benchmarks" / "latency.py")
+    result = json.loads(run(live, script, "pattern/z16", "--frames", "20", "--warm-up", "2", "--json"))
+    assert 0 < result["p50_us"] <= result["p99_us"] <= result["max_us"]
+    assert (result["stream"], result["frames"]) == ("pattern/z16", 20)
+
+
+def test_the_lines_of_the_readme_run(live: Path) -> None:
+    code = re.findall(r"```python\n(.*?)```", (PYTHON / "README.md").read_text(), re.DOTALL)[0]
+    assert len([line for line in code.splitlines() if line]) <= 5
+    # On a picture of this size, and not for ever.
+    code = code.replace("d435/depth", "pattern/z16").replace("[240, 320]", "[24, 32]") + "    break\n"
+    out = run(live, "-c", code)
+    assert re.fullmatch(r"\d+ [\d.]+ \(48, 64\) [\d.]+\n", out), out
