@@ -8,8 +8,9 @@ use crossbeam::channel::Receiver;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 
-/// Encoding may wait for capture, not the other way round.
-const NICE: i32 = 5;
+/// Encoding yields to capture, but not so much that other work on the computer starves it: a set lost to a
+/// compiler running beside is still a lost set.
+const NICE: i32 = 2;
 
 pub(super) fn run(shared: &Shared, queue: &Receiver<Job>) {
     // On Linux this is the calling thread. Being refused costs nothing but the politeness.
