@@ -37,6 +37,14 @@ impl Publisher {
         frame.header_mut().publish_time_ns = HostTime::now().ns();
         self.sender.send(frame.loan)
     }
+
+    /// Publishes `frame` with the publish time that its header has: a replay keeps the original times.
+    ///
+    /// # Errors
+    /// As [`Self::send`].
+    pub fn send_unstamped(&self, frame: FrameMut) -> Result<usize> {
+        self.sender.send(frame.loan)
+    }
 }
 
 /// A slot on loan: the frame being written. Dropping it gives the slot back unpublished.
