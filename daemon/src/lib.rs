@@ -4,9 +4,21 @@
 //! contains no device protocol and no codec; those are in the floors below.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
+pub mod api;
+mod camera;
+pub mod client;
+pub mod config;
 pub mod control;
 mod error;
+pub mod metrics;
+mod priority;
+mod recording;
+pub mod replay;
+pub mod rig;
 pub mod sets;
+mod sink;
 pub mod status;
+mod stream;
+mod wake;
 
 pub use error::{Error, ErrorKind, Result};

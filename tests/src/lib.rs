@@ -1,1 +1,117 @@
-//! Helpers for the tests that cross crates.
+//! Helpers for the tests that cross crates: rigs of cheap synthetic cameras in a private runtime folder.
+#![allow(clippy::unwrap_used, clippy::expect_used)] // test support: a failure here is a failed test
+
+use depthrig_bus::{HostTime, RuntimeDir};
+use depthrig_daemon::config::RigConfig;
+use depthrig_daemon::rig::{Rig, RigOptions};
+use depthrig_daemon::status::{CameraState, CameraStatus, RigStatus};
+use std::fmt::Write;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// A folder that a test's rigs live in; removed at the end.
+pub struct Home {
+    dir: tempfile::TempDir,
+}
+
+impl Default for Home {
+    fn default() -> Self {
+        // Short, because Unix sockets are made below it.
+        Self { dir: tempfile::Builder::new().prefix("dr").tempdir_in("/tmp").unwrap() }
+    }
+}
+
+impl Home {
+    /// The runtime folder.
+    pub fn runtime(&self) -> RuntimeDir {
+        RuntimeDir::at(&self.dir.path().join("r")).unwrap()
+    }
+
+    /// A folder for datasets and the like.
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.dir.path().join(name)
+    }
+
+    /// Starts the rig of `text`.
+    ///
+    /// # Errors
+    /// Those of [`Rig::start`].
+    pub fn start(&self, text: &str) -> depthrig_daemon::Result<Rig> {
+        let config = RigConfig::parse(text, None).unwrap();
+        let options = RigOptions {
+            runtime: self.runtime(),
+            serve_api: false,
+            cache_dir: Some(self.path("cache")),
+            progress: None,
+        };
+        Rig::start(config, &options)
+    }
+}
+
+/// A rig configuration of cheap synthetic cameras.
+pub struct RigText(String);
+
+impl Default for RigText {
+    fn default() -> Self {
+        Self("rig = \"test\"\n[supervisor]\nstall_s = 0.4\nbackoff_max_s = 0.5\n".into())
+    }
+}
+
+impl RigText {
+    /// Adds a cheap camera of 160x120 pixels at 30 Hz, with `extra` lines of TOML in its table.
+    pub fn camera(mut self, name: &str, extra: &str) -> Self {
+        write!(
+            self.0,
+            "[[camera]]\nname = \"{name}\"\nbackend = \"synthetic\"\nmodel = \"generic\"\ncheap = true\n{extra}\n\
+             [[camera.stream]]\nname = \"color\"\nwidth = 160\nheight = 120\n\
+             [[camera.stream]]\nname = \"depth\"\nwidth = 160\nheight = 120\n"
+        )
+        .unwrap();
+        self
+    }
+
+    /// Adds a fault to the camera added last.
+    pub fn fault(mut self, kind: &str, at_s: f64, more: &str) -> Self {
+        write!(self.0, "[[camera.fault]]\nkind = \"{kind}\"\nat_s = {at_s:?}\n{more}\n").unwrap();
+        self
+    }
+
+    /// The TOML text.
+    pub fn text(&self) -> &str {
+        &self.0
+    }
+}
+
+/// Waits until `done` says so; panics with the last status after 20 s.
+pub fn wait_until(rig: &Rig, what: &str, mut done: impl FnMut(&RigStatus) -> bool) -> RigStatus {
+    let deadline = HostTime::now().plus(Duration::from_secs(20));
+    loop {
+        let status = rig.control().status();
+        if done(&status) {
+            return status;
+        }
+        assert!(!deadline.from_now().is_zero(), "never came to pass: {what}; last status {status:#?}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// The camera `name` of a status.
+pub fn camera<'s>(status: &'s RigStatus, name: &str) -> &'s CameraStatus {
+    status.cameras.iter().find(|c| c.name == name).expect("a camera of that name")
+}
+
+/// Whether every camera streams.
+pub fn all_stream(status: &RigStatus) -> bool {
+    status.cameras.iter().all(|c| c.state == CameraState::Streaming)
+}
+
+/// Panics unless the books of every stream balance.
+pub fn assert_balanced(status: &RigStatus) {
+    for s in status.cameras.iter().flat_map(|c| &c.streams) {
+        let dropped: u64 = s.dropped.values().sum();
+        assert_eq!(s.captured, s.delivered + dropped, "{}: {s:?}", s.id);
+        let i = &s.in_sets;
+        let taken = i.used + i.decimated + i.late + i.out_of_order + i.overflow + i.missed + i.pending;
+        assert_eq!(s.delivered, taken, "{} in sets: {s:?}", s.id);
+    }
+}

@@ -1,0 +1,433 @@
+//! Recording under control of the daemon: start, stop, notes, and the numbers that go with it.
+
+use crate::config::{ColorCodec, RecordingConfig, RigConfig};
+use crate::control::RecordRequest;
+use crate::status::RecordingStatus;
+use crate::stream::Stream;
+use crate::{Error, ErrorKind, Result};
+use depthrig_bus::{Frame, HostTime, StreamId, UtcPair};
+use depthrig_calib::PoseExt;
+use depthrig_recorder::{
+    Diagnostic, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamAccount,
+    StreamRecord, Summary, fs,
+};
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use time::OffsetDateTime;
+
+/// The recordings of a rig: at most one at a time, and what became of the last.
+#[derive(Default)]
+pub struct Recording {
+    active: Option<Active>,
+    last: Option<RecordingStatus>,
+    summary: Option<Summary>,
+}
+
+/// A recording that was made and is not yet handed any set.
+pub struct Begun(Active);
+
+struct Active {
+    recorder: Recorder,
+    status: RecordingStatus,
+    indices: HashMap<StreamId, usize>,
+    streams: Vec<Recorded>,
+    started: HostTime,
+    reserve_bytes: u64,
+}
+
+/// A stream in a recording, with the frames it had before the first recorded set.
+struct Recorded {
+    stream: Arc<Stream>,
+    captured: u64,
+    delivered: u64,
+    dropped: depthrig_bus::DropCounts,
+}
+
+/// A frame's pixels where the driver wrote them; encoding reads them from there.
+struct SharedPixels(Frame);
+
+impl Pixels for SharedPixels {
+    fn bytes(&self) -> &[u8] {
+        self.0.pixels()
+    }
+}
+
+/// What a recording needs to know of a camera's stream.
+pub struct StreamFacts {
+    /// The stream.
+    pub stream: Arc<Stream>,
+    /// Model and serial number of its camera.
+    pub model: String,
+    /// Serial number of its camera.
+    pub serial: String,
+    /// Where its calibration comes from.
+    pub calibration: String,
+    /// Pose of its camera on the mount.
+    pub camera_pose: depthrig_bus::Pose,
+}
+
+impl Begun {
+    /// Makes the dataset for a recording of `streams`.
+    ///
+    /// # Errors
+    /// `WrongState` without a stream, `BadInput` for a name that is no folder name or exists, `NoSpace`,
+    /// `PermissionDenied`.
+    pub fn new(config: &RigConfig, request: &RecordRequest, streams: Vec<StreamFacts>) -> Result<Self> {
+        let streams: Vec<_> = streams.into_iter().filter(|s| s.stream.record).collect();
+        if streams.is_empty() {
+            return Err(Error::new(
+                ErrorKind::WrongState,
+                "no camera has a stream to record yet; try again when one streams",
+            ));
+        }
+        let utc = UtcPair::sample();
+        let (name, path) = place(&config.recording, request, utc.utc_ns)?;
+        let mut session = Session::new(&name, config.rig.as_str());
+        session.scene.clone_from(&request.scene);
+        session.operator.clone_from(&request.operator);
+        session.started_utc_ns = utc.utc_ns;
+        session.host = rustix::system::uname().nodename().to_string_lossy().into_owned();
+        session.rig_config.clone_from(&config.text);
+        session.streams = streams.iter().map(record_of).collect();
+        let options = options_of(&config.recording);
+        let recorder =
+            Recorder::create(Arc::new(fs::RealFs), &path, session, options).map_err(of_recorder)?;
+        if !request.notes.is_empty() {
+            recorder.add_note(request.notes.as_str()).map_err(of_recorder)?;
+        }
+        tracing::info!(path = %path.display(), streams = streams.len(), "recording");
+        let status = RecordingStatus {
+            active: true,
+            path: path.display().to_string(),
+            name,
+            scene: request.scene.clone(),
+            operator: request.operator.clone(),
+            started_utc_ns: utc.utc_ns,
+            ..RecordingStatus::default()
+        };
+        let recorded = |s: &StreamFacts| {
+            let books = s.stream.books();
+            Recorded {
+                stream: Arc::clone(&s.stream),
+                captured: books.captured,
+                delivered: books.delivered,
+                dropped: books.dropped,
+            }
+        };
+        Ok(Self(Active {
+            recorder,
+            indices: streams.iter().enumerate().map(|(i, s)| (s.stream.id.clone(), i)).collect(),
+            streams: streams.iter().map(recorded).collect(),
+            started: HostTime::now(),
+            reserve_bytes: config.recording.reserve_mb << 20,
+            status,
+        }))
+    }
+}
+
+impl Recording {
+    /// Refuses when a recording is going on.
+    ///
+    /// # Errors
+    /// `InUse` naming the recording.
+    pub fn must_be_idle(&self) -> Result<()> {
+        let Some(active) = &self.active else { return Ok(()) };
+        let path = &active.status.path;
+        Err(Error::new(
+            ErrorKind::InUse,
+            format!("a recording is going on already ({path}); stop it first (depthrig record stop)"),
+        ))
+    }
+
+    /// From now on sets go to `begun`.
+    pub fn begin(&mut self, begun: Begun) -> RecordingStatus {
+        let active = self.active.insert(begun.0);
+        active.refresh();
+        self.summary = None;
+        self.last.insert(active.status.clone()).clone()
+    }
+
+    /// Hands a set to the recorder, if one is running. Never blocks.
+    pub fn offer(
+        &mut self,
+        id: u64,
+        tick: HostTime,
+        spread_ns: i64,
+        frames: impl Iterator<Item = (Arc<Stream>, Option<Frame>)>,
+    ) {
+        let Some(active) = &mut self.active else { return };
+        let (mut present, mut missing) = (Vec::new(), Vec::new());
+        for (stream, frame) in frames {
+            let Some(&index) = active.indices.get(&stream.id) else { continue };
+            match frame {
+                Some(frame) => present.push(RecordFrame {
+                    stream: index,
+                    header: *frame.header(),
+                    pixels: Box::new(SharedPixels(frame)),
+                }),
+                None => missing.push(index),
+            }
+        }
+        let set = RecordSet { id, tick, utc: UtcPair::sample(), frames: present, missing, spread_ns };
+        if let Err(e) = active.recorder.push(set) {
+            tracing::error!(set = id, reason = e.reason.name(), "a frame set was not recorded: {e}");
+        }
+    }
+
+    /// Adds a note to the recording.
+    ///
+    /// # Errors
+    /// `WrongState` when none is going on, `BadInput` for an empty note.
+    pub fn note(&mut self, text: &str) -> Result<()> {
+        let active = self.active.as_ref().ok_or_else(none_active)?;
+        if text.trim().is_empty() {
+            return Err(Error::new(ErrorKind::BadInput, "the note is empty"));
+        }
+        active.recorder.add_note(text).map_err(of_recorder)
+    }
+
+    /// Takes the recorder out, to be finished without keeping others waiting.
+    ///
+    /// # Errors
+    /// `WrongState` when no recording is going on.
+    pub fn take(&mut self) -> Result<Finishing> {
+        self.refresh();
+        let active = self.active.take().ok_or_else(none_active)?;
+        active.hand_over_accounts();
+        Ok(Finishing { active })
+    }
+
+    /// Whether a recording is going on.
+    pub const fn is_active(&self) -> bool {
+        self.active.is_some()
+    }
+
+    /// Keeps the numbers of a finished recording.
+    pub fn keep(&mut self, status: RecordingStatus, summary: Option<Summary>) {
+        self.last = Some(status);
+        self.summary = summary;
+    }
+
+    /// The recording in progress, or the last one.
+    pub fn status(&mut self) -> Option<RecordingStatus> {
+        self.refresh();
+        self.last.clone()
+    }
+
+    /// What the last finished recording holds.
+    pub fn summary(&self) -> Option<&Summary> {
+        self.summary.as_ref()
+    }
+
+    /// Once a second: accounts and diagnostics into the file.
+    pub fn housekeeping(&self, diagnostics: Vec<Diagnostic>) {
+        if let Some(active) = &self.active {
+            active.hand_over_accounts();
+            active.recorder.diagnostics(diagnostics);
+        }
+    }
+
+    fn refresh(&mut self) {
+        let Some(active) = &mut self.active else { return };
+        active.refresh();
+        self.last = Some(active.status.clone());
+    }
+}
+
+impl Active {
+    fn refresh(&mut self) {
+        let progress = self.recorder.progress();
+        let status = &mut self.status;
+        status.duration_s = self.started.elapsed().as_secs_f64();
+        status.sets = progress.sets.recorded;
+        status.dropped = progress.sets.dropped_by_reason().map(|(r, n)| (r.name().to_owned(), n)).collect();
+        status.frames = progress.frames;
+        status.bytes = progress.bytes;
+        status.segments = u64::from(progress.segments);
+        status.error = progress.error.map(|e| e.to_string());
+        status.disk_free_bytes = depthrig_bus::shm::free_bytes(Path::new(&status.path)).unwrap_or(0);
+        let rate = status.bytes as f64 / status.duration_s.max(0.001);
+        let usable = status.disk_free_bytes.saturating_sub(self.reserve_bytes) as f64;
+        status.disk_seconds_left = (status.bytes > 0).then(|| usable / rate.max(1.0));
+    }
+
+    /// What the cameras delivered and lost since the recording began.
+    fn hand_over_accounts(&self) {
+        let account = |r: &Recorded| {
+            let books = r.stream.books();
+            let mut dropped = books.dropped;
+            for (now, before) in dropped.0.iter_mut().zip(r.dropped.0) {
+                *now -= before;
+            }
+            StreamAccount {
+                stream: r.stream.id.clone(),
+                captured: books.captured - r.captured,
+                delivered: books.delivered - r.delivered,
+                dropped,
+            }
+        };
+        self.recorder.update_accounts(self.streams.iter().map(account).collect());
+    }
+}
+
+/// A recording that takes no more sets and is being closed.
+pub struct Finishing {
+    active: Active,
+}
+
+impl Finishing {
+    /// Waits until everything is on disk.
+    ///
+    /// # Errors
+    /// `Other` when the dataset could not be closed; the status says what is known all the same.
+    pub fn finish(mut self) -> (RecordingStatus, Result<Summary>) {
+        self.active.refresh();
+        let mut status = self.active.status;
+        status.active = false;
+        match self.active.recorder.finish() {
+            Ok(summary) => {
+                status.sets = summary.sets.recorded;
+                status.dropped =
+                    summary.sets.dropped_by_reason().map(|(r, n)| (r.name().to_owned(), n)).collect();
+                status.frames = summary.frames;
+                status.bytes = summary.bytes;
+                status.segments = u64::from(summary.segments);
+                status.duration_s = summary.duration_ns as f64 * 1e-9;
+                if summary.complete {
+                    tracing::info!(path = status.path, sets = status.sets, bytes = status.bytes, "recorded");
+                } else {
+                    let lost = summary.lost.join("; ");
+                    tracing::error!(path = status.path, "the recording lost something: {lost}");
+                    status.error = Some(lost);
+                }
+                (status, Ok(summary))
+            }
+            Err(e) => {
+                status.error = Some(e.to_string());
+                tracing::error!(path = status.path, error = %e, "the recording could not be closed");
+                (status, Err(of_recorder(e)))
+            }
+        }
+    }
+}
+
+fn none_active() -> Error {
+    Error::new(ErrorKind::WrongState, "no recording is going on; start one with: depthrig record start")
+}
+
+fn of_recorder(e: depthrig_recorder::Error) -> Error {
+    use depthrig_recorder::ErrorKind as Rec;
+    let kind = match e.kind() {
+        Rec::DiskFull => ErrorKind::NoSpace,
+        Rec::PermissionDenied => ErrorKind::PermissionDenied,
+        Rec::AlreadyExists | Rec::BadInput => ErrorKind::BadInput,
+        _ => ErrorKind::Other,
+    };
+    Error::new(kind, e.to_string()).with_source(e)
+}
+
+fn record_of(s: &StreamFacts) -> StreamRecord {
+    let p = &s.stream.profile;
+    StreamRecord {
+        id: s.stream.id.clone(),
+        model: s.model.clone(),
+        serial: s.serial.clone(),
+        format: p.format,
+        width: p.width,
+        height: p.height,
+        rate_hz: p.rate_hz,
+        depth_unit_m: p.depth_unit_m,
+        calibration: s.calibration.clone(),
+        intrinsics: p.intrinsics,
+        pose: s.camera_pose.compose(&p.pose_in_device),
+    }
+}
+
+fn options_of(config: &RecordingConfig) -> RecorderOptions {
+    let mut options = RecorderOptions {
+        jpeg_quality: config.jpeg_quality,
+        color: match config.color {
+            ColorCodec::Jpeg => depthrig_recorder::ColorCodec::Jpeg,
+            ColorCodec::Raw => depthrig_recorder::ColorCodec::Raw,
+        },
+        segment_max_bytes: config.segment_max_mb << 20,
+        segment_max_ns: config.segment_max_s as i64 * 1_000_000_000,
+        queue_sets: config.queue_sets,
+        min_free_bytes: config.reserve_mb << 20,
+        ..RecorderOptions::default()
+    };
+    if config.workers > 0 {
+        options.workers = config.workers;
+    }
+    options
+}
+
+/// Name and folder of a new dataset.
+fn place(config: &RecordingConfig, request: &RecordRequest, utc_ns: i64) -> Result<(String, PathBuf)> {
+    let name = match &request.name {
+        Some(name) => name.clone(),
+        None => default_name(&request.scene, utc_ns),
+    };
+    let bad = name.is_empty() || name.starts_with('.') || name.contains(['/', '\0']);
+    if bad {
+        return Err(Error::new(
+            ErrorKind::BadInput,
+            format!("\"{name}\" cannot be the name of a dataset's folder"),
+        ));
+    }
+    let directory = request.directory.as_ref().unwrap_or(&config.directory);
+    let mut path = directory.join(&name);
+    if request.name.is_none() {
+        // Two recordings of a scene in one minute are no mistake.
+        let mut n = 2;
+        while path.exists() {
+            path = directory.join(format!("{name}_{n}"));
+            n += 1;
+        }
+    }
+    let name = path.file_name().map_or(name, |n| n.to_string_lossy().into_owned());
+    Ok((name, path))
+}
+
+/// `YYYYMMDD_HHMM_<scene>` in UTC, with what cannot be in a file name replaced.
+fn default_name(scene: &str, utc_ns: i64) -> String {
+    let t =
+        OffsetDateTime::from_unix_timestamp_nanos(i128::from(utc_ns)).unwrap_or(OffsetDateTime::UNIX_EPOCH);
+    let (date, clock) = (t.date(), t.time());
+    let stamp = format!(
+        "{:04}{:02}{:02}_{:02}{:02}",
+        date.year(),
+        u8::from(date.month()),
+        date.day(),
+        clock.hour(),
+        clock.minute()
+    );
+    let clean: String = scene
+        .trim()
+        .chars()
+        .map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' })
+        .collect();
+    if clean.is_empty() { stamp } else { format!("{stamp}_{clean}") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn default_names_sort_by_time_and_are_file_names() {
+        let utc_ns = 1_795_000_000_000_000_000;
+        assert_eq!(default_name("", utc_ns), "20261118_1106");
+        assert_eq!(default_name(" kitchen/sink 2 ", utc_ns), "20261118_1106_kitchen_sink_2");
+    }
+
+    #[test]
+    fn a_name_that_is_a_path_is_refused() {
+        let config = RecordingConfig::default();
+        for name in ["../up", "", ".hidden"] {
+            let request = RecordRequest { name: Some(name.into()), ..RecordRequest::default() };
+            assert_eq!(place(&config, &request, 0).unwrap_err().kind(), ErrorKind::BadInput);
+        }
+    }
+}

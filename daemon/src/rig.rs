@@ -1,0 +1,376 @@
+//! A running rig: its cameras, its sets, its recording and its control, in one process.
+//!
+//! ```text
+//! supervisor thread ── steps every camera's state machine
+//! camera threads    ── driver → gate → slot on the bus
+//! set thread        ── bus → frame sets → bus, recorder
+//! house thread      ── once a second: dead subscribers, accounts into the file, CPU
+//! API thread        ── HTTP on the rig's socket
+//! ```
+
+mod assembly;
+mod report;
+
+use crate::api::{self, ServerHandle};
+use crate::camera::{Camera, Shared, Supervisor};
+use crate::config::{BackendConfig, RigConfig};
+use crate::control::{Control, RecordRequest};
+use crate::recording::{Begun, Recording, StreamFacts};
+use crate::sets::SpreadStats;
+use crate::status::{CameraState, RecordingStatus, RigStatus, SetAccount};
+use crate::wake::Wake;
+use crate::{Error, ErrorKind, Result, priority};
+use assembly::Assembly;
+use core::time::Duration;
+use depthrig_bus::runtime::{RigLock, RuntimeDir};
+use depthrig_bus::{Bus, HostTime, StreamId, clock, shm};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+
+/// How often the supervisors look at their cameras.
+const STEP: Duration = Duration::from_millis(20);
+/// How long the start waits for cameras that answer slowly; they come in later all the same.
+const START_PATIENCE: Duration = Duration::from_secs(10);
+/// How long one camera thread gets to end; with it the whole stop stays below a second.
+const STOP_PATIENCE: Duration = Duration::from_millis(500);
+
+/// Set to end a thread.
+type StopFlag = Arc<AtomicBool>;
+
+/// Told how far the pictures of synthetic cameras are rendered: camera, pictures done, pictures in all.
+pub type Progress = Box<dyn Fn(&str, usize, usize) + Send + Sync>;
+
+/// How a rig is to run.
+pub struct RigOptions {
+    /// Where its files are.
+    pub runtime: RuntimeDir,
+    /// Whether to serve the control API.
+    pub serve_api: bool,
+    /// Where rendered pictures are kept; the configuration's folder when `None`.
+    pub cache_dir: Option<PathBuf>,
+    /// Told about long work before the start.
+    pub progress: Option<Progress>,
+}
+
+/// What a rig says at its end.
+#[derive(Debug, Clone, serde::Serialize)]
+pub struct RigSummary {
+    /// Its last status.
+    pub status: RigStatus,
+    /// What its last recording holds.
+    pub recording: Option<depthrig_recorder::Summary>,
+    /// What was lost, in words; empty when nothing was.
+    pub lost: Vec<String>,
+}
+
+/// A running rig. Dropping it stops it.
+pub struct Rig {
+    inner: Arc<Inner>,
+    /// Each with the flag that ends it.
+    threads: Vec<(JoinHandle<()>, StopFlag)>,
+    api: Option<ServerHandle>,
+    _lock: RigLock,
+}
+
+/// What the rig's threads share.
+pub struct Inner {
+    config: RigConfig,
+    shared: Arc<Shared>,
+    cameras: Vec<Arc<Camera>>,
+    stop_asked: AtomicBool,
+    ended: Wake,
+    started: HostTime,
+    recording: Mutex<Recording>,
+    starting: Mutex<()>,
+    spreads: Mutex<SpreadStats>,
+    set_accounts: Mutex<SetAccounts>,
+    cpu_millicores: AtomicU64,
+}
+
+/// The set assembler's numbers, as `status` shows them.
+#[derive(Debug, Default)]
+pub struct SetAccounts {
+    sent: u64,
+    incomplete: u64,
+    streams: BTreeMap<StreamId, SetAccount>,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Rig {
+    /// Starts the rig and returns when every camera streams or is known not to, after 10 s at most.
+    ///
+    /// # Errors
+    /// [`ErrorKind::InUse`] naming who runs a rig of this name, [`ErrorKind::NoSpace`] when `/dev/shm` is too
+    /// small, [`ErrorKind::BadInput`] when a camera's settings cannot work (all such cameras are named).
+    pub fn start(mut config: RigConfig, options: &RigOptions) -> Result<Self> {
+        priority::raise_file_limit();
+        let source =
+            config.path.as_deref().map_or("built-in configuration".to_owned(), |p| p.display().to_string());
+        let who = format!("process {} ({source})", std::process::id());
+        let lock = options.runtime.lock(&config.rig, &who)?;
+        let bus = Bus::open(&options.runtime, &config.rig)?;
+        bus.clean_dead();
+        prepare(&mut config, options)?;
+        let shared = Arc::new(Shared {
+            memory_share: shm::free_bytes(shm::SHM_DIR.as_ref())? / config.cameras.len().max(1) as u64,
+            slots: config.bus.slots,
+            supervisor: config.supervisor.clone(),
+            frames: Arc::default(),
+            bus,
+        });
+        let inner = Arc::new(Inner {
+            cameras: config.cameras.iter().map(|c| Arc::new(Camera::new(c.clone()))).collect(),
+            config,
+            shared,
+            stop_asked: AtomicBool::new(false),
+            ended: Wake::default(),
+            started: HostTime::now(),
+            recording: Mutex::default(),
+            starting: Mutex::default(),
+            spreads: Mutex::default(),
+            set_accounts: Mutex::default(),
+            cpu_millicores: AtomicU64::new(0),
+        });
+        let assembly = Assembly::new(Arc::clone(&inner))?;
+        let mut rig = Self { threads: Vec::new(), api: None, inner, _lock: lock };
+        let inner = Arc::clone(&rig.inner);
+        rig.spawn("supervisor", move |stop| supervise(&inner, stop))?;
+        rig.spawn("sets", move |stop| assembly.run(stop))?;
+        let inner = Arc::clone(&rig.inner);
+        rig.spawn("house", move |stop| keep_house(&inner, stop))?;
+        rig.wait_for_cameras()?;
+        if options.serve_api {
+            let socket = options.runtime.socket_path(&rig.inner.config.rig);
+            rig.api = Some(api::serve(rig.control(), &socket, rig.inner.config.control.tcp)?);
+        }
+        Ok(rig)
+    }
+
+    /// The rig's control.
+    pub fn control(&self) -> Arc<dyn Control> {
+        Arc::clone(&self.inner) as Arc<dyn Control>
+    }
+
+    /// Waits until somebody asks the rig to stop, until `deadline`, or until every camera is done (at the end of
+    /// its files, or failed). Returns whether there is more to wait for.
+    pub fn wait(&self, deadline: Option<HostTime>) -> bool {
+        const LOOK: Duration = Duration::from_millis(50);
+        loop {
+            let left = deadline.map_or(LOOK, HostTime::from_now);
+            if self.inner.stop_asked.load(Ordering::Relaxed) || left.is_zero() || self.inner.all_done() {
+                return false;
+            }
+            self.inner.ended.wait(left.min(LOOK));
+        }
+    }
+
+    /// Stops the rig: closes the recording, ends the cameras, and says what was lost.
+    pub fn stop(mut self) -> RigSummary {
+        // The recording first: its last sets are still being made.
+        let active = lock(&self.inner.recording).is_active();
+        if active && let Err(e) = self.inner.record_stop() {
+            tracing::error!(error = %e, "the recording could not be closed");
+        }
+        self.end_threads();
+        let status = self.inner.status();
+        let recording = lock(&self.inner.recording).summary().cloned();
+        let lost = report::lost(&status);
+        RigSummary { status, recording, lost }
+    }
+
+    fn end_threads(&mut self) {
+        if let Some(api) = self.api.take() {
+            api.stop();
+        }
+        // In the order of `spawn`: the cameras end first, then the set thread reads what they left.
+        for (thread, stop) in self.threads.drain(..) {
+            stop.store(true, Ordering::Relaxed);
+            self.inner.shared.frames.raise();
+            if thread.join().is_err() {
+                tracing::error!("a thread of the rig panicked");
+            }
+        }
+    }
+
+    fn spawn(&mut self, name: &str, run: impl FnOnce(&AtomicBool) + Send + 'static) -> Result<()> {
+        let stop = StopFlag::default();
+        let theirs = Arc::clone(&stop);
+        let thread =
+            std::thread::Builder::new().name(name.to_owned()).spawn(move || run(&theirs)).map_err(|e| {
+                Error::new(ErrorKind::Other, format!("the {name} thread could not be started")).with_source(e)
+            })?;
+        self.threads.push((thread, stop));
+        Ok(())
+    }
+
+    /// Waits for the first word of every camera. One whose settings cannot work fails the start: better now
+    /// than after an hour of recording without it.
+    fn wait_for_cameras(&self) -> Result<()> {
+        let deadline = HostTime::now().plus(START_PATIENCE);
+        while !deadline.from_now().is_zero()
+            && self.inner.cameras.iter().any(|c| c.state().phase == CameraState::Opening)
+        {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let mut failed: Vec<Error> = Vec::new();
+        for camera in &self.inner.cameras {
+            let mut state = camera.state();
+            if state.phase == CameraState::Failed {
+                failed.extend(state.error.take());
+            }
+        }
+        match failed.len() {
+            0 => Ok(()),
+            1 => Err(failed.remove(0)),
+            n => {
+                let all: Vec<_> = failed.iter().map(ToString::to_string).collect();
+                Err(Error::new(failed[0].kind(), format!("{n} cameras cannot work:\n  {}", all.join("\n  "))))
+            }
+        }
+    }
+}
+
+impl Drop for Rig {
+    fn drop(&mut self) {
+        self.end_threads();
+    }
+}
+
+impl Inner {
+    fn spreads(&self) -> MutexGuard<'_, SpreadStats> {
+        lock(&self.spreads)
+    }
+
+    fn recording(&self) -> MutexGuard<'_, Recording> {
+        lock(&self.recording)
+    }
+
+    fn set_accounts(&self) -> MutexGuard<'_, SetAccounts> {
+        lock(&self.set_accounts)
+    }
+
+    fn all_done(&self) -> bool {
+        self.cameras.iter().all(|c| matches!(c.state().phase, CameraState::Finished | CameraState::Failed))
+    }
+
+    fn stream_facts(&self) -> Vec<StreamFacts> {
+        let mut facts = Vec::new();
+        for camera in &self.cameras {
+            let state = camera.state();
+            let Some(info) = &state.info else { continue };
+            facts.extend(state.streams.iter().map(|stream| StreamFacts {
+                stream: Arc::clone(stream),
+                model: info.model.clone(),
+                serial: info.serial.clone(),
+                calibration: info.calibration.clone(),
+                camera_pose: camera.config.pose,
+            }));
+        }
+        facts
+    }
+}
+
+impl Control for Inner {
+    fn status(&self) -> RigStatus {
+        report::status(self)
+    }
+
+    fn config_text(&self) -> String {
+        self.config.text.clone()
+    }
+
+    fn record_start(&self, request: &RecordRequest) -> Result<RecordingStatus> {
+        let _one_at_a_time = lock(&self.starting);
+        self.recording().must_be_idle()?;
+        // Without the recording's lock: making a file must not keep the set thread waiting.
+        let begun = Begun::new(&self.config, request, self.stream_facts())?;
+        Ok(self.recording().begin(begun))
+    }
+
+    fn record_stop(&self) -> Result<RecordingStatus> {
+        let finishing = self.recording().take()?;
+        // Without the lock: `status` and the next frames need not wait for the disk.
+        let (status, result) = finishing.finish();
+        self.recording().keep(status.clone(), result.as_ref().ok().cloned());
+        result.map(|_| status)
+    }
+
+    fn record_note(&self, text: &str) -> Result<()> {
+        self.recording().note(text)
+    }
+
+    fn request_stop(&self) {
+        self.stop_asked.store(true, Ordering::Relaxed);
+        self.ended.raise();
+    }
+}
+
+/// Renders what synthetic cameras will show, so that the cameras themselves start at once.
+fn prepare(config: &mut RigConfig, options: &RigOptions) -> Result<()> {
+    for camera in &mut config.cameras {
+        let BackendConfig::Synthetic(c) = &mut camera.backend else { continue };
+        c.pose_on_mount = camera.pose;
+        if let Some(dir) = &options.cache_dir {
+            c.cache_dir.clone_from(dir);
+        }
+        let name = camera.name.as_str();
+        depthrig_drivers::synthetic::prepare(c, &|done, total| {
+            if let Some(progress) = &options.progress {
+                progress(name, done, total);
+            }
+        })?;
+    }
+    Ok(())
+}
+
+/// The supervisor thread.
+fn supervise(inner: &Arc<Inner>, stop: &AtomicBool) {
+    let supervisor = |c: &Arc<Camera>| Supervisor::new(Arc::clone(c), Arc::clone(&inner.shared));
+    let mut supervisors: Vec<_> = inner.cameras.iter().map(supervisor).collect();
+    while !stop.load(Ordering::Relaxed) {
+        let now = HostTime::now();
+        for s in &mut supervisors {
+            s.step(now);
+        }
+        std::thread::sleep(STEP);
+    }
+    for s in &supervisors {
+        s.request_stop();
+    }
+    let deadline = HostTime::now().plus(STOP_PATIENCE);
+    for s in &mut supervisors {
+        s.stop(deadline.from_now());
+    }
+}
+
+/// The house thread: what must be done about once a second and by nobody in particular.
+fn keep_house(inner: &Inner, stop: &AtomicBool) {
+    const LOOK: Duration = Duration::from_millis(50);
+    let (mut last, mut last_cpu) = (HostTime::now(), clock::process_cpu_ns());
+    while !stop.load(Ordering::Relaxed) {
+        std::thread::sleep(LOOK);
+        let now = HostTime::now();
+        let passed_ns = now.since_ns(last);
+        if passed_ns < 1_000_000_000 {
+            continue;
+        }
+        let cpu = clock::process_cpu_ns();
+        inner.cpu_millicores.store(((cpu - last_cpu) * 1000 / passed_ns) as u64, Ordering::Relaxed);
+        (last, last_cpu) = (now, cpu);
+        let cleaned = inner.shared.bus.clean_dead();
+        if cleaned > 0 {
+            tracing::info!(processes = cleaned, "cleaned up after subscribers that were killed");
+        }
+        let recording = inner.recording().is_active();
+        if recording {
+            let diagnostics = report::diagnostics(&report::status(inner));
+            inner.recording().housekeeping(diagnostics);
+        }
+    }
+}

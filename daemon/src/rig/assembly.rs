@@ -1,0 +1,212 @@
+//! The set thread: reads every stream of the rig, makes frame sets, sends them and hands them to the recorder.
+//!
+//! It is a subscriber like any other, so that nothing it does can hold up a camera.
+
+use super::Inner;
+use crate::camera::Camera;
+use crate::config::Phase;
+use crate::sets::{Assembler, AssemblerConfig, FrameSet, PhasePolicy};
+use crate::status::{CameraState, SetAccount};
+use crate::stream::Stream;
+use core::time::Duration;
+use depthrig_bus::{Frame, HostTime, MemberRecord, SetHeader, SetPublisher, Subscriber};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// How long the thread sleeps at most, so that it sees a stop or a lost camera in time.
+const IDLE: Duration = Duration::from_millis(50);
+/// Frames of one stream that may wait for their set: with the recorder's queue they stay below what a
+/// subscriber may hold (16).
+const MAX_PENDING: usize = 6;
+
+/// One stream as the set thread sees it.
+struct Input {
+    stream: Arc<Stream>,
+    camera: Arc<Camera>,
+    subscriber: Subscriber,
+    /// Counts from before the assembler was last rebuilt.
+    base: SetAccount,
+    /// Frames that were published before the set thread came to listen.
+    before: Option<u64>,
+}
+
+/// The set thread's state.
+pub struct Assembly {
+    inner: Arc<Inner>,
+    inputs: Vec<Input>,
+    assembler: Option<Assembler<Frame>>,
+    publisher: SetPublisher,
+    next_id: u64,
+    incomplete: u64,
+}
+
+impl Assembly {
+    /// The set thread of a rig.
+    ///
+    /// # Errors
+    /// Those of opening the channel of sets.
+    pub fn new(inner: Arc<Inner>) -> crate::Result<Self> {
+        let publisher = inner.shared.bus.set_publisher()?;
+        Ok(Self { inner, inputs: Vec::new(), assembler: None, publisher, next_id: 1, incomplete: 0 })
+    }
+
+    /// Runs until the rig stops.
+    pub fn run(mut self, stop: &AtomicBool) {
+        while !stop.load(Ordering::Relaxed) {
+            self.find_streams();
+            let now = HostTime::now();
+            let deadline = self.assembler.as_ref().and_then(Assembler::next_deadline);
+            let sleep = deadline.map_or(IDLE, |d| d.from_now().min(IDLE)).max(Duration::from_millis(1));
+            self.inner.shared.frames.wait(sleep);
+            self.read_frames();
+            self.send_sets(HostTime::now().max(now));
+        }
+        // Frames that were on their way when the rig stopped still count.
+        self.read_frames();
+        self.send_sets(HostTime::now());
+    }
+
+    /// Takes in the streams of cameras that opened since the last look.
+    fn find_streams(&mut self) {
+        let mut found = false;
+        for camera in &self.inner.cameras {
+            let state = camera.state();
+            let known = self.inputs.iter().filter(|i| Arc::ptr_eq(&i.camera, camera)).count();
+            for stream in state.streams.iter().skip(known) {
+                if stream.books().publisher.is_none() {
+                    break; // its channel is just being made
+                }
+                match self.inner.shared.bus.subscriber(&stream.id) {
+                    Ok(subscriber) => self.inputs.push(Input {
+                        stream: Arc::clone(stream),
+                        camera: Arc::clone(camera),
+                        subscriber,
+                        base: SetAccount::default(),
+                        before: None,
+                    }),
+                    Err(e) => {
+                        tracing::error!(stream = %stream.id, error = %e, "the stream cannot become part of sets");
+                        break;
+                    }
+                }
+                found = true;
+            }
+        }
+        if found {
+            self.rebuild();
+        }
+        let Some(assembler) = &mut self.assembler else { return };
+        for (i, input) in self.inputs.iter().enumerate() {
+            let phase = input.camera.state().phase;
+            assembler.set_stream_active(i, matches!(phase, CameraState::Opening | CameraState::Streaming));
+        }
+    }
+
+    /// Makes an assembler for the streams there are now; frames that waited in the old one are let go.
+    fn rebuild(&mut self) {
+        if let Some(old) = self.assembler.take() {
+            for (input, account) in self.inputs.iter_mut().zip(old.accounts()) {
+                let mut sum = add(&input.base, account);
+                sum.overflow += core::mem::take(&mut sum.pending);
+                input.base = sum;
+            }
+        }
+        let sets = &self.inner.config.sets;
+        let periods: Vec<i64> = self.inputs.iter().map(|i| i.stream.profile.period_ns() as i64).collect();
+        let period_ns = (1e9 / sets.rate_hz).round() as i64;
+        let mut config = AssemblerConfig::new(period_ns, periods);
+        config.max_pending = MAX_PENDING;
+        if let Some(ms) = sets.max_wait_ms {
+            config.max_wait_ns = (ms * 1e6) as i64;
+        }
+        config.phase = match sets.phase {
+            Phase::Auto => PhasePolicy::MinimiseSpread,
+            Phase::Fixed => PhasePolicy::Fixed,
+        };
+        self.assembler = Some(Assembler::new(config));
+    }
+
+    fn read_frames(&mut self) {
+        let Some(assembler) = &mut self.assembler else { return };
+        for (i, input) in self.inputs.iter_mut().enumerate() {
+            loop {
+                match input.subscriber.try_next() {
+                    Ok(Some(frame)) => {
+                        // The rig numbers a stream's frames from 1.
+                        input.before.get_or_insert(frame.header().sequence - 1);
+                        let capture = HostTime::from_ns(frame.header().capture_time_ns);
+                        assembler.push(i, capture, frame);
+                    }
+                    Ok(None) => break,
+                    Err(e) => {
+                        // All sixteen are held: the recorder is behind. What is replaced meanwhile counts as missed.
+                        tracing::debug!(stream = %input.stream.id, error = %e, "cannot read");
+                        break;
+                    }
+                }
+            }
+        }
+    }
+
+    fn send_sets(&mut self, now: HostTime) {
+        while let Some(set) = self.assembler.as_mut().and_then(|a| a.poll(now)) {
+            self.send(set);
+        }
+        self.report();
+    }
+
+    fn send(&mut self, set: FrameSet<Frame>) {
+        let id = self.next_id;
+        self.next_id += 1;
+        let members: Vec<_> = self
+            .inputs
+            .iter()
+            .zip(&set.members)
+            .map(|(input, member)| MemberRecord {
+                id: input.stream.id.clone(),
+                sequence: member.as_ref().map(|m| m.item.header().sequence),
+                capture_time_ns: member.as_ref().map_or(set.tick, |m| m.capture).ns(),
+            })
+            .collect();
+        self.incomplete += u64::from(members.iter().any(|m| m.sequence.is_none()));
+        let header = SetHeader {
+            set_id: id,
+            tick_ns: set.tick.ns(),
+            spread_ns: set.spread_ns,
+            incomplete: self.incomplete,
+            ..SetHeader::default()
+        };
+        if let Err(e) = self.publisher.send(header, &members) {
+            tracing::error!(set = id, error = %e, "a frame set could not be sent");
+        }
+        self.inner.spreads().add(set.spread_ns);
+        let frames =
+            self.inputs.iter().zip(set.members).map(|(i, m)| (Arc::clone(&i.stream), m.map(|m| m.item)));
+        self.inner.recording().offer(id, set.tick, set.spread_ns, frames);
+    }
+
+    /// Puts the accounts where `status` finds them.
+    fn report(&self) {
+        let Some(assembler) = &self.assembler else { return };
+        let mut accounts = self.inner.set_accounts();
+        accounts.sent = self.next_id - 1;
+        accounts.incomplete = self.incomplete;
+        for (input, account) in self.inputs.iter().zip(assembler.accounts()) {
+            let mut sum = add(&input.base, account);
+            sum.missed = input.before.unwrap_or(0) + input.subscriber.missed();
+            accounts.streams.insert(input.stream.id.clone(), sum);
+        }
+    }
+}
+
+fn add(base: &SetAccount, a: &crate::sets::Account) -> SetAccount {
+    SetAccount {
+        used: base.used + a.used,
+        decimated: base.decimated + a.decimated,
+        late: base.late + a.late,
+        out_of_order: base.out_of_order + a.out_of_order,
+        overflow: base.overflow + a.overflow,
+        missed: base.missed,
+        pending: a.pending,
+    }
+}

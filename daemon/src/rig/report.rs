@@ -1,0 +1,189 @@
+//! The rig in numbers: its status, the diagnostics that go into a recording, and what was lost.
+
+use super::{Inner, lock};
+use crate::camera::Camera;
+use crate::status::{
+    CameraState, CameraStatus, ClockStatus, RigStatus, SetAccount, SetStatus, SharedMemoryStatus,
+    StreamStatus,
+};
+use crate::stream::Stream;
+use depthrig_bus::{ClockDomain, HostTime, UtcPair, shm};
+use depthrig_recorder::{Diagnostic, Level};
+use std::sync::atomic::Ordering;
+
+/// Everything there is to know about the rig now.
+pub fn status(inner: &Inner) -> RigStatus {
+    let now = HostTime::now();
+    let cameras: Vec<_> = inner.cameras.iter().map(|c| camera(inner, c, now)).collect();
+    let reserved = |c: &Camera| -> u64 {
+        c.state().streams.iter().map(|s| (s.slots * s.profile.frame_bytes()) as u64).sum()
+    };
+    let slots = inner.cameras.iter().filter_map(|c| c.state().streams.iter().map(|s| s.slots).min()).min();
+    RigStatus {
+        rig: inner.config.rig.to_string(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        pid: std::process::id(),
+        uptime_s: inner.started.elapsed().as_secs_f64(),
+        utc_ns: UtcPair::sample().utc_ns(now),
+        cameras,
+        sets: sets(inner),
+        recording: lock(&inner.recording).status(),
+        shared_memory: SharedMemoryStatus {
+            free_bytes: shm::free_bytes(shm::SHM_DIR.as_ref()).unwrap_or(0),
+            slots: slots.unwrap_or(0),
+            reserved_bytes: inner.cameras.iter().map(|c| reserved(c)).sum(),
+        },
+        cpu_cores: inner.cpu_millicores.load(Ordering::Relaxed) as f64 / 1000.0,
+    }
+}
+
+fn sets(inner: &Inner) -> SetStatus {
+    let accounts = inner.set_accounts();
+    let spreads = inner.spreads();
+    let ms = |ns: i64| ns as f64 / 1e6;
+    SetStatus {
+        nominal_hz: inner.config.sets.rate_hz,
+        sent: accounts.sent,
+        incomplete: accounts.incomplete,
+        spread_p50_ms: ms(spreads.quantile_ns(0.5)),
+        spread_p95_ms: ms(spreads.quantile_ns(0.95)),
+        spread_p99_ms: ms(spreads.quantile_ns(0.99)),
+        spread_max_ms: ms(spreads.max_ns()),
+    }
+}
+
+fn camera(inner: &Inner, camera: &Camera, now: HostTime) -> CameraStatus {
+    let state = camera.state();
+    let info = state.info.clone().unwrap_or_default();
+    let accounts = inner.set_accounts();
+    CameraStatus {
+        name: camera.config.name.to_string(),
+        backend: camera.config.backend.name().to_owned(),
+        model: info.model,
+        serial: info.serial,
+        firmware: info.firmware,
+        calibration: info.calibration,
+        state: state.phase,
+        state_for_s: state.since.elapsed().as_secs_f64(),
+        message: state.message.clone(),
+        reconnects: state.reconnects,
+        streams: state
+            .streams
+            .iter()
+            .map(|s| stream(s, accounts.streams.get(&s.id).copied().unwrap_or_default(), now))
+            .collect(),
+    }
+}
+
+fn stream(stream: &Stream, in_sets: SetAccount, now: HostTime) -> StreamStatus {
+    let p = &stream.profile;
+    let books = stream.books();
+    let clock = books.clock.as_ref();
+    let us = |ns: i64| ns as f64 / 1e3;
+    StreamStatus {
+        id: stream.id.to_string(),
+        format: p.format.name().to_owned(),
+        width: p.width,
+        height: p.height,
+        nominal_hz: p.rate_hz,
+        rate_hz: books.rate_hz(now),
+        captured: books.captured,
+        delivered: books.delivered,
+        dropped: books.dropped.nonzero().map(|(r, n)| (r.name().to_owned(), n)).collect(),
+        last_frame_age_ms: books.last_frame.map(|t| now.since_ns(t) as f64 / 1e6),
+        latency_p50_ms: books.latency_ms(0.5),
+        latency_p99_ms: books.latency_ms(0.99),
+        clock: ClockStatus {
+            domain: match p.clock.domain {
+                ClockDomain::Device => "device",
+                ClockDomain::Kernel => "kernel",
+                _ => "arrival",
+            }
+            .to_owned(),
+            epoch: books.epoch,
+            rate_ppm: clock.map_or(0.0, |c| c.rate_ppm),
+            uncertainty_us: books.uncertainty_ns as f64 / 1e3,
+            residual_p50_us: clock.map_or(0.0, |c| us(c.residual_p50_ns)),
+            residual_p99_us: clock.map_or(0.0, |c| us(c.residual_p99_ns)),
+            uncertain_frames: books.uncertain,
+        },
+        in_sets,
+    }
+}
+
+/// The status as `diagnostic_msgs` see it: one entry per camera and one for the sets.
+pub fn diagnostics(status: &RigStatus) -> Vec<Diagnostic> {
+    let mut all: Vec<_> = status.cameras.iter().map(|c| diagnose(&status.rig, c)).collect();
+    let s = &status.sets;
+    all.push(Diagnostic {
+        level: if s.incomplete > 0 { Level::Warn } else { Level::Ok },
+        name: format!("{}/sets", status.rig),
+        message: format!("{} sets, {} incomplete", s.sent, s.incomplete),
+        hardware_id: String::new(),
+        values: vec![
+            ("spread_p50_ms".to_owned(), format!("{:.3}", s.spread_p50_ms)),
+            ("spread_p99_ms".to_owned(), format!("{:.3}", s.spread_p99_ms)),
+            ("cpu_cores".to_owned(), format!("{:.2}", status.cpu_cores)),
+        ],
+    });
+    all
+}
+
+fn diagnose(rig: &str, camera: &CameraStatus) -> Diagnostic {
+    let mut values = vec![("reconnects".to_owned(), camera.reconnects.to_string())];
+    for s in &camera.streams {
+        let name = s.id.rsplit('/').next().unwrap_or(&s.id);
+        let mut value = |key: &str, text: String| values.push((format!("{name}.{key}"), text));
+        value("rate_hz", format!("{:.2}", s.rate_hz));
+        value("captured", s.captured.to_string());
+        value("delivered", s.delivered.to_string());
+        for (reason, n) in &s.dropped {
+            value(&format!("dropped_{reason}"), n.to_string());
+        }
+        value("latency_p99_ms", format!("{:.3}", s.latency_p99_ms));
+        value("clock_epoch", s.clock.epoch.to_string());
+        value("clock_rate_ppm", format!("{:.2}", s.clock.rate_ppm));
+        value("clock_uncertainty_us", format!("{:.1}", s.clock.uncertainty_us));
+        value("clock_residual_p99_us", format!("{:.1}", s.clock.residual_p99_us));
+    }
+    Diagnostic {
+        level: match camera.state {
+            CameraState::Streaming => Level::Ok,
+            CameraState::Failed => Level::Error,
+            _ => Level::Warn,
+        },
+        name: format!("{rig}/{}", camera.name),
+        message: camera.message.clone().unwrap_or_else(|| camera.state.name().to_owned()),
+        hardware_id: camera.serial.clone(),
+        values,
+    }
+}
+
+/// What was lost over the rig's life, one line each.
+pub fn lost(status: &RigStatus) -> Vec<String> {
+    let mut lost = Vec::new();
+    for camera in &status.cameras {
+        if camera.state == CameraState::Failed {
+            let why = camera.message.as_deref().unwrap_or("no reason known");
+            lost.push(format!("camera {} failed: {why}", camera.name));
+        }
+        for s in camera.streams.iter().filter(|s| !s.dropped.is_empty()) {
+            let reasons: Vec<_> = s.dropped.iter().map(|(r, n)| format!("{n} {r}")).collect();
+            lost.push(format!(
+                "{}: {} of {} frames ({})",
+                s.id,
+                s.dropped.values().sum::<u64>(),
+                s.captured,
+                reasons.join(", ")
+            ));
+        }
+    }
+    if let Some(recording) = &status.recording {
+        lost.extend(recording.error.iter().map(|e| format!("recording {}: {e}", recording.path)));
+        let reasons: Vec<_> = recording.dropped.iter().map(|(r, n)| format!("{n} {r}")).collect();
+        if !reasons.is_empty() {
+            lost.push(format!("recording {}: sets not recorded: {}", recording.path, reasons.join(", ")));
+        }
+    }
+    lost
+}

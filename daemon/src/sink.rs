@@ -1,0 +1,133 @@
+//! From a driver to the bus: pixels are written once, into the slot that subscribers read.
+
+use crate::stream::{Books, Stream};
+use crate::wake::Wake;
+use depthrig_bus::{DropReason, FrameHeader, FrameMut, HostTime, Publisher};
+use depthrig_drivers::clock::ClockQuality;
+use depthrig_drivers::{FrameMeta, FrameSink};
+use std::sync::{Arc, MutexGuard};
+
+/// The sink of one opening of one camera.
+pub struct BusSink {
+    streams: Vec<Port>,
+    wake: Arc<Wake>,
+}
+
+/// One stream of the sink.
+struct Port {
+    stream: Arc<Stream>,
+    publisher: Arc<Publisher>,
+    /// The header of every frame; what changes per frame is filled in at commit.
+    template: FrameHeader,
+    session: u64,
+    loan: Option<FrameMut>,
+}
+
+impl BusSink {
+    /// A sink over `streams`, each with its channel and the header that all its frames share. `wake` is
+    /// raised after each frame.
+    pub fn new(streams: Vec<(Arc<Stream>, Arc<Publisher>, FrameHeader)>, wake: Arc<Wake>) -> Self {
+        let port = |(stream, publisher, template): (Arc<Stream>, Arc<Publisher>, FrameHeader)| {
+            let session = stream.books().begin_session();
+            Port { stream, publisher, template, session, loan: None }
+        };
+        Self { streams: streams.into_iter().map(port).collect(), wake }
+    }
+}
+
+impl Port {
+    /// The stream's books, unless this session was closed.
+    fn books(&self) -> Option<MutexGuard<'_, Books>> {
+        let books = self.stream.books();
+        (books.session == self.session).then_some(books)
+    }
+
+    fn publish(&mut self, meta: &FrameMeta) {
+        let Some(mut frame) = self.loan.take() else { return };
+        let stream = Arc::clone(&self.stream);
+        let mut books = stream.books();
+        if books.session != self.session {
+            return;
+        }
+        let payload_len = frame.header().payload_len;
+        *frame.header_mut() = FrameHeader {
+            sequence: books.delivered + 1,
+            device_sequence: meta.device_sequence,
+            device_time: meta.device_time,
+            capture_time_ns: meta.capture_time.ns(),
+            capture_uncertainty_ns: meta.capture_uncertainty_ns,
+            arrival_time_ns: meta.arrival.ns(),
+            exposure_ns: meta.exposure_ns,
+            captured: books.captured,
+            dropped: books.dropped.0,
+            clock_domain: meta.clock_domain as u32,
+            clock_epoch: books.epoch_base + meta.clock_epoch,
+            flags: meta.flags.0,
+            gain: meta.gain,
+            temperature_c: meta.temperature_c,
+            payload_len,
+            ..self.template
+        };
+        if let Err(e) = self.publisher.send(frame) {
+            books.dropped.add(DropReason::NoSlot, 1);
+            tracing::error!(stream = %self.stream.id, error = %e, "a frame was lost on its way to the subscribers");
+            return;
+        }
+        let now = HostTime::now();
+        books.delivered += 1;
+        books.epoch = books.epoch_base + meta.clock_epoch;
+        books.uncertainty_ns = meta.capture_uncertainty_ns;
+        books.uncertain += u64::from(meta.flags.0 & depthrig_bus::FrameFlags::TIME_UNCERTAIN.0 != 0);
+        books.note(now, now.since_ns(meta.capture_time));
+    }
+}
+
+impl FrameSink for BusSink {
+    fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]> {
+        let port = self.streams.get_mut(stream)?;
+        port.loan = None;
+        match port.publisher.loan(len) {
+            Ok(frame) => Some(port.loan.insert(frame).pixels_mut()),
+            Err(e) => {
+                tracing::debug!(stream = %port.stream.id, error = %e, "no slot");
+                None
+            }
+        }
+    }
+
+    fn commit(&mut self, stream: usize, meta: &FrameMeta) {
+        if let Some(port) = self.streams.get_mut(stream) {
+            port.publish(meta);
+            self.wake.raise();
+        }
+    }
+
+    fn discard(&mut self, stream: usize) {
+        if let Some(port) = self.streams.get_mut(stream) {
+            port.loan = None;
+        }
+    }
+
+    fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
+        let Some(port) = self.streams.get(stream) else { return };
+        let Some(mut books) = port.books() else { return };
+        books.dropped.add(reason, n);
+        // A camera that loses every frame must not fill the log: one line a second, the counts say the rest.
+        if books.may_log_loss(HostTime::now()) {
+            let (id, total) = (&port.stream.id, books.dropped.total());
+            tracing::error!(stream = %id, reason = reason.name(), frames = n, total, "frames lost");
+        }
+    }
+
+    fn captured(&mut self, stream: usize, n: u64) {
+        if let Some(mut books) = self.streams.get(stream).and_then(Port::books) {
+            books.captured += n;
+        }
+    }
+
+    fn clock_quality(&mut self, stream: usize, quality: &ClockQuality) {
+        if let Some(mut books) = self.streams.get(stream).and_then(Port::books) {
+            books.clock = Some(*quality);
+        }
+    }
+}

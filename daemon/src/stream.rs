@@ -1,0 +1,155 @@
+//! What the daemon keeps of one stream for as long as it lives, whatever happens to its camera.
+//!
+//! The books are double-entry: `captured` is what the device announced, `delivered` and `dropped` are what
+//! became of it, and [`Books::close`] balances them when a hung thread is given up with a frame in its hands.
+
+use depthrig_bus::{DropCounts, DropReason, HostTime, Publisher, StreamId};
+use depthrig_drivers::StreamProfile;
+use depthrig_drivers::clock::ClockQuality;
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// Frames over which latency and rate are measured.
+const WINDOW: usize = 256;
+
+/// One stream of a rig.
+#[derive(Debug)]
+pub struct Stream {
+    /// Which.
+    pub id: StreamId,
+    /// Its mode; a camera that comes back with another one is refused.
+    pub profile: StreamProfile,
+    /// Whether its frames belong into recordings.
+    pub record: bool,
+    /// Slots of its channel.
+    pub slots: usize,
+    books: Mutex<Books>,
+}
+
+/// The books of a stream.
+#[derive(Debug, Default)]
+pub struct Books {
+    /// Frames the device announced.
+    pub captured: u64,
+    /// Frames published; also the sequence number of the newest.
+    pub delivered: u64,
+    /// Frames lost.
+    pub dropped: DropCounts,
+    /// Which opening of the camera may write here; an abandoned thread's is over.
+    pub session: u64,
+    /// The channel; it outlives the camera's sessions so that subscribers need not come back.
+    pub publisher: Option<Arc<Publisher>>,
+    /// When the newest frame was published.
+    pub last_frame: Option<HostTime>,
+    /// Clock epochs of earlier sessions.
+    pub epoch_base: u32,
+    /// Epoch of the newest frame.
+    pub epoch: u32,
+    /// Stated uncertainty of the newest capture time.
+    pub uncertainty_ns: u64,
+    /// Frames flagged as uncertain in time.
+    pub uncertain: u64,
+    /// The clock map's own word.
+    pub clock: Option<ClockQuality>,
+    recent: VecDeque<(HostTime, i64)>,
+    loss_logged: Option<HostTime>,
+}
+
+impl Stream {
+    /// A stream without a frame yet.
+    pub fn new(id: StreamId, profile: StreamProfile, record: bool, slots: usize) -> Self {
+        Self { id, profile, record, slots, books: Mutex::default() }
+    }
+
+    /// The books, for reading or writing.
+    pub fn books(&self) -> MutexGuard<'_, Books> {
+        self.books.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Books {
+    /// Begins a new opening of the camera and returns its number.
+    pub fn begin_session(&mut self) -> u64 {
+        self.session += 1;
+        if self.session > 1 {
+            self.epoch_base = self.epoch + 1;
+        }
+        self.session
+    }
+
+    /// Ends the present session against the will of its thread: the frame it was writing is lost, and what it
+    /// says from now on is not heard. Its publisher stays with it.
+    pub fn close(&mut self) {
+        let pending = self.captured - self.delivered - self.dropped.total();
+        self.dropped.add(DropReason::Abandoned, pending);
+        self.session += 1;
+        self.publisher = None;
+    }
+
+    /// Whether a loss may be logged now: once a second.
+    pub fn may_log_loss(&mut self, now: HostTime) -> bool {
+        let may = self.loss_logged.is_none_or(|t| now.since_ns(t) > 1_000_000_000);
+        if may {
+            self.loss_logged = Some(now);
+        }
+        may
+    }
+
+    /// Notes a published frame.
+    pub fn note(&mut self, published: HostTime, latency_ns: i64) {
+        if self.recent.len() == WINDOW {
+            self.recent.pop_front();
+        }
+        self.recent.push_back((published, latency_ns));
+        self.last_frame = Some(published);
+    }
+
+    /// Frames per second over the last two seconds or the last 256 frames.
+    pub fn rate_hz(&self, now: HostTime) -> f64 {
+        let from = now.plus_ns(-2_000_000_000);
+        let mut recent = self.recent.iter().map(|r| r.0).filter(|t| *t >= from);
+        let Some(first) = recent.next() else { return 0.0 };
+        let count = recent.count();
+        // Until now, not until the last frame: a stream that just stopped must not look alive.
+        let span = now.since_ns(first).max(1);
+        (count + 1) as f64 * 1e9 / span as f64
+    }
+
+    /// The latency from capture to publish that a share of `quantile` of the last frames stayed below, ms.
+    pub fn latency_ms(&self, quantile: f64) -> f64 {
+        let mut latencies: Vec<_> = self.recent.iter().map(|r| r.1).collect();
+        if latencies.is_empty() {
+            return 0.0;
+        }
+        let at = ((latencies.len() - 1) as f64 * quantile).round() as usize;
+        *latencies.select_nth_unstable(at).1 as f64 / 1e6
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn closing_balances_the_books() {
+        let mut books = Books { captured: 10, delivered: 7, ..Books::default() };
+        books.dropped.add(DropReason::DeviceGap, 2);
+        let session = books.begin_session();
+        books.close();
+        assert_eq!(books.captured, books.delivered + books.dropped.total());
+        assert_eq!(books.dropped.get(DropReason::Abandoned), 1);
+        assert_ne!(books.session, session);
+    }
+
+    #[test]
+    fn rate_counts_until_now() {
+        let mut books = Books::default();
+        let at = |ms: i64| HostTime::from_ns(10_000_000_000 + ms * 1_000_000);
+        for i in 0..30 {
+            books.note(at(i * 33), 5_000_000);
+        }
+        assert!((books.rate_hz(at(29 * 33 + 33)) - 30.3).abs() < 0.5);
+        assert!(books.rate_hz(at(5000)).abs() < 1e-9);
+        assert!((books.latency_ms(0.5) - 5.0).abs() < 1e-9);
+    }
+}

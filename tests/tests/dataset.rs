@@ -1,0 +1,199 @@
+//! From camera to disk and back: what a subscriber saw live is what the dataset and its replay hold.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+use depthrig_bus::{Bus, Frame, FrameFlags, FrameHeader, RigName, StreamId};
+use depthrig_daemon::ErrorKind;
+use depthrig_daemon::control::RecordRequest;
+use depthrig_daemon::replay::{Replay, ReplayOptions};
+use depthrig_recorder::{Dataset, SetRange};
+use depthrig_tests::{Home, RigText, all_stream, assert_balanced, wait_until};
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+const WAIT: Duration = Duration::from_secs(10);
+const RAW: &str = "[recording]\ncolor = \"raw\"\n";
+
+/// Frames by stream and device sequence.
+type Seen = BTreeMap<(String, u64), (FrameHeader, Vec<u8>)>;
+
+fn text() -> String {
+    RigText::default().camera("left", "").camera("right", "").text().to_owned() + RAW
+}
+
+fn streams() -> Vec<StreamId> {
+    ["left", "right"].iter().flat_map(|c| ["color", "depth"].map(|s| StreamId::new(c, s).unwrap())).collect()
+}
+
+fn keep(seen: &mut Seen, frame: &Frame) {
+    let h = frame.header();
+    seen.insert((h.stream_id().unwrap().to_string(), h.device_sequence), (*h, frame.pixels().to_vec()));
+}
+
+/// Ends a watcher however its test ends, or a failed assertion would leave the test waiting for it.
+struct StopAtEnd<'a>(&'a AtomicBool);
+
+impl Drop for StopAtEnd<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::SeqCst);
+    }
+}
+
+/// Reads every stream until `stop`.
+fn watch(home: &Home, stop: &AtomicBool) -> Seen {
+    let bus = Bus::open(&home.runtime(), &RigName::new("test").unwrap()).unwrap();
+    let mut subscribers: Vec<_> =
+        streams().iter().map(|id| bus.subscriber_within(id, WAIT).unwrap()).collect();
+    let mut seen = Seen::new();
+    loop {
+        let last = stop.load(Ordering::SeqCst);
+        for subscriber in &mut subscribers {
+            while let Some(frame) = subscriber.try_next().unwrap() {
+                keep(&mut seen, &frame);
+            }
+        }
+        if last {
+            assert!(subscribers.iter().all(|s| s.missed() == 0), "the test's own subscriber was too slow");
+            return seen;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn live_recorded_and_replayed_frames_are_the_same() {
+    let home = Home::default();
+    let rig = home.start(&text()).unwrap();
+    wait_until(&rig, "streaming", all_stream);
+    let stop = AtomicBool::new(false);
+    let control = rig.control();
+    let (live, recorded) = std::thread::scope(|s| {
+        let _stop = StopAtEnd(&stop);
+        let watcher = s.spawn(|| watch(&home, &stop));
+        std::thread::sleep(Duration::from_millis(300));
+        let request = RecordRequest {
+            directory: Some(home.path("data")),
+            scene: "desk".into(),
+            notes: "first".into(),
+            ..RecordRequest::default()
+        };
+        let started = control.record_start(&request).unwrap();
+        assert_eq!(control.record_start(&request).unwrap_err().kind(), ErrorKind::InUse);
+        control.record_note("cup moved").unwrap();
+        wait_until(&rig, "ten sets", |s| s.recording.as_ref().is_some_and(|r| r.sets >= 10));
+        let recorded = control.record_stop().unwrap();
+        assert_eq!(recorded.path, started.path);
+        stop.store(true, Ordering::SeqCst);
+        (watcher.join().unwrap(), recorded)
+    });
+    let summary = rig.stop();
+    assert_balanced(&summary.status);
+    assert_eq!(summary.lost, Vec::<String>::new());
+
+    let dataset = Dataset::open(recorded.path.as_ref()).unwrap();
+    assert_eq!(dataset.session().scene, "desk");
+    assert_eq!(
+        dataset.session().notes.iter().map(|n| n.text.as_str()).collect::<Vec<_>>(),
+        ["first", "cup moved"]
+    );
+    let sets: Vec<_> = dataset.sets(SetRange::ALL).map(Result::unwrap).collect();
+    assert!(sets.len() >= 10);
+    let mut in_dataset = Seen::new();
+    for set in &sets {
+        assert_eq!((set.frames.len(), set.missing.len()), (4, 0), "set {}", set.id);
+        for frame in &set.frames {
+            let key = (frame.header.stream_id().unwrap().to_string(), frame.header.device_sequence);
+            let (header, pixels) = &live[&key];
+            assert_eq!(frame.header, FrameHeader { set_id: set.id, ..*header });
+            assert!(frame.pixels == *pixels, "{key:?}");
+            in_dataset.insert(key, (frame.header, frame.pixels.clone()));
+        }
+    }
+    replayed_is(&home, recorded.path.as_ref(), &in_dataset);
+}
+
+/// Replays the dataset and compares every frame with `expected`.
+fn replayed_is(home: &Home, path: &std::path::Path, expected: &Seen) {
+    let stop = AtomicBool::new(false);
+    let replayed = std::thread::scope(|s| {
+        let options = ReplayOptions { rate: 4.0, ..ReplayOptions::default() };
+        let replay = Replay::start(path, &home.runtime(), None, options).unwrap();
+        let _stop = StopAtEnd(&stop);
+        let watcher = s.spawn(|| watch(home, &stop));
+        while !replay.progress().done {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        std::thread::sleep(Duration::from_millis(200));
+        stop.store(true, Ordering::SeqCst);
+        let seen = watcher.join().unwrap();
+        assert_eq!(replay.stop().lost, Vec::<String>::new());
+        seen
+    });
+    // The watcher joins when the replay has begun, so it may miss the first set.
+    assert!(replayed.len() + 8 >= expected.len(), "{} of {}", replayed.len(), expected.len());
+    for (key, (header, pixels)) in &replayed {
+        let (recorded, recorded_pixels) = &expected[key];
+        assert!(header.has(FrameFlags::REPLAYED));
+        let original = FrameHeader {
+            sequence: recorded.sequence,
+            captured: recorded.captured,
+            flags: header.flags & !FrameFlags::REPLAYED.0,
+            ..*header
+        };
+        assert_eq!(original, *recorded, "{key:?}");
+        assert!(pixels == recorded_pixels, "{key:?}");
+    }
+}
+
+#[test]
+fn a_camera_that_is_lost_leaves_marked_sets() {
+    let text = RigText::default()
+        .camera("left", "")
+        .camera("right", "")
+        .fault("unplug", 1.0, "duration_s = 1.0")
+        .text()
+        .to_owned()
+        + RAW;
+    let home = Home::default();
+    let rig = home.start(&text).unwrap();
+    wait_until(&rig, "streaming", all_stream);
+    let control = rig.control();
+    let request = RecordRequest { directory: Some(home.path("data")), ..RecordRequest::default() };
+    control.record_start(&request).unwrap();
+    wait_until(&rig, "back", |s| s.cameras[1].reconnects == 1);
+    std::thread::sleep(Duration::from_millis(600));
+    let recorded = control.record_stop().unwrap();
+    rig.stop();
+    let dataset = Dataset::open(recorded.path.as_ref()).unwrap();
+    let sets: Vec<_> = dataset.sets(SetRange::ALL).map(Result::unwrap).collect();
+    let missing = sets.iter().filter(|s| !s.missing.is_empty()).count();
+    assert!(
+        (2..=12).contains(&missing),
+        "one second without a camera and its return are five to ten sets, not {missing}"
+    );
+    for set in &sets {
+        assert_eq!(set.frames.len() + set.missing.len(), 4);
+        assert!(
+            set.frames.iter().filter(|f| f.header.camera() == "left").count() == 2,
+            "left was always there"
+        );
+    }
+}
+
+#[test]
+fn what_is_no_dataset_is_said() {
+    let home = Home::default();
+    let Err(e) = Replay::start(&home.path("nowhere"), &home.runtime(), None, ReplayOptions::default()) else {
+        panic!()
+    };
+    assert_eq!(e.kind(), ErrorKind::NotFound);
+    std::fs::create_dir(home.path("empty")).unwrap();
+    let Err(e) = Replay::start(&home.path("empty"), &home.runtime(), None, ReplayOptions::default()) else {
+        panic!()
+    };
+    assert_eq!(e.kind(), ErrorKind::BadInput);
+    assert!(e.to_string().contains("is no dataset"), "{e}");
+    let options = ReplayOptions { rate: 0.0, ..ReplayOptions::default() };
+    let Err(e) = Replay::start(&home.path("empty"), &home.runtime(), None, options) else { panic!() };
+    assert!(e.to_string().contains("rate above 0"), "{e}");
+}

@@ -1,0 +1,119 @@
+//! A rig whose cameras fail: each failure is seen for what it is, and the other cameras do not notice.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+use depthrig_bus::HostTime;
+use depthrig_daemon::ErrorKind;
+use depthrig_daemon::status::{CameraState, RigStatus};
+use depthrig_tests::{Home, RigText, all_stream, assert_balanced, camera, wait_until};
+use std::time::Duration;
+
+/// One camera with `fault` at 1 s and two without; runs until `seen` of the bad camera and it streams again.
+fn run(kind: &str, more: &str, seen: impl Fn(&RigStatus) -> bool) -> RigStatus {
+    let text =
+        RigText::default().camera("good", "").camera("bad", "").fault(kind, 1.0, more).camera("fine", "");
+    let home = Home::default();
+    let rig = home.start(text.text()).unwrap();
+    wait_until(&rig, kind, &seen);
+    wait_until(&rig, "back to streaming", |s| camera(s, "bad").state == CameraState::Streaming);
+    std::thread::sleep(Duration::from_millis(300));
+    let summary = rig.stop();
+    for name in ["good", "fine"] {
+        for s in &camera(&summary.status, name).streams {
+            assert!(s.dropped.is_empty(), "{} lost frames to another camera's {kind}: {:?}", s.id, s.dropped);
+        }
+    }
+    assert_balanced(&summary.status);
+    summary.status
+}
+
+fn lost(status: &RigStatus, reason: &str) -> u64 {
+    camera(status, "bad").streams.iter().map(|s| s.dropped.get(reason).copied().unwrap_or(0)).sum()
+}
+
+#[test]
+fn an_unplugged_camera_comes_back() {
+    let status = run("unplug", "duration_s = 0.8", |s| camera(s, "bad").state == CameraState::Reconnecting);
+    assert_eq!(camera(&status, "bad").reconnects, 1);
+    assert!(
+        camera(&status, "bad").streams[0].clock.epoch >= 1,
+        "a device that starts afresh has a new clock map"
+    );
+}
+
+#[test]
+fn a_stalled_camera_is_seen_and_comes_back() {
+    let status = run("stall", "duration_s = 0.9", |s| camera(s, "bad").state == CameraState::Stalled);
+    assert_eq!(camera(&status, "bad").reconnects, 0, "a short stall needs no reconnect");
+    assert!(lost(&status, "device_gap") > 0, "the frames of the stall are lost and counted");
+}
+
+#[test]
+fn a_hung_driver_is_given_up_and_its_successor_streams() {
+    let status = run("hang", "duration_s = 3.0", |s| {
+        let bad = camera(s, "bad");
+        bad.message.as_deref().is_some_and(|m| m.contains("hangs")) || bad.reconnects > 0
+    });
+    assert!(camera(&status, "bad").reconnects >= 1);
+}
+
+#[test]
+fn broken_frames_are_dropped_and_counted() {
+    for (kind, reason) in [
+        ("half_frame", "incomplete"),
+        ("wrong_size", "wrong_size"),
+        ("damaged", "device_error"),
+        ("skip", "device_gap"),
+    ] {
+        let status = run(kind, "count = 3", |s| lost(s, reason) > 0);
+        assert_eq!(lost(&status, reason), 6, "three frames of two streams each: {kind}");
+    }
+}
+
+#[test]
+fn time_going_backwards_is_a_new_epoch_or_flagged() {
+    let status = run("time_backwards", "duration_s = 5.0", |s| {
+        let stream = &camera(s, "bad").streams[0];
+        stream.clock.uncertain_frames > 0 || stream.clock.epoch > 0
+    });
+    assert!(camera(&status, "bad").streams.iter().all(|s| s.clock.epoch > 0 || s.clock.uncertain_frames > 0));
+}
+
+#[test]
+fn a_rig_stops_within_a_second_even_when_a_driver_hangs() {
+    let text = RigText::default().camera("bad", "").fault("hang", 0.5, "duration_s = 8.0").camera("good", "");
+    let home = Home::default();
+    let rig = home.start(text.text()).unwrap();
+    wait_until(&rig, "streaming", all_stream);
+    std::thread::sleep(Duration::from_millis(700));
+    let began = HostTime::now();
+    let summary = rig.stop();
+    assert!(began.elapsed() < Duration::from_secs(3), "{:?}", began.elapsed());
+    assert_balanced(&summary.status);
+}
+
+#[test]
+fn settings_that_cannot_work_fail_the_start_and_name_every_camera() {
+    let files = |name: &str| {
+        format!("[[camera]]\nname = \"{name}\"\nbackend = \"files\"\nmanifest = \"/nowhere/{name}.toml\"\n")
+    };
+    let text = RigText::default().camera("one", "").text().to_owned() + &files("two") + &files("three");
+    let home = Home::default();
+    let Err(e) = home.start(&text) else { panic!("it started") };
+    assert_eq!(e.kind(), ErrorKind::NotFound);
+    let message = e.to_string();
+    for part in ["2 cameras", "\"two\"", "/nowhere/two.toml", "\"three\"", "/nowhere/three.toml"] {
+        assert!(message.contains(part), "{message}");
+    }
+}
+
+#[test]
+fn a_rig_runs_once() {
+    let text = RigText::default().camera("cam", "");
+    let home = Home::default();
+    let rig = home.start(text.text()).unwrap();
+    let Err(e) = home.start(text.text()) else { panic!("it started twice") };
+    assert_eq!(e.kind(), ErrorKind::InUse);
+    assert!(e.to_string().contains(&format!("process {}", std::process::id())), "{e}");
+    drop(rig);
+    home.start(text.text()).unwrap();
+}

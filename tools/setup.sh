@@ -1,0 +1,50 @@
+#!/usr/bin/env bash
+# Installs the Debian packages that building (`build`) and testing (`test`) need, when it may; else prints the one
+# line to run. Says nothing when everything is there.
+set -euo pipefail
+
+missing=()
+need() { # PACKAGE COMMAND...: the package when the command fails
+    local package=$1
+    shift
+    "$@" >/dev/null 2>&1 || missing+=("$package")
+}
+
+for part in "$@"; do
+    case $part in
+    build)
+        need gcc command -v cc
+        need libc6-dev test -e /usr/include/stdio.h
+        ;;
+    test)
+        need python3 command -v python3
+        need python3-venv python3 -c 'import ensurepip, venv'
+        need nodejs command -v node
+        need npm command -v npm
+        ;;
+    *)
+        echo "usage: tools/setup.sh [build] [test]" >&2
+        exit 2
+        ;;
+    esac
+done
+
+if ! command -v cargo >/dev/null; then
+    echo "Rust is missing: install the stable toolchain (1.91 or later) with rustup, see https://rustup.rs" >&2
+    exit 1
+fi
+[ ${#missing[@]} -eq 0 ] && exit 0
+
+install=(apt-get install --yes --no-install-recommends "${missing[@]}")
+if command -v apt-get >/dev/null && [ "$(id -u)" -eq 0 ]; then
+    run=(env DEBIAN_FRONTEND=noninteractive)
+elif command -v apt-get >/dev/null && sudo --non-interactive true 2>/dev/null; then
+    run=(sudo --non-interactive env DEBIAN_FRONTEND=noninteractive)
+else
+    echo "missing: ${missing[*]}. Install them, then run this again:" >&2
+    echo "  sudo ${install[*]}" >&2
+    exit 1
+fi
+echo "installing: ${missing[*]}"
+"${run[@]}" apt-get update --quiet=2
+"${run[@]}" "${install[@]}"

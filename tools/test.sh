@@ -1,0 +1,54 @@
+#!/usr/bin/env bash
+# Runs every test there is and ends with one line that counts them. `make test` prepares what it needs.
+set -uo pipefail
+cd "$(dirname "$0")/.."
+
+python=$PWD/.venv/bin/python
+logs=target/test-logs
+mkdir -p "$logs"
+failed_steps=""
+step() { # NAME COMMAND...: runs it, keeps its output, remembers a failure
+    local name=$1
+    shift
+    printf '\n== %s\n' "$name"
+    if ! "$@" 2>&1 | tee "$logs/$name.log"; then
+        failed_steps+=" $name"
+        echo "== $name FAILED"
+    fi
+}
+
+if [ ! -d "$DEPTHRIG_TEST_DATA" ]; then
+    echo "the real pictures are not at $DEPTHRIG_TEST_DATA; set DEPTHRIG_TEST_DATA to their folder" >&2
+    exit 1
+fi
+
+step rust cargo test --workspace --no-fail-fast --quiet
+cargo build --quiet --package depthrig --bin depthrig || exit 1
+cargo build --quiet --package depthrig-bus --example publish || exit 1
+cargo build --quiet --package depthrig-recorder --example golden || exit 1
+export DEPTHRIG_BIN=$PWD/target/debug/depthrig
+export DEPTHRIG_TEST_PUBLISHER=$PWD/target/debug/examples/publish
+
+step python "$python" -m pytest --quiet python/tests
+step daemon "$python" -m pytest --quiet tests/python
+
+# Readers that are not ours must find the same pixels.
+work=$(mktemp --directory)
+trap 'rm -rf "$work"' EXIT
+step golden target/debug/examples/golden "$work/dataset" "$work/expected"
+step reader-python "$python" tests/readers/check_python.py "$work/dataset" "$work/expected"
+step reader-node node tests/readers/check_node.mjs "$work/dataset" "$work/expected"
+
+# Every test that cargo and pytest counted, and one for each of the other steps.
+count() { grep -ohE "[0-9]+ $1" "$logs"/{rust,python,daemon}.log | awk '{n += $1} END {print n + 0}'; }
+passed=$(count passed)
+failed=$(count failed)
+for name in golden reader-python reader-node; do
+    case "$failed_steps " in
+    *" $name "*) failed=$((failed + 1)) ;;
+    *) passed=$((passed + 1)) ;;
+    esac
+done
+[ -z "$failed_steps" ] || printf '\nfailed:%s\n' "$failed_steps"
+printf '\n%d passed, %d failed\n' "$passed" "$failed"
+[ -z "$failed_steps" ]
