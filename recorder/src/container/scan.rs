@@ -60,6 +60,15 @@ pub(crate) struct SegmentReader {
     pub(crate) message_count: Option<u64>,
 }
 
+/// Bytes of an attachment's fields before its data: two times, name and media type, length.
+fn attachment_head(body: &[u8]) -> Option<usize> {
+    let text = |at: usize| {
+        let len = body.get(at..)?.first_chunk::<4>()?;
+        at.checked_add(4)?.checked_add(u32::from_le_bytes(*len) as usize)
+    };
+    text(text(16)?)?.checked_add(8)
+}
+
 /// What a walk collects before schemas and channels are put together.
 #[derive(Default)]
 struct Collected {
@@ -169,8 +178,8 @@ impl SegmentReader {
 
     /// The fields of a record, taken apart.
     pub(crate) fn parse<'a>(&self, opcode: u8, body: &'a [u8], offset: u64) -> Result<Record<'a>> {
-        // The crate subtracts the CRC from an attachment's length unasked.
-        if opcode == op::ATTACHMENT && body.len() < 36 {
+        // The crate cuts the CRC off an attachment without looking whether there is one.
+        if opcode == op::ATTACHMENT && attachment_head(body).is_none_or(|n| n + 4 > body.len()) {
             return Err(self.error(ErrorKind::Corrupt, offset, "an attachment is too short"));
         }
         mcap::parse_record(opcode, body)
@@ -363,6 +372,54 @@ impl Collected {
             }
             Record::Metadata(m) => self.metadata.push((m.name, m.metadata)),
             _ => {}
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fs::MemFs;
+    use proptest::prelude::*;
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(2000))]
+        /// Small numbers make lengths that nearly fit, where a parser goes wrong.
+        #[test]
+        fn no_record_makes_the_parser_panic(
+            opcode in 0u8..0x12,
+            body in proptest::collection::vec(prop_oneof![3 => 0u8..6, 1 => any::<u8>()], 0..90),
+        ) {
+            let fs = MemFs::new();
+            fs.put(Path::new("f"), MAGIC.to_vec());
+            let reader = SegmentReader::open_bare(&fs, Path::new("f")).unwrap();
+            let _ = reader.parse(opcode, &body, 8);
+            let _ = reader.chunk_messages(&body, 8, |_| Ok(()));
+        }
+
+        #[test]
+        fn no_file_makes_the_reader_panic(
+            records in proptest::collection::vec(
+                (0u8..0x12, proptest::collection::vec(0u8..6, 0..60), 0u64..3), 0..8),
+            tail in proptest::collection::vec(any::<u8>(), 0..12),
+        ) {
+            let mut bytes = MAGIC.to_vec();
+            for (opcode, body, lie) in records {
+                bytes.push(opcode);
+                bytes.extend((body.len() as u64 + lie / 2).to_le_bytes());
+                bytes.extend(body);
+            }
+            bytes.extend(tail);
+            let fs = MemFs::new();
+            fs.put(Path::new("f"), bytes.clone());
+            if let Ok(reader) = SegmentReader::open(&fs, Path::new("f")) {
+                for entry in &reader.chunks {
+                    let _ = reader.messages(entry, |_| Ok(()));
+                }
+            }
+            bytes.extend(MAGIC);
+            fs.put(Path::new("f"), bytes);
+            let _ = SegmentReader::open(&fs, Path::new("f"));
         }
     }
 }
