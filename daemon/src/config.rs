@@ -1,0 +1,226 @@
+//! The rig's configuration: what the TOML file says, checked, with defaults filled in.
+//!
+//! `default_rig.toml` explains every key; a test keeps it complete and its defaults true. Every problem of a file
+//! is reported, each with its line, because a rig is edited on a headless computer where each attempt costs a
+//! restart. Reading a configuration touches no camera and no file but its own.
+
+mod camera;
+mod error;
+mod read;
+mod rig;
+mod synthetic;
+#[cfg(test)]
+mod tests;
+
+pub use depthrig_drivers::files::FilesConfig as FilesSettings;
+pub use depthrig_drivers::synthetic::SyntheticConfig as SyntheticSettings;
+pub use depthrig_recorder::ColorCodec;
+pub use error::{ConfigError, Problem};
+
+use depthrig_bus::{CameraName, Pose, RigName, StreamName};
+use depthrig_drivers::StreamRequest;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+
+/// The highest rate that a camera or the sets may have, Hz.
+pub const MAX_RATE_HZ: f64 = 1000.0;
+/// The most cameras that a rig may have: as many as a frame set's mask has bits.
+pub const MAX_CAMERAS: usize = 64;
+
+/// A rig: one mount on one computer.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RigConfig {
+    /// Its name, the `<rig>` of its channels.
+    pub rig: RigName,
+    /// Shared memory.
+    pub bus: BusConfig,
+    /// The set assembler.
+    pub sets: SetsConfig,
+    /// Recordings.
+    pub recording: RecordingConfig,
+    /// The control API.
+    pub control: ControlConfig,
+    /// Supervision of the cameras.
+    pub supervisor: SupervisorConfig,
+    /// The cameras in the order of the file; at least one, names unique.
+    pub cameras: Vec<CameraConfig>,
+    /// The file's text.
+    pub text: String,
+    /// The file, if it came from one; absolute.
+    pub path: Option<PathBuf>,
+}
+
+/// Shared memory.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct BusConfig {
+    /// Slots that each stream gets when `/dev/shm` is large enough.
+    pub slots: usize,
+}
+
+/// The set assembler.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SetsConfig {
+    /// Sets per second.
+    pub rate_hz: f64,
+    /// How long after its tick a set waits for late frames, milliseconds; `None`: the assembler chooses.
+    pub max_wait_ms: Option<f64>,
+    /// Where in time the ticks lie.
+    pub phase: Phase,
+}
+
+/// Where in time the ticks of the sets lie.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Phase {
+    /// Where the frames of the cameras lie closest together.
+    #[default]
+    Auto,
+    /// On whole multiples of the period of the host's clock.
+    Fixed,
+}
+
+/// Recordings.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RecordingConfig {
+    /// Folder that the folders of the datasets are made in; absolute.
+    pub directory: PathBuf,
+    /// JPEG quality of colour, 1 to 100.
+    pub jpeg_quality: u8,
+    /// How colour is stored.
+    pub color: ColorCodec,
+    /// A segment is closed at this size, MiB.
+    pub segment_max_mb: u64,
+    /// A segment is closed after this long, seconds.
+    pub segment_max_s: u64,
+    /// Threads that encode; 0: chosen by the number of cores.
+    pub workers: usize,
+    /// Sets that may wait to be encoded.
+    pub queue_sets: usize,
+    /// The recording ends cleanly when the disk has less than this left, MiB.
+    pub reserve_mb: u64,
+}
+
+/// The control API. The Unix socket is always there.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ControlConfig {
+    /// Loopback address that the API is also served on.
+    pub tcp: Option<SocketAddr>,
+}
+
+/// Supervision of the cameras.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SupervisorConfig {
+    /// A camera without a frame for this long is stalled and opened again, seconds.
+    pub stall_s: f64,
+    /// First pause before a lost camera is opened again, seconds.
+    pub backoff_min_s: f64,
+    /// The pause doubles up to this, seconds.
+    pub backoff_max_s: f64,
+    /// Whether camera threads ask for a higher priority.
+    pub raise_priority: bool,
+}
+
+/// A camera of the rig.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CameraConfig {
+    /// Its name, unique in the rig.
+    pub name: CameraName,
+    /// Pose of the camera on the mount: `p_mount = R p_camera + t`, optical axes (x right, y down, z forward).
+    pub pose: Pose,
+    /// Streams to start and their modes; empty: every stream in its default mode.
+    pub streams: Vec<StreamRequest>,
+    /// Streams to record; `None`: all.
+    pub record: Option<Vec<StreamName>>,
+    /// Its driver and what that needs.
+    pub backend: BackendConfig,
+}
+
+impl CameraConfig {
+    /// Whether frames of `stream` belong into recordings.
+    pub fn records(&self, stream: &StreamName) -> bool {
+        self.record.as_ref().is_none_or(|list| list.contains(stream))
+    }
+}
+
+/// A driver with its settings.
+#[derive(Debug, Clone, PartialEq)]
+#[allow(clippy::large_enum_variant)] // one per camera of a rig
+pub enum BackendConfig {
+    /// A simulated camera.
+    Synthetic(SyntheticSettings),
+    /// A folder of pictures that plays as a camera.
+    Files(FilesSettings),
+}
+
+impl BackendConfig {
+    /// The driver's name in the configuration.
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Self::Synthetic(_) => "synthetic",
+            Self::Files(_) => "files",
+        }
+    }
+}
+
+impl Default for BusConfig {
+    fn default() -> Self {
+        Self { slots: depthrig_bus::shm::DEFAULT_SLOTS }
+    }
+}
+
+impl Default for SetsConfig {
+    fn default() -> Self {
+        Self { rate_hz: 5.0, max_wait_ms: None, phase: Phase::Auto }
+    }
+}
+
+impl Default for RecordingConfig {
+    fn default() -> Self {
+        Self {
+            directory: PathBuf::from("datasets"),
+            jpeg_quality: 95,
+            color: ColorCodec::Jpeg,
+            segment_max_mb: 1024,
+            segment_max_s: 60,
+            workers: 0,
+            queue_sets: 4,
+            reserve_mb: 2048,
+        }
+    }
+}
+
+impl Default for SupervisorConfig {
+    fn default() -> Self {
+        Self { stall_s: 1.0, backoff_min_s: 0.1, backoff_max_s: 2.0, raise_priority: true }
+    }
+}
+
+impl RigConfig {
+    /// Reads the file at `path`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] when the file cannot be read (with the system's error as source), or with every problem
+    /// that it has. It converts into [`crate::Error`] of kind `BadInput`, `NotFound` or `PermissionDenied`.
+    pub fn load(path: &Path) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path).map_err(|e| ConfigError::unreadable(path, e))?;
+        Self::parse(&text, Some(path))
+    }
+
+    /// Reads `text`, which came from the file `path` if any: relative paths are taken from that file's folder,
+    /// else from the working directory.
+    ///
+    /// # Errors
+    /// [`ConfigError`] with every problem of the text.
+    pub fn parse(text: &str, path: Option<&Path>) -> Result<Self, ConfigError> {
+        rig::parse(text, path)
+    }
+
+    /// The commented default configuration: the seven cameras of the mount, simulated. It runs as it is.
+    pub const fn default_text() -> &'static str {
+        include_str!("../default_rig.toml")
+    }
+
+    /// The camera `name`.
+    pub fn camera(&self, name: &str) -> Option<&CameraConfig> {
+        self.cameras.iter().find(|c| c.name.as_str() == name)
+    }
+}

@@ -1,0 +1,153 @@
+//! From a `[[camera]]` table to [`CameraConfig`]: what all drivers share, and the `files` driver.
+
+use super::read::{Found, Section};
+use super::rig::{not_empty, rate, resolve};
+use super::{BackendConfig, CameraConfig, FilesSettings, synthetic};
+use depthrig_bus::{CameraName, Name, PixelFormat, Pose, StreamName};
+use depthrig_drivers::StreamRequest;
+use std::path::{Path, PathBuf};
+
+#[derive(Clone, Copy)]
+enum Driver {
+    Synthetic,
+    Files,
+}
+
+/// Reads one camera; `None` after a problem without which there is no camera. `taken` are the names so far.
+pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraName>) -> Option<CameraConfig> {
+    let name = s.required::<CameraName>("name", "\"d435\"");
+    if let Some(Found { value: name, at }) = &name {
+        s.set_name(name.as_str());
+        if taken.contains(name) {
+            s.problem(
+                *at,
+                format!("camera name \"{name}\" is taken by an earlier camera; names must be unique"),
+            );
+        }
+        taken.push(name.clone());
+    }
+    let drivers = [("synthetic", Driver::Synthetic), ("files", Driver::Files)];
+    if !s.has("backend") {
+        s.required::<String>("backend", "\"synthetic\"");
+    }
+    let driver = s.choose("backend", &drivers);
+    let pose = pose(&s);
+    let wanted = streams(&s);
+    let streams: Vec<_> = wanted.iter().map(|w| w.request.clone()).collect();
+    let record = record(&s, &streams);
+    let backend = match driver {
+        Some(Driver::Synthetic) => {
+            let name = name.as_ref().map_or("", |n| n.value.as_str());
+            Some(BackendConfig::Synthetic(synthetic::read(&s, base, name, pose, &wanted)))
+        }
+        Some(Driver::Files) => files(&s, base).map(BackendConfig::Files),
+        // Which keys belong to an unknown driver is unknown too.
+        None => return None,
+    };
+    s.finish();
+    Some(CameraConfig { name: name?.value, pose, streams, record, backend: backend? })
+}
+
+/// The highest rate among the camera's streams, as far as the file says.
+pub(super) fn fastest_rate_hz(camera: &CameraConfig) -> Option<f64> {
+    match &camera.backend {
+        BackendConfig::Files(files) => files.rate_hz,
+        BackendConfig::Synthetic(config) => synthetic::fastest_rate_hz(config, &camera.streams).ok(),
+    }
+}
+
+fn pose(camera: &Section<'_, '_>) -> Pose {
+    let s = camera.table("pose", "pose = { }");
+    let translation_m = s.or("translation_m", [0.0; 3], |_| Ok(()));
+    let quaternion = s.get::<[f64; 4]>("rotation_xyzw");
+    let angles = s.get::<[f64; 3]>("rotation_rpy_deg");
+    let rotation_xyzw = match (quaternion, angles) {
+        (None, None) => Pose::IDENTITY.rotation_xyzw,
+        (None, Some(a)) => quaternion_of_rpy_deg(a.value),
+        (Some(q), None) => {
+            let norm = q.value.iter().map(|c| c * c).sum::<f64>().sqrt();
+            if (norm - 1.0).abs() > 1e-3 {
+                let why = format!("must be a quaternion x, y, z, w of length 1; its length is {norm:.4}");
+                s.problem(q.at, format!("{} {why}", s.key_of("rotation_xyzw")));
+            }
+            q.value.map(|c| c / norm)
+        }
+        (Some(q), Some(a)) => {
+            s.problem(q.at.max(a.at), "rotation_xyzw and rotation_rpy_deg say the same thing; keep one");
+            Pose::IDENTITY.rotation_xyzw
+        }
+    };
+    s.finish();
+    Pose { translation_m, rotation_xyzw }
+}
+
+/// The unit quaternion of turns about the fixed axes x, then y, then z of the mount (roll, pitch, yaw as in URDF):
+/// `R = Rz(yaw) Ry(pitch) Rx(roll)`.
+fn quaternion_of_rpy_deg(angles: [f64; 3]) -> [f64; 4] {
+    let [(sr, cr), (sp, cp), (sy, cy)] = angles.map(|a| (a.to_radians() / 2.0).sin_cos());
+    [
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    ]
+}
+
+/// A `[[camera.stream]]` and where it stands.
+pub(super) struct WantedStream {
+    pub(super) request: StreamRequest,
+    pub(super) at: usize,
+}
+
+fn streams(camera: &Section<'_, '_>) -> Vec<WantedStream> {
+    let formats = PixelFormat::ALL.map(|f| (f.name(), f));
+    let mut wanted: Vec<WantedStream> = Vec::new();
+    for mut s in camera.tables("stream", "[[camera.stream]]").unwrap_or_default() {
+        let name = s.required::<StreamName>("name", "\"depth\"");
+        if let Some(Found { value, at }) = &name {
+            s.set_name(value.as_str());
+            if wanted.iter().any(|w| w.request.stream == *value) {
+                s.problem(*at, format!("stream \"{value}\" is listed twice; keep one"));
+            }
+        }
+        let side = |v: &u32| match v {
+            1..=16_384 => Ok(()),
+            _ => Err(format!("is {v} pixels; it must be within 1 and 16384")),
+        };
+        let width = s.or("width", None, |w| w.as_ref().map_or(Ok(()), side));
+        let height = s.or("height", None, |h| h.as_ref().map_or(Ok(()), side));
+        if width.is_some() != height.is_some() {
+            let (given, missing) = if width.is_some() { ("width", "height") } else { ("height", "width") };
+            s.problem(s.at, format!("{} needs {missing} as well", s.key_of(given)));
+        }
+        let rate_hz = s.or("rate_hz", None, |r| r.map_or(Ok(()), rate));
+        let format = s.choose("format", &formats);
+        let at = s.at;
+        s.finish();
+        if let Some(name) = name {
+            let request = StreamRequest { stream: name.value, size: width.zip(height), rate_hz, format };
+            wanted.push(WantedStream { request, at });
+        }
+    }
+    wanted
+}
+
+fn record(camera: &Section<'_, '_>, streams: &[StreamRequest]) -> Option<Vec<StreamName>> {
+    let Found { value, at } = camera.get::<Vec<Name>>("record")?;
+    let unknown = value.iter().find(|r| !streams.is_empty() && streams.iter().all(|s| s.stream != **r));
+    if let Some(name) = unknown {
+        let why = format!("names \"{name}\", which is not among the streams of its [[camera.stream]] tables");
+        camera.problem(at, format!("{} {why}", camera.key_of("record")));
+    }
+    Some(value)
+}
+
+fn files(s: &Section<'_, '_>, base: &Path) -> Option<FilesSettings> {
+    let manifest = s.required::<PathBuf>("manifest", "\"pictures/camera.toml\"");
+    if let Some(Err(why)) = manifest.as_ref().map(|m| not_empty(&m.value)) {
+        s.problem(manifest.as_ref()?.at, format!("{} {why}", s.key_of("manifest")));
+    }
+    let rate_hz = s.or("rate_hz", None, |r| r.map_or(Ok(()), rate));
+    let looped = s.get::<bool>("loop").map(|f| f.value);
+    Some(FilesSettings { manifest: resolve(base, &manifest?.value), rate_hz, looped })
+}

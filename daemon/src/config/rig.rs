@@ -1,0 +1,211 @@
+//! From the tables of the file to [`RigConfig`], with the checks that concern more than one key.
+
+use super::read::{FromToml, Report, Section};
+use super::{
+    BusConfig, ColorCodec, ConfigError, ControlConfig, MAX_CAMERAS, MAX_RATE_HZ, Phase, RecordingConfig,
+    RigConfig, SetsConfig, SupervisorConfig, camera,
+};
+use core::fmt::Display;
+use core::ops::RangeInclusive;
+use depthrig_bus::RigName;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use toml::de::DeTable;
+
+/// Everything that `text` says, or every problem that it has.
+pub(super) fn parse(text: &str, path: Option<&Path>) -> Result<RigConfig, ConfigError> {
+    let shown = path.map_or_else(|| "configuration".to_owned(), |p| p.display().to_string());
+    let path = path.map(absolute);
+    let report = Report::new(text);
+    let config = read(&report, text, path.as_deref());
+    match (report.into_problems(), config) {
+        (problems, Some(config)) if problems.is_empty() => Ok(config),
+        (problems, _) => Err(ConfigError::new(shown, problems)),
+    }
+}
+
+/// As [`parse`], for callers that look at the report. `None` only after a problem was noted.
+pub(super) fn read(report: &Report<'_>, text: &str, path: Option<&Path>) -> Option<RigConfig> {
+    let (document, errors) = DeTable::parse_recoverable(text);
+    // What the parser made of a damaged text is guesswork; checking that would only add noise.
+    if !errors.is_empty() {
+        for e in errors {
+            report.problem(e.span().map_or(0, |s| s.start), e.message().replace('\n', ", "));
+        }
+        return None;
+    }
+    let base = path.and_then(Path::parent).map(Path::to_owned);
+    let base = base.or_else(|| std::env::current_dir().ok()).unwrap_or_default();
+    let top = Section::top(report, document.get_ref());
+    let rig = top.required::<RigName>("rig", "\"mount\"");
+    let bus = bus(&top);
+    let sets = sets(&top);
+    let recording = recording(&top, &base);
+    let control = control(&top);
+    let supervisor = supervisor(&top);
+    let cameras = cameras(&top, &base);
+    check_set_rate(&top, &sets, &cameras);
+    top.finish();
+    let text = text.to_owned();
+    let path = path.map(Path::to_owned);
+    let cameras = cameras.into_iter().collect::<Option<Vec<_>>>()?;
+    Some(RigConfig { rig: rig?.value, bus, sets, recording, control, supervisor, cameras, text, path })
+}
+
+fn bus(top: &Section<'_, '_>) -> BusConfig {
+    let s = top.table("bus", "[bus]");
+    let slots = s.or("slots", BusConfig::default().slots, within(depthrig_bus::shm::MIN_SLOTS..=1024));
+    s.finish();
+    BusConfig { slots }
+}
+
+fn sets(top: &Section<'_, '_>) -> SetsConfig {
+    let d = SetsConfig::default();
+    let s = top.table("sets", "[sets]");
+    let rate_hz = s.or("rate_hz", d.rate_hz, |hz| rate(*hz));
+    let max_wait_ms = s.or("max_wait_ms", None, |wait: &Option<f64>| match wait {
+        Some(ms) => above_zero(60_000.0)(ms),
+        None => Ok(()),
+    });
+    let phase = s.choice("phase", &[("auto", Phase::Auto), ("fixed", Phase::Fixed)], d.phase);
+    s.finish();
+    SetsConfig { rate_hz, max_wait_ms, phase }
+}
+
+fn recording(top: &Section<'_, '_>, base: &Path) -> RecordingConfig {
+    let d = RecordingConfig::default();
+    let s = top.table("recording", "[recording]");
+    let directory = s.or("directory", d.directory, |p| not_empty(p));
+    let config = RecordingConfig {
+        directory: resolve(base, &directory),
+        jpeg_quality: s.or("jpeg_quality", d.jpeg_quality, within(1..=100)),
+        color: s.choice("color", &[("jpeg", ColorCodec::Jpeg), ("raw", ColorCodec::Raw)], d.color),
+        segment_max_mb: s.or("segment_max_mb", d.segment_max_mb, within(1..=1 << 20)),
+        segment_max_s: s.or("segment_max_s", d.segment_max_s, within(1..=86_400)),
+        workers: s.or("workers", d.workers, within(0..=256)),
+        queue_sets: s.or("queue_sets", d.queue_sets, within(1..=1024)),
+        reserve_mb: s.or("reserve_mb", d.reserve_mb, within(0..=1 << 30)),
+    };
+    s.finish();
+    config
+}
+
+fn control(top: &Section<'_, '_>) -> ControlConfig {
+    let s = top.table("control", "[control]");
+    let tcp = s.or("tcp", None, |tcp: &Option<SocketAddr>| match tcp {
+        Some(a) if !a.ip().is_loopback() => Err(format!(
+            "must be a loopback address such as 127.0.0.1:{}, not {a}: the API has no password, and whoever reaches it \
+             controls the rig; forward a port over SSH instead",
+            a.port()
+        )),
+        _ => Ok(()),
+    });
+    s.finish();
+    ControlConfig { tcp }
+}
+
+fn supervisor(top: &Section<'_, '_>) -> SupervisorConfig {
+    let d = SupervisorConfig::default();
+    let s = top.table("supervisor", "[supervisor]");
+    let stall_s = s.or("stall_s", d.stall_s, above_zero(3600.0));
+    let backoff_min_s = s.or("backoff_min_s", d.backoff_min_s, above_zero(3600.0));
+    let backoff_max_s = s.or("backoff_max_s", d.backoff_max_s.max(backoff_min_s), |most: &f64| {
+        above_zero(3600.0)(most)?;
+        if *most < backoff_min_s {
+            return Err(format!("is {most}, less than backoff_min_s, which is {backoff_min_s}"));
+        }
+        Ok(())
+    });
+    let raise_priority = s.or("raise_priority", d.raise_priority, |_| Ok(()));
+    s.finish();
+    SupervisorConfig { stall_s, backoff_min_s, backoff_max_s, raise_priority }
+}
+
+/// A camera that has a problem is `None`.
+fn cameras(top: &Section<'_, '_>, base: &Path) -> Vec<Option<super::CameraConfig>> {
+    let Some(sections) = top.tables("camera", "[[camera]]") else { return vec![None] };
+    if sections.is_empty() {
+        top.problem(top.at, "the rig has no camera; add a [[camera]] table");
+    }
+    if let Some(s) = sections.get(MAX_CAMERAS) {
+        s.problem(s.at, format!("a rig has at most {MAX_CAMERAS} cameras"));
+    }
+    let mut names = Vec::new();
+    sections.into_iter().map(|s| camera::read(s, base, &mut names)).collect()
+}
+
+/// Sets faster than every camera would all be incomplete. Only rates that the file itself gives are known here.
+fn check_set_rate(top: &Section<'_, '_>, sets: &SetsConfig, cameras: &[Option<super::CameraConfig>]) {
+    let fastest = |c: &Option<super::CameraConfig>| camera::fastest_rate_hz(c.as_ref()?);
+    let Some(rates) = cameras.iter().map(fastest).collect::<Option<Vec<_>>>() else { return };
+    let most = rates.into_iter().fold(0.0, f64::max);
+    if most > 0.0 && sets.rate_hz > most {
+        let s = top.table("sets", "[sets]");
+        let at = s.get::<f64>("rate_hz").map_or(s.at, |f| f.at);
+        let why =
+            format!("is {} sets a second, but the fastest camera gives {most} frames a second", sets.rate_hz);
+        top.problem(at, format!("{} {why}; lower it", s.key_of("rate_hz")));
+    }
+}
+
+/// A rate that a camera or the sets may have.
+pub(super) fn rate(hz: f64) -> Result<(), String> {
+    above_zero(MAX_RATE_HZ)(&hz)
+}
+
+pub(super) fn above_zero(most: f64) -> impl Fn(&f64) -> Result<(), String> {
+    move |v| {
+        if *v > 0.0 && *v <= most {
+            Ok(())
+        } else {
+            Err(format!("is {v}; it must be above 0 and at most {most}"))
+        }
+    }
+}
+
+fn within<T: PartialOrd + Display>(range: RangeInclusive<T>) -> impl FnOnce(&T) -> Result<(), String> {
+    move |v| {
+        let (least, most) = (range.start(), range.end());
+        if range.contains(v) { Ok(()) } else { Err(format!("is {v}; it must be within {least} and {most}")) }
+    }
+}
+
+pub(super) fn not_empty(path: &Path) -> Result<(), String> {
+    if path.as_os_str().is_empty() { Err("is empty".to_owned()) } else { Ok(()) }
+}
+
+/// `path` as the file means it: `~/` is the home folder, anything relative starts at `base`.
+pub(super) fn resolve(base: &Path, path: &Path) -> PathBuf {
+    let home = path
+        .strip_prefix("~")
+        .ok()
+        .and_then(|rest| Some(PathBuf::from(std::env::var_os("HOME")?).join(rest)));
+    let path = home.unwrap_or_else(|| base.join(path));
+    // Without the `.` and double slashes that joining leaves behind.
+    path.components().collect()
+}
+
+fn absolute(path: &Path) -> PathBuf {
+    std::path::absolute(path).unwrap_or_else(|_| path.to_owned())
+}
+
+impl<T: FromToml> FromToml for Option<T> {
+    fn from_toml(value: &toml::de::DeValue<'_>) -> Result<Self, String> {
+        T::from_toml(value).map(Some)
+    }
+}
+
+impl FromToml for PathBuf {
+    fn from_toml(value: &toml::de::DeValue<'_>) -> Result<Self, String> {
+        String::from_toml(value).map(Self::from)
+    }
+}
+
+impl FromToml for SocketAddr {
+    fn from_toml(value: &toml::de::DeValue<'_>) -> Result<Self, String> {
+        let text = String::from_toml(value)?;
+        text.parse().map_err(|_| {
+            format!("must be an address and a port such as \"127.0.0.1:8642\"; it is \"{text}\"")
+        })
+    }
+}

@@ -1,0 +1,156 @@
+//! The keys of a `synthetic` camera.
+//!
+//! The driver knows what its numbers may be, so it is the one that is asked, key by key: each value is put into an
+//! otherwise default configuration, and what the driver says of that is reported at the key's own line.
+
+use super::SyntheticSettings;
+use super::camera::WantedStream;
+use super::read::{Found, FromToml, Section, nearest};
+use super::rig::resolve;
+use depthrig_bus::Pose;
+use depthrig_drivers::synthetic::models::MODELS;
+use depthrig_drivers::synthetic::{ClockSim, FaultKind, ScheduledFault, StreamOverride, profiles};
+use depthrig_drivers::{Result, StreamRequest, choose_profiles};
+use std::path::{Path, PathBuf};
+
+/// Reads the settings of the simulated camera `name`, which stands at `pose` and is asked for `streams`.
+pub(super) fn read(
+    s: &Section<'_, '_>,
+    base: &Path,
+    name: &str,
+    pose: Pose,
+    streams: &[WantedStream],
+) -> SyntheticSettings {
+    let d = SyntheticSettings::default();
+    // Two cameras of one model must differ in their serial numbers, and the name is unique already.
+    let serial = s.get::<String>("serial").map_or_else(|| format!("sim-{name}"), |f| f.value);
+    let mut config = SyntheticSettings {
+        model: model(s, d.model),
+        serial,
+        seed: field(s, "seed", d.seed, |c, v| c.seed = v),
+        pose_on_mount: pose,
+        streams: Vec::new(),
+        truth: field(s, "truth", d.truth, |c, v| c.truth = v),
+        clock: clock(s),
+        faults: s.tables("fault", "[[camera.fault]]").into_iter().flatten().filter_map(fault).collect(),
+        poses: field(s, "poses", d.poses, |c, v| c.poses = v),
+        pose_rate_hz: field(s, "pose_rate_hz", d.pose_rate_hz, |c, v| c.pose_rate_hz = v),
+        phase: field(s, "phase", d.phase, |c, v| c.phase = v),
+        cache_dir: s.get::<PathBuf>("cache_dir").map_or(d.cache_dir, |f| resolve(base, &f.value)),
+        cheap: field(s, "cheap", d.cheap, |c, v| c.cheap = v),
+        ring_frames: field(s, "ring_frames", d.ring_frames, |c, v| c.ring_frames = v),
+    };
+    for wanted in streams {
+        let StreamRequest { stream, size, rate_hz, .. } = wanted.request.clone();
+        config.streams.push(StreamOverride { stream, size, rate_hz });
+        // Each alone, so that each has its own problem; what is wrong elsewhere was reported already.
+        let problem = problem_of(|c| {
+            (c.model, c.truth, c.cheap) = (config.model.clone(), config.truth, config.cheap);
+            c.streams.extend(config.streams.last().cloned());
+        });
+        let problem = problem.or_else(|| {
+            let modes = profiles(&config).ok()?;
+            Some(choose_profiles("it", &modes, std::slice::from_ref(&wanted.request)).err()?.to_string())
+        });
+        if let Some(why) = problem {
+            s.problem(wanted.at, format!("[[camera]] \"{name}\": {why}"));
+        }
+    }
+    config
+}
+
+/// The highest rate among the streams that `config` starts on `requests`, Hz.
+pub(super) fn fastest_rate_hz(config: &SyntheticSettings, requests: &[StreamRequest]) -> Result<f64> {
+    let chosen = choose_profiles("", &profiles(config)?, requests)?;
+    Ok(chosen.iter().map(|p| p.rate_hz).fold(0.0, f64::max))
+}
+
+fn model(s: &Section<'_, '_>, default: String) -> String {
+    let Some(Found { value, at }) = s.get::<String>("model") else { return default };
+    if let Some(why) = problem_of(|c| c.model.clone_from(&value)) {
+        let near = nearest(&value, MODELS.iter().map(|m| m.name));
+        let advice = near.map(|near| format!("; did you mean \"{near}\"?")).unwrap_or_default();
+        s.problem(at, format!("{}: {why}{advice}", s.key_of("model")));
+        return default;
+    }
+    value
+}
+
+fn clock(camera: &Section<'_, '_>) -> ClockSim {
+    let table = camera.table("clock", "[camera.clock]");
+    let (s, d) = (&table, ClockSim::default());
+    let config = ClockSim {
+        start_ticks: field(s, "start_ticks", d.start_ticks, |c, v| c.clock.start_ticks = v),
+        counter_bits: field(s, "counter_bits", d.counter_bits, |c, v| c.clock.counter_bits = v),
+        drift_ppm: field(s, "drift_ppm", d.drift_ppm, |c, v| c.clock.drift_ppm = v),
+        thermal_ppm: field(s, "thermal_ppm", d.thermal_ppm, |c, v| c.clock.thermal_ppm = v),
+        thermal_period_s: field(s, "thermal_period_s", d.thermal_period_s, |c, v| {
+            c.clock.thermal_period_s = v;
+        }),
+        stamp_jitter_us: field(s, "stamp_jitter_us", d.stamp_jitter_us, |c, v| c.clock.stamp_jitter_us = v),
+        latency_ms: field(s, "latency_ms", d.latency_ms, |c, v| c.clock.latency_ms = v),
+        latency_jitter_ms: field(s, "latency_jitter_ms", d.latency_jitter_ms, |c, v| {
+            c.clock.latency_jitter_ms = v;
+        }),
+        stall_probability: field(s, "stall_probability", d.stall_probability, |c, v| {
+            c.clock.stall_probability = v;
+        }),
+        stall_ms: field(s, "stall_ms", d.stall_ms.into(), |c, v: [f64; 2]| c.clock.stall_ms = v.into())
+            .into(),
+        reset_at_s: field(s, "reset_at_s", d.reset_at_s, |c, v| c.clock.reset_at_s = v),
+    };
+    table.finish();
+    config
+}
+
+fn fault(s: Section<'_, '_>) -> Option<ScheduledFault> {
+    let names = FaultKind::ALL.map(|kind| (wire_name(kind), kind));
+    let kinds = names.each_ref().map(|(name, kind)| (name.as_str(), *kind));
+    let at_s = s.required::<f64>("at_s", "3.0");
+    if !s.has("kind") {
+        s.required::<String>("kind", "\"unplug\"");
+    }
+    let kind = s.choose("kind", &kinds);
+    let duration_s = s.or("duration_s", 1.0, |_| Ok(()));
+    let count = s.or("count", 1, |_| Ok(()));
+    let at = s.at;
+    let fault =
+        at_s.zip(kind).map(|(at_s, kind)| ScheduledFault { at_s: at_s.value, kind, duration_s, count });
+    if let Some(why) = fault.and_then(|f| problem_of(|c| c.faults.push(f))) {
+        s.problem(at, why);
+    }
+    s.finish();
+    fault
+}
+
+/// The name that serde gives the fault.
+fn wire_name(kind: FaultKind) -> String {
+    serde_json::to_value(kind).ok().and_then(|v| v.as_str().map(str::to_owned)).unwrap_or_default()
+}
+
+/// The value of `key`, put into the configuration by `set`, else `default`.
+fn field<T: FromToml + Clone>(
+    s: &Section<'_, '_>,
+    key: &'static str,
+    default: T,
+    set: impl FnOnce(&mut SyntheticSettings, T),
+) -> T {
+    let Some(Found { value, at }) = s.get::<T>(key) else { return default };
+    match problem_of(|c| set(c, value.clone())) {
+        None => value,
+        Some(why) => {
+            s.problem(at, format!("{}: {why}", s.key_of(key)));
+            default
+        }
+    }
+}
+
+/// What the driver says of a default configuration that `change` was made to.
+fn problem_of(change: impl FnOnce(&mut SyntheticSettings)) -> Option<String> {
+    let mut config = SyntheticSettings::default();
+    change(&mut config);
+    let text = profiles(&config).err()?.to_string();
+    // The driver names the camera, which here is the default one; the caller knows the real one.
+    let what = text.strip_prefix("synthetic camera ").and_then(|t| t.split_once(": "));
+    Some(what.map_or_else(|| text.clone(), |(_, what)| what.to_owned()))
+}

@@ -1,0 +1,310 @@
+//! The default file is complete and true, and every problem of a bad one is named with its place.
+
+use super::read::Report;
+use super::*;
+use std::collections::BTreeSet;
+use std::fmt::Write as _;
+
+fn parse(text: &str) -> Result<RigConfig, ConfigError> {
+    RigConfig::parse(text, Some(Path::new("/rigs/rig.toml")))
+}
+
+fn problems(text: &str) -> Vec<String> {
+    parse(text).unwrap_err().to_string().lines().map(str::to_owned).collect()
+}
+
+/// The default file with its `# key = value` lines (and, if wanted, its `#e.g.` lines) brought to life.
+fn uncommented(examples: bool) -> String {
+    let mut text = String::new();
+    for line in RigConfig::default_text().lines() {
+        let example = line.strip_prefix("#e.g. ").filter(|_| examples);
+        let is_key = |l: &&str| {
+            l.split_once(" = ").is_some_and(|(k, _)| k.chars().all(|c| c.is_ascii_lowercase() || c == '_'))
+        };
+        let default = line.strip_prefix("# ").filter(is_key);
+        writeln!(text, "{}", example.or(default).unwrap_or(line)).unwrap();
+    }
+    text
+}
+
+#[test]
+fn the_defaults_in_the_comments_are_those_of_the_code() {
+    let mut as_it_is = parse(RigConfig::default_text()).unwrap();
+    let mut written_out = parse(&uncommented(false)).unwrap();
+    assert_ne!(as_it_is.text, written_out.text);
+    let lines = |text: &str| text.lines().filter(|l| !l.starts_with('#')).count();
+    let brought_to_life = lines(&written_out.text) - lines(&as_it_is.text);
+    assert!(brought_to_life > 30, "only {brought_to_life} defaults were found in the comments");
+    (as_it_is.text, written_out.text) = <_>::default();
+    assert_eq!(as_it_is, written_out);
+}
+
+#[test]
+fn every_key_is_in_the_default_file() {
+    let text = uncommented(true);
+    let report = Report::new(&text);
+    super::rig::read(&report, &text, None).unwrap();
+    let asked = report.asked();
+    assert!(asked.contains(&("[[camera.fault]]", "count")), "{asked:?}");
+    assert_eq!(report.into_problems(), []);
+
+    let document: toml::Table = text.parse().unwrap();
+    let mut present = BTreeSet::new();
+    gather(&document, "", &mut present);
+    // The two spellings of a rotation exclude each other, so one of them is only described.
+    let described = |key: &str| RigConfig::default_text().contains(&format!("{key}, "));
+    let missing: Vec<_> = asked
+        .iter()
+        .filter(|(table, key)| !present.contains(&(plain(table), (*key).to_owned())) && !described(key))
+        .collect();
+    assert!(missing.is_empty(), "default_rig.toml does not explain {missing:?}");
+}
+
+/// `[[camera.stream]]` and `pose = { }` as the path that [`gather`] makes.
+fn plain(table: &str) -> String {
+    match table {
+        "pose = { }" => "camera.pose".to_owned(),
+        _ => table.trim_matches(['[', ']']).to_owned(),
+    }
+}
+
+fn gather(table: &toml::Table, path: &str, keys: &mut BTreeSet<(String, String)>) {
+    for (key, value) in table {
+        keys.insert((path.to_owned(), key.clone()));
+        let inner = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
+        let items = value.as_array().cloned().unwrap_or_else(|| vec![value.clone()]);
+        items.iter().filter_map(toml::Value::as_table).for_each(|t| gather(t, &inner, keys));
+    }
+}
+
+#[test]
+fn a_synthetic_camera_can_be_told_everything_that_its_driver_knows() {
+    // Serialised names of the driver that have another form in a rig file.
+    let renamed = |key: &str| match key {
+        "pose_on_mount" => "pose".to_owned(),
+        "streams" => "stream".to_owned(),
+        "faults" => "fault".to_owned(),
+        _ => key.to_owned(),
+    };
+    let driver = toml::Table::try_from(SyntheticSettings::default()).unwrap();
+    let text = uncommented(true);
+    let report = Report::new(&text);
+    super::rig::read(&report, &text, None).unwrap();
+    let asked = report.asked();
+    let has = |table: &str, key: &str| asked.iter().any(|(t, k)| *t == table && *k == key);
+    for key in driver.keys() {
+        assert!(has("[[camera]]", &renamed(key)), "{key}");
+    }
+    for key in driver["clock"].as_table().unwrap().keys() {
+        assert!(has("[camera.clock]", key), "{key}");
+    }
+}
+
+#[test]
+fn the_default_rig_is_the_mount_of_seven() {
+    let rig = parse(RigConfig::default_text()).unwrap();
+    let names: Vec<_> = rig.cameras.iter().map(|c| c.name.as_str()).collect();
+    assert_eq!(names, ["d405", "d415", "d435", "d455", "l515", "zed2i", "kinect"]);
+    for camera in &rig.cameras {
+        let BackendConfig::Synthetic(s) = &camera.backend else { panic!("{}", camera.name) };
+        assert_eq!((s.model.as_str(), s.pose_on_mount), (camera.name.as_str(), camera.pose));
+        // The point 0.7 m ahead of the mount lies on the camera's axis, 0.7 m and a little away.
+        let there = depthrig_calib::PoseExt::inverse(&camera.pose);
+        let p = depthrig_calib::PoseExt::transform_point(&there, [0.0, 0.0, 0.7].into());
+        assert!(
+            p.x.abs() < 0.003 && p.y.abs() < 0.003 && (0.69..0.75).contains(&p.z),
+            "{}: {p}",
+            camera.name
+        );
+    }
+    let seeds: BTreeSet<_> = rig.cameras.iter().map(|c| format!("{:?}", c.backend)).collect();
+    assert_eq!(seeds.len(), 7);
+}
+
+#[test]
+fn what_a_file_says_is_what_comes_out() {
+    let rig = parse(
+        r#"
+        rig = "lab_2"
+        bus.slots = 32
+        sets = { rate_hz = 10, max_wait_ms = 40, phase = "fixed" }
+        recording = { directory = "../out/./x", color = "raw", segment_max_s = 5, workers = 3 }
+        control.tcp = "[::1]:8000"
+        [[camera]]
+        name = "a"
+        backend = "files"
+        manifest = "pictures"
+        rate_hz = 15
+        loop = false
+        record = ["depth"]
+        pose = { translation_m = [1, 2.5, -3], rotation_xyzw = [0, 0.7071, 0, 0.7071] }
+        stream = [{ name = "depth" }, { name = "color", width = 640, height = 480, rate_hz = 15, format = "rgb8" }]
+        [[camera]]
+        name = "b"
+        backend = "synthetic"
+        fault = [{ at_s = 2.5, kind = "half_frame", count = 3 }]
+        stream = [{ name = "color", width = 320, height = 240, rate_hz = 30 }]
+        "#,
+    )
+    .unwrap();
+    assert_eq!((rig.rig.as_str(), rig.bus.slots), ("lab_2", 32));
+    assert_eq!(rig.sets, SetsConfig { rate_hz: 10.0, max_wait_ms: Some(40.0), phase: Phase::Fixed });
+    assert_eq!(rig.recording.directory, Path::new("/rigs/../out/x"));
+    assert_eq!(
+        (rig.recording.color, rig.recording.workers, rig.recording.segment_max_s),
+        (ColorCodec::Raw, 3, 5)
+    );
+    assert_eq!(rig.control.tcp, Some("[::1]:8000".parse().unwrap()));
+    let a = rig.camera("a").unwrap();
+    let settings =
+        FilesSettings { manifest: "/rigs/pictures".into(), rate_hz: Some(15.0), looped: Some(false) };
+    assert_eq!(a.backend, BackendConfig::Files(settings));
+    assert_eq!(a.pose.translation_m, [1.0, 2.5, -3.0]);
+    assert!((a.pose.rotation_xyzw[1] - 0.5f64.sqrt()).abs() < 1e-12, "made unit length: {:?}", a.pose);
+    assert_eq!((a.streams[1].size, a.streams[1].rate_hz), (Some((640, 480)), Some(15.0)));
+    let name = |s: &str| StreamName::new(s).unwrap();
+    assert!(
+        a.records(&name("depth")) && !a.records(&name("color")) && rig.cameras[1].records(&name("color"))
+    );
+    let BackendConfig::Synthetic(b) = &rig.cameras[1].backend else { panic!() };
+    assert_eq!((b.serial.as_str(), b.faults[0].count, b.faults[0].at_s), ("sim-b", 3, 2.5));
+    assert_eq!((b.streams[0].size, b.streams[0].rate_hz), (Some((320, 240)), Some(30.0)));
+}
+
+#[test]
+fn angles_turn_about_x_then_y_then_z() {
+    let pose = |rpy: &str| {
+        let text = format!(
+            "rig = \"r\"\n[[camera]]\nname = \"a\"\nbackend = \"synthetic\"\npose.rotation_rpy_deg = {rpy}\n"
+        );
+        parse(&text).unwrap().cameras[0].pose
+    };
+    let turned =
+        |rpy: &str, p: [f64; 3]| depthrig_calib::PoseExt::transform_point(&pose(rpy), p.into()).to_array();
+    let near = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-12);
+    assert!(near(turned("[90, 0, 0]", [0.0, 1.0, 0.0]), [0.0, 0.0, 1.0]));
+    assert!(near(turned("[0, 90, 0]", [0.0, 0.0, 1.0]), [1.0, 0.0, 0.0]));
+    assert!(near(turned("[0, 0, 90]", [1.0, 0.0, 0.0]), [0.0, 1.0, 0.0]));
+    // x first: y goes to z, which the turn about y takes to x, which the turn about z takes to y.
+    assert!(near(turned("[90, 90, 90]", [0.0, 1.0, 0.0]), [0.0, 1.0, 0.0]));
+    assert!(near(turned("[90, 90, 0]", [0.0, 1.0, 0.0]), [1.0, 0.0, 0.0]));
+}
+
+const ONE_CAMERA: &str = "rig = \"r\"\n[[camera]]\nname = \"d435\"\nbackend = \"synthetic\"\n";
+
+#[test]
+fn each_problem_has_its_place_and_says_what_to_write() {
+    let top = |line: &str| format!("{line}\n{ONE_CAMERA}");
+    let camera = |line: &str| format!("{ONE_CAMERA}{line}\n");
+    let second = |lines: &str| format!("{ONE_CAMERA}[[camera]]\n{lines}\n");
+    #[rustfmt::skip]
+    let cases: Vec<(String, &str)> = vec![
+        (camera("  modle = \"d405\""), "rig.toml:5:3: unknown key \"modle\" in [[camera]] \"d435\"; did you mean \"model\"?"),
+        (camera("rate_hz = 5"), "5:1: unknown key \"rate_hz\" in [[camera]] \"d435\"; it belongs to [sets]"),
+        (top("set = {}"), "1:1: unknown key \"set\" at the top of the file; did you mean \"sets\"?"),
+        (top("xyz = 1"), "1:1: unknown key \"xyz\" at the top of the file; it has: rig, bus, sets"),
+        (camera("clock = { drift = 3 }"), "5:11: unknown key \"drift\" in [camera.clock] of camera \"d435\"; did you mean \"drift_ppm\"?"),
+        (camera("seed = \"1\""), "5:8: \"seed\" in [[camera]] \"d435\" must be a whole number; it is the string \"1\""),
+        (camera("seed = -1"), "5:8: \"seed\" in [[camera]] \"d435\" must be a whole number within 0..="),
+        (camera("truth = 1"), "must be true or false; it is the number 1"),
+        (camera("phase = nan"), "must be a finite number"),
+        (camera("phase = 1.5"), "5:9: \"phase\" in [[camera]] \"d435\": phase = 1.5 is not within 0..1"),
+        (camera("clock.counter_bits = 8"), "5:22: \"counter_bits\" in [camera.clock] of camera \"d435\": clock.counter_bits = 8"),
+        (camera("model = \"d436\""), "5:9: \"model\" in [[camera]] \"d435\": there is no model \"d436\"; there are d405,"),
+        (camera("stream = [{ name = \"ir\" }]"), "it has no stream \"ir\""),
+        (camera("stream = [{ name = \"color\", rate_hz = 0 }]"), "5:39: \"rate_hz\" in [[camera.stream]] \"color\" is 0; it must be above 0 and at most 1000"),
+        (camera("stream = [{ name = \"color\", rate_hz = 1001 }]"), "is 1001; it must be above 0"),
+        (camera("stream = [{ name = \"color\", width = 3 }]"), "\"width\" in [[camera.stream]] \"color\" needs height as well"),
+        (camera("stream = [{ name = \"color\", format = \"rbg8\" }]"), "cannot be \"rbg8\"; did you mean \"rgb8\"?"),
+        (camera("stream = [{ name = \"color\" }, { name = \"color\" }]"), "stream \"color\" is listed twice"),
+        (camera("stream = [{ name = \"color\" }]\nrecord = [\"depth\"]"), "6:10: \"record\" in [[camera]] \"d435\" names \"depth\", which is not among"),
+        (camera("fault = [{ at_s = 1, kind = \"fire\" }]"), "5:29: \"kind\" in [[camera.fault]] of camera \"d435\" cannot be \"fire\"; it is one of: unplug, stall"),
+        (camera("fault = [{ at_s = -1, kind = \"hang\" }]"), "at_s and duration_s must be 0 or more"),
+        (camera("fault = [{ kind = \"hang\" }]"), "\"at_s\" is missing in [[camera.fault]]"),
+        (camera("pose = { rotation_xyzw = [0, 0, 0, 2] }"), "5:26: \"rotation_xyzw\" in pose = { } of camera \"d435\" must be a quaternion x, y, z, w of length 1; its length is 2.0000"),
+        (camera("pose = { rotation_xyzw = [0, 0, 0, 0] }"), "its length is 0.0000"),
+        (camera("pose = { translation_m = [0, inf, 0] }"), "value 2 must be a finite number"),
+        (camera("pose = { translation_m = [0, 1] }"), "must have 3 values; it has 2"),
+        (camera("pose = { rotation_xyzw = [0, 0, 0, 1], rotation_rpy_deg = [0, 0, 0] }"), "keep one"),
+        (second("name = \"d435\"\nbackend = \"synthetic\""), "6:8: camera name \"d435\" is taken by an earlier camera"),
+        (second("name = \"D435\"\nbackend = \"synthetic\""), "6:8: \"name\" in [[camera]] is no good name: \"D435\" cannot be a name: it begins with 'D'"),
+        (second("backend = \"synthetic\""), "5:1: \"name\" is missing in [[camera]]"),
+        (second("name = \"b\""), "5:1: \"backend\" is missing in [[camera]] \"b\""),
+        (second("name = \"b\"\nbackend = \"file\""), "7:11: \"backend\" in [[camera]] \"b\" cannot be \"file\"; did you mean \"files\"?"),
+        (second("name = \"b\"\nbackend = \"files\""), "\"manifest\" is missing in [[camera]] \"b\"; write, for example, manifest = "),
+        (second("name = \"b\"\nbackend = \"files\"\nmanifest = \"x\"\nrate_hz = -3"), "9:11: \"rate_hz\" in [[camera]] \"b\" is -3; it must be above 0"),
+        (second("name = \"b\"\nbackend = \"files\"\nmanifest = \"x\"\nmodel = \"d405\""), "only another backend has it"),
+        (top("sets.rate_hz = 31"), "1:16: \"rate_hz\" in [sets] is 31 sets a second, but the fastest camera gives 30 frames a second"),
+        (top("sets.rate_hz = 0.0"), "1:16: \"rate_hz\" in [sets] is 0; it must be above 0"),
+        (top("control.tcp = \"0.0.0.0:80\""), "1:15: \"tcp\" in [control] must be a loopback address such as 127.0.0.1:80, not 0.0.0.0:80: the API has no password"),
+        (top("control.tcp = \"localhost\""), "must be an address and a port such as"),
+        (top("bus.slots = 3"), "\"slots\" in [bus] is 3; it must be within 16 and 1024"),
+        (top("recording.jpeg_quality = 101"), "is 101; it must be within 1 and 100"),
+        (top("recording.jpeg_quality = 300"), "whole number within 0..=255"),
+        (top("recording.directory = \"\""), "\"directory\" in [recording] is empty"),
+        (top("supervisor = { backoff_min_s = 3, backoff_max_s = 1 }"), "is 1, less than backoff_min_s, which is 3"),
+        (top("sets = 3"), "1:8: \"sets\" must be a table, [sets]; it is the number 3"),
+        ("rig = \"r\"\n[camera]\nname = \"a\"".into(), "must be written as tables, each headed [[camera]]"),
+        ("rig = \"r\"".into(), "1:1: the rig has no camera; add a [[camera]] table"),
+        ("rig = \"r\"\ncamera = []".into(), "the rig has no camera"),
+        ("[[camera]]\nname = \"a\"\nbackend = \"synthetic\"".into(), "1:1: \"rig\" is missing in the top of the file"),
+        ("rig = \"r\nx = 3".into(), "rig.toml:1:"),
+        (top("rig = \"s\""), "rig.toml:2:1: duplicate key"),
+        (top("x = 1 # \u{e4}\u{f6}\n\u{ff} = 2"), "rig.toml:2:1: "),
+    ];
+    let mut wrong = String::new();
+    for (text, wanted) in cases {
+        let found = problems(&text);
+        if found.len() != 1 || !found[0].contains(wanted) || !found[0].starts_with("/rigs/rig.toml:") {
+            writeln!(wrong, "{text}\nwanted: {wanted}\nfound:  {found:#?}\n").unwrap();
+        }
+    }
+    assert!(wrong.is_empty(), "{wrong}");
+}
+
+#[test]
+fn all_problems_are_listed_in_the_order_of_the_file() {
+    let text = "rig = \"R\"\n[sets]\nrate_hz = 0\nphas = \"auto\"\n[[camera]]\nname = \"a\"\nbackend = \"synthetic\"\n\
+                seed = true\nphase = 7\n[[camera]]\nname = \"a\"\nbackend = \"files\"\n";
+    let lines: Vec<_> = parse(text).unwrap_err().problems().iter().map(|p| p.line).collect();
+    assert_eq!(lines, [1, 3, 4, 8, 9, 10, 11]);
+}
+
+#[test]
+fn columns_count_characters() {
+    let text = format!("{ONE_CAMERA}clock = {{ \"drift_ppm\" = 1, \"\u{e4}\u{f6}\u{fc}\" = 2, zz = 1 }}\n");
+    let places: Vec<_> = parse(&text).unwrap_err().problems().iter().map(|p| (p.line, p.column)).collect();
+    assert_eq!(places, [(5, 28), (5, 39)]);
+}
+
+#[test]
+fn files_that_cannot_be_read_say_why() {
+    let tmp = tempfile::tempdir().unwrap();
+    let path = tmp.path().join("rig.toml");
+    let e = RigConfig::load(&path).unwrap_err();
+    assert_eq!(e.kind(), crate::ErrorKind::NotFound);
+    assert!(e.to_string().contains("depthrig config show"), "{e}");
+    assert!(RigConfig::load(tmp.path()).unwrap_err().to_string().contains("it is a folder"));
+    std::fs::write(&path, [0xff, 0xfe, 0x00]).unwrap();
+    assert!(RigConfig::load(&path).unwrap_err().to_string().contains("it is no text"));
+    std::fs::write(&path, RigConfig::default_text()).unwrap();
+    let rig = RigConfig::load(&path).unwrap();
+    assert_eq!(rig.recording.directory, tmp.path().join("datasets"));
+    assert_eq!(rig.path.as_deref(), Some(path.as_path()));
+}
+
+proptest::proptest! {
+    /// Whatever is done to a good file, reading it ends with a configuration or with problems that lie in it.
+    #[test]
+    fn damaged_files_never_panic(at in 0usize..20_000, cut in 0usize..40, put in "[\\[\\]{}=\".#a0 \n-]{0,8}") {
+        let mut text = uncommented(true);
+        let at = text.floor_char_boundary(at % text.len());
+        let end = text.floor_char_boundary((at + cut).min(text.len()));
+        text.replace_range(at..end, &put);
+        if let Err(e) = parse(&text) {
+            let lines = text.lines().count().max(1);
+            proptest::prop_assert!(!e.problems().is_empty());
+            proptest::prop_assert!(e.problems().iter().all(|p| (1..=lines + 1).contains(&p.line)), "{e}");
+        }
+    }
+}
