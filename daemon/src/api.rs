@@ -1,0 +1,45 @@
+//! The control API: HTTP/JSON on the rig's Unix socket and, when configured, on a loopback port.
+//!
+//! `api/openapi.json` describes it, and a test holds the two together. The server lives in one thread of its own
+//! with a single-threaded runtime, so the rest of the daemon knows nothing of async; calls of [`Control`] run on a
+//! few extra threads, so a recording that takes long to close does not make `status` wait.
+//!
+//! **Who may call.** The socket has mode 0600 in a folder of mode 0700: the user that runs the rig. A port has no
+//! such protection, so it must be loopback, and web pages in that user's browser are kept out by two rules: the
+//! `Host` must be a loopback name (against DNS rebinding), and a POST must be `application/json`, which a page of
+//! another origin may not send without asking first, and nobody answers that question (against CSRF).
+
+mod guard;
+mod reply;
+mod routes;
+mod serve;
+mod socket;
+
+pub(crate) use reply::{ErrorBody, kind_of_name};
+pub use routes::{Health, HealthReason, NoteRequest, OPENAPI, ROUTES, Route};
+pub use serve::ServerHandle;
+
+use crate::Result;
+use crate::control::Control;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::sync::Arc;
+
+/// The largest request body, bytes; notes are the longest thing anybody sends.
+pub const MAX_BODY_BYTES: usize = 64 << 10;
+/// The most connections at once; more wait until one ends.
+pub const MAX_CONNECTIONS: usize = 64;
+/// The header in which every answer says what made it: `depthrig/0.1.0`.
+pub const SERVER_HEADER: &str = "server";
+
+/// Serves `control` on the Unix socket `socket` and, if given, on the loopback address `tcp` (port 0: any).
+///
+/// The caller holds the rig's lock: only then is a socket file that is already there the rest of a process that
+/// died, and removed. It returns when both accept connections; dropping the handle ends the service.
+///
+/// # Errors
+/// `InUse` when something answers on the socket or the port is taken, `BadInput` for an address that is not
+/// loopback, `PermissionDenied`, `Other`.
+pub fn serve(control: Arc<dyn Control>, socket: &Path, tcp: Option<SocketAddr>) -> Result<ServerHandle> {
+    ServerHandle::start(control, socket, tcp)
+}

@@ -1,0 +1,199 @@
+//! The calls of the API: one table that the router is built from and the OpenAPI document is compared with.
+
+use super::reply::Refusal;
+use super::{MAX_BODY_BYTES, SERVER_HEADER, guard};
+use crate::control::{Control, RecordRequest};
+use crate::metrics;
+use crate::status::{CameraState, CameraStatus, RecordingStatus, RigStatus};
+use crate::{Error, ErrorKind};
+use axum::body::Bytes;
+use axum::extract::rejection::BytesRejection;
+use axum::extract::{DefaultBodyLimit, Request, State};
+use axum::http::{HeaderValue, Method, StatusCode, Uri, header};
+use axum::middleware::{self, Next};
+use axum::response::{IntoResponse, Response};
+use axum::routing::{MethodRouter, get, post};
+use axum::{Json, Router};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// The OpenAPI 3.1 document of the API.
+pub const OPENAPI: &str = include_str!("openapi.json");
+
+type Rig = Arc<dyn Control>;
+type Body = Result<Bytes, BytesRejection>;
+type Answer<T> = Result<T, Refusal>;
+
+/// A call of the API.
+#[derive(Debug, Clone, Copy)]
+pub struct Route {
+    /// `GET` or `POST`.
+    pub method: &'static str,
+    /// Its path.
+    pub path: &'static str,
+    handler: fn() -> MethodRouter<Rig>,
+}
+
+/// Every call of the API.
+pub const ROUTES: [Route; 10] = [
+    Route { method: "GET", path: "/v1/status", handler: || get(status) },
+    Route { method: "GET", path: "/v1/health", handler: || get(health) },
+    Route { method: "GET", path: "/v1/config", handler: || get(config) },
+    Route { method: "GET", path: "/v1/record", handler: || get(record) },
+    Route { method: "POST", path: "/v1/record/start", handler: || post(record_start) },
+    Route { method: "POST", path: "/v1/record/stop", handler: || post(record_stop) },
+    Route { method: "POST", path: "/v1/record/note", handler: || post(record_note) },
+    Route { method: "POST", path: "/v1/stop", handler: || post(stop) },
+    Route { method: "GET", path: "/v1/openapi.json", handler: || get(openapi) },
+    Route { method: "GET", path: "/metrics", handler: || get(scrape) },
+];
+
+/// A timed note for the recording.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NoteRequest {
+    /// What to note.
+    pub text: String,
+}
+
+/// Whether every camera streams.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Health {
+    /// Whether every camera streams.
+    pub healthy: bool,
+    /// The cameras that do not.
+    pub reasons: Vec<HealthReason>,
+}
+
+/// A camera that does not stream.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct HealthReason {
+    /// Its name.
+    pub camera: String,
+    /// Its state.
+    pub state: CameraState,
+    /// Why.
+    pub message: Option<String>,
+}
+
+impl Health {
+    /// The health of a rig with these cameras.
+    pub fn of(cameras: &[CameraStatus]) -> Self {
+        let ill = cameras.iter().filter(|c| c.state != CameraState::Streaming);
+        let reason = |c: &CameraStatus| HealthReason {
+            camera: c.name.clone(),
+            state: c.state,
+            message: c.message.clone(),
+        };
+        let reasons: Vec<_> = ill.map(reason).collect();
+        Self { healthy: reasons.is_empty(), reasons }
+    }
+}
+
+pub(super) fn router(control: Rig) -> Router {
+    let router = ROUTES.iter().fold(Router::new(), |router, r| router.route(r.path, (r.handler)()));
+    router
+        .fallback(unknown_path)
+        .method_not_allowed_fallback(wrong_method)
+        .with_state(control)
+        .layer(DefaultBodyLimit::max(MAX_BODY_BYTES))
+        .layer(middleware::from_fn(guard::json_posts))
+        .layer(middleware::from_fn(name_server))
+}
+
+/// Says in every answer which version made it, so that a client of another one can say so.
+async fn name_server(request: Request, next: Next) -> Response {
+    let mut response = next.run(request).await;
+    let name = HeaderValue::from_static(concat!("depthrig/", env!("CARGO_PKG_VERSION")));
+    response.headers_mut().insert(SERVER_HEADER, name);
+    response
+}
+
+async fn status(State(rig): State<Rig>) -> Answer<Json<RigStatus>> {
+    call(rig, |rig| Ok(rig.status())).await.map(Json)
+}
+
+async fn health(State(rig): State<Rig>) -> Answer<(StatusCode, Json<Health>)> {
+    let health = Health::of(&call(rig, |rig| Ok(rig.status())).await?.cameras);
+    let status = if health.healthy { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
+    Ok((status, Json(health)))
+}
+
+async fn config(State(rig): State<Rig>) -> Answer<Response> {
+    let text = call(rig, |rig| Ok(rig.config_text())).await?;
+    Ok(([(header::CONTENT_TYPE, "application/toml; charset=utf-8")], text).into_response())
+}
+
+async fn record(State(rig): State<Rig>) -> Answer<Json<Option<RecordingStatus>>> {
+    call(rig, |rig| Ok(rig.status().recording)).await.map(Json)
+}
+
+async fn record_start(State(rig): State<Rig>, body: Body) -> Answer<Json<RecordingStatus>> {
+    let request: RecordRequest = parse(body)?;
+    call(rig, move |rig| rig.record_start(&request)).await.map(Json)
+}
+
+async fn record_stop(State(rig): State<Rig>) -> Answer<Json<RecordingStatus>> {
+    call(rig, |rig| rig.record_stop()).await.map(Json)
+}
+
+async fn record_note(State(rig): State<Rig>, body: Body) -> Answer<StatusCode> {
+    let note: NoteRequest = parse(body)?;
+    call(rig, move |rig| rig.record_note(&note.text)).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+async fn stop(State(rig): State<Rig>) -> Answer<StatusCode> {
+    call(rig, |rig| {
+        rig.request_stop();
+        Ok(())
+    })
+    .await?;
+    Ok(StatusCode::ACCEPTED)
+}
+
+async fn openapi() -> Response {
+    ([(header::CONTENT_TYPE, "application/json")], OPENAPI).into_response()
+}
+
+async fn scrape(State(rig): State<Rig>) -> Answer<Response> {
+    let text = call(rig, |rig| Ok(metrics::render(&rig.status()))).await?;
+    Ok(([(header::CONTENT_TYPE, metrics::CONTENT_TYPE)], text).into_response())
+}
+
+async fn unknown_path(uri: Uri) -> Refusal {
+    let paths: Vec<_> = ROUTES.iter().map(|r| r.path).collect();
+    let message = format!("there is no {}; there are {}", uri.path(), paths.join(", "));
+    Refusal::new(StatusCode::NOT_FOUND, message)
+}
+
+async fn wrong_method(method: Method, uri: Uri) -> Refusal {
+    let wanted = ROUTES.iter().find(|r| r.path == uri.path()).map_or("another method", |r| r.method);
+    let message = format!("{} answers to {wanted}, not to {method}", uri.path());
+    Refusal::new(StatusCode::METHOD_NOT_ALLOWED, message)
+}
+
+/// Runs a call of the rig where it may take its time.
+async fn call<T: Send + 'static>(
+    rig: Rig,
+    what: impl FnOnce(&dyn Control) -> crate::Result<T> + Send + 'static,
+) -> Answer<T> {
+    match tokio::task::spawn_blocking(move || what(&*rig)).await {
+        Ok(result) => result.map_err(Refusal::from),
+        Err(e) => {
+            tracing::error!(error = %e, "a call of the control API failed inside");
+            let message = "the call failed inside the daemon; its log says more";
+            Err(Error::new(ErrorKind::Other, message).into())
+        }
+    }
+}
+
+/// The body as JSON; an empty one is an empty object.
+fn parse<T: DeserializeOwned>(body: Body) -> Answer<T> {
+    let body =
+        body.map_err(|e| Refusal::new(e.status(), format!("the body cannot be read: {}", e.body_text())))?;
+    let text = if body.is_empty() { b"{}".as_slice() } else { &body };
+    serde_json::from_slice(text)
+        .map_err(|e| Refusal::new(StatusCode::BAD_REQUEST, format!("the body is wrong: {e}")))
+}

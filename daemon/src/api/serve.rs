@@ -1,0 +1,169 @@
+//! The thread that serves: it accepts, keeps connections few and short-lived, and ends within half a second.
+
+use super::socket::{self, SocketFile};
+use super::{MAX_CONNECTIONS, guard, routes};
+use crate::control::Control;
+use crate::{Error, ErrorKind, Result};
+use axum::Router;
+use core::time::Duration;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::{TcpListener, UnixListener};
+use tokio::sync::{Semaphore, watch};
+
+/// How long a client may take to send the head of its next request; an idle connection ends after it.
+const HEAD_PATIENCE: Duration = Duration::from_secs(30);
+/// How long requests that are under way when the service ends get.
+const STOP_PATIENCE: Duration = Duration::from_millis(300);
+/// The pause after a connection could not be accepted, which is when the process is out of file descriptors.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// Threads for calls of `Control`.
+const CALL_THREADS: usize = 8;
+
+/// The running service; dropping it ends the service.
+#[derive(Debug)]
+pub struct ServerHandle {
+    stop: watch::Sender<bool>,
+    thread: Option<JoinHandle<()>>,
+    tcp: Option<SocketAddr>,
+    _socket: SocketFile,
+}
+
+impl ServerHandle {
+    pub(super) fn start(control: Arc<dyn Control>, path: &Path, tcp: Option<SocketAddr>) -> Result<Self> {
+        let failed = |e: std::io::Error| {
+            Error::new(ErrorKind::Other, format!("the control API cannot be served: {e}")).with_source(e)
+        };
+        // The port first: when it is refused, no socket has come and gone.
+        let port = tcp.map(socket::bind_tcp).transpose()?;
+        let (unix, socket) = socket::bind_unix(path)?;
+        let tcp = port.as_ref().map(std::net::TcpListener::local_addr).transpose().map_err(failed)?;
+        let mut builder = tokio::runtime::Builder::new_current_thread();
+        let runtime = builder.enable_all().max_blocking_threads(CALL_THREADS).thread_name("api-call").build();
+        let runtime = runtime.map_err(failed)?;
+        let (unix, port) = {
+            let _inside = runtime.enter();
+            let port = port.map(TcpListener::from_std).transpose().map_err(failed)?;
+            (UnixListener::from_std(unix).map_err(failed)?, port)
+        };
+        let (stop, stopped) = watch::channel(false);
+        let serve = move || {
+            runtime.block_on(run(control, unix, port, stopped));
+            // A call that is still under way ends by itself; nobody waits for its answer.
+            runtime.shutdown_background();
+        };
+        let thread = std::thread::Builder::new().name("api".into()).spawn(serve).map_err(failed)?;
+        tracing::debug!(socket = %path.display(), tcp = ?tcp, "control API is served");
+        Ok(Self { stop, thread: Some(thread), tcp, _socket: socket })
+    }
+
+    /// The address of the loopback port, if one is served.
+    pub const fn tcp(&self) -> Option<SocketAddr> {
+        self.tcp
+    }
+
+    /// Ends the service: no new requests, half a second for those under way, then the socket's file goes.
+    pub fn stop(self) {
+        drop(self);
+    }
+}
+
+impl Drop for ServerHandle {
+    fn drop(&mut self) {
+        self.stop.send_replace(true);
+        if let Some(thread) = self.thread.take()
+            && thread.join().is_err()
+        {
+            tracing::error!("the thread of the control API had panicked");
+        }
+    }
+}
+
+async fn run(
+    control: Arc<dyn Control>,
+    unix: UnixListener,
+    port: Option<TcpListener>,
+    stopped: watch::Receiver<bool>,
+) {
+    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    let router = routes::router(control);
+    let guarded = router.clone().layer(axum::middleware::from_fn(guard::loopback_host));
+    let on_port = Acceptor { places: Arc::clone(&places), router: guarded, stopped: stopped.clone() };
+    let on_socket = Acceptor { places: Arc::clone(&places), router, stopped };
+    let on_port = async {
+        if let Some(port) = port {
+            on_port.run(async || port.accept().await.map(|(stream, _)| stream)).await;
+        }
+    };
+    tokio::join!(on_port, on_socket.run(async || unix.accept().await.map(|(stream, _)| stream)));
+    let all = places.acquire_many(MAX_CONNECTIONS as u32);
+    if tokio::time::timeout(STOP_PATIENCE, all).await.is_err() {
+        tracing::debug!("requests under way were cut off because the rig ends");
+    }
+}
+
+struct Acceptor {
+    places: Arc<Semaphore>,
+    router: Router,
+    stopped: watch::Receiver<bool>,
+}
+
+impl Acceptor {
+    /// Serves what `next` accepts until the service is stopped.
+    async fn run<S>(mut self, next: impl AsyncFn() -> std::io::Result<S>)
+    where
+        S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+    {
+        loop {
+            let accepted = async {
+                let stream = next().await;
+                (stream, Arc::clone(&self.places).acquire_owned().await)
+            };
+            let (stream, place) = tokio::select! {
+                () = end_of(&mut self.stopped) => return,
+                accepted = accepted => accepted,
+            };
+            let (Ok(stream), Ok(place)) = (stream, place) else {
+                tokio::time::sleep(ACCEPT_PAUSE).await;
+                continue;
+            };
+            let (router, stopped) = (self.router.clone(), self.stopped.clone());
+            tokio::spawn(async move {
+                converse(stream, router, stopped).await;
+                drop(place);
+            });
+        }
+    }
+}
+
+/// Waits until the service is to end.
+async fn end_of(stopped: &mut watch::Receiver<bool>) {
+    // An error means that the handle is gone, which is an end as well.
+    let _ = stopped.wait_for(|stopped| *stopped).await;
+}
+
+/// Answers the requests of one connection. A client that goes away or talks nonsense concerns only itself.
+async fn converse<S>(stream: S, router: Router, mut stopped: watch::Receiver<bool>)
+where
+    S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
+{
+    let mut http = hyper::server::conn::http1::Builder::new();
+    http.timer(TokioTimer::new()).header_read_timeout(HEAD_PATIENCE);
+    let connection = http.serve_connection(TokioIo::new(stream), TowerToHyperService::new(router));
+    tokio::pin!(connection);
+    let ended = tokio::select! {
+        ended = connection.as_mut() => ended,
+        () = end_of(&mut stopped) => {
+            connection.as_mut().graceful_shutdown();
+            connection.await
+        }
+    };
+    if let Err(e) = ended {
+        tracing::debug!(error = %e, "a connection of the control API ended early");
+    }
+}

@@ -1,0 +1,444 @@
+//! The control API as others see it: over its socket and its port, against its own description.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "api/fake.rs"]
+mod fake;
+#[path = "api/schema.rs"]
+mod schema;
+
+use depthrig_bus::clock::HostTime;
+use depthrig_bus::{RigName, RuntimeDir};
+use depthrig_daemon::api::{self, MAX_BODY_BYTES, OPENAPI, ROUTES, ServerHandle};
+use depthrig_daemon::client::Client;
+use depthrig_daemon::control::RecordRequest;
+use depthrig_daemon::status::CameraState;
+use depthrig_daemon::{Error, ErrorKind};
+use fake::Fake;
+use schema::Document;
+use serde_json::{Value, json};
+use std::collections::BTreeSet;
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::sync::Arc;
+use std::time::Duration;
+
+/// A served rig with a fake behind it.
+struct Served {
+    fake: Arc<Fake>,
+    runtime: RuntimeDir,
+    rig: RigName,
+    server: ServerHandle,
+    lock: depthrig_bus::runtime::RigLock,
+    _tmp: tempfile::TempDir,
+}
+
+fn served() -> Served {
+    let tmp = tempfile::Builder::new().prefix("dr").rand_bytes(4).tempdir_in("/tmp").unwrap();
+    let runtime = RuntimeDir::at(tmp.path()).unwrap();
+    let rig = RigName::new("mount").unwrap();
+    let lock = runtime.lock(&rig, "process 42 (rig.toml)").unwrap();
+    let fake = Arc::new(Fake::default());
+    let any_port = Some("127.0.0.1:0".parse().unwrap());
+    let server = api::serve(fake.clone(), &runtime.socket_path(&rig), any_port).unwrap();
+    Served { fake, runtime, rig, server, lock, _tmp: tmp }
+}
+
+struct Answer {
+    status: u16,
+    head: String,
+    body: String,
+}
+
+impl Answer {
+    fn json(&self) -> Value {
+        serde_json::from_str(&self.body).unwrap_or_else(|e| panic!("{e}: {}", self.body))
+    }
+
+    fn media_type(&self) -> String {
+        let line = self.head.lines().find_map(|l| l.strip_prefix("content-type: "));
+        line.unwrap_or_default().trim().to_owned()
+    }
+}
+
+/// Sends `bytes` as they are and reads the answer; the request asks for the connection to be closed.
+fn exchange(mut stream: impl Read + Write, bytes: &[u8]) -> Answer {
+    // A refusal may come, and the connection go, before all of a large body was sent.
+    let _ = stream.write_all(bytes);
+    let mut text = Vec::new();
+    let _ = stream.read_to_end(&mut text);
+    let text = String::from_utf8(text).unwrap();
+    let (head, body) = text.split_once("\r\n\r\n").unwrap_or_else(|| panic!("no answer: {text:?}"));
+    let status = head.split(' ').nth(1).unwrap().parse().unwrap();
+    Answer { status, head: head.to_ascii_lowercase(), body: body.to_owned() }
+}
+
+fn request(method: &str, path: &str, host: &str, content_type: Option<&str>, body: &str) -> String {
+    let kind = content_type.map(|t| format!("content-type: {t}\r\n")).unwrap_or_default();
+    let length = body.len();
+    format!(
+        "{method} {path} HTTP/1.1\r\nhost: {host}\r\n{kind}content-length: {length}\r\nconnection: close\r\n\r\n{body}"
+    )
+}
+
+impl Served {
+    fn unix(&self) -> UnixStream {
+        UnixStream::connect(self.runtime.socket_path(&self.rig)).unwrap()
+    }
+
+    fn get(&self, path: &str) -> Answer {
+        exchange(self.unix(), request("GET", path, "localhost", None, "").as_bytes())
+    }
+
+    fn post(&self, path: &str, body: &str) -> Answer {
+        exchange(self.unix(), request("POST", path, "localhost", Some("application/json"), body).as_bytes())
+    }
+
+    fn on_port(&self, text: &str) -> Answer {
+        exchange(TcpStream::connect(self.server.tcp().unwrap()).unwrap(), text.as_bytes())
+    }
+}
+
+#[test]
+fn the_document_describes_every_call_and_no_other() {
+    let document: Value = serde_json::from_str(OPENAPI).unwrap();
+    let described: BTreeSet<_> = document["paths"]
+        .as_object()
+        .unwrap()
+        .iter()
+        .flat_map(|(path, calls)| {
+            calls.as_object().unwrap().keys().map(move |m| (m.to_uppercase(), path.clone()))
+        })
+        .collect();
+    let routed: BTreeSet<_> = ROUTES.iter().map(|r| (r.method.to_owned(), r.path.to_owned())).collect();
+    assert_eq!(described, routed);
+    assert_eq!(document["openapi"], "3.1.0");
+    Document::new(document).check_itself();
+}
+
+/// Every route, in every situation that it has an answer for: the answer's status and media type are described,
+/// and its body fits the schema, which has every field and no other.
+#[test]
+fn every_answer_of_a_live_server_fits_the_document() {
+    let served = served();
+    let document = Document::new(serde_json::from_str(OPENAPI).unwrap());
+    let mut seen = BTreeSet::new();
+    let mut check = |method: &str, path: &str, answer: &Answer, wanted: u16| {
+        assert_eq!(answer.status, wanted, "{method} {path}: {}", answer.body);
+        document.check_answer(method, path, answer.status, &answer.media_type(), &answer.body);
+        seen.insert((method.to_owned(), path.to_owned()));
+    };
+    check("GET", "/v1/record", &served.get("/v1/record"), 200);
+    assert_eq!(served.get("/v1/record").json(), Value::Null);
+    check("GET", "/v1/status", &served.get("/v1/status"), 200);
+    check("POST", "/v1/record/stop", &served.post("/v1/record/stop", ""), 409);
+    check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": "x"}"#), 409);
+    check("POST", "/v1/record/start", &served.post("/v1/record/start", r#"{"scene": "table"}"#), 200);
+    check("POST", "/v1/record/start", &served.post("/v1/record/start", "{}"), 409);
+    check("GET", "/v1/status", &served.get("/v1/status"), 200);
+    check("GET", "/v1/record", &served.get("/v1/record"), 200);
+    check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": "lamp on"}"#), 204);
+    check("POST", "/v1/record/note", &served.post("/v1/record/note", r#"{"text": ""}"#), 400);
+    check("POST", "/v1/record/stop", &served.post("/v1/record/stop", ""), 200);
+    check("GET", "/v1/health", &served.get("/v1/health"), 503);
+    served.fake.set_all(CameraState::Streaming);
+    check("GET", "/v1/health", &served.get("/v1/health"), 200);
+    check("GET", "/v1/config", &served.get("/v1/config"), 200);
+    check("GET", "/metrics", &served.get("/metrics"), 200);
+    check("GET", "/v1/openapi.json", &served.get("/v1/openapi.json"), 200);
+    for (kind, wanted) in [
+        (ErrorKind::NotFound, 404),
+        (ErrorKind::NoSpace, 507),
+        (ErrorKind::PermissionDenied, 403),
+        (ErrorKind::Other, 500),
+    ] {
+        served.fake.fail_next(kind, "as told");
+        let answer = served.post("/v1/record/start", "{}");
+        check("POST", "/v1/record/start", &answer, wanted);
+        assert_eq!(answer.json()["error"]["message"], "as told");
+    }
+    check("POST", "/v1/stop", &served.post("/v1/stop", ""), 202);
+    assert!(served.fake.stop_was_asked());
+    let all: BTreeSet<_> = ROUTES.iter().map(|r| (r.method.to_owned(), r.path.to_owned())).collect();
+    assert_eq!(seen, all, "a route was not tried");
+}
+
+#[test]
+fn what_is_asked_arrives() {
+    let served = served();
+    let body = r#"{"directory": "/data", "name": "n", "scene": "s", "operator": "o", "notes": "a\nb"}"#;
+    assert_eq!(served.post("/v1/record/start", body).status, 200);
+    let request = RecordRequest {
+        directory: Some("/data".into()),
+        name: Some("n".into()),
+        scene: "s".into(),
+        operator: "o".into(),
+        notes: "a\nb".into(),
+    };
+    assert_eq!(served.fake.last_request(), Some(request));
+    assert_eq!(served.get("/v1/config").body, fake::CONFIG);
+    assert!(served.get("/metrics").body.contains("depthrig_sets_sent_total 7\n"));
+    let health = served.get("/v1/health").json();
+    let reason = json!({"camera": "d405", "state": "reconnecting", "message": "unplugged"});
+    assert_eq!(health, json!({"healthy": false, "reasons": [reason]}));
+}
+
+#[test]
+fn requests_that_make_no_sense_are_told_so() {
+    let served = served();
+    let error = |answer: &Answer, status: u16, kind: &str, says: &str| {
+        assert_eq!(answer.status, status, "{}", answer.body);
+        assert_eq!(answer.media_type(), "application/json");
+        assert_eq!(answer.json()["error"]["kind"], kind);
+        let message = answer.json()["error"]["message"].as_str().unwrap().to_owned();
+        assert!(message.contains(says), "{message}");
+    };
+    error(&served.get("/v1/nothing"), 404, "not_found", "there is no /v1/nothing; there are /v1/status");
+    error(&served.get("/v2/status"), 404, "not_found", "/v1/status");
+    error(&served.post("/v1/status", ""), 405, "bad_input", "answers to GET, not to POST");
+    error(&served.get("/v1/stop"), 405, "bad_input", "answers to POST, not to GET");
+    assert!(!served.fake.stop_was_asked());
+    error(&served.post("/v1/record/start", "{"), 400, "bad_input", "EOF");
+    error(&served.post("/v1/record/start", r#"{"scen": "x"}"#), 400, "bad_input", "unknown field `scen`");
+    error(&served.post("/v1/record/note", "{}"), 400, "bad_input", "missing field `text`");
+    error(&served.post("/v1/record/note", r#"{"text": 3}"#), 400, "bad_input", "invalid type");
+    let long = format!(r#"{{"text": "{}"}}"#, "x".repeat(MAX_BODY_BYTES));
+    error(&served.post("/v1/record/note", &long), 413, "bad_input", "body");
+    let fits = format!(r#"{{"text": "{}"}}"#, "x".repeat(MAX_BODY_BYTES - 20));
+    assert_eq!(
+        served.post("/v1/record/note", &fits).status,
+        409,
+        "read, then refused for want of a recording"
+    );
+    served.fake.panic_next();
+    error(&served.post("/v1/record/start", "{}"), 500, "other", "failed inside the daemon");
+    assert_eq!(served.get("/v1/status").status, 200, "a call that failed inside takes nothing with it");
+}
+
+#[test]
+fn web_pages_are_kept_out() {
+    let served = served();
+    let get = |host: &str| served.on_port(&request("GET", "/v1/status", host, None, ""));
+    for host in ["localhost", "127.0.0.1:8642", "[::1]:80"] {
+        assert_eq!(get(host).status, 200, "{host}");
+    }
+    for host in ["evil.example", "127.0.0.1.evil.example:80", "192.168.1.4"] {
+        let answer = get(host);
+        assert_eq!(
+            (answer.status, answer.json()["error"]["kind"].as_str()),
+            (403, Some("permission_denied")),
+            "{host}"
+        );
+    }
+    let two = "GET /v1/status HTTP/1.1\r\nhost: localhost\r\nhost: evil.example\r\nconnection: close\r\n\r\n";
+    assert!(served.on_port(two).status >= 400);
+    let none = "GET /v1/status HTTP/1.0\r\n\r\n";
+    assert_eq!(served.on_port(none).status, 403);
+    // What a page of another origin may send without being allowed to: these types, and none at all.
+    let simple = [
+        "text/plain",
+        "application/x-www-form-urlencoded",
+        "multipart/form-data",
+        "text/plain;application/json",
+    ];
+    for kind in simple.map(Some).into_iter().chain([None]) {
+        for answer in [
+            served.on_port(&request("POST", "/v1/stop", "localhost", kind, "{}")),
+            exchange(served.unix(), request("POST", "/v1/stop", "localhost", kind, "{}").as_bytes()),
+        ] {
+            assert_eq!(answer.status, 415, "{kind:?}");
+            assert!(answer.body.contains("Content-Type: application/json"), "{}", answer.body);
+        }
+    }
+    assert!(!served.fake.stop_was_asked());
+    // The question that a browser asks first for JSON is not answered with leave.
+    let preflight = served.on_port(&request("OPTIONS", "/v1/stop", "localhost", None, ""));
+    assert_eq!(preflight.status, 405);
+    assert!(!preflight.head.contains("access-control"));
+    let good = request("POST", "/v1/stop", "localhost", Some("application/json; charset=utf-8"), "");
+    assert_eq!(served.on_port(&good).status, 202);
+    assert!(served.fake.stop_was_asked());
+}
+
+#[test]
+fn the_socket_is_private_and_goes_with_the_server() {
+    let served = served();
+    let path = served.runtime.socket_path(&served.rig);
+    assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
+    served.server.stop();
+    assert!(!path.exists());
+}
+
+#[test]
+fn a_dead_daemons_socket_is_replaced_and_nothing_else_is() {
+    let tmp = tempfile::tempdir().unwrap();
+    let path = tmp.path().join("r.sock");
+    let fake: Arc<Fake> = Arc::default();
+    drop(UnixListener::bind(&path).unwrap());
+    assert!(path.exists(), "a socket that nobody listens on");
+    let first = api::serve(fake.clone(), &path, None).unwrap();
+    let e = api::serve(fake.clone(), &path, None).unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::InUse);
+    assert!(e.to_string().contains("another process answers on it"), "{e}");
+    // A server whose file was replaced by somebody leaves that file alone.
+    std::fs::remove_file(&path).unwrap();
+    let second = api::serve(fake.clone(), &path, None).unwrap();
+    let inode = std::fs::metadata(&path).unwrap().ino();
+    first.stop();
+    assert_eq!(std::fs::metadata(&path).unwrap().ino(), inode);
+    second.stop();
+    std::fs::write(&path, "precious").unwrap();
+    let e = api::serve(fake, &path, None).unwrap_err();
+    assert!(e.to_string().contains("a file that is no socket is in the way"), "{e}");
+    assert_eq!(std::fs::read_to_string(&path).unwrap(), "precious");
+}
+
+#[test]
+fn ports_that_cannot_be_served_say_why() {
+    let tmp = tempfile::tempdir().unwrap();
+    let path = tmp.path().join("r.sock");
+    let serve = |address: SocketAddr| api::serve(Arc::<Fake>::default(), &path, Some(address)).unwrap_err();
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let e = serve(taken.local_addr().unwrap());
+    assert_eq!(e.kind(), ErrorKind::InUse);
+    assert!(e.to_string().contains("another program listens there"), "{e}");
+    let e = serve("0.0.0.0:0".parse().unwrap());
+    assert_eq!(e.kind(), ErrorKind::BadInput);
+    assert!(e.to_string().contains("not loopback"), "{e}");
+    assert!(!path.exists(), "a start that failed leaves no socket");
+}
+
+#[test]
+fn the_end_does_not_wait_for_slow_clients_or_slow_calls() {
+    let served = served();
+    let mut idle = served.unix();
+    let mut half = served.unix();
+    half.write_all(b"POST /v1/record/note HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\ncontent-length: 50\r\n\r\n{").unwrap();
+    served.fake.delay(Duration::from_secs(3));
+    let mut slow = served.unix();
+    slow.write_all(request("POST", "/v1/record/start", "localhost", Some("application/json"), "").as_bytes())
+        .unwrap();
+    served.fake.wait_for_call();
+    let begin = HostTime::now();
+    served.server.stop();
+    let took = begin.elapsed();
+    assert!(took < Duration::from_secs(1), "{took:?}");
+    let mut rest = Vec::new();
+    assert_eq!(idle.read_to_end(&mut rest).unwrap_or(0), 0);
+}
+
+#[test]
+fn a_slow_call_does_not_make_others_wait_and_idle_connections_leave_room() {
+    let served = served();
+    let _idle: Vec<_> = (0..api::MAX_CONNECTIONS - 2).map(|_| served.unix()).collect();
+    served.fake.delay(Duration::from_secs(2));
+    let mut slow = served.unix();
+    slow.write_all(request("POST", "/v1/record/start", "localhost", Some("application/json"), "").as_bytes())
+        .unwrap();
+    served.fake.wait_for_call();
+    let begin = HostTime::now();
+    assert_eq!(served.get("/v1/status").status, 200);
+    assert!(begin.elapsed() < Duration::from_secs(1));
+}
+
+#[test]
+fn the_client_says_and_hears_everything() {
+    let served = served();
+    let client = Client::connect(&served.runtime, None).unwrap();
+    assert_eq!(client.rig().as_str(), "mount");
+    assert_eq!(client.status().unwrap(), served.fake.current());
+    assert_eq!(client.config().unwrap(), fake::CONFIG);
+    assert_eq!(client.record_status().unwrap(), None);
+    let request = RecordRequest { scene: "table".into(), ..RecordRequest::default() };
+    let started = client.record_start(&request).unwrap();
+    assert!(started.active && started.scene == "table");
+    assert_eq!(served.fake.last_request(), Some(request.clone()));
+    assert_eq!(client.record_status().unwrap(), Some(started));
+    client.record_note("lamp \u{1f4a1} on").unwrap();
+    assert_eq!(served.fake.notes(), ["lamp \u{1f4a1} on"]);
+    let e = client.record_start(&request).unwrap_err();
+    assert_eq!((e.kind(), e.to_string().as_str()), (ErrorKind::InUse, "a recording goes on already"));
+    assert!(!client.record_stop().unwrap().active);
+    for kind in [
+        ErrorKind::BadInput,
+        ErrorKind::NotFound,
+        ErrorKind::InUse,
+        ErrorKind::WrongState,
+        ErrorKind::NoSpace,
+        ErrorKind::PermissionDenied,
+        ErrorKind::Unreachable,
+        ErrorKind::Other,
+    ] {
+        served.fake.fail_next(kind, "as told");
+        let e: Error = client.record_start(&request).unwrap_err();
+        assert_eq!((e.kind(), e.to_string().as_str()), (kind, "as told"));
+    }
+    client.stop().unwrap();
+    assert!(served.fake.stop_was_asked());
+    let Served { server, lock, .. } = served;
+    server.stop();
+    let e = client.status().unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::Unreachable);
+    assert!(e.to_string().contains("runs (process 42 (rig.toml)) but has no control socket"), "{e}");
+    drop(lock);
+    let e = client.status().unwrap_err();
+    assert!(e.to_string().contains("rig \"mount\" has ended"), "{e}");
+}
+
+#[test]
+fn the_client_says_what_is_missing() {
+    let tmp = tempfile::Builder::new().prefix("dr").rand_bytes(4).tempdir_in("/tmp").unwrap();
+    let runtime = RuntimeDir::at(tmp.path()).unwrap();
+    let (a, b) = (RigName::new("a").unwrap(), RigName::new("b").unwrap());
+    let fails = |rig: Option<&RigName>, kind: ErrorKind, says: &str| {
+        let e = Client::connect(&runtime, rig).unwrap_err();
+        assert_eq!(e.kind(), kind, "{e}");
+        assert!(e.to_string().contains(says), "{e}");
+    };
+    fails(None, ErrorKind::Unreachable, "start one: depthrig run RIG.toml");
+    fails(Some(&a), ErrorKind::Unreachable, "rig \"a\" does not run, nor does any other");
+    let lock_a = runtime.lock(&a, "process 7 (a.toml)").unwrap();
+    fails(Some(&b), ErrorKind::Unreachable, "rig \"b\" does not run; these do: a");
+    fails(None, ErrorKind::Unreachable, "rig \"a\" runs (process 7 (a.toml)) but has no control socket");
+    drop(UnixListener::bind(runtime.socket_path(&a)).unwrap());
+    fails(Some(&a), ErrorKind::Unreachable, "nothing answers on");
+    let lock_b = runtime.lock(&b, "process 8").unwrap();
+    fails(None, ErrorKind::BadInput, "several rigs run: a, b; say which one");
+    drop((lock_a, lock_b));
+}
+
+/// A daemon of another version, one that answers nonsense, and one that hangs up.
+#[test]
+fn strange_daemons_are_named() {
+    let tmp = tempfile::Builder::new().prefix("dr").rand_bytes(4).tempdir_in("/tmp").unwrap();
+    let runtime = RuntimeDir::at(tmp.path()).unwrap();
+    let rig = RigName::new("a").unwrap();
+    let _lock = runtime.lock(&rig, "process 7").unwrap();
+    let listener = UnixListener::bind(runtime.socket_path(&rig)).unwrap();
+    let answers = [
+        (
+            "HTTP/1.1 200 OK\r\nserver: depthrig/99.0.0\r\ncontent-length: 0\r\n\r\n",
+            ErrorKind::Other,
+            "of version 99.0.0, this program of",
+        ),
+        ("HTTP/1.1 200 OK\r\ncontent-length: 0\r\n\r\n", ErrorKind::Other, "of version ?"),
+        ("SSH-2.0-OpenSSH\r\n", ErrorKind::Unreachable, "broke off"),
+        ("", ErrorKind::Unreachable, "broke off"),
+    ];
+    let texts = answers.map(|(text, ..)| text);
+    let daemon = std::thread::spawn(move || {
+        for text in texts {
+            let (mut stream, _) = listener.accept().unwrap();
+            let mut head = [0; 4096];
+            let _ = stream.read(&mut head).unwrap();
+            stream.write_all(text.as_bytes()).unwrap();
+        }
+    });
+    for (text, kind, says) in answers {
+        let e = Client::connect(&runtime, Some(&rig)).unwrap_err();
+        assert_eq!(e.kind(), kind, "{text}: {e}");
+        assert!(e.to_string().contains(says), "{text}: {e}");
+    }
+    daemon.join().unwrap();
+}

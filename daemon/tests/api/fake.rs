@@ -1,0 +1,183 @@
+//! A rig that does as the test tells it.
+
+use depthrig_daemon::control::{Control, RecordRequest};
+use depthrig_daemon::status::{
+    CameraState, CameraStatus, ClockStatus, RecordingStatus, RigStatus, SetAccount, SetStatus,
+    SharedMemoryStatus, StreamStatus,
+};
+use depthrig_daemon::{Error, ErrorKind, Result};
+use std::sync::{Condvar, Mutex};
+use std::time::Duration;
+
+pub const CONFIG: &str = "rig = \"mount\" # \u{e4}\n";
+
+#[derive(Default)]
+pub struct Fake {
+    inner: Mutex<Inner>,
+    called: Condvar,
+}
+
+#[derive(Default)]
+struct Inner {
+    all: Option<CameraState>,
+    recording: Option<RecordingStatus>,
+    request: Option<RecordRequest>,
+    notes: Vec<String>,
+    fail: Option<(ErrorKind, String)>,
+    panic: bool,
+    delay: Duration,
+    calls: u32,
+    stop: bool,
+}
+
+impl Fake {
+    pub fn set_all(&self, state: CameraState) {
+        self.inner.lock().unwrap().all = Some(state);
+    }
+
+    pub fn fail_next(&self, kind: ErrorKind, message: &str) {
+        self.inner.lock().unwrap().fail = Some((kind, message.to_owned()));
+    }
+
+    pub fn panic_next(&self) {
+        self.inner.lock().unwrap().panic = true;
+    }
+
+    /// Makes `record_start` take this long.
+    pub fn delay(&self, delay: Duration) {
+        self.inner.lock().unwrap().delay = delay;
+    }
+
+    /// Waits until `record_start` has been called.
+    pub fn wait_for_call(&self) {
+        let inner = self.inner.lock().unwrap();
+        let (inner, late) =
+            self.called.wait_timeout_while(inner, Duration::from_secs(20), |i| i.calls == 0).unwrap();
+        assert!(!late.timed_out() && inner.calls > 0, "the call never came");
+    }
+
+    pub fn last_request(&self) -> Option<RecordRequest> {
+        self.inner.lock().unwrap().request.clone()
+    }
+
+    pub fn notes(&self) -> Vec<String> {
+        self.inner.lock().unwrap().notes.clone()
+    }
+
+    pub fn stop_was_asked(&self) -> bool {
+        self.inner.lock().unwrap().stop
+    }
+
+    pub fn current(&self) -> RigStatus {
+        let inner = self.inner.lock().unwrap();
+        let camera = |name: &str, state, message: Option<&str>| CameraStatus {
+            name: name.into(),
+            backend: "synthetic".into(),
+            model: "D435".into(),
+            serial: "s".into(),
+            firmware: String::new(),
+            calibration: "simulated".into(),
+            state: inner.all.unwrap_or(state),
+            state_for_s: 1.5,
+            message: message.map(str::to_owned),
+            reconnects: 2,
+            streams: vec![
+                stream(&format!("{name}/depth"), Some(3.25)),
+                stream(&format!("{name}/color"), None),
+            ],
+        };
+        RigStatus {
+            rig: "mount".into(),
+            version: "0.1.0".into(),
+            pid: 42,
+            uptime_s: 12.5,
+            utc_ns: 1_700_000_000_123_456_789,
+            cameras: vec![
+                camera("d435", CameraState::Streaming, None),
+                camera("d405", CameraState::Reconnecting, Some("unplugged")),
+            ],
+            sets: SetStatus { nominal_hz: 5.0, sent: 7, spread_max_ms: 12.0, ..SetStatus::default() },
+            recording: inner.recording.clone(),
+            shared_memory: SharedMemoryStatus { free_bytes: 1 << 40, slots: 48, reserved_bytes: 1 << 30 },
+            cpu_cores: 0.5,
+        }
+    }
+}
+
+fn stream(id: &str, age: Option<f64>) -> StreamStatus {
+    StreamStatus {
+        id: id.into(),
+        format: "z16".into(),
+        width: 1280,
+        height: 720,
+        nominal_hz: 30.0,
+        rate_hz: 29.97,
+        captured: 12,
+        delivered: 10,
+        dropped: [("no_slot".to_owned(), 2)].into(),
+        last_frame_age_ms: age,
+        latency_p50_ms: 3.0,
+        latency_p99_ms: 4.0,
+        clock: ClockStatus { domain: "device".into(), rate_ppm: -12.5, ..ClockStatus::default() },
+        in_sets: SetAccount { used: 2, decimated: 7, pending: 1, ..SetAccount::default() },
+    }
+}
+
+impl Control for Fake {
+    fn status(&self) -> RigStatus {
+        self.current()
+    }
+
+    fn config_text(&self) -> String {
+        CONFIG.to_owned()
+    }
+
+    fn record_start(&self, request: &RecordRequest) -> Result<RecordingStatus> {
+        let mut inner = self.inner.lock().unwrap();
+        inner.calls += 1;
+        self.called.notify_all();
+        let (delay, panic, fail) = (inner.delay, std::mem::take(&mut inner.panic), inner.fail.take());
+        drop(inner);
+        std::thread::sleep(delay);
+        assert!(!panic, "as told");
+        if let Some((kind, message)) = fail {
+            return Err(Error::new(kind, message));
+        }
+        let mut inner = self.inner.lock().unwrap();
+        if inner.recording.as_ref().is_some_and(|r| r.active) {
+            return Err(Error::new(ErrorKind::InUse, "a recording goes on already"));
+        }
+        let status = RecordingStatus {
+            active: true,
+            scene: request.scene.clone(),
+            dropped: [("backlog_full".to_owned(), 1)].into(),
+            ..RecordingStatus::default()
+        };
+        (inner.request, inner.recording) = (Some(request.clone()), Some(status.clone()));
+        Ok(status)
+    }
+
+    fn record_stop(&self) -> Result<RecordingStatus> {
+        let mut inner = self.inner.lock().unwrap();
+        let running = inner.recording.as_mut().filter(|r| r.active);
+        let recording = running.ok_or_else(|| Error::new(ErrorKind::WrongState, "no recording goes on"))?;
+        (recording.active, recording.error) = (false, Some("1 set was lost".into()));
+        Ok(recording.clone())
+    }
+
+    fn record_note(&self, text: &str) -> Result<()> {
+        let mut inner = self.inner.lock().unwrap();
+        if text.is_empty() {
+            return Err(Error::new(ErrorKind::BadInput, "the note is empty"));
+        }
+        if !inner.recording.as_ref().is_some_and(|r| r.active) {
+            return Err(Error::new(ErrorKind::WrongState, "no recording goes on"));
+        }
+        inner.notes.push(text.to_owned());
+        Ok(())
+    }
+
+    fn request_stop(&self) {
+        self.inner.lock().unwrap().stop = true;
+    }
+}
