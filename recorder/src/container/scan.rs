@@ -382,6 +382,28 @@ mod tests {
     use crate::fs::MemFs;
     use proptest::prelude::*;
 
+    /// The lengths at which name, media type and data meet the end of the record.
+    #[test]
+    fn short_attachments_are_refused() {
+        let fs = MemFs::new();
+        fs.put(Path::new("f"), MAGIC.to_vec());
+        let reader = SegmentReader::open_bare(&fs, Path::new("f")).unwrap();
+        for name in 0u32..6 {
+            let mut body = vec![0; 16];
+            body.extend(name.to_le_bytes());
+            body.extend(vec![b'a'; name as usize]);
+            body.extend([0; 12]);
+            for len in 0..body.len() + 4 {
+                let mut cut = body.clone();
+                cut.resize(len, 0);
+                let e = reader.parse(op::ATTACHMENT, &cut, 8).unwrap_err();
+                assert_eq!(e.kind(), ErrorKind::Corrupt);
+            }
+            body.extend([0; 4]);
+            assert!(reader.parse(op::ATTACHMENT, &body, 8).is_ok());
+        }
+    }
+
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(2000))]
         /// Small numbers make lengths that nearly fit, where a parser goes wrong.
