@@ -1,2 +1,31 @@
-//! The command line of depthrig.
-fn main() {}
+//! The command line of depthrig: one binary that runs the rig, looks at it, and looks after its datasets.
+//!
+//! Exit codes: 0 good, 1 failed, 2 wrong usage or configuration, 3 finished but something was lost.
+#![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
+
+mod bench;
+mod cli;
+mod commands;
+mod context;
+mod demo;
+mod exit;
+mod logging;
+mod out;
+mod picture;
+mod progress;
+mod screen;
+mod signals;
+mod turbo;
+mod view;
+
+use clap::Parser;
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    let cli = cli::Cli::parse(); // ends the process with 2 and a hint when the usage is wrong
+    logging::start(&cli.global, cli.command.runs_for_hours());
+    match commands::run(cli) {
+        Ok(exit) => exit.into(),
+        Err(error) => exit::report(&error).into(),
+    }
+}

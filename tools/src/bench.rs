@@ -1,0 +1,5 @@
+//! Benches of the command line: what a promise about speed is measured with.
+
+pub mod bus;
+pub mod conditions;
+pub mod stats;

@@ -1,0 +1,165 @@
+//! The commands and options, and what `--help` says of them.
+
+use crate::commands::{
+    bench, completions, config, demo, info, man, record, replay, run, status, tap, top, verify,
+};
+use clap::{ArgAction, Parser, Subcommand, ValueEnum};
+use depthrig_bus::RigName;
+use std::path::PathBuf;
+
+/// Captures, stamps, groups, shares, records and replays the cameras of a multi-camera RGB-D mount.
+#[derive(Debug, Parser)]
+#[command(name = "depthrig", version, max_term_width = 100, after_help = EXIT_CODES)]
+pub struct Cli {
+    /// Options of every command.
+    #[command(flatten)]
+    pub global: Global,
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+const EXIT_CODES: &str = "\
+Exit codes:
+  0  good
+  1  failed
+  2  wrong usage or configuration
+  3  finished, but something was lost (the output says what)
+
+Examples:
+  depthrig demo                          see everything once, without a camera
+  depthrig config show > rig.toml        a commented configuration that runs as it is
+  depthrig run rig.toml                  the daemon, in the foreground
+  depthrig top                           watch it from another terminal
+  depthrig record start --scene kitchen  record until `depthrig record stop`";
+
+/// Options of every command.
+#[derive(Debug, Clone, clap::Args)]
+pub struct Global {
+    /// The rig that is meant; without it the only one that is running
+    #[arg(long, global = true, value_name = "NAME", help_heading = "Global options")]
+    pub rig: Option<RigName>,
+    /// Folder of the locks, sockets and names of your rigs [env: DEPTHRIG_RUNTIME_DIR]
+    #[arg(long, global = true, value_name = "DIR", help_heading = "Global options")]
+    pub runtime_dir: Option<PathBuf>,
+    /// Log more (twice: everything)
+    #[arg(short, long, global = true, action = ArgAction::Count, help_heading = "Global options")]
+    pub verbose: u8,
+    /// Log less, and show no progress
+    #[arg(short, long, global = true, action = ArgAction::Count, help_heading = "Global options")]
+    pub quiet: u8,
+    /// Form of the log lines on stderr
+    #[arg(long, global = true, value_enum, default_value = "text", help_heading = "Global options")]
+    pub log_format: LogFormat,
+    /// When to use colour; NO_COLOR is honoured
+    #[arg(
+        long,
+        global = true,
+        value_enum,
+        default_value = "auto",
+        value_name = "WHEN",
+        help_heading = "Global options"
+    )]
+    pub color: ColorChoice,
+}
+
+/// Form of the log lines.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum LogFormat {
+    /// For people.
+    Text,
+    /// One JSON object a line.
+    Json,
+}
+
+/// When to use colour.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum ColorChoice {
+    /// On a terminal.
+    Auto,
+    /// In any case.
+    Always,
+    /// In no case.
+    Never,
+}
+
+/// The commands.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Run the seven-camera mount with synthetic cameras once through: capture, record, verify, replay, report
+    #[command(after_help = demo::EXAMPLES)]
+    Demo(demo::DemoArgs),
+    /// Run the daemon in the foreground; Ctrl-C ends it cleanly, twice ends it at once
+    #[command(after_help = run::EXAMPLES)]
+    Run(run::RunArgs),
+    /// Start, stop and annotate recordings of the running daemon
+    #[command(subcommand, after_help = record::EXAMPLES)]
+    Record(record::RecordCommand),
+    /// Show cameras, rates, losses, clocks, sets, recording and disk of the running daemon
+    #[command(after_help = status::EXAMPLES)]
+    Status(status::StatusArgs),
+    /// Watch the running daemon, refreshed in place; q or Ctrl-C leaves
+    Top(top::TopArgs),
+    /// Publish a dataset on the same channels as if the cameras were there
+    #[command(after_help = replay::EXAMPLES)]
+    Replay(replay::ReplayArgs),
+    /// Say what is in a dataset
+    Info(info::InfoArgs),
+    /// Check that a dataset is whole
+    #[command(after_help = verify::EXAMPLES)]
+    Verify(verify::VerifyArgs),
+    /// Check a rig configuration, or print the commented default
+    #[command(subcommand, after_help = config::EXAMPLES)]
+    Config(config::ConfigCommand),
+    /// Look at one live stream: a line per frame, or pictures
+    #[command(after_help = tap::EXAMPLES)]
+    Tap(tap::TapArgs),
+    /// Measure what depthrig promises about speed
+    #[command(subcommand, after_help = bench::EXAMPLES)]
+    Bench(bench::BenchCommand),
+    /// Print completions for a shell
+    #[command(after_help = completions::EXAMPLES)]
+    Completions(completions::CompletionsArgs),
+    /// Print the manual page, or write one page per command
+    Man(man::ManArgs),
+    /// The subscribing process of `bench bus`
+    #[command(hide = true)]
+    BenchReader(crate::bench::bus::reader::ReaderArgs),
+}
+
+impl Command {
+    /// Whether it runs until somebody ends it, so that its log is what one sees of it.
+    pub const fn runs_for_hours(&self) -> bool {
+        matches!(self, Self::Run(_))
+    }
+}
+
+/// A number of seconds above 0 and below ten years.
+///
+/// # Errors
+/// When `text` is none.
+pub fn positive_seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(s) if s > 0.0 && s < 3.2e8 => Ok(s),
+        _ => Err("write a number of seconds above 0, such as 10 or 0.5".to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_definition_is_sound() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn seconds_are_positive() {
+        assert_eq!(positive_seconds("0.5"), Ok(0.5));
+        for bad in ["0", "-1", "nan", "inf", "1e300", "ten"] {
+            assert!(positive_seconds(bad).is_err(), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,47 @@
+//! One module per command.
+
+pub mod bench;
+pub mod completions;
+pub mod config;
+pub mod demo;
+pub mod info;
+pub mod man;
+pub mod record;
+pub mod replay;
+pub mod run;
+pub mod status;
+pub mod tap;
+pub mod top;
+pub mod verify;
+
+use crate::cli::{Cli, Command};
+use crate::context::Context;
+use crate::exit::Exit;
+use anyhow::Result;
+
+/// Runs the command that was asked for.
+///
+/// # Errors
+/// What kept it from working; [`crate::exit::report`] tells it.
+pub fn run(cli: Cli) -> Result<Exit> {
+    let context = Context { global: cli.global };
+    match cli.command {
+        Command::Demo(args) => demo::run(&args, &context),
+        Command::Run(args) => run::run(&args, &context),
+        Command::Record(command) => record::run(&command, &context),
+        Command::Status(args) => status::run(&args, &context),
+        Command::Top(args) => top::run(&args, &context),
+        Command::Replay(args) => replay::run(&args, &context),
+        Command::Info(args) => info::run(&args),
+        Command::Verify(args) => verify::run(&args, &context),
+        Command::Config(command) => config::run(&command),
+        Command::Tap(args) => tap::run(&args, &context),
+        Command::Bench(command) => bench::run(&command, &context),
+        Command::Completions(args) => completions::run(&args),
+        Command::Man(args) => man::run(&args),
+        Command::BenchReader(args) => {
+            crate::bench::bus::reader::run(&args, &context.runtime()?)?;
+            Ok(Exit::Good)
+        }
+    }
+}

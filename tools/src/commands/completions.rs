@@ -1,0 +1,29 @@
+//! `depthrig completions`: completions for a shell.
+
+use crate::cli::Cli;
+use crate::exit::Exit;
+use anyhow::Result;
+use clap::CommandFactory;
+use clap_complete::Shell;
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+Examples:
+  depthrig completions bash > ~/.local/share/bash-completion/completions/depthrig
+  depthrig completions zsh > ~/.zfunc/_depthrig
+  depthrig completions fish > ~/.config/fish/completions/depthrig.fish";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct CompletionsArgs {
+    /// The shell
+    shell: Shell,
+}
+
+/// Prints them.
+pub fn run(args: &CompletionsArgs) -> Result<Exit> {
+    let mut script = Vec::new();
+    clap_complete::generate(args.shell, &mut Cli::command(), "depthrig", &mut script);
+    std::io::Write::write_all(&mut std::io::stdout().lock(), &script)?;
+    Ok(Exit::Good)
+}

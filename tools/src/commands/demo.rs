@@ -1,0 +1,191 @@
+//! `depthrig demo`: the whole way of a frame once, with synthetic cameras.
+
+use crate::commands::run::{self, Started};
+use crate::context::{Context, private_folder};
+use crate::demo::live::{Seen, Watcher};
+use crate::demo::report::DemoReport;
+use crate::demo::{replayed, sheet};
+use crate::exit::Exit;
+use crate::out;
+use crate::progress::Progress;
+use crate::signals::Stop;
+use anyhow::{Context as _, Result, anyhow, bail};
+use core::sync::atomic::{AtomicBool, Ordering};
+use core::time::Duration;
+use depthrig_bus::{Bus, HostTime, Name, RuntimeDir, StreamId, UtcPair};
+use depthrig_daemon::config::{BackendConfig, RigConfig};
+use depthrig_daemon::control::RecordRequest;
+use depthrig_daemon::rig::{Rig, RigSummary};
+use depthrig_daemon::status::RigStatus;
+use depthrig_recorder::{Dataset, VerifyOptions, verify};
+use std::path::{Path, PathBuf};
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+It needs no camera and no daemon, and leaves a running one alone.
+
+Examples:
+  depthrig demo
+  depthrig demo --seconds 60 --out /data/demo
+  depthrig demo --json | jq .replay";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct DemoArgs {
+    /// How long to record
+    #[arg(long, value_name = "N", default_value = "10", value_parser = crate::cli::positive_seconds)]
+    seconds: f64,
+    /// A new folder for the dataset, the pictures and the report [default: demo-data/DATE_TIME]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Print everything as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Name of the dataset's folder in the demo's folder.
+const DATASET: &str = "dataset";
+
+/// Runs the demo.
+pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
+    let stop = Stop::on_signals()?;
+    let folder = args.out.clone().unwrap_or_else(default_folder);
+    if folder.join(DATASET).exists() {
+        bail!("{}: there is a dataset already; name another folder with --out", folder.display());
+    }
+    std::fs::create_dir_all(&folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
+    let config = configuration()?;
+    let private = private_folder()?;
+    let runtime = RuntimeDir::at(private.path())?;
+    let name = config.rig.clone();
+    let quiet = context.global.quiet > 0;
+
+    let Started { rig, start_s } = run::start(config, runtime.clone(), false, None, quiet)?;
+    let recorded = record(rig, &runtime, &folder, args, &stop, quiet)?;
+    let mut progress = Progress::new(quiet);
+    progress.set("verifying", 0, 1);
+    let dataset = folder.join(DATASET);
+    let verified = verify(&dataset, &VerifyOptions { decode: true, max_spread_ns: None })?;
+    progress.set("replaying", 0, 1);
+    let replay = replayed::run(&dataset, &runtime, &name, &recorded.seen.checksums)?;
+    progress.clear();
+
+    let contact_sheet = folder.join("contact-sheet.png");
+    let cameras = recorded.live.cameras.iter().filter_map(|c| recorded.seen.pictures.get(&c.name));
+    sheet::contact_sheet(cameras.map(|(color, depth)| (color.as_ref(), depth.as_ref())))
+        .save(&contact_sheet)
+        .with_context(|| format!("{}: cannot be written", contact_sheet.display()))?;
+    let report = DemoReport {
+        start_s,
+        stop_s: recorded.stop_s,
+        live: recorded.live,
+        depth: recorded.seen.depth,
+        units_mm: recorded.seen.units_mm,
+        sets_seen: recorded.seen.sets,
+        frames_unread: recorded.seen.unread,
+        summary: recorded.summary,
+        verify: verified,
+        replay,
+        segments: Dataset::open(&dataset)?.segments().to_vec(),
+        dataset,
+        contact_sheet,
+    };
+    let saved = folder.join("report.json");
+    std::fs::write(&saved, serde_json::to_string_pretty(&report)?)
+        .with_context(|| format!("{}: cannot be written", saved.display()))?;
+    if args.json {
+        out::json(&report)?;
+    } else {
+        out::line(report.text())?;
+    }
+    Ok(report.exit())
+}
+
+/// The default rig, with the true depth as streams of their own that are not recorded.
+fn configuration() -> Result<RigConfig> {
+    let mut config =
+        RigConfig::parse(RigConfig::default_text(), None).map_err(depthrig_daemon::Error::from)?;
+    for camera in &mut config.cameras {
+        if let BackendConfig::Synthetic(settings) = &mut camera.backend {
+            settings.truth = true;
+            camera.record = Some(vec![Name::new("color")?, Name::new("depth")?]);
+        }
+    }
+    Ok(config)
+}
+
+struct Recorded {
+    stop_s: f64,
+    live: RigStatus,
+    seen: Seen,
+    summary: RigSummary,
+}
+
+/// Records for the time asked for with a subscriber beside it, and ends the rig.
+fn record(
+    rig: Rig,
+    runtime: &RuntimeDir,
+    folder: &Path,
+    args: &DemoArgs,
+    stop: &Stop,
+    quiet: bool,
+) -> Result<Recorded> {
+    let control = rig.control();
+    let status = control.status();
+    let rig_name = Name::new(status.rig.as_str())?;
+    let streams: Vec<StreamId> =
+        status.cameras.iter().flat_map(|c| &c.streams).map(|s| s.id.parse()).collect::<Result<_, _>>()?;
+    let bus = Bus::open(runtime, &rig_name)?;
+    let ended = AtomicBool::new(false);
+    let (live, seen) = std::thread::scope(|scope| -> Result<(RigStatus, Seen)> {
+        let watcher = Watcher::new(&bus, &streams)?;
+        let ended = &ended;
+        let watching = scope.spawn(move || watcher.run(|| ended.load(Ordering::Relaxed)));
+        let recording = || -> Result<RigStatus> {
+            let request = RecordRequest {
+                directory: Some(folder.to_owned()),
+                name: Some(DATASET.into()),
+                scene: "synthetic table".into(),
+                ..RecordRequest::default()
+            };
+            control.record_start(&request)?;
+            show_recording(args.seconds, stop, quiet);
+            let live = control.status();
+            control.record_stop()?;
+            Ok(live)
+        };
+        let live = recording();
+        ended.store(true, Ordering::Relaxed);
+        let seen = watching.join().map_err(|_| anyhow!("the subscriber of the demo panicked"))?;
+        Ok((live?, seen?))
+    })?;
+    if stop.is_asked() {
+        rig.stop();
+        bail!("interrupted; what was recorded until then is in {}", folder.join(DATASET).display());
+    }
+    let began = HostTime::now();
+    let summary = rig.stop();
+    Ok(Recorded { stop_s: began.elapsed().as_secs_f64(), live, seen, summary })
+}
+
+fn show_recording(seconds: f64, stop: &Stop, quiet: bool) {
+    let mut progress = Progress::new(quiet);
+    let began = HostTime::now();
+    let tenths = (seconds * 10.0).ceil() as u64;
+    loop {
+        let done = began.elapsed().as_secs_f64();
+        progress.set("recording", ((done * 10.0) as u64).min(tenths), tenths);
+        let left = seconds - done;
+        if left <= 0.0 || stop.wait(Duration::from_secs_f64(left.min(0.1))) {
+            return;
+        }
+    }
+}
+
+/// `demo-data/20261121_101500`, in UTC.
+fn default_folder() -> PathBuf {
+    let stamp = crate::commands::info::utc(UtcPair::sample().utc_ns);
+    let digits: String = stamp.chars().filter(char::is_ascii_digit).collect();
+    let (date, time) = digits.split_at(8);
+    Path::new("demo-data").join(format!("{date}_{time}"))
+}

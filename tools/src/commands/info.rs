@@ -1,0 +1,123 @@
+//! `depthrig info`: what is in a dataset.
+
+use crate::exit::Exit;
+use crate::out;
+use anyhow::Result;
+use depthrig_recorder::{Dataset, DatasetInfo};
+use std::path::PathBuf;
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct InfoArgs {
+    /// The dataset's folder
+    dataset: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Prints it. Exit code 3 when the dataset says itself that something is missing.
+pub fn run(args: &InfoArgs) -> Result<Exit> {
+    let info = Dataset::open(&args.dataset)?.info()?;
+    if args.json {
+        out::json(&info)?;
+    } else {
+        out::line(text(&info))?;
+    }
+    let lost = !info.problems.is_empty() || !info.unfinished.is_empty();
+    Ok(if lost { Exit::Lost } else { Exit::Good })
+}
+
+/// The dataset for people.
+pub fn text(info: &DatasetInfo) -> String {
+    let ms = |ns: i64| ns as f64 / 1e6;
+    let or_none = |text: &str| if text.is_empty() { "-".to_owned() } else { text.to_owned() };
+    let mut lines = vec![
+        format!("dataset   {} ({})", info.name, info.path.display()),
+        format!(
+            "rig       {}, scene {}, operator {}",
+            info.rig,
+            or_none(&info.scene),
+            or_none(&info.operator)
+        ),
+        format!("started   {}", utc(info.started_utc_ns)),
+        format!(
+            "holds     {} sets ({} incomplete) over {}, {} in {} segments",
+            info.sets,
+            info.incomplete_sets,
+            out::seconds(info.duration_ns as f64 / 1e9),
+            out::bytes(info.bytes),
+            info.segments
+        ),
+        format!(
+            "spread    p50 {:.1} ms, p95 {:.1} ms, max {:.1} ms",
+            ms(info.spread.p50_ns),
+            ms(info.spread.p95_ns),
+            ms(info.spread.max_ns)
+        ),
+        String::new(),
+        out::table(
+            &[
+                "stream",
+                "model",
+                "picture",
+                "format",
+                "stored as",
+                "frames",
+                "missing",
+                "Hz",
+                "unit mm",
+                "size",
+                "of raw",
+            ],
+            5,
+            info.streams.iter().map(|s| {
+                let share = 100.0 * s.bytes as f64 / (s.raw_bytes.max(1) as f64);
+                vec![
+                    s.stream.clone(),
+                    s.model.clone(),
+                    format!("{}x{}", s.width, s.height),
+                    s.format.to_owned(),
+                    s.codec.to_owned(),
+                    s.frames.to_string(),
+                    s.missing.to_string(),
+                    format!("{:.2}", s.rate_hz),
+                    if s.depth_unit_m > 0.0 { format!("{}", s.depth_unit_m * 1e3) } else { "-".to_owned() },
+                    out::bytes(s.bytes),
+                    format!("{share:.0} %"),
+                ]
+            }),
+        ),
+    ];
+    lines.extend(info.unfinished.iter().map(|file| format!("unfinished: {file}")));
+    lines.extend(info.problems.iter().map(|problem| format!("problem: {problem}")));
+    lines.join("\n")
+}
+
+/// `2026-08-21 14:05:09 UTC` from nanoseconds since 1970, by the civil calendar (H. Hinnant, "chrono-compatible
+/// low-level date algorithms", `civil_from_days`).
+pub fn utc(ns: i64) -> String {
+    let seconds = ns.div_euclid(1_000_000_000);
+    let (days, rest) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
+    let z = days + 719_468;
+    let (era, doe) = (z.div_euclid(146_097), z.rem_euclid(146_097));
+    let yoe = (doe - doe / 1460 + doe / 36_524 - doe / 146_096) / 365;
+    let doy = doe - (365 * yoe + yoe / 4 - yoe / 100);
+    let mp = (5 * doy + 2) / 153;
+    let (day, month) = (doy - (153 * mp + 2) / 5 + 1, if mp < 10 { mp + 3 } else { mp - 9 });
+    let year = yoe + era * 400 + i64::from(month <= 2);
+    format!("{year:04}-{month:02}-{day:02} {:02}:{:02}:{:02} UTC", rest / 3600, rest / 60 % 60, rest % 60)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn dates() {
+        assert_eq!(utc(0), "1970-01-01 00:00:00 UTC");
+        assert_eq!(utc(1_709_210_096_789_000_000), "2024-02-29 12:34:56 UTC");
+        assert_eq!(utc(-1), "1969-12-31 23:59:59 UTC");
+        assert_eq!(utc(4_102_444_800_000_000_000), "2100-01-01 00:00:00 UTC");
+    }
+}

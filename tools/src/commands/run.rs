@@ -1,0 +1,159 @@
+//! `depthrig run`: the daemon in the foreground.
+
+use crate::context::Context;
+use crate::exit::Exit;
+use crate::out;
+use crate::progress::Progress;
+use crate::signals::Stop;
+use anyhow::Result;
+use core::sync::atomic::{AtomicBool, Ordering};
+use core::time::Duration;
+use depthrig_bus::{HostTime, RuntimeDir};
+use depthrig_daemon::config::RigConfig;
+use depthrig_daemon::control::{Control, RecordRequest};
+use depthrig_daemon::rig::{Rig, RigOptions, RigSummary};
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+The first Ctrl-C or SIGTERM closes a recording and ends cleanly, a second one ends at once.
+
+Examples:
+  depthrig run rig.toml
+  depthrig run rig.toml --record data --seconds 60 --scene kitchen
+  depthrig run rig.toml --log-format json 2>> depthrig.log";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct RunArgs {
+    /// The rig's configuration (`depthrig config show` prints one to begin with)
+    config: PathBuf,
+    /// Record from the start, into a new folder below this one
+    #[arg(long, value_name = "DIR")]
+    record: Option<PathBuf>,
+    /// What is in front of the cameras, for the recording
+    #[arg(long, value_name = "LABEL", requires = "record", default_value = "")]
+    scene: String,
+    /// Who records
+    #[arg(long, value_name = "NAME", requires = "record", default_value = "")]
+    operator: String,
+    /// End after so many seconds
+    #[arg(long, value_name = "N", value_parser = crate::cli::positive_seconds)]
+    seconds: Option<f64>,
+    /// At the end, print what happened as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the rig until it is told to end.
+pub fn run(args: &RunArgs, context: &Context) -> Result<Exit> {
+    let mut config = RigConfig::load(&args.config).map_err(depthrig_daemon::Error::from)?;
+    if let Some(rig) = &context.global.rig {
+        config.rig = rig.clone();
+    }
+    let stop = Stop::on_signals()?;
+    let Started { rig, .. } = start(config, context.runtime()?, true, None, context.global.quiet > 0)?;
+    let control = rig.control();
+    if let Some(directory) = &args.record {
+        let request = RecordRequest {
+            directory: Some(directory.clone()),
+            scene: args.scene.clone(),
+            operator: args.operator.clone(),
+            ..RecordRequest::default()
+        };
+        if let Err(e) = control.record_start(&request) {
+            rig.stop();
+            return Err(e.into());
+        }
+    }
+    wait(&rig, &stop, args.seconds);
+    let summary = rig.stop();
+    if args.json {
+        out::json(&summary)?;
+    } else {
+        tell(&summary)?;
+    }
+    Ok(if summary.lost.is_empty() { Exit::Good } else { Exit::Lost })
+}
+
+/// A rig whose cameras stream.
+pub struct Started {
+    /// The rig.
+    pub rig: Rig,
+    /// How long its start took, without the rendering of pictures.
+    pub start_s: f64,
+}
+
+/// Starts a rig, showing how far its pictures are rendered.
+pub fn start(
+    config: RigConfig,
+    runtime: RuntimeDir,
+    serve_api: bool,
+    cache_dir: Option<PathBuf>,
+    quiet: bool,
+) -> Result<Started> {
+    let shared = Arc::new(Mutex::new((Progress::new(quiet), HostTime::now())));
+    let lock = |shared: &Mutex<(Progress, HostTime)>, f: &dyn Fn(&mut (Progress, HostTime))| {
+        f(&mut shared.lock().unwrap_or_else(PoisonError::into_inner));
+    };
+    let shown = shared.clone();
+    let progress = move |camera: &str, done: usize, total: usize| {
+        let what = format!("rendering {camera} (kept for next time)");
+        lock(&shown, &|(bar, rendered)| {
+            bar.set(&what, done as u64, total as u64);
+            *rendered = HostTime::now();
+        });
+    };
+    let options = RigOptions { runtime, serve_api, cache_dir, progress: Some(Box::new(progress)) };
+    let rig = Rig::start(config, &options);
+    let mut shared = shared.lock().unwrap_or_else(PoisonError::into_inner);
+    shared.0.clear();
+    Ok(Started { rig: rig?, start_s: shared.1.elapsed().as_secs_f64() })
+}
+
+/// Waits for a signal, the time limit, or the rig's own end (asked for over its API, or every camera is done).
+pub fn wait(rig: &Rig, stop: &Stop, seconds: Option<f64>) {
+    let deadline = seconds.map(|s| HostTime::now().plus(Duration::from_secs_f64(s)));
+    let control: Arc<dyn Control> = rig.control();
+    let ended = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let ended = &ended;
+        scope.spawn(move || {
+            while !ended.load(Ordering::Relaxed) {
+                if stop.wait(Duration::from_millis(50)) {
+                    control.request_stop();
+                    return;
+                }
+            }
+        });
+        rig.wait(deadline);
+        ended.store(true, Ordering::Relaxed);
+    });
+}
+
+fn tell(summary: &RigSummary) -> Result<()> {
+    let status = &summary.status;
+    let delivered: u64 = status.cameras.iter().flat_map(|c| &c.streams).map(|s| s.delivered).sum();
+    out::line(format_args!(
+        "rig {} ran {}: {delivered} frames of {} cameras, {} sets",
+        status.rig,
+        out::seconds(status.uptime_s),
+        status.cameras.len(),
+        status.sets.sent
+    ))?;
+    if let Some(recording) = &summary.recording {
+        out::line(format_args!(
+            "recorded {}: {} sets, {} frames, {} over {}",
+            recording.path.display(),
+            recording.sets.recorded,
+            recording.frames,
+            out::bytes(recording.bytes),
+            out::seconds(recording.duration_ns as f64 / 1e9)
+        ))?;
+    }
+    for lost in &summary.lost {
+        out::line(format_args!("lost: {lost}"))?;
+    }
+    Ok(())
+}

@@ -1,0 +1,57 @@
+//! `depthrig status`: how the running rig does.
+
+use crate::context::Context;
+use crate::exit::Exit;
+use crate::signals::Stop;
+use crate::view::{self, Style};
+use crate::{out, screen};
+use anyhow::Result;
+use core::time::Duration;
+use depthrig_daemon::status::{CameraState, RigStatus};
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+Exit code 3 when a camera is not streaming or the recording has lost anything.
+
+Examples:
+  depthrig status
+  depthrig status --json | jq '.cameras[].streams[] | {id, rate_hz, dropped}'
+  depthrig status --watch --json >> rig.jsonl";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct StatusArgs {
+    /// Print again every second until Ctrl-C
+    #[arg(long)]
+    watch: bool,
+    /// Print JSON; with --watch one object a line
+    #[arg(long)]
+    json: bool,
+}
+
+/// Prints the status once or again and again.
+pub fn run(args: &StatusArgs, context: &Context) -> Result<Exit> {
+    let client = super::record::connect(context)?;
+    let style = Style { width: screen::size().map_or(120, |(width, _)| width), color: context.color() };
+    let print = |rig: &RigStatus| match (args.json, args.watch) {
+        (true, false) => out::json(rig),
+        (true, true) => out::json_line(rig),
+        (false, false) => out::line(view::status(rig, style)),
+        (false, true) => out::line(format_args!("{}\n", view::status(rig, style))),
+    };
+    let stop = args.watch.then(Stop::on_signals).transpose()?;
+    loop {
+        let rig = client.status()?;
+        print(&rig)?;
+        if stop.as_ref().is_none_or(|stop| stop.wait(Duration::from_secs(1))) {
+            return Ok(exit(&rig));
+        }
+    }
+}
+
+fn exit(rig: &RigStatus) -> Exit {
+    let fine = |state| matches!(state, CameraState::Streaming | CameraState::Finished | CameraState::Opening);
+    let lost =
+        rig.recording.as_ref().is_some_and(|r| r.error.is_some() || r.dropped.values().any(|n| *n > 0));
+    if lost || !rig.cameras.iter().all(|c| fine(c.state)) { Exit::Lost } else { Exit::Good }
+}

@@ -1,0 +1,130 @@
+//! `depthrig tap`: looks at one live stream from a terminal.
+
+use crate::context::Context;
+use crate::exit::Exit;
+use crate::signals::Stop;
+use crate::{out, picture};
+use anyhow::{Context as _, Result};
+use core::time::Duration;
+use depthrig_bus::{Bus, Frame, FrameFlags, FrameHeader, HostTime, PixelFormat, StreamId, Subscriber};
+use std::path::PathBuf;
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+Examples:
+  depthrig tap d435/depth                          a line per frame until Ctrl-C
+  depthrig tap d435/depth --count 1                the next frame
+  depthrig tap d435/depth --png pictures --count 5 16-bit PNGs, and previews in colours";
+
+/// How long a stream may be silent before that is worth a line.
+const SILENCE: Duration = Duration::from_secs(2);
+const POLL: Duration = Duration::from_millis(200);
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct TapArgs {
+    /// The stream, such as d435/depth
+    stream: StreamId,
+    /// Write each frame into this folder as PNG; depth as 16 bits with a preview in colours beside it
+    #[arg(long, value_name = "DIR")]
+    png: Option<PathBuf>,
+    /// End after so many frames
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    count: Option<u64>,
+}
+
+/// Taps until it is enough, the stream ends or a signal comes.
+pub fn run(args: &TapArgs, context: &Context) -> Result<Exit> {
+    let runtime = context.runtime()?;
+    let bus = Bus::open(&runtime, &context.running_rig(&runtime)?)?;
+    let mut subscriber = bus.subscriber(&args.stream)?;
+    if let Some(folder) = &args.png {
+        std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
+    }
+    let stop = Stop::on_signals()?;
+    let mut seen = 0;
+    while args.count.is_none_or(|count| seen < count) {
+        let Some(frame) = next(&mut subscriber, &stop, args)? else { break };
+        seen += 1;
+        out::line(describe(frame.header()))?;
+        if let Some(folder) = &args.png {
+            let header = frame.header();
+            let stem = format!("{}_{}_{:08}", header.camera(), header.stream(), header.sequence);
+            for path in picture::write_png(header, frame.pixels(), folder, &stem)? {
+                out::line(format_args!("  {}", path.display()))?;
+            }
+        }
+    }
+    let short = args.count.is_some_and(|count| seen < count) && !stop.is_asked();
+    if short {
+        anyhow::bail!("{}: the stream ended after {seen} of {} frames", args.stream, args.count.unwrap_or(0));
+    }
+    if args.png.is_some() && subscriber.missed() > 0 {
+        tracing::warn!(frames = subscriber.missed(), "pictures were written slower than frames came");
+    }
+    Ok(Exit::Good)
+}
+
+/// The next frame; `None` at a signal or when nobody publishes any more.
+fn next(subscriber: &mut Subscriber, stop: &Stop, args: &TapArgs) -> Result<Option<Frame>> {
+    let began = HostTime::now();
+    let mut told = false;
+    while !stop.is_asked() {
+        if let Some(frame) = subscriber.next_timeout(POLL)? {
+            return Ok(Some(frame));
+        }
+        if !subscriber.is_live() {
+            return Ok(None);
+        }
+        if began.elapsed() > SILENCE && !told {
+            tracing::warn!(stream = %args.stream, "no frame for {} s; the camera may be lost", SILENCE.as_secs());
+            told = true;
+        }
+    }
+    Ok(None)
+}
+
+/// One line: what a person at a camera wants to know of a frame.
+fn describe(h: &FrameHeader) -> String {
+    let ms = |ns: i64| ns as f64 / 1e6;
+    let flags: Vec<_> = FrameFlags::ALL.iter().filter(|(_, f)| h.has(*f)).map(|(name, _)| *name).collect();
+    let drops: Vec<_> = h.drops().nonzero().map(|(why, n)| format!("{} {n}", why.name())).collect();
+    let unit =
+        if h.depth_unit_m > 0.0 { format!(" unit {} mm", h.depth_unit_m * 1e3) } else { String::new() };
+    format!(
+        "{}/{} #{} {}x{} {}{unit} capture {:.3} ms ±{:.3} latency {:.2} ms epoch {} dropped {} flags {}",
+        h.camera(),
+        h.stream(),
+        h.sequence,
+        h.width,
+        h.height,
+        h.pixel_format().map_or("unknown", PixelFormat::name),
+        ms(h.capture_time_ns),
+        h.capture_uncertainty_ns as f64 / 1e6,
+        ms(h.publish_time_ns - h.capture_time_ns),
+        h.clock_epoch,
+        if drops.is_empty() { "0".to_owned() } else { drops.join(",") },
+        if flags.is_empty() { "-".to_owned() } else { flags.join(",") },
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_says_what_matters() {
+        let mut h = FrameHeader::default();
+        h.set_picture(PixelFormat::Z16, 640, 480);
+        h.set_names("mount", &StreamId::new("d405", "depth").unwrap());
+        (h.sequence, h.capture_time_ns, h.publish_time_ns) = (7, 1_000_000_000, 1_012_500_000);
+        (h.capture_uncertainty_ns, h.depth_unit_m) = (250_000, 0.0001);
+        h.dropped[0] = 2;
+        h.flags = FrameFlags::SYNTHETIC.with(FrameFlags::REPLAYED).0;
+        assert_eq!(
+            describe(&h),
+            "d405/depth #7 640x480 z16 unit 0.1 mm capture 1000.000 ms ±0.250 latency 12.50 ms epoch 0 \
+             dropped device_gap 2 flags replayed,synthetic"
+        );
+    }
+}

@@ -1,0 +1,93 @@
+//! `depthrig verify`: checks that a dataset is whole.
+
+use crate::context::Context;
+use crate::exit::Exit;
+use crate::out;
+use anyhow::Result;
+use depthrig_recorder::{Severity, VerifyOptions, VerifyReport, verify};
+use std::path::PathBuf;
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+Exit codes: 0 it is whole, 1 it is broken or no dataset, 3 it says itself that something was not recorded.
+
+Examples:
+  depthrig verify data/20261121_1015_kitchen
+  depthrig verify data/20261121_1015_kitchen --decode --max-spread-ms 20";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct VerifyArgs {
+    /// The dataset's folder
+    dataset: PathBuf,
+    /// Decode every picture as well
+    #[arg(long)]
+    decode: bool,
+    /// Report sets whose frames were captured further apart than this
+    #[arg(long, value_name = "MS")]
+    max_spread_ms: Option<f64>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Verifies and reports.
+pub fn run(args: &VerifyArgs, context: &Context) -> Result<Exit> {
+    let max_spread_ns = args.max_spread_ms.map(|ms| (ms * 1e6) as i64);
+    let report = verify(&args.dataset, &VerifyOptions { decode: args.decode, max_spread_ns })?;
+    if args.json {
+        out::json(&report)?;
+    } else {
+        if context.global.quiet == 0 {
+            for finding in &report.findings {
+                let at = finding.offset.map_or_else(String::new, |offset| format!(":{offset}"));
+                out::line(format_args!(
+                    "{}: {}{at}: {}",
+                    word(finding.severity),
+                    finding.file,
+                    finding.message
+                ))?;
+            }
+        }
+        out::line(summary(&report))?;
+    }
+    Ok(exit(&report))
+}
+
+/// One line: how much was looked at, and what came of it.
+pub fn summary(report: &VerifyReport) -> String {
+    let count = |severity| report.findings.iter().filter(|f| f.severity == severity).count();
+    let verdict = match report.worst() {
+        Some(Severity::Broken) => format!("BROKEN ({} findings)", count(Severity::Broken)),
+        Some(Severity::Lost) => {
+            format!("intact, but not everything was recorded ({} findings)", count(Severity::Lost))
+        }
+        _ => "whole".to_owned(),
+    };
+    format!(
+        "{}: {verdict}; {} sets, {} frames{}, {} in {} segments",
+        report.path.display(),
+        report.sets,
+        report.frames,
+        if report.decoded { " (every picture decoded)" } else { "" },
+        out::bytes(report.bytes),
+        report.segments
+    )
+}
+
+/// The exit code that the worst finding asks for.
+pub fn exit(report: &VerifyReport) -> Exit {
+    match report.worst() {
+        Some(Severity::Broken) => Exit::Failed,
+        Some(Severity::Lost) => Exit::Lost,
+        _ => Exit::Good,
+    }
+}
+
+const fn word(severity: Severity) -> &'static str {
+    match severity {
+        Severity::Note => "note",
+        Severity::Lost => "lost",
+        Severity::Broken => "broken",
+    }
+}

@@ -1,0 +1,142 @@
+//! The report of the demo: one table and a few lines, and everything as JSON.
+
+use super::live::DepthSeen;
+use super::replayed::Replayed;
+use crate::commands::verify;
+use crate::exit::Exit;
+use crate::out;
+use depthrig_daemon::rig::RigSummary;
+use depthrig_daemon::status::{CameraStatus, RigStatus, StreamStatus};
+use depthrig_recorder::VerifyReport;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+/// Everything that the demo found out.
+#[derive(Debug, Serialize)]
+pub struct DemoReport {
+    /// From the start of the rig to the first frame of every camera, seconds; rendering not counted.
+    pub start_s: f64,
+    /// From the request to stop to the end of the last thread, with the recording already closed, seconds.
+    pub stop_s: f64,
+    /// The rig while it was recording.
+    pub live: RigStatus,
+    /// Depth as a subscriber saw it, by camera.
+    pub depth: BTreeMap<String, DepthSeen>,
+    /// Millimetres per unit of depth, by camera.
+    pub units_mm: BTreeMap<String, f64>,
+    /// Sets that the subscriber got.
+    pub sets_seen: u64,
+    /// Frames of those sets that were gone before the subscriber read them.
+    pub frames_unread: u64,
+    /// The rig's last words.
+    pub summary: RigSummary,
+    /// What `depthrig verify --decode` says of the dataset.
+    pub verify: VerifyReport,
+    /// What came out of the replay.
+    pub replay: Replayed,
+    /// The dataset.
+    pub dataset: PathBuf,
+    /// Its segments.
+    pub segments: Vec<PathBuf>,
+    /// The picture of what the cameras saw.
+    pub contact_sheet: PathBuf,
+}
+
+impl DemoReport {
+    /// 1 when something is wrong, 3 when something was lost.
+    pub fn exit(&self) -> Exit {
+        if verify::exit(&self.verify) == Exit::Failed || !self.replay.is_right() {
+            return Exit::Failed;
+        }
+        let whole = self.summary.lost.is_empty()
+            && verify::exit(&self.verify) == Exit::Good
+            && self.replay.is_complete()
+            && self.frames_unread == 0;
+        if whole { Exit::Good } else { Exit::Lost }
+    }
+
+    /// The report for people.
+    pub fn text(&self) -> String {
+        let ok = |good: bool| if good { "ok  " } else { "LOOK" };
+        let sets = &self.live.sets;
+        let recording = self.summary.recording.as_ref();
+        let mut lines = vec![
+            out::table(
+                &["camera", "model", "colour", "depth", "unit mm", "Hz", "frames", "lost", "p99 ms", "ppm", "±us", "fill", "error"],
+                4,
+                self.live.cameras.iter().map(|camera| self.row(camera)),
+            ),
+            "Hz, p99 (capture to published), ppm and ± (device clock against host) are of depth; error is the mean \
+             distance from the true depth"
+                .to_owned(),
+            String::new(),
+            format!("{} start    every camera streaming after {:.2} s, stopped in {:.2} s", ok(true), self.start_s, self.stop_s),
+            format!(
+                "{} sets     {} seen, {} incomplete; frames of a set lie {:.1} ms apart (p50), {:.1} ms (p95)",
+                ok(self.frames_unread == 0),
+                self.sets_seen,
+                sets.incomplete,
+                sets.spread_p50_ms,
+                sets.spread_p95_ms
+            ),
+            format!(
+                "{} record   {} sets, {} frames, {}",
+                ok(recording.is_some_and(|r| r.complete)),
+                recording.map_or(0, |r| r.sets.recorded),
+                recording.map_or(0, |r| r.frames),
+                out::bytes(recording.map_or(0, |r| r.bytes))
+            ),
+            format!("{} verify   {}", ok(self.verify.is_whole()), verify::summary(&self.verify)),
+            format!(
+                "{} replay   {} of {} frames received; {} depth pictures equal the live ones bit by bit, {} differ",
+                ok(self.replay.is_right() && self.replay.is_complete()),
+                self.replay.received,
+                self.replay.published,
+                self.replay.depth_equal,
+                self.replay.depth_different
+            ),
+        ];
+        let lost = self.summary.lost.iter().chain(&self.replay.lost);
+        lines.extend(lost.map(|lost| format!("lost      {lost}")));
+        lines.push(String::new());
+        lines.push(format!("pictures  {}", self.contact_sheet.display()));
+        if let Some(segment) = self.segments.first() {
+            lines.push(format!(
+                "open it   rerun {0}     (or open that file in Foxglove or Lichtblick)",
+                segment.display()
+            ));
+        }
+        lines.join("\n")
+    }
+
+    fn row(&self, camera: &CameraStatus) -> Vec<String> {
+        let stream = |name: &str| camera.streams.iter().find(|s| s.id.ends_with(&format!("/{name}")));
+        let size =
+            |s: Option<&StreamStatus>| s.map_or_else(|| "-".into(), |s| format!("{}x{}", s.width, s.height));
+        let (color, depth) = (stream("color"), stream("depth"));
+        let of_depth = |tell: &dyn Fn(&StreamStatus) -> String| depth.map_or_else(|| "-".into(), tell);
+        let sum = |count: fn(&StreamStatus) -> u64| camera.streams.iter().map(count).sum::<u64>().to_string();
+        let seen = self.depth.get(&camera.name);
+        vec![
+            camera.name.clone(),
+            camera.model.clone(),
+            size(color),
+            size(depth),
+            self.units(camera),
+            of_depth(&|s| format!("{:.1}", s.rate_hz)),
+            sum(|s| s.delivered),
+            sum(|s| s.dropped.values().sum()),
+            of_depth(&|s| format!("{:.1}", s.latency_p99_ms)),
+            of_depth(&|s| format!("{:+.1}", s.clock.rate_ppm)),
+            of_depth(&|s| format!("{:.0}", s.clock.uncertainty_us)),
+            seen.map_or_else(|| "-".into(), |d| format!("{:.0} %", d.fill_percent)),
+            seen.and_then(|d| d.l1_mm).map_or_else(|| "-".into(), |mm| format!("{mm:.1} mm")),
+        ]
+    }
+
+    fn units(&self, camera: &CameraStatus) -> String {
+        let unit = self.units_mm.get(&camera.name).copied();
+        unit.map_or_else(|| "-".into(), |mm| format!("{}", (mm * 1e6).round() / 1e6))
+    }
+}

@@ -1,0 +1,116 @@
+//! Exit codes, and how an error is told.
+
+use core::fmt;
+use std::process::ExitCode;
+
+/// How a command ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Exit {
+    /// Everything as asked: 0.
+    Good,
+    /// It did not work: 1.
+    Failed,
+    /// Wrong usage or configuration: 2.
+    Usage,
+    /// It worked, but something was lost on the way: 3.
+    Lost,
+}
+
+impl Exit {
+    /// The number that the shell sees.
+    pub const fn code(self) -> u8 {
+        match self {
+            Self::Good => 0,
+            Self::Failed => 1,
+            Self::Usage => 2,
+            Self::Lost => 3,
+        }
+    }
+}
+
+impl From<Exit> for ExitCode {
+    fn from(exit: Exit) -> Self {
+        Self::from(exit.code())
+    }
+}
+
+/// An error of the person at the keyboard: exit code 2.
+#[derive(Debug)]
+pub struct UsageError(pub String);
+
+impl fmt::Display for UsageError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for UsageError {}
+
+/// Tells `error` on the standard error output, and says which code it is.
+pub fn report(error: &anyhow::Error) -> Exit {
+    if is_broken_pipe(error) {
+        return Exit::Good; // `depthrig tap … | head` has seen enough
+    }
+    let mut out = std::io::stderr().lock();
+    // When even the standard error output is gone, the exit code has to do.
+    let _ = std::io::Write::write_all(&mut out, text(error).as_bytes());
+    of(error)
+}
+
+/// The code of `error`: 2 when the person has to change the command or a file, else 1.
+fn of(error: &anyhow::Error) -> Exit {
+    let usage = error.chain().any(|cause| {
+        cause.is::<UsageError>()
+            || cause
+                .downcast_ref::<depthrig_daemon::Error>()
+                .is_some_and(|e| e.kind() == depthrig_daemon::ErrorKind::BadInput)
+            || cause
+                .downcast_ref::<depthrig_bus::Error>()
+                .is_some_and(|e| e.kind() == depthrig_bus::ErrorKind::BadName)
+    });
+    if usage { Exit::Usage } else { Exit::Failed }
+}
+
+/// The error in one line, then each cause that adds something.
+fn text(error: &anyhow::Error) -> String {
+    let mut told = format!("depthrig: error: {error}");
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        if !told.contains(&cause) {
+            told.push_str("\n  cause: ");
+            told.push_str(&cause);
+        }
+    }
+    told.push('\n');
+    told
+}
+
+fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    error.chain().any(|cause| {
+        cause.downcast_ref::<std::io::Error>().is_some_and(|e| e.kind() == std::io::ErrorKind::BrokenPipe)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use anyhow::Context as _;
+
+    #[test]
+    fn causes_are_told_once() {
+        let inner = std::io::Error::other("the disk is on fire");
+        let error =
+            anyhow::Error::new(inner).context("d435 was lost: the disk is on fire").context("no luck");
+        assert_eq!(text(&error), "depthrig: error: no luck\n  cause: d435 was lost: the disk is on fire\n");
+    }
+
+    #[test]
+    fn bad_input_is_2_and_the_rest_is_1() {
+        use depthrig_daemon::{Error, ErrorKind};
+        let bad = || anyhow::Error::new(Error::new(ErrorKind::BadInput, "line 3"));
+        assert_eq!(of(&bad()), Exit::Usage);
+        assert_eq!(of(&Err::<(), _>(bad()).context("rig.toml").unwrap_err()), Exit::Usage);
+        assert_eq!(of(&anyhow::Error::new(Error::new(ErrorKind::NoSpace, "full"))), Exit::Failed);
+        assert_eq!(of(&anyhow::Error::new(UsageError("no".into()))), Exit::Usage);
+        assert_eq!([Exit::Good, Exit::Failed, Exit::Usage, Exit::Lost].map(Exit::code), [0, 1, 2, 3]);
+    }
+}

@@ -1,0 +1,108 @@
+//! What is written to the standard output: lines, JSON, tables, and numbers as people read them.
+
+use anyhow::Result;
+use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+use serde::Serialize;
+use std::io::Write;
+
+/// Writes `text` and a newline.
+///
+/// # Errors
+/// When the output is closed; a closed pipe ends a command quietly (see [`crate::exit`]).
+pub fn line(text: impl core::fmt::Display) -> Result<()> {
+    writeln!(std::io::stdout().lock(), "{text}")?;
+    Ok(())
+}
+
+/// Writes `value` as indented JSON.
+///
+/// # Errors
+/// As [`line`].
+pub fn json(value: &impl Serialize) -> Result<()> {
+    line(serde_json::to_string_pretty(value)?)
+}
+
+/// Writes `value` as JSON on one line, as streams of JSON want it.
+///
+/// # Errors
+/// As [`line`].
+pub fn json_line(value: &impl Serialize) -> Result<()> {
+    line(serde_json::to_string(value)?)
+}
+
+/// A table without borders; the columns from `first_number` on are aligned to the right.
+pub fn table(header: &[&str], first_number: usize, rows: impl IntoIterator<Item = Vec<String>>) -> String {
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING);
+    table.set_content_arrangement(ContentArrangement::Disabled);
+    table.set_header(header.to_vec());
+    for row in rows {
+        table.add_row(row);
+    }
+    for (i, column) in table.column_iter_mut().enumerate() {
+        column.set_padding((0, 2));
+        if i >= first_number {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+    }
+    table.trim_fmt()
+}
+
+/// Bytes with a binary unit: `1.5 GiB`.
+pub fn bytes(n: u64) -> String {
+    const UNITS: [&str; 5] = ["B", "KiB", "MiB", "GiB", "TiB"];
+    let mut value = n as f64;
+    let mut unit = 0;
+    while value >= 1024.0 && unit < UNITS.len() - 1 {
+        value /= 1024.0;
+        unit += 1;
+    }
+    if unit == 0 { format!("{n} B") } else { format!("{value:.1} {}", UNITS[unit]) }
+}
+
+/// A length of time: `8.2 s`, `4 min 09 s`, `3 h 05 min`.
+pub fn seconds(s: f64) -> String {
+    if s < 0.0 || !s.is_finite() {
+        return "-".to_owned();
+    }
+    let whole = s as u64;
+    match whole {
+        0..60 => format!("{s:.1} s"),
+        60..3600 => format!("{} min {:02} s", whole / 60, whole % 60),
+        _ => format!("{} h {:02} min", whole / 3600, whole / 60 % 60),
+    }
+}
+
+/// Reasons and counts: `device_gap 3, no_slot 1`; `0` when nothing was lost.
+pub fn reasons(counts: &std::collections::BTreeMap<String, u64>) -> String {
+    let told: Vec<_> = counts.iter().filter(|(_, n)| **n > 0).map(|(why, n)| format!("{why} {n}")).collect();
+    if told.is_empty() { "0".to_owned() } else { told.join(", ") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_read_well() {
+        assert_eq!(
+            [bytes(0), bytes(1023), bytes(1536), bytes(3 << 30)],
+            ["0 B", "1023 B", "1.5 KiB", "3.0 GiB"]
+        );
+        assert_eq!(bytes(u64::MAX), "16777216.0 TiB");
+        assert_eq!([seconds(8.24), seconds(249.0), seconds(11_105.0)], ["8.2 s", "4 min 09 s", "3 h 05 min"]);
+        assert_eq!(seconds(f64::NAN), "-");
+        let counts = [("no_slot".to_owned(), 1), ("device_gap".to_owned(), 3), ("late".to_owned(), 0)].into();
+        assert_eq!(reasons(&counts), "device_gap 3, no_slot 1");
+    }
+
+    #[test]
+    fn tables_align_numbers_to_the_right() {
+        let text = table(
+            &["camera", "Hz"],
+            1,
+            [vec!["d435".into(), "30.0".into()], vec!["l515".into(), "5".into()]],
+        );
+        assert_eq!(text, "camera    Hz\nd435    30.0\nl515       5");
+    }
+}

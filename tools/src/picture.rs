@@ -1,0 +1,160 @@
+//! A frame as picture files: colour as it is, depth as 16-bit PNG and as a preview in colours.
+
+use crate::turbo::depth_color;
+use anyhow::{Context, Result, bail};
+use depthrig_bus::{FrameHeader, PixelFormat};
+use image::{ExtendedColorType, ImageEncoder, RgbImage, codecs::png};
+use std::path::{Path, PathBuf};
+
+/// Nearest depth that a preview tells apart, metres.
+const NEAR_M: f32 = 0.15;
+/// Farthest.
+const FAR_M: f32 = 3.0;
+
+/// The rows of a frame without padding between them.
+fn rows<'a>(header: &FrameHeader, pixels: &'a [u8]) -> Result<impl Iterator<Item = &'a [u8]>> {
+    let format = header.pixel_format().context("the frame's pixel format is unknown to this version")?;
+    let row = format.row_bytes(header.width) as usize;
+    let (stride, height) = (header.stride as usize, header.height as usize);
+    if row == 0 || stride < row || pixels.len() < stride * height.saturating_sub(1) + row {
+        bail!(
+            "a {}x{} {} frame with a stride of {stride} cannot have {} bytes",
+            header.width,
+            header.height,
+            format.name(),
+            pixels.len()
+        );
+    }
+    Ok((0..height).map(move |y| &pixels[y * stride..y * stride + row]))
+}
+
+/// Depth in metres, row by row; 0 where there is none. `None` when the frame is no depth.
+pub fn depth_m(header: &FrameHeader, pixels: &[u8]) -> Result<Option<Vec<f32>>> {
+    let unit = header.depth_unit_m as f32;
+    let read: fn(&[u8], f32) -> Vec<f32> = match header.pixel_format() {
+        Some(PixelFormat::Z16) => |row, unit| {
+            row.chunks_exact(2).map(|b| f32::from(u16::from_le_bytes([b[0], b[1]])) * unit).collect()
+        },
+        Some(PixelFormat::DepthF32) => {
+            |row, _| row.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
+        }
+        _ => return Ok(None),
+    };
+    Ok(Some(rows(header, pixels)?.flat_map(|row| read(row, unit)).collect()))
+}
+
+/// The frame as a person sees it: colour as it is, depth in colours, 16-bit grey stretched.
+pub fn to_rgb(header: &FrameHeader, pixels: &[u8]) -> Result<RgbImage> {
+    if let Some(depth) = depth_m(header, pixels)? {
+        let data = depth.iter().flat_map(|z| depth_color(*z, NEAR_M, FAR_M)).collect();
+        return image_of(header, data);
+    }
+    let data = match header.pixel_format() {
+        Some(PixelFormat::Mjpeg) => {
+            let picture = image::load_from_memory_with_format(pixels, image::ImageFormat::Jpeg);
+            return Ok(picture.context("the frame's JPEG cannot be decoded")?.into_rgb8());
+        }
+        Some(PixelFormat::Rgb8) => rows(header, pixels)?.flatten().copied().collect(),
+        Some(PixelFormat::Bgr8) => {
+            rows(header, pixels)?.flat_map(|r| r.chunks_exact(3).flat_map(|p| [p[2], p[1], p[0]])).collect()
+        }
+        Some(PixelFormat::Mono8 | PixelFormat::Confidence8) => {
+            rows(header, pixels)?.flatten().flat_map(|v| [*v; 3]).collect()
+        }
+        Some(PixelFormat::Mono16) => stretched(rows(header, pixels)?),
+        Some(other) => bail!("{} frames cannot be shown yet", other.name()),
+        None => bail!("the frame's pixel format is unknown to this version"),
+    };
+    image_of(header, data)
+}
+
+/// 16-bit grey with its brightest pixel at white.
+fn stretched<'a>(rows: impl Iterator<Item = &'a [u8]>) -> Vec<u8> {
+    let values: Vec<u32> =
+        rows.flat_map(|r| r.chunks_exact(2).map(|b| u32::from(u16::from_le_bytes([b[0], b[1]])))).collect();
+    let most = values.iter().copied().max().unwrap_or(0).max(1);
+    values.iter().flat_map(|v| [(v * 255 / most) as u8; 3]).collect()
+}
+
+fn image_of(header: &FrameHeader, data: Vec<u8>) -> Result<RgbImage> {
+    RgbImage::from_raw(header.width, header.height, data).context("the frame is smaller than it says")
+}
+
+/// Writes the frame into `folder` as PNG files named after `stem`; returns their paths. Depth and 16-bit grey
+/// keep every bit; depth gets a preview beside it.
+///
+/// # Errors
+/// When the frame is not what its header says, its format cannot be shown, or a file cannot be written.
+pub fn write_png(header: &FrameHeader, pixels: &[u8], folder: &Path, stem: &str) -> Result<Vec<PathBuf>> {
+    let mut written = Vec::new();
+    let mut write = |name: String, data: &[u8], color: ExtendedColorType| -> Result<()> {
+        let path = folder.join(name);
+        let file =
+            std::fs::File::create(&path).with_context(|| format!("{}: cannot be written", path.display()))?;
+        // Pictures of a live stream: the fastest compression that still compresses.
+        let encoder = png::PngEncoder::new_with_quality(
+            std::io::BufWriter::new(file),
+            png::CompressionType::Fast,
+            png::FilterType::Sub,
+        );
+        encoder
+            .write_image(data, header.width, header.height, color)
+            .with_context(|| format!("{}: cannot be written", path.display()))?;
+        written.push(path);
+        Ok(())
+    };
+    let format = header.pixel_format();
+    let is_depth = format.is_some_and(PixelFormat::is_depth);
+    if matches!(format, Some(PixelFormat::Z16 | PixelFormat::Mono16)) {
+        let native: Vec<u8> = rows(header, pixels)?
+            .flat_map(|r| r.chunks_exact(2).flat_map(|b| u16::from_le_bytes([b[0], b[1]]).to_ne_bytes()))
+            .collect();
+        write(format!("{stem}.png"), &native, ExtendedColorType::L16)?;
+    }
+    if is_depth || format != Some(PixelFormat::Mono16) {
+        let name = if is_depth { format!("{stem}_preview.png") } else { format!("{stem}.png") };
+        write(name, to_rgb(header, pixels)?.as_raw(), ExtendedColorType::Rgb8)?;
+    }
+    Ok(written)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn header(format: PixelFormat, width: u32, height: u32) -> FrameHeader {
+        let mut h = FrameHeader::default();
+        h.set_picture(format, width, height);
+        h.depth_unit_m = 0.0001;
+        h
+    }
+
+    #[test]
+    fn depth_survives_the_png_bit_by_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        let values: Vec<u16> = (0..12).map(|i| i * 5461).collect();
+        let pixels: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+        let written = write_png(&header(PixelFormat::Z16, 4, 3), &pixels, folder.path(), "d").unwrap();
+        assert_eq!(written, [folder.path().join("d.png"), folder.path().join("d_preview.png")]);
+        let read = image::open(&written[0]).unwrap();
+        assert_eq!(read.as_luma16().unwrap().as_raw(), &values);
+        assert_eq!(image::open(&written[1]).unwrap().into_rgb8().get_pixel(0, 0).0, [0; 3]);
+    }
+
+    #[test]
+    fn row_padding_is_left_out_and_a_short_frame_is_refused() {
+        let mut h = header(PixelFormat::Bgr8, 1, 2);
+        h.stride = 5;
+        let image = to_rgb(&h, &[1, 2, 3, 99, 99, 4, 5, 6]).unwrap();
+        assert_eq!(image.as_raw(), &[3, 2, 1, 6, 5, 4]);
+        let e = to_rgb(&h, &[0; 7]).unwrap_err().to_string();
+        assert!(e.contains("1x2 bgr8 frame"), "{e}");
+    }
+
+    #[test]
+    fn depth_is_in_metres_whatever_its_unit() {
+        let z16 = depth_m(&header(PixelFormat::Z16, 1, 1), &5000u16.to_le_bytes()).unwrap().unwrap();
+        assert!((z16[0] - 0.5).abs() < 1e-6);
+        assert_eq!(depth_m(&header(PixelFormat::Rgb8, 1, 1), &[0; 3]).unwrap(), None);
+    }
+}

@@ -1,0 +1,189 @@
+//! The status of a rig as text: what `status` prints and `top` refreshes.
+
+use crate::out;
+use depthrig_daemon::status::{CameraState, CameraStatus, RecordingStatus, RigStatus, StreamStatus};
+
+const BOLD: &str = "\x1b[1m";
+const RED: &str = "\x1b[31m";
+const YELLOW: &str = "\x1b[33m";
+const GREEN: &str = "\x1b[32m";
+const RESET: &str = "\x1b[0m";
+
+/// How to draw.
+#[derive(Debug, Clone, Copy)]
+pub struct Style {
+    /// Columns of the terminal; narrow ones get fewer columns of numbers.
+    pub width: usize,
+    /// Whether to use colour.
+    pub color: bool,
+}
+
+impl Style {
+    fn paint(self, color: &str, text: &str) -> String {
+        if self.color { format!("{color}{text}{RESET}") } else { text.to_owned() }
+    }
+
+    const fn is_wide(self) -> bool {
+        self.width >= 116
+    }
+}
+
+/// The whole status, without a newline at the end.
+pub fn status(rig: &RigStatus, style: Style) -> String {
+    let mut lines = vec![
+        format!(
+            "{}  depthrig {}, process {}, up {}, {:.2} cores",
+            style.paint(BOLD, &format!("rig {}", rig.rig)),
+            rig.version,
+            rig.pid,
+            out::seconds(rig.uptime_s),
+            rig.cpu_cores
+        ),
+        format!(
+            "sets    {} sent at {} Hz, {} incomplete; spread p50 {:.1}, p95 {:.1}, max {:.1} ms",
+            rig.sets.sent,
+            rig.sets.nominal_hz,
+            rig.sets.incomplete,
+            rig.sets.spread_p50_ms,
+            rig.sets.spread_p95_ms,
+            rig.sets.spread_max_ms
+        ),
+    ];
+    lines.extend(rig.recording.iter().flat_map(|r| recording(r, style)));
+    lines.push(format!(
+        "memory  /dev/shm {} free; {} slots a stream, {} in all",
+        out::bytes(rig.shared_memory.free_bytes),
+        rig.shared_memory.slots,
+        out::bytes(rig.shared_memory.reserved_bytes)
+    ));
+    lines.push(String::new());
+    lines.extend(streams(rig, style));
+    let troubles: Vec<_> = rig.cameras.iter().filter_map(|c| trouble(c, style)).collect();
+    if !troubles.is_empty() {
+        lines.push(String::new());
+        lines.extend(troubles);
+    }
+    lines.join("\n")
+}
+
+fn recording(r: &RecordingStatus, style: Style) -> Vec<String> {
+    let word = if r.active { style.paint(RED, "record ") } else { "last   ".to_owned() };
+    let left = r.disk_seconds_left.filter(|_| r.active);
+    let mut lines = vec![
+        format!(
+            "{word} {}: {}, {} sets, lost {}, {} in {} segments",
+            r.name,
+            out::seconds(r.duration_s),
+            r.sets,
+            out::reasons(&r.dropped),
+            out::bytes(r.bytes),
+            r.segments
+        ),
+        format!(
+            "disk    {} free{}; {}",
+            out::bytes(r.disk_free_bytes),
+            left.map_or_else(String::new, |s| format!(", enough for {}", out::seconds(s))),
+            r.path
+        ),
+    ];
+    lines.extend(r.error.iter().map(|e| style.paint(RED, &format!("        {e}"))));
+    lines
+}
+
+fn streams(rig: &RigStatus, style: Style) -> Vec<String> {
+    let rows = rig.cameras.iter().flat_map(|c| c.streams.iter().map(move |s| (c, s)));
+    let (header, cells): (&[&str], fn(&CameraStatus, &StreamStatus) -> Vec<String>) = if style.is_wide() {
+        (
+            &[
+                "stream", "state", "picture", "format", "Hz", "frames", "lost", "p50 ms", "p99 ms", "clock",
+                "ppm", "±us",
+            ],
+            |c, s| {
+                let mut row = narrow(c, s);
+                row.insert(3, s.format.clone());
+                row.insert(5, s.delivered.to_string());
+                row.insert(7, format!("{:.1}", s.latency_p50_ms));
+                row.insert(9, s.clock.domain.clone());
+                row
+            },
+        )
+    } else {
+        (&["stream", "state", "picture", "Hz", "lost", "p99 ms", "ppm", "±us"], narrow)
+    };
+    let cameras: Vec<_> = rows.clone().map(|(c, _)| c).collect();
+    let table = out::table(header, if style.is_wide() { 4 } else { 3 }, rows.map(|(c, s)| cells(c, s)));
+    let paint = |(i, line): (usize, &str)| match i.checked_sub(1).and_then(|i| cameras.get(i)) {
+        None if i == 0 => style.paint(BOLD, line),
+        None => line.to_owned(),
+        Some(camera) => match color_of(camera.state) {
+            Some(color) => style.paint(color, line),
+            None => line.to_owned(),
+        },
+    };
+    table.lines().enumerate().map(paint).collect()
+}
+
+fn narrow(camera: &CameraStatus, stream: &StreamStatus) -> Vec<String> {
+    let lost: u64 = stream.dropped.values().sum();
+    vec![
+        stream.id.clone(),
+        camera.state.name().to_owned(),
+        format!("{}x{}", stream.width, stream.height),
+        format!("{:.1}", stream.rate_hz),
+        lost.to_string(),
+        format!("{:.1}", stream.latency_p99_ms),
+        format!("{:+.1}", stream.clock.rate_ppm),
+        format!("{:.0}", stream.clock.uncertainty_us),
+    ]
+}
+
+/// Why a camera is not streaming, or what its streams have lost.
+fn trouble(camera: &CameraStatus, style: Style) -> Option<String> {
+    let mut told = Vec::new();
+    if camera.state != CameraState::Streaming {
+        let why = camera.message.as_deref().map_or_else(String::new, |why| format!(": {why}"));
+        let text = format!("{} for {}{why}", camera.state.name(), out::seconds(camera.state_for_s));
+        told.push(color_of(camera.state).map_or_else(|| text.clone(), |color| style.paint(color, &text)));
+    }
+    if camera.reconnects > 0 {
+        told.push(format!("came back {} times", camera.reconnects));
+    }
+    for stream in camera.streams.iter().filter(|s| s.dropped.values().any(|n| *n > 0)) {
+        told.push(format!("{} lost {}", stream.id, out::reasons(&stream.dropped)));
+    }
+    (!told.is_empty()).then(|| format!("{}: {}", camera.name, told.join("; ")))
+}
+
+const fn color_of(state: CameraState) -> Option<&'static str> {
+    match state {
+        CameraState::Streaming => None,
+        CameraState::Failed => Some(RED),
+        CameraState::Finished | CameraState::Stopped => Some(GREEN),
+        _ => Some(YELLOW),
+    }
+}
+
+/// `line` cut to `width` visible characters; colour codes take no room and are never cut in half.
+pub fn clip(line: &str, width: usize) -> String {
+    let mut clipped = String::new();
+    let mut shown = 0;
+    let mut chars = line.chars();
+    while let Some(c) = chars.next() {
+        if c == '\x1b' {
+            clipped.push(c);
+            for c in chars.by_ref() {
+                clipped.push(c);
+                if c.is_ascii_alphabetic() {
+                    break;
+                }
+            }
+        } else if shown < width {
+            clipped.push(c);
+            shown += 1;
+        }
+    }
+    clipped
+}
+
+#[cfg(test)]
+pub mod tests;

@@ -1,0 +1,112 @@
+//! What a status looks like.
+
+use super::*;
+use depthrig_daemon::status::{ClockStatus, SetAccount, SetStatus, SharedMemoryStatus};
+
+fn stream(id: &str, lost: u64) -> StreamStatus {
+    StreamStatus {
+        id: id.into(),
+        format: "z16".into(),
+        width: 1280,
+        height: 720,
+        nominal_hz: 30.0,
+        rate_hz: 29.97,
+        captured: 903,
+        delivered: 903 - lost,
+        dropped: [("device_gap".to_owned(), lost)].into(),
+        last_frame_age_ms: Some(12.0),
+        latency_p50_ms: 4.1,
+        latency_p99_ms: 8.25,
+        clock: ClockStatus {
+            domain: "device".into(),
+            rate_ppm: -12.3,
+            uncertainty_us: 210.0,
+            ..ClockStatus::default()
+        },
+        in_sets: SetAccount::default(),
+    }
+}
+
+fn camera(name: &str, state: CameraState, message: Option<&str>, lost: u64) -> CameraStatus {
+    CameraStatus {
+        name: name.into(),
+        backend: "synthetic".into(),
+        model: "D435".into(),
+        serial: "1".into(),
+        firmware: String::new(),
+        calibration: "factory".into(),
+        state,
+        state_for_s: 2.5,
+        message: message.map(Into::into),
+        reconnects: 0,
+        streams: vec![stream(&format!("{name}/depth"), lost)],
+    }
+}
+
+fn rig() -> RigStatus {
+    RigStatus {
+        rig: "mount".into(),
+        version: "0.1.0".into(),
+        pid: 42,
+        uptime_s: 30.1,
+        utc_ns: 0,
+        cameras: vec![
+            camera("d435", CameraState::Streaming, None, 0),
+            camera("l515", CameraState::Reconnecting, Some("unplugged"), 3),
+        ],
+        sets: SetStatus { nominal_hz: 5.0, sent: 150, ..SetStatus::default() },
+        recording: None,
+        shared_memory: SharedMemoryStatus { free_bytes: 1 << 30, slots: 48, reserved_bytes: 1 << 29 },
+        cpu_cores: 0.5,
+    }
+}
+
+#[test]
+fn a_status_says_what_matters_and_fits_80_columns() {
+    let text = status(&rig(), Style { width: 80, color: false });
+    for line in text.lines() {
+        assert!(line.chars().count() <= 80, "{line}");
+    }
+    assert!(text.contains("d435/depth  streaming"), "{text}");
+    assert!(
+        text.ends_with("l515: reconnecting for 2.5 s: unplugged; l515/depth lost device_gap 3"),
+        "{text}"
+    );
+    assert!(!text.contains('\x1b'));
+}
+
+#[test]
+fn a_wide_one_has_more_columns() {
+    let text = status(&rig(), Style { width: 140, color: false });
+    let header = text.lines().find(|l| l.starts_with("stream")).unwrap();
+    assert_eq!(
+        header.split_whitespace().collect::<Vec<_>>().join(" "),
+        "stream state picture format Hz frames lost p50 ms p99 ms clock ppm ±us"
+    );
+    let row = text.lines().find(|l| l.starts_with("l515/depth")).unwrap();
+    assert_eq!(
+        row.split_whitespace().collect::<Vec<_>>(),
+        [
+            "l515/depth",
+            "reconnecting",
+            "1280x720",
+            "z16",
+            "30.0",
+            "900",
+            "3",
+            "4.1",
+            "8.2",
+            "device",
+            "-12.3",
+            "210"
+        ]
+    );
+}
+
+#[test]
+fn color_marks_what_is_wrong_and_clipping_keeps_it_whole() {
+    let text = status(&rig(), Style { width: 80, color: true });
+    let bad = text.lines().find(|l| l.contains("l515/depth  ")).unwrap();
+    assert!(bad.starts_with(YELLOW) && bad.ends_with(RESET));
+    assert_eq!(clip("\x1b[31mabcdef\x1b[0m", 3), "\x1b[31mabc\x1b[0m");
+}
