@@ -7,6 +7,8 @@
 
 pub mod capture;
 pub mod clock;
+#[doc(hidden)]
+pub mod conformance;
 mod device;
 mod error;
 pub mod files;

@@ -12,6 +12,8 @@ use rayon::prelude::*;
 const BOUNCES: u32 = 3;
 /// Standard deviation of the sensor's noise in steps of 256 in the mid-tones.
 const NOISE: f32 = 1.3;
+/// Bayer's 4x4 matrix.
+const DITHER: [usize; 16] = [0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5];
 
 /// Renders an RGB8 picture.
 pub(crate) fn render(world: &World, view: &View<'_>, white: [f32; 3], seed: u64) -> Vec<u8> {
@@ -46,6 +48,7 @@ struct Shader<'a> {
     shading: Vec<u16>,
     near: Vec<u16>,
     all: Vec<u16>,
+    extent: Ball,
 }
 
 /// Whose shadows and contacts matter at a spot.
@@ -67,6 +70,7 @@ impl<'a> Shader<'a> {
             shading: between(world, extent, lamp),
             near: between(world, reach, reach),
             all: world.all(),
+            extent,
         })
     }
 
@@ -81,7 +85,8 @@ impl<'a> Shader<'a> {
             || (y > 0 && key(x, y - 1) != met.key)
             || (y + 1 < h && key(x, y + 1) != met.key);
         let around = Around { shading: &self.shading, near: &self.near };
-        let phase = (x & 1) | ((y & 1) << 1);
+        // The order of a 4x4 ordered dither: neighbours differ as much as can be.
+        let phase = DITHER[(y & 3) * 4 + (x & 3)];
         if !(is_edge || spot.paint.is_sharp()) || w < 2 || h < 2 {
             return self.light(&spot, dir, met.t, around, phase, BOUNCES);
         }
@@ -93,9 +98,10 @@ impl<'a> Shader<'a> {
             let met = self.world.meet(&self.seen, eye, dir);
             let spot = self.world.spot(eye, dir, met);
             // The spots between pixels of an edge may lie outside what the tile's lists were made for.
-            let around = if is_edge { Around { shading: &self.all, near: &self.near } } else { around };
+            let is_outside = (spot.p - self.extent.center).length() > self.extent.radius;
+            let around = if is_outside { Around { shading: &self.all, near: &self.all } } else { around };
             // Bright spots are cut before the mean, or the edge of a highlight would stay jagged.
-            sum += self.light(&spot, dir, met.t, around, i, BOUNCES).min(Vec3::splat(1.5));
+            sum += self.light(&spot, dir, met.t, around, (phase + i * 4) % 16, BOUNCES).min(Vec3::splat(1.5));
         }
         sum * 0.25
     }
@@ -103,15 +109,17 @@ impl<'a> Shader<'a> {
     /// The light that leaves `spot` against `dir`.
     fn light(&self, spot: &Spot, dir: Vec3, t: f32, around: Around<'_>, phase: usize, bounces: u32) -> Vec3 {
         let forward = dir.normalize();
-        let facing = (-spot.n.dot(forward)).clamp(0.0, 1.0);
+        let facing = spot.n.dot(forward).abs().min(1.0);
         let fresnel = (1.0 - facing).powi(5);
         match spot.paint.surface() {
             Surface::Mirror => {
                 self.follow(spot, forward.reflect(spot.n), bounces) * Vec3::new(0.86, 0.88, 0.87)
             }
+            // Out of the pane again: what is reflected inside is left out.
+            Surface::Glass if spot.n.dot(forward) > 0.0 => self.follow(spot, forward, bounces),
             Surface::Glass => {
-                let part = 0.06 + 0.94 * fresnel;
-                let behind = self.follow(spot, forward, bounces) * Vec3::new(0.90, 0.965, 0.94);
+                let part = 0.05 + 0.95 * fresnel;
+                let behind = self.follow(spot, forward, bounces + 1) * Vec3::new(0.90, 0.965, 0.94);
                 let rim = spot.normal_local.y.abs() < 0.5;
                 let behind = if rim { behind * 0.35 + Vec3::new(0.10, 0.26, 0.20) } else { behind };
                 behind * (1.0 - part) + self.follow(spot, forward.reflect(spot.n), bounces) * part
@@ -120,7 +128,7 @@ impl<'a> Shader<'a> {
                 let color = spot.paint.color(spot.local, spot.normal_local, t * self.view.rays.pixel_rad);
                 let open = self.world.openness(around.near, spot);
                 let to_lamp = LAMP.0 - spot.p;
-                let lit = self.lit(spot, around.shading, phase);
+                let lit = self.lit(spot, around.shading, phase, if bounces == 0 { 1 } else { 4 });
                 let half = (to_lamp.normalize() - forward).normalize_or(spot.n);
                 let fall = 1.9 / to_lamp.length_squared();
                 let key =
@@ -162,24 +170,23 @@ impl<'a> Shader<'a> {
     }
 
     /// The part of the lamp that a spot sees, 0..1.
-    fn lit(&self, spot: &Spot, shading: &[u16], phase: usize) -> f32 {
+    fn lit(&self, spot: &Spot, shading: &[u16], phase: usize, rays: u16) -> f32 {
         let to_lamp = LAMP.0 - spot.p;
         if spot.n.dot(to_lamp) <= 0.0 {
             return 0.0;
         }
-        if shading.is_empty() {
+        if shading.iter().all(|i| *i == spot.thing) {
             return 1.0;
         }
         // Neighbouring pixels try other places on the lamp, which blurs the steps of the shadow's rim.
         let (u, v) = to_lamp.normalize().any_orthonormal_pair();
-        let from = spot.p + spot.n * 3e-4;
-        let mut seen = 0;
-        for i in 0..4 {
-            let (sin, cos) = ((i * 4 + phase) as f32 * (core::f32::consts::TAU / 16.0) * 2.76).sin_cos();
-            let radius = LAMP.1 * (0.35 + 0.2 * i as f32);
-            seen += u32::from(!self.world.is_blocked(shading, from, LAMP.0 + (u * cos + v * sin) * radius));
+        let mut seen = 0u32;
+        for i in 0..rays {
+            let (sin, cos) = ((i as f32 * 0.618 + phase as f32 / 16.0) * core::f32::consts::TAU).sin_cos();
+            let radius = LAMP.1 * ((i as f32 + 0.2 + phase as f32 / 20.0) / 4.0).sqrt();
+            seen += u32::from(!self.world.is_blocked(shading, spot, LAMP.0 + (u * cos + v * sin) * radius));
         }
-        seen as f32 / 4.0
+        seen as f32 / rays as f32
     }
 }
 

@@ -123,7 +123,7 @@ impl Lists {
     /// Adds what depends on the surroundings of the first surface.
     fn finish(&self, world: &World, (mut sample, spot): (Sample, super::scene::Spot)) -> Sample {
         match self.second_eye {
-            Some(eye) => sample.is_hidden = world.is_blocked(&self.hiding, spot.p + spot.n * 2e-4, eye),
+            Some(eye) => sample.is_hidden = world.is_blocked(&self.hiding, &spot, eye),
             None => sample.open = world.openness(&self.near, &spot),
         }
         sample

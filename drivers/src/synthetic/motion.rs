@@ -28,7 +28,7 @@ pub(crate) fn mount(index: u32, poses: u32) -> DAffine3 {
     let s = if poses < 2 { 0.5 } else { f64::from(index) / f64::from(poses - 1) };
     let swing = -(s * TAU / 2.0).cos(); // -1 … 1, at rest at both ends
     let eye = DVec3::new(0.02 + 0.075 * swing, -0.60 + 0.015 * swing * swing, 0.47 + 0.02 * swing);
-    let target = DVec3::new(-0.01 - 0.01 * swing, 0.07, 0.035);
+    let target = DVec3::new(-0.01 - 0.01 * swing, 0.09, 0.07);
     look_at(eye, target)
 }
 

@@ -216,8 +216,8 @@ mod tests {
     #[test]
     fn a_slow_reader_loses_the_oldest_and_the_next_frame_says_how_many() {
         let (mut q, t) = queue(ClockSim::default());
-        q.expose_until(ms(25), &t, BOOT);
-        assert_eq!(drain(&mut q, ms(25)).iter().map(|w| w.k).collect::<Vec<_>>(), [0, 1]);
+        q.expose_until(ms(21), &t, BOOT);
+        assert_eq!(drain(&mut q, ms(21)).iter().map(|w| w.k).collect::<Vec<_>>(), [0, 1]);
         q.expose_until(ms(208), &t, BOOT);
         let got = drain(&mut q, ms(208));
         assert_eq!(got.len(), 4);
@@ -261,8 +261,8 @@ mod tests {
         q.expose_until(ms(15), &t, BOOT);
         q.spoil(FaultKind::Skip, 1);
         q.expose_until(ms(25), &t, BOOT);
-        q.expose_until(ms(60), &t, Boot { number: 1, at: ms(30), set_back_us: 0 });
-        let got = drain(&mut q, ms(60));
+        q.expose_until(ms(46), &t, Boot { number: 1, at: ms(30), set_back_us: 0 });
+        let got = drain(&mut q, ms(46));
         assert_eq!(
             got.iter().map(|w| (w.k, w.boot, w.lost_before)).take(3).collect::<Vec<_>>(),
             [(0, 0, 0), (1, 0, 0), (0, 1, 0)]

@@ -37,6 +37,8 @@ pub(crate) struct Spot {
     pub(crate) local: Vec3,
     pub(crate) normal_local: Vec3,
     pub(crate) paint: Paint,
+    /// Number of the solid; that of none for the room.
+    pub(crate) thing: u16,
 }
 
 /// The world.
@@ -71,12 +73,19 @@ impl World {
         met
     }
 
-    /// Whether a solid of `among` that is not clear stands between the two points.
-    pub(crate) fn is_blocked(&self, among: &[u16], from: Vec3, to: Vec3) -> bool {
+    /// Whether a solid of `among` that is not clear stands between a spot and a point. The spot's own solid
+    /// is convex, so it can only do so by facing away.
+    pub(crate) fn is_blocked(&self, among: &[u16], spot: &Spot, to: Vec3) -> bool {
+        let from = spot.p + spot.n * 3e-4;
         let way = to - from;
+        if spot.n.dot(way) <= 0.0 {
+            return true;
+        }
         among.iter().any(|i| {
             let thing = &self.things[usize::from(*i)];
-            thing.paint.surface() != Surface::Glass && thing.solid.meet(from, way, 1e-3, 0.999).is_some()
+            *i != spot.thing
+                && thing.paint.surface() != Surface::Glass
+                && thing.solid.meet(from, way, 1e-4, 0.9999).is_some()
         })
     }
 
@@ -87,7 +96,14 @@ impl World {
             Some(thing) => {
                 let local = thing.solid.to_local(p);
                 let normal_local = thing.solid.normal_local(local).0;
-                Spot { p, n: thing.solid.axes * normal_local, local, normal_local, paint: thing.paint }
+                Spot {
+                    p,
+                    n: thing.solid.axes * normal_local,
+                    local,
+                    normal_local,
+                    paint: thing.paint,
+                    thing: met.key >> 3,
+                }
             }
             None => {
                 let n = room_normal(met.key);
@@ -98,7 +114,7 @@ impl World {
                 } else {
                     Paint::Wall
                 };
-                Spot { p, n, local: p, normal_local: n, paint }
+                Spot { p, n, local: p, normal_local: n, paint, thing: met.key >> 3 }
             }
         }
     }
@@ -195,9 +211,16 @@ impl Builder {
         for (x, y) in [(-0.72, -0.3), (0.72, -0.3), (-0.72, 0.58), (0.72, 0.58)] {
             self.block([0.03, 0.03, 0.352], [x, y, -0.388], 0.0, Paint::DarkWood);
         }
-        self.block([0.42, 0.012, 0.27], [-0.52, 1.035, 0.62], 0.0, Paint::Poster);
+        self.block([0.42, 0.012, 0.27], [-0.2, 1.035, 0.40], 0.0, Paint::Poster);
         self.block([0.36, 0.2, 0.32], [1.15, 0.82, -0.42], 0.0, Paint::Cabinet);
-        self.ball(0.17, [1.15, 0.8, 0.07], turned(0.0), Paint::Lampshade);
+        self.add(
+            Shape::Cylinder { half: 0.09, radius: 0.075 },
+            Vec3::new(1.0, 0.86, 0.13),
+            Mat3::IDENTITY,
+            Paint::Lampshade,
+        );
+        self.rod(Vec3::new(1.0, 0.86, -0.1), Vec3::new(1.0, 0.86, 0.05), 0.01, Paint::DarkWood);
+        self.block([0.06, 0.06, 0.008], [1.0, 0.86, -0.092], 0.0, Paint::DarkWood);
         self.block([0.3, 0.3, 0.2], [-1.3, 0.6, -0.54], 12.0, Paint::Sofa);
     }
 
@@ -287,9 +310,12 @@ mod tests {
     fn nothing_but_glass_lets_light_through() {
         let world = World::new();
         let all = world.all();
-        let eye = Vec3::new(0.19, -0.3, 0.1);
+        let from = Vec3::new(0.19, -0.3, 0.1);
+        let wall =
+            |p: Vec3, n: Vec3| Spot { p, n, local: p, normal_local: n, paint: Paint::Wall, thing: ROOM_KEY };
         let behind_glass = Vec3::new(0.2, 0.12, 0.1);
-        assert!(!world.is_blocked(&all, eye, behind_glass));
-        assert!(world.is_blocked(&all, eye, Vec3::new(0.2, 0.1, -0.3)), "the table");
+        assert!(!world.is_blocked(&all, &wall(from, Vec3::Y), behind_glass));
+        assert!(world.is_blocked(&all, &wall(from, Vec3::NEG_Y), behind_glass), "it faces away");
+        assert!(world.is_blocked(&all, &wall(from, Vec3::NEG_Z), Vec3::new(0.2, 0.1, -0.3)), "the table");
     }
 }

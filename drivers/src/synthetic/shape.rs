@@ -32,6 +32,8 @@ pub(crate) struct Solid {
     pub(crate) axes: Mat3,
     /// Radius of a sphere around `center` that holds it.
     pub(crate) bound: f32,
+    /// Its square, with a little margin for rounding.
+    bound_squared: f32,
 }
 
 impl Solid {
@@ -42,7 +44,7 @@ impl Solid {
             Shape::Capsule { half, radius } => half + radius,
             Shape::Cylinder { half, radius } => half.hypot(radius),
         };
-        Self { shape, center, axes, bound }
+        Self { shape, center, axes, bound, bound_squared: bound * bound * 1.001 + 1e-8 }
     }
 
     /// The point of the world in the shape's own frame.
@@ -53,7 +55,14 @@ impl Solid {
     /// Distance along the ray at which it enters the solid, if that lies within `near..far`. A ray that
     /// begins inside meets the far side.
     pub(crate) fn meet(&self, from: Vec3, dir: Vec3, near: f32, far: f32) -> Option<f32> {
-        let o = self.axes.transpose() * (from - self.center);
+        // Most rays miss the sphere around the solid: this is where rendering spends its time.
+        let to = self.center - from;
+        let (along, dd, tt) = (to.dot(dir), dir.dot(dir), to.dot(to));
+        let outside = tt - self.bound_squared;
+        if outside > 0.0 && (along < 0.0 || (outside - 1e-6 * tt) * dd > along * along) {
+            return None;
+        }
+        let o = self.axes.transpose() * -to;
         let d = self.axes.transpose() * dir;
         match self.shape {
             Shape::Sphere { radius } => first(sphere(o, d, radius)?, near, far),

@@ -112,7 +112,12 @@ mod tests {
 
     #[test]
     fn frames_lie_on_the_device_grid() {
-        let t = timeline(ClockSim { drift_ppm: 100.0, stamp_jitter_us: 0.0, ..ClockSim::default() });
+        let t = timeline(ClockSim {
+            drift_ppm: 100.0,
+            stamp_jitter_us: 0.0,
+            counter_bits: 64,
+            ..ClockSim::default()
+        });
         for k in [0, 1, 1_000_000] {
             let at = t.capture(boot(), 30.0, k);
             assert_eq!(t.first_at_or_after(boot(), 30.0, at), k);

@@ -159,14 +159,18 @@ impl<'a> View<'a> {
     }
 }
 
-/// The solids that can touch the space between two spheres.
+/// The solids that can touch the space between two spheres: the cone that holds both.
 pub(crate) fn between(world: &World, a: Ball, b: Ball) -> Vec<u16> {
     let way = b.center - a.center;
-    let thick = a.radius.max(b.radius);
+    let length = way.length().max(1e-6);
     let touches = |i: &u16| {
         let solid = &world.things[usize::from(*i)].solid;
-        let along = ((solid.center - a.center).dot(way) / way.length_squared().max(1e-12)).clamp(0.0, 1.0);
-        (solid.center - (a.center + way * along)).length() < solid.bound + thick
+        let along = (solid.center - a.center).dot(way) / (length * length);
+        let off = (solid.center - (a.center + way * along.clamp(0.0, 1.0))).length();
+        // How wide the cone is where the solid's bounding sphere can touch it at the widest.
+        let reach = (solid.bound + a.radius.max(b.radius)) / length;
+        let widest = if b.radius > a.radius { along + reach } else { along - reach };
+        off < solid.bound + a.radius + (b.radius - a.radius) * widest.clamp(0.0, 1.0)
     };
     (0..world.things.len() as u16).filter(touches).collect()
 }
@@ -200,12 +204,17 @@ mod tests {
         let world = World::new();
         let all = world.all();
         let lamp = Ball { center: super::super::scene::LAMP.0, radius: super::super::scene::LAMP.1 };
-        for i in 0..2000u32 {
+        let mut met = 0;
+        for i in 0..4000u32 {
             let r = super::super::noise::Rolls::new(5, i, 0, 0);
-            let spot = Vec3::new(r.unit(0) - 0.5, r.unit(1) * 0.8 - 0.3, r.unit(2) * 0.2);
-            let list = between(&world, Ball { center: spot, radius: 0.01 }, lamp);
+            let center = Vec3::new(r.unit(0) - 0.5, r.unit(1) * 0.8 - 0.3, r.unit(2) * 0.03);
+            let list = between(&world, Ball { center, radius: 0.01 }, lamp);
             let to = lamp.center + Vec3::new(r.unit(3) - 0.5, 0.0, 0.0) * lamp.radius;
-            assert_eq!(world.is_blocked(&list, spot, to), world.is_blocked(&all, spot, to));
+            let spot = world.spot(center, Vec3::NEG_Z, world.meet(&all, center, Vec3::NEG_Z));
+            let list = if (spot.p - center).length() < 0.01 { list } else { continue };
+            met += 1;
+            assert_eq!(world.is_blocked(&list, &spot, to), world.is_blocked(&all, &spot, to));
         }
+        assert!(met > 500, "only {met} spots were tried");
     }
 }

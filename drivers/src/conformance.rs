@@ -1,0 +1,182 @@
+//! What every back end must do, as a suite that runs against any of them.
+//!
+//! Implement [`Subject`] for the back end: how to make a device of it, how to make that device fail in each of
+//! the ways that it can, and what the device knows about the frames it sent. Then, in a test of the back end:
+//!
+//! ```no_run
+//! use depthrig_drivers::conformance::{self, Subject};
+//! # fn subject() -> Box<dyn Subject> { unimplemented!() }
+//! let report = conformance::run(subject().as_ref());
+//! // Every case is listed: passed, failed and why, or not applicable and why.
+//! println!("{report}");
+//! assert!(report.is_good(), "{report}");
+//! // Cases must not become inapplicable unnoticed.
+//! assert_eq!(report.not_applicable(), ["clock"]);
+//! ```
+//!
+//! A case never assumes how fast the machine is; its waits are generous bounds on liveness.
+
+use crate::{Backend, StreamRequest};
+use core::fmt;
+use core::time::Duration;
+use depthrig_bus::{DropCounts, HostTime};
+
+mod cases;
+mod probe;
+
+/// A back end under test.
+pub trait Subject {
+    /// What reports call it.
+    fn name(&self) -> String;
+
+    /// A fresh back end with exactly one device, which has not failed yet and will deliver at least some
+    /// seconds of frames, with the means to make that device fail.
+    fn make(&self) -> Bench;
+}
+
+/// One device of the subject on the bench.
+pub struct Bench {
+    /// The back end.
+    pub backend: Box<dyn Backend>,
+    /// Serial number of the device.
+    pub serial: String,
+    /// What to start; empty for the default modes.
+    pub requests: Vec<StreamRequest>,
+    /// The hands that make it fail, and the eyes that see what it does.
+    pub rig: Box<dyn Rig>,
+}
+
+/// Hands and eyes of a test on a device.
+///
+/// What a subject cannot do says so with `None` or [`Cannot`]; the case is then reported as not applicable.
+pub trait Rig {
+    /// Makes `trouble` happen now.
+    ///
+    /// # Errors
+    /// [`Cannot`] with the reason when this device cannot fail in this way.
+    fn cause(&self, trouble: Trouble) -> Result<(), Cannot>;
+
+    /// What the device knows it did with the frames of a stream since it was last started.
+    fn sent(&self, stream: usize) -> Option<Sent>;
+
+    /// True mid-exposure of the frame of a stream that arrived at `arrival`, and by how much the clock map may
+    /// be off in its first seconds, nanoseconds.
+    fn true_capture(&self, stream: usize, arrival: HostTime) -> Option<(HostTime, u64)>;
+
+    /// Whether `pixels` are exactly a frame that the device sent.
+    fn is_genuine(&self, stream: usize, pixels: &[u8]) -> Option<bool>;
+}
+
+/// This device cannot fail in this way, and why.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Cannot(pub &'static str);
+
+/// A way to fail.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Trouble {
+    /// Pulled out, and plugged in again after this long.
+    Unplug(Duration),
+    /// Sends nothing for this long.
+    Stall(Duration),
+    /// Does not let the driver return from a call for this long.
+    Hang(Duration),
+    /// Sends so many frames of every stream with half of their bytes.
+    HalfFrame(u32),
+    /// Sends so many frames of every stream with too many bytes.
+    WrongSize(u32),
+    /// Sends so many frames of every stream flagged or evident as damaged.
+    Damaged(u32),
+    /// Sends so many frames of every stream twice.
+    Repeated(u32),
+    /// Loses so many frames of every stream.
+    Skip(u32),
+    /// Sets its clock back by this much.
+    TimeBackwards(Duration),
+    /// Restarts its clock and its frame counter.
+    ClockReset,
+    /// Is held by somebody else for this long.
+    Busy(Duration),
+}
+
+/// What a device did with the frames of one stream.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Sent {
+    /// Frames that the host could know of.
+    pub captured: u64,
+    /// Frames that came whole and once.
+    pub good: u64,
+    /// Frames that did not, by the reason that the driver must find.
+    pub drops: DropCounts,
+}
+
+/// How one case ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Verdict {
+    /// As it must.
+    Passed,
+    /// Not as it must, and how.
+    Failed(String),
+    /// The subject cannot do what the case needs, and why.
+    NotApplicable(String),
+}
+
+/// The verdicts on a back end.
+#[derive(Debug)]
+pub struct Report {
+    /// The back end.
+    pub subject: String,
+    /// Every case with its verdict, in the order of the suite.
+    pub verdicts: Vec<(&'static str, Verdict)>,
+}
+
+impl Report {
+    /// Whether no case failed.
+    pub fn is_good(&self) -> bool {
+        !self.verdicts.iter().any(|(_, v)| matches!(v, Verdict::Failed(_)))
+    }
+
+    /// The cases that the subject cannot do.
+    pub fn not_applicable(&self) -> Vec<&'static str> {
+        let cannot = self.verdicts.iter().filter(|(_, v)| matches!(v, Verdict::NotApplicable(_)));
+        cannot.map(|(name, _)| *name).collect()
+    }
+
+    /// The cases that failed.
+    pub fn failed(&self) -> Vec<&'static str> {
+        let failed = self.verdicts.iter().filter(|(_, v)| matches!(v, Verdict::Failed(_)));
+        failed.map(|(name, _)| *name).collect()
+    }
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "conformance of {}:", self.subject)?;
+        for (case, verdict) in &self.verdicts {
+            match verdict {
+                Verdict::Passed => writeln!(f, "  passed          {case}")?,
+                Verdict::Failed(why) => writeln!(f, "  FAILED          {case}: {why}")?,
+                Verdict::NotApplicable(why) => writeln!(f, "  not applicable  {case}: {why}")?,
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The names of all cases, in order.
+pub fn cases() -> Vec<&'static str> {
+    cases::ALL.iter().map(|(name, _)| *name).collect()
+}
+
+/// Runs every case, each on a fresh device.
+pub fn run(subject: &dyn Subject) -> Report {
+    let verdicts = cases::ALL.iter().map(|(name, case)| (*name, judge(*case, subject))).collect();
+    Report { subject: subject.name(), verdicts }
+}
+
+fn judge(case: cases::Case, subject: &dyn Subject) -> Verdict {
+    match case(&subject.make()) {
+        Ok(()) => Verdict::Passed,
+        Err(cases::Stop::Failed(why)) => Verdict::Failed(why),
+        Err(cases::Stop::NotApplicable(why)) => Verdict::NotApplicable(why),
+    }
+}

@@ -1,0 +1,205 @@
+//! A sink that checks every promise about a single frame as it comes, and keeps the books.
+
+use crate::clock::ClockQuality;
+use crate::{FrameMeta, FrameSink, StreamProfile};
+use core::time::Duration;
+use depthrig_bus::{DropCounts, DropReason, HostTime, PixelFormat};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// What memory on loan holds before the driver writes: two different fills in turn, so that a byte that a
+/// driver leaves alone cannot look right every time.
+const FILLS: [u8; 2] = [0xA5, 0x5A];
+
+/// A frame that was published.
+#[derive(Debug, Clone)]
+pub(super) struct Published {
+    pub(super) stream: usize,
+    pub(super) meta: FrameMeta,
+    pub(super) pixels: Vec<u8>,
+    /// What the memory held before.
+    pub(super) fill: u8,
+}
+
+/// What came out of a driver.
+#[derive(Debug, Default)]
+pub(super) struct Books {
+    pub(super) published: Vec<Published>,
+    pub(super) delivered: Vec<u64>,
+    pub(super) drops: Vec<DropCounts>,
+    pub(super) captured: Vec<u64>,
+    pub(super) broken: Vec<String>,
+    pub(super) refuse: u32,
+    last: Vec<Option<FrameMeta>>,
+    profiles: Vec<StreamProfile>,
+    on_loan: Vec<Option<(Vec<u8>, u8)>>,
+    loans: usize,
+}
+
+/// The probe; clones share the books.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Probe {
+    books: Arc<Mutex<Books>>,
+    lent: Vec<u8>,
+    lent_of: usize,
+}
+
+impl Probe {
+    pub(super) fn new(profiles: &[StreamProfile]) -> Self {
+        let n = profiles.len();
+        let books = Books {
+            delivered: vec![0; n],
+            drops: vec![DropCounts::default(); n],
+            captured: vec![0; n],
+            last: vec![None; n],
+            on_loan: (0..n).map(|_| None).collect(),
+            profiles: profiles.to_vec(),
+            ..Books::default()
+        };
+        Self { books: Arc::new(Mutex::new(books)), ..Self::default() }
+    }
+
+    /// Looks into the books.
+    pub(super) fn with<T>(&self, look: impl FnOnce(&mut Books) -> T) -> T {
+        look(&mut self.books.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+impl Books {
+    /// Frames published on the stream that has the fewest.
+    pub(super) fn least_delivered(&self) -> u64 {
+        self.delivered.iter().copied().min().unwrap_or_default()
+    }
+
+    /// Frames published or dropped, all streams.
+    pub(super) fn seen(&self) -> u64 {
+        self.delivered.iter().sum::<u64>() + self.drops.iter().map(DropCounts::total).sum::<u64>()
+    }
+
+    fn check(&mut self, stream: usize, meta: &FrameMeta, bytes: usize) {
+        let now = HostTime::now();
+        let mut broken = Vec::new();
+        let Some(p) = self.profiles.get(stream) else {
+            self.broken.push(format!("a frame of stream {stream}, which was not started"));
+            return;
+        };
+        if p.format != PixelFormat::Mjpeg && bytes != p.frame_bytes() {
+            broken.push(format!("it has {bytes} bytes, not {}", p.frame_bytes()));
+        }
+        if meta.capture_time > meta.arrival {
+            broken.push(format!("captured {} ns after it arrived", meta.capture_time.since_ns(meta.arrival)));
+        }
+        if meta.arrival > now {
+            broken.push(format!("arrives {} ns in the future", meta.arrival.since_ns(now)));
+        }
+        if meta.captured != self.delivered[stream] + 1 + self.drops[stream].total() {
+            broken.push(format!(
+                "captured = {}, but {} are delivered with it and {} dropped",
+                meta.captured,
+                self.delivered[stream] + 1,
+                self.drops[stream].total()
+            ));
+        }
+        if let Some(last) = &self.last[stream] {
+            if meta.clock_epoch < last.clock_epoch {
+                broken.push(format!("clock epoch {} after {}", meta.clock_epoch, last.clock_epoch));
+            }
+            if meta.clock_epoch == last.clock_epoch && meta.capture_time < last.capture_time {
+                broken.push(format!(
+                    "its time went back by {} ns",
+                    last.capture_time.since_ns(meta.capture_time)
+                ));
+            }
+            if meta.arrival < last.arrival {
+                broken.push(format!("its arrival went back by {} ns", last.arrival.since_ns(meta.arrival)));
+            }
+        }
+        self.last[stream] = Some(*meta);
+        let n = self.delivered[stream];
+        self.broken.extend(broken.into_iter().map(|what| format!("frame {n} of {}: {what}", p.describe())));
+    }
+}
+
+impl FrameSink for Probe {
+    fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]> {
+        let fill = self.with(|b| {
+            if b.refuse > 0 {
+                b.refuse -= 1;
+                return None;
+            }
+            b.loans += 1;
+            if b.on_loan.get(stream).is_some_and(Option::is_some) {
+                b.broken.push(format!("stream {stream}: memory is asked for while some is on loan"));
+            }
+            let fill = FILLS[b.loans % 2];
+            if let Some(slot) = b.on_loan.get_mut(stream) {
+                *slot = Some((Vec::new(), fill));
+            }
+            Some(fill)
+        })?;
+        self.lent = vec![fill; len];
+        self.lent_of = stream;
+        Some(&mut self.lent)
+    }
+
+    fn commit(&mut self, stream: usize, meta: &FrameMeta) {
+        let pixels = core::mem::take(&mut self.lent);
+        let is_right = self.lent_of == stream;
+        self.with(|b| {
+            let Some((_, fill)) = b.on_loan.get_mut(stream).and_then(Option::take).filter(|_| is_right)
+            else {
+                b.broken.push(format!("stream {stream}: a commit without memory on loan"));
+                return;
+            };
+            b.check(stream, meta, pixels.len());
+            b.delivered[stream] += 1;
+            // The last frames are enough to look at; all of them would be gigabytes.
+            if b.published.len() >= 64 {
+                b.published.remove(0);
+            }
+            b.published.push(Published { stream, meta: *meta, pixels, fill });
+        });
+    }
+
+    fn discard(&mut self, stream: usize) {
+        self.with(|b| {
+            if b.on_loan.get_mut(stream).and_then(Option::take).is_none() {
+                b.broken.push(format!("stream {stream}: a discard without memory on loan"));
+            }
+        });
+    }
+
+    fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
+        self.with(|b| match b.drops.get_mut(stream) {
+            Some(drops) => drops.add(reason, n),
+            None => b.broken.push(format!("a drop on stream {stream}, which was not started")),
+        });
+    }
+
+    fn captured(&mut self, stream: usize, n: u64) {
+        self.with(|b| match b.captured.get_mut(stream) {
+            Some(captured) => *captured += n,
+            None => b.broken.push(format!("a capture on stream {stream}, which was not started")),
+        });
+    }
+
+    fn clock_quality(&mut self, stream: usize, quality: &ClockQuality) {
+        let is_number = quality.rate_ppm.is_finite();
+        self.with(|b| {
+            if stream >= b.delivered.len() || !is_number {
+                b.broken.push(format!("stream {stream}: a clock quality that is none: {quality:?}"));
+            }
+        });
+    }
+}
+
+/// Waits until `is_done`, at most `patience`.
+pub(super) fn wait_for(patience: Duration, mut is_done: impl FnMut() -> bool) -> bool {
+    let deadline = HostTime::now().plus(patience);
+    while !is_done() {
+        if deadline.from_now().is_zero() {
+            return false;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    true
+}
