@@ -110,7 +110,7 @@ impl Begun {
             let books = s.stream.books();
             Recorded {
                 stream: Arc::clone(&s.stream),
-                captured: books.captured,
+                captured: books.delivered + books.dropped.total(),
                 delivered: books.delivered,
                 dropped: books.dropped,
             }
@@ -153,7 +153,6 @@ impl Recording {
         &mut self,
         id: u64,
         tick: HostTime,
-        spread_ns: i64,
         frames: impl Iterator<Item = (Arc<Stream>, Option<Frame>)>,
     ) {
         let Some(active) = &mut self.active else { return };
@@ -169,6 +168,9 @@ impl Recording {
                 None => missing.push(index),
             }
         }
+        // Of what is recorded: the set may have streams that are not.
+        let times = present.iter().map(|f| f.header.capture_time_ns);
+        let spread_ns = times.clone().max().unwrap_or(0) - times.min().unwrap_or(0);
         let set = RecordSet { id, tick, utc: UtcPair::sample(), frames: present, missing, spread_ns };
         if let Err(e) = active.recorder.push(set) {
             tracing::error!(set = id, reason = e.reason.name(), "a frame set was not recorded: {e}");
@@ -256,13 +258,15 @@ impl Active {
     fn hand_over_accounts(&self) {
         let account = |r: &Recorded| {
             let books = r.stream.books();
+            // A frame that is being written this moment is not accounted for before its fate is known.
+            let captured = books.delivered + books.dropped.total();
             let mut dropped = books.dropped;
             for (now, before) in dropped.0.iter_mut().zip(r.dropped.0) {
                 *now -= before;
             }
             StreamAccount {
                 stream: r.stream.id.clone(),
-                captured: books.captured - r.captured,
+                captured: captured - r.captured,
                 delivered: books.delivered - r.delivered,
                 dropped,
             }

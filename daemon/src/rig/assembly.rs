@@ -182,7 +182,7 @@ impl Assembly {
         self.inner.spreads().add(set.spread_ns);
         let frames =
             self.inputs.iter().zip(set.members).map(|(i, m)| (Arc::clone(&i.stream), m.map(|m| m.item)));
-        self.inner.recording().offer(id, set.tick, set.spread_ns, frames);
+        self.inner.recording().offer(id, set.tick, frames);
     }
 
     /// Puts the accounts where `status` finds them.
