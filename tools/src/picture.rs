@@ -6,10 +6,8 @@ use depthrig_bus::{FrameHeader, PixelFormat};
 use image::{ExtendedColorType, ImageEncoder, RgbImage, codecs::png};
 use std::path::{Path, PathBuf};
 
-/// Nearest depth that a preview tells apart, metres.
-const NEAR_M: f32 = 0.15;
-/// Farthest.
-const FAR_M: f32 = 3.0;
+/// Share of the depths of a picture that get the colours of the ends of the map.
+const TAIL: f64 = 0.02;
 
 /// The rows of a frame without padding between them.
 fn rows<'a>(header: &FrameHeader, pixels: &'a [u8]) -> Result<impl Iterator<Item = &'a [u8]>> {
@@ -43,10 +41,20 @@ pub fn depth_m(header: &FrameHeader, pixels: &[u8]) -> Result<Option<Vec<f32>>> 
     Ok(Some(rows(header, pixels)?.flat_map(|row| read(row, unit)).collect()))
 }
 
+/// The range of colours that shows most of a picture: from one end of its depths to the other, without the tails.
+fn depth_range(depth: &[f32]) -> (f32, f32) {
+    let mut some: Vec<f32> = depth.iter().copied().filter(|z| z.is_finite() && *z > 0.0).step_by(7).collect();
+    some.sort_unstable_by(f32::total_cmp);
+    let at = |share| crate::bench::stats::quantile(&some, share).unwrap_or(1.0);
+    let near = at(TAIL);
+    (near, at(1.0 - TAIL).max(near * 1.01))
+}
+
 /// The frame as a person sees it: colour as it is, depth in colours, 16-bit grey stretched.
 pub fn to_rgb(header: &FrameHeader, pixels: &[u8]) -> Result<RgbImage> {
     if let Some(depth) = depth_m(header, pixels)? {
-        let data = depth.iter().flat_map(|z| depth_color(*z, NEAR_M, FAR_M)).collect();
+        let (near, far) = depth_range(&depth);
+        let data = depth.iter().flat_map(|z| depth_color(*z, near, far)).collect();
         return image_of(header, data);
     }
     let data = match header.pixel_format() {
@@ -138,7 +146,9 @@ mod tests {
         assert_eq!(written, [folder.path().join("d.png"), folder.path().join("d_preview.png")]);
         let read = image::open(&written[0]).unwrap();
         assert_eq!(read.as_luma16().unwrap().as_raw(), &values);
-        assert_eq!(image::open(&written[1]).unwrap().into_rgb8().get_pixel(0, 0).0, [0; 3]);
+        let preview = image::open(&written[1]).unwrap().into_rgb8();
+        assert_eq!(preview.get_pixel(0, 0).0, [0; 3]); // no depth
+        assert_eq!(preview.get_pixel(1, 0).0, crate::turbo::turbo(1.0)); // nearest
     }
 
     #[test]

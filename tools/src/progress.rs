@@ -1,15 +1,20 @@
 //! How long work shows that it goes on: a bar on a terminal, plain lines otherwise, both on stderr.
 
+use core::time::Duration;
+use depthrig_bus::HostTime;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::IsTerminal;
+
+/// Time between plain lines.
+const PLAIN_INTERVAL: Duration = Duration::from_secs(5);
 
 /// Work with a known end.
 #[derive(Debug)]
 pub struct Progress {
     bar: Option<ProgressBar>,
     what: String,
-    /// The last tenth that was told as a plain line.
-    told: Option<u64>,
+    /// When the last plain line was written.
+    told: Option<HostTime>,
     quiet: bool,
 }
 
@@ -40,12 +45,12 @@ impl Progress {
         }
     }
 
-    /// A plain line for each tenth, not for each part.
+    /// A plain line at the start, every few seconds, and at the end.
     fn tell(&mut self, done: u64, total: u64) {
-        let tenth = (done * 10).checked_div(total).unwrap_or(10);
-        if self.told.is_none_or(|told| tenth > told) {
-            eprintln!("{}: {} %", self.what, tenth * 10);
-            self.told = Some(tenth);
+        if done == total || self.told.is_none_or(|told| told.elapsed() >= PLAIN_INTERVAL) {
+            let percent = (done * 100).checked_div(total).unwrap_or(100);
+            eprintln!("{}: {percent} %", self.what);
+            self.told = Some(HostTime::now());
         }
     }
 

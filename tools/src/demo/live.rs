@@ -4,7 +4,7 @@ use super::{Checksums, checksum};
 use crate::picture;
 use anyhow::Result;
 use core::time::Duration;
-use depthrig_bus::{Bus, ErrorKind, Frame, HostTime, MemberRecord, SetSubscriber, StreamId, Subscriber};
+use depthrig_bus::{Bus, ErrorKind, Frame, FrameHeader, MemberRecord, SetSubscriber, StreamId, Subscriber};
 use depthrig_cdm::metrics::{Depth, DepthRange, compare, fill_rate};
 use image::RgbImage;
 use serde::Serialize;
@@ -12,8 +12,10 @@ use std::collections::{BTreeMap, VecDeque};
 
 /// Frames of a stream that are kept until the set that names them comes; the bus lets a subscriber hold 16.
 const KEEP: usize = 14;
-/// Depth is compared with the truth in every so-manieth set: it is the work of a tenth of a second.
+/// Depth of every so-manieth set is kept, to be compared with the truth at the end: here it would hold up frames.
 const COMPARE_EVERY: u64 = 10;
+/// Sets that are compared at most; each is some 25 MB.
+const COMPARE_MOST: usize = 6;
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// What was seen of one camera's depth.
@@ -25,6 +27,8 @@ pub struct DepthSeen {
     pub l1_mm: Option<f64>,
     /// Pictures looked at.
     pub pictures: u64,
+    /// Pictures compared with the truth.
+    pub compared: u64,
 }
 
 /// What was seen of the rig.
@@ -44,6 +48,18 @@ pub struct Seen {
     pub pictures: BTreeMap<String, (Option<RgbImage>, Option<RgbImage>)>,
 }
 
+/// A frame that outlives its slot.
+struct Copied {
+    header: FrameHeader,
+    pixels: Vec<u8>,
+}
+
+impl Copied {
+    fn of(frame: &Frame) -> Self {
+        Self { header: *frame.header(), pixels: frame.pixels().to_vec() }
+    }
+}
+
 struct Input {
     subscriber: Subscriber,
     kept: VecDeque<Frame>,
@@ -54,6 +70,8 @@ pub struct Watcher {
     inputs: BTreeMap<StreamId, Input>,
     sets: SetSubscriber,
     seen: Seen,
+    /// Depth and truth to be compared at the end.
+    to_compare: Vec<Vec<(Copied, Option<Copied>)>>,
 }
 
 impl Watcher {
@@ -64,7 +82,7 @@ impl Watcher {
             let subscriber = bus.subscriber_within(id, PATIENCE)?;
             inputs.insert(id.clone(), Input { subscriber, kept: VecDeque::with_capacity(KEEP) });
         }
-        Ok(Self { inputs, sets: bus.set_subscriber()?, seen: Seen::default() })
+        Ok(Self { inputs, sets: bus.set_subscriber()?, seen: Seen::default(), to_compare: Vec::new() })
     }
 
     /// Takes frames and sets until `ended`.
@@ -92,16 +110,21 @@ impl Watcher {
                 _ => {}
             }
         }
+        for (depth, truth) in self.to_compare.iter().flatten() {
+            let seen = self.seen.depth.entry(depth.header.camera().to_owned()).or_default();
+            seen.add(depth, truth.as_ref())?;
+        }
         for depth in self.seen.depth.values_mut() {
-            let n = depth.pictures.max(1) as f64;
-            depth.fill_percent /= n;
-            depth.l1_mm = depth.l1_mm.map(|sum| sum / n);
+            depth.fill_percent /= depth.pictures.max(1) as f64;
+            depth.l1_mm = depth.l1_mm.map(|sum| sum / depth.compared.max(1) as f64);
         }
         Ok(self.seen)
     }
 
     fn take(&mut self, members: &[MemberRecord]) -> Result<()> {
         self.seen.sets += 1;
+        let compare = self.seen.sets % COMPARE_EVERY == 2 && self.to_compare.len() < COMPARE_MOST;
+        let mut pairs = Vec::new();
         let frame = |id: &StreamId| {
             let sequence = members.iter().find(|m| m.id == *id)?.sequence?;
             self.inputs.get(id)?.kept.iter().find(|f| f.header().sequence == sequence)
@@ -114,11 +137,13 @@ impl Watcher {
             let key = (member.id.clone(), depth.header().capture_time_ns);
             self.seen.checksums.insert(key, checksum(depth.pixels()));
             self.seen.units_mm.insert(member.id.camera.to_string(), depth.header().depth_unit_m * 1e3);
-            if self.seen.sets % COMPARE_EVERY == 1 {
+            if compare {
                 let truth = StreamId::new(member.id.camera.as_str(), "depth_true")?;
-                let seen = self.seen.depth.entry(member.id.camera.to_string()).or_default();
-                seen.add(depth, frame(&truth))?;
+                pairs.push((Copied::of(depth), frame(&truth).map(Copied::of)));
             }
+        }
+        if compare {
+            self.to_compare.push(pairs);
         }
         Ok(())
     }
@@ -147,21 +172,19 @@ impl Input {
 
 impl DepthSeen {
     /// Sums are divided by the number of pictures at the end.
-    fn add(&mut self, depth: &Frame, truth: Option<&Frame>) -> Result<()> {
-        let Some(metres) = picture::depth_m(depth.header(), depth.pixels())? else { return Ok(()) };
+    fn add(&mut self, depth: &Copied, truth: Option<&Copied>) -> Result<()> {
+        let Some(metres) = picture::depth_m(&depth.header, &depth.pixels)? else { return Ok(()) };
         self.pictures += 1;
         self.fill_percent += 100.0 * fill_rate(&Depth::Metres(&metres));
-        let same_moment = |t: &&Frame| {
-            let apart = HostTime::from_ns(t.header().capture_time_ns)
-                .since_ns(HostTime::from_ns(depth.header().capture_time_ns));
-            apart.abs() < 1_000_000
-        };
+        let same_moment =
+            |t: &&Copied| (t.header.capture_time_ns - depth.header.capture_time_ns).abs() < 1_000_000;
         if let Some(truth) = truth.filter(same_moment)
-            && let Some(true_metres) = picture::depth_m(truth.header(), truth.pixels())?
+            && let Some(true_metres) = picture::depth_m(&truth.header, &truth.pixels)?
         {
             let range = DepthRange { min_m: 0.1, max_m: 5.0 };
             let metrics = compare(&Depth::Metres(&metres), &Depth::Metres(&true_metres), range)?;
             if metrics.valid > 0 {
+                self.compared += 1;
                 *self.l1_mm.get_or_insert(0.0) += metrics.l1_m * 1e3;
             }
         }

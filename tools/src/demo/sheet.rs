@@ -3,7 +3,7 @@
 use image::{Rgb, RgbImage, imageops};
 
 /// Height of a picture on the sheet.
-const HEIGHT: u32 = 150;
+const HEIGHT: u32 = 120;
 /// Space between pictures.
 const GAP: u32 = 4;
 /// Cameras side by side.
@@ -48,7 +48,7 @@ mod tests {
         let sheet = contact_sheet([(Some(&red), Some(&blue)), (None, Some(&blue)), (Some(&red), None)]);
         assert_eq!(sheet.height(), 2 * (HEIGHT + 2 * GAP));
         assert_eq!(sheet.get_pixel(GAP + 5, GAP + 5).0, [255, 0, 0]);
-        assert_eq!(sheet.get_pixel(GAP + 200 + GAP + 5, GAP + 5).0, [0, 0, 255]);
+        assert_eq!(sheet.get_pixel(GAP + 160 + GAP + 5, GAP + 5).0, [0, 0, 255]);
         assert_eq!(*sheet.get_pixel(0, 0), BACKGROUND);
     }
 }
