@@ -21,9 +21,10 @@ pub(crate) fn render(world: &World, view: &View<'_>, white: [f32; 3], seed: u64)
     let (w, h) = (view.rays.width, view.rays.height);
     let mut picture = vec![0; w * h * 3];
     let tone = Tone::new(white);
+    let lamp = places_on_lamp();
     picture.par_chunks_mut(w * TILE * 3).enumerate().for_each(|(band, out)| {
         for tile in view.tiles(band * TILE) {
-            let Some(shader) = Shader::new(world, view, &mets, &tile) else { continue };
+            let Some(shader) = Shader::new(world, view, &mets, &tile, &lamp) else { continue };
             for y in tile.ys.clone() {
                 for x in tile.xs.clone() {
                     let met = mets[y * w + x];
@@ -40,6 +41,16 @@ pub(crate) fn render(world: &World, view: &View<'_>, white: [f32; 3], seed: u64)
     picture
 }
 
+/// Four places on the lamp's disc, spread evenly, for each of 16 phases: in metres from its middle.
+fn places_on_lamp() -> [[f32; 2]; 64] {
+    core::array::from_fn(|n| {
+        let (i, phase) = ((n / 16) as f32, (n % 16) as f32);
+        let (sin, cos) = ((i * 0.618 + phase / 16.0) * core::f32::consts::TAU).sin_cos();
+        let radius = LAMP.1 * ((i + 0.2 + phase / 20.0) / 4.0).sqrt();
+        [radius * cos, radius * sin]
+    })
+}
+
 struct Shader<'a> {
     world: &'a World,
     view: &'a View<'a>,
@@ -49,6 +60,7 @@ struct Shader<'a> {
     near: Vec<u16>,
     all: Vec<u16>,
     extent: Ball,
+    lamp: &'a [[f32; 2]; 64],
 }
 
 /// Whose shadows and contacts matter at a spot.
@@ -59,18 +71,25 @@ struct Around<'a> {
 }
 
 impl<'a> Shader<'a> {
-    fn new(world: &'a World, view: &'a View<'a>, mets: &[Met], tile: &Tile) -> Option<Self> {
+    fn new(
+        world: &'a World,
+        view: &'a View<'a>,
+        mets: &[Met],
+        tile: &Tile,
+        lamp: &'a [[f32; 2]; 64],
+    ) -> Option<Self> {
         let extent = view.extent(mets, tile)?;
-        let lamp = Ball { center: LAMP.0, radius: LAMP.1 };
+        let whole_lamp = Ball { center: LAMP.0, radius: LAMP.1 };
         let reach = Ball { center: extent.center, radius: extent.radius + 0.17 };
         Some(Self {
             world,
             view,
             seen: view.in_sight(world, tile),
-            shading: between(world, extent, lamp),
+            shading: between(world, extent, whole_lamp),
             near: between(world, reach, reach),
             all: world.all(),
             extent,
+            lamp,
         })
     }
 
@@ -182,9 +201,8 @@ impl<'a> Shader<'a> {
         let (u, v) = to_lamp.normalize().any_orthonormal_pair();
         let mut seen = 0u32;
         for i in 0..rays {
-            let (sin, cos) = ((i as f32 * 0.618 + phase as f32 / 16.0) * core::f32::consts::TAU).sin_cos();
-            let radius = LAMP.1 * ((i as f32 + 0.2 + phase as f32 / 20.0) / 4.0).sqrt();
-            seen += u32::from(!self.world.is_blocked(shading, spot, LAMP.0 + (u * cos + v * sin) * radius));
+            let [across, up] = self.lamp[(i as usize * 16 + phase) % 64];
+            seen += u32::from(!self.world.is_blocked(shading, spot, LAMP.0 + u * across + v * up));
         }
         seen as f32 / rays as f32
     }

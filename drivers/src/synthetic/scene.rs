@@ -138,7 +138,8 @@ impl World {
             let mut free = room_distance(at).min(reach);
             for i in among {
                 let thing = &self.things[usize::from(*i)];
-                if !thing.is_thin {
+                // Over its own convex solid a spot is as free as it can be.
+                if *i != spot.thing && !thing.is_thin && thing.solid.is_within(at, reach) {
                     free = free.min(thing.solid.distance(at));
                 }
             }

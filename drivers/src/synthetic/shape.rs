@@ -111,6 +111,12 @@ impl Solid {
         }
     }
 
+    /// Whether the surface can be nearer than `reach` to a point of the world; a quick look that may say yes
+    /// too often.
+    pub(crate) fn is_within(&self, p: Vec3, reach: f32) -> bool {
+        (p - self.center).length_squared() < (self.bound + reach) * (self.bound + reach)
+    }
+
     /// Distance of a point of the world from the surface, negative inside.
     pub(crate) fn distance(&self, p: Vec3) -> f32 {
         let q = self.to_local(p);

@@ -1,0 +1,239 @@
+//! The conformance suite can fail: for each promise a back end that breaks just it, and the case that says so.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+use depthrig_bus::{DropReason, HostTime, Name};
+use depthrig_drivers::clock::ClockQuality;
+use depthrig_drivers::conformance::{self, Bench, Cannot, Rig, Sent, Subject, Trouble};
+use depthrig_drivers::synthetic::{
+    FaultKind, Pattern, SimTruth, StreamOverride, SyntheticBackend, SyntheticConfig,
+};
+use depthrig_drivers::{
+    Backend, Device, DeviceInfo, Error, ErrorKind, FrameMeta, FrameSink, Poll, Result, Stream, StreamProfile,
+    StreamRequest,
+};
+use std::time::Duration;
+
+/// A promise, broken.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Sin {
+    None,
+    LastByteUnwritten,
+    FromTheFuture,
+    TimeGoesBack,
+    HidesDrops,
+    PublishesTwice,
+    StallIsAnError,
+    SlowPoll,
+    NotListed,
+    AnyModeWillDo,
+    KeepsTheDevice,
+    LivesOnAfterUnplug,
+}
+
+struct Sinner(Sin, Box<dyn Backend>);
+
+impl Backend for Sinner {
+    fn name(&self) -> &'static str {
+        self.1.name()
+    }
+    fn discover(&self) -> Result<Vec<DeviceInfo>> {
+        if self.0 == Sin::NotListed { Ok(vec![]) } else { self.1.discover() }
+    }
+    fn open(&self, serial: Option<&str>) -> Result<Box<dyn Device>> {
+        Ok(Box::new(SinfulDevice(self.0, self.1.open(serial)?)))
+    }
+}
+
+struct SinfulDevice(Sin, Box<dyn Device>);
+
+impl Device for SinfulDevice {
+    fn info(&self) -> &DeviceInfo {
+        self.1.info()
+    }
+    fn profiles(&self) -> &[StreamProfile] {
+        self.1.profiles()
+    }
+    fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
+        let requests = if self.0 == Sin::AnyModeWillDo { &[] } else { requests };
+        Ok(Box::new(SinfulStream { sin: self.0, inner: Some(self.1.start(requests)?), idle: 0 }))
+    }
+}
+
+struct SinfulStream {
+    sin: Sin,
+    inner: Option<Box<dyn Stream>>,
+    idle: u32,
+}
+
+impl Stream for SinfulStream {
+    fn profiles(&self) -> &[StreamProfile] {
+        self.inner.as_ref().unwrap().profiles()
+    }
+    fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
+        if self.sin == Sin::SlowPoll {
+            std::thread::sleep(Duration::from_millis(150));
+        }
+        let got = self.inner.as_mut().unwrap().poll(timeout, &mut Spoiler(self.sin, sink));
+        match (self.sin, &got) {
+            (Sin::StallIsAnError, Ok(Poll::Idle)) => {
+                self.idle += 1;
+                if self.idle > 3 { Err(Error::new(ErrorKind::Stalled, "no frames")) } else { got }
+            }
+            (Sin::LivesOnAfterUnplug, Err(_)) => Ok(Poll::Idle),
+            _ => got,
+        }
+    }
+}
+
+impl Drop for SinfulStream {
+    fn drop(&mut self) {
+        if self.sin == Sin::KeepsTheDevice {
+            std::mem::forget(self.inner.take());
+        }
+    }
+}
+
+struct Spoiler<'a>(Sin, &'a mut dyn FrameSink);
+
+impl FrameSink for Spoiler<'_> {
+    fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]> {
+        let memory = self.1.loan(stream, len)?;
+        // What the driver does not get, it does not write.
+        if self.0 == Sin::LastByteUnwritten {
+            // A whole frame must be returned, so the driver writes elsewhere.
+            return Some(Box::leak(vec![0; memory.len()].into_boxed_slice()));
+        }
+        Some(memory)
+    }
+    fn commit(&mut self, stream: usize, meta: &FrameMeta) {
+        let mut meta = *meta;
+        match self.0 {
+            Sin::FromTheFuture => meta.capture_time = meta.arrival.plus_ns(1),
+            Sin::TimeGoesBack if meta.device_sequence.is_multiple_of(3) => {
+                meta.capture_time = meta.capture_time.plus_ns(-50_000_000);
+            }
+            _ => {}
+        }
+        self.1.commit(stream, &meta);
+        if self.0 == Sin::PublishesTwice {
+            self.1.commit(stream, &meta);
+        }
+    }
+    fn discard(&mut self, stream: usize) {
+        self.1.discard(stream);
+    }
+    fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
+        if self.0 != Sin::HidesDrops {
+            self.1.dropped(stream, reason, n);
+        }
+    }
+    fn captured(&mut self, stream: usize, n: u64) {
+        self.1.captured(stream, n);
+    }
+    fn clock_quality(&mut self, stream: usize, quality: &ClockQuality) {
+        self.1.clock_quality(stream, quality);
+    }
+}
+
+struct Sinful(Sin);
+
+impl Subject for Sinful {
+    fn name(&self) -> String {
+        format!("{:?}", self.0)
+    }
+    fn make(&self) -> Bench {
+        let depth = StreamOverride {
+            stream: Name::new("depth").unwrap(),
+            size: Some((64, 48)),
+            rate_hz: Some(200.0),
+        };
+        let config = SyntheticConfig {
+            serial: "s".into(),
+            cheap: true,
+            streams: vec![depth],
+            ..SyntheticConfig::default()
+        };
+        let backend = SyntheticBackend::new(vec![config]).unwrap();
+        let rig = Box::new(Hands(backend.truth("s").unwrap()));
+        let requests = vec![StreamRequest::any(Name::new("depth").unwrap())];
+        Bench { backend: Box::new(Sinner(self.0, Box::new(backend))), serial: "s".into(), requests, rig }
+    }
+}
+
+/// Knows only some tricks, so that the suite's "not applicable" shows too.
+struct Hands(SimTruth);
+
+impl Rig for Hands {
+    fn cause(&self, trouble: Trouble) -> std::result::Result<(), Cannot> {
+        let (kind, duration, count) = match trouble {
+            Trouble::Unplug(d) => (FaultKind::Unplug, d, 1),
+            Trouble::Stall(d) => (FaultKind::Stall, d, 1),
+            Trouble::Damaged(n) => (FaultKind::Damaged, Duration::ZERO, n),
+            _ => return Err(Cannot("not taught")),
+        };
+        self.0.inject(kind, duration, count);
+        Ok(())
+    }
+    fn sent(&self, stream: usize) -> Option<Sent> {
+        let l = self.0.ledger(stream);
+        Some(Sent { captured: l.captured, good: l.good, drops: l.drops })
+    }
+    fn true_capture(&self, _: usize, _: HostTime) -> Option<(HostTime, u64)> {
+        None
+    }
+    fn is_genuine(&self, _: usize, pixels: &[u8]) -> Option<bool> {
+        let pattern = Pattern::new(1, "depth", depthrig_bus::PixelFormat::Z16, 64, 48);
+        Some(pattern.identify(pixels).is_some())
+    }
+}
+
+fn caught(sin: Sin, cases: &[&str]) {
+    let report = conformance::run_some(&Sinful(sin), cases);
+    assert_eq!(report.failed(), cases, "{report}");
+}
+
+#[test]
+fn an_honest_back_end_passes_and_says_what_it_cannot() {
+    let report = conformance::run(&Sinful(Sin::None));
+    assert!(report.is_good(), "{report}");
+    let cannot = [
+        "clock",
+        "half_frame",
+        "wrong_size",
+        "repeated",
+        "skip",
+        "time_backwards",
+        "clock_reset",
+        "busy",
+        "hang",
+    ];
+    assert_eq!(report.not_applicable(), cannot);
+    assert_eq!(report.verdicts.len(), conformance::cases().len());
+}
+
+#[test]
+fn frames_that_lie_are_caught() {
+    caught(Sin::LastByteUnwritten, &["every_byte"]);
+    caught(Sin::FromTheFuture, &["frames"]);
+    caught(Sin::TimeGoesBack, &["frames"]);
+    caught(Sin::PublishesTwice, &["frames"]);
+}
+
+#[test]
+fn books_that_are_wrong_are_caught() {
+    caught(Sin::HidesDrops, &["no_slot"]);
+}
+
+#[test]
+fn devices_that_are_not_what_they_say_are_caught() {
+    caught(Sin::NotListed, &["discover"]);
+    caught(Sin::AnyModeWillDo, &["profiles", "unsupported"]);
+    caught(Sin::KeepsTheDevice, &["reopen"]);
+}
+
+#[test]
+fn wrong_answers_to_trouble_are_caught() {
+    caught(Sin::StallIsAnError, &["stall"]);
+    caught(Sin::SlowPoll, &["poll_timeout"]);
+    caught(Sin::LivesOnAfterUnplug, &["unplug"]);
+}
