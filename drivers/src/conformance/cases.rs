@@ -178,9 +178,8 @@ fn unsupported(bench: &Bench) -> Outcome {
     let Some(mode) = device.profiles().first().cloned() else { return fail("the device has no mode") };
     let request = StreamRequest { size: Some((3, 1)), ..StreamRequest::any(mode.stream.clone()) };
     let nothing = Name::new("no_such_stream").map_err(|e| Stop::Failed(e.to_string()))?;
-    let e = match device.start(&[request]) {
-        Ok(_) => return fail("a mode that does not exist was started"),
-        Err(e) => e,
+    let Err(e) = device.start(&[request]) else {
+        return fail("a mode that does not exist was started");
     };
     check(e.kind() == ErrorKind::Unsupported, || format!("{:?}: {e}", e.kind()))?;
     check(e.to_string().contains(&mode.describe()), || format!("the message does not name the modes: {e}"))?;
@@ -392,7 +391,7 @@ fn unplug(bench: &Bench) -> Outcome {
         match running.stream.poll(POLL, &mut sink) {
             Err(e) => break e,
             Ok(_) => {
-                check(!deadline.from_now().is_zero(), || "the unplugged device still answers".to_owned())?
+                check(!deadline.from_now().is_zero(), || "the unplugged device still answers".to_owned())?;
             }
         }
     };

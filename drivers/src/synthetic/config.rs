@@ -318,7 +318,7 @@ mod tests {
                         kind: FaultKind::Hang,
                         duration_s: 1.0,
                         count: 1,
-                    })
+                    });
                 },
                 "Hang",
             ),

@@ -175,3 +175,55 @@ fn trace(world: &World, eye: Vec3, dir: Vec3, met: Met, all: &[u16]) -> (Sample,
     }
     (sample, spot)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::models;
+    use super::super::motion;
+    use super::super::view::Rays;
+    use super::*;
+    use depthrig_bus::Intrinsics;
+
+    fn pair(model: &str, pose: u32) -> (Intrinsics, DepthPair) {
+        let model = models::find(model).unwrap();
+        let k = Intrinsics::pinhole(130.0, 130.0, 119.0, 80.0);
+        let rays = Rays::new(&k, 240, 160);
+        let world = World::new();
+        (k, render(&world, &View::new(&rays, &motion::mount(pose, 12)), model, 5))
+    }
+
+    /// The truth is checked against distances to the solids, which the intersections do not use.
+    #[test]
+    fn every_true_depth_lies_on_a_surface() {
+        let world = World::new();
+        for (name, unit) in [("d405", 0.0001), ("l515", 0.00025)] {
+            let (k, pair) = pair(name, 3);
+            let camera = motion::mount(3, 12);
+            for (i, counts) in pair.truth.iter().enumerate() {
+                let (x, y) = ((i % 240) as f64, (i / 240) as f64);
+                let ray = glam::DVec3::new((x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.0);
+                let p = camera.transform_point3(ray * f64::from(*counts) * unit).as_vec3();
+                let off = world.distance(p).abs();
+                // Half a count along the ray, and the rounding of single precision.
+                let most = (0.5 * unit * ray.length()) as f32 + 3e-6;
+                assert!(off <= most, "({x}, {y}): {off} m from every surface, {most} m allowed");
+            }
+        }
+    }
+
+    #[test]
+    fn the_sensors_see_through_glass_and_into_the_mirror() {
+        let (_, pair) = pair("l515", 6);
+        let deeper = pair.sensed.iter().zip(&pair.truth).filter(|(s, t)| **s > **t + 200); // 5 cm
+        assert!(deeper.count() > 200);
+    }
+
+    #[test]
+    fn what_a_count_cannot_hold_is_no_depth() {
+        assert_eq!(
+            [0.0, 0.04, 6.5535, 6.6, f32::INFINITY, f32::NAN].map(|z| counts(z, 0.0001)),
+            [0, 400, 65535, 0, 0, 0]
+        );
+        assert_eq!(counts(0.0004, 0.001), 0);
+    }
+}

@@ -106,9 +106,9 @@ fn put_override_first(
         let base = modes[0];
         let (width, height) = wish.size.unwrap_or((base.width, base.height));
         let rate_hz = wish.rate_hz.unwrap_or(base.rates_hz[0]);
-        if !((1..=16_384).contains(&width) && (1..=16_384).contains(&height))
-            || !(rate_hz > 0.0 && rate_hz <= 2000.0)
-        {
+        let is_possible =
+            [width, height].iter().all(|n| (1..=16_384).contains(n)) && rate_hz > 0.0 && rate_hz <= 2000.0;
+        if !is_possible {
             let message = format!(
                 "{}: {} of {width}x{height} at {rate_hz} Hz is impossible; sizes go from 1 to 16384, rates to 2000 Hz",
                 config.label(),

@@ -92,31 +92,25 @@ impl World {
     /// The spot that a ray met.
     pub(crate) fn spot(&self, from: Vec3, dir: Vec3, met: Met) -> Spot {
         let p = from + dir * met.t;
-        match self.things.get(usize::from(met.key >> 3)) {
-            Some(thing) => {
-                let local = thing.solid.to_local(p);
-                let normal_local = thing.solid.normal_local(local).0;
-                Spot {
-                    p,
-                    n: thing.solid.axes * normal_local,
-                    local,
-                    normal_local,
-                    paint: thing.paint,
-                    thing: met.key >> 3,
-                }
-            }
-            None => {
-                let n = room_normal(met.key);
-                let paint = if n.z > 0.5 {
-                    Paint::Floor
-                } else if n.z < -0.5 {
-                    Paint::Ceiling
-                } else {
-                    Paint::Wall
-                };
-                Spot { p, n, local: p, normal_local: n, paint, thing: met.key >> 3 }
-            }
+        let thing = met.key >> 3;
+        if let Some(Thing { solid, paint, .. }) = self.things.get(usize::from(thing)) {
+            let local = solid.to_local(p);
+            let normal_local = solid.normal_local(local).0;
+            return Spot { p, n: solid.axes * normal_local, local, normal_local, paint: *paint, thing };
         }
+        let n = room_normal(met.key);
+        let paint = match n.z {
+            z if z > 0.5 => Paint::Floor,
+            z if z < -0.5 => Paint::Ceiling,
+            _ => Paint::Wall,
+        };
+        Spot { p, n, local: p, normal_local: n, paint, thing }
+    }
+
+    /// Distance of a point from the nearest surface, negative inside a solid.
+    #[cfg(test)]
+    pub(crate) fn distance(&self, p: Vec3) -> f32 {
+        self.things.iter().map(|t| t.solid.distance(p)).fold(room_distance(p), f32::min)
     }
 
     /// Adds the face to what was met, so that two faces of a block are told apart.

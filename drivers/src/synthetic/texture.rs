@@ -80,7 +80,7 @@ impl Paint {
         let (albedo, texture) = match self {
             Self::Wood => (0.55, 0.8),
             Self::DarkWood => (0.3, 0.5),
-            Self::Wall => (0.7, 0.3),
+            Self::Wall | Self::Eraser => (0.7, 0.3),
             Self::Floor => (0.4, 0.6),
             Self::Ceiling => (0.8, 0.05),
             Self::Poster => (0.6, 0.9),
@@ -98,7 +98,6 @@ impl Paint {
             Self::Mug => (0.85, 0.04),
             Self::Velvet => (0.015, 0.12),
             Self::Steel => (0.5, 0.05),
-            Self::Eraser => (0.7, 0.3),
             Self::Cutlery => (0.6, 0.45),
         };
         Infrared { albedo, texture }

@@ -172,7 +172,7 @@ impl State {
         self.to_come.last().map(|(at, _)| *at)
     }
 
-    /// The next fault that is due, with its moment as nanoseconds in `at_s`'s place left untouched.
+    /// Takes the next fault that is due.
     pub(crate) fn take_due(&mut self, now: HostTime) -> Option<DueFault> {
         if self.next_fault()? > now {
             return None;

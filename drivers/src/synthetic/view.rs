@@ -33,7 +33,7 @@ impl Rays {
         dirs.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
             for (x, dir) in row.iter_mut().enumerate() {
                 let ray = k.unproject(DVec2::new(x as f64, y as f64));
-                *dir = ray.map_or(Vec3::ZERO, |r| r.as_vec3());
+                *dir = ray.map_or(Vec3::ZERO, glam::DVec3::as_vec3);
             }
         });
         Self { width, height, dirs, pixel_rad: (1.0 / k.fx) as f32 }

@@ -5,7 +5,7 @@
 //! nothing can be matched, and beyond the search range. The matching window makes near things wider.
 
 use super::super::models::{DepthPrinciple, Model};
-use super::super::noise::{Rolls, normal_of, smooth2};
+use super::super::noise::{Rolls, smooth2};
 use super::super::texture::Surface;
 use super::super::view::View;
 use super::Sample;
@@ -55,53 +55,59 @@ struct Matcher {
 }
 
 impl Matcher {
+    /// Depth of one row.
     fn row(&self, y: usize, samples: &[Sample], ideal: &[f32], out: &mut [f32]) {
-        let reach = (self.window * 1.4).ceil() as usize;
-        let h = samples.len() / self.w;
-        // The nearest thing within the window above and below, per column.
-        let above = y.saturating_sub(reach / 2);
-        let below = (y + reach / 2).min(h - 1);
-        for x in 0..self.w {
-            let at = y * self.w + x;
-            let here = &samples[at];
-            let layer = (self.seed & 0xFFFF) as i32;
+        let layer = (self.seed & 0xFFFF) as i32;
+        for (x, z) in out.iter_mut().enumerate() {
             let (fx, fy) = (x as f32 / self.scale, y as f32 / self.scale);
-            let rolls = Rolls::new(self.seed, x as u32, y as u32, 7).bits(0);
             let blotch = smooth2(fx / 9.0, fy / 9.0, layer);
             // How far this window reaches wanders along an edge, as in real pictures.
             let window = (self.window * (0.35 + 1.1 * smooth2(fx / 7.0, fy / 7.0, layer + 1))) as usize;
-            let mut disparity = ideal[at];
-            let mut is_hidden = here.is_hidden;
-            let mut texture = here.texture;
-            for dx in 1..=window {
-                for side in [x.checked_sub(dx), Some(x + dx).filter(|x| *x < self.w)].into_iter().flatten() {
-                    let there = y * self.w + side;
-                    if ideal[there] > disparity + EDGE_PX {
-                        (disparity, is_hidden, texture) =
-                            (ideal[there], samples[there].is_hidden, samples[there].texture);
-                    }
-                }
-            }
-            for there in [above * self.w + x, below * self.w + x] {
-                if ideal[there] > disparity + EDGE_PX && blotch > 0.5 {
-                    (disparity, is_hidden, texture) =
-                        (ideal[there], samples[there].is_hidden, samples[there].texture);
-                }
-            }
-            if is_hidden || disparity <= 0.0 || disparity > self.search_px || (x as f32) < disparity {
+            let found = self.nearest_in_window((x, y), ideal, window, blotch > 0.5);
+            let (disparity, matched) = (ideal[found], &samples[found]);
+            let has_partner = disparity > 0.0 && disparity <= self.search_px && x as f32 >= disparity;
+            if matched.is_hidden || !has_partner {
                 continue;
             }
-            if self.quality(here, texture, disparity) < 0.16 + 0.34 * blotch + 0.05 * normal_of(rolls) {
+            let rolls = Rolls::new(self.seed, x as u32, y as u32, 7);
+            let here = &samples[y * self.w + x];
+            if self.quality(here, matched.texture, disparity) < 0.16 + 0.34 * blotch + 0.05 * rolls.normal(0)
+            {
                 continue;
             }
             // Part of the error is shared by neighbours that share most of a window.
             let shared = smooth2(fx / 5.0, fy / 5.0, layer + 2) - 0.5;
-            let own = normal_of(rolls.rotate_left(32).wrapping_mul(0x9E37_79B9_7F4A_7C15));
-            let sigma = self.sigma_px * (1.5 - 0.5 * texture.min(1.0));
-            let matched = disparity + sigma * (0.55 * own + 3.2 * shared);
-            let step = (matched * SUBPIXEL).round().max(1.0) / SUBPIXEL;
-            out[x] = self.focal_baseline / step;
+            let sigma = self.sigma_px * (1.5 - 0.5 * matched.texture.min(1.0));
+            let noisy = disparity + sigma * (0.55 * rolls.normal(1) + 3.2 * shared);
+            *z = self.focal_baseline / ((noisy * SUBPIXEL).round().max(1.0) / SUBPIXEL);
         }
+    }
+
+    /// The pixel of the window around `(x, y)` whose match wins: that of the nearest thing, when it is nearer
+    /// by more than an edge's step. This is what makes near things wider than they are.
+    fn nearest_in_window(
+        &self,
+        (x, y): (usize, usize),
+        ideal: &[f32],
+        window: usize,
+        is_tall: bool,
+    ) -> usize {
+        let (w, h) = (self.w, ideal.len() / self.w);
+        let mut best = y * w + x;
+        let mut consider = |at: usize| {
+            if ideal[at] > ideal[best] + EDGE_PX {
+                best = at;
+            }
+        };
+        for at in y * w + x.saturating_sub(window)..=y * w + (x + window).min(w - 1) {
+            consider(at);
+        }
+        if is_tall {
+            let half = window.div_ceil(2);
+            consider(y.saturating_sub(half) * w + x);
+            consider((y + half).min(h - 1) * w + x);
+        }
+        best
     }
 
     /// How surely a match is found, about 0..1; below the threshold of about 0.3 there is a hole.

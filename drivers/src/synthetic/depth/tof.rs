@@ -40,7 +40,7 @@ pub(super) fn measure(view: &View<'_>, model: &Model, samples: &[Sample], seed: 
             }
             let mixed = mix_at_edge(samples, (w, h), (x, y), rolls.unit(1));
             let detour = multipath_m * (1.0 - here.open) * (1.0 + here.albedo) * 0.8;
-            // Glass sends part of the light back itself, which pulls the depth towards it.
+            // Weak light is noisy light.
             let sigma = sigma_m * (0.35 + 0.65 * here.z) * (0.25 / signal.max(0.02)).sqrt().clamp(0.6, 4.0);
             *z = mixed + detour + sigma * normal_of(rolls.bits(0));
         }
