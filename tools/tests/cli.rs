@@ -1,0 +1,227 @@
+//! The binary as a person meets it: exit codes, messages, and one rig from start to stop.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "support/home.rs"]
+mod support;
+
+use std::path::Path;
+use support::{Home, depthrig};
+
+#[test]
+fn wrong_usage_is_2_and_says_what_was_meant() {
+    let ran = depthrig().args(["statsu"]).output().unwrap();
+    assert_eq!(ran.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&ran.stderr).contains("status"));
+    for bad in [
+        &["run"][..],
+        &["tap", "no-slash"],
+        &["demo", "--seconds", "0"],
+        &["tap", "a/b", "--count", "0"],
+        &["status", "--rig", "Bad Name"],
+    ] {
+        let ran = Home::new().run(bad);
+        assert_eq!(ran.code, 2, "{bad:?}: {}", ran.err);
+    }
+}
+
+#[test]
+fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
+    let help = Home::new().run(&["--help"]).good();
+    assert!(help.contains("Exit codes:"));
+    let folder = tempfile::tempdir().unwrap();
+    Home::new().run(&["man", "--out", folder.path().to_str().unwrap()]).good();
+    for command in ["demo", "run", "record", "status", "top", "replay", "info", "verify", "config", "tap", "bench", "completions", "man"]
+    {
+        assert!(help.lines().any(|l| l.trim_start().starts_with(command)), "{command} is not in --help");
+        let text = Home::new().run(&[command, "--help"]).good();
+        assert!(text.lines().all(|l| l.chars().count() <= 120), "{command} --help has a long line");
+        assert!(folder.path().join(format!("depthrig-{command}.1")).exists(), "{command} has no manual page");
+    }
+    assert!(!help.contains("bench-reader"));
+    for shell in ["bash", "zsh", "fish"] {
+        assert!(Home::new().run(&["completions", shell]).good().contains("depthrig"), "{shell}");
+    }
+}
+
+#[test]
+fn without_a_rig_commands_say_how_to_start_one() {
+    let home = Home::new();
+    for command in [&["status"][..], &["record", "stop"], &["tap", "d435/depth"], &["status", "--json"]] {
+        let ran = home.run(command);
+        assert_eq!(ran.code, 1, "{command:?}");
+        assert!(ran.err.starts_with("depthrig: error: no rig"), "{command:?}: {}", ran.err);
+        assert!(ran.err.contains("depthrig run"), "{command:?}: {}", ran.err);
+        assert_eq!(ran.out, "");
+    }
+}
+
+#[test]
+fn top_needs_a_terminal_and_a_rig() {
+    let ran = Home::new().run(&["top"]);
+    assert_ne!(ran.code, 0);
+    assert!(!ran.out.contains('\x1b'), "a pipe must not get terminal codes");
+}
+
+#[test]
+fn config_show_is_a_configuration_that_check_accepts() {
+    let home = Home::new();
+    let text = home.run(&["config", "show"]).good();
+    let file = home.write("rig.toml", &text);
+    let said = home.run(&["config", "check", &file]).good();
+    assert!(said.contains("good") && said.contains("7 cameras"), "{said}");
+}
+
+#[test]
+fn config_check_names_every_problem_with_its_line() {
+    let home = Home::new();
+    let text = "rig = \"mount\"\n\n[sets]\nrate_hzz = 5.0\n\n[[camera]]\nname = \"Cam\"\nbackend = \"synthetic\"\nmodel = \"d435\"\n";
+    let file = home.write("rig.toml", text);
+    let ran = home.run(&["config", "check", &file]);
+    assert_eq!(ran.code, 2, "{}", ran.err);
+    assert!(ran.err.contains("rig.toml:4:") && ran.err.contains("rate_hz"), "{}", ran.err);
+    assert!(ran.err.contains("rig.toml:7:"), "{}", ran.err);
+    let ran = home.run(&["run", &file]);
+    assert_eq!(ran.code, 2, "{}", ran.err);
+}
+
+#[test]
+fn what_is_no_dataset_is_refused_by_name() {
+    let home = Home::new();
+    let text = home.write("notes.txt", "no dataset");
+    for command in ["info", "verify"] {
+        for path in ["does/not/exist", &text] {
+            let ran = home.run(&[command, path]);
+            assert_eq!(ran.code, 1, "{command} {path}: {}", ran.err);
+            assert!(ran.err.starts_with("depthrig: error: ") && ran.err.contains(path), "{command}: {}", ran.err);
+        }
+    }
+    let ran = home.run(&["replay", &text]);
+    assert_ne!(ran.code, 0);
+    assert!(ran.err.contains("notes.txt"), "{}", ran.err);
+}
+
+#[test]
+fn a_closed_pipe_ends_quietly() {
+    let mut child = depthrig()
+        .args(["config", "show"])
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(child.stdout.take());
+    let ran = child.wait_with_output().unwrap();
+    assert_eq!(String::from_utf8_lossy(&ran.stderr), "");
+    assert_eq!(ran.status.code(), Some(0));
+}
+
+#[test]
+fn the_whole_way_of_a_small_rig() {
+    let home = Home::new();
+    home.pictures(6);
+    let rig = home.rig_file("small");
+    let running = home.start(&["run", &rig, "-q"]);
+    home.wait_for_rig("small");
+
+    let status: serde_json::Value = serde_json::from_str(&home.run(&["status", "--json"]).good()).unwrap();
+    assert_eq!(status["rig"], "small");
+    assert_eq!(status["cameras"][0]["state"], "streaming");
+    let text = home.run(&["status"]).good();
+    assert!(text.contains("desk/depth") && !text.contains('\x1b'), "{text}");
+
+    let again = home.run(&["run", &rig]);
+    assert_eq!(again.code, 1);
+    assert!(again.err.contains("running already") && again.err.contains(&running.id().to_string()), "{}", again.err);
+
+    let pictures = home.path().join("tapped");
+    let said = home.run(&["tap", "desk/depth", "--count", "2", "--png", pictures.to_str().unwrap()]).good();
+    assert_eq!(said.lines().filter(|l| l.starts_with("desk/depth #")).count(), 2, "{said}");
+    let files: Vec<_> = std::fs::read_dir(&pictures).unwrap().map(|e| e.unwrap().path()).collect();
+    assert_eq!(files.len(), 4, "{files:?}");
+    let depth = files.iter().find(|f| !f.to_str().unwrap().contains("preview")).unwrap();
+    assert!(home.is_a_source(depth), "the tapped depth is none of the pictures that the camera plays");
+    let unknown = home.run(&["tap", "desk/infrared"]);
+    assert_eq!(unknown.code, 1);
+    assert!(unknown.err.contains("desk/depth"), "it names the streams that there are: {}", unknown.err);
+
+    let out = home.path().join("data");
+    let none = home.run(&["record", "stop"]);
+    assert_eq!(none.code, 1, "{}", none.err);
+    home.run(&["record", "start", "--out", out.to_str().unwrap(), "--name", "first", "--scene", "desk"]).good();
+    let twice = home.run(&["record", "start", "--out", out.to_str().unwrap()]);
+    assert_eq!(twice.code, 1);
+    assert!(twice.err.contains("first"), "{}", twice.err);
+    home.run(&["record", "note", "the cup was moved"]).good();
+    home.wait_for_sets(5);
+    home.run(&["record", "stop"]).good();
+    let summary = running.interrupt();
+    assert_eq!(summary.code, 0, "{}\n{}", summary.out, summary.err);
+
+    let dataset = out.join("first");
+    check_dataset(&home, &dataset);
+}
+
+fn check_dataset(home: &Home, dataset: &Path) {
+    let path = dataset.to_str().unwrap();
+    let info: serde_json::Value = serde_json::from_str(&home.run(&["info", path, "--json"]).good()).unwrap();
+    assert_eq!((&info["rig"], &info["scene"]), (&"small".into(), &"desk".into()));
+    let sets = info["sets"].as_u64().unwrap();
+    assert!(sets >= 5, "{sets} sets");
+    let said = home.run(&["verify", path, "--decode"]).good();
+    assert!(said.contains("whole"), "{said}");
+
+    let replay: serde_json::Value =
+        serde_json::from_str(&home.run(&["replay", path, "--as-fast-as-possible", "--json", "-q"]).good()).unwrap();
+    assert_eq!(replay["sets"].as_u64(), Some(sets));
+
+    // One byte in the middle of a picture.
+    let segment = dataset.join("seg_0000.mcap");
+    let mut bytes = std::fs::read(&segment).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&segment, bytes).unwrap();
+    let broken = home.run(&["verify", path]);
+    assert_eq!(broken.code, 1, "{}{}", broken.out, broken.err);
+    assert!(broken.out.contains("broken: seg_0000.mcap"), "{}", broken.out);
+}
+
+#[test]
+fn run_ends_after_its_time_and_records_what_it_was_told() {
+    let home = Home::new();
+    home.pictures(4);
+    let rig = home.rig_file("timed");
+    let out = home.path().join("data");
+    let said = home
+        .run(&["run", &rig, "--record", out.to_str().unwrap(), "--scene", "shelf", "--seconds", "1.5", "--json", "-q"])
+        .good();
+    let summary: serde_json::Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(summary["lost"].as_array().unwrap().len(), 0);
+    let path = summary["recording"]["path"].as_str().unwrap();
+    assert!(path.ends_with("shelf"), "{path}");
+    home.run(&["verify", path]).good();
+}
+
+#[test]
+fn sigterm_closes_the_recording() {
+    let home = Home::new();
+    home.pictures(4);
+    let rig = home.rig_file("term");
+    let out = home.path().join("data");
+    let running = home.start(&["run", &rig, "--record", out.to_str().unwrap(), "-q"]);
+    home.wait_for_rig("term");
+    home.wait_for_sets(2);
+    let ended = running.signal("TERM");
+    assert_eq!(ended.code, 0, "{}", ended.err);
+    let dataset = std::fs::read_dir(&out).unwrap().next().unwrap().unwrap().path();
+    home.run(&["verify", dataset.to_str().unwrap()]).good();
+}
+
+#[test]
+fn an_output_that_cannot_be_written_is_named() {
+    let home = Home::new();
+    home.pictures(2);
+    let rig = home.rig_file("blocked");
+    let file = home.write("in_the_way", "a file, no folder");
+    let ran = home.run(&["run", &rig, "--record", &file, "--seconds", "1"]);
+    assert_ne!(ran.code, 0);
+    assert!(ran.err.contains("in_the_way"), "{}", ran.err);
+}
