@@ -24,6 +24,11 @@ use std::path::{Path, PathBuf};
 
 /// The highest rate that a camera or the sets may have, Hz.
 pub const MAX_RATE_HZ: f64 = 1000.0;
+/// The most sets that may wait for the encoders: what waits keeps its slots in shared memory, and with the frames
+/// that the set thread holds and those being encoded that must stay below what a subscriber may hold (16).
+pub const MAX_QUEUE_SETS: usize = 6;
+/// The most threads that encode; each may keep one more set's slots.
+pub const MAX_WORKERS: usize = 4;
 /// The most cameras that a rig may have: as many as a frame set's mask has bits.
 pub const MAX_CAMERAS: usize = 64;
 

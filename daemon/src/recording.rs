@@ -1,6 +1,6 @@
 //! Recording under control of the daemon: start, stop, notes, and the numbers that go with it.
 
-use crate::config::{ColorCodec, RecordingConfig, RigConfig};
+use crate::config::{RecordingConfig, RigConfig};
 use crate::control::RecordRequest;
 use crate::status::RecordingStatus;
 use crate::stream::Stream;
@@ -351,10 +351,7 @@ fn record_of(s: &StreamFacts) -> StreamRecord {
 fn options_of(config: &RecordingConfig) -> RecorderOptions {
     let mut options = RecorderOptions {
         jpeg_quality: config.jpeg_quality,
-        color: match config.color {
-            ColorCodec::Jpeg => depthrig_recorder::ColorCodec::Jpeg,
-            ColorCodec::Raw => depthrig_recorder::ColorCodec::Raw,
-        },
+        color: config.color,
         segment_max_bytes: config.segment_max_mb << 20,
         segment_max_ns: config.segment_max_s as i64 * 1_000_000_000,
         queue_sets: config.queue_sets,

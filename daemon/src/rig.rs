@@ -81,6 +81,8 @@ pub struct Inner {
     shared: Arc<Shared>,
     cameras: Vec<Arc<Camera>>,
     stop_asked: AtomicBool,
+    /// The cameras are being stopped.
+    ending: AtomicBool,
     ended: Wake,
     started: HostTime,
     recording: Mutex<Recording>,
@@ -129,6 +131,7 @@ impl Rig {
             config,
             shared,
             stop_asked: AtomicBool::new(false),
+            ending: AtomicBool::new(false),
             ended: Wake::default(),
             started: HostTime::now(),
             recording: Mutex::default(),
@@ -188,6 +191,7 @@ impl Rig {
         if let Some(api) = self.api.take() {
             api.stop();
         }
+        self.inner.ending.store(true, Ordering::Relaxed);
         // In the order of `spawn`: the cameras end first, then the set thread reads what they left.
         for (thread, stop) in self.threads.drain(..) {
             stop.store(true, Ordering::Relaxed);

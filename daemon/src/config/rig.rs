@@ -82,8 +82,8 @@ fn recording(top: &Section<'_, '_>, base: &Path) -> RecordingConfig {
         color: s.choice("color", &[("jpeg", ColorCodec::Jpeg), ("raw", ColorCodec::Raw)], d.color),
         segment_max_mb: s.or("segment_max_mb", d.segment_max_mb, within(1..=1 << 20)),
         segment_max_s: s.or("segment_max_s", d.segment_max_s, within(1..=86_400)),
-        workers: s.or("workers", d.workers, within(0..=256)),
-        queue_sets: s.or("queue_sets", d.queue_sets, within(1..=1024)),
+        workers: s.or("workers", d.workers, within(0..=super::MAX_WORKERS)),
+        queue_sets: s.or("queue_sets", d.queue_sets, within(1..=super::MAX_QUEUE_SETS)),
         reserve_mb: s.or("reserve_mb", d.reserve_mb, within(0..=1 << 30)),
     };
     s.finish();

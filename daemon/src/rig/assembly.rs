@@ -54,16 +54,18 @@ impl Assembly {
     pub fn run(mut self, stop: &AtomicBool) {
         while !stop.load(Ordering::Relaxed) {
             self.find_streams();
-            let now = HostTime::now();
             let deadline = self.assembler.as_ref().and_then(Assembler::next_deadline);
             let sleep = deadline.map_or(IDLE, |d| d.from_now().min(IDLE)).max(Duration::from_millis(1));
             self.inner.shared.frames.wait(sleep);
             self.read_frames();
-            self.send_sets(HostTime::now().max(now));
+            // While the cameras are being stopped, sets would miss those that ended first.
+            if !self.inner.ending.load(Ordering::Relaxed) {
+                self.send_sets();
+            }
         }
-        // Frames that were on their way when the rig stopped still count.
+        // Frames that were on their way when the cameras stopped still count.
         self.read_frames();
-        self.send_sets(HostTime::now());
+        self.report();
     }
 
     /// Takes in the streams of cameras that opened since the last look.
@@ -148,7 +150,8 @@ impl Assembly {
         }
     }
 
-    fn send_sets(&mut self, now: HostTime) {
+    fn send_sets(&mut self) {
+        let now = HostTime::now();
         while let Some(set) = self.assembler.as_mut().and_then(|a| a.poll(now)) {
             self.send(set);
         }
