@@ -14,7 +14,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 /// Goes up with every change of what is rendered, so that older caches are not used.
-const RENDER_VERSION: u32 = 1;
+const RENDER_VERSION: u32 = 2;
 
 /// Says how many of how many pictures are ready.
 pub type Progress<'a> = &'a (dyn Fn(usize, usize) + Sync);

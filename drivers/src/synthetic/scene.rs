@@ -235,7 +235,7 @@ impl Builder {
         let glass = middle + stand * Vec3::new(0.0, -0.007, 0.0);
         self.add(Shape::Block { half: Vec3::new(0.103, 0.002, 0.123) }, glass, stand, Paint::Mirror);
         // A pane of glass in a foot, and a ball behind it.
-        self.block([0.1, 0.003, 0.085], [0.2, 0.06, 0.097], 12.0, Paint::Glass);
+        self.block([0.1, 0.003, 0.085], [0.2, 0.06, 0.1005], 12.0, Paint::Glass);
         self.block([0.115, 0.016, 0.007], [0.2, 0.06, 0.007], 12.0, Paint::DarkWood);
         self.ball(0.045, [0.21, 0.17, 0.045], turned(40.0), Paint::Green);
         // Boxes.
