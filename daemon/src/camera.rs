@@ -48,6 +48,10 @@ pub struct State {
     pub info: Option<DeviceInfo>,
     /// Its streams, once it was open; they stay the same over reconnects.
     pub streams: Vec<Arc<Stream>>,
+    /// Bytes of one frame of every stream, once it was open.
+    pub set_bytes: u64,
+    /// Shared memory is too small for it.
+    pub short_of_memory: bool,
     /// Times that it came back.
     pub reconnects: u64,
 }
@@ -62,6 +66,8 @@ impl Camera {
             error: None,
             info: None,
             streams: Vec::new(),
+            set_bytes: 0,
+            short_of_memory: false,
             reconnects: 0,
         };
         Self { config, state: Mutex::new(state) }
@@ -100,6 +106,8 @@ pub struct Shared {
     pub memory_share: u64,
     /// Slots per stream when memory is plenty.
     pub slots: usize,
+    /// When the rig began: the beginning of time for simulated cameras.
+    pub began: HostTime,
     /// Supervision settings.
     pub supervisor: SupervisorConfig,
 }
@@ -313,7 +321,7 @@ fn open_session(
         let mut backend = backend.lock().unwrap_or_else(PoisonError::into_inner);
         let backend = match backend.as_ref() {
             Some(backend) => backend,
-            None => backend.insert(make_backend(&camera.config.backend).map_err(in_camera)?),
+            None => backend.insert(make_backend(&camera.config.backend, shared.began).map_err(in_camera)?),
         };
         backend.open(None).map_err(in_camera)?
     };
@@ -342,10 +350,14 @@ fn open_session(
     Ok(Session { info, stream, sink: Box::new(BusSink::new(ports, Arc::clone(&shared.frames))) })
 }
 
-fn make_backend(config: &BackendConfig) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {
+fn make_backend(
+    config: &BackendConfig,
+    began: HostTime,
+) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {
     use depthrig_drivers::{files::FilesBackend, synthetic::SyntheticBackend};
     Ok(match config {
-        BackendConfig::Synthetic(c) => Box::new(SyntheticBackend::new(vec![c.clone()])?),
+        // One beginning for all cameras of the rig, or each would see the world at another moment.
+        BackendConfig::Synthetic(c) => Box::new(SyntheticBackend::starting_at(vec![c.clone()], began)?),
         BackendConfig::Files(c) => Box::new(FilesBackend::new(c.clone())),
     })
 }
@@ -370,8 +382,10 @@ fn adopt(
     let mut state = camera.state();
     state.info = Some(info.clone());
     if state.streams.is_empty() {
-        let set_bytes = profiles.iter().map(|p| p.frame_bytes() as u64).sum();
-        let slots = shm::slots_that_fit(shared.slots, set_bytes, shared.memory_share).map_err(|e| {
+        state.set_bytes = profiles.iter().map(|p| p.frame_bytes() as u64).sum();
+        let slots = shm::slots_that_fit(shared.slots, state.set_bytes, shared.memory_share);
+        state.short_of_memory = slots.is_err();
+        let slots = slots.map_err(|e| {
             depthrig_drivers::Error::new(DriverErrorKind::Unsupported, e.to_string()).with_source(e)
         })?;
         let stream = |p: &StreamProfile| {

@@ -122,6 +122,7 @@ impl Rig {
         let shared = Arc::new(Shared {
             memory_share: shm::free_bytes(shm::SHM_DIR.as_ref())? / config.cameras.len().max(1) as u64,
             slots: config.bus.slots,
+            began: HostTime::now(),
             supervisor: config.supervisor.clone(),
             frames: Arc::default(),
             bus,
@@ -213,6 +214,18 @@ impl Rig {
         Ok(())
     }
 
+    /// Says once what each camera that found too little shared memory says of its share.
+    fn check_memory(&self) -> Result<()> {
+        let cameras = &self.inner.cameras;
+        if !cameras.iter().any(|c| c.state().short_of_memory) {
+            return Ok(());
+        }
+        let set_bytes: u64 = cameras.iter().map(|c| c.state().set_bytes).sum();
+        let free = self.inner.shared.memory_share * cameras.len() as u64;
+        shm::slots_that_fit(shm::MIN_SLOTS, set_bytes, free)?;
+        Ok(()) // it would do if the cameras were alike; each says what it lacks
+    }
+
     /// Waits for the first word of every camera. One whose settings cannot work fails the start: better now
     /// than after an hour of recording without it.
     fn wait_for_cameras(&self) -> Result<()> {
@@ -222,6 +235,7 @@ impl Rig {
         {
             std::thread::sleep(Duration::from_millis(5));
         }
+        self.check_memory()?;
         let mut failed: Vec<Error> = Vec::new();
         for camera in &self.inner.cameras {
             let mut state = camera.state();

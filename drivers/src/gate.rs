@@ -64,6 +64,8 @@ pub enum Outcome {
 
 /// How far back a frame counter may step and still be a late or repeated frame rather than a restart.
 const REORDER_WINDOW: u64 = 64;
+/// So many frames behind the newest, each the successor of the last, are no stragglers: the counter restarted.
+const RESTARTING_FRAMES: u32 = 4;
 
 /// The gate of one stream.
 #[derive(Debug)]
@@ -76,6 +78,8 @@ pub struct Gate {
     clock: ClockMap,
     /// Newest unwrapped sequence number, and which of the 64 before it were seen (bit 0 = the newest).
     newest: Option<(u64, u64)>,
+    /// The last frame behind the newest, and how many in a row came before it, itself included.
+    behind: Option<(u64, u32)>,
     captured: u64,
     delivered: u64,
     drops: DropCounts,
@@ -97,6 +101,7 @@ impl Gate {
             domain: profile.clock.domain,
             clock: ClockMap::new(clock),
             newest: None,
+            behind: None,
             captured: 0,
             delivered: 0,
             drops: DropCounts::default(),
@@ -230,6 +235,7 @@ impl Gate {
         // Signed distance on the counter's own circle.
         let step = ((raw.device_sequence << shift).wrapping_sub(newest << shift) as i64) >> shift;
         if step > 0 {
+            self.behind = None;
             let step = step as u64;
             self.capture(step, sink);
             self.lose(DropReason::DeviceGap, step - 1, sink);
@@ -238,7 +244,12 @@ impl Gate {
             return Some(Ok(newest + step));
         }
         let back = step.unsigned_abs();
-        if back < REORDER_WINDOW && back <= newest {
+        let in_a_row = match self.behind {
+            Some((last, n)) if last.wrapping_add(1) == raw.device_sequence => n + 1,
+            _ => 1,
+        };
+        self.behind = Some((raw.device_sequence, in_a_row));
+        if back < REORDER_WINDOW && back <= newest && in_a_row < RESTARTING_FRAMES {
             if seen & (1 << back) == 0 {
                 self.newest = Some((newest, seen | (1 << back)));
                 return None;
@@ -248,6 +259,7 @@ impl Gate {
         }
         // The counter restarted: the device was reset. How many frames it lost meanwhile nobody knows.
         self.capture(1, sink);
+        self.behind = None;
         self.newest = Some((raw.device_sequence, 1));
         Some(Ok(raw.device_sequence))
     }

@@ -90,15 +90,19 @@ fn a_failing_and_a_panicking_driver_end_with_their_reason() {
 #[test]
 fn a_hung_device_is_abandoned_and_publishes_nothing_when_it_wakes() {
     let sink = Counting::default();
-    let wake = Arc::new(AtomicBool::new(false));
-    let woken = Arc::clone(&wake);
+    let (wake, hanging) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
+    let (woken, hangs) = (Arc::clone(&wake), Arc::clone(&hanging));
     let capture = start(&sink, move |_, sink| {
+        hangs.store(true, Ordering::SeqCst);
         while !woken.load(Ordering::SeqCst) {
             std::thread::sleep(Duration::from_millis(1)); // ignores its timeout, as a stuck ioctl does
         }
         sink.commit(0, &meta());
         Ok(Poll::Frame)
     });
+    while !hanging.load(Ordering::SeqCst) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
     let began = HostTime::now();
     assert!(matches!(capture.stop(Duration::from_millis(100)), StopOutcome::Abandoned));
     assert!(began.elapsed() < Duration::from_secs(2));

@@ -61,6 +61,18 @@ fn a_reset_counter_is_no_gap() {
 }
 
 #[test]
+fn a_counter_reset_soon_after_the_start_costs_three_frames() {
+    let (mut gate, mut sink) = (Gate::new(0, &profile(32, ClockDomain::Device)), MemorySink::default());
+    let sequence = (1..=30).chain(1..=30);
+    let delivered = sequence
+        .enumerate()
+        .filter(|(i, s)| feed(&mut gate, &mut sink, &raw(*s, *i as i64)) == Outcome::Delivered)
+        .count();
+    assert_eq!(delivered, 57, "three frames are taken for repeated ones, then the restart is certain");
+    assert_eq!((gate.captured(), gate.drops().get(DropReason::OutOfOrder)), (60, 3));
+}
+
+#[test]
 fn broken_frames_are_dropped_with_their_reason() {
     let (mut gate, mut sink) = (Gate::new(0, &profile(32, ClockDomain::Device)), MemorySink::default());
     let mut frame = raw(1, 0);

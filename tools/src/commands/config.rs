@@ -3,7 +3,10 @@
 use crate::exit::Exit;
 use crate::out;
 use anyhow::Result;
-use depthrig_daemon::config::RigConfig;
+use depthrig_daemon::ErrorKind;
+use depthrig_daemon::config::{BackendConfig, RigConfig};
+use depthrig_drivers::Backend;
+use depthrig_drivers::files::FilesBackend;
 use std::path::PathBuf;
 
 /// Examples for `--help`.
@@ -30,9 +33,17 @@ pub fn run(command: &ConfigCommand) -> Result<Exit> {
         ConfigCommand::Show => out::line(RigConfig::default_text().trim_end())?,
         ConfigCommand::Check { file } => {
             let config = RigConfig::load(file).map_err(depthrig_daemon::Error::from)?;
-            let streams: usize = config.cameras.iter().map(|c| c.streams.len()).sum();
+            // Pictures are part of what must be right, and cost little to look at; cameras may be unplugged now.
+            for camera in &config.cameras {
+                if let BackendConfig::Files(settings) = &camera.backend {
+                    FilesBackend::new(settings.clone()).discover().map_err(|e| {
+                        let message = format!("camera \"{}\": {e}", camera.name);
+                        depthrig_daemon::Error::new(ErrorKind::BadInput, message).with_source(e)
+                    })?;
+                }
+            }
             out::line(format_args!(
-                "{}: good: rig \"{}\", {} cameras, {streams} streams, sets at {} Hz",
+                "{}: good: rig \"{}\", {} cameras, sets at {} Hz",
                 file.display(),
                 config.rig,
                 config.cameras.len(),
