@@ -14,7 +14,7 @@ REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt
 .PHONY: help demo test lint bench clean setup-build setup-test
 
 help: ## show this list
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1|/' | column -t -s '|'
+	@sed -nE 's/^([a-z-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-7s %s\n", $$1, $$2}'
 
 demo: setup-build ## the seven-camera rig with synthetic cameras: record, verify, replay, report
 	cargo build --release --package depthrig

@@ -23,11 +23,11 @@ if [ ! -d "$DEPTHRIG_TEST_DATA" ]; then
 fi
 
 step rust cargo test --workspace --no-fail-fast --quiet
-cargo build --quiet --package depthrig --bin depthrig || exit 1
-cargo build --quiet --package depthrig-bus --example publish || exit 1
-cargo build --quiet --package depthrig-recorder --example golden || exit 1
-export DEPTHRIG_BIN=$PWD/target/debug/depthrig
-export DEPTHRIG_TEST_PUBLISHER=$PWD/target/debug/examples/publish
+# The same selection as above, so that nothing is compiled twice with other features.
+cargo build --workspace --bins --examples --quiet || exit 1
+target=${CARGO_TARGET_DIR:-$PWD/target}/debug
+export DEPTHRIG_BIN=$target/depthrig
+export DEPTHRIG_TEST_PUBLISHER=$target/examples/publish
 
 step python "$python" -m pytest --quiet python/tests
 step daemon "$python" -m pytest --quiet tests/python
@@ -35,7 +35,7 @@ step daemon "$python" -m pytest --quiet tests/python
 # Readers that are not ours must find the same pixels.
 work=$(mktemp --directory)
 trap 'rm -rf "$work"' EXIT
-step golden target/debug/examples/golden "$work/dataset" "$work/expected"
+step golden "$target/examples/golden" "$work/dataset" "$work/expected"
 step reader-python "$python" tests/readers/check_python.py "$work/dataset" "$work/expected"
 step reader-node node tests/readers/check_node.mjs "$work/dataset" "$work/expected"
 

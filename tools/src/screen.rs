@@ -4,8 +4,10 @@ use anyhow::{Context, Result};
 use core::time::Duration;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::termios::{self, LocalModes, OptionalActions, Termios};
-use std::io::{IsTerminal, Read, Write};
+use std::io::{IsTerminal, Read, Stdout, Write};
 
+/// Columns and rows of a terminal that does not say.
+pub const USUAL: (usize, usize) = (80, 24);
 const ENTER: &str = "\x1b[?1049h\x1b[?25l";
 const LEAVE: &str = "\x1b[?25h\x1b[?1049l";
 const HOME: &str = "\x1b[H";
@@ -14,6 +16,7 @@ const CLEAR_BELOW: &str = "\x1b[J";
 
 /// The page. Dropping it gives the terminal back as it was.
 pub struct Screen {
+    out: Stdout,
     before: Option<Termios>,
 }
 
@@ -39,14 +42,9 @@ impl Screen {
             termios::tcsetattr(std::io::stdin(), OptionalActions::Now, &raw)
                 .context("the terminal cannot be set up")?;
         }
-        let screen = Self { before };
-        write(ENTER)?;
+        let screen = Self { out, before };
+        screen.write(ENTER)?;
         Ok(screen)
-    }
-
-    /// Columns and rows.
-    pub fn size(&self) -> (usize, usize) {
-        size().unwrap_or((80, 24))
     }
 
     /// Draws `text` from the top; what does not fit is left out.
@@ -54,7 +52,7 @@ impl Screen {
     /// # Errors
     /// When the terminal is gone.
     pub fn draw(&self, text: &str) -> Result<()> {
-        let (width, height) = self.size();
+        let (width, height) = size().unwrap_or(USUAL);
         let mut page = HOME.to_owned();
         for (i, line) in text.lines().take(height).enumerate() {
             page.push_str(if i == 0 { "" } else { "\r\n" });
@@ -62,7 +60,14 @@ impl Screen {
             page.push_str(CLEAR_LINE);
         }
         page.push_str(CLEAR_BELOW);
-        write(&page)
+        self.write(&page)
+    }
+
+    fn write(&self, text: &str) -> Result<()> {
+        let mut out = self.out.lock();
+        out.write_all(text.as_bytes())?;
+        out.flush()?;
+        Ok(())
     }
 
     /// Waits up to `length` for a key.
@@ -86,7 +91,7 @@ impl Screen {
 impl Drop for Screen {
     fn drop(&mut self) {
         // A terminal that is gone needs no restoring.
-        let _ = write(LEAVE);
+        let _ = self.write(LEAVE);
         if let Some(before) = &self.before {
             let _ = termios::tcsetattr(std::io::stdin(), OptionalActions::Now, before);
         }
@@ -97,11 +102,4 @@ impl Drop for Screen {
 pub fn size() -> Option<(usize, usize)> {
     let size = termios::tcgetwinsize(std::io::stdout()).ok()?;
     (size.ws_col > 0 && size.ws_row > 0).then(|| (size.ws_col.into(), size.ws_row.into()))
-}
-
-fn write(text: &str) -> Result<()> {
-    let mut out = std::io::stdout().lock();
-    out.write_all(text.as_bytes())?;
-    out.flush()?;
-    Ok(())
 }

@@ -86,7 +86,7 @@ mod tests {
         assert!(!stop.wait(Duration::from_millis(1)) && !stop.is_asked());
         let waiter = std::thread::spawn({
             let stop = stop.clone();
-            move || stop.wait(Duration::from_secs(60))
+            move || stop.wait(Duration::from_mins(1))
         });
         drop(closer);
         assert!(waiter.join().unwrap());

@@ -90,9 +90,12 @@ fn recording(r: &RecordingStatus, style: Style) -> Vec<String> {
     lines
 }
 
+/// Makes the cells of a stream's row.
+type Row = fn(&CameraStatus, &StreamStatus) -> Vec<String>;
+
 fn streams(rig: &RigStatus, style: Style) -> Vec<String> {
     let rows = rig.cameras.iter().flat_map(|c| c.streams.iter().map(move |s| (c, s)));
-    let (header, cells): (&[&str], fn(&CameraStatus, &StreamStatus) -> Vec<String>) = if style.is_wide() {
+    let (header, cells): (&[&str], Row) = if style.is_wide() {
         (
             &[
                 "stream", "state", "picture", "format", "Hz", "frames", "lost", "p50 ms", "p99 ms", "clock",

@@ -5,7 +5,10 @@ use std::process::Command;
 
 #[test]
 fn the_bus_bench_measures_and_counts_one_copy() {
-    let ran = Command::new(env!("CARGO_BIN_EXE_depthrig")).args(["bench", "bus", "--quick", "--json", "-q"]).output().unwrap();
+    let ran = Command::new(env!("CARGO_BIN_EXE_depthrig"))
+        .args(["bench", "bus", "--quick", "--json", "-q"])
+        .output()
+        .unwrap();
     assert!(ran.status.success(), "{}", String::from_utf8_lossy(&ran.stderr));
     let report: serde_json::Value = serde_json::from_slice(&ran.stdout).unwrap();
     // Times mean nothing in a debug build on a loaded machine; these do.

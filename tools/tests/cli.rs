@@ -30,8 +30,21 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
     assert!(help.contains("Exit codes:"));
     let folder = tempfile::tempdir().unwrap();
     Home::new().run(&["man", "--out", folder.path().to_str().unwrap()]).good();
-    for command in ["demo", "run", "record", "status", "top", "replay", "info", "verify", "config", "tap", "bench", "completions", "man"]
-    {
+    for command in [
+        "demo",
+        "run",
+        "record",
+        "status",
+        "top",
+        "replay",
+        "info",
+        "verify",
+        "config",
+        "tap",
+        "bench",
+        "completions",
+        "man",
+    ] {
         assert!(help.lines().any(|l| l.trim_start().starts_with(command)), "{command} is not in --help");
         let text = Home::new().run(&[command, "--help"]).good();
         assert!(text.lines().all(|l| l.chars().count() <= 120), "{command} --help has a long line");
@@ -92,7 +105,11 @@ fn what_is_no_dataset_is_refused_by_name() {
         for path in ["does/not/exist", &text] {
             let ran = home.run(&[command, path]);
             assert_eq!(ran.code, 1, "{command} {path}: {}", ran.err);
-            assert!(ran.err.starts_with("depthrig: error: ") && ran.err.contains(path), "{command}: {}", ran.err);
+            assert!(
+                ran.err.starts_with("depthrig: error: ") && ran.err.contains(path),
+                "{command}: {}",
+                ran.err
+            );
         }
     }
     let ran = home.run(&["replay", &text]);
@@ -130,7 +147,11 @@ fn the_whole_way_of_a_small_rig() {
 
     let again = home.run(&["run", &rig]);
     assert_eq!(again.code, 1);
-    assert!(again.err.contains("running already") && again.err.contains(&running.id().to_string()), "{}", again.err);
+    assert!(
+        again.err.contains("running already") && again.err.contains(&running.id().to_string()),
+        "{}",
+        again.err
+    );
 
     let pictures = home.path().join("tapped");
     let said = home.run(&["tap", "desk/depth", "--count", "2", "--png", pictures.to_str().unwrap()]).good();
@@ -146,7 +167,8 @@ fn the_whole_way_of_a_small_rig() {
     let out = home.path().join("data");
     let none = home.run(&["record", "stop"]);
     assert_eq!(none.code, 1, "{}", none.err);
-    home.run(&["record", "start", "--out", out.to_str().unwrap(), "--name", "first", "--scene", "desk"]).good();
+    home.run(&["record", "start", "--out", out.to_str().unwrap(), "--name", "first", "--scene", "desk"])
+        .good();
     let twice = home.run(&["record", "start", "--out", out.to_str().unwrap()]);
     assert_eq!(twice.code, 1);
     assert!(twice.err.contains("first"), "{}", twice.err);
@@ -170,7 +192,8 @@ fn check_dataset(home: &Home, dataset: &Path) {
     assert!(said.contains("whole"), "{said}");
 
     let replay: serde_json::Value =
-        serde_json::from_str(&home.run(&["replay", path, "--as-fast-as-possible", "--json", "-q"]).good()).unwrap();
+        serde_json::from_str(&home.run(&["replay", path, "--as-fast-as-possible", "--json", "-q"]).good())
+            .unwrap();
     assert_eq!(replay["sets"].as_u64(), Some(sets));
 
     // One byte in the middle of a picture.
@@ -191,7 +214,18 @@ fn run_ends_after_its_time_and_records_what_it_was_told() {
     let rig = home.rig_file("timed");
     let out = home.path().join("data");
     let said = home
-        .run(&["run", &rig, "--record", out.to_str().unwrap(), "--scene", "shelf", "--seconds", "1.5", "--json", "-q"])
+        .run(&[
+            "run",
+            &rig,
+            "--record",
+            out.to_str().unwrap(),
+            "--scene",
+            "shelf",
+            "--seconds",
+            "1.5",
+            "--json",
+            "-q",
+        ])
         .good();
     let summary: serde_json::Value = serde_json::from_str(&said).unwrap();
     assert_eq!(summary["lost"].as_array().unwrap().len(), 0);

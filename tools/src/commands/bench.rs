@@ -75,7 +75,7 @@ fn run_bus(args: &BenchArgs, context: &Context) -> Result<Exit> {
     let plan = if args.quick {
         Plan { blocks: 3, rounds: 1, phase: Duration::from_secs(2), settle: Duration::from_millis(500) }
     } else {
-        Plan { blocks: 20, rounds: 5, phase: Duration::from_secs(5), settle: Duration::from_secs(1) }
+        Plan { blocks: 30, rounds: 5, phase: Duration::from_secs(5), settle: Duration::from_secs(1) }
     };
     let mut progress = Progress::new(context.global.quiet > 0);
     let result = bus::run(&runtime, plan, |what, done, total| progress.set(what, done, total))?;

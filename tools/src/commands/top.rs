@@ -2,7 +2,7 @@
 
 use crate::context::Context;
 use crate::exit::Exit;
-use crate::screen::Screen;
+use crate::screen::{self, Screen};
 use crate::signals::Stop;
 use crate::view::{self, Style};
 use anyhow::Result;
@@ -27,7 +27,7 @@ pub fn run(args: &TopArgs, context: &Context) -> Result<Exit> {
     let screen = Screen::enter()?;
     loop {
         let rig = client.status()?;
-        let style = Style { width: screen.size().0, color: context.color() };
+        let style = Style { width: screen::size().unwrap_or(screen::USUAL).0, color: context.color() };
         screen.draw(&format!("{}\n\nq leaves", view::status(&rig, style)))?;
         let until = depthrig_bus::HostTime::now().plus(Duration::from_secs_f64(args.interval));
         while !until.from_now().is_zero() {

@@ -26,7 +26,11 @@ pub struct Ran {
 impl Ran {
     fn of(output: &Output) -> Self {
         let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-        Self { code: output.status.code().unwrap_or(-1), out: text(&output.stdout), err: text(&output.stderr) }
+        Self {
+            code: output.status.code().unwrap_or(-1),
+            out: text(&output.stdout),
+            err: text(&output.stderr),
+        }
     }
 
     /// The output of a run that must have gone well.
@@ -63,8 +67,13 @@ impl Home {
     }
 
     pub fn start(&self, args: &[&str]) -> Running {
-        let child =
-            self.command(args).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let child = self
+            .command(args)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
         Running(Some(child))
     }
 
@@ -80,7 +89,8 @@ impl Home {
             std::fs::create_dir_all(self.path().join(folder)).unwrap();
         }
         for i in 0..count {
-            let color = image::RgbImage::from_fn(64, 48, |x, y| image::Rgb([x as u8 * 3, y as u8 * 5, i as u8 * 20]));
+            let color =
+                image::RgbImage::from_fn(64, 48, |x, y| image::Rgb([x as u8 * 3, y as u8 * 5, i as u8 * 20]));
             color.save(self.path().join(format!("color/{i:03}.png"))).unwrap();
             depth(i).save(self.path().join(format!("depth/{i:03}.png"))).unwrap();
         }
@@ -151,7 +161,8 @@ impl Running {
 
     pub fn signal(mut self, name: &str) -> Ran {
         let child = self.0.take().unwrap();
-        let sent = Command::new("kill").args([&format!("-{name}"), &child.id().to_string()]).status().unwrap();
+        let sent =
+            Command::new("kill").args([&format!("-{name}"), &child.id().to_string()]).status().unwrap();
         assert!(sent.success());
         Ran::of(&child.wait_with_output().unwrap())
     }

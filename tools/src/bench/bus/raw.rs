@@ -10,6 +10,7 @@ use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
+use iceoryx2::service::port_factory::{event, publish_subscribe};
 
 /// The least header that the measurement needs.
 #[repr(C)]
@@ -25,14 +26,10 @@ pub struct RawHeader {
 }
 
 type Service = ipc::Service;
+type Frames = publish_subscribe::PortFactory<Service, [u8], RawHeader>;
+type Events = event::PortFactory<Service>;
 
-fn service(
-    runtime: &RuntimeDir,
-) -> Result<(
-    Node<Service>,
-    iceoryx2::service::port_factory::publish_subscribe::PortFactory<Service, [u8], RawHeader>,
-    iceoryx2::service::port_factory::event::PortFactory<Service>,
-)> {
+fn service(runtime: &RuntimeDir) -> Result<(Node<Service>, Frames, Events)> {
     let mut config = Config::default();
     let root = runtime.path().join("raw").to_string_lossy().into_owned();
     let root = Path::new(root.as_bytes()).ok().context("the runtime folder is no path for iceoryx2")?;
