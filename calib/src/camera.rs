@@ -117,7 +117,7 @@ mod tests {
 
     #[test]
     fn brown_conrady_by_hand() {
-        let k = with(Distortion::BrownConrady, [-0.28, 0.025, 0.0012, -0.000136, 0.16, 0.0, 0.0, 0.0]);
+        let k = with(Distortion::BrownConrady, [-0.28, 0.025, 0.001_2, -0.000_136, 0.16, 0.0, 0.0, 0.0]);
         let px = k.project(DVec3::new(0.3, -0.2, 1.0)).unwrap();
         // By the formula on paper: r² = 0.13, s = 1 − 0.0364 + 0.0004225 + 0.00035152 = 0.96437402.
         let x = 0.964_374_02 * 0.3 + 2.0 * 0.0012 * 0.3 * -0.2 - 0.000_136 * (0.13 + 2.0 * 0.09);

@@ -1,5 +1,6 @@
 //! The gate's accounts are exact whatever a device does with its frame counter.
 
+use super::Outcome::{AlreadyCounted, Delivered, Dropped};
 use super::*;
 use crate::{DeviceClock, MemorySink};
 use depthrig_bus::{Intrinsics, Name, Pose};
@@ -42,7 +43,6 @@ fn gaps_duplicates_and_late_frames_are_told_apart() {
         .enumerate()
         .map(|(i, s)| feed(&mut gate, &mut sink, &raw(s, i as i64)))
         .collect();
-    use Outcome::{AlreadyCounted, Delivered, Dropped};
     let twice = Dropped(DropReason::OutOfOrder);
     assert_eq!(outcomes, [Delivered, Delivered, twice, Delivered, AlreadyCounted, Delivered, twice]);
     // 250..=257 are eight frames, and two came twice.
@@ -82,7 +82,6 @@ fn broken_frames_are_dropped_with_their_reason() {
         change(&mut broken);
         feed(gate, sink, &broken)
     };
-    use Outcome::Dropped;
     assert_eq!(outcome(&mut gate, &mut sink, &|f| f.bytes = 9), Dropped(DropReason::Incomplete));
     assert_eq!(outcome(&mut gate, &mut sink, &|f| f.bytes = 0), Dropped(DropReason::Incomplete));
     assert_eq!(outcome(&mut gate, &mut sink, &|f| f.bytes = 17), Dropped(DropReason::WrongSize));
