@@ -58,8 +58,8 @@ class Check {
     const { channel, reader } = this.channels.get(message.channelId);
     const ros = reader.readMessage(message.data);
     if (channel.topic.endsWith("/frame_set")) {
+      assert.equal(ros.id, BigInt(index.first_set ?? 1) + this.sets, "set ids");
       this.sets++;
-      assert.equal(ros.id, this.sets, "set ids");
     }
     const key = `${channel.topic} ${message.logTime}`;
     const p = pictures.get(key);
