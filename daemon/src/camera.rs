@@ -368,6 +368,9 @@ fn publisher_of(shared: &Shared, stream: &Stream) -> Result<Arc<depthrig_bus::Pu
         return Ok(Arc::clone(publisher));
     }
     let publisher = Arc::new(shared.bus.publisher(&stream.id, stream.profile.frame_bytes(), stream.slots)?);
+    if books.session == 0 {
+        books.reader = Some(shared.bus.subscriber(&stream.id)?);
+    }
     books.publisher = Some(Arc::clone(&publisher));
     Ok(publisher)
 }

@@ -187,7 +187,7 @@ impl Default for RecordingConfig {
             segment_max_mb: 1024,
             segment_max_s: 60,
             workers: 0,
-            queue_sets: 4,
+            queue_sets: 6,
             reserve_mb: 2048,
         }
     }

@@ -3,7 +3,7 @@
 //! The books are double-entry: `captured` is what the device announced, `delivered` and `dropped` are what
 //! became of it, and [`Books::close`] balances them when a hung thread is given up with a frame in its hands.
 
-use depthrig_bus::{DropCounts, DropReason, HostTime, Publisher, StreamId};
+use depthrig_bus::{DropCounts, DropReason, HostTime, Publisher, StreamId, Subscriber};
 use depthrig_drivers::StreamProfile;
 use depthrig_drivers::clock::ClockQuality;
 use std::collections::VecDeque;
@@ -39,6 +39,9 @@ pub struct Books {
     pub session: u64,
     /// The channel; it outlives the camera's sessions so that subscribers need not come back.
     pub publisher: Option<Arc<Publisher>>,
+    /// The set thread's end of the channel until that thread takes it. It is made before the first frame: a
+    /// publisher that sends while a subscriber is half made waits for it, half a second at worst.
+    pub reader: Option<Subscriber>,
     /// When the newest frame was published.
     pub last_frame: Option<HostTime>,
     /// Clock epochs of earlier sessions.

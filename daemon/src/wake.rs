@@ -1,31 +1,33 @@
 //! A bell between threads: ringing it many times wakes the sleeper once.
+//!
+//! A mutex and not a lock-free queue, because camera threads ring it at real-time priority: one that met a queue
+//! operation of a preempted ordinary thread would spin until the kernel's real-time throttling ended it, which costs
+//! a second of frames. On a mutex it sleeps, and the other thread runs.
 
 use core::time::Duration;
-use crossbeam::channel::{Receiver, Sender, bounded};
+use std::sync::{Condvar, Mutex, PoisonError};
 
-/// A bell; `raise` never blocks.
-#[derive(Debug)]
+/// A bell.
+#[derive(Debug, Default)]
 pub struct Wake {
-    ring: Sender<()>,
-    heard: Receiver<()>,
-}
-
-impl Default for Wake {
-    fn default() -> Self {
-        let (ring, heard) = bounded(1);
-        Self { ring, heard }
-    }
+    rung: Mutex<bool>,
+    bell: Condvar,
 }
 
 impl Wake {
     /// Wakes the sleeper, now or when it next lies down.
     pub fn raise(&self) {
-        // A full queue means that it was rung already and nothing is lost.
-        let _ = self.ring.try_send(());
+        *self.rung.lock().unwrap_or_else(PoisonError::into_inner) = true;
+        self.bell.notify_one();
     }
 
     /// Sleeps until the bell rings or `timeout` has passed.
     pub fn wait(&self, timeout: Duration) {
-        let _ = self.heard.recv_timeout(timeout);
+        let rung = self.rung.lock().unwrap_or_else(PoisonError::into_inner);
+        let (mut rung, _) = self
+            .bell
+            .wait_timeout_while(rung, timeout, |rung| !*rung)
+            .unwrap_or_else(PoisonError::into_inner);
+        *rung = false;
     }
 }

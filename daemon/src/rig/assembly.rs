@@ -75,22 +75,16 @@ impl Assembly {
             let state = camera.state();
             let known = self.inputs.iter().filter(|i| Arc::ptr_eq(&i.camera, camera)).count();
             for stream in state.streams.iter().skip(known) {
-                if stream.books().publisher.is_none() {
+                let Some(subscriber) = stream.books().reader.take() else {
                     break; // its channel is just being made
-                }
-                match self.inner.shared.bus.subscriber(&stream.id) {
-                    Ok(subscriber) => self.inputs.push(Input {
-                        stream: Arc::clone(stream),
-                        camera: Arc::clone(camera),
-                        subscriber,
-                        base: SetAccount::default(),
-                        before: None,
-                    }),
-                    Err(e) => {
-                        tracing::error!(stream = %stream.id, error = %e, "the stream cannot become part of sets");
-                        break;
-                    }
-                }
+                };
+                self.inputs.push(Input {
+                    stream: Arc::clone(stream),
+                    camera: Arc::clone(camera),
+                    subscriber,
+                    base: SetAccount::default(),
+                    before: None,
+                });
                 found = true;
             }
         }
