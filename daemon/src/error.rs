@@ -1,7 +1,5 @@
 //! The error of the daemon: a kind to match on (exit code, HTTP status), what happened and what to do.
 
-use core::fmt;
-
 /// What went wrong, for callers that decide on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
@@ -24,45 +22,8 @@ pub enum ErrorKind {
     Other,
 }
 
-/// An error of the daemon.
-#[derive(Debug)]
-pub struct Error {
-    kind: ErrorKind,
-    message: String,
-    source: Option<Box<dyn std::error::Error + Send + Sync>>,
-}
-
-/// The result of a call of the daemon.
-pub type Result<T, E = Error> = core::result::Result<T, E>;
-
-impl Error {
-    /// An error of `kind` whose message says what happened, to what, and what to do.
-    pub fn new(kind: ErrorKind, message: impl Into<String>) -> Self {
-        Self { kind, message: message.into(), source: None }
-    }
-
-    /// The same error with the error that caused it.
-    pub fn with_source(mut self, source: impl std::error::Error + Send + Sync + 'static) -> Self {
-        self.source = Some(Box::new(source));
-        self
-    }
-
-    /// What went wrong, for callers that decide on it.
-    pub const fn kind(&self) -> ErrorKind {
-        self.kind
-    }
-}
-
-impl fmt::Display for Error {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.message)
-    }
-}
-
-impl std::error::Error for Error {
-    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
-        self.source.as_deref().map(|s| s as _)
-    }
+depthrig_bus::error_type! {
+    /// An error of the daemon.
 }
 
 impl From<depthrig_bus::Error> for Error {

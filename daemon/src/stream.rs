@@ -111,11 +111,13 @@ impl Books {
     pub fn rate_hz(&self, now: HostTime) -> f64 {
         let from = now.plus_ns(-2_000_000_000);
         let mut recent = self.recent.iter().map(|r| r.0).filter(|t| *t >= from);
-        let Some(first) = recent.next() else { return 0.0 };
-        let count = recent.count();
-        // Until now, not until the last frame: a stream that just stopped must not look alive.
-        let span = now.since_ns(first).max(1);
-        (count + 1) as f64 * 1e9 / span as f64
+        let (Some(first), Some((last, _))) = (recent.next(), self.recent.back()) else { return 0.0 };
+        let intervals = recent.count() as f64;
+        let span_ns = last.since_ns(first) as f64;
+        // A stream that just stopped must not look alive: from two missing frames on the silence counts.
+        let silent = now.since_ns(*last) as f64 > 3.0 * span_ns / intervals.max(1.0);
+        let span_ns = if silent { now.since_ns(first) as f64 } else { span_ns };
+        if span_ns > 0.0 { intervals * 1e9 / span_ns } else { 0.0 }
     }
 
     /// The latency from capture to publish that a share of `quantile` of the last frames stayed below, ms.
@@ -151,7 +153,10 @@ mod tests {
         for i in 0..30 {
             books.note(at(i * 33), 5_000_000);
         }
-        assert!((books.rate_hz(at(29 * 33 + 33)) - 30.3).abs() < 0.5);
+        for late in [0, 10, 33, 66] {
+            assert!((books.rate_hz(at(29 * 33 + late)) - 1000.0 / 33.0).abs() < 0.01, "{late}");
+        }
+        assert!(books.rate_hz(at(29 * 33 + 500)) < 21.0);
         assert!(books.rate_hz(at(5000)).abs() < 1e-9);
         assert!((books.latency_ms(0.5) - 5.0).abs() < 1e-9);
     }

@@ -1,7 +1,5 @@
 //! The error of a driver: a kind that the supervisor acts on, what happened, and to which device.
 
-use core::fmt;
-
 /// What went wrong, as the supervisor needs to know it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
@@ -33,43 +31,6 @@ impl ErrorKind {
     }
 }
 
-/// An error of a driver.
-#[derive(Debug)]
-pub struct Error {
-    kind: ErrorKind,
-    message: String,
-    source: Option<Box<dyn std::error::Error + Send + Sync>>,
-}
-
-/// The result of a driver call.
-pub type Result<T, E = Error> = core::result::Result<T, E>;
-
-impl Error {
-    /// An error of `kind` whose message says what happened, to which device or file, and what to do.
-    pub fn new(kind: ErrorKind, message: impl Into<String>) -> Self {
-        Self { kind, message: message.into(), source: None }
-    }
-
-    /// The same error with the error that caused it.
-    pub fn with_source(mut self, source: impl std::error::Error + Send + Sync + 'static) -> Self {
-        self.source = Some(Box::new(source));
-        self
-    }
-
-    /// What went wrong, as the supervisor needs to know it.
-    pub const fn kind(&self) -> ErrorKind {
-        self.kind
-    }
-}
-
-impl fmt::Display for Error {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.message)
-    }
-}
-
-impl std::error::Error for Error {
-    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
-        self.source.as_deref().map(|s| s as _)
-    }
+depthrig_bus::error_type! {
+    /// An error of a driver.
 }

@@ -1,6 +1,5 @@
 //! The error of the recorder: a kind to match on, what happened to which file, and what to do about it.
 
-use core::fmt;
 use std::io;
 use std::path::Path;
 
@@ -35,29 +34,11 @@ pub enum ErrorKind {
     Io,
 }
 
-/// An error of the recorder.
-#[derive(Debug)]
-pub struct Error {
-    kind: ErrorKind,
-    message: String,
-    source: Option<Box<dyn std::error::Error + Send + Sync>>,
+depthrig_bus::error_type! {
+    /// An error of the recorder.
 }
 
-/// The result of a recorder call.
-pub type Result<T, E = Error> = core::result::Result<T, E>;
-
 impl Error {
-    /// An error of `kind` whose message says what happened, to what, and what to do.
-    pub fn new(kind: ErrorKind, message: impl Into<String>) -> Self {
-        Self { kind, message: message.into(), source: None }
-    }
-
-    /// The same error with the error that caused it.
-    pub fn with_source(mut self, source: impl std::error::Error + Send + Sync + 'static) -> Self {
-        self.source = Some(Box::new(source));
-        self
-    }
-
     /// A failed operation on `path`; `what` reads as in "cannot {what} {path}".
     pub(crate) fn io(what: &str, path: &Path, e: io::Error) -> Self {
         let (kind, advice) = match e.kind() {
@@ -77,22 +58,5 @@ impl Error {
         };
         let detail = if advice.is_empty() { format!(": {e}") } else { advice.to_owned() };
         Self::new(kind, format!("cannot {what} {}{detail}", path.display())).with_source(e)
-    }
-
-    /// What went wrong, for callers that decide on it.
-    pub const fn kind(&self) -> ErrorKind {
-        self.kind
-    }
-}
-
-impl fmt::Display for Error {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.message)
-    }
-}
-
-impl std::error::Error for Error {
-    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
-        self.source.as_deref().map(|s| s as _)
     }
 }

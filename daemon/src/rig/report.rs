@@ -179,10 +179,14 @@ pub fn lost(status: &RigStatus) -> Vec<String> {
         }
     }
     if let Some(recording) = &status.recording {
-        lost.extend(recording.error.iter().map(|e| format!("recording {}: {e}", recording.path)));
         let reasons: Vec<_> = recording.dropped.iter().map(|(r, n)| format!("{n} {r}")).collect();
-        if !reasons.is_empty() {
-            lost.push(format!("recording {}: sets not recorded: {}", recording.path, reasons.join(", ")));
+        // The error of a finished recording names its dropped sets already.
+        match &recording.error {
+            Some(e) => lost.push(format!("recording {}: {e}", recording.path)),
+            None if reasons.is_empty() => {}
+            None => {
+                lost.push(format!("recording {}: sets not recorded: {}", recording.path, reasons.join(", ")));
+            }
         }
     }
     lost
