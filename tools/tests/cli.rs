@@ -259,3 +259,16 @@ fn an_output_that_cannot_be_written_is_named() {
     assert_ne!(ran.code, 0);
     assert!(ran.err.contains("in_the_way"), "{}", ran.err);
 }
+
+#[test]
+fn a_run_that_lost_frames_ends_with_3_and_says_which() {
+    let home = Home::new();
+    let rig = home.write(
+        "lossy.toml",
+        "rig = \"lossy\"\n[[camera]]\nname = \"cam\"\nbackend = \"synthetic\"\nmodel = \"generic\"\ncheap = true\n\
+         [[camera.fault]]\nkind = \"skip\"\nat_s = 0.5\ncount = 3\n",
+    );
+    let ran = home.run(&["run", &rig, "--seconds", "1.5", "-q"]);
+    assert_eq!(ran.code, 3, "{}{}", ran.out, ran.err);
+    assert!(ran.out.contains("lost: cam/color: 3 of") && ran.out.contains("3 device_gap"), "{}", ran.out);
+}
