@@ -107,7 +107,7 @@ fn a_hung_device_is_abandoned_and_publishes_nothing_when_it_wakes() {
     assert!(matches!(capture.stop(Duration::from_millis(100)), StopOutcome::Abandoned));
     assert!(began.elapsed() < Duration::from_secs(2));
     wake.store(true, Ordering::SeqCst);
-    while sink.0.lock().unwrap().1.is_empty() {
+    while *sink.0.lock().unwrap() == (0, vec![]) {
         std::thread::sleep(Duration::from_millis(1));
     }
     assert_eq!(*sink.0.lock().unwrap(), (0, vec![DropReason::Abandoned]));
