@@ -9,7 +9,7 @@ use depthrig_bus::{Frame, HostTime, StreamId, UtcPair};
 use depthrig_calib::PoseExt;
 use depthrig_recorder::{
     Diagnostic, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamAccount,
-    StreamRecord, Summary, fs,
+    StreamRecord, Summary, UtcSource, fs,
 };
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -24,6 +24,21 @@ pub struct Recording {
     summary: Option<Summary>,
 }
 
+/// What recordings have of the computer: its disk and its clocks.
+#[derive(Clone)]
+pub struct Outside {
+    /// Where datasets are written.
+    pub fs: Arc<dyn fs::Fs>,
+    /// What places a recording in UTC.
+    pub utc: UtcSource,
+}
+
+impl Default for Outside {
+    fn default() -> Self {
+        Self { fs: Arc::new(fs::RealFs), utc: Arc::new(UtcPair::sample) }
+    }
+}
+
 /// A recording that was made and is not yet handed any set.
 pub struct Begun(Active);
 
@@ -34,6 +49,7 @@ struct Active {
     streams: Vec<Recorded>,
     started: HostTime,
     reserve_bytes: u64,
+    utc: UtcSource,
 }
 
 /// A stream in a recording, with the frames it had before the first recorded set.
@@ -73,7 +89,12 @@ impl Begun {
     /// # Errors
     /// `WrongState` without a stream, `BadInput` for a name that is no folder name or exists, `NoSpace`,
     /// `PermissionDenied`.
-    pub fn new(config: &RigConfig, request: &RecordRequest, streams: Vec<StreamFacts>) -> Result<Self> {
+    pub fn new(
+        config: &RigConfig,
+        request: &RecordRequest,
+        streams: Vec<StreamFacts>,
+        outside: &Outside,
+    ) -> Result<Self> {
         let streams: Vec<_> = streams.into_iter().filter(|s| s.stream.record).collect();
         if streams.is_empty() {
             return Err(Error::new(
@@ -81,7 +102,7 @@ impl Begun {
                 "no camera has a stream to record yet; try again when one streams",
             ));
         }
-        let utc = UtcPair::sample();
+        let utc = (outside.utc)();
         let (name, path) = place(&config.recording, request, utc.utc_ns)?;
         let mut session = Session::new(&name, config.rig.as_str());
         session.scene.clone_from(&request.scene);
@@ -91,8 +112,8 @@ impl Begun {
         session.rig_config.clone_from(&config.text);
         session.streams = streams.iter().map(record_of).collect();
         let options = options_of(&config.recording);
-        let recorder =
-            Recorder::create(Arc::new(fs::RealFs), &path, session, options).map_err(of_recorder)?;
+        let (fs, clock) = (Arc::clone(&outside.fs), Arc::clone(&outside.utc));
+        let recorder = Recorder::create_with(fs, clock, &path, session, options).map_err(of_recorder)?;
         if !request.notes.is_empty() {
             recorder.add_note(request.notes.as_str()).map_err(of_recorder)?;
         }
@@ -121,6 +142,7 @@ impl Begun {
             streams: streams.iter().map(recorded).collect(),
             started: HostTime::now(),
             reserve_bytes: config.recording.reserve_mb << 20,
+            utc: Arc::clone(&outside.utc),
             status,
         }))
     }
@@ -171,7 +193,8 @@ impl Recording {
         // Of what is recorded: the set may have streams that are not.
         let times = present.iter().map(|f| f.header.capture_time_ns);
         let spread_ns = times.clone().max().unwrap_or(0) - times.min().unwrap_or(0);
-        let set = RecordSet { id, tick, utc: UtcPair::sample(), frames: present, missing, spread_ns };
+        let utc = (active.utc)();
+        let set = RecordSet { id, tick, utc, frames: present, missing, spread_ns };
         if let Err(e) = active.recorder.push(set) {
             tracing::error!(set = id, reason = e.reason.name(), "a frame set was not recorded: {e}");
         }

@@ -15,7 +15,7 @@ use crate::api::{self, ServerHandle};
 use crate::camera::{Camera, Shared, Supervisor};
 use crate::config::{BackendConfig, RigConfig};
 use crate::control::{Control, RecordRequest};
-use crate::recording::{Begun, Recording, StreamFacts};
+use crate::recording::{Begun, Outside, Recording, StreamFacts};
 use crate::sets::SpreadStats;
 use crate::status::{CameraState, RecordingStatus, RigStatus, SetAccount};
 use crate::wake::Wake;
@@ -23,7 +23,9 @@ use crate::{Error, ErrorKind, Result, priority};
 use assembly::Assembly;
 use core::time::Duration;
 use depthrig_bus::runtime::{RigLock, RuntimeDir};
-use depthrig_bus::{Bus, HostTime, StreamId, clock, shm};
+use depthrig_bus::{Bus, HostTime, StreamId, UtcPair, clock, shm};
+use depthrig_recorder::UtcSource;
+use depthrig_recorder::fs::{Fs, RealFs};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -53,6 +55,24 @@ pub struct RigOptions {
     pub cache_dir: Option<PathBuf>,
     /// Told about long work before the start.
     pub progress: Option<Progress>,
+    /// The disk that recordings are written to; tests put one that fails or stalls here.
+    pub fs: Arc<dyn Fs>,
+    /// What places recordings in UTC; tests step it.
+    pub utc: UtcSource,
+}
+
+impl RigOptions {
+    /// A rig in `runtime` with its control API, on this computer's disk and clocks.
+    pub fn new(runtime: RuntimeDir) -> Self {
+        Self {
+            runtime,
+            serve_api: true,
+            cache_dir: None,
+            progress: None,
+            fs: Arc::new(RealFs),
+            utc: Arc::new(UtcPair::sample),
+        }
+    }
 }
 
 /// What a rig says at its end.
@@ -86,6 +106,7 @@ pub struct Inner {
     ended: Wake,
     started: HostTime,
     recording: Mutex<Recording>,
+    outside: Outside,
     starting: Mutex<()>,
     spreads: Mutex<SpreadStats>,
     set_accounts: Mutex<SetAccounts>,
@@ -136,6 +157,7 @@ impl Rig {
             ended: Wake::default(),
             started: HostTime::now(),
             recording: Mutex::default(),
+            outside: Outside { fs: Arc::clone(&options.fs), utc: Arc::clone(&options.utc) },
             starting: Mutex::default(),
             spreads: Mutex::default(),
             set_accounts: Mutex::default(),
@@ -307,7 +329,7 @@ impl Control for Inner {
         let _one_at_a_time = lock(&self.starting);
         self.recording().must_be_idle()?;
         // Without the recording's lock: making a file must not keep the set thread waiting.
-        let begun = Begun::new(&self.config, request, self.stream_facts())?;
+        let begun = Begun::new(&self.config, request, self.stream_facts(), &self.outside)?;
         Ok(self.recording().begin(begun))
     }
 

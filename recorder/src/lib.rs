@@ -34,6 +34,6 @@ pub use error::{Error, ErrorKind, Result};
 pub use frame::{Pixels, PushError, RecordFrame, RecordSet, SetDrop};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
 pub use options::{ColorCodec, Compression, RecorderOptions};
-pub use recorder::{Progress, Recorder, Summary};
+pub use recorder::{Progress, Recorder, Summary, UtcSource};
 pub use session::{FORMAT, Note, Outcome, SESSION_FILE, Session, StreamRecord};
 pub use verify::{Finding, Severity, VerifyOptions, VerifyReport, verify, verify_with};

@@ -39,9 +39,13 @@ pub struct Recorder {
     writer: Option<JoinHandle<Summary>>,
 }
 
+/// Where a recording reads both clocks. Tests step its wall clock, a replay gives the times of its dataset.
+pub type UtcSource = Arc<dyn Fn() -> UtcPair + Send + Sync>;
+
 /// What the threads share.
 struct Shared {
     fs: Arc<dyn Fs>,
+    utc: UtcSource,
     dir: PathBuf,
     options: RecorderOptions,
     topics: Topics,
@@ -135,6 +139,20 @@ impl Recorder {
     /// [`ErrorKind::DiskFull`] when it cannot take a dataset, [`ErrorKind::BadInput`] when the session names
     /// no rig or no streams, [`ErrorKind::Io`] otherwise.
     pub fn create(fs: Arc<dyn Fs>, dir: &Path, session: Session, options: RecorderOptions) -> Result<Self> {
+        Self::create_with(fs, Arc::new(UtcPair::sample), dir, session, options)
+    }
+
+    /// The same with another source of the clock pairs that are written each second.
+    ///
+    /// # Errors
+    /// As [`Recorder::create`].
+    pub fn create_with(
+        fs: Arc<dyn Fs>,
+        utc: UtcSource,
+        dir: &Path,
+        session: Session,
+        options: RecorderOptions,
+    ) -> Result<Self> {
         session.check()?;
         let topics = Topics::new(&session, &options);
         prepare_folder(&*fs, dir, &options)?;
@@ -157,6 +175,7 @@ impl Recorder {
         let (tickets, ticket_queue) = bounded(queue_sets + BACKLOG_MAX_SETS);
         let shared = Arc::new(Shared {
             fs,
+            utc,
             dir: dir.to_owned(),
             options,
             topics,
@@ -264,7 +283,7 @@ impl Recorder {
     /// # Errors
     /// [`ErrorKind::BadInput`] when more notes wait to be written than anybody types.
     pub fn add_note(&self, text: impl Into<String>) -> Result<()> {
-        let note = crate::Note { utc_ns: UtcPair::sample().utc_ns, text: text.into() };
+        let note = crate::Note { utc_ns: (self.shared.utc)().utc_ns, text: text.into() };
         let mut state = self.shared.lock();
         if state.pending_notes.len() >= NOTES_MAX {
             let message = format!("{NOTES_MAX} notes wait to be written already; try again in a second");

@@ -37,13 +37,25 @@ impl Home {
     /// # Errors
     /// Those of [`Rig::start`].
     pub fn start(&self, text: &str) -> depthrig_daemon::Result<Rig> {
+        self.start_with(text, |_| {})
+    }
+
+    /// Starts the rig of `text` with options that `change` has changed.
+    ///
+    /// # Errors
+    /// Those of [`Rig::start`].
+    pub fn start_with(
+        &self,
+        text: &str,
+        change: impl FnOnce(&mut RigOptions),
+    ) -> depthrig_daemon::Result<Rig> {
         let config = RigConfig::parse(text, None).unwrap();
-        let options = RigOptions {
-            runtime: self.runtime(),
+        let mut options = RigOptions {
             serve_api: false,
             cache_dir: Some(self.path("cache")),
-            progress: None,
+            ..RigOptions::new(self.runtime())
         };
+        change(&mut options);
         Rig::start(config, &options)
     }
 }

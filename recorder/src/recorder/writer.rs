@@ -260,7 +260,7 @@ impl Writer {
     /// Clock, accounts, diagnostics and notes; then everything so far is made durable.
     fn each_second(&mut self) -> Result<()> {
         let Some(log_time) = self.last_log_time.filter(|_| self.in_segment.is_some()) else { return Ok(()) };
-        let pair = UtcPair::sample();
+        let pair = (self.shared.utc)();
         self.clock_pair(log_time, pair.utc_ns, &pair);
         self.accounts(log_time);
         self.diagnostics_and_notes(log_time);
@@ -309,7 +309,7 @@ impl Writer {
     fn close_segment(&mut self) -> Result<()> {
         let sets = self.in_segment.take();
         if let Some(log_time) = self.last_log_time.filter(|_| sets.is_some()) {
-            let pair = UtcPair::sample();
+            let pair = (self.shared.utc)();
             self.clock_pair(log_time, pair.utc_ns, &pair);
             self.accounts(log_time);
             self.diagnostics_and_notes(log_time);

@@ -105,7 +105,8 @@ pub fn start(
             *rendered = HostTime::now();
         });
     };
-    let options = RigOptions { runtime, serve_api, cache_dir, progress: Some(Box::new(progress)) };
+    let options =
+        RigOptions { serve_api, cache_dir, progress: Some(Box::new(progress)), ..RigOptions::new(runtime) };
     let rig = Rig::start(config, &options);
     let mut shared = shared.lock().unwrap_or_else(PoisonError::into_inner);
     shared.0.clear();
