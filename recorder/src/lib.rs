@@ -21,6 +21,8 @@ mod encode;
 mod error;
 mod frame;
 pub mod fs;
+#[doc(hidden)]
+pub mod fuzzing;
 mod msgs;
 mod options;
 mod recorder;

@@ -64,7 +64,7 @@ pub(crate) const fn image_channel(stream: usize) -> u16 {
     (Global::ALL.len() + 1 + 3 * stream) as u16
 }
 
-pub(super) struct Topics {
+pub(crate) struct Topics {
     frame_ids: Vec<String>,
     /// Picture formats as announced, with width and height.
     formats: Vec<depthrig_bus::PixelFormat>,
@@ -73,7 +73,7 @@ pub(super) struct Topics {
 }
 
 impl Topics {
-    pub(super) fn new(session: &Session, options: &RecorderOptions) -> Self {
+    pub(crate) fn new(session: &Session, options: &RecorderOptions) -> Self {
         let streams = &session.streams;
         Self {
             frame_ids: streams.iter().map(|s| optical_frame(&s.id)).collect(),
@@ -125,7 +125,7 @@ impl Topics {
     }
 
     /// Everything that a segment says before its first chunk.
-    pub(super) fn preamble(&self, session: &Session, segment: u32) -> Result<Preamble> {
+    pub(crate) fn preamble(&self, session: &Session, segment: u32) -> Result<Preamble> {
         let rig = &session.rig;
         let mut channels: Vec<Channel> = Global::ALL
             .into_iter()

@@ -1,0 +1,107 @@
+//! The corpus of the fuzz targets as tests: what a fuzzer once found interesting or broken stays mended.
+
+use depthrig_recorder::fuzzing;
+use proptest::prelude::*;
+use std::path::{Path, PathBuf};
+
+/// Every input that is kept for a target, with its name.
+fn corpus(target: &str) -> Vec<(String, Vec<u8>)> {
+    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus").join(target);
+    let mut paths: Vec<PathBuf> = std::fs::read_dir(&dir)
+        .unwrap_or_else(|e| panic!("{}: {e}", dir.display()))
+        .map(|e| e.unwrap().path())
+        .collect();
+    paths.sort();
+    let name = |p: &Path| p.file_name().unwrap().to_string_lossy().into_owned();
+    paths.iter().map(|p| (name(p), std::fs::read(p).unwrap())).collect()
+}
+
+/// Runs each input, and sees that the seeds still reach what they were made for.
+fn run<T: PartialOrd + Copy + std::fmt::Debug>(
+    target: &str,
+    reached: impl Fn(&[u8]) -> T,
+    seeds_reach_more_than: T,
+) {
+    let inputs = corpus(target);
+    let mut seeds = 0;
+    for (name, bytes) in &inputs {
+        println!("{target}/{name}");
+        let far = reached(bytes);
+        if name.starts_with("seed_") {
+            seeds += 1;
+            assert!(far > seeds_reach_more_than, "{target}/{name} reaches {far:?}: make the seeds anew");
+        }
+    }
+    assert!(seeds > 0, "{target} has no seeds");
+}
+
+#[test]
+fn segments() {
+    run("segment", fuzzing::segment, 1);
+}
+
+#[test]
+fn sessions() {
+    run("session", fuzzing::session, false);
+}
+
+/// Changes a few bytes, or cuts or repeats some.
+fn change(bytes: &[u8], seed: u64) -> Vec<u8> {
+    let mut out = bytes.to_vec();
+    let mut x = seed | 1;
+    let mut next = |n: usize| {
+        // xorshift64
+        x ^= x << 13;
+        x ^= x >> 7;
+        x ^= x << 17;
+        (x % n.max(1) as u64) as usize
+    };
+    for _ in 0..=next(3) {
+        let (at, len) = (next(out.len()), next(9));
+        let end = (at + len).min(out.len());
+        match next(5) {
+            0 => drop(out.drain(at..end)),
+            1 => {
+                let part = out[at..end].to_vec();
+                out.splice(at..at, part);
+            }
+            2 => out[at..end].fill([0, 0xff, 0x7f][next(3)]),
+            _ if at < out.len() => out[at] ^= 1 << next(8),
+            _ => {}
+        }
+    }
+    out
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(if std::env::var_os("DEPTHRIG_LONG").is_some() { 50_000 } else { 400 }))]
+    /// Fuzzing in short, with the same mutations: on any computer, without the tools.
+    #[test]
+    fn damaged_segments_end_in_errors(seeds in proptest::collection::vec(any::<u64>(), 1..4), file in any::<usize>()) {
+        let all = corpus("segment");
+        let mut bytes = all[file % all.len()].1.clone();
+        for seed in seeds {
+            let mut plain = |b: &[u8]| change(b, seed);
+            bytes = fuzzing::mcap::mutate(&bytes, seed, &mut plain).unwrap_or_else(|| change(&bytes, seed));
+        }
+        fuzzing::segment(&bytes);
+    }
+}
+
+/// The mutations are worth something: many leave sets to be read, and the checksums really are put right.
+#[test]
+fn mutations_get_behind_the_checksums() {
+    let (_, seed) = corpus("segment").into_iter().find(|(name, _)| name == "seed_jpeg").unwrap();
+    let whole = fuzzing::segment(&seed);
+    let mut broken_sets = 0;
+    for n in 0..200 {
+        if let Some(bytes) = fuzzing::mcap::mutate(&seed, n, &mut |b| change(b, n)) {
+            let sets = fuzzing::segment(&bytes);
+            broken_sets += u64::from(sets > 0 && sets < whole);
+        }
+    }
+    assert!(broken_sets > 10, "{broken_sets} of 200 mutations broke a set and left another");
+    let mut file = fuzzing::mcap::File::parse(&seed).unwrap();
+    file.mend_checksums();
+    assert_eq!(file.to_bytes(), seed, "a good file has good checksums");
+}
