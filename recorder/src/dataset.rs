@@ -11,7 +11,7 @@ mod decode;
 mod info;
 mod sets;
 
-pub(crate) use decode::check_stored;
+pub(crate) use decode::{check_stored, jpeg_pixels};
 pub use info::{DatasetInfo, SpreadStats, StreamInfo};
 pub use sets::{DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};
 pub(crate) use sets::{Kind, kinds};

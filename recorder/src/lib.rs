@@ -15,6 +15,7 @@
 
 pub mod bench;
 mod cdr;
+mod compare;
 mod container;
 mod dataset;
 mod encode;
@@ -29,6 +30,10 @@ mod recorder;
 mod session;
 mod verify;
 
+pub use compare::{
+    CompareOptions, CompareProgress, Comparison, Difference, FieldCount, PixelCheck, PixelDifference,
+    compare, compare_with,
+};
 pub use dataset::{
     Dataset, DatasetFrame, DatasetInfo, DatasetSet, PixelMode, SetRange, Sets, SpreadStats, StreamInfo,
 };

@@ -1,7 +1,7 @@
 //! The commands and options, and what `--help` says of them.
 
 use crate::commands::{
-    bench, completions, config, demo, info, man, record, replay, run, status, tap, top, verify,
+    bench, compare, completions, config, demo, info, man, record, replay, run, status, tap, top, verify,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -108,6 +108,9 @@ pub enum Command {
     /// Check that a dataset is whole
     #[command(after_help = verify::EXAMPLES)]
     Verify(verify::VerifyArgs),
+    /// Say whether two datasets hold the same, and where they differ
+    #[command(after_help = compare::EXAMPLES)]
+    Compare(compare::CompareArgs),
     /// Check a rig configuration, or print the commented default
     #[command(subcommand, after_help = config::EXAMPLES)]
     Config(config::ConfigCommand),

@@ -1,6 +1,7 @@
 //! One module per command.
 
 pub mod bench;
+pub mod compare;
 pub mod completions;
 pub mod config;
 pub mod demo;
@@ -34,6 +35,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Replay(args) => replay::run(&args, &context),
         Command::Info(args) => info::run(&args),
         Command::Verify(args) => verify::run(&args, &context),
+        Command::Compare(args) => compare::run(&args, &context),
         Command::Config(command) => config::run(&command),
         Command::Tap(args) => tap::run(&args, &context),
         Command::Bench(command) => bench::run(&command, &context),

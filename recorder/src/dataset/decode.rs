@@ -30,7 +30,7 @@ fn wrong(h: &FrameHeader, what: impl core::fmt::Display) -> Error {
 }
 
 /// The pixels of a colour JPEG, three bytes each without row padding.
-fn jpeg_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
+pub(crate) fn jpeg_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
     let damaged = |e: ::image::ImageError| wrong(h, "its JPEG is damaged").with_source(e);
     let decoder = JpegDecoder::new(Cursor::new(stored)).map_err(damaged)?;
     let (width, height) = decoder.dimensions();

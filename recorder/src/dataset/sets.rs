@@ -94,6 +94,17 @@ pub struct DatasetFrame {
     pub pixels: Vec<u8>,
 }
 
+impl DatasetFrame {
+    /// The payload as the camera's channel carried it, of a frame that was read with [`PixelMode::Stored`].
+    ///
+    /// # Errors
+    /// [`ErrorKind::Codec`] when it cannot be decoded.
+    pub fn decoded(&self) -> Result<Vec<u8>> {
+        let unknown = || Error::new(ErrorKind::Version, format!("codec \"{}\" is unknown here", self.codec));
+        decode::decode(&self.pixels, Codec::from_name(self.codec).ok_or_else(unknown)?, &self.header)
+    }
+}
+
 /// Iterator over the sets of a dataset; it holds one set in memory.
 ///
 /// A set that cannot be read is an error of its own and the next one follows. A file that was cut delivers
