@@ -8,10 +8,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 mod decode;
+mod index;
 mod info;
 mod sets;
 
 pub(crate) use decode::{check_stored, jpeg_pixels};
+pub use index::SetReader;
 pub use info::{DatasetInfo, SpreadStats, StreamInfo};
 pub use sets::{DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};
 pub(crate) use sets::{Kind, kinds};

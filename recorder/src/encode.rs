@@ -80,7 +80,7 @@ impl FrameEncoder {
 
     pub(crate) fn encode(&mut self, job: &FrameJob<'_>) -> Result<EncodedFrame> {
         let h = &job.frame.header;
-        let pixels = job.frame.pixels.bytes();
+        let (pixels, stored) = (job.frame.pixels.bytes(), job.frame.pixels.jpeg());
         let format = image::check_picture(h, pixels.len())?;
         let pixels = &pixels[..h.payload_len as usize];
         let codec = Codec::of(format, self.color);
@@ -107,6 +107,10 @@ impl FrameEncoder {
                 })
                 .map(|_| ()),
                 (Codec::Jpeg, _) => image::write_compressed(buf, job.stamp_utc_ns, job.frame_id, |out| {
+                    if let Some(stored) = stored {
+                        out.extend_from_slice(stored);
+                        return Ok(());
+                    }
                     jpeg(out, h, format, pixels, quality, repacked)
                 })
                 .map(|_| ()),

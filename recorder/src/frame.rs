@@ -6,6 +6,12 @@ use depthrig_bus::{FrameHeader, HostTime, UtcPair};
 pub trait Pixels: Send {
     /// The payload: at least `FrameHeader::payload_len` bytes.
     fn bytes(&self) -> &[u8];
+
+    /// The JPEG that these pixels were decoded from, if they were. A stream that is stored as JPEG stores this one,
+    /// because encoding a second time would lose a second time.
+    fn jpeg(&self) -> Option<&[u8]> {
+        None
+    }
 }
 
 impl Pixels for Vec<u8> {

@@ -35,7 +35,8 @@ pub use compare::{
     compare, compare_with,
 };
 pub use dataset::{
-    Dataset, DatasetFrame, DatasetInfo, DatasetSet, PixelMode, SetRange, Sets, SpreadStats, StreamInfo,
+    Dataset, DatasetFrame, DatasetInfo, DatasetSet, PixelMode, SetRange, SetReader, Sets, SpreadStats,
+    StreamInfo,
 };
 pub use error::{Error, ErrorKind, Result};
 pub use frame::{Pixels, PushError, RecordFrame, RecordSet, SetDrop};

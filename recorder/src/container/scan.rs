@@ -281,10 +281,14 @@ impl SegmentReader {
             ));
         }
         let mut c = Collected::default();
-        let mut offset = start;
-        while offset < at {
-            let (opcode, body) = self.record(offset)?;
-            match self.parse(opcode, &body, offset)? {
+        let (mut offset, mut rest) = (start, summary.as_slice());
+        while !rest.is_empty() {
+            let cut = || self.error(ErrorKind::Corrupt, offset, "the summary ends in the middle of a record");
+            let (head, after) = rest.split_at_checked(HEAD as usize).ok_or_else(cut)?;
+            let len = head[1..].iter().rev().fold(0, |v, b| v << 8 | u64::from(*b));
+            let len = usize::try_from(len).unwrap_or(usize::MAX);
+            let (body, next) = after.split_at_checked(len).ok_or_else(cut)?;
+            match self.parse(head[0], body, offset)? {
                 Record::ChunkIndex(i) => c.chunks.push(ChunkEntry {
                     offset: i.chunk_start_offset,
                     length: i.chunk_length,
@@ -297,6 +301,7 @@ impl SegmentReader {
                 other => c.definition(other),
             }
             offset += HEAD + body.len() as u64;
+            rest = next;
         }
         Ok(Some(c))
     }

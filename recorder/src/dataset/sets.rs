@@ -54,6 +54,8 @@ pub enum PixelMode {
     Decoded,
     /// Deliver what is stored: the JPEG, or the pixels of a picture stored losslessly.
     Stored,
+    /// As `Decoded`, and where that was a JPEG, deliver it as well.
+    DecodedAndStored,
     /// Deliver none; the pictures are not even read.
     None,
 }
@@ -92,6 +94,8 @@ pub struct DatasetFrame {
     pub stored_bytes: u64,
     /// The payload, as [`PixelMode`] says.
     pub pixels: Vec<u8>,
+    /// The JPEG that the pixels were decoded from, with [`PixelMode::DecodedAndStored`].
+    pub jpeg: Option<Vec<u8>>,
 }
 
 impl DatasetFrame {
@@ -119,9 +123,9 @@ pub struct Sets {
 }
 
 /// A segment being read.
-struct Open {
-    reader: SegmentReader,
-    kinds: BTreeMap<u16, Kind>,
+pub(super) struct Open {
+    pub(super) reader: SegmentReader,
+    pub(super) kinds: BTreeMap<u16, Kind>,
     next_chunk: usize,
     partial: Partial,
 }
@@ -154,30 +158,21 @@ impl Sets {
             match opened {
                 Ok(reader) => {
                     let kinds = kinds(&reader);
-                    self.segment = Some(Open { reader, kinds, next_chunk: 0, partial: Partial::default() });
+                    self.segment = Some(Open::new(reader, kinds));
                 }
                 Err(e) => self.ready.push_back(Err(e)),
             }
             return Some(());
         };
         let Some(entry) = open.reader.chunks.get(open.next_chunk).cloned() else {
-            if let Some((offset, why)) = &open.reader.cut {
-                let what = format!("{why}; the sets before it are whole");
-                self.ready.push_back(Err(open.reader.error(ErrorKind::Truncated, *offset, what)));
-            }
+            self.ready.extend(open.cut_error().map(Err));
             self.segment = None;
             return Some(());
         };
         open.next_chunk += 1;
         let outside = (entry.end_time as i64) < self.range.from_utc_ns
             || (entry.start_time as i64) > self.range.to_utc_ns;
-        let wanted = |id: &u16| match open.kinds.get(id) {
-            Some(Kind::Picture(_)) => self.mode != PixelMode::None,
-            Some(_) => true,
-            None => false,
-        };
-        // A chunk without message indexes says nothing of its channels: look into it.
-        if outside || !(entry.channels.is_empty() || entry.channels.iter().any(wanted)) {
+        if outside || !open.wants(&entry, self.mode) {
             return Some(());
         }
         let read = open.read_chunk(&entry, self.mode, &self.dataset, self.range, &mut self.ready);
@@ -200,7 +195,34 @@ impl Iterator for Sets {
 }
 
 impl Open {
-    fn read_chunk(
+    pub(super) fn new(reader: SegmentReader, kinds: BTreeMap<u16, Kind>) -> Self {
+        Self { reader, kinds, next_chunk: 0, partial: Partial::default() }
+    }
+
+    /// Forgets messages of a set whose end was not read.
+    pub(super) fn forget(&mut self) {
+        self.partial = Partial::default();
+    }
+
+    /// Whether a chunk holds anything that sets read in this mode are made of.
+    pub(super) fn wants(&self, entry: &ChunkEntry, mode: PixelMode) -> bool {
+        let wanted = |id: &u16| match self.kinds.get(id) {
+            Some(Kind::Picture(_)) => mode != PixelMode::None,
+            Some(_) => true,
+            None => false,
+        };
+        // A chunk without message indexes says nothing of its channels: look into it.
+        entry.channels.is_empty() || entry.channels.iter().any(wanted)
+    }
+
+    /// The error that says where the segment was cut, if it was.
+    pub(super) fn cut_error(&self) -> Option<Error> {
+        let (offset, why) = self.reader.cut.as_ref()?;
+        let what = format!("{why}; the sets before it are whole");
+        Some(self.reader.error(ErrorKind::Truncated, *offset, what))
+    }
+
+    pub(super) fn read_chunk(
         &mut self,
         entry: &ChunkEntry,
         mode: PixelMode,
@@ -264,6 +286,7 @@ fn assemble(
             let what = format!("{} is stored with codec \"{}\", unknown here", member.stream, extra.codec);
             Error::new(ErrorKind::Version, what)
         })?;
+        let mut jpeg = None;
         let pixels = if mode == PixelMode::None {
             Vec::new()
         } else {
@@ -273,13 +296,14 @@ fn assemble(
                 return Err(lacks(&member.stream, "right picture: another one is in its place, that"));
             }
             let stored = decode::stored(&picture, codec)?;
+            jpeg = (mode == PixelMode::DecodedAndStored && codec == Codec::Jpeg).then(|| stored.to_vec());
             match mode {
-                PixelMode::Decoded => decode::decode(stored, codec, &header)?,
-                _ => stored.to_vec(),
+                PixelMode::Stored => stored.to_vec(),
+                _ => decode::decode(stored, codec, &header)?,
             }
         };
         let stored_bytes = member.message_bytes;
-        frames.push(DatasetFrame { stream, header, codec: codec.name(), stored_bytes, pixels });
+        frames.push(DatasetFrame { stream, header, codec: codec.name(), stored_bytes, pixels, jpeg });
     }
     Ok(DatasetSet {
         id: set.id,

@@ -6,5 +6,6 @@ mod corpus;
 mod failures;
 mod kill;
 mod round_trip;
+mod set_reader;
 mod support;
 mod verify;
