@@ -28,6 +28,7 @@ mod msgs;
 mod options;
 mod recorder;
 mod session;
+mod still;
 mod verify;
 
 pub use compare::{
@@ -44,4 +45,5 @@ pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
 pub use options::{ColorCodec, Compression, RecorderOptions};
 pub use recorder::{Progress, Recorder, Summary, UtcSource};
 pub use session::{FORMAT, Note, Outcome, SESSION_FILE, Session, StreamRecord};
+pub use still::{StillFormat, still};
 pub use verify::{Finding, Severity, VerifyOptions, VerifyReport, verify, verify_with};

@@ -1,9 +1,9 @@
 //! How far apart two pictures are, sample by sample, summed over a stream.
 
 use crate::dataset::jpeg_pixels;
+use crate::still::tight;
 use depthrig_bus::{FrameHeader, PixelFormat};
 use serde::Serialize;
-use std::borrow::Cow;
 
 /// How far the pixels of a stream are apart, over the frames whose pixels differ.
 ///
@@ -160,17 +160,6 @@ impl Sums {
     fn psnr_db(&self) -> f64 {
         10.0 * (255.0 * 255.0 * self.samples as f64 / self.squares.max(f64::MIN_POSITIVE)).log10()
     }
-}
-
-/// The rows without what lies between them.
-fn tight<'a>(h: &FrameHeader, pixels: &'a [u8], format: PixelFormat) -> Cow<'a, [u8]> {
-    let (row, stride) = (format.row_bytes(h.width) as usize, h.stride as usize);
-    if stride <= row || row == 0 {
-        return pixels.into();
-    }
-    let mut rows = Vec::with_capacity(pixels.len());
-    pixels.chunks(stride).for_each(|r| rows.extend_from_slice(&r[..row.min(r.len())]));
-    rows.into()
 }
 
 #[cfg(test)]
