@@ -74,7 +74,8 @@ impl DropCounts {
 
     /// Frames lost for any reason.
     pub fn total(&self) -> u64 {
-        self.0.iter().sum()
+        // Numbers of a damaged file may not fit.
+        self.0.iter().fold(0, |sum, n| sum.saturating_add(*n))
     }
 
     /// The reasons that lost anything, with their counts.

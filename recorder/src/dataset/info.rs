@@ -158,7 +158,7 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         for f in set.frames {
             let s = &mut info.streams[f.stream];
             s.frames += 1;
-            s.bytes += f.stored_bytes;
+            s.bytes = s.bytes.saturating_add(f.stored_bytes);
             s.raw_bytes += u64::from(f.header.payload_len);
             s.codec = f.codec;
             let t = f.header.capture_time_ns;

@@ -26,7 +26,7 @@ fn by_name<S: Serializer>(counts: &DropCounts, s: S) -> Result<S::Ok, S::Error> 
 impl StreamAccount {
     /// Whether `captured = delivered + Σ dropped`.
     pub fn balances(&self) -> bool {
-        self.captured == self.delivered + self.dropped.total()
+        self.captured == self.delivered.saturating_add(self.dropped.total())
     }
 }
 
@@ -44,7 +44,8 @@ pub struct SetCounts {
 impl SetCounts {
     /// Sets lost for any reason.
     pub fn dropped_total(&self) -> u64 {
-        self.dropped.iter().sum()
+        // What a damaged file says may not fit.
+        self.dropped.iter().fold(0, |sum, n| sum.saturating_add(*n))
     }
 
     /// The reasons that lost anything, with their counts.
@@ -54,7 +55,7 @@ impl SetCounts {
 
     /// Whether `offered = recorded + Σ dropped`.
     pub fn balances(&self) -> bool {
-        self.offered == self.recorded + self.dropped_total()
+        self.offered == self.recorded.saturating_add(self.dropped_total())
     }
 }
 

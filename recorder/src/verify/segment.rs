@@ -370,12 +370,9 @@ impl Walk {
         let base = *self
             .account_base
             .get_or_insert_with(|| if first_is_zero { 0 } else { sets.recorded.saturating_sub(self.sets) });
-        if sets.recorded != base + self.sets {
-            broken(format!(
-                "the account says {} sets were recorded, {} are there",
-                sets.recorded,
-                base + self.sets
-            ));
+        let there = base.saturating_add(self.sets);
+        if sets.recorded != there {
+            broken(format!("the account says {} sets were recorded, {there} are there", sets.recorded));
         }
         self.dropped = Some(sets);
         for a in streams {
