@@ -11,10 +11,12 @@ use depthrig_recorder::{
     Diagnostic, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamAccount,
     StreamRecord, Summary, UtcSource, fs,
 };
+use place::place;
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
-use time::OffsetDateTime;
+
+mod place;
 
 /// The recordings of a rig: at most one at a time, and what became of the last.
 #[derive(Default)]
@@ -385,73 +387,4 @@ fn options_of(config: &RecordingConfig) -> RecorderOptions {
         options.workers = config.workers;
     }
     options
-}
-
-/// Name and folder of a new dataset.
-fn place(config: &RecordingConfig, request: &RecordRequest, utc_ns: i64) -> Result<(String, PathBuf)> {
-    let name = match &request.name {
-        Some(name) => name.clone(),
-        None => default_name(&request.scene, utc_ns),
-    };
-    let bad = name.is_empty() || name.starts_with('.') || name.contains(['/', '\0']);
-    if bad {
-        return Err(Error::new(
-            ErrorKind::BadInput,
-            format!("\"{name}\" cannot be the name of a dataset's folder"),
-        ));
-    }
-    let directory = request.directory.as_ref().unwrap_or(&config.directory);
-    let mut path = directory.join(&name);
-    if request.name.is_none() {
-        // Two recordings of a scene in one minute are no mistake.
-        let mut n = 2;
-        while path.exists() {
-            path = directory.join(format!("{name}_{n}"));
-            n += 1;
-        }
-    }
-    let name = path.file_name().map_or(name, |n| n.to_string_lossy().into_owned());
-    Ok((name, path))
-}
-
-/// `YYYYMMDD_HHMM_<scene>` in UTC, with what cannot be in a file name replaced.
-fn default_name(scene: &str, utc_ns: i64) -> String {
-    let t =
-        OffsetDateTime::from_unix_timestamp_nanos(i128::from(utc_ns)).unwrap_or(OffsetDateTime::UNIX_EPOCH);
-    let (date, clock) = (t.date(), t.time());
-    let stamp = format!(
-        "{:04}{:02}{:02}_{:02}{:02}",
-        date.year(),
-        u8::from(date.month()),
-        date.day(),
-        clock.hour(),
-        clock.minute()
-    );
-    let clean: String = scene
-        .trim()
-        .chars()
-        .map(|c| if c.is_alphanumeric() || "-_.".contains(c) { c } else { '_' })
-        .collect();
-    if clean.is_empty() { stamp } else { format!("{stamp}_{clean}") }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn default_names_sort_by_time_and_are_file_names() {
-        let utc_ns = 1_795_000_000_000_000_000;
-        assert_eq!(default_name("", utc_ns), "20261118_1106");
-        assert_eq!(default_name(" kitchen/sink 2 ", utc_ns), "20261118_1106_kitchen_sink_2");
-    }
-
-    #[test]
-    fn a_name_that_is_a_path_is_refused() {
-        let config = RecordingConfig::default();
-        for name in ["../up", "", ".hidden"] {
-            let request = RecordRequest { name: Some(name.into()), ..RecordRequest::default() };
-            assert_eq!(place(&config, &request, 0).unwrap_err().kind(), ErrorKind::BadInput);
-        }
-    }
 }

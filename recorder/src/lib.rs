@@ -14,6 +14,7 @@
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 pub mod bench;
+mod catalog;
 mod cdr;
 mod compare;
 mod container;
@@ -31,6 +32,7 @@ mod session;
 mod still;
 mod verify;
 
+pub use catalog::{CatalogEntry, Health, catalog, look_at};
 pub use compare::{
     CompareOptions, CompareProgress, Comparison, Difference, FieldCount, PixelCheck, PixelDifference,
     compare, compare_with,
@@ -44,6 +46,9 @@ pub use frame::{Pixels, PushError, RecordFrame, RecordSet, SetDrop};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
 pub use options::{ColorCodec, Compression, RecorderOptions};
 pub use recorder::{Progress, Recorder, Summary, UtcSource};
-pub use session::{FORMAT, Note, Outcome, SESSION_FILE, Session, StreamRecord};
+pub use session::{
+    Edit, FORMAT, Note, Outcome, SESSION_FILE, Session, SessionChanges, StreamRecord, check_name, edit,
+    rename,
+};
 pub use still::{StillFormat, still};
 pub use verify::{Finding, Severity, VerifyOptions, VerifyReport, verify, verify_with};

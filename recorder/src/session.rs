@@ -7,6 +7,10 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
 
+mod edit;
+
+pub use edit::{SessionChanges, check_name, edit, rename};
+
 /// The value of `Session::format` that this version writes and reads.
 pub const FORMAT: &str = "depthrig.dataset/1";
 /// The name of the session file in a dataset.
@@ -45,8 +49,32 @@ pub struct Session {
     /// What the operator noted.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub notes: Vec<Note>,
+    /// What was changed after the recording, oldest first.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub history: Vec<Edit>,
     /// The recorded streams; a frame names its stream by the index here.
     pub streams: Vec<StreamRecord>,
+    /// Keys that this version does not know: a user's own, or a later version's. They are kept.
+    #[serde(flatten)]
+    pub extra: toml::Table,
+}
+
+/// A change of `session.toml` after the recording.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Edit {
+    /// When, UTC nanoseconds since 1970.
+    pub utc_ns: i64,
+    /// Which key.
+    pub field: String,
+    /// Its value until then; empty for a note.
+    #[serde(default)]
+    pub before: String,
+    /// Its value since.
+    #[serde(default)]
+    pub after: String,
+    /// The version of depthrig that changed it.
+    #[serde(default)]
+    pub depthrig_version: String,
 }
 
 /// A note of the operator.
@@ -170,7 +198,9 @@ impl Session {
             rig_config: String::new(),
             outcome: None,
             notes: Vec::new(),
+            history: Vec::new(),
             streams: Vec::new(),
+            extra: toml::Table::new(),
         }
     }
 
@@ -232,17 +262,20 @@ impl Session {
     /// Reads `session.toml` in `dir`.
     pub(crate) fn load(fs: &dyn Fs, dir: &Path) -> Result<Self> {
         let path = dir.join(SESSION_FILE);
-        let read = || {
-            let file = fs.open(&path)?;
-            // A session with every note of a long day is some kilobytes.
-            let mut bytes = vec![0; usize::try_from(file.size()?.min(64 << 20)).unwrap_or(0)];
-            file.read_exact_at(&mut bytes, 0)?;
-            Ok(bytes)
-        };
-        let bytes = read().map_err(|e: std::io::Error| Error::io("read", &path, e))?;
-        let text = String::from_utf8(bytes).map_err(|e| {
-            Error::new(ErrorKind::Corrupt, format!("{} is not text", path.display())).with_source(e)
-        })?;
-        Self::from_toml(&text, &path)
+        Self::from_toml(&text_of(fs, &path)?, &path)
     }
+}
+
+/// The text of a `session.toml`.
+fn text_of(fs: &dyn Fs, path: &Path) -> Result<String> {
+    let read = || {
+        let file = fs.open(path)?;
+        // A session with every note of a long day is some kilobytes.
+        let mut bytes = vec![0; usize::try_from(file.size()?.min(64 << 20)).unwrap_or(0)];
+        file.read_exact_at(&mut bytes, 0)?;
+        Ok(bytes)
+    };
+    let bytes = read().map_err(|e: std::io::Error| Error::io("read", path, e))?;
+    String::from_utf8(bytes)
+        .map_err(|e| Error::new(ErrorKind::Corrupt, format!("{} is not text", path.display())).with_source(e))
 }

@@ -1,7 +1,8 @@
 //! The commands and options, and what `--help` says of them.
 
 use crate::commands::{
-    bench, compare, completions, config, demo, info, man, record, replay, run, status, tap, top, verify,
+    bench, compare, completions, config, demo, edit, info, man, record, replay, run, sessions, status, tap,
+    top, verify,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -105,6 +106,12 @@ pub enum Command {
     Replay(replay::ReplayArgs),
     /// Say what is in a dataset
     Info(info::InfoArgs),
+    /// List the datasets of a folder: scene, start, length, sets, size, health
+    #[command(after_help = sessions::EXAMPLES)]
+    Sessions(sessions::SessionsArgs),
+    /// Change scene, operator, notes or name of a dataset; what it said before stays in its history
+    #[command(after_help = edit::EXAMPLES)]
+    Edit(edit::EditArgs),
     /// Check that a dataset is whole
     #[command(after_help = verify::EXAMPLES)]
     Verify(verify::VerifyArgs),

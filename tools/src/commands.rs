@@ -5,11 +5,13 @@ pub mod compare;
 pub mod completions;
 pub mod config;
 pub mod demo;
+pub mod edit;
 pub mod info;
 pub mod man;
 pub mod record;
 pub mod replay;
 pub mod run;
+pub mod sessions;
 pub mod status;
 pub mod tap;
 pub mod top;
@@ -34,6 +36,8 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Top(args) => top::run(&args, &context),
         Command::Replay(args) => replay::run(&args, &context),
         Command::Info(args) => info::run(&args),
+        Command::Sessions(args) => sessions::run(&args, &context),
+        Command::Edit(args) => edit::run(&args),
         Command::Verify(args) => verify::run(&args, &context),
         Command::Compare(args) => compare::run(&args, &context),
         Command::Config(command) => config::run(&command),

@@ -1,8 +1,10 @@
 //! Datasets from the outside: written, read, damaged, and read by the `mcap` crate's own reader.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
+mod catalog;
 mod compare;
 mod corpus;
+mod edit;
 mod failures;
 mod kill;
 mod round_trip;

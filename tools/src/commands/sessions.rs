@@ -1,0 +1,190 @@
+//! `depthrig sessions`: the datasets of a folder at a glance.
+
+use crate::context::Context;
+use crate::exit::Exit;
+use crate::out;
+use anyhow::Result;
+use clap::ValueEnum;
+use depthrig_daemon::client::Client;
+use depthrig_daemon::config::RecordingConfig;
+use depthrig_recorder::fs::RealFs;
+use depthrig_recorder::{CatalogEntry, catalog};
+use std::path::PathBuf;
+use time::{OffsetDateTime, UtcOffset};
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+It reads what each dataset says of itself and no pictures; `depthrig verify` proves a dataset.
+Exit codes: 0 every listed dataset is well, 1 the folder cannot be read, 3 some are lost, unfinished or damaged.
+
+Examples:
+  depthrig sessions
+  depthrig sessions /data --sort size --reverse
+  depthrig sessions /data --filter kitchen --json | jq '.[] | select(.health != \"whole\") | .path'";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct SessionsArgs {
+    /// Folder of datasets; those in its folders are found too [default: where the running rig records, else datasets]
+    #[arg(value_name = "DIR")]
+    folder: Option<PathBuf>,
+    /// Order of the list
+    #[arg(long, value_enum, default_value = "start", value_name = "KEY")]
+    sort: Sort,
+    /// Turn the order around
+    #[arg(long)]
+    reverse: bool,
+    /// Only those with this text in name, scene or operator, in any case
+    #[arg(long, value_name = "TEXT")]
+    filter: Option<String>,
+    /// Only those with this text in their scene, in any case
+    #[arg(long, value_name = "TEXT")]
+    scene: Option<String>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// What the list is ordered by; equal ones by their path.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Sort {
+    /// When they began, the latest last.
+    Start,
+    /// Name.
+    Name,
+    /// Scene.
+    Scene,
+    /// Length, the longest last.
+    Length,
+    /// Sets, the most last.
+    Sets,
+    /// Bytes, the most last.
+    Size,
+    /// Health, the worst last.
+    Health,
+}
+
+/// Lists them.
+pub fn run(args: &SessionsArgs, context: &Context) -> Result<Exit> {
+    let folder = args.folder.clone().unwrap_or_else(|| recordings_folder(context));
+    let mut entries = catalog(&RealFs, &folder)?;
+    entries.retain(|e| is_wanted(e, args));
+    sort(&mut entries, args.sort);
+    if args.reverse {
+        entries.reverse();
+    }
+    if args.json {
+        out::json(&entries)?;
+    } else {
+        out::line(text(&entries, &folder.display().to_string()))?;
+    }
+    Ok(if entries.iter().any(|e| e.health.is_bad()) { Exit::Lost } else { Exit::Good })
+}
+
+/// Where the running rig records, as far as it says; else the folder that a configuration names by default.
+fn recordings_folder(context: &Context) -> PathBuf {
+    let of_rig = || {
+        let client = Client::connect(&context.runtime().ok()?, context.global.rig.as_ref()).ok()?;
+        let recording = client.record_status().ok()??;
+        Some(PathBuf::from(recording.path).parent()?.to_owned())
+    };
+    of_rig().unwrap_or_else(|| RecordingConfig::default().directory)
+}
+
+fn is_wanted(e: &CatalogEntry, args: &SessionsArgs) -> bool {
+    let has = |text: &str, part: &str| text.to_lowercase().contains(&part.to_lowercase());
+    args.scene.as_ref().is_none_or(|part| has(&e.scene, part))
+        && args
+            .filter
+            .as_ref()
+            .is_none_or(|part| [&e.name, &e.scene, &e.operator].into_iter().any(|text| has(text, part)))
+}
+
+fn sort(entries: &mut [CatalogEntry], by: Sort) {
+    match by {
+        Sort::Start => entries.sort_by_key(|e| e.started_utc_ns),
+        Sort::Name => entries.sort_by(|a, b| a.name.cmp(&b.name)),
+        Sort::Scene => entries.sort_by(|a, b| a.scene.cmp(&b.scene)),
+        Sort::Length => entries.sort_by_key(|e| e.duration_ns),
+        Sort::Sets => entries.sort_by_key(|e| e.sets),
+        Sort::Size => entries.sort_by_key(|e| e.bytes),
+        Sort::Health => entries.sort_by_key(|e| e.health),
+    }
+}
+
+fn text(entries: &[CatalogEntry], folder: &str) -> String {
+    if entries.is_empty() {
+        return format!("no datasets in {folder}");
+    }
+    let mut lines = vec![out::table(
+        &["name", "scene", "operator", "start", "health", "length", "sets", "lost", "streams", "size"],
+        5,
+        entries.iter().map(|e| {
+            vec![
+                short(&e.name, 44),
+                short(&e.scene, 24),
+                short(&e.operator, 16),
+                e.started_utc_ns.map_or_else(|| "-".to_owned(), local),
+                e.health.name().to_owned(),
+                out::seconds(e.duration_ns as f64 / 1e9),
+                e.sets.to_string(),
+                e.sets_lost.to_string(),
+                e.streams.to_string(),
+                out::bytes(e.bytes),
+            ]
+        }),
+    )];
+    let bad: Vec<_> = entries.iter().filter(|e| e.health.is_bad()).collect();
+    let (sets, bytes) = entries.iter().fold((0, 0), |(s, b), e| (s + e.sets, b + e.bytes));
+    lines.push(String::new());
+    for e in &bad {
+        let why = e.why.first().map_or("", String::as_str);
+        lines.push(format!("{}: {}: {why}", e.health.name(), e.path.display()));
+    }
+    let all = format!("{} datasets, {sets} sets, {}", entries.len(), out::bytes(bytes));
+    lines.push(if bad.is_empty() { all } else { format!("{all}; {} need a look", bad.len()) });
+    lines.join("\n")
+}
+
+/// The text on one line, cut to `most` characters; `-` when there is none.
+fn short(text: &str, most: usize) -> String {
+    let text: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    match text.trim() {
+        "" => "-".to_owned(),
+        text if text.chars().count() <= most => text.to_owned(),
+        text => text.chars().take(most - 1).chain(['…']).collect(),
+    }
+}
+
+/// `2026-08-21 14:05 +02:00`: in the zone of this computer at that time, in UTC when it has none.
+fn local(utc_ns: i64) -> String {
+    let Ok(utc) = OffsetDateTime::from_unix_timestamp_nanos(i128::from(utc_ns)) else {
+        return "-".to_owned();
+    };
+    let t = utc.to_offset(UtcOffset::local_offset_at(utc).unwrap_or(UtcOffset::UTC));
+    let (hours, minutes, _) = t.offset().as_hms();
+    let sign = if t.offset().is_negative() { '-' } else { '+' };
+    format!(
+        "{:04}-{:02}-{:02} {:02}:{:02} {sign}{:02}:{:02}",
+        t.year(),
+        u8::from(t.month()),
+        t.day(),
+        t.hour(),
+        t.minute(),
+        hours.unsigned_abs(),
+        minutes.unsigned_abs()
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texts_stay_on_their_line() {
+        assert_eq!(short("", 5), "-");
+        assert_eq!(short(" a\nb\x1b[31m ", 20), "a b [31m");
+        assert_eq!(short("Küchentisch", 5), "Küch…");
+        assert_eq!(short("Küche", 5), "Küche");
+    }
+}

@@ -1,0 +1,111 @@
+//! Listing and editing datasets from the command line.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "support/home.rs"]
+#[allow(dead_code)]
+mod support;
+
+use depthrig_bus::{FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
+use depthrig_recorder::{
+    RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamRecord, fs::RealFs,
+};
+use std::path::Path;
+use std::sync::Arc;
+use support::Home;
+
+/// One set of one small picture.
+fn write(dir: &Path, scene: &str, started_utc_ns: i64) {
+    let mut session = Session::new(dir.file_name().unwrap().to_str().unwrap(), "rig");
+    (session.scene, session.operator) = (scene.into(), "ada".into());
+    session.started_utc_ns = started_utc_ns;
+    session.streams = vec![StreamRecord {
+        id: "desk/depth".parse().unwrap(),
+        model: String::new(),
+        serial: String::new(),
+        format: PixelFormat::Z16,
+        width: 8,
+        height: 8,
+        rate_hz: 30.0,
+        depth_unit_m: 0.001,
+        calibration: String::new(),
+        intrinsics: Intrinsics::default(),
+        pose: Pose::IDENTITY,
+    }];
+    let options = RecorderOptions { min_free_bytes: 0, ..RecorderOptions::default() };
+    let r = Recorder::create(Arc::new(RealFs), dir, session.clone(), options).unwrap();
+    let mut header = FrameHeader::default();
+    header.set_picture(PixelFormat::Z16, 8, 8);
+    header.set_names("rig", &session.streams[0].id);
+    let utc = UtcPair { mono: HostTime::from_ns(1), utc_ns: started_utc_ns, width_ns: 1 };
+    let frame = RecordFrame { stream: 0, header, pixels: Box::new(vec![1; 128]) };
+    let set = RecordSet {
+        id: 1,
+        tick: HostTime::from_ns(1),
+        utc,
+        frames: vec![frame],
+        missing: vec![],
+        spread_ns: 0,
+    };
+    r.push(set).unwrap();
+    r.finish().unwrap();
+}
+
+fn names(json: &str) -> Vec<String> {
+    let list: serde_json::Value = serde_json::from_str(json).unwrap();
+    list.as_array().unwrap().iter().map(|e| e["name"].as_str().unwrap().to_owned()).collect()
+}
+
+#[test]
+fn a_folder_is_listed_sorted_and_filtered() {
+    let home = Home::new();
+    let data = home.path().join("datasets");
+    for (name, scene, at) in [("b", "Kitchen", 3), ("a", "lab\n2", 1), ("c", "kitchen sink", 2)] {
+        write(&data.join(name), scene, at * 1_000_000_000_000_000_000 / 2);
+    }
+    let data = data.to_str().unwrap();
+    let listed = |more: &[&str]| names(&home.run(&[&["sessions", data, "--json"], more].concat()).good());
+    assert_eq!(listed(&[]), ["a", "c", "b"]);
+    assert_eq!(listed(&["--sort", "name", "--reverse"]), ["c", "b", "a"]);
+    assert_eq!(listed(&["--scene", "KITCHEN"]), ["c", "b"]);
+    assert_eq!(listed(&["--filter", "sink"]), ["c"]);
+    assert_eq!(listed(&["--filter", "Ada"]).len(), 3);
+    let text = home.run(&["sessions", data]).good();
+    assert!(text.contains("lab 2") && text.contains("3 datasets, 3 sets"), "{text}");
+    assert!(!home.run(&["sessions", data, "--sort", "colour"]).err.is_empty());
+
+    // One that is bad makes the exit code 3, and is in the list.
+    std::fs::remove_file(Path::new(data).join("b/seg_0000.mcap")).unwrap();
+    let ran = home.run(&["sessions", data]);
+    assert_eq!(ran.code, 3, "{}", ran.err);
+    assert!(ran.out.contains("damaged:") && ran.out.contains("there are no segments"), "{}", ran.out);
+    assert_eq!(home.run(&["sessions", data, "--filter", "a"]).code, 3, "operator ada has all of them");
+    assert_eq!(home.run(&["sessions", data, "--scene", "sink"]).code, 0);
+    let ran = home.run(&["sessions", "/no/such/folder"]);
+    assert_eq!(ran.code, 1);
+    assert!(ran.err.contains("/no/such/folder"), "{}", ran.err);
+}
+
+#[test]
+fn an_edit_shows_in_info_and_leaves_its_history() {
+    let home = Home::new();
+    let dir = home.path().join("first");
+    write(&dir, "old scene", 1_700_000_000_000_000_000);
+    let at = dir.to_str().unwrap();
+    assert!(home.run(&["edit", at]).good().contains("never edited"));
+    let said = home.run(&["edit", at, "--scene", "new scene", "--note", "bumped"]).good();
+    assert!(said.contains("\"old scene\" is now \"new scene\"") && said.contains("note added"), "{said}");
+    assert!(home.run(&["edit", at, "--scene", "new scene"]).good().contains("nothing to change"));
+    assert!(home.run(&["info", at]).good().contains("new scene"));
+    let json = home.run(&["edit", at, "--rename", "second", "--json"]).good();
+    let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert_eq!(json["changed"][0]["after"], "second");
+    assert_eq!(json["history"].as_array().unwrap().len(), 3);
+    let to = home.path().join("second");
+    assert!(to.join("seg_0000.mcap").exists() && !dir.exists());
+    assert!(home.run(&["verify", to.to_str().unwrap()]).good().contains("whole"));
+    for bad in [&["--rename", "a/b"][..], &["--note", " "]] {
+        let ran = home.run(&[&["edit", to.to_str().unwrap()], bad].concat());
+        assert_eq!(ran.code, 2, "{bad:?}: {}", ran.err);
+    }
+    assert_eq!(home.run(&["edit", "/no/such/dataset", "--scene", "x"]).code, 1);
+}
