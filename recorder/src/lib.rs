@@ -14,6 +14,7 @@
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 pub mod bench;
+mod cat;
 mod catalog;
 mod cdr;
 mod compare;
@@ -28,10 +29,12 @@ pub mod fuzzing;
 mod msgs;
 mod options;
 mod recorder;
+mod select;
 mod session;
 mod still;
 mod verify;
 
+pub use cat::{FRAMES_FILE, FrameChoice, FrameRow, FramesDone, SetChoice, export_frames, list_frames};
 pub use catalog::{CatalogEntry, Health, catalog, look_at};
 pub use compare::{
     CompareOptions, CompareProgress, Comparison, Difference, FieldCount, PixelCheck, PixelDifference,
@@ -46,6 +49,7 @@ pub use frame::{Pixels, PushError, RecordFrame, RecordSet, SetDrop};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
 pub use options::{ColorCodec, Compression, RecorderOptions};
 pub use recorder::{Progress, Recorder, Summary, UtcSource};
+pub use select::{Edge, Moment, SetSpan};
 pub use session::{
     Edit, FORMAT, Note, Outcome, SESSION_FILE, Session, SessionChanges, StreamRecord, check_name, edit,
     rename,

@@ -1,8 +1,8 @@
 //! The commands and options, and what `--help` says of them.
 
 use crate::commands::{
-    bench, compare, completions, config, demo, edit, info, man, record, replay, run, sessions, status, tap,
-    top, verify,
+    bench, cat, compare, completions, config, demo, edit, info, man, record, replay, run, sessions, status,
+    tap, top, verify,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -115,6 +115,9 @@ pub enum Command {
     /// Check that a dataset is whole
     #[command(after_help = verify::EXAMPLES)]
     Verify(verify::VerifyArgs),
+    /// List single frames of a dataset, or write them as PNG, NPY or JPEG files
+    #[command(after_help = cat::EXAMPLES)]
+    Cat(cat::CatArgs),
     /// Say whether two datasets hold the same, and where they differ
     #[command(after_help = compare::EXAMPLES)]
     Compare(compare::CompareArgs),

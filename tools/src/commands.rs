@@ -1,6 +1,7 @@
 //! One module per command.
 
 pub mod bench;
+pub mod cat;
 pub mod compare;
 pub mod completions;
 pub mod config;
@@ -39,6 +40,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Sessions(args) => sessions::run(&args, &context),
         Command::Edit(args) => edit::run(&args),
         Command::Verify(args) => verify::run(&args, &context),
+        Command::Cat(args) => cat::run(&args, &context),
         Command::Compare(args) => compare::run(&args, &context),
         Command::Config(command) => config::run(&command),
         Command::Tap(args) => tap::run(&args, &context),

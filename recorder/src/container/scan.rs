@@ -93,7 +93,10 @@ impl SegmentReader {
         let file = fs.open(path).map_err(|e| Error::io("open", path, e))?;
         let size = file.size().map_err(|e| Error::io("open", path, e))?;
         let mut magic = [0; 8];
-        if size < 8 || file.read_exact_at(&mut magic, 0).is_err() || magic != MAGIC {
+        if size >= 8 {
+            file.read_exact_at(&mut magic, 0).map_err(|e| Error::io("read", path, e))?;
+        }
+        if magic != MAGIC {
             return Err(Error::new(
                 ErrorKind::NotADataset,
                 format!("{} is no MCAP file: it does not begin with the MCAP magic", path.display()),

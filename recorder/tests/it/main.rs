@@ -1,6 +1,7 @@
 //! Datasets from the outside: written, read, damaged, and read by the `mcap` crate's own reader.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
+mod cat;
 mod catalog;
 mod compare;
 mod corpus;

@@ -1,0 +1,203 @@
+//! `depthrig cat`: single frames of a dataset, listed or written as picture files.
+
+use crate::context::Context;
+use crate::exit::{Exit, UsageError};
+use crate::out;
+use crate::progress::Progress;
+use crate::signals::Stop;
+use anyhow::Result;
+use clap::ValueEnum;
+use core::ops::ControlFlow;
+use depthrig_bus::StreamId;
+use depthrig_recorder::fs::RealFs;
+use depthrig_recorder::{
+    Dataset, Edge, FrameChoice, FrameRow, FramesDone, Moment, SetChoice, SetSpan, StillFormat, export_frames,
+    list_frames,
+};
+use std::path::PathBuf;
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+Without --out the frames are listed: a line each, with --json an object each with all numbers of the header.
+With --out DIR each frame becomes a file DIR/CAM/STREAM/SET.png (.npy, .jpg), and DIR/frames.csv tells set,
+times, counters and depth unit of each. DIR is new or empty; a list named frames.csv.part was not finished.
+
+A moment T is a number of seconds after the first set, or a time such as 2026-11-21T10:15:03.2Z.
+PNG is 8 or 16 bits; depth is in the camera's units (times depth_unit_m of frames.csv gives metres; 0 is no
+depth). NPY is the array as the camera's channel carried it. Without --format each stream gets PNG, or NPY
+where a PNG would lose bits (depth_f32, yuyv, uyvy, nv12).
+
+Exit codes: 0 all, 1 failed, 2 wrong usage, 3 written, but some frames of the dataset could not be read.
+
+Examples:
+  depthrig cat data/20261121_1015_kitchen | head
+  depthrig cat data/20261121_1015_kitchen --at 12.5 --out shot
+  depthrig cat data/20261121_1015_kitchen --stream d435/depth --from 10 --to 20 --every 5 --format npy --out d
+  depthrig cat data/20261121_1015_kitchen --set 17 --stream d435/color --format jpg --out as_stored";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct CatArgs {
+    /// The dataset's folder, or one segment
+    dataset: PathBuf,
+    /// Only this stream (CAM/STREAM); may be given several times
+    #[arg(long = "stream", value_name = "CAM/STREAM")]
+    streams: Vec<StreamId>,
+    /// The set of this id
+    #[arg(long, value_name = "ID", conflicts_with_all = ["from", "to", "at"])]
+    set: Option<u64>,
+    /// The set nearest to this moment
+    #[arg(long, value_name = "T", conflicts_with_all = ["from", "to"])]
+    at: Option<Moment>,
+    /// Sets from this moment on
+    #[arg(long, value_name = "T")]
+    from: Option<Moment>,
+    /// Sets up to this moment
+    #[arg(long, value_name = "T")]
+    to: Option<Moment>,
+    /// One of every N sets
+    #[arg(long, value_name = "N", default_value = "1", value_parser = clap::value_parser!(u32).range(1..))]
+    every: u32,
+    /// Form of the picture files
+    #[arg(long, value_enum, requires = "out")]
+    format: Option<Form>,
+    /// New folder for the picture files
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Print JSON: without --out one object per frame and line
+    #[arg(long)]
+    json: bool,
+}
+
+/// Form of the picture files.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Form {
+    /// 8 or 16 bits, for what a PNG can hold
+    Png,
+    /// NumPy arrays
+    Npy,
+    /// The JPEG as it is stored
+    Jpg,
+}
+
+/// Lists or writes.
+pub fn run(args: &CatArgs, context: &Context) -> Result<Exit> {
+    let dataset = Dataset::open(&args.dataset)?;
+    let sets = match (args.set, args.at) {
+        (Some(id), _) => SetChoice::Id(id),
+        (_, Some(moment)) => SetChoice::Nearest(moment),
+        _ => SetChoice::Span(SetSpan { from: args.from.map(Edge::Moment), to: args.to.map(Edge::Moment) }),
+    };
+    let choice = FrameChoice { sets, every: args.every as usize, streams: args.streams.clone() };
+    let done = match &args.out {
+        None => list(args, &dataset, &choice)?,
+        Some(_) => export(args, context, &dataset, &choice)?,
+    };
+    for problem in &done.problems {
+        eprintln!("lost: {problem}");
+    }
+    Ok(match done {
+        _ if done.ended => Exit::Failed,
+        _ if done.lost > 0 => Exit::Lost,
+        _ => Exit::Good,
+    })
+}
+
+fn list(args: &CatArgs, dataset: &Dataset, choice: &FrameChoice) -> Result<FramesDone> {
+    if !args.json {
+        out::line(columns(
+            "set",
+            "stream",
+            "captured (UTC)",
+            "device frame",
+            "after tick",
+            "picture",
+            "stored",
+        ))?;
+    }
+    let mut failed = None;
+    let done = list_frames(dataset, choice, &mut |row| {
+        let told = if args.json { out::json_line(&row) } else { out::line(text(&row)) };
+        match told {
+            Ok(()) => ControlFlow::Continue(()),
+            Err(e) => {
+                failed = Some(e);
+                ControlFlow::Break(())
+            }
+        }
+    })
+    .map_err(usage)?;
+    failed.map_or(Ok(done), Err)
+}
+
+/// A row for people. Widths are fixed, because a table of a day's frames cannot wait for its widest row.
+fn text(row: &FrameRow) -> String {
+    let late_ms = (row.capture_time_ns - row.tick_ns) as f64 / 1e6;
+    columns(
+        &row.set.to_string(),
+        &row.stream,
+        &utc_ms(row.capture_utc_ns),
+        &row.device_sequence.to_string(),
+        &format!("{late_ms:+.3} ms"),
+        &format!("{}x{} {}", row.width, row.height, row.format),
+        &format!("{} {}", row.codec, out::bytes(row.stored_bytes)),
+    )
+}
+
+/// `2026-08-21 14:05:09.250`.
+fn utc_ms(ns: i64) -> String {
+    let whole = super::info::utc(ns);
+    format!("{}.{:03}", whole.trim_end_matches(" UTC"), ns.rem_euclid(1_000_000_000) / 1_000_000)
+}
+
+fn columns(
+    set: &str,
+    stream: &str,
+    time: &str,
+    frame: &str,
+    offset: &str,
+    picture: &str,
+    stored: &str,
+) -> String {
+    format!("{set:>7}  {stream:<20}  {time:<23}  {frame:>12}  {offset:>11}  {picture:<21}  {stored}")
+}
+
+fn export(args: &CatArgs, context: &Context, dataset: &Dataset, choice: &FrameChoice) -> Result<FramesDone> {
+    let Some(dir) = &args.out else { return Ok(FramesDone::default()) };
+    let form = args.format.map(|form| match form {
+        Form::Png => StillFormat::Png,
+        Form::Npy => StillFormat::Npy,
+        Form::Jpg => StillFormat::Jpeg,
+    });
+    let stop = Stop::on_signals()?;
+    let mut bar = Progress::new(context.global.quiet > 0);
+    let done = export_frames(&RealFs, dataset, choice, form, dir, &mut |n, total| {
+        bar.set("cat", n, total);
+        if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    })
+    .map_err(usage)?;
+    bar.clear();
+    if args.json {
+        out::json(&done)?;
+    } else {
+        let ended =
+            if done.ended { " (ended before all were written; frames.csv.part lists them)" } else { "" };
+        out::line(format_args!(
+            "{}: {} frames of {} sets, {}{ended}",
+            dir.display(),
+            done.frames,
+            done.sets,
+            out::bytes(done.bytes)
+        ))?;
+    }
+    Ok(done)
+}
+
+/// What was asked for cannot be done, or only with other words: exit code 2.
+fn usage(e: depthrig_recorder::Error) -> anyhow::Error {
+    use depthrig_recorder::ErrorKind;
+    match e.kind() {
+        ErrorKind::BadInput => UsageError(e.to_string()).into(),
+        _ => e.into(),
+    }
+}
