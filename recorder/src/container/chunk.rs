@@ -9,9 +9,10 @@ const SMALL: usize = 512;
 /// A chunk record and what the index must know of it.
 #[derive(Debug)]
 pub(crate) struct Chunk {
-    /// The whole record.
-    pub(crate) record: Vec<u8>,
-    /// CRC-32 of `record`.
+    /// The record, behind `start` bytes that are not of it.
+    record: Vec<u8>,
+    start: usize,
+    /// CRC-32 of the record.
     pub(crate) crc: u32,
     pub(crate) start_time: u64,
     pub(crate) end_time: u64,
@@ -118,6 +119,7 @@ impl ChunkBuilder {
         }
         Ok(Chunk {
             record,
+            start: spare,
             crc: crc.finalize(),
             start_time,
             end_time,
@@ -152,6 +154,73 @@ impl ChunkBuilder {
 impl Chunk {
     /// The bytes of the record.
     pub(crate) fn bytes(&self) -> &[u8] {
-        &self.record[ROOM - head_len(self.compression)..]
+        &self.record[self.start..]
+    }
+
+    /// The fields of the record.
+    pub(crate) fn body(&self) -> &[u8] {
+        &self.record[self.start + 9..]
+    }
+
+    /// A chunk as it lies in a file, opcode and length included, to be appended to another one as it is. Its
+    /// `messages` are for the caller to fill in. `None` when its lengths contradict each other or it is packed
+    /// in a way that depthrig does not use.
+    pub(crate) fn from_record(record: Vec<u8>) -> Option<Self> {
+        let head = ChunkHead::read(&record)?;
+        (head.record_len() == record.len() as u64).then(|| Self {
+            crc: crc32fast::hash(&record),
+            record,
+            start: 0,
+            start_time: head.start_time,
+            end_time: head.end_time,
+            compression: head.compression,
+            compressed_size: head.compressed_size,
+            uncompressed_size: head.uncompressed_size,
+            messages: Vec::new(),
+        })
+    }
+}
+
+/// What a chunk record says before its data.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct ChunkHead {
+    pub(crate) start_time: u64,
+    pub(crate) end_time: u64,
+    pub(crate) compression: &'static str,
+    pub(crate) compressed_size: u64,
+    pub(crate) uncompressed_size: u64,
+}
+
+impl ChunkHead {
+    /// Bytes that are enough to read any head.
+    pub(crate) const MAX_LEN: usize = ROOM;
+
+    /// The head that `bytes` begin with; `None` when they do not begin with a chunk of ours. The opcode, two
+    /// lengths and the compression's name must agree, so that hardly anything else is taken for one.
+    pub(crate) fn read(bytes: &[u8]) -> Option<Self> {
+        let u64_at = |at: usize| Some(u64::from_le_bytes(*bytes.get(at..)?.first_chunk()?));
+        let name = u32::from_le_bytes(*bytes.get(37..)?.first_chunk()?) as usize;
+        let compression = match (name, bytes.get(41..)?) {
+            (0, _) => "",
+            (4, rest) if rest.starts_with(b"zstd") => "zstd",
+            _ => return None,
+        };
+        let head = Self {
+            start_time: u64_at(9)?,
+            end_time: u64_at(17)?,
+            compression,
+            compressed_size: u64_at(41 + name)?,
+            uncompressed_size: u64_at(25)?,
+        };
+        let agrees = bytes[0] == op::CHUNK
+            && u64_at(1)?.checked_add(9) == Some(head.record_len())
+            && head.start_time <= head.end_time
+            && (head.compressed_size == head.uncompressed_size || !compression.is_empty());
+        agrees.then_some(head)
+    }
+
+    /// Bytes of the whole record.
+    pub(crate) const fn record_len(&self) -> u64 {
+        (head_len(self.compression) as u64).saturating_add(self.compressed_size)
     }
 }

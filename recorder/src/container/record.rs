@@ -55,12 +55,22 @@ pub(crate) fn header(buf: &mut Vec<u8>, profile: &str, library: &str) {
     });
 }
 
-pub(crate) fn schema(buf: &mut Vec<u8>, id: u16, name: &str, encoding: &str, data: &[u8]) {
+/// A message type: its name and its definition.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct SchemaRecord {
+    pub(crate) id: u16,
+    pub(crate) name: String,
+    /// The language of the definition.
+    pub(crate) encoding: String,
+    pub(crate) data: Vec<u8>,
+}
+
+pub(crate) fn schema(buf: &mut Vec<u8>, s: &SchemaRecord) {
     put(buf, op::SCHEMA, |b| {
-        put_le!(b, id);
-        put_str(b, name);
-        put_str(b, encoding);
-        put_bytes(b, data);
+        put_le!(b, s.id);
+        put_str(b, &s.name);
+        put_str(b, &s.encoding);
+        put_bytes(b, &s.data);
     });
 }
 

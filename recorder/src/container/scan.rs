@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 /// No record that we write comes near; a longer one is a damaged length.
 const RECORD_MAX: u64 = 1 << 30;
 /// Opcode and length.
-const HEAD: u64 = 9;
+pub(crate) const HEAD: u64 = 9;
 /// Footer record and magic.
 const FOOTER: u64 = HEAD + 20 + 8;
 
@@ -163,6 +163,13 @@ impl SegmentReader {
         let mut bytes = vec![0; len as usize];
         self.file.read_exact_at(&mut bytes, offset).map_err(|e| Error::io("read", &self.path, e))?;
         Ok(bytes)
+    }
+
+    /// Fills `buf` with bytes of the file, and uses its memory again.
+    #[allow(dead_code)]
+    pub(crate) fn read_into(&self, buf: &mut Vec<u8>, offset: u64, len: u64) -> Result<()> {
+        buf.resize(len as usize, 0);
+        self.file.read_exact_at(buf, offset).map_err(|e| Error::io("read", &self.path, e))
     }
 
     /// Opcode and length of the record at `offset`.

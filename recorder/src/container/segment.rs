@@ -5,9 +5,8 @@
 
 use super::MAGIC;
 use super::chunk::Chunk;
-use super::record::{self, AttachmentIndex, Channel, ChunkIndex, Statistics, op};
+use super::record::{self, AttachmentIndex, Channel, ChunkIndex, SchemaRecord, Statistics, op};
 use crate::fs::{self, Fs, WriteFile};
-use crate::msgs::schemas::Schema;
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -22,10 +21,17 @@ pub(crate) fn file_name(index: u32) -> String {
 /// What stands at the head of each segment so that it stands alone.
 #[derive(Debug, Clone)]
 pub(crate) struct Preamble {
+    pub(crate) schemas: Vec<SchemaRecord>,
     pub(crate) channels: Vec<Channel>,
     pub(crate) metadata: Vec<(String, BTreeMap<String, String>)>,
     /// Time, name, media type and bytes.
     pub(crate) attachments: Vec<(u64, String, String, Vec<u8>)>,
+}
+
+/// Makes the names in the folder of `path` durable.
+pub(crate) fn sync_folder_of(fs: &dyn Fs, path: &Path) -> Result<()> {
+    let dir = path.parent().unwrap_or(Path::new("."));
+    fs.sync_dir(dir).map_err(|e| Error::io("sync the folder", dir, e))
 }
 
 pub(crate) struct Segment {
@@ -49,7 +55,11 @@ impl Segment {
     /// Creates `seg_<index>.mcap.part` with everything that comes before the first chunk.
     pub(crate) fn create(fs: &dyn Fs, dir: &Path, index: u32, preamble: &Preamble) -> Result<Self> {
         let path = dir.join(file_name(index));
-        let part = path.with_extension("mcap.part");
+        Self::create_as(fs, path.with_extension("mcap.part"), path, preamble)
+    }
+
+    /// The same under the name `part`, to be finished as `path` in the same folder.
+    pub(crate) fn create_as(fs: &dyn Fs, part: PathBuf, path: PathBuf, preamble: &Preamble) -> Result<Self> {
         let file = fs.create_new(&part).map_err(|e| Error::io("create", &part, e))?;
         let mut segment = Self {
             file,
@@ -65,13 +75,13 @@ impl Segment {
             stats: Statistics::default(),
             torn: false,
         };
-        for s in Schema::ALL {
-            record::schema(&mut segment.schemas, s.id(), s.name(), "ros2msg", s.text().as_bytes());
+        for s in &preamble.schemas {
+            record::schema(&mut segment.schemas, s);
         }
         for c in &preamble.channels {
             record::channel(&mut segment.channels, c);
         }
-        segment.stats.schemas = Schema::ALL.len() as u16;
+        segment.stats.schemas = preamble.schemas.len() as u16;
         segment.stats.channels = preamble.channels.len() as u32;
         let mut head = MAGIC.to_vec();
         record::header(&mut head, PROFILE, concat!("depthrig ", env!("CARGO_PKG_VERSION")));
@@ -97,13 +107,18 @@ impl Segment {
         segment.stats.metadata = segment.metadata.len() as u32;
         segment.stats.attachments = segment.attachments.len() as u32;
         segment.append(&[(&head, crc32fast::hash(&head))])?;
-        fs.sync_dir(dir).map_err(|e| Error::io("sync the folder", dir, e))?;
+        sync_folder_of(fs, &segment.part)?;
         Ok(segment)
     }
 
     /// Bytes of the file so far.
     pub(crate) const fn len(&self) -> u64 {
         self.len
+    }
+
+    /// Bytes of the file so far and their CRC-32.
+    pub(crate) fn checkpoint(&self) -> (u64, u32) {
+        (self.len, self.crc.clone().finalize())
     }
 
     /// The file's present name.
@@ -185,16 +200,20 @@ impl Segment {
     }
 
     /// Writes index and footer, makes the file durable and gives it its final name.
-    pub(crate) fn finish(mut self, fs: &dyn Fs) -> Result<PathBuf> {
+    pub(crate) fn finish(self, fs: &dyn Fs) -> Result<PathBuf> {
+        let path = self.path.clone();
+        let part = self.seal()?;
+        fs.rename(&part, &path).map_err(|e| Error::io("rename", &part, e))?;
+        sync_folder_of(fs, &path)?;
+        Ok(path)
+    }
+
+    /// Writes index and footer and makes the file durable under the name that it has.
+    pub(crate) fn seal(mut self) -> Result<PathBuf> {
         let tail = self.tail();
         self.append(&[(&tail, 0)])?;
         self.file.sync_all().map_err(|e| Error::io("sync", &self.part, e))?;
-        let Self { file, part, path, .. } = self;
-        drop(file);
-        fs.rename(&part, &path).map_err(|e| Error::io("rename", &part, e))?;
-        let dir = path.parent().unwrap_or(Path::new("."));
-        fs.sync_dir(dir).map_err(|e| Error::io("sync the folder", dir, e))?;
-        Ok(path)
+        Ok(self.part)
     }
 
     /// Everything after the data: `DataEnd`, summary, summary offsets, footer, magic.

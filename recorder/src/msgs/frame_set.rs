@@ -68,6 +68,25 @@ pub(crate) fn write_clock_pair(buf: &mut Vec<u8>, stamp_utc_ns: i64, pair: &UtcP
     w.time(stamp_utc_ns).i64(pair.mono.ns()).i64(pair.utc_ns).i64(pair.width_ns);
 }
 
+/// `depthrig_msgs/msg/Checkpoint`: the CRC-32 of the first `file_bytes` bytes of the file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Checkpoint {
+    pub(crate) file_bytes: u64,
+    pub(crate) crc32: u32,
+}
+
+impl Checkpoint {
+    pub(crate) fn write(self, buf: &mut Vec<u8>, stamp_utc_ns: i64) {
+        Writer::new(buf).time(stamp_utc_ns).u64(self.file_bytes).u32(self.crc32);
+    }
+
+    pub(crate) fn read(message: &[u8]) -> Result<Self> {
+        let mut r = Reader::new(message)?;
+        r.time()?;
+        Ok(Self { file_bytes: r.u64()?, crc32: r.u32()? })
+    }
+}
+
 #[cfg(test)]
 fn read_clock_pair(message: &[u8]) -> Result<UtcPair> {
     let mut r = Reader::new(message)?;
@@ -108,5 +127,9 @@ mod tests {
         let mut buf = Vec::new();
         write_clock_pair(&mut buf, 1, &pair);
         assert_eq!(read_clock_pair(&buf).unwrap(), pair);
+        let checkpoint = Checkpoint { file_bytes: 1 << 40, crc32: 7 };
+        let mut buf = Vec::new();
+        checkpoint.write(&mut buf, 1);
+        assert_eq!(Checkpoint::read(&buf).unwrap(), checkpoint);
     }
 }

@@ -1,6 +1,7 @@
 //! The schema texts, in the `ros2msg` form: the definition, then each definition it uses after a `====` line.
 //! The standard ones follow `common_interfaces` and `rcl_interfaces` (Apache-2.0), without their comments.
 
+use crate::container::record::SchemaRecord;
 use depthrig_bus::{DropReason, FIELDS};
 use std::borrow::Cow;
 use std::fmt::Write;
@@ -18,10 +19,11 @@ pub(crate) enum Schema {
     FrameSet,
     ClockPair,
     Accounts,
+    Checkpoint,
 }
 
 impl Schema {
-    pub(crate) const ALL: [Self; 10] = [
+    pub(crate) const ALL: [Self; 11] = [
         Self::Image,
         Self::CompressedImage,
         Self::CameraInfo,
@@ -32,6 +34,7 @@ impl Schema {
         Self::FrameSet,
         Self::ClockPair,
         Self::Accounts,
+        Self::Checkpoint,
     ];
 
     /// The id of the schema record: 1, 2, … in the order of [`Self::ALL`].
@@ -51,6 +54,7 @@ impl Schema {
             Self::FrameSet => "depthrig_msgs/msg/FrameSet",
             Self::ClockPair => "depthrig_msgs/msg/ClockPair",
             Self::Accounts => "depthrig_msgs/msg/Accounts",
+            Self::Checkpoint => "depthrig_msgs/msg/Checkpoint",
         }
     }
 
@@ -73,7 +77,19 @@ impl Schema {
             Self::FrameSet => with(FRAME_SET, &[TIME_DEP, MEMBER_DEP]),
             Self::ClockPair => with(CLOCK_PAIR, &[TIME_DEP]),
             Self::Accounts => with(&accounts(), &[TIME_DEP, STREAM_ACCOUNT_DEP]),
+            Self::Checkpoint => with(CHECKPOINT, &[TIME_DEP]),
         }
+    }
+
+    /// The records of all types, as they stand at the head of a segment.
+    pub(crate) fn records() -> Vec<SchemaRecord> {
+        let record = |s: Self| SchemaRecord {
+            id: s.id(),
+            name: s.name().to_owned(),
+            encoding: "ros2msg".to_owned(),
+            data: s.text().into_bytes(),
+        };
+        Self::ALL.into_iter().map(record).collect()
     }
 }
 
@@ -171,6 +187,15 @@ uint64 sets_offered
 depthrig_msgs/FrameMember[] members
 # Streams (camera/stream) that have no frame in this set.
 string[] missing
+";
+
+const CHECKPOINT: &str = "\
+# What lies before: with it an unfinished file is proven without unpacking its chunks.
+builtin_interfaces/Time stamp
+# Bytes of the file before the chunk of this message, and their CRC-32 (ISO-HDLC, as everywhere in MCAP).
+# Where file_bytes is not the offset of that chunk, the chunk was copied from another file: no use then.
+uint64 file_bytes
+uint32 crc32
 ";
 
 const MEMBER_DEP: Dep = (

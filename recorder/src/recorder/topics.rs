@@ -26,11 +26,19 @@ pub(crate) enum Global {
     Notes,
     TfStatic,
     Diagnostics,
+    Checkpoint,
 }
 
 impl Global {
-    const ALL: [Self; 6] =
-        [Self::FrameSet, Self::Clock, Self::Accounts, Self::Notes, Self::TfStatic, Self::Diagnostics];
+    const ALL: [Self; 7] = [
+        Self::FrameSet,
+        Self::Clock,
+        Self::Accounts,
+        Self::Notes,
+        Self::TfStatic,
+        Self::Diagnostics,
+        Self::Checkpoint,
+    ];
 
     pub(crate) const fn channel(self) -> u16 {
         self as u16 + 1
@@ -44,6 +52,7 @@ impl Global {
             Self::Notes => Schema::Log,
             Self::TfStatic => Schema::TfMessage,
             Self::Diagnostics => Schema::DiagnosticArray,
+            Self::Checkpoint => Schema::Checkpoint,
         }
     }
 
@@ -55,6 +64,7 @@ impl Global {
             Self::Notes => format!("/{rig}/notes"),
             Self::TfStatic => "/tf_static".to_owned(),
             Self::Diagnostics => "/diagnostics".to_owned(),
+            Self::Checkpoint => format!("/{rig}/checkpoint"),
         }
     }
 }
@@ -184,6 +194,7 @@ impl Topics {
         let time = u64::try_from(session.started_utc_ns).unwrap_or(0);
         let config = session.rig_config.clone().into_bytes();
         Ok(Preamble {
+            schemas: Schema::records(),
             channels,
             metadata: vec![(SESSION_METADATA.to_owned(), facts.map(|(k, v)| (k.to_owned(), v)).into())],
             attachments: vec![(time, RIG_ATTACHMENT.to_owned(), "application/toml".to_owned(), config)],

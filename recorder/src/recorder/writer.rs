@@ -8,7 +8,7 @@ use crate::container::segment::Segment;
 use crate::encode::EncodedFrame;
 use crate::frame::SetDrop;
 use crate::msgs::frame_info::{self, Extra};
-use crate::msgs::frame_set::{self, FrameSetMsg, Member};
+use crate::msgs::frame_set::{self, Checkpoint, FrameSetMsg, Member};
 use crate::msgs::{accounts, diagnostics, image, tf};
 use crate::{Error, ErrorKind, Outcome, Result};
 use crossbeam::channel::{Receiver, RecvTimeoutError};
@@ -260,12 +260,7 @@ impl Writer {
     /// Clock, accounts, diagnostics and notes; then everything so far is made durable.
     fn each_second(&mut self) -> Result<()> {
         let Some(log_time) = self.last_log_time.filter(|_| self.in_segment.is_some()) else { return Ok(()) };
-        let pair = (self.shared.utc)();
-        self.clock_pair(log_time, pair.utc_ns, &pair);
-        self.accounts(log_time);
-        self.diagnostics_and_notes(log_time);
-        let chunk = self.builder.pack(true)?;
-        self.append(&[chunk])?;
+        self.between(log_time)?;
         if let Some(segment) = self.segment.as_mut().filter(|_| self.dirty) {
             segment.sync()?;
             self.dirty = false;
@@ -286,6 +281,20 @@ impl Writer {
             ));
         }
         Ok(())
+    }
+
+    /// The chunk between two sets, and before the end.
+    fn between(&mut self, log_time: i64) -> Result<()> {
+        let pair = (self.shared.utc)();
+        self.clock_pair(log_time, pair.utc_ns, &pair);
+        self.accounts(log_time);
+        self.diagnostics_and_notes(log_time);
+        if let Some((file_bytes, crc32)) = self.segment.as_ref().map(Segment::checkpoint) {
+            let checkpoint = Checkpoint { file_bytes, crc32 };
+            self.message(Global::Checkpoint, log_time, pair.utc_ns, |b| checkpoint.write(b, pair.utc_ns));
+        }
+        let chunk = self.builder.pack(true)?;
+        self.append(&[chunk])
     }
 
     fn diagnostics_and_notes(&mut self, log_time: i64) {
@@ -309,12 +318,7 @@ impl Writer {
     fn close_segment(&mut self) -> Result<()> {
         let sets = self.in_segment.take();
         if let Some(log_time) = self.last_log_time.filter(|_| sets.is_some()) {
-            let pair = (self.shared.utc)();
-            self.clock_pair(log_time, pair.utc_ns, &pair);
-            self.accounts(log_time);
-            self.diagnostics_and_notes(log_time);
-            let chunk = self.builder.pack(true)?;
-            self.append(&[chunk])?;
+            self.between(log_time)?;
         }
         self.finish_file(sets)
     }

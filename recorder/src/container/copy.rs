@@ -1,0 +1,729 @@
+//! Copying from one segment to another: whole sets and what lies between them, each chunk proven and then
+//! appended as it lies there, never packed anew.
+//!
+//! [`Groups`] walks a file in constant memory, one set at a time. It needs no index and survives damage: what
+//! cannot be proven is passed over, said as [`Group::Damage`], and the walk goes on at the next good chunk.
+//! Bytes that a checkpoint (or the checksum of the whole data) vouches for are not unpacked; all others are.
+
+use super::chunk::{Chunk, ChunkHead};
+use super::record::{Channel, SchemaRecord, op};
+use super::scan::{HEAD, SegmentReader};
+use super::segment::{Preamble, Segment};
+use crate::msgs::frame_set::{Checkpoint, FrameSetMsg};
+use crate::msgs::schemas::Schema;
+use crate::{Error, ErrorKind, Result};
+use mcap::records::Record;
+use std::collections::{BTreeMap, VecDeque};
+
+/// Bytes read at a time where they are only looked at.
+const WINDOW: u64 = 1 << 20;
+
+/// What a segment consists of after its head.
+#[derive(Debug)]
+pub(crate) enum Group {
+    /// A whole set.
+    Set(SetGroup),
+    /// A chunk between two sets: clock, accounts, notes, diagnostics, `/tf_static`.
+    Between(BetweenGroup),
+    /// A metadata record after the first chunk.
+    Metadata(String, BTreeMap<String, String>),
+    /// Bytes that belong to no whole set.
+    Damage(Damage),
+}
+
+/// A set: its pictures, and last the chunk with its commit mark.
+#[derive(Debug)]
+pub(crate) struct SetGroup {
+    pub(crate) mark: FrameSetMsg,
+    pub(crate) log_time: u64,
+    /// In the order of the file.
+    pub(crate) chunks: Vec<Chunk>,
+    /// Where each of them begins in the file.
+    pub(crate) offsets: Vec<u64>,
+}
+
+/// A chunk between two sets.
+#[derive(Debug)]
+pub(crate) struct BetweenGroup {
+    pub(crate) chunk: Chunk,
+    pub(crate) offset: u64,
+    /// Whether it is the one with `/tf_static` that every segment begins with.
+    pub(crate) head: bool,
+}
+
+/// What was passed over.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Damage {
+    /// The first byte, and the one after the last.
+    pub(crate) from: u64,
+    pub(crate) to: u64,
+    pub(crate) kind: DamageKind,
+    /// The set that it was, where its mark can still be read.
+    pub(crate) set: Option<u64>,
+    /// What is wrong, in words.
+    pub(crate) why: String,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum DamageKind {
+    /// The file ends here, in the middle of a record.
+    Tail,
+    /// Pictures without a commit mark, or a mark without its pictures.
+    Torn,
+    /// Bytes that are no good record, with good ones after them.
+    Bytes,
+}
+
+/// What a channel is to the walk.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Role {
+    Picture,
+    Set,
+    TfStatic,
+    Checkpoint,
+}
+
+/// A picture whose set is not complete yet.
+struct Picture {
+    chunk: Chunk,
+    offset: u64,
+    channel: u16,
+    log_time: u64,
+    /// Length and CRC-32 of the message, where the chunk was unpacked.
+    content: Option<(u64, u32)>,
+}
+
+/// The groups of a segment in the order of the file.
+pub(crate) struct Groups<'a> {
+    reader: &'a SegmentReader,
+    roles: BTreeMap<u16, Role>,
+    /// The picture channel of each stream.
+    pictures: BTreeMap<String, u16>,
+    /// Where the next record begins.
+    at: u64,
+    /// The bytes before this are proven by a checksum over all of them.
+    proven: u64,
+    pending: Vec<Picture>,
+    ready: VecDeque<Group>,
+    ended: bool,
+}
+
+/// What stands before the first chunk, and where that begins or what is damaged begins: once schemas, channels
+/// and metadata are there, the rest can be done without.
+///
+/// # Errors
+/// [`ErrorKind::Corrupt`] or [`ErrorKind::Truncated`] when a record before them is damaged, [`ErrorKind::Io`].
+pub(crate) fn read_preamble(reader: &SegmentReader) -> Result<(Preamble, u64)> {
+    let mut p =
+        Preamble { schemas: Vec::new(), channels: Vec::new(), metadata: Vec::new(), attachments: Vec::new() };
+    let mut offset = 8;
+    while offset < reader.size {
+        match preamble_record(reader, &mut p, offset) {
+            Ok(Some(next)) => offset = next,
+            Ok(None) => break,
+            Err(e) if is_damage(&e) && !p.metadata.is_empty() => break,
+            Err(e) => return Err(e),
+        }
+    }
+    Ok((p, offset.min(reader.size)))
+}
+
+/// Takes one record before the first chunk; where the next one begins.
+fn preamble_record(reader: &SegmentReader, p: &mut Preamble, offset: u64) -> Result<Option<u64>> {
+    let (opcode, len) = reader.record_head(offset)?;
+    if matches!(opcode, op::CHUNK | op::DATA_END) {
+        return Ok(None);
+    }
+    let body = reader.read(offset + HEAD, len)?;
+    match reader.parse(opcode, &body, offset)? {
+        Record::Header(_) => {}
+        Record::Schema { header, data } => p.schemas.push(SchemaRecord {
+            id: header.id,
+            name: header.name,
+            encoding: header.encoding,
+            data: data.into_owned(),
+        }),
+        Record::Channel(c) => {
+            p.channels.push(Channel { id: c.id, schema: c.schema_id, topic: c.topic, metadata: c.metadata });
+        }
+        Record::Metadata(m) => p.metadata.push((m.name, m.metadata)),
+        Record::Attachment { header, data, crc } => {
+            if crc != 0 && crc != crc32fast::hash(&body[..body.len() - 4]) {
+                return Err(reader.error(ErrorKind::Corrupt, offset, "an attachment's checksum is wrong"));
+            }
+            p.attachments.push((header.log_time, header.name, header.media_type, data.into_owned()));
+        }
+        _ => {
+            let what = format!("a record of type {opcode} before the first chunk");
+            return Err(reader.error(ErrorKind::Corrupt, offset, what));
+        }
+    }
+    Ok(Some(offset + HEAD + len))
+}
+
+impl<'a> Groups<'a> {
+    /// The groups of the file behind `reader`, from `first`, where its first chunk begins or may begin. The
+    /// reader needs no index.
+    pub(crate) fn new(reader: &'a SegmentReader, preamble: &Preamble, first: u64) -> Result<Self> {
+        let mut roles = BTreeMap::new();
+        let mut pictures = BTreeMap::new();
+        let schemas: BTreeMap<_, _> = preamble.schemas.iter().map(|s| (s.id, s.name.as_str())).collect();
+        for c in &preamble.channels {
+            let is = |s: Schema| schemas.get(&c.schema) == Some(&s.name());
+            let role = if is(Schema::Image) || is(Schema::CompressedImage) {
+                let Some(stream) = c.metadata.get("stream") else { continue };
+                pictures.insert(stream.clone(), c.id);
+                Role::Picture
+            } else if is(Schema::FrameSet) {
+                Role::Set
+            } else if is(Schema::TfMessage) {
+                Role::TfStatic
+            } else if is(Schema::Checkpoint) {
+                Role::Checkpoint
+            } else {
+                continue;
+            };
+            roles.insert(c.id, role);
+        }
+        let mut groups = Self {
+            reader,
+            roles,
+            pictures,
+            at: first,
+            proven: 0,
+            pending: Vec::new(),
+            ready: VecDeque::new(),
+            ended: false,
+        };
+        groups.prove(0, 0, first)?;
+        Ok(groups)
+    }
+
+    /// Where the walk stands.
+    pub(crate) const fn offset(&self) -> u64 {
+        self.at
+    }
+
+    /// The next group; `None` at the end of the data.
+    ///
+    /// # Errors
+    /// When the operating system cannot read the file. Damage is no error.
+    pub(crate) fn next(&mut self) -> Result<Option<Group>> {
+        loop {
+            if let Some(group) = self.ready.pop_front() {
+                return Ok(Some(group));
+            }
+            if self.ended {
+                return Ok(None);
+            }
+            self.step()?;
+        }
+    }
+
+    /// Takes one record, or what is damaged.
+    fn step(&mut self) -> Result<()> {
+        if self.at >= self.reader.size {
+            self.end();
+            return Ok(());
+        }
+        let at = self.at;
+        match self.record(at) {
+            Ok(next) => self.at = next,
+            Err(e) if is_damage(&e) => self.pass_over(at, &e)?,
+            Err(e) => return Err(e),
+        }
+        Ok(())
+    }
+
+    /// Takes the record at `at`; where the next one begins.
+    fn record(&mut self, at: u64) -> Result<u64> {
+        let (opcode, len) = self.reader.record_head(at)?;
+        let next = at.checked_add(HEAD).and_then(|o| o.checked_add(len)).filter(|n| *n <= self.reader.size);
+        let next = next.ok_or_else(|| {
+            let what = format!("a record of {len} bytes is cut off by the end of the file");
+            self.reader.error(ErrorKind::Truncated, at, what)
+        })?;
+        match opcode {
+            op::CHUNK => return self.chunk(at, next),
+            op::DATA_END if len == 4 => self.end(),
+            // Computed anew from the chunk; looked at, because a damaged chunk may pass for one.
+            op::MESSAGE_INDEX => {
+                let body = self.reader.read(at + HEAD, len)?;
+                let entries = body.get(2..6).and_then(|n| n.first_chunk()).map(|n| u32::from_le_bytes(*n));
+                if len % 16 != 6 || entries.map(u64::from) != Some(len - 6) {
+                    return Err(self.reader.error(ErrorKind::Corrupt, at, "a damaged message index"));
+                }
+            }
+            op::METADATA => {
+                let body = self.reader.read(at + HEAD, len)?;
+                if let Record::Metadata(m) = self.reader.parse(opcode, &body, at)? {
+                    self.ready.push_back(Group::Metadata(m.name, m.metadata));
+                }
+            }
+            other => {
+                let what = format!("no record of type {other} belongs here");
+                return Err(self.reader.error(ErrorKind::Corrupt, at, what));
+            }
+        }
+        Ok(next)
+    }
+
+    /// Takes the chunk from `at` to `next`; where the next record begins.
+    fn chunk(&mut self, at: u64, next: u64) -> Result<u64> {
+        let record = self.reader.read(at, next - at)?;
+        let mut chunk = Chunk::from_record(record).ok_or_else(|| {
+            self.reader.error(ErrorKind::Corrupt, at, "the head of a chunk contradicts itself")
+        })?;
+        if next < self.proven {
+            let after = self.listed(&mut chunk, next)?;
+            if self.role(&chunk) == Some(Role::Picture) {
+                self.picture(chunk, at, None);
+                return Ok(after);
+            }
+        }
+        // The rest is small: what it says matters more than the time it takes.
+        let mut content = None;
+        let mut mark = None;
+        let mut checkpoint = None;
+        let mut messages = Vec::new();
+        self.reader.chunk_messages(chunk.body(), at, |m| {
+            messages.push((m.channel, m.log_time, m.offset));
+            match self.roles.get(&m.channel) {
+                Some(Role::Picture) => content = Some((m.data.len() as u64, crc32fast::hash(m.data))),
+                Some(Role::Set) => mark = Some((FrameSetMsg::read(m.data)?, m.log_time)),
+                Some(Role::Checkpoint) => checkpoint = Some(Checkpoint::read(m.data)?),
+                _ => {}
+            }
+            Ok(())
+        })?;
+        // The chunk's own checksum does not cover its head.
+        let times = messages.iter().map(|m| m.1).min().zip(messages.iter().map(|m| m.1).max());
+        if times.is_some_and(|times| times != (chunk.start_time, chunk.end_time)) {
+            return Err(self.reader.error(
+                ErrorKind::Corrupt,
+                at,
+                "the times of a chunk are not its messages'",
+            ));
+        }
+        chunk.messages = messages;
+        match (self.role(&chunk), mark) {
+            (_, Some((mark, log_time))) => self.commit(chunk, at, mark, log_time),
+            (Some(Role::Picture), _) => self.picture(chunk, at, content),
+            (role, _) => {
+                self.tear();
+                let head = role == Some(Role::TfStatic);
+                self.ready.push_back(Group::Between(BetweenGroup { chunk, offset: at, head }));
+            }
+        }
+        if let Some(c) = checkpoint.filter(|c| c.file_bytes == at) {
+            self.prove(at, c.crc32, next)?;
+        }
+        Ok(next)
+    }
+
+    /// What a chunk is for: a commit mark outweighs pictures, these outweigh the rest.
+    fn role(&self, chunk: &Chunk) -> Option<Role> {
+        let rank = |r: &Role| match r {
+            Role::Set => 3,
+            Role::Picture => 2,
+            Role::TfStatic => 1,
+            Role::Checkpoint => 0,
+        };
+        let roles = chunk.messages.iter().filter_map(|m| self.roles.get(&m.0).copied());
+        roles.max_by_key(rank)
+    }
+
+    /// Fills in the messages of a proven chunk from the index records after it; where those end.
+    fn listed(&self, chunk: &mut Chunk, mut at: u64) -> Result<u64> {
+        while at < self.proven {
+            let (opcode, body) = self.reader.record(at)?;
+            if opcode != op::MESSAGE_INDEX {
+                break;
+            }
+            if let Record::MessageIndex(index) = self.reader.parse(opcode, &body, at)? {
+                let entries = index.records.iter().map(|e| (index.channel_id, e.log_time, e.offset));
+                chunk.messages.extend(entries);
+            }
+            at += HEAD + body.len() as u64;
+        }
+        chunk.messages.sort_unstable_by_key(|m| m.2);
+        Ok(at)
+    }
+
+    fn picture(&mut self, chunk: Chunk, offset: u64, content: Option<(u64, u32)>) {
+        let Some(&(channel, log_time, _)) = chunk.messages.iter().find(|m| self.is_picture(m.0)) else {
+            return;
+        };
+        // Pictures of one set have one time and one stream each; so at most one set waits in memory.
+        let other = |p: &Picture| p.log_time != log_time || p.channel == channel;
+        if self.pending.iter().any(other) {
+            self.tear();
+        }
+        self.pending.push(Picture { chunk, offset, channel, log_time, content });
+    }
+
+    fn is_picture(&self, channel: u16) -> bool {
+        self.roles.get(&channel) == Some(&Role::Picture)
+    }
+
+    fn commit(&mut self, chunk: Chunk, offset: u64, mark: FrameSetMsg, log_time: u64) {
+        let lacks = mark.members.iter().find(|member| {
+            let channel = self.pictures.get(&member.stream);
+            !self.pending.iter().any(|p| {
+                Some(&p.channel) == channel
+                    && p.log_time == log_time
+                    && p.content.is_none_or(|c| c == (member.message_bytes, member.message_crc32))
+            })
+        });
+        let why = match lacks {
+            Some(member) => Some(format!("set {} lacks the picture of {}", mark.id, member.stream)),
+            None if self.pending.len() > mark.members.len() => {
+                Some(format!("set {} has pictures that its mark does not list", mark.id))
+            }
+            None => None,
+        };
+        if let Some(why) = why {
+            self.torn(Some((offset, &chunk)), Some(mark.id), why);
+            return;
+        }
+        let (mut chunks, mut offsets) = (Vec::new(), Vec::new());
+        for p in self.pending.drain(..) {
+            chunks.push(p.chunk);
+            offsets.push(p.offset);
+        }
+        chunks.push(chunk);
+        offsets.push(offset);
+        self.ready.push_back(Group::Set(SetGroup { mark, log_time, chunks, offsets }));
+    }
+
+    /// Gives up the pictures that wait for their mark.
+    fn tear(&mut self) {
+        if !self.pending.is_empty() {
+            let why = format!("{} pictures of a set without its commit mark", self.pending.len());
+            self.torn(None, None, why);
+        }
+    }
+
+    fn torn(&mut self, mark: Option<(u64, &Chunk)>, set: Option<u64>, why: String) {
+        let spans = self.pending.iter().map(|p| (p.offset, p.offset + p.chunk.bytes().len() as u64));
+        let spans = spans.chain(mark.map(|(at, c)| (at, at + c.bytes().len() as u64)));
+        let (from, to) = spans.fold((u64::MAX, 0), |(a, b), (from, to)| (a.min(from), b.max(to)));
+        self.pending.clear();
+        self.ready.push_back(Group::Damage(Damage { from, to, kind: DamageKind::Torn, set, why }));
+    }
+
+    /// The data ends here.
+    fn end(&mut self) {
+        self.tear();
+        self.ended = true;
+    }
+
+    /// Goes on at the next good chunk after `from`.
+    fn pass_over(&mut self, from: u64, why: &Error) -> Result<()> {
+        // The mark of what waits may follow all the same: a damaged index hurts no set.
+        let found = self.next_good_chunk(from + 1)?;
+        let (to, kind) = match found {
+            Some(at) => (at, DamageKind::Bytes),
+            None => (self.reader.size, DamageKind::Tail),
+        };
+        if found.is_none() {
+            self.tear();
+        }
+        let why = why.to_string();
+        self.ready.push_back(Group::Damage(Damage { from, to, kind, set: None, why }));
+        self.at = to;
+        Ok(())
+    }
+
+    /// The first byte at or after `from` where a chunk begins whose content agrees with its checksum.
+    fn next_good_chunk(&self, mut from: u64) -> Result<Option<u64>> {
+        let overlap = ChunkHead::MAX_LEN as u64;
+        while from < self.reader.size {
+            let len = WINDOW.min(self.reader.size - from);
+            let window = self.reader.read(from, len)?;
+            for (i, _) in window.iter().enumerate().filter(|(_, b)| **b == op::CHUNK) {
+                let Some(head) = ChunkHead::read(&window[i..]) else { continue };
+                let at = from + i as u64;
+                if at.checked_add(head.record_len()).is_some_and(|end| end <= self.reader.size) {
+                    let (_, body) = self.reader.record(at)?;
+                    match self.reader.chunk_messages(&body, at, |_| Ok(())) {
+                        Ok(()) => return Ok(Some(at)),
+                        Err(e) if is_damage(&e) => {}
+                        Err(e) => return Err(e),
+                    }
+                }
+            }
+            if len < WINDOW {
+                return Ok(None);
+            }
+            from += len - overlap;
+        }
+        Ok(None)
+    }
+
+    /// Compares the bytes from `from`, before which they have the checksum `crc`, to the next checkpoint with
+    /// what that says; `records` is a place after `from` where a record begins.
+    fn prove(&mut self, from: u64, crc: u32, records: u64) -> Result<()> {
+        let Some((to, expected)) = self.next_checkpoint(records)? else { return Ok(()) };
+        let mut hasher = crc32fast::Hasher::new_with_initial(crc);
+        let mut buf = Vec::new();
+        let mut at = from;
+        while at < to {
+            let len = WINDOW.min(to - at);
+            self.reader.read_into(&mut buf, at, len)?;
+            hasher.update(&buf);
+            at += len;
+        }
+        if hasher.finalize() == expected {
+            self.proven = to;
+        }
+        Ok(())
+    }
+
+    /// Where the next checkpoint (or the end of the data) is, and the checksum of all bytes before it.
+    fn next_checkpoint(&self, mut at: u64) -> Result<Option<(u64, u32)>> {
+        let mut last_chunk = None;
+        while at < self.reader.size {
+            let found = self.checkpoint_at(at, &mut last_chunk);
+            match found {
+                Ok((_, Some(found))) => return Ok(Some(found)),
+                Ok((next, None)) => at = next,
+                Err(e) if is_damage(&e) => return Ok(None),
+                Err(e) => return Err(e),
+            }
+        }
+        Ok(None)
+    }
+
+    /// Looks at the record at `at`; where the next begins, and the checkpoint if it is one.
+    fn checkpoint_at(&self, at: u64, last_chunk: &mut Option<u64>) -> Result<(u64, Option<(u64, u32)>)> {
+        let (opcode, len) = self.reader.record_head(at)?;
+        let next = at.saturating_add(HEAD).saturating_add(len);
+        match opcode {
+            op::CHUNK => *last_chunk = Some(at),
+            op::DATA_END => {
+                let body = self.reader.read(at + HEAD, len)?;
+                if let Record::DataEnd(end) = self.reader.parse(opcode, &body, at)? {
+                    let crc = Some(end.data_section_crc).filter(|crc| *crc != 0);
+                    return Ok((self.reader.size, crc.map(|crc| (at, crc))));
+                }
+            }
+            op::MESSAGE_INDEX => {
+                let id = self.reader.read(at + HEAD, 2)?;
+                let role = self.roles.get(&u16::from_le_bytes([id[0], id[1]]));
+                let Some(chunk) = last_chunk.filter(|_| role == Some(&Role::Checkpoint)) else {
+                    return Ok((next, None));
+                };
+                let (_, body) = self.reader.record(chunk)?;
+                let mut found = None;
+                self.reader.chunk_messages(&body, chunk, |m| {
+                    if self.roles.get(&m.channel) == Some(&Role::Checkpoint) {
+                        let c = Checkpoint::read(m.data)?;
+                        found = (c.file_bytes == chunk).then_some((chunk, c.crc32));
+                    }
+                    Ok(())
+                })?;
+                return Ok((next, found));
+            }
+            1..=0x0F => {}
+            other => {
+                let what = format!("no record of type {other} belongs here");
+                return Err(self.reader.error(ErrorKind::Corrupt, at, what));
+            }
+        }
+        Ok((next, None))
+    }
+}
+
+/// Whether an error says that the file is damaged, and not that it cannot be read.
+fn is_damage(e: &Error) -> bool {
+    matches!(e.kind(), ErrorKind::Corrupt | ErrorKind::Truncated | ErrorKind::Version)
+}
+
+impl Segment {
+    /// Appends a group as it was in its file.
+    ///
+    /// # Errors
+    /// As [`Segment::append_chunks`].
+    pub(crate) fn append_group(&mut self, group: &Group) -> Result<()> {
+        match group {
+            Group::Set(set) => self.append_chunks(&set.chunks),
+            Group::Between(between) => self.append_chunks(std::slice::from_ref(&between.chunk)),
+            Group::Metadata(name, map) => self.append_metadata(name, map),
+            Group::Damage(_) => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fs::{Fs, MemFs};
+    use crate::{RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamRecord};
+    use depthrig_bus::{FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
+    use std::path::{Path, PathBuf};
+    use std::sync::Arc;
+    use std::time::Duration;
+
+    /// A recording of `sets` sets of a depth and a colour stream, with a checkpoint now and then.
+    fn recorded(sets: u64) -> (MemFs, PathBuf) {
+        let fs = MemFs::new();
+        let mut session = Session::new("s", "rig");
+        for (name, format) in [("a/depth", PixelFormat::Z16), ("a/color", PixelFormat::Rgb8)] {
+            session.streams.push(StreamRecord {
+                id: name.parse().unwrap(),
+                model: String::new(),
+                serial: String::new(),
+                format,
+                width: 32,
+                height: 16,
+                rate_hz: 5.0,
+                depth_unit_m: 0.001,
+                calibration: String::new(),
+                intrinsics: Intrinsics::default(),
+                pose: Pose::IDENTITY,
+            });
+        }
+        let options = RecorderOptions {
+            min_free_bytes: 0,
+            reserve_bytes: 0,
+            sync_interval_ns: 1_000_000,
+            ..Default::default()
+        };
+        let r = Recorder::create(Arc::new(fs.clone()), Path::new("/d"), session.clone(), options).unwrap();
+        for n in 0..sets {
+            let frame = |(i, s): (usize, &StreamRecord)| {
+                let mut header = FrameHeader::default();
+                header.set_picture(s.format, s.width, s.height);
+                let bytes = s.format.frame_bytes(s.width, s.height);
+                let pixels = (0..bytes).map(|k| (k as u64 * (n + 3) % 251) as u8).collect::<Vec<_>>();
+                RecordFrame { stream: i, header, pixels: Box::new(pixels) }
+            };
+            let utc = UtcPair { mono: HostTime::from_ns(0), utc_ns: 1, width_ns: 0 };
+            let tick = HostTime::from_ns(n as i64 + 1);
+            let frames = session.streams.iter().enumerate().map(frame).collect();
+            r.push(RecordSet { id: n, tick, utc, frames, missing: Vec::new(), spread_ns: 0 }).unwrap();
+            while r.progress().sets.recorded <= n {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        }
+        assert!(r.finish().unwrap().complete);
+        (fs, PathBuf::from("/d/seg_0000.mcap"))
+    }
+
+    /// Copies what is left of `bytes`; the copy, the ids of its sets, and how far the bytes were proven first.
+    fn copied(bytes: Vec<u8>) -> (Vec<u8>, Vec<u64>, u64, Vec<Damage>) {
+        let fs = MemFs::new();
+        fs.create_dir_all(Path::new("/d")).unwrap();
+        fs.put(Path::new("/d/f"), bytes);
+        let reader = SegmentReader::open_bare(&fs, Path::new("/d/f")).unwrap();
+        let (preamble, first) = read_preamble(&reader).unwrap();
+        let mut copy = Segment::create(&fs, Path::new("/d"), 7, &preamble).unwrap();
+        let mut groups = Groups::new(&reader, &preamble, first).unwrap();
+        let (mut ids, mut damage) = (Vec::new(), Vec::new());
+        while let Some(group) = groups.next().unwrap() {
+            copy.append_group(&group).unwrap();
+            match group {
+                Group::Set(set) => ids.push(set.mark.id),
+                Group::Damage(d) => damage.push(d),
+                _ => {}
+            }
+        }
+        let proven = groups.proven;
+        let path = copy.finish(&fs).unwrap();
+        (fs.contents(&path).unwrap(), ids, proven, damage)
+    }
+
+    #[test]
+    fn a_copy_is_the_same_file_whether_proven_by_checksum_or_chunk_by_chunk() {
+        let (fs, path) = recorded(12);
+        let whole = fs.contents(&path).unwrap();
+        let (copy, ids, proven, damage) = copied(whole.clone());
+        assert_eq!(ids, (0..12).collect::<Vec<_>>());
+        assert!(damage.is_empty(), "{damage:?}");
+        let differs = copy.iter().zip(&whole).position(|(a, b)| a != b);
+        let lens = (copy.len(), whole.len());
+        assert!(copy == whole, "{lens:?} bytes differ at {differs:?}; index and statistics are the same");
+        assert!(proven as usize > whole.len() / 2, "{proven} of {} bytes are proven", whole.len());
+
+        // Checkpoints that are somewhere else say nothing: every chunk is unpacked.
+        let reader = SegmentReader::open(&fs, &path).unwrap();
+        let (preamble, first) = read_preamble(&reader).unwrap();
+        let mut moved = preamble.clone();
+        moved.metadata.push(("more".into(), BTreeMap::new()));
+        let fs2 = MemFs::new();
+        fs2.create_dir_all(Path::new("/d")).unwrap();
+        let mut copy = Segment::create(&fs2, Path::new("/d"), 0, &moved).unwrap();
+        let mut groups = Groups::new(&reader, &preamble, first).unwrap();
+        while let Some(group) = groups.next().unwrap() {
+            copy.append_group(&group).unwrap();
+        }
+        let part = fs2.contents(copy.part()).unwrap();
+        let (again, ids, proven, damage) = copied(part.clone());
+        assert_eq!((ids.len(), proven, damage), (12, 0, Vec::new()));
+        assert!(again.starts_with(&part));
+    }
+    /// The sets whose chunks do not have the byte `at`: what must outlive its damage.
+    fn untouched(bytes: &[u8], at: u64) -> Vec<u64> {
+        let fs = MemFs::new();
+        fs.create_dir_all(Path::new("/d")).unwrap();
+        fs.put(Path::new("/d/f"), bytes.to_vec());
+        let reader = SegmentReader::open_bare(&fs, Path::new("/d/f")).unwrap();
+        let (preamble, first) = read_preamble(&reader).unwrap();
+        let mut groups = Groups::new(&reader, &preamble, first).unwrap();
+        let mut ids = Vec::new();
+        while let Some(group) = groups.next().unwrap() {
+            let Group::Set(set) = group else { continue };
+            let mut spans = set.offsets.iter().zip(&set.chunks);
+            if !spans.any(|(from, c)| (*from..from + c.bytes().len() as u64).contains(&at)) {
+                ids.push(set.mark.id);
+            }
+        }
+        ids
+    }
+
+    #[test]
+    fn a_damaged_byte_costs_the_set_that_it_is_in_and_no_other() {
+        let (fs, path) = recorded(6);
+        let whole = fs.contents(&path).unwrap();
+        let reader = SegmentReader::open(&fs, &path).unwrap();
+        let (_, first) = read_preamble(&reader).unwrap();
+        let end = reader.chunks.last().map(|c| (c.offset + c.length) as usize).unwrap();
+        let mut harmless = 0;
+        for unfinished in [false, true] {
+            let bytes = if unfinished { whole[..end].to_vec() } else { whole.clone() };
+            // Every byte takes long in a build that is not optimised; 17 has no part in any length here.
+            for at in (first as usize..end).step_by(17) {
+                let mut damaged = bytes.clone();
+                damaged[at] ^= 1 << (at % 8);
+                let (_, ids, _, damage) = copied(damaged);
+                let least = untouched(&bytes, at as u64);
+                // A bit that zstd has no use for may cost nothing at all; the checksums say so.
+                assert!(least.iter().all(|id| ids.contains(id)), "byte {at}: {ids:?} of {least:?}");
+                assert!(ids.is_sorted() && ids.len() <= 6, "byte {at}: {ids:?}");
+                harmless += usize::from(ids.len() > least.len());
+                if ids.len() < 6 {
+                    let said = damage.iter().any(|d| d.from <= at as u64 && (at as u64) < d.to);
+                    assert!(said, "byte {at}: {damage:?}");
+                }
+            }
+        }
+        assert!(harmless * 100 < end - first as usize, "{harmless} damaged bytes were taken for good ones");
+    }
+
+    #[test]
+    fn a_cut_file_gives_its_whole_sets() {
+        let (fs, path) = recorded(5);
+        let whole = fs.contents(&path).unwrap();
+        let (_, first) = read_preamble(&SegmentReader::open(&fs, &path).unwrap()).unwrap();
+        let mut before = 0;
+        for cut in (first as usize..whole.len()).step_by(11) {
+            let (_, ids, _, damage) = copied(whole[..cut].to_vec());
+            assert_eq!(ids, (0..ids.len() as u64).collect::<Vec<_>>(), "cut at {cut}");
+            assert!(ids.len() >= before, "cut at {cut}");
+            assert!(damage.iter().all(|d| d.kind != DamageKind::Bytes && d.to <= cut as u64), "{damage:?}");
+            before = ids.len();
+        }
+        assert_eq!(before, 5);
+    }
+}
