@@ -14,7 +14,7 @@ mod tests;
 
 pub use depthrig_drivers::files::FilesConfig as FilesSettings;
 pub use depthrig_drivers::synthetic::SyntheticConfig as SyntheticSettings;
-pub use depthrig_recorder::ColorCodec;
+pub use depthrig_recorder::{ColorCodec, DepthCodec};
 pub use error::{ConfigError, Problem};
 
 use depthrig_bus::{CameraName, Pose, RigName, StreamName};
@@ -92,6 +92,8 @@ pub struct RecordingConfig {
     pub jpeg_quality: u8,
     /// How colour is stored.
     pub color: ColorCodec,
+    /// How depth of 16 bit is stored.
+    pub depth: DepthCodec,
     /// A segment is closed at this size, MiB.
     pub segment_max_mb: u64,
     /// A segment is closed after this long, seconds.
@@ -184,6 +186,7 @@ impl Default for RecordingConfig {
             directory: PathBuf::from("datasets"),
             jpeg_quality: 95,
             color: ColorCodec::Jpeg,
+            depth: DepthCodec::Zstd,
             segment_max_mb: 1024,
             segment_max_s: 60,
             workers: 0,

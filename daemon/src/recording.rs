@@ -377,6 +377,7 @@ fn options_of(config: &RecordingConfig) -> RecorderOptions {
     let mut options = RecorderOptions {
         jpeg_quality: config.jpeg_quality,
         color: config.color,
+        depth: config.depth,
         segment_max_bytes: config.segment_max_mb << 20,
         segment_max_ns: config.segment_max_s as i64 * 1_000_000_000,
         queue_sets: config.queue_sets,

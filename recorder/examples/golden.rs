@@ -1,5 +1,6 @@
 //! Writes a short dataset that is always the same, and the pixels that readers must find in it:
-//! `cargo run --example golden -- DATASET EXPECTED`.
+//! `cargo run --example golden -- DATASET EXPECTED [raw|rank]`: colour as JPEG, as it is, or as PNG with
+//! depth in our own codec.
 //!
 //! `EXPECTED/index.json` lists each picture: topic, log time, size, encoding, the file with its pixels, how
 //! they are to be compared (`exact` or `jpeg`) and the intrinsics. The files hold bare pixels, row by row.
@@ -8,8 +9,8 @@
 use depthrig_bus::{DropCounts, FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{
-    ColorCodec, Dataset, Diagnostic, Level, RecordFrame, RecordSet, Recorder, RecorderOptions, Session,
-    SetRange, StreamAccount, StreamRecord,
+    ColorCodec, Dataset, DepthCodec, Diagnostic, Level, RecordFrame, RecordSet, Recorder, RecorderOptions,
+    Session, SetRange, StreamAccount, StreamRecord,
 };
 use serde_json::json;
 use std::path::Path;
@@ -60,7 +61,7 @@ fn pixels(s: &StreamRecord, n: u64) -> Vec<u8> {
     out
 }
 
-fn write(dir: &Path, color: ColorCodec) -> Session {
+fn write(dir: &Path, color: ColorCodec, depth: DepthCodec) -> Session {
     let mut session = Session::new(dir.file_name().unwrap().to_string_lossy(), "golden");
     (session.scene, session.started_utc_ns) = ("a gradient with an edge".into(), UTC_NS);
     session.rig_config = "# the golden rig\n".into();
@@ -73,6 +74,7 @@ fn write(dir: &Path, color: ColorCodec) -> Session {
     // Two segments, and room on any disk.
     let options = RecorderOptions {
         color,
+        depth,
         segment_max_ns: 4 * PERIOD_NS,
         min_free_bytes: 0,
         queue_sets: SETS as usize,
@@ -139,15 +141,19 @@ fn expect(dir: &Path, expected: &Path, session: &Session) {
         let set = set.unwrap();
         for f in set.frames {
             let s = &session.streams[f.stream];
-            let exact = f.codec == "raw";
+            let exact = f.codec != "jpeg";
             assert!(!exact || f.pixels == pixels(s, set.id - 1));
             let file = format!("{}_{}_{}.bin", set.id, s.id.camera, s.id.stream);
             std::fs::write(expected.join(&file), &f.pixels).unwrap();
-            let (encoding, last) = match (s.format, exact) {
-                (PixelFormat::Z16, _) => ("16UC1", "image_raw"),
-                (PixelFormat::Rgb8, true) => ("rgb8", "image_raw"),
-                (PixelFormat::Rgb8, false) => ("rgb8", "image_compressed"),
-                _ => ("mono8", "image_raw"),
+            let encoding = match s.format {
+                PixelFormat::Z16 => "16UC1",
+                PixelFormat::Rgb8 => "rgb8",
+                _ => "mono8",
+            };
+            let last = match f.codec {
+                "raw" => "image_raw",
+                "rank" => "depth_compressed",
+                _ => "image_compressed",
             };
             let base = format!("/golden/{}/{}", s.id.camera, s.id.stream);
             let i = &f.header.intrinsics;
@@ -157,7 +163,7 @@ fn expect(dir: &Path, expected: &Path, session: &Session) {
                 "log_time": set.utc_ns.to_string(),
                 "stamp": (f.header.capture_time_ns + set.utc_offset_ns).to_string(),
                 "width": s.width, "height": s.height, "encoding": encoding,
-                "compare": if exact { "exact" } else { "jpeg" },
+                "codec": f.codec, "compare": if exact { "exact" } else { "jpeg" },
                 "sequence": f.header.sequence, "depth_unit_m": f.header.depth_unit_m,
                 "k": [i.fx, 0.0, i.cx, 0.0, i.fy, i.cy, 0.0, 0.0, 1.0], "d": i.coeffs[..5],
                 "translation": s.pose.translation_m, "rotation": s.pose.rotation_xyzw,
@@ -170,14 +176,15 @@ fn expect(dir: &Path, expected: &Path, session: &Session) {
 
 fn main() {
     let args: Vec<String> = std::env::args().skip(1).collect();
-    let (dataset, expected, color) = match args.as_slice() {
-        [d, e] => (d, e, ColorCodec::Jpeg),
-        [d, e, raw] if raw == "raw" => (d, e, ColorCodec::Raw),
+    let (dataset, expected, color, depth) = match args.as_slice() {
+        [d, e] => (d, e, ColorCodec::Jpeg, DepthCodec::Zstd),
+        [d, e, raw] if raw == "raw" => (d, e, ColorCodec::Raw, DepthCodec::Zstd),
+        [d, e, rank] if rank == "rank" => (d, e, ColorCodec::Png, DepthCodec::Rank),
         _ => {
-            println!("usage: golden DATASET EXPECTED [raw]");
+            println!("usage: golden DATASET EXPECTED [raw|rank]");
             std::process::exit(2);
         }
     };
-    let session = write(Path::new(dataset), color);
+    let session = write(Path::new(dataset), color, depth);
     expect(Path::new(dataset), Path::new(expected), &session);
 }

@@ -12,7 +12,7 @@ mod index;
 mod info;
 mod sets;
 
-pub(crate) use decode::{check_stored, jpeg_pixels};
+pub(crate) use decode::{check_stored, color_decodes, jpeg_pixels};
 pub use index::SetReader;
 pub use info::{DatasetInfo, SpreadStats, StreamInfo};
 pub use sets::{DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};

@@ -4,11 +4,15 @@
 //! A panic is a finding; so is a broken promise, which is why there are assertions here. Each function returns how
 //! far its input came, so that a corpus which no longer reaches anything is noticed.
 
+use crate::codec::{DepthDecoder, DepthEncoder, DepthShape};
+use crate::dataset::color_decodes;
 use crate::fs::{Fs, MemFs};
+use crate::msgs::image;
 use crate::recorder::topics::Topics;
 use crate::{
     Dataset, PixelMode, RecorderOptions, SESSION_FILE, Session, SetRange, VerifyOptions, verify_with,
 };
+use depthrig_bus::{FrameHeader, PixelFormat};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -64,4 +68,35 @@ pub fn session(bytes: &[u8]) -> bool {
         assert!(again.is_ok_and(|again| again == text), "a session changes by being written and read");
     }
     true
+}
+
+/// The depth codec: a shape from the first bytes, the packed picture in the rest; and the message of such a picture.
+/// Whether either was a picture.
+///
+/// # Panics
+/// When a picture that was unpacked is another one after being packed and unpacked again.
+pub fn depth_codec(bytes: &[u8]) -> bool {
+    let Some(([width, height, pad], data)) = bytes.split_first_chunk::<3>() else { return false };
+    let [width, height, pad] = [width, height, pad].map(|b| u32::from(*b));
+    let shape = DepthShape { width, height, step: 2 * width + pad % 8 };
+    let mut picture = Vec::new();
+    let good = DepthDecoder::new().decode(data, shape, &mut picture).is_ok();
+    if good {
+        let (mut packed, mut again) = (Vec::new(), Vec::new());
+        let same = DepthEncoder::new()
+            .encode(&picture, shape, &mut packed)
+            .and_then(|()| DepthDecoder::new().decode(&packed, shape, &mut again));
+        assert!(same.is_ok() && again == picture, "a picture changes by being packed");
+    }
+    let read = image::read_compressed_depth(bytes);
+    let as_message = read.and_then(|(shape, _, data)| DepthDecoder::new().decode(data, shape, &mut picture));
+    good || as_message.is_ok()
+}
+
+/// A PNG or a JPEG of a colour stream, under a header of the size in the first two bytes; whether it was one.
+pub fn color_codec(bytes: &[u8]) -> bool {
+    let Some(([width, height], data)) = bytes.split_first_chunk::<2>() else { return false };
+    let mut h = FrameHeader::default();
+    h.set_picture(PixelFormat::Rgb8, u32::from(*width), u32::from(*height));
+    color_decodes(data, &h)
 }

@@ -17,6 +17,7 @@ pub mod bench;
 mod cat;
 mod catalog;
 mod cdr;
+pub mod codec;
 mod compare;
 mod container;
 mod dataset;
@@ -47,7 +48,7 @@ pub use dataset::{
 pub use error::{Error, ErrorKind, Result};
 pub use frame::{Pixels, PushError, RecordFrame, RecordSet, SetDrop};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
-pub use options::{ColorCodec, Compression, RecorderOptions};
+pub use options::{ColorCodec, Compression, DepthCodec, RecorderOptions};
 pub use recorder::{Progress, Recorder, Summary, UtcSource};
 pub use select::{Edge, Moment, SetSpan};
 pub use session::{

@@ -9,8 +9,21 @@ pub enum ColorCodec {
     /// JPEG 4:4:4 of `RecorderOptions::jpeg_quality`.
     #[default]
     Jpeg,
-    /// Every bit, as `rgb8`.
+    /// Every bit, as `rgb8` in `Zstandard` chunks: quick to read, twice as small as not packed.
     Raw,
+    /// Every bit, as PNG: smaller than raw, and every viewer knows it.
+    Png,
+}
+
+/// How depth pictures of 16 bit are stored; either way every bit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DepthCodec {
+    /// As `16UC1`, packed as `RecorderOptions::compression` says: opens in every viewer.
+    #[default]
+    Zstd,
+    /// With [`crate::codec`]: takes about half of the space, and needs our decoder, in Rust or in Python.
+    Rank,
 }
 
 /// How pictures that are not JPEG are packed.
@@ -32,6 +45,8 @@ pub struct RecorderOptions {
     pub jpeg_quality: u8,
     /// How RGB and BGR pictures are stored; all others are stored losslessly.
     pub color: ColorCodec,
+    /// How depth pictures of 16 bit are stored.
+    pub depth: DepthCodec,
     /// How losslessly stored pictures are packed.
     pub compression: Compression,
     /// A segment is closed before the set that would begin beyond this size, bytes.
@@ -57,6 +72,7 @@ impl Default for RecorderOptions {
         Self {
             jpeg_quality: 95,
             color: ColorCodec::Jpeg,
+            depth: DepthCodec::Zstd,
             compression: Compression::Zstd1,
             segment_max_bytes: 1 << 30,
             segment_max_ns: 60_000_000_000,

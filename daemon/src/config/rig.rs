@@ -2,8 +2,8 @@
 
 use super::read::{FromToml, Report, Section};
 use super::{
-    BusConfig, ColorCodec, ConfigError, ControlConfig, MAX_CAMERAS, MAX_RATE_HZ, Phase, RecordingConfig,
-    RigConfig, SetsConfig, SupervisorConfig, camera,
+    BusConfig, ColorCodec, ConfigError, ControlConfig, DepthCodec, MAX_CAMERAS, MAX_RATE_HZ, Phase,
+    RecordingConfig, RigConfig, SetsConfig, SupervisorConfig, camera,
 };
 use core::fmt::Display;
 use core::ops::RangeInclusive;
@@ -72,6 +72,9 @@ fn sets(top: &Section<'_, '_>) -> SetsConfig {
     SetsConfig { rate_hz, max_wait_ms, phase }
 }
 
+const COLOR: [(&str, ColorCodec); 3] =
+    [("jpeg", ColorCodec::Jpeg), ("png", ColorCodec::Png), ("raw", ColorCodec::Raw)];
+
 fn recording(top: &Section<'_, '_>, base: &Path) -> RecordingConfig {
     let d = RecordingConfig::default();
     let s = top.table("recording", "[recording]");
@@ -79,7 +82,8 @@ fn recording(top: &Section<'_, '_>, base: &Path) -> RecordingConfig {
     let config = RecordingConfig {
         directory: resolve(base, &directory),
         jpeg_quality: s.or("jpeg_quality", d.jpeg_quality, within(1..=100)),
-        color: s.choice("color", &[("jpeg", ColorCodec::Jpeg), ("raw", ColorCodec::Raw)], d.color),
+        color: s.choice("color", &COLOR, d.color),
+        depth: s.choice("depth", &[("zstd", DepthCodec::Zstd), ("rank", DepthCodec::Rank)], d.depth),
         segment_max_mb: s.or("segment_max_mb", d.segment_max_mb, within(1..=1 << 20)),
         segment_max_s: s.or("segment_max_s", d.segment_max_s, within(1..=86_400)),
         workers: s.or("workers", d.workers, within(0..=super::MAX_WORKERS)),

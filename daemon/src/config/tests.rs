@@ -128,7 +128,7 @@ fn what_a_file_says_is_what_comes_out() {
         rig = "lab_2"
         bus.slots = 32
         sets = { rate_hz = 10, max_wait_ms = 40, phase = "fixed" }
-        recording = { directory = "../out/./x", color = "raw", segment_max_s = 5, workers = 3 }
+        recording = { directory = "../out/./x", color = "png", depth = "rank", segment_max_s = 5, workers = 3 }
         control.tcp = "[::1]:8000"
         [[camera]]
         name = "a"
@@ -151,8 +151,8 @@ fn what_a_file_says_is_what_comes_out() {
     assert_eq!(rig.sets, SetsConfig { rate_hz: 10.0, max_wait_ms: Some(40.0), phase: Phase::Fixed });
     assert_eq!(rig.recording.directory, Path::new("/rigs/../out/x"));
     assert_eq!(
-        (rig.recording.color, rig.recording.workers, rig.recording.segment_max_s),
-        (ColorCodec::Raw, 3, 5)
+        (rig.recording.color, rig.recording.depth, rig.recording.workers, rig.recording.segment_max_s),
+        (ColorCodec::Png, DepthCodec::Rank, 3, 5)
     );
     assert_eq!(rig.control.tcp, Some("[::1]:8000".parse().unwrap()));
     let a = rig.camera("a").unwrap();

@@ -1,27 +1,59 @@
 //! A stored picture becomes the pixels that the camera's channel carried.
 
+use crate::codec::{DEPTH_CODEC, DepthDecoder, DepthShape};
 use crate::encode::Codec;
 use crate::msgs::image;
 use crate::{Error, ErrorKind, Result};
-use ::image::ImageDecoder;
 use ::image::codecs::jpeg::JpegDecoder;
+use ::image::codecs::png::PngDecoder;
+use ::image::{ColorType, ImageDecoder, Limits};
 use depthrig_bus::{FrameHeader, PixelFormat};
+use std::cell::RefCell;
 use std::io::Cursor;
 
-/// The bytes in an image message, as stored.
-pub(super) fn stored(message: &[u8], codec: Codec) -> Result<&[u8]> {
-    image::read_data(message, codec != Codec::Raw)
+/// Colour pictures above this many bytes are refused: 16384x16384.
+const COLOR_MAX: u64 = 3 << 28;
+
+thread_local! {
+    /// One per thread that reads depth, so that its tables and buffers are made once.
+    static DEPTH: RefCell<Option<DepthDecoder>> = const { RefCell::new(None) };
+}
+
+/// The bytes in a picture's message, as stored.
+pub(crate) fn stored(message: &[u8], codec: Codec) -> Result<&[u8]> {
+    match codec {
+        Codec::Raw => image::read_image(message),
+        Codec::Jpeg | Codec::Mjpeg | Codec::Png => image::read_compressed(message),
+        Codec::Rank => {
+            let (_, name, data) = image::read_compressed_depth(message)?;
+            if name != DEPTH_CODEC {
+                let what = format!("depth is packed with \"{name}\"; this depthrig reads \"{DEPTH_CODEC}\"");
+                return Err(Error::new(ErrorKind::Version, what));
+            }
+            Ok(data)
+        }
+    }
 }
 
 /// Whether the picture of a whole image message can be decoded to what its header says. A camera's own JPEG,
 /// which a replay hands on as it came, is decoded here as well.
 pub(crate) fn check_stored(message: &[u8], codec: Codec, h: &FrameHeader) -> Result<()> {
     let stored = stored(message, codec)?;
+    if codec == Codec::Rank {
+        let (shape, ..) = image::read_compressed_depth(message)?;
+        if shape != shape_of(h) {
+            return Err(wrong(h, format_args!("its message says {shape:?}, its header {:?}", shape_of(h))));
+        }
+    }
     decode(stored, codec, h)?;
     if codec == Codec::Mjpeg {
         jpeg_pixels(stored, h)?;
     }
     Ok(())
+}
+
+const fn shape_of(h: &FrameHeader) -> DepthShape {
+    DepthShape { width: h.width, height: h.height, step: h.stride }
 }
 
 fn wrong(h: &FrameHeader, what: impl core::fmt::Display) -> Error {
@@ -33,27 +65,64 @@ fn wrong(h: &FrameHeader, what: impl core::fmt::Display) -> Error {
 pub(crate) fn jpeg_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
     let damaged = |e: ::image::ImageError| wrong(h, "its JPEG is damaged").with_source(e);
     let decoder = JpegDecoder::new(Cursor::new(stored)).map_err(damaged)?;
+    color_pixels(decoder, "JPEG", h)
+}
+
+fn png_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
+    let damaged = |e: ::image::ImageError| wrong(h, "its PNG is damaged").with_source(e);
+    let mut limits = Limits::default();
+    (limits.max_image_width, limits.max_image_height) = (Some(h.width), Some(h.height));
+    let decoder = PngDecoder::with_limits(Cursor::new(stored), limits).map_err(damaged)?;
+    if decoder.color_type() != ColorType::Rgb8 {
+        return Err(wrong(h, "its PNG is not RGB of 8 bit"));
+    }
+    color_pixels(decoder, "PNG", h)
+}
+
+/// Whether this is a PNG or a JPEG of the header's size: for the fuzz targets.
+pub(crate) fn color_decodes(stored: &[u8], h: &FrameHeader) -> bool {
+    png_pixels(stored, h).is_ok() | jpeg_pixels(stored, h).is_ok()
+}
+
+fn color_pixels(decoder: impl ImageDecoder, kind: &str, h: &FrameHeader) -> Result<Vec<u8>> {
     let (width, height) = decoder.dimensions();
     if (width, height) != (h.width, h.height) || decoder.color_type().bytes_per_pixel() != 3 {
         let said = format!("its header says {}x{} in colour", h.width, h.height);
-        return Err(wrong(h, format_args!("its JPEG is {width}x{height}, {said}")));
+        return Err(wrong(h, format_args!("its {kind} is {width}x{height}, {said}")));
     }
-    let mut pixels = vec![0; 3 * h.width as usize * h.height as usize];
+    let bytes = 3 * u64::from(width) * u64::from(height);
+    if bytes > COLOR_MAX {
+        return Err(wrong(h, format_args!("a {kind} of {width}x{height} is too large")));
+    }
+    let mut pixels = vec![0; bytes as usize];
+    let damaged = |e: ::image::ImageError| wrong(h, format_args!("its {kind} is damaged")).with_source(e);
     decoder.read_image(&mut pixels).map_err(damaged)?;
     Ok(pixels)
 }
 
 /// The payload as the header describes it: same format, same stride, same length.
 pub(super) fn decode(stored: &[u8], codec: Codec, h: &FrameHeader) -> Result<Vec<u8>> {
-    if codec != Codec::Jpeg {
-        return if stored.len() == h.payload_len as usize {
-            Ok(stored.to_vec())
-        } else {
-            let said = h.payload_len;
-            Err(wrong(h, format_args!("{} bytes are stored, its header says {said}", stored.len())))
-        };
+    let pixels = match codec {
+        Codec::Raw | Codec::Mjpeg => stored.to_vec(),
+        Codec::Rank => {
+            let mut pixels = Vec::new();
+            DEPTH
+                .with_borrow_mut(|d| d.get_or_insert_default().decode(stored, shape_of(h), &mut pixels))
+                .map_err(|e| wrong(h, e))?;
+            pixels
+        }
+        Codec::Jpeg => padded(jpeg_pixels(stored, h)?, h)?,
+        Codec::Png => padded(png_pixels(stored, h)?, h)?,
+    };
+    if pixels.len() == h.payload_len as usize {
+        return Ok(pixels);
     }
-    let mut pixels = jpeg_pixels(stored, h)?;
+    let (len, said) = (pixels.len(), h.payload_len);
+    Err(wrong(h, format_args!("{len} bytes are stored, its header says {said}")))
+}
+
+/// RGB pixels in the channel order and with the row padding of the live picture; the padding is zero.
+fn padded(mut pixels: Vec<u8>, h: &FrameHeader) -> Result<Vec<u8>> {
     if h.pixel_format() == Some(PixelFormat::Bgr8) {
         pixels.chunks_exact_mut(3).for_each(|p| p.swap(0, 2));
     }

@@ -88,7 +88,7 @@ pub struct DatasetFrame {
     pub stream: usize,
     /// The header as it was on the channel, bit by bit, with `set_id` filled in.
     pub header: FrameHeader,
-    /// How the pixels are stored: `raw`, `jpeg` or `mjpeg`.
+    /// How the pixels are stored: `raw`, `jpeg`, `mjpeg`, `png` or `rank`.
     pub codec: &'static str,
     /// Bytes of the stored message.
     pub stored_bytes: u64,
@@ -323,7 +323,11 @@ pub(crate) fn kinds(reader: &SegmentReader) -> BTreeMap<u16, Kind> {
         let stream = channel.metadata.get("stream").and_then(|s| s.parse().ok());
         let is = |s: Schema| channel.schema == s.name();
         let kind = match stream {
-            Some(stream) if is(Schema::Image) || is(Schema::CompressedImage) => Kind::Picture(stream),
+            Some(stream)
+                if [Schema::Image, Schema::CompressedImage, Schema::CompressedDepth].into_iter().any(is) =>
+            {
+                Kind::Picture(stream)
+            }
             Some(stream) if is(Schema::FrameInfo) => Kind::Info(stream),
             _ if is(Schema::FrameSet) => Kind::Set,
             _ => continue,

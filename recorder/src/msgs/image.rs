@@ -1,6 +1,7 @@
 //! `sensor_msgs` images and camera information.
 
 use crate::cdr::{Reader, Writer};
+use crate::codec::DepthShape;
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{Distortion, FrameHeader, PixelFormat};
 
@@ -34,31 +35,61 @@ pub(crate) fn write_image(
     w.bytes(pixels);
 }
 
-/// The pixels of an `Image` or the picture file in a `CompressedImage`.
-pub(crate) fn read_data(message: &[u8], compressed: bool) -> Result<&[u8]> {
+/// The pixels of an `Image`.
+pub(crate) fn read_image(message: &[u8]) -> Result<&[u8]> {
     let mut r = Reader::new(message)?;
     r.time()?;
     r.str()?;
-    if compressed {
-        r.str()?;
-    } else {
-        r.u32()?;
-        r.u32()?;
-        r.str()?;
-        r.u8()?;
-        r.u32()?;
-    }
+    r.u32()?;
+    r.u32()?;
+    r.str()?;
+    r.u8()?;
+    r.u32()?;
     r.bytes()
 }
 
-/// Appends a `CompressedImage` whose JPEG `fill` writes; returns the JPEG's length.
+/// The picture file in a `CompressedImage`.
+pub(crate) fn read_compressed(message: &[u8]) -> Result<&[u8]> {
+    let mut r = Reader::new(message)?;
+    r.time()?;
+    r.str()?;
+    r.str()?;
+    r.bytes()
+}
+
+/// Shape, codec and data of a `CompressedDepth`.
+pub(crate) fn read_compressed_depth(message: &[u8]) -> Result<(DepthShape, &str, &[u8])> {
+    let mut r = Reader::new(message)?;
+    r.time()?;
+    r.str()?;
+    // Fields in the order of the bytes.
+    let (height, width, step) = (r.u32()?, r.u32()?, r.u32()?);
+    Ok((DepthShape { width, height, step }, r.str()?, r.bytes()?))
+}
+
+/// Appends a `CompressedDepth` whose data `fill` writes.
+pub(crate) fn write_compressed_depth(
+    buf: &mut Vec<u8>,
+    stamp_utc_ns: i64,
+    frame_id: &str,
+    shape: DepthShape,
+    codec: &str,
+    fill: impl FnOnce(&mut Vec<u8>) -> Result<()>,
+) -> Result<()> {
+    let mut w = Writer::new(buf);
+    w.header(stamp_utc_ns, frame_id).u32(shape.height).u32(shape.width).u32(shape.step).str(codec);
+    w.bytes_with(fill).map(drop)
+}
+
+/// Appends a `CompressedImage` whose picture file, of this format, `fill` writes.
 pub(crate) fn write_compressed(
     buf: &mut Vec<u8>,
     stamp_utc_ns: i64,
     frame_id: &str,
+    format: &str,
     fill: impl FnOnce(&mut Vec<u8>) -> Result<()>,
-) -> Result<usize> {
-    Writer::new(buf).header(stamp_utc_ns, frame_id).str("jpeg").bytes_with(fill)
+) -> Result<()> {
+    Writer::new(buf).header(stamp_utc_ns, frame_id).str(format).bytes_with(fill).map(drop)
 }
 
 pub(crate) fn write_camera_info(buf: &mut Vec<u8>, stamp_utc_ns: i64, frame_id: &str, h: &FrameHeader) {

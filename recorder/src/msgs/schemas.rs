@@ -20,10 +20,11 @@ pub(crate) enum Schema {
     ClockPair,
     Accounts,
     Checkpoint,
+    CompressedDepth,
 }
 
 impl Schema {
-    pub(crate) const ALL: [Self; 11] = [
+    pub(crate) const ALL: [Self; 12] = [
         Self::Image,
         Self::CompressedImage,
         Self::CameraInfo,
@@ -35,6 +36,7 @@ impl Schema {
         Self::ClockPair,
         Self::Accounts,
         Self::Checkpoint,
+        Self::CompressedDepth,
     ];
 
     /// The id of the schema record: 1, 2, … in the order of [`Self::ALL`].
@@ -55,6 +57,7 @@ impl Schema {
             Self::ClockPair => "depthrig_msgs/msg/ClockPair",
             Self::Accounts => "depthrig_msgs/msg/Accounts",
             Self::Checkpoint => "depthrig_msgs/msg/Checkpoint",
+            Self::CompressedDepth => "depthrig_msgs/msg/CompressedDepth",
         }
     }
 
@@ -78,6 +81,7 @@ impl Schema {
             Self::ClockPair => with(CLOCK_PAIR, &[TIME_DEP]),
             Self::Accounts => with(&accounts(), &[TIME_DEP, STREAM_ACCOUNT_DEP]),
             Self::Checkpoint => with(CHECKPOINT, &[TIME_DEP]),
+            Self::CompressedDepth => with(COMPRESSED_DEPTH, &[HEADER_DEP, TIME_DEP]),
         }
     }
 
@@ -213,6 +217,19 @@ int64 utc_ns
 int64 width_ns
 ";
 
+const COMPRESSED_DEPTH: &str = "\
+# A depth picture of 16 bit, without loss. docs/dataset-format.md of depthrig, \"Depth codec\", says how data is read;
+# the Python package depthrig has decode_depth.
+std_msgs/Header header
+uint32 height
+uint32 width
+# Bytes from row to row once it is unpacked.
+uint32 step
+# Name and version of the codec: rank/1.
+string codec
+uint8[] data
+";
+
 const STREAM_ACCOUNT_DEP: Dep = (
     "depthrig_msgs/StreamAccount",
     "# captured = delivered + sum(dropped) since the stream began; dropped by reason as in FrameInfo.\n\
@@ -236,7 +253,7 @@ fn frame_info() -> String {
     }
     text.push_str(
         "# Capture time as UTC, and the name of the optical frame.\nbuiltin_interfaces/Time stamp\n\
-         string frame_id\n# How the pixels are stored: raw, jpeg or mjpeg.\nstring codec\n",
+         string frame_id\n# How the pixels are stored: raw, jpeg, mjpeg, png or rank.\nstring codec\n",
     );
     text
 }

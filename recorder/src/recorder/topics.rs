@@ -89,7 +89,7 @@ impl Topics {
             frame_ids: streams.iter().map(|s| optical_frame(&s.id)).collect(),
             formats: streams.iter().map(|s| s.format).collect(),
             names: streams.iter().map(|s| s.id.to_string()).collect(),
-            codecs: streams.iter().map(|s| Codec::of(s.format, options.color)).collect(),
+            codecs: streams.iter().map(|s| Codec::of(s.format, options)).collect(),
         }
     }
 
@@ -151,7 +151,8 @@ impl Topics {
             // One folder per stream: viewers match a picture with the camera_info beside it.
             let (picture, schema) = match self.codecs[i] {
                 Codec::Raw => ("image_raw", Schema::Image),
-                Codec::Jpeg | Codec::Mjpeg => ("image_compressed", Schema::CompressedImage),
+                Codec::Jpeg | Codec::Mjpeg | Codec::Png => ("image_compressed", Schema::CompressedImage),
+                Codec::Rank => ("depth_compressed", Schema::CompressedDepth),
             };
             let facts = [
                 ("stream", s.id.to_string()),

@@ -3,6 +3,7 @@
 
 mod cat;
 mod catalog;
+mod codecs;
 mod compare;
 mod corpus;
 mod edit;
