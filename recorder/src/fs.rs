@@ -64,6 +64,14 @@ pub trait Fs: Send + Sync + fmt::Debug {
     /// # Errors
     /// As the operating system says.
     fn available_space(&self, dir: &Path) -> io::Result<u64>;
+    /// Keeps other processes from locking the folder `dir` until the result is dropped; a process that is killed lets go
+    /// of it. A file system that only one process sees needs none.
+    ///
+    /// # Errors
+    /// `WouldBlock` when another one has it, else as the operating system says.
+    fn lock(&self, _dir: &Path) -> io::Result<Box<dyn Send + Sync>> {
+        Ok(Box::new(()))
+    }
 }
 
 /// A file that is being appended to.
@@ -183,6 +191,12 @@ impl Fs for RealFs {
     fn available_space(&self, dir: &Path) -> io::Result<u64> {
         let s = rustix::fs::statvfs(dir)?;
         Ok(s.f_bavail * s.f_frsize)
+    }
+
+    fn lock(&self, dir: &Path) -> io::Result<Box<dyn Send + Sync>> {
+        let dir = File::open(dir)?;
+        dir.try_lock()?;
+        Ok(Box::new(dir))
     }
 }
 

@@ -23,6 +23,7 @@ mod container;
 mod dataset;
 mod encode;
 mod error;
+pub mod exchange;
 mod frame;
 pub mod fs;
 #[doc(hidden)]

@@ -20,6 +20,7 @@ pub struct SetReader {
 }
 
 /// A segment that has sets.
+#[derive(Clone)]
 struct Place {
     /// Its index in [`Dataset::segments`].
     segment: usize,
@@ -84,6 +85,23 @@ impl SetReader {
     /// What of the dataset cannot be read, one line per segment.
     pub fn problems(&self) -> &[String] {
         &self.problems
+    }
+
+    /// Another reader of the same sets, without reading the indexes again.
+    pub(crate) fn fork(&self) -> Self {
+        Self {
+            dataset: self.dataset.clone(),
+            times: self.times.clone(),
+            segments: self.segments.clone(),
+            problems: self.problems.clone(),
+            open: None,
+        }
+    }
+
+    /// The numbers of the sets of each segment that has any.
+    pub(crate) fn segment_numbers(&self) -> Vec<std::ops::Range<usize>> {
+        let ends = self.segments.iter().skip(1).map(|p| p.first).chain([self.times.len()]);
+        self.segments.iter().zip(ends).map(|(p, end)| p.first..end).collect()
     }
 
     /// Reads the set of this number.

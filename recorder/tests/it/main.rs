@@ -7,6 +7,7 @@ mod codecs;
 mod compare;
 mod corpus;
 mod edit;
+mod exchange;
 mod failures;
 mod kill;
 mod round_trip;

@@ -1,0 +1,149 @@
+//! Drives an [`Importer`]: records what it reads as a dataset, and verifies that.
+
+use crate::dataset::Dataset;
+use crate::fs::Fs;
+use crate::{
+    Error, ErrorKind, RecordSet, Recorder, RecorderOptions, Result, Session, StreamAccount, Summary,
+    VerifyOptions, VerifyReport, verify_with,
+};
+use depthrig_bus::UtcPair;
+use serde::Serialize;
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+/// One layout that can become a dataset. It reads one set at a time.
+pub trait Importer {
+    /// The name of the layout.
+    fn format(&self) -> &'static str;
+
+    /// Who recorded what with which cameras. Its table `import` in `extra` says where each fact comes from.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] when it cannot be a dataset.
+    fn session(&mut self) -> Result<Session>;
+
+    /// The next set; `None` at the end. A picture that cannot be read is counted in [`ImportFacts`].
+    ///
+    /// # Errors
+    /// What ends the whole import.
+    fn next(&mut self) -> Result<Option<RecordSet>>;
+
+    /// How much of how much has been read, in any unit.
+    fn progress(&self) -> ImportProgress;
+
+    /// What became of what was there, after the last set.
+    fn facts(&self) -> ImportFacts;
+}
+
+/// How far an import has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImportProgress {
+    /// Read so far.
+    pub done: u64,
+    /// There is in all.
+    pub total: u64,
+}
+
+/// What became of what was there.
+#[derive(Debug, Clone, Default, Serialize)]
+#[non_exhaustive]
+pub struct ImportFacts {
+    /// `captured = delivered + Σ dropped` of each stream, as far as the source tells.
+    pub accounts: Vec<StreamAccount>,
+    /// Pictures and sets that could not be imported.
+    pub lost: u64,
+    /// The first of them, in words.
+    pub problems: Vec<String>,
+    /// What was assumed, inferred or left out, a sentence each.
+    pub stated: Vec<String>,
+}
+
+impl ImportFacts {
+    /// Counts something that could not be imported.
+    pub fn lose(&mut self, problem: String) {
+        self.lost += 1;
+        if self.problems.len() < super::report::MAX_PROBLEMS {
+            self.problems.push(problem);
+        }
+    }
+}
+
+/// What an import made.
+#[derive(Debug, Serialize)]
+#[non_exhaustive]
+pub struct ImportReport {
+    /// The layout.
+    pub format: String,
+    /// What was recorded.
+    pub summary: Summary,
+    /// What became of what was there.
+    pub facts: ImportFacts,
+    /// Whether the dataset is whole.
+    pub verified: VerifyReport,
+    /// Whether it was ended from outside before all was read.
+    pub ended: bool,
+}
+
+/// Time between looks at a recorder that has no room.
+const PAUSE: Duration = Duration::from_millis(2);
+
+/// Reads everything from `importer`, records it as the dataset `out`, a new folder, and verifies it.
+///
+/// # Errors
+/// As [`Importer`] and [`Recorder::create`]; what was recorded before a failure is left in `out` and is named in
+/// the message.
+pub fn import(
+    importer: &mut dyn Importer,
+    fs: Arc<dyn Fs>,
+    out: &Path,
+    options: RecorderOptions,
+    progress: &mut dyn FnMut(ImportProgress) -> ControlFlow<()>,
+) -> Result<ImportReport> {
+    let session = importer.session()?;
+    let start = UtcPair { utc_ns: session.started_utc_ns, ..UtcPair::default() };
+    let pair = Arc::new(Mutex::new(start));
+    let clock = {
+        let pair = Arc::clone(&pair);
+        Arc::new(move || *pair.lock().unwrap_or_else(PoisonError::into_inner))
+    };
+    let (queue_sets, backlog) = (options.queue_sets.max(1), options.backlog_max_bytes);
+    let recorder = Recorder::create_with(Arc::clone(&fs), clock, out, session, options)?;
+    let cut = |e: Error| {
+        let what = format!(
+            "{e}; what was read before stays in {} as a dataset that is not whole: remove it",
+            out.display()
+        );
+        Error::new(e.kind(), what).with_source(e)
+    };
+    let mut ended = false;
+    while let Some(set) = importer.next().map_err(cut)? {
+        *pair.lock().unwrap_or_else(PoisonError::into_inner) =
+            UtcPair { mono: set.tick, utc_ns: set.utc.utc_ns(set.tick), width_ns: set.utc.width_ns };
+        // A set that finds no room would be refused: wait for it, nothing is live here.
+        loop {
+            let p = recorder.progress();
+            if p.error.is_some() || (p.encode_queue < queue_sets && p.backlog_bytes < backlog) {
+                break;
+            }
+            std::thread::sleep(PAUSE);
+        }
+        if let Err(e) = recorder.push(set) {
+            let cause = recorder.progress().error;
+            let kind = cause.as_ref().map_or(ErrorKind::BadInput, |e| e.kind());
+            return Err(cut(Error::new(kind, e.to_string())));
+        }
+        if progress(importer.progress()).is_break() {
+            ended = true;
+            break;
+        }
+    }
+    let facts = importer.facts();
+    recorder.update_accounts(facts.accounts.clone());
+    let summary = recorder.finish()?;
+    let verified = verify_with(&fs, out, &VerifyOptions::default())?;
+    // A dataset that was verified can be opened.
+    drop(Dataset::open_with(fs, out)?);
+    Ok(ImportReport { format: importer.format().to_owned(), summary, facts, verified, ended })
+}
