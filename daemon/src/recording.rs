@@ -17,6 +17,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 mod place;
+mod report;
+
+pub use report::Reports;
 
 /// The recordings of a rig: at most one at a time, and what became of the last.
 #[derive(Default)]

@@ -15,7 +15,7 @@ use crate::api::{self, ServerHandle};
 use crate::camera::{Camera, Shared, Supervisor};
 use crate::config::{BackendConfig, RigConfig};
 use crate::control::{Control, RecordRequest};
-use crate::recording::{Begun, Outside, Recording, StreamFacts};
+use crate::recording::{Begun, Outside, Recording, Reports, StreamFacts};
 use crate::sets::SpreadStats;
 use crate::status::{CameraState, RecordingStatus, RigStatus, SetAccount};
 use crate::wake::Wake;
@@ -38,6 +38,8 @@ const STEP: Duration = Duration::from_millis(20);
 const START_PATIENCE: Duration = Duration::from_secs(10);
 /// How long one camera thread gets to end; with it the whole stop stays below a second.
 const STOP_PATIENCE: Duration = Duration::from_millis(500);
+/// How long the end of the rig waits for reports; what is not written then is left to `depthrig report`.
+const REPORT_PATIENCE: Duration = Duration::from_secs(10);
 
 /// Set to end a thread.
 type StopFlag = Arc<AtomicBool>;
@@ -106,6 +108,7 @@ pub struct Inner {
     ended: Wake,
     started: HostTime,
     recording: Mutex<Recording>,
+    reports: Reports,
     outside: Outside,
     starting: Mutex<()>,
     spreads: Mutex<SpreadStats>,
@@ -157,6 +160,7 @@ impl Rig {
             ended: Wake::default(),
             started: HostTime::now(),
             recording: Mutex::default(),
+            reports: Reports::default(),
             outside: Outside { fs: Arc::clone(&options.fs), utc: Arc::clone(&options.utc) },
             starting: Mutex::default(),
             spreads: Mutex::default(),
@@ -204,10 +208,16 @@ impl Rig {
             tracing::error!(error = %e, "the recording could not be closed");
         }
         self.end_threads();
+        self.finish_reports();
         let status = self.inner.status();
         let recording = lock(&self.inner.recording).summary().cloned();
         let lost = report::lost(&status);
         RigSummary { status, recording, lost }
+    }
+
+    /// Waits for the reports of recordings that have ended, for some seconds at most.
+    pub fn finish_reports(&self) {
+        self.inner.reports.finish(REPORT_PATIENCE);
     }
 
     fn end_threads(&mut self) {
@@ -337,6 +347,9 @@ impl Control for Inner {
         let finishing = self.recording().take()?;
         // Without the lock: `status` and the next frames need not wait for the disk.
         let (status, result) = finishing.finish();
+        if result.is_ok() {
+            self.reports.begin(PathBuf::from(&status.path));
+        }
         self.recording().keep(status.clone(), result.as_ref().ok().cloned());
         result.map(|_| status)
     }

@@ -104,6 +104,16 @@ impl Dataset {
         info::gather(self)
     }
 
+    /// Where it is read from.
+    pub(crate) fn fs(&self) -> &dyn Fs {
+        &*self.fs
+    }
+
+    /// Whether it was opened as a folder and not as one of its segments.
+    pub(crate) fn is_folder(&self) -> bool {
+        self.segments != [self.path.as_path()]
+    }
+
     pub(crate) fn open_segment(&self, index: usize) -> Option<Result<SegmentReader>> {
         let path = self.segments.get(index)?;
         Some(SegmentReader::open(&*self.fs, path).and_then(|r| ours(&r).map(|()| r)))

@@ -31,6 +31,7 @@ pub mod fuzzing;
 mod msgs;
 mod options;
 mod recorder;
+pub mod report;
 mod select;
 mod session;
 mod still;

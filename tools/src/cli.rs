@@ -1,8 +1,8 @@
 //! The commands and options, and what `--help` says of them.
 
 use crate::commands::{
-    bench, cat, compare, completions, config, demo, edit, info, man, record, replay, run, sessions, status,
-    tap, top, verify,
+    bench, cat, compare, completions, config, demo, edit, info, man, record, replay, report, run, sessions,
+    status, tap, top, verify,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -106,6 +106,9 @@ pub enum Command {
     Replay(replay::ReplayArgs),
     /// Say what is in a dataset
     Info(info::InfoArgs),
+    /// Write the quality report of a dataset: verdict, rates, losses, spreads, clocks, fill rate, pictures
+    #[command(after_help = report::EXAMPLES)]
+    Report(report::ReportArgs),
     /// List the datasets of a folder: scene, start, length, sets, size, health
     #[command(after_help = sessions::EXAMPLES)]
     Sessions(sessions::SessionsArgs),

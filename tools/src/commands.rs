@@ -11,6 +11,7 @@ pub mod info;
 pub mod man;
 pub mod record;
 pub mod replay;
+pub mod report;
 pub mod run;
 pub mod sessions;
 pub mod status;
@@ -37,6 +38,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Top(args) => top::run(&args, &context),
         Command::Replay(args) => replay::run(&args, &context),
         Command::Info(args) => info::run(&args),
+        Command::Report(args) => report::run(&args, &context),
         Command::Sessions(args) => sessions::run(&args, &context),
         Command::Edit(args) => edit::run(&args),
         Command::Verify(args) => verify::run(&args, &context),

@@ -38,6 +38,7 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
         "top",
         "replay",
         "info",
+        "report",
         "sessions",
         "edit",
         "verify",

@@ -87,8 +87,7 @@ impl Checkpoint {
     }
 }
 
-#[cfg(test)]
-fn read_clock_pair(message: &[u8]) -> Result<UtcPair> {
+pub(crate) fn read_clock_pair(message: &[u8]) -> Result<UtcPair> {
     let mut r = Reader::new(message)?;
     r.time()?;
     Ok(UtcPair { mono: depthrig_bus::HostTime::from_ns(r.i64()?), utc_ns: r.i64()?, width_ns: r.i64()? })

@@ -17,6 +17,7 @@ use depthrig_daemon::config::{BackendConfig, RigConfig};
 use depthrig_daemon::control::RecordRequest;
 use depthrig_daemon::rig::{Rig, RigSummary};
 use depthrig_daemon::status::RigStatus;
+use depthrig_recorder::report::REPORT_FILE;
 use depthrig_recorder::{Dataset, VerifyOptions, verify};
 use std::path::{Path, PathBuf};
 
@@ -87,6 +88,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
         verify: verified,
         replay,
         segments: Dataset::open(&dataset)?.segments().to_vec(),
+        quality_report: dataset.join(REPORT_FILE),
         dataset,
         contact_sheet,
     };
@@ -163,6 +165,7 @@ fn record(
         rig.stop();
         bail!("interrupted; what was recorded until then is in {}", folder.join(DATASET).display());
     }
+    rig.finish_reports(); // so that the time to stop is that of the rig
     let began = HostTime::now();
     let summary = rig.stop();
     Ok(Recorded { stop_s: began.elapsed().as_secs_f64(), live, seen, summary })

@@ -37,6 +37,8 @@ pub struct DemoReport {
     pub replay: Replayed,
     /// The dataset.
     pub dataset: PathBuf,
+    /// Its quality report, a page to look at.
+    pub quality_report: PathBuf,
     /// Its segments.
     pub segments: Vec<PathBuf>,
     /// The picture of what the cameras saw.
@@ -100,6 +102,7 @@ impl DemoReport {
         lines.extend(lost.map(|lost| format!("lost      {lost}")));
         lines.push(String::new());
         lines.push(format!("pictures  {}", self.contact_sheet.display()));
+        lines.push(format!("report    {}", self.quality_report.display()));
         if let Some(segment) = self.segments.first() {
             lines.push(format!(
                 "open it   rerun {0}     (or open that file in Foxglove or Lichtblick)",

@@ -1,0 +1,289 @@
+//! The quality report of a dataset: what was recorded and how well, on one page that needs nothing but itself.
+//!
+//! Numbers come from every set; pictures are sampled evenly over the dataset, and the report says how many. Memory is
+//! constant in the length of the dataset but for eight bytes per set. Damage ends nothing: it is in the report.
+
+use crate::catalog::Health;
+use crate::dataset::Dataset;
+use crate::fs::{self, Fs};
+use crate::{Edit, Error, Note, Result, SetCounts, StreamAccount};
+use core::ops::ControlFlow;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+mod gather;
+mod html;
+mod pixels;
+mod series;
+mod svg;
+mod verdict;
+
+pub use series::{Quantiles, Range, TimeBins};
+
+/// The name of the report in a dataset's folder.
+pub const REPORT_FILE: &str = "report.html";
+
+/// What a report looks at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ReportOptions {
+    /// Sets whose depth pictures are decoded for the fill rate, evenly over the dataset.
+    pub fill_sets: usize,
+    /// Frames of a set should not lie further apart than this, nanoseconds; `None`: half a period of the slowest
+    /// camera, within which a nearest frame always lies.
+    pub max_spread_ns: Option<i64>,
+}
+
+impl Default for ReportOptions {
+    fn default() -> Self {
+        Self { fill_sets: 48, max_spread_ns: None }
+    }
+}
+
+/// Told how far the work is, in thousandths; says whether to go on.
+pub type OnProgress<'a> = &'a mut dyn FnMut(u64) -> ControlFlow<()>;
+
+/// The quality of a dataset. Series are `null` where nothing is known.
+#[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
+pub struct Report {
+    /// The dataset.
+    pub path: PathBuf,
+    /// The session's name.
+    pub name: String,
+    /// The rig's name.
+    pub rig: String,
+    /// What was in front of the cameras.
+    pub scene: String,
+    /// Who recorded it.
+    pub operator: String,
+    /// The computer's name.
+    pub host: String,
+    /// The version of depthrig that recorded it.
+    pub depthrig_version: String,
+    /// When the recording began, UTC nanoseconds since 1970.
+    pub started_utc_ns: i64,
+    /// What the operator noted.
+    pub notes: Vec<Note>,
+    /// What was changed afterwards.
+    pub history: Vec<Edit>,
+    /// What is to be thought of it.
+    pub verdict: Verdict,
+    /// Its sets.
+    pub sets: SetsReport,
+    /// How the time of the series below is divided.
+    pub bins: TimeBins,
+    /// Its streams.
+    pub streams: Vec<StreamReport>,
+    /// The two clocks of the host.
+    pub host_clock: HostClock,
+    /// Bytes of its segments.
+    pub bytes: u64,
+    /// Its segments.
+    pub segments: usize,
+    /// Segments that were not finished, by file name.
+    pub unfinished: Vec<String>,
+    /// What could not be read: the first [`PROBLEMS_MAX`].
+    pub problems: Vec<String>,
+    /// How much could not be read.
+    pub problem_count: u64,
+    /// How many pictures were looked at.
+    pub sampled: Sampled,
+    /// First, middle and last set; not in JSON.
+    #[serde(skip)]
+    pictures: Vec<SetPictures>,
+}
+
+/// Problems that a report names; the rest is counted.
+pub const PROBLEMS_MAX: usize = 20;
+
+/// What is to be thought of a dataset.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Verdict {
+    /// How it is.
+    pub health: Health,
+    /// The same in a sentence.
+    pub headline: String,
+    /// What makes it so, and what to do.
+    pub why: Vec<String>,
+    /// What a careful reader should know although nothing of it is wrong with the dataset.
+    pub remarks: Vec<String>,
+}
+
+/// The sets of a dataset.
+#[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
+pub struct SetsReport {
+    /// Sets that are there.
+    pub count: u64,
+    /// Of those, sets that lack a frame of some stream.
+    pub incomplete: u64,
+    /// From the first to the last, nanoseconds.
+    pub duration_ns: i64,
+    /// Time from set to set, nanoseconds.
+    pub interval_ns: Quantiles,
+    /// Sets handed over, recorded and dropped by reason: `offered = recorded + Σ dropped`.
+    pub counts: Option<SetCounts>,
+    /// Sets per second over time.
+    pub per_second: Vec<Option<f64>>,
+    /// Latest minus earliest capture time of a set, nanoseconds.
+    pub spread_ns: Quantiles,
+    /// How many sets have which spread.
+    pub spread_histogram: LinearHistogram,
+    /// Within which a spread should be, nanoseconds.
+    pub spread_limit_ns: Option<i64>,
+    /// Sets beyond that.
+    pub beyond_limit: u64,
+}
+
+/// Counts in bins of equal width from 0.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub struct LinearHistogram {
+    /// Width of a bin, nanoseconds.
+    pub width_ns: i64,
+    /// Values in each.
+    pub counts: Vec<u64>,
+    /// Values beyond the last.
+    pub beyond: u64,
+}
+
+/// One stream of a dataset.
+#[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
+pub struct StreamReport {
+    /// What the session says of it.
+    #[serde(flatten)]
+    pub record: crate::StreamRecord,
+    /// How pixels are stored; empty when there is no frame.
+    pub codec: &'static str,
+    /// Frames in the dataset.
+    pub frames: u64,
+    /// Sets without a frame of it.
+    pub missing: u64,
+    /// Bytes of its pictures before the chunks are packed.
+    pub bytes: u64,
+    /// Bytes that its pixels have on the channel.
+    pub raw_bytes: u64,
+    /// Frames per second on its channel between its first and its last recorded frame.
+    pub live_hz: f64,
+    /// The same over time.
+    pub live_hz_series: Vec<Option<f64>>,
+    /// Sets without a frame of it, over time.
+    pub missing_series: Vec<u64>,
+    /// Frames lost before its channel, over time.
+    pub dropped_series: Vec<u64>,
+    /// `captured = delivered + Σ dropped` over the recording, from the last account in the file.
+    pub account: Option<StreamAccount>,
+    /// Time of its first frame since the first set, nanoseconds.
+    pub first_ns: Option<i64>,
+    /// Time of its last frame since the first set, nanoseconds.
+    pub last_ns: Option<i64>,
+    /// When it was missing first and last, since the first set, nanoseconds.
+    pub missing_ns: Option<(i64, i64)>,
+    /// Its capture clock.
+    pub clock: ClockReport,
+    /// How much of its pictures has depth; `None` when it is no depth or none was looked at.
+    pub fill: Option<Fill>,
+}
+
+/// The capture clock of a stream.
+#[derive(Debug, Clone, Serialize)]
+pub struct ClockReport {
+    /// Where capture times come from: `device`, `kernel` or `arrival`; empty when there is no frame.
+    pub domain: &'static str,
+    /// Arrival minus capture time, nanoseconds: exposure, read-out and transport, and what the clock map missed.
+    pub lag_ns: Quantiles,
+    /// The same over time, nanoseconds.
+    pub lag_series: Vec<Option<Range>>,
+    /// Stated uncertainty of the capture times, nanoseconds.
+    pub uncertainty_ns: Quantiles,
+    /// Frames flagged `time_uncertain`.
+    pub uncertain_frames: u64,
+    /// Times at which the clock map was restarted, since the first set, nanoseconds: the first 32.
+    pub restarts_ns: Vec<i64>,
+    /// How often it was restarted.
+    pub restarts: u64,
+}
+
+/// How much of the depth pictures has depth.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Fill {
+    /// Time since the first set in nanoseconds, and share of the pixels that have a depth, 0 to 1.
+    pub samples: Vec<(i64, f64)>,
+    /// Least.
+    pub min: f64,
+    /// Mean.
+    pub mean: f64,
+    /// Greatest.
+    pub max: f64,
+}
+
+/// The host's wall clock against its monotonic one.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct HostClock {
+    /// Readings of both clocks.
+    pub pairs: u64,
+    /// The two were read within this at worst, nanoseconds.
+    pub width_ns: i64,
+    /// How much the difference changed from the first reading to the last, nanoseconds; steps included.
+    pub change_ns: i64,
+    /// The same without steps, parts per million of the time.
+    pub drift_ppm: f64,
+    /// The change over time, nanoseconds.
+    pub series: Vec<Option<Range>>,
+    /// Changes that no slewing explains: time since the first set and size, nanoseconds; the first 32.
+    pub steps: Vec<(i64, i64)>,
+}
+
+/// How many pictures were looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+pub struct Sampled {
+    /// Sets whose depth pictures were decoded.
+    pub sets: usize,
+    /// Pictures that were decoded, those shown included.
+    pub pictures: usize,
+}
+
+/// The pictures of a set, by stream.
+#[derive(Debug, Clone)]
+struct SetPictures {
+    /// `first`, `middle` or `last`.
+    title: &'static str,
+    number: usize,
+    /// Since the first set, nanoseconds.
+    at_ns: i64,
+    pictures: BTreeMap<usize, Shown>,
+}
+
+/// A small picture as the page carries it.
+#[derive(Debug, Clone)]
+struct Shown {
+    data_uri: String,
+    width: u32,
+    height: u32,
+    /// Range of the colours of depth, metres.
+    range_m: Option<(f32, f32)>,
+}
+
+impl Report {
+    /// Looks at `dataset`; `None` when `progress` asked to stop.
+    ///
+    /// # Errors
+    /// When the disk cannot be read. Damage is in the report, not an error.
+    pub fn of(dataset: &Dataset, options: &ReportOptions, progress: OnProgress<'_>) -> Result<Option<Self>> {
+        gather::gather(dataset, options, progress)
+    }
+
+    /// One page of HTML that needs no script, no network and no other file. It is well-formed XML as well.
+    pub fn to_html(&self) -> String {
+        html::page(self)
+    }
+
+    /// Writes the page to `path`, replacing in one step what is there.
+    ///
+    /// # Errors
+    /// What the file system says.
+    pub fn write(&self, fs: &dyn Fs, path: &Path) -> Result<()> {
+        fs::replace(fs, path, self.to_html().as_bytes()).map_err(|e| Error::io("write", path, e))
+    }
+}

@@ -1,0 +1,589 @@
+//! One pass over the numbers of a dataset, and a look at some of its pictures.
+
+use super::pixels::{Picture, Small, depth_range};
+use super::series::{Counts, Histogram, TimeBins, Values};
+use super::{
+    ClockReport, Fill, HostClock, LinearHistogram, OnProgress, PROBLEMS_MAX, Report, ReportOptions, Sampled,
+    SetPictures, SetsReport, Shown, StreamReport, verdict,
+};
+use crate::catalog::look_at;
+use crate::dataset::{Dataset, DatasetSet, PixelMode, SetRange, SetReader};
+use crate::msgs::schemas::Schema;
+use crate::msgs::{accounts, frame_set};
+use crate::{ErrorKind, Result, SetCounts, StreamAccount};
+use depthrig_bus::{FrameFlags, FrameHeader, UtcPair};
+use std::collections::BTreeMap;
+
+/// Bars of the histogram of spreads.
+const BARS: i64 = 48;
+/// Restarts and steps that are told with their time.
+const TOLD_MAX: usize = 32;
+/// The fastest that the kernel slews the wall clock (adjtimex(2): `tick` may be off by a tenth, NTP uses 500 ppm).
+const SLEW_PPM: i64 = 500;
+/// Below this a change of the wall clock is no step, whatever its rate, nanoseconds.
+const STEP_MIN_NS: i64 = 100_000;
+/// Readings of the clocks lie within this around the sets, nanoseconds.
+const AROUND_NS: i64 = 60_000_000_000;
+/// Streams whose pictures are shown: what a page can carry.
+const SHOWN_MAX: usize = 32;
+
+/// What is summed up of a stream while its frames pass.
+struct Stream {
+    codec: &'static str,
+    frames: u64,
+    missing: u64,
+    bytes: u64,
+    raw_bytes: u64,
+    live: Counts,
+    missing_at: Counts,
+    dropped_at: Counts,
+    lag: Histogram,
+    lag_at: Values,
+    uncertainty: Histogram,
+    uncertain: u64,
+    restarts_ns: Vec<i64>,
+    restarts: u64,
+    /// Time since the first set and header of the first and the last frame.
+    first: Option<(i64, FrameHeader)>,
+    last: Option<(i64, FrameHeader)>,
+    /// When it was missing first and last.
+    missing_ns: Option<(i64, i64)>,
+    /// Frames on the channel and the time between recorded frames that they lie in, without restarts of the count.
+    delivered: u64,
+    over_ns: i64,
+}
+
+impl Stream {
+    fn new(bins: TimeBins) -> Self {
+        Self {
+            codec: "",
+            frames: 0,
+            missing: 0,
+            bytes: 0,
+            raw_bytes: 0,
+            live: Counts::new(bins),
+            missing_at: Counts::new(bins),
+            dropped_at: Counts::new(bins),
+            lag: Histogram::default(),
+            lag_at: Values::new(bins),
+            uncertainty: Histogram::default(),
+            uncertain: 0,
+            restarts_ns: Vec::new(),
+            restarts: 0,
+            first: None,
+            last: None,
+            missing_ns: None,
+            delivered: 0,
+            over_ns: 0,
+        }
+    }
+
+    /// A frame captured `t_ns` after the first set.
+    fn frame(&mut self, bins: TimeBins, t_ns: i64, h: &FrameHeader) {
+        self.frames += 1;
+        self.raw_bytes += u64::from(h.payload_len);
+        let lag = h.arrival_time_ns.saturating_sub(h.capture_time_ns);
+        self.lag.add(lag);
+        self.lag_at.add(bins, t_ns, lag as f64);
+        self.uncertainty.add(i64::try_from(h.capture_uncertainty_ns).unwrap_or(i64::MAX));
+        self.uncertain += u64::from(h.has(FrameFlags::TIME_UNCERTAIN));
+        if let Some((before_ns, before)) = self.last {
+            // A daemon that was started again counts from the beginning.
+            if let (Some(n), true) = (h.sequence.checked_sub(before.sequence), t_ns > before_ns) {
+                self.live.spread(bins, before_ns, t_ns, n as f64);
+                (self.delivered, self.over_ns) = (self.delivered + n, self.over_ns + (t_ns - before_ns));
+            }
+            let lost = h.drops().total().saturating_sub(before.drops().total());
+            self.dropped_at.add(bins, t_ns, lost as f64);
+            if h.clock_epoch != before.clock_epoch {
+                self.restarts += 1;
+                if self.restarts_ns.len() < TOLD_MAX {
+                    self.restarts_ns.push(t_ns);
+                }
+            }
+        }
+        self.first.get_or_insert((t_ns, *h));
+        self.last = Some((t_ns, *h));
+    }
+
+    /// A stream that is there at an end of the dataset is measured up to its own frame there; one that is not,
+    /// has no frames until the end.
+    fn live_series(&self, bins: TimeBins) -> Vec<Option<f64>> {
+        let (Some((first, _)), Some((last, _))) = (self.first, self.last) else {
+            return self.live.per_second(bins, 0, bins.span_ns);
+        };
+        let near = bins.width_ns;
+        let from = if first < near { first } else { 0 };
+        let to = if last > bins.span_ns - near { last } else { bins.span_ns };
+        self.live.per_second(bins, from, to)
+    }
+
+    fn report(
+        self,
+        bins: TimeBins,
+        record: crate::StreamRecord,
+        account: Option<StreamAccount>,
+    ) -> StreamReport {
+        let whole = |c: &Counts| c.0.iter().map(|n| n.round() as u64).collect();
+        StreamReport {
+            record,
+            codec: self.codec,
+            frames: self.frames,
+            missing: self.missing,
+            bytes: self.bytes,
+            raw_bytes: self.raw_bytes,
+            live_hz: if self.over_ns > 0 { self.delivered as f64 * 1e9 / self.over_ns as f64 } else { 0.0 },
+            live_hz_series: self.live_series(bins),
+            missing_series: whole(&self.missing_at),
+            dropped_series: whole(&self.dropped_at),
+            account,
+            first_ns: self.first.map(|(t, _)| t),
+            last_ns: self.last.map(|(t, _)| t),
+            missing_ns: self.missing_ns,
+            clock: ClockReport {
+                domain: self.last.map_or("", |(_, h)| domain(h.clock_domain)),
+                lag_ns: self.lag.quantiles(),
+                lag_series: self.lag_at.ranges(),
+                uncertainty_ns: self.uncertainty.quantiles(),
+                uncertain_frames: self.uncertain,
+                restarts_ns: self.restarts_ns,
+                restarts: self.restarts,
+            },
+            fill: None,
+        }
+    }
+}
+
+const fn domain(code: u32) -> &'static str {
+    match code {
+        0 => "arrival",
+        1 => "device",
+        2 => "kernel",
+        _ => "unknown",
+    }
+}
+
+/// Everything that is summed up while the sets pass.
+struct Pass {
+    bins: TimeBins,
+    /// Log time of the first set.
+    t0_ns: i64,
+    streams: Vec<Stream>,
+    sets: u64,
+    incomplete: u64,
+    at: Counts,
+    spread: Histogram,
+    interval: Histogram,
+    last_tick: Option<i64>,
+    beyond_limit: u64,
+    limit_ns: Option<i64>,
+    problems: Vec<String>,
+    problem_count: u64,
+}
+
+impl Pass {
+    fn problem(&mut self, what: String) {
+        self.problem_count += 1;
+        if self.problems.len() < PROBLEMS_MAX && !self.problems.contains(&what) {
+            self.problems.push(what);
+        }
+    }
+
+    fn set(&mut self, set: DatasetSet) {
+        let (bins, t_ns) = (self.bins, set.utc_ns - self.t0_ns);
+        self.sets += 1;
+        self.incomplete += u64::from(!set.missing.is_empty());
+        if set.frames.len() > 1 {
+            self.spread.add(set.spread_ns);
+            self.beyond_limit += u64::from(self.limit_ns.is_some_and(|limit| set.spread_ns > limit));
+        }
+        if let Some(before) = self.last_tick.replace(set.tick.ns()) {
+            let interval = set.tick.ns() - before;
+            self.interval.add(interval);
+            self.at.spread(bins, t_ns - interval, t_ns, 1.0);
+        }
+        for s in set.missing {
+            let s = &mut self.streams[s];
+            s.missing += 1;
+            s.missing_at.add(bins, t_ns, 1.0);
+            s.missing_ns = Some((s.missing_ns.map_or(t_ns, |(first, _)| first), t_ns));
+        }
+        for f in set.frames {
+            let s = &mut self.streams[f.stream];
+            s.codec = f.codec;
+            s.bytes += f.stored_bytes;
+            let at = f.header.capture_time_ns.saturating_add(set.utc_offset_ns).saturating_sub(self.t0_ns);
+            s.frame(bins, at, &f.header);
+        }
+    }
+}
+
+pub(super) fn gather(
+    dataset: &Dataset,
+    options: &ReportOptions,
+    progress: OnProgress<'_>,
+) -> Result<Option<Report>> {
+    let mut reader = dataset.set_reader()?;
+    let (t0_ns, end_ns) =
+        (reader.times().first().copied().unwrap_or(0), reader.times().last().copied().unwrap_or(0));
+    let span_ns = end_ns.saturating_sub(t0_ns);
+    let intervals = i64::try_from(reader.times().len()).unwrap_or(i64::MAX) - 1;
+    let bins = TimeBins::new(span_ns, span_ns / intervals.max(1));
+    let session = dataset.session();
+    let slowest = session.streams.iter().map(|s| s.rate_hz).filter(|r| *r > 0.0).reduce(f64::min);
+    let mut pass = Pass {
+        bins,
+        t0_ns,
+        streams: session.streams.iter().map(|_| Stream::new(bins)).collect(),
+        sets: 0,
+        incomplete: 0,
+        at: Counts::new(bins),
+        spread: Histogram::default(),
+        interval: Histogram::default(),
+        last_tick: None,
+        beyond_limit: 0,
+        limit_ns: options.max_spread_ns.or(slowest.map(|hz| (0.5e9 / hz) as i64)),
+        problems: Vec::new(),
+        problem_count: 0,
+    };
+    for set in dataset.sets_with(SetRange::ALL, PixelMode::None) {
+        match set {
+            Ok(set) => {
+                // The numbers are half of the work, the pictures the other half.
+                let done = set.utc_ns.saturating_sub(t0_ns).saturating_mul(500) / bins.span_ns.max(1);
+                pass.set(set);
+                if progress(done.clamp(0, 500) as u64).is_break() {
+                    return Ok(None);
+                }
+            }
+            Err(e) if e.kind() == ErrorKind::Io => return Err(e),
+            Err(e) => pass.problem(e.to_string()),
+        }
+    }
+    let told = read_told(dataset, &mut pass)?;
+    let mut looked = Looked::new(&reader, session.streams.len(), options);
+    if looked.look(&mut reader, &mut pass, progress)?.is_break() {
+        return Ok(None);
+    }
+    Ok(Some(put_together(dataset, pass, told, looked)))
+}
+
+fn put_together(dataset: &Dataset, pass: Pass, told: Told, looked: Looked) -> Report {
+    let (session, bins) = (dataset.session(), pass.bins);
+    let mut accounts: BTreeMap<String, StreamAccount> =
+        told.accounts.into_iter().map(|a| (a.stream.to_string(), a)).collect();
+    let records = session.streams.iter().cloned();
+    let mut streams: Vec<_> = (pass.streams.into_iter().zip(records))
+        .map(|(s, record)| {
+            let account = accounts.remove(&record.id.to_string());
+            s.report(bins, record, account)
+        })
+        .collect();
+    for (s, samples) in streams.iter_mut().zip(looked.fill) {
+        s.fill = fill_of(samples);
+    }
+    let sets = SetsReport {
+        count: pass.sets,
+        incomplete: pass.incomplete,
+        duration_ns: bins.span_ns,
+        interval_ns: pass.interval.quantiles(),
+        counts: told.counts,
+        per_second: pass.at.per_second(bins, 0, bins.span_ns),
+        spread_ns: pass.spread.quantiles(),
+        spread_histogram: linear(&pass.spread, pass.limit_ns),
+        spread_limit_ns: pass.limit_ns,
+        beyond_limit: pass.beyond_limit,
+    };
+    let mut report = Report {
+        path: dataset.path().to_owned(),
+        name: session.name.clone(),
+        rig: session.rig.clone(),
+        scene: session.scene.clone(),
+        operator: session.operator.clone(),
+        host: session.host.clone(),
+        depthrig_version: session.depthrig_version.clone(),
+        started_utc_ns: session.started_utc_ns,
+        notes: session.notes.clone(),
+        history: session.history.clone(),
+        verdict: verdict::unknown(),
+        sets,
+        bins,
+        streams,
+        host_clock: told.clock.report(),
+        bytes: told.bytes,
+        segments: dataset.segments().len(),
+        unfinished: told.unfinished,
+        problems: pass.problems,
+        problem_count: pass.problem_count,
+        sampled: looked.sampled,
+        pictures: looked.pictures,
+    };
+    let catalog = dataset.is_folder().then(|| look_at(dataset.fs(), dataset.path()));
+    report.verdict = verdict::of(&report, catalog.as_ref());
+    report
+}
+
+fn fill_of(samples: Vec<(i64, f64)>) -> Option<Fill> {
+    let values = samples.iter().map(|(_, share)| *share);
+    let (min, max) = (values.clone().reduce(f64::min)?, values.clone().reduce(f64::max)?);
+    let mean = values.sum::<f64>() / samples.len() as f64;
+    Some(Fill { samples, min, mean, max })
+}
+
+/// Bars that show nearly all spreads and the limit.
+fn linear(spread: &Histogram, limit_ns: Option<i64>) -> LinearHistogram {
+    if spread.total() == 0 {
+        return LinearHistogram::default();
+    }
+    let most = spread.quantile(999, 1000).max(limit_ns.unwrap_or(0)).max(1000);
+    let width_ns = super::svg::nice_step(most as f64 * 1.05 / BARS as f64) as i64;
+    let (counts, beyond) = spread.linear(width_ns.max(1), (most / width_ns.max(1) + 1) as usize);
+    LinearHistogram { width_ns, counts, beyond }
+}
+
+/// What the messages between the sets tell.
+#[derive(Default)]
+struct Told {
+    bytes: u64,
+    /// Segments that were not finished.
+    unfinished: Vec<String>,
+    counts: Option<SetCounts>,
+    accounts: Vec<StreamAccount>,
+    clock: Clock,
+}
+
+/// The two clocks of the host over time.
+#[derive(Default)]
+struct Clock {
+    first: Option<UtcPair>,
+    last: Option<UtcPair>,
+    pairs: u64,
+    width_ns: i64,
+    stepped_ns: i64,
+    steps: Vec<(i64, i64)>,
+    series: Option<Values>,
+}
+
+impl Clock {
+    fn pair(&mut self, bins: TimeBins, t0_ns: i64, pair: UtcPair) {
+        let offset = |p: &UtcPair| p.utc_ns.saturating_sub(p.mono.ns());
+        let first = *self.first.get_or_insert(pair);
+        // Log times follow the first pair: a step of the wall clock does not move a reading on the axis.
+        let t_ns = first.utc_ns.saturating_add(pair.mono.since_ns(first.mono)).saturating_sub(t0_ns);
+        // A dataset that was made from another has readings of the computer that made it, of another time.
+        if !(-AROUND_NS..=bins.span_ns.saturating_add(AROUND_NS)).contains(&t_ns) {
+            return;
+        }
+        self.pairs += 1;
+        self.width_ns = self.width_ns.max(pair.width_ns);
+        if let Some(before) = self.last.replace(pair) {
+            let change = offset(&pair).saturating_sub(offset(&before));
+            let slewed = pair.mono.since_ns(before.mono).max(0) / 1_000_000 * SLEW_PPM;
+            if change.abs() > STEP_MIN_NS.max(slewed) + pair.width_ns + before.width_ns {
+                self.stepped_ns += change;
+                if self.steps.len() < TOLD_MAX {
+                    self.steps.push((t_ns, change));
+                }
+            }
+        }
+        let change = offset(&pair).saturating_sub(offset(&first));
+        self.series.get_or_insert_with(|| Values::new(bins)).add(bins, t_ns, change as f64);
+    }
+
+    fn report(self) -> HostClock {
+        let (Some(first), Some(last)) = (self.first, self.last) else { return HostClock::default() };
+        let over_ns = last.mono.since_ns(first.mono);
+        let change_ns = (last.utc_ns - last.mono.ns()).saturating_sub(first.utc_ns - first.mono.ns());
+        let drift = (change_ns - self.stepped_ns) as f64;
+        HostClock {
+            pairs: self.pairs,
+            width_ns: self.width_ns,
+            change_ns,
+            drift_ppm: if over_ns > 0 { drift / over_ns as f64 * 1e6 } else { 0.0 },
+            series: self.series.map(|v| v.ranges()).unwrap_or_default(),
+            steps: self.steps,
+        }
+    }
+}
+
+/// Reads accounts and clock pairs of all segments.
+fn read_told(dataset: &Dataset, pass: &mut Pass) -> Result<Told> {
+    let mut told = Told::default();
+    for i in 0..dataset.segments().len() {
+        // What cannot be opened is among the problems already.
+        let Some(Ok(reader)) = dataset.open_segment(i) else { continue };
+        told.bytes += reader.size;
+        if !reader.finished {
+            let name = reader.path.file_name().map(|n| n.to_string_lossy().into_owned());
+            told.unfinished.extend(name);
+        }
+        let channel = |schema: Schema| {
+            reader.channels.iter().find(|(_, c)| c.schema == schema.name()).map(|(id, _)| *id)
+        };
+        let (clock, account) = (channel(Schema::ClockPair), channel(Schema::Accounts));
+        let is = |id: u16, which: Option<u16>| which == Some(id);
+        for entry in &reader.chunks {
+            if !entry.channels.iter().any(|id| is(*id, clock) || is(*id, account)) {
+                continue;
+            }
+            let read = reader.messages(entry, |m| {
+                if is(m.channel, clock) {
+                    let pair = frame_set::read_clock_pair(m.data)?;
+                    told.clock.pair(pass.bins, pass.t0_ns, pair);
+                } else if is(m.channel, account) {
+                    let (sets, streams) = accounts::read(m.data)?;
+                    (told.counts, told.accounts) = (Some(sets), streams);
+                }
+                Ok(())
+            });
+            match read {
+                Err(e) if e.kind() == ErrorKind::Io => return Err(e),
+                Err(e) => pass.problem(e.to_string()),
+                Ok(()) => {}
+            }
+        }
+    }
+    Ok(told)
+}
+
+/// Pictures that were looked at.
+struct Looked {
+    /// Numbers of the sets whose depth is looked at, increasing.
+    fill_sets: Vec<usize>,
+    /// Numbers of the sets that are shown, increasing, with their titles.
+    shown: Vec<(usize, &'static str)>,
+    fill: Vec<Vec<(i64, f64)>>,
+    sampled: Sampled,
+    pictures: Vec<SetPictures>,
+}
+
+impl Looked {
+    fn new(reader: &SetReader, streams: usize, options: &ReportOptions) -> Self {
+        let sets = reader.times().len();
+        let wanted = options.fill_sets.min(sets);
+        let evenly = |k: usize| if wanted > 1 { k * (sets - 1) / (wanted - 1) } else { 0 };
+        let last = sets.saturating_sub(1);
+        let mut shown = vec![(0, "first"), (last / 2, "middle"), (last, "last")];
+        shown.dedup_by_key(|(number, _)| *number);
+        shown.retain(|_| sets > 0);
+        Self {
+            fill_sets: (0..wanted).map(evenly).collect(),
+            shown,
+            fill: vec![Vec::new(); streams],
+            sampled: Sampled::default(),
+            pictures: Vec::new(),
+        }
+    }
+
+    fn look(
+        &mut self,
+        reader: &mut SetReader,
+        pass: &mut Pass,
+        progress: OnProgress<'_>,
+    ) -> Result<core::ops::ControlFlow<()>> {
+        let mut numbers: Vec<_> =
+            self.fill_sets.iter().copied().chain(self.shown.iter().map(|s| s.0)).collect();
+        numbers.sort_unstable();
+        numbers.dedup();
+        let mut small: Vec<BTreeMap<usize, Small>> = Vec::new();
+        for (done, number) in numbers.iter().enumerate() {
+            let fraction = 500 + 500 * done / numbers.len();
+            if progress(fraction as u64).is_break() {
+                return Ok(core::ops::ControlFlow::Break(()));
+            }
+            match reader.read(*number, PixelMode::Stored) {
+                Ok(set) => self.set(*number, &set, pass, &mut small),
+                Err(e) if e.kind() == ErrorKind::Io => return Err(e),
+                Err(e) => pass.problem(e.to_string()),
+            }
+        }
+        self.show(&small, pass);
+        Ok(core::ops::ControlFlow::Continue(()))
+    }
+
+    fn set(
+        &mut self,
+        number: usize,
+        set: &DatasetSet,
+        pass: &mut Pass,
+        small: &mut Vec<BTreeMap<usize, Small>>,
+    ) {
+        let title = self.shown.iter().find(|(n, _)| *n == number).map(|(_, title)| *title);
+        let measured = self.fill_sets.binary_search(&number).is_ok();
+        let at_ns = set.utc_ns - pass.t0_ns;
+        let mut shown = BTreeMap::new();
+        for f in &set.frames {
+            let is_depth = f.header.pixel_format().is_some_and(depthrig_bus::PixelFormat::is_depth);
+            let show = title.is_some() && f.stream < SHOWN_MAX;
+            if !(show || measured && is_depth) {
+                continue;
+            }
+            match Picture::of(f) {
+                Ok(picture) => {
+                    self.sampled.pictures += 1;
+                    if let (true, Some(fill)) = (measured, picture.fill()) {
+                        self.fill[f.stream].push((at_ns, fill));
+                    }
+                    if show {
+                        shown.insert(f.stream, picture.small());
+                    }
+                }
+                Err(e) => pass.problem(e.to_string()),
+            }
+        }
+        self.sampled.sets += usize::from(measured);
+        if let Some(title) = title {
+            self.pictures.push(SetPictures { title, number, at_ns, pictures: BTreeMap::new() });
+            small.push(shown);
+        }
+    }
+
+    /// Makes the small copies what the page carries; a stream's depth has the same colours in each set.
+    fn show(&mut self, small: &[BTreeMap<usize, Small>], pass: &mut Pass) {
+        for stream in 0..self.fill.len() {
+            let range_m = depth_range(small.iter().filter_map(|set| set.get(&stream)));
+            for (set, page) in small.iter().zip(&mut self.pictures) {
+                let Some(picture) = set.get(&stream) else { continue };
+                let (width, height) = picture.size();
+                match picture.data_uri(range_m) {
+                    Ok(data_uri) => {
+                        page.pictures.insert(stream, Shown { data_uri, width, height, range_m });
+                    }
+                    Err(e) => pass.problem(e.to_string()),
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use depthrig_bus::HostTime;
+
+    /// An hour of readings at 20 ppm, slewed faster for a while as NTP does, with one step of a second back.
+    #[test]
+    fn steps_are_told_from_drift() {
+        let bins = TimeBins::new(3600 * 1_000_000_000, 1_000_000_000);
+        let mut clock = Clock::default();
+        let mut offset = 1_700_000_000_000_000_000;
+        for s in 0..=3600i64 {
+            offset += if (1000..1100).contains(&s) { 400_000 } else { 20_000 };
+            if s == 2000 {
+                offset -= 1_000_000_000;
+            }
+            let mono = HostTime::from_ns(s * 1_000_000_000);
+            clock.pair(
+                bins,
+                1_700_000_000_000_020_000,
+                UtcPair { mono, utc_ns: mono.ns() + offset, width_ns: 200 },
+            );
+        }
+        let r = clock.report();
+        assert_eq!(r.steps.len(), 1, "{:?}", r.steps);
+        let (at, by) = r.steps[0];
+        assert_eq!((at / 1_000_000_000, by), (2000, -999_980_000));
+        assert!((r.drift_ppm - (3500.0 * 20.0 + 100.0 * 400.0) / 3600.0).abs() < 0.1, "{}", r.drift_ppm);
+        assert_eq!(r.pairs, 3601);
+    }
+}

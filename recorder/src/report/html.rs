@@ -1,0 +1,663 @@
+//! The report as one page. Every text that somebody could have chosen goes through [`escape`].
+
+use super::pixels::viridis;
+use super::svg::{self, Strip, Time, Trace, nice_end, number};
+use super::{Quantiles, Range, Report, Shown, StreamReport};
+use crate::catalog::Health;
+use depthrig_bus::Distortion;
+use std::fmt::Write;
+use time::OffsetDateTime;
+
+const CSS: &str = include_str!("page.css");
+
+/// Notes and edits that are shown.
+const LISTED_MAX: usize = 50;
+
+/// Text as it stands in HTML and XML, in attributes too; control characters, which XML cannot hold, are replaced.
+pub(super) fn escape(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            '\'' => out.push_str("&#39;"),
+            '\n' | '\t' => out.push(c),
+            c if c.is_control() || matches!(c, '\u{fffe}' | '\u{ffff}') => out.push('\u{fffd}'),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+/// `2026-08-21 14:05:09 UTC`.
+fn utc(ns: i64) -> String {
+    let t = OffsetDateTime::from_unix_timestamp_nanos(i128::from(ns)).unwrap_or(OffsetDateTime::UNIX_EPOCH);
+    let (h, m, s) = t.to_hms();
+    format!("{:04}-{:02}-{:02} {h:02}:{m:02}:{s:02} UTC", t.year(), u8::from(t.month()), t.day())
+}
+
+fn length(ns: i64) -> String {
+    let s = ns as f64 / 1e9;
+    let whole = s.max(0.0) as u64;
+    match whole {
+        0..60 => format!("{s:.1} s"),
+        60..3600 => format!("{} min {:02} s", whole / 60, whole % 60),
+        _ => format!("{} h {:02} min", whole / 3600, whole / 60 % 60),
+    }
+}
+
+fn size(bytes: u64) -> String {
+    match bytes as f64 {
+        b if b < 1e6 => format!("{:.1} kB", b / 1e3),
+        b if b < 1e9 => format!("{:.1} MB", b / 1e6),
+        b => format!("{:.2} GB", b / 1e9),
+    }
+}
+
+fn ms(ns: i64) -> String {
+    format!("{:.1} ms", ns as f64 / 1e6)
+}
+
+fn or_none(text: &str) -> &str {
+    if text.is_empty() { "–" } else { text }
+}
+
+pub(super) fn page(r: &Report) -> String {
+    let mut out = String::with_capacity(1 << 19);
+    let _ = write!(
+        out,
+        "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"/>\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\
+         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; img-src data:; style-src \
+         'unsafe-inline'\"/><title>{} – depthrig report</title><style>{CSS}</style></head><body>",
+        escape(&r.name)
+    );
+    head(&mut out, r);
+    streams(&mut out, r);
+    rates(&mut out, r);
+    losses(&mut out, r);
+    spreads(&mut out, r);
+    clocks(&mut out, r);
+    fill(&mut out, r);
+    pictures(&mut out, r);
+    calibration(&mut out, r);
+    footer(&mut out, r);
+    out.push_str("</body></html>\n");
+    out
+}
+
+fn list(out: &mut String, lines: &[String]) {
+    if lines.is_empty() {
+        return;
+    }
+    out.push_str("<ul>");
+    for line in lines {
+        let _ = write!(out, "<li>{}</li>", escape(line));
+    }
+    out.push_str("</ul>");
+}
+
+fn head(out: &mut String, r: &Report) {
+    let v = &r.verdict;
+    let (tone, sign) = match v.health {
+        Health::Whole if v.remarks.is_empty() => ("whole", "✓"),
+        Health::Whole => ("remarks", "✓"),
+        Health::Recording => ("remarks", "●"),
+        Health::Lost => ("lost", "▲"),
+        Health::Unfinished | Health::Damaged => ("bad", "✕"),
+    };
+    let scene = if r.scene.is_empty() { r.name.as_str() } else { r.scene.as_str() };
+    let _ = write!(
+        out,
+        "<header><h1>{}</h1><div class=\"sub\">{} · {}</div></header><div class=\"verdict {tone}\"><strong>{sign} {}\
+         </strong>",
+        escape(scene),
+        escape(&r.name),
+        utc(r.started_utc_ns),
+        escape(&v.headline)
+    );
+    list(out, &v.why);
+    if !v.remarks.is_empty() {
+        out.push_str("<p class=\"sub\">Remarks</p>");
+        list(out, &v.remarks);
+    }
+    out.push_str("</div><dl>");
+    let rate = r.bytes as f64 / (r.sets.duration_ns.max(1) as f64 * 1e-9) / 1e6;
+    let lost =
+        r.sets.counts.map_or_else(|| "–".to_owned(), |c| format!("{} of {}", c.dropped_total(), c.offered));
+    let per_s = if r.sets.interval_ns.p50 > 0 { 1e9 / r.sets.interval_ns.p50 as f64 } else { 0.0 };
+    for (name, value) in [
+        ("Length", length(r.sets.duration_ns)),
+        ("Sets", format!("{} at {} Hz", r.sets.count, number(per_s))),
+        ("Sets lost", lost),
+        ("Incomplete sets", r.sets.incomplete.to_string()),
+        ("Size", format!("{} in {} segments", size(r.bytes), r.segments)),
+        ("Data rate", if r.sets.duration_ns > 0 { format!("{rate:.1} MB/s") } else { "–".to_owned() }),
+        ("Rig, host", format!("{}, {}", r.rig, or_none(&r.host))),
+        ("Operator", or_none(&r.operator).to_owned()),
+    ] {
+        let _ = write!(out, "<div><dt>{name}</dt><dd>{}</dd></div>", escape(&value));
+    }
+    out.push_str("</dl>");
+    let notes = r.notes.iter().map(|n| format!("{}: {}", utc(n.utc_ns), n.text));
+    named_list(out, "Notes", notes.collect());
+    let edits = r.history.iter().map(|e| match e.field.as_str() {
+        "notes" => format!("{}: note added: {}", utc(e.utc_ns), e.after),
+        field => format!("{}: {field} “{}” became “{}”", utc(e.utc_ns), e.before, e.after),
+    });
+    named_list(out, "Changed after the recording", edits.collect());
+}
+
+fn named_list(out: &mut String, name: &str, mut lines: Vec<String>) {
+    if lines.is_empty() {
+        return;
+    }
+    if lines.len() > LISTED_MAX {
+        let more = lines.len() - LISTED_MAX;
+        lines.truncate(LISTED_MAX);
+        lines.push(format!("… and {more} more in session.toml"));
+    }
+    let _ = write!(out, "<p class=\"sub\">{name}</p>");
+    list(out, &lines);
+}
+
+/// Begins a table; columns whose name begins with `#` are numbers.
+fn table(out: &mut String, columns: &[&str]) {
+    out.push_str("<div class=\"wide\"><table><thead><tr>");
+    for name in columns {
+        let _ = match name.strip_prefix('#') {
+            Some(name) => write!(out, "<th class=\"n\">{name}</th>"),
+            None => write!(out, "<th>{name}</th>"),
+        };
+    }
+    out.push_str("</tr></thead><tbody>");
+}
+
+/// A row; cells are escaped here.
+fn row(out: &mut String, columns: &[&str], cells: &[String]) {
+    out.push_str("<tr>");
+    for (name, cell) in columns.iter().zip(cells) {
+        let class = if name.starts_with('#') { " class=\"n\"" } else { "" };
+        let _ = write!(out, "<td{class}>{}</td>", escape(cell));
+    }
+    out.push_str("</tr>");
+}
+
+const END_TABLE: &str = "</tbody></table></div>";
+
+fn streams(out: &mut String, r: &Report) {
+    const COLUMNS: [&str; 9] = [
+        "stream",
+        "camera",
+        "pictures",
+        "stored as",
+        "#frames",
+        "#missing",
+        "#live Hz (nominal)",
+        "#size",
+        "#of raw",
+    ];
+    out.push_str("<section><h2>Streams</h2>");
+    table(out, &COLUMNS);
+    for s in &r.streams {
+        let share = 100.0 * s.bytes as f64 / s.raw_bytes.max(1) as f64;
+        let serial =
+            if s.record.serial.is_empty() { String::new() } else { format!(" #{}", s.record.serial) };
+        let cells = [
+            s.record.id.to_string(),
+            format!("{}{serial}", or_none(&s.record.model)),
+            format!("{}×{} {}", s.record.width, s.record.height, s.record.format.name()),
+            or_none(s.codec).to_owned(),
+            s.frames.to_string(),
+            s.missing.to_string(),
+            format!("{:.2} ({})", s.live_hz, number(s.record.rate_hz)),
+            size(s.bytes),
+            format!("{share:.0} %"),
+        ];
+        row(out, &COLUMNS, &cells);
+    }
+    out.push_str(END_TABLE);
+    out.push_str(
+        "<p class=\"cap\">Size is that of the stored pictures before lossless packing; live Hz is the rate on the \
+         camera’s channel, of which sets take a part.</p></section>",
+    );
+}
+
+fn time(r: &Report) -> Time {
+    Time { span_ns: r.bins.span_ns, bin_ns: r.bins.width_ns }
+}
+
+fn marked(counts: &[u64]) -> Vec<usize> {
+    counts.iter().enumerate().filter(|(_, n)| **n > 0).map(|(i, _)| i).collect()
+}
+
+fn plain(series: &[Option<f64>]) -> Trace {
+    Trace::Steps(series.iter().map(|v| v.map(|v| (v, v, v))).collect())
+}
+
+fn highest(series: &[Option<f64>]) -> f64 {
+    series.iter().flatten().copied().fold(0.0, f64::max)
+}
+
+fn least(series: &[Option<f64>]) -> Option<f64> {
+    series.iter().flatten().copied().reduce(f64::min)
+}
+
+fn too_short(out: &mut String, r: &Report) -> bool {
+    if r.bins.span_ns == 0 {
+        out.push_str("<p class=\"none\">Fewer than two sets: nothing over time.</p></section>");
+    }
+    r.bins.span_ns == 0
+}
+
+fn rates(out: &mut String, r: &Report) {
+    out.push_str("<section><h2>Rate over time</h2>");
+    if too_short(out, r) {
+        return;
+    }
+    let strip = |label: String, series: &[Option<f64>], nominal: f64, note: String, marks| Strip {
+        label,
+        note,
+        trace: plain(series),
+        y: (0.0, nice_end(highest(series).max(nominal) * 1.1)),
+        nominal: (nominal > 0.0).then_some(nominal),
+        marks,
+    };
+    let per_s = if r.sets.interval_ns.p50 > 0 { 1e9 / r.sets.interval_ns.p50 as f64 } else { 0.0 };
+    let worst = ms(r.sets.interval_ns.max);
+    let mut strips = vec![strip(
+        "sets".to_owned(),
+        &r.sets.per_second,
+        per_s,
+        format!("longest pause {worst}"),
+        [Vec::new(), Vec::new()],
+    )];
+    for s in &r.streams {
+        let note = match least(&s.live_hz_series) {
+            Some(least) if s.frames > 1 => format!("{:.2} Hz, least {}", s.live_hz, number(least)),
+            _ => format!("{} frames", s.frames),
+        };
+        let marks = [marked(&s.missing_series), marked(&s.dropped_series)];
+        strips.push(strip(s.record.id.to_string(), &s.live_hz_series, s.record.rate_hz, note, marks));
+    }
+    let _ = write!(
+        out,
+        "<p class=\"cap\">Frames per second on each camera’s channel, in steps of {} s; dashed is the nominal rate, for \
+         sets the usual one.<span class=\"key\"><svg viewBox=\"0 0 10 8\"><path class=\"missing\" d=\"M5 1l-4 6h8z\"/>\
+         </svg>sets without a frame of the stream<svg viewBox=\"0 0 10 8\"><path class=\"dropped\" d=\"M5 7l-4 -6h8z\"/>\
+         </svg>frames lost before the channel</span></p>",
+        number(r.bins.width_ns as f64 / 1e9)
+    );
+    out.push_str(&svg::strips("Frames per second over time, per stream", "Hz", time(r), &strips));
+    out.push_str("</section>");
+}
+
+/// Whether a sum is what it should be, as text and in colour.
+fn check(out: &mut String, balances: bool) {
+    out.push_str(if balances {
+        "<td class=\"ok\">✓ exact</td>"
+    } else {
+        "<td class=\"no\">✕ NOT exact</td>"
+    });
+}
+
+fn losses(out: &mut String, r: &Report) {
+    out.push_str("<section><h2>Losses by reason</h2>");
+    let mut bars = Vec::new();
+    out.push_str(
+        "<div class=\"wide\"><table><thead><tr><th></th><th>account</th><th>checked</th></tr></thead><tbody>",
+    );
+    if let Some(c) = r.sets.counts {
+        let mut text = format!("{} offered = {} recorded", c.offered, c.recorded);
+        for (reason, n) in c.dropped_by_reason() {
+            let _ = write!(text, " + {n} {}", reason.name());
+            bars.push((format!("sets · {}", reason.name()), n));
+        }
+        let _ = write!(out, "<tr><td>sets</td><td>{text}</td>");
+        check(out, c.balances());
+        out.push_str("</tr>");
+    }
+    for s in &r.streams {
+        let _ = write!(out, "<tr><td>{}</td>", escape(&s.record.id.to_string()));
+        let Some(a) = &s.account else {
+            out.push_str("<td colspan=\"2\">no account in the file</td></tr>");
+            continue;
+        };
+        let mut text = format!("{} captured = {} delivered", a.captured, a.delivered);
+        for (reason, n) in a.dropped.nonzero() {
+            let _ = write!(text, " + {n} {}", reason.name());
+            bars.push((format!("{} · {}", a.stream, reason.name()), n));
+        }
+        let _ = write!(out, "<td>{text}</td>");
+        check(out, a.balances());
+        out.push_str("</tr>");
+    }
+    out.push_str(END_TABLE);
+    if bars.is_empty() {
+        out.push_str("<p class=\"cap\">Nothing was lost for any reason.</p>");
+    } else {
+        out.push_str("<p class=\"cap\">Sets, and frames before their channel, that were lost:</p>");
+        out.push_str(&svg::bars("Losses by stream and reason", &bars));
+    }
+    out.push_str("</section>");
+}
+
+fn spreads(out: &mut String, r: &Report) {
+    let s = &r.sets;
+    out.push_str("<section><h2>Spread of the sets</h2>");
+    if s.spread_histogram.counts.is_empty() {
+        out.push_str("<p class=\"none\">No set has two frames.</p></section>");
+        return;
+    }
+    let at = |ns: i64| ns as f64 / 1e6;
+    let mut marks = vec![
+        (at(s.spread_ns.p50), format!("p50 {}", ms(s.spread_ns.p50))),
+        (at(s.spread_ns.p95), format!("p95 {}", ms(s.spread_ns.p95))),
+    ];
+    if let Some(limit) = s.spread_limit_ns {
+        marks.push((at(limit), format!("limit {}", ms(limit))));
+    }
+    let _ = write!(
+        out,
+        "<p class=\"cap\">Latest minus earliest capture time of the frames of a set. p99 {}, greatest {}; {} of {} sets \
+         are beyond the limit, {} beyond the plot.</p>",
+        ms(s.spread_ns.p99),
+        ms(s.spread_ns.max),
+        s.beyond_limit,
+        s.count,
+        s.spread_histogram.beyond
+    );
+    out.push_str(&svg::histogram(
+        "Histogram of set spreads",
+        "spread, ms",
+        at(s.spread_histogram.width_ns),
+        &s.spread_histogram.counts,
+        &marks,
+    ));
+    out.push_str("</section>");
+}
+
+fn in_ms(series: &[Option<Range>]) -> Trace {
+    Trace::Steps(series.iter().map(|v| v.map(|v| (v.min / 1e6, v.mean / 1e6, v.max / 1e6))).collect())
+}
+
+fn clocks(out: &mut String, r: &Report) {
+    const COLUMNS: [&str; 7] = [
+        "stream",
+        "capture time from",
+        "#lag p50",
+        "#lag p99",
+        "#lag max",
+        "#stated ± p50 (max)",
+        "#map restarts",
+    ];
+    out.push_str("<section><h2>Clocks</h2>");
+    table(out, &COLUMNS);
+    for s in r.streams.iter().filter(|s| s.frames > 0) {
+        let c = &s.clock;
+        let us = |ns: i64| number(ns as f64 / 1e3);
+        let cells = [
+            s.record.id.to_string(),
+            format!("{} clock", c.domain),
+            ms(c.lag_ns.p50),
+            ms(c.lag_ns.p99),
+            ms(c.lag_ns.max),
+            format!("{} ({}) µs", us(c.uncertainty_ns.p50), us(c.uncertainty_ns.max)),
+            c.restarts.to_string(),
+        ];
+        row(out, &COLUMNS, &cells);
+    }
+    out.push_str(END_TABLE);
+    out.push_str(
+        "<p class=\"cap\">Lag is arrival minus mapped capture time (middle of the exposure): half the exposure, read-out \
+         and transport. A map that is right makes it flat; drift in it is an error of the map, peaks are the transport.</p>",
+    );
+    if r.bins.span_ns > 0 {
+        let strips: Vec<_> = r.streams.iter().filter(|s| s.frames > 0).map(lag_strip).collect();
+        out.push_str(&svg::strips("Arrival minus capture time, per stream", "ms", time(r), &strips));
+        host_clock(out, r);
+    }
+    out.push_str("</section>");
+}
+
+fn lag_strip(s: &StreamReport) -> Strip {
+    let q: &Quantiles = &s.clock.lag_ns;
+    let top = s.clock.lag_series.iter().flatten().map(|v| v.max / 1e6).fold(0.0, f64::max);
+    let restarts =
+        if s.clock.restarts > 0 { format!(", {} restarts", s.clock.restarts) } else { String::new() };
+    Strip {
+        label: s.record.id.to_string(),
+        note: format!("p50 {}, max {}{restarts}", ms(q.p50), ms(q.max)),
+        trace: in_ms(&s.clock.lag_series),
+        y: (0.0, nice_end(top * 1.05)),
+        nominal: None,
+        marks: [Vec::new(), Vec::new()],
+    }
+}
+
+fn host_clock(out: &mut String, r: &Report) {
+    let c = &r.host_clock;
+    if c.pairs < 2 {
+        return;
+    }
+    let values = c.series.iter().flatten();
+    let (low, high) = values.fold((0.0f64, 0.0f64), |(a, b), v| (a.min(v.min / 1e6), b.max(v.max / 1e6)));
+    let span = nice_end((high - low).max(0.01));
+    let middle = f64::midpoint(low, high);
+    let at = |i: usize| i as i64 * r.bins.width_ns + r.bins.width_ns / 2;
+    let readings: Vec<_> = c
+        .series
+        .iter()
+        .enumerate()
+        .filter_map(|(i, v)| Some((at(i).min(r.bins.span_ns), (*v)?.mean / 1e6)))
+        .collect();
+    let strip = Strip {
+        label: "UTC − monotonic".to_owned(),
+        note: format!(
+            "{:+.3} ms, {:+.2} ppm, {} steps",
+            c.change_ns as f64 / 1e6,
+            c.drift_ppm,
+            c.steps.len()
+        ),
+        trace: Trace::Points(readings),
+        y: (middle - span * 0.6, middle + span * 0.6),
+        nominal: Some(0.0),
+        marks: [Vec::new(), Vec::new()],
+    };
+    let _ = write!(
+        out,
+        "<p class=\"cap\">The host’s wall clock against its monotonic one, change since the first of {} readings (each \
+         read within {} µs). Recorded times follow the monotonic clock and the first reading.</p>",
+        c.pairs,
+        number(c.width_ns as f64 / 1e3)
+    );
+    out.push_str(&svg::strips("Wall clock against monotonic clock", "ms", time(r), &[strip]));
+}
+
+fn fill(out: &mut String, r: &Report) {
+    let depth: Vec<_> = r.streams.iter().filter_map(|s| Some((s, s.fill.as_ref()?))).collect();
+    if depth.is_empty() {
+        return;
+    }
+    let strips: Vec<_> = depth
+        .iter()
+        .map(|(s, fill)| Strip {
+            label: s.record.id.to_string(),
+            note: format!(
+                "mean {:.1} %, {:.1} to {:.1} %",
+                100.0 * fill.mean,
+                100.0 * fill.min,
+                100.0 * fill.max
+            ),
+            trace: Trace::Points(fill.samples.iter().map(|(t, share)| (*t, 100.0 * share)).collect()),
+            y: (0.0, 100.0),
+            nominal: None,
+            marks: [Vec::new(), Vec::new()],
+        })
+        .collect();
+    let _ = write!(
+        out,
+        "<section><h2>Fill rate of depth</h2><p class=\"cap\">Share of the pixels that have a depth, in {} of {} sets, \
+         evenly chosen.</p>{}</section>",
+        r.sampled.sets,
+        r.sets.count,
+        svg::strips("Fill rate of depth, per stream", "%", time(r), &strips)
+    );
+}
+
+fn pictures(out: &mut String, r: &Report) {
+    let Some(columns) =
+        r.streams.chunk_by(|a, b| a.record.id.camera == b.record.id.camera).map(<[_]>::len).max()
+    else {
+        return;
+    };
+    out.push_str(
+        "<section><h2>Pictures</h2><div class=\"wide\"><table class=\"pictures\"><thead><tr><th></th>",
+    );
+    for set in &r.pictures {
+        let at = length(set.at_ns);
+        let _ = write!(out, "<th colspan=\"{columns}\">{} set (no. {}, {at})</th>", set.title, set.number);
+    }
+    out.push_str("</tr></thead><tbody>");
+    let mut at = 0;
+    for camera in r.streams.chunk_by(|a, b| a.record.id.camera == b.record.id.camera) {
+        let _ = write!(out, "<tr><th>{}", escape(&camera[0].record.id.camera.to_string()));
+        for i in at..at + camera.len() {
+            let range = r.pictures.iter().find_map(|set| set.pictures.get(&i)?.range_m);
+            if let Some((near, far)) = range {
+                let _ = write!(out, "<br/><span class=\"none\">{} to {} m</span>", metres(near), metres(far));
+            }
+        }
+        out.push_str("</th>");
+        for set in &r.pictures {
+            for k in 0..columns {
+                let shown = if k < camera.len() { set.pictures.get(&(at + k)) } else { None };
+                let name = camera.get(k).map(|s| format!("{}, {} set", s.record.id, set.title));
+                picture(out, shown, name.as_deref());
+            }
+        }
+        out.push_str("</tr>");
+        at += camera.len();
+    }
+    let ramp: Vec<_> =
+        (0..=10).map(|i| viridis(1.0 - i as f32 / 10.0).map(|v| v.to_string()).join(",")).collect();
+    let stops: Vec<_> = ramp.iter().map(|rgb| format!("rgb({rgb})")).collect();
+    let _ = write!(
+        out,
+        "{END_TABLE}<p class=\"cap\">Depth in colours: near <span class=\"ramp\" style=\"background:linear-gradient(90deg,\
+         {})\"></span> far, in the range beside each camera, the same in all sets; black is no depth.</p></section>",
+        stops.join(",")
+    );
+}
+
+fn metres(m: f32) -> String {
+    if m < 1.0 { format!("{m:.2}") } else { format!("{m:.1}") }
+}
+
+fn picture(out: &mut String, shown: Option<&Shown>, name: Option<&str>) {
+    let _ = match (shown, name) {
+        (Some(p), Some(name)) => write!(
+            out,
+            "<td><img width=\"{}\" height=\"{}\" alt=\"{}\" src=\"{}\"/></td>",
+            p.width,
+            p.height,
+            escape(name),
+            p.data_uri
+        ),
+        (None, Some(_)) => write!(out, "<td class=\"none\">none</td>"),
+        _ => write!(out, "<td></td>"),
+    };
+}
+
+fn calibration(out: &mut String, r: &Report) {
+    const COLUMNS: [&str; 8] = [
+        "stream",
+        "size",
+        "fx, fy (px)",
+        "cx, cy (px)",
+        "distortion",
+        "depth unit",
+        "position on the mount (m)",
+        "comes from",
+    ];
+    out.push_str("<section><h2>Calibration</h2>");
+    table(out, &COLUMNS);
+    for s in &r.streams {
+        let (i, record) = (&s.record.intrinsics, &s.record);
+        let known = i.is_known();
+        let pair = |a: f64, b: f64| if known { format!("{a:.2}, {b:.2}") } else { "unknown".to_owned() };
+        let unit = if record.depth_unit_m > 0.0 {
+            format!("{} mm", number(record.depth_unit_m * 1e3))
+        } else {
+            "–".into()
+        };
+        let t = record.pose.translation_m.map(|v| format!("{v:.4}")).join(", ");
+        let cells = [
+            record.id.to_string(),
+            format!("{}×{}", record.width, record.height),
+            pair(i.fx, i.fy),
+            pair(i.cx, i.cy),
+            distortion(i),
+            unit,
+            t,
+            or_none(&record.calibration).to_owned(),
+        ];
+        row(out, &COLUMNS, &cells);
+    }
+    out.push_str(END_TABLE);
+    out.push_str(
+        "<p class=\"cap\">Rotations are in session.toml and in /tf_static of each segment.</p></section>",
+    );
+}
+
+fn distortion(i: &depthrig_bus::Intrinsics) -> String {
+    let name = match i.distortion() {
+        Distortion::None => return "none".to_owned(),
+        Distortion::BrownConrady => "Brown-Conrady",
+        Distortion::InverseBrownConrady => "inverse Brown-Conrady",
+        Distortion::KannalaBrandt4 => "Kannala-Brandt",
+        Distortion::Rational => "rational",
+        _ => return "unknown".to_owned(),
+    };
+    let last = i.coeffs.iter().rposition(|c| *c != 0.0).map_or(0, |n| n + 1);
+    let coefficients: Vec<_> = i.coeffs[..last].iter().map(|c| format!("{c:.5}")).collect();
+    if coefficients.is_empty() {
+        format!("{name}, all 0")
+    } else {
+        format!("{name}: {}", coefficients.join(", "))
+    }
+}
+
+fn footer(out: &mut String, r: &Report) {
+    let _ = write!(
+        out,
+        "<footer><p>Made by depthrig {} from every number of {} sets and {} of their pictures ({} sets looked at for \
+         depth). Recorded by depthrig {}. Checksums of pictures that were not looked at are checked by \
+         <code>depthrig verify {}</code>.</p></footer>",
+        env!("CARGO_PKG_VERSION"),
+        r.sets.count,
+        r.sampled.pictures,
+        r.sampled.sets,
+        escape(or_none(&r.depthrig_version)),
+        escape(&r.path.display().to_string())
+    );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn escaped_text_is_text_everywhere() {
+        assert_eq!(escape("<script>&\"'\0\u{1b}\n"), "&lt;script&gt;&amp;&quot;&#39;\u{fffd}\u{fffd}\n");
+    }
+
+    #[test]
+    fn numbers_read_well() {
+        assert_eq!([length(8_240_000_000), length(249_000_000_000)], ["8.2 s", "4 min 09 s"]);
+        assert_eq!([size(1500), size(2_500_000), size(3_210_000_000)], ["1.5 kB", "2.5 MB", "3.21 GB"]);
+        assert_eq!(utc(1_709_210_096_789_000_000), "2024-02-29 12:34:56 UTC");
+    }
+}

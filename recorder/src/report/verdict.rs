@@ -1,0 +1,154 @@
+//! What is to be thought of a dataset, in sentences: the first thing that a reader sees.
+
+use super::{Report, StreamReport, Verdict};
+use crate::catalog::{CatalogEntry, Health};
+
+/// Sentences of each kind at most; the rest is counted.
+const LINES_MAX: usize = 12;
+
+/// Before anything is known.
+pub(super) const fn unknown() -> Verdict {
+    Verdict { health: Health::Whole, headline: String::new(), why: Vec::new(), remarks: Vec::new() }
+}
+
+/// The verdict on what was gathered, and on what the folder says of itself.
+pub(super) fn of(report: &Report, catalog: Option<&CatalogEntry>) -> Verdict {
+    let mut health = catalog.map_or(Health::Whole, |c| c.health);
+    let mut why: Vec<String> = catalog.map(|c| c.why.clone()).unwrap_or_default();
+    let unfinished =
+        matches!(health, Health::Unfinished | Health::Recording) || !report.unfinished.is_empty();
+    if !report.unfinished.is_empty() && health == Health::Whole {
+        health = Health::Unfinished;
+    }
+    if report.problem_count > 0 {
+        // An unfinished segment ends in the middle, which is no damage.
+        if !unfinished {
+            health = Health::Damaged;
+        }
+        why.extend(report.problems.iter().filter(|p| !unfinished || !p.contains(".part")).cloned());
+    }
+    let lost = report.sets.counts.map_or(0, |c| c.dropped_total());
+    if lost > 0 && health == Health::Whole {
+        health = Health::Lost;
+        why.push(format!("{lost} sets were not recorded"));
+    }
+    let balanced = report.sets.counts.is_none_or(|c| c.balances())
+        && report.streams.iter().filter_map(|s| s.account.as_ref()).all(crate::StreamAccount::balances);
+    if !balanced {
+        health = Health::Damaged;
+        why.push("an account does not balance: a frame or a set vanished without a reason".to_owned());
+    }
+    why.dedup();
+    shorten(&mut why);
+    let mut remarks = remarks(report);
+    shorten(&mut remarks);
+    let headline = headline(report, health, lost, remarks.is_empty());
+    Verdict { health, headline, why, remarks }
+}
+
+fn headline(report: &Report, health: Health, lost: u64, plain: bool) -> String {
+    let (sets, path) = (report.sets.count, report.path.display());
+    match health {
+        Health::Whole if plain => format!("Whole: all {sets} sets are here, each with every stream."),
+        Health::Whole => format!("Whole: all {sets} sets that were taken are here. Read the remarks."),
+        Health::Recording => format!("Still being recorded: this is what is on disk so far, {sets} sets."),
+        Health::Lost => {
+            let offered = report.sets.counts.map_or(sets + lost, |c| c.offered);
+            format!("Something was lost: {lost} of {offered} sets were not recorded.")
+        }
+        Health::Unfinished => {
+            format!(
+                "Not finished: {sets} sets can be read as they are. Finish it with: depthrig recover {path}"
+            )
+        }
+        Health::Damaged => {
+            format!("Damaged: {sets} sets can be read. Find out where with: depthrig verify {path}")
+        }
+    }
+}
+
+fn remarks(report: &Report) -> Vec<String> {
+    let mut remarks = Vec::new();
+    let sets = &report.sets;
+    // Streams of one camera tell the same story once.
+    let mut told: Vec<(Vec<String>, String)> = Vec::new();
+    for s in report.streams.iter().filter(|s| s.missing > 0) {
+        let story = missing(s, sets.count, sets.duration_ns);
+        match told.iter_mut().find(|(_, said)| *said == story) {
+            Some((names, _)) => names.push(s.record.id.to_string()),
+            None => told.push((vec![s.record.id.to_string()], story)),
+        }
+    }
+    remarks.extend(told.into_iter().map(|(names, story)| format!("{}: {story}.", some_of(&names))));
+    for s in &report.streams {
+        if let Some(a) = s.account.as_ref().filter(|a| a.dropped.total() > 0) {
+            let reasons: Vec<_> = a.dropped.nonzero().map(|(r, n)| format!("{n} {}", r.name())).collect();
+            remarks.push(format!(
+                "{}: {} of {} captured frames were lost before their channel: {}.",
+                a.stream,
+                a.dropped.total(),
+                a.captured,
+                reasons.join(", ")
+            ));
+        }
+    }
+    if sets.beyond_limit > 0 {
+        let limit = sets.spread_limit_ns.unwrap_or(0) as f64 / 1e6;
+        remarks.push(format!(
+            "{} of {} sets have frames more than {limit:.1} ms apart, {:.1} ms at most.",
+            sets.beyond_limit,
+            sets.count,
+            sets.spread_ns.max as f64 / 1e6
+        ));
+    }
+    for s in report.streams.iter().filter(|s| s.clock.restarts > 0) {
+        remarks.push(format!("{}: its clock map was restarted {} times.", s.record.id, s.clock.restarts));
+    }
+    for (at, by) in &report.host_clock.steps {
+        let (at, by) = (*at as f64 / 1e9, *by as f64 / 1e6);
+        remarks.push(format!(
+            "The wall clock was set by {by:+.1} ms at {at:.1} s; recorded times did not jump."
+        ));
+    }
+    let without: Vec<_> = report
+        .streams
+        .iter()
+        .filter(|s| !s.record.intrinsics.is_known())
+        .map(|s| s.record.id.to_string())
+        .collect();
+    if !without.is_empty() {
+        remarks.push(format!("Without calibration: {}.", some_of(&without)));
+    }
+    remarks
+}
+
+fn missing(s: &StreamReport, sets: u64, duration_ns: i64) -> String {
+    let at = |ns: i64| format!("{:.1} s", ns as f64 / 1e9);
+    let story = format!("missing in {} of {sets} sets", s.missing);
+    let Some((from, to)) = s.missing_ns.filter(|_| s.last_ns.is_some()) else {
+        return story + ": no frame at all";
+    };
+    let near = 2 * duration_ns / i64::try_from(sets.max(1)).unwrap_or(1);
+    match (from <= near, to >= duration_ns - near) {
+        (true, true) => story,
+        (true, false) => format!("{story}, until {}", at(to)),
+        (false, true) => format!("{story}, from {} to the end", at(from)),
+        (false, false) => format!("{story}, between {} and {}", at(from), at(to)),
+    }
+}
+
+/// A few of the names, and how many more there are.
+fn some_of(names: &[String]) -> String {
+    match names.len() {
+        0..=4 => names.join(", "),
+        n => format!("{} and {} more", names[..3].join(", "), n - 3),
+    }
+}
+
+fn shorten(lines: &mut Vec<String>) {
+    if lines.len() > LINES_MAX {
+        let more = lines.len() - LINES_MAX;
+        lines.truncate(LINES_MAX);
+        lines.push(format!("… and {more} more."));
+    }
+}

@@ -1,0 +1,82 @@
+//! `depthrig report`: the quality report of a dataset.
+
+use crate::context::Context;
+use crate::exit::{Exit, UsageError};
+use crate::out;
+use crate::progress::Progress;
+use crate::signals::Stop;
+use anyhow::{Result, bail};
+use core::ops::ControlFlow;
+use depthrig_recorder::Dataset;
+use depthrig_recorder::fs::RealFs;
+use depthrig_recorder::report::{REPORT_FILE, Report, ReportOptions};
+use std::path::PathBuf;
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+A recording writes its report at its end; this writes it anew, for instance after `depthrig recover`.
+Exit codes: 0 the dataset is whole, 1 no report could be made, 3 the report says that it is not.
+
+Examples:
+  depthrig report data/20261121_1015_kitchen
+  depthrig report data/20261121_1015_kitchen --out kitchen.html --max-spread-ms 20
+  depthrig report data/20261121_1015_kitchen --json | jq .verdict";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct ReportArgs {
+    /// The dataset's folder, or one of its segments
+    dataset: PathBuf,
+    /// Write the page to this file [default: report.html in the dataset]
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Frames of a set should not lie further apart [default: half a period of the slowest camera]
+    #[arg(long, value_name = "MS", value_parser = crate::cli::positive_seconds)]
+    max_spread_ms: Option<f64>,
+    /// Sets whose depth pictures are decoded for the fill rate
+    #[arg(long, value_name = "N", default_value_t = ReportOptions::default().fill_sets)]
+    fill_sets: usize,
+    /// Print JSON instead of writing a page (with --out, do both)
+    #[arg(long)]
+    json: bool,
+}
+
+/// Makes it.
+pub fn run(args: &ReportArgs, context: &Context) -> Result<Exit> {
+    let dataset = Dataset::open(&args.dataset)?;
+    let page = match &args.out {
+        Some(path) => Some(path.clone()),
+        None if args.json => None,
+        None if args.dataset.is_dir() => Some(args.dataset.join(REPORT_FILE)),
+        None => return Err(UsageError("a report of one segment needs --out FILE".to_owned()).into()),
+    };
+    let options = ReportOptions {
+        fill_sets: args.fill_sets,
+        max_spread_ns: args.max_spread_ms.map(|ms| (ms * 1e6) as i64),
+    };
+    let stop = Stop::on_signals()?;
+    let mut bar = Progress::new(context.global.quiet > 0);
+    let mut tell = |done: u64| {
+        bar.set("looking at the dataset", done, 1000);
+        if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    };
+    let Some(report) = Report::of(&dataset, &options, &mut tell)? else {
+        bail!("interrupted; no report was written");
+    };
+    bar.clear();
+    if let Some(path) = &page {
+        report.write(&RealFs, path)?;
+    }
+    if args.json {
+        out::json(&report)?;
+    } else {
+        out::line(&report.verdict.headline)?;
+        for line in report.verdict.why.iter().chain(&report.verdict.remarks) {
+            out::line(format_args!("  {line}"))?;
+        }
+        if let Some(path) = &page {
+            out::line(format_args!("report    {}", path.display()))?;
+        }
+    }
+    Ok(if report.verdict.health.is_bad() { Exit::Lost } else { Exit::Good })
+}
