@@ -28,6 +28,8 @@ pub enum ErrorKind {
     PermissionDenied,
     /// What the caller handed over cannot be recorded as it is.
     BadInput,
+    /// The caller ended the work before it was done.
+    Cancelled,
     /// Pixels could not be encoded or decoded.
     Codec,
     /// The operating system refused for another reason.

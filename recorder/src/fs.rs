@@ -39,7 +39,7 @@ pub trait Fs: Send + Sync + fmt::Debug {
     /// # Errors
     /// As the operating system says.
     fn open(&self, path: &Path) -> io::Result<Box<dyn ReadFile>>;
-    /// Renames a file, replacing what is there.
+    /// Renames a file, replacing what is there; or a folder, if nothing or an empty folder has the new name.
     ///
     /// # Errors
     /// As the operating system says.
@@ -49,6 +49,13 @@ pub trait Fs: Send + Sync + fmt::Debug {
     /// # Errors
     /// As the operating system says.
     fn remove_file(&self, path: &Path) -> io::Result<()>;
+    /// Removes an empty folder.
+    ///
+    /// # Errors
+    /// As the operating system says; `Unsupported` where the file system does not offer it.
+    fn remove_dir(&self, _dir: &Path) -> io::Result<()> {
+        Err(io::ErrorKind::Unsupported.into())
+    }
     /// Makes the names in a folder durable.
     ///
     /// # Errors
@@ -166,6 +173,10 @@ impl Fs for RealFs {
 
     fn remove_file(&self, path: &Path) -> io::Result<()> {
         std::fs::remove_file(path)
+    }
+
+    fn remove_dir(&self, dir: &Path) -> io::Result<()> {
+        std::fs::remove_dir(dir)
     }
 
     fn sync_dir(&self, dir: &Path) -> io::Result<()> {

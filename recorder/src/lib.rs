@@ -34,6 +34,7 @@ mod recorder;
 pub mod report;
 mod select;
 mod session;
+mod slice;
 mod still;
 mod verify;
 
@@ -57,5 +58,6 @@ pub use session::{
     Edit, FORMAT, Note, Outcome, SESSION_FILE, Session, SessionChanges, StreamRecord, check_name, edit,
     rename,
 };
+pub use slice::{Derived, SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, still};
 pub use verify::{Finding, Severity, VerifyOptions, VerifyReport, verify, verify_with};

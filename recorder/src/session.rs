@@ -52,6 +52,9 @@ pub struct Session {
     /// What was changed after the recording, oldest first.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub history: Vec<Edit>,
+    /// What it was cut from or joined from, oldest first; empty for a recording as it was made.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub derived: Vec<crate::Derived>,
     /// The recorded streams; a frame names its stream by the index here.
     pub streams: Vec<StreamRecord>,
     /// Keys that this version does not know: a user's own, or a later version's. They are kept.
@@ -199,6 +202,7 @@ impl Session {
             outcome: None,
             notes: Vec::new(),
             history: Vec::new(),
+            derived: Vec::new(),
             streams: Vec::new(),
             extra: toml::Table::new(),
         }

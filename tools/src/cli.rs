@@ -1,8 +1,8 @@
 //! The commands and options, and what `--help` says of them.
 
 use crate::commands::{
-    bench, cat, compare, completions, config, demo, edit, info, man, record, replay, report, run, sessions,
-    status, tap, top, verify,
+    bench, cat, compare, completions, config, demo, edit, info, man, merge, record, replay, report, run,
+    sessions, status, tap, top, trim, verify,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -121,6 +121,12 @@ pub enum Command {
     /// List single frames of a dataset, or write them as PNG, NPY or JPEG files
     #[command(after_help = cat::EXAMPLES)]
     Cat(cat::CatArgs),
+    /// Write a part of a dataset as a dataset of its own
+    #[command(after_help = trim::EXAMPLES)]
+    Trim(trim::TrimArgs),
+    /// Join parts of one recording again
+    #[command(after_help = merge::EXAMPLES)]
+    Merge(merge::MergeArgs),
     /// Say whether two datasets hold the same, and where they differ
     #[command(after_help = compare::EXAMPLES)]
     Compare(compare::CompareArgs),

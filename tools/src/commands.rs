@@ -9,6 +9,7 @@ pub mod demo;
 pub mod edit;
 pub mod info;
 pub mod man;
+pub mod merge;
 pub mod record;
 pub mod replay;
 pub mod report;
@@ -17,6 +18,7 @@ pub mod sessions;
 pub mod status;
 pub mod tap;
 pub mod top;
+pub mod trim;
 pub mod verify;
 
 use crate::cli::{Cli, Command};
@@ -43,6 +45,8 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Edit(args) => edit::run(&args),
         Command::Verify(args) => verify::run(&args, &context),
         Command::Cat(args) => cat::run(&args, &context),
+        Command::Trim(args) => trim::run(&args, &context),
+        Command::Merge(args) => merge::run(&args, &context),
         Command::Compare(args) => compare::run(&args, &context),
         Command::Config(command) => config::run(&command),
         Command::Tap(args) => tap::run(&args, &context),

@@ -170,7 +170,8 @@ impl<'a> Groups<'a> {
         let schemas: BTreeMap<_, _> = preamble.schemas.iter().map(|s| (s.id, s.name.as_str())).collect();
         for c in &preamble.channels {
             let is = |s: Schema| schemas.get(&c.schema) == Some(&s.name());
-            let role = if is(Schema::Image) || is(Schema::CompressedImage) {
+            let kinds = [Schema::Image, Schema::CompressedImage, Schema::CompressedDepth];
+            let role = if kinds.into_iter().any(is) {
                 let Some(stream) = c.metadata.get("stream") else { continue };
                 pictures.insert(stream.clone(), c.id);
                 Role::Picture

@@ -38,6 +38,7 @@ pub(crate) struct ChannelInfo {
 pub(crate) struct Message<'a> {
     pub(crate) channel: u16,
     pub(crate) log_time: u64,
+    pub(crate) publish_time: u64,
     /// Where its record begins in the unpacked chunk.
     pub(crate) offset: u64,
     pub(crate) data: &'a [u8],
@@ -257,7 +258,8 @@ impl SegmentReader {
                     return Err(cut());
                 };
                 let (channel, log_time) = (header.channel_id, header.log_time);
-                f(Message { channel, log_time, offset: at as u64, data: &data })?;
+                let publish_time = header.publish_time;
+                f(Message { channel, log_time, publish_time, offset: at as u64, data: &data })?;
             }
             at += HEAD as usize + len;
         }

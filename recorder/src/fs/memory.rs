@@ -52,6 +52,19 @@ impl State {
         self.capacity.map_or(u64::MAX, |c| c.saturating_sub(self.used()))
     }
 
+    /// Gives a folder with all below it another name, unless something is there.
+    fn rename_dir(&mut self, from: &Path, to: &Path) -> io::Result<()> {
+        if self.files.keys().chain(&self.dirs).any(|p| p.starts_with(to) && p != to) {
+            return Err(io::ErrorKind::DirectoryNotEmpty.into());
+        }
+        let moved = |p: PathBuf| p.strip_prefix(from).map(|rest| to.join(rest)).unwrap_or(p);
+        self.files = std::mem::take(&mut self.files).into_iter().map(|(p, node)| (moved(p), node)).collect();
+        // Joining an empty rest leaves a slash at the end, which no path of a folder has here.
+        let tidy = |p: PathBuf| p.components().collect();
+        self.dirs = std::mem::take(&mut self.dirs).into_iter().map(moved).map(tidy).collect();
+        Ok(())
+    }
+
     fn node(&mut self, path: &Path) -> io::Result<&mut Node> {
         self.files.get_mut(path).ok_or_else(|| io::ErrorKind::NotFound.into())
     }
@@ -155,6 +168,9 @@ impl Fs for MemFs {
 
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         let mut state = self.op("rename", from)?;
+        if state.dirs.contains(from) {
+            return state.rename_dir(from, to);
+        }
         let node = state.files.remove(from).ok_or(io::ErrorKind::NotFound)?;
         state.files.insert(to.to_owned(), node);
         Ok(())
@@ -163,6 +179,14 @@ impl Fs for MemFs {
     fn remove_file(&self, path: &Path) -> io::Result<()> {
         let removed = self.op("remove", path)?.files.remove(path);
         removed.map(|_| ()).ok_or_else(|| io::ErrorKind::NotFound.into())
+    }
+
+    fn remove_dir(&self, dir: &Path) -> io::Result<()> {
+        let mut state = self.op("rmdir", dir)?;
+        if state.files.keys().chain(&state.dirs).any(|p| p.parent() == Some(dir)) {
+            return Err(io::ErrorKind::DirectoryNotEmpty.into());
+        }
+        if state.dirs.remove(dir) { Ok(()) } else { Err(io::ErrorKind::NotFound.into()) }
     }
 
     fn sync_dir(&self, dir: &Path) -> io::Result<()> {

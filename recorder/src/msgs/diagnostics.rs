@@ -1,6 +1,7 @@
 //! `diagnostic_msgs/msg/DiagnosticArray`, and the operator's notes as `rcl_interfaces/msg/Log`.
 
-use crate::cdr::Writer;
+use crate::Result;
+use crate::cdr::{Reader, Writer};
 use serde::Serialize;
 
 /// How well something is.
@@ -47,4 +48,25 @@ pub(crate) fn write(buf: &mut Vec<u8>, stamp_utc_ns: i64, statuses: &[Diagnostic
 /// A note of the operator, at level INFO.
 pub(crate) fn write_note(buf: &mut Vec<u8>, utc_ns: i64, text: &str) {
     Writer::new(buf).time(utc_ns).u8(20).str("operator").str(text).str("").str("").u32(0);
+}
+
+/// Time (UTC nanoseconds) and text of a note.
+pub(crate) fn read_note(message: &[u8]) -> Result<(i64, &str)> {
+    let mut r = Reader::new(message)?;
+    let utc_ns = r.time()?;
+    r.u8()?;
+    r.str()?;
+    Ok((utc_ns, r.str()?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_note_is_read_as_it_was_written() {
+        let mut buf = Vec::new();
+        write_note(&mut buf, 1_700_000_000_000_000_007, "lamp on");
+        assert_eq!(read_note(&buf).unwrap(), (1_700_000_000_000_000_007, "lamp on"));
+    }
 }

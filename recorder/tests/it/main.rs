@@ -13,5 +13,6 @@ mod kill;
 mod report;
 mod round_trip;
 mod set_reader;
+mod slice;
 mod support;
 mod verify;

@@ -1,0 +1,195 @@
+//! Cutting and joining: a part of a dataset as a dataset of its own, and parts of one session together again.
+//!
+//! Sets are copied as they lie in the file, proven on the way and never packed anew. What counts over the whole
+//! recording (accounts, checkpoints, the session's outcome) is written for what the new dataset holds. One thread
+//! reads each input ahead by a set; memory does not grow with the length of the datasets.
+//!
+//! The new dataset grows in a folder named `OUT.part`, which gets its name when everything in it is durable. So
+//! `OUT` is whole or not there, and the inputs are only read.
+
+use crate::dataset::Dataset;
+use crate::fs::Fs;
+use crate::recorder::topics::SESSION_METADATA;
+use crate::select::SetSpan;
+use crate::{Error, ErrorKind, RecorderOptions, Result, Session};
+use depthrig_bus::UtcPair;
+use serde::{Deserialize, Serialize};
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+mod books;
+mod folder;
+mod join;
+mod lane;
+mod output;
+mod session;
+
+use join::Join;
+use lane::{Input, Lanes, Piece, lanes};
+
+/// How the new dataset is divided; the defaults are those of a recording.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SliceOptions {
+    /// A segment is closed before the set that would begin beyond this size, bytes.
+    pub segment_max_bytes: u64,
+    /// A segment is closed before the set that begins this long after its first one, nanoseconds.
+    pub segment_max_ns: i64,
+}
+
+impl Default for SliceOptions {
+    fn default() -> Self {
+        let o = RecorderOptions::default();
+        Self { segment_max_bytes: o.segment_max_bytes, segment_max_ns: o.segment_max_ns }
+    }
+}
+
+/// One step of how a dataset came to be after its recording, in `session.toml` under `[[derived]]`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Derived {
+    /// `trim` or `merge`.
+    pub by: String,
+    /// When, UTC nanoseconds since 1970.
+    pub utc_ns: i64,
+    /// The version of depthrig that did it.
+    pub depthrig_version: String,
+    /// File names of what it was made from.
+    pub from: Vec<String>,
+    /// Log time of the first set, UTC nanoseconds since 1970.
+    pub first_utc_ns: i64,
+    /// Log time of the last set.
+    pub last_utc_ns: i64,
+    /// Sets that were offered to the recorder before its own begin: `FrameSet.sets_offered` counts these as well.
+    #[serde(default)]
+    pub offered_before: u64,
+}
+
+/// What was made.
+#[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
+pub struct SliceReport {
+    /// The new dataset.
+    pub path: PathBuf,
+    /// Its sets.
+    pub sets: u64,
+    /// Id of the first set.
+    pub first_set: u64,
+    /// Id of the last set.
+    pub last_set: u64,
+    /// Time from the first set to the last, nanoseconds.
+    pub duration_ns: i64,
+    /// Its segments.
+    pub segments: u32,
+    /// Bytes of its segments.
+    pub bytes: u64,
+    /// Sets that were in several inputs and are in it once.
+    pub repeated: u64,
+    /// Whether nothing is missing between its first set and its last, as far as the recording tells.
+    pub complete: bool,
+    /// What is missing, in words; empty when `complete`.
+    pub lost: Vec<String>,
+}
+
+/// Is told how many bytes of how many are read, and may end the work.
+pub type SliceProgress<'a> = &'a mut dyn FnMut(u64, u64) -> ControlFlow<()>;
+
+/// Writes the sets of `span` as the new dataset `out`.
+///
+/// # Errors
+/// [`ErrorKind::BadInput`] when no set is in the span, [`ErrorKind::AlreadyExists`] when `out` or what is left of an
+/// earlier try is there, [`ErrorKind::DiskFull`], [`ErrorKind::Cancelled`], and as reading and writing do. `out` is
+/// not there then.
+pub fn trim(
+    fs: &dyn Fs,
+    dataset: &Dataset,
+    out: &Path,
+    span: SetSpan,
+    options: &SliceOptions,
+    progress: SliceProgress<'_>,
+) -> Result<SliceReport> {
+    let mut sets = dataset.set_reader()?;
+    let numbers = span.numbers(&mut sets)?;
+    let times = sets.times();
+    let part = lane::Range {
+        from_utc_ns: times[numbers.start],
+        to_utc_ns: times[numbers.end - 1],
+        begins: numbers.start == 0,
+        ends: numbers.end == times.len(),
+        // What happens after the last set and before the next one belongs to the last set.
+        notes_from_utc_ns: if numbers.start == 0 { i64::MIN } else { times[numbers.start] },
+        notes_to_utc_ns: times.get(numbers.end).map_or(i64::MAX, |next| next - 1),
+    };
+    drop(sets);
+    let inputs = [Input::new(dataset)];
+    let pieces = (0..dataset.segments().len()).map(|segment| Piece { input: 0, segment }).collect();
+    let mut session = session::trimmed(dataset.session(), out, &part);
+    session.derived.push(derived("trim", &inputs, (part.from_utc_ns, part.to_utc_ns)));
+    Join::new(&inputs, part, *options).run(fs, &[pieces], session, out, progress)
+}
+
+/// Joins datasets or single segments of one session, in the order of their times, as the new dataset `out`. A set that
+/// is in several of them is in it once.
+///
+/// # Errors
+/// [`ErrorKind::BadInput`] when the inputs are not of one session or contradict each other; otherwise as [`trim`].
+pub fn merge(
+    fs: &dyn Fs,
+    datasets: &[Dataset],
+    out: &Path,
+    options: &SliceOptions,
+    progress: SliceProgress<'_>,
+) -> Result<SliceReport> {
+    let Some(first) = datasets.first() else {
+        return Err(Error::new(ErrorKind::BadInput, "there is nothing to merge"));
+    };
+    for other in &datasets[1..] {
+        session::must_be_one(first, other)?;
+    }
+    let inputs: Vec<_> = datasets.iter().map(Input::new).collect();
+    let Some(Lanes { lanes, times }) = lanes(&inputs)? else {
+        return Err(Error::new(ErrorKind::BadInput, "there is no set in what is to be merged"));
+    };
+    let mut session = session::merged(datasets, out);
+    session.derived.push(derived("merge", &inputs, times));
+    Join::new(&inputs, lane::Range::ALL, *options).run(fs, &lanes, session, out, progress)
+}
+
+/// The provenance of what is made from `inputs`, with sets from one log time to another.
+fn derived(by: &str, inputs: &[Input<'_>], (first_utc_ns, last_utc_ns): (i64, i64)) -> Derived {
+    let name = |p: &Path| {
+        p.file_name().map_or_else(|| p.display().to_string(), |n| n.to_string_lossy().into_owned())
+    };
+    Derived {
+        by: by.to_owned(),
+        utc_ns: UtcPair::sample().utc_ns,
+        depthrig_version: env!("CARGO_PKG_VERSION").to_owned(),
+        from: inputs.iter().map(|i| name(i.dataset.path())).collect(),
+        first_utc_ns,
+        last_utc_ns,
+        // Known with the first set.
+        offered_before: 0,
+    }
+}
+
+/// Refuses a segment that is of another session than its dataset says.
+fn check_segment(
+    session: &Session,
+    metadata: Option<&std::collections::BTreeMap<String, String>>,
+    path: &Path,
+) -> Result<()> {
+    let says = |key: &str| metadata.and_then(|m| m.get(key)).map(String::as_str).unwrap_or_default();
+    for (key, expected) in
+        [("rig", session.rig.clone()), ("started_utc_ns", session.started_utc_ns.to_string())]
+    {
+        if says(key) != expected {
+            return Err(Error::new(
+                ErrorKind::BadInput,
+                format!(
+                    "{} is of another session: its {SESSION_METADATA} says {key} {}, not {expected}",
+                    path.display(),
+                    says(key)
+                ),
+            ));
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,95 @@
+//! The folder in which a new dataset grows: it is renamed when everything in it is durable.
+
+use crate::fs::Fs;
+use crate::{Error, ErrorKind, Result};
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// Beside the chunks there are heads, indexes and `session.toml`, bytes.
+const MARGIN_BYTES: u64 = 16 << 20;
+
+pub(super) struct Folder<'a> {
+    fs: &'a dyn Fs,
+    out: PathBuf,
+    part: PathBuf,
+    done: bool,
+}
+
+impl<'a> Folder<'a> {
+    /// Makes `OUT.part`, if there is neither that nor `OUT`, and room for `bytes`.
+    pub(super) fn create(fs: &'a dyn Fs, out: &Path, bytes: u64) -> Result<Self> {
+        let name = out.file_name().ok_or_else(|| {
+            Error::new(ErrorKind::BadInput, format!("{} is no name for a new dataset", out.display()))
+        })?;
+        let mut part = name.to_os_string();
+        part.push(".part");
+        let part = out.with_file_name(part);
+        must_be_free(fs, out, "choose another name")?;
+        must_be_free(
+            fs,
+            &part,
+            "it is being written by another process, or is left of one that was cut off; if nothing writes to it, \
+             remove it",
+        )?;
+        let made = fs.create_dir_all(&part);
+        made.map_err(|e| Error::io("create the folder", &part, e))?;
+        let folder = Self { fs, out: out.to_owned(), part, done: false };
+        let free = fs.available_space(&folder.part);
+        let free = free.map_err(|e| Error::io("ask for the free space of", &folder.part, e))?;
+        let needed = bytes.saturating_add(MARGIN_BYTES);
+        if free < needed {
+            return Err(Error::new(
+                ErrorKind::DiskFull,
+                format!(
+                    "{} would take {} MB, its disk has {} MB left; free some space or choose another disk",
+                    out.display(),
+                    needed.div_ceil(1_000_000),
+                    free / 1_000_000
+                ),
+            ));
+        }
+        Ok(folder)
+    }
+
+    /// Where to write.
+    pub(super) fn path(&self) -> &Path {
+        &self.part
+    }
+
+    /// Gives it its name. What is in it must be durable.
+    pub(super) fn finish(mut self) -> Result<()> {
+        // An empty folder of that name would be replaced; anything else of that name makes this fail.
+        self.fs.rename(&self.part, &self.out).map_err(|e| Error::io("rename", &self.part, e))?;
+        self.done = true;
+        let parent = self.out.parent().unwrap_or(Path::new("."));
+        self.fs.sync_dir(parent).map_err(|e| Error::io("sync the folder", parent, e))
+    }
+}
+
+impl Drop for Folder<'_> {
+    /// What was not finished goes; it is all of our making. What cannot be removed keeps the name that says so.
+    fn drop(&mut self) {
+        if self.done {
+            return;
+        }
+        for entry in self.fs.read_dir(&self.part).unwrap_or_default() {
+            let _ = self.fs.remove_file(&self.part.join(entry.name));
+        }
+        if let Err(e) = self.fs.remove_dir(&self.part) {
+            tracing::warn!("{} is left unfinished: {e}", self.part.display());
+        }
+    }
+}
+
+/// Whether nothing of this name is there, or an empty folder.
+fn must_be_free(fs: &dyn Fs, path: &Path, advice: &str) -> Result<()> {
+    match fs.read_dir(path) {
+        Ok(entries) if entries.is_empty() => Ok(()),
+        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
+        Ok(_) => {
+            let message = format!("{} is there already; {advice}", path.display());
+            Err(Error::new(ErrorKind::AlreadyExists, message))
+        }
+        Err(e) => Err(Error::io("use the folder", path, e)),
+    }
+}

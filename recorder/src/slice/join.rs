@@ -1,0 +1,398 @@
+//! The sets of all lanes in the order of their times, each once.
+
+use super::books::Books;
+use super::folder::Folder;
+use super::lane::{self, Input, Item, Lane, Loose, Range, Source};
+use super::output::{Losses, Output};
+use super::session::{IN_NO_INPUT, lost_in_words};
+use super::{SliceOptions, SliceProgress, SliceReport};
+use crate::container::copy::SetGroup;
+use crate::fs::Fs;
+use crate::msgs::accounts;
+use crate::msgs::schemas::Schema;
+use crate::{Error, ErrorKind, Result, Session};
+use crossbeam::channel::{Receiver, bounded};
+use std::path::Path;
+use std::sync::Arc;
+
+/// Items that a lane reads ahead. A set is one of them, so this bounds the memory.
+const AHEAD: usize = 1;
+/// Lines of what is missing that are kept one by one.
+const MAX_LOST: usize = 100;
+
+pub(super) struct Join<'a> {
+    inputs: &'a [Input<'a>],
+    range: Range,
+    options: SliceOptions,
+    losses: Losses,
+    lost: Vec<String>,
+    more_lost: u64,
+    repeated: u64,
+    unexplained: u64,
+}
+
+/// Where a lane stands.
+struct Head {
+    items: Receiver<Item>,
+    source: Option<Arc<Source>>,
+    books: Books,
+    /// Id and offered sets of the set before, and its input.
+    before: Option<(u64, u64, usize)>,
+    next: Option<Box<SetGroup>>,
+    /// The clock pair that the next set's segment begins with.
+    clock: Option<Loose>,
+    /// What could not be read since the set before.
+    damage: Vec<String>,
+    /// There are sets beyond the range.
+    beyond: bool,
+}
+
+impl<'a> Join<'a> {
+    pub(super) fn new(inputs: &'a [Input<'a>], range: Range, options: SliceOptions) -> Self {
+        Self {
+            inputs,
+            range,
+            options,
+            losses: Losses::default(),
+            lost: Vec::new(),
+            more_lost: 0,
+            repeated: 0,
+            unexplained: 0,
+        }
+    }
+
+    pub(super) fn run(
+        mut self,
+        fs: &dyn Fs,
+        lanes: &[Lane],
+        session: Session,
+        out: &Path,
+        progress: SliceProgress<'_>,
+    ) -> Result<SliceReport> {
+        let mut total = 0;
+        for lane in lanes {
+            total += lane::bytes(self.inputs, lane, &self.range)?;
+        }
+        let folder = Folder::create(fs, out, total)?;
+        let mut output = Output::new(fs, folder.path(), session, self.range, self.options);
+        let (inputs, range) = (self.inputs, self.range);
+        let lost = std::thread::scope(|scope| {
+            let mut heads = Vec::new();
+            for lane in lanes {
+                let (sender, items) = bounded(AHEAD);
+                scope.spawn(move || lane::read(inputs, lane, &range, &sender));
+                heads.push(Head::new(items));
+            }
+            // The heads go before the threads are waited for: a thread that has nobody to read for ends.
+            self.copy(heads, &mut output, progress, total)
+        })?;
+        let (Some(first), Some(last)) = (output.first, output.last) else {
+            let what = "no set in what was asked for can be read; `depthrig verify` says why";
+            return Err(Error::new(ErrorKind::Corrupt, what));
+        };
+        let report = SliceReport {
+            path: out.to_owned(),
+            sets: output.recorded,
+            first_set: first.0,
+            last_set: last.0,
+            duration_ns: (last.1 - first.1) as i64,
+            segments: output.segments(),
+            bytes: output.bytes,
+            repeated: self.repeated,
+            complete: lost.is_empty(),
+            lost,
+        };
+        drop(output);
+        folder.finish()?;
+        Ok(report)
+    }
+
+    /// Copies everything; what is missing, in words.
+    fn copy(
+        &mut self,
+        mut heads: Vec<Head>,
+        output: &mut Output<'_>,
+        progress: SliceProgress<'_>,
+        total: u64,
+    ) -> Result<Vec<String>> {
+        for head in &mut heads {
+            for (source, message) in self.fill(head, output)? {
+                output.before(source, message);
+            }
+        }
+        let (mut done, mut last) = (0, None);
+        while let Some(at) = heads.iter().filter_map(Head::time).min() {
+            if progress(done, total).is_break() {
+                return Err(Error::new(
+                    ErrorKind::Cancelled,
+                    "it was ended before it was done; nothing is left of it",
+                ));
+            }
+            let due: Vec<_> = (0..heads.len()).filter(|i| heads[*i].time() == Some(at)).collect();
+            // Staying with a lane keeps its accounts together.
+            let chosen = last.filter(|l| due.contains(l)).unwrap_or(due[0]);
+            for other in due.iter().filter(|i| **i != chosen) {
+                must_be_same(&heads[chosen], &heads[*other])?;
+                self.repeated += 1;
+            }
+            self.account_for(&mut heads, &due, chosen, output)?;
+            for i in due {
+                let head = &mut heads[i];
+                let (Some(set), Some(source)) = (head.next.take(), head.source.clone()) else { continue };
+                done += set.chunks.iter().map(|c| c.bytes().len() as u64).sum::<u64>();
+                let clock = head.clock.take();
+                if i == chosen {
+                    output.set(&set, &source, clock, &self.losses)?;
+                }
+                head.before = Some((set.mark.id, set.mark.sets_offered, source.input));
+                drop(set);
+                let after = self.fill(head, output)?;
+                if i == chosen {
+                    output.hold(after);
+                }
+            }
+            last = Some(chosen);
+        }
+        self.end(&mut heads, last, output);
+        let lost = self.told();
+        let lost = output.finish(&self.losses, lost)?;
+        // What is not read is between sets and outside of the range.
+        let _ = progress(total, total);
+        Ok(lost)
+    }
+
+    /// Finds what is missing between the last set written and the next one, and for which reason.
+    fn account_for(
+        &mut self,
+        heads: &mut [Head],
+        due: &[usize],
+        chosen: usize,
+        output: &mut Output<'_>,
+    ) -> Result<()> {
+        let inputs = self.inputs;
+        for i in due {
+            let head = &mut heads[*i];
+            let Some(mark) = head.next.as_ref().map(|set| &set.mark) else { continue };
+            let gap = head.gap(inputs, mark.sets_offered);
+            let damage = std::mem::take(&mut head.damage);
+            if *i != chosen {
+                head.books.gap(gap, false, &mut self.losses);
+                continue;
+            }
+            let Some((id, _)) = output.last else {
+                // What was lost before the first set belongs to a whole recording and not to a part.
+                let counted = head.before.is_none() && self.range.begins;
+                let own = head.source.as_ref().filter(|s| counted && s.is_first);
+                output.begin(
+                    own.map_or(mark.sets_offered.saturating_sub(1), |s| inputs[s.input].offered_before()),
+                );
+                head.books.gap(gap, counted && damage.is_empty(), &mut self.losses);
+                if counted && gap > 0 && !damage.is_empty() {
+                    let why = damage.join("; ");
+                    self.lose(format!("{gap} sets before set {} are not there: {why}", mark.id));
+                }
+                continue;
+            };
+            if mark.id <= id {
+                return Err(Error::new(
+                    ErrorKind::BadInput,
+                    format!(
+                        "set {} of {} comes after set {id} in time, but not by its number: the inputs contradict \
+                         each other; `depthrig verify` each of them",
+                        mark.id,
+                        head.name()
+                    ),
+                ));
+            }
+            // With the set of another input before it, its own accounts do not tell of the gap.
+            let same = head.before.zip(head.source.as_ref()).is_some_and(|((before, _, input), source)| {
+                before == id && inputs[input].shares_accounts(&inputs[source.input])
+            });
+            let missing = if same { gap } else { mark.sets_offered.saturating_sub(output.offered + 1) };
+            let between = format!("between set {id} and set {}", mark.id);
+            if missing == 0 {
+                head.books.gap(gap, false, &mut self.losses);
+            } else if !same {
+                head.books.gap(gap, false, &mut self.losses);
+                self.lose(format!("{missing} sets {between} are {IN_NO_INPUT}"));
+            } else if damage.is_empty() {
+                head.books.gap(gap, true, &mut self.losses);
+            } else {
+                self.lose(format!("{missing} sets {between} are not there: {}", damage.join("; ")));
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes what happened after the last set.
+    fn end(&mut self, heads: &mut [Head], last: Option<usize>, output: &Output<'_>) {
+        let head = last.map(|i| &mut heads[i]).filter(|head| self.range.ends && !head.beyond);
+        if let Some(head) = head {
+            head.books.end(&mut self.losses);
+            if !head.damage.is_empty() {
+                let after = output.last.map_or(0, |l| l.0);
+                let why = std::mem::take(&mut head.damage).join("; ");
+                self.lose(format!("what came after set {after} is not there: {why}"));
+            }
+        }
+        self.unexplained += heads.iter().map(|h| h.books.unexplained()).sum::<u64>();
+        if self.unexplained > 0 {
+            let n = self.unexplained;
+            self.lose(format!("{n} sets are not there, and no account tells why"));
+        }
+        if self.range.ends {
+            for line in self.inputs.iter().flat_map(|i| lost_in_words(i.dataset.session())) {
+                if !self.lost.contains(&line) {
+                    self.lose(line);
+                }
+            }
+        }
+    }
+
+    fn lose(&mut self, line: String) {
+        if self.lost.len() < MAX_LOST {
+            self.lost.push(line);
+        } else {
+            self.more_lost += 1;
+        }
+    }
+
+    fn told(&mut self) -> Vec<String> {
+        let mut lost = std::mem::take(&mut self.lost);
+        if self.more_lost > 0 {
+            lost.push(format!("and {} more like these", self.more_lost));
+        }
+        lost
+    }
+
+    /// Reads on to the next set; what lies before it.
+    fn fill(&mut self, head: &mut Head, output: &mut Output<'_>) -> Result<Vec<(Arc<Source>, Loose)>> {
+        let mut messages = Vec::new();
+        while let Ok(item) = head.items.recv() {
+            match item {
+                Item::Source(source, account) => {
+                    let goes_on = head
+                        .source
+                        .as_ref()
+                        .is_some_and(|s| self.inputs[s.input].shares_accounts(&self.inputs[source.input]));
+                    if !goes_on {
+                        self.unexplained += head.books.unexplained();
+                        head.books =
+                            if source.is_first { Books::from_zero() } else { Books::after(account.as_ref()) };
+                    }
+                    head.source = Some(source);
+                }
+                Item::Skipped(id, offered) => {
+                    let gap = head.gap(self.inputs, offered);
+                    head.books.gap(gap, false, &mut self.losses);
+                    head.before = head.source.as_ref().map(|s| (id, offered, s.input));
+                    head.damage.clear();
+                    for (source, message) in messages.drain(..) {
+                        output.before(source, message);
+                    }
+                }
+                Item::Set(set) => {
+                    head.next = Some(set);
+                    break;
+                }
+                Item::Between { messages: between, head: is_head } => {
+                    let Some(source) = &head.source else { continue };
+                    for message in between {
+                        if source.channel(Schema::Accounts) == Some(message.channel) {
+                            let (counts, streams) = accounts::read(&message.data)?;
+                            head.books.account(&counts, &mut self.losses);
+                            if output.last.is_none() {
+                                output.see_streams(streams);
+                            }
+                        }
+                        if !is_head {
+                            messages.push((Arc::clone(source), message));
+                        } else if source.channel(Schema::ClockPair) == Some(message.channel) {
+                            head.clock = Some(message);
+                        }
+                    }
+                }
+                Item::Damage(what) => head.damage.push(what),
+                Item::Beyond(account) => {
+                    head.beyond = true;
+                    if let Some(account) = account {
+                        head.books.account(&account, &mut self.losses);
+                    }
+                }
+                Item::Failed(e) => return Err(e),
+            }
+        }
+        Ok(messages)
+    }
+}
+
+impl Head {
+    fn new(items: Receiver<Item>) -> Self {
+        Self {
+            items,
+            source: None,
+            books: Books::default(),
+            before: None,
+            next: None,
+            clock: None,
+            damage: Vec::new(),
+            beyond: false,
+        }
+    }
+
+    fn time(&self) -> Option<u64> {
+        self.next.as_ref().map(|set| set.log_time)
+    }
+
+    fn name(&self) -> String {
+        self.source.as_ref().map_or_else(String::new, |s| s.reader.path.display().to_string())
+    }
+
+    /// Sets that were offered since the set before and are not in this lane.
+    fn gap(&self, inputs: &[Input<'_>], offered: u64) -> u64 {
+        match (&self.before, &self.source) {
+            (Some((_, before, _)), _) => offered.saturating_sub(before.saturating_add(1)),
+            (None, Some(s)) if s.is_first => {
+                offered.saturating_sub(inputs[s.input].offered_before().saturating_add(1))
+            }
+            _ => 0,
+        }
+    }
+}
+
+/// Refuses two sets of one time that are not the same.
+fn must_be_same(a: &Head, b: &Head) -> Result<()> {
+    let (Some(x), Some(y), Some(from), Some(to)) = (&a.next, &b.next, &a.source, &b.source) else {
+        return Ok(());
+    };
+    let what = if x.mark != y.mark {
+        "their commit marks differ"
+    } else if described(x, from)? != described(y, to)? {
+        "their frames are described otherwise"
+    } else {
+        return Ok(());
+    };
+    Err(Error::new(
+        ErrorKind::BadInput,
+        format!(
+            "set {} of {} and set {} of {} have the same time and are not the same ({what}): the inputs contradict \
+             each other; `depthrig verify` each of them",
+            x.mark.id,
+            a.name(),
+            y.mark.id,
+            b.name()
+        ),
+    ))
+}
+
+/// The messages that describe a set; its pictures are in the mark by length and checksum.
+fn described(set: &SetGroup, source: &Source) -> Result<Vec<(String, Vec<u8>)>> {
+    let (Some(chunk), Some(offset)) = (set.chunks.last(), set.offsets.last()) else { return Ok(Vec::new()) };
+    let mut messages = Vec::new();
+    source.reader.chunk_messages(chunk.body(), *offset, |m| {
+        let topic = source.preamble.channels.iter().find(|c| c.id == m.channel).map(|c| c.topic.clone());
+        messages.push((topic.unwrap_or_default(), m.data.to_vec()));
+        Ok(())
+    })?;
+    Ok(messages)
+}

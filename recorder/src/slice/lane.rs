@@ -1,0 +1,319 @@
+//! Reading ahead: a lane is a row of segments whose sets follow each other; one thread reads each.
+
+use crate::container::copy::{Damage, Group, Groups, SetGroup, read_preamble};
+use crate::container::scan::SegmentReader;
+use crate::container::segment::Preamble;
+use crate::dataset::{Dataset, Kind, kinds, segment_number};
+use crate::msgs::accounts;
+use crate::msgs::schemas::Schema;
+use crate::recorder::topics::SESSION_METADATA;
+use crate::{Error, ErrorKind, Result, SetCounts};
+use crossbeam::channel::Sender;
+use std::sync::Arc;
+
+/// Which sets are wanted, by log time; which notes go with them.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Range {
+    pub(super) from_utc_ns: i64,
+    pub(super) to_utc_ns: i64,
+    /// The first set of the source is in it.
+    pub(super) begins: bool,
+    /// The last set of the source is in it.
+    pub(super) ends: bool,
+    pub(super) notes_from_utc_ns: i64,
+    pub(super) notes_to_utc_ns: i64,
+}
+
+impl Range {
+    pub(super) const ALL: Self = Self {
+        from_utc_ns: i64::MIN,
+        to_utc_ns: i64::MAX,
+        begins: true,
+        ends: true,
+        notes_from_utc_ns: i64::MIN,
+        notes_to_utc_ns: i64::MAX,
+    };
+
+    pub(super) const fn has_note(&self, utc_ns: i64) -> bool {
+        self.notes_from_utc_ns <= utc_ns && utc_ns <= self.notes_to_utc_ns
+    }
+}
+
+/// A dataset or a segment to read from.
+pub(super) struct Input<'a> {
+    pub(super) dataset: &'a Dataset,
+}
+
+impl<'a> Input<'a> {
+    pub(super) fn new(dataset: &'a Dataset) -> Self {
+        Self { dataset }
+    }
+
+    /// Sets that were offered before its first segment begins, as its marks count.
+    pub(super) fn offered_before(&self) -> u64 {
+        self.dataset.session().derived.last().map_or(0, |d| d.offered_before)
+    }
+
+    /// Whether the accounts of both count from the same beginning.
+    pub(super) fn shares_accounts(&self, other: &Self) -> bool {
+        self.dataset.session().derived == other.dataset.session().derived
+    }
+}
+
+/// A segment of an input.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Piece {
+    pub(super) input: usize,
+    pub(super) segment: usize,
+}
+
+/// Segments whose sets follow each other in time.
+pub(super) type Lane = Vec<Piece>;
+
+/// A segment that is being read.
+pub(super) struct Source {
+    pub(super) reader: SegmentReader,
+    pub(super) preamble: Preamble,
+    pub(super) input: usize,
+    /// It is the first segment of its dataset.
+    pub(super) is_first: bool,
+}
+
+impl Source {
+    /// The channel whose messages are of this type.
+    pub(super) fn channel(&self, schema: Schema) -> Option<u16> {
+        channel(&self.preamble, schema)
+    }
+}
+
+/// The channel of a file whose messages are of this type.
+pub(super) fn channel(preamble: &Preamble, schema: Schema) -> Option<u16> {
+    let id = preamble.schemas.iter().find(|s| s.name == schema.name())?.id;
+    preamble.channels.iter().find(|c| c.schema == id).map(|c| c.id)
+}
+
+/// A message between two sets.
+#[derive(Debug, Clone)]
+pub(super) struct Loose {
+    pub(super) channel: u16,
+    pub(super) publish_time: u64,
+    pub(super) data: Vec<u8>,
+}
+
+/// What a lane's thread hands on.
+pub(super) enum Item {
+    /// What follows is from this segment.
+    Source(Arc<Source>, Option<SetCounts>),
+    /// A set before the range: its id and how many sets were offered up to it.
+    Skipped(u64, u64),
+    Set(Box<SetGroup>),
+    /// What lies between two sets; `head` before the first set of a segment.
+    Between {
+        messages: Vec<Loose>,
+        head: bool,
+    },
+    /// What cannot be read, in words.
+    Damage(String),
+    /// There are sets beyond the range. With the next account: it tells of losses before them.
+    Beyond(Option<SetCounts>),
+    Failed(Error),
+}
+
+/// All that is to be read.
+pub(super) struct Lanes {
+    pub(super) lanes: Vec<Lane>,
+    /// Log times of the first and the last set.
+    pub(super) times: (i64, i64),
+}
+
+/// Divides segments into as few lanes as possible, so that the sets of each lane follow each other in time. `None`
+/// when there is no set.
+pub(super) fn lanes(inputs: &[Input<'_>]) -> Result<Option<Lanes>> {
+    let mut spans = Vec::new();
+    for (input, source) in inputs.iter().enumerate() {
+        for segment in 0..source.dataset.segments().len() {
+            let Some(reader) = source.dataset.open_segment(segment) else { continue };
+            let reader = reader?;
+            let kinds = kinds(&reader);
+            let is_set = |id: &u16| kinds.get(id) == Some(&Kind::Set);
+            let marks = reader.chunks.iter().filter(|c| c.channels.iter().any(is_set));
+            let times = marks.map(|c| (c.start_time as i64, c.end_time as i64));
+            let span = times.reduce(|(a, b), (from, to)| (a.min(from), b.max(to)));
+            if let Some((from, to)) = span {
+                spans.push((from, to, Piece { input, segment }));
+            }
+        }
+    }
+    spans.sort_by_key(|(from, to, piece)| (*from, *to, piece.input, piece.segment));
+    let Some(first) = spans.first().map(|s| s.0) else { return Ok(None) };
+    let last = spans.iter().map(|s| s.1).max().unwrap_or(first);
+    let mut lanes: Vec<(i64, Lane)> = Vec::new();
+    for (from, to, piece) in spans {
+        let free = |lane: &&mut (i64, Lane)| lane.0 < from;
+        let same = |lane: &(i64, Lane)| lane.1.last().is_some_and(|p| p.input == piece.input);
+        // Stay with an input where that is possible: its accounts go on.
+        let at = lanes.iter_mut().filter(free).max_by_key(|lane| same(lane));
+        match at {
+            Some((end, pieces)) => {
+                *end = to;
+                pieces.push(piece);
+            }
+            None => lanes.push((to, vec![piece])),
+        }
+    }
+    let lanes = lanes.into_iter().map(|(_, pieces)| pieces).collect();
+    Ok(Some(Lanes { lanes, times: (first, last) }))
+}
+
+/// Bytes of the chunks that a lane will copy.
+pub(super) fn bytes(inputs: &[Input<'_>], lane: &[Piece], range: &Range) -> Result<u64> {
+    let mut total = 0;
+    for piece in lane {
+        let reader = match inputs[piece.input].dataset.open_segment(piece.segment) {
+            Some(Ok(reader)) => reader,
+            Some(Err(e)) if e.kind() == ErrorKind::Io => return Err(e),
+            _ => continue,
+        };
+        let inside = reader
+            .chunks
+            .iter()
+            .filter(|c| (c.end_time as i64) >= range.from_utc_ns && (c.start_time as i64) <= range.to_utc_ns);
+        total += inside.map(|c| c.length).sum::<u64>();
+    }
+    Ok(total)
+}
+
+/// Hands on everything of a lane, in order. Ends early when nobody listens any more.
+pub(super) fn read(inputs: &[Input<'_>], lane: &[Piece], range: &Range, items: &Sender<Item>) {
+    let mut reading = Reading { inputs, range, items, account: None };
+    if let Err(Stop::Failed(e)) = reading.run(lane) {
+        // Nobody listens where this fails.
+        let _ = items.send(Item::Failed(e));
+    }
+}
+
+/// Why reading ends before the end.
+enum Stop {
+    Failed(Error),
+    /// Beyond the range, or nobody listens.
+    Enough,
+}
+
+impl From<Error> for Stop {
+    fn from(e: Error) -> Self {
+        Self::Failed(e)
+    }
+}
+
+struct Reading<'a> {
+    inputs: &'a [Input<'a>],
+    range: &'a Range,
+    items: &'a Sender<Item>,
+    /// The last account of the segments that were passed over.
+    account: Option<SetCounts>,
+}
+
+impl Reading<'_> {
+    fn send(&self, item: Item) -> Result<(), Stop> {
+        self.items.send(item).map_err(|_| Stop::Enough)
+    }
+
+    fn run(&mut self, lane: &[Piece]) -> Result<(), Stop> {
+        for piece in lane {
+            let input = &self.inputs[piece.input];
+            let Some(opened) = input.dataset.open_segment(piece.segment) else { continue };
+            let reader = match opened {
+                Ok(reader) => reader,
+                Err(e) if e.kind() == ErrorKind::Io => return Err(e.into()),
+                Err(e) => {
+                    self.send(Item::Damage(e.to_string()))?;
+                    continue;
+                }
+            };
+            super::check_segment(input.dataset.session(), reader.metadata(SESSION_METADATA), &reader.path)?;
+            if reader.chunks.iter().all(|c| (c.end_time as i64) < self.range.from_utc_ns) {
+                self.account = last_account(&reader)?.or(self.account);
+                continue;
+            }
+            self.segment(reader, *piece)?;
+        }
+        Ok(())
+    }
+
+    fn segment(&mut self, reader: SegmentReader, piece: Piece) -> Result<(), Stop> {
+        let (preamble, first) = read_preamble(&reader)?;
+        let number = reader.path.file_name().and_then(|n| segment_number(&n.to_string_lossy()));
+        let is_first = number == Some(0);
+        let source = Arc::new(Source { reader, preamble, input: piece.input, is_first });
+        let account = self.account.take();
+        self.send(Item::Source(Arc::clone(&source), account))?;
+        let mut groups = Groups::new(&source.reader, &source.preamble, first)?;
+        let file = &source.reader.path;
+        while let Some(group) = groups.next()? {
+            match group {
+                Group::Set(set) if (set.log_time as i64) < self.range.from_utc_ns => {
+                    self.send(Item::Skipped(set.mark.id, set.mark.sets_offered))?;
+                }
+                Group::Set(set) if (set.log_time as i64) > self.range.to_utc_ns => {
+                    let account = next_account(&source, &mut groups)?;
+                    self.send(Item::Beyond(account))?;
+                    return Err(Stop::Enough);
+                }
+                Group::Set(set) => self.send(Item::Set(Box::new(set)))?,
+                Group::Between(between) => {
+                    let mut messages = Vec::new();
+                    source.reader.chunk_messages(between.chunk.body(), between.offset, |m| {
+                        let (channel, publish_time) = (m.channel, m.publish_time);
+                        messages.push(Loose { channel, publish_time, data: m.data.to_vec() });
+                        Ok(())
+                    })?;
+                    self.send(Item::Between { messages, head: between.head })?;
+                }
+                Group::Metadata(..) => {}
+                Group::Damage(Damage { from, why, .. }) => {
+                    self.send(Item::Damage(format!("{} at byte {from}: {why}", file.display())))?;
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The next account in the segment, which is within about a second.
+fn next_account(source: &Source, groups: &mut Groups<'_>) -> Result<Option<SetCounts>> {
+    let channel = source.channel(Schema::Accounts);
+    while let Some(group) = groups.next()? {
+        let Group::Between(between) = group else { continue };
+        let mut account = None;
+        source.reader.chunk_messages(between.chunk.body(), between.offset, |m| {
+            if channel == Some(m.channel) {
+                account = Some(accounts::read(m.data)?.0);
+            }
+            Ok(())
+        })?;
+        if account.is_some() {
+            return Ok(account);
+        }
+    }
+    Ok(None)
+}
+
+/// The last account in a segment.
+fn last_account(reader: &SegmentReader) -> Result<Option<SetCounts>> {
+    let channel = reader.channels.iter().find(|(_, c)| c.schema == Schema::Accounts.name());
+    let Some((channel, _)) = channel else { return Ok(None) };
+    let Some(entry) = reader.chunks.iter().rev().find(|c| c.channels.contains(channel)) else {
+        return Ok(None);
+    };
+    let mut last = None;
+    let read = reader.messages(entry, |m| {
+        if m.channel == *channel {
+            last = Some(accounts::read(m.data)?.0);
+        }
+        Ok(())
+    });
+    match read {
+        Err(e) if e.kind() == ErrorKind::Io => Err(e),
+        _ => Ok(last),
+    }
+}

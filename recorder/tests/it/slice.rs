@@ -1,0 +1,525 @@
+//! Cutting and joining.
+
+use crate::support::*;
+use depthrig_recorder::fs::{Fault, Fs, MemFs};
+use depthrig_recorder::{
+    ColorCodec, CompareOptions, Dataset, DepthCodec, Edge, ErrorKind, Moment, Recorder, RecorderOptions,
+    Session, SetSpan, Severity, SliceOptions, SliceReport, StreamAccount, VerifyOptions, VerifyReport,
+    compare, merge, trim, verify_with,
+};
+use proptest::prelude::*;
+use std::io;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+fn shared(fs: &MemFs) -> Arc<dyn Fs> {
+    Arc::new(fs.clone())
+}
+
+fn at(fs: &MemFs, path: impl AsRef<Path>) -> Dataset {
+    Dataset::open_with(shared(fs), path.as_ref()).unwrap()
+}
+
+fn named(name: &str) -> PathBuf {
+    PathBuf::from("/data").join(name)
+}
+
+fn ids(from: u64, to: u64) -> SetSpan {
+    SetSpan { from: Some(Edge::Set(from)), to: Some(Edge::Set(to)) }
+}
+
+fn cut(fs: &MemFs, out: &str, span: SetSpan) -> depthrig_recorder::Result<SliceReport> {
+    trim(fs, &open(fs), &named(out), span, &SliceOptions::default(), &mut |_, _| ControlFlow::Continue(()))
+}
+
+fn join(fs: &MemFs, out: &str, inputs: &[Dataset]) -> depthrig_recorder::Result<SliceReport> {
+    merge(fs, inputs, &named(out), &SliceOptions::default(), &mut |_, _| ControlFlow::Continue(()))
+}
+
+fn check(fs: &MemFs, name: &str) -> VerifyReport {
+    verify_with(&shared(fs), &named(name), &VerifyOptions { decode: true, ..VerifyOptions::default() })
+        .unwrap()
+}
+
+fn strictly() -> CompareOptions {
+    CompareOptions { strict: true, pixels: depthrig_recorder::PixelCheck::Stored, ..Default::default() }
+}
+
+/// A recording that writes accounts as often as it can, with segments of so many sets.
+fn quick(sets_per_segment: i64) -> RecorderOptions {
+    RecorderOptions {
+        // Each picture in a message of another type: an image, a picture file, depth in its own codec.
+        color: if sets_per_segment % 2 == 0 { ColorCodec::Jpeg } else { ColorCodec::Raw },
+        depth: if sets_per_segment % 3 == 0 { DepthCodec::Rank } else { DepthCodec::Zstd },
+        sync_interval_ns: 1_000_000,
+        segment_max_ns: sets_per_segment * PERIOD,
+        ..options()
+    }
+}
+
+fn account(stream: &str, n: u64) -> StreamAccount {
+    let stream = stream.parse().unwrap();
+    StreamAccount { stream, captured: 6 * n, delivered: 6 * n, dropped: depthrig_bus::DropCounts([0; 8]) }
+}
+
+/// Records `sets` sets; before the set numbered `n`, `refused(n)` sets are refused.
+fn recording(fs: &MemFs, sets: u64, options: RecorderOptions, refused: impl Fn(u64) -> u64) {
+    let r = Recorder::create(shared(fs), &dir(), session(), options).unwrap();
+    for n in 0..=sets {
+        for _ in 0..refused(n) {
+            // An id that is not greater than the last one, or a stream that is not there.
+            let mut bad = set(&session(), n);
+            bad.id = 0;
+            bad.missing.push(9);
+            r.push(bad).unwrap_err();
+        }
+        if n < sets {
+            r.push(set(&session(), n)).unwrap();
+            settle(&r);
+        }
+        r.update_accounts(vec![account("front/depth", n + 1), account("front/color", n + 1)]);
+    }
+    r.finish().unwrap();
+}
+
+#[test]
+fn a_part_is_a_whole_dataset() {
+    let fs = MemFs::new();
+    recording(&fs, 12, quick(4), |_| 0);
+    let report = cut(
+        &fs,
+        "part",
+        SetSpan { from: Some(Edge::Moment(Moment::AfterFirst(3 * PERIOD))), to: Some(Edge::Set(10)) },
+    );
+    let report = report.unwrap();
+    assert_eq!((report.sets, report.first_set, report.last_set, report.segments), (7, 4, 10, 1));
+    assert!(report.complete && report.duration_ns == 6 * PERIOD);
+    let verified = check(&fs, "part");
+    assert_eq!(verified.findings, []);
+    assert_eq!((verified.sets, verified.frames, verified.bytes), (7, 21, report.bytes));
+
+    let part = at(&fs, named("part"));
+    let s = part.session();
+    assert_eq!((s.name.as_str(), s.started_utc_ns, &s.streams), ("part", T0, &session().streams));
+    let outcome = s.outcome.as_ref().unwrap();
+    assert_eq!((outcome.sets_offered, outcome.sets_recorded, outcome.complete), (7, 7, true));
+    assert_eq!(outcome.ended_utc_ns, T0 + 9 * PERIOD);
+    let [derived] = &s.derived[..] else { panic!("{:?}", s.derived) };
+    assert_eq!((derived.by.as_str(), &derived.from[..]), ("trim", &["session".to_owned()][..]));
+    assert_eq!((derived.first_utc_ns, derived.last_utc_ns), (T0 + 3 * PERIOD, T0 + 9 * PERIOD));
+
+    // The frames are those of the source, byte by byte as stored.
+    let got: Vec<_> =
+        part.sets_with((..).into(), depthrig_recorder::PixelMode::Stored).map(Result::unwrap).collect();
+    let want =
+        open(&fs).sets_with((T0 + 3 * PERIOD..=T0 + 9 * PERIOD).into(), depthrig_recorder::PixelMode::Stored);
+    for (got, want) in got.iter().zip(want.map(Result::unwrap)) {
+        assert_eq!((got.id, got.utc_ns, got.utc_offset_ns), (want.id, want.utc_ns, want.utc_offset_ns));
+        for (a, b) in got.frames.iter().zip(&want.frames) {
+            assert_eq!(
+                (&a.pixels, a.stored_bytes, a.header.sequence),
+                (&b.pixels, b.stored_bytes, b.header.sequence)
+            );
+        }
+    }
+    // The segment stands alone, and another reader finds all of it.
+    let bytes = contents(&fs, &named("part/seg_0000.mcap"));
+    let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
+    let topics: Vec<_> =
+        mcap::MessageStream::new(&bytes).unwrap().map(|m| m.unwrap().channel.topic.clone()).collect();
+    assert_eq!(topics.len() as u64, summary.stats.unwrap().message_count);
+    assert_eq!(topics[..2], ["/tf_static", "/rig/clock"]);
+    assert_eq!(topics.iter().filter(|t| *t == "/rig/frame_set").count(), 7);
+    let names: Vec<_> = fs.read_dir(&named("")).unwrap().into_iter().map(|e| e.name).collect();
+    assert_eq!(names, ["part", "session"], "nothing else is left");
+}
+
+#[test]
+fn segments_are_cut_at_their_limits() {
+    let fs = MemFs::new();
+    recording(&fs, 9, quick(100), |_| 0);
+    let options = SliceOptions { segment_max_ns: 2 * PERIOD, ..SliceOptions::default() };
+    let report =
+        trim(&fs, &open(&fs), &named("part"), ids(2, 8), &options, &mut |_, _| ControlFlow::Continue(()))
+            .unwrap();
+    assert_eq!(report.segments, 4);
+    assert_eq!(check(&fs, "part").findings, []);
+    let options = SliceOptions { segment_max_bytes: 1, ..SliceOptions::default() };
+    let part = at(&fs, named("part"));
+    let report =
+        merge(&fs, &[part], &named("again"), &options, &mut |_, _| ControlFlow::Continue(())).unwrap();
+    assert_eq!(report.segments, 7);
+    assert_eq!(check(&fs, "again").findings, []);
+    // Each is whole on its own.
+    for i in 0..7 {
+        assert_eq!(check(&fs, &format!("again/seg_{i:04}.mcap")).findings, [], "segment {i}");
+    }
+}
+
+/// Notes by their own time, wherever the second's chunk put them.
+#[test]
+fn notes_go_with_the_sets_of_their_time() {
+    let fs = MemFs::new();
+    let r = Recorder::create(
+        shared(&fs),
+        &dir(),
+        session(),
+        RecorderOptions { sync_interval_ns: 1 << 60, ..quick(100) },
+    );
+    let r = r.unwrap();
+    for n in 0..6 {
+        r.push(set(&session(), n)).unwrap();
+        settle(&r);
+    }
+    r.finish().unwrap();
+    // The recorder stamps notes with the time of day; the sets here are of another day, so the stamps are set.
+    let mut s = open(&fs).session().clone();
+    let note = |ns: i64, text: &str| depthrig_recorder::Note { utc_ns: T0 + ns, text: text.into() };
+    s.notes = vec![
+        note(-5, "before"),
+        note(PERIOD + 7, "in set 2"),
+        note(4 * PERIOD - 1, "in set 4"),
+        note(4 * PERIOD, "in set 5"),
+        note(9 * PERIOD, "after"),
+    ];
+    fs.put(&dir().join("session.toml"), s.to_toml().unwrap().into_bytes());
+    let notes = |name: &str| {
+        let texts: Vec<_> = at(&fs, named(name)).session().notes.iter().map(|n| n.text.clone()).collect();
+        let bytes = contents(&fs, &named(name).join("seg_0000.mcap"));
+        let messages = mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap);
+        let in_file = messages.filter(|m| m.channel.topic == "/rig/notes").count();
+        assert_eq!(in_file, texts.len(), "{name}");
+        texts
+    };
+    cut(&fs, "a", ids(1, 1)).unwrap();
+    cut(&fs, "b", ids(2, 4)).unwrap();
+    cut(&fs, "c", ids(5, 6)).unwrap();
+    assert_eq!(notes("a"), ["before"]);
+    assert_eq!(notes("b"), ["in set 2", "in set 4"]);
+    assert_eq!(notes("c"), ["in set 5", "after"]);
+    join(&fs, "all", &[at(&fs, named("c")), at(&fs, named("a")), at(&fs, named("b"))]).unwrap();
+    assert_eq!(notes("all"), ["before", "in set 2", "in set 4", "in set 5", "after"]);
+    for name in ["a", "b", "c", "all"] {
+        assert_eq!(check(&fs, name).findings, [], "{name}");
+    }
+}
+
+/// Where a recording is cut, which parts overlap, and what it lost.
+#[derive(Debug, Clone)]
+struct Plan {
+    sets: u64,
+    sets_per_segment: i64,
+    /// Sets refused before the set of each number; the last is after the last set.
+    refused: Vec<u64>,
+    /// First and last id of each part.
+    parts: Vec<(u64, u64)>,
+}
+
+fn plan() -> impl Strategy<Value = Plan> {
+    (2..11u64).prop_flat_map(|sets| {
+        let refused = proptest::collection::vec(prop_oneof![4 => Just(0), 1 => 1..3u64], sets as usize + 1);
+        let parts = proptest::collection::vec((1..=sets, 1..=sets), 1..5);
+        (Just(sets), 1..5i64, refused, any::<bool>(), parts, any::<u64>()).prop_map(
+            |(sets, sets_per_segment, refused, lossless, parts, shuffle)| {
+                let refused = if lossless { vec![0; refused.len()] } else { refused };
+                let mut parts: Vec<_> = parts.into_iter().map(|(a, b)| (a.min(b), a.max(b))).collect();
+                // Whatever no part covers becomes a part: together they are the whole.
+                let mut next = 1;
+                for n in 1..=sets + 1 {
+                    if n > sets || parts.iter().any(|(a, b)| (a..=b).contains(&&n)) {
+                        if next < n {
+                            parts.push((next, n - 1));
+                        }
+                        next = n + 1;
+                    }
+                }
+                let by = shuffle as usize % parts.len();
+                parts.rotate_left(by);
+                Plan { sets, sets_per_segment, refused, parts }
+            },
+        )
+    })
+}
+
+/// How many sets a dataset says were lost, by count and in words.
+fn lost(fs: &MemFs, name: &str) -> (u64, u64) {
+    let dataset = at(fs, named(name));
+    let outcome = dataset.session().outcome.clone().unwrap();
+    let counted: u64 = outcome.sets_dropped.values().sum();
+    assert_eq!(outcome.sets_offered, outcome.sets_recorded + counted);
+    let in_words = outcome.lost.iter().filter(|l| !l.contains("were not recorded"));
+    (counted, in_words.filter_map(|l| l.split(' ').next()?.parse::<u64>().ok()).sum())
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(if std::env::var_os("DEPTHRIG_LONG").is_some() { 1500 } else { 40 }))]
+    #[test]
+    fn parts_joined_again_are_the_recording(plan in plan()) {
+        let fs = MemFs::new();
+        recording(&fs, plan.sets, quick(plan.sets_per_segment), |n| plan.refused[n as usize]);
+        let mut parts = Vec::new();
+        for (i, (a, b)) in plan.parts.iter().enumerate() {
+            let name = format!("part{i}");
+            let report = cut(&fs, &name, ids(*a, *b)).unwrap();
+            prop_assert_eq!((report.sets, report.first_set, report.last_set), (b - a + 1, *a, *b));
+            // Set n is number n - 1: what was refused before it belongs to a part that has the set before as well.
+            let between = plan.refused[*a as usize..*b as usize].iter().sum::<u64>();
+            let before = if *a == 1 { plan.refused[0] } else { 0 };
+            let after = if *b == plan.sets { plan.refused[*b as usize] } else { 0 };
+            prop_assert_eq!(lost(&fs, &name), (between + before + after, 0), "part {} of {:?}", i, plan);
+            let expected = if report.complete { None } else { Some(Severity::Lost) };
+            let verified = check(&fs, &name);
+            prop_assert_eq!(verified.worst(), expected, "{:?}", verified.findings);
+            prop_assert_eq!(verified.sets, report.sets);
+            parts.push(at(&fs, named(&name)));
+        }
+        let report = join(&fs, "whole", &parts).unwrap();
+        let total: u64 = plan.parts.iter().map(|(a, b)| b - a + 1).sum();
+        prop_assert_eq!((report.sets, report.repeated), (plan.sets, total - plan.sets));
+        let all: u64 = plan.refused.iter().sum();
+        let (counted, in_words) = lost(&fs, "whole");
+        prop_assert_eq!(counted + in_words, all, "{:?}", at(&fs, named("whole")).session().outcome);
+        let verified = check(&fs, "whole");
+        prop_assert_eq!(verified.worst(), (all > 0).then_some(Severity::Lost), "{:?}", verified.findings);
+        let c = compare(&open(&fs), &at(&fs, named("whole")), &strictly()).unwrap();
+        prop_assert!(c.equal, "{:?}", c.differences);
+    }
+
+    /// Single segments, in any order, some of them twice.
+    #[test]
+    fn loose_segments_joined_are_the_recording(plan in plan(), twice in 0..4usize, shuffle in any::<usize>()) {
+        let fs = MemFs::new();
+        recording(&fs, plan.sets, quick(plan.sets_per_segment), |n| plan.refused[n as usize]);
+        let source = open(&fs);
+        let mut loose: Vec<_> = source.segments().iter().map(|path| at(&fs, path)).collect();
+        let n = loose.len();
+        loose.extend(source.segments().iter().cycle().skip(shuffle % n).take(twice).map(|path| at(&fs, path)));
+        let by = shuffle % loose.len();
+        loose.rotate_left(by);
+        let report = join(&fs, "whole", &loose).unwrap();
+        prop_assert_eq!(report.sets, plan.sets);
+        let all: u64 = plan.refused.iter().sum();
+        prop_assert_eq!(lost(&fs, "whole"), (all, 0), "{:?}", at(&fs, named("whole")).session().outcome);
+        let verified = check(&fs, "whole");
+        prop_assert_eq!(verified.worst(), (all > 0).then_some(Severity::Lost), "{:?}", verified.findings);
+        let c = compare(&source, &at(&fs, named("whole")), &strictly()).unwrap();
+        prop_assert!(c.equal, "{:?}", c.differences);
+    }
+}
+
+#[test]
+fn a_gap_between_the_inputs_is_said() {
+    let fs = MemFs::new();
+    recording(&fs, 9, quick(3), |_| 0);
+    cut(&fs, "a", ids(1, 3)).unwrap();
+    cut(&fs, "b", ids(6, 9)).unwrap();
+    let report = join(&fs, "both", &[at(&fs, named("b")), at(&fs, named("a"))]).unwrap();
+    assert_eq!(report.lost, ["2 sets between set 3 and set 6 are in none of the inputs"]);
+    let verified = check(&fs, "both");
+    assert_eq!(verified.worst(), Some(Severity::Lost));
+    assert!(verified.findings.iter().any(|f| f.message == report.lost[0]), "{:?}", verified.findings);
+    // Once the gap is filled, nobody speaks of it any more.
+    cut(&fs, "c", ids(4, 5)).unwrap();
+    let report = join(&fs, "all", &[at(&fs, named("both")), at(&fs, named("c"))]).unwrap();
+    assert!(report.complete, "{:?}", report.lost);
+    assert_eq!(check(&fs, "all").findings, []);
+}
+
+#[test]
+fn what_contradicts_itself_or_is_of_another_session_is_refused() {
+    let fs = MemFs::new();
+    recording(&fs, 4, quick(100), |_| 0);
+    let refused = |change: &dyn Fn(&mut Session, u64) -> depthrig_recorder::RecordSet| {
+        let other = MemFs::new();
+        let mut s = session();
+        change(&mut s, 0);
+        let r = Recorder::create(shared(&other), &dir(), s, quick(100)).unwrap();
+        for n in 0..4 {
+            r.push(change(&mut session(), n)).unwrap();
+            settle(&r);
+        }
+        r.finish().unwrap();
+        let e = join(&fs, "out", &[open(&fs), at(&other, dir())]).unwrap_err();
+        assert_eq!(e.kind(), ErrorKind::BadInput, "{e}");
+        assert_eq!(names_of(&fs), ["session"], "nothing is left: {e}");
+        e.to_string()
+    };
+    let plain = |_: &mut Session, n: u64| set(&session(), n);
+    let e = refused(&|s, n| {
+        s.started_utc_ns += 1;
+        plain(s, n)
+    });
+    assert!(e.contains("not of the same session") && e.contains("began at"), "{e}");
+    let e = refused(&|s, n| {
+        s.streams[1].intrinsics.fx += 1.0;
+        s.streams[1].depth_unit_m = 0.001;
+        plain(s, n)
+    });
+    assert!(e.contains("front/depth has another calibration; front/depth has another depth unit"), "{e}");
+    let e = refused(&|s, n| {
+        s.streams.pop();
+        let mut set = plain(s, n);
+        set.frames.truncate(2);
+        set
+    });
+    assert!(
+        e.contains("the streams are front/color, front/depth, side/ir_left and front/color, front/depth"),
+        "{e}"
+    );
+
+    let e = refused(&|_, n| {
+        let mut s = set(&session(), n);
+        if n == 2 {
+            let mut bytes = s.frames[1].pixels.bytes().to_vec();
+            bytes[9] ^= 1;
+            s.frames[1].pixels = Box::new(bytes);
+        }
+        s
+    });
+    assert!(e.contains("set 3 of") && e.contains("their commit marks differ"), "{e}");
+    let e = refused(&|_, n| {
+        let mut s = set(&session(), n);
+        s.frames[0].header.gain += f32::from(u8::from(n == 1));
+        s
+    });
+    assert!(e.contains("set 2 of") && e.contains("their frames are described otherwise"), "{e}");
+    let e = refused(&|_, n| {
+        let mut s = set(&session(), n);
+        s.id += 10;
+        s
+    });
+    assert!(e.contains("set 1 of") && e.contains("their commit marks differ"), "{e}");
+    let e = refused(&|_, n| {
+        let mut s = set(&session(), n);
+        s.tick = s.tick.plus_ns(50_000_000);
+        s
+    });
+    assert!(e.contains("comes after set 1 in time, but not by its number"), "{e}");
+}
+
+fn names_of(fs: &MemFs) -> Vec<String> {
+    fs.read_dir(&named("")).unwrap().into_iter().map(|e| e.name).collect()
+}
+
+#[test]
+fn nothing_is_written_over() {
+    let fs = MemFs::new();
+    recording(&fs, 3, quick(100), |_| 0);
+    let before = contents(&fs, &segment(0));
+    let e = cut(&fs, "session", ids(1, 2)).unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::AlreadyExists);
+    // What a run that was cut off has left stays as well, and is named.
+    fs.create_dir_all(&named("part.part")).unwrap();
+    fs.put(&named("part.part/seg_0000.mcap.part"), vec![1]);
+    let e = cut(&fs, "part", ids(1, 2)).unwrap_err();
+    assert!(e.to_string().contains("/data/part.part is there already"), "{e}");
+    assert_eq!(contents(&fs, &named("part.part/seg_0000.mcap.part")), [1]);
+    assert_eq!(contents(&fs, &segment(0)), before);
+    let e = cut(&fs, "empty", SetSpan { from: Some(Edge::Set(8)), to: None }).unwrap_err();
+    assert!(e.to_string().contains("no set is between these; the dataset has sets 1 to 3"), "{e}");
+}
+
+#[test]
+fn a_disk_without_room_is_refused_before_and_leaves_nothing() {
+    let fs = MemFs::new();
+    recording(&fs, 3, quick(100), |_| 0);
+    let full = copy(&fs).with_capacity(10 << 20);
+    let e = trim(&full, &open(&fs), &named("part"), ids(1, 3), &SliceOptions::default(), &mut |_, _| {
+        ControlFlow::Continue(())
+    });
+    assert_eq!(e.unwrap_err().kind(), ErrorKind::DiskFull);
+    assert_eq!(names_of(&full), ["session"]);
+}
+
+#[test]
+fn an_end_from_outside_leaves_nothing() {
+    let fs = MemFs::new();
+    recording(&fs, 6, quick(2), |_| 0);
+    let mut told = Vec::new();
+    let e = trim(&fs, &open(&fs), &named("part"), ids(2, 6), &SliceOptions::default(), &mut |done, total| {
+        told.push((done, total));
+        if told.len() == 4 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    })
+    .unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::Cancelled);
+    assert!(told.windows(2).all(|w| w[0].0 < w[1].0 && w[1].0 < w[1].1), "{told:?}");
+    assert_eq!(names_of(&fs), ["session"]);
+}
+
+/// Whatever operation fails: an error, the input as it was, and either the whole or nothing under the new name.
+#[test]
+fn any_failing_operation_leaves_the_whole_or_nothing() {
+    let good = MemFs::new();
+    recording(&good, 4, quick(2), |_| 0);
+    let source = contents(&good, &segment(1));
+    let whole = copy(&good);
+    cut(&whole, "part", ids(2, 4)).unwrap();
+    let (mut failed, mut nothing) = (0, 0);
+    for n in 0..whole.ops() {
+        for short in [false, true] {
+            let fault = Fault::FailFrom(n, io::ErrorKind::StorageFull);
+            let fault = if short { Fault::FailOnce(n, io::ErrorKind::StorageFull) } else { fault };
+            // The input is read from a good disk: this is about the one that is written.
+            let fs = copy(&good).with_fault(fault).with_fault(Fault::ShortWrites(1000));
+            let made =
+                trim(&fs, &open(&good), &named("part"), ids(2, 4), &SliceOptions::default(), &mut |_, _| {
+                    ControlFlow::Continue(())
+                });
+            assert_eq!(contents(&fs, &segment(1)), source);
+            let after = copy(&fs);
+            if after.contents(&named("part/session.toml")).is_some() {
+                assert_eq!(check(&after, "part").findings, [], "operation {n}");
+            } else {
+                assert!(
+                    !names_of(&after).contains(&"part".to_owned()),
+                    "operation {n}: {:?}",
+                    names_of(&after)
+                );
+                nothing += 1;
+            }
+            if let Err(e) = made {
+                failed += 1;
+                assert_eq!(e.kind(), ErrorKind::DiskFull, "operation {n}: {e}");
+            }
+        }
+    }
+    assert!(failed > 30 && nothing > 30, "{failed} failed, {nothing} left nothing");
+}
+
+#[test]
+fn a_damaged_set_costs_itself_and_is_named() {
+    let fs = MemFs::new();
+    recording(&fs, 6, quick(100), |_| 0);
+    let reference = copy(&fs);
+    let mut bytes = contents(&fs, &segment(0));
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    fs.put(&segment(0), bytes);
+    let report = cut(&fs, "part", SetSpan::default()).unwrap();
+    assert_eq!(report.sets, 5);
+    assert!(report.lost.len() == 1 && report.lost[0].starts_with("1 sets between set "), "{:?}", report.lost);
+    let verified = check(&fs, "part");
+    assert_eq!(verified.worst(), Some(Severity::Lost), "{:?}", verified.findings);
+    // Another copy has the set that is damaged here.
+    let report = join(&fs, "mended", &[open(&fs), open(&reference)]).unwrap();
+    assert!(report.complete && report.sets == 6, "{:?}", report.lost);
+    let c = compare(&open(&reference), &at(&fs, named("mended")), &strictly()).unwrap();
+    assert!(c.equal, "{:?}", c.differences);
+    assert_eq!(check(&fs, "mended").findings, []);
+}
+
+#[test]
+fn an_unfinished_segment_can_be_joined_and_its_end_is_said() {
+    let fs = MemFs::new();
+    recording(&fs, 6, quick(3), |_| 0);
+    let bytes = contents(&fs, &segment(1));
+    fs.remove_file(&segment(1)).unwrap();
+    let chunks = mcap::Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
+    let end = chunks[chunks.len() / 2].chunk_start_offset as usize + 5;
+    fs.put(&dir().join("seg_0001.mcap.part"), bytes[..end].to_vec());
+    let report = join(&fs, "joined", &[open(&fs)]).unwrap();
+    assert!((4..6).contains(&report.sets), "{report:?}");
+    assert!(report.lost.iter().any(|l| l.starts_with("what came after set ")), "{:?}", report.lost);
+    assert_eq!(check(&fs, "joined").worst(), Some(Severity::Lost));
+}
