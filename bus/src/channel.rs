@@ -12,6 +12,7 @@ use iceoryx2::port::listener::{Listener, ListenerWaitError};
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::port::{LoanError, ReceiveError};
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample;
@@ -287,6 +288,13 @@ impl<H: Header> Sender<H> {
             };
             Error::new(kind, format!("{}: {why}", self.what)).with_source(e)
         })
+    }
+
+    /// Gives subscribers that came since the last sample that one. Sending does it as well.
+    pub fn welcome(&self) {
+        if let Err(e) = self.port.update_connections() {
+            tracing::debug!(channel = self.what, error = ?e, "a new subscriber could not be connected");
+        }
     }
 
     /// Publishes a slot whose every byte has been written, then wakes sleepers. Never blocks on one.

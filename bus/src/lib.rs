@@ -20,6 +20,7 @@ mod sets;
 pub mod shm;
 mod subscriber;
 
+pub use channel::BUFFER as SUBSCRIBER_BUFFER;
 pub use clock::{HostTime, UtcPair};
 pub use drops::{DropCounts, DropReason};
 pub use error::{Error, ErrorKind, Result};

@@ -104,8 +104,17 @@ impl Bus {
     /// # Errors
     /// As [`Self::publisher`].
     pub fn set_publisher(&self) -> Result<SetPublisher> {
+        self.set_publisher_with(SetPublisher::SLOTS)
+    }
+
+    /// The same with `slots` slots of shared memory. With as few as wait unread for a subscriber at most
+    /// ([`crate::SUBSCRIBER_BUFFER`]) no set is ever replaced: sending fails until one was read.
+    ///
+    /// # Errors
+    /// As [`Self::publisher`].
+    pub fn set_publisher_with(&self, slots: usize) -> Result<SetPublisher> {
         let channel = self.set_channel();
-        Ok(SetPublisher::new(channel.sender(&self.node, SetPublisher::MAX_BYTES, SetPublisher::SLOTS)?))
+        Ok(SetPublisher::new(channel.sender(&self.node, SetPublisher::MAX_BYTES, slots)?))
     }
 
     /// Opens the rig's channel of frame sets for reading.

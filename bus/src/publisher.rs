@@ -29,6 +29,12 @@ impl Publisher {
         Ok(FrameMut { loan })
     }
 
+    /// Gives subscribers that came since the last frame that one. Sending does it as well, so only who pauses needs
+    /// it.
+    pub fn welcome(&self) {
+        self.sender.welcome();
+    }
+
     /// Publishes `frame`, stamping its publish time; returns how many subscribers it went to.
     ///
     /// # Errors

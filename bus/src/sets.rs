@@ -83,6 +83,11 @@ impl SetPublisher {
         Self { sender }
     }
 
+    /// Gives subscribers that came since the last set that one, as [`crate::Publisher::welcome`] does.
+    pub fn welcome(&self) {
+        self.sender.welcome();
+    }
+
     /// Publishes a set; `members` and `present` of `header` are filled in.
     ///
     /// # Errors

@@ -16,7 +16,9 @@ mod serve;
 mod socket;
 
 pub(crate) use reply::{ErrorBody, kind_of_name};
-pub use routes::{Health, HealthReason, NoteRequest, OPENAPI, ROUTES, Route};
+pub use routes::{
+    Health, HealthReason, LoopRequest, NoteRequest, OPENAPI, ROUTES, RateRequest, Route, StepRequest,
+};
 pub use serve::ServerHandle;
 
 use crate::Result;

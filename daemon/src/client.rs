@@ -6,9 +6,9 @@ mod http;
 #[cfg(test)]
 mod tests;
 
-use crate::api::{self, NoteRequest};
-use crate::control::RecordRequest;
-use crate::status::{RecordingStatus, RigStatus};
+use crate::api::{self, LoopRequest, NoteRequest, RateRequest, StepRequest};
+use crate::control::{RecordRequest, SeekRequest};
+use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::{RigName, RuntimeDir};
@@ -121,6 +121,62 @@ impl Client {
     pub fn record_note(&self, text: &str) -> Result<()> {
         let body = self.encode(&NoteRequest { text: text.to_owned() })?;
         self.send("POST", "/v1/record/note", Some(body), PATIENCE).map(drop)
+    }
+
+    /// How far the replay has come.
+    ///
+    /// # Errors
+    /// As [`Self::status`], `WrongState` when the rig is no replay.
+    pub fn replay(&self) -> Result<ReplayStatus> {
+        self.get("/v1/replay")
+    }
+
+    /// Stops the replay where it is.
+    ///
+    /// # Errors
+    /// As [`Self::replay`] and [`crate::control::ReplayControl::pause`].
+    pub fn replay_pause(&self) -> Result<ReplayStatus> {
+        self.post("/v1/replay/pause", &serde_json::Map::new(), PATIENCE)
+    }
+
+    /// Plays on.
+    ///
+    /// # Errors
+    /// As [`Self::replay`] and [`crate::control::ReplayControl::resume`].
+    pub fn replay_resume(&self) -> Result<ReplayStatus> {
+        self.post("/v1/replay/resume", &serde_json::Map::new(), PATIENCE)
+    }
+
+    /// Goes to a set and publishes it.
+    ///
+    /// # Errors
+    /// As [`Self::replay`] and [`crate::control::ReplayControl::seek`].
+    pub fn replay_seek(&self, to: &SeekRequest) -> Result<ReplayStatus> {
+        self.post("/v1/replay/seek", to, PATIENCE)
+    }
+
+    /// Plays so many sets and pauses; a negative number goes back.
+    ///
+    /// # Errors
+    /// As [`Self::replay`] and [`crate::control::ReplayControl::step`].
+    pub fn replay_step(&self, sets: i64) -> Result<ReplayStatus> {
+        self.post("/v1/replay/step", &StepRequest { sets }, PATIENCE)
+    }
+
+    /// Changes the speed of the replay.
+    ///
+    /// # Errors
+    /// As [`Self::replay`] and [`crate::control::ReplayControl::set_rate`].
+    pub fn replay_rate(&self, rate: f64) -> Result<ReplayStatus> {
+        self.post("/v1/replay/rate", &RateRequest { rate }, PATIENCE)
+    }
+
+    /// Whether the replay begins again at its end.
+    ///
+    /// # Errors
+    /// As [`Self::replay`] and [`crate::control::ReplayControl::set_loop`].
+    pub fn replay_loop(&self, on: bool) -> Result<ReplayStatus> {
+        self.post("/v1/replay/loop", &LoopRequest { on }, PATIENCE)
     }
 
     /// Asks the daemon to end; it closes a recording before it does.

@@ -1,7 +1,7 @@
 //! What can be asked of a running rig, whoever asks: the HTTP API, the command line in process, or a test.
 
 use crate::Result;
-use crate::status::{RecordingStatus, RigStatus};
+use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -34,6 +34,67 @@ pub trait Control: Send + Sync {
 
     /// Asks the daemon to end.
     fn request_stop(&self);
+
+    /// The controls of the replay, when the rig is one.
+    fn replay(&self) -> Option<&dyn ReplayControl> {
+        None
+    }
+}
+
+/// What can be asked of a replay. A call that publishes a set returns when that was done, or after 3 s.
+pub trait ReplayControl: Send + Sync {
+    /// How far it has come.
+    fn status(&self) -> ReplayStatus;
+
+    /// Stops where it is.
+    ///
+    /// # Errors
+    /// None today.
+    fn pause(&self) -> Result<ReplayStatus>;
+
+    /// Plays on.
+    ///
+    /// # Errors
+    /// `WrongState` at the end.
+    fn resume(&self) -> Result<ReplayStatus>;
+
+    /// Goes to the set that `to` names and publishes it at once, paused or not.
+    ///
+    /// # Errors
+    /// `BadInput` when there is no such place, `NotFound` for an id that no set has, `WrongState` for a place before
+    /// the present one while it is recorded.
+    fn seek(&self, to: &SeekRequest) -> Result<ReplayStatus>;
+
+    /// Plays so many sets, the first one at once, and pauses. A negative number goes back to the set so far before
+    /// the last one, publishes it and pauses.
+    ///
+    /// # Errors
+    /// `BadInput` for 0, `WrongState` at the end, at the beginning, or backwards while it is recorded.
+    fn step(&self, sets: i64) -> Result<ReplayStatus>;
+
+    /// Changes the speed; what was published stays, what comes is neither skipped nor bunched.
+    ///
+    /// # Errors
+    /// `BadInput` outside of 0.1 to 10, `WrongState` when its subscribers pace it.
+    fn set_rate(&self, rate: f64) -> Result<ReplayStatus>;
+
+    /// Whether to begin again at the end.
+    ///
+    /// # Errors
+    /// `WrongState` while it is recorded.
+    fn set_loop(&self, on: bool) -> Result<ReplayStatus>;
+}
+
+/// A place in a replay: one of the fields.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SeekRequest {
+    /// The set at, or first after, so many seconds after the first set.
+    pub seconds: Option<f64>,
+    /// The set of this number, from 0.
+    pub set: Option<u64>,
+    /// The set with this id in the only dataset.
+    pub id: Option<u64>,
 }
 
 /// What a recording is to be.

@@ -14,7 +14,7 @@ use depthrig_recorder::{
 use place::place;
 use std::collections::HashMap;
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 mod place;
 mod report;
@@ -176,13 +176,8 @@ impl Recording {
     }
 
     /// Hands a set to the recorder, if one is running. Never blocks.
-    pub fn offer(
-        &mut self,
-        id: u64,
-        tick: HostTime,
-        frames: impl Iterator<Item = (Arc<Stream>, Option<Frame>)>,
-    ) {
-        let Some(active) = &mut self.active else { return };
+    pub fn offer(&self, id: u64, tick: HostTime, frames: impl Iterator<Item = (Arc<Stream>, Option<Frame>)>) {
+        let Some(active) = &self.active else { return };
         let (mut present, mut missing) = (Vec::new(), Vec::new());
         for (stream, frame) in frames {
             let Some(&index) = active.indices.get(&stream.id) else { continue };
@@ -199,10 +194,22 @@ impl Recording {
         let times = present.iter().map(|f| f.header.capture_time_ns);
         let spread_ns = times.clone().max().unwrap_or(0) - times.min().unwrap_or(0);
         let utc = (active.utc)();
-        let set = RecordSet { id, tick, utc, frames: present, missing, spread_ns };
+        self.push(RecordSet { id, tick, utc, frames: present, missing, spread_ns });
+    }
+
+    /// Hands a set to the recorder, if one is running; its streams are those that the recording was begun with.
+    /// Never blocks.
+    pub fn push(&self, set: RecordSet) {
+        let Some(active) = &self.active else { return };
+        let id = set.id;
         if let Err(e) = active.recorder.push(set) {
             tracing::error!(set = id, reason = e.reason.name(), "a frame set was not recorded: {e}");
         }
+    }
+
+    /// Whether the next set would find room, or needs none.
+    pub fn has_room(&self) -> bool {
+        self.active.as_ref().is_none_or(|active| active.recorder.has_room())
     }
 
     /// Adds a note to the recording.
@@ -342,6 +349,18 @@ impl Finishing {
             }
         }
     }
+}
+
+/// Ends the recording and closes its files. What goes on in `recording` meanwhile need not wait for the disk.
+///
+/// # Errors
+/// `WrongState` when none is going on, `Other` when the dataset could not be closed.
+pub fn stop(recording: &Mutex<Recording>) -> Result<RecordingStatus> {
+    let lock = || recording.lock().unwrap_or_else(PoisonError::into_inner);
+    let finishing = lock().take()?;
+    let (status, result) = finishing.finish();
+    lock().keep(status.clone(), result.as_ref().ok().cloned());
+    result.map(|_| status)
 }
 
 fn none_active() -> Error {

@@ -1,27 +1,58 @@
-//! Replay: a dataset published on the channels that it was recorded from.
+//! Replay: datasets published on the channels that they were recorded from, as a bench for whatever reads them.
 //!
 //! Pixels are those of the dataset and every time in a header is the original one; such frames carry
-//! [`FrameFlags::REPLAYED`]. Sequence numbers are counted anew, because a channel's numbers have no gaps and a
-//! dataset holds every sixth frame. What the device counted (`device_sequence`) stays.
+//! [`FrameFlags::REPLAYED`](depthrig_bus::FrameFlags::REPLAYED). Sequence numbers are counted anew, because a channel's
+//! numbers have no gaps and a dataset holds every sixth frame. What the device counted (`device_sequence`) stays.
+//!
+//! ```text
+//! timeline   which sets of which dataset when: built from the segments' indexes
+//! transport  play, pause, seek, step, rate, loop: arithmetic on times
+//! source     reads a moment, wherever it lies
+//! player     the thread that publishes, and hands to a recorder
+//! control    the same API that a rig of cameras has
+//! ```
+//!
+//! **By the clock** a replay behaves as the cameras did: a slow subscriber misses frames. **By its subscribers**
+//! ([`ReplayOptions::as_fast_as_possible`]) it never does: a channel has then no more slots than wait unread for a
+//! subscriber, so there is nothing that could replace an unread frame, and the replay waits. Two such replays give a
+//! subscriber the same bytes.
 
+mod control;
+mod player;
+mod source;
+mod timeline;
+mod transport;
+
+use crate::api::{self, ServerHandle};
+use crate::config::{BusConfig, ControlConfig, RecordingConfig, RigConfig, SetsConfig, SupervisorConfig};
+use crate::control::Control;
+use crate::recording::{Outside, Recording};
+use crate::rig::report;
+use crate::sets::SpreadStats;
+use crate::status::{RecordingStatus, ReplayStatus};
+use crate::stream::Stream;
 use crate::wake::Wake;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::runtime::RigLock;
-use depthrig_bus::{
-    Bus, FrameFlags, FrameHeader, HostTime, MemberRecord, Publisher, RigName, RuntimeDir, SetHeader,
-    SetPublisher, StreamId, shm,
-};
-use depthrig_recorder::{Dataset, DatasetFrame, DatasetSet, SetRange};
-use std::path::Path;
+use depthrig_bus::{Bus, ClockDomain, HostTime, RigName, RuntimeDir, SUBSCRIBER_BUFFER, UtcPair, clock, shm};
+use depthrig_drivers::StreamProfile;
+use depthrig_recorder::StreamRecord;
+use player::Player;
+use source::{Moment, Sources};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
+use timeline::Timeline;
+pub use transport::RATES;
+use transport::{Begin, Transport};
 
-/// How a dataset is to be replayed.
+/// How a replay is to begin.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[allow(clippy::struct_excessive_bools)] // each is a choice of its own
 pub struct ReplayOptions {
-    /// Speed against the original, 1 is the original; must be above 0.
+    /// Speed against the original, within [`RATES`]; 1 is the original.
     pub rate: f64,
     /// Begin again at the end.
     pub looped: bool,
@@ -29,134 +60,186 @@ pub struct ReplayOptions {
     pub from_s: Option<f64>,
     /// Seconds after the first set at which to end.
     pub to_s: Option<f64>,
-    /// Do not wait between sets. A subscriber that is slower than the disk misses frames then.
+    /// Do not wait for the clock but for the subscribers: they miss nothing. A subscriber that never reads, or that
+    /// holds more than three frames of a stream, holds the replay up.
     pub as_fast_as_possible: bool,
+    /// Publish nothing until it is resumed, stepped or sought: a subscriber that is to see the first set is there then.
+    pub paused: bool,
+    /// Pause at the end, and do not end.
+    pub hold: bool,
+    /// Whether to serve the control API.
+    pub serve_api: bool,
 }
 
 impl Default for ReplayOptions {
     fn default() -> Self {
-        Self { rate: 1.0, looped: false, from_s: None, to_s: None, as_fast_as_possible: false }
+        Self {
+            rate: 1.0,
+            looped: false,
+            from_s: None,
+            to_s: None,
+            as_fast_as_possible: false,
+            paused: false,
+            hold: false,
+            serve_api: false,
+        }
     }
-}
-
-/// How far a replay has come.
-#[derive(Debug, Clone, PartialEq, serde::Serialize)]
-pub struct ReplayProgress {
-    /// Sets published.
-    pub sets: u64,
-    /// Frames published.
-    pub frames: u64,
-    /// Seconds of the dataset that have been replayed, in the present round.
-    pub position_s: f64,
-    /// Length of what is replayed, seconds.
-    pub length_s: f64,
-    /// Rounds begun.
-    pub rounds: u64,
-    /// What could not be read or published, one line each (100 at most).
-    pub lost: Vec<String>,
-    /// Whether it is over.
-    pub done: bool,
 }
 
 /// A running replay. Dropping it stops it.
 pub struct Replay {
-    shared: Arc<Shared>,
-    thread: Option<JoinHandle<()>>,
+    inner: Arc<Inner>,
+    threads: Vec<JoinHandle<()>>,
+    api: Option<ServerHandle>,
     _lock: RigLock,
 }
 
-#[derive(Default)]
-struct Shared {
-    stop: AtomicBool,
-    done: AtomicBool,
-    wake: Wake,
-    sets: AtomicU64,
-    frames: AtomicU64,
-    rounds: AtomicU64,
-    position_ns: AtomicU64,
-    length_ns: AtomicU64,
-    lost: Mutex<Vec<String>>,
+/// What a replay leaves.
+#[derive(Debug, Clone, serde::Serialize)]
+pub struct ReplaySummary {
+    /// Its last status.
+    #[serde(flatten)]
+    pub status: ReplayStatus,
+    /// The last recording of it.
+    pub recording: Option<RecordingStatus>,
 }
 
 /// Lines of `lost` that are kept.
 const MAX_LOST: usize = 100;
 
-impl Shared {
-    fn lose(&self, what: String) {
-        tracing::error!("{what}");
-        let mut lost = self.lost.lock().unwrap_or_else(PoisonError::into_inner);
-        if lost.len() < MAX_LOST {
-            lost.push(what);
-        }
-    }
+/// What the threads of a replay share.
+struct Inner {
+    /// What recordings of it are made with.
+    config: RigConfig,
+    paths: Vec<PathBuf>,
+    options: ReplayOptions,
+    timeline: Arc<Timeline>,
+    sources: Mutex<Sources>,
+    transport: Mutex<Transport>,
+    /// With `transport`: a moment was published.
+    acted: Condvar,
+    wake: Wake,
+    ended: Wake,
+    stop: AtomicBool,
+    stop_asked: AtomicBool,
+    done: AtomicBool,
+    records: Vec<StreamRecord>,
+    streams: Vec<Arc<Stream>>,
+    numbers: Mutex<Numbers>,
+    spreads: Mutex<SpreadStats>,
+    recording: Mutex<Recording>,
+    starting: Mutex<()>,
+    outside: Outside,
+    /// The clocks of the dataset at the last moment: what a recording of this replay takes for its own.
+    clock: Arc<Mutex<UtcPair>>,
+    started: HostTime,
+    cpu_millicores: AtomicU64,
+}
 
-    fn stopping(&self) -> bool {
-        self.stop.load(Ordering::Relaxed)
-    }
+#[derive(Debug, Default)]
+struct Numbers {
+    sets: u64,
+    incomplete: u64,
+    /// The moment that was published last, and the id of its set.
+    last: Option<(usize, u64)>,
+    waiting_for: Option<String>,
+    lost: Vec<String>,
+}
+
+/// The numbers of a set that goes out.
+struct Counted {
+    set: u64,
+    incomplete: u64,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Replay {
-    /// Starts to replay the dataset `path` as the rig it was recorded from, or as `rig`.
+    /// Starts to replay `datasets` as the rig that they were recorded from, or as `rig`. Several are one rig: see
+    /// the rules for their sets at the top of `replay/timeline.rs`.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`] when `path` is no dataset or the options make no sense,
-    /// [`ErrorKind::NotFound`], [`ErrorKind::InUse`] when that rig is running, [`ErrorKind::NoSpace`].
+    /// [`ErrorKind::BadInput`] when one of them is no dataset, when they contradict each other or the options make
+    /// no sense, [`ErrorKind::NotFound`], [`ErrorKind::InUse`] when that rig is running, [`ErrorKind::NoSpace`].
     pub fn start(
-        path: &Path,
+        datasets: &[PathBuf],
         runtime: &RuntimeDir,
         rig: Option<RigName>,
         options: ReplayOptions,
     ) -> Result<Self> {
-        if !(options.rate.is_finite() && options.rate > 0.0) {
-            return Err(Error::new(
-                ErrorKind::BadInput,
-                format!("a replay cannot run at {} x; use a rate above 0", options.rate),
-            ));
-        }
-        let dataset = Dataset::open(path).map_err(of_dataset)?;
-        let rig = match rig {
-            Some(rig) => rig,
-            None => RigName::new(dataset.session().rig.as_str())?,
-        };
-        let range = range(&dataset, &options)?;
-        let lock =
-            runtime.lock(&rig, &format!("process {} (replay of {})", std::process::id(), path.display()))?;
-        let bus = Bus::open(runtime, &rig)?;
+        transport::check_rate(options.rate)?;
+        let mut sources = Sources::open(datasets, rig)?;
+        let timeline = Arc::new(part(&sources.timeline()?, &options)?);
+        let config = recording_config(&mut sources);
+        let rig = config.rig.clone();
+        let names: Vec<_> = datasets.iter().map(|p| p.display().to_string()).collect();
+        let who = format!("process {} (replay of {})", std::process::id(), names.join(", "));
+        let held = runtime.lock(&rig, &who)?;
+        let bus = Arc::new(Bus::open(runtime, &rig)?);
         bus.clean_dead();
-        let player = Player::open(bus, dataset, range, options)?;
-        let shared = Arc::clone(&player.shared);
-        let thread =
-            std::thread::Builder::new().name("replay".into()).spawn(move || player.run()).map_err(|e| {
-                Error::new(ErrorKind::Other, "the replay thread could not be started").with_source(e)
-            })?;
-        Ok(Self { shared, thread: Some(thread), _lock: lock })
+        let inner = Arc::new(Inner::new(config, datasets, options, timeline, sources));
+        let player = Player::new(Arc::clone(&inner), Arc::clone(&bus))?;
+        let mut replay = Self { inner, threads: Vec::new(), api: None, _lock: held };
+        if options.serve_api {
+            replay.api = Some(api::serve(replay.control(), &runtime.socket_path(&rig), None)?);
+        }
+        let inner = Arc::clone(&replay.inner);
+        replay.spawn("house", move || keep_house(&inner, &bus))?;
+        replay.spawn("replay", move || player.run())?;
+        Ok(replay)
+    }
+
+    fn spawn(&mut self, name: &str, run: impl FnOnce() + Send + 'static) -> Result<()> {
+        let thread = std::thread::Builder::new().name(name.to_owned()).spawn(run).map_err(|e| {
+            Error::new(ErrorKind::Other, format!("the {name} thread could not be started")).with_source(e)
+        })?;
+        self.threads.push(thread);
+        Ok(())
+    }
+
+    /// Its control, as the control API has it; [`Control::replay`] is there.
+    pub fn control(&self) -> Arc<dyn Control> {
+        Arc::clone(&self.inner) as Arc<dyn Control>
     }
 
     /// How far it has come.
-    pub fn progress(&self) -> ReplayProgress {
-        let s = &self.shared;
-        ReplayProgress {
-            sets: s.sets.load(Ordering::Relaxed),
-            frames: s.frames.load(Ordering::Relaxed),
-            position_s: s.position_ns.load(Ordering::Relaxed) as f64 / 1e9,
-            length_s: s.length_ns.load(Ordering::Relaxed) as f64 / 1e9,
-            rounds: s.rounds.load(Ordering::Relaxed),
-            lost: s.lost.lock().unwrap_or_else(PoisonError::into_inner).clone(),
-            done: s.done.load(Ordering::Acquire),
-        }
+    pub fn progress(&self) -> ReplayStatus {
+        self.inner.replay_status()
     }
 
-    /// Stops it and says how far it came.
-    pub fn stop(mut self) -> ReplayProgress {
+    /// Waits up to `timeout` for its end, or until somebody asks for it; says whether that is so.
+    pub fn wait(&self, timeout: Duration) -> bool {
+        let over =
+            || self.inner.done.load(Ordering::Acquire) || self.inner.stop_asked.load(Ordering::Relaxed);
+        if !over() {
+            self.inner.ended.wait(timeout);
+        }
+        over()
+    }
+
+    /// Stops it, closes its recording, and says how far it came.
+    pub fn stop(mut self) -> ReplaySummary {
         self.end();
-        self.progress()
+        let recording = lock(&self.inner.recording).status();
+        ReplaySummary { status: self.progress(), recording }
     }
 
     fn end(&mut self) {
-        self.shared.stop.store(true, Ordering::Relaxed);
-        self.shared.wake.raise();
-        if self.thread.take().is_some_and(|t| t.join().is_err()) {
-            self.shared.lose("the replay thread panicked".into());
+        if let Some(api) = self.api.take() {
+            api.stop();
+        }
+        self.inner.stop.store(true, Ordering::Relaxed);
+        self.inner.wake.raise();
+        for thread in self.threads.drain(..) {
+            if thread.join().is_err() {
+                self.inner.lose("a thread of the replay panicked".into());
+            }
+        }
+        let active = lock(&self.inner.recording).is_active();
+        if active && let Err(e) = self.inner.record_stop() {
+            tracing::error!(error = %e, "the recording could not be closed");
         }
     }
 }
@@ -167,195 +250,166 @@ impl Drop for Replay {
     }
 }
 
-/// What is left of a dataset after `--from` and `--to`.
-fn range(dataset: &Dataset, options: &ReplayOptions) -> Result<SetRange> {
-    let mut range = SetRange::ALL;
-    let Some(first) = dataset.sets_with(range, depthrig_recorder::PixelMode::None).next() else {
-        let shown = dataset.path().display();
-        return Err(Error::new(
-            ErrorKind::BadInput,
-            format!("{shown} holds no frame set, there is nothing to replay"),
-        ));
-    };
-    let first = first.map_err(of_dataset)?;
-    let at = |s: f64| first.utc_ns.saturating_add((s * 1e9).round() as i64);
+/// What is left after `--from` and `--to`.
+fn part(all: &Timeline, options: &ReplayOptions) -> Result<Timeline> {
+    let bad = |what: String| Err(Error::new(ErrorKind::BadInput, what));
     let usable = |s: &f64| s.is_finite() && *s >= 0.0;
-    if options.from_s.iter().chain(&options.to_s).any(|s| !usable(s))
-        || options.from_s > options.to_s.or(Some(f64::MAX))
-    {
-        return Err(Error::new(
-            ErrorKind::BadInput,
-            "--from and --to are seconds after the first set, from before to",
-        ));
+    let (from, to) = (options.from_s, options.to_s);
+    if !from.iter().chain(&to).all(usable) || from > to.or(Some(f64::MAX)) {
+        return bad("--from and --to are seconds after the first set, from before to".into());
     }
-    range.from_utc_ns = options.from_s.map_or(i64::MIN, at);
-    range.to_utc_ns = options.to_s.map_or(i64::MAX, at);
-    Ok(range)
+    let ns = |s: f64| (s * 1e9).round() as i64;
+    let part = all.between(from.map_or(0, ns), to.map_or(i64::MAX, ns));
+    if part.len() == 0 {
+        let length = all.length_ns() as f64 / 1e9;
+        return bad(format!("no set is between --from and --to; the replay is {length:.3} s long"));
+    }
+    Ok(part)
 }
 
-/// The replay thread's state.
-struct Player {
-    bus: Bus,
-    dataset: Dataset,
-    range: SetRange,
-    options: ReplayOptions,
-    outputs: Vec<Output>,
-    sets: SetPublisher,
-    shared: Arc<Shared>,
-    next_set: u64,
+/// The configuration that recordings of the replay are made with: as the defaults, colour and depth as the datasets have it.
+fn recording_config(sources: &mut Sources) -> RigConfig {
+    let (color, depth) = sources.codecs();
+    let recording = RecordingConfig { color, depth, ..RecordingConfig::default() };
+    RigConfig {
+        rig: sources.rig().clone(),
+        bus: BusConfig::default(),
+        sets: SetsConfig::default(),
+        recording,
+        control: ControlConfig { tcp: None },
+        supervisor: SupervisorConfig::default(),
+        cameras: Vec::new(),
+        text: sources.session().rig_config.clone(),
+        path: None,
+    }
 }
 
-struct Output {
-    id: StreamId,
-    publisher: Publisher,
-    sequence: u64,
-}
-
-impl Player {
-    fn open(bus: Bus, dataset: Dataset, range: SetRange, options: ReplayOptions) -> Result<Self> {
-        let streams = &dataset.session().streams;
-        let bytes = |r: &depthrig_recorder::StreamRecord| r.format.frame_bytes(r.width, r.height);
-        let set_bytes = streams.iter().map(|r| bytes(r) as u64).sum();
-        let slots =
-            shm::slots_that_fit(shm::DEFAULT_SLOTS, set_bytes, shm::free_bytes(shm::SHM_DIR.as_ref())?)?;
-        let mut outputs = Vec::new();
-        for record in streams {
-            let publisher = bus.publisher(&record.id, bytes(record), slots)?;
-            outputs.push(Output { id: record.id.clone(), publisher, sequence: 0 });
-        }
-        let sets = bus.set_publisher()?;
-        Ok(Self { bus, dataset, range, options, outputs, sets, shared: Arc::default(), next_set: 1 })
-    }
-
-    fn run(mut self) {
-        let length = self.length_ns();
-        self.shared.length_ns.store(length, Ordering::Relaxed);
-        loop {
-            self.shared.rounds.fetch_add(1, Ordering::Relaxed);
-            let before = self.shared.sets.load(Ordering::Relaxed);
-            self.round();
-            let empty = self.shared.sets.load(Ordering::Relaxed) == before;
-            if !self.options.looped || empty || self.shared.stopping() {
-                break;
-            }
-        }
-        self.shared.done.store(true, Ordering::Release);
-        // The channels stay until the replay is dropped, so that subscribers can read the last frames.
-        while !self.shared.stopping() {
-            self.shared.wake.wait(Duration::from_secs(1));
-            self.bus.clean_dead();
-        }
-    }
-
-    /// Time from the first set to the last.
-    fn length_ns(&self) -> u64 {
-        let mut ticks = self
-            .dataset
-            .sets_with(self.range, depthrig_recorder::PixelMode::None)
-            .filter_map(|s| s.ok().map(|s| s.tick));
-        let first = ticks.next();
-        let last = ticks.last().or(first);
-        first.zip(last).map_or(0, |(a, b)| b.since_ns(a).max(0) as u64)
-    }
-
-    /// Replays the range once.
-    fn round(&mut self) {
-        let began = HostTime::now();
-        let mut first_tick = None;
-        let sets = self.dataset.sets(self.range);
-        for set in sets {
-            let set = match set {
-                Ok(set) => set,
-                Err(e) => {
-                    self.shared.lose(e.to_string());
-                    continue;
-                }
-            };
-            let first = *first_tick.get_or_insert(set.tick);
-            let position_ns = set.tick.since_ns(first).max(0);
-            if !self.options.as_fast_as_possible {
-                self.sleep_until(began.plus_ns((position_ns as f64 / self.options.rate) as i64));
-            }
-            if self.shared.stopping() {
-                return;
-            }
-            self.publish(set);
-            self.shared.position_ns.store(position_ns as u64, Ordering::Relaxed);
-        }
-    }
-
-    fn sleep_until(&self, due: HostTime) {
-        while !self.shared.stopping() {
-            let left = due.from_now();
-            if left.is_zero() {
-                return;
-            }
-            self.shared.wake.wait(left);
-        }
-    }
-
-    fn publish(&mut self, mut set: DatasetSet) {
-        let mut members: Vec<_> = self
-            .outputs
-            .iter()
-            .map(|o| MemberRecord { id: o.id.clone(), sequence: None, capture_time_ns: set.tick.ns() })
-            .collect();
-        // In the order in which they were published, as a subscriber of several streams saw them.
-        set.frames.sort_by_key(|f| f.header.publish_time_ns);
-        for frame in &set.frames {
-            match self.publish_frame(frame) {
-                Ok(sequence) => {
-                    if let Some(member) = members.get_mut(frame.stream) {
-                        member.sequence = Some(sequence);
-                        member.capture_time_ns = frame.header.capture_time_ns;
-                    }
-                }
-                Err(e) => self.shared.lose(format!("set {}: {e}", set.id)),
-            }
-        }
-        let header = SetHeader {
-            set_id: self.next_set,
-            tick_ns: set.tick.ns(),
-            spread_ns: set.spread_ns,
-            ..SetHeader::default()
+impl Inner {
+    fn new(
+        config: RigConfig,
+        datasets: &[PathBuf],
+        options: ReplayOptions,
+        timeline: Arc<Timeline>,
+        sources: Sources,
+    ) -> Self {
+        let slots = if options.as_fast_as_possible { SUBSCRIBER_BUFFER } else { shm::DEFAULT_SLOTS };
+        let stream = |r: &StreamRecord| Arc::new(Stream::new(r.id.clone(), profile(r), true, slots));
+        let begin = Begin {
+            by_clock: !options.as_fast_as_possible,
+            rate: options.rate,
+            looped: options.looped,
+            hold: options.hold,
+            paused: options.paused,
         };
-        self.next_set += 1;
-        if let Err(e) = self.sets.send(header, &members) {
-            self.shared.lose(format!("set {}: {e}", set.id));
+        let now = HostTime::now();
+        let clock = Arc::new(Mutex::new(UtcPair::sample()));
+        let theirs = Arc::clone(&clock);
+        Self {
+            config,
+            paths: datasets.to_vec(),
+            options,
+            transport: Mutex::new(Transport::new(Arc::clone(&timeline), begin, now)),
+            timeline,
+            acted: Condvar::new(),
+            wake: Wake::default(),
+            ended: Wake::default(),
+            stop: AtomicBool::new(false),
+            stop_asked: AtomicBool::new(false),
+            done: AtomicBool::new(false),
+            records: sources.streams().to_vec(),
+            streams: sources.streams().iter().map(stream).collect(),
+            numbers: Mutex::new(Numbers {
+                lost: sources.problems().take(MAX_LOST).cloned().collect(),
+                ..Numbers::default()
+            }),
+            sources: Mutex::new(sources),
+            spreads: Mutex::default(),
+            recording: Mutex::default(),
+            starting: Mutex::default(),
+            outside: Outside { utc: Arc::new(move || *lock(&theirs)), ..Outside::default() },
+            clock,
+            started: now,
+            cpu_millicores: AtomicU64::new(0),
         }
-        self.shared.sets.fetch_add(1, Ordering::Relaxed);
     }
 
-    fn publish_frame(&mut self, frame: &DatasetFrame) -> Result<u64> {
-        let output = self.outputs.get_mut(frame.stream).ok_or_else(|| {
-            Error::new(
-                ErrorKind::BadInput,
-                format!("a frame names stream {}, which the session has not", frame.stream),
-            )
-        })?;
-        let mut slot = output.publisher.loan(frame.pixels.len())?;
-        slot.pixels_mut().copy_from_slice(&frame.pixels);
-        output.sequence += 1;
-        *slot.header_mut() = FrameHeader {
-            sequence: output.sequence,
-            captured: output.sequence + frame.header.drops().total(),
-            flags: frame.header.flags | FrameFlags::REPLAYED.0,
-            payload_len: frame.pixels.len() as u32,
-            ..frame.header
-        };
-        output.publisher.send_unstamped(slot)?;
-        self.shared.frames.fetch_add(1, Ordering::Relaxed);
-        Ok(output.sequence)
+    const fn lossless(&self) -> bool {
+        self.options.as_fast_as_possible
+    }
+
+    /// Slots that each stream gets when there is memory for them.
+    const fn slots(&self) -> usize {
+        if self.lossless() { SUBSCRIBER_BUFFER } else { shm::DEFAULT_SLOTS }
+    }
+
+    fn stopping(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    fn set_done(&self, done: bool) {
+        if self.done.swap(done, Ordering::Release) != done && done {
+            self.ended.raise();
+            self.acted.notify_all();
+        }
+    }
+
+    fn set_waiting_for(&self, channel: Option<&str>) {
+        lock(&self.numbers).waiting_for = channel.map(str::to_owned);
+    }
+
+    fn lose(&self, what: String) {
+        tracing::error!("{what}");
+        let lost = &mut lock(&self.numbers).lost;
+        if lost.len() < MAX_LOST {
+            lost.push(what);
+        }
+    }
+
+    /// Counts a set that goes out.
+    fn count(&self, number: usize, moment: &Moment, incomplete: bool) -> Counted {
+        lock(&self.spreads).add(moment.spread_ns);
+        let mut numbers = lock(&self.numbers);
+        numbers.sets += 1;
+        numbers.incomplete += u64::from(incomplete);
+        numbers.last = Some((number, moment.id));
+        Counted { set: numbers.sets, incomplete: numbers.incomplete }
     }
 }
 
-fn of_dataset(e: depthrig_recorder::Error) -> Error {
-    use depthrig_recorder::ErrorKind as Rec;
-    let kind = match e.kind() {
-        Rec::NotFound => ErrorKind::NotFound,
-        Rec::PermissionDenied => ErrorKind::PermissionDenied,
-        Rec::NotADataset | Rec::Foreign | Rec::Version => ErrorKind::BadInput,
-        _ => ErrorKind::Other,
-    };
-    Error::new(kind, e.to_string()).with_source(e)
+/// A stream's mode, as a driver would say it. The device's clock is behind the frames and not asked any more.
+fn profile(r: &StreamRecord) -> StreamProfile {
+    StreamProfile {
+        stream: r.id.stream.clone(),
+        format: r.format,
+        width: r.width,
+        height: r.height,
+        rate_hz: r.rate_hz,
+        depth_unit_m: r.depth_unit_m,
+        intrinsics: r.intrinsics,
+        pose_in_device: r.pose,
+        clock: depthrig_drivers::DeviceClock { counter_bits: 64, tick_ps: 1000, domain: ClockDomain::Device },
+        sequence_bits: 64,
+    }
+}
+
+/// What must be done about once a second and by nobody in particular.
+fn keep_house(inner: &Inner, bus: &Bus) {
+    const LOOK: Duration = Duration::from_millis(50);
+    let (mut last, mut last_cpu) = (HostTime::now(), clock::process_cpu_ns());
+    while !inner.stopping() {
+        std::thread::sleep(LOOK);
+        let now = HostTime::now();
+        let passed_ns = now.since_ns(last);
+        if passed_ns < 1_000_000_000 {
+            continue;
+        }
+        let cpu = clock::process_cpu_ns();
+        inner.cpu_millicores.store(((cpu - last_cpu) * 1000 / passed_ns) as u64, Ordering::Relaxed);
+        (last, last_cpu) = (now, cpu);
+        bus.clean_dead();
+        if lock(&inner.recording).is_active() {
+            let diagnostics = report::diagnostics(&inner.status());
+            lock(&inner.recording).housekeeping(diagnostics);
+        }
+    }
 }

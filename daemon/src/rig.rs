@@ -9,13 +9,13 @@
 //! ```
 
 mod assembly;
-mod report;
+pub(crate) mod report;
 
 use crate::api::{self, ServerHandle};
 use crate::camera::{Camera, Shared, Supervisor};
 use crate::config::{BackendConfig, RigConfig};
 use crate::control::{Control, RecordRequest};
-use crate::recording::{Begun, Outside, Recording, Reports, StreamFacts};
+use crate::recording::{self, Begun, Outside, Recording, Reports, StreamFacts};
 use crate::sets::SpreadStats;
 use crate::status::{CameraState, RecordingStatus, RigStatus, SetAccount};
 use crate::wake::Wake;
@@ -344,14 +344,9 @@ impl Control for Inner {
     }
 
     fn record_stop(&self) -> Result<RecordingStatus> {
-        let finishing = self.recording().take()?;
-        // Without the lock: `status` and the next frames need not wait for the disk.
-        let (status, result) = finishing.finish();
-        if result.is_ok() {
-            self.reports.begin(PathBuf::from(&status.path));
-        }
-        self.recording().keep(status.clone(), result.as_ref().ok().cloned());
-        result.map(|_| status)
+        let status = recording::stop(&self.recording)?;
+        self.reports.begin(PathBuf::from(&status.path));
+        Ok(status)
     }
 
     fn record_note(&self, text: &str) -> Result<()> {

@@ -26,6 +26,47 @@ pub struct RigStatus {
     pub shared_memory: SharedMemoryStatus,
     /// CPU that the daemon used over the last second or so, in cores.
     pub cpu_cores: f64,
+    /// The replay, when the cameras are those of a dataset.
+    pub replay: Option<ReplayStatus>,
+}
+
+/// A replay. Seconds and sets are counted from the first set that is replayed.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[allow(clippy::struct_excessive_bools)] // each is a fact of its own
+pub struct ReplayStatus {
+    /// The datasets' folders.
+    pub datasets: Vec<String>,
+    /// Whether it waits for a command, or plays no more than the sets that it was told.
+    pub paused: bool,
+    /// Whether everything was published.
+    pub done: bool,
+    /// The set that was published last, seconds after the first.
+    pub position_s: f64,
+    /// From the first set to the last, seconds.
+    pub length_s: f64,
+    /// Number of the set that was published last, from 0; `None` before the first.
+    pub set: Option<u64>,
+    /// Its id in its dataset.
+    pub set_id: Option<u64>,
+    /// Sets of one round.
+    pub length_sets: u64,
+    /// Speed against the original.
+    pub rate: f64,
+    /// Whether its subscribers pace it, and not the clock at `rate`.
+    pub as_fast_as_possible: bool,
+    /// Whether it begins again at the end.
+    #[serde(rename = "loop")]
+    pub looped: bool,
+    /// Rounds begun.
+    pub rounds: u64,
+    /// Sets published.
+    pub sets: u64,
+    /// Frames published.
+    pub frames: u64,
+    /// The channel whose subscribers keep it waiting for more than a second.
+    pub waiting_for: Option<String>,
+    /// What could not be read or published, one line each (100 at most).
+    pub lost: Vec<String>,
 }
 
 /// The state of a camera's supervisor.

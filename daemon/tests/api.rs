@@ -10,7 +10,7 @@ use depthrig_bus::clock::HostTime;
 use depthrig_bus::{RigName, RuntimeDir};
 use depthrig_daemon::api::{self, MAX_BODY_BYTES, OPENAPI, ROUTES, ServerHandle};
 use depthrig_daemon::client::Client;
-use depthrig_daemon::control::RecordRequest;
+use depthrig_daemon::control::{RecordRequest, SeekRequest};
 use depthrig_daemon::status::CameraState;
 use depthrig_daemon::{Error, ErrorKind};
 use fake::Fake;
@@ -158,6 +158,33 @@ fn every_answer_of_a_live_server_fits_the_document() {
         check("POST", "/v1/record/start", &answer, wanted);
         assert_eq!(answer.json()["error"]["message"], "as told");
     }
+    for call in ["pause", "resume", "seek", "step", "rate", "loop"] {
+        let path = format!("/v1/replay/{call}");
+        let body = match call {
+            "rate" => r#"{"rate": 2}"#,
+            "loop" => r#"{"on": true}"#,
+            _ => "{}",
+        };
+        if call == "pause" {
+            check("GET", "/v1/replay", &served.get("/v1/replay"), 409);
+            check("POST", &path, &served.post(&path, body), 409);
+            served.fake.become_replay();
+            check("GET", "/v1/replay", &served.get("/v1/replay"), 200);
+            check("GET", "/v1/status", &served.get("/v1/status"), 200);
+        }
+        check("POST", &path, &served.post(&path, body), 200);
+        check(
+            "POST",
+            &path,
+            &served.post(&path, r#"{"unknown": 1}"#),
+            if body == "{}" && !["seek", "step"].contains(&call) { 200 } else { 400 },
+        );
+        served.fake.fail_next(ErrorKind::WrongState, "as told");
+        check("POST", &path, &served.post(&path, body), 409);
+    }
+    check("GET", "/v1/replay", &served.get("/v1/replay"), 200);
+    served.fake.fail_next(ErrorKind::NotFound, "as told");
+    check("POST", "/v1/replay/seek", &served.post("/v1/replay/seek", r#"{"id": 9}"#), 404);
     check("POST", "/v1/stop", &served.post("/v1/stop", ""), 202);
     assert!(served.fake.stop_was_asked());
     let all: BTreeSet<_> = ROUTES.iter().map(|r| (r.method.to_owned(), r.path.to_owned())).collect();
@@ -182,6 +209,39 @@ fn what_is_asked_arrives() {
     let health = served.get("/v1/health").json();
     let reason = json!({"camera": "d405", "state": "reconnecting", "message": "unplugged"});
     assert_eq!(health, json!({"healthy": false, "reasons": [reason]}));
+}
+
+#[test]
+fn a_client_steers_a_replay() {
+    let served = served();
+    let client = Client::connect(&served.runtime, None).unwrap();
+    let e = client.replay().unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::WrongState);
+    assert!(e.to_string().contains("is no replay"), "{e}");
+    served.fake.become_replay();
+    assert_eq!(client.replay().unwrap().set, None);
+    client.replay_pause().unwrap();
+    client.replay_resume().unwrap();
+    client.replay_seek(&SeekRequest { seconds: Some(0.1), ..SeekRequest::default() }).unwrap();
+    client.replay_seek(&SeekRequest { set: Some(3), ..SeekRequest::default() }).unwrap();
+    client.replay_step(-2).unwrap();
+    client.replay_rate(0.1).unwrap();
+    assert_eq!(client.replay_loop(true).unwrap().set, Some(7));
+    assert_eq!(served.post("/v1/replay/step", "").status, 200);
+    assert_eq!(
+        served.fake.replay_calls(),
+        [
+            "pause",
+            "resume",
+            "SeekRequest { seconds: Some(0.1), set: None, id: None }",
+            "SeekRequest { seconds: None, set: Some(3), id: None }",
+            "step -2",
+            "rate 0.1",
+            "loop true",
+            "step 1",
+        ]
+    );
+    assert_eq!(client.status().unwrap().replay.unwrap().position_s, 1.5);
 }
 
 #[test]

@@ -278,6 +278,15 @@ impl Recorder {
         Ok(())
     }
 
+    /// Whether the next set would find room, for callers that rather wait than lose one. True as well when it would
+    /// be refused for good: waiting does not help then.
+    pub fn has_room(&self) -> bool {
+        let load = &self.shared.load;
+        self.shared.lock().ended.is_some()
+            || (load.unencoded.load(Ordering::Relaxed) < self.shared.options.queue_sets.max(1)
+                && load.backlog_bytes.load(Ordering::Relaxed) < self.shared.options.backlog_max_bytes)
+    }
+
     /// Adds a note of the operator, stamped now; it goes into the file and into `session.toml`.
     ///
     /// # Errors

@@ -101,7 +101,7 @@ pub enum Command {
     Status(status::StatusArgs),
     /// Watch the running daemon, refreshed in place; q or Ctrl-C leaves
     Top(top::TopArgs),
-    /// Publish a dataset on the same channels as if the cameras were there
+    /// Publish datasets on the same channels as if the cameras were there, and steer that
     #[command(after_help = replay::EXAMPLES)]
     Replay(replay::ReplayArgs),
     /// Say what is in a dataset

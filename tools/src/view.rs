@@ -1,7 +1,9 @@
 //! The status of a rig as text: what `status` prints and `top` refreshes.
 
 use crate::out;
-use depthrig_daemon::status::{CameraState, CameraStatus, RecordingStatus, RigStatus, StreamStatus};
+use depthrig_daemon::status::{
+    CameraState, CameraStatus, RecordingStatus, ReplayStatus, RigStatus, StreamStatus,
+};
 
 const BOLD: &str = "\x1b[1m";
 const RED: &str = "\x1b[31m";
@@ -49,6 +51,7 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
             rig.sets.spread_max_ms
         ),
     ];
+    lines.extend(rig.replay.iter().map(|r| format!("replay  {}", replay(r))));
     lines.extend(rig.recording.iter().flat_map(|r| recording(r, style)));
     lines.push(format!(
         "memory  /dev/shm {} free; {} slots a stream, {} in all",
@@ -64,6 +67,32 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
         lines.extend(troubles);
     }
     lines.join("\n")
+}
+
+/// Where a replay is, in one line.
+pub fn replay(r: &ReplayStatus) -> String {
+    let state = match (r.done, r.paused) {
+        (true, _) => "at its end",
+        (false, true) => "paused",
+        (false, false) => "playing",
+    };
+    let speed = if r.as_fast_as_possible {
+        "as fast as its subscribers read".to_owned()
+    } else {
+        format!("{} x", r.rate)
+    };
+    let set = r.set.map_or_else(
+        || "no set yet".to_owned(),
+        |n| format!("set {n} of 0 to {}", r.length_sets.saturating_sub(1)),
+    );
+    let round = if r.looped || r.rounds > 1 { format!(", round {}", r.rounds) } else { String::new() };
+    let waiting = r.waiting_for.as_ref().map_or_else(String::new, |c| format!("; waits for {c}"));
+    format!(
+        "{state} at {:.3} of {:.3} s, {set}, {speed}{round}, lost {}{waiting}",
+        r.position_s,
+        r.length_s,
+        r.lost.len()
+    )
 }
 
 fn recording(r: &RecordingStatus, style: Style) -> Vec<String> {

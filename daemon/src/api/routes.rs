@@ -2,9 +2,9 @@
 
 use super::reply::Refusal;
 use super::{MAX_BODY_BYTES, SERVER_HEADER, guard};
-use crate::control::{Control, RecordRequest};
+use crate::control::{Control, RecordRequest, ReplayControl, SeekRequest};
 use crate::metrics;
-use crate::status::{CameraState, CameraStatus, RecordingStatus, RigStatus};
+use crate::status::{CameraState, CameraStatus, RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind};
 use axum::body::Bytes;
 use axum::extract::rejection::BytesRejection;
@@ -36,7 +36,7 @@ pub struct Route {
 }
 
 /// Every call of the API.
-pub const ROUTES: [Route; 10] = [
+pub const ROUTES: [Route; 17] = [
     Route { method: "GET", path: "/v1/status", handler: || get(status) },
     Route { method: "GET", path: "/v1/health", handler: || get(health) },
     Route { method: "GET", path: "/v1/config", handler: || get(config) },
@@ -44,6 +44,13 @@ pub const ROUTES: [Route; 10] = [
     Route { method: "POST", path: "/v1/record/start", handler: || post(record_start) },
     Route { method: "POST", path: "/v1/record/stop", handler: || post(record_stop) },
     Route { method: "POST", path: "/v1/record/note", handler: || post(record_note) },
+    Route { method: "GET", path: "/v1/replay", handler: || get(replay) },
+    Route { method: "POST", path: "/v1/replay/pause", handler: || post(replay_pause) },
+    Route { method: "POST", path: "/v1/replay/resume", handler: || post(replay_resume) },
+    Route { method: "POST", path: "/v1/replay/seek", handler: || post(replay_seek) },
+    Route { method: "POST", path: "/v1/replay/step", handler: || post(replay_step) },
+    Route { method: "POST", path: "/v1/replay/rate", handler: || post(replay_rate) },
+    Route { method: "POST", path: "/v1/replay/loop", handler: || post(replay_loop) },
     Route { method: "POST", path: "/v1/stop", handler: || post(stop) },
     Route { method: "GET", path: "/v1/openapi.json", handler: || get(openapi) },
     Route { method: "GET", path: "/metrics", handler: || get(scrape) },
@@ -55,6 +62,36 @@ pub const ROUTES: [Route; 10] = [
 pub struct NoteRequest {
     /// What to note.
     pub text: String,
+}
+
+/// How far to step in a replay.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct StepRequest {
+    /// Sets to play; negative: back.
+    pub sets: i64,
+}
+
+impl Default for StepRequest {
+    fn default() -> Self {
+        Self { sets: 1 }
+    }
+}
+
+/// A speed for a replay.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RateRequest {
+    /// Against the original.
+    pub rate: f64,
+}
+
+/// Whether a replay begins again at its end.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LoopRequest {
+    /// Whether.
+    pub on: bool,
 }
 
 /// Whether every camera streams.
@@ -142,6 +179,53 @@ async fn record_note(State(rig): State<Rig>, body: Body) -> Answer<StatusCode> {
     let note: NoteRequest = parse(body)?;
     call(rig, move |rig| rig.record_note(&note.text)).await?;
     Ok(StatusCode::NO_CONTENT)
+}
+
+async fn replay(State(rig): State<Rig>) -> Answer<Json<ReplayStatus>> {
+    of_replay(rig, |replay| Ok(replay.status())).await
+}
+
+async fn replay_pause(State(rig): State<Rig>) -> Answer<Json<ReplayStatus>> {
+    of_replay(rig, |replay| replay.pause()).await
+}
+
+async fn replay_resume(State(rig): State<Rig>) -> Answer<Json<ReplayStatus>> {
+    of_replay(rig, |replay| replay.resume()).await
+}
+
+async fn replay_seek(State(rig): State<Rig>, body: Body) -> Answer<Json<ReplayStatus>> {
+    let to: SeekRequest = parse(body)?;
+    of_replay(rig, move |replay| replay.seek(&to)).await
+}
+
+async fn replay_step(State(rig): State<Rig>, body: Body) -> Answer<Json<ReplayStatus>> {
+    let step: StepRequest = parse(body)?;
+    of_replay(rig, move |replay| replay.step(step.sets)).await
+}
+
+async fn replay_rate(State(rig): State<Rig>, body: Body) -> Answer<Json<ReplayStatus>> {
+    let request: RateRequest = parse(body)?;
+    of_replay(rig, move |replay| replay.set_rate(request.rate)).await
+}
+
+async fn replay_loop(State(rig): State<Rig>, body: Body) -> Answer<Json<ReplayStatus>> {
+    let request: LoopRequest = parse(body)?;
+    of_replay(rig, move |replay| replay.set_loop(request.on)).await
+}
+
+/// Runs a call of the replay, when the rig is one.
+async fn of_replay(
+    rig: Rig,
+    what: impl FnOnce(&dyn ReplayControl) -> crate::Result<ReplayStatus> + Send + 'static,
+) -> Answer<Json<ReplayStatus>> {
+    let on_replay = move |rig: &dyn Control| {
+        let none = || {
+            let why = "this rig has cameras and is no replay; start one with: depthrig replay DATASET";
+            Error::new(ErrorKind::WrongState, why)
+        };
+        what(rig.replay().ok_or_else(none)?)
+    };
+    call(rig, on_replay).await.map(Json)
 }
 
 async fn stop(State(rig): State<Rig>) -> Answer<StatusCode> {

@@ -34,6 +34,7 @@ pub fn status(inner: &Inner) -> RigStatus {
             reserved_bytes: inner.cameras.iter().map(|c| reserved(c)).sum(),
         },
         cpu_cores: inner.cpu_millicores.load(Ordering::Relaxed) as f64 / 1000.0,
+        replay: None,
     }
 }
 
@@ -75,7 +76,8 @@ fn camera(inner: &Inner, camera: &Camera, now: HostTime) -> CameraStatus {
     }
 }
 
-fn stream(stream: &Stream, in_sets: SetAccount, now: HostTime) -> StreamStatus {
+/// A stream in numbers.
+pub fn stream(stream: &Stream, in_sets: SetAccount, now: HostTime) -> StreamStatus {
     let p = &stream.profile;
     let books = stream.books();
     let clock = books.clock.as_ref();

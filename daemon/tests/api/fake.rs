@@ -1,8 +1,8 @@
 //! A rig that does as the test tells it.
 
-use depthrig_daemon::control::{Control, RecordRequest};
+use depthrig_daemon::control::{Control, RecordRequest, ReplayControl, SeekRequest};
 use depthrig_daemon::status::{
-    CameraState, CameraStatus, ClockStatus, RecordingStatus, RigStatus, SetAccount, SetStatus,
+    CameraState, CameraStatus, ClockStatus, RecordingStatus, ReplayStatus, RigStatus, SetAccount, SetStatus,
     SharedMemoryStatus, StreamStatus,
 };
 use depthrig_daemon::{Error, ErrorKind, Result};
@@ -28,9 +28,30 @@ struct Inner {
     delay: Duration,
     calls: u32,
     stop: bool,
+    /// What a replay was asked for; none when this is a rig of cameras.
+    replay: Option<Vec<String>>,
 }
 
 impl Fake {
+    /// From now on this is a replay.
+    pub fn become_replay(&self) {
+        self.inner.lock().unwrap().replay = Some(Vec::new());
+    }
+
+    pub fn replay_calls(&self) -> Vec<String> {
+        self.inner.lock().unwrap().replay.clone().unwrap_or_default()
+    }
+
+    fn note_call(&self, call: String) -> Result<ReplayStatus> {
+        let mut inner = self.inner.lock().unwrap();
+        if let Some((kind, message)) = inner.fail.take() {
+            return Err(Error::new(kind, message));
+        }
+        let calls = inner.replay.as_mut().unwrap();
+        calls.push(call);
+        Ok(replay(calls))
+    }
+
     pub fn set_all(&self, state: CameraState) {
         self.inner.lock().unwrap().all = Some(state);
     }
@@ -100,6 +121,7 @@ impl Fake {
             recording: inner.recording.clone(),
             shared_memory: SharedMemoryStatus { free_bytes: 1 << 40, slots: 48, reserved_bytes: 1 << 30 },
             cpu_cores: 0.5,
+            replay: inner.replay.as_ref().map(|calls| replay(calls)),
         }
     }
 }
@@ -179,5 +201,49 @@ impl Control for Fake {
 
     fn request_stop(&self) {
         self.inner.lock().unwrap().stop = true;
+    }
+
+    fn replay(&self) -> Option<&dyn ReplayControl> {
+        self.inner.lock().unwrap().replay.is_some().then_some(self)
+    }
+}
+
+impl ReplayControl for Fake {
+    fn status(&self) -> ReplayStatus {
+        replay(&self.replay_calls())
+    }
+
+    fn pause(&self) -> Result<ReplayStatus> {
+        self.note_call("pause".into())
+    }
+
+    fn resume(&self) -> Result<ReplayStatus> {
+        self.note_call("resume".into())
+    }
+
+    fn seek(&self, to: &SeekRequest) -> Result<ReplayStatus> {
+        self.note_call(format!("{to:?}"))
+    }
+
+    fn step(&self, sets: i64) -> Result<ReplayStatus> {
+        self.note_call(format!("step {sets}"))
+    }
+
+    fn set_rate(&self, rate: f64) -> Result<ReplayStatus> {
+        self.note_call(format!("rate {rate}"))
+    }
+
+    fn set_loop(&self, on: bool) -> Result<ReplayStatus> {
+        self.note_call(format!("loop {on}"))
+    }
+}
+
+fn replay(calls: &[String]) -> ReplayStatus {
+    ReplayStatus {
+        datasets: vec!["/data/a".into()],
+        position_s: 1.5,
+        set: (!calls.is_empty()).then_some(7),
+        lost: vec!["a set".into()],
+        ..ReplayStatus::default()
     }
 }

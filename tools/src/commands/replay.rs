@@ -1,4 +1,4 @@
-//! `depthrig replay`: a dataset on the same channels as if the cameras were there.
+//! `depthrig replay`: datasets on the same channels as if the cameras were there, and the controls of a running one.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -7,24 +7,49 @@ use crate::progress::Progress;
 use crate::signals::Stop;
 use anyhow::Result;
 use core::time::Duration;
-use depthrig_daemon::replay::{Replay, ReplayOptions};
+use depthrig_daemon::client::Client;
+use depthrig_daemon::control::{RecordRequest, SeekRequest};
+use depthrig_daemon::replay::{Replay, ReplayOptions, ReplaySummary};
+use depthrig_daemon::status::ReplayStatus;
 use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Frames carry their original times and the flag `replayed`; nothing else tells them from live ones.
+Frames carry their original times and the flag `replayed`; nothing else tells them from live ones. Several datasets
+are replayed as one rig: side by side when their cameras differ, one after the other when they are the same.
 
 Examples:
   depthrig replay data/20261121_1015_kitchen
   depthrig replay data/20261121_1015_kitchen --rate 0.5 --from 10 --to 20 --loop
-  depthrig replay data/20261121_1015_kitchen --as-fast-as-possible --rig bench2";
+  depthrig replay data/left data/right --rig bench2
+  depthrig replay data/20261121_1015_kitchen --as-fast-as-possible --paused    nothing is missed, nor the first set
+  depthrig replay data/20261121_1015_kitchen --as-fast-as-possible --record data/again
+
+From another terminal, while it runs:
+  depthrig replay pause
+  depthrig replay seek 12.5    the set at, or first after, 12.5 s after the first; published at once
+  depthrig replay step         one more set; -1 goes back
+  depthrig replay rate 0.1
+  depthrig status              the cameras of the dataset, as if they were there";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
+#[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
 pub struct ReplayArgs {
-    /// The dataset's folder
-    dataset: PathBuf,
-    /// Speed against the original
+    #[command(subcommand)]
+    command: Option<ReplayCommand>,
+    #[command(flatten)]
+    start: StartArgs,
+}
+
+/// A replay to be started.
+#[derive(Debug, clap::Args)]
+#[allow(clippy::struct_excessive_bools)] // options of a command line
+struct StartArgs {
+    /// The datasets' folders
+    #[arg(required = true, value_name = "DATASET")]
+    datasets: Vec<PathBuf>,
+    /// Speed against the original, 0.1 to 10
     #[arg(long, value_name = "R", default_value = "1", conflicts_with = "as_fast_as_possible")]
     rate: f64,
     /// Begin again at the end
@@ -36,19 +61,127 @@ pub struct ReplayArgs {
     /// End so many seconds after the first set
     #[arg(long, value_name = "T")]
     to: Option<f64>,
-    /// Do not wait between sets; slow subscribers miss frames then
+    /// Wait for the subscribers and not for the clock: none of them misses a frame
     #[arg(long)]
     as_fast_as_possible: bool,
+    /// Publish nothing until `depthrig replay resume`, `step` or `seek`
+    #[arg(long)]
+    paused: bool,
+    /// Pause at the end, and do not end
+    #[arg(long, conflicts_with = "looped")]
+    hold: bool,
+    /// Record what is replayed, into a new folder below this one; nothing is encoded a second time
+    #[arg(long, value_name = "DIR", conflicts_with = "looped")]
+    record: Option<PathBuf>,
+    /// Name of the recording's folder; made of date, time and scene when left out
+    #[arg(long, requires = "record")]
+    name: Option<String>,
     /// Print JSON at the end
     #[arg(long)]
     json: bool,
+}
+
+/// What to tell a running replay.
+#[derive(Debug, clap::Subcommand)]
+enum ReplayCommand {
+    /// Say where the running replay is
+    Status(Told),
+    /// Stop it where it is
+    Pause(Told),
+    /// Play on
+    Resume(Told),
+    /// Go to a set and publish it, paused or not
+    Seek(SeekArgs),
+    /// Play one more set, or so many, and pause; negative: go back
+    Step {
+        /// Sets
+        #[arg(default_value = "1", allow_negative_numbers = true)]
+        sets: i64,
+        #[command(flatten)]
+        told: Told,
+    },
+    /// Change its speed
+    Rate {
+        /// Against the original, 0.1 to 10
+        #[arg(allow_negative_numbers = true)]
+        rate: f64,
+        #[command(flatten)]
+        told: Told,
+    },
+    /// Begin again at the end, or not
+    Loop {
+        /// `on` or `off`
+        #[arg(value_enum)]
+        on: Switch,
+        #[command(flatten)]
+        told: Told,
+    },
+}
+
+/// How a replay's answer is told.
+#[derive(Debug, Clone, Copy, clap::Args)]
+struct Told {
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, clap::Args)]
+#[group(id = "place", required = true, multiple = false, args = ["seconds", "set", "id"])]
+struct SeekArgs {
+    /// The set at, or first after, so many seconds after the first
+    #[arg(allow_negative_numbers = true)]
+    seconds: Option<f64>,
+    /// The set of this number, from 0
+    #[arg(long, value_name = "N")]
+    set: Option<u64>,
+    /// The set with this id in its dataset
+    #[arg(long)]
+    id: Option<u64>,
+    #[command(flatten)]
+    told: Told,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Switch {
+    On,
+    Off,
+}
+
+/// Replays, or steers a running replay.
+pub fn run(args: &ReplayArgs, context: &Context) -> Result<Exit> {
+    match &args.command {
+        None => replay(&args.start, context),
+        Some(command) => steer(command, &super::record::connect(context)?),
+    }
+}
+
+fn steer(command: &ReplayCommand, replay: &Client) -> Result<Exit> {
+    let (status, told) = match command {
+        ReplayCommand::Status(told) => (replay.replay()?, told),
+        ReplayCommand::Pause(told) => (replay.replay_pause()?, told),
+        ReplayCommand::Resume(told) => (replay.replay_resume()?, told),
+        ReplayCommand::Seek(a) => {
+            let place = SeekRequest { seconds: a.seconds, set: a.set, id: a.id };
+            (replay.replay_seek(&place)?, &a.told)
+        }
+        ReplayCommand::Step { sets, told } => (replay.replay_step(*sets)?, told),
+        ReplayCommand::Rate { rate, told } => (replay.replay_rate(*rate)?, told),
+        ReplayCommand::Loop { on, told } => (replay.replay_loop(*on == Switch::On)?, told),
+    };
+    if told.json {
+        out::json(&status)?;
+    } else {
+        out::line(crate::view::replay(&status))?;
+    }
+    Ok(if status.lost.is_empty() { Exit::Good } else { Exit::Lost })
 }
 
 /// Time that subscribers get to read the last frames before the channels go.
 const LINGER: Duration = Duration::from_millis(300);
 
 /// Replays until the end or a signal.
-pub fn run(args: &ReplayArgs, context: &Context) -> Result<Exit> {
+fn replay(args: &StartArgs, context: &Context) -> Result<Exit> {
     let stop = Stop::on_signals()?;
     let options = ReplayOptions {
         rate: args.rate,
@@ -56,15 +189,30 @@ pub fn run(args: &ReplayArgs, context: &Context) -> Result<Exit> {
         from_s: args.from,
         to_s: args.to,
         as_fast_as_possible: args.as_fast_as_possible,
+        // A recording begins before the first set does.
+        paused: args.paused || args.record.is_some(),
+        hold: args.hold,
+        serve_api: true,
     };
-    let replay = Replay::start(&args.dataset, &context.runtime()?, context.global.rig.clone(), options)?;
+    let replay = Replay::start(&args.datasets, &context.runtime()?, context.global.rig.clone(), options)?;
+    if let Some(directory) = &args.record {
+        let request = RecordRequest {
+            directory: Some(directory.clone()),
+            name: args.name.clone(),
+            ..RecordRequest::default()
+        };
+        let control = replay.control();
+        control.record_start(&request)?;
+        if let (Some(replay), false) = (control.replay(), args.paused) {
+            replay.resume()?;
+        }
+    }
     let mut bar = Progress::new(context.global.quiet > 0);
     loop {
+        let over = replay.wait(Duration::from_millis(100));
         let progress = replay.progress();
-        let what =
-            if progress.rounds > 1 { format!("replay, round {}", progress.rounds) } else { "replay".into() };
-        bar.set(&what, (progress.position_s * 10.0) as u64, (progress.length_s * 10.0) as u64);
-        if progress.done || stop.wait(Duration::from_millis(100)) {
+        bar.set(&headline(&progress), (progress.position_s * 10.0) as u64, (progress.length_s * 10.0) as u64);
+        if over || stop.is_asked() {
             break;
         }
     }
@@ -76,16 +224,44 @@ pub fn run(args: &ReplayArgs, context: &Context) -> Result<Exit> {
     if args.json {
         out::json(&result)?;
     } else {
+        tell(&result)?;
+    }
+    let recorded = result.recording.as_ref().is_none_or(|r| r.error.is_none() && r.dropped.is_empty());
+    Ok(if result.status.lost.is_empty() && recorded { Exit::Good } else { Exit::Lost })
+}
+
+/// What the bar says.
+fn headline(progress: &ReplayStatus) -> String {
+    match (&progress.waiting_for, progress.paused) {
+        (Some(channel), _) => format!("replay, waiting for {channel}"),
+        (None, true) => "replay, paused".into(),
+        (None, false) if progress.rounds > 1 => format!("replay, round {}", progress.rounds),
+        (None, false) => "replay".into(),
+    }
+}
+
+fn tell(result: &ReplaySummary) -> Result<()> {
+    let status = &result.status;
+    out::line(format_args!(
+        "replayed {} sets, {} frames, {} of {}",
+        status.sets,
+        status.frames,
+        out::seconds(status.position_s),
+        out::seconds(status.length_s)
+    ))?;
+    if let Some(r) = &result.recording {
+        let lost = out::reasons(&r.dropped);
+        let size = out::bytes(r.bytes);
         out::line(format_args!(
-            "replayed {} sets, {} frames, {} of {}",
-            result.sets,
-            result.frames,
-            out::seconds(result.position_s),
-            out::seconds(result.length_s)
+            "recorded {}: {} sets, {} frames, {size}, lost {lost}",
+            r.path, r.sets, r.frames
         ))?;
-        for lost in &result.lost {
-            out::line(format_args!("lost: {lost}"))?;
+        if let Some(e) = &r.error {
+            out::line(format_args!("lost: {e}"))?;
         }
     }
-    Ok(if result.lost.is_empty() { Exit::Good } else { Exit::Lost })
+    for lost in &status.lost {
+        out::line(format_args!("lost: {lost}"))?;
+    }
+    Ok(())
 }

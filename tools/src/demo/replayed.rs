@@ -52,15 +52,19 @@ pub fn run(
     rig: &depthrig_bus::RigName,
     live: &Checksums,
 ) -> Result<Replayed> {
-    let options = ReplayOptions { as_fast_as_possible: true, ..ReplayOptions::default() };
+    // Paused until the subscriber is there: it is to see every frame.
+    let options = ReplayOptions { as_fast_as_possible: true, paused: true, ..ReplayOptions::default() };
     let streams: Vec<StreamId> =
         depthrig_recorder::Dataset::open(dataset)?.session().streams.iter().map(|s| s.id.clone()).collect();
-    let replay = Replay::start(dataset, runtime, Some(rig.clone()), options)?;
+    let replay = Replay::start(&[dataset.to_owned()], runtime, Some(rig.clone()), options)?;
     let bus = Bus::open(runtime, rig)?;
     let mut inputs = Vec::new();
     for id in streams {
         let subscriber = bus.subscriber_within(&id, PATIENCE)?;
         inputs.push(Input { id, subscriber, last_ns: i64::MIN });
+    }
+    if let Some(replay) = replay.control().replay() {
+        replay.resume()?;
     }
     let mut seen = Replayed::default();
     let mut quiet_since = None;
@@ -79,7 +83,7 @@ pub fn run(
             std::thread::sleep(Duration::from_millis(2));
         }
     }
-    let progress = replay.stop();
+    let progress = replay.stop().status;
     (seen.sets, seen.published, seen.lost) = (progress.sets, progress.frames, progress.lost);
     Ok(seen)
 }

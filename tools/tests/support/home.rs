@@ -1,4 +1,5 @@
 //! A home for the binary under test: its own runtime folder, pictures for `files` cameras, and its output.
+#![allow(dead_code)] // each test binary uses a part of it
 
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};

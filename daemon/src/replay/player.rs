@@ -1,0 +1,259 @@
+//! The replay thread: reads moments, waits until they are due, publishes and records them.
+
+use super::source::Moment;
+use super::transport::Order;
+use super::{Inner, lock};
+use crate::Result;
+use crate::stream::Stream;
+use core::time::Duration;
+use depthrig_bus::{
+    Bus, DropReason, ErrorKind, FrameFlags, FrameHeader, HostTime, MemberRecord, Publisher,
+    SUBSCRIBER_BUFFER, SetHeader, SetPublisher, UtcPair, shm,
+};
+use depthrig_recorder::{DatasetFrame, PixelMode, Pixels, RecordFrame, RecordSet};
+use std::sync::Arc;
+
+/// How often a replay that has nothing to publish looks for new subscribers, who are to see the last set.
+const IDLE: Duration = Duration::from_millis(100);
+/// How often a replay that waits for a subscriber looks for one that was killed.
+const CLEAN: Duration = Duration::from_secs(1);
+/// How often a replay that waits for a subscriber or the recorder asks again.
+const ASK: Duration = Duration::from_millis(1);
+/// A subscriber that keeps a replay waiting this long is worth a line in the log.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// The replay thread's state.
+pub struct Player {
+    inner: Arc<Inner>,
+    bus: Arc<Bus>,
+    outputs: Vec<Output>,
+    sets: SetPublisher,
+}
+
+struct Output {
+    stream: Arc<Stream>,
+    publisher: Publisher,
+    sequence: u64,
+}
+
+/// A frame's pixels, with the JPEG that they came from.
+struct Read {
+    pixels: Vec<u8>,
+    jpeg: Option<Vec<u8>>,
+}
+
+impl Pixels for Read {
+    fn bytes(&self) -> &[u8] {
+        &self.pixels
+    }
+
+    fn jpeg(&self) -> Option<&[u8]> {
+        self.jpeg.as_deref()
+    }
+}
+
+impl Player {
+    /// Opens the channels.
+    ///
+    /// # Errors
+    /// `NoSpace` when shared memory is too small, and those of opening a channel.
+    pub fn new(inner: Arc<Inner>, bus: Arc<Bus>) -> Result<Self> {
+        let bytes = |s: &Stream| s.profile.frame_bytes();
+        let set_bytes = inner.streams.iter().map(|s| bytes(s) as u64).sum();
+        let free = shm::free_bytes(shm::SHM_DIR.as_ref())?;
+        let fit = shm::slots_that_fit(inner.slots(), set_bytes, free)?;
+        let mut outputs = Vec::new();
+        for stream in &inner.streams {
+            let publisher = bus.publisher(&stream.id, bytes(stream), fit)?;
+            outputs.push(Output { stream: Arc::clone(stream), publisher, sequence: 0 });
+        }
+        let sets =
+            if inner.lossless() { bus.set_publisher_with(SUBSCRIBER_BUFFER)? } else { bus.set_publisher()? };
+        Ok(Self { inner, bus, outputs, sets })
+    }
+
+    /// Runs until the replay is stopped. The channels stay until then, so that subscribers can read the last frames.
+    pub fn run(mut self) {
+        let inner = Arc::clone(&self.inner);
+        let mut ahead: Option<(usize, Moment)> = None;
+        while !inner.stopping() {
+            let order = lock(&inner.transport).order(HostTime::now());
+            inner.set_done(order == Order::End);
+            let Order::Publish { moment, due, turn } = order else {
+                self.idle(IDLE);
+                continue;
+            };
+            // Read before it is due, then look again: a command may have come meanwhile.
+            let Some((_, read)) = ahead.take_if(|(n, _)| *n == moment && due <= HostTime::now()) else {
+                if ahead.as_ref().is_some_and(|(n, _)| *n == moment) {
+                    self.idle(due.from_now().min(IDLE));
+                } else {
+                    let read =
+                        lock(&inner.sources).read(&inner.timeline, moment, PixelMode::DecodedAndStored);
+                    ahead = Some((moment, read));
+                }
+                continue;
+            };
+            let now = HostTime::now();
+            self.publish(moment, read);
+            lock(&inner.transport).published(moment, turn, now);
+            inner.acted.notify_all();
+        }
+    }
+
+    /// Sleeps until a command comes or `length` has passed.
+    fn idle(&self, length: Duration) {
+        self.inner.wake.wait(length);
+        self.outputs.iter().for_each(|o| o.publisher.welcome());
+        self.sets.welcome();
+    }
+
+    fn publish(&mut self, number: usize, mut moment: Moment) {
+        for problem in std::mem::take(&mut moment.problems) {
+            self.inner.lose(problem);
+        }
+        if moment.frames.is_empty() {
+            return;
+        }
+        let mut members: Vec<_> = self
+            .outputs
+            .iter()
+            .map(|o| MemberRecord {
+                id: o.stream.id.clone(),
+                sequence: None,
+                capture_time_ns: moment.tick.ns(),
+            })
+            .collect();
+        let mut recorded = Vec::with_capacity(moment.frames.len());
+        for frame in std::mem::take(&mut moment.frames) {
+            let (Some(output), Some(member)) =
+                (self.outputs.get_mut(frame.stream), members.get_mut(frame.stream))
+            else {
+                continue;
+            };
+            match send(&self.inner, &self.bus, output, &frame) {
+                Ok(Some(header)) => {
+                    member.sequence = Some(header.sequence);
+                    member.capture_time_ns = header.capture_time_ns;
+                    let pixels = Box::new(Read { pixels: frame.pixels, jpeg: frame.jpeg });
+                    recorded.push(RecordFrame { stream: frame.stream, header, pixels });
+                }
+                Ok(None) => return, // stopped while it waited
+                Err(e) => self.inner.lose(format!("set {}: {e}", moment.id)),
+            }
+        }
+        let id = self.inner.count(number, &moment, members.iter().any(|m| m.sequence.is_none()));
+        let header = SetHeader {
+            set_id: id.set,
+            tick_ns: moment.tick.ns(),
+            spread_ns: moment.spread_ns,
+            incomplete: id.incomplete,
+            ..SetHeader::default()
+        };
+        let sent = patiently(&self.inner, &self.bus, "the frame sets", || self.sets.send(header, &members));
+        if let Err(e) = sent {
+            self.inner.lose(format!("set {}: {e}", moment.id));
+        }
+        self.record(id.set, &moment, recorded);
+    }
+
+    /// Hands the set to the recorder, if one is running, and waits until it has room: a recording of a replay loses
+    /// nothing.
+    fn record(&self, id: u64, moment: &Moment, frames: Vec<RecordFrame>) {
+        let inner = &self.inner;
+        while !lock(&inner.recording).has_room() && !inner.stopping() {
+            std::thread::sleep(ASK);
+        }
+        let present = |s: &usize| frames.iter().any(|f| f.stream == *s);
+        let missing = (0..self.outputs.len()).filter(|s| !present(s)).collect();
+        let utc_ns = lock(&inner.sources).utc_ns(moment.tick);
+        let utc = UtcPair { mono: moment.tick, utc_ns, width_ns: 0 };
+        *lock(&inner.clock) = utc;
+        let (tick, spread_ns) = (moment.tick, moment.spread_ns);
+        lock(&inner.recording).push(RecordSet { id, tick, utc, frames, missing, spread_ns });
+    }
+}
+
+/// Publishes a frame with the header that it was recorded with; `None` when the replay was stopped meanwhile.
+fn send(
+    inner: &Inner,
+    bus: &Bus,
+    output: &mut Output,
+    frame: &DatasetFrame,
+) -> depthrig_bus::Result<Option<FrameHeader>> {
+    let stream = Arc::clone(&output.stream);
+    let mut books = stream.books();
+    books.captured += 1;
+    drop(books);
+    let name = stream.id.to_string();
+    let loan = patiently(inner, bus, &name, || output.publisher.loan(frame.pixels.len()));
+    let sent = loan.and_then(|slot| {
+        let Some(mut slot) = slot else { return Ok(None) };
+        slot.pixels_mut().copy_from_slice(&frame.pixels);
+        let sequence = output.sequence + 1;
+        let header = FrameHeader {
+            sequence,
+            captured: sequence + frame.header.drops().total(),
+            flags: frame.header.flags | FrameFlags::REPLAYED.0,
+            payload_len: frame.pixels.len() as u32,
+            ..frame.header
+        };
+        *slot.header_mut() = header;
+        output.publisher.send_unstamped(slot)?;
+        output.sequence = sequence;
+        Ok(Some(header))
+    });
+    let mut books = stream.books();
+    match &sent {
+        Ok(Some(h)) => {
+            books.delivered += 1;
+            books.epoch = h.clock_epoch;
+            books.uncertainty_ns = h.capture_uncertainty_ns;
+            books.uncertain += u64::from(h.has(FrameFlags::TIME_UNCERTAIN));
+            books.note(HostTime::now(), h.publish_time_ns.saturating_sub(h.capture_time_ns));
+        }
+        _ => books.dropped.add(DropReason::NoSlot, 1),
+    }
+    sent
+}
+
+/// Does `what` on a channel. A replay that its subscribers pace waits until they have let go of a slot; `None` when
+/// it was stopped meanwhile.
+fn patiently<T>(
+    inner: &Inner,
+    bus: &Bus,
+    channel: &str,
+    mut what: impl FnMut() -> depthrig_bus::Result<T>,
+) -> depthrig_bus::Result<Option<T>> {
+    let began = HostTime::now();
+    let (mut told, mut looked) = (false, began);
+    loop {
+        match what() {
+            Err(e) if e.kind() == ErrorKind::NoSpace && inner.lossless() => {}
+            done => {
+                if looked != began || told {
+                    inner.set_waiting_for(None);
+                }
+                return done.map(Some);
+            }
+        }
+        if inner.stopping() {
+            return Ok(None);
+        }
+        if looked.elapsed() > CLEAN {
+            // One of them may have been killed, and will never let go.
+            looked = HostTime::now();
+            inner.set_waiting_for(Some(channel));
+            bus.clean_dead();
+        }
+        if began.elapsed() > PATIENCE && !told {
+            told = true;
+            tracing::warn!(
+                channel,
+                "the replay waits: a subscriber reads no further, or holds more than {} frames",
+                SUBSCRIBER_BUFFER - 1
+            );
+        }
+        std::thread::sleep(ASK);
+    }
+}

@@ -1,0 +1,270 @@
+//! Where replayed sets come from: one or several datasets, read as the sets of one rig.
+
+use super::timeline::{Part, Timeline};
+use crate::{Error, ErrorKind, Result};
+use depthrig_bus::{HostTime, PixelFormat, RigName};
+use depthrig_recorder::{
+    ColorCodec, Dataset, DatasetFrame, DatasetSet, DepthCodec, PixelMode, Session, SetReader, StreamRecord,
+};
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+/// Clocks of two datasets that agree within this are one clock of one computer: two boots, or two computers, differ
+/// by hours.
+const SAME_CLOCK_NS: i64 = 1_000_000_000;
+/// Sets that are looked at to learn how pictures are stored.
+const LOOK_AT: usize = 8;
+
+/// Datasets that are replayed as one rig.
+pub struct Sources {
+    list: Vec<Source>,
+    rig: RigName,
+    streams: Vec<StreamRecord>,
+    /// Added to a monotonic time of the replay this gives UTC.
+    utc_offset_ns: i64,
+}
+
+struct Source {
+    dataset: Dataset,
+    reader: SetReader,
+    /// The rig's stream of each stream of this dataset.
+    streams: Vec<usize>,
+}
+
+/// One moment of a replay: a set, or several that were paired.
+#[derive(Default)]
+pub struct Moment {
+    /// Id of the set in its dataset; of the first one, where there are several.
+    pub id: u64,
+    /// The moment that it stands for, on the clock of the replay.
+    pub tick: HostTime,
+    /// Latest minus earliest capture time, nanoseconds.
+    pub spread_ns: i64,
+    /// The frames; `stream` is the rig's stream.
+    pub frames: Vec<DatasetFrame>,
+    /// Sets of this moment that could not be read.
+    pub problems: Vec<String>,
+}
+
+impl Sources {
+    /// Opens `paths` as the rig `rig`, or as the one that they were recorded from.
+    ///
+    /// # Errors
+    /// [`ErrorKind::NotFound`], [`ErrorKind::BadInput`] when one of them is no dataset or has no set, or when they
+    /// are not of one rig.
+    pub fn open(paths: &[PathBuf], rig: Option<RigName>) -> Result<Self> {
+        let mut sources = Vec::new();
+        let mut streams: Vec<StreamRecord> = Vec::new();
+        for path in paths {
+            let dataset = Dataset::open(path).map_err(of_dataset)?;
+            let reader = dataset.set_reader().map_err(of_dataset)?;
+            if reader.times().is_empty() {
+                let shown = path.display();
+                let why = reader.problems().first().map_or(String::new(), |p| format!(": {p}"));
+                return Err(bad(format!("{shown} holds no frame set, there is nothing to replay{why}")));
+            }
+            let mut indices = Vec::new();
+            for record in &dataset.session().streams {
+                indices.push(join(&mut streams, record, &dataset)?);
+            }
+            sources.push(Source { dataset, reader, streams: indices });
+        }
+        let Some(first) = sources.first_mut() else {
+            return Err(bad("name a dataset to replay"));
+        };
+        let utc_offset_ns = first.reader.read(0, PixelMode::None).map_or(0, |set| set.utc_offset_ns);
+        let rig = match rig {
+            Some(rig) => rig,
+            None => rig_of(&sources)?,
+        };
+        Ok(Self { list: sources, rig, streams, utc_offset_ns })
+    }
+
+    /// The moments of a replay of them.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] when two of them hold the same stream at the same time.
+    pub fn timeline(&self) -> Result<Timeline> {
+        let parts: Vec<_> = self
+            .list
+            .iter()
+            .map(|s| Part {
+                name: s.dataset.path().display().to_string(),
+                streams: s.streams.iter().map(|i| &self.streams[*i].id).collect(),
+                times: s.reader.times(),
+            })
+            .collect();
+        Timeline::new(&parts)
+    }
+
+    /// The rig's name.
+    pub const fn rig(&self) -> &RigName {
+        &self.rig
+    }
+
+    /// The streams of all of them.
+    pub fn streams(&self) -> &[StreamRecord] {
+        &self.streams
+    }
+
+    /// The session of the first one.
+    pub fn session(&self) -> &Session {
+        self.list[0].dataset.session()
+    }
+
+    /// What cannot be read, one line per segment.
+    pub fn problems(&self) -> impl Iterator<Item = &String> {
+        self.list.iter().flat_map(|s| s.reader.problems())
+    }
+
+    /// How colour and depth must be stored for nothing to be lost: as in the datasets where they agree.
+    pub fn codecs(&mut self) -> (ColorCodec, DepthCodec) {
+        let (mut color, mut depth) = (BTreeSet::new(), BTreeSet::new());
+        for source in &mut self.list {
+            for n in 0..source.reader.times().len().min(LOOK_AT) {
+                let Ok(set) = source.reader.read(n, PixelMode::None) else { continue };
+                for frame in &set.frames {
+                    match frame.header.pixel_format() {
+                        Some(PixelFormat::Rgb8 | PixelFormat::Bgr8) => color.insert(frame.codec),
+                        Some(PixelFormat::Z16) => depth.insert(frame.codec),
+                        _ => false,
+                    };
+                }
+            }
+        }
+        let only = |codecs: BTreeSet<&'static str>| codecs.first().copied().filter(|_| codecs.len() == 1);
+        (
+            match only(color) {
+                Some("jpeg") => ColorCodec::Jpeg,
+                Some("png") => ColorCodec::Png,
+                _ => ColorCodec::Raw,
+            },
+            if only(depth) == Some("rank") { DepthCodec::Rank } else { DepthCodec::default() },
+        )
+    }
+
+    /// Reads a moment of `timeline`.
+    pub fn read(&mut self, timeline: &Timeline, moment: usize, mode: PixelMode) -> Moment {
+        let mut read = Moment::default();
+        let mut sets = 0;
+        for member in timeline.members(moment) {
+            let Some(source) = self.list.get_mut(member.dataset as usize) else { continue };
+            match source.reader.read(member.set as usize, mode) {
+                Ok(set) => {
+                    let shift_ns = shift(set.utc_offset_ns, self.utc_offset_ns);
+                    take(&mut read, set, &source.streams, shift_ns, sets == 0);
+                    sets += 1;
+                }
+                Err(e) => read.problems.push(e.to_string()),
+            }
+        }
+        if sets > 1 {
+            let times = read.frames.iter().map(|f| f.header.capture_time_ns);
+            read.spread_ns = times.clone().max().unwrap_or(0) - times.min().unwrap_or(0);
+        }
+        // In the order in which they were published, as a subscriber of several streams saw them.
+        read.frames.sort_by_key(|f| f.header.publish_time_ns);
+        read
+    }
+
+    /// A time of the replay's clock as UTC.
+    pub const fn utc_ns(&self, t: HostTime) -> i64 {
+        t.ns().saturating_add(self.utc_offset_ns)
+    }
+
+    /// The number of the set with this id, in the only dataset.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] when there are several datasets, [`ErrorKind::NotFound`] when no set has this id.
+    pub fn number_of(&mut self, id: u64) -> Result<usize> {
+        let [source] = self.list.as_mut_slice() else {
+            return Err(bad("ids name sets of one dataset, and this replay has several; seek by time"));
+        };
+        // Ids increase, so the index need not have them: a dozen sets are looked at, their pictures not read.
+        let (mut low, mut high) = (0, source.reader.times().len());
+        while low < high {
+            let middle = low + (high - low) / 2;
+            let readable = (middle..high)
+                .find_map(|n| source.reader.read(n, PixelMode::None).ok().map(|set| (n, set.id)));
+            match readable {
+                Some((n, found)) if found == id => return Ok(n),
+                Some((n, found)) if found < id => low = n + 1,
+                _ => high = middle,
+            }
+        }
+        let shown = source.dataset.path().display();
+        Err(Error::new(ErrorKind::NotFound, format!("{shown} has no set with the id {id}")))
+    }
+}
+
+/// The rig's stream for `record`; a new one unless a dataset before it has it.
+fn join(streams: &mut Vec<StreamRecord>, record: &StreamRecord, dataset: &Dataset) -> Result<usize> {
+    let Some(i) = streams.iter().position(|s| s.id == record.id) else {
+        streams.push(record.clone());
+        return Ok(streams.len() - 1);
+    };
+    let mode = |r: &StreamRecord| format!("{}x{} {}", r.width, r.height, r.format.name());
+    let (before, now) = (mode(&streams[i]), mode(record));
+    if before == now {
+        return Ok(i);
+    }
+    Err(bad(format!(
+        "{}: stream {} is {now} there and {before} in a dataset before it; a rig's stream has one mode: replay them one \
+         at a time",
+        dataset.path().display(),
+        record.id
+    )))
+}
+
+fn rig_of(sources: &[Source]) -> Result<RigName> {
+    let mut names: Vec<&str> = sources.iter().map(|s| s.dataset.session().rig.as_str()).collect();
+    names.dedup();
+    match names.as_slice() {
+        [name] => Ok(RigName::new(*name)?),
+        names => {
+            let names = names.join(", ");
+            Err(bad(format!(
+                "the datasets are of several rigs ({names}); name the one to replay as with --rig"
+            )))
+        }
+    }
+}
+
+/// What moves a time of a clock with `offset_ns` to UTC onto the clock with `base_ns`.
+fn shift(offset_ns: i64, base_ns: i64) -> i64 {
+    let shift = offset_ns.saturating_sub(base_ns);
+    if shift.saturating_abs() < SAME_CLOCK_NS { 0 } else { shift }
+}
+
+/// Adds a set to a moment.
+fn take(moment: &mut Moment, set: DatasetSet, streams: &[usize], shift_ns: i64, first: bool) {
+    let tick = set.tick.plus_ns(shift_ns);
+    if first {
+        (moment.id, moment.tick, moment.spread_ns) = (set.id, tick, set.spread_ns);
+    }
+    moment.tick = moment.tick.min(tick);
+    for mut frame in set.frames {
+        let Some(stream) = streams.get(frame.stream) else { continue };
+        frame.stream = *stream;
+        let h = &mut frame.header;
+        for t in [&mut h.capture_time_ns, &mut h.arrival_time_ns, &mut h.publish_time_ns] {
+            *t = t.saturating_add(shift_ns);
+        }
+        moment.frames.push(frame);
+    }
+}
+
+fn bad(what: impl Into<String>) -> Error {
+    Error::new(ErrorKind::BadInput, what)
+}
+
+fn of_dataset(e: depthrig_recorder::Error) -> Error {
+    use depthrig_recorder::ErrorKind as Rec;
+    let kind = match e.kind() {
+        Rec::NotFound => ErrorKind::NotFound,
+        Rec::PermissionDenied => ErrorKind::PermissionDenied,
+        Rec::NotADataset | Rec::Foreign | Rec::Version => ErrorKind::BadInput,
+        _ => ErrorKind::Other,
+    };
+    Error::new(kind, e.to_string()).with_source(e)
+}
