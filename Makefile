@@ -9,6 +9,8 @@ export DEPTHRIG_TEST_DATA ?= $(abspath ../shared/data)
 
 READERS := tests/readers
 VENV := .venv
+# LeRobot brings PyTorch, so it has an environment of its own, and a Python of 3.12 or later if there is one.
+LEROBOT := .venv-lerobot
 REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt
 
 .PHONY: help demo test lint bench clean setup-build setup-test
@@ -20,7 +22,7 @@ demo: setup-build ## the seven-camera rig with synthetic cameras: record, verify
 	cargo build --release --package depthrig
 	target/release/depthrig demo $(ARGS)
 
-test: setup-test $(VENV)/.stamp $(READERS)/node_modules/.stamp ## every test there is: Rust, Python, readers that are not ours
+test: setup-test $(VENV)/.stamp $(LEROBOT)/.stamp $(READERS)/node_modules/.stamp ## every test there is: Rust, Python, readers that are not ours
 	tools/test.sh
 
 lint: ## formatting and lints, as CI runs them
@@ -35,7 +37,7 @@ bench: setup-build ## the numbers of docs/performance.md
 
 clean: ## remove what was built
 	cargo clean
-	rm -rf $(VENV) $(READERS)/node_modules
+	rm -rf $(VENV) $(LEROBOT) $(READERS)/node_modules
 
 setup-build:
 	@tools/setup.sh build
@@ -46,6 +48,12 @@ setup-test:
 $(VENV)/.stamp: $(REQUIREMENTS) python/pyproject.toml
 	python3 -m venv $(VENV)
 	$(VENV)/bin/pip install --quiet $(addprefix --requirement ,$(REQUIREMENTS)) --editable ./python
+	touch $@
+
+$(LEROBOT)/.stamp: tests/python/requirements-lerobot.txt
+	for python in python3.12 $$HOME/.pyenv/versions/3.12*/bin/python python3; do \
+		"$$python" -c 'import venv' 2>/dev/null && break; done && "$$python" -m venv --clear $(LEROBOT)
+	$(LEROBOT)/bin/pip install --quiet --no-deps --no-compile --no-cache-dir --requirement $<
 	touch $@
 
 $(READERS)/node_modules/.stamp: $(READERS)/package.json $(READERS)/package-lock.json

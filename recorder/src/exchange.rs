@@ -11,6 +11,7 @@
 mod export;
 mod folder;
 mod import;
+pub mod lerobot;
 mod report;
 mod source;
 

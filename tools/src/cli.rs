@@ -1,8 +1,8 @@
 //! The commands and options, and what `--help` says of them.
 
 use crate::commands::{
-    bench, cat, compare, completions, config, demo, edit, info, man, merge, record, replay, report, run,
-    sessions, status, tap, top, trim, verify,
+    bench, cat, compare, completions, config, demo, edit, export, info, man, merge, record, replay, report,
+    run, sessions, status, tap, top, trim, verify,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -115,6 +115,9 @@ pub enum Command {
     /// Change scene, operator, notes or name of a dataset; what it said before stays in its history
     #[command(after_help = edit::EXAMPLES)]
     Edit(edit::EditArgs),
+    /// Write datasets in the layout of others: LeRobot
+    #[command(subcommand, after_help = export::EXAMPLES)]
+    Export(export::ExportCommand),
     /// Check that a dataset is whole
     #[command(after_help = verify::EXAMPLES)]
     Verify(verify::VerifyArgs),

@@ -7,6 +7,7 @@ pub mod completions;
 pub mod config;
 pub mod demo;
 pub mod edit;
+pub mod export;
 pub mod info;
 pub mod man;
 pub mod merge;
@@ -43,6 +44,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Report(args) => report::run(&args, &context),
         Command::Sessions(args) => sessions::run(&args, &context),
         Command::Edit(args) => edit::run(&args),
+        Command::Export(command) => export::run(&command, &context),
         Command::Verify(args) => verify::run(&args, &context),
         Command::Cat(args) => cat::run(&args, &context),
         Command::Trim(args) => trim::run(&args, &context),

@@ -41,6 +41,7 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
         "report",
         "sessions",
         "edit",
+        "export",
         "verify",
         "cat",
         "compare",

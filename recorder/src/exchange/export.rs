@@ -147,6 +147,13 @@ impl PartSets<'_> {
     }
 }
 
+impl<'a> PartOut<'a> {
+    /// Begins a file that is removed before the export is whole, as [`Output::scratch`].
+    pub(super) fn scratch(&self, name: &str) -> Result<OutFile<'a>> {
+        self.out.scratch(name)
+    }
+}
+
 impl PartOut<'_> {
     /// Begins a file, as [`Output::create`].
     ///

@@ -4,7 +4,7 @@
 //! `.part_NNNNN.rows` and then `.part_NNNNN.json`. When all is done `export.json` is written and these go.
 
 use super::report::{PartRecord, REPORT_FILE};
-use crate::fs::{self, Fs, WriteFile};
+use crate::fs::{self, Fs, ReadFile, WriteFile};
 use crate::{Error, ErrorKind, Result};
 use serde::de::DeserializeOwned;
 use serde_json::Value;
@@ -118,6 +118,38 @@ impl<'a> Output<'a> {
         let mut file = self.begin(name)?;
         file.count = Some((&self.files, &self.bytes));
         Ok(file)
+    }
+
+    /// Begins a file that is not of the layout: needed until the export is whole, removed then because its name begins
+    /// with `.part_`.
+    pub(super) fn scratch(&self, name: &str) -> Result<OutFile<'_>> {
+        debug_assert!(name.starts_with(".part_"));
+        self.begin(name)
+    }
+
+    /// Opens the file `name`; `None` when it is not there.
+    pub(super) fn open_file(&self, name: &str) -> Result<Option<Box<dyn ReadFile>>> {
+        let path = self.dir.join(name);
+        match self.fs.open(&path) {
+            Ok(file) => Ok(Some(file)),
+            Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(e) => Err(Error::io("open", &path, e)),
+        }
+    }
+
+    /// Counts a file of the layout that an earlier run made whole.
+    pub(super) fn keep(&self, bytes: u64) {
+        self.files.fetch_add(1, Ordering::Relaxed);
+        self.bytes.fetch_add(bytes, Ordering::Relaxed);
+    }
+
+    /// Removes the file `name`, if it is there.
+    pub(super) fn remove(&self, name: &str) -> Result<()> {
+        let path = self.dir.join(name);
+        match self.fs.remove_file(&path) {
+            Err(e) if e.kind() != io::ErrorKind::NotFound => Err(Error::io("remove", &path, e)),
+            _ => Ok(()),
+        }
     }
 
     /// Writes the file `name` in one step.

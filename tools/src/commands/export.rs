@@ -1,0 +1,128 @@
+//! `depthrig export`: datasets in the layouts of others.
+
+use crate::context::Context;
+use crate::exit::{Exit, UsageError};
+use crate::out;
+use crate::progress::Progress;
+use crate::signals::Stop;
+use anyhow::Result;
+use core::ops::ControlFlow;
+use depthrig_recorder::exchange::{ExportOptions, ExportReport, Exporter, export};
+use depthrig_recorder::fs::RealFs;
+use depthrig_recorder::{Dataset, ErrorKind};
+use std::path::PathBuf;
+
+mod lerobot;
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+OUT is new. An export that was ended or killed goes on where it was when it is run again with the same datasets
+and options; the result is the same as without the interruption. Nothing is ever overwritten. OUT/export.json, written
+last, says what was exported and what was lost on the way; docs/exchange.md describes each layout.
+
+Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage, 3 exported, but some sets, frames or pixels
+could not be.
+
+Examples:
+  depthrig export lerobot data/20261121_1015_kitchen lerobot/kitchen
+  depthrig export lerobot data/* lerobot/all --task \"put the cup on the shelf\"";
+
+/// The layouts.
+#[derive(Debug, clap::Subcommand)]
+pub enum ExportCommand {
+    /// LeRobot v3.0: each dataset is an episode, colour as JPEG or PNG, depth as TIFF
+    #[command(after_help = lerobot::EXAMPLES)]
+    Lerobot(lerobot::Args),
+}
+
+/// What every export has.
+#[derive(Debug, clap::Args)]
+pub struct Common {
+    /// The datasets' folders
+    #[arg(required = true, value_name = "DATASET")]
+    datasets: Vec<PathBuf>,
+    /// The new folder
+    #[arg(required = true)]
+    out: PathBuf,
+    /// Segments that are worked on at once [default: one for each core]
+    #[arg(short = 'j', long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
+    jobs: Option<u16>,
+    /// Print the report as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Exports.
+pub fn run(command: &ExportCommand, context: &Context) -> Result<Exit> {
+    match command {
+        ExportCommand::Lerobot(args) => {
+            let (mut exporter, common) = args.exporter();
+            drive(&mut exporter, common, context)
+        }
+    }
+}
+
+/// Runs an exporter, shows how far it is, and tells its report.
+fn drive(exporter: &mut dyn Exporter, common: &Common, context: &Context) -> Result<Exit> {
+    let dir = &common.out;
+    let datasets = common.datasets.iter().map(|d| Dataset::open(d)).collect::<Result<Vec<_>, _>>()?;
+    let mut options = ExportOptions::default();
+    if let Some(jobs) = common.jobs {
+        options.workers = usize::from(jobs);
+    }
+    let stop = Stop::on_signals()?;
+    let mut bar = Progress::new(context.global.quiet > 0);
+    let report = export(&RealFs, exporter, datasets, dir, options, &mut |p| {
+        bar.set("export", p.sets, p.total);
+        if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    })
+    .map_err(usage)?;
+    bar.clear();
+    if common.json {
+        out::json(&report)?;
+    } else if context.global.quiet == 0 {
+        tell(&report, dir)?;
+    }
+    for problem in &report.problems {
+        eprintln!("lost: {problem}");
+    }
+    Ok(match report {
+        _ if report.ended => Exit::Failed,
+        _ if report.lost > 0 => Exit::Lost,
+        _ => Exit::Good,
+    })
+}
+
+fn tell(report: &ExportReport, dir: &std::path::Path) -> Result<()> {
+    let dir = dir.display();
+    if report.ended {
+        return out::line(format_args!("{dir}: ended; run it again to go on"));
+    }
+    let resumed = match report.parts_resumed {
+        0 => String::new(),
+        n if n == report.parts => " (was there already)".to_owned(),
+        n => format!(" ({n} of {} parts were there already)", report.parts),
+    };
+    out::line(format_args!(
+        "{dir}: {} frames of {} sets in {} files, {}{resumed}",
+        report.frames,
+        report.sets,
+        report.files,
+        out::bytes(report.bytes)
+    ))?;
+    for loss in &report.losses {
+        out::line(format_args!("note: {loss}"))?;
+    }
+    for (counter, n) in &report.counters {
+        out::line(format_args!("note: {counter}: {n}"))?;
+    }
+    Ok(())
+}
+
+/// What was asked for cannot be done, or only with other words: exit code 2.
+pub fn usage(e: depthrig_recorder::Error) -> anyhow::Error {
+    match e.kind() {
+        ErrorKind::BadInput => UsageError(e.to_string()).into(),
+        _ => e.into(),
+    }
+}
