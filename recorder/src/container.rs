@@ -7,9 +7,7 @@
 //!
 //! <https://mcap.dev/spec>
 
-#[allow(dead_code)] // what copying needs is not used yet
 pub(crate) mod chunk;
-#[allow(dead_code)]
 pub(crate) mod copy;
 pub(crate) mod record;
 pub(crate) mod scan;

@@ -26,6 +26,10 @@ pub enum ErrorKind {
     DiskFull,
     /// The folder cannot be written by this user, or its file system is read-only.
     PermissionDenied,
+    /// The dataset is being recorded or recovered right now.
+    InUse,
+    /// The caller asked to end before it was done.
+    Interrupted,
     /// What the caller handed over cannot be recorded as it is.
     BadInput,
     /// The caller ended the work before it was done.

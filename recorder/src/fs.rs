@@ -79,6 +79,13 @@ pub trait Fs: Send + Sync + fmt::Debug {
     fn lock(&self, _dir: &Path) -> io::Result<Box<dyn Send + Sync>> {
         Ok(Box::new(()))
     }
+    /// Makes the data of a file durable that somebody else wrote.
+    ///
+    /// # Errors
+    /// `Unsupported` where that cannot be done, else as the operating system says.
+    fn sync_file(&self, _path: &Path) -> io::Result<()> {
+        Err(io::ErrorKind::Unsupported.into())
+    }
 }
 
 /// A file that is being appended to.
@@ -208,6 +215,10 @@ impl Fs for RealFs {
         let dir = File::open(dir)?;
         dir.try_lock()?;
         Ok(Box::new(dir))
+    }
+
+    fn sync_file(&self, path: &Path) -> io::Result<()> {
+        File::open(path)?.sync_all()
     }
 }
 

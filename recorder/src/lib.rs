@@ -31,6 +31,7 @@ pub mod fuzzing;
 mod msgs;
 mod options;
 mod recorder;
+mod recover;
 pub mod report;
 mod select;
 mod session;
@@ -53,6 +54,10 @@ pub use frame::{Pixels, PushError, RecordFrame, RecordSet, SetDrop};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
 pub use options::{ColorCodec, Compression, DepthCodec, RecorderOptions};
 pub use recorder::{Progress, Recorder, Summary, UtcSource};
+pub use recover::{
+    LostBytes, RecoverAction, RecoverOptions, RecoverProgress, RecoverReport, RecoveredSegment, recover,
+    recover_with, unfinished_in,
+};
 pub use select::{Edge, Moment, SetSpan};
 pub use session::{
     Edit, FORMAT, Note, Outcome, SESSION_FILE, Session, SessionChanges, StreamRecord, check_name, edit,

@@ -25,7 +25,7 @@ use topics::Topics;
 use writer::Writer;
 
 /// The file whose space is given up for the index when the disk is full.
-const RESERVE_FILE: &str = ".reserve";
+pub(crate) const RESERVE_FILE: &str = ".reserve";
 /// Encoded sets that may wait to be written, beside the limit on their bytes.
 const BACKLOG_MAX_SETS: usize = 4096;
 /// Notes that may wait for the writer.
@@ -53,6 +53,8 @@ struct Shared {
     load: Arc<Load>,
     /// The writer leaves the segment unfinished.
     abandoned: AtomicBool,
+    /// Tells others that the dataset is being recorded.
+    _lock: Option<Box<dyn Send + Sync>>,
 }
 
 struct State {
@@ -156,6 +158,7 @@ impl Recorder {
         session.check()?;
         let topics = Topics::new(&session, &options);
         prepare_folder(&*fs, dir, &options)?;
+        let lock = lock_folder(&*fs, dir)?;
         let made = make_reserve(&*fs, dir, options.reserve_bytes)
             .and_then(|()| session.save(&*fs, dir))
             .and_then(|()| {
@@ -164,7 +167,8 @@ impl Recorder {
             });
         let segment = made.inspect_err(|_| {
             // Leave nothing behind that would make the next try say "there is a dataset already".
-            for name in [RESERVE_FILE, crate::SESSION_FILE, "session.tmp", "seg_0000.mcap.part"] {
+            for name in [RESERVE_FILE, crate::SESSION_FILE, crate::session::SESSION_TMP, "seg_0000.mcap.part"]
+            {
                 let _ = fs.remove_file(&dir.join(name));
             }
         })?;
@@ -201,6 +205,7 @@ impl Recorder {
             }),
             load: Arc::default(),
             abandoned: AtomicBool::new(false),
+            _lock: lock,
         });
         let mut recorder = Self { shared: Arc::clone(&shared), threads: Vec::new(), writer: None };
         let no_thread = |e| Error::new(ErrorKind::Io, "cannot start a thread of the recorder").with_source(e);
@@ -430,6 +435,24 @@ fn prepare_folder(fs: &dyn Fs, dir: &Path, options: &RecorderOptions) -> Result<
         ));
     }
     Ok(())
+}
+
+/// Locks the dataset against a recovery. A file system that cannot lock a folder is no reason not to record.
+fn lock_folder(fs: &dyn Fs, dir: &Path) -> Result<Option<Box<dyn Send + Sync>>> {
+    match fs.lock(dir) {
+        Ok(lock) => Ok(Some(lock)),
+        Err(e) if e.kind() == std::io::ErrorKind::WouldBlock => Err(Error::new(
+            ErrorKind::InUse,
+            format!("{} is being recorded or recovered by somebody else; choose another name", dir.display()),
+        )),
+        Err(e) => {
+            tracing::warn!(
+                "{} cannot be locked: {e}; do not run `depthrig recover` on it now",
+                dir.display()
+            );
+            Ok(None)
+        }
+    }
 }
 
 /// Writes the reserve file, really, so that its blocks are there to be given back.

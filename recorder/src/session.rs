@@ -15,6 +15,8 @@ pub use edit::{SessionChanges, check_name, edit, rename};
 pub const FORMAT: &str = "depthrig.dataset/1";
 /// The name of the session file in a dataset.
 pub const SESSION_FILE: &str = "session.toml";
+/// Its name while it is written.
+pub(crate) const SESSION_TMP: &str = "session.tmp";
 
 /// What `session.toml` says.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -1,8 +1,8 @@
 //! The commands and options, and what `--help` says of them.
 
 use crate::commands::{
-    bench, cat, compare, completions, config, demo, edit, export, info, man, merge, record, replay, report,
-    run, sessions, status, tap, top, trim, verify,
+    bench, cat, compare, completions, config, demo, edit, export, info, man, merge, record, recover, replay,
+    report, run, sessions, status, tap, top, trim, verify,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -130,6 +130,9 @@ pub enum Command {
     /// Join parts of one recording again
     #[command(after_help = merge::EXAMPLES)]
     Merge(merge::MergeArgs),
+    /// Make a dataset whole again after a crash, a full disk or a damaged sector
+    #[command(after_help = recover::EXAMPLES)]
+    Recover(recover::RecoverArgs),
     /// Say whether two datasets hold the same, and where they differ
     #[command(after_help = compare::EXAMPLES)]
     Compare(compare::CompareArgs),

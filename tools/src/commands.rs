@@ -12,6 +12,7 @@ pub mod info;
 pub mod man;
 pub mod merge;
 pub mod record;
+pub mod recover;
 pub mod replay;
 pub mod report;
 pub mod run;
@@ -49,6 +50,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Cat(args) => cat::run(&args, &context),
         Command::Trim(args) => trim::run(&args, &context),
         Command::Merge(args) => merge::run(&args, &context),
+        Command::Recover(args) => recover::run(&args, &context),
         Command::Compare(args) => compare::run(&args, &context),
         Command::Config(command) => config::run(&command),
         Command::Tap(args) => tap::run(&args, &context),

@@ -170,8 +170,7 @@ impl<'a> Groups<'a> {
         let schemas: BTreeMap<_, _> = preamble.schemas.iter().map(|s| (s.id, s.name.as_str())).collect();
         for c in &preamble.channels {
             let is = |s: Schema| schemas.get(&c.schema) == Some(&s.name());
-            let kinds = [Schema::Image, Schema::CompressedImage, Schema::CompressedDepth];
-            let role = if kinds.into_iter().any(is) {
+            let role = if Schema::PICTURES.into_iter().any(is) {
                 let Some(stream) = c.metadata.get("stream") else { continue };
                 pictures.insert(stream.clone(), c.id);
                 Role::Picture
@@ -586,6 +585,8 @@ mod tests {
             });
         }
         let options = RecorderOptions {
+            // Another type for the picture, and a chunk that is not packed.
+            depth: crate::DepthCodec::Rank,
             min_free_bytes: 0,
             reserve_bytes: 0,
             sync_interval_ns: 1_000_000,

@@ -91,11 +91,10 @@ impl SegmentReader {
 
     /// Opens a segment without its index.
     pub(crate) fn open_bare(fs: &dyn Fs, path: &Path) -> Result<Self> {
-        let file = fs.open(path).map_err(|e| Error::io("open", path, e))?;
-        let size = file.size().map_err(|e| Error::io("open", path, e))?;
+        let reader = Self::open_any(fs, path)?;
         let mut magic = [0; 8];
-        if size >= 8 {
-            file.read_exact_at(&mut magic, 0).map_err(|e| Error::io("read", path, e))?;
+        if reader.size >= 8 {
+            reader.file.read_exact_at(&mut magic, 0).map_err(|e| Error::io("read", path, e))?;
         }
         if magic != MAGIC {
             return Err(Error::new(
@@ -103,6 +102,13 @@ impl SegmentReader {
                 format!("{} is no MCAP file: it does not begin with the MCAP magic", path.display()),
             ));
         }
+        Ok(reader)
+    }
+
+    /// Opens a file of which even the beginning may be damaged.
+    pub(crate) fn open_any(fs: &dyn Fs, path: &Path) -> Result<Self> {
+        let file = fs.open(path).map_err(|e| Error::io("open", path, e))?;
+        let size = file.size().map_err(|e| Error::io("open", path, e))?;
         Ok(Self {
             file,
             path: path.to_owned(),
@@ -167,7 +173,6 @@ impl SegmentReader {
     }
 
     /// Fills `buf` with bytes of the file, and uses its memory again.
-    #[allow(dead_code)]
     pub(crate) fn read_into(&self, buf: &mut Vec<u8>, offset: u64, len: u64) -> Result<()> {
         buf.resize(len as usize, 0);
         self.file.read_exact_at(buf, offset).map_err(|e| Error::io("read", &self.path, e))

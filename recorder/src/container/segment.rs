@@ -49,6 +49,9 @@ pub(crate) struct Segment {
     stats: Statistics,
     /// Bytes beyond `len` may lie in the file.
     torn: bool,
+    /// A sync failed. What it was for may never reach the disk, and a later sync that succeeds says nothing of
+    /// it (<https://wiki.postgresql.org/wiki/Fsync_Errors>): such a file must not pass for a durable one.
+    doubtful: bool,
 }
 
 impl Segment {
@@ -74,6 +77,7 @@ impl Segment {
             metadata: Vec::new(),
             stats: Statistics::default(),
             torn: false,
+            doubtful: false,
         };
         for s in &preamble.schemas {
             record::schema(&mut segment.schemas, s);
@@ -183,6 +187,14 @@ impl Segment {
         Ok(())
     }
 
+    /// Bytes of the message indexes that follow `chunk`.
+    pub(crate) fn index_len(chunk: &Chunk) -> u64 {
+        let mut channels: Vec<u16> = chunk.messages.iter().map(|m| m.0).collect();
+        channels.sort_unstable();
+        channels.dedup();
+        (15 * channels.len() + 16 * chunk.messages.len()) as u64
+    }
+
     /// Appends metadata.
     pub(crate) fn append_metadata(&mut self, name: &str, map: &BTreeMap<String, String>) -> Result<()> {
         let mut bytes = Vec::new();
@@ -196,7 +208,10 @@ impl Segment {
 
     /// Makes what was appended durable.
     pub(crate) fn sync(&mut self) -> Result<()> {
-        self.file.sync_data().map_err(|e| Error::io("sync", &self.part, e))
+        self.file.sync_data().map_err(|e| {
+            self.doubtful = true;
+            Error::io("sync", &self.part, e)
+        })
     }
 
     /// Writes index and footer, makes the file durable and gives it its final name.
@@ -213,6 +228,12 @@ impl Segment {
         let tail = self.tail();
         self.append(&[(&tail, 0)])?;
         self.file.sync_all().map_err(|e| Error::io("sync", &self.part, e))?;
+        if self.doubtful {
+            return Err(Error::new(
+                crate::ErrorKind::Io,
+                format!("{} may not be on the disk whole: a sync of it failed", self.part.display()),
+            ));
+        }
         Ok(self.part)
     }
 

@@ -323,11 +323,7 @@ pub(crate) fn kinds(reader: &SegmentReader) -> BTreeMap<u16, Kind> {
         let stream = channel.metadata.get("stream").and_then(|s| s.parse().ok());
         let is = |s: Schema| channel.schema == s.name();
         let kind = match stream {
-            Some(stream)
-                if [Schema::Image, Schema::CompressedImage, Schema::CompressedDepth].into_iter().any(is) =>
-            {
-                Kind::Picture(stream)
-            }
+            Some(stream) if Schema::PICTURES.into_iter().any(is) => Kind::Picture(stream),
             Some(stream) if is(Schema::FrameInfo) => Kind::Info(stream),
             _ if is(Schema::FrameSet) => Kind::Set,
             _ => continue,

@@ -1,11 +1,20 @@
-//! A file system in memory for tests: any operation can be made to fail, writes can be short, space can
-//! run out, and a crash leaves what was synced plus a chosen part of what was not.
+//! A file system in memory for tests: any operation can be made to fail, writes can be short, space can run
+//! out, and a crash leaves what was synced plus whatever a disk may have kept of the rest.
+//!
+//! The model of a crash is the weakest that POSIX allows. A name is durable only after its folder was synced;
+//! names that are not may be there or not, each for itself. Bytes are durable only after their file was
+//! synced; of the others each sector may be new, old or zero, whatever became of those before it, and the
+//! file may have any length between. After a sync that failed, the bytes that it was for never become durable
+//! (<https://wiki.postgresql.org/wiki/Fsync_Errors>).
 
 use super::{DirEntry, Fs, ReadFile, WriteFile};
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// What a disk writes or does not write at once, bytes.
+const SECTOR: usize = 512;
 
 /// What goes wrong on a [`MemFs`], and at which operation (numbered from 0, over all files).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -16,57 +25,160 @@ pub enum Fault {
     FailFrom(u64, io::ErrorKind),
     /// Every write takes at most this many bytes.
     ShortWrites(usize),
+    /// The operation of this number takes one byte if it is a write, and no other does.
+    ShortOnce(u64),
 }
 
 #[derive(Debug, Default, Clone)]
 struct Node {
     data: Vec<u8>,
+    /// The first bytes of `data` that are durable.
     synced: usize,
+    /// Durable bytes after those that were cut off or replaced since.
+    old: Vec<u8>,
+    /// A sync failed: what was not durable then never becomes so.
+    stuck: bool,
+}
+
+/// A change of names that is not durable yet: the file of this number went from one name to another.
+#[derive(Debug, Clone)]
+struct Move {
+    file: u64,
+    from: Option<PathBuf>,
+    to: Option<PathBuf>,
 }
 
 #[derive(Debug, Default)]
 struct State {
-    files: BTreeMap<PathBuf, Node>,
+    nodes: BTreeMap<u64, Node>,
+    names: BTreeMap<PathBuf, u64>,
+    /// The names that a crash leaves for sure.
+    durable: BTreeMap<PathBuf, u64>,
+    moves: Vec<Move>,
+    next: u64,
     dirs: BTreeSet<PathBuf>,
+    locks: BTreeSet<PathBuf>,
     ops: u64,
     log: Vec<String>,
     faults: Vec<Fault>,
     capacity: Option<u64>,
+    /// Names and bytes changed so far, however often.
+    changes: u64,
 }
 
 /// A file system in memory; clones share it.
 #[derive(Debug, Clone, Default)]
 pub struct MemFs(Arc<Mutex<State>>);
 
+/// A file that is open: it stays what it is when its name changes.
 struct MemFile {
     fs: MemFs,
     path: PathBuf,
+    file: u64,
+}
+
+/// Ends the lock.
+struct Unlock(MemFs, PathBuf);
+
+impl Drop for Unlock {
+    fn drop(&mut self) {
+        self.0.state().locks.remove(&self.1);
+    }
 }
 
 impl State {
     fn used(&self) -> u64 {
-        self.files.values().map(|n| n.data.len() as u64).sum()
+        self.names.values().filter_map(|n| self.nodes.get(n)).map(|n| n.data.len() as u64).sum()
     }
 
     fn free(&self) -> u64 {
         self.capacity.map_or(u64::MAX, |c| c.saturating_sub(self.used()))
     }
 
+    fn node(&mut self, file: u64) -> io::Result<&mut Node> {
+        self.nodes.get_mut(&file).ok_or_else(|| io::ErrorKind::NotFound.into())
+    }
+
     /// Gives a folder with all below it another name, unless something is there.
     fn rename_dir(&mut self, from: &Path, to: &Path) -> io::Result<()> {
-        if self.files.keys().chain(&self.dirs).any(|p| p.starts_with(to) && p != to) {
+        if self.names.keys().chain(&self.dirs).any(|p| p.starts_with(to) && p != to) {
             return Err(io::ErrorKind::DirectoryNotEmpty.into());
         }
         let moved = |p: PathBuf| p.strip_prefix(from).map(|rest| to.join(rest)).unwrap_or(p);
-        self.files = std::mem::take(&mut self.files).into_iter().map(|(p, node)| (moved(p), node)).collect();
+        let renamed =
+            |names: BTreeMap<PathBuf, u64>| names.into_iter().map(|(p, file)| (moved(p), file)).collect();
+        self.names = renamed(std::mem::take(&mut self.names));
+        self.durable = renamed(std::mem::take(&mut self.durable));
+        for m in &mut self.moves {
+            (m.from, m.to) = (m.from.take().map(moved), m.to.take().map(moved));
+        }
         // Joining an empty rest leaves a slash at the end, which no path of a folder has here.
         let tidy = |p: PathBuf| p.components().collect();
         self.dirs = std::mem::take(&mut self.dirs).into_iter().map(moved).map(tidy).collect();
+        self.changes += 1;
         Ok(())
     }
 
-    fn node(&mut self, path: &Path) -> io::Result<&mut Node> {
-        self.files.get_mut(path).ok_or_else(|| io::ErrorKind::NotFound.into())
+    fn moved(&mut self, file: u64, from: Option<&Path>, to: Option<&Path>) {
+        self.moves.push(Move { file, from: from.map(Path::to_owned), to: to.map(Path::to_owned) });
+        self.changes += 1;
+    }
+
+    /// Takes over the changes that `keep` says into `names`.
+    fn settle(&self, names: &mut BTreeMap<PathBuf, u64>, mut keep: impl FnMut(&Move) -> bool) {
+        for m in self.moves.iter().filter(|m| keep(m)) {
+            if let Some(from) = m.from.as_ref().filter(|from| names.get(*from) == Some(&m.file)) {
+                names.remove(from);
+            }
+            if let Some(to) = &m.to {
+                names.insert(to.clone(), m.file);
+            }
+        }
+    }
+
+    fn fails(&self, n: u64) -> Option<io::Error> {
+        self.faults.iter().find_map(|fault| match *fault {
+            Fault::FailOnce(at, kind) if n == at => Some(kind.into()),
+            Fault::FailFrom(at, kind) if n >= at => Some(kind.into()),
+            _ => None,
+        })
+    }
+}
+
+impl Node {
+    /// What a crash leaves of it; `choose(n)` is any number below `n`.
+    fn crashed(&self, choose: &mut dyn FnMut(usize) -> usize) -> Vec<u8> {
+        let durable_len = self.synced + self.old.len();
+        let (least, most) = (durable_len.min(self.data.len()), durable_len.max(self.data.len()));
+        let len = match choose(4) {
+            0 => least,
+            1 => most,
+            _ => least + choose(most - least + 1),
+        };
+        let mut out = vec![0; len];
+        let sure = self.synced.min(len);
+        out[..sure].copy_from_slice(&self.data[..sure]);
+        let mut at = sure;
+        while at < len {
+            let to = (at / SECTOR + 1) * SECTOR;
+            let to = to.min(len);
+            let new = self.data.get(at..to.min(self.data.len())).unwrap_or_default();
+            let old = self.old.get(at - self.synced..).unwrap_or_default();
+            let old = &old[..old.len().min(to - at)];
+            match choose(4) {
+                // As it was on the disk before: old bytes, or zeros where there were none.
+                0 => out[at..at + old.len()].copy_from_slice(old),
+                // Torn within the sector.
+                1 => {
+                    let n = choose(new.len() + 1);
+                    out[at..at + old.len()].copy_from_slice(old);
+                    out[at..at + n].copy_from_slice(&new[..n]);
+                }
+                _ => out[at..at + new.len()].copy_from_slice(new),
+            }
+            at = to;
+        }
+        out
     }
 }
 
@@ -78,67 +190,118 @@ impl MemFs {
 
     /// The same file system with a fault added.
     pub fn with_fault(self, fault: Fault) -> Self {
-        self.lock().faults.push(fault);
+        self.state().faults.push(fault);
         self
     }
 
     /// The same file system that holds `bytes` at most.
     pub fn with_capacity(self, bytes: u64) -> Self {
-        self.lock().capacity = Some(bytes);
+        self.state().capacity = Some(bytes);
         self
     }
 
     /// How many operations were asked for so far.
     pub fn ops(&self) -> u64 {
-        self.lock().ops
+        self.state().ops
+    }
+
+    /// How many changes of names and bytes there were so far; two states with the same number are one.
+    pub fn changes(&self) -> u64 {
+        self.state().changes
     }
 
     /// The operations so far, each as a line.
     pub fn log(&self) -> Vec<String> {
-        self.lock().log.clone()
+        self.state().log.clone()
     }
 
     /// The bytes of a file.
     pub fn contents(&self, path: &Path) -> Option<Vec<u8>> {
-        self.lock().files.get(path).map(|n| n.data.clone())
+        let state = self.state();
+        state.nodes.get(state.names.get(path)?).map(|n| n.data.clone())
     }
 
-    /// Puts a file there, as synced.
+    /// How many bytes of the file at `path` a crash leaves for sure; 0 when its name is not durable.
+    pub fn synced(&self, path: &Path) -> usize {
+        let state = self.state();
+        let file = state.names.get(path).filter(|file| state.durable.get(path) == Some(file));
+        file.and_then(|file| state.nodes.get(file)).map_or(0, |n| n.synced)
+    }
+
+    /// Puts a file there, as durable.
     pub fn put(&self, path: &Path, data: Vec<u8>) {
-        let synced = data.len();
-        self.lock().files.insert(path.to_owned(), Node { data, synced });
+        let mut state = self.state();
+        let file = state.next;
+        state.next += 1;
+        state.nodes.insert(file, Node { synced: data.len(), data, ..Node::default() });
+        state.names.insert(path.to_owned(), file);
+        state.durable.insert(path.to_owned(), file);
     }
 
-    /// What a crash leaves: of each file the synced bytes and `keep(unsynced bytes)` of the rest. Faults,
-    /// limits and counts are gone.
+    /// What is left when every name is kept: of each file the synced bytes and `keep(unsynced bytes)` of the
+    /// rest. Faults, limits, locks and counts are gone.
     pub fn after_crash(&self, mut keep: impl FnMut(usize) -> usize) -> Self {
-        let state = self.lock();
-        let mut files = state.files.clone();
-        for node in files.values_mut() {
+        let state = self.state();
+        let left = Self::new();
+        left.state().dirs.clone_from(&state.dirs);
+        for (path, file) in &state.names {
+            let Some(node) = state.nodes.get(file) else { continue };
             let unsynced = node.data.len().saturating_sub(node.synced);
-            node.data.truncate(node.synced + keep(unsynced).min(unsynced));
+            let len = node.synced + keep(unsynced).min(unsynced);
+            left.put(path, node.data[..len].to_vec());
         }
-        Self(Arc::new(Mutex::new(State { files, dirs: state.dirs.clone(), ..State::default() })))
+        left
     }
 
-    fn lock(&self) -> MutexGuard<'_, State> {
+    /// What a crash of the whole computer leaves, where `choose(n)`, any number below `n`, decides what the
+    /// disk kept. Faults, limits, locks and counts are gone.
+    pub fn crash(&self, choose: &mut dyn FnMut(usize) -> usize) -> Self {
+        let state = self.state();
+        let mut names = state.durable.clone();
+        let style = choose(3);
+        state.settle(&mut names, |_| style == 1 || (style == 2 && choose(2) == 1));
+        let left = Self::new();
+        left.state().dirs.clone_from(&state.dirs);
+        for (path, file) in names {
+            let Some(node) = state.nodes.get(&file) else { continue };
+            left.put(&path, node.crashed(choose));
+        }
+        left
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Counts an operation, and fails it if a fault says so.
     fn op(&self, what: &str, path: &Path) -> io::Result<MutexGuard<'_, State>> {
-        let mut state = self.lock();
+        let mut state = self.state();
         let n = state.ops;
         state.ops += 1;
         state.log.push(format!("{what} {}", path.display()));
-        for fault in &state.faults {
-            match *fault {
-                Fault::FailOnce(at, kind) if n == at => return Err(kind.into()),
-                Fault::FailFrom(at, kind) if n >= at => return Err(kind.into()),
-                _ => {}
+        match state.fails(n) {
+            Some(e) => Err(e),
+            None => Ok(state),
+        }
+    }
+
+    fn sync(&self, path: &Path, file: u64) -> io::Result<()> {
+        match self.op("sync", path) {
+            Ok(mut state) => {
+                let node = state.node(file)?;
+                if !node.stuck {
+                    node.synced = node.data.len();
+                    node.old.clear();
+                }
+                Ok(())
+            }
+            Err(e) => {
+                if let Ok(node) = self.state().node(file) {
+                    node.stuck = true;
+                }
+                Err(e)
             }
         }
-        Ok(state)
     }
 }
 
@@ -151,19 +314,23 @@ impl Fs for MemFs {
 
     fn create_new(&self, path: &Path) -> io::Result<Box<dyn WriteFile>> {
         let mut state = self.op("create", path)?;
-        if state.files.contains_key(path) {
+        if state.names.contains_key(path) {
             return Err(io::ErrorKind::AlreadyExists.into());
         }
         if !path.parent().is_some_and(|dir| state.dirs.contains(dir)) {
             return Err(io::ErrorKind::NotFound.into());
         }
-        state.files.insert(path.to_owned(), Node::default());
-        Ok(Box::new(MemFile { fs: self.clone(), path: path.to_owned() }))
+        let file = state.next;
+        state.next += 1;
+        state.nodes.insert(file, Node::default());
+        state.names.insert(path.to_owned(), file);
+        state.moved(file, None, Some(path));
+        Ok(Box::new(MemFile { fs: self.clone(), path: path.to_owned(), file }))
     }
 
     fn open(&self, path: &Path) -> io::Result<Box<dyn ReadFile>> {
-        self.op("open", path)?.node(path)?;
-        Ok(Box::new(MemFile { fs: self.clone(), path: path.to_owned() }))
+        let file = self.op("open", path)?.names.get(path).copied().ok_or(io::ErrorKind::NotFound)?;
+        Ok(Box::new(MemFile { fs: self.clone(), path: path.to_owned(), file }))
     }
 
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
@@ -171,26 +338,35 @@ impl Fs for MemFs {
         if state.dirs.contains(from) {
             return state.rename_dir(from, to);
         }
-        let node = state.files.remove(from).ok_or(io::ErrorKind::NotFound)?;
-        state.files.insert(to.to_owned(), node);
+        let file = state.names.remove(from).ok_or(io::ErrorKind::NotFound)?;
+        state.names.insert(to.to_owned(), file);
+        state.moved(file, Some(from), Some(to));
         Ok(())
     }
 
     fn remove_file(&self, path: &Path) -> io::Result<()> {
-        let removed = self.op("remove", path)?.files.remove(path);
-        removed.map(|_| ()).ok_or_else(|| io::ErrorKind::NotFound.into())
+        let mut state = self.op("remove", path)?;
+        let file = state.names.remove(path).ok_or(io::ErrorKind::NotFound)?;
+        state.moved(file, Some(path), None);
+        Ok(())
     }
 
     fn remove_dir(&self, dir: &Path) -> io::Result<()> {
         let mut state = self.op("rmdir", dir)?;
-        if state.files.keys().chain(&state.dirs).any(|p| p.parent() == Some(dir)) {
+        if state.names.keys().chain(&state.dirs).any(|p| p.parent() == Some(dir)) {
             return Err(io::ErrorKind::DirectoryNotEmpty.into());
         }
         if state.dirs.remove(dir) { Ok(()) } else { Err(io::ErrorKind::NotFound.into()) }
     }
 
     fn sync_dir(&self, dir: &Path) -> io::Result<()> {
-        self.op("syncdir", dir).map(|_| ())
+        let mut state = self.op("syncdir", dir)?;
+        let inside = |p: &Option<PathBuf>| p.as_ref().is_none_or(|p| p.parent() == Some(dir));
+        let mut durable = std::mem::take(&mut state.durable);
+        state.settle(&mut durable, |m| inside(&m.from) && inside(&m.to));
+        state.durable = durable;
+        state.moves.retain(|m| !(inside(&m.from) && inside(&m.to)));
+        Ok(())
     }
 
     fn read_dir(&self, dir: &Path) -> io::Result<Vec<DirEntry>> {
@@ -199,11 +375,12 @@ impl Fs for MemFs {
             return Err(io::ErrorKind::NotFound.into());
         }
         let name = |p: &Path| p.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        let len = |file: &u64| state.nodes.get(file).map_or(0, |n| n.data.len() as u64);
         let mut entries: Vec<_> = state
-            .files
+            .names
             .iter()
             .filter(|(p, _)| p.parent() == Some(dir))
-            .map(|(p, n)| DirEntry { name: name(p), len: n.data.len() as u64, is_dir: false })
+            .map(|(p, file)| DirEntry { name: name(p), len: len(file), is_dir: false })
             .collect();
         let dirs = state.dirs.iter().filter(|p| p.parent() == Some(dir));
         entries.extend(dirs.map(|p| DirEntry { name: name(p), len: 0, is_dir: true }));
@@ -214,38 +391,58 @@ impl Fs for MemFs {
     fn available_space(&self, dir: &Path) -> io::Result<u64> {
         self.op("statvfs", dir).map(|state| state.free())
     }
+
+    fn sync_file(&self, path: &Path) -> io::Result<()> {
+        let file = self.state().names.get(path).copied().ok_or(io::ErrorKind::NotFound)?;
+        self.sync(path, file)
+    }
+
+    fn lock(&self, dir: &Path) -> io::Result<Box<dyn Send + Sync>> {
+        let mut state = self.op("lock", dir)?;
+        if !state.locks.insert(dir.to_owned()) {
+            return Err(io::ErrorKind::WouldBlock.into());
+        }
+        Ok(Box::new(Unlock(self.clone(), dir.to_owned())))
+    }
 }
 
 impl WriteFile for MemFile {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let mut state = self.fs.op("write", &self.path)?;
+        let this = state.ops - 1;
         let mut n = bytes.len();
         for fault in &state.faults {
-            if let Fault::ShortWrites(most) = *fault {
-                n = n.min(most.max(1));
+            match *fault {
+                Fault::ShortWrites(most) => n = n.min(most.max(1)),
+                Fault::ShortOnce(at) if at == this => n = n.min(1),
+                _ => {}
             }
         }
         n = n.min(usize::try_from(state.free()).unwrap_or(usize::MAX));
         if n == 0 && !bytes.is_empty() {
             return Err(io::ErrorKind::StorageFull.into());
         }
-        state.node(&self.path)?.data.extend_from_slice(&bytes[..n]);
+        state.changes += 1;
+        state.node(self.file)?.data.extend_from_slice(&bytes[..n]);
         Ok(n)
     }
 
     fn truncate(&mut self, len: u64) -> io::Result<()> {
         let mut state = self.fs.op("truncate", &self.path)?;
-        let node = state.node(&self.path)?;
-        node.data.truncate(len as usize);
-        node.synced = node.synced.min(len as usize);
+        state.changes += 1;
+        let node = state.node(self.file)?;
+        let len = (len as usize).min(node.data.len());
+        if len < node.synced {
+            let mut old = node.data[len..node.synced].to_vec();
+            old.append(&mut node.old);
+            (node.old, node.synced) = (old, len);
+        }
+        node.data.truncate(len);
         Ok(())
     }
 
     fn sync_data(&mut self) -> io::Result<()> {
-        let mut state = self.fs.op("sync", &self.path)?;
-        let node = state.node(&self.path)?;
-        node.synced = node.data.len();
-        Ok(())
+        self.fs.sync(&self.path, self.file)
     }
 
     fn sync_all(&mut self) -> io::Result<()> {
@@ -256,7 +453,7 @@ impl WriteFile for MemFile {
 impl ReadFile for MemFile {
     fn read_exact_at(&self, buf: &mut [u8], offset: u64) -> io::Result<()> {
         let mut state = self.fs.op("read", &self.path)?;
-        let data = &state.node(&self.path)?.data;
+        let data = &state.node(self.file)?.data;
         let start = usize::try_from(offset).unwrap_or(usize::MAX);
         let part = data.get(start..start.saturating_add(buf.len())).ok_or(io::ErrorKind::UnexpectedEof)?;
         buf.copy_from_slice(part);
@@ -264,6 +461,6 @@ impl ReadFile for MemFile {
     }
 
     fn size(&self) -> io::Result<u64> {
-        Ok(self.fs.lock().node(&self.path)?.data.len() as u64)
+        Ok(self.fs.state().node(self.file)?.data.len() as u64)
     }
 }

@@ -39,6 +39,9 @@ impl Schema {
         Self::CompressedDepth,
     ];
 
+    /// The types that carry a picture.
+    pub(crate) const PICTURES: [Self; 3] = [Self::Image, Self::CompressedImage, Self::CompressedDepth];
+
     /// The id of the schema record: 1, 2, … in the order of [`Self::ALL`].
     pub(crate) const fn id(self) -> u16 {
         self as u16 + 1

@@ -33,6 +33,8 @@ pub(super) struct Writer {
     dirty: bool,
     /// The recording ended before its time; nothing more is written.
     failed: bool,
+    /// The segment being closed is the last one.
+    ending: bool,
     unfinished: Vec<String>,
 }
 
@@ -52,6 +54,7 @@ impl Writer {
             next_sync,
             dirty: true,
             failed: false,
+            ending: false,
             unfinished: Vec::new(),
         }
     }
@@ -68,6 +71,7 @@ impl Writer {
         if self.shared.abandoned.load(Ordering::Acquire) {
             self.try_io(|w| w.segment.as_mut().map_or(Ok(()), Segment::sync));
         } else {
+            self.ending = true;
             self.try_io(Self::close_segment);
         }
         self.summary()
@@ -339,6 +343,9 @@ impl Writer {
         }
         if let Some(e) = &self.shared.lock().error {
             facts.insert("error".to_owned(), e.to_string());
+        }
+        if self.ending || self.failed {
+            facts.insert("final".to_owned(), "true".to_owned());
         }
         let part = segment.part().display().to_string();
         let done =

@@ -10,6 +10,7 @@ mod edit;
 mod exchange;
 mod failures;
 mod kill;
+mod recover;
 mod report;
 mod round_trip;
 mod set_reader;

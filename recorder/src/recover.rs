@@ -1,0 +1,391 @@
+//! Makes a dataset whole again after a crash, a full disk or a damaged sector.
+//!
+//! Each segment that is unfinished, torn or damaged is copied, set by whole set, into a new file beside it; the
+//! copy is read back and compared, and only then takes the old one's place, in one rename. Until then nothing
+//! of the old file is touched, so that a crash of the recovery itself costs nothing: the next one begins anew.
+//! What was lost is said in the report, in the file (`depthrig.recovered`) and in `session.toml`.
+
+use crate::container::segment::{file_name, sync_folder_of};
+use crate::dataset::{segment_number, segments_in};
+use crate::fs::{DirEntry, Fs, RealFs};
+use crate::recorder::RESERVE_FILE;
+use crate::session::SESSION_TMP;
+use crate::{Error, ErrorKind, Result, SESSION_FILE, Session};
+use core::ops::ControlFlow;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+mod segment;
+mod session;
+
+use segment::{Facts, Rebuild};
+
+/// What a copy is called until it is proven.
+const TEMPORARY: &str = "mcap.recovering";
+/// The metadata record that says what was lost.
+pub(crate) const RECOVERED_METADATA: &str = "depthrig.recovered";
+
+/// How to recover.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct RecoverOptions {
+    /// Say what would be done and change nothing.
+    pub dry_run: bool,
+    /// Of segments that have their index and their name, believe that they are whole: nothing that is long
+    /// finished is read.
+    pub unfinished_only: bool,
+}
+
+/// How far a recovery is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RecoverProgress {
+    /// Bytes done.
+    pub done_bytes: u64,
+    /// Bytes of all segments.
+    pub total_bytes: u64,
+}
+
+/// What was done with a segment.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RecoverAction {
+    /// It was whole.
+    None,
+    /// It was whole and got its final name.
+    Finished,
+    /// It was copied, set by set.
+    Rebuilt,
+}
+
+/// Bytes that held nothing whole.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct LostBytes {
+    /// The first one.
+    pub from: u64,
+    /// The one after the last.
+    pub to: u64,
+    /// Why they were given up.
+    pub why: String,
+}
+
+/// What was found in a segment and done with it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[non_exhaustive]
+pub struct RecoveredSegment {
+    /// Its name before.
+    pub file: String,
+    /// What was done.
+    pub action: RecoverAction,
+    /// Whole sets in it.
+    pub sets: u64,
+    /// Its bytes before.
+    pub bytes: u64,
+    /// Bytes at its end, after the last whole record.
+    pub tail_bytes: u64,
+    /// Sets that were begun and not finished, or hit by damage.
+    pub torn_sets: u64,
+    /// Where something was lost.
+    pub lost_bytes: Vec<LostBytes>,
+    /// Ids between the whole sets around a damaged place, first and last.
+    pub sets_missing: Vec<(u64, u64)>,
+    /// What was lost, in words.
+    pub lost: Vec<String>,
+}
+
+/// What a recovery did.
+#[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
+pub struct RecoverReport {
+    /// The dataset.
+    pub path: PathBuf,
+    /// Whether it was only said what would be done.
+    pub dry_run: bool,
+    /// Whether anything was changed, or would be.
+    pub changed: bool,
+    /// Its segments.
+    pub segments: Vec<RecoveredSegment>,
+    /// Whether `session.toml` had to be made anew.
+    pub session_rebuilt: bool,
+    /// Leftovers that were removed.
+    pub removed: Vec<String>,
+    /// Whole sets in the dataset.
+    pub sets: u64,
+    /// What this recovery found lost, in words; empty when it found nothing to do.
+    pub lost: Vec<String>,
+    /// What was noticed besides.
+    pub notes: Vec<String>,
+}
+
+/// Recovers the dataset in the folder `path`. Once it succeeded, doing it again changes nothing.
+///
+/// # Errors
+/// [`ErrorKind::InUse`] when the dataset is being recorded, [`ErrorKind::NotADataset`] when nothing was ever
+/// recorded there, [`ErrorKind::DiskFull`] when a segment's copy finds no room, [`ErrorKind::Interrupted`] when
+/// `progress` breaks, else as the disk says. Whatever the error, all that could be read before still can.
+pub fn recover(
+    path: &Path,
+    options: &RecoverOptions,
+    progress: &mut dyn FnMut(RecoverProgress) -> ControlFlow<()>,
+) -> Result<RecoverReport> {
+    let fs: Arc<dyn Fs> = Arc::new(RealFs);
+    recover_with(&fs, path, options, progress)
+}
+
+/// The same on another file system.
+///
+/// # Errors
+/// As [`recover`].
+pub fn recover_with(
+    fs: &Arc<dyn Fs>,
+    path: &Path,
+    options: &RecoverOptions,
+    progress: &mut dyn FnMut(RecoverProgress) -> ControlFlow<()>,
+) -> Result<RecoverReport> {
+    let entries = fs.read_dir(path).map_err(|e| Error::io("open the folder", path, e))?;
+    check_names(path, &entries)?;
+    let mut notes = Vec::new();
+    let lock = fs.lock(path);
+    match &lock {
+        Ok(_) => {}
+        Err(e) if e.kind() == std::io::ErrorKind::WouldBlock => {
+            let what = format!("{} is being recorded right now; stop the recording first", path.display());
+            return Err(Error::new(ErrorKind::InUse, what));
+        }
+        Err(e) => {
+            notes.push(format!("the folder cannot be locked ({e}): make sure that nobody records into it"));
+        }
+    }
+    // Again, now that nobody else changes anything.
+    let entries = fs.read_dir(path).map_err(|e| Error::io("open the folder", path, e))?;
+    let mut job = Job {
+        fs,
+        dir: path,
+        options: *options,
+        progress,
+        done: 0,
+        total: entries.iter().filter(|e| segment_number(&e.name).is_some()).map(|e| e.len).sum(),
+        report: RecoverReport {
+            path: path.to_owned(),
+            dry_run: options.dry_run,
+            changed: false,
+            segments: Vec::new(),
+            session_rebuilt: false,
+            removed: Vec::new(),
+            sets: 0,
+            lost: Vec::new(),
+            notes,
+        },
+    };
+    let done = job.run(&entries);
+    let report = job.report;
+    drop(lock);
+    done.map(|()| report)
+}
+
+/// The datasets in `folder` that `rig` left unfinished and that nobody records now, sorted.
+///
+/// # Errors
+/// As reading the folder does; a folder that is not there holds none.
+pub fn unfinished_in(fs: &Arc<dyn Fs>, folder: &Path, rig: &str) -> Result<Vec<PathBuf>> {
+    let entries = match fs.read_dir(folder) {
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
+        entries => entries.map_err(|e| Error::io("open the folder", folder, e))?,
+    };
+    let mut found = Vec::new();
+    for entry in entries.iter().filter(|e| e.is_dir) {
+        let dir = folder.join(&entry.name);
+        let Ok(inside) = fs.read_dir(&dir) else { continue };
+        let part = inside
+            .iter()
+            .any(|e| segment_number(&e.name).is_some() && e.name.strip_suffix(".part").is_some());
+        let session = match Session::load(&**fs, &dir) {
+            Ok(session) if session.outcome.is_some() && !part => continue,
+            Ok(session) => session,
+            Err(_) => {
+                let told = segments_in(&inside, &dir).into_iter();
+                let mut told = told.filter_map(|s| crate::Dataset::open_with(Arc::clone(fs), &s).ok());
+                let Some(dataset) = told.next() else { continue };
+                dataset.session().clone()
+            }
+        };
+        let locked = fs.lock(&dir).err().is_some_and(|e| e.kind() == std::io::ErrorKind::WouldBlock);
+        if session.rig == rig && !locked {
+            found.push(dir);
+        }
+    }
+    Ok(found)
+}
+
+/// Refuses folders that are no datasets, and ones in which a segment is there twice.
+fn check_names(path: &Path, entries: &[DirEntry]) -> Result<()> {
+    let mut numbers: Vec<_> =
+        entries.iter().filter(|e| !e.is_dir).filter_map(|e| segment_number(&e.name)).collect();
+    numbers.sort_unstable();
+    if let Some(pair) = numbers.windows(2).find(|w| w[0] == w[1]) {
+        let name = file_name(pair[0]);
+        return Err(Error::new(
+            ErrorKind::Corrupt,
+            format!(
+                "{} holds both {name} and {name}.part, which depthrig never leaves; move one of them away",
+                path.display()
+            ),
+        ));
+    }
+    if numbers.is_empty() && !entries.iter().any(|e| e.name == SESSION_FILE) {
+        return Err(Error::new(
+            ErrorKind::NotADataset,
+            format!("{} is no dataset: it holds neither {SESSION_FILE} nor a segment", path.display()),
+        ));
+    }
+    Ok(())
+}
+
+/// Whether a segment has the name of an unfinished one.
+fn is_part(path: &Path) -> bool {
+    path.extension().is_some_and(|e| e == "part")
+}
+
+/// A recovery on its way.
+struct Job<'a> {
+    fs: &'a Arc<dyn Fs>,
+    dir: &'a Path,
+    options: RecoverOptions,
+    progress: &'a mut dyn FnMut(RecoverProgress) -> ControlFlow<()>,
+    done: u64,
+    total: u64,
+    report: RecoverReport,
+}
+
+impl Job<'_> {
+    fn run(&mut self, entries: &[DirEntry]) -> Result<()> {
+        self.remove_leftovers(entries)?;
+        let session = match Session::load(&**self.fs, self.dir) {
+            Ok(session) => Some(session),
+            Err(e) if session::is_damage(&e) => {
+                self.report.notes.push(e.to_string());
+                None
+            }
+            Err(e) => return Err(e),
+        };
+        let segments = segments_in(entries, self.dir);
+        let mut all = Vec::new();
+        for path in &segments {
+            let before = all.last().and_then(|f: &Facts| f.last_set);
+            let facts = self.segment(path, &segments, session.as_ref(), before)?;
+            self.report.sets += facts.sets;
+            all.push(facts);
+        }
+        self.tell(self.total)?;
+        session::settle(self, session, &segments, &all)
+    }
+
+    /// Tells how far it is.
+    fn tell(&mut self, done: u64) -> Result<()> {
+        let progress = RecoverProgress { done_bytes: done.min(self.total), total_bytes: self.total };
+        match (self.progress)(progress) {
+            ControlFlow::Continue(()) => Ok(()),
+            ControlFlow::Break(()) => Err(Error::new(
+                ErrorKind::Interrupted,
+                format!("the recovery of {} was interrupted; begin it again", self.dir.display()),
+            )),
+        }
+    }
+
+    fn remove_leftovers(&mut self, entries: &[DirEntry]) -> Result<()> {
+        for e in entries.iter().filter(|e| !e.is_dir) {
+            let ours = e.name == RESERVE_FILE
+                || e.name == SESSION_TMP
+                || e.name
+                    .strip_suffix("recovering")
+                    .is_some_and(|n| segment_number(n.trim_end_matches('.')).is_some());
+            if !ours {
+                continue;
+            }
+            if !self.options.dry_run {
+                let path = self.dir.join(&e.name);
+                self.fs.remove_file(&path).map_err(|e| Error::io("remove", &path, e))?;
+            }
+            self.report.changed = true;
+            self.report.removed.push(e.name.clone());
+        }
+        Ok(())
+    }
+
+    /// Makes one segment whole; what is in it then.
+    fn segment(
+        &mut self,
+        path: &Path,
+        segments: &[PathBuf],
+        session: Option<&Session>,
+        before: Option<u64>,
+    ) -> Result<Facts> {
+        let fs = Arc::clone(self.fs);
+        let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        let part = is_part(path);
+        let base = self.done;
+        let whole = segment::whole(&*fs, path, self.options.unfinished_only && !part, &mut |bytes| {
+            self.tell(base + bytes)
+        })?;
+        let mut segment = RecoveredSegment {
+            file: name,
+            action: RecoverAction::None,
+            sets: 0,
+            bytes: 0,
+            tail_bytes: 0,
+            torn_sets: 0,
+            lost_bytes: Vec::new(),
+            sets_missing: Vec::new(),
+            lost: Vec::new(),
+        };
+        let whole = match whole {
+            Some(whole) if !part || self.options.dry_run || self.finish(path)? => Some(whole),
+            _ => None,
+        };
+        let facts = if let Some(whole) = whole {
+            segment.action = if part { RecoverAction::Finished } else { RecoverAction::None };
+            segment.bytes = whole.bytes;
+            whole
+        } else {
+            let job = Rebuild { fs: &*fs, dir: self.dir, path, segments, session, before };
+            let (facts, lost) = job.run(self.options.dry_run, &mut |bytes| self.tell(base + bytes))?;
+            segment.action = RecoverAction::Rebuilt;
+            lost.tell(&mut segment);
+            if !self.options.dry_run {
+                self.replace(path)?;
+            }
+            facts
+        };
+        segment.sets = facts.sets;
+        self.done += segment.bytes;
+        self.report.changed |= segment.action != RecoverAction::None;
+        self.report.lost.extend(segment.lost.iter().cloned());
+        self.report.segments.push(segment);
+        Ok(facts)
+    }
+
+    /// Gives a whole `.part` its name; `false` when this file system cannot make it durable as it is.
+    fn finish(&self, part: &Path) -> Result<bool> {
+        match self.fs.sync_file(part) {
+            Ok(()) => {}
+            Err(e) if e.kind() == std::io::ErrorKind::Unsupported => return Ok(false),
+            Err(e) => return Err(Error::io("sync", part, e)),
+        }
+        self.rename(part, &part.with_extension(""))?;
+        Ok(true)
+    }
+
+    /// Puts the proven copy in the place of `path`, and gives that its final name. Each step is durable before
+    /// the next one, and after each the dataset holds every set exactly once.
+    fn replace(&self, path: &Path) -> Result<()> {
+        self.rename(&segment::temporary(path), path)?;
+        if is_part(path) {
+            self.rename(path, &path.with_extension(""))?;
+        }
+        Ok(())
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> Result<()> {
+        self.fs.rename(from, to).map_err(|e| Error::io("rename", from, e))?;
+        sync_folder_of(&**self.fs, to)
+    }
+}

@@ -1,0 +1,567 @@
+//! One segment: whether it is whole, and if not, a proven copy of what is.
+
+use super::{LostBytes, RECOVERED_METADATA, RecoveredSegment, TEMPORARY};
+use crate::container::MAGIC;
+use crate::container::chunk::{Chunk, ChunkBuilder, MessageHead};
+use crate::container::copy::{Damage, DamageKind, Group, Groups, SetGroup, read_preamble};
+use crate::container::record::op;
+use crate::container::scan::{HEAD, SegmentReader};
+use crate::container::segment::{Preamble, Segment};
+use crate::dataset::segment_number;
+use crate::encode::Codec;
+use crate::fs::Fs;
+use crate::msgs::frame_set::FrameSetMsg;
+use crate::msgs::schemas::Schema;
+use crate::msgs::{accounts, frame_info, tf};
+use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA, Topics, image_channel};
+use crate::{ColorCodec, DepthCodec, Error, ErrorKind, RecorderOptions, Result, Session, SetCounts};
+use depthrig_bus::UtcPair;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Bytes compared at a time.
+const WINDOW: u64 = 1 << 20;
+/// Room that a copy takes beside what it copies: index, footer, metadata.
+const SPARE: u64 = 1 << 20;
+
+/// Told how many bytes of a segment are done; its error ends the work.
+pub(super) type Tell<'a> = &'a mut dyn FnMut(u64) -> Result<()>;
+
+/// What a whole segment says of itself.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Facts {
+    pub(super) bytes: u64,
+    pub(super) sets: u64,
+    pub(super) first_set: Option<u64>,
+    pub(super) last_set: Option<u64>,
+    pub(super) last_log_time: Option<u64>,
+    /// Sets handed to the recorder, as the last mark says.
+    pub(super) offered: u64,
+    /// The last account of the sets.
+    pub(super) counts: Option<SetCounts>,
+    /// Whether the recording was closed with this segment.
+    pub(super) last: bool,
+    /// What ended the recording before its time.
+    pub(super) error: Option<String>,
+    /// What a recovery found lost in it.
+    pub(super) lost: Vec<String>,
+}
+
+impl Facts {
+    fn set(&mut self, mark: &FrameSetMsg, log_time: u64) {
+        self.sets += 1;
+        self.first_set.get_or_insert(mark.id);
+        self.last_set = Some(mark.id);
+        self.last_log_time = Some(log_time);
+        self.offered = mark.sets_offered;
+    }
+
+    fn metadata(&mut self, facts: &BTreeMap<String, String>) {
+        self.last = facts.get("final").is_some_and(|v| v == "true");
+        self.error = facts.get("error").cloned();
+    }
+
+    fn recovered(&mut self, facts: &BTreeMap<String, String>) {
+        self.lost.extend(facts.get("lost").into_iter().flat_map(|l| l.lines()).map(str::to_owned));
+    }
+}
+
+/// The name of the copy of `path` until it is proven.
+pub(super) fn temporary(path: &Path) -> PathBuf {
+    let segment =
+        if path.extension().is_some_and(|e| e == "part") { path.with_extension("") } else { path.into() };
+    segment.with_extension(TEMPORARY)
+}
+
+/// What the segment holds if it is finished and whole; `None` when there is anything to do about it. With
+/// `believe`, its index is enough.
+pub(super) fn whole(fs: &dyn Fs, path: &Path, believe: bool, tell: Tell<'_>) -> Result<Option<Facts>> {
+    let found = (|| {
+        let mut reader = SegmentReader::open_bare(fs, path)?;
+        reader.load_index()?;
+        if !reader.finished || reader.metadata(SESSION_METADATA).is_none() {
+            return Ok(None);
+        }
+        if !believe && !data_is_whole(&reader, tell)? {
+            return Ok(None);
+        }
+        facts_of(&reader).map(Some)
+    })();
+    match found {
+        Err(e) if matches!(e.kind(), ErrorKind::Corrupt | ErrorKind::Truncated | ErrorKind::NotADataset) => {
+            Ok(None)
+        }
+        found => found,
+    }
+}
+
+/// Whether the data has the checksum that stands at its end, and records from the first to the last byte.
+fn data_is_whole(reader: &SegmentReader, tell: Tell<'_>) -> Result<bool> {
+    let mut at = 8;
+    let end = loop {
+        let (opcode, len) = reader.record_head(at)?;
+        if opcode == op::DATA_END {
+            break at;
+        }
+        at = at.saturating_add(HEAD).saturating_add(len);
+    };
+    let (opcode, body) = reader.record(end)?;
+    let mcap::records::Record::DataEnd(said) = reader.parse(opcode, &body, end)? else { return Ok(false) };
+    let mut crc = crc32fast::Hasher::new();
+    let mut buf = Vec::new();
+    let mut at = 0;
+    while at < end {
+        let len = WINDOW.min(end - at);
+        reader.read_into(&mut buf, at, len)?;
+        crc.update(&buf);
+        at += len;
+        tell(at)?;
+    }
+    Ok(said.data_section_crc == crc.finalize())
+}
+
+/// What a finished segment says, from its index and its last few chunks.
+fn facts_of(reader: &SegmentReader) -> Result<Facts> {
+    let channel = |s: Schema| reader.channels.iter().find(|(_, c)| c.schema == s.name()).map(|(id, _)| *id);
+    let mut facts = Facts { bytes: reader.size, ..Facts::default() };
+    let (marks, counts) = (channel(Schema::FrameSet), channel(Schema::Accounts));
+    let with =
+        |id: Option<u16>| reader.chunks.iter().filter(move |c| id.is_some_and(|id| c.channels.contains(&id)));
+    facts.sets = with(marks).count() as u64;
+    for (entry, first) in
+        with(marks).take(1).map(|c| (c, true)).chain(with(marks).next_back().map(|c| (c, false)))
+    {
+        reader.messages(entry, |m| {
+            if Some(m.channel) == marks {
+                let mark = FrameSetMsg::read(m.data)?;
+                if first {
+                    facts.first_set = Some(mark.id);
+                }
+                (facts.last_set, facts.offered) = (Some(mark.id), mark.sets_offered);
+                facts.last_log_time = Some(m.log_time);
+            }
+            Ok(())
+        })?;
+    }
+    if let Some(entry) = with(counts).next_back() {
+        reader.messages(entry, |m| {
+            if Some(m.channel) == counts {
+                facts.counts = Some(accounts::read(m.data)?.0);
+            }
+            Ok(())
+        })?;
+    }
+    for (name, map) in &reader.metadata {
+        match name.as_str() {
+            SEGMENT_METADATA => facts.metadata(map),
+            RECOVERED_METADATA => facts.recovered(map),
+            _ => {}
+        }
+    }
+    Ok(facts)
+}
+
+/// A segment to be copied.
+pub(super) struct Rebuild<'a> {
+    pub(super) fs: &'a dyn Fs,
+    pub(super) dir: &'a Path,
+    pub(super) path: &'a Path,
+    /// All segments of the dataset: each has channels and session.
+    pub(super) segments: &'a [PathBuf],
+    pub(super) session: Option<&'a Session>,
+    /// The last set of the segment before.
+    pub(super) before: Option<u64>,
+}
+
+/// What did not make it into the copy.
+#[derive(Debug, Default)]
+pub(super) struct Lost {
+    bytes: u64,
+    damage: Vec<Damage>,
+    missing: Vec<(u64, u64)>,
+    /// Whether the file has lost something after its last set.
+    at_end: bool,
+    head_rebuilt: bool,
+    file: String,
+}
+
+impl Lost {
+    fn tail_bytes(&self) -> u64 {
+        self.damage.iter().filter(|d| d.kind == DamageKind::Tail).map(|d| d.to - d.from).sum()
+    }
+
+    fn torn_sets(&self) -> u64 {
+        self.damage.iter().filter(|d| d.kind == DamageKind::Torn).count() as u64
+    }
+
+    fn words(&self) -> Vec<String> {
+        let mut words = Vec::new();
+        let file = &self.file;
+        if self.head_rebuilt {
+            words.push(format!("{file}: its head was damaged and was made anew from the session"));
+        }
+        for d in &self.damage {
+            let (n, why) = (d.to - d.from, &d.why);
+            words.push(match d.kind {
+                DamageKind::Tail => format!("{file}: its last {n} bytes are no whole record"),
+                DamageKind::Torn => format!("{file}: {n} bytes from byte {} are {why}", d.from),
+                DamageKind::Bytes => format!("{file}: {n} bytes from byte {} are damaged: {why}", d.from),
+            });
+        }
+        for (first, last) in &self.missing {
+            let n = last - first + 1;
+            words.push(match n {
+                1 => format!("{file}: set {first} is lost"),
+                _ => format!("{file}: sets {first} to {last} are lost, {n} of them at most"),
+            });
+        }
+        words
+    }
+
+    pub(super) fn tell(&self, segment: &mut RecoveredSegment) {
+        segment.bytes = self.bytes;
+        segment.tail_bytes = self.tail_bytes();
+        segment.torn_sets = self.torn_sets();
+        segment.lost_bytes =
+            self.damage.iter().map(|d| LostBytes { from: d.from, to: d.to, why: d.why.clone() }).collect();
+        segment.sets_missing.clone_from(&self.missing);
+        segment.lost = self.words();
+    }
+
+    fn metadata(&self) -> BTreeMap<String, String> {
+        let list = |parts: Vec<String>| parts.join(" ");
+        let bytes = |d: &Damage| format!("{}-{}", d.from, d.to);
+        let ids = |(a, b): &(u64, u64)| if a == b { a.to_string() } else { format!("{a}-{b}") };
+        let damaged = self.damage.iter().filter(|d| d.kind != DamageKind::Tail).map(bytes).collect();
+        [
+            ("when_utc_ns", UtcPair::sample().utc_ns.to_string()),
+            ("depthrig_version", env!("CARGO_PKG_VERSION").to_owned()),
+            ("file", self.file.clone()),
+            ("file_bytes", self.bytes.to_string()),
+            ("tail_bytes", self.tail_bytes().to_string()),
+            ("torn_sets", self.torn_sets().to_string()),
+            ("damaged", list(damaged)),
+            ("sets_missing", list(self.missing.iter().map(ids).collect())),
+            ("sets_lost", self.missing.iter().map(|(a, b)| b - a + 1).sum::<u64>().to_string()),
+            ("lost", self.words().join("\n")),
+        ]
+        .map(|(k, v)| (k.to_owned(), v))
+        .into()
+    }
+}
+
+/// A chunk of the copy: where it was in the original, unless it was made anew; where it is; its bytes.
+type Copied = (Option<u64>, u64, u64);
+
+impl Rebuild<'_> {
+    /// Copies what is whole into the temporary file and proves that. With `dry_run` it only looks.
+    pub(super) fn run(&self, dry_run: bool, tell: Tell<'_>) -> Result<(Facts, Lost)> {
+        let reader = SegmentReader::open_any(self.fs, self.path)?;
+        let file = self.path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        let mut lost = Lost { bytes: reader.size, file, ..Lost::default() };
+        let (preamble, first) = if let Some(own) = self.own_preamble(&reader)? {
+            own
+        } else {
+            // A file that was only just created has nothing to lose.
+            lost.head_rebuilt = reader.size > 0;
+            (self.other_preamble(&reader)?, MAGIC.len().min(reader.size as usize) as u64)
+        };
+        let temporary = temporary(self.path);
+        if dry_run {
+            let (facts, _) = self.copy(&reader, &preamble, first, None, &mut lost, tell)?;
+            return Ok((facts, lost));
+        }
+        self.check_room(reader.size)?;
+        let done =
+            Segment::create_as(self.fs, temporary.clone(), temporary.clone(), &preamble).and_then(|copy| {
+                let mut copy = copy;
+                let (facts, copied) =
+                    self.copy(&reader, &preamble, first, Some(&mut copy), &mut lost, tell)?;
+                let (end, crc) = copy.checkpoint();
+                copy.seal()?;
+                self.prove(&reader, &temporary, end, crc, &copied)?;
+                Ok(facts)
+            });
+        match done {
+            Ok(facts) => Ok((facts, lost)),
+            Err(e) => {
+                // The next recovery removes it if this cannot.
+                let _ = self.fs.remove_file(&temporary);
+                Err(e)
+            }
+        }
+    }
+
+    fn check_room(&self, bytes: u64) -> Result<()> {
+        let dir = self.dir;
+        let free =
+            self.fs.available_space(dir).map_err(|e| Error::io("ask for the free space of", dir, e))?;
+        let needed = bytes.saturating_add(SPARE.min(bytes));
+        if free >= needed {
+            return Ok(());
+        }
+        Err(Error::new(
+            ErrorKind::DiskFull,
+            format!(
+                "{} cannot be recovered: its copy takes {needed} bytes, the disk has {free} left; free some space and \
+                 try again (nothing was changed)",
+                self.path.display()
+            ),
+        ))
+    }
+
+    fn copy(
+        &self,
+        reader: &SegmentReader,
+        preamble: &Preamble,
+        first: u64,
+        mut copy: Option<&mut Segment>,
+        lost: &mut Lost,
+        tell: Tell<'_>,
+    ) -> Result<(Facts, Vec<Copied>)> {
+        let schema = |s: Schema| preamble.schemas.iter().find(|r| r.name == s.name()).map(|r| r.id);
+        let accounts_channel = schema(Schema::Accounts)
+            .and_then(|id| preamble.channels.iter().find(|c| c.schema == id).map(|c| c.id));
+        let mut facts = Facts { bytes: reader.size, ..Facts::default() };
+        let mut said = BTreeMap::new();
+        let mut copied = Vec::new();
+        let mut groups = Groups::new(reader, preamble, first)?;
+        let mut before = self.before;
+        let mut last_time = None;
+        let mut head = false;
+        while let Some(group) = groups.next()? {
+            if let (Group::Set(set), Some(copy), false) = (&group, copy.as_deref_mut(), head) {
+                // Damage took the chunk that says where the cameras are.
+                let chunk = head_chunk(preamble, set.log_time, self.path)?;
+                copied.push((None, copy.len(), chunk.bytes().len() as u64));
+                copy.append_chunks(&[chunk])?;
+            }
+            head |= matches!(&group, Group::Set(_)) || matches!(&group, Group::Between(b) if b.head);
+            let at = copy.as_ref().map_or(0, |c| c.len());
+            match &group {
+                Group::Damage(d) => {
+                    lost.at_end = true;
+                    lost.damage.push(d.clone());
+                }
+                Group::Set(set) if out_of_order(set, before, last_time) => {
+                    let (Some(from), Some(to)) = (set.offsets.first(), set.offsets.last()) else { continue };
+                    let why = format!("set {}, which is not after the set before", set.mark.id);
+                    let kind = DamageKind::Torn;
+                    lost.damage.push(Damage { from: *from, to: *to, kind, set: Some(set.mark.id), why });
+                    continue;
+                }
+                Group::Set(set) => {
+                    if let Some(before) = before.filter(|b| lost.at_end && set.mark.id > b + 1) {
+                        lost.missing.push((before + 1, set.mark.id - 1));
+                    }
+                    lost.at_end = false;
+                    (before, last_time) = (Some(set.mark.id), Some(set.log_time));
+                    facts.set(&set.mark, set.log_time);
+                }
+                Group::Between(between) => {
+                    reader.chunk_messages(between.chunk.body(), between.offset, |m| {
+                        if Some(m.channel) == accounts_channel {
+                            facts.counts = Some(accounts::read(m.data)?.0);
+                        }
+                        Ok(())
+                    })?;
+                }
+                Group::Metadata(name, map) if name == SEGMENT_METADATA => {
+                    facts.metadata(map);
+                    said.clone_from(map);
+                    continue;
+                }
+                Group::Metadata(name, map) if name == RECOVERED_METADATA => facts.recovered(map),
+                Group::Metadata(..) => {}
+            }
+            if let Some(copy) = copy.as_deref_mut() {
+                copy.append_group(&group)?;
+                let mut to = at;
+                let (chunks, offsets): (&[_], &[_]) = match &group {
+                    Group::Set(set) => (&set.chunks, &set.offsets),
+                    Group::Between(b) => (std::slice::from_ref(&b.chunk), std::slice::from_ref(&b.offset)),
+                    _ => (&[], &[]),
+                };
+                for (chunk, from) in chunks.iter().zip(offsets) {
+                    let len = chunk.bytes().len() as u64;
+                    copied.push((Some(*from), to, len));
+                    to += len + Segment::index_len(chunk);
+                }
+            }
+            tell(groups.offset())?;
+        }
+        facts.lost.extend(lost.words());
+        if let Some(copy) = copy {
+            copy.append_metadata(RECOVERED_METADATA, &lost.metadata())?;
+            said.extend(
+                [
+                    ("segment", segment_number(&lost.file).unwrap_or_default() as u64),
+                    ("sets", facts.sets),
+                    ("first_set", facts.first_set.unwrap_or_default()),
+                    ("last_set", facts.last_set.unwrap_or_default()),
+                ]
+                .map(|(k, v)| (k.to_owned(), v.to_string())),
+            );
+            copy.append_metadata(SEGMENT_METADATA, &said)?;
+        }
+        Ok((facts, copied))
+    }
+
+    /// Reads the copy back: its index must be readable, its data must have the checksum that was computed while
+    /// it was written, and each chunk must be that of the original, bit by bit.
+    fn prove(
+        &self,
+        original: &SegmentReader,
+        copy: &Path,
+        end: u64,
+        crc: u32,
+        copied: &[Copied],
+    ) -> Result<()> {
+        let mut reader = SegmentReader::open_bare(self.fs, copy)?;
+        reader.load_index()?;
+        let wrong = |at: u64, what: &str| {
+            let what = format!("the recovered copy is not what was written: {what}; is the disk failing?");
+            reader.error(ErrorKind::Corrupt, at, what)
+        };
+        if !reader.finished
+            || !reader.chunks.iter().map(|c| (c.offset, c.length)).eq(copied.iter().map(|c| (c.1, c.2)))
+        {
+            return Err(wrong(end, "its index is another one"));
+        }
+        let mut hasher = crc32fast::Hasher::new();
+        let (mut ours, mut theirs) = (Vec::new(), Vec::new());
+        let mut at = 0;
+        for &(from, to, len) in copied.iter().chain([&(None, end, 0)]) {
+            while at < to {
+                let n = WINDOW.min(to - at);
+                reader.read_into(&mut ours, at, n)?;
+                hasher.update(&ours);
+                at += n;
+            }
+            let mut done = 0;
+            while done < len {
+                let n = WINDOW.min(len - done);
+                reader.read_into(&mut ours, to + done, n)?;
+                if let Some(from) = from {
+                    original.read_into(&mut theirs, from + done, n)?;
+                    if ours != theirs {
+                        return Err(wrong(to + done, "a chunk differs"));
+                    }
+                }
+                hasher.update(&ours);
+                done += n;
+            }
+            at += len;
+        }
+        if hasher.finalize() == crc { Ok(()) } else { Err(wrong(end, "its checksum is another one")) }
+    }
+
+    /// Schemas, channels and session as they stand in the file, if they do.
+    fn own_preamble(&self, reader: &SegmentReader) -> Result<Option<(Preamble, u64)>> {
+        if reader.size < MAGIC.len() as u64 || reader.read(0, MAGIC.len() as u64)? != MAGIC {
+            return Ok(None);
+        }
+        let found = match read_preamble(reader) {
+            Ok(found) => found,
+            Err(e) if matches!(e.kind(), ErrorKind::Corrupt | ErrorKind::Truncated) => return Ok(None),
+            Err(e) => return Err(e),
+        };
+        let session = found.0.metadata.iter().find(|(name, _)| name == SESSION_METADATA);
+        let text = session.and_then(|(_, m)| m.get("session_toml"));
+        Ok(text.is_some_and(|t| Session::from_toml(t, self.path).is_ok()).then_some(found))
+    }
+
+    /// The same from another segment, or from the session.
+    fn other_preamble(&self, reader: &SegmentReader) -> Result<Preamble> {
+        let number =
+            segment_number(&self.path.file_name().unwrap_or_default().to_string_lossy()).unwrap_or_default();
+        for other in self.segments.iter().filter(|p| *p != self.path) {
+            let other = SegmentReader::open_any(self.fs, other)?;
+            if let Some((mut preamble, _)) = self.own_preamble(&other)? {
+                for (name, map) in &mut preamble.metadata {
+                    if name == SESSION_METADATA {
+                        map.insert("segment".to_owned(), number.to_string());
+                    }
+                }
+                return Ok(preamble);
+            }
+        }
+        let Some(session) = self.session else {
+            return Err(Error::new(
+                ErrorKind::NotADataset,
+                format!(
+                    "nothing says what {} holds: its head is damaged, and so are session.toml and all other segments",
+                    self.path.display()
+                ),
+            ));
+        };
+        let preamble = |options: &RecorderOptions| {
+            let mut session = session.clone();
+            session.outcome = None;
+            Topics::new(&session, options).preamble(&session, number)
+        };
+        // How pictures are stored decides the types of their channels; the first set tells.
+        let mut options = RecorderOptions::default();
+        let guess = preamble(&options)?;
+        let mut groups = Groups::new(reader, &guess, MAGIC.len().min(reader.size as usize) as u64)?;
+        while let Some(group) = groups.next()? {
+            if let Group::Set(set) = group {
+                codecs(reader, &set, session, &mut options)?;
+                return preamble(&options);
+            }
+        }
+        Ok(guess)
+    }
+}
+
+fn out_of_order(set: &SetGroup, before: Option<u64>, last_time: Option<u64>) -> bool {
+    before.is_some_and(|b| set.mark.id <= b) || last_time.is_some_and(|t| set.log_time <= t)
+}
+
+/// The chunk with `/tf_static`, from the session in the head of the file.
+fn head_chunk(preamble: &Preamble, log_time: u64, path: &Path) -> Result<Chunk> {
+    let metadata = preamble.metadata.iter().find(|(name, _)| name == SESSION_METADATA);
+    let text = metadata.and_then(|(_, m)| m.get("session_toml"));
+    let session = Session::from_toml(text.map(String::as_str).unwrap_or_default(), path)?;
+    let schema = preamble.schemas.iter().find(|s| s.name == Schema::TfMessage.name());
+    let channel = preamble.channels.iter().find(|c| Some(c.schema) == schema.map(|s| s.id));
+    let mut builder = ChunkBuilder::new();
+    if let Some(channel) = channel {
+        let head = MessageHead { channel: channel.id, sequence: 0, log_time, publish_time: log_time };
+        builder.message(head, |b| {
+            tf::write(b, log_time as i64, &session.rig, session.streams.iter().map(|s| (&s.id, &s.pose)));
+            Ok::<_, Error>(())
+        })?;
+    }
+    builder.pack(true)
+}
+
+/// Finds out how the pictures of a set are stored.
+fn codecs(
+    reader: &SegmentReader,
+    set: &SetGroup,
+    session: &Session,
+    options: &mut RecorderOptions,
+) -> Result<()> {
+    let (Some(chunk), Some(offset)) = (set.chunks.last(), set.offsets.last()) else { return Ok(()) };
+    reader.chunk_messages(chunk.body(), *offset, |m| {
+        let stream = session.streams.iter().enumerate().find(|(i, _)| image_channel(*i) + 2 == m.channel);
+        let Some((_, stream)) = stream else { return Ok(()) };
+        let (header, extra) = frame_info::read(m.data)?;
+        let stored = Codec::from_name(extra.codec);
+        if header.format != stream.format as u32 {
+            return Ok(());
+        }
+        let agrees = |to: &RecorderOptions| Some(Codec::of(stream.format, to)) == stored;
+        let colors = [ColorCodec::Jpeg, ColorCodec::Raw, ColorCodec::Png]
+            .map(|color| RecorderOptions { color, ..options.clone() });
+        let depths =
+            [DepthCodec::Zstd, DepthCodec::Rank].map(|depth| RecorderOptions { depth, ..options.clone() });
+        if !agrees(options)
+            && let Some(found) = colors.into_iter().chain(depths).find(agrees)
+        {
+            *options = found;
+        }
+        Ok(())
+    })
+}

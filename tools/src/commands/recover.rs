@@ -1,0 +1,84 @@
+//! `depthrig recover`: makes a dataset whole again after a crash.
+
+use crate::context::Context;
+use crate::exit::Exit;
+use crate::out;
+use crate::progress::Progress;
+use crate::signals::Stop;
+use anyhow::Result;
+use core::fmt::Write;
+use core::ops::ControlFlow;
+use depthrig_recorder::{RecoverAction, RecoverOptions, RecoverReport, recover};
+use std::path::PathBuf;
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+Each segment that is unfinished, torn or damaged is copied set by set; the copy is read back and compared, and only
+then takes the old file's place. It may be interrupted at any time and begun again; done twice it changes nothing.
+A segment's copy needs as much free space as the segment.
+
+Exit codes: 0 nothing was lost or nothing to do, 3 recovered and something is lost, 1 not recovered, 2 wrong usage.
+
+Examples:
+  depthrig recover data/20261121_1015_kitchen
+  depthrig recover data/20261121_1015_kitchen --dry-run     what would be done
+  for d in data/*/; do depthrig recover \"$d\"; done";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct RecoverArgs {
+    /// The dataset's folder
+    dataset: PathBuf,
+    /// Say what would be done and change nothing
+    #[arg(long)]
+    dry_run: bool,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Recovers and reports.
+pub fn run(args: &RecoverArgs, context: &Context) -> Result<Exit> {
+    let stop = Stop::on_signals()?;
+    let mut bar = Progress::new(context.global.quiet > 0);
+    let options = RecoverOptions { dry_run: args.dry_run, ..RecoverOptions::default() };
+    let report = recover(&args.dataset, &options, &mut |p| {
+        bar.set("recover", p.done_bytes, p.total_bytes);
+        if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    })?;
+    bar.clear();
+    if args.json {
+        out::json(&report)?;
+    } else {
+        out::line(text(&report))?;
+    }
+    Ok(if report.lost.is_empty() { Exit::Good } else { Exit::Lost })
+}
+
+fn text(report: &RecoverReport) -> String {
+    let mut told = String::new();
+    let path = report.path.display();
+    // Writing to a string cannot fail.
+    let _ = match (report.changed, report.dry_run) {
+        (false, _) => write!(told, "{path}: nothing to do, {} sets", report.sets),
+        (true, false) => write!(told, "{path}: recovered, {} sets", report.sets),
+        (true, true) => write!(told, "{path}: can be recovered, {} sets", report.sets),
+    };
+    for s in report.segments.iter().filter(|s| s.action != RecoverAction::None) {
+        let done = match s.action {
+            RecoverAction::Rebuilt => "copied set by set",
+            _ => "whole, got its final name",
+        };
+        let _ = write!(told, "\n  {}: {done}, {} sets, {}", s.file, s.sets, out::bytes(s.bytes));
+    }
+    for name in &report.removed {
+        let _ = write!(told, "\n  {name}: a leftover, removed");
+    }
+    for what in &report.lost {
+        let _ = write!(told, "\n  lost: {what}");
+    }
+    for what in &report.notes {
+        let _ = write!(told, "\n  note: {what}");
+    }
+    told
+}
