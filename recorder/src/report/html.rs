@@ -57,7 +57,15 @@ fn size(bytes: u64) -> String {
 }
 
 fn ms(ns: i64) -> String {
-    format!("{:.1} ms", ns as f64 / 1e6)
+    match ns as f64 / 1e6 {
+        x if x.abs() < 1.0 => format!("{x:.2} ms"),
+        x => format!("{x:.1} ms"),
+    }
+}
+
+/// `1 set`, `2 sets`.
+pub(super) fn count(n: u64, what: &str) -> String {
+    format!("{n} {what}{}", if n == 1 { "" } else { "s" })
 }
 
 fn or_none(text: &str) -> &str {
@@ -133,7 +141,7 @@ fn head(out: &mut String, r: &Report) {
         ("Sets", format!("{} at {} Hz", r.sets.count, number(per_s))),
         ("Sets lost", lost),
         ("Incomplete sets", r.sets.incomplete.to_string()),
-        ("Size", format!("{} in {} segments", size(r.bytes), r.segments)),
+        ("Size", format!("{} in {}", size(r.bytes), count(r.segments as u64, "segment"))),
         ("Data rate", if r.sets.duration_ns > 0 { format!("{rate:.1} MB/s") } else { "–".to_owned() }),
         ("Rig, host", format!("{}, {}", r.rig, or_none(&r.host))),
         ("Operator", or_none(&r.operator).to_owned()),
@@ -425,8 +433,11 @@ fn clocks(out: &mut String, r: &Report) {
 fn lag_strip(s: &StreamReport) -> Strip {
     let q: &Quantiles = &s.clock.lag_ns;
     let top = s.clock.lag_series.iter().flatten().map(|v| v.max / 1e6).fold(0.0, f64::max);
-    let restarts =
-        if s.clock.restarts > 0 { format!(", {} restarts", s.clock.restarts) } else { String::new() };
+    let restarts = if s.clock.restarts > 0 {
+        format!(", {}", count(s.clock.restarts, "restart"))
+    } else {
+        String::new()
+    };
     Strip {
         label: s.record.id.to_string(),
         note: format!("p50 {}, max {}{restarts}", ms(q.p50), ms(q.max)),

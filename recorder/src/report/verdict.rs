@@ -1,5 +1,6 @@
 //! What is to be thought of a dataset, in sentences: the first thing that a reader sees.
 
+use super::html::count;
 use super::{Report, StreamReport, Verdict};
 use crate::catalog::{CatalogEntry, Health};
 
@@ -50,7 +51,15 @@ fn headline(report: &Report, health: Health, lost: u64, plain: bool) -> String {
     let (sets, path) = (report.sets.count, report.path.display());
     match health {
         Health::Whole if plain => format!("Whole: all {sets} sets are here, each with every stream."),
-        Health::Whole => format!("Whole: all {sets} sets that were taken are here. Read the remarks."),
+        Health::Whole if report.sets.incomplete > 0 => {
+            let incomplete = report.sets.incomplete;
+            format!(
+                "Whole: all {sets} sets that were taken are here, {incomplete} of them without every stream."
+            )
+        }
+        Health::Whole => {
+            format!("Whole: all {sets} sets are here, each with every stream. Read the remarks.")
+        }
         Health::Recording => format!("Still being recorded: this is what is on disk so far, {sets} sets."),
         Health::Lost => {
             let offered = report.sets.counts.map_or(sets + lost, |c| c.offered);
@@ -102,7 +111,7 @@ fn remarks(report: &Report) -> Vec<String> {
         ));
     }
     for s in report.streams.iter().filter(|s| s.clock.restarts > 0) {
-        remarks.push(format!("{}: its clock map was restarted {} times.", s.record.id, s.clock.restarts));
+        remarks.push(format!("{}: its clock map had {}.", s.record.id, count(s.clock.restarts, "restart")));
     }
     for (at, by) in &report.host_clock.steps {
         let (at, by) = (*at as f64 / 1e9, *by as f64 / 1e6);

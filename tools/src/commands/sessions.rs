@@ -142,7 +142,7 @@ fn text(entries: &[CatalogEntry], folder: &str) -> String {
         lines.push(format!("{}: {}: {why}", e.health.name(), e.path.display()));
     }
     let all = format!("{} datasets, {sets} sets, {}", entries.len(), out::bytes(bytes));
-    lines.push(if bad.is_empty() { all } else { format!("{all}; {} need a look", bad.len()) });
+    lines.push(if bad.is_empty() { all } else { format!("{all}; to be looked at: {}", bad.len()) });
     lines.join("\n")
 }
 
