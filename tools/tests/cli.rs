@@ -182,6 +182,10 @@ fn the_whole_way_of_a_small_rig() {
     assert!(twice.err.contains("first"), "{}", twice.err);
     home.run(&["record", "note", "the cup was moved"]).good();
     home.wait_for_sets(5);
+    let said = home.run(&["sessions", out.to_str().unwrap()]).good();
+    assert!(said.contains("recording") && !said.contains("unfinished"), "{said}");
+    let said = home.run(&["edit", out.join("first").to_str().unwrap(), "--scene", "table"]);
+    assert_eq!(said.code, 2, "what is being recorded is not edited: {}", said.err);
     home.run(&["record", "stop"]).good();
     let summary = running.interrupt();
     assert_eq!(summary.code, 0, "{}\n{}", summary.out, summary.err);
@@ -198,6 +202,11 @@ fn check_dataset(home: &Home, dataset: &Path) {
     assert!(sets >= 5, "{sets} sets");
     let said = home.run(&["verify", path, "--decode"]).good();
     assert!(said.contains("whole"), "{said}");
+    let page =
+        std::fs::read_to_string(dataset.join("report.html")).expect("a recording ends with its report");
+    assert!(page.contains("Whole: all ") && page.ends_with("</html>\n"), "{}", &page[page.len() - 200..]);
+    let said = home.run(&["sessions", path]).good();
+    assert!(said.contains("whole") && said.contains("desk"), "{said}");
 
     let replay: serde_json::Value =
         serde_json::from_str(&home.run(&["replay", path, "--as-fast-as-possible", "--json", "-q"]).good())
@@ -213,6 +222,9 @@ fn check_dataset(home: &Home, dataset: &Path) {
     let broken = home.run(&["verify", path]);
     assert_eq!(broken.code, 1, "{}{}", broken.out, broken.err);
     assert!(broken.out.contains("broken: seg_0000.mcap"), "{}", broken.out);
+    let report = home.run(&["report", path, "-q"]);
+    let page = std::fs::read_to_string(dataset.join("report.html")).unwrap();
+    assert_eq!(report.code == 3, page.contains("Damaged: "), "{}{}", report.out, report.err);
 }
 
 #[test]

@@ -2,7 +2,6 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/home.rs"]
-#[allow(dead_code)]
 mod support;
 
 use depthrig_bus::{FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
@@ -108,4 +107,29 @@ fn an_edit_shows_in_info_and_leaves_its_history() {
         assert_eq!(ran.code, 2, "{bad:?}: {}", ran.err);
     }
     assert_eq!(home.run(&["edit", "/no/such/dataset", "--scene", "x"]).code, 1);
+}
+
+#[test]
+fn a_report_is_a_page_or_json_and_its_exit_code_says_how_it_is() {
+    let home = Home::new();
+    let dir = home.path().join("data");
+    write(&dir, "a <b>", 1_700_000_000_000_000_000);
+    let at = dir.to_str().unwrap();
+    let said = home.run(&["report", at, "-q"]).good();
+    assert!(said.contains("Whole: ") && said.contains("report.html"), "{said}");
+    assert!(std::fs::read_to_string(dir.join("report.html")).unwrap().contains("a &lt;b&gt;"));
+
+    let other = home.path().join("other.html");
+    let json = home.run(&["report", at, "--json", "--out", other.to_str().unwrap(), "-q"]).good();
+    let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert_eq!((&json["verdict"]["health"], &json["sets"]["count"]), (&"whole".into(), &1.into()));
+    assert!(other.exists());
+
+    let segment = dir.join("seg_0000.mcap");
+    assert_eq!(home.run(&["report", segment.to_str().unwrap(), "-q"]).code, 2, "where should the page be?");
+    std::fs::rename(&segment, dir.join("seg_0000.mcap.part")).unwrap();
+    let ran = home.run(&["report", at, "-q"]);
+    assert_eq!(ran.code, 3, "{}", ran.err);
+    assert!(ran.out.contains("depthrig recover"), "{}", ran.out);
+    assert_eq!(home.run(&["report", "/no/such/dataset", "-q"]).code, 1);
 }

@@ -440,7 +440,7 @@ fn lag_strip(s: &StreamReport) -> Strip {
     };
     Strip {
         label: s.record.id.to_string(),
-        note: format!("p50 {}, max {}{restarts}", ms(q.p50), ms(q.max)),
+        note: format!("p50 {} max {}{restarts}", ms(q.p50), ms(q.max)),
         trace: in_ms(&s.clock.lag_series),
         y: (0.0, nice_end(top * 1.05)),
         nominal: None,

@@ -10,7 +10,7 @@ use std::fmt::Write;
 /// Width of every plot; the page scales it.
 const WIDTH: f64 = 960.0;
 /// Where the plots of strips begin and end.
-const X: (f64, f64) = (196.0, 770.0);
+const X: (f64, f64) = (196.0, 750.0);
 /// Height of a strip and the space below it.
 const STRIP: f64 = 36.0;
 const GAP: f64 = 9.0;

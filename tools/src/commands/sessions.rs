@@ -8,8 +8,8 @@ use clap::ValueEnum;
 use depthrig_daemon::client::Client;
 use depthrig_daemon::config::RecordingConfig;
 use depthrig_recorder::fs::RealFs;
-use depthrig_recorder::{CatalogEntry, catalog};
-use std::path::PathBuf;
+use depthrig_recorder::{CatalogEntry, Health, catalog};
+use std::path::{Path, PathBuf};
 use time::{OffsetDateTime, UtcOffset};
 
 /// Examples for `--help`.
@@ -68,6 +68,7 @@ enum Sort {
 pub fn run(args: &SessionsArgs, context: &Context) -> Result<Exit> {
     let folder = args.folder.clone().unwrap_or_else(|| recordings_folder(context));
     let mut entries = catalog(&RealFs, &folder)?;
+    mark_recordings(&mut entries, context);
     entries.retain(|e| is_wanted(e, args));
     sort(&mut entries, args.sort);
     if args.reverse {
@@ -89,6 +90,24 @@ fn recordings_folder(context: &Context) -> PathBuf {
         Some(PathBuf::from(recording.path).parent()?.to_owned())
     };
     of_rig().unwrap_or_else(|| RecordingConfig::default().directory)
+}
+
+/// What a running rig records now is unfinished, and well.
+fn mark_recordings(entries: &mut [CatalogEntry], context: &Context) {
+    let Ok(runtime) = context.runtime() else { return };
+    for rig in runtime.running_rigs() {
+        let Ok(client) = Client::connect(&runtime, Some(&rig)) else { continue };
+        let Ok(Some(recording)) = client.record_status() else { continue };
+        let Some(path) = recording.active.then(|| Path::new(&recording.path).canonicalize().ok()).flatten()
+        else {
+            continue;
+        };
+        let mut unfinished = entries.iter_mut().filter(|e| e.health == Health::Unfinished);
+        if let Some(entry) = unfinished.find(|e| e.path.canonicalize().is_ok_and(|p| p == path)) {
+            (entry.health, entry.sets, entry.why) = (Health::Recording, recording.sets, Vec::new());
+            entry.duration_ns = (recording.duration_s * 1e9) as i64;
+        }
+    }
 }
 
 fn is_wanted(e: &CatalogEntry, args: &SessionsArgs) -> bool {
