@@ -17,6 +17,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 mod pictures;
+pub mod soak;
 
 /// What to measure.
 #[derive(Debug, Clone, Serialize)]
@@ -118,21 +119,28 @@ pub struct Throughput {
     pub payload_bytes: usize,
 }
 
+impl Conditions {
+    fn now(pictures: String) -> Self {
+        let read = |path: &str| std::fs::read_to_string(path).unwrap_or_default();
+        let cpuinfo = read("/proc/cpuinfo");
+        let cpu = cpuinfo.lines().find_map(|l| l.strip_prefix("model name\t: "));
+        Self {
+            cpu: cpu.unwrap_or("unknown").to_owned(),
+            cores: std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
+            load: read("/proc/loadavg").split(' ').next().unwrap_or_default().to_owned(),
+            optimised: !cfg!(debug_assertions),
+            pictures,
+        }
+    }
+}
+
 /// Measures what recording costs.
 ///
 /// # Errors
 /// As recording does; [`ErrorKind::BadInput`] when the pictures cannot be used.
 pub fn run(options: &BenchOptions) -> Result<BenchReport> {
-    let read = |path: &str| std::fs::read_to_string(path).unwrap_or_default();
-    let cpu = read("/proc/cpuinfo").lines().find_map(|l| l.strip_prefix("model name\t: ").map(str::to_owned));
-    let (pool, pictures) = pictures::pool(options)?;
-    let conditions = Conditions {
-        cpu: cpu.unwrap_or_else(|| "unknown".to_owned()),
-        cores: std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
-        load: read("/proc/loadavg").split(' ').next().unwrap_or_default().to_owned(),
-        optimised: !cfg!(debug_assertions),
-        pictures,
-    };
+    let (pool, pictures) = pictures::pool(options.images.as_deref(), options.width, options.height)?;
+    let conditions = Conditions::now(pictures);
     let steady = steady(options, &pool)?;
     let writer = (options.writer_bytes > 0).then(|| throughput(options)).transpose()?;
     Ok(BenchReport { options: options.clone(), conditions, steady, writer })
@@ -197,7 +205,7 @@ fn steady(options: &BenchOptions, pool: &pictures::Pool) -> Result<Steady> {
     let sets = (options.seconds * options.rate_hz).round().max(1.0) as u64;
     let (begin, cpu, utc) = (HostTime::now(), process_cpu_ns(), UtcPair::sample());
     let mut push_max_ns = 0;
-    let measured = record(&options.dir, &sources, options.recorder.clone(), |recorder| {
+    let feed = |recorder: &Recorder| {
         for n in 0..sets {
             let due = begin.plus(period.saturating_mul(n as u32));
             std::thread::sleep(due.from_now());
@@ -208,7 +216,8 @@ fn steady(options: &BenchOptions, pool: &pictures::Pool) -> Result<Steady> {
             push_max_ns = push_max_ns.max(HostTime::now().since_ns(before));
         }
         std::thread::sleep(begin.plus(period.saturating_mul(sets as u32)).from_now());
-    })?;
+    };
+    let (measured, ()) = record(&options.dir, &sources, options.recorder.clone(), feed, |_| Ok(()))?;
     let Measured { summary, end, end_cpu_ns } = measured;
     let (wall, cpu) = (end.since_ns(begin) as f64 / 1e9, (end_cpu_ns - cpu) as f64 / 1e9);
     let raw: usize = sources.iter().map(|s| s.pictures[0].len()).sum();
@@ -247,7 +256,7 @@ fn throughput(options: &BenchOptions) -> Result<Throughput> {
     };
     let sets = options.writer_bytes.div_ceil((PAYLOAD * STREAMS) as u64).max(1);
     let (begin, cpu, utc) = (HostTime::now(), process_cpu_ns(), UtcPair::sample());
-    let measured = record(&options.dir, &sources, recorder, |recorder| {
+    let feed = |recorder: &Recorder| {
         for n in 0..sets {
             let tick = begin.plus_ns(n as i64 * 1_000_000);
             while recorder.progress().encode_queue >= 2 || recorder.progress().backlog_bytes > 64 << 20 {
@@ -255,7 +264,8 @@ fn throughput(options: &BenchOptions) -> Result<Throughput> {
             }
             drop(recorder.push(set(&sources, n + 1, tick, utc)));
         }
-    })?;
+    };
+    let (measured, ()) = record(&options.dir, &sources, recorder, feed, |_| Ok(()))?;
     let Measured { summary, end, end_cpu_ns } = measured;
     let (wall, cpu) = (end.since_ns(begin) as f64 / 1e9, (end_cpu_ns - cpu) as f64 / 1e9);
     if summary.sets.recorded != sets {
@@ -273,13 +283,14 @@ struct Measured {
     end_cpu_ns: i64,
 }
 
-/// Records into a new folder below `dir` and removes it.
-fn record(
+/// Records into a new folder below `dir`, looks at it with `look`, and removes it.
+fn record<T>(
     dir: &Path,
     sources: &[Source],
     options: RecorderOptions,
     feed: impl FnOnce(&Recorder),
-) -> Result<Measured> {
+    look: impl FnOnce(&Path) -> Result<T>,
+) -> Result<(Measured, T)> {
     let dir = dir.join(format!("depthrig-bench-{}", std::process::id()));
     let mut session = Session::new("bench", "bench");
     session.streams = sources.iter().map(|s| s.record.clone()).collect();
@@ -287,6 +298,7 @@ fn record(
     feed(&recorder);
     let summary = recorder.finish();
     let (end, end_cpu_ns) = (HostTime::now(), process_cpu_ns());
+    let seen = look(&dir);
     std::fs::remove_dir_all(&dir).map_err(|e| Error::io("remove", &dir, e))?;
-    Ok(Measured { summary: summary?, end, end_cpu_ns })
+    Ok((Measured { summary: summary?, end, end_cpu_ns }, seen?))
 }

@@ -1,6 +1,5 @@
 //! Pictures to record: real ones from a folder, or made ones that compress about as real ones do.
 
-use super::BenchOptions;
 use crate::{Error, ErrorKind, Result};
 use std::path::Path;
 use std::sync::Arc;
@@ -15,10 +14,9 @@ pub(super) struct Pool {
 }
 
 /// The pictures to record, and where they come from in words.
-pub(super) fn pool(options: &BenchOptions) -> Result<(Pool, String)> {
-    let (w, h) = (options.width, options.height);
+pub(super) fn pool(images: Option<&Path>, w: u32, h: u32) -> Result<(Pool, String)> {
     let mut pool = Pool { color: Vec::new(), depth: Vec::new() };
-    if let Some(dir) = &options.images {
+    if let Some(dir) = images {
         load(dir, w, h, &mut pool)?;
         if pool.color.is_empty() || pool.depth.is_empty() {
             let message = format!(

@@ -8,7 +8,8 @@ use crate::progress::Progress;
 use anyhow::Result;
 use core::time::Duration;
 use depthrig_bus::RuntimeDir;
-use depthrig_recorder::bench::{BenchOptions, BenchReport};
+use depthrig_recorder::bench::soak::{self, SoakOptions, SoakReport};
+use depthrig_recorder::bench::{BenchOptions, BenchReport, Conditions};
 use std::path::PathBuf;
 
 /// Examples for `--help`.
@@ -19,7 +20,8 @@ Examples:
   depthrig bench bus             about three minutes
   depthrig bench bus --quick     half a minute, to see that it works
   depthrig bench bus --check     exit code 1 when a promise is not kept
-  depthrig bench record --json";
+  depthrig bench record --json
+  depthrig bench soak --check    ten minutes of recording as fast as it goes; 12 GB of disk, removed again";
 
 /// What to measure.
 #[derive(Debug, clap::Subcommand)]
@@ -28,6 +30,8 @@ pub enum BenchCommand {
     Bus(BenchArgs),
     /// Recording seven cameras at 5 Hz: CPU, lost sets, and how fast the writer can be
     Record(RecordArgs),
+    /// A long recording, faster than real time: memory must stay where it is and every set be accounted for
+    Soak(SoakArgs),
 }
 
 /// How much, and in which form.
@@ -61,11 +65,29 @@ pub struct RecordArgs {
     bench: BenchArgs,
 }
 
+/// How long to record.
+#[derive(Debug, clap::Args)]
+pub struct SoakArgs {
+    /// Where the dataset is written and removed again
+    #[arg(long, value_name = "DIR")]
+    dir: Option<PathBuf>,
+    /// Record these pictures instead of made ones (8-bit PNG or JPEG for colour, 16-bit PNG for depth)
+    #[arg(long, value_name = "DIR")]
+    images: Option<PathBuf>,
+    /// Recorded time, at 5 sets a second
+    #[arg(long, value_name = "SECONDS", default_value = "600", value_parser = crate::cli::positive_seconds)]
+    seconds: f64,
+    /// How much, and in which form; --quick is five minutes of small pictures
+    #[command(flatten)]
+    bench: BenchArgs,
+}
+
 /// Runs a bench.
 pub fn run(command: &BenchCommand, context: &Context) -> Result<Exit> {
     match command {
         BenchCommand::Bus(args) => run_bus(args, context),
         BenchCommand::Record(args) => run_record(args),
+        BenchCommand::Soak(args) => run_soak(args, context),
     }
 }
 
@@ -109,6 +131,95 @@ fn run_record(args: &RecordArgs) -> Result<Exit> {
     Ok(if args.bench.check && !bars.iter().all(|b| b.kept) { Exit::Failed } else { Exit::Good })
 }
 
+fn run_soak(args: &SoakArgs, context: &Context) -> Result<Exit> {
+    let mut options =
+        SoakOptions { images: args.images.clone(), recorded_s: args.seconds, ..SoakOptions::default() };
+    if let Some(dir) = &args.dir {
+        options.dir.clone_from(dir);
+    }
+    if args.bench.quick {
+        (options.width, options.height) = (160, 120);
+        options.recorded_s = options.recorded_s.min(300.0);
+        // As many segments as the long form has, and as little on its way to the disk beside what is recorded.
+        (options.recorder.segment_max_ns, options.backlog_bytes) = (20_000_000_000, 1 << 20);
+    }
+    let mut progress = Progress::new(context.global.quiet > 0);
+    let result = soak::run(&options, |done, total| progress.set("sets recorded", done, total));
+    progress.clear();
+    let report = result?;
+    let bars = soak_bars(&report);
+    if args.bench.json {
+        out::json(&report)?;
+    } else {
+        out::line(soak_text(&report, &bars))?;
+    }
+    Ok(if args.bench.check && !bars.iter().all(|b| b.kept) { Exit::Failed } else { Exit::Good })
+}
+
+/// Promises about long recordings.
+fn soak_bars(report: &SoakReport) -> [report::Bar; 3] {
+    [
+        report::Bar {
+            promise: "resident memory: below 1 MB more per minute recorded",
+            measured: format!("{:+.3}", report.slope_mb_per_min),
+            kept: report.slope_mb_per_min < 1.0,
+        },
+        report::Bar {
+            promise: "sets neither recorded nor in the accounts of the dropped: 0",
+            measured: format!("{} of {}", report.unexplained, report.pushed),
+            kept: report.unexplained == 0,
+        },
+        report::Bar {
+            promise: "sets dropped, and findings of verify: none",
+            measured: format!("{} dropped, {} findings", report.dropped, report.findings.len()),
+            kept: report.dropped == 0 && report.findings.is_empty(),
+        },
+    ]
+}
+
+fn soak_text(report: &SoakReport, bars: &[report::Bar]) -> String {
+    let options = &report.options;
+    let mut lines = vec![
+        conditions(&report.conditions),
+        format!(
+            "{} cameras x {}x{} (colour + depth), {:.0} s at {} Hz, in {:.0} s ({:.1} times as fast), {:.0} s of CPU",
+            options.cameras,
+            options.width,
+            options.height,
+            options.recorded_s,
+            options.rate_hz,
+            report.wall_s,
+            options.recorded_s / report.wall_s,
+            report.cpu_s
+        ),
+        format!(
+            "  {} sets in {} segments, {}; resident after {:.0} s: {:.1} to {:.1} MB",
+            report.recorded,
+            report.segments,
+            out::bytes(report.bytes),
+            options.warm_up_s,
+            report.rss_mb.0,
+            report.rss_mb.1
+        ),
+    ];
+    let minutes: Vec<String> = report
+        .samples
+        .chunk_by(|a, b| (a.recorded_s / 60.0).floor() == (b.recorded_s / 60.0).floor())
+        .map(|m| format!("{:.1}", m.iter().map(|s| s.rss_mb).sum::<f64>() / m.len() as f64))
+        .collect();
+    lines.push(format!("  mean resident MB of each minute: {}", minutes.join(" ")));
+    lines.extend(report.findings.iter().map(|f| format!("  {f}")));
+    lines.push("\nPromises".to_owned());
+    lines.extend(bars.iter().map(report::Bar::line));
+    lines.join("\n")
+}
+
+/// The computer, in a line.
+fn conditions(c: &Conditions) -> String {
+    let warning = if c.optimised { "" } else { "; DEBUG BUILD, numbers mean nothing" };
+    format!("{} x {}, load average {} before; {}{warning}", c.cores, c.cpu, c.load, c.pictures)
+}
+
 /// Promises about recording.
 fn record_bars(report: &BenchReport) -> Vec<report::Bar> {
     let steady = &report.steady;
@@ -133,13 +244,9 @@ fn record_bars(report: &BenchReport) -> Vec<report::Bar> {
 }
 
 fn record_text(report: &BenchReport, bars: &[report::Bar]) -> String {
-    let (conditions, options, steady) = (&report.conditions, &report.options, &report.steady);
-    let warning = if conditions.optimised { "" } else { "; DEBUG BUILD, numbers mean nothing" };
+    let (options, steady) = (&report.options, &report.steady);
     let mut lines = vec![
-        format!(
-            "{} x {}, load average {} before; {}{warning}",
-            conditions.cores, conditions.cpu, conditions.load, conditions.pictures
-        ),
+        conditions(&report.conditions),
         format!(
             "{} cameras x {}x{} (colour + depth) at {} Hz for {} s, JPEG quality {}",
             options.cameras,
