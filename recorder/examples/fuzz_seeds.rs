@@ -5,12 +5,15 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stdout)]
 
 use depthrig_bus::{DropCounts, FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
+use depthrig_recorder::codec::{DepthEncoder, DepthShape};
 use depthrig_recorder::fs::{Fs, MemFs};
 use depthrig_recorder::fuzzing::mcap::File;
 use depthrig_recorder::{
-    ColorCodec, Compression, Diagnostic, Level, RecordFrame, RecordSet, Recorder, RecorderOptions, Session,
-    StreamAccount, StreamRecord,
+    ColorCodec, Compression, DepthCodec, Diagnostic, Level, RecordFrame, RecordSet, Recorder,
+    RecorderOptions, Session, StreamAccount, StreamRecord,
 };
+use image::ImageFormat;
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -111,7 +114,9 @@ fn main() {
     };
     let raw = RecorderOptions { color: ColorCodec::Raw, ..RecorderOptions::default() };
     let plain = RecorderOptions { compression: Compression::None, ..raw.clone() };
+    let lossless = RecorderOptions { color: ColorCodec::Png, depth: DepthCodec::Rank, ..raw.clone() };
     let kinds = [
+        ("seed_lossless", vec![PixelFormat::Rgb8, PixelFormat::Z16], lossless),
         ("seed_jpeg", vec![PixelFormat::Rgb8, PixelFormat::Z16], RecorderOptions::default()),
         ("seed_raw", vec![PixelFormat::Bgr8, PixelFormat::DepthF32, PixelFormat::Mono8], raw),
         ("seed_plain", vec![PixelFormat::Z16, PixelFormat::Nv12], plain),
@@ -127,5 +132,29 @@ fn main() {
         put("segment", &format!("{name}_cut"), &segment[..segment.len() * 2 / 3]);
         put("session", name, &fs.contents(&dir.join("session.toml")).unwrap());
         assert!(fs.read_dir(dir).unwrap().len() == 2);
+    }
+    for (name, shape) in [("seed_tight", [16, 12, 0]), ("seed_padded", [9, 5, 3])] {
+        // The head that `fuzzing::depth_codec` reads: what follows, width, height, padding.
+        let head = |kind: u8| vec![kind, shape[0], shape[1], shape[2]];
+        let [width, height, pad] = shape.map(u32::from);
+        let size = DepthShape { width, height, step: 2 * width + pad };
+        let pixels: Vec<u8> = (0..=size.bytes() / 2)
+            .flat_map(|i| (if i % 7 == 0 { 0 } else { 400 + 37 * (i % 11) as u16 }).to_le_bytes())
+            .take(size.bytes() as usize)
+            .collect();
+        let mut packed = Vec::new();
+        DepthEncoder::new().encode(&pixels, size, &mut packed).unwrap();
+        let body = zstd::bulk::decompress(&packed[4..], 1 << 16).unwrap();
+        put("depth_codec", &format!("{name}_packed"), &[head(0), packed.clone()].concat());
+        put("depth_codec", &format!("{name}_body"), &[head(1), packed[..4].to_vec(), body].concat());
+        put("depth_codec", &format!("{name}_pixels"), &[head(2), pixels].concat());
+    }
+    // The size, then the file, as `fuzzing::color_codec` reads it.
+    let color: Vec<u8> = (0..8 * 6 * 3).map(|i| (i * 5) as u8).collect();
+    let color = image::RgbImage::from_raw(8, 6, color).unwrap();
+    for (name, format) in [("seed_png", ImageFormat::Png), ("seed_jpeg", ImageFormat::Jpeg)] {
+        let mut file = Vec::new();
+        color.write_to(&mut Cursor::new(&mut file), format).unwrap();
+        put("color_codec", name, &[&[8, 6], &file[..]].concat());
     }
 }

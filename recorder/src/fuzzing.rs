@@ -70,27 +70,41 @@ pub fn session(bytes: &[u8]) -> bool {
     true
 }
 
-/// The depth codec: a shape from the first bytes, the packed picture in the rest; and the message of such a picture.
-/// Whether either was a picture.
+/// The depth codec. The first four bytes say what the rest is and the shape of the picture: a packed picture, the same
+/// before it is compressed (so that mutations reach what is in it), or pixels to be packed. The whole is read as the
+/// message of such a picture too. Whether there is a picture in the end.
 ///
 /// # Panics
-/// When a picture that was unpacked is another one after being packed and unpacked again.
+/// When a picture is another one after being packed and unpacked.
 pub fn depth_codec(bytes: &[u8]) -> bool {
-    let Some(([width, height, pad], data)) = bytes.split_first_chunk::<3>() else { return false };
-    let [width, height, pad] = [width, height, pad].map(|b| u32::from(*b));
-    let shape = DepthShape { width, height, step: 2 * width + pad % 8 };
-    let mut picture = Vec::new();
-    let good = DepthDecoder::new().decode(data, shape, &mut picture).is_ok();
-    if good {
-        let (mut packed, mut again) = (Vec::new(), Vec::new());
-        let same = DepthEncoder::new()
-            .encode(&picture, shape, &mut packed)
-            .and_then(|()| DepthDecoder::new().decode(&packed, shape, &mut again));
-        assert!(same.is_ok() && again == picture, "a picture changes by being packed");
+    let (mut encoder, mut decoder, mut picture) = (DepthEncoder::new(), DepthDecoder::new(), Vec::new());
+    let message = image::read_compressed_depth(bytes);
+    let message = message.and_then(|(shape, _, data)| decoder.decode(data, shape, &mut picture));
+    let Some((&[kind, width, height, pad], rest)) = bytes.split_first_chunk() else { return message.is_ok() };
+    let [width, height] = [width, height].map(u32::from);
+    let shape = DepthShape { width, height, step: 2 * width + u32::from(pad) % 8 };
+    let decoded = match (kind % 3, rest.split_first_chunk::<4>()) {
+        (0, _) => decoder.decode(rest, shape, &mut picture),
+        (1, Some((count, body))) => {
+            let Ok(packed) = zstd::bulk::compress(body, 1) else { return false };
+            decoder.decode(&[&count[..], &packed].concat(), shape, &mut picture)
+        }
+        _ if width * height == 0 => return message.is_ok(),
+        _ => {
+            picture.clear();
+            picture.extend(rest.iter().cycle().take(shape.bytes() as usize));
+            picture.resize(shape.bytes() as usize, 0);
+            Ok(())
+        }
+    };
+    if decoded.is_err() {
+        return message.is_ok();
     }
-    let read = image::read_compressed_depth(bytes);
-    let as_message = read.and_then(|(shape, _, data)| DepthDecoder::new().decode(data, shape, &mut picture));
-    good || as_message.is_ok()
+    let (mut packed, mut again) = (Vec::new(), Vec::new());
+    let done = encoder.encode(&picture, shape, &mut packed);
+    let done = done.and_then(|()| decoder.decode(&packed, shape, &mut again));
+    assert!(done.is_ok() && again == picture, "a picture changes by being packed: {done:?}");
+    true
 }
 
 /// A PNG or a JPEG of a colour stream, under a header of the size in the first two bytes; whether it was one.

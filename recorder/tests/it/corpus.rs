@@ -41,6 +41,16 @@ fn segments() {
 }
 
 #[test]
+fn depth_pictures() {
+    run("depth_codec", fuzzing::depth_codec, false);
+}
+
+#[test]
+fn color_pictures() {
+    run("color_codec", fuzzing::color_codec, false);
+}
+
+#[test]
 fn sessions() {
     run("session", fuzzing::session, false);
 }
