@@ -46,7 +46,7 @@ impl Default for SoakOptions {
             height: 720,
             rate_hz: 5.0,
             recorded_s: 600.0,
-            warm_up_s: 120.0,
+            warm_up_s: 180.0,
             backlog_bytes: 16 << 20,
             images: None,
             recorder: RecorderOptions::default(),
