@@ -11,12 +11,15 @@ READERS := tests/readers
 VENV := .venv
 # LeRobot brings PyTorch, so it has an environment of its own, and a Python of 3.12 or later if there is one.
 LEROBOT := .venv-lerobot
+# Other recorders to compare with; Debian's Python, because Debian's rosbag is for no other.
+PEERS := tests/peers
+PEERS_VENV := .venv-peers
 REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt
 
-.PHONY: help demo test lint bench clean setup-build setup-test
+.PHONY: help demo test test-long fuzz lint bench bench-peers clean setup-build setup-test setup-peers setup-fuzz
 
 help: ## show this list
-	@sed -nE 's/^([a-z-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-7s %s\n", $$1, $$2}'
+	@sed -nE 's/^([a-z-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 demo: setup-build ## the seven-camera rig with synthetic cameras: record, verify, replay, report
 	cargo build --release --package depthrig
@@ -24,6 +27,17 @@ demo: setup-build ## the seven-camera rig with synthetic cameras: record, verify
 
 test: setup-test $(VENV)/.stamp $(LEROBOT)/.stamp $(READERS)/node_modules/.stamp ## every test there is: Rust, Python, readers that are not ours
 	tools/test.sh
+
+test-long: ## the long forms: every test with DEPTHRIG_LONG=1, ten minutes of recording, an hour of fuzzing per target
+	DEPTHRIG_LONG=1 $(MAKE) test
+	cargo build --release --package depthrig
+	target/release/depthrig bench soak --check
+	$(MAKE) fuzz
+
+# How long for each target, and which: make fuzz FUZZ="600 segment"
+FUZZ ?= 3600
+fuzz: setup-fuzz ## an hour for each fuzz target, or FUZZ="SECONDS [TARGET...]"
+	tools/fuzz.sh $(FUZZ)
 
 lint: ## formatting and lints, as CI runs them
 	cargo fmt --all --check
@@ -35,15 +49,26 @@ bench: setup-build ## the numbers of docs/performance.md
 	target/release/depthrig bench bus
 	target/release/depthrig bench record
 
+bench-peers: setup-peers $(PEERS_VENV)/.stamp ## beside Python mcap, foxglove-sdk, rosbag and PNG files, in one run
+	cargo build --release --package depthrig-recorder --example bench_frames
+	$(PEERS_VENV)/bin/python $(PEERS)/compare.py --depthrig target/release/examples/bench_frames \
+	    --json target/bench-peers.json $(ARGS)
+
 clean: ## remove what was built
 	cargo clean
-	rm -rf $(VENV) $(LEROBOT) $(READERS)/node_modules
+	rm -rf $(VENV) $(LEROBOT) $(PEERS_VENV) $(READERS)/node_modules
 
 setup-build:
 	@tools/setup.sh build
 
 setup-test:
 	@tools/setup.sh build test
+
+setup-fuzz:
+	@tools/setup.sh build fuzz
+
+setup-peers:
+	@tools/setup.sh build peers
 
 $(VENV)/.stamp: $(REQUIREMENTS) python/pyproject.toml
 	python3 -m venv $(VENV)
@@ -54,6 +79,9 @@ $(LEROBOT)/.stamp: tests/python/requirements-lerobot.txt
 	for python in python3.12 $$HOME/.pyenv/versions/3.12*/bin/python python3; do \
 		"$$python" -c 'import venv' 2>/dev/null && break; done && "$$python" -m venv --clear $(LEROBOT)
 	$(LEROBOT)/bin/pip install --quiet --no-deps --no-compile --no-cache-dir --requirement $<
+$(PEERS_VENV)/.stamp: $(PEERS)/requirements.txt
+	/usr/bin/python3 -m venv --system-site-packages $(PEERS_VENV)
+	$(PEERS_VENV)/bin/pip install --quiet --requirement $(PEERS)/requirements.txt
 	touch $@
 
 $(READERS)/node_modules/.stamp: $(READERS)/package.json $(READERS)/package-lock.json

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Installs the Debian packages that building (`build`) and testing (`test`) need, when it may; else prints the one
-# line to run. Says nothing when everything is there.
+# Installs the Debian packages that building (`build`), testing (`test`), comparing with other recorders (`peers`) and
+# fuzzing (`fuzz`) need, when it may; else prints the one line to run. Says nothing when everything is there.
 set -euo pipefail
 
 missing=()
@@ -22,8 +22,19 @@ for part in "$@"; do
         need nodejs command -v node
         need npm command -v npm
         ;;
+    peers)
+        # Debian's own Python: its rosbag is for no other.
+        need python3 test -x /usr/bin/python3
+        need python3-venv /usr/bin/python3 -c 'import ensurepip, venv'
+        need python3-rosbag /usr/bin/python3 -c 'import importlib.util as u, sys; sys.exit(not u.find_spec("rosbag"))'
+        need python3-sensor-msgs /usr/bin/python3 -c 'import importlib.util as u, sys; sys.exit(not u.find_spec("sensor_msgs"))'
+        ;;
+    fuzz)
+        # libFuzzer is C++ and is built with the targets.
+        need g++ command -v c++
+        ;;
     *)
-        echo "usage: tools/setup.sh [build] [test]" >&2
+        echo "usage: tools/setup.sh [build] [test] [peers] [fuzz]" >&2
         exit 2
         ;;
     esac
