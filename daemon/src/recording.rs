@@ -36,11 +36,13 @@ pub struct Outside {
     pub fs: Arc<dyn fs::Fs>,
     /// What places a recording in UTC.
     pub utc: UtcSource,
+    /// Encoded bytes that may wait for the disk, unless the recorder's own limit is to hold.
+    pub backlog_max_bytes: Option<u64>,
 }
 
 impl Default for Outside {
     fn default() -> Self {
-        Self { fs: Arc::new(fs::RealFs), utc: Arc::new(UtcPair::sample) }
+        Self { fs: Arc::new(fs::RealFs), utc: Arc::new(UtcPair::sample), backlog_max_bytes: None }
     }
 }
 
@@ -116,7 +118,8 @@ impl Begun {
         session.host = rustix::system::uname().nodename().to_string_lossy().into_owned();
         session.rig_config.clone_from(&config.text);
         session.streams = streams.iter().map(record_of).collect();
-        let options = options_of(&config.recording);
+        let mut options = options_of(&config.recording);
+        options.backlog_max_bytes = outside.backlog_max_bytes.unwrap_or(options.backlog_max_bytes);
         let (fs, clock) = (Arc::clone(&outside.fs), Arc::clone(&outside.utc));
         let recorder = Recorder::create_with(fs, clock, &path, session, options).map_err(of_recorder)?;
         if !request.notes.is_empty() {
@@ -281,6 +284,8 @@ impl Active {
         status.dropped = progress.sets.dropped_by_reason().map(|(r, n)| (r.name().to_owned(), n)).collect();
         status.frames = progress.frames;
         status.bytes = progress.bytes;
+        status.encode_queue = progress.encode_queue as u64;
+        status.backlog_bytes = progress.backlog_bytes;
         status.segments = u64::from(progress.segments);
         status.error = progress.error.map(|e| e.to_string());
         status.disk_free_bytes = depthrig_bus::shm::free_bytes(Path::new(&status.path)).unwrap_or(0);
@@ -324,6 +329,7 @@ impl Finishing {
         self.active.refresh();
         let mut status = self.active.status;
         status.active = false;
+        (status.encode_queue, status.backlog_bytes) = (0, 0);
         match self.active.recorder.finish() {
             Ok(summary) => {
                 status.sets = summary.sets.recorded;

@@ -61,6 +61,8 @@ pub struct RigOptions {
     pub fs: Arc<dyn Fs>,
     /// What places recordings in UTC; tests step it.
     pub utc: UtcSource,
+    /// Encoded bytes that may wait for the disk before sets are refused; the recorder's own limit when `None`.
+    pub backlog_max_bytes: Option<u64>,
 }
 
 impl RigOptions {
@@ -73,6 +75,7 @@ impl RigOptions {
             progress: None,
             fs: Arc::new(RealFs),
             utc: Arc::new(UtcPair::sample),
+            backlog_max_bytes: None,
         }
     }
 }
@@ -161,7 +164,11 @@ impl Rig {
             started: HostTime::now(),
             recording: Mutex::default(),
             reports: Reports::default(),
-            outside: Outside { fs: Arc::clone(&options.fs), utc: Arc::clone(&options.utc) },
+            outside: Outside {
+                fs: Arc::clone(&options.fs),
+                utc: Arc::clone(&options.utc),
+                backlog_max_bytes: options.backlog_max_bytes,
+            },
             starting: Mutex::default(),
             spreads: Mutex::default(),
             set_accounts: Mutex::default(),

@@ -272,6 +272,10 @@ pub struct RecordingStatus {
     pub bytes: u64,
     /// Segments begun.
     pub segments: u64,
+    /// Sets that wait to be encoded.
+    pub encode_queue: u64,
+    /// Encoded bytes that wait for the disk.
+    pub backlog_bytes: u64,
     /// Why it ended early or lost something.
     pub error: Option<String>,
     /// Bytes free on its disk.

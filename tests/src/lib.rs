@@ -1,6 +1,7 @@
 //! Helpers for the tests that cross crates: rigs of cheap synthetic cameras in a private runtime folder.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // test support: a failure here is a failed test
 
+pub mod disk;
 pub mod made;
 
 use depthrig_bus::{HostTime, RuntimeDir};

@@ -1,0 +1,337 @@
+//! A rig whose disk fails: the recording ends or loses sets and says so; the live feed does not notice.
+//!
+//! Each test watches every stream with a subscriber of its own, before the fault and during it. No frame may be lost,
+//! and frames may not come much later than before. `DEPTHRIG_LONG=1` makes the faults last three times as long.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+use depthrig_bus::{Bus, HostTime, RigName, StreamId, UtcPair};
+use depthrig_daemon::control::RecordRequest;
+use depthrig_daemon::rig::{Rig, RigOptions};
+use depthrig_daemon::status::RecordingStatus;
+use depthrig_recorder::{Dataset, DatasetSet, SetRange, Severity, VerifyOptions, verify};
+use depthrig_tests::disk::{Disk, Tmpfs};
+use depthrig_tests::{Home, RigText, all_stream, assert_balanced, wait_until};
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+/// Encoded bytes that may wait for the disk in these tests.
+const BACKLOG: u64 = 1 << 20;
+const MIB: u64 = 1 << 20;
+/// How long each feed is watched before the fault.
+const BEFORE: Duration = Duration::from_millis(1500);
+
+/// One rig at a time: two would disturb each other's latencies.
+fn alone() -> MutexGuard<'static, ()> {
+    static ALONE: Mutex<()> = Mutex::new(());
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn long() -> u32 {
+    if std::env::var_os("DEPTHRIG_LONG").is_some() { 3 } else { 1 }
+}
+
+fn seconds(s: f64) -> Duration {
+    Duration::from_secs_f64(s * f64::from(long()))
+}
+
+/// Two cameras whose sets are stored unpacked enough to trouble a disk.
+fn text() -> String {
+    RigText::default().camera("left", "").camera("right", "").text().to_owned()
+        + "[sets]\nrate_hz = 15.0\n[recording]\ncolor = \"raw\"\nreserve_mb = 0\nqueue_sets = 4\n"
+}
+
+/// What a subscriber saw of all streams: how long after its capture each frame came, ns.
+#[derive(Default)]
+struct Seen {
+    late_ns: Vec<i64>,
+    missed: u64,
+    out_of_order: u64,
+}
+
+impl Seen {
+    fn quantile_ms(&self, quantile: f64) -> f64 {
+        let mut late = self.late_ns.clone();
+        assert!(late.len() > 50, "only {} frames came", late.len());
+        let at = ((late.len() - 1) as f64 * quantile) as usize;
+        *late.select_nth_unstable(at).1 as f64 / 1e6
+    }
+}
+
+/// Watches every stream until `stop`: what came while the rig warmed up, before the fault, and since.
+fn watch(home: &Home, phase: &AtomicUsize, stop: &AtomicBool) -> [Seen; 3] {
+    let bus = Bus::open(&home.runtime(), &RigName::new("test").unwrap()).unwrap();
+    let ids = ["left", "right"].iter().flat_map(|c| ["color", "depth"].map(|s| StreamId::new(c, s).unwrap()));
+    let mut subscribers: Vec<_> = ids.map(|id| (bus.subscriber(&id).unwrap(), None)).collect();
+    let mut seen = [Seen::default(), Seen::default(), Seen::default()];
+    while !stop.load(Ordering::SeqCst) {
+        let seen = &mut seen[phase.load(Ordering::SeqCst)];
+        for (subscriber, last) in &mut subscribers {
+            while let Some(frame) = subscriber.try_next().unwrap() {
+                let h = frame.header();
+                seen.late_ns.push(HostTime::now().ns() - h.capture_time_ns);
+                seen.out_of_order += u64::from(last.is_some_and(|l| h.sequence <= l));
+                *last = Some(h.sequence);
+            }
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    seen[2].missed = subscribers.iter().map(|(s, _)| s.missed()).sum();
+    seen
+}
+
+fn resident_bytes() -> u64 {
+    let pages = std::fs::read_to_string("/proc/self/statm").unwrap();
+    pages.split(' ').nth(1).unwrap().parse::<u64>().unwrap() * 4096
+}
+
+/// What a fault left.
+struct Left {
+    recording: RecordingStatus,
+    /// What `record stop` said.
+    stopped: depthrig_daemon::Result<RecordingStatus>,
+    /// The most that waited for the disk.
+    backlog_bytes: u64,
+    /// The most sets that waited for an encoder.
+    encode_queue: u64,
+    grown_bytes: u64,
+}
+
+/// Runs a rig that records into `data`, watches it, lets `fault` happen and looks for `length` at what comes of it.
+fn run(
+    home: &Home,
+    data: &Path,
+    change: impl FnOnce(&mut RigOptions),
+    fault: impl FnOnce(&Rig, &RecordingStatus),
+    length: Duration,
+) -> Left {
+    let rig = home
+        .start_with(&text(), |o| {
+            o.backlog_max_bytes = Some(BACKLOG);
+            change(o);
+        })
+        .unwrap();
+    wait_until(&rig, "streaming", all_stream);
+    let (phase, stop) = (AtomicUsize::new(0), AtomicBool::new(false));
+    let control = rig.control();
+    let (left, seen) = std::thread::scope(|s| {
+        let watcher = s.spawn(|| watch(home, &phase, &stop));
+        let request = RecordRequest { directory: Some(data.to_owned()), ..RecordRequest::default() };
+        let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+            let recording = control.record_start(&request).unwrap();
+            wait_until(&rig, "sets", |s| s.recording.as_ref().is_some_and(|r| r.sets >= 3));
+            phase.store(1, Ordering::SeqCst);
+            std::thread::sleep(BEFORE);
+            let before = resident_bytes();
+            fault(&rig, &recording);
+            phase.store(2, Ordering::SeqCst);
+            let end = HostTime::now().plus(length);
+            let (mut backlog_bytes, mut encode_queue, mut resident) = (0, 0, 0);
+            let mut recording = recording;
+            while !end.from_now().is_zero() {
+                std::thread::sleep(Duration::from_millis(20));
+                recording = control.status().recording.unwrap();
+                backlog_bytes = backlog_bytes.max(recording.backlog_bytes);
+                encode_queue = encode_queue.max(recording.encode_queue);
+                resident = resident.max(resident_bytes());
+            }
+            let stopped = control.record_stop();
+            let grown_bytes = resident.saturating_sub(before);
+            Left { recording, stopped, backlog_bytes, encode_queue, grown_bytes }
+        }));
+        stop.store(true, Ordering::SeqCst);
+        (result, watcher.join().unwrap())
+    });
+    let left = left.unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+    let again = control
+        .record_start(&RecordRequest { directory: Some(home.path("another")), ..RecordRequest::default() });
+    let disk_is_well = again.is_ok();
+    let summary = rig.stop();
+    unaffected(&summary.status, &seen);
+    assert!(left.grown_bytes < BACKLOG + 48 * MIB, "memory grew by {} MiB", left.grown_bytes / MIB);
+    assert!(left.encode_queue <= 4, "{} sets waited for an encoder", left.encode_queue);
+    // A set that was admitted below the limit may carry it over, and so may those in the encoders.
+    assert!(left.backlog_bytes < BACKLOG + 8 * 400_000, "{} bytes waited for the disk", left.backlog_bytes);
+    assert!(disk_is_well || left.recording.error.is_some(), "{again:?}");
+    left
+}
+
+/// The feed lost nothing and came as soon as before.
+fn unaffected(status: &depthrig_daemon::status::RigStatus, [_, before, during]: &[Seen; 3]) {
+    assert_balanced(status);
+    for s in status.cameras.iter().flat_map(|c| &c.streams) {
+        assert!(s.dropped.is_empty(), "{} lost frames: {:?}", s.id, s.dropped);
+        assert_eq!(s.in_sets.missed + s.in_sets.overflow, 0, "{}: {:?}", s.id, s.in_sets);
+    }
+    assert_eq!((during.missed, before.out_of_order, during.out_of_order), (0, 0, 0));
+    // Far apart from noise: a feed that waits for a stalled disk comes seconds late.
+    for (quantile, times, floor_ms) in [(0.5, 4.0, 5.0), (0.99, 10.0, 20.0)] {
+        let (b, d) = (before.quantile_ms(quantile), during.quantile_ms(quantile));
+        eprintln!("latency p{:.0}: {b:.2} ms before, {d:.2} ms during", quantile * 100.0);
+        assert!(
+            d < times * b.max(floor_ms),
+            "quantile {quantile}: {b:.2} ms before, {d:.2} ms during the fault"
+        );
+    }
+}
+
+/// Every set of the dataset, which must be whole as far as it goes: `lost` says whether it may say that it lost sets.
+fn sets_of(path: &str, lost: bool) -> Vec<DatasetSet> {
+    let report = verify(Path::new(path), &VerifyOptions { decode: true, max_spread_ns: None }).unwrap();
+    let bad = |f: &&depthrig_recorder::Finding| match f.severity {
+        Severity::Note => false,
+        Severity::Lost => !lost,
+        Severity::Broken => true,
+    };
+    let bad: Vec<_> = report.findings.iter().filter(bad).collect();
+    assert!(bad.is_empty(), "{bad:#?}");
+    Dataset::open(Path::new(path)).unwrap().sets(SetRange::ALL).map(Result::unwrap).collect()
+}
+
+#[test]
+fn a_disk_that_stalls_costs_counted_sets_and_nothing_else() {
+    let _alone = alone();
+    let home = Home::default();
+    let disk = Disk::default();
+    let fs = Arc::new(disk.clone());
+    let fault = |_: &Rig, _: &RecordingStatus| disk.stall(seconds(5.0));
+    let left = run(&home, &home.path("data"), |o| o.fs = fs, fault, seconds(5.0) + Duration::from_secs(2));
+    let stopped = left.stopped.unwrap();
+    let dropped = stopped.dropped.get("disk_slow").copied().unwrap_or(0);
+    assert!(dropped > 10, "five seconds are 75 sets and the backlog takes a few: {:?}", stopped.dropped);
+    assert!(left.backlog_bytes >= BACKLOG, "the backlog was never full");
+    assert!(stopped.error.as_ref().is_some_and(|e| e.contains("disk_slow")), "{:?}", stopped.error);
+    assert_eq!(stopped.dropped.keys().collect::<Vec<_>>(), ["disk_slow"]);
+    // It goes on after the stall: the last set is later than the stall's end.
+    let sets = sets_of(&stopped.path, true);
+    assert_eq!(sets.len() as u64, stopped.sets);
+    let gap = sets.windows(2).map(|w| w[1].tick.since_ns(w[0].tick)).max().unwrap();
+    assert!(gap > 1_000_000_000, "the refused sets are missing");
+    assert!(sets.last().unwrap().id > sets.len() as u64 + dropped / 2, "ids show what was refused");
+}
+
+#[test]
+fn a_disk_ten_times_too_slow_costs_counted_sets_and_nothing_else() {
+    let _alone = alone();
+    let home = Home::default();
+    let disk = Disk::default();
+    let fs = Arc::new(disk.clone());
+    let fault = |_: &Rig, recording: &RecordingStatus| {
+        let rate = disk.written() as f64 / (BEFORE.as_secs_f64() + 0.5);
+        assert!(rate > 100_000.0, "{} writes {rate} bytes a second", recording.path);
+        disk.slow_down((rate / 10.0) as u64);
+    };
+    let watch = |o: &mut RigOptions| o.fs = fs;
+    let left = run(&home, &home.path("data"), watch, fault, seconds(6.0));
+    let dropped = left.recording.dropped.get("disk_slow").copied().unwrap_or(0);
+    assert!(dropped > 10, "{:?}", left.recording.dropped);
+    disk.slow_down(0);
+    let stopped = left.stopped.unwrap();
+    let sets = sets_of(&stopped.path, true);
+    assert_eq!(sets.len() as u64, stopped.sets);
+    assert!(stopped.error.as_ref().is_some_and(|e| e.contains("disk_slow")), "{:?}", stopped.error);
+}
+
+#[test]
+fn a_full_disk_ends_the_recording_with_a_closed_file() {
+    let _alone = alone();
+    let home = Home::default();
+    let Some(small) = Tmpfs::mount(&home.path("small"), 24 * MIB) else { return };
+    let fault = |_: &Rig, _: &RecordingStatus| small.fill(200_000);
+    let left = run(&home, small.path(), |_| {}, fault, seconds(3.0));
+    assert!(left.recording.error.is_some(), "the status says so while the rig runs: {:?}", left.recording);
+    let stopped = left.stopped.unwrap();
+    assert!(stopped.dropped.contains_key("write_failed"), "{:?}", stopped.dropped);
+    assert!(stopped.error.as_ref().is_some_and(|e| e.contains("the disk is full")), "{:?}", stopped.error);
+    let sets = sets_of(&stopped.path, true);
+    assert_eq!(sets.len() as u64, stopped.sets, "what was recorded until then is there");
+    let names: Vec<_> = std::fs::read_dir(&stopped.path)
+        .unwrap()
+        .map(|e| e.unwrap().file_name().into_string().unwrap())
+        .collect();
+    assert!(!names.iter().any(|n| n.ends_with(".part")), "the last segment has its index: {names:?}");
+}
+
+#[test]
+fn a_disk_that_becomes_read_only_ends_the_recording() {
+    let _alone = alone();
+    let home = Home::default();
+    let disk = Disk::default();
+    let fs = Arc::new(disk.clone());
+    // As a kernel does it after an error of the medium: what is open fails as well. A remount by hand is refused then.
+    let fault = |_: &Rig, _: &RecordingStatus| disk.fail(std::io::ErrorKind::ReadOnlyFilesystem);
+    let left = run(&home, &home.path("data"), |o| o.fs = fs, fault, seconds(2.0));
+    assert!(left.recording.error.as_ref().is_some_and(|e| e.contains("read-only")), "{:?}", left.recording);
+    let stopped = left.stopped.unwrap();
+    assert!(stopped.dropped.contains_key("write_failed"), "{:?}", stopped.dropped);
+    // Nothing more could be written, an index least of all; what is there can be read.
+    let sets =
+        Dataset::open(Path::new(&stopped.path)).unwrap().sets(SetRange::ALL).filter_map(Result::ok).count();
+    assert!(sets as u64 >= stopped.sets && stopped.sets > 10, "{sets} of {} sets", stopped.sets);
+}
+
+#[test]
+fn a_read_only_disk_is_refused_at_the_start() {
+    let _alone = alone();
+    let home = Home::default();
+    let Some(small) = Tmpfs::mount(&home.path("small"), 8 * MIB) else { return };
+    small.make_read_only();
+    let rig = home.start(&text()).unwrap();
+    wait_until(&rig, "streaming", all_stream);
+    let request = RecordRequest { directory: Some(small.path().to_owned()), ..RecordRequest::default() };
+    let e = rig.control().record_start(&request).unwrap_err();
+    assert!(e.to_string().to_lowercase().contains("read-only"), "{e}");
+    assert!(e.to_string().contains("small"), "it names the folder: {e}");
+    let request = RecordRequest { directory: Some(home.path("data")), ..RecordRequest::default() };
+    rig.control().record_start(&request).unwrap();
+    wait_until(&rig, "sets", |s| s.recording.as_ref().is_some_and(|r| r.sets >= 3));
+    assert_eq!(rig.stop().lost, Vec::<String>::new());
+}
+
+#[test]
+fn a_folder_deleted_under_the_recorder_ends_the_recording() {
+    let _alone = alone();
+    let home = Home::default();
+    let fault = |_: &Rig, recording: &RecordingStatus| std::fs::remove_dir_all(&recording.path).unwrap();
+    let left = run(&home, &home.path("data"), |_| {}, fault, seconds(2.5));
+    let error = left.recording.error.as_deref().unwrap_or_default();
+    assert!(
+        error.contains("it does not exist"),
+        "the status says so while the rig runs: {:?}",
+        left.recording
+    );
+    let stopped = left.stopped.map_or_else(|e| e.to_string(), |s| s.error.unwrap_or_default());
+    assert!(!stopped.is_empty(), "`record stop` says so");
+    assert!(!Path::new(&left.recording.path).exists(), "it is not made anew behind the user's back");
+}
+
+#[test]
+fn a_step_of_the_wall_clock_moves_no_recorded_time() {
+    let _alone = alone();
+    let home = Home::default();
+    let step_ns = Arc::new(AtomicI64::new(0));
+    let theirs = Arc::clone(&step_ns);
+    let utc = Arc::new(move || {
+        let pair = UtcPair::sample();
+        UtcPair { utc_ns: pair.utc_ns + theirs.load(Ordering::SeqCst), ..pair }
+    });
+    let hour = 3_600_000_000_000;
+    let fault = |_: &Rig, _: &RecordingStatus| step_ns.store(hour, Ordering::SeqCst);
+    let left = run(&home, &home.path("data"), |o| o.utc = utc, fault, seconds(2.5));
+    let stopped = left.stopped.unwrap();
+    assert_eq!((stopped.error.clone(), stopped.dropped.len()), (None, 0));
+    let sets = sets_of(&stopped.path, false);
+    assert!(sets.len() > 30);
+    let offset = sets[0].utc_offset_ns;
+    for pair in sets.windows(2) {
+        assert_eq!(pair[1].utc_offset_ns, offset);
+        assert_eq!(pair[1].utc_ns - pair[0].utc_ns, pair[1].tick.since_ns(pair[0].tick), "a time jumped");
+    }
+    let now = UtcPair::sample().utc_ns;
+    assert!(
+        (0..60_000_000_000).contains(&(now - sets.last().unwrap().utc_ns)),
+        "placed by the first reading"
+    );
+    assert!(stopped.started_utc_ns < now);
+}
