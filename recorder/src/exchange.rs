@@ -8,6 +8,7 @@
 //!
 //! An [`Importer`] reads one layout and is driven by [`import`], which records a dataset and verifies it.
 
+mod bytecamera;
 mod export;
 mod folder;
 mod import;
@@ -15,8 +16,14 @@ pub mod lerobot;
 mod report;
 mod source;
 
+pub use bytecamera::{ByteCameraExport, ByteCameraImport, ByteCameraOptions, CameraNames};
 pub use export::{ExportOptions, ExportProgress, Exporter, PartOut, PartSets, Parts, Plan, export};
 pub use folder::{OutFile, Output};
 pub use import::{ImportFacts, ImportProgress, ImportReport, Importer, import};
 pub use report::{DatasetIdentity, ExportReport, PartRecord, REPORT_FILE, SegmentIdentity, StreamCount};
 pub use source::{PART_SETS, Part, Source};
+
+/// What the fuzz targets reach.
+pub(crate) mod fuzzing {
+    pub(crate) use super::bytecamera::fuzzing::{calibration, npy, row};
+}

@@ -1,8 +1,8 @@
 //! The commands and options, and what `--help` says of them.
 
 use crate::commands::{
-    bench, cat, compare, completions, config, demo, edit, export, info, man, merge, record, recover, replay,
-    report, run, sessions, status, tap, top, trim, verify,
+    bench, cat, compare, completions, config, demo, edit, export, import, info, man, merge, record, recover,
+    replay, report, run, sessions, status, tap, top, trim, verify,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -115,9 +115,12 @@ pub enum Command {
     /// Change scene, operator, notes or name of a dataset; what it said before stays in its history
     #[command(after_help = edit::EXAMPLES)]
     Edit(edit::EditArgs),
-    /// Write datasets in the layout of others: LeRobot
+    /// Write datasets in the layouts of others: ByteCameraDepth, LeRobot
     #[command(subcommand, after_help = export::EXAMPLES)]
     Export(export::ExportCommand),
+    /// Make a dataset of what others recorded
+    #[command(subcommand, after_help = import::EXAMPLES)]
+    Import(import::ImportCommand),
     /// Check that a dataset is whole
     #[command(after_help = verify::EXAMPLES)]
     Verify(verify::VerifyArgs),

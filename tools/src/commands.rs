@@ -8,6 +8,7 @@ pub mod config;
 pub mod demo;
 pub mod edit;
 pub mod export;
+pub mod import;
 pub mod info;
 pub mod man;
 pub mod merge;
@@ -46,6 +47,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Sessions(args) => sessions::run(&args, &context),
         Command::Edit(args) => edit::run(&args),
         Command::Export(command) => export::run(&command, &context),
+        Command::Import(command) => import::run(&command, &context),
         Command::Verify(args) => verify::run(&args, &context),
         Command::Cat(args) => cat::run(&args, &context),
         Command::Trim(args) => trim::run(&args, &context),

@@ -147,3 +147,15 @@ pub fn import(
     drop(Dataset::open_with(fs, out)?);
     Ok(ImportReport { format: importer.format().to_owned(), summary, facts, verified, ended })
 }
+
+/// The table `import` of a session: from where, and what was assumed.
+pub(super) fn table(format: &str, path: &Path, facts: &ImportFacts) -> toml::Value {
+    let mut table = toml::Table::new();
+    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    table.insert("format".to_owned(), format.to_owned().into());
+    table.insert("from".to_owned(), name.into());
+    table.insert("depthrig_version".to_owned(), env!("CARGO_PKG_VERSION").into());
+    let stated: Vec<toml::Value> = facts.stated.iter().cloned().map(Into::into).collect();
+    table.insert("stated".to_owned(), stated.into());
+    table.into()
+}

@@ -1,5 +1,7 @@
 //! The framework of exports: resumed, failed at each operation, refused, with an exporter that is as small as can be.
 
+mod bytecamera;
+
 use crate::support::*;
 use core::ops::ControlFlow;
 use depthrig_recorder::exchange::{

@@ -12,6 +12,7 @@ use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{Dataset, ErrorKind};
 use std::path::PathBuf;
 
+mod bytecameradepth;
 mod lerobot;
 
 /// Examples for `--help`.
@@ -24,12 +25,16 @@ Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage, 3 expor
 could not be.
 
 Examples:
+  depthrig export bytecameradepth data/20261121_1015_kitchen paper
   depthrig export lerobot data/20261121_1015_kitchen lerobot/kitchen
   depthrig export lerobot data/* lerobot/all --task \"put the cup on the shelf\"";
 
 /// The layouts.
 #[derive(Debug, clap::Subcommand)]
 pub enum ExportCommand {
+    /// The folders of the public ByteCameraDepth dataset, with times and calibration
+    #[command(after_help = bytecameradepth::EXAMPLES)]
+    Bytecameradepth(bytecameradepth::Args),
     /// LeRobot v3.0: each dataset is an episode, colour as JPEG or PNG, depth as TIFF
     #[command(after_help = lerobot::EXAMPLES)]
     Lerobot(lerobot::Args),
@@ -55,6 +60,10 @@ pub struct Common {
 /// Exports.
 pub fn run(command: &ExportCommand, context: &Context) -> Result<Exit> {
     match command {
+        ExportCommand::Bytecameradepth(args) => {
+            let (mut exporter, common) = args.exporter()?;
+            drive(&mut exporter, common, context)
+        }
         ExportCommand::Lerobot(args) => {
             let (mut exporter, common) = args.exporter();
             drive(&mut exporter, common, context)

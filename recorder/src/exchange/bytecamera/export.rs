@@ -1,0 +1,349 @@
+//! Datasets as ByteCameraDepth folders.
+
+use super::calibration::{Calibration, StreamFacts};
+use super::rows::{Row, head};
+use super::{CALIBRATION_FILE, FORMAT, FRAMES_FILE, names};
+use crate::dataset::{DatasetFrame, DatasetSet, PixelMode};
+use crate::exchange::{Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source};
+use crate::still::{StillFormat, encode, still, tight};
+use crate::{Error, ErrorKind, Result, Session};
+use depthrig_bus::{FrameHeader, PixelFormat};
+use serde_json::{Value, json};
+use std::borrow::Cow;
+use std::collections::BTreeSet;
+use time::OffsetDateTime;
+
+/// How cameras are spelled in the names of folders.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum CameraNames {
+    /// `camera_d455`, as the recorder of the dataset spells them today.
+    #[default]
+    Short,
+    /// `camera_realsense_455`, as the published dataset does.
+    Long,
+}
+
+/// The exporter.
+#[derive(Debug, Clone, Default)]
+pub struct ByteCameraExport {
+    names: CameraNames,
+    depth_unit_m: Option<f64>,
+    sessions: Vec<Layout>,
+}
+
+/// The folders of one session.
+#[derive(Debug, Clone)]
+struct Layout {
+    /// `YYYYMMDD_HHMM`.
+    folder: String,
+    /// By the index of the stream.
+    streams: Vec<StreamFacts>,
+}
+
+impl ByteCameraExport {
+    /// With depth PNGs in units of `depth_unit_m`, or as the cameras count when `None`.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] for a unit that is none.
+    pub fn new(names: CameraNames, depth_unit_m: Option<f64>) -> Result<Self> {
+        if let Some(unit) = depth_unit_m
+            && !(1e-6..=1.0).contains(&unit)
+        {
+            let what = format!("a depth unit of {unit} m makes no sense; write metres, such as 0.001");
+            return Err(Error::new(ErrorKind::BadInput, what));
+        }
+        Ok(Self { names, depth_unit_m, sessions: Vec::new() })
+    }
+
+    /// Folder and files of each stream, and what is lost with them.
+    fn layout(&self, session: &Session, taken: &mut BTreeSet<String>, losses: &mut Vec<String>) -> Layout {
+        let stem = folder_name(session);
+        let mut folder = stem.clone();
+        let mut n = 2;
+        while !taken.insert(folder.clone()) {
+            folder = format!("{stem}_{n}");
+            n += 1;
+        }
+        let mut cameras: Vec<(String, String)> = Vec::new();
+        let mut files = BTreeSet::new();
+        let mut streams = Vec::new();
+        for s in &session.streams {
+            let camera = s.id.camera.as_str();
+            let known = cameras.iter().find(|(name, _)| name == camera).map(|(_, folder)| folder.clone());
+            let of_camera = known.unwrap_or_else(|| {
+                let plain = names::of_model(&s.model, camera, self.names == CameraNames::Long);
+                let mut name = format!("camera_{plain}");
+                let mut n = 2;
+                while cameras.iter().any(|(_, folder)| *folder == name) {
+                    name = format!("camera_{plain}_{n}");
+                    n += 1;
+                }
+                cameras.push((camera.to_owned(), name.clone()));
+                name
+            });
+            let wanted = match s.format {
+                PixelFormat::Z16 => "depth",
+                PixelFormat::DepthF32 => "raw_depth",
+                PixelFormat::Mono8 | PixelFormat::Mono16 => "ir",
+                PixelFormat::Confidence8 => "confidence",
+                _ => "color",
+            };
+            // A second stream of the same kind keeps its own name.
+            let mut prefix = wanted.to_owned();
+            let mut n = 2;
+            let ending = StillFormat::of(s.format).extension();
+            while !files.insert((of_camera.clone(), prefix.clone())) {
+                let own = s.id.stream.as_str();
+                prefix = if prefix == wanted { own.to_owned() } else { format!("{own}_{n}") };
+                n += 1;
+            }
+            let mut stream = s.clone();
+            let (mut recorded_format, mut recorded_depth_unit_m) = (None, None);
+            if s.format == PixelFormat::Mjpeg {
+                stream.format = PixelFormat::Rgb8;
+                recorded_format = Some(s.format.name().to_owned());
+                losses.push(format!(
+                    "{}: the camera's JPEG becomes PNG; what JPEG lost was lost in the camera",
+                    s.id
+                ));
+            } else if matches!(s.format, PixelFormat::Rgb8 | PixelFormat::Bgr8) {
+                let what =
+                    "where it was recorded as JPEG, the PNG holds what JPEG left; nothing more is lost here";
+                losses.push(format!("{}: {what}", s.id));
+            } else if matches!(s.format, PixelFormat::Yuyv | PixelFormat::Uyvy | PixelFormat::Nv12) {
+                losses.push(format!(
+                    "{}: {} is written as NPY, because no PNG holds it",
+                    s.id,
+                    s.format.name()
+                ));
+            }
+            if let Some(unit) = self.rescaled(s.format, s.depth_unit_m) {
+                stream.depth_unit_m = unit;
+                recorded_depth_unit_m = Some(s.depth_unit_m);
+                losses.push(format!(
+                    "{}: depth is rounded from units of {} m to {unit} m, which moves a distance by up to {} m",
+                    s.id,
+                    s.depth_unit_m,
+                    unit / 2.0
+                ));
+            }
+            let (folder, ending) = (of_camera, ending.to_owned());
+            streams.push(StreamFacts {
+                folder,
+                prefix,
+                ending,
+                recorded_format,
+                recorded_depth_unit_m,
+                stream,
+            });
+        }
+        Layout { folder, streams }
+    }
+
+    /// The unit that depth of such a stream is rescaled to, if it is.
+    fn rescaled(&self, format: PixelFormat, unit_m: f64) -> Option<f64> {
+        let wanted = self.depth_unit_m?;
+        (format == PixelFormat::Z16 && unit_m > 0.0 && unit_m != wanted).then_some(wanted)
+    }
+
+    /// The file of a frame.
+    fn picture<'a>(&self, frame: &'a DatasetFrame, set: u64, out: &mut PartOut<'_>) -> Result<Cow<'a, [u8]>> {
+        let h = &frame.header;
+        let format = h.pixel_format().unwrap_or(PixelFormat::Mjpeg);
+        let Some(unit) = self.rescaled(format, h.depth_unit_m) else {
+            return still(frame, StillFormat::of(format));
+        };
+        let pixels = frame.decoded()?;
+        let (scaled, rounded, beyond) = rescale(&tight(h, &pixels, format), h.depth_unit_m / unit);
+        out.count("pixels of depth that were rounded", rounded);
+        out.count("pixels of depth beyond 65535 units, written as 0 (no depth)", beyond);
+        if beyond > 0 {
+            out.lose(format!(
+                "set {set}: {beyond} pixels of {}/{} are beyond 65535 units of {unit} m",
+                h.camera(),
+                h.stream()
+            ));
+        }
+        encode(h, format, &scaled, StillFormat::Png).map(Cow::Owned)
+    }
+
+    fn set(
+        &self,
+        layout: &Layout,
+        source: &Source,
+        n: u32,
+        set: &DatasetSet,
+        out: &mut PartOut<'_>,
+    ) -> Result<()> {
+        for (stream, facts) in layout.streams.iter().enumerate() {
+            let mut row = Row {
+                n,
+                set: set.id,
+                tick_ns: set.tick.ns(),
+                set_utc_ns: set.utc_ns,
+                utc_offset_ns: set.utc_offset_ns,
+                spread_ns: set.spread_ns,
+                stream: facts.stream.id.to_string(),
+                file: String::new(),
+                header: FrameHeader::default(),
+            };
+            if let Some(frame) = set.frames.iter().find(|f| f.stream == stream) {
+                match self.picture(frame, set.id, out) {
+                    Ok(file) => {
+                        row.file = format!("{}/{}_{n}.{}", facts.folder, facts.prefix, facts.ending);
+                        row.header = frame.header;
+                        if facts.recorded_depth_unit_m.is_some() {
+                            row.header.depth_unit_m = facts.stream.depth_unit_m;
+                        }
+                        let recorded = &source.session().streams[stream];
+                        let h = &frame.header;
+                        let differs = h.intrinsics != recorded.intrinsics || h.pose != recorded.pose;
+                        out.count(
+                            "frames whose own calibration is not the session's and is left out",
+                            differs.into(),
+                        );
+                        out.file(&format!("{}/{}", layout.folder, row.file), &file)?;
+                        out.frame(stream);
+                    }
+                    Err(e) => out.lose(format!("set {}: {e}", set.id)),
+                }
+            }
+            out.rows().extend_from_slice(row.text().as_bytes());
+        }
+        Ok(())
+    }
+}
+
+/// Depth in other units: the pixels, how many were rounded, and how many do not fit.
+fn rescale(pixels: &[u8], factor: f64) -> (Vec<u8>, u64, u64) {
+    let (mut rounded, mut beyond) = (0, 0);
+    let mut out = Vec::with_capacity(pixels.len());
+    for raw in pixels.as_chunks().0 {
+        let exact = f64::from(u16::from_le_bytes(*raw)) * factor;
+        let nearest = exact.round();
+        let fits = nearest <= f64::from(u16::MAX);
+        // Products such as 3 * 0.1 are not what they stand for; a billionth is no loss.
+        rounded += u64::from(fits && (nearest - exact).abs() > 1e-9 * exact.max(1.0));
+        beyond += u64::from(!fits);
+        out.extend((if fits { nearest as u16 } else { 0 }).to_le_bytes());
+    }
+    (out, rounded, beyond)
+}
+
+/// `YYYYMMDD_HHMM`: as the session is called, else when it began in UTC.
+fn folder_name(session: &Session) -> String {
+    let begin: Vec<char> = session.name.chars().take(14).collect();
+    let digit = |i: usize| begin.get(i).is_some_and(char::is_ascii_digit);
+    let named = (0..8).chain(9..13).all(digit)
+        && begin[8] == '_'
+        && begin.get(13).is_none_or(|c| !c.is_ascii_digit());
+    if named {
+        return begin[..13].iter().collect();
+    }
+    let t = OffsetDateTime::from_unix_timestamp_nanos(i128::from(session.started_utc_ns));
+    let t = t.unwrap_or(OffsetDateTime::UNIX_EPOCH);
+    format!("{:04}{:02}{:02}_{:02}{:02}", t.year(), u8::from(t.month()), t.day(), t.hour(), t.minute())
+}
+
+impl Exporter for ByteCameraExport {
+    fn format(&self) -> &'static str {
+        FORMAT
+    }
+
+    fn options(&self) -> Value {
+        let names = if self.names == CameraNames::Long { "long" } else { "short" };
+        json!({ "names": names, "depth_unit_m": self.depth_unit_m })
+    }
+
+    fn plan(&mut self, sources: &[Source]) -> Result<Plan> {
+        let mut plan = Plan::by_segment(sources);
+        let mut taken = BTreeSet::new();
+        plan.losses.push(
+            "depth and colour of a camera are as they were captured; the published dataset has depth aligned to colour"
+                .to_owned(),
+        );
+        self.sessions.clear();
+        for source in sources {
+            if source.times().len() as u64 > u64::from(u32::MAX) {
+                return Err(Error::new(
+                    ErrorKind::BadInput,
+                    "the dataset has more sets than files can be numbered",
+                ));
+            }
+            let layout = self.layout(source.session(), &mut taken, &mut plan.losses);
+            let folders: BTreeSet<_> = layout.streams.iter().map(|s| &s.folder).collect();
+            plan.folders.push(layout.folder.clone());
+            plan.folders.extend(folders.into_iter().map(|f| format!("{}/{f}", layout.folder)));
+            self.sessions.push(layout);
+        }
+        Ok(plan)
+    }
+
+    fn part(
+        &self,
+        source: &Source,
+        part: &Part,
+        sets: &mut PartSets<'_>,
+        out: &mut PartOut<'_>,
+    ) -> Result<()> {
+        let layout = &self.sessions[part.source];
+        while let Some((number, set)) = sets.next(PixelMode::Stored, out)? {
+            self.set(layout, source, number as u32, &set, out)?;
+        }
+        Ok(())
+    }
+
+    fn finish(&self, sources: &[Source], parts: &Parts<'_>, out: &Output<'_>) -> Result<()> {
+        for (i, (layout, source)) in self.sessions.iter().zip(sources).enumerate() {
+            let calibration = Calibration::new(source.session(), layout.streams.clone());
+            out.file(&format!("{}/{CALIBRATION_FILE}", layout.folder), &calibration.text()?)?;
+            let mut list = out.create(&format!("{}/{FRAMES_FILE}", layout.folder))?;
+            list.append(head().as_bytes())?;
+            for rows in parts.rows(i) {
+                list.append(&rows?)?;
+            }
+            list.finish()?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn rescaled_depth_is_the_nearest_or_none(values: Vec<u16>, tenths in 1u32..40) {
+            let pixels: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+            let factor = f64::from(tenths) / 10.0;
+            let (out, rounded, beyond) = rescale(&pixels, factor);
+            let (mut r, mut b) = (0, 0);
+            for (v, o) in values.iter().zip(out.chunks(2)) {
+                // Exactly, in tenths.
+                let exact = u32::from(*v) * tenths;
+                let o = u32::from(u16::from_le_bytes([o[0], o[1]]));
+                if (exact + 5) / 10 > 65535 {
+                    b += 1;
+                    prop_assert_eq!(o, 0);
+                } else {
+                    r += u64::from(exact % 10 != 0);
+                    prop_assert!((10 * o).abs_diff(exact) <= 5);
+                }
+            }
+            prop_assert_eq!((rounded, beyond), (r, b));
+        }
+    }
+
+    #[test]
+    fn folders_are_called_as_sessions_are() {
+        let mut session = Session::new("20260314_1512_kitchen", "rig");
+        session.started_utc_ns = 1_700_000_000_000_000_000;
+        assert_eq!(folder_name(&session), "20260314_1512");
+        for other in ["20260314_15123", "kitchen", "", "20260314-1512", "2026031é_1512"] {
+            session.name = other.into();
+            assert_eq!(folder_name(&session), "20231114_2213", "{other}");
+        }
+    }
+}

@@ -1,0 +1,140 @@
+//! `depthrig import`: what others recorded as a dataset.
+
+use crate::context::Context;
+use crate::exit::{Exit, UsageError};
+use crate::out;
+use crate::progress::Progress;
+use crate::signals::Stop;
+use anyhow::Result;
+use clap::ValueEnum;
+use core::ops::ControlFlow;
+use depthrig_recorder::exchange::{ByteCameraImport, ByteCameraOptions, ImportReport, Importer, import};
+use depthrig_recorder::fs::{Fs, RealFs};
+use depthrig_recorder::{ColorCodec, RecorderOptions};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+OUT is a new dataset, verified at the end. What was assumed or inferred is told, and is in the table [import] of its
+session.toml; docs/exchange.md describes each layout.
+
+Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage or input, 3 imported, but some of the input
+could not be.
+
+Examples:
+  depthrig import bytecameradepth recorded_data/20250314_1512 data/20250314_1512_kitchen
+  depthrig import bytecameradepth recorded_data/20250314_1512 data/kitchen --depth-unit d405=0.0001 --rate 5";
+
+/// The layouts.
+#[derive(Debug, clap::Subcommand)]
+pub enum ImportCommand {
+    /// A session of the public ByteCameraDepth dataset, or one that depthrig exported
+    #[command(after_help = EXAMPLES)]
+    Bytecameradepth(ByteCameraArgs),
+}
+
+/// What every import has.
+#[derive(Debug, clap::Args)]
+struct Common {
+    /// What is imported
+    input: PathBuf,
+    /// The new dataset's folder
+    out: PathBuf,
+    /// How colour is stored: every bit, or as JPEG of quality 95
+    #[arg(long, value_enum, default_value = "raw")]
+    color: Color,
+    /// Print the report as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Color {
+    /// Every bit
+    Raw,
+    /// A tenth of the size, with JPEG's loss
+    Jpeg,
+}
+
+/// Arguments of `import bytecameradepth`.
+#[derive(Debug, clap::Args)]
+pub struct ByteCameraArgs {
+    #[command(flatten)]
+    common: Common,
+    /// Metres per unit of depth, of all cameras or of one; may be given several times
+    #[arg(long = "depth-unit", value_name = "[CAM=]METRES", value_parser = depth_unit)]
+    depth_units: Vec<(Option<String>, f64)>,
+    /// Sets in a second, where there is no frames.csv [default: 5]
+    #[arg(long, value_name = "HZ")]
+    rate: Option<f64>,
+}
+
+fn depth_unit(text: &str) -> Result<(Option<String>, f64), String> {
+    let (camera, unit) = text.rsplit_once('=').map_or((None, text), |(c, u)| (Some(c.to_owned()), u));
+    let unit: f64 = unit.parse().map_err(|_| "write metres, such as 0.001 or d405=0.0001".to_owned())?;
+    Ok((camera, unit))
+}
+
+/// Imports.
+pub fn run(command: &ImportCommand, context: &Context) -> Result<Exit> {
+    let fs: Arc<dyn Fs> = Arc::new(RealFs);
+    match command {
+        ImportCommand::Bytecameradepth(args) => {
+            let mut options = ByteCameraOptions { rate_hz: args.rate, ..ByteCameraOptions::default() };
+            options.name = name_of(&args.common.out);
+            for (camera, unit) in &args.depth_units {
+                match camera {
+                    Some(camera) => drop(options.camera_depth_unit_m.insert(camera.clone(), *unit)),
+                    None => options.depth_unit_m = Some(*unit),
+                }
+            }
+            let importer = ByteCameraImport::open(Arc::clone(&fs), &args.common.input, options);
+            drive(&mut importer.map_err(super::export::usage)?, fs, &args.common, context)
+        }
+    }
+}
+
+fn name_of(out: &Path) -> String {
+    out.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// Runs an importer, shows how far it is, and tells what it made.
+fn drive(importer: &mut dyn Importer, fs: Arc<dyn Fs>, common: &Common, context: &Context) -> Result<Exit> {
+    if name_of(&common.out).is_empty() {
+        return Err(UsageError(format!("{} is no name of a dataset", common.out.display())).into());
+    }
+    let color = match common.color {
+        Color::Raw => ColorCodec::Raw,
+        Color::Jpeg => ColorCodec::Jpeg,
+    };
+    let options = RecorderOptions { color, ..RecorderOptions::default() };
+    let stop = Stop::on_signals()?;
+    let mut bar = Progress::new(context.global.quiet > 0);
+    let report = import(importer, fs, &common.out, options, &mut |p| {
+        bar.set("import", p.done, p.total);
+        if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    })
+    .map_err(super::export::usage)?;
+    bar.clear();
+    if common.json {
+        out::json(&report)?;
+    } else if context.global.quiet == 0 {
+        for stated in &report.facts.stated {
+            out::line(format_args!("note: {stated}"))?;
+        }
+        out::line(super::verify::summary(&report.verified))?;
+    }
+    for lost in report.facts.problems.iter().chain(&report.summary.lost) {
+        eprintln!("lost: {lost}");
+    }
+    Ok(exit(&report))
+}
+
+fn exit(report: &ImportReport) -> Exit {
+    match super::verify::exit(&report.verified) {
+        _ if report.ended => Exit::Failed,
+        Exit::Good if report.facts.lost > 0 || !report.summary.complete => Exit::Lost,
+        verified => verified,
+    }
+}
