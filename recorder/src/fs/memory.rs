@@ -221,11 +221,10 @@ impl MemFs {
         state.nodes.get(state.names.get(path)?).map(|n| n.data.clone())
     }
 
-    /// How many bytes of the file at `path` a crash leaves for sure; 0 when its name is not durable.
+    /// How many bytes are durable of the file whose durable name is `path`; 0 when there is none.
     pub fn synced(&self, path: &Path) -> usize {
         let state = self.state();
-        let file = state.names.get(path).filter(|file| state.durable.get(path) == Some(file));
-        file.and_then(|file| state.nodes.get(file)).map_or(0, |n| n.synced)
+        state.durable.get(path).and_then(|file| state.nodes.get(file)).map_or(0, |n| n.synced)
     }
 
     /// Puts a file there, as durable.

@@ -6,6 +6,7 @@ mod catalog;
 mod codecs;
 mod compare;
 mod corpus;
+mod crash;
 mod edit;
 mod exchange;
 mod failures;
