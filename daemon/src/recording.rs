@@ -117,6 +117,7 @@ impl Begun {
         session.started_utc_ns = utc.utc_ns;
         session.host = rustix::system::uname().nodename().to_string_lossy().into_owned();
         session.rig_config.clone_from(&config.text);
+        session.max_spread_ns = max_spread_ns(streams.iter().map(|s| s.stream.profile.rate_hz));
         session.streams = streams.iter().map(record_of).collect();
         let mut options = options_of(&config.recording);
         options.backlog_max_bytes = outside.backlog_max_bytes.unwrap_or(options.backlog_max_bytes);
@@ -401,6 +402,15 @@ fn record_of(s: &StreamFacts) -> StreamRecord {
     }
 }
 
+/// How far apart the frames of one set may be: each lies within half of its stream's period and a millisecond of the
+/// tick (see `sets`), on either side. `None` when a stream does not say how fast it is.
+fn max_spread_ns(rates_hz: impl Iterator<Item = f64>) -> Option<i64> {
+    let reach = |hz: f64| (hz > 0.0).then(|| (0.5e9 / hz).ceil() as i64 + 1_000_000);
+    let mut reaches = rates_hz.map(reach).collect::<Option<Vec<_>>>()?;
+    reaches.sort_unstable();
+    Some(reaches.iter().rev().take(2).sum())
+}
+
 fn options_of(config: &RecordingConfig) -> RecorderOptions {
     let mut options = RecorderOptions {
         jpeg_quality: config.jpeg_quality,
@@ -416,4 +426,16 @@ fn options_of(config: &RecordingConfig) -> RecorderOptions {
         options.workers = config.workers;
     }
     options
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_limit_of_the_spread_is_what_the_two_slowest_streams_allow() {
+        // Half of 40 ms and half of 100 ms, and a millisecond for each.
+        assert_eq!(max_spread_ns([25.0, 10.0, 30.0].into_iter()), Some(72_000_000));
+        assert_eq!(max_spread_ns([30.0, 0.0].into_iter()), None);
+    }
 }

@@ -16,7 +16,7 @@ pub(crate) use decode::{check_stored, color_decodes, jpeg_pixels};
 pub use index::SetReader;
 pub use info::{DatasetInfo, SpreadStats, StreamInfo};
 pub use sets::{DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};
-pub(crate) use sets::{Kind, kinds};
+pub(crate) use sets::{Kind, kind_of, kinds};
 
 /// A dataset opened for reading: a folder, or one segment of one.
 #[derive(Debug, Clone)]

@@ -65,4 +65,6 @@ pub use session::{
 };
 pub use slice::{Derived, SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, still};
-pub use verify::{Finding, Severity, VerifyOptions, VerifyReport, verify, verify_with};
+pub use verify::{
+    Finding, Severity, VerifyOptions, VerifyProgress, VerifyReport, verify, verify_watched, verify_with,
+};

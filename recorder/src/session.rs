@@ -45,6 +45,10 @@ pub struct Session {
     /// The rig's configuration, TOML text.
     #[serde(default)]
     pub rig_config: String,
+    /// The frames of one set should not be further apart than this, nanoseconds: twice what the rig's set window
+    /// allows. Without it `verify` judges no spread unless it is told a limit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max_spread_ns: Option<i64>,
     /// How it ended; absent while it runs and when it was cut off.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub outcome: Option<Outcome>,
@@ -201,6 +205,7 @@ impl Session {
             depthrig_version: env!("CARGO_PKG_VERSION").to_owned(),
             host: rustix::system::uname().nodename().to_string_lossy().into_owned(),
             rig_config: String::new(),
+            max_spread_ns: None,
             outcome: None,
             notes: Vec::new(),
             history: Vec::new(),

@@ -1,26 +1,84 @@
 //! Proves that a dataset is whole, or says where it is not.
 //!
-//! Checked are: checksums of chunks, data, summary and attachments; the index against the data; that every
-//! set has what its commit mark lists and that the mark lists or excuses every stream; order and times; the
-//! accounts; that segments follow each other; calibration; and on request that every picture decodes.
+//! Checked are: the checksums of data, summary, chunks and attachments; the index against the data, record by
+//! record; that every set has what its commit mark lists, of the length and with the checksum that it lists, and
+//! that the mark lists or excuses every stream; order, times and spreads; the accounts, of sets, of streams and in
+//! the header of each frame; that segments follow each other; calibration; and on request that every picture
+//! decodes.
+//!
+//! Without that request a picture is unpacked only where nothing else proves its bytes, see `segment`.
 
 use crate::dataset::segments_in;
 use crate::fs::{Fs, RealFs};
 use crate::{Dataset, ErrorKind, Result, SESSION_FILE, Session};
 use serde::Serialize;
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+mod index;
+mod pictures;
+mod records;
 mod segment;
-use segment::Walk;
+mod sets;
+
+use sets::Walk;
+
+/// Findings beyond these are counted and not kept: a file of noise must not fill the memory.
+const FINDINGS_MAX: usize = 10_000;
+/// Bytes between two reports of progress.
+const REPORT_BYTES: u64 = 4 << 20;
 
 /// What to check beyond the usual.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct VerifyOptions {
     /// Decode every picture as well.
     pub decode: bool,
-    /// Report sets whose frames are further apart than this, nanoseconds.
+    /// Report sets whose frames are further apart than this, nanoseconds, whatever the session says.
     pub max_spread_ns: Option<i64>,
+    /// Threads that unpack and decode pictures; 0: as many as there are cores.
+    pub threads: usize,
+}
+
+impl VerifyOptions {
+    fn threads(&self) -> usize {
+        match self.threads {
+            0 => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
+            n => n,
+        }
+    }
+}
+
+/// How far a verification is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct VerifyProgress {
+    /// Bytes that were read.
+    pub bytes: u64,
+    /// Bytes of all segments.
+    pub total_bytes: u64,
+}
+
+/// Tells somebody how far it is, and hears whether to go on.
+struct Watch<'a> {
+    tell: &'a mut dyn FnMut(VerifyProgress) -> ControlFlow<()>,
+    done: u64,
+    told: u64,
+    total: u64,
+    stopped: bool,
+}
+
+impl Watch<'_> {
+    /// Whether to stop, after `bytes` more.
+    fn advance(&mut self, bytes: u64) -> bool {
+        self.done += bytes;
+        if self.done.saturating_sub(self.told) >= REPORT_BYTES {
+            self.told = self.done;
+            let progress = VerifyProgress { bytes: self.done.min(self.total), total_bytes: self.total };
+            self.stopped |= (self.tell)(progress).is_break();
+        }
+        self.stopped
+    }
 }
 
 /// How bad a finding is.
@@ -66,6 +124,8 @@ pub struct VerifyReport {
     pub segments: u32,
     /// Whether the pictures were decoded.
     pub decoded: bool,
+    /// Whether it was stopped before the end; the rest was not looked at.
+    pub stopped: bool,
 }
 
 impl VerifyReport {
@@ -94,29 +154,53 @@ pub fn verify(path: &Path, options: &VerifyOptions) -> Result<VerifyReport> {
 /// # Errors
 /// As [`verify`].
 pub fn verify_with(fs: &Arc<dyn Fs>, path: &Path, options: &VerifyOptions) -> Result<VerifyReport> {
+    verify_watched(fs, path, options, &mut |_| ControlFlow::Continue(()))
+}
+
+/// The same while telling how far it is, and as long as `tell` says so.
+///
+/// # Errors
+/// As [`verify`].
+pub fn verify_watched(
+    fs: &Arc<dyn Fs>,
+    path: &Path,
+    options: &VerifyOptions,
+    tell: &mut dyn FnMut(VerifyProgress) -> ControlFlow<()>,
+) -> Result<VerifyReport> {
     let mut findings = Findings::default();
     let (session, segments, outcome) = open(fs, path, &mut findings)?;
     check_session(&session, &mut findings);
     check_names(&segments, path, &mut findings);
+    let sizes = segments.iter().filter_map(|s| fs.open(s).and_then(|f| f.size()).ok());
+    let mut watch = Watch { tell, done: 0, told: 0, total: sizes.sum(), stopped: false };
     let mut walk = Walk::new(&session, *options);
-    for segment in &segments {
-        walk.segment(&**fs, segment, &mut findings);
+    for path in &segments {
+        segment::segment(&mut walk, &**fs, path, &mut findings, &mut watch);
+        if watch.stopped {
+            break;
+        }
     }
-    walk.finish(outcome.then_some(&session), &mut findings);
-    findings.0.sort_by_key(|f| std::cmp::Reverse(f.severity));
+    let stopped = watch.stopped;
+    walk.finish(outcome.then_some(&session).filter(|_| !stopped), &mut findings);
     Ok(VerifyReport {
         path: path.to_owned(),
-        findings: findings.0,
+        findings: findings.sorted(),
         sets: walk.sets,
         frames: walk.frames,
         bytes: walk.bytes,
         segments: segments.len() as u32,
         decoded: options.decode,
+        stopped,
     })
 }
 
 #[derive(Default)]
-struct Findings(Vec<Finding>);
+struct Findings {
+    kept: Vec<Finding>,
+    /// Those beyond [`FINDINGS_MAX`], and the worst of them.
+    more: u64,
+    worst: Option<Severity>,
+}
 
 impl Findings {
     fn add(&mut self, severity: Severity, file: &str, offset: Option<u64>, message: impl Into<String>) {
@@ -124,7 +208,32 @@ impl Findings {
         if severity == Severity::Broken {
             tracing::debug!(file, "{message}");
         }
-        self.0.push(Finding { severity, file: file.to_owned(), offset, message });
+        self.push(Finding { severity, file: file.to_owned(), offset, message });
+    }
+
+    fn push(&mut self, finding: Finding) {
+        if self.kept.len() < FINDINGS_MAX {
+            self.kept.push(finding);
+        } else {
+            self.more += 1;
+            self.worst = self.worst.max(Some(finding.severity));
+        }
+    }
+
+    fn append(&mut self, other: Self) {
+        other.kept.into_iter().for_each(|f| self.push(f));
+        self.more += other.more;
+        self.worst = self.worst.max(other.worst);
+    }
+
+    /// All of them, worst first; what was found first stays first.
+    fn sorted(mut self) -> Vec<Finding> {
+        if let Some(severity) = self.worst {
+            let message = format!("{} more findings are not listed", self.more);
+            self.kept.push(Finding { severity, file: "all".to_owned(), offset: None, message });
+        }
+        self.kept.sort_by_key(|f| std::cmp::Reverse(f.severity));
+        self.kept
     }
 }
 

@@ -286,7 +286,7 @@ fn a_recorded_replay_is_the_dataset_that_was_replayed() {
         fields.sort_unstable();
         fields.dedup();
         assert_eq!(fields, ["captured", "flags", "id", "sequence", "set_id"], "{name}");
-        let report = verify(&again, &VerifyOptions { decode: true, max_spread_ns: None }).unwrap();
+        let report = verify(&again, &VerifyOptions { decode: true, ..VerifyOptions::default() }).unwrap();
         let bad: Vec<_> = report.findings.iter().filter(|f| f.severity != Severity::Note).collect();
         assert!(bad.is_empty(), "{name}: {bad:#?}");
         assert_eq!(b.session().rig_config, a.session().rig_config);

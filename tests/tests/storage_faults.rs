@@ -178,7 +178,8 @@ fn unaffected(status: &depthrig_daemon::status::RigStatus, [_, before, during]: 
 
 /// Every set of the dataset, which must be whole as far as it goes: `lost` says whether it may say that it lost sets.
 fn sets_of(path: &str, lost: bool) -> Vec<DatasetSet> {
-    let report = verify(Path::new(path), &VerifyOptions { decode: true, max_spread_ns: None }).unwrap();
+    let report =
+        verify(Path::new(path), &VerifyOptions { decode: true, ..VerifyOptions::default() }).unwrap();
     let bad = |f: &&depthrig_recorder::Finding| match f.severity {
         Severity::Note => false,
         Severity::Lost => !lost,

@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// No record that we write comes near; a longer one is a damaged length.
-const RECORD_MAX: u64 = 1 << 30;
+pub(crate) const RECORD_MAX: u64 = 1 << 30;
 /// Opcode and length.
 pub(crate) const HEAD: u64 = 9;
 /// Footer record and magic.
@@ -175,6 +175,11 @@ impl SegmentReader {
     /// Fills `buf` with bytes of the file, and uses its memory again.
     pub(crate) fn read_into(&self, buf: &mut Vec<u8>, offset: u64, len: u64) -> Result<()> {
         buf.resize(len as usize, 0);
+        self.file.read_exact_at(buf, offset).map_err(|e| Error::io("read", &self.path, e))
+    }
+
+    /// Fills `buf` with the bytes of the file from `offset`.
+    pub(crate) fn read_at(&self, buf: &mut [u8], offset: u64) -> Result<()> {
         self.file.read_exact_at(buf, offset).map_err(|e| Error::io("read", &self.path, e))
     }
 

@@ -1,7 +1,7 @@
 //! The sets of a dataset one after the other.
 
 use super::{Dataset, decode};
-use crate::container::scan::{ChunkEntry, SegmentReader};
+use crate::container::scan::{ChannelInfo, ChunkEntry, SegmentReader};
 use crate::encode::Codec;
 use crate::msgs::frame_info;
 use crate::msgs::frame_set::FrameSetMsg;
@@ -318,17 +318,18 @@ fn assemble(
 
 /// What the channels of a segment carry, by type and by the `stream` in their metadata.
 pub(crate) fn kinds(reader: &SegmentReader) -> BTreeMap<u16, Kind> {
-    let mut kinds = BTreeMap::new();
-    for (id, channel) in &reader.channels {
-        let stream = channel.metadata.get("stream").and_then(|s| s.parse().ok());
-        let is = |s: Schema| channel.schema == s.name();
-        let kind = match stream {
-            Some(stream) if Schema::PICTURES.into_iter().any(is) => Kind::Picture(stream),
-            Some(stream) if is(Schema::FrameInfo) => Kind::Info(stream),
-            _ if is(Schema::FrameSet) => Kind::Set,
-            _ => continue,
-        };
-        kinds.insert(*id, kind);
+    reader.channels.iter().filter_map(|(id, channel)| Some((*id, kind_of(channel)?))).collect()
+}
+
+/// What a channel carries, of what sets are made of.
+pub(crate) fn kind_of(channel: &ChannelInfo) -> Option<Kind> {
+    let is = |s: Schema| channel.schema == s.name();
+    if is(Schema::FrameSet) {
+        return Some(Kind::Set);
     }
-    kinds
+    let stream = channel.metadata.get("stream").and_then(|s| s.parse().ok())?;
+    if is(Schema::FrameInfo) {
+        return Some(Kind::Info(stream));
+    }
+    Schema::PICTURES.into_iter().any(is).then_some(Kind::Picture(stream))
 }

@@ -1,440 +1,418 @@
-//! One pass over a segment's records, carrying along what spans segments.
+//! One pass over a segment's records.
+//!
+//! What proves the bytes: the checksum over the data of a finished segment, or the last good checkpoint of an
+//! unfinished one. Chunks with a picture that lie in proven bytes are not unpacked: their message index says
+//! which picture they are, and from their set's mark follows what the checksum in their head must be. Bytes that
+//! nothing proves, and every picture when it is to be decoded, are unpacked by workers, see `pictures`.
 
-use super::{Findings, Severity, VerifyOptions, file_name};
+use super::index::Contents;
+use super::pictures::{Pictures, with_workers};
+use super::records::Records;
+use super::sets::{Picture, Proof, Walk};
+use super::{Findings, Severity, Watch, file_name};
 use crate::container::record::op;
-use crate::container::scan::{ChunkEntry, Message, SegmentReader};
-use crate::dataset::{Kind, check_stored, kinds};
-use crate::encode::Codec;
+use crate::container::scan::{ChannelInfo, HEAD, Message, SegmentReader};
+use crate::dataset::{Kind, kind_of};
 use crate::fs::Fs;
-use crate::msgs::frame_set::FrameSetMsg;
+use crate::msgs::frame_set::{Checkpoint, FrameSetMsg};
 use crate::msgs::schemas::Schema;
-use crate::msgs::{accounts, frame_info};
-use crate::recorder::topics::SESSION_METADATA;
-use crate::{Error, ErrorKind, Result, Session, StreamAccount};
+use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA};
+use crate::{Error, ErrorKind, Result};
 use depthrig_bus::StreamId;
 use mcap::records::Record;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// What is carried from segment to segment.
-pub(super) struct Walk {
-    options: VerifyOptions,
-    streams: BTreeSet<String>,
-    pub(super) sets: u64,
-    pub(super) frames: u64,
-    pub(super) bytes: u64,
-    last: Option<Last>,
-    /// Sets counted by the accounts minus those seen, fixed at the first account of a lone segment.
-    account_base: Option<u64>,
-    dropped: Option<crate::SetCounts>,
-    accounts: BTreeMap<StreamId, StreamAccount>,
-}
-
-/// The set before.
-struct Last {
-    id: u64,
-    log_time: u64,
-    tick_ns: i64,
-}
+/// Opcode, length, channel, sequence, log time and publish time of a message.
+pub(super) const MESSAGE_HEAD: u64 = HEAD + 2 + 4 + 8 + 8;
 
 /// What one segment's pass collects.
-struct Pass<'a> {
-    file: String,
+pub(super) struct Pass<'a> {
+    pub(super) file: String,
+    pub(super) findings: &'a mut Findings,
+    /// Pictures in chunks from here on are unpacked.
+    pub(super) unproven: u64,
+    schemas: BTreeMap<u16, String>,
     kinds: BTreeMap<u16, Kind>,
     camera_infos: BTreeMap<u16, StreamId>,
     accounts_channel: Option<u16>,
-    findings: &'a mut Findings,
+    checkpoints: Option<u16>,
     /// Messages since the last commit mark.
-    pictures: BTreeMap<StreamId, Picture>,
-    infos: BTreeMap<StreamId, (u64, Vec<u8>)>,
-    calibrated: BTreeSet<StreamId>,
-    messages: u64,
+    pub(super) pictures: BTreeMap<StreamId, Picture>,
+    pub(super) infos: BTreeMap<StreamId, (u64, Vec<u8>)>,
+    pub(super) calibrated: BTreeSet<StreamId>,
+    contents: Contents,
+    stands_alone: bool,
+    /// Channel, time and offset of each message of the last chunk that no index record has named yet.
+    unlisted: BTreeSet<(u16, u64, u64)>,
+    /// Of the bytes before the present record.
+    crc: crc32fast::Hasher,
+    /// The bytes before this are what was written.
+    proven: u64,
 }
 
-struct Picture {
-    offset: u64,
-    log_time: u64,
-    len: u64,
-    crc: u32,
-    /// Kept only when it will be decoded.
-    message: Vec<u8>,
+/// Verifies a segment and takes its sets into `walk`.
+pub(super) fn segment(
+    walk: &mut Walk,
+    fs: &dyn Fs,
+    path: &Path,
+    findings: &mut Findings,
+    watch: &mut Watch<'_>,
+) {
+    let file = file_name(path);
+    if let Err(e) = read(walk, fs, path, findings, watch) {
+        findings.add(Severity::Broken, &file, None, e.to_string());
+    }
 }
 
-impl Walk {
-    pub(super) fn new(session: &Session, options: VerifyOptions) -> Self {
-        Self {
-            options,
-            streams: session.streams.iter().map(|s| s.id.to_string()).collect(),
-            sets: 0,
-            frames: 0,
-            bytes: 0,
-            last: None,
-            account_base: None,
-            dropped: None,
-            accounts: BTreeMap::new(),
-        }
-    }
-
-    pub(super) fn segment(&mut self, fs: &dyn Fs, path: &Path, findings: &mut Findings) {
-        let file = file_name(path);
-        if let Err(e) = self.read(fs, path, &file, findings) {
-            findings.add(Severity::Broken, &file, None, e.to_string());
-        }
-    }
-
-    fn read(&mut self, fs: &dyn Fs, path: &Path, file: &str, findings: &mut Findings) -> Result<()> {
-        let mut reader = SegmentReader::open_bare(fs, path)?;
-        self.bytes += reader.size;
-        let index = reader.load_index();
-        if let Err(e) = &index {
-            findings.add(Severity::Broken, file, None, e.to_string());
-        } else if reader.metadata(SESSION_METADATA).is_none() {
-            findings.add(Severity::Broken, file, None, "it does not stand alone: the session is not in it");
-        }
-        if index.is_ok() && !reader.finished {
+fn read(
+    walk: &mut Walk,
+    fs: &dyn Fs,
+    path: &Path,
+    findings: &mut Findings,
+    watch: &mut Watch<'_>,
+) -> Result<()> {
+    let file = file_name(path);
+    let mut reader = SegmentReader::open_bare(fs, path)?;
+    walk.bytes += reader.size;
+    let index = reader.load_index();
+    match &index {
+        Err(e) => findings.add(Severity::Broken, &file, None, e.to_string()),
+        Ok(()) if !reader.finished => {
             let (offset, why) = reader.cut.clone().unwrap_or_default();
             let what = format!("unfinished: {why}; its whole sets can still be read");
-            findings.add(Severity::Broken, file, Some(offset), what);
+            findings.add(Severity::Broken, &file, Some(offset), what);
         }
-        let find = |schema: Schema| {
-            reader.channels.iter().filter(move |(_, c)| c.schema == schema.name()).map(|(id, c)| (*id, c))
-        };
-        let mut pass = Pass {
+        Ok(()) => {}
+    }
+    let finished = reader.finished && index.is_ok();
+    // With decoding every picture is unpacked anyway. Without, a first pass shows what the checksums prove; where
+    // they do not prove all, a second one takes its place.
+    let mut unproven = if walk.options.decode { 0 } else { u64::MAX };
+    let (before, watched) = (walk.clone(), watch.done);
+    loop {
+        let mut found = Findings::default();
+        let threads = if unproven == u64::MAX { 0 } else { walk.options.threads() };
+        let (result, problems) = with_workers(&reader, threads, |pictures| {
+            let mut pass = Pass::new(&file, &mut found, unproven);
+            // Another writer may have put them into chunks; those at the head of the data are taken as they come.
+            reader.channels.iter().for_each(|(id, info)| pass.channel(*id, info));
+            let result = pass.run(walk, &reader, finished, pictures, watch);
+            result.map(|()| pass.proven)
+        });
+        let proven = *result.as_ref().unwrap_or(&0);
+        if unproven == u64::MAX && proven < reader.size && !watch.stopped {
+            (*walk, watch.done, unproven) = (before.clone(), watched, proven);
+            continue;
+        }
+        findings.append(found);
+        for (offset, what) in problems {
+            findings.add(Severity::Broken, &file, Some(offset), what);
+        }
+        return result.map(drop);
+    }
+}
+
+impl<'a> Pass<'a> {
+    fn new(file: &str, findings: &'a mut Findings, unproven: u64) -> Self {
+        Self {
             file: file.to_owned(),
-            kinds: kinds(&reader),
-            camera_infos: find(Schema::CameraInfo)
-                .filter_map(|(id, c)| Some((id, c.metadata.get("stream")?.parse().ok()?)))
-                .collect(),
-            accounts_channel: find(Schema::Accounts).map(|(id, _)| id).next(),
             findings,
+            unproven,
+            schemas: BTreeMap::new(),
+            kinds: BTreeMap::new(),
+            camera_infos: BTreeMap::new(),
+            accounts_channel: None,
+            checkpoints: None,
             pictures: BTreeMap::new(),
             infos: BTreeMap::new(),
             calibrated: BTreeSet::new(),
-            messages: 0,
-        };
-        let chunks = self.records(&reader, &mut pass)?;
-        if !pass.pictures.is_empty() {
-            let n = pass.pictures.len();
-            let at = pass.pictures.values().map(|p| p.offset).min();
-            let what = format!("a torn set: {n} pictures have no commit mark after them");
-            pass.findings.add(Severity::Broken, file, at, what);
+            contents: Contents::default(),
+            stands_alone: false,
+            unlisted: BTreeSet::new(),
+            crc: crc32fast::Hasher::new(),
+            proven: 0,
         }
-        if index.is_ok() && reader.finished {
-            if reader.chunks != chunks {
-                let differs = reader.chunks.iter().zip(&chunks).find(|(a, b)| a != b);
-                let at = differs.map(|(a, _)| a.offset);
-                let (said, there) = (reader.chunks.len(), chunks.len());
-                let what = format!("the index ({said} chunks) is not that of the data ({there} chunks)");
-                pass.findings.add(Severity::Broken, file, at, what);
-            }
-            if reader.message_count != Some(pass.messages) {
-                let what =
-                    format!("{} messages, the statistics say {:?}", pass.messages, reader.message_count);
-                pass.findings.add(Severity::Broken, file, None, what);
-            }
-        }
-        Ok(())
     }
 
-    /// Every record from the first to the end of the data; the chunks as they lie there.
-    fn records(&mut self, reader: &SegmentReader, pass: &mut Pass<'_>) -> Result<Vec<ChunkEntry>> {
-        let mut crc = crc32fast::Hasher::new();
-        crc.update(&super::super::container::MAGIC);
-        let mut chunks: Vec<ChunkEntry> = Vec::new();
-        // Channel, time and offset of each message of the last chunk that no index record has named yet.
-        let mut unlisted: BTreeSet<(u16, u64, u64)> = BTreeSet::new();
-        let mut offset = 8;
-        while offset < reader.size {
-            let head = reader.read(offset, 9);
-            let record = head.and_then(|head| Ok((head, reader.record(offset)?)));
-            let (head, (opcode, body)) = match record {
-                Ok(r) => r,
-                // Said already: the file is unfinished and cut here.
-                Err(e) if e.kind() == ErrorKind::Truncated && !reader.finished => return Ok(chunks),
-                Err(e) => return Err(e),
-            };
-            if opcode != op::MESSAGE_INDEX && !unlisted.is_empty() {
-                let what = format!("{} messages of the chunk before are in no message index", unlisted.len());
-                pass.findings.add(Severity::Broken, &pass.file, Some(offset), what);
-                unlisted.clear();
+    pub(super) fn broken(&mut self, offset: Option<u64>, what: impl Into<String>) {
+        self.findings.add(Severity::Broken, &self.file, offset, what);
+    }
+
+    fn run(
+        &mut self,
+        walk: &mut Walk,
+        reader: &SegmentReader,
+        finished: bool,
+        pictures: &mut Pictures<'_>,
+        watch: &mut Watch<'_>,
+    ) -> Result<()> {
+        let ended = self.data(walk, reader, pictures, watch);
+        if watch.stopped {
+            return Ok(());
+        }
+        if !self.stands_alone {
+            self.broken(None, "it does not stand alone: the session is not in it");
+        }
+        if !self.pictures.is_empty() {
+            let n = self.pictures.len();
+            let at = self.pictures.values().map(|p| p.offset).min();
+            self.broken(at, format!("a torn set: {n} pictures have no commit mark after them"));
+        }
+        match ended {
+            Ok(Some(summary)) => self.summary(reader, summary, finished),
+            Ok(None) if finished => {
+                self.broken(None, "the data has no end record");
+                Ok(())
             }
-            match opcode {
+            // Said already: the file is unfinished and cut here.
+            Ok(None) => Ok(()),
+            Err(e) if e.kind() == ErrorKind::Truncated && !reader.finished => Ok(()),
+            Err(e) => Err(e),
+        }
+    }
+
+    /// Every record up to the end of the data; where the summary begins.
+    fn data(
+        &mut self,
+        walk: &mut Walk,
+        reader: &SegmentReader,
+        pictures: &mut Pictures<'_>,
+        watch: &mut Watch<'_>,
+    ) -> Result<Option<u64>> {
+        self.crc.update(&crate::container::MAGIC);
+        let mut records = Records::new(reader, 8);
+        loop {
+            let offset = records.offset;
+            let Some(raw) = records.record()? else { return Ok(None) };
+            let length = raw.whole.len() as u64;
+            if raw.opcode != op::MESSAGE_INDEX && !self.unlisted.is_empty() {
+                let what =
+                    format!("{} messages of the chunk before are in no message index", self.unlisted.len());
+                self.broken(Some(offset), what);
+                self.unlisted.clear();
+            }
+            match raw.opcode {
                 op::DATA_END => {
-                    if let Record::DataEnd(end) = reader.parse(opcode, &body, offset)? {
-                        let crc = crc.finalize();
-                        if end.data_section_crc != 0 && end.data_section_crc != crc {
-                            let saved = end.data_section_crc;
+                    if let Record::DataEnd(end) = reader.parse(raw.opcode, raw.body(), offset)? {
+                        let (crc, saved) = (self.crc.clone().finalize(), end.data_section_crc);
+                        if saved == crc {
+                            self.proven = reader.size;
+                        } else if saved != 0 {
                             let what = format!("the data's checksum is {crc:08x}, the file says {saved:08x}");
-                            pass.findings.add(Severity::Broken, &pass.file, Some(offset), what);
+                            self.broken(Some(offset), what);
                         }
                     }
-                    return Ok(chunks);
+                    return Ok(Some(offset + length));
                 }
-                op::CHUNK => chunks.push(self.chunk(reader, pass, offset, &body, &mut unlisted)?),
+                op::CHUNK => self.chunk(walk, reader, pictures, offset, &raw)?,
                 op::MESSAGE_INDEX => {
-                    let Record::MessageIndex(index) = reader.parse(opcode, &body, offset)? else { continue };
-                    if let Some(chunk) = chunks.last_mut() {
-                        chunk.channels.push(index.channel_id);
-                    }
-                    for e in index.records {
-                        if !unlisted.remove(&(index.channel_id, e.log_time, e.offset)) {
-                            let what =
-                                format!("a message index points to nothing (channel {})", index.channel_id);
-                            pass.findings.add(Severity::Broken, &pass.file, Some(offset), what);
+                    if let Record::MessageIndex(index) = reader.parse(raw.opcode, raw.body(), offset)? {
+                        self.contents.message_index(index.channel_id, offset, length);
+                        for e in index.records {
+                            if !self.unlisted.remove(&(index.channel_id, e.log_time, e.offset)) {
+                                let channel = index.channel_id;
+                                let what = format!("a message index points to nothing (channel {channel})");
+                                self.broken(Some(offset), what);
+                            }
                         }
                     }
                 }
                 _ => {
-                    reader.parse(opcode, &body, offset)?;
+                    let record = reader.parse(raw.opcode, raw.body(), offset)?;
+                    self.definition(record, raw.opcode, raw.whole, offset);
                 }
             }
-            crc.update(&head);
-            crc.update(&body);
-            offset += 9 + body.len() as u64;
+            self.crc.update(raw.whole);
+            records.advance(length as usize);
+            if watch.advance(length) {
+                return Ok(None);
+            }
         }
-        if reader.finished {
-            pass.findings.add(Severity::Broken, &pass.file, None, "the data has no end record");
+    }
+
+    /// Takes what describes the messages.
+    fn definition(&mut self, record: Record<'_>, opcode: u8, whole: &[u8], offset: u64) {
+        match record {
+            Record::Schema { header, .. } => {
+                self.contents.definition(opcode, header.id, whole);
+                self.schemas.insert(header.id, header.name);
+            }
+            Record::Channel(c) => {
+                self.contents.definition(opcode, c.id, whole);
+                let schema = self.schemas.get(&c.schema_id).cloned().unwrap_or_default();
+                let info = ChannelInfo { topic: c.topic, schema, metadata: c.metadata };
+                self.channel(c.id, &info);
+            }
+            Record::Attachment { .. } => self.contents.other(opcode, offset, whole.len() as u64),
+            Record::Metadata(m) => {
+                self.contents.other(opcode, offset, whole.len() as u64);
+                self.stands_alone |= m.name == SESSION_METADATA;
+                if let Some(error) = m.metadata.get("error").filter(|_| m.name == SEGMENT_METADATA) {
+                    let what = format!("the recording ended before its time: {error}");
+                    self.findings.add(Severity::Lost, &self.file, Some(offset), what);
+                }
+            }
+            _ => {}
         }
-        Ok(chunks)
+    }
+
+    fn channel(&mut self, id: u16, info: &ChannelInfo) {
+        let is = |s: Schema| info.schema == s.name();
+        if is(Schema::CameraInfo)
+            && let Some(stream) = info.metadata.get("stream").and_then(|s| s.parse().ok())
+        {
+            self.camera_infos.insert(id, stream);
+        } else if is(Schema::Accounts) {
+            self.accounts_channel = Some(id);
+        } else if is(Schema::Checkpoint) {
+            self.checkpoints = Some(id);
+        } else if let Some(kind) = kind_of(info) {
+            self.kinds.insert(id, kind);
+        }
     }
 
     fn chunk(
         &mut self,
+        walk: &mut Walk,
         reader: &SegmentReader,
-        pass: &mut Pass<'_>,
+        pictures: &mut Pictures<'_>,
         offset: u64,
-        body: &[u8],
-        unlisted: &mut BTreeSet<(u16, u64, u64)>,
-    ) -> Result<ChunkEntry> {
-        let Record::Chunk { header, .. } = reader.parse(op::CHUNK, body, offset)? else {
+        raw: &super::records::Raw<'_>,
+    ) -> Result<()> {
+        let Record::Chunk { header, .. } = reader.parse(op::CHUNK, raw.body(), offset)? else {
             return Err(reader.error(ErrorKind::Corrupt, offset, "this is no chunk"));
         };
-        let entry = ChunkEntry {
-            offset,
-            length: 9 + body.len() as u64,
-            start_time: header.message_start_time,
-            end_time: header.message_end_time,
-            channels: Vec::new(),
-        };
-        let read = reader.chunk_messages(body, offset, |m| {
-            pass.messages += 1;
-            unlisted.insert((m.channel, m.log_time, m.offset));
+        self.contents.chunk(offset, raw.whole.len() as u64, &header);
+        if let Some((id, picture)) = self.lone_picture(&header, offset, raw.after) {
+            self.contents.message(picture.channel);
+            self.unlisted.insert((picture.channel, picture.log_time, 0));
+            self.pictures.insert(id, picture);
+            return Ok(());
+        }
+        let read = reader.chunk_messages(raw.body(), offset, |m| {
+            self.contents.message(m.channel);
+            self.unlisted.insert((m.channel, m.log_time, m.offset));
             if m.log_time < header.message_start_time || m.log_time > header.message_end_time {
-                let what = "a message lies outside of the times of its chunk";
-                pass.findings.add(Severity::Broken, &pass.file, Some(offset), what);
+                self.broken(Some(offset), "a message lies outside of the times of its chunk");
             }
-            if let Err(e) = self.message(pass, &m, offset) {
-                pass.findings.add(Severity::Broken, &pass.file, Some(offset), e.to_string());
+            if let Err(e) = self.message(walk, pictures, &m, offset) {
+                self.broken(Some(offset), e.to_string());
             }
             Ok(())
         });
         if let Err(e) = read {
             // The next chunk may be whole.
-            unlisted.clear();
-            pass.findings.add(Severity::Broken, &pass.file, Some(offset), e.to_string());
+            self.unlisted.clear();
+            self.broken(Some(offset), e.to_string());
         }
-        Ok(entry)
+        Ok(())
     }
 
-    fn message(&mut self, pass: &mut Pass<'_>, m: &Message<'_>, offset: u64) -> Result<()> {
-        if pass.accounts_channel == Some(m.channel) {
-            return self.account(pass, m.data, offset);
+    /// The picture that a packed chunk holds, by its message index alone; `None` when that does not say.
+    fn lone_picture(
+        &self,
+        header: &mcap::records::ChunkHeader,
+        offset: u64,
+        after: &[u8],
+    ) -> Option<(StreamId, Picture)> {
+        let (index, next) = after.split_at_checked(HEAD as usize + 22)?;
+        let number =
+            |at: usize, n: usize| index[at..at + n].iter().rev().fold(0, |v, b| v << 8 | u64::from(*b));
+        let one = index[0] == op::MESSAGE_INDEX && number(1, 8) == 22 && number(11, 4) == 16;
+        let (channel, log_time) = (number(9, 2) as u16, number(15, 8));
+        let times = (header.message_start_time, header.message_end_time);
+        if !one
+            || next.first() == Some(&op::MESSAGE_INDEX)
+            || number(23, 8) != 0
+            || times != (log_time, log_time)
+        {
+            return None;
         }
-        if let Some(id) = pass.camera_infos.get(&m.channel) {
-            pass.calibrated.insert(id.clone());
+        // What is not packed is checked on the spot: that costs no more than its checksum.
+        let len =
+            header.uncompressed_size.checked_sub(MESSAGE_HEAD).filter(|_| header.compression == "zstd")?;
+        let Some(Kind::Picture(id)) = self.kinds.get(&channel) else { return None };
+        let proof = Proof::Packed(header.uncompressed_crc);
+        Some((id.clone(), Picture { offset, channel, log_time, len, proof }))
+    }
+
+    fn message(
+        &mut self,
+        walk: &mut Walk,
+        pictures: &mut Pictures<'_>,
+        m: &Message<'_>,
+        offset: u64,
+    ) -> Result<()> {
+        if self.accounts_channel == Some(m.channel) {
+            return walk.account(self, m.data, offset);
+        }
+        if self.checkpoints == Some(m.channel) {
+            return self.checkpoint(Checkpoint::read(m.data)?, offset);
+        }
+        if let Some(id) = self.camera_infos.get(&m.channel) {
+            self.calibrated.insert(id.clone());
             return Ok(());
         }
-        match pass.kinds.get(&m.channel) {
+        match self.kinds.get(&m.channel) {
             Some(Kind::Picture(id)) => {
-                let picture = Picture {
-                    offset,
-                    log_time: m.log_time,
-                    len: m.data.len() as u64,
-                    crc: crc32fast::hash(m.data),
-                    message: if self.options.decode { m.data.to_vec() } else { Vec::new() },
-                };
-                pass.pictures.insert(id.clone(), picture);
+                let (len, proof) = (m.data.len() as u64, Proof::Crc(crc32fast::hash(m.data)));
+                let picture = Picture { offset, channel: m.channel, log_time: m.log_time, len, proof };
+                self.pictures.insert(id.clone(), picture);
             }
             Some(Kind::Info(id)) => {
-                pass.infos.insert(id.clone(), (m.log_time, m.data.to_vec()));
+                self.infos.insert(id.clone(), (m.log_time, m.data.to_vec()));
             }
             Some(Kind::Set) => {
                 let set = FrameSetMsg::read(m.data)?;
-                for problem in self.set(pass, &set, m.log_time) {
-                    let what = format!("set {}: {problem}", set.id);
-                    pass.findings.add(Severity::Broken, &pass.file, Some(offset), what);
-                }
-                if let Some(max) = self.options.max_spread_ns.filter(|max| set.spread_ns > *max) {
-                    let what = format!(
-                        "set {}: its frames are {} ns apart, {max} is the limit",
-                        set.id, set.spread_ns
-                    );
-                    pass.findings.add(Severity::Lost, &pass.file, Some(offset), what);
-                }
-                (pass.pictures, pass.infos, pass.calibrated) = Default::default();
+                walk.set(self, &set, m.log_time, offset, pictures);
+                (self.pictures, self.infos, self.calibrated) = Default::default();
             }
             None => {}
         }
         Ok(())
     }
 
-    /// What is wrong with a set.
-    fn set(&mut self, pass: &Pass<'_>, set: &FrameSetMsg, log_time: u64) -> Vec<String> {
-        let mut problems = Vec::new();
-        if let Some(last) = &self.last {
-            if set.id <= last.id {
-                problems.push(format!("it follows set {}", last.id));
-            }
-            if log_time <= last.log_time {
-                problems.push("its log time is not later than that of the set before".to_owned());
-            }
-            if set.tick_ns <= last.tick_ns {
-                problems.push("its tick is not later than that of the set before".to_owned());
-            }
+    /// A checkpoint in the chunk at `offset` proves all that lies before that chunk.
+    fn checkpoint(&mut self, c: Checkpoint, offset: u64) -> Result<()> {
+        // In a copy of the segment it speaks of another file, and proves nothing of this one.
+        if c.file_bytes != offset {
+            return Ok(());
         }
-        self.last = Some(Last { id: set.id, log_time, tick_ns: set.tick_ns });
-        let mut named: BTreeSet<&str> = set.missing.iter().map(String::as_str).collect();
-        let mut captures = Vec::new();
-        for member in &set.members {
-            let name = &member.stream;
-            if !named.insert(name) {
-                problems.push(format!("{name} is in it twice"));
-            }
-            captures.push(member.capture_time_ns);
-            let Ok(id) = name.parse::<StreamId>() else {
-                problems.push(format!("\"{name}\" is no stream"));
-                continue;
-            };
-            if !pass.calibrated.contains(&id) {
-                problems.push(format!("{name} has no camera_info"));
-            }
-            let info = pass.infos.get(&id).filter(|(t, _)| *t == log_time);
-            let header = info.map(|(_, bytes)| frame_info::read(bytes));
-            match &header {
-                None => problems.push(format!("{name} has no frame_info")),
-                Some(Err(e)) => problems.push(format!("{name}: {e}")),
-                Some(Ok((h, _))) => {
-                    let same = h.sequence == member.sequence
-                        && h.capture_time_ns == member.capture_time_ns
-                        && h.set_id == set.id;
-                    if !same {
-                        problems.push(format!("{name}: its frame_info is that of another frame"));
-                    }
-                }
-            }
-            let Some(picture) = pass.pictures.get(&id).filter(|p| p.log_time == log_time) else {
-                problems.push(format!("{name} has no picture"));
-                continue;
-            };
-            if picture.crc != member.message_crc32 || picture.len != member.message_bytes {
-                problems.push(format!("{name}: its picture is another one"));
-            } else if let (true, Some(Ok((h, extra)))) = (self.options.decode, &header) {
-                let codec = Codec::from_name(extra.codec)
-                    .ok_or_else(|| Error::new(ErrorKind::Version, format!("unknown codec {}", extra.codec)));
-                if let Err(e) = codec.and_then(|codec| check_stored(&picture.message, codec, h)) {
-                    problems.push(e.to_string());
-                }
-            }
+        let crc = self.crc.clone().finalize();
+        if c.crc32 == crc {
+            self.proven = self.proven.max(offset);
+            return Ok(());
         }
-        let spread =
-            captures.iter().max().zip(captures.iter().min()).map_or(0, |(a, b)| a.saturating_sub(*b));
-        if spread != set.spread_ns {
-            problems.push(format!("its frames are {spread} ns apart, it says {}", set.spread_ns));
-        }
-        for stream in &self.streams {
-            if !named.contains(stream.as_str()) {
-                problems.push(format!("{stream} is neither in it nor marked missing"));
-            }
-        }
-        if let Some(stranger) = named.iter().find(|n| !self.streams.contains(**n)) {
-            problems.push(format!("{stranger} is not in the session"));
-        }
-        self.sets += 1;
-        self.frames += set.members.len() as u64;
-        problems
+        let what = format!("the bytes before have checksum {crc:08x}, the checkpoint says {:08x}", c.crc32);
+        Err(Error::new(ErrorKind::Corrupt, what))
     }
 
-    fn account(&mut self, pass: &mut Pass<'_>, message: &[u8], offset: u64) -> Result<()> {
-        let (sets, streams) = accounts::read(message)?;
-        let mut broken = |what: String| pass.findings.add(Severity::Broken, &pass.file, Some(offset), what);
-        if !sets.balances() {
-            broken(format!(
-                "the account of sets does not balance: {} offered, {} recorded, {} dropped",
-                sets.offered,
-                sets.recorded,
-                sets.dropped_total()
-            ));
+    /// The summary against the data.
+    fn summary(&mut self, reader: &SegmentReader, offset: u64, finished: bool) -> Result<()> {
+        if !finished {
+            return Ok(());
         }
-        // A segment on its own begins in the middle of the account.
-        let first_is_zero = self.last.as_ref().is_none_or(|_| pass.file.starts_with("seg_0000."));
-        let base = *self
-            .account_base
-            .get_or_insert_with(|| if first_is_zero { 0 } else { sets.recorded.saturating_sub(self.sets) });
-        let there = base.saturating_add(self.sets);
-        if sets.recorded != there {
-            broken(format!("the account says {} sets were recorded, {there} are there", sets.recorded));
+        let mut records = Records::new(reader, offset);
+        loop {
+            let offset = records.offset;
+            let Some(raw) = records.record()? else {
+                self.broken(None, "the summary has no footer");
+                return Ok(());
+            };
+            let record = reader.parse(raw.opcode, raw.body(), offset)?;
+            if let Some((at, what)) = self.contents.summary(&record, raw.whole)? {
+                self.broken(at, what);
+            }
+            if raw.opcode == op::FOOTER {
+                break;
+            }
+            let length = raw.whole.len();
+            records.advance(length);
         }
-        self.dropped = Some(sets);
-        for a in streams {
-            if !a.balances() {
-                broken(format!(
-                    "the account of {} does not balance: {} captured, {} delivered, {} dropped",
-                    a.stream,
-                    a.captured,
-                    a.delivered,
-                    a.dropped.total()
-                ));
-            }
-            if self
-                .accounts
-                .get(&a.stream)
-                .is_some_and(|b| a.captured < b.captured || a.delivered < b.delivered)
-            {
-                broken(format!("the account of {} goes backwards", a.stream));
-            }
-            self.accounts.insert(a.stream.clone(), a);
+        for (at, what) in self.contents.compare() {
+            self.broken(at, what);
         }
         Ok(())
-    }
-
-    /// The whole against what the session says of it.
-    pub(super) fn finish(&self, whole: Option<&Session>, findings: &mut Findings) {
-        for (reason, n) in self.dropped.iter().flat_map(crate::SetCounts::dropped_by_reason) {
-            let what = format!("{n} sets were not recorded: {}", reason.name());
-            findings.add(Severity::Lost, "accounts", None, what);
-        }
-        for a in self.accounts.values().filter(|a| a.dropped.total() > 0) {
-            let reasons: Vec<_> = a.dropped.nonzero().map(|(r, n)| format!("{n} {}", r.name())).collect();
-            let what = format!(
-                "{} of {} frames of {} were lost live: {}",
-                a.dropped.total(),
-                a.captured,
-                a.stream,
-                reasons.join(", ")
-            );
-            findings.add(Severity::Note, "accounts", None, what);
-        }
-        let Some(session) = whole else { return };
-        let file = crate::SESSION_FILE;
-        match &session.outcome {
-            None => {
-                findings.add(
-                    Severity::Broken,
-                    file,
-                    None,
-                    "the recording was not closed: no outcome is there",
-                );
-            }
-            Some(o) => {
-                if o.sets_recorded != self.sets {
-                    let what =
-                        format!("it says {} sets were recorded, {} are there", o.sets_recorded, self.sets);
-                    findings.add(Severity::Broken, file, None, what);
-                }
-                for lost in &o.lost {
-                    findings.add(Severity::Lost, file, None, lost.clone());
-                }
-            }
-        }
     }
 }

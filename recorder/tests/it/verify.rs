@@ -22,7 +22,7 @@ fn found(fs: &MemFs) -> Vec<String> {
 fn a_good_dataset_has_no_findings() {
     let fs = MemFs::new();
     record(&fs, 7, RecorderOptions { segment_max_ns: 3 * PERIOD, ..options() });
-    let report = check(&fs, &VerifyOptions { decode: true, max_spread_ns: Some(1000) });
+    let report = check(&fs, &VerifyOptions { decode: true, max_spread_ns: Some(1000), threads: 0 });
     assert_eq!(report.findings, []);
     assert!(report.is_whole());
     assert_eq!((report.sets, report.frames, report.segments), (7, 21, 3));
@@ -256,4 +256,383 @@ fn a_cameras_damaged_jpeg_is_found_when_pictures_are_decoded() {
             Some(what) => assert!(findings.len() == 1 && findings[0].message.contains(what), "{findings:?}"),
         }
     }
+}
+
+/// Where a record of a file begins, its opcode and its length with head.
+fn records(bytes: &[u8]) -> Vec<(usize, u8, usize)> {
+    let (mut at, mut found) = (8, Vec::new());
+    while at + 9 <= bytes.len() && bytes[at..] != bytes[..8] {
+        let len = 9 + u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap()) as usize;
+        found.push((at, bytes[at], len));
+        at += len;
+    }
+    found
+}
+
+const CHUNK: u8 = 6;
+const MESSAGE_INDEX: u8 = 7;
+const CHUNK_INDEX: u8 = 8;
+const STATISTICS: u8 = 0x0b;
+const DATA_END: u8 = 0x0f;
+const FOOTER: u8 = 2;
+
+/// Makes the checksums over data and summary those of the changed bytes, and the footer point to the summary.
+fn mend(bytes: &mut [u8]) {
+    let records = records(bytes);
+    let place = |opcode| records.iter().find(|r| r.1 == opcode).unwrap().0;
+    let (data_end, footer) = (place(DATA_END), place(FOOTER));
+    let crc = crc32fast::hash(&bytes[..data_end]);
+    bytes[data_end + 9..data_end + 13].copy_from_slice(&crc.to_le_bytes());
+    bytes[footer + 9..footer + 17].copy_from_slice(&(data_end as u64 + 13).to_le_bytes());
+    let crc = crc32fast::hash(&bytes[data_end + 13..footer + 25]);
+    bytes[footer + 25..footer + 29].copy_from_slice(&crc.to_le_bytes());
+}
+
+/// The recorded segment with its checksums mended after a change; what is found by default and with decoding.
+fn forged(change: impl FnOnce(&mut Vec<u8>)) -> [Vec<String>; 2] {
+    let (fs, bytes) = recorded();
+    let mut bytes = bytes.clone();
+    change(&mut bytes);
+    mend(&mut bytes);
+    let fs = copy(fs);
+    fs.put(&segment(0), bytes);
+    [false, true].map(|decode| {
+        let report = check(&fs, &VerifyOptions { decode, ..Default::default() });
+        let broken = report.findings.into_iter().filter(|f| f.severity == Severity::Broken);
+        // A checkpoint sees most of what is forged, too; here it is about what would be seen without one.
+        broken.map(|f| f.message).filter(|m| !m.contains("the checkpoint says")).collect()
+    })
+}
+
+/// The packed chunks with a picture: those that verification does not unpack by itself.
+fn packed_pictures(bytes: &[u8]) -> Vec<(usize, usize)> {
+    let all = records(bytes);
+    let one_message = |i: usize| all[i + 1].1 == MESSAGE_INDEX && all[i + 2].1 != MESSAGE_INDEX;
+    let zstd = |at: usize| &bytes[at + 41..at + 45] == b"zstd";
+    let chunks = all.iter().enumerate().filter(|(i, r)| r.1 == CHUNK && one_message(*i) && zstd(r.0));
+    chunks.map(|(_, r)| (r.0, r.2)).collect()
+}
+
+/// One bit of each byte (`DEPTHRIG_LONG=1`), or of every 23rd.
+#[test]
+fn no_flipped_byte_of_a_finished_segment_stays_unseen() {
+    let (fs, bytes) = recorded();
+    let fs = copy(fs);
+    let step = if std::env::var_os("DEPTHRIG_LONG").is_some() { 1 } else { 23 };
+    let mut changed = bytes.clone();
+    for at in (0..bytes.len()).step_by(step) {
+        changed[at] ^= 1 << (at % 8);
+        fs.put(&segment(0), changed.clone());
+        let worst = check(&fs, &VerifyOptions::default()).worst();
+        assert_eq!(worst, Some(Severity::Broken), "byte {at} was changed unnoticed");
+        changed[at] = bytes[at];
+    }
+    assert!(packed_pictures(bytes).len() >= 6, "pictures that are not unpacked were among them");
+}
+
+/// First, middle and last byte of each part of each kind of record.
+#[test]
+fn damage_of_every_kind_of_record_is_found() {
+    let (fs, bytes) = recorded();
+    let fs = copy(fs);
+    let mut kinds = std::collections::BTreeSet::new();
+    for (at, opcode, len) in records(bytes) {
+        kinds.insert(opcode);
+        for place in [at, at + 1, at + 8, at + 9, at + usize::midpoint(9, len), at + len - 1] {
+            let mut changed = bytes.clone();
+            changed[place.min(bytes.len() - 1)] ^= 0x41;
+            fs.put(&segment(0), changed);
+            let worst = check(&fs, &VerifyOptions::default()).worst();
+            assert_eq!(worst, Some(Severity::Broken), "byte {place}, a record of kind {opcode:#x} at {at}");
+        }
+    }
+    // Header, footer, schema, channel, chunk, message index, chunk index, attachment and its index, statistics,
+    // metadata and its index, summary offset, data end.
+    assert_eq!(kinds.into_iter().collect::<Vec<_>>(), [1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15]);
+}
+
+/// A picture whose packed bytes were changed and every checksum around it mended is the one thing that only
+/// unpacking shows: this is also the proof that verification by default does not unpack it.
+#[test]
+fn a_picture_forged_behind_its_checksums_is_found_by_unpacking() {
+    let (_, bytes) = recorded();
+    for (at, len) in packed_pictures(bytes) {
+        let [default, decoded] = forged(|b| b[at + len - 20] ^= 0x55);
+        assert_eq!(default, Vec::<String>::new());
+        assert!(decoded.len() == 1 && decoded[0].starts_with("set "), "{decoded:?}");
+        // What the head of the chunk says of the picture is compared with the mark of its set.
+        let [default, _] = forged(|b| b[at + 33] ^= 1);
+        assert!(default.len() == 1 && default[0].contains("a chunk's checksum is"), "checksum: {default:?}");
+        let [default, _] = forged(|b| b[at + 25] ^= 1);
+        let told = default.iter().any(|m| m.ends_with("its picture is another one"));
+        assert!(told && default.len() == 2, "size: {default:?}");
+        for time in [at + 9, at + 17] {
+            let [default, _] = forged(|b| b[time] ^= 1);
+            assert!(default.iter().any(|m| m.contains("the index of a chunk")), "times: {default:?}");
+        }
+    }
+}
+
+#[test]
+fn an_index_that_lies_is_found_though_every_checksum_is_right() {
+    let (_, bytes) = recorded();
+    let all = records(bytes);
+    let mut chunk_indexes = 0;
+    for (at, opcode, len) in all {
+        let fields: &[usize] = match opcode {
+            // Times, offset, length of the chunk, a message index's offset; then the end: its uncompressed size.
+            CHUNK_INDEX => &[0, 8, 16, 24, 36, 38, len - 9 - 8],
+            // Messages; schemas, channels, attachments, metadata, chunks; first and last time.
+            STATISTICS => &[0, 8, 10, 14, 18, 22, 26, 34],
+            // Log time and offset of the first entry.
+            MESSAGE_INDEX => &[6, 14],
+            _ => continue,
+        };
+        chunk_indexes += usize::from(opcode == CHUNK_INDEX);
+        if opcode == CHUNK_INDEX && chunk_indexes % 5 != 1 {
+            continue;
+        }
+        for field in fields {
+            let [default, _] = forged(|b| b[at + 9 + field] ^= 1);
+            assert!(!default.is_empty(), "kind {opcode:#x} at {at}, field at {field}");
+        }
+    }
+    assert!(chunk_indexes > 10);
+}
+
+#[test]
+fn a_chunk_taken_out_is_found_though_every_checksum_is_right() {
+    let (_, bytes) = recorded();
+    for (at, len) in packed_pictures(bytes) {
+        let index = u64::from_le_bytes(bytes[at + len + 1..at + len + 9].try_into().unwrap()) as usize + 9;
+        let [default, _] = forged(|b| {
+            b.drain(at..at + len + index);
+        });
+        assert!(default.len() >= 2, "the index as well: {default:?}");
+        assert!(default.iter().any(|m| m.ends_with("has no picture")), "{default:?}");
+    }
+}
+
+/// Writes a segment again with its messages in another order: `order` is given the place of each and its log time.
+fn reorder(fs: &MemFs, order: impl Fn(&mut Vec<(u64, mcap::Message<'static>)>)) {
+    let bytes = contents(fs, &segment(0));
+    let all = mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap);
+    let mut all: Vec<_> =
+        all.map(|m| (m.log_time, mcap::Message { data: m.data.into_owned().into(), ..m })).collect();
+    order(&mut all);
+    let mut next = all.into_iter();
+    rewrite(fs, |m| {
+        let Some((_, other)) = next.next() else { return false };
+        *m = other;
+        true
+    });
+}
+
+#[test]
+fn two_sets_in_each_others_place_are_found() {
+    let fs = MemFs::new();
+    record(&fs, 3, options());
+    let second = (T0 + PERIOD).cast_unsigned();
+    reorder(&fs, |all| all.sort_by_key(|(t, _)| if *t == second { u64::MAX } else { *t }));
+    let found = found(&fs);
+    for what in
+        ["set 2: it follows set 3", "set 2: its log time is not later", "set 2: its tick is not later"]
+    {
+        assert!(found.iter().any(|f| f.starts_with(what)), "{what}: {found:?}");
+    }
+}
+
+#[test]
+fn accounts_that_do_not_agree_with_the_sets_are_found() {
+    let fs = MemFs::new();
+    record(&fs, 3, options());
+    rewrite(&fs, |m| {
+        if m.channel.topic == "/rig/accounts" {
+            // Stamp, then offered and recorded: both one more, so that the account balances.
+            for at in [12, 20] {
+                m.data.to_mut()[at] += 1;
+            }
+        }
+        true
+    });
+    assert_eq!(found(&fs), ["the account says 4 sets were recorded, 3 are there"]);
+}
+
+#[test]
+fn frames_whose_own_accounts_are_wrong_are_found() {
+    let found = |change: &dyn Fn(usize, &mut depthrig_bus::FrameHeader)| {
+        let fs = MemFs::new();
+        let r = recorder(&fs, options());
+        for n in 0..3 {
+            let mut pushed = set(&session(), n);
+            change(n as usize, &mut pushed.frames[1].header);
+            r.push(pushed).unwrap();
+        }
+        r.finish().unwrap();
+        found(&fs)
+    };
+    let balance = found(&|n, h| h.captured += u64::from(n == 1));
+    assert_eq!(
+        balance,
+        ["set 2: front/depth: its header does not balance: 10 captured, 7 delivered, 2 dropped"]
+    );
+    let backwards = |n: usize, h: &mut depthrig_bus::FrameHeader| {
+        if n == 2 {
+            (h.sequence, h.captured) = (3, 5);
+        }
+    };
+    assert_eq!(found(&backwards), ["set 3: front/depth: the account in its header goes backwards"]);
+    let reasons = found(&|n, h| {
+        if n == 2 {
+            (h.dropped[1], h.dropped[2]) = (1, 1);
+        }
+    });
+    assert_eq!(reasons, ["set 3: front/depth: the account in its header goes backwards"]);
+    // A replay that was recorded may have begun again.
+    let replayed = found(&|n, h| {
+        backwards(n, h);
+        h.flags |= depthrig_bus::FrameFlags::REPLAYED.0;
+    });
+    assert_eq!(replayed, Vec::<String>::new());
+}
+
+#[test]
+fn the_sessions_own_limit_of_the_spread_is_used() {
+    let fs = MemFs::new();
+    let mut session = session();
+    session.max_spread_ns = Some(2_000_000);
+    let r = Recorder::create(Arc::new(fs.clone()), &dir(), session.clone(), options()).unwrap();
+    let mut wide = set(&session, 0);
+    wide.frames[0].header.capture_time_ns += 5_000_000;
+    let times = wide.frames.iter().map(|f| f.header.capture_time_ns);
+    wide.spread_ns = times.clone().max().unwrap() - times.min().unwrap();
+    r.push(wide).unwrap();
+    r.push(set(&session, 1)).unwrap();
+    r.finish().unwrap();
+    let report = check(&fs, &VerifyOptions::default());
+    assert_eq!(report.worst(), Some(Severity::Lost));
+    assert!(report.findings[0].message.ends_with("2000000 is the limit"), "{:?}", report.findings);
+    let wider = VerifyOptions { max_spread_ns: Some(9_000_000), ..Default::default() };
+    assert_eq!(check(&fs, &wider).findings, [], "what is asked for goes before what the session says");
+}
+
+#[test]
+fn streams_without_calibration_or_without_its_source_are_named() {
+    let fs = MemFs::new();
+    let mut session = session();
+    session.streams[0].intrinsics = depthrig_bus::Intrinsics::default();
+    session.streams[1].calibration = String::new();
+    session.streams[1].depth_unit_m = 0.0;
+    let r = Recorder::create(Arc::new(fs.clone()), &dir(), session.clone(), options()).unwrap();
+    r.push(set(&session, 0)).unwrap();
+    r.finish().unwrap();
+    let report = check(&fs, &VerifyOptions::default());
+    let found: Vec<_> = report.findings.iter().map(|f| (f.severity, f.message.as_str())).collect();
+    assert_eq!(
+        found,
+        [
+            (Severity::Broken, "front/depth is depth without a unit: its numbers mean nothing"),
+            (Severity::Note, "front/color has no calibration"),
+            (Severity::Note, "front/depth does not say where its calibration comes from"),
+        ]
+    );
+}
+
+/// A `.part` with checkpoints, and sets after the last of them.
+fn unfinished() -> (MemFs, std::path::PathBuf, Vec<u8>) {
+    let fs = MemFs::new();
+    let r = recorder(&fs, RecorderOptions { sync_interval_ns: 3_000_000, ..options() });
+    for n in 0..4 {
+        r.push(set(&session(), n)).unwrap();
+        settle(&r);
+        std::thread::sleep(std::time::Duration::from_millis(12));
+    }
+    drop(r);
+    let part = dir().join("seg_0000.mcap.part");
+    let bytes = contents(&fs, &part);
+    (fs, part, bytes)
+}
+
+#[test]
+fn damage_in_an_unfinished_segment_is_found_before_and_after_its_checkpoints() {
+    let (fs, part, bytes) = unfinished();
+    let usual = check(&fs, &VerifyOptions::default()).findings;
+    assert!(
+        usual.iter().all(|f| f.message.contains("unfinished") || f.message.contains("not closed")),
+        "{usual:?}"
+    );
+    let chunks: Vec<_> = records(&bytes).into_iter().filter(|r| r.1 == CHUNK && r.2 > 700).collect();
+    assert!(chunks.len() >= 8, "{chunks:?}");
+    for (at, _, len) in chunks {
+        for place in [at + 60, at + len / 2, at + len - 1] {
+            let mut changed = bytes.clone();
+            changed[place] ^= 0x10;
+            fs.put(&part, changed);
+            let found = check(&fs, &VerifyOptions::default()).findings;
+            assert!(found.len() > usual.len(), "byte {place} of the chunk at {at}: {found:?}");
+        }
+    }
+}
+
+#[test]
+fn findings_do_not_depend_on_the_number_of_threads() {
+    let (fs, bytes) = recorded();
+    let mut bytes = bytes.clone();
+    for (at, len) in packed_pictures(&bytes) {
+        bytes[at + len - 20] ^= 0x55;
+    }
+    mend(&mut bytes);
+    let fs = copy(fs);
+    fs.put(&segment(0), bytes);
+    let with = |threads| check(&fs, &VerifyOptions { decode: true, threads, ..Default::default() }).findings;
+    let one = with(1);
+    assert!(one.len() >= 7 && one[0].message.contains("the checkpoint says"), "{one:?}");
+    assert!(one[1..].is_sorted_by_key(|f| f.offset), "{one:?}");
+    for threads in [0, 2, 3, 7] {
+        for _ in 0..5 {
+            assert_eq!(with(threads), one);
+        }
+    }
+}
+
+#[test]
+fn verification_tells_how_far_it_is_and_can_be_stopped() {
+    use std::ops::ControlFlow;
+    let fs = MemFs::new();
+    let mut session = session();
+    session.streams = vec![stream("cam/ir", PixelFormat::Mono8, 1024, 1024)];
+    let noise: Arc<[u8]> = {
+        let mut x = 1u64;
+        let mut next = || {
+            x ^= x << 13;
+            x ^= x >> 7;
+            x ^= x << 17;
+            x as u8
+        };
+        (0..1 << 20).map(|_| next()).collect()
+    };
+    let r = Recorder::create(Arc::new(fs.clone()), &dir(), session.clone(), options()).unwrap();
+    for n in 0..12 {
+        let mut pushed = set_of(&session, n, &[]);
+        (pushed.missing, pushed.spread_ns) = (Vec::new(), 0);
+        let header = header(&session.streams[0], n);
+        pushed.frames =
+            vec![depthrig_recorder::RecordFrame { stream: 0, header, pixels: Box::new(Arc::clone(&noise)) }];
+        r.push(pushed).unwrap();
+        settle(&r);
+    }
+    r.finish().unwrap();
+    let fs: Arc<dyn Fs> = Arc::new(fs);
+    let mut seen = Vec::new();
+    let mut go_on = |p: depthrig_recorder::VerifyProgress| {
+        seen.push((p.bytes, p.total_bytes));
+        ControlFlow::Continue(())
+    };
+    let options = VerifyOptions::default();
+    let report = depthrig_recorder::verify_watched(&fs, &dir(), &options, &mut go_on).unwrap();
+    assert!(report.is_whole() && !report.stopped);
+    assert!(seen.len() >= 2 && seen.is_sorted() && seen.iter().all(|(b, t)| b <= t), "{seen:?}");
+    let stopped =
+        depthrig_recorder::verify_watched(&fs, &dir(), &options, &mut |_| ControlFlow::Break(())).unwrap();
+    assert!(stopped.stopped && stopped.sets < report.sets, "{stopped:?}");
 }

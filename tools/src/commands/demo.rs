@@ -66,7 +66,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
     let mut progress = Progress::new(quiet);
     progress.set("verifying", 0, 1);
     let dataset = folder.join(DATASET);
-    let verified = verify(&dataset, &VerifyOptions { decode: true, max_spread_ns: None })?;
+    let verified = verify(&dataset, &VerifyOptions { decode: true, ..VerifyOptions::default() })?;
     progress.set("replaying", 0, 1);
     let replay = replayed::run(&dataset, &runtime, &name, &recorded.seen.checksums)?;
     progress.clear();
