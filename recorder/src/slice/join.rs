@@ -348,14 +348,15 @@ impl Head {
         self.source.as_ref().map_or_else(String::new, |s| s.reader.path.display().to_string())
     }
 
-    /// Sets that were offered since the set before and are not in this lane.
+    /// Sets that were offered since the set before and are not in this lane, as far as its accounts go back: what
+    /// lies between two inputs with accounts of their own is in neither.
     fn gap(&self, inputs: &[Input<'_>], offered: u64) -> u64 {
-        match (&self.before, &self.source) {
-            (Some((_, before, _)), _) => offered.saturating_sub(before.saturating_add(1)),
-            (None, Some(s)) if s.is_first => {
-                offered.saturating_sub(inputs[s.input].offered_before().saturating_add(1))
-            }
-            _ => 0,
+        let Some(source) = &self.source else { return 0 };
+        let own = &inputs[source.input];
+        match self.before.filter(|(.., input)| inputs[*input].shares_accounts(own)) {
+            Some((_, before, _)) => offered.saturating_sub(before.saturating_add(1)),
+            None if source.is_first => offered.saturating_sub(own.offered_before().saturating_add(1)),
+            None => 0,
         }
     }
 }

@@ -326,6 +326,21 @@ fn a_gap_between_the_inputs_is_said() {
     assert_eq!(check(&fs, "all").findings, []);
 }
 
+/// A part's own losses stay its own: the gap before it does not use them up.
+#[test]
+fn a_gap_before_a_part_and_a_loss_after_it_are_two() {
+    let fs = MemFs::new();
+    recording(&fs, 5, quick(1), |n| u64::from(n == 2 || n == 5));
+    cut(&fs, "a", ids(1, 2)).unwrap();
+    cut(&fs, "b", ids(3, 5)).unwrap();
+    let report = join(&fs, "both", &[at(&fs, named("b")), at(&fs, named("a"))]).unwrap();
+    let expected = [
+        "1 of 6 sets were not recorded: bad_set",
+        "1 sets between set 2 and set 3 are in none of the inputs",
+    ];
+    assert_eq!(report.lost, expected);
+}
+
 #[test]
 fn what_contradicts_itself_or_is_of_another_session_is_refused() {
     let fs = MemFs::new();
