@@ -3,8 +3,9 @@
 usage: python lerobot_loader.py (DATASET EXPECTED)...
 
 Runs in the environment of the package `lerobot` (`make test` installs it), called by test_lerobot.py. EXPECTED holds
-`STREAM.npy` (every row is this) or `STREAM.ROW.npy` / `STREAM.ROW.jpg` (rows of each episode). For each dataset it prints a line of
-JSON: frames, episodes, fps, pictures compared. Statistics are compared with those that the package's own functions compute.
+`STREAM.npy` (every row is this) or `STREAM.ROW.npy` / `STREAM.ROW.jpg` (rows of each episode). For each dataset it
+prints a line of JSON: frames, episodes, fps, pictures compared. Statistics are compared with those that the package's
+own functions compute.
 """
 
 from __future__ import annotations
