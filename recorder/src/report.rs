@@ -97,6 +97,9 @@ pub struct Report {
 /// Problems that a report names; the rest is counted.
 pub const PROBLEMS_MAX: usize = 20;
 
+/// Restarts and steps that are told with their time.
+const TOLD_MAX: usize = 32;
+
 /// What is to be thought of a dataset.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Verdict {

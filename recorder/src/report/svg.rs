@@ -12,8 +12,8 @@ const WIDTH: f64 = 960.0;
 /// Where the plots of strips begin and end.
 const X: (f64, f64) = (196.0, 750.0);
 /// Height of a strip and the space below it.
-const STRIP: f64 = 36.0;
-const GAP: f64 = 9.0;
+const STRIP: f64 = 27.0;
+const GAP: f64 = 8.0;
 /// Space for an axis with its title.
 const AXIS: f64 = 38.0;
 
