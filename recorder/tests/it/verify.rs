@@ -549,7 +549,14 @@ fn unfinished() -> (MemFs, std::path::PathBuf, Vec<u8>) {
     }
     drop(r);
     let part = dir().join("seg_0000.mcap.part");
-    let bytes = contents(&fs, &part);
+    let mut bytes = contents(&fs, &part);
+    // The last set is the end of the file: no checkpoint speaks of it.
+    let last = packed_pictures(&bytes).pop().unwrap().0;
+    let after: Vec<_> = records(&bytes).into_iter().filter(|r| r.1 == CHUNK && r.0 > last).collect();
+    if let Some(beyond) = after.get(1) {
+        bytes.truncate(beyond.0);
+        fs.put(&part, bytes.clone());
+    }
     (fs, part, bytes)
 }
 
