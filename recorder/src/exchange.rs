@@ -14,6 +14,7 @@ mod folder;
 mod import;
 pub mod lerobot;
 mod report;
+mod rosbag;
 mod source;
 
 pub use bytecamera::{ByteCameraExport, ByteCameraImport, ByteCameraOptions, CameraNames};
@@ -21,9 +22,11 @@ pub use export::{ExportOptions, ExportProgress, Exporter, PartOut, PartSets, Par
 pub use folder::{OutFile, Output};
 pub use import::{ImportFacts, ImportProgress, ImportReport, Importer, import};
 pub use report::{DatasetIdentity, ExportReport, PartRecord, REPORT_FILE, SegmentIdentity, StreamCount};
+pub use rosbag::RosbagImport;
 pub use source::{PART_SETS, Part, Source};
 
 /// What the fuzz targets reach.
 pub(crate) mod fuzzing {
     pub(crate) use super::bytecamera::fuzzing::{calibration, npy, row};
+    pub(crate) use super::rosbag::fuzzing::fuzz as rosbag;
 }

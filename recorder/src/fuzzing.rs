@@ -132,3 +132,12 @@ pub fn calibration_json(bytes: &[u8]) -> bool {
 pub fn npy(bytes: &[u8]) -> bool {
     crate::exchange::fuzzing::npy(bytes)
 }
+
+/// A rosbag, read to its end; how many frames came out.
+///
+/// # Panics
+/// When the accounts of what came out do not balance.
+pub fn rosbag(bytes: &[u8]) -> u64 {
+    let (fs, dir) = folder("fuzz.bag", bytes);
+    fs.open(&dir.join("fuzz.bag")).map_or(0, crate::exchange::fuzzing::rosbag)
+}

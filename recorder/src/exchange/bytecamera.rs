@@ -14,6 +14,11 @@ mod rows;
 pub use export::{ByteCameraExport, CameraNames};
 pub use import::{ByteCameraImport, ByteCameraOptions};
 
+/// The name of a camera: that of a known model, else the nearest name to `otherwise`.
+pub(super) fn camera_name(model: &str, otherwise: &str) -> depthrig_bus::Name {
+    names::name(&names::of_model(model, otherwise, false))
+}
+
 /// The name of the layout.
 pub const FORMAT: &str = "bytecameradepth";
 /// Every number of every frame.

@@ -8,7 +8,9 @@ use crate::signals::Stop;
 use anyhow::Result;
 use clap::ValueEnum;
 use core::ops::ControlFlow;
-use depthrig_recorder::exchange::{ByteCameraImport, ByteCameraOptions, ImportReport, Importer, import};
+use depthrig_recorder::exchange::{
+    ByteCameraImport, ByteCameraOptions, ImportReport, Importer, RosbagImport, import,
+};
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{ColorCodec, RecorderOptions};
 use std::path::{Path, PathBuf};
@@ -24,7 +26,8 @@ could not be.
 
 Examples:
   depthrig import bytecameradepth recorded_data/20250314_1512 data/20250314_1512_kitchen
-  depthrig import bytecameradepth recorded_data/20250314_1512 data/kitchen --depth-unit d405=0.0001 --rate 5";
+  depthrig import bytecameradepth recorded_data/20250314_1512 data/kitchen --depth-unit d405=0.0001 --rate 5
+  depthrig import rosbag 20260314_151200.bag data/kitchen";
 
 /// The layouts.
 #[derive(Debug, clap::Subcommand)]
@@ -32,6 +35,9 @@ pub enum ImportCommand {
     /// A session of the public ByteCameraDepth dataset, or one that depthrig exported
     #[command(after_help = EXAMPLES)]
     Bytecameradepth(ByteCameraArgs),
+    /// A rosbag (version 2, .bag) that librealsense or the RealSense viewer recorded
+    #[command(after_help = EXAMPLES)]
+    Rosbag(RosbagArgs),
 }
 
 /// What every import has.
@@ -70,6 +76,13 @@ pub struct ByteCameraArgs {
     rate: Option<f64>,
 }
 
+/// Arguments of `import rosbag`.
+#[derive(Debug, clap::Args)]
+pub struct RosbagArgs {
+    #[command(flatten)]
+    common: Common,
+}
+
 fn depth_unit(text: &str) -> Result<(Option<String>, f64), String> {
     let (camera, unit) = text.rsplit_once('=').map_or((None, text), |(c, u)| (Some(c.to_owned()), u));
     let unit: f64 = unit.parse().map_err(|_| "write metres, such as 0.001 or d405=0.0001".to_owned())?;
@@ -90,6 +103,10 @@ pub fn run(command: &ImportCommand, context: &Context) -> Result<Exit> {
                 }
             }
             let importer = ByteCameraImport::open(Arc::clone(&fs), &args.common.input, options);
+            drive(&mut importer.map_err(super::export::usage)?, fs, &args.common, context)
+        }
+        ImportCommand::Rosbag(args) => {
+            let importer = RosbagImport::open(&*fs, &args.common.input, name_of(&args.common.out));
             drive(&mut importer.map_err(super::export::usage)?, fs, &args.common, context)
         }
     }

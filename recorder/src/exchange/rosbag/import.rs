@@ -1,0 +1,630 @@
+//! A bag of librealsense as a dataset.
+
+use super::FORMAT;
+use super::bag::{Bag, Message, Place, Unpacked};
+use super::messages::{camera_info, float, image, key_value, stream_rate, transform};
+use super::sets::{Set, group};
+use crate::exchange::bytecamera::camera_name;
+use crate::exchange::{ImportFacts, ImportProgress, Importer, import as driver};
+use crate::fs::{Fs, ReadFile};
+use crate::{Error, ErrorKind, RecordFrame, RecordSet, Result, Session, StreamAccount, StreamRecord};
+use depthrig_bus::{
+    ClockDomain, DropCounts, DropReason, FrameFlags, FrameHeader, HostTime, Intrinsics, PixelFormat, Pose,
+    StreamId, UtcPair,
+};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Frames that are imported from one bag: three weeks at 30 Hz with two streams.
+const FRAMES_MAX: usize = 100_000_000;
+/// The clock map of a bag with less than this has `CLOCK_WARMUP`, as that of a camera that just began.
+const WARMUP_NS: i64 = 5_000_000_000;
+/// Largest rotation that two quaternions of one rotation differ by, to see one that is none.
+const UNIT: core::ops::Range<f64> = 0.99..1.01;
+
+/// The importer of one bag.
+pub struct RosbagImport {
+    bag: Bag,
+    name: String,
+    streams: Vec<Stream>,
+    sets: Vec<Set>,
+    at: usize,
+    /// One unpacked chunk for each stream: their messages lie in turns.
+    chunks: Vec<Unpacked>,
+    facts: ImportFacts,
+    options: toml::Table,
+    facts_of_devices: toml::Table,
+}
+
+/// One stream of one sensor.
+struct Stream {
+    record: StreamRecord,
+    frames: Vec<Frame>,
+    sequence: u64,
+    dropped: DropCounts,
+    last_counter: Option<u64>,
+}
+
+/// What the bag says of one frame.
+#[derive(Debug, Clone, Default)]
+struct Frame {
+    place: Option<Place>,
+    /// Time of its messages in the bag.
+    bag_ns: i64,
+    stamp_ns: i64,
+    counter: Option<u64>,
+    sensor_us: Option<u64>,
+    sent_us: Option<u64>,
+    arrival_ns: Option<i64>,
+    exposure_us: Option<u64>,
+    gain: Option<f32>,
+    host_clock: bool,
+    /// Filled in when the clocks are mapped.
+    capture_ns: i64,
+    device_us: u64,
+    uncertainty_ns: u64,
+}
+
+/// What is found under a topic's prefix `/device_D/sensor_S/Stream_I`.
+#[derive(Default)]
+struct Found {
+    frames: Vec<Frame>,
+    size: Option<(u32, u32)>,
+    format: Option<PixelFormat>,
+    info: Option<(u32, u32, Intrinsics)>,
+    to_color: Option<([f64; 3], [f64; 4])>,
+    rate_hz: f64,
+    refused: Option<String>,
+}
+
+/// The first pass.
+#[derive(Default)]
+struct Scan {
+    streams: BTreeMap<Key, Found>,
+    /// Key and value of each device.
+    devices: BTreeMap<u32, BTreeMap<String, String>>,
+    /// Option and value of each sensor, the last one.
+    options: BTreeMap<(u32, u32), BTreeMap<String, f32>>,
+    topics: usize,
+    others: BTreeMap<String, u64>,
+}
+
+/// Device, sensor, kind of stream, index.
+type Key = (u32, u32, String, u32);
+
+/// The parts of a topic of librealsense.
+enum Topic<'a> {
+    Stream(Key, &'a str),
+    Device(u32, &'a str),
+    Sensor(u32, u32, &'a str),
+}
+
+fn topic(text: &str) -> Option<Topic<'_>> {
+    let (device, rest) = text.strip_prefix("/device_")?.split_once('/')?;
+    let device = device.parse().ok()?;
+    let Some(rest) = rest.strip_prefix("sensor_") else { return Some(Topic::Device(device, rest)) };
+    let (sensor, rest) = rest.split_once('/')?;
+    let sensor = sensor.parse().ok()?;
+    if let Some((stream, what)) = rest.split_once('/')
+        && let Some((kind, index)) = stream.rsplit_once('_')
+        && let Ok(index) = index.parse()
+    {
+        return Some(Topic::Stream((device, sensor, kind.to_owned(), index), what));
+    }
+    Some(Topic::Sensor(device, sensor, rest))
+}
+
+impl Scan {
+    fn message(&mut self, m: &Message<'_>) {
+        self.topics += 1;
+        match topic(&m.connection.topic) {
+            Some(Topic::Stream(key, what)) => self.of_stream(key, what, m),
+            Some(Topic::Device(device, "info")) => {
+                if let Some((k, v)) = key_value(m.data) {
+                    self.devices.entry(device).or_default().insert(k.to_owned(), v.to_owned());
+                }
+            }
+            Some(Topic::Sensor(device, sensor, what)) => {
+                let option = what.strip_prefix("option/").and_then(|o| o.strip_suffix("/value"));
+                if let (Some(option), Some(v)) = (option, float(m.data)) {
+                    self.options.entry((device, sensor)).or_default().insert(option.to_owned(), v);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn of_stream(&mut self, key: Key, what: &str, m: &Message<'_>) {
+        let depth = key.2 == "Depth";
+        let found = self.streams.entry(key).or_default();
+        match what {
+            "info" => found.rate_hz = f64::from(stream_rate(m.data).unwrap_or(0)),
+            "info/camera_info" => found.info = camera_info(m.data),
+            "tf/0" => found.to_color = transform(m.data),
+            "image/data" => match image(m.data) {
+                Some(i) => match i.format(depth).filter(|_| !i.big_endian) {
+                    Some(format) if found.frames.len() < FRAMES_MAX => {
+                        found.format.get_or_insert(format);
+                        found.size.get_or_insert((i.width, i.height));
+                        let (place, bag_ns) = (Some(m.place), m.time_ns);
+                        found.frames.push(Frame { place, bag_ns, stamp_ns: i.stamp_ns, ..Frame::default() });
+                    }
+                    _ => found.refused = Some(format!("{} pixels", i.encoding)),
+                },
+                None => found.refused = Some("an image that ends too early".to_owned()),
+            },
+            "image/metadata" => {
+                // Written after the picture, with the picture's time.
+                if let (Some(frame), Some((k, v))) = (found.frames.last_mut(), key_value(m.data))
+                    && frame.bag_ns == m.time_ns
+                {
+                    frame.learn(k, v);
+                }
+            }
+            _ if what.starts_with("imu/") || what.starts_with("pose/") => {
+                *self.others.entry(m.connection.topic.clone()).or_default() += 1;
+            }
+            _ => {}
+        }
+    }
+}
+
+impl Frame {
+    fn learn(&mut self, key: &str, value: &str) {
+        let whole = || value.parse::<u64>().ok();
+        match key {
+            "Frame Counter" => self.counter = whole(),
+            "Sensor Timestamp" => self.sensor_us = whole(),
+            "Frame Timestamp" => self.sent_us = whole(),
+            "Actual Exposure" => self.exposure_us = whole(),
+            "Gain Level" => self.gain = value.parse().ok(),
+            // The same moment twice: to the microsecond, and to the millisecond.
+            "system_time" => self.arrival_ns = milliseconds(value),
+            "Time Of Arrival" if self.arrival_ns.is_none() => self.arrival_ns = milliseconds(value),
+            "timestamp_domain" => self.host_clock = value != "Hardware Clock",
+            _ => {}
+        }
+    }
+}
+
+/// Nanoseconds of a decimal number of milliseconds, exactly: `f64` would lose the last digits.
+fn milliseconds(text: &str) -> Option<i64> {
+    let (whole, part) = text.split_once('.').unwrap_or((text, ""));
+    let whole: i64 = whole.parse().ok()?;
+    let digits: String = part.chars().chain(std::iter::repeat('0')).take(6).collect();
+    let part: i64 = digits.parse().ok()?;
+    whole.checked_mul(1_000_000)?.checked_add(part)
+}
+
+impl RosbagImport {
+    /// Reads the bag `path` once from front to back; pictures are read later.
+    ///
+    /// # Errors
+    /// [`ErrorKind::NotFound`], [`ErrorKind::BadInput`] when it is no rosbag of version 2, is packed with bz2 or holds no
+    /// frames of librealsense, [`ErrorKind::Io`]. Damage is counted in [`ImportFacts`].
+    pub fn open(fs: &dyn Fs, path: &Path, name: String) -> Result<Self> {
+        let file = fs.open(path).map_err(|e| Error::io("open", path, e))?;
+        Self::read(file, path, name)
+    }
+
+    fn read(file: Box<dyn ReadFile>, path: &Path, name: String) -> Result<Self> {
+        let bag = Bag::open(file, path)?;
+        let mut scan = Scan::default();
+        let mut facts = ImportFacts::default();
+        bag.messages(
+            &mut |m| {
+                scan.message(&m);
+                Ok(())
+            },
+            &mut |damage| facts.lose(damage),
+        )?;
+        let mut import = Self {
+            bag,
+            name,
+            streams: Vec::new(),
+            sets: Vec::new(),
+            at: 0,
+            chunks: Vec::new(),
+            facts,
+            options: toml::Table::new(),
+            facts_of_devices: toml::Table::new(),
+        };
+        import.streams(scan)?;
+        import.clocks();
+        let times: Vec<Vec<i64>> =
+            import.streams.iter().map(|s| s.frames.iter().map(|f| f.capture_ns).collect()).collect();
+        import.sets = group(&times);
+        import.chunks = import.streams.iter().map(|_| Unpacked::default()).collect();
+        let spread = import.sets.iter().map(|s| import.spread(s)).max().unwrap_or(0);
+        import.state(format!(
+            "frames were put into sets by nearest capture time; the widest spread is {:.3} ms",
+            spread as f64 / 1e6
+        ));
+        Ok(import)
+    }
+
+    fn state(&mut self, what: String) {
+        self.facts.stated.push(what);
+    }
+
+    /// What the first pass found, as streams of cameras.
+    fn streams(&mut self, scan: Scan) -> Result<()> {
+        let mut cameras: BTreeMap<u32, (String, String, String)> = BTreeMap::new();
+        for ((device, sensor, kind, index), found) in scan.streams {
+            let facts = scan.devices.get(&device);
+            let fact = |key: &str| facts.and_then(|f| f.get(key)).cloned().unwrap_or_default();
+            if !cameras.contains_key(&device) {
+                let model = fact("Name");
+                let plain = camera_name(&model, &format!("device_{device}"));
+                let mut camera = plain.to_string();
+                while cameras.values().any(|(taken, ..)| *taken == camera) {
+                    camera = format!("{plain}_{device}");
+                }
+                cameras.insert(device, (camera, model, fact("Serial Number")));
+            }
+            let Some((camera, model, serial)) = cameras.get(&device).cloned() else { continue };
+            let plain = kind.to_lowercase();
+            let stream = if index == 0 { plain } else { format!("{plain}_{index}") };
+            let stream = camera_name("", &stream);
+            let topic = format!("/device_{device}/sensor_{sensor}/{kind}_{index}");
+            if let Some(refused) = found.refused {
+                self.facts.lose(format!("{topic}: {refused} cannot be imported"));
+            }
+            let (Some(format), Some((width, height))) = (found.format, found.size) else { continue };
+            let id = StreamId::new(&camera, stream.as_str())
+                .map_err(|e| Error::new(ErrorKind::BadInput, format!("{topic}: {e}")).with_source(e))?;
+            if self.streams.iter().any(|s| s.record.id == id) {
+                self.facts.lose(format!("{topic}: there is a stream {id} already, this one is left out"));
+                continue;
+            }
+            let options = scan.options.get(&(device, sensor));
+            let unit = options.and_then(|o| o.get("Depth Units")).copied();
+            let depth_unit_m = match format {
+                // The shortest number that is this float: 0.001, not 0.0010000000474974513.
+                PixelFormat::Z16 => unit.and_then(|u| u.to_string().parse().ok()).unwrap_or(0.001),
+                PixelFormat::DepthF32 => 1.0,
+                _ => 0.0,
+            };
+            if format == PixelFormat::Z16 {
+                let why = if unit.is_some() { "as the bag says" } else { "assumed, the bag does not say it" };
+                self.state(format!("{id}: depth unit {depth_unit_m} m {why}"));
+            }
+            let known = found.info.filter(|(w, h, i)| (*w, *h) == (width, height) && i.is_known());
+            let calibration =
+                if known.is_some() { "factory, as librealsense wrote it into the bag" } else { "none" };
+            let pose = found.to_color.and_then(pose_of);
+            if pose.is_none() {
+                self.state(format!("{id}: the bag has no pose, it is put where depth is"));
+            }
+            let record = StreamRecord {
+                id,
+                model,
+                serial,
+                format,
+                width,
+                height,
+                rate_hz: found.rate_hz,
+                depth_unit_m,
+                calibration: calibration.to_owned(),
+                intrinsics: known.map_or_else(Intrinsics::default, |(.., i)| i),
+                pose: pose.unwrap_or(Pose::IDENTITY),
+            };
+            let dropped = DropCounts::default();
+            self.streams.push(Stream {
+                record,
+                frames: found.frames,
+                sequence: 0,
+                dropped,
+                last_counter: None,
+            });
+        }
+        for (topic, n) in scan.others {
+            self.state(format!("{topic}: {n} messages are left out, a dataset holds pictures"));
+        }
+        for ((device, sensor), options) in scan.options {
+            let table = options.into_iter().map(|(k, v)| (k, f64::from(v).into())).collect::<toml::Table>();
+            self.options.insert(format!("device_{device}/sensor_{sensor}"), table.into());
+        }
+        for (device, facts) in scan.devices {
+            let table = facts.into_iter().map(|(k, v)| (k, v.into())).collect::<toml::Table>();
+            self.facts_of_devices.insert(format!("device_{device}"), table.into());
+        }
+        if self.streams.is_empty() {
+            return Err(Error::new(
+                ErrorKind::BadInput,
+                format!(
+                    "{} holds no pictures of librealsense (topics /device_0/sensor_0/Depth_0/image/data){}",
+                    self.bag.path.display(),
+                    self.facts.problems.first().map_or_else(String::new, |p| format!("; {p}"))
+                ),
+            ));
+        }
+        Ok(())
+    }
+
+    /// Places the device's times on the host's clock: what arrived fastest sets the offset, as in the live map.
+    fn clocks(&mut self) {
+        let mut devices: BTreeMap<String, (Vec<i64>, i64, i64)> = BTreeMap::new();
+        for s in &mut self.streams {
+            let mut last = 0;
+            for f in &mut s.frames {
+                // The device counts microseconds in 32 bits, which is 71 minutes.
+                let raw =
+                    f.sensor_us.or(f.sent_us).unwrap_or_else(|| f.stamp_ns.max(0).unsigned_abs() / 1000);
+                let mut us = raw;
+                if u32::try_from(raw).is_ok() {
+                    us = (last & !u64::from(u32::MAX)) | raw;
+                    if us + (1 << 31) < last {
+                        us += 1 << 32;
+                    }
+                }
+                last = us;
+                f.device_us = us;
+                let device_ns = i64::try_from(us).unwrap_or(0).saturating_mul(1000);
+                let entry = devices.entry(s.record.id.camera.to_string());
+                let (late, first, end) = entry.or_insert((Vec::new(), device_ns, device_ns));
+                if let (Some(arrival), false) = (f.arrival_ns, f.host_clock) {
+                    late.push(arrival.saturating_sub(device_ns));
+                }
+                (*first, *end) = ((*first).min(device_ns), (*end).max(device_ns));
+            }
+        }
+        for (camera, (late, first, end)) in &devices {
+            let (Some(least), Some(most)) = (late.iter().min(), late.iter().max()) else {
+                self.facts
+                    .stated
+                    .push(format!("{camera}: no frame says when it arrived; times are those of the bag"));
+                continue;
+            };
+            self.facts.stated.push(format!(
+                "{camera}: capture times are device times plus the least delay seen, over {:.3} s; delays vary by {:.3} ms, \
+                 and a constant one cannot be seen",
+                (end - first) as f64 / 1e9,
+                (most - least) as f64 / 1e6
+            ));
+        }
+        for s in &mut self.streams {
+            let device = devices.get(s.record.id.camera.as_str());
+            let least = device.and_then(|(late, ..)| late.iter().min().copied());
+            let most = device.and_then(|(late, ..)| late.iter().max().copied());
+            let mut before = i64::MIN;
+            for f in &mut s.frames {
+                let device_ns = i64::try_from(f.device_us).unwrap_or(0).saturating_mul(1000);
+                f.capture_ns = match (least, f.host_clock) {
+                    (Some(least), false) => device_ns.saturating_add(least),
+                    (_, true) if f.stamp_ns > 0 => f.stamp_ns,
+                    _ => f.bag_ns,
+                };
+                // Two readings of a delay cannot say less than how far they lie apart.
+                let width = most.zip(least).map_or(0, |(most, least)| most.saturating_sub(least));
+                f.uncertainty_ns = width.unsigned_abs().max(1_000_000);
+                // A set's frames are in order; a frame that went back in time is at least not before the last one.
+                f.capture_ns = f.capture_ns.max(before);
+                before = f.capture_ns;
+            }
+        }
+    }
+
+    fn spread(&self, set: &Set) -> i64 {
+        let times =
+            set.frames.iter().enumerate().filter_map(|(s, f)| Some(self.streams[s].frames[(*f)?].capture_ns));
+        let (low, high) = times.fold((i64::MAX, i64::MIN), |(low, high), t| (low.min(t), high.max(t)));
+        high.saturating_sub(low).max(0)
+    }
+
+    /// The frame's header and pixels.
+    fn frame(&mut self, stream: usize, index: usize, warmup: bool) -> Result<RecordFrame> {
+        let s = &mut self.streams[stream];
+        let f = &s.frames[index];
+        let name = format!("{}: frame {} of {}", self.bag.path.display(), index, s.record.id);
+        let damaged = |why: &str| Error::new(ErrorKind::Corrupt, format!("{name} {why}"));
+        let place = f.place.ok_or_else(|| damaged("has no picture"))?;
+        let data = self.bag.message(place, &mut self.chunks[stream])?;
+        let picture = image(data).ok_or_else(|| damaged("ends too early"))?;
+        let r = &s.record;
+        let (format, step) = (r.format, picture.step as usize);
+        let row = format.row_bytes(r.width) as usize;
+        let whole = step.checked_mul(r.height as usize).is_some_and(|n| n <= picture.data.len());
+        if (picture.width, picture.height) != (r.width, r.height)
+            || picture.format(format.is_depth()) != Some(format)
+            || step < row
+            || !whole
+        {
+            return Err(damaged(&format!(
+                "is {}x{} {} with {step} bytes a row, its stream is {}x{} {}",
+                picture.width,
+                picture.height,
+                picture.encoding,
+                r.width,
+                r.height,
+                format.name()
+            )));
+        }
+        let mut pixels = Vec::with_capacity(row * r.height as usize);
+        picture
+            .data
+            .chunks(step.max(1))
+            .take(r.height as usize)
+            .for_each(|line| pixels.extend_from_slice(&line[..row]));
+        if let (Some(last), Some(counter)) = (s.last_counter, f.counter) {
+            s.dropped.add(DropReason::DeviceGap, counter.saturating_sub(last).saturating_sub(1).min(1 << 32));
+        }
+        s.last_counter = f.counter.or(s.last_counter);
+        s.sequence += 1;
+        let domain =
+            if f.host_clock || f.arrival_ns.is_none() { ClockDomain::Arrival } else { ClockDomain::Device };
+        let mut flags = 0;
+        if domain == ClockDomain::Arrival {
+            flags |= FrameFlags::TIME_UNCERTAIN.0;
+        } else if warmup {
+            flags |= FrameFlags::CLOCK_WARMUP.0;
+        }
+        let arrival = f.arrival_ns.unwrap_or(f.capture_ns);
+        let mut header = FrameHeader {
+            sequence: s.sequence,
+            device_sequence: f.counter.unwrap_or(s.sequence),
+            device_time: f.device_us,
+            device_tick_ns: 1000.0,
+            capture_time_ns: f.capture_ns,
+            capture_uncertainty_ns: f.uncertainty_ns,
+            arrival_time_ns: arrival,
+            publish_time_ns: arrival,
+            exposure_ns: f.exposure_us.unwrap_or(0).saturating_mul(1000),
+            captured: s.sequence.saturating_add(s.dropped.total()),
+            dropped: s.dropped.0,
+            depth_unit_m: r.depth_unit_m,
+            intrinsics: r.intrinsics,
+            pose: r.pose,
+            clock_domain: domain as u32,
+            flags,
+            gain: f.gain.unwrap_or(0.0),
+            ..FrameHeader::default()
+        };
+        header.set_names("rig", &r.id);
+        header.set_device(&r.model, &r.serial);
+        header.set_picture(format, r.width, r.height);
+        Ok(RecordFrame { stream, header, pixels: Box::new(pixels) })
+    }
+}
+
+/// Where the camera is on the mount, whose origin is that of depth: the bag has the way from depth to this stream,
+/// `p_stream = R p_depth + t`, and a pose is the way back.
+fn pose_of((t, q): ([f64; 3], [f64; 4])) -> Option<Pose> {
+    let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
+    if !UNIT.contains(&norm) || !t.iter().all(|v| v.is_finite()) {
+        return None;
+    }
+    let [x, y, z, w] = q.map(|v| v / norm);
+    // The inverse of a rotation is its conjugate; the identity stays as it is, without a minus zero.
+    let q = [0.0 - x, 0.0 - y, 0.0 - z, w];
+    let [a, b, c] = rotate(q, t);
+    Some(Pose { translation_m: [0.0 - a, 0.0 - b, 0.0 - c], rotation_xyzw: q })
+}
+
+/// `v` turned by the unit quaternion `q`: v + 2w(u × v) + 2(u × (u × v)).
+fn rotate([x, y, z, w]: [f64; 4], v: [f64; 3]) -> [f64; 3] {
+    let cross = |a: [f64; 3], b: [f64; 3]| {
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    };
+    let once = cross([x, y, z], v);
+    let twice = cross([x, y, z], once);
+    [0, 1, 2].map(|i| v[i] + 2.0 * w * once[i] + 2.0 * twice[i])
+}
+
+impl Importer for RosbagImport {
+    fn format(&self) -> &'static str {
+        FORMAT
+    }
+
+    fn session(&mut self) -> Result<Session> {
+        let mut session = Session::new(self.name.clone(), "rig");
+        session.host = String::new();
+        session.started_utc_ns = self.sets.first().map_or(0, |s| s.tick_ns);
+        session.streams = self.streams.iter().map(|s| s.record.clone()).collect();
+        let mut table = driver::table(FORMAT, &self.bag.path, &self.facts);
+        if let toml::Value::Table(table) = &mut table {
+            table.insert("devices".to_owned(), self.facts_of_devices.clone().into());
+            table.insert("options".to_owned(), self.options.clone().into());
+        }
+        session.extra.insert("import".to_owned(), table);
+        Ok(session)
+    }
+
+    fn next(&mut self) -> Result<Option<RecordSet>> {
+        let length =
+            self.sets.last().zip(self.sets.first()).map_or(0, |(b, a)| b.tick_ns.saturating_sub(a.tick_ns));
+        let Some(set) = self.sets.get(self.at).cloned() else { return Ok(None) };
+        self.at += 1;
+        let mut out = RecordSet {
+            id: self.at as u64,
+            tick: HostTime::from_ns(set.tick_ns),
+            // Times of an import count from 1970: its own zero of the monotonic clock.
+            utc: UtcPair::default(),
+            frames: Vec::new(),
+            missing: Vec::new(),
+            spread_ns: 0,
+        };
+        for (stream, frame) in set.frames.iter().enumerate() {
+            let read = frame.map(|f| self.frame(stream, f, length < WARMUP_NS));
+            match read {
+                Some(Ok(frame)) => out.frames.push(frame),
+                Some(Err(e)) if e.kind() == ErrorKind::Io => return Err(e),
+                Some(Err(e)) => {
+                    let s = &mut self.streams[stream];
+                    s.dropped.add(DropReason::Incomplete, 1);
+                    s.last_counter = frame.and_then(|f| s.frames[f].counter).or(s.last_counter);
+                    self.facts.lose(e.to_string());
+                    out.missing.push(stream);
+                }
+                None => out.missing.push(stream),
+            }
+        }
+        let times = out.frames.iter().map(|f| f.header.capture_time_ns);
+        out.spread_ns = times.clone().max().zip(times.min()).map_or(0, |(b, a)| b.saturating_sub(a));
+        Ok(Some(out))
+    }
+
+    fn progress(&self) -> ImportProgress {
+        ImportProgress { done: self.at as u64, total: self.sets.len() as u64 }
+    }
+
+    fn facts(&self) -> ImportFacts {
+        let mut facts = self.facts.clone();
+        facts.accounts = self
+            .streams
+            .iter()
+            .map(|s| StreamAccount {
+                stream: s.record.id.clone(),
+                captured: s.sequence.saturating_add(s.dropped.total()),
+                delivered: s.sequence,
+                dropped: s.dropped,
+            })
+            .collect();
+        facts
+    }
+}
+
+/// A bag from any bytes: opened, and every set read; how many frames came out.
+pub(crate) fn fuzz(file: Box<dyn ReadFile>) -> u64 {
+    let Ok(mut import) = RosbagImport::read(file, Path::new("fuzz.bag"), "fuzz".to_owned()) else { return 0 };
+    drop(import.session());
+    let mut frames = 0;
+    while let Ok(Some(set)) = import.next() {
+        frames += set.frames.len() as u64;
+    }
+    assert!(import.facts().accounts.iter().all(StreamAccount::balances), "captured = delivered + dropped");
+    frames
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn milliseconds_are_exact() {
+        assert_eq!(milliseconds("1534232519732.935547"), Some(1_534_232_519_732_935_547));
+        assert_eq!(milliseconds("1534232519732"), Some(1_534_232_519_732_000_000));
+        assert_eq!(milliseconds("1.5"), Some(1_500_000));
+        for bad in ["", "x", "1.x", "99999999999999999999", "9223372036854775807"] {
+            assert_eq!(milliseconds(bad), None, "{bad}");
+        }
+    }
+
+    #[test]
+    fn a_pose_is_the_way_back() {
+        let half = core::f64::consts::FRAC_1_SQRT_2;
+        // A quarter turn about z, then 1 m along x: the point (0, -1, 0) of depth is the stream's (2, 0, 0).
+        let (t, q) = ([1.0, 0.0, 0.0], [0.0, 0.0, half, half]);
+        let p = [0.0, -1.0, 0.0];
+        let there = rotate(q, p);
+        let there = [there[0] + t[0], there[1] + t[1], there[2] + t[2]];
+        let pose = pose_of((t, q)).unwrap();
+        let back = rotate(pose.rotation_xyzw, there);
+        for (i, v) in p.iter().enumerate() {
+            assert!((there[i] - [2.0, 0.0, 0.0][i]).abs() < 1e-12);
+            assert!((back[i] + pose.translation_m[i] - v).abs() < 1e-12);
+        }
+        assert_eq!(pose_of(([0.0; 3], [0.0, 0.0, 0.0, 1.0])), Some(Pose::IDENTITY));
+        assert_eq!(pose_of(([0.0; 3], [0.0; 4])), None);
+    }
+}
