@@ -170,7 +170,7 @@ pub fn look_at(fs: &dyn Fs, dir: &Path) -> CatalogEntry {
         }
         None => {}
         Some(o) => {
-            entry.sets_lost = o.sets_dropped.values().sum();
+            entry.sets_lost = o.sets_dropped.values().fold(0, |sum: u64, n| sum.saturating_add(*n));
             if entry.health == Health::Whole && o.sets_recorded != entry.sets {
                 let what =
                     format!("{SESSION_FILE} says {} sets, the segments hold {}", o.sets_recorded, entry.sets);

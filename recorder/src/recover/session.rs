@@ -86,7 +86,9 @@ fn outcome(session: &Session, all: &[Facts], mut lost: Vec<String>, job: &mut Jo
         None => counts.dropped_by_reason().map(|(r, n)| (r.name().to_owned(), n)).collect(),
     };
     dropped.remove(IN_CRASH);
-    let missing = offered.saturating_sub(recorded + dropped.values().sum::<u64>());
+    // What a damaged file says may not fit.
+    let known = dropped.values().fold(recorded, |sum, n| sum.saturating_add(*n));
+    let missing = offered.saturating_sub(known);
     let mut say = |what: String, new: bool| {
         if new {
             job.report.lost.push(what.clone());

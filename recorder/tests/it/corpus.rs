@@ -41,6 +41,15 @@ fn segments() {
 }
 
 #[test]
+fn recovered_segments() {
+    run("recover", fuzzing::recover, 1);
+    for (name, bytes) in corpus("segment") {
+        println!("segment/{name}");
+        fuzzing::recover(&bytes);
+    }
+}
+
+#[test]
 fn depth_pictures() {
     run("depth_codec", fuzzing::depth_codec, false);
 }
@@ -95,6 +104,7 @@ proptest! {
             bytes = fuzzing::mcap::mutate(&bytes, seed, &mut plain).unwrap_or_else(|| change(&bytes, seed));
         }
         fuzzing::segment(&bytes);
+        fuzzing::recover(&bytes);
     }
 }
 

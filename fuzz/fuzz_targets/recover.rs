@@ -1,0 +1,15 @@
+//! A segment of a dataset: recovered.
+#![no_main]
+
+use depthrig_recorder::fuzzing;
+use libfuzzer_sys::{fuzz_mutator, fuzz_target};
+
+mod mutator;
+
+fuzz_target!(|bytes: &[u8]| {
+    fuzzing::recover(bytes);
+});
+
+fuzz_mutator!(|data: &mut [u8], size: usize, max_size: usize, seed: u32| {
+    mutator::mutate(data, size, max_size, seed)
+});
