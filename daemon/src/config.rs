@@ -104,6 +104,8 @@ pub struct RecordingConfig {
     pub queue_sets: usize,
     /// The recording ends cleanly when the disk has less than this left, MiB.
     pub reserve_mb: u64,
+    /// Whether datasets that were left unfinished here are recovered at the start.
+    pub recover_on_start: bool,
 }
 
 /// The control API. The Unix socket is always there.
@@ -192,6 +194,7 @@ impl Default for RecordingConfig {
             workers: 0,
             queue_sets: 6,
             reserve_mb: 2048,
+            recover_on_start: true,
         }
     }
 }

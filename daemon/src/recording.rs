@@ -12,11 +12,12 @@ use depthrig_recorder::{
     StreamRecord, Summary, UtcSource, fs,
 };
 use place::place;
+pub use recovery::recover_left;
 use std::collections::HashMap;
-use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
 mod place;
+mod recovery;
 mod report;
 
 pub use report::Reports;
@@ -55,7 +56,6 @@ struct Active {
     indices: HashMap<StreamId, usize>,
     streams: Vec<Recorded>,
     started: HostTime,
-    reserve_bytes: u64,
     utc: UtcSource,
 }
 
@@ -150,7 +150,6 @@ impl Begun {
             indices: streams.iter().enumerate().map(|(i, s)| (s.stream.id.clone(), i)).collect(),
             streams: streams.iter().map(recorded).collect(),
             started: HostTime::now(),
-            reserve_bytes: config.recording.reserve_mb << 20,
             utc: Arc::clone(&outside.utc),
             status,
         }))
@@ -289,10 +288,10 @@ impl Active {
         status.backlog_bytes = progress.backlog_bytes;
         status.segments = u64::from(progress.segments);
         status.error = progress.error.map(|e| e.to_string());
-        status.disk_free_bytes = depthrig_bus::shm::free_bytes(Path::new(&status.path)).unwrap_or(0);
-        let rate = status.bytes as f64 / status.duration_s.max(0.001);
-        let usable = status.disk_free_bytes.saturating_sub(self.reserve_bytes) as f64;
-        status.disk_seconds_left = (status.bytes > 0).then(|| usable / rate.max(1.0));
+        // As the disk guard knows it: asking here could wait for a disk that stalls.
+        status.disk_free_bytes = progress.disk.free_bytes;
+        status.disk_seconds_left = progress.disk.seconds_left;
+        status.warning = progress.disk.warning;
     }
 
     /// What the cameras delivered and lost since the recording began.

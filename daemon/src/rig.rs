@@ -15,7 +15,7 @@ use crate::api::{self, ServerHandle};
 use crate::camera::{Camera, Shared, Supervisor};
 use crate::config::{BackendConfig, RigConfig};
 use crate::control::{Control, RecordRequest};
-use crate::recording::{self, Begun, Outside, Recording, Reports, StreamFacts};
+use crate::recording::{self, Begun, Outside, Recording, Reports, StreamFacts, recover_left};
 use crate::sets::SpreadStats;
 use crate::status::{CameraState, RecordingStatus, RigStatus, SetAccount};
 use crate::wake::Wake;
@@ -181,6 +181,10 @@ impl Rig {
         rig.spawn("sets", move |stop| assembly.run(stop))?;
         let inner = Arc::clone(&rig.inner);
         rig.spawn("house", move |stop| keep_house(&inner, stop))?;
+        if rig.inner.config.recording.recover_on_start {
+            let inner = Arc::clone(&rig.inner);
+            rig.spawn("recover", move |stop| recover_left(&inner.config, &inner.outside.fs, stop))?;
+        }
         rig.wait_for_cameras()?;
         if options.serve_api {
             let socket = options.runtime.socket_path(&rig.inner.config.rig);

@@ -282,4 +282,7 @@ pub struct RecordingStatus {
     pub disk_free_bytes: u64,
     /// Seconds left at the present rate; `None` before a rate is known.
     pub disk_seconds_left: Option<f64>,
+    /// What somebody should look at: little room left, a disk that does not answer.
+    #[serde(default)]
+    pub warning: Option<String>,
 }

@@ -53,7 +53,7 @@ pub use error::{Error, ErrorKind, Result};
 pub use frame::{Pixels, PushError, RecordFrame, RecordSet, SetDrop};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
 pub use options::{ColorCodec, Compression, DepthCodec, RecorderOptions};
-pub use recorder::{Progress, Recorder, Summary, UtcSource};
+pub use recorder::{DiskStatus, Progress, Recorder, Summary, UtcSource};
 pub use recover::{
     LostBytes, RecoverAction, RecoverOptions, RecoverProgress, RecoverReport, RecoveredSegment, recover,
     recover_with, unfinished_in,

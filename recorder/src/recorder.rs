@@ -11,15 +11,17 @@ use crate::{Error, ErrorKind, RecorderOptions, Result, Session};
 use crossbeam::channel::{Sender, bounded};
 use depthrig_bus::{HostTime, UtcPair};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
+mod guard;
 mod ticket;
 pub(crate) mod topics;
 mod worker;
 mod writer;
 
+pub use guard::DiskStatus;
 use ticket::{Job, Load, Ticket};
 use topics::Topics;
 use writer::Writer;
@@ -37,6 +39,8 @@ pub struct Recorder {
     shared: Arc<Shared>,
     threads: Vec<JoinHandle<()>>,
     writer: Option<JoinHandle<Summary>>,
+    /// The disk guard, and what ends it when it is dropped.
+    guard: Option<(Sender<()>, JoinHandle<()>)>,
 }
 
 /// Where a recording reads both clocks. Tests step its wall clock, a replay gives the times of its dataset.
@@ -53,6 +57,8 @@ struct Shared {
     load: Arc<Load>,
     /// The writer leaves the segment unfinished.
     abandoned: AtomicBool,
+    /// Since when the writer waits for the disk, on the host's clock; 0 when it does not.
+    io_since_ns: AtomicI64,
     /// Tells others that the dataset is being recorded.
     _lock: Option<Box<dyn Send + Sync>>,
 }
@@ -71,6 +77,9 @@ struct State {
     /// Why no more sets are taken.
     ended: Option<SetDrop>,
     error: Option<Arc<Error>>,
+    /// Why the writer is to end the recording.
+    end_because: Option<Error>,
+    disk: DiskStatus,
     session: Session,
     session_changed: bool,
     pending_notes: Vec<crate::Note>,
@@ -98,6 +107,8 @@ pub struct Progress {
     pub backlog_bytes: u64,
     /// Time from the first set to the last, nanoseconds.
     pub duration_ns: i64,
+    /// How the disk stands.
+    pub disk: DiskStatus,
     /// Why the recording ended before its time, if it did.
     #[serde(serialize_with = "as_text")]
     pub error: Option<Arc<Error>>,
@@ -157,7 +168,7 @@ impl Recorder {
     ) -> Result<Self> {
         session.check()?;
         let topics = Topics::new(&session, &options);
-        prepare_folder(&*fs, dir, &options)?;
+        let free_bytes = prepare_folder(&*fs, dir, &options)?;
         let lock = lock_folder(&*fs, dir)?;
         let made = make_reserve(&*fs, dir, options.reserve_bytes)
             .and_then(|()| session.save(&*fs, dir))
@@ -195,6 +206,8 @@ impl Recorder {
                 last_tick: None,
                 ended: None,
                 error: None,
+                end_because: None,
+                disk: DiskStatus { free_bytes, ..DiskStatus::default() },
                 session,
                 session_changed: false,
                 pending_notes: Vec::new(),
@@ -205,9 +218,11 @@ impl Recorder {
             }),
             load: Arc::default(),
             abandoned: AtomicBool::new(false),
+            io_since_ns: AtomicI64::new(0),
             _lock: lock,
         });
-        let mut recorder = Self { shared: Arc::clone(&shared), threads: Vec::new(), writer: None };
+        let mut recorder =
+            Self { shared: Arc::clone(&shared), threads: Vec::new(), writer: None, guard: None };
         let no_thread = |e| Error::new(ErrorKind::Io, "cannot start a thread of the recorder").with_source(e);
         for i in 0..workers {
             let (shared, queue) = (Arc::clone(&shared), job_queue.clone());
@@ -216,6 +231,11 @@ impl Recorder {
             recorder.threads.push(thread.spawn(run).map_err(no_thread)?);
         }
         let thread = std::thread::Builder::new().name("rec-write".into());
+        let (stop, stopped) = bounded(0);
+        let watched = Arc::clone(&shared);
+        let guard = std::thread::Builder::new().name("rec-disk".into());
+        let guard = guard.spawn(move || guard::run(&watched, &stopped)).map_err(no_thread)?;
+        recorder.guard = Some((stop, guard));
         let writer = Writer::new(shared, ticket_queue, segment);
         recorder.writer = Some(thread.spawn(move || writer.run()).map_err(no_thread)?);
         Ok(recorder)
@@ -325,6 +345,13 @@ impl Recorder {
         &self.shared.dir
     }
 
+    fn end_guard(&mut self) {
+        if let Some((stop, guard)) = self.guard.take() {
+            drop(stop);
+            let _ = guard.join();
+        }
+    }
+
     /// How the recording stands.
     pub fn progress(&self) -> Progress {
         let s = self.shared.lock();
@@ -336,6 +363,7 @@ impl Recorder {
             encode_queue: self.shared.load.unencoded.load(Ordering::Relaxed),
             backlog_bytes: self.shared.load.backlog_bytes.load(Ordering::Relaxed),
             duration_ns: s.duration_ns(),
+            disk: s.disk.clone(),
             error: s.error.clone(),
         }
     }
@@ -351,6 +379,7 @@ impl Recorder {
             let _ = thread.join();
         }
         let writer = self.writer.take().map(JoinHandle::join);
+        self.end_guard();
         match writer {
             Some(Ok(summary)) => Ok(summary),
             _ => Err(Error::new(
@@ -374,6 +403,7 @@ impl Drop for Recorder {
         if let Some(writer) = self.writer.take() {
             let _ = writer.join();
         }
+        self.end_guard();
     }
 }
 
@@ -397,8 +427,8 @@ impl State {
     }
 }
 
-/// Creates the folder, or finds it empty, and checks that it can take a dataset.
-fn prepare_folder(fs: &dyn Fs, dir: &Path, options: &RecorderOptions) -> Result<()> {
+/// Creates the folder, or finds it empty, and checks that it can take a dataset; the bytes that are free there.
+fn prepare_folder(fs: &dyn Fs, dir: &Path, options: &RecorderOptions) -> Result<u64> {
     match fs.read_dir(dir) {
         Ok(entries) => {
             let names: Vec<_> = entries.iter().map(|e| e.name.as_str()).collect();
@@ -434,7 +464,7 @@ fn prepare_folder(fs: &dyn Fs, dir: &Path, options: &RecorderOptions) -> Result<
             ),
         ));
     }
-    Ok(())
+    Ok(free)
 }
 
 /// Locks the dataset against a recovery. A file system that cannot lock a folder is no reason not to record.

@@ -10,7 +10,7 @@ use crate::frame::SetDrop;
 use crate::msgs::frame_info::{self, Extra};
 use crate::msgs::frame_set::{self, Checkpoint, FrameSetMsg, Member};
 use crate::msgs::{accounts, diagnostics, image, tf};
-use crate::{Error, ErrorKind, Outcome, Result};
+use crate::{Error, Outcome, Result};
 use crossbeam::channel::{Receiver, RecvTimeoutError};
 use depthrig_bus::{HostTime, UtcPair};
 use std::collections::BTreeMap;
@@ -252,6 +252,10 @@ impl Writer {
     }
 
     fn sync_when_due(&mut self) {
+        let end_because = self.shared.lock().end_because.take();
+        if let Some(e) = end_because {
+            self.try_io(|_| Err(e));
+        }
         let now = HostTime::now();
         if now < self.next_sync {
             return;
@@ -268,21 +272,6 @@ impl Writer {
         if let Some(segment) = self.segment.as_mut().filter(|_| self.dirty) {
             segment.sync()?;
             self.dirty = false;
-        }
-        let (dir, least) = (&self.shared.dir, self.shared.options.min_free_bytes);
-        let free = self.shared.fs.available_space(dir);
-        let free = free.map_err(|e| Error::io("ask for the free space of", dir, e))?;
-        if free < least {
-            return Err(Error::new(
-                ErrorKind::DiskFull,
-                format!(
-                    "the recording {} was ended with {} MB left on the disk (the limit is {} MB); what was \
-                     recorded is whole; free some space and start a new one",
-                    dir.display(),
-                    free / 1_000_000,
-                    least / 1_000_000
-                ),
-            ));
         }
         Ok(())
     }
@@ -303,10 +292,13 @@ impl Writer {
 
     fn diagnostics_and_notes(&mut self, log_time: i64) {
         let mut state = self.shared.lock();
-        let statuses = state.diagnostics.take();
+        let mut statuses = state.diagnostics.take().unwrap_or_default();
         let notes = std::mem::take(&mut state.pending_notes);
+        if !statuses.is_empty() || state.disk.warning.is_some() {
+            statuses.push(state.disk.diagnostic(&state.session.rig));
+        }
         drop(state);
-        if let Some(statuses) = statuses {
+        if !statuses.is_empty() {
             self.message(Global::Diagnostics, log_time, log_time, |b| {
                 diagnostics::write(b, log_time, &statuses);
             });
@@ -364,7 +356,10 @@ impl Writer {
         if self.failed {
             return;
         }
-        let Err(e) = operation(self) else { return };
+        self.shared.io_since_ns.store(HostTime::now().ns(), Ordering::Relaxed);
+        let done = operation(self);
+        self.shared.io_since_ns.store(0, Ordering::Relaxed);
+        let Err(e) = done else { return };
         self.failed = true;
         self.builder = ChunkBuilder::new();
         tracing::error!(dataset = %self.shared.dir.display(), "the recording ended: {e}");
