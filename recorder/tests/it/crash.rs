@@ -64,7 +64,10 @@ fn durable(fs: &MemFs, written: &[(u64, u32, usize)]) -> Vec<u64> {
         let name = segment(number);
         fs.synced(&name).max(fs.synced(&name.with_extension("mcap.part")))
     };
-    written.iter().filter(|(_, number, end)| synced(*number) >= *end).map(|(id, ..)| *id).collect()
+    // A segment is closed, name and all, before a set is written into the next one.
+    let last = written.last().map_or(0, |(_, number, _)| *number);
+    let durable = |(_, number, end): &&(u64, u32, usize)| *number < last || synced(*number) >= *end;
+    written.iter().filter(durable).map(|(id, ..)| *id).collect()
 }
 
 /// Recovers; all of `durable` must be there then, and a second time nothing is changed.
