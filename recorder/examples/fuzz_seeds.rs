@@ -131,7 +131,7 @@ fn main() {
         // The same without its end, as a killed process leaves it.
         put("segment", &format!("{name}_cut"), &segment[..segment.len() * 2 / 3]);
         // An odd length is an unfinished one's; enough that two sets are whole.
-        put("recover", name, &segment[..segment.len() * 7 / 10 | 1]);
+        put("recover", name, &segment[..(segment.len() * 7 / 10) | 1]);
         put("session", name, &fs.contents(&dir.join("session.toml")).unwrap());
         assert!(fs.read_dir(dir).unwrap().len() == 2);
     }
