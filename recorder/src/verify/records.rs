@@ -3,7 +3,7 @@
 use crate::container::scan::{HEAD, RECORD_MAX, SegmentReader};
 use crate::{ErrorKind, Result};
 
-/// Bytes read at a time. 1 MiB reads were as fast as larger ones, and stay in the processor's cache for the checksum.
+/// Bytes read at a time: few calls, and what was read is still in the processor's cache for the checksum.
 const WINDOW: usize = 1 << 20;
 
 /// A reader of records from one place on.

@@ -11,6 +11,7 @@ mod edit;
 mod exchange;
 mod failures;
 mod kill;
+mod lerobot;
 mod recover;
 mod report;
 mod round_trip;

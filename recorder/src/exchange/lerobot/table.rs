@@ -137,16 +137,29 @@ impl Layout {
     }
 }
 
+/// The file, until it is taken out of the Parquet writer to be finished.
+struct Sink<'a>(Option<OutFile<'a>>);
+
+impl io::Write for Sink<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.as_mut().map_or_else(|| Err(io::ErrorKind::BrokenPipe.into()), |file| file.write(bytes))
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
 /// Writes a table, a row group at a time.
 pub(super) struct TableWriter<'a> {
-    writer: SerializedFileWriter<OutFile<'a>>,
+    writer: SerializedFileWriter<Sink<'a>>,
     name: String,
 }
 
 impl<'a> TableWriter<'a> {
     /// Begins a table; `name` is for messages.
     pub(super) fn new(file: OutFile<'a>, name: &str, layout: &Layout) -> Result<Self> {
-        let new = || SerializedFileWriter::new(file, layout.schema()?, layout.properties()?);
+        let new = || SerializedFileWriter::new(Sink(Some(file)), layout.schema()?, layout.properties()?);
         let writer = new().map_err(|e| failed("write", name, e))?;
         Ok(Self { writer, name: name.to_owned() })
     }
@@ -182,8 +195,11 @@ impl<'a> TableWriter<'a> {
 
     /// Writes the footer, makes the file durable, gives it its name and says how long it is.
     pub(super) fn close(self) -> Result<u64> {
-        let Self { writer, name } = self;
-        writer.into_inner().map_err(|e| failed("write", &name, e))?.finish()
+        let Self { mut writer, name } = self;
+        // Not `into_inner`: that tells a failed write as text, and a full disk must be known as one.
+        writer.finish().map_err(|e| failed("write", &name, e))?;
+        let gone = || Error::new(ErrorKind::Io, format!("cannot write {name}: it is closed already"));
+        writer.inner_mut().0.take().ok_or_else(gone)?.finish()
     }
 }
 
@@ -249,7 +265,7 @@ impl ChunkReader for Table {
 }
 
 fn write_group(
-    writer: &mut SerializedFileWriter<OutFile<'_>>,
+    writer: &mut SerializedFileWriter<Sink<'_>>,
     columns: &[Values],
 ) -> parquet::errors::Result<()> {
     let mut group = writer.next_row_group()?;
@@ -278,7 +294,7 @@ fn write_group(
     group.close().map(drop)
 }
 
-type Group<'a, 'f> = SerializedRowGroupWriter<'a, OutFile<'f>>;
+type Group<'a, 'f> = SerializedRowGroupWriter<'a, Sink<'f>>;
 
 /// Writes the next leaf column: values with their definition and repetition levels.
 fn write_leaf<T: DataType>(
