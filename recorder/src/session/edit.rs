@@ -30,8 +30,8 @@ pub struct SessionChanges {
 ///
 /// # Errors
 /// [`ErrorKind::NotFound`] or [`ErrorKind::NotADataset`] without a session file, [`ErrorKind::BadInput`] while it is
-/// being recorded or unfinished or for an empty note, [`ErrorKind::Corrupt`] when the file is no session (it is left
-/// alone), and what the file system says.
+/// being recorded or unfinished or for an empty note, [`ErrorKind::InUse`] while another process works on it,
+/// [`ErrorKind::Corrupt`] when the file is no session (it is left alone), and what the file system says.
 pub fn edit(fs: &dyn Fs, dir: &Path, changes: &SessionChanges) -> Result<Vec<Edit>> {
     if changes.notes.iter().any(|n| n.trim().is_empty()) {
         return Err(Error::new(ErrorKind::BadInput, "the note is empty"));
@@ -103,10 +103,13 @@ struct SessionText<'a> {
     document: DocumentMut,
     session: Session,
     edits: Vec<Edit>,
+    /// Keeps a recorder, a recovery and another edit out; `None` where the file system has no locks.
+    _lock: Option<Box<dyn Send + Sync>>,
 }
 
 impl<'a> SessionText<'a> {
     fn open(fs: &'a dyn Fs, dir: &Path) -> Result<Self> {
+        let lock = fs.lock(dir);
         let entries = fs.read_dir(dir).map_err(|e| Error::io("open", dir, e))?;
         let part = |p: &PathBuf| p.extension().is_some_and(|e| e == "part");
         if let Some(part) = segments_in(&entries, dir).iter().find(|p| part(p)) {
@@ -120,6 +123,17 @@ impl<'a> SessionText<'a> {
                 ),
             ));
         }
+        // After the search: who records can be told more than that it is in use.
+        let lock = match lock {
+            Err(e) if e.kind() == std::io::ErrorKind::WouldBlock => {
+                let what = format!(
+                    "{} is in use: it is being recorded, recovered or edited; try again when that is done",
+                    dir.display()
+                );
+                return Err(Error::new(ErrorKind::InUse, what).with_source(e));
+            }
+            lock => lock.ok(),
+        };
         let path = dir.join(SESSION_FILE);
         if !entries.iter().any(|e| !e.is_dir && e.name == SESSION_FILE) {
             let what = format!("{} has no {SESSION_FILE} to edit", dir.display());
@@ -130,7 +144,7 @@ impl<'a> SessionText<'a> {
         let document = text.parse::<DocumentMut>().map_err(|e| {
             Error::new(ErrorKind::Corrupt, format!("{} is no TOML: {e}", path.display())).with_source(e)
         })?;
-        Ok(Self { fs, path, document, session, edits: Vec::new() })
+        Ok(Self { fs, path, document, session, edits: Vec::new(), _lock: lock })
     }
 
     /// Sets a text of the session.
@@ -202,9 +216,9 @@ impl<'a> SessionText<'a> {
     }
 
     /// Replaces the file, if anything changed, after reading the new text as a session.
-    fn save(self) -> Result<Vec<Edit>> {
+    fn save(&mut self) -> Result<Vec<Edit>> {
         if self.edits.is_empty() {
-            return Ok(self.edits);
+            return Ok(Vec::new());
         }
         let text = self.document.to_string();
         // Compared as text, in which a NaN of a hand-written key equals itself.
@@ -213,6 +227,6 @@ impl<'a> SessionText<'a> {
             return Err(Error::new(ErrorKind::Corrupt, what));
         }
         fs::replace(self.fs, &self.path, text.as_bytes()).map_err(|e| Error::io("write", &self.path, e))?;
-        Ok(self.edits)
+        Ok(std::mem::take(&mut self.edits))
     }
 }

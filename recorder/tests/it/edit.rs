@@ -150,6 +150,33 @@ fn renaming_moves_folder_and_name_and_never_onto_something() {
 }
 
 #[test]
+fn what_another_process_has_locked_is_not_edited() {
+    let home = tempfile::tempdir().unwrap();
+    let dir = home.path().join("held");
+    let r = depthrig_recorder::Recorder::create(Arc::new(RealFs), &dir, session(), options()).unwrap();
+    r.push(set(&session(), 0)).unwrap();
+    settle(&r);
+    let told = edit(&RealFs, &dir, &scene("x")).unwrap_err().to_string();
+    assert!(told.contains("is being recorded") && told.contains("record note"), "{told}");
+    r.finish().unwrap();
+    let before = std::fs::read(dir.join(SESSION_FILE)).unwrap();
+    let lock = RealFs.lock(&dir).unwrap();
+    for e in [edit(&RealFs, &dir, &scene("x")).err(), rename(&RealFs, &dir, "other").err()] {
+        let e = e.expect("it is locked");
+        assert_eq!(e.kind(), ErrorKind::InUse);
+        assert!(e.to_string().contains("is in use") && e.to_string().contains("held"), "{e}");
+    }
+    assert_eq!(std::fs::read(dir.join(SESSION_FILE)).unwrap(), before);
+    assert!(dir.exists());
+    drop(lock);
+    // Each lets go of it at its end.
+    for value in ["x", "y"] {
+        edit(&RealFs, &dir, &scene(value)).unwrap();
+    }
+    rename(&RealFs, &dir, "other").unwrap();
+}
+
+#[test]
 fn names_that_are_no_names() {
     for good in ["a", "20260314_1512_kitchen", "Küche 2", &"x".repeat(240)] {
         assert!(check_name(good).is_ok(), "{good}");
