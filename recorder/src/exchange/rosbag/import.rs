@@ -1,8 +1,8 @@
 //! A bag of librealsense as a dataset.
 
 use super::FORMAT;
-use super::bag::{Bag, Message, Place, Unpacked};
-use super::messages::{camera_info, float, image, key_value, stream_rate, transform};
+use super::bag::{Bag, Unpacked};
+use super::messages::image;
 use super::sets::{Set, group};
 use crate::exchange::bytecamera::camera_name;
 use crate::exchange::{ImportFacts, ImportProgress, Importer, import as driver};
@@ -12,15 +12,16 @@ use depthrig_bus::{
     ClockDomain, DropCounts, DropReason, FrameFlags, FrameHeader, HostTime, Intrinsics, PixelFormat, Pose,
     StreamId, UtcPair,
 };
+use pose::pose_of;
+use scan::{Frame, Scan};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Frames that are imported from one bag: three weeks at 30 Hz with two streams.
-const FRAMES_MAX: usize = 100_000_000;
+mod pose;
+mod scan;
+
 /// The clock map of a bag with less than this has `CLOCK_WARMUP`, as that of a camera that just began.
 const WARMUP_NS: i64 = 5_000_000_000;
-/// Largest rotation that two quaternions of one rotation differ by, to see one that is none.
-const UNIT: core::ops::Range<f64> = 0.99..1.01;
 
 /// The importer of one bag.
 pub struct RosbagImport {
@@ -43,157 +44,6 @@ struct Stream {
     sequence: u64,
     dropped: DropCounts,
     last_counter: Option<u64>,
-}
-
-/// What the bag says of one frame.
-#[derive(Debug, Clone, Default)]
-struct Frame {
-    place: Option<Place>,
-    /// Time of its messages in the bag.
-    bag_ns: i64,
-    stamp_ns: i64,
-    counter: Option<u64>,
-    sensor_us: Option<u64>,
-    sent_us: Option<u64>,
-    arrival_ns: Option<i64>,
-    exposure_us: Option<u64>,
-    gain: Option<f32>,
-    host_clock: bool,
-    /// Filled in when the clocks are mapped.
-    capture_ns: i64,
-    device_us: u64,
-    uncertainty_ns: u64,
-}
-
-/// What is found under a topic's prefix `/device_D/sensor_S/Stream_I`.
-#[derive(Default)]
-struct Found {
-    frames: Vec<Frame>,
-    size: Option<(u32, u32)>,
-    format: Option<PixelFormat>,
-    info: Option<(u32, u32, Intrinsics)>,
-    to_color: Option<([f64; 3], [f64; 4])>,
-    rate_hz: f64,
-    refused: Option<String>,
-}
-
-/// The first pass.
-#[derive(Default)]
-struct Scan {
-    streams: BTreeMap<Key, Found>,
-    /// Key and value of each device.
-    devices: BTreeMap<u32, BTreeMap<String, String>>,
-    /// Option and value of each sensor, the last one.
-    options: BTreeMap<(u32, u32), BTreeMap<String, f32>>,
-    topics: usize,
-    others: BTreeMap<String, u64>,
-}
-
-/// Device, sensor, kind of stream, index.
-type Key = (u32, u32, String, u32);
-
-/// The parts of a topic of librealsense.
-enum Topic<'a> {
-    Stream(Key, &'a str),
-    Device(u32, &'a str),
-    Sensor(u32, u32, &'a str),
-}
-
-fn topic(text: &str) -> Option<Topic<'_>> {
-    let (device, rest) = text.strip_prefix("/device_")?.split_once('/')?;
-    let device = device.parse().ok()?;
-    let Some(rest) = rest.strip_prefix("sensor_") else { return Some(Topic::Device(device, rest)) };
-    let (sensor, rest) = rest.split_once('/')?;
-    let sensor = sensor.parse().ok()?;
-    if let Some((stream, what)) = rest.split_once('/')
-        && let Some((kind, index)) = stream.rsplit_once('_')
-        && let Ok(index) = index.parse()
-    {
-        return Some(Topic::Stream((device, sensor, kind.to_owned(), index), what));
-    }
-    Some(Topic::Sensor(device, sensor, rest))
-}
-
-impl Scan {
-    fn message(&mut self, m: &Message<'_>) {
-        self.topics += 1;
-        match topic(&m.connection.topic) {
-            Some(Topic::Stream(key, what)) => self.of_stream(key, what, m),
-            Some(Topic::Device(device, "info")) => {
-                if let Some((k, v)) = key_value(m.data) {
-                    self.devices.entry(device).or_default().insert(k.to_owned(), v.to_owned());
-                }
-            }
-            Some(Topic::Sensor(device, sensor, what)) => {
-                let option = what.strip_prefix("option/").and_then(|o| o.strip_suffix("/value"));
-                if let (Some(option), Some(v)) = (option, float(m.data)) {
-                    self.options.entry((device, sensor)).or_default().insert(option.to_owned(), v);
-                }
-            }
-            _ => {}
-        }
-    }
-
-    fn of_stream(&mut self, key: Key, what: &str, m: &Message<'_>) {
-        let depth = key.2 == "Depth";
-        let found = self.streams.entry(key).or_default();
-        match what {
-            "info" => found.rate_hz = f64::from(stream_rate(m.data).unwrap_or(0)),
-            "info/camera_info" => found.info = camera_info(m.data),
-            "tf/0" => found.to_color = transform(m.data),
-            "image/data" => match image(m.data) {
-                Some(i) => match i.format(depth).filter(|_| !i.big_endian) {
-                    Some(format) if found.frames.len() < FRAMES_MAX => {
-                        found.format.get_or_insert(format);
-                        found.size.get_or_insert((i.width, i.height));
-                        let (place, bag_ns) = (Some(m.place), m.time_ns);
-                        found.frames.push(Frame { place, bag_ns, stamp_ns: i.stamp_ns, ..Frame::default() });
-                    }
-                    _ => found.refused = Some(format!("{} pixels", i.encoding)),
-                },
-                None => found.refused = Some("an image that ends too early".to_owned()),
-            },
-            "image/metadata" => {
-                // Written after the picture, with the picture's time.
-                if let (Some(frame), Some((k, v))) = (found.frames.last_mut(), key_value(m.data))
-                    && frame.bag_ns == m.time_ns
-                {
-                    frame.learn(k, v);
-                }
-            }
-            _ if what.starts_with("imu/") || what.starts_with("pose/") => {
-                *self.others.entry(m.connection.topic.clone()).or_default() += 1;
-            }
-            _ => {}
-        }
-    }
-}
-
-impl Frame {
-    fn learn(&mut self, key: &str, value: &str) {
-        let whole = || value.parse::<u64>().ok();
-        match key {
-            "Frame Counter" => self.counter = whole(),
-            "Sensor Timestamp" => self.sensor_us = whole(),
-            "Frame Timestamp" => self.sent_us = whole(),
-            "Actual Exposure" => self.exposure_us = whole(),
-            "Gain Level" => self.gain = value.parse().ok(),
-            // The same moment twice: to the microsecond, and to the millisecond.
-            "system_time" => self.arrival_ns = milliseconds(value),
-            "Time Of Arrival" if self.arrival_ns.is_none() => self.arrival_ns = milliseconds(value),
-            "timestamp_domain" => self.host_clock = value != "Hardware Clock",
-            _ => {}
-        }
-    }
-}
-
-/// Nanoseconds of a decimal number of milliseconds, exactly: `f64` would lose the last digits.
-fn milliseconds(text: &str) -> Option<i64> {
-    let (whole, part) = text.split_once('.').unwrap_or((text, ""));
-    let whole: i64 = whole.parse().ok()?;
-    let digits: String = part.chars().chain(std::iter::repeat('0')).take(6).collect();
-    let part: i64 = digits.parse().ok()?;
-    whole.checked_mul(1_000_000)?.checked_add(part)
 }
 
 impl RosbagImport {
@@ -487,30 +337,6 @@ impl RosbagImport {
     }
 }
 
-/// Where the camera is on the mount, whose origin is that of depth: the bag has the way from depth to this stream,
-/// `p_stream = R p_depth + t`, and a pose is the way back.
-fn pose_of((t, q): ([f64; 3], [f64; 4])) -> Option<Pose> {
-    let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
-    if !UNIT.contains(&norm) || !t.iter().all(|v| v.is_finite()) {
-        return None;
-    }
-    let [x, y, z, w] = q.map(|v| v / norm);
-    // The inverse of a rotation is its conjugate; the identity stays as it is, without a minus zero.
-    let q = [0.0 - x, 0.0 - y, 0.0 - z, w];
-    let [a, b, c] = rotate(q, t);
-    Some(Pose { translation_m: [0.0 - a, 0.0 - b, 0.0 - c], rotation_xyzw: q })
-}
-
-/// `v` turned by the unit quaternion `q`: v + 2w(u × v) + 2(u × (u × v)).
-fn rotate([x, y, z, w]: [f64; 4], v: [f64; 3]) -> [f64; 3] {
-    let cross = |a: [f64; 3], b: [f64; 3]| {
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    };
-    let once = cross([x, y, z], v);
-    let twice = cross([x, y, z], once);
-    [0, 1, 2].map(|i| v[i] + 2.0 * w * once[i] + 2.0 * twice[i])
-}
-
 impl Importer for RosbagImport {
     fn format(&self) -> &'static str {
         FORMAT
@@ -594,37 +420,4 @@ pub(crate) fn fuzz(file: Box<dyn ReadFile>) -> u64 {
     }
     assert!(import.facts().accounts.iter().all(StreamAccount::balances), "captured = delivered + dropped");
     frames
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn milliseconds_are_exact() {
-        assert_eq!(milliseconds("1534232519732.935547"), Some(1_534_232_519_732_935_547));
-        assert_eq!(milliseconds("1534232519732"), Some(1_534_232_519_732_000_000));
-        assert_eq!(milliseconds("1.5"), Some(1_500_000));
-        for bad in ["", "x", "1.x", "99999999999999999999", "9223372036854775807"] {
-            assert_eq!(milliseconds(bad), None, "{bad}");
-        }
-    }
-
-    #[test]
-    fn a_pose_is_the_way_back() {
-        let half = core::f64::consts::FRAC_1_SQRT_2;
-        // A quarter turn about z, then 1 m along x: the point (0, -1, 0) of depth is the stream's (2, 0, 0).
-        let (t, q) = ([1.0, 0.0, 0.0], [0.0, 0.0, half, half]);
-        let p = [0.0, -1.0, 0.0];
-        let there = rotate(q, p);
-        let there = [there[0] + t[0], there[1] + t[1], there[2] + t[2]];
-        let pose = pose_of((t, q)).unwrap();
-        let back = rotate(pose.rotation_xyzw, there);
-        for (i, v) in p.iter().enumerate() {
-            assert!((there[i] - [2.0, 0.0, 0.0][i]).abs() < 1e-12);
-            assert!((back[i] + pose.translation_m[i] - v).abs() < 1e-12);
-        }
-        assert_eq!(pose_of(([0.0; 3], [0.0, 0.0, 0.0, 1.0])), Some(Pose::IDENTITY));
-        assert_eq!(pose_of(([0.0; 3], [0.0; 4])), None);
-    }
 }

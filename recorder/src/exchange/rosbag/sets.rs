@@ -101,9 +101,27 @@ mod tests {
             }
             let most = times.iter().map(Vec::len).max().unwrap_or(0);
             let reference = times.iter().position(|t| t.len() == most).unwrap();
+            let ticks = &times[reference];
+            let mut steps: Vec<i64> = ticks.windows(2).map(|w| w[1] - w[0]).collect();
+            steps.sort_unstable();
+            let half = steps.get(steps.len() / 2).unwrap_or(&100_000_000) / 2;
             for s in sets.iter().filter(|s| s.frames[reference].is_none()) {
-                // Who is alone has no tick near, or a nearer one of its stream has it.
-                prop_assert_eq!(s.frames.iter().flatten().count(), 1);
+                let all: Vec<usize> = (0..times.len()).filter(|i| s.frames[*i].is_some()).collect();
+                prop_assert_eq!(all.len(), 1);
+                // Who is alone has no tick near, or a frame of its stream that is as near has it.
+                let far = |tick: i64| (tick - s.tick_ns).abs();
+                let least = ticks.iter().map(|tick| far(*tick)).min().unwrap();
+                let taken = sets.iter().filter(|o| o.frames[reference].is_some() && far(o.tick_ns) == least);
+                let nearer = |o: &Set| {
+                    o.frames[all[0]].is_some_and(|f| (times[all[0]][f] - o.tick_ns).abs() <= least)
+                };
+                prop_assert!(least > half || taken.clone().any(nearer), "{:?} of {:?}", s, sets);
+            }
+            for s in sets.iter().filter(|s| s.frames[reference].is_some()) {
+                let near = |(stream, f): (usize, &Option<usize>)| {
+                    f.is_none_or(|f| (times[stream][f] - s.tick_ns).abs() <= half)
+                };
+                prop_assert!(s.frames.iter().enumerate().all(near), "{:?}", s);
             }
         }
     }

@@ -268,6 +268,21 @@ fn depth_units_and_rates_are_as_given() {
     assert_eq!(times, [0, 100_000_000]);
 }
 
+/// A list that ends early between two lines is no broken line: the files it does not name tell.
+#[test]
+fn a_list_that_lost_its_last_lines_is_told() {
+    let fs = recorded(&everything(), 3, ColorCodec::Raw);
+    exported(&fs, CameraNames::Short, None).unwrap();
+    let path = session_dir().join("frames.csv");
+    let whole = String::from_utf8(contents(&fs, &path)).unwrap();
+    // The head and two sets of ten streams; the third set has nine frames.
+    let begin: String = whole.split_inclusive('\n').take(21).collect();
+    fs.put(&path, begin.into_bytes());
+    let made = imported(&fs, &session_dir(), ByteCameraOptions::default()).unwrap();
+    assert_eq!((made.summary.sets.recorded, made.facts.lost), (2, 9));
+    assert_eq!(made.facts.problems, ["9 files are not named in frames.csv"]);
+}
+
 #[test]
 fn what_is_no_such_folder_is_refused() {
     let refused = |fs: &MemFs, from: &str, options| {

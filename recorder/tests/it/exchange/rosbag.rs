@@ -122,6 +122,26 @@ fn other_files_are_refused_with_advice() {
     assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains("rosbag decompress"), "{e}");
 }
 
+/// A chunk that unpacks to more or less than its header says is damaged, whatever is in it.
+#[test]
+fn a_chunk_of_another_size_is_told() {
+    let whole = real_bag();
+    let at = whole.windows(5).rposition(|w| w == b"size=").unwrap() + 5;
+    let size = u32::from_le_bytes(whole[at..at + 4].try_into().unwrap());
+    for (wrong, word) in [
+        (size - 1, format!("its header says {}", size - 1)),
+        (size + 1, format!("its header says {}", size + 1)),
+        (u32::MAX, "is the most".to_owned()),
+    ] {
+        let mut bytes = whole.clone();
+        bytes[at..at + 4].copy_from_slice(&wrong.to_le_bytes());
+        let (_, report) = imported(bytes);
+        let report = report.unwrap();
+        assert_eq!(report.facts.lost, 1, "{:?}", report.facts.problems);
+        assert!(report.facts.problems[0].contains(&word), "{:?}", report.facts.problems);
+    }
+}
+
 /// A byte changed at many places: no panic, no endless loop, and no frame that is not what the file says.
 #[test]
 fn a_bag_that_is_damaged_is_no_surprise() {

@@ -1,0 +1,72 @@
+//! The files of a session's folder.
+
+use super::bad;
+use crate::exchange::bytecamera::names;
+use crate::exchange::bytecamera::pictures::MAX_FILE;
+use crate::fs::{Fs, ReadFile};
+use crate::{Error, Result};
+use std::collections::BTreeMap;
+use std::io::{self, Read};
+use std::path::Path;
+
+/// A file as a stream of bytes.
+pub(super) struct Bytes {
+    pub(super) file: Box<dyn ReadFile>,
+    pub(super) at: u64,
+    pub(super) size: u64,
+}
+
+impl Read for Bytes {
+    fn read(&mut self, buf: &mut [u8]) -> io::Result<usize> {
+        let n = buf.len().min(usize::try_from(self.size - self.at).unwrap_or(usize::MAX));
+        self.file.read_exact_at(&mut buf[..n], self.at)?;
+        self.at += n as u64;
+        Ok(n)
+    }
+}
+
+/// The files of each folder, prefix and ending by their numbers, with the name where it is not the plain one.
+pub(super) type Found = BTreeMap<(String, String, String), BTreeMap<u32, Option<String>>>;
+
+pub(super) fn list(fs: &dyn Fs, dir: &Path) -> Result<Found> {
+    let mut found = Found::new();
+    for folder in fs.read_dir(dir).map_err(|e| Error::io("list", dir, e))? {
+        if !folder.is_dir || !folder.name.starts_with("camera_") {
+            continue;
+        }
+        let path = dir.join(&folder.name);
+        for file in fs.read_dir(&path).map_err(|e| Error::io("list", &path, e))? {
+            let Some((prefix, n, ending)) = names::file_parts(&file.name).filter(|_| !file.is_dir) else {
+                continue;
+            };
+            let plain = format!("{prefix}_{n}.{ending}");
+            let key = (folder.name.clone(), prefix.to_owned(), ending.to_owned());
+            let name = (file.name != plain).then(|| file.name.clone());
+            if found.entry(key).or_default().insert(n, name).is_some() {
+                return Err(bad(
+                    &path,
+                    format_args!(
+                        "number {n} of {prefix}_N.{ending} is there twice, as {plain} and with leading zeros"
+                    ),
+                ));
+            }
+        }
+    }
+    Ok(found)
+}
+
+/// A whole file; `None` when it is not there.
+pub(super) fn read_file(fs: &dyn Fs, path: &Path) -> Result<Option<Vec<u8>>> {
+    let file = match fs.open(path) {
+        Ok(file) => file,
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(e) => return Err(Error::io("open", path, e)),
+    };
+    let size = file.size().map_err(|e| Error::io("read", path, e))?;
+    if size > MAX_FILE {
+        return Err(bad(path, format_args!("it has {size} bytes, more than any picture")));
+    }
+    let mut bytes = vec![0; size as usize];
+    file.read_exact_at(&mut bytes, 0).map_err(|e| Error::io("read", path, e))?;
+    Ok(Some(bytes))
+}

@@ -1,0 +1,122 @@
+//! Streams without a `calibration.json`: from the names of folders and files, and the first picture of each.
+
+use super::files::Found;
+use super::stream::Stream;
+use super::{ByteCameraImport, bad};
+use crate::exchange::bytecamera::names;
+use crate::exchange::bytecamera::pictures::{Picture, Want};
+use crate::{Result, StreamRecord};
+use depthrig_bus::{Intrinsics, PixelFormat, Pose, StreamId};
+use std::collections::BTreeMap;
+
+impl ByteCameraImport {
+    /// Streams as the names of folders and files and the first picture of each tell them.
+    pub(super) fn inferred(&mut self, found: Found) -> Result<()> {
+        let mut cameras: BTreeMap<String, (String, String)> = BTreeMap::new();
+        for ((folder, prefix, ending), files) in found {
+            let want = match (prefix.as_str(), ending.as_str()) {
+                ("raw_depth", "npy") => Want::Metres,
+                (p, "png") if p == "depth" || p.starts_with("depth_") => Want::Depth,
+                (p, "png") if p.ends_with("color") => Want::Color,
+                (p, "png") if p.starts_with("ir") => Want::Grey,
+                _ => {
+                    self.state(format!(
+                        "{folder}/{prefix}_N.{ending}: {} files are left out, a dataset has no such stream",
+                        files.len()
+                    ));
+                    continue;
+                }
+            };
+            let part = folder.strip_prefix("camera_").unwrap_or(&folder);
+            let (mut name, model) = names::camera_of(part);
+            if let Some((known, _)) = cameras.get(&folder) {
+                name = names::name(known);
+            } else {
+                let plain = name.clone();
+                let mut n = 2;
+                while cameras.values().any(|(taken, _)| taken == name.as_str()) {
+                    name = names::name(&format!("{plain}_{n}"));
+                    n += 1;
+                }
+                cameras.insert(folder.clone(), (name.to_string(), model.clone()));
+            }
+            let stream = match prefix.as_str() {
+                "R_color" => "color_right".to_owned(),
+                other => names::name(other).to_string(),
+            };
+            let id = StreamId::new(name.as_str(), &stream).map_err(|e| bad(&self.dir.join(&folder), e))?;
+            if self.streams.iter().any(|s| s.record.id == id) {
+                return Err(bad(&self.dir.join(&folder), format_args!("stream {id} is there twice")));
+            }
+            let record = StreamRecord {
+                id: id.clone(),
+                model: model.clone(),
+                serial: String::new(),
+                format: PixelFormat::Z16,
+                width: 0,
+                height: 0,
+                rate_hz: 0.0,
+                depth_unit_m: 0.0,
+                calibration: "none: the folders hold no calibration".to_owned(),
+                intrinsics: Intrinsics::default(),
+                pose: Pose::IDENTITY,
+            };
+            let mut stream = Stream::new(folder.clone(), prefix, ending, want, files, record);
+            let Some(first) = self.first_picture(&mut stream)? else { continue };
+            let r = &mut stream.record;
+            (r.format, r.width, r.height) = (first.format, first.width, first.height);
+            if r.format == PixelFormat::Z16 {
+                r.depth_unit_m = self.unit(&id, &folder, &model, &first.pixels);
+            } else if r.format == PixelFormat::DepthF32 {
+                r.depth_unit_m = 1.0;
+            }
+            self.streams.push(stream);
+        }
+        if self.streams.is_empty() {
+            return Err(bad(
+                &self.dir,
+                "it holds no folder camera_<model> with depth_N.png, color_N.png, ir_N.png or raw_depth_N.npy",
+            ));
+        }
+        "rig".clone_into(&mut self.session.rig);
+        self.state("there is no calibration.json: no intrinsics, no poses".to_owned());
+        Ok(())
+    }
+
+    /// The first picture of a stream that can be read; it says format and size.
+    fn first_picture(&mut self, stream: &mut Stream) -> Result<Option<Picture>> {
+        let numbers: Vec<u32> = stream.files.keys().copied().collect();
+        for n in numbers {
+            if let Ok(picture) = self.picture(stream, n)? {
+                return Ok(Some(picture));
+            }
+        }
+        for n in stream.files.keys() {
+            let path = stream.path(*n);
+            self.facts.lose(format!("{path}: no file of its kind can be read, the stream is left out"));
+        }
+        Ok(None)
+    }
+
+    /// The depth unit as given, else as inferred; it is stated.
+    fn unit(&mut self, id: &StreamId, folder: &str, model: &str, pixels: &[u8]) -> f64 {
+        let mut values: Vec<u16> = pixels.as_chunks().0.iter().map(|v| u16::from_le_bytes(*v)).collect();
+        values.retain(|v| *v != 0 && *v != u16::MAX);
+        let middle = values.len() / 2;
+        let median = if values.is_empty() { 0 } else { *values.select_nth_unstable(middle).1 };
+        let (unit, why) = if let Some(unit) = self.given_unit(id.camera.as_str(), folder) {
+            (unit, "as given".to_owned())
+        } else if let Some(unit) = names::usual_depth_unit_m(model) {
+            (unit, format!("inferred from the model {model}, which comes so"))
+        } else {
+            // Indoors the middle of a picture is nearer than 8 m; in units of 0.1 mm it is then below 65535.
+            let unit = if median > 8000 { 0.0001 } else { 0.001 };
+            (unit, "inferred from the numbers of the first picture".to_owned())
+        };
+        let metres = f64::from(median) * unit;
+        self.state(format!(
+            "{id}: depth unit {unit} m {why}; the first picture's median is then {metres:.3} m"
+        ));
+        unit
+    }
+}

@@ -1,0 +1,137 @@
+//! Sets, times and counters from `frames.csv`, read line by line.
+
+use super::files::Bytes;
+use super::{ByteCameraImport, FRAMES_FILE, List, bad};
+use crate::exchange::bytecamera::rows::{Row, head};
+use crate::fs::ReadFile;
+use crate::{Error, RecordFrame, RecordSet, Result};
+use depthrig_bus::{HostTime, UtcPair};
+use std::io::{BufRead, BufReader, Read};
+use std::path::Path;
+
+/// Longest line of `frames.csv`, bytes; ours have a few hundred.
+const LINE_MAX: u64 = 64 << 10;
+
+impl ByteCameraImport {
+    /// Sets from `frames.csv`, whose first lines are read.
+    pub(super) fn by_rows(&mut self, file: Box<dyn ReadFile>, path: &Path) -> Result<()> {
+        let size = file.size().map_err(|e| Error::io("read", path, e))?;
+        let lines = Box::new(BufReader::with_capacity(64 << 10, Bytes { file, at: 0, size }));
+        self.list = List::Rows { lines, line: 0, next: None };
+        let first = self.line()?;
+        if first.as_deref() != Some(head().trim_end()) {
+            return Err(bad(
+                path,
+                "its first line does not name the columns that depthrig writes; remove the file to import without times",
+            ));
+        }
+        let row = self.row()?;
+        let Some(row) = row else { return Err(bad(path, "it names no frames")) };
+        if self.session.started_utc_ns == 0 {
+            self.session.started_utc_ns = row.set_utc_ns;
+        }
+        self.put_back(row);
+        self.state(format!("times, counters and set numbers are those of {FRAMES_FILE}"));
+        Ok(())
+    }
+
+    /// The next line of `frames.csv`.
+    fn line(&mut self) -> Result<Option<String>> {
+        let path = self.dir.join(FRAMES_FILE);
+        let List::Rows { lines, line, .. } = &mut self.list else { return Ok(None) };
+        *line += 1;
+        let mut bytes = Vec::new();
+        lines
+            .by_ref()
+            .take(LINE_MAX)
+            .read_until(b'\n', &mut bytes)
+            .map_err(|e| Error::io("read", &path, e))?;
+        if bytes.is_empty() {
+            return Ok(None);
+        }
+        if bytes.pop_if(|b| *b == b'\n').is_none() {
+            return Err(bad(&path, format_args!("line {line} has no end: the file was cut")));
+        }
+        bytes.pop_if(|b| *b == b'\r');
+        String::from_utf8(bytes).map(Some).map_err(|_| bad(&path, format_args!("line {line} is no text")))
+    }
+
+    fn row(&mut self) -> Result<Option<Box<Row>>> {
+        if let List::Rows { next, .. } = &mut self.list
+            && let Some(row) = next.take()
+        {
+            return Ok(Some(row));
+        }
+        let Some(text) = self.line()? else { return Ok(None) };
+        let List::Rows { line, .. } = &self.list else { return Ok(None) };
+        let path = self.dir.join(FRAMES_FILE);
+        Row::parse(&text).map(|r| Some(Box::new(r))).map_err(|e| bad(&path, format_args!("line {line}: {e}")))
+    }
+
+    fn put_back(&mut self, row: Box<Row>) {
+        if let List::Rows { next, .. } = &mut self.list {
+            *next = Some(row);
+        }
+    }
+
+    /// A set as `frames.csv` tells it.
+    pub(super) fn set_of_rows(&mut self) -> Result<Option<RecordSet>> {
+        let Some(first) = self.row()? else {
+            let unnamed = self.total.saturating_sub(self.done);
+            if unnamed > 0 {
+                self.facts.lost += unnamed;
+                self.facts.problems.push(format!("{unnamed} files are not named in {FRAMES_FILE}"));
+                self.done = self.total;
+            }
+            return Ok(None);
+        };
+        let mut set = RecordSet {
+            id: first.set,
+            tick: HostTime::from_ns(first.tick_ns),
+            utc: UtcPair { utc_ns: first.utc_offset_ns, ..UtcPair::default() },
+            frames: Vec::new(),
+            missing: Vec::new(),
+            spread_ns: first.spread_ns,
+        };
+        let id = first.set;
+        let mut row = Some(first);
+        while let Some(r) = row {
+            if r.set != id {
+                self.put_back(r);
+                break;
+            }
+            if !r.file.is_empty() {
+                self.frame_of_row(&r, &mut set)?;
+            }
+            row = self.row()?;
+        }
+        self.close(&mut set);
+        Ok(Some(set))
+    }
+
+    fn frame_of_row(&mut self, row: &Row, set: &mut RecordSet) -> Result<()> {
+        let Some(i) = self.streams.iter().position(|s| s.path(row.n) == row.file) else {
+            self.facts.lose(format!("set {}: {} is of no stream that is imported", row.set, row.file));
+            return Ok(());
+        };
+        if set.frames.iter().any(|f| f.stream == i) {
+            return Err(bad(
+                &self.dir.join(FRAMES_FILE),
+                format_args!("set {} names {} twice", row.set, row.file),
+            ));
+        }
+        self.done += u64::from(self.streams[i].files.contains_key(&row.n));
+        match self.picture(&self.streams[i], row.n)? {
+            Ok(picture) => {
+                let s = &mut self.streams[i];
+                let mut header = row.header;
+                s.fill(&mut header, &self.session.rig, &picture);
+                s.told = Some(header);
+                self.alpha_dropped += u64::from(picture.alpha_dropped);
+                set.frames.push(RecordFrame { stream: i, header, pixels: Box::new(picture.pixels) });
+            }
+            Err(why) => self.facts.lose(format!("{}: {why}", row.file)),
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,95 @@
+//! One stream of pictures while it is imported.
+
+use crate::exchange::bytecamera::pictures::{Picture, Want};
+use crate::{StreamAccount, StreamRecord};
+use depthrig_bus::{DropCounts, FrameHeader};
+use std::collections::BTreeMap;
+
+/// One kind of file in one folder.
+pub(super) struct Stream {
+    pub(super) folder: String,
+    pub(super) prefix: String,
+    pub(super) ending: String,
+    pub(super) want: Want,
+    /// The name of each number's file where it is not the plain one (`depth_007.png`), and which numbers there are.
+    pub(super) files: BTreeMap<u32, Option<String>>,
+    pub(super) record: StreamRecord,
+    /// The unit of depth is another one than the files say.
+    pub(super) unit_given: bool,
+    pub(super) sequence: u64,
+    pub(super) dropped: DropCounts,
+    /// The number of the last frame, to see what is missing between it and the next.
+    pub(super) last: Option<u32>,
+    /// The header of the last frame, where the files say it.
+    pub(super) told: Option<FrameHeader>,
+}
+
+impl Stream {
+    pub(super) fn new(
+        folder: String,
+        prefix: String,
+        ending: String,
+        want: Want,
+        files: BTreeMap<u32, Option<String>>,
+        record: StreamRecord,
+    ) -> Self {
+        let dropped = DropCounts::default();
+        Self {
+            folder,
+            prefix,
+            ending,
+            want,
+            files,
+            record,
+            unit_given: false,
+            sequence: 0,
+            dropped,
+            last: None,
+            told: None,
+        }
+    }
+
+    /// The file of a number, below the folder of the session.
+    pub(super) fn path(&self, n: u32) -> String {
+        match self.files.get(&n) {
+            Some(Some(name)) => format!("{}/{name}", self.folder),
+            _ => format!("{}/{}_{n}.{}", self.folder, self.prefix, self.ending),
+        }
+    }
+
+    /// Refuses a picture that is not like the first one.
+    pub(super) fn check(&self, picture: Picture) -> Result<Picture, String> {
+        let r = &self.record;
+        if (picture.format, picture.width, picture.height) == (r.format, r.width, r.height) {
+            return Ok(picture);
+        }
+        let said = format!("{}x{} {}", r.width, r.height, r.format.name());
+        Err(format!(
+            "it is {}x{} {}, its stream is {said}",
+            picture.width,
+            picture.height,
+            picture.format.name()
+        ))
+    }
+
+    /// What the stream says of each of its frames.
+    pub(super) fn fill(&self, header: &mut FrameHeader, rig: &str, picture: &Picture) {
+        header.set_names(rig, &self.record.id);
+        header.set_device(&self.record.model, &self.record.serial);
+        header.set_picture(picture.format, picture.width, picture.height);
+        (header.intrinsics, header.pose) = (self.record.intrinsics, self.record.pose);
+        if self.unit_given {
+            header.depth_unit_m = self.record.depth_unit_m;
+        }
+    }
+
+    pub(super) fn account(&self) -> StreamAccount {
+        let (captured, delivered, dropped) = match &self.told {
+            Some(h) if self.sequence == 0 => {
+                (h.captured, h.captured.saturating_sub(h.drops().total()), h.drops())
+            }
+            _ => (self.sequence + self.dropped.total(), self.sequence, self.dropped),
+        };
+        StreamAccount { stream: self.record.id.clone(), captured, delivered, dropped }
+    }
+}
