@@ -186,6 +186,25 @@ mod tests {
         Cli::command().debug_assert();
     }
 
+    /// clap finds a clash with a global option only when the command is run, and panics then.
+    #[test]
+    fn no_command_has_an_option_of_the_name_of_a_global_one() {
+        fn check(command: &clap::Command, globals: &[&clap::Arg]) {
+            for sub in command.get_subcommands() {
+                for arg in sub.get_arguments() {
+                    let long = |g: &clap::Arg| g.get_long().is_some() && g.get_long() == arg.get_long();
+                    let clash = globals.iter().any(|g| g.get_id() == arg.get_id() || long(g));
+                    assert!(!clash, "{}: {}", sub.get_name(), arg.get_id());
+                }
+                check(sub, globals);
+            }
+        }
+        let cli = Cli::command();
+        let globals: Vec<_> = cli.get_arguments().filter(|a| a.is_global_set()).collect();
+        assert!(globals.iter().any(|g| g.get_id() == "color"));
+        check(&cli, &globals);
+    }
+
     #[test]
     fn seconds_are_positive() {
         assert_eq!(positive_seconds("0.5"), Ok(0.5));

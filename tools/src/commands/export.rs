@@ -17,12 +17,13 @@ mod lerobot;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-OUT is new. An export that was ended or killed goes on where it was when it is run again with the same datasets
-and options; the result is the same as without the interruption. Nothing is ever overwritten. OUT/export.json, written
-last, says what was exported and what was lost on the way; docs/exchange.md describes each layout.
+OUT is new. An export that was ended or killed goes on where it was when it is run again with the
+same datasets and options; the result is the same as without the interruption. Nothing is ever
+overwritten. OUT/export.json, written last, says what was exported and what was lost on the way;
+docs/exchange.md describes each layout.
 
-Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage, 3 exported, but some sets, frames or pixels
-could not be.
+Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage, 3 exported, but some sets,
+frames or pixels could not be.
 
 Examples:
   depthrig export bytecameradepth data/20261121_1015_kitchen paper
@@ -49,7 +50,7 @@ pub struct Common {
     /// The new folder
     #[arg(required = true)]
     out: PathBuf,
-    /// Segments that are worked on at once [default: one for each core]
+    /// Parts of 100 sets that are worked on at once [default: one for each core]
     #[arg(short = 'j', long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     jobs: Option<u16>,
     /// Print the report as JSON

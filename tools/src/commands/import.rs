@@ -18,38 +18,58 @@ use std::sync::Arc;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-OUT is a new dataset, verified at the end. What was assumed or inferred is told, and is in the table [import] of its
-session.toml; docs/exchange.md describes each layout.
+OUT is a new dataset, verified at the end. What was assumed or inferred is told, and is in the table
+[import] of its session.toml; docs/exchange.md describes each layout.
 
-Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage or input, 3 imported, but some of the input
-could not be.
+Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage or input, 3 imported, but
+some of the input could not be.
 
 Examples:
   depthrig import bytecameradepth recorded_data/20250314_1512 data/20250314_1512_kitchen
-  depthrig import bytecameradepth recorded_data/20250314_1512 data/kitchen --depth-unit d405=0.0001 --rate 5
-  depthrig import rosbag 20260314_151200.bag data/kitchen";
+  depthrig import rosbag 20260314_151200.bag data/20260314_1512_kitchen";
+
+const BYTECAMERA_EXAMPLES: &str = "\
+FOLDER holds camera_<model> folders with depth_N.png, color_N.png, ir_N.png and raw_depth_N.npy. With
+the frames.csv and calibration.json of an export it becomes that dataset again; without them times
+follow from N, and units of depth from the models.
+
+Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage or input, 3 imported, but
+some of the input could not be.
+
+Examples:
+  depthrig import bytecameradepth recorded_data/20250314_1512 data/20250314_1512_kitchen
+  depthrig import bytecameradepth monday data/monday --depth-unit d405=0.0001 --rate 5";
+
+const ROSBAG_EXAMPLES: &str = "\
+Pictures with their counters, device times, exposure and gain, intrinsics, poses and options come
+over; messages of motion sensors do not. A bag that was cut or damaged gives what can be read.
+
+Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage or input, 3 imported, but
+some of the bag could not be.
+
+Examples:
+  depthrig import rosbag 20260314_151200.bag data/20260314_1512_kitchen
+  depthrig import rosbag 20260314_151200.bag data/small --color-codec jpeg --json";
 
 /// The layouts.
 #[derive(Debug, clap::Subcommand)]
 pub enum ImportCommand {
     /// A session of the public ByteCameraDepth dataset, or one that depthrig exported
-    #[command(after_help = EXAMPLES)]
+    #[command(after_help = BYTECAMERA_EXAMPLES)]
     Bytecameradepth(ByteCameraArgs),
     /// A rosbag (version 2, .bag) that librealsense or the RealSense viewer recorded
-    #[command(after_help = EXAMPLES)]
+    #[command(after_help = ROSBAG_EXAMPLES)]
     Rosbag(RosbagArgs),
 }
 
 /// What every import has.
 #[derive(Debug, clap::Args)]
 struct Common {
-    /// What is imported
-    input: PathBuf,
     /// The new dataset's folder
     out: PathBuf,
     /// How colour is stored: every bit, or as JPEG of quality 95
-    #[arg(long, value_enum, default_value = "raw")]
-    color: Color,
+    #[arg(long, value_enum, default_value = "raw", value_name = "CODEC")]
+    color_codec: Color,
     /// Print the report as JSON
     #[arg(long)]
     json: bool,
@@ -66,6 +86,9 @@ enum Color {
 /// Arguments of `import bytecameradepth`.
 #[derive(Debug, clap::Args)]
 pub struct ByteCameraArgs {
+    /// The folder of one session
+    #[arg(value_name = "FOLDER")]
+    input: PathBuf,
     #[command(flatten)]
     common: Common,
     /// Metres per unit of depth, of all cameras or of one; may be given several times
@@ -79,6 +102,9 @@ pub struct ByteCameraArgs {
 /// Arguments of `import rosbag`.
 #[derive(Debug, clap::Args)]
 pub struct RosbagArgs {
+    /// The bag
+    #[arg(value_name = "FILE.bag")]
+    input: PathBuf,
     #[command(flatten)]
     common: Common,
 }
@@ -102,11 +128,11 @@ pub fn run(command: &ImportCommand, context: &Context) -> Result<Exit> {
                     None => options.depth_unit_m = Some(*unit),
                 }
             }
-            let importer = ByteCameraImport::open(Arc::clone(&fs), &args.common.input, options);
+            let importer = ByteCameraImport::open(Arc::clone(&fs), &args.input, options);
             drive(&mut importer.map_err(super::export::usage)?, fs, &args.common, context)
         }
         ImportCommand::Rosbag(args) => {
-            let importer = RosbagImport::open(&*fs, &args.common.input, name_of(&args.common.out));
+            let importer = RosbagImport::open(&*fs, &args.input, name_of(&args.common.out));
             drive(&mut importer.map_err(super::export::usage)?, fs, &args.common, context)
         }
     }
@@ -121,7 +147,7 @@ fn drive(importer: &mut dyn Importer, fs: Arc<dyn Fs>, common: &Common, context:
     if name_of(&common.out).is_empty() {
         return Err(UsageError(format!("{} is no name of a dataset", common.out.display())).into());
     }
-    let color = match common.color {
+    let color = match common.color_codec {
         Color::Raw => ColorCodec::Raw,
         Color::Jpeg => ColorCodec::Jpeg,
     };

@@ -7,13 +7,14 @@ use depthrig_recorder::exchange::{ByteCameraExport, CameraNames};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Writes OUT/YYYYMMDD_HHMM/camera_<model>/ with depth_N.png (16 bits, in the unit that calibration.json names; 0 is no
-depth), color_N.png, ir_N.png, raw_depth_N.npy (metres), and frames.csv and calibration.json beside the cameras. N counts
-the sets from 0: the same N is the same set in every folder, and a number that is not there is a frame that the set
-has not. OUT is new, or holds the same export unfinished, which then goes on.
+Writes OUT/YYYYMMDD_HHMM/camera_<model>/ with depth_N.png (16 bits, in the unit that
+calibration.json names; 0 is no depth), color_N.png, ir_N.png, raw_depth_N.npy (metres), and
+frames.csv and calibration.json beside the cameras. N counts the sets from 0: the same N is the same
+set in every folder, and a number that is not there is a frame that the set has not. OUT is new, or
+holds the same export unfinished, which then goes on.
 
-Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage, 3 exported, but some sets, frames or pixels
-could not be.
+Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage, 3 exported, but some sets,
+frames or pixels could not be.
 
 Examples:
   depthrig export bytecameradepth data/20261121_1015_kitchen paper
