@@ -28,7 +28,7 @@ BAG = DATA / "librealsense_bag" / "single_depth_color_640x480.bag"
 
 
 def test_real_pictures_come_back_as_they_were(binary: str, runtime: Path, rig_file: Path, tmp_path: Path) -> None:
-    arguments = ("run", str(rig_file), "--record", str(tmp_path / "recorded"), "--seconds", "2")
+    arguments = ("run", str(rig_file), "--record", str(tmp_path / "recorded"), "--seconds", "1")
     with running(binary, runtime, tmp_path / "log", *arguments) as daemon:
         daemon.wait(WAIT_S)
     (recorded,) = sorted(p.parent for p in (tmp_path / "recorded").rglob("session.toml"))
@@ -93,7 +93,7 @@ def test_a_bag_is_what_another_reader_says(dataset: Path, stream: str, topic: st
         wanted = [c for c in reader.connections if c.topic.startswith(f"/device_0/{topic}/image/")]
         for connection, _, raw in reader.messages(wanted):
             message = reader.deserialize(raw, connection.msgtype)
-            if connection.topic.endswith("data"):
+            if connection.topic.endswith("/image/data"):
                 images.append(message)
                 metadata.append({})
             else:
@@ -128,7 +128,7 @@ def paper_session(folder: Path, sets: int) -> Path:
 
 
 def test_an_export_that_is_killed_ends_as_one_that_is_not(binary: str, tmp_path: Path) -> None:
-    session = paper_session(tmp_path, 240)
+    session = paper_session(tmp_path, 150)
     recorded = tmp_path / "recorded"
     subprocess.run([binary, "import", "bytecameradepth", session, recorded], check=True, timeout=WAIT_S)
     export = [binary, "export", "bytecameradepth", recorded]
