@@ -177,7 +177,7 @@ fn set(sources: &[Source], id: u64, tick: HostTime, utc: UtcPair) -> RecordSet {
         header.set_names("bench", &record.id);
         header.set_picture(record.format, record.width, record.height);
         header.payload_len = picture.len() as u32;
-        header.sequence = id;
+        (header.sequence, header.captured) = (id, id);
         header.capture_time_ns = tick.ns();
         header.depth_unit_m = record.depth_unit_m;
         header.intrinsics = record.intrinsics;

@@ -295,7 +295,7 @@ fn a_folder_deleted_under_the_recorder_ends_the_recording() {
     let left = run(&home, &home.path("data"), |_| {}, fault, seconds(2.5));
     let error = left.recording.error.as_deref().unwrap_or_default();
     assert!(
-        error.contains("it does not exist"),
+        error.contains("was removed while it was recorded into"),
         "the status says so while the rig runs: {:?}",
         left.recording
     );
