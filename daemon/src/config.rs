@@ -104,6 +104,8 @@ pub struct RecordingConfig {
     pub queue_sets: usize,
     /// The recording ends cleanly when the disk has less than this left, MiB.
     pub reserve_mb: u64,
+    /// A recording is refused when the disk is expected to take less than so many minutes of it; 0: never.
+    pub min_minutes: u64,
     /// Whether datasets that were left unfinished here are recovered at the start.
     pub recover_on_start: bool,
 }
@@ -194,6 +196,7 @@ impl Default for RecordingConfig {
             workers: 0,
             queue_sets: 6,
             reserve_mb: 2048,
+            min_minutes: 1,
             recover_on_start: true,
         }
     }

@@ -17,7 +17,8 @@ pub trait Control: Send + Sync {
     /// Starts a recording.
     ///
     /// # Errors
-    /// `InUse` when one is going on, `BadInput` for a name that exists, `NoSpace`, `PermissionDenied`.
+    /// `InUse` when one is going on, `BadInput` for a name that exists or a time that is none, `NoSpace` when the disk
+    /// has too little room, now or for as long as it is to last, `PermissionDenied`.
     fn record_start(&self, request: &RecordRequest) -> Result<RecordingStatus>;
 
     /// Ends the recording and closes its files.
@@ -98,7 +99,7 @@ pub struct SeekRequest {
 }
 
 /// What a recording is to be.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RecordRequest {
     /// Folder that the dataset's folder is made in; the rig's default when `None`.
@@ -111,4 +112,8 @@ pub struct RecordRequest {
     pub operator: String,
     /// Free notes.
     pub notes: String,
+    /// The recording ends by itself after so long, seconds; above 0. By this computer's clock, also in a replay.
+    pub max_duration_s: Option<f64>,
+    /// Begin even when its disk is expected to be full too soon.
+    pub force: bool,
 }

@@ -5,6 +5,7 @@ use crate::control::RecordRequest;
 use crate::status::RecordingStatus;
 use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
+use core::time::Duration;
 use depthrig_bus::{Frame, HostTime, StreamId, UtcPair};
 use depthrig_calib::PoseExt;
 use depthrig_recorder::{
@@ -16,6 +17,7 @@ pub use recovery::recover_left;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
+mod budget;
 mod place;
 mod recovery;
 mod report;
@@ -56,6 +58,8 @@ struct Active {
     indices: HashMap<StreamId, usize>,
     streams: Vec<Recorded>,
     started: HostTime,
+    /// When it ends by itself.
+    ends: Option<HostTime>,
     utc: UtcSource,
 }
 
@@ -91,17 +95,19 @@ pub struct StreamFacts {
 }
 
 impl Begun {
-    /// Makes the dataset for a recording of `streams`.
+    /// Makes the dataset for a recording of `streams`, of about `sets_hz` sets a second.
     ///
     /// # Errors
-    /// `WrongState` without a stream, `BadInput` for a name that is no folder name or exists, `NoSpace`,
-    /// `PermissionDenied`.
+    /// `WrongState` without a stream, `BadInput` for a name that is no folder name or exists and for a time that is
+    /// none, `NoSpace` when it does not fit, `PermissionDenied`.
     pub fn new(
         config: &RigConfig,
         request: &RecordRequest,
         streams: Vec<StreamFacts>,
+        sets_hz: f64,
         outside: &Outside,
     ) -> Result<Self> {
+        budget::check_duration(request)?;
         let streams: Vec<_> = streams.into_iter().filter(|s| s.stream.record).collect();
         if streams.is_empty() {
             return Err(Error::new(
@@ -121,6 +127,10 @@ impl Begun {
         session.streams = streams.iter().map(record_of).collect();
         let mut options = options_of(&config.recording);
         options.backlog_max_bytes = outside.backlog_max_bytes.unwrap_or(options.backlog_max_bytes);
+        let raw = streams.iter().map(|s| (s.stream.profile.format, s.stream.profile.frame_bytes()));
+        let rate = budget::bytes_per_s(raw, sets_hz, &config.recording);
+        let reserve = options.min_free_bytes.saturating_add(options.reserve_bytes);
+        budget::check(&*outside.fs, &path, request, rate, reserve, &config.recording)?;
         let (fs, clock) = (Arc::clone(&outside.fs), Arc::clone(&outside.utc));
         let recorder = Recorder::create_with(fs, clock, &path, session, options).map_err(of_recorder)?;
         if !request.notes.is_empty() {
@@ -145,11 +155,13 @@ impl Begun {
                 dropped: books.dropped,
             }
         };
+        let started = HostTime::now();
         Ok(Self(Active {
             recorder,
             indices: streams.iter().enumerate().map(|(i, s)| (s.stream.id.clone(), i)).collect(),
             streams: streams.iter().map(recorded).collect(),
-            started: HostTime::now(),
+            started,
+            ends: request.max_duration_s.map(|s| started.plus(Duration::from_secs_f64(s))),
             utc: Arc::clone(&outside.utc),
             status,
         }))
@@ -241,6 +253,12 @@ impl Recording {
     /// Whether a recording is going on.
     pub const fn is_active(&self) -> bool {
         self.active.is_some()
+    }
+
+    /// As [`Self::take`], if the recording has lasted as long as it was to.
+    fn take_due(&mut self) -> Option<Finishing> {
+        let ends = self.active.as_ref()?.ends?;
+        if ends.from_now().is_zero() { self.take().ok() } else { None }
     }
 
     /// Keeps the numbers of a finished recording.
@@ -362,10 +380,26 @@ impl Finishing {
 /// # Errors
 /// `WrongState` when none is going on, `Other` when the dataset could not be closed.
 pub fn stop(recording: &Mutex<Recording>) -> Result<RecordingStatus> {
-    let lock = || recording.lock().unwrap_or_else(PoisonError::into_inner);
-    let finishing = lock().take()?;
+    let finishing = recording.lock().unwrap_or_else(PoisonError::into_inner).take()?;
+    finish(recording, finishing)
+}
+
+/// Ends the recording, as [`stop`] does, if it has lasted as long as it was to: to be asked often. `None`: it is not
+/// over yet, or there is none. The moment it ends is that of its start and its length, however late this is asked the
+/// times before.
+pub fn stop_when_due(recording: &Mutex<Recording>) -> Option<Result<RecordingStatus>> {
+    let finishing = recording.lock().unwrap_or_else(PoisonError::into_inner).take_due()?;
+    tracing::info!(path = finishing.active.status.path, "the recording has lasted as long as it was to");
+    Some(finish(recording, finishing))
+}
+
+fn finish(recording: &Mutex<Recording>, finishing: Finishing) -> Result<RecordingStatus> {
     let (status, result) = finishing.finish();
-    lock().keep(status.clone(), result.as_ref().ok().cloned());
+    let mut recording = recording.lock().unwrap_or_else(PoisonError::into_inner);
+    // Another one may have begun while this one was being closed; its numbers are not these.
+    if !recording.is_active() {
+        recording.keep(status.clone(), result.as_ref().ok().cloned());
+    }
     result.map(|_| status)
 }
 

@@ -26,7 +26,7 @@ mod transport;
 use crate::api::{self, ServerHandle};
 use crate::config::{BusConfig, ControlConfig, RecordingConfig, RigConfig, SetsConfig, SupervisorConfig};
 use crate::control::Control;
-use crate::recording::{Outside, Recording};
+use crate::recording::{self, Outside, Recording};
 use crate::rig::report;
 use crate::sets::SpreadStats;
 use crate::status::{RecordingStatus, ReplayStatus};
@@ -398,6 +398,8 @@ fn keep_house(inner: &Inner, bus: &Bus) {
     let (mut last, mut last_cpu) = (HostTime::now(), clock::process_cpu_ns());
     while !inner.stopping() {
         std::thread::sleep(LOOK);
+        // What goes wrong is logged and in the status.
+        let _ = recording::stop_when_due(&inner.recording);
         let now = HostTime::now();
         let passed_ns = now.since_ns(last);
         if passed_ns < 1_000_000_000 {

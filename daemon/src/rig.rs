@@ -4,7 +4,7 @@
 //! supervisor thread ── steps every camera's state machine
 //! camera threads    ── driver → gate → slot on the bus
 //! set thread        ── bus → frame sets → bus, recorder
-//! house thread      ── once a second: dead subscribers, accounts into the file, CPU
+//! house thread      ── once a second: dead subscribers, accounts into the file, CPU; ends a recording that is due
 //! API thread        ── HTTP on the rig's socket
 //! ```
 
@@ -349,8 +349,9 @@ impl Control for Inner {
     fn record_start(&self, request: &RecordRequest) -> Result<RecordingStatus> {
         let _one_at_a_time = lock(&self.starting);
         self.recording().must_be_idle()?;
+        let sets_hz = self.config.sets.rate_hz;
         // Without the recording's lock: making a file must not keep the set thread waiting.
-        let begun = Begun::new(&self.config, request, self.stream_facts(), &self.outside)?;
+        let begun = Begun::new(&self.config, request, self.stream_facts(), sets_hz, &self.outside)?;
         Ok(self.recording().begin(begun))
     }
 
@@ -414,6 +415,9 @@ fn keep_house(inner: &Inner, stop: &AtomicBool) {
     let (mut last, mut last_cpu) = (HostTime::now(), clock::process_cpu_ns());
     while !stop.load(Ordering::Relaxed) {
         std::thread::sleep(LOOK);
+        if let Some(Ok(status)) = recording::stop_when_due(&inner.recording) {
+            inner.reports.begin(PathBuf::from(&status.path));
+        }
         let now = HostTime::now();
         let passed_ns = now.since_ns(last);
         if passed_ns < 1_000_000_000 {

@@ -194,7 +194,8 @@ fn every_answer_of_a_live_server_fits_the_document() {
 #[test]
 fn what_is_asked_arrives() {
     let served = served();
-    let body = r#"{"directory": "/data", "name": "n", "scene": "s", "operator": "o", "notes": "a\nb"}"#;
+    let body = r#"{"directory": "/data", "name": "n", "scene": "s", "operator": "o", "notes": "a\nb",
+        "max_duration_s": 90.5, "force": true}"#;
     assert_eq!(served.post("/v1/record/start", body).status, 200);
     let request = RecordRequest {
         directory: Some("/data".into()),
@@ -202,6 +203,8 @@ fn what_is_asked_arrives() {
         scene: "s".into(),
         operator: "o".into(),
         notes: "a\nb".into(),
+        max_duration_s: Some(90.5),
+        force: true,
     };
     assert_eq!(served.fake.last_request(), Some(request));
     assert_eq!(served.get("/v1/config").body, fake::CONFIG);

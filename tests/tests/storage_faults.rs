@@ -5,6 +5,7 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{Bus, HostTime, RigName, StreamId, UtcPair};
+use depthrig_daemon::ErrorKind;
 use depthrig_daemon::control::RecordRequest;
 use depthrig_daemon::rig::{Rig, RigOptions};
 use depthrig_daemon::status::RecordingStatus;
@@ -39,7 +40,7 @@ fn seconds(s: f64) -> Duration {
 /// Two cameras whose sets are stored unpacked enough to trouble a disk.
 fn text() -> String {
     RigText::default().camera("left", "").camera("right", "").text().to_owned()
-        + "[sets]\nrate_hz = 15.0\n[recording]\ncolor = \"raw\"\nreserve_mb = 0\nqueue_sets = 4\n"
+        + "[sets]\nrate_hz = 15.0\n[recording]\ncolor = \"raw\"\nreserve_mb = 0\nmin_minutes = 0\nqueue_sets = 4\n"
 }
 
 /// What a subscriber saw of all streams: how long after its capture each frame came, ns.
@@ -267,6 +268,67 @@ fn a_disk_that_becomes_read_only_ends_the_recording() {
     let sets =
         Dataset::open(Path::new(&stopped.path)).unwrap().sets(SetRange::ALL).filter_map(Result::ok).count();
     assert!(sets as u64 >= stopped.sets && stopped.sets > 10, "{sets} of {} sets", stopped.sets);
+}
+
+#[test]
+fn what_will_not_fit_is_refused_unless_forced() {
+    let _alone = alone();
+    let home = Home::default();
+    let Some(small) = Tmpfs::mount(&home.path("small"), 24 * MIB) else { return };
+    let rig = home.start(&text().replace("min_minutes = 0", "min_minutes = 1")).unwrap();
+    wait_until(&rig, "streaming", all_stream);
+    let control = rig.control();
+    let asks = |max_duration_s, force| RecordRequest {
+        directory: Some(small.path().to_owned()),
+        max_duration_s,
+        force,
+        ..RecordRequest::default()
+    };
+    // About 1.7 MB a second: 14 s of them fit.
+    for length_s in [None, Some(60.0)] {
+        let e = control.record_start(&asks(length_s, false)).unwrap_err();
+        assert_eq!(e.kind(), ErrorKind::NoSpace, "{e}");
+        assert!(e.to_string().contains("about 0.2 minutes fit"), "{e}");
+        assert_eq!(std::fs::read_dir(small.path()).unwrap().count(), 0, "nothing was begun");
+    }
+    control.record_start(&asks(Some(60.0), true)).unwrap();
+    wait_until(&rig, "sets", |s| s.recording.as_ref().is_some_and(|r| r.sets >= 3));
+    control.record_stop().unwrap();
+    control.record_start(&asks(Some(0.5), false)).unwrap();
+    assert_eq!(rig.stop().lost, Vec::<String>::new());
+}
+
+#[test]
+fn a_recording_ends_by_itself_when_its_time_is_over() {
+    let _alone = alone();
+    let home = Home::default();
+    let rig = home.start(&text()).unwrap();
+    wait_until(&rig, "streaming", all_stream);
+    let control = rig.control();
+    let asks = |max_duration_s| RecordRequest {
+        directory: Some(home.path("data")),
+        max_duration_s,
+        ..RecordRequest::default()
+    };
+    assert_eq!(control.record_start(&asks(Some(-1.0))).unwrap_err().kind(), ErrorKind::BadInput);
+    control.record_start(&asks(Some(1.0))).unwrap();
+    let early = control.status().recording.unwrap();
+    assert!(early.active || early.duration_s >= 1.0);
+    let ended = wait_until(&rig, "its end", |s| s.recording.as_ref().is_some_and(|r| !r.active));
+    let ended = ended.recording.unwrap();
+    assert!(ended.duration_s >= 0.8, "{} s: sets of less than a second", ended.duration_s);
+    assert_eq!((&ended.error, ended.dropped.len()), (&None, 0));
+    // The feed was asked for about one second of 15 sets; a loaded machine may be late to end it.
+    let sets = sets_of(&ended.path, false);
+    assert!(sets.len() as u64 == ended.sets && (10..90).contains(&sets.len()), "{} sets", sets.len());
+    assert!(Dataset::open(Path::new(&ended.path)).unwrap().session().outcome.as_ref().unwrap().complete);
+    assert_eq!(control.record_stop().unwrap_err().kind(), ErrorKind::WrongState);
+    // One without an end goes on past that.
+    control.record_start(&asks(None)).unwrap();
+    std::thread::sleep(Duration::from_millis(1500));
+    assert!(control.status().recording.unwrap().active);
+    let summary = rig.stop();
+    assert_eq!(summary.lost, Vec::<String>::new());
 }
 
 #[test]

@@ -176,6 +176,26 @@ pub fn positive_seconds(text: &str) -> Result<f64, String> {
     }
 }
 
+/// A time as people write it, in seconds: hours, minutes and seconds, each once at most and in this order, such as
+/// `90s`, `10m`, `1h30m` or `1.5h`.
+///
+/// # Errors
+/// When `text` is none, is 0 or is ten years.
+pub fn duration_s(text: &str) -> Result<f64, String> {
+    let wrong = || format!("write a time such as 90s, 10m or 1h30m, not \"{text}\"");
+    let (mut rest, mut total_s) = (text, 0.0);
+    for (unit, seconds) in [('h', 3600.0), ('m', 60.0), ('s', 1.0)] {
+        let Some((number, after)) = rest.split_once(unit) else { continue };
+        // No sign, exponent or word for infinity, which a float may have.
+        if !number.bytes().all(|b| b.is_ascii_digit() || b == b'.') {
+            return Err(wrong());
+        }
+        total_s += number.parse::<f64>().map_err(|_| wrong())? * seconds;
+        rest = after;
+    }
+    if rest.is_empty() && total_s > 0.0 && total_s < 3.2e8 { Ok(total_s) } else { Err(wrong()) }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -203,6 +223,26 @@ mod tests {
         let globals: Vec<_> = cli.get_arguments().filter(|a| a.is_global_set()).collect();
         assert!(globals.iter().any(|g| g.get_id() == "color"));
         check(&cli, &globals);
+    }
+
+    #[test]
+    fn a_time_has_units_in_their_order() {
+        for (text, s) in [
+            ("90s", 90.0),
+            ("10m", 600.0),
+            ("1h30m", 5400.0),
+            ("1h0m5s", 3605.0),
+            ("1.5h", 5400.0),
+            ("0.5s", 0.5),
+        ] {
+            assert_eq!(duration_s(text), Ok(s), "{text}");
+        }
+        for bad in [
+            "", "10", "m", "0s", "-5m", "1e3s", "infs", "nans", "30m1h", "1m1m", "5 m", "10m5", "9999999h",
+            "1ms",
+        ] {
+            assert!(duration_s(bad).unwrap_err().contains("1h30m"), "{bad}");
+        }
     }
 
     #[test]

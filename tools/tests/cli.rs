@@ -175,8 +175,17 @@ fn the_whole_way_of_a_small_rig() {
     let out = home.path().join("data");
     let none = home.run(&["record", "stop"]);
     assert_eq!(none.code, 1, "{}", none.err);
-    home.run(&["record", "start", "--out", out.to_str().unwrap(), "--name", "first", "--scene", "desk"])
-        .good();
+    // Nine years of these small pictures are 5 TB, more than a disk for temporary files has.
+    let first = ["record", "start", "--out", out.to_str().unwrap(), "--name", "first", "--scene", "desk"];
+    let long = [&first[..], &["--for", "80000h"]].concat();
+    let refused = home.run(&long);
+    assert_eq!(refused.code, 1, "{}", refused.err);
+    for part in ["needs about", "above the reserve of 0.0 GB", "minutes fit", "--force"] {
+        assert!(refused.err.contains(part), "{}", refused.err);
+    }
+    assert!(!out.exists(), "nothing was begun");
+    assert_eq!(home.run(&[&first[..], &["--for", "10"]].concat()).code, 2);
+    home.run(&[&long[..], &["--force"]].concat()).good();
     let twice = home.run(&["record", "start", "--out", out.to_str().unwrap()]);
     assert_eq!(twice.code, 1);
     assert!(twice.err.contains("first"), "{}", twice.err);

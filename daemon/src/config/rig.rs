@@ -89,6 +89,7 @@ fn recording(top: &Section<'_, '_>, base: &Path) -> RecordingConfig {
         workers: s.or("workers", d.workers, within(0..=super::MAX_WORKERS)),
         queue_sets: s.or("queue_sets", d.queue_sets, within(1..=super::MAX_QUEUE_SETS)),
         reserve_mb: s.or("reserve_mb", d.reserve_mb, within(0..=1 << 30)),
+        min_minutes: s.or("min_minutes", d.min_minutes, within(0..=100_000)),
         recover_on_start: s.or("recover_on_start", d.recover_on_start, |_| Ok(())),
     };
     s.finish();

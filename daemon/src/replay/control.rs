@@ -125,6 +125,13 @@ impl Inner {
         cameras
     }
 
+    /// Sets a second of the original.
+    fn nominal_hz(&self) -> f64 {
+        let gaps = self.timeline.len().saturating_sub(1) as f64;
+        let length_s = self.timeline.length_ns() as f64 / 1e9;
+        if length_s > 0.0 { gaps / length_s } else { 0.0 }
+    }
+
     fn stream_facts(&self) -> Vec<StreamFacts> {
         let facts =
             |(record, stream): (&depthrig_recorder::StreamRecord, &Arc<crate::stream::Stream>)| StreamFacts {
@@ -146,8 +153,6 @@ impl Control for Inner {
             (n.sets, n.incomplete)
         };
         let ms = |quantile: f64| spreads.quantile_ns(quantile) as f64 / 1e6;
-        let gaps = self.timeline.len().saturating_sub(1) as f64;
-        let length_s = self.timeline.length_ns() as f64 / 1e9;
         let slots = self.slots();
         let recording = lock(&self.recording).status();
         RigStatus {
@@ -158,7 +163,7 @@ impl Control for Inner {
             utc_ns: UtcPair::sample().utc_ns,
             cameras: self.cameras(),
             sets: SetStatus {
-                nominal_hz: if length_s > 0.0 { gaps / length_s } else { 0.0 },
+                nominal_hz: self.nominal_hz(),
                 sent,
                 incomplete,
                 spread_p50_ms: ms(0.5),
@@ -206,7 +211,9 @@ impl Control for Inner {
         }
         drop(sources);
         *lock(&self.clock) = pair;
-        let begun = Begun::new(&self.config, &request, self.stream_facts(), &self.outside)?;
+        // As fast as possible is as fast as the disk takes it; then this is what a second of the original takes.
+        let sets_hz = self.nominal_hz() * lock(&self.transport).rate();
+        let begun = Begun::new(&self.config, &request, self.stream_facts(), sets_hz, &self.outside)?;
         Ok(lock(&self.recording).begin(begun))
     }
 

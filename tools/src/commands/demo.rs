@@ -148,6 +148,7 @@ fn record(
                 directory: Some(folder.to_owned()),
                 name: Some(DATASET.into()),
                 scene: "synthetic table".into(),
+                force: true, // some seconds; it is the recording that says when the disk is full
                 ..RecordRequest::default()
             };
             control.record_start(&request)?;

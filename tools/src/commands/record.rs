@@ -13,6 +13,7 @@ use std::path::PathBuf;
 pub const EXAMPLES: &str = "\
 Examples:
   depthrig record start --scene kitchen --operator ada
+  depthrig record start --for 10m       ends by itself, and is refused when it would not fit
   depthrig record note \"the cup was moved\"
   depthrig record stop        exit code 3 when the recording lost anything";
 
@@ -58,6 +59,12 @@ pub struct StartArgs {
     /// Free text that is kept with the dataset
     #[arg(long, value_name = "TEXT", default_value = "")]
     notes: String,
+    /// End by itself after so long, such as 90s, 10m or 1h30m; refused when that is not expected to fit on the disk
+    #[arg(long = "for", value_name = "DURATION", value_parser = crate::cli::duration_s)]
+    duration_s: Option<f64>,
+    /// Begin even when the disk is expected to be full too soon
+    #[arg(long)]
+    force: bool,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -76,6 +83,8 @@ pub fn run(command: &RecordCommand, context: &Context) -> Result<Exit> {
                 scene: args.scene.clone(),
                 operator: args.operator.clone(),
                 notes: args.notes.clone(),
+                max_duration_s: args.duration_s,
+                force: args.force,
             };
             tell(&client.record_start(&request)?, args.json)
         }
