@@ -16,10 +16,12 @@ use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+mod facts;
 mod segment;
 mod session;
 
-use segment::{Facts, Rebuild};
+use facts::Facts;
+use segment::Rebuild;
 
 /// What a copy is called until it is proven.
 const TEMPORARY: &str = "mcap.recovering";
@@ -337,7 +339,7 @@ impl Job<'_> {
         let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let part = is_part(path);
         let base = self.done;
-        let whole = segment::whole(&*fs, path, self.options.unfinished_only && !part, &mut |bytes| {
+        let whole = facts::whole(&*fs, path, self.options.unfinished_only && !part, &mut |bytes| {
             self.tell(base + bytes)
         })?;
         let mut segment = RecoveredSegment {

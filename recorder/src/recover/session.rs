@@ -1,6 +1,6 @@
 //! What `session.toml` says after a recovery.
 
-use super::segment::Facts;
+use super::facts::Facts;
 use super::{Job, RecoverAction};
 use crate::{Dataset, Error, ErrorKind, Outcome, Result, SESSION_FILE, Session, SetCounts};
 use std::path::PathBuf;

@@ -1,0 +1,141 @@
+//! Whether a segment is whole, and what it says of itself.
+
+use super::RECOVERED_METADATA;
+use super::segment::{Tell, WINDOW};
+use crate::container::record::op;
+use crate::container::scan::{HEAD, SegmentReader};
+use crate::fs::Fs;
+use crate::msgs::accounts;
+use crate::msgs::frame_set::FrameSetMsg;
+use crate::msgs::schemas::Schema;
+use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA};
+use crate::{ErrorKind, Result, SetCounts};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// What a whole segment says of itself.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Facts {
+    pub(super) bytes: u64,
+    pub(super) sets: u64,
+    pub(super) first_set: Option<u64>,
+    pub(super) last_set: Option<u64>,
+    pub(super) last_log_time: Option<u64>,
+    /// Sets handed to the recorder, as the last mark says.
+    pub(super) offered: u64,
+    /// The last account of the sets.
+    pub(super) counts: Option<SetCounts>,
+    /// Whether the recording was closed with this segment.
+    pub(super) last: bool,
+    /// What ended the recording before its time.
+    pub(super) error: Option<String>,
+    /// What a recovery found lost in it.
+    pub(super) lost: Vec<String>,
+}
+
+impl Facts {
+    pub(super) fn set(&mut self, mark: &FrameSetMsg, log_time: u64) {
+        self.sets += 1;
+        self.first_set.get_or_insert(mark.id);
+        self.last_set = Some(mark.id);
+        self.last_log_time = Some(log_time);
+        self.offered = mark.sets_offered;
+    }
+
+    pub(super) fn metadata(&mut self, facts: &BTreeMap<String, String>) {
+        self.last = facts.get("final").is_some_and(|v| v == "true");
+        self.error = facts.get("error").cloned();
+    }
+
+    pub(super) fn recovered(&mut self, facts: &BTreeMap<String, String>) {
+        self.lost.extend(facts.get("lost").into_iter().flat_map(|l| l.lines()).map(str::to_owned));
+    }
+}
+
+/// What the segment holds if it is finished and whole; `None` when there is anything to do about it. With
+/// `believe`, its index is enough.
+pub(super) fn whole(fs: &dyn Fs, path: &Path, believe: bool, tell: Tell<'_>) -> Result<Option<Facts>> {
+    let found = (|| {
+        let mut reader = SegmentReader::open_bare(fs, path)?;
+        reader.load_index()?;
+        if !reader.finished || reader.metadata(SESSION_METADATA).is_none() {
+            return Ok(None);
+        }
+        if !believe && !data_is_whole(&reader, tell)? {
+            return Ok(None);
+        }
+        facts_of(&reader).map(Some)
+    })();
+    match found {
+        Err(e) if matches!(e.kind(), ErrorKind::Corrupt | ErrorKind::Truncated | ErrorKind::NotADataset) => {
+            Ok(None)
+        }
+        found => found,
+    }
+}
+
+/// Whether the data has the checksum that stands at its end, and records from the first to the last byte.
+fn data_is_whole(reader: &SegmentReader, tell: Tell<'_>) -> Result<bool> {
+    let mut at = 8;
+    let end = loop {
+        let (opcode, len) = reader.record_head(at)?;
+        if opcode == op::DATA_END {
+            break at;
+        }
+        at = at.saturating_add(HEAD).saturating_add(len);
+    };
+    let (opcode, body) = reader.record(end)?;
+    let mcap::records::Record::DataEnd(said) = reader.parse(opcode, &body, end)? else { return Ok(false) };
+    let mut crc = crc32fast::Hasher::new();
+    let mut buf = Vec::new();
+    let mut at = 0;
+    while at < end {
+        let len = WINDOW.min(end - at);
+        reader.read_into(&mut buf, at, len)?;
+        crc.update(&buf);
+        at += len;
+        tell(at)?;
+    }
+    Ok(said.data_section_crc == crc.finalize())
+}
+
+/// What a finished segment says, from its index and its last few chunks.
+fn facts_of(reader: &SegmentReader) -> Result<Facts> {
+    let channel = |s: Schema| reader.channels.iter().find(|(_, c)| c.schema == s.name()).map(|(id, _)| *id);
+    let mut facts = Facts { bytes: reader.size, ..Facts::default() };
+    let (marks, counts) = (channel(Schema::FrameSet), channel(Schema::Accounts));
+    let with =
+        |id: Option<u16>| reader.chunks.iter().filter(move |c| id.is_some_and(|id| c.channels.contains(&id)));
+    facts.sets = with(marks).count() as u64;
+    for (entry, first) in
+        with(marks).take(1).map(|c| (c, true)).chain(with(marks).next_back().map(|c| (c, false)))
+    {
+        reader.messages(entry, |m| {
+            if Some(m.channel) == marks {
+                let mark = FrameSetMsg::read(m.data)?;
+                if first {
+                    facts.first_set = Some(mark.id);
+                }
+                (facts.last_set, facts.offered) = (Some(mark.id), mark.sets_offered);
+                facts.last_log_time = Some(m.log_time);
+            }
+            Ok(())
+        })?;
+    }
+    if let Some(entry) = with(counts).next_back() {
+        reader.messages(entry, |m| {
+            if Some(m.channel) == counts {
+                facts.counts = Some(accounts::read(m.data)?.0);
+            }
+            Ok(())
+        })?;
+    }
+    for (name, map) in &reader.metadata {
+        match name.as_str() {
+            SEGMENT_METADATA => facts.metadata(map),
+            RECOVERED_METADATA => facts.recovered(map),
+            _ => {}
+        }
+    }
+    Ok(facts)
+}
