@@ -86,7 +86,7 @@ impl<'a> Output<'a> {
         let found: Value = out.read_json(known)?;
         if let Some(differs) = difference(&found, state) {
             let what = format!(
-                "{} holds an export of something else: its {differs} is not the same; choose a new folder",
+                "{} holds an export that differs in its {differs}; choose a new folder",
                 dir.display()
             );
             return Err(Error::new(ErrorKind::AlreadyExists, what));

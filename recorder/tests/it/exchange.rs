@@ -251,17 +251,17 @@ fn what_is_there_is_never_overwritten() {
     // An unfinished export with other options, then a finished one.
     run(&fs, &mut sums, 1, &mut |_| ControlFlow::Break(())).unwrap();
     let mut sweet = Sums { sets_of_a_part: 3, flavour: "sweet" };
-    assert!(refused(&fs, &mut sweet).contains("its options is not the same"));
+    assert!(refused(&fs, &mut sweet).contains("differs in its options"));
     plain(&fs, 1).unwrap();
     let before = files(&fs);
-    assert!(refused(&fs, &mut sweet).contains("its options is not the same"));
+    assert!(refused(&fs, &mut sweet).contains("differs in its options"));
     // Another dataset.
     let other = dataset(5);
     for (name, bytes) in &before {
         other.create_dir_all(Path::new(name).parent().unwrap()).unwrap();
         other.put(Path::new(name), bytes.clone());
     }
-    assert!(refused(&other, &mut sums).contains("its datasets is not the same"));
+    assert!(refused(&other, &mut sums).contains("differs in its datasets"));
     assert_eq!(files(&fs), before);
 }
 

@@ -168,6 +168,10 @@ fn drive(importer: &mut dyn Importer, fs: Arc<dyn Fs>, common: &Common, context:
         }
         out::line(super::verify::summary(&report.verified))?;
     }
+    if report.ended {
+        let out = common.out.display();
+        eprintln!("ended: {out} holds what was read until then; for all, remove it and import again");
+    }
     for lost in report.facts.problems.iter().chain(&report.summary.lost) {
         eprintln!("lost: {lost}");
     }

@@ -295,6 +295,9 @@ fn what_is_no_such_folder_is_refused() {
     let (kind, why) = refused(&fs, "/empty", ByteCameraOptions::default());
     assert!(kind == ErrorKind::BadInput && why.contains("no folder camera_<model>"), "{why}");
     foreign(&fs, "camera_d455", "depth", &[1], PixelFormat::Z16, "a");
+    // The folder around it is one step off.
+    let (_, why) = refused(&fs, "/in", ByteCameraOptions::default());
+    assert!(why.contains("import one, such as /in/a"), "{why}");
     let picture = contents(&fs, Path::new("/in/a/camera_d455/depth_1.png"));
     fs.put(Path::new("/in/a/camera_d455/depth_001.png"), picture);
     let (_, why) = refused(&fs, "/in/a", ByteCameraOptions::default());

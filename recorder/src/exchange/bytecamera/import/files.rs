@@ -7,7 +7,7 @@ use crate::fs::{Fs, ReadFile};
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 use std::io::{self, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// A file as a stream of bytes.
 pub(super) struct Bytes {
@@ -53,6 +53,13 @@ pub(super) fn list(fs: &dyn Fs, dir: &Path) -> Result<Found> {
         }
     }
     Ok(found)
+}
+
+/// The first folder in `dir` that looks like a session: a person gave the folder around it.
+pub(super) fn session_within(fs: &dyn Fs, dir: &Path) -> Option<PathBuf> {
+    let mut folders: Vec<_> = fs.read_dir(dir).ok()?.into_iter().filter(|e| e.is_dir).collect();
+    folders.sort_by(|a, b| a.name.cmp(&b.name));
+    folders.into_iter().map(|e| dir.join(e.name)).find(|folder| list(fs, folder).is_ok_and(|f| !f.is_empty()))
 }
 
 /// A whole file; `None` when it is not there.

@@ -1,6 +1,6 @@
 //! Streams without a `calibration.json`: from the names of folders and files, and the first picture of each.
 
-use super::files::Found;
+use super::files::{Found, session_within};
 use super::stream::Stream;
 use super::{ByteCameraImport, bad};
 use crate::exchange::bytecamera::names;
@@ -73,6 +73,10 @@ impl ByteCameraImport {
             self.streams.push(stream);
         }
         if self.streams.is_empty() {
+            if let Some(within) = session_within(&*self.fs, &self.dir) {
+                let within = within.display();
+                return Err(bad(&self.dir, format_args!("it holds sessions; import one, such as {within}")));
+            }
             return Err(bad(
                 &self.dir,
                 "it holds no folder camera_<model> with depth_N.png, color_N.png, ir_N.png or raw_depth_N.npy",
