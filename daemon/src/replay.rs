@@ -26,7 +26,7 @@ mod transport;
 use crate::api::{self, ServerHandle};
 use crate::config::{BusConfig, ControlConfig, RecordingConfig, RigConfig, SetsConfig, SupervisorConfig};
 use crate::control::Control;
-use crate::recording::{self, Outside, Recording};
+use crate::recording::{self, Outside, Recording, Reports};
 use crate::rig::report;
 use crate::sets::SpreadStats;
 use crate::status::{RecordingStatus, ReplayStatus};
@@ -128,6 +128,7 @@ struct Inner {
     numbers: Mutex<Numbers>,
     spreads: Mutex<SpreadStats>,
     recording: Mutex<Recording>,
+    reports: Reports,
     starting: Mutex<()>,
     outside: Outside,
     /// The clocks of the dataset at the last moment: what a recording of this replay takes for its own.
@@ -241,6 +242,7 @@ impl Replay {
         if active && let Err(e) = self.inner.record_stop() {
             tracing::error!(error = %e, "the recording could not be closed");
         }
+        self.inner.reports.finish();
     }
 }
 
@@ -325,6 +327,7 @@ impl Inner {
             sources: Mutex::new(sources),
             spreads: Mutex::default(),
             recording: Mutex::default(),
+            reports: Reports::default(),
             starting: Mutex::default(),
             outside: Outside { utc: Arc::new(move || *lock(&theirs)), ..Outside::default() },
             clock,

@@ -38,8 +38,6 @@ const STEP: Duration = Duration::from_millis(20);
 const START_PATIENCE: Duration = Duration::from_secs(10);
 /// How long one camera thread gets to end; with it the whole stop stays below a second.
 const STOP_PATIENCE: Duration = Duration::from_millis(500);
-/// How long the end of the rig waits for reports; what is not written then is left to `depthrig report`.
-const REPORT_PATIENCE: Duration = Duration::from_secs(10);
 
 /// Set to end a thread.
 type StopFlag = Arc<AtomicBool>;
@@ -228,7 +226,7 @@ impl Rig {
 
     /// Waits for the reports of recordings that have ended, for some seconds at most.
     pub fn finish_reports(&self) {
-        self.inner.reports.finish(REPORT_PATIENCE);
+        self.inner.reports.finish();
     }
 
     fn end_threads(&mut self) {

@@ -71,6 +71,7 @@ fn one_terminal_replays_and_another_one_steers() {
     assert_eq!(ended.code, 0, "{}", ended.err);
     let result: serde_json::Value = serde_json::from_str(&ended.out).unwrap();
     assert_eq!((result["paused"].as_bool(), result["recording"]["sets"].as_u64()), (Some(true), Some(1)));
+    assert!(again.join("a/report.html").is_file(), "made after `record stop`, and waited for at the end");
     let none = home.run(&["replay", "status"]);
     assert_eq!(none.code, 1);
 }
@@ -85,6 +86,8 @@ fn a_recorded_replay_compares_equal() {
         home.run(&["replay", &path, "--as-fast-as-possible", "--record", out, "--name", "b", "-q"]).good();
     assert!(said.contains("recorded") && said.contains("lost 0"), "{said}");
     let copy = again.join("b");
+    let page = std::fs::read_to_string(copy.join("report.html")).expect("a report, as a rig's recording has");
+    assert!(page.contains("desk/depth"), "of this recording");
     let same = home.run(&["compare", &path, copy.to_str().unwrap()]);
     assert_eq!(same.code, 0, "{}{}", same.out, same.err);
     home.run(&["verify", "--decode", copy.to_str().unwrap()]).good();

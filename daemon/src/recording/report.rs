@@ -12,6 +12,8 @@ use std::thread::JoinHandle;
 
 /// Reports that may be in work at once; a further one is left to `depthrig report`.
 const MAX: usize = 4;
+/// How long the end of the daemon waits for reports; what is not written then is left to `depthrig report`.
+const PATIENCE: Duration = Duration::from_secs(10);
 /// What the kernel gives such a thread: what nobody else wants.
 const NICE: i32 = 19;
 
@@ -42,9 +44,9 @@ impl Reports {
         }
     }
 
-    /// Waits for the reports in work; what is not done after `patience` is left out.
-    pub fn finish(&self, patience: Duration) {
-        let deadline = HostTime::now().plus(patience);
+    /// Waits for the reports in work, for some seconds at most; what is not done then is left out.
+    pub fn finish(&self) {
+        let deadline = HostTime::now().plus(PATIENCE);
         let threads = std::mem::take(&mut *self.threads.lock().unwrap_or_else(PoisonError::into_inner));
         for thread in threads {
             while !thread.is_finished() && !deadline.from_now().is_zero() {

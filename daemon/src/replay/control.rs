@@ -12,6 +12,7 @@ use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::{HostTime, Pose, UtcPair, shm};
 use depthrig_recorder::PixelMode;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
@@ -218,7 +219,9 @@ impl Control for Inner {
     }
 
     fn record_stop(&self) -> Result<RecordingStatus> {
-        recording::stop(&self.recording)
+        let status = recording::stop(&self.recording)?;
+        self.reports.begin(PathBuf::from(&status.path));
+        Ok(status)
     }
 
     fn record_note(&self, text: &str) -> Result<()> {
