@@ -29,8 +29,8 @@ pub const REPORT_FILE: &str = "report.html";
 pub struct ReportOptions {
     /// Sets whose depth pictures are decoded for the fill rate, evenly over the dataset.
     pub fill_sets: usize,
-    /// Frames of a set should not lie further apart than this, nanoseconds; `None`: half a period of the slowest
-    /// camera, within which a nearest frame always lies.
+    /// Frames of a set should not lie further apart than this, nanoseconds; `None`: what the session says, and
+    /// where that says nothing half a period of the slowest camera, within which a nearest frame always lies.
     pub max_spread_ns: Option<i64>,
 }
 

@@ -234,7 +234,7 @@ pub(super) fn gather(
         interval: Histogram::default(),
         last_tick: None,
         beyond_limit: 0,
-        limit_ns: options.max_spread_ns.or(slowest.map(|hz| (0.5e9 / hz) as i64)),
+        limit_ns: options.max_spread_ns.or(session.max_spread_ns).or(slowest.map(|hz| (0.5e9 / hz) as i64)),
         problems: Vec::new(),
         problem_count: 0,
     };

@@ -76,6 +76,22 @@ fn the_numbers_are_those_of_the_recording() {
 }
 
 #[test]
+fn the_sessions_own_limit_of_the_spread_is_used() {
+    let beyond = |limit_ns: Option<i64>, options: &ReportOptions| {
+        let session = Session { max_spread_ns: limit_ns, ..session() };
+        let fs = record_with(&session, 4, |_| vec![0, 1, 2], &[]);
+        let report = Report::of(&open(&fs), options, &mut |_| ControlFlow::Continue(()));
+        let sets = report.unwrap().unwrap().sets;
+        (sets.spread_limit_ns, sets.beyond_limit)
+    };
+    let usual = ReportOptions::default();
+    // The frames of each set are 1 ns apart; half a period of the slowest camera is the bound without a limit.
+    assert_eq!(beyond(None, &usual), (Some(16_666_666), 0));
+    assert_eq!(beyond(Some(0), &usual), (Some(0), 4));
+    assert_eq!(beyond(Some(0), &ReportOptions { max_spread_ns: Some(7), ..usual }), (Some(7), 0));
+}
+
+#[test]
 fn a_camera_that_is_lost_in_the_middle_is_told() {
     let streams = |n| if (10..18).contains(&n) { vec![2] } else { vec![0, 1, 2] };
     let fs = record_with(&session(), 25, streams, &[]);

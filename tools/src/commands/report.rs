@@ -30,7 +30,8 @@ pub struct ReportArgs {
     /// Write the page to this file [default: report.html in the dataset]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Frames of a set should not lie further apart [default: half a period of the slowest camera]
+    /// Frames of a set should not lie further apart [default: the session's limit, else half a period of the
+    /// slowest camera]
     #[arg(long, value_name = "MS", value_parser = crate::cli::positive_seconds)]
     max_spread_ms: Option<f64>,
     /// Sets whose depth pictures are decoded for the fill rate
