@@ -17,6 +17,7 @@ pub mod bench;
 mod cat;
 mod catalog;
 mod cdr;
+mod clock;
 pub mod codec;
 mod compare;
 mod container;

@@ -14,9 +14,10 @@ use crate::container::record::op;
 use crate::container::scan::{ChannelInfo, HEAD, Message, SegmentReader};
 use crate::dataset::{Kind, kind_of};
 use crate::fs::Fs;
-use crate::msgs::frame_set::{Checkpoint, FrameSetMsg};
+use crate::msgs::frame_set::{Checkpoint, FrameSetMsg, read_clock_pair};
 use crate::msgs::schemas::Schema;
 use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA};
+use crate::recover::RECOVERED_METADATA;
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::StreamId;
 use mcap::records::Record;
@@ -36,6 +37,7 @@ pub(super) struct Pass<'a> {
     kinds: BTreeMap<u16, Kind>,
     camera_infos: BTreeMap<u16, StreamId>,
     accounts_channel: Option<u16>,
+    clock: Option<u16>,
     checkpoints: Option<u16>,
     /// Messages since the last commit mark.
     pub(super) pictures: BTreeMap<StreamId, Picture>,
@@ -86,6 +88,8 @@ fn read(
         Ok(()) => {}
     }
     let finished = reader.finished && index.is_ok();
+    let recovered = reader.metadata(RECOVERED_METADATA).and_then(|m| m.get("sets_lost")?.parse::<u64>().ok());
+    walk.lost = walk.lost.saturating_add(recovered.unwrap_or(0));
     // With decoding every picture is unpacked anyway. Without, a first pass shows what the checksums prove; where
     // they do not prove all, a second one takes its place.
     let mut unproven = if walk.options.decode { 0 } else { u64::MAX };
@@ -123,6 +127,7 @@ impl<'a> Pass<'a> {
             kinds: BTreeMap::new(),
             camera_infos: BTreeMap::new(),
             accounts_channel: None,
+            clock: None,
             checkpoints: None,
             pictures: BTreeMap::new(),
             infos: BTreeMap::new(),
@@ -252,6 +257,11 @@ impl<'a> Pass<'a> {
                     let what = format!("the recording ended before its time: {error}");
                     self.findings.add(Severity::Lost, &self.file, Some(offset), what);
                 }
+                if let Some(lost) = m.metadata.get("lost").filter(|_| m.name == RECOVERED_METADATA) {
+                    for what in lost.lines() {
+                        self.findings.add(Severity::Lost, &self.file, Some(offset), what);
+                    }
+                }
             }
             _ => {}
         }
@@ -265,6 +275,8 @@ impl<'a> Pass<'a> {
             self.camera_infos.insert(id, stream);
         } else if is(Schema::Accounts) {
             self.accounts_channel = Some(id);
+        } else if is(Schema::ClockPair) {
+            self.clock = Some(id);
         } else if is(Schema::Checkpoint) {
             self.checkpoints = Some(id);
         } else if let Some(kind) = kind_of(info) {
@@ -346,6 +358,10 @@ impl<'a> Pass<'a> {
     ) -> Result<()> {
         if self.accounts_channel == Some(m.channel) {
             return walk.account(self, m.data, offset);
+        }
+        if self.clock == Some(m.channel) {
+            walk.clock(self, read_clock_pair(m.data)?, m.log_time, offset);
+            return Ok(());
         }
         if self.checkpoints == Some(m.channel) {
             return self.checkpoint(Checkpoint::read(m.data)?, offset);

@@ -3,14 +3,19 @@
 use super::pictures::{Job, Pictures};
 use super::segment::{MESSAGE_HEAD, Pass};
 use super::{Findings, Severity, VerifyOptions};
+use crate::clock::step_ns;
 use crate::container::record::{op, put_le};
 use crate::encode::Codec;
 use crate::msgs::frame_info::Extra;
 use crate::msgs::frame_set::{FrameSetMsg, Member};
 use crate::msgs::{accounts, frame_info};
 use crate::{Result, Session, StreamAccount};
-use depthrig_bus::{FrameFlags, FrameHeader, StreamId};
+use depthrig_bus::{FrameFlags, FrameHeader, StreamId, UtcPair};
 use std::collections::{BTreeMap, BTreeSet};
+
+/// A reading of the clocks lies within this of the recorded time that it was written at, nanoseconds: a writer that
+/// waits for its disk is behind.
+const CLOCK_AROUND_NS: i64 = 60_000_000_000;
 
 /// What is carried from segment to segment.
 #[derive(Clone)]
@@ -24,10 +29,14 @@ pub(super) struct Walk {
     last: Option<Last>,
     /// Sets counted by the accounts minus those seen, fixed at the first account of a lone segment.
     account_base: Option<u64>,
+    /// Sets that recoveries say they lost at most; the accounts, which are older, count them.
+    pub(super) lost: u64,
     dropped: Option<crate::SetCounts>,
     accounts: BTreeMap<StreamId, StreamAccount>,
     /// What the last frame of each stream says was captured and lost.
     books: BTreeMap<StreamId, Books>,
+    /// The first and the last reading of the host's clocks.
+    clocks: Option<(UtcPair, UtcPair)>,
 }
 
 /// The set before.
@@ -75,9 +84,11 @@ impl Walk {
             bytes: 0,
             last: None,
             account_base: None,
+            lost: 0,
             dropped: None,
             accounts: BTreeMap::new(),
             books: BTreeMap::new(),
+            clocks: None,
         }
     }
 
@@ -250,6 +261,29 @@ impl Walk {
         fell.then(|| "the account in its header goes backwards".to_owned())
     }
 
+    /// Takes a reading of the host's clocks from the chunk at `offset`.
+    pub(super) fn clock(&mut self, pass: &mut Pass<'_>, pair: UtcPair, log_time: u64, offset: u64) {
+        let (first, last) = self.clocks.get_or_insert((pair, pair));
+        let passed_ns = pair.mono.since_ns(first.mono);
+        let log_time = i64::try_from(log_time).unwrap_or(i64::MAX);
+        let behind_ns = first.utc_ns.saturating_add(passed_ns).saturating_sub(log_time);
+        // Each segment begins with the first reading again; and a dataset that was made from another may have
+        // readings of the computer that made it, of another time.
+        if pair.mono <= last.mono || behind_ns.saturating_abs() > CLOCK_AROUND_NS {
+            return;
+        }
+        let before = std::mem::replace(last, pair);
+        if let Some(by_ns) = step_ns(&before, &pair) {
+            let what = format!(
+                "the wall clock was set by {:+.1} ms, seen {:.1} s after its first reading; the recorded times do not \
+                 jump",
+                by_ns as f64 / 1e6,
+                passed_ns as f64 / 1e9
+            );
+            pass.findings.add(Severity::Note, &pass.file, Some(offset), what);
+        }
+    }
+
     /// Takes an account from the chunk at `offset`.
     pub(super) fn account(&mut self, pass: &mut Pass<'_>, message: &[u8], offset: u64) -> Result<()> {
         let (sets, streams) = accounts::read(message)?;
@@ -268,7 +302,7 @@ impl Walk {
             .account_base
             .get_or_insert_with(|| if first_is_zero { 0 } else { sets.recorded.saturating_sub(self.sets) });
         let there = base.saturating_add(self.sets);
-        if sets.recorded != there {
+        if !(there..=there.saturating_add(self.lost)).contains(&sets.recorded) {
             let what = format!("the account says {} sets were recorded, {there} are there", sets.recorded);
             pass.broken(Some(offset), what);
         }
@@ -326,7 +360,9 @@ impl Walk {
             let what = format!("it says {} sets were recorded, {} are there", o.sets_recorded, self.sets);
             findings.add(Severity::Broken, file, None, what);
         }
-        for lost in &o.lost {
+        // What its segments say themselves was reported at its place.
+        let said: BTreeSet<String> = findings.kept.iter().map(|f| f.message.clone()).collect();
+        for lost in o.lost.iter().filter(|l| !said.contains(*l)) {
             findings.add(Severity::Lost, file, None, lost.clone());
         }
     }

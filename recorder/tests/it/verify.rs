@@ -1,13 +1,15 @@
 //! What verification finds.
 
 use crate::support::*;
-use depthrig_bus::{DropCounts, PixelFormat};
+use depthrig_bus::{DropCounts, HostTime, PixelFormat, UtcPair};
 use depthrig_recorder::fs::{Fs, MemFs};
 use depthrig_recorder::{
-    Recorder, RecorderOptions, Severity, StreamAccount, VerifyOptions, VerifyReport, verify_with,
+    Finding, Recorder, RecorderOptions, RecoverOptions, Severity, StreamAccount, VerifyOptions, VerifyReport,
+    recover_with, verify_with,
 };
 use proptest::prelude::*;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
 
 fn check(fs: &MemFs, options: &VerifyOptions) -> VerifyReport {
     let fs: Arc<dyn Fs> = Arc::new(fs.clone());
@@ -536,6 +538,81 @@ fn streams_without_calibration_or_without_its_source_are_named() {
             (Severity::Note, "front/depth does not say where its calibration comes from"),
         ]
     );
+}
+
+#[test]
+fn a_recovered_segment_says_what_it_lost_alone_and_the_dataset_says_it_once() {
+    let fs = MemFs::new();
+    record(&fs, 9, RecorderOptions { segment_max_ns: 100 * PERIOD, ..options() });
+    let mut bytes = contents(&fs, &segment(0));
+    let at = bytes.len() * 2 / 5;
+    bytes[at..at + 512].fill(0xA5);
+    fs.put(&segment(0), bytes);
+    let shared: Arc<dyn Fs> = Arc::new(fs.clone());
+    let go_on = &mut |_| std::ops::ControlFlow::Continue(());
+    let said = recover_with(&shared, &dir(), &RecoverOptions::default(), go_on).unwrap();
+    let words = &said.segments[0].lost;
+    assert!(!words.is_empty());
+    let alone = verify_with(&shared, &segment(0), &VerifyOptions::default()).unwrap();
+    let told = |f: &Finding| (f.severity, f.file.clone(), f.message.clone());
+    let expected: Vec<_> =
+        words.iter().map(|w| (Severity::Lost, "seg_0000.mcap".to_owned(), w.clone())).collect();
+    assert_eq!(alone.findings.iter().map(told).collect::<Vec<_>>(), expected);
+    assert!(alone.findings.iter().all(|f| f.offset.is_some()));
+    let whole = check(&fs, &VerifyOptions::default()).findings;
+    for what in words {
+        assert_eq!(whole.iter().filter(|f| f.message == *what).count(), 1, "{whole:?}");
+    }
+    assert!(whole.len() > words.len(), "the session knows of sets in no segment: {whole:?}");
+}
+
+/// Records `sets` sets over two segments; after set n the clocks are read, UTC being off by `off_ns(n)`.
+fn clocked(sets: u64, off_ns: impl Fn(i64) -> i64) -> MemFs {
+    let fs = MemFs::new();
+    let now = Arc::new(AtomicI64::new(0));
+    let (theirs, read) = (Arc::clone(&now), Arc::new(AtomicI64::new(-1)));
+    let offs: Vec<i64> = (0..sets as i64).map(off_ns).collect();
+    let utc = {
+        let read = Arc::clone(&read);
+        Arc::new(move || {
+            let n = theirs.load(Ordering::SeqCst);
+            read.store(n, Ordering::SeqCst);
+            let mono = HostTime::from_ns(M0 + n * PERIOD + 1);
+            UtcPair { mono, utc_ns: T0 + n * PERIOD + 1 + offs[n as usize], width_ns: 100 }
+        })
+    };
+    let options = RecorderOptions { sync_interval_ns: 1, segment_max_ns: 5 * PERIOD, ..options() };
+    let r = Recorder::create_with(Arc::new(fs.clone()), utc, &dir(), session(), options).unwrap();
+    for n in 0..sets {
+        now.store(n as i64, Ordering::SeqCst);
+        r.push(set(&session(), n)).unwrap();
+        let there = || read.load(Ordering::SeqCst) == n as i64;
+        assert!((0..20_000).any(|_| there() || {
+            std::thread::sleep(std::time::Duration::from_millis(1));
+            false
+        }));
+    }
+    r.finish().unwrap();
+    fs
+}
+
+#[test]
+fn a_step_of_the_wall_clock_is_a_note_with_its_size_and_time_and_drift_is_none() {
+    let day = 86_400_000_000_000;
+    for (by_ns, said) in [(-day, "-86400000.0 ms"), (1_500_000, "+1.5 ms")] {
+        // Seen in the first of two segments: the second begins with the first reading again.
+        let fs = clocked(8, |n| if n >= 3 { by_ns } else { 0 });
+        let report = check(&fs, &VerifyOptions::default());
+        assert_eq!((report.findings.len(), report.segments), (1, 2), "{:?}", report.findings);
+        let f = &report.findings[0];
+        let at = format!("{:.1} s after", 3.0 * PERIOD as f64 / 1e9);
+        assert_eq!((f.severity, f.file.as_str()), (Severity::Note, "seg_0000.mcap"));
+        assert!(f.offset.is_some() && f.message.contains(said) && f.message.contains(&at), "{f:?}");
+        assert!(report.is_whole());
+    }
+    // 400 ppm, as NTP slews.
+    let fs = clocked(8, |n| n * PERIOD / 2500);
+    assert_eq!(check(&fs, &VerifyOptions::default()).findings, []);
 }
 
 /// A `.part` with checkpoints, and sets after the last of them.

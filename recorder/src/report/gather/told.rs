@@ -3,16 +3,13 @@
 use super::super::series::{TimeBins, Values};
 use super::super::{HostClock, TOLD_MAX};
 use super::Pass;
+use crate::clock::{offset_ns, step_ns};
 use crate::dataset::Dataset;
 use crate::msgs::schemas::Schema;
 use crate::msgs::{accounts, frame_set};
 use crate::{ErrorKind, Result, SetCounts, StreamAccount};
 use depthrig_bus::UtcPair;
 
-/// The fastest that the kernel slews the wall clock (adjtimex(2): `tick` may be off by a tenth, NTP uses 500 ppm).
-const SLEW_PPM: i64 = 500;
-/// Below this a change of the wall clock is no step, whatever its rate, nanoseconds.
-const STEP_MIN_NS: i64 = 100_000;
 /// Readings of the clocks lie within this around the sets, nanoseconds.
 const AROUND_NS: i64 = 60_000_000_000;
 
@@ -41,7 +38,6 @@ pub(super) struct Clock {
 
 impl Clock {
     fn pair(&mut self, bins: TimeBins, t0_ns: i64, pair: UtcPair) {
-        let offset = |p: &UtcPair| p.utc_ns.saturating_sub(p.mono.ns());
         let first = *self.first.get_or_insert(pair);
         // Log times follow the first pair: a step of the wall clock does not move a reading on the axis.
         let t_ns = first.utc_ns.saturating_add(pair.mono.since_ns(first.mono)).saturating_sub(t0_ns);
@@ -49,19 +45,19 @@ impl Clock {
         if !(-AROUND_NS..=bins.span_ns.saturating_add(AROUND_NS)).contains(&t_ns) {
             return;
         }
+        // Each segment begins with the first reading again.
+        if self.last.is_some_and(|last| pair.mono <= last.mono) {
+            return;
+        }
         self.pairs += 1;
         self.width_ns = self.width_ns.max(pair.width_ns);
-        if let Some(before) = self.last.replace(pair) {
-            let change = offset(&pair).saturating_sub(offset(&before));
-            let slewed = pair.mono.since_ns(before.mono).max(0) / 1_000_000 * SLEW_PPM;
-            if change.abs() > STEP_MIN_NS.max(slewed) + pair.width_ns + before.width_ns {
-                self.stepped_ns += change;
-                if self.steps.len() < TOLD_MAX {
-                    self.steps.push((t_ns, change));
-                }
+        if let Some(change) = self.last.replace(pair).and_then(|before| step_ns(&before, &pair)) {
+            self.stepped_ns += change;
+            if self.steps.len() < TOLD_MAX {
+                self.steps.push((t_ns, change));
             }
         }
-        let change = offset(&pair).saturating_sub(offset(&first));
+        let change = offset_ns(&pair).saturating_sub(offset_ns(&first));
         self.series.get_or_insert_with(|| Values::new(bins)).add(bins, t_ns, change as f64);
     }
 
