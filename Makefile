@@ -79,6 +79,8 @@ $(LEROBOT)/.stamp: tests/python/requirements-lerobot.txt
 	for python in python3.12 $$HOME/.pyenv/versions/3.12*/bin/python python3; do \
 		"$$python" -c 'import venv' 2>/dev/null && break; done && "$$python" -m venv --clear $(LEROBOT)
 	$(LEROBOT)/bin/pip install --quiet --no-deps --no-compile --no-cache-dir --requirement $<
+	touch $@
+
 $(PEERS_VENV)/.stamp: $(PEERS)/requirements.txt
 	/usr/bin/python3 -m venv --system-site-packages $(PEERS_VENV)
 	$(PEERS_VENV)/bin/pip install --quiet --requirement $(PEERS)/requirements.txt
