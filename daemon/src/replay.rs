@@ -402,7 +402,9 @@ fn keep_house(inner: &Inner, bus: &Bus) {
     while !inner.stopping() {
         std::thread::sleep(LOOK);
         // What goes wrong is logged and in the status.
-        let _ = recording::stop_when_due(&inner.recording);
+        if let Some(Ok(status)) = recording::stop_when_due(&inner.recording) {
+            inner.reports.begin(PathBuf::from(&status.path));
+        }
         let now = HostTime::now();
         let passed_ns = now.since_ns(last);
         if passed_ns < 1_000_000_000 {
