@@ -4,16 +4,18 @@
 //! `fuzz/corpus/TARGET`, where those that the fuzzer found lie too.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stdout)]
 
+use core::ops::ControlFlow;
 use depthrig_bus::{DropCounts, FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
 use depthrig_recorder::codec::{DepthEncoder, DepthShape};
+use depthrig_recorder::exchange::{ByteCameraExport, CameraNames, ExportOptions, export};
 use depthrig_recorder::fs::{Fs, MemFs};
 use depthrig_recorder::fuzzing::mcap::File;
 use depthrig_recorder::{
-    ColorCodec, Compression, DepthCodec, Diagnostic, Level, RecordFrame, RecordSet, Recorder,
+    ColorCodec, Compression, Dataset, DepthCodec, Diagnostic, Level, RecordFrame, RecordSet, Recorder,
     RecorderOptions, Session, StreamAccount, StreamRecord,
 };
 use image::ImageFormat;
-use std::io::Cursor;
+use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -104,6 +106,94 @@ fn record(session: &Session, options: &RecorderOptions, sets: u64, missing: Opti
     fs
 }
 
+/// A record of a bag: fields, then data, both with their length.
+fn bag_record(fields: &[(&str, &[u8])], data: &[u8]) -> Vec<u8> {
+    let fields: Vec<u8> =
+        fields.iter().flat_map(|(k, v)| of_bag(&[k.as_bytes(), b"=", v].concat())).collect();
+    [of_bag(&fields), of_bag(data)].concat()
+}
+
+/// Bytes or text of a bag.
+fn of_bag(bytes: &[u8]) -> Vec<u8> {
+    [&(bytes.len() as u32).to_le_bytes(), bytes].concat()
+}
+
+/// A bag as librealsense writes one, of `frames` pictures of two streams, with what is said of them.
+fn bag(frames: u32, lz4: bool) -> Vec<u8> {
+    let words = |w: &[u32]| w.iter().flat_map(|w| w.to_le_bytes()).collect::<Vec<u8>>();
+    let floats = |w: &[f64]| w.iter().flat_map(|w| w.to_le_bytes()).collect::<Vec<u8>>();
+    let said = |k: &str, v: &str| [of_bag(k.as_bytes()), of_bag(v.as_bytes())].concat();
+    let mut out = b"#ROSBAG V2.0\n".to_vec();
+    let mut topics: Vec<String> = Vec::new();
+    let mut chunk = |time_ns: u32, messages: Vec<(String, Vec<u8>)>| {
+        let mut body = Vec::new();
+        for (topic, data) in messages {
+            let known = topics.iter().position(|t| *t == topic);
+            let conn = (known.unwrap_or(topics.len()) as u32).to_le_bytes();
+            if known.is_none() {
+                let fields = [("op", &[7][..]), ("conn", &conn), ("topic", topic.as_bytes())];
+                body.extend(bag_record(&fields, b""));
+                topics.push(topic);
+            }
+            let time = words(&[0, time_ns]);
+            body.extend(bag_record(&[("op", &[2]), ("conn", &conn), ("time", &time)], &data));
+        }
+        let size = (body.len() as u32).to_le_bytes();
+        let mut packed = lz4_flex::frame::FrameEncoder::new(Vec::new());
+        packed.write_all(&body).unwrap();
+        let packed = packed.finish().unwrap();
+        let (how, data) = if lz4 { (&b"lz4"[..], &packed) } else { (&b"none"[..], &body) };
+        out.extend(bag_record(&[("op", &[5]), ("compression", how), ("size", &size)], data));
+    };
+    let streams = ["/device_0/sensor_0/Depth_0", "/device_0/sensor_1/Color_0"];
+    let mut first = vec![
+        ("/device_0/info".to_owned(), said("Name", "Intel RealSense D435")),
+        ("/device_0/info".to_owned(), said("Serial Number", "1")),
+        ("/device_0/sensor_0/option/Depth Units/value".to_owned(), 0.001f32.to_le_bytes().to_vec()),
+        ("/device_0/sensor_2/Accel_0/imu/data".to_owned(), Vec::new()),
+    ];
+    let k = floats(&[0.1, 0.0, 0.0, 0.0, 0.0, 9.0, 0.0, 4.0, 0.0, 9.0, 2.0, 0.0, 0.0, 1.0]);
+    let info = [words(&[0, 0, 0, 0, 2, 4]), of_bag(b"Brown Conrady"), words(&[5]), k].concat();
+    for stream in streams {
+        first.push((format!("{stream}/info"), words(&[30])));
+        first.push((format!("{stream}/info/camera_info"), info.clone()));
+        first.push((format!("{stream}/tf/0"), floats(&[0.015, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])));
+    }
+    chunk(0, first);
+    for n in 0..frames {
+        for (stream, encoding, pixel) in [(streams[0], "mono16", 2), (streams[1], "rgb8", 3)] {
+            let time_ns = 33_000_000 * n;
+            let (head, step) = (words(&[n, 0, time_ns, 0, 2, 4]), words(&[4 * pixel]));
+            let pixels: Vec<u8> = (0..8 * pixel).map(|i| (i + n) as u8).collect();
+            let picture = [head, of_bag(encoding.as_bytes()), vec![0], step, of_bag(&pixels)].concat();
+            let mut messages = vec![(format!("{stream}/image/data"), picture)];
+            for (key, value) in [
+                ("Frame Counter", (n + 7).to_string()),
+                ("Sensor Timestamp", (33_000 * u64::from(n) + 4_294_950_000).to_string()),
+                ("system_time", format!("{}.5", 1_534_232_519_732 + 33 * u64::from(n))),
+                ("timestamp_domain", "Hardware Clock".to_owned()),
+                ("Actual Exposure", "6452".to_owned()),
+            ] {
+                messages.push((format!("{stream}/image/metadata"), said(key, &value)));
+            }
+            chunk(time_ns, messages);
+        }
+    }
+    out
+}
+
+/// An export of the layout `bytecameradepth`; the file system and the folder of the session.
+fn exported() -> (MemFs, PathBuf) {
+    let made = session(&[PixelFormat::Z16, PixelFormat::Rgb8, PixelFormat::DepthF32]);
+    let fs = record(&made, &RecorderOptions::default(), 3, Some(1));
+    let dataset = Dataset::open_with(Arc::new(fs.clone()), Path::new("/d")).unwrap();
+    let mut exporter = ByteCameraExport::new(CameraNames::Short, None).unwrap();
+    let (to, on) = (Path::new("/e"), &mut |_| ControlFlow::Continue(()));
+    export(&fs, &mut exporter, vec![dataset], to, ExportOptions { workers: 1 }, on).unwrap();
+    let folder = fs.read_dir(to).unwrap().into_iter().find(|e| e.is_dir).unwrap();
+    (fs, to.join(folder.name))
+}
+
 fn main() {
     let corpus = PathBuf::from(std::env::args().nth(1).expect("which folder?"));
     let put = |target: &str, name: &str, bytes: &[u8]| {
@@ -159,4 +249,19 @@ fn main() {
         color.write_to(&mut Cursor::new(&mut file), format).unwrap();
         put("color_codec", name, &[&[8, 6], &file[..]].concat());
     }
+    put("rosbag", "seed_plain", &bag(2, false));
+    put("rosbag", "seed_lz4", &bag(3, true));
+    let (fs, folder) = exported();
+    let file = |name: &str| fs.contents(&folder.join(name)).unwrap();
+    put("calibration_json", "seed_export", &file("calibration.json"));
+    let rows = String::from_utf8(file("frames.csv")).unwrap();
+    for (n, row) in rows.lines().skip(1).enumerate() {
+        put("frames_csv", &format!("seed_row_{n}"), row.as_bytes());
+    }
+    let metres = fs.read_dir(&folder.join("camera_c")).unwrap();
+    let metres = metres.iter().find(|e| e.name.starts_with("raw_depth_")).unwrap();
+    put("npy", "seed_metres", &file(&format!("camera_c/{}", metres.name)));
+    let mut array = b"\x93NUMPY\x02\x00\x3d\0\0\0".to_vec();
+    array.extend(b"{'descr': '|u1', 'fortran_order': False, 'shape': (2, 3), } \n123456");
+    put("npy", "seed_bytes", &array);
 }

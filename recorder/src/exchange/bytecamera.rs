@@ -37,13 +37,37 @@ pub(crate) mod fuzzing {
         true
     }
 
-    /// Whether a `calibration.json` is one.
+    use super::calibration::Calibration;
+    use super::pictures::{Want, npy as array, read};
+
+    /// Whether a `calibration.json` is one; what it says of the files is used on a small one.
     pub(crate) fn calibration(text: &[u8]) -> bool {
-        super::calibration::Calibration::parse(text, std::path::Path::new("calibration.json")).is_ok()
+        let parse = |text: &[u8]| Calibration::parse(text, std::path::Path::new("calibration.json"));
+        let Ok(calibration) = parse(text) else { return false };
+        for s in &calibration.streams {
+            let want = Want::Exactly(s.stream.format, s.stream.width, s.stream.height);
+            drop(read(NPY_OF_ONE, "npy", want));
+        }
+        let again = calibration.text().and_then(|text| parse(&text));
+        assert!(again.is_ok(), "a calibration that was read and written cannot be read: {again:?}");
+        true
     }
 
-    /// Whether an NPY file is an array that can be imported.
+    /// An NPY file of one byte.
+    const NPY_OF_ONE: &[u8] =
+        b"\x93NUMPY\x01\x00\x3c\x00{'descr': '|u1', 'fortran_order': False, 'shape': (1, 1)}  \n\x07";
+
+    /// Whether an NPY file is an array that can be imported; a picture has the size that the array has.
     pub(crate) fn npy(bytes: &[u8]) -> bool {
-        super::pictures::npy(bytes).is_ok()
+        let Ok((_, shape, _)) = array(bytes) else {
+            assert!(read(bytes, "npy", Want::Metres).is_err(), "a picture from no array");
+            return false;
+        };
+        if let Ok(picture) = read(bytes, "npy", Want::Metres) {
+            assert_eq!([picture.height, picture.width], shape[..], "a picture of another size");
+            let size = picture.format.frame_bytes(picture.width, picture.height);
+            assert_eq!(picture.pixels.len(), size, "pixels of another size");
+        }
+        true
     }
 }

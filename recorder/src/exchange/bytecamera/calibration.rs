@@ -1,5 +1,6 @@
 //! `calibration.json`: what the pictures are of, and how a pixel becomes a ray and a distance.
 
+use super::pictures::MAX_SIDE;
 use crate::{Error, ErrorKind, Result, Session, StreamRecord};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -97,6 +98,10 @@ impl Calibration {
                     "stream {id} is in \"{}\" files; png and npy can be read",
                     s.ending
                 )));
+            }
+            let size = [s.stream.width, s.stream.height];
+            if !size.iter().all(|side| (1..=MAX_SIDE).contains(side)) {
+                return Err(bad(format!("stream {id} is {}x{}, which is no picture", size[0], size[1])));
             }
             if s.folder.contains(['/', ',']) || s.prefix.contains(['/', ',']) || s.folder.starts_with('.') {
                 return Err(bad(format!("stream {id} lies in \"{}\", which is no folder here", s.folder)));

@@ -7,6 +7,8 @@ use std::io::Cursor;
 
 /// The largest picture that is read: twice the pixels of the largest depth camera's colour sensor.
 const MAX_PIXELS: u64 = 64 << 20;
+/// The longest side of a picture, pixels: a longer one would overflow the size of a picture.
+pub(super) const MAX_SIDE: u32 = 1 << 16;
 /// The largest file that is read, bytes.
 pub(super) const MAX_FILE: u64 = MAX_PIXELS * 8;
 
@@ -143,8 +145,7 @@ pub(super) fn npy(bytes: &[u8]) -> Result<(&str, Vec<u32>, &[u8]), String> {
     if elements.and_then(|n| n.checked_mul(of_one)) != Some(data.len() as u64) {
         return Err(format!("shape {shape:?} of {kind} does not fit its {} bytes", data.len()));
     }
-    // Too large a side would overflow the size of a picture.
-    if shape.iter().any(|d| *d > 1 << 16) {
+    if shape.iter().any(|d| *d > MAX_SIDE) {
         return Err(format!("shape {shape:?} is no picture"));
     }
     Ok((kind, shape, data))

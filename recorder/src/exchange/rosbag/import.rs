@@ -204,8 +204,9 @@ impl RosbagImport {
                 let mut us = raw;
                 if u32::try_from(raw).is_ok() {
                     us = (last & !u64::from(u32::MAX)) | raw;
-                    if us + (1 << 31) < last {
-                        us += 1 << 32;
+                    // Near the end of 64 bits, where only a damaged file is, it stays as it is.
+                    if last.saturating_sub(us) > 1 << 31 {
+                        us = us.saturating_add(1 << 32);
                     }
                 }
                 last = us;
@@ -230,7 +231,7 @@ impl RosbagImport {
                 "{camera}: capture times are device times plus the least delay seen, over {:.3} s; delays vary by {:.3} ms, \
                  and a constant one cannot be seen",
                 (end - first) as f64 / 1e9,
-                (most - least) as f64 / 1e6
+                most.abs_diff(*least) as f64 / 1e6
             ));
         }
         for s in &mut self.streams {

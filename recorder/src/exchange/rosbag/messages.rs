@@ -3,6 +3,9 @@
 
 use depthrig_bus::{Distortion, Intrinsics, PixelFormat};
 
+/// The longest side of a picture, pixels: a longer one would overflow the size of a picture.
+const MAX_SIDE: u32 = 1 << 16;
+
 /// Reads fields; `None` where the data end too early.
 struct Fields<'a>(&'a [u8]);
 
@@ -64,8 +67,11 @@ pub(super) fn image(data: &[u8]) -> Option<Image<'_>> {
 }
 
 impl Image<'_> {
-    /// The pixel format, if datasets know it; a depth stream says only how wide its numbers are.
+    /// The pixel format, if datasets know it and the size is one of a picture; a depth stream says only how wide its numbers are.
     pub(super) fn format(&self, depth: bool) -> Option<PixelFormat> {
+        if ![self.width, self.height].iter().all(|side| (1..=MAX_SIDE).contains(side)) {
+            return None;
+        }
         Some(match self.encoding {
             "mono16" | "16UC1" if depth => PixelFormat::Z16,
             "mono16" | "16UC1" => PixelFormat::Mono16,

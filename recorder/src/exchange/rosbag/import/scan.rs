@@ -112,7 +112,7 @@ impl Scan {
                         let (place, bag_ns) = (Some(m.place), m.time_ns);
                         found.frames.push(Frame { place, bag_ns, stamp_ns: i.stamp_ns, ..Frame::default() });
                     }
-                    _ => found.refused = Some(format!("{} pixels", i.encoding)),
+                    _ => found.refused = Some(format!("{}x{} {} pixels", i.width, i.height, i.encoding)),
                 },
                 None => found.refused = Some("an image that ends too early".to_owned()),
             },

@@ -1,0 +1,9 @@
+//! An NPY file, as an import of pictures reads it.
+#![no_main]
+
+use depthrig_recorder::fuzzing;
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|bytes: &[u8]| {
+    fuzzing::npy(bytes);
+});
