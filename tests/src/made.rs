@@ -138,6 +138,21 @@ impl Made {
 
     /// Records it into the new folder `dir`.
     pub fn record(&self, dir: &Path) -> Summary {
+        let summary = self.recorder(dir).finish().unwrap();
+        assert_eq!((summary.complete, summary.sets.recorded), (true, self.sets), "{:?}", summary.lost);
+        summary
+    }
+
+    /// Records it into the new folder `dir`, all but the end: what a crash of the process leaves.
+    pub fn record_and_crash(&self, dir: &Path) {
+        let recorder = self.recorder(dir);
+        while recorder.progress().sets.recorded < self.sets {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    /// A recorder that was handed every set.
+    fn recorder(&self, dir: &Path) -> Recorder {
         let options = RecorderOptions {
             color: self.color,
             depth: self.depth,
@@ -156,9 +171,7 @@ impl Made {
             }
             recorder.push(self.set(&session, n)).unwrap();
         }
-        let summary = recorder.finish().unwrap();
-        assert_eq!((summary.complete, summary.sets.recorded), (true, self.sets), "{:?}", summary.lost);
-        summary
+        recorder
     }
 }
 

@@ -5,11 +5,14 @@ use depthrig_bus::{Bus, Frame, FrameFlags, FrameHeader, RigName, StreamId};
 use depthrig_daemon::ErrorKind;
 use depthrig_daemon::control::RecordRequest;
 use depthrig_daemon::replay::{Replay, ReplayOptions};
+use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{Dataset, SetRange};
+use depthrig_tests::made::Made;
 use depthrig_tests::{Home, RigText, all_stream, assert_balanced, wait_until};
 use std::collections::BTreeMap;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 const WAIT: Duration = Duration::from_secs(10);
 const RAW: &str = "[recording]\ncolor = \"raw\"\n";
@@ -193,4 +196,47 @@ fn what_is_no_dataset_is_said() {
     let options = ReplayOptions { rate: 0.0, ..ReplayOptions::default() };
     let Err(e) = start("empty", options) else { panic!() };
     assert!(e.to_string().contains("from 0.1 to 10"), "{e}");
+}
+
+/// Every file of a folder: its bytes and when they were last written.
+fn files(dir: &Path) -> BTreeMap<String, (Vec<u8>, SystemTime)> {
+    let entries = std::fs::read_dir(dir).unwrap().map(Result::unwrap);
+    let read = |e: std::fs::DirEntry| {
+        let modified = e.metadata().unwrap().modified().unwrap();
+        (e.file_name().into_string().unwrap(), (std::fs::read(e.path()).unwrap(), modified))
+    };
+    entries.map(read).collect()
+}
+
+#[test]
+fn a_rig_finishes_at_its_start_what_a_crash_left_of_its_own() {
+    let home = Home::default();
+    let data = home.path("data");
+    // In the order in which they are looked at: what must not be touched comes first.
+    let [foreign, held, cut] = ["1_foreign", "2_held", "3_cut"].map(|name| data.join(name));
+    let made = Made { rig: "test", ..Made::default() };
+    Made { rig: "another", ..Made::default() }.record_and_crash(&foreign);
+    made.record_and_crash(&held);
+    made.record_and_crash(&cut);
+    // As whoever records into it does.
+    let lock = RealFs.lock(&held).unwrap();
+    let before = [files(&foreign), files(&held)];
+    let unfinished = files(&cut);
+    assert!(unfinished.contains_key("seg_0002.mcap.part"), "{:?}", unfinished.keys());
+
+    let config = |more: &str| text() + &format!("directory = \"{}\"\n{more}", data.display());
+    home.start(&config("recover_on_start = false\n")).unwrap().stop();
+    assert!(files(&cut) == unfinished, "it was told not to");
+
+    let rig = home.start(&config("")).unwrap();
+    wait_until(&rig, "the recovery", |_| Dataset::open(&cut).unwrap().session().outcome.is_some());
+    rig.stop();
+    drop(lock);
+    assert!([files(&foreign), files(&held)] == before, "what is not its own or in use was touched");
+    assert!(!cut.join("seg_0002.mcap.part").exists());
+    let dataset = Dataset::open(&cut).unwrap();
+    let ids: Vec<_> = dataset.sets(SetRange::ALL).map(|s| s.unwrap().id).collect();
+    assert_eq!(ids, (0..12).map(|n| 3 * n + 5).collect::<Vec<_>>());
+    let outcome = dataset.session().outcome.as_ref().unwrap();
+    assert!(!outcome.complete && outcome.lost[0].contains("cut off"), "{:?}", outcome.lost);
 }

@@ -1,4 +1,4 @@
-//! Listing and editing datasets from the command line.
+//! Listing, editing and recovering datasets from the command line.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/home.rs"]
@@ -6,14 +6,22 @@ mod support;
 
 use depthrig_bus::{FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
 use depthrig_recorder::{
-    RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamRecord, fs::RealFs,
+    RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamRecord,
+    fs::{Fs, RealFs},
 };
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
+use std::time::{Duration, SystemTime};
 use support::Home;
 
 /// One set of one small picture.
 fn write(dir: &Path, scene: &str, started_utc_ns: i64) {
+    record(dir, scene, started_utc_ns).finish().unwrap();
+}
+
+/// As [`write`], up to where the files are closed.
+fn record(dir: &Path, scene: &str, started_utc_ns: i64) -> Recorder {
     let mut session = Session::new(dir.file_name().unwrap().to_str().unwrap(), "rig");
     (session.scene, session.operator) = (scene.into(), "ada".into());
     session.started_utc_ns = started_utc_ns;
@@ -46,7 +54,17 @@ fn write(dir: &Path, scene: &str, started_utc_ns: i64) {
         spread_ns: 0,
     };
     r.push(set).unwrap();
-    r.finish().unwrap();
+    r
+}
+
+/// Every file of a folder: its bytes and when they were last written.
+fn files(dir: &Path) -> BTreeMap<String, (Vec<u8>, SystemTime)> {
+    let entries = std::fs::read_dir(dir).unwrap().map(Result::unwrap);
+    let read = |e: std::fs::DirEntry| {
+        let modified = e.metadata().unwrap().modified().unwrap();
+        (e.file_name().into_string().unwrap(), (std::fs::read(e.path()).unwrap(), modified))
+    };
+    entries.map(read).collect()
 }
 
 fn names(json: &str) -> Vec<String> {
@@ -132,4 +150,57 @@ fn a_report_is_a_page_or_json_and_its_exit_code_says_how_it_is() {
     assert_eq!(ran.code, 3, "{}", ran.err);
     assert!(ran.out.contains("depthrig recover"), "{}", ran.out);
     assert_eq!(home.run(&["report", "/no/such/dataset", "-q"]).code, 1);
+}
+
+#[test]
+fn a_crash_is_recovered_once_and_the_exit_code_says_what_it_cost() {
+    let home = Home::new();
+    let dir = home.path().join("cut");
+    let recorder = record(&dir, "sink", 1_700_000_000_000_000_000);
+    while recorder.progress().sets.recorded < 1 {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    let at = dir.to_str().unwrap();
+    let refused = home.run(&["recover", at, "-q"]);
+    assert_eq!(refused.code, 1, "{}", refused.err);
+    assert!(refused.err.contains("is being recorded right now"), "{}", refused.err);
+    drop(recorder); // as a crash does
+    let before = files(&dir);
+
+    let plan = home.run(&["recover", at, "--dry-run", "-q"]);
+    assert_eq!(plan.code, 3, "{}", plan.err);
+    assert!(plan.out.contains("can be recovered, 1 sets") && plan.out.contains("lost: "), "{}", plan.out);
+    assert!(files(&dir) == before, "a dry run changed something");
+    let lock = RealFs.lock(&dir).unwrap();
+    assert_eq!(home.run(&["recover", at, "-q"]).code, 1);
+    assert!(files(&dir) == before, "a refused recovery changed something");
+    drop(lock);
+
+    let json = |ran: support::Ran, code| -> serde_json::Value {
+        assert_eq!(ran.code, code, "{}{}", ran.out, ran.err);
+        serde_json::from_str(&ran.out).unwrap()
+    };
+    let done = json(home.run(&["recover", at, "--json", "-q"]), 3);
+    assert_eq!((&done["changed"], &done["sets"]), (&true.into(), &1.into()));
+    assert_eq!(done["segments"][0]["action"], "rebuilt");
+    assert!(done["lost"][0].as_str().unwrap().contains("cut off"), "{done}");
+    let recovered = files(&dir);
+    assert_eq!(recovered.keys().collect::<Vec<_>>(), ["seg_0000.mcap", "session.toml"]);
+    assert!(home.run(&["info", at]).good().contains("sink"));
+
+    let again = json(home.run(&["recover", at, "--json", "-q"]), 0);
+    assert_eq!((&again["changed"], &again["lost"]), (&false.into(), &serde_json::json!([])));
+    assert!(home.run(&["recover", at, "-q"]).good().contains("nothing to do, 1 sets"));
+    assert!(files(&dir) == recovered, "a second time changed something");
+
+    // Killed between its index and its name: nothing is lost.
+    let named = home.path().join("named");
+    write(&named, "sink", 1_700_000_000_000_000_000);
+    let whole = std::fs::read(named.join("seg_0000.mcap")).unwrap();
+    std::fs::rename(named.join("seg_0000.mcap"), named.join("seg_0000.mcap.part")).unwrap();
+    assert!(home.run(&["recover", named.to_str().unwrap(), "-q"]).good().contains("got its final name"));
+    assert!(std::fs::read(named.join("seg_0000.mcap")).unwrap() == whole);
+
+    assert_eq!(home.run(&["recover", "/no/such/dataset", "-q"]).code, 1);
+    assert_eq!(home.run(&["recover"]).code, 2);
 }
