@@ -366,6 +366,21 @@ fn a_folder_deleted_under_the_recorder_ends_the_recording() {
     assert!(!Path::new(&left.recording.path).exists(), "it is not made anew behind the user's back");
 }
 
+/// How UTC minus the monotonic clock changed from each `clock` message to the next, nanoseconds, read with the `mcap`
+/// crate alone.
+fn clock_steps(dataset: &Path) -> Vec<i64> {
+    let bytes = std::fs::read(dataset.join("seg_0000.mcap")).unwrap();
+    let number = |data: &[u8], at: usize| i64::from_le_bytes(data[at..at + 8].try_into().unwrap());
+    let offsets: Vec<i64> = mcap::MessageStream::new(&bytes)
+        .unwrap()
+        .map(Result::unwrap)
+        .filter(|m| m.channel.topic.ends_with("/clock"))
+        // Encapsulation (4 bytes) and stamp (8), then an int64 each; CDR aligns from behind the encapsulation.
+        .map(|m| number(&m.data, 20) - number(&m.data, 12))
+        .collect();
+    offsets.windows(2).map(|w| w[1] - w[0]).collect()
+}
+
 #[test]
 fn a_step_of_the_wall_clock_moves_no_recorded_time() {
     let _alone = alone();
@@ -388,6 +403,12 @@ fn a_step_of_the_wall_clock_moves_no_recorded_time() {
         assert_eq!(pair[1].utc_offset_ns, offset);
         assert_eq!(pair[1].utc_ns - pair[0].utc_ns, pair[1].tick.since_ns(pair[0].tick), "a time jumped");
     }
+    let steps = clock_steps(Path::new(&stopped.path));
+    assert!(steps.iter().any(|by| (by - hour).abs() < 1_000_000_000), "the step is in `clock`: {steps:?}");
+    let notes = verify(Path::new(&stopped.path), &VerifyOptions::default()).unwrap().findings;
+    let said = |f: &&depthrig_recorder::Finding| f.message.starts_with("the wall clock was set by +3600");
+    let said: Vec<_> = notes.iter().filter(said).collect();
+    assert!(said.len() == 1 && said[0].severity == Severity::Note, "{notes:#?}");
     let now = UtcPair::sample().utc_ns;
     assert!(
         (0..60_000_000_000).contains(&(now - sets.last().unwrap().utc_ns)),

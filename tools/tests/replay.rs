@@ -97,3 +97,24 @@ fn a_recorded_replay_compares_equal() {
     assert_eq!(twice.code, 2, "{}", twice.err);
     assert!(twice.err.contains("both hold desk/"), "{}", twice.err);
 }
+
+#[test]
+fn a_subscriber_that_is_killed_holds_nobody_up() {
+    let home = Home::new();
+    let path = dataset(&home);
+    let running = home.start(&["replay", &path, "--as-fast-as-possible", "--paused", "-q", "--json"]);
+    home.wait_for_rig("desk");
+    let mut reader = home.start(&["tap", "desk/depth"]);
+    // A step wakes the reader: its line is the sign that it has subscribed, and stopped it reads no further.
+    home.run(&["replay", "step"]).good();
+    reader.wait_for_line();
+    reader.send("STOP");
+    home.run(&["replay", "resume"]).good();
+    let waiting = || json(&home, &["replay", "status", "--json"])["waiting_for"] == "desk/depth";
+    support::wait(waiting, "nobody is waited for");
+    reader.send("KILL");
+    let ended = running.wait_for_end();
+    assert_eq!(ended.code, 0, "{}", ended.err);
+    let result: serde_json::Value = serde_json::from_str(&ended.out).unwrap();
+    assert_eq!(result["sets"], result["length_sets"]);
+}

@@ -150,7 +150,13 @@ impl Player {
             incomplete: id.incomplete,
             ..SetHeader::default()
         };
-        let sent = patiently(&self.inner, &self.bus, "the frame sets", || self.sets.send(header, &members));
+        let sent = patiently(
+            &self.inner,
+            &self.bus,
+            "the frame sets",
+            || self.sets.send(header, &members),
+            || self.sets.welcome(),
+        );
         if let Err(e) = sent {
             self.inner.lose(format!("set {}: {e}", moment.id));
         }
@@ -186,7 +192,13 @@ fn send(
     books.captured += 1;
     drop(books);
     let name = stream.id.to_string();
-    let loan = patiently(inner, bus, &name, || output.publisher.loan(frame.pixels.len()));
+    let loan = patiently(
+        inner,
+        bus,
+        &name,
+        || output.publisher.loan(frame.pixels.len()),
+        || output.publisher.welcome(),
+    );
     let sent = loan.and_then(|slot| {
         let Some(mut slot) = slot else { return Ok(None) };
         slot.pixels_mut().copy_from_slice(&frame.pixels);
@@ -218,12 +230,14 @@ fn send(
 }
 
 /// Does `what` on a channel. A replay that its subscribers pace waits until they have let go of a slot; `None` when
-/// it was stopped meanwhile.
+/// it was stopped meanwhile. `refresh` has the channel look at who is still there: only then does it take back what a
+/// killed subscriber held.
 fn patiently<T>(
     inner: &Inner,
     bus: &Bus,
     channel: &str,
     mut what: impl FnMut() -> depthrig_bus::Result<T>,
+    refresh: impl Fn(),
 ) -> depthrig_bus::Result<Option<T>> {
     let began = HostTime::now();
     let (mut told, mut looked) = (false, began);
@@ -245,6 +259,7 @@ fn patiently<T>(
             looked = HostTime::now();
             inner.set_waiting_for(Some(channel));
             bus.clean_dead();
+            refresh();
         }
         if began.elapsed() > PATIENCE && !told {
             told = true;

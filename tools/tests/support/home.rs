@@ -136,8 +136,9 @@ fn depth(i: u32) -> image::ImageBuffer<image::Luma<u16>, Vec<u16>> {
     image::ImageBuffer::from_fn(64, 48, |x, y| image::Luma([(400 + 100 * i + 7 * x + y) as u16]))
 }
 
+/// Waits until `done`.
 #[track_caller]
-fn wait(mut done: impl FnMut() -> bool, what: &str) {
+pub fn wait(mut done: impl FnMut() -> bool, what: &str) {
     for _ in 0..POLLS {
         if done() {
             return;
@@ -158,6 +159,29 @@ impl Running {
     /// Ctrl-C.
     pub fn interrupt(self) -> Ran {
         self.signal("INT")
+    }
+
+    /// Sends a signal and leaves it running.
+    pub fn send(&self, name: &str) {
+        let sent = Command::new("kill").args([&format!("-{name}"), &self.id().to_string()]).status().unwrap();
+        assert!(sent.success());
+    }
+
+    /// Waits for its first line.
+    pub fn wait_for_line(&mut self) {
+        use std::io::Read;
+        let out = self.0.as_mut().unwrap().stdout.as_mut().unwrap();
+        let mut byte = [0];
+        while byte != *b"\n" {
+            assert_eq!(out.read(&mut byte).unwrap(), 1, "it ended");
+        }
+    }
+
+    /// Waits for its end, and kills it when that does not come.
+    pub fn wait_for_end(mut self) -> Ran {
+        let child = self.0.as_mut().unwrap();
+        wait(|| child.try_wait().unwrap().is_some(), "it does not end");
+        Ran::of(&self.0.take().unwrap().wait_with_output().unwrap())
     }
 
     pub fn signal(mut self, name: &str) -> Ran {
