@@ -11,10 +11,9 @@ CARGO_FUZZ=0.13.2
 # The instrumentation is not in the stable interface of rustc; it is the same in the stable one.
 export RUSTC_BOOTSTRAP=1
 
-if ! command -v cargo-fuzz >/dev/null; then
+export PATH=$PWD/target/tools/bin:$PATH
+command -v cargo-fuzz >/dev/null ||
     cargo install cargo-fuzz --version "$CARGO_FUZZ" --locked --quiet --root target/tools
-    export PATH=$PWD/target/tools/bin:$PATH
-fi
 
 mode=${1:-3600}
 shift || true
@@ -22,6 +21,7 @@ targets=("$@")
 [ ${#targets[@]} -gt 0 ] || mapfile -t targets < <(sed -nE 's/^name = "([a-z_]+)"$/\1/p' Cargo.toml)
 
 # Without a sanitizer: depthrig's code is safe Rust, where a bad access is a panic.
+# With --release cargo-fuzz leaves assertions to the profiles in Cargo.toml; without it, it switches on those of all crates.
 cargo fuzz build --fuzz-dir . --release --sanitizer none
 binaries=target/$(rustc -vV | sed -n 's/host: //p')/release
 

@@ -10,6 +10,7 @@ use ::image::{ColorType, ImageDecoder, Limits};
 use depthrig_bus::{FrameHeader, PixelFormat};
 use std::cell::RefCell;
 use std::io::Cursor;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Colour pictures above this many bytes are refused: 16384x16384.
 const COLOR_MAX: u64 = 3 << 28;
@@ -64,8 +65,13 @@ fn wrong(h: &FrameHeader, what: impl core::fmt::Display) -> Error {
 /// The pixels of a colour JPEG, three bytes each without row padding.
 pub(crate) fn jpeg_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
     let damaged = |e: ::image::ImageError| wrong(h, "its JPEG is damaged").with_source(e);
-    let decoder = JpegDecoder::new(Cursor::new(stored)).map_err(damaged)?;
-    color_pixels(decoder, "JPEG", h)
+    // zune-jpeg 0.4.21 panics on a few damaged files, such as a narrow one with odd sampling
+    // factors; what it worked on is given up then.
+    catch_unwind(AssertUnwindSafe(|| {
+        let decoder = JpegDecoder::new(Cursor::new(stored)).map_err(damaged)?;
+        color_pixels(decoder, "JPEG", h)
+    }))
+    .unwrap_or_else(|_| Err(wrong(h, "its JPEG is damaged: the decoder gave up")))
 }
 
 fn png_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
