@@ -326,3 +326,44 @@ fn whichever_operation_of_a_recovery_fails_nothing_is_lost() {
     }
     assert!(tried > 100, "only {tried} operations were tried");
 }
+
+#[test]
+fn a_sync_that_fails_fails_the_recovery() {
+    // One that is copied, and one that only lacks its name.
+    let unnamed = MemFs::new();
+    record(&unnamed, 4, options());
+    unnamed.rename(&segment(0), &segment(0).with_extension("mcap.part")).unwrap();
+    for fs in [crashed(5, 100), unnamed] {
+        let log = {
+            let fs = copy(&fs);
+            recover(&fs).unwrap();
+            fs.log()
+        };
+        let syncs: Vec<_> = (0..).zip(&log).filter(|(_, o)| o.starts_with("sync ")).collect();
+        assert!(syncs.iter().any(|(_, o)| o.contains("seg_0000")), "{log:?}");
+        for (n, operation) in syncs {
+            let fs = copy(&fs).with_fault(Fault::FailOnce(n, io::ErrorKind::Other));
+            let e = recover(&fs).expect_err(operation);
+            assert_eq!(e.kind(), ErrorKind::Io, "{operation}: {e}");
+        }
+    }
+}
+
+#[test]
+fn a_copy_that_is_not_what_was_written_takes_nobodys_place() {
+    let fs = crashed(5, 100);
+    let part = dir().join("seg_0000.mcap.part");
+    let before = contents(&fs, &part);
+    let theirs: Arc<dyn Fs> = Arc::new(fs.clone());
+    let e = recover_with(&theirs, &dir(), &RecoverOptions::default(), &mut |_| {
+        // As a disk that keeps something else than it was given.
+        if let Some(mut bytes) = fs.contents(&dir().join("seg_0000.mcap.recovering")) {
+            let middle = bytes.len() / 2;
+            bytes[middle] ^= 1;
+            fs.put(&dir().join("seg_0000.mcap.recovering"), bytes);
+        }
+        ControlFlow::Continue(())
+    });
+    assert!(e.is_err(), "{e:?}");
+    assert!(contents(&fs, &part) == before && ids(&fs) == [1, 2, 3, 4, 5]);
+}
