@@ -73,7 +73,9 @@ fn record(dir: &Path, bytes: u64) {
             let mut header = FrameHeader::default();
             header.set_names("rig", &session.streams[i].id);
             header.set_picture(session.streams[i].format, WIDTH, HEIGHT);
-            (header.sequence, header.capture_time_ns) = (n, n as i64);
+            // The recording numbers its frames from 1, and loses none.
+            (header.sequence, header.captured) = (n + 1, n + 1);
+            header.capture_time_ns = n as i64;
             header.payload_len = pixels.len() as u32;
             RecordFrame { stream: i, header, pixels: Box::new(pixels) }
         });
@@ -127,5 +129,8 @@ fn main() {
     std::fs::remove_file(&torn).unwrap();
     let found = verify(&dir, &VerifyOptions::default()).unwrap();
     println!("verified: {} sets, worst {:?}", found.sets, found.worst());
+    for finding in found.findings.iter().filter(|f| f.severity > depthrig_recorder::Severity::Note) {
+        println!("  {}: {}", finding.file, finding.message);
+    }
     std::fs::remove_dir_all(&dir).unwrap();
 }
