@@ -25,9 +25,11 @@ targets=("$@")
 cargo fuzz build --fuzz-dir . --release --sanitizer none
 binaries=target/$(rustc -vV | sed -n 's/host: //p')/release
 
+mkdir -p logs
 if [ "$mode" = keep ]; then
     for target in "${targets[@]}"; do
         merged=$(mktemp --directory)
+        mkdir -p "work/$target"
         "$binaries/$target" -merge=1 "$merged" "corpus/$target" "work/$target" 2>"logs/$target-merge.log"
         total=0
         # By size; names are the hashes of the contents.

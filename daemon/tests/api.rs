@@ -1,4 +1,5 @@
-//! The control API as others see it: over its socket and its port, against its own description.
+//! The control API as others see it: over its socket and its port, against its own description. Long because
+//! every route is in it, so that none is forgotten.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "api/fake.rs"]

@@ -1,5 +1,5 @@
 //! Replay as a bench for whatever reads it: the same bytes each time, nothing missed, and every control does what it
-//! says.
+//! says. Long because a rig, its recording and two readers are set up for all of it.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{Bus, FrameFlags, FrameHeader, HostTime, RigName, SetSubscriber, StreamId, Subscriber};

@@ -1,4 +1,4 @@
-//! Cutting and joining.
+//! Cutting and joining. Long because trimmed parts are what merging is tested with.
 
 use crate::support::*;
 use depthrig_recorder::fs::{Fault, Fs, MemFs, RealFs};

@@ -1,4 +1,4 @@
-//! What verification finds.
+//! What verification finds. Long because it is a list: each kind of damage with the finding that must name it.
 
 use crate::support::*;
 use depthrig_bus::{DropCounts, HostTime, PixelFormat, UtcPair};
