@@ -243,7 +243,7 @@ def test_nothing_is_overwritten(binary: str, golden: Golden, tmp_path: Path) -> 
     before = {name: (done / name).stat().st_mtime_ns for name in tree(done)}
     export(binary, golden.dataset, done)
     assert {name: (done / name).stat().st_mtime_ns for name in tree(done)} == before, "it was whole already"
-    assert "something else" in export(binary, "--task", "another", golden.dataset, done, code=1)["error"]
+    assert "differs in its options" in export(binary, "--task", "another", golden.dataset, done, code=1)["error"]
     assert {name: (done / name).stat().st_mtime_ns for name in tree(done)} == before
 
 

@@ -116,7 +116,8 @@ def check_mcap(segments, index, pictures):
                     elif topic == "/tf_static":
                         check_poses(ros.transforms, index)
                     elif topic == "/diagnostics":
-                        (status,) = ros.status
+                        status, disk = ros.status
+                        assert disk.name == "golden/disk" and disk.level in (0, 1), disk
                         assert status.level == 0 and status.message == "streaming", status
                         assert [(v.key, v.value) for v in status.values] == [("drift_ppm", "1.5")]
         assert seen == pictures.keys(), f"mcap: {len(pictures.keys() - seen)} pictures are missing"
