@@ -10,6 +10,7 @@ pub mod client;
 pub mod config;
 pub mod control;
 mod error;
+mod house;
 pub mod metrics;
 mod priority;
 mod recording;

@@ -255,10 +255,9 @@ impl Recording {
         self.active.is_some()
     }
 
-    /// As [`Self::take`], if the recording has lasted as long as it was to.
-    fn take_due(&mut self) -> Option<Finishing> {
-        let ends = self.active.as_ref()?.ends?;
-        if ends.from_now().is_zero() { self.take().ok() } else { None }
+    /// Whether a recording is going on that has lasted as long as it was to.
+    fn is_due(&self) -> bool {
+        self.active.as_ref().and_then(|a| a.ends).is_some_and(|ends| ends.from_now().is_zero())
     }
 
     /// Keeps the numbers of a finished recording.
@@ -384,11 +383,18 @@ pub fn stop(recording: &Mutex<Recording>) -> Result<RecordingStatus> {
     finish(recording, finishing)
 }
 
-/// Ends the recording, as [`stop`] does, if it has lasted as long as it was to: to be asked often. `None`: it is not
+/// Whether the recording has lasted as long as it was to: to be asked often.
+pub fn is_due(recording: &Mutex<Recording>) -> bool {
+    recording.lock().unwrap_or_else(PoisonError::into_inner).is_due()
+}
+
+/// Ends the recording, as [`stop`] does, if it has lasted as long as it was to. `None`: it is not
 /// over yet, or there is none. The moment it ends is that of its start and its length, however late this is asked the
 /// times before.
 pub fn stop_when_due(recording: &Mutex<Recording>) -> Option<Result<RecordingStatus>> {
-    let finishing = recording.lock().unwrap_or_else(PoisonError::into_inner).take_due()?;
+    let mut idle = recording.lock().unwrap_or_else(PoisonError::into_inner);
+    let finishing = if idle.is_due() { idle.take().ok()? } else { return None };
+    drop(idle);
     tracing::info!(path = finishing.active.status.path, "the recording has lasted as long as it was to");
     Some(finish(recording, finishing))
 }

@@ -26,7 +26,8 @@ mod transport;
 use crate::api::{self, ServerHandle};
 use crate::config::{BusConfig, ControlConfig, RecordingConfig, RigConfig, SetsConfig, SupervisorConfig};
 use crate::control::Control;
-use crate::recording::{self, Outside, Recording, Reports};
+use crate::house::House;
+use crate::recording::{Outside, Recording, Reports};
 use crate::rig::report;
 use crate::sets::SpreadStats;
 use crate::status::{RecordingStatus, ReplayStatus};
@@ -35,7 +36,7 @@ use crate::wake::Wake;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::runtime::RigLock;
-use depthrig_bus::{Bus, ClockDomain, HostTime, RigName, RuntimeDir, SUBSCRIBER_BUFFER, UtcPair, clock, shm};
+use depthrig_bus::{Bus, ClockDomain, HostTime, RigName, RuntimeDir, SUBSCRIBER_BUFFER, UtcPair, shm};
 use depthrig_drivers::StreamProfile;
 use depthrig_recorder::StreamRecord;
 use player::Player;
@@ -395,28 +396,15 @@ fn profile(r: &StreamRecord) -> StreamProfile {
     }
 }
 
-/// What must be done about once a second and by nobody in particular.
+/// The house thread.
 fn keep_house(inner: &Inner, bus: &Bus) {
-    const LOOK: Duration = Duration::from_millis(50);
-    let (mut last, mut last_cpu) = (HostTime::now(), clock::process_cpu_ns());
-    while !inner.stopping() {
-        std::thread::sleep(LOOK);
-        // What goes wrong is logged and in the status.
-        if let Some(Ok(status)) = recording::stop_when_due(&inner.recording) {
-            inner.reports.begin(PathBuf::from(&status.path));
-        }
-        let now = HostTime::now();
-        let passed_ns = now.since_ns(last);
-        if passed_ns < 1_000_000_000 {
-            continue;
-        }
-        let cpu = clock::process_cpu_ns();
-        inner.cpu_millicores.store(((cpu - last_cpu) * 1000 / passed_ns) as u64, Ordering::Relaxed);
-        (last, last_cpu) = (now, cpu);
-        bus.clean_dead();
-        if lock(&inner.recording).is_active() {
-            let diagnostics = report::diagnostics(&inner.status());
-            lock(&inner.recording).housekeeping(diagnostics);
-        }
-    }
+    let house =
+        House { recording: &inner.recording, reports: &inner.reports, cpu_millicores: &inner.cpu_millicores };
+    house.keep(
+        || inner.stopping(),
+        || {
+            bus.clean_dead();
+        },
+        || report::diagnostics(&inner.status()),
+    );
 }

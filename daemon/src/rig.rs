@@ -15,6 +15,7 @@ use crate::api::{self, ServerHandle};
 use crate::camera::{Camera, Shared, Supervisor};
 use crate::config::{BackendConfig, RigConfig};
 use crate::control::{Control, RecordRequest};
+use crate::house::House;
 use crate::recording::{self, Begun, Outside, Recording, Reports, StreamFacts, recover_left};
 use crate::sets::SpreadStats;
 use crate::status::{CameraState, RecordingStatus, RigStatus, SetAccount};
@@ -23,7 +24,7 @@ use crate::{Error, ErrorKind, Result, priority};
 use assembly::Assembly;
 use core::time::Duration;
 use depthrig_bus::runtime::{RigLock, RuntimeDir};
-use depthrig_bus::{Bus, HostTime, StreamId, UtcPair, clock, shm};
+use depthrig_bus::{Bus, HostTime, StreamId, UtcPair, shm};
 use depthrig_recorder::UtcSource;
 use depthrig_recorder::fs::{Fs, RealFs};
 use std::collections::BTreeMap;
@@ -407,31 +408,18 @@ fn supervise(inner: &Arc<Inner>, stop: &AtomicBool) {
     }
 }
 
-/// The house thread: what must be done about once a second and by nobody in particular.
+/// The house thread.
 fn keep_house(inner: &Inner, stop: &AtomicBool) {
-    const LOOK: Duration = Duration::from_millis(50);
-    let (mut last, mut last_cpu) = (HostTime::now(), clock::process_cpu_ns());
-    while !stop.load(Ordering::Relaxed) {
-        std::thread::sleep(LOOK);
-        if let Some(Ok(status)) = recording::stop_when_due(&inner.recording) {
-            inner.reports.begin(PathBuf::from(&status.path));
-        }
-        let now = HostTime::now();
-        let passed_ns = now.since_ns(last);
-        if passed_ns < 1_000_000_000 {
-            continue;
-        }
-        let cpu = clock::process_cpu_ns();
-        inner.cpu_millicores.store(((cpu - last_cpu) * 1000 / passed_ns) as u64, Ordering::Relaxed);
-        (last, last_cpu) = (now, cpu);
-        let cleaned = inner.shared.bus.clean_dead();
-        if cleaned > 0 {
-            tracing::info!(processes = cleaned, "cleaned up after subscribers that were killed");
-        }
-        let recording = inner.recording().is_active();
-        if recording {
-            let diagnostics = report::diagnostics(&report::status(inner));
-            inner.recording().housekeeping(diagnostics);
-        }
-    }
+    let house =
+        House { recording: &inner.recording, reports: &inner.reports, cpu_millicores: &inner.cpu_millicores };
+    house.keep(
+        || stop.load(Ordering::Relaxed),
+        || {
+            let cleaned = inner.shared.bus.clean_dead();
+            if cleaned > 0 {
+                tracing::info!(processes = cleaned, "cleaned up after subscribers that were killed");
+            }
+        },
+        || report::diagnostics(&report::status(inner)),
+    );
 }

@@ -42,6 +42,7 @@ mod verify;
 
 pub use cat::{FRAMES_FILE, FrameChoice, FrameRow, FramesDone, SetChoice, export_frames, list_frames};
 pub use catalog::{CatalogEntry, Health, catalog, look_at};
+pub use clock::utc_text;
 pub use compare::{
     CompareOptions, CompareProgress, Comparison, Difference, FieldCount, PixelCheck, PixelDifference,
     compare, compare_with,

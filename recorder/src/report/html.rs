@@ -4,9 +4,9 @@ use super::pixels::viridis;
 use super::svg::number;
 use super::{Report, Shown};
 use crate::catalog::Health;
+use crate::clock::utc_text;
 use depthrig_bus::Distortion;
 use std::fmt::Write;
-use time::OffsetDateTime;
 
 mod plots;
 
@@ -31,13 +31,6 @@ pub(super) fn escape(text: &str) -> String {
         }
     }
     out
-}
-
-/// `2026-08-21 14:05:09 UTC`.
-fn utc(ns: i64) -> String {
-    let t = OffsetDateTime::from_unix_timestamp_nanos(i128::from(ns)).unwrap_or(OffsetDateTime::UNIX_EPOCH);
-    let (h, m, s) = t.to_hms();
-    format!("{:04}-{:02}-{:02} {h:02}:{m:02}:{s:02} UTC", t.year(), u8::from(t.month()), t.day())
 }
 
 fn length(ns: i64) -> String {
@@ -125,7 +118,7 @@ fn head(out: &mut String, r: &Report) {
          </strong>",
         escape(scene),
         escape(&r.name),
-        utc(r.started_utc_ns),
+        utc_text(r.started_utc_ns),
         escape(&v.headline)
     );
     list(out, &v.why);
@@ -151,11 +144,11 @@ fn head(out: &mut String, r: &Report) {
         let _ = write!(out, "<div><dt>{name}</dt><dd>{}</dd></div>", escape(&value));
     }
     out.push_str("</dl>");
-    let notes = r.notes.iter().map(|n| format!("{}: {}", utc(n.utc_ns), n.text));
+    let notes = r.notes.iter().map(|n| format!("{}: {}", utc_text(n.utc_ns), n.text));
     named_list(out, "Notes", notes.collect());
     let edits = r.history.iter().map(|e| match e.field.as_str() {
-        "notes" => format!("{}: note added: {}", utc(e.utc_ns), e.after),
-        field => format!("{}: {field} “{}” became “{}”", utc(e.utc_ns), e.before, e.after),
+        "notes" => format!("{}: note added: {}", utc_text(e.utc_ns), e.after),
+        field => format!("{}: {field} “{}” became “{}”", utc_text(e.utc_ns), e.before, e.after),
     });
     named_list(out, "Changed after the recording", edits.collect());
 }
@@ -386,6 +379,6 @@ mod tests {
     fn numbers_read_well() {
         assert_eq!([length(8_240_000_000), length(249_000_000_000)], ["8.2 s", "4 min 09 s"]);
         assert_eq!([size(1500), size(2_500_000), size(3_210_000_000)], ["1.5 kB", "2.5 MB", "3.21 GB"]);
-        assert_eq!(utc(1_709_210_096_789_000_000), "2024-02-29 12:34:56 UTC");
+        assert_eq!(utc_text(1_709_210_096_789_000_000), "2024-02-29 12:34:56 UTC");
     }
 }

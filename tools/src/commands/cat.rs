@@ -146,7 +146,7 @@ fn text(row: &FrameRow) -> String {
 
 /// `2026-08-21 14:05:09.250`.
 fn utc_ms(ns: i64) -> String {
-    let whole = super::info::utc(ns);
+    let whole = depthrig_recorder::utc_text(ns);
     format!("{}.{:03}", whole.trim_end_matches(" UTC"), ns.rem_euclid(1_000_000_000) / 1_000_000)
 }
 

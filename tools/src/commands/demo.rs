@@ -188,7 +188,7 @@ fn show_recording(seconds: f64, stop: &Stop, quiet: bool) {
 
 /// `demo-data/20261121_101500`, in UTC.
 fn default_folder() -> PathBuf {
-    let stamp = crate::commands::info::utc(UtcPair::sample().utc_ns);
+    let stamp = depthrig_recorder::utc_text(UtcPair::sample().utc_ns);
     let digits: String = stamp.chars().filter(char::is_ascii_digit).collect();
     let (date, time) = digits.split_at(8);
     Path::new("demo-data").join(format!("{date}_{time}"))

@@ -1,10 +1,10 @@
 //! `depthrig edit`: changes what a dataset says of itself, with history.
 
-use crate::commands::info::utc;
 use crate::exit::{Exit, UsageError};
 use crate::out;
 use anyhow::Result;
 use depthrig_recorder::fs::RealFs;
+use depthrig_recorder::utc_text;
 use depthrig_recorder::{Dataset, Edit, SessionChanges, edit, rename};
 use serde::Serialize;
 use std::path::PathBuf;
@@ -90,7 +90,7 @@ pub fn run(args: &EditArgs) -> Result<Exit> {
         } else {
             format!("{}: {:?} is now {:?}", e.field, e.before, e.after)
         };
-        out::line(format_args!("{} {}: {what}", utc(e.utc_ns), path.display()))?;
+        out::line(format_args!("{} {}: {what}", utc_text(e.utc_ns), path.display()))?;
     }
     Ok(Exit::Good)
 }

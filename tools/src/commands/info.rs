@@ -3,7 +3,7 @@
 use crate::exit::Exit;
 use crate::out;
 use anyhow::Result;
-use depthrig_recorder::{Dataset, DatasetInfo};
+use depthrig_recorder::{Dataset, DatasetInfo, utc_text};
 use std::path::PathBuf;
 
 /// Arguments.
@@ -40,7 +40,7 @@ pub fn text(info: &DatasetInfo) -> String {
             or_none(&info.scene),
             or_none(&info.operator)
         ),
-        format!("started   {}", utc(info.started_utc_ns)),
+        format!("started   {}", utc_text(info.started_utc_ns)),
         format!(
             "holds     {} sets ({} incomplete) over {}, {} in {} segments",
             info.sets,
@@ -92,32 +92,4 @@ pub fn text(info: &DatasetInfo) -> String {
     lines.extend(info.unfinished.iter().map(|file| format!("unfinished: {file}")));
     lines.extend(info.problems.iter().map(|problem| format!("problem: {problem}")));
     lines.join("\n")
-}
-
-/// `2026-08-21 14:05:09 UTC` from nanoseconds since 1970, by the civil calendar (H. Hinnant, "chrono-compatible
-/// low-level date algorithms", `civil_from_days`).
-pub fn utc(ns: i64) -> String {
-    let seconds = ns.div_euclid(1_000_000_000);
-    let (days, rest) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
-    let z = days + 719_468;
-    let (era, doe) = (z.div_euclid(146_097), z.rem_euclid(146_097));
-    let yoe = (doe - doe / 1460 + doe / 36_524 - doe / 146_096) / 365;
-    let doy = doe - (365 * yoe + yoe / 4 - yoe / 100);
-    let mp = (5 * doy + 2) / 153;
-    let (day, month) = (doy - (153 * mp + 2) / 5 + 1, if mp < 10 { mp + 3 } else { mp - 9 });
-    let year = yoe + era * 400 + i64::from(month <= 2);
-    format!("{year:04}-{month:02}-{day:02} {:02}:{:02}:{:02} UTC", rest / 3600, rest / 60 % 60, rest % 60)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn dates() {
-        assert_eq!(utc(0), "1970-01-01 00:00:00 UTC");
-        assert_eq!(utc(1_709_210_096_789_000_000), "2024-02-29 12:34:56 UTC");
-        assert_eq!(utc(-1), "1969-12-31 23:59:59 UTC");
-        assert_eq!(utc(4_102_444_800_000_000_000), "2100-01-01 00:00:00 UTC");
-    }
 }

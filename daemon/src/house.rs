@@ -1,0 +1,117 @@
+//! The house thread of a rig or a replay: what must be done about once a second and by nobody in particular.
+
+use crate::recording::{self, Recording, Reports};
+use core::time::Duration;
+use depthrig_bus::{HostTime, clock};
+use depthrig_recorder::Diagnostic;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// How often it looks whether a recording is due to end, or whether it shall end itself.
+const LOOK: Duration = Duration::from_millis(50);
+const SECOND_NS: i64 = 1_000_000_000;
+
+/// What every house thread looks after.
+pub struct House<'a> {
+    /// Ended when it has lasted as long as it was to.
+    pub recording: &'a Mutex<Recording>,
+    /// Where the report of such a recording is begun.
+    pub reports: &'a Reports,
+    /// Gets the CPU of this process over the last second, thousandths of a core.
+    pub cpu_millicores: &'a AtomicU64,
+}
+
+impl House<'_> {
+    /// Keeps house until `stopping`; `each_second` is what this rig or replay wants done besides, and `diagnose` says
+    /// what belongs into a recording that is going on.
+    pub fn keep(
+        &self,
+        stopping: impl Fn() -> bool,
+        mut each_second: impl FnMut(),
+        diagnose: impl Fn() -> Vec<Diagnostic>,
+    ) {
+        let (mut last, mut last_cpu) = (HostTime::now(), clock::process_cpu_ns());
+        let due = || recording::is_due(self.recording);
+        let close = || {
+            // What goes wrong is logged and in the status.
+            if let Some(Ok(status)) = recording::stop_when_due(self.recording) {
+                self.reports.begin(PathBuf::from(&status.path));
+            }
+        };
+        run(stopping, due, close, || {
+            let (now, cpu) = (HostTime::now(), clock::process_cpu_ns());
+            let passed_ns = now.since_ns(last).max(1);
+            self.cpu_millicores.store(((cpu - last_cpu) * 1000 / passed_ns) as u64, Ordering::Relaxed);
+            (last, last_cpu) = (now, cpu);
+            each_second();
+            if lock(self.recording).is_active() {
+                // Before the recording is locked again: the rig's status asks it, too.
+                let diagnostics = diagnose();
+                lock(self.recording).housekeeping(diagnostics);
+            }
+        });
+    }
+}
+
+fn lock(recording: &Mutex<Recording>) -> MutexGuard<'_, Recording> {
+    recording.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Closing takes as long as the disk does, so it has a thread of its own, which is waited for at the end: meanwhile
+/// the house goes on.
+fn run(
+    stopping: impl Fn() -> bool,
+    due: impl Fn() -> bool,
+    close: impl Fn() + Sync,
+    mut each_second: impl FnMut(),
+) {
+    std::thread::scope(|scope| {
+        let mut last = HostTime::now();
+        while !stopping() {
+            std::thread::sleep(LOOK);
+            if due() {
+                let thread = std::thread::Builder::new().name("rec-close".into());
+                if let Err(e) = thread.spawn_scoped(scope, &close) {
+                    tracing::error!(error = %e, "no thread to end the recording, which is tried again");
+                }
+            }
+            let now = HostTime::now();
+            if now.since_ns(last) >= SECOND_NS {
+                last = now;
+                each_second();
+            }
+        }
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::atomic::{AtomicBool, AtomicUsize};
+
+    /// A disk that does not answer keeps a recording from being closed, and nothing else.
+    #[test]
+    fn the_house_goes_on_while_a_recording_is_closed() {
+        let (due, closed, seconds) = (AtomicBool::new(true), AtomicBool::new(false), AtomicUsize::new(0));
+        let seen_open = AtomicUsize::new(0);
+        run(
+            || seconds.load(Ordering::SeqCst) >= 2,
+            || due.swap(false, Ordering::SeqCst),
+            || {
+                // As long as the house has not been kept twice, or ten seconds where it never is.
+                let began = HostTime::now();
+                while seconds.load(Ordering::SeqCst) < 2 && began.elapsed() < Duration::from_secs(10) {
+                    std::thread::sleep(Duration::from_millis(10));
+                }
+                closed.store(true, Ordering::SeqCst);
+            },
+            || {
+                seen_open.fetch_add(usize::from(!closed.load(Ordering::SeqCst)), Ordering::SeqCst);
+                seconds.fetch_add(1, Ordering::SeqCst);
+            },
+        );
+        assert!(closed.into_inner(), "its end is waited for");
+        assert_eq!(seen_open.into_inner(), 2, "the house waited for the disk");
+    }
+}
