@@ -15,6 +15,8 @@ pub mod files;
 mod gate;
 mod sink;
 pub mod synthetic;
+pub mod uvc;
+pub mod video;
 
 pub use device::{
     Backend, Device, DeviceClock, DeviceInfo, Poll, Stream, StreamProfile, StreamRequest, choose_profiles,
