@@ -273,9 +273,13 @@ impl FrameFlags {
     pub const LATE: Self = Self(1 << 6);
     /// Made by a simulated camera.
     pub const SYNTHETIC: Self = Self(1 << 7);
+    /// The device time is that of the transport's header, which is later than mid-exposure.
+    pub const HEADER_TIME: Self = Self(1 << 8);
+    /// The metadata of this frame alone did not come: its device time is reckoned from when it arrived.
+    pub const METADATA_LOST: Self = Self(1 << 9);
 
     /// Every flag with its name.
-    pub const ALL: [(&'static str, Self); 8] = [
+    pub const ALL: [(&'static str, Self); 10] = [
         ("replayed", Self::REPLAYED),
         ("time_uncertain", Self::TIME_UNCERTAIN),
         ("clock_warmup", Self::CLOCK_WARMUP),
@@ -284,7 +288,14 @@ impl FrameFlags {
         ("hardware_triggered", Self::HARDWARE_TRIGGERED),
         ("late", Self::LATE),
         ("synthetic", Self::SYNTHETIC),
+        ("header_time", Self::HEADER_TIME),
+        ("metadata_lost", Self::METADATA_LOST),
     ];
+
+    /// Whether all bits of `flag` are set.
+    pub const fn has(self, flag: Self) -> bool {
+        self.0 & flag.0 == flag.0
+    }
 
     /// Both sets of flags together.
     pub const fn with(self, other: Self) -> Self {

@@ -140,6 +140,13 @@ fn clock(f: &mut Families, labels: &Labels, c: &ClockStatus) {
         f.gauge("clock_residual", "How late arrivals are against the map.", Unit::Seconds, &labels, us / 1e6);
     }
     f.gauge("clock_epoch", "Number of the clock map in force.", Unit::None, labels, f64::from(c.epoch));
+    f.counter(
+        "metadata_lost_frames",
+        "Frames whose own metadata did not come.",
+        Unit::None,
+        labels,
+        c.metadata_lost,
+    );
     let help = "Frames whose capture time is flagged uncertain.";
     f.counter("clock_uncertain_frames", help, Unit::None, labels, c.uncertain_frames);
 }

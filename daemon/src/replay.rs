@@ -36,7 +36,9 @@ use crate::wake::Wake;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::runtime::RigLock;
-use depthrig_bus::{Bus, ClockDomain, HostTime, RigName, RuntimeDir, SUBSCRIBER_BUFFER, UtcPair, shm};
+use depthrig_bus::{
+    Bus, ClockDomain, HostTime, MetadataLevel, RigName, RuntimeDir, SUBSCRIBER_BUFFER, UtcPair, shm,
+};
 use depthrig_drivers::StreamProfile;
 use depthrig_recorder::StreamRecord;
 use player::Player;
@@ -393,6 +395,7 @@ fn profile(r: &StreamRecord) -> StreamProfile {
         pose_in_device: r.pose,
         clock: depthrig_drivers::DeviceClock { counter_bits: 64, tick_ps: 1000, domain: ClockDomain::Device },
         sequence_bits: 64,
+        metadata: MetadataLevel::Full,
     }
 }
 

@@ -2,7 +2,7 @@
 
 use crate::stream::{Books, Stream};
 use crate::wake::Wake;
-use depthrig_bus::{DropReason, FrameHeader, FrameMut, HostTime, Publisher};
+use depthrig_bus::{DropReason, FrameFlags, FrameHeader, FrameMut, HostTime, MetadataLevel, Publisher};
 use depthrig_drivers::clock::ClockQuality;
 use depthrig_drivers::{FrameMeta, FrameSink};
 use std::sync::{Arc, MutexGuard};
@@ -77,7 +77,8 @@ impl Port {
         books.delivered += 1;
         books.epoch = books.epoch_base + meta.clock_epoch;
         books.uncertainty_ns = meta.capture_uncertainty_ns;
-        books.uncertain += u64::from(meta.flags.0 & depthrig_bus::FrameFlags::TIME_UNCERTAIN.0 != 0);
+        books.uncertain += u64::from(meta.flags.has(FrameFlags::TIME_UNCERTAIN));
+        books.note_metadata(MetadataLevel::of(meta.clock_domain, meta.flags), meta.flags);
         books.note(now, now.since_ns(meta.capture_time));
     }
 }

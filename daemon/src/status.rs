@@ -181,6 +181,13 @@ pub struct StreamStatus {
 pub struct ClockStatus {
     /// `device`, `kernel` or `arrival`.
     pub domain: String,
+    /// What the times come from: `full`, `header`, `kernel`, `arrival` or `simulated`
+    /// ([`depthrig_bus::MetadataLevel`]).
+    #[serde(default)]
+    pub metadata: String,
+    /// Frames of a better level whose own metadata did not come.
+    #[serde(default)]
+    pub metadata_lost: u64,
     /// Number of the map in force.
     pub epoch: u32,
     /// Device clock rate against the host's, parts per million.

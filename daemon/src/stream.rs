@@ -3,7 +3,9 @@
 //! The books are double-entry: `captured` is what the device announced, `delivered` and `dropped` are what
 //! became of it, and [`Books::close`] balances them when a hung thread is given up with a frame in its hands.
 
-use depthrig_bus::{DropCounts, DropReason, HostTime, Publisher, StreamId, Subscriber};
+use depthrig_bus::{
+    DropCounts, DropReason, FrameFlags, HostTime, MetadataLevel, Publisher, StreamId, Subscriber,
+};
 use depthrig_drivers::StreamProfile;
 use depthrig_drivers::clock::ClockQuality;
 use std::collections::VecDeque;
@@ -52,6 +54,10 @@ pub struct Books {
     pub uncertainty_ns: u64,
     /// Frames flagged as uncertain in time.
     pub uncertain: u64,
+    /// What the times of the newest frame that had its metadata come from.
+    pub metadata: Option<MetadataLevel>,
+    /// Frames whose metadata did not come.
+    pub metadata_lost: u64,
     /// The clock map's own word.
     pub clock: Option<ClockQuality>,
     recent: VecDeque<(HostTime, i64)>,
@@ -107,6 +113,15 @@ impl Books {
         self.last_frame = Some(published);
     }
 
+    /// Notes what the times of a published frame come from.
+    pub const fn note_metadata(&mut self, level: MetadataLevel, flags: FrameFlags) {
+        if flags.has(FrameFlags::METADATA_LOST) {
+            self.metadata_lost += 1;
+        } else {
+            self.metadata = Some(level);
+        }
+    }
+
     /// Frames per second over the last two seconds or the last 256 frames.
     pub fn rate_hz(&self, now: HostTime) -> f64 {
         let from = now.plus_ns(-2_000_000_000);
@@ -144,6 +159,14 @@ mod tests {
         assert_eq!(books.captured, books.delivered + books.dropped.total());
         assert_eq!(books.dropped.get(DropReason::Abandoned), 1);
         assert_ne!(books.session, session);
+    }
+
+    #[test]
+    fn a_frame_without_its_metadata_does_not_change_the_level() {
+        let mut books = Books::default();
+        books.note_metadata(MetadataLevel::Header, FrameFlags::HEADER_TIME);
+        books.note_metadata(MetadataLevel::Arrival, FrameFlags::METADATA_LOST);
+        assert_eq!((books.metadata, books.metadata_lost), (Some(MetadataLevel::Header), 1));
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use crate::{Error, ErrorKind, FrameSink, Result};
 use core::time::Duration;
-use depthrig_bus::{ClockDomain, Intrinsics, PixelFormat, Pose, StreamName};
+use depthrig_bus::{ClockDomain, Intrinsics, MetadataLevel, PixelFormat, Pose, StreamName};
 
 /// A camera family: finds devices and opens them.
 pub trait Backend: Send {
@@ -107,6 +107,9 @@ pub struct StreamProfile {
     pub clock: DeviceClock,
     /// Width of the device's frame counter in bits.
     pub sequence_bits: u32,
+    /// What the frames' times come from. Of a device that is not started it is the best that can be hoped for; the
+    /// running stream knows what the kernel granted.
+    pub metadata: MetadataLevel,
 }
 
 impl StreamProfile {

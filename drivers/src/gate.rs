@@ -75,6 +75,8 @@ pub struct Gate {
     frame_bytes: usize,
     sequence_bits: u32,
     domain: ClockDomain,
+    /// Flags of every frame.
+    flags: FrameFlags,
     clock: ClockMap,
     /// Newest unwrapped sequence number, and which of the 64 before it were seen (bit 0 = the newest).
     newest: Option<(u64, u64)>,
@@ -99,6 +101,7 @@ impl Gate {
             frame_bytes: profile.frame_bytes(),
             sequence_bits: profile.sequence_bits,
             domain: profile.clock.domain,
+            flags: profile.metadata.flags(),
             clock: ClockMap::new(clock),
             newest: None,
             behind: None,
@@ -200,7 +203,7 @@ impl Gate {
             clock_epoch: 0,
             clock_domain: self.domain,
             arrival: raw.arrival,
-            flags: raw.flags,
+            flags: raw.flags.with(self.flags),
             captured: self.captured,
             exposure_ns: raw.exposure_ns,
             gain: raw.gain,

@@ -89,6 +89,25 @@ def test_what_follows_from_the_fields(dumped: tuple[bytes, dict]) -> None:
         assert part in repr(header)
 
 
+@pytest.mark.parametrize(
+    ("clock", "flags", "level"),
+    [
+        (1, 0, "full"),
+        (1, FrameFlags.HEADER_TIME, "header"),
+        (1, FrameFlags.HEADER_TIME | FrameFlags.METADATA_LOST, "arrival"),
+        (1, FrameFlags.SYNTHETIC, "simulated"),
+        (2, 0, "kernel"),
+        (0, 0, "arrival"),
+        (999, 0, "arrival"),
+    ],
+)
+def test_a_frame_says_what_its_times_come_from(
+    dumped: tuple[bytes, dict], clock: int, flags: int, level: str
+) -> None:
+    values = Header(dumped[0]).to_dict() | {"clock_domain": clock, "flags": int(flags)}
+    assert Header(Header.pack(values)).metadata_level == level
+
+
 def test_text_with_an_invalid_tail_is_cut_there(dumped: tuple[bytes, dict]) -> None:
     values = Header(dumped[0]).to_dict()
     assert Header(Header.pack(values | {"model": "é".encode() * 2 + b"\xc3"})).model == "éé"

@@ -4,6 +4,7 @@ use crate::out;
 use depthrig_daemon::status::{
     CameraState, CameraStatus, RecordingStatus, ReplayStatus, RigStatus, StreamStatus,
 };
+use std::collections::BTreeMap;
 
 const BOLD: &str = "\x1b[1m";
 const RED: &str = "\x1b[31m";
@@ -26,7 +27,7 @@ impl Style {
     }
 
     const fn is_wide(self) -> bool {
-        self.width >= 116
+        self.width >= 126
     }
 }
 
@@ -61,6 +62,7 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
     ));
     lines.push(String::new());
     lines.extend(streams(rig, style));
+    lines.extend(poor_metadata(rig));
     let troubles: Vec<_> = rig.cameras.iter().filter_map(|c| trouble(c, style)).collect();
     if !troubles.is_empty() {
         lines.push(String::new());
@@ -128,7 +130,7 @@ fn streams(rig: &RigStatus, style: Style) -> Vec<String> {
         (
             &[
                 "stream", "state", "picture", "format", "Hz", "frames", "lost", "p50 ms", "p99 ms", "clock",
-                "ppm", "±us",
+                "metadata", "ppm", "±us",
             ],
             |c, s| {
                 let mut row = narrow(c, s);
@@ -136,6 +138,7 @@ fn streams(rig: &RigStatus, style: Style) -> Vec<String> {
                 row.insert(5, s.delivered.to_string());
                 row.insert(7, format!("{:.1}", s.latency_p50_ms));
                 row.insert(9, s.clock.domain.clone());
+                row.insert(10, s.clock.metadata.clone());
                 row
             },
         )
@@ -153,6 +156,21 @@ fn streams(rig: &RigStatus, style: Style) -> Vec<String> {
         },
     };
     table.lines().enumerate().map(paint).collect()
+}
+
+/// The streams whose times do not come from the device's own account of each frame.
+fn poor_metadata(rig: &RigStatus) -> Option<String> {
+    let is_poor = |s: &&StreamStatus| !matches!(s.clock.metadata.as_str(), "" | "full" | "simulated");
+    // Pictures from files have no device that could say more.
+    let cameras = rig.cameras.iter().filter(|c| c.backend != "files");
+    let poor = cameras.flat_map(|c| c.streams.iter()).filter(is_poor);
+    let mut by_level = BTreeMap::<&str, Vec<&str>>::new();
+    for s in poor {
+        by_level.entry(s.clock.metadata.as_str()).or_default().push(&s.id);
+    }
+    let told: Vec<_> =
+        by_level.into_iter().map(|(level, ids)| format!("{level} only: {}", ids.join(", "))).collect();
+    (!told.is_empty()).then(|| format!("metadata  {}", told.join("; ")))
 }
 
 fn narrow(camera: &CameraStatus, stream: &StreamStatus) -> Vec<String> {
@@ -176,6 +194,9 @@ fn trouble(camera: &CameraStatus, style: Style) -> Option<String> {
         let why = camera.message.as_deref().map_or_else(String::new, |why| format!(": {why}"));
         let text = format!("{} for {}{why}", camera.state.name(), out::seconds(camera.state_for_s));
         told.push(color_of(camera.state).map_or_else(|| text.clone(), |color| style.paint(color, &text)));
+    }
+    for stream in camera.streams.iter().filter(|s| s.clock.metadata_lost > 0) {
+        told.push(format!("{} had {} frames without metadata", stream.id, stream.clock.metadata_lost));
     }
     if camera.reconnects > 0 {
         told.push(format!("came back {} times", camera.reconnects));

@@ -21,6 +21,8 @@ fn rig() -> RigStatus {
         latency_p99_ms: 9.0,
         clock: ClockStatus {
             domain: "device".into(),
+            metadata: "full".into(),
+            metadata_lost: 8,
             epoch: 2,
             rate_ppm: 31.0,
             uncertainty_us: 250.0,

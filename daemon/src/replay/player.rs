@@ -222,6 +222,7 @@ fn send(
             books.epoch = h.clock_epoch;
             books.uncertainty_ns = h.capture_uncertainty_ns;
             books.uncertain += u64::from(h.has(FrameFlags::TIME_UNCERTAIN));
+            books.note_metadata(h.metadata_level(), FrameFlags(h.flags));
             books.note(HostTime::now(), h.publish_time_ns.saturating_sub(h.capture_time_ns));
         }
         _ => books.dropped.add(DropReason::NoSlot, 1),

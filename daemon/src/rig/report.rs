@@ -102,6 +102,8 @@ pub fn stream(stream: &Stream, in_sets: SetAccount, now: HostTime) -> StreamStat
                 _ => "arrival",
             }
             .to_owned(),
+            metadata: books.metadata.unwrap_or(p.metadata).name().to_owned(),
+            metadata_lost: books.metadata_lost,
             epoch: books.epoch,
             rate_ppm: clock.map_or(0.0, |c| c.rate_ppm),
             uncertainty_us: books.uncertainty_ns as f64 / 1e3,

@@ -3,7 +3,7 @@
 use crate::clock::ClockQuality;
 use crate::{FrameMeta, FrameSink, StreamProfile};
 use core::time::Duration;
-use depthrig_bus::{DropCounts, DropReason, HostTime, PixelFormat};
+use depthrig_bus::{DropCounts, DropReason, FrameFlags, HostTime, MetadataLevel, PixelFormat};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// What memory on loan holds before the driver writes: two different fills in turn, so that a byte that a
@@ -98,6 +98,11 @@ impl Books {
                 self.delivered[stream] + 1,
                 self.drops[stream].total()
             ));
+        }
+        let level = MetadataLevel::of(meta.clock_domain, meta.flags);
+        let is_lost = meta.flags.has(FrameFlags::METADATA_LOST);
+        if level != p.metadata && !is_lost {
+            broken.push(format!("its metadata is {}, the stream's {}", level.name(), p.metadata.name()));
         }
         if let Some(last) = &self.last[stream] {
             if meta.clock_epoch < last.clock_epoch {

@@ -5,7 +5,7 @@ use super::manifest::{Loaded, PairBy, StreamEntry};
 use super::pattern::{Key, captures};
 use super::picture::{Info, Kind, io_error, probe};
 use crate::{DeviceClock, DeviceInfo, Error, ErrorKind, Result, StreamProfile};
-use depthrig_bus::{ClockDomain, PixelFormat};
+use depthrig_bus::{ClockDomain, MetadataLevel, PixelFormat};
 use std::path::{Path, PathBuf};
 use toml::Spanned;
 
@@ -260,6 +260,7 @@ fn profile(
         // The schedule is kept on the host's clock: see the documentation of the module `files`.
         clock: DeviceClock { counter_bits: 64, tick_ps: 1000, domain: ClockDomain::Kernel },
         sequence_bits: 64,
+        metadata: MetadataLevel::Kernel,
     })
 }
 

@@ -3,7 +3,7 @@
 use super::Outcome::{AlreadyCounted, Delivered, Dropped};
 use super::*;
 use crate::{DeviceClock, MemorySink};
-use depthrig_bus::{Intrinsics, Name, Pose};
+use depthrig_bus::{Intrinsics, MetadataLevel, Name, Pose};
 use proptest::prelude::*;
 
 fn profile(sequence_bits: u32, domain: ClockDomain) -> StreamProfile {
@@ -18,6 +18,7 @@ fn profile(sequence_bits: u32, domain: ClockDomain) -> StreamProfile {
         pose_in_device: Pose::IDENTITY,
         clock: DeviceClock { counter_bits: 32, tick_ps: 1_000_000, domain },
         sequence_bits,
+        metadata: MetadataLevel::Full,
     }
 }
 

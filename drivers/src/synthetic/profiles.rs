@@ -4,7 +4,7 @@ use super::config::SyntheticConfig;
 use super::models::{self, MODELS, Mode, Model};
 use super::noise;
 use crate::{DeviceClock, Error, ErrorKind, Result, StreamProfile, StreamRequest, choose_profiles};
-use depthrig_bus::{Name, PixelFormat, Pose};
+use depthrig_bus::{MetadataLevel, Name, PixelFormat, Pose};
 
 /// What a stream shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -151,6 +151,7 @@ fn profile(
         pose_in_device: if color { model.color_in_device } else { Pose::IDENTITY },
         clock: DeviceClock::microseconds(config.clock.counter_bits),
         sequence_bits: 32,
+        metadata: MetadataLevel::Simulated,
     })
 }
 

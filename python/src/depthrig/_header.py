@@ -152,6 +152,17 @@ class Header(HeaderFields):
         return FrameFlags.SYNTHETIC in self.flags
 
     @property
+    def metadata_level(self) -> str:
+        """What the times come from, best first: full, header, kernel or arrival; simulated for a made-up camera."""
+        if FrameFlags.SYNTHETIC in self.flags:
+            return "simulated"
+        if FrameFlags.METADATA_LOST in self.flags:
+            return "arrival"
+        if self.clock is ClockDomain.DEVICE:
+            return "header" if FrameFlags.HEADER_TIME in self.flags else "full"
+        return "kernel" if self.clock is ClockDomain.KERNEL else "arrival"
+
+    @property
     def age_s(self) -> float:
         """Seconds since the middle of the exposure. Of a replayed frame it is the age of the recording."""
         return (time.monotonic_ns() - self.capture_time_ns) / 1e9

@@ -83,6 +83,8 @@ class FrameFlags(enum.IntFlag):
     HARDWARE_TRIGGERED = 32
     LATE = 64
     SYNTHETIC = 128
+    HEADER_TIME = 256
+    METADATA_LOST = 512
 
 
 # (name, offset, element type, elements)

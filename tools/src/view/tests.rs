@@ -19,6 +19,7 @@ fn stream(id: &str, lost: u64) -> StreamStatus {
         latency_p99_ms: 8.25,
         clock: ClockStatus {
             domain: "device".into(),
+            metadata: "full".into(),
             rate_ppm: -12.3,
             uncertainty_us: 210.0,
             ..ClockStatus::default()
@@ -82,7 +83,7 @@ fn a_wide_one_has_more_columns() {
     let header = text.lines().find(|l| l.starts_with("stream")).unwrap();
     assert_eq!(
         header.split_whitespace().collect::<Vec<_>>().join(" "),
-        "stream state picture format Hz frames lost p50 ms p99 ms clock ppm ±us"
+        "stream state picture format Hz frames lost p50 ms p99 ms clock metadata ppm ±us"
     );
     let row = text.lines().find(|l| l.starts_with("l515/depth")).unwrap();
     assert_eq!(
@@ -98,10 +99,24 @@ fn a_wide_one_has_more_columns() {
             "4.1",
             "8.2",
             "device",
+            "full",
             "-12.3",
             "210"
         ]
     );
+}
+
+#[test]
+fn what_times_come_from_is_said_at_every_width() {
+    let mut rig = rig();
+    assert!(!status(&rig, Style { width: 80, color: false }).contains("metadata"));
+    rig.cameras[0].streams[0].clock.metadata = "header".into();
+    rig.cameras[0].streams[0].clock.metadata_lost = 4;
+    for width in [80, 140] {
+        let text = status(&rig, Style { width, color: false });
+        assert!(text.contains("metadata  header only: d435/depth"), "{text}");
+        assert!(text.contains("d435: d435/depth had 4 frames without metadata"), "{text}");
+    }
 }
 
 #[test]
