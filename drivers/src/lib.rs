@@ -15,6 +15,7 @@ pub mod files;
 mod gate;
 mod sink;
 pub mod synthetic;
+pub mod usb;
 pub mod uvc;
 pub mod video;
 
