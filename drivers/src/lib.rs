@@ -13,6 +13,7 @@ mod device;
 mod error;
 pub mod files;
 mod gate;
+pub mod realsense;
 mod sink;
 pub mod synthetic;
 pub mod usb;

@@ -1,0 +1,144 @@
+//! What a D400 is reached through: the kernel's video driver or libusb, behind one trait.
+//!
+//! The back end does not know which one it has. A transport lists what the device offers, hands out the ways to its
+//! controls, and starts the pictures; what their bytes and headers mean is not its business.
+
+use crate::Result;
+use crate::uvc::control::ControlPort;
+use crate::video::PictureSource;
+
+/// One of the video streaming interfaces of a D400.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Sensor {
+    /// Depth.
+    Depth,
+    /// The imagers behind it.
+    Infrared,
+    /// Colour: a module of its own, or the stereo module's on a D405.
+    Color,
+}
+
+/// One of the video control functions of a D400.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Function {
+    /// The stereo module: depth and infrared, and colour on a D405.
+    Stereo,
+    /// The colour module; a D405 has none.
+    Color,
+}
+
+/// A mode as the device's descriptors have it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Mode {
+    /// Which interface offers it.
+    pub sensor: Sensor,
+    /// Encoding of the pixels, as V4L2 names it: `Z16 `, `GREY`, `Y8I `, `Y12I`, `YUYV`, `UYVY`.
+    pub fourcc: [u8; 4],
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Frames per second.
+    pub rate_hz: f64,
+}
+
+impl Mode {
+    /// Bytes of one picture on the wire; `None` for an encoding that is not known here.
+    pub const fn wire_bytes(&self) -> Option<usize> {
+        let pixels = self.width as usize * self.height as usize;
+        match &self.fourcc {
+            b"GREY" => Some(pixels),
+            b"Z16 " | b"Y8I " | b"YUYV" | b"UYVY" => Some(pixels * 2),
+            b"Y12I" => Some(pixels * 3),
+            _ => None,
+        }
+    }
+}
+
+/// How much of the payload header the pictures of a source bring along.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum HeaderPart {
+    /// None of it: [`crate::video::Picture::header`] is `None`.
+    Nothing,
+    /// Its standard part of 12 bytes: the device's time stamp and clock sample.
+    Standard,
+    /// All of it, with the vendor's metadata blocks.
+    Whole,
+}
+
+/// What was started.
+pub struct Started {
+    /// The pictures; [`crate::video::Picture::source`] is the index into the modes that were asked for.
+    pub pictures: Box<dyn PictureSource>,
+    /// What the kernel or the library really grants of the header, for each of the modes.
+    pub headers: Vec<HeaderPart>,
+}
+
+/// A control of the camera's picture, such as exposure or white balance, by the name that V4L2 gives it in lower case
+/// with `_` (`exposure_time_absolute`, `white_balance_automatic`).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PictureControl {
+    /// Its name.
+    pub name: String,
+    /// Least value.
+    pub minimum: i32,
+    /// Greatest value.
+    pub maximum: i32,
+    /// Step between values.
+    pub step: i32,
+    /// Value after power-on.
+    pub default: i32,
+}
+
+/// The picture controls of one function (camera terminal and processing unit). Every call may take as long as the
+/// kernel's control time-out (5 s), so none belongs on a capture thread.
+pub trait PictureControls: Send {
+    /// All that there are.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::Disconnected`], [`crate::ErrorKind::Io`].
+    fn list(&mut self) -> Result<Vec<PictureControl>>;
+
+    /// The present value.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::Unsupported`] when there is no such control, [`crate::ErrorKind::Disconnected`],
+    /// [`crate::ErrorKind::Io`].
+    fn get(&mut self, name: &str) -> Result<i32>;
+
+    /// Sets it. The caller has checked the range.
+    ///
+    /// # Errors
+    /// Those of [`Self::get`], and [`crate::ErrorKind::BadInput`] when the device refuses the value.
+    fn set(&mut self, name: &str, value: i32) -> Result<()>;
+}
+
+/// An open D400, however it is reached. Dropping it, and what it handed out, lets go of the device.
+pub trait Transport: Send {
+    /// `kernel` or `libusb`, for messages.
+    fn name(&self) -> &'static str;
+
+    /// Every mode that the device's descriptors list, also such as the back end cannot use.
+    fn modes(&self) -> &[Mode];
+
+    /// A way to the extension units of a function. It is independent of the pictures: what is handed out may be used
+    /// on another thread while they stream.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::Unsupported`] when there is no such function, [`crate::ErrorKind::Disconnected`],
+    /// [`crate::ErrorKind::Io`].
+    fn control(&mut self, function: Function) -> Result<Box<dyn ControlPort>>;
+
+    /// A way to the picture controls of a function, as independent.
+    ///
+    /// # Errors
+    /// Those of [`Self::control`].
+    fn picture_controls(&mut self, function: Function) -> Result<Box<dyn PictureControls>>;
+
+    /// Starts the sources of `modes` together; at most one for each [`Sensor`].
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::Unsupported`] when the device refuses a mode, [`crate::ErrorKind::Busy`],
+    /// [`crate::ErrorKind::Disconnected`], [`crate::ErrorKind::Io`].
+    fn start(&mut self, modes: &[Mode]) -> Result<Started>;
+}
