@@ -5,6 +5,7 @@
 //! device's clock and asks a [`FrameSink`] for the memory that the pixels are written into, once.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
+mod bytes;
 pub mod capture;
 pub mod clock;
 #[doc(hidden)]

@@ -3,6 +3,7 @@
 //! Layouts and constants: librealsense 2.58 (Apache-2.0), `src/ds` and `src/ds/d400`, unless a line says otherwise.
 
 pub mod config;
+pub mod protocol;
 pub mod transport;
 
 pub use config::RealsenseConfig;

@@ -1,0 +1,16 @@
+//! What a RealSense camera says and is told, as bytes: parsed and built without any I/O of its own.
+//!
+//! Everything that comes from a device is read with checks: short, damaged and contradictory bytes are errors, never
+//! a panic. What the emulator in `tests/vm` answers with is built by the same types.
+
+pub mod firmware;
+pub mod gvd;
+pub mod hwm;
+pub mod tables;
+
+use crate::{Error, ErrorKind};
+
+/// An error about bytes that are not what the protocol says they are.
+pub(crate) fn protocol_error(text: impl Into<String>) -> Error {
+    Error::new(ErrorKind::Protocol, text)
+}
