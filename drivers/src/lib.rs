@@ -20,6 +20,7 @@ pub mod synthetic;
 pub mod usb;
 pub mod uvc;
 pub mod video;
+pub mod zed;
 
 pub use device::{
     Backend, Device, DeviceClock, DeviceInfo, Poll, Stream, StreamProfile, StreamRequest, choose_profiles,
