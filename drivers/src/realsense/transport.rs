@@ -3,6 +3,7 @@
 //! The back end does not know which one it has. A transport lists what the device offers, hands out the ways to its
 //! controls, and starts the pictures; what their bytes and headers mean is not its business.
 
+use super::protocol::hwm::HardwareMonitor;
 use crate::Result;
 use crate::uvc::control::ControlPort;
 use crate::video::PictureSource;
@@ -134,6 +135,13 @@ pub trait Transport: Send {
     /// # Errors
     /// Those of [`Self::control`].
     fn picture_controls(&mut self, function: Function) -> Result<Box<dyn PictureControls>>;
+
+    /// A way to the hardware monitor, as independent. It goes by the extension unit through the kernel and by the
+    /// vendor's bulk interface through libusb.
+    ///
+    /// # Errors
+    /// Those of [`Self::control`].
+    fn monitor(&mut self) -> Result<Box<dyn HardwareMonitor>>;
 
     /// Starts the sources of `modes` together; at most one for each [`Sensor`].
     ///
