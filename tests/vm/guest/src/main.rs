@@ -1,0 +1,72 @@
+//! What runs inside the virtual machine: `guest boot` as the child of init, and one process for each scenario.
+//!
+//! A scenario is a file below `scenarios/` with a line in [`SCENARIOS`]; `tests/vm/README.md` says how to write one.
+
+mod boot;
+mod checks;
+mod system;
+
+mod scenarios {
+    pub mod vivid_smoke;
+}
+
+use anyhow::{Context, bail};
+use checks::{Checks, Report};
+use std::path::Path;
+use std::process::ExitCode;
+
+/// One thing to show, in a process of its own.
+pub struct Scenario {
+    /// Its name on the command line and in the report.
+    pub name: &'static str,
+    /// One line for `tests/vm/run --list`.
+    pub about: &'static str,
+    /// Processor seconds of the host that it takes, roughly: scenarios are shared out by it.
+    pub cost: u32,
+    /// It is killed, and has failed, after so many seconds of guest time.
+    pub limit_s: u64,
+    /// What it does. An error is a failed check.
+    pub run: fn(&mut Checks) -> anyhow::Result<()>,
+}
+
+/// Every scenario, in the order in which they run.
+const SCENARIOS: &[Scenario] = &[scenarios::vivid_smoke::SCENARIO];
+
+fn main() -> anyhow::Result<ExitCode> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    match words[..] {
+        ["list"] => {
+            for scenario in SCENARIOS {
+                println!("{:24} {}", scenario.name, scenario.about);
+            }
+        }
+        ["list", "--json"] => {
+            let list: Vec<_> = SCENARIOS
+                .iter()
+                .map(|s| serde_json::json!({ "name": s.name, "about": s.about, "cost": s.cost }))
+                .collect();
+            println!("{}", serde_json::Value::from(list));
+        }
+        ["boot", share] => boot::run(Path::new(share))?,
+        [name] => return one(name),
+        _ => bail!("usage: guest SCENARIO | guest list [--json] | guest boot FOLDER"),
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The scenario called `name`.
+fn scenario(name: &str) -> anyhow::Result<&'static Scenario> {
+    SCENARIOS.iter().find(|s| s.name == name).with_context(|| format!("no scenario {name}; see `guest list`"))
+}
+
+/// Runs one scenario in this process.
+fn one(name: &str) -> anyhow::Result<ExitCode> {
+    let scenario = scenario(name)?;
+    let mut checks = Checks::new(Report::of_environment(scenario.name)?);
+    let outcome = (scenario.run)(&mut checks);
+    if let Err(error) = outcome {
+        checks.that("runs to its end", false, format!("{error:#}"));
+    }
+    Ok(if checks.all_hold() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
