@@ -17,8 +17,10 @@ mod gate;
 pub mod realsense;
 mod sink;
 pub mod synthetic;
+pub mod unpack;
 pub mod usb;
 pub mod uvc;
+pub mod v4l2;
 pub mod video;
 pub mod zed;
 

@@ -1,0 +1,172 @@
+//! What the kernel hands over beside a picture: the payload headers of USB video, and finding those of a picture.
+
+use super::fourcc::FourCc;
+
+/// The format that a metadata node was set to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum MetadataFormat {
+    /// Payload headers with the blocks of RealSense D400 cameras.
+    D4xx,
+    /// Payload headers of 2 to 12 bytes.
+    Uvch,
+    /// There is no metadata node, or it gives something else.
+    #[default]
+    None,
+}
+
+impl MetadataFormat {
+    /// The code that asks the kernel for it.
+    pub const fn fourcc(self) -> Option<FourCc> {
+        match self {
+            Self::D4xx => Some(FourCc::D4XX),
+            Self::Uvch => Some(FourCc::UVCH),
+            Self::None => None,
+        }
+    }
+
+    /// What the kernel set.
+    pub fn from_fourcc(code: FourCc) -> Self {
+        match code {
+            FourCc::D4XX => Self::D4xx,
+            FourCc::UVCH => Self::Uvch,
+            _ => Self::None,
+        }
+    }
+}
+
+/// Bytes of the kernel's own prefix of a block: host time (8) and bus frame number (2). Kernel documentation,
+/// "V4L2_META_FMT_UVC".
+const PREFIX: usize = 10;
+
+/// The payload header in a buffer of a metadata node: its first block without the kernel's prefix, from the byte
+/// with its own length to its end. `None` when the buffer is too short for what it claims.
+///
+/// The kernel writes one block per payload; a picture that came in several has the same stamp in each.
+pub fn payload_header(record: &[u8]) -> Option<&[u8]> {
+    let block = record.get(PREFIX..)?;
+    let length = usize::from(*block.first()?);
+    if length < 2 { None } else { block.get(..length) }
+}
+
+/// The longest record that is kept: prefix and a header of 255 bytes.
+pub(super) const RECORD_BYTES: usize = PREFIX + 255;
+
+/// Two stamps of one picture, taken at two moments, are no further apart than this (5 ms).
+const NEAR_NS: i64 = 5_000_000;
+/// Records that wait for their pictures; more are never on their way, as there are no more buffers.
+const KEPT: usize = 16;
+
+/// One record of a metadata node.
+#[derive(Clone, Copy)]
+pub(super) struct Record {
+    pub(super) sequence: u32,
+    pub(super) stamp_ns: i64,
+    length: usize,
+    bytes: [u8; RECORD_BYTES],
+}
+
+impl Record {
+    /// A copy of the first bytes of a buffer: what lies behind the first block is dropped.
+    pub(super) fn new(sequence: u32, stamp_ns: i64, buffer: &[u8]) -> Self {
+        let mut bytes = [0; RECORD_BYTES];
+        let length = buffer.len().min(RECORD_BYTES);
+        for (to, from) in bytes.iter_mut().zip(buffer) {
+            *to = *from;
+        }
+        Self { sequence, stamp_ns, length, bytes }
+    }
+
+    pub(super) fn bytes(&self) -> &[u8] {
+        self.bytes.get(..self.length).unwrap_or_default()
+    }
+
+    /// Whether this belongs to the picture with that number and stamp.
+    ///
+    /// `uvcvideo` gives both to the record; with its parameter `hwtimestamps` the picture's stamp is moved a little
+    /// afterwards. `vivid` counts the records by themselves and gives them the picture's stamp.
+    fn belongs_to(&self, sequence: u32, stamp_ns: i64) -> bool {
+        self.stamp_ns == stamp_ns
+            || (self.sequence == sequence && self.stamp_ns.abs_diff(stamp_ns) < NEAR_NS.unsigned_abs())
+    }
+}
+
+/// Records that wait for their pictures.
+#[derive(Default)]
+pub(super) struct Waiting {
+    records: Vec<Record>,
+}
+
+impl Waiting {
+    /// Keeps one; the oldest goes when there are too many.
+    pub(super) fn keep(&mut self, record: &Record) {
+        if self.records.len() >= KEPT {
+            self.records.remove(0);
+        }
+        self.records.push(*record);
+    }
+
+    /// Whether the record of that picture has come.
+    pub(super) fn has(&self, sequence: u32, stamp_ns: i64) -> bool {
+        self.records.iter().any(|r| r.belongs_to(sequence, stamp_ns))
+    }
+
+    /// The record of that picture. Those that came before it are dropped: their pictures will not come any more.
+    pub(super) fn take(&mut self, sequence: u32, stamp_ns: i64) -> Option<Record> {
+        let at = self.records.iter().position(|r| r.belongs_to(sequence, stamp_ns))?;
+        let record = self.records.get(at).copied();
+        self.records.drain(..=at);
+        record
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn a_header_is_cut_out_of_its_record() {
+        let mut record = vec![0; PREFIX];
+        record.extend([12, 0x8F, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 99]);
+        assert_eq!(payload_header(&record), Some(&record[10..22]));
+        assert_eq!(payload_header(&record[..21]), None, "the last byte of the header is missing");
+        record[10] = 1;
+        assert_eq!(payload_header(&record), None, "shorter than length and flags");
+        assert_eq!(payload_header(&[]), None);
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_a_header_or_none(record: Vec<u8>) {
+            if let Some(header) = payload_header(&record) {
+                prop_assert_eq!(header.len(), usize::from(header[0]));
+                prop_assert_eq!(header.as_ptr(), record[PREFIX..].as_ptr());
+            }
+        }
+    }
+
+    #[test]
+    fn a_picture_gets_its_own_record_and_no_other() {
+        let mut waiting = Waiting::default();
+        for (sequence, stamp) in [(7, 100_000_000), (8, 133_000_000), (9, 166_000_000)] {
+            waiting.keep(&Record::new(sequence, stamp, &[sequence as u8]));
+        }
+        assert!(waiting.has(8, 133_000_000));
+        assert!(!waiting.has(12, 133_000_001), "another picture, a moment later");
+        assert!(!waiting.has(8, 150_000_000), "that number, but long after: the counter began anew");
+        assert_eq!(waiting.take(8, 134_000_000).unwrap().bytes(), [8], "stamp moved by the kernel");
+        assert!(!waiting.has(7, 100_000_000), "its picture was lost before");
+        assert_eq!(waiting.take(30, 166_000_000).unwrap().bytes(), [9], "records counted by themselves");
+        assert!(waiting.take(9, 166_000_000).is_none());
+    }
+
+    #[test]
+    fn records_without_pictures_do_not_pile_up() {
+        let mut waiting = Waiting::default();
+        for i in 0..100 {
+            waiting.keep(&Record::new(i, i64::from(i) * 33_000_000, &[0; 400]));
+        }
+        assert_eq!(waiting.records.len(), KEPT);
+        assert_eq!(waiting.take(99, 99 * 33_000_000).unwrap().bytes().len(), RECORD_BYTES);
+    }
+}
