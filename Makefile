@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 
-# Extra arguments for the demo: make demo ARGS="--seconds 30"
+# Extra arguments for the demo and the virtual machine: make demo ARGS="--seconds 30"
 ARGS ?=
 # Real sensor pictures for the tests.
 export DEPTHRIG_TEST_DATA ?= $(abspath ../shared/data)
@@ -16,7 +16,7 @@ PEERS := tests/peers
 PEERS_VENV := .venv-peers
 REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt
 
-.PHONY: help demo test test-long fuzz lint bench bench-peers clean setup-build setup-test setup-peers setup-fuzz
+.PHONY: help demo test test-long vm fuzz lint bench bench-peers clean setup-build setup-test setup-vm setup-peers setup-fuzz
 
 help: ## show this list
 	@sed -nE 's/^([a-z-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -25,7 +25,7 @@ demo: setup-build ## the seven-camera rig with synthetic cameras: record, verify
 	cargo build --release --package depthrig
 	target/release/depthrig demo $(ARGS)
 
-test: setup-test $(VENV)/.stamp $(LEROBOT)/.stamp $(READERS)/node_modules/.stamp ## every test there is: Rust, Python, readers that are not ours
+test: setup-test $(VENV)/.stamp $(LEROBOT)/.stamp $(READERS)/node_modules/.stamp ## every test there is: Rust, Python, readers that are not ours, the virtual machine
 	tools/test.sh
 
 test-long: ## the long forms: every test with DEPTHRIG_LONG=1, ten minutes of recording, an hour of fuzzing per target
@@ -33,6 +33,9 @@ test-long: ## the long forms: every test with DEPTHRIG_LONG=1, ten minutes of re
 	cargo build --release --package depthrig
 	target/release/depthrig bench soak --check
 	$(MAKE) fuzz
+
+vm: setup-build setup-vm ## drivers and daemon on a real kernel, in a virtual machine; one scenario: make vm ARGS="vivid-smoke"
+	tests/vm/run --require $(ARGS)
 
 # How long for each target, and which: make fuzz FUZZ="600 segment"
 FUZZ ?= 3600
@@ -63,6 +66,9 @@ setup-build:
 
 setup-test:
 	@tools/setup.sh build test
+
+setup-vm:
+	@tools/setup.sh vm
 
 setup-fuzz:
 	@tools/setup.sh build fuzz

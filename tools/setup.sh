@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Installs the Debian packages that building (`build`), testing (`test`), comparing with other recorders (`peers`) and
-# fuzzing (`fuzz`) need, when it may; else prints the one line to run. Says nothing when everything is there.
+# Installs the Debian packages that building (`build`), testing (`test`), testing on a real kernel (`vm`), comparing with
+# other recorders (`peers`) and fuzzing (`fuzz`) need, when it may; else prints the one line to run. Says nothing when
+# everything is there.
 set -euo pipefail
 
 missing=()
@@ -15,12 +16,24 @@ for part in "$@"; do
     build)
         need gcc command -v cc
         need libc6-dev test -e /usr/include/stdio.h
+        # The bindings of the kernel's video interface are made from its header, by libclang and with Clang's own headers.
+        clang=$(apt-cache depends libclang1 2>/dev/null | sed -n 's/^ *Depends: libclang1-//p')
+        need "libclang1-${clang:-14}" eval '[ -n "${LIBCLANG_PATH:-}" ] || compgen -G "/usr/lib/*/libclang-[0-9]*.so*"'
+        need "libclang-common-${clang:-14}-dev" compgen -G '/usr/lib/*/lib/clang/*/include/stddef.h'
         ;;
     test)
         need python3 command -v python3
         need python3-venv python3 -c 'import ensurepip, venv'
         need nodejs command -v node
         need npm command -v npm
+        ;;
+    vm)
+        need qemu-system-x86 command -v qemu-system-x86_64
+        need busybox-static command -v busybox
+        need kmod command -v depmod
+        need zstd command -v zstd
+        need binutils command -v objcopy
+        need python3 command -v python3
         ;;
     peers)
         # Debian's own Python: its rosbag is for no other.
@@ -34,7 +47,7 @@ for part in "$@"; do
         need g++ command -v c++
         ;;
     *)
-        echo "usage: tools/setup.sh [build] [test] [peers] [fuzz]" >&2
+        echo "usage: tools/setup.sh [build] [test] [vm] [peers] [fuzz]" >&2
         exit 2
         ;;
     esac

@@ -81,6 +81,7 @@ impl Checks {
     }
 
     /// `got` should equal `wanted`.
+    #[allow(clippy::needless_pass_by_value)] // a check reads `equal("...", frames.len(), 10)`
     pub fn equal<T: PartialEq<W> + Debug, W: Debug>(&mut self, what: &str, got: T, wanted: W) -> bool {
         let holds = got == wanted;
         let detail = if holds { format!("{got:?}") } else { format!("{got:?}, and not {wanted:?}") };
