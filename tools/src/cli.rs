@@ -1,8 +1,8 @@
 //! The commands and options, and what `--help` says of them.
 
 use crate::commands::{
-    bench, cat, compare, completions, config, demo, edit, export, import, info, man, merge, record, recover,
-    replay, report, run, sessions, status, tap, top, trim, verify,
+    bench, cat, compare, completions, config, demo, edit, export, import, info, install, man, merge, record,
+    recover, replay, report, run, sessions, status, tap, top, trim, verify,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -142,6 +142,9 @@ pub enum Command {
     /// Check a rig configuration, or print the commented default
     #[command(subcommand, after_help = config::EXAMPLES)]
     Config(config::ConfigCommand),
+    /// Show, write or remove the udev rules and the service that a computer with cameras needs
+    #[command(after_help = install::EXAMPLES)]
+    Install(install::InstallArgs),
     /// Look at one live stream: a line per frame, or pictures
     #[command(after_help = tap::EXAMPLES)]
     Tap(tap::TapArgs),

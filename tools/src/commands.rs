@@ -10,6 +10,7 @@ pub mod edit;
 pub mod export;
 pub mod import;
 pub mod info;
+pub mod install;
 pub mod man;
 pub mod merge;
 pub mod record;
@@ -43,6 +44,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Top(args) => top::run(&args, &context),
         Command::Replay(args) => replay::run(&args, &context),
         Command::Info(args) => info::run(&args),
+        Command::Install(args) => install::run(&args),
         Command::Report(args) => report::run(&args, &context),
         Command::Sessions(args) => sessions::run(&args, &context),
         Command::Edit(args) => edit::run(&args),

@@ -9,6 +9,7 @@ mod commands;
 mod context;
 mod demo;
 mod exit;
+mod install;
 mod logging;
 mod out;
 mod picture;

@@ -48,6 +48,7 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
         "trim",
         "merge",
         "config",
+        "install",
         "tap",
         "bench",
         "completions",

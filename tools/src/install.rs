@@ -1,0 +1,184 @@
+//! The files that depthrig puts into a system: the udev rules, the limit of USB transfers, the service.
+//!
+//! Each begins with a line that holds a checksum of the rest. So a file that somebody changed is told from one that an
+//! earlier version wrote: the second is replaced, the first only when that is asked for.
+
+use anyhow::{Context, Result};
+use std::io;
+use std::path::{Path, PathBuf};
+
+const MARK: &str = "# Written by `depthrig install`, checksum ";
+
+/// What the service is to run.
+#[derive(Debug, Clone)]
+pub struct Service {
+    /// The user it runs as.
+    pub user: String,
+    /// The program.
+    pub binary: PathBuf,
+    /// The rig's configuration.
+    pub rig_file: PathBuf,
+    /// Where it may record.
+    pub data: PathBuf,
+}
+
+/// A file to be installed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct SystemFile {
+    /// Where it goes, absolute.
+    pub path: PathBuf,
+    /// What it is for, in a few words.
+    pub what: &'static str,
+    /// All of it, the first line included.
+    pub text: String,
+}
+
+/// How a file stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum State {
+    /// Not there.
+    Missing,
+    /// There, as this version writes it.
+    Current,
+    /// There, as depthrig wrote it once.
+    Older,
+    /// There, and somebody else wrote or changed it.
+    Changed,
+}
+
+/// What became of a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Done {
+    /// It is new, or replaced.
+    Written,
+    /// It was as it should be already.
+    Unchanged,
+    /// It is somebody's, so it was left alone.
+    Refused,
+    /// It is gone.
+    Removed,
+    /// There was none.
+    Absent,
+}
+
+/// Every file, in the order in which they are shown.
+pub fn files(service: &Service) -> Vec<SystemFile> {
+    let unit = include_str!("../systemd/depthrig.service")
+        .replace("@USER@", &service.user)
+        .replace("@BINARY@", &quoted(&service.binary).replace('$', "$$"))
+        .replace("@RIG_FILE@", &quoted(&service.rig_file).replace('$', "$$"))
+        .replace("@DATA@", &quoted(&service.data));
+    let file = |path: &str, what, text: &str| SystemFile { path: path.into(), what, text: marked(text) };
+    vec![
+        file(
+            "/etc/udev/rules.d/70-depthrig.rules",
+            "who may use cameras; no autosuspend",
+            include_str!("../udev/70-depthrig.rules"),
+        ),
+        file(
+            "/etc/tmpfiles.d/depthrig.conf",
+            "memory for USB transfers",
+            include_str!("../tmpfiles/depthrig.conf"),
+        ),
+        file("/etc/systemd/system/depthrig.service", "the daemon as a service", &unit),
+    ]
+}
+
+/// A path as a unit file wants it: in double quotes, with `%`, `"` and `\` escaped (systemd.syntax(7), systemd.unit(5)
+/// "Specifiers"). In command lines `$` is doubled besides (systemd.service(5) "Command lines").
+fn quoted(path: &Path) -> String {
+    let mut text = String::from("\"");
+    for c in path.to_string_lossy().chars() {
+        match c {
+            '%' => text.push_str("%%"),
+            '"' | '\\' => text.extend(['\\', c]),
+            c => text.push(c),
+        }
+    }
+    text + "\""
+}
+
+fn marked(text: &str) -> String {
+    format!(
+        "{MARK}{:08x}; a file that was changed by hand is left alone.\n{text}",
+        crc32fast::hash(text.as_bytes())
+    )
+}
+
+/// Whether `text` is as depthrig wrote it, this version or another.
+fn is_ours(text: &str) -> bool {
+    text.split_once('\n').is_some_and(|(_, rest)| marked(rest) == text)
+}
+
+impl SystemFile {
+    /// Where it lies when the system is in the folder `root`.
+    pub fn below(&self, root: &Path) -> PathBuf {
+        root.join(self.path.strip_prefix("/").unwrap_or(&self.path))
+    }
+
+    /// How it stands below `root`.
+    ///
+    /// # Errors
+    /// When what is there cannot be read.
+    pub fn state(&self, root: &Path) -> Result<State> {
+        let path = self.below(root);
+        match std::fs::read(&path) {
+            Ok(bytes) if bytes == self.text.as_bytes() => Ok(State::Current),
+            Ok(bytes) if std::str::from_utf8(&bytes).is_ok_and(is_ours) => Ok(State::Older),
+            Ok(_) => Ok(State::Changed),
+            Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(State::Missing),
+            Err(e) => Err(e).with_context(|| format!("{} cannot be read", path.display())),
+        }
+    }
+
+    /// Puts it in place; what somebody changed only with `force`.
+    ///
+    /// # Errors
+    /// When it cannot be written; what was there is then as it was.
+    pub fn install(&self, root: &Path, force: bool) -> Result<Done> {
+        match self.state(root)? {
+            State::Current => return Ok(Done::Unchanged),
+            State::Changed if !force => return Ok(Done::Refused),
+            _ => {}
+        }
+        let path = self.below(root);
+        let write = || -> io::Result<()> {
+            let folder = path.parent().unwrap_or(root);
+            std::fs::create_dir_all(folder)?;
+            // Beside it and then moved, so that nobody ever reads half a rule.
+            let mut beside = tempfile::Builder::new().prefix(".depthrig").tempfile_in(folder)?;
+            io::Write::write_all(&mut beside, self.text.as_bytes())?;
+            let mode = std::os::unix::fs::PermissionsExt::from_mode(0o644);
+            beside.as_file().set_permissions(mode)?;
+            beside.as_file().sync_all()?;
+            beside.persist(&path)?;
+            Ok(())
+        };
+        write().map_err(|e| refused(e, &path))?;
+        Ok(Done::Written)
+    }
+
+    /// Takes it away; what somebody changed only with `force`.
+    ///
+    /// # Errors
+    /// When it cannot be removed.
+    pub fn remove(&self, root: &Path, force: bool) -> Result<Done> {
+        match self.state(root)? {
+            State::Missing => return Ok(Done::Absent),
+            State::Changed if !force => return Ok(Done::Refused),
+            _ => {}
+        }
+        let path = self.below(root);
+        std::fs::remove_file(&path).map_err(|e| refused(e, &path))?;
+        Ok(Done::Removed)
+    }
+}
+
+fn refused(e: io::Error, path: &Path) -> anyhow::Error {
+    let denied = e.kind() == io::ErrorKind::PermissionDenied;
+    let what = if denied { "you may not write it; run this as root (sudo)" } else { "it cannot be written" };
+    anyhow::Error::new(e).context(format!("{}: {what}", path.display()))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,72 @@
+//! `depthrig install` as a person meets it, into a made root.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "support/home.rs"]
+mod support;
+
+use std::process::Command;
+use support::Home;
+
+#[test]
+fn what_is_shown_is_what_is_written_and_a_change_by_hand_survives() {
+    let home = Home::new();
+    let root = home.path().join("root").to_str().unwrap().to_owned();
+    let options = ["--user", "robot", "--data", "/data/rig", "--root", &root];
+    let run = |action: &str, more: &[&str]| home.run(&[&["install", action], &options[..], more].concat());
+    let shown = run("--print", &[]).good();
+    assert!(shown.contains("not installed") && shown.contains("udevadm control --reload"), "{shown}");
+    assert!(!home.path().join("root").exists(), "--print writes nothing");
+
+    run("--apply", &[]).good();
+    for name in [
+        "etc/udev/rules.d/70-depthrig.rules",
+        "etc/tmpfiles.d/depthrig.conf",
+        "etc/systemd/system/depthrig.service",
+    ] {
+        let text = std::fs::read_to_string(home.path().join("root").join(name)).unwrap();
+        assert!(shown.contains(&text), "{name} is not what was shown");
+    }
+    assert!(!run("--print", &[]).good().contains("not installed"));
+    assert!(run("--apply", &[]).good().matches("is as it should be").count() == 3);
+
+    let rules = home.path().join("root/etc/udev/rules.d/70-depthrig.rules");
+    std::fs::write(&rules, "# mine\n").unwrap();
+    for action in ["--apply", "--remove"] {
+        let ran = run(action, &[]);
+        assert_eq!(ran.code, 3, "{action}: {}", ran.out);
+        assert!(ran.out.contains("changed by hand") && ran.out.contains("--force"), "{}", ran.out);
+        assert_eq!(std::fs::read_to_string(&rules).unwrap(), "# mine\n");
+    }
+    run("--remove", &["--force"]).good();
+    assert!(!rules.exists());
+}
+
+#[test]
+fn one_action_is_asked_for_and_names_are_checked() {
+    let home = Home::new();
+    for bad in [
+        &["install"][..],
+        &["install", "--print", "--apply"],
+        &["install", "--print", "--user", "a b"],
+        &["install", "--print", "--data", "/a\nb"],
+    ] {
+        let ran = home.run(bad);
+        assert_eq!(ran.code, 2, "{bad:?}: {}", ran.err);
+    }
+}
+
+/// systemd reads its own files best. Where it is not installed, this says nothing.
+#[test]
+fn systemd_finds_nothing_wrong_with_the_service() {
+    let home = Home::new();
+    let root = home.path().join("root").to_str().unwrap().to_owned();
+    home.run(&["install", "--apply", "--user", "daemon", "--root", &root]).good();
+    let unit = format!("{root}/etc/systemd/system/depthrig.service");
+    let Ok(said) = Command::new("systemd-analyze").args(["verify", "--man=no", &unit]).output() else {
+        eprintln!("systemd-analyze is not installed; the service file is not verified");
+        return;
+    };
+    let said = format!("{}{}", String::from_utf8_lossy(&said.stdout), String::from_utf8_lossy(&said.stderr));
+    let ours: Vec<_> = said.lines().filter(|l| l.contains("depthrig.service")).collect();
+    assert!(ours.is_empty(), "{ours:#?}");
+}
