@@ -4,9 +4,12 @@
 
 mod boot;
 mod checks;
+mod daemon;
+mod feed;
 mod system;
 
 mod scenarios {
+    pub mod daemon_smoke;
     pub mod vivid_smoke;
 }
 
@@ -30,7 +33,7 @@ pub struct Scenario {
 }
 
 /// Every scenario, in the order in which they run.
-const SCENARIOS: &[Scenario] = &[scenarios::vivid_smoke::SCENARIO];
+const SCENARIOS: &[Scenario] = &[scenarios::vivid_smoke::SCENARIO, scenarios::daemon_smoke::SCENARIO];
 
 fn main() -> anyhow::Result<ExitCode> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
