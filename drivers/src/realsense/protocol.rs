@@ -3,9 +3,15 @@
 //! Everything that comes from a device is read with checks: short, damaged and contradictory bytes are errors, never
 //! a panic. What the emulator in `tests/vm` answers with is built by the same types.
 
+pub mod advanced;
 pub mod firmware;
 pub mod gvd;
+pub mod health;
 pub mod hwm;
+pub mod intrinsics;
+pub mod metadata;
+pub mod preset;
+pub mod sync;
 pub mod tables;
 
 use crate::{Error, ErrorKind};

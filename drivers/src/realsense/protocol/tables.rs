@@ -5,6 +5,12 @@ use super::protocol_error;
 use crate::Result;
 use crate::bytes::{array, put, u16_at, u32_at};
 
+mod coefficients;
+mod rgb;
+
+pub use coefficients::{Coefficients, Pinhole, RectifiedItem, SIZES};
+pub use rgb::RgbTable;
+
 /// Number of the table of coefficients of the stereo pair.
 pub const COEFFICIENTS: u16 = 25;
 /// Number of the table of the colour sensor.
@@ -85,3 +91,6 @@ impl Header {
 pub fn read(monitor: &mut dyn HardwareMonitor, id: u16) -> Result<Vec<u8>> {
     monitor.command(&Request::calibration_table(id))
 }
+
+#[cfg(test)]
+mod tests;
