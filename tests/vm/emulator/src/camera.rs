@@ -1,0 +1,274 @@
+//! The handle of an emulated camera: plug it in, unplug it, make it fail, ask what it did.
+
+use crate::content::{self, hash};
+use crate::device::{Device, spawn};
+use crate::fault::Fault;
+use crate::firmware::Identity;
+use crate::model::{Mode, Model};
+use crate::shared::{Command, Presence, Session, Shared};
+use crate::{Accounts, Error, Result, vhci};
+use core::time::Duration;
+use depthrig_bus::HostTime;
+use std::collections::BTreeMap;
+use std::os::unix::net::UnixStream;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::thread::JoinHandle;
+
+/// How long a device may take to come or to go.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// How fast the bus is that a camera is plugged into.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Speed {
+    /// USB 3, 5 Gb/s.
+    Super,
+    /// USB 2, 480 Mb/s.
+    High,
+}
+
+/// What differs between two cameras of one model.
+#[derive(Debug, Clone)]
+pub struct Options {
+    /// The serial, in the model's own form: 12 digits for a D400, 8 hexadecimal digits for an L515, decimal for a ZED.
+    /// Without one, one is made up: the next in this process.
+    pub serial: Option<String>,
+    /// How much its clock gains, in parts per million.
+    pub drift_ppm: f64,
+    /// What its clock shows at power-on, in microseconds: near 2^32 for a wrap.
+    pub start_ticks: u32,
+    /// The largest delay of a frame on its way.
+    pub jitter: Duration,
+    /// The bus.
+    pub speed: Speed,
+    /// The virtual host controller that it hangs on, 0 to 7: cameras of one controller are those of one hub.
+    pub hub: u32,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            serial: None,
+            drift_ppm: 0.0,
+            start_ticks: 1_000_000,
+            jitter: Duration::from_micros(300),
+            speed: Speed::Super,
+            hub: 0,
+        }
+    }
+}
+
+/// An emulated camera. Dropping it unplugs it.
+pub struct Camera {
+    model: Arc<Model>,
+    serial: String,
+    options: Options,
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+    port: std::sync::Mutex<Option<u32>>,
+}
+
+static MADE: AtomicU32 = AtomicU32::new(1);
+
+fn new_serial(model: &Model) -> String {
+    let number = MADE.fetch_add(1, Ordering::Relaxed);
+    match model.family {
+        crate::model::Family::D400 => format!("{:012}", 830_000_000_000 + u64::from(number)),
+        crate::model::Family::L515 => format!("f{number:07x}"),
+        _ => format!("{}", 30_000_000 + number),
+    }
+}
+
+impl Camera {
+    /// Makes a camera of a model that comes with the emulator and plugs it in.
+    ///
+    /// # Errors
+    /// When there is no such model, no virtual host controller, or no free port.
+    pub fn plug(model: &str, options: Options) -> Result<Self> {
+        let camera = Self::unplugged(Arc::new(Model::named(model)?), options)?;
+        camera.replug()?;
+        Ok(camera)
+    }
+
+    /// Makes a camera that is not plugged in.
+    ///
+    /// # Errors
+    /// When its thread cannot be started.
+    pub fn unplugged(model: Arc<Model>, options: Options) -> Result<Self> {
+        let serial = options.serial.clone().unwrap_or_else(|| new_serial(&model));
+        let shared = Arc::new(Shared::new(model.streams().count())?);
+        let device = Device::new(Arc::clone(&model), options.clone(), &serial, Arc::clone(&shared));
+        let thread = Some(spawn(device, &format!("emu {serial}"))?);
+        Ok(Self { model, serial, options, shared, thread, port: None.into() })
+    }
+
+    fn port_slot(&self) -> std::sync::MutexGuard<'_, Option<u32>> {
+        self.port.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+    }
+
+    /// Plugs it in again: into the port that it had.
+    ///
+    /// # Errors
+    /// When it is plugged in, or the port does not become free.
+    pub fn replug(&self) -> Result<()> {
+        if self.shared.lock().presence != Presence::Unplugged {
+            return Err(Error::new(format!("{} is plugged in already", self.serial)));
+        }
+        let mut slot = self.port_slot();
+        let (line, port) = vhci::attach(self.options.hub, self.options.speed, *slot)?;
+        *slot = Some(port);
+        self.shared.ask(Command::Serve(line, Some(port)))?;
+        self.shared.wait(PATIENCE, |p| matches!(p, Presence::Plugged(_)))
+    }
+
+    /// Serves a host that is no kernel: `line` is the device's end of a stream that speaks USB/IP.
+    ///
+    /// # Errors
+    /// When its thread does not take the line.
+    pub fn serve(&self, line: UnixStream) -> Result<()> {
+        self.shared.ask(Command::Serve(line, None))?;
+        self.shared.wait(PATIENCE, |p| matches!(p, Presence::Plugged(_)))
+    }
+
+    /// Pulls the plug. Returns when the device is off its port.
+    ///
+    /// # Errors
+    /// When it does not go.
+    pub fn unplug(&self) -> Result<()> {
+        self.shared.ask(Command::Unplug(None))?;
+        self.shared.wait(PATIENCE, |p| p == Presence::Unplugged)
+    }
+
+    /// Pulls the plug and puts it back after a time, by itself.
+    ///
+    /// # Errors
+    /// When its thread does not take the command.
+    pub fn unplug_for(&self, time: Duration) -> Result<()> {
+        self.shared.ask(Command::Unplug(Some(time)))
+    }
+
+    /// Makes something go wrong, from now on.
+    ///
+    /// # Errors
+    /// When the fault names a stream that the camera has not.
+    pub fn fault(&self, fault: Fault) -> Result<()> {
+        if let Fault::Frames { stream, .. } | Fault::StallEndpoint { stream } = &fault {
+            self.model.stream_index(stream)?;
+        }
+        self.shared.ask(Command::Fault(fault))
+    }
+
+    /// What a stream did.
+    ///
+    /// # Errors
+    /// When the camera has no such stream.
+    pub fn accounts(&self, stream: &str) -> Result<Accounts> {
+        let index = self.model.stream_index(stream)?;
+        Ok(self.shared.lock().accounts.get(index).copied().unwrap_or_default())
+    }
+
+    /// How often each kind of fault was asked for.
+    pub fn faults(&self) -> BTreeMap<&'static str, u64> {
+        self.shared.lock().faults.clone()
+    }
+
+    /// The bytes of a frame as they travelled, by its stamp's index.
+    ///
+    /// # Errors
+    /// When the camera has no such stream, or no such frame was due.
+    pub fn expected(&self, stream: &str, index: u64) -> Result<Vec<u8>> {
+        let session = self.session(stream, index)?;
+        Ok(content::frame(&self.serial, self.model.stream_index(stream)? as u16, &session.mode, index))
+    }
+
+    /// The mode that a frame was sent in.
+    ///
+    /// # Errors
+    /// Those of [`Self::expected`].
+    pub fn mode(&self, stream: &str, index: u64) -> Result<Mode> {
+        Ok(self.session(stream, index)?.mode)
+    }
+
+    /// When a frame was truly captured: the middle of its exposure, on the host's clock.
+    ///
+    /// # Errors
+    /// Those of [`Self::expected`].
+    pub fn true_capture(&self, stream: &str, index: u64) -> Result<HostTime> {
+        Ok(self.session(stream, index)?.captured(index))
+    }
+
+    fn session(&self, stream: &str, index: u64) -> Result<Session> {
+        let at = self.model.stream_index(stream)?;
+        let state = self.shared.lock();
+        let sessions = state.sessions.get(at);
+        let found = sessions.and_then(|all| all.iter().rev().find(|s| s.first_index <= index)).copied();
+        found.ok_or_else(|| Error::new(format!("{} {stream} had no frame {index}", self.serial)))
+    }
+
+    /// Its serial.
+    pub fn serial(&self) -> &str {
+        &self.serial
+    }
+
+    /// The serial that its USB descriptor has: that of its chip, for a RealSense camera.
+    pub fn usb_serial(&self) -> String {
+        Identity::new(&self.model, &self.serial).chip_serial
+    }
+
+    /// What its stamps carry in place of its serial.
+    pub fn serial_hash(&self) -> u64 {
+        hash(&self.serial)
+    }
+
+    /// Its model.
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    /// Whether it is on the bus.
+    pub fn is_plugged(&self) -> bool {
+        matches!(self.shared.lock().presence, Presence::Plugged(_))
+    }
+
+    /// Its name in sysfs (`2-1`): the same after every plugging. `None` until the kernel has seen it.
+    pub fn port_path(&self) -> Option<String> {
+        vhci::device_on((*self.port_slot())?)
+    }
+
+    /// The controller that it hangs on.
+    pub fn hub(&self) -> u32 {
+        self.options.hub
+    }
+}
+
+impl Drop for Camera {
+    fn drop(&mut self) {
+        // When the thread does not take the command it has ended.
+        let _ = self.shared.ask(Command::End);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// What happens to all cameras of one controller at once.
+pub struct Hub;
+
+impl Hub {
+    /// A reset: every camera of the controller drops off the bus and comes back after a time.
+    ///
+    /// # Errors
+    /// When a camera's thread does not take the command.
+    pub fn reset<'a>(
+        cameras: impl IntoIterator<Item = &'a Camera>,
+        hub: u32,
+        time: Duration,
+    ) -> Result<usize> {
+        let mut count = 0;
+        for camera in cameras.into_iter().filter(|c| c.hub() == hub && c.is_plugged()) {
+            camera.unplug_for(time)?;
+            count += 1;
+        }
+        Ok(count)
+    }
+}

@@ -1,0 +1,50 @@
+//! Emulated USB cameras, served to this machine's own kernel over USB/IP through a socket pair: `vhci-hcd`, then the
+//! real `uvcvideo`, `usbhid` and usbfs take it from there.
+//!
+//! A [`Camera`] is plugged in from a [`Model`], which is data (`models/*.toml`). It has a serial, calibration numbers
+//! that follow from it, a clock of its own, and [`Fault`]s on demand; what it sent is in its [`Accounts`], and what each
+//! frame held can be asked for afterwards.
+
+pub mod accounts;
+pub mod camera;
+pub mod clock;
+pub mod console;
+pub mod content;
+mod control;
+mod descriptors;
+mod device;
+pub mod fault;
+mod firmware;
+pub mod model;
+mod payload;
+mod pump;
+mod shared;
+pub mod usbip;
+mod vhci;
+
+pub use accounts::Accounts;
+pub use camera::{Camera, Hub, Options, Speed};
+pub use content::Stamp;
+pub use fault::Fault;
+pub use model::Model;
+
+/// What goes wrong in the emulator itself.
+#[derive(Debug)]
+pub struct Error(String);
+
+impl Error {
+    pub(crate) fn new(text: impl Into<String>) -> Self {
+        Self(text.into())
+    }
+}
+
+impl core::fmt::Display for Error {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl core::error::Error for Error {}
+
+/// Or an [`Error`] of the emulator.
+pub type Result<T> = core::result::Result<T, Error>;
