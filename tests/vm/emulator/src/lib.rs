@@ -25,7 +25,7 @@ mod vhci;
 pub use accounts::Accounts;
 pub use camera::{Camera, Hub, Options, Speed};
 pub use content::Stamp;
-pub use fault::Fault;
+pub use fault::{Damage, Fault, WrongReply};
 pub use model::Model;
 
 /// What goes wrong in the emulator itself.

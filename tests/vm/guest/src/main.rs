@@ -10,6 +10,7 @@ mod system;
 
 mod scenarios {
     pub mod daemon_smoke;
+    pub mod emulator;
     pub mod vivid_smoke;
 }
 
@@ -33,7 +34,8 @@ pub struct Scenario {
 }
 
 /// Every scenario, in the order in which they run.
-const SCENARIOS: &[Scenario] = &[scenarios::vivid_smoke::SCENARIO, scenarios::daemon_smoke::SCENARIO];
+const SCENARIOS: &[Scenario] =
+    &[scenarios::vivid_smoke::SCENARIO, scenarios::daemon_smoke::SCENARIO, scenarios::emulator::SCENARIO];
 
 fn main() -> anyhow::Result<ExitCode> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();

@@ -1,0 +1,145 @@
+//! The emulator itself: a camera on the kernel's own bus, its nodes, its frames byte by byte, its accounts.
+
+use crate::checks::Checks;
+use crate::{Scenario, system};
+use anyhow::Context;
+use depthrig_bus::HostTime;
+use depthrig_drivers::uvc::control::{ControlPort, Query};
+use depthrig_drivers::v4l2::{FourCc, MetadataFormat, Node, Source, Wanted};
+use depthrig_drivers::video::PictureSource;
+use depthrig_emulator::{Camera, Damage, Fault, Options, Stamp};
+use std::path::Path;
+use std::time::Duration;
+
+/// See the module.
+pub const SCENARIO: Scenario = Scenario {
+    name: "emulator",
+    about: "an emulated D435 under uvcvideo: nodes, frames and metadata, identity, faults, unplugging",
+    cost: 8,
+    limit_s: 60,
+    run,
+};
+
+const PATIENCE: Duration = Duration::from_secs(5);
+
+fn run(checks: &mut Checks) -> anyhow::Result<()> {
+    system::modprobe("vhci-hcd", &[])?;
+    system::modprobe("uvcvideo", &[])?;
+    let plugged = HostTime::now();
+    let camera = Camera::plug("d435", Options { drift_ppm: 40.0, start_ticks: 0, ..Options::default() })?;
+    let six = || system::video_nodes().is_ok_and(|nodes| nodes.len() == 6);
+    checks.that(
+        "a D435 has six nodes",
+        system::wait_until(PATIENCE, six),
+        format!("{:?}", system::video_nodes()?),
+    );
+
+    identity(checks, &camera)?;
+    let depth = FourCc(*b"Z16 ");
+    // The clock is set to 0.2 s before it wraps, which is in the middle of the next frames.
+    let shown_us = plugged.elapsed().as_micros() as i64;
+    camera.fault(Fault::ClockJump((1 << 32) - 200_000 - shown_us))?;
+    let seen = stream(checks, &camera, "depth", "/dev/video0", depth, 12, None)?;
+    checks.equal("a stream alone loses nothing", seen.lost, 0);
+    checks.that("the clock wraps within the run", seen.pts_fell == 1, seen.pts_fell);
+    for (name, node, format) in
+        [("ir", "/dev/video2", FourCc(*b"GREY")), ("color", "/dev/video4", FourCc(*b"YUYV"))]
+    {
+        let seen = stream(checks, &camera, name, node, format, 5, None)?;
+        checks.equal(&format!("{name} loses nothing"), seen.lost, 0);
+    }
+    let skip = Fault::Frames { stream: "depth".into(), damage: Damage::Skip, frames: 2 };
+    let seen = stream(checks, &camera, "depth", "/dev/video0", depth, 6, Some(skip))?;
+    checks.equal("skipped frames are missing", seen.lost, 2);
+    checks.equal("and are in the accounts", camera.accounts("depth")?.skipped, 2);
+
+    let port = camera.port_path();
+    camera.unplug()?;
+    let none = || system::video_nodes().is_ok_and(|nodes| nodes.is_empty());
+    checks.that("unplugged, its nodes go", system::wait_until(PATIENCE, none), "");
+    camera.replug()?;
+    checks.that("plugged in again, they come back", system::wait_until(PATIENCE, six), "");
+    checks.equal("at the same port", camera.port_path(), port);
+    stream(checks, &camera, "depth", "/dev/video0", depth, 3, None)?;
+    checks.equal("the emulator was never late", camera.accounts("depth")?.late, 0);
+    Ok(())
+}
+
+/// The hardware monitor says who the camera is, through the kernel.
+fn identity(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
+    let mut node = Node::open(Path::new("/dev/video0"))?;
+    checks.equal("the hardware monitor takes 1024 bytes", node.length(3, 1)?, 1024);
+    let mut bytes = vec![0; 1024];
+    bytes[..8].copy_from_slice(&[0x14, 0, 0xAB, 0xCD, 0x10, 0, 0, 0]);
+    node.query(3, 1, Query::SetCur, &mut bytes)?;
+    node.query(3, 1, Query::GetCur, &mut bytes)?;
+    checks.equal("GVD is echoed", bytes[0], 0x10);
+    let serial: String = bytes[4 + 48..4 + 54].iter().map(|byte| format!("{byte:02x}")).collect();
+    checks.equal("GVD has the serial", serial.as_str(), camera.serial());
+    Ok(())
+}
+
+struct Seen {
+    lost: u64,
+    pts_fell: u32,
+}
+
+/// Takes frames of a stream and compares each with what was sent; the fault happens after the second of them.
+fn stream(
+    checks: &mut Checks,
+    camera: &Camera,
+    name: &str,
+    path: &str,
+    format: FourCc,
+    frames: usize,
+    mut fault: Option<Fault>,
+) -> anyhow::Result<Seen> {
+    let number: u32 = path.trim_start_matches("/dev/video").parse()?;
+    let node = Node::open(Path::new(path))?;
+    let modes = node.modes(|f| f == format)?;
+    let mode =
+        modes.iter().find(|m| (m.width, m.height) == (640, 480) && m.interval.rate_hz().round() == 30.0);
+    node.set_mode(mode.context("no 640x480 at 30 Hz")?)?;
+    let metadata = Node::open(Path::new(&format!("/dev/video{}", number + 1)))?;
+    let wanted = Wanted { video: node, metadata: Some((metadata, MetadataFormat::D4xx)) };
+    let mut source = Source::start(vec![wanted], 4)?;
+    let mut pictures: Vec<(Vec<u8>, Vec<u8>, Option<HostTime>)> = Vec::new();
+    let end = HostTime::now().plus(PATIENCE);
+    while pictures.len() < frames && HostTime::now() < end {
+        source.poll(Duration::from_millis(500), &mut |picture| {
+            pictures.push((
+                picture.bytes.to_vec(),
+                picture.header.unwrap_or_default().to_vec(),
+                picture.kernel_time,
+            ));
+        })?;
+        if pictures.len() >= 2
+            && let Some(fault) = fault.take()
+        {
+            camera.fault(fault)?;
+        }
+    }
+    drop(source);
+    checks.equal(&format!("{name}: frames"), pictures.len(), frames);
+    let (mut last, mut last_pts, mut seen) = (None, None, Seen { lost: 0, pts_fell: 0 });
+    let (mut equal, mut whole, mut off) = (0, 0, 0);
+    for (bytes, header, kernel_time) in &pictures {
+        let stamp = Stamp::read(bytes).context("a frame without a stamp")?;
+        equal += usize::from(*bytes == camera.expected(name, stamp.index)?);
+        if let Some(last) = last {
+            seen.lost += stamp.index - last - 1;
+        }
+        last = Some(stamp.index);
+        whole += usize::from(header.len() == if name == "color" { 244 } else { 232 });
+        let pts = header.get(2..6).and_then(|b| b.first_chunk()).map_or(0, |b| u32::from_le_bytes(*b));
+        seen.pts_fell += u32::from(last_pts.is_some_and(|last| pts < last));
+        last_pts = Some(pts);
+        let arrival =
+            kernel_time.context("no kernel time")?.since_ns(camera.true_capture(name, stamp.index)?);
+        off += usize::from(!(0..40_000_000).contains(&arrival));
+    }
+    checks.equal(&format!("{name}: frames that are byte for byte what was sent"), equal, frames);
+    checks.equal(&format!("{name}: headers that have all of the vendor's blocks"), whole, frames);
+    checks.equal(&format!("{name}: frames that come before or long after their capture"), off, 0);
+    Ok(seen)
+}
