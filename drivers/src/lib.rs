@@ -14,6 +14,7 @@ mod device;
 mod error;
 pub mod files;
 mod gate;
+pub mod libusb;
 pub mod realsense;
 mod sink;
 pub mod synthetic;

@@ -1,6 +1,6 @@
 //! The header in front of every payload of USB video (UVC 1.5 class specification, section 2.4.3.3).
 
-use super::{u16_at, u32_at};
+use crate::bytes::{u16_at, u32_at};
 use core::fmt;
 
 /// Bytes of a header that has both time stamps and no vendor blocks.

@@ -1,6 +1,6 @@
 //! The block by which host and camera agree on a stream: probed, then committed (UVC 1.5 class specification, 4.3.1.1).
 
-use super::{u16_at, u32_at};
+use crate::bytes::{u16_at, u32_at};
 use crate::{Error, ErrorKind, Result};
 
 /// Bytes of the block in UVC 1.0.

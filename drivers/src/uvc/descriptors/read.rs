@@ -4,8 +4,8 @@ use super::{
     Companion, Configuration, ControlInterface, Endpoint, Format, FormatKind, FrameSize, Interval, Intervals,
     OtherInterface, Setting, StreamingInterface, TransferKind, Unit, UnitKind,
 };
+use crate::bytes::{u16_at, u32_at};
 use crate::uvc::formats::{FourCc, Guid};
-use crate::uvc::{u16_at, u32_at};
 use crate::{Error, ErrorKind, Result};
 
 /// Descriptor types (USB 3.2, table 9-6; UVC 1.5, table A-4).
@@ -174,7 +174,7 @@ impl Reader {
                 match c.others.last_mut().filter(|i| i.number == number) {
                     Some(other) => other.settings.push(setting),
                     None => {
-                        c.others.push(OtherInterface { number, class, subclass, settings: vec![setting] })
+                        c.others.push(OtherInterface { number, class, subclass, settings: vec![setting] });
                     }
                 }
                 Place::Other
