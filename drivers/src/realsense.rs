@@ -2,11 +2,26 @@
 //!
 //! Layouts and constants: librealsense 2.58 (Apache-2.0), `src/ds` and `src/ds/d400`, unless a line says otherwise.
 
+mod account;
+mod backend;
+mod calibration;
 pub mod config;
+mod control;
+mod device;
 mod find;
+mod kernel;
+mod libusb;
+mod memory;
 mod models;
+mod options;
+mod profiles;
 pub mod protocol;
+mod stream;
 pub mod transport;
 
+pub use backend::RealsenseBackend;
 pub use config::RealsenseConfig;
 pub use transport::Transport;
+
+/// Name of the back end in rig files.
+pub const NAME: &str = "realsense";

@@ -3,6 +3,8 @@
 //! Each kernel writes every byte of `to` or says why it cannot, in words of the gate's ([`DropReason`]), so that it
 //! can be the `fill` of [`crate::Gate::deliver`]. What is copied is counted.
 
+pub mod y8i;
+
 use core::sync::atomic::{AtomicU64, Ordering};
 use depthrig_bus::DropReason;
 

@@ -1,5 +1,7 @@
 //! What a rig may ask of a D400.
 
+use super::protocol::sync::SyncMode;
+use crate::v4l2::ControlValue;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -24,12 +26,12 @@ pub struct RealsenseConfig {
     pub auto_exposure: Option<bool>,
     /// Gain of the stereo module, in the camera's units.
     pub gain: Option<u32>,
-    /// A file of advanced-mode groups that is written at the start.
+    /// A file of advanced-mode groups ([`super::protocol::preset`]) that is written at the start.
     pub preset: Option<PathBuf>,
     /// Synchronisation between cameras, by cable.
     pub sync: Option<SyncMode>,
     /// Controls of the colour picture by their V4L2 names.
-    pub color_controls: BTreeMap<String, i32>,
+    pub color_controls: BTreeMap<String, ControlValue>,
     /// Metres per unit of depth. It is written to the camera, which must be in advanced mode.
     pub depth_unit_m: Option<f64>,
     /// Whether a camera without factory calibration is used all the same; its intrinsics are unknown then.
@@ -74,17 +76,4 @@ pub enum Emitter {
     Auto = 2,
     /// LED instead of the laser, where there is one.
     Led = 3,
-}
-
-/// Synchronisation between cameras (`SET_CAM_SYNC`).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum SyncMode {
-    /// Every camera for itself.
-    Free,
-    /// Gives the pulse.
-    Master,
-    /// Follows it with depth.
-    Slave,
-    /// Follows it with depth and colour.
-    FullSlave,
 }

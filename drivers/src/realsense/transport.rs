@@ -6,6 +6,7 @@
 use super::protocol::hwm::HardwareMonitor;
 use crate::Result;
 use crate::uvc::control::ControlPort;
+use crate::v4l2::Control;
 use crate::video::PictureSource;
 
 /// One of the video streaming interfaces of a D400.
@@ -75,43 +76,28 @@ pub struct Started {
     pub headers: Vec<HeaderPart>,
 }
 
-/// A control of the camera's picture, such as exposure or white balance, by the name that V4L2 gives it in lower case
-/// with `_` (`exposure_time_absolute`, `white_balance_automatic`).
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct PictureControl {
-    /// Its name.
-    pub name: String,
-    /// Least value.
-    pub minimum: i32,
-    /// Greatest value.
-    pub maximum: i32,
-    /// Step between values.
-    pub step: i32,
-    /// Value after power-on.
-    pub default: i32,
-}
-
-/// The picture controls of one function (camera terminal and processing unit). Every call may take as long as the
-/// kernel's control time-out (5 s), so none belongs on a capture thread.
+/// The picture controls of one function (camera terminal and processing unit), by the names that V4L2 gives them
+/// ([`Control`]). Every call may take as long as the kernel's control time-out (5 s), so none belongs on a capture
+/// thread.
 pub trait PictureControls: Send {
     /// All that there are.
     ///
     /// # Errors
     /// [`crate::ErrorKind::Disconnected`], [`crate::ErrorKind::Io`].
-    fn list(&mut self) -> Result<Vec<PictureControl>>;
+    fn list(&mut self) -> Result<Vec<Control>>;
 
     /// The present value.
     ///
     /// # Errors
-    /// [`crate::ErrorKind::Unsupported`] when there is no such control, [`crate::ErrorKind::Disconnected`],
-    /// [`crate::ErrorKind::Io`].
-    fn get(&mut self, name: &str) -> Result<i32>;
+    /// [`crate::ErrorKind::Disconnected`], [`crate::ErrorKind::Io`], [`crate::ErrorKind::Protocol`] when the camera
+    /// refuses.
+    fn get(&mut self, control: &Control) -> Result<i64>;
 
-    /// Sets it. The caller has checked the range.
+    /// Sets it to a value that [`Control::check`] gave.
     ///
     /// # Errors
-    /// Those of [`Self::get`], and [`crate::ErrorKind::BadInput`] when the device refuses the value.
-    fn set(&mut self, name: &str, value: i32) -> Result<()>;
+    /// Those of [`Self::get`].
+    fn set(&mut self, control: &Control, value: i64) -> Result<()>;
 }
 
 /// An open D400, however it is reached. Dropping it, and what it handed out, lets go of the device.
@@ -142,6 +128,15 @@ pub trait Transport: Send {
     /// # Errors
     /// Those of [`Self::control`].
     fn monitor(&mut self) -> Result<Box<dyn HardwareMonitor>>;
+
+    /// Checks that nobody else streams from the camera, as far as that shows before it is started. A transport that takes
+    /// the camera for itself when it is opened need not.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::Busy`] naming the process, [`crate::ErrorKind::Disconnected`], [`crate::ErrorKind::Io`].
+    fn check_free(&mut self) -> Result<()> {
+        Ok(())
+    }
 
     /// Starts the sources of `modes` together; at most one for each [`Sensor`].
     ///

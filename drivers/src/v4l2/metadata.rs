@@ -41,11 +41,18 @@ const PREFIX: usize = 10;
 /// The payload header in a buffer of a metadata node: its first block without the kernel's prefix, from the byte
 /// with its own length to its end. `None` when the buffer is too short for what it claims.
 ///
-/// The kernel writes one block per payload; a picture that came in several has the same stamp in each.
-pub fn payload_header(record: &[u8]) -> Option<&[u8]> {
+/// The kernel writes one block per payload; a picture that came in several has the same stamp in each. With
+/// [`MetadataFormat::Uvch`] it leaves out what the vendor put behind the standard part, yet the length stays that of
+/// the whole.
+pub fn payload_header(record: &[u8], format: MetadataFormat) -> Option<&[u8]> {
     let block = record.get(PREFIX..)?;
-    let length = usize::from(*block.first()?);
-    if length < 2 { None } else { block.get(..length) }
+    let (length, flags) = (usize::from(*block.first()?), *block.get(1)?);
+    if length < 2 {
+        return None;
+    }
+    // USB video class 1.5, table 2-6: presentation time of 4 bytes, clock sample of 6.
+    let standard = 2 + if flags & 0x04 == 0 { 0 } else { 4 } + if flags & 0x08 == 0 { 0 } else { 6 };
+    block.get(..if format == MetadataFormat::Uvch { length.min(standard) } else { length })
 }
 
 /// The longest record that is kept: prefix and a header of 255 bytes.
@@ -121,6 +128,7 @@ impl Waiting {
 
 #[cfg(test)]
 mod tests {
+    use super::MetadataFormat::{D4xx, Uvch};
     use super::*;
     use proptest::prelude::*;
 
@@ -128,17 +136,31 @@ mod tests {
     fn a_header_is_cut_out_of_its_record() {
         let mut record = vec![0; PREFIX];
         record.extend([12, 0x8F, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 99]);
-        assert_eq!(payload_header(&record), Some(&record[10..22]));
-        assert_eq!(payload_header(&record[..21]), None, "the last byte of the header is missing");
+        assert_eq!(payload_header(&record, D4xx), Some(&record[10..22]));
+        assert_eq!(payload_header(&record[..21], D4xx), None, "the last byte of the header is missing");
         record[10] = 1;
-        assert_eq!(payload_header(&record), None, "shorter than length and flags");
-        assert_eq!(payload_header(&[]), None);
+        assert_eq!(payload_header(&record, D4xx), None, "shorter than length and flags");
+        assert_eq!(payload_header(&[], D4xx), None);
+    }
+
+    #[test]
+    fn the_standard_header_of_a_longer_one_is_told_by_its_flags() {
+        // What uvcvideo makes of the header of a D435: 232 bytes long, of which it hands over 12.
+        let mut record = vec![0; PREFIX];
+        record.extend([232, 0x8F, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10]);
+        assert_eq!(payload_header(&record, Uvch), Some(&record[10..22]));
+        record.extend([0; 250]);
+        assert_eq!(payload_header(&record, Uvch), Some(&record[10..22]), "the next record is none of it");
+        record[11] = 0x86;
+        assert_eq!(payload_header(&record, Uvch), Some(&record[10..16]), "presentation time alone");
+        record[10] = 2;
+        assert_eq!(payload_header(&record, Uvch), Some(&record[10..12]));
     }
 
     proptest! {
         #[test]
         fn any_bytes_are_a_header_or_none(record: Vec<u8>) {
-            if let Some(header) = payload_header(&record) {
+            if let Some(header) = payload_header(&record, D4xx) {
                 prop_assert_eq!(header.len(), usize::from(header[0]));
                 prop_assert_eq!(header.as_ptr(), record[PREFIX..].as_ptr());
             }

@@ -195,6 +195,7 @@ impl Port {
     /// Hands the oldest picture to `each`; whether there was one.
     fn next(&mut self, index: usize, each: &mut dyn FnMut(&Picture<'_>)) -> Result<bool> {
         let Self { video, metadata, sequence } = self;
+        let format = metadata.as_ref().map_or(MetadataFormat::None, |m| m.format);
         let came = video.next(|b, bytes| {
             let arrival = HostTime::now();
             let record = match metadata {
@@ -214,7 +215,7 @@ impl Port {
                 sequence: sequence.next(b.sequence),
                 kernel_time,
                 arrival,
-                header: record.as_ref().and_then(|r| payload_header(r.bytes())),
+                header: record.as_ref().and_then(|r| payload_header(r.bytes(), format)),
             });
             problem
         })?;
