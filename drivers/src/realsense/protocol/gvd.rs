@@ -195,3 +195,6 @@ fn unhex(text: &str) -> Vec<u8> {
     let bytes: Option<Vec<u8>> = pairs.map(|p| Some(digit(p[0])? << 4 | digit(p[1])?)).collect();
     bytes.filter(|_| whole).unwrap_or_default()
 }
+
+#[cfg(test)]
+mod tests;
