@@ -4,6 +4,8 @@
 //! a panic. What the emulator in `tests/vm` answers with is built by the same types.
 
 pub mod advanced;
+#[cfg(test)]
+mod fake;
 pub mod firmware;
 pub mod gvd;
 pub mod health;

@@ -38,10 +38,7 @@ fn every_request() -> Vec<Request> {
 #[test]
 fn requests_are_the_published_bytes() {
     let zeros = |n| vec![0; n];
-    assert_eq!(
-        Request::device_info().to_bytes(),
-        [hex("14 00 AB CD 10 00 00 00"), zeros(16)].concat()
-    );
+    assert_eq!(Request::device_info().to_bytes(), [hex("14 00 AB CD 10 00 00 00"), zeros(16)].concat());
     assert_eq!(
         Request::calibration_table(32).to_bytes(),
         [hex("14 00 AB CD 15 00 00 00 20 00 00 00"), zeros(12)].concat()
@@ -77,8 +74,8 @@ fn nothing_that_writes_calibration_flash_or_firmware_can_be_sent() {
     // librealsense's fw_cmd of both families: what writes or erases flash, tables or fuses, and what starts an
     // update. 0x44 writes a table on an L515 (on a D400 it is the region of auto-exposure).
     let writing = [
-        0x02, 0x0A, 0x0B, 0x0C, 0x0D, 0x0E, 0x16, 0x1D, 0x1E, 0x29, 0x2D, 0x2E, 0x2F, 0x35, 0x36, 0x3B, 0x44, 0x51,
-        0x5B, 0x61, 0x62, 0x80, 0x83, 0xA6, 0xA8,
+        0x02, 0x0A, 0x0B, 0x0C, 0x0D, 0x0E, 0x16, 0x1D, 0x1E, 0x29, 0x2D, 0x2E, 0x2F, 0x35, 0x36, 0x3B, 0x44,
+        0x51, 0x5B, 0x61, 0x62, 0x80, 0x83, 0xA6, 0xA8,
     ];
     for opcode in D4xxOpcode::ALL.iter().map(|o| o.code()).chain(L515Opcode::ALL.iter().map(|o| o.code())) {
         assert!(!writing.contains(&opcode), "{opcode:#x}");
@@ -87,7 +84,10 @@ fn nothing_that_writes_calibration_flash_or_firmware_can_be_sent() {
         let bytes = request.to_bytes();
         let opcode = u32::from_le_bytes(bytes[4..8].try_into().unwrap());
         assert!(!writing.contains(&opcode), "{request}");
-        assert!(D4xxOpcode::from_code(opcode).is_some() || L515Opcode::from_code(opcode).is_some(), "{request}");
+        assert!(
+            D4xxOpcode::from_code(opcode).is_some() || L515Opcode::from_code(opcode).is_some(),
+            "{request}"
+        );
     }
     // There is no constructor that this test does not know.
     let source = include_str!("request.rs");

@@ -152,7 +152,9 @@ fn a_damaged_table_is_refused_wherever_it_is_damaged() {
         let mut damaged = bytes.clone();
         damaged[100] ^= 1;
         let text = open(&damaged).unwrap_err().to_string();
-        assert!(text.contains("checksum") && text.contains(&id.to_string()) && text.contains("calibration tool"));
+        assert!(
+            text.contains("checksum") && text.contains(&id.to_string()) && text.contains("calibration tool")
+        );
     }
 }
 
@@ -160,12 +162,19 @@ fn a_damaged_table_is_refused_wherever_it_is_damaged() {
 fn cut_off_at_every_length() {
     for (bytes, id) in [(coefficients_by_hand(), 25u8), (rgb_by_hand(), 32)] {
         for n in 0..bytes.len() {
-            assert!(Coefficients::parse(&bytes[..n]).is_err() && RgbTable::parse(&bytes[..n]).is_err(), "{n}");
+            assert!(
+                Coefficients::parse(&bytes[..n]).is_err() && RgbTable::parse(&bytes[..n]).is_err(),
+                "{n}"
+            );
             if n >= 16 {
                 // Cut off with a checksum that fits all the same.
                 let mut short = bytes[..n].to_vec();
                 seal(&mut short, id);
-                let parsed = if id == 25 { Coefficients::parse(&short).is_ok() } else { RgbTable::parse(&short).is_ok() };
+                let parsed = if id == 25 {
+                    Coefficients::parse(&short).is_ok()
+                } else {
+                    RgbTable::parse(&short).is_ok()
+                };
                 assert_eq!(parsed, n >= if id == 25 { 512 } else { 232 }, "table {id}, {n} bytes");
             }
         }
