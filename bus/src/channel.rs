@@ -39,8 +39,10 @@ pub const BUFFER: usize = 4;
 pub const MAX_HELD: usize = 16;
 /// A camera's publisher, one that replaces a hung thread's, and one to spare.
 const MAX_PUBLISHERS: usize = 3;
-/// Loans of one publisher at a time: the frame being written, and the next.
-const MAX_LOANS: usize = 2;
+/// Frames of one channel that a device may be filling by itself at a time.
+pub const MAX_LENT: usize = 8;
+/// Loans of one publisher at a time: the frame that a driver is writing, and those that the device fills.
+const MAX_LOANS: usize = 1 + MAX_LENT;
 const MAX_NODES: usize = 32;
 const NEW_FRAME: EventId = EventId::new(1);
 

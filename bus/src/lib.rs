@@ -21,7 +21,7 @@ mod sets;
 pub mod shm;
 mod subscriber;
 
-pub use channel::BUFFER as SUBSCRIBER_BUFFER;
+pub use channel::{BUFFER as SUBSCRIBER_BUFFER, MAX_LENT};
 pub use clock::{HostTime, UtcPair};
 pub use drops::{DropCounts, DropReason};
 pub use error::{Error, ErrorKind, Result};

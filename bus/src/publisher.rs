@@ -21,8 +21,8 @@ impl Publisher {
     ///
     /// # Errors
     /// [`crate::ErrorKind::NoSpace`] when subscribers hold every slot: drop the frame and count it.
-    /// [`crate::ErrorKind::LimitReached`] when `len` is larger than the channel's frames or two frames are on
-    /// loan already.
+    /// [`crate::ErrorKind::LimitReached`] when `len` is larger than the channel's frames, or one more than
+    /// [`crate::MAX_LENT`] frames are on loan already.
     pub fn loan(&self, len: usize) -> Result<FrameMut> {
         let mut loan = self.sender.loan(len)?;
         *loan.user_header_mut() = FrameHeader { payload_len: len as u32, ..FrameHeader::default() };

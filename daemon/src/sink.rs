@@ -4,7 +4,7 @@ use crate::stream::{Books, Stream};
 use crate::wake::Wake;
 use depthrig_bus::{DropReason, FrameFlags, FrameHeader, FrameMut, HostTime, MetadataLevel, Publisher};
 use depthrig_drivers::clock::ClockQuality;
-use depthrig_drivers::{FrameMeta, FrameSink};
+use depthrig_drivers::{FrameMeta, FrameSink, Loan};
 use std::sync::{Arc, MutexGuard};
 
 /// The sink of one opening of one camera.
@@ -42,8 +42,7 @@ impl Port {
         (books.session == self.session).then_some(books)
     }
 
-    fn publish(&mut self, meta: &FrameMeta) {
-        let Some(mut frame) = self.loan.take() else { return };
+    fn publish(&mut self, mut frame: FrameMut, meta: &FrameMeta) {
         let stream = Arc::clone(&self.stream);
         let mut books = stream.books();
         if books.session != self.session {
@@ -98,9 +97,30 @@ impl FrameSink for BusSink {
 
     fn commit(&mut self, stream: usize, meta: &FrameMeta) {
         if let Some(port) = self.streams.get_mut(stream) {
-            port.publish(meta);
+            if let Some(frame) = port.loan.take() {
+                port.publish(frame, meta);
+            }
             self.wake.raise();
         }
+    }
+
+    fn lend(&mut self, stream: usize, len: usize) -> Option<Loan> {
+        let port = self.streams.get(stream)?;
+        // Its absence is the kernel's to notice: what it skips for want of memory is a gap in its counter.
+        let lent = port.publisher.loan(len);
+        lent.inspect_err(|e| tracing::debug!(stream = %port.stream.id, error = %e, "no slot"))
+            .ok()
+            .map(Loan::Slot)
+    }
+
+    fn commit_lent(&mut self, stream: usize, loan: Loan, meta: &FrameMeta) {
+        let Some(port) = self.streams.get_mut(stream) else { return };
+        match loan {
+            Loan::Slot(frame) => port.publish(frame, meta),
+            // Not of this sink; what is not in a slot cannot be published without a copy.
+            Loan::Memory(_) => self.dropped(stream, DropReason::NoSlot, 1),
+        }
+        self.wake.raise();
     }
 
     fn discard(&mut self, stream: usize) {

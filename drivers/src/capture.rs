@@ -4,7 +4,7 @@
 //! is *abandoned*: it is left behind, and if it ever wakes, nothing that it still holds is published.
 
 use crate::clock::ClockQuality;
-use crate::{DeviceInfo, Error, ErrorKind, FrameMeta, FrameSink, Poll, Result, Stream};
+use crate::{DeviceInfo, Error, ErrorKind, FrameMeta, FrameSink, Loan, Poll, Result, Stream};
 use core::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use core::time::Duration;
 use depthrig_bus::{DropReason, HostTime};
@@ -211,6 +211,21 @@ impl FrameSink for Guarded<'_> {
 
     fn discard(&mut self, stream: usize) {
         self.sink.discard(stream);
+    }
+
+    fn lend(&mut self, stream: usize, len: usize) -> Option<Loan> {
+        if self.is_abandoned() { None } else { self.sink.lend(stream, len) }
+    }
+
+    fn commit_lent(&mut self, stream: usize, loan: Loan, meta: &FrameMeta) {
+        self.note_frame();
+        let _no_abandoning_meanwhile = self.shared.end.lock().unwrap_or_else(PoisonError::into_inner);
+        if self.is_abandoned() {
+            drop(loan);
+            self.sink.dropped(stream, DropReason::Abandoned, 1);
+        } else {
+            self.sink.commit_lent(stream, loan, meta);
+        }
     }
 
     fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {

@@ -7,7 +7,7 @@
 //! - capture times never go back within one clock epoch, and never lie after the arrival.
 
 use crate::clock::{ClockConfig, ClockMap};
-use crate::{FrameMeta, FrameSink, StreamProfile};
+use crate::{FrameMeta, FrameSink, Loan, StreamProfile};
 use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameFlags, HostTime, PixelFormat};
 
 /// A frame as the device announces it, before its pixels are written anywhere.
@@ -142,33 +142,64 @@ impl Gate {
         sink: &mut dyn FrameSink,
         fill: impl FnOnce(&mut [u8]) -> Result<(), DropReason>,
     ) -> Outcome {
-        let Some(device_sequence) = self.account(raw, sink) else {
-            return Outcome::AlreadyCounted;
-        };
-        let outcome = match device_sequence {
-            Err(reason) => Err(reason),
-            Ok(sequence) => self.pass(raw, sequence, sink, fill),
-        };
-        match outcome {
-            Ok(()) => {
-                self.delivered += 1;
-                Outcome::Delivered
+        let stream = self.stream;
+        self.pass(raw, sink, |meta, sink| {
+            let memory = sink.loan(stream, raw.bytes).ok_or(DropReason::NoSlot)?;
+            if let Err(reason) = fill(memory) {
+                sink.discard(stream);
+                return Err(reason);
             }
-            Err(reason) => {
-                self.lose(reason, 1, sink);
-                Outcome::Dropped(reason)
-            }
-        }
+            sink.commit(stream, meta);
+            Ok(())
+        })
     }
 
-    /// Checks, stamps and writes a frame whose number is already accounted for.
+    /// Passes one frame whose pixels the device has written into `loan`, which came from `sink`'s
+    /// [`FrameSink::lend`] and is of the size of the frame. The loan comes back when the frame is not delivered.
+    pub fn deliver_lent(
+        &mut self,
+        raw: &RawFrame,
+        sink: &mut dyn FrameSink,
+        loan: Loan,
+    ) -> (Outcome, Option<Loan>) {
+        let (stream, mut loan) = (self.stream, Some(loan));
+        let outcome = self.pass(raw, sink, |meta, sink| {
+            if let Some(loan) = loan.take() {
+                sink.commit_lent(stream, loan, meta);
+            }
+            Ok(())
+        });
+        (outcome, loan)
+    }
+
+    /// Counts, checks and stamps one frame; `hand_over` publishes it or says why it cannot.
     fn pass(
         &mut self,
         raw: &RawFrame,
-        device_sequence: u64,
         sink: &mut dyn FrameSink,
-        fill: impl FnOnce(&mut [u8]) -> Result<(), DropReason>,
-    ) -> Result<(), DropReason> {
+        hand_over: impl FnOnce(&FrameMeta, &mut dyn FrameSink) -> Result<(), DropReason>,
+    ) -> Outcome {
+        let Some(device_sequence) = self.account(raw, sink) else {
+            return Outcome::AlreadyCounted;
+        };
+        let passed = device_sequence.and_then(|sequence| {
+            self.check(raw)?;
+            let meta = FrameMeta { captured: self.captured, ..self.stamp(raw, sequence) };
+            hand_over(&meta, sink)
+        });
+        if let Err(reason) = passed {
+            self.lose(reason, 1, sink);
+            return Outcome::Dropped(reason);
+        }
+        if self.domain == ClockDomain::Device && self.delivered.is_multiple_of(self.report_every) {
+            sink.clock_quality(self.stream, &self.clock.quality());
+        }
+        self.delivered += 1;
+        Outcome::Delivered
+    }
+
+    /// Whether the frame is whole and undamaged.
+    fn check(&self, raw: &RawFrame) -> Result<(), DropReason> {
         if raw.damaged {
             return Err(DropReason::DeviceError);
         }
@@ -178,17 +209,6 @@ impl Gate {
         }
         if raw.bytes < self.frame_bytes && !varies {
             return Err(DropReason::Incomplete);
-        }
-        let mut meta = self.stamp(raw, device_sequence);
-        let memory = sink.loan(self.stream, raw.bytes).ok_or(DropReason::NoSlot)?;
-        if let Err(reason) = fill(memory) {
-            sink.discard(self.stream);
-            return Err(reason);
-        }
-        meta.captured = self.captured;
-        sink.commit(self.stream, &meta);
-        if self.domain == ClockDomain::Device && self.delivered.is_multiple_of(self.report_every) {
-            sink.clock_quality(self.stream, &self.clock.quality());
         }
         Ok(())
     }

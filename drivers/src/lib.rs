@@ -30,4 +30,4 @@ pub use device::{
 };
 pub use error::{Error, ErrorKind, Result};
 pub use gate::{Gate, Outcome, RawFrame};
-pub use sink::{FrameMeta, FrameSink, MemorySink};
+pub use sink::{FrameMeta, FrameSink, Loan, MemorySink};

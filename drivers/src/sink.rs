@@ -1,7 +1,7 @@
 //! Where a driver's frames go: memory on loan, written once, then committed or given back.
 
 use crate::clock::ClockQuality;
-use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameFlags, HostTime};
+use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameFlags, FrameMut, HostTime};
 
 /// The receiver of a camera's frames. `stream` is the index into [`crate::Stream::profiles`].
 ///
@@ -18,6 +18,19 @@ pub trait FrameSink {
     /// Takes back the memory lent last for `stream`, unpublished.
     fn discard(&mut self, stream: usize);
 
+    /// Memory of exactly `len` bytes for a frame of `stream` that the device itself will write; as many as
+    /// [`depthrig_bus::MAX_LENT`] may be out at once, beside what [`Self::loan`] lends. Dropping it gives it back.
+    /// `None` when there is none free, or when the receiver lends none in this way.
+    fn lend(&mut self, _stream: usize, _len: usize) -> Option<Loan> {
+        None
+    }
+
+    /// Publishes memory from [`Self::lend`].
+    fn commit_lent(&mut self, stream: usize, loan: Loan, _meta: &FrameMeta) {
+        drop(loan);
+        self.dropped(stream, DropReason::NoSlot, 1);
+    }
+
     /// Says that `n` frames of `stream` were lost.
     fn dropped(&mut self, stream: usize, reason: DropReason, n: u64);
 
@@ -26,6 +39,26 @@ pub trait FrameSink {
 
     /// Says how the clock map of `stream` is doing, about once a second.
     fn clock_quality(&mut self, stream: usize, quality: &ClockQuality);
+}
+
+/// Memory for one frame that is the driver's until it is committed or dropped, so that a device can fill several at
+/// once. It stays where it is when the loan moves.
+#[derive(Debug)]
+pub enum Loan {
+    /// A slot of a stream's channel.
+    Slot(FrameMut),
+    /// Memory of the process.
+    Memory(Box<[u8]>),
+}
+
+impl Loan {
+    /// The bytes, all of them.
+    pub fn bytes_mut(&mut self) -> &mut [u8] {
+        match self {
+            Self::Slot(frame) => frame.pixels_mut(),
+            Self::Memory(bytes) => bytes,
+        }
+    }
 }
 
 /// What is known of one frame besides its pixels.
@@ -68,6 +101,7 @@ pub struct MemorySink {
     pub captured: Vec<u64>,
     /// Number of loans from now on that are refused, as if no slot were free.
     pub refuse: usize,
+    lends: bool,
     buffers: Vec<Vec<u8>>,
 }
 
@@ -77,6 +111,11 @@ impl MemorySink {
             list.push(T::default());
         }
         &mut list[i]
+    }
+
+    /// A sink that lends memory for the device to write.
+    pub fn lending() -> Self {
+        Self { lends: true, ..Self::default() }
     }
 
     /// Frames delivered on `stream`.
@@ -108,6 +147,21 @@ impl FrameSink for MemorySink {
 
     fn discard(&mut self, stream: usize) {
         Self::at(&mut self.buffers, stream).clear();
+    }
+
+    fn lend(&mut self, _: usize, len: usize) -> Option<Loan> {
+        if !self.lends {
+            return None;
+        }
+        if self.refuse > 0 {
+            self.refuse -= 1;
+            return None;
+        }
+        Some(Loan::Memory(vec![0xA5; len].into()))
+    }
+
+    fn commit_lent(&mut self, stream: usize, mut loan: Loan, meta: &FrameMeta) {
+        self.frames.push((stream, *meta, loan.bytes_mut().to_vec()));
     }
 
     fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {

@@ -3,7 +3,10 @@
 //! Each kernel writes every byte of `to` or says why it cannot, in words of the gate's ([`DropReason`]), so that it
 //! can be the `fill` of [`crate::Gate::deliver`]. What is copied is counted.
 
+mod mjpeg;
 pub mod y8i;
+
+pub use mjpeg::{decode_jpeg, jpeg_span, keep_jpeg};
 
 use core::sync::atomic::{AtomicU64, Ordering};
 use depthrig_bus::DropReason;

@@ -5,18 +5,77 @@
 //! (`v4l2/ioctl.rs`), because in `v4l` 0.14 the stream panics when a camera fails to stop, holds one buffer at a time,
 //! and cannot set the format of a metadata node; listing controls, formats and capabilities panics on names that are
 //! not UTF-8 and on types newer than itself; and there are no requests to extension units.
+//!
+//! **Memory.** A picture is copied once, from the kernel's buffer into the slot that subscribers read
+//! ([`MemoryChoice::Mmap`]), or not at all by us, when the kernel writes into that slot itself
+//! ([`MemoryChoice::UserPointer`]; `uvcvideo` and `vivid` can, drivers whose devices need contiguous memory cannot).
+//! [`crate::unpack::copied_bytes`] counts.
+//!
+//! **Time.** Where the camera's metadata node gives payload headers and their clock ticks as it should (`v4l2/tick.rs`),
+//! frames are stamped by the device: when it began to capture the picture, by USB video's own definition. Else by the
+//! kernel: when the first packet of the picture came, or the last, as its flags say; and where the kernel's stamp is not
+//! of the monotonic clock, when we got the picture. A kernel stamp that lies after that is moved back to it and the
+//! frame is flagged as uncertain in time: `vivid` stamps 30 ms ahead. Streaming into user memory goes by the kernel's
+//! stamps.
+//!
+//! **Accounts.** A buffer that is flagged as damaged or too short is a counted drop; so is every number that the
+//! kernel's counter skips. `uvcvideo` itself throws damaged pictures away, which shows as such a gap.
 
+use crate::usb::SysRoot;
+use crate::{Backend, Device, DeviceInfo, Result};
+
+mod config;
 pub mod controls;
+mod device;
 mod error;
-mod fourcc;
+mod find;
 mod ioctl;
+mod lent;
 mod metadata;
 mod node;
+mod offer;
 mod queue;
 mod source;
+mod stream;
+mod tick;
 
+pub use crate::uvc::formats::FourCc;
+pub use config::{BUFFERS, ClockChoice, GivenIntrinsics, MemoryChoice, MjpegChoice, V4l2Config};
 pub use controls::{Control, ControlKind, ControlValue};
-pub use fourcc::FourCc;
 pub use metadata::{MetadataFormat, payload_header};
 pub use node::{Capability, Interval, Layout, Mode, Node};
 pub use source::{DEFAULT_BUFFERS, Source, Stamp, Wanted};
+
+/// The name of the back end.
+const NAME: &str = "v4l2";
+
+/// The back end `v4l2`: any camera at the kernel's video nodes.
+#[derive(Debug, Clone)]
+pub struct V4l2Backend {
+    config: V4l2Config,
+    root: SysRoot,
+}
+
+impl V4l2Backend {
+    /// A back end for the one camera of `config`. Nothing is opened before it is asked for.
+    pub fn new(config: V4l2Config) -> Self {
+        Self { config, root: SysRoot::default() }
+    }
+}
+
+impl Backend for V4l2Backend {
+    fn name(&self) -> &'static str {
+        NAME
+    }
+
+    /// Every camera at a video node that no other back end drives.
+    fn discover(&self) -> Result<Vec<DeviceInfo>> {
+        let found = find::cameras(&self.root)?;
+        Ok(found.into_iter().filter(|f| f.family().is_none()).map(|f| f.info).collect())
+    }
+
+    fn open(&self, serial: Option<&str>) -> Result<Box<dyn Device>> {
+        let found = find::choose(&find::cameras(&self.root)?, &self.config, serial)?;
+        Ok(Box::new(device::V4l2Device::open(found, self.config.clone(), self.root.clone())?))
+    }
+}

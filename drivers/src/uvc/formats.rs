@@ -106,6 +106,22 @@ impl FourCc {
     pub const BYR2: Self = Self(*b"BYR2");
     /// JPEG pictures.
     pub const MJPG: Self = Self(*b"MJPG");
+    /// JPEG pictures by the name that some kernel drivers give them.
+    pub const JPEG: Self = Self(*b"JPEG");
+    /// Payload headers of USB video: a format of metadata nodes.
+    pub const UVCH: Self = Self(*b"UVCH");
+    /// Payload headers with the blocks of RealSense D400: a format of metadata nodes.
+    pub const D4XX: Self = Self(*b"D4XX");
+
+    /// The kernel's number for it: the first character in the lowest byte.
+    pub const fn number(self) -> u32 {
+        u32::from_le_bytes(self.0)
+    }
+
+    /// From the kernel's number.
+    pub const fn from_number(number: u32) -> Self {
+        Self(number.to_le_bytes())
+    }
 
     /// The pixel format of depthrig that has the same bytes; `None` when a driver must unpack it first, or when
     /// depthrig does not know it.
@@ -117,7 +133,7 @@ impl FourCc {
             Self::GREY => PixelFormat::Mono8,
             Self::Y16 => PixelFormat::Mono16,
             Self::Z16 => PixelFormat::Z16,
-            Self::MJPG => PixelFormat::Mjpeg,
+            Self::MJPG | Self::JPEG => PixelFormat::Mjpeg,
             _ => return None,
         })
     }

@@ -48,6 +48,8 @@ pub struct Control {
     pub default: i64,
     /// It can be read only.
     pub read_only: bool,
+    /// It can be written only.
+    pub write_only: bool,
     /// It has no effect now, mostly because an automatic has it.
     pub inactive: bool,
     /// The items of a menu with their values.
@@ -203,6 +205,7 @@ pub(super) fn enumerate(fd: RawFd) -> io::Result<Vec<Control>> {
             step: next.step,
             default: next.default_value,
             read_only: next.flags & sys::V4L2_CTRL_FLAG_READ_ONLY != 0,
+            write_only: next.flags & sys::V4L2_CTRL_FLAG_WRITE_ONLY != 0,
             inactive: next.flags & sys::V4L2_CTRL_FLAG_INACTIVE != 0,
             items,
         });

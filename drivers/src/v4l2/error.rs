@@ -10,11 +10,7 @@ pub(super) fn node_error(path: &Path, what: &str, e: io::Error) -> Error {
     let errno = e.raw_os_error().map(Errno::from_raw_os_error);
     let (kind, cure) = match errno {
         Some(Errno::NOENT) => (ErrorKind::NotFound, "is the camera plugged in?"),
-        Some(Errno::ACCESS | Errno::PERM) => (
-            ErrorKind::PermissionDenied,
-            "this user may not open it; `depthrig install --print` shows the udev rule that lets them, and being in \
-             the group `video` does as well",
-        ),
+        Some(Errno::ACCESS | Errno::PERM) => (ErrorKind::PermissionDenied, crate::usb::health::RULE_CURE),
         Some(Errno::BUSY) => (ErrorKind::Busy, "another process streams from it; end that process"),
         Some(Errno::NODEV | Errno::NXIO) => (ErrorKind::Disconnected, "the camera was unplugged"),
         Some(Errno::INVAL | Errno::NOTTY | Errno::OPNOTSUPP) => {

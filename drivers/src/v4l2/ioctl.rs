@@ -24,6 +24,7 @@ pub(super) enum QueueKind {
 #[repr(u32)]
 pub(super) enum Memory {
     Mapped = 1,
+    UserPointer = 2,
 }
 
 /// A buffer as the kernel describes it.
@@ -216,6 +217,19 @@ pub(super) fn query_buffer(fd: RawFd, kind: QueueKind, memory: Memory, index: u3
 /// `VIDIOC_QBUF` of a mapped buffer.
 pub(super) fn queue_mapped(fd: RawFd, kind: QueueKind, index: u32) -> io::Result<()> {
     plain_call(fd, vidioc::VIDIOC_QBUF, &mut blank(kind, Memory::Mapped, index))
+}
+
+/// `VIDIOC_QBUF` of the caller's own memory.
+///
+/// # Safety
+/// `bytes` must stay mapped, and nobody else may read or write it, until buffer `index` was dequeued, the queue was
+/// switched off, or the node was closed.
+pub(super) unsafe fn queue_user(fd: RawFd, index: u32, bytes: ptr::NonNull<[u8]>) -> io::Result<()> {
+    let mut b = blank(QueueKind::Video, Memory::UserPointer, index);
+    b.m.userptr = bytes.as_ptr().cast::<u8>() as u64;
+    b.length = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
+    // SAFETY: the caller's promise; the kernel pins the pages of exactly this range and writes into no others.
+    unsafe { call(fd, vidioc::VIDIOC_QBUF, &mut b) }
 }
 
 /// `VIDIOC_DQBUF`: the buffer that was filled first; `None` when none is.

@@ -1,6 +1,6 @@
 //! What the kernel hands over beside a picture: the payload headers of USB video, and finding those of a picture.
 
-use super::fourcc::FourCc;
+use crate::uvc::formats::FourCc;
 
 /// The format that a metadata node was set to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]

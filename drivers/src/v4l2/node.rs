@@ -2,10 +2,10 @@
 
 use super::controls::{self, Control, ControlValue};
 use super::error::node_error;
-use super::fourcc::FourCc;
 use super::ioctl::{self, QueueKind, text};
 use super::metadata::MetadataFormat;
 use crate::uvc::control::{ControlPort, Query};
+use crate::uvc::formats::FourCc;
 use crate::{Error, ErrorKind, Result};
 use core::fmt;
 use rustix::io::Errno;
@@ -173,7 +173,7 @@ impl Node {
             let next = ioctl::enum_format(self.fd(), kind, formats.len() as u32)
                 .map_err(|e| self.error("does not list its formats (VIDIOC_ENUM_FMT)", e))?;
             match next {
-                Some(code) => formats.push(FourCc::from_code(code)),
+                Some(code) => formats.push(FourCc::from_number(code)),
                 None => break,
             }
         }
@@ -267,10 +267,10 @@ impl Node {
     /// [`ErrorKind::Unsupported`] when the driver gives another mode, naming it; [`ErrorKind::Busy`],
     /// [`ErrorKind::Disconnected`], [`ErrorKind::Io`].
     pub fn set_mode(&self, mode: &Mode) -> Result<Layout> {
-        let got = ioctl::set_pix_format(self.fd(), mode.width, mode.height, mode.format.code())
+        let got = ioctl::set_pix_format(self.fd(), mode.width, mode.height, mode.format.number())
             .map_err(|e| self.error(&format!("does not take the mode {mode} (VIDIOC_S_FMT)"), e))?;
-        if (got.width, got.height, got.fourcc) != (mode.width, mode.height, mode.format.code()) {
-            let given = FourCc::from_code(got.fourcc);
+        if (got.width, got.height, got.fourcc) != (mode.width, mode.height, mode.format.number()) {
+            let given = FourCc::from_number(got.fourcc);
             return Err(self.other_mode(mode, &format!("{given} {}x{}", got.width, got.height)));
         }
         let fraction = v4l::Fraction::new(mode.interval.numerator, mode.interval.denominator);
@@ -305,10 +305,10 @@ impl Node {
     /// # Errors
     /// [`ErrorKind::Busy`], [`ErrorKind::Disconnected`], [`ErrorKind::Io`].
     pub fn set_metadata_format(&self, wanted: MetadataFormat) -> Result<(MetadataFormat, u32)> {
-        let code = wanted.fourcc().unwrap_or(FourCc::UVCH).code();
+        let code = wanted.fourcc().unwrap_or(FourCc::UVCH).number();
         let (got, size) = ioctl::set_metadata_format(self.fd(), code)
             .map_err(|e| self.error("does not take a metadata format (VIDIOC_S_FMT)", e))?;
-        Ok((MetadataFormat::from_fourcc(FourCc::from_code(got)), size))
+        Ok((MetadataFormat::from_fourcc(FourCc::from_number(got)), size))
     }
 
     /// The controls that it has, without the compound ones.
@@ -342,8 +342,16 @@ impl Node {
         let control = controls::find(controls, name).map_err(in_node)?;
         let number = control.check(value).map_err(in_node)?;
         let wide = control.kind == controls::ControlKind::Integer64;
-        ioctl::set_control(self.fd(), control.id, wide, number)
-            .map_err(|e| self.error(&format!("control {} cannot be set to {value}", control.name), e))
+        ioctl::set_control(self.fd(), control.id, wide, number).map_err(|e| {
+            let what = format!("control {} cannot be set to {value}", control.name);
+            if e.kind() != std::io::ErrorKind::PermissionDenied {
+                return self.error(&what, e);
+            }
+            // The kernel's word for a control that is read-only now.
+            let path = self.path.display();
+            let why = "an automatic has it; switch that off first";
+            Error::new(ErrorKind::BadInput, format!("{path}: {what}: {why}")).with_source(e)
+        })
     }
 }
 

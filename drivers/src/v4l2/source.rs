@@ -229,12 +229,12 @@ impl Port {
 
 /// The kernel's counter of 32 bits as one that does not wrap.
 #[derive(Debug, Default)]
-struct Unwrapped {
+pub(super) struct Unwrapped {
     last: Option<u64>,
 }
 
 impl Unwrapped {
-    fn next(&mut self, sequence: u32) -> u64 {
+    pub(super) fn next(&mut self, sequence: u32) -> u64 {
         let now = match self.last {
             None => u64::from(sequence),
             Some(last) => {
@@ -252,7 +252,7 @@ impl Unwrapped {
 }
 
 /// Waits for any of `nodes`; the indices of those that have something, and whether that is an error.
-fn wait(nodes: &[&Node], timeout: Duration) -> Result<Vec<(usize, bool)>> {
+pub(super) fn wait(nodes: &[&Node], timeout: Duration) -> Result<Vec<(usize, bool)>> {
     let until = HostTime::now().plus(timeout);
     loop {
         let mut fds: Vec<PollFd<'_>> = Vec::with_capacity(nodes.len());

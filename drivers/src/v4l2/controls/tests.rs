@@ -13,6 +13,7 @@ fn control(kind: ControlKind, minimum: i64, maximum: i64, step: u64) -> Control 
         step,
         default: minimum,
         read_only: false,
+        write_only: false,
         inactive: false,
         items: Vec::new(),
     }
