@@ -54,6 +54,7 @@ fn supervise(scenario: &Scenario, share: &Path) -> anyhow::Result<()> {
         // 1 is a failed check, which has been reported.
         checks.that("ends by itself", false, status);
     }
+    leave_nothing(&mut checks)?;
     complaints(&mut checks, scenario, share)?;
 
     let guest_s = started.elapsed().as_secs_f64();
@@ -66,6 +67,17 @@ fn end_group(child: &Child) {
         // It fails when nobody is left, which is the ordinary case.
         let _ = kill_process_group(group, Signal::KILL);
     }
+}
+
+/// No camera is left for the next scenario: those of the emulator go with its process, those of vivid with its module.
+fn leave_nothing(checks: &mut Checks) -> anyhow::Result<()> {
+    // It fails when it is not loaded.
+    let _ = Command::new("rmmod").arg("vivid").stderr(std::process::Stdio::null()).status();
+    let gone = || system::video_nodes().is_ok_and(|nodes| nodes.is_empty());
+    if !system::wait_until(Duration::from_secs(5), gone) {
+        checks.that("leaves no camera behind", false, format!("{:?}", system::video_nodes()?));
+    }
+    Ok(())
 }
 
 /// The kernel must not have complained: a warning there is a bug of a driver, of the emulator, or of depthrig's order.

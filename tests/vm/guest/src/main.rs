@@ -34,8 +34,12 @@ pub struct Scenario {
 }
 
 /// Every scenario, in the order in which they run.
-const SCENARIOS: &[Scenario] =
-    &[scenarios::vivid_smoke::SCENARIO, scenarios::daemon_smoke::SCENARIO, scenarios::emulator::SCENARIO];
+#[rustfmt::skip] // a line for each, or every new one moves the others
+const SCENARIOS: &[Scenario] = &[
+    scenarios::vivid_smoke::SCENARIO,
+    scenarios::daemon_smoke::SCENARIO,
+    scenarios::emulator::SCENARIO,
+];
 
 fn main() -> anyhow::Result<ExitCode> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
