@@ -38,6 +38,9 @@ trap 'rm -rf "$work"' EXIT
 step golden "$target/examples/golden" "$work/dataset" "$work/expected"
 step reader-python "$python" tests/readers/check_python.py "$work/dataset" "$work/expected"
 step reader-node node tests/readers/check_node.mjs "$work/dataset" "$work/expected"
+step golden-stereo "$target/examples/golden" "$work/stereo" "$work/stereo-expected" stereo
+step reader-python-stereo "$python" tests/readers/check_python.py "$work/stereo" "$work/stereo-expected"
+step reader-node-stereo node tests/readers/check_node.mjs "$work/stereo" "$work/stereo-expected"
 
 # The drivers and the daemon on a real kernel. 77: what that needs is not installed, which DEPTHRIG_REQUIRE_VM forbids.
 skipped=""
@@ -54,7 +57,7 @@ if grep -q '^virtual machine skipped' "$logs/vm.log"; then skipped=", 1 skipped:
 count() { grep -ohE "[0-9]+ $1" "$logs"/{rust,python,daemon,vm}.log | awk '{n += $1} END {print n + 0}'; }
 passed=$(count passed)
 failed=$(count failed)
-for name in golden reader-python reader-node; do
+for name in {golden,reader-python,reader-node}{,-stereo}; do
     case "$failed_steps " in
     *" $name "*) failed=$((failed + 1)) ;;
     *) passed=$((passed + 1)) ;;

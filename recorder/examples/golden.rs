@@ -1,6 +1,6 @@
 //! Writes a short dataset that is always the same, and the pixels that readers must find in it:
-//! `cargo run --example golden -- DATASET EXPECTED [raw|rank]`: colour as JPEG, as it is, or as PNG with
-//! depth in our own codec.
+//! `cargo run --example golden -- DATASET EXPECTED [raw|rank|stereo]`: colour as JPEG, as it is, as PNG with
+//! depth in our own codec, or as JPEG beside a raw stereo pair.
 //!
 //! `EXPECTED/index.json` lists each picture: topic, log time, size, encoding, the file with its pixels, how
 //! they are to be compared (`exact` or `jpeg`) and the intrinsics. The files hold bare pixels, row by row.
@@ -54,6 +54,7 @@ fn pixels(s: &StreamRecord, n: u64) -> Vec<u8> {
                 } else {
                     (v as u16).wrapping_mul(67).to_le_bytes()
                 }),
+                PixelFormat::Yuyv => out.extend([v as u8, (if x % 2 == 0 { x } else { y }) as u8]),
                 _ => out.push(v as u8),
             }
         }
@@ -61,7 +62,7 @@ fn pixels(s: &StreamRecord, n: u64) -> Vec<u8> {
     out
 }
 
-fn write(dir: &Path, color: ColorCodec, depth: DepthCodec) -> Session {
+fn write(dir: &Path, color: ColorCodec, depth: DepthCodec, stereo: bool) -> Session {
     let mut session = Session::new(dir.file_name().unwrap().to_string_lossy(), "golden");
     (session.scene, session.started_utc_ns) = ("a gradient with an edge".into(), UTC_NS);
     session.rig_config = "# the golden rig\n".into();
@@ -71,6 +72,14 @@ fn write(dir: &Path, color: ColorCodec, depth: DepthCodec) -> Session {
         stream("front/ir_left", PixelFormat::Mono8, 96, 64, 0.0),
         stream("near/depth", PixelFormat::Z16, 128, 72, 0.0001),
     ];
+    if stereo {
+        let left = stream("stereo/left", PixelFormat::Yuyv, 96, 54, 0.0);
+        // A lens of its own, and a baseline to the left.
+        let mut right = StreamRecord { id: "stereo/right".parse().unwrap(), ..left.clone() };
+        (right.intrinsics.cx, right.intrinsics.coeffs[0]) = (49.5, 0.012);
+        right.pose.translation_m[1] -= 0.12;
+        session.streams.extend([left, right]);
+    }
     // Two segments, and room on any disk.
     let options = RecorderOptions {
         color,
@@ -148,6 +157,7 @@ fn expect(dir: &Path, expected: &Path, session: &Session) {
             let encoding = match s.format {
                 PixelFormat::Z16 => "16UC1",
                 PixelFormat::Rgb8 => "rgb8",
+                PixelFormat::Yuyv => "yuv422_yuy2",
                 _ => "mono8",
             };
             let last = match f.codec {
@@ -176,15 +186,16 @@ fn expect(dir: &Path, expected: &Path, session: &Session) {
 
 fn main() {
     let args: Vec<String> = std::env::args().skip(1).collect();
-    let (dataset, expected, color, depth) = match args.as_slice() {
-        [d, e] => (d, e, ColorCodec::Jpeg, DepthCodec::Zstd),
-        [d, e, raw] if raw == "raw" => (d, e, ColorCodec::Raw, DepthCodec::Zstd),
-        [d, e, rank] if rank == "rank" => (d, e, ColorCodec::Png, DepthCodec::Rank),
+    let (dataset, expected, color, depth, stereo) = match args.as_slice() {
+        [d, e] => (d, e, ColorCodec::Jpeg, DepthCodec::Zstd, false),
+        [d, e, stereo] if stereo == "stereo" => (d, e, ColorCodec::Jpeg, DepthCodec::Zstd, true),
+        [d, e, raw] if raw == "raw" => (d, e, ColorCodec::Raw, DepthCodec::Zstd, false),
+        [d, e, rank] if rank == "rank" => (d, e, ColorCodec::Png, DepthCodec::Rank, false),
         _ => {
-            println!("usage: golden DATASET EXPECTED [raw|rank]");
+            println!("usage: golden DATASET EXPECTED [raw|rank|stereo]");
             std::process::exit(2);
         }
     };
-    let session = write(Path::new(dataset), color, depth);
+    let session = write(Path::new(dataset), color, depth, stereo);
     expect(Path::new(dataset), Path::new(expected), &session);
 }

@@ -24,12 +24,13 @@ from PIL import Image
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
-DTYPES = {"16UC1": np.dtype("<u2"), "mono8": np.dtype("u1"), "rgb8": np.dtype("u1")}
+DTYPES = {"16UC1": np.dtype("<u2"), "mono8": np.dtype("u1"), "rgb8": np.dtype("u1"), "yuv422_yuy2": np.dtype("u1")}
+
+CHANNELS = {"rgb8": (3,), "yuv422_yuy2": (2,)}
 
 
 def shape(picture):
-    size = (picture["height"], picture["width"])
-    return (*size, 3) if picture["encoding"] == "rgb8" else size
+    return (picture["height"], picture["width"], *CHANNELS.get(picture["encoding"], ()))
 
 
 def load(expected):
@@ -86,6 +87,13 @@ def check_poses(transforms, index):
         assert [v.x, v.y, v.z] == p["translation"] and [q.x, q.y, q.z, q.w] == p["rotation"]
 
 
+def check_projection(info):
+    """Pictures are as the camera sent them: nothing is rectified, and a baseline is in the poses alone."""
+    k = list(info.k)
+    assert list(info.r) == [1, 0, 0, 0, 1, 0, 0, 0, 1], info.r
+    assert list(info.p) == [*k[0:3], 0, *k[3:6], 0, *k[6:9], 0], info.p
+
+
 def check_mcap(segments, index, pictures):
     """mcap + mcap-ros2-support: through the index and as a stream, with every checksum."""
     for kind in (make_reader, NonSeekingReader):
@@ -125,6 +133,7 @@ def check_mcap(segments, index, pictures):
         for (_, time), p in pictures.items():
             assert list(infos[p["base"], time].k) == p["k"], f"intrinsics of {p['base']}"
             assert list(infos[p["base"], time].d) == p["d"], f"distortion of {p['base']}"
+            check_projection(infos[p["base"], time])
             assert (p["base"], time, p["sequence"], p["set"]) in frames, f"frame_info of {p['base']}"
         print(f"mcap {kind.__name__}: {len(seen)} pictures agree")
 

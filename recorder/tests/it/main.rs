@@ -17,5 +17,6 @@ mod report;
 mod round_trip;
 mod set_reader;
 mod slice;
+mod stereo;
 mod support;
 mod verify;
