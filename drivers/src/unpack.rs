@@ -4,9 +4,11 @@
 //! can be the `fill` of [`crate::Gate::deliver`]. What is copied is counted.
 
 mod mjpeg;
+mod side_by_side;
 pub mod y8i;
 
 pub use mjpeg::{decode_jpeg, jpeg_span, keep_jpeg};
+pub use side_by_side::{Half, copy_half};
 
 use core::sync::atomic::{AtomicU64, Ordering};
 use depthrig_bus::DropReason;

@@ -1,0 +1,295 @@
+//! Finding and opening a camera, and starting it.
+
+use super::command::Vendor;
+use super::conf::{FactoryCalibration, how_to_get, known_paths};
+use super::find::{self, Found};
+use super::hid::HidNode;
+use super::mode::Eye;
+use super::motion::Motion;
+use super::stream::ZedStream;
+use super::{CalibrationFile, ZedConfig, profiles, settings};
+use crate::usb::holder::holders_of;
+use crate::usb::{SysRoot, scan};
+use crate::v4l2::{DEFAULT_BUFFERS, FourCc, Mode, Node, Source, Stamp, Wanted};
+use crate::{Backend, Device, DeviceInfo, Error, ErrorKind, Result, Stream, StreamProfile, StreamRequest};
+use depthrig_bus::{ClockDomain, MetadataLevel};
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, sync_channel};
+
+/// The backend `zed`.
+#[derive(Debug, Clone, Default)]
+pub struct ZedBackend {
+    config: ZedConfig,
+    root: SysRoot,
+}
+
+impl ZedBackend {
+    /// A backend for the camera that `config` means.
+    pub fn new(config: ZedConfig) -> Self {
+        Self { config, root: SysRoot::default() }
+    }
+
+    /// The same, for a tree of `/sys` and `/dev` that is somewhere else.
+    #[must_use]
+    pub fn with_root(mut self, root: SysRoot) -> Self {
+        self.root = root;
+        self
+    }
+
+    fn found(&self) -> Result<Vec<Found>> {
+        Ok(find::cameras(&self.root, &scan(&self.root)?))
+    }
+}
+
+impl Backend for ZedBackend {
+    fn name(&self) -> &'static str {
+        "zed"
+    }
+
+    /// Every ZED that is attached. One whose motion unit is not seen is asked for its serial number; where that fails,
+    /// the number is left empty.
+    fn discover(&self) -> Result<Vec<DeviceInfo>> {
+        let info = |f: Found| {
+            let serial = f.serial().map_or_else(|| flash_serial(&f).unwrap_or_default(), str::to_owned);
+            let calibration = calibration(&self.config.calibration, &serial)
+                .map_or_else(|e| format!("unusable: {e}"), |(_, source)| source);
+            info(&f, serial, calibration)
+        };
+        Ok(self.found()?.into_iter().map(info).collect())
+    }
+
+    fn open(&self, serial: Option<&str>) -> Result<Box<dyn Device>> {
+        settings::check(&self.config)?;
+        let serial = serial.or(self.config.serial.as_deref());
+        let mut candidates =
+            find::candidates(self.found()?, self.config.port.as_deref(), serial)?.into_iter();
+        // Where the number is known, there is one candidate. Else each is asked, and the last one's error is said.
+        let mut last = None;
+        for found in candidates {
+            match ZedDevice::open(&found, &self.config, &self.root) {
+                Ok(device) if serial.is_none_or(|s| s == device.info.serial) => return Ok(Box::new(device)),
+                Ok(other) => {
+                    let what =
+                        format!("there is no ZED with the serial number asked for, only {}", other.name());
+                    last = Some(Error::new(ErrorKind::NotFound, what));
+                }
+                Err(e) => last = Some(e),
+            }
+        }
+        Err(last.unwrap_or_else(|| Error::new(ErrorKind::NotFound, "there is no ZED")))
+    }
+}
+
+/// An open camera.
+struct ZedDevice {
+    info: DeviceInfo,
+    node: Node,
+    modes: Vec<Mode>,
+    profiles: Vec<StreamProfile>,
+    motion: Option<PathBuf>,
+    config: ZedConfig,
+    root: SysRoot,
+}
+
+impl ZedDevice {
+    fn open(found: &Found, config: &ZedConfig, root: &SysRoot) -> Result<Self> {
+        let node = capture_node(found)?;
+        let serial = match vendor(node.path(), &found.describe()).and_then(|mut v| v.serial()) {
+            Ok(flash) => {
+                if let Some(unit) = found.serial().filter(|unit| *unit != flash) {
+                    tracing::warn!(flash, unit, "a ZED and its motion unit have different serial numbers");
+                }
+                flash
+            }
+            Err(e) => match found.serial() {
+                Some(unit) => {
+                    tracing::warn!(error = %e, serial = unit, "the ZED's flash gives no serial number; using its motion unit's");
+                    unit.to_owned()
+                }
+                None => return Err(e),
+            },
+        };
+        let (calibration, source) = calibration(&config.calibration, &serial)?;
+        let name = find::describe(found.model.name, &serial, &found.video.port);
+        if calibration.is_none() && config.calibration == CalibrationFile::Known {
+            tracing::warn!(
+                camera = name,
+                cure = how_to_get(&serial),
+                "no factory calibration; it streams without"
+            );
+        }
+        if found.video.speed_mbps > 0 && found.video.speed_mbps < 5000 {
+            tracing::warn!(
+                camera = name,
+                mbps = found.video.speed_mbps,
+                "the ZED is not on USB 3 and has few modes"
+            );
+        }
+        let modes = node.modes(|f| f == FourCc(*b"YUYV"))?;
+        let profiles = profiles::profiles(&name, &modes, calibration.as_ref())?;
+        let motion =
+            found.motion.iter().flat_map(|m| &m.interfaces).flat_map(|i| &i.hidraw_nodes).next().cloned();
+        let info = info(found, serial, source);
+        Ok(Self { info, node, modes, profiles, motion, config: config.clone(), root: root.clone() })
+    }
+
+    fn name(&self) -> String {
+        find::describe(&self.info.model, &self.info.serial, &self.info.port)
+    }
+}
+
+impl Device for ZedDevice {
+    fn info(&self) -> &DeviceInfo {
+        &self.info
+    }
+
+    fn profiles(&self) -> &[StreamProfile] {
+        &self.profiles
+    }
+
+    fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
+        let name = self.name();
+        let Self { node, modes, profiles, motion, config, root, .. } = *self;
+        let mut chosen = profiles::choose(&name, &profiles, requests)?;
+        let mode = chosen.first().and_then(|p| modes.iter().find(|m| is_mode_of(m, p)));
+        let Some(mode) = mode else {
+            return Err(Error::new(ErrorKind::Unsupported, format!("{name}: no stream was asked for")));
+        };
+        let path = node.path().to_owned();
+        let named = |e: Error| named(&name, &root, &path, e);
+        settings::apply_controls(&node, &config).map_err(named)?;
+        let layout = node.set_mode(mode).map_err(named)?;
+        let stride = (layout.bytes_per_line as usize).max(2 * mode.width as usize);
+        let pictures = Source::start(vec![Wanted::plain(node)], DEFAULT_BUFFERS).map_err(named)?;
+        if pictures.stamp(0) == Stamp::Unknown {
+            for p in &mut chosen {
+                (p.clock, p.metadata) = (profiles::clock(ClockDomain::Arrival), MetadataLevel::Arrival);
+            }
+        }
+        let settled =
+            settings::has_commands(&config).then(|| settle(&name, &path, &config, mode)).transpose()?;
+        let motion = motion.filter(|_| !config.without_motion).and_then(|node| start_motion(&name, &node));
+        let eyes = chosen.into_iter().map(|p| (eye_of(&p), p)).collect();
+        Ok(Box::new(ZedStream::new(name, eyes, Box::new(pictures), stride, motion, settled)))
+    }
+}
+
+fn is_mode_of(mode: &Mode, profile: &StreamProfile) -> bool {
+    (mode.width, mode.height) == (2 * profile.width, profile.height)
+        && (mode.interval.rate_hz() - profile.rate_hz).abs() < 0.01
+}
+
+fn eye_of(profile: &StreamProfile) -> Eye {
+    if profile.stream.as_str() == profiles::STREAMS[1] { Eye::Right } else { Eye::Left }
+}
+
+fn info(found: &Found, serial: String, calibration: String) -> DeviceInfo {
+    DeviceInfo {
+        backend: "zed",
+        model: found.model.name.to_owned(),
+        serial,
+        firmware: found.firmware(),
+        port: found.video.port.clone(),
+        calibration,
+    }
+}
+
+/// The node that pictures come from; the video half has a metadata node as well.
+fn capture_node(found: &Found) -> Result<Node> {
+    let mut last = None;
+    for n in found.video.video_nodes() {
+        match Node::open(&n.path) {
+            Ok(node) if node.capability().is_capture() => return Ok(node),
+            Ok(_) => {}
+            Err(e) => last = Some(e),
+        }
+    }
+    Err(last.map_or_else(
+        || {
+            let what = format!(
+                "{} has no video node; is the kernel's uvcvideo loaded, or does a program hold it through libusb?",
+                found.describe()
+            );
+            Error::new(ErrorKind::NotFound, what)
+        },
+        |e| Error::new(e.kind(), format!("{}: {e}", found.describe())).with_source(e),
+    ))
+}
+
+/// The vendor commands by a node of their own, so that they are nobody's who captures.
+fn vendor(path: &Path, device: &str) -> Result<Vendor<Node>> {
+    Vendor::new(Node::open(path)?, device)
+}
+
+fn flash_serial(found: &Found) -> Result<String> {
+    vendor(capture_node(found)?.path(), &found.describe())?.serial()
+}
+
+/// The calibration and where it comes from, for [`DeviceInfo::calibration`].
+fn calibration(wanted: &CalibrationFile, serial: &str) -> Result<(Option<FactoryCalibration>, String)> {
+    let none = || (None, "none".to_owned());
+    let path = match wanted {
+        CalibrationFile::None => return Ok(none()),
+        CalibrationFile::At(path) => path.clone(),
+        CalibrationFile::Known => {
+            let home = std::env::var_os("HOME").map(PathBuf::from);
+            match known_paths(serial, home.as_deref()).into_iter().find(|p| p.exists()) {
+                Some(path) => path,
+                None => return Ok(none()),
+            }
+        }
+    };
+    let name = path.file_stem().unwrap_or_default().to_string_lossy();
+    if let Some(of) =
+        name.strip_prefix("SN").filter(|of| !of.is_empty() && of.bytes().all(|c| c.is_ascii_digit()))
+        && of.trim_start_matches('0') != serial.trim_start_matches('0')
+    {
+        let what = format!(
+            "{} is the calibration of the camera {of}, and this one is {serial}: {}",
+            path.display(),
+            how_to_get(serial)
+        );
+        return Err(Error::new(ErrorKind::BadInput, what));
+    }
+    let loaded = FactoryCalibration::load(&path).map_err(|e| {
+        // A file that the rig names is part of its configuration: trying again does not make it appear.
+        let what = format!("{e}; {}", how_to_get(serial));
+        Error::new(ErrorKind::BadInput, what).with_source(e)
+    })?;
+    Ok((Some(loaded), format!("factory {}", path.display())))
+}
+
+/// Sets the camera on a thread of its own, after it began to stream, because starting may set it anew and because
+/// each command may take seconds. The thread is not waited for; it ends by itself.
+fn settle(name: &str, path: &Path, config: &ZedConfig, mode: &Mode) -> Result<Receiver<Result<()>>> {
+    let (send, receive) = sync_channel(1);
+    let mut vendor = vendor(path, name)?;
+    let (config, rate_hz) = (config.clone(), mode.interval.rate_hz());
+    std::thread::Builder::new()
+        .name("zed-settings".to_owned())
+        .spawn(move || {
+            // Nobody listens any more when the stream ended first.
+            let _ = send.send(settings::apply(&mut vendor, &config, rate_hz));
+        })
+        .map_err(|e| {
+            Error::new(ErrorKind::Io, format!("{name}: no thread for its settings")).with_source(e)
+        })?;
+    Ok(receive)
+}
+
+fn start_motion(name: &str, node: &Path) -> Option<Motion> {
+    let started = HidNode::open(node).and_then(|hid| Motion::start(Box::new(hid), name));
+    started.inspect_err(|e| tracing::warn!(camera = name, error = %e, "the motion unit is not read")).ok()
+}
+
+/// The error with the camera's name, and for a camera that is held with that of the holder.
+fn named(name: &str, root: &SysRoot, node: &Path, e: Error) -> Error {
+    let held = match e.kind() {
+        ErrorKind::Busy => format!("; it is held by {}", holders_of(root, node).describe()),
+        _ => String::new(),
+    };
+    Error::new(e.kind(), format!("{name}: {e}{held}")).with_source(e)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,258 @@
+//! The motion unit of a camera that streams: a thread of its own reads its records and keeps it awake.
+//!
+//! What it gives today: the temperatures of both image sensors for the frames' headers, and, for a program that links
+//! this crate, the latest sample with its time on the host's clock. There is no motion stream on the bus: a channel
+//! carries pictures, and a record of 62 bytes 400 times a second is none.
+//!
+//! **Time.** The unit counts 25600 ticks a second. Each record's ticks and arrival go into a [`ClockMap`], as those of a
+//! camera do. A record that says `frame_sync` is the first after an exposure began, so its time is that of the
+//! exposure's start, late by at most the 2.5 ms between records.
+
+use super::hid::Reports;
+use super::sensors::{self, Record};
+use crate::clock::{ClockConfig, ClockMap};
+use crate::{Error, ErrorKind, Result};
+use core::sync::atomic::{AtomicBool, Ordering};
+use core::time::Duration;
+use depthrig_bus::HostTime;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// How often the unit is told that somebody listens. It stops after a few seconds without.
+const KEEP_ALIVE: Duration = Duration::from_secs(1);
+/// How long one read waits; also how late the thread notices that it is to end.
+const WAIT: Duration = Duration::from_millis(50);
+/// Nanoseconds from one record to the next.
+const PERIOD_NS: u64 = 2_500_000;
+
+/// A record and when it was measured.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sample {
+    /// What the unit measured.
+    pub record: Record,
+    /// When, on the host's clock.
+    pub time: HostTime,
+    /// The time is right within this much.
+    pub uncertainty_ns: u64,
+}
+
+/// What came so far.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Tally {
+    /// Records.
+    pub records: u64,
+    /// Reports that were none.
+    pub rejected: u64,
+    /// Records that began an exposure.
+    pub frame_syncs: u64,
+    /// Records that the unit's clock says should have come in between and did not.
+    pub missed: u64,
+}
+
+#[derive(Default)]
+struct State {
+    tally: Tally,
+    latest: Option<Sample>,
+    /// The last record that began an exposure.
+    exposure: Option<Sample>,
+    eyes_c: [Option<f64>; 2],
+    ended: Option<String>,
+}
+
+#[derive(Default)]
+struct Shared {
+    stop: AtomicBool,
+    state: Mutex<State>,
+}
+
+/// The running reader. Dropping it stops the unit.
+pub struct Motion {
+    shared: Arc<Shared>,
+}
+
+impl Motion {
+    /// Starts the unit and the thread that reads it; `device` names the camera.
+    ///
+    /// # Errors
+    /// Those of [`Reports::send_feature`]; [`ErrorKind::Io`] when the system refuses a thread.
+    pub fn start(mut reports: Box<dyn Reports>, device: &str) -> Result<Self> {
+        reports.send_feature(sensors::stream_report(true))?;
+        let shared = Arc::new(Shared::default());
+        let theirs = Arc::clone(&shared);
+        let name = device.to_owned();
+        std::thread::Builder::new()
+            .name("zed-motion".to_owned())
+            .spawn(move || {
+                let end = run(reports.as_mut(), &theirs);
+                if let Err(e) = &end {
+                    tracing::warn!(camera = name, error = %e, "the motion unit is no longer read");
+                }
+                lock(&theirs.state).ended = end.err().map(|e| e.to_string());
+            })
+            .map_err(|e| {
+                Error::new(ErrorKind::Io, format!("{device}: no thread for the motion unit")).with_source(e)
+            })?;
+        Ok(Self { shared })
+    }
+
+    /// The newest sample.
+    pub fn latest(&self) -> Option<Sample> {
+        lock(&self.shared.state).latest
+    }
+
+    /// The sample that began the newest exposure: its record has the number of exposures.
+    pub fn exposure(&self) -> Option<Sample> {
+        lock(&self.shared.state).exposure
+    }
+
+    /// What came so far.
+    pub fn tally(&self) -> Tally {
+        lock(&self.shared.state).tally
+    }
+
+    /// Temperatures of the left and the right image sensor, °C, as last said.
+    pub fn eyes_c(&self) -> [Option<f64>; 2] {
+        lock(&self.shared.state).eyes_c
+    }
+
+    /// Why the unit is no longer read, if so.
+    pub fn problem(&self) -> Option<String> {
+        lock(&self.shared.state).ended.clone()
+    }
+}
+
+impl Drop for Motion {
+    fn drop(&mut self) {
+        // The thread is not waited for: a device that hangs would hang its camera too.
+        self.shared.stop.store(true, Ordering::Relaxed);
+    }
+}
+
+fn lock(state: &Mutex<State>) -> std::sync::MutexGuard<'_, State> {
+    state.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn run(reports: &mut dyn Reports, shared: &Shared) -> Result<()> {
+    let tick_ns = sensors::TICK_PS as f64 / 1000.0;
+    let mut clock = ClockMap::new(ClockConfig::new(64, tick_ns, PERIOD_NS));
+    let mut awake_until = HostTime::now().plus(KEEP_ALIVE);
+    let mut buffer = [0; 64];
+    let mut last_ticks: Option<u64> = None;
+    let mut sequence = 0;
+    while !shared.stop.load(Ordering::Relaxed) {
+        if awake_until.from_now().is_zero() {
+            reports.send_feature(sensors::keep_alive())?;
+            awake_until = HostTime::now().plus(KEEP_ALIVE);
+        }
+        let Some(n) = reports.read(&mut buffer, WAIT)? else { continue };
+        let arrival = HostTime::now();
+        let Ok(record) = Record::parse(buffer.get(..n).unwrap_or_default()) else {
+            lock(&shared.state).tally.rejected += 1;
+            continue;
+        };
+        // The unit has no counter; how many records there should have been follows from its clock.
+        let steps = last_ticks.map_or(1, |last| {
+            let ticks = record.ticks.saturating_sub(last);
+            (ticks as f64 * tick_ns / PERIOD_NS as f64).round().max(1.0) as u64
+        });
+        last_ticks = Some(record.ticks);
+        sequence += steps;
+        let mapped = clock.observe(record.ticks, sequence, arrival);
+        let sample = Sample { record, time: mapped.capture_time, uncertainty_ns: mapped.uncertainty_ns };
+        let mut state = lock(&shared.state);
+        state.tally.records += 1;
+        state.tally.missed += steps - 1;
+        state.latest = Some(sample);
+        if record.frame_sync {
+            state.tally.frame_syncs += 1;
+            state.exposure = Some(sample);
+        }
+        for (kept, new) in state.eyes_c.iter_mut().zip(record.eyes_c()) {
+            *kept = new.or(*kept);
+        }
+    }
+    reports.send_feature(sensors::stream_report(false))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::mpsc;
+
+    /// A unit that sends what it is given and notes what it is told.
+    struct Unit {
+        records: mpsc::Receiver<Vec<u8>>,
+        told: Arc<Mutex<Vec<[u8; 2]>>>,
+    }
+
+    impl Reports for Unit {
+        fn send_feature(&mut self, report: [u8; 2]) -> Result<()> {
+            self.told.lock().unwrap().push(report);
+            Ok(())
+        }
+
+        fn read(&mut self, into: &mut [u8], timeout: Duration) -> Result<Option<usize>> {
+            match self.records.recv_timeout(timeout.min(Duration::from_millis(5))) {
+                Ok(r) => {
+                    into[..r.len()].copy_from_slice(&r);
+                    Ok(Some(r.len()))
+                }
+                Err(mpsc::RecvTimeoutError::Timeout) => Ok(None),
+                Err(mpsc::RecvTimeoutError::Disconnected) => {
+                    Err(Error::new(ErrorKind::Disconnected, "pulled"))
+                }
+            }
+        }
+    }
+
+    fn wait_for(mut ready: impl FnMut() -> bool) {
+        let until = HostTime::now().plus(Duration::from_secs(20));
+        while !ready() {
+            assert!(!until.from_now().is_zero(), "nothing happened");
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    #[test]
+    fn records_are_counted_stamped_and_the_unit_is_kept_awake() {
+        let (send, records) = mpsc::sync_channel(64);
+        let told = Arc::<Mutex<Vec<[u8; 2]>>>::default();
+        let motion =
+            Motion::start(Box::new(Unit { records, told: Arc::clone(&told) }), "ZED 2i at 1-1").unwrap();
+        let began = HostTime::now();
+        for i in 0..10u64 {
+            // Three records are missing after the fifth.
+            let ticks = 1000 + 64 * if i < 5 { i } else { i + 3 };
+            let air_raw = (i == 4).then_some((2000, 0, 0));
+            let record = Record {
+                ticks,
+                frame_sync: i == 6,
+                frame_count: 77,
+                air_raw,
+                eyes_raw: [4100, 4250],
+                ..Record::default()
+            };
+            send.send(record.build().to_vec()).unwrap();
+        }
+        send.send(vec![9, 9, 9]).unwrap();
+        wait_for(|| motion.tally().rejected == 1);
+        assert_eq!(motion.tally(), Tally { records: 10, rejected: 1, frame_syncs: 1, missed: 3 });
+        assert_eq!(motion.eyes_c(), [Some(41.0), Some(42.5)], "said once, kept since");
+        let (latest, exposure) = (motion.latest().unwrap(), motion.exposure().unwrap());
+        assert_eq!((latest.record.ticks, exposure.record.frame_count), (1000 + 64 * 12, 77));
+        assert!(latest.time >= began.plus(Duration::ZERO) && latest.time <= HostTime::now());
+        assert!(latest.time > exposure.time);
+        wait_for(|| told.lock().unwrap().contains(&[0x21, 0xF2]));
+        assert_eq!(told.lock().unwrap()[0], [0x32, 1]);
+        drop(motion);
+        wait_for(|| told.lock().unwrap().last() == Some(&[0x32, 0]));
+    }
+
+    #[test]
+    fn a_unit_that_goes_away_says_so_and_hurts_nobody() {
+        let (send, records) = mpsc::sync_channel(64);
+        let motion = Motion::start(Box::new(Unit { records, told: Arc::default() }), "ZED 2i").unwrap();
+        drop(send);
+        wait_for(|| motion.problem().is_some());
+        assert_eq!((motion.problem().as_deref(), motion.latest()), (Some("pulled"), None));
+    }
+}
