@@ -61,8 +61,7 @@ impl Backend for ZedBackend {
     fn open(&self, serial: Option<&str>) -> Result<Box<dyn Device>> {
         settings::check(&self.config)?;
         let serial = serial.or(self.config.serial.as_deref());
-        let mut candidates =
-            find::candidates(self.found()?, self.config.port.as_deref(), serial)?.into_iter();
+        let candidates = find::candidates(self.found()?, self.config.port.as_deref(), serial)?.into_iter();
         // Where the number is known, there is one candidate. Else each is asked, and the last one's error is said.
         let mut last = None;
         for found in candidates {
