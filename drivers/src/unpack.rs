@@ -5,6 +5,8 @@
 
 mod mjpeg;
 mod side_by_side;
+pub mod turn;
+pub mod y411;
 pub mod y8i;
 
 pub use mjpeg::{decode_jpeg, jpeg_span, keep_jpeg};

@@ -11,6 +11,7 @@ pub mod gvd;
 pub mod health;
 pub mod hwm;
 pub mod intrinsics;
+pub mod l515;
 pub mod metadata;
 pub mod preset;
 pub mod sync;
