@@ -129,6 +129,9 @@ pub struct CameraStatus {
     pub serial: String,
     /// Firmware as the device says.
     pub firmware: String,
+    /// Where it is attached: USB port path, folder, …
+    #[serde(default)]
+    pub port: String,
     /// Where its calibration comes from.
     pub calibration: String,
     /// State of its supervisor.

@@ -46,6 +46,7 @@ fn rig() -> RigStatus {
         model: "D435".into(),
         serial: "a\"b\\c\nd".into(),
         firmware: "1.2".into(),
+        port: String::new(),
         calibration: "simulated".into(),
         state,
         state_for_s: 3.5,

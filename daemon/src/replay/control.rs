@@ -115,6 +115,7 @@ impl Inner {
                 model: record.model.clone(),
                 serial: record.serial.clone(),
                 firmware: String::new(),
+                port: String::new(),
                 calibration: record.calibration.clone(),
                 state: if status.done { CameraState::Finished } else { CameraState::Streaming },
                 state_for_s: self.started.elapsed().as_secs_f64(),

@@ -63,6 +63,7 @@ fn camera(inner: &Inner, camera: &Camera, now: HostTime) -> CameraStatus {
         model: info.model,
         serial: info.serial,
         firmware: info.firmware,
+        port: info.port,
         calibration: info.calibration,
         state: state.phase,
         state_for_s: state.since.elapsed().as_secs_f64(),

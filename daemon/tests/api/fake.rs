@@ -97,6 +97,7 @@ impl Fake {
             model: "D435".into(),
             serial: "s".into(),
             firmware: String::new(),
+            port: String::new(),
             calibration: "simulated".into(),
             state: inner.all.unwrap_or(state),
             state_for_s: 1.5,

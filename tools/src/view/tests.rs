@@ -35,6 +35,7 @@ fn camera(name: &str, state: CameraState, message: Option<&str>, lost: u64) -> C
         model: "D435".into(),
         serial: "1".into(),
         firmware: String::new(),
+        port: String::new(),
         calibration: "factory".into(),
         state,
         state_for_s: 2.5,
