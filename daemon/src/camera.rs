@@ -350,7 +350,8 @@ fn open_session(
     Ok(Session { info, stream, sink: Box::new(BusSink::new(ports, Arc::clone(&shared.frames))) })
 }
 
-fn make_backend(
+/// The driver of a camera; `began` is the beginning of time for simulated ones.
+pub fn make_backend(
     config: &BackendConfig,
     began: HostTime,
 ) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {

@@ -170,6 +170,12 @@ impl BackendConfig {
             Self::Files(_) => "files",
         }
     }
+
+    /// The driver of a family with nothing but defaults, for the camera at a port; `None` when there is no driver.
+    pub fn at_port(family: crate::attached::Family, port: &str) -> Option<Self> {
+        let _ = (family, port);
+        None
+    }
 }
 
 impl Default for BusConfig {

@@ -5,10 +5,12 @@
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 pub mod api;
+pub mod attached;
 mod camera;
 pub mod client;
 pub mod config;
 pub mod control;
+pub mod doctor;
 mod error;
 mod house;
 pub mod metrics;

@@ -13,12 +13,7 @@ const CAMERA_PRIORITY: u8 = 10;
 /// Puts the calling thread into the real-time class `SCHED_FIFO`. When the kernel refuses, one hint is logged.
 pub fn raise_current_thread() {
     static HINT: Once = Once::new();
-    let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
-    let raised = ThreadPriorityValue::try_from(CAMERA_PRIORITY).map_err(|e| format!("{e:?}")).and_then(|p| {
-        set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(p), policy)
-            .map_err(|e| format!("{e:?}"))
-    });
-    if let Err(e) = raised {
+    if let Err(e) = raise() {
         HINT.call_once(|| {
             tracing::info!(
                 reason = e,
@@ -27,6 +22,26 @@ pub fn raise_current_thread() {
             );
         });
     }
+}
+
+/// Why a thread of this process gets no real-time priority; `None` when it does. Tried on a thread of its own.
+pub fn refusal() -> Option<String> {
+    let tried = std::thread::Builder::new().name("priority".into()).spawn(raise);
+    match tried.map(std::thread::JoinHandle::join) {
+        Ok(Ok(raised)) => raised.err(),
+        Ok(Err(_)) => Some("the thread that tried it ended early".to_owned()),
+        Err(e) => Some(e.to_string()),
+    }
+}
+
+fn raise() -> Result<(), String> {
+    let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
+    let priority = ThreadPriorityValue::try_from(CAMERA_PRIORITY).map_err(|e| format!("{e:?}"))?;
+    set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(priority), policy)
+        .map_err(|e| match e {
+            thread_priority::Error::OS(code) => std::io::Error::from_raw_os_error(code).to_string(),
+            e => format!("{e:?}"),
+        })
 }
 
 /// Raises the soft limit of open files to the hard one: every channel costs some files per subscriber.

@@ -17,7 +17,7 @@ pub use recovery::recover_left;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-mod budget;
+pub mod budget;
 mod place;
 mod recovery;
 mod report;
@@ -129,7 +129,7 @@ impl Begun {
         options.backlog_max_bytes = outside.backlog_max_bytes.unwrap_or(options.backlog_max_bytes);
         let raw = streams.iter().map(|s| (s.stream.profile.format, s.stream.profile.frame_bytes()));
         let rate = budget::bytes_per_s(raw, sets_hz, &config.recording);
-        let reserve = options.min_free_bytes.saturating_add(options.reserve_bytes);
+        let reserve = reserve_bytes(&config.recording);
         budget::check(&*outside.fs, &path, request, rate, reserve, &config.recording)?;
         let (fs, clock) = (Arc::clone(&outside.fs), Arc::clone(&outside.utc));
         let recorder = Recorder::create_with(fs, clock, &path, session, options).map_err(of_recorder)?;
@@ -448,6 +448,12 @@ fn max_spread_ns(rates_hz: impl Iterator<Item = f64>) -> Option<i64> {
     let mut reaches = rates_hz.map(reach).collect::<Option<Vec<_>>>()?;
     reaches.sort_unstable();
     Some(reaches.iter().rev().take(2).sum())
+}
+
+/// Bytes of its disk that a recording never uses.
+pub fn reserve_bytes(config: &RecordingConfig) -> u64 {
+    let options = options_of(config);
+    options.min_free_bytes.saturating_add(options.reserve_bytes)
 }
 
 fn options_of(config: &RecordingConfig) -> RecorderOptions {

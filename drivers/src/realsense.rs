@@ -12,7 +12,7 @@ mod find;
 mod kernel;
 mod libusb;
 mod memory;
-mod models;
+pub mod models;
 mod options;
 mod profiles;
 pub mod protocol;

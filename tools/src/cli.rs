@@ -1,8 +1,8 @@
 //! The commands and options, and what `--help` says of them.
 
 use crate::commands::{
-    bench, cat, compare, completions, config, demo, edit, export, import, info, install, man, merge, record,
-    recover, replay, report, run, sessions, status, tap, top, trim, verify,
+    bench, cameras, cat, compare, completions, config, demo, doctor, edit, export, import, info, install,
+    man, merge, record, recover, replay, report, run, sessions, status, tap, top, trim, verify,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -90,6 +90,12 @@ pub enum Command {
     /// Run the seven-camera mount with synthetic cameras once through: capture, record, verify, replay, report
     #[command(after_help = demo::EXAMPLES)]
     Demo(demo::DemoArgs),
+    /// List the cameras that are attached: model, serial number, port, speed, who has it, what is wrong
+    #[command(after_help = cameras::EXAMPLES)]
+    Cameras(cameras::CamerasArgs),
+    /// Examine a session before it begins: cameras, modes, USB, permissions, memory, disk; each finding with its cure
+    #[command(after_help = doctor::EXAMPLES)]
+    Doctor(doctor::DoctorArgs),
     /// Run the daemon in the foreground; Ctrl-C ends it cleanly, twice ends it at once
     #[command(after_help = run::EXAMPLES)]
     Run(run::RunArgs),

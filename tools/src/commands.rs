@@ -1,11 +1,13 @@
 //! One module per command.
 
 pub mod bench;
+pub mod cameras;
 pub mod cat;
 pub mod compare;
 pub mod completions;
 pub mod config;
 pub mod demo;
+pub mod doctor;
 pub mod edit;
 pub mod export;
 pub mod import;
@@ -51,6 +53,8 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Export(command) => export::run(&command, &context),
         Command::Import(command) => import::run(&command, &context),
         Command::Verify(args) => verify::run(&args, &context),
+        Command::Cameras(args) => cameras::run(&args, &context),
+        Command::Doctor(args) => doctor::run(&args, &context),
         Command::Cat(args) => cat::run(&args, &context),
         Command::Trim(args) => trim::run(&args, &context),
         Command::Merge(args) => merge::run(&args, &context),

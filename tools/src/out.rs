@@ -48,6 +48,25 @@ pub fn table(header: &[&str], first_number: usize, rows: impl IntoIterator<Item 
     table.trim_fmt()
 }
 
+/// `text` behind `mark`, indented by two and wrapped at `width` columns; words longer than a line stay whole.
+pub fn item(mark: &str, text: &str, width: usize) -> Vec<String> {
+    let room = width.saturating_sub(4).max(20);
+    let mut lines = vec![String::new()];
+    for word in text.split_whitespace() {
+        let line =
+            lines.last_mut().filter(|l| l.is_empty() || l.chars().count() + 1 + word.chars().count() <= room);
+        match line {
+            Some(line) if line.is_empty() => line.push_str(word),
+            Some(line) => {
+                line.push(' ');
+                line.push_str(word);
+            }
+            None => lines.push(word.to_owned()),
+        }
+    }
+    lines.iter().enumerate().map(|(i, l)| format!("  {} {l}", if i == 0 { mark } else { " " })).collect()
+}
+
 /// Bytes with a binary unit: `1.5 GiB`.
 pub fn bytes(n: u64) -> String {
     const UNITS: [&str; 5] = ["B", "KiB", "MiB", "GiB", "TiB"];
@@ -94,6 +113,14 @@ mod tests {
         assert_eq!(seconds(f64::NAN), "-");
         let counts = [("no_slot".to_owned(), 1), ("device_gap".to_owned(), 3), ("late".to_owned(), 0)].into();
         assert_eq!(reasons(&counts), "device_gap 3, no_slot 1");
+    }
+
+    #[test]
+    fn items_are_wrapped_at_words() {
+        let said = item("!", "one two  three four five six seven", 24);
+        assert_eq!(said, ["  ! one two three four", "    five six seven"]);
+        assert_eq!(item("-", &"x".repeat(30), 10), [format!("  - {}", "x".repeat(30))]);
+        assert_eq!(item("-", "", 80), ["  - "]);
     }
 
     #[test]

@@ -49,6 +49,8 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
         "merge",
         "config",
         "install",
+        "cameras",
+        "doctor",
         "tap",
         "bench",
         "completions",

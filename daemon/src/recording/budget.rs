@@ -95,7 +95,7 @@ pub fn check(
 }
 
 /// Bytes free where `dir` is or will be.
-fn free_above(fs: &dyn Fs, dir: &Path) -> Option<u64> {
+pub fn free_above(fs: &dyn Fs, dir: &Path) -> Option<u64> {
     for dir in dir.ancestors() {
         let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
         match fs.available_space(dir) {

@@ -2,7 +2,7 @@
 
 use super::controls::{self, Control, ControlValue};
 use super::error::node_error;
-use super::ioctl::{self, QueueKind, text};
+use super::ioctl::{self, Memory, QueueKind, text};
 use super::metadata::MetadataFormat;
 use crate::uvc::control::{ControlPort, Query};
 use crate::uvc::formats::FourCc;
@@ -160,6 +160,14 @@ impl Node {
 
     pub(super) fn error(&self, what: &str, e: std::io::Error) -> Error {
         node_error(&self.path, what, e)
+    }
+
+    /// Whether another open file has this node's buffers, so that it streams or is about to. Nothing is taken from it.
+    pub fn is_used_elsewhere(&self) -> bool {
+        let kind = if self.capability.is_metadata() { QueueKind::Metadata } else { QueueKind::Video };
+        // Giving back buffers that one has not is refused with EBUSY exactly when somebody else has them.
+        ioctl::request_buffers(self.fd(), kind, Memory::Mapped, 0)
+            .is_err_and(|e| e.raw_os_error() == Some(Errno::BUSY.raw_os_error()))
     }
 
     /// The formats of a capture or metadata node, in the driver's order.

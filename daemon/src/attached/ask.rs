@@ -1,0 +1,80 @@
+//! Asking nodes, cameras and running rigs; behind a trait, because tests have none of them.
+
+use super::Family;
+use crate::client::Client;
+use crate::config::BackendConfig;
+use crate::status::RigStatus;
+use depthrig_bus::{HostTime, RuntimeDir};
+use depthrig_drivers::v4l2::Node;
+use depthrig_drivers::{DeviceInfo, Result, StreamProfile};
+use std::path::Path;
+
+/// What is learned of a node by asking the kernel.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NodeFacts {
+    /// `pictures`, `metadata` or `other`.
+    pub role: &'static str,
+    /// Its formats as V4L2 names them.
+    pub formats: Vec<String>,
+    /// Another process streams from it.
+    pub used_elsewhere: bool,
+}
+
+/// Who answers.
+pub trait Ask {
+    /// Asks the kernel about a node; the camera notices nothing.
+    ///
+    /// # Errors
+    /// Those of opening it.
+    fn node(&self, path: &Path) -> Result<NodeFacts>;
+
+    /// Opens the camera at a port, which nobody has, and asks what it is and can. `None` when there is no driver for
+    /// its family.
+    fn device(&self, family: Family, port: &str) -> Option<Result<(DeviceInfo, Vec<StreamProfile>)>>;
+
+    /// The rigs of this user that run, and what could not be asked.
+    fn rigs(&self) -> (Vec<RigStatus>, Vec<String>);
+}
+
+/// Asks the system that this runs on.
+#[derive(Debug)]
+pub struct System {
+    /// Where the rigs of this user are; `None`: none are asked.
+    pub runtime: Option<RuntimeDir>,
+}
+
+impl Ask for System {
+    fn node(&self, path: &Path) -> Result<NodeFacts> {
+        let node = Node::open(path)?;
+        let c = node.capability();
+        let role = match (c.is_capture(), c.is_metadata()) {
+            (true, _) => "pictures",
+            (false, true) => "metadata",
+            (false, false) => "other",
+        };
+        let formats = if role == "other" { Vec::new() } else { node.formats()? };
+        let formats = formats.iter().map(ToString::to_string).collect();
+        Ok(NodeFacts { role, formats, used_elsewhere: node.is_used_elsewhere() })
+    }
+
+    fn device(&self, family: Family, port: &str) -> Option<Result<(DeviceInfo, Vec<StreamProfile>)>> {
+        let config = BackendConfig::at_port(family, port)?;
+        let open = || {
+            let device = crate::camera::make_backend(&config, HostTime::now())?.open(None)?;
+            Ok((device.info().clone(), device.profiles().to_vec()))
+        };
+        Some(open())
+    }
+
+    fn rigs(&self) -> (Vec<RigStatus>, Vec<String>) {
+        let Some(runtime) = &self.runtime else { return (Vec::new(), Vec::new()) };
+        let (mut rigs, mut silent) = (Vec::new(), Vec::new());
+        for rig in runtime.running_rigs() {
+            match Client::connect(runtime, Some(&rig)).and_then(|c| c.status()) {
+                Ok(status) => rigs.push(status),
+                Err(e) => silent.push(format!("rig \"{rig}\" was not asked: {e}")),
+            }
+        }
+        (rigs, silent)
+    }
+}

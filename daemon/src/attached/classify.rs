@@ -1,0 +1,125 @@
+//! Which devices are cameras, and of which family.
+
+use super::{UsbDevice, VideoNode};
+use depthrig_drivers::realsense::models as d400;
+use std::path::PathBuf;
+
+/// USB class of video, and its subclass of controlling interfaces (UVC 1.5 class specification, tables ).
+const VIDEO_CONTROL: (u8, u8) = (0x0e, 0x01);
+const STEREOLABS: u16 = 0x2b03;
+/// ZED 2i: camera, and the inertial sensor that hangs beside it on one hub (zed-open-capture `include/defines.hpp`).
+const ZED_2I: (u16, u16) = (0xf880, 0xf881);
+/// L515 and its recovery mode (librealsense 2.54 `src/l500/l500-private.h`).
+const L515: u16 = 0x0b64;
+const L515_RECOVERY: u16 = 0x0b55;
+
+/// A family of cameras: what is common to how they are driven.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Family {
+    /// RealSense D400.
+    D400,
+    /// RealSense L515.
+    L515,
+    /// ZED 2i.
+    Zed,
+    /// Any other USB video camera.
+    Uvc,
+    /// A video device that is on no USB.
+    Platform,
+}
+
+impl Family {
+    /// The driver's name in a rig file.
+    pub const fn backend(self) -> &'static str {
+        match self {
+            Self::D400 | Self::L515 => "realsense",
+            Self::Zed => "zed",
+            Self::Uvc | Self::Platform => "v4l2",
+        }
+    }
+}
+
+/// A camera as the bus shows it.
+pub(super) struct Candidate {
+    pub(super) family: Family,
+    pub(super) model: String,
+    pub(super) port: String,
+    pub(super) usb: Option<UsbDevice>,
+    pub(super) nodes: Vec<VideoNode>,
+    pub(super) hidraw: Vec<PathBuf>,
+}
+
+/// The cameras among `devices` and `platform` nodes, and what is attached and of no use.
+pub(super) fn cameras(devices: &[UsbDevice], platform: Vec<VideoNode>) -> (Vec<Candidate>, Vec<String>) {
+    let mut cameras = Vec::new();
+    let mut unusable = Vec::new();
+    for d in devices {
+        match family(d) {
+            Ok(Some((family, model))) => cameras.push(Candidate {
+                family,
+                model,
+                port: d.port.clone(),
+                nodes: d.video_nodes().cloned().collect(),
+                hidraw: hidraw(d, devices),
+                usb: Some(d.clone()),
+            }),
+            Ok(None) => {}
+            Err(why) => unusable.push(format!("{}: {why}", d.describe())),
+        }
+    }
+    for node in platform {
+        match cameras.iter_mut().find(|c| c.usb.is_none() && c.port == node.parent) {
+            Some(camera) => camera.nodes.push(node),
+            None => cameras.push(Candidate {
+                family: Family::Platform,
+                model: node.name.clone(),
+                port: node.parent.clone(),
+                usb: None,
+                nodes: vec![node],
+                hidraw: Vec::new(),
+            }),
+        }
+    }
+    (cameras, unusable)
+}
+
+/// The family of a device with its model; `None` when it is no camera, an error when it is one of no use.
+fn family(d: &UsbDevice) -> Result<Option<(Family, String)>, &'static str> {
+    if d.vendor_id == d400::VENDOR {
+        if let Some(model) = d400::of_product(d.product_id) {
+            return Ok(Some((Family::D400, model.name.to_owned())));
+        }
+        if d.product_id == L515 {
+            return Ok(Some((Family::L515, "L515".to_owned())));
+        }
+        if d.product_id == L515_RECOVERY {
+            return Err("it is in recovery mode: its firmware was lost; write it again with Intel's tools");
+        }
+        if let Some(why) = d400::undriven(d.product_id) {
+            return Err(why);
+        }
+    }
+    if (d.vendor_id, d.product_id) == (STEREOLABS, ZED_2I.0) {
+        return Ok(Some((Family::Zed, "ZED 2i".to_owned())));
+    }
+    let is_video = d.interfaces.iter().any(|i| (i.class, i.subclass) == VIDEO_CONTROL);
+    let name = if d.product.is_empty() { d.id() } else { d.product.clone() };
+    Ok(is_video.then_some((Family::Uvc, name)))
+}
+
+/// The raw HID nodes of a camera; a ZED 2i has them on a device beside itself.
+fn hidraw(d: &UsbDevice, all: &[UsbDevice]) -> Vec<PathBuf> {
+    let hub = |port: &str| port.rsplit_once('.').map(|(hub, _)| hub.to_owned());
+    let beside = |other: &&UsbDevice| {
+        (d.vendor_id, d.product_id) == (STEREOLABS, ZED_2I.0)
+            && (other.vendor_id, other.product_id) == (STEREOLABS, ZED_2I.1)
+            // The hub is one for USB2 and one for USB3, of the same ports below their buses.
+            && hub(&other.port).map(without_bus) == hub(&d.port).map(without_bus)
+    };
+    let sources = all.iter().filter(beside).chain([d]);
+    sources.flat_map(|d| d.interfaces.iter().flat_map(|i| i.hidraw_nodes.iter().cloned())).collect()
+}
+
+fn without_bus(port: String) -> String {
+    port.split_once('-').map_or(port.clone(), |(_, ports)| ports.to_owned())
+}

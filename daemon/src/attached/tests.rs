@@ -1,0 +1,278 @@
+//! Made buses, read through answers that are made as well.
+
+use super::*;
+use crate::status::CameraState;
+use depthrig_bus::{ClockDomain, Intrinsics, MetadataLevel, PixelFormat, Pose, StreamName};
+use depthrig_drivers::usb::made::{MadeDevice, MadeTree};
+use depthrig_drivers::{DeviceClock, Error};
+use std::cell::RefCell;
+
+/// Answers that a test chooses, and a list of the cameras that were opened.
+#[derive(Default)]
+pub(crate) struct Made {
+    pub(crate) denied: Vec<String>,
+    pub(crate) streaming: Vec<String>,
+    pub(crate) failing: Vec<(String, ErrorKind)>,
+    pub(crate) rigs: Vec<RigStatus>,
+    pub(crate) no_d4xx: bool,
+    pub(crate) uncalibrated: bool,
+    pub(crate) opened: RefCell<Vec<String>>,
+}
+
+pub(crate) fn profile(
+    stream: &str,
+    format: PixelFormat,
+    width: u32,
+    height: u32,
+    rate_hz: f64,
+) -> StreamProfile {
+    StreamProfile {
+        stream: StreamName::new(stream).unwrap(),
+        format,
+        width,
+        height,
+        rate_hz,
+        depth_unit_m: 0.001,
+        intrinsics: Intrinsics::default(),
+        pose_in_device: Pose::IDENTITY,
+        clock: DeviceClock { counter_bits: 64, tick_ps: 1000, domain: ClockDomain::Kernel },
+        sequence_bits: 32,
+        metadata: MetadataLevel::Kernel,
+    }
+}
+
+impl Ask for Made {
+    fn node(&self, path: &Path) -> depthrig_drivers::Result<NodeFacts> {
+        let name = path.file_name().unwrap().to_str().unwrap();
+        if self.denied.iter().any(|d| d == name) {
+            return Err(Error::new(ErrorKind::PermissionDenied, format!("{name}: no")));
+        }
+        let number: u32 = name.strip_prefix("video").unwrap().parse().unwrap();
+        let formats: &[&str] = match (number % 2, self.no_d4xx) {
+            (0, _) => &["Z16 "],
+            (_, true) => &["UVCH"],
+            (_, false) => &["UVCH", "D4XX"],
+        };
+        Ok(NodeFacts {
+            role: if number.is_multiple_of(2) { "pictures" } else { "metadata" },
+            formats: formats.iter().map(ToString::to_string).collect(),
+            used_elsewhere: self.streaming.iter().any(|s| s == name),
+        })
+    }
+
+    fn device(
+        &self,
+        family: Family,
+        port: &str,
+    ) -> Option<depthrig_drivers::Result<(DeviceInfo, Vec<StreamProfile>)>> {
+        self.opened.borrow_mut().push(port.to_owned());
+        if let Some((_, kind)) = self.failing.iter().find(|(p, _)| p == port) {
+            return Some(Err(Error::new(*kind, format!("{port} does not answer; plug it in again"))));
+        }
+        let info = DeviceInfo {
+            backend: family.backend(),
+            serial: format!("sn{port}"),
+            firmware: "5.15.1.0".into(),
+            port: port.into(),
+            calibration: if self.uncalibrated { "none" } else { "factory" }.into(),
+            ..DeviceInfo::default()
+        };
+        let profiles = vec![
+            profile("depth", PixelFormat::Z16, 640, 480, 30.0),
+            profile("depth", PixelFormat::Z16, 1280, 720, 30.0),
+            profile("color", PixelFormat::Rgb8, 1280, 720, 30.0),
+        ];
+        Some(Ok((info, profiles)))
+    }
+
+    fn rigs(&self) -> (Vec<RigStatus>, Vec<String>) {
+        (self.rigs.clone(), Vec::new())
+    }
+}
+
+/// A running rig that has the camera at `port`.
+pub(crate) fn rig_with(port: &str) -> RigStatus {
+    let camera = CameraStatus {
+        name: "front".into(),
+        backend: "realsense".into(),
+        model: "D435".into(),
+        serial: "012345".into(),
+        firmware: "5.16.0.1".into(),
+        port: port.into(),
+        calibration: "factory".into(),
+        state: CameraState::Streaming,
+        state_for_s: 1.0,
+        message: None,
+        reconnects: 0,
+        streams: Vec::new(),
+    };
+    RigStatus {
+        rig: "mount".into(),
+        version: String::new(),
+        pid: 77,
+        uptime_s: 1.0,
+        utc_ns: 0,
+        cameras: vec![camera],
+        sets: Default::default(),
+        recording: None,
+        shared_memory: Default::default(),
+        cpu_cores: 0.0,
+        replay: None,
+    }
+}
+
+fn look_at(devices: &[MadeDevice], made: &Made, more: impl FnOnce(&MadeTree)) -> Attached {
+    let home = tempfile::tempdir().unwrap();
+    let tree = MadeTree::new(home.path());
+    for d in devices {
+        tree.plug(d);
+    }
+    more(&tree);
+    look(tree.root(), made).unwrap()
+}
+
+#[test]
+fn a_free_camera_is_asked_everything() {
+    let made = Made::default();
+    let found = look_at(&[MadeDevice::new("4-1.2", 0)], &made, |_| {});
+    let [c] = found.cameras.as_slice() else { panic!("{found:?}") };
+    assert_eq!((c.backend, c.model.as_str(), c.state), ("realsense", "D435", UseState::Free));
+    assert_eq!((c.serial.as_deref(), c.firmware.as_deref()), (Some("sn4-1.2"), Some("5.15.1.0")));
+    assert_eq!((c.usb_mbps, c.controller.as_deref()), (Some(5000), Some("0000:00:14.0")));
+    assert_eq!((c.kernel_metadata, c.modes.len()), (Some("full"), 3));
+    let roles: Vec<_> = c.nodes.iter().map(|n| n.role).collect();
+    assert_eq!(roles, ["pictures", "metadata", "pictures", "metadata", "pictures", "metadata", "usb"]);
+    assert!(c.problems.is_empty() && found.not_asked.is_empty(), "{found:?}");
+    assert_eq!(c.describe(), "D435 sn4-1.2 at USB port 4-1.2");
+}
+
+#[test]
+fn a_camera_that_a_process_has_is_named_with_it_and_not_opened() {
+    let made = Made::default();
+    let found = look_at(&[MadeDevice::new("4-1", 0), MadeDevice::new("4-2", 10)], &made, |tree| {
+        tree.process(4711, "obs", &["/dev/video4"]);
+    });
+    let states: Vec<_> = found.cameras.iter().map(|c| c.state).collect();
+    assert_eq!(states, [UseState::InUse, UseState::Free]);
+    assert_eq!(found.cameras[0].held_words(), "obs (process 4711)");
+    assert_eq!(found.cameras[0].serial, None);
+    assert_eq!(*made.opened.borrow(), ["4-2"], "only the free one is opened");
+}
+
+#[test]
+fn a_camera_that_a_program_has_over_libusb_is_in_use_too() {
+    let made = Made::default();
+    let found = look_at(&[MadeDevice::new("4-1", 0)], &made, |tree| {
+        tree.process(4711, "realsense-viewe", &["/dev/bus/usb/004/002"]);
+    });
+    assert_eq!(found.cameras[0].state, UseState::InUse);
+    assert!(made.opened.borrow().is_empty());
+}
+
+#[test]
+fn what_a_running_rig_has_is_told_from_its_status() {
+    let made = Made { rigs: vec![rig_with("4-1")], ..Made::default() };
+    let found = look_at(&[MadeDevice::new("4-1", 0), MadeDevice::new("4-2", 10)], &made, |_| {});
+    let c = &found.cameras[0];
+    assert_eq!(
+        (c.state, c.serial.as_deref(), c.firmware.as_deref()),
+        (UseState::InUse, Some("012345"), Some("5.16.0.1"))
+    );
+    assert_eq!(c.held_words(), "rig \"mount\", camera \"front\"");
+    assert_eq!(*made.opened.borrow(), ["4-2"]);
+}
+
+#[test]
+fn what_may_not_be_opened_is_said_with_the_rule() {
+    let denied = (0..6).map(|n| format!("video{n}")).collect();
+    let made = Made { denied, ..Made::default() };
+    let found = look_at(&[MadeDevice::new("4-1", 0)], &made, |_| {});
+    assert_eq!(found.cameras[0].state, UseState::Denied);
+    assert!(made.opened.borrow().is_empty());
+    assert!(found.not_asked[0].contains("depthrig install"), "{:?}", found.not_asked);
+}
+
+#[test]
+fn a_camera_that_does_not_answer_keeps_its_message() {
+    let made = Made { failing: vec![("4-1".into(), ErrorKind::Io)], ..Made::default() };
+    let found = look_at(&[MadeDevice::new("4-1", 0)], &made, |_| {});
+    assert_eq!(found.cameras[0].state, UseState::Failed);
+    assert!(found.cameras[0].problems[0].contains("plug it in again"));
+    let made = Made { failing: vec![("4-1".into(), ErrorKind::Busy)], ..Made::default() };
+    let found = look_at(&[MadeDevice::new("4-1", 0)], &made, |_| {});
+    assert_eq!(found.cameras[0].state, UseState::InUse);
+}
+
+#[test]
+fn families_are_told_apart_and_hubs_are_no_cameras() {
+    let uvc = |id, port: &str, node| MadeDevice {
+        id,
+        strings: ["", "HD Webcam", "77"],
+        interfaces: vec![(0, 0x0e, 1, "uvcvideo", vec![node, node + 1], vec![])],
+        ..MadeDevice::new(port, 0)
+    };
+    let zed_sensors = MadeDevice {
+        id: (0x2b03, 0xf881),
+        interfaces: vec![(0, 3, 0, "usbhid", vec![], vec![2])],
+        ..MadeDevice::new("3-4.2", 0)
+    };
+    let recovery = MadeDevice { id: (0x8086, 0x0adb), ..MadeDevice::new("4-9", 40) };
+    let devices = [
+        uvc((0x2b03, 0xf880), "4-4.1", 10),
+        zed_sensors,
+        uvc((0x046d, 0x0825), "4-5", 20),
+        MadeDevice { id: (0x8086, 0x0b64), ..MadeDevice::new("4-6", 30) },
+        MadeDevice {
+            interfaces: vec![(0, 9, 0, "hub", vec![], vec![])],
+            id: (0x0424, 0x2512),
+            ..MadeDevice::new("4-4", 0)
+        },
+        recovery,
+    ];
+    let found = look_at(&devices, &Made::default(), |tree| {
+        tree.platform_video("platform/vivid.0", 50, "vivid-000-vid-cap");
+        tree.platform_video("platform/vivid.0", 51, "vivid-000-meta-cap");
+    });
+    let told: Vec<_> = found.cameras.iter().map(|c| (c.family, c.model.as_str(), c.port.as_str())).collect();
+    let expected = [
+        (Family::Zed, "ZED 2i", "4-4.1"),
+        (Family::Uvc, "HD Webcam", "4-5"),
+        (Family::L515, "L515", "4-6"),
+        (Family::Platform, "vivid-000-vid-cap", "vivid.0"),
+    ];
+    assert_eq!(told, expected);
+    assert!(
+        found.cameras[0].nodes.iter().any(|n| n.role == "hid" && n.path.ends_with("hidraw2")),
+        "{found:?}"
+    );
+    assert_eq!(found.cameras[3].nodes.len(), 2);
+    assert!(found.unusable[0].contains("recovery"), "{:?}", found.unusable);
+}
+
+#[test]
+fn how_a_camera_is_attached_is_complained_about() {
+    let slow = MadeDevice { speed: 480, version: " 2.10", power: "auto", ..MadeDevice::new("3-1", 0) };
+    let made = Made { no_d4xx: true, ..Made::default() };
+    let found = look_at(&[slow], &made, |_| {});
+    let problems = found.cameras[0].problems.join("\n");
+    assert!(problems.contains("USB2") && problems.contains("sleep"), "{problems}");
+    assert_eq!(found.cameras[0].kernel_metadata, Some("header"));
+}
+
+/// Without the right to see every process, a node that somebody streams from is the only sign.
+#[test]
+fn a_busy_node_counts_when_its_holder_cannot_be_seen() {
+    // Process 1 of this very system belongs to root; its files are hidden from everybody else, so the test is made of a
+    // folder that cannot be listed instead, which root can all the same.
+    if rustix::process::geteuid().is_root() {
+        return;
+    }
+    let made = Made { streaming: vec!["video0".into()], ..Made::default() };
+    let found = look_at(&[MadeDevice::new("4-1", 0)], &made, |tree| {
+        tree.process(4711, "hidden", &["/dev/video0"]);
+        let fd = tree.root().join("proc/4711/fd");
+        std::fs::set_permissions(fd, std::os::unix::fs::PermissionsExt::from_mode(0)).unwrap();
+    });
+    assert_eq!(found.cameras[0].state, UseState::InUse);
+    assert!(found.cameras[0].held_words().contains("another user"));
+}

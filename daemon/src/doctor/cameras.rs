@@ -1,0 +1,358 @@
+//! The cameras of the rig file against what is attached: found or not, with which modes, in which state.
+
+use super::finding::{Finding, Severity};
+use crate::attached::{Attached, AttachedCamera, ModeReport, UseState};
+use crate::config::{BackendConfig, CameraConfig, RigConfig};
+use depthrig_drivers::files::FilesBackend;
+use depthrig_drivers::usb::health::{self, RULE_CURE};
+use depthrig_drivers::{Backend, Result, StreamProfile, choose_profiles, synthetic};
+use serde::Serialize;
+
+/// A camera of the rig and the device that it would be.
+#[derive(Debug, Clone, Serialize)]
+pub struct CameraPlan {
+    /// Its name in the rig.
+    pub name: String,
+    /// Its driver.
+    pub backend: &'static str,
+    /// The device that it would be, in words; `None` when none was found.
+    pub device: Option<String>,
+    /// Where that is attached.
+    pub port: Option<String>,
+    /// The streams it would deliver; empty when they are not known.
+    pub streams: Vec<PlannedStream>,
+    /// The worst of its findings.
+    pub worst: Option<Severity>,
+    /// Whether it would be read through libusb.
+    pub libusb: bool,
+    /// The modes of `streams`, with whether each is recorded.
+    #[serde(skip)]
+    pub profiles: Vec<(StreamProfile, bool)>,
+}
+
+/// A stream of a plan.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PlannedStream {
+    /// Its mode.
+    #[serde(flatten)]
+    pub mode: ModeReport,
+    /// What it takes of the USB, Mbit/s; 0 when it is on none.
+    pub usb_mbit_s: f64,
+    /// Whether it is recorded.
+    pub recorded: bool,
+}
+
+/// A plan with what is wrong with it.
+pub(super) struct Planned {
+    pub(super) plan: CameraPlan,
+    pub(super) findings: Vec<Finding>,
+}
+
+/// Which device a camera of the rig means.
+pub(super) struct Wanted<'c> {
+    pub(super) serial: Option<&'c str>,
+    pub(super) port: Option<&'c str>,
+    /// Reads it through libusb whatever the kernel offers.
+    pub(super) libusb: bool,
+}
+
+/// What of a plan is read from the rig file alone; `None` for cameras that are on no bus.
+fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
+    match backend {
+        BackendConfig::Synthetic(_) | BackendConfig::Files(_) => None,
+    }
+}
+
+/// Plans every camera of `config`.
+pub(super) fn plan(config: &RigConfig, attached: &Attached) -> Vec<Planned> {
+    let plan_one = |camera: &CameraConfig| match wanted(&camera.backend) {
+        Some(wanted) => plan_device(camera, camera.backend.name(), &wanted, attached),
+        None => plan_made(camera),
+    };
+    config.cameras.iter().map(plan_one).collect()
+}
+
+fn no_plan(camera: &CameraConfig, backend: &'static str) -> CameraPlan {
+    CameraPlan {
+        name: camera.name.to_string(),
+        backend,
+        device: None,
+        port: None,
+        streams: Vec::new(),
+        worst: None,
+        libusb: false,
+        profiles: Vec::new(),
+    }
+}
+
+/// A camera that is a device of the family that `backend` drives.
+pub(super) fn plan_device(
+    camera: &CameraConfig,
+    backend: &'static str,
+    wanted: &Wanted<'_>,
+    attached: &Attached,
+) -> Planned {
+    let mut findings = Vec::new();
+    let mut plan = CameraPlan { libusb: wanted.libusb, ..no_plan(camera, backend) };
+    if let Some(device) = find(backend, wanted, attached, &mut findings) {
+        plan.device = Some(device.describe());
+        plan.port = Some(device.port.clone());
+        check_device(device, wanted.libusb, &mut findings);
+        if !device.profiles.is_empty() {
+            match choose_profiles(&device.describe(), &device.profiles, &camera.streams) {
+                Ok(chosen) => set_streams(&mut plan, camera, chosen, device.usb.is_some()),
+                Err(e) => findings.push(mode_missing(device, &e.to_string())),
+            }
+        }
+    }
+    let findings = findings.into_iter().map(|f| f.of(camera.name.as_str())).collect();
+    Planned { plan, findings }
+}
+
+fn mode_missing(device: &AttachedCamera, what: &str) -> Finding {
+    let cure = "write one of its modes into [[camera.stream]]";
+    Finding::new(
+        Severity::Error,
+        "mode_missing",
+        what,
+        "the camera is not started in a mode that it does not have, so it would be missing from every set",
+        match device.usb.as_ref().and_then(health::slow_link) {
+            Some(slow) => format!("{slow}; or {cure}"),
+            None => cure.to_owned(),
+        },
+    )
+}
+
+/// A camera that is no device: synthetic, or a folder of pictures.
+fn plan_made(camera: &CameraConfig) -> Planned {
+    let mut plan = no_plan(camera, camera.backend.name());
+    let profiles = || -> Result<(String, Vec<StreamProfile>)> {
+        Ok(match &camera.backend {
+            BackendConfig::Synthetic(c) => {
+                (format!("simulated {} {}", c.model, c.serial), synthetic::profiles(c)?)
+            }
+            BackendConfig::Files(c) => {
+                let device = FilesBackend::new(c.clone()).open(None)?;
+                (format!("pictures of {}", device.info().port), device.profiles().to_vec())
+            }
+        })
+    };
+    let chosen = profiles().and_then(|(device, all)| {
+        let chosen = choose_profiles(&device, &all, &camera.streams)?;
+        Ok((device, chosen))
+    });
+    let mut findings = Vec::new();
+    match chosen {
+        Ok((device, chosen)) => {
+            plan.device = Some(device);
+            set_streams(&mut plan, camera, chosen, false);
+        }
+        Err(e) => findings.push(
+            Finding::new(
+                Severity::Error,
+                "camera_unusable",
+                e.to_string(),
+                "the rig does not start with a camera that cannot work",
+                "correct what the message names",
+            )
+            .of(camera.name.as_str()),
+        ),
+    }
+    Planned { plan, findings }
+}
+
+fn set_streams(plan: &mut CameraPlan, camera: &CameraConfig, chosen: Vec<StreamProfile>, on_usb: bool) {
+    for p in chosen {
+        let recorded = camera.records(&p.stream);
+        let usb_mbit_s = if on_usb { super::wire_bits_per_s(&p) / 1e6 } else { 0.0 };
+        plan.streams.push(PlannedStream { mode: ModeReport::from(&p), usb_mbit_s, recorded });
+        plan.profiles.push((p, recorded));
+    }
+}
+
+/// The attached camera that is meant, or what to say when there is none.
+fn find<'a>(
+    backend: &str,
+    wanted: &Wanted<'_>,
+    attached: &'a Attached,
+    findings: &mut Vec<Finding>,
+) -> Option<&'a AttachedCamera> {
+    let why = "the rig runs without the camera and looks for it again and again; its sets are incomplete";
+    let family: Vec<_> = attached.cameras.iter().filter(|c| c.backend == backend).collect();
+    let list = |cameras: &[&AttachedCamera]| match cameras {
+        [] => format!("no camera for `backend = \"{backend}\"` is attached"),
+        some => format!("attached are: {}", some.iter().map(|c| c.describe()).collect::<Vec<_>>().join(", ")),
+    };
+    let fits = |c: &&&AttachedCamera| {
+        wanted.port.is_none_or(|port| c.port == port)
+            && wanted.serial.is_none_or(|serial| c.serial.as_deref() == Some(serial))
+    };
+    let found: Vec<_> = family.iter().filter(fits).copied().collect();
+    match (found.as_slice(), wanted.port, wanted.serial) {
+        ([one], ..) => return Some(one),
+        ([], port, serial) => {
+            let what = match (port, serial) {
+                (Some(port), Some(serial)) => format!("no camera {serial} at port {port}"),
+                (Some(port), None) => format!("no camera at port {port}"),
+                (None, Some(serial)) => format!("no camera with the serial number {serial}"),
+                (None, None) => "no such camera".to_owned(),
+            };
+            let unknown: Vec<_> = family.iter().filter(|c| c.serial.is_none()).copied().collect();
+            let near = serial.and_then(|s| nearest(s, &family));
+            let cure = match (near, unknown.as_slice()) {
+                (Some(near), _) => format!("did you mean serial = \"{near}\"?"),
+                (None, []) => {
+                    "plug it in, or correct `serial` or `port` (`depthrig cameras` lists what is there)"
+                        .into()
+                }
+                (None, some) => format!(
+                    "it may be {}, whose serial number could not be asked ({}); name it by `port`, or make it free",
+                    some.iter().map(|c| c.describe()).collect::<Vec<_>>().join(" or "),
+                    some.iter().map(|c| c.state.name()).collect::<Vec<_>>().join(", "),
+                ),
+            };
+            findings.push(Finding::new(
+                Severity::Error,
+                "camera_missing",
+                format!("{what}; {}", list(&family)),
+                why,
+                cure,
+            ));
+        }
+        (several, ..) => findings.push(Finding::new(
+            Severity::Error,
+            "camera_ambiguous",
+            format!("{} cameras fit; {}", several.len(), list(several)),
+            "which one it would be depends on chance",
+            "name it by `serial` or `port`",
+        )),
+    }
+    None
+}
+
+/// The serial number that differs from `serial` in one or two characters.
+fn nearest<'a>(serial: &str, family: &[&'a AttachedCamera]) -> Option<&'a str> {
+    let distances = family.iter().filter_map(|c| {
+        let theirs = c.serial.as_deref()?;
+        Some((strsim::damerau_levenshtein(serial, theirs), theirs))
+    });
+    distances.filter(|(d, _)| *d <= 2).min().map(|(_, s)| s)
+}
+
+/// What is wrong with the device itself.
+fn check_device(device: &AttachedCamera, libusb: bool, findings: &mut Vec<Finding>) {
+    match device.state {
+        UseState::Free => {}
+        UseState::InUse => findings.push(Finding::new(
+            Severity::Error,
+            "camera_in_use",
+            format!("{} is in use by {}", device.describe(), device.held_words()),
+            "a camera streams to one program at a time; what it can do was not asked, so as not to disturb it",
+            "end that program before the session",
+        )),
+        UseState::Denied => findings.push(Finding::new(
+            Severity::Error,
+            "permission_denied",
+            format!("{}: this user may not open its nodes", device.describe()),
+            "the camera stays dark",
+            format!("{RULE_CURE}, then plug the camera in again"),
+        )),
+        UseState::Failed => findings.push(Finding::new(
+            Severity::Error,
+            "camera_failed",
+            device.problems.last().cloned().unwrap_or_else(|| format!("{} does not answer", device.describe())),
+            "the camera would not open for the session either",
+            "do what the message says; if it says nothing, plug the camera in again",
+        )),
+        UseState::NoDriver => findings.push(Finding::new(
+            Severity::Error,
+            "no_driver",
+            format!("{}: this version has no driver for it", device.describe()),
+            "the rig cannot run with it",
+            "use a newer version of depthrig",
+        )),
+    }
+    if device.state == UseState::Free && device.calibration.as_deref().is_none_or(|c| c == "none") {
+        findings.push(Finding::new(
+            Severity::Warning,
+            "calibration_missing",
+            format!("{} has no calibration", device.describe()),
+            "its frames carry no intrinsics, so depth cannot be turned into points nor laid over colour",
+            "give the rig file a calibration for it, or have the camera calibrated",
+        ));
+    }
+    if device.kernel_metadata == Some("header") && device.backend == "realsense" && !libusb {
+        findings.push(Finding::new(
+            Severity::Info,
+            "metadata_header",
+            format!("the kernel knows no metadata format for {} ({})", device.model, device.usb_id.as_deref().unwrap_or("?")),
+            "frames carry the device's time of the USB header; frame counter, exposure and mid-exposure time are missing",
+            "use Linux 6.5 or later (6.11 for a D421), or transport = \"libusb\"; or leave it: times stay good to a few milliseconds",
+        ));
+    }
+    let Some(usb) = &device.usb else { return };
+    if let Some(what) = health::slow_link(usb) {
+        findings.push(Finding::new(
+            Severity::Warning,
+            "usb2",
+            what,
+            "modes are missing or slower, and cameras on the bus push each other out",
+            format!("move it from port {} to a USB3 socket, with a USB3 cable", usb.port),
+        ));
+    }
+    if let Some(what) = health::may_sleep(usb) {
+        findings.push(Finding::new(
+            Severity::Info,
+            "autosuspend",
+            what,
+            "a camera that was put to sleep between two sessions may not answer at the next",
+            RULE_CURE,
+        ));
+    }
+}
+
+/// Two cameras of the rig that are one device.
+pub(super) fn check_named_twice(plans: &[CameraPlan], findings: &mut Vec<Finding>) {
+    for (i, a) in plans.iter().enumerate() {
+        for b in plans.iter().skip(i + 1).filter(|b| b.port.is_some() && b.port == a.port) {
+            let port = a.port.as_deref().unwrap_or_default();
+            findings.push(
+                Finding::new(
+                    Severity::Error,
+                    "camera_named_twice",
+                    format!("\"{}\" and \"{}\" are both the camera at port {port}", a.name, b.name),
+                    "the second to open it finds it busy",
+                    "give each its own `serial` or `port`",
+                )
+                .of(&b.name),
+            );
+        }
+    }
+}
+
+/// What is attached and of no use, or in no camera of the rig.
+pub(super) fn check_unnamed(attached: &Attached, plans: &[CameraPlan], findings: &mut Vec<Finding>) {
+    for line in &attached.unusable {
+        findings.push(Finding::new(
+            Severity::Info,
+            "device_unusable",
+            line.as_str(),
+            "it is attached, but no rig can use it",
+            "do what the message says, or unplug it",
+        ));
+    }
+    // A rig of made cameras alone says nothing of the real ones.
+    if plans.iter().all(|p| p.port.is_none()) {
+        return;
+    }
+    let named = |c: &AttachedCamera| plans.iter().any(|p| p.port.as_deref() == Some(&*c.port));
+    for c in attached.cameras.iter().filter(|c| !named(c) && c.usb.is_some()) {
+        findings.push(Finding::new(
+            Severity::Info,
+            "camera_unnamed",
+            format!("{} is attached and not in the rig file", c.describe()),
+            "it is not used",
+            "add a [[camera]] for it, if it belongs to the rig",
+        ));
+    }
+}

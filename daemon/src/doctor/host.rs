@@ -1,0 +1,82 @@
+//! What is asked of the computer itself.
+
+use super::clock::{ClockSync, clock_sync};
+use super::disk::DiskFacts;
+use super::finding::{Finding, Severity};
+use super::{CameraPlan, Surroundings};
+use crate::config::RigConfig;
+use crate::priority;
+use crate::recording::reserve_bytes;
+use depthrig_bus::shm;
+use depthrig_drivers::usb::SysRoot;
+use std::path::Path;
+
+/// Facts of the computer.
+#[derive(Debug, Clone)]
+pub struct Host {
+    /// The file system of the kernel's facts.
+    pub root: SysRoot,
+    /// Bytes free in `/dev/shm`; `None` when it cannot be asked.
+    pub shm_free_bytes: Option<u64>,
+    /// Why camera threads get no real-time priority; `None` when they do.
+    pub realtime_refusal: Option<String>,
+    /// The clock; `None` when the kernel does not say.
+    pub clock: Option<ClockSync>,
+    /// Who runs a rig of this name now.
+    pub rig_holder: Option<String>,
+    /// The disk of the recordings.
+    pub disk: DiskFacts,
+}
+
+impl Host {
+    /// Asks for everything. The disk is measured only when something would be recorded.
+    pub(super) fn gather<'p>(
+        config: &RigConfig,
+        around: &Surroundings,
+        plans: impl Iterator<Item = &'p CameraPlan>,
+    ) -> Self {
+        let shm_folder = around.root.at(Path::new(shm::SHM_DIR));
+        let mut recorded = plans.flat_map(|p| &p.profiles).map(|(_, recorded)| *recorded);
+        let measure = around.measure_disk && recorded.any(|r| r);
+        Self {
+            root: around.root.clone(),
+            shm_free_bytes: shm::free_bytes(&shm_folder).ok(),
+            realtime_refusal: priority::refusal(),
+            clock: clock_sync(),
+            rig_holder: around.runtime.as_ref().and_then(|r| r.holder(&config.rig)),
+            disk: DiskFacts::gather(&config.recording.directory, reserve_bytes(&config.recording), measure),
+        }
+    }
+
+    /// What is wrong with the computer, apart from disk and shared memory.
+    pub(super) fn check(&self, config: &RigConfig, findings: &mut Vec<Finding>) {
+        if let Some(holder) = &self.rig_holder {
+            findings.push(Finding::new(
+                Severity::Error,
+                "rig_running",
+                format!("rig \"{}\" runs already, held by {holder}", config.rig),
+                "one rig of a name runs at a time, and its cameras are in use",
+                "stop it first (Ctrl-C, or systemctl stop depthrig), or give this rig another name",
+            ));
+        }
+        if let Some(why) = self.realtime_refusal.as_ref().filter(|_| config.supervisor.raise_priority) {
+            findings.push(Finding::new(
+                Severity::Warning,
+                "realtime",
+                format!("camera threads get no real-time priority: {why}"),
+                "a busy computer can delay them, and a frame that waits too long is overwritten",
+                "allow it: `@video - rtprio 20` in /etc/security/limits.d/depthrig.conf and log in again, or LimitRTPRIO=20 \
+                 in a service (depthrig install has one); or set supervisor.raise_priority = false",
+            ));
+        }
+        if self.clock.is_some_and(|c| !c.synchronised) {
+            findings.push(Finding::new(
+                Severity::Info,
+                "clock_unsynchronised",
+                "nobody keeps this computer's clock right",
+                "capture times stay consistent among the cameras, but their UTC may be off, and differs from other computers'",
+                "start chrony or systemd-timesyncd (timedatectl set-ntp true)",
+            ));
+        }
+    }
+}

@@ -1,0 +1,172 @@
+//! `depthrig cameras`: what is attached.
+
+use crate::context::Context;
+use crate::exit::Exit;
+use crate::{out, screen};
+use anyhow::Result;
+use depthrig_daemon::attached::{Attached, AttachedCamera, ModeReport, System, UseState, look};
+use depthrig_drivers::usb::SysRoot;
+use std::path::PathBuf;
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+A camera that is in use is listed with who has it, and left alone. What it says of itself comes from the running rig.
+Exit code 3 when a camera cannot be used, or something could not be asked.
+
+Examples:
+  depthrig cameras
+  depthrig cameras --modes D435        what can be written into [[camera.stream]]
+  depthrig cameras --json | jq '.cameras[] | {model, serial, port, state}'";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct CamerasArgs {
+    /// Show the cameras whose model, serial number or port has this in it
+    #[arg(value_name = "PART")]
+    only: Option<String>,
+    /// Show the modes of each
+    #[arg(long)]
+    modes: bool,
+    /// Show nodes, formats and controller of each
+    #[arg(long)]
+    nodes: bool,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    /// The folder that /sys, /proc and /dev are in
+    #[arg(long, value_name = "DIR", default_value = "/", hide = true)]
+    sys_root: PathBuf,
+}
+
+/// Looks and tells.
+pub fn run(args: &CamerasArgs, context: &Context) -> Result<Exit> {
+    let ask = System { runtime: context.runtime().ok() };
+    let mut attached = look(&SysRoot::new(&args.sys_root), &ask)?;
+    if let Some(part) = &args.only {
+        let part = part.to_lowercase();
+        let has = |text: &str| text.to_lowercase().contains(&part);
+        attached.cameras.retain(|c| has(&c.model) || has(&c.port) || c.serial.as_deref().is_some_and(has));
+    }
+    if args.json {
+        out::json(&attached)?;
+    } else {
+        let width = screen::size().map_or(120, |(width, _)| width);
+        out::line(text(&attached, args, width))?;
+    }
+    Ok(exit(&attached))
+}
+
+fn exit(attached: &Attached) -> Exit {
+    let usable = |c: &AttachedCamera| matches!(c.state, UseState::Free | UseState::InUse);
+    if attached.cameras.iter().all(usable) && attached.not_asked.is_empty() { Exit::Good } else { Exit::Lost }
+}
+
+fn text(attached: &Attached, args: &CamerasArgs, width: usize) -> String {
+    if attached.cameras.is_empty() {
+        let nothing =
+            if args.only.is_some() { "no such camera is attached" } else { "no camera is attached" };
+        let more = attached.unusable.iter().flat_map(|line| out::item("!", line, width));
+        return [nothing.to_owned()].into_iter().chain(more).collect::<Vec<_>>().join("\n");
+    }
+    let or_dash = |text: &Option<String>| text.clone().unwrap_or_else(|| "-".to_owned());
+    let mut lines = vec![out::table(
+        &["model", "serial", "port", "USB", "state", "backend", "firmware", "calibration"],
+        usize::MAX,
+        attached.cameras.iter().map(|c| {
+            vec![
+                c.model.clone(),
+                or_dash(&c.serial),
+                c.port.clone(),
+                speed(c),
+                c.state.name().to_owned(),
+                c.backend.to_owned(),
+                or_dash(&c.firmware),
+                or_dash(&c.calibration),
+            ]
+        }),
+    )];
+    for c in &attached.cameras {
+        let mut more = Vec::new();
+        if c.state == UseState::InUse {
+            more.extend(out::item("-", &format!("in use by {}", c.held_words()), width));
+        }
+        more.extend(c.problems.iter().flat_map(|p| out::item("!", p, width)));
+        if args.nodes {
+            let on = c.controller.as_ref().map(|n| format!("controller {n}"));
+            let metadata = c.kernel_metadata.map(|level| format!("kernel metadata: {level}"));
+            let facts: Vec<_> = c.usb_id.clone().into_iter().chain(on).chain(metadata).collect();
+            more.extend(out::item("-", &facts.join(", "), width));
+            for n in &c.nodes {
+                let formats = n.formats.join(" ");
+                more.extend(out::item("-", &format!("{} {} {formats}", n.path, n.role), width));
+            }
+        }
+        if args.modes {
+            more.extend(modes(&c.modes).iter().flat_map(|m| out::item("-", m, width)));
+            if c.modes.is_empty() {
+                more.extend(out::item("-", &format!("its modes are not known: {}", c.state.name()), width));
+            }
+        }
+        if !more.is_empty() {
+            lines.push(String::new());
+            lines.push(c.describe());
+            lines.extend(more);
+        }
+    }
+    let notes = attached.unusable.iter().chain(&attached.not_asked);
+    let notes: Vec<_> = notes.flat_map(|line| out::item("!", line, width)).collect();
+    if !notes.is_empty() {
+        lines.push(String::new());
+        lines.extend(notes);
+    }
+    lines.join("\n")
+}
+
+/// `USB3 5 Gbit/s`.
+fn speed(c: &AttachedCamera) -> String {
+    match c.usb_mbps {
+        None => "-".to_owned(),
+        Some(0) => "?".to_owned(),
+        Some(mbps @ 5000..) => format!("USB3 {} Gbit/s", mbps / 1000),
+        Some(mbps @ 480..) => format!("USB2 {mbps} Mbit/s"),
+        Some(mbps) => format!("USB1 {mbps} Mbit/s"),
+    }
+}
+
+/// One line for each stream, format and size: `depth z16 848x480: 90, 60, 30, 15 Hz`.
+fn modes(all: &[ModeReport]) -> Vec<String> {
+    let mut lines: Vec<(String, Vec<String>)> = Vec::new();
+    for m in all {
+        let what = format!("{} {} {}x{}", m.stream, m.format, m.width, m.height);
+        let rate = m.rate_hz.to_string();
+        match lines.iter_mut().find(|(w, _)| *w == what) {
+            Some((_, rates)) if !rates.contains(&rate) => rates.push(rate),
+            Some(_) => {}
+            None => lines.push((what, vec![rate])),
+        }
+    }
+    lines.into_iter().map(|(what, rates)| format!("{what}: {} Hz", rates.join(", "))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rates_of_one_size_share_a_line() {
+        let mode = |stream: &str, height, rate_hz| ModeReport {
+            stream: stream.into(),
+            format: "z16",
+            width: 640,
+            height,
+            rate_hz,
+        };
+        let all = [
+            mode("depth", 480, 30.0),
+            mode("depth", 480, 15.0),
+            mode("depth", 480, 30.0),
+            mode("depth", 360, 90.0),
+        ];
+        assert_eq!(modes(&all), ["depth z16 640x480: 30, 15 Hz", "depth z16 640x360: 90 Hz"]);
+    }
+}
