@@ -1,5 +1,6 @@
 //! The handle of an emulated camera: plug it in, unplug it, make it fail, ask what it did.
 
+use crate::calibration::Calibration;
 use crate::content::{self, hash};
 use crate::device::{Device, spawn};
 use crate::fault::Fault;
@@ -66,6 +67,8 @@ pub struct Camera {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
     port: std::sync::Mutex<Option<u32>>,
+    /// The other USB device in the same housing.
+    companion: Option<Box<Camera>>,
 }
 
 static MADE: AtomicU32 = AtomicU32::new(1);
@@ -95,11 +98,24 @@ impl Camera {
     /// # Errors
     /// When its thread cannot be started.
     pub fn unplugged(model: Arc<Model>, options: Options) -> Result<Self> {
+        Self::part(model, options, None)
+    }
+
+    /// One USB device of a camera; `video` is what a companion follows.
+    fn part(model: Arc<Model>, options: Options, video: Option<Arc<Shared>>) -> Result<Self> {
         let serial = options.serial.clone().unwrap_or_else(|| new_serial(&model));
         let shared = Arc::new(Shared::new(model.streams().count())?);
-        let device = Device::new(Arc::clone(&model), options.clone(), &serial, Arc::clone(&shared));
+        let companion = match &model.companion {
+            Some(name) => {
+                let options = Options { serial: Some(serial.clone()), speed: Speed::High, ..options.clone() };
+                let part = Self::part(Arc::new(Model::named(name)?), options, Some(Arc::clone(&shared)))?;
+                Some(Box::new(part))
+            }
+            None => None,
+        };
+        let device = Device::new(Arc::clone(&model), options.clone(), &serial, Arc::clone(&shared), video);
         let thread = Some(spawn(device, &format!("emu {serial}"))?);
-        Ok(Self { model, serial, options, shared, thread, port: None.into() })
+        Ok(Self { model, serial, options, shared, thread, port: None.into(), companion })
     }
 
     fn port_slot(&self) -> std::sync::MutexGuard<'_, Option<u32>> {
@@ -118,7 +134,8 @@ impl Camera {
         let (line, port) = vhci::attach(self.options.hub, self.options.speed, *slot)?;
         *slot = Some(port);
         self.shared.ask(Command::Serve(line, Some(port)))?;
-        self.shared.wait(PATIENCE, |p| matches!(p, Presence::Plugged(_)))
+        self.shared.wait(PATIENCE, |p| matches!(p, Presence::Plugged(_)))?;
+        self.companion.as_ref().map_or(Ok(()), |c| c.replug())
     }
 
     /// Serves a host that is no kernel: `line` is the device's end of a stream that speaks USB/IP.
@@ -136,7 +153,8 @@ impl Camera {
     /// When it does not go.
     pub fn unplug(&self) -> Result<()> {
         self.shared.ask(Command::Unplug(None))?;
-        self.shared.wait(PATIENCE, |p| p == Presence::Unplugged)
+        self.shared.wait(PATIENCE, |p| p == Presence::Unplugged)?;
+        self.companion.as_ref().map_or(Ok(()), |c| c.unplug())
     }
 
     /// Pulls the plug and puts it back after a time, by itself.
@@ -144,7 +162,8 @@ impl Camera {
     /// # Errors
     /// When its thread does not take the command.
     pub fn unplug_for(&self, time: Duration) -> Result<()> {
-        self.shared.ask(Command::Unplug(Some(time)))
+        self.shared.ask(Command::Unplug(Some(time)))?;
+        self.companion.as_ref().map_or(Ok(()), |c| c.unplug_for(time))
     }
 
     /// Makes something go wrong, from now on.
@@ -218,6 +237,16 @@ impl Camera {
     /// What its stamps carry in place of its serial.
     pub fn serial_hash(&self) -> u64 {
         hash(&self.serial)
+    }
+
+    /// What it was calibrated to.
+    pub fn calibration(&self) -> Calibration {
+        Calibration::new(&self.model, &self.serial)
+    }
+
+    /// The other USB device in the same housing: the motion unit of a ZED 2i.
+    pub fn companion(&self) -> Option<&Self> {
+        self.companion.as_deref()
     }
 
     /// Its model.

@@ -3,13 +3,15 @@
 //! One thread does it all, so an answer to UNLINK can never overtake the end of the transfer that it names, which the
 //! kernel takes for a broken connection.
 
+mod hid;
 mod requests;
 
 use crate::clock::DeviceClock;
 use crate::control::Units;
 use crate::fault::Fault;
+use crate::firmware::zed::{Bridge, Motion};
 use crate::firmware::{Firmware, Identity, World};
-use crate::model::{Mode, Model};
+use crate::model::{Family, Mode, Model};
 use crate::pump::{Pump, Settings, Urb, write_all};
 use crate::shared::{Command, Presence, Shared};
 use crate::usbip::{self, HEADER, Submit};
@@ -41,10 +43,14 @@ pub(crate) struct Device {
     shared: Arc<Shared>,
     pumps: Vec<Pump>,
     port: Option<u32>,
+    /// The video half, for the sensor half of a ZED.
+    video: Option<Arc<Shared>>,
     // What follows is as it was at power-on.
     clock: DeviceClock,
     units: Units,
     firmware: Firmware,
+    bridge: Bridge,
+    motion: Motion,
     probes: Vec<Option<(Vec<u8>, Mode)>>,
     refusal: u8,
     // Faults that last.
@@ -61,7 +67,13 @@ pub(crate) struct Device {
 }
 
 impl Device {
-    pub fn new(model: Arc<Model>, options: Options, serial: &str, shared: Arc<Shared>) -> Self {
+    pub fn new(
+        model: Arc<Model>,
+        options: Options,
+        serial: &str,
+        shared: Arc<Shared>,
+        video: Option<Arc<Shared>>,
+    ) -> Self {
         let jitter = options.jitter.as_nanos() as i64;
         let pumps =
             model.functions.iter().flat_map(|f| f.streams.iter()).enumerate().map(|(i, stream)| {
@@ -76,6 +88,9 @@ impl Device {
             probes: vec![None; pumps.len()],
             pumps,
             port: None,
+            video,
+            bridge: Bridge::default(),
+            motion: Motion::default(),
             refusal: 0,
             silent: false,
             nak: false,
@@ -184,7 +199,9 @@ impl Device {
     fn connection(&mut self, line: &UnixStream) -> End {
         self.clock = DeviceClock::new(HostTime::now(), self.options.start_ticks, self.options.drift_ppm);
         self.units = Units::new(&self.model, self.options.speed);
-        self.firmware = Firmware::new(&self.model);
+        self.firmware.power_on(&self.model);
+        self.bridge = Bridge::default();
+        self.motion = Motion::default();
         self.probes.fill(None);
         self.restart = false;
         self.shared.lock().trouble = None;
@@ -237,7 +254,8 @@ impl Device {
 
     /// When something is due by itself.
     fn next_event(&self) -> Option<HostTime> {
-        self.pumps.iter().filter_map(Pump::next_due).chain(self.control_held).min()
+        let pumps = self.pumps.iter().filter_map(Pump::next_due);
+        pumps.chain(self.control_held).chain(self.motion.next_due()).min()
     }
 
     /// Everything that is due now.
@@ -262,7 +280,7 @@ impl Device {
             let take = urb.length.min(reply.len());
             answer(line, urb.seq, 0, reply.get(..take).unwrap_or_default(), take)?;
         }
-        Ok(())
+        self.reports(line, now)
     }
 
     fn settings(&self) -> Settings {
@@ -310,9 +328,8 @@ impl Device {
                 }
                 self.firmware.fault(fault);
             }
-            Fault::Reply { .. } | Fault::DamagedTable(_) | Fault::Uncalibrated | Fault::ReportError(_) => {
-                self.firmware.fault(fault);
-            }
+            Fault::ReportError(code) => self.units.put(3, self.error_selector(), &[*code]),
+            Fault::Reply { .. } | Fault::DamagedTable(_) | Fault::Uncalibrated => self.firmware.fault(fault),
         }
     }
 
@@ -401,8 +418,13 @@ impl Device {
         before > self.idle_urbs.len() + self.held.len()
     }
 
-    fn world<'a>(model: &'a Model, identity: &'a Identity, clock: &'a DeviceClock) -> World<'a> {
-        World { model, identity, clock, now: HostTime::now() }
+    /// Where the extension unit has the error report.
+    fn error_selector(&self) -> u8 {
+        if self.model.family == Family::L515 { 3 } else { 7 }
+    }
+
+    fn streaming(&self) -> bool {
+        self.pumps.iter().any(Pump::is_running)
     }
 
     fn speed(&self) -> Speed {

@@ -1,14 +1,18 @@
 //! What answers the vendor's requests: the hardware monitor of RealSense cameras, the registers of a ZED.
 
 mod d400;
+mod l515;
 mod monitor;
+pub(crate) mod zed;
 
+use crate::calibration::Calibration;
 use crate::clock::DeviceClock;
 use crate::content;
 use crate::fault::{Fault, WrongReply};
 use crate::model::{Family, Model};
 use depthrig_bus::HostTime;
 use monitor::Request;
+use std::collections::BTreeSet;
 
 /// Who a camera is.
 #[derive(Debug, Clone)]
@@ -17,6 +21,7 @@ pub(crate) struct Identity {
     pub serial: String,
     /// The serial of its chip, which is what USB shows for a RealSense camera.
     pub chip_serial: String,
+    pub calibration: Calibration,
 }
 
 impl Identity {
@@ -26,9 +31,11 @@ impl Identity {
             Family::D400 | Family::L515 => {
                 format!("{:012}", content::hash(&format!("{serial} chip")) % 1_000_000_000_000)
             }
-            Family::Zed | Family::ZedMcu => serial.to_owned(),
+            // The same on every unit: the bridge has no serial of its own.
+            Family::Zed => "OV0001".to_owned(),
+            Family::ZedMcu => serial.to_owned(),
         };
-        Self { serial: serial.to_owned(), chip_serial }
+        Self { serial: serial.to_owned(), chip_serial, calibration: Calibration::new(model, serial) }
     }
 }
 
@@ -38,6 +45,8 @@ pub(crate) struct World<'a> {
     pub identity: &'a Identity,
     pub clock: &'a DeviceClock,
     pub now: HostTime,
+    /// A stream is running.
+    pub streaming: bool,
 }
 
 /// What a command of the host leads to.
@@ -47,71 +56,98 @@ pub(crate) enum Answer {
     Restart,
 }
 
-/// The state of a camera's firmware since power-on.
+/// Faults of what is in the flash: they outlive a restart.
+#[derive(Debug, Default)]
+pub(crate) struct Flash {
+    pub damaged: BTreeSet<u32>,
+    pub uncalibrated: bool,
+}
+
+/// A camera's firmware.
 pub(crate) struct Firmware {
     d400: d400::State,
+    l515: l515::State,
+    flash: Flash,
     wrong: Option<(WrongReply, u32)>,
     seed: u64,
 }
 
 impl Firmware {
     pub fn new(model: &Model) -> Self {
-        Self { d400: d400::State::new(model), wrong: None, seed: 1 }
+        let flash = Flash::default();
+        Self { d400: d400::State::new(model), l515: l515::State::default(), flash, wrong: None, seed: 1 }
     }
 
-    /// Takes a fault that is the firmware's; says whether it was.
-    pub fn fault(&mut self, fault: &Fault) -> bool {
+    /// Everything but the flash starts again.
+    pub fn power_on(&mut self, model: &Model) {
+        self.d400 = d400::State::new(model);
+        self.l515 = l515::State::default();
+    }
+
+    /// Takes a fault that is the firmware's.
+    pub fn fault(&mut self, fault: &Fault) {
         match fault {
-            Fault::Reply { wrong, times } => self.wrong = Some((*wrong, *times)),
-            Fault::Clear => self.wrong = None,
-            _ => return false,
+            Fault::Reply { wrong, times } => self.wrong = Some((*wrong, *times)).filter(|w| w.1 > 0),
+            Fault::DamagedTable(id) => drop(self.flash.damaged.insert(*id)),
+            Fault::Uncalibrated => self.flash.uncalibrated = true,
+            Fault::Clear => {
+                self.wrong = None;
+                self.flash = Flash::default();
+            }
+            _ => {}
         }
-        true
     }
 
     /// Answers a request of the hardware monitor.
     pub fn monitor(&mut self, bytes: &[u8], world: &World<'_>) -> Answer {
-        let reply = match Request::parse(bytes) {
-            Some(request) => match world.model.family {
-                Family::D400 => match self.d400.answer(&request, world) {
-                    Some(answer) => monitor::reply(request.opcode, answer),
-                    None => return Answer::Restart,
-                },
-                _ => monitor::reply(request.opcode, Err(monitor::WRONG_COMMAND)),
-            },
-            None => monitor::error(monitor::WRONG_COMMAND),
+        let Some(request) = Request::parse(bytes) else {
+            return Answer::Reply(self.spoil(monitor::error(monitor::WRONG_COMMAND)));
         };
-        Answer::Reply(self.spoil(reply))
+        let answer = match world.model.family {
+            Family::D400 => self.d400.answer(&request, world, &self.flash),
+            Family::L515 => self.l515.answer(&request, world),
+            Family::Zed | Family::ZedMcu => Some(Err(monitor::WRONG_COMMAND)),
+        };
+        match answer {
+            Some(answer) => Answer::Reply(self.spoil(monitor::reply(request.opcode, answer))),
+            None => Answer::Restart,
+        }
     }
 
-    fn spoil(&mut self, reply: Vec<u8>) -> Vec<u8> {
+    fn spoil(&mut self, mut reply: Vec<u8>) -> Vec<u8> {
         let Some((wrong, times)) = self.wrong else { return reply };
         self.wrong = (times > 1).then_some((wrong, times - 1));
         match wrong {
             WrongReply::Opcode => {
-                let mut reply = reply;
                 if let Some(byte) = reply.first_mut() {
                     *byte ^= 0x40;
                 }
-                reply
             }
-            WrongReply::Code(code) => monitor::error(code),
+            WrongReply::Code(code) => reply = monitor::error(code),
             WrongReply::Garbage => {
-                let mut next = || {
+                for byte in &mut reply {
                     self.seed = self
                         .seed
                         .wrapping_mul(6_364_136_223_846_793_005)
                         .wrapping_add(1_442_695_040_888_963_407);
-                    (self.seed >> 56) as u8
-                };
-                reply.iter().map(|_| next()).collect()
+                    *byte = (self.seed >> 56) as u8;
+                }
             }
-            WrongReply::Truncated => reply[..reply.len() / 2].to_vec(),
+            WrongReply::Truncated => reply.truncate(reply.len() / 2),
         }
+        reply
     }
 }
 
 /// A reply of the hardware monitor as the extension unit hands it out.
 pub(crate) fn as_control(reply: &[u8]) -> Vec<u8> {
     monitor::control(reply)
+}
+
+/// The clock register: the only memory that can be read.
+fn read_clock(request: &Request<'_>, world: &World<'_>, address: u32) -> Result<Vec<u8>, i32> {
+    if request.params[0] != address || request.params[1] != address + 4 {
+        return Err(monitor::WRONG_PARAMETER);
+    }
+    Ok(world.clock.shown_us(world.clock.running_ns(world.now)).to_le_bytes().to_vec())
 }

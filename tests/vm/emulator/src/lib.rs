@@ -6,6 +6,7 @@
 //! frame held can be asked for afterwards.
 
 pub mod accounts;
+pub mod calibration;
 pub mod camera;
 pub mod clock;
 pub mod console;
@@ -23,6 +24,7 @@ pub mod usbip;
 mod vhci;
 
 pub use accounts::Accounts;
+pub use calibration::Calibration;
 pub use camera::{Camera, Hub, Options, Speed};
 pub use content::Stamp;
 pub use fault::{Damage, Fault, WrongReply};

@@ -246,7 +246,53 @@ pub struct Vendor {
 }
 
 /// The models that come with the emulator.
-const BUILT_IN: [(&str, &str); 1] = [("d435", include_str!("../models/d435.toml"))];
+const BUILT_IN: [(&str, &str); 8] = [
+    ("d405", include_str!("../models/d405.toml")),
+    ("d415", include_str!("../models/d415.toml")),
+    ("d435", include_str!("../models/d435.toml")),
+    ("d435i", include_str!("../models/d435i.toml")),
+    ("d455", include_str!("../models/d455.toml")),
+    ("l515", include_str!("../models/l515.toml")),
+    ("zed2i", include_str!("../models/zed2i.toml")),
+    ("zed2i-mcu", include_str!("../models/zed2i-mcu.toml")),
+];
+
+fn built_in(name: &str) -> Result<&'static str> {
+    let found = BUILT_IN.iter().find(|(known, _)| *known == name);
+    found.map(|(_, text)| *text).ok_or_else(|| {
+        Error::new(format!("there is no model '{name}'; there are {}", Model::names().join(", ")))
+    })
+}
+
+/// Reads a model's table. With `inherit` it is another model's, with what it has itself put over it; `modes` replaces
+/// lists of sizes: `"depth Z16 usb3" = […]`.
+fn table(text: &str) -> Result<toml::Table> {
+    let mut own: toml::Table =
+        toml::from_str(text).map_err(|e| Error::new(format!("not a camera model: {e}")))?;
+    let Some(parent) = own.remove("inherit") else { return Ok(own) };
+    let parent = parent.as_str().ok_or_else(|| Error::new("inherit is not the name of a model"))?;
+    let mut all = table(built_in(parent)?)?;
+    let modes = own.remove("modes");
+    all.extend(own);
+    for (path, sizes) in modes.as_ref().and_then(toml::Value::as_table).into_iter().flatten() {
+        let list = size_list(&mut all, path)
+            .ok_or_else(|| Error::new(format!("modes: {parent} has no list of sizes '{path}'")))?;
+        *list = sizes.clone();
+    }
+    Ok(all)
+}
+
+/// The list of sizes that a path such as `depth Z16 usb3` names.
+fn size_list<'a>(model: &'a mut toml::Table, path: &str) -> Option<&'a mut toml::Value> {
+    let words: Vec<&str> = path.split_whitespace().collect();
+    let [stream, fourcc, speed] = words.as_slice() else { return None };
+    let text = |table: &toml::Value, key: &str| table.get(key)?.as_str().map(|s| s.trim().to_owned());
+    let functions = model.get_mut("functions")?.as_array_mut()?;
+    let streams = functions.iter_mut().filter_map(|f| f.get_mut("streams")?.as_array_mut()).flatten();
+    let mut wanted = streams.filter(|s| text(s, "name").as_deref() == Some(stream));
+    let formats = wanted.next()?.get_mut("formats")?.as_array_mut()?;
+    formats.iter_mut().find(|f| text(f, "fourcc").as_deref() == Some(fourcc))?.get_mut(speed)
+}
 
 impl Model {
     /// A model that comes with the emulator.
@@ -254,11 +300,7 @@ impl Model {
     /// # Errors
     /// When there is none of that name.
     pub fn named(name: &str) -> Result<Self> {
-        let found = BUILT_IN.iter().find(|(known, _)| *known == name);
-        let (_, text) = found.ok_or_else(|| {
-            Error::new(format!("there is no model '{name}'; there are {}", Self::names().join(", ")))
-        })?;
-        Self::from_toml(text)
+        Self::from_toml(built_in(name)?)
     }
 
     /// The names of the models that come with the emulator.
@@ -271,7 +313,8 @@ impl Model {
     /// # Errors
     /// When the text is not a model.
     pub fn from_toml(text: &str) -> Result<Self> {
-        let model: Self = toml::from_str(text).map_err(|e| Error::new(format!("not a camera model: {e}")))?;
+        let model: Self =
+            table(text)?.try_into().map_err(|e| Error::new(format!("not a camera model: {e}")))?;
         for stream in model.streams() {
             for format in &stream.formats {
                 for text in format.usb3.iter().chain(&format.usb2) {

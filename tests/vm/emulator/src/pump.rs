@@ -144,6 +144,7 @@ impl Pump {
             self.next_index = running.session.first_index + running.next;
             self.patterns.truncate(3);
             self.patterns.push((running.session.mode, running.body));
+            shared.end_session(self.stream.into());
         }
     }
 

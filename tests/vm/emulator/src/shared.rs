@@ -17,6 +17,9 @@ const COMMANDS: usize = 64;
 /// Starts of a stream that are remembered.
 const SESSIONS: usize = 8192;
 
+/// From the start of an exposure to its middle, where nothing else is known.
+const HALF_EXPOSURE_NS: i64 = 4_000_000;
+
 /// What a handle asks of its camera's thread.
 pub(crate) enum Command {
     /// Serve the host at the other end of this socket; the number of its port, when it has one.
@@ -60,6 +63,8 @@ pub(crate) struct State {
     pub accounts: Vec<Accounts>,
     pub sessions: Vec<VecDeque<Session>>,
     pub faults: BTreeMap<&'static str, u64>,
+    /// Which streams are running.
+    pub running: Vec<bool>,
     pub presence: Presence,
     /// Why it is not on the bus although it should be.
     pub trouble: Option<String>,
@@ -80,6 +85,7 @@ impl Shared {
             accounts: vec![Accounts::default(); streams],
             sessions: vec![VecDeque::new(); streams],
             faults: BTreeMap::new(),
+            running: vec![false; streams],
             presence: Presence::Unplugged,
             trouble: None,
         };
@@ -142,5 +148,22 @@ impl Shared {
             }
             sessions.push_back(session);
         }
+        if let Some(running) = state.running.get_mut(stream) {
+            *running = true;
+        }
+    }
+
+    pub fn end_session(&self, stream: usize) {
+        if let Some(running) = self.lock().running.get_mut(stream) {
+            *running = false;
+        }
+    }
+
+    /// How many exposures of the first stream have begun in its present run; `None` while it does not run.
+    pub fn exposures(&self, now: HostTime) -> Option<u64> {
+        let state = self.lock();
+        let session = state.sessions.first()?.back().filter(|_| state.running.first() == Some(&true))?;
+        let since = now.since_ns(session.captured(session.first_index)) + HALF_EXPOSURE_NS;
+        u64::try_from(since.div_euclid(session.period_ns) + 1).ok()
     }
 }

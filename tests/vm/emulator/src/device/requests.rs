@@ -2,7 +2,7 @@
 
 use super::{Device, answer};
 use crate::control::{Refusal, probe, query};
-use crate::firmware::Answer;
+use crate::firmware::{Answer, World, zed};
 use crate::model::{Family, Model, Stream};
 use crate::usbip::{self, Submit};
 use crate::{descriptors, firmware};
@@ -11,15 +11,15 @@ use std::io;
 use std::os::unix::net::UnixStream;
 
 /// A setup packet, read.
-struct Setup {
-    kind: u8,
-    request: u8,
-    value: u16,
-    index: u16,
+pub(super) struct Setup {
+    pub kind: u8,
+    pub request: u8,
+    pub value: u16,
+    pub index: u16,
 }
 
 /// The reply to a control transfer; `None` is STALL.
-type Reply = Option<Vec<u8>>;
+pub(super) type Reply = Option<Vec<u8>>;
 
 impl Device {
     /// Answers a control transfer, or holds it back while that is the fault.
@@ -73,6 +73,7 @@ impl Device {
                 Some(Vec::new())
             }
             (0x00..=0x02, _) => Some(Vec::new()), // configuration, interface, feature, exit latency
+            (0x21 | 0xA1, _) if self.is_hid(setup.index) => self.hid_request(setup, data),
             (0x21 | 0xA1, _) => self.class_request(setup, data),
             _ => None,
         }
@@ -131,6 +132,7 @@ impl Device {
                 Vec::new()
             })
         } else {
+            self.before_unit_is_read(unit, selector);
             self.units.get(interface, unit, selector, setup.request)
         };
         match result {
@@ -153,10 +155,25 @@ impl Device {
                 Answer::Restart => self.restart = true,
             }
         }
+        if self.model.family == Family::Zed && (unit, selector) == zed::CONTROL {
+            let reply = self.bridge.command(data, &self.identity.serial);
+            self.units.put(unit, selector, &reply);
+        }
+    }
+
+    /// Controls that the firmware sets by itself.
+    fn before_unit_is_read(&mut self, unit: u8, selector: u8) {
+        if self.model.family == Family::D400 && (unit, selector) == (3, 9) {
+            // Both known only while it streams: valid flags, then projector and processor in °C.
+            let known = u8::from(self.streaming());
+            self.units.put(unit, selector, &[known, known, 36 * known, 41 * known]);
+        }
     }
 
     fn monitor(&mut self, data: &[u8]) -> Answer {
-        let world = Self::world(&self.model, &self.identity, &self.clock);
+        let streaming = self.streaming();
+        let (model, identity, clock) = (&*self.model, &self.identity, &self.clock);
+        let world = World { model, identity, clock, now: HostTime::now(), streaming };
         self.firmware.monitor(data, &world)
     }
 

@@ -1,35 +1,188 @@
 //! The firmware of a D400: what its hardware monitor answers.
+//!
+//! Opcodes and structures: librealsense `src/ds/d400/d400-private.h` and `src/ds/ds-private.h` (Apache-2.0).
 
-use super::World;
-use super::monitor::{Request, WRONG_COMMAND, WRONG_PARAMETER};
+use super::monitor::{EMPTY_TABLE, NO_DATA, NOT_READY, Request, UNSUPPORTED, WRONG_COMMAND, WRONG_PARAMETER};
+use super::{Flash, World, read_clock};
 use crate::model::{Model, from_hex};
+use depthrig_drivers::realsense::protocol::advanced::Group;
+use depthrig_drivers::realsense::protocol::tables::{self, Header, Pinhole, RectifiedItem, SIZES};
+
+const CLOCK: u32 = 0x0001_613C;
+/// The table of the inertial unit, and the version that it begins with.
+const IMU: u32 = 34;
+const D405: u16 = 0x0B5B;
+const D415: u16 = 0x0AD3;
 
 /// The state of the firmware since power-on.
-pub(crate) struct State {}
+pub(crate) struct State {
+    /// The groups of advanced mode.
+    groups: Vec<Vec<u8>>,
+    sync: u32,
+    depth_roi: [u16; 4],
+    color_roi: [u16; 4],
+    limits: [u32; 4],
+    laser_constant: u32,
+}
 
 impl State {
-    pub fn new(_model: &Model) -> Self {
-        Self {}
+    pub fn new(model: &Model) -> Self {
+        let mut groups: Vec<Vec<u8>> = Group::ALL.iter().map(|group| vec![0; group.bytes()]).collect();
+        let depth = [model.depth_unit_um as u32, 0, 65_535, 0, 0];
+        if let Some(group) = groups.get_mut(Group::DepthTable as usize) {
+            *group = depth.iter().flat_map(|v| v.to_le_bytes()).collect();
+        }
+        let whole = [0, 719, 0, 1279];
+        Self {
+            groups,
+            sync: 0,
+            depth_roi: whole,
+            color_roi: whole,
+            limits: [165_000, 248, 0, 0],
+            laser_constant: 0,
+        }
     }
 
     /// What a request is answered; `None`: with a restart.
-    pub fn answer(&mut self, request: &Request<'_>, world: &World<'_>) -> Option<Result<Vec<u8>, i32>> {
+    pub fn answer(
+        &mut self,
+        request: &Request<'_>,
+        world: &World<'_>,
+        flash: &Flash,
+    ) -> Option<Result<Vec<u8>, i32>> {
+        let [p1, p2, ..] = request.params;
         Some(match request.opcode {
-            0x01 => read_memory(request, world),
+            0x01 => read_clock(request, world, CLOCK),
+            0x09 => Ok(vec![0xFF; p2.min(1000) as usize]),
+            0x0F => Err(NO_DATA),
             0x10 => Ok(version_data(world)),
+            0x15 => table(p1, world, flash),
             0x20 => return None,
+            // Its data begin with the temperature in °C.
+            0x2A => Ok(vec![if world.streaming { 41 } else { 29 }, 0, 0, 0]),
+            0x2B => self.set_group(request, world),
+            0x2C => self.group(p1, p2),
+            0x2D => Ok(Vec::new()),
+            0x30 => Ok(vec![1, 0, 0, 0]),
+            0x44 => set_roi(&mut self.depth_roi, request),
+            0x45 => Ok(words16(&self.depth_roi)),
+            0x4F if world.model.imu => Ok(imu(flash)),
+            0x4F => Err(EMPTY_TABLE),
+            0x69 | 0x6A if world.model.product_id == D405 => Err(UNSUPPORTED),
+            0x69 if world.streaming => Err(NOT_READY),
+            0x69 => {
+                self.sync = p1;
+                Ok(Vec::new())
+            }
+            0x6A => Ok(self.sync.to_le_bytes().to_vec()),
+            0x75 => set_roi(&mut self.color_roi, request),
+            0x76 => Ok(words16(&self.color_roi)),
+            0x7E => Ok(RectifiedItem::build_all(&rectified(world, flash))),
+            0x7F if p1 == 2 => Ok(self.laser_constant.to_le_bytes().to_vec()),
+            0x7F => {
+                self.laser_constant = p1;
+                Ok(Vec::new())
+            }
+            0x89 => {
+                self.limits = request.params;
+                Ok(Vec::new())
+            }
+            0x8A => Ok(self.limits.iter().flat_map(|v| v.to_le_bytes()).collect()),
             _ => Err(WRONG_COMMAND),
         })
     }
+
+    fn group(&self, group: u32, bound: u32) -> Result<Vec<u8>, i32> {
+        let group = self.groups.get(group as usize).ok_or(WRONG_PARAMETER)?;
+        match bound {
+            0 => Ok(group.clone()),
+            1 => Ok(vec![0; group.len()]),
+            2 => Ok(vec![0x7F; group.len()]),
+            _ => Err(WRONG_PARAMETER),
+        }
+    }
+
+    fn set_group(&mut self, request: &Request<'_>, world: &World<'_>) -> Result<Vec<u8>, i32> {
+        let group = self.groups.get_mut(request.params[0] as usize).ok_or(WRONG_PARAMETER)?;
+        if request.data.len() != group.len() {
+            return Err(WRONG_PARAMETER);
+        }
+        if world.streaming && request.params[0] == Group::DepthTable as u32 {
+            return Err(NOT_READY);
+        }
+        group.copy_from_slice(request.data);
+        Ok(Vec::new())
+    }
 }
 
-/// The clock is the only memory that can be read.
-fn read_memory(request: &Request<'_>, world: &World<'_>) -> Result<Vec<u8>, i32> {
-    if request.params[..2] != [0x0001_613C, 0x0001_6140] {
+fn words16(values: &[u16; 4]) -> Vec<u8> {
+    values.iter().flat_map(|v| v.to_le_bytes()).collect()
+}
+
+fn set_roi(roi: &mut [u16; 4], request: &Request<'_>) -> Result<Vec<u8>, i32> {
+    let [min_y, max_y, min_x, max_x] = request.params;
+    if min_y >= max_y || min_x >= max_x {
         return Err(WRONG_PARAMETER);
     }
-    let us = world.clock.shown_us(world.clock.running_ns(world.now));
-    Ok(us.to_le_bytes().to_vec())
+    *roi = request.params.map(|v| v as u16);
+    Ok(Vec::new())
+}
+
+/// A calibration table, as the flash has it.
+fn table(id: u32, world: &World<'_>, flash: &Flash) -> Result<Vec<u8>, i32> {
+    let calibration = &world.identity.calibration;
+    let mut table = match id {
+        25 => {
+            let mut coefficients = calibration.coefficients.clone().ok_or(EMPTY_TABLE)?;
+            if flash.uncalibrated {
+                coefficients.rectified = [UNCALIBRATED; 16];
+            }
+            coefficients.build()
+        }
+        32 => calibration.rgb.as_ref().ok_or(EMPTY_TABLE)?.build(),
+        IMU if world.model.imu => return Ok(imu(flash)),
+        31 | 33..=36 => return Err(EMPTY_TABLE),
+        _ => return Err(WRONG_PARAMETER),
+    };
+    if flash.damaged.contains(&id)
+        && let Some(byte) = table.get_mut(tables::HEADER + 40)
+    {
+        *byte ^= 0x10;
+    }
+    Ok(table)
+}
+
+/// What a unit has that was never calibrated: equal focal lengths, and equal coordinates of the principal point.
+const UNCALIBRATED: Pinhole = Pinhole { fx: 1.0, fy: 1.0, ppx: 0.0, ppy: 0.0 };
+
+fn rectified(world: &World<'_>, flash: &Flash) -> Vec<RectifiedItem> {
+    let Some(coefficients) = &world.identity.calibration.coefficients else { return Vec::new() };
+    let item = |(size, pinhole): (Option<(u32, u32)>, &Pinhole)| {
+        let (width, height) = size?;
+        let pinhole = if flash.uncalibrated { UNCALIBRATED } else { *pinhole };
+        Some(RectifiedItem { width: width as u16, height: height as u16, pinhole })
+    };
+    SIZES.into_iter().zip(&coefficients.rectified).filter_map(item).collect()
+}
+
+/// The table of the inertial unit (`dm_v2_calibration_table`): valid flags, pose of the depth camera, then sensitivity
+/// and bias of both sensors.
+fn imu(flash: &Flash) -> Vec<u8> {
+    let identity = [1.0f32, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
+    let pose = [-1.0f32, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, -0.005_52, 0.005_1, 0.011_74];
+    let accelerometer = [0.02f32, -0.11, 0.07];
+    let gyroscope = [0.001f32, -0.002, 0.0015];
+    let values = pose.iter().chain(&identity).chain(&accelerometer).chain(&identity).chain(&gyroscope);
+    let mut payload = vec![1, 1, 0, 0];
+    payload.extend(values.flat_map(|v| v.to_le_bytes()));
+    payload.resize(payload.len() + 96, 0);
+    let mut table = Header::close(IMU as u16, [1, 1], 0, &payload);
+    if flash.damaged.contains(&IMU)
+        && let Some(byte) = table.get_mut(30)
+    {
+        *byte ^= 0x10;
+    }
+    table
 }
 
 /// GVD: who the camera is and what it has.
@@ -46,11 +199,9 @@ fn version_data(world: &World<'_>) -> Vec<u8> {
     put(25, &[1]);
     put(48, &from_hex(&world.identity.serial).unwrap_or_default());
     put(64, &from_hex(&world.identity.chip_serial).unwrap_or_default());
-    let has_color = world.model.functions.len() > 1;
-    let global_shutter = world.model.product_id != 0x0AD3;
-    put(166, &[if global_shutter { 2 } else { 1 }]);
-    put(170, &[(world.model.product_id != 0x0B5B).into()]);
-    put(174, &[has_color.into()]);
+    put(166, &[if world.model.product_id == D415 { 1 } else { 2 }]);
+    put(170, &[(world.model.product_id != D405).into()]);
+    put(174, &[(world.model.functions.len() > 1).into()]);
     put(178, &[world.model.imu.into()]);
     if world.model.imu {
         put(124, &[0x1F]);

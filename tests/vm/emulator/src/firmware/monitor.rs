@@ -4,18 +4,24 @@
 pub(crate) const WRONG_COMMAND: i32 = -1;
 /// "Wrong parameter".
 pub(crate) const WRONG_PARAMETER: i32 = -6;
+/// "Hardware not ready".
+pub(crate) const NOT_READY: i32 = -7;
 /// "No data to return".
-#[allow(dead_code)]
 pub(crate) const NO_DATA: i32 = -21;
+/// "Table is empty".
+pub(crate) const EMPTY_TABLE: i32 = -25;
+/// "Not supported".
+pub(crate) const UNSUPPORTED: i32 = -58;
 /// The length of the control that carries them.
-pub(crate) const CONTROL: usize = 1024;
+const CONTROL: usize = 1024;
+/// No reply has more data.
+const DATA: usize = 1000;
 
 /// A request of the host.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Request<'a> {
     pub opcode: u32,
     pub params: [u32; 4],
-    #[allow(dead_code)]
     pub data: &'a [u8],
 }
 
@@ -36,7 +42,7 @@ impl<'a> Request<'a> {
 /// The reply to an opcode: its echo and the data, or an error code.
 pub(crate) fn reply(opcode: u32, answer: Result<Vec<u8>, i32>) -> Vec<u8> {
     match answer {
-        Ok(data) => [&opcode.to_le_bytes()[..], &data].concat(),
+        Ok(data) => [&opcode.to_le_bytes()[..], data.get(..DATA).unwrap_or(&data)].concat(),
         Err(code) => error(code),
     }
 }
@@ -53,4 +59,31 @@ pub(crate) fn control(reply: &[u8]) -> Vec<u8> {
     let length = reply.len().saturating_sub(4) as u32;
     bytes[CONTROL - 4..].copy_from_slice(&length.to_le_bytes());
     bytes
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_request_is_read_from_its_bytes() {
+        let mut bytes = vec![0x18, 0, 0xAB, 0xCD, 0x2B, 0, 0, 0, 9, 0, 0, 0];
+        bytes.resize(24, 0);
+        bytes.extend([1, 2, 3, 4]);
+        let request = Request::parse(&bytes).unwrap();
+        assert_eq!((request.opcode, request.params, request.data), (0x2B, [9, 0, 0, 0], &[1, 2, 3, 4][..]));
+        bytes[2] = 0;
+        assert!(Request::parse(&bytes).is_none());
+        assert!(Request::parse(&[0x18, 0, 0xAB, 0xCD]).is_none());
+    }
+
+    #[test]
+    fn the_extension_unit_has_the_length_at_its_end() {
+        let bytes = control(&reply(0x10, Ok(vec![7; 256])));
+        assert_eq!(
+            (bytes.len(), &bytes[..5], &bytes[1020..]),
+            (1024, &[0x10, 0, 0, 0, 7][..], &[0, 1, 0, 0][..])
+        );
+        assert_eq!(reply(0x10, Err(-7)), [0xF9, 0xFF, 0xFF, 0xFF]);
+    }
 }

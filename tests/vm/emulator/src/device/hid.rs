@@ -1,0 +1,45 @@
+//! A HID interface: its class requests, and its input reports.
+
+use super::requests::{Reply, Setup};
+use super::{Device, answer};
+use crate::model::Family;
+use depthrig_bus::HostTime;
+use std::io;
+use std::os::unix::net::UnixStream;
+
+impl Device {
+    pub(super) fn is_hid(&self, interface: u16) -> bool {
+        self.model.hid.as_ref().is_some_and(|hid| u16::from(hid.interface) == interface)
+    }
+
+    /// GET_REPORT, SET_REPORT, SET_IDLE (Device Class Definition for HID 1.11, section 7.2).
+    pub(super) fn hid_request(&mut self, setup: &Setup, data: &[u8]) -> Reply {
+        let of_motion_unit = self.model.family == Family::ZedMcu;
+        match (setup.kind, setup.request) {
+            (0xA1, 0x01) if of_motion_unit => Some(self.motion.read_feature(setup.value as u8)),
+            (0x21, 0x09) if of_motion_unit => {
+                self.motion.feature(data, HostTime::now());
+                Some(Vec::new())
+            }
+            (0x21, 0x0A) => Some(Vec::new()),
+            _ => None,
+        }
+    }
+
+    /// Sends the input reports that are due.
+    pub(super) fn reports(&mut self, line: &UnixStream, now: HostTime) -> io::Result<()> {
+        if self.motion.next_due().is_none_or(|due| due > now) {
+            return Ok(());
+        }
+        let frames = self.video.as_ref().and_then(|video| video.exposures(now));
+        let Some(record) = self.motion.record(now, frames) else { return Ok(()) };
+        let Some(endpoint) = self.model.hid.as_ref().map(|hid| hid.endpoint) else { return Ok(()) };
+        // Without a transfer that waits, the record is lost, as on a device.
+        let Some(at) = self.idle_urbs.iter().position(|(address, _)| *address == endpoint) else {
+            return Ok(());
+        };
+        let (_, urb) = self.idle_urbs.remove(at);
+        let take = urb.length.min(record.len());
+        answer(line, urb.seq, 0, record.get(..take).unwrap_or_default(), take)
+    }
+}
