@@ -10,7 +10,7 @@ use crate::clock::DeviceClock;
 use crate::control::Units;
 use crate::fault::Fault;
 use crate::firmware::zed::{Bridge, Motion};
-use crate::firmware::{Firmware, Identity, World};
+use crate::firmware::{Firmware, Identity};
 use crate::model::{Family, Mode, Model};
 use crate::pump::{Pump, Settings, Urb, write_all};
 use crate::shared::{Command, Presence, Shared};

@@ -62,6 +62,37 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     checks.equal("at the same port", camera.port_path(), port);
     stream(checks, &camera, "depth", "/dev/video0", depth, 3, None)?;
     checks.equal("the emulator was never late", camera.accounts("depth")?.late, 0);
+    drop(camera);
+    checks.that("dropped, it is gone", system::wait_until(PATIENCE, none), "");
+    models(checks)
+}
+
+/// Every model is taken for a camera by the kernel, at both speeds.
+fn models(checks: &mut Checks) -> anyhow::Result<()> {
+    use depthrig_emulator::Speed::{High, Super};
+    // Two nodes for each streaming interface, even one with a format that the kernel does not know.
+    for (model, speed, nodes) in [
+        ("d405", Super, 6),
+        ("d415", Super, 6),
+        ("d435", High, 6),
+        ("d435i", Super, 6),
+        ("d455", Super, 6),
+        ("l515", Super, 8),
+        ("zed2i", Super, 2),
+        ("zed2i", High, 2),
+    ] {
+        let camera = Camera::plug(model, Options { speed, ..Options::default() })?;
+        let there = || system::video_nodes().is_ok_and(|found| found.len() == nodes);
+        let settled = system::wait_until(PATIENCE, there);
+        checks.that(
+            &format!("{model} at {speed:?} speed: nodes"),
+            settled,
+            format!("{}", system::video_nodes()?.len()),
+        );
+        drop(camera);
+        let none = || system::video_nodes().is_ok_and(|found| found.is_empty());
+        system::wait_until(PATIENCE, none);
+    }
     Ok(())
 }
 
