@@ -44,7 +44,13 @@ impl RealsenseBackend {
         let is_other = |s: &str| wanted.is_some_and(|w| !w.eq_ignore_ascii_case(s));
         let devices = usb::scan(&self.root)?;
         let unusable = find::unusable(&devices);
-        let candidates = find::candidates(find::cameras(devices), &self.config, wanted, &unusable)?;
+        let candidates = find::candidates(
+            find::D400,
+            find::cameras(devices),
+            self.config.port.as_deref(),
+            wanted,
+            &unusable,
+        )?;
         let (mut others, mut failed) = (Vec::new(), Vec::new());
         for found in candidates {
             // A camera that is known to be another one is not disturbed; it may be streaming.

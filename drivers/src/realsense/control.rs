@@ -1,10 +1,10 @@
-//! The control thread of a streaming D400: clock probes, its own error report, its temperature.
+//! The control thread of a streaming camera: clock probes, its own error report, its temperature.
 //!
 //! A control request may take the kernel's time-out of 5 s, so none is made by the thread that captures. What is found
 //! out reaches that thread through a bounded channel (probes) and a number that it reads (temperature).
 
-use super::protocol::health::{self, ERROR_SELECTOR, TEMPERATURES_SELECTOR, Temperatures};
-use super::protocol::hwm::{HardwareMonitor, Request};
+use super::family::Family;
+use super::protocol::hwm::HardwareMonitor;
 use crate::uvc::control::{ControlPort, Query};
 use crate::{Error, ErrorKind, Result};
 use core::sync::atomic::{AtomicU32, AtomicU64, Ordering};
@@ -62,6 +62,7 @@ impl Control {
     /// [`ErrorKind::Io`] when the system refuses a thread.
     pub(super) fn spawn(
         label: String,
+        family: Family,
         monitor: Box<dyn HardwareMonitor>,
         port: Box<dyn ControlPort>,
     ) -> Result<Self> {
@@ -73,8 +74,18 @@ impl Control {
         let name = label.clone();
         let theirs = Arc::clone(&shared);
         let thread = std::thread::Builder::new().name("realsense-ctl".to_owned()).spawn(move || {
-            Worker { label, monitor, port, shared: theirs, send, fault: 0, polls: true, failing: false }
-                .run(&stopped);
+            Worker {
+                label,
+                family,
+                monitor,
+                port,
+                shared: theirs,
+                send,
+                fault: 0,
+                polls: true,
+                failing: false,
+            }
+            .run(&stopped);
             // Nobody listens when the stream is gone already.
             let _ = end.send(());
         });
@@ -116,6 +127,7 @@ impl Drop for Control {
 /// What runs on the thread.
 struct Worker {
     label: String,
+    family: Family,
     monitor: Box<dyn HardwareMonitor>,
     port: Box<dyn ControlPort>,
     shared: Arc<Shared>,
@@ -173,7 +185,7 @@ impl Worker {
 
     fn probe(&mut self) -> Result<()> {
         let before = HostTime::now();
-        let data = self.monitor.command(&Request::clock())?;
+        let data = self.monitor.command(&self.family.clock())?;
         let after = HostTime::now();
         self.failing = false;
         let ticks = crate::bytes::u32_at(&data, 0).ok_or_else(|| {
@@ -191,7 +203,7 @@ impl Worker {
     /// Looks at the error report and the temperature.
     fn look(&mut self) -> Result<()> {
         let mut code = [0];
-        let asked = self.port.query(UNIT, ERROR_SELECTOR, Query::GetCur, &mut code);
+        let asked = self.port.query(UNIT, self.family.error_selector(), Query::GetCur, &mut code);
         if asked.as_ref().is_err_and(|e| e.kind() == ErrorKind::Unsupported) {
             tracing::debug!(camera = %self.label, "this firmware has no error report");
             self.polls = false;
@@ -200,20 +212,14 @@ impl Worker {
         asked?;
         let [code] = code;
         if code != self.fault {
-            match health::error_report(code) {
+            match self.family.error_report(code) {
                 Some(text) => tracing::warn!(camera = %self.label, code, "{text}"),
                 None => tracing::info!(camera = %self.label, "it reports no error any more"),
             }
             self.fault = code;
         }
-        let mut temperatures = [0; 4];
-        match self.port.query(UNIT, TEMPERATURES_SELECTOR, Query::GetCur, &mut temperatures) {
-            Ok(()) => {
-                // The projector sits between the imagers; the processor is further away.
-                let Temperatures { projector_c, asic_c } = Temperatures::parse(temperatures);
-                let degrees = projector_c.or(asic_c).map_or(f32::NAN, f32::from);
-                self.shared.temperature.store(degrees.to_bits(), Ordering::Relaxed);
-            }
+        match self.family.temperature_c(self.monitor.as_mut(), self.port.as_mut()) {
+            Ok(degrees) => self.shared.temperature.store(degrees.to_bits(), Ordering::Relaxed),
             // Models differ; the error report alone is worth asking for.
             Err(e) if matches!(e.kind(), ErrorKind::Unsupported | ErrorKind::Protocol) => {}
             Err(e) => return Err(e),

@@ -2,18 +2,18 @@
 
 use super::calibration::{Calibration, FACTORY, NONE, View};
 use super::config::RealsenseConfig;
-use super::control::Control;
+use super::family::Family;
 use super::find::Found;
+use super::launch::Launch;
 use super::memory::Memory;
 use super::profiles::{self, Basis};
 use super::protocol::advanced::{self, UnitOrigin};
 use super::protocol::gvd::Gvd;
 use super::protocol::hwm::HardwareMonitor;
 use super::protocol::preset::Preset;
-use super::stream::{Lane, Parts, RealsenseStream};
 use super::transport::{Function, Mode, Transport};
 use super::{NAME, options};
-use crate::{Device, DeviceInfo, Error, ErrorKind, Gate, Result, Stream, StreamProfile, StreamRequest};
+use crate::{Device, DeviceInfo, Error, ErrorKind, Result, Stream, StreamProfile, StreamRequest};
 use std::sync::Arc;
 
 /// An open D400.
@@ -171,39 +171,13 @@ impl Device for RealsenseDevice {
             true => e,
             false => Error::new(e.kind(), format!("{label}: {e}")).with_source(e),
         };
-        let (mut profiles, plan) = profiles::plan(&label, &self.profiles, &self.modes, requests)?;
+        let (profiles, plan) = profiles::plan(&label, &self.profiles, &self.modes, requests)?;
         self.configure(&label, &profiles).map_err(in_camera)?;
         self.warn_of_scaled(&label, &profiles);
-        let started = self.transport.start(&plan.modes).map_err(in_camera)?;
-        let sources = profiles::granted(&mut profiles, &plan, &started.headers);
-        for p in &profiles {
-            tracing::info!(
-                camera = %label,
-                transport = self.transport.name(),
-                metadata = p.metadata.name(),
-                "started {}",
-                p.describe()
-            );
-        }
-        let lanes = profiles.iter().zip(&plan.lanes).enumerate().map(|(i, (p, (source, unpack)))| Lane {
-            gate: Gate::new(i, p),
-            source: *source,
-            unpack: *unpack,
-            frame_bytes: p.frame_bytes(),
-        });
-        let lanes = lanes.collect();
-        let port = self.transport.control(Function::Stereo).map_err(in_camera)?;
-        let control = Control::spawn(label.clone(), self.monitor, port)?;
-        let parts = Parts {
-            label,
-            pictures: started.pictures,
-            profiles,
-            lanes,
-            sources,
-            control,
-            memory: self.memory,
-        };
-        Ok(Box::new(RealsenseStream::new(parts)))
+        let Self { mut transport, monitor, memory, .. } = *self;
+        let family = Family::D4xx;
+        let launch = Launch { family, label: label.clone(), profiles, plan, monitor, memory };
+        launch.start(transport.as_mut()).map_err(in_camera)
     }
 }
 

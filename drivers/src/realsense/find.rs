@@ -1,11 +1,13 @@
 //! Which cameras are attached, and which of them a rig means.
 
-use super::RealsenseConfig;
 use super::models::{self, Model};
 use crate::usb::UsbDevice;
 use crate::{Error, ErrorKind, Result};
 
-/// An attached D400.
+/// What [`candidates`] calls the cameras of [`cameras`].
+pub const D400: &str = "RealSense D400";
+
+/// An attached camera.
 #[derive(Debug, Clone)]
 pub struct Found {
     /// Its model.
@@ -38,50 +40,52 @@ pub fn unusable(devices: &[UsbDevice]) -> Vec<String> {
         .collect()
 }
 
-/// The cameras of `found` that may be the one that `config` and `serial` mean. The serial number on a camera is known
+/// The cameras of `found` that `port` and `serial` may mean; `what` is their
+/// family in messages. The serial number on a camera is known
 /// only after it was opened, so with one there may be several candidates.
 ///
 /// # Errors
 /// [`ErrorKind::NotFound`] when nothing is at the port, or nothing is attached, or more than one camera is and none was named; the
 /// message lists what there is, and what of `unusable` explains it.
 pub fn candidates(
+    what: &str,
     found: Vec<Found>,
-    config: &RealsenseConfig,
+    port: Option<&str>,
     serial: Option<&str>,
     unusable: &[String],
 ) -> Result<Vec<Found>> {
     let list = |found: &[Found]| found.iter().map(Found::describe).collect::<Vec<_>>().join(", ");
-    let not_found = |what: String, there_are: &[Found]| {
+    let not_found = |said: String, there_are: &[Found]| {
         let mut text = match there_are {
-            [] => format!("{what}; no RealSense D400 is attached"),
-            some => format!("{what}; there are: {}", list(some)),
+            [] => format!("{said}; no {what} is attached"),
+            some => format!("{said}; there are: {}", list(some)),
         };
         for line in unusable {
             text = format!("{text}; {line}");
         }
         Error::new(ErrorKind::NotFound, text)
     };
-    if let Some(port) = &config.port {
-        let (at_port, others): (Vec<_>, Vec<_>) = found.into_iter().partition(|f| f.usb.port == *port);
+    if let Some(port) = port {
+        let (at_port, others): (Vec<_>, Vec<_>) = found.into_iter().partition(|f| f.usb.port == port);
         return match at_port.is_empty() {
-            true => Err(not_found(format!("no RealSense D400 is at USB port {port}"), &others)),
+            true => Err(not_found(format!("no {what} is at USB port {port}"), &others)),
             false => Ok(at_port),
         };
     }
     match (serial, found.as_slice()) {
-        (Some(serial), []) => Err(not_found(format!("the RealSense D400 {serial} is not there"), &[])),
-        (None, []) => Err(not_found("no camera for `backend = \"realsense\"`".to_owned(), &[])),
+        (Some(serial), []) => Err(not_found(format!("the {what} {serial} is not there"), &[])),
+        (None, []) => Err(not_found(format!("the rig wants a {what}"), &[])),
         (Some(_), _) | (None, [_]) => Ok(found),
-        (None, _) => Err(not_found(
-            "several RealSense D400 are attached, so name one by `serial` or `port`".to_owned(),
-            &found,
-        )),
+        (None, _) => {
+            Err(not_found(format!("several {what} are attached, so name one by `serial` or `port`"), &found))
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::realsense::RealsenseConfig;
     use crate::usb::PowerControl;
 
     fn usb(product_id: u16, port: &str) -> UsbDevice {
@@ -114,14 +118,18 @@ mod tests {
         let found = || cameras(vec![usb(0x0B07, "4-1"), usb(0x0B5B, "4-2"), usb(0x0B64, "4-3")]);
         assert_eq!(found().len(), 2, "an L515 is none of them");
         let ports = |c: &RealsenseConfig, s| -> Vec<String> {
-            candidates(found(), c, s, &[]).unwrap().into_iter().map(|f| f.usb.port).collect()
+            candidates(D400, found(), c.port.as_deref(), s, &[])
+                .unwrap()
+                .into_iter()
+                .map(|f| f.usb.port)
+                .collect()
         };
         assert_eq!(ports(&at("4-2"), None), ["4-2"]);
         assert_eq!(ports(&RealsenseConfig::default(), Some("x")), ["4-1", "4-2"]);
-        let e = candidates(found(), &RealsenseConfig::default(), None, &[]).unwrap_err();
+        let e = candidates(D400, found(), None, None, &[]).unwrap_err();
         assert_eq!(e.kind(), ErrorKind::NotFound);
         assert!(e.to_string().ends_with("there are: D435 at USB port 4-1, D405 at USB port 4-2"), "{e}");
-        let e = candidates(found(), &at("4-9"), None, &[]).unwrap_err();
+        let e = candidates(D400, found(), Some("4-9"), None, &[]).unwrap_err();
         assert!(e.to_string().starts_with("no RealSense D400 is at USB port 4-9; there are: D435"), "{e}");
     }
 
@@ -129,7 +137,7 @@ mod tests {
     fn a_camera_in_recovery_explains_why_none_is_found() {
         let devices = vec![usb(0x0ADB, "4-1")];
         let why = unusable(&devices);
-        let e = candidates(cameras(devices), &RealsenseConfig::default(), None, &why).unwrap_err();
+        let e = candidates(D400, cameras(devices), None, None, &why).unwrap_err();
         assert!(e.to_string().contains("rs-fw-update -r") && e.to_string().contains("4-1"), "{e}");
     }
 }

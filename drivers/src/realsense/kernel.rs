@@ -15,7 +15,7 @@ use crate::{Error, ErrorKind, Result};
 use std::path::PathBuf;
 
 /// The encodings that are of use.
-const FORMATS: [&[u8; 4]; 5] = [b"Z16 ", b"GREY", b"Y8I ", b"YUYV", b"UYVY"];
+const FORMATS: [&[u8; 4]; 7] = [b"Z16 ", b"GREY", b"Y8I ", b"YUYV", b"UYVY", b"NV12", b"CNF4"];
 
 /// A streaming interface as the kernel shows it.
 #[derive(Debug)]
@@ -183,6 +183,8 @@ fn sensor_of(function: Function, modes: &[v4l2::Mode]) -> Option<Sensor> {
         Some(Sensor::Depth)
     } else if has(b"GREY") || has(b"Y8I ") {
         Some(Sensor::Infrared)
+    } else if has(b"CNF4") {
+        Some(Sensor::Confidence)
     } else if has(b"YUYV") || (has(b"UYVY") && function == Function::Color) {
         Some(Sensor::Color)
     } else {

@@ -110,7 +110,10 @@ impl UnitControl {
 }
 
 /// Sets picture controls by name.
-fn set_named<'a>(
+///
+/// # Errors
+/// As [`apply`].
+pub(super) fn set_named<'a>(
     label: &str,
     key: &str,
     controls: &mut dyn PictureControls,

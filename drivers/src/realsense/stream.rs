@@ -18,6 +18,14 @@ pub(super) enum Unpack {
     Left,
     /// The right bytes.
     Right,
+    /// Pixels of one byte, turned, in rows of so many as they come.
+    Turn8(usize),
+    /// Pixels of two bytes, likewise.
+    Turn16(usize),
+    /// Confidence, turned, in rows of so many bytes as it comes.
+    Confidence(usize),
+    /// Blocks of Y411 for rows of so many pixels.
+    Y411(usize),
 }
 
 /// One stream: its gate, and how it is made from its source.
@@ -171,6 +179,10 @@ fn hand_over(
             Unpack::Copy => unpack::copy_rows(picture.bytes, memory.len(), memory.len(), memory),
             Unpack::Left => unpack::y8i::left(picture.bytes, memory),
             Unpack::Right => unpack::y8i::right(picture.bytes, memory),
+            Unpack::Turn8(columns) => unpack::turn::turn::<1>(picture.bytes, columns, memory),
+            Unpack::Turn16(columns) => unpack::turn::turn::<2>(picture.bytes, columns, memory),
+            Unpack::Confidence(columns) => unpack::turn::confidence(picture.bytes, columns, memory),
+            Unpack::Y411(width) => unpack::y411::to_nv12(picture.bytes, width, memory),
         });
     }
     stamped

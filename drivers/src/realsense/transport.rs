@@ -18,6 +18,8 @@ pub enum Sensor {
     Infrared,
     /// Colour: a module of its own, or the stereo module's on a D405.
     Color,
+    /// How sure depth is, which an L515 alone has.
+    Confidence,
 }
 
 /// One of the video control functions of a D400.
@@ -34,7 +36,8 @@ pub enum Function {
 pub struct Mode {
     /// Which interface offers it.
     pub sensor: Sensor,
-    /// Encoding of the pixels, as V4L2 names it: `Z16 `, `GREY`, `Y8I `, `Y12I`, `YUYV`, `UYVY`.
+    /// Encoding of the pixels, as V4L2 names it: `Z16 `, `GREY`, `Y8I `, `Y12I`, `YUYV`, `UYVY`; of an
+    /// L515 also `NV12` and `CNF4`.
     pub fourcc: [u8; 4],
     /// Pixels per row.
     pub width: u32,
@@ -49,7 +52,9 @@ impl Mode {
     pub const fn wire_bytes(&self) -> Option<usize> {
         let pixels = self.width as usize * self.height as usize;
         match &self.fourcc {
-            b"GREY" => Some(pixels),
+            // Confidence counts bytes, of two pixels each, as its pixels.
+            b"GREY" | b"CNF4" => Some(pixels),
+            b"NV12" => Some(pixels * 3 / 2),
             b"Z16 " | b"Y8I " | b"YUYV" | b"UYVY" => Some(pixels * 2),
             b"Y12I" => Some(pixels * 3),
             _ => None,

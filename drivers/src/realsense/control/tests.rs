@@ -1,6 +1,8 @@
 //! The control thread never holds anybody up, whatever the camera does.
 
 use super::*;
+use crate::realsense::protocol::health::ERROR_SELECTOR;
+use crate::realsense::protocol::hwm::Request;
 use core::sync::atomic::AtomicBool;
 use std::sync::Mutex;
 
@@ -32,7 +34,8 @@ impl Made {
     }
 
     fn spawn(&self) -> Control {
-        Control::spawn("D435 1".to_owned(), Box::new(self.clone()), Box::new(self.clone())).unwrap()
+        Control::spawn("D435 1".to_owned(), Family::D4xx, Box::new(self.clone()), Box::new(self.clone()))
+            .unwrap()
     }
 }
 
@@ -129,6 +132,7 @@ fn probes_that_nobody_takes_are_counted_and_bounded() {
     let shared = Arc::new(Shared::default());
     let mut worker = Worker {
         label: String::new(),
+        family: Family::D4xx,
         monitor: Box::new(made.clone()),
         port: Box::new(made),
         shared: Arc::clone(&shared),

@@ -1,0 +1,141 @@
+//! An open L515 that is not streaming: identity, calibration, modes, settings.
+
+use super::profiles::{self, Tables};
+use super::{L515Config, NAME};
+use crate::realsense::calibration::{FACTORY, NONE};
+use crate::realsense::family::Family;
+use crate::realsense::find::Found;
+use crate::realsense::launch::Launch;
+use crate::realsense::memory::Memory;
+use crate::realsense::options;
+use crate::realsense::protocol::gvd::L515Gvd;
+use crate::realsense::protocol::hwm::HardwareMonitor;
+use crate::realsense::protocol::l515::Control;
+use crate::realsense::transport::{Function, Mode, Transport};
+use crate::{Device, DeviceInfo, Error, ErrorKind, Result, Stream, StreamProfile, StreamRequest};
+use std::sync::Arc;
+
+/// What a camera says of itself, and the link to it.
+pub(super) struct Opened {
+    pub(super) transport: Box<dyn Transport>,
+    pub(super) gvd: L515Gvd,
+    monitor: Box<dyn HardwareMonitor>,
+    found: Found,
+}
+
+impl Opened {
+    /// Asks the camera behind `transport` who it is.
+    ///
+    /// # Errors
+    /// Those of the hardware monitor.
+    pub(super) fn new(found: Found, transport: impl Transport + 'static) -> Result<Self> {
+        let mut transport: Box<dyn Transport> = Box::new(transport);
+        let mut monitor = transport.monitor()?;
+        let gvd = L515Gvd::read(&mut monitor)
+            .map_err(|e| Error::new(e.kind(), format!("{}: {e}", found.describe())).with_source(e))?;
+        Ok(Self { transport, gvd, monitor, found })
+    }
+
+    /// `L515 f0123456 (USB port 4-1.2)`, for messages.
+    pub(super) fn label(&self) -> String {
+        format!("{} {} (USB port {})", self.found.model.name, self.gvd.serial, self.found.usb.port)
+    }
+
+    /// What the camera says of itself.
+    pub(super) fn info(&mut self) -> DeviceInfo {
+        let calibration = if Tables::read(&mut self.monitor).is_ok() { FACTORY } else { NONE };
+        self.info_with(calibration)
+    }
+
+    fn info_with(&self, calibration: &str) -> DeviceInfo {
+        DeviceInfo {
+            backend: NAME,
+            model: self.found.model.name.to_owned(),
+            serial: self.gvd.serial.clone(),
+            firmware: self.gvd.firmware.to_string(),
+            port: self.found.usb.port.clone(),
+            calibration: calibration.to_owned(),
+        }
+    }
+}
+
+/// An open L515.
+pub(super) struct L515Device {
+    opened: Opened,
+    label: String,
+    config: L515Config,
+    info: DeviceInfo,
+    modes: Vec<Mode>,
+    profiles: Vec<StreamProfile>,
+    memory: Arc<Memory>,
+}
+
+impl L515Device {
+    /// Reads calibration and modes of an opened camera.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Unsupported`] when it is not calibrated; [`ErrorKind::Protocol`] when its tables are damaged; those
+    /// of the hardware monitor.
+    pub(super) fn new(mut opened: Opened, config: L515Config, memory: Arc<Memory>) -> Result<Self> {
+        let label = opened.label();
+        let in_camera = |e: Error| Error::new(e.kind(), format!("{label}: {e}")).with_source(e);
+        let tables = Tables::read(&mut opened.monitor).map_err(in_camera)?;
+        let modes = opened.transport.modes().to_vec();
+        let profiles = profiles::offered(&tables, &modes).map_err(in_camera)?;
+        let info = opened.info_with(FACTORY);
+        Ok(Self { opened, label, config, info, modes, profiles, memory })
+    }
+
+    /// Writes what the rig asks for into the camera, which does not stream yet.
+    fn configure(&mut self, chosen: &[StreamProfile]) -> Result<()> {
+        let Self { opened, label, config, .. } = self;
+        for (name, value) in &config.controls {
+            let control = Control::from_name(name).ok_or_else(|| {
+                let known = Control::ALL.map(Control::name).join(", ");
+                Error::new(
+                    ErrorKind::BadInput,
+                    format!("controls: there is no \"{name}\"; there are {known}"),
+                )
+            })?;
+            let now = control.set(&mut opened.monitor, *value)?;
+            if now != *value {
+                let text =
+                    format!("controls: {name} was given {value} and the camera says that it has {now}");
+                return Err(Error::new(ErrorKind::Protocol, text));
+            }
+            tracing::info!(camera = %label, "{name} set to {value}");
+        }
+        if config.color_controls.is_empty() {
+            return Ok(());
+        }
+        if !chosen.iter().any(|p| p.stream.as_str() == "color") {
+            let text = "color_controls are set, but colour is not among the streams";
+            return Err(Error::new(ErrorKind::BadInput, text));
+        }
+        let mut color = opened.transport.picture_controls(Function::Color)?;
+        options::set_named(label, "color_controls", color.as_mut(), config.color_controls.iter())
+    }
+}
+
+impl Device for L515Device {
+    fn info(&self) -> &DeviceInfo {
+        &self.info
+    }
+
+    fn profiles(&self) -> &[StreamProfile] {
+        &self.profiles
+    }
+
+    fn start(mut self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
+        let label = self.label.clone();
+        let in_camera = |e: Error| match e.to_string().contains(&label) {
+            true => e,
+            false => Error::new(e.kind(), format!("{label}: {e}")).with_source(e),
+        };
+        let (profiles, plan) = profiles::plan(&label, &self.profiles, &self.modes, requests)?;
+        self.configure(&profiles).map_err(in_camera)?;
+        let Self { opened: Opened { mut transport, monitor, .. }, memory, .. } = *self;
+        let launch = Launch { family: Family::L515, label: label.clone(), profiles, plan, monitor, memory };
+        launch.start(transport.as_mut()).map_err(in_camera)
+    }
+}

@@ -1,0 +1,54 @@
+//! From a plan to a running stream: the pictures started, a gate for each stream, the control thread.
+
+use super::control::Control;
+use super::family::Family;
+use super::memory::Memory;
+use super::profiles::{self, Plan};
+use super::protocol::hwm::HardwareMonitor;
+use super::stream::{Lane, Parts, RealsenseStream};
+use super::transport::{Function, Transport};
+use crate::{Gate, Result, Stream, StreamProfile};
+use std::sync::Arc;
+
+/// What is to be started.
+pub(super) struct Launch {
+    pub(super) family: Family,
+    /// Model, serial number and port, for messages.
+    pub(super) label: String,
+    pub(super) profiles: Vec<StreamProfile>,
+    pub(super) plan: Plan,
+    pub(super) monitor: Box<dyn HardwareMonitor>,
+    pub(super) memory: Arc<Memory>,
+}
+
+impl Launch {
+    /// Starts it through `transport`.
+    ///
+    /// # Errors
+    /// Those of [`Transport::start`].
+    pub(super) fn start(self, transport: &mut dyn Transport) -> Result<Box<dyn Stream>> {
+        let Self { family, label, mut profiles, plan, monitor, memory } = self;
+        let started = transport.start(&plan.modes)?;
+        let sources = profiles::granted(&mut profiles, &plan, &started.headers);
+        for p in &profiles {
+            tracing::info!(
+                camera = %label,
+                transport = transport.name(),
+                metadata = p.metadata.name(),
+                "started {}",
+                p.describe()
+            );
+        }
+        let lanes = profiles.iter().zip(&plan.lanes).enumerate().map(|(i, (p, (source, unpack)))| Lane {
+            gate: Gate::new(i, p),
+            source: *source,
+            unpack: *unpack,
+            frame_bytes: p.frame_bytes(),
+        });
+        let lanes = lanes.collect();
+        let port = transport.control(Function::Stereo)?;
+        let control = Control::spawn(label.clone(), family, monitor, port)?;
+        let parts = Parts { label, pictures: started.pictures, profiles, lanes, sources, control, memory };
+        Ok(Box::new(RealsenseStream::new(parts)))
+    }
+}
