@@ -355,11 +355,12 @@ pub fn make_backend(
     config: &BackendConfig,
     began: HostTime,
 ) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {
-    use depthrig_drivers::{files::FilesBackend, synthetic::SyntheticBackend};
+    use depthrig_drivers::{files::FilesBackend, realsense::RealsenseBackend, synthetic::SyntheticBackend};
     Ok(match config {
         // One beginning for all cameras of the rig, or each would see the world at another moment.
         BackendConfig::Synthetic(c) => Box::new(SyntheticBackend::starting_at(vec![c.clone()], began)?),
         BackendConfig::Files(c) => Box::new(FilesBackend::new(c.clone())),
+        BackendConfig::Realsense(c) => Box::new(RealsenseBackend::new(c.clone())),
     })
 }
 

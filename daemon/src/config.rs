@@ -5,14 +5,17 @@
 //! restart. Reading a configuration touches no camera and no file but its own.
 
 mod camera;
+mod controls;
 mod error;
 mod read;
+mod realsense;
 mod rig;
 mod synthetic;
 #[cfg(test)]
 mod tests;
 
 pub use depthrig_drivers::files::FilesConfig as FilesSettings;
+pub use depthrig_drivers::realsense::RealsenseConfig as RealsenseSettings;
 pub use depthrig_drivers::synthetic::SyntheticConfig as SyntheticSettings;
 pub use depthrig_recorder::{ColorCodec, DepthCodec};
 pub use error::{ConfigError, Problem};
@@ -160,6 +163,8 @@ pub enum BackendConfig {
     Synthetic(SyntheticSettings),
     /// A folder of pictures that plays as a camera.
     Files(FilesSettings),
+    /// A RealSense D400.
+    Realsense(RealsenseSettings),
 }
 
 impl BackendConfig {
@@ -168,13 +173,21 @@ impl BackendConfig {
         match self {
             Self::Synthetic(_) => "synthetic",
             Self::Files(_) => "files",
+            Self::Realsense(_) => depthrig_drivers::realsense::NAME,
         }
     }
 
     /// The driver of a family with nothing but defaults, for the camera at a port; `None` when there is no driver.
     pub fn at_port(family: crate::attached::Family, port: &str) -> Option<Self> {
-        let _ = (family, port);
-        None
+        let port = Some(port.to_owned());
+        match family {
+            crate::attached::Family::D400 => {
+                // Asked who it is, a camera need not be calibrated.
+                let settings = RealsenseSettings { port, allow_uncalibrated: true, ..<_>::default() };
+                Some(Self::Realsense(settings))
+            }
+            _ => None,
+        }
     }
 }
 

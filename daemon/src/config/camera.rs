@@ -2,7 +2,7 @@
 
 use super::read::{Found, Section};
 use super::rig::{not_empty, rate, resolve};
-use super::{BackendConfig, CameraConfig, FilesSettings, synthetic};
+use super::{BackendConfig, CameraConfig, FilesSettings, realsense, synthetic};
 use depthrig_bus::{CameraName, Name, PixelFormat, Pose, StreamName};
 use depthrig_drivers::StreamRequest;
 use std::path::{Path, PathBuf};
@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 enum Driver {
     Synthetic,
     Files,
+    Realsense,
 }
 
 /// Reads one camera; `None` after a problem without which there is no camera. `taken` are the names so far.
@@ -26,7 +27,8 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         }
         taken.push(name.clone());
     }
-    let drivers = [("synthetic", Driver::Synthetic), ("files", Driver::Files)];
+    let drivers =
+        [("synthetic", Driver::Synthetic), ("files", Driver::Files), ("realsense", Driver::Realsense)];
     if !s.has("backend") {
         s.required::<String>("backend", "\"synthetic\"");
     }
@@ -41,10 +43,16 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
             Some(BackendConfig::Synthetic(synthetic::read(&s, base, name, pose, &wanted)))
         }
         Some(Driver::Files) => files(&s, base).map(BackendConfig::Files),
+        Some(Driver::Realsense) => Some(BackendConfig::Realsense(realsense::read(&s, base, &wanted))),
         // Which keys belong to an unknown driver is unknown too.
         None => return None,
     };
     s.finish();
+    let streams = match &backend {
+        // The imagers behind depth are asked for by name.
+        Some(BackendConfig::Realsense(_)) if streams.is_empty() => realsense::default_streams(),
+        _ => streams,
+    };
     Some(CameraConfig { name: name?.value, pose, streams, record, backend: backend? })
 }
 
@@ -52,8 +60,15 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
 pub(super) fn fastest_rate_hz(camera: &CameraConfig) -> Option<f64> {
     match &camera.backend {
         BackendConfig::Files(files) => files.rate_hz,
+        BackendConfig::Realsense(_) => fastest_given_rate(&camera.streams),
         BackendConfig::Synthetic(config) => synthetic::fastest_rate_hz(config, &camera.streams).ok(),
     }
+}
+
+/// The highest rate of `streams` if each of them says one: what a camera does otherwise, it alone knows.
+fn fastest_given_rate(streams: &[StreamRequest]) -> Option<f64> {
+    let rates = streams.iter().map(|s| s.rate_hz).collect::<Option<Vec<_>>>()?;
+    rates.into_iter().reduce(f64::max)
 }
 
 fn pose(camera: &Section<'_, '_>) -> Pose {

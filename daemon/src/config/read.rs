@@ -203,6 +203,37 @@ impl<'r, 't> Section<'r, 't> {
         self.inner(table, at, kind)
     }
 
+    /// The entries of the table `key`, whose keys may be any; those with another value than `T` are noted and left out.
+    pub(super) fn entries<T: FromToml>(
+        &self,
+        key: &'static str,
+        kind: &'static str,
+    ) -> Vec<(String, Found<T>)> {
+        let Some((_, value)) = self.find(key) else { return Vec::new() };
+        let Some(table) = value.get_ref().as_table() else {
+            let is = describe(value.get_ref());
+            let what = format!("{} must be a table, {kind}; it is {is}", self.key_of(key));
+            self.problem(value.span().start, what);
+            return Vec::new();
+        };
+        let mut entries = Vec::new();
+        for (name, value) in table {
+            let at = value.span().start;
+            match T::from_toml(value.get_ref()) {
+                Ok(value) => entries.push((name.get_ref().to_string(), Found { value, at })),
+                Err(why) => {
+                    self.problem(at, format!("\"{}\" of {} {why}", name.get_ref(), self.key_of(key)));
+                }
+            }
+        }
+        entries
+    }
+
+    /// Where the value of `key` stands; the table itself when it is absent.
+    pub(super) fn at_key(&self, key: &'static str) -> usize {
+        self.find(key).map_or(self.at, |(_, value)| value.span().start)
+    }
+
     /// Whether `key` is there, whatever it is.
     pub(super) fn has(&self, key: &'static str) -> bool {
         self.find(key).is_some()
@@ -305,7 +336,7 @@ macro_rules! integers {
         }
     )*};
 }
-integers!(u8, u32, u64, usize);
+integers!(u8, u16, u32, u64, usize);
 
 impl FromToml for depthrig_bus::Name {
     fn from_toml(value: &DeValue<'_>) -> Result<Self, String> {

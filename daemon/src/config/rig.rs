@@ -169,7 +169,9 @@ pub(super) fn above_zero(most: f64) -> impl Fn(&f64) -> Result<(), String> {
     }
 }
 
-fn within<T: PartialOrd + Display>(range: RangeInclusive<T>) -> impl FnOnce(&T) -> Result<(), String> {
+pub(super) fn within<T: PartialOrd + Display>(
+    range: RangeInclusive<T>,
+) -> impl FnOnce(&T) -> Result<(), String> {
     move |v| {
         let (least, most) = (range.start(), range.end());
         if range.contains(v) { Ok(()) } else { Err(format!("is {v}; it must be within {least} and {most}")) }

@@ -172,6 +172,65 @@ fn what_a_file_says_is_what_comes_out() {
 }
 
 #[test]
+fn a_realsense_camera_is_set_as_the_file_says() {
+    let rig = parse(
+        r#"
+        rig = "r"
+        [[camera]]
+        name = "a"
+        backend = "realsense"
+        serial = "012345678901"
+        port = "4-1.2"
+        transport = "libusb"
+        metadata = "header"
+        emitter = "off"
+        laser_power_mw = 150
+        exposure_us = 8500
+        gain = 16
+        color_controls = { gamma = 300, power_line_frequency = "50 Hz", white_balance_automatic = false }
+        depth_unit_m = 0.0001
+        preset = "near.json"
+        sync = "slave"
+        allow_uncalibrated = true
+        reset_when_silent = true
+        [[camera]]
+        name = "b"
+        backend = "realsense"
+        "#,
+    )
+    .unwrap();
+    use depthrig_drivers::realsense::config::{Emitter, MetadataWish, TransportChoice};
+    use depthrig_drivers::realsense::protocol::sync::SyncMode;
+    use depthrig_drivers::v4l2::ControlValue::{Boolean, Integer, Item};
+    let color_controls = [
+        ("gamma", Integer(300)),
+        ("power_line_frequency", Item("50 Hz".into())),
+        ("white_balance_automatic", Boolean(false)),
+    ];
+    let wanted = RealsenseSettings {
+        serial: Some("012345678901".into()),
+        port: Some("4-1.2".into()),
+        transport: TransportChoice::Libusb,
+        metadata: MetadataWish::Header,
+        emitter: Some(Emitter::Off),
+        laser_power_mw: Some(150),
+        exposure_us: Some(8500),
+        auto_exposure: None,
+        gain: Some(16),
+        preset: Some("/rigs/near.json".into()),
+        sync: Some(SyncMode::Slave),
+        color_controls: color_controls.map(|(n, v)| (n.to_owned(), v)).into(),
+        depth_unit_m: Some(0.0001),
+        allow_uncalibrated: true,
+        reset_when_silent: true,
+    };
+    assert_eq!(rig.cameras[0].backend, BackendConfig::Realsense(wanted));
+    assert_eq!(rig.cameras[1].backend, BackendConfig::Realsense(RealsenseSettings::default()));
+    let streams: Vec<_> = rig.cameras[1].streams.iter().map(|s| s.stream.as_str()).collect();
+    assert_eq!(streams, ["depth", "color"], "the imagers are asked for by name");
+}
+
+#[test]
 fn angles_turn_about_x_then_y_then_z() {
     let pose = |rpy: &str| {
         let text = format!(
@@ -234,6 +293,18 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (second("name = \"b\"\nbackend = \"files\""), "\"manifest\" is missing in [[camera]] \"b\"; write, for example, manifest = "),
         (second("name = \"b\"\nbackend = \"files\"\nmanifest = \"x\"\nrate_hz = -3"), "9:11: \"rate_hz\" in [[camera]] \"b\" is -3; it must be above 0"),
         (second("name = \"b\"\nbackend = \"files\"\nmanifest = \"x\"\nmodel = \"d405\""), "only another backend has it"),
+        (second("name = \"b\"\nbackend = \"realsense\"\nemitter = \"lazer\""), "8:11: \"emitter\" in [[camera]] \"b\" cannot be \"lazer\"; did you mean \"laser\"?"),
+        (second("name = \"b\"\nbackend = \"realsense\"\nlaser_power_mw = 361"), "\"laser_power_mw\" in [[camera]] \"b\" is 361; it must be within 0 and 360"),
+        (second("name = \"b\"\nbackend = \"realsense\"\nexposure_us = 0"), "is 0; it must be within 1 and 200000"),
+        (second("name = \"b\"\nbackend = \"realsense\"\nauto_exposure = true\ngain = 16"), "9:8: \"gain\" in [[camera]] \"b\" cannot be set while auto_exposure is true"),
+        (second("name = \"b\"\nbackend = \"realsense\"\ndepth_unit_m = 1"), "is 1; it must be within 0.000001 and 0.01"),
+        (second("name = \"b\"\nbackend = \"realsense\"\nserial = \" \""), "8:10: \"serial\" in [[camera]] \"b\" is empty"),
+        (second("name = \"b\"\nbackend = \"realsense\"\nserial = 12345"), "must be a string in quotes"),
+        (second("name = \"b\"\nbackend = \"realsense\"\ncolor_controls = { hue = 1.5 }"), "8:26: \"hue\" of \"color_controls\" in [[camera]] \"b\" must be a whole number, true, false"),
+        (second("name = \"b\"\nbackend = \"realsense\"\ncolor_controls = 1"), "must be a table, color_controls = { }; it is the number 1"),
+        (second("name = \"b\"\nbackend = \"realsense\"\ncolor_controls = { hue = 1 }\nstream = [{ name = \"depth\" }]"), "is set, but color is not among the streams"),
+        (second("name = \"b\"\nbackend = \"realsense\"\nstream = [{ name = \"ir\" }]"), "8:11: a RealSense D400 has no stream \"ir\"; it has: depth, color, ir_left, ir_right"),
+        (second("name = \"b\"\nbackend = \"realsense\"\nmanifest = \"x\""), "only another backend has it"),
         (top("sets.rate_hz = 31"), "1:16: \"rate_hz\" in [sets] is 31 sets a second, but the fastest camera gives 30 frames a second"),
         (top("sets.rate_hz = 0.0"), "1:16: \"rate_hz\" in [sets] is 0; it must be above 0"),
         (top("control.tcp = \"0.0.0.0:80\""), "1:15: \"tcp\" in [control] must be a loopback address such as 127.0.0.1:80, not 0.0.0.0:80: the API has no password"),

@@ -4,6 +4,7 @@ use super::finding::{Finding, Severity};
 use crate::attached::{Attached, AttachedCamera, ModeReport, UseState};
 use crate::config::{BackendConfig, CameraConfig, RigConfig};
 use depthrig_drivers::files::FilesBackend;
+use depthrig_drivers::realsense::config::TransportChoice;
 use depthrig_drivers::usb::health::{self, RULE_CURE};
 use depthrig_drivers::{Backend, Result, StreamProfile, choose_profiles, synthetic};
 use serde::Serialize;
@@ -60,6 +61,11 @@ pub(super) struct Wanted<'c> {
 fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
     match backend {
         BackendConfig::Synthetic(_) | BackendConfig::Files(_) => None,
+        BackendConfig::Realsense(c) => Some(Wanted {
+            serial: c.serial.as_deref(),
+            port: c.port.as_deref(),
+            libusb: c.transport == TransportChoice::Libusb,
+        }),
     }
 }
 
@@ -135,6 +141,8 @@ fn plan_made(camera: &CameraConfig) -> Planned {
                 let device = FilesBackend::new(c.clone()).open(None)?;
                 (format!("pictures of {}", device.info().port), device.profiles().to_vec())
             }
+            // Devices are planned with what is attached.
+            BackendConfig::Realsense(_) => (camera.backend.name().to_owned(), Vec::new()),
         })
     };
     let chosen = profiles().and_then(|(device, all)| {

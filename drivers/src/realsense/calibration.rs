@@ -152,3 +152,6 @@ impl Calibration {
         Ok(Geometry { intrinsics, pose_in_device, is_scaled: basis == Basis::Scaled })
     }
 }
+
+#[cfg(test)]
+mod tests;

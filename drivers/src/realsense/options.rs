@@ -4,7 +4,7 @@ use super::config::RealsenseConfig;
 use super::control::UNIT;
 use super::transport::PictureControls;
 use crate::uvc::control::{ControlPort, Query};
-use crate::v4l2::{Control, ControlValue};
+use crate::v4l2::{Control, ControlKind, ControlValue};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 
@@ -129,8 +129,10 @@ pub(super) fn set_named<'a>(
         let control = crate::v4l2::controls::find(&there, name).map_err(in_key)?;
         let number = control.check(value).map_err(in_key)?;
         controls.set(control, number).map_err(in_key)?;
-        let now = controls.get(control).map_err(in_key)?;
-        kept(&format!("{key}, {name}"), number, now)?;
+        if !control.write_only && control.kind != ControlKind::Button {
+            let now = controls.get(control).map_err(in_key)?;
+            kept(&format!("{key}, {name}"), number, now)?;
+        }
         tracing::info!(camera = %label, "{name} set to {value}");
     }
     Ok(())
@@ -158,3 +160,6 @@ fn patiently<T>(mut ask: impl FnMut() -> Result<T>) -> Result<T> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

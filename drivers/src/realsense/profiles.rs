@@ -227,3 +227,6 @@ fn stream_name(name: &str) -> Result<StreamName> {
 fn unsupported(text: String) -> Error {
     Error::new(ErrorKind::Unsupported, text)
 }
+
+#[cfg(test)]
+mod tests;

@@ -187,3 +187,6 @@ fn hand_over(
     }
     stamped
 }
+
+#[cfg(test)]
+mod tests;

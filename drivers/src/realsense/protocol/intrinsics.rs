@@ -226,7 +226,9 @@ pub(super) fn rotation(rows: [f32; 9]) -> Result<DMat3> {
     let norm = off.to_cols_array().iter().map(|v| v * v).sum::<f64>().sqrt();
     // Written so that a matrix with a NaN in it does not pass.
     if norm < 1e-3 && m.determinant() > 0.0 {
-        Ok(m)
+        // The table's 32-bit floats are a rotation within 1e-7 or so; the nearest one is found by Newton's iteration for
+        // the polar decomposition, which squares the error in each step.
+        Ok((0..3).fold(m, |r, _| (r + r.inverse().transpose()) * 0.5))
     } else {
         Err(protocol_error(format!("a calibration table holds a rotation that is none (off by {norm:.3})")))
     }

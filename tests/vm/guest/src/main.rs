@@ -6,11 +6,16 @@ mod boot;
 mod checks;
 mod daemon;
 mod feed;
+mod subject;
 mod system;
+mod tally;
 
 mod scenarios {
     pub mod daemon_smoke;
     pub mod emulator;
+    pub mod realsense_calibration;
+    pub mod realsense_clock;
+    pub mod realsense_conformance;
     pub mod vivid_smoke;
 }
 
@@ -34,11 +39,13 @@ pub struct Scenario {
 }
 
 /// Every scenario, in the order in which they run.
-#[rustfmt::skip] // a line for each, or every new one moves the others
 const SCENARIOS: &[Scenario] = &[
     scenarios::vivid_smoke::SCENARIO,
     scenarios::daemon_smoke::SCENARIO,
     scenarios::emulator::SCENARIO,
+    scenarios::realsense_calibration::SCENARIO,
+    scenarios::realsense_clock::SCENARIO,
+    scenarios::realsense_conformance::SCENARIO,
 ];
 
 fn main() -> anyhow::Result<ExitCode> {

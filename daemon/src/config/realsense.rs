@@ -1,0 +1,104 @@
+//! The keys of a `realsense` camera. What a camera itself decides (the range of its laser, its controls' names) is
+//! checked when it is started; here is what can be known without it.
+
+use super::RealsenseSettings;
+use super::camera::WantedStream;
+use super::controls;
+use super::read::Section;
+use super::rig::{not_empty, resolve, within};
+use depthrig_bus::StreamName;
+use depthrig_drivers::StreamRequest;
+use depthrig_drivers::realsense::config::{Emitter, MetadataWish, TransportChoice};
+use depthrig_drivers::realsense::protocol::sync::SyncMode;
+use std::path::{Path, PathBuf};
+
+const TRANSPORTS: [(&str, TransportChoice); 3] = [
+    ("auto", TransportChoice::Auto),
+    ("kernel", TransportChoice::Kernel),
+    ("libusb", TransportChoice::Libusb),
+];
+const METADATA: [(&str, MetadataWish); 3] =
+    [("full", MetadataWish::Full), ("header", MetadataWish::Header), ("none", MetadataWish::None)];
+const EMITTERS: [(&str, Emitter); 4] =
+    [("off", Emitter::Off), ("laser", Emitter::Laser), ("auto", Emitter::Auto), ("led", Emitter::Led)];
+const SYNC: [(&str, SyncMode); 5] = [
+    ("free", SyncMode::Free),
+    ("master", SyncMode::Master),
+    ("slave", SyncMode::Slave),
+    ("full_slave", SyncMode::FullSlave),
+    ("genlock", SyncMode::Genlock(1)),
+];
+const STREAMS: [&str; 4] = ["depth", "color", "ir_left", "ir_right"];
+
+/// The longest exposure that any model takes, microseconds; a model may take less.
+const MAX_EXPOSURE_US: u32 = 200_000;
+/// The strongest laser of any model, milliwatts.
+const MAX_LASER_MW: u16 = 360;
+
+/// Reads the settings of a camera that is asked for `streams`.
+pub(super) fn read(s: &Section<'_, '_>, base: &Path, streams: &[WantedStream]) -> RealsenseSettings {
+    let d = RealsenseSettings::default();
+    let text = |key| s.or(key, None, |t: &Option<String>| controls::not_blank(t.as_deref()));
+    let preset = s.or("preset", None, |p: &Option<PathBuf>| p.as_deref().map_or(Ok(()), not_empty));
+    let config = RealsenseSettings {
+        serial: text("serial"),
+        port: text("port"),
+        transport: s.choice("transport", &TRANSPORTS, d.transport),
+        metadata: s.choice("metadata", &METADATA, d.metadata),
+        emitter: s.choose("emitter", &EMITTERS),
+        laser_power_mw: s.or("laser_power_mw", None, optional(within(0..=MAX_LASER_MW))),
+        exposure_us: s.or("exposure_us", None, optional(within(1..=MAX_EXPOSURE_US))),
+        auto_exposure: s.get::<bool>("auto_exposure").map(|f| f.value),
+        gain: s.or("gain", None, optional(within(1..=1000))),
+        preset: preset.map(|p| resolve(base, &p)),
+        sync: s.choose("sync", &SYNC),
+        color_controls: controls::read(s, "color_controls", "color_controls = { }"),
+        depth_unit_m: s.or("depth_unit_m", None, optional(depth_unit)),
+        allow_uncalibrated: s.or("allow_uncalibrated", d.allow_uncalibrated, |_| Ok(())),
+        reset_when_silent: s.or("reset_when_silent", d.reset_when_silent, |_| Ok(())),
+    };
+    if config.auto_exposure == Some(true) {
+        for (key, is_set) in [("exposure_us", config.exposure_us.is_some()), ("gain", config.gain.is_some())]
+        {
+            if is_set {
+                let why = "cannot be set while auto_exposure is true; keep one";
+                s.problem(s.at_key(key), format!("{} {why}", s.key_of(key)));
+            }
+        }
+    }
+    for wanted in streams {
+        let name = wanted.request.stream.as_str();
+        if !STREAMS.contains(&name) {
+            let why = format!("a RealSense D400 has no stream \"{name}\"; it has: {}", STREAMS.join(", "));
+            s.problem(wanted.at, why);
+        }
+    }
+    let asks_color = streams.is_empty() || streams.iter().any(|w| w.request.stream.as_str() == "color");
+    if !config.color_controls.is_empty() && !asks_color {
+        let why = "is set, but color is not among the streams of its [[camera.stream]] tables";
+        s.problem(s.at_key("color_controls"), format!("{} {why}", s.key_of("color_controls")));
+    }
+    config
+}
+
+/// What is started when the file names no stream.
+pub(super) fn default_streams() -> Vec<StreamRequest> {
+    let request = |name| StreamName::new(name).ok().map(StreamRequest::any);
+    ["depth", "color"].into_iter().filter_map(request).collect()
+}
+
+/// `check` for a key that may be missing.
+fn optional<T>(
+    check: impl FnOnce(&T) -> Result<(), String>,
+) -> impl FnOnce(&Option<T>) -> Result<(), String> {
+    move |v| v.as_ref().map_or(Ok(()), check)
+}
+
+/// From a micrometre to a centimetre; a camera takes less of it.
+fn depth_unit(unit: &f64) -> Result<(), String> {
+    if (1e-6..=0.01).contains(unit) {
+        Ok(())
+    } else {
+        Err(format!("is {unit}; it must be within 0.000001 and 0.01 (0.001 are millimetres)"))
+    }
+}

@@ -1,0 +1,94 @@
+//! A camera's own tables become intrinsics and poses, and one without them is refused.
+
+use super::*;
+use crate::realsense::models;
+use crate::realsense::protocol::hwm::{D4xxOpcode, Request};
+use crate::realsense::protocol::tables::Pinhole;
+
+/// A camera that answers with these tables, whole.
+#[derive(Clone)]
+struct Made {
+    stereo: Vec<u8>,
+    rgb: Vec<u8>,
+    sizes: Option<Vec<u8>>,
+    gone: bool,
+}
+
+impl HardwareMonitor for Made {
+    fn command(&mut self, request: &Request) -> Result<Vec<u8>> {
+        if self.gone {
+            return Err(Error::new(ErrorKind::Disconnected, "gone"));
+        }
+        match (D4xxOpcode::from_code(request.opcode()), request.params()[0]) {
+            (Some(D4xxOpcode::CalibrationTable), 25) => Ok(self.stereo.clone()),
+            (Some(D4xxOpcode::CalibrationTable), 32) => Ok(self.rgb.clone()),
+            (Some(D4xxOpcode::RectifiedParams), _) => {
+                self.sizes.clone().ok_or_else(|| Error::new(ErrorKind::Unsupported, "old firmware"))
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+}
+
+fn made() -> Made {
+    let mut stereo = Coefficients { baseline_mm: -50.1, ..Coefficients::default() };
+    // 1280x720, then 848x480.
+    stereo.rectified[1] = Pinhole { fx: 640.5, fy: 640.25, ppx: 639.0, ppy: 361.0 };
+    stereo.rectified[3] = Pinhole { fx: 424.5, fy: 424.25, ppx: 423.0, ppy: 241.0 };
+    let rgb = RgbTable {
+        k: [1.2, 0.0, 0.01, 0.0, 2.1, -0.02, 0.0, 0.0, 1.0],
+        calibrated: (1920, 1080),
+        rectified_rotation: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        rectified_translation_mm: [14.7, 0.1, 0.2],
+        ..RgbTable::default()
+    };
+    Made { stereo: stereo.build(), rgb: rgb.build(), sizes: None, gone: false }
+}
+
+fn read(mut made: Made, config: &RealsenseConfig) -> Result<Option<Calibration>> {
+    Calibration::read(&mut made, models::of_product(0x0B07).unwrap(), config, "D435 1")
+}
+
+fn allowed() -> RealsenseConfig {
+    RealsenseConfig { allow_uncalibrated: true, ..RealsenseConfig::default() }
+}
+
+#[test]
+fn each_view_has_its_own_place() {
+    let c = read(made(), &RealsenseConfig::default()).unwrap().unwrap();
+    let at = |view| c.geometry(view, 848, 480).unwrap();
+    assert!((at(View::Left).intrinsics.fx - 424.5).abs() < 1e-6);
+    assert_eq!(at(View::Left).pose_in_device, Pose::IDENTITY);
+    // The right imager sees with the left one's intrinsics, 50.1 mm to the right of it.
+    assert_eq!(at(View::Right).intrinsics, at(View::Left).intrinsics);
+    assert!((at(View::Right).pose_in_device.translation_m[0] - 0.0501).abs() < 1e-8);
+    assert!((at(View::Color).pose_in_device.translation_m[0] + 0.0147).abs() < 1e-8);
+    assert!(at(View::Color).intrinsics.fx > 400.0);
+}
+
+#[test]
+fn newer_firmware_lists_sizes_by_itself() {
+    let p = Pinhole { fx: 400.0, fy: 401.0, ppx: 420.0, ppy: 240.0 };
+    let items = RectifiedItem::build_all(&[RectifiedItem { width: 848, height: 480, pinhole: p }]);
+    let c = read(Made { sizes: Some(items), ..made() }, &RealsenseConfig::default()).unwrap().unwrap();
+    assert!((c.geometry(View::Left, 848, 480).unwrap().intrinsics.fx - 400.0).abs() < 1e-6);
+}
+
+#[test]
+fn a_camera_without_calibration_is_refused_unless_the_rig_allows_it() {
+    let mut damaged = made();
+    damaged.rgb[40] ^= 1;
+    let blank = Made { stereo: Coefficients::default().build(), ..made() };
+    for (made, why) in [(damaged, "checksum"), (blank, "not calibrated")] {
+        let e = read(made.clone(), &RealsenseConfig::default()).unwrap_err();
+        assert_eq!(e.kind(), ErrorKind::Unsupported);
+        assert!(e.to_string().contains(why) && e.to_string().contains("allow_uncalibrated = true"), "{e}");
+        assert!(read(made, &allowed()).unwrap().is_none());
+    }
+}
+
+#[test]
+fn a_camera_that_went_away_is_no_uncalibrated_one() {
+    let e = read(Made { gone: true, ..made() }, &allowed()).unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::Disconnected);
+}

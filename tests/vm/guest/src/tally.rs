@@ -1,0 +1,93 @@
+//! A sink that keeps what is known of each frame and looks at its pixels, instead of keeping them.
+
+use core::time::Duration;
+use depthrig_bus::{DropCounts, DropReason, HostTime};
+use depthrig_drivers::clock::ClockQuality;
+use depthrig_drivers::{FrameMeta, FrameSink, Poll, Stream};
+use depthrig_emulator::Stamp;
+
+/// A frame that was delivered.
+#[derive(Debug, Clone, Copy)]
+pub struct Frame {
+    /// The stream it belongs to.
+    pub stream: usize,
+    /// What the driver says of it.
+    pub meta: FrameMeta,
+    /// Index of the emulator's stamp; `None` when its pixels have none.
+    pub index: Option<u64>,
+    /// Whether the clock map knew the latency of its frames by then.
+    pub latency_known: bool,
+}
+
+/// What came out of a stream.
+#[derive(Debug, Default)]
+pub struct Tally {
+    /// Delivered frames in their order.
+    pub frames: Vec<Frame>,
+    /// Frames lost, by stream.
+    pub drops: Vec<DropCounts>,
+    /// Frames captured, by stream.
+    pub captured: Vec<u64>,
+    memory: Vec<u8>,
+    latency_known: Vec<bool>,
+}
+
+impl Tally {
+    /// Polls `stream` for `time`.
+    ///
+    /// # Errors
+    /// Those of the stream.
+    pub fn poll_for(&mut self, stream: &mut dyn Stream, time: Duration) -> depthrig_drivers::Result<()> {
+        let end = HostTime::now().plus(time);
+        while !end.from_now().is_zero() {
+            if stream.poll(Duration::from_millis(50), self)? == Poll::End {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// The frames of one stream.
+    pub fn of(&self, stream: usize) -> impl Iterator<Item = &Frame> {
+        self.frames.iter().filter(move |f| f.stream == stream)
+    }
+
+    /// Frames of a stream that were lost for `reason`.
+    pub fn lost(&self, stream: usize, reason: DropReason) -> u64 {
+        self.drops.get(stream).map_or(0, |d| d.get(reason))
+    }
+
+    fn at<T: Default>(list: &mut Vec<T>, i: usize) -> &mut T {
+        while list.len() <= i {
+            list.push(T::default());
+        }
+        &mut list[i]
+    }
+}
+
+impl FrameSink for Tally {
+    fn loan(&mut self, _: usize, len: usize) -> Option<&mut [u8]> {
+        self.memory.resize(len, 0);
+        Some(&mut self.memory)
+    }
+
+    fn commit(&mut self, stream: usize, meta: &FrameMeta) {
+        let index = Stamp::read(&self.memory).map(|s| s.index);
+        let latency_known = *Self::at(&mut self.latency_known, stream);
+        self.frames.push(Frame { stream, meta: *meta, index, latency_known });
+    }
+
+    fn discard(&mut self, _: usize) {}
+
+    fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
+        Self::at(&mut self.drops, stream).add(reason, n);
+    }
+
+    fn captured(&mut self, stream: usize, n: u64) {
+        *Self::at(&mut self.captured, stream) += n;
+    }
+
+    fn clock_quality(&mut self, stream: usize, quality: &ClockQuality) {
+        *Self::at(&mut self.latency_known, stream) = quality.latency_known;
+    }
+}
