@@ -121,7 +121,7 @@ fn rgb(model: &Model, spread: &Spread<'_>) -> RgbTable {
         1.0,
     ];
     // A third of the units have no distortion in their table, as retail units often have.
-    let strength = if hash(spread.0) % 3 == 0 { 0.0 } else { 0.02 };
+    let strength = if hash(spread.0).is_multiple_of(3) { 0.0 } else { 0.02 };
     let distortion = ["k1", "k2", "p1", "p2", "k3"].map(|name| {
         let scale = if name.starts_with('p') { 0.02 } else { 1.0 };
         strength * scale * spread.at(name)

@@ -115,7 +115,7 @@ pub(crate) fn put_stamp(frame: &mut [u8], mode: &Mode, stamp: &Stamp) {
 /// The wire's pixel (row i, column j) belongs at x = Hs − 1 − i, y = Ws − 1 − j (librealsense
 /// src/l500, rotation-transform.cpp, Apache-2.0), so upright (x, 0) is row Hs − 1 − x, column Ws − 1.
 fn turned_offset(mode: &Mode, i: usize) -> usize {
-    let pixel = usize::from(mode.bits) / 8;
+    let pixel = (usize::from(mode.bits) / 8).max(1);
     let (x, part) = (i / pixel, i % pixel);
     let (width, height) = (usize::from(mode.width), usize::from(mode.height));
     ((height - 1 - x.min(height - 1)) * width + width - 1) * pixel + part

@@ -101,7 +101,7 @@ fn endpoint(
     bytes
 }
 
-fn control_interface(model: &Model, function: &Function, _speed: Speed) -> Result<Vec<u8>> {
+fn control_interface(model: &Model, function: &Function, speed: Speed) -> Result<Vec<u8>> {
     let mut units = Vec::new();
     for unit in &function.units {
         units.extend(unit_descriptor(unit)?);
@@ -116,7 +116,7 @@ fn control_interface(model: &Model, function: &Function, _speed: Speed) -> Resul
     bytes.extend(head.u8(&numbers).sized());
     bytes.extend(units);
     if let Some(address) = function.status_endpoint {
-        bytes.extend(endpoint(address, 3, 64, 8, _speed, 64));
+        bytes.extend(endpoint(address, 3, 64, 8, speed, 64));
         bytes.extend(Bytes::default().u8(&[0x25, 3]).u16(64).sized());
     }
     Ok(bytes)

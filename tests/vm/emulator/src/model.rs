@@ -384,7 +384,7 @@ pub(crate) fn from_hex(text: &str) -> Result<Vec<u8>> {
         .map(|c| c.to_digit(16))
         .collect::<Option<_>>()
         .ok_or_else(|| Error::new(format!("'{text}' is not hexadecimal")))?;
-    if digits.len() % 2 != 0 {
+    if !digits.len().is_multiple_of(2) {
         return Err(Error::new(format!("'{text}' has half a byte too many")));
     }
     Ok(digits.chunks(2).map(|pair| (pair[0] << 4 | pair[1]) as u8).collect())

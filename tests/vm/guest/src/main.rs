@@ -16,6 +16,7 @@ mod scenarios {
     pub mod realsense_calibration;
     pub mod realsense_clock;
     pub mod realsense_conformance;
+    pub mod emulator_load;
     pub mod vivid_smoke;
 }
 
@@ -46,6 +47,7 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::realsense_calibration::SCENARIO,
     scenarios::realsense_clock::SCENARIO,
     scenarios::realsense_conformance::SCENARIO,
+    scenarios::emulator_load::SCENARIO,
 ];
 
 fn main() -> anyhow::Result<ExitCode> {

@@ -65,7 +65,7 @@ impl State {
             0x2D => Ok(Vec::new()),
             0x30 => Ok(vec![1, 0, 0, 0]),
             0x44 => set_roi(&mut self.depth_roi, request),
-            0x45 => Ok(words16(&self.depth_roi)),
+            0x45 => Ok(words16(self.depth_roi)),
             0x4F if world.model.imu => Ok(imu(flash)),
             0x4F => Err(EMPTY_TABLE),
             0x69 | 0x6A if world.model.product_id == D405 => Err(UNSUPPORTED),
@@ -76,7 +76,7 @@ impl State {
             }
             0x6A => Ok(self.sync.to_le_bytes().to_vec()),
             0x75 => set_roi(&mut self.color_roi, request),
-            0x76 => Ok(words16(&self.color_roi)),
+            0x76 => Ok(words16(self.color_roi)),
             0x7E => Ok(RectifiedItem::build_all(&rectified(world, flash))),
             0x7F if p1 == 2 => Ok(self.laser_constant.to_le_bytes().to_vec()),
             0x7F => {
@@ -115,7 +115,7 @@ impl State {
     }
 }
 
-fn words16(values: &[u16; 4]) -> Vec<u8> {
+fn words16(values: [u16; 4]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 

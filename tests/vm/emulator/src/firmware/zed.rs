@@ -124,8 +124,8 @@ impl Motion {
             can_sync: true,
             frame_count: self.frames as u32,
             temperature_raw: 3150,
-            field_raw: (self.count % 8 == 0).then_some([320, -160, 640]),
-            air_raw: (self.count % 16 == 0).then_some((2950, 101_325, 40_000)),
+            field_raw: (self.count.is_multiple_of(8)).then_some([320, -160, 640]),
+            air_raw: (self.count.is_multiple_of(16)).then_some((2950, 101_325, 40_000)),
             eyes_raw: [3820, 3815],
         };
         Some(record.build().to_vec())

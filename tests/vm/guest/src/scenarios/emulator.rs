@@ -70,7 +70,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
 /// Every model is taken for a camera by the kernel, at both speeds.
 fn models(checks: &mut Checks) -> anyhow::Result<()> {
     use depthrig_emulator::Speed::{High, Super};
-    // Two nodes for each streaming interface, even one with a format that the kernel does not know.
+    // Two nodes for each streaming interface; the L515 has four (the kernel knows the format of its confidence).
     for (model, speed, nodes) in [
         ("d405", Super, 6),
         ("d415", Super, 6),
