@@ -13,10 +13,10 @@ mod tally;
 mod scenarios {
     pub mod daemon_smoke;
     pub mod emulator;
+    pub mod emulator_load;
     pub mod realsense_calibration;
     pub mod realsense_clock;
     pub mod realsense_conformance;
-    pub mod emulator_load;
     pub mod vivid_smoke;
 }
 

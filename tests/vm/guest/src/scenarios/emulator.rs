@@ -105,8 +105,9 @@ fn identity(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
     node.query(3, 1, Query::SetCur, &mut bytes)?;
     node.query(3, 1, Query::GetCur, &mut bytes)?;
     checks.equal("GVD is echoed", bytes[0], 0x10);
-    let serial: String = bytes[4 + 48..4 + 54].iter().map(|byte| format!("{byte:02x}")).collect();
-    checks.equal("GVD has the serial", serial.as_str(), camera.serial());
+    // Two digits a byte: six bytes are a number of twelve hexadecimal digits.
+    let serial = bytes[4 + 48..4 + 54].iter().fold(0u64, |all, byte| all << 8 | u64::from(*byte));
+    checks.equal("GVD has the serial", format!("{serial:012x}").as_str(), camera.serial());
     Ok(())
 }
 
