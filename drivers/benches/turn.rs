@@ -1,7 +1,8 @@
 //! What unpacking an L515's pictures costs: turned depth against a plain copy and against the two loops of the rule.
 #![allow(missing_docs)]
 
-use criterion::{Criterion, Throughput, black_box, criterion_group, criterion_main};
+use core::hint::black_box;
+use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use depthrig_drivers::unpack::{turn, y411};
 
 /// The rule as it is written: down a column of the picture for each row that came.

@@ -13,6 +13,8 @@ pub mod conformance;
 mod device;
 mod error;
 pub mod files;
+#[doc(hidden)]
+pub mod fuzzing;
 mod gate;
 pub mod libusb;
 pub mod realsense;

@@ -14,6 +14,7 @@ mod scenarios {
     pub mod daemon_smoke;
     pub mod emulator;
     pub mod emulator_load;
+    pub mod l515;
     pub mod realsense_calibration;
     pub mod realsense_clock;
     pub mod realsense_conformance;
@@ -48,6 +49,7 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::realsense_clock::SCENARIO,
     scenarios::realsense_conformance::SCENARIO,
     scenarios::emulator_load::SCENARIO,
+    scenarios::l515::SCENARIO,
 ];
 
 fn main() -> anyhow::Result<ExitCode> {

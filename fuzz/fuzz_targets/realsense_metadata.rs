@@ -1,0 +1,9 @@
+//! Payload headers and the records of a metadata node.
+#![no_main]
+
+use depthrig_drivers::fuzzing::realsense;
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|bytes: &[u8]| {
+    realsense::metadata(bytes);
+});
