@@ -355,12 +355,15 @@ pub fn make_backend(
     config: &BackendConfig,
     began: HostTime,
 ) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {
-    use depthrig_drivers::{files::FilesBackend, realsense::RealsenseBackend, synthetic::SyntheticBackend};
+    use depthrig_drivers::{
+        files::FilesBackend, realsense::RealsenseBackend, synthetic::SyntheticBackend, v4l2::V4l2Backend,
+    };
     Ok(match config {
         // One beginning for all cameras of the rig, or each would see the world at another moment.
         BackendConfig::Synthetic(c) => Box::new(SyntheticBackend::starting_at(vec![c.clone()], began)?),
         BackendConfig::Files(c) => Box::new(FilesBackend::new(c.clone())),
         BackendConfig::Realsense(c) => Box::new(RealsenseBackend::new(c.clone())),
+        BackendConfig::V4l2(c) => Box::new(V4l2Backend::new(c.clone())),
     })
 }
 

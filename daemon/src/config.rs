@@ -13,10 +13,12 @@ mod rig;
 mod synthetic;
 #[cfg(test)]
 mod tests;
+mod v4l2;
 
 pub use depthrig_drivers::files::FilesConfig as FilesSettings;
 pub use depthrig_drivers::realsense::RealsenseConfig as RealsenseSettings;
 pub use depthrig_drivers::synthetic::SyntheticConfig as SyntheticSettings;
+pub use depthrig_drivers::v4l2::V4l2Config as V4l2Settings;
 pub use depthrig_recorder::{ColorCodec, DepthCodec};
 pub use error::{ConfigError, Problem};
 
@@ -165,6 +167,8 @@ pub enum BackendConfig {
     Files(FilesSettings),
     /// A RealSense D400.
     Realsense(RealsenseSettings),
+    /// A camera at the kernel's video nodes.
+    V4l2(V4l2Settings),
 }
 
 impl BackendConfig {
@@ -174,6 +178,7 @@ impl BackendConfig {
             Self::Synthetic(_) => "synthetic",
             Self::Files(_) => "files",
             Self::Realsense(_) => depthrig_drivers::realsense::NAME,
+            Self::V4l2(_) => "v4l2",
         }
     }
 
@@ -185,6 +190,9 @@ impl BackendConfig {
                 // Asked who it is, a camera need not be calibrated.
                 let settings = RealsenseSettings { port, allow_uncalibrated: true, ..<_>::default() };
                 Some(Self::Realsense(settings))
+            }
+            crate::attached::Family::Uvc | crate::attached::Family::Platform => {
+                Some(Self::V4l2(V4l2Settings { port, ..<_>::default() }))
             }
             _ => None,
         }

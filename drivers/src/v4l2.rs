@@ -23,6 +23,7 @@
 
 use crate::usb::SysRoot;
 use crate::{Backend, Device, DeviceInfo, Result};
+use std::path::PathBuf;
 
 mod config;
 pub mod controls;
@@ -60,6 +61,16 @@ impl V4l2Backend {
     /// A back end for the one camera of `config`. Nothing is opened before it is asked for.
     pub fn new(config: V4l2Config) -> Self {
         Self { config, root: SysRoot::default() }
+    }
+
+    /// The nodes that the camera's pictures come from, for tools that look beside the back end. The numbers change
+    /// with every plug.
+    ///
+    /// # Errors
+    /// Those of [`Backend::open`].
+    pub fn nodes(&self) -> Result<Vec<PathBuf>> {
+        let found = find::choose(&find::cameras(&self.root)?, &self.config, None)?;
+        Ok(found.open(&self.root)?.iter().map(|pair| pair.video.path().to_owned()).collect())
     }
 }
 

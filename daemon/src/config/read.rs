@@ -276,7 +276,7 @@ impl<'r, 't> Section<'r, 't> {
     }
 }
 
-fn describe(value: &DeValue<'_>) -> String {
+pub(super) fn describe(value: &DeValue<'_>) -> String {
     match value {
         DeValue::String(s) => format!("the string \"{s}\""),
         DeValue::Integer(i) => format!("the number {i}"),

@@ -382,3 +382,107 @@ proptest::proptest! {
         }
     }
 }
+
+#[test]
+fn a_v4l2_camera_is_read_with_all_its_keys() {
+    use depthrig_drivers::v4l2::{ClockChoice, ControlValue, MemoryChoice, MjpegChoice};
+    let rig = parse(
+        r#"
+        rig = "lab"
+        [[camera]]
+        name = "a"
+        backend = "v4l2"
+        port = "1-2"
+        memory = "userptr"
+        mjpeg = "keep"
+        clock = "kernel"
+        device_clock_hz = 48_000_000
+        depth_unit_m = 0.0001
+        buffers = 6
+        controls = { gain = 0x10, "White Balance, Automatic" = false, auto_exposure = "Manual Mode" }
+        stream = [{ name = "color", rate_hz = 15 }]
+        [[camera.intrinsics]]
+        stream = "color"
+        width = 640
+        height = 480
+        fx = 500
+        fy = 501.5
+        cx = 320
+        cy = 240
+        model = "rational"
+        coefficients = [1, 2, 3, 4, 5, 6, 7, 8]
+        [[camera]]
+        name = "b"
+        backend = "v4l2"
+        "#,
+    )
+    .unwrap();
+    let BackendConfig::V4l2(a) = &rig.cameras[0].backend else { panic!("{:?}", rig.cameras[0]) };
+    let chosen = (a.memory, a.mjpeg, a.clock);
+    assert_eq!(chosen, (MemoryChoice::UserPointer, MjpegChoice::Keep, ClockChoice::Kernel));
+    assert_eq!((a.serial.as_deref(), a.port.as_deref()), (None, Some("1-2")));
+    assert_eq!((a.device_clock_hz, a.depth_unit_m, a.buffers), (Some(48_000_000), 0.0001, 6));
+    let has = |name: &str, value: ControlValue| a.controls.contains(&(name.to_owned(), value));
+    assert!(has("gain", ControlValue::Integer(16)));
+    assert!(has("White Balance, Automatic", ControlValue::Boolean(false)));
+    assert!(has("auto_exposure", ControlValue::Item("Manual Mode".into())));
+    let given = &a.intrinsics[0];
+    assert_eq!((given.width, given.height, given.intrinsics.fy), (640, 480, 501.5));
+    assert_eq!(given.intrinsics.coeffs, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]);
+    assert_eq!(given.intrinsics.distortion(), depthrig_bus::Distortion::Rational);
+    assert_eq!(rig.cameras[1].backend, BackendConfig::V4l2(V4l2Settings::default()));
+}
+
+#[test]
+fn every_problem_of_a_v4l2_camera_is_named_at_its_line() {
+    let found = problems(
+        r#"rig = "lab"
+[[camera]]
+name = "a"
+backend = "v4l2"
+serial = ""
+memory = "dma"
+buffers = 9
+device_clock_hz = 10
+depth_unit_m = 0
+model = "d435"
+[camera.controls]
+gain = 1.5
+[[camera.intrinsics]]
+stream = "color"
+width = 640
+height = 0
+fx = -1
+fy = 500
+cx = 320
+cy = 240
+model = "brown_conrady"
+coefficients = [0, 0, 0, 0, 0, 0]
+"#,
+    );
+    let said = |line: usize, what: &str| {
+        let place = format!(":{line}:");
+        assert!(found.iter().any(|p| p.contains(&place) && p.contains(what)), "{line} {what}: {found:#?}");
+    };
+    said(5, "is empty");
+    said(6, "it is one of: mmap, userptr");
+    said(7, "must be within 2 and 8");
+    said(8, "must be within 1000 and 1000000000");
+    said(9, "must be above 0");
+    said(10, "unknown key \"model\"");
+    said(12, "must be a whole number, true, false or the name of an item");
+    said(16, "must be within 1 and 16384");
+    said(17, "must be above 0");
+    said(22, "has 6 values; this model has 5");
+}
+
+#[test]
+fn a_rig_of_v4l2_cameras_is_not_faster_than_its_streams() {
+    let text = |rate: &str| {
+        format!(
+            "rig = \"lab\"\nsets.rate_hz = 20\n[[camera]]\nname = \"a\"\nbackend = \"v4l2\"\nstream = [{{ name = \"color\"{rate} }}]"
+        )
+    };
+    assert!(problems(&text(", rate_hz = 15")).iter().any(|p| p.contains("the fastest camera gives 15")));
+    assert!(parse(&text("")).is_ok(), "the camera decides");
+}

@@ -66,6 +66,9 @@ fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
             port: c.port.as_deref(),
             libusb: c.transport == TransportChoice::Libusb,
         }),
+        BackendConfig::V4l2(c) => {
+            Some(Wanted { serial: c.serial.as_deref(), port: c.port.as_deref(), libusb: false })
+        }
     }
 }
 
@@ -142,7 +145,9 @@ fn plan_made(camera: &CameraConfig) -> Planned {
                 (format!("pictures of {}", device.info().port), device.profiles().to_vec())
             }
             // Devices are planned with what is attached.
-            BackendConfig::Realsense(_) => (camera.backend.name().to_owned(), Vec::new()),
+            BackendConfig::Realsense(_) | BackendConfig::V4l2(_) => {
+                (camera.backend.name().to_owned(), Vec::new())
+            }
         })
     };
     let chosen = profiles().and_then(|(device, all)| {

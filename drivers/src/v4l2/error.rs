@@ -13,9 +13,7 @@ pub(super) fn node_error(path: &Path, what: &str, e: io::Error) -> Error {
         Some(Errno::ACCESS | Errno::PERM) => (ErrorKind::PermissionDenied, crate::usb::health::RULE_CURE),
         Some(Errno::BUSY) => (ErrorKind::Busy, "another process streams from it; end that process"),
         Some(Errno::NODEV | Errno::NXIO) => (ErrorKind::Disconnected, "the camera was unplugged"),
-        Some(Errno::INVAL | Errno::NOTTY | Errno::OPNOTSUPP) => {
-            (ErrorKind::Unsupported, "its driver cannot do that")
-        }
+        Some(Errno::NOTTY | Errno::OPNOTSUPP) => (ErrorKind::Unsupported, "its driver cannot do that"),
         Some(Errno::NOSPC) => (
             ErrorKind::Io,
             "the USB bus has no bandwidth left for it; use a smaller mode or another USB controller",

@@ -93,6 +93,11 @@ impl Found {
         }
     }
 
+    /// Whether this is its port: of a camera on no USB also the kernel's name of the device, such as `vivid.0`.
+    fn is_at(&self, port: &str) -> bool {
+        self.info.port == port || (self.usb.is_none() && self.nodes.iter().any(|n| n.parent == port))
+    }
+
     /// The family that has a driver of its own for it.
     pub(super) fn family(&self) -> Option<&'static str> {
         self.usb.as_ref().and_then(|u| family(u.vendor_id))
@@ -154,7 +159,7 @@ pub(super) fn choose(found: &[Found], config: &V4l2Config, serial: Option<&str>)
     let named = serial.is_some() || port.is_some();
     let fits = |f: &Found| {
         serial.is_none_or(|s| f.info.serial == s)
-            && port.is_none_or(|p| f.info.port == p)
+            && port.is_none_or(|p| f.is_at(p))
             && (named || f.family().is_none())
     };
     let mut fitting = found.iter().filter(|f| fits(f));

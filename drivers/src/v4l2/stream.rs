@@ -167,11 +167,13 @@ fn mapped(
         }
     };
     let clocks: Vec<LaneClock> = (0..profiles.len()).map(clock).collect();
-    let unused =
-        clocks.iter().zip(&samples).any(|(c, s)| !matches!(c, LaneClock::Device { .. }) && !s.is_empty());
-    if unused {
+    let is_unused =
+        |(c, s): &(&LaneClock, &Vec<Sample>)| !matches!(c, LaneClock::Device { .. }) && !s.is_empty();
+    if let Some((_, seen)) = clocks.iter().zip(&samples).find(is_unused) {
+        let measured_hz = tick::measured_hz(seen).unwrap_or(f64::NAN).round();
         tracing::info!(
             camera = name,
+            measured_hz,
             "the clock in its payload headers ticks neither as its descriptor says nor in microseconds; the kernel's \
              stamps are used (device_clock_hz in the rig file names its frequency)"
         );

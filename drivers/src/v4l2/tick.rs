@@ -23,9 +23,8 @@ pub(super) struct Sample {
     pub(super) host: HostTime,
 }
 
-/// The frequency of the clock that gave `samples`, out of `named` and a million; `None` when it is neither, or when
-/// there is too little to tell.
-pub(super) fn frequency_hz(samples: &[Sample], named: Option<u32>) -> Option<u32> {
+/// Ticks a second in `samples`; `None` when there is too little to tell.
+pub(super) fn measured_hz(samples: &[Sample]) -> Option<f64> {
     let (first, last) = (samples.first()?, samples.last()?);
     let span_ns = last.host.since_ns(first.host);
     if samples.len() < 3 || span_ns < SPAN_NS {
@@ -34,7 +33,13 @@ pub(super) fn frequency_hz(samples: &[Sample], named: Option<u32>) -> Option<u32
     // Pairwise, so that a counter of 32 bits may wrap once between any two.
     let steps = samples.iter().zip(samples.get(1..)?);
     let ticks: u64 = steps.map(|(a, b)| u64::from(b.ticks.wrapping_sub(a.ticks))).sum();
-    let measured = ticks as f64 * 1e9 / span_ns as f64;
+    Some(ticks as f64 * 1e9 / span_ns as f64)
+}
+
+/// The frequency of the clock that gave `samples`, out of `named` and a million; `None` when it is neither, or when
+/// there is too little to tell.
+pub(super) fn frequency_hz(samples: &[Sample], named: Option<u32>) -> Option<u32> {
+    let measured = measured_hz(samples)?;
     let near = |hz: &u32| (measured / f64::from(*hz) - 1.0).abs() <= TOLERANCE;
     named.filter(|hz| *hz > 0).into_iter().chain([MICROSECONDS_HZ]).find(near)
 }

@@ -1,6 +1,7 @@
 //! `depthrig bench`: measures what depthrig promises about speed.
 
 use crate::bench::bus::{self, Plan, report};
+use crate::bench::capture;
 use crate::context::Context;
 use crate::exit::Exit;
 use crate::out;
@@ -8,6 +9,7 @@ use crate::progress::Progress;
 use anyhow::Result;
 use core::time::Duration;
 use depthrig_bus::RuntimeDir;
+use depthrig_drivers::v4l2::V4l2Config;
 use depthrig_recorder::bench::soak::{self, SoakOptions, SoakReport};
 use depthrig_recorder::bench::{BenchOptions, BenchReport, Conditions};
 use std::path::PathBuf;
@@ -21,6 +23,7 @@ Examples:
   depthrig bench bus --quick     half a minute, to see that it works
   depthrig bench bus --check     exit code 1 when a promise is not kept
   depthrig bench record --json
+  depthrig bench capture --port 1-2 --check
   depthrig bench soak --check    ten minutes of recording as fast as it goes; 12 GB of disk, removed again";
 
 /// What to measure.
@@ -30,6 +33,8 @@ pub enum BenchCommand {
     Bus(BenchArgs),
     /// Recording seven cameras at 5 Hz: CPU, lost sets, and how fast the writer can be
     Record(RecordArgs),
+    /// Taking pictures from a camera at the kernel's nodes: CPU beside a bare loop, and copies
+    Capture(CaptureArgs),
     /// A long recording, faster than real time: memory must stay where it is and every set be accounted for
     Soak(SoakArgs),
 }
@@ -65,6 +70,29 @@ pub struct RecordArgs {
     bench: BenchArgs,
 }
 
+/// Which camera, and what of it.
+#[derive(Debug, clap::Args)]
+pub struct CaptureArgs {
+    /// The camera's serial number; without it and --port, the only one there is
+    #[arg(long)]
+    serial: Option<String>,
+    /// The camera's port, as `depthrig cameras` shows it
+    #[arg(long)]
+    port: Option<String>,
+    /// Pixels per row
+    #[arg(long, default_value_t = 1280)]
+    width: u32,
+    /// Rows
+    #[arg(long, default_value_t = 720)]
+    height: u32,
+    /// Frame rate
+    #[arg(long, value_name = "HZ", default_value_t = 30.0)]
+    rate_hz: f64,
+    /// How much, and in which form
+    #[command(flatten)]
+    bench: BenchArgs,
+}
+
 /// How long to record.
 #[derive(Debug, clap::Args)]
 pub struct SoakArgs {
@@ -88,7 +116,27 @@ pub fn run(command: &BenchCommand, context: &Context) -> Result<Exit> {
         BenchCommand::Bus(args) => run_bus(args, context),
         BenchCommand::Record(args) => run_record(args),
         BenchCommand::Soak(args) => run_soak(args, context),
+        BenchCommand::Capture(args) => run_capture(args, context),
     }
+}
+
+fn run_capture(args: &CaptureArgs, context: &Context) -> Result<Exit> {
+    let folder = crate::context::private_folder()?;
+    let runtime = RuntimeDir::at(folder.path())?;
+    let camera = V4l2Config { serial: args.serial.clone(), port: args.port.clone(), ..V4l2Config::default() };
+    let (pictures, warm_up, rounds) = if args.bench.quick { (20, 10, 1) } else { (150, 30, 5) };
+    let size = (args.width, args.height);
+    let plan = capture::Plan { camera, size, rate_hz: args.rate_hz, pictures, warm_up, rounds };
+    let mut progress = Progress::new(context.global.quiet > 0);
+    let result = capture::run(&runtime, &plan, |what, done, total| progress.set(what, done, total))?;
+    progress.clear();
+    if args.bench.json {
+        out::json(&result)?;
+    } else {
+        out::line(capture::text(&result))?;
+    }
+    let kept = capture::bars(&result).iter().all(|bar| bar.kept);
+    Ok(if args.bench.check && !kept { Exit::Failed } else { Exit::Good })
 }
 
 fn run_bus(args: &BenchArgs, context: &Context) -> Result<Exit> {

@@ -9,6 +9,7 @@ mod feed;
 mod subject;
 mod system;
 mod tally;
+mod vivid;
 
 mod scenarios {
     pub mod daemon_smoke;
@@ -18,6 +19,10 @@ mod scenarios {
     pub mod realsense_calibration;
     pub mod realsense_clock;
     pub mod realsense_conformance;
+    pub mod v4l2_cost;
+    pub mod v4l2_daemon;
+    pub mod v4l2_faults;
+    pub mod v4l2_formats;
     pub mod vivid_smoke;
 }
 
@@ -50,6 +55,10 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::realsense_conformance::SCENARIO,
     scenarios::emulator_load::SCENARIO,
     scenarios::l515::SCENARIO,
+    scenarios::v4l2_formats::SCENARIO,
+    scenarios::v4l2_faults::SCENARIO,
+    scenarios::v4l2_cost::SCENARIO,
+    scenarios::v4l2_daemon::SCENARIO,
 ];
 
 fn main() -> anyhow::Result<ExitCode> {

@@ -1,0 +1,121 @@
+//! The keys of a `v4l2` camera.
+
+use super::V4l2Settings;
+use super::read::{Found, Section};
+use super::rig::within;
+use depthrig_bus::{Distortion, Intrinsics, StreamName};
+use depthrig_drivers::v4l2::{
+    BUFFERS, ClockChoice, ControlValue, GivenIntrinsics, MemoryChoice, MjpegChoice,
+};
+
+const MEMORY: [(&str, MemoryChoice); 2] =
+    [("mmap", MemoryChoice::Mmap), ("userptr", MemoryChoice::UserPointer)];
+const MJPEG: [(&str, MjpegChoice); 2] = [("decode", MjpegChoice::Decode), ("keep", MjpegChoice::Keep)];
+const CLOCK: [(&str, ClockChoice); 2] = [("auto", ClockChoice::Auto), ("kernel", ClockChoice::Kernel)];
+
+/// Reads the settings of a camera at the kernel's video nodes.
+pub(super) fn read(s: &Section<'_, '_>) -> V4l2Settings {
+    let d = V4l2Settings::default();
+    let text = |key| {
+        s.or(key, None, |v: &Option<String>| match v {
+            Some(v) if v.is_empty() => Err("is empty".to_owned()),
+            _ => Ok(()),
+        })
+    };
+    V4l2Settings {
+        serial: text("serial"),
+        port: text("port"),
+        controls: controls(s),
+        memory: s.choice("memory", &MEMORY, d.memory),
+        mjpeg: s.choice("mjpeg", &MJPEG, d.mjpeg),
+        clock: s.choice("clock", &CLOCK, d.clock),
+        // A slower clock could not tell frames apart, and no camera has a faster one.
+        device_clock_hz: s.or("device_clock_hz", None, |v: &Option<u32>| {
+            v.map_or(Ok(()), |hz| within(1000..=1_000_000_000)(&hz))
+        }),
+        depth_unit_m: s.or("depth_unit_m", d.depth_unit_m, super::rig::above_zero(1.0)),
+        intrinsics: s
+            .tables("intrinsics", "[[camera.intrinsics]]")
+            .into_iter()
+            .flatten()
+            .filter_map(intrinsics)
+            .collect(),
+        buffers: s.or("buffers", d.buffers, within(BUFFERS)),
+    }
+}
+
+/// The controls by name. What a name may be only the camera knows.
+fn controls(camera: &Section<'_, '_>) -> Vec<(String, ControlValue)> {
+    let entries = camera.entries::<Value>("controls", "[camera.controls]");
+    entries.into_iter().map(|(name, found)| (name, found.value.0)).collect()
+}
+
+/// A [`ControlValue`] out of a rig file.
+struct Value(ControlValue);
+
+impl super::read::FromToml for Value {
+    fn from_toml(value: &toml::de::DeValue<'_>) -> Result<Self, String> {
+        use toml::de::DeValue;
+        Ok(Self(match value {
+            DeValue::Boolean(b) => ControlValue::Boolean(*b),
+            DeValue::String(item) => ControlValue::Item(item.to_string()),
+            DeValue::Integer(i) => match i64::from_str_radix(i.as_str(), i.radix()) {
+                Ok(i) => ControlValue::Integer(i),
+                Err(_) => return Err("must be a whole number of 64 bits".to_owned()),
+            },
+            other => {
+                let is = super::read::describe(other);
+                return Err(format!(
+                    "must be a whole number, true, false or the name of an item; it is {is}"
+                ));
+            }
+        }))
+    }
+}
+
+const MODELS: [(&str, Distortion); 5] = [
+    ("none", Distortion::None),
+    ("brown_conrady", Distortion::BrownConrady),
+    ("inverse_brown_conrady", Distortion::InverseBrownConrady),
+    ("kannala_brandt4", Distortion::KannalaBrandt4),
+    ("rational", Distortion::Rational),
+];
+
+fn intrinsics(s: Section<'_, '_>) -> Option<GivenIntrinsics> {
+    let stream = s.required::<StreamName>("stream", "\"color\"");
+    let side = |key, example| {
+        let found = s.required::<u32>(key, example);
+        found.filter(|f| check(&s, key, f, &within(1..=16_384)(&f.value))).map(|f| f.value)
+    };
+    let (width, height) = (side("width", "1280"), side("height", "720"));
+    let pixels = |key, example| {
+        let found = s.required::<f64>(key, example);
+        found.filter(|f| check(&s, key, f, &super::rig::above_zero(1e5)(&f.value))).map(|f| f.value)
+    };
+    let (fx, fy) = (pixels("fx", "910.5"), pixels("fy", "909.8"));
+    let (cx, cy) = (pixels("cx", "640.2"), pixels("cy", "361.7"));
+    let model = s.choice("model", &MODELS, Distortion::None);
+    let most = match model {
+        Distortion::Unknown | Distortion::None => 0,
+        Distortion::BrownConrady | Distortion::InverseBrownConrady => 5,
+        Distortion::KannalaBrandt4 => 4,
+        _ => 8,
+    };
+    let given = s.or("coefficients", Vec::<f64>::new(), |c| {
+        let n = c.len();
+        if n <= most { Ok(()) } else { Err(format!("has {n} values; this model has {most}")) }
+    });
+    let mut coeffs = [0.0; 8];
+    coeffs.iter_mut().zip(&given).for_each(|(to, from)| *to = *from);
+    s.finish();
+    let intrinsics = Intrinsics { coeffs, model: model as u32, ..Intrinsics::pinhole(fx?, fy?, cx?, cy?) };
+    Some(GivenIntrinsics { stream: stream?.value, width: width?, height: height?, intrinsics })
+}
+
+/// Whether `outcome` is good; if not, it is noted.
+fn check<T>(s: &Section<'_, '_>, key: &str, found: &Found<T>, outcome: &Result<(), String>) -> bool {
+    if let Err(why) = outcome {
+        s.problem(found.at, format!("{} {why}", s.key_of(key)));
+    }
+    outcome.is_ok()
+}
