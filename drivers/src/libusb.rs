@@ -25,6 +25,8 @@ mod camera;
 mod control;
 mod errors;
 mod frames;
+#[doc(hidden)]
+pub mod fuzzing;
 mod negotiate;
 mod source;
 mod stream;

@@ -5,5 +5,8 @@
 pub mod control;
 pub mod descriptors;
 pub mod formats;
+#[doc(hidden)]
+pub mod fuzzing;
 pub mod payload;
+pub mod picture;
 pub mod probe;

@@ -8,7 +8,7 @@ use crate::uvc::payload::{Flags, PayloadHeader};
 /// A frame, whole or not.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Assembled<'a> {
-    /// Its bytes as far as they came.
+    /// Its bytes as far as they came. Of a frame that is too long, one byte more than a frame has.
     pub bytes: &'a [u8],
     /// The header of its first payload; `None` when it had none.
     pub header: Option<&'a [u8]>,
@@ -109,9 +109,7 @@ impl Assembler {
             }
             let sequence = self.number(id);
             if ends && (last || (self.layout.fixed && data.len() >= self.layout.frame_bytes)) {
-                let too_long = data.len() > self.layout.frame_bytes;
-                let bytes = data.get(..self.layout.frame_bytes).unwrap_or(data);
-                let damaged = damaged || too_long;
+                let bytes = data.get(..=self.layout.frame_bytes).unwrap_or(data);
                 each(&Assembled { bytes, header: Some(header.bytes), damaged, sequence });
                 return;
             }
@@ -162,9 +160,10 @@ impl Assembler {
     }
 
     fn append(&mut self, data: &[u8]) {
-        let Some(open) = &mut self.open else { return };
-        let room = self.layout.frame_bytes.saturating_sub(self.frame.len());
-        open.damaged |= data.len() > room;
+        if self.open.is_none() {
+            return;
+        }
+        let room = (self.layout.frame_bytes + 1).saturating_sub(self.frame.len());
         let data = data.get(..room).unwrap_or(data);
         self.frame.extend_from_slice(data);
         self.copied += data.len() as u64;

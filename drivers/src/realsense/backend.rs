@@ -95,7 +95,7 @@ impl RealsenseBackend {
             TransportChoice::Auto => Kernel::has_bound(found),
         };
         if !by_kernel {
-            return libusb::open(found);
+            return libusb::open(&self.root, found);
         }
         let wish = match self.config.metadata {
             _ if self.memory.is_mute() => MetadataWish::None,

@@ -16,6 +16,7 @@ mod scenarios {
     pub mod emulator;
     pub mod emulator_load;
     pub mod l515;
+    pub mod libusb;
     pub mod realsense_calibration;
     pub mod realsense_clock;
     pub mod realsense_conformance;
@@ -59,6 +60,10 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::v4l2_faults::SCENARIO,
     scenarios::v4l2_cost::SCENARIO,
     scenarios::v4l2_daemon::SCENARIO,
+    scenarios::libusb::SCENARIO,
+    scenarios::libusb::END,
+    scenarios::libusb::SEVEN,
+    scenarios::realsense_conformance::LIBUSB,
 ];
 
 fn main() -> anyhow::Result<ExitCode> {

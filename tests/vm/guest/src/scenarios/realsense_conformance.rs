@@ -1,4 +1,4 @@
-//! The conformance suite on an emulated D435 behind the kernel's own driver.
+//! The conformance suite on an emulated D435, behind the kernel's own driver and through libusb.
 
 use crate::checks::Checks;
 use crate::subject::EmulatedD400;
@@ -15,13 +15,31 @@ pub const SCENARIO: Scenario = Scenario {
     run,
 };
 
-/// What this transport cannot show, and no more.
+/// The same through libusb.
+pub const LIBUSB: Scenario = Scenario {
+    name: "libusb-conformance",
+    about: "the conformance suite on a D435 through libusb",
+    cost: 40,
+    limit_s: 300,
+    run: through_libusb,
+};
+
+/// What each transport cannot show, and no more.
 const NOT_APPLICABLE: [&str; 5] = ["half_frame", "wrong_size", "damaged", "repeated", "hang"];
+const NOT_THROUGH_LIBUSB: [&str; 1] = ["hang"];
 
 fn run(checks: &mut Checks) -> anyhow::Result<()> {
+    over(checks, TransportChoice::Kernel, &NOT_APPLICABLE)
+}
+
+fn through_libusb(checks: &mut Checks) -> anyhow::Result<()> {
+    over(checks, TransportChoice::Libusb, &NOT_THROUGH_LIBUSB)
+}
+
+fn over(checks: &mut Checks, transport: TransportChoice, cannot: &[&str]) -> anyhow::Result<()> {
     system::modprobe("vhci-hcd", &[])?;
     system::modprobe("uvcvideo", &[])?;
-    let subject = EmulatedD400 { model: "d435", transport: TransportChoice::Kernel };
+    let subject = EmulatedD400 { model: "d435", transport };
     let mut not_applicable = Vec::new();
     // One by one, so that each is reported when it is done.
     for case in conformance::cases() {
@@ -37,6 +55,6 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
             }
         }
     }
-    checks.equal("what this transport cannot show", not_applicable, NOT_APPLICABLE);
+    checks.equal("what this transport cannot show", not_applicable, cannot);
     Ok(())
 }

@@ -1,0 +1,35 @@
+//! What the fuzz target `uvc_payload` calls beside the header itself: transfers of a stream with any bytes.
+
+use super::frames::{Assembler, Layout};
+
+const FRAME: usize = 64;
+
+/// Feeds transfers to a stream's assembler: the first byte says what frames are like, then each transfer is a byte of
+/// length, one with a flag, and its bytes. The number of frames that came of it.
+///
+/// # Panics
+/// When a frame has more bytes than it may have, or their numbers do not rise.
+pub fn transfers(bytes: &[u8]) -> u64 {
+    let Some((&kind, mut rest)) = bytes.split_first() else { return 0 };
+    let layout =
+        Layout { frame_bytes: FRAME, fixed: kind & 1 == 1, payload_bytes: usize::from(kind >> 1) + 12 };
+    let mut assembler = Assembler::new(layout);
+    let (mut frames, mut last) = (0, None);
+    while let [length, flags, tail @ ..] = rest {
+        let (transfer, next) = tail.split_at(usize::from(*length).min(tail.len()));
+        rest = next;
+        let mut each = |frame: &super::frames::Assembled<'_>| {
+            assert!(frame.bytes.len() <= FRAME + 1, "{} bytes", frame.bytes.len());
+            assert!(last < Some(frame.sequence), "{last:?}, then {}", frame.sequence);
+            assert!(frame.header.is_none_or(|h| h.len() >= 2));
+            last = Some(frame.sequence);
+            frames += 1;
+        };
+        match flags & 0x0F {
+            0x0E => assembler.broken(&mut each),
+            0x0F => assembler.restart(&mut each),
+            _ => assembler.take(transfer, flags & 0x10 != 0, &mut each),
+        }
+    }
+    frames
+}
