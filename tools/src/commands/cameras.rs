@@ -5,6 +5,7 @@ use crate::exit::Exit;
 use crate::{out, screen};
 use anyhow::Result;
 use depthrig_daemon::attached::{Attached, AttachedCamera, ModeReport, System, UseState, look};
+use depthrig_drivers::realsense::{RealsenseBackend, RealsenseConfig};
 use depthrig_drivers::usb::SysRoot;
 use std::path::PathBuf;
 
@@ -16,6 +17,7 @@ Exit code 3 when a camera cannot be used, or something could not be asked.
 Examples:
   depthrig cameras
   depthrig cameras --modes D435        what can be written into [[camera.stream]]
+  depthrig cameras --reset 012345678901
   depthrig cameras --json | jq '.cameras[] | {model, serial, port, state}'";
 
 /// Arguments.
@@ -30,6 +32,9 @@ pub struct CamerasArgs {
     /// Show nodes, formats and controller of each
     #[arg(long)]
     nodes: bool,
+    /// Restart the RealSense D400 with this serial number, also one that is in use; its rig sees it go and come back
+    #[arg(long, value_name = "SERIAL", conflicts_with_all = ["only", "modes", "nodes", "json"])]
+    reset: Option<String>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -40,6 +45,12 @@ pub struct CamerasArgs {
 
 /// Looks and tells.
 pub fn run(args: &CamerasArgs, context: &Context) -> Result<Exit> {
+    if let Some(serial) = &args.reset {
+        let camera = RealsenseBackend::new(RealsenseConfig::default()).reset(Some(serial))?;
+        let (model, serial, port) = (camera.model, camera.serial, camera.port);
+        out::line(format_args!("{model} {serial} at USB port {port} restarts and is back in some seconds"))?;
+        return Ok(Exit::Good);
+    }
     let ask = System { runtime: context.runtime().ok() };
     let mut attached = look(&SysRoot::new(&args.sys_root), &ask)?;
     if let Some(part) = &args.only {

@@ -225,7 +225,7 @@ pub fn depth_unit_m(monitor: &mut dyn HardwareMonitor, product_id: u16) -> Resul
         return Ok((default_depth_unit_m(product_id), UnitOrigin::Model));
     }
     match DepthTable::read(monitor, Bound::Current)?.unit_um {
-        um @ 1..=1_000_000 => Ok((f64::from(um) * 1e-6, UnitOrigin::Camera)),
+        um @ 1..=1_000_000 => Ok((f64::from(um) / 1e6, UnitOrigin::Camera)),
         um => Err(protocol_error(format!("the camera says that its unit of depth is {um} µm"))),
     }
 }
@@ -255,7 +255,7 @@ pub fn set_depth_unit_m(monitor: &mut dyn HardwareMonitor, unit_m: f64) -> Resul
             "the unit of depth was set to {must} µm and the camera says {is} µm"
         )));
     }
-    Ok(f64::from(before.unit_um) * 1e-6)
+    Ok(f64::from(before.unit_um) / 1e6)
 }
 
 /// An error that says how to switch advanced mode on, where it is off.

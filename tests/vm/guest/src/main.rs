@@ -24,6 +24,7 @@ mod scenarios {
     pub mod v4l2_daemon;
     pub mod v4l2_faults;
     pub mod v4l2_formats;
+    pub mod realsense_control;
     pub mod vivid_smoke;
 }
 
@@ -64,6 +65,7 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::libusb::END,
     scenarios::libusb::SEVEN,
     scenarios::realsense_conformance::LIBUSB,
+    scenarios::realsense_control::SCENARIO,
 ];
 
 fn main() -> anyhow::Result<ExitCode> {
