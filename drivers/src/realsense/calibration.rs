@@ -104,9 +104,11 @@ impl Calibration {
         let sizes = match RectifiedItem::read_all(monitor) {
             Ok(sizes) => sizes,
             // Firmware before 5.11.9.5 has the table of coefficients alone.
-            Err(e)
-                if matches!(e.kind(), ErrorKind::Unsupported | ErrorKind::NotFound | ErrorKind::Protocol) =>
-            {
+            Err(e) if matches!(e.kind(), ErrorKind::Unsupported | ErrorKind::NotFound) => Vec::new(),
+            Err(e) if e.kind() == ErrorKind::Protocol => {
+                tracing::warn!(
+                    "its list of intrinsics by size is of no use, the table of coefficients is taken: {e}"
+                );
                 Vec::new()
             }
             Err(e) => return Err(e),

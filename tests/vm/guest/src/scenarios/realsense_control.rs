@@ -187,13 +187,17 @@ fn accounts(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
     let mut tally = Tally::default();
     tally.poll_for(stream.as_mut(), SECOND)?;
     for (damage, frames) in
-        [(Damage::Skip, 3), (Damage::ErrorBit, 2), (Damage::Short, 2), (Damage::Long, 1), (Damage::Skip, 1)]
+        [(Damage::Skip, 2), (Damage::ErrorBit, 2), (Damage::Short, 2), (Damage::Long, 1), (Damage::Skip, 2)]
     {
         for stream in STREAMS {
             camera.fault(Fault::Frames { stream: stream.to_owned(), damage, frames })?;
         }
         tally.poll_for(stream.as_mut(), SECOND)?;
     }
+    // What it does not send from here on, nobody can miss. An odd number of skipped frames would cost one more: the
+    // emulator's frame bit follows its counter, and uvcvideo takes two alike for one frame.
+    let skipped: Vec<_> =
+        STREAMS.iter().map(|s| camera.accounts(s).map(|a| a.skipped)).collect::<Result<_, _>>()?;
     // The camera falls silent, and whatever is on its way arrives.
     camera.fault(Fault::Silence)?;
     tally.poll_for(stream.as_mut(), SECOND)?;
@@ -202,7 +206,7 @@ fn accounts(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
         let good = now.good - then.good;
         checks.equal(&format!("{name}: delivered are all that came whole"), tally.of(i).count() as u64, good);
         let damaged = (now.error_bit - then.error_bit) + (now.short - then.short) + (now.long - then.long);
-        let skipped = now.skipped - then.skipped;
+        let skipped = skipped[i] - then.skipped;
         checks.equal(&format!("{name}: the camera spoiled and skipped"), (damaged, skipped), (5, 4));
         let lost = tally.drops.get(i).map_or(0, |d| d.total());
         checks.equal(&format!("{name}: lost are all the others"), lost, damaged + skipped);
