@@ -20,11 +20,11 @@ mod scenarios {
     pub mod realsense_calibration;
     pub mod realsense_clock;
     pub mod realsense_conformance;
+    pub mod realsense_control;
     pub mod v4l2_cost;
     pub mod v4l2_daemon;
     pub mod v4l2_faults;
     pub mod v4l2_formats;
-    pub mod realsense_control;
     pub mod vivid_smoke;
 }
 
