@@ -54,6 +54,8 @@ pub struct AttachedCamera {
     pub controller: Option<String>,
     /// Whether it can be used, and if not why.
     pub state: UseState,
+    /// Whether the kernel may put it to sleep; `None` on no USB.
+    pub may_sleep: Option<bool>,
     /// Processes that have it open.
     pub held_by: Vec<HeldBy>,
     /// The rig and camera that it is in a running rig of this user.
@@ -181,7 +183,12 @@ impl AttachedCamera {
 pub fn look(root: &SysRoot, ask: &dyn Ask) -> crate::Result<Attached> {
     let devices = scan(root)?;
     let (rigs, mut not_asked) = ask.rigs();
-    let (candidates, unusable) = classify::cameras(&devices, video_nodes(root)?);
+    // One driver may have many cameras below one device; only the node says which it is of.
+    let platform = video_nodes(root)?.into_iter().map(|node| match ask.node(&node.path) {
+        Ok(facts) => (facts.bus, node),
+        Err(_) => (node.parent.clone(), node),
+    });
+    let (candidates, unusable) = classify::cameras(&devices, platform);
     let cameras: Vec<_> = candidates.into_iter().map(|c| camera(root, ask, &rigs, c)).collect();
     for c in cameras.iter().filter(|c| c.state == UseState::Denied) {
         not_asked.push(format!("{}: this user may not open it; {}", c.describe(), health::RULE_CURE));
@@ -220,7 +227,6 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
     let in_rig = rigs.iter().find_map(|rig| Some((rig, in_rig(rig, &c)?)));
     // Without the right to see every process, a busy node is the only sign of who streams.
     let in_use = in_rig.is_some() || !holders.others.is_empty() || (holders.hidden > 0 && used_elsewhere);
-    let usb_problems = c.usb.iter().flat_map(|d| [health::slow_link(d), health::may_sleep(d)]);
     let mut found = AttachedCamera {
         backend: c.family.backend(),
         model: c.model,
@@ -232,12 +238,13 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
         usb_mbps: c.usb.as_ref().map(|d| d.speed_mbps),
         controller: c.usb.as_ref().map(|d| d.controller.clone()),
         state: UseState::Free,
+        may_sleep: c.usb.as_ref().map(|d| health::may_sleep(d).is_some()),
         held_by: holders.others.into_iter().map(HeldBy::from).collect(),
         rig: in_rig.map(|(rig, camera)| format!("\"{}\", camera \"{}\"", rig.rig, camera.name)),
         kernel_metadata: metadata,
         nodes,
         modes: Vec::new(),
-        problems: usb_problems.flatten().collect(),
+        problems: c.usb.as_ref().and_then(health::slow_link).into_iter().collect(),
         usb: c.usb,
         family: c.family,
         profiles: Vec::new(),

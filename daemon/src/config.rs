@@ -181,22 +181,6 @@ impl BackendConfig {
             Self::V4l2(_) => "v4l2",
         }
     }
-
-    /// The driver of a family with nothing but defaults, for the camera at a port; `None` when there is no driver.
-    pub fn at_port(family: crate::attached::Family, port: &str) -> Option<Self> {
-        let port = Some(port.to_owned());
-        match family {
-            crate::attached::Family::D400 => {
-                // Asked who it is, a camera need not be calibrated.
-                let settings = RealsenseSettings { port, allow_uncalibrated: true, ..<_>::default() };
-                Some(Self::Realsense(settings))
-            }
-            crate::attached::Family::Uvc | crate::attached::Family::Platform => {
-                Some(Self::V4l2(V4l2Settings { port, ..<_>::default() }))
-            }
-            _ => None,
-        }
-    }
 }
 
 impl Default for BusConfig {

@@ -83,7 +83,7 @@ fn judge(config: &RigConfig, attached: &Attached, plans: Vec<cameras::Planned>, 
     cameras::check_unnamed(attached, &plans, &mut findings);
     let links = bandwidth::loads(&plans, attached);
     bandwidth::check(&links, &mut findings);
-    bandwidth::check_usbfs(config, &plans, host, &mut findings);
+    bandwidth::check_usbfs(&plans, host, &mut findings);
     let disk = disk::check(config, &plans, host, &mut findings);
     let shm_needed_bytes = memory::check(config, &plans, host, &mut findings);
     host.check(config, &mut findings);

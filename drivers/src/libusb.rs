@@ -37,3 +37,8 @@ pub use camera::{Camera, give_to_kernel};
 pub use control::Port;
 pub use source::{Settings, Source, Statistics, StreamMode};
 pub use vendor::VendorBulk;
+
+/// What the kernel counts against its limit for `transfers` transfers of `bytes` bytes each.
+pub const fn transfer_memory(transfers: usize, bytes: usize) -> u64 {
+    budget::needed(transfers, bytes)
+}

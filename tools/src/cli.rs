@@ -168,9 +168,14 @@ pub enum Command {
 }
 
 impl Command {
-    /// Whether it runs until somebody ends it, so that its log is what one sees of it.
-    pub const fn runs_for_hours(&self) -> bool {
-        matches!(self, Self::Run(_))
+    /// By how much its log is louder than others': what runs until somebody ends it shows itself by its log, and what
+    /// tells all that is wrong in its output does not tell it twice.
+    pub const fn loudness(&self) -> i32 {
+        match self {
+            Self::Run(_) => 1,
+            Self::Cameras(_) | Self::Doctor(_) => -1,
+            _ => 0,
+        }
     }
 }
 

@@ -6,9 +6,9 @@ use std::io::IsTerminal;
 use tracing::level_filters::LevelFilter;
 use tracing_subscriber::fmt;
 
-/// Starts logging as `global` asks. A command that runs for hours tells what happens without being asked.
-pub fn start(global: &Global, runs_for_hours: bool) {
-    let level = level(global.verbose + u8::from(runs_for_hours), global.quiet);
+/// Starts logging as `global` asks, by `loudness` steps louder than usual.
+pub fn start(global: &Global, loudness: i32) {
+    let level = level(i32::from(global.verbose) - i32::from(global.quiet) + loudness);
     let no_color = std::env::var_os("NO_COLOR").is_some_and(|v| !v.is_empty());
     let color = wants_color(global.color, no_color, std::io::stderr().is_terminal());
     let logs = fmt().with_max_level(level).with_writer(std::io::stderr).with_target(global.verbose > 1);
@@ -19,8 +19,8 @@ pub fn start(global: &Global, runs_for_hours: bool) {
 }
 
 /// Warnings without an option; more with each `-v`, less with each `-q`.
-const fn level(verbose: u8, quiet: u8) -> LevelFilter {
-    match verbose as i32 - quiet as i32 {
+const fn level(loudness: i32) -> LevelFilter {
+    match loudness {
         ..=-2 => LevelFilter::OFF,
         -1 => LevelFilter::ERROR,
         0 => LevelFilter::WARN,
@@ -36,10 +36,10 @@ mod tests {
 
     #[test]
     fn levels() {
-        assert_eq!(level(0, 0), LevelFilter::WARN);
-        assert_eq!(level(1, 0), LevelFilter::INFO);
-        assert_eq!(level(9, 0), LevelFilter::TRACE);
-        assert_eq!(level(0, 1), LevelFilter::ERROR);
-        assert_eq!(level(0, 5), LevelFilter::OFF);
+        assert_eq!(level(0), LevelFilter::WARN);
+        assert_eq!(level(1), LevelFilter::INFO);
+        assert_eq!(level(9), LevelFilter::TRACE);
+        assert_eq!(level(-1), LevelFilter::ERROR);
+        assert_eq!(level(-5), LevelFilter::OFF);
     }
 }

@@ -24,7 +24,7 @@ use std::process::ExitCode;
 
 fn main() -> ExitCode {
     let cli = cli::Cli::parse(); // ends the process with 2 and a hint when the usage is wrong
-    logging::start(&cli.global, cli.command.runs_for_hours());
+    logging::start(&cli.global, cli.command.loudness());
     match commands::run(cli) {
         Ok(exit) => exit.into(),
         Err(error) => exit::report(&error).into(),

@@ -2,11 +2,13 @@
 
 use super::Family;
 use crate::client::Client;
-use crate::config::BackendConfig;
 use crate::status::RigStatus;
-use depthrig_bus::{HostTime, RuntimeDir};
-use depthrig_drivers::v4l2::Node;
-use depthrig_drivers::{DeviceInfo, Result, StreamProfile};
+use depthrig_bus::RuntimeDir;
+use depthrig_drivers::realsense::l515::{L515Backend, L515Config};
+use depthrig_drivers::realsense::{RealsenseBackend, RealsenseConfig};
+use depthrig_drivers::v4l2::{Node, V4l2Backend, V4l2Config};
+use depthrig_drivers::zed::{ZedBackend, ZedConfig};
+use depthrig_drivers::{Backend, Device, DeviceInfo, Result, StreamProfile};
 use std::path::Path;
 
 /// What is learned of a node by asking the kernel.
@@ -16,6 +18,8 @@ pub struct NodeFacts {
     pub role: &'static str,
     /// Its formats as V4L2 names them.
     pub formats: Vec<String>,
+    /// Where the kernel says that its device is, such as `platform:vivid-000`.
+    pub bus: String,
     /// Another process streams from it.
     pub used_elsewhere: bool,
 }
@@ -54,16 +58,28 @@ impl Ask for System {
         };
         let formats = if role == "other" { Vec::new() } else { node.formats()? };
         let formats = formats.iter().map(ToString::to_string).collect();
-        Ok(NodeFacts { role, formats, used_elsewhere: node.is_used_elsewhere() })
+        Ok(NodeFacts { role, formats, bus: c.bus.clone(), used_elsewhere: node.is_used_elsewhere() })
     }
 
     fn device(&self, family: Family, port: &str) -> Option<Result<(DeviceInfo, Vec<StreamProfile>)>> {
-        let config = BackendConfig::at_port(family, port)?;
-        let open = || {
-            let device = crate::camera::make_backend(&config, HostTime::now())?.open(None)?;
-            Ok((device.info().clone(), device.profiles().to_vec()))
+        let port = Some(port.to_owned());
+        let backend: Box<dyn Backend> = match family {
+            Family::D400 => {
+                Box::new(RealsenseBackend::new(RealsenseConfig {
+                    port,
+                    // Listed all the same, with the calibration `none`.
+                    allow_uncalibrated: true,
+                    ..RealsenseConfig::default()
+                }))
+            }
+            Family::Zed => Box::new(ZedBackend::new(ZedConfig { port, ..ZedConfig::default() })),
+            Family::Uvc | Family::Platform => {
+                Box::new(V4l2Backend::new(V4l2Config { port, ..V4l2Config::default() }))
+            }
+            Family::L515 => Box::new(L515Backend::new(L515Config { port, ..L515Config::default() })),
         };
-        Some(open())
+        let told = |device: Box<dyn Device>| (device.info().clone(), device.profiles().to_vec());
+        Some(backend.open(None).map(told))
     }
 
     fn rigs(&self) -> (Vec<RigStatus>, Vec<String>) {

@@ -32,7 +32,8 @@ impl Family {
     /// The driver's name in a rig file.
     pub const fn backend(self) -> &'static str {
         match self {
-            Self::D400 | Self::L515 => "realsense",
+            Self::D400 => "realsense",
+            Self::L515 => "l515",
             Self::Zed => "zed",
             Self::Uvc | Self::Platform => "v4l2",
         }
@@ -49,8 +50,11 @@ pub(super) struct Candidate {
     pub(super) hidraw: Vec<PathBuf>,
 }
 
-/// The cameras among `devices` and `platform` nodes, and what is attached and of no use.
-pub(super) fn cameras(devices: &[UsbDevice], platform: Vec<VideoNode>) -> (Vec<Candidate>, Vec<String>) {
+/// The cameras among `devices` and `platform` nodes, each with where it is, and what is attached and of no use.
+pub(super) fn cameras(
+    devices: &[UsbDevice],
+    platform: impl Iterator<Item = (String, VideoNode)>,
+) -> (Vec<Candidate>, Vec<String>) {
     let mut cameras = Vec::new();
     let mut unusable = Vec::new();
     for d in devices {
@@ -67,13 +71,13 @@ pub(super) fn cameras(devices: &[UsbDevice], platform: Vec<VideoNode>) -> (Vec<C
             Err(why) => unusable.push(format!("{}: {why}", d.describe())),
         }
     }
-    for node in platform {
-        match cameras.iter_mut().find(|c| c.usb.is_none() && c.port == node.parent) {
+    for (place, node) in platform {
+        match cameras.iter_mut().find(|c| c.usb.is_none() && c.port == place) {
             Some(camera) => camera.nodes.push(node),
             None => cameras.push(Candidate {
                 family: Family::Platform,
                 model: node.name.clone(),
-                port: node.parent.clone(),
+                port: place,
                 usb: None,
                 nodes: vec![node],
                 hidraw: Vec::new(),

@@ -56,6 +56,7 @@ impl Ask for Made {
         Ok(NodeFacts {
             role: if number.is_multiple_of(2) { "pictures" } else { "metadata" },
             formats: formats.iter().map(ToString::to_string).collect(),
+            bus: if number < 60 { "platform:vivid-000".into() } else { "platform:vivid-001".into() },
             used_elsewhere: self.streaming.iter().any(|s| s == name),
         })
     }
@@ -232,13 +233,15 @@ fn families_are_told_apart_and_hubs_are_no_cameras() {
     let found = look_at(&devices, &Made::default(), |tree| {
         tree.platform_video("platform/vivid.0", 50, "vivid-000-vid-cap");
         tree.platform_video("platform/vivid.0", 51, "vivid-000-meta-cap");
+        tree.platform_video("platform/vivid.0", 60, "vivid-001-vid-cap");
     });
     let told: Vec<_> = found.cameras.iter().map(|c| (c.family, c.model.as_str(), c.port.as_str())).collect();
     let expected = [
         (Family::Zed, "ZED 2i", "4-4.1"),
         (Family::Uvc, "HD Webcam", "4-5"),
         (Family::L515, "L515", "4-6"),
-        (Family::Platform, "vivid-000-vid-cap", "vivid.0"),
+        (Family::Platform, "vivid-000-vid-cap", "platform:vivid-000"),
+        (Family::Platform, "vivid-001-vid-cap", "platform:vivid-001"),
     ];
     assert_eq!(told, expected);
     assert!(
@@ -255,7 +258,8 @@ fn how_a_camera_is_attached_is_complained_about() {
     let made = Made { no_d4xx: true, ..Made::default() };
     let found = look_at(&[slow], &made, |_| {});
     let problems = found.cameras[0].problems.join("\n");
-    assert!(problems.contains("USB2") && problems.contains("sleep"), "{problems}");
+    assert!(problems.contains("USB2") && problems.contains("USB port 3-1"), "{problems}");
+    assert_eq!(found.cameras[0].may_sleep, Some(true));
     assert_eq!(found.cameras[0].kernel_metadata, Some("header"));
 }
 

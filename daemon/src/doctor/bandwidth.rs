@@ -7,9 +7,9 @@ use super::cameras::CameraPlan;
 use super::finding::{Finding, Severity};
 use super::host::Host;
 use crate::attached::Attached;
-use crate::config::RigConfig;
 use depthrig_bus::PixelFormat;
 use depthrig_drivers::StreamProfile;
+use depthrig_drivers::libusb;
 use depthrig_drivers::usb::health;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -152,13 +152,7 @@ pub(super) fn check(links: &[LinkLoad], findings: &mut Vec<Finding>) {
 }
 
 /// The libusb path: the memory of its transfers against the kernel's limit.
-pub(super) fn check_usbfs(
-    config: &RigConfig,
-    plans: &[CameraPlan],
-    host: &Host,
-    findings: &mut Vec<Finding>,
-) {
-    let _ = config;
+pub(super) fn check_usbfs(plans: &[CameraPlan], host: &Host, findings: &mut Vec<Finding>) {
     let over: Vec<_> = plans.iter().filter(|p| p.libusb).collect();
     let needed: u64 = over.iter().flat_map(|p| &p.profiles).map(|(p, _)| transfer_bytes(p)).sum();
     if needed == 0 {
@@ -175,11 +169,8 @@ pub(super) fn check_usbfs(
     }
 }
 
-/// Transfers that the libusb path keeps in flight for one stream.
-const TRANSFERS: u64 = 8;
-
-/// Bytes of the transfers of one stream over libusb: each holds a picture with its header.
+/// What the kernel counts for the transfers of one stream over libusb: each holds a picture with its header.
 fn transfer_bytes(p: &StreamProfile) -> u64 {
-    let picture = wire_bits_per_s(p) / p.rate_hz / 8.0;
-    (picture as u64 + 1024) * TRANSFERS
+    let picture = (wire_bits_per_s(p) / p.rate_hz / 8.0) as usize;
+    libusb::transfer_memory(libusb::Settings::default().transfers(), picture + 1024)
 }

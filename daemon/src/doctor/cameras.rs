@@ -1,7 +1,7 @@
 //! The cameras of the rig file against what is attached: found or not, with which modes, in which state.
 
 use super::finding::{Finding, Severity};
-use crate::attached::{Attached, AttachedCamera, ModeReport, UseState};
+use crate::attached::{Attached, AttachedCamera, Family, ModeReport, UseState};
 use crate::config::{BackendConfig, CameraConfig, RigConfig};
 use depthrig_drivers::files::FilesBackend;
 use depthrig_drivers::realsense::config::TransportChoice;
@@ -55,6 +55,8 @@ pub(super) struct Wanted<'c> {
     pub(super) port: Option<&'c str>,
     /// Reads it through libusb whatever the kernel offers.
     pub(super) libusb: bool,
+    /// Is refused without a calibration.
+    pub(super) needs_calibration: bool,
 }
 
 /// What of a plan is read from the rig file alone; `None` for cameras that are on no bus.
@@ -65,10 +67,14 @@ fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
             serial: c.serial.as_deref(),
             port: c.port.as_deref(),
             libusb: c.transport == TransportChoice::Libusb,
+            needs_calibration: !c.allow_uncalibrated,
         }),
-        BackendConfig::V4l2(c) => {
-            Some(Wanted { serial: c.serial.as_deref(), port: c.port.as_deref(), libusb: false })
-        }
+        BackendConfig::V4l2(c) => Some(Wanted {
+            serial: c.serial.as_deref(),
+            port: c.port.as_deref(),
+            libusb: false,
+            needs_calibration: false,
+        }),
     }
 }
 
@@ -106,7 +112,7 @@ pub(super) fn plan_device(
     if let Some(device) = find(backend, wanted, attached, &mut findings) {
         plan.device = Some(device.describe());
         plan.port = Some(device.port.clone());
-        check_device(device, wanted.libusb, &mut findings);
+        check_device(device, wanted, &mut findings);
         if !device.profiles.is_empty() {
             match choose_profiles(&device.describe(), &device.profiles, &camera.streams) {
                 Ok(chosen) => set_streams(&mut plan, camera, chosen, device.usb.is_some()),
@@ -213,7 +219,7 @@ fn find<'a>(
             let unknown: Vec<_> = family.iter().filter(|c| c.serial.is_none()).copied().collect();
             let near = serial.and_then(|s| nearest(s, &family));
             let cure = match (near, unknown.as_slice()) {
-                (Some(near), _) => format!("did you mean serial = \"{near}\"?"),
+                (Some(near), _) => format!("plug it in; or did you mean serial = \"{near}\"?"),
                 (None, []) => {
                     "plug it in, or correct `serial` or `port` (`depthrig cameras` lists what is there)"
                         .into()
@@ -253,7 +259,7 @@ fn nearest<'a>(serial: &str, family: &[&'a AttachedCamera]) -> Option<&'a str> {
 }
 
 /// What is wrong with the device itself.
-fn check_device(device: &AttachedCamera, libusb: bool, findings: &mut Vec<Finding>) {
+fn check_device(device: &AttachedCamera, wanted: &Wanted<'_>, findings: &mut Vec<Finding>) {
     match device.state {
         UseState::Free => {}
         UseState::InUse => findings.push(Finding::new(
@@ -287,14 +293,14 @@ fn check_device(device: &AttachedCamera, libusb: bool, findings: &mut Vec<Findin
     }
     if device.state == UseState::Free && device.calibration.as_deref().is_none_or(|c| c == "none") {
         findings.push(Finding::new(
-            Severity::Warning,
+            if wanted.needs_calibration { Severity::Error } else { Severity::Warning },
             "calibration_missing",
             format!("{} has no calibration", device.describe()),
             "its frames carry no intrinsics, so depth cannot be turned into points nor laid over colour",
-            "give the rig file a calibration for it, or have the camera calibrated",
+            "give the rig file a calibration for it, or have the camera calibrated; `allow_uncalibrated = true` uses a RealSense without",
         ));
     }
-    if device.kernel_metadata == Some("header") && device.backend == "realsense" && !libusb {
+    if device.kernel_metadata == Some("header") && device.family == Family::D400 && !wanted.libusb {
         findings.push(Finding::new(
             Severity::Info,
             "metadata_header",

@@ -127,7 +127,7 @@ fn a_camera_that_cannot_work_is_an_error_of_its_own() {
 
 /// A camera of the rig that means a real device, without the rig file's keys for it.
 fn planned(port: Option<&str>, serial: Option<&str>, attached: &Attached) -> Planned {
-    let wanted = cameras::Wanted { serial, port, libusb: false };
+    let wanted = cameras::Wanted { serial, port, libusb: false, needs_calibration: true };
     let config = config(FILES);
     cameras::plan_device(&config.cameras[0], "realsense", &wanted, attached)
 }
@@ -244,7 +244,7 @@ fn every_fault_of_a_camera_has_its_finding() {
             Bus { made: Made { uncalibrated: true, ..Made::default() }, ..Bus::default() },
             None,
             None,
-            &[("calibration_missing", Warning)],
+            &[("calibration_missing", Error)],
             "calibrated",
         ),
         (
@@ -291,7 +291,7 @@ fn a_mode_that_is_missing_is_listed_with_those_there_are() {
     let text = format!("{FILES}[[camera.stream]]\nname = \"depth\"\n");
     let mut camera = config(&text).cameras.remove(0);
     camera.streams[0].size = Some((848, 480));
-    let wanted = cameras::Wanted { serial: None, port: None, libusb: false };
+    let wanted = cameras::Wanted { serial: None, port: None, libusb: false, needs_calibration: true };
     let found = cameras::plan_device(&camera, "realsense", &wanted, &attached).findings;
     let missing = found.iter().find(|f| f.id == "mode_missing").unwrap();
     assert!(missing.what.contains("depth 640x480 z16 30 Hz"), "{missing:?}");
@@ -384,23 +384,17 @@ fn transfers_over_libusb_are_held_against_the_limit() {
     let tree = MadeTree::new(home.path());
     tree.plug(&MadeDevice::new("4-1", 0));
     let attached = look(tree.root(), &Made::default()).unwrap();
-    let config = config(FILES);
     let mut plan = planned(None, None, &attached).plan;
     let found = |limit: &str, plan: &CameraPlan| {
         tree.file("sys/module/usbcore/parameters/usbfs_memory_mb", limit);
         let mut findings = Vec::new();
-        bandwidth::check_usbfs(
-            &config,
-            core::slice::from_ref(plan),
-            &well(tree.root().clone()),
-            &mut findings,
-        );
+        bandwidth::check_usbfs(core::slice::from_ref(plan), &well(tree.root().clone()), &mut findings);
         findings.into_iter().map(|f| f.what).collect::<Vec<_>>()
     };
     plan.profiles = vec![(profile("depth", PixelFormat::Z16, 1280, 720, 30.0), true); 2];
-    assert!(found("16", &plan).is_empty(), "the kernel's driver needs none");
+    assert!(found("8", &plan).is_empty(), "the kernel's driver needs none");
     plan.libusb = true;
-    assert!(found("16", &plan)[0].contains("29 MB are needed"), "{:?}", found("16", &plan));
+    assert!(found("8", &plan)[0].contains("15 MB are needed"), "{:?}", found("8", &plan));
     assert!(found("512", &plan).is_empty());
 }
 

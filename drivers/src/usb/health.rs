@@ -66,10 +66,9 @@ pub fn open_error(root: &SysRoot, device: &str, node: &Path, e: io::Error) -> Er
 pub fn slow_link(device: &UsbDevice) -> Option<String> {
     (is_usb3_device(device) && (1..SUPERSPEED_MBPS).contains(&device.speed_mbps)).then(|| {
         format!(
-            "{} is attached as USB2 ({} Mbit/s), which offers fewer modes and carries few streams; plug it into a USB3 \
-             socket with a USB3 cable, and push the plug in fully",
-            device.describe(),
-            device.speed_mbps
+            "USB port {} runs it as USB2 ({} Mbit/s), which offers fewer modes and carries few streams: move it to a USB3 \
+             socket, with a USB3 cable that is pushed in fully",
+            device.port, device.speed_mbps
         )
     })
 }
@@ -104,9 +103,8 @@ pub fn is_usb3_device(device: &UsbDevice) -> bool {
 pub fn may_sleep(device: &UsbDevice) -> Option<String> {
     (device.power_control == PowerControl::Auto).then(|| {
         format!(
-            "the kernel may put {} to sleep when it is idle, from which some cameras do not wake; {RULE_CURE}, or write \
-             `on` to /sys/bus/usb/devices/{}/power/control",
-            device.describe(),
+            "the kernel may put it to sleep when it is idle (autosuspend), from which some cameras do not wake: \
+             {RULE_CURE}, or write `on` to /sys/bus/usb/devices/{}/power/control",
             device.port
         )
     })

@@ -105,7 +105,8 @@ fn text(attached: &Attached, args: &CamerasArgs, width: usize) -> String {
         if args.nodes {
             let on = c.controller.as_ref().map(|n| format!("controller {n}"));
             let metadata = c.kernel_metadata.map(|level| format!("kernel metadata: {level}"));
-            let facts: Vec<_> = c.usb_id.clone().into_iter().chain(on).chain(metadata).collect();
+            let sleep = c.may_sleep.map(|may| format!("autosuspend: {}", if may { "yes" } else { "no" }));
+            let facts: Vec<_> = c.usb_id.clone().into_iter().chain(on).chain(metadata).chain(sleep).collect();
             more.extend(out::item("-", &facts.join(", "), width));
             for n in &c.nodes {
                 let formats = n.formats.join(" ");

@@ -12,7 +12,9 @@ mod tally;
 mod vivid;
 
 mod scenarios {
+    pub mod cameras;
     pub mod daemon_smoke;
+    pub mod doctor;
     pub mod emulator;
     pub mod emulator_load;
     pub mod l515;
@@ -21,6 +23,7 @@ mod scenarios {
     pub mod realsense_clock;
     pub mod realsense_conformance;
     pub mod realsense_control;
+    pub mod udev;
     pub mod v4l2_cost;
     pub mod v4l2_daemon;
     pub mod v4l2_faults;
@@ -51,6 +54,9 @@ pub struct Scenario {
 const SCENARIOS: &[Scenario] = &[
     scenarios::vivid_smoke::SCENARIO,
     scenarios::daemon_smoke::SCENARIO,
+    scenarios::cameras::SCENARIO,
+    scenarios::doctor::SCENARIO,
+    scenarios::udev::SCENARIO,
     scenarios::emulator::SCENARIO,
     scenarios::realsense_calibration::SCENARIO,
     scenarios::realsense_clock::SCENARIO,
