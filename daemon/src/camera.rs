@@ -294,12 +294,10 @@ impl Supervisor {
         let (camera, shared) = (Arc::clone(&self.camera), Arc::clone(&self.shared));
         let backend = Arc::clone(&self.backend);
         let opening = Capture::spawn(self.camera.config.name.as_str(), move || {
-            // Ordinary until it streams: opening is work, and must not keep other cameras' threads from theirs.
-            let session = open_session(&camera, &shared, &backend)?;
             if shared.supervisor.raise_priority {
                 priority::raise_current_thread();
             }
-            Ok(session)
+            open_session(&camera, &shared, &backend)
         });
         match opening {
             Ok(capture) => self.capture = Some(capture),
@@ -359,6 +357,7 @@ pub fn make_backend(
 ) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {
     use depthrig_drivers::{
         files::FilesBackend, realsense::RealsenseBackend, synthetic::SyntheticBackend, v4l2::V4l2Backend,
+        zed::ZedBackend,
     };
     Ok(match config {
         // One beginning for all cameras of the rig, or each would see the world at another moment.
@@ -366,6 +365,7 @@ pub fn make_backend(
         BackendConfig::Files(c) => Box::new(FilesBackend::new(c.clone())),
         BackendConfig::Realsense(c) => Box::new(RealsenseBackend::new(c.clone())),
         BackendConfig::V4l2(c) => Box::new(V4l2Backend::new(c.clone())),
+        BackendConfig::Zed(c) => Box::new(ZedBackend::new(c.clone())),
     })
 }
 

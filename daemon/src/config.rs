@@ -14,11 +14,13 @@ mod synthetic;
 #[cfg(test)]
 mod tests;
 mod v4l2;
+mod zed;
 
 pub use depthrig_drivers::files::FilesConfig as FilesSettings;
 pub use depthrig_drivers::realsense::RealsenseConfig as RealsenseSettings;
 pub use depthrig_drivers::synthetic::SyntheticConfig as SyntheticSettings;
 pub use depthrig_drivers::v4l2::V4l2Config as V4l2Settings;
+pub use depthrig_drivers::zed::ZedConfig as ZedSettings;
 pub use depthrig_recorder::{ColorCodec, DepthCodec};
 pub use error::{ConfigError, Problem};
 
@@ -169,6 +171,8 @@ pub enum BackendConfig {
     Realsense(RealsenseSettings),
     /// A camera at the kernel's video nodes.
     V4l2(V4l2Settings),
+    /// A Stereolabs ZED.
+    Zed(ZedSettings),
 }
 
 impl BackendConfig {
@@ -179,6 +183,7 @@ impl BackendConfig {
             Self::Files(_) => "files",
             Self::Realsense(_) => depthrig_drivers::realsense::NAME,
             Self::V4l2(_) => "v4l2",
+            Self::Zed(_) => "zed",
         }
     }
 }

@@ -18,6 +18,8 @@ pub mod conf;
 mod config;
 mod device;
 pub mod find;
+#[doc(hidden)]
+pub mod fuzzing;
 pub mod hid;
 mod ini;
 pub mod mode;
@@ -29,4 +31,5 @@ mod stream;
 
 pub use config::{CalibrationFile, ZedConfig};
 pub use device::ZedBackend;
+pub use profiles::STREAMS;
 pub use stream::ZedStream;

@@ -2,7 +2,7 @@
 
 use super::read::{Found, Section};
 use super::rig::{not_empty, rate, resolve};
-use super::{BackendConfig, CameraConfig, FilesSettings, realsense, synthetic, v4l2};
+use super::{BackendConfig, CameraConfig, FilesSettings, realsense, synthetic, v4l2, zed};
 use depthrig_bus::{CameraName, Name, PixelFormat, Pose, StreamName};
 use depthrig_drivers::StreamRequest;
 use std::path::{Path, PathBuf};
@@ -13,6 +13,7 @@ enum Driver {
     Files,
     Realsense,
     V4l2,
+    Zed,
 }
 
 /// Reads one camera; `None` after a problem without which there is no camera. `taken` are the names so far.
@@ -33,6 +34,7 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         ("files", Driver::Files),
         ("realsense", Driver::Realsense),
         ("v4l2", Driver::V4l2),
+        ("zed", Driver::Zed),
     ];
     if !s.has("backend") {
         s.required::<String>("backend", "\"synthetic\"");
@@ -50,6 +52,7 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         Some(Driver::Files) => files(&s, base).map(BackendConfig::Files),
         Some(Driver::Realsense) => Some(BackendConfig::Realsense(realsense::read(&s, base, &wanted))),
         Some(Driver::V4l2) => Some(BackendConfig::V4l2(v4l2::read(&s))),
+        Some(Driver::Zed) => Some(BackendConfig::Zed(zed::read(&s, base, &wanted))),
         // Which keys belong to an unknown driver is unknown too.
         None => return None,
     };
@@ -66,7 +69,9 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
 pub(super) fn fastest_rate_hz(camera: &CameraConfig) -> Option<f64> {
     match &camera.backend {
         BackendConfig::Files(files) => files.rate_hz,
-        BackendConfig::Realsense(_) | BackendConfig::V4l2(_) => fastest_given_rate(&camera.streams),
+        BackendConfig::Realsense(_) | BackendConfig::V4l2(_) | BackendConfig::Zed(_) => {
+            fastest_given_rate(&camera.streams)
+        }
         BackendConfig::Synthetic(config) => synthetic::fastest_rate_hz(config, &camera.streams).ok(),
     }
 }

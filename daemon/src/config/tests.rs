@@ -231,6 +231,61 @@ fn a_realsense_camera_is_set_as_the_file_says() {
 }
 
 #[test]
+fn a_zed_is_set_as_the_file_says() {
+    let rig = parse(
+        r#"
+        rig = "r"
+        [[camera]]
+        name = "a"
+        backend = "zed"
+        serial = "31234567"
+        port = "4-1"
+        calibration = "SN31234567.conf"
+        exposure_percent = 40
+        gain_percent = 0
+        led = false
+        controls = { brightness = 4, white_balance_automatic = false }
+        motion = false
+        [[camera.stream]]
+        name = "right"
+        width = 672
+        height = 376
+        [[camera]]
+        name = "b"
+        backend = "zed"
+        auto_exposure = true
+        calibration = "none"
+        [[camera]]
+        name = "c"
+        backend = "zed"
+        "#,
+    )
+    .unwrap();
+    use depthrig_drivers::v4l2::ControlValue::{Boolean, Integer};
+    use depthrig_drivers::zed::CalibrationFile;
+    let controls = [("brightness", Integer(4)), ("white_balance_automatic", Boolean(false))];
+    let wanted = ZedSettings {
+        serial: Some("31234567".into()),
+        port: Some("4-1".into()),
+        calibration: CalibrationFile::At("/rigs/SN31234567.conf".into()),
+        auto_exposure: None,
+        exposure_percent: Some(40),
+        gain_percent: Some(0),
+        led: Some(false),
+        controls: controls.map(|(n, v)| (n.to_owned(), v)).into(),
+        without_motion: true,
+    };
+    assert_eq!(rig.cameras[0].backend, BackendConfig::Zed(wanted));
+    let b = ZedSettings {
+        auto_exposure: Some(true),
+        calibration: CalibrationFile::None,
+        ..ZedSettings::default()
+    };
+    assert_eq!(rig.cameras[1].backend, BackendConfig::Zed(b));
+    assert_eq!(rig.cameras[2].backend, BackendConfig::Zed(ZedSettings::default()));
+}
+
+#[test]
 fn angles_turn_about_x_then_y_then_z() {
     let pose = |rpy: &str| {
         let text = format!(
@@ -305,6 +360,11 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (second("name = \"b\"\nbackend = \"realsense\"\ncolor_controls = { hue = 1 }\nstream = [{ name = \"depth\" }]"), "is set, but color is not among the streams"),
         (second("name = \"b\"\nbackend = \"realsense\"\nstream = [{ name = \"ir\" }]"), "8:11: a RealSense D400 has no stream \"ir\"; it has: depth, color, ir_left, ir_right"),
         (second("name = \"b\"\nbackend = \"realsense\"\nmanifest = \"x\""), "only another backend has it"),
+        (second("name = \"b\"\nbackend = \"zed\"\nexposure_percent = 101"), "8:20: \"exposure_percent\" in [[camera]] \"b\" is 101; it must be within 0 and 100"),
+        (second("name = \"b\"\nbackend = \"zed\"\nauto_exposure = true\ngain_percent = 16"), "9:16: \"gain_percent\" in [[camera]] \"b\" cannot be set while auto_exposure is true"),
+        (second("name = \"b\"\nbackend = \"zed\"\ncalibration = \"\""), "8:15: \"calibration\" in [[camera]] \"b\" is empty"),
+        (second("name = \"b\"\nbackend = \"zed\"\nstream = [{ name = \"depth\" }]"), "8:11: a ZED has no stream \"depth\"; it has: left, right"),
+        (second("name = \"b\"\nbackend = \"zed\"\nemitter = \"off\""), "only another backend has it"),
         (top("sets.rate_hz = 31"), "1:16: \"rate_hz\" in [sets] is 31 sets a second, but the fastest camera gives 30 frames a second"),
         (top("sets.rate_hz = 0.0"), "1:16: \"rate_hz\" in [sets] is 0; it must be above 0"),
         (top("control.tcp = \"0.0.0.0:80\""), "1:15: \"tcp\" in [control] must be a loopback address such as 127.0.0.1:80, not 0.0.0.0:80: the API has no password"),

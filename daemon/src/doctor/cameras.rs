@@ -75,6 +75,12 @@ fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
             libusb: false,
             needs_calibration: false,
         }),
+        BackendConfig::Zed(c) => Some(Wanted {
+            serial: c.serial.as_deref(),
+            port: c.port.as_deref(),
+            libusb: false,
+            needs_calibration: false,
+        }),
     }
 }
 
@@ -151,7 +157,7 @@ fn plan_made(camera: &CameraConfig) -> Planned {
                 (format!("pictures of {}", device.info().port), device.profiles().to_vec())
             }
             // Devices are planned with what is attached.
-            BackendConfig::Realsense(_) | BackendConfig::V4l2(_) => {
+            BackendConfig::Realsense(_) | BackendConfig::V4l2(_) | BackendConfig::Zed(_) => {
                 (camera.backend.name().to_owned(), Vec::new())
             }
         })

@@ -65,7 +65,7 @@ impl Backend for ZedBackend {
         // Where the number is known, there is one candidate. Else each is asked, and the last one's error is said.
         let mut last = None;
         for found in candidates {
-            match ZedDevice::open(&found, &self.config, &self.root) {
+            match ZedDevice::open(found, &self.config, &self.root) {
                 Ok(device) if serial.is_none_or(|s| s == device.info.serial) => return Ok(Box::new(device)),
                 Ok(other) => {
                     let what =
@@ -91,23 +91,22 @@ struct ZedDevice {
 }
 
 impl ZedDevice {
-    fn open(found: &Found, config: &ZedConfig, root: &SysRoot) -> Result<Self> {
-        let node = capture_node(found)?;
+    fn open(mut found: Found, config: &ZedConfig, root: &SysRoot) -> Result<Self> {
+        let node = capture_node(&found)?;
         let serial = match vendor(node.path(), &found.describe()).and_then(|mut v| v.serial()) {
-            Ok(flash) => {
-                if let Some(unit) = found.serial().filter(|unit| *unit != flash) {
-                    tracing::warn!(flash, unit, "a ZED and its motion unit have different serial numbers");
-                }
-                flash
-            }
+            Ok(flash) => flash,
             Err(e) => match found.serial() {
                 Some(unit) => {
-                    tracing::warn!(error = %e, serial = unit, "the ZED's flash gives no serial number; using its motion unit's");
+                    tracing::warn!(error = %e, serial = unit, "the ZED's flash gives no serial number; its motion unit does");
                     unit.to_owned()
                 }
                 None => return Err(e),
             },
         };
+        // Both halves have the camera's number, so it decides over what the ports say.
+        if found.serial() != Some(&serial) {
+            found.motion = find::motion_unit(&scan(root)?, found.model, &serial).cloned();
+        }
         let (calibration, source) = calibration(&config.calibration, &serial)?;
         let name = find::describe(found.model.name, &serial, &found.video.port);
         if calibration.is_none() && config.calibration == CalibrationFile::Known {
@@ -128,7 +127,7 @@ impl ZedDevice {
         let profiles = profiles::profiles(&name, &modes, calibration.as_ref())?;
         let motion =
             found.motion.iter().flat_map(|m| &m.interfaces).flat_map(|i| &i.hidraw_nodes).next().cloned();
-        let info = info(found, serial, source);
+        let info = info(&found, serial, source);
         Ok(Self { info, node, modes, profiles, motion, config: config.clone(), root: root.clone() })
     }
 
@@ -158,6 +157,9 @@ impl Device for ZedDevice {
         let named = |e: Error| named(&name, &root, &path, e);
         settings::apply_controls(&node, &config).map_err(named)?;
         let layout = node.set_mode(mode).map_err(named)?;
+        // Nothing is asked of the camera on this thread once it streams.
+        let vendor = settings::has_commands(&config).then(|| vendor(&path, &name)).transpose()?;
+        let motion = motion.filter(|_| !config.without_motion).and_then(|node| start_motion(&name, &node));
         let stride = (layout.bytes_per_line as usize).max(2 * mode.width as usize);
         let pictures = Source::start(vec![Wanted::plain(node)], DEFAULT_BUFFERS).map_err(named)?;
         if pictures.stamp(0) == Stamp::Unknown {
@@ -165,9 +167,7 @@ impl Device for ZedDevice {
                 (p.clock, p.metadata) = (profiles::clock(ClockDomain::Arrival), MetadataLevel::Arrival);
             }
         }
-        let settled =
-            settings::has_commands(&config).then(|| settle(&name, &path, &config, mode)).transpose()?;
-        let motion = motion.filter(|_| !config.without_motion).and_then(|node| start_motion(&name, &node));
+        let settled = vendor.map(|v| settle(&name, v, &config, mode)).transpose()?;
         let eyes = chosen.into_iter().map(|p| (eye_of(&p), p)).collect();
         Ok(Box::new(ZedStream::new(name, eyes, Box::new(pictures), stride, motion, settled)))
     }
@@ -260,9 +260,13 @@ fn calibration(wanted: &CalibrationFile, serial: &str) -> Result<(Option<Factory
 
 /// Sets the camera on a thread of its own, after it began to stream, because starting may set it anew and because
 /// each command may take seconds. The thread is not waited for; it ends by itself.
-fn settle(name: &str, path: &Path, config: &ZedConfig, mode: &Mode) -> Result<Receiver<Result<()>>> {
+fn settle(
+    name: &str,
+    mut vendor: Vendor<Node>,
+    config: &ZedConfig,
+    mode: &Mode,
+) -> Result<Receiver<Result<()>>> {
     let (send, receive) = sync_channel(1);
-    let mut vendor = vendor(path, name)?;
     let (config, rate_hz) = (config.clone(), mode.interval.rate_hz());
     std::thread::Builder::new()
         .name("zed-settings".to_owned())

@@ -97,6 +97,16 @@ pub fn cameras(root: &SysRoot, devices: &[UsbDevice]) -> Vec<Found> {
     found
 }
 
+/// The motion unit of `model` with this serial number: that of the camera, wherever it is.
+pub fn motion_unit<'d>(devices: &'d [UsbDevice], model: Model, serial: &str) -> Option<&'d UsbDevice> {
+    devices.iter().find(|d| {
+        d.vendor_id == VENDOR_ID
+            && Some(d.product_id) == model.motion
+            && d.serial == serial
+            && !serial.is_empty()
+    })
+}
+
 /// Ports at which the hub of the camera may be whose video half is at `port`: the one it is behind, and the slow
 /// halves of its own socket and of that one.
 fn hubs(root: &SysRoot, port: &str) -> Vec<String> {

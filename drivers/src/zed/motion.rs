@@ -21,6 +21,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 const KEEP_ALIVE: Duration = Duration::from_secs(1);
 /// How long one read waits; also how late the thread notices that it is to end.
 const WAIT: Duration = Duration::from_millis(50);
+/// After so long without a record the unit is started anew: whoever had it before may have stopped it just now.
+const SILENCE: Duration = Duration::from_millis(500);
 /// Nanoseconds from one record to the next.
 const PERIOD_NS: u64 = 2_500_000;
 
@@ -70,12 +72,12 @@ pub struct Motion {
 }
 
 impl Motion {
-    /// Starts the unit and the thread that reads it; `device` names the camera.
+    /// Starts the thread that starts the unit and reads it; `device` names the camera. What the unit says against it is
+    /// in [`Self::problem`].
     ///
     /// # Errors
-    /// Those of [`Reports::send_feature`]; [`ErrorKind::Io`] when the system refuses a thread.
+    /// [`ErrorKind::Io`] when the system refuses a thread.
     pub fn start(mut reports: Box<dyn Reports>, device: &str) -> Result<Self> {
-        reports.send_feature(sensors::stream_report(true))?;
         let shared = Arc::new(Shared::default());
         let theirs = Arc::clone(&shared);
         let name = device.to_owned();
@@ -134,7 +136,9 @@ fn lock(state: &Mutex<State>) -> std::sync::MutexGuard<'_, State> {
 fn run(reports: &mut dyn Reports, shared: &Shared) -> Result<()> {
     let tick_ns = sensors::TICK_PS as f64 / 1000.0;
     let mut clock = ClockMap::new(ClockConfig::new(64, tick_ns, PERIOD_NS));
+    reports.send_feature(sensors::stream_report(true))?;
     let mut awake_until = HostTime::now().plus(KEEP_ALIVE);
+    let mut silent_at = HostTime::now().plus(SILENCE);
     let mut buffer = [0; 64];
     let mut last_ticks: Option<u64> = None;
     let mut sequence = 0;
@@ -143,8 +147,13 @@ fn run(reports: &mut dyn Reports, shared: &Shared) -> Result<()> {
             reports.send_feature(sensors::keep_alive())?;
             awake_until = HostTime::now().plus(KEEP_ALIVE);
         }
+        if silent_at.from_now().is_zero() {
+            reports.send_feature(sensors::stream_report(true))?;
+            silent_at = HostTime::now().plus(SILENCE);
+        }
         let Some(n) = reports.read(&mut buffer, WAIT)? else { continue };
         let arrival = HostTime::now();
+        silent_at = arrival.plus(SILENCE);
         let Ok(record) = Record::parse(buffer.get(..n).unwrap_or_default()) else {
             lock(&shared.state).tally.rejected += 1;
             continue;
@@ -242,7 +251,11 @@ mod tests {
         assert!(latest.time >= began.plus(Duration::ZERO) && latest.time <= HostTime::now());
         assert!(latest.time > exposure.time);
         wait_for(|| told.lock().unwrap().contains(&[0x21, 0xF2]));
-        assert_eq!(told.lock().unwrap()[0], [0x32, 1]);
+        let starts = told.lock().unwrap().iter().filter(|t| **t == [0x32, 1]).count();
+        assert!(
+            told.lock().unwrap()[0] == [0x32, 1] && starts > 1,
+            "silent for a second, it is started anew"
+        );
         drop(motion);
         wait_for(|| told.lock().unwrap().last() == Some(&[0x32, 0]));
     }

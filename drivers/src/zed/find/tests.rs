@@ -100,6 +100,13 @@ fn without_that_only_one_of_each_is_a_pair() {
     assert_eq!(pairs(&tree), [pair("2-1", "111")]);
     tree.plug(&motion("1-8.2", "222", 1));
     assert_eq!(pairs(&tree), [("2-1".to_owned(), None)], "either could be it");
+    let devices = scan(tree.root()).unwrap();
+    let port = |serial: &str| motion_unit(&devices, MODELS[0], serial).map(|d| d.port.as_str());
+    assert_eq!(
+        [port("222"), port("333"), port("")],
+        [Some("1-8.2"), None, None],
+        "until the camera says its number"
+    );
     // One of another model is not asked for.
     let other = MadeDevice { id: (0x2b03, 0xf781), ..motion("1-2.2", "333", 2) };
     let dir = tempfile::tempdir().unwrap();

@@ -6,7 +6,6 @@ mod boot;
 mod checks;
 mod daemon;
 mod feed;
-mod mount;
 mod subject;
 mod system;
 mod tally;
@@ -18,7 +17,6 @@ mod scenarios {
     pub mod doctor;
     pub mod emulator;
     pub mod emulator_load;
-    pub mod fourteen;
     pub mod l515;
     pub mod libusb;
     pub mod realsense_calibration;
@@ -31,6 +29,8 @@ mod scenarios {
     pub mod v4l2_faults;
     pub mod v4l2_formats;
     pub mod vivid_smoke;
+    pub mod zed;
+    pub mod zed_records;
 }
 
 use anyhow::{Context, bail};
@@ -74,7 +74,8 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::libusb::SEVEN,
     scenarios::realsense_conformance::LIBUSB,
     scenarios::realsense_control::SCENARIO,
-    scenarios::fourteen::SCENARIO,
+    scenarios::zed::SCENARIO,
+    scenarios::zed_records::SCENARIO,
 ];
 
 fn main() -> anyhow::Result<ExitCode> {

@@ -1,0 +1,126 @@
+//! What the fuzz target `zed_conf` calls, and the test that runs its corpus.
+
+use super::command::{Command, parse_serial};
+use super::conf::FactoryCalibration;
+use super::mode::{Eye, Mode};
+use super::sensors::Record;
+
+/// Bytes as a factory calibration, and as a command block, flash and motion record; whether they are a calibration.
+///
+/// # Panics
+/// When a calibration is implausible, or changes by being written and read.
+pub fn conf(bytes: &[u8]) -> bool {
+    let _ = (Command::parse(bytes), parse_serial(bytes), Record::parse(bytes));
+    let text = String::from_utf8_lossy(bytes);
+    let Ok(read) = FactoryCalibration::parse(&text, "fuzz") else { return false };
+    let known: Vec<_> = Mode::ALL.into_iter().filter_map(|m| Some((m, read.at(m)?))).collect();
+    assert!(!known.is_empty(), "a calibration of no mode");
+    for (mode, c) in &known {
+        let (width, height) = mode.eye_size();
+        for eye in Eye::BOTH {
+            let i = c.intrinsics(eye);
+            let inside = i.cx > 0.0 && i.cx < f64::from(width) && i.cy > 0.0 && i.cy < f64::from(height);
+            assert!(i.fx > 0.0 && i.fy > 0.0 && inside && i.coeffs.iter().all(|k| k.is_finite()), "{i:?}");
+        }
+        let t = c.right_in_left.translation_m;
+        assert!((0.02..0.4).contains(&c.baseline_m()) && t[0] > 0.0, "{t:?}");
+    }
+    // A file may have a baseline for each mode; what is written has one.
+    let first = known.first().map(|(_, c)| c.baseline_m());
+    if known.iter().all(|(_, c)| Some(c.baseline_m()) == first) {
+        let again = FactoryCalibration::parse(&read.build(), "built");
+        let again = again.unwrap_or_else(|e| panic!("what was written cannot be read: {e}"));
+        for (mode, c) in known {
+            let other = again.at(mode).unwrap_or_else(|| panic!("{mode:?} is gone"));
+            assert_eq!((c.left, c.right), (other.left, other.right));
+        }
+    }
+    true
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    fn corpus() -> Vec<(String, Vec<u8>)> {
+        let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus/zed_conf");
+        let mut found: Vec<_> = std::fs::read_dir(&dir)
+            .unwrap()
+            .map(|e| e.unwrap().path())
+            .map(|p| (p.file_name().unwrap().to_string_lossy().into_owned(), std::fs::read(p).unwrap()))
+            .collect();
+        found.sort();
+        found
+    }
+
+    #[test]
+    fn the_corpus_is_read_or_refused() {
+        let mut seeds = 0;
+        for (name, bytes) in corpus() {
+            let is_one = super::conf(&bytes);
+            if name.starts_with("seed_") {
+                seeds += 1;
+                assert!(is_one, "{name} is no calibration any more");
+            }
+        }
+        assert!(seeds >= 3, "{seeds} seeds");
+    }
+
+    /// Pieces that a number, a line or a section is spoilt with.
+    const PIECES: [&str; 16] = [
+        "1e308",
+        "-1e-320",
+        "NaN",
+        "inf",
+        "-",
+        "=",
+        "[",
+        "]",
+        "\n",
+        "\r",
+        ";",
+        "0",
+        "9",
+        ",",
+        "\u{fffd}",
+        "[STEREO]\nBaseline_HD=60\n",
+    ];
+
+    /// 20 000 files with up to four pieces put in, taken out or moved; two million with `DEPTHRIG_LONG=1`.
+    #[test]
+    fn spoilt_files_are_read_or_refused() {
+        let rounds = if std::env::var_os("DEPTHRIG_LONG").is_some() { 2_000_000 } else { 20_000 };
+        let seeds = corpus();
+        let mut x = 0x2545_F491_4F6C_DD1D_u64;
+        let mut random = |below: usize| {
+            x ^= x << 13;
+            x ^= x >> 7;
+            x ^= x << 17;
+            (x >> 11) as usize % below.max(1)
+        };
+        let mut still_good = 0;
+        for _ in 0..rounds {
+            let mut bytes = seeds[random(seeds.len())].1.clone();
+            for _ in 0..=random(4) {
+                let at = random(bytes.len() + 1);
+                let end = (at + random(24)).min(bytes.len());
+                match random(4) {
+                    0 => drop(bytes.splice(at..at, PIECES[random(PIECES.len())].bytes())),
+                    1 => drop(bytes.drain(at..end)),
+                    2 => {
+                        let piece = bytes[at..end].to_vec();
+                        let to = random(bytes.len() + 1);
+                        drop(bytes.splice(to..to, piece));
+                    }
+                    _ => {
+                        if let Some(byte) = bytes.get_mut(at) {
+                            *byte ^= 1 << random(8);
+                        }
+                    }
+                }
+            }
+            still_good += u32::from(super::conf(&bytes));
+        }
+        assert!(still_good > rounds / 100, "{still_good} of {rounds} are still read: nothing is reached");
+    }
+}

@@ -1,0 +1,9 @@
+//! A ZED's factory calibration; also its command blocks and motion records.
+#![no_main]
+
+use depthrig_drivers::zed::fuzzing;
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|bytes: &[u8]| {
+    fuzzing::conf(bytes);
+});
