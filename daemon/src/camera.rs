@@ -294,10 +294,12 @@ impl Supervisor {
         let (camera, shared) = (Arc::clone(&self.camera), Arc::clone(&self.shared));
         let backend = Arc::clone(&self.backend);
         let opening = Capture::spawn(self.camera.config.name.as_str(), move || {
+            // Ordinary until it streams: opening is work, and must not keep other cameras' threads from theirs.
+            let session = open_session(&camera, &shared, &backend)?;
             if shared.supervisor.raise_priority {
                 priority::raise_current_thread();
             }
-            open_session(&camera, &shared, &backend)
+            Ok(session)
         });
         match opening {
             Ok(capture) => self.capture = Some(capture),

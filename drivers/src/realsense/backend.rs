@@ -89,6 +89,10 @@ impl RealsenseBackend {
     }
 
     fn connect(&self, found: &Found) -> Result<Box<dyn Transport>> {
+        if found.usb.interfaces.is_empty() {
+            let text = format!("{}: the kernel has not configured it yet", found.describe());
+            return Err(Error::new(ErrorKind::NotFound, text));
+        }
         let by_kernel = match self.config.transport {
             TransportChoice::Kernel => true,
             TransportChoice::Libusb => false,

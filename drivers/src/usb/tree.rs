@@ -150,6 +150,10 @@ fn device(root: &SysRoot, port: String, path: &Path) -> Option<UsbDevice> {
     let text = |file: &str| read_text(&real.join(file)).unwrap_or_default();
     let bus_number = text("busnum").parse().ok()?;
     let device_number = text("devnum").parse().ok()?;
+    // The kernel answers this when it is done with the device: until then it adds interface after interface, each with
+    // its nodes, and what is listed in the meantime is a camera with parts missing. (usb_lock_device in the sysfs
+    // attributes of the configuration.)
+    let _ = text("bNumInterfaces");
     let root_hub = format!("usb{bus_number}");
     let controller =
         real.ancestors().find(|dir| file_name(dir) == root_hub).and_then(Path::parent).map(file_name);

@@ -6,6 +6,7 @@ mod boot;
 mod checks;
 mod daemon;
 mod feed;
+mod mount;
 mod subject;
 mod system;
 mod tally;
@@ -17,6 +18,7 @@ mod scenarios {
     pub mod doctor;
     pub mod emulator;
     pub mod emulator_load;
+    pub mod fourteen;
     pub mod l515;
     pub mod libusb;
     pub mod realsense_calibration;
@@ -76,6 +78,7 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::realsense_control::SCENARIO,
     scenarios::zed::SCENARIO,
     scenarios::zed_records::SCENARIO,
+    scenarios::fourteen::SCENARIO,
 ];
 
 fn main() -> anyhow::Result<ExitCode> {
