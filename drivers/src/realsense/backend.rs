@@ -105,7 +105,25 @@ impl RealsenseBackend {
             _ if self.memory.is_mute() => MetadataWish::None,
             wish => wish,
         };
-        Ok(Box::new(Kernel::open(&self.root, found, wish)?))
+        Ok(Box::new(Kernel::open(&self.root, &self.bound(found), wish)?))
+    }
+
+    /// The camera with its nodes. A program that had it through libusb and was killed leaves it without a driver.
+    fn bound(&self, found: &Found) -> Found {
+        let mut found = found.clone();
+        if !Kernel::has_bound(&found) {
+            match crate::libusb::give_to_kernel(&self.root, &found.usb) {
+                Ok(0) => {}
+                Ok(_) => {
+                    tracing::info!("{}: the kernel's driver is bound again", found.describe());
+                    let port = found.usb.port.clone();
+                    let now = usb::scan(&self.root).unwrap_or_default().into_iter().find(|d| d.port == port);
+                    found.usb = now.unwrap_or(found.usb);
+                }
+                Err(e) => tracing::debug!("{}: its driver cannot be bound: {e}", found.describe()),
+            }
+        }
+        found
     }
 }
 

@@ -6,11 +6,13 @@ use crate::checks::Checks;
 use crate::{Scenario, system};
 use anyhow::Context;
 use depthrig_bus::HostTime;
-use depthrig_drivers::ErrorKind;
 use depthrig_drivers::libusb::{Camera, Settings, Source, give_to_kernel};
+use depthrig_drivers::realsense::RealsenseBackend;
+use depthrig_drivers::realsense::config::{RealsenseConfig, TransportChoice};
 use depthrig_drivers::usb::{self, SysRoot};
 use depthrig_drivers::v4l2::{FourCc, Node, Source as KernelSource, Wanted};
 use depthrig_drivers::video::PictureSource;
+use depthrig_drivers::{Backend, ErrorKind};
 use depthrig_emulator as emulator;
 use emulator::Options;
 use std::io::{BufRead, BufReader};
@@ -142,6 +144,15 @@ fn killed(checks: &mut Checks, device: &emulator::Camera, truth: &mut Truth) -> 
     checks.that("and the nodes are back without a replug", nodes_become(6), "");
     checks.equal("a second call has nothing to do", give_to_kernel(&root, &usb_device(device)?)?, 0);
     kernel_streams(checks, device, truth, "after kill -9")?;
+    // And by itself, when the back end next opens the camera through the kernel.
+    let mut third = self::child(device)?;
+    third.kill()?;
+    third.wait()?;
+    let (port, transport) = (device.port_path(), TransportChoice::Kernel);
+    let backend = RealsenseBackend::new(RealsenseConfig { port, transport, ..RealsenseConfig::default() });
+    let opened = backend.open(Some(device.serial())).map(|d| d.info().serial.clone());
+    checks.that("the back end binds the driver itself", opened.is_ok(), format!("{opened:?}"));
+    nodes_become(6);
     // The same once more, and straight into libusb again.
     let mut again = self::child(device)?;
     again.kill()?;
