@@ -35,7 +35,10 @@ impl Reservation {
             None => Ok(taken),
             Some(cure) => Err(Error::new(
                 ErrorKind::Io,
-                format!("{label}: its transfers take {} of them: {cure}", megabytes(bytes)),
+                format!(
+                    "{label}: {cure}; of the memory that is needed its own transfers take {}",
+                    megabytes(bytes)
+                ),
             )),
         }
     }
@@ -84,7 +87,10 @@ mod tests {
         let six: Vec<_> = (0..6).map(|_| Reservation::take(tree.root(), "D435", stream).unwrap()).collect();
         let error = Reservation::take(tree.root(), "D435 at port 4-1", stream).unwrap_err();
         let text = error.to_string();
-        assert!(text.contains("D435 at port 4-1") && text.contains("2.4 MB of them"), "{text}");
+        assert!(
+            text.contains("D435 at port 4-1") && text.contains("its own transfers take 2.4 MB"),
+            "{text}"
+        );
         assert!(text.contains("have 16 MB") && text.contains("17 MB are needed"), "{text}");
         assert!(text.contains("echo 64 > /sys/module/usbcore/parameters/usbfs_memory_mb"), "{text}");
         // What was refused counts no longer, and neither does what was given back.
