@@ -22,6 +22,7 @@ pub const SCENARIO: Scenario = Scenario {
 };
 
 const PATIENCE: Duration = Duration::from_secs(5);
+const ENUMERATION: Duration = Duration::from_secs(15);
 /// Any user but root.
 const NOBODY: u32 = 65534;
 
@@ -102,15 +103,22 @@ fn every_model(checks: &mut Checks) -> anyhow::Result<()> {
     ] {
         cameras.push((Camera::plug(model, Options::default())?, name, backend));
     }
+    // Enumerated one after the other, and the drivers take them later still.
+    let free = || {
+        let states =
+            listed(None).ok().and_then(|(_, v)| v["cameras"].as_array().cloned()).unwrap_or_default();
+        states.iter().filter(|c| c["state"] == "free").count() == cameras.len()
+    };
+    checks.that("one of each model is there and free", system::wait_until(ENUMERATION, free), "");
     let (front, ..) = cameras.first().context("no camera")?;
     let keys = format!("serial = \"{}\"", front.serial());
     let stream = "[[camera.stream]]\nname = \"depth\"\nwidth = 640\nheight = 480\nrate_hz = 30.0";
     let rig = format!("[[camera]]\nname = \"front\"\nbackend = \"realsense\"\n{keys}\n{stream}\n");
     let daemon = Daemon::start(&rig)?;
     daemon.wait_until_streaming()?;
-    let (_, listed) = listed(None)?;
+    let (_, all) = listed(None)?;
     for (camera, name, backend) in &cameras {
-        let c = entry(&listed, camera).cloned().unwrap_or_default();
+        let c = entry(&all, camera).cloned().unwrap_or_default();
         checks.equal(
             &format!("{name}: model and backend"),
             (&c["model"], &c["backend"]),
@@ -118,7 +126,7 @@ fn every_model(checks: &mut Checks) -> anyhow::Result<()> {
         );
         checks.equal(&format!("{name}: serial"), &c["serial"], camera.serial());
     }
-    let c = entry(&listed, front).cloned().unwrap_or_default();
+    let c = entry(&all, front).cloned().unwrap_or_default();
     checks.equal("in a rig: state", &c["state"], "in_use");
     checks.equal("in a rig: which", &c["rig"], "\"vm\", camera \"front\"");
     for arguments in
@@ -137,6 +145,8 @@ fn every_model(checks: &mut Checks) -> anyhow::Result<()> {
     checks.equal("the rig was not disturbed: reconnects", camera.reconnects, 0);
     checks.that("the rig streams", streams(camera), told(&status));
     daemon.stop()?;
+    drop(cameras);
+    checks.that("all are unplugged again", system::wait_until(PATIENCE, none), "");
     Ok(())
 }
 
