@@ -325,13 +325,13 @@ fn check_device(device: &AttachedCamera, wanted: &Wanted<'_>, findings: &mut Vec
             format!("move it from port {} to a USB3 socket, with a USB3 cable", usb.port),
         ));
     }
-    if let Some(what) = health::may_sleep(usb) {
+    if health::may_sleep(usb).is_some() {
         findings.push(Finding::new(
             Severity::Info,
             "autosuspend",
-            what,
+            "the kernel may put it to sleep when it is idle (autosuspend)",
             "a camera that was put to sleep between two sessions may not answer at the next",
-            RULE_CURE,
+            format!("{RULE_CURE}, or write `on` to /sys/bus/usb/devices/{}/power/control", usb.port),
         ));
     }
 }

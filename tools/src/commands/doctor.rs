@@ -63,7 +63,7 @@ pub fn run(args: &DoctorArgs, context: &Context) -> Result<Exit> {
 }
 
 fn text(r: &Report, style: Style) -> String {
-    let mut lines = vec![format!("rig {}: {} cameras", r.rig, r.cameras.len()), String::new()];
+    let mut lines = vec![format!("rig {}: {}", r.rig, plural(r.cameras.len(), "camera")), String::new()];
     lines.push(out::table(
         &["camera", "device", "streams", "Mbit/s", ""],
         usize::MAX,
@@ -84,7 +84,8 @@ fn text(r: &Report, style: Style) -> String {
         }),
     ));
     lines.push(String::new());
-    for l in &r.links {
+    // A camera that could not be asked has no load that is known.
+    for l in r.links.iter().filter(|l| l.load_mbit_s > 0.0) {
         let share = 100.0 * l.load_mbit_s / l.plan_mbit_s;
         lines.push(format!(
             "{}: {:.0} of {:.0} Mbit/s planned ({share:.0} %): {}",
