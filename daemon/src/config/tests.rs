@@ -364,7 +364,7 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (second("name = \"b\"\nbackend = \"zed\"\nauto_exposure = true\ngain_percent = 16"), "9:16: \"gain_percent\" in [[camera]] \"b\" cannot be set while auto_exposure is true"),
         (second("name = \"b\"\nbackend = \"zed\"\ncalibration = \"\""), "8:15: \"calibration\" in [[camera]] \"b\" is empty"),
         (second("name = \"b\"\nbackend = \"zed\"\nstream = [{ name = \"depth\" }]"), "8:11: a ZED has no stream \"depth\"; it has: left, right"),
-        (second("name = \"b\"\nbackend = \"zed\"\nemitter = \"off\""), "only another backend has it"),
+        (second("name = \"b\"\nbackend = \"zed\"\nmodel = \"zed2i\""), "only another backend has it"),
         (top("sets.rate_hz = 31"), "1:16: \"rate_hz\" in [sets] is 31 sets a second, but the fastest camera gives 30 frames a second"),
         (top("sets.rate_hz = 0.0"), "1:16: \"rate_hz\" in [sets] is 0; it must be above 0"),
         (top("control.tcp = \"0.0.0.0:80\""), "1:15: \"tcp\" in [control] must be a loopback address such as 127.0.0.1:80, not 0.0.0.0:80: the API has no password"),
