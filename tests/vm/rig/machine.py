@@ -71,6 +71,15 @@ class Machine:
                 self.initrd.unlink(missing_ok=True)
         return self.process.returncode is not None
 
+    def used_s(self) -> float:
+        """The processor time it has used so far: unlike the time on the wall, the same on a busy host."""
+        try:
+            # After the name in parentheses: state, and from there the 12th and 13th (proc_pid_stat(5): utime, stime).
+            fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            return 0.0
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
     def stop(self):
         """Ends it at once."""
         if not self.poll():

@@ -14,6 +14,7 @@ mod vivid;
 
 mod scenarios {
     pub mod cameras;
+    pub mod daemon_life;
     pub mod daemon_smoke;
     pub mod doctor;
     pub mod emulator;
@@ -25,6 +26,7 @@ mod scenarios {
     pub mod realsense_clock;
     pub mod realsense_conformance;
     pub mod realsense_control;
+    pub mod replug;
     pub mod udev;
     pub mod v4l2_cost;
     pub mod v4l2_daemon;
@@ -79,6 +81,8 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::zed::SCENARIO,
     scenarios::zed_records::SCENARIO,
     scenarios::fourteen::SCENARIO,
+    scenarios::replug::SCENARIO,
+    scenarios::daemon_life::SCENARIO,
 ];
 
 fn main() -> anyhow::Result<ExitCode> {
