@@ -358,13 +358,14 @@ pub fn make_backend(
     began: HostTime,
 ) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {
     use depthrig_drivers::{
-        files::FilesBackend, realsense::RealsenseBackend, synthetic::SyntheticBackend, v4l2::V4l2Backend,
-        zed::ZedBackend,
+        files::FilesBackend, realsense::RealsenseBackend, realsense::l515::L515Backend,
+        synthetic::SyntheticBackend, v4l2::V4l2Backend, zed::ZedBackend,
     };
     Ok(match config {
         // One beginning for all cameras of the rig, or each would see the world at another moment.
         BackendConfig::Synthetic(c) => Box::new(SyntheticBackend::starting_at(vec![c.clone()], began)?),
         BackendConfig::Files(c) => Box::new(FilesBackend::new(c.clone())),
+        BackendConfig::L515(c) => Box::new(L515Backend::new(c.clone())),
         BackendConfig::Realsense(c) => Box::new(RealsenseBackend::new(c.clone())),
         BackendConfig::V4l2(c) => Box::new(V4l2Backend::new(c.clone())),
         BackendConfig::Zed(c) => Box::new(ZedBackend::new(c.clone())),

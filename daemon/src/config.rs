@@ -7,6 +7,7 @@
 mod camera;
 mod controls;
 mod error;
+mod l515;
 mod read;
 mod realsense;
 mod rig;
@@ -18,6 +19,7 @@ mod zed;
 
 pub use depthrig_drivers::files::FilesConfig as FilesSettings;
 pub use depthrig_drivers::realsense::RealsenseConfig as RealsenseSettings;
+pub use depthrig_drivers::realsense::l515::L515Config as L515Settings;
 pub use depthrig_drivers::synthetic::SyntheticConfig as SyntheticSettings;
 pub use depthrig_drivers::v4l2::V4l2Config as V4l2Settings;
 pub use depthrig_drivers::zed::ZedConfig as ZedSettings;
@@ -169,6 +171,8 @@ pub enum BackendConfig {
     Files(FilesSettings),
     /// A RealSense D400.
     Realsense(RealsenseSettings),
+    /// A RealSense L515.
+    L515(L515Settings),
     /// A camera at the kernel's video nodes.
     V4l2(V4l2Settings),
     /// A Stereolabs ZED.
@@ -182,6 +186,7 @@ impl BackendConfig {
             Self::Synthetic(_) => "synthetic",
             Self::Files(_) => "files",
             Self::Realsense(_) => depthrig_drivers::realsense::NAME,
+            Self::L515(_) => depthrig_drivers::realsense::l515::NAME,
             Self::V4l2(_) => "v4l2",
             Self::Zed(_) => "zed",
         }

@@ -4,6 +4,34 @@
 use depthrig_drivers::fuzzing::realsense;
 use std::path::{Path, PathBuf};
 
+/// Changes an input by up to four bytes, by cutting it, or by repeating a part of it.
+fn mutated(bytes: &[u8], mut seed: u64) -> Vec<u8> {
+    let mut next = |below: usize| {
+        seed ^= seed << 13;
+        seed ^= seed >> 7;
+        seed ^= seed << 17;
+        (seed >> 11) as usize % below.max(1)
+    };
+    let mut out = bytes.to_vec();
+    for _ in 0..=next(4) {
+        let (at, value) = (next(out.len()), [0, 0xFF, 0x80, 0x7F, next(256) as u8][next(5)]);
+        match next(8) {
+            0 => out.truncate(at),
+            1 => {
+                let part = out.get(at..(at + next(40)).min(out.len())).unwrap_or_default().to_vec();
+                out.splice(at.min(out.len())..at.min(out.len()), part);
+            }
+            _ => out.iter_mut().skip(at).take(1 + next(4)).for_each(|b| *b = value),
+        }
+    }
+    out
+}
+
+/// Changed inputs for each that is kept: 300, and with `DEPTHRIG_LONG=1` so many that it takes minutes.
+fn mutations() -> u64 {
+    if std::env::var_os("DEPTHRIG_LONG").is_some() { 100_000 } else { 300 }
+}
+
 /// Runs each input that is kept for `target`, and sees that the seeds still reach what they were made for.
 fn run(target: &str, reached: impl Fn(&[u8]) -> u64) {
     let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus").join(target);
@@ -15,7 +43,11 @@ fn run(target: &str, reached: impl Fn(&[u8]) -> u64) {
     let mut seeds = 0;
     for path in &paths {
         println!("{}", path.display());
-        let far = reached(&std::fs::read(path).unwrap());
+        let bytes = std::fs::read(path).unwrap();
+        let far = reached(&bytes);
+        for n in 1..=mutations() {
+            reached(&mutated(&bytes, n.wrapping_mul(0x9E37_79B9_7F4A_7C15)));
+        }
         if path.file_name().unwrap().to_string_lossy().starts_with("seed_") {
             seeds += 1;
             assert!(far > 0, "{} reaches nothing: make the seeds anew", path.display());

@@ -2,7 +2,7 @@
 
 use super::read::{Found, Section};
 use super::rig::{not_empty, rate, resolve};
-use super::{BackendConfig, CameraConfig, FilesSettings, realsense, synthetic, v4l2, zed};
+use super::{BackendConfig, CameraConfig, FilesSettings, l515, realsense, synthetic, v4l2, zed};
 use depthrig_bus::{CameraName, Name, PixelFormat, Pose, StreamName};
 use depthrig_drivers::StreamRequest;
 use std::path::{Path, PathBuf};
@@ -12,6 +12,7 @@ enum Driver {
     Synthetic,
     Files,
     Realsense,
+    L515,
     V4l2,
     Zed,
 }
@@ -33,6 +34,7 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         ("synthetic", Driver::Synthetic),
         ("files", Driver::Files),
         ("realsense", Driver::Realsense),
+        ("l515", Driver::L515),
         ("v4l2", Driver::V4l2),
         ("zed", Driver::Zed),
     ];
@@ -51,6 +53,7 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         }
         Some(Driver::Files) => files(&s, base).map(BackendConfig::Files),
         Some(Driver::Realsense) => Some(BackendConfig::Realsense(realsense::read(&s, base, &wanted))),
+        Some(Driver::L515) => Some(BackendConfig::L515(l515::read(&s, &wanted))),
         Some(Driver::V4l2) => Some(BackendConfig::V4l2(v4l2::read(&s))),
         Some(Driver::Zed) => Some(BackendConfig::Zed(zed::read(&s, base, &wanted))),
         // Which keys belong to an unknown driver is unknown too.
@@ -60,6 +63,7 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
     let streams = match &backend {
         // The imagers behind depth are asked for by name.
         Some(BackendConfig::Realsense(_)) if streams.is_empty() => realsense::default_streams(),
+        Some(BackendConfig::L515(_)) if streams.is_empty() => l515::default_streams(),
         _ => streams,
     };
     Some(CameraConfig { name: name?.value, pose, streams, record, backend: backend? })
@@ -69,9 +73,10 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
 pub(super) fn fastest_rate_hz(camera: &CameraConfig) -> Option<f64> {
     match &camera.backend {
         BackendConfig::Files(files) => files.rate_hz,
-        BackendConfig::Realsense(_) | BackendConfig::V4l2(_) | BackendConfig::Zed(_) => {
-            fastest_given_rate(&camera.streams)
-        }
+        BackendConfig::Realsense(_)
+        | BackendConfig::L515(_)
+        | BackendConfig::V4l2(_)
+        | BackendConfig::Zed(_) => fastest_given_rate(&camera.streams),
         BackendConfig::Synthetic(config) => synthetic::fastest_rate_hz(config, &camera.streams).ok(),
     }
 }

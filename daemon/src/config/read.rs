@@ -336,7 +336,7 @@ macro_rules! integers {
         }
     )*};
 }
-integers!(u8, u16, u32, u64, usize);
+integers!(u8, u16, u32, u64, usize, i32);
 
 impl FromToml for depthrig_bus::Name {
     fn from_toml(value: &DeValue<'_>) -> Result<Self, String> {

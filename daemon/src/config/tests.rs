@@ -546,3 +546,43 @@ fn a_rig_of_v4l2_cameras_is_not_faster_than_its_streams() {
     assert!(problems(&text(", rate_hz = 15")).iter().any(|p| p.contains("the fastest camera gives 15")));
     assert!(parse(&text("")).is_ok(), "the camera decides");
 }
+
+#[test]
+fn an_l515_and_its_controls() {
+    use depthrig_drivers::v4l2::ControlValue::Integer;
+    let rig = parse(
+        r#"
+        [[camera]]
+        name = "l"
+        backend = "l515"
+        serial = "f0123456"
+        port = "4-1.2"
+        controls = { laser_power = 60, noise_filtering = 4 }
+        color_controls = { gamma = 300 }
+        "#,
+    )
+    .unwrap();
+    let wanted = L515Settings {
+        serial: Some("f0123456".into()),
+        port: Some("4-1.2".into()),
+        controls: [("laser_power".to_owned(), 60), ("noise_filtering".to_owned(), 4)].into(),
+        color_controls: [("gamma".to_owned(), Integer(300))].into(),
+    };
+    assert_eq!(rig.cameras[0].backend, BackendConfig::L515(wanted));
+    let streams: Vec<_> = rig.cameras[0].streams.iter().map(|s| s.stream.as_str()).collect();
+    assert_eq!(streams, ["depth", "color"]);
+}
+
+#[test]
+fn what_an_l515_has_not() {
+    let wrong = |more: &str| {
+        let text = format!("[[camera]]\nname = \"l\"\nbackend = \"l515\"\n{more}");
+        parse(&text).unwrap_err().to_string()
+    };
+    assert!(wrong("controls = { laser = 1 }").contains("laser_power"), "the names there are");
+    assert!(wrong("[[camera.stream]]\nname = \"ir_left\"").contains("depth, color, ir, confidence"));
+    assert!(
+        wrong("color_controls = { gamma = 1 }\n[[camera.stream]]\nname = \"depth\"")
+            .contains("color_controls")
+    );
+}

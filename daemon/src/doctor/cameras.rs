@@ -81,6 +81,12 @@ fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
             libusb: false,
             needs_calibration: false,
         }),
+        BackendConfig::L515(c) => Some(Wanted {
+            serial: c.serial.as_deref(),
+            port: c.port.as_deref(),
+            libusb: false,
+            needs_calibration: true,
+        }),
     }
 }
 
@@ -157,9 +163,10 @@ fn plan_made(camera: &CameraConfig) -> Planned {
                 (format!("pictures of {}", device.info().port), device.profiles().to_vec())
             }
             // Devices are planned with what is attached.
-            BackendConfig::Realsense(_) | BackendConfig::V4l2(_) | BackendConfig::Zed(_) => {
-                (camera.backend.name().to_owned(), Vec::new())
-            }
+            BackendConfig::Realsense(_)
+            | BackendConfig::L515(_)
+            | BackendConfig::V4l2(_)
+            | BackendConfig::Zed(_) => (camera.backend.name().to_owned(), Vec::new()),
         })
     };
     let chosen = profiles().and_then(|(device, all)| {

@@ -176,7 +176,8 @@ impl DepthIntrinsics {
     pub fn unit_m(&self) -> Result<f64> {
         let z_norm = self.sizes.first().map_or(0.0, |s| f64::from(s.world.z_norm));
         let unit = 0.001 / z_norm;
-        if z_norm > 0.0 && unit.is_finite() && unit < 1.0 {
+        // Infinitely many units would make each of them nothing.
+        if z_norm.is_finite() && z_norm > 0.0 && unit < 1.0 {
             return Ok(unit);
         }
         Err(protocol_error(format!("the L515 says that a millimetre has {z_norm} units of depth")))
