@@ -125,6 +125,14 @@ pub struct Supervisor {
     retry_at: HostTime,
     backoff: Duration,
     lost: bool,
+    heard: Vec<Heard>,
+}
+
+/// When a stream last announced a frame, kept or lost.
+#[derive(Debug, Clone, Copy)]
+struct Heard {
+    captured: u64,
+    at: HostTime,
 }
 
 impl Supervisor {
@@ -140,6 +148,7 @@ impl Supervisor {
             retry_at: HostTime::from_ns(0),
             backoff,
             lost: false,
+            heard: Vec::new(),
         }
     }
 
@@ -188,6 +197,15 @@ impl Supervisor {
                 let why = format!("no frame for {:.1} s although the device answers", stall.as_secs_f64());
                 state.enter(name.as_str(), CameraState::Stalled, Some(why));
             }
+        } else if let Some((stream, silence)) = self.mute_stream(now).filter(|(_, silence)| *silence > stall)
+        {
+            let why =
+                format!("no frame of {stream} for {:.1} s while other streams go on", silence.as_secs_f64());
+            if silence > stall * STALLS_UNTIL_RESTART {
+                self.restart(now, &format!("{why}, the device is opened again"));
+            } else if self.camera.state().phase != CameraState::Stalled {
+                self.camera.state().enter(name.as_str(), CameraState::Stalled, Some(why));
+            }
         } else {
             let mut state = self.camera.state();
             if state.phase != CameraState::Streaming {
@@ -218,6 +236,26 @@ impl Supervisor {
         if !matches!(state.phase, CameraState::Failed | CameraState::Finished) {
             state.enter(name.as_str(), CameraState::Stopped, None);
         }
+    }
+
+    /// The stream that has announced no frame for the longest, and for how long.
+    fn mute_stream(&mut self, now: HostTime) -> Option<(String, Duration)> {
+        let state = self.camera.state();
+        let unheard = Heard { captured: u64::MAX, at: now };
+        self.heard.resize(state.streams.len(), unheard);
+        let mut longest = None;
+        for (stream, heard) in state.streams.iter().zip(&mut self.heard) {
+            let captured = stream.books().captured;
+            // A camera that was opened again starts with all its time.
+            if heard.captured != captured || heard.at < self.opened_at {
+                *heard = Heard { captured, at: now };
+            }
+            let silence = Duration::from_nanos(now.since_ns(heard.at).max(0) as u64);
+            if longest.as_ref().is_none_or(|(_, most)| silence > *most) {
+                longest = Some((stream.id.stream.to_string(), silence));
+            }
+        }
+        longest
     }
 
     fn stall_time(&self) -> Duration {

@@ -19,6 +19,7 @@ mod scenarios {
     pub mod doctor;
     pub mod emulator;
     pub mod emulator_load;
+    pub mod faults;
     pub mod fourteen;
     pub mod l515;
     pub mod libusb;
@@ -83,6 +84,7 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::fourteen::SCENARIO,
     scenarios::replug::SCENARIO,
     scenarios::daemon_life::SCENARIO,
+    scenarios::faults::SCENARIO,
 ];
 
 fn main() -> anyhow::Result<ExitCode> {

@@ -1,0 +1,273 @@
+//! Everything that a camera can do wrong, to one of three under the daemon: it ends in the named state with a message
+//! that says what to do, it streams again when the fault is over, and the camera on the other hub never notices.
+
+use crate::checks::Checks;
+use crate::daemon::{Daemon, drops};
+use crate::subject::plug;
+use crate::{Scenario, system};
+use anyhow::Context;
+use depthrig_daemon::status::{CameraState, CameraStatus, RigStatus};
+use depthrig_emulator::{Camera, Damage, Fault, Hub, Options, Speed, WrongReply};
+use std::time::Duration;
+
+/// See the module.
+pub const SCENARIO: Scenario = Scenario {
+    name: "faults",
+    about: "every fault of an emulated D435 under the daemon: the state it ends in, what is said, and that it comes back",
+    cost: 60,
+    limit_s: 240,
+    run,
+};
+
+/// The camera that is hurt, one on the same hub, and one on another.
+const NAMES: [&str; 3] = ["victim", "neighbour", "witness"];
+const PATIENCE: Duration = Duration::from_secs(20);
+const AWAY: Duration = Duration::from_millis(600);
+/// More wrong replies than an opening asks for, with all its retries.
+const MANY: u32 = 10_000;
+
+struct Bench {
+    cameras: Vec<Camera>,
+    daemon: Daemon,
+}
+
+fn run(checks: &mut Checks) -> anyhow::Result<()> {
+    system::modprobe("vhci-hcd", &[])?;
+    system::modprobe("uvcvideo", &[])?;
+    let mut cameras = Vec::new();
+    for hub in [0, 0, 1] {
+        cameras.push(plug("d435", Options { hub, ..Options::default() })?);
+    }
+    let rig = "[supervisor]\nstall_s = 0.5\nbackoff_min_s = 0.1\nbackoff_max_s = 0.5\n".to_owned();
+    let tables = cameras.iter().zip(NAMES).map(|(camera, name)| table(name, camera.serial(), 424, 240));
+    let daemon = Daemon::start(&(rig + &tables.collect::<String>()))?;
+    daemon.wait_until_streaming()?;
+    let bench = Bench { cameras, daemon };
+    bench.streams_that_end(checks)?;
+    bench.frames_that_are_lost(checks)?;
+    bench.controls(checks)?;
+    bench.openings(checks)?;
+    bench.hub(checks)?;
+    let witness = bench.camera("witness")?;
+    checks.equal("the camera on the other hub has lost nothing", drops(&witness), "");
+    checks.equal("and was never opened again", witness.reconnects, 0);
+    for (camera, name) in bench.cameras.iter().zip(NAMES) {
+        let late = camera.accounts("depth")?.late + camera.accounts("color")?.late;
+        checks.equal(&format!("the emulator was never late for the {name}"), late, 0);
+    }
+    bench.daemon.stop()?;
+    usb2(checks)
+}
+
+fn table(name: &str, serial: &str, width: u32, height: u32) -> String {
+    let stream = |stream: &str, rate: u32| {
+        format!(
+            "[[camera.stream]]\nname = \"{stream}\"\nwidth = {width}\nheight = {height}\nrate_hz = {rate}.0\n"
+        )
+    };
+    let head = format!("[[camera]]\nname = \"{name}\"\nbackend = \"realsense\"\nserial = \"{serial}\"\n");
+    head + &stream("depth", 15) + &stream("color", 15)
+}
+
+fn of<'a>(status: &'a RigStatus, name: &str) -> anyhow::Result<&'a CameraStatus> {
+    status.cameras.iter().find(|c| c.name == name).with_context(|| format!("no camera {name} in the status"))
+}
+
+/// What is checked of a message: each of these words, without regard to case.
+fn says(message: Option<&String>, words: &[&str]) -> bool {
+    let message = message.map(|m| m.to_lowercase()).unwrap_or_default();
+    words.iter().all(|word| message.contains(word))
+}
+
+impl Bench {
+    fn victim(&self) -> &Camera {
+        &self.cameras[0]
+    }
+
+    fn camera(&self, name: &str) -> anyhow::Result<CameraStatus> {
+        of(&self.daemon.status()?, name).cloned()
+    }
+
+    /// The victim comes into a state with a message.
+    fn ends_in(
+        &self,
+        checks: &mut Checks,
+        fault: &str,
+        state: CameraState,
+        words: &[&str],
+    ) -> anyhow::Result<()> {
+        let what = format!("{fault}: {} with a message that says {words:?}", state.name());
+        let there = |s: &RigStatus| {
+            of(s, "victim").is_ok_and(|c| c.state == state && says(c.message.as_ref(), words))
+        };
+        let found = self.daemon.wait_for(PATIENCE, &what, there);
+        let now = self.camera("victim")?;
+        let detail = format!("{}: {}", now.state.name(), now.message.unwrap_or_default());
+        match found {
+            Ok(status) => {
+                let message = of(&status, "victim")?.message.clone();
+                checks.that(&what, true, message.unwrap_or_default());
+            }
+            Err(_) => drop(checks.that(&what, false, detail)),
+        }
+        Ok(())
+    }
+
+    /// A camera streams, and goes on to.
+    fn streams_again(&self, checks: &mut Checks, fault: &str, name: &str) -> anyhow::Result<()> {
+        let delivered = |c: &CameraStatus| c.streams.iter().map(|s| s.delivered).collect::<Vec<_>>();
+        let before = delivered(&self.camera(name)?);
+        let more = |s: &RigStatus| {
+            of(s, name).is_ok_and(|c| {
+                c.state == CameraState::Streaming
+                    && c.message.is_none()
+                    && delivered(c).iter().zip(&before).all(|(now, before)| *now > before + 2)
+            })
+        };
+        let found = self.daemon.wait_for(PATIENCE, "it streams again", more);
+        checks.that(
+            &format!("{fault}: the {name} streams again"),
+            found.is_ok(),
+            found.err().map_or(String::new(), |e| e.to_string()),
+        );
+        Ok(())
+    }
+
+    /// Faults that end a stream.
+    fn streams_that_end(&self, checks: &mut Checks) -> anyhow::Result<()> {
+        use CameraState::{Reconnecting, Stalled};
+        self.victim().unplug()?;
+        self.ends_in(checks, "unplugged", Reconnecting, &["no realsense", self.victim().serial()])?;
+        self.victim().replug()?;
+        self.streams_again(checks, "plugged in again", "victim")?;
+
+        for fault in [Fault::Silence, Fault::Nak] {
+            let name = fault.name();
+            self.victim().fault(fault)?;
+            self.ends_in(checks, name, Stalled, &["no frame"])?;
+            self.ends_in(checks, name, Reconnecting, &["opened again"])?;
+            self.victim().fault(Fault::Clear)?;
+            self.streams_again(checks, name, "victim")?;
+        }
+        // Colour goes on: the camera as a whole is not silent.
+        self.victim().fault(Fault::StallEndpoint { stream: "depth".into() })?;
+        self.ends_in(checks, "stall-endpoint", Stalled, &["no frame of depth"])?;
+        self.ends_in(checks, "stall-endpoint", Reconnecting, &["depth", "opened again"])?;
+        self.streams_again(checks, "stall-endpoint", "victim")?;
+
+        self.victim().fault(Fault::Restart)?;
+        self.ends_in(checks, "restart", Reconnecting, &["d435"])?;
+        self.streams_again(checks, "restart", "victim")
+    }
+
+    /// Damaged frames cost those frames, each counted with a reason, and nothing else.
+    fn frames_that_are_lost(&self, checks: &mut Checks) -> anyhow::Result<()> {
+        const FRAMES: u32 = 3;
+        let before = self.camera("victim")?.reconnects;
+        for damage in [Damage::ErrorBit, Damage::Short, Damage::Long, Damage::Skip, Damage::Repeat] {
+            let fault = Fault::Frames { stream: "depth".into(), damage, frames: FRAMES };
+            let name = fault.name();
+            let dropped = || -> anyhow::Result<(u64, String)> {
+                let camera = self.camera("victim")?;
+                let depth = camera.streams.iter().find(|s| s.id.ends_with("depth")).context("no depth")?;
+                Ok((depth.dropped.values().sum(), format!("{:?}", depth.dropped)))
+            };
+            let (earlier, _) = dropped()?;
+            self.victim().fault(fault)?;
+            let enough = |s: &RigStatus| {
+                of(s, "victim").is_ok_and(|c| {
+                    let depth = c.streams.iter().find(|s| s.id.ends_with("depth"));
+                    depth.is_some_and(|d| d.dropped.values().sum::<u64>() >= earlier + u64::from(FRAMES))
+                })
+            };
+            let seen = self.daemon.wait_for(PATIENCE, name, enough);
+            self.streams_again(checks, name, "victim")?;
+            let (now, reasons) = dropped()?;
+            let lost = now - earlier;
+            checks.that(
+                &format!("{name}: exactly those frames are dropped and counted"),
+                seen.is_ok() && lost == u64::from(FRAMES),
+                format!("{lost} of {FRAMES}; all so far {reasons}"),
+            );
+        }
+        for fault in [Fault::ClockJump(-2_000_000), Fault::ClockReset] {
+            let name = fault.name();
+            self.victim().fault(fault)?;
+            self.streams_again(checks, name, "victim")?;
+        }
+        let now = self.camera("victim")?;
+        checks.equal("none of that has the camera opened again", now.reconnects, before);
+        Ok(())
+    }
+
+    /// Controls that do not answer do not stop the stream.
+    fn controls(&self, checks: &mut Checks) -> anyhow::Result<()> {
+        let before = self.camera("victim")?;
+        self.victim().fault(Fault::ControlTimeout(Duration::from_secs(6)))?;
+        std::thread::sleep(Duration::from_secs(7));
+        self.victim().fault(Fault::ControlStall { times: 3 })?;
+        std::thread::sleep(Duration::from_secs(1));
+        let after = self.camera("victim")?;
+        checks.equal("no frame is lost while controls do not answer", drops(&after), drops(&before).as_str());
+        checks.equal("and the camera stays open", after.reconnects, before.reconnects);
+        self.victim().fault(Fault::Clear)?;
+        self.streams_again(checks, "control-timeout", "victim")
+    }
+
+    /// Openings that fail.
+    fn openings(&self, checks: &mut Checks) -> anyhow::Result<()> {
+        use CameraState::Reconnecting;
+        let wrong = [
+            (WrongReply::Opcode, "opcode"),
+            (WrongReply::Code(-7), "not ready"),
+            (WrongReply::Garbage, "reply"),
+            (WrongReply::Truncated, "bytes"),
+        ];
+        for (wrong, word) in wrong {
+            self.victim().unplug()?;
+            self.victim().fault(Fault::Reply { wrong, times: MANY })?;
+            self.victim().replug()?;
+            self.ends_in(checks, &format!("reply {wrong:?}"), Reconnecting, &[word, "d435"])?;
+            self.victim().fault(Fault::Clear)?;
+            self.streams_again(checks, &format!("reply {wrong:?}"), "victim")?;
+        }
+        Ok(())
+    }
+
+    /// A hub that resets takes all its cameras along, and they come back.
+    fn hub(&self, checks: &mut Checks) -> anyhow::Result<()> {
+        let before = self.camera("neighbour")?.reconnects;
+        checks.equal("cameras on the hub", Hub::reset(&self.cameras, 0, AWAY)?, 2);
+        self.ends_in(checks, "hub reset", CameraState::Reconnecting, &["d435"])?;
+        for name in ["victim", "neighbour"] {
+            self.streams_again(checks, "hub reset", name)?;
+        }
+        checks.equal("the neighbour came back once", self.camera("neighbour")?.reconnects, before + 1);
+        // A table that is damaged for good; last, because a camera that failed is not opened again.
+        self.victim().unplug()?;
+        self.victim().fault(Fault::DamagedTable(25))?;
+        self.victim().replug()?;
+        self.ends_in(checks, "damaged-table", CameraState::Failed, &["crc", "allow_uncalibrated"])
+    }
+}
+
+/// Openings that cannot work: at USB 2, a mode of USB 3; a unit without calibration.
+fn usb2(checks: &mut Checks) -> anyhow::Result<()> {
+    let slow = plug("d435", Options { speed: Speed::High, ..Options::default() })?;
+    let raw = plug("d435", Options::default())?;
+    raw.fault(Fault::Uncalibrated)?;
+    let rig = table("slow", slow.serial(), 848, 480) + &table("raw", raw.serial(), 424, 240);
+    let daemon = Daemon::start(&rig)?;
+    let port = slow.port_path().context("it has a port")?;
+    for (name, words) in
+        [("slow", vec!["usb 2", port.as_str()]), ("raw", vec!["calibrat", "allow_uncalibrated"])]
+    {
+        let failed = |s: &RigStatus| of(s, name).is_ok_and(|c| c.state == CameraState::Failed);
+        let found = daemon.wait_for(PATIENCE, name, failed);
+        let now = of(&daemon.status()?, name)?.clone();
+        let holds = found.is_ok() && says(now.message.as_ref(), &words);
+        let detail = format!("{}: {}", now.state.name(), now.message.unwrap_or_default());
+        checks.that(&format!("{name}: failed, with a message that says {words:?}"), holds, detail);
+    }
+    Ok(())
+}
