@@ -6,6 +6,9 @@
 //!    └──────error────────┴──────────────────error, hang───────────────────┘
 //! an error that cannot pass (wrong settings) ──▶ failed      end of the files ──▶ finished
 //! ```
+//!
+//! "No frame" is said of each stream: one that is silent alone, while the others go on, has its camera stalled and
+//! opened again all the same.
 
 use crate::config::{BackendConfig, CameraConfig, SupervisorConfig};
 use crate::sink::BusSink;

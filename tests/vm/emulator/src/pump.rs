@@ -79,6 +79,8 @@ struct Running {
     /// The host has taken bytes of this session.
     taken: bool,
     sent_before: bool,
+    /// The frame bit of the payload header: it changes with every frame that is sent, not with those that are not.
+    toggle: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -87,6 +89,7 @@ struct Current {
     body: usize,
     excess: usize,
     offset: usize,
+    begun: bool,
     damage: Option<Damage>,
 }
 
@@ -129,6 +132,7 @@ impl Pump {
             current: None,
             taken: false,
             sent_before: false,
+            toggle: false,
         };
         running.due = due(&running, &clock, settings, self.jitter_ns);
         self.running = Some(running);
@@ -233,7 +237,7 @@ impl Pump {
             Some(Damage::Repeat) if running.sent_before => {
                 let header = usize::from(running.header[0]);
                 let body = running.body.len();
-                running.current = Some(Current { header, body, excess: 0, offset: 0, damage });
+                running.current = Some(Current { header, body, excess: 0, offset: 0, begun: false, damage });
                 return;
             }
             _ => {}
@@ -245,7 +249,7 @@ impl Pump {
             mode: &session.mode,
             metadata: self.metadata,
             color: self.color,
-            toggle: k & 1 == 1,
+            toggle: false,
             damaged: damage == Some(Damage::ErrorBit),
             pts_us: clock.shown_us(captured_ns + i64::from(sensor_us) * 1000),
             sent_us: clock.shown_us(clock.running_ns(now)),
@@ -263,7 +267,7 @@ impl Pump {
         content::put_stamp(&mut running.body, &session.mode, &stamp);
         let body = if damage == Some(Damage::Short) { running.body.len() / 3 } else { running.body.len() };
         let excess = if damage == Some(Damage::Long) { EXCESS.len() } else { 0 };
-        running.current = Some(Current { header, body, excess, offset: 0, damage });
+        running.current = Some(Current { header, body, excess, offset: 0, begun: false, damage });
     }
 
     /// Sends what is ready into the transfers that wait.
@@ -282,6 +286,11 @@ impl Pump {
         while let Some(current) = running.current.as_mut() {
             if self.urbs.is_empty() {
                 break;
+            }
+            if current.offset == 0 && !current.begun {
+                current.begun = true;
+                running.toggle = !running.toggle;
+                running.header[1] = running.header[1] & !1 | u8::from(running.toggle);
             }
             let parts: [&[u8]; 3] = [
                 running.header.get(..current.header).unwrap_or_default(),

@@ -188,6 +188,24 @@ fn frames_and_damage() {
     assert_eq!(accounts.good + 3, accounts.sent);
 }
 
+/// The kernel takes a frame whose bit has not changed for more of the one before, and drops it.
+#[test]
+fn the_frame_bit_changes_with_every_frame_that_is_sent() {
+    let (camera, mut host) = camera("d435", Options::default());
+    host.commit(1, 1, 1, 33_333);
+    let mut bit = host.frame(2).0[1] & 1;
+    for damage in [Damage::Skip, Damage::Repeat, Damage::Skip] {
+        camera.fault(Fault::Frames { stream: "depth".into(), damage, frames: 1 }).unwrap();
+        for _ in 0..5 {
+            let next = host.frame(2).0[1] & 1;
+            assert_ne!(next, bit, "around {damage:?}");
+            bit = next;
+        }
+    }
+    let accounts = camera.accounts("depth").unwrap();
+    assert_eq!((accounts.skipped, accounts.repeated), (2, 1));
+}
+
 /// USB/IP's own rule: a transfer that is taken back ends with ECONNRESET, one that had ended before with 0.
 #[test]
 fn a_transfer_that_is_taken_back_is_answered_once() {

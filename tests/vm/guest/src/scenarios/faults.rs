@@ -21,7 +21,7 @@ pub const SCENARIO: Scenario = Scenario {
 
 /// The camera that is hurt, one on the same hub, and one on another.
 const NAMES: [&str; 3] = ["victim", "neighbour", "witness"];
-const PATIENCE: Duration = Duration::from_secs(20);
+const PATIENCE: Duration = Duration::from_secs(10);
 const AWAY: Duration = Duration::from_millis(600);
 /// More wrong replies than an opening asks for, with all its retries.
 const MANY: u32 = 10_000;
@@ -167,27 +167,23 @@ impl Bench {
         for damage in [Damage::ErrorBit, Damage::Short, Damage::Long, Damage::Skip, Damage::Repeat] {
             let fault = Fault::Frames { stream: "depth".into(), damage, frames: FRAMES };
             let name = fault.name();
-            let dropped = || -> anyhow::Result<(u64, String)> {
-                let camera = self.camera("victim")?;
-                let depth = camera.streams.iter().find(|s| s.id.ends_with("depth")).context("no depth")?;
-                Ok((depth.dropped.values().sum(), format!("{:?}", depth.dropped)))
+            // A frame that is missing shows as a gap of the device's own counter, whatever became of it.
+            let gaps = |c: &CameraStatus| {
+                let depth = c.streams.iter().find(|s| s.id.ends_with("depth"));
+                depth.and_then(|d| d.dropped.get("device_gap").copied()).unwrap_or(0)
             };
-            let (earlier, _) = dropped()?;
+            let earlier = gaps(&self.camera("victim")?);
             self.victim().fault(fault)?;
-            let enough = |s: &RigStatus| {
-                of(s, "victim").is_ok_and(|c| {
-                    let depth = c.streams.iter().find(|s| s.id.ends_with("depth"));
-                    depth.is_some_and(|d| d.dropped.values().sum::<u64>() >= earlier + u64::from(FRAMES))
-                })
-            };
+            let enough =
+                |s: &RigStatus| of(s, "victim").is_ok_and(|c| gaps(c) >= earlier + u64::from(FRAMES));
             let seen = self.daemon.wait_for(PATIENCE, name, enough);
             self.streams_again(checks, name, "victim")?;
-            let (now, reasons) = dropped()?;
-            let lost = now - earlier;
+            let now = self.camera("victim")?;
+            let lost = gaps(&now) - earlier;
             checks.that(
                 &format!("{name}: exactly those frames are dropped and counted"),
                 seen.is_ok() && lost == u64::from(FRAMES),
-                format!("{lost} of {FRAMES}; all so far {reasons}"),
+                format!("{lost} of {FRAMES}; all so far: {}", drops(&now)),
             );
         }
         for fault in [Fault::ClockJump(-2_000_000), Fault::ClockReset] {
@@ -221,7 +217,6 @@ impl Bench {
             (WrongReply::Opcode, "opcode"),
             (WrongReply::Code(-7), "not ready"),
             (WrongReply::Garbage, "reply"),
-            (WrongReply::Truncated, "bytes"),
         ];
         for (wrong, word) in wrong {
             self.victim().unplug()?;
@@ -247,7 +242,7 @@ impl Bench {
         self.victim().unplug()?;
         self.victim().fault(Fault::DamagedTable(25))?;
         self.victim().replug()?;
-        self.ends_in(checks, "damaged-table", CameraState::Failed, &["crc", "allow_uncalibrated"])
+        self.ends_in(checks, "damaged-table", CameraState::Failed, &["checksum", "allow_uncalibrated"])
     }
 }
 
@@ -256,12 +251,19 @@ fn usb2(checks: &mut Checks) -> anyhow::Result<()> {
     let slow = plug("d435", Options { speed: Speed::High, ..Options::default() })?;
     let raw = plug("d435", Options::default())?;
     raw.fault(Fault::Uncalibrated)?;
-    let rig = table("slow", slow.serial(), 848, 480) + &table("raw", raw.serial(), 424, 240);
+    // Half a GVD is enough; half a table is not.
+    let cut = plug("d435", Options::default())?;
+    cut.fault(Fault::Reply { wrong: WrongReply::Truncated, times: MANY })?;
+    let rig = table("slow", slow.serial(), 848, 480)
+        + &table("raw", raw.serial(), 424, 240)
+        + &table("cut", cut.serial(), 424, 240);
     let daemon = Daemon::start(&rig)?;
     let port = slow.port_path().context("it has a port")?;
-    for (name, words) in
-        [("slow", vec!["usb 2", port.as_str()]), ("raw", vec!["calibrat", "allow_uncalibrated"])]
-    {
+    for (name, words) in [
+        ("slow", vec!["usb 2", port.as_str()]),
+        ("raw", vec!["calibrat", "allow_uncalibrated"]),
+        ("cut", vec!["checksum", "vendor's calibration tool"]),
+    ] {
         let failed = |s: &RigStatus| of(s, name).is_ok_and(|c| c.state == CameraState::Failed);
         let found = daemon.wait_for(PATIENCE, name, failed);
         let now = of(&daemon.status()?, name)?.clone();
