@@ -79,23 +79,7 @@ fn text(attached: &Attached, args: &CamerasArgs, width: usize) -> String {
         let more = attached.unusable.iter().flat_map(|line| out::item("!", line, width));
         return [nothing.to_owned()].into_iter().chain(more).collect::<Vec<_>>().join("\n");
     }
-    let or_dash = |text: &Option<String>| text.clone().unwrap_or_else(|| "-".to_owned());
-    let mut lines = vec![out::table(
-        &["model", "serial", "port", "USB", "state", "backend", "firmware", "calibration"],
-        usize::MAX,
-        attached.cameras.iter().map(|c| {
-            vec![
-                c.model.clone(),
-                or_dash(&c.serial),
-                c.port.clone(),
-                speed(c),
-                c.state.name().to_owned(),
-                c.backend.to_owned(),
-                or_dash(&c.firmware),
-                or_dash(&c.calibration),
-            ]
-        }),
-    )];
+    let mut lines = vec![table(&attached.cameras, width)];
     for c in &attached.cameras {
         let mut more = Vec::new();
         if c.state == UseState::InUse {
@@ -134,6 +118,31 @@ fn text(attached: &Attached, args: &CamerasArgs, width: usize) -> String {
     lines.join("\n")
 }
 
+/// One line a camera; of the columns as many as fit.
+fn table(cameras: &[AttachedCamera], width: usize) -> String {
+    let or_dash = |text: &Option<String>| text.clone().unwrap_or_else(|| "-".to_owned());
+    let header = ["model", "serial", "port", "USB", "state", "backend", "calibration", "firmware"];
+    let row = |c: &AttachedCamera| {
+        [
+            c.model.clone(),
+            or_dash(&c.serial),
+            c.port.clone(),
+            speed(c),
+            c.state.name().to_owned(),
+            c.backend.to_owned(),
+            or_dash(&c.calibration),
+            or_dash(&c.firmware),
+        ]
+    };
+    // Who has it and how it is attached come first.
+    let with = |columns: usize| {
+        let rows = cameras.iter().map(|c| row(c).into_iter().take(columns).collect());
+        out::table(header.get(..columns).unwrap_or(&header), usize::MAX, rows)
+    };
+    let fits = |text: &String| text.lines().all(|line| line.chars().count() <= width);
+    (6..=header.len()).rev().map(with).find(fits).unwrap_or_else(|| with(6))
+}
+
 /// `USB3 5 Gbit/s`.
 fn speed(c: &AttachedCamera) -> String {
     match c.usb_mbps {
@@ -147,17 +156,21 @@ fn speed(c: &AttachedCamera) -> String {
 
 /// One line for each stream, format and size: `depth z16 848x480: 90, 60, 30, 15 Hz`.
 fn modes(all: &[ModeReport]) -> Vec<String> {
-    let mut lines: Vec<(String, Vec<String>)> = Vec::new();
+    let mut lines: Vec<(String, Vec<f64>)> = Vec::new();
     for m in all {
         let what = format!("{} {} {}x{}", m.stream, m.format, m.width, m.height);
-        let rate = m.rate_hz.to_string();
         match lines.iter_mut().find(|(w, _)| *w == what) {
-            Some((_, rates)) if !rates.contains(&rate) => rates.push(rate),
-            Some(_) => {}
-            None => lines.push((what, vec![rate])),
+            Some((_, rates)) => rates.push(m.rate_hz),
+            None => lines.push((what, vec![m.rate_hz])),
         }
     }
-    lines.into_iter().map(|(what, rates)| format!("{what}: {} Hz", rates.join(", "))).collect()
+    let line = |(what, mut rates): (String, Vec<f64>)| {
+        rates.sort_by(|a, b| b.total_cmp(a));
+        rates.dedup();
+        let rates: Vec<_> = rates.iter().map(f64::to_string).collect();
+        format!("{what}: {} Hz", rates.join(", "))
+    };
+    lines.into_iter().map(line).collect()
 }
 
 #[cfg(test)]
