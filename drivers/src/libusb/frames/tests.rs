@@ -148,6 +148,28 @@ fn a_broken_payload_over_several_transfers_is_passed_over_whole() {
     assert_eq!(seen, [good(0), (1, vec![], None, true), good(2)]);
 }
 
+#[test]
+fn an_error_flag_in_any_payload_damages_the_frame() {
+    let payloads = [
+        payload(0, 0, &picture(0)[..30]),
+        payload(0, Flags::ERROR, &picture(0)[30..60]),
+        payload(0, Flags::END_OF_FRAME, &picture(0)[60..]),
+    ];
+    let (seen, _) = run(layout(90), 128, &payloads);
+    assert_eq!(seen, [(0, picture(0), Some(6), true)]);
+}
+
+#[test]
+fn a_restart_forgets_the_payload_that_was_under_way() {
+    let mut assembler = Assembler::new(layout(FRAME + 20));
+    let mut seen = Vec::new();
+    let mut note = |f: &Assembled<'_>| seen.push((f.bytes.len(), f.damaged));
+    assembler.take(&payload(0, 0, &picture(0))[..32], false, &mut note);
+    assembler.restart(&mut note);
+    assembler.take(&payload(0, Flags::END_OF_FRAME, &picture(1)), true, &mut note);
+    assert_eq!(seen, [(26, true), (100, false)]);
+}
+
 proptest! {
     /// However a device cuts its frames into payloads, and however those fall into transfers, they come out whole.
     #[test]
