@@ -32,6 +32,8 @@ for part in "$@"; do
         need busybox-static command -v busybox
         need kmod command -v depmod
         need zstd command -v zstd
+        # Whose rules a scenario checks.
+        need udev command -v udevadm
         need binutils command -v objcopy
         need python3 command -v python3
         ;;

@@ -1,5 +1,6 @@
 //! The corpus of the fuzz targets of what devices send, as tests: what a fuzzer once found interesting or broken stays
 //! mended.
+#![allow(clippy::unwrap_used)]
 
 use depthrig_drivers::fuzzing::realsense;
 use std::path::{Path, PathBuf};

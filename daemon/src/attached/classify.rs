@@ -118,12 +118,12 @@ fn hidraw(d: &UsbDevice, all: &[UsbDevice]) -> Vec<PathBuf> {
         (d.vendor_id, d.product_id) == (STEREOLABS, ZED_2I.0)
             && (other.vendor_id, other.product_id) == (STEREOLABS, ZED_2I.1)
             // The hub is one for USB2 and one for USB3, of the same ports below their buses.
-            && hub(&other.port).map(without_bus) == hub(&d.port).map(without_bus)
+            && hub(&other.port).map(|p| without_bus(&p)) == hub(&d.port).map(|p| without_bus(&p))
     };
     let sources = all.iter().filter(beside).chain([d]);
     sources.flat_map(|d| d.interfaces.iter().flat_map(|i| i.hidraw_nodes.iter().cloned())).collect()
 }
 
-fn without_bus(port: String) -> String {
-    port.split_once('-').map_or(port.clone(), |(_, ports)| ports.to_owned())
+fn without_bus(port: &str) -> String {
+    port.split_once('-').map_or(port, |(_, ports)| ports).to_owned()
 }

@@ -114,9 +114,9 @@ pub(crate) fn rig_with(port: &str) -> RigStatus {
         uptime_s: 1.0,
         utc_ns: 0,
         cameras: vec![camera],
-        sets: Default::default(),
+        sets: crate::status::SetStatus::default(),
         recording: None,
-        shared_memory: Default::default(),
+        shared_memory: crate::status::SharedMemoryStatus::default(),
         cpu_cores: 0.0,
         replay: None,
     }
@@ -275,7 +275,7 @@ fn a_busy_node_counts_when_its_holder_cannot_be_seen() {
     let found = look_at(&[MadeDevice::new("4-1", 0)], &made, |tree| {
         tree.process(4711, "hidden", &["/dev/video0"]);
         let fd = tree.root().join("proc/4711/fd");
-        std::fs::set_permissions(fd, std::os::unix::fs::PermissionsExt::from_mode(0)).unwrap();
+        std::fs::set_permissions(fd, std::os::unix::fs::PermissionsExt::from_mode(0o0)).unwrap();
     });
     assert_eq!(found.cameras[0].state, UseState::InUse);
     assert!(found.cameras[0].held_words().contains("another user"));

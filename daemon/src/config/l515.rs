@@ -4,7 +4,6 @@ use super::L515Settings;
 use super::camera::WantedStream;
 use super::controls;
 use super::read::Section;
-use depthrig_bus::StreamName;
 use depthrig_drivers::StreamRequest;
 use depthrig_drivers::realsense::protocol::l515::Control;
 

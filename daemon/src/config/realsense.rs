@@ -95,6 +95,7 @@ fn optional<T>(
 }
 
 /// From a micrometre to a centimetre; a camera takes less of it.
+#[allow(clippy::trivially_copy_pass_by_ref)] // as a check of a key is called
 fn depth_unit(unit: &f64) -> Result<(), String> {
     if (1e-6..=0.01).contains(unit) {
         Ok(())

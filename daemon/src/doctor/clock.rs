@@ -18,7 +18,7 @@ pub fn clock_sync() -> Option<ClockSync> {
     let mut timex: libc::timex = unsafe { mem::zeroed() };
     // SAFETY: the pointer is to a whole `timex` that lives over the call.
     let state = unsafe { libc::adjtimex(&raw mut timex) };
-    (state >= 0).then(|| ClockSync {
+    (state >= 0).then_some(ClockSync {
         synchronised: state != libc::TIME_ERROR && timex.status & libc::STA_UNSYNC == 0,
         max_error_us: timex.maxerror,
     })

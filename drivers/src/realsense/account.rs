@@ -131,9 +131,12 @@ impl Account {
     pub(super) fn take_orphans(&mut self) -> Vec<u64> {
         let Some(last) = self.last else { return Vec::new() };
         let is_full = self.level == MetadataLevel::Full;
-        let number = |transport: u64| match is_full {
-            true => u64::from(last.counter.wrapping_sub(last.transport.wrapping_sub(transport) as u32)),
-            false => transport,
+        let number = |transport: u64| {
+            if is_full {
+                u64::from(last.counter.wrapping_sub(last.transport.wrapping_sub(transport) as u32))
+            } else {
+                transport
+            }
         };
         core::mem::take(&mut self.orphans).into_iter().map(number).collect()
     }

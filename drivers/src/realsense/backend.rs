@@ -58,7 +58,7 @@ impl RealsenseBackend {
                 others.push(format!("{} {serial} (USB port {})", found.model.name, found.usb.port));
                 continue;
             }
-            match self.ask(found.clone()) {
+            match self.ask(&found) {
                 Ok(opened) if is_other(&opened.gvd.serial) => others.push(opened.label()),
                 Ok(opened) => return Ok(opened),
                 Err(e) => {
@@ -82,8 +82,8 @@ impl RealsenseBackend {
     }
 
     /// Opens a camera and has it say who it is.
-    fn ask(&self, found: Found) -> Result<Opened> {
-        let opened = Opened::new(found.clone(), self.connect(&found)?)?;
+    fn ask(&self, found: &Found) -> Result<Opened> {
+        let opened = Opened::new(found.clone(), self.connect(found)?)?;
         identity::note(&found.usb, &opened.gvd.serial);
         Ok(opened)
     }
@@ -166,7 +166,7 @@ impl Backend for RealsenseBackend {
             if !here {
                 continue;
             }
-            match self.ask(found.clone()) {
+            match self.ask(&found) {
                 Ok(mut opened) => {
                     let word = Calibration::word(&mut opened.monitor, found.model);
                     infos.push(opened.info(word));

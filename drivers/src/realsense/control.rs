@@ -11,7 +11,7 @@ use core::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use core::time::Duration;
 use depthrig_bus::HostTime;
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, TrySendError, channel, sync_channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 
 /// Extension unit of the stereo module.
@@ -50,7 +50,7 @@ struct Shared {
 pub(super) struct Control {
     shared: Arc<Shared>,
     probes: Receiver<Probe>,
-    stop: Option<Sender<()>>,
+    stop: Option<SyncSender<()>>,
     ended: Receiver<()>,
     thread: Option<JoinHandle<()>>,
 }
@@ -69,8 +69,8 @@ impl Control {
         let shared = Arc::new(Shared::default());
         shared.temperature.store(f32::NAN.to_bits(), Ordering::Relaxed);
         let (send, probes) = sync_channel(QUEUE);
-        let (stop, stopped) = channel();
-        let (end, ended) = channel();
+        let (stop, stopped) = sync_channel(1);
+        let (end, ended) = sync_channel(1);
         let name = label.clone();
         let theirs = Arc::clone(&shared);
         let thread = std::thread::Builder::new().name("realsense-ctl".to_owned()).spawn(move || {
@@ -212,9 +212,10 @@ impl Worker {
         asked?;
         let [code] = code;
         if code != self.fault {
-            match self.family.error_report(code) {
-                Some(text) => tracing::warn!(camera = %self.label, code, "{text}"),
-                None => tracing::info!(camera = %self.label, "it reports no error any more"),
+            if let Some(text) = self.family.error_report(code) {
+                tracing::warn!(camera = %self.label, code, "{text}");
+            } else {
+                tracing::info!(camera = %self.label, "it reports no error any more");
             }
             self.fault = code;
         }

@@ -167,9 +167,12 @@ impl Device for RealsenseDevice {
 
     fn start(mut self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
         let label = self.label();
-        let in_camera = |e: Error| match e.to_string().contains(&label) {
-            true => e,
-            false => Error::new(e.kind(), format!("{label}: {e}")).with_source(e),
+        let in_camera = |e: Error| {
+            if e.to_string().contains(&label) {
+                e
+            } else {
+                Error::new(e.kind(), format!("{label}: {e}")).with_source(e)
+            }
         };
         let (profiles, plan) = profiles::plan(&label, &self.profiles, &self.modes, requests)?;
         self.configure(&label, &profiles).map_err(in_camera)?;

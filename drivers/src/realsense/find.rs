@@ -67,9 +67,10 @@ pub fn candidates(
     };
     if let Some(port) = port {
         let (at_port, others): (Vec<_>, Vec<_>) = found.into_iter().partition(|f| f.usb.port == port);
-        return match at_port.is_empty() {
-            true => Err(not_found(format!("no {what} is at USB port {port}"), &others)),
-            false => Ok(at_port),
+        return if at_port.is_empty() {
+            Err(not_found(format!("no {what} is at USB port {port}"), &others))
+        } else {
+            Ok(at_port)
         };
     }
     match (serial, found.as_slice()) {

@@ -141,12 +141,11 @@ pub(super) fn plan(
         let mode = modes.iter().filter(fits).min_by_key(|m| m.wire_bytes()).ok_or_else(|| {
             unsupported(format!("{label} cannot send {} together with the right imager", p.describe()))
         })?;
-        let at = match plan.modes.iter().position(|m| m.sensor == sensor) {
-            Some(at) => at,
-            None => {
-                plan.modes.push(*mode);
-                plan.modes.len() - 1
-            }
+        let at = if let Some(at) = plan.modes.iter().position(|m| m.sensor == sensor) {
+            at
+        } else {
+            plan.modes.push(*mode);
+            plan.modes.len() - 1
         };
         if plan.modes.get(at) != Some(mode) {
             return Err(unsupported(format!(

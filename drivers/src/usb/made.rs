@@ -13,6 +13,9 @@ pub struct MadeTree {
     root: SysRoot,
 }
 
+/// Number, class, subclass, driver, numbers of its video nodes, of its raw HID nodes.
+pub type MadeInterface = (u8, u8, u8, &'static str, Vec<u32>, Vec<u32>);
+
 /// A device to be put into the tree; [`MadeDevice::new`] is a D435 on USB3.
 #[derive(Debug, Clone)]
 pub struct MadeDevice {
@@ -30,8 +33,8 @@ pub struct MadeDevice {
     pub version: &'static str,
     /// `power/control`.
     pub power: &'static str,
-    /// Number, class, subclass, driver, numbers of its video nodes, of its raw HID nodes.
-    pub interfaces: Vec<(u8, u8, u8, &'static str, Vec<u32>, Vec<u32>)>,
+    /// Its interfaces.
+    pub interfaces: Vec<MadeInterface>,
 }
 
 impl MadeDevice {

@@ -15,13 +15,13 @@ fn stereo() -> Session {
     let mut s = session();
     let mut left = stream("zed/left", PixelFormat::Yuyv, 64, 36);
     left.intrinsics = Intrinsics {
-        coeffs: [-0.0634518, 0.0401532, -0.000375, 0.000748, -0.0161, 0.0, 0.0, 0.0],
+        coeffs: [-0.063_451_8, 0.040_153_2, -0.000_375, 0.000_748, -0.0161, 0.0, 0.0, 0.0],
         model: Distortion::BrownConrady as u32,
         ..Intrinsics::pinhole(26.6, 26.7, 31.8, 18.1)
     };
     let mut right = stream("zed/right", PixelFormat::Yuyv, 64, 36);
     right.intrinsics = Intrinsics { cx: 32.1, cy: 18.8, ..left.intrinsics };
-    right.intrinsics.coeffs[0] = -0.0587747;
+    right.intrinsics.coeffs[0] = -0.058_774_7;
     right.pose = Pose {
         translation_m: [0.22014, -0.2001, 0.3002],
         rotation_xyzw: [-0.0018, 0.0016, 0.0005, 0.999_996_974_995_2],

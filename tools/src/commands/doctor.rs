@@ -127,10 +127,9 @@ fn text(r: &Report, style: Style) -> String {
 
 fn finding(f: &Finding, style: Style) -> Vec<String> {
     let name = match (f.severity, style.color) {
-        (s, false) => s.name().to_owned(),
         (s @ Severity::Error, true) => format!("\u{1b}[31m{}\u{1b}[0m", s.name()),
         (s @ Severity::Warning, true) => format!("\u{1b}[33m{}\u{1b}[0m", s.name()),
-        (s, true) => s.name().to_owned(),
+        (s, _) => s.name().to_owned(),
     };
     let camera = f.camera.as_ref().map(|c| format!(" {c}:")).unwrap_or_default();
     let mut lines = vec![format!("{name}{camera} [{}]", f.id)];

@@ -19,6 +19,7 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 #[command(group = clap::ArgGroup::new("action").required(true))]
+#[allow(clippy::struct_excessive_bools)] // each is a flag of the command line
 pub struct InstallArgs {
     /// Show the files, how each stands on this computer, and the commands that make them work
     #[arg(long, group = "action")]
@@ -135,7 +136,8 @@ fn user_name(name: &str) -> Result<String, String> {
 fn absolute(path: &Path) -> Result<PathBuf> {
     let path = std::path::absolute(path).with_context(|| format!("{} is no path", path.display()))?;
     if path.to_string_lossy().contains(char::is_control) {
-        return Err(UsageError(format!("{path:?} has a line break or the like in it")).into());
+        let path = path.to_string_lossy().escape_debug().to_string();
+        return Err(UsageError(format!("{path} has a line break or the like in it")).into());
     }
     Ok(path)
 }

@@ -1,4 +1,5 @@
 //! Streams from modes, and modes from streams.
+#![allow(clippy::trivially_copy_pass_by_ref)] // b"Z16 " reads better than *b"Z16 "
 
 use super::*;
 use crate::realsense::models;

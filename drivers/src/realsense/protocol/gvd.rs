@@ -10,6 +10,7 @@ use crate::Result;
 use crate::bytes::{array, put, u8_at};
 
 /// A D400's account of itself.
+#[allow(clippy::struct_excessive_bools)] // each is a byte of the reply
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Gvd {
     /// Version of this structure (byte 2).
@@ -184,7 +185,7 @@ impl L515Gvd {
 }
 
 fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
+    bytes.iter().fold(String::new(), |text, b| text + &format!("{b:02x}"))
 }
 
 /// The bytes of hexadecimal digits; none when there is anything else in `text`.

@@ -22,10 +22,10 @@ impl Temperatures {
     /// Reads the four bytes of [`TEMPERATURES_SELECTOR`]: two flags, two temperatures. The camera gives them only
     /// while it streams.
     pub const fn parse(bytes: [u8; 4]) -> Self {
-        let [projector_valid, asic_valid, projector, asic] = bytes;
         const fn known(valid: u8, c: u8) -> Option<i8> {
             if valid == 0 { None } else { Some(c as i8) }
         }
+        let [projector_valid, asic_valid, projector, asic] = bytes;
         Self { projector_c: known(projector_valid, projector), asic_c: known(asic_valid, asic) }
     }
 

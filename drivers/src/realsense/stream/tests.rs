@@ -107,12 +107,13 @@ fn profile(stream: &str, format: PixelFormat, level: MetadataLevel) -> StreamPro
 /// A stream over `pictures`: depth, or both imagers out of one source.
 fn stream(pictures: Vec<Made>, end: Option<ErrorKind>, both: bool) -> (RealsenseStream, Arc<Memory>) {
     let level = MetadataLevel::Full;
-    let made = match both {
-        false => vec![(profile("depth", PixelFormat::Z16, level), Unpack::Copy)],
-        true => vec![
+    let made = if both {
+        vec![
             (profile("ir_left", PixelFormat::Mono8, level), Unpack::Left),
             (profile("ir_right", PixelFormat::Mono8, level), Unpack::Right),
-        ],
+        ]
+    } else {
+        vec![(profile("depth", PixelFormat::Z16, level), Unpack::Copy)]
     };
     let lane = |(i, (p, unpack)): (usize, &(StreamProfile, Unpack))| Lane {
         gate: Gate::new(i, p),

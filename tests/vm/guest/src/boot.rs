@@ -75,7 +75,7 @@ fn leave_nothing(checks: &mut Checks) -> anyhow::Result<()> {
     let _ = Command::new("rmmod").arg("vivid").stderr(std::process::Stdio::null()).status();
     let gone = || system::video_nodes().is_ok_and(|nodes| nodes.is_empty());
     // The kernel's hub needs up to 2.5 s for each camera that went together with others.
-    if !system::wait_until(Duration::from_secs(60), gone) {
+    if !system::wait_until(Duration::from_mins(1), gone) {
         checks.that("leaves no camera behind", false, format!("{:?}", system::video_nodes()?));
     }
     Ok(())

@@ -66,11 +66,6 @@ impl Daemon {
         }
     }
 
-    /// Its API.
-    pub fn client(&self) -> &Client {
-        &self.client
-    }
-
     /// Everything it says of itself.
     ///
     /// # Errors

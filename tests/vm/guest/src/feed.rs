@@ -40,7 +40,7 @@ impl Watched {
     /// Frames between the first and the last one seen that were sent by the camera and are not here, by their stamps.
     pub fn lost(&self) -> u64 {
         let indexes = || self.frames.iter().filter_map(|f| f.index);
-        match (indexes().next(), indexes().last()) {
+        match (indexes().next(), indexes().next_back()) {
             (Some(first), Some(last)) => (last - first + 1).saturating_sub(indexes().count() as u64),
             _ => 0,
         }

@@ -1,3 +1,5 @@
+#![allow(clippy::trivially_copy_pass_by_ref)] // b"Z16 " reads better than *b"Z16 "
+
 use super::*;
 use crate::realsense::protocol::l515::{DepthLens, DepthPart, Lens};
 

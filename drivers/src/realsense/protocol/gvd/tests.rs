@@ -62,7 +62,10 @@ fn cut_off_at_every_length() {
                 assert_eq!(gvd.shutter == Shutter::Global, n > 166);
             }
             Err(e) => {
-                assert!(n < 70 && e.kind() == ErrorKind::Protocol && e.to_string().contains("70"), "{n}: {e}")
+                assert!(
+                    n < 70 && e.kind() == ErrorKind::Protocol && e.to_string().contains("70"),
+                    "{n}: {e}"
+                );
             }
         }
         assert_eq!(L515Gvd::parse(&whole[..n]).is_ok(), n >= 80);

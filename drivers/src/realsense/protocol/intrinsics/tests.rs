@@ -202,7 +202,7 @@ fn colour_in_depth_is_the_transpose_and_minus_the_translation() {
 
 #[test]
 fn what_is_no_rotation_is_refused() {
-    let mut tables = vec![turned(), turned(), turned(), turned(), turned()];
+    let mut tables = [turned(), turned(), turned(), turned(), turned()];
     tables[0].rectified_rotation[0] += 0.01;
     tables[1].rectified_rotation = [0.0; 9];
     tables[2].rectified_rotation[4] = f32::NAN;

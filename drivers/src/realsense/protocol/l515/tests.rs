@@ -5,11 +5,11 @@ use depthrig_calib::PoseExt;
 use proptest::prelude::*;
 
 fn f(b: &mut Vec<u8>, values: &[f32]) {
-    values.iter().for_each(|v| b.extend(v.to_le_bytes()));
+    b.extend(values.iter().flat_map(|v| v.to_le_bytes()));
 }
 
 fn n(b: &mut Vec<u8>, values: &[u32]) {
-    values.iter().for_each(|v| b.extend(v.to_le_bytes()));
+    b.extend(values.iter().flat_map(|v| v.to_le_bytes()));
 }
 
 /// Two sizes by the note, written one field after the other; the raw half has 1 added to every number.
@@ -166,7 +166,7 @@ fn controls_are_checked_against_the_camera_s_range() {
 #[test]
 fn temperatures_and_errors() {
     let mut b = Vec::new();
-    [41.5f64, 40.0, 39.0, 38.0, 30.0, 41.0].iter().for_each(|v| b.extend(v.to_le_bytes()));
+    b.extend([41.5f64, 40.0, 39.0, 38.0, 30.0, 41.0].iter().flat_map(|v| v.to_le_bytes()));
     let t = Temperatures::parse(&b).unwrap();
     assert_eq!(
         (t.laser_c, t.processor_c, t.mirror_c, t.receiver_c, t.humidity_c),

@@ -61,7 +61,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
         format!("{:?} to {:?}", epochs.first(), epochs.last()),
     );
     judge(checks, &camera, "after the clock reset", after);
-    let lost: u64 = tally.drops.iter().map(|d| d.total()).sum();
+    let lost: u64 = tally.drops.iter().map(depthrig_bus::DropCounts::total).sum();
     checks.equal("nothing was lost meanwhile", lost, 0);
 
     checks.done("a hardware reset is taken while it streams", backend.reset(None));

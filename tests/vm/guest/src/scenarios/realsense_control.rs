@@ -142,13 +142,13 @@ fn metadata_levels(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
         checks.equal(&format!("{wish:?}: frames of another level"), other.count(), 0);
         let n = tally.frames.len();
         checks.that(&format!("{wish:?}: frames came of both streams"), n > 100, n);
-        let lost: u64 = tally.drops.iter().map(|d| d.total()).sum();
+        let lost: u64 = tally.drops.iter().map(depthrig_bus::DropCounts::total).sum();
         checks.equal(&format!("{wish:?}: frames lost"), lost, 0);
         let late = tally.frames.iter().filter_map(|f| {
             let name = if f.stream == 0 { "depth" } else { "color" };
             Some(f.meta.capture_time.since_ns(camera.true_capture(name, f.index?).ok()?))
         });
-        let worst_ms = late.map(|ns| ns.unsigned_abs()).max().unwrap_or(u64::MAX) as f64 / 1e6;
+        let worst_ms = late.map(i64::unsigned_abs).max().unwrap_or(u64::MAX) as f64 / 1e6;
         checks.that(&format!("{wish:?}: capture times are within a frame"), worst_ms < 33.0, worst_ms);
     }
     Ok(())
@@ -167,7 +167,7 @@ fn hanging_controls(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> 
     let came = tally.frames.len() - before;
     checks.that("while no control is answered, frames come", came > 2 * 8 * 29, came);
     checks.that("none of them late", gap_ms < 50.0, format!("the longest pause is {gap_ms:.1} ms"));
-    let lost: u64 = tally.drops.iter().map(|d| d.total()).sum();
+    let lost: u64 = tally.drops.iter().map(depthrig_bus::DropCounts::total).sum();
     checks.equal("and none is lost", lost, 0);
     let began = depthrig_bus::HostTime::now();
     drop(stream);
@@ -208,7 +208,7 @@ fn accounts(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
         let damaged = (now.error_bit - then.error_bit) + (now.short - then.short) + (now.long - then.long);
         let skipped = skipped[i] - then.skipped;
         checks.equal(&format!("{name}: the camera spoiled and skipped"), (damaged, skipped), (5, 4));
-        let lost = tally.drops.get(i).map_or(0, |d| d.total());
+        let lost = tally.drops.get(i).map_or(0, depthrig_bus::DropCounts::total);
         checks.equal(&format!("{name}: lost are all the others"), lost, damaged + skipped);
         // The kernel's driver keeps damaged frames to itself.
         checks.equal(&format!("{name}: as gaps"), tally.lost(i, DropReason::DeviceGap), lost);
