@@ -553,6 +553,7 @@ fn an_l515_and_its_controls() {
     use depthrig_drivers::v4l2::ControlValue::Integer;
     let rig = parse(
         r#"
+        rig = "mount"
         [[camera]]
         name = "l"
         backend = "l515"

@@ -16,6 +16,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::thread::JoinHandle;
 
+/// How long a fault may wait for the device's thread, which may be busy sending.
+const FAULT_PATIENCE: Duration = Duration::from_secs(2);
+
 /// How long a device may take to come or to go.
 const PATIENCE: Duration = Duration::from_secs(5);
 
@@ -166,7 +169,7 @@ impl Camera {
         self.companion.as_ref().map_or(Ok(()), |c| c.unplug_for(time))
     }
 
-    /// Makes something go wrong, from now on.
+    /// Makes something go wrong, from now on: what the host asks after this meets it.
     ///
     /// # Errors
     /// When the fault names a stream that the camera has not.
@@ -174,7 +177,14 @@ impl Camera {
         if let Fault::Frames { stream, .. } | Fault::StallEndpoint { stream } = &fault {
             self.model.stream_index(stream)?;
         }
-        self.shared.ask(Command::Fault(fault))
+        let (name, until) = (fault.name(), HostTime::now().plus(FAULT_PATIENCE));
+        let asked = || self.shared.lock().faults.get(name).copied();
+        let before = asked();
+        self.shared.ask(Command::Fault(fault))?;
+        while asked() == before && !until.from_now().is_zero() {
+            std::thread::sleep(Duration::from_micros(100));
+        }
+        Ok(())
     }
 
     /// What a stream did.
