@@ -38,13 +38,15 @@ pub(super) fn run(
     around.extend(hit(Damage::Skip, 1)?);
     let whole: Vec<_> = around.iter().filter_map(|p| Some((p.sequence, p.index?))).collect();
     let steps: Vec<_> = whole.windows(2).map(|w| (w[1].0 - w[0].0, w[1].1 - w[0].1)).collect();
+    // The identifier bit changes with each frame that is sent. One that the device did not send shows in the frame
+    // counter of its metadata alone, which is the back end's to read (`libusb-conformance` has the case).
+    let skipped = steps.iter().filter(|(_, due)| *due == 2).count();
+    checks.equal("the device skipped one frame", skipped, 1);
     checks.that(
-        "the numbers rise as the frames that were due",
-        steps.iter().all(|(a, b)| a == b),
+        "the numbers rise with the frames that came",
+        steps.iter().all(|(n, _)| *n == 1),
         format!("{steps:?}"),
     );
-    let lost = around.windows(2).filter(|w| w[1].sequence > w[0].sequence + 1).count();
-    checks.equal("a skipped frame shows once", lost, 1);
 
     device.fault(Fault::StallEndpoint { stream: "depth".into() })?;
     let began = HostTime::now();
