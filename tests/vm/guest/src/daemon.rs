@@ -30,22 +30,8 @@ impl Daemon {
     /// # Errors
     /// When it ends at once or never answers; the scenario's log has what it said.
     pub fn start(cameras: &str) -> anyhow::Result<Self> {
-        let text = format!(
-            "rig = \"{RIG}\"\n\
-             [recording]\ndirectory = \"{}\"\ncolor = \"raw\"\nreserve_mb = 1\nmin_minutes = 0\n{cameras}",
-            datasets().display()
-        );
-        let folder = Path::new("/tmp/rig");
-        std::fs::create_dir_all(folder)?;
-        let file = folder.join("rig.toml");
-        std::fs::write(&file, text)?;
-        let runtime = RuntimeDir::at(&folder.join("run"))?;
-        let child = Command::new("depthrig")
-            .args(["run", "--json", "--runtime-dir"])
-            .arg(runtime.path())
-            .arg(&file)
-            .spawn()
-            .context("depthrig run")?;
+        let (mut command, runtime) = Self::command(cameras)?;
+        let child = command.spawn().context("depthrig run")?;
         let mut daemon = Starting(Some(child));
         let rig = RigName::new(RIG)?;
         let end = HostTime::now().plus(PATIENCE);
@@ -64,6 +50,31 @@ impl Daemon {
                 Err(_) => std::thread::sleep(Duration::from_millis(20)),
             }
         }
+    }
+
+    /// Runs a daemon that shall refuse to start; how it ended, and what it said of that.
+    ///
+    /// # Errors
+    /// When it cannot be run.
+    pub fn refused(cameras: &str) -> anyhow::Result<(Option<i32>, String)> {
+        let output = Self::command(cameras)?.0.output().context("depthrig run")?;
+        Ok((output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned()))
+    }
+
+    fn command(cameras: &str) -> anyhow::Result<(Command, RuntimeDir)> {
+        let text = format!(
+            "rig = \"{RIG}\"\n\
+             [recording]\ndirectory = \"{}\"\ncolor = \"raw\"\nreserve_mb = 1\nmin_minutes = 0\n{cameras}",
+            datasets().display()
+        );
+        let folder = Path::new("/tmp/rig");
+        std::fs::create_dir_all(folder)?;
+        let file = folder.join("rig.toml");
+        std::fs::write(&file, text)?;
+        let runtime = RuntimeDir::at(&folder.join("run"))?;
+        let mut command = Command::new("depthrig");
+        command.args(["run", "--json", "--runtime-dir"]).arg(runtime.path()).arg(&file);
+        Ok((command, runtime))
     }
 
     /// Everything it says of itself.
