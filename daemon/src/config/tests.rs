@@ -1,4 +1,5 @@
-//! The default file is complete and true, and every problem of a bad one is named with its place.
+//! The default file is complete and true, and every problem of a bad one is named with its place. Long because every
+//! back end's keys are in it.
 #![allow(clippy::items_after_statements)] // each test names what it is about
 
 use super::read::Report;

@@ -4,7 +4,7 @@ use super::calibration::{Calibration, FACTORY, NONE, View};
 use super::config::RealsenseConfig;
 use super::family::Family;
 use super::find::Found;
-use super::launch::Launch;
+use super::launch::{Launch, in_camera};
 use super::memory::Memory;
 use super::profiles::{self, Basis};
 use super::protocol::advanced::{self, UnitOrigin};
@@ -167,13 +167,7 @@ impl Device for RealsenseDevice {
 
     fn start(mut self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
         let label = self.label();
-        let in_camera = |e: Error| {
-            if e.to_string().contains(&label) {
-                e
-            } else {
-                Error::new(e.kind(), format!("{label}: {e}")).with_source(e)
-            }
-        };
+        let in_camera = |e| in_camera(&label, e);
         let (profiles, plan) = profiles::plan(&label, &self.profiles, &self.modes, requests)?;
         self.configure(&label, &profiles).map_err(in_camera)?;
         self.warn_of_scaled(&label, &profiles);

@@ -7,7 +7,7 @@ use super::profiles::{self, Plan};
 use super::protocol::hwm::HardwareMonitor;
 use super::stream::{Lane, Parts, RealsenseStream};
 use super::transport::{Function, Transport};
-use crate::{Gate, Result, Stream, StreamProfile};
+use crate::{Error, Gate, Result, Stream, StreamProfile};
 use std::sync::Arc;
 
 /// What is to be started.
@@ -50,5 +50,14 @@ impl Launch {
         let control = Control::spawn(label.clone(), family, monitor, port)?;
         let parts = Parts { label, pictures: started.pictures, profiles, lanes, sources, control, memory };
         Ok(Box::new(RealsenseStream::new(parts)))
+    }
+}
+
+/// The error with the camera it is about, which `label` names, unless it says so already.
+pub(super) fn in_camera(label: &str, e: Error) -> Error {
+    if e.to_string().contains(label) {
+        e
+    } else {
+        Error::new(e.kind(), format!("{label}: {e}")).with_source(e)
     }
 }

@@ -5,7 +5,7 @@ use super::{L515Config, NAME};
 use crate::realsense::calibration::{FACTORY, NONE};
 use crate::realsense::family::Family;
 use crate::realsense::find::Found;
-use crate::realsense::launch::Launch;
+use crate::realsense::launch::{Launch, in_camera};
 use crate::realsense::memory::Memory;
 use crate::realsense::options;
 use crate::realsense::protocol::gvd::L515Gvd;
@@ -128,13 +128,7 @@ impl Device for L515Device {
 
     fn start(mut self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
         let label = self.label.clone();
-        let in_camera = |e: Error| {
-            if e.to_string().contains(&label) {
-                e
-            } else {
-                Error::new(e.kind(), format!("{label}: {e}")).with_source(e)
-            }
-        };
+        let in_camera = |e| in_camera(&label, e);
         let (profiles, plan) = profiles::plan(&label, &self.profiles, &self.modes, requests)?;
         self.configure(&profiles).map_err(in_camera)?;
         let Self { opened: Opened { mut transport, monitor, .. }, memory, .. } = *self;
