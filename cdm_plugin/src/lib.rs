@@ -1,11 +1,21 @@
 //! Camera depth models: what refines the depth of a camera, and how good depth is.
 //!
-//! Floor 3. **What is here today: [`metrics`]**, the measures by which depth is compared with a reference, over
-//! raw 16-bit or float depth. There is no model, no engine and no training yet; nothing in this crate pretends to
-//! be one.
+//! Floor 3. Start at [`Refiner`]: colour and raw depth of one view in, clean metric depth out. A camera depth model is
+//! one network ([`Encoder`] says which size of it) with its [`Weights`]; a [`Network`] runs it. [`metrics`] are the
+//! measures by which depth is compared with a reference.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
+mod arch;
 mod error;
 pub mod metrics;
+mod model;
+mod network;
+mod refine;
+pub mod weights;
 
+pub use arch::Encoder;
 pub use error::{Error, ErrorKind, Result};
+pub use model::{ChannelOrder, Model};
+pub use network::{NetShape, Network, PositionEmbeddings};
+pub use refine::{Color, ColorFormat, Description, Job, Output, RawDepth, Refiner, StepTimes};
+pub use weights::Weights;

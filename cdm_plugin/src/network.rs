@@ -1,0 +1,65 @@
+//! What runs the network: one trait, whatever library stands behind it.
+
+use crate::Result;
+
+/// The size of a network's input.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct NetShape {
+    /// Pictures at a time.
+    pub batch: usize,
+    /// Rows, a multiple of 14.
+    pub height: usize,
+    /// Columns, a multiple of 14.
+    pub width: usize,
+}
+
+impl NetShape {
+    /// Patches of one picture, without the class token.
+    pub const fn patches(self) -> usize {
+        (self.height / crate::arch::PATCH) * (self.width / crate::arch::PATCH)
+    }
+
+    /// Numbers in the input: colour in three planes and inverse depth in one.
+    pub const fn input_len(self) -> usize {
+        self.batch * 4 * self.height * self.width
+    }
+
+    /// Numbers in the output: inverse depth in one plane.
+    pub const fn output_len(self) -> usize {
+        self.batch * self.height * self.width
+    }
+}
+
+/// The position embeddings of both encoders at one size of input, row-major `[1 + patches, width of the encoder]`, the
+/// class token first.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PositionEmbeddings {
+    /// Of the encoder of colour.
+    pub rgb: Vec<f32>,
+    /// Of the encoder of inverse depth.
+    pub depth: Vec<f32>,
+}
+
+/// A network with its weights, on some engine and device.
+pub trait Network: Send {
+    /// The engine, its version, the device and the precision, such as `onnxruntime 1.31.1 cpu fp32`; at most 31 bytes.
+    fn describe(&self) -> &str;
+
+    /// How many pictures at a time this engine gains from; 1 when it gains nothing.
+    fn best_batch(&self) -> usize {
+        1
+    }
+
+    /// Gets ready for inputs of `shape`; called once per size, before the first [`Self::run`] at it.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::OutOfMemory`] and [`crate::ErrorKind::Engine`].
+    fn prepare(&mut self, shape: NetShape, positions: &PositionEmbeddings) -> Result<()>;
+
+    /// Runs the network at the size that was prepared last. `x` is `[batch, 4, height, width]`: colour, normalised, and
+    /// inverse depth in 1/m; `y` becomes `[batch, height, width]`: inverse depth in 1/m, not negative.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::OutOfMemory`] and [`crate::ErrorKind::Engine`].
+    fn run(&mut self, x: &[f32], y: &mut [f32]) -> Result<()>;
+}
