@@ -5,17 +5,21 @@
 //! measures by which depth is compared with a reference.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
-mod arch;
+pub mod arch;
 mod error;
+mod factory;
 pub mod metrics;
 mod model;
 mod network;
+mod options;
 mod refine;
 pub mod weights;
 
 pub use arch::Encoder;
 pub use error::{Error, ErrorKind, Result};
+pub use factory::refiner;
 pub use model::{ChannelOrder, Model};
 pub use network::{NetShape, Network, PositionEmbeddings};
+pub use options::{EngineKind, Precision, RefinerOptions};
 pub use refine::{Color, ColorFormat, Description, Job, Output, RawDepth, Refiner, StepTimes};
 pub use weights::Weights;
