@@ -206,11 +206,15 @@ fn distinct() -> FrameHeader {
         payload_len: 618_406,
         gain: 16.5,
         temperature_c: 36.625,
+        source_color_sequence: 0xA1A2_A3A4_A5A6_A7A8,
+        source_color_capture_time_ns: -0x2122_2324_2526_2728,
+        stage_ns: [201, 202, 203, 204, 205, 206],
         ..FrameHeader::default()
     };
     header.rig = text("rig-µ");
     header.camera = text("camera_of_thirty_one_characters");
     header.stream = text("depth_refined");
+    header.set_refiner("onnxruntime 1.31.1 cpu fp32", "cdm-d435@1f2e3d4c");
     header.set_device("Modèle 深度", "SN-00042");
     for (i, word) in header.reserved.iter_mut().enumerate() {
         *word = 0x9192_9394_0000_0000 + i as u64;
@@ -246,7 +250,10 @@ fn dump(folder: &Path) -> Result<(), Box<dyn Error>> {
         "clock_domain": h.clock_domain, "clock_epoch": h.clock_epoch, "flags": h.flags, "format": h.format,
         "width": h.width, "height": h.height, "stride": h.stride, "payload_len": h.payload_len, "gain": h.gain,
         "temperature_c": h.temperature_c, "rig": h.rig(), "camera": h.camera(), "stream": h.stream(),
-        "model": h.model(), "serial": h.serial(), "reserved": h.reserved,
+        "model": h.model(), "serial": h.serial(),
+        "source_color_sequence": h.source_color_sequence,
+        "source_color_capture_time_ns": h.source_color_capture_time_ns, "stage_ns": h.stage_ns,
+        "refiner": h.refiner(), "refiner_model": h.refiner_model(), "reserved": h.reserved,
     });
     std::fs::create_dir_all(folder)?;
     std::fs::write(folder.join("header.bin"), bytes)?;

@@ -59,7 +59,8 @@ pub struct FrameHeader {
     pub captured: u64,
     /// Frames lost so far, indexed by [`crate::DropReason`].
     pub dropped: [u64; 8],
-    /// For a derived stream, `sequence` of the frame that it was made from; else 0.
+    /// For a derived stream, `sequence` of the frame that it was made from (the depth frame where there are several);
+    /// else 0.
     pub source_sequence: u64,
     /// Metres per unit of depth; 0 when the pixels are no depth.
     pub depth_unit_m: f64,
@@ -97,8 +98,19 @@ pub struct FrameHeader {
     pub model: [u8; 32],
     /// Camera serial number, zero-padded UTF-8.
     pub serial: [u8; 32],
+    /// For depth that was made from depth and colour, `sequence` of the colour frame; else 0.
+    pub source_color_sequence: u64,
+    /// Middle of the exposure of that colour frame on the host clock; else 0. `capture_time_ns` is that of the depth
+    /// frame.
+    pub source_color_capture_time_ns: i64,
+    /// How long each step of making a derived frame took, nanoseconds, indexed by [`StageStep`]; else 0.
+    pub stage_ns: [u64; StageStep::ALL.len()],
+    /// What made a derived frame, such as `fill` or `onnxruntime 1.31.1 cpu fp32`, zero-padded UTF-8.
+    pub refiner: [u8; 32],
+    /// The model that it used, such as `cdm-d435@1f2e3d4c`, zero-padded UTF-8; empty when it needs none.
+    pub refiner_model: [u8; 32],
     /// Zero; space for later fields of this version.
-    pub reserved: [u64; 29],
+    pub reserved: [u64; 13],
 }
 
 const _: () = assert!(size_of::<FrameHeader>() == HEADER_SIZE, "the header's size is part of the contract");
@@ -141,7 +153,12 @@ impl Default for FrameHeader {
             stream: [0; 32],
             model: [0; 32],
             serial: [0; 32],
-            reserved: [0; 29],
+            source_color_sequence: 0,
+            source_color_capture_time_ns: 0,
+            stage_ns: [0; StageStep::ALL.len()],
+            refiner: [0; 32],
+            refiner_model: [0; 32],
+            reserved: [0; 13],
         }
     }
 }
@@ -191,6 +208,28 @@ impl FrameHeader {
     pub fn set_device(&mut self, model: &str, serial: &str) {
         set_text(&mut self.model, model);
         set_text(&mut self.serial, serial);
+    }
+
+    /// Writes what made a derived frame and with which model; what does not fit in 31 bytes is cut at a character
+    /// boundary.
+    pub fn set_refiner(&mut self, refiner: &str, model: &str) {
+        set_text(&mut self.refiner, refiner);
+        set_text(&mut self.refiner_model, model);
+    }
+
+    /// What made this frame, such as `fill`; empty when it was captured.
+    pub fn refiner(&self) -> &str {
+        text(&self.refiner)
+    }
+
+    /// The model that it was made with; empty when none was needed.
+    pub fn refiner_model(&self) -> &str {
+        text(&self.refiner_model)
+    }
+
+    /// How long `step` of making this frame took, nanoseconds.
+    pub const fn step_ns(&self, step: StageStep) -> u64 {
+        self.stage_ns[step as usize]
     }
 
     /// The rig's name.
@@ -300,6 +339,44 @@ impl FrameFlags {
     /// Both sets of flags together.
     pub const fn with(self, other: Self) -> Self {
         Self(self.0 | other.0)
+    }
+}
+
+/// A step of making a derived frame. The discriminant is the index into `FrameHeader::stage_ns`; it is part of the wire
+/// format and never changes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[repr(u32)]
+#[non_exhaustive]
+pub enum StageStep {
+    /// From when both frames were there until work on them began.
+    Wait = 0,
+    /// Depth into the view of colour.
+    Register = 1,
+    /// From pictures to the engine's input.
+    Prepare = 2,
+    /// The engine.
+    Infer = 3,
+    /// From the engine's output to the pixels of this frame.
+    Finish = 4,
+    /// All of it, from when both frames were there until this one was published.
+    Total = 5,
+}
+
+impl StageStep {
+    /// Every step, in wire order.
+    pub const ALL: [Self; 6] =
+        [Self::Wait, Self::Register, Self::Prepare, Self::Infer, Self::Finish, Self::Total];
+
+    /// The name used in reports, metrics and JSON.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Wait => "wait",
+            Self::Register => "register",
+            Self::Prepare => "prepare",
+            Self::Infer => "infer",
+            Self::Finish => "finish",
+            Self::Total => "total",
+        }
     }
 }
 

@@ -27,7 +27,9 @@ pub use drops::{DropCounts, DropReason};
 pub use error::{Error, ErrorKind, Result};
 pub use format::PixelFormat;
 pub use geometry::{Distortion, Intrinsics, Pose};
-pub use header::{ClockDomain, FIELDS, Field, FrameFlags, FrameHeader, HEADER_SIZE, HEADER_VERSION, SCHEMA};
+pub use header::{
+    ClockDomain, FIELDS, Field, FrameFlags, FrameHeader, HEADER_SIZE, HEADER_VERSION, SCHEMA, StageStep,
+};
 pub use ids::{CameraName, Name, RigName, StreamId, StreamName};
 pub use metadata::MetadataLevel;
 pub use node::{Bus, IOX_FOLDER, SHM_PREFIX};

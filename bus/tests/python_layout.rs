@@ -6,7 +6,8 @@
 use core::mem::offset_of;
 use depthrig_bus::{
     ClockDomain, Distortion, DropReason, FIELDS, Field, FrameFlags, FrameHeader, HEADER_SIZE, HEADER_VERSION,
-    IOX_FOLDER, PixelFormat, RECORD_BYTES, SCHEMA, SHM_PREFIX, SetHeader, runtime::RUNTIME_DIR_VARIABLE,
+    IOX_FOLDER, PixelFormat, RECORD_BYTES, SCHEMA, SHM_PREFIX, SetHeader, StageStep,
+    runtime::RUNTIME_DIR_VARIABLE,
 };
 use iceoryx2::prelude::ZeroCopySend;
 use std::path::Path;
@@ -115,6 +116,14 @@ fn enums(out: &mut String) {
     enumeration(out, "IntEnum", "DropReason", "Why a captured frame never reached its channel.", &reasons);
     enumeration(out, "IntEnum", "Distortion", "The distortion model of a camera.", &models);
     enumeration(out, "IntEnum", "ClockDomain", "Where a capture time comes from.", &domains);
+    let steps = StageStep::ALL.map(|s| (s.name().to_owned(), s as u32));
+    enumeration(
+        out,
+        "IntEnum",
+        "StageStep",
+        "A step of making a derived frame, by its place in `stage_ns`.",
+        &steps,
+    );
     enumeration(out, "IntFlag", "FrameFlags", "Facts about a frame, one bit each.", &flags);
 }
 

@@ -1,6 +1,6 @@
 //! The layout of the header as data: what mirrors in other languages are generated from and tested against.
 
-use super::FrameHeader;
+use super::{FrameHeader, StageStep};
 use crate::{Intrinsics, Pose};
 use core::mem::offset_of;
 use serde::Serialize;
@@ -84,7 +84,12 @@ pub const FIELDS: &[Field] = fields! {
     "stream": stream => "u8" x 32;
     "model": model => "u8" x 32;
     "serial": serial => "u8" x 32;
-    "reserved": reserved => "u64" x 29;
+    "source_color_sequence": source_color_sequence => "u64" x 1;
+    "source_color_capture_time_ns": source_color_capture_time_ns => "i64" x 1;
+    "stage_ns": stage_ns => "u64" x StageStep::ALL.len();
+    "refiner": refiner => "u8" x 32;
+    "refiner_model": refiner_model => "u8" x 32;
+    "reserved": reserved => "u64" x 13;
 };
 
 const _: () = assert!(size_of::<Intrinsics>() == 104 && size_of::<Pose>() == 56);

@@ -72,6 +72,17 @@ class ClockDomain(enum.IntEnum):
     KERNEL = 2
 
 
+class StageStep(enum.IntEnum):
+    """A step of making a derived frame, by its place in `stage_ns`."""
+
+    WAIT = 0
+    REGISTER = 1
+    PREPARE = 2
+    INFER = 3
+    FINISH = 4
+    TOTAL = 5
+
+
 class FrameFlags(enum.IntFlag):
     """Facts about a frame, one bit each."""
 
@@ -130,7 +141,12 @@ FIELDS = (
     ("stream", 440, "u8", 32),
     ("model", 472, "u8", 32),
     ("serial", 504, "u8", 32),
-    ("reserved", 536, "u64", 29),
+    ("source_color_sequence", 536, "u64", 1),
+    ("source_color_capture_time_ns", 544, "i64", 1),
+    ("stage_ns", 552, "u64", 6),
+    ("refiner", 600, "u8", 32),
+    ("refiner_model", 632, "u8", 32),
+    ("reserved", 664, "u64", 13),
 )
 
 
@@ -258,7 +274,7 @@ class HeaderFields:
 
     @property
     def source_sequence(self) -> int:
-        """For a derived stream, `sequence` of the frame that it was made from; else 0."""
+        """For a derived stream, `sequence` of the frame that it was made from (the depth frame where there are several); else 0."""
         return int(struct.unpack_from("<Q", self._raw, 160)[0])
 
     @property
@@ -342,9 +358,34 @@ class HeaderFields:
         return _text(self._raw[504:536])
 
     @property
+    def source_color_sequence(self) -> int:
+        """For depth that was made from depth and colour, `sequence` of the colour frame; else 0."""
+        return int(struct.unpack_from("<Q", self._raw, 536)[0])
+
+    @property
+    def source_color_capture_time_ns(self) -> int:
+        """Middle of the exposure of that colour frame on the host clock; else 0. `capture_time_ns` is that of the depth frame."""
+        return int(struct.unpack_from("<q", self._raw, 544)[0])
+
+    @property
+    def stage_ns(self) -> tuple[int, ...]:
+        """How long each step of making a derived frame took, nanoseconds, indexed by `StageStep`; else 0."""
+        return struct.unpack_from("<6Q", self._raw, 552)
+
+    @property
+    def refiner(self) -> str:
+        """What made a derived frame, such as `fill` or `onnxruntime 1.31.1 cpu fp32`, zero-padded UTF-8."""
+        return _text(self._raw[600:632])
+
+    @property
+    def refiner_model(self) -> str:
+        """The model that it used, such as `cdm-d435@1f2e3d4c`, zero-padded UTF-8; empty when it needs none."""
+        return _text(self._raw[632:664])
+
+    @property
     def reserved(self) -> tuple[int, ...]:
         """Zero; space for later fields of this version."""
-        return struct.unpack_from("<29Q", self._raw, 536)
+        return struct.unpack_from("<13Q", self._raw, 664)
 
     def _intrinsics(self) -> IntrinsicsFields:
         return IntrinsicsFields(

@@ -27,7 +27,9 @@ pub(crate) fn write(buf: &mut Vec<u8>, h: &FrameHeader, extra: &Extra<'_>) {
     w.u32(h.clock_domain).u32(h.clock_epoch).u32(h.flags).u32(h.format);
     w.u32(h.width).u32(h.height).u32(h.stride).u32(h.payload_len);
     w.f32(h.gain).f32(h.temperature_c);
-    w.raw(&h.rig).raw(&h.camera).raw(&h.stream).raw(&h.model).raw(&h.serial).u64s(&h.reserved);
+    w.raw(&h.rig).raw(&h.camera).raw(&h.stream).raw(&h.model).raw(&h.serial);
+    w.u64(h.source_color_sequence).i64(h.source_color_capture_time_ns).u64s(&h.stage_ns);
+    w.raw(&h.refiner).raw(&h.refiner_model).u64s(&h.reserved);
     w.time(extra.stamp_utc_ns).str(extra.frame_id).str(extra.codec);
 }
 
@@ -77,6 +79,11 @@ pub(crate) fn read(message: &[u8]) -> Result<(FrameHeader, Extra<'_>)> {
         stream: r.array(Reader::u8)?,
         model: r.array(Reader::u8)?,
         serial: r.array(Reader::u8)?,
+        source_color_sequence: r.u64()?,
+        source_color_capture_time_ns: r.i64()?,
+        stage_ns: r.array(Reader::u64)?,
+        refiner: r.array(Reader::u8)?,
+        refiner_model: r.array(Reader::u8)?,
         reserved: r.array(Reader::u64)?,
     };
     let extra = Extra { stamp_utc_ns: r.time()?, frame_id: r.str()?, codec: r.str()? };

@@ -1,6 +1,6 @@
 //! A line of `frames.csv`: one frame of one set with every number of its header, or a frame that the set has not.
 
-use depthrig_bus::FrameHeader;
+use depthrig_bus::{FrameFlags, FrameHeader};
 use std::fmt::Write;
 
 /// One frame of one set.
@@ -51,6 +51,10 @@ macro_rules! header_fields {
 /// Columns before those of the header.
 const OF_SET: &str = "n,set,tick_ns,set_utc_ns,utc_offset_ns,spread_ns,stream,file,capture_utc_ns,dropped";
 
+/// Columns after those of the header: of frames that were made from others, empty for those that were captured. Files of
+/// before there were such streams end without them.
+const OF_DERIVED: &str = ",source_color_sequence,source_color_capture_time_ns,stage_ns,refiner,refiner_model";
+
 /// The first line.
 pub(super) fn head() -> String {
     let mut line = OF_SET.to_owned();
@@ -58,8 +62,14 @@ pub(super) fn head() -> String {
         ($($field:ident),*) => { $( line.push(','); line.push_str(stringify!($field)); )* };
     }
     header_fields!(names);
+    line.push_str(OF_DERIVED);
     line.push('\n');
     line
+}
+
+/// A field of text as a column: what would end a column is replaced.
+fn plain(text: &str) -> String {
+    text.trim().replace(|c: char| c == ',' || c == '"' || c.is_control(), "_")
 }
 
 impl Row {
@@ -86,6 +96,17 @@ impl Row {
                 ($($field:ident),*) => { $( let _ = write!(line, ",{}", h.$field); )* };
             }
             header_fields!(values);
+            if h.has(FrameFlags::DERIVED) {
+                let steps = h.stage_ns.map(|n| n.to_string()).join("|");
+                let (engine, model) = (plain(h.refiner()), plain(h.refiner_model()));
+                let _ = write!(
+                    line,
+                    ",{},{},{steps},{engine},{model}",
+                    h.source_color_sequence, h.source_color_capture_time_ns
+                );
+            } else {
+                line.push_str(",,,,,");
+            }
         }
         line.push('\n');
         line
@@ -122,6 +143,19 @@ impl Row {
             ($($field:ident),*) => { $( h.$field = number(next(stringify!($field))?)?; )* };
         }
         header_fields!(values);
+        let derived = OF_DERIVED.trim_start_matches(',').split(',').map(|name| (name, texts.next()));
+        let derived: Vec<_> = derived.map(|(name, text)| (name, text.unwrap_or_default())).collect();
+        if let [color, time, steps, engine, model] = derived[..]
+            && !color.1.is_empty()
+        {
+            h.source_color_sequence = number(color)?;
+            h.source_color_capture_time_ns = number(time)?;
+            let mut counts = steps.1.split('|');
+            for step in &mut h.stage_ns {
+                *step = number((steps.0, counts.next().unwrap_or_default()))?;
+            }
+            h.set_refiner(engine.1, model.1);
+        }
         Ok(row)
     }
 }
@@ -159,9 +193,33 @@ mod tests {
             macro_rules! copy { ($($f:ident),*) => { $( expected.$f = header.$f; )* }; }
             header_fields!(copy);
             expected.dropped = header.dropped;
+            if header.has(FrameFlags::DERIVED) {
+                expected.source_color_sequence = header.source_color_sequence;
+                expected.source_color_capture_time_ns = header.source_color_capture_time_ns;
+                expected.stage_ns = header.stage_ns;
+                expected.set_refiner(&plain(header.refiner()), &plain(header.refiner_model()));
+            }
             let bits = crate::msgs::frame_info::tests::memory;
             prop_assert_eq!(bits(&back.header), bits(&expected));
         }
+    }
+
+    #[test]
+    fn what_made_a_derived_frame_comes_back_and_rows_of_before_have_none() {
+        let mut header =
+            FrameHeader { flags: FrameFlags::DERIVED.0, source_color_sequence: 7, ..FrameHeader::default() };
+        header.set_refiner("onnxruntime 1.31.1 cpu fp32", "cdm-d435@1f2e3d4c");
+        let file = "camera_a/depth_refined_1.png".to_owned();
+        let (n, set, stream) = (1, 2, "a/depth_refined".to_owned());
+        let row =
+            Row { n, set, tick_ns: 0, set_utc_ns: 0, utc_offset_ns: 0, spread_ns: 0, stream, file, header };
+        let text = row.text();
+        let back = Row::parse(text.trim_end()).unwrap().header;
+        assert_eq!((back.refiner(), back.refiner_model()), (header.refiner(), header.refiner_model()));
+        assert_eq!(back.source_color_sequence, 7);
+        // As it was written before there were derived frames.
+        let old = text.rsplitn(6, ',').last().unwrap();
+        assert_eq!(Row::parse(old).unwrap().header.source_color_sequence, 0);
     }
 
     #[test]
