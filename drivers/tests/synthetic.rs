@@ -88,7 +88,8 @@ fn compare(a: &Shot, b: &Shot) -> [u32; 3] {
     let (w, h) = b.size();
     let [mut agree, mut hidden, mut missing] = [0; 3];
     for (x, y) in a.every_pixel() {
-        let ray = a.profile.intrinsics.unproject(DVec2::new(x as f64, y as f64)).unwrap();
+        // The corners of a wide lens show nothing.
+        let Some(ray) = a.profile.intrinsics.unproject(DVec2::new(x as f64, y as f64)) else { continue };
         let p = a_to_b.transform_point(ray * a.depth_m(x, y));
         let Some(px) = b.profile.intrinsics.project(p) else { continue };
         let (u, v) = (px.x.round(), px.y.round());
@@ -130,6 +131,28 @@ fn all_cameras_see_one_world() {
     b.on_mount.translation_m[1] += 0.01;
     let [_, _, missing] = compare(&a, &b);
     assert!(missing * 10 > total, "with a wrong pose {missing} of {total} would be missing");
+}
+
+#[test]
+fn the_truth_in_colours_view_is_the_same_world_pixel_by_pixel_beside_colour() {
+    let cache = tempfile::tempdir().unwrap();
+    // Offsets to the side, and a lens that looks elsewhere.
+    for (model, size) in [("d455", (640, 480)), ("kinect", (512, 512))] {
+        let shots = shoot(&camera(model, size, cache.path()), &["color", "depth_true", "depth_true_color"]);
+        let [color, truth, mut in_color] = shots.try_into().ok().unwrap();
+        assert_eq!((in_color.size(), in_color.on_mount), (color.size(), color.on_mount));
+        assert_eq!(in_color.profile.intrinsics, color.profile.intrinsics);
+        assert_eq!(in_color.profile.rate_hz, color.profile.rate_hz);
+        assert_eq!((in_color.holes(), in_color.profile.depth_unit_m), (0.0, truth.profile.depth_unit_m));
+        let [agree, hidden, missing] = compare(&truth, &in_color);
+        let total = agree + hidden + missing;
+        assert!(total > 100_000 && agree * 100 > total * 90, "{model}: {agree} agree, {hidden} hidden");
+        assert!(missing * 1000 < total, "{model}: {missing} of {total} are not there");
+        // The comparison would see that it is not in colour's view.
+        in_color.on_mount = truth.on_mount;
+        let [_, _, missing] = compare(&truth, &in_color);
+        assert!(missing * 20 > total, "{model}: with depth's pose {missing} of {total} would be missing");
+    }
 }
 
 #[test]
@@ -219,7 +242,7 @@ fn a_seed_gives_the_same_bytes_with_any_number_of_threads() {
         all.sort();
         all
     };
-    assert_eq!(files(one.path()).len(), 2, "one file for colour and one for depth with its truth");
+    assert_eq!(files(one.path()).len(), 3, "colour; depth with its truth; the truth in colour's view");
     assert!(files(one.path()) == files(two.path()));
     let seeded = SyntheticConfig { seed: 2, ..config(one.path()) };
     let (a, b) = (shoot(&config(one.path()), &["depth"]), shoot(&seeded, &["depth"]));

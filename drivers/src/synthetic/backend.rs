@@ -132,7 +132,7 @@ impl Device for SyntheticDevice {
         let boot = unit.state().boot;
         let lanes = profiles.iter().zip(sources).enumerate().map(|(i, (p, source))| {
             let content = Content::of(&p.stream).unwrap_or(Content::Color);
-            let exposure_ns = unit.model.exposure_ns[usize::from(content != Content::Color)];
+            let exposure_ns = unit.model.exposure_ns[usize::from(!content.is_color_view())];
             Lane {
                 gate: Gate::new(i, p),
                 queue: Queue::new(

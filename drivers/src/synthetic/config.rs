@@ -21,7 +21,7 @@ pub struct SyntheticConfig {
     pub pose_on_mount: Pose,
     /// What differs from the model's default modes.
     pub streams: Vec<StreamOverride>,
-    /// Whether the true depth is a stream of its own, `depth_true`.
+    /// Whether the true depth is given too: `depth_true` in the view of `depth`, `depth_true_color` in that of `color`.
     pub truth: bool,
     /// The device's clock and its transport.
     pub clock: ClockSim,
@@ -77,7 +77,7 @@ pub fn default_cache_dir() -> PathBuf {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StreamOverride {
-    /// `color`, `depth` or `depth_true`.
+    /// `color`, `depth`, `depth_true` or `depth_true_color`.
     pub stream: StreamName,
     /// Width and height in pixels.
     #[serde(default)]

@@ -54,14 +54,18 @@ pub(crate) fn render(world: &World, view: &View<'_>, model: &Model, seed: u64) -
     let mets = view.cast(world);
     let samples = sample(world, view, &mets, model.depth);
     let unit = model.depth_unit_m;
-    let truth = mets.iter().map(|m| if *m == NOTHING { 0 } else { counts(m.t, unit) }).collect();
     let sensed_m = match model.depth {
         DepthPrinciple::Stereo { .. } => stereo::measure(view, model, &samples, seed),
         DepthPrinciple::TimeOfFlight { .. } => tof::measure(view, model, &samples, seed),
     };
     let (near, far) = model.range_m;
     let in_range = |z: &f32| if (near..=far).contains(z) { counts(*z, unit) } else { 0 };
-    DepthPair { sensed: sensed_m.iter().map(in_range).collect(), truth }
+    DepthPair { sensed: sensed_m.iter().map(in_range).collect(), truth: truth(&mets, model) }
+}
+
+/// The depth of the first surfaces, in counts of the model's depth unit.
+pub(crate) fn truth(mets: &[Met], model: &Model) -> Vec<u16> {
+    mets.iter().map(|m| if *m == NOTHING { 0 } else { counts(m.t, model.depth_unit_m) }).collect()
 }
 
 /// Metres to counts; what a count cannot hold is 0, "no depth".

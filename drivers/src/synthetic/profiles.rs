@@ -12,20 +12,44 @@ pub(crate) enum Content {
     Color,
     Depth,
     DepthTrue,
+    /// The true depth as the colour sensor would see it.
+    DepthTrueColor,
 }
 
 impl Content {
+    const ALL: [Self; 4] = [Self::Color, Self::Depth, Self::DepthTrue, Self::DepthTrueColor];
+
+    /// What a camera shows, with or without its truth.
+    fn of_camera(truth: bool) -> &'static [Self] {
+        if truth { &Self::ALL } else { &Self::ALL[..2] }
+    }
+
+    /// Whether the colour sensor's optics, place and timing are its own.
+    pub(crate) const fn is_color_view(self) -> bool {
+        matches!(self, Self::Color | Self::DepthTrueColor)
+    }
+
+    /// The stream whose mode a truth follows.
+    const fn follows(self) -> Option<Self> {
+        match self {
+            Self::Color | Self::Depth => None,
+            Self::DepthTrue => Some(Self::Depth),
+            Self::DepthTrueColor => Some(Self::Color),
+        }
+    }
+
     const fn name(self) -> &'static str {
         match self {
             Self::Color => "color",
             Self::Depth => "depth",
             Self::DepthTrue => "depth_true",
+            Self::DepthTrueColor => "depth_true_color",
         }
     }
 
     /// What the stream called `name` shows.
     pub(crate) fn of(name: &Name) -> Option<Self> {
-        [Self::Color, Self::Depth, Self::DepthTrue].into_iter().find(|c| c.name() == name.as_str())
+        Self::ALL.into_iter().find(|c| c.name() == name.as_str())
     }
 }
 
@@ -54,9 +78,9 @@ pub fn profiles(config: &SyntheticConfig) -> Result<Vec<StreamProfile>> {
     config.validate()?;
     let model = model_of(config)?;
     let mut all = Vec::new();
-    let contents = [Content::Color, Content::Depth, Content::DepthTrue];
-    for content in contents.into_iter().take(if config.truth { 3 } else { 2 }) {
-        let modes = if content == Content::Color { model.color_modes } else { model.depth_modes };
+    let contents = Content::of_camera(config.truth);
+    for content in contents.iter().copied() {
+        let modes = if content.is_color_view() { model.color_modes } else { model.depth_modes };
         let mut own = Vec::new();
         for mode in modes {
             for rate_hz in mode.rates_hz {
@@ -68,9 +92,8 @@ pub fn profiles(config: &SyntheticConfig) -> Result<Vec<StreamProfile>> {
     }
     for o in &config.streams {
         if all.iter().all(|p| p.stream != o.stream) {
-            let names: Vec<_> =
-                contents.iter().take(if config.truth { 3 } else { 2 }).map(|c| c.name()).collect();
-            let hint = if o.stream.as_str() == "depth_true" { " (set truth = true)" } else { "" };
+            let names: Vec<_> = contents.iter().map(|c| c.name()).collect();
+            let hint = if Content::of(&o.stream).is_some() { " (set truth = true)" } else { "" };
             let message = format!(
                 "{}: it has no stream \"{}\"{hint}; it has {}",
                 config.label(),
@@ -96,10 +119,9 @@ fn put_override_first(
     modes: &[Mode],
     own: &mut Vec<StreamProfile>,
 ) -> Result<()> {
-    // The true depth follows what was said of depth unless something was said of itself.
-    let said = |name: &str| config.streams.iter().rev().find(|o| o.stream.as_str() == name);
-    let Some(wish) = said(content.name()).or_else(|| said("depth").filter(|_| content == Content::DepthTrue))
-    else {
+    // A truth follows what was said of the stream whose view it has, unless something was said of itself.
+    let said = |content: Content| config.streams.iter().rev().find(|o| o.stream.as_str() == content.name());
+    let Some(wish) = said(content).or_else(|| content.follows().and_then(said)) else {
         return Ok(());
     };
     let chosen = if config.cheap || model.name == "generic" {
@@ -135,8 +157,8 @@ fn profile(
     mode: &Mode,
     rate_hz: f64,
 ) -> Result<StreamProfile> {
-    // Up to 1 % of the picture; depth and true depth share one lens.
-    let sensor = u32::from(content != Content::Color);
+    // Up to 1 % of the picture; a truth has the lens of the sensor whose view it has.
+    let sensor = u32::from(!content.is_color_view());
     let rolls = noise::Rolls::new(noise::text_seed(config.seed, &config.serial_or_default()), sensor, 0, 0);
     let off = [0, 1].map(|i| (f64::from(rolls.unit(i)) - 0.5) * 0.02);
     let color = content == Content::Color;
@@ -148,7 +170,7 @@ fn profile(
         rate_hz,
         depth_unit_m: if color { 0.0 } else { model.depth_unit_m },
         intrinsics: mode.intrinsics(off),
-        pose_in_device: if color { model.color_in_device } else { Pose::IDENTITY },
+        pose_in_device: if content.is_color_view() { model.color_in_device } else { Pose::IDENTITY },
         clock: DeviceClock::microseconds(config.clock.counter_bits),
         sequence_bits: 32,
         metadata: MetadataLevel::Simulated,
@@ -195,6 +217,16 @@ mod tests {
         assert_eq!(list[1].describe(), "depth 848x480 z16 60 Hz");
         assert_eq!(list[2].describe(), "depth_true 848x480 z16 60 Hz");
         assert_eq!(list[1].intrinsics, list[2].intrinsics);
+        assert_eq!(list[3].describe(), "depth_true_color 1280x720 z16 30 Hz");
+        let stream = Name::new("color").unwrap();
+        c.streams.push(StreamOverride { stream, size: Some((640, 480)), rate_hz: None });
+        let with_color = default_profiles(&c).unwrap();
+        let [color, depth, _, in_color] = &with_color[..] else { panic!("{with_color:?}") };
+        assert_eq!(in_color.describe(), "depth_true_color 640x480 z16 30 Hz");
+        assert_eq!((in_color.intrinsics, in_color.pose_in_device), (color.intrinsics, color.pose_in_device));
+        assert!(
+            in_color.depth_unit_m == depth.depth_unit_m && in_color.pose_in_device != depth.pose_in_device
+        );
         c.streams[0].size = Some((850, 480));
         let e = profiles(&c).unwrap_err();
         assert_eq!(e.kind(), ErrorKind::Unsupported);
@@ -207,9 +239,11 @@ mod tests {
     fn unknown_models_and_streams_name_what_there_is() {
         let e = profiles(&config("d436")).unwrap_err();
         assert!(e.to_string().contains("d405, d415, d435"), "{e}");
-        let mut c = SyntheticConfig { truth: false, ..config("d435") };
-        let stream = Name::new("depth_true").unwrap();
-        c.streams.push(StreamOverride { stream, size: None, rate_hz: None });
-        assert!(profiles(&c).unwrap_err().to_string().contains("truth = true"));
+        for name in ["depth_true", "depth_true_color"] {
+            let mut c = SyntheticConfig { truth: false, ..config("d435") };
+            let stream = Name::new(name).unwrap();
+            c.streams.push(StreamOverride { stream, size: None, rate_hz: None });
+            assert!(profiles(&c).unwrap_err().to_string().contains("truth = true"));
+        }
     }
 }

@@ -53,9 +53,11 @@ pub fn prepare_all(configs: &[SyntheticConfig], progress: Progress<'_>) -> Resul
             let is_truth = Content::of(&p.stream) == Some(Content::DepthTrue);
             // Depth and true depth of one size come out of one job.
             let is_done = is_truth
-                && jobs
-                    .iter()
-                    .any(|(c, q)| core::ptr::eq::<SyntheticConfig>(*c, config) && is_same_depth(q, &p));
+                && jobs.iter().any(|(c, q)| {
+                    core::ptr::eq::<SyntheticConfig>(*c, config)
+                        && Content::of(&q.stream) == Some(Content::Depth)
+                        && (q.width, q.height, q.intrinsics) == (p.width, p.height, p.intrinsics)
+                });
             if !config.cheap && !is_done {
                 jobs.push((config, p));
             }
@@ -72,10 +74,6 @@ pub fn prepare_all(configs: &[SyntheticConfig], progress: Progress<'_>) -> Resul
     Ok(())
 }
 
-fn is_same_depth(a: &StreamProfile, b: &StreamProfile) -> bool {
-    a.depth_unit_m > 0.0 && (a.width, a.height, a.intrinsics) == (b.width, b.height, b.intrinsics)
-}
-
 /// The pictures of one stream, rendered if they are not in the cache.
 pub(crate) fn pictures(
     config: &SyntheticConfig,
@@ -84,7 +82,7 @@ pub(crate) fn pictures(
 ) -> Result<Pictures> {
     let model = model_of(config)?;
     let content = Content::of(&profile.stream).unwrap_or(Content::Color);
-    let planes = if content != Content::Color && config.truth { 2 } else { 1 };
+    let planes = if content.is_color_view() || !config.truth { 1 } else { 2 };
     let key = key(config, model, profile, planes);
     let wanted = Wanted { key: &key, planes, poses: config.poses, bytes: profile.frame_bytes() };
     let path = path(config, profile, &key);
@@ -102,12 +100,14 @@ pub(crate) fn pictures(
     let file = PictureFile::create(&path, &wanted, |pose| {
         let view = View::new(&rays, &(motion::mount(pose, config.poses) * camera));
         let seed = mix(text_seed(config.seed, &config.serial_or_default()).wrapping_add(u64::from(pose)));
-        let made = if content == Content::Color {
-            vec![color::render(&world, &view, model.white, seed)]
-        } else {
-            let pair = depth::render(&world, &view, model, seed);
-            let planes = [pair.sensed, pair.truth].into_iter().take(planes as usize);
-            planes.map(|p| p.iter().flat_map(|z| z.to_le_bytes()).collect()).collect()
+        let bytes = |counts: Vec<u16>| counts.iter().flat_map(|z| z.to_le_bytes()).collect();
+        let made = match content {
+            Content::Color => vec![color::render(&world, &view, model.white, seed)],
+            Content::DepthTrueColor => vec![bytes(depth::truth(&view.cast(&world), model))],
+            Content::Depth | Content::DepthTrue => {
+                let pair = depth::render(&world, &view, model, seed);
+                [pair.sensed, pair.truth].into_iter().take(planes as usize).map(bytes).collect()
+            }
         };
         progress(pose as usize + 1, config.poses as usize);
         made
@@ -117,7 +117,7 @@ pub(crate) fn pictures(
 
 /// Everything that the pictures depend on, as text.
 fn key(config: &SyntheticConfig, model: &Model, p: &StreamProfile, planes: u32) -> String {
-    let stream = if p.depth_unit_m > 0.0 { "depth" } else { "color" };
+    let stream = file_of(p);
     format!(
         "render {RENDER_VERSION} {stream} planes {planes} poses {} seed {} serial {} model {} {:?} unit {} range {:?} \
          white {:?} size {}x{} {:?} on mount {:?} in device {:?}",
@@ -137,8 +137,17 @@ fn key(config: &SyntheticConfig, model: &Model, p: &StreamProfile, planes: u32) 
     )
 }
 
+/// What the file of a stream's pictures is called: depth and its truth share one.
+fn file_of(p: &StreamProfile) -> &'static str {
+    match Content::of(&p.stream) {
+        Some(Content::Depth | Content::DepthTrue) => "depth",
+        Some(Content::DepthTrueColor) => "truth",
+        Some(Content::Color) | None => "color",
+    }
+}
+
 fn path(config: &SyntheticConfig, p: &StreamProfile, key: &str) -> PathBuf {
-    let stream = if p.depth_unit_m > 0.0 { "depth" } else { "color" };
+    let stream = file_of(p);
     let hash = text_seed(0, key);
     let name =
         format!("{}-{stream}-{}x{}-{hash:016x}.pictures", config.model.to_lowercase(), p.width, p.height);
