@@ -173,21 +173,22 @@ impl ClockMap {
     /// Takes a two-way probe: the device read its counter somewhere between two readings of the host's clock.
     ///
     /// From then on capture times are free of the constant latency, up to half the width of the tightest probes,
-    /// which is part of the claimed uncertainty. Ignored until the map is warm and while a restart is in doubt.
+    /// which is part of the claimed uncertainty. While the map warms up they are measured against its line anew with
+    /// every frame, because that line still moves. Ignored while a restart is in doubt.
     pub fn probe(&mut self, before: HostTime, raw_ticks: u64, after: HostTime) {
         let Some(epoch) = &self.epoch else { return };
         let width_ns = after.since_ns(before);
-        if !(0..FAR_NS).contains(&width_ns) || epoch.newest_x < WARM_NS || !self.pending.is_empty() {
+        if !(0..FAR_NS).contains(&width_ns) || !self.pending.is_empty() {
             return;
         }
         let middle = before.plus_ns(width_ns / 2);
         let delta = self.counter.delta(epoch.last.raw, raw_ticks, middle.since_ns(epoch.last.arrival));
         let x = self.counter.ns(epoch.last.ticks.saturating_add(delta));
-        let line_ns = x + epoch.line.at(x) as i64;
-        let latency_ns = line_ns.saturating_sub(middle.since_ns(epoch.first.arrival));
+        let offset_ns = middle.since_ns(epoch.first.arrival).saturating_sub(x);
+        let latency_ns = (epoch.line.at(x) as i64).saturating_sub(offset_ns);
         // A probe of another timeline (the device is just restarting) says nothing.
         if latency_ns.saturating_abs() < 10_000_000_000 {
-            self.latency = Some(self.probes.add(latency_ns, width_ns));
+            self.latency = Some(self.probes.add(x, offset_ns, width_ns, epoch.line));
         }
     }
 
@@ -276,6 +277,11 @@ impl ClockMap {
         }
         if let Some(line) = self.hull.support(self.rate) {
             epoch.line = line;
+        }
+        if epoch.newest_x < WARM_NS
+            && let Some(latency) = self.probes.measure_again(epoch.line)
+        {
+            self.latency = Some(latency);
         }
         self.claim_ns = self.line_claim_ns(epoch);
     }

@@ -1,13 +1,18 @@
 //! Two-way probes of a device clock: what one-way arrivals can never tell, the least latency itself.
 
+use super::hull::Line;
 use std::collections::VecDeque;
 
 /// Probes remembered.
 const KEPT: usize = 64;
 
 /// One probe: the device read its clock at `x` at some moment in a host interval.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 struct Probe {
+    /// Device time, nanoseconds since the epoch's first frame.
+    x: i64,
+    /// Middle of the interval on the host's clock, since the arrival of that frame, less `x`.
+    offset_ns: i64,
     /// Height of the map's line (arrival of the fastest frame) over the middle of the interval, nanoseconds.
     latency_ns: i64,
     width_ns: i64,
@@ -26,20 +31,39 @@ pub(super) struct Latency {
 pub(super) struct Probes(VecDeque<Probe>);
 
 impl Probes {
-    /// Takes a probe and returns the latency: the median of the probes at most 1.5 times as wide as the tightest.
-    /// The tightest is that of the last 64, so a device that became slower is believed after a while.
-    pub(super) fn add(&mut self, latency_ns: i64, width_ns: i64) -> Latency {
+    /// Takes a probe whose middle lies `offset_ns` above device time `x`, while the map's line is as `line` says, and
+    /// returns the latency.
+    pub(super) fn add(&mut self, x: i64, offset_ns: i64, width_ns: i64, line: Line) -> Latency {
         if self.0.len() == KEPT {
             self.0.pop_front();
         }
-        self.0.push_back(Probe { latency_ns, width_ns });
-        let tightest = self.0.iter().map(|p| p.width_ns).min().unwrap_or(width_ns);
+        let latency_ns = (line.at(x) as i64).saturating_sub(offset_ns);
+        self.0.push_back(Probe { x, offset_ns, latency_ns, width_ns });
+        self.latency()
+    }
+
+    /// Measures every probe against a line that has moved since; `None` when there is no probe.
+    pub(super) fn measure_again(&mut self, line: Line) -> Option<Latency> {
+        for p in &mut self.0 {
+            p.latency_ns = (line.at(p.x) as i64).saturating_sub(p.offset_ns);
+        }
+        (!self.0.is_empty()).then(|| self.latency())
+    }
+
+    /// The median of the probes at most 1.5 times as wide as the tightest. The tightest is that of the last 64, so a
+    /// device that became slower is believed after a while.
+    fn latency(&self) -> Latency {
+        let tightest = self.0.iter().map(|p| p.width_ns).min().unwrap_or(0);
         let limit = tightest.saturating_add(tightest / 2);
-        let mut good: Vec<Probe> = self.0.iter().copied().filter(|p| p.width_ns <= limit).collect();
-        good.sort_unstable_by_key(|p| p.latency_ns);
-        let widest = good.iter().map(|p| p.width_ns).max().unwrap_or(width_ns);
-        let ns = good.get(good.len() / 2).map_or(0, |p| p.latency_ns);
-        Latency { ns: ns.max(0), bound_ns: widest / 2 + 1 }
+        let (mut good, mut n, mut widest) = ([0; KEPT], 0, 0);
+        for p in self.0.iter().filter(|p| p.width_ns <= limit).take(KEPT) {
+            good[n] = p.latency_ns;
+            n += 1;
+            widest = widest.max(p.width_ns);
+        }
+        let good = &mut good[..n];
+        good.sort_unstable();
+        Latency { ns: good.get(n / 2).map_or(0, |ns| *ns).max(0), bound_ns: widest / 2 + 1 }
     }
 }
 
@@ -47,22 +71,34 @@ impl Probes {
 mod tests {
     use super::*;
 
+    const LEVEL: Line = Line { x0: 0, d0: 0, slope: 0.0 };
+
     #[test]
     fn wide_probes_do_not_count() {
         let mut probes = Probes::default();
         for (latency, width) in [(3_000, 100), (9_000, 151), (3_040, 140), (2_980, 120), (-50_000, 900_000)] {
-            probes.add(latency, width);
+            probes.add(0, -latency, width, LEVEL);
         }
-        assert_eq!(probes.add(3_010, 110), Latency { ns: 3_010, bound_ns: 71 });
+        assert_eq!(probes.add(0, -3_010, 110, LEVEL), Latency { ns: 3_010, bound_ns: 71 });
     }
 
     #[test]
     fn a_device_that_became_slower_is_believed_in_the_end() {
         let mut probes = Probes::default();
-        probes.add(1_000, 10);
+        probes.add(0, -1_000, 10, LEVEL);
         for _ in 0..KEPT {
-            probes.add(5_000, 400);
+            probes.add(0, -5_000, 400, LEVEL);
         }
-        assert_eq!(probes.add(5_000, 400), Latency { ns: 5_000, bound_ns: 201 });
+        assert_eq!(probes.add(0, -5_000, 400, LEVEL), Latency { ns: 5_000, bound_ns: 201 });
+    }
+
+    #[test]
+    fn a_line_that_moved_is_measured_anew() {
+        let mut probes = Probes::default();
+        assert_eq!(probes.measure_again(LEVEL), None);
+        probes.add(1_000_000, -7_000, 100, LEVEL);
+        probes.add(2_000_000, -7_000, 100, LEVEL);
+        let risen = Line { x0: 0, d0: 500, slope: 0.001 };
+        assert_eq!(probes.measure_again(risen), Some(Latency { ns: 9_500, bound_ns: 51 }));
     }
 }
