@@ -22,10 +22,12 @@ help: ## show this list
 	@sed -nE 's/^([a-z-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 demo: setup-build ## the seven-camera rig with synthetic cameras: record, verify, replay, report
+	@tools/onnxruntime.sh || true
 	cargo build --release --package depthrig
 	target/release/depthrig demo $(ARGS)
 
 test: setup-test $(VENV)/.stamp $(LEROBOT)/.stamp $(READERS)/node_modules/.stamp ## every test there is: Rust, Python, readers that are not ours, the virtual machine
+	@tools/onnxruntime.sh || true
 	tools/test.sh
 
 test-long: ## the long forms: every test with DEPTHRIG_LONG=1, ten minutes of recording, an hour of fuzzing per target
