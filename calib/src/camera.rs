@@ -1,146 +1,245 @@
 //! Camera models: from a point in the optical frame to a pixel and back.
 //!
-//! One formula serves the pinhole, Brown-Conrady and rational models: with `r² = x² + y²`,
-//! `s = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)`,
-//! `x' = s x + 2 p1 x y + p2 (r² + 2 x²)`, `y' = s y + p1 (r² + 2 y²) + 2 p2 x y` (`OpenCV`'s definition,
-//! `calib3d` module documentation); the shorter models leave the later coefficients zero.
+//! A [`Camera`] is made once from [`Intrinsics`]: it knows how far from its axis the lens can be trusted. The formulas
+//! of the lenses are in `camera/lens.rs`.
 
+use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{Distortion, Intrinsics};
-use glam::{DVec2, DVec3};
+use glam::{DMat2, DVec2, DVec3};
 
-/// Newton steps of the inverse at the most; lenses up to 120° need about six.
+mod lens;
+mod radius;
+
+pub(crate) use lens::Lens;
+
+/// Newton steps of the inverse at the most; from the radial inverse two to four are enough.
 const MAX_STEPS: usize = 30;
-/// The inverse is accepted when it projects back within this distance on the plane z = 1.
-const TOLERANCE: f64 = 1e-9;
+/// The inverse is accepted when it projects back within this distance, pixels.
+const TOLERANCE_PX: f64 = 1e-10;
 
-/// Projection by [`Intrinsics`].
+/// Intrinsics, ready for use.
+///
+/// Every lens model is a polynomial or a ratio of two that was fitted within a picture. Further out it turns round and
+/// would show points from far outside at a second place: [`Camera::max_radius`] is where that begins, and nothing is
+/// projected to or from beyond it.
+#[derive(Debug, Clone, Copy)]
+pub struct Camera {
+    intrinsics: Intrinsics,
+    lens: Lens,
+    max_radius: f64,
+}
+
+/// A pixel with how it changes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Projection {
+    /// The pixel.
+    pub pixel: DVec2,
+    /// Change of `u` and of `v` with the point's x, y, z: pixels per unit of the point.
+    pub d_point: [DVec3; 2],
+    /// Change of `u` and of `v` with `fx fy cx cy` and the eight coefficients in the order of [`Intrinsics::coeffs`];
+    /// 0 for those that the model does not have.
+    pub d_params: [[f64; 12]; 2],
+}
+
+/// A ray with how it changes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Ray {
+    /// The direction, scaled to z = 1.
+    pub direction: DVec3,
+    /// Change of the direction's (x, y) with the pixel's (u, v); columns are `∂/∂u` and `∂/∂v`.
+    pub d_pixel: DMat2,
+}
+
+impl Camera {
+    /// Makes a camera ready.
+    ///
+    /// # Errors
+    /// [`ErrorKind::NoCalibration`] when nothing is known of the camera, [`ErrorKind::BadInput`] for numbers that are
+    /// not finite or focal lengths that are not positive.
+    pub fn new(intrinsics: &Intrinsics) -> Result<Self> {
+        let k = *intrinsics;
+        if !k.is_known() || k.distortion() == Distortion::Unknown {
+            return Err(Error::new(
+                ErrorKind::NoCalibration,
+                "the camera's calibration is not known; give its intrinsics in the rig file",
+            ));
+        }
+        let numbers = [k.fx, k.fy, k.cx, k.cy];
+        if numbers.iter().chain(&k.coeffs).any(|n| !n.is_finite()) || k.fy <= 0.0 {
+            return Err(Error::new(
+                ErrorKind::BadInput,
+                format!(
+                    "fx {}, fy {}, cx {}, cy {} with coefficients {:?} are no intrinsics",
+                    k.fx, k.fy, k.cx, k.cy, k.coeffs
+                ),
+            ));
+        }
+        let lens = Lens::new(&k);
+        Ok(Self { intrinsics: k, lens, max_radius: radius::monotone(&lens) })
+    }
+
+    /// The same with a smaller radius of trust, such as the `metric radius` of an Azure Kinect.
+    pub fn with_max_radius(self, radius: f64) -> Self {
+        Self { max_radius: self.max_radius.min(radius), ..self }
+    }
+
+    /// What the camera was made from.
+    pub const fn intrinsics(&self) -> &Intrinsics {
+        &self.intrinsics
+    }
+
+    pub(crate) const fn lens(&self) -> &Lens {
+        &self.lens
+    }
+
+    /// How far from the axis on the plane z = 1 a point may be; infinite for a pinhole.
+    pub const fn max_radius(&self) -> f64 {
+        self.max_radius
+    }
+
+    /// The pixel that sees `p` (optical frame, metres); the centre of the top-left pixel is (0, 0). `None` when `p` is
+    /// not in front of the camera or beyond [`Camera::max_radius`].
+    pub fn project(&self, p: DVec3) -> Option<DVec2> {
+        let d = self.lens.distort(self.seen(p)?);
+        Some(self.to_pixel(d))
+    }
+
+    /// [`Camera::project`] with its derivatives.
+    pub fn project_with_jacobian(&self, p: DVec3) -> Option<Projection> {
+        let at = self.seen(p)?;
+        let (d, j) = self.lens.distort_with_jacobian(at);
+        let by_coeffs = self.lens.by_coeffs(at);
+        let Intrinsics { fx, fy, .. } = self.intrinsics;
+        // (x, y) = (X, Y) / Z.
+        let row = |f: f64, dx: f64, dy: f64| DVec3::new(dx, dy, -(dx * at.x + dy * at.y)) * (f / p.z);
+        let mut d_params = [[0.0; 12]; 2];
+        (d_params[0][0], d_params[0][2]) = (d.x, 1.0);
+        (d_params[1][1], d_params[1][3]) = (d.y, 1.0);
+        for (i, by) in by_coeffs.iter().enumerate() {
+            d_params[0][4 + i] = fx * by.x;
+            d_params[1][4 + i] = fy * by.y;
+        }
+        Some(Projection {
+            pixel: self.to_pixel(d),
+            d_point: [row(fx, j.x_axis.x, j.y_axis.x), row(fy, j.x_axis.y, j.y_axis.y)],
+            d_params,
+        })
+    }
+
+    /// The ray that `pixel` sees, scaled to z = 1: multiply by the depth to get the point. `None` when no point within
+    /// [`Camera::max_radius`] is seen there.
+    pub fn unproject(&self, pixel: DVec2) -> Option<DVec3> {
+        self.invert(pixel).map(|(at, _)| at.extend(1.0))
+    }
+
+    /// [`Camera::unproject`] with its derivatives.
+    pub fn unproject_with_jacobian(&self, pixel: DVec2) -> Option<Ray> {
+        let (at, j) = self.invert(pixel)?;
+        let Intrinsics { fx, fy, .. } = self.intrinsics;
+        let inverse = j.inverse();
+        let d_pixel = DMat2::from_cols(inverse.x_axis / fx, inverse.y_axis / fy);
+        Some(Ray { direction: at.extend(1.0), d_pixel })
+    }
+
+    /// The point on the plane z = 1 that the lens shows at `pixel`, and the Jacobian of the lens there.
+    fn invert(&self, pixel: DVec2) -> Option<(DVec2, DMat2)> {
+        let Intrinsics { fx, fy, cx, cy, .. } = self.intrinsics;
+        let shown = DVec2::new((pixel.x - cx) / fx, (pixel.y - cy) / fy);
+        if !shown.is_finite() {
+            return None;
+        }
+        if matches!(self.lens, Lens::None) {
+            return Some((shown, DMat2::IDENTITY)).filter(|_| shown.length() <= self.max_radius);
+        }
+        let tolerance = TOLERANCE_PX / fx.max(fy);
+        let mut at = self.first_guess(shown);
+        let mut best: Option<(f64, DVec2, DMat2)> = None;
+        for _ in 0..MAX_STEPS {
+            let (d, j) = self.lens.distort_with_jacobian(at);
+            let error = d - shown;
+            let det = j.determinant();
+            // Beyond its image circle the model folds back: there the Jacobian is singular or reversed.
+            if !(det > 0.0) {
+                return None;
+            }
+            let size = error.length();
+            // Steps go on while they help: the last ones are what brings a pixel back to where it was.
+            if best.is_some_and(|(least, ..)| size >= least && least < tolerance) {
+                break;
+            }
+            if best.is_none_or(|(least, ..)| size < least) {
+                best = Some((size, at, j));
+            }
+            if size == 0.0 {
+                break;
+            }
+            // What tangential terms add to the radial inverse is small; a long step leaves the valley.
+            let step = j.inverse() * error;
+            at -= step * (0.5 / step.length().max(0.5));
+            let r = at.length();
+            if r > self.max_radius {
+                at *= self.max_radius / r;
+            }
+        }
+        let (error, at, j) = best?;
+        (error < tolerance && at.length() <= self.max_radius).then_some((at, j))
+    }
+
+    /// The inverse without tangential terms: on the interval where the radius grows there is exactly one.
+    fn first_guess(&self, shown: DVec2) -> DVec2 {
+        let wanted = shown.length();
+        if wanted == 0.0 {
+            return shown;
+        }
+        let (mut low, mut high) = (0.0, self.max_radius);
+        let mut r = wanted.min(high);
+        for _ in 0..60 {
+            let (value, slope) = self.lens.radial(r);
+            let error = value - wanted;
+            if error.abs() <= 1e-9 {
+                break;
+            }
+            if error > 0.0 {
+                high = r;
+            } else {
+                low = r;
+            }
+            let newton = r - error / slope;
+            r = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
+        }
+        shown * (r / wanted)
+    }
+
+    fn seen(&self, p: DVec3) -> Option<DVec2> {
+        let at = DVec2::new(p.x / p.z, p.y / p.z);
+        // Written so that NaN is refused.
+        (p.z > 0.0 && at.length() <= self.max_radius).then_some(at)
+    }
+
+    fn to_pixel(&self, d: DVec2) -> DVec2 {
+        let Intrinsics { fx, fy, cx, cy, .. } = self.intrinsics;
+        DVec2::new(fx * d.x + cx, fy * d.y + cy)
+    }
+}
+
+/// Projection straight from [`Intrinsics`], for a point or two: a [`Camera`] is made each time.
 pub trait CameraExt {
-    /// The pixel that sees `p` (optical frame, metres); the centre of the top-left pixel is (0, 0).
-    /// `None` when `p` is not in front of the camera or the distortion model is not supported.
+    /// As [`Camera::project`]; `None` as well when no calibration is known.
     fn project(&self, p: DVec3) -> Option<DVec2>;
 
-    /// The ray that `pixel` sees, scaled to z = 1: multiply by the depth to get the point. `None` when the
-    /// model cannot be inverted there (beyond the lens' image circle) or is not supported.
+    /// As [`Camera::unproject`]; `None` as well when no calibration is known.
     fn unproject(&self, pixel: DVec2) -> Option<DVec3>;
 }
 
 impl CameraExt for Intrinsics {
     fn project(&self, p: DVec3) -> Option<DVec2> {
-        if p.z <= 0.0 || !is_supported(self) {
-            return None;
-        }
-        let d = distort(&self.coeffs, DVec2::new(p.x / p.z, p.y / p.z)).0;
-        Some(DVec2::new(self.fx * d.x + self.cx, self.fy * d.y + self.cy))
+        Camera::new(self).ok()?.project(p)
     }
 
     fn unproject(&self, pixel: DVec2) -> Option<DVec3> {
-        if !is_supported(self) {
-            return None;
-        }
-        let seen = DVec2::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy);
-        if self.distortion() == Distortion::None {
-            return Some(seen.extend(1.0));
-        }
-        // Newton with the analytic Jacobian; steps are shortened so that a wide lens does not overshoot.
-        let mut at = seen;
-        for _ in 0..MAX_STEPS {
-            let (d, [xx, xy, yx, yy]) = distort(&self.coeffs, at);
-            let error = d - seen;
-            if error.length() < TOLERANCE {
-                return Some(at.extend(1.0));
-            }
-            let det = xx * yy - xy * yx;
-            // The model folds back beyond its image circle: there the Jacobian is singular or reversed.
-            if det <= 1e-9 {
-                return None;
-            }
-            let step = DVec2::new(yy * error.x - xy * error.y, xx * error.y - yx * error.x) / det;
-            at -= step * (0.5 / step.length().max(0.5));
-        }
-        None
+        Camera::new(self).ok()?.unproject(pixel)
     }
-}
-
-fn is_supported(k: &Intrinsics) -> bool {
-    k.is_known()
-        && matches!(k.distortion(), Distortion::None | Distortion::BrownConrady | Distortion::Rational)
-}
-
-/// The distorted point and its Jacobian `[∂x'/∂x, ∂x'/∂y, ∂y'/∂x, ∂y'/∂y]`.
-fn distort(c: &[f64; 8], p: DVec2) -> (DVec2, [f64; 4]) {
-    let [k1, k2, p1, p2, k3, k4, k5, k6] = *c;
-    let DVec2 { x, y } = p;
-    let r2 = x * x + y * y;
-    let top = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
-    let bottom = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6));
-    let s = top / bottom;
-    let top_slope = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3);
-    let bottom_slope = k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6);
-    let slope = (top_slope - s * bottom_slope) / bottom; // ds/d(r²)
-    let to = DVec2::new(
-        s * x + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-        s * y + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-    );
-    let cross = 2.0 * slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y;
-    let xx = s + 2.0 * slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x;
-    let yy = s + 2.0 * slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x;
-    (to, [xx, cross, cross, yy])
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-
-    fn with(model: Distortion, coeffs: [f64; 8]) -> Intrinsics {
-        Intrinsics { coeffs, model: model as u32, ..Intrinsics::pinhole(600.0, 610.0, 320.5, 239.0) }
-    }
-
-    /// A lens of the Azure Kinect's wide mode: 120° across.
-    fn wide() -> Intrinsics {
-        let c = [1.147, 0.2557, 2.5e-5, 7.5e-5, 0.00358, 1.4849, 0.5187, 0.0451];
-        Intrinsics {
-            coeffs: c,
-            model: Distortion::Rational as u32,
-            ..Intrinsics::pinhole(504.0, 504.0, 512.0, 512.0)
-        }
-    }
-
-    #[test]
-    fn pinhole_by_hand() {
-        let k = with(Distortion::None, [0.0; 8]);
-        assert_eq!(k.project(DVec3::new(0.2, -0.1, 2.0)).unwrap(), DVec2::new(380.5, 208.5));
-        assert_eq!(k.unproject(DVec2::new(380.5, 208.5)).unwrap(), DVec3::new(0.1, -0.05, 1.0));
-        assert_eq!(k.project(DVec3::new(0.2, -0.1, 0.0)), None);
-        assert_eq!(Intrinsics::default().project(DVec3::Z), None);
-    }
-
-    #[test]
-    fn brown_conrady_by_hand() {
-        let k = with(Distortion::BrownConrady, [-0.28, 0.025, 0.001_2, -0.000_136, 0.16, 0.0, 0.0, 0.0]);
-        let px = k.project(DVec3::new(0.3, -0.2, 1.0)).unwrap();
-        // By the formula on paper: r² = 0.13, s = 1 − 0.0364 + 0.0004225 + 0.00035152 = 0.96437402.
-        let x = 0.964_374_02 * 0.3 + 2.0 * 0.0012 * 0.3 * -0.2 - 0.000_136 * (0.13 + 2.0 * 0.09);
-        let y = 0.964_374_02 * -0.2 + 0.0012 * (0.13 + 2.0 * 0.04) - 2.0 * 0.000_136 * 0.3 * -0.2;
-        assert!((px - DVec2::new(600.0 * x + 320.5, 610.0 * y + 239.0)).length() < 1e-6, "{px}");
-    }
-
-    proptest! {
-        #[test]
-        fn there_and_back(x in -1.2f64..1.2, y in -1.2f64..1.2, z in 0.1f64..8.0) {
-            let p = DVec3::new(x, y, 1.0) * z;
-            let px = wide().project(p).unwrap();
-            prop_assert!((wide().unproject(px).unwrap() * z - p).length() < 1e-6 * z);
-            let k = with(Distortion::BrownConrady, [-0.05, 0.01, 0.001, -0.0005, 0.0, 0.0, 0.0, 0.0]);
-            prop_assert!((k.unproject(k.project(p).unwrap()).unwrap() * z - p).length() < 1e-6 * z);
-        }
-    }
-
-    #[test]
-    fn beyond_the_image_circle_there_is_no_ray() {
-        // A barrel so strong that the picture folds back at r = 0.91 on the plane z = 1.
-        let k = with(Distortion::BrownConrady, [-0.4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
-        assert_eq!(k.unproject(DVec2::new(320.5 + 600.0, 239.0)), None);
-        assert!(k.unproject(DVec2::new(320.5 + 300.0, 239.0)).is_some());
-    }
-}
+mod tests;

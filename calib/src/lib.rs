@@ -1,10 +1,15 @@
-//! Camera geometry: poses and camera models.
+//! Camera geometry: lens models, poses, and pictures of one camera in the view of another.
 //!
-//! Floor 2. Pure mathematics on the types that travel in a frame header.
+//! Floor 2. Mathematics on the types that travel in a frame header; no I/O. Start at [`Camera`] (from a point to a
+//! pixel and back) and [`Registration`] (depth in the view of colour).
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 mod camera;
+mod error;
 mod pose;
+mod registration;
 
-pub use camera::CameraExt;
+pub use camera::{Camera, CameraExt, Projection, Ray};
+pub use error::{Error, ErrorKind, Result};
 pub use pose::PoseExt;
+pub use registration::{Method, Registration, same_view};

@@ -6,7 +6,7 @@
 
 use super::scene::{Met, World};
 use depthrig_bus::Intrinsics;
-use depthrig_calib::CameraExt;
+use depthrig_calib::Camera;
 use glam::{DAffine3, DVec2, Mat3, Vec3};
 use rayon::prelude::*;
 
@@ -29,10 +29,11 @@ pub(crate) struct Rays {
 impl Rays {
     pub(crate) fn new(k: &Intrinsics, width: u32, height: u32) -> Self {
         let (width, height) = (width as usize, height as usize);
+        let camera = Camera::new(k).ok();
         let mut dirs = vec![Vec3::ZERO; width * height];
         dirs.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
             for (x, dir) in row.iter_mut().enumerate() {
-                let ray = k.unproject(DVec2::new(x as f64, y as f64));
+                let ray = camera.and_then(|c| c.unproject(DVec2::new(x as f64, y as f64)));
                 *dir = ray.map_or(Vec3::ZERO, glam::DVec3::as_vec3);
             }
         });
