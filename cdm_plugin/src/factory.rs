@@ -1,6 +1,6 @@
 //! From options to a refiner: the one place that knows every engine.
 
-use crate::{EngineKind, Error, ErrorKind, Refiner, RefinerOptions, Result};
+use crate::{EngineKind, Error, ErrorKind, FillRefiner, Refiner, RefinerOptions, Result};
 
 /// The refiner that `options` ask for.
 ///
@@ -16,6 +16,9 @@ pub fn refiner(options: &RefinerOptions) -> Result<Box<dyn Refiner>> {
              `depthrig cdm fetch NAME`, or use the engine fill, which needs none"
         );
         return Err(Error::new(ErrorKind::BadInput, message));
+    }
+    if engine == EngineKind::Fill {
+        return Ok(Box::new(FillRefiner::new(options.threads)?));
     }
     let message = format!("the engine {engine} is not part of this build");
     Err(Error::new(ErrorKind::Unsupported, message))

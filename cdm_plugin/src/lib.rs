@@ -8,6 +8,7 @@
 pub mod arch;
 mod error;
 mod factory;
+mod fill;
 pub mod metrics;
 mod model;
 mod network;
@@ -18,6 +19,7 @@ pub mod weights;
 pub use arch::Encoder;
 pub use error::{Error, ErrorKind, Result};
 pub use factory::refiner;
+pub use fill::FillRefiner;
 pub use model::{ChannelOrder, Model};
 pub use network::{NetShape, Network, PositionEmbeddings};
 pub use options::{EngineKind, Precision, RefinerOptions};

@@ -1,0 +1,167 @@
+//! Refined depth without a model: wrong pixels taken out, holes filled along the colour picture, noise smoothed.
+//!
+//! Everything works on inverse depth (1/m), in which a plane is a linear function of the pixel, so that means and
+//! interpolation keep planes. The steps:
+//! 1. colour and depth are brought into one form ([`load`]); 0, 65535 and what lies beyond the range are holes;
+//! 2. pixels without support by their neighbours, and small islands, become holes ([`clean`]);
+//! 3. the picture is halved until one cell is left ([`pyramid`]); where a cell lies on two surfaces, the farther wins;
+//! 4. from the coarsest on, holes take the depth of those coarse cells around them that look like them ([`pull`]); small
+//!    differences between what a pixel has and what its surroundings say are noise and shrink.
+//!
+//! A picture without any depth stays without: its result is 0 everywhere, and no error.
+
+use crate::{Color, ColorFormat, Description, Error, ErrorKind, Job, Output, Refiner, Result, StepTimes};
+use clean::Islands;
+use depthrig_bus::HostTime;
+use lanes::Crew;
+use pyramid::Level;
+
+mod clean;
+mod lanes;
+mod load;
+mod pull;
+mod pyramid;
+
+/// Islands below this part of the picture are taken out: 60 pixels of 1280x720.
+const ISLAND: f64 = 65e-6;
+/// Islands below this are taken out of small pictures too, pixels.
+const LEAST_ISLAND: u32 = 8;
+
+/// The refiner that needs no model.
+///
+/// Its results are the same bits with any number of threads and on every processor.
+#[derive(Debug)]
+pub struct FillRefiner {
+    description: Description,
+    crew: Crew,
+    levels: Vec<Level>,
+    cleaned: Vec<f32>,
+    islands: Islands,
+}
+
+impl FillRefiner {
+    /// A refiner that uses `threads` threads; 0 and 1 mean the caller's own, and then nothing is allocated for a picture
+    /// that is not larger than those before it. (With more, rayon's queue allocates a block now and then.)
+    ///
+    /// # Errors
+    /// [`ErrorKind::Engine`] when the threads cannot be made.
+    pub fn new(threads: usize) -> Result<Self> {
+        let crew = Crew::new(threads).map_err(|e| {
+            let message =
+                format!("the {threads} threads that fill depth cannot be made ({e}); ask for fewer");
+            Error::new(ErrorKind::Engine, message).with_source(e)
+        })?;
+        let description = Description { engine: "fill".into(), model: String::new() };
+        Ok(Self { description, crew, levels: Vec::new(), cleaned: Vec::new(), islands: Islands::default() })
+    }
+
+    fn run(&mut self, job: &mut Job<'_>) -> Result<()> {
+        check(job)?;
+        let began = HostTime::now();
+        let (w, h) = (job.color.width, job.color.height);
+        self.resize(w, h);
+        let Self { crew, levels, cleaned, islands, .. } = self;
+        let Some((full, _)) = levels.split_first_mut() else { return Ok(()) };
+        load::load(crew, &job.color, &job.depth, cleaned, &mut full.color);
+        crew.rows(&mut full.q, w, |y, row| clean::keep_supported(crew.wide, cleaned, w, y, row));
+        islands.remove(&mut full.q, w, LEAST_ISLAND.max((ISLAND * (w * h) as f64).round() as u32));
+        let loaded = HostTime::now();
+
+        crew.rows2((&mut full.share, &mut cleaned[..]), w, |y, share, _| {
+            load::share(crew.wide, &full.q[y * w..(y + 1) * w], share);
+        });
+        for i in 1..levels.len() {
+            if let [fine, coarse] = &mut levels[i - 1..=i] {
+                pyramid::shrink(crew, fine, coarse);
+            }
+        }
+        let has_depth = levels.last().is_some_and(|l| l.q.iter().all(|q| *q > 0.0));
+        if has_depth {
+            for i in (1..levels.len()).rev() {
+                if let [fine, coarse] = &mut levels[i - 1..=i] {
+                    pull::fill(crew, coarse, fine);
+                }
+            }
+        }
+        let filled = HostTime::now();
+
+        load::store(crew, &levels[0].q, w, &mut job.out);
+        job.steps = StepTimes {
+            prepare_ns: loaded.since_ns(began).unsigned_abs(),
+            infer_ns: filled.since_ns(loaded).unsigned_abs(),
+            finish_ns: HostTime::now().since_ns(filled).unsigned_abs(),
+        };
+        Ok(())
+    }
+
+    /// Makes room for pictures of this size; nothing to do when the last one had it.
+    fn resize(&mut self, w: usize, h: usize) {
+        if self.levels.first().is_some_and(|l| (l.w, l.h) == (w, h)) {
+            return;
+        }
+        self.cleaned.resize(w * h, 0.0);
+        self.islands.reserve(w * h);
+        let (mut size, mut count) = ((w, h), 1);
+        while size != (1, 1) {
+            size = (size.0.div_ceil(2), size.1.div_ceil(2));
+            count += 1;
+        }
+        self.levels.resize_with(count, Level::default);
+        let mut size = (w, h);
+        for level in &mut self.levels {
+            level.resize(size.0, size.1);
+            size = (size.0.div_ceil(2), size.1.div_ceil(2));
+        }
+    }
+}
+
+impl Refiner for FillRefiner {
+    fn describe(&self) -> &Description {
+        &self.description
+    }
+
+    fn refine(&mut self, jobs: &mut [Job<'_>]) -> Result<()> {
+        jobs.iter_mut().try_for_each(|job| self.run(job))
+    }
+}
+
+#[cfg(test)]
+mod tests;
+
+/// Whether sizes and units go together.
+fn check(job: &Job<'_>) -> Result<()> {
+    let Color { pixels, width, height, stride, format: ColorFormat::Rgb8 | ColorFormat::Bgr8 } = job.color;
+    let bad = |message: String| Err(Error::new(ErrorKind::BadInput, message));
+    if width == 0 || height == 0 {
+        return bad(format!("a colour picture of {width}x{height} has no pixels; give one that has"));
+    }
+    let needed = width.checked_mul(3).and_then(|row| stride.checked_mul(height - 1)?.checked_add(row));
+    if stride < width.saturating_mul(3) || needed.is_none_or(|n| n > pixels.len()) {
+        return bad(format!(
+            "a colour picture of {width}x{height} with {stride} bytes a row does not fit its {} bytes",
+            pixels.len()
+        ));
+    }
+    let (count, out, out_unit_m) = match &job.out {
+        Output::Units { pixels, unit_m } => (width * height, pixels.len(), *unit_m),
+        Output::Metres(pixels) | Output::Inverse(pixels) => (width * height, pixels.len(), 1.0),
+    };
+    if job.depth.pixels.len() != count || out != count {
+        return Err(Error::new(
+            ErrorKind::SizeMismatch,
+            format!(
+                "colour has {width}x{height} pixels, depth {} and the output {out}; depth must be registered to colour \
+                 first",
+                job.depth.pixels.len()
+            ),
+        ));
+    }
+    for (what, unit_m) in [("raw depth", job.depth.unit_m), ("the output", out_unit_m)] {
+        if !(unit_m.is_finite() && unit_m > 0.0) {
+            return bad(format!(
+                "{what}: {unit_m} metres is no unit of depth; it must be above 0, such as 0.001"
+            ));
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,163 @@
+//! Taking out what cannot be right: pixels without support, such as the "flying" ones between two surfaces, and small
+//! islands.
+//!
+//! Depth is compared as inverse depth `q` (1/m) and relative to itself, so that the same rule holds near and far.
+
+use super::lanes::wide;
+
+/// How much two neighbours on one surface may differ, relative to their inverse depth: noise and slant of ordinary
+/// cameras stay below, flying pixels beyond.
+pub(super) const SAME: f32 = 0.035;
+/// Of a pixel's eight neighbours so many must lie on its surface. Two keep a line one pixel wide.
+const SUPPORT: f32 = 2.0;
+
+wide! {
+/// Writes row `y` of `q`, without the pixels that too few of their eight neighbours support, to `out`; 0 is a hole.
+///
+/// At the edge of the picture the neighbours that are missing support nothing.
+pub(super) fn keep_supported(q: &[f32], w: usize, y: usize, out: &mut [f32]) {
+    let h = q.len() / w;
+    let row = |y: usize| &q[y * w..(y + 1) * w];
+    let here = row(y);
+    // A row that is not there is read as the row itself and weighs nothing.
+    let (up, up_weight) = if y > 0 { (row(y - 1), 1.0) } else { (here, 0.0) };
+    let (down, down_weight) = if y + 1 < h { (row(y + 1), 1.0) } else { (here, 0.0) };
+    for x in [0, w - 1] {
+        let (from, to) = (x.saturating_sub(1), (x + 1).min(w - 1));
+        let mut n = 0.0;
+        for nx in from..=to {
+            let side = if nx == x { 0.0 } else { same(here[nx], here[x]) };
+            n += side + up_weight * same(up[nx], here[x]) + down_weight * same(down[nx], here[x]);
+        }
+        out[x] = if n >= SUPPORT { here[x] } else { 0.0 };
+    }
+    if w < 3 {
+        return;
+    }
+    let n = w - 2;
+    let (u0, u1, u2) = (&up[..n], &up[1..=n], &up[2..]);
+    let (d0, d1, d2) = (&down[..n], &down[1..=n], &down[2..]);
+    let (m0, m1, m2) = (&here[..n], &here[1..=n], &here[2..]);
+    let out = &mut out[1..=n];
+    for i in 0..n {
+        let c = m1[i];
+        let sides = same(m0[i], c) + same(m2[i], c);
+        let over = same(u0[i], c) + same(u1[i], c) + same(u2[i], c);
+        let under = same(d0[i], c) + same(d1[i], c) + same(d2[i], c);
+        let n = sides + up_weight * over + down_weight * under;
+        out[i] = if n >= SUPPORT { c } else { 0.0 };
+    }
+}
+}
+
+/// 1 when both lie on one surface. A hole is on none, not even with another hole.
+#[inline(always)]
+fn same(a: f32, b: f32) -> f32 {
+    let near = (a - b).abs() < SAME * b;
+    if near { 1.0 } else { 0.0 }
+}
+
+/// Pixels of one row that follow each other on one surface.
+#[derive(Debug, Clone, Copy)]
+struct Run {
+    from: u32,
+    to: u32,
+    y: u32,
+    /// The run that stands for the whole island, or one nearer to it.
+    parent: u32,
+    /// Pixels of the island, right for the run that stands for it.
+    pixels: u32,
+}
+
+/// Finds islands: pixels that are connected by sides on one surface.
+#[derive(Debug, Default)]
+pub(super) struct Islands {
+    runs: Vec<Run>,
+}
+
+impl Islands {
+    /// Makes room for every picture of `pixels` pixels, so that none needs more later.
+    pub(super) fn reserve(&mut self, pixels: usize) {
+        self.runs.clear();
+        self.runs.reserve(pixels);
+    }
+
+    /// Makes holes of the islands of fewer than `least` pixels.
+    pub(super) fn remove(&mut self, q: &mut [f32], w: usize, least: u32) {
+        self.runs.clear();
+        let mut before = 0..0;
+        for (y, row) in q.chunks_exact(w).enumerate() {
+            let first = self.runs.len();
+            find_runs(row, y as u32, &mut self.runs);
+            let above = if y > 0 { &q[(y - 1) * w..y * w] } else { &q[..0] };
+            self.join(before.clone(), first, above, row);
+            before = first..self.runs.len();
+        }
+        for i in 0..self.runs.len() {
+            let root = self.root(i as u32) as usize;
+            if self.runs[root].pixels < least {
+                let Run { from, to, y, .. } = self.runs[i];
+                q[y as usize * w..][from as usize..to as usize].fill(0.0);
+            }
+        }
+    }
+
+    /// Joins the runs from `first` on with those of the row above, both in order of columns.
+    fn join(&mut self, above: core::ops::Range<usize>, first: usize, above_row: &[f32], row: &[f32]) {
+        let mut up = above.start;
+        for i in first..self.runs.len() {
+            let Run { from, to, .. } = self.runs[i];
+            while up < above.end && self.runs[up].to <= from {
+                up += 1;
+            }
+            let mut at = up;
+            while at < above.end && self.runs[at].from < to {
+                let shared = from.max(self.runs[at].from) as usize..to.min(self.runs[at].to) as usize;
+                let pairs = above_row[shared.clone()].iter().zip(&row[shared]);
+                if pairs.into_iter().any(|(a, b)| same(*a, *b) > 0.0) {
+                    self.unite(at as u32, i as u32);
+                }
+                at += 1;
+            }
+        }
+    }
+
+    fn root(&mut self, mut i: u32) -> u32 {
+        loop {
+            let parent = self.runs[i as usize].parent;
+            if parent == i {
+                return i;
+            }
+            // Halves the way for whoever comes next.
+            let grandparent = self.runs[parent as usize].parent;
+            self.runs[i as usize].parent = grandparent;
+            i = grandparent;
+        }
+    }
+
+    fn unite(&mut self, a: u32, b: u32) {
+        let (a, b) = (self.root(a), self.root(b));
+        if a != b {
+            let (keep, give) = (a.min(b) as usize, a.max(b) as usize);
+            self.runs[give].parent = keep as u32;
+            self.runs[keep].pixels += self.runs[give].pixels;
+        }
+    }
+}
+
+fn find_runs(row: &[f32], y: u32, runs: &mut Vec<Run>) {
+    let mut x = 0;
+    while x < row.len() {
+        if row[x] <= 0.0 {
+            x += 1;
+            continue;
+        }
+        let from = x;
+        x += 1;
+        while x < row.len() && same(row[x - 1], row[x]) > 0.0 {
+            x += 1;
+        }
+        let parent = runs.len() as u32;
+        runs.push(Run { from: from as u32, to: x as u32, y, parent, pixels: (x - from) as u32 });
+    }
+}

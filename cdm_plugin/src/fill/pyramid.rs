@@ -1,0 +1,100 @@
+//! The same picture ever smaller: inverse depth where there is some, the colour it was seen with, and how much of each
+//! cell it covers.
+
+use super::lanes::{Crew, wide};
+
+/// A picture at one size. `q` is inverse depth in 1/m, 0 in a hole; `share` is how much of the cell had depth, 0 to 1.
+#[derive(Debug, Default)]
+pub(super) struct Level {
+    pub(super) w: usize,
+    pub(super) h: usize,
+    pub(super) q: Vec<f32>,
+    pub(super) share: Vec<f32>,
+    /// Red, green, blue and 0 from the lowest byte on: of what gave the depth, and of all where there is none.
+    pub(super) color: Vec<u32>,
+}
+
+impl Level {
+    pub(super) fn resize(&mut self, w: usize, h: usize) {
+        (self.w, self.h) = (w, h);
+        self.q.resize(w * h, 0.0);
+        self.share.resize(w * h, 0.0);
+        self.color.resize(w * h, 0);
+    }
+}
+
+/// Makes `coarse` of `fine`, which has twice its size, rounded up.
+pub(super) fn shrink(crew: &Crew, fine: &Level, coarse: &mut Level) {
+    let planes = (&mut coarse.q[..], &mut coarse.share[..], &mut coarse.color[..]);
+    crew.rows3(planes, coarse.w, |y, q, share, color| {
+        let rows = [2 * y, (2 * y + 1).min(fine.h - 1)].map(|y| y * fine.w..(y + 1) * fine.w);
+        let [a, b] = rows;
+        shrink_row(
+            crew.wide,
+            [&fine.q[a.clone()], &fine.q[b.clone()]],
+            [&fine.share[a.clone()], &fine.share[b.clone()]],
+            [&fine.color[a], &fine.color[b]],
+            q,
+            share,
+            color,
+        );
+    });
+}
+
+wide! {
+fn shrink_row(
+    q: [&[f32]; 2],
+    share: [&[f32]; 2],
+    color: [&[u32]; 2],
+    out_q: &mut [f32],
+    out_share: &mut [f32],
+    out_color: &mut [u32],
+) {
+    let w = q[0].len();
+    let whole = w / 2;
+    for x in 0..whole {
+        let (i, j) = (2 * x, 2 * x + 1);
+        let cell = cell(
+            [q[0][i], q[0][j], q[1][i], q[1][j]],
+            [share[0][i], share[0][j], share[1][i], share[1][j]],
+            [color[0][i], color[0][j], color[1][i], color[1][j]],
+        );
+        (out_q[x], out_share[x], out_color[x]) = cell;
+    }
+    if w % 2 == 1 {
+        let i = w - 1;
+        let cell = cell(
+            [q[0][i], q[0][i], q[1][i], q[1][i]],
+            [share[0][i], share[0][i], share[1][i], share[1][i]],
+            [color[0][i], color[0][i], color[1][i], color[1][i]],
+        );
+        (out_q[whole], out_share[whole], out_color[whole]) = cell;
+    }
+}
+}
+
+/// Four cells in one. Where they lie on two surfaces the farther one wins: holes are mostly shadows that a near thing
+/// throws on a far one, and a thing must not grow.
+#[inline(always)]
+pub(super) fn cell(q: [f32; 4], share: [f32; 4], color: [u32; 4]) -> (f32, f32, u32) {
+    let far = |q: f32| if q > 0.0 { q } else { f32::MAX };
+    let farthest = far(q[0]).min(far(q[1])).min(far(q[2]).min(far(q[3])));
+    let weight = |i: usize| {
+        let ratio = if q[i] > 0.0 { farthest / q[i] } else { 0.0 };
+        let square = ratio * ratio;
+        square * square * share[i]
+    };
+    let weights = [weight(0), weight(1), weight(2), weight(3)];
+    let sum = (weights[0] + weights[1]) + (weights[2] + weights[3]);
+    let has_depth = sum > 0.0;
+    let scale = if has_depth { 1.0 / sum } else { 0.0 };
+    let mean = (weights[0] * q[0] + weights[1] * q[1]) + (weights[2] * q[2] + weights[3] * q[3]);
+    let total = (share[0] + share[1]) + (share[2] + share[3]);
+    let of = |i: usize| if has_depth { weights[i] * scale } else { 0.25 };
+    let channel = |shift: u32| {
+        let value = |i: usize| ((color[i] >> shift) & 255) as f32 * of(i);
+        let mean = (value(0) + value(1)) + (value(2) + value(3));
+        ((mean + 0.5) as i32 as u32) << shift
+    };
+    (mean * scale, total * 0.25, channel(0) | channel(8) | channel(16))
+}
