@@ -10,6 +10,12 @@ mod map;
 mod pickle;
 mod pth;
 mod safetensors;
+mod seeded;
+mod verify;
+mod write;
+
+pub use seeded::write_seeded;
+pub use verify::{Extra, Misshaped, Missing, NotFinite, Report, examine, verify, verify_names};
 
 /// How the numbers of a tensor are stored, little-endian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -89,7 +95,7 @@ pub struct Weights {
 
 impl Weights {
     /// Opens a `.safetensors` file or a checkpoint of PyTorch; what it is decides, not how it is called. No code that
-    /// is in a checkpoint is ever run, and no number is looked at: [`verify`](crate::weights) does that.
+    /// is in a checkpoint is ever run, and no number is looked at: [`verify()`] does that.
     ///
     /// Names are those of the network's own code. A checkpoint with tensors under `model` has the first seven
     /// characters of every name cut off, as the official loader does (they are `module.`); in every other file

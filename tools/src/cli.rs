@@ -1,8 +1,8 @@
 //! The commands and options, and what `--help` says of them.
 
 use crate::commands::{
-    bench, cameras, cat, compare, completions, config, demo, doctor, edit, export, import, info, install,
-    man, merge, record, recover, replay, report, run, sessions, status, tap, top, trim, verify,
+    bench, cameras, cat, cdm, compare, completions, config, demo, doctor, edit, export, import, info,
+    install, man, merge, record, recover, replay, report, run, sessions, status, tap, top, trim, verify,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -133,6 +133,9 @@ pub enum Command {
     /// List single frames of a dataset, or write them as PNG, NPY or JPEG files
     #[command(after_help = cat::EXAMPLES)]
     Cat(cat::CatArgs),
+    /// Install camera depth models, and refine depth with them
+    #[command(subcommand, after_help = cdm::EXAMPLES)]
+    Cdm(cdm::CdmCommand),
     /// Write a part of a dataset as a dataset of its own
     #[command(after_help = trim::EXAMPLES)]
     Trim(trim::TrimArgs),

@@ -3,6 +3,7 @@
 pub mod bench;
 pub mod cameras;
 pub mod cat;
+pub mod cdm;
 pub mod compare;
 pub mod completions;
 pub mod config;
@@ -56,6 +57,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Cameras(args) => cameras::run(&args, &context),
         Command::Doctor(args) => doctor::run(&args, &context),
         Command::Cat(args) => cat::run(&args, &context),
+        Command::Cdm(command) => cdm::run(&command, &context),
         Command::Trim(args) => trim::run(&args, &context),
         Command::Merge(args) => merge::run(&args, &context),
         Command::Recover(args) => recover::run(&args, &context),
