@@ -13,6 +13,22 @@ pub(super) const FACTORY: &str = "factory";
 /// [`crate::DeviceInfo::calibration`] of a camera without.
 pub(super) const NONE: &str = "none";
 
+/// How often a table is read before it is called damaged: a reply can be cut or belong to another program's request.
+const READINGS: usize = 3;
+
+/// Reads a table again when what came is no such table.
+fn until_sound<T>(mut read: impl FnMut() -> Result<T>) -> Result<T> {
+    for _ in 1..READINGS {
+        match read() {
+            Err(e) if e.kind() == ErrorKind::Protocol => {
+                tracing::debug!("a calibration table is read again: {e}")
+            }
+            done => return done,
+        }
+    }
+    read()
+}
+
 /// A stream of the device, as far as its geometry goes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum View {
@@ -100,8 +116,8 @@ impl Calibration {
     }
 
     fn read_all(monitor: &mut dyn HardwareMonitor, model: &Model) -> Result<Self> {
-        let stereo = Coefficients::read(monitor)?;
-        let sizes = match RectifiedItem::read_all(monitor) {
+        let stereo = until_sound(|| Coefficients::read(monitor))?;
+        let sizes = match until_sound(|| RectifiedItem::read_all(monitor)) {
             Ok(sizes) => sizes,
             // Firmware before 5.11.9.5 has the table of coefficients alone.
             Err(e) if matches!(e.kind(), ErrorKind::Unsupported | ErrorKind::NotFound) => Vec::new(),
@@ -113,7 +129,7 @@ impl Calibration {
             }
             Err(e) => return Err(e),
         };
-        let rgb = RgbTable::read(monitor)?;
+        let rgb = until_sound(|| RgbTable::read(monitor))?;
         let read = Self { stereo, sizes, rgb, color_module: model.color_module };
         // A camera that was never calibrated has tables too; the sizes that it is used at tell.
         for (view, (width, height)) in

@@ -12,6 +12,9 @@ struct Made {
     rgb: Vec<u8>,
     sizes: Option<Vec<u8>>,
     gone: bool,
+    /// Replies in a row that are damaged before one is whole.
+    bad_replies: usize,
+    asked: usize,
 }
 
 impl HardwareMonitor for Made {
@@ -19,12 +22,22 @@ impl HardwareMonitor for Made {
         if self.gone {
             return Err(Error::new(ErrorKind::Disconnected, "gone"));
         }
-        match (D4xxOpcode::from_code(request.opcode()), request.params()[0]) {
-            (Some(D4xxOpcode::CalibrationTable), 25) => Ok(self.stereo.clone()),
-            (Some(D4xxOpcode::CalibrationTable), 32) => Ok(self.rgb.clone()),
-            (Some(D4xxOpcode::RectifiedParams), _) => {
-                self.sizes.clone().ok_or_else(|| Error::new(ErrorKind::Unsupported, "old firmware"))
+        self.asked += 1;
+        let bad = self.asked % (self.bad_replies + 1) != 0;
+        let spoiled = |mut table: Vec<u8>| {
+            if let Some(last) = table.last_mut() {
+                *last ^= u8::from(bad);
             }
+            table
+        };
+        match (D4xxOpcode::from_code(request.opcode()), request.params()[0]) {
+            (Some(D4xxOpcode::CalibrationTable), 25) => Ok(spoiled(self.stereo.clone())),
+            (Some(D4xxOpcode::CalibrationTable), 32) => Ok(spoiled(self.rgb.clone())),
+            (Some(D4xxOpcode::RectifiedParams), _) => self
+                .sizes
+                .clone()
+                .map(spoiled)
+                .ok_or_else(|| Error::new(ErrorKind::Unsupported, "old firmware")),
             other => panic!("{other:?}"),
         }
     }
@@ -42,7 +55,7 @@ fn made() -> Made {
         rectified_translation_mm: [14.7, 0.1, 0.2],
         ..RgbTable::default()
     };
-    Made { stereo: stereo.build(), rgb: rgb.build(), sizes: None, gone: false }
+    Made { stereo: stereo.build(), rgb: rgb.build(), sizes: None, gone: false, bad_replies: 0, asked: 0 }
 }
 
 fn read(mut made: Made, config: &RealsenseConfig) -> Result<Option<Calibration>> {
@@ -91,4 +104,26 @@ fn a_camera_without_calibration_is_refused_unless_the_rig_allows_it() {
 fn a_camera_that_went_away_is_no_uncalibrated_one() {
     let e = read(Made { gone: true, ..made() }, &allowed()).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::Disconnected);
+}
+
+#[test]
+fn a_damaged_reply_is_asked_for_again_and_a_damaged_table_is_not_for_ever() {
+    // Two replies of three are damaged: the first table comes whole the third time, the other one the second time.
+    let camera = |bad_replies| Made { bad_replies, sizes: None, ..made() };
+    let whole = read(camera(0), &RealsenseConfig::default()).unwrap().unwrap();
+    let told = read(camera(2), &RealsenseConfig::default());
+    assert_eq!(
+        told.unwrap().unwrap().geometry(View::Left, 848, 480).unwrap(),
+        whole.geometry(View::Left, 848, 480).unwrap()
+    );
+    let mut damaged = camera(usize::MAX - 1);
+    let e = Calibration::read(
+        &mut damaged,
+        models::of_product(0x0B07).unwrap(),
+        &RealsenseConfig::default(),
+        "it",
+    )
+    .unwrap_err();
+    assert!(e.to_string().contains("checksum"), "{e}");
+    assert_eq!(damaged.asked, READINGS);
 }
