@@ -14,7 +14,9 @@ pub mod metrics;
 mod model;
 mod network;
 mod options;
+pub mod prep;
 mod refine;
+mod refiner;
 pub mod weights;
 
 pub use arch::Encoder;
@@ -25,4 +27,5 @@ pub use model::{ChannelOrder, Model};
 pub use network::{NetShape, Network, PositionEmbeddings};
 pub use options::{EngineKind, Precision, RefinerOptions};
 pub use refine::{Color, ColorFormat, Description, Job, Output, RawDepth, Refiner, StepTimes};
+pub use refiner::CdmRefiner;
 pub use weights::Weights;

@@ -50,7 +50,8 @@ pub trait Network: Send {
         1
     }
 
-    /// Gets ready for inputs of `shape`; called once per size, before the first [`Self::run`] at it.
+    /// Gets ready for inputs of `shape`; called before the first [`Self::run`] at it, and again after another shape was
+    /// prepared: pictures of two sizes may take turns.
     ///
     /// # Errors
     /// [`crate::ErrorKind::OutOfMemory`] and [`crate::ErrorKind::Engine`].

@@ -98,7 +98,8 @@ pub trait Refiner: Send {
         1
     }
 
-    /// Refines every job. After an error the outputs hold nothing of use.
+    /// Refines every job. After an error the outputs hold nothing of use. A job without any depth to go by comes out all
+    /// holes, and is no error: in a live view that is a hand before the lens.
     ///
     /// # Errors
     /// [`crate::ErrorKind::SizeMismatch`] when colour, depth and output of a job differ in size,

@@ -6,6 +6,7 @@ use memmap2::Mmap;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+mod floats;
 mod map;
 mod pickle;
 mod pth;

@@ -1,0 +1,108 @@
+//! Everything around the network: from pictures to its input, and from its output to depth.
+//!
+//! What the official code does (`manip-as-in-sim-suite/cdm`, Apache-2.0) in one pass over each picture and without
+//! allocating: [`Prep`] holds the tables for one size of picture and one size of input. The numbers are those of the
+//! official code, except that colour is summed in `f32` where it uses `f64` (about 1e-6 of the network's input), and
+//! that 65535 is a hole before it is a depth, which is the same with the official range of 6 m for every unit from
+//! 0.1 mm up (65535 of them are more than 6 m).
+
+mod cubic;
+mod depth;
+mod finish;
+mod nearest;
+mod position;
+mod size;
+
+#[cfg(test)]
+mod tests;
+
+pub use position::Positions;
+pub use size::net_size;
+
+use crate::{ChannelOrder, Color, Output, RawDepth, Result};
+use cubic::CubicResize;
+use depth::DepthTable;
+use nearest::{index_like_opencv, index_like_torch};
+
+/// Tables and scratch memory for pictures of one size going to a network's input of one size.
+#[derive(Debug)]
+pub struct Prep {
+    picture: (usize, usize),
+    net: (usize, usize),
+    cubic: CubicResize,
+    /// For each column and row of the input, that of the picture.
+    depth_columns: Vec<u32>,
+    depth_rows: Vec<u32>,
+    inverse: DepthTable,
+    /// For each column and row of the picture, that of the output.
+    out_columns: Vec<u32>,
+    out_rows: Vec<u32>,
+    row: finish::Row,
+}
+
+impl Prep {
+    /// Tables for pictures of `picture` (width, height) with the input's shorter side near `input_size`.
+    ///
+    /// # Errors
+    /// Those of [`net_size`].
+    pub fn new(picture: (usize, usize), input_size: u32, max_depth_m: f64) -> Result<Self> {
+        let net = net_size(picture, input_size)?;
+        Ok(Self {
+            picture,
+            net,
+            cubic: CubicResize::new(picture, net),
+            depth_columns: index_like_opencv(picture.0, net.0),
+            depth_rows: index_like_opencv(picture.1, net.1),
+            inverse: DepthTable::new(max_depth_m),
+            out_columns: index_like_torch(net.0, picture.0),
+            out_rows: index_like_torch(net.1, picture.1),
+            row: finish::Row::new(net.0),
+        })
+    }
+
+    /// Width and height of the pictures.
+    pub const fn picture(&self) -> (usize, usize) {
+        self.picture
+    }
+
+    /// Width and height of the network's input.
+    pub const fn net(&self) -> (usize, usize) {
+        self.net
+    }
+
+    /// Writes the network's input `[4, height, width]`: colour, normalised, and inverse depth in 1/m. Returns whether any
+    /// inverse depth is above 0: where there is none, the network would have nothing to measure by.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::SizeMismatch`] and [`crate::ErrorKind::BadInput`] when the pictures are not of the size that
+    /// this was made for, or are cut short.
+    pub fn prepare(
+        &mut self,
+        color: &Color<'_>,
+        depth: &RawDepth<'_>,
+        order: ChannelOrder,
+        x: &mut [f32],
+    ) -> Result<bool> {
+        color.check()?;
+        depth.check(color)?;
+        size::check_picture(self.picture, color)?;
+        let plane = self.net.0 * self.net.1;
+        size::check_len("the network's input", x.len(), 4 * plane)?;
+        let (planes, inverse) = x.split_at_mut(3 * plane);
+        self.cubic.run(color, order, planes);
+        self.inverse.use_unit(depth.unit_m);
+        Ok(self.inverse.sample(depth.pixels, self.picture.0, &self.depth_rows, &self.depth_columns, inverse))
+    }
+
+    /// Writes depth at the picture's size from the network's output `[height, width]`, inverse depth in 1/m.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::SizeMismatch`] and [`crate::ErrorKind::BadInput`] when `y` or `out` is of another size, or
+    /// for a unit that is none.
+    pub fn finish(&mut self, y: &[f32], out: &mut Output<'_>) -> Result<()> {
+        size::check_len("the network's output", y.len(), self.net.0 * self.net.1)?;
+        out.check(self.picture)?;
+        self.row.write(y, &self.out_rows, &self.out_columns, out);
+        Ok(())
+    }
+}
