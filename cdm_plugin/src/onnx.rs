@@ -1,0 +1,79 @@
+//! The network as an ONNX graph, made from its architecture: one graph for every size of input.
+//!
+//! Exporting the official code does not give that. Exporters take heights and widths as dynamic and bake them in all
+//! the same, and the bicubic resize of the position embeddings that they leave in the graph is computed wrongly by
+//! some runtimes. Here the embeddings are inputs, already of the right size, and every size in the graph comes from the
+//! shape of the picture.
+//!
+//! Inputs: `x` `[batch, 4, height, width]`, `pos_rgb` and `pos_depth` `[tokens, width of the encoder]`, all in 32-bit
+//! floats. Output: `y` `[batch, height, width]`. The graph holds no weights: whoever runs it puts the tensors of a
+//! checkpoint in their places ([`Graph::weights`]), as they lie in the file.
+
+use crate::Encoder;
+use core::ops::Range;
+
+mod builder;
+mod network;
+pub mod proto;
+
+/// How attention within the encoders is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Attention {
+    /// With ONNX's own operators, for engines that find and fuse the pattern themselves: OpenVINO, TensorRT.
+    #[default]
+    Standard,
+    /// As ONNX Runtime's operator `MultiHeadAttention`, which never writes the matrix of scores to memory. For its own
+    /// providers, CPU and CUDA.
+    Fused,
+}
+
+/// The numbers that a graph computes with. Its inputs, its output and its weights are 32-bit floats always.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Numbers {
+    /// 32-bit floats.
+    #[default]
+    Fp32,
+    /// 16-bit floats; engines convert the weights once, while they load.
+    Fp16,
+}
+
+/// How a graph is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Style {
+    /// How attention is written.
+    pub attention: Attention,
+    /// The numbers that it computes with.
+    pub numbers: Numbers,
+}
+
+/// A part of a tensor of the checkpoint that the graph computes with.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct WeightSlice {
+    /// The initializer of the graph that it takes the place of.
+    pub initializer: String,
+    /// The tensor's name in the checkpoint.
+    pub tensor: String,
+    /// Its rows (first dimension); they lie together in the file.
+    pub rows: Range<usize>,
+    /// The shape that the graph takes these numbers in.
+    pub shape: Vec<usize>,
+}
+
+/// A graph without its weights.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Graph {
+    /// The encoded `ModelProto`.
+    pub model: Vec<u8>,
+    /// What the initializers without data stand for.
+    pub weights: Vec<WeightSlice>,
+}
+
+impl Graph {
+    /// The graph of a network.
+    pub fn of(encoder: Encoder, style: Style) -> Self {
+        network::build(encoder.architecture(), encoder.name(), style)
+    }
+}
+
+#[cfg(test)]
+mod tests;
