@@ -13,7 +13,7 @@
 //! - The depth encoder's three input channels are the same picture, so that its kernel can be summed over them.
 
 use super::builder::{Attribute, Builder, CONTRIB, Dimension, Value};
-use super::{Attention, Graph, Numbers, Style};
+use super::{Attention, Graph, Style};
 use crate::arch::{Architecture, ENCODERS, FUSION_HEADS, FeedForward, HEAD, NORM_EPS, PATCH};
 use Attribute::{Float, Int, Ints, Text};
 
@@ -125,7 +125,14 @@ impl Net {
     }
 
     /// The part of a linear layer that gives outputs `part * width .. (part + 1) * width`.
-    fn linear_part(&mut self, x: &Value, weight: &str, bias: Option<&str>, part: usize, width: usize) -> Value {
+    fn linear_part(
+        &mut self,
+        x: &Value,
+        weight: &str,
+        bias: Option<&str>,
+        part: usize,
+        width: usize,
+    ) -> Value {
         let rows = part * width..(part + 1) * width;
         let weight = self.g.raw_rows(weight, rows.clone());
         let weight = self.g.cast(weight);
@@ -216,13 +223,13 @@ impl Net {
     /// width in heads.
     fn attention(&mut self, x: &Value, name: &str, shape: &Value, head_shape: &Value) -> Value {
         let (weight, bias) = (format!("{name}.qkv.weight"), format!("{name}.qkv.bias"));
-        let [q, k, v] = [0, 1, 2].map(|part| self.linear_part(x, &weight, Some(&bias), part, self.arch.width));
+        let [q, k, v] =
+            [0, 1, 2].map(|part| self.linear_part(x, &weight, Some(&bias), part, self.arch.width));
         let scale = (self.arch.head_width() as f64).powf(-0.5);
         let y = match self.style.attention {
             Attention::Fused => {
                 let [q, k, v] = [q, k, v].map(|t| self.reshape(&t, shape));
-                let attributes =
-                    [("num_heads", Int(self.arch.heads as i64)), ("scale", Float(scale as f32))];
+                let attributes = [("num_heads", Int(self.arch.heads as i64)), ("scale", Float(scale as f32))];
                 self.g.op_in(CONTRIB, "MultiHeadAttention", &[&q, &k, &v], &attributes)
             }
             Attention::Standard => {

@@ -1,0 +1,216 @@
+//! The network in ONNX Runtime: a native library that is loaded when a model runs, on CPU, CUDA, TensorRT or OpenVINO.
+
+use crate::onnx::{Attention, Graph, Numbers, Style};
+use crate::{
+    Error, ErrorKind, Model, NetShape, Network, PositionEmbeddings, Precision, RefinerOptions, Result,
+};
+use device::Device;
+use ort::memory::{AllocationDevice, Allocator, AllocatorType, MemoryInfo, MemoryType};
+use ort::session::{IoBinding, Session};
+use ort::value::Tensor;
+use runtime::Runtime;
+use weights::BoundWeights;
+
+mod device;
+mod library;
+mod runtime;
+mod session;
+mod weights;
+
+/// As many bytes as the name of an engine may have.
+const NAME_BYTES: usize = 31;
+
+/// The network of one model in ONNX Runtime.
+///
+/// Weights in 32-bit floats are read where they lie in the mapped file; the library keeps what it rearranged for its
+/// kernels beside them.
+#[derive(Debug)]
+pub struct OnnxNetwork {
+    description: String,
+    device: Device,
+    /// Of the size that was prepared last.
+    bound: Option<Bound>,
+    session: Session,
+    /// After the session, which reads them.
+    _weights: BoundWeights,
+}
+
+/// Input and output at one size.
+#[derive(Debug)]
+struct Bound {
+    shape: NetShape,
+    x: Tensor<f32>,
+    binding: IoBinding,
+}
+
+impl OnnxNetwork {
+    /// Loads the library if that was not done yet, and the model into it. `options` give device, precision, threads
+    /// and library.
+    ///
+    /// # Errors
+    /// [`ErrorKind::NoEngine`] when there is no library that can be used, [`ErrorKind::Unsupported`] when it lacks the
+    /// device or the precision, [`ErrorKind::BadInput`] for an unknown device, [`ErrorKind::BadModel`] when a tensor
+    /// is missing, [`ErrorKind::OutOfMemory`] and [`ErrorKind::Engine`].
+    pub fn open(model: &Model, options: &RefinerOptions) -> Result<Self> {
+        let device: Device = options.device.parse()?;
+        device.check(options.precision)?;
+        let runtime = Runtime::get(options.library.as_deref(), &device)?;
+        let graph = Graph::of(model.encoder, style(&device, options.precision));
+        let weights = BoundWeights::new(&model.weights, &graph.weights)?;
+        let threads = options.thread_count();
+        let session = session::open(&runtime, &graph, &weights, &device, options.precision, threads)?;
+        let description = describe(&runtime.version, &device, options.precision);
+        Ok(Self { description, device, bound: None, session, _weights: weights })
+    }
+
+    fn bind(&mut self, shape: NetShape, positions: &PositionEmbeddings) -> ort::Result<Bound> {
+        let NetShape { batch, height, width } = shape;
+        let memory = |kind| match self.device {
+            Device::Cuda(n) | Device::TensorRt(n) => {
+                let info =
+                    MemoryInfo::new(AllocationDevice::CUDA_PINNED, n as i32, AllocatorType::Device, kind)?;
+                Allocator::new(&self.session, info)
+            }
+            Device::Cpu | Device::OpenVino(_) => Ok(Allocator::default()),
+        };
+        let x = Tensor::<f32>::new(&memory(MemoryType::CPUInput)?, [batch, 4, height, width])?;
+        let y = Tensor::<f32>::new(&memory(MemoryType::CPUOutput)?, [batch, height, width])?;
+        let mut binding = self.session.create_binding()?;
+        let tokens = 1 + shape.patches();
+        for (name, numbers) in [("pos_rgb", &positions.rgb), ("pos_depth", &positions.depth)] {
+            let width = numbers.len() / tokens;
+            let value = Tensor::from_array(([tokens, width], numbers.clone()))?;
+            binding.bind_input(name, &value)?;
+        }
+        binding.bind_input("x", &x)?;
+        binding.bind_output("y", y)?;
+        Ok(Bound { shape, x, binding })
+    }
+}
+
+impl Network for OnnxNetwork {
+    fn describe(&self) -> &str {
+        &self.description
+    }
+
+    fn best_batch(&self) -> usize {
+        match self.device {
+            // Measured: the CPU is as busy with one picture as with several.
+            Device::Cpu | Device::OpenVino(_) => 1,
+            Device::Cuda(_) | Device::TensorRt(_) => 4,
+        }
+    }
+
+    fn prepare(&mut self, shape: NetShape, positions: &PositionEmbeddings) -> Result<()> {
+        self.bound = None;
+        let patches =
+            shape.height.is_multiple_of(crate::arch::PATCH) && shape.width.is_multiple_of(crate::arch::PATCH);
+        let tokens = 1 + shape.patches();
+        let fits = |numbers: &[f32]| !numbers.is_empty() && numbers.len().is_multiple_of(tokens);
+        if shape.input_len() == 0 || !patches || !fits(&positions.rgb) || !fits(&positions.depth) {
+            let message = format!(
+                "{} pictures of {}x{} with {} position embeddings are no input of the network, whose sides are \
+                 multiples of 14",
+                shape.batch,
+                shape.width,
+                shape.height,
+                positions.rgb.len()
+            );
+            return Err(Error::new(ErrorKind::BadInput, message));
+        }
+        let bound = self.bind(shape, positions).map_err(|e| failed(&self.description, "making room", &e))?;
+        self.bound = Some(bound);
+        Ok(())
+    }
+
+    fn run(&mut self, x: &[f32], y: &mut [f32]) -> Result<()> {
+        let Self { description, device, bound, session, .. } = self;
+        let not_prepared =
+            |what: String| Err(Error::new(ErrorKind::BadInput, format!("{description}: {what}")));
+        let Some(Bound { shape, x: input, binding }) = bound else {
+            return not_prepared("run before it was prepared for a size".into());
+        };
+        if x.len() != shape.input_len() || y.len() != shape.output_len() {
+            let (height, width) = (shape.height, shape.width);
+            return not_prepared(format!(
+                "{} numbers in and {} out do not fit {} pictures of {width}x{height}",
+                x.len(),
+                y.len(),
+                shape.batch
+            ));
+        }
+        let mut infer = || -> ort::Result<()> {
+            input.extract_tensor_mut().1.copy_from_slice(x);
+            // Where the device has memory of its own, binding is what copies.
+            if matches!(device, Device::Cuda(_) | Device::TensorRt(_)) {
+                binding.bind_input("x", input)?;
+            }
+            let outputs = session.run_binding(binding)?;
+            binding.synchronize_outputs()?;
+            let (_, numbers) = outputs["y"].try_extract_tensor::<f32>()?;
+            if numbers.len() != y.len() {
+                return Err(ort::Error::new(format!(
+                    "{} numbers came out instead of {}",
+                    numbers.len(),
+                    y.len()
+                )));
+            }
+            y.copy_from_slice(numbers);
+            Ok(())
+        };
+        infer().map_err(|e| failed(description, "running", &e))
+    }
+}
+
+/// How the graph is written for a device.
+const fn style(device: &Device, precision: Precision) -> Style {
+    match (device, precision) {
+        (Device::Cuda(_), Precision::Fp16) => Style { attention: Attention::Fused, numbers: Numbers::Fp16 },
+        (Device::Cpu | Device::Cuda(_), _) => Style { attention: Attention::Fused, numbers: Numbers::Fp32 },
+        // These two take a graph in 32-bit floats and choose the precision themselves, as they are told.
+        (Device::TensorRt(_) | Device::OpenVino(_), _) => {
+            Style { attention: Attention::Standard, numbers: Numbers::Fp32 }
+        }
+    }
+}
+
+/// `onnxruntime 1.31.1 cpu fp32`; with less of the version and of the device when that is too long for a header.
+fn describe(version: &str, device: &Device, precision: Precision) -> String {
+    let whole = format!("onnxruntime {version} {device} {precision}");
+    if whole.len() <= NAME_BYTES {
+        return whole;
+    }
+    let version: Vec<&str> = version.split('.').take(2).collect();
+    let mut device = device.to_string();
+    device.truncate(device.find(':').unwrap_or(device.len()));
+    let mut short = format!("onnxruntime {} {device} {precision}", version.join("."));
+    short.truncate(NAME_BYTES);
+    short
+}
+
+/// What went wrong in the library. There is no code for lack of memory; the texts are those of ONNX Runtime's arena
+/// (`bfc_arena.cc`), of the C++ library, and of CUDA, cuBLAS and cuDNN.
+fn failed(engine: &str, what: &str, error: &ort::Error) -> Error {
+    const MEMORY: [&str; 8] = [
+        "Failed to allocate memory",
+        "bad_alloc",
+        "bad allocation",
+        "out of memory",
+        "Available memory of",
+        "CUDA_ERROR_OUT_OF_MEMORY",
+        "ALLOC_FAILED",
+        "OutOfMemory",
+    ];
+    let text = error.message();
+    if MEMORY.iter().any(|m| text.contains(m)) {
+        let message = format!(
+            "{engine}: {what} needs more memory than the device has left ({text}); use a smaller input_size, a smaller \
+             model or a 16-bit precision, or run fewer models on this device"
+        );
+        return Error::new(ErrorKind::OutOfMemory, message);
+    }
+    Error::new(ErrorKind::Engine, format!("{engine}: {what} failed: {text}"))
+}
+
+#[cfg(test)]
+mod tests;
