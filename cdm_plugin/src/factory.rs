@@ -1,6 +1,8 @@
 //! From options to a refiner: the one place that knows every engine.
 
-use crate::{EngineKind, Error, ErrorKind, FillRefiner, Refiner, RefinerOptions, Result};
+use crate::{
+    CdmRefiner, EngineKind, Error, ErrorKind, FillRefiner, OnnxNetwork, Refiner, RefinerOptions, Result,
+};
 
 /// The refiner that `options` ask for.
 ///
@@ -19,6 +21,10 @@ pub fn refiner(options: &RefinerOptions) -> Result<Box<dyn Refiner>> {
     }
     if engine == EngineKind::Fill {
         return Ok(Box::new(FillRefiner::new(options.threads)?));
+    }
+    if let (EngineKind::OnnxRuntime, Some(model)) = (engine, &options.model) {
+        let network = OnnxNetwork::open(model, options)?;
+        return Ok(Box::new(CdmRefiner::new(Box::new(network), model, options.input_size)?));
     }
     let message = format!("the engine {engine} is not part of this build");
     Err(Error::new(ErrorKind::Unsupported, message))
