@@ -30,6 +30,12 @@ pub fn json_line(value: &impl Serialize) -> Result<()> {
     line(serde_json::to_string(value)?)
 }
 
+/// `n` of `what`, which takes an `s` unless there is one: `1 set`, `2 sets`.
+pub fn count(n: impl core::fmt::Display + TryInto<u64> + Copy, what: &str) -> String {
+    let one = n.try_into().is_ok_and(|n| n == 1);
+    format!("{n} {what}{}", if one { "" } else { "s" })
+}
+
 /// A table without borders; the columns from `first_number` on are aligned to the right.
 pub fn table(header: &[&str], first_number: usize, rows: impl IntoIterator<Item = Vec<String>>) -> String {
     let mut table = Table::new();

@@ -102,13 +102,13 @@ fn recording(r: &RecordingStatus, style: Style) -> Vec<String> {
     let left = r.disk_seconds_left.filter(|_| r.active);
     let mut lines = vec![
         format!(
-            "{word} {}: {}, {} sets, lost {}, {} in {} segments",
+            "{word} {}: {}, {}, lost {}, {} in {}",
             r.name,
             out::seconds(r.duration_s),
-            r.sets,
+            out::count(r.sets, "set"),
             out::reasons(&r.dropped),
             out::bytes(r.bytes),
-            r.segments
+            out::count(r.segments, "segment")
         ),
         format!(
             "disk    {} free{}; {}",

@@ -169,7 +169,7 @@ fn a_crash_is_recovered_once_and_the_exit_code_says_what_it_cost() {
 
     let plan = home.run(&["recover", at, "--dry-run", "-q"]);
     assert_eq!(plan.code, 3, "{}", plan.err);
-    assert!(plan.out.contains("can be recovered, 1 sets") && plan.out.contains("lost: "), "{}", plan.out);
+    assert!(plan.out.contains("can be recovered, 1 set") && plan.out.contains("lost: "), "{}", plan.out);
     assert!(files(&dir) == before, "a dry run changed something");
     let lock = RealFs.lock(&dir).unwrap();
     assert_eq!(home.run(&["recover", at, "-q"]).code, 1);
@@ -190,7 +190,7 @@ fn a_crash_is_recovered_once_and_the_exit_code_says_what_it_cost() {
 
     let again = json(home.run(&["recover", at, "--json", "-q"]), 0);
     assert_eq!((&again["changed"], &again["lost"]), (&false.into(), &serde_json::json!([])));
-    assert!(home.run(&["recover", at, "-q"]).good().contains("nothing to do, 1 sets"));
+    assert!(home.run(&["recover", at, "-q"]).good().contains("nothing to do, 1 set"));
     assert!(files(&dir) == recovered, "a second time changed something");
 
     // Killed between its index and its name: nothing is lost.

@@ -183,10 +183,10 @@ fn export(args: &CatArgs, context: &Context, dataset: &Dataset, choice: &FrameCh
         let ended =
             if done.ended { " (ended before all were written; frames.csv.part lists them)" } else { "" };
         out::line(format_args!(
-            "{}: {} frames of {} sets, {}{ended}",
+            "{}: {} of {}, {}{ended}",
             dir.display(),
-            done.frames,
-            done.sets,
+            out::count(done.frames, "frame"),
+            out::count(done.sets, "set"),
             out::bytes(done.bytes)
         ))?;
     }

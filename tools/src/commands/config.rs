@@ -43,10 +43,10 @@ pub fn run(command: &ConfigCommand) -> Result<Exit> {
                 }
             }
             out::line(format_args!(
-                "{}: good: rig \"{}\", {} cameras, sets at {} Hz",
+                "{}: good: rig \"{}\", {}, sets at {} Hz",
                 file.display(),
                 config.rig,
-                config.cameras.len(),
+                out::count(config.cameras.len(), "camera"),
                 config.sets.rate_hz
             ))?;
         }

@@ -63,7 +63,7 @@ pub fn run(args: &DoctorArgs, context: &Context) -> Result<Exit> {
 }
 
 fn text(r: &Report, style: Style) -> String {
-    let mut lines = vec![format!("rig {}: {}", r.rig, plural(r.cameras.len(), "camera")), String::new()];
+    let mut lines = vec![format!("rig {}: {}", r.rig, out::count(r.cameras.len(), "camera")), String::new()];
     lines.push(out::table(
         &["camera", "device", "streams", "Mbit/s", ""],
         usize::MAX,
@@ -118,9 +118,9 @@ fn text(r: &Report, style: Style) -> String {
     lines.push(String::new());
     lines.push(match (count(Severity::Error), count(Severity::Warning)) {
         (0, 0) => "ready: nothing stands in the way".to_owned(),
-        (0, w) => format!("runs, but something may be lost: {}", plural(w, "warning")),
-        (e, 0) => format!("not ready: {}", plural(e, "error")),
-        (e, w) => format!("not ready: {}, {}", plural(e, "error"), plural(w, "warning")),
+        (0, w) => format!("runs, but something may be lost: {}", out::count(w, "warning")),
+        (e, 0) => format!("not ready: {}", out::count(e, "error")),
+        (e, w) => format!("not ready: {}, {}", out::count(e, "error"), out::count(w, "warning")),
     });
     lines.join("\n")
 }
@@ -137,10 +137,6 @@ fn finding(f: &Finding, style: Style) -> Vec<String> {
     lines.extend(out::item(" ", &format!("why:  {}", f.why), style.width));
     lines.extend(out::item(" ", &format!("cure: {}", f.cure), style.width));
     lines
-}
-
-fn plural(n: usize, what: &str) -> String {
-    if n == 1 { format!("1 {what}") } else { format!("{n} {what}s") }
 }
 
 /// Streams on one line where there is room, else one a line.

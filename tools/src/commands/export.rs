@@ -114,10 +114,10 @@ fn tell(report: &ExportReport, dir: &std::path::Path) -> Result<()> {
         n => format!(" ({n} of {} parts were there already)", report.parts),
     };
     out::line(format_args!(
-        "{dir}: {} frames of {} sets in {} files, {}{resumed}",
-        report.frames,
-        report.sets,
-        report.files,
+        "{dir}: {} of {} in {}, {}{resumed}",
+        out::count(report.frames, "frame"),
+        out::count(report.sets, "set"),
+        out::count(report.files, "file"),
         out::bytes(report.bytes)
     ))?;
     for loss in &report.losses {

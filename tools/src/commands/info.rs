@@ -42,12 +42,12 @@ pub fn text(info: &DatasetInfo) -> String {
         ),
         format!("started   {}", utc_text(info.started_utc_ns)),
         format!(
-            "holds     {} sets ({} incomplete) over {}, {} in {} segments",
-            info.sets,
+            "holds     {} ({} incomplete) over {}, {} in {}",
+            out::count(info.sets, "set"),
             info.incomplete_sets,
             out::seconds(info.duration_ns as f64 / 1e9),
             out::bytes(info.bytes),
-            info.segments
+            out::count(info.segments, "segment")
         ),
         format!(
             "spread    p50 {:.1} ms, p95 {:.1} ms, max {:.1} ms",

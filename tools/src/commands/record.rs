@@ -118,12 +118,12 @@ fn tell(status: &RecordingStatus, json: bool) -> Result<Exit> {
         return Ok(Exit::Good);
     }
     out::line(format_args!(
-        "{} {}: {}, {} sets, {} frames, {}, lost {}",
+        "{} {}: {}, {}, {}, {}, lost {}",
         if status.active { "recording" } else { "recorded" },
         status.path,
         out::seconds(status.duration_s),
-        status.sets,
-        status.frames,
+        out::count(status.sets, "set"),
+        out::count(status.frames, "frame"),
         out::bytes(status.bytes),
         out::reasons(&status.dropped)
     ))?;

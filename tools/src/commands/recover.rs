@@ -60,16 +60,17 @@ fn text(report: &RecoverReport) -> String {
     let path = report.path.display();
     // Writing to a string cannot fail.
     let _ = match (report.changed, report.dry_run) {
-        (false, _) => write!(told, "{path}: nothing to do, {} sets", report.sets),
-        (true, false) => write!(told, "{path}: recovered, {} sets", report.sets),
-        (true, true) => write!(told, "{path}: can be recovered, {} sets", report.sets),
+        (false, _) => write!(told, "{path}: nothing to do, {}", out::count(report.sets, "set")),
+        (true, false) => write!(told, "{path}: recovered, {}", out::count(report.sets, "set")),
+        (true, true) => write!(told, "{path}: can be recovered, {}", out::count(report.sets, "set")),
     };
     for s in report.segments.iter().filter(|s| s.action != RecoverAction::None) {
         let done = match s.action {
             RecoverAction::Rebuilt => "copied set by set",
             _ => "whole, got its final name",
         };
-        let _ = write!(told, "\n  {}: {done}, {} sets, {}", s.file, s.sets, out::bytes(s.bytes));
+        let _ =
+            write!(told, "\n  {}: {done}, {}, {}", s.file, out::count(s.sets, "set"), out::bytes(s.bytes));
     }
     for name in &report.removed {
         let _ = write!(told, "\n  {name}: a leftover, removed");

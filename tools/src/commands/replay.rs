@@ -243,9 +243,9 @@ fn headline(progress: &ReplayStatus) -> String {
 fn tell(result: &ReplaySummary) -> Result<()> {
     let status = &result.status;
     out::line(format_args!(
-        "replayed {} sets, {} frames, {} of {}",
-        status.sets,
-        status.frames,
+        "replayed {}, {}, {} of {}",
+        out::count(status.sets, "set"),
+        out::count(status.frames, "frame"),
         out::seconds(status.position_s),
         out::seconds(status.length_s)
     ))?;
@@ -253,8 +253,10 @@ fn tell(result: &ReplaySummary) -> Result<()> {
         let lost = out::reasons(&r.dropped);
         let size = out::bytes(r.bytes);
         out::line(format_args!(
-            "recorded {}: {} sets, {} frames, {size}, lost {lost}",
-            r.path, r.sets, r.frames
+            "recorded {}: {}, {}, {size}, lost {lost}",
+            r.path,
+            out::count(r.sets, "set"),
+            out::count(r.frames, "frame")
         ))?;
         if let Some(e) = &r.error {
             out::line(format_args!("lost: {e}"))?;

@@ -137,18 +137,19 @@ fn tell(summary: &RigSummary) -> Result<()> {
     let status = &summary.status;
     let delivered: u64 = status.cameras.iter().flat_map(|c| &c.streams).map(|s| s.delivered).sum();
     out::line(format_args!(
-        "rig {} ran {}: {delivered} frames of {} cameras, {} sets",
+        "rig {} ran {}: {} of {}, {}",
         status.rig,
         out::seconds(status.uptime_s),
-        status.cameras.len(),
-        status.sets.sent
+        out::count(delivered, "frame"),
+        out::count(status.cameras.len(), "camera"),
+        out::count(status.sets.sent, "set")
     ))?;
     if let Some(recording) = &summary.recording {
         out::line(format_args!(
-            "recorded {}: {} sets, {} frames, {} over {}",
+            "recorded {}: {}, {}, {} over {}",
             recording.path.display(),
-            recording.sets.recorded,
-            recording.frames,
+            out::count(recording.sets.recorded, "set"),
+            out::count(recording.frames, "frame"),
             out::bytes(recording.bytes),
             out::seconds(recording.duration_ns as f64 / 1e9)
         ))?;

@@ -160,7 +160,12 @@ fn text(entries: &[CatalogEntry], folder: &str) -> String {
         let why = e.why.first().map_or("", String::as_str);
         lines.push(format!("{}: {}: {why}", e.health.name(), e.path.display()));
     }
-    let all = format!("{} datasets, {sets} sets, {}", entries.len(), out::bytes(bytes));
+    let all = format!(
+        "{}, {}, {}",
+        out::count(entries.len(), "dataset"),
+        out::count(sets, "set"),
+        out::bytes(bytes)
+    );
     lines.push(if bad.is_empty() { all } else { format!("{all}; to be looked at: {}", bad.len()) });
     lines.join("\n")
 }

@@ -93,14 +93,14 @@ pub(super) fn report(json: bool, make: impl FnOnce() -> Result<SliceReport>) -> 
             n => format!(" ({n} were in several inputs)"),
         };
         out::line(format_args!(
-            "{}: {} sets{repeated}, {} to {}, {}, {} in {} segments",
+            "{}: {}{repeated}, {} to {}, {}, {} in {}",
             made.path.display(),
-            made.sets,
+            out::count(made.sets, "set"),
             made.first_set,
             made.last_set,
             out::seconds(made.duration_ns as f64 / 1e9),
             out::bytes(made.bytes),
-            made.segments
+            out::count(made.segments, "segment")
         ))?;
         for lost in &made.lost {
             out::line(format_args!("lost: {lost}"))?;

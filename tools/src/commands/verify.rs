@@ -88,13 +88,13 @@ pub fn summary(report: &VerifyReport) -> String {
         _ => "whole".to_owned(),
     };
     format!(
-        "{}: {verdict}; {} sets, {} frames{}, {} in {} segments",
+        "{}: {verdict}; {}, {}{}, {} in {}",
         report.path.display(),
-        report.sets,
-        report.frames,
+        out::count(report.sets, "set"),
+        out::count(report.frames, "frame"),
         if report.decoded { " (every picture decoded)" } else { "" },
         out::bytes(report.bytes),
-        report.segments
+        out::count(report.segments, "segment")
     )
 }
 
