@@ -10,6 +10,7 @@ import pytest
 
 import depthrig
 from depthrig import Frame, Header, PixelFormat, _layout
+from depthrig._header import essentials
 
 BLANK = {n: ("" if (k, c) == ("u8", 32) else b"\0" * c if k == "u8" else [0] * c) for n, _, k, c in _layout.FIELDS}
 
@@ -23,7 +24,7 @@ def header(pixel_format: int, width: int, height: int, stride: int, length: int,
 def frame(h: Header, data: np.ndarray) -> Frame:
     """A frame over `data`, which stands for the sample: the frame must keep it alive."""
     raw = np.ascontiguousarray(data).view(np.uint8).reshape(-1)
-    return Frame(raw, h, raw.ctypes.data, raw.size)
+    return Frame(raw, h.raw, essentials(h.raw), raw.ctypes.data, raw.size)
 
 
 @pytest.mark.parametrize(

@@ -101,9 +101,7 @@ def test_what_follows_from_the_fields(dumped: tuple[bytes, dict]) -> None:
         (999, 0, "arrival"),
     ],
 )
-def test_a_frame_says_what_its_times_come_from(
-    dumped: tuple[bytes, dict], clock: int, flags: int, level: str
-) -> None:
+def test_a_frame_says_what_its_times_come_from(dumped: tuple[bytes, dict], clock: int, flags: int, level: str) -> None:
     values = Header(dumped[0]).to_dict() | {"clock_domain": clock, "flags": int(flags)}
     assert Header(Header.pack(values)).metadata_level == level
 

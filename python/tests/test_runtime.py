@@ -100,7 +100,7 @@ def test_another_wheel_is_refused_with_what_to_install(
 def test_without_the_wheel_the_import_says_what_to_install(tmp_path: Path) -> None:
     (tmp_path / "iceoryx2.py").write_text("raise ImportError('GLIBC_2.34 not found')")
     code = "import depthrig"
-    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])}
     done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "ImportError: depthrig reads shared memory with the iceoryx2 wheel" in done.stderr

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 from ._frame import Frame
+from ._group import FrameGroup, SetReader
 from ._header import Header, Intrinsics, Pose
 from ._layout import ClockDomain, Distortion, DropReason, FrameFlags, PixelFormat
 from ._runtime import running_rigs
@@ -21,6 +22,7 @@ from .errors import (
     DepthrigError,
     HoldingTooMany,
     RigNotRunning,
+    Stale,
     StreamGone,
     StreamNotFound,
     Timeout,
@@ -39,6 +41,7 @@ __all__ = [
     "DropReason",
     "Frame",
     "FrameFlags",
+    "FrameGroup",
     "FrameSet",
     "Header",
     "HoldingTooMany",
@@ -46,7 +49,9 @@ __all__ = [
     "PixelFormat",
     "Pose",
     "RigNotRunning",
+    "SetReader",
     "Sets",
+    "Stale",
     "Stream",
     "StreamGone",
     "StreamNotFound",

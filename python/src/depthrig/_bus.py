@@ -71,6 +71,18 @@ def wheel_version() -> str:
         return _WHEEL
 
 
+# How often this process and its ancestors were forked since they loaded this module.
+_forks = 0
+
+
+def _forked() -> None:
+    global _forks
+    _forks += 1
+
+
+os.register_at_fork(after_in_child=_forked)
+
+
 class Bus:
     """This process's place on the bus of one runtime folder, shared by all its channels."""
 
@@ -129,7 +141,7 @@ class Receiver:
     def __init__(self, bus: Bus, rig: str, channel: str, header: type[ctypes.Structure], what: str) -> None:
         self.bus = bus
         self.what = what
-        self._pid = os.getpid()
+        self._forks = _forks
         name = iox2.ServiceName.new(f"depthrig/{rig}/{channel}")
         schema = iox2.AttributeVerifier.new().require(
             iox2.AttributeKey.new("schema"), iox2.AttributeValue.new(_layout.SCHEMA)
@@ -179,7 +191,7 @@ class Receiver:
         """Return the oldest unread sample, or None."""
         if self._subscriber is None:
             raise ValueError(f"{self.what} was closed")
-        if os.getpid() != self._pid:
+        if _forks != self._forks:
             raise BusError(f"{self.what} was opened before this process was forked; open it in the process that reads")
         try:
             return self._subscriber.receive()

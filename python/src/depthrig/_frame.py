@@ -2,19 +2,26 @@
 
 The array that iceoryx2 itself offers is writable memory whose slot is reused as soon as the sample object is gone:
 the pixels change under the reader, and writing to them kills the process. Here every array has, at the end of its
-chain of bases, an `_Owner` that holds the sample, and it is read-only for NumPy as it is for the hardware.
+chain of bases, an `_Owner` that holds the sample, and it is read-only for NumPy as it is for the hardware. (A read-only
+`memoryview` at that place would not do: NumPy looks through it and lets itself be told to write.)
 """
 
 from __future__ import annotations
 
-from typing import Any
+import functools
+import time
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from . import _torch
 from ._header import Header
-from ._layout import PixelFormat
+from ._layout import FrameFlags, PixelFormat
 from .errors import BadFrame, VersionMismatch
+
+if TYPE_CHECKING:
+    import torch
 
 # Per format: NumPy's element type, its bytes, and how many of them a pixel has.
 _ELEMENTS = {
@@ -29,6 +36,7 @@ _ELEMENTS = {
     PixelFormat.NV12: ("|u1", 1, 1),
     PixelFormat.CONFIDENCE8: ("|u1", 1, 1),
 }
+_FORMATS = frozenset(int(f) for f in PixelFormat)
 
 
 class _Owner:
@@ -41,40 +49,44 @@ class _Owner:
         self.__array_interface__ = interface
 
 
-def array_interface(header: Header, address: int, available: int) -> dict[str, Any]:
-    """Describe the pixels at `address`, of which `available` bytes may be read, to NumPy.
+class Shape(NamedTuple):
+    """How NumPy sees pixels of one format and size."""
 
-    Raises BadFrame when the header speaks of more bytes than there are.
+    typestr: str
+    shape: tuple[int, ...]
+    strides: tuple[int, ...] | None
+    length: int
+    """Bytes that a slot must have."""
+
+
+@functools.lru_cache(maxsize=64)
+def shape_of(code: int, width: int, height: int, stride: int, length: int) -> Shape:
+    """Return how NumPy sees such pixels. Worked out once: a stream's frames are alike.
+
+    Raises BadFrame when the picture does not fit into `length` bytes, VersionMismatch for an unknown format; neither
+    text says which frame it is.
     """
-    where = f"{header.stream_id} frame {header.sequence}"
-    length = header.payload_len
-    if length > available:
-        raise BadFrame(f"{where}: its header speaks of {length} bytes, its slot has {available}")
-    interface: dict[str, Any] = {"version": 3, "data": (address, True), "strides": None}
-    pixel_format = header.pixel_format
-    if pixel_format is None:
+    if code not in _FORMATS:
         raise VersionMismatch(
-            f"{where}: pixel format {header.format} is unknown to this version; install the `depthrig` package of "
-            "the daemon's version"
+            f"pixel format {code} is unknown to this version; install the `depthrig` package of the daemon's version"
         )
+    pixel_format = PixelFormat(code)
     if pixel_format is PixelFormat.MJPEG:
-        interface.update(typestr="|u1", shape=(length,))
-        return interface
+        return Shape("|u1", (length,), None, length)
     typestr, size, channels = _ELEMENTS[pixel_format]
-    width, stride = header.width, header.stride
-    rows = header.height * 3 // 2 if pixel_format is PixelFormat.NV12 else header.height
+    rows = height * 3 // 2 if pixel_format is PixelFormat.NV12 else height
     row_bytes = width * size * channels
     needed = (rows - 1) * stride + row_bytes if rows else 0
     if stride < row_bytes or needed > length:
         raise BadFrame(
-            f"{where}: {width}x{header.height} {header.format_name} with {stride} bytes a row does not fit into "
-            f"its {length} bytes"
+            f"{width}x{height} {pixel_format.name.lower()} with {stride} bytes a row does not fit into its "
+            f"{length} bytes"
         )
     shape: tuple[int, ...] = (rows, width) if channels == 1 else (rows, width, channels)
-    interface.update(typestr=typestr, shape=shape)
+    strides: tuple[int, ...] | None = None
     if stride != row_bytes:
-        interface["strides"] = (stride, size) if channels == 1 else (stride, size * channels, size)
-    return interface
+        strides = (stride, size) if channels == 1 else (stride, size * channels, size)
+    return Shape(typestr, shape, strides, length)
 
 
 class Frame:
@@ -84,15 +96,51 @@ class Frame:
     may hold 16 frames; work on :meth:`copy` when more are needed.
     """
 
-    __slots__ = ("_interface", "_sample", "header")
+    __slots__ = ("_address", "_flags", "_header", "_raw", "_sample", "_shape", "capture_time_ns", "sequence")
 
-    header: Header
-    """What the frame says of itself; valid also without the frame."""
+    sequence: int
+    """Number of this frame on its channel; as in the header."""
+    capture_time_ns: int
+    """Middle of the exposure, nanoseconds on the clock of :func:`time.monotonic_ns`; as in the header."""
 
-    def __init__(self, sample: Any, header: Header, address: int, available: int) -> None:
-        self.header = header
-        self._interface = array_interface(header, address, available)
+    def __init__(self, sample: Any, raw: Any, fields: tuple[Any, ...], address: int, available: int) -> None:
+        """Make a frame of a sample: the bytes of its header, what `essentials` read in them, and where its pixels are.
+
+        `raw` may be the header in shared memory: it is copied when somebody asks for it. Raises BadFrame when the
+        header speaks of more than the `available` bytes of pixels.
+        """
         self._sample: Any | None = sample
+        self._raw = raw
+        self._header: Header | None = None
+        self._address = address
+        _, self.sequence, self.capture_time_ns, self._flags, *picture = fields
+        try:
+            shape = self._shape = shape_of(*picture)
+        except (BadFrame, VersionMismatch) as e:
+            raise type(e)(f"{self._where}: {e}") from None
+        if shape.length > available:
+            raise BadFrame(f"{self._where}: its header speaks of {shape.length} bytes, its slot has {available}")
+
+    @property
+    def header(self) -> Header:
+        """What the frame says of itself; valid also without the frame."""
+        if self._header is None:
+            self._header = Header(bytes(self._raw))
+            self._raw = None
+        return self._header
+
+    @property
+    def _where(self) -> str:
+        return f"{self.header.stream_id} frame {self.sequence}"
+
+    def _array(self, read_only: bool) -> npt.NDArray[Any]:
+        """Return the pixels as an array that keeps the slot. One that can be written to is not for others' hands."""
+        if self._sample is None:
+            raise ValueError(f"frame {self.sequence} of {self.header.stream_id} was released")
+        typestr, shape, strides, _ = self._shape
+        data = (self._address, read_only)
+        interface = {"version": 3, "data": data, "typestr": typestr, "shape": shape, "strides": strides}
+        return np.asarray(_Owner(self._sample, interface))
 
     @property
     def array(self) -> npt.NDArray[Any]:
@@ -102,9 +150,7 @@ class Frame:
         `(H, W)` u8 for mono8 and confidence8; `(H, W, 2)` u8 for yuyv and uyvy; `(H * 3 // 2, W)` u8 for nv12;
         `(bytes,)` u8 for mjpeg.
         """
-        if self._sample is None:
-            raise ValueError(f"frame {self.header.sequence} of {self.header.stream_id} was released")
-        return np.asarray(_Owner(self._sample, self._interface))
+        return self._array(read_only=True)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         array = self.array
@@ -137,13 +183,42 @@ class Frame:
         metres[array == 0] = np.nan
         return metres
 
+    def torch(
+        self,
+        device: str | torch.device = "cpu",
+        *,
+        metres: bool = False,
+        out: torch.Tensor | None = None,
+        copy: bool = True,
+    ) -> torch.Tensor:
+        """Return the pixels as a PyTorch tensor on `device`, of the shape of :attr:`array`: one copy to the device.
+
+        * On the CPU the pixels are copied once, out of shared memory into the tensor.
+        * With CUDA they are copied into pinned memory and from there to the GPU in one asynchronous transfer, ordered
+          on the current stream like every operation of PyTorch; the frame may be let go at once.
+        * `out` is a tensor to write into in place of a new one: its shape, type and device must fit.
+        * `metres` gives float32 metres of a depth picture, 0 where there is no depth (:meth:`depth_m` has NaN there).
+          On the CPU that is the same single pass; elsewhere the pixels travel as they are and are converted there.
+        * `copy=False` (CPU only) shares the memory: it holds the frame's slot as an array does, and PyTorch knows no
+          read-only tensors, so **writing to such a tensor ends the process** with a segmentation fault.
+
+        16-bit pixels are `torch.uint16`, which PyTorch has since 2.3. Raises ImportError without PyTorch.
+        """
+        return _torch.tensor(self, device, metres, out, copy)
+
     @property
     def age_s(self) -> float:
         """Seconds since the middle of the exposure. Of a replayed frame it is the age of the recording."""
-        return self.header.age_s
+        return (time.monotonic_ns() - self.capture_time_ns) / 1e9
+
+    @property
+    def replayed(self) -> bool:
+        """Whether a replay published it: its times are those of the recording."""
+        return bool(self._flags & FrameFlags.REPLAYED)
 
     def release(self) -> None:
         """Let go of the pixels now. Arrays made before stay valid, and keep the slot until they are gone."""
+        _ = self.header  # its bytes go with the slot
         self._sample = None
 
     def __enter__(self) -> Frame:

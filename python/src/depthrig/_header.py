@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import struct
 import time
 from collections.abc import Mapping
@@ -13,6 +14,12 @@ import numpy.typing as npt
 from . import _layout
 from ._layout import ClockDomain, Distortion, DropReason, FrameFlags, HeaderFields, PixelFormat
 from .errors import VersionMismatch
+
+essentials = struct.Struct("<8sQ32xq288xI5I").unpack_from
+"""What receiving a frame needs of its header, in one go: VERSION_BYTES, sequence, capture time, flags; then format,
+width, height, stride and payload_len. Between publishing and a policy's use, what nobody asked for costs time."""
+VERSION_BYTES = struct.pack("<4sHH", _layout.HEADER_MAGIC, _layout.HEADER_VERSION, _layout.HEADER_SIZE)
+HeaderBytes = ctypes.c_char * _layout.HEADER_SIZE
 
 _CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "i64": "q", "f32": "f", "f64": "d"}
 
@@ -71,11 +78,7 @@ class Header(HeaderFields):
 
     def check_version(self, what: str) -> None:
         """Raise VersionMismatch unless this is a header of the version that this package reads."""
-        if (self.magic, self.version, self.size) != (
-            _layout.HEADER_MAGIC,
-            _layout.HEADER_VERSION,
-            _layout.HEADER_SIZE,
-        ):
+        if self._raw[: len(VERSION_BYTES)] != VERSION_BYTES:
             raise VersionMismatch(
                 f"{what}: a frame has header version {self.version} ({self.magic!r}, {self.size} bytes), this "
                 f"package reads version {_layout.HEADER_VERSION}; install the `depthrig` package of the "

@@ -15,8 +15,8 @@ T = TypeVar("T")
 Self = TypeVar("Self", bound="Reader")  # type: ignore[type-arg]
 
 # How often a waiting reader lets Python handle signals, and looks whether anybody still publishes.
-_SLICE_S = 0.1
-_LIVENESS_S = 0.5
+SLICE_S = 0.1
+LIVENESS_S = 0.5
 
 
 class Reader(Generic[T]):
@@ -71,24 +71,28 @@ class Reader(Generic[T]):
         """
         started = time.monotonic()
         deadline = float("inf") if timeout is None else started + timeout
-        look = started + _LIVENESS_S
+        look = started + LIVENESS_S
         while True:
             item = self._take()
             if item is not None:
                 return item
             now = time.monotonic()
             if now >= look:
-                if not self._open.has_publisher():
-                    raise StreamGone(
-                        f"{self._open.what}: nobody publishes it any more; is the daemon running (`depthrig status`)?"
-                    )
-                look = now + _LIVENESS_S
+                self._check_publisher()
+                look = now + LIVENESS_S
             if now >= deadline:
                 raise Timeout(
                     f"{self._open.what}: nothing came within {timeout:g} s; `depthrig status` shows what the camera "
                     "is doing"
                 )
-            self._open.wait(min(_SLICE_S, deadline - now, look - now))
+            self._open.wait(min(SLICE_S, deadline - now, look - now))
+
+    def _check_publisher(self) -> None:
+        """Raise StreamGone when nobody publishes the channel any more."""
+        if not self._open.has_publisher():
+            raise StreamGone(
+                f"{self._open.what}: nobody publishes it any more; is the daemon running (`depthrig status`)?"
+            )
 
     @property
     def is_live(self) -> bool:

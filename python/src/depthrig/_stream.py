@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
+import time
+from typing import TYPE_CHECKING
 
 from ._bus import FRAME_HEADER, Bus
 from ._frame import Frame
-from ._header import Header
-from ._layout import HEADER_SIZE
-from ._reader import Reader
+from ._header import VERSION_BYTES, Header, HeaderBytes, essentials
+from ._reader import SLICE_S, Reader
 from ._runtime import PathLike, check_name, not_running, pick_rig, runtime_dir
+from .errors import Stale
+
+if TYPE_CHECKING:
+    import torch
 
 
 class Stream(Reader[Frame]):
@@ -40,6 +44,10 @@ class Stream(Reader[Frame]):
         self.name = stream
         self._last_sequence = 0
         self._missed = 0
+        self._restarts = 0
+        self._newest_ns: int | None = None
+        self.header: Header | None = None
+        """Header of the frame that :meth:`torch` gave last."""
         super().__init__(stream, FRAME_HEADER, rig, runtime_dir, timeout)
 
     @property
@@ -47,19 +55,96 @@ class Stream(Reader[Frame]):
         """Frames that were published but replaced before this subscriber read them."""
         return self._missed
 
+    @property
+    def restarts(self) -> int:
+        """How often the numbering began anew: the daemon, the camera or its stage was restarted."""
+        return self._restarts
+
+    def wait_fresh(self, max_age: float, timeout: float | None = None) -> Frame:
+        """Return the newest unread frame whose exposure is at most `max_age` seconds ago, waiting for one if need be.
+
+        Waits up to `timeout` seconds, by default `max_age`: a policy that asks for each frame so never acts on older
+        depth. Raises Stale, which has the age of the newest frame there was, when none came that is fresh; StreamGone
+        instead when nobody publishes any more. The age counts from the middle of the exposure, so that of refined depth
+        contains the time that refining took. A frame is returned once: between two of them, look at the `age_s` of
+        the one you have. Frames of a replay carry the times of their recording, have no age, and raise Stale at once.
+        """
+        if not max_age > 0:
+            raise ValueError(f"max_age is a number of seconds above 0, not {max_age!r}")
+        now = time.monotonic()
+        deadline = now + (max_age if timeout is None else timeout)
+        while True:
+            frame = self.latest()
+            if frame is not None:
+                if frame.replayed:
+                    raise Stale(
+                        f"{self._open.what}: it is replayed, its frames carry the times of the recording and have no "
+                        "age; read a replay with next() or latest()",
+                        None,
+                        max_age,
+                    )
+                if frame.age_s <= max_age:
+                    return frame
+                frame = None  # gives its slot back
+            now = time.monotonic()
+            if now >= deadline:
+                self._check_publisher()
+                raise self._stale(max_age)
+            self._open.wait(min(SLICE_S, deadline - now))
+
+    def _stale(self, max_age: float) -> Stale:
+        if self._newest_ns is None:
+            return Stale(f"{self._open.what}: no frame has come yet, and one of {max_age:g} s is needed", None, max_age)
+        age = (time.monotonic_ns() - self._newest_ns) / 1e9
+        return Stale(
+            f"{self._open.what}: its newest frame is {age:.3f} s old, at most {max_age:g} s is allowed; "
+            "`depthrig status` shows what the camera and its stage are doing",
+            age,
+            max_age,
+        )
+
+    def torch(
+        self,
+        device: str | torch.device = "cpu",
+        *,
+        max_age: float | None = None,
+        timeout: float | None = None,
+        metres: bool = False,
+        out: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Return the newest unread frame's pixels as a tensor on `device`; its header is in :attr:`header`.
+
+        Waits for a frame up to `timeout` seconds (None: as long as it takes) and raises Timeout and StreamGone as
+        :meth:`next` does; with `max_age` it is :meth:`wait_fresh` that waits. One copy to the device, after which the
+        frame's slot is free again; `metres` and `out` as for :meth:`Frame.torch`, which also has `copy`.
+        """
+        if max_age is not None:
+            frame = self.wait_fresh(max_age, timeout)
+        else:
+            newest = self.latest()
+            frame = self.next(timeout) if newest is None else newest
+        tensor = frame.torch(device, metres=metres, out=out)
+        self.header = frame.header
+        return tensor
+
     def _take(self) -> Frame | None:
-        receiver = self._open
+        receiver = self._receiver or self._open
         sample = receiver.receive()
         if sample is None:
             return None
-        header = Header(ctypes.string_at(sample.user_header_ptr, HEADER_SIZE))
-        header.check_version(receiver.what)
-        sequence = header.sequence
-        # The first frame sets the mark; a smaller number means that the publisher was restarted.
-        if 0 < self._last_sequence < sequence:
-            self._missed += sequence - self._last_sequence - 1
+        raw = HeaderBytes.from_address(sample.user_header_ptr)
+        fields = essentials(raw)
+        if fields[0] != VERSION_BYTES:
+            Header(bytes(raw)).check_version(receiver.what)
+        sequence, last = fields[1], self._last_sequence
+        if sequence != last + 1 and last > 0:  # the first frame sets the mark
+            if sequence > last:
+                self._missed += sequence - last - 1
+            else:  # a smaller number means that the publisher was restarted
+                self._restarts += 1
         self._last_sequence = sequence
-        return Frame(sample, header, sample.payload_ptr, sample.header.number_of_elements)
+        self._newest_ns = fields[2]
+        return Frame(sample, raw, fields, sample.payload_ptr, sample.header.number_of_elements)
 
     def __repr__(self) -> str:
         state = "closed" if self._receiver is None else f"at #{self._last_sequence}, {self._missed} missed"

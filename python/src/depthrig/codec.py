@@ -83,14 +83,14 @@ def unpack_depth(data: Any, height: int, width: int, step: int | None = None) ->
     body = np.frombuffer(_unzstd(packed[4:], 2 * count + step * height), np.uint8).astype(np.uint16)
 
     def plane(at: int, n: int) -> npt.NDArray[np.uint16]:
-        return body[at : at + n] | body[at + n : at + 2 * n] << 8
+        return body[at : at + n] | (body[at + n : at + 2 * n] << np.uint16(8))
 
     steps = plane(0, count).astype(np.int64)
     palette = np.cumsum(steps)
     if (steps[1:] == 0).any() or palette[-1] > 65535:
         raise ValueError("the palette is not rising or leaves 16 bits")
     folded = plane(2 * count, pixels)
-    residuals = (folded >> 1) ^ (0 - (folded & 1)).astype(np.uint16)
+    residuals = (folded >> np.uint16(1)) ^ (0 - (folded & np.uint16(1))).astype(np.uint16)
     ranks = _unpredict(residuals.reshape(height, width))
     if ranks.max() >= count:
         raise ValueError(f"rank {ranks.max()} is not in the palette of {count} values")

@@ -27,6 +27,17 @@ class Timeout(DepthrigError, TimeoutError):
     """No frame came in time."""
 
 
+class Stale(DepthrigError):
+    """The newest depth there is, is older than the reader allows; the message says by how much, and of which stream."""
+
+    def __init__(self, message: str, age_s: float | None = None, max_age_s: float | None = None) -> None:
+        super().__init__(message)
+        self.age_s = age_s
+        """Seconds since the middle of the newest frame's exposure; None when no frame has come at all."""
+        self.max_age_s = max_age_s
+        """The age that was allowed, seconds."""
+
+
 class HoldingTooMany(DepthrigError):
     """This subscriber holds as many frames as it may; delete some, or work on copies."""
 
