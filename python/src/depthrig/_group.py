@@ -122,6 +122,8 @@ class SetReader:
         self._max_skew_ns = int(max_skew * 1e9)
         self._partial_after = partial_after
         self._moment_ns = _NEVER
+        # Of each stream the capture time of the newest frame that came, and of the newest that is in a group.
+        self._reached: dict[str, int] = {}
         self._given: dict[str, int] = {}
         self._skew_seen_ns: int | None = None
         self._kept: dict[str, deque[Frame]] = {name: deque() for name in names}
@@ -220,17 +222,15 @@ class SetReader:
                     continue
                 if frame is None:
                     break
-                if kept and frame.capture_time_ns <= kept[-1].capture_time_ns:
-                    kept.clear()  # a clock that was set anew, or a replay that was wound back
-                    self._forget()
+                if frame.capture_time_ns <= self._reached.get(name, _NEVER):
+                    # A replay that was wound back, or a computer's clock after a restart: begin anew.
+                    kept.clear()
+                    self._moment_ns = _NEVER
+                    self._given.clear()
+                self._reached[name] = frame.capture_time_ns
                 kept.append(frame)
                 if len(kept) > KEPT:
                     kept.popleft()
-
-    def _forget(self) -> None:
-        """Begin anew: capture times went back."""
-        self._moment_ns = _NEVER
-        self._given.clear()
 
     def _complete(self) -> FrameGroup | None:
         if not all(self._kept.values()):
@@ -265,12 +265,7 @@ class SetReader:
 
     def _laggard(self) -> Stream:
         """Return the stream without which there is no complete group."""
-
-        def reached(name: str) -> int:
-            kept = self._kept[name]
-            return kept[-1].capture_time_ns if kept else self._given.get(name, _NEVER)
-
-        return self._streams[min(self._kept, key=reached)]
+        return self._streams[min(self._kept, key=lambda name: self._reached.get(name, _NEVER))]
 
     def _check_publishers(self) -> None:
         gone = [n for n, s in self._streams.items() if not s.is_live]
