@@ -19,7 +19,7 @@ BLANK |= {"magic": _layout.HEADER_MAGIC, "version": [_layout.HEADER_VERSION], "s
 class Channel:
     """One stream; its frames are z16 unless told otherwise, each pixel holding the frame's number."""
 
-    def __init__(self, bus: _bus.Bus, name: str) -> None:
+    def __init__(self, bus: _bus.Bus, name: str, slot: int) -> None:
         self.camera, self.stream = name.split("/")
         self.sent = 0
         service_name = iox2.ServiceName.new(f"depthrig/mount/{name}")
@@ -31,7 +31,7 @@ class Channel:
         builder = builder.subscriber_max_buffer_size(4).subscriber_max_borrowed_samples(16)
         self._service = builder.create_with_attributes(schema)
         self._events = bus.node.service_builder(service_name).event().create()
-        self._publisher = self._service.publisher_builder().initial_max_slice_len(WIDTH * HEIGHT * 4).create()
+        self._publisher = self._service.publisher_builder().initial_max_slice_len(slot).create()
         self._notifier = self._events.notifier_builder().create()
 
     def pixels(self, sequence: int) -> np.ndarray:
@@ -72,8 +72,8 @@ class Maker:
         self._bus = _bus.Bus.at(str(folder))
         self._channels: list[Channel] = []
 
-    def channel(self, name: str) -> Channel:
-        self._channels.append(Channel(self._bus, name))
+    def channel(self, name: str, slot: int = WIDTH * HEIGHT * 4) -> Channel:
+        self._channels.append(Channel(self._bus, name, slot))
         return self._channels[-1]
 
     def __enter__(self) -> Maker:

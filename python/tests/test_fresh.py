@@ -105,6 +105,7 @@ def test_without_a_publisher_it_is_gone_and_not_stale(start: Start, folder: Path
     publisher = start()
     s = Stream("pattern/z16", runtime_dir=folder, timeout=WAIT_S)
     publisher.publish(1)
+    s.next(WAIT_S)
     publisher.kill()
     with pytest.raises(depthrig.StreamGone):
         s.wait_fresh(max_age=0.05)
