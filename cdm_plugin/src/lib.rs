@@ -6,6 +6,8 @@
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 pub mod arch;
+#[cfg(feature = "candle")]
+mod candle;
 mod durable;
 mod error;
 mod factory;
@@ -22,6 +24,8 @@ mod refiner;
 pub mod weights;
 
 pub use arch::Encoder;
+#[cfg(feature = "candle")]
+pub use candle::CandleNetwork;
 pub use error::{Error, ErrorKind, Result};
 pub use factory::refiner;
 pub use fill::FillRefiner;

@@ -1,0 +1,132 @@
+//! Around a network, a picture of a size that was seen before costs no allocation.
+//!
+//! One test in a binary of its own: the counter sees every thread of the process.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+// The allocator is what is tested, and a GlobalAlloc cannot be written without.
+#![allow(unsafe_code)]
+
+use depthrig_cdm::{
+    CdmRefiner, ChannelOrder, Color, ColorFormat, Encoder, Job, Model, NetShape, Network, Output,
+    PositionEmbeddings, RawDepth, Refiner, Result, StepTimes, Weights,
+};
+use safetensors::tensor::{Dtype, TensorView};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
+
+struct Counting;
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
+
+// SAFETY: every call is passed on to the system's allocator as it came.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller keeps the contract of `GlobalAlloc::alloc`, which is that of `System`.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        // SAFETY: `ptr` came from `System` with this layout, through `alloc` or `realloc`.
+        unsafe { System.dealloc(ptr, layout) }
+    }
+
+    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
+        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: `ptr` came from `System` with this layout, through `alloc` or `realloc`.
+        unsafe { System.realloc(ptr, layout, new_size) }
+    }
+}
+
+/// Gives back inverse depth as it came.
+struct Mirror(NetShape);
+
+impl Network for Mirror {
+    fn describe(&self) -> &'static str {
+        "mirror"
+    }
+
+    fn best_batch(&self) -> usize {
+        2
+    }
+
+    fn prepare(&mut self, shape: NetShape, _: &PositionEmbeddings) -> Result<()> {
+        self.0 = shape;
+        Ok(())
+    }
+
+    fn run(&mut self, x: &[f32], y: &mut [f32]) -> Result<()> {
+        let plane = self.0.height * self.0.width;
+        for (x, y) in x.chunks_exact(4 * plane).zip(y.chunks_exact_mut(plane)) {
+            y.copy_from_slice(&x[3 * plane..]);
+        }
+        Ok(())
+    }
+}
+
+fn model() -> Model {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("positions.safetensors");
+    let numbers = 1f32.to_le_bytes().repeat(1370 * 384);
+    let view = || TensorView::new(Dtype::F32, vec![1, 1370, 384], &numbers).unwrap();
+    let tensors = [("pretrained.pos_embed", view()), ("depth_pretrained.pos_embed", view())];
+    safetensors::serialize_to_file(tensors, None, &path).unwrap();
+    Model {
+        id: "mirror".into(),
+        encoder: Encoder::Vits,
+        weights: Arc::new(Weights::open(&path).unwrap()),
+        channel_order: ChannelOrder::Bgr,
+        input_size: 70,
+        max_depth_m: 6.0,
+    }
+}
+
+#[test]
+fn nothing_is_allocated_per_picture() {
+    let mirror = Mirror(NetShape { batch: 0, height: 0, width: 0 });
+    let mut refiner = CdmRefiner::new(Box::new(mirror), &model(), None).unwrap();
+    // Two cameras of one size and one of another, each with an output of its own kind.
+    let sizes = [(128, 72), (128, 72), (64, 48)];
+    let color: Vec<Vec<u8>> = sizes.iter().map(|(w, h)| vec![77; 3 * w * h]).collect();
+    let depth: Vec<Vec<u16>> = sizes.iter().map(|(w, h)| vec![1500; w * h]).collect();
+    let mut units = vec![0u16; 128 * 72];
+    let mut metres = vec![0f32; 128 * 72];
+    let mut inverse = vec![0f32; 64 * 48];
+    let mut before = 0;
+    for round in 0..6 {
+        if round == 2 {
+            before = ALLOCATIONS.load(Ordering::Relaxed);
+        }
+        let outputs = [
+            Output::Units { pixels: &mut units, unit_m: 0.0005 },
+            Output::Metres(&mut metres),
+            Output::Inverse(&mut inverse),
+        ];
+        let mut i = 0;
+        let mut jobs = outputs.map(|out| {
+            let (width, height) = sizes[i];
+            let job = Job {
+                color: Color {
+                    pixels: &color[i],
+                    format: ColorFormat::Rgb8,
+                    width,
+                    height,
+                    stride: 3 * width,
+                },
+                depth: RawDepth { pixels: &depth[i], unit_m: 0.001 },
+                out,
+                steps: StepTimes::default(),
+            };
+            i += 1;
+            job
+        });
+        refiner.refine(&mut jobs).unwrap();
+    }
+    let allocated = ALLOCATIONS.load(Ordering::Relaxed) - before;
+    assert_eq!(allocated, 0);
+    assert!(before > 0 && units.iter().all(|d| *d == 3000) && metres.iter().all(|d| *d == 1.5));
+    assert!(inverse.iter().all(|d| (d - 1.0 / 1.5).abs() < 1e-7));
+}
