@@ -9,7 +9,7 @@ use depthrig_bus::HostTime;
 
 /// Sizes of pictures, and of the network's input, that tables are kept for: more than a rig has.
 const PREPS: usize = 16;
-const POSITIONS: usize = 4;
+const POSITIONS: usize = 8;
 
 /// A camera depth model: any [`Network`] with the official code's pre- and post-processing around it.
 ///
