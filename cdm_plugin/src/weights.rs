@@ -1,8 +1,9 @@
 //! Named tensors in a file, mapped into memory: a `.safetensors` file or a PyTorch checkpoint.
 
-use crate::{Error, ErrorKind, Result};
+use crate::{Error, ErrorKind, Result, durable};
 use core::ops::Range;
 use memmap2::Mmap;
+use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -17,6 +18,9 @@ mod write;
 
 pub use seeded::write_seeded;
 pub use verify::{Extra, Misshaped, Missing, NotFinite, Report, examine, verify, verify_names};
+pub(crate) use write::copy;
+#[cfg(test)]
+pub(crate) use write::{Planned, write};
 
 /// How the numbers of a tensor are stored, little-endian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -147,6 +151,11 @@ impl Weights {
     /// The bytes of a tensor as they lie in the file; they may begin at any address.
     pub fn bytes(&self, name: &str) -> Option<&[u8]> {
         self.map.get(self.entries.get(name)?.bytes.clone())
+    }
+
+    /// SHA-256 of the whole file, in hexadecimal; reads all of it.
+    pub fn sha256(&self) -> String {
+        durable::hex(&Sha256::digest(&self.map))
     }
 
     /// The numbers of a tensor as 32-bit floats, whatever they are stored as.

@@ -5,6 +5,7 @@ use crate::exit::Exit;
 use anyhow::Result;
 
 pub mod seeded;
+pub mod store;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
@@ -13,19 +14,36 @@ docs/cdm.md tells the way from a downloaded checkpoint to a policy that reads re
 Exit codes: 0 good, 1 failed, 2 wrong usage or configuration.
 
 Examples:
+  depthrig cdm import cdm_d435.ckpt
+  depthrig cdm list
   depthrig cdm seeded vits --out untrained-vits.safetensors";
 
 /// What to do.
 #[derive(Debug, clap::Subcommand)]
 pub enum CdmCommand {
+    /// Install a checkpoint, all of which is verified
+    #[command(after_help = store::IMPORT_EXAMPLES)]
+    Import(store::ImportArgs),
+    /// List the installed models, or the published ones
+    #[command(after_help = store::LIST_EXAMPLES)]
+    List(store::ListArgs),
+    /// Say where a model came from and what it wants
+    #[command(after_help = store::INFO_EXAMPLES)]
+    Info(store::InfoArgs),
+    /// Remove an installed model; who uses it keeps it until they let go
+    Remove(store::RemoveArgs),
     /// Write a model of random numbers, for demonstrations and tests: what it gives is no depth
     #[command(after_help = seeded::EXAMPLES)]
     Seeded(seeded::SeededArgs),
 }
 
 /// Runs the subcommand.
-pub fn run(command: &CdmCommand, _context: &Context) -> Result<Exit> {
+pub fn run(command: &CdmCommand, context: &Context) -> Result<Exit> {
     match command {
+        CdmCommand::Import(args) => store::import(args, context),
+        CdmCommand::List(args) => store::list(args),
+        CdmCommand::Info(args) => store::info(args),
+        CdmCommand::Remove(args) => store::remove(args),
         CdmCommand::Seeded(args) => seeded::run(args),
     }
 }
