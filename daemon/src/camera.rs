@@ -12,6 +12,7 @@
 
 use crate::config::{BackendConfig, CameraConfig, SupervisorConfig};
 use crate::sink::BusSink;
+use crate::stage::{self, Entrance, Lane};
 use crate::status::CameraState;
 use crate::stream::Stream;
 use crate::wake::Wake;
@@ -51,6 +52,10 @@ pub struct State {
     pub info: Option<DeviceInfo>,
     /// Its streams, once it was open; they stay the same over reconnects.
     pub streams: Vec<Arc<Stream>>,
+    /// Those that are made of them.
+    pub made: Vec<Arc<Stream>>,
+    /// How they are made.
+    pub lane: Option<Arc<Lane>>,
     /// Bytes of one frame of every stream, once it was open.
     pub set_bytes: u64,
     /// Shared memory is too small for it.
@@ -69,6 +74,8 @@ impl Camera {
             error: None,
             info: None,
             streams: Vec::new(),
+            made: Vec::new(),
+            lane: None,
             set_bytes: 0,
             short_of_memory: false,
             reconnects: 0,
@@ -83,6 +90,11 @@ impl Camera {
 }
 
 impl State {
+    /// Its streams and those that are made of them.
+    pub fn all_streams(&self) -> impl Iterator<Item = &Arc<Stream>> {
+        self.streams.iter().chain(&self.made)
+    }
+
     fn enter(&mut self, camera: &str, state: CameraState, message: Option<String>) {
         if self.phase == state && self.message == message {
             return;
@@ -113,6 +125,8 @@ pub struct Shared {
     pub began: HostTime,
     /// Supervision settings.
     pub supervisor: SupervisorConfig,
+    /// Where depth is refined.
+    pub stage: Arc<Entrance>,
 }
 
 /// A camera's driver, made at the first opening and kept for the later ones.
@@ -390,7 +404,42 @@ fn open_session(
         })?;
         ports.push((s, publisher, header));
     }
+    open_lane(camera, shared, &info).map_err(|e| {
+        in_camera(depthrig_drivers::Error::new(DriverErrorKind::Io, e.to_string()).with_source(e))
+    })?;
     Ok(Session { info, stream, sink: Box::new(BusSink::new(ports, Arc::clone(&shared.frames))) })
+}
+
+/// Opens the way from the camera's streams to those that are made of them, at its first opening. All of it is there
+/// before the first frame, so that no publisher waits for a subscriber that is half made.
+fn open_lane(camera: &Camera, shared: &Shared, info: &DeviceInfo) -> Result<()> {
+    let Some(config) = &camera.config.refine else { return Ok(()) };
+    let (streams, made, begun) = {
+        let state = camera.state();
+        (state.streams.clone(), state.made.clone(), state.lane.is_some())
+    };
+    let find = |name: &str| streams.iter().find(|s| s.id.stream.as_str() == name);
+    let (Some(color), Some(depth)) = (find("color"), find("depth")) else { return Ok(()) };
+    let [refined, aligned @ ..] = made.as_slice() else { return Ok(()) };
+    if begun {
+        return Ok(());
+    }
+    for stream in &made {
+        publisher_of(shared, stream)?;
+    }
+    let readers = (shared.bus.subscriber(&color.id)?, shared.bus.subscriber(&depth.id)?);
+    let color_ns = color.profile.period_ns() as i64;
+    let lane = Arc::new(Lane::new(
+        (camera.config.name.clone(), info.model.clone()),
+        config.clone(),
+        (Arc::clone(refined), aligned.first().cloned()),
+        (color_ns, depth.profile.period_ns() as i64),
+        color_ns / 2 + 1_000_000,
+        readers,
+    ));
+    camera.state().lane = Some(Arc::clone(&lane));
+    shared.stage.enter(lane);
+    Ok(())
 }
 
 /// The driver of a camera; `began` is the beginning of time for simulated ones.
@@ -436,17 +485,22 @@ fn adopt(
     let mut state = camera.state();
     state.info = Some(info.clone());
     if state.streams.is_empty() {
-        state.set_bytes = profiles.iter().map(|p| p.frame_bytes() as u64).sum();
+        let made = stage::profiles(&camera.config, profiles).map_err(|e| {
+            depthrig_drivers::Error::new(DriverErrorKind::BadInput, e.to_string()).with_source(e)
+        })?;
+        let all = profiles.iter().chain(made.iter().map(|(p, _)| p));
+        state.set_bytes = all.map(|p| p.frame_bytes() as u64).sum();
         let slots = shm::slots_that_fit(shared.slots, state.set_bytes, shared.memory_share);
         state.short_of_memory = slots.is_err();
         let slots = slots.map_err(|e| {
             depthrig_drivers::Error::new(DriverErrorKind::Unsupported, e.to_string()).with_source(e)
         })?;
-        let stream = |p: &StreamProfile| {
+        let stream = |p: &StreamProfile, record: bool| {
             let id = StreamId { camera: camera.config.name.clone(), stream: p.stream.clone() };
-            Arc::new(Stream::new(id, p.clone(), camera.config.records(&p.stream), slots))
+            Arc::new(Stream::new(id, p.clone(), record, slots))
         };
-        state.streams = profiles.iter().map(stream).collect();
+        state.streams = profiles.iter().map(|p| stream(p, camera.config.records(&p.stream))).collect();
+        state.made = made.iter().map(|(p, record)| stream(p, *record)).collect();
     } else if state.streams.len() != profiles.len()
         || state.streams.iter().zip(profiles).any(|(s, p)| !same_mode(&s.profile, p))
     {

@@ -10,6 +10,7 @@ mod error;
 mod l515;
 mod read;
 mod realsense;
+mod refine;
 mod rig;
 mod synthetic;
 #[cfg(test)]
@@ -17,6 +18,7 @@ mod tests;
 mod v4l2;
 mod zed;
 
+pub use depthrig_cdm::Precision;
 pub use depthrig_drivers::files::FilesConfig as FilesSettings;
 pub use depthrig_drivers::realsense::RealsenseConfig as RealsenseSettings;
 pub use depthrig_drivers::realsense::l515::L515Config as L515Settings;
@@ -26,7 +28,7 @@ pub use depthrig_drivers::zed::ZedConfig as ZedSettings;
 pub use depthrig_recorder::{ColorCodec, DepthCodec};
 pub use error::{ConfigError, Problem};
 
-use depthrig_bus::{CameraName, Pose, RigName, StreamName};
+use depthrig_bus::{CameraName, PixelFormat, Pose, RigName, StreamName};
 use depthrig_drivers::StreamRequest;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -56,6 +58,8 @@ pub struct RigConfig {
     pub control: ControlConfig,
     /// Supervision of the cameras.
     pub supervisor: SupervisorConfig,
+    /// What refines depth.
+    pub cdm: CdmConfig,
     /// The cameras in the order of the file; at least one, names unique.
     pub cameras: Vec<CameraConfig>,
     /// The file's text.
@@ -150,8 +154,97 @@ pub struct CameraConfig {
     pub streams: Vec<StreamRequest>,
     /// Streams to record; `None`: all.
     pub record: Option<Vec<StreamName>>,
+    /// How its depth is refined; `None`: not at all.
+    pub refine: Option<RefineConfig>,
     /// Its driver and what that needs.
     pub backend: BackendConfig,
+}
+
+/// What refines the depth of the rig's cameras: settings that they share.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CdmConfig {
+    /// CPU threads of all refiners together; 0: all cores but one.
+    pub threads: usize,
+    /// The library of ONNX Runtime; `None`: looked for.
+    pub library: Option<PathBuf>,
+    /// Folder of the installed models; `None`: this user's.
+    pub models: Option<PathBuf>,
+    /// A refiner that needs longer than this for a picture, and than ten times what it ever needed, hangs, seconds.
+    pub hang_s: f64,
+}
+
+/// How a camera's depth is refined.
+#[derive(Debug, Clone, PartialEq)]
+#[allow(clippy::struct_excessive_bools)] // each is a choice of its own
+pub struct RefineConfig {
+    /// What runs.
+    pub engine: EngineChoice,
+    /// The model; `None`: the one for this camera, if it is installed.
+    pub model: Option<RefineModel>,
+    /// Pairs of pictures a second at most; 0: every one.
+    pub rate_hz: f64,
+    /// Shorter side of the network's input, pixels; `None`: what the model was trained for.
+    pub input_size: Option<u32>,
+    /// Precision of the network.
+    pub precision: Precision,
+    /// What it runs on: `cpu`, `cuda:0`, `tensorrt:0`, `openvino`.
+    pub device: String,
+    /// `Z16` in the unit of the camera's depth, or `DepthF32`.
+    pub format: PixelFormat,
+    /// Whether refined depth is recorded.
+    pub record: bool,
+    /// Whether depth in the view of colour is published as well, as it was before it was refined.
+    pub align: bool,
+    /// The camera gives depth in the view of colour, whatever calibration says or does not say.
+    pub is_aligned: bool,
+}
+
+/// What refines depth.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum EngineChoice {
+    /// A model for this camera if one is installed and the library is there, else [`Self::Fill`].
+    #[default]
+    Auto,
+    /// Hole filling guided by colour; needs no model.
+    Fill,
+    /// ONNX Runtime.
+    OnnxRuntime,
+    /// The network in pure Rust.
+    Candle,
+    /// Nothing: the stream is there and silent.
+    Off,
+}
+
+/// Which model.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum RefineModel {
+    /// An installed one, by name.
+    Installed(String),
+    /// A checkpoint; absolute.
+    File(PathBuf),
+}
+
+impl Default for CdmConfig {
+    fn default() -> Self {
+        Self { threads: 0, library: None, models: None, hang_s: 10.0 }
+    }
+}
+
+impl Default for RefineConfig {
+    fn default() -> Self {
+        Self {
+            engine: EngineChoice::Auto,
+            model: None,
+            rate_hz: 5.0,
+            input_size: None,
+            precision: Precision::Fp32,
+            device: "cpu".to_owned(),
+            format: PixelFormat::Z16,
+            record: false,
+            align: false,
+            is_aligned: false,
+        }
+    }
 }
 
 impl CameraConfig {

@@ -20,6 +20,7 @@ pub mod replay;
 pub mod rig;
 pub mod sets;
 mod sink;
+pub mod stage;
 pub mod status;
 mod stream;
 mod wake;

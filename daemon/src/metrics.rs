@@ -9,7 +9,8 @@ mod family;
 mod tests;
 
 use crate::status::{
-    CameraState, ClockStatus, RecordingStatus, RigStatus, SetAccount, SetStatus, StreamStatus,
+    CameraState, ClockStatus, RecordingStatus, RefineState, RefineStatus, RigStatus, SetAccount, SetStatus,
+    StreamStatus,
 };
 use depthrig_bus::DropReason;
 use family::{Families, Labels, Unit};
@@ -24,6 +25,9 @@ pub fn render(status: &RigStatus) -> String {
     daemon(&mut f, status);
     for camera in &status.cameras {
         cameras(&mut f, camera);
+        if let Some(refine) = &camera.refine {
+            refined(&mut f, &Labels::new(&[("camera", &camera.name)]), refine);
+        }
         for stream in &camera.streams {
             let name = stream.id.split_once('/').map_or(stream.id.as_str(), |(_, name)| name);
             let labels = Labels::new(&[("camera", &camera.name), ("stream", name)]);
@@ -93,6 +97,34 @@ fn cameras(f: &mut Families, c: &crate::status::CameraStatus) {
     let labels = labels.with("firmware", &c.firmware);
     f.gauge("camera_info", "Always 1; what the camera is.", Unit::None, &labels, 1.0);
 }
+
+fn refined(f: &mut Families, labels: &Labels, r: &RefineStatus) {
+    for state in RefineState::ALL {
+        let labels = labels.with("state", state.name());
+        let help = "1 for the state that the refining of the camera's depth is in.";
+        f.gauge("refine_state", help, Unit::None, &labels, flag(r.state == state));
+    }
+    let info = labels.with("engine", &r.engine).with("model", &r.model);
+    f.gauge("refine_info", "Always 1; what refines the camera's depth.", Unit::None, &info, 1.0);
+    f.declare_counter("refine_skipped", SKIPPED, Unit::None);
+    for skip in crate::stage::Skip::ALL {
+        let n = r.skipped.get(skip.name()).copied().unwrap_or(0);
+        f.counter("refine_skipped", SKIPPED, Unit::None, &labels.with("reason", skip.name()), n);
+    }
+    let help = "Depth frames beyond the rate asked for.";
+    f.counter("refine_not_due", help, Unit::None, labels, r.not_due);
+    let help = "Times the refining came back after it had failed.";
+    f.counter("refine_restarts", help, Unit::None, labels, r.restarts);
+    for (quantile, steps) in [("0.5", &r.steps_p50_ms), ("0.99", &r.steps_p99_ms)] {
+        for (step, ms) in steps {
+            let labels = labels.with("step", step).with("quantile", quantile);
+            let help = "How long a step of refining took, over the last frames.";
+            f.gauge("refine_step", help, Unit::Seconds, &labels, ms / 1e3);
+        }
+    }
+}
+
+const SKIPPED: &str = "Pairs of pictures that were due and not refined, by reason.";
 
 fn frames(f: &mut Families, labels: &Labels, s: &StreamStatus) {
     f.counter(

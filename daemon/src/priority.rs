@@ -24,6 +24,17 @@ pub fn raise_current_thread() {
     }
 }
 
+/// What the kernel gives threads that refine depth: less than to any camera's or subscriber's, more than to reports.
+const REFINE_NICE: i32 = 10;
+
+/// Puts the calling thread, and what threads it makes from now on, below all others that somebody waits for.
+pub fn lower_current_thread() {
+    // Of this thread alone on Linux; refused it is merely as urgent as others.
+    if let Err(e) = rustix::process::nice(REFINE_NICE) {
+        tracing::debug!(error = %e, "a thread that refines depth keeps its priority");
+    }
+}
+
 /// Why a thread of this process gets no real-time priority; `None` when it does. Tried on a thread of its own.
 pub fn refusal() -> Option<String> {
     let tried = std::thread::Builder::new().name("priority".into()).spawn(raise);

@@ -24,7 +24,9 @@ mod timeline;
 mod transport;
 
 use crate::api::{self, ServerHandle};
-use crate::config::{BusConfig, ControlConfig, RecordingConfig, RigConfig, SetsConfig, SupervisorConfig};
+use crate::config::{
+    BusConfig, CdmConfig, ControlConfig, RecordingConfig, RigConfig, SetsConfig, SupervisorConfig,
+};
 use crate::control::Control;
 use crate::house::House;
 use crate::recording::{Outside, Recording, Reports};
@@ -283,6 +285,7 @@ fn recording_config(sources: &mut Sources) -> RigConfig {
         recording,
         control: ControlConfig { tcp: None },
         supervisor: SupervisorConfig::default(),
+        cdm: CdmConfig::default(),
         cameras: Vec::new(),
         text: sources.session().rig_config.clone(),
         path: None,

@@ -3,12 +3,14 @@
 //! ```text
 //! supervisor thread ── steps every camera's state machine
 //! camera threads    ── driver → gate → slot on the bus
+//! stage thread      ── bus → pairs of colour and depth → refine threads → bus
 //! set thread        ── bus → frame sets → bus, recorder
 //! house thread      ── once a second: dead subscribers, accounts into the file, CPU; ends a recording that is due
 //! API thread        ── HTTP on the rig's socket
 //! ```
 
 mod assembly;
+mod join;
 pub(crate) mod report;
 
 use crate::api::{self, ServerHandle};
@@ -18,6 +20,7 @@ use crate::control::{Control, RecordRequest};
 use crate::house::House;
 use crate::recording::{self, Begun, Outside, Recording, Reports, StreamFacts, recover_left};
 use crate::sets::SpreadStats;
+use crate::stage::{Entrance, Installed, Refiners, Stage};
 use crate::status::{CameraState, RecordingStatus, RigStatus, SetAccount};
 use crate::wake::Wake;
 use crate::{Error, ErrorKind, Result, priority};
@@ -29,7 +32,7 @@ use depthrig_recorder::UtcSource;
 use depthrig_recorder::fs::{Fs, RealFs};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
@@ -62,6 +65,9 @@ pub struct RigOptions {
     pub utc: UtcSource,
     /// Encoded bytes that may wait for the disk before sets are refused; the recorder's own limit when `None`.
     pub backlog_max_bytes: Option<u64>,
+    /// Where what refines depth comes from; tests put something that fails or hangs here. The engines and models of this
+    /// computer when `None`.
+    pub refiners: Option<Arc<dyn Refiners>>,
 }
 
 impl RigOptions {
@@ -75,6 +81,7 @@ impl RigOptions {
             fs: Arc::new(RealFs),
             utc: Arc::new(UtcPair::sample),
             backlog_max_bytes: None,
+            refiners: None,
         }
     }
 }
@@ -116,6 +123,10 @@ pub struct Inner {
     spreads: Mutex<SpreadStats>,
     set_accounts: Mutex<SetAccounts>,
     cpu_millicores: AtomicU64,
+    /// A recording is about to end: sets made from now on are not part of it.
+    closing: AtomicBool,
+    /// Sets that wait for refined depth.
+    held_sets: AtomicUsize,
 }
 
 /// The set assembler's numbers, as `status` shows them.
@@ -145,12 +156,16 @@ impl Rig {
         let bus = Bus::open(&options.runtime, &config.rig)?;
         bus.clean_dead();
         prepare(&mut config, options)?;
+        let entrance = Arc::new(Entrance::default());
+        let refiners = options.refiners.clone();
+        let refiners = refiners.unwrap_or_else(|| Arc::new(Installed::new(config.cdm.clone())));
         let shared = Arc::new(Shared {
             memory_share: shm::free_bytes(shm::SHM_DIR.as_ref())? / config.cameras.len().max(1) as u64,
             slots: config.bus.slots,
             began: HostTime::now(),
             supervisor: config.supervisor.clone(),
-            frames: Arc::default(),
+            frames: Arc::new(Wake::with(Arc::clone(&entrance.bell))),
+            stage: entrance,
             bus,
         });
         let inner = Arc::new(Inner {
@@ -172,11 +187,19 @@ impl Rig {
             spreads: Mutex::default(),
             set_accounts: Mutex::default(),
             cpu_millicores: AtomicU64::new(0),
+            closing: AtomicBool::new(false),
+            held_sets: AtomicUsize::new(0),
         });
         let assembly = Assembly::new(Arc::clone(&inner))?;
         let mut rig = Self { threads: Vec::new(), api: None, inner, _lock: lock };
         let inner = Arc::clone(&rig.inner);
         rig.spawn("supervisor", move |stop| supervise(&inner, stop))?;
+        if rig.inner.config.cameras.iter().any(|c| c.refine.is_some()) {
+            let (config, shared) = (&rig.inner.config, &rig.inner.shared);
+            let (entrance, frames) = (Arc::clone(&shared.stage), Arc::clone(&shared.frames));
+            let stage = Stage::new(entrance, refiners, config.cdm.clone(), frames, config.sets.rate_hz);
+            rig.spawn("stage", move |stop| stage.run(stop))?;
+        }
         rig.spawn("sets", move |stop| assembly.run(stop))?;
         let inner = Arc::clone(&rig.inner);
         rig.spawn("house", move |stop| keep_house(&inner, stop))?;
@@ -315,6 +338,15 @@ impl Inner {
         lock(&self.set_accounts)
     }
 
+    /// Waits until the sets that wait for refined depth are with the recorder.
+    fn finish_held(&self) {
+        self.closing.store(true, Ordering::Relaxed);
+        let deadline = HostTime::now().plus(join::PATIENCE);
+        while self.held_sets.load(Ordering::Relaxed) > 0 && !deadline.from_now().is_zero() {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
     fn all_done(&self) -> bool {
         self.cameras.iter().all(|c| matches!(c.state().phase, CameraState::Finished | CameraState::Failed))
     }
@@ -324,7 +356,7 @@ impl Inner {
         for camera in &self.cameras {
             let state = camera.state();
             let Some(info) = &state.info else { continue };
-            facts.extend(state.streams.iter().map(|stream| StreamFacts {
+            facts.extend(state.all_streams().map(|stream| StreamFacts {
                 stream: Arc::clone(stream),
                 model: info.model.clone(),
                 serial: info.serial.clone(),
@@ -355,7 +387,10 @@ impl Control for Inner {
     }
 
     fn record_stop(&self) -> Result<RecordingStatus> {
-        let status = recording::stop(&self.recording)?;
+        self.finish_held();
+        let stopped = recording::stop(&self.recording);
+        self.closing.store(false, Ordering::Relaxed);
+        let status = stopped?;
         self.reports.begin(PathBuf::from(&status.path));
         Ok(status)
     }

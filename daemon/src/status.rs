@@ -142,8 +142,71 @@ pub struct CameraStatus {
     pub message: Option<String>,
     /// Times it was lost and came back.
     pub reconnects: u64,
-    /// Its streams.
+    /// Its streams; those that are made of them come last.
     pub streams: Vec<StreamStatus>,
+    /// How its depth is refined; `None` when that is not asked for.
+    #[serde(default)]
+    pub refine: Option<RefineStatus>,
+}
+
+/// Where the refining of a camera's depth stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[non_exhaustive]
+pub enum RefineState {
+    /// The engine is being made ready.
+    Starting,
+    /// Pairs of pictures are refined as they come.
+    Running,
+    /// It does not go (the message says why); the engine is tried again with growing pauses.
+    Failed,
+    /// Switched off.
+    Off,
+}
+
+impl RefineState {
+    /// Every state.
+    pub const ALL: [Self; 4] = [Self::Starting, Self::Running, Self::Failed, Self::Off];
+
+    /// The name used in reports, metrics and JSON.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Starting => "starting",
+            Self::Running => "running",
+            Self::Failed => "failed",
+            Self::Off => "off",
+        }
+    }
+}
+
+/// How a camera's depth is refined. The accounts are those of the stream `depth_refined`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RefineStatus {
+    /// Where it stands.
+    pub state: RefineState,
+    /// How long it has been in this state, seconds.
+    pub state_for_s: f64,
+    /// Why it does not run, or what of it is not as asked for.
+    pub message: Option<String>,
+    /// What runs, such as `fill` or `onnxruntime 1.31.1 cpu fp32`; empty before anything did.
+    pub engine: String,
+    /// The model; empty when the engine needs none.
+    pub model: String,
+    /// Rate asked for, Hz.
+    pub nominal_hz: f64,
+    /// Rate over the last seconds, Hz.
+    pub rate_hz: f64,
+    /// Pairs of pictures that were due and not refined, by reason: `busy`, `no_color`, `unfit`, `engine`, `hung`,
+    /// `no_slot`; reasons that never were are left out.
+    pub skipped: BTreeMap<String, u64>,
+    /// Depth frames beyond the rate asked for.
+    pub not_due: u64,
+    /// Times it came back after it had failed.
+    pub restarts: u64,
+    /// How long each step took, median over the last frames, milliseconds.
+    pub steps_p50_ms: BTreeMap<String, f64>,
+    /// 99th percentile.
+    pub steps_p99_ms: BTreeMap<String, f64>,
 }
 
 /// One stream. `captured = delivered + Σ dropped`.
@@ -151,6 +214,9 @@ pub struct CameraStatus {
 pub struct StreamStatus {
     /// `camera/stream`.
     pub id: String,
+    /// Whether it is made of other streams of the camera; captured are then the pairs of pictures that were due.
+    #[serde(default)]
+    pub derived: bool,
     /// Pixel format.
     pub format: String,
     /// Pixels per row.

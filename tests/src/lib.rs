@@ -9,7 +9,7 @@ use depthrig_daemon::config::RigConfig;
 use depthrig_daemon::rig::{Rig, RigOptions};
 use depthrig_daemon::status::{CameraState, CameraStatus, RigStatus};
 use std::fmt::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// A folder that a test's rigs live in; removed at the end.
@@ -85,6 +85,23 @@ impl RigText {
         self
     }
 
+    /// Adds a camera of the pictures that `manifest` names, with `extra` lines of TOML in its table.
+    pub fn files(mut self, name: &str, manifest: &Path, extra: &str) -> Self {
+        let manifest = manifest.display();
+        write!(
+            self.0,
+            "[[camera]]\nname = \"{name}\"\nbackend = \"files\"\nmanifest = \"{manifest}\"\nloop = true\n{extra}\n"
+        )
+        .unwrap();
+        self
+    }
+
+    /// Adds lines to the end of the text.
+    pub fn and(mut self, more: &str) -> Self {
+        self.0.push_str(more);
+        self
+    }
+
     /// Adds a fault to the camera added last.
     pub fn fault(mut self, kind: &str, at_s: f64, more: &str) -> Self {
         write!(self.0, "[[camera.fault]]\nkind = \"{kind}\"\nat_s = {at_s:?}\n{more}\n").unwrap();
@@ -95,6 +112,28 @@ impl RigText {
     pub fn text(&self) -> &str {
         &self.0
     }
+}
+
+/// Writes the pictures of a camera without any calibration into `dir`: colour and depth of these sizes, the first row of
+/// depth without any, the second saturated. Returns its manifest.
+pub fn uncalibrated_camera(dir: &Path, color: (u32, u32), depth: (u32, u32)) -> PathBuf {
+    for i in 0..4u8 {
+        let picture = image::RgbImage::from_fn(color.0, color.1, |x, y| image::Rgb([x as u8, y as u8, i]));
+        picture.save(dir.join(format!("color_{i}.png"))).unwrap();
+        let picture = image::ImageBuffer::<image::Luma<u16>, _>::from_fn(depth.0, depth.1, |x, y| {
+            image::Luma([match y {
+                0 => 0,
+                1 => u16::MAX,
+                _ => 500 + x as u16,
+            }])
+        });
+        picture.save(dir.join(format!("depth_{i}.png"))).unwrap();
+    }
+    let manifest = dir.join("camera.toml");
+    let text = "model = \"test\"\nrate_hz = 30.0\n[[stream]]\nname = \"color\"\nfiles = \"color_*.png\"\n\
+         [[stream]]\nname = \"depth\"\nfiles = \"depth_*.png\"\ndepth_unit_m = 0.001\n";
+    std::fs::write(&manifest, text).unwrap();
+    manifest
 }
 
 /// Waits until `done` says so; panics with the last status after 20 s.

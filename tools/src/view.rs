@@ -2,7 +2,7 @@
 
 use crate::out;
 use depthrig_daemon::status::{
-    CameraState, CameraStatus, RecordingStatus, ReplayStatus, RigStatus, StreamStatus,
+    CameraState, CameraStatus, RecordingStatus, RefineState, ReplayStatus, RigStatus, StreamStatus,
 };
 use std::collections::BTreeMap;
 
@@ -63,6 +63,7 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
     lines.push(String::new());
     lines.extend(streams(rig, style));
     lines.extend(poor_metadata(rig));
+    lines.extend(rig.cameras.iter().filter_map(|c| refined(c, style)));
     let troubles: Vec<_> = rig.cameras.iter().filter_map(|c| trouble(c, style)).collect();
     if !troubles.is_empty() {
         lines.push(String::new());
@@ -173,11 +174,45 @@ fn poor_metadata(rig: &RigStatus) -> Option<String> {
     (!told.is_empty()).then(|| format!("metadata  {}", told.join("; ")))
 }
 
+/// How a camera's depth is refined, in one line.
+fn refined(camera: &CameraStatus, style: Style) -> Option<String> {
+    let r = camera.refine.as_ref()?;
+    let color = match r.state {
+        RefineState::Failed => Some(RED),
+        RefineState::Running => None,
+        _ => Some(YELLOW),
+    };
+    let state = color.map_or_else(|| r.state.name().to_owned(), |color| style.paint(color, r.state.name()));
+    let mut told = format!("refined   {}: {state}", camera.name);
+    if !r.engine.is_empty() {
+        told += &format!(", {}", r.engine);
+    }
+    if !r.model.is_empty() {
+        told += &format!(" with {}", r.model);
+    }
+    if r.state == RefineState::Running {
+        told += &format!(", {:.1} of {:.1} Hz", r.rate_hz, r.nominal_hz);
+        let step = |name: &str| r.steps_p50_ms.get(name).copied().unwrap_or(0.0);
+        let steps = ["wait", "register", "prepare", "infer", "finish"].map(|s| format!("{s} {:.1}", step(s)));
+        told += &format!(", {:.1} ms ({})", step("total"), steps.join(", "));
+    }
+    if !r.skipped.is_empty() {
+        told += &format!(", skipped {}", out::reasons(&r.skipped));
+    }
+    if let Some(why) = &r.message {
+        told += &format!(": {why}");
+    }
+    Some(told)
+}
+
 fn narrow(camera: &CameraStatus, stream: &StreamStatus) -> Vec<String> {
     let lost: u64 = stream.dropped.values().sum();
     vec![
         stream.id.clone(),
-        camera.state.name().to_owned(),
+        match &camera.refine {
+            Some(refine) if stream.derived => refine.state.name().to_owned(),
+            _ => camera.state.name().to_owned(),
+        },
         format!("{}x{}", stream.width, stream.height),
         format!("{:.1}", stream.rate_hz),
         lost.to_string(),
@@ -201,7 +236,7 @@ fn trouble(camera: &CameraStatus, style: Style) -> Option<String> {
     if camera.reconnects > 0 {
         told.push(format!("came back {} times", camera.reconnects));
     }
-    for stream in camera.streams.iter().filter(|s| s.dropped.values().any(|n| *n > 0)) {
+    for stream in camera.streams.iter().filter(|s| !s.derived && s.dropped.values().any(|n| *n > 0)) {
         told.push(format!("{} lost {}", stream.id, out::reasons(&stream.dropped)));
     }
     (!told.is_empty()).then(|| format!("{}: {}", camera.name, told.join("; ")))

@@ -105,6 +105,7 @@ pub(crate) fn rig_with(port: &str) -> RigStatus {
         state_for_s: 1.0,
         message: None,
         reconnects: 0,
+        refine: None,
         streams: Vec::new(),
     };
     RigStatus {

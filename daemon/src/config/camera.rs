@@ -2,7 +2,7 @@
 
 use super::read::{Found, Section};
 use super::rig::{not_empty, rate, resolve};
-use super::{BackendConfig, CameraConfig, FilesSettings, l515, realsense, synthetic, v4l2, zed};
+use super::{BackendConfig, CameraConfig, FilesSettings, l515, realsense, refine, synthetic, v4l2, zed};
 use depthrig_bus::{CameraName, Name, PixelFormat, Pose, StreamName};
 use depthrig_drivers::StreamRequest;
 use std::path::{Path, PathBuf};
@@ -45,7 +45,8 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
     let pose = pose(&s);
     let wanted = streams(&s);
     let streams: Vec<_> = wanted.iter().map(|w| w.request.clone()).collect();
-    let record = record(&s, &streams);
+    let refine = refine::read(&s, base, &wanted);
+    let record = record(&s, &streams, refine.is_some());
     let backend = match driver {
         Some(Driver::Synthetic) => {
             let name = name.as_ref().map_or("", |n| n.value.as_str());
@@ -66,7 +67,7 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         Some(BackendConfig::L515(_)) if streams.is_empty() => l515::default_streams(),
         _ => streams,
     };
-    Some(CameraConfig { name: name?.value, pose, streams, record, backend: backend? })
+    Some(CameraConfig { name: name?.value, pose, streams, record, refine, backend: backend? })
 }
 
 /// The highest rate among the camera's streams, as far as the file says.
@@ -163,9 +164,15 @@ fn streams(camera: &Section<'_, '_>) -> Vec<WantedStream> {
     wanted
 }
 
-fn record(camera: &Section<'_, '_>, streams: &[StreamRequest]) -> Option<Vec<StreamName>> {
+fn record(camera: &Section<'_, '_>, streams: &[StreamRequest], refined: bool) -> Option<Vec<StreamName>> {
     let Found { value, at } = camera.get::<Vec<Name>>("record")?;
-    let unknown = value.iter().find(|r| !streams.is_empty() && streams.iter().all(|s| s.stream != **r));
+    let made = |r: &Name| refine::MADE.contains(&r.as_str());
+    if let Some(name) = value.iter().find(|r| made(r) && !refined) {
+        let why = format!("names \"{name}\", which only a camera with {} has", refine::TABLE);
+        camera.problem(at, format!("{} {why}", camera.key_of("record")));
+    }
+    let unknown =
+        value.iter().find(|r| !streams.is_empty() && !made(r) && streams.iter().all(|s| s.stream != **r));
     if let Some(name) = unknown {
         let why = format!("names \"{name}\", which is not among the streams of its [[camera.stream]] tables");
         camera.problem(at, format!("{} {why}", camera.key_of("record")));

@@ -3,7 +3,7 @@
 use super::read::{FromToml, Report, Section};
 use super::{
     BusConfig, ColorCodec, ConfigError, ControlConfig, DepthCodec, MAX_CAMERAS, MAX_RATE_HZ, Phase,
-    RecordingConfig, RigConfig, SetsConfig, SupervisorConfig, camera,
+    RecordingConfig, RigConfig, SetsConfig, SupervisorConfig, camera, refine,
 };
 use core::fmt::Display;
 use core::ops::RangeInclusive;
@@ -43,13 +43,14 @@ pub(super) fn read(report: &Report<'_>, text: &str, path: Option<&Path>) -> Opti
     let recording = recording(&top, &base);
     let control = control(&top);
     let supervisor = supervisor(&top);
+    let cdm = refine::cdm(&top, &base);
     let cameras = cameras(&top, &base);
     check_set_rate(&top, &sets, &cameras);
     top.finish();
     let text = text.to_owned();
     let path = path.map(Path::to_owned);
     let cameras = cameras.into_iter().collect::<Option<Vec<_>>>()?;
-    Some(RigConfig { rig: rig?.value, bus, sets, recording, control, supervisor, cameras, text, path })
+    Some(RigConfig { rig: rig?.value, bus, sets, recording, control, supervisor, cdm, cameras, text, path })
 }
 
 fn bus(top: &Section<'_, '_>) -> BusConfig {
@@ -153,6 +154,9 @@ fn check_set_rate(top: &Section<'_, '_>, sets: &SetsConfig, cameras: &[Option<su
         top.problem(at, format!("{} {why}; lower it", s.key_of("rate_hz")));
     }
 }
+
+/// The highest rate of refined depth that can be asked for, Hz; 0 asks for all that the camera gives.
+pub(super) const MAX_REFINE_HZ: f64 = MAX_RATE_HZ;
 
 /// A rate that a camera or the sets may have.
 pub(super) fn rate(hz: f64) -> Result<(), String> {

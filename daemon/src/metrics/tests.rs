@@ -5,9 +5,28 @@ use crate::status::CameraStatus;
 use crate::status::SharedMemoryStatus;
 use std::collections::BTreeSet;
 
+fn refine() -> RefineStatus {
+    let steps = |ms: f64| [("infer", ms), ("register", ms / 10.0)].map(|(s, ms)| (s.to_owned(), ms)).into();
+    RefineStatus {
+        state: RefineState::Running,
+        state_for_s: 4.0,
+        message: None,
+        engine: "onnxruntime 1.31.1 cpu fp32".into(),
+        model: "cdm-d435@1f2e3d4c".into(),
+        nominal_hz: 5.0,
+        rate_hz: 4.5,
+        skipped: [("busy".to_owned(), 3)].into(),
+        not_due: 77,
+        restarts: 1,
+        steps_p50_ms: steps(200.0),
+        steps_p99_ms: steps(300.0),
+    }
+}
+
 fn rig() -> RigStatus {
     let stream = |id: &str, dropped: &[(&str, u64)]| StreamStatus {
         id: id.into(),
+        derived: id.ends_with("_refined"),
         format: "z16".into(),
         width: 1280,
         height: 720,
@@ -52,6 +71,7 @@ fn rig() -> RigStatus {
         state_for_s: 3.5,
         message: None,
         reconnects: 1,
+        refine: (name == "d435").then(refine),
         streams,
     };
     RigStatus {
@@ -67,6 +87,7 @@ fn rig() -> RigStatus {
                 vec![
                     stream("d435/color", &[]),
                     stream("d435/depth", &[("no_slot", 2), ("of_a_later_version", 1)]),
+                    stream("d435/depth_refined", &[("queue_full", 3)]),
                 ],
             ),
             camera("d405", CameraState::Reconnecting, vec![]),

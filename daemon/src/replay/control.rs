@@ -122,6 +122,7 @@ impl Inner {
                 message: status.paused.then(|| format!("paused at {:.3} s", status.position_s)),
                 reconnects: 0,
                 streams: vec![told],
+                refine: None,
             });
         }
         cameras

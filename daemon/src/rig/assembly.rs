@@ -3,6 +3,7 @@
 //! It is a subscriber like any other, so that nothing it does can hold up a camera.
 
 use super::Inner;
+use super::join::{Held, Joints};
 use crate::camera::Camera;
 use crate::config::Phase;
 use crate::sets::{Assembler, AssemblerConfig, FrameSet, PhasePolicy};
@@ -36,6 +37,8 @@ pub struct Assembly {
     inputs: Vec<Input>,
     assembler: Option<Assembler<Frame>>,
     publisher: SetPublisher,
+    /// Streams that are made of others join the sets that are recorded.
+    joints: Joints,
     next_id: u64,
     incomplete: u64,
 }
@@ -47,7 +50,8 @@ impl Assembly {
     /// Those of opening the channel of sets.
     pub fn new(inner: Arc<Inner>) -> crate::Result<Self> {
         let publisher = inner.shared.bus.set_publisher()?;
-        Ok(Self { inner, inputs: Vec::new(), assembler: None, publisher, next_id: 1, incomplete: 0 })
+        let joints = Joints::new(&inner.config);
+        Ok(Self { inner, inputs: Vec::new(), assembler: None, publisher, joints, next_id: 1, incomplete: 0 })
     }
 
     /// Runs until the rig stops.
@@ -58,13 +62,16 @@ impl Assembly {
             let sleep = deadline.map_or(IDLE, |d| d.from_now().min(IDLE)).max(Duration::from_millis(1));
             self.inner.shared.frames.wait(sleep);
             self.read_frames();
+            self.joints.read();
             // While the cameras are being stopped, sets would miss those that ended first.
             if !self.inner.ending.load(Ordering::Relaxed) {
                 self.send_sets();
             }
+            self.joints.release(&self.inner);
         }
         // Frames that were on their way when the cameras stopped still count.
         self.read_frames();
+        self.joints.read();
         self.report();
     }
 
@@ -87,6 +94,7 @@ impl Assembly {
                 });
                 found = true;
             }
+            self.joints.find(camera, &state);
         }
         if found {
             self.rebuild();
@@ -177,9 +185,17 @@ impl Assembly {
             tracing::error!(set = id, error = %e, "a frame set could not be sent");
         }
         self.inner.spreads().add(set.spread_ns);
+        self.inner.shared.stage.tick(set.tick);
         let frames =
             self.inputs.iter().zip(set.members).map(|(i, m)| (Arc::clone(&i.stream), m.map(|m| m.item)));
-        self.inner.recording().offer(id, set.tick, frames);
+        let closing = self.inner.closing.load(Ordering::Relaxed);
+        if self.joints.are_awaited() && self.inner.recording().is_active() {
+            if !closing {
+                self.joints.hold(Held::new(id, set.tick, frames.collect()));
+            }
+        } else {
+            self.inner.recording().offer(id, set.tick, frames);
+        }
     }
 
     /// Puts the accounts where `status` finds them.
@@ -193,6 +209,7 @@ impl Assembly {
             sum.missed = input.before.unwrap_or(0) + input.subscriber.missed();
             accounts.streams.insert(input.stream.id.clone(), sum);
         }
+        accounts.streams.extend(self.joints.accounts());
     }
 }
 

@@ -2,9 +2,10 @@
 
 use super::{Inner, lock};
 use crate::camera::Camera;
+use crate::stage;
 use crate::status::{
-    CameraState, CameraStatus, ClockStatus, RigStatus, SetAccount, SetStatus, SharedMemoryStatus,
-    StreamStatus,
+    CameraState, CameraStatus, ClockStatus, RefineState, RigStatus, SetAccount, SetStatus,
+    SharedMemoryStatus, StreamStatus,
 };
 use crate::stream::Stream;
 use depthrig_bus::{ClockDomain, HostTime, UtcPair, shm};
@@ -16,7 +17,7 @@ pub fn status(inner: &Inner) -> RigStatus {
     let now = HostTime::now();
     let cameras: Vec<_> = inner.cameras.iter().map(|c| camera(inner, c, now)).collect();
     let reserved = |c: &Camera| -> u64 {
-        c.state().streams.iter().map(|s| (s.slots * s.profile.frame_bytes()) as u64).sum()
+        c.state().all_streams().map(|s| (s.slots * s.profile.frame_bytes()) as u64).sum()
     };
     let slots = inner.cameras.iter().filter_map(|c| c.state().streams.iter().map(|s| s.slots).min()).min();
     RigStatus {
@@ -69,9 +70,9 @@ fn camera(inner: &Inner, camera: &Camera, now: HostTime) -> CameraStatus {
         state_for_s: state.since.elapsed().as_secs_f64(),
         message: state.message.clone(),
         reconnects: state.reconnects,
+        refine: state.lane.as_ref().map(|lane| lane.status()),
         streams: state
-            .streams
-            .iter()
+            .all_streams()
             .map(|s| stream(s, accounts.streams.get(&s.id).copied().unwrap_or_default(), now))
             .collect(),
     }
@@ -85,6 +86,7 @@ pub fn stream(stream: &Stream, in_sets: SetAccount, now: HostTime) -> StreamStat
     let us = |ns: i64| ns as f64 / 1e3;
     StreamStatus {
         id: stream.id.to_string(),
+        derived: stage::is_derived(stream),
         format: p.format.name().to_owned(),
         width: p.width,
         height: p.height,
@@ -151,6 +153,14 @@ fn diagnose(rig: &str, camera: &CameraStatus) -> Diagnostic {
         value("clock_uncertainty_us", format!("{:.1}", s.clock.uncertainty_us));
         value("clock_residual_p99_us", format!("{:.1}", s.clock.residual_p99_us));
     }
+    if let Some(refine) = &camera.refine {
+        values.push(("refine.state".to_owned(), refine.state.name().to_owned()));
+        values.push(("refine.engine".to_owned(), refine.engine.clone()));
+        values.push(("refine.model".to_owned(), refine.model.clone()));
+        values.extend(refine.message.iter().map(|m| ("refine.message".to_owned(), m.clone())));
+        let steps = refine.steps_p50_ms.iter();
+        values.extend(steps.map(|(step, ms)| (format!("refine.{step}_p50_ms"), format!("{ms:.3}"))));
+    }
     Diagnostic {
         level: match camera.state {
             CameraState::Streaming => Level::Ok,
@@ -172,7 +182,12 @@ pub fn lost(status: &RigStatus) -> Vec<String> {
             let why = camera.message.as_deref().unwrap_or("no reason known");
             lost.push(format!("camera {} failed: {why}", camera.name));
         }
-        for s in camera.streams.iter().filter(|s| !s.dropped.is_empty()) {
+        if let Some(refine) = camera.refine.as_ref().filter(|r| r.state == RefineState::Failed) {
+            let why = refine.message.as_deref().unwrap_or("no reason known");
+            lost.push(format!("camera {}: no refined depth: {why}", camera.name));
+        }
+        // A pair that gave way to a newer one is no loss: that is how the stage keeps up.
+        for s in camera.streams.iter().filter(|s| !s.derived && !s.dropped.is_empty()) {
             let reasons: Vec<_> = s.dropped.iter().map(|(r, n)| format!("{n} {r}")).collect();
             lost.push(format!(
                 "{}: {} of {} frames ({})",

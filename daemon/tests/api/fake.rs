@@ -2,14 +2,32 @@
 
 use depthrig_daemon::control::{Control, RecordRequest, ReplayControl, SeekRequest};
 use depthrig_daemon::status::{
-    CameraState, CameraStatus, ClockStatus, RecordingStatus, ReplayStatus, RigStatus, SetAccount, SetStatus,
-    SharedMemoryStatus, StreamStatus,
+    CameraState, CameraStatus, ClockStatus, RecordingStatus, RefineState, RefineStatus, ReplayStatus,
+    RigStatus, SetAccount, SetStatus, SharedMemoryStatus, StreamStatus,
 };
 use depthrig_daemon::{Error, ErrorKind, Result};
 use std::sync::{Condvar, Mutex};
 use std::time::Duration;
 
 pub const CONFIG: &str = "rig = \"mount\" # \u{e4}\n";
+
+fn refine() -> RefineStatus {
+    let steps = || [("infer".to_owned(), 20.5)].into();
+    RefineStatus {
+        state: RefineState::Failed,
+        state_for_s: 4.0,
+        message: Some("no memory".into()),
+        engine: "fill".into(),
+        model: String::new(),
+        nominal_hz: 5.0,
+        rate_hz: 4.5,
+        skipped: [("busy".to_owned(), 3)].into(),
+        not_due: 77,
+        restarts: 1,
+        steps_p50_ms: steps(),
+        steps_p99_ms: steps(),
+    }
+}
 
 #[derive(Default)]
 pub struct Fake {
@@ -103,6 +121,7 @@ impl Fake {
             state_for_s: 1.5,
             message: message.map(str::to_owned),
             reconnects: 2,
+            refine: (name == "d435").then(refine),
             streams: vec![
                 stream(&format!("{name}/depth"), Some(3.25)),
                 stream(&format!("{name}/color"), None),
@@ -130,6 +149,7 @@ impl Fake {
 fn stream(id: &str, age: Option<f64>) -> StreamStatus {
     StreamStatus {
         id: id.into(),
+        derived: false,
         format: "z16".into(),
         width: 1280,
         height: 720,

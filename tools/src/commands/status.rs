@@ -7,11 +7,11 @@ use crate::view::{self, Style};
 use crate::{out, screen};
 use anyhow::Result;
 use core::time::Duration;
-use depthrig_daemon::status::{CameraState, RigStatus};
+use depthrig_daemon::status::{CameraState, CameraStatus, RefineState, RigStatus};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Exit code 3 when a camera is not streaming or the recording has lost anything.
+Exit code 3 when a camera is not streaming, its depth is to be refined and is not, or the recording has lost anything.
 
 Examples:
   depthrig status
@@ -53,5 +53,10 @@ fn exit(rig: &RigStatus) -> Exit {
     let fine = |state| matches!(state, CameraState::Streaming | CameraState::Finished | CameraState::Opening);
     let lost =
         rig.recording.as_ref().is_some_and(|r| r.error.is_some() || r.dropped.values().any(|n| *n > 0));
-    if lost || !rig.cameras.iter().all(|c| fine(c.state)) { Exit::Lost } else { Exit::Good }
+    let refined = |c: &CameraStatus| c.refine.as_ref().is_none_or(|r| r.state != RefineState::Failed);
+    if lost || !rig.cameras.iter().all(refined) || !rig.cameras.iter().all(|c| fine(c.state)) {
+        Exit::Lost
+    } else {
+        Exit::Good
+    }
 }

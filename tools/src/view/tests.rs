@@ -6,6 +6,7 @@ use depthrig_daemon::status::{ClockStatus, SetAccount, SetStatus, SharedMemorySt
 fn stream(id: &str, lost: u64) -> StreamStatus {
     StreamStatus {
         id: id.into(),
+        derived: false,
         format: "z16".into(),
         width: 1280,
         height: 720,
@@ -41,6 +42,7 @@ fn camera(name: &str, state: CameraState, message: Option<&str>, lost: u64) -> C
         state_for_s: 2.5,
         message: message.map(Into::into),
         reconnects: 0,
+        refine: None,
         streams: vec![stream(&format!("{name}/depth"), lost)],
     }
 }

@@ -1,0 +1,246 @@
+//! Refined depth in recordings: frames that are made of others join the set that their source is in.
+//!
+//! A refined frame is later than its set by what refining takes. The set goes out on the channel of sets without waiting.
+//! On its way to the recorder it waits until the refined frame of each camera that records one is there or is known not
+//! to come, in the order of the sets, and for a few sets at most: its other frames keep their slots meanwhile, and a
+//! subscriber may hold sixteen. What comes later than that is missing from its set (`depthrig cdm relabel` adds it
+//! afterwards); the live stream has it.
+//!
+//! Which refined frame belongs to a set goes by capture time, which is that of its depth frame: the one made of the set's
+//! own depth frame, or one less than half a refined period away from it.
+
+use super::Inner;
+use crate::camera::{Camera, State};
+use crate::config::RigConfig;
+use crate::status::{RefineState, SetAccount};
+use crate::stream::Stream;
+use core::time::Duration;
+use depthrig_bus::{Frame, HostTime, StreamId, Subscriber};
+use depthrig_recorder::RecorderOptions;
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+/// How long the end of a recording waits for sets that wait; longer than any set does.
+pub const PATIENCE: Duration = Duration::from_secs(2);
+/// Frames of one stream that a subscriber may hold, less one to read with.
+const MAX_HELD: usize = 15;
+/// Frames that the assembler holds.
+const ASSEMBLING: usize = 3;
+/// Sets that wait at most, however few the recorder holds.
+const MAX_SETS: usize = 4;
+/// Refined frames that wait for their set.
+const MAX_WAITING: usize = 4;
+/// A refined frame this much of its period away from a set's depth is that set's.
+const NEAR: f64 = 0.45;
+
+/// A set that waits.
+pub struct Held {
+    id: u64,
+    tick: HostTime,
+    since: HostTime,
+    frames: Vec<(Arc<Stream>, Option<Frame>)>,
+}
+
+impl Held {
+    /// A set with its frames.
+    pub fn new(id: u64, tick: HostTime, frames: Vec<(Arc<Stream>, Option<Frame>)>) -> Self {
+        Self { id, tick, since: HostTime::now(), frames }
+    }
+
+    /// Where in time the refined frame of `depth` is to lie.
+    fn moment_of(&self, depth: &StreamId) -> i64 {
+        let frame = self.frames.iter().find(|(s, _)| s.id == *depth).and_then(|(_, f)| f.as_ref());
+        frame.map_or(self.tick.ns(), |f| f.header().capture_time_ns)
+    }
+}
+
+/// A stream that joins.
+struct Joint {
+    stream: Arc<Stream>,
+    camera: Arc<Camera>,
+    depth: StreamId,
+    near_ns: i64,
+    subscriber: Subscriber,
+    waiting: VecDeque<Frame>,
+    account: SetAccount,
+    before: Option<u64>,
+}
+
+/// What there is for a set.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Found {
+    /// The frame at this place is it.
+    At(usize),
+    /// It is still to come.
+    Coming,
+    /// It will not come.
+    Never,
+}
+
+/// The streams that join sets, and the sets that wait for them.
+pub struct Joints {
+    joints: Vec<Joint>,
+    held: VecDeque<Held>,
+    max_sets: usize,
+    max_age: Duration,
+}
+
+impl Joints {
+    /// None yet; `config` bounds how many sets may wait.
+    pub fn new(config: &RigConfig) -> Self {
+        let workers = match config.recording.workers {
+            0 => RecorderOptions::default().workers,
+            n => n,
+        };
+        let taken = ASSEMBLING + config.recording.queue_sets + workers;
+        let max_sets = MAX_HELD.saturating_sub(taken).clamp(1, MAX_SETS);
+        let max_age = Duration::from_secs_f64(max_sets as f64 / config.sets.rate_hz).min(PATIENCE / 2);
+        Self { joints: Vec::new(), held: VecDeque::new(), max_sets, max_age }
+    }
+
+    /// Takes in the streams that `camera` makes, once they are there.
+    pub fn find(&mut self, camera: &Arc<Camera>, state: &State) {
+        for stream in &state.made {
+            let Some(subscriber) = stream.books().reader.take() else { continue };
+            let Some(depth) = state.streams.iter().find(|s| s.id.stream.as_str() == "depth") else {
+                continue;
+            };
+            self.joints.push(Joint {
+                near_ns: (stream.profile.period_ns() as f64 * NEAR) as i64,
+                stream: Arc::clone(stream),
+                camera: Arc::clone(camera),
+                depth: depth.id.clone(),
+                subscriber,
+                waiting: VecDeque::with_capacity(MAX_WAITING + 1),
+                account: SetAccount::default(),
+                before: None,
+            });
+        }
+    }
+
+    /// Whether any of them is recorded.
+    pub fn are_awaited(&self) -> bool {
+        self.joints.iter().any(|j| j.stream.record)
+    }
+
+    /// Reads what came.
+    pub fn read(&mut self) {
+        self.joints.iter_mut().for_each(Joint::read);
+    }
+
+    /// Lets a set wait.
+    pub fn hold(&mut self, set: Held) {
+        self.held.push_back(set);
+    }
+
+    /// Hands on the sets that wait no longer, in their order.
+    pub fn release(&mut self, inner: &Inner) {
+        let recording = inner.recording().is_active();
+        while let Some(first) = self.held.front() {
+            let waiting = self.joints.iter().filter(|j| j.stream.record);
+            let decided = waiting.map(|j| j.find(first)).all(|f| f != Found::Coming);
+            let due = self.held.len() > self.max_sets || first.since.elapsed() > self.max_age;
+            if recording && !decided && !due {
+                break;
+            }
+            let Some(Held { id, tick, since, mut frames }) = self.held.pop_front() else { break };
+            let set = Held { id, tick, since, frames: Vec::new() };
+            for joint in self.joints.iter_mut().filter(|j| j.stream.record) {
+                let moment = frames.iter().find(|(s, _)| s.id == joint.depth).and_then(|(_, f)| f.as_ref());
+                let moment = moment.map_or(set.tick.ns(), |f| f.header().capture_time_ns);
+                let frame = joint.take(moment);
+                frames.push((Arc::clone(&joint.stream), frame));
+            }
+            inner.recording().offer(set.id, set.tick, frames.into_iter());
+        }
+        if self.held.is_empty() {
+            // Nothing waits, so that all but the newest frames are too old for any set to come.
+            let idle = !recording || !self.are_awaited();
+            self.joints.iter_mut().for_each(|j| j.keep(if idle { 0 } else { MAX_WAITING }));
+        }
+        inner.held_sets.store(self.held.len(), Ordering::Relaxed);
+    }
+
+    /// What became of the frames of each stream.
+    pub fn accounts(&self) -> impl Iterator<Item = (StreamId, SetAccount)> + '_ {
+        self.joints.iter().map(|j| {
+            let missed = j.before.unwrap_or(0) + j.subscriber.missed();
+            let pending = j.waiting.len() as u64;
+            (j.stream.id.clone(), SetAccount { missed, pending, ..j.account })
+        })
+    }
+}
+
+impl Joint {
+    fn read(&mut self) {
+        while let Ok(Some(frame)) = self.subscriber.try_next() {
+            self.before.get_or_insert(frame.header().sequence - 1);
+            self.waiting.push_back(frame);
+            self.keep(MAX_WAITING);
+        }
+    }
+
+    /// Lets go of the oldest frames until no more than `most` are left.
+    fn keep(&mut self, most: usize) {
+        while self.waiting.len() > most {
+            self.waiting.pop_front();
+            self.account.decimated += 1;
+        }
+    }
+
+    fn find(&self, set: &Held) -> Found {
+        let stamps = self.waiting.iter().map(|f| f.header().capture_time_ns);
+        let runs = || {
+            let state = self.camera.state();
+            state.lane.as_ref().is_some_and(|lane| lane.state() == RefineState::Running)
+        };
+        match nearest(stamps, set.moment_of(&self.depth), self.near_ns) {
+            Found::Coming if !runs() => Found::Never,
+            found => found,
+        }
+    }
+
+    /// The frame of the set whose depth is of `moment`; older ones are let go.
+    fn take(&mut self, moment: i64) -> Option<Frame> {
+        let stamps = self.waiting.iter().map(|f| f.header().capture_time_ns);
+        let Found::At(i) = nearest(stamps, moment, self.near_ns) else { return None };
+        self.account.decimated += i as u64;
+        self.account.used += 1;
+        self.waiting.drain(..i);
+        self.waiting.pop_front()
+    }
+}
+
+/// Which of the frames with these rising `stamps` is the one for `moment`.
+fn nearest(stamps: impl Iterator<Item = i64>, moment: i64, near_ns: i64) -> Found {
+    let mut later = false;
+    let mut best = None;
+    for (i, stamp) in stamps.enumerate() {
+        let apart = (stamp - moment).abs();
+        if apart <= near_ns && best.is_none_or(|(_, least)| apart < least) {
+            best = Some((i, apart));
+        }
+        later |= stamp > moment;
+    }
+    match best {
+        Some((i, _)) => Found::At(i),
+        None if later => Found::Never,
+        None => Found::Coming,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_set_takes_its_own_refined_frame_waits_for_it_and_knows_when_it_will_not_come() {
+        let find = |stamps: &[i64], moment| nearest(stamps.iter().copied(), moment, 90);
+        assert_eq!(find(&[], 1000), Found::Coming);
+        assert_eq!(find(&[800], 1000), Found::Coming, "of the set before");
+        assert_eq!(find(&[800, 1000, 1200], 1000), Found::At(1));
+        assert_eq!(find(&[967], 1000), Found::At(0), "of the depth frame beside it");
+        assert_eq!(find(&[800, 1200], 1000), Found::Never, "a later one has come");
+    }
+}

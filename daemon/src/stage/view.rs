@@ -1,0 +1,141 @@
+//! Depth in the view of colour: tables made once, and again when what a camera says of itself changes.
+
+use super::pixels;
+use crate::config::RefineConfig;
+use depthrig_bus::{FrameHeader, Intrinsics, Pose};
+use depthrig_calib::{Method, PoseExt, Registration, same_view};
+
+/// Where colour has this many times the pixels of depth along a side, rectangles would leave gaps and triangles do not.
+const TRIANGLES_FROM: f64 = 1.3;
+
+/// What registration depends on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Key {
+    depth: Side,
+    color: Side,
+}
+
+/// One camera of the two.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Side {
+    intrinsics: Intrinsics,
+    pose: Pose,
+    size: (u32, u32),
+    format: u32,
+}
+
+impl Side {
+    const fn of(h: &FrameHeader) -> Self {
+        Self { intrinsics: h.intrinsics, pose: h.pose, size: (h.width, h.height), format: h.format }
+    }
+}
+
+/// How depth comes into the view of colour.
+#[derive(Debug)]
+enum How {
+    /// It is there.
+    AsItIs,
+    /// It is registered.
+    Registered(Box<Registration>),
+    /// It cannot be, and why.
+    Not(String),
+}
+
+/// How the depth of one camera comes into the view of its colour.
+#[derive(Debug, Default)]
+pub struct View {
+    made: Option<(Key, How)>,
+    /// Where registered depth is put.
+    registered: Vec<u16>,
+    /// Where depth is put that does not lie as it is wanted.
+    packed: Vec<u16>,
+}
+
+impl View {
+    /// Depth in the view of colour and its unit in metres, or why there is none. `config` says whether it is there
+    /// already, `color` and `depth` are the headers.
+    pub fn depth<'a>(
+        &'a mut self,
+        config: &RefineConfig,
+        color: &FrameHeader,
+        depth: &FrameHeader,
+        depth_pixels: &'a [u8],
+    ) -> Result<(&'a [u16], f64), String> {
+        let key = Key { depth: Side::of(depth), color: Side::of(color) };
+        if self.made.as_ref().is_none_or(|(old, _)| *old != key) {
+            let how = pixels::unfit(color, depth).map_or_else(|| how(config, &key), How::Not);
+            self.made = Some((key, how));
+        }
+        let (raw, unit_m) =
+            pixels::depth(depth, depth_pixels, &mut self.packed).map_err(|e| e.to_string())?;
+        match &mut self.made {
+            Some((_, How::Registered(registration))) => {
+                let pixels = color.width as usize * color.height as usize;
+                self.registered.resize(pixels, 0);
+                registration.depth_to_color(raw, unit_m, &mut self.registered).map_err(|e| e.to_string())?;
+                Ok((&self.registered, unit_m))
+            }
+            Some((_, How::Not(why))) => Err(why.clone()),
+            _ => Ok((raw, unit_m)),
+        }
+    }
+
+    /// What the last [`Self::depth`] that succeeded gave, unless it lies in the frame that it was asked of.
+    pub fn last<'a>(&'a self, depth: &FrameHeader, depth_pixels: &'a [u8]) -> Option<&'a [u16]> {
+        match &self.made {
+            Some((_, How::Registered(_))) => Some(&self.registered),
+            Some((_, How::AsItIs)) => pixels::in_place(depth, depth_pixels).or(Some(&self.packed)),
+            _ => None,
+        }
+    }
+}
+
+fn how(config: &RefineConfig, key: &Key) -> How {
+    let Key { depth, color } = key;
+    let sizes = || {
+        let ((dw, dh), (cw, ch)) = (depth.size, color.size);
+        format!("depth is {dw}x{dh} and colour {cw}x{ch}")
+    };
+    if config.is_aligned {
+        return if depth.size == color.size {
+            How::AsItIs
+        } else {
+            How::Not(format!("is_aligned says that depth is in the view of colour, but {}", sizes()))
+        };
+    }
+    let none = match (depth.intrinsics.is_known(), color.intrinsics.is_known()) {
+        (true, true) => None,
+        (false, true) => Some("depth has no calibration"),
+        (true, false) => Some("colour has no calibration"),
+        (false, false) => Some("neither has a calibration"),
+    };
+    if let Some(none) = none {
+        let hint = if depth.size == color.size {
+            "; if the camera gives depth in the view of colour, write is_aligned = true into [camera.refine]"
+        } else {
+            ""
+        };
+        return How::Not(format!(
+            "{} and {none}, so that depth cannot be put into the view of colour; give the camera its calibration{hint}",
+            sizes()
+        ));
+    }
+    if same_view((&depth.intrinsics, depth.size, &depth.pose), (&color.intrinsics, color.size, &color.pose)) {
+        return How::AsItIs;
+    }
+    let color_from_depth = color.pose.inverse().compose(&depth.pose);
+    let magnified = color.intrinsics.fx / depth.intrinsics.fx;
+    let method = if magnified > TRIANGLES_FROM { Method::Triangles } else { Method::Splat };
+    let made = Registration::new(
+        &depth.intrinsics,
+        depth.size,
+        &color.intrinsics,
+        color.size,
+        &color_from_depth,
+        method,
+    );
+    match made {
+        Ok(registration) => How::Registered(Box::new(registration)),
+        Err(e) => How::Not(e.to_string()),
+    }
+}

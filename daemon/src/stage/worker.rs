@@ -1,0 +1,379 @@
+//! The thread of one refiner: takes the newest pairs of its cameras in turn, refines them, publishes what comes out.
+//!
+//! Nothing is allocated per frame once every camera has had one: scratch memory is kept, and pixels are written where
+//! subscribers read them.
+
+use super::lane::{Lane, Pair, Skip};
+use super::pixels;
+use super::view::View;
+use crate::stream::Stream;
+use crate::wake::Wake;
+use core::time::Duration;
+use depthrig_bus::{FrameFlags, FrameHeader, FrameMut, HostTime, PixelFormat, Publisher, StageStep};
+use depthrig_cdm::{Color, Error, ErrorKind, Job, Output, RawDepth, Refiner, StepTimes};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// How long an idle worker sleeps at most.
+const IDLE: Duration = Duration::from_millis(100);
+/// Pairs of one batch at most.
+pub const MAX_BATCH: usize = 8;
+/// Flags of the source frames that hold for what is made of them, too.
+const INHERITED: u32 = FrameFlags::REPLAYED
+    .with(FrameFlags::SYNTHETIC)
+    .with(FrameFlags::TIME_UNCERTAIN)
+    .with(FrameFlags::CLOCK_WARMUP)
+    .0;
+
+/// What a worker shares with the thread that supervises it. Each worker has its own, so that one that was given up can
+/// do no harm.
+#[derive(Debug, Default)]
+pub struct Shared {
+    /// Rung when a pair or a lane is there.
+    pub bell: Wake,
+    /// Ends the worker after the work in hand.
+    pub stop: AtomicBool,
+    /// The refiner is ready.
+    pub open: AtomicBool,
+    /// The cameras; the worker takes in those that are new.
+    pub lanes: Mutex<Vec<Arc<Lane>>>,
+    /// When the work in hand began, nanoseconds of the host clock; 0 when there is none.
+    pub busy_since: AtomicI64,
+    /// The longest that work on a batch has taken, nanoseconds; 0 before the first was done.
+    pub slowest_ns: AtomicU64,
+}
+
+impl Shared {
+    fn begin(&self) {
+        self.busy_since.store(HostTime::now().ns().max(1), Ordering::Relaxed);
+    }
+
+    fn end(&self) {
+        let since = self.busy_since.swap(0, Ordering::Relaxed);
+        let took = HostTime::now().ns().saturating_sub(since).max(1) as u64;
+        self.slowest_ns.fetch_max(took, Ordering::Relaxed);
+    }
+}
+
+/// One camera at the worker.
+struct Seat {
+    lane: Arc<Lane>,
+    view: View,
+    session: u64,
+    aligned_session: u64,
+    /// The clock map of the last frame that was published.
+    epoch: Option<u32>,
+}
+
+/// A pair in work.
+struct InWork {
+    seat: usize,
+    pair: Pair,
+    out: FrameMut,
+    publisher: Arc<Publisher>,
+    unit_m: f64,
+    began: HostTime,
+    register_ns: u64,
+}
+
+/// The worker.
+pub struct Worker {
+    shared: Arc<Shared>,
+    refiner: Box<dyn Refiner>,
+    /// What of it is not as asked for.
+    note: Option<String>,
+    /// Rung after each frame: the set thread's.
+    frames: Arc<Wake>,
+    batch: usize,
+    seats: Vec<Seat>,
+    /// The seat whose turn is next.
+    turn: usize,
+    work: Vec<InWork>,
+    steps: Vec<StepTimes>,
+    /// Empty; kept for its memory.
+    jobs: Vec<Job<'static>>,
+}
+
+impl Worker {
+    /// A worker of `refiner`, of which `note` says what is not as asked for.
+    pub fn new(
+        shared: Arc<Shared>,
+        refiner: Box<dyn Refiner>,
+        note: Option<String>,
+        frames: Arc<Wake>,
+    ) -> Self {
+        let batch = refiner.best_batch().clamp(1, MAX_BATCH);
+        Self {
+            shared,
+            refiner,
+            note,
+            frames,
+            batch,
+            seats: Vec::new(),
+            turn: 0,
+            work: Vec::with_capacity(batch),
+            steps: Vec::with_capacity(batch),
+            jobs: Vec::with_capacity(batch),
+        }
+    }
+
+    /// Works until it is stopped or the refiner fails.
+    ///
+    /// # Errors
+    /// The refiner's.
+    pub fn run(mut self) -> Result<(), Error> {
+        while !self.shared.stop.load(Ordering::Relaxed) {
+            self.take_seats();
+            self.shared.begin();
+            self.collect();
+            if self.work.is_empty() {
+                self.shared.busy_since.store(0, Ordering::Relaxed);
+                self.shared.bell.wait(IDLE);
+                continue;
+            }
+            let done = self.refine();
+            self.publish(done.is_ok());
+            self.shared.end();
+            done?;
+        }
+        Ok(())
+    }
+
+    fn take_seats(&mut self) {
+        let lanes = self.shared.lanes.lock().unwrap_or_else(PoisonError::into_inner);
+        for lane in lanes.iter().skip(self.seats.len()) {
+            let description = self.refiner.describe();
+            lane.runs(&description.engine, &description.model, self.note.as_deref());
+            let session = lane.refined.books().begin_session();
+            let aligned_session = lane.aligned.as_ref().map_or(0, |s| s.books().begin_session());
+            let view = View::default();
+            self.seats.push(Seat { lane: Arc::clone(lane), view, session, aligned_session, epoch: None });
+        }
+    }
+
+    /// Takes pairs, one of each camera at most, beginning with the one whose turn it is.
+    fn collect(&mut self) {
+        let seats = self.seats.len();
+        for i in 0..seats {
+            if self.work.len() == self.batch {
+                break;
+            }
+            let at = (self.turn + i) % seats;
+            let seat = &mut self.seats[at];
+            let Some(pair) = seat.lane.take() else { continue };
+            match seat.prepare(at, pair) {
+                Ok(work) => self.work.push(work),
+                Err(why) => seat.finished(Some(why)),
+            }
+        }
+        // Whoever was served last comes last.
+        if let Some(last) = self.work.last() {
+            self.turn = (last.seat + 1) % seats.max(1);
+        }
+    }
+
+    fn refine(&mut self) -> Result<(), Error> {
+        let Self { refiner, seats, work, steps, jobs, .. } = self;
+        let mut list: Vec<Job<'_>> = recycle(core::mem::take(jobs));
+        for w in work.iter_mut() {
+            list.push(w.job(&seats[w.seat])?);
+        }
+        let done = refiner.refine(&mut list);
+        steps.clear();
+        steps.extend(list.iter().map(|j| j.steps));
+        *jobs = recycle(list);
+        done
+    }
+
+    fn publish(&mut self, good: bool) {
+        let description = self.refiner.describe();
+        for (i, work) in self.work.drain(..).enumerate() {
+            let seat = &mut self.seats[work.seat];
+            let steps = self.steps.get(i).copied().unwrap_or_default();
+            let skipped = if good {
+                seat.publish(work, steps, &description.engine, &description.model).err().flatten()
+            } else {
+                Some(Skip::Engine)
+            };
+            seat.finished(skipped);
+        }
+        self.frames.raise();
+    }
+}
+
+/// The memory of an emptied list for another list; the compiler reuses it in place.
+fn recycle<'b>(mut list: Vec<Job<'_>>) -> Vec<Job<'b>> {
+    list.clear();
+    list.into_iter().filter_map(|_| None).collect()
+}
+
+impl InWork {
+    fn job<'a>(&'a mut self, seat: &'a Seat) -> Result<Job<'a>, Error> {
+        let bad = |what: String| Error::new(ErrorKind::BadInput, what);
+        let (color, depth) = (&self.pair.color, &self.pair.depth);
+        let color: Color<'_> =
+            pixels::color(color.header(), color.pixels()).map_err(|e| bad(e.to_string()))?;
+        let registered = seat.view.last(depth.header(), depth.pixels());
+        let registered = registered.ok_or_else(|| bad("depth is not in the view of colour".to_owned()))?;
+        let out = self.out.pixels_mut();
+        let unaligned = |_| bad("a slot of shared memory is not aligned".to_owned());
+        let out = if seat.lane.config.format == PixelFormat::DepthF32 {
+            Output::Metres(bytemuck::try_cast_slice_mut(out).map_err(unaligned)?)
+        } else {
+            let pixels = bytemuck::try_cast_slice_mut(out).map_err(unaligned)?;
+            Output::Units { pixels, unit_m: self.unit_m }
+        };
+        let depth = RawDepth { pixels: registered, unit_m: self.unit_m };
+        Ok(Job { color, depth, out, steps: StepTimes::default() })
+    }
+}
+
+impl Seat {
+    /// Puts depth into the view of colour and gets the memory for the result.
+    fn prepare(&mut self, at: usize, pair: Pair) -> Result<InWork, Skip> {
+        let began = HostTime::now();
+        let (color, depth) = (*pair.color.header(), *pair.depth.header());
+        let profile = &self.lane.refined.profile;
+        let seen = if (profile.width, profile.height) == (color.width, color.height) {
+            self.view.depth(&self.lane.config, &color, &depth, pair.depth.pixels())
+        } else {
+            Err(format!("colour became {}x{}; restart the daemon", color.width, color.height))
+        };
+        let (registered, unit_m) = match seen {
+            Ok(seen) => seen,
+            Err(why) => {
+                self.lane.obstacle(Some(&why));
+                return Err(Skip::Unfit);
+            }
+        };
+        self.lane.obstacle(None);
+        let register_ns = began.elapsed().as_nanos() as u64;
+        if let Some(stream) = &self.lane.aligned {
+            let steps = [began.since_ns(pair.ready).max(0) as u64, register_ns, 0, 0, 0, 0];
+            let header = derived(&pair, PixelFormat::Z16, unit_m, steps, self.epoch);
+            let publisher = stream.books().publisher.clone();
+            let loan = publisher.and_then(|p| Some((p.loan(registered.len() * 2).ok()?, p)));
+            let sent = loan.ok_or(Some(Skip::NoSlot)).and_then(|(mut out, publisher)| {
+                out.pixels_mut().copy_from_slice(bytemuck::cast_slice(registered));
+                publish_on(stream, self.aligned_session, &publisher, out, header, pair.ready)
+            });
+            if let Err(Some(why)) = sent {
+                let mut books = stream.books();
+                books.captured += 1;
+                books.dropped.add(why.reason(), 1);
+            }
+        }
+        let publisher = self.lane.refined.books().publisher.clone().ok_or(Skip::NoSlot)?;
+        let out = publisher.loan(self.lane.refined.profile.frame_bytes()).map_err(|e| {
+            tracing::debug!(stream = %self.lane.refined.id, error = %e, "no slot");
+            Skip::NoSlot
+        })?;
+        Ok(InWork { seat: at, pair, out, publisher, unit_m, began, register_ns })
+    }
+
+    /// Publishes what was made of a pair; why it was not, if that is still to be counted.
+    fn publish(
+        &mut self,
+        work: InWork,
+        steps: StepTimes,
+        engine: &str,
+        model: &str,
+    ) -> Result<(), Option<Skip>> {
+        let InWork { pair, out, publisher, unit_m, began, register_ns, .. } = work;
+        let wait_ns = began.since_ns(pair.ready).max(0) as u64;
+        let steps = [wait_ns, register_ns, steps.prepare_ns, steps.infer_ns, steps.finish_ns, 0];
+        let format = self.lane.refined.profile.format;
+        let unit_m = if format == PixelFormat::DepthF32 { 1.0 } else { unit_m };
+        let mut header = derived(&pair, format, unit_m, steps, self.epoch);
+        header.set_refiner(engine, model);
+        let total = publish_on(&self.lane.refined, self.session, &publisher, out, header, pair.ready)?;
+        self.epoch = Some(header.clock_epoch);
+        let [wait, register, prepare, infer, finish, _] = steps;
+        self.lane.measured([wait, register, prepare, infer, finish, total]);
+        Ok(())
+    }
+
+    /// A pair has met its fate; `skipped` says why it was not refined.
+    fn finished(&self, skipped: Option<Skip>) {
+        // Of a worker that was given up everything is counted already.
+        if self.lane.refined.books().session != self.session {
+            return;
+        }
+        self.lane.finished();
+        if let Some(why) = skipped {
+            self.lane.skip(why);
+        }
+    }
+}
+
+/// The header of what is made of `pair`, but for its numbers on the channel and its times there. `epoch` is the clock map
+/// of the frame before.
+fn derived(
+    pair: &Pair,
+    format: PixelFormat,
+    unit_m: f64,
+    stage_ns: [u64; StageStep::ALL.len()],
+    epoch: Option<u32>,
+) -> FrameHeader {
+    let (color, depth) = (pair.color.header(), pair.depth.header());
+    let changed = epoch.is_some_and(|e| e != depth.clock_epoch);
+    let inherited = depth.flags & !(FrameFlags::EPOCH_CHANGED.0) | color.flags & INHERITED;
+    let mut header = FrameHeader {
+        // Everything about the time is depth's, everything about the view is colour's.
+        intrinsics: color.intrinsics,
+        pose: color.pose,
+        depth_unit_m: unit_m,
+        flags: inherited | FrameFlags::DERIVED.0 | if changed { FrameFlags::EPOCH_CHANGED.0 } else { 0 },
+        set_id: 0,
+        source_sequence: depth.sequence,
+        source_color_sequence: color.sequence,
+        source_color_capture_time_ns: color.capture_time_ns,
+        capture_uncertainty_ns: depth.capture_uncertainty_ns,
+        stage_ns,
+        ..*depth
+    };
+    header.set_picture(format, color.width, color.height);
+    header
+}
+
+/// Numbers and publishes a frame on `stream` and says how long it took since `ready`, nanoseconds. `Err(None)`: this
+/// worker was given up meanwhile, and everything is counted.
+fn publish_on(
+    stream: &Stream,
+    session: u64,
+    publisher: &Publisher,
+    mut out: FrameMut,
+    mut header: FrameHeader,
+    ready: HostTime,
+) -> Result<u64, Option<Skip>> {
+    let mut books = stream.books();
+    if books.session != session {
+        return Err(None);
+    }
+    header.stream = [0; 32];
+    let name = stream.id.stream.as_str().as_bytes();
+    header.stream[..name.len()].copy_from_slice(name);
+    header.sequence = books.delivered + 1;
+    header.dropped = books.dropped.0;
+    header.captured = header.sequence + books.dropped.total();
+    let total = ready.elapsed().as_nanos() as u64;
+    header.stage_ns[StageStep::Total as usize] = total;
+    // Of a replay everything is as long ago as it was; what was made of it is so, too.
+    let replayed = header.has(FrameFlags::REPLAYED);
+    let published =
+        if replayed { header.publish_time_ns.saturating_add(total as i64) } else { HostTime::now().ns() };
+    header.publish_time_ns = published;
+    *out.header_mut() = header;
+    if let Err(e) = publisher.send_unstamped(out) {
+        tracing::error!(stream = %stream.id, error = %e, "a frame was lost on its way to the subscribers");
+        return Err(Some(Skip::NoSlot));
+    }
+    books.captured += 1;
+    books.delivered += 1;
+    books.epoch = header.clock_epoch;
+    books.uncertainty_ns = header.capture_uncertainty_ns;
+    books.uncertain += u64::from(header.has(FrameFlags::TIME_UNCERTAIN));
+    books.note_metadata(header.metadata_level(), FrameFlags(header.flags));
+    books.note(HostTime::now(), published.saturating_sub(header.capture_time_ns));
+    Ok(total)
+}

@@ -1,0 +1,473 @@
+//! Refined depth in a running rig: what is published, what it says of itself, and what happens when something fails.
+//!
+//! Faults come from a refiner of these tests, through the one place where a rig takes its refiners from.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+use depthrig_bus::{Bus, Frame, FrameFlags, HostTime, PixelFormat, RigName, StageStep, Subscriber};
+use depthrig_cdm::{Description, EngineKind, Error, ErrorKind, Job, Output, Precision, Refiner, Result};
+use depthrig_daemon::config::RefineConfig;
+use depthrig_daemon::rig::Rig;
+use depthrig_daemon::stage::{Opened, Plan, Refiners};
+use depthrig_daemon::status::{RefineState, RefineStatus, RigStatus, StreamStatus};
+use depthrig_tests::{Home, RigText, all_stream, assert_balanced, camera, wait_until};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::time::Duration;
+
+/// What the refiner of these tests does: a pixel is its raw depth and 7 units.
+#[derive(Debug, Default)]
+struct Script {
+    /// Milliseconds that a batch takes.
+    delay_ms: AtomicU64,
+    /// Batches that fail from now on.
+    failing: AtomicUsize,
+    /// Openings that fail from now on.
+    closed: AtomicUsize,
+    /// It hangs while this is set.
+    hang: AtomicBool,
+    /// Pairs of a batch; 0 is 1.
+    batch: AtomicUsize,
+    opened: AtomicUsize,
+    /// Sizes of the batches.
+    largest: AtomicUsize,
+}
+
+#[derive(Clone)]
+struct Scripted(Arc<Script>);
+
+struct Fake(Arc<Script>, Description);
+
+impl Refiners for Scripted {
+    fn plan(&self, config: &RefineConfig, _device_model: &str) -> Plan {
+        Plan {
+            engine: EngineKind::Fill,
+            model: config.model.clone(),
+            input_size: config.input_size,
+            precision: Precision::Fp32,
+            device: config.device.clone(),
+            may_fill: false,
+            note: None,
+        }
+    }
+
+    fn open(&self, plan: &Plan, threads: usize) -> Result<Opened> {
+        assert!(threads >= 1);
+        self.0.opened.fetch_add(1, Ordering::SeqCst);
+        if take_one(&self.0.closed) {
+            return Err(Error::new(ErrorKind::OutOfMemory, "the device has no memory left"));
+        }
+        let what = Description { engine: "fake 1.0".into(), model: format!("script-{}", plan.device) };
+        Ok(Opened { refiner: Box::new(Fake(Arc::clone(&self.0), what)), note: None })
+    }
+}
+
+/// Takes one of what is left, if anything is.
+fn take_one(n: &AtomicUsize) -> bool {
+    n.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok()
+}
+
+impl Refiner for Fake {
+    fn describe(&self) -> &Description {
+        &self.1
+    }
+
+    fn best_batch(&self) -> usize {
+        self.0.batch.load(Ordering::SeqCst).max(1)
+    }
+
+    fn refine(&mut self, jobs: &mut [Job<'_>]) -> Result<()> {
+        while self.0.hang.load(Ordering::SeqCst) {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        std::thread::sleep(Duration::from_millis(self.0.delay_ms.load(Ordering::SeqCst)));
+        self.0.largest.fetch_max(jobs.len(), Ordering::SeqCst);
+        if take_one(&self.0.failing) {
+            return Err(Error::new(ErrorKind::Engine, "the script says so"));
+        }
+        for job in jobs {
+            job.steps.infer_ns = 3_000_000;
+            match &mut job.out {
+                Output::Units { pixels, .. } => {
+                    for (out, raw) in pixels.iter_mut().zip(job.depth.pixels) {
+                        *out = if *raw == 0 || *raw == u16::MAX { 0 } else { *raw + 7 };
+                    }
+                }
+                Output::Metres(pixels) => {
+                    for (out, raw) in pixels.iter_mut().zip(job.depth.pixels) {
+                        *out = (f64::from(*raw) * job.depth.unit_m) as f32;
+                    }
+                }
+                Output::Inverse(_) => panic!("nobody asked for it"),
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A rig with the refiner of these tests.
+fn start(home: &Home, text: &RigText, script: &Arc<Script>) -> Rig {
+    let refiners = Scripted(Arc::clone(script));
+    home.start_with(text.text(), |o| o.refiners = Some(Arc::new(refiners))).unwrap()
+}
+
+fn refined<'s>(status: &'s RigStatus, name: &str) -> (&'s RefineStatus, &'s StreamStatus) {
+    let camera = camera(status, name);
+    let stream = camera.streams.iter().find(|s| s.id.ends_with("/depth_refined")).unwrap();
+    (camera.refine.as_ref().unwrap(), stream)
+}
+
+fn bus(home: &Home) -> Bus {
+    Bus::open(&home.runtime(), &RigName::new("test").unwrap()).unwrap()
+}
+
+fn next(from: &mut Subscriber) -> Frame {
+    from.next_timeout(Duration::from_secs(10)).unwrap().expect("a frame within ten seconds")
+}
+
+/// Panics when a stream that a camera captured lost a frame.
+fn assert_captured_everything(status: &RigStatus) {
+    for s in status.cameras.iter().flat_map(|c| &c.streams).filter(|s| !s.derived) {
+        assert!(s.dropped.is_empty(), "{} lost frames: {:?}", s.id, s.dropped);
+    }
+}
+
+#[test]
+fn a_refined_frame_says_what_it_is_made_of() {
+    let home = Home::default();
+    let script = Arc::new(Script::default());
+    let rig = start(
+        &home,
+        &RigText::default().camera("cam", "[camera.refine]\nrate_hz = 0\nalign = true"),
+        &script,
+    );
+    wait_until(&rig, "refined", |s| all_stream(s) && refined(s, "cam").1.delivered > 3);
+    let bus = bus(&home);
+    let [mut color, mut depth, mut out, mut aligned] = ["color", "depth", "depth_refined", "depth_aligned"]
+        .map(|s| bus.subscriber(&format!("cam/{s}").parse().unwrap()).unwrap());
+    let (mut colors, mut depths, mut views) = (Vec::new(), Vec::new(), Vec::new());
+    let mut checked = 0;
+    let mut before: Option<depthrig_bus::FrameHeader> = None;
+    while checked < 20 {
+        let frame = next(&mut out);
+        while let Some(f) = color.try_next().unwrap() {
+            colors.push(*f.header());
+        }
+        while let Some(f) = depth.try_next().unwrap() {
+            depths.push((*f.header(), f.pixels().to_vec()));
+        }
+        while let Some(f) = aligned.try_next().unwrap() {
+            views.push((*f.header(), f.pixels().to_vec()));
+        }
+        let h = frame.header();
+        assert_eq!(
+            (h.stream(), h.camera(), h.refiner(), h.refiner_model()),
+            ("depth_refined", "cam", "fake 1.0", "script-cpu")
+        );
+        assert!(h.has(FrameFlags::DERIVED) && h.has(FrameFlags::SYNTHETIC));
+        assert_eq!(h.pixel_format(), Some(PixelFormat::Z16));
+        assert_eq!(h.captured, h.sequence + h.drops().total(), "{h:?}");
+        if let Some(before) = before.replace(*h) {
+            assert!(h.capture_time_ns > before.capture_time_ns && h.captured > before.captured);
+        }
+        assert_eq!(h.step_ns(StageStep::Infer), 3_000_000);
+        let total = h.step_ns(StageStep::Total);
+        assert!(
+            total >= h.step_ns(StageStep::Wait) + h.step_ns(StageStep::Register) && total < 5_000_000_000
+        );
+        assert!(h.publish_time_ns > h.capture_time_ns);
+        let (Some(c), Some((d, raw))) = (
+            colors.iter().find(|c| c.sequence == h.source_color_sequence),
+            depths.iter().find(|d| d.0.sequence == h.source_sequence),
+        ) else {
+            continue; // of before these subscribers
+        };
+        assert_eq!(
+            (h.capture_time_ns, h.depth_unit_m, h.device_time),
+            (d.capture_time_ns, d.depth_unit_m, d.device_time)
+        );
+        assert_eq!((h.intrinsics, h.pose, h.width, h.height), (c.intrinsics, c.pose, c.width, c.height));
+        assert_eq!(h.source_color_capture_time_ns, c.capture_time_ns);
+        let apart = |c: &depthrig_bus::FrameHeader| (c.capture_time_ns - d.capture_time_ns).abs();
+        assert!(apart(c) <= 17_700_000, "half a period and a millisecond");
+        assert!(colors.iter().all(|other| apart(other) >= apart(c)), "another colour frame lies nearer");
+        let Some((v, view)) = views.iter().find(|v| v.0.source_sequence == h.source_sequence) else {
+            continue;
+        };
+        assert_eq!((v.refiner(), v.stream(), v.intrinsics), ("", "depth_aligned", c.intrinsics));
+        let words =
+            |b: &[u8]| b.as_chunks::<2>().0.iter().map(|b| u16::from_le_bytes(*b)).collect::<Vec<_>>();
+        let (seen, was) = (words(frame.pixels()), words(view));
+        assert!(seen.iter().zip(&was).all(|(s, w)| *s == if *w == 0 || *w == u16::MAX { 0 } else { w + 7 }));
+        assert_eq!(was.len(), words(raw).len());
+        checked += 1;
+    }
+    let summary = rig.stop();
+    assert_balanced(&summary.status);
+    assert_captured_everything(&summary.status);
+    assert_eq!(summary.lost, [] as [&str; 0]);
+    let (state, stream) = refined(&summary.status, "cam");
+    assert_eq!((state.state, state.engine.as_str()), (RefineState::Running, "fake 1.0"));
+    assert!(stream.derived && state.steps_p50_ms["infer"] == 3.0);
+}
+
+#[test]
+fn the_newest_pair_wins_and_the_others_are_counted() {
+    let home = Home::default();
+    let script = Arc::new(Script { delay_ms: 150.into(), ..Script::default() });
+    let rig = start(&home, &RigText::default().camera("cam", "[camera.refine]\nrate_hz = 0"), &script);
+    let status = wait_until(&rig, "some", |s| refined(s, "cam").1.delivered >= 8);
+    let (state, stream) = refined(&status, "cam");
+    // Of about five pairs one is refined.
+    let busy = state.skipped["busy"];
+    assert!(busy >= 2 * stream.delivered, "{busy} skipped, {} refined", stream.delivered);
+    assert_eq!(stream.dropped.get("queue_full"), Some(&busy));
+    // What is published is of the newest pair: no older than one refining and what a frame takes.
+    assert!(stream.latency_p50_ms < 300.0, "{}", stream.latency_p50_ms);
+    let summary = rig.stop();
+    assert_balanced(&summary.status);
+    assert_captured_everything(&summary.status);
+}
+
+#[test]
+fn the_rate_asked_for_is_kept() {
+    let home = Home::default();
+    let script = Arc::new(Script::default());
+    let rig = start(&home, &RigText::default().camera("cam", "[camera.refine]\nrate_hz = 5"), &script);
+    wait_until(&rig, "running", |s| refined(s, "cam").1.delivered >= 1);
+    let before = rig.control().status();
+    std::thread::sleep(Duration::from_secs(3));
+    let after = rig.stop().status;
+    let (n, m) = (refined(&before, "cam").1.delivered, refined(&after, "cam").1.delivered);
+    assert!((13..=17).contains(&(m - n)), "{} in three seconds", m - n);
+    assert!(refined(&after, "cam").0.not_due > 60);
+    assert_balanced(&after);
+}
+
+#[test]
+fn an_engine_that_fails_stops_the_stream_says_why_and_comes_back() {
+    let home = Home::default();
+    let script = Arc::new(Script::default());
+    let rig = start(&home, &RigText::default().camera("cam", "[camera.refine]\nrate_hz = 0"), &script);
+    wait_until(&rig, "running", |s| refined(s, "cam").1.delivered > 3);
+    script.closed.store(1, Ordering::SeqCst);
+    script.failing.store(1, Ordering::SeqCst);
+    let status = wait_until(&rig, "failed", |s| refined(s, "cam").0.state == RefineState::Failed);
+    let message = refined(&status, "cam").0.message.clone().unwrap();
+    assert!(message.contains("the script says so") && message.contains("tried again in 1 s"), "{message}");
+    let stopped = refined(&status, "cam").1.delivered;
+    let status = wait_until(&rig, "out of memory", |s| {
+        refined(s, "cam").0.message.as_deref().is_some_and(|m| m.contains("no memory left"))
+    });
+    assert_eq!(refined(&status, "cam").1.delivered, stopped, "frames came although the engine had failed");
+    let status = wait_until(&rig, "back", |s| refined(s, "cam").1.delivered > stopped + 3);
+    assert_eq!(refined(&status, "cam").0.state, RefineState::Running);
+    assert_eq!(script.opened.load(Ordering::SeqCst), 3);
+    let summary = rig.stop();
+    assert_balanced(&summary.status);
+    assert_captured_everything(&summary.status);
+    assert_eq!(refined(&summary.status, "cam").1.dropped["device_error"], 1);
+}
+
+#[test]
+fn an_engine_that_hangs_is_given_up_and_neither_capture_nor_the_end_waits_for_it() {
+    let home = Home::default();
+    let script = Arc::new(Script::default());
+    let text = RigText::default().camera("cam", "[camera.refine]\nrate_hz = 0").and("[cdm]\nhang_s = 0.3\n");
+    let rig = start(&home, &text, &script);
+    wait_until(&rig, "running", |s| refined(s, "cam").1.delivered > 3);
+    script.hang.store(true, Ordering::SeqCst);
+    let status = wait_until(&rig, "given up", |s| refined(s, "cam").0.state == RefineState::Failed);
+    let message = refined(&status, "cam").0.message.clone().unwrap();
+    assert!(message.contains("hangs for"), "{message}");
+    assert_eq!(refined(&status, "cam").1.dropped["abandoned"], 1);
+    let stopped = refined(&status, "cam").1.delivered;
+    script.hang.store(false, Ordering::SeqCst);
+    // The thread that hung comes back now, and must not be heard.
+    let status = wait_until(&rig, "back", |s| refined(s, "cam").1.delivered > stopped + 5);
+    assert_balanced_live(&status);
+    script.hang.store(true, Ordering::SeqCst);
+    std::thread::sleep(Duration::from_millis(50));
+    let began = HostTime::now();
+    let summary = rig.stop();
+    assert!(began.elapsed() < Duration::from_secs(2), "{:?}", began.elapsed());
+    script.hang.store(false, Ordering::SeqCst);
+    assert_balanced(&summary.status);
+    assert_captured_everything(&summary.status);
+}
+
+/// As [`assert_balanced`], of the refined stream of a rig that runs.
+fn assert_balanced_live(status: &RigStatus) {
+    let stream = refined(status, "cam").1;
+    assert_eq!(stream.captured, stream.delivered + stream.dropped.values().sum::<u64>());
+}
+
+#[test]
+fn cameras_share_an_engine_in_turn_and_in_batches() {
+    for batch in [1, 3] {
+        let home = Home::default();
+        let script = Arc::new(Script { delay_ms: 40.into(), batch: batch.into(), ..Script::default() });
+        let refine = "[camera.refine]\nrate_hz = 0";
+        let text = RigText::default().camera("a", refine).camera("b", refine).camera("c", refine);
+        let rig = start(&home, &text, &script);
+        wait_until(&rig, "all", |s| ["a", "b", "c"].iter().all(|n| refined(s, n).1.delivered >= 5));
+        let summary = rig.stop();
+        let counts = ["a", "b", "c"].map(|n| refined(&summary.status, n).1.delivered);
+        let (least, most) = (counts.iter().min().unwrap(), counts.iter().max().unwrap());
+        assert!(most - least <= 4, "not in turn: {counts:?}");
+        assert_eq!(script.opened.load(Ordering::SeqCst), 1, "one engine for all of them");
+        assert_eq!(script.largest.load(Ordering::SeqCst), batch);
+        assert_balanced(&summary.status);
+        assert_captured_everything(&summary.status);
+    }
+}
+
+#[test]
+fn two_engines_on_one_device_where_only_one_fits() {
+    let home = Home::default();
+    let script = Arc::new(Script { closed: usize::MAX.into(), ..Script::default() });
+    let one = "[camera.refine]\nrate_hz = 0\ndevice = \"cuda:0\"\ninput_size = 252";
+    let text = RigText::default().camera("a", "[camera.refine]\nrate_hz = 0").camera("b", one);
+    // The first that opens gets the memory.
+    let refiners = OneFits(Arc::clone(&script), AtomicBool::new(false));
+    let rig = home.start_with(text.text(), |o| o.refiners = Some(Arc::new(refiners))).unwrap();
+    let status = wait_until(&rig, "one runs and one fails", |s| {
+        let states = ["a", "b"].map(|n| refined(s, n).0.state);
+        states.contains(&RefineState::Running) && states.contains(&RefineState::Failed)
+    });
+    let failed = ["a", "b"].into_iter().find(|n| refined(&status, n).0.state == RefineState::Failed).unwrap();
+    assert!(refined(&status, failed).0.message.as_deref().unwrap().contains("no memory left"));
+    let summary = rig.stop();
+    assert!(
+        summary.lost.iter().any(|l| l.contains(failed) && l.contains("no memory left")),
+        "{:?}",
+        summary.lost
+    );
+    assert_captured_everything(&summary.status);
+}
+
+struct OneFits(Arc<Script>, AtomicBool);
+
+impl Refiners for OneFits {
+    fn plan(&self, config: &RefineConfig, device_model: &str) -> Plan {
+        Scripted(Arc::clone(&self.0)).plan(config, device_model)
+    }
+
+    fn open(&self, plan: &Plan, threads: usize) -> Result<Opened> {
+        if !self.1.swap(true, Ordering::SeqCst) {
+            self.0.closed.store(0, Ordering::SeqCst);
+            let opened = Scripted(Arc::clone(&self.0)).open(plan, threads);
+            self.0.closed.store(usize::MAX, Ordering::SeqCst);
+            return opened;
+        }
+        Scripted(Arc::clone(&self.0)).open(plan, threads)
+    }
+}
+
+#[test]
+fn a_reader_that_holds_its_frames_costs_nobody_anything() {
+    let home = Home::default();
+    let script = Arc::new(Script::default());
+    let rig = start(&home, &RigText::default().camera("cam", "[camera.refine]\nrate_hz = 0"), &script);
+    wait_until(&rig, "running", |s| refined(s, "cam").1.delivered > 3);
+    let bus = bus(&home);
+    let id = "cam/depth_refined".parse().unwrap();
+    // One that never reads, and one that holds all it may.
+    let _silent = bus.subscriber(&id).unwrap();
+    let mut greedy = bus.subscriber(&id).unwrap();
+    let held: Vec<_> = (0..16).map(|_| next(&mut greedy)).collect();
+    let before = refined(&rig.control().status(), "cam").1.delivered;
+    wait_until(&rig, "it goes on", |s| refined(s, "cam").1.delivered > before + 40);
+    assert!(held.windows(2).all(|w| w[0].header().sequence < w[1].header().sequence));
+    let summary = rig.stop();
+    assert_balanced(&summary.status);
+    assert_captured_everything(&summary.status);
+    assert!(refined(&summary.status, "cam").1.dropped.get("no_slot").is_none());
+}
+
+#[test]
+fn what_cannot_be_registered_is_said_and_the_raw_streams_go_on() {
+    let home = Home::default();
+    let script = Arc::new(Script::default());
+    let table = "uncalibrated";
+    let dir = home.path(table);
+    std::fs::create_dir_all(&dir).unwrap();
+    let manifest = depthrig_tests::uncalibrated_camera(&dir, (64, 48), (32, 24));
+    let text = RigText::default().files("cam", &manifest, "[camera.refine]\nrate_hz = 0");
+    let rig = start(&home, &text, &script);
+    let status = wait_until(&rig, "failed", |s| refined(s, "cam").0.state == RefineState::Failed);
+    let message = refined(&status, "cam").0.message.clone().unwrap();
+    assert!(
+        message.contains("depth is 32x24 and colour 64x48") && message.contains("neither has a calibration"),
+        "{message}"
+    );
+    assert!(!message.contains("is_aligned"), "that would not help here: {message}");
+    let status = wait_until(&rig, "some more", |s| refined(s, "cam").1.captured > 5);
+    assert_eq!(refined(&status, "cam").1.delivered, 0);
+    let summary = rig.stop();
+    assert_balanced(&summary.status);
+    assert_captured_everything(&summary.status);
+
+    // Of one size the camera may be believed.
+    let dir = home.path("one_size");
+    std::fs::create_dir_all(&dir).unwrap();
+    let manifest = depthrig_tests::uncalibrated_camera(&dir, (64, 48), (64, 48));
+    let text = RigText::default().files("cam", &manifest, "[camera.refine]\nrate_hz = 0");
+    let rig = start(&home, &text, &script);
+    let status = wait_until(&rig, "failed", |s| refined(s, "cam").0.state == RefineState::Failed);
+    let message = refined(&status, "cam").0.message.clone().unwrap();
+    assert!(message.contains("is_aligned = true"), "{message}");
+    drop(rig);
+    let text = RigText::default().files("cam", &manifest, "[camera.refine]\nrate_hz = 0\nis_aligned = true");
+    let rig = start(&home, &text, &script);
+    wait_until(&rig, "refined", |s| refined(s, "cam").1.delivered > 3);
+    // The first row has no depth, the second is saturated: no value is made of either.
+    let frame = next(&mut bus(&home).subscriber(&"cam/depth_refined".parse().unwrap()).unwrap());
+    assert!(frame.pixels()[..64 * 2 * 2].iter().all(|b| *b == 0));
+    assert!(frame.pixels()[64 * 2 * 2..].iter().any(|b| *b != 0));
+}
+
+#[test]
+fn refined_depth_is_recorded_with_the_depth_that_it_is_made_of() {
+    let home = Home::default();
+    let script = Arc::new(Script { delay_ms: 60.into(), ..Script::default() });
+    let text = RigText::default().camera("cam", "[camera.refine]\nrecord = true").camera("other", "");
+    let rig = start(&home, &text, &script);
+    wait_until(&rig, "running", |s| all_stream(s) && refined(s, "cam").1.delivered > 3);
+    let control = rig.control();
+    let request = depthrig_daemon::control::RecordRequest {
+        directory: Some(home.path("")),
+        name: Some("made".into()),
+        force: true,
+        ..<_>::default()
+    };
+    control.record_start(&request).unwrap();
+    std::thread::sleep(Duration::from_secs(4));
+    control.record_stop().unwrap();
+    let summary = rig.stop();
+    assert_balanced(&summary.status);
+    let dataset = home.path("made");
+    let report = depthrig_recorder::verify(
+        &dataset,
+        &depthrig_recorder::VerifyOptions { decode: true, ..<_>::default() },
+    )
+    .unwrap();
+    assert!(report.findings.is_empty(), "{:#?}", report.findings);
+    let opened = depthrig_recorder::Dataset::open(&dataset).unwrap();
+    let streams = &opened.session().streams;
+    let at = |name: &str| streams.iter().position(|s| s.id.to_string() == name).unwrap();
+    let (depth, made) = (at("cam/depth"), at("cam/depth_refined"));
+    let (mut sets, mut whole, mut own) = (0, 0, 0);
+    for set in opened.sets(depthrig_recorder::SetRange::ALL) {
+        let set = set.unwrap();
+        sets += 1;
+        let find = |stream| set.frames.iter().find(|f| f.stream == stream);
+        let (Some(raw), Some(refined)) = (find(depth), find(made)) else { continue };
+        whole += 1;
+        let (r, d) = (refined.header, raw.header);
+        assert!((r.capture_time_ns - d.capture_time_ns).abs() < 90_000_000);
+        own += usize::from(r.capture_time_ns == d.capture_time_ns);
+        assert_eq!((r.refiner(), r.has(FrameFlags::DERIVED)), ("fake 1.0", true));
+    }
+    assert!(sets >= 17 && whole >= sets - 2, "{whole} of {sets} sets have refined depth");
+    assert!(own * 10 >= whole * 8, "{own} of {whole} are of the set's own depth frame");
+}
