@@ -23,6 +23,8 @@ pub mod published;
 mod refine;
 mod refiner;
 pub mod store;
+#[cfg(test)]
+mod tiny;
 pub mod weights;
 
 pub use arch::Encoder;
