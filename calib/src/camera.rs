@@ -101,7 +101,7 @@ impl Camera {
     /// not in front of the camera or beyond [`Camera::max_radius`].
     pub fn project(&self, p: DVec3) -> Option<DVec2> {
         let d = self.lens.distort(self.seen(p)?);
-        Some(self.to_pixel(d))
+        Some(self.pixel(d))
     }
 
     /// [`Camera::project`] with its derivatives.
@@ -120,7 +120,7 @@ impl Camera {
             d_params[1][4 + i] = fy * by.y;
         }
         Some(Projection {
-            pixel: self.to_pixel(d),
+            pixel: self.pixel(d),
             d_point: [row(fx, j.x_axis.x, j.y_axis.x), row(fy, j.x_axis.y, j.y_axis.y)],
             d_params,
         })
@@ -159,7 +159,7 @@ impl Camera {
             let error = d - shown;
             let det = j.determinant();
             // Beyond its image circle the model folds back: there the Jacobian is singular or reversed.
-            if !(det > 0.0) {
+            if det.is_nan() || det <= 0.0 {
                 return None;
             }
             let size = error.length();
@@ -216,7 +216,7 @@ impl Camera {
         (p.z > 0.0 && at.length() <= self.max_radius).then_some(at)
     }
 
-    fn to_pixel(&self, d: DVec2) -> DVec2 {
+    fn pixel(&self, d: DVec2) -> DVec2 {
         let Intrinsics { fx, fy, cx, cy, .. } = self.intrinsics;
         DVec2::new(fx * d.x + cx, fy * d.y + cy)
     }

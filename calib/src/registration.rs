@@ -25,9 +25,11 @@ use warp::Warp;
 /// How depth is put into another view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Method {
-    /// Each depth pixel covers the rectangle between its projected corners; the nearest wins. Values are kept as they
-    /// were measured, along depth's own axis. As librealsense: right where both pictures have about the same scale and
-    /// direction.
+    /// Each depth pixel covers the rectangle between its projected corners; the nearest wins. Where colour is the coarser
+    /// picture, a pixel alone: that of the first corner. Values are kept as they were measured, along depth's own axis.
+    /// As librealsense 2.59: right where both pictures have about the same scale and direction. Unlike it, colour's lens
+    /// is honoured whatever its model (librealsense ignores all but `MODIFIED_BROWN_CONRADY`), and so is a colour camera
+    /// that is mounted upside down.
     Splat,
     /// Each 2x2 neighbourhood is drawn as two triangles unless depth jumps inside it; the nearest wins. Values are
     /// depth along colour's axis. As the Azure Kinect SDK: leaves no holes inside surfaces when colour has more pixels
@@ -200,8 +202,9 @@ impl Registration {
     /// are 8-bit RGB or any other three bytes a pixel. What colour cannot see because something nearer hides it gets
     /// the colour of what hides it.
     ///
-    /// [`Method::Splat`] takes the last pixel of the rectangle that depth's pixel covers, as librealsense does;
-    /// [`Method::Triangles`] the four pixels around its middle in proportion, as the Azure Kinect SDK does.
+    /// [`Method::Splat`] takes the pixel under the top left corner of depth's pixel, under the bottom right one when colour
+    /// has fewer rows and columns than depth: what librealsense does. [`Method::Triangles`] takes the four pixels around
+    /// its middle in proportion, as the Azure Kinect SDK does.
     ///
     /// # Errors
     /// As [`Registration::depth_to_color`].
@@ -213,8 +216,8 @@ impl Registration {
         let (warp, method, (w, h)) = (&*self.warp, self.method, self.depth_size);
         let (size, n) = (self.color_size, self.bands.len());
         let paint = |band: &mut Band, rows: core::ops::Range<usize>, part: &mut [u8]| match method {
-            Method::Splat => band.splat.paint(warp, depth, unit, w, rows, color, size, part),
-            Method::Triangles => band.triangles.paint(warp, depth, unit, w, rows, color, size, part),
+            Method::Splat => band.splat.paint(warp, depth, unit, (w, h), rows, color, size, part),
+            Method::Triangles => band.triangles.paint(warp, depth, unit, (w, h), rows, color, size, part),
         };
         let Some(pool) = &self.pool else {
             paint(&mut self.bands[0], 0..h, out);
@@ -256,7 +259,8 @@ pub fn same_view(
         return false;
     }
     let between = color_pose.inverse().compose(depth_pose).to_affine();
-    if !(between.translation.length() <= SAME_PLACE_M) {
+    let apart = between.translation.length();
+    if apart.is_nan() || apart > SAME_PLACE_M {
         return false;
     }
     let (w, h) = (f64::from(depth_size.0) - 1.0, f64::from(depth_size.1) - 1.0);

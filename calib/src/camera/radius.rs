@@ -52,8 +52,7 @@ fn roots_of(polynomial: &[f64], end: f64, roots: &mut [f64; 8]) -> usize {
     let value = |q: f64| polynomial[..=degree].iter().rev().fold(0.0, |sum, c| sum * q + c);
     let mut found = 0;
     let mut low = 0.0;
-    for at in 0..=n {
-        let high = if at == n { end } else { bounds[at] };
+    for high in bounds[..n].iter().copied().chain([end]) {
         let (a, b) = (value(low), value(high));
         if a != 0.0 && (b == 0.0 || (a > 0.0) != (b > 0.0)) {
             roots[found] = bisect(value, low, high);

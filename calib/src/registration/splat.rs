@@ -2,6 +2,10 @@
 //!
 //! Neighbouring pixels of a row mostly cover the same rows of colour. Such a run is drawn once into a line, and the line
 //! into each of these rows: most of the work is then minima of whole vectors.
+#![allow(
+    clippy::needless_bitwise_bool,
+    reason = "a lazy operator is a branch, and branches keep loops from being vectors"
+)]
 
 use super::target::{EMPTY, Target, key};
 use super::warp::{Place, Seen, Warp};
@@ -58,8 +62,13 @@ impl SplatRows {
         let [w, h] = warp.size;
         warp.row(depth, unit, row, Place::First, &mut self.seen);
         whole(&self.seen, w, h, &mut self.left, &mut self.top);
-        warp.row(depth, unit, row, Place::Last, &mut self.seen);
-        whole(&self.seen, w, h, &mut self.right, &mut self.bottom);
+        if warp.spreads {
+            warp.row(depth, unit, row, Place::Last, &mut self.seen);
+            whole(&self.seen, w, h, &mut self.right, &mut self.bottom);
+        } else {
+            self.right.copy_from_slice(&self.left);
+            self.bottom.copy_from_slice(&self.top);
+        }
         let (w, h) = (w as i16 - 1, h as i16 - 1);
         let n = depth.len();
         let (left, top) = (&mut self.left[..n], &mut self.top[..n]);
@@ -111,27 +120,31 @@ impl SplatRows {
         }
     }
 
-    /// Paints some rows of depth with colour: each pixel gets the last one of its rectangle.
+    /// Paints some rows of depth with colour: the pixel in which a corner lies, which one librealsense decides by the sizes.
     #[expect(clippy::too_many_arguments, reason = "two pictures with their sizes")]
     pub(super) fn paint(
         &mut self,
         warp: &Warp,
         depth: &[u16],
         unit: f32,
-        width: usize,
+        (width, height): (usize, usize),
         rows: core::ops::Range<usize>,
         color: &[u8],
-        (color_width, _): (usize, usize),
+        (color_width, color_height): (usize, usize),
         out: &mut [u8],
     ) {
+        let is_coarser = color_width < width && color_height < height;
+        let place = if is_coarser { Place::Last } else { Place::First };
         for (row, out) in rows.zip(out.chunks_exact_mut(width * 3)) {
-            self.rectangles(warp, &depth[row * width..(row + 1) * width], unit, row);
-            for (i, out) in out.chunks_exact_mut(3).enumerate() {
-                if self.bottom[i] < 0 {
-                    out.fill(0);
-                } else {
-                    let at = (self.bottom[i] as usize * color_width + self.right[i] as usize) * 3;
+            warp.row(&depth[row * width..(row + 1) * width], unit, row, place, &mut self.seen);
+            whole(&self.seen, warp.size[0], warp.size[1], &mut self.left, &mut self.top);
+            for ((x, y), out) in self.left.iter().zip(&self.top).zip(out.chunks_exact_mut(3)) {
+                let (x, y) = (*x as u16 as usize, *y as u16 as usize);
+                if x < color_width && y < color_height {
+                    let at = (y * color_width + x) * 3;
                     out.copy_from_slice(&color[at..at + 3]);
+                } else {
+                    out.fill(0);
                 }
             }
         }

@@ -7,7 +7,6 @@
 pub(super) const EMPTY: u16 = u16::MAX;
 
 /// What is compared for a depth value; [`EMPTY`] for a hole.
-#[inline(always)]
 pub(super) const fn key(depth: u16) -> u16 {
     depth.wrapping_sub(1)
 }

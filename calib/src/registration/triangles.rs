@@ -5,7 +5,7 @@ use super::warp::{Place, Seen, Warp};
 
 /// A neighbourhood whose depths differ by more than this part of the least is the border of an object
 /// (Azure Kinect SDK `src/transformation/rgbz.c`, `skip_interpolation_ratio`).
-const MAX_JUMP: f32 = 0.046_934_417_59;
+const MAX_JUMP: f32 = 0.046_934_42;
 /// A neighbourhood that is drawn wider or higher than this is not one: it is all but in colour's pupil.
 const MAX_SPAN: f32 = 128.0;
 
@@ -73,7 +73,7 @@ impl TriangleRows {
         warp: &Warp,
         depth: &[u16],
         unit: f32,
-        width: usize,
+        (width, _): (usize, usize),
         rows: core::ops::Range<usize>,
         color: &[u8],
         (color_width, color_height): (usize, usize),

@@ -3,6 +3,11 @@
 //! The loop is written once, for any number of lanes; it is compiled for the processors that have AVX2 and once more for
 //! all. Nothing is fused or reordered, so both give the same bits.
 #![allow(unsafe_code)] // calls of functions that are compiled for more than the oldest processor
+#![allow(clippy::inline_always, reason = "what is not inlined is compiled for the oldest processor")]
+#![allow(
+    clippy::needless_bitwise_bool,
+    reason = "a lazy operator is a branch, and branches keep loops from being vectors"
+)]
 
 use super::Method;
 use crate::camera::{Camera, Lens};
@@ -22,6 +27,8 @@ pub(super) struct Warp {
     max_radius2: f32,
     /// Width and height of colour.
     pub(super) size: [f32; 2],
+    /// Whether a depth pixel covers more than one of colour.
+    pub(super) spreads: bool,
 }
 
 /// The rays of depth, scaled to z = 1: through the corners of its pixels for [`Method::Splat`] (one more column and row
@@ -78,6 +85,7 @@ impl Warp {
             k: [k.fx, k.fy, k.cx, k.cy].map(|n| n as f32),
             max_radius2: (radius * radius) as f32,
             size: [color_size.0 as f32, color_size.1 as f32],
+            spreads: spreads(depth, depth_size, color, color_size),
         }
     }
 
@@ -197,6 +205,19 @@ impl Warp {
             depth_out[i] = qz * per_unit;
         }
     }
+}
+
+/// Whether librealsense would use both corners of a pixel: where colour has more pixels per angle than depth on one of
+/// the axes (`align_depth_to_other_sse` and `rs2_fov`), and for two pairs of sizes.
+fn spreads(depth: &Camera, depth_size: (usize, usize), color: &Camera, color_size: (usize, usize)) -> bool {
+    let density = |camera: &Camera, (w, h): (usize, usize)| {
+        let k = camera.intrinsics();
+        let angle = |c: f64, f: f64, n: usize| ((c + 0.5) / f).atan() + ((n as f64 - c - 0.5) / f).atan();
+        (w as f64 / angle(k.cx, k.fx, w), h as f64 / angle(k.cy, k.fy, h))
+    };
+    let (from, to) = (density(depth, depth_size), density(color, color_size));
+    let is_special = matches!((depth_size, color_size), ((640, 240), (320, 180)) | ((640, 480), (640, 360)));
+    from.0 < to.0 || from.1 < to.1 || is_special
 }
 
 type Out<'a> = (&'a mut [f32], &'a mut [f32], &'a mut [f32]);
