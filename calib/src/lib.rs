@@ -8,6 +8,7 @@ mod camera;
 mod error;
 mod pose;
 mod registration;
+mod simd;
 
 pub use camera::{Camera, CameraExt, Projection, Ray};
 pub use error::{Error, ErrorKind, Result};

@@ -12,6 +12,7 @@ use depthrig_bus::{Intrinsics, Pose};
 use rayon::prelude::*;
 use std::sync::Arc;
 
+mod lens;
 mod splat;
 mod target;
 mod triangles;
@@ -133,7 +134,7 @@ impl Registration {
     fn band(&self, private: bool) -> Band {
         let (w, h) = self.color_size;
         Band {
-            splat: SplatRows::new(self.depth_size.0, w),
+            splat: SplatRows::new(self.depth_size.0),
             triangles: TriangleRows::new(if self.method == Method::Triangles {
                 self.depth_size.0
             } else {

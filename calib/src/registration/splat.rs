@@ -2,41 +2,49 @@
 //!
 //! Neighbouring pixels of a row mostly cover the same rows of colour. Such a run is drawn once into a line, and the line
 //! into each of these rows: most of the work is then minima of whole vectors.
+#![allow(unsafe_code)] // a cast whose range is known
+#![allow(clippy::inline_always, reason = "what is not inlined is compiled for the oldest processor")]
 #![allow(
     clippy::needless_bitwise_bool,
     reason = "a lazy operator is a branch, and branches keep loops from being vectors"
 )]
 
+use super::lens::Lens32;
 use super::target::{EMPTY, Target, key};
-use super::warp::{Place, Seen, Warp};
+use super::warp::{Lane, Numbers, Warp, WithRow};
+use crate::simd::for_every_processor;
 
 /// A rectangle wider or higher than this is not drawn: the point is all but in colour's pupil, and one such pixel after
 /// another would take minutes.
-const MAX_SPAN: i16 = 128;
-/// Left of everything: a corner that is not seen.
-const NOWHERE: i16 = i16::MIN;
+const MAX_SPAN: i32 = 128;
+/// The columns and rows of a pixel that is not seen.
+const NOWHERE: u32 = u32::MAX;
+
+/// A column of colour for every 16-bit number, so that none need be checked.
+type Line = Box<[u16; 1 << 16]>;
 
 /// The rows that one thread works with.
 #[derive(Debug)]
 pub(super) struct SplatRows {
-    seen: Seen,
-    left: Vec<i16>,
-    top: Vec<i16>,
-    right: Vec<i16>,
-    bottom: Vec<i16>,
-    line: Vec<u16>,
+    /// First and last column of colour that a pixel covers, in the upper and lower half.
+    columns: Vec<u32>,
+    /// First and last row, likewise.
+    rows: Vec<u32>,
+    /// Runs are drawn into three lines, for the left, the middle and the right of each pixel: written to one line, each
+    /// pixel would wait for the one before.
+    lines: [Line; 3],
 }
 
 impl SplatRows {
-    pub(super) fn new(depth_width: usize, color_width: usize) -> Self {
-        let row = || vec![0; depth_width];
+    pub(super) fn new(depth_width: usize) -> Self {
+        let line = || {
+            let line: Result<Line, _> = vec![EMPTY; 1 << 16].into_boxed_slice().try_into();
+            line.unwrap_or_else(|_| Box::new([EMPTY; 1 << 16]))
+        };
         Self {
-            seen: Seen::new(depth_width),
-            left: row(),
-            top: row(),
-            right: row(),
-            bottom: row(),
-            line: vec![EMPTY; color_width],
+            columns: vec![NOWHERE; depth_width],
+            rows: vec![NOWHERE; depth_width],
+            lines: [line(), line(), line()],
         }
     }
 
@@ -52,75 +60,21 @@ impl SplatRows {
     ) {
         for row in rows {
             let depth = &depth[row * width..(row + 1) * width];
-            self.rectangles(warp, depth, unit, row);
-            self.draw_row(depth, target);
+            let corners = if warp.spreads { Corners::Both } else { Corners::First };
+            self.rectangles(warp, depth, unit, row, corners);
+            let [first, middle, last] = &mut self.lines;
+            draw_row(depth, &self.columns, &self.rows, first, middle, last, target.pixels, target.width);
         }
     }
 
-    /// Finds the rectangle of every pixel, cut to the picture. One that is not seen has `bottom` −1.
-    fn rectangles(&mut self, warp: &Warp, depth: &[u16], unit: f32, row: usize) {
-        let [w, h] = warp.size;
-        warp.row(depth, unit, row, Place::First, &mut self.seen);
-        whole(&self.seen, w, h, &mut self.left, &mut self.top);
-        if warp.spreads {
-            warp.row(depth, unit, row, Place::Last, &mut self.seen);
-            whole(&self.seen, w, h, &mut self.right, &mut self.bottom);
-        } else {
-            self.right.copy_from_slice(&self.left);
-            self.bottom.copy_from_slice(&self.top);
-        }
-        let (w, h) = (w as i16 - 1, h as i16 - 1);
-        let n = depth.len();
-        let (left, top) = (&mut self.left[..n], &mut self.top[..n]);
-        let (right, bottom) = (&mut self.right[..n], &mut self.bottom[..n]);
-        for i in 0..n {
-            let (l, r) = (left[i].min(right[i]), left[i].max(right[i]));
-            let (t, b) = (top[i].min(bottom[i]), top[i].max(bottom[i]));
-            let seen = (l > NOWHERE) & (r >= 0) & (b >= 0) & (l <= w) & (t <= h);
-            let small = (r.wrapping_sub(l) <= MAX_SPAN) & (b.wrapping_sub(t) <= MAX_SPAN);
-            left[i] = l.max(0);
-            right[i] = r.min(w);
-            top[i] = if seen & small { t.max(0) } else { -1 };
-            bottom[i] = if seen & small { b.min(h) } else { -1 };
-        }
+    fn rectangles(&mut self, warp: &Warp, depth: &[u16], unit: f32, row: usize, corners: Corners) {
+        let (columns, rows) = (&mut *self.columns, &mut *self.rows);
+        let numbers = &warp.numbers;
+        warp.with_row(row, depth.len(), Rectangles { depth, unit, corners, numbers, columns, rows });
     }
 
-    fn draw_row(&mut self, depth: &[u16], target: &mut Target<'_>) {
-        let n = depth.len();
-        let (left, right) = (&self.left[..n], &self.right[..n]);
-        let (top, bottom) = (&self.top[..n], &self.bottom[..n]);
-        let mut i = 0;
-        while i < n {
-            let (t, b) = (top[i], bottom[i]);
-            if b < 0 {
-                i += 1;
-                continue;
-            }
-            let (mut from, mut to) = (left[i], right[i]);
-            let begin = i;
-            while i < n && top[i] == t && bottom[i] == b {
-                let key = key(depth[i]);
-                for x in &mut self.line[left[i] as usize..=right[i] as usize] {
-                    *x = (*x).min(key);
-                }
-                from = from.min(left[i]);
-                to = to.max(right[i]);
-                i += 1;
-            }
-            debug_assert!(i > begin);
-            let (from, to) = (from as usize, to as usize + 1);
-            let line = &mut self.line[from..to];
-            for y in t as usize..=b as usize {
-                let row = &mut target.pixels[y * target.width + from..y * target.width + to];
-                for (old, new) in row.iter_mut().zip(&*line) {
-                    *old = (*old).min(*new);
-                }
-            }
-            line.fill(EMPTY);
-        }
-    }
-
-    /// Paints some rows of depth with colour: the pixel in which a corner lies, which one librealsense decides by the sizes.
+    /// Paints some rows of depth with colour: the pixel in which a corner lies, which one librealsense decides by the
+    /// sizes.
     #[expect(clippy::too_many_arguments, reason = "two pictures with their sizes")]
     pub(super) fn paint(
         &mut self,
@@ -134,33 +88,177 @@ impl SplatRows {
         out: &mut [u8],
     ) {
         let is_coarser = color_width < width && color_height < height;
-        let place = if is_coarser { Place::Last } else { Place::First };
+        let corners = if is_coarser { Corners::Last } else { Corners::First };
         for (row, out) in rows.zip(out.chunks_exact_mut(width * 3)) {
-            warp.row(&depth[row * width..(row + 1) * width], unit, row, place, &mut self.seen);
-            whole(&self.seen, warp.size[0], warp.size[1], &mut self.left, &mut self.top);
-            for ((x, y), out) in self.left.iter().zip(&self.top).zip(out.chunks_exact_mut(3)) {
-                let (x, y) = (*x as u16 as usize, *y as u16 as usize);
-                if x < color_width && y < color_height {
-                    let at = (y * color_width + x) * 3;
-                    out.copy_from_slice(&color[at..at + 3]);
-                } else {
+            self.rectangles(warp, &depth[row * width..(row + 1) * width], unit, row, corners);
+            for ((x, y), out) in self.columns.iter().zip(&self.rows).zip(out.chunks_exact_mut(3)) {
+                if *x == NOWHERE {
                     out.fill(0);
+                } else {
+                    let at = ((y & 0xffff) as usize * color_width + (x & 0xffff) as usize) * 3;
+                    out.copy_from_slice(&color[at..at + 3]);
                 }
             }
         }
     }
 }
 
-/// Whole pixels, one beyond the picture at the most.
-fn whole(seen: &Seen, w: f32, h: f32, xs: &mut [i16], ys: &mut [i16]) {
-    let round = |at: f32, end: f32| {
-        let at = at + 0.5;
-        let at = if at > -1.0 { at } else { -1.0 };
-        (if at < end { at } else { end }) as i32 as i16
-    };
-    for ((u, v), (x, y)) in seen.u.iter().zip(&seen.v).zip(xs.iter_mut().zip(ys.iter_mut())) {
-        let nowhere = u.is_nan();
-        *x = if nowhere { NOWHERE } else { round(*u, w) };
-        *y = if nowhere { NOWHERE } else { round(*v, h) };
+/// Which corners of a depth pixel are looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Corners {
+    First,
+    Last,
+    Both,
+}
+
+struct Rectangles<'a> {
+    depth: &'a [u16],
+    unit: f32,
+    corners: Corners,
+    numbers: &'a Numbers,
+    columns: &'a mut [u32],
+    rows: &'a mut [u32],
+}
+
+impl WithRow for Rectangles<'_> {
+    fn run<Y: Lane, L: Lens32>(self, first: (&[f32], Y), last: (&[f32], Y), lens: L) {
+        let Self { depth, unit, corners, numbers, columns, rows } = self;
+        match corners {
+            Corners::Both => {
+                both(depth, unit, first.0, first.1, last.0, last.1, lens, numbers, columns, rows)
+            }
+            Corners::First => one(depth, unit, first.0, first.1, lens, numbers, columns, rows),
+            Corners::Last => one(depth, unit, last.0, last.1, lens, numbers, columns, rows),
+        }
     }
+}
+
+for_every_processor! {
+    /// The rectangles between both corners.
+    fn both<Y: Lane, L: Lens32>(
+        depth: &[u16], unit: f32, x0: &[f32], y0: Y, x1: &[f32], y1: Y, lens: L, numbers: &Numbers,
+        columns: &mut [u32], rows: &mut [u32],
+    ) {
+        let n = depth.len();
+        let (x0, y0, x1, y1) = (&x0[..n], y0.cut(n), &x1[..n], y1.cut(n));
+        let (columns, rows, numbers) = (&mut columns[..n], &mut rows[..n], *numbers);
+        for i in 0..n {
+            let z = f32::from(depth[i]) * unit;
+            let a = numbers.project(z, x0[i], y0.at(i), lens);
+            let b = numbers.project(z, x1[i], y1.at(i), lens);
+            let seen = (depth[i] != 0) & a.seen & b.seen;
+            (columns[i], rows[i]) = rectangle((a.u, a.v), (b.u, b.v), seen, numbers.size);
+        }
+    }
+}
+
+for_every_processor! {
+    /// The pixels under one corner.
+    fn one<Y: Lane, L: Lens32>(
+        depth: &[u16], unit: f32, x: &[f32], y: Y, lens: L, numbers: &Numbers, columns: &mut [u32], rows: &mut [u32],
+    ) {
+        let n = depth.len();
+        let (x, y) = (&x[..n], y.cut(n));
+        let (columns, rows, numbers) = (&mut columns[..n], &mut rows[..n], *numbers);
+        for i in 0..n {
+            let a = numbers.project(f32::from(depth[i]) * unit, x[i], y.at(i), lens);
+            let seen = (depth[i] != 0) & a.seen;
+            (columns[i], rows[i]) = rectangle((a.u, a.v), (a.u, a.v), seen, numbers.size);
+        }
+    }
+}
+
+/// The pixels between two corners, cut to the picture: columns and rows.
+#[inline(always)]
+fn rectangle(a: (f32, f32), b: (f32, f32), seen: bool, [w, h]: [f32; 2]) -> (u32, u32) {
+    let span = |a: f32, b: f32, end: f32| {
+        let (a, b) = (truncated(a, end), truncated(b, end));
+        let (a, b) = (a.min(b), a.max(b));
+        let end = whole(end);
+        let inside = (b >= 0) & (a < end) & (b - a <= MAX_SPAN);
+        ((a.max(0) << 16 | b.min(end - 1)) as u32, inside)
+    };
+    let (columns, in_columns) = span(a.0, b.0, w);
+    let (rows, in_rows) = span(a.1, b.1, h);
+    let seen = seen & in_columns & in_rows;
+    (if seen { columns } else { NOWHERE }, if seen { rows } else { NOWHERE })
+}
+
+/// The pixel that librealsense takes: cut towards zero, so that the one left of the picture is in it by half. One beyond
+/// the picture at the most.
+#[inline(always)]
+fn truncated(at: f32, end: f32) -> i32 {
+    let at = at + 0.5;
+    // NaN becomes −1.
+    let at = if at > -1.0 { at } else { -1.0 };
+    whole(if at < end { at } else { end })
+}
+
+/// The whole part of a number between −1 and the side of a picture.
+#[inline(always)]
+fn whole(at: f32) -> i32 {
+    // SAFETY: the number is no NaN and is far within 32 bits.
+    unsafe { at.to_int_unchecked() }
+}
+
+for_every_processor! {
+    /// Draws the rectangles of a row.
+    fn draw_row(
+        depth: &[u16], columns: &[u32], rows: &[u32], first: &mut [u16; 1 << 16], middle: &mut [u16; 1 << 16],
+        last: &mut [u16; 1 << 16], pixels: &mut [u16], width: usize,
+    ) {
+        let n = depth.len();
+        let (columns, rows) = (&columns[..n], &rows[..n]);
+        let mut i = 0;
+        while i < n {
+            let run = rows[i];
+            if run == NOWHERE {
+                i += 1;
+                continue;
+            }
+            let (mut from, mut to) = (u32::MAX, 0);
+            while i < n && rows[i] == run {
+                let (l, r, key) = (columns[i] >> 16, columns[i] & 0xffff, key(depth[i]));
+                least(&mut first[l as u16 as usize], key);
+                // Of up to three columns this is the one between, or one of them.
+                least(&mut middle[((l + r) >> 1) as u16 as usize], key);
+                least(&mut last[r as u16 as usize], key);
+                if r - l > 2 {
+                    for x in l..=r {
+                        least(&mut first[x as u16 as usize], key);
+                    }
+                }
+                (from, to) = (from.min(l), to.max(r));
+                i += 1;
+            }
+            let (from, to) = (from as usize, to as usize + 1);
+            let (first, middle, last) = (&mut first[from..to], &mut middle[from..to], &mut last[from..to]);
+            flatten(first, middle, last);
+            for y in (run >> 16) as usize..=(run & 0xffff) as usize {
+                draw_line(first, &mut pixels[y * width + from..y * width + to]);
+            }
+            first.fill(EMPTY);
+        }
+    }
+}
+
+/// The three lines as one, in the first; the others are emptied.
+#[inline(always)]
+fn flatten(first: &mut [u16], middle: &mut [u16], last: &mut [u16]) {
+    for ((first, middle), last) in first.iter_mut().zip(middle).zip(last) {
+        *first = (*first).min(*middle).min(*last);
+        (*middle, *last) = (EMPTY, EMPTY);
+    }
+}
+
+#[inline(always)]
+fn draw_line(line: &[u16], row: &mut [u16]) {
+    for (old, new) in row.iter_mut().zip(line) {
+        *old = (*old).min(*new);
+    }
+}
+
+#[inline(always)]
+fn least(old: &mut u16, new: u16) {
+    *old = (*old).min(new);
 }

@@ -1,13 +1,70 @@
 //! Drawing every 2x2 neighbourhood of depth as two triangles; see [`super::Method::Triangles`].
+#![allow(
+    clippy::needless_bitwise_bool,
+    reason = "a lazy operator is a branch, and branches keep loops from being vectors"
+)]
 
+use super::lens::Lens32;
 use super::target::{Target, key};
-use super::warp::{Place, Seen, Warp};
+use super::warp::{Lane, Numbers, Warp, WithRow};
+use crate::simd::for_every_processor;
 
 /// A neighbourhood whose depths differ by more than this part of the least is the border of an object
 /// (Azure Kinect SDK `src/transformation/rgbz.c`, `skip_interpolation_ratio`).
 const MAX_JUMP: f32 = 0.046_934_42;
 /// A neighbourhood that is drawn wider or higher than this is not one: it is all but in colour's pupil.
 const MAX_SPAN: f32 = 128.0;
+
+/// Where the pixels of a row are seen. A hole, and what colour's lens cannot show, is at NaN.
+#[derive(Debug, Default)]
+struct Seen {
+    u: Vec<f32>,
+    v: Vec<f32>,
+    /// Depth along colour's axis, in units of depth.
+    z: Vec<f32>,
+}
+
+impl Seen {
+    fn new(width: usize) -> Self {
+        Self { u: vec![0.0; width], v: vec![0.0; width], z: vec![0.0; width] }
+    }
+
+    fn fill(&mut self, warp: &Warp, depth: &[u16], unit: f32, row: usize) {
+        warp.with_row(row, depth.len(), Middles { depth, unit, numbers: &warp.numbers, seen: self });
+    }
+}
+
+struct Middles<'a> {
+    depth: &'a [u16],
+    unit: f32,
+    numbers: &'a Numbers,
+    seen: &'a mut Seen,
+}
+
+impl WithRow for Middles<'_> {
+    fn run<Y: Lane, L: Lens32>(self, first: (&[f32], Y), _last: (&[f32], Y), lens: L) {
+        let Seen { u, v, z } = self.seen;
+        middles(self.depth, self.unit, first.0, first.1, lens, self.numbers, u, v, z);
+    }
+}
+
+for_every_processor! {
+    fn middles<Y: Lane, L: Lens32>(
+        depth: &[u16], unit: f32, x: &[f32], y: Y, lens: L, numbers: &Numbers,
+        u: &mut [f32], v: &mut [f32], z: &mut [f32],
+    ) {
+        let n = depth.len();
+        let (x, y, numbers, per_unit) = (&x[..n], y.cut(n), *numbers, 1.0 / unit);
+        let (u, v, z) = (&mut u[..n], &mut v[..n], &mut z[..n]);
+        for i in 0..n {
+            let p = numbers.project(f32::from(depth[i]) * unit, x[i], y.at(i), lens);
+            let seen = (depth[i] != 0) & p.seen;
+            u[i] = if seen { p.u } else { f32::NAN };
+            v[i] = if seen { p.v } else { f32::NAN };
+            z[i] = p.z * per_unit;
+        }
+    }
+}
 
 /// The rows that one thread works with.
 #[derive(Debug)]
@@ -51,13 +108,13 @@ impl TriangleRows {
         target: &mut Target<'_>,
     ) {
         let of = |row: usize| &depth[row * width..(row + 1) * width];
-        warp.row(of(rows.start), unit, rows.start, Place::First, &mut self.below);
+        self.below.fill(warp, of(rows.start), unit, rows.start);
         for row in rows {
             if row + 1 == height {
                 break;
             }
             core::mem::swap(&mut self.above, &mut self.below);
-            warp.row(of(row + 1), unit, row + 1, Place::First, &mut self.below);
+            self.below.fill(warp, of(row + 1), unit, row + 1);
             for x in 1..width {
                 let at = |seen: &Seen, x: usize| Vertex { u: seen.u[x], v: seen.v[x], z: seen.z[x] };
                 let (above, below) = (&self.above, &self.below);
@@ -82,7 +139,7 @@ impl TriangleRows {
         let (last_x, last_y) = (color_width as f32 - 1.0, color_height as f32 - 1.0);
         for (row, out) in rows.zip(out.chunks_exact_mut(width * 3)) {
             let depth = &depth[row * width..(row + 1) * width];
-            warp.row(depth, unit, row, Place::First, &mut self.above);
+            self.above.fill(warp, depth, unit, row);
             for (i, out) in out.chunks_exact_mut(3).enumerate() {
                 let (u, v) = (self.above.u[i], self.above.v[i]);
                 // NaN is outside.
