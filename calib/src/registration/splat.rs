@@ -20,8 +20,13 @@ const MAX_SPAN: i32 = 128;
 /// The columns and rows of a pixel that is not seen.
 const NOWHERE: u32 = u32::MAX;
 
-/// A column of colour for every 16-bit number, so that none need be checked.
-type Line = Box<[u16; 1 << 16]>;
+/// Three lines of colour, for the left, the middle and the right of each pixel: written to one line, each pixel would
+/// wait for the one before. There is a column for every 16-bit number, so that none need be checked.
+type Lines = [u16; 1 << 18];
+/// Where the second and the third line begin: were the same column of each at the same place of a page, the processor
+/// would take writing one for writing the other.
+const MIDDLE: usize = (1 << 16) + 683;
+const LAST: usize = (2 << 16) + 1366;
 
 /// The rows that one thread works with.
 #[derive(Debug)]
@@ -30,21 +35,16 @@ pub(super) struct SplatRows {
     columns: Vec<u32>,
     /// First and last row, likewise.
     rows: Vec<u32>,
-    /// Runs are drawn into three lines, for the left, the middle and the right of each pixel: written to one line, each
-    /// pixel would wait for the one before.
-    lines: [Line; 3],
+    lines: Box<Lines>,
 }
 
 impl SplatRows {
     pub(super) fn new(depth_width: usize) -> Self {
-        let line = || {
-            let line: Result<Line, _> = vec![EMPTY; 1 << 16].into_boxed_slice().try_into();
-            line.unwrap_or_else(|_| Box::new([EMPTY; 1 << 16]))
-        };
+        let lines: Result<Box<Lines>, _> = vec![EMPTY; 1 << 18].into_boxed_slice().try_into();
         Self {
             columns: vec![NOWHERE; depth_width],
             rows: vec![NOWHERE; depth_width],
-            lines: [line(), line(), line()],
+            lines: lines.unwrap_or_else(|_| Box::new([EMPTY; 1 << 18])),
         }
     }
 
@@ -62,8 +62,7 @@ impl SplatRows {
             let depth = &depth[row * width..(row + 1) * width];
             let corners = if warp.spreads { Corners::Both } else { Corners::First };
             self.rectangles(warp, depth, unit, row, corners);
-            let [first, middle, last] = &mut self.lines;
-            draw_row(depth, &self.columns, &self.rows, first, middle, last, target.pixels, target.width);
+            draw_row(depth, &self.columns, &self.rows, &mut self.lines, target.pixels, target.width);
         }
     }
 
@@ -204,40 +203,42 @@ fn whole(at: f32) -> i32 {
 for_every_processor! {
     /// Draws the rectangles of a row.
     fn draw_row(
-        depth: &[u16], columns: &[u32], rows: &[u32], first: &mut [u16; 1 << 16], middle: &mut [u16; 1 << 16],
-        last: &mut [u16; 1 << 16], pixels: &mut [u16], width: usize,
+        depth: &[u16], columns: &[u32], rows: &[u32], lines: &mut Lines, pixels: &mut [u16], width: usize,
     ) {
-        let n = depth.len();
-        let (columns, rows) = (&columns[..n], &rows[..n]);
-        let mut i = 0;
-        while i < n {
-            let run = rows[i];
+        let mut left = depth.len();
+        let (mut depth, mut columns, mut rows) = (depth, &columns[..left], &rows[..left]);
+        while let Some(run) = rows.first().copied() {
+            let n = rows.iter().position(|r| *r != run).unwrap_or(left);
+            let of_run = (&columns[..n], &depth[..n]);
+            (depth, columns, rows) = (&depth[n..], &columns[n..], &rows[n..]);
+            left -= n;
             if run == NOWHERE {
-                i += 1;
                 continue;
             }
             let (mut from, mut to) = (u32::MAX, 0);
-            while i < n && rows[i] == run {
-                let (l, r, key) = (columns[i] >> 16, columns[i] & 0xffff, key(depth[i]));
-                least(&mut first[l as u16 as usize], key);
+            for c in of_run.0 {
+                (from, to) = (from.min(*c), to.max(c & 0xffff));
+            }
+            for (c, z) in of_run.0.iter().zip(of_run.1) {
+                let (l, r, key) = (c >> 16, c & 0xffff, key(*z));
+                least(&mut lines[l as u16 as usize], key);
                 // Of up to three columns this is the one between, or one of them.
-                least(&mut middle[((l + r) >> 1) as u16 as usize], key);
-                least(&mut last[r as u16 as usize], key);
+                least(&mut lines[usize::from(((l + r) >> 1) as u16) + MIDDLE], key);
+                least(&mut lines[usize::from(r as u16) + LAST], key);
                 if r - l > 2 {
                     for x in l..=r {
-                        least(&mut first[x as u16 as usize], key);
+                        least(&mut lines[usize::from(x as u16)], key);
                     }
                 }
-                (from, to) = (from.min(l), to.max(r));
-                i += 1;
             }
-            let (from, to) = (from as usize, to as usize + 1);
-            let (first, middle, last) = (&mut first[from..to], &mut middle[from..to], &mut last[from..to]);
-            flatten(first, middle, last);
+            let (from, to) = ((from >> 16) as usize, to as usize + 1);
+            let (first, others) = lines.split_at_mut(MIDDLE);
+            let (middle, last) = others.split_at_mut(LAST - MIDDLE);
+            flatten(&mut first[from..to], &mut middle[from..to], &mut last[from..to]);
             for y in (run >> 16) as usize..=(run & 0xffff) as usize {
-                draw_line(first, &mut pixels[y * width + from..y * width + to]);
+                draw_line(&first[from..to], &mut pixels[y * width + from..y * width + to]);
             }
-            first.fill(EMPTY);
+            first[from..to].fill(EMPTY);
         }
     }
 }

@@ -15,15 +15,13 @@ pub(super) const fn key(depth: u16) -> u16 {
 pub(super) struct Target<'a> {
     pub(super) pixels: &'a mut [u16],
     pub(super) width: usize,
-    pub(super) height: usize,
 }
 
 impl<'a> Target<'a> {
     /// An empty picture in this memory.
     pub(super) fn new(pixels: &'a mut [u16], width: usize) -> Self {
         pixels.fill(EMPTY);
-        let height = pixels.len() / width;
-        Self { pixels, width, height }
+        Self { pixels, width }
     }
 
     /// From what is compared back to depth.

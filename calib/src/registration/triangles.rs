@@ -5,7 +5,7 @@
 )]
 
 use super::lens::Lens32;
-use super::target::{Target, key};
+use super::target::{EMPTY, Target, key};
 use super::warp::{Lane, Numbers, Warp, WithRow};
 use crate::simd::for_every_processor;
 
@@ -115,11 +115,8 @@ impl TriangleRows {
             }
             core::mem::swap(&mut self.above, &mut self.below);
             self.below.fill(warp, of(row + 1), unit, row + 1);
-            for x in 1..width {
-                let at = |seen: &Seen, x: usize| Vertex { u: seen.u[x], v: seen.v[x], z: seen.z[x] };
-                let (above, below) = (&self.above, &self.below);
-                cell([at(above, x - 1), at(above, x), at(below, x), at(below, x - 1)], target);
-            }
+            let (above, below) = (&self.above, &self.below);
+            cells(&above.u, &above.v, &above.z, &below.u, &below.v, &below.z, target.pixels, target.width);
         }
     }
 
@@ -162,72 +159,93 @@ impl TriangleRows {
     }
 }
 
-/// Draws one neighbourhood, given clockwise from the top left. With one vertex missing it is the triangle of the others.
-fn cell(vertices: [Vertex; 4], target: &mut Target<'_>) {
-    let mut quad = vertices;
-    let mut missing = 0;
-    for (i, vertex) in vertices.iter().enumerate() {
-        if !vertex.is_seen() {
-            missing += 1;
-            // On the edge between its neighbours; the two halves then lie along the other diagonal or this one.
-            quad[i] = vertices[(i + 3) % 4].middle(vertices[(i + 1) % 4]);
+for_every_processor! {
+    /// Draws the neighbourhoods between two rows.
+    fn cells(
+        u0: &[f32], v0: &[f32], z0: &[f32], u1: &[f32], v1: &[f32], z1: &[f32], pixels: &mut [u16], width: usize,
+    ) {
+        let n = u0.len();
+        let (v0, z0, u1, v1, z1) = (&v0[..n], &z0[..n], &u1[..n], &v1[..n], &z1[..n]);
+        let height = pixels.len() / width;
+        for x in 1..n {
+            let above = |x: usize| Vertex { u: u0[x], v: v0[x], z: z0[x] };
+            let below = |x: usize| Vertex { u: u1[x], v: v1[x], z: z1[x] };
+            cell([above(x - 1), above(x), below(x), below(x - 1)], pixels, (width, height));
         }
     }
-    if missing > 1 {
+}
+
+/// Draws one neighbourhood, given clockwise from the top left. With one vertex missing it is the triangle of the others.
+#[inline(always)]
+fn cell(vertices: [Vertex; 4], pixels: &mut [u16], (width, height): (usize, usize)) {
+    let mut quad = vertices;
+    if !vertices.iter().all(|v| v.is_seen()) && !mend(&mut quad) {
         return;
     }
-    // A vertex on the diagonal makes one half flat, so the cut goes through it.
-    let turn = usize::from(!vertices[1].is_seen() || !vertices[3].is_seen());
-    quad.rotate_left(turn);
-    let near = quad.iter().fold(f32::INFINITY, |least, v| least.min(v.z));
-    let far = quad.iter().fold(0.0f32, |most, v| most.max(v.z));
+    let [a, b, c, d] = quad;
+    let (near, far) = (a.z.min(b.z).min(c.z).min(d.z), a.z.max(b.z).max(c.z).max(d.z));
     if far - near > MAX_JUMP * near {
         return;
     }
-    let (mut u0, mut u1, mut v0, mut v1) =
-        (f32::INFINITY, f32::NEG_INFINITY, f32::INFINITY, f32::NEG_INFINITY);
-    for p in &quad {
-        (u0, u1) = (u0.min(p.u), u1.max(p.u));
-        (v0, v1) = (v0.min(p.v), v1.max(p.v));
-    }
+    let (u0, u1) = (a.u.min(b.u).min(c.u).min(d.u), a.u.max(b.u).max(c.u).max(d.u));
+    let (v0, v1) = (a.v.min(b.v).min(c.v).min(d.v), a.v.max(b.v).max(c.v).max(d.v));
     if u1 - u0 > MAX_SPAN || v1 - v0 > MAX_SPAN {
         return;
     }
     let clip = |at: f32, end: usize| at.ceil().clamp(0.0, end as f32) as usize;
-    let (x0, x1) = (clip(u0, target.width), clip(u1, target.width));
-    let (y0, y1) = (clip(v0, target.height), clip(v1, target.height));
+    let (x0, x1) = (clip(u0, width), clip(u1, width));
+    let (y0, y1) = (clip(v0, height), clip(v1, height));
     for y in y0..y1 {
-        let row = &mut target.pixels[y * target.width..(y + 1) * target.width];
-        for (x, pixel) in row.iter_mut().enumerate().take(x1).skip(x0) {
-            if let Some(z) = inside(&quad, x as f32, y as f32) {
-                // Depth beyond 16 bits is out of range: no pixel.
-                if z < 65_535.5 {
-                    *pixel = (*pixel).min(key((z + 0.5) as u16));
-                }
-            }
+        // A box of which nothing is left in the picture ends before it begins.
+        let Some(row) = pixels.get_mut(y * width + x0..y * width + x1) else { return };
+        for (i, pixel) in row.iter_mut().enumerate() {
+            *pixel = (*pixel).min(inside(&quad, (x0 + i) as f32, y as f32));
         }
     }
 }
 
+/// Puts a vertex for the one that is missing; `false` when more are.
+fn mend(quad: &mut [Vertex; 4]) -> bool {
+    let vertices = *quad;
+    let mut missing = 0;
+    for (i, vertex) in vertices.iter().enumerate() {
+        if !vertex.is_seen() {
+            missing += 1;
+            quad[i] = vertices[(i + 3) % 4].middle(vertices[(i + 1) % 4]);
+        }
+    }
+    // It lies on one diagonal, and makes one half flat unless the cut goes through it.
+    if !vertices[1].is_seen() || !vertices[3].is_seen() {
+        quad.rotate_left(1);
+    }
+    missing == 1
+}
+
 /// Twice the area of the triangle `a`, `b`, (x, y); its sign tells on which side of the line the point is.
+#[inline(always)]
 fn area(a: Vertex, b: Vertex, x: f32, y: f32) -> f32 {
     (y - a.v) * (b.u - a.u) - (x - a.u) * (b.v - a.v)
 }
 
-/// Depth at a point of one of the two halves, cut from the first vertex to the third. Edges on the first side belong to
-/// the neighbourhood and those on the other to the next one, so that each point is drawn once.
-fn inside(quad: &[Vertex; 4], x: f32, y: f32) -> Option<f32> {
+/// The key of the depth at a point of one of the two halves, cut from the first vertex to the third; [`EMPTY`] outside.
+/// Edges on the first side belong to the neighbourhood and those on the other to the next one, so that each point is
+/// drawn once.
+#[inline(always)]
+fn inside(quad: &[Vertex; 4], x: f32, y: f32) -> u16 {
     let [first, second, third, fourth] = *quad;
     let between = area(first, third, x, y);
     let side = between >= 0.0;
-    let corner = if side { fourth } else { second };
+    let corner = Vertex {
+        u: if side { fourth.u } else { second.u },
+        v: if side { fourth.v } else { second.v },
+        z: if side { fourth.z } else { second.z },
+    };
     let sign = if side { 1.0 } else { -1.0 };
     let to_first = area(corner, first, x, y);
     let to_third = area(third, corner, x, y);
-    if to_first * sign < 0.0 || to_third * sign <= 0.0 {
-        return None;
-    }
     let sum = to_first + between + to_third;
     let z = (to_first * third.z + between * corner.z + to_third * first.z) / sum;
-    (sum != 0.0).then_some(z)
+    let inside = (to_first * sign >= 0.0) & (to_third * sign > 0.0) & (sum != 0.0);
+    // Depth beyond 16 bits is out of range: no pixel.
+    if inside & (z < 65_535.5) { key((z + 0.5) as u16) } else { EMPTY }
 }
