@@ -1,4 +1,5 @@
 //! What registration costs at 1280x720: `cargo bench -p depthrig-calib`.
+#![allow(clippy::unwrap_used)]
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use depthrig_bus::{Distortion, Intrinsics, Pose};

@@ -108,7 +108,11 @@ impl Camera {
     pub fn project_with_jacobian(&self, p: DVec3) -> Option<Projection> {
         let at = self.seen(p)?;
         let (d, j) = self.lens.distort_with_jacobian(at);
-        let by_coeffs = self.lens.by_coeffs(at);
+        // A coefficient that is 0 matters too: a calibration may begin there.
+        let mut by_coeffs = Lens::of_model(&self.intrinsics).by_coeffs(at);
+        if self.intrinsics.distortion() == Distortion::BrownConrady {
+            by_coeffs[5..].fill(DVec2::ZERO);
+        }
         let Intrinsics { fx, fy, .. } = self.intrinsics;
         // (x, y) = (X, Y) / Z.
         let row = |f: f64, dx: f64, dy: f64| DVec3::new(dx, dy, -(dx * at.x + dy * at.y)) * (f / p.z);

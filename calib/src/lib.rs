@@ -1,16 +1,20 @@
 //! Camera geometry: lens models, poses, and pictures of one camera in the view of another.
 //!
 //! Floor 2. Mathematics on the types that travel in a frame header; no I/O. Start at [`Camera`] (from a point to a
-//! pixel and back) and [`Registration`] (depth in the view of colour).
+//! pixel and back) and [`Registration`] (depth in the view of colour). [`Deprojection`] makes point clouds, [`Undistortion`] other pictures of the same view.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 mod camera;
+mod cloud;
 mod error;
 mod pose;
 mod registration;
 mod simd;
+mod undistort;
 
 pub use camera::{Camera, CameraExt, Projection, Ray};
+pub use cloud::{Deprojection, PointCloud, write_pcd, write_ply};
 pub use error::{Error, ErrorKind, Result};
 pub use pose::PoseExt;
 pub use registration::{Method, Registration, same_view};
+pub use undistort::Undistortion;

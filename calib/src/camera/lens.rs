@@ -29,17 +29,23 @@ pub(crate) enum Lens {
 const NEAR_AXIS: f64 = 1e-4;
 
 impl Lens {
-    /// The lens of `k`. Coefficients that the model does not have are ignored, whatever they hold.
+    /// The lens of `k`, [`Lens::None`] when it bends nothing.
     pub(crate) fn new(k: &Intrinsics) -> Self {
+        match Self::of_model(k) {
+            Self::Rational([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+            | Self::InverseBrownConrady([0.0, 0.0, 0.0, 0.0, 0.0]) => Self::None,
+            // Without coefficients a fisheye is still one.
+            lens => lens,
+        }
+    }
+
+    /// The lens of `k`, whatever its coefficients. Those that the model does not have are ignored, whatever they hold.
+    pub(crate) fn of_model(k: &Intrinsics) -> Self {
         let [k1, k2, p1, p2, k3, ..] = k.coeffs;
-        let five = [k1, k2, p1, p2, k3];
         match k.distortion() {
-            Distortion::BrownConrady if five != [0.0; 5] => {
-                Self::Rational([k1, k2, p1, p2, k3, 0.0, 0.0, 0.0])
-            }
-            Distortion::InverseBrownConrady if five != [0.0; 5] => Self::InverseBrownConrady(five),
-            Distortion::Rational if k.coeffs != [0.0; 8] => Self::Rational(k.coeffs),
-            // Without coefficients it is still a fisheye.
+            Distortion::BrownConrady => Self::Rational([k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]),
+            Distortion::InverseBrownConrady => Self::InverseBrownConrady([k1, k2, p1, p2, k3]),
+            Distortion::Rational => Self::Rational(k.coeffs),
             Distortion::KannalaBrandt4 => Self::KannalaBrandt([k1, k2, p1, p2]),
             _ => Self::None,
         }

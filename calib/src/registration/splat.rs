@@ -22,7 +22,8 @@ const NOWHERE: u32 = u32::MAX;
 
 /// Three lines of colour, for the left, the middle and the right of each pixel: written to one line, each pixel would
 /// wait for the one before. There is a column for every 16-bit number, so that none need be checked.
-type Lines = [u16; 1 << 18];
+type Lines = [u16; LINES];
+const LINES: usize = 1 << 18;
 /// Where the second and the third line begin: were the same column of each at the same place of a page, the processor
 /// would take writing one for writing the other.
 const MIDDLE: usize = (1 << 16) + 683;
@@ -35,16 +36,16 @@ pub(super) struct SplatRows {
     columns: Vec<u32>,
     /// First and last row, likewise.
     rows: Vec<u32>,
-    lines: Box<Lines>,
+    /// [`Lines`].
+    lines: Vec<u16>,
 }
 
 impl SplatRows {
     pub(super) fn new(depth_width: usize) -> Self {
-        let lines: Result<Box<Lines>, _> = vec![EMPTY; 1 << 18].into_boxed_slice().try_into();
         Self {
             columns: vec![NOWHERE; depth_width],
             rows: vec![NOWHERE; depth_width],
-            lines: lines.unwrap_or_else(|_| Box::new([EMPTY; 1 << 18])),
+            lines: vec![EMPTY; LINES],
         }
     }
 
@@ -62,7 +63,9 @@ impl SplatRows {
             let depth = &depth[row * width..(row + 1) * width];
             let corners = if warp.spreads { Corners::Both } else { Corners::First };
             self.rectangles(warp, depth, unit, row, corners);
-            draw_row(depth, &self.columns, &self.rows, &mut self.lines, target.pixels, target.width);
+            if let Some(lines) = self.lines.first_chunk_mut() {
+                draw_row(depth, &self.columns, &self.rows, lines, target.pixels, target.width);
+            }
         }
     }
 
@@ -124,7 +127,7 @@ impl WithRow for Rectangles<'_> {
         let Self { depth, unit, corners, numbers, columns, rows } = self;
         match corners {
             Corners::Both => {
-                both(depth, unit, first.0, first.1, last.0, last.1, lens, numbers, columns, rows)
+                both(depth, unit, first.0, first.1, last.0, last.1, lens, numbers, columns, rows);
             }
             Corners::First => one(depth, unit, first.0, first.1, lens, numbers, columns, rows),
             Corners::Last => one(depth, unit, last.0, last.1, lens, numbers, columns, rows),

@@ -1,4 +1,5 @@
 //! Drawing every 2x2 neighbourhood of depth as two triangles; see [`super::Method::Triangles`].
+#![allow(clippy::inline_always, reason = "what is not inlined is compiled for the oldest processor")]
 #![allow(
     clippy::needless_bitwise_bool,
     reason = "a lazy operator is a branch, and branches keep loops from being vectors"
@@ -65,6 +66,10 @@ for_every_processor! {
         }
     }
 }
+
+/// How far outside of its edges, pixels, a half is drawn: neighbours then leave no gap where a pixel lies on an edge
+/// exactly or rounding puts it there.
+const EDGE: f32 = 1e-3;
 
 /// The rows that one thread works with.
 #[derive(Debug)]
@@ -192,14 +197,14 @@ fn cell(vertices: [Vertex; 4], pixels: &mut [u16], (width, height): (usize, usiz
     if u1 - u0 > MAX_SPAN || v1 - v0 > MAX_SPAN {
         return;
     }
-    let clip = |at: f32, end: usize| at.ceil().clamp(0.0, end as f32) as usize;
-    let (x0, x1) = (clip(u0, width), clip(u1, width));
-    let (y0, y1) = (clip(v0, height), clip(v1, height));
+    let clip = |at: f32, end: usize| at.clamp(0.0, end as f32) as usize;
+    let (x0, x1) = (clip((u0 - EDGE).ceil(), width), clip((u1 + EDGE).floor() + 1.0, width));
+    let (y0, y1) = (clip((v0 - EDGE).ceil(), height), clip((v1 + EDGE).floor() + 1.0, height));
     for y in y0..y1 {
         // A box of which nothing is left in the picture ends before it begins.
         let Some(row) = pixels.get_mut(y * width + x0..y * width + x1) else { return };
         for (i, pixel) in row.iter_mut().enumerate() {
-            *pixel = (*pixel).min(inside(&quad, (x0 + i) as f32, y as f32));
+            *pixel = (*pixel).min(inside(&quad, (near, far), (x0 + i) as f32, y as f32));
         }
     }
 }
@@ -228,10 +233,8 @@ fn area(a: Vertex, b: Vertex, x: f32, y: f32) -> f32 {
 }
 
 /// The key of the depth at a point of one of the two halves, cut from the first vertex to the third; [`EMPTY`] outside.
-/// Edges on the first side belong to the neighbourhood and those on the other to the next one, so that each point is
-/// drawn once.
 #[inline(always)]
-fn inside(quad: &[Vertex; 4], x: f32, y: f32) -> u16 {
+fn inside(quad: &[Vertex; 4], (near, far): (f32, f32), x: f32, y: f32) -> u16 {
     let [first, second, third, fourth] = *quad;
     let between = area(first, third, x, y);
     let side = between >= 0.0;
@@ -245,7 +248,10 @@ fn inside(quad: &[Vertex; 4], x: f32, y: f32) -> u16 {
     let to_third = area(third, corner, x, y);
     let sum = to_first + between + to_third;
     let z = (to_first * third.z + between * corner.z + to_third * first.z) / sum;
-    let inside = (to_first * sign >= 0.0) & (to_third * sign > 0.0) & (sum != 0.0);
+    let inside = (to_first * sign >= -EDGE) & (to_third * sign >= -EDGE) & (sum != 0.0);
+    // A half that is nearly flat has no weights to trust.
+    let z = if z > near { z } else { near };
+    let z = if z < far { z } else { far };
     // Depth beyond 16 bits is out of range: no pixel.
     if inside & (z < 65_535.5) { key((z + 0.5) as u16) } else { EMPTY }
 }

@@ -132,7 +132,12 @@ impl Warp {
 
 /// Whether librealsense would use both corners of a pixel: where colour has more pixels per angle than depth on one of
 /// the axes (`align_depth_to_other_sse` and `rs2_fov`), and for two pairs of sizes.
-fn spreads(depth: &Camera, depth_size: (usize, usize), color: &Camera, color_size: (usize, usize)) -> bool {
+pub(super) fn spreads(
+    depth: &Camera,
+    depth_size: (usize, usize),
+    color: &Camera,
+    color_size: (usize, usize),
+) -> bool {
     let density = |camera: &Camera, (w, h): (usize, usize)| {
         let k = camera.intrinsics();
         let angle = |c: f64, f: f64, n: usize| ((c + 0.5) / f).atan() + ((n as f64 - c - 0.5) / f).atan();

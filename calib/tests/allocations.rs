@@ -1,0 +1,99 @@
+//! What is done for every frame takes no memory: counted by an allocator.
+#![allow(unsafe_code)] // a global allocator is unsafe to write
+#![allow(clippy::unwrap_used)]
+
+use core::cell::Cell;
+use depthrig_bus::{Distortion, Intrinsics, Pose};
+use depthrig_calib::{Deprojection, Method, PointCloud, Registration, Undistortion};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+struct Counting;
+
+static COUNT: AtomicU64 = AtomicU64::new(0);
+
+thread_local! {
+    static OWN: Cell<u64> = const { Cell::new(0) };
+}
+
+// SAFETY: everything is handed on to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        COUNT.fetch_add(1, Ordering::Relaxed);
+        OWN.set(OWN.get() + 1);
+        // SAFETY: as the caller promises.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        // SAFETY: as the caller promises.
+        unsafe { System.dealloc(ptr, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// How often `work` takes memory on this thread.
+fn allocations(work: impl FnOnce()) -> u64 {
+    let before = OWN.get();
+    work();
+    OWN.get() - before
+}
+
+/// How often anything takes memory while `work` runs.
+fn all_allocations(work: impl FnOnce()) -> u64 {
+    let before = COUNT.load(Ordering::Relaxed);
+    work();
+    COUNT.load(Ordering::Relaxed) - before
+}
+
+/// One test alone: others in this program would be counted too.
+#[test]
+fn a_frame_takes_no_memory() {
+    let size = (160, 120);
+    let k = Intrinsics::pinhole(150.0, 150.0, 79.5, 59.5);
+    let coeffs = [-0.05, 0.06, 0.0007, 0.0002, -0.02, 0.0, 0.0, 0.0];
+    let bent = Intrinsics { coeffs, model: Distortion::InverseBrownConrady as u32, ..k };
+    let pose = Pose { translation_m: [0.015, 0.0, 0.0], ..Pose::IDENTITY };
+    let depth: Vec<u16> =
+        (0..160 * 120).map(|i| if i % 17 == 0 { 0 } else { 700 + (i % 160) as u16 }).collect();
+    let color = vec![7; 160 * 120 * 3];
+    let (mut z, mut rgb) = (vec![0; 160 * 120], vec![0; 160 * 120 * 3]);
+    for method in [Method::Splat, Method::Triangles] {
+        for (d, c) in [(&k, &k), (&k, &bent), (&bent, &bent)] {
+            let mut one = Registration::new(d, size, c, size, &pose, method).unwrap();
+            assert_eq!(
+                allocations(|| for _ in 0..3 {
+                    one.depth_to_color(&depth, 0.001, &mut z).unwrap();
+                    one.color_to_depth(&depth, 0.001, &color, &mut rgb).unwrap();
+                }),
+                0,
+                "{method:?}"
+            );
+            // Handing a frame over to threads takes a block of a queue every 31st time or more seldom.
+            let mut several = one.with_threads(3);
+            for _ in 0..5 {
+                several.depth_to_color(&depth, 0.001, &mut z).unwrap();
+            }
+            let taken = all_allocations(|| {
+                for _ in 0..62 {
+                    several.depth_to_color(&depth, 0.001, &mut z).unwrap();
+                }
+            });
+            assert!(taken <= 4, "{method:?}: {taken} in 62 frames");
+        }
+    }
+    let deprojection = Deprojection::new(&bent, size).unwrap();
+    let mut cloud = PointCloud::default();
+    deprojection.cloud(&depth, 0.001, Some(&color), &mut cloud).unwrap();
+    assert_eq!(allocations(|| deprojection.cloud(&depth, 0.001, Some(&color), &mut cloud).unwrap()), 0);
+    let map = Undistortion::new((&bent, size), (&k, size), glam::DMat3::IDENTITY).unwrap();
+    assert_eq!(
+        allocations(|| {
+            map.bytes::<3>(&color, &mut rgb).unwrap();
+            map.depth(&depth, &mut z).unwrap();
+        }),
+        0
+    );
+}
