@@ -11,6 +11,7 @@ mod candle;
 mod durable;
 mod error;
 mod factory;
+pub mod fetch;
 mod fill;
 pub mod metrics;
 mod model;

@@ -66,7 +66,7 @@ pub use session::{
     rename,
 };
 pub use slice::{Derived, SliceOptions, SliceProgress, SliceReport, merge, trim};
-pub use still::{StillFormat, still};
+pub use still::{StillFormat, npy_file, still};
 pub use verify::{
     Finding, Severity, VerifyOptions, VerifyProgress, VerifyReport, verify, verify_watched, verify_with,
 };

@@ -113,31 +113,38 @@ fn png(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Result<Vec<u8>> {
     Ok(out)
 }
 
-/// NPY version 1.0: <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>.
+/// The pixels of a frame as a NumPy array.
 fn npy(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Vec<u8> {
-    let (height, width) = (h.height, h.width);
+    let (height, width) = (h.height as usize, h.width as usize);
     let kind = match format {
         PixelFormat::Mono16 | PixelFormat::Z16 => "<u2",
         PixelFormat::DepthF32 => "<f4",
         _ => "|u1",
     };
-    let shape = match format {
-        PixelFormat::Rgb8 | PixelFormat::Bgr8 => format!("({height}, {width}, 3)"),
-        PixelFormat::Yuyv | PixelFormat::Uyvy => format!("({height}, {width}, 2)"),
+    match format {
+        PixelFormat::Rgb8 | PixelFormat::Bgr8 => npy_file(kind, &[height, width, 3], pixels),
+        PixelFormat::Yuyv | PixelFormat::Uyvy => npy_file(kind, &[height, width, 2], pixels),
         // The rows of both planes: all of Y, then half as many of U and V in turns.
-        PixelFormat::Nv12 => format!("({}, {width})", pixels.len() / width.max(1) as usize),
-        _ => format!("({height}, {width})"),
-    };
-    let mut text = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}");
+        PixelFormat::Nv12 => npy_file(kind, &[pixels.len() / width.max(1), width], pixels),
+        _ => npy_file(kind, &[height, width], pixels),
+    }
+}
+
+/// An NPY file (form 1.0) of an array of two or more dimensions, row-major; `kind` is NumPy's name of its numbers, such as
+/// `<f4` for 32-bit floats. <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>.
+pub fn npy_file(kind: &str, shape: &[usize], data: &[u8]) -> Vec<u8> {
+    let shape: Vec<_> = shape.iter().map(ToString::to_string).collect();
+    let mut text =
+        format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({}), }}", shape.join(", "));
     // Magic, version and length are ten bytes; the data begins at a multiple of 64, after a newline.
     let padding = (64 - (10 + text.len() + 1) % 64) % 64;
     text.extend(std::iter::repeat_n(' ', padding));
     text.push('\n');
-    let mut out = Vec::with_capacity(10 + text.len() + pixels.len());
+    let mut out = Vec::with_capacity(10 + text.len() + data.len());
     out.extend_from_slice(b"\x93NUMPY\x01\x00");
     out.extend_from_slice(&(text.len() as u16).to_le_bytes());
     out.extend_from_slice(text.as_bytes());
-    out.extend_from_slice(pixels);
+    out.extend_from_slice(data);
     out
 }
 

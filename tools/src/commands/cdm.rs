@@ -4,6 +4,8 @@ use crate::context::Context;
 use crate::exit::Exit;
 use anyhow::Result;
 
+pub mod fetch;
+pub mod run;
 pub mod seeded;
 pub mod store;
 
@@ -14,8 +16,10 @@ docs/cdm.md tells the way from a downloaded checkpoint to a policy that reads re
 Exit codes: 0 good, 1 failed, 2 wrong usage or configuration.
 
 Examples:
+  depthrig cdm fetch cdm-d435
   depthrig cdm import cdm_d435.ckpt
   depthrig cdm list
+  depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.001 --model cdm-d435 --out refined.npy
   depthrig cdm seeded vits --out untrained-vits.safetensors";
 
 /// What to do.
@@ -24,6 +28,9 @@ pub enum CdmCommand {
     /// Install a checkpoint, all of which is verified
     #[command(after_help = store::IMPORT_EXAMPLES)]
     Import(store::ImportArgs),
+    /// Fetch a published model and install it; what was cut goes on where it ended
+    #[command(after_help = fetch::EXAMPLES)]
+    Fetch(fetch::FetchArgs),
     /// List the installed models, or the published ones
     #[command(after_help = store::LIST_EXAMPLES)]
     List(store::ListArgs),
@@ -32,6 +39,9 @@ pub enum CdmCommand {
     Info(store::InfoArgs),
     /// Remove an installed model; who uses it keeps it until they let go
     Remove(store::RemoveArgs),
+    /// Refine the depth of one pair of pictures
+    #[command(after_help = run::EXAMPLES)]
+    Run(run::RunArgs),
     /// Write a model of random numbers, for demonstrations and tests: what it gives is no depth
     #[command(after_help = seeded::EXAMPLES)]
     Seeded(seeded::SeededArgs),
@@ -41,9 +51,11 @@ pub enum CdmCommand {
 pub fn run(command: &CdmCommand, context: &Context) -> Result<Exit> {
     match command {
         CdmCommand::Import(args) => store::import(args, context),
+        CdmCommand::Fetch(args) => fetch::run(args, context),
         CdmCommand::List(args) => store::list(args),
         CdmCommand::Info(args) => store::info(args),
         CdmCommand::Remove(args) => store::remove(args),
+        CdmCommand::Run(args) => run::run(args),
         CdmCommand::Seeded(args) => seeded::run(args),
     }
 }

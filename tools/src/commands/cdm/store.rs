@@ -208,10 +208,10 @@ struct Refused<'a> {
 pub fn import(args: &ImportArgs, context: &Context) -> Result<Exit> {
     let ImportArgs { file, name, encoder, settings, models, json } = args;
     let name = name.clone().map_or_else(|| name_of(file), Ok)?;
-    let store = models.store()?;
+    let (store, stop) = (models.store()?, Stop::on_signals()?);
     let installed = Weights::open(file).and_then(|weights| {
         let source = Source::file(&weights);
-        install(&store, &weights, settings.import(&name, *encoder, source), context)
+        install(&store, &weights, settings.import(&name, *encoder, source), &stop, context)
     });
     let installed = match installed {
         Err(e) if *json && e.kind() == ErrorKind::BadModel => {
@@ -233,9 +233,9 @@ pub fn install(
     store: &ModelStore,
     weights: &Weights,
     import: Import,
+    stop: &Stop,
     context: &Context,
 ) -> depthrig_cdm::Result<Installed> {
-    let stop = Stop::on_signals().map_err(|e| depthrig_cdm::Error::new(ErrorKind::Io, e.to_string()))?;
     let mut bar = Progress::new(context.global.quiet > 0);
     store.import(weights, import, &mut |what, done, total| {
         bar.set(what, done >> 20, total >> 20);

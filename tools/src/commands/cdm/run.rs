@@ -1,0 +1,337 @@
+//! `depthrig cdm run`: refined depth of one pair of pictures.
+
+use super::store::{Channels, Models, usage};
+use crate::exit::{Exit, UsageError};
+use crate::out;
+use anyhow::{Context as _, Result};
+use depthrig_cdm::{
+    Color, ColorFormat, EngineKind, Job, Output, Precision, RawDepth, RefinerOptions, StepTimes, refiner,
+};
+use image::{DynamicImage, ExtendedColorType, ImageEncoder, codecs::png};
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+Colour and depth must show the same view at the same size: depth registered to colour.
+
+OUT.npy holds 32-bit floats, metres (0 where there is none), or 1/m as the network gives them with --inverse.
+OUT.png holds 16 bits in units of --out-unit.
+
+Exit codes: 0 good, 1 failed, 2 wrong usage or pictures that do not fit.
+
+Examples:
+  depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.001 --model cdm-d435 --out refined.npy
+  depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.0001 --model cdm_d405.ckpt --input-size 252 \\
+      --inverse --out inverse.npy
+  depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.001 --engine fill --out filled.png";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct RunArgs {
+    /// Colour, PNG or JPEG
+    #[arg(long, value_name = "FILE")]
+    rgb: PathBuf,
+    /// Raw depth in the view of colour, a PNG of 16 bits; 0 is a hole
+    #[arg(long, value_name = "FILE")]
+    depth: PathBuf,
+    /// Metres per unit of the raw depth
+    #[arg(long, value_name = "METRES", value_parser = unit)]
+    depth_unit: f64,
+    /// The name of an installed model, or a checkpoint file
+    #[arg(long, value_name = "NAME|FILE", required_unless_present = "engine")]
+    model: Option<String>,
+    /// The shorter side of the network's input, pixels [default: the model's]
+    #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(14..=8192))]
+    input_size: Option<u32>,
+    /// What runs: onnxruntime, candle or fill (needs no model) [default: onnxruntime]
+    #[arg(long, value_name = "ENGINE", value_parser = engine)]
+    engine: Option<EngineKind>,
+    /// Write what the network gives: inverse depth, 1/m
+    #[arg(long)]
+    inverse: bool,
+    /// The file to write, .npy or .png
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Metres per unit of a PNG that is written
+    #[arg(long, value_name = "METRES", value_parser = unit, default_value_t = 0.001)]
+    out_unit: f64,
+    /// Order of the colour channels, in place of the model's
+    #[arg(long, value_enum, value_name = "ORDER")]
+    channel_order: Option<Channels>,
+    /// Raw depth beyond this is a hole, metres, in place of the model's
+    #[arg(long, value_name = "METRES", value_parser = metres)]
+    max_depth: Option<f64>,
+    /// Numbers that the network computes with: fp32, fp16 or bf16
+    #[arg(long, value_name = "PRECISION", default_value = "fp32", value_parser = precision)]
+    precision: Precision,
+    /// Where it runs: cpu, cuda:0, tensorrt:0 or openvino
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    device: String,
+    /// Threads on the CPU; all cores when not given
+    #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true)]
+    threads: usize,
+    /// The library of ONNX Runtime, when it is not to be looked for
+    #[arg(long, value_name = "FILE")]
+    library: Option<PathBuf>,
+    #[command(flatten)]
+    models: Models,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Reads the name of an engine.
+///
+/// # Errors
+/// When there is none of that name.
+pub fn engine(text: &str) -> Result<EngineKind, String> {
+    text.parse().map_err(|e: depthrig_cdm::Error| e.to_string())
+}
+
+/// Reads the name of a precision.
+///
+/// # Errors
+/// When there is none of that name.
+pub fn precision(text: &str) -> Result<Precision, String> {
+    text.parse().map_err(|e: depthrig_cdm::Error| e.to_string())
+}
+
+/// Metres per unit of depth.
+fn unit(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(unit) if unit > 0.0 && unit <= 1.0 => Ok(unit),
+        _ => Err("write the metres of one unit, such as 0.001 for millimetres".to_owned()),
+    }
+}
+
+fn metres(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(m) if m > 0.0 && m.is_finite() => Ok(m),
+        _ => Err("write metres above 0, such as 6".to_owned()),
+    }
+}
+
+/// What was done.
+#[derive(Debug, Serialize)]
+struct Report<'a> {
+    out: &'a Path,
+    width: usize,
+    height: usize,
+    /// What the numbers of the file are: `metres`, `inverse metres`, or `units` of a PNG.
+    values: &'static str,
+    /// Metres per unit of a PNG.
+    unit_m: Option<f64>,
+    engine: &'a str,
+    /// Empty when the engine needs none.
+    model: &'a str,
+    /// Whether the model was ever trained; none when there is no model.
+    trained: Option<bool>,
+    /// Pixels with raw depth, percent.
+    raw_percent: f64,
+    /// Pixels with refined depth, percent.
+    refined_percent: f64,
+    prepare_ms: f64,
+    infer_ms: f64,
+    finish_ms: f64,
+}
+
+/// How the result is kept.
+enum Refined {
+    Units(Vec<u16>),
+    Floats(Vec<f32>),
+}
+
+/// Refines.
+pub fn run(args: &RunArgs) -> Result<Exit> {
+    let as_png = form(args)?;
+    let (color, width, height) = read_color(&args.rgb)?;
+    let depth = read_depth(&args.depth, &args.rgb, (width, height))?;
+    let options = options(args)?;
+    let trained = options.model.as_ref().map(depthrig_cdm::Model::is_trained);
+    let mut refiner = refiner(&options).map_err(usage)?;
+    let mut refined =
+        if as_png { Refined::Units(vec![0; depth.len()]) } else { Refined::Floats(vec![0.0; depth.len()]) };
+    let mut job = Job {
+        color: Color { pixels: &color, format: ColorFormat::Rgb8, width, height, stride: 3 * width },
+        depth: RawDepth { pixels: &depth, unit_m: args.depth_unit },
+        out: match &mut refined {
+            Refined::Units(pixels) => Output::Units { pixels, unit_m: args.out_unit },
+            Refined::Floats(pixels) if args.inverse => Output::Inverse(pixels),
+            Refined::Floats(pixels) => Output::Metres(pixels),
+        },
+        steps: StepTimes::default(),
+    };
+    refiner.refine(core::slice::from_mut(&mut job)).map_err(usage)?;
+    let steps = job.steps;
+    write(&args.out, &refined, width, height)?;
+    let described = refiner.describe();
+    let share = |n: usize| 100.0 * n as f64 / depth.len() as f64;
+    let seen = match &refined {
+        Refined::Units(p) => p.iter().filter(|d| **d > 0).count(),
+        Refined::Floats(p) => p.iter().filter(|d| d.is_finite() && **d > 0.0).count(),
+    };
+    let report = Report {
+        out: &args.out,
+        width,
+        height,
+        values: if as_png {
+            "units"
+        } else if args.inverse {
+            "inverse metres"
+        } else {
+            "metres"
+        },
+        unit_m: as_png.then_some(args.out_unit),
+        engine: &described.engine,
+        model: &described.model,
+        trained,
+        raw_percent: share(depth.iter().filter(|d| **d > 0 && **d < u16::MAX).count()),
+        refined_percent: share(seen),
+        prepare_ms: steps.prepare_ns as f64 / 1e6,
+        infer_ms: steps.infer_ns as f64 / 1e6,
+        finish_ms: steps.finish_ns as f64 / 1e6,
+    };
+    tell(&report, args.json)?;
+    Ok(Exit::Good)
+}
+
+fn tell(r: &Report<'_>, json: bool) -> Result<()> {
+    if json {
+        return out::json(r);
+    }
+    let model = if r.model.is_empty() { String::new() } else { format!(", model {}", r.model) };
+    out::line(format_args!(
+        "{}: {}x{}, {}; {}{model}; depth in {:.1} % of the pixels, {:.1} % before; {:.0} + {:.0} + {:.0} ms",
+        r.out.display(),
+        r.width,
+        r.height,
+        r.values,
+        r.engine,
+        r.refined_percent,
+        r.raw_percent,
+        r.prepare_ms,
+        r.infer_ms,
+        r.finish_ms
+    ))?;
+    if r.trained == Some(false) {
+        out::line("the model was NEVER TRAINED: its numbers are random, and what it gives is no depth")?;
+    }
+    Ok(())
+}
+
+/// Whether a PNG is asked for.
+fn form(args: &RunArgs) -> Result<bool> {
+    let ending = args.out.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
+    match ending.as_str() {
+        "npy" => Ok(false),
+        "png" if args.inverse => Err(UsageError(
+            "--inverse gives 1/m, which a PNG of whole numbers cannot hold; write a .npy".to_owned(),
+        )
+        .into()),
+        "png" => Ok(true),
+        _ => Err(UsageError(format!("{}: the result is a .npy or a .png", args.out.display())).into()),
+    }
+}
+
+fn options(args: &RunArgs) -> Result<RefinerOptions> {
+    let model = match &args.model {
+        Some(_) if args.engine == Some(EngineKind::Fill) => None, // it needs none
+        Some(name) => {
+            let mut model = args.models.store()?.model(name).map_err(usage)?;
+            if let Some(order) = args.channel_order {
+                model.channel_order = order.into();
+            }
+            if let Some(max) = args.max_depth {
+                model.max_depth_m = max;
+            }
+            Some(model)
+        }
+        None => None,
+    };
+    Ok(RefinerOptions {
+        engine: args.engine,
+        model,
+        input_size: args.input_size,
+        precision: args.precision,
+        device: args.device.clone(),
+        threads: args.threads,
+        library: args.library.clone(),
+    })
+}
+
+fn decode(path: &Path) -> Result<DynamicImage> {
+    let told = || format!("{}: cannot be read as a picture", path.display());
+    let reader =
+        image::ImageReader::open(path).with_context(told)?.with_guessed_format().with_context(told)?;
+    reader.decode().with_context(told)
+}
+
+/// Colour as red, green, blue, 8 bits each; grey becomes all three, and transparency is left out.
+fn read_color(path: &Path) -> Result<(Vec<u8>, usize, usize)> {
+    let picture = decode(path)?;
+    if picture.color().bytes_per_pixel() / picture.color().channel_count() != 1 {
+        let text = format!("{}: colour has more than 8 bits a channel; write it with 8", path.display());
+        return Err(UsageError(text).into());
+    }
+    let (width, height) = (picture.width() as usize, picture.height() as usize);
+    // Dropped, not blended: as OpenCV reads it.
+    Ok((picture.into_rgb8().into_raw(), width, height))
+}
+
+/// Depth of the size of its colour.
+fn read_depth(path: &Path, rgb: &Path, size: (usize, usize)) -> Result<Vec<u16>> {
+    let picture = decode(path)?;
+    let has = (picture.width() as usize, picture.height() as usize);
+    if has != size {
+        return Err(UsageError(format!(
+            "{} is {}x{} and {} is {}x{}: they do not show one view. Depth must be registered to colour first, for which the \
+             calibration of the camera is needed; depthrig does it for the cameras of a rig (refine) and for its datasets \
+             (depthrig cdm relabel)",
+            path.display(),
+            has.0,
+            has.1,
+            rgb.display(),
+            size.0,
+            size.1
+        ))
+        .into());
+    }
+    match picture {
+        DynamicImage::ImageLuma16(depth) => Ok(depth.into_raw()),
+        DynamicImage::ImageLuma8(depth) => Ok(depth.into_raw().into_iter().map(u16::from).collect()),
+        other => Err(UsageError(format!(
+            "{}: is a picture in {:?}; depth is a PNG of one channel of 16 bits",
+            path.display(),
+            other.color()
+        ))
+        .into()),
+    }
+}
+
+/// Writes the result; the file is there when it is whole.
+fn write(path: &Path, refined: &Refined, width: usize, height: usize) -> Result<()> {
+    let bytes = match refined {
+        Refined::Floats(pixels) => {
+            let data: Vec<_> = pixels.iter().flat_map(|d| d.to_le_bytes()).collect();
+            depthrig_recorder::npy_file("<f4", &[height, width], &data)
+        }
+        Refined::Units(pixels) => {
+            // PNG is big-endian; the encoder takes the order of this computer.
+            let data: Vec<_> = pixels.iter().flat_map(|d| d.to_ne_bytes()).collect();
+            let mut file = Vec::new();
+            png::PngEncoder::new(&mut file).write_image(
+                &data,
+                width as u32,
+                height as u32,
+                ExtendedColorType::L16,
+            )?;
+            file
+        }
+    };
+    let mut part = path.as_os_str().to_owned();
+    part.push(".part");
+    std::fs::write(&part, bytes)
+        .and_then(|()| std::fs::rename(&part, path))
+        .with_context(|| format!("{} cannot be written", path.display()))
+}
