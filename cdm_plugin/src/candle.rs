@@ -10,7 +10,7 @@ mod head;
 mod layers;
 
 use crate::arch::{Architecture, ENCODERS};
-use crate::{Error, ErrorKind, Model, NetShape, Network, PositionEmbeddings, Result};
+use crate::{Error, ErrorKind, Model, NetShape, Network, PositionEmbeddings, Result, Weights};
 use candle_core::{Device, Tensor};
 use encoder::Encoder;
 use fusion::Fusion;
@@ -51,6 +51,11 @@ impl CandleNetwork {
     /// [`ErrorKind::BadModel`] when a tensor is missing or of another shape, [`ErrorKind::Engine`] when threads cannot be
     /// started.
     pub fn open(model: &Model, threads: usize) -> Result<Self> {
+        Self::of(model.encoder.architecture(), &model.weights, threads)
+    }
+
+    /// The same for a network of any sizes.
+    pub(crate) fn of(arch: Architecture, weights: &Weights, threads: usize) -> Result<Self> {
         let pool = ThreadPoolBuilder::new()
             .num_threads(threads)
             .thread_name(|i| format!("cdm-candle-{i}"))
@@ -59,7 +64,7 @@ impl CandleNetwork {
                 let message = format!("the threads of candle could not be started: {e}; give it fewer");
                 Error::new(ErrorKind::Engine, message).with_source(e)
             })?;
-        Self::with_architecture(model.encoder.architecture(), &Params::new(&model.weights), pool)
+        Self::with_architecture(arch, &Params::new(weights), pool)
     }
 
     fn with_architecture(arch: Architecture, params: &Params<'_>, threads: ThreadPool) -> Result<Self> {

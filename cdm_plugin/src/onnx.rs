@@ -9,7 +9,9 @@
 //! floats. Output: `y` `[batch, height, width]`. The graph holds no weights: whoever runs it puts the tensors of a
 //! checkpoint in their places ([`Graph::weights`]), as they lie in the file.
 
+#[cfg(test)]
 use crate::Encoder;
+use crate::arch::Architecture;
 use core::ops::Range;
 
 mod builder;
@@ -70,8 +72,14 @@ pub struct Graph {
 
 impl Graph {
     /// The graph of a network.
+    #[cfg(test)]
     pub fn of(encoder: Encoder, style: Style) -> Self {
-        network::build(encoder.architecture(), encoder.name(), style)
+        Self::of_architecture(encoder.architecture(), style)
+    }
+
+    /// The graph of a network of these sizes.
+    pub fn of_architecture(arch: Architecture, style: Style) -> Self {
+        network::build(arch, style)
     }
 }
 

@@ -1,14 +1,17 @@
 //! The network in ONNX Runtime: a native library that is loaded when a model runs, on CPU, CUDA, TensorRT or OpenVINO.
 
+use crate::arch::Architecture;
 use crate::onnx::{Attention, Graph, Numbers, Style};
 use crate::{
     Error, ErrorKind, Model, NetShape, Network, PositionEmbeddings, Precision, RefinerOptions, Result,
+    Weights,
 };
 use device::Device;
 use ort::memory::{AllocationDevice, Allocator, AllocatorType, MemoryInfo, MemoryType};
 use ort::session::{IoBinding, Session};
 use ort::value::Tensor;
 use runtime::Runtime;
+use std::sync::Arc;
 use weights::BoundWeights;
 
 mod device;
@@ -52,11 +55,19 @@ impl OnnxNetwork {
     /// device or the precision, [`ErrorKind::BadInput`] for an unknown device, [`ErrorKind::BadModel`] when a tensor
     /// is missing, [`ErrorKind::OutOfMemory`] and [`ErrorKind::Engine`].
     pub fn open(model: &Model, options: &RefinerOptions) -> Result<Self> {
+        Self::with_architecture(model.encoder.architecture(), &model.weights, options)
+    }
+
+    fn with_architecture(
+        arch: Architecture,
+        weights: &Arc<Weights>,
+        options: &RefinerOptions,
+    ) -> Result<Self> {
         let device: Device = options.device.parse()?;
         device.check(options.precision)?;
         let runtime = Runtime::get(options.library.as_deref(), &device)?;
-        let graph = Graph::of(model.encoder, style(&device, options.precision));
-        let weights = BoundWeights::new(&model.weights, &graph.weights)?;
+        let graph = Graph::of_architecture(arch, style(&device, options.precision));
+        let weights = BoundWeights::new(weights, &graph.weights)?;
         let threads = options.thread_count();
         let session = session::open(&runtime, &graph, &weights, &device, options.precision, threads)?;
         let description = describe(&runtime.version, &device, options.precision);
@@ -183,26 +194,16 @@ fn describe(version: &str, device: &Device, precision: Precision) -> String {
     let version: Vec<&str> = version.split('.').take(2).collect();
     let mut device = device.to_string();
     device.truncate(device.find(':').unwrap_or(device.len()));
-    let mut short = format!("onnxruntime {} {device} {precision}", version.join("."));
-    short.truncate(NAME_BYTES);
-    short
+    let room = NAME_BYTES.saturating_sub("onnxruntime   ".len() + device.len() + precision.name().len());
+    let mut version = version.join(".");
+    version.truncate(room);
+    format!("onnxruntime {version} {device} {precision}")
 }
 
-/// What went wrong in the library. There is no code for lack of memory; the texts are those of ONNX Runtime's arena
-/// (`bfc_arena.cc`), of the C++ library, and of CUDA, cuBLAS and cuDNN.
+/// What went wrong in the library.
 fn failed(engine: &str, what: &str, error: &ort::Error) -> Error {
-    const MEMORY: [&str; 8] = [
-        "Failed to allocate memory",
-        "bad_alloc",
-        "bad allocation",
-        "out of memory",
-        "Available memory of",
-        "CUDA_ERROR_OUT_OF_MEMORY",
-        "ALLOC_FAILED",
-        "OutOfMemory",
-    ];
     let text = error.message();
-    if MEMORY.iter().any(|m| text.contains(m)) {
+    if is_memory(text) {
         let message = format!(
             "{engine}: {what} needs more memory than the device has left ({text}); use a smaller input_size, a smaller \
              model or a 16-bit precision, or run fewer models on this device"
@@ -212,5 +213,22 @@ fn failed(engine: &str, what: &str, error: &ort::Error) -> Error {
     Error::new(ErrorKind::Engine, format!("{engine}: {what} failed: {text}"))
 }
 
+/// Whether the text of an error tells of too little memory. There is no code for it; the texts are those of ONNX
+/// Runtime's arena (`bfc_arena.cc`), of the C++ library, and of CUDA and cuBLAS.
+fn is_memory(text: &str) -> bool {
+    const TEXTS: [&str; 7] = [
+        "Failed to allocate memory",
+        "bad_alloc",
+        "bad allocation",
+        "out of memory",
+        "Available memory of",
+        "OUT_OF_MEMORY",
+        "ALLOC_FAILED",
+    ];
+    TEXTS.iter().any(|t| text.contains(t))
+}
+
+#[cfg(all(test, feature = "candle"))]
+mod against_candle;
 #[cfg(test)]
 mod tests;

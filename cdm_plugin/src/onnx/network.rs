@@ -28,11 +28,11 @@ struct Net {
 }
 
 /// The graph of a network of these sizes.
-pub fn build(arch: Architecture, name: &str, style: Style) -> Graph {
+pub fn build(arch: Architecture, style: Style) -> Graph {
     let shapes = arch.tensors().into_iter().map(|t| (t.name, t.shape)).collect();
     let mut net = Net { g: Builder::new(shapes, style.numbers), arch, style };
     net.whole();
-    net.g.finish(name)
+    net.g.finish("camera depth model")
 }
 
 impl Net {
@@ -157,9 +157,14 @@ impl Net {
         let name = ENCODERS[which];
         let x = self.tokens(picture, positions, name, which == 1, batch);
         let shape = self.dims(&x, 0, 3);
-        let heads = self.g.ints(&[self.arch.heads as i64, self.arch.head_width() as i64]);
-        let first_two = self.dims(&x, 0, 2);
-        let head_shape = self.concat(&[&first_two, &heads], 0);
+        let head_shape = match self.style.attention {
+            Attention::Fused => Value::none(),
+            Attention::Standard => {
+                let heads = self.g.ints(&[self.arch.heads as i64, self.arch.head_width() as i64]);
+                let first_two = self.dims(&x, 0, 2);
+                self.concat(&[&first_two, &heads], 0)
+            }
+        };
 
         let mut x = self.rows(&x);
         let mut taps = Vec::new();

@@ -30,23 +30,20 @@ impl Runtime {
     /// process runs is another than `wanted` or does not have the device.
     pub fn get(wanted: Option<&Path>, device: &Device) -> Result<Self> {
         let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
-        let runtime = match &*loaded {
-            Some(runtime) => {
-                let runtime = runtime.clone()?;
-                if let Some(wanted) = wanted {
-                    runtime.is(&library::find(Some(wanted), None, device)?)?;
-                }
-                runtime
+        let runtime = if let Some(runtime) = &*loaded {
+            let runtime = runtime.clone()?;
+            if let Some(wanted) = wanted {
+                runtime.is(&library::find(Some(wanted), None, device)?)?;
             }
-            None => {
-                let variable = std::env::var_os(library::VARIABLE);
-                let path = library::find(wanted, variable.as_deref(), device)?;
-                let version = library::version(&path)?;
-                // From here on the process is bound to this library, whatever comes of it.
-                let runtime = start(path, version);
-                *loaded = Some(runtime.clone());
-                runtime?
-            }
+            runtime
+        } else {
+            let variable = std::env::var_os(library::VARIABLE);
+            let path = library::find(wanted, variable.as_deref(), device)?;
+            let version = library::version(&path)?;
+            // From here on the process is bound to this library, whatever comes of it.
+            let runtime = start(path, version);
+            *loaded = Some(runtime.clone());
+            runtime?
         };
         drop(loaded);
         runtime.check(device)?;

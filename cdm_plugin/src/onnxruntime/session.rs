@@ -48,6 +48,7 @@ fn builder(runtime: &Runtime, threads: usize) -> ort::Result<SessionBuilder> {
 }
 
 /// The error without the builder that it carries.
+#[allow(clippy::needless_pass_by_value)] // for `map_err`
 fn plain(error: ort::Error<SessionBuilder>) -> ort::Error {
     ort::Error::new_with_code(error.code(), error.message())
 }

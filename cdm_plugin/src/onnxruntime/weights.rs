@@ -46,7 +46,8 @@ impl BoundWeights {
             if slice.rows.end > rows || needed != there {
                 return Err(wrong(&format!("has the shape {:?}", entry.shape)));
             }
-            let in_place = entry.dtype == Dtype::F32 && bytes.as_ptr().cast::<f32>().is_aligned();
+            let aligned = bytes.as_ptr().addr().is_multiple_of(align_of::<f32>());
+            let in_place = entry.dtype == Dtype::F32 && aligned;
             if !in_place && !converted.contains_key(name) {
                 let numbers = weights.to_f32(name).ok_or_else(|| wrong("cannot be read"))?;
                 converted.insert(name.clone(), numbers);
@@ -58,12 +59,11 @@ impl BoundWeights {
     /// The numbers of one slice, little-endian 32-bit floats at an even address.
     fn bytes(&self, slice: &WeightSlice) -> Option<*const u8> {
         let row = 4 * slice.shape.iter().product::<usize>() / slice.rows.len().max(1);
-        let whole: (*const u8, usize) = match self.converted.get(&slice.tensor) {
-            Some(numbers) => (numbers.as_ptr().cast(), 4 * numbers.len()),
-            None => {
-                let bytes = self.weights.bytes(&slice.tensor)?;
-                (bytes.as_ptr(), bytes.len())
-            }
+        let whole: (*const u8, usize) = if let Some(numbers) = self.converted.get(&slice.tensor) {
+            (numbers.as_ptr().cast(), size_of_val(numbers.as_slice()))
+        } else {
+            let bytes = self.weights.bytes(&slice.tensor)?;
+            (bytes.as_ptr(), bytes.len())
         };
         // `wrapping_add` because only what is read has to be within bounds; it is, see `new`.
         (slice.rows.end * row <= whole.1).then(|| whole.0.wrapping_add(slice.rows.start * row))
