@@ -5,9 +5,10 @@
 //! - it is *valid* when `d` is finite and above 0 as well; there are `N` valid pixels;
 //! - L1 = 1/N Σ|d − d*|, RMSE = √(1/N Σ(d − d*)²), `AbsRel` = 1/N Σ|d − d*|/d*;
 //! - δt = 1/N #{max(d/d*, d*/d) < 1.25^t}, for t = 0.5 (1.118034) and t = 1 (1.25), strictly below;
-//! - *strict* δt divides by the pixels that count: a prediction that is missing is a failure. Raw sensors have
-//!   holes and models have none, so that comparing on valid pixels alone flatters the sensor; for the same
-//!   reason `missing_percent` stands beside the others.
+//! - the *strict* measures are over the pixels that count: a prediction that is missing is one of 0 m, as it is
+//!   stored. Its error is `d*`, its relative error 1, and it is within no factor. Raw sensors have holes and models
+//!   have none, so that comparing on valid pixels alone flatters the sensor; for the same reason `missing_percent`
+//!   stands beside the others. A prediction that is not finite or not above 0 is missing as well.
 //!
 //! A measure over no pixels at all is NaN and [`DepthMetrics::is_empty`] says so; it is never 0, which would be
 //! perfect. Everything is summed in `f64`.
@@ -15,15 +16,14 @@
 //! Over a dataset, the *mean of pictures* and the *pixel-pooled* value differ; [`Dataset`] gives both by name.
 
 use crate::{Error, ErrorKind, Result};
+use sums::{Sums, each};
 
 mod dataset;
+mod measured;
+mod sums;
 
 pub use dataset::{Dataset, DatasetMetrics};
-
-/// 1.25^0.5, the threshold of δ0.5.
-const DELTA_05: f64 = 1.118_033_988_749_895;
-/// The threshold of δ1.
-const DELTA_1: f64 = 1.25;
+pub use measured::{DistanceBin, ERROR_BOUNDS_M, ErrorHistogram, Measured};
 
 /// A depth picture, row by row without padding.
 #[derive(Debug, Clone, Copy)]
@@ -94,7 +94,7 @@ impl DepthRange {
 }
 
 /// Depth against a reference. Fractions are 0 to 1; NaN when there is nothing to divide by.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct DepthMetrics {
     /// Reference pixels that count.
     pub counted: u64,
@@ -110,6 +110,12 @@ pub struct DepthMetrics {
     pub delta_05: f64,
     /// Share of valid pixels within a factor of 1.25.
     pub delta_1: f64,
+    /// As `l1_m`, over the pixels that count; what is missing is off by its reference.
+    pub strict_l1_m: f64,
+    /// As `rmse_m`, over the pixels that count; what is missing is off by its reference.
+    pub strict_rmse_m: f64,
+    /// As `abs_rel`, over the pixels that count; what is missing is off by 1.
+    pub strict_abs_rel: f64,
     /// As `delta_05`, over the pixels that count.
     pub strict_delta_05: f64,
     /// As `delta_1`, over the pixels that count.
@@ -131,88 +137,9 @@ impl DepthMetrics {
 /// [`ErrorKind::SizeMismatch`] when they differ in the number of pixels, [`ErrorKind::BadInput`] for a unit or a
 /// range that is none.
 pub fn compare(prediction: &Depth<'_>, reference: &Depth<'_>, range: DepthRange) -> Result<DepthMetrics> {
-    Ok(Sums::of(prediction, reference, range)?.metrics())
-}
-
-/// The sums that every measure is made of; those of several pictures add up.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-struct Sums {
-    counted: u64,
-    valid: u64,
-    within_05: u64,
-    within_1: u64,
-    abs_m: f64,
-    square_m2: f64,
-    relative: f64,
-}
-
-impl Sums {
-    fn of(prediction: &Depth<'_>, reference: &Depth<'_>, range: DepthRange) -> Result<Self> {
-        if prediction.len() != reference.len() {
-            let (p, r) = (prediction.len(), reference.len());
-            let message =
-                format!("the prediction has {p} pixels and its reference {r}; compare pictures of one size");
-            return Err(Error::new(ErrorKind::SizeMismatch, message));
-        }
-        prediction.check("prediction")?;
-        reference.check("reference")?;
-        let DepthRange { min_m, max_m } = range;
-        if min_m.is_nan() || max_m.is_nan() || min_m > max_m {
-            let message = format!("{min_m} m to {max_m} m is no range of depth; the nearest comes first");
-            return Err(Error::new(ErrorKind::BadInput, message));
-        }
-        let mut sums = Self::default();
-        for i in 0..reference.len() {
-            let Some(truth) = reference.metres(i).filter(|d| range.min_m <= *d && *d <= range.max_m) else {
-                continue;
-            };
-            sums.counted += 1;
-            if let Some(seen) = prediction.metres(i) {
-                sums.add(seen, truth);
-            }
-        }
-        Ok(sums)
-    }
-
-    fn add(&mut self, seen: f64, truth: f64) {
-        let error = (seen - truth).abs();
-        let factor = (seen / truth).max(truth / seen);
-        self.valid += 1;
-        self.abs_m += error;
-        self.square_m2 += error * error;
-        self.relative += error / truth;
-        self.within_05 += u64::from(factor < DELTA_05);
-        self.within_1 += u64::from(factor < DELTA_1);
-    }
-
-    fn plus(self, other: Self) -> Self {
-        Self {
-            counted: self.counted + other.counted,
-            valid: self.valid + other.valid,
-            within_05: self.within_05 + other.within_05,
-            within_1: self.within_1 + other.within_1,
-            abs_m: self.abs_m + other.abs_m,
-            square_m2: self.square_m2 + other.square_m2,
-            relative: self.relative + other.relative,
-        }
-    }
-
-    /// Division by no pixels is 0/0, and that is NaN as it should be.
-    fn metrics(&self) -> DepthMetrics {
-        let (n, counted) = (self.valid as f64, self.counted as f64);
-        DepthMetrics {
-            counted: self.counted,
-            valid: self.valid,
-            l1_m: self.abs_m / n,
-            rmse_m: (self.square_m2 / n).sqrt(),
-            abs_rel: self.relative / n,
-            delta_05: self.within_05 as f64 / n,
-            delta_1: self.within_1 as f64 / n,
-            strict_delta_05: self.within_05 as f64 / counted,
-            strict_delta_1: self.within_1 as f64 / counted,
-            missing_percent: 100.0 * (self.counted - self.valid) as f64 / counted,
-        }
-    }
+    let mut sums = Sums::default();
+    each(prediction, reference, range, |_, seen, truth| sums.add(seen, truth))?;
+    Ok(sums.metrics())
 }
 
 #[cfg(test)]

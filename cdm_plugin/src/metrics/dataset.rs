@@ -1,6 +1,7 @@
 //! The measures over many pictures: their mean, and all pixels pooled.
 
-use super::{Depth, DepthMetrics, DepthRange, Sums};
+use super::sums::{Sums, each};
+use super::{Depth, DepthMetrics, DepthRange, Measured};
 use crate::Result;
 
 /// Collects pictures one at a time; memory does not grow with their number.
@@ -10,14 +11,14 @@ pub struct Dataset {
     pooled: Sums,
     /// Sums over the pictures of the plain measures, and over those that have a strict one.
     plain: [f64; 5],
-    strict: [f64; 3],
+    strict: [f64; 6],
     pictures: u64,
     compared: u64,
     counted: u64,
 }
 
 /// What a [`Dataset`] came to.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct DatasetMetrics {
     /// Mean over pictures of each picture's value; `counted` and `valid` are sums. A picture without a valid
     /// pixel takes no part in the plain measures, one without a pixel that counts in none.
@@ -37,7 +38,7 @@ impl Dataset {
             range,
             pooled: Sums::default(),
             plain: [0.0; 5],
-            strict: [0.0; 3],
+            strict: [0.0; 6],
             pictures: 0,
             compared: 0,
             counted: 0,
@@ -49,7 +50,17 @@ impl Dataset {
     /// # Errors
     /// Those of [`super::compare`]; the picture is left out then.
     pub fn add(&mut self, prediction: &Depth<'_>, reference: &Depth<'_>) -> Result<DepthMetrics> {
-        let sums = Sums::of(prediction, reference, self.range)?;
+        let mut sums = Sums::default();
+        each(prediction, reference, self.range, |_, seen, truth| sums.add(seen, truth))?;
+        Ok(self.include(sums))
+    }
+
+    /// Adds one picture that was measured elsewhere.
+    pub fn push(&mut self, measured: &Measured) -> DepthMetrics {
+        self.include(measured.sums)
+    }
+
+    fn include(&mut self, sums: Sums) -> DepthMetrics {
         let m = sums.metrics();
         self.pooled = self.pooled.plus(sums);
         self.pictures += 1;
@@ -63,19 +74,23 @@ impl Dataset {
         }
         if m.counted > 0 {
             self.counted += 1;
-            let values = [m.strict_delta_05, m.strict_delta_1, m.missing_percent];
+            let errors = [m.strict_l1_m, m.strict_rmse_m, m.strict_abs_rel];
+            let shares = [m.strict_delta_05, m.strict_delta_1, m.missing_percent];
+            let values = errors.into_iter().chain(shares);
             for (sum, value) in self.strict.iter_mut().zip(values) {
                 *sum += value;
             }
         }
-        Ok(m)
+        m
     }
 
     /// The measures so far.
     pub fn metrics(&self) -> DatasetMetrics {
         let pixel_pooled = self.pooled.metrics();
         let [l1_m, rmse_m, abs_rel, delta_05, delta_1] = self.plain.map(|s| s / self.compared as f64);
-        let [strict_delta_05, strict_delta_1, missing_percent] = self.strict.map(|s| s / self.counted as f64);
+        let strict = self.strict.map(|s| s / self.counted as f64);
+        let [strict_l1_m, strict_rmse_m, strict_abs_rel, strict_delta_05, strict_delta_1, missing_percent] =
+            strict;
         DatasetMetrics {
             mean_of_pictures: DepthMetrics {
                 counted: pixel_pooled.counted,
@@ -85,6 +100,9 @@ impl Dataset {
                 abs_rel,
                 delta_05,
                 delta_1,
+                strict_l1_m,
+                strict_rmse_m,
+                strict_abs_rel,
                 strict_delta_05,
                 strict_delta_1,
                 missing_percent,

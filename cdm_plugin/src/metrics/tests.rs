@@ -31,6 +31,9 @@ fn a_picture_worked_out_by_hand() {
     assert!(near(m.delta_1, 3.0 / 4.0), "1.25 itself is not below 1.25: {m:?}");
     assert!(near(m.strict_delta_05, 2.0 / 5.0) && near(m.strict_delta_1, 3.0 / 5.0), "{m:?}");
     assert!(near(m.missing_percent, 20.0), "{m:?}");
+    // The hole is off by its 1 m.
+    assert!(near(m.strict_l1_m, 2.4 / 5.0) && near(m.strict_rmse_m, (2.08f64 / 5.0).sqrt()), "{m:?}");
+    assert!(near(m.strict_abs_rel, 1.55 / 5.0), "{m:?}");
 }
 
 #[test]
@@ -130,6 +133,10 @@ fn slow(prediction: &[f32], reference: &[f32], range: DepthRange) -> DepthMetric
     let mean = |f: &dyn Fn(f64, f64) -> f64| valid.iter().map(|(d, t)| f(*d, *t)).sum::<f64>() / n;
     let hits = |t: f64| valid.iter().filter(|(d, r)| (d / r).max(r / d) < 1.25f64.powf(t)).count() as f64;
     let all = counted.len() as f64;
+    // Strict: what is missing is a prediction of 0.
+    let or_zero = |p: f32| if p.is_finite() && p > 0.0 { f64::from(p) } else { 0.0 };
+    let all_errors: Vec<(f64, f64)> =
+        counted.iter().map(|(p, r)| ((or_zero(**p) - f64::from(**r)).abs(), f64::from(**r))).collect();
     DepthMetrics {
         counted: counted.len() as u64,
         valid: valid.len() as u64,
@@ -138,17 +145,21 @@ fn slow(prediction: &[f32], reference: &[f32], range: DepthRange) -> DepthMetric
         abs_rel: mean(&|d, t| (d - t).abs() / t),
         delta_05: hits(0.5) / n,
         delta_1: hits(1.0) / n,
+        strict_l1_m: all_errors.iter().map(|(e, _)| e).sum::<f64>() / all,
+        strict_rmse_m: (all_errors.iter().map(|(e, _)| e * e).sum::<f64>() / all).sqrt(),
+        strict_abs_rel: all_errors.iter().map(|(e, t)| e / t).sum::<f64>() / all,
         strict_delta_05: hits(0.5) / all,
         strict_delta_1: hits(1.0) / all,
         missing_percent: 100.0 * (all - n) / all,
     }
 }
 
-fn values(m: &DepthMetrics) -> [f64; 10] {
+fn values(m: &DepthMetrics) -> [f64; 13] {
     let (counted, valid) = (m.counted as f64, m.valid as f64);
     let plain = [m.l1_m, m.rmse_m, m.abs_rel, m.delta_05, m.delta_1];
     let [a, b, c, d, e] = plain;
-    [counted, valid, a, b, c, d, e, m.strict_delta_05, m.strict_delta_1, m.missing_percent]
+    let [f, g, h] = [m.strict_l1_m, m.strict_rmse_m, m.strict_abs_rel];
+    [counted, valid, a, b, c, d, e, f, g, h, m.strict_delta_05, m.strict_delta_1, m.missing_percent]
 }
 
 /// Depth that is mostly ordinary and now and then a hole of some kind.
@@ -173,6 +184,25 @@ proptest! {
         for (a, b) in values(&fast).into_iter().zip(values(&slow)) {
             prop_assert!(near(a, b), "{:?}\n{:?}", fast, slow);
         }
+        // By distance: each bin is the measure of a range, and all of them together are the whole.
+        let (p, r) = (Depth::Metres(&prediction), Depth::Metres(&reference));
+        let measured = Measured::of(&p, &r, range, (0.5, 9)).unwrap();
+        prop_assert_eq!(values(&measured.metrics()).map(f64::to_bits), values(&fast).map(f64::to_bits));
+        let bins = measured.by_distance();
+        prop_assert_eq!(bins.iter().map(|b| b.metrics.counted).sum::<u64>(), fast.counted);
+        for bin in &bins {
+            // The end of a bin belongs to the next one; the last one has none.
+            let below = if bin.to_m < 4.5 { f64::from_bits(bin.to_m.to_bits() - 1) } else { f64::INFINITY };
+            let (min_m, max_m) = (bin.from_m.max(range.min_m), below.min(range.max_m));
+            let wanted = if min_m > max_m { 0 } else {
+                compare(&p, &r, DepthRange { min_m, max_m }).unwrap().counted
+            };
+            prop_assert!(bin.metrics.counted == wanted, "{:?}: {}", bin, wanted);
+        }
+        let errors = measured.errors();
+        prop_assert_eq!(errors.counts.iter().sum::<u64>(), fast.valid);
+        prop_assert_eq!(errors.missing, fast.counted - fast.valid);
+        prop_assert_eq!(measured.fill_rate().to_bits(), fill_rate(&p).to_bits());
     }
 
     #[test]
