@@ -3,7 +3,7 @@
 //! Everything works on inverse depth (1/m), in which a plane is a linear function of the pixel, so that means and
 //! interpolation keep planes. The steps:
 //! 1. colour and depth are brought into one form ([`load`]); 0, 65535 and what lies beyond the range are holes;
-//! 2. pixels without support by their neighbours, and small islands, become holes ([`clean`]);
+//! 2. pixels without support by their neighbours, and small islands, become holes ([`clean`]), and so does what a mirror or glass shows ([`behind`]);
 //! 3. the picture is halved until one cell is left ([`pyramid`]); where a cell lies on two surfaces, the farther wins;
 //! 4. from the coarsest on, holes take the depth of those coarse cells around them that look like them ([`pull`]); small
 //!    differences between what a pixel has and what its surroundings say are noise and shrink.
@@ -11,11 +11,13 @@
 //! A picture without any depth stays without: its result is 0 everywhere, and no error.
 
 use crate::{Color, ColorFormat, Description, Error, ErrorKind, Job, Output, Refiner, Result, StepTimes};
+use behind::Behind;
 use clean::Islands;
 use depthrig_bus::HostTime;
 use lanes::Crew;
 use pyramid::Level;
 
+mod behind;
 mod clean;
 mod lanes;
 mod load;
@@ -37,6 +39,7 @@ pub struct FillRefiner {
     levels: Vec<Level>,
     cleaned: Vec<f32>,
     islands: Islands,
+    behind: Behind,
 }
 
 impl FillRefiner {
@@ -52,7 +55,14 @@ impl FillRefiner {
             Error::new(ErrorKind::Engine, message).with_source(e)
         })?;
         let description = Description { engine: "fill".into(), model: String::new() };
-        Ok(Self { description, crew, levels: Vec::new(), cleaned: Vec::new(), islands: Islands::default() })
+        Ok(Self {
+            description,
+            crew,
+            levels: Vec::new(),
+            cleaned: Vec::new(),
+            islands: Islands::default(),
+            behind: Behind::default(),
+        })
     }
 
     fn run(&mut self, job: &mut Job<'_>) -> Result<()> {
@@ -60,11 +70,12 @@ impl FillRefiner {
         let began = HostTime::now();
         let (w, h) = (job.color.width, job.color.height);
         self.resize(w, h);
-        let Self { crew, levels, cleaned, islands, .. } = self;
+        let Self { crew, levels, cleaned, islands, behind, .. } = self;
         let Some((full, _)) = levels.split_first_mut() else { return Ok(()) };
         load::load(crew, &job.color, &job.depth, cleaned, &mut full.color);
         crew.rows(&mut full.q, w, |y, row| clean::keep_supported(crew.wide, cleaned, w, y, row));
         islands.remove(&mut full.q, w, LEAST_ISLAND.max((ISLAND * (w * h) as f64).round() as u32));
+        behind.remove(&mut full.q, w);
         let loaded = HostTime::now();
 
         crew.rows2((&mut full.share, &mut cleaned[..]), w, |y, share, _| {
@@ -101,6 +112,7 @@ impl FillRefiner {
         }
         self.cleaned.resize(w * h, 0.0);
         self.islands.reserve(w * h);
+        self.behind.resize(w, h);
         let (mut size, mut count) = ((w, h), 1);
         while size != (1, 1) {
             size = (size.0.div_ceil(2), size.1.div_ceil(2));

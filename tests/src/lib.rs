@@ -3,6 +3,7 @@
 
 pub mod disk;
 pub mod made;
+pub mod scene;
 
 use depthrig_bus::{HostTime, RuntimeDir};
 use depthrig_daemon::config::RigConfig;
