@@ -12,8 +12,10 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+pub mod curves;
 mod gather;
 mod html;
+pub mod page;
 mod pixels;
 mod series;
 mod svg;

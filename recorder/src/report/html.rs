@@ -10,13 +10,14 @@ use std::fmt::Write;
 
 mod plots;
 
-const CSS: &str = include_str!("page.css");
+/// The look of all pages.
+pub(super) const CSS: &str = include_str!("page.css");
 
 /// Notes and edits that are shown.
 const LISTED_MAX: usize = 50;
 
 /// Text as it stands in HTML and XML, in attributes too; control characters, which XML cannot hold, are replaced.
-pub(super) fn escape(text: &str) -> String {
+pub fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {
@@ -68,15 +69,7 @@ fn or_none(text: &str) -> &str {
 }
 
 pub(super) fn page(r: &Report) -> String {
-    let mut out = String::with_capacity(1 << 19);
-    let _ = write!(
-        out,
-        "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"/>\
-         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\"/>\
-         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; img-src data:; style-src \
-         'unsafe-inline'\"/><title>{} – depthrig report</title><style>{CSS}</style></head><body>",
-        escape(&r.name)
-    );
+    let mut out = super::page::begin(&format!("{} – depthrig report", r.name));
     head(&mut out, r);
     streams(&mut out, r);
     plots::rates(&mut out, r);
@@ -87,7 +80,7 @@ pub(super) fn page(r: &Report) -> String {
     pictures(&mut out, r);
     calibration(&mut out, r);
     footer(&mut out, r);
-    out.push_str("</body></html>\n");
+    super::page::end(&mut out);
     out
 }
 
@@ -167,7 +160,7 @@ fn named_list(out: &mut String, name: &str, mut lines: Vec<String>) {
 }
 
 /// Begins a table; columns whose name begins with `#` are numbers.
-fn table(out: &mut String, columns: &[&str]) {
+pub fn table(out: &mut String, columns: &[&str]) {
     out.push_str("<div class=\"wide\"><table><thead><tr>");
     for name in columns {
         let _ = match name.strip_prefix('#') {
@@ -179,7 +172,7 @@ fn table(out: &mut String, columns: &[&str]) {
 }
 
 /// A row; cells are escaped here.
-fn row(out: &mut String, columns: &[&str], cells: &[String]) {
+pub fn row(out: &mut String, columns: &[&str], cells: &[String]) {
     out.push_str("<tr>");
     for (name, cell) in columns.iter().zip(cells) {
         let class = if name.starts_with('#') { " class=\"n\"" } else { "" };
@@ -188,7 +181,8 @@ fn row(out: &mut String, columns: &[&str], cells: &[String]) {
     out.push_str("</tr>");
 }
 
-const END_TABLE: &str = "</tbody></table></div>";
+/// What ends a table.
+pub const END_TABLE: &str = "</tbody></table></div>";
 
 fn streams(out: &mut String, r: &Report) {
     const COLUMNS: [&str; 9] = [

@@ -46,12 +46,12 @@ pub(super) struct Time {
 }
 
 /// The least of 1, 2, 2.5, 5 times a power of ten that is not below `x`: a distance of ticks.
-pub(super) fn nice_step(x: f64) -> f64 {
+pub fn nice_step(x: f64) -> f64 {
     above(x, &[1.0, 2.0, 2.5, 5.0])
 }
 
 /// The end of an axis that has `x` on it.
-pub(super) fn nice_end(x: f64) -> f64 {
+pub fn nice_end(x: f64) -> f64 {
     above(x, &[1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0])
 }
 
@@ -65,7 +65,7 @@ fn above(x: f64, factors: &[f64]) -> f64 {
 }
 
 /// A number without digits that say nothing.
-pub(super) fn number(x: f64) -> String {
+pub fn number(x: f64) -> String {
     let digits = match x.abs() {
         0.0 => 0,
         a if a < 0.1 => 3,
@@ -77,7 +77,7 @@ pub(super) fn number(x: f64) -> String {
     if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
 }
 
-fn begin(out: &mut String, height: f64, title: &str) {
+pub(super) fn begin(out: &mut String, height: f64, title: &str) {
     let title = escape(title);
     let _ = write!(
         out,
@@ -85,12 +85,12 @@ fn begin(out: &mut String, height: f64, title: &str) {
     );
 }
 
-fn text(out: &mut String, x: f64, y: f64, class: &str, text: &str) {
+pub(super) fn text(out: &mut String, x: f64, y: f64, class: &str, text: &str) {
     let _ = write!(out, "<text x=\"{x:.1}\" y=\"{y:.1}\" class=\"{class}\">{}</text>", escape(text));
 }
 
 /// `points` are pairs that `line` joins.
-fn line(out: &mut String, class: &str, x: (f64, f64), y: (f64, f64)) {
+pub(super) fn line(out: &mut String, class: &str, x: (f64, f64), y: (f64, f64)) {
     let _ = write!(
         out,
         "<line class=\"{class}\" x1=\"{:.1}\" x2=\"{:.1}\" y1=\"{:.1}\" y2=\"{:.1}\"/>",
