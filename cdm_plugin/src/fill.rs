@@ -5,8 +5,8 @@
 //! 1. colour and depth are brought into one form ([`load`]); 0, 65535 and what lies beyond the range are holes;
 //! 2. pixels without support by their neighbours, and small islands, become holes ([`clean`]), and so does what a mirror or glass shows ([`behind`]);
 //! 3. the picture is halved until one cell is left ([`pyramid`]); where a cell lies on two surfaces, the farther wins;
-//! 4. from the coarsest on, holes take the depth of those coarse cells around them that look like them ([`pull`]); small
-//!    differences between what a pixel has and what its surroundings say are noise and shrink.
+//! 4. from the coarsest on, holes take the depth of those coarse cells around them that look like them, and are smoothed
+//!    within their surface ([`pull`]). What was measured and kept stays as it was measured.
 //!
 //! A picture without any depth stays without: its result is 0 everywhere, and no error.
 
@@ -36,7 +36,9 @@ const LEAST_ISLAND: u32 = 8;
 pub struct FillRefiner {
     description: Description,
     crew: Crew,
+    /// Those in use first, from the whole picture to one cell; kept when a smaller picture needs fewer.
     levels: Vec<Level>,
+    in_use: usize,
     cleaned: Vec<f32>,
     islands: Islands,
     behind: Behind,
@@ -59,6 +61,7 @@ impl FillRefiner {
             description,
             crew,
             levels: Vec::new(),
+            in_use: 0,
             cleaned: Vec::new(),
             islands: Islands::default(),
             behind: Behind::default(),
@@ -70,7 +73,8 @@ impl FillRefiner {
         let began = HostTime::now();
         let (w, h) = (job.color.width, job.color.height);
         self.resize(w, h);
-        let Self { crew, levels, cleaned, islands, behind, .. } = self;
+        let Self { crew, levels, in_use, cleaned, islands, behind, .. } = self;
+        let levels = &mut levels[..*in_use];
         let Some((full, _)) = levels.split_first_mut() else { return Ok(()) };
         load::load(crew, &job.color, &job.depth, cleaned, &mut full.color);
         crew.rows(&mut full.q, w, |y, row| clean::keep_supported(crew.wide, cleaned, w, y, row));
@@ -91,6 +95,9 @@ impl FillRefiner {
             for i in (1..levels.len()).rev() {
                 if let [fine, coarse] = &mut levels[i - 1..=i] {
                     pull::fill(crew, coarse, fine);
+                    if i > 1 {
+                        pull::smooth(crew, fine, cleaned);
+                    }
                 }
             }
         }
@@ -118,9 +125,12 @@ impl FillRefiner {
             size = (size.0.div_ceil(2), size.1.div_ceil(2));
             count += 1;
         }
-        self.levels.resize_with(count, Level::default);
+        self.in_use = count;
+        if self.levels.len() < count {
+            self.levels.resize_with(count, Level::default);
+        }
         let mut size = (w, h);
-        for level in &mut self.levels {
+        for level in &mut self.levels[..count] {
             level.resize(size.0, size.1);
             size = (size.0.div_ceil(2), size.1.div_ceil(2));
         }

@@ -69,7 +69,7 @@ impl Behind {
         for start in 0..self.blocks.len() {
             if self.blocks[start].patch == Patch::Open {
                 self.grow(start, columns);
-                if self.is_behind(columns) {
+                if self.is_behind(columns, q.len() as f64) {
                     for i in &self.members {
                         let (bx, by) = (*i as usize % columns, *i as usize / columns);
                         for row in q[by * side * w..].chunks_mut(w).take(side) {
@@ -122,7 +122,7 @@ impl Behind {
     }
 
     /// Whether the patch in `members` lies behind what surrounds it.
-    fn is_behind(&self, columns: usize) -> bool {
+    fn is_behind(&self, columns: usize, whole: f64) -> bool {
         let number = self.members.first().map(|i| self.blocks[*i as usize].patch);
         let (mut nearer, mut not, mut pixels, mut area) = (0.0, 0.0, 0.0, 0.0);
         for i in &self.members {
@@ -139,8 +139,7 @@ impl Behind {
                 }
             }
         }
-        let whole: u32 = self.blocks.iter().map(|b| b.area).sum();
-        area <= LARGEST * f64::from(whole)
+        area <= LARGEST * whole
             && pixels < DENSE * area
             && nearer > 0.0
             && nearer >= ENCLOSED * (nearer + not)

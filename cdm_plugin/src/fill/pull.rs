@@ -7,7 +7,7 @@ use super::pyramid::Level;
 /// The difference of colours (root of the sum of squares, of 255) at which a cell counts a quarter.
 const COLOR: f32 = 18.0;
 /// Weight of a cell however different it looks: where nothing looks alike, near ones still count.
-const LEAST: f32 = 1e-4;
+const LEAST: f32 = 1e-2;
 /// Relative spread of inverse depth beyond which coarse cells lie on two surfaces, of which one is chosen.
 const SPREAD: f32 = 0.08;
 
@@ -18,6 +18,48 @@ pub(super) fn fill(crew: &Crew, coarse: &Level, fine: &mut Level) {
     crew.rows(&mut fine.q, w, |y, row| {
         fill_row(crew.wide, coarse, (y, h), &color[y * w..(y + 1) * w], row);
     });
+}
+
+/// How often what was filled is smoothed at each size.
+const ROUNDS: usize = 2;
+/// Relative difference of inverse depth up to which neighbours are smoothed together.
+const SURFACE: f32 = 0.1;
+
+/// Smooths what was filled, so that a large hole in a surface becomes a surface; what was measured stays. `spare` is as
+/// large as the level at least.
+pub(super) fn smooth(crew: &Crew, level: &mut Level, spare: &mut [f32]) {
+    let (w, h) = (level.w, level.h);
+    let spare = &mut spare[..w * h];
+    for _ in 0..ROUNDS {
+        let (q, share) = (&level.q, &level.share);
+        crew.rows(spare, w, |y, row| {
+            let (above, below) = (y.saturating_sub(1) * w, (y + 1).min(h - 1) * w);
+            let at = |start: usize| &q[start..start + w];
+            smooth_row(crew.wide, at(above), at(y * w), at(below), &share[y * w..(y + 1) * w], row);
+        });
+        level.q.copy_from_slice(spare);
+    }
+}
+
+wide! {
+fn smooth_row(above: &[f32], here: &[f32], below: &[f32], share: &[f32], out: &mut [f32]) {
+    let w = here.len();
+    let (above, below, share, out) = (&above[..w], &below[..w], &share[..w], &mut out[..w]);
+    let mean = |left: f32, right: f32, x: usize| {
+        let q = here[x];
+        let weight = |other: f32| if (other - q).abs() < SURFACE * q { 1.0 } else { 0.0 };
+        let weights = [weight(left), weight(right), weight(above[x]), weight(below[x])];
+        let sum = (weights[0] * left + weights[1] * right) + (weights[2] * above[x] + weights[3] * below[x]);
+        let n = (weights[0] + weights[1]) + (weights[2] + weights[3]);
+        let smoothed = (q + sum) / (1.0 + n);
+        if share[x] > 0.0 { q } else { smoothed }
+    };
+    out[0] = mean(here[0], here[1.min(w - 1)], 0);
+    out[w - 1] = mean(here[w.saturating_sub(2)], here[w - 1], w - 1);
+    for x in 1..w.saturating_sub(1) {
+        out[x] = mean(here[x - 1], here[x + 1], x);
+    }
+}
 }
 
 /// The two coarse rows (or columns) nearest to a fine one, and the weight of the second.
