@@ -1,7 +1,7 @@
 //! The commands and options, and what `--help` says of them.
 
 use crate::commands::{
-    bench, cameras, cat, cdm, compare, completions, config, demo, doctor, edit, export, import, info,
+    bench, cameras, cat, cdm, compare, completions, config, demo, doctor, edit, eval, export, import, info,
     install, man, merge, record, recover, replay, report, run, sessions, status, tap, top, trim, verify,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
@@ -121,6 +121,9 @@ pub enum Command {
     /// Change scene, operator, notes or name of a dataset; what it said before stays in its history
     #[command(after_help = edit::EXAMPLES)]
     Edit(edit::EditArgs),
+    /// Tell how good depth is against a reference: a table as in papers, and a page
+    #[command(after_help = eval::EXAMPLES)]
+    Eval(eval::EvalArgs),
     /// Write datasets in the layouts of others: ByteCameraDepth, LeRobot
     #[command(subcommand, after_help = export::EXAMPLES)]
     Export(export::ExportCommand),

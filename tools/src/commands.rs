@@ -10,6 +10,7 @@ pub mod config;
 pub mod demo;
 pub mod doctor;
 pub mod edit;
+pub mod eval;
 pub mod export;
 pub mod import;
 pub mod info;
@@ -51,6 +52,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Report(args) => report::run(&args, &context),
         Command::Sessions(args) => sessions::run(&args, &context),
         Command::Edit(args) => edit::run(&args),
+        Command::Eval(args) => eval::run(&args, &context),
         Command::Export(command) => export::run(&command, &context),
         Command::Import(command) => import::run(&command, &context),
         Command::Verify(args) => verify::run(&args, &context),

@@ -8,6 +8,7 @@ mod cli;
 mod commands;
 mod context;
 mod demo;
+mod eval;
 mod exit;
 mod install;
 mod logging;

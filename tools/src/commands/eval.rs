@@ -1,0 +1,188 @@
+//! `depthrig eval`: how good depth is against a reference.
+
+use crate::context::Context;
+use crate::eval::dataset::FromDataset;
+use crate::eval::files::{Files, HAMMER_RANGE_M, HAMMER_UNIT_M, Named};
+use crate::eval::{Evaluation, Options, Row, Source, page};
+use crate::exit::{Exit, UsageError};
+use crate::out;
+use crate::progress::Progress;
+use crate::signals::Stop;
+use anyhow::{Context as _, Result, bail};
+use depthrig_bus::StreamName;
+use depthrig_cdm::metrics::DepthRange;
+use std::path::{Path, PathBuf};
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+INPUT is a depthrig dataset whose cameras know the truth, or a folder laid out as the HAMMER dataset; without it,
+--truth names a folder of references and each --pred one of predictions, whose files have the same paths but for the
+ending (.png and .tiff of 16 bits, .tiff and .npy of metres).
+
+Plain measures are over the pixels where both have depth. Strict ones are over all pixels whose reference counts: what
+is missing is a prediction of 0 m. The table has means over pictures; the page and --json have both means.
+
+Exit codes: 0 compared, 1 nothing could be compared, 2 wrong usage, 3 some pictures could not be compared.
+
+Examples:
+  depthrig eval data/20261121_1015_kitchen
+  depthrig eval data/20261121_1015_kitchen --pred depth --pred depth_refined --truth depth_true_color
+  depthrig eval HAMMER/test --pred cdm=out/hammer --out hammer.html
+  depthrig eval --truth truth --pred raw=raw --pred model=out --unit 0.001 --max-m 3 --json";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct EvalArgs {
+    /// A dataset with truth, or a folder laid out as HAMMER
+    input: Option<PathBuf>,
+    /// What to compare, several times: a stream of the dataset, or a folder, as NAME=DIR or DIR
+    #[arg(long, value_name = "STREAM|[NAME=]DIR")]
+    pred: Vec<String>,
+    /// What to compare with: a stream of the dataset [default: depth_true_color, else depth_true], or a folder
+    #[arg(long, value_name = "STREAM|DIR")]
+    truth: Option<String>,
+    /// Folder of colour pictures, to be shown beside the worst
+    #[arg(long, value_name = "DIR")]
+    rgb: Option<PathBuf>,
+    /// Metres per unit of files with whole numbers
+    #[arg(long, value_name = "M", default_value_t = HAMMER_UNIT_M, value_parser = positive_metres)]
+    unit: f64,
+    /// The same for references [default: as --unit]
+    #[arg(long, value_name = "M", value_parser = positive_metres)]
+    truth_unit: Option<f64>,
+    /// Nearest reference that counts, metres [default: 0; of HAMMER 0.1]
+    #[arg(long, value_name = "M")]
+    min_m: Option<f64>,
+    /// Farthest reference that counts, metres [default: no limit; of HAMMER 6]
+    #[arg(long, value_name = "M")]
+    max_m: Option<f64>,
+    /// Width of the bins of distance, metres; what is beyond 48 of them is in the last
+    #[arg(long, value_name = "M", default_value = "0.25", value_parser = positive_metres)]
+    bin_m: f64,
+    /// Write the page to this file [default: eval.html in the current folder]
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Print JSON instead of the table and writing a page (with --out, do both)
+    #[arg(long)]
+    json: bool,
+    /// Threads; all cores when not given
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
+}
+
+/// Bins of distance.
+const BINS: usize = 48;
+/// The page when nothing is said.
+const PAGE: &str = "eval.html";
+
+/// Reads a length above 0.
+fn positive_metres(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(m) if m > 0.0 && m < 1e6 => Ok(m),
+        _ => Err("write a number of metres above 0, such as 0.001".to_owned()),
+    }
+}
+
+/// Compares and reports.
+pub fn run(args: &EvalArgs, context: &Context) -> Result<Exit> {
+    let (mut source, limits, title) = source(args)?;
+    let range =
+        DepthRange { min_m: args.min_m.unwrap_or(limits.min_m), max_m: args.max_m.unwrap_or(limits.max_m) };
+    if !(range.min_m <= range.max_m) {
+        return Err(UsageError(format!("{} m to {} m is no range of depth", range.min_m, range.max_m)).into());
+    }
+    let cores = || std::thread::available_parallelism().map_or(1, usize::from);
+    let options =
+        Options { range, bins: (args.bin_m, BINS), threads: args.threads.map_or_else(cores, usize::from) };
+    let stop = Stop::on_signals()?;
+    let mut bar = Progress::new(context.global.quiet > 0);
+    let evaluation = crate::eval::run(source.as_mut(), &options, |done, total| {
+        bar.set("comparing", done.min(total), total);
+        !stop.is_asked()
+    })?;
+    bar.clear();
+    let Some(evaluation) = evaluation else { bail!("interrupted; nothing was written") };
+    if evaluation.rows.is_empty() {
+        let why = evaluation.failed.iter().chain(&evaluation.left_out).take(3).cloned().collect::<Vec<_>>();
+        bail!("nothing could be compared: {}", why.join("; "));
+    }
+    let path = match (&args.out, args.json) {
+        (Some(path), _) => Some(path.clone()),
+        (None, true) => None,
+        (None, false) => Some(PathBuf::from(PAGE)),
+    };
+    if let Some(path) = &path {
+        std::fs::write(path, page::page(&title, &evaluation, &options))
+            .with_context(|| format!("{}: cannot be written", path.display()))?;
+    }
+    if args.json {
+        out::json(&evaluation)?;
+    } else {
+        out::line(text(&evaluation))?;
+        if let Some(path) = &path {
+            out::line(format_args!("page      {}", path.display()))?;
+        }
+    }
+    for line in evaluation.failed.iter().take(20) {
+        eprintln!("not compared: {line}");
+    }
+    let all = evaluation.failed.is_empty() && evaluation.left_out.is_empty();
+    Ok(if all { Exit::Good } else { Exit::Lost })
+}
+
+/// Where the pictures come from, which references count when nothing is said, and what to call it.
+fn source(args: &EvalArgs) -> Result<(Box<dyn Source>, DepthRange, String)> {
+    let truth_unit_m = args.truth_unit.unwrap_or(args.unit);
+    let Some(input) = &args.input else {
+        let usage = "without INPUT give --truth DIR and --pred DIR, or give a dataset with truth";
+        let truth =
+            args.truth.as_ref().filter(|_| !args.pred.is_empty()).ok_or_else(|| UsageError(usage.into()))?;
+        let files = Files::pairs(&folders(args), (Path::new(truth), truth_unit_m), args.rgb.as_deref())?;
+        return Ok((Box::new(files), DepthRange::ALL, truth.clone()));
+    };
+    let title = input.display().to_string();
+    if input.join(depthrig_recorder::SESSION_FILE).is_file() || input.is_file() {
+        let names = args.pred.iter().map(|p| stream(p)).collect::<Result<Vec<_>>>()?;
+        let truth = args.truth.as_deref().map(stream).transpose()?;
+        let source = FromDataset::open(input, &names, truth.as_ref())?;
+        return Ok((Box::new(source), DepthRange::ALL, title));
+    }
+    let (min_m, max_m) = HAMMER_RANGE_M;
+    Ok((Box::new(Files::hammer(input, &folders(args))?), DepthRange { min_m, max_m }, title))
+}
+
+fn stream(text: &str) -> Result<StreamName> {
+    StreamName::new(text).map_err(|e| UsageError(format!("{text} is no name of a stream: {e}")).into())
+}
+
+fn folders(args: &EvalArgs) -> Vec<Named> {
+    let named = |text: &String| {
+        let (name, folder) = text.split_once('=').unwrap_or_else(|| (last_part(text), text));
+        Named { name: name.to_owned(), folder: folder.into(), unit_m: args.unit }
+    };
+    args.pred.iter().map(named).collect()
+}
+
+fn last_part(path: &str) -> &str {
+    path.trim_end_matches('/').rsplit('/').next().unwrap_or(path)
+}
+
+fn text(evaluation: &Evaluation) -> String {
+    let mut header = vec!["PREDICTION"];
+    header.extend(["L1", "RMSE", "AbsRel", "δ0.5", "δ1", "strict L1", "RMSE", "AbsRel", "δ0.5", "δ1"]);
+    header.extend(["missing %", "pictures"]);
+    let row = |r: &Row| {
+        let m = &r.metrics.mean_of_pictures;
+        let mut cells = vec![page::label(r)];
+        cells.extend([false, true].iter().flat_map(|s| page::measures(m, *s)).map(|(_, v)| page::value(v)));
+        cells.push(format!("{:.2}", m.missing_percent));
+        cells.push(r.metrics.pictures.to_string());
+        cells
+    };
+    let mut text = out::table(&header, 1, evaluation.rows.iter().map(row));
+    for line in &evaluation.left_out {
+        text.push_str("\nleft out  ");
+        text.push_str(line);
+    }
+    text
+}

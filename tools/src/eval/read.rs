@@ -1,0 +1,162 @@
+//! Depth out of picture files: 16-bit PNG and TIFF in some unit, NPY and TIFF in metres.
+
+use anyhow::{Context, Result, bail};
+use std::path::Path;
+
+/// The largest side of a picture that is read.
+const MAX_SIDE: usize = 32_768;
+
+/// A depth picture in metres, row by row; what is not above 0 or not finite is a hole.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Metres {
+    /// Pixels per row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// The pixels.
+    pub pixels: Vec<f32>,
+}
+
+/// Endings of the files that can be read.
+pub const ENDINGS: [&str; 4] = ["png", "npy", "tiff", "tif"];
+
+/// Reads `path`. Whole numbers are taken times `unit_m`, floating-point ones are metres; `65535` of 16 bits says that a
+/// range ended, and is a hole.
+pub fn depth(path: &Path, unit_m: f64) -> Result<Metres> {
+    let read = || -> Result<Metres> {
+        let bytes = std::fs::read(path)?;
+        match path.extension().and_then(|e| e.to_str()).map(str::to_lowercase).as_deref() {
+            Some("npy") => npy(&bytes, unit_m),
+            Some("tif" | "tiff") => tiff(&bytes, unit_m),
+            _ => png(&bytes, unit_m),
+        }
+    };
+    read().with_context(|| format!("{}: cannot be read as depth", path.display()))
+}
+
+fn units(values: impl Iterator<Item = u16>, unit_m: f64) -> Vec<f32> {
+    values.map(|v| if v == u16::MAX { 0.0 } else { (f64::from(v) * unit_m) as f32 }).collect()
+}
+
+fn png(bytes: &[u8], unit_m: f64) -> Result<Metres> {
+    let image = image::load_from_memory_with_format(bytes, image::ImageFormat::Png)?;
+    let (width, height) = (image.width() as usize, image.height() as usize);
+    let image::DynamicImage::ImageLuma16(image) = image else {
+        bail!("it is {:?}, not 16-bit grey", image.color());
+    };
+    Ok(Metres { width, height, pixels: units(image.into_raw().into_iter(), unit_m) })
+}
+
+fn tiff(bytes: &[u8], unit_m: f64) -> Result<Metres> {
+    use tiff::decoder::{Decoder, DecodingResult};
+    let mut decoder = Decoder::new(std::io::Cursor::new(bytes))?;
+    let (width, height) = decoder.dimensions()?;
+    let (width, height) = (width as usize, height as usize);
+    let pixels = match decoder.read_image()? {
+        DecodingResult::U16(v) => units(v.into_iter(), unit_m),
+        DecodingResult::F32(v) => v,
+        DecodingResult::F64(v) => v.into_iter().map(|d| d as f32).collect(),
+        _ => bail!("its numbers are neither 16-bit units nor metres as floating point"),
+    };
+    if pixels.len() != width * height {
+        bail!("it is not one number a pixel");
+    }
+    Ok(Metres { width, height, pixels })
+}
+
+/// <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>.
+fn npy(bytes: &[u8], unit_m: f64) -> Result<Metres> {
+    let rest = bytes.strip_prefix(b"\x93NUMPY").context("it is no NPY file")?;
+    let (len, rest) = match rest {
+        [1, _, a, b, rest @ ..] => (usize::from(u16::from_le_bytes([*a, *b])), rest),
+        [2 | 3, _, a, b, c, d, rest @ ..] => (u32::from_le_bytes([*a, *b, *c, *d]) as usize, rest),
+        _ => bail!("it is no NPY file of a known version"),
+    };
+    let (head, data) = rest.split_at_checked(len).context("its head is cut off")?;
+    let head = core::str::from_utf8(head).context("its head is no text")?;
+    let value = |key: &str| {
+        let at = head.find(&format!("'{key}'"))? + key.len() + 2;
+        Some(head[at..].trim_start().strip_prefix(':')?.trim_start())
+    };
+    let kind = value("descr").and_then(|v| v.strip_prefix('\'')?.split_once('\'')).map(|(kind, _)| kind);
+    if !value("fortran_order").is_some_and(|v| v.starts_with("False")) {
+        bail!("it is stored column by column; save it with np.ascontiguousarray");
+    }
+    let shape = value("shape").and_then(|v| v.strip_prefix('(')?.split_once(')')).map(|(shape, _)| shape);
+    let shape = shape.context("its head has no shape")?.split(',').map(str::trim).filter(|n| !n.is_empty());
+    let shape: Vec<usize> =
+        shape.map(str::parse).collect::<Result<_, _>>().context("its shape is no shape")?;
+    let (height, width) = match shape[..] {
+        [h, w] | [1, h, w] | [h, w, 1] | [1, h, w, 1] | [1, 1, h, w] => (h, w),
+        _ => bail!("shape {shape:?} is not that of one picture"),
+    };
+    if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
+        bail!("shape {shape:?} is no picture");
+    }
+    let pixels: Vec<f32> = match kind {
+        Some("<u2") => units(data.as_chunks::<2>().0.iter().map(|b| u16::from_le_bytes(*b)), unit_m),
+        Some("<f2") => data.as_chunks::<2>().0.iter().map(|b| half(u16::from_le_bytes(*b))).collect(),
+        Some("<f4") => data.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect(),
+        Some("<f8") => data.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b) as f32).collect(),
+        other => bail!("its numbers are {other:?}; <u2, <f2, <f4 and <f8 can be read"),
+    };
+    if pixels.len() != width * height {
+        bail!("shape {shape:?} does not fit its {} bytes", data.len());
+    }
+    Ok(Metres { width, height, pixels })
+}
+
+/// A 16-bit float of IEEE 754.
+fn half(bits: u16) -> f32 {
+    let (sign, exponent, part) = (bits >> 15, (bits >> 10) & 31, bits & 1023);
+    let value = match exponent {
+        0 => f32::from(part) * 2f32.powi(-24),
+        31 => f32::NAN,
+        e => (1.0 + f32::from(part) / 1024.0) * 2f32.powi(i32::from(e) - 15),
+    };
+    if sign == 1 { -value } else { value }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn array(kind: &str, shape: &str, data: &[u8]) -> Vec<u8> {
+        let head = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n");
+        let mut out = b"\x93NUMPY\x01\x00".to_vec();
+        out.extend((head.len() as u16).to_le_bytes());
+        out.extend(head.as_bytes());
+        out.extend(data);
+        out
+    }
+
+    #[test]
+    fn arrays_of_every_kind() {
+        let metres = [0.5f32, 1.0, 0.0, 2.0];
+        let of = |kind: &str, shape: &str, data: Vec<u8>| npy(&array(kind, shape, &data), 0.001).unwrap();
+        let f4 = metres.iter().flat_map(|v| v.to_le_bytes()).collect();
+        assert_eq!(of("<f4", "(2, 2)", f4), Metres { width: 2, height: 2, pixels: metres.to_vec() });
+        let f8 = metres.iter().flat_map(|v| f64::from(*v).to_le_bytes()).collect();
+        assert_eq!(of("<f8", "(1, 1, 4)", f8).pixels, metres);
+        let f2 = [0x3800u16, 0x3c00, 0, 0x4000].iter().flat_map(|v| v.to_le_bytes()).collect();
+        assert_eq!(of("<f2", "(4, 1, 1)", f2).pixels, metres);
+        let u2 = [500u16, 1000, 65535, 2000].iter().flat_map(|v| v.to_le_bytes()).collect();
+        assert_eq!(of("<u2", "(1, 4)", u2).pixels, metres);
+    }
+
+    #[test]
+    fn what_is_no_picture_is_refused() {
+        for (kind, shape, n) in [
+            ("<f4", "(2, 2)", 15),
+            ("<f4", "(2, 2, 3)", 48),
+            ("|u1", "(2, 2)", 4),
+            ("<f4", "(0, 2)", 0),
+            ("<f4", "(9999999, 9999999)", 4),
+        ] {
+            assert!(npy(&array(kind, shape, &vec![0; n]), 0.001).is_err(), "{kind} {shape} {n}");
+        }
+        for bytes in [&b""[..], b"\x93NUMPY", b"\x93NUMPY\x01\x00\xff\xff{"] {
+            assert!(npy(bytes, 0.001).is_err() && png(bytes, 0.001).is_err() && tiff(bytes, 0.001).is_err());
+        }
+    }
+}

@@ -1,0 +1,287 @@
+//! `depthrig eval`: against NumPy, on folders, on HAMMER's layout, and on a recording of cameras that know the truth.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "support/home.rs"]
+mod support;
+
+use serde_json::Value;
+use std::path::Path;
+use std::process::Command;
+use support::Home;
+
+type Depth = image::ImageBuffer<image::Luma<u16>, Vec<u16>>;
+
+/// Numbers that look random and are the same on every machine.
+fn roll(a: u32, b: u32) -> u32 {
+    let mut h = a.wrapping_mul(0x9E37_79B9) ^ b.wrapping_mul(0x85EB_CA6B);
+    h = (h ^ (h >> 15)).wrapping_mul(0x2C1B_3C6D);
+    h ^ (h >> 13)
+}
+
+fn save(path: &Path, of: impl Fn(u32) -> u16) {
+    std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+    Depth::from_fn(40, 30, |x, y| image::Luma([of(y * 40 + x)])).save(path).unwrap();
+}
+
+/// Millimetres, with holes; in picture 3 all of it.
+fn truth(i: u32, p: u32) -> u16 {
+    if i == 3 || roll(i, p).is_multiple_of(17) { 0 } else { 300 + (roll(i + 9, p) % 4000) as u16 }
+}
+
+/// Some 10 % off in either direction, with holes and saturated pixels.
+fn seen(i: u32, p: u32) -> u16 {
+    match roll(i + 99, p) % 11 {
+        0 => 0,
+        1 => u16::MAX,
+        r => (u32::from(truth(i, p)) * (85 + 3 * r) / 100).max(1) as u16,
+    }
+}
+
+/// Writes an NPY of metres.
+fn npy(path: &Path, of: impl Fn(u32) -> f32) {
+    let head = "{'descr': '<f4', 'fortran_order': False, 'shape': (30, 40), }\n";
+    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+    bytes.extend((head.len() as u16).to_le_bytes());
+    bytes.extend(head.as_bytes());
+    bytes.extend((0..1200).flat_map(|p| of(p).to_le_bytes()));
+    std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+    std::fs::write(path, bytes).unwrap();
+}
+
+/// Folders `truth`, `raw` (16-bit units) and `model` (metres), five pictures each, the last in a folder below.
+fn folders(home: &Home) {
+    for i in 0..5 {
+        let name = if i == 4 { "deeper/4".to_owned() } else { i.to_string() };
+        save(&home.path().join(format!("truth/{name}.png")), |p| truth(i, p));
+        save(&home.path().join(format!("raw/{name}.png")), |p| seen(i, p));
+        npy(&home.path().join(format!("model/{name}.npy")), |p| match roll(i + 5, p) % 40 {
+            0 => f32::NAN,
+            1 => -1.0,
+            r => f32::from(truth(i, p)) * 0.001 + r as f32 * 0.002 - 0.03,
+        });
+    }
+}
+
+fn evaluate(home: &Home, args: &[&str]) -> Value {
+    let at = |a: &&str| a.replace("@/", &format!("{}/", home.path().display()));
+    let args: Vec<String> = args.iter().map(at).collect();
+    let args: Vec<&str> =
+        ["eval", "-q", "--json"].into_iter().chain(args.iter().map(String::as_str)).collect();
+    serde_json::from_str(&home.run(&args).good()).unwrap()
+}
+
+/// The definitions once more, with arrays.
+const NUMPY: &str = r#"
+import json, math, sys
+import numpy as np
+def metrics(p, t, lo, hi):
+    counts = np.isfinite(t) & (t > 0) & (t >= lo) & (t <= hi)
+    t = t[counts]; p = p[counts]
+    valid = np.isfinite(p) & (p > 0)
+    a, b = p[valid], t[valid]
+    zero = np.where(valid, p, 0.0)
+    f = np.maximum(a / b, b / a)
+    mean = lambda x: float(np.mean(x)) if x.size else float("nan")
+    return dict(counted=int(t.size), valid=int(a.size), l1_m=mean(np.abs(a - b)), rmse_m=mean((a - b) ** 2) ** 0.5,
+        abs_rel=mean(np.abs(a - b) / b), delta_05=mean(f < 1.25 ** 0.5), delta_1=mean(f < 1.25),
+        strict_l1_m=mean(np.abs(zero - t)), strict_rmse_m=mean((zero - t) ** 2) ** 0.5,
+        strict_abs_rel=mean(np.abs(zero - t) / t),
+        strict_delta_05=float((f < 1.25 ** 0.5).sum()) / t.size if t.size else float("nan"),
+        strict_delta_1=float((f < 1.25).sum()) / t.size if t.size else float("nan"),
+        missing_percent=100.0 * (t.size - a.size) / t.size if t.size else float("nan"))
+lo, hi = float(sys.argv[2]), float(sys.argv[3])
+out = {}
+for name in ("raw", "model"):
+    ps, ts = [np.fromfile(f"{sys.argv[1]}/{name}{k}.f64").reshape(5, -1) for k in ("", "_truth")]
+    each = [metrics(p, t, lo, hi) for p, t in zip(ps, ts)]
+    mean = {k: float(np.nanmean([m[k] for m in each])) for k in each[0]}
+    out[name] = dict(mean=mean, pooled=metrics(ps.ravel(), ts.ravel(), lo, hi))
+print(json.dumps(out).replace("NaN", "null"))
+"#;
+
+#[test]
+fn numbers_are_those_of_numpy() {
+    let python = Path::new(env!("CARGO_MANIFEST_DIR")).join("../.venv/bin/python");
+    let has_numpy =
+        Command::new(&python).args(["-c", "import numpy"]).output().is_ok_and(|o| o.status.success());
+    if !has_numpy {
+        eprintln!("skipped: {} has no numpy; `make setup` makes it", python.display());
+        return;
+    }
+    let home = Home::new();
+    folders(&home);
+    // What NumPy is given comes from the functions above and not through any file format.
+    let dump = |name: &str, of: &dyn Fn(u32, u32) -> f64| {
+        let bytes: Vec<u8> = (0..5)
+            .flat_map(|i| (0..1200).flat_map(move |p| [(i, p)]))
+            .flat_map(|(i, p)| of(i, p).to_le_bytes())
+            .collect();
+        std::fs::write(home.path().join(name), bytes).unwrap();
+    };
+    let metres = |d: u16| if d == u16::MAX { 0.0 } else { f64::from((f64::from(d) * 0.001) as f32) };
+    let model = |i: u32, p: u32| match roll(i + 5, p) % 40 {
+        0 => f64::NAN,
+        1 => -1.0,
+        r => f64::from(f32::from(truth(i, p)) * 0.001 + r as f32 * 0.002 - 0.03),
+    };
+    dump("raw.f64", &|i, p| metres(seen(i, p)));
+    dump("model.f64", &model);
+    dump("raw_truth.f64", &|i, p| metres(truth(i, p)));
+    dump("model_truth.f64", &|i, p| metres(truth(i, p)));
+    let said =
+        Command::new(&python).args(["-c", NUMPY]).arg(home.path()).args(["0.5", "3.5"]).output().unwrap();
+    assert!(said.status.success(), "{}", String::from_utf8_lossy(&said.stderr));
+    let wanted: Value = serde_json::from_slice(&said.stdout).unwrap();
+
+    let args = [
+        "--truth",
+        "@/truth",
+        "--pred",
+        "raw=@/raw",
+        "--pred",
+        "@/model",
+        "--min-m",
+        "0.5",
+        "--max-m",
+        "3.5",
+    ];
+    for threads in ["1", "3"] {
+        let got = evaluate(&home, &[&args[..], &["--threads", threads]].concat());
+        for row in got["rows"].as_array().unwrap() {
+            let name = row["name"].as_str().unwrap();
+            for (ours, theirs) in [("mean_of_pictures", "mean"), ("pixel_pooled", "pooled")] {
+                let theirs = &wanted[name][theirs];
+                for (key, value) in theirs.as_object().unwrap() {
+                    if ours == "mean_of_pictures" && (key == "counted" || key == "valid") {
+                        continue; // sums there
+                    }
+                    let (a, b) = (row[ours][key].as_f64().unwrap(), value.as_f64().unwrap());
+                    assert!(
+                        (a - b).abs() <= 1e-9 * (1.0 + b.abs()),
+                        "{name} {ours} {key}: {a}, NumPy has {b}"
+                    );
+                }
+            }
+            assert_eq!(row["pictures"], 5);
+            assert_eq!(row["empty_pictures"], 1, "the picture without a reference");
+        }
+    }
+}
+
+#[test]
+fn folders_are_paired_and_the_page_stands_alone() {
+    let home = Home::new();
+    folders(&home);
+    let page = home.path().join("page.html");
+    let at = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
+    let (truth, model, page_text) = (at("truth"), at("model"), page.to_str().unwrap().to_owned());
+    let raw = format!("sensor <raw>={}", at("raw"));
+    let args = ["eval", "-q", "--truth", &truth, "--pred", &raw, "--pred", &model, "--out", &page_text];
+    let said = home.run(&args).good();
+    assert!(said.contains("strict L1") && said.contains("sensor <raw>") && said.contains("page "), "{said}");
+    let html = std::fs::read_to_string(&page).unwrap();
+    assert!(html.contains("sensor &lt;raw&gt;") && !html.contains("<raw>") && !html.contains(">NaN<"));
+    assert!(!html.contains("http://") && !html.contains("https://") && !html.contains("<script"));
+    assert_eq!(html.matches("<svg ").count(), 5, "four curves and the sizes of errors");
+    assert_eq!(
+        html.matches("src=\"data:image/jpeg").count(),
+        2 * 3 * 3,
+        "the worst three of each, three pictures each"
+    );
+
+    // A prediction that is missing is said, and what can be compared is.
+    std::fs::remove_file(home.path().join("raw/2.png")).unwrap();
+    let said = home.run(&args);
+    assert_eq!(said.code, 3, "{}", said.err);
+    assert!(said.out.contains("sensor <raw>: 1 of 5 references have no prediction, 2 first"), "{}", said.out);
+    // So is one of another size.
+    Depth::new(41, 30).save(home.path().join("raw/1.png")).unwrap();
+    let said = home.run(&args);
+    assert_eq!(said.code, 3);
+    assert!(said.err.contains("raw/1.png: it has 41x30 pixels and its reference 40x30"), "{}", said.err);
+    // And when nothing can be compared it has failed.
+    let said =
+        home.run(&["eval", "-q", "--truth", &truth, "--pred", home.path().join("run").to_str().unwrap()]);
+    assert_eq!(said.code, 1, "{}", said.err);
+    for bad in [
+        &["eval"][..],
+        &["eval", "--truth", &truth],
+        &["eval", "--truth", &truth, "--pred", &model, "--min-m", "2", "--max-m", "1"],
+    ] {
+        assert_eq!(home.run(bad).code, 2, "{bad:?}");
+    }
+}
+
+#[test]
+fn hammers_folders_are_known() {
+    let home = Home::new();
+    for (s, sequence) in ["scene1_traj1_1", "scene2_traj1_naked_1"].iter().enumerate() {
+        let view = home.path().join("HAMMER/test").join(sequence).join("polarization");
+        for i in 0..2 {
+            let k = 10 * s as u32 + i;
+            save(&view.join(format!("_gt/{i:06}.png")), |p| truth(k, p));
+            save(&view.join(format!("depth_d435/{i:06}.png")), |p| seen(k, p));
+            save(&view.join(format!("depth_l515/{i:06}.png")), |p| truth(k, p));
+            npy(&home.path().join(format!("out/{sequence}/{i:06}.npy")), |p| f32::from(truth(k, p)) * 0.002);
+        }
+    }
+    let got = evaluate(&home, &["@/HAMMER", "--pred", "twice=@/out"]);
+    let row = |name: &str| {
+        let rows = got["rows"].as_array().unwrap();
+        rows.iter().find(|r| r["name"] == name).unwrap_or_else(|| panic!("{name} in {got}")).clone()
+    };
+    assert_eq!(got["rows"].as_array().unwrap().len(), 3, "no depth_tof was there");
+    assert_eq!(row("depth_l515")["mean_of_pictures"]["strict_l1_m"], 0.0);
+    assert!(row("depth_d435")["mean_of_pictures"]["strict_l1_m"].as_f64().unwrap() > 0.1);
+    let twice = row("twice")["pixel_pooled"]["abs_rel"].as_f64().unwrap();
+    assert!((twice - 1.0).abs() < 1e-6, "{twice}");
+    let none = home.run(&["eval", home.path().join("out").to_str().unwrap()]);
+    assert_eq!(none.code, 1);
+    assert!(none.err.contains("not laid out as HAMMER"), "{}", none.err);
+}
+
+#[test]
+fn a_recording_with_truth_is_compared_in_one_view() {
+    let home = Home::new();
+    let cache = home.path().join("cache").display().to_string();
+    let text = |truth: bool| {
+        let truths =
+            "[[camera.stream]]\nname = \"depth_true\"\n[[camera.stream]]\nname = \"depth_true_color\"\n";
+        let more = if truth { truths } else { "" };
+        format!(
+            "rig = \"sim\"\n[recording]\nreserve_mb = 16\n\n[[camera]]\nname = \"cam\"\nbackend = \"synthetic\"\n\
+             model = \"generic\"\ntruth = {truth}\nposes = 2\ncache_dir = \"{cache}\"\n\
+             [[camera.stream]]\nname = \"color\"\nwidth = 160\nheight = 120\n\
+             [[camera.stream]]\nname = \"depth\"\nwidth = 160\nheight = 120\n{more}"
+        )
+    };
+    let record = |name: &str, truth: bool| -> String {
+        let rig = home.write("rig.toml", &text(truth));
+        let out = home.path().join(name);
+        let said =
+            home.run(&["run", &rig, "--record", out.to_str().unwrap(), "--seconds", "2", "--json", "-q"]);
+        let summary: Value = serde_json::from_str(&said.good()).unwrap();
+        summary["recording"]["path"].as_str().unwrap().to_owned()
+    };
+    let path = record("with", true);
+    let got = evaluate(&home, &[&path, "--pred", "depth", "--pred", "depth_true"]);
+    let row = |name: &str| {
+        let rows = got["rows"].as_array().unwrap();
+        rows.iter().find(|r| r["name"] == name).unwrap_or_else(|| panic!("{name} in {got}")).clone()
+    };
+    // The true depth, moved into colour's view, is the truth but for what only one of the two sees.
+    let (raw, moved) = (row("depth"), row("depth_true"));
+    assert_eq!((raw["group"].as_str(), raw["empty_pictures"].as_u64()), (Some("cam"), Some(0)));
+    assert!(raw["pictures"].as_u64().unwrap() >= 3);
+    let value = |r: &Value, key: &str| r["mean_of_pictures"][key].as_f64().unwrap();
+    assert!(value(&moved, "delta_1") > 0.98 && value(&moved, "l1_m") < 0.02, "{}", moved["mean_of_pictures"]);
+    assert!(value(&raw, "strict_l1_m") > 2.0 * value(&moved, "strict_l1_m"), "{got}");
+    // In depth's own view nothing moves, and the truth is perfect.
+    let own = evaluate(&home, &[&path, "--pred", "depth_true", "--truth", "depth_true"]);
+    assert_eq!(own["rows"][0]["mean_of_pictures"]["strict_l1_m"], 0.0);
+
+    let without = record("without", false);
+    let said = home.run(&["eval", "-q", &without]);
+    assert_eq!(said.code, 1);
+    assert!(said.err.contains("truth = true") && said.err.contains("cam/color"), "{}", said.err);
+}
