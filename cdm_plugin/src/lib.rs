@@ -36,7 +36,7 @@ pub use factory::refiner;
 pub use fill::FillRefiner;
 pub use model::{ChannelOrder, INPUT_SIZE, MAX_DEPTH_M, Model};
 pub use network::{NetShape, Network, PositionEmbeddings};
-pub use onnxruntime::OnnxNetwork;
+pub use onnxruntime::{OnnxNetwork, find_library};
 pub use options::{EngineKind, Precision, RefinerOptions};
 pub use refine::{Color, ColorFormat, Description, Job, Output, RawDepth, Refiner, StepTimes};
 pub use refiner::CdmRefiner;

@@ -11,6 +11,7 @@ use ort::memory::{AllocationDevice, Allocator, AllocatorType, MemoryInfo, Memory
 use ort::session::{IoBinding, Session};
 use ort::value::Tensor;
 use runtime::Runtime;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use weights::BoundWeights;
 
@@ -22,6 +23,21 @@ mod weights;
 
 /// As many bytes as the name of an engine may have.
 const NAME_BYTES: usize = 31;
+
+/// The version of the library that `device` would run on and where it is, without binding this process to it. `wanted` is
+/// the library or its folder; it is looked for without.
+///
+/// # Errors
+/// [`ErrorKind::NoEngine`] when there is none that can be used, [`ErrorKind::BadInput`] for an unknown device,
+/// [`ErrorKind::Unsupported`] for a precision that the device has not.
+pub fn find_library(wanted: Option<&Path>, device: &str, precision: Precision) -> Result<(PathBuf, String)> {
+    let device: Device = device.parse()?;
+    device.check(precision)?;
+    let variable = std::env::var_os(library::VARIABLE);
+    let path = library::find(wanted, variable.as_deref(), &device)?;
+    let version = library::version(&path)?;
+    Ok((path, version))
+}
 
 /// The network of one model in ONNX Runtime.
 ///

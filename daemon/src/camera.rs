@@ -12,7 +12,7 @@
 
 use crate::config::{BackendConfig, CameraConfig, SupervisorConfig};
 use crate::sink::BusSink;
-use crate::stage::{self, Entrance, Lane};
+use crate::stage::{Entrance, Lane};
 use crate::status::CameraState;
 use crate::stream::Stream;
 use crate::wake::Wake;
@@ -485,7 +485,7 @@ fn adopt(
     let mut state = camera.state();
     state.info = Some(info.clone());
     if state.streams.is_empty() {
-        let made = stage::profiles(&camera.config, profiles).map_err(|e| {
+        let made = camera.config.makes(profiles).map_err(|e| {
             depthrig_drivers::Error::new(DriverErrorKind::BadInput, e.to_string()).with_source(e)
         })?;
         let all = profiles.iter().chain(made.iter().map(|(p, _)| p));

@@ -29,7 +29,7 @@ pub use depthrig_recorder::{ColorCodec, DepthCodec};
 pub use error::{ConfigError, Problem};
 
 use depthrig_bus::{CameraName, PixelFormat, Pose, RigName, StreamName};
-use depthrig_drivers::StreamRequest;
+use depthrig_drivers::{StreamProfile, StreamRequest};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
@@ -251,6 +251,14 @@ impl CameraConfig {
     /// Whether frames of `stream` belong into recordings.
     pub fn records(&self, stream: &StreamName) -> bool {
         self.record.as_ref().is_none_or(|list| list.contains(stream))
+    }
+
+    /// The streams that are made of `profiles`, and whether each is recorded.
+    ///
+    /// # Errors
+    /// `BadInput` when its depth is to be refined and colour or depth is not among them.
+    pub(crate) fn makes(&self, profiles: &[StreamProfile]) -> crate::Result<Vec<(StreamProfile, bool)>> {
+        crate::stage::profiles(self.refine.as_ref(), self.record.as_deref(), profiles)
     }
 }
 

@@ -10,6 +10,7 @@ mod disk;
 mod finding;
 mod host;
 mod memory;
+mod refine;
 #[cfg(test)]
 mod tests;
 
@@ -87,6 +88,7 @@ fn judge(config: &RigConfig, attached: &Attached, plans: Vec<cameras::Planned>, 
     let disk = disk::check(config, &plans, host, &mut findings);
     let shm_needed_bytes = memory::check(config, &plans, host, &mut findings);
     host.check(config, &mut findings);
+    refine::check(config, &plans, &mut findings);
     findings.sort_by_key(|f| (core::cmp::Reverse(f.severity), f.camera.is_some()));
     for p in &mut plans {
         p.worst = findings.iter().filter(|f| f.camera.as_deref() == Some(&*p.name)).map(|f| f.severity).max();

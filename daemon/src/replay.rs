@@ -19,19 +19,22 @@
 
 mod control;
 mod player;
+mod refine;
 mod source;
 mod timeline;
 mod transport;
 
 use crate::api::{self, ServerHandle};
 use crate::config::{
-    BusConfig, CdmConfig, ControlConfig, RecordingConfig, RigConfig, SetsConfig, SupervisorConfig,
+    BusConfig, CdmConfig, ControlConfig, EngineChoice, RecordingConfig, RigConfig, SetsConfig,
+    SupervisorConfig,
 };
 use crate::control::Control;
 use crate::house::House;
 use crate::recording::{Outside, Recording, Reports};
 use crate::rig::report;
 use crate::sets::SpreadStats;
+use crate::stage::{Entrance, Installed, Lane, Stage};
 use crate::status::{RecordingStatus, ReplayStatus};
 use crate::stream::Stream;
 use crate::wake::Wake;
@@ -72,6 +75,8 @@ pub struct ReplayOptions {
     pub paused: bool,
     /// Pause at the end, and do not end.
     pub hold: bool,
+    /// Refine the depth of its cameras with this engine, as a rig does; not with `as_fast_as_possible`.
+    pub refine: Option<EngineChoice>,
     /// Whether to serve the control API.
     pub serve_api: bool,
 }
@@ -86,6 +91,7 @@ impl Default for ReplayOptions {
             as_fast_as_possible: false,
             paused: false,
             hold: false,
+            refine: None,
             serve_api: false,
         }
     }
@@ -130,6 +136,9 @@ struct Inner {
     done: AtomicBool,
     records: Vec<StreamRecord>,
     streams: Vec<Arc<Stream>>,
+    /// Where depth is refined, and whose.
+    entrance: Arc<Entrance>,
+    lanes: Mutex<Vec<Arc<Lane>>>,
     numbers: Mutex<Numbers>,
     spreads: Mutex<SpreadStats>,
     recording: Mutex<Recording>,
@@ -176,6 +185,13 @@ impl Replay {
         options: ReplayOptions,
     ) -> Result<Self> {
         transport::check_rate(options.rate)?;
+        if options.refine.is_some() && options.as_fast_as_possible {
+            return Err(Error::new(
+                ErrorKind::BadInput,
+                "refined depth goes with a replay by the clock: of each camera the newest pair of pictures wins, and the \
+                 others are skipped; leave out one of the two (depthrig cdm relabel refines every frame)",
+            ));
+        }
         let mut sources = Sources::open(datasets, rig)?;
         let timeline = Arc::new(part(&sources.timeline()?, &options)?);
         let config = recording_config(&mut sources);
@@ -187,12 +203,28 @@ impl Replay {
         bus.clean_dead();
         let inner = Arc::new(Inner::new(config, datasets, options, timeline, sources));
         let player = Player::new(Arc::clone(&inner), Arc::clone(&bus))?;
+        let lanes = options.refine.map(|engine| refine::lanes(&inner, &bus, engine)).transpose()?;
         let mut replay = Self { inner, threads: Vec::new(), api: None, _lock: held };
         if options.serve_api {
             replay.api = Some(api::serve(replay.control(), &runtime.socket_path(&rig), None)?);
         }
         let inner = Arc::clone(&replay.inner);
         replay.spawn("house", move || keep_house(&inner, &bus))?;
+        if let Some(lanes) = lanes {
+            let inner = Arc::clone(&replay.inner);
+            let cdm = inner.config.cdm.clone();
+            let refiners = Arc::new(Installed::new(cdm.clone()));
+            let stage = Stage::new(
+                Arc::clone(&inner.entrance),
+                refiners,
+                cdm,
+                Arc::default(),
+                inner.config.sets.rate_hz,
+            );
+            lanes.iter().cloned().for_each(|lane| inner.entrance.enter(lane));
+            *lock(&inner.lanes) = lanes;
+            replay.spawn("stage", move || stage.run(&inner.stop))?;
+        }
         replay.spawn("replay", move || player.run())?;
         Ok(replay)
     }
@@ -326,6 +358,8 @@ impl Inner {
             done: AtomicBool::new(false),
             records: sources.streams().to_vec(),
             streams: sources.streams().iter().map(stream).collect(),
+            entrance: Arc::default(),
+            lanes: Mutex::default(),
             numbers: Mutex::new(Numbers {
                 lost: sources.problems().take(MAX_LOST).cloned().collect(),
                 ..Numbers::default()

@@ -16,7 +16,7 @@
 mod crew;
 mod engines;
 mod lane;
-mod models;
+pub(crate) mod models;
 mod pace;
 mod pair;
 mod pixels;
@@ -26,13 +26,14 @@ mod worker;
 pub use engines::{Installed, Opened, Plan, Refiners};
 pub use lane::{Lane, Skip};
 
-use crate::config::{CdmConfig, EngineChoice};
+use crate::config::{CdmConfig, EngineChoice, RefineConfig};
 use crate::status::RefineState;
-use crate::stream::Stream;
 use crate::wake::Wake;
+use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use crew::Crew;
-use depthrig_bus::{Frame, HostTime, Subscriber};
+use depthrig_bus::{Frame, HostTime, PixelFormat, StreamName, Subscriber};
+use depthrig_drivers::StreamProfile;
 use lane::Pair;
 use pace::Pace;
 use pair::{Paired, Pairer};
@@ -223,13 +224,17 @@ impl Stage {
     }
 }
 
-/// The streams that a camera with these settings makes of the streams `color` and `depth`, and which of them are recorded.
+/// The streams that a camera with these settings makes of its streams `color` and `depth`, and which of them are recorded:
+/// those that the settings say or that are among `listed`.
+///
+/// # Errors
+/// `BadInput` when one of the two is missing.
 pub fn profiles(
-    config: &crate::config::CameraConfig,
-    profiles: &[depthrig_drivers::StreamProfile],
-) -> crate::Result<Vec<(depthrig_drivers::StreamProfile, bool)>> {
-    use depthrig_bus::{PixelFormat, StreamName};
-    let Some(refine) = &config.refine else { return Ok(Vec::new()) };
+    refine: Option<&RefineConfig>,
+    listed: Option<&[StreamName]>,
+    profiles: &[StreamProfile],
+) -> Result<Vec<(StreamProfile, bool)>> {
+    let Some(refine) = refine else { return Ok(Vec::new()) };
     let find = |name: &str| {
         profiles.iter().find(|p| p.stream.as_str() == name).ok_or_else(|| {
             let has: Vec<_> = profiles.iter().map(|p| p.stream.to_string()).collect();
@@ -238,13 +243,13 @@ pub fn profiles(
                  or remove [camera.refine]",
                 has.join(", ")
             );
-            crate::Error::new(crate::ErrorKind::BadInput, text)
+            Error::new(ErrorKind::BadInput, text)
         })
     };
     let (color, depth) = (find("color")?, find("depth")?);
     let most = color.rate_hz.min(depth.rate_hz);
-    let made = |name: &str, format: PixelFormat| -> crate::Result<_> {
-        Ok(depthrig_drivers::StreamProfile {
+    let made = |name: &str, format: PixelFormat| -> Result<_> {
+        Ok(StreamProfile {
             stream: StreamName::new(name)?,
             format,
             width: color.width,
@@ -260,7 +265,7 @@ pub fn profiles(
             ..depth.clone()
         })
     };
-    let listed = |name: &str| config.record.iter().flatten().any(|r| r.as_str() == name);
+    let listed = |name: &str| listed.unwrap_or_default().iter().any(|r| r.as_str() == name);
     let mut all = vec![(made(REFINED, refine.format)?, refine.record || listed(REFINED))];
     if refine.align {
         all.push((made(ALIGNED, PixelFormat::Z16)?, listed(ALIGNED)));
@@ -268,7 +273,7 @@ pub fn profiles(
     Ok(all)
 }
 
-/// Whether `stream` is made of others.
-pub fn is_derived(stream: &Stream) -> bool {
-    [REFINED, ALIGNED].contains(&stream.id.stream.as_str())
+/// Whether a stream of this name is made of others.
+pub fn is_derived(stream: &StreamName) -> bool {
+    [REFINED, ALIGNED].contains(&stream.as_str())
 }

@@ -29,6 +29,7 @@ const FAST: ReplayOptions = ReplayOptions {
     as_fast_as_possible: true,
     paused: true,
     hold: false,
+    refine: None,
     serve_api: false,
 };
 

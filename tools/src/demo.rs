@@ -3,6 +3,7 @@
 pub mod live;
 pub mod replayed;
 pub mod report;
+pub mod seeded;
 pub mod sheet;
 
 use depthrig_bus::StreamId;

@@ -316,7 +316,7 @@ fn each_problem_has_its_place_and_says_what_to_write() {
     #[rustfmt::skip]
     let cases: Vec<(String, &str)> = vec![
         (camera("  modle = \"d405\""), "rig.toml:5:3: unknown key \"modle\" in [[camera]] \"d435\"; did you mean \"model\"?"),
-        (camera("rate_hz = 5"), "5:1: unknown key \"rate_hz\" in [[camera]] \"d435\"; it belongs to [sets]"),
+        (camera("rate_hz = 5"), "5:1: unknown key \"rate_hz\" in [[camera]] \"d435\"; it belongs to [camera.refine]"),
         (top("set = {}"), "1:1: unknown key \"set\" at the top of the file; did you mean \"sets\"?"),
         (top("xyz = 1"), "1:1: unknown key \"xyz\" at the top of the file; it has: rig, bus, sets"),
         (camera("clock = { drift = 3 }"), "5:11: unknown key \"drift\" in [camera.clock] of camera \"d435\"; did you mean \"drift_ppm\"?"),
@@ -588,4 +588,67 @@ fn what_an_l515_has_not() {
         wrong("color_controls = { gamma = 1 }\n[[camera.stream]]\nname = \"depth\"")
             .contains("color_controls")
     );
+}
+
+const REFINED: &str = "rig = \"r\"\n[cdm]\nthreads = 3\nlibrary = \"lib/ort\"\nmodels = \"/models\"\nhang_s = 2.5\n\
+    [[camera]]\nname = \"a\"\nbackend = \"synthetic\"\nrecord = [\"depth\", \"depth_aligned\"]\n\
+    [camera.refine]\nengine = \"onnxruntime\"\nmodel = \"my/net.pth\"\nrate_hz = 0\ninput_size = 252\n\
+    precision = \"bf16\"\ndevice = \"tensorrt:1\"\nformat = \"depth_f32\"\nrecord = true\nalign = true\n\
+    is_aligned = true\n\
+    [[camera]]\nname = \"b\"\nbackend = \"synthetic\"\nrefine = { model = \"cdm-d435\" }\n\
+    [[camera]]\nname = \"c\"\nbackend = \"synthetic\"\n";
+
+#[test]
+fn how_depth_is_refined_is_read_with_all_its_keys() {
+    let rig = parse(REFINED).unwrap();
+    let models = Some("/models".into());
+    let library = Some("/rigs/lib/ort".into());
+    assert_eq!(rig.cdm, CdmConfig { threads: 3, library, models, hang_s: 2.5 });
+    let written_out = RefineConfig {
+        engine: EngineChoice::OnnxRuntime,
+        model: Some(RefineModel::File("/rigs/my/net.pth".into())),
+        rate_hz: 0.0,
+        input_size: Some(252),
+        precision: Precision::Bf16,
+        device: "tensorrt:1".into(),
+        format: PixelFormat::DepthF32,
+        record: true,
+        align: true,
+        is_aligned: true,
+    };
+    assert_eq!(rig.cameras[0].refine.as_ref(), Some(&written_out));
+    let model = Some(RefineModel::Installed("cdm-d435".into()));
+    assert_eq!(rig.cameras[1].refine, Some(RefineConfig { model, ..RefineConfig::default() }));
+    assert_eq!(rig.cameras[2].refine, None);
+}
+
+#[test]
+fn what_is_wrong_with_refining_is_named_at_its_line() {
+    let rig = |keys: &str| {
+        format!("rig = \"r\"\n[[camera]]\nname = \"a\"\nbackend = \"synthetic\"\n[camera.refine]\n{keys}\n")
+    };
+    for (keys, line, said) in [
+        (
+            "engine = \"onnx\"",
+            6,
+            "\"engine\" in [camera.refine] of camera \"a\" cannot be \"onnx\"; did you mean \"onnxruntime\"?",
+        ),
+        (
+            "engnie = \"fill\"",
+            6,
+            "unknown key \"engnie\" in [camera.refine] of camera \"a\"; did you mean \"engine\"?",
+        ),
+        ("rate_hz = -1", 6, "is -1; it must be above 0 and at most 1000, or 0 for every pair"),
+        ("device = \"gpu\"", 6, "is \"gpu\"; it must be cpu, cuda, cuda:1, tensorrt, tensorrt:0 or openvino"),
+        ("input_size = 8", 6, "is 8; it must be within 56 and 2044"),
+        ("format = \"rgb8\"", 6, "it is one of: z16, depth_f32"),
+        ("engine = \"fill\"\nmodel = \"x\"", 7, "has no use: the engine \"fill\" needs no model"),
+        ("[[camera.stream]]\nname = \"depth\"", 5, "[camera.refine] needs the stream \"color\""),
+    ] {
+        let all = problems(&rig(keys));
+        let at = format!("/rigs/rig.toml:{line}:");
+        assert!(all.iter().any(|p| p.starts_with(&at) && p.contains(said)), "{keys}: {all:#?}");
+    }
+    let recorded = rig("").replace("[camera.refine]", "record = [\"depth_refined\"]");
+    assert!(problems(&recorded)[0].contains("which only a camera with [camera.refine] has"));
 }

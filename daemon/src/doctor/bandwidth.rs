@@ -7,6 +7,7 @@ use super::cameras::CameraPlan;
 use super::finding::{Finding, Severity};
 use super::host::Host;
 use crate::attached::Attached;
+use crate::stage;
 use depthrig_bus::PixelFormat;
 use depthrig_drivers::StreamProfile;
 use depthrig_drivers::libusb;
@@ -154,7 +155,8 @@ pub(super) fn check(links: &[LinkLoad], findings: &mut Vec<Finding>) {
 /// The libusb path: the memory of its transfers against the kernel's limit.
 pub(super) fn check_usbfs(plans: &[CameraPlan], host: &Host, findings: &mut Vec<Finding>) {
     let over: Vec<_> = plans.iter().filter(|p| p.libusb).collect();
-    let needed: u64 = over.iter().flat_map(|p| &p.profiles).map(|(p, _)| transfer_bytes(p)).sum();
+    let captured = over.iter().flat_map(|p| &p.profiles).filter(|(p, _)| !stage::is_derived(&p.stream));
+    let needed: u64 = captured.map(|(p, _)| transfer_bytes(p)).sum();
     if needed == 0 {
         return;
     }

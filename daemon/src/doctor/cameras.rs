@@ -127,7 +127,7 @@ pub(super) fn plan_device(
         check_device(device, wanted, &mut findings);
         if !device.profiles.is_empty() {
             match choose_profiles(&device.describe(), &device.profiles, &camera.streams) {
-                Ok(chosen) => set_streams(&mut plan, camera, chosen, device.usb.is_some()),
+                Ok(chosen) => set_streams(&mut plan, camera, chosen, device.usb.is_some(), &mut findings),
                 Err(e) => findings.push(mode_missing(device, &e.to_string())),
             }
         }
@@ -177,7 +177,7 @@ fn plan_made(camera: &CameraConfig) -> Planned {
     match chosen {
         Ok((device, chosen)) => {
             plan.device = Some(device);
-            set_streams(&mut plan, camera, chosen, false);
+            set_streams(&mut plan, camera, chosen, false, &mut findings);
         }
         Err(e) => findings.push(
             Finding::new(
@@ -193,9 +193,26 @@ fn plan_made(camera: &CameraConfig) -> Planned {
     Planned { plan, findings }
 }
 
-fn set_streams(plan: &mut CameraPlan, camera: &CameraConfig, chosen: Vec<StreamProfile>, on_usb: bool) {
-    for p in chosen {
+fn set_streams(
+    plan: &mut CameraPlan,
+    camera: &CameraConfig,
+    chosen: Vec<StreamProfile>,
+    on_usb: bool,
+    findings: &mut Vec<Finding>,
+) {
+    let made = camera.makes(&chosen).unwrap_or_else(|e| {
+        let (why, cure) =
+            ("the camera does not start: its depth cannot be refined", "correct what the message names");
+        let finding = Finding::new(Severity::Error, "refine_impossible", e.to_string(), why, cure);
+        findings.push(finding.of(camera.name.as_str()));
+        Vec::new()
+    });
+    let captured = chosen.into_iter().map(|p| {
         let recorded = camera.records(&p.stream);
+        (p, recorded)
+    });
+    for (p, recorded) in captured.collect::<Vec<_>>().into_iter().chain(made) {
+        let on_usb = on_usb && !crate::stage::is_derived(&p.stream);
         let usb_mbit_s = if on_usb { super::wire_bits_per_s(&p) / 1e6 } else { 0.0 };
         plan.streams.push(PlannedStream { mode: ModeReport::from(&p), usb_mbit_s, recorded });
         plan.profiles.push((p, recorded));

@@ -125,6 +125,13 @@ impl Inner {
                 refine: None,
             });
         }
+        for lane in lock(&self.lanes).iter() {
+            let name = lane.camera.to_string();
+            let Some(camera) = cameras.iter_mut().find(|c| c.name == name) else { continue };
+            camera.refine = Some(lane.status());
+            let told = |s: &Arc<crate::stream::Stream>| report::stream(s, SetAccount::default(), now);
+            camera.streams.extend(lane.streams().map(told));
+        }
         cameras
     }
 

@@ -215,6 +215,7 @@ fn send(
         output.sequence = sequence;
         Ok(Some(header))
     });
+    inner.entrance.bell.raise();
     let mut books = stream.books();
     match &sent {
         Ok(Some(h)) => {

@@ -86,7 +86,7 @@ pub fn stream(stream: &Stream, in_sets: SetAccount, now: HostTime) -> StreamStat
     let us = |ns: i64| ns as f64 / 1e3;
     StreamStatus {
         id: stream.id.to_string(),
-        derived: stage::is_derived(stream),
+        derived: stage::is_derived(&stream.id.stream),
         format: p.format.name().to_owned(),
         width: p.width,
         height: p.height,

@@ -298,7 +298,7 @@ impl Lane {
             message: if blocked {
                 facts.obstacle.clone()
             } else {
-                { facts.message.clone().or_else(|| facts.note.clone()).or_else(|| facts.plan_note.clone()) }
+                facts.message.clone().or_else(|| facts.note.clone()).or_else(|| facts.plan_note.clone())
             },
             engine: facts.engine.clone(),
             model: facts.model.clone(),

@@ -1,7 +1,7 @@
 //! The models of this computer, by name or by camera.
 
 use crate::config::{CdmConfig, RefineModel};
-use depthrig_cdm::{Model, ModelStore, Result, published};
+use depthrig_cdm::{Encoder, Error, ErrorKind, Model, ModelStore, Result, published};
 
 /// The name of the published model that serves a device, if there is one.
 pub fn for_camera(device_model: &str) -> Option<&'static str> {
@@ -23,6 +23,24 @@ pub fn open(config: &CdmConfig, model: &RefineModel) -> Result<Model> {
     match model {
         RefineModel::Installed(name) => store(config)?.get(name),
         RefineModel::File(path) => Model::from_file(path),
+    }
+}
+
+/// The size of a model's network and the shorter side of its input, as far as its record says: nothing is read of files.
+///
+/// # Errors
+/// Those of the store; [`ErrorKind::NotFound`] for a file that is not there.
+pub fn look(config: &CdmConfig, model: &RefineModel) -> Result<Option<(Encoder, u32)>> {
+    match model {
+        RefineModel::Installed(name) => {
+            let record = store(config)?.info(name)?.record;
+            Ok(Some((record.encoder, record.input_size)))
+        }
+        RefineModel::File(path) if path.is_file() => Ok(None),
+        RefineModel::File(path) => {
+            let what = format!("the checkpoint {} is not there", path.display());
+            Err(Error::new(ErrorKind::NotFound, what))
+        }
     }
 }
 

@@ -4,7 +4,7 @@ use crate::commands::run::{self, Started};
 use crate::context::{Context, private_folder};
 use crate::demo::live::{Seen, Watcher};
 use crate::demo::report::DemoReport;
-use crate::demo::{replayed, sheet};
+use crate::demo::{replayed, seeded, sheet};
 use crate::exit::Exit;
 use crate::out;
 use crate::progress::Progress;
@@ -13,7 +13,7 @@ use anyhow::{Context as _, Result, anyhow, bail};
 use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
 use depthrig_bus::{Bus, HostTime, Name, RuntimeDir, StreamId, UtcPair};
-use depthrig_daemon::config::{BackendConfig, RigConfig};
+use depthrig_daemon::config::{BackendConfig, EngineChoice, RefineConfig, RigConfig};
 use depthrig_daemon::control::RecordRequest;
 use depthrig_daemon::rig::{Rig, RigSummary};
 use depthrig_daemon::status::RigStatus;
@@ -69,11 +69,13 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
     let verified = verify(&dataset, &VerifyOptions { decode: true, ..VerifyOptions::default() })?;
     progress.set("replaying", 0, 1);
     let replay = replayed::run(&dataset, &runtime, &name, &recorded.seen.checksums)?;
+    progress.set("a depth model", 0, 1);
+    let seeded = seeded::run()?;
     progress.clear();
 
     let contact_sheet = folder.join("contact-sheet.png");
     let cameras = recorded.live.cameras.iter().filter_map(|c| recorded.seen.pictures.get(&c.name));
-    sheet::contact_sheet(cameras.map(|(color, depth)| (color.as_ref(), depth.as_ref())))
+    sheet::contact_sheet(cameras.map(|pictures| pictures.each_ref().map(Option::as_ref)))
         .save(&contact_sheet)
         .with_context(|| format!("{}: cannot be written", contact_sheet.display()))?;
     let report = DemoReport {
@@ -81,6 +83,8 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
         stop_s: recorded.stop_s,
         live: recorded.live,
         depth: recorded.seen.depth,
+        refined: recorded.seen.refined,
+        seeded,
         units_mm: recorded.seen.units_mm,
         sets_seen: recorded.seen.sets,
         frames_unread: recorded.seen.unread,
@@ -103,13 +107,22 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
     Ok(report.exit())
 }
 
-/// The default rig, with the true depth as streams of their own that are not recorded.
+/// Refined pictures of each camera a second: all seven share what the cores have left.
+const REFINE_HZ: f64 = 0.5;
+
+/// The default rig, with the true depth and, by the engine that needs no model, refined depth as streams of their own
+/// that are not recorded.
 fn configuration() -> Result<RigConfig> {
     let mut config =
         RigConfig::parse(RigConfig::default_text(), None).map_err(depthrig_daemon::Error::from)?;
     for camera in &mut config.cameras {
         if let BackendConfig::Synthetic(settings) = &mut camera.backend {
             settings.truth = true;
+            camera.refine = Some(RefineConfig {
+                engine: EngineChoice::Fill,
+                rate_hz: REFINE_HZ,
+                ..RefineConfig::default()
+            });
             camera.record = Some(vec![Name::new("color")?, Name::new("depth")?]);
         }
     }

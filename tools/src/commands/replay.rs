@@ -8,6 +8,7 @@ use crate::signals::Stop;
 use anyhow::Result;
 use core::time::Duration;
 use depthrig_daemon::client::Client;
+use depthrig_daemon::config::EngineChoice;
 use depthrig_daemon::control::{RecordRequest, SeekRequest};
 use depthrig_daemon::replay::{Replay, ReplayOptions, ReplaySummary};
 use depthrig_daemon::status::ReplayStatus;
@@ -24,6 +25,7 @@ Examples:
   depthrig replay data/left data/right --rig bench2
   depthrig replay data/20261121_1015_kitchen --as-fast-as-possible --paused    nothing is missed, nor the first set
   depthrig replay data/20261121_1015_kitchen --as-fast-as-possible --record data/again
+  depthrig replay data/20261121_1015_kitchen --refine           depth_refined beside the streams of the dataset
 
 From another terminal, while it runs:
   depthrig replay pause
@@ -76,9 +78,23 @@ struct StartArgs {
     /// Name of the recording's folder; made of date, time and scene when left out
     #[arg(long, requires = "record")]
     name: Option<String>,
+    /// Refine the depth of its cameras, by this engine: auto, fill, onnxruntime or candle
+    #[arg(long, value_name = "ENGINE", num_args = 0..=1, default_missing_value = "auto", require_equals = true,
+          value_parser = engine, conflicts_with = "as_fast_as_possible")]
+    refine: Option<EngineChoice>,
     /// Print JSON at the end
     #[arg(long)]
     json: bool,
+}
+
+fn engine(text: &str) -> Result<EngineChoice, String> {
+    Ok(match text {
+        "auto" => EngineChoice::Auto,
+        "fill" => EngineChoice::Fill,
+        "onnxruntime" => EngineChoice::OnnxRuntime,
+        "candle" => EngineChoice::Candle,
+        _ => return Err("it is one of auto, fill, onnxruntime and candle".to_owned()),
+    })
 }
 
 /// What to tell a running replay.
@@ -192,6 +208,7 @@ fn replay(args: &StartArgs, context: &Context) -> Result<Exit> {
         // A recording begins before the first set does.
         paused: args.paused || args.record.is_some(),
         hold: args.hold,
+        refine: args.refine,
         serve_api: true,
     };
     let replay = Replay::start(&args.datasets, &context.runtime()?, context.global.rig.clone(), options)?;

@@ -16,6 +16,10 @@ const KEEP: usize = 14;
 const COMPARE_EVERY: u64 = 10;
 /// Sets that are compared at most; each is some 25 MB.
 const COMPARE_MOST: usize = 6;
+/// Refined pictures of a camera that are compared at most.
+const REFINED_MOST: usize = 3;
+/// Frames of one moment are this close.
+const SAME_MOMENT_NS: i64 = 1_000_000;
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// What was seen of one camera's depth.
@@ -44,8 +48,21 @@ pub struct Seen {
     pub depth: BTreeMap<String, DepthSeen>,
     /// Millimetres per unit of depth, by camera.
     pub units_mm: BTreeMap<String, f64>,
-    /// The newest pictures by camera: colour and depth as colours.
-    pub pictures: BTreeMap<String, (Option<RgbImage>, Option<RgbImage>)>,
+    /// Refined depth by camera.
+    pub refined: BTreeMap<String, RefinedSeen>,
+    /// The newest pictures by camera: colour, depth and refined depth as colours.
+    pub pictures: BTreeMap<String, [Option<RgbImage>; 3]>,
+}
+
+/// What was seen of one camera's refined depth.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct RefinedSeen {
+    /// What refined it, as the frames say.
+    pub engine: String,
+    /// Frames that came.
+    pub frames: u64,
+    /// Against the truth in the view of colour.
+    pub depth: DepthSeen,
 }
 
 /// A frame that outlives its slot.
@@ -72,6 +89,8 @@ pub struct Watcher {
     seen: Seen,
     /// Depth and truth to be compared at the end.
     to_compare: Vec<Vec<(Copied, Option<Copied>)>>,
+    /// Refined depth and truth, likewise.
+    refined: Vec<(Copied, Copied)>,
 }
 
 impl Watcher {
@@ -82,7 +101,13 @@ impl Watcher {
             let subscriber = bus.subscriber_within(id, PATIENCE)?;
             inputs.insert(id.clone(), Input { subscriber, kept: VecDeque::with_capacity(KEEP) });
         }
-        Ok(Self { inputs, sets: bus.set_subscriber()?, seen: Seen::default(), to_compare: Vec::new() })
+        Ok(Self {
+            inputs,
+            sets: bus.set_subscriber()?,
+            seen: Seen::default(),
+            to_compare: Vec::new(),
+            refined: Vec::new(),
+        })
     }
 
     /// Takes frames and sets until `ended`.
@@ -91,6 +116,7 @@ impl Watcher {
             for input in self.inputs.values_mut() {
                 input.pump()?;
             }
+            self.take_refined()?;
             // Frames come at up to 60 Hz and four wait unread: a look every 20 ms loses none.
             if let Some(set) = self.sets.next_timeout(Duration::from_millis(20))? {
                 let members = set.members()?;
@@ -105,20 +131,50 @@ impl Watcher {
             let Some(frame) = input.kept.back() else { continue };
             let pictures = self.seen.pictures.entry(id.camera.to_string()).or_default();
             match id.stream.as_str() {
-                "color" => pictures.0 = Some(picture::to_rgb(frame.header(), frame.pixels())?),
-                "depth" => pictures.1 = Some(picture::to_rgb(frame.header(), frame.pixels())?),
+                "color" => pictures[0] = Some(picture::to_rgb(frame.header(), frame.pixels())?),
+                "depth" => pictures[1] = Some(picture::to_rgb(frame.header(), frame.pixels())?),
+                "depth_refined" => {
+                    pictures[2] = Some(picture::to_rgb(frame.header(), frame.pixels())?);
+                }
                 _ => {}
             }
+        }
+        for (refined, truth) in &self.refined {
+            let seen = self.seen.refined.entry(refined.header.camera().to_owned()).or_default();
+            seen.depth.add(refined, Some(truth))?;
         }
         for (depth, truth) in self.to_compare.iter().flatten() {
             let seen = self.seen.depth.entry(depth.header.camera().to_owned()).or_default();
             seen.add(depth, truth.as_ref())?;
         }
-        for depth in self.seen.depth.values_mut() {
+        for depth in self.seen.depth.values_mut().chain(self.seen.refined.values_mut().map(|r| &mut r.depth))
+        {
             depth.fill_percent /= depth.pictures.max(1) as f64;
             depth.l1_mm = depth.l1_mm.map(|sum| sum / depth.compared.max(1) as f64);
         }
         Ok(self.seen)
+    }
+
+    /// Counts refined frames, and keeps some with the truth of their moment.
+    fn take_refined(&mut self) -> Result<()> {
+        for (id, input) in self.inputs.iter().filter(|(id, _)| id.stream.as_str() == "depth_refined") {
+            let Some(frame) = input.kept.back() else { continue };
+            let seen = self.seen.refined.entry(id.camera.to_string()).or_default();
+            let before = core::mem::replace(&mut seen.frames, frame.header().sequence);
+            if before == seen.frames {
+                continue;
+            }
+            frame.header().refiner().clone_into(&mut seen.engine);
+            let truth = StreamId::new(id.camera.as_str(), "depth_true_color")?;
+            let at = frame.header().capture_time_ns;
+            let same = |f: &&Frame| (f.header().capture_time_ns - at).abs() < SAME_MOMENT_NS;
+            let truth = self.inputs.get(&truth).and_then(|i| i.kept.iter().find(same));
+            let kept = self.refined.iter().filter(|(r, _)| r.header.camera() == id.camera.as_str()).count();
+            if let Some(truth) = truth.filter(|_| kept < REFINED_MOST) {
+                self.refined.push((Copied::of(frame), Copied::of(truth)));
+            }
+        }
+        Ok(())
     }
 
     fn take(&mut self, members: &[MemberRecord]) -> Result<()> {
@@ -177,7 +233,7 @@ impl DepthSeen {
         self.pictures += 1;
         self.fill_percent += 100.0 * fill_rate(&Depth::Metres(&metres));
         let same_moment =
-            |t: &&Copied| (t.header.capture_time_ns - depth.header.capture_time_ns).abs() < 1_000_000;
+            |t: &&Copied| (t.header.capture_time_ns - depth.header.capture_time_ns).abs() < SAME_MOMENT_NS;
         if let Some(truth) = truth.filter(same_moment)
             && let Some(true_metres) = picture::depth_m(&truth.header, &truth.pixels)?
         {

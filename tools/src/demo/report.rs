@@ -1,7 +1,8 @@
 //! The report of the demo: one table and a few lines, and everything as JSON.
 
-use super::live::DepthSeen;
+use super::live::{DepthSeen, RefinedSeen};
 use super::replayed::Replayed;
+use super::seeded::Seeded;
 use crate::commands::verify;
 use crate::exit::Exit;
 use crate::out;
@@ -23,6 +24,10 @@ pub struct DemoReport {
     pub live: RigStatus,
     /// Depth as a subscriber saw it, by camera.
     pub depth: BTreeMap<String, DepthSeen>,
+    /// Refined depth as a subscriber saw it, by camera.
+    pub refined: BTreeMap<String, RefinedSeen>,
+    /// A camera depth model of random weights, end to end.
+    pub seeded: Seeded,
     /// Millimetres per unit of depth, by camera.
     pub units_mm: BTreeMap<String, f64>,
     /// Sets that the subscriber got.
@@ -98,10 +103,11 @@ impl DemoReport {
                 self.replay.depth_different
             ),
         ];
+        lines.extend(self.refined_lines());
         let lost = self.summary.lost.iter().chain(&self.replay.lost);
         lines.extend(lost.map(|lost| format!("lost      {lost}")));
         lines.push(String::new());
-        lines.push(format!("pictures  {}", self.contact_sheet.display()));
+        lines.push(format!("pictures  {}  (colour, depth, refined depth)", self.contact_sheet.display()));
         lines.push(format!("report    {}", self.quality_report.display()));
         if let Some(segment) = self.segments.first() {
             lines.push(format!(
@@ -112,13 +118,65 @@ impl DemoReport {
         lines.join("\n")
     }
 
+    /// What was refined live and by what, and what a model of random weights did.
+    fn refined_lines(&self) -> Vec<String> {
+        let mut lines = vec![String::new()];
+        let frames: u64 = self.refined.values().map(|r| r.frames).sum();
+        let engine = self.refined.values().map(|r| r.engine.as_str()).find(|e| !e.is_empty());
+        let verdict = if frames > 0 { "ok  " } else { "LOOK" };
+        lines.push(format!(
+            "{verdict} refined  {frames} frames of depth_refined by {}, which fills holes along colour and uses no model",
+            engine.unwrap_or("nothing")
+        ));
+        let percent = |d: &DepthSeen| format!("{:.0} %", d.fill_percent);
+        let error = |d: &DepthSeen| d.l1_mm.map_or_else(|| "-".into(), |mm| format!("{mm:.1} mm"));
+        let row = |(name, refined): (&String, &RefinedSeen)| {
+            let raw = self.depth.get(name).cloned().unwrap_or_default();
+            let live = self.live.cameras.iter().find(|c| c.name == *name).and_then(|c| c.refine.as_ref());
+            let step = |s: &str| {
+                live.and_then(|r| r.steps_p50_ms.get(s)).map_or("-".into(), |ms| format!("{ms:.1}"))
+            };
+            let made = &refined.depth;
+            let seen = made.pictures > 0;
+            vec![
+                name.clone(),
+                percent(&raw),
+                if seen { percent(made) } else { "-".into() },
+                error(&raw),
+                error(made),
+                step("wait"),
+                step("register"),
+                step("infer"),
+            ]
+        };
+        let header = &["camera", "raw", "filled", "raw error", "filled error", "wait ms", "register", "fill"];
+        lines.push(out::table(header, 1, self.refined.iter().map(row)));
+        lines.push(
+            "raw and filled: pixels with depth; errors: mean distance from the true depth where both are, so that filled \
+             counts the hard pixels that raw leaves out"
+                .to_owned(),
+        );
+        let s = &self.seeded;
+        lines.push(match &s.missing {
+            Some(why) => format!("--   model    a camera depth model is not shown: {why}"),
+            None => format!(
+                "ok   model    {} ran {}: first frame after {:.1} s, network {:.0} ms, all steps {:.0} ms; its weights are \
+                 random, so what it gives is no depth",
+                s.engine, s.model, s.first_frame_s, s.infer_ms, s.total_ms
+            ),
+        });
+        lines
+    }
+
     fn row(&self, camera: &CameraStatus) -> Vec<String> {
         let stream = |name: &str| camera.streams.iter().find(|s| s.id.ends_with(&format!("/{name}")));
         let size =
             |s: Option<&StreamStatus>| s.map_or_else(|| "-".into(), |s| format!("{}x{}", s.width, s.height));
         let (color, depth) = (stream("color"), stream("depth"));
         let of_depth = |tell: &dyn Fn(&StreamStatus) -> String| depth.map_or_else(|| "-".into(), tell);
-        let sum = |count: fn(&StreamStatus) -> u64| camera.streams.iter().map(count).sum::<u64>().to_string();
+        let sum = |count: fn(&StreamStatus) -> u64| {
+            camera.streams.iter().filter(|s| !s.derived).map(count).sum::<u64>().to_string()
+        };
         let seen = self.depth.get(&camera.name);
         vec![
             camera.name.clone(),

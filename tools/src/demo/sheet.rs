@@ -1,4 +1,4 @@
-//! The contact sheet: what the cameras saw, colour beside depth, in one picture.
+//! The contact sheet: what the cameras saw in one picture: colour, depth, and refined depth beside each other.
 
 use image::{Rgb, RgbImage, imageops};
 
@@ -10,20 +10,22 @@ const GAP: u32 = 4;
 const COLUMNS: u32 = 2;
 const BACKGROUND: Rgb<u8> = Rgb([24, 24, 28]);
 
-/// The sheet of `cameras`, two abreast, each colour and then depth. Where one has no picture is background.
-pub fn contact_sheet<'a>(
-    cameras: impl IntoIterator<Item = (Option<&'a RgbImage>, Option<&'a RgbImage>)>,
+/// The sheet of `cameras`, two abreast, each with its pictures from left to right. Where one is missing is background.
+pub fn contact_sheet<'a, const N: usize>(
+    cameras: impl IntoIterator<Item = [Option<&'a RgbImage>; N]>,
 ) -> RgbImage {
-    let pairs: Vec<[RgbImage; 2]> =
-        cameras.into_iter().map(|(color, depth)| [small(color), small(depth)]).collect();
-    let cell = pairs.iter().map(|[a, b]| a.width() + GAP + b.width()).max().unwrap_or(1) + 3 * GAP;
-    let rows = (pairs.len() as u32).div_ceil(COLUMNS).max(1);
+    let all: Vec<[RgbImage; N]> = cameras.into_iter().map(|pictures| pictures.map(small)).collect();
+    let width = |pictures: &[RgbImage; N]| pictures.iter().map(|p| p.width() + GAP).sum::<u32>();
+    let cell = all.iter().map(width).max().unwrap_or(1) + 2 * GAP;
+    let rows = (all.len() as u32).div_ceil(COLUMNS).max(1);
     let mut sheet = RgbImage::from_pixel(cell * COLUMNS, rows * (HEIGHT + 2 * GAP), BACKGROUND);
-    for (i, [color, depth]) in pairs.iter().enumerate() {
+    for (i, pictures) in all.iter().enumerate() {
         let (column, row) = (i as u32 % COLUMNS, i as u32 / COLUMNS);
-        let (x, y) = (column * cell + GAP, row * (HEIGHT + 2 * GAP) + GAP);
-        imageops::replace(&mut sheet, color, x.into(), y.into());
-        imageops::replace(&mut sheet, depth, (x + color.width() + GAP).into(), y.into());
+        let (mut x, y) = (column * cell + GAP, row * (HEIGHT + 2 * GAP) + GAP);
+        for picture in pictures {
+            imageops::replace(&mut sheet, picture, x.into(), y.into());
+            x += picture.width() + GAP;
+        }
     }
     sheet
 }
@@ -45,7 +47,7 @@ mod tests {
     fn pictures_stand_side_by_side() {
         let red = RgbImage::from_pixel(640, 480, Rgb([255, 0, 0]));
         let blue = RgbImage::from_pixel(320, 240, Rgb([0, 0, 255]));
-        let sheet = contact_sheet([(Some(&red), Some(&blue)), (None, Some(&blue)), (Some(&red), None)]);
+        let sheet = contact_sheet([[Some(&red), Some(&blue)], [None, Some(&blue)], [Some(&red), None]]);
         assert_eq!(sheet.height(), 2 * (HEIGHT + 2 * GAP));
         assert_eq!(sheet.get_pixel(GAP + 5, GAP + 5).0, [255, 0, 0]);
         assert_eq!(sheet.get_pixel(GAP + 160 + GAP + 5, GAP + 5).0, [0, 0, 255]);
