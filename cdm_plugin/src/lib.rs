@@ -13,6 +13,7 @@ mod error;
 mod factory;
 pub mod fetch;
 mod fill;
+pub mod fuzzing;
 pub mod metrics;
 mod model;
 mod network;

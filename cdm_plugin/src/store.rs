@@ -17,6 +17,7 @@ use std::path::{Path, PathBuf};
 
 mod record;
 
+pub(crate) use record::fuzz as fuzz_record;
 pub use record::{Record, Source, WeightsRecord};
 
 /// The weights within a model's folder.

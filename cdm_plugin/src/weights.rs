@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 mod floats;
+pub(crate) mod fuzzing;
 mod map;
 mod pickle;
 mod pth;

@@ -128,3 +128,15 @@ pub(super) fn of(import: &Import, weights: &Weights, report: &Report, written: W
         source: import.source.clone(),
     }
 }
+
+/// For the fuzz target: reads a record, and sees that writing it changes nothing.
+pub(crate) fn fuzz(text: &str) -> bool {
+    let Ok(record) = Record::from_toml(text) else { return false };
+    let again = Record::from_toml(&record.to_toml());
+    // Compared as text, because a record may hold NaN.
+    assert!(
+        again.is_ok_and(|again| again.to_toml() == record.to_toml()),
+        "a record changes by being written and read"
+    );
+    true
+}

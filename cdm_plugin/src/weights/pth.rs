@@ -97,7 +97,11 @@ fn members(file: &[u8]) -> Parsed<HashMap<String, Range<usize>>> {
     Ok(members)
 }
 
-fn contents(pickle: &Pickle<'_>, place: &dyn Fn(&str) -> Option<Range<usize>>) -> Parsed<Contents> {
+/// The tensors of a list, whose storages lie where `place` says.
+pub(super) fn contents(
+    pickle: &Pickle<'_>,
+    place: &dyn Fn(&str) -> Option<Range<usize>>,
+) -> Parsed<Contents> {
     let Value::Dict(top) = pickle.get(pickle.root) else {
         return Err(format!(
             "holds {}, not a dict of tensors; save a state dict: torch.save(net.state_dict(), FILE)",
