@@ -221,7 +221,7 @@ impl ModelStore {
     /// Those of [`Self::info`], and [`ErrorKind::BadModel`] when its weights are not those of the record.
     pub fn get(&self, name: &str) -> Result<Model> {
         let installed = self.info(name)?;
-        let weights = self.weights(&installed)?;
+        let weights = Self::weights(&installed)?;
         let id = installed.id();
         let record = installed.record;
         Ok(Model {
@@ -264,7 +264,7 @@ impl ModelStore {
         Ok(installed.into_iter().find(names_it).map(|i| i.name))
     }
 
-    fn weights(&self, installed: &Installed) -> Result<Weights> {
+    fn weights(installed: &Installed) -> Result<Weights> {
         let weights = Weights::open(installed.path.join(WEIGHTS))?;
         let Record { encoder, weights: recorded, .. } = &installed.record;
         let changed = |what: String| {
@@ -293,7 +293,7 @@ impl ModelStore {
     /// are none.
     pub fn check(&self, name: &str) -> Result<Report> {
         let installed = self.info(name)?;
-        let weights = self.weights(&installed)?;
+        let weights = Self::weights(&installed)?;
         let (has, said) = (weights.sha256(), &installed.record.weights.sha256);
         if has != *said {
             let path = weights.path().display();
@@ -327,7 +327,8 @@ impl ModelStore {
         }
         told(watch, "check", 0, 1)?;
         let report = weights::examine(weights, import.encoder)?;
-        if !report.is_good() && !(import.drop_extra && report.is_good_but_for_extra()) {
+        let good = report.is_good() || (import.drop_extra && report.is_good_but_for_extra());
+        if !good {
             return Err(report.error(weights));
         }
         let part = self.dir.join(format!(".import-{}", import.name));

@@ -207,12 +207,12 @@ fn parse(file: &[u8]) -> Parsed<(Format, Contents)> {
 /// Cuts `module.` off every name when all have it: a wrapper's prefix, and never the network's own.
 fn without_module(contents: Contents) -> Contents {
     const PREFIX: &str = "module.";
+    fn cut<V>(map: BTreeMap<String, V>) -> BTreeMap<String, V> {
+        map.into_iter().map(|(name, v)| (name[PREFIX.len()..].to_owned(), v)).collect()
+    }
     let mut names = contents.entries.keys().chain(contents.others.keys());
     if contents.entries.is_empty() || !names.all(|n| n.starts_with(PREFIX)) {
         return contents;
-    }
-    fn cut<V>(map: BTreeMap<String, V>) -> BTreeMap<String, V> {
-        map.into_iter().map(|(name, v)| (name[PREFIX.len()..].to_owned(), v)).collect()
     }
     Contents { entries: cut(contents.entries), others: cut(contents.others), ..contents }
 }

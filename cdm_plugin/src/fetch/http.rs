@@ -57,8 +57,8 @@ impl Client {
             .max_redirects(0)
             .max_redirects_will_error(false)
             .timeout_connect(Some(Duration::from_secs(30)))
-            .timeout_recv_response(Some(Duration::from_secs(60)))
-            .timeout_per_read(Some(Duration::from_secs(60)))
+            .timeout_recv_response(Some(Duration::from_mins(1)))
+            .timeout_per_read(Some(Duration::from_mins(1)))
             .user_agent(concat!("depthrig/", env!("CARGO_PKG_VERSION")));
         // This computer is never behind a proxy.
         let here = ["127.0.0.1", "localhost", "[::1]"].contains(&host(url));

@@ -168,7 +168,8 @@ impl<'a> Machine<'a> {
             0x80 => self.protocol()?,
             0x95 => drop(self.take(8)?), // a frame: only a hint for readers of streams
             b'(' => self.marks.push(self.stack.len()),
-            b'0' => drop(self.pop()?),
+            // `b`: the state of an object. Dicts carry `_metadata`, with versions of layers that do not matter here.
+            b'0' | b'b' => drop(self.pop()?),
             b'1' => drop(self.since_mark()?),
             b'N' => self.push(Value::None)?,
             0x88 | 0x89 => self.push(Value::Bool)?,
@@ -239,8 +240,6 @@ impl<'a> Machine<'a> {
             }
             b'Q' => self.persistent()?,
             b'R' | 0x81 => self.call()?,
-            // The state of an object. Dicts carry `_metadata`, with versions of layers that do not matter here.
-            b'b' => drop(self.pop()?),
             other => return Err(unknown(other)),
         }
         Ok(())

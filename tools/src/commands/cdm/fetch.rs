@@ -88,12 +88,13 @@ pub fn run(args: &FetchArgs, context: &Context) -> Result<Exit> {
     let installed = install(&store, &weights, import, &stop, context).map_err(usage)?;
     fetched.discard();
     tell_installed(&installed, args.json)?;
-    if let (Source::Fetched { sha256, compared_with, .. }, false) = (&fetched.source, args.json) {
-        if compared_with == "nothing" {
-            out::line(format_args!(
-                "no SHA-256 of this file was known; the one that came is written down: {sha256}"
-            ))?;
-        }
+    if let Source::Fetched { sha256, compared_with, .. } = &fetched.source
+        && compared_with == "nothing"
+        && !args.json
+    {
+        out::line(format_args!(
+            "no SHA-256 of this file was known; the one that came is written down: {sha256}"
+        ))?;
     }
     Ok(Exit::Good)
 }
