@@ -49,6 +49,7 @@ class Channel:
             "camera": self.camera,
             "stream": self.stream,
             "capture_time_ns": capture_ns,
+            "publish_time_ns": capture_ns,
             "format": int(pixel_format),
             "width": array.shape[1],
             "height": array.shape[0],

@@ -142,6 +142,7 @@ class Receiver:
         self.bus = bus
         self.what = what
         self._forks = _forks
+        self._waitset: tuple[Any, Any] | None = None
         name = iox2.ServiceName.new(f"depthrig/{rig}/{channel}")
         schema = iox2.AttributeVerifier.new().require(
             iox2.AttributeKey.new("schema"), iox2.AttributeValue.new(_layout.SCHEMA)
@@ -220,6 +221,34 @@ class Receiver:
             if str(e) != "InterruptSignal":  # the signal's own handler runs when this returns
                 raise BusError(f"{self.what}: waiting for a frame failed ({e})") from e
 
+    def rest(self, nanoseconds: int) -> bool:
+        """Sleep for so long, to a tenth of a millisecond; whether nothing was sent meanwhile.
+
+        :meth:`wait` rounds up to the kernel's ticks of 4 ms, this to milliseconds; what is over a millisecond is slept
+        first, when a frame is least likely.
+        """
+        if self._listener is None:
+            raise ValueError(f"{self.what} was closed")
+        try:
+            if self._waitset is None:
+                builder = iox2.WaitSetBuilder.new().signal_handling_mode(iox2.SignalHandlingMode.Disabled)
+                waitset = builder.create(iox2.ServiceType.Ipc)
+                self._waitset = (waitset, waitset.attach_notification(self._listener))
+            self._listener.try_wait()  # notifications of frames that were read already
+            millis, over = divmod(nanoseconds, 1_000_000)
+            time.sleep(over / 1e9)
+            if self.has_unread():
+                return False
+            came, _ = self._waitset[0].wait_and_process_with_timeout(iox2.Duration.from_millis(millis))
+            return not came
+        except (
+            iox2.ListenerWaitError,
+            iox2.WaitSetCreateError,
+            iox2.WaitSetAttachmentError,
+            iox2.WaitSetRunError,
+        ):
+            return False  # a signal, whose handler runs when this returns; the next wait reports all else
+
     def has_publisher(self) -> bool:
         """Whether anybody publishes the channel now; cleans up after killed publishers first."""
         self.bus.clean_dead()
@@ -227,6 +256,7 @@ class Receiver:
 
     def close(self) -> None:
         """Stop receiving. Samples that are held stay valid."""
+        self._waitset = None
         self._subscriber = None
         self._listener = None
 

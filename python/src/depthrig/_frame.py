@@ -113,7 +113,7 @@ class Frame:
         self._raw = raw
         self._header: Header | None = None
         self._address = address
-        _, self.sequence, self.capture_time_ns, self._flags, *picture = fields
+        _, self.sequence, self.capture_time_ns, _, self._flags, *picture = fields
         try:
             shape = self._shape = shape_of(*picture)
         except (BadFrame, VersionMismatch) as e:

@@ -204,7 +204,7 @@ class SetReader:
             until = min(SLICE_S, deadline - now, look - now)
             # Behind the moment from which a group may be partial, any stream may bring it; asked often enough.
             until = min(until, partial - now) if now < partial else min(until, 0.005)
-            self._laggard()._open.wait(until)
+            self._laggard()._pause(until)
 
     def _drain(self) -> None:
         """Take what came, and keep the newest frames of each stream."""

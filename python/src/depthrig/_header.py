@@ -15,9 +15,10 @@ from . import _layout
 from ._layout import ClockDomain, Distortion, DropReason, FrameFlags, HeaderFields, PixelFormat
 from .errors import VersionMismatch
 
-essentials = struct.Struct("<8sQ32xq288xI5I").unpack_from
-"""What receiving a frame needs of its header, in one go: VERSION_BYTES, sequence, capture time, flags; then format,
-width, height, stride and payload_len. Between publishing and a policy's use, what nobody asked for costs time."""
+essentials = struct.Struct("<8sQ32xq16xq264xI5I").unpack_from
+"""What receiving a frame needs of its header, in one go: VERSION_BYTES, sequence, capture and publish time, flags; then
+format, width, height, stride and payload_len. Between publishing and a policy's use, what nobody asked for costs time.
+"""
 VERSION_BYTES = struct.pack("<4sHH", _layout.HEADER_MAGIC, _layout.HEADER_VERSION, _layout.HEADER_SIZE)
 HeaderBytes = ctypes.c_char * _layout.HEADER_SIZE
 

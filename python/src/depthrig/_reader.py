@@ -55,6 +55,10 @@ class Reader(Generic[T]):
     def _take(self) -> T | None:
         raise NotImplementedError
 
+    def _pause(self, seconds: float) -> None:
+        """Wait until something was published, or up to `seconds`; may return early."""
+        self._open.wait(seconds)
+
     def latest(self) -> T | None:
         """Return the newest unread frame, skipping older ones; None when nothing came since the last call."""
         newest = self._take()
@@ -85,7 +89,7 @@ class Reader(Generic[T]):
                     f"{self._open.what}: nothing came within {timeout:g} s; `depthrig status` shows what the camera "
                     "is doing"
                 )
-            self._open.wait(min(SLICE_S, deadline - now, look - now))
+            self._pause(min(SLICE_S, deadline - now, look - now))
 
     def _check_publisher(self) -> None:
         """Raise StreamGone when nobody publishes the channel any more."""

@@ -1,0 +1,93 @@
+"""When a steady stream's next frame is due, and that nothing is lost or late when it comes at another time."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import depthrig
+from depthrig._rhythm import LEAD_NS, Rhythm
+from maker import Maker
+from rig import WAIT_S
+
+MS = 1_000_000
+
+
+def heard(*times_ms: float, steps: int = 1) -> Rhythm:
+    rhythm = Rhythm()
+    for i, ms in enumerate(times_ms):
+        rhythm.heard(1 + i * steps, int(ms * MS))
+    return rhythm
+
+
+def test_a_steady_stream_is_due_after_its_period() -> None:
+    rhythm = heard(*(100 + 33 * i for i in range(6)))
+    assert rhythm.rest_ns(265 * MS) == 33 * MS - LEAD_NS
+    assert rhythm.rest_ns(298 * MS) == 0
+    assert rhythm.rest_ns(400 * MS) == 0
+
+
+def test_frames_that_were_missed_do_not_change_the_period() -> None:
+    assert heard(*(100 + 66 * i for i in range(6)), steps=2).rest_ns(430 * MS) == 33 * MS - LEAD_NS
+
+
+@pytest.mark.parametrize(
+    "times_ms",
+    [(), (100,), (100, 133, 166), (0, 50, 60, 140, 150, 230, 231), tuple(range(0, 9000, 1000)), (5, 5, 5, 5, 5, 5)],
+    ids=["nothing", "one", "three", "irregular", "seldom", "at once"],
+)
+def test_without_a_rhythm_nothing_is_expected(times_ms: tuple[float, ...]) -> None:
+    assert heard(*times_ms).rest_ns(int((times_ms or (0,))[-1] * MS)) == 0
+
+
+def test_a_restarted_stream_is_learnt_anew() -> None:
+    rhythm = heard(*(100 + 33 * i for i in range(6)))
+    rhythm.heard(1, 300 * MS)
+    assert rhythm.rest_ns(300 * MS) == 0
+    for i in range(1, 4):
+        rhythm.heard(1 + i, (300 + 100 * i) * MS)
+    assert rhythm.rest_ns(600 * MS) == 100 * MS - LEAD_NS
+
+
+@pytest.fixture
+def maker(folder: Path) -> Iterator[Maker]:
+    with Maker(folder) as made:
+        yield made
+
+
+@pytest.mark.parametrize("prepare", [True, False])
+def test_frames_out_of_time_are_read_at_once_and_none_is_lost(maker: Maker, folder: Path, prepare: bool) -> None:
+    """Twenty frames at a steady pace, then one far too early, and one far too late."""
+    depth = maker.channel("cam/depth")
+    s = depthrig.Stream("cam/depth", rig="mount", runtime_dir=folder, timeout=WAIT_S, prepare=prepare)
+    rests: list[bool] = []
+    rest = s._open.rest
+    s._open.rest = lambda ns: rests.append(rest(ns)) or rests[-1]  # type: ignore[method-assign, func-returns-value]
+
+    def publish() -> None:
+        start = time.monotonic()
+        for due in (*(0.05 * i for i in range(1, 21)), 1.005, 1.3):
+            time.sleep(max(0.0, start + due - time.monotonic()))
+            depth.send(time.monotonic_ns(), publish_time_ns=time.monotonic_ns())
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    waits = []
+    for sequence in range(1, 23):
+        frame = s.next(WAIT_S)
+        waits.append(frame.age_s)
+        assert frame.sequence == sequence
+        del frame
+    thread.join()
+    assert s.missed == 0
+    if prepare:
+        assert len(rests) >= 10, "a steady stream is prepared for"
+        assert True in rests
+    else:
+        assert rests == []
+    # Half a period would be a frame that was slept through. A loaded computer wakes threads late, but not each time.
+    assert sorted(waits)[len(waits) // 2] < 0.025
