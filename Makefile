@@ -14,9 +14,11 @@ LEROBOT := .venv-lerobot
 # Other recorders to compare with; Debian's Python, because Debian's rosbag is for no other.
 PEERS := tests/peers
 PEERS_VENV := .venv-peers
+# Other transports to carry pictures with.
+FEED := .venv-feed
 REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt
 
-.PHONY: help demo test test-long vm fuzz lint bench bench-peers clean setup-build setup-test setup-vm setup-peers setup-fuzz
+.PHONY: help demo test test-long vm fuzz lint bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
 
 help: ## show this list
 	@sed -nE 's/^([a-z-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -59,9 +61,13 @@ bench-peers: setup-peers $(PEERS_VENV)/.stamp ## beside Python mcap, foxglove-sd
 	$(PEERS_VENV)/bin/python $(PEERS)/compare.py --depthrig target/release/examples/bench_frames \
 	    --json target/bench-peers.json $(ARGS)
 
+bench-feed: setup-build $(FEED)/.stamp ## from one process to a NumPy array in another, beside pyzmq, zenoh and dora-rs
+	cargo build --release --package depthrig-bus --example latency
+	$(FEED)/bin/python $(PEERS)/feed.py --latency target/release/examples/latency --json target/bench-feed.json $(ARGS)
+
 clean: ## remove what was built
 	cargo clean
-	rm -rf $(VENV) $(LEROBOT) $(PEERS_VENV) $(READERS)/node_modules
+	rm -rf $(VENV) $(LEROBOT) $(PEERS_VENV) $(FEED) $(READERS)/node_modules
 
 setup-build:
 	@tools/setup.sh build
@@ -92,6 +98,11 @@ $(LEROBOT)/.stamp: tests/python/requirements-lerobot.txt
 $(PEERS_VENV)/.stamp: $(PEERS)/requirements.txt
 	/usr/bin/python3 -m venv --system-site-packages $(PEERS_VENV)
 	$(PEERS_VENV)/bin/pip install --quiet --requirement $(PEERS)/requirements.txt
+	touch $@
+
+$(FEED)/.stamp: $(PEERS)/requirements-feed.txt python/pyproject.toml
+	python3 -m venv $(FEED)
+	$(FEED)/bin/pip install --quiet --requirement $< --editable ./python
 	touch $@
 
 $(READERS)/node_modules/.stamp: $(READERS)/package.json $(READERS)/package-lock.json

@@ -35,6 +35,17 @@ export DEPTHRIG_BIN=$target/depthrig
 export DEPTHRIG_TEST_PUBLISHER=$target/examples/publish
 
 step python "$python" -m pytest --quiet python/tests
+# The wheel on other versions of Python, and with PyTorch.
+step python-versions tools/python.sh versions
+skipped=""
+torch() {
+    tools/python.sh torch
+    local status=$?
+    [ "$status" -ne 77 ] || echo "PyTorch skipped"
+    [ "$status" -eq 0 ] || [ "$status" -eq 77 ]
+}
+step python-torch torch
+if grep -q '^PyTorch skipped' "$logs/python-torch.log"; then skipped+=", 1 skipped: tests with PyTorch"; fi
 step daemon "$python" -m pytest --quiet tests/python
 
 # Readers that are not ours must find the same pixels.
@@ -48,7 +59,6 @@ step reader-python-stereo "$python" tests/readers/check_python.py "$work/stereo"
 step reader-node-stereo node tests/readers/check_node.mjs "$work/stereo" "$work/stereo-expected"
 
 # The drivers and the daemon on a real kernel. 77: what that needs is not installed, which DEPTHRIG_REQUIRE_VM forbids.
-skipped=""
 vm() {
     tests/vm/run --no-build ${DEPTHRIG_REQUIRE_VM:+--require}
     local status=$?
@@ -56,10 +66,10 @@ vm() {
     [ "$status" -eq 0 ] || [ "$status" -eq 77 ]
 }
 step vm vm
-if grep -q '^virtual machine skipped' "$logs/vm.log"; then skipped=", 1 skipped: the virtual machine"; fi
+if grep -q '^virtual machine skipped' "$logs/vm.log"; then skipped+=", 1 skipped: the virtual machine"; fi
 
 # Every test that cargo and pytest counted, every check of the virtual machine, and one for each of the other steps.
-count() { grep -ohE "[0-9]+ $1" "$logs"/{rust,python,daemon,vm}.log | awk '{n += $1} END {print n + 0}'; }
+count() { grep -ohE "[0-9]+ $1" "$logs"/{rust,python,python-versions,python-torch,daemon,vm}.log | awk '{n += $1} END {print n + 0}'; }
 passed=$(count passed)
 failed=$(count failed)
 for name in {golden,reader-python,reader-node}{,-stereo}; do

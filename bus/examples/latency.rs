@@ -25,7 +25,10 @@ fn main() -> Result<(), Box<dyn Error>> {
         ["receive", folder, stream, frames, warm_up] => {
             receive(folder, stream, frames.parse()?, warm_up.parse()?)
         }
-        _ => Err("send RUNTIME_DIR FORMAT WIDTHxHEIGHT FPS, or receive RUNTIME_DIR STREAM FRAMES WARM_UP".into()),
+        _ => {
+            Err("send RUNTIME_DIR FORMAT WIDTHxHEIGHT FPS, or receive RUNTIME_DIR STREAM FRAMES WARM_UP"
+                .into())
+        }
     }
 }
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import gc
 import shutil
+import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,6 +28,18 @@ def folder() -> Iterator[Path]:
     Bus.at(str(path)).clean_dead()
     gc.collect()
     shutil.rmtree(path, ignore_errors=True)
+
+
+@pytest.fixture
+def live(binary: str, folder: Path) -> Iterator[Path]:
+    """A publisher at 100 Hz."""
+    process = subprocess.Popen([binary, str(folder), "--fps", "100", "--pad", "2"], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.readline()
+    yield folder
+    process.kill()
+    process.wait()
+    process.stdout.close()
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,18 +17,6 @@ import depthrig
 from rig import ROOT, WAIT_S, pattern_rows
 
 PYTHON = ROOT / "python"
-
-
-@pytest.fixture
-def live(binary: str, folder: Path) -> Iterator[Path]:
-    """A publisher at 100 Hz."""
-    process = subprocess.Popen([binary, str(folder), "--fps", "100", "--pad", "2"], stdout=subprocess.PIPE)
-    assert process.stdout is not None
-    process.stdout.readline()
-    yield folder
-    process.kill()
-    process.wait()
-    process.stdout.close()
 
 
 def run(folder: Path, *arguments: str) -> str:
@@ -54,6 +41,16 @@ def test_the_viewer_saves_the_pixels(live: Path, tmp_path: Path, stream: str, dt
         values = s.next(WAIT_S).header.to_dict() | {"sequence": sequences[-1]}
     expected = pattern_rows(depthrig.Header(depthrig.Header.pack(values)))
     np.testing.assert_array_equal(picture.view(np.uint8).reshape(48, -1), expected)
+
+
+def test_frames_are_stacked(live: Path) -> None:
+    out = run(live, str(PYTHON / "examples" / "frame_stack.py"), "pattern/z16", "--frames", "3", "--count", "2")
+    lines = re.findall(r"#(\d+) to #(\d+): \(3, 48, 64\) uint16, ([\d.]+) ms", out)
+    assert len(lines) == 2
+    for first, last, span_ms in lines:
+        # A slow computer may miss frames, a fast one sees each: their times always fit their numbers.
+        assert int(last) - int(first) >= 2
+        assert float(span_ms) == pytest.approx(10 * (int(last) - int(first)), abs=30)
 
 
 def test_the_benchmark_prints_json(live: Path) -> None:

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from ._frame import Frame
 from ._group import FrameGroup, SetReader
-from ._header import Header, Intrinsics, Pose
-from ._layout import ClockDomain, Distortion, DropReason, FrameFlags, PixelFormat
+from ._header import Header, Intrinsics, Pose, Refinement
+from ._layout import ClockDomain, Distortion, DropReason, FrameFlags, PixelFormat, StageStep
 from ._runtime import running_rigs
 from ._sets import FrameSet, Sets
 from ._stream import Stream, streams
@@ -48,9 +48,11 @@ __all__ = [
     "Intrinsics",
     "PixelFormat",
     "Pose",
+    "Refinement",
     "RigNotRunning",
     "SetReader",
     "Sets",
+    "StageStep",
     "Stale",
     "Stream",
     "StreamGone",

@@ -6,13 +6,13 @@ import ctypes
 import struct
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from . import _layout
-from ._layout import ClockDomain, Distortion, DropReason, FrameFlags, HeaderFields, PixelFormat
+from ._layout import ClockDomain, Distortion, DropReason, FrameFlags, HeaderFields, PixelFormat, StageStep
 from .errors import VersionMismatch
 
 essentials = struct.Struct("<8sQ32xq16xq264xI5I").unpack_from
@@ -61,6 +61,25 @@ class Pose(_layout.PoseFields):
         ]
         pose[:3, 3] = self.translation_m
         return pose
+
+
+class Refinement(NamedTuple):
+    """How a refined frame was made, and of what."""
+
+    engine: str
+    """What made it, such as `fill` (which has no weights) or `onnxruntime 1.31.1 cpu fp32`."""
+    model: str | None
+    """The model, such as `cdm-d435@1f2e3d4c`; None for an engine without weights."""
+    steps_s: dict[str, float]
+    """Seconds spent in each step: wait, register, prepare, infer, finish, and in total."""
+    depth_sequence: int
+    """`sequence` of the depth frame."""
+    depth_capture_time_ns: int
+    """Middle of the depth frame's exposure, which is also the capture time of the refined one."""
+    color_sequence: int
+    """`sequence` of the colour frame."""
+    color_capture_time_ns: int
+    """Middle of the colour frame's exposure."""
 
 
 class Header(HeaderFields):
@@ -154,6 +173,21 @@ class Header(HeaderFields):
     def synthetic(self) -> bool:
         """Made by a simulated camera."""
         return FrameFlags.SYNTHETIC in self.flags
+
+    @property
+    def refinement(self) -> Refinement | None:
+        """Which engine and model made this frame, in what time, of which frames; None when it was not refined."""
+        if not self.refiner:
+            return None
+        return Refinement(
+            engine=self.refiner,
+            model=self.refiner_model or None,
+            steps_s={step.name.lower(): ns / 1e9 for step, ns in zip(StageStep, self.stage_ns)},
+            depth_sequence=self.source_sequence,
+            depth_capture_time_ns=self.capture_time_ns,
+            color_sequence=self.source_color_sequence,
+            color_capture_time_ns=self.source_color_capture_time_ns,
+        )
 
     @property
     def metadata_level(self) -> str:

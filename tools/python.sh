@@ -1,0 +1,96 @@
+#!/usr/bin/env bash
+# The Python package as its users get it: builds the source archive and from it the wheel, and runs the tests.
+#
+#   tools/python.sh versions   types, then the wheel's tests on every Python from 3.9 on that this computer has
+#   tools/python.sh torch      the tests that need PyTorch, with that of .venv-lerobot; 77 when it is not there
+#
+# Looked for are python3.9, python3.10, … and pyenv's; DEPTHRIG_PYTHONS="3.9 3.13" chooses. Environments are made once,
+# below target/python. The tests start a publisher: DEPTHRIG_TEST_PUBLISHER, else cargo builds it.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+root=$PWD
+envs=${CARGO_TARGET_DIR:-$PWD/target}/python
+
+interpreter() { # VERSION: the path of a Python of that version that can make environments
+    local candidate
+    for candidate in "$(command -v "python$1" || true)" "$HOME/.pyenv/versions/$1".*/bin/python; do
+        [ -x "$candidate" ] || continue
+        if "$candidate" -c "import ensurepip, sys, venv; sys.exit('%d.%d' % sys.version_info[:2] != '$1')" 2>/dev/null; then
+            echo "$candidate"
+            return
+        fi
+    done
+    return 1
+}
+
+environment() { # NAME PYTHON REQUIREMENT...: an environment with these, made once
+    local folder=$envs/$1 python=$2
+    shift 2
+    local wanted
+    wanted="$("$python" -V) $* $(cat python/pyproject.toml python/requirements-test.txt)"
+    if [ "$(cat "$folder/.stamp" 2>/dev/null)" != "$wanted" ]; then
+        "$python" -m venv --clear "$folder"
+        "$folder/bin/pip" install --quiet --disable-pip-version-check "$@"
+        printf '%s\n' "$wanted" >"$folder/.stamp"
+    fi
+}
+
+versions() {
+    local wanted=${DEPTHRIG_PYTHONS:-3.9 3.10 3.11 3.12 3.13 3.14} version python found=() failed=""
+    for version in $wanted; do
+        if interpreter "$version" >/dev/null; then found+=("$version"); fi
+    done
+    [ ${#found[@]} -gt 0 ] || { echo "no Python of $wanted was found" >&2; return 1; }
+    echo "found: ${found[*]}; not there: $(comm -23 <(tr ' ' '\n' <<<"$wanted" | sort) <(printf '%s\n' "${found[@]}" | sort) | tr '\n' ' ')"
+
+    # What checks and builds needs a newer Python than what is checked.
+    python=$(for version in 3.14 3.13 3.12 3.11 3.10; do interpreter "$version" && break; done)
+    environment tools "$python" build==1.3.0 mypy==2.4.1 numpy==2.2.6 'iceoryx2==0.10.*'
+    "$envs/tools/bin/mypy" --config-file python/pyproject.toml --cache-dir "$envs/mypy" python/src
+    rm -rf "$envs/dist"
+    "$envs/tools/bin/python" -m build --outdir "$envs/dist" python >"$envs/build.log" 2>&1 || { cat "$envs/build.log"; return 1; }
+    rm -rf python/build
+    local wheel
+    wheel=$(echo "$envs"/dist/depthrig-*-py3-none-any.whl)
+    tar --list --file "$envs"/dist/depthrig-*.tar.gz | grep --quiet '/src/depthrig/py.typed$'
+
+    for version in "${found[@]}"; do
+        python=$(interpreter "$version")
+        environment "$version" "$python" --requirement python/requirements-test.txt 'iceoryx2==0.10.*' 'numpy>=1.21'
+        "$envs/$version/bin/pip" install --quiet --disable-pip-version-check --force-reinstall --no-deps "$wheel"
+        "$envs/$version/bin/pip" check
+        (cd / && "$envs/$version/bin/python" -c 'import depthrig, pathlib, sys
+folder = pathlib.Path(depthrig.__file__).parent
+assert "site-packages" in str(folder) and (folder / "py.typed").exists(), folder
+print("==", sys.version.split()[0], "from", folder.relative_to(sys.prefix))')
+        # Not from the folder python/, where the package lies as source.
+        (cd "$envs" && "$envs/$version/bin/python" -m pytest --quiet --config-file "$root/python/pyproject.toml" \
+            --rootdir "$root/python" -p no:cacheprovider "$root/python/tests") || failed+=" $version"
+    done
+    [ -z "$failed" ] || { echo "failed on Python$failed" >&2; return 1; }
+}
+
+torch() {
+    local python=$PWD/.venv-lerobot/bin/python
+    if ! "$python" -c 'import torch' 2>/dev/null; then
+        echo "PyTorch is not in .venv-lerobot; make test puts it there"
+        return 77
+    fi
+    # Beside PyTorch's environment, not into it: that one is LeRobot's, version by version.
+    if [ ! -e "$envs/torch/.stamp" ] || [ python/requirements-torch.txt -nt "$envs/torch/.stamp" ]; then
+        rm -rf "$envs/torch"
+        "$python" -m pip install --quiet --disable-pip-version-check --no-deps --target "$envs/torch" \
+            --requirement python/requirements-torch.txt
+        touch "$envs/torch/.stamp"
+    fi
+    PYTHONPATH=$PWD/python/src:$envs/torch "$python" -m pytest --quiet -p no:cacheprovider \
+        python/tests/test_torch.py python/tests/test_policy.py
+}
+
+case ${1:-} in
+versions | torch) "$1" ;;
+*)
+    sed -n '2,8s/^# \{0,1\}//p' "$0" >&2
+    exit 2
+    ;;
+esac
