@@ -44,15 +44,15 @@ versions() {
     echo "found: ${found[*]}; not there: $(comm -23 <(tr ' ' '\n' <<<"$wanted" | sort) <(printf '%s\n' "${found[@]}" | sort) | tr '\n' ' ')"
 
     # What checks and builds needs a newer Python than what is checked.
-    python=$(for version in 3.14 3.13 3.12 3.11 3.10; do interpreter "$version" && break; done)
-    environment tools "$python" build==1.3.0 mypy==2.4.1 numpy==2.2.6 'iceoryx2==0.10.*'
+    python=$(for version in 3.14 3.13 3.12 3.11; do interpreter "$version" && break; done)
+    environment tools "$python" build==1.6.1 mypy==2.4.1 numpy==2.4.6 'iceoryx2==0.10.*'
     "$envs/tools/bin/mypy" --config-file python/pyproject.toml --cache-dir "$envs/mypy" python/src
     rm -rf "$envs/dist"
     "$envs/tools/bin/python" -m build --outdir "$envs/dist" python >"$envs/build.log" 2>&1 || { cat "$envs/build.log"; return 1; }
     rm -rf python/build
     local wheel
     wheel=$(echo "$envs"/dist/depthrig-*-py3-none-any.whl)
-    tar --list --file "$envs"/dist/depthrig-*.tar.gz | grep --quiet '/src/depthrig/py.typed$'
+    tar --list --file "$envs"/dist/depthrig-*.tar.gz --wildcards '*/src/depthrig/py.typed' >/dev/null
 
     for version in "${found[@]}"; do
         python=$(interpreter "$version")

@@ -64,6 +64,6 @@ def test_the_lines_of_the_readme_run(live: Path) -> None:
     code = re.findall(r"```python\n(.*?)```", (PYTHON / "README.md").read_text(), re.DOTALL)[0]
     assert len([line for line in code.splitlines() if line]) <= 5
     # On a picture of this size, and not for ever.
-    code = code.replace("d435/depth", "pattern/z16").replace("[240, 320]", "[24, 32]") + "    break\n"
+    code = code.replace("d435/depth_refined", "pattern/z16").replace("[240, 320]", "[24, 32]") + "    break\n"
     out = run(live, "-c", code)
     assert re.fullmatch(r"\d+ [\d.]+ \(48, 64\) [\d.]+\n", out), out

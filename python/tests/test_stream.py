@@ -164,6 +164,22 @@ def test_each_view_holds_one_slot_and_gives_it_back(start: Start, folder: Path) 
         s.latest()
 
 
+def test_a_header_outlives_the_slot_of_its_frame(start: Start, folder: Path) -> None:
+    """It is read lazily: letting go of the pixels must not leave it pointing at memory that another frame has now."""
+    publisher = start()
+    s = stream(folder)
+    publisher.publish(1)
+    with s.next(WAIT_S) as frame:
+        pass
+    other = stream(folder)
+    for _ in range(200):
+        publisher.publish(1)
+        s.latest()
+        other.latest()
+    assert (frame.sequence, frame.header.sequence) == (1, 1)
+    assert frame.header.capture_time_ns == frame.capture_time_ns == 1_033_333_333
+
+
 def test_what_is_not_held_takes_no_slot(start: Start, folder: Path) -> None:
     publisher = start()
     s = stream(folder)

@@ -104,16 +104,22 @@ def run(way: str, picture: str, args: argparse.Namespace) -> dict[str, list[int]
     path = Path(folder) / "config.json"
     path.write_text(json.dumps(config))
     first = ["chrt", "--fifo", "10"] if args.fifo else []
+    quiet = {**os.environ, "RUST_LOG": "error", "DORA_LOG_LEVEL": "error"}  # dora says something for each picture
     processes: list[subprocess.Popen[bytes]] = []
-    log = Path(folder) / "log"
-    out = Path(folder) / "out"
+    log = Path(folder) / "stderr.txt"
+    out = Path(folder) / "stdout.txt"
     try:
         with log.open("wb") as err, out.open("wb") as stdout:
             for i, command in enumerate(commands(way, args, config, str(path))):
                 pin = ["taskset", "--cpu-list", str(args.pin[i % len(args.pin)])] if args.pin else []
                 processes.append(
                     subprocess.Popen(
-                        [*first, *pin, *command], stdout=stdout, stderr=err, cwd=folder, start_new_session=True
+                        [*first, *pin, *command],
+                        stdout=stdout,
+                        stderr=err,
+                        cwd=folder,
+                        env=quiet,
+                        start_new_session=True,
                     )
                 )
                 time.sleep(0.3)
@@ -190,7 +196,8 @@ def main() -> None:
     args = parser.parse_args()
     args.latency = str(Path(args.latency).resolve())
     load = os.getloadavg()[0]
-    model = next(l.split(": ")[1].strip() for l in Path("/proc/cpuinfo").open() if l.startswith("model name"))
+    cpu = Path("/proc/cpuinfo").read_text().splitlines()
+    model = next(line.split(": ")[1].strip() for line in cpu if line.startswith("model name"))
     print(
         f"{os.cpu_count()} x {model}, Linux {platform.release()}, Python {platform.python_version()}, load average {load:.1f}"
     )
