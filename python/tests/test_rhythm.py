@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import depthrig
+from depthrig import _rhythm
 from depthrig._rhythm import LEAD_NS, Rhythm
 from maker import Maker
 from rig import WAIT_S
@@ -78,8 +79,11 @@ def test_a_rest_ends_with_its_time_or_with_a_frame(maker: Maker, folder: Path) -
 
 
 @pytest.mark.parametrize("prepare", [True, False])
-def test_frames_out_of_time_are_read_at_once_and_none_is_lost(maker: Maker, folder: Path, prepare: bool) -> None:
+def test_frames_out_of_time_are_read_at_once_and_none_is_lost(
+    maker: Maker, folder: Path, monkeypatch: pytest.MonkeyPatch, prepare: bool
+) -> None:
     """Twenty frames at a steady pace, then one far too early, and one far too late."""
+    monkeypatch.setattr(_rhythm, "_JITTER_NS", 1_000 * MS)  # a loaded computer keeps no better time
     depth = maker.channel("cam/depth")
     s = depthrig.Stream("cam/depth", rig="mount", runtime_dir=folder, timeout=WAIT_S, prepare=prepare)
     rests: list[bool] = []
