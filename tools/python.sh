@@ -64,7 +64,7 @@ folder = pathlib.Path(depthrig.__file__).parent
 assert "site-packages" in str(folder) and (folder / "py.typed").exists(), folder
 print("==", sys.version.split()[0], "from", folder.relative_to(sys.prefix))')
         # Not from the folder python/, where the package lies as source.
-        (cd "$envs" && "$envs/$version/bin/python" -m pytest --quiet --config-file "$root/python/pyproject.toml" \
+        (cd / && "$envs/$version/bin/python" -m pytest --quiet --config-file "$root/python/pyproject.toml" \
             --rootdir "$root/python" -p no:cacheprovider "$root/python/tests") || failed+=" $version"
     done
     [ -z "$failed" ] || { echo "failed on Python$failed" >&2; return 1; }
@@ -77,13 +77,13 @@ torch() {
         return 77
     fi
     # Beside PyTorch's environment, not into it: that one is LeRobot's, version by version.
-    if [ ! -e "$envs/torch/.stamp" ] || [ python/requirements-torch.txt -nt "$envs/torch/.stamp" ]; then
-        rm -rf "$envs/torch"
-        "$python" -m pip install --quiet --disable-pip-version-check --no-deps --target "$envs/torch" \
+    if [ ! -e "$envs/beside-torch/.stamp" ] || [ python/requirements-torch.txt -nt "$envs/beside-torch/.stamp" ]; then
+        rm -rf "$envs/beside-torch"
+        "$python" -m pip install --quiet --disable-pip-version-check --no-deps --target "$envs/beside-torch" \
             --requirement python/requirements-torch.txt
-        touch "$envs/torch/.stamp"
+        touch "$envs/beside-torch/.stamp"
     fi
-    PYTHONPATH=$PWD/python/src:$envs/torch "$python" -m pytest --quiet -p no:cacheprovider \
+    PYTHONPATH=$PWD/python/src:$envs/beside-torch "$python" -m pytest --quiet -p no:cacheprovider \
         python/tests/test_torch.py python/tests/test_policy.py
 }
 
