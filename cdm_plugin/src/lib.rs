@@ -25,7 +25,7 @@ pub mod published;
 mod refine;
 mod refiner;
 pub mod store;
-#[cfg(test)]
+#[cfg(all(test, feature = "candle"))]
 mod tiny;
 pub mod weights;
 

@@ -134,3 +134,19 @@ impl ConvTranspose {
         x.conv_transpose2d(&self.weight, 0, 0, self.stride, 1)?.broadcast_add(&self.bias)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// With a variance as small as the epsilon it matters which one it is; tokens of a real network do not show it.
+    #[test]
+    fn the_epsilon_of_a_norm() {
+        let row = |v: Vec<f32>| Tensor::from_vec(v, (1, 2), &Device::Cpu).unwrap();
+        let norm = LayerNorm { weight: row(vec![2.0, 4.0]), bias: row(vec![0.5, 0.0]) };
+        let y = norm.forward(&row(vec![0.001, -0.001])).unwrap().flatten_all().unwrap();
+        let y = y.to_vec1::<f32>().unwrap();
+        let half = 0.5f32.sqrt();
+        assert!((y[0] - (2.0 * half + 0.5)).abs() < 1e-5 && (y[1] + 4.0 * half).abs() < 1e-5, "{y:?}");
+    }
+}
