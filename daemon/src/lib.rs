@@ -16,6 +16,7 @@ mod house;
 pub mod metrics;
 mod priority;
 mod recording;
+pub mod relabel;
 pub mod replay;
 pub mod rig;
 pub mod sets;

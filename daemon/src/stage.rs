@@ -19,9 +19,9 @@ mod lane;
 pub(crate) mod models;
 mod pace;
 mod pair;
-mod pixels;
-mod view;
-mod worker;
+pub(crate) mod pixels;
+pub(crate) mod view;
+pub(crate) mod worker;
 
 pub use engines::{Installed, Opened, Plan, Refiners};
 pub use lane::{Lane, Skip};

@@ -315,7 +315,18 @@ fn derived(
     stage_ns: [u64; StageStep::ALL.len()],
     epoch: Option<u32>,
 ) -> FrameHeader {
-    let (color, depth) = (pair.color.header(), pair.depth.header());
+    derived_header(pair.color.header(), pair.depth.header(), format, unit_m, stage_ns, epoch)
+}
+
+/// The same of the two headers.
+pub(crate) fn derived_header(
+    color: &FrameHeader,
+    depth: &FrameHeader,
+    format: PixelFormat,
+    unit_m: f64,
+    stage_ns: [u64; StageStep::ALL.len()],
+    epoch: Option<u32>,
+) -> FrameHeader {
     let changed = epoch.is_some_and(|e| e != depth.clock_epoch);
     let inherited = depth.flags & !(FrameFlags::EPOCH_CHANGED.0) | color.flags & INHERITED;
     let mut header = FrameHeader {

@@ -6,6 +6,7 @@ use anyhow::Result;
 
 pub mod fetch;
 pub mod run;
+pub mod relabel;
 pub mod seeded;
 pub mod store;
 
@@ -45,11 +46,15 @@ pub enum CdmCommand {
     /// Write a model of random numbers, for demonstrations and tests: what it gives is no depth
     #[command(after_help = seeded::EXAMPLES)]
     Seeded(seeded::SeededArgs),
+    /// Give a dataset refined depth, in a copy of it
+    #[command(after_help = relabel::EXAMPLES)]
+    Relabel(relabel::RelabelArgs),
 }
 
 /// Runs the subcommand.
 pub fn run(command: &CdmCommand, context: &Context) -> Result<Exit> {
     match command {
+        CdmCommand::Relabel(args) => relabel::run(args, context),
         CdmCommand::Import(args) => store::import(args, context),
         CdmCommand::Fetch(args) => fetch::run(args, context),
         CdmCommand::List(args) => store::list(args),

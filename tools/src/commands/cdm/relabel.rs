@@ -1,0 +1,167 @@
+//! `depthrig cdm relabel`: refined depth for a dataset that was recorded without, in a copy of it.
+
+use super::store::Models;
+use crate::context::Context;
+use crate::exit::{Exit, UsageError};
+use crate::out;
+use crate::progress::Progress;
+use crate::signals::Stop;
+use anyhow::Result;
+use clap::ValueEnum;
+use core::ops::ControlFlow;
+use depthrig_daemon::config::{CdmConfig, EngineChoice, RefineConfig, RefineModel};
+use depthrig_daemon::relabel::{RelabelOptions, RelabelReport, Step, relabel};
+use depthrig_recorder::{Dataset, ErrorKind};
+use std::path::PathBuf;
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+OUT is DATASET with a stream depth_refined for every camera that has color and depth, in the view and size of colour.
+Every other picture is kept as it is stored, and DATASET is only read. Until OUT is whole, what is done lies in
+OUT.relabel: a run that was ended or killed goes on there when it is started again with the same options.
+
+Exit codes: 0 all, 1 failed or ended before all was done (OUT is not there), 2 wrong usage or a dataset that cannot
+be refined, 3 done, but some of DATASET could not be read.
+
+Examples:
+  depthrig cdm relabel data/20261121_1015_kitchen data/kitchen_fill --engine fill
+  depthrig cdm relabel data/20261121_1015_kitchen --out data/kitchen_cdm --model cdm-d435 -j 2 --threads 4";
+
+/// What refines.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Engine {
+    /// The model for each camera if one is installed, else fill
+    Auto,
+    /// Hole filling guided by colour; needs no model
+    Fill,
+    /// ONNX Runtime
+    Onnxruntime,
+    /// The network in pure Rust
+    Candle,
+}
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct RelabelArgs {
+    /// The dataset's folder
+    dataset: PathBuf,
+    /// Folder of the new dataset; must not be there
+    #[arg(value_name = "OUT", required_unless_present = "out_option")]
+    out: Option<PathBuf>,
+    /// The same as an option
+    #[arg(long = "out", value_name = "OUT", id = "out_option", conflicts_with = "out")]
+    out_option: Option<PathBuf>,
+    /// What refines
+    #[arg(long, value_enum, default_value = "auto")]
+    engine: Engine,
+    /// An installed model or a checkpoint file, for every camera [default: the one for each camera]
+    #[arg(long, value_name = "MODEL")]
+    model: Option<String>,
+    /// Shorter side of the network's input, pixels [default: the model's]
+    #[arg(long, value_name = "N")]
+    input_size: Option<u32>,
+    /// What the network runs on: cpu, cuda:0, tensorrt:0, openvino
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// The library of ONNX Runtime [default: looked for]
+    #[arg(long, value_name = "FILE")]
+    library: Option<PathBuf>,
+    /// Depth lies in the view of colour, whatever the dataset says of its calibration
+    #[arg(long)]
+    is_aligned: bool,
+    /// Pictures that are worked on at once [default: one for each core; 1 with a network]
+    #[arg(short = 'j', long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
+    jobs: Option<u16>,
+    /// Threads for each picture [default: 1; every core with a network]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: Option<u16>,
+    #[command(flatten)]
+    models: Models,
+    /// Print the report as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+impl RelabelArgs {
+    fn options(&self) -> RelabelOptions {
+        let engine = match self.engine {
+            Engine::Auto => EngineChoice::Auto,
+            Engine::Fill => EngineChoice::Fill,
+            Engine::Onnxruntime => EngineChoice::OnnxRuntime,
+            Engine::Candle => EngineChoice::Candle,
+        };
+        let model = self.model.as_ref().map(|name| {
+            let path = PathBuf::from(name);
+            if path.is_file() { RefineModel::File(path) } else { RefineModel::Installed(name.clone()) }
+        });
+        let refine = RefineConfig {
+            engine,
+            model,
+            input_size: self.input_size,
+            device: self.device.clone(),
+            is_aligned: self.is_aligned,
+            ..RefineConfig::default()
+        };
+        let cdm = CdmConfig {
+            library: self.library.clone(),
+            models: self.models.dir.clone(),
+            ..CdmConfig::default()
+        };
+        let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+        let (workers, threads) = if self.engine == Engine::Fill { (cores, 1) } else { (1, cores) };
+        RelabelOptions {
+            refine,
+            cdm,
+            workers: self.jobs.map_or(workers, usize::from),
+            threads: self.threads.map_or(threads, usize::from),
+        }
+    }
+}
+
+/// Relabels.
+pub fn run(args: &RelabelArgs, context: &Context) -> Result<Exit> {
+    let Some(out) = args.out.as_ref().or(args.out_option.as_ref()) else {
+        return Err(UsageError("say where the new dataset is to be: --out OUT".to_owned()).into());
+    };
+    let dataset = Dataset::open(&args.dataset)?;
+    let stop = Stop::on_signals()?;
+    let mut bar = Progress::new(context.global.quiet > 0);
+    let report = relabel(&dataset, out, &args.options(), &mut |step, done, total| {
+        bar.set(if step == Step::Refine { "refine" } else { "write" }, done, total);
+        if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    bar.clear();
+    let report = report.map_err(|e| match e.kind() {
+        ErrorKind::BadInput => anyhow::Error::from(UsageError(e.to_string())),
+        _ => e.into(),
+    })?;
+    if args.json {
+        out::json(&report)?;
+    } else if context.global.quiet == 0 {
+        tell(&report)?;
+    }
+    for problem in &report.problems {
+        eprintln!("lost: {problem}");
+    }
+    Ok(match report {
+        _ if report.ended => Exit::Failed,
+        _ if report.lost > 0 => Exit::Lost,
+        _ => Exit::Good,
+    })
+}
+
+fn tell(report: &RelabelReport) -> Result<()> {
+    let path = report.path.display();
+    if report.ended {
+        return out::line(format_args!("{path}: ended; run it again to go on"));
+    }
+    out::line(format_args!("{path}: {}, {}", out::count(report.sets, "set"), out::bytes(report.bytes)))?;
+    for s in &report.streams {
+        let with = if s.model.is_empty() { String::new() } else { format!(" with {}", s.model) };
+        out::line(format_args!("  {}: {} by {}{with}", s.stream, out::count(s.frames, "frame"), s.engine))?;
+        if let Some(note) = &s.note {
+            out::line(format_args!("  note: {note}"))?;
+        }
+    }
+    Ok(())
+}
