@@ -5,10 +5,11 @@ use crate::exit::Exit;
 use anyhow::Result;
 
 pub mod fetch;
-pub mod run;
 pub mod relabel;
+pub mod run;
 pub mod seeded;
 pub mod store;
+pub mod view;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
@@ -21,7 +22,9 @@ Examples:
   depthrig cdm import cdm_d435.ckpt
   depthrig cdm list
   depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.001 --model cdm-d435 --out refined.npy
-  depthrig cdm seeded vits --out untrained-vits.safetensors";
+  depthrig cdm seeded vits --out untrained-vits.safetensors
+  depthrig cdm relabel data/kitchen data/kitchen_cdm
+  depthrig cdm view --dataset data/kitchen_cdm --out kitchen";
 
 /// What to do.
 #[derive(Debug, clap::Subcommand)]
@@ -49,12 +52,14 @@ pub enum CdmCommand {
     /// Give a dataset refined depth, in a copy of it
     #[command(after_help = relabel::EXAMPLES)]
     Relabel(relabel::RelabelArgs),
+    /// Show refined depth beside raw depth: a picture of four panels, and points that turn
+    #[command(after_help = view::EXAMPLES)]
+    View(view::ViewArgs),
 }
 
 /// Runs the subcommand.
 pub fn run(command: &CdmCommand, context: &Context) -> Result<Exit> {
     match command {
-        CdmCommand::Relabel(args) => relabel::run(args, context),
         CdmCommand::Import(args) => store::import(args, context),
         CdmCommand::Fetch(args) => fetch::run(args, context),
         CdmCommand::List(args) => store::list(args),
@@ -62,5 +67,7 @@ pub fn run(command: &CdmCommand, context: &Context) -> Result<Exit> {
         CdmCommand::Remove(args) => store::remove(args),
         CdmCommand::Run(args) => run::run(args),
         CdmCommand::Seeded(args) => seeded::run(args),
+        CdmCommand::Relabel(args) => relabel::run(args, context),
+        CdmCommand::View(args) => view::run(args, context),
     }
 }
