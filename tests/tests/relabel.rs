@@ -69,10 +69,20 @@ fn a_copy_with_refined_depth() {
             assert_eq!((h.camera(), h.stream(), h.refiner()), (camera, "depth_refined", "fill"));
             assert_eq!((h.sequence, h.captured), (number as u64 + 1, number as u64 + 1));
             let of = |stream: &str| {
-                new.frames.iter().map(|f| &f.header).find(|h| h.camera() == camera && h.stream() == stream).unwrap()
+                new.frames
+                    .iter()
+                    .map(|f| &f.header)
+                    .find(|h| h.camera() == camera && h.stream() == stream)
+                    .unwrap()
             };
-            assert_eq!((h.source_sequence, h.source_color_sequence), (of("depth").sequence, of("color").sequence));
-            assert_eq!((h.capture_time_ns, h.intrinsics), (of("depth").capture_time_ns, of("color").intrinsics));
+            assert_eq!(
+                (h.source_sequence, h.source_color_sequence),
+                (of("depth").sequence, of("color").sequence)
+            );
+            assert_eq!(
+                (h.capture_time_ns, h.intrinsics),
+                (of("depth").capture_time_ns, of("color").intrinsics)
+            );
             assert!(h.has(FrameFlags::DERIVED));
             assert!(made.pixels.as_chunks::<2>().0.iter().any(|z| *z != [0; 2]), "there is depth");
         }
@@ -109,7 +119,9 @@ fn a_run_that_was_ended_goes_on() {
             ControlFlow::Continue(())
         })
         .unwrap();
-        assert!(report.parts_resumed >= 1 && first.unwrap().0 >= 10, "{} {first:?}", report.parts_resumed);
+        // What was refined is not refined again; when all was, there is nothing to tell of.
+        let done = if last_step == Step::Refine { first.unwrap().0 } else { 45 };
+        assert!(report.parts_resumed >= 1 && done >= 10, "{} {first:?}", report.parts_resumed);
         assert_eq!(refined(&out), refined(&whole));
         assert!(verify(&out, &VerifyOptions::default()).unwrap().is_whole());
         let same = compare(
