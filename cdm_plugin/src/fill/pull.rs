@@ -62,43 +62,77 @@ fn smooth_row(above: &[f32], here: &[f32], below: &[f32], share: &[f32], out: &m
 }
 }
 
-/// The two coarse rows (or columns) nearest to a fine one, and the weight of the second.
+/// The two coarse rows nearest to a fine one, nearer first.
 #[inline(always)]
-pub(super) const fn parents(i: usize, n_coarse: usize) -> (usize, usize) {
+const fn parents(i: usize, n_coarse: usize) -> (usize, usize) {
     let own = i / 2;
     let other = if i % 2 == 1 { own + 1 } else { own.wrapping_sub(1) };
     (own, if other >= n_coarse { own } else { other })
 }
 
+/// Pixels that are worked on at once; even.
+const CHUNK: usize = 32;
+/// Coarse cells that they look at.
+const CELLS: usize = CHUNK / 2 + 2;
+
 wide! {
+/// Pixels are worked on in chunks without a condition in them, so that processors do eight at a time.
 fn fill_row(coarse: &Level, at: (usize, usize), color: &[u32], q: &mut [f32]) {
-    let (y, _) = at;
-    let (own, other) = parents(y, coarse.h);
-    let rows = [own, other].map(|r| r * coarse.w);
-    for x in 0..q.len() {
-        if q[x] > 0.0 {
+    let (own, other) = parents(at.0, coarse.h);
+    for (i, (q, color)) in q.chunks_mut(CHUNK).zip(color.chunks(CHUNK)).enumerate() {
+        if q.iter().all(|q| *q > 0.0) {
             continue;
         }
-        let (left, right) = parents(x, coarse.w);
-        let at = [rows[0] + left, rows[0] + right, rows[1] + left, rows[1] + right];
-        let place = [9.0, 3.0, 3.0, 1.0];
-        let mut values = [0.0f32; 4];
-        let mut weights = [0.0f32; 4];
-        for i in 0..4 {
-            values[i] = coarse.q[at[i]];
-            weights[i] = place[i] * likeness(color[x], coarse.color[at[i]]) * (coarse.share[at[i]] + 0.05);
+        let mut colors = [0u32; CHUNK];
+        colors[..color.len()].copy_from_slice(color);
+        let mut values = [[0.0f32; CHUNK]; 4];
+        let mut weights = [[0.0f32; CHUNK]; 4];
+        for (k, (row, near)) in [(own, 0.75), (other, 0.25)].into_iter().enumerate() {
+            let start = row * coarse.w;
+            let (cell_q, cell_share, cell_color) = cells(coarse, start, i * CHUNK / 2);
+            for m in 0..CHUNK / 2 {
+                // Of two pixels in one cell, the left one looks to the left as well, the right one to the right.
+                for (side, other) in [(0, m), (1, m + 2)] {
+                    let x = 2 * m + side;
+                    values[2 * k][x] = cell_q[m + 1];
+                    values[2 * k + 1][x] = cell_q[other];
+                    let share = [cell_share[m + 1] + 0.05, cell_share[other] + 0.05];
+                    weights[2 * k][x] = near * 0.75 * share[0] * likeness(colors[x], cell_color[m + 1]);
+                    weights[2 * k + 1][x] = near * 0.25 * share[1] * likeness(colors[x], cell_color[other]);
+                }
+            }
         }
-        q[x] = choose(values, weights);
+        let mut chosen = [0.0f32; CHUNK];
+        for x in 0..CHUNK {
+            let of = |a: &[[f32; CHUNK]; 4]| [a[0][x], a[1][x], a[2][x], a[3][x]];
+            chosen[x] = choose(of(&values), of(&weights));
+        }
+        for (q, chosen) in q.iter_mut().zip(chosen) {
+            *q = if *q > 0.0 { *q } else { chosen };
+        }
     }
 }
+}
+
+/// The cells of a coarse row from the one before `first` on; beyond the ends it is the last one.
+#[inline(always)]
+fn cells(coarse: &Level, start: usize, first: usize) -> ([f32; CELLS], [f32; CELLS], [u32; CELLS]) {
+    let row = start..start + coarse.w;
+    let (q, share, color) = (&coarse.q[row.clone()], &coarse.share[row.clone()], &coarse.color[row]);
+    let mut out = ([0.0; CELLS], [0.0; CELLS], [0; CELLS]);
+    for m in 0..CELLS {
+        let at = (first + m).saturating_sub(1).min(coarse.w - 1);
+        (out.0[m], out.1[m], out.2[m]) = (q[at], share[at], color[at]);
+    }
+    out
 }
 
 /// How alike two colours are, 1 for the same.
 #[inline(always)]
 fn likeness(a: u32, b: u32) -> f32 {
-    let channel = |shift: u32| ((a >> shift) & 255) as i32 - ((b >> shift) & 255) as i32;
+    let channel = |shift: u32| ((a >> shift) & 255) as i32 as f32 - ((b >> shift) & 255) as i32 as f32;
     let (r, g, b) = (channel(0), channel(8), channel(16));
-    let square = (r * r + g * g + b * b) as f32;
+    let square = (r * r + g * g) + b * b;
     let near = 1.0 / (1.0 + square * (1.0 / (COLOR * COLOR)));
     near * near + LEAST
 }

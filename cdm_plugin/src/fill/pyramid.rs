@@ -52,14 +52,16 @@ fn shrink_row(
 ) {
     let w = q[0].len();
     let whole = w / 2;
+    // Pairs, and slices of one length: nothing is left to be checked in the loop.
+    let [qa, qb] = q.map(|r| &r.as_chunks::<2>().0[..whole]);
+    let [sa, sb] = share.map(|r| &r.as_chunks::<2>().0[..whole]);
+    let [ca, cb] = color.map(|r| &r.as_chunks::<2>().0[..whole]);
+    let (to_q, to_share, to_color) = (&mut out_q[..whole], &mut out_share[..whole], &mut out_color[..whole]);
     for x in 0..whole {
-        let (i, j) = (2 * x, 2 * x + 1);
-        let cell = cell(
-            [q[0][i], q[0][j], q[1][i], q[1][j]],
-            [share[0][i], share[0][j], share[1][i], share[1][j]],
-            [color[0][i], color[0][j], color[1][i], color[1][j]],
-        );
-        (out_q[x], out_share[x], out_color[x]) = cell;
+        let q = [qa[x][0], qa[x][1], qb[x][0], qb[x][1]];
+        let share = [sa[x][0], sa[x][1], sb[x][0], sb[x][1]];
+        let color = [ca[x][0], ca[x][1], cb[x][0], cb[x][1]];
+        (to_q[x], to_share[x], to_color[x]) = cell(q, share, color);
     }
     if w % 2 == 1 {
         let i = w - 1;
@@ -92,7 +94,7 @@ pub(super) fn cell(q: [f32; 4], share: [f32; 4], color: [u32; 4]) -> (f32, f32, 
     let total = (share[0] + share[1]) + (share[2] + share[3]);
     let of = |i: usize| if has_depth { weights[i] * scale } else { 0.25 };
     let channel = |shift: u32| {
-        let value = |i: usize| ((color[i] >> shift) & 255) as f32 * of(i);
+        let value = |i: usize| ((color[i] >> shift) & 255) as i32 as f32 * of(i);
         let mean = (value(0) + value(1)) + (value(2) + value(3));
         ((mean + 0.5) as i32 as u32) << shift
     };
