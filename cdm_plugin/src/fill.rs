@@ -9,6 +9,8 @@
 //!    within their surface ([`pull`]). What was measured and kept stays as it was measured.
 //!
 //! A picture without any depth stays without: its result is 0 everywhere, and no error.
+// The steps of a pixel must end up inside the loops that are compiled for AVX2, whatever their size.
+#![allow(clippy::inline_always)]
 
 use crate::{Color, ColorFormat, Description, Error, ErrorKind, Job, Output, Refiner, Result, StepTimes};
 use behind::Behind;

@@ -118,8 +118,8 @@ pub fn page(title: &str, evaluation: &Evaluation, options: &Options) -> String {
         &by(|m| m.missing_percent),
     ));
     out.push_str(
-        "<p class=\"cap\">Of all pixels together, by the distance of the reference. The last point holds all that is \
-         farther as well.</p></section><section><h2>How large errors are</h2>",
+        "<p class=\"cap\">Of all pixels together, by the distance of the reference, from the first distance that has one to \
+         the last.</p></section><section><h2>How large errors are</h2>",
     );
     let share = |r: &Row| {
         let n = r.metrics.pixel_pooled.counted.max(1) as f64;
