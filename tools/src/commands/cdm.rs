@@ -4,6 +4,7 @@ use crate::context::Context;
 use crate::exit::Exit;
 use anyhow::Result;
 
+pub mod bench;
 pub mod fetch;
 pub mod relabel;
 pub mod run;
@@ -46,6 +47,9 @@ pub enum CdmCommand {
     /// Refine the depth of one pair of pictures
     #[command(after_help = run::EXAMPLES)]
     Run(run::RunArgs),
+    /// Measure how fast each engine refines, and with what memory
+    #[command(after_help = bench::EXAMPLES)]
+    Bench(bench::BenchArgs),
     /// Write a model of random numbers, for demonstrations and tests: what it gives is no depth
     #[command(after_help = seeded::EXAMPLES)]
     Seeded(seeded::SeededArgs),
@@ -66,6 +70,7 @@ pub fn run(command: &CdmCommand, context: &Context) -> Result<Exit> {
         CdmCommand::Info(args) => store::info(args),
         CdmCommand::Remove(args) => store::remove(args),
         CdmCommand::Run(args) => run::run(args),
+        CdmCommand::Bench(args) => bench::run(args),
         CdmCommand::Seeded(args) => seeded::run(args),
         CdmCommand::Relabel(args) => relabel::run(args, context),
         CdmCommand::View(args) => view::run(args, context),

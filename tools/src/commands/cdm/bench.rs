@@ -1,0 +1,429 @@
+//! `depthrig cdm bench`: how fast each engine refines, with what memory, next to each other.
+//!
+//! Each combination of engine and size runs in a process of its own: a process loads one ONNX Runtime, the memory it
+//! took is only known of a whole process, and one that fails takes nothing with it.
+
+use super::run::{engine as parse_engine, precision as parse_precision};
+use super::store::{Models, usage};
+use crate::bench::stats::median;
+use crate::exit::{Exit, UsageError};
+use crate::out;
+use anyhow::{Context as _, Result};
+use depthrig_bus::clock::{HostTime, process_cpu_ns};
+use depthrig_cdm::{
+    Color, ColorFormat, EngineKind, Job, Output, Precision, RawDepth, RefinerOptions, StepTimes, refiner,
+};
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+The picture is made up, with edges and holes; times do not depend on what it shows. Times are medians, on the clock and
+of the CPU (all threads). A busy computer makes the clock's longer; the CPU's less so.
+
+An engine is fill, candle, or onnxruntime with a device and a precision: onnxruntime/cpu/fp32,
+onnxruntime/openvino/bf16, onnxruntime/cuda:0/fp16.
+
+Exit codes: 0 good, 1 an engine failed, 2 wrong usage.
+
+Examples:
+  depthrig cdm bench
+  depthrig cdm bench --model cdm-d435 --input-size 252,518
+  depthrig cdm bench --model cdm-d435 --engine onnxruntime/cpu/fp32,onnxruntime/openvino/bf16 --threads 2 --json";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct BenchArgs {
+    /// The name of an installed model, or a checkpoint file; without one, only fill can run
+    #[arg(long, value_name = "NAME|FILE")]
+    model: Option<String>,
+    /// What runs, ENGINE[/DEVICE[/PRECISION]] [default: fill, and onnxruntime when there is a model]
+    #[arg(long = "engine", value_name = "ENGINE", value_delimiter = ',', value_parser = Spec::parse)]
+    engines: Vec<Spec>,
+    /// Size of the picture
+    #[arg(long, value_name = "WxH", default_value = "1280x720", value_parser = size)]
+    picture: (usize, usize),
+    /// The shorter side of the network's input, pixels [default: the model's]
+    #[arg(long = "input-size", value_name = "PIXELS", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(14..=8192))]
+    input_sizes: Vec<u32>,
+    /// Pictures at a time
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64))]
+    batch: u16,
+    /// Threads on the CPU; all cores when not given
+    #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true)]
+    threads: usize,
+    /// How long to measure each, seconds; at least three times are measured
+    #[arg(long, value_name = "SECONDS", default_value_t = 5.0)]
+    seconds: f64,
+    /// The library of ONNX Runtime, when it is not to be looked for
+    #[arg(long, value_name = "FILE")]
+    library: Option<PathBuf>,
+    #[command(flatten)]
+    models: Models,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    /// Measure one engine in this process
+    #[arg(long, hide = true)]
+    here: bool,
+}
+
+/// An engine with its device and precision.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Spec {
+    engine: EngineKind,
+    device: String,
+    precision: Precision,
+}
+
+impl Spec {
+    fn of(engine: EngineKind) -> Self {
+        Self { engine, device: "cpu".into(), precision: Precision::Fp32 }
+    }
+
+    fn parse(text: &str) -> Result<Self, String> {
+        let mut parts = text.split('/');
+        let mut spec = Self::of(parse_engine(parts.next().unwrap_or_default())?);
+        if let Some(device) = parts.next() {
+            device.clone_into(&mut spec.device);
+        }
+        if let Some(precision) = parts.next() {
+            spec.precision = parse_precision(precision)?;
+        }
+        match parts.next() {
+            None => Ok(spec),
+            Some(more) => {
+                Err(format!("after engine, device and precision comes nothing more, and not {more:?}"))
+            }
+        }
+    }
+
+    fn text(&self) -> String {
+        match self.engine {
+            EngineKind::OnnxRuntime => format!("{}/{}/{}", self.engine, self.device, self.precision),
+            engine => engine.to_string(),
+        }
+    }
+}
+
+fn size(text: &str) -> Result<(usize, usize), String> {
+    let numbers = text.split_once('x').map(|(w, h)| (w.parse(), h.parse()));
+    match numbers {
+        Some((Ok(w @ 1..=8192), Ok(h @ 1..=8192))) => Ok((w, h)),
+        _ => Err("write columns and rows, such as 1280x720".to_owned()),
+    }
+}
+
+/// What one engine did; times are milliseconds of a picture.
+#[derive(Debug, Default, Serialize, Deserialize)]
+struct Measured {
+    /// What was asked for.
+    asked: String,
+    /// What ran, with version, device and precision.
+    engine: String,
+    /// Empty when it needs none.
+    model: String,
+    /// The shorter side of the network's input; 0 where there is no network.
+    input_size: u32,
+    threads: usize,
+    batch: usize,
+    runs: usize,
+    /// Until the engine was ready, and the first batch, which makes room.
+    load_ms: f64,
+    first_ms: f64,
+    prepare_ms: f64,
+    infer_ms: f64,
+    finish_ms: f64,
+    total_ms: f64,
+    best_ms: f64,
+    cpu_ms: f64,
+    pictures_per_s: f64,
+    peak_mb: f64,
+    /// Why there are no numbers.
+    error: Option<String>,
+}
+
+/// Measures every engine at every size.
+pub fn run(args: &BenchArgs) -> Result<Exit> {
+    if args.here {
+        let spec = args.engines.first().context("no engine was given")?;
+        out::json_line(&measure(args, spec)?)?;
+        return Ok(Exit::Good);
+    }
+    let mut specs = args.engines.clone();
+    if specs.is_empty() {
+        specs.push(Spec::of(EngineKind::Fill));
+        specs.extend(args.model.is_some().then(|| Spec::of(EngineKind::OnnxRuntime)));
+    }
+    if let Some(spec) = specs.iter().find(|s| s.engine.needs_model() && args.model.is_none()) {
+        let text = format!("the engine {} needs a model: say which with --model", spec.engine);
+        return Err(UsageError(text).into());
+    }
+    let mut rows = Vec::new();
+    for spec in &specs {
+        if !spec.engine.needs_model() || args.input_sizes.is_empty() {
+            rows.push(elsewhere(args, spec, None)?);
+        } else {
+            for size in &args.input_sizes {
+                rows.push(elsewhere(args, spec, Some(*size))?);
+            }
+        }
+    }
+    if args.json {
+        out::json(&rows)?
+    } else {
+        tell(&rows)?
+    }
+    Ok(if rows.iter().any(|r| r.error.is_some()) { Exit::Failed } else { Exit::Good })
+}
+
+/// Measures in a process of its own.
+fn elsewhere(args: &BenchArgs, spec: &Spec, input_size: Option<u32>) -> Result<Measured> {
+    let program = std::env::current_exe().context("this program was not found")?;
+    let mut command = Command::new(program);
+    command.args(["cdm", "bench", "--here", "--engine", &spec.text()]);
+    command.args(["--picture", &format!("{}x{}", args.picture.0, args.picture.1)]);
+    command.args(["--batch", &args.batch.to_string(), "--threads", &args.threads.to_string()]);
+    command.args(["--seconds", &args.seconds.to_string()]);
+    let mut option = |name: &str, value: Option<&std::ffi::OsStr>| {
+        if let Some(value) = value {
+            command.arg(name).arg(value);
+        }
+    };
+    option("--model", args.model.as_ref().filter(|_| spec.engine.needs_model()).map(AsRef::as_ref));
+    option("--library", args.library.as_ref().map(AsRef::as_ref));
+    option("--models", args.models.dir.as_ref().map(AsRef::as_ref));
+    option("--input-size", input_size.map(|s| s.to_string()).as_ref().map(AsRef::as_ref));
+    let done =
+        command.stdin(Stdio::null()).output().context("a process for the measurement cannot be started")?;
+    let failed = |why: String| Measured {
+        asked: spec.text(),
+        input_size: input_size.unwrap_or(0),
+        error: Some(why),
+        ..Measured::default()
+    };
+    Ok(match serde_json::from_slice::<Measured>(&done.stdout) {
+        Ok(measured) => measured,
+        Err(_) => {
+            let text = String::from_utf8_lossy(&done.stderr);
+            let why = if text.trim().is_empty() {
+                format!("ended with {}", done.status)
+            } else {
+                text.trim().to_owned()
+            };
+            failed(why)
+        }
+    })
+}
+
+fn measure(args: &BenchArgs, spec: &Spec) -> Result<Measured> {
+    let model = match &args.model {
+        Some(name) if spec.engine.needs_model() => Some(args.models.store()?.model(name).map_err(usage)?),
+        _ => None,
+    };
+    let input_size = args.input_sizes.first().copied().or(model.as_ref().map(|m| m.input_size)).unwrap_or(0);
+    let options = RefinerOptions {
+        engine: Some(spec.engine),
+        model,
+        input_size: args.input_sizes.first().copied(),
+        precision: spec.precision,
+        device: spec.device.clone(),
+        threads: args.threads,
+        library: args.library.clone(),
+    };
+    let start = HostTime::now();
+    let mut refiner = refiner(&options).map_err(usage)?;
+    let load_ms = ms(start);
+
+    let (width, height) = args.picture;
+    let (color, depth) = picture(width, height);
+    let batch = usize::from(args.batch);
+    let mut outputs = vec![vec![0u16; width * height]; batch];
+    let mut jobs: Vec<Job<'_>> = outputs
+        .iter_mut()
+        .map(|pixels| Job {
+            color: Color { pixels: &color, format: ColorFormat::Rgb8, width, height, stride: 3 * width },
+            depth: RawDepth { pixels: &depth, unit_m: 0.001 },
+            out: Output::Units { pixels, unit_m: 0.001 },
+            steps: StepTimes::default(),
+        })
+        .collect();
+    let start = HostTime::now();
+    refiner.refine(&mut jobs).map_err(usage)?;
+    let first_ms = ms(start);
+
+    // One column for each: prepare, infer, finish, all of it, CPU.
+    let mut times: [Vec<f64>; 5] = Default::default();
+    let begin = HostTime::now();
+    while times[0].len() < 3 || begin.elapsed().as_secs_f64() < args.seconds {
+        let (start, cpu) = (HostTime::now(), process_cpu_ns());
+        refiner.refine(&mut jobs).map_err(usage)?;
+        let (all, cpu) = (ms(start), (process_cpu_ns() - cpu) as f64 / 1e6);
+        let mean = |of: fn(&StepTimes) -> u64| {
+            jobs.iter().map(|j| of(&j.steps) as f64 / 1e6).sum::<f64>() / batch as f64
+        };
+        let row = [
+            mean(|s| s.prepare_ns),
+            mean(|s| s.infer_ns),
+            mean(|s| s.finish_ns),
+            all / batch as f64,
+            cpu / batch as f64,
+        ];
+        for (column, value) in times.iter_mut().zip(row) {
+            column.push(value);
+        }
+    }
+    let [prepare_ms, infer_ms, finish_ms, total_ms, cpu_ms] = times.each_ref().map(|t| median(t));
+    let described = refiner.describe();
+    Ok(Measured {
+        asked: spec.text(),
+        engine: described.engine.clone(),
+        model: described.model.clone(),
+        input_size,
+        threads: options.thread_count(),
+        batch,
+        runs: times[0].len(),
+        load_ms,
+        first_ms,
+        prepare_ms,
+        infer_ms,
+        finish_ms,
+        total_ms,
+        best_ms: times[3].iter().copied().fold(f64::INFINITY, f64::min),
+        cpu_ms,
+        pictures_per_s: 1000.0 / total_ms,
+        peak_mb: peak_mb().unwrap_or(0.0),
+        error: None,
+    })
+}
+
+fn ms(since: HostTime) -> f64 {
+    since.elapsed().as_secs_f64() * 1e3
+}
+
+/// The most memory that this process has held, from `/proc/self/status`.
+fn peak_mb() -> Option<f64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find(|l| l.starts_with("VmHWM:"))?;
+    Some(line.split_whitespace().nth(1)?.parse::<f64>().ok()? / 1024.0)
+}
+
+/// A slanted floor with boxes on it in millimetres, its holes along the edges of the boxes, and colour to match.
+fn picture(width: usize, height: usize) -> (Vec<u8>, Vec<u16>) {
+    let mut color = Vec::with_capacity(3 * width * height);
+    let mut depth = Vec::with_capacity(width * height);
+    for v in 0..height {
+        for u in 0..width {
+            let (x, y) = (u as f64 / width as f64, v as f64 / height as f64);
+            let (bx, by) = ((x * 5.0).fract(), (y * 4.0).fract());
+            let inside = bx > 0.25 && bx < 0.75 && by > 0.25 && by < 0.75;
+            let near_edge = (bx - 0.25).abs() < 0.04 || (bx - 0.75).abs() < 0.03;
+            let floor = 2200.0 - 1200.0 * y + 90.0 * (9.0 * x).sin();
+            let d = if inside { floor * 0.8 } else { floor };
+            depth.push(if near_edge && by > 0.2 && by < 0.8 { 0 } else { d as u16 });
+            let shade = if inside { 190.0 } else { 90.0 } + 30.0 * (40.0 * x).sin() * (31.0 * y).cos();
+            color.extend([shade as u8, (shade * 0.8) as u8, (255.0 - shade) as u8]);
+        }
+    }
+    (color, depth)
+}
+
+fn tell(rows: &[Measured]) -> Result<()> {
+    let header = [
+        "ENGINE",
+        "INPUT",
+        "THREADS",
+        "PREPARE ms",
+        "INFER ms",
+        "FINISH ms",
+        "TOTAL ms",
+        "CPU ms",
+        "PER s",
+        "PEAK MB",
+        "LOAD ms",
+    ];
+    let good = rows.iter().filter(|r| r.error.is_none()).map(|r| {
+        let n = |v: f64| if v < 10.0 { format!("{v:.2}") } else { format!("{v:.0}") };
+        vec![
+            r.engine.clone(),
+            if r.input_size == 0 { "-".into() } else { r.input_size.to_string() },
+            r.threads.to_string(),
+            n(r.prepare_ms),
+            n(r.infer_ms),
+            n(r.finish_ms),
+            n(r.total_ms),
+            n(r.cpu_ms),
+            n(r.pictures_per_s),
+            n(r.peak_mb),
+            n(r.load_ms),
+        ]
+    });
+    if rows.iter().any(|r| r.error.is_none()) {
+        out::line(out::table(&header, 1, good))?;
+    }
+    for row in rows {
+        if let Some(error) = &row.error {
+            out::line(format_args!("{}: {error}", row.asked))?;
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn engines_by_their_words() {
+        let spec = Spec::parse("onnxruntime/cuda:0/fp16").unwrap();
+        assert_eq!(
+            (spec.engine, &*spec.device, spec.precision),
+            (EngineKind::OnnxRuntime, "cuda:0", Precision::Fp16)
+        );
+        for text in ["fill", "candle", "onnxruntime/cpu/fp32", "onnxruntime/openvino/bf16"] {
+            assert_eq!(Spec::parse(text).unwrap().text(), text);
+        }
+        assert_eq!(Spec::parse("onnxruntime").unwrap().text(), "onnxruntime/cpu/fp32");
+        for wrong in ["", "torch", "onnxruntime/cpu/int8", "onnxruntime/cpu/fp32/more"] {
+            assert!(Spec::parse(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn the_picture_has_holes_and_depth() {
+        let (color, depth) = picture(160, 90);
+        assert_eq!((color.len(), depth.len()), (3 * 160 * 90, 160 * 90));
+        let holes = depth.iter().filter(|d| **d == 0).count();
+        assert!(holes > 100 && holes < depth.len() / 3, "{holes}");
+        assert!(size("640x480") == Ok((640, 480)) && size("640").is_err() && size("0x5").is_err());
+    }
+
+    #[test]
+    fn fill_is_measured() {
+        use clap::Parser;
+        #[derive(clap::Parser)]
+        struct Cli {
+            #[command(flatten)]
+            bench: BenchArgs,
+        }
+        let words = [
+            "bench",
+            "--here",
+            "--engine",
+            "fill",
+            "--picture",
+            "160x90",
+            "--seconds",
+            "0",
+            "--threads",
+            "1",
+        ];
+        let Cli { bench } = Cli::try_parse_from(words).unwrap();
+        let measured = measure(&bench, &bench.engines[0]).unwrap();
+        assert!(measured.engine.starts_with("fill") && measured.runs == 3 && measured.error.is_none());
+        assert!(measured.total_ms > 0.0 && measured.peak_mb > 1.0 && measured.pictures_per_s > 0.0);
+        let parts = measured.prepare_ms + measured.infer_ms + measured.finish_ms;
+        assert!(parts > 0.0 && measured.threads == 1);
+    }
+}
