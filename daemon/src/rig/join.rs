@@ -80,7 +80,7 @@ enum Found {
 
 /// The streams that join sets, and the sets that wait for them.
 pub struct Joints {
-    joints: Vec<Joint>,
+    streams: Vec<Joint>,
     held: VecDeque<Held>,
     max_sets: usize,
     max_age: Duration,
@@ -96,7 +96,7 @@ impl Joints {
         let taken = ASSEMBLING + config.recording.queue_sets + workers;
         let max_sets = MAX_HELD.saturating_sub(taken).clamp(1, MAX_SETS);
         let max_age = Duration::from_secs_f64(max_sets as f64 / config.sets.rate_hz).min(PATIENCE / 2);
-        Self { joints: Vec::new(), held: VecDeque::new(), max_sets, max_age }
+        Self { streams: Vec::new(), held: VecDeque::new(), max_sets, max_age }
     }
 
     /// Takes in the streams that `camera` makes, once they are there.
@@ -106,7 +106,7 @@ impl Joints {
             let Some(depth) = state.streams.iter().find(|s| s.id.stream.as_str() == "depth") else {
                 continue;
             };
-            self.joints.push(Joint {
+            self.streams.push(Joint {
                 near_ns: (stream.profile.period_ns() as f64 * NEAR) as i64,
                 stream: Arc::clone(stream),
                 camera: Arc::clone(camera),
@@ -121,12 +121,12 @@ impl Joints {
 
     /// Whether any of them is recorded.
     pub fn are_awaited(&self) -> bool {
-        self.joints.iter().any(|j| j.stream.record)
+        self.streams.iter().any(|j| j.stream.record)
     }
 
     /// Reads what came.
     pub fn read(&mut self) {
-        self.joints.iter_mut().for_each(Joint::read);
+        self.streams.iter_mut().for_each(Joint::read);
     }
 
     /// Lets a set wait.
@@ -138,7 +138,7 @@ impl Joints {
     pub fn release(&mut self, inner: &Inner) {
         let recording = inner.recording().is_active();
         while let Some(first) = self.held.front() {
-            let waiting = self.joints.iter().filter(|j| j.stream.record);
+            let waiting = self.streams.iter().filter(|j| j.stream.record);
             let decided = waiting.map(|j| j.find(first)).all(|f| f != Found::Coming);
             let due = self.held.len() > self.max_sets || first.since.elapsed() > self.max_age;
             if recording && !decided && !due {
@@ -146,7 +146,7 @@ impl Joints {
             }
             let Some(Held { id, tick, since, mut frames }) = self.held.pop_front() else { break };
             let set = Held { id, tick, since, frames: Vec::new() };
-            for joint in self.joints.iter_mut().filter(|j| j.stream.record) {
+            for joint in self.streams.iter_mut().filter(|j| j.stream.record) {
                 let moment = frames.iter().find(|(s, _)| s.id == joint.depth).and_then(|(_, f)| f.as_ref());
                 let moment = moment.map_or(set.tick.ns(), |f| f.header().capture_time_ns);
                 let frame = joint.take(moment);
@@ -157,14 +157,14 @@ impl Joints {
         if self.held.is_empty() {
             // Nothing waits, so that all but the newest frames are too old for any set to come.
             let idle = !recording || !self.are_awaited();
-            self.joints.iter_mut().for_each(|j| j.keep(if idle { 0 } else { MAX_WAITING }));
+            self.streams.iter_mut().for_each(|j| j.keep(if idle { 0 } else { MAX_WAITING }));
         }
         inner.held_sets.store(self.held.len(), Ordering::Relaxed);
     }
 
     /// What became of the frames of each stream.
     pub fn accounts(&self) -> impl Iterator<Item = (StreamId, SetAccount)> + '_ {
-        self.joints.iter().map(|j| {
+        self.streams.iter().map(|j| {
             let missed = j.before.unwrap_or(0) + j.subscriber.missed();
             let pending = j.waiting.len() as u64;
             (j.stream.id.clone(), SetAccount { missed, pending, ..j.account })

@@ -13,7 +13,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
 /// The pause before a refiner that failed is opened again; it doubles up to the second.
-const BACKOFF: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(60));
+const BACKOFF: (Duration, Duration) = (Duration::from_secs(1), Duration::from_mins(1));
 /// A worker may take this many times longer than it ever took.
 const SLOWER: u64 = 10;
 /// Before its first result it may take this many times `hang_s`: engines compile networks then.

@@ -40,7 +40,7 @@ pub struct Work {
     pub readers: Option<(Subscriber, Subscriber)>,
     pending: Option<Pair>,
     /// A pair is in the hands of a worker.
-    in_work: bool,
+    busy: bool,
 }
 
 /// Colour and depth of one moment.
@@ -182,7 +182,7 @@ impl Lane {
     pub fn take(&self) -> Option<Pair> {
         let mut work = self.work();
         let pair = work.pending.take();
-        work.in_work |= pair.is_some();
+        work.busy |= pair.is_some();
         pair
     }
 
@@ -193,12 +193,12 @@ impl Lane {
 
     /// The pair in work has met its fate.
     pub fn finished(&self) {
-        self.work().in_work = false;
+        self.work().busy = false;
     }
 
     /// Gives up a pair that is in the hands of a worker that hangs.
     pub fn abandon(&self) {
-        let was = core::mem::take(&mut self.work().in_work);
+        let was = core::mem::take(&mut self.work().busy);
         for stream in self.streams() {
             // What that worker says from now on is not heard.
             stream.books().begin_session();
@@ -266,9 +266,10 @@ impl Lane {
         if facts.obstacle.as_deref() == why {
             return;
         }
-        match why {
-            Some(why) => tracing::error!(camera = %self.camera, "no refined depth: {why}"),
-            None => tracing::info!(camera = %self.camera, "depth is refined again"),
+        if let Some(why) = why {
+            tracing::error!(camera = %self.camera, "no refined depth: {why}");
+        } else {
+            tracing::info!(camera = %self.camera, "depth is refined again");
         }
         facts.since = HostTime::now();
         facts.obstacle = why.map(str::to_owned);

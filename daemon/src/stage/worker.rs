@@ -202,6 +202,7 @@ impl Worker {
 }
 
 /// The memory of an emptied list for another list; the compiler reuses it in place.
+#[allow(clippy::unnecessary_filter_map)] // `filter` would keep the old list's lifetime
 fn recycle<'b>(mut list: Vec<Job<'_>>) -> Vec<Job<'b>> {
     list.clear();
     list.into_iter().filter_map(|_| None).collect()
