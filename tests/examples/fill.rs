@@ -166,16 +166,16 @@ fn pictures(folder: &Path, name: &str, scene: &Scene, filled: &[u16]) {
         let pale = (255.0 * (1.0 - e.abs())) as u8;
         if e > 0.0 { [255, pale, pale] } else { [pale, pale, 255] }
     };
-    for i in 0..w * h {
+    for (i, filled) in filled.iter().enumerate() {
         let (x, y) = ((i % w) as u32, (i / w) as u32);
         let c = [scene.color[3 * i], scene.color[3 * i + 1], scene.color[3 * i + 2]];
         let (w, h) = (w as u32, h as u32);
         sheet.put_pixel(x, y, image::Rgb(c));
         sheet.put_pixel(x + w, y, image::Rgb(depth(scene.truth[i])));
         sheet.put_pixel(x, y + h, image::Rgb(depth(scene.raw[i])));
-        sheet.put_pixel(x + w, y + h, image::Rgb(depth(filled[i])));
+        sheet.put_pixel(x + w, y + h, image::Rgb(depth(*filled)));
         sheet.put_pixel(x, y + 2 * h, image::Rgb(error(scene.raw[i], scene.truth[i])));
-        sheet.put_pixel(x + w, y + 2 * h, image::Rgb(error(filled[i], scene.truth[i])));
+        sheet.put_pixel(x + w, y + 2 * h, image::Rgb(error(*filled, scene.truth[i])));
     }
     std::fs::create_dir_all(folder).unwrap();
     sheet.save(folder.join(format!("{name}.png"))).unwrap();

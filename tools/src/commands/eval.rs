@@ -88,7 +88,7 @@ pub fn run(args: &EvalArgs, context: &Context) -> Result<Exit> {
     let (mut source, limits, title) = source(args)?;
     let range =
         DepthRange { min_m: args.min_m.unwrap_or(limits.min_m), max_m: args.max_m.unwrap_or(limits.max_m) };
-    if !(range.min_m <= range.max_m) {
+    if range.min_m.is_nan() || range.max_m.is_nan() || range.min_m > range.max_m {
         return Err(UsageError(format!("{} m to {} m is no range of depth", range.min_m, range.max_m)).into());
     }
     let cores = || std::thread::available_parallelism().map_or(1, usize::from);

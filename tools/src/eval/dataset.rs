@@ -4,7 +4,7 @@ use super::read::Metres;
 use super::{Job, Loaded, Source};
 use crate::picture::depth_m;
 use anyhow::{Context, Result, bail};
-use depthrig_bus::{FrameHeader, PixelFormat, Pose, StreamName};
+use depthrig_bus::{FrameHeader, PixelFormat, StreamName};
 use depthrig_calib::{Method, PoseExt, Registration, same_view};
 use depthrig_recorder::{Dataset, DatasetFrame, PixelMode, SetRange, Sets};
 use std::collections::BTreeMap;
@@ -176,16 +176,14 @@ impl Shared {
         }
         let key = (frame.stream, truth.stream);
         let known = self.pool().get_mut(&key).and_then(Vec::pop);
-        let mut registration = match known {
-            Some(registration) => registration,
-            None => {
-                let between = pb.inverse().compose(&pa);
-                // Cameras that look in different directions need the surfaces; others the rule of their makers.
-                let is_parallel = between.rotation_xyzw[..3].iter().all(|v| v.abs() < 1e-3)
-                    && Pose::IDENTITY.rotation_xyzw[3] == 1.0;
-                let method = if is_parallel { Method::Splat } else { Method::Triangles };
-                Registration::new(&ka, sa, &kb, sb, &between, method).with_context(what)?
-            }
+        let mut registration = if let Some(registration) = known {
+            registration
+        } else {
+            let between = pb.inverse().compose(&pa);
+            // Cameras that look in different directions need the surfaces; others the rule of their makers.
+            let is_parallel = between.rotation_xyzw[..3].iter().all(|v| v.abs() < 1e-3);
+            let method = if is_parallel { Method::Splat } else { Method::Triangles };
+            Registration::new(&ka, sa, &kb, sb, &between, method).with_context(what)?
         };
         let pixels = rows(a, &frame.decoded()?)?;
         let mut out = vec![0u16; sb.0 as usize * sb.1 as usize];

@@ -86,9 +86,13 @@ fn npy(bytes: &[u8], unit_m: f64) -> Result<Metres> {
     let shape = shape.context("its head has no shape")?.split(',').map(str::trim).filter(|n| !n.is_empty());
     let shape: Vec<usize> =
         shape.map(str::parse).collect::<Result<_, _>>().context("its shape is no shape")?;
-    let (height, width) = match shape[..] {
-        [h, w] | [1, h, w] | [h, w, 1] | [1, h, w, 1] | [1, 1, h, w] => (h, w),
-        _ => bail!("shape {shape:?} is not that of one picture"),
+    let ([height, width]
+    | [1, height, width]
+    | [height, width, 1]
+    | [1, height, width, 1]
+    | [1, 1, height, width]) = shape[..]
+    else {
+        bail!("shape {shape:?} is not that of one picture");
     };
     if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
         bail!("shape {shape:?} is no picture");
