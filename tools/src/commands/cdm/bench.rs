@@ -171,9 +171,9 @@ pub fn run(args: &BenchArgs) -> Result<Exit> {
         }
     }
     if args.json {
-        out::json(&rows)?
+        out::json(&rows)?;
     } else {
-        tell(&rows)?
+        tell(&rows)?;
     }
     Ok(if rows.iter().any(|r| r.error.is_some()) { Exit::Failed } else { Exit::Good })
 }
@@ -203,18 +203,13 @@ fn elsewhere(args: &BenchArgs, spec: &Spec, input_size: Option<u32>) -> Result<M
         error: Some(why),
         ..Measured::default()
     };
-    Ok(match serde_json::from_slice::<Measured>(&done.stdout) {
-        Ok(measured) => measured,
-        Err(_) => {
-            let text = String::from_utf8_lossy(&done.stderr);
-            let why = if text.trim().is_empty() {
-                format!("ended with {}", done.status)
-            } else {
-                text.trim().to_owned()
-            };
-            failed(why)
-        }
-    })
+    if let Ok(measured) = serde_json::from_slice::<Measured>(&done.stdout) {
+        return Ok(measured);
+    }
+    let text = String::from_utf8_lossy(&done.stderr);
+    let why =
+        if text.trim().is_empty() { format!("ended with {}", done.status) } else { text.trim().to_owned() };
+    Ok(failed(why))
 }
 
 fn measure(args: &BenchArgs, spec: &Spec) -> Result<Measured> {
