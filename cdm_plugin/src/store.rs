@@ -130,6 +130,13 @@ pub fn check_name(name: &str) -> Result<()> {
     Err(Error::new(ErrorKind::BadInput, message))
 }
 
+/// Whether `text` can only mean a file: it has a folder or the ending of a checkpoint. Anything else is the name of an
+/// installed model first.
+pub fn names_a_file(text: &str) -> bool {
+    let ending = Path::new(text).extension().and_then(|e| e.to_str()).unwrap_or_default();
+    text.contains('/') || ["safetensors", "pth", "pt", "ckpt", "bin"].contains(&ending)
+}
+
 impl ModelStore {
     /// The models in `dir`, or in [`default_dir`]. The folder need not be there.
     ///
@@ -239,10 +246,7 @@ impl ModelStore {
     /// Those of [`Self::get`] and [`Model::from_file`].
     pub fn model(&self, name_or_file: &str) -> Result<Model> {
         let path = Path::new(name_or_file);
-        let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
-        let is_path =
-            name_or_file.contains('/') || ["safetensors", "pth", "pt", "ckpt", "bin"].contains(&ending);
-        if !is_path && (self.dir.join(name_or_file).is_dir() || !path.is_file()) {
+        if !names_a_file(name_or_file) && (self.dir.join(name_or_file).is_dir() || !path.is_file()) {
             return self.get(name_or_file);
         }
         Model::from_file(path)

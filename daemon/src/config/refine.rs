@@ -96,8 +96,7 @@ pub(super) fn cdm(top: &Section<'_, '_>, base: &Path) -> CdmConfig {
 
 /// A path is a file, anything else the name of an installed model.
 fn model(base: &Path, text: &str) -> RefineModel {
-    let is_file = text.contains('/') || [".pth", ".pt", ".safetensors"].iter().any(|e| text.ends_with(e));
-    if is_file {
+    if depthrig_cdm::store::names_a_file(text) {
         RefineModel::File(resolve(base, Path::new(text)))
     } else {
         RefineModel::Installed(text.to_owned())
