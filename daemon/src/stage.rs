@@ -47,8 +47,10 @@ pub const ALIGNED: &str = "depth_aligned";
 
 /// How long the stage thread sleeps at most: it watches refiners and looks for new cameras.
 const LOOK: Duration = Duration::from_millis(20);
-/// How long refiners get to end; they may be in the middle of a picture.
+/// How long refiners get to end at least; they may be in the middle of a picture, and slow ones get twice their slowest.
 const STOP_PATIENCE: Duration = Duration::from_millis(300);
+/// How long the slowest of them gets.
+const STOP_PATIENCE_MOST: Duration = Duration::from_secs(3);
 /// A depth frame waits for its colour this many colour periods.
 const COLOR_PERIODS: i64 = 3;
 
@@ -133,7 +135,8 @@ impl Stage {
                 crew.step(now, threads);
             }
         }
-        let deadline = HostTime::now().plus(STOP_PATIENCE);
+        let slowest = self.crews.iter().map(Crew::slowest).max().unwrap_or_default();
+        let deadline = HostTime::now().plus((slowest * 2).clamp(STOP_PATIENCE, STOP_PATIENCE_MOST));
         self.crews.iter().for_each(Crew::request_stop);
         for crew in &mut self.crews {
             crew.stop(deadline);

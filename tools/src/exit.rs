@@ -1,7 +1,7 @@
-//! Exit codes, and how an error is told.
+//! Exit codes, how an error is told, and how the process ends.
+#![allow(unsafe_code)] // `_exit`, which the standard library does not have
 
 use core::fmt;
-use std::process::ExitCode;
 
 /// How a command ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,10 +28,15 @@ impl Exit {
     }
 }
 
-impl From<Exit> for ExitCode {
-    fn from(exit: Exit) -> Self {
-        Self::from(exit.code())
-    }
+/// Ends the process with the code of `exit`, everything that was written to the standard output being out.
+///
+/// Without the handlers that libraries have put to its end: a refiner that hangs is left behind in its thread, and ONNX
+/// Runtime under it must not be taken apart while it runs.
+pub fn leave(exit: Exit) -> ! {
+    // A closed pipe has nobody to be told.
+    let _ = std::io::Write::flush(&mut std::io::stdout());
+    // SAFETY: `_exit` takes any number and does not return; what must not be left undone was dropped before.
+    unsafe { libc::_exit(exit.code().into()) }
 }
 
 /// An error of the person at the keyboard: exit code 2.

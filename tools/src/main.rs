@@ -21,13 +21,10 @@ mod turbo;
 mod view;
 
 use clap::Parser;
-use std::process::ExitCode;
 
-fn main() -> ExitCode {
+fn main() {
     let cli = cli::Cli::parse(); // ends the process with 2 and a hint when the usage is wrong
     logging::start(&cli.global, cli.command.loudness());
-    match commands::run(cli) {
-        Ok(exit) => exit.into(),
-        Err(error) => exit::report(&error).into(),
-    }
+    let exit = commands::run(cli).unwrap_or_else(|error| exit::report(&error));
+    exit::leave(exit)
 }

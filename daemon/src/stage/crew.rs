@@ -126,6 +126,12 @@ impl Crew {
         }
     }
 
+    /// The longest that work on a batch has taken so far.
+    pub fn slowest(&self) -> Duration {
+        let slowest = self.running.as_ref().map_or(0, |r| r.shared.slowest_ns.load(Ordering::Relaxed));
+        Duration::from_nanos(slowest)
+    }
+
     /// Waits for the worker's end until `deadline`; one that does not answer is left behind.
     pub fn stop(&mut self, deadline: HostTime) {
         let Some(running) = self.running.take() else { return };

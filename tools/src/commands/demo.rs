@@ -108,7 +108,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
 }
 
 /// Refined pictures of each camera a second: all seven share what the cores have left.
-const REFINE_HZ: f64 = 0.5;
+const REFINE_HZ: f64 = 2.0;
 
 /// The default rig, with the true depth and, by the engine that needs no model, refined depth as streams of their own
 /// that are not recorded.

@@ -20,6 +20,9 @@ const COMPARE_MOST: usize = 6;
 const REFINED_MOST: usize = 3;
 /// Frames of one moment are this close.
 const SAME_MOMENT_NS: i64 = 1_000_000;
+/// The same of depth and of the truth in colour's view: half of what their exposures differ by is latency that no clock
+/// map can know. Simulated streams of one rate expose at the same moments, 11 ms apart at the least.
+const SAME_MOMENT_IN_COLOR_NS: i64 = 5_000_000;
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// What was seen of one camera's depth.
@@ -29,6 +32,8 @@ pub struct DepthSeen {
     pub fill_percent: f64,
     /// Mean of |depth - truth| where both are, mean over the pictures, millimetres; `None` without a truth.
     pub l1_mm: Option<f64>,
+    /// The same over every pixel of the truth: what is missing counts as 0, so that its whole depth is its error.
+    pub strict_l1_mm: Option<f64>,
     /// Pictures looked at.
     pub pictures: u64,
     /// Pictures compared with the truth.
@@ -141,16 +146,18 @@ impl Watcher {
         }
         for (refined, truth) in &self.refined {
             let seen = self.seen.refined.entry(refined.header.camera().to_owned()).or_default();
-            seen.depth.add(refined, Some(truth))?;
+            seen.depth.add(refined, Some(truth), SAME_MOMENT_IN_COLOR_NS)?;
         }
         for (depth, truth) in self.to_compare.iter().flatten() {
             let seen = self.seen.depth.entry(depth.header.camera().to_owned()).or_default();
-            seen.add(depth, truth.as_ref())?;
+            seen.add(depth, truth.as_ref(), SAME_MOMENT_NS)?;
         }
         for depth in self.seen.depth.values_mut().chain(self.seen.refined.values_mut().map(|r| &mut r.depth))
         {
             depth.fill_percent /= depth.pictures.max(1) as f64;
-            depth.l1_mm = depth.l1_mm.map(|sum| sum / depth.compared.max(1) as f64);
+            let mean = |sum: f64| sum / depth.compared.max(1) as f64;
+            depth.l1_mm = depth.l1_mm.map(mean);
+            depth.strict_l1_mm = depth.strict_l1_mm.map(mean);
         }
         Ok(self.seen)
     }
@@ -167,7 +174,7 @@ impl Watcher {
             frame.header().refiner().clone_into(&mut seen.engine);
             let truth = StreamId::new(id.camera.as_str(), "depth_true_color")?;
             let at = frame.header().capture_time_ns;
-            let same = |f: &&Frame| (f.header().capture_time_ns - at).abs() < SAME_MOMENT_NS;
+            let same = |f: &&Frame| (f.header().capture_time_ns - at).abs() < SAME_MOMENT_IN_COLOR_NS;
             let truth = self.inputs.get(&truth).and_then(|i| i.kept.iter().find(same));
             let kept = self.refined.iter().filter(|(r, _)| r.header.camera() == id.camera.as_str()).count();
             if let Some(truth) = truth.filter(|_| kept < REFINED_MOST) {
@@ -227,13 +234,13 @@ impl Input {
 }
 
 impl DepthSeen {
-    /// Sums are divided by the number of pictures at the end.
-    fn add(&mut self, depth: &Copied, truth: Option<&Copied>) -> Result<()> {
+    /// Sums are divided by the number of pictures at the end. The truth counts when it is `within` nanoseconds of `depth`.
+    fn add(&mut self, depth: &Copied, truth: Option<&Copied>, within: i64) -> Result<()> {
         let Some(metres) = picture::depth_m(&depth.header, &depth.pixels)? else { return Ok(()) };
         self.pictures += 1;
         self.fill_percent += 100.0 * fill_rate(&Depth::Metres(&metres));
         let same_moment =
-            |t: &&Copied| (t.header.capture_time_ns - depth.header.capture_time_ns).abs() < SAME_MOMENT_NS;
+            |t: &&Copied| (t.header.capture_time_ns - depth.header.capture_time_ns).abs() < within;
         if let Some(truth) = truth.filter(same_moment)
             && let Some(true_metres) = picture::depth_m(&truth.header, &truth.pixels)?
         {
@@ -242,6 +249,7 @@ impl DepthSeen {
             if metrics.valid > 0 {
                 self.compared += 1;
                 *self.l1_mm.get_or_insert(0.0) += metrics.l1_m * 1e3;
+                *self.strict_l1_mm.get_or_insert(0.0) += metrics.strict_l1_m * 1e3;
             }
         }
         Ok(())

@@ -129,7 +129,7 @@ impl DemoReport {
             engine.unwrap_or("nothing")
         ));
         let percent = |d: &DepthSeen| format!("{:.0} %", d.fill_percent);
-        let error = |d: &DepthSeen| d.l1_mm.map_or_else(|| "-".into(), |mm| format!("{mm:.1} mm"));
+        let error = |d: &DepthSeen| d.strict_l1_mm.map_or_else(|| "-".into(), |mm| format!("{mm:.0} mm"));
         let row = |(name, refined): (&String, &RefinedSeen)| {
             let raw = self.depth.get(name).cloned().unwrap_or_default();
             let live = self.live.cameras.iter().find(|c| c.name == *name).and_then(|c| c.refine.as_ref());
@@ -152,8 +152,8 @@ impl DemoReport {
         let header = &["camera", "raw", "filled", "raw error", "filled error", "wait ms", "register", "fill"];
         lines.push(out::table(header, 1, self.refined.iter().map(row)));
         lines.push(
-            "raw and filled: pixels with depth; errors: mean distance from the true depth where both are, so that filled \
-             counts the hard pixels that raw leaves out"
+            "raw and filled: pixels with depth; errors: mean distance from the true depth over every pixel that has one, a \
+             missing one counting as 0 m; raw in its own view, filled in that of colour, which sees more"
                 .to_owned(),
         );
         let s = &self.seeded;

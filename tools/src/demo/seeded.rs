@@ -39,7 +39,7 @@ pub struct Seeded {
 /// Makes a model of random numbers and runs it in a rig of one simulated camera until its first frame.
 pub fn run() -> Result<Seeded> {
     let folder = tempfile::tempdir().context("no folder for the random weights")?;
-    let weights = folder.path().join("untrained.safetensors");
+    let weights = folder.path().join("vits.safetensors");
     depthrig_cdm::weights::write_seeded(Encoder::Vits, 7, &weights)?;
     let mut config =
         RigConfig::parse(RigConfig::default_text(), None).map_err(depthrig_daemon::Error::from)?;
