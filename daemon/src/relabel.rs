@@ -95,6 +95,8 @@ struct Camera {
     id: StreamId,
     /// Index of what refines it.
     engine: usize,
+    /// Why this engine and not the one that one would expect.
+    note: Option<String>,
 }
 
 /// A refiner, as often as there are threads.
@@ -239,6 +241,7 @@ fn plan(
         let stream = StreamName::new(REFINED).map_err(|e| bad(e.to_string()))?;
         let id = StreamId { camera: record.id.camera.clone(), stream };
         let plan = refiners.plan(&options.refine, &session.streams[depth].model);
+        let note = plan.note.clone();
         let engine = match engines.iter().position(|e| e.plan.is_as(&plan)) {
             Some(at) => at,
             None => {
@@ -246,7 +249,7 @@ fn plan(
                 engines.len() - 1
             }
         };
-        cameras.push(Camera { color, depth, id, engine });
+        cameras.push(Camera { color, depth, id, engine, note });
     }
     if cameras.is_empty() {
         let names: Vec<_> = session.streams.iter().map(|s| s.id.to_string()).collect();
@@ -277,7 +280,7 @@ fn streams(cameras: &[Camera], engines: &[Engine]) -> Vec<RelabelledStream> {
             stream: camera.id.to_string(),
             engine: engine.description.engine.clone(),
             model: engine.description.model.clone(),
-            note: engine.note.clone(),
+            note: engine.note.clone().or_else(|| camera.note.clone()),
             frames: 0,
         }
     };

@@ -130,7 +130,8 @@ impl Refiners for Installed {
                 let refiner = self.make(&fill(false, None), threads)?;
                 Ok(Opened { refiner, note: Some(note) })
             }
-            made => made.map(|refiner| Opened { refiner, note: plan.note.clone() }),
+            // Cameras that share it may have come to it for different reasons; their plans tell those.
+            made => made.map(|refiner| Opened { refiner, note: None }),
         }
     }
 }
