@@ -242,12 +242,11 @@ fn plan(
         let id = StreamId { camera: record.id.camera.clone(), stream };
         let plan = refiners.plan(&options.refine, &session.streams[depth].model);
         let note = plan.note.clone();
-        let engine = match engines.iter().position(|e| e.plan.is_as(&plan)) {
-            Some(at) => at,
-            None => {
-                engines.push(Engine::open(refiners, plan, options)?);
-                engines.len() - 1
-            }
+        let engine = if let Some(at) = engines.iter().position(|e| e.plan.is_as(&plan)) {
+            at
+        } else {
+            engines.push(Engine::open(refiners, plan, options)?);
+            engines.len() - 1
         };
         cameras.push(Camera { color, depth, id, engine, note });
     }

@@ -381,7 +381,7 @@ fn a_reader_that_holds_its_frames_costs_nobody_anything() {
     let summary = rig.stop();
     assert_balanced(&summary.status);
     assert_captured_everything(&summary.status);
-    assert!(refined(&summary.status, "cam").1.dropped.get("no_slot").is_none());
+    assert!(!refined(&summary.status, "cam").1.dropped.contains_key("no_slot"));
 }
 
 #[test]

@@ -1,4 +1,5 @@
 //! `cdm relabel`: a copy of a dataset with refined depth, whatever happens to the run that makes it.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use core::ops::ControlFlow;
 use depthrig_bus::FrameFlags;
@@ -20,7 +21,7 @@ fn options(workers: usize) -> RelabelOptions {
 fn bytes_of(dir: &Path) -> BTreeMap<String, Vec<u8>> {
     std::fs::read_dir(dir)
         .unwrap()
-        .map(|e| e.unwrap())
+        .map(Result::unwrap)
         .map(|e| (e.file_name().to_string_lossy().into_owned(), std::fs::read(e.path()).unwrap()))
         .collect()
 }
@@ -32,7 +33,7 @@ fn go_on(_: Step, _: u64, _: u64) -> ControlFlow<()> {
 /// Refined pixels of each set and stream.
 fn refined(path: &Path) -> Vec<(u64, String, Vec<u8>)> {
     let dataset = Dataset::open(path).unwrap();
-    let sets = dataset.sets_with(SetRange::ALL, PixelMode::Decoded).map(|s| s.unwrap());
+    let sets = dataset.sets_with(SetRange::ALL, PixelMode::Decoded).map(Result::unwrap);
     sets.flat_map(|set| {
         let frames = set.frames.into_iter().filter(|f| f.header.stream() == "depth_refined");
         frames.map(|f| (set.id, f.header.camera().to_owned(), f.pixels)).collect::<Vec<_>>()

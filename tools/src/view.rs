@@ -1,6 +1,7 @@
 //! The status of a rig as text: what `status` prints and `top` refreshes.
 
 use crate::out;
+use core::fmt::Write as _;
 use depthrig_daemon::status::{
     CameraState, CameraStatus, RecordingStatus, RefineState, ReplayStatus, RigStatus, StreamStatus,
 };
@@ -185,22 +186,22 @@ fn refined(camera: &CameraStatus, style: Style) -> Option<String> {
     let state = color.map_or_else(|| r.state.name().to_owned(), |color| style.paint(color, r.state.name()));
     let mut told = format!("refined   {}: {state}", camera.name);
     if !r.engine.is_empty() {
-        told += &format!(", {}", r.engine);
+        let _ = write!(told, ", {}", r.engine);
     }
     if !r.model.is_empty() {
-        told += &format!(" with {}", r.model);
+        let _ = write!(told, " with {}", r.model);
     }
     if r.state == RefineState::Running {
-        told += &format!(", {:.1} of {:.1} Hz", r.rate_hz, r.nominal_hz);
+        let _ = write!(told, ", {:.1} of {:.1} Hz", r.rate_hz, r.nominal_hz);
         let step = |name: &str| r.steps_p50_ms.get(name).copied().unwrap_or(0.0);
         let steps = ["wait", "register", "prepare", "infer", "finish"].map(|s| format!("{s} {:.1}", step(s)));
-        told += &format!(", {:.1} ms ({})", step("total"), steps.join(", "));
+        let _ = write!(told, ", {:.1} ms ({})", step("total"), steps.join(", "));
     }
     if !r.skipped.is_empty() {
-        told += &format!(", skipped {}", out::reasons(&r.skipped));
+        let _ = write!(told, ", skipped {}", out::reasons(&r.skipped));
     }
     if let Some(why) = &r.message {
-        told += &format!(": {why}");
+        let _ = write!(told, ": {why}");
     }
     Some(told)
 }

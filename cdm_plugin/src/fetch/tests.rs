@@ -3,6 +3,7 @@
 use super::*;
 use core::ops::ControlFlow;
 use core::sync::atomic::{AtomicUsize, Ordering};
+use std::fmt::Write as _;
 use std::io::{BufRead, BufReader};
 use std::net::{TcpListener, TcpStream};
 use std::sync::{Arc, Mutex};
@@ -59,7 +60,7 @@ fn answer(mut stream: TcpStream, seen: &Mutex<Vec<Request>>, handler: &Handler, 
     let Some(Ok(first)) = lines.next() else { return };
     let path = first.split(' ').nth(1).unwrap_or_default().to_owned();
     let mut headers = Vec::new();
-    for line in lines.map_while(|l| l.ok()).take_while(|l| !l.is_empty()) {
+    for line in lines.map_while(Result::ok).take_while(|l| !l.is_empty()) {
         let (name, value) = line.split_once(": ").unwrap();
         headers.push((name.to_lowercase(), value.to_owned()));
     }
@@ -71,7 +72,7 @@ fn answer(mut stream: TcpStream, seen: &Mutex<Vec<Request>>, handler: &Handler, 
 fn reply(status: &str, headers: &[(&str, String)], body: &[u8]) -> Vec<u8> {
     let mut text = format!("HTTP/1.1 {status}\r\nConnection: close\r\n");
     for (name, value) in headers {
-        text.push_str(&format!("{name}: {value}\r\n"));
+        let _ = write!(text, "{name}: {value}\r\n");
     }
     [text.as_bytes(), b"\r\n", body].concat()
 }

@@ -110,9 +110,8 @@ impl Refine<'_> {
                 format!("{id} cannot be made of frame {}: {why}", depth.header.sequence),
             )
         };
-        let (registered, unit_m) = view
-            .depth(&self.options.refine, &color.header, &depth.header, &depth.pixels)
-            .map_err(|why| bad(why))?;
+        let (registered, unit_m) =
+            view.depth(&self.options.refine, &color.header, &depth.header, &depth.pixels).map_err(bad)?;
         let picture = pixels::color(&color.header, &color.pixels).map_err(|e| bad(e.to_string()))?;
         let mut out = vec![0; picture.width * picture.height];
         let engine = &self.engines[camera.engine];

@@ -21,7 +21,7 @@ fn until_sound<T>(mut read: impl FnMut() -> Result<T>) -> Result<T> {
     for _ in 1..READINGS {
         match read() {
             Err(e) if e.kind() == ErrorKind::Protocol => {
-                tracing::debug!("a calibration table is read again: {e}")
+                tracing::debug!("a calibration table is read again: {e}");
             }
             done => return done,
         }

@@ -17,7 +17,7 @@ const CAMERA: &str = "d435";
 /// Shorter side of the network's input: enough to see it work.
 const INPUT_SIZE: u32 = 252;
 /// How long a computer may take for it.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 /// What became of it.
 #[derive(Debug, Clone, Default, Serialize)]

@@ -23,7 +23,7 @@ impl HardwareMonitor for Made {
             return Err(Error::new(ErrorKind::Disconnected, "gone"));
         }
         self.asked += 1;
-        let bad = self.asked % (self.bad_replies + 1) != 0;
+        let bad = !self.asked.is_multiple_of(self.bad_replies + 1);
         let spoiled = |mut table: Vec<u8>| {
             if let Some(last) = table.last_mut() {
                 *last ^= u8::from(bad);

@@ -66,13 +66,7 @@ pub(super) fn draw(look: &Look) -> RgbImage {
         match n {
             0 => font::text(&mut image, below, LETTER, INK, &format!("{w}x{h} {}", look.note)),
             3 => {
-                legend(
-                    &mut image,
-                    below,
-                    pw,
-                    |t| turbo(t),
-                    &["0".to_owned(), format!("{MAX_DIFFERENCE_M} m")],
-                );
+                legend(&mut image, below, pw, turbo, &["0".to_owned(), format!("{MAX_DIFFERENCE_M} m")]);
                 let row = below.1 + 18;
                 let mut x = below.0 + 24 * LETTER * font::ADVANCE / 2;
                 for (color, what) in [(ONLY_REFINED, "refined alone"), (ONLY_RAW, "raw alone")] {
