@@ -101,6 +101,8 @@ pub struct Stage {
     /// Rung after each refined frame.
     frames: Arc<Wake>,
     sets_ns: i64,
+    /// Threads of all refiners together.
+    threads: usize,
     feeds: Vec<Feed>,
     crews: Vec<Crew>,
     /// Lanes taken in so far.
@@ -118,7 +120,11 @@ impl Stage {
         sets_hz: f64,
     ) -> Self {
         let sets_ns = (1e9 / sets_hz).round() as i64;
-        Self { entrance, refiners, config, frames, sets_ns, feeds: Vec::new(), crews: Vec::new(), known: 0 }
+        // Asked once: it reads files.
+        let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+        let threads = if config.threads == 0 { cores.saturating_sub(1) } else { config.threads };
+        let (feeds, crews) = (Vec::new(), Vec::new());
+        Self { entrance, refiners, config, frames, sets_ns, threads, feeds, crews, known: 0 }
     }
 
     /// Runs until `stop` is set.
@@ -145,9 +151,7 @@ impl Stage {
 
     /// Threads of one refiner.
     fn threads(&self) -> usize {
-        let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
-        let all = if self.config.threads == 0 { cores.saturating_sub(1) } else { self.config.threads };
-        (all / self.crews.len().max(1)).max(1)
+        (self.threads / self.crews.len().max(1)).max(1)
     }
 
     /// Takes in the cameras that opened since the last look.

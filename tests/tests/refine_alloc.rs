@@ -1,4 +1,6 @@
-//! The thread that refines depth allocates nothing per frame once it runs: registration, refining, publishing, accounts.
+//! The threads of refined depth allocate nothing per frame once they run: pacing and pairing on that of the stage;
+//! registration, refining, publishing and accounts on that of the refiner. iceoryx2 itself makes one small shared counter
+//! for each slot that it lends, which is all that is allowed here.
 //!
 //! A test binary of its own, because its allocator counts.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
@@ -11,19 +13,32 @@ use depthrig_daemon::config::RefineConfig;
 use depthrig_daemon::stage::{Opened, Plan, Refiners};
 use depthrig_tests::{Home, RigText, wait_until};
 use std::alloc::System;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 thread_local! {
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
+    /// This is the stage's thread.
+    static IS_STAGE: Cell<bool> = const { Cell::new(false) };
 }
 
+/// Allocations of the stage's thread since it began to be counted.
+static OF_STAGE: AtomicU64 = AtomicU64::new(0);
+
 struct Counting;
+
+fn count() {
+    // A thread that is being torn down has no counter any more.
+    let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + 1));
+    if IS_STAGE.try_with(Cell::get) == Ok(true) {
+        OF_STAGE.fetch_add(1, Ordering::Relaxed);
+    }
+}
 
 // SAFETY: everything is handed to the system's allocator as it came.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        // A thread that is being torn down has no counter any more.
-        let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + 1));
+        count();
         // SAFETY: the caller's promises are passed on.
         unsafe { System.alloc(layout) }
     }
@@ -34,7 +49,7 @@ unsafe impl GlobalAlloc for Counting {
     }
 
     unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + 1));
+        count();
         // SAFETY: likewise.
         unsafe { System.realloc(ptr, layout, size) }
     }
@@ -43,8 +58,11 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static COUNTING: Counting = Counting;
 
-/// Notes how many allocations its thread has made whenever it is called.
-struct Noting(Arc<Mutex<Vec<u64>>>, Description);
+/// Allocations so far of the refiner's thread and of the stage's, and how many pairs there were at once.
+type Seen = (u64, u64, usize);
+
+/// Notes how many allocations there have been whenever it is called.
+struct Noting(Arc<Mutex<Vec<Seen>>>, Description);
 
 impl Refiner for Noting {
     fn describe(&self) -> &Description {
@@ -56,12 +74,13 @@ impl Refiner for Noting {
     }
 
     fn refine(&mut self, jobs: &mut [Job<'_>]) -> Result<()> {
+        let pairs = jobs.len();
         for job in jobs {
             if let Output::Units { pixels, .. } = &mut job.out {
                 pixels.copy_from_slice(job.depth.pixels);
             }
         }
-        let so_far = ALLOCATIONS.with(Cell::get);
+        let so_far = (ALLOCATIONS.with(Cell::get), OF_STAGE.load(Ordering::Relaxed), pairs);
         let mut list = self.0.lock().unwrap();
         if list.len() < list.capacity() {
             list.push(so_far);
@@ -70,10 +89,12 @@ impl Refiner for Noting {
     }
 }
 
-struct Source(Arc<Mutex<Vec<u64>>>);
+struct Source(Arc<Mutex<Vec<Seen>>>);
 
 impl Refiners for Source {
     fn plan(&self, config: &RefineConfig, _: &str) -> Plan {
+        // It is the stage that asks.
+        IS_STAGE.set(true);
         Plan {
             engine: EngineKind::Fill,
             model: None,
@@ -107,5 +128,12 @@ fn nothing_is_allocated_per_frame() {
     rig.stop();
     let seen = seen.lock().unwrap();
     let last = &seen[seen.len() - 40..];
-    assert_eq!(last.first(), last.last(), "allocations per frame: {last:?}");
+    assert!(last[0].0 > 0 && last[0].1 > 0, "nothing was counted: {last:?}");
+    assert!(last.iter().any(|s| s.2 == 2), "no batch of two: {last:?}");
+    for two in last.windows(2) {
+        // Each pair takes two slots, one for aligned and one for refined depth, before it is refined.
+        let slots = 2 * two[1].2 as u64;
+        assert_eq!(two[1].0 - two[0].0, slots, "allocations beside those of slots: {last:?}");
+        assert_eq!(two[1].1, two[0].1, "allocations on the stage's thread: {last:?}");
+    }
 }
