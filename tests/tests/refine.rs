@@ -25,12 +25,19 @@ struct Script {
     closed: AtomicUsize,
     /// It hangs while this is set.
     hang: AtomicBool,
+    /// Opening hangs while this is set.
+    hang_open: AtomicBool,
+    /// Colour of this width is refused; 0 is none.
+    refused_width: AtomicUsize,
     /// Pairs of a batch; 0 is 1.
     batch: AtomicUsize,
     opened: AtomicUsize,
     /// Sizes of the batches.
     largest: AtomicUsize,
 }
+
+/// How long refining took by its own account when it hung.
+const HUNG_NS: u64 = 77_000_000;
 
 #[derive(Clone)]
 struct Scripted(Arc<Script>);
@@ -53,6 +60,9 @@ impl Refiners for Scripted {
     fn open(&self, plan: &Plan, threads: usize) -> Result<Opened> {
         assert!(threads >= 1);
         self.0.opened.fetch_add(1, Ordering::SeqCst);
+        while self.0.hang_open.load(Ordering::SeqCst) {
+            std::thread::sleep(Duration::from_millis(5));
+        }
         if take_one(&self.0.closed) {
             return Err(Error::new(ErrorKind::OutOfMemory, "the device has no memory left"));
         }
@@ -76,7 +86,9 @@ impl Refiner for Fake {
     }
 
     fn refine(&mut self, jobs: &mut [Job<'_>]) -> Result<()> {
+        let mut infer_ns = 3_000_000;
         while self.0.hang.load(Ordering::SeqCst) {
+            infer_ns = HUNG_NS;
             std::thread::sleep(Duration::from_millis(5));
         }
         std::thread::sleep(Duration::from_millis(self.0.delay_ms.load(Ordering::SeqCst)));
@@ -84,8 +96,13 @@ impl Refiner for Fake {
         if take_one(&self.0.failing) {
             return Err(Error::new(ErrorKind::Engine, "the script says so"));
         }
+        let refused = self.0.refused_width.load(Ordering::SeqCst);
+        if let Some(i) = jobs.iter().position(|j| j.color.width == refused) {
+            let what = format!("pair {i} is {refused} pixels wide");
+            return Err(Error::new(ErrorKind::BadInput, what));
+        }
         for job in jobs {
-            job.steps.infer_ns = 3_000_000;
+            job.steps.infer_ns = infer_ns;
             match &mut job.out {
                 Output::Units { pixels, .. } => {
                     for (out, raw) in pixels.iter_mut().zip(job.depth.pixels) {
@@ -260,7 +277,10 @@ fn an_engine_that_fails_stops_the_stream_says_why_and_comes_back() {
     });
     assert_eq!(refined(&status, "cam").1.delivered, stopped, "frames came although the engine had failed");
     let status = wait_until(&rig, "back", |s| refined(s, "cam").1.delivered > stopped + 3);
-    assert_eq!(refined(&status, "cam").0.state, RefineState::Running);
+    assert_eq!(
+        (refined(&status, "cam").0.state, refined(&status, "cam").0.restarts),
+        (RefineState::Running, 1)
+    );
     assert_eq!(script.opened.load(Ordering::SeqCst), 3);
     let summary = rig.stop();
     assert_balanced(&summary.status);
@@ -275,6 +295,7 @@ fn an_engine_that_hangs_is_given_up_and_neither_capture_nor_the_end_waits_for_it
     let text = RigText::default().camera("cam", "[camera.refine]\nrate_hz = 0").and("[cdm]\nhang_s = 0.3\n");
     let rig = start(&home, &text, &script);
     wait_until(&rig, "running", |s| refined(s, "cam").1.delivered > 3);
+    let mut out = bus(&home).subscriber(&"cam/depth_refined".parse().unwrap()).unwrap();
     script.hang.store(true, Ordering::SeqCst);
     let status = wait_until(&rig, "given up", |s| refined(s, "cam").0.state == RefineState::Failed);
     let message = refined(&status, "cam").0.message.clone().unwrap();
@@ -283,7 +304,13 @@ fn an_engine_that_hangs_is_given_up_and_neither_capture_nor_the_end_waits_for_it
     let stopped = refined(&status, "cam").1.delivered;
     script.hang.store(false, Ordering::SeqCst);
     // The thread that hung comes back now, and must not be heard.
-    let status = wait_until(&rig, "back", |s| refined(s, "cam").1.delivered > stopped + 5);
+    let status = wait_until(&rig, "back", |s| {
+        while let Some(frame) = out.try_next().unwrap() {
+            assert_ne!(frame.header().step_ns(StageStep::Infer), HUNG_NS, "it was given up and published");
+        }
+        refined(s, "cam").1.delivered > stopped + 5
+    });
+    assert_eq!(out.missed(), 0);
     assert_balanced_live(&status);
     script.hang.store(true, Ordering::SeqCst);
     std::thread::sleep(Duration::from_millis(50));
@@ -293,6 +320,93 @@ fn an_engine_that_hangs_is_given_up_and_neither_capture_nor_the_end_waits_for_it
     script.hang.store(false, Ordering::SeqCst);
     assert_balanced(&summary.status);
     assert_captured_everything(&summary.status);
+}
+
+#[test]
+fn an_engine_that_hangs_while_it_opens_has_no_pair_to_lose() {
+    let home = Home::default();
+    let script = Arc::new(Script::default());
+    let rig = start(&home, &RigText::default().camera("cam", "[camera.refine]\nrate_hz = 0"), &script);
+    wait_until(&rig, "running", |s| refined(s, "cam").1.delivered > 3);
+    script.hang_open.store(true, Ordering::SeqCst);
+    script.failing.store(1, Ordering::SeqCst);
+    wait_until(&rig, "opening", |s| {
+        script.opened.load(Ordering::SeqCst) == 2 && refined(s, "cam").0.state == RefineState::Starting
+    });
+    let began = HostTime::now();
+    let summary = rig.stop();
+    assert!(began.elapsed() < Duration::from_secs(2), "{:?}", began.elapsed());
+    script.hang_open.store(false, Ordering::SeqCst);
+    assert_balanced(&summary.status);
+    let (state, stream) = refined(&summary.status, "cam");
+    assert_eq!((state.skipped.get("hung"), stream.dropped.get("abandoned")), (None, None));
+    assert_eq!(state.skipped["engine"], 1);
+}
+
+#[test]
+fn what_an_engine_refuses_of_one_camera_costs_the_others_nothing() {
+    let home = Home::default();
+    let script = Arc::new(Script {
+        delay_ms: 20.into(),
+        batch: 2.into(),
+        refused_width: 64.into(),
+        ..Script::default()
+    });
+    let dir = home.path("narrow");
+    std::fs::create_dir_all(&dir).unwrap();
+    let manifest = depthrig_tests::uncalibrated_camera(&dir, (64, 48), (64, 48));
+    let text = RigText::default().camera("good", "[camera.refine]\nrate_hz = 0").files(
+        "bad",
+        &manifest,
+        "[camera.refine]\nrate_hz = 0\nis_aligned = true",
+    );
+    let rig = start(&home, &text, &script);
+    let status = wait_until(&rig, "one is refined, the other is not", |s| {
+        refined(s, "good").1.delivered > 20
+            && refined(s, "bad").0.skipped.get("unfit").is_some_and(|n| *n > 20)
+    });
+    let (state, stream) = refined(&status, "bad");
+    assert_eq!((state.state, stream.delivered), (RefineState::Failed, 0));
+    assert!(state.message.as_deref().unwrap().contains("64 pixels wide"), "{:?}", state.message);
+    assert_eq!(refined(&status, "good").0.state, RefineState::Running);
+    assert_eq!(script.largest.load(Ordering::SeqCst), 2, "they were never in one batch");
+    // Once it takes them it is told so.
+    script.refused_width.store(0, Ordering::SeqCst);
+    let status = wait_until(&rig, "both", |s| refined(s, "bad").1.delivered > 3);
+    assert_eq!(refined(&status, "bad").0.state, RefineState::Running);
+    assert_eq!(script.opened.load(Ordering::SeqCst), 1, "an engine that works was opened again");
+    let summary = rig.stop();
+    assert_balanced(&summary.status);
+    assert_captured_everything(&summary.status);
+    assert_eq!(refined(&summary.status, "good").0.skipped.get("engine"), None);
+}
+
+#[test]
+fn depth_without_colour_near_it_is_not_refined() {
+    let home = Home::default();
+    let script = Arc::new(Script::default());
+    // Of every three depth frames one has its own colour frame, and the others are 33 ms from any.
+    let text = RigText::default().and(
+        "[[camera]]\nname = \"cam\"\nbackend = \"synthetic\"\nmodel = \"generic\"\ncheap = true\n\
+         [camera.refine]\nrate_hz = 0\n\
+         [[camera.stream]]\nname = \"color\"\nwidth = 160\nheight = 120\nrate_hz = 10\n\
+         [[camera.stream]]\nname = \"depth\"\nwidth = 160\nheight = 120\nrate_hz = 30\n",
+    );
+    let rig = start(&home, &text, &script);
+    wait_until(&rig, "running", |s| refined(s, "cam").1.delivered > 3);
+    let mut out = bus(&home).subscriber(&"cam/depth_refined".parse().unwrap()).unwrap();
+    for _ in 0..15 {
+        let h = *next(&mut out).header();
+        let apart = (h.capture_time_ns - h.source_color_capture_time_ns).abs();
+        assert!(apart <= 51_000_000, "{apart} ns: more than half a colour period and a millisecond");
+    }
+    let summary = rig.stop();
+    assert_balanced(&summary.status);
+    assert_captured_everything(&summary.status);
+    let (state, stream) = refined(&summary.status, "cam");
+    println!("{} refined, {:?}", stream.delivered, state.skipped);
+    assert_eq!(stream.dropped["incomplete"], state.skipped["no_color"]);
+    assert!(state.skipped["no_color"] >= stream.delivered / 4, "{:?}", state.skipped);
 }
 
 /// As [`assert_balanced`], of the refined stream of a rig that runs.
@@ -324,7 +438,7 @@ fn cameras_share_an_engine_in_turn_and_in_batches() {
 #[test]
 fn two_engines_on_one_device_where_only_one_fits() {
     let home = Home::default();
-    let script = Arc::new(Script { closed: usize::MAX.into(), ..Script::default() });
+    let script = Arc::new(Script::default());
     let one = "[camera.refine]\nrate_hz = 0\ndevice = \"cuda:0\"\ninput_size = 252";
     let text = RigText::default().camera("a", "[camera.refine]\nrate_hz = 0").camera("b", one);
     // The first that opens gets the memory.
@@ -353,11 +467,8 @@ impl Refiners for OneFits {
     }
 
     fn open(&self, plan: &Plan, threads: usize) -> Result<Opened> {
-        if !self.1.swap(true, Ordering::SeqCst) {
-            self.0.closed.store(0, Ordering::SeqCst);
-            let opened = Scripted(Arc::clone(&self.0)).open(plan, threads);
-            self.0.closed.store(usize::MAX, Ordering::SeqCst);
-            return opened;
+        if self.1.swap(true, Ordering::SeqCst) {
+            return Err(Error::new(ErrorKind::OutOfMemory, "the device has no memory left"));
         }
         Scripted(Arc::clone(&self.0)).open(plan, threads)
     }

@@ -107,7 +107,7 @@ impl Joints {
                 continue;
             };
             self.streams.push(Joint {
-                near_ns: (stream.profile.period_ns() as f64 * NEAR) as i64,
+                near_ns: near_ns(stream.profile.period_ns() as i64),
                 stream: Arc::clone(stream),
                 camera: Arc::clone(camera),
                 depth: depth.id.clone(),
@@ -212,6 +212,11 @@ impl Joint {
     }
 }
 
+/// How far from a set's depth its refined frame may be when these are `period_ns` apart.
+fn near_ns(period_ns: i64) -> i64 {
+    (period_ns as f64 * NEAR) as i64
+}
+
 /// Which of the frames with these rising `stamps` is the one for `moment`.
 fn nearest(stamps: impl Iterator<Item = i64>, moment: i64, near_ns: i64) -> Found {
     let mut later = false;
@@ -242,5 +247,19 @@ mod tests {
         assert_eq!(find(&[800, 1000, 1200], 1000), Found::At(1));
         assert_eq!(find(&[967], 1000), Found::At(0), "of the depth frame beside it");
         assert_eq!(find(&[800, 1200], 1000), Found::Never, "a later one has come");
+    }
+
+    #[test]
+    fn a_refined_frame_is_of_one_set_and_of_the_depth_frames_beside_it() {
+        let (period, beside) = (200_000_000, 2 * 33_333_334);
+        let find = |stamp, moment| nearest(core::iter::once(stamp), moment, near_ns(period));
+        for off in [-beside, 0, beside] {
+            assert_eq!(find(10 * period + off, 10 * period), Found::At(0), "{off}");
+        }
+        // No stamp lies near two sets.
+        for stamp in (10 * period..=11 * period).step_by(1_000_000) {
+            let near = [10, 11].map(|set| matches!(find(stamp, set * period), Found::At(_)));
+            assert!(near != [true, true], "{stamp}");
+        }
     }
 }

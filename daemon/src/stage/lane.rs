@@ -119,6 +119,8 @@ struct Facts {
     skipped: [u64; Skip::ALL.len()],
     /// Depth frames beyond the rate.
     not_due: u64,
+    /// Its engine failed and does not run again yet.
+    has_failed: bool,
     restarts: u64,
     steps: [[u64; StageStep::ALL.len()]; WINDOW],
     /// Frames in `steps` so far.
@@ -147,6 +149,7 @@ impl Lane {
             model: String::new(),
             skipped: [0; Skip::ALL.len()],
             not_due: 0,
+            has_failed: false,
             restarts: 0,
             steps: [[0; StageStep::ALL.len()]; WINDOW],
             measured: 0,
@@ -242,7 +245,11 @@ impl Lane {
         let mut facts = self.facts();
         if facts.state != state {
             facts.since = HostTime::now();
-            facts.restarts += u64::from(facts.state == RefineState::Failed && state == RefineState::Running);
+        }
+        match state {
+            RefineState::Failed => facts.has_failed = true,
+            RefineState::Running => facts.restarts += u64::from(core::mem::take(&mut facts.has_failed)),
+            RefineState::Starting | RefineState::Off => {}
         }
         facts.state = state;
         facts.message = message.map(str::to_owned);

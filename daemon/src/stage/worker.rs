@@ -1,7 +1,7 @@
 //! The thread of one refiner: takes the newest pairs of its cameras in turn, refines them, publishes what comes out.
 //!
-//! Nothing is allocated per frame once every camera has had one: scratch memory is kept, and pixels are written where
-//! subscribers read them.
+//! Nothing is allocated per frame once every camera has had one, but for the counter that iceoryx2 makes for each slot
+//! that it lends: scratch memory is kept, and pixels are written where subscribers read them.
 
 use super::lane::{Lane, Pair, Skip};
 use super::pixels;
@@ -131,7 +131,10 @@ impl Worker {
                 self.shared.bell.wait(IDLE);
                 continue;
             }
-            let done = self.refine();
+            let mut done = self.refine();
+            if done.as_ref().is_err_and(is_of_a_picture) {
+                done = self.refine_one_by_one();
+            }
             self.publish(done.is_ok());
             self.shared.end();
             done?;
@@ -175,14 +178,40 @@ impl Worker {
     fn refine(&mut self) -> Result<(), Error> {
         let Self { refiner, seats, work, steps, jobs, .. } = self;
         let mut list: Vec<Job<'_>> = recycle(core::mem::take(jobs));
-        for w in work.iter_mut() {
-            list.push(w.job(&seats[w.seat])?);
-        }
-        let done = refiner.refine(&mut list);
+        let made = work.iter_mut().try_for_each(|w| w.job(&seats[w.seat]).map(|job| list.push(job)));
+        let done = made.and_then(|()| refiner.refine(&mut list));
         steps.clear();
         steps.extend(list.iter().map(|j| j.steps));
         *jobs = recycle(list);
         done
+    }
+
+    /// Refines what a refiner refused as a batch. The pictures of one camera must not cost the others theirs, so that
+    /// only the pairs that are refused alone, too, are out of the work then.
+    fn refine_one_by_one(&mut self) -> Result<(), Error> {
+        let Self { refiner, seats, work, steps, .. } = self;
+        steps.clear();
+        let mut at = 0;
+        while let Some(w) = work.get_mut(at) {
+            let seat = &seats[w.seat];
+            let done = w.job(seat).and_then(|mut job| {
+                refiner.refine(core::slice::from_mut(&mut job))?;
+                Ok(job.steps)
+            });
+            match done {
+                Ok(took) => {
+                    steps.push(took);
+                    at += 1;
+                }
+                Err(e) if is_of_a_picture(&e) => {
+                    seat.lane.obstacle(Some(&e.to_string()));
+                    seat.finished(Some(Skip::Unfit));
+                    work.remove(at);
+                }
+                Err(e) => return Err(e),
+            }
+        }
+        Ok(())
     }
 
     fn publish(&mut self, good: bool) {
@@ -199,6 +228,11 @@ impl Worker {
         }
         self.frames.raise();
     }
+}
+
+/// Whether it is a pair of pictures that a refiner cannot use, and not the refiner itself that failed.
+const fn is_of_a_picture(e: &Error) -> bool {
+    matches!(e.kind(), ErrorKind::BadInput | ErrorKind::SizeMismatch)
 }
 
 /// The memory of an emptied list for another list; the compiler reuses it in place.
@@ -247,7 +281,6 @@ impl Seat {
                 return Err(Skip::Unfit);
             }
         };
-        self.lane.obstacle(None);
         let register_ns = began.elapsed().as_nanos() as u64;
         if let Some(stream) = &self.lane.aligned {
             let steps = [began.since_ns(pair.ready).max(0) as u64, register_ns, 0, 0, 0, 0];
@@ -281,6 +314,8 @@ impl Seat {
         model: &str,
     ) -> Result<(), Option<Skip>> {
         let InWork { pair, out, publisher, unit_m, began, register_ns, .. } = work;
+        // Not before: what the refiner refuses is an obstacle as well.
+        self.lane.obstacle(None);
         let wait_ns = began.since_ns(pair.ready).max(0) as u64;
         let steps = [wait_ns, register_ns, steps.prepare_ns, steps.infer_ns, steps.finish_ns, 0];
         let format = self.lane.refined.profile.format;
