@@ -429,3 +429,64 @@ fn the_worst_comes_first() {
     assert_eq!(order, [Severity::Error, Severity::Warning, Severity::Info]);
     assert_eq!(report.verdict, Severity::Error);
 }
+
+/// A folder of models with one that is for the D415, as far as its record says: the weights are not looked for.
+fn models_of(dir: &std::path::Path) -> PathBuf {
+    let record = "format = 1\nencoder = \"vitl\"\nchannel_order = \"bgr\"\ninput_size = 518\nmax_depth_m = 6.0\n\
+        trained = true\ncameras = [\"D415\"]\ninstalled = \"2026-01-01T00:00:00Z\"\ninstalled_by = \"test\"\n\
+        [weights]\nsha256 = \"00\"\nbytes = 1\ntensors = 1\n\
+        [source]\nkind = \"file\"\npath = \"/lab.pth\"\nsha256 = \"00\"\nbytes = 1\n";
+    let model = dir.join("models/lab");
+    std::fs::create_dir_all(&model).unwrap();
+    std::fs::write(model.join("model.toml"), record).unwrap();
+    dir.join("models")
+}
+
+#[test]
+fn what_keeps_depth_from_being_refined_is_found() {
+    use Severity::{Error, Info, Warning};
+    let home = tempfile::tempdir().unwrap();
+    let models = models_of(home.path());
+    let checkpoint = home.path().join("net.pth");
+    std::fs::write(&checkpoint, "").unwrap();
+    let net = format!("engine = \"candle\"\nmodel = \"{}\"", checkpoint.display());
+    let engine = ("engine_missing", Error);
+    let cases: [(&str, &str, &[(&str, Severity)], &str); 14] = [
+        ("d435", "engine = \"fill\"", &[], ""),
+        ("d435", "engine = \"off\"", &[], ""),
+        ("d435", "", &[("refine_fill", Info)], "cdm-d435"),
+        ("generic", "", &[("refine_fill", Info)], "no camera depth model is known for"),
+        // The library stands in a place where there is none.
+        ("d415", "rate_hz = 0.01", &[("engine_missing", Warning)], "fill stands in"),
+        ("d415", "engine = \"onnxruntime\"\nrate_hz = 0.01", &[engine], "/none/such.so"),
+        ("d415", "engine = \"onnxruntime\"\nrate_hz = 0.01\nmodel = \"lab\"", &[engine], "stays silent"),
+        ("d415", "engine = \"candle\"\nrate_hz = 0.01", &[], ""),
+        ("d415", "engine = \"candle\"\nrate_hz = 1", &[("refine_too_fast", Warning)], "threads of this CPU"),
+        ("d415", "engine = \"candle\"\nrate_hz = 1\ninput_size = 56\nmodel = \"lab\"", &[], ""),
+        ("d435", "engine = \"candle\"", &[("model_missing", Error)], "depthrig cdm fetch cdm-d435"),
+        ("generic", "engine = \"candle\"", &[("model_missing", Error)], "no camera depth model is known"),
+        (
+            "generic",
+            "engine = \"candle\"\nmodel = \"/none/x.pth\"",
+            &[("model_missing", Error)],
+            "/none/x.pth",
+        ),
+        ("generic", &net, &[], ""),
+    ];
+    for (model, refine, expected, part) in cases {
+        let text = format!(
+            "{FILES}model = \"{model}\"\n[camera.refine]\n{refine}\n[cdm]\nthreads = 1\nmodels = \"{}\"\n\
+             library = \"/none/such.so\"\n",
+            models.display()
+        );
+        let report = host_report(&text, |_| {});
+        assert_eq!(ids(&report), expected, "{model} {refine}: {:#?}", report.findings);
+        let said = all_text(&report.findings);
+        assert!(said.contains(part), "{part} in {said}");
+        for f in &report.findings {
+            assert!(!f.what.is_empty() && !f.why.is_empty() && !f.cure.is_empty(), "{f:?}");
+            let of = if f.id == "refine_too_fast" { None } else { Some("front") };
+            assert_eq!(f.camera.as_deref(), of, "{f:?}");
+        }
+    }
+}
