@@ -31,11 +31,11 @@ pub enum ErrorKind {
 macro_rules! error_type {
     ($(#[$doc:meta])*) => {
         $(#[$doc])*
-        #[derive(Debug)]
+        #[derive(Debug, Clone)]
         pub struct Error {
             kind: ErrorKind,
             message: String,
-            source: Option<Box<dyn std::error::Error + Send + Sync>>,
+            source: Option<std::sync::Arc<dyn std::error::Error + Send + Sync>>,
         }
 
         /// The result of a call of this crate.
@@ -49,7 +49,7 @@ macro_rules! error_type {
 
             /// The same error with the error that caused it.
             pub fn with_source(mut self, source: impl std::error::Error + Send + Sync + 'static) -> Self {
-                self.source = Some(Box::new(source));
+                self.source = Some(std::sync::Arc::new(source));
                 self
             }
 
