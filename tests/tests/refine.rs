@@ -240,6 +240,9 @@ fn the_newest_pair_wins_and_the_others_are_counted() {
     assert_eq!(stream.dropped.get("queue_full"), Some(&busy));
     // What is published is of the newest pair: no older than one refining and what a frame takes.
     assert!(stream.latency_p50_ms < 300.0, "{}", stream.latency_p50_ms);
+    // Pairs come every 33 ms: the newest has waited for less than that, the oldest for nearly all of the 150 ms.
+    let wait = state.steps_p50_ms["wait"];
+    assert!(wait < 75.0, "{wait} ms: that is not the newest");
     let summary = rig.stop();
     assert_balanced(&summary.status);
     assert_captured_everything(&summary.status);
