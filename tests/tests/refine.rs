@@ -588,3 +588,44 @@ fn refined_depth_is_recorded_with_the_depth_that_it_is_made_of() {
     assert!(sets >= 17 && whole >= sets - 2, "{whole} of {sets} sets have refined depth");
     assert!(own * 10 >= whole * 8, "{own} of {whole} are of the set's own depth frame");
 }
+
+#[test]
+fn a_recording_goes_on_at_once_when_the_engine_does_not() {
+    let home = Home::default();
+    let script = Arc::new(Script::default());
+    let text = RigText::default().camera("cam", "[camera.refine]\nrecord = true");
+    let rig = start(&home, &text, &script);
+    wait_until(&rig, "running", |s| refined(s, "cam").1.delivered > 3);
+    script.closed.store(usize::MAX, Ordering::SeqCst);
+    script.failing.store(1, Ordering::SeqCst);
+    wait_until(&rig, "failed", |s| refined(s, "cam").0.state == RefineState::Failed);
+    let control = rig.control();
+    let request = depthrig_daemon::control::RecordRequest {
+        directory: Some(home.path("")),
+        name: Some("bare".into()),
+        force: true,
+        ..<_>::default()
+    };
+    let before = control.status().sets.sent;
+    control.record_start(&request).unwrap();
+    // How many sets are on their way to the recorder when they are fewest, once as many wait as ever do.
+    let mut waiting = u64::MAX;
+    wait_until(&rig, "some sets", |s| {
+        let written = s.recording.as_ref().map_or(0, |r| r.sets);
+        if s.sets.sent - before > 6 {
+            waiting = waiting.min((s.sets.sent - before).saturating_sub(written));
+        }
+        written >= 12
+    });
+    assert!(waiting <= 1, "{waiting} sets waited for depth that does not come");
+    control.record_stop().unwrap();
+    let summary = rig.stop();
+    assert_captured_everything(&summary.status);
+    let opened = depthrig_recorder::Dataset::open(&home.path("bare")).unwrap();
+    let streams = &opened.session().streams;
+    let made = streams.iter().position(|s| s.id.to_string() == "cam/depth_refined").unwrap();
+    for set in opened.sets(depthrig_recorder::SetRange::ALL) {
+        let set = set.unwrap();
+        assert!(set.frames.len() == 2 && set.frames.iter().all(|f| f.stream != made));
+    }
+}
