@@ -122,8 +122,9 @@ impl Network for OnnxNetwork {
 
     fn best_batch(&self) -> usize {
         match self.device {
-            // Measured: the CPU is as busy with one picture as with several.
+            // One picture keeps a CPU busy; waiting for others would make each later.
             Device::Cpu | Device::OpenVino(_) => 1,
+            // Not measured: there was no GPU.
             Device::Cuda(_) | Device::TensorRt(_) => 4,
         }
     }
