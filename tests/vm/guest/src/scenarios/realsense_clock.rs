@@ -5,6 +5,7 @@ use crate::checks::Checks;
 use crate::subject::{plug, small};
 use crate::tally::{Frame, Tally};
 use crate::{Scenario, system};
+use core::fmt::Write as _;
 use core::time::Duration;
 use depthrig_bus::{FrameFlags, HostTime, MetadataLevel};
 use depthrig_drivers::realsense::RealsenseBackend;
@@ -101,19 +102,26 @@ fn shown_us(camera: &Camera, stream: &mut dyn Stream) -> anyhow::Result<i64> {
 fn judge(checks: &mut Checks, camera: &Camera, when: &str, frames: &[Frame]) {
     let claimed = |f: &&Frame| f.latency_known && !f.meta.flags.has(FrameFlags::TIME_UNCERTAIN);
     let (mut judged, mut wrong, mut worst_us, mut claim_us) = (0, 0, 0.0_f64, 0.0_f64);
+    let mut which = String::new();
+    let began = frames.first().map(|f| f.meta.arrival);
     for f in frames.iter().filter(claimed) {
         let name = if f.stream == 0 { "depth" } else { "color" };
         let Some(truth) = f.index.and_then(|i| camera.true_capture(name, i).ok()) else { continue };
         let off_ns = f.meta.capture_time.since_ns(truth);
         judged += 1;
-        wrong += u32::from(off_ns.unsigned_abs() > f.meta.capture_uncertainty_ns);
+        if off_ns.unsigned_abs() > f.meta.capture_uncertainty_ns {
+            wrong += 1;
+            let at_ms = began.map_or(0, |b| f.meta.arrival.since_ns(b) / 1_000_000);
+            let (off_us, claim_us) = (off_ns / 1000, f.meta.capture_uncertainty_ns / 1000);
+            let _ = write!(which, "; {name} at {at_ms} ms, epoch {}: {off_us} of {claim_us} µs", f.meta.clock_epoch);
+        }
         worst_us = worst_us.max(off_ns.unsigned_abs() as f64 / 1e3);
         claim_us = claim_us.max(f.meta.capture_uncertainty_ns as f64 / 1e3);
     }
     checks.that(
         &format!("{when} capture times are right within what they claim"),
         judged > 60 && wrong == 0,
-        format!("{wrong} of {judged} are not; off by {worst_us:.0} µs at most, the largest claim is {claim_us:.0} µs"),
+        format!("{wrong} of {judged} are not; off by {worst_us:.0} µs at most, the largest claim is {claim_us:.0} µs{which}"),
     );
     let full = |f: &Frame| MetadataLevel::of(f.meta.clock_domain, f.meta.flags) == MetadataLevel::Full;
     checks.that(&format!("{when} every frame has its metadata"), frames.iter().all(full), "");
