@@ -30,11 +30,13 @@ pub enum PixelFormat {
     Mjpeg = 10,
     /// One byte of confidence, higher is surer.
     Confidence8 = 11,
+    /// 32-bit float disparity of the left picture of a rectified pair, pixels; NaN is "no match".
+    DisparityF32 = 12,
 }
 
 impl PixelFormat {
     /// Every format, in wire order.
-    pub const ALL: [Self; 11] = [
+    pub const ALL: [Self; 12] = [
         Self::Rgb8,
         Self::Bgr8,
         Self::Mono8,
@@ -46,6 +48,7 @@ impl PixelFormat {
         Self::Nv12,
         Self::Mjpeg,
         Self::Confidence8,
+        Self::DisparityF32,
     ];
 
     /// The format of a wire code, if this version knows it.
@@ -67,6 +70,7 @@ impl PixelFormat {
             Self::Nv12 => "nv12",
             Self::Mjpeg => "mjpeg",
             Self::Confidence8 => "confidence8",
+            Self::DisparityF32 => "disparity_f32",
         }
     }
 
@@ -76,7 +80,7 @@ impl PixelFormat {
             Self::Rgb8 | Self::Bgr8 => width * 3,
             Self::Mono8 | Self::Nv12 | Self::Confidence8 => width,
             Self::Mono16 | Self::Z16 | Self::Yuyv | Self::Uyvy => width * 2,
-            Self::DepthF32 => width * 4,
+            Self::DepthF32 | Self::DisparityF32 => width * 4,
             Self::Mjpeg => 0,
         }
     }
@@ -90,7 +94,7 @@ impl PixelFormat {
         }
     }
 
-    /// Whether the pixels are depth.
+    /// Whether the pixels are depth, in metres or units of metres. Disparity is not.
     pub const fn is_depth(self) -> bool {
         matches!(self, Self::Z16 | Self::DepthF32)
     }

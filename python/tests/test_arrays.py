@@ -40,6 +40,7 @@ def frame(h: Header, data: np.ndarray) -> Frame:
         (PixelFormat.UYVY, 10, (4, 5, 2), np.uint8),
         (PixelFormat.NV12, 5, (6, 5), np.uint8),
         (PixelFormat.CONFIDENCE8, 5, (4, 5), np.uint8),
+        (PixelFormat.DISPARITY_F32, 20, (4, 5), np.float32),
     ],
 )
 @pytest.mark.parametrize("pad", [0, 3, 8])

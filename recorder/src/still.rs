@@ -118,7 +118,7 @@ fn npy(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Vec<u8> {
     let (height, width) = (h.height as usize, h.width as usize);
     let kind = match format {
         PixelFormat::Mono16 | PixelFormat::Z16 => "<u2",
-        PixelFormat::DepthF32 => "<f4",
+        PixelFormat::DepthF32 | PixelFormat::DisparityF32 => "<f4",
         _ => "|u1",
     };
     match format {

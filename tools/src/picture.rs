@@ -70,6 +70,7 @@ pub fn to_rgb(header: &FrameHeader, pixels: &[u8]) -> Result<RgbImage> {
             rows(header, pixels)?.flatten().flat_map(|v| [*v; 3]).collect()
         }
         Some(PixelFormat::Mono16) => stretched(rows(header, pixels)?),
+        Some(PixelFormat::DisparityF32) => disparity_colors(rows(header, pixels)?),
         Some(other) => bail!("{} frames cannot be shown yet", other.name()),
         None => bail!("the frame's pixel format is unknown to this version"),
     };
@@ -82,6 +83,14 @@ fn stretched<'a>(rows: impl Iterator<Item = &'a [u8]>) -> Vec<u8> {
         rows.flat_map(|r| r.chunks_exact(2).map(|b| u32::from(u16::from_le_bytes([b[0], b[1]])))).collect();
     let most = values.iter().copied().max().unwrap_or(0).max(1);
     values.iter().flat_map(|v| [(v * 255 / most) as u8; 3]).collect()
+}
+
+/// Disparity in the colours of depth: the greatest is the nearest, no match is black.
+fn disparity_colors<'a>(rows: impl Iterator<Item = &'a [u8]>) -> Vec<u8> {
+    let inverse = |b: &[u8; 4]| f32::from_le_bytes(*b).recip();
+    let depths: Vec<f32> = rows.flat_map(|r| r.as_chunks().0.iter().map(inverse)).collect();
+    let (near, far) = depth_range(&depths);
+    depths.iter().flat_map(|z| depth_color(*z, near, far)).collect()
 }
 
 fn image_of(header: &FrameHeader, data: Vec<u8>) -> Result<RgbImage> {
@@ -159,6 +168,16 @@ mod tests {
         assert_eq!(image.as_raw(), &[3, 2, 1, 6, 5, 4]);
         let e = to_rgb(&h, &[0; 7]).unwrap_err().to_string();
         assert!(e.contains("1x2 bgr8 frame"), "{e}");
+    }
+
+    #[test]
+    fn the_greatest_disparity_is_the_nearest() {
+        let values = [f32::NAN, 20.0, 10.0, 5.0];
+        let pixels: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+        let image = to_rgb(&header(PixelFormat::DisparityF32, 4, 1), &pixels).unwrap();
+        assert_eq!(image.get_pixel(0, 0).0, [0; 3]);
+        assert_eq!(image.get_pixel(1, 0).0, crate::turbo::turbo(1.0));
+        assert_eq!(image.get_pixel(3, 0).0, crate::turbo::turbo(0.0));
     }
 
     #[test]

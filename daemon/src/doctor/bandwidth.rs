@@ -55,7 +55,7 @@ pub fn wire_bits_per_s(p: &StreamProfile) -> f64 {
         PixelFormat::Mono8 | PixelFormat::Confidence8 => 8.0,
         PixelFormat::Nv12 => 12.0,
         PixelFormat::Mjpeg => MJPEG_BITS,
-        PixelFormat::DepthF32 => 32.0,
+        PixelFormat::DepthF32 | PixelFormat::DisparityF32 => 32.0,
         _ => 16.0,
     };
     f64::from(p.width) * f64::from(p.height) * bits * p.rate_hz

@@ -35,6 +35,7 @@ _ELEMENTS = {
     PixelFormat.UYVY: ("|u1", 1, 2),
     PixelFormat.NV12: ("|u1", 1, 1),
     PixelFormat.CONFIDENCE8: ("|u1", 1, 1),
+    PixelFormat.DISPARITY_F32: ("<f4", 4, 1),
 }
 _FORMATS = frozenset(int(f) for f in PixelFormat)
 
@@ -146,9 +147,9 @@ class Frame:
     def array(self) -> npt.NDArray[Any]:
         """The pixels as a read-only array without a copy.
 
-        Shapes: `(H, W, 3)` u8 for rgb8 and bgr8; `(H, W)` u16 for z16 and mono16; `(H, W)` f32 for depth_f32;
-        `(H, W)` u8 for mono8 and confidence8; `(H, W, 2)` u8 for yuyv and uyvy; `(H * 3 // 2, W)` u8 for nv12;
-        `(bytes,)` u8 for mjpeg.
+        Shapes: `(H, W, 3)` u8 for rgb8 and bgr8; `(H, W)` u16 for z16 and mono16; `(H, W)` f32 for depth_f32 and
+        disparity_f32; `(H, W)` u8 for mono8 and confidence8; `(H, W, 2)` u8 for yuyv and uyvy; `(H * 3 // 2, W)` u8
+        for nv12; `(bytes,)` u8 for mjpeg.
         """
         return self._array(read_only=True)
 

@@ -38,6 +38,7 @@ class PixelFormat(enum.IntEnum):
     NV12 = 9
     MJPEG = 10
     CONFIDENCE8 = 11
+    DISPARITY_F32 = 12
 
 
 class DropReason(enum.IntEnum):

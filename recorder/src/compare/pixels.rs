@@ -108,7 +108,9 @@ impl PixelDifference {
             PixelFormat::Z16 | PixelFormat::Mono16 => {
                 Sums::of(a, b, |v: [u8; 2]| u16::from_le_bytes(v).into())
             }
-            PixelFormat::DepthF32 => Sums::of(a, b, |v: [u8; 4]| f32::from_le_bytes(v).into()),
+            PixelFormat::DepthF32 | PixelFormat::DisparityF32 => {
+                Sums::of(a, b, |v: [u8; 4]| f32::from_le_bytes(v).into())
+            }
             _ => Sums { eight_bit: true, ..Sums::of(a, b, |v: [u8; 1]| v[0].into()) },
         };
         let t = &mut self.sums;

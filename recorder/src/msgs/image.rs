@@ -13,7 +13,7 @@ pub(crate) const fn encoding(format: PixelFormat) -> Option<&'static str> {
         PixelFormat::Mono8 | PixelFormat::Confidence8 => "mono8",
         PixelFormat::Mono16 => "mono16",
         PixelFormat::Z16 => "16UC1",
-        PixelFormat::DepthF32 => "32FC1",
+        PixelFormat::DepthF32 | PixelFormat::DisparityF32 => "32FC1",
         PixelFormat::Yuyv => "yuv422_yuy2",
         PixelFormat::Uyvy => "yuv422",
         PixelFormat::Nv12 => "nv12",

@@ -119,6 +119,7 @@ impl<'a> Picture<'a> {
             PixelFormat::Rgb8 => [byte(3 * i), byte(3 * i + 1), byte(3 * i + 2)],
             PixelFormat::Bgr8 => [byte(3 * i + 2), byte(3 * i + 1), byte(3 * i)],
             PixelFormat::Mono16 => [(byte(2 * i) + 256.0 * byte(2 * i + 1)) * 255.0 / brightest; 3],
+            PixelFormat::DisparityF32 => [(disparity(row, i) * 255.0 / brightest).clamp(0.0, 255.0); 3],
             PixelFormat::Yuyv => rgb_of(byte(2 * i), byte(4 * (i / 2) + 1), byte(4 * (i / 2) + 3)),
             PixelFormat::Uyvy => rgb_of(byte(2 * i + 1), byte(4 * (i / 2)), byte(4 * (i / 2) + 2)),
             PixelFormat::Nv12 => {
@@ -148,7 +149,10 @@ impl<'a> Picture<'a> {
             };
             return Small { width, height, content: Content::Depth((0..width * height).map(at).collect()) };
         }
-        let brightest = if self.format == PixelFormat::Mono16 { self.brightest() } else { 255.0 };
+        let brightest = match self.format {
+            PixelFormat::Mono16 | PixelFormat::DisparityF32 => self.brightest(),
+            _ => 255.0,
+        };
         let mut data = Vec::with_capacity(3 * (width * height) as usize);
         for i in 0..width * height {
             let mut sum = [0.0; 3];
@@ -166,13 +170,23 @@ impl<'a> Picture<'a> {
         Small { width, height, content: Content::Color(data) }
     }
 
-    /// The greatest of some of the 16-bit pixels, at least 1.
+    /// The greatest of some of the pixels of 16-bit grey or disparity, at least 1.
     fn brightest(&self) -> f32 {
-        let rows = (0..self.height).step_by(4).map(|y| self.row(y));
+        let mut rows = (0..self.height).step_by(4).map(|y| self.row(y));
+        if self.format == PixelFormat::DisparityF32 {
+            let xs = || (0..self.width as usize).step_by(4);
+            return rows.flat_map(|r| xs().map(|x| disparity(r, x))).fold(1.0, f32::max);
+        }
         let values =
             rows.flat_map(|r| r.as_chunks::<2>().0.iter().step_by(4).map(|p| u16::from_le_bytes(*p)));
         f32::from(values.max().unwrap_or(1).max(1))
     }
+}
+
+/// The disparity of a pixel of a row, 0 where there is none.
+fn disparity(row: &[u8], x: usize) -> f32 {
+    let value = row.as_chunks().0.get(x).map_or(f32::NAN, |b| f32::from_le_bytes(*b));
+    if value.is_finite() { value } else { 0.0 }
 }
 
 /// ITU-R BT.601, full range, as webcams send it.
@@ -278,6 +292,16 @@ mod tests {
         assert_eq!(Picture::new(&header(PixelFormat::Mono8, 1, 1), vec![3]).unwrap().fill(), None);
     }
 
+    /// The greatest disparity is white and no match is black.
+    #[test]
+    fn disparity_is_shown_as_grey() {
+        let row: Vec<f32> = (0..8).map(|i| if i < 4 { 32.0 } else { f32::NAN }).collect();
+        let pixels: Vec<u8> = row.repeat(8).iter().flat_map(|f| f.to_le_bytes()).collect();
+        let small = Picture::new(&header(PixelFormat::DisparityF32, 8, 8), pixels).unwrap().small();
+        let Content::Color(rgb) = &small.content else { panic!("disparity is no depth") };
+        assert_eq!((rgb[0], rgb[3 * 7]), (255, 0));
+    }
+
     /// Every format gives a small picture of the right colour, and damaged headers an error.
     #[test]
     fn every_format_is_shown() {
@@ -287,7 +311,12 @@ mod tests {
             let small = Picture::new(&h, &pixels[..]).unwrap().small();
             assert_eq!(small.size(), (240, 135), "{}", format.name());
             if let Content::Color(rgb) = &small.content {
-                let grey = if format == PixelFormat::Mono16 { 255 } else { 128 };
+                let grey = match format {
+                    PixelFormat::Mono16 => 255,
+                    // The bytes are those of a small negative number.
+                    PixelFormat::DisparityF32 => 0,
+                    _ => 128,
+                };
                 assert!(rgb.iter().all(|v| v.abs_diff(grey) <= 1), "{}: {:?}", format.name(), &rgb[..3]);
             }
             assert!(small.data_uri(Some((0.1, 50.0))).unwrap().starts_with("data:image/jpeg;base64,/9j/"));

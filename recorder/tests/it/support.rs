@@ -69,6 +69,8 @@ pub fn pixels(format: PixelFormat, width: u32, height: u32, n: u64) -> Vec<u8> {
                     out.extend((if (x + y) % 17 == 0 { 0 } else { 400 + 3 * v }).to_le_bytes());
                 }
                 PixelFormat::DepthF32 => out.extend((f32::from(v) / 100.0).to_le_bytes()),
+                PixelFormat::DisparityF32 if (x + y) % 11 == 0 => out.extend(f32::NAN.to_le_bytes()),
+                PixelFormat::DisparityF32 => out.extend((f32::from(v) / 16.0).to_le_bytes()),
                 PixelFormat::Mono16 => out.extend((v * 7).to_le_bytes()),
                 _ => out.push(v as u8),
             }

@@ -86,6 +86,7 @@ impl ByteCameraExport {
                 PixelFormat::DepthF32 => "raw_depth",
                 PixelFormat::Mono8 | PixelFormat::Mono16 => "ir",
                 PixelFormat::Confidence8 => "confidence",
+                PixelFormat::DisparityF32 => "disparity",
                 _ => "color",
             };
             // A second stream of the same kind keeps its own name.

@@ -95,7 +95,7 @@ fn npy_picture(bytes: &[u8], want: Want) -> Result<Picture, String> {
         (Want::Exactly(format, w, h), ..) => {
             let fits = match format {
                 PixelFormat::Z16 | PixelFormat::Mono16 => kind == "<u2",
-                PixelFormat::DepthF32 => kind == "<f4",
+                PixelFormat::DepthF32 | PixelFormat::DisparityF32 => kind == "<f4",
                 _ => kind == "|u1",
             };
             if !fits {

@@ -30,6 +30,7 @@ fn everything() -> Session {
         stream("stereo/depth", PixelFormat::DepthF32, 16, 12),
         stream("stereo/color", PixelFormat::Yuyv, 16, 12),
         stream("stereo/confidence", PixelFormat::Confidence8, 16, 12),
+        stream("stereo/disparity", PixelFormat::DisparityF32, 16, 12),
         stream("tof/ir", PixelFormat::Mono16, 16, 12),
     ];
     for s in &mut s.streams {
