@@ -113,7 +113,11 @@ fn judge(checks: &mut Checks, camera: &Camera, when: &str, frames: &[Frame]) {
             wrong += 1;
             let at_ms = began.map_or(0, |b| f.meta.arrival.since_ns(b) / 1_000_000);
             let (off_us, claim_us) = (off_ns / 1000, f.meta.capture_uncertainty_ns / 1000);
-            let _ = write!(which, "; {name} at {at_ms} ms, epoch {}: {off_us} of {claim_us} µs", f.meta.clock_epoch);
+            let _ = write!(
+                which,
+                "; {name} at {at_ms} ms, epoch {}: {off_us} of {claim_us} µs",
+                f.meta.clock_epoch
+            );
         }
         worst_us = worst_us.max(off_ns.unsigned_abs() as f64 / 1e3);
         claim_us = claim_us.max(f.meta.capture_uncertainty_ns as f64 / 1e3);
