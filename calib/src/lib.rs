@@ -1,7 +1,8 @@
 //! Camera geometry: lens models, poses, and pictures of one camera in the view of another.
 //!
 //! Floor 2. Mathematics on the types that travel in a frame header; no I/O. Start at [`Camera`] (from a point to a
-//! pixel and back) and [`Registration`] (depth in the view of colour). [`Deprojection`] makes point clouds, [`Undistortion`] other pictures of the same view.
+//! pixel and back) and [`Registration`] (depth in the view of colour). [`Deprojection`] makes point clouds, [`Undistortion`] other pictures of the same
+//! view; [`stereo`] finds depth in a pair of pictures.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 mod camera;
@@ -10,6 +11,7 @@ mod error;
 mod pose;
 mod registration;
 mod simd;
+pub mod stereo;
 mod undistort;
 
 pub use camera::{Camera, CameraExt, Projection, Ray};

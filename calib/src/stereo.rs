@@ -1,0 +1,160 @@
+//! Stereo: from a rectified pair of pictures to the disparity of the left one, and from disparity to depth.
+//!
+//! Both pictures are grey, of one size, and rectified: what is seen at `(x, y)` in the left one is seen at `(x - d, y)`
+//! in the right one, with a disparity `d >= 0` in pixels. [`SgmMatcher`] finds `d` by semi-global matching over a census
+//! (Hirschmueller 2008, with the census of Zabih and Woodfill 1994); [`Matcher`] is what it has in common with a network.
+//! What the presets are, what they cost and where they fail: docs/stereo.md.
+//!
+//! # Example
+//! ```
+//! use depthrig_calib::stereo::{DisparityMap, Gray, Matcher, Parameters, Preset, SgmMatcher, StereoPair};
+//!
+//! // A wall of noise, 5 pixels away in disparity.
+//! let noise = |x: usize, y: usize| ((x * 7919 + y * 104_729) * 2_654_435_761 >> 7) as u8;
+//! let picture = |shift: usize| (0..96 * 32).map(|i| noise(i % 96 + shift, i / 96)).collect::<Vec<u8>>();
+//! let (left, right) = (picture(0), picture(5));
+//! let pair = StereoPair::new(Gray::packed(&left, 96, 32), Gray::packed(&right, 96, 32));
+//! let mut matcher = SgmMatcher::new(96, 32, &Parameters::preset(Preset::Quality, 32), 1)?;
+//! let mut map = DisparityMap::default();
+//! matcher.run(&pair, &mut map)?;
+//! assert!((map.disparity[16 * 96 + 48] - 5.0).abs() < 0.1);
+//! # Ok::<(), depthrig_calib::Error>(())
+//! ```
+
+use crate::{Error, ErrorKind, Result};
+
+mod depth;
+mod parameters;
+mod sgm;
+
+pub use depth::{depth_from_disparity, metres_from_disparity};
+pub use parameters::{Parameters, Preset};
+pub use sgm::SgmMatcher;
+
+/// A grey picture, one byte a pixel.
+#[derive(Debug, Clone, Copy)]
+pub struct Gray<'a> {
+    /// Rows from the top, each `stride` bytes from the one before; the last may end after `width`.
+    pub pixels: &'a [u8],
+    /// Pixels per row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Bytes from a row to the next, at least `width`.
+    pub stride: usize,
+}
+
+impl<'a> Gray<'a> {
+    /// A picture whose rows lie without padding.
+    pub const fn packed(pixels: &'a [u8], width: usize, height: usize) -> Self {
+        Self { pixels, width, height, stride: width }
+    }
+
+    /// Row `y`, `width` bytes. Only of a picture that [`Gray::check`] found whole.
+    pub(crate) fn row(&self, y: usize) -> &'a [u8] {
+        &self.pixels[y * self.stride..][..self.width]
+    }
+
+    /// Refuses a picture of another size than `width` x `height`, or one whose bytes do not reach.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SizeMismatch`], and it says which of them.
+    pub(crate) fn check(&self, what: &str, width: usize, height: usize) -> Result<()> {
+        if (self.width, self.height) != (width, height) {
+            return Err(Error::new(
+                ErrorKind::SizeMismatch,
+                format!(
+                    "the {what} picture is {}x{} where {width}x{height} was agreed on; both eyes must give pictures of that size",
+                    self.width, self.height
+                ),
+            ));
+        }
+        let reach = self.stride.checked_mul(height.saturating_sub(1)).and_then(|n| n.checked_add(width));
+        if self.stride < width || reach.is_none_or(|n| self.pixels.len() < n) {
+            return Err(Error::new(
+                ErrorKind::SizeMismatch,
+                format!(
+                    "the {what} picture of {width}x{height} with rows {} bytes apart cannot have {} bytes",
+                    self.stride,
+                    self.pixels.len()
+                ),
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// What both eyes saw at one time, rectified.
+#[derive(Debug, Clone, Copy)]
+pub struct StereoPair<'a> {
+    /// The left eye's picture.
+    pub left: Gray<'a>,
+    /// The right eye's picture, of the same size.
+    pub right: Gray<'a>,
+    /// The left picture in colour where there is one, for networks: RGB, 3 bytes a pixel, rows without padding.
+    pub left_rgb: Option<&'a [u8]>,
+    /// The right picture in colour, likewise.
+    pub right_rgb: Option<&'a [u8]>,
+}
+
+impl<'a> StereoPair<'a> {
+    /// A pair without colour.
+    pub const fn new(left: Gray<'a>, right: Gray<'a>) -> Self {
+        Self { left, right, left_rgb: None, right_rgb: None }
+    }
+}
+
+/// Disparity and confidence in the left view. Kept by the caller and filled again for each pair, so that nothing is
+/// allocated after the first.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct DisparityMap {
+    /// Pixels per row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Disparity in pixels, `width * height`, rows without padding; NaN where none was found. Never negative.
+    pub disparity: Vec<f32>,
+    /// How sure each is, `width * height`: 0 where there is none, else 1 (a guess) to 255.
+    pub confidence: Vec<u8>,
+}
+
+impl DisparityMap {
+    /// Gives it the size of a pair; allocates when it has grown.
+    pub fn resize(&mut self, width: usize, height: usize) {
+        (self.width, self.height) = (width, height);
+        self.disparity.resize(width * height, f32::NAN);
+        self.confidence.resize(width * height, 0);
+    }
+
+    /// Share of pixels that have a disparity, 0 to 1.
+    pub fn fill(&self) -> f64 {
+        let valid = self.disparity.iter().filter(|d| !d.is_nan()).count();
+        valid as f64 / self.disparity.len().max(1) as f64
+    }
+}
+
+/// What a matcher is, for logs and for what a recording says about where its depth came from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Description {
+    /// What computes, with its version, such as `depthrig-sgm 0.1.0`.
+    pub producer: String,
+    /// Which form of it, such as `quality`.
+    pub name: String,
+    /// Every number that the result depends on, as `key=value` words.
+    pub parameters: String,
+    /// Bytes that it keeps from its making on; it takes no more while it runs.
+    pub memory_bytes: u64,
+}
+
+/// Finds the disparity of the left picture of rectified pairs of one size.
+pub trait Matcher: Send {
+    /// What it is.
+    fn describe(&self) -> Description;
+
+    /// Fills `out` (which it resizes) from a pair of the agreed size.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SizeMismatch`] for pictures of another size or with too few bytes; what else can fail is the
+    /// matcher's own.
+    fn run(&mut self, pair: &StereoPair<'_>, out: &mut DisparityMap) -> Result<()>;
+}

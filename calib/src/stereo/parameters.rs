@@ -1,0 +1,133 @@
+//! The numbers of the engine, and the presets that choose them.
+
+use crate::{Error, ErrorKind, Result};
+use core::fmt;
+use core::str::FromStr;
+
+/// A point of the curve between fast and good. Recordings that stand in for a vendor's mode of the same name call them
+/// `mimic_performance` and so on: they are nobody's closed algorithm.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Preset {
+    /// Matching at half the resolution.
+    Performance,
+    /// Matching at full resolution along eight paths.
+    Quality,
+    /// As quality, with what costs more than it gains for most.
+    Ultra,
+}
+
+impl Preset {
+    /// All of them, the fastest first.
+    pub const ALL: [Self; 3] = [Self::Performance, Self::Quality, Self::Ultra];
+
+    /// Its name: `performance`, `quality` or `ultra`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Performance => "performance",
+            Self::Quality => "quality",
+            Self::Ultra => "ultra",
+        }
+    }
+}
+
+impl fmt::Display for Preset {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+impl FromStr for Preset {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        Self::ALL.into_iter().find(|p| p.name() == text).ok_or_else(|| {
+            Error::new(
+                ErrorKind::BadInput,
+                format!("\"{text}\" is no preset of the stereo engine; write performance, quality or ultra"),
+            )
+        })
+    }
+}
+
+/// Largest number of disparities: a winner is kept in a byte.
+pub const MAX_DISPARITIES: usize = 256;
+
+/// All that a result depends on. Made by [`Parameters::preset`]; a caller may change any of them.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub struct Parameters {
+    /// The preset that they come from; what a recording calls them.
+    pub preset: Preset,
+    /// Disparities that are searched, in pixels of the full picture: 0 to this number less one. 1 to 256; nearer things
+    /// than `focal_px * baseline_m / max_disparity` get none.
+    pub max_disparity: usize,
+    /// Match at half the resolution.
+    pub half_resolution: bool,
+    /// Penalty of a step of one disparity between neighbours along a path, in census bits.
+    pub p1: u8,
+    /// Penalty of a larger step, in census bits; at most 63.
+    pub p2: u8,
+    /// By how many percent the best cost must be below the best that is not its neighbour.
+    pub uniqueness_percent: u8,
+    /// Largest difference between the left and the right view's disparity, in pixels.
+    pub left_right_px: u8,
+    /// Regions of at most this many pixels that differ from what surrounds them are removed; 0 keeps all.
+    pub speckle_px: u32,
+    /// Step of disparity, in pixels, at which a region ends.
+    pub speckle_step_px: f32,
+    /// Median of 3x3 over what is valid.
+    pub median: bool,
+}
+
+impl Parameters {
+    /// The numbers of `preset` for `max_disparity` disparities.
+    pub const fn preset(preset: Preset, max_disparity: usize) -> Self {
+        Self {
+            preset,
+            max_disparity,
+            half_resolution: matches!(preset, Preset::Performance),
+            p1: 10,
+            p2: 60,
+            uniqueness_percent: 5,
+            left_right_px: 1,
+            speckle_px: 100,
+            speckle_step_px: 1.0,
+            median: true,
+        }
+    }
+
+    /// Every number as `key=value` words, for the metadata of what is made with them.
+    pub fn describe(&self) -> String {
+        let Self { preset, max_disparity, half_resolution, p1, p2, uniqueness_percent, .. } = self;
+        let Self { left_right_px, speckle_px, speckle_step_px, median, .. } = self;
+        format!(
+            "preset={preset} max_disparity={max_disparity} half_resolution={half_resolution} p1={p1} p2={p2} \
+             uniqueness_percent={uniqueness_percent} left_right_px={left_right_px} speckle_px={speckle_px} \
+             speckle_step_px={speckle_step_px} median={median}"
+        )
+    }
+
+    /// Refuses numbers that the engine cannot have.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`], and it says which.
+    pub(crate) fn check(&self) -> Result<()> {
+        let wrong = |text: String| Err(Error::new(ErrorKind::BadInput, text));
+        if self.max_disparity == 0 || self.max_disparity > MAX_DISPARITIES {
+            return wrong(format!(
+                "a search of {} disparities is not possible; choose 1 to {MAX_DISPARITIES}, and shrink the pictures when things are nearer",
+                self.max_disparity
+            ));
+        }
+        if self.p1 == 0 || self.p1 > self.p2 || self.p2 > 63 {
+            return wrong(format!(
+                "penalties of {} and {} do not go together: 0 < p1 <= p2 <= 63",
+                self.p1, self.p2
+            ));
+        }
+        if !(self.speckle_step_px >= 0.0 && self.speckle_step_px.is_finite()) {
+            return wrong(format!("a speckle step of {} pixels is none", self.speckle_step_px));
+        }
+        Ok(())
+    }
+}
