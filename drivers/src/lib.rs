@@ -16,6 +16,7 @@ pub mod files;
 #[doc(hidden)]
 pub mod fuzzing;
 mod gate;
+pub mod kinect;
 pub mod libusb;
 pub mod realsense;
 mod sink;
