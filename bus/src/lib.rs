@@ -9,6 +9,7 @@ mod channel;
 pub mod clock;
 mod drops;
 mod error;
+pub mod external;
 mod format;
 mod geometry;
 mod header;

@@ -98,13 +98,7 @@ impl RuntimeDir {
 
     /// Who runs `rig` now, as that process described itself.
     pub fn holder(&self, rig: &RigName) -> Option<String> {
-        let mut file = std::fs::File::open(self.lock_path(rig)).ok()?;
-        if flock(&file, FlockOperation::NonBlockingLockShared).is_ok() {
-            return None;
-        }
-        let mut text = String::new();
-        file.read_to_string(&mut text).ok()?;
-        Some(text)
+        holder_of(&self.lock_path(rig))
     }
 
     /// Takes the lock of `rig` until the returned value is dropped; the process's end frees it, however it
@@ -113,21 +107,7 @@ impl RuntimeDir {
     /// # Errors
     /// [`ErrorKind::InUse`] naming the holder, [`ErrorKind::PermissionDenied`] when the file cannot be opened.
     pub fn lock(&self, rig: &RigName, who: &str) -> Result<RigLock> {
-        let path = self.lock_path(rig);
-        let flags = OFlags::RDWR | OFlags::CREATE | OFlags::CLOEXEC;
-        let fd = rustix::fs::open(&path, flags, Mode::RUSR | Mode::WUSR).map_err(|e| {
-            Error::new(ErrorKind::PermissionDenied, format!("{}: cannot be opened", path.display()))
-                .with_source(e)
-        })?;
-        let mut file = std::fs::File::from(fd);
-        // Who looks whether the rig runs holds the lock for an instant, so one refusal proves nothing.
-        let taken = (0..LOCK_ATTEMPTS).any(|attempt| {
-            if attempt > 0 {
-                std::thread::sleep(LOCK_PAUSE);
-            }
-            flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok()
-        });
-        if !taken {
+        let Some(file) = take(&self.lock_path(rig), who)? else {
             let holder = self.holder(rig).unwrap_or_else(|| "another process".to_owned());
             return Err(Error::new(
                 ErrorKind::InUse,
@@ -135,12 +115,7 @@ impl RuntimeDir {
                     "rig \"{rig}\" is running already, held by {holder}; stop it first, or give this rig another name"
                 ),
             ));
-        }
-        let written =
-            file.set_len(0).and_then(|()| file.rewind()).and_then(|()| file.write_all(who.as_bytes()));
-        written.map_err(|e| {
-            Error::new(ErrorKind::Other, format!("{}: cannot be written", path.display())).with_source(e)
-        })?;
+        };
         Ok(RigLock { _file: file })
     }
 
@@ -153,6 +128,42 @@ impl RuntimeDir {
 #[derive(Debug)]
 pub struct RigLock {
     _file: std::fs::File,
+}
+
+/// Who holds the lock `path`, as that process described itself; `None` when nobody does.
+pub(crate) fn holder_of(path: &Path) -> Option<String> {
+    let mut file = std::fs::File::open(path).ok()?;
+    if flock(&file, FlockOperation::NonBlockingLockShared).is_ok() {
+        return None;
+    }
+    let mut text = String::new();
+    file.read_to_string(&mut text).ok()?;
+    Some(text)
+}
+
+/// Takes the lock `path` and writes `who` into it; `None` when somebody else holds it.
+pub(crate) fn take(path: &Path, who: &str) -> Result<Option<std::fs::File>> {
+    let flags = OFlags::RDWR | OFlags::CREATE | OFlags::CLOEXEC;
+    let fd = rustix::fs::open(path, flags, Mode::RUSR | Mode::WUSR).map_err(|e| {
+        Error::new(ErrorKind::PermissionDenied, format!("{}: cannot be opened", path.display()))
+            .with_source(e)
+    })?;
+    let mut file = std::fs::File::from(fd);
+    // Who looks whether it is held holds it for an instant, so one refusal proves nothing.
+    let taken = (0..LOCK_ATTEMPTS).any(|attempt| {
+        if attempt > 0 {
+            std::thread::sleep(LOCK_PAUSE);
+        }
+        flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok()
+    });
+    if !taken {
+        return Ok(None);
+    }
+    let written = file.set_len(0).and_then(|()| file.rewind()).and_then(|()| file.write_all(who.as_bytes()));
+    written.map_err(|e| {
+        Error::new(ErrorKind::Other, format!("{}: cannot be written", path.display())).with_source(e)
+    })?;
+    Ok(Some(file))
 }
 
 #[cfg(test)]

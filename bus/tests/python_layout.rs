@@ -4,6 +4,11 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::format_push_string, unsafe_code)]
 
 use core::mem::offset_of;
+use depthrig_bus::external::{
+    self, ANSWER_FIELDS, ExternalAnswer, ExternalClock, ExternalFrame, ExternalFrameFlags, ExternalMode,
+    ExternalModeFlags, ExternalOffer, ExternalReason, ExternalState, ExternalWant, FRAME_FIELDS, MODE_FIELDS,
+    OFFER_FIELDS,
+};
 use depthrig_bus::{
     ClockDomain, Distortion, DropReason, FIELDS, Field, FrameFlags, FrameHeader, HEADER_SIZE, HEADER_VERSION,
     IOX_FOLDER, PixelFormat, RECORD_BYTES, SCHEMA, SHM_PREFIX, SetHeader, StageStep,
@@ -62,6 +67,10 @@ fn mirror() -> String {
     enums(&mut out);
     table(&mut out, "FIELDS", FIELDS);
     table(&mut out, "SET_FIELDS", &sets);
+    table(&mut out, "EXTERNAL_OFFER_FIELDS", OFFER_FIELDS);
+    table(&mut out, "EXTERNAL_MODE_FIELDS", MODE_FIELDS);
+    table(&mut out, "EXTERNAL_ANSWER_FIELDS", ANSWER_FIELDS);
+    table(&mut out, "EXTERNAL_FRAME_FIELDS", FRAME_FIELDS);
     nested(&mut out, "intrinsics", "IntrinsicsFields", "Intrinsics", GEOMETRY_SOURCE);
     nested(&mut out, "pose", "PoseFields", "Pose", GEOMETRY_SOURCE);
     class(&mut out, "HeaderFields", "FrameHeader", HEADER_SOURCE, FIELDS);
@@ -103,6 +112,57 @@ fn constants(out: &mut String) {
     ] {
         out.push_str(&format!("{name} = {value}\n"));
     }
+    out.push_str("\n# Cameras that another process serves: docs/external.md\n");
+    for (name, value) in external_constants() {
+        out.push_str(&format!("EXTERNAL_{name} = {value}\n"));
+    }
+}
+
+fn external_constants() -> Vec<(&'static str, String)> {
+    // SAFETY: as in `constants`.
+    let types = unsafe {
+        [
+            <ExternalOffer as ZeroCopySend>::type_name(),
+            <ExternalMode as ZeroCopySend>::type_name(),
+            <ExternalAnswer as ZeroCopySend>::type_name(),
+            <ExternalFrame as ZeroCopySend>::type_name(),
+        ]
+    };
+    let magic = |bytes: [u8; 4]| format!("b{:?}", core::str::from_utf8(&bytes).unwrap());
+    vec![
+        ("VERSION", external::VERSION.to_string()),
+        ("SCHEMA", format!("{:?}", external::SCHEMA)),
+        ("PREFIX", format!("{:?}", external::PREFIX)),
+        ("LOCK_SUFFIX", format!("{:?}", external::LOCK_SUFFIX)),
+        ("OFFER_TYPE", format!("{:?}", types[0])),
+        ("OFFER_SIZE", size_of::<ExternalOffer>().to_string()),
+        ("OFFER_MAGIC", magic(external::OFFER_MAGIC)),
+        ("MODE_TYPE", format!("{:?}", types[1])),
+        ("MODE_SIZE", size_of::<ExternalMode>().to_string()),
+        ("ANSWER_TYPE", format!("{:?}", types[2])),
+        ("ANSWER_SIZE", size_of::<ExternalAnswer>().to_string()),
+        ("ANSWER_MAGIC", magic(external::ANSWER_MAGIC)),
+        ("FRAME_TYPE", format!("{:?}", types[3])),
+        ("FRAME_SIZE", size_of::<ExternalFrame>().to_string()),
+        ("FRAME_MAGIC", magic(external::FRAME_MAGIC)),
+        ("ALIGN", align_of::<ExternalOffer>().to_string()),
+        ("HEARTBEAT_S", format!("{:?}", external::HEARTBEAT.as_secs_f64())),
+        ("SILENCE_S", format!("{:?}", external::SILENCE.as_secs_f64())),
+        ("MAX_MODES", external::MAX_MODES.to_string()),
+        ("MAX_STREAMS", external::MAX_STREAMS.to_string()),
+        ("MAX_FRAME_BYTES", external::MAX_FRAME_BYTES.to_string()),
+        ("TEXT_SIZE", external::TEXT_BYTES.to_string()),
+        ("FRAME_SLOTS", external::FRAME_SLOTS.to_string()),
+        ("MAX_PUBLISHERS", external::MAX_PUBLISHERS.to_string()),
+        ("MAX_SUBSCRIBERS", external::MAX_SUBSCRIBERS.to_string()),
+        ("BUFFER", external::BUFFER.to_string()),
+        ("MAX_HELD", external::MAX_HELD.to_string()),
+        ("MAX_NODES", external::MAX_NODES.to_string()),
+        ("MAX_EVENT_PORTS", external::MAX_EVENT_PORTS.to_string()),
+        ("EVENT_ID", external::EVENT_ID.to_string()),
+        ("RIG_VARIABLE", format!("{:?}", external::RIG_VARIABLE)),
+        ("CAMERA_VARIABLE", format!("{:?}", external::CAMERA_VARIABLE)),
+    ]
 }
 
 fn enums(out: &mut String) {
@@ -125,6 +185,32 @@ fn enums(out: &mut String) {
         &steps,
     );
     enumeration(out, "IntFlag", "FrameFlags", "Facts about a frame, one bit each.", &flags);
+    external_enums(out);
+}
+
+fn external_enums(out: &mut String) {
+    macro_rules! codes {
+        ($($name:ident $doc:literal)*) => {$(
+            let members: Vec<_> = $name::ALL.iter().map(|c| (c.name().to_owned(), *c as u32)).collect();
+            enumeration(out, "IntEnum", stringify!($name), $doc, &members);
+        )*};
+    }
+    macro_rules! bits {
+        ($($name:ident $doc:literal)*) => {$(
+            let members: Vec<_> = $name::ALL.iter().map(|(n, f)| ((*n).to_owned(), f.0)).collect();
+            enumeration(out, "IntFlag", stringify!($name), $doc, &members);
+        )*};
+    }
+    codes! {
+        ExternalState "How a process that serves a camera stands."
+        ExternalWant "What the daemon wants of a process that serves a camera."
+        ExternalReason "Why one side refuses, or a process ends."
+        ExternalClock "Which clock stamps the frames of a mode."
+    }
+    bits! {
+        ExternalModeFlags "Facts about a mode, one bit each."
+        ExternalFrameFlags "Facts about a frame, one bit each."
+    }
 }
 
 fn serde_name(value: impl serde::Serialize) -> String {

@@ -23,6 +23,40 @@ SHM_PREFIX = "depthrig_"
 IOX_FOLDER = "iox2"
 RUNTIME_DIR_VARIABLE = "DEPTHRIG_RUNTIME_DIR"
 
+# Cameras that another process serves: docs/external.md
+EXTERNAL_VERSION = 1
+EXTERNAL_SCHEMA = "depthrig.external/1"
+EXTERNAL_PREFIX = "depthrig.external"
+EXTERNAL_LOCK_SUFFIX = ".external"
+EXTERNAL_OFFER_TYPE = "depthrig.ExternalOffer.v1"
+EXTERNAL_OFFER_SIZE = 568
+EXTERNAL_OFFER_MAGIC = b"DREO"
+EXTERNAL_MODE_TYPE = "depthrig.ExternalMode.v1"
+EXTERNAL_MODE_SIZE = 320
+EXTERNAL_ANSWER_TYPE = "depthrig.ExternalAnswer.v1"
+EXTERNAL_ANSWER_SIZE = 376
+EXTERNAL_ANSWER_MAGIC = b"DREA"
+EXTERNAL_FRAME_TYPE = "depthrig.ExternalFrame.v1"
+EXTERNAL_FRAME_SIZE = 128
+EXTERNAL_FRAME_MAGIC = b"DREF"
+EXTERNAL_ALIGN = 8
+EXTERNAL_HEARTBEAT_S = 0.2
+EXTERNAL_SILENCE_S = 2.0
+EXTERNAL_MAX_MODES = 64
+EXTERNAL_MAX_STREAMS = 16
+EXTERNAL_MAX_FRAME_BYTES = 268435456
+EXTERNAL_TEXT_SIZE = 256
+EXTERNAL_FRAME_SLOTS = 8
+EXTERNAL_MAX_PUBLISHERS = 4
+EXTERNAL_MAX_SUBSCRIBERS = 4
+EXTERNAL_BUFFER = 4
+EXTERNAL_MAX_HELD = 4
+EXTERNAL_MAX_NODES = 16
+EXTERNAL_MAX_EVENT_PORTS = 8
+EXTERNAL_EVENT_ID = 1
+EXTERNAL_RIG_VARIABLE = "DEPTHRIG_RIG"
+EXTERNAL_CAMERA_VARIABLE = "DEPTHRIG_CAMERA"
+
 
 class PixelFormat(enum.IntEnum):
     """How the pixels of a frame are stored."""
@@ -99,6 +133,62 @@ class FrameFlags(enum.IntFlag):
     METADATA_LOST = 512
 
 
+class ExternalState(enum.IntEnum):
+    """How a process that serves a camera stands."""
+
+    IDLE = 0
+    STARTING = 1
+    RUNNING = 2
+    REFUSED = 3
+    ENDED = 4
+
+
+class ExternalWant(enum.IntEnum):
+    """What the daemon wants of a process that serves a camera."""
+
+    STOP = 0
+    RUN = 1
+    REFUSED = 2
+
+
+class ExternalReason(enum.IntEnum):
+    """Why one side refuses, or a process ends."""
+
+    NONE = 0
+    VERSION = 1
+    INVALID = 2
+    UNSUPPORTED = 3
+    NOT_FOUND = 4
+    BUSY = 5
+    PERMISSION = 6
+    DISCONNECTED = 7
+    DEVICE = 8
+    FINISHED = 9
+
+
+class ExternalClock(enum.IntEnum):
+    """Which clock stamps the frames of a mode."""
+
+    ARRIVAL = 0
+    DEVICE = 1
+    DEVICE_HEADER = 2
+    HOST = 3
+
+
+class ExternalModeFlags(enum.IntFlag):
+    """Facts about a mode, one bit each."""
+
+    SIMULATED = 1
+
+
+class ExternalFrameFlags(enum.IntFlag):
+    """Facts about a frame, one bit each."""
+
+    DAMAGED = 1
+    HARDWARE_TRIGGERED = 2
+    METADATA_LOST = 4
+
+
 # (name, offset, element type, elements)
 FIELDS = (
     ("magic", 0, "u8", 4),
@@ -159,6 +249,99 @@ SET_FIELDS = (
     ("incomplete", 24, "u64", 1),
     ("members", 32, "u32", 1),
     ("present", 36, "u32", 1),
+)
+
+
+# (name, offset, element type, elements)
+EXTERNAL_OFFER_FIELDS = (
+    ("magic", 0, "u8", 4),
+    ("version", 4, "u16", 1),
+    ("size", 6, "u16", 1),
+    ("instance", 8, "u64", 1),
+    ("number", 16, "u64", 1),
+    ("sent_ns", 24, "i64", 1),
+    ("session", 32, "u64", 1),
+    ("state", 40, "u32", 1),
+    ("reason", 44, "u32", 1),
+    ("modes", 48, "u32", 1),
+    ("pid", 52, "u32", 1),
+    ("model", 56, "u8", 32),
+    ("serial", 88, "u8", 32),
+    ("firmware", 120, "u8", 32),
+    ("port", 152, "u8", 32),
+    ("calibration", 184, "u8", 32),
+    ("program", 216, "u8", 32),
+    ("text", 248, "u8", 256),
+    ("reserved", 504, "u64", 8),
+)
+
+
+# (name, offset, element type, elements)
+EXTERNAL_MODE_FIELDS = (
+    ("stream", 0, "u8", 32),
+    ("rate_hz", 32, "f64", 1),
+    ("depth_unit_m", 40, "f64", 1),
+    ("intrinsics.fx", 48, "f64", 1),
+    ("intrinsics.fy", 56, "f64", 1),
+    ("intrinsics.cx", 64, "f64", 1),
+    ("intrinsics.cy", 72, "f64", 1),
+    ("intrinsics.coeffs", 80, "f64", 8),
+    ("intrinsics.model", 144, "u32", 1),
+    ("intrinsics.reserved", 148, "u32", 1),
+    ("pose.translation_m", 152, "f64", 3),
+    ("pose.rotation_xyzw", 176, "f64", 4),
+    ("tick_ps", 208, "u64", 1),
+    ("format", 216, "u32", 1),
+    ("width", 220, "u32", 1),
+    ("height", 224, "u32", 1),
+    ("clock", 228, "u32", 1),
+    ("counter_bits", 232, "u32", 1),
+    ("sequence_bits", 236, "u32", 1),
+    ("flags", 240, "u32", 1),
+    ("reserved_word", 244, "u32", 1),
+    ("reserved", 248, "u64", 9),
+)
+
+
+# (name, offset, element type, elements)
+EXTERNAL_ANSWER_FIELDS = (
+    ("magic", 0, "u8", 4),
+    ("version", 4, "u16", 1),
+    ("size", 6, "u16", 1),
+    ("instance", 8, "u64", 1),
+    ("number", 16, "u64", 1),
+    ("sent_ns", 24, "i64", 1),
+    ("session", 32, "u64", 1),
+    ("want", 40, "u32", 1),
+    ("reason", 44, "u32", 1),
+    ("modes", 48, "u32", 1),
+    ("pid", 52, "u32", 1),
+    ("text", 56, "u8", 256),
+    ("reserved", 312, "u64", 8),
+)
+
+
+# (name, offset, element type, elements)
+EXTERNAL_FRAME_FIELDS = (
+    ("magic", 0, "u8", 4),
+    ("version", 4, "u16", 1),
+    ("size", 6, "u16", 1),
+    ("instance", 8, "u64", 1),
+    ("session", 16, "u64", 1),
+    ("sequence", 24, "u64", 1),
+    ("device_sequence", 32, "u64", 1),
+    ("device_time", 40, "u64", 1),
+    ("arrival_time_ns", 48, "i64", 1),
+    ("exposure_ns", 56, "u64", 1),
+    ("gain", 64, "f32", 1),
+    ("temperature_c", 68, "f32", 1),
+    ("format", 72, "u32", 1),
+    ("width", 76, "u32", 1),
+    ("height", 80, "u32", 1),
+    ("payload_len", 84, "u32", 1),
+    ("flags", 88, "u32", 1),
+    ("reserved_word", 92, "u32", 1),
+    ("reserved", 96, "u64", 4),
 )
 
 

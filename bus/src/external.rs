@@ -1,0 +1,68 @@
+//! Cameras that another process serves: the hand-shake between that process and the daemon.
+//!
+//! docs/external.md is the contract; [`ExternalOffer`], [`ExternalMode`], [`ExternalAnswer`] and [`ExternalFrame`] are its
+//! bytes. Whatever comes from the other side is checked before it is believed.
+
+mod codes;
+mod fields;
+mod layout;
+mod lock;
+
+pub use codes::{
+    ExternalClock, ExternalFrameFlags, ExternalModeFlags, ExternalReason, ExternalState, ExternalWant,
+};
+pub use fields::{ANSWER_FIELDS, FRAME_FIELDS, MODE_FIELDS, OFFER_FIELDS};
+pub use layout::{ExternalAnswer, ExternalFrame, ExternalMode, ExternalOffer};
+pub use lock::{ExternalLock, holder, lock};
+
+use core::time::Duration;
+
+/// Version of the hand-shake.
+pub const VERSION: u16 = 1;
+/// The value of the channels' attribute `schema`, checked on open.
+pub const SCHEMA: &str = "depthrig.external/1";
+/// First part of the channels' names.
+pub const PREFIX: &str = "depthrig.external";
+/// What the name of a camera's lock ends with.
+pub const LOCK_SUFFIX: &str = ".external";
+/// What an [`ExternalOffer`] begins with.
+pub const OFFER_MAGIC: [u8; 4] = *b"DREO";
+/// What an [`ExternalAnswer`] begins with.
+pub const ANSWER_MAGIC: [u8; 4] = *b"DREA";
+/// What an [`ExternalFrame`] begins with.
+pub const FRAME_MAGIC: [u8; 4] = *b"DREF";
+/// How often both sides say that they are there.
+pub const HEARTBEAT: Duration = Duration::from_millis(200);
+/// Silence after which the daemon is taken for gone.
+pub const SILENCE: Duration = Duration::from_secs(2);
+/// Modes of one camera at most.
+pub const MAX_MODES: usize = 64;
+/// Streams of one camera at most.
+pub const MAX_STREAMS: usize = 16;
+/// Bytes of one frame at most.
+pub const MAX_FRAME_BYTES: usize = 256 << 20;
+/// Bytes of the text of a refusal.
+pub const TEXT_BYTES: usize = 256;
+/// Bytes of an [`ExternalMode`] in the payload of an offer.
+pub const MODE_BYTES: usize = size_of::<ExternalMode>();
+/// Slots of a stream's channel from the process to the daemon: four that wait unread, one that is being copied, and
+/// three to write into.
+pub const FRAME_SLOTS: usize = 8;
+/// Ports that send at most: a camera's own, and those of killed processes that nobody has cleaned up yet.
+pub const MAX_PUBLISHERS: usize = 4;
+/// Subscribers of a channel at most.
+pub const MAX_SUBSCRIBERS: usize = 4;
+/// Unread samples that a channel keeps per subscriber.
+pub const BUFFER: usize = 4;
+/// Samples that one subscriber may hold.
+pub const MAX_HELD: usize = 4;
+/// Processes that may have a channel open.
+pub const MAX_NODES: usize = 16;
+/// Notifiers, and listeners, of an event.
+pub const MAX_EVENT_PORTS: usize = 8;
+/// The event that both sides raise.
+pub const EVENT_ID: usize = 1;
+/// The environment variable that names the rig to a process that the daemon starts.
+pub const RIG_VARIABLE: &str = "DEPTHRIG_RIG";
+/// The environment variable that names the camera to a process that the daemon starts.
+pub const CAMERA_VARIABLE: &str = "DEPTHRIG_CAMERA";
