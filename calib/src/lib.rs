@@ -2,13 +2,14 @@
 //!
 //! Floor 2. Mathematics on the types that travel in a frame header; no I/O. Start at [`Camera`] (from a point to a
 //! pixel and back) and [`Registration`] (depth in the view of colour). [`Deprojection`] makes point clouds, [`Undistortion`] other pictures of the same
-//! view; [`stereo`] finds depth in a pair of pictures.
+//! view; [`Rectifier`] makes the two pictures of a stereo camera a pair in which [`stereo`] finds depth.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 mod camera;
 mod cloud;
 mod error;
 mod pose;
+mod rectify;
 mod registration;
 mod simd;
 pub mod stereo;
@@ -18,5 +19,6 @@ pub use camera::{Camera, CameraExt, Projection, Ray};
 pub use cloud::{Deprojection, PointCloud, write_pcd, write_ply};
 pub use error::{Error, ErrorKind, Result};
 pub use pose::PoseExt;
+pub use rectify::{Rectifier, View};
 pub use registration::{Method, Registration, same_view};
 pub use undistort::Undistortion;

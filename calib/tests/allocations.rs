@@ -4,7 +4,7 @@
 
 use core::cell::Cell;
 use depthrig_bus::{Distortion, Intrinsics, Pose};
-use depthrig_calib::{Deprojection, Method, PointCloud, Registration, Undistortion};
+use depthrig_calib::{Deprojection, Method, PointCloud, Rectifier, Registration, Undistortion, View};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -93,6 +93,17 @@ fn a_frame_takes_no_memory() {
         allocations(|| {
             map.bytes::<3>(&color, &mut rgb).unwrap();
             map.depth(&depth, &mut z).unwrap();
+        }),
+        0
+    );
+    let rectifier = Rectifier::new(&bent, &k, &pose, size).unwrap();
+    let (yuyv, mut grey) = (vec![90; 160 * 120 * 2], vec![0; 160 * 120]);
+    assert_eq!(
+        allocations(|| for view in View::BOTH {
+            rectifier.grey_from_yuyv(view, &yuyv, &mut grey).unwrap();
+            rectifier.rgb_from_yuyv(view, &yuyv, &mut rgb).unwrap();
+            rectifier.grey_from_rgb(view, &color, &mut grey).unwrap();
+            rectifier.rgb(view, &color, &mut rgb).unwrap();
         }),
         0
     );

@@ -25,6 +25,7 @@ mod ini;
 pub mod mode;
 pub mod motion;
 mod profiles;
+pub mod replay;
 pub mod sensors;
 mod settings;
 mod stream;

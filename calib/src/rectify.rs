@@ -1,0 +1,183 @@
+//! Stereo rectification: both eyes turned to one orientation, so that what one eye sees lies in the same row of the other.
+//!
+//! The geometry is that of `OpenCV`'s `stereoRectify` with `CALIB_ZERO_DISPARITY` and `alpha = 0` (Bouguet's method,
+//! `calib3d/src/calibration.cpp`, Apache-2.0): the rotation between the eyes is shared out between them, the row axis
+//! becomes the line between their centres, and the picture is magnified until every pixel of both views is seen by its
+//! eye. A test holds it to numbers of `OpenCV`.
+
+use crate::error::check_len;
+use crate::{Camera, Error, ErrorKind, PoseExt, Result};
+use depthrig_bus::{Intrinsics, Pose};
+use glam::{DMat3, DQuat};
+
+mod geometry;
+mod map;
+
+use map::Map;
+
+/// One of the two rectified views.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum View {
+    /// That of the left eye, in which disparity and depth are.
+    Left,
+    /// That of the right eye.
+    Right,
+}
+
+impl View {
+    /// Both, left first.
+    pub const BOTH: [Self; 2] = [Self::Left, Self::Right];
+}
+
+/// Turns raw pictures of a stereo camera into rectified ones. Its tables are made once; a picture costs one pass,
+/// allocates nothing and goes between four pixels in proportion.
+///
+/// Both rectified views are pinholes with the same intrinsics and no distortion, so a point at depth `z` metres has
+/// disparity `x_left - x_right = fx * baseline_m / z` pixels. Pictures are rows of `width` pixels without padding.
+#[derive(Debug, Clone)]
+pub struct Rectifier {
+    size: (u32, u32),
+    intrinsics: Intrinsics,
+    baseline_m: f64,
+    rotations: [DMat3; 2],
+    maps: [Map; 2],
+}
+
+impl Rectifier {
+    /// For a camera whose eyes have these intrinsics at `size` (width, height) and whose right eye is at `right_in_left`:
+    /// `p_left = R p_right + t`, so that `t.x` is positive.
+    ///
+    /// # Errors
+    /// As [`Camera::new`]; [`ErrorKind::BadInput`] for a size that no picture has, for eyes that are above each other, that
+    /// have no distance, or that are swapped (the right one left of the left one), and for lenses of which nothing is
+    /// left after rectification.
+    pub fn new(
+        left: &Intrinsics,
+        right: &Intrinsics,
+        right_in_left: &Pose,
+        size: (u32, u32),
+    ) -> Result<Self> {
+        let (left, right) = (Camera::new(left)?, Camera::new(right)?);
+        let right_from_left = right_in_left.to_affine().inverse();
+        let made = geometry::rectify(left.intrinsics(), right.intrinsics(), &right_from_left, size)?;
+        let map = |camera: &Camera, rotation: DMat3| Map::new(camera, rotation, &made.intrinsics, size);
+        Ok(Self {
+            size,
+            intrinsics: made.intrinsics,
+            baseline_m: made.baseline_m,
+            maps: [map(&left, made.rotations[0]), map(&right, made.rotations[1])],
+            rotations: made.rotations,
+        })
+    }
+
+    /// Width and height of the raw and of the rectified pictures, pixels.
+    pub const fn size(&self) -> (u32, u32) {
+        self.size
+    }
+
+    /// Intrinsics of both rectified views: a pinhole with `fx = fy`.
+    pub const fn intrinsics(&self) -> &Intrinsics {
+        &self.intrinsics
+    }
+
+    /// Distance between the eyes, metres.
+    pub const fn baseline_m(&self) -> f64 {
+        self.baseline_m
+    }
+
+    /// What turns directions of the eye into those of its rectified view: `R1` and `R2` of `stereoRectify`.
+    pub const fn rotation(&self, view: View) -> DMat3 {
+        self.rotations[view as usize]
+    }
+
+    /// Pose of the rectified left view in the left eye's own frame: a rotation alone.
+    pub fn left_view_in_left(&self) -> Pose {
+        let turned = DQuat::from_mat3(&self.rotations[0].transpose()).normalize();
+        Pose { translation_m: [0.0; 3], rotation_xyzw: turned.to_array() }
+    }
+
+    /// Where the rectified pixel (`x`, `y`) is in the eye's own picture, pixels, with the map's own precision of
+    /// 1/256 pixel; `None` when the eye does not see it.
+    pub fn source(&self, view: View, x: u32, y: u32) -> Option<(f64, f64)> {
+        let inside = x < self.size.0 && y < self.size.1;
+        inside.then(|| self.maps[view as usize].source(y as usize * self.size.0 as usize + x as usize))?
+    }
+
+    /// The rectified picture of one byte a pixel, out of one of one byte a pixel; 0 where the eye sees nothing.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SizeMismatch`] for pictures of another size.
+    pub fn grey(&self, view: View, picture: &[u8], out: &mut [u8]) -> Result<()> {
+        self.check("the grey picture", picture, 1, out, 1)?;
+        self.maps[view as usize].bytes::<1>(picture, out);
+        Ok(())
+    }
+
+    /// The rectified picture in three bytes a pixel, out of one in three bytes a pixel.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SizeMismatch`] for pictures of another size.
+    pub fn rgb(&self, view: View, picture: &[u8], out: &mut [u8]) -> Result<()> {
+        self.check("the colour picture", picture, 3, out, 3)?;
+        self.maps[view as usize].bytes::<3>(picture, out);
+        Ok(())
+    }
+
+    /// The rectified grey picture out of a colour picture in three bytes (red, green, blue) a pixel.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SizeMismatch`] for pictures of another size.
+    pub fn grey_from_rgb(&self, view: View, picture: &[u8], out: &mut [u8]) -> Result<()> {
+        self.check("the colour picture", picture, 3, out, 1)?;
+        self.maps[view as usize].grey_from_rgb(picture, out);
+        Ok(())
+    }
+
+    /// The rectified grey picture out of YUYV: its luminance as it is.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SizeMismatch`] for pictures of another size, [`ErrorKind::BadInput`] for an odd width.
+    pub fn grey_from_yuyv(&self, view: View, picture: &[u8], out: &mut [u8]) -> Result<()> {
+        self.check_pairs()?;
+        self.check("the YUYV picture", picture, 2, out, 1)?;
+        self.maps[view as usize].grey_from_yuyv(picture, out);
+        Ok(())
+    }
+
+    /// The rectified colour picture (red, green, blue) out of YUYV as BT.601 with its limited range has it, which is
+    /// what `OpenCV` makes of it and what USB cameras send.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SizeMismatch`] for pictures of another size, [`ErrorKind::BadInput`] for an odd width.
+    pub fn rgb_from_yuyv(&self, view: View, picture: &[u8], out: &mut [u8]) -> Result<()> {
+        self.check_pairs()?;
+        self.check("the YUYV picture", picture, 2, out, 3)?;
+        self.maps[view as usize].rgb_from_yuyv(picture, out);
+        Ok(())
+    }
+
+    /// In YUYV two pixels share a colour.
+    fn check_pairs(&self) -> Result<()> {
+        let (width, height) = self.size;
+        if width.is_multiple_of(2) {
+            return Ok(());
+        }
+        Err(bad(format!(
+            "a picture of {width}x{height} pixels cannot be YUYV, which has pairs of pixels: its width is odd"
+        )))
+    }
+
+    fn check(&self, what: &str, picture: &[u8], from: usize, out: &[u8], to: usize) -> Result<()> {
+        let size = (self.size.0 as usize, self.size.1 as usize);
+        check_len(what, picture.len(), size, from)?;
+        check_len("the rectified picture", out.len(), size, to)
+    }
+}
+
+/// The error of numbers that are no stereo camera's.
+fn bad(what: impl Into<String>) -> Error {
+    Error::new(ErrorKind::BadInput, what)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,213 @@
+//! Against `OpenCV`, against the eyes' own projection, and with what is no stereo camera.
+
+use super::*;
+use depthrig_bus::Distortion;
+use glam::{DAffine3, DVec2, DVec3};
+use proptest::prelude::*;
+use serde::Deserialize;
+use std::collections::BTreeMap;
+use std::sync::LazyLock;
+
+#[derive(Deserialize)]
+struct Reference {
+    cameras: Vec<Theirs>,
+}
+
+#[derive(Deserialize)]
+struct Theirs {
+    name: String,
+    size: (u32, u32),
+    rotation_vector: [f64; 3],
+    translation: [f64; 3],
+    focal: f64,
+    center: [f64; 2],
+    baseline: f64,
+    eyes: [TheirEye; 2],
+}
+
+#[derive(Deserialize)]
+struct TheirEye {
+    intrinsics: [f64; 4],
+    coeffs: [f64; 8],
+    rational: bool,
+    rotation: [f64; 9],
+    map: Vec<(u32, u32, f64, f64)>,
+    pixels: BTreeMap<String, Vec<Vec<u8>>>,
+}
+
+impl Theirs {
+    fn eye(&self, view: View) -> Intrinsics {
+        let eye = &self.eyes[view as usize];
+        let [fx, fy, cx, cy] = eye.intrinsics;
+        let model = if eye.rational { Distortion::Rational } else { Distortion::BrownConrady };
+        Intrinsics { coeffs: eye.coeffs, model: model as u32, ..Intrinsics::pinhole(fx, fy, cx, cy) }
+    }
+
+    fn right_in_left(&self) -> Pose {
+        let turn = DQuat::from_scaled_axis(DVec3::from_array(self.rotation_vector));
+        let right_from_left = DAffine3::from_rotation_translation(turn, DVec3::from_array(self.translation));
+        Pose::from_affine(&right_from_left.inverse())
+    }
+
+    fn rectifier(&self) -> Rectifier {
+        let (left, right) = (self.eye(View::Left), self.eye(View::Right));
+        Rectifier::new(&left, &right, &self.right_in_left(), self.size).unwrap()
+    }
+}
+
+/// Numbers of `OpenCV` 4.14, which `opencv.py` wrote.
+fn reference() -> Vec<Theirs> {
+    serde_json::from_str::<Reference>(include_str!("opencv.json")).unwrap().cameras
+}
+
+#[test]
+fn views_and_maps_are_those_of_opencv() {
+    for theirs in reference() {
+        let (own, name) = (theirs.rectifier(), &theirs.name);
+        let k = own.intrinsics();
+        // `OpenCV` keeps the points from which it finds focal length and centre in single precision.
+        let near =
+            |a: f64, b: f64, tolerance: f64| assert!((a - b).abs() < tolerance, "{name}: {a} is not {b}");
+        near(k.fx, theirs.focal, 1e-3);
+        near(k.fy, theirs.focal, 1e-3);
+        near(k.cx, theirs.center[0], 1e-3);
+        near(k.cy, theirs.center[1], 1e-3);
+        near(own.baseline_m(), theirs.baseline, 1e-9);
+        for view in View::BOTH {
+            let eye = &theirs.eyes[view as usize];
+            for (a, b) in own.rotation(view).transpose().to_cols_array().iter().zip(eye.rotation) {
+                near(*a, b, 1e-9);
+            }
+            for &(x, y, u, v) in &eye.map {
+                let (w, h) = (f64::from(theirs.size.0) - 1.0, f64::from(theirs.size.1) - 1.0);
+                let Some(at) = own.source(view, x, y) else {
+                    let edge = u.min(v).min(w - u).min(h - v);
+                    assert!(edge < 1e-3, "{name} {view:?}: nothing at {x}, {y}; theirs is {u}, {v}");
+                    continue;
+                };
+                near(at.0, u, 0.5 / 256.0 + 2e-3);
+                near(at.1, v, 0.5 / 256.0 + 2e-3);
+            }
+        }
+    }
+}
+
+/// The picture of `opencv.py`.
+fn picture((width, height): (u32, u32)) -> Vec<[u8; 3]> {
+    let at = |x: u32, y: u32, c: f64| {
+        let (x, y) = (f64::from(x), f64::from(y));
+        (128.0 + 100.0 * (x / (11.0 + c) + y / (17.0 - c)).sin()).floor() as u8
+    };
+    (0..height).flat_map(|y| (0..width).map(move |x| [0.0, 1.0, 2.0].map(|c| at(x, y, c)))).collect()
+}
+
+#[test]
+fn pictures_are_those_of_opencv() {
+    for theirs in reference() {
+        let (own, n) = (theirs.rectifier(), (theirs.size.0 * theirs.size.1) as usize);
+        let rgb = picture(theirs.size);
+        let yuyv: Vec<u8> =
+            rgb.chunks(2).flat_map(|p| [p[0][0], p[0][1] / 4 + 96, p[1][0], p[0][2] / 4 + 96]).collect();
+        let grey: Vec<u8> = rgb.iter().map(|p| p[0]).collect();
+        let rgb = rgb.concat();
+        for view in View::BOTH {
+            let eye = &theirs.eyes[view as usize];
+            let same = |what: &str, ours: &[u8], channels: usize| {
+                let mut most = 0;
+                for ((x, y, ..), want) in eye.map.iter().zip(&eye.pixels[what]) {
+                    // At the outermost pixels `OpenCV` mixes in what lies outside of the picture, which is black.
+                    if *x == 0 || *y == 0 || *x == theirs.size.0 - 1 || *y == theirs.size.1 - 1 {
+                        continue;
+                    }
+                    let at = (y * theirs.size.0 + x) as usize * channels;
+                    for (a, b) in ours[at..at + channels].iter().zip(want) {
+                        most = most.max(a.abs_diff(*b));
+                    }
+                }
+                // It knows places to 1/32 pixel, this module to 1/256.
+                assert!(most <= 2, "{} {view:?} {what}: {most} levels apart", theirs.name);
+            };
+            let (mut one, mut three) = (vec![7; n], vec![7; 3 * n]);
+            own.grey(view, &grey, &mut one).unwrap();
+            same("grey", &one, 1);
+            own.rgb(view, &rgb, &mut three).unwrap();
+            same("rgb", &three, 3);
+            own.grey_from_rgb(view, &rgb, &mut one).unwrap();
+            same("luma", &one, 1);
+            own.rgb_from_yuyv(view, &yuyv, &mut three).unwrap();
+            same("yuyv", &three, 3);
+            own.grey_from_yuyv(view, &yuyv, &mut one).unwrap();
+            same("grey", &one, 1);
+        }
+    }
+}
+
+proptest! {
+    /// A point that both eyes see lies in one row of both views, at the disparity of its depth: by the eyes' own
+    /// projection, which knows nothing of rectification.
+    #[test]
+    fn points_have_one_row_and_the_disparity_of_their_depth(
+        which in 0usize..3, u in 0.1f64..0.9, v in 0.05f64..0.95, z in 0.5f64..20.0,
+    ) {
+        static CAMERAS: LazyLock<Vec<(Theirs, Rectifier)>> =
+            LazyLock::new(|| reference().into_iter().map(|t| (t.rectifier(), t)).map(|(r, t)| (t, r)).collect());
+        let (theirs, own) = &CAMERAS[which];
+        let k = *own.intrinsics();
+        let at = DVec2::new(u * f64::from(theirs.size.0), v * f64::from(theirs.size.1)).round();
+        let disparity = k.fx * own.baseline_m() / z;
+        let p = DVec3::new((at.x - k.cx) / k.fx, (at.y - k.cy) / k.fy, 1.0) * z;
+        let in_left = own.rotation(View::Left).transpose() * p;
+        let in_right = theirs.right_in_left().to_affine().inverse().transform_point3(in_left);
+        let left = Camera::new(&theirs.eye(View::Left)).unwrap().project(in_left).unwrap();
+        let seen = own.source(View::Left, at.x as u32, at.y as u32).unwrap();
+        prop_assert!((left - DVec2::from(seen)).length() < 0.004);
+        let x = at.x - disparity;
+        prop_assume!(x >= 1.0);
+        let right = Camera::new(&theirs.eye(View::Right)).unwrap().project(in_right).unwrap();
+        // Between the two pixels of the row, since the disparity is no whole number.
+        let (a, b) = (x.floor() as u32, x.floor() as u32 + 1);
+        let (a, b) = (own.source(View::Right, a, at.y as u32).unwrap(), own.source(View::Right, b, at.y as u32).unwrap());
+        let between = DVec2::from(a).lerp(DVec2::from(b), x.fract());
+        prop_assert!((right - between).length() < 0.006, "{right} is not {between}");
+    }
+}
+
+#[test]
+fn the_pose_of_the_left_view_is_a_rotation_alone() {
+    let theirs = reference().remove(1);
+    let own = theirs.rectifier();
+    let pose = own.left_view_in_left();
+    assert_eq!(pose.translation_m, [0.0; 3]);
+    let turned = pose.transform_point(own.rotation(View::Left) * DVec3::new(0.1, -0.2, 1.0));
+    assert!((turned - DVec3::new(0.1, -0.2, 1.0)).length() < 1e-9);
+}
+
+#[test]
+fn what_is_no_stereo_camera_is_refused() {
+    let theirs = reference().remove(0);
+    let (left, right, pose, size) =
+        (theirs.eye(View::Left), theirs.eye(View::Right), theirs.right_in_left(), theirs.size);
+    let message = |left: &Intrinsics, pose: &Pose, size| {
+        let e = Rectifier::new(left, &right, pose, size).unwrap_err();
+        (e.kind(), e.to_string())
+    };
+    let said = |(kind, text): (ErrorKind, String), wanted: &str| {
+        assert!(kind == ErrorKind::BadInput && text.contains(wanted), "{kind:?}: {text}");
+    };
+    said(message(&left, &pose.inverse(), size), "left and right are swapped: the right eye is 120.");
+    let above = Pose { translation_m: [0.001, 0.12, 0.0], ..pose };
+    said(message(&left, &above, size), "above each other");
+    said(message(&left, &Pose::IDENTITY, size), "no baseline");
+    said(message(&left, &pose, (1, 720)), "1x720 is no size");
+    said(message(&left, &pose, (1_000_000, 720)), "is no size");
+    assert_eq!(message(&Intrinsics::default(), &pose, size).0, ErrorKind::NoCalibration);
+    let own = theirs.rectifier();
+    let mut out = vec![0; 1280 * 720];
+    let short = own.grey(View::Left, &[0; 100], &mut out).unwrap_err();
+    assert_eq!(short.kind(), ErrorKind::SizeMismatch);
+    let odd = Rectifier::new(&left, &right, &pose, (1279, 720)).unwrap();
+    let e =
+        odd.rgb_from_yuyv(View::Left, &vec![0; 1279 * 720 * 2], &mut vec![0; 1279 * 720 * 3]).unwrap_err();
+    assert!(e.to_string().contains("its width is odd"), "{e}");
+    odd.grey(View::Left, &vec![9; 1279 * 720], &mut vec![0; 1279 * 720]).unwrap();
+}
