@@ -47,6 +47,8 @@ const MAX_RATE: f64 = 500e-6;
 const SLEW: f64 = 200e-6;
 /// History from which on the hull's slope is used.
 const WARM_NS: i64 = 5_000_000_000;
+/// History from which on a probe is measured once; until then the slope may turn, and the probes with it.
+const SETTLED_NS: i64 = 4 * WARM_NS;
 /// Arrivals more than 20 ms above the line for this long are more than a stall.
 const HIGH_SUSPECT_NS: i64 = 1_000_000_000;
 /// Furthest that times are kept from an epoch's first frame (31 years), so that sums cannot overflow.
@@ -99,6 +101,8 @@ pub struct ClockMap {
     claim_ns: f64,
     probes: Probes,
     latency: Option<Latency>,
+    /// The latency is that of probes in an epoch that is over.
+    is_carried: bool,
     shown_latency: f64,
     /// Frames that may be the first of a restarted device.
     pending: Vec<Seen>,
@@ -125,6 +129,7 @@ impl ClockMap {
             claim_ns: 0.0,
             probes: Probes::default(),
             latency: known.then_some(Latency { ns: config.latency_ns, bound_ns: 0 }),
+            is_carried: false,
             shown_latency: config.latency_ns as f64,
             pending: Vec::with_capacity(DECIDING_FRAMES),
             last_capture: HostTime::from_ns(i64::MIN),
@@ -173,7 +178,7 @@ impl ClockMap {
     /// Takes a two-way probe: the device read its counter somewhere between two readings of the host's clock.
     ///
     /// From then on capture times are free of the constant latency, up to half the width of the tightest probes,
-    /// which is part of the claimed uncertainty. While the map warms up they are measured against its line anew with
+    /// which is part of the claimed uncertainty. In the first 20 s they are measured against the map's line anew with
     /// every frame, because that line still moves. Ignored while a restart is in doubt.
     pub fn probe(&mut self, before: HostTime, raw_ticks: u64, after: HostTime) {
         let Some(epoch) = &self.epoch else { return };
@@ -189,6 +194,7 @@ impl ClockMap {
         // A probe of another timeline (the device is just restarting) says nothing.
         if latency_ns.saturating_abs() < 10_000_000_000 {
             self.latency = Some(self.probes.add(x, offset_ns, width_ns, epoch.line));
+            self.is_carried = false;
         }
     }
 
@@ -216,7 +222,7 @@ impl ClockMap {
         self.epochs = self.epochs.saturating_add(1);
         self.hull.clear();
         self.trust.restart();
-        self.probes = Probes::default();
+        self.forget_probes();
         self.pending.clear();
         let mut epoch = Epoch {
             first,
@@ -236,6 +242,12 @@ impl ClockMap {
         let last = own(&last);
         self.take(&mut epoch, last);
         self.publish(epoch, last)
+    }
+
+    /// The line that the probes were measured against is gone; the latency that they found is all there is for now.
+    fn forget_probes(&mut self) {
+        self.is_carried |= !self.probes.is_empty();
+        self.probes = Probes::default();
     }
 
     /// Lets a frame that follows the line move the line.
@@ -272,18 +284,25 @@ impl ClockMap {
                 if checked || self.claim_ns == 0.0 {
                     self.claim_ns = self.line_claim_ns(epoch);
                 }
+                self.measure_again(epoch);
                 return;
             }
         }
         if let Some(line) = self.hull.support(self.rate) {
             epoch.line = line;
         }
-        if epoch.newest_x < WARM_NS
+        self.measure_again(epoch);
+        self.claim_ns = self.line_claim_ns(epoch);
+    }
+
+    /// Measures the probes against a line that still turns. Once it rests on a long history each probe keeps what it
+    /// measured: then the line is off at its end by the crystal's curvature, and so is what is measured there, alike.
+    fn measure_again(&mut self, epoch: &Epoch) {
+        if epoch.newest_x < SETTLED_NS
             && let Some(latency) = self.probes.measure_again(epoch.line)
         {
             self.latency = Some(latency);
         }
-        self.claim_ns = self.line_claim_ns(epoch);
     }
 
     /// What the line itself may be off by, nanoseconds.
@@ -342,7 +361,7 @@ impl ClockMap {
                 // The hull has forgotten: the whole window lies on the new line, so the map is warm at once.
                 self.epochs = self.epochs.saturating_add(1);
                 self.trust.restart();
-                self.probes = Probes::default();
+                self.forget_probes();
                 epoch.shown_d = target_d;
                 epoch.high_since = None;
                 suspect_ns = 0.0;
@@ -359,7 +378,11 @@ impl ClockMap {
             epoch.shown_d = (y - x) as f64 + self.shown_latency;
         }
         let forced_ns = capture.since_ns(wish).saturating_abs() as f64;
-        let bound = self.latency.map_or(0.0, |l| l.bound_ns as f64);
+        let mut bound = self.latency.map_or(0.0, |l| l.bound_ns as f64);
+        if self.is_carried {
+            // Its first frames may all be late alike, by what nearly every delivery has been late by at most.
+            bound += self.residuals.quantile_ns(0.99) as f64;
+        }
         if !warming {
             self.trust.published(x, epoch.shown_d);
         }

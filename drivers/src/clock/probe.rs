@@ -5,6 +5,8 @@ use std::collections::VecDeque;
 
 /// Probes remembered.
 const KEPT: usize = 64;
+/// Probes that count while the slope of the line is a guess.
+const NEWEST: usize = 3;
 
 /// One probe: the device read its clock at `x` at some moment in a host interval.
 #[derive(Debug, Clone, Copy, Default)]
@@ -42,29 +44,52 @@ impl Probes {
         self.latency()
     }
 
-    /// Measures every probe against a line that has moved since; `None` when there is no probe.
+    /// Whether there is no probe.
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Measures every probe against a line that has moved since; `None` when there is no probe. While the line's slope
+    /// is a guess, the newest probes alone are near enough to now, and how they differ says how wrong the slope is.
     pub(super) fn measure_again(&mut self, line: Line) -> Option<Latency> {
         for p in &mut self.0 {
             p.latency_ns = (line.at(p.x) as i64).saturating_sub(p.offset_ns);
         }
-        (!self.0.is_empty()).then(|| self.latency())
+        (!self.0.is_empty()).then(|| {
+            let newest = self.median_of(NEWEST);
+            let bound_ns = newest.latency.bound_ns.saturating_add(newest.spread_ns + newest.spread_ns / 2);
+            Latency { bound_ns, ..newest.latency }
+        })
     }
 
     /// The median of the probes at most 1.5 times as wide as the tightest. The tightest is that of the last 64, so a
     /// device that became slower is believed after a while.
     fn latency(&self) -> Latency {
+        self.median_of(KEPT).latency
+    }
+
+    /// The same of the newest `most` of them.
+    fn median_of(&self, most: usize) -> Median {
         let tightest = self.0.iter().map(|p| p.width_ns).min().unwrap_or(0);
         let limit = tightest.saturating_add(tightest / 2);
         let (mut good, mut n, mut widest) = ([0; KEPT], 0, 0);
-        for p in self.0.iter().filter(|p| p.width_ns <= limit).take(KEPT) {
+        for p in self.0.iter().rev().filter(|p| p.width_ns <= limit).take(most.min(KEPT)) {
             good[n] = p.latency_ns;
             n += 1;
             widest = widest.max(p.width_ns);
         }
         let good = &mut good[..n];
         good.sort_unstable();
-        Latency { ns: good.get(n / 2).map_or(0, |ns| *ns).max(0), bound_ns: widest / 2 + 1 }
+        let ns = good.get(n / 2).map_or(0, |ns| *ns);
+        let spread_ns = good.iter().map(|l| l.saturating_sub(ns).saturating_abs()).max().unwrap_or(0);
+        Median { latency: Latency { ns: ns.max(0), bound_ns: widest / 2 + 1 }, spread_ns }
     }
+}
+
+/// What some probes agree on, and how far the one that agrees least is off.
+struct Median {
+    latency: Latency,
+    spread_ns: i64,
 }
 
 #[cfg(test)]
@@ -99,6 +124,6 @@ mod tests {
         probes.add(1_000_000, -7_000, 100, LEVEL);
         probes.add(2_000_000, -7_000, 100, LEVEL);
         let risen = Line { x0: 0, d0: 500, slope: 0.001 };
-        assert_eq!(probes.measure_again(risen), Some(Latency { ns: 9_500, bound_ns: 51 }));
+        assert_eq!(probes.measure_again(risen), Some(Latency { ns: 9_500, bound_ns: 51 + 1500 }));
     }
 }

@@ -374,6 +374,73 @@ fn probes_make_the_time_absolute() {
     assert!(least_cover >= 0.99);
 }
 
+/// A probe of `frame`'s device 5 ms after its stamp: a round trip of 0.3 ms and more.
+fn probe(map: &mut ClockMap, rng: &mut sim::Rng, frame: &Sample) {
+    let (there, back) = (150e3 + rng.exponential(100e3), 150e3 + rng.exponential(100e3));
+    let read_ns = frame.truth_ns + 5e6;
+    let host = |ns: f64| HostTime::from_ns(ns as i64);
+    map.probe(host(read_ns - there), frame.raw.wrapping_add(5000) & 0xffff_ffff, host(read_ns + back));
+}
+
+/// The clock starts again just when the computer is busy: the first frames are held up, every one of them, and the
+/// latency is that of the epoch before. When that lasts for half of the warm-up, the first slope is of the load.
+#[test]
+fn a_latency_of_another_epoch_claims_what_deliveries_do() {
+    let mut least_cover = 1f64;
+    for (seed, busy_s) in SEEDS.flat_map(|seed| [0.5, 1.0, 2.0, 3.0, 4.0].map(|busy_s| (seed, busy_s))) {
+        let s = Scenario { seconds: 40.0, base_ns: 8e6, jitter_ns: 60e3, stall_share: 0.0, ..NOMINAL };
+        let mut map = ClockMap::new(config_of(&s));
+        let mut rng = sim::Rng::new(seed + 100);
+        let mut outcomes = Vec::new();
+        let mut samples = with_reset(&s, seed, 30.0, 0, false);
+        for (i, frame) in samples.iter_mut().enumerate() {
+            let at_s = i as f64 / s.fps;
+            // Now and then it was busy before: that is what can be known of it.
+            if (at_s % 7.0) < 0.3 || (30.0..30.0 + busy_s).contains(&at_s) {
+                frame.arrival_ns += 400_000;
+            }
+            outcomes.extend(play(&mut map, core::slice::from_ref(frame)));
+            outcomes[i].at_s = at_s;
+            if i % 30 == 29 {
+                probe(&mut map, &mut rng, frame);
+            }
+        }
+        let told: Vec<Outcome> =
+            after(&outcomes, 30.0).filter(|o| !o.has(FrameFlags::TIME_UNCERTAIN)).copied().collect();
+        let (covered, claim) = coverage(&told, 0.0);
+        assert!(covered >= 0.99, "{seed}, busy for {busy_s} s: {covered}");
+        assert!(claim < 1000.0, "{seed}: claims of {claim} µs are no use");
+        least_cover = least_cover.min(covered);
+    }
+    println!("after a reset under load: covered {least_cover:.4}");
+}
+
+/// The slope of the first seconds is a guess: what was measured against the line must turn with it.
+#[test]
+fn probes_hold_while_the_slope_is_still_young() {
+    let mut least_cover = 1f64;
+    for seed in SEEDS {
+        for (fps, hops, jitter_ns) in [(15.0, 2, 0.3e6), (30.0, 1, 0.4e6), (15.0, 1, 60e3)] {
+            let s = Scenario { seconds: 30.0, base_ns: 8e6, fps, hops, jitter_ns, ..NOMINAL };
+            let mut map = ClockMap::new(config_of(&s));
+            let mut rng = sim::Rng::new(seed + 100);
+            let mut outcomes = Vec::new();
+            for (i, frame) in generate(&s, seed).iter().enumerate() {
+                outcomes.extend(play(&mut map, core::slice::from_ref(frame)));
+                outcomes[i].at_s = i as f64 / s.fps;
+                if i % 2 == 1 && i < 30 || i % fps as usize == 11 {
+                    probe(&mut map, &mut rng, frame);
+                }
+            }
+            let young: Vec<Outcome> = after(&outcomes, 0.5).copied().collect();
+            let (covered, _) = coverage(&young, 0.0);
+            assert!(covered >= 0.99, "{seed}, {fps} Hz, {hops} hops: {covered}");
+            least_cover = least_cover.min(covered);
+        }
+    }
+    println!("while the slope is young: covered {least_cover:.4}");
+}
+
 /// A rig whose frames all wait for an overloaded computer from the first one on: only probes can tell, and a recording
 /// that begins at once must not have to wait for the map to be warm.
 #[test]
@@ -388,14 +455,7 @@ fn probes_count_from_the_first_second_on() {
             outcomes.extend(play(&mut map, core::slice::from_ref(frame)));
             outcomes[i].at_s = i as f64 / s.fps;
             if i % 3 == 1 && i < 45 || i % 30 == 17 {
-                let (there, back) = (150e3 + rng.exponential(100e3), 150e3 + rng.exponential(100e3));
-                let read_ns = frame.truth_ns + 5e6;
-                let host = |ns: f64| HostTime::from_ns(ns as i64);
-                map.probe(
-                    host(read_ns - there),
-                    frame.raw.wrapping_add(5000) & 0xffff_ffff,
-                    host(read_ns + back),
-                );
+                probe(&mut map, &mut rng, frame);
             }
         }
         // The line comes down by half a period a frame at the most, so that times never run backwards.
