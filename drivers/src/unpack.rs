@@ -3,12 +3,14 @@
 //! Each kernel writes every byte of `to` or says why it cannot, in words of the gate's ([`DropReason`]), so that it
 //! can be the `fill` of [`crate::Gate::deliver`]. What is copied is counted.
 
+mod alpha;
 mod mjpeg;
 mod side_by_side;
 pub mod turn;
 pub mod y411;
 pub mod y8i;
 
+pub use alpha::drop_alpha;
 pub use mjpeg::{decode_jpeg, jpeg_span, keep_jpeg};
 pub use side_by_side::{Half, copy_half};
 

@@ -1,0 +1,63 @@
+//! Frame numbers of a camera that has none: reckoned from the device's own times.
+//!
+//! A Kinect takes pictures at a fixed rate and stamps each with its clock, so a step of the clock by several periods is
+//! as many pictures of which all but the last were lost. The same time twice is the same picture twice. A clock that
+//! went back was set anew, and nobody knows how many pictures fell into that.
+
+/// Reckons the numbers of one stream.
+#[derive(Debug, Clone)]
+pub struct FrameCounter {
+    period_us: u64,
+    last: Option<(u64, u64)>,
+}
+
+impl FrameCounter {
+    /// A counter for pictures every `period_us` microseconds of the device's clock.
+    pub const fn new(period_us: u64) -> Self {
+        Self { period_us: if period_us == 0 { 1 } else { period_us }, last: None }
+    }
+
+    /// The number of the picture that was taken at `device_us`.
+    pub fn number(&mut self, device_us: u64) -> u64 {
+        let number = match self.last {
+            None => 0,
+            Some((number, then)) if device_us == then => number,
+            Some((number, then)) => {
+                let passed = device_us.checked_sub(then).unwrap_or(self.period_us);
+                let periods = passed.saturating_add(self.period_us / 2) / self.period_us;
+                // A clock that jumped ahead by more than a day tells nothing either.
+                let is_lost = periods > 86_400 * 30;
+                number + if is_lost { 1 } else { periods.max(1) }
+            }
+        };
+        self.last = Some((number, device_us));
+        number
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_follow_the_clock() {
+        let mut counter = FrameCounter::new(33_333);
+        let numbers = [1_000_000, 1_033_340, 1_066_600, 1_166_600, 1_166_600, 1_200_100];
+        let numbers = numbers.map(|t| counter.number(t));
+        assert_eq!(numbers, [0, 1, 2, 5, 5, 6]);
+        assert_eq!(counter.number(400_000), 7, "set back");
+        assert_eq!(counter.number(433_333), 8);
+        assert_eq!(counter.number(u64::MAX), 9, "a jump that no frame counter could follow");
+        // A camera whose clock runs a little differently never gains or loses a number.
+        let mut counter = FrameCounter::new(33_333);
+        for i in 0..100_000 {
+            assert_eq!(counter.number(i * 33_340), i);
+        }
+        // Jitter of less than half a period changes nothing.
+        let mut counter = FrameCounter::new(33_333);
+        for i in 0..1000u64 {
+            assert_eq!(counter.number(1_000_000 + i * 33_333 + (i % 3) * 5_000), i);
+        }
+        assert_eq!(FrameCounter::new(0).number(5), 0);
+    }
+}
