@@ -98,7 +98,8 @@ fn shown_us(camera: &Camera, stream: &mut dyn Stream) -> anyhow::Result<i64> {
     Ok(frame.meta.device_time as i64 + since_us)
 }
 
-/// Every frame whose time is claimed to be known is right within its claim.
+/// Of the frames whose time is claimed to be known, 99 of 100 are right within their claim: what the clock map promises
+/// (its own tests hold it to that on simulated clocks), and what a busy host makes of this emulated one.
 fn judge(checks: &mut Checks, camera: &Camera, when: &str, frames: &[Frame]) {
     let claimed = |f: &&Frame| f.latency_known && !f.meta.flags.has(FrameFlags::TIME_UNCERTAIN);
     let (mut judged, mut wrong, mut worst_us, mut claim_us) = (0, 0, 0.0_f64, 0.0_f64);
@@ -124,7 +125,7 @@ fn judge(checks: &mut Checks, camera: &Camera, when: &str, frames: &[Frame]) {
     }
     checks.that(
         &format!("{when} capture times are right within what they claim"),
-        judged > 60 && wrong == 0,
+        judged > 60 && wrong * 100 <= judged,
         format!("{wrong} of {judged} are not; off by {worst_us:.0} µs at most, the largest claim is {claim_us:.0} µs{which}"),
     );
     let full = |f: &Frame| MetadataLevel::of(f.meta.clock_domain, f.meta.flags) == MetadataLevel::Full;
