@@ -14,6 +14,8 @@ import pytest
 from PIL import Image
 
 import depthrig
+from daemon import fake_daemon
+from depthrig._layout import ExternalState
 from rig import ROOT, WAIT_S, pattern_rows
 
 PYTHON = ROOT / "python"
@@ -67,3 +69,24 @@ def test_the_lines_of_the_readme_run(live: Path) -> None:
     code = code.replace("d435/depth_refined", "pattern/z16").replace("[240, 320]", "[24, 32]") + "    break\n"
     out = run(live, "-c", code)
     assert re.fullmatch(r"\d+ [\d.]+ \(48, 64\) [\d.]+\n", out), out
+
+
+def test_the_external_camera_serves_until_it_is_told_to_stop(folder: Path) -> None:
+    script = str(PYTHON / "examples" / "external_camera.py")
+    env = {**os.environ, "DEPTHRIG_RUNTIME_DIR": str(folder)}
+    command = [sys.executable, script, "--camera", "front", "--rig", "mount"]
+    with (
+        fake_daemon(folder) as daemon,
+        subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
+    ):
+        daemon.until(state=ExternalState.IDLE)
+        daemon.run(1, ("color", "depth"))
+        head, color = daemon.frame("color")
+        assert len(set(color)) > 200, "a moving pattern and no plain colour"
+        assert 0 <= head["arrival_time_ns"] - head["device_time"] < 1e9
+        assert daemon.frame("depth")[0]["payload_len"] == 640 * 480 * 2
+        process.terminate()
+        daemon.until(state=ExternalState.ENDED)
+        out, errors = process.communicate(timeout=WAIT_S)
+    assert (process.returncode, errors) == (0, "")
+    assert out == "session 1: color 640x480 rgb8 30 Hz, depth 640x480 z16 30 Hz\n"

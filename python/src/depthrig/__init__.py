@@ -1,4 +1,4 @@
-"""Subscribe to the streams of a depthrig camera rig: read-only NumPy arrays in shared memory, without a copy.
+"""Read the streams of a depthrig camera rig as NumPy arrays in shared memory, and serve cameras to it.
 
 >>> import depthrig
 >>> with depthrig.Stream("d435/depth") as stream:
@@ -8,10 +8,22 @@
 
 from __future__ import annotations
 
+from ._external import ExternalCamera
+from ._external_mode import ExternalMode
+from ._external_session import ExternalSession, Lent
 from ._frame import Frame
 from ._group import FrameGroup, SetReader
 from ._header import Header, Intrinsics, Pose, Refinement
-from ._layout import ClockDomain, Distortion, DropReason, FrameFlags, PixelFormat, StageStep
+from ._layout import (
+    ClockDomain,
+    Distortion,
+    DropReason,
+    ExternalClock,
+    ExternalReason,
+    FrameFlags,
+    PixelFormat,
+    StageStep,
+)
 from ._runtime import running_rigs
 from ._sets import FrameSet, Sets
 from ._stream import Stream, streams
@@ -19,6 +31,8 @@ from .errors import (
     AmbiguousRig,
     BadFrame,
     BusError,
+    CameraRefused,
+    CameraServed,
     DepthrigError,
     HoldingTooMany,
     RigNotRunning,
@@ -35,10 +49,17 @@ __all__ = [
     "AmbiguousRig",
     "BadFrame",
     "BusError",
+    "CameraRefused",
+    "CameraServed",
     "ClockDomain",
     "DepthrigError",
     "Distortion",
     "DropReason",
+    "ExternalCamera",
+    "ExternalClock",
+    "ExternalMode",
+    "ExternalReason",
+    "ExternalSession",
     "Frame",
     "FrameFlags",
     "FrameGroup",
@@ -46,6 +67,7 @@ __all__ = [
     "Header",
     "HoldingTooMany",
     "Intrinsics",
+    "Lent",
     "PixelFormat",
     "Pose",
     "Refinement",

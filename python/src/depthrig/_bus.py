@@ -1,4 +1,4 @@
-"""The only module that speaks to iceoryx2: opens channels and turns its errors into ours."""
+"""Opens channels for reading, and turns errors of iceoryx2 into ours. Only this module and _ports.py speak to it."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import struct
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +22,44 @@ format, width, height, stride and payload_len. Between publishing and a policy's
 VERSION_BYTES = struct.pack("<4sHH", _layout.HEADER_MAGIC, _layout.HEADER_VERSION, _layout.HEADER_SIZE)
 HeaderBytes = ctypes.c_char * _layout.HEADER_SIZE
 
+_TEXT_SIZE = 32
 _CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "i64": "q", "f32": "f", "f64": "d"}
+
+
+Fields = Sequence[tuple[str, int, str, int]]
+"""A layout as the generated tables have it: name, offset, element type, elements."""
+
+
+def pack_fields(fields: Fields, size: int, values: Mapping[str, Any]) -> bytes:
+    """Return `size` bytes with these values at the places of `fields`; texts are padded with zeros."""
+    raw = bytearray(size)
+    for name, offset, kind, count in fields:
+        value = values[name]
+        if isinstance(value, (str, bytes)):
+            value = value.encode() if isinstance(value, str) else value
+            struct.pack_into(f"<{count}s", raw, offset, value)
+        else:
+            parts = value if isinstance(value, (tuple, list)) else (value,)
+            struct.pack_into(f"<{count}{_CODES[kind]}", raw, offset, *parts)
+    return bytes(raw)
+
+
+def blank_fields(fields: Fields) -> dict[str, Any]:
+    """Return zero for each field."""
+    return {name: b"" if kind == "u8" else 0 if count == 1 else (0,) * count for name, _, kind, count in fields}
+
+
+def unpack_fields(fields: Fields, raw: bytes) -> dict[str, Any]:
+    """Return the values at the places of `fields`: text of 32 bytes and more, bytes of fewer, tuples of several."""
+    values: dict[str, Any] = {}
+    for name, offset, kind, count in fields:
+        if kind == "u8":
+            field = raw[offset : offset + count]
+            values[name] = _layout._text(field) if count >= _TEXT_SIZE else field
+        else:
+            parts = struct.unpack_from(f"<{count}{_CODES[kind]}", raw, offset)
+            values[name] = parts[0] if count == 1 else parts
+    return values
 
 
 class Intrinsics(_layout.IntrinsicsFields):
@@ -218,16 +255,7 @@ class Header(HeaderFields):
     @classmethod
     def pack(cls, values: Mapping[str, Any]) -> bytes:
         """Return the bytes of a header with these values, named as :meth:`to_dict` names them."""
-        raw = bytearray(_layout.HEADER_SIZE)
-        for name, offset, kind, count in _layout.FIELDS:
-            value = values[name]
-            if isinstance(value, (str, bytes)):
-                value = value.encode() if isinstance(value, str) else value
-                struct.pack_into(f"<{count}s", raw, offset, value)
-            else:
-                parts = value if isinstance(value, (tuple, list)) else (value,)
-                struct.pack_into(f"<{count}{_CODES[kind]}", raw, offset, *parts)
-        return bytes(raw)
+        return pack_fields(_layout.FIELDS, _layout.HEADER_SIZE, values)
 
     @property
     def raw(self) -> bytes:

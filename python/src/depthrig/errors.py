@@ -52,3 +52,11 @@ class BadFrame(DepthrigError):
 
 class BusError(DepthrigError):
     """The shared memory cannot be used: permissions, limits, or a failure of iceoryx2."""
+
+
+class CameraServed(DepthrigError):
+    """Another process serves the camera; the message names it."""
+
+
+class CameraRefused(DepthrigError):
+    """The daemon does not take the camera that this process offers; the message is the daemon's."""

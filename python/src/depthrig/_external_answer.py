@@ -1,0 +1,52 @@
+"""What the daemon says to a process that serves a camera, read and checked."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from . import _layout as layout
+from ._header import unpack_fields
+from ._layout import ExternalReason, ExternalWant
+
+
+class Answer:
+    """What the daemon wants, as it was read."""
+
+    __slots__ = ("heard", "modes", "reason", "sent_ns", "session", "text", "want")
+
+    def __init__(self, values: dict[str, Any], modes: bytes) -> None:
+        self.session: int = values["session"]
+        self.sent_ns: int = values["sent_ns"]
+        self.want = ExternalWant(values["want"])
+        self.reason: int = values["reason"]
+        self.text: str = values["text"]
+        self.modes = modes
+        self.heard = time.monotonic()
+
+    @property
+    def fresh(self) -> bool:
+        """Whether the daemon has been heard lately."""
+        return time.monotonic() - self.heard <= layout.EXTERNAL_SILENCE_S
+
+    @property
+    def reason_name(self) -> str:
+        known = {int(r): r.name.lower() for r in ExternalReason}
+        return known.get(self.reason, f"reason {self.reason}")
+
+
+def read_answer(message: tuple[bytes, bytes], instance: int, modes: int) -> Answer | None:
+    """Read an answer; None for one that is not meant for this process, or that it cannot understand."""
+    head, payload = message
+    values = unpack_fields(layout.EXTERNAL_ANSWER_FIELDS, head)
+    if values["magic"] != layout.EXTERNAL_ANSWER_MAGIC or values["instance"] != instance:
+        return None
+    if values["version"] != layout.EXTERNAL_VERSION or values["size"] != layout.EXTERNAL_ANSWER_SIZE:
+        return None
+    if values["want"] not in list(ExternalWant):
+        return None
+    if time.monotonic_ns() - values["sent_ns"] > layout.EXTERNAL_SILENCE_S * 1e9:
+        return None
+    if values["want"] == ExternalWant.RUN and not (len(payload) == values["modes"] == modes):
+        return None
+    return Answer(values, payload)

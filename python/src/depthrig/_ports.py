@@ -1,0 +1,166 @@
+"""The channels of the hand-shake with the daemon, opened or made: the second module that speaks to iceoryx2.
+
+docs/external.md has the settings; either side may come first, so they are the same on both.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import iceoryx2 as iox2
+
+from . import _layout as layout
+from ._bus import _OTHER_VERSION, _PASSING, Bus, _header_type, _retry
+from .errors import BusError, VersionMismatch
+
+OFFER = _header_type(layout.EXTERNAL_OFFER_TYPE, layout.EXTERNAL_OFFER_SIZE, layout.EXTERNAL_ALIGN)
+ANSWER = _header_type(layout.EXTERNAL_ANSWER_TYPE, layout.EXTERNAL_ANSWER_SIZE, layout.EXTERNAL_ALIGN)
+FRAME = _header_type(layout.EXTERNAL_FRAME_TYPE, layout.EXTERNAL_FRAME_SIZE, layout.EXTERNAL_ALIGN)
+
+# A frame that is being written, and two that are lent out at the same time.
+_LOANS = 3
+
+
+def _service(bus: Bus, name: str, header: type[ctypes.Structure], history: int) -> Any:
+    """Open or make a channel of the hand-shake."""
+    schema = iox2.AttributeVerifier.new().require(
+        iox2.AttributeKey.new("schema"), iox2.AttributeValue.new(layout.EXTERNAL_SCHEMA)
+    )
+
+    def attempt() -> Any:
+        builder = bus.node.service_builder(iox2.ServiceName.new(name))
+        builder = builder.publish_subscribe(iox2.Slice[ctypes.c_uint8]).user_header(header)
+        builder = builder.max_publishers(layout.EXTERNAL_MAX_PUBLISHERS)
+        builder = builder.max_subscribers(layout.EXTERNAL_MAX_SUBSCRIBERS)
+        builder = builder.subscriber_max_buffer_size(layout.EXTERNAL_BUFFER)
+        builder = builder.subscriber_max_borrowed_samples(layout.EXTERNAL_MAX_HELD)
+        builder = builder.max_nodes(layout.EXTERNAL_MAX_NODES).history_size(history).enable_safe_overflow(True)
+        return builder.open_or_create_with_attributes(schema)
+
+    try:
+        return _retry(attempt, iox2.PublishSubscribeOpenOrCreateError, _PASSING)
+    except iox2.PublishSubscribeOpenOrCreateError as e:
+        raise _open_error(name, str(e)) from e
+
+
+def _events(bus: Bus, name: str) -> Any:
+    """Open or make the event of a channel."""
+
+    def attempt() -> Any:
+        builder = bus.node.service_builder(iox2.ServiceName.new(name)).event()
+        builder = builder.max_notifiers(layout.EXTERNAL_MAX_EVENT_PORTS)
+        builder = builder.max_listeners(layout.EXTERNAL_MAX_EVENT_PORTS)
+        return builder.max_nodes(layout.EXTERNAL_MAX_NODES).open_or_create()
+
+    try:
+        return _retry(attempt, iox2.EventOpenOrCreateError, _PASSING)
+    except iox2.EventOpenOrCreateError as e:
+        raise _open_error(name, str(e)) from e
+
+
+def _open_error(name: str, why: str) -> BusError | VersionMismatch:
+    if any(part in why for part in _OTHER_VERSION):
+        return VersionMismatch(
+            f"channel {name} was made by another version of depthrig or iceoryx2 ({why}); install the `depthrig` "
+            "package of the daemon's version, and restart programs that still hold the channel in the other one"
+        )
+    return BusError(f"channel {name} cannot be opened ({why}); is the folder this user's, and /dev/shm not full?")
+
+
+class Slot:
+    """A slot of shared memory on loan; sent, or given back when it is forgotten."""
+
+    __slots__ = ("_sample", "address", "header_address", "length")
+
+    def __init__(self, sample: Any, length: int) -> None:
+        self._sample = sample
+        self.address: int = sample.payload_ptr
+        self.header_address: int = sample.user_header_ptr
+        self.length = length
+
+    def send(self) -> int:
+        """Send it; returns how many received it. It is of no more use then."""
+        sample, self._sample = self._sample, None
+        if sample is None:
+            raise ValueError("this slot was sent already")
+        return int(sample.send())
+
+
+class Sender:
+    """The writing end of a channel."""
+
+    def __init__(self, bus: Bus, name: str, header: type[ctypes.Structure], length: int, slots: int, history: int):
+        self.name = name
+        self._service = _service(bus, name, header, history)
+        builder = self._service.publisher_builder().initial_max_slice_len(max(length, 1))
+        builder = builder.allocation_strategy(iox2.AllocationStrategy.Static).max_loaned_samples(_LOANS)
+        try:
+            self._publisher = builder.override_sample_preallocation(slots).create()
+        except iox2.PublisherCreateError as e:
+            raise BusError(
+                f"channel {name} cannot be written ({e}): {slots} slots of {length} bytes; is /dev/shm full, or does "
+                "another process still serve the camera?"
+            ) from e
+
+    def loan(self, length: int) -> Slot | None:
+        """Lend a slot of `length` bytes; None when the other side holds them all."""
+        try:
+            return Slot(self._publisher.loan_slice_uninit(length).assume_init(), length)
+        except iox2.LoanError as e:
+            if str(e) in ("OutOfMemory", "ExceedsMaxLoans"):
+                return None
+            raise BusError(f"channel {self.name}: no slot of {length} bytes can be had ({e})") from e
+
+
+class Bell:
+    """Wakes those who wait for a channel."""
+
+    def __init__(self, bus: Bus, name: str) -> None:
+        self._events = _events(bus, name)
+        event = iox2.EventId.new(layout.EXTERNAL_EVENT_ID)
+        try:
+            self._notifier = self._events.notifier_builder().default_event_id(event).create()
+        except iox2.NotifierCreateError as e:
+            raise BusError(f"the event of channel {name} cannot be raised ({e})") from e
+
+    def ring(self) -> None:
+        """Wake them. That nobody is there, or somebody's queue is full, is no error: then it is awake."""
+        try:
+            self._notifier.notify()
+        except iox2.NotifierNotifyError:
+            return
+
+
+class Letters:
+    """The reading end of a channel of messages: the newest one counts."""
+
+    def __init__(self, bus: Bus, name: str, header: type[ctypes.Structure], header_size: int) -> None:
+        self.name = name
+        self._size = header_size
+        self._service = _service(bus, name, header, 1)
+        self._events = _events(bus, name)
+        try:
+            self._subscriber = self._service.subscriber_builder().create()
+            self._listener = self._events.listener_builder().create()
+        except (iox2.SubscriberCreateError, iox2.ListenerCreateError) as e:
+            raise BusError(f"channel {name} cannot be read ({e})") from e
+
+    def take(self) -> tuple[bytes, bytes] | None:
+        """Return the oldest unread message's header and payload, or None."""
+        try:
+            sample = self._subscriber.receive()
+        except (iox2.ReceiveError, iox2.ConnectionFailure) as e:
+            raise BusError(f"channel {self.name} cannot be read ({e})") from e
+        if sample is None:
+            return None
+        header = ctypes.string_at(sample.user_header_ptr, self._size)
+        return header, ctypes.string_at(sample.payload_ptr, sample.header.number_of_elements)
+
+    def wait(self, seconds: float) -> None:
+        """Sleep until something was sent or `seconds` have passed, without Python's lock."""
+        try:
+            self._listener.timed_wait(iox2.Duration.from_nanos(max(0, int(seconds * 1e9))))
+        except iox2.ListenerWaitError as e:
+            if str(e) != "InterruptSignal":
+                raise BusError(f"channel {self.name}: waiting failed ({e})") from e
