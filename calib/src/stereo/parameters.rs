@@ -65,8 +65,12 @@ pub struct Parameters {
     pub half_resolution: bool,
     /// Penalty of a step of one disparity between neighbours along a path, in census bits.
     pub p1: u8,
-    /// Penalty of a larger step, in census bits; at most 63.
+    /// Penalty of a larger step where grey does not change along the path, in census bits; at most 63.
     pub p2: u8,
+    /// What `p2` comes down to where grey changes; at least `p1`.
+    pub p2_least: u8,
+    /// Change of grey from which on `p2` comes down, by 1 for each level of grey.
+    pub p2_slack: u8,
     /// By how many percent the best cost must be below the best that is not its neighbour.
     pub uniqueness_percent: u8,
     /// Largest difference between the left and the right view's disparity, in pixels.
@@ -77,6 +81,10 @@ pub struct Parameters {
     pub speckle_step_px: f32,
     /// Median of 3x3 over what is valid.
     pub median: bool,
+    /// Gaps of at most this many pixels in a row or a column are filled when both ends are of one surface; 0 fills none.
+    pub gap_px: u32,
+    /// By how many pixels of disparity the ends of such a gap may differ.
+    pub gap_step_px: f32,
 }
 
 impl Parameters {
@@ -86,24 +94,30 @@ impl Parameters {
             preset,
             max_disparity,
             half_resolution: matches!(preset, Preset::Performance),
-            p1: 10,
-            p2: 60,
-            uniqueness_percent: 5,
-            left_right_px: 1,
+            p1: 6,
+            p2: 50,
+            p2_least: 15,
+            p2_slack: 4,
+            uniqueness_percent: 0,
+            left_right_px: 2,
             speckle_px: 100,
             speckle_step_px: 1.0,
             median: true,
+            gap_px: 16,
+            gap_step_px: 2.0,
         }
     }
 
     /// Every number as `key=value` words, for the metadata of what is made with them.
     pub fn describe(&self) -> String {
-        let Self { preset, max_disparity, half_resolution, p1, p2, uniqueness_percent, .. } = self;
-        let Self { left_right_px, speckle_px, speckle_step_px, median, .. } = self;
+        let Self { preset, max_disparity, half_resolution, p1, p2, p2_least, p2_slack, .. } = self;
+        let Self { uniqueness_percent, left_right_px, speckle_px, speckle_step_px, .. } = self;
+        let Self { median, gap_px, gap_step_px, .. } = self;
         format!(
             "preset={preset} max_disparity={max_disparity} half_resolution={half_resolution} p1={p1} p2={p2} \
-             uniqueness_percent={uniqueness_percent} left_right_px={left_right_px} speckle_px={speckle_px} \
-             speckle_step_px={speckle_step_px} median={median}"
+             p2_least={p2_least} p2_slack={p2_slack} uniqueness_percent={uniqueness_percent} \
+             left_right_px={left_right_px} speckle_px={speckle_px} speckle_step_px={speckle_step_px} median={median} \
+             gap_px={gap_px} gap_step_px={gap_step_px}"
         )
     }
 
@@ -119,14 +133,16 @@ impl Parameters {
                 self.max_disparity
             ));
         }
-        if self.p1 == 0 || self.p1 > self.p2 || self.p2 > 63 {
+        let (p1, least, p2) = (self.p1, self.p2_least, self.p2);
+        if p1 == 0 || p1 > least || least > p2 || p2 > 63 {
             return wrong(format!(
-                "penalties of {} and {} do not go together: 0 < p1 <= p2 <= 63",
-                self.p1, self.p2
+                "penalties of p1 {p1}, p2_least {least} and p2 {p2} do not go together: 0 < p1 <= p2_least <= p2 <= 63"
             ));
         }
-        if !(self.speckle_step_px >= 0.0 && self.speckle_step_px.is_finite()) {
-            return wrong(format!("a speckle step of {} pixels is none", self.speckle_step_px));
+        for (what, step) in [("speckle_step_px", self.speckle_step_px), ("gap_step_px", self.gap_step_px)] {
+            if !(step >= 0.0 && step.is_finite()) {
+                return wrong(format!("a {what} of {step} pixels is none"));
+            }
         }
         Ok(())
     }

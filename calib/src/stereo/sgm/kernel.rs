@@ -1,0 +1,237 @@
+//! The inner loop: the cost of every disparity of a pixel, four paths through it, and in the second pass the best sum.
+#![allow(clippy::needless_range_loop)] // closures would not be compiled for the processor
+#![allow(unsafe_code)] // as the vectors that it is made of
+
+use super::lanes::Lanes;
+use core::mem::MaybeUninit;
+
+/// Planes of a picture: three bytes of census and the grey value.
+pub const PLANES: usize = 4;
+/// Largest difference of grey that counts, in the cost's units.
+const GREY_MOST: u8 = 7;
+/// Cost of what is beyond the last disparity: a path that crosses it never wins, and no sum of it overflows a byte.
+const BEYOND: u8 = 127;
+/// What lies beside the first and the last disparity; with a penalty it stays below 256.
+const EDGE: u8 = 190;
+
+/// What one row of a pass works on. Steps count pixels in the direction of the pass: from the left in the first, from the
+/// right in the second.
+#[derive(Debug, Clone, Copy)]
+pub struct Row {
+    /// Pixels of the row.
+    pub width: usize,
+    /// [`PLANES`] of the left picture, `width` apart.
+    pub left: *const u8,
+    /// [`PLANES`] of the right picture, mirrored: pixel `width - 1 - k` is byte `k / n` of phase `k % n`, with `n`
+    /// vectors a pixel. Beyond the picture's left edge its first column is repeated.
+    pub right: *const u8,
+    /// Bytes of a phase.
+    pub reach: usize,
+    /// Penalty of a step of one disparity.
+    pub small: u8,
+    /// Penalties of larger steps for the four paths, `width` apart.
+    pub large: *const u8,
+    /// Three rings of cells: the paths from the row before, each cell where its path goes on.
+    pub cells: [*mut u8; 3],
+    /// The least of each cell.
+    pub least: [*mut u8; 3],
+    /// Cells of a ring.
+    pub ring: usize,
+    /// Place of step 0 in each ring.
+    pub base: [usize; 3],
+    /// Sums of the first pass.
+    pub sums: *mut u8,
+    /// For each vector the disparities of its lanes, then [`u8::MAX`] in lanes that are beyond the last disparity.
+    pub lanes: *const u8,
+    /// Number of disparities is that of all lanes.
+    pub full: bool,
+    /// Of each pixel, in the second pass.
+    pub winners: *mut Winner,
+    /// The right view's disparity of each pixel, in the second pass.
+    pub mirrored: *mut u8,
+}
+
+/// The best disparity of a pixel, and what is around it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[repr(C)]
+pub struct Winner {
+    /// The disparity of the least cost, the smallest of several.
+    pub disparity: u8,
+    /// Its cost.
+    pub cost: u8,
+    /// Cost of the disparity before it; 255 when it is the first.
+    pub before: u8,
+    /// Cost of the disparity after it; 255 when it is the last.
+    pub after: u8,
+    /// The least cost of those that are not beside it; 255 when there is none.
+    pub second: u8,
+}
+
+/// What goes from one step of a row to the next.
+#[derive(Clone, Copy)]
+pub struct Carry<S: Lanes, const N: usize> {
+    along: [S; N],
+    least: S,
+    window: [[S::Keys; 2]; N],
+}
+
+impl<S: Lanes, const N: usize> Carry<S, N> {
+    /// Before the first step.
+    #[inline(always)]
+    pub unsafe fn new() -> Self {
+        // SAFETY: as the caller promises.
+        unsafe { Self { along: [S::splat(0); N], least: S::splat(0), window: [S::no_keys(); N] } }
+    }
+}
+
+/// What a path adds to the cost: `before` are the path's costs one pixel earlier, `least` the least of them.
+#[inline(always)]
+unsafe fn step<S: Lanes, const N: usize>(before: &[S; N], least: S, small: S, large: S) -> [S; N] {
+    // SAFETY: as the caller promises.
+    unsafe {
+        let edge = S::splat(EDGE);
+        let (first, last) = (before[N - 1].up(edge), before[0].down(edge));
+        let mut more = *before;
+        for i in 0..N {
+            let lower = if i == 0 { first } else { before[i - 1] };
+            let upper = if i == N - 1 { last } else { before[i + 1] };
+            more[i] = before[i].min(lower.min(upper).add(small)).sub(least).min(large);
+        }
+        more
+    }
+}
+
+/// Costs along a path, and the least of each lane.
+#[inline(always)]
+unsafe fn grown<S: Lanes, const N: usize>(cost: &[S; N], more: &[S; N]) -> ([S; N], S) {
+    // SAFETY: as the caller promises.
+    unsafe {
+        let mut path = *cost;
+        let mut least = cost[0].add(more[0]);
+        for i in 0..N {
+            path[i] = cost[i].add(more[i]);
+            least = least.min(path[i]);
+        }
+        (path, least)
+    }
+}
+
+/// Some steps of a row: `BACK` is the second pass.
+///
+/// # Safety
+/// The processor has what `S` needs; every pointer of `row` reaches as its comment says; nobody else writes there.
+#[inline(always)]
+pub unsafe fn run<S: Lanes, const N: usize, const BACK: bool>(
+    row: &Row,
+    carry: &mut Carry<S, N>,
+    steps: core::ops::Range<usize>,
+) {
+    let cell = N * S::LANES;
+    let w = row.width;
+    // SAFETY: as the caller promises.
+    unsafe {
+        let small = S::splat(row.small);
+        let grey_most = S::splat(GREY_MOST);
+        let Carry { mut along, mut least, mut window } = *carry;
+        for s in steps {
+            let x = if BACK { w - 1 - s } else { s };
+            let here = row.left.add(x);
+            let left = [S::splat(*here), S::splat(*here.add(w)), S::splat(*here.add(2 * w))];
+            let grey = S::splat(*here.add(3 * w));
+            let mut cost = [small; N];
+            for i in 0..N {
+                let k = w - 1 - x + i;
+                let at = row.right.add((k % N) * row.reach + k / N);
+                let plane = N * row.reach;
+                let right = [S::load(at), S::load(at.add(plane)), S::load(at.add(2 * plane))];
+                let difference = grey.quarter_of_difference(S::load(at.add(3 * plane)));
+                cost[i] = S::hamming(left, right).add(difference.min(grey_most));
+            }
+            if !row.full {
+                let beyond = S::splat(BEYOND);
+                for i in 0..N {
+                    let lanes = S::load(row.lanes.add(cell + i * S::LANES));
+                    cost[i] = cost[i].or(lanes.min(beyond));
+                }
+            }
+
+            let more = step(&along, least, small, S::splat(*row.large.add(x)));
+            let lowest;
+            (along, lowest) = grown(&cost, &more);
+            least = lowest.least_everywhere();
+            let mut sum = more;
+            for p in 0..3 {
+                let at = row.base[p] + s;
+                let at = if at >= row.ring { at - row.ring } else { at };
+                let (here, low) = (row.cells[p].add(at * cell), row.least[p].add(at));
+                let mut before = [small; N];
+                for i in 0..N {
+                    before[i] = S::load(here.add(i * S::LANES));
+                }
+                let large = S::splat(*row.large.add((p + 1) * w + x));
+                let more = step(&before, S::splat(*low), small, large);
+                let (path, lowest) = grown(&cost, &more);
+                for i in 0..N {
+                    path[i].store(here.add(i * S::LANES));
+                    sum[i] = sum[i].add(more[i]);
+                }
+                *low = lowest.least();
+            }
+
+            let sums = row.sums.add(x * cell);
+            if !BACK {
+                for i in 0..N {
+                    sum[i].stream(sums.add(i * S::LANES));
+                }
+                continue;
+            }
+            let mut total = sum;
+            for i in 0..N {
+                let both = sum[i].add_saturating(S::load(sums.add(i * S::LANES)));
+                total[i] = both.average(cost[i].times_8());
+                if !row.full {
+                    total[i] = total[i].or(S::load(row.lanes.add(cell + i * S::LANES)));
+                }
+            }
+            let mut number = total;
+            let mut best = S::no_keys();
+            for i in 0..N {
+                number[i] = S::load(row.lanes.add(i * S::LANES));
+                let keys = total[i].keys(number[i]);
+                best = S::min_keys(best, keys);
+                window[i] = S::min_keys(window[i], keys);
+            }
+            // The right pixel at the same place has now been seen from all its disparities.
+            *row.mirrored.add(x) = S::first_key(window[0]) as u8;
+            let last = S::keys_down(window[0]);
+            for i in 1..N {
+                window[i - 1] = window[i];
+            }
+            window[N - 1] = last;
+
+            let key = S::least_key(best);
+            let d = key as u8;
+            let around = S::splat(d);
+            let mut other = total[0].or(number[0].beside(around));
+            for i in 1..N {
+                other = other.min(total[i].or(number[i].beside(around)));
+            }
+            // At most 256 bytes, as MAX_DISPARITIES is; every byte that is read was written.
+            let mut costs = MaybeUninit::<[u8; 256]>::uninit();
+            let costs = costs.as_mut_ptr().cast::<u8>();
+            for i in 0..N {
+                total[i].store(costs.add(i * S::LANES));
+            }
+            let at = |d: usize| *costs.add((d % N) * S::LANES + d / N);
+            let d_ = d as usize;
+            *row.winners.add(x) = Winner {
+                disparity: d,
+                cost: (key >> 8) as u8,
+                before: if d_ == 0 { u8::MAX } else { at(d_ - 1) },
+                after: if d_ + 1 == cell { u8::MAX } else { at(d_ + 1) },
+                second: other.least(),
+            };
+        }
+        *carry = Carry { along, least, window };
+    }
+}
