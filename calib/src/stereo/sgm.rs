@@ -20,6 +20,8 @@ mod lanes;
 mod model;
 mod pass;
 mod planes;
+#[cfg(test)]
+mod tests;
 mod volume;
 
 /// Largest side of a picture.
@@ -62,7 +64,13 @@ impl SgmMatcher {
     }
 
     /// The same with the vectors of `form`, which the processor must have.
-    fn with_form(width: usize, height: usize, parameters: &Parameters, threads: usize, form: Form) -> Result<Self> {
+    fn with_form(
+        width: usize,
+        height: usize,
+        parameters: &Parameters,
+        threads: usize,
+        form: Form,
+    ) -> Result<Self> {
         parameters.check()?;
         if !(1..=MAX_SIDE).contains(&width) || !(1..=MAX_SIDE).contains(&height) {
             return Err(Error::new(
@@ -76,7 +84,8 @@ impl SgmMatcher {
             ((width, height), parameters.max_disparity)
         };
         let threads = threads.clamp(1, size.1.min(64));
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|i| format!("stereo-{i}"));
+        let pool =
+            rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|i| format!("stereo-{i}"));
         let pool = if threads > 1 { pool.build().ok() } else { None };
         let threads = if pool.is_some() { threads } else { 1 };
         let Parameters { p1: small, p2: most, p2_least: least, p2_slack: slack, .. } = *parameters;
@@ -178,7 +187,13 @@ impl Matcher for SgmMatcher {
             self.matched(&StereoPair::new(left, right), &mut half.confidence);
             half.map.copy_from_slice(&self.maps[0][..w * h]);
             let full = (self.width, self.height);
-            filter::double(self.size, (&half.map, &half.confidence), full, &mut self.maps[0], &mut out.confidence);
+            filter::double(
+                self.size,
+                (&half.map, &half.confidence),
+                full,
+                &mut self.maps[0],
+                &mut out.confidence,
+            );
             self.half = Some(half);
         } else {
             self.matched(pair, &mut out.confidence);

@@ -1,5 +1,6 @@
 //! Vectors of AVX2.
 #![allow(unsafe_code)] // vectors of one processor are unsafe to use
+#![allow(clippy::inline_always)] // what is not inlined is compiled for the oldest processor
 
 use super::lanes::Lanes;
 #[allow(clippy::wildcard_imports, reason = "as everybody does with intrinsics")]
@@ -63,7 +64,8 @@ impl Lanes for Avx2 {
     #[inline(always)]
     unsafe fn quarter_of_difference(self, other: Self) -> Self {
         unsafe {
-            let difference = _mm256_or_si256(_mm256_subs_epu8(self.0, other.0), _mm256_subs_epu8(other.0, self.0));
+            let difference =
+                _mm256_or_si256(_mm256_subs_epu8(self.0, other.0), _mm256_subs_epu8(other.0, self.0));
             Self(_mm256_and_si256(_mm256_srli_epi16::<2>(difference), _mm256_set1_epi8(0x3f)))
         }
     }
@@ -79,7 +81,8 @@ impl Lanes for Avx2 {
             let twos = _mm256_or_si256(_mm256_and_si256(a, b), _mm256_and_si256(half, c));
             let low = _mm256_set1_epi8(0x0f);
             let count = _mm256_setr_epi8(
-                0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4, 0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4,
+                0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4, 0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3,
+                4,
             );
             let double = _mm256_add_epi8(count, count);
             let a = _mm256_shuffle_epi8(count, _mm256_and_si256(ones, low));
@@ -92,7 +95,8 @@ impl Lanes for Avx2 {
     #[inline(always)]
     unsafe fn beside(self, other: Self) -> Self {
         unsafe {
-            let difference = _mm256_or_si256(_mm256_subs_epu8(self.0, other.0), _mm256_subs_epu8(other.0, self.0));
+            let difference =
+                _mm256_or_si256(_mm256_subs_epu8(self.0, other.0), _mm256_subs_epu8(other.0, self.0));
             Self(_mm256_cmpeq_epi8(_mm256_min_epu8(difference, _mm256_set1_epi8(1)), difference))
         }
     }

@@ -1,5 +1,6 @@
 //! Vectors of AVX-512, with the byte permutation and the byte popcount that came with Ice Lake and Zen 4.
 #![allow(unsafe_code)] // vectors of one processor are unsafe to use
+#![allow(clippy::inline_always)] // what is not inlined is compiled for the oldest processor
 
 use super::lanes::Lanes;
 #[allow(clippy::wildcard_imports, reason = "as everybody does with intrinsics")]
@@ -76,7 +77,8 @@ impl Lanes for Avx512 {
     #[inline(always)]
     unsafe fn quarter_of_difference(self, other: Self) -> Self {
         unsafe {
-            let difference = _mm512_or_si512(_mm512_subs_epu8(self.0, other.0), _mm512_subs_epu8(other.0, self.0));
+            let difference =
+                _mm512_or_si512(_mm512_subs_epu8(self.0, other.0), _mm512_subs_epu8(other.0, self.0));
             Self(_mm512_and_si512(_mm512_srli_epi16::<2>(difference), _mm512_set1_epi8(0x3f)))
         }
     }
@@ -92,7 +94,8 @@ impl Lanes for Avx512 {
     #[inline(always)]
     unsafe fn beside(self, other: Self) -> Self {
         unsafe {
-            let difference = _mm512_or_si512(_mm512_subs_epu8(self.0, other.0), _mm512_subs_epu8(other.0, self.0));
+            let difference =
+                _mm512_or_si512(_mm512_subs_epu8(self.0, other.0), _mm512_subs_epu8(other.0, self.0));
             Self(_mm512_movm_epi8(_mm512_cmple_epu8_mask(difference, _mm512_set1_epi8(1))))
         }
     }

@@ -28,7 +28,7 @@ pub fn choose(
         let agree = there.is_some_and(|e| e.abs_diff(d) <= parameters.left_right_px);
         let margin = w.second.saturating_sub(w.cost);
         if agree && u32::from(margin) * 100 >= least_margin * u32::from(w.cost) {
-            *out = (i32::from(d) * i32::from(ONE) + fraction(w, last)) as u16;
+            *out = (i32::from(d) * i32::from(ONE) + fraction(*w, last)) as u16;
             *confidence = 1 + margin.min(127) * 2;
         } else {
             (*out, *confidence) = (NONE, 0);
@@ -38,7 +38,7 @@ pub fn choose(
 
 /// Where two lines of equal and opposite slope through the three costs meet, in 256ths of a pixel from the middle one
 /// (the equiangular fit, Shimizu and Okutomi 2005); 0 at both ends of the search.
-fn fraction(w: &Winner, last: u8) -> i32 {
+fn fraction(w: Winner, last: u8) -> i32 {
     if w.disparity == 0 || w.disparity == last {
         return 0;
     }

@@ -1,34 +1,41 @@
 //! What is done to disparities afterwards: median, speckle, short gaps, twice the size.
+#![allow(clippy::inline_always)] // what is not inlined is compiled for the oldest processor
 
 use super::choose::{NONE, ONE};
 use crate::simd::for_every_processor;
 
-/// Rows of three, sorted: the median of all nine follows (Smith 1996, nineteen exchanges).
-macro_rules! median_of_nine {
-    ($v:expr) => {{
-        let mut v = $v;
-        for (i, j) in [
-            (1, 2), (4, 5), (7, 8), (0, 1), (3, 4), (6, 7), (1, 2), (4, 5), (7, 8), (0, 3), (5, 8), (4, 7), (3, 6),
-            (1, 4), (2, 5), (4, 7), (4, 2), (6, 4), (4, 2),
-        ] {
-            (v[i], v[j]) = (v[i].min(v[j]), v[i].max(v[j]));
-        }
-        v[4]
-    }};
-}
-
 for_every_processor! {
-    /// A row but for its first and last pixel; each slice is that row's, `n` long.
+    /// A row but for its first and last pixel; each slice is that row's, as long as `out` and two more.
     fn median_row(above: &[u16], row: &[u16], below: &[u16], out: &mut [u16]) {
         let n = out.len();
-        let (a, r, b) = (&above[..n], &row[..n], &below[..n]);
-        for x in 1..n.max(2) - 1 {
-            let middle = r[x];
-            let or_middle = |v: u16| if v == NONE { middle } else { v };
-            let nine = [a[x - 1], a[x], a[x + 1], r[x - 1], middle, r[x + 1], b[x - 1], b[x], b[x + 1]];
-            out[x] = median_of_nine!(nine.map(or_middle));
+        let (a, b, c) = (&above[..n], &above[1..=n], &above[2..n + 2]);
+        let (d, e, f) = (&row[..n], &row[1..=n], &row[2..n + 2]);
+        let (g, h, i) = (&below[..n], &below[1..=n], &below[2..n + 2]);
+        for x in 0..n {
+            let m = e[x];
+            let [a, b, c] = sorted(or(a[x], m), or(b[x], m), or(c[x], m));
+            let [d, e, f] = sorted(or(d[x], m), m, or(f[x], m));
+            let [g, h, i] = sorted(or(g[x], m), or(h[x], m), or(i[x], m));
+            // Of sorted triples: the middle of the largest least, the middle middle and the smallest most (Smith 1996).
+            let low = a.max(d).max(g);
+            let middle = sorted(b, e, h)[1];
+            let high = c.min(f).min(i);
+            out[x] = sorted(low, middle, high)[1];
         }
     }
+}
+
+/// `v`, or `middle` where there is none.
+#[inline(always)]
+fn or(v: u16, middle: u16) -> u16 {
+    if v == NONE { middle } else { v }
+}
+
+/// The three in order.
+#[inline(always)]
+fn sorted(a: u16, b: u16, c: u16) -> [u16; 3] {
+    let (low, high) = (a.min(b), a.max(b));
+    [low.min(c), high.min(low.max(c)), high.max(c)]
 }
 
 /// The median of 3x3 around each disparity; where a neighbour has none, the middle stands in for it. The outermost
@@ -36,9 +43,12 @@ for_every_processor! {
 pub fn median(width: usize, from: &[u16], to: &mut [u16]) {
     to.copy_from_slice(from);
     let height = from.len() / width;
+    if width < 3 {
+        return;
+    }
     for y in 1..height.max(2) - 1 {
         let row = |y: usize| &from[y * width..][..width];
-        median_row(row(y - 1), row(y), row(y + 1), &mut to[y * width..][..width]);
+        median_row(row(y - 1), row(y), row(y + 1), &mut to[y * width + 1..][..width - 2]);
     }
 }
 
@@ -141,7 +151,14 @@ fn root(runs: &mut [Run], mut i: usize) -> usize {
 
 /// Fills gaps of at most `most` pixels in a row, and then in a column, whose ends differ by at most `step`: on a line from
 /// one end to the other, and with the least confidence.
-pub fn fill_gaps(width: usize, map: &mut [u16], confidence: &mut [u8], most: usize, step: u16, last: &mut [u32]) {
+pub fn fill_gaps(
+    width: usize,
+    map: &mut [u16],
+    confidence: &mut [u8],
+    most: usize,
+    step: u16,
+    last: &mut [u32],
+) {
     for (row, confidence) in map.chunks_exact_mut(width).zip(confidence.chunks_exact_mut(width)) {
         let mut x = 0;
         while x < width {

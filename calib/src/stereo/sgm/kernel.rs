@@ -1,6 +1,7 @@
 //! The inner loop: the cost of every disparity of a pixel, four paths through it, and in the second pass the best sum.
 #![allow(clippy::needless_range_loop)] // closures would not be compiled for the processor
 #![allow(unsafe_code)] // as the vectors that it is made of
+#![allow(clippy::inline_always)] // what is not inlined is compiled for the oldest processor
 
 use super::lanes::Lanes;
 use core::mem::MaybeUninit;
@@ -193,45 +194,61 @@ pub unsafe fn run<S: Lanes, const N: usize, const BACK: bool>(
                     total[i] = total[i].or(S::load(row.lanes.add(cell + i * S::LANES)));
                 }
             }
-            let mut number = total;
-            let mut best = S::no_keys();
-            for i in 0..N {
-                number[i] = S::load(row.lanes.add(i * S::LANES));
-                let keys = total[i].keys(number[i]);
-                best = S::min_keys(best, keys);
-                window[i] = S::min_keys(window[i], keys);
-            }
-            // The right pixel at the same place has now been seen from all its disparities.
-            *row.mirrored.add(x) = S::first_key(window[0]) as u8;
-            let last = S::keys_down(window[0]);
-            for i in 1..N {
-                window[i - 1] = window[i];
-            }
-            window[N - 1] = last;
-
-            let key = S::least_key(best);
-            let d = key as u8;
-            let around = S::splat(d);
-            let mut other = total[0].or(number[0].beside(around));
-            for i in 1..N {
-                other = other.min(total[i].or(number[i].beside(around)));
-            }
-            // At most 256 bytes, as MAX_DISPARITIES is; every byte that is read was written.
-            let mut costs = MaybeUninit::<[u8; 256]>::uninit();
-            let costs = costs.as_mut_ptr().cast::<u8>();
-            for i in 0..N {
-                total[i].store(costs.add(i * S::LANES));
-            }
-            let at = |d: usize| *costs.add((d % N) * S::LANES + d / N);
-            let d_ = d as usize;
-            *row.winners.add(x) = Winner {
-                disparity: d,
-                cost: (key >> 8) as u8,
-                before: if d_ == 0 { u8::MAX } else { at(d_ - 1) },
-                after: if d_ + 1 == cell { u8::MAX } else { at(d_ + 1) },
-                second: other.least(),
-            };
+            choose(row, x, &total, &mut window);
         }
         *carry = Carry { along, least, window };
+    }
+}
+
+/// The best of the costs of pixel `x`, and what the right view makes of them. `window[i]` has the best keys of the right pixels
+/// that pixel `x` is compared with, each in the lane of its disparity.
+#[inline(always)]
+unsafe fn choose<S: Lanes, const N: usize>(
+    row: &Row,
+    x: usize,
+    total: &[S; N],
+    window: &mut [[S::Keys; 2]; N],
+) {
+    // SAFETY: as the caller promises.
+    unsafe {
+        let mut number = *total;
+        let mut best = S::no_keys();
+        for i in 0..N {
+            number[i] = S::load(row.lanes.add(i * S::LANES));
+            let keys = total[i].keys(number[i]);
+            best = S::min_keys(best, keys);
+            window[i] = S::min_keys(window[i], keys);
+        }
+        // The right pixel at the same place has now been seen from all its disparities.
+        *row.mirrored.add(x) = S::first_key(window[0]) as u8;
+        let last = S::keys_down(window[0]);
+        for i in 1..N {
+            window[i - 1] = window[i];
+        }
+        window[N - 1] = last;
+
+        let key = S::least_key(best);
+        let disparity = key as u8;
+        let around = S::splat(disparity);
+        let mut other = S::splat(u8::MAX);
+        // At most 256 bytes, as MAX_DISPARITIES is; every byte that is read was written.
+        let mut costs = MaybeUninit::<[u8; 256]>::uninit();
+        let costs = costs.as_mut_ptr().cast::<u8>();
+        for i in 0..N {
+            other = other.min(total[i].or(number[i].beside(around)));
+            total[i].store(costs.add(i * S::LANES));
+        }
+        let d = usize::from(disparity);
+        *row.winners.add(x) = Winner {
+            disparity,
+            cost: (key >> 8) as u8,
+            before: if d == 0 { u8::MAX } else { *costs.add(((d - 1) % N) * S::LANES + (d - 1) / N) },
+            after: if d + 1 == N * S::LANES {
+                u8::MAX
+            } else {
+                *costs.add(((d + 1) % N) * S::LANES + (d + 1) / N)
+            },
+            second: other.least(),
+        };
     }
 }

@@ -4,6 +4,7 @@
 //! alignment): its neighbours `d - 1` and `d + 1` are then the same lane of the vectors beside it, and only the two at
 //! the ends are moved by a lane.
 #![allow(unsafe_code)] // vectors of one processor are unsafe to use
+#![allow(clippy::inline_always)] // what is not inlined is compiled for the oldest processor
 
 /// Unsigned bytes side by side, and the 16-bit keys that are made of them.
 ///

@@ -1,111 +1,90 @@
-//! The steps, written plainly: what the fast forms must equal.
+//! What the two passes must find, written as slowly and as plainly as it can be.
 
-use crate::stereo::{DisparityMap, Parameters, StereoPair};
+use super::kernel::Winner;
+use super::pass::Costs;
 
-/// Cost of a disparity that leads out of the right picture.
-const OUTSIDE: u8 = 40;
-/// The eight directions that paths come from, as steps to the pixel before.
-const PATHS: [(isize, isize); 8] = [(-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1)];
-
-/// The matcher without tricks.
-#[derive(Debug)]
-pub struct Plain {
-    size: (usize, usize),
-    parameters: Parameters,
-    census: [Vec<u64>; 2],
-    cost: Vec<u8>,
-    path: Vec<u8>,
-    sum: Vec<u16>,
+/// A picture, by pixel; beyond its edges it goes on with the edge.
+pub struct Picture<'a> {
+    pub pixels: &'a [u8],
+    pub width: usize,
+    pub height: usize,
+    pub stride: usize,
 }
 
-impl Plain {
-    pub fn new(width: usize, height: usize, parameters: &Parameters) -> Self {
-        let cells = width * height * parameters.max_disparity;
-        Self {
-            size: (width, height),
-            parameters: parameters.clone(),
-            census: [vec![0; width * height], vec![0; width * height]],
-            cost: vec![0; cells],
-            path: vec![0; cells],
-            sum: vec![0; cells],
-        }
+impl Picture<'_> {
+    pub fn at(&self, x: isize, y: isize) -> i32 {
+        let x = x.clamp(0, self.width as isize - 1) as usize;
+        let y = y.clamp(0, self.height as isize - 1) as usize;
+        i32::from(self.pixels[y * self.stride + x])
     }
 
-    pub fn memory_bytes(&self) -> u64 {
-        (self.cost.len() + self.path.len() + 2 * self.sum.len() + 16 * self.census[0].len()) as u64
+    /// Which of the 24 pixels around one are darker than it.
+    fn census(&self, x: isize, y: isize) -> Vec<bool> {
+        let around = (-2..=2).flat_map(|dy| (-2..=2).map(move |dx| (dx, dy))).filter(|o| *o != (0, 0));
+        around.map(|(dx, dy)| self.at(x + dx, y + dy) < self.at(x, y)).collect()
     }
+}
 
-    /// 9x7 around each pixel, 62 bits: which neighbours are darker.
-    fn census(pixels: impl Fn(usize, usize) -> u8, (w, h): (usize, usize), out: &mut [u64]) {
-        for (i, bits) in out.iter_mut().enumerate() {
-            let (x, y) = (i % w, i / w);
-            let centre = pixels(x, y);
-            *bits = 0;
-            for dy in -3..=3_isize {
-                for dx in (-4..=4_isize).filter(|dx| (*dx, dy) != (0, 0)) {
-                    let at = |p: usize, d: isize, n: usize| p.saturating_add_signed(d).min(n - 1);
-                    *bits = *bits << 1 | u64::from(pixels(at(x, dx, w), at(y, dy, h)) < centre);
+/// What a disparity costs at a pixel: bits of the census that differ, and up to 7 for a quarter of the difference of grey.
+pub fn cost(left: &Picture<'_>, right: &Picture<'_>, (x, y): (usize, usize), d: usize) -> i32 {
+    let (x, y) = (x as isize, y as isize);
+    // There is no pixel of the right picture beyond its left edge: the one at the edge stands for it.
+    let there = (x - d as isize).max(0);
+    let bits = left.census(x, y).iter().zip(right.census(there, y)).filter(|(a, b)| **a != *b).count();
+    bits as i32 + ((left.at(x, y) - right.at(there, y)).abs() / 4).min(7)
+}
+
+/// The winners of the left view and the disparities of the right one.
+pub fn winners(left: &Picture<'_>, right: &Picture<'_>, costs: &Costs) -> (Vec<Winner>, Vec<u8>) {
+    let (w, h, n) = (left.width, left.height, costs.disparities);
+    let all: Vec<(usize, usize)> = (0..h).flat_map(|y| (0..w).map(move |x| (x, y))).collect();
+    let cost: Vec<Vec<i32>> =
+        all.iter().map(|at| (0..n).map(|d| cost(left, right, *at, d)).collect()).collect();
+    let mut more = vec![vec![0; n]; w * h];
+    for (dx, dy) in [(-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1)] {
+        let backward = dy > 0 || (dy == 0 && dx > 0);
+        let mut path: Vec<Vec<i32>> = vec![Vec::new(); w * h];
+        for k in 0..w * h {
+            let i = if backward { w * h - 1 - k } else { k };
+            let (x, y) = all[i];
+            let (bx, by) = (x as isize + dx, y as isize + dy);
+            path[i] = cost[i].clone();
+            if !(0..w as isize).contains(&bx) || !(0..h as isize).contains(&by) {
+                continue;
+            }
+            let before = path[by as usize * w + bx as usize].clone();
+            let least = *before.iter().min().unwrap();
+            let change = (left.at(x as isize, y as isize) - left.at(bx, by)).abs();
+            let large = i32::from(costs.large.most) - (change - i32::from(costs.large.slack)).max(0);
+            let large = large.max(i32::from(costs.large.least));
+            for d in 0..n {
+                let mut added = (before[d] - least).min(large);
+                for beside in [d.wrapping_sub(1), d + 1] {
+                    if let Some(v) = before.get(beside) {
+                        added = added.min(v - least + i32::from(costs.small));
+                    }
                 }
+                path[i][d] += added;
+                more[i][d] += added;
             }
         }
     }
-
-    pub fn run(&mut self, pair: &StereoPair<'_>, out: &mut DisparityMap) {
-        let ((w, h), n) = (self.size, self.parameters.max_disparity);
-        Self::census(|x, y| pair.left.row(y)[x], self.size, &mut self.census[0]);
-        Self::census(|x, y| pair.right.row(y)[x], self.size, &mut self.census[1]);
-        for (i, costs) in self.cost.chunks_exact_mut(n).enumerate() {
-            for (d, cost) in costs.iter_mut().enumerate() {
-                *cost = if d > i % w {
-                    OUTSIDE
-                } else {
-                    (self.census[0][i] ^ self.census[1][i - d]).count_ones() as u8
-                };
-            }
-        }
-        self.sum.fill(0);
-        for (dx, dy) in PATHS {
-            let backward = dy > 0 || (dy == 0 && dx > 0);
-            for k in 0..w * h {
-                let i = if backward { w * h - 1 - k } else { k };
-                let (x, y) = ((i % w) as isize + dx, (i / w) as isize + dy);
-                let before = ((0..w as isize).contains(&x) && (0..h as isize).contains(&y))
-                    .then(|| (y as usize * w + x as usize) * n);
-                for d in 0..n {
-                    let more = before.map_or(0, |at| step(&self.path[at..at + n], d, &self.parameters));
-                    let cost = self.cost[i * n + d] + more;
-                    self.path[i * n + d] = cost;
-                    self.sum[i * n + d] += u16::from(cost);
-                }
-            }
-        }
-        for (i, sums) in self.sum.chunks_exact(n).enumerate() {
-            let x = i % w;
-            let d = best(sums);
-            let right = (0..n.min(w - x + d)).min_by_key(|e| self.sum[(i - d.min(x) + e) * n..][*e]);
-            let kept = d <= x && right.is_some_and(|e| e.abs_diff(d) <= self.parameters.left_right_px.into());
-            (out.disparity[i], out.confidence[i]) =
-                if kept { (sub_pixel(sums, d), 255) } else { (f32::NAN, 0) };
-        }
-    }
-}
-
-/// What a path adds to the cost of `d`.
-fn step(before: &[u8], d: usize, parameters: &Parameters) -> u8 {
-    let least = before.iter().copied().min().unwrap_or(0);
-    let at = |d: usize| before.get(d).map_or(u8::MAX, |v| v - least);
-    let beside = at(d.wrapping_sub(1)).min(at(d + 1)).saturating_add(parameters.p1);
-    at(d).min(beside).min(parameters.p2)
-}
-
-fn best(sums: &[u16]) -> usize {
-    sums.iter().enumerate().min_by_key(|(_, s)| **s).map_or(0, |(d, _)| d)
-}
-
-/// The minimum between whole disparities: two lines of equal and opposite slope through three sums.
-fn sub_pixel(sums: &[u16], d: usize) -> f32 {
-    let (Some(&a), Some(&c)) = (sums.get(d.wrapping_sub(1)), sums.get(d + 1)) else { return d as f32 };
-    let (a, b, c) = (f32::from(a), f32::from(sums[d]), f32::from(c));
-    let slope = (a - b).max(c - b);
-    if slope > 0.0 { d as f32 + (a - c) / (2.0 * slope) } else { d as f32 }
+    // Half of what all eight paths say, in a byte.
+    let total: Vec<Vec<u8>> = cost
+        .iter()
+        .zip(&more)
+        .map(|(c, m)| c.iter().zip(m).map(|(c, m)| ((8 * c + (*m).min(255) + 1) / 2) as u8).collect())
+        .collect();
+    let least = |of: &mut dyn Iterator<Item = (u8, usize)>| of.min().unwrap_or((u8::MAX, 0));
+    let winners = total.iter().map(|t| {
+        let (cost, d) = least(&mut t.iter().copied().zip(0_usize..));
+        let second = least(&mut t.iter().copied().zip(0_usize..).filter(|(_, e)| e.abs_diff(d) > 1)).0;
+        let beside = |d: usize| t.get(d).copied().unwrap_or(u8::MAX);
+        Winner { disparity: d as u8, cost, before: beside(d.wrapping_sub(1)), after: beside(d + 1), second }
+    });
+    let mirrored = all
+        .iter()
+        .enumerate()
+        .map(|(i, (x, _))| least(&mut (0..n.min(w - x)).map(|d| (total[i + d][d], d))).1 as u8);
+    (winners.collect(), mirrored.collect())
 }

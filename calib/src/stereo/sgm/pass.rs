@@ -3,6 +3,7 @@
 //! Rows are given to the threads in turn. A row may go on as far as the row before it has come, less one pixel; so every
 //! number of threads computes the same, and no row is computed twice.
 #![allow(unsafe_code)] // loops for one processor, and rows that follow each other on several threads
+#![allow(clippy::inline_always)] // what is not inlined is compiled for the oldest processor
 
 use super::kernel::{self, Carry, PLANES, Row, Winner};
 use super::lanes::{Lanes, Plain};
@@ -34,7 +35,12 @@ impl Form {
         #[cfg(target_arch = "x86_64")]
         {
             use std::arch::is_x86_feature_detected as has;
-            if has!("avx512f") && has!("avx512bw") && has!("avx512vl") && has!("avx512vbmi") && has!("avx512bitalg") {
+            if has!("avx512f")
+                && has!("avx512bw")
+                && has!("avx512vl")
+                && has!("avx512vbmi")
+                && has!("avx512bitalg")
+            {
                 return Self::Avx512;
             }
             if has!("avx2") {
@@ -139,10 +145,7 @@ impl Passes {
         let place = |at: usize| at / lanes + (at % lanes) * vectors;
         let number = (0..cell).map(|at| place(at) as u8);
         let beyond = (0..cell).map(|at| if place(at) < costs.disparities { 0 } else { u8::MAX });
-        let band = || Band {
-            planes: vec![0; PLANES * width],
-            penalties: vec![0; PLANES * width],
-        };
+        let band = || Band { planes: vec![0; PLANES * width], penalties: vec![0; PLANES * width] };
         Self {
             form,
             costs,
@@ -180,8 +183,15 @@ impl Passes {
         let bands = self.bands.len() * self.width * 2 * PLANES;
         let found = self.winners.len() * size_of::<Winner>() + self.mirrored.len();
         let rings = self.cells.bytes() + self.least.len();
-        let pictures = self.padded.iter().map(Padded::bytes).sum::<usize>() + self.left.len() + self.right.len();
-        self.sums.bytes() + rings + pictures + bands + found + self.lanes.len() + self.done.len() * size_of::<AtomicUsize>()
+        let pictures =
+            self.padded.iter().map(Padded::bytes).sum::<usize>() + self.left.len() + self.right.len();
+        self.sums.bytes()
+            + rings
+            + pictures
+            + bands
+            + found
+            + self.lanes.len()
+            + self.done.len() * size_of::<AtomicUsize>()
     }
 
     /// Computes both passes: for each pixel the best disparity of the left view, and that of the right view.
@@ -286,7 +296,13 @@ impl Passes {
                 winners: to.winners.add(w * y),
                 mirrored: to.mirrored.add(w * y),
             };
-            let order = Order { done: &self.done, r, width: w, chunk: if self.bands.len() > 1 { CHUNK } else { w }, failed };
+            let order = Order {
+                done: &self.done,
+                r,
+                width: w,
+                chunk: if self.bands.len() > 1 { CHUNK } else { w },
+                failed,
+            };
             self.dispatch(&row, back, &order);
         }
     }

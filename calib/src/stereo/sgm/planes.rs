@@ -59,22 +59,32 @@ impl Padded {
     }
 }
 
-for_every_processor! {
-    fn census(r0: &[u8], r1: &[u8], r2: &[u8], r3: &[u8], r4: &[u8], a: &mut [u8], b: &mut [u8], c: &mut [u8]) {
-        let n = a.len();
-        let (b, c) = (&mut b[..n], &mut c[..n]);
-        let [r0, r1, r2, r3, r4] = [&r0[..n + 4], &r1[..n + 4], &r2[..n + 4], &r3[..n + 4], &r4[..n + 4]];
-        let middle = &r2[2..n + 2];
-        for x in 0..n {
+/// Sets bit `n` of `out` where what lies `$at` further in `$row` is darker than the middle.
+macro_rules! eight_bits {
+    ($out:ident, $middle:ident, [$(($row:ident, $at:literal)),* $(,)?]) => {{
+        let len = $out.len();
+        let middle = &$middle[..len];
+        let rows = [$(&$row[$at..$at + len]),*];
+        for x in 0..len {
             let m = middle[x];
-            let bit = |v: u8, n: u8| u8::from(v < m) << n;
-            a[x] = bit(r0[x], 0) | bit(r0[x + 1], 1) | bit(r0[x + 2], 2) | bit(r0[x + 3], 3)
-                | bit(r0[x + 4], 4) | bit(r1[x], 5) | bit(r1[x + 1], 6) | bit(r1[x + 2], 7);
-            b[x] = bit(r1[x + 3], 0) | bit(r1[x + 4], 1) | bit(r2[x], 2) | bit(r2[x + 1], 3)
-                | bit(r2[x + 3], 4) | bit(r2[x + 4], 5) | bit(r3[x], 6) | bit(r3[x + 1], 7);
-            c[x] = bit(r3[x + 2], 0) | bit(r3[x + 3], 1) | bit(r3[x + 4], 2) | bit(r4[x], 3)
-                | bit(r4[x + 1], 4) | bit(r4[x + 2], 5) | bit(r4[x + 3], 6) | bit(r4[x + 4], 7);
+            let mut bits = 0;
+            let mut n = 0;
+            while n < 8 {
+                bits |= u8::from(rows[n][x] < m) << n;
+                n += 1;
+            }
+            $out[x] = bits;
         }
+    }};
+}
+
+for_every_processor! {
+    /// The three bytes of the census of a row; the five rows are longer than `a`, `b` and `c` by [`RADIUS`] on each side.
+    fn census(r0: &[u8], r1: &[u8], r2: &[u8], r3: &[u8], r4: &[u8], a: &mut [u8], b: &mut [u8], c: &mut [u8]) {
+        let middle = &r2[RADIUS..];
+        eight_bits!(a, middle, [(r0, 0), (r0, 1), (r0, 2), (r0, 3), (r0, 4), (r1, 0), (r1, 1), (r1, 2)]);
+        eight_bits!(b, middle, [(r1, 3), (r1, 4), (r2, 0), (r2, 1), (r2, 3), (r2, 4), (r3, 0), (r3, 1)]);
+        eight_bits!(c, middle, [(r3, 2), (r3, 3), (r3, 4), (r4, 0), (r4, 1), (r4, 2), (r4, 3), (r4, 4)]);
     }
 }
 
@@ -84,7 +94,9 @@ pub fn mirror(planes: &[u8], width: usize, vectors: usize, reach: usize, out: &m
         for (q, phase) in out.chunks_exact_mut(reach).enumerate() {
             let inside = (width.saturating_sub(q)).div_ceil(vectors).min(reach);
             let (inside, beyond) = phase.split_at_mut(inside);
-            for (to, from) in inside.iter_mut().zip(plane[..width - q.min(width)].iter().rev().step_by(vectors)) {
+            for (to, from) in
+                inside.iter_mut().zip(plane[..width - q.min(width)].iter().rev().step_by(vectors))
+            {
                 *to = *from;
             }
             beyond.fill(plane[0]);
@@ -117,7 +129,7 @@ for_every_processor! {
 impl Penalties {
     /// Of row `y` of a pass, in the order of [`super::kernel::Row`]'s paths: along the row, and from the row before it the
     /// pixel behind, the one beside and the one ahead. `back` is the pass from the right and from below.
-    pub fn row(&self, picture: &Padded, y: usize, back: bool, out: &mut [u8]) {
+    pub fn row(self, picture: &Padded, y: usize, back: bool, out: &mut [u8]) {
         let w = picture.width;
         let (y, side) = (y as isize, if back { 1 } else { -1 });
         let here = picture.grey(y as usize);

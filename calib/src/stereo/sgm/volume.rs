@@ -20,10 +20,6 @@ impl Aligned {
         self.lines.len() * 64
     }
 
-    pub fn as_ptr(&self) -> *const u8 {
-        self.lines.as_ptr().cast()
-    }
-
     pub fn as_mut_ptr(&mut self) -> *mut u8 {
         self.lines.as_mut_ptr().cast()
     }

@@ -1,0 +1,273 @@
+//! The passes beside the model, in every form that the processor has; the filters beside plain ones.
+
+use super::kernel::Winner;
+use super::model::{self, Picture};
+use super::*;
+use proptest::prelude::*;
+
+fn forms() -> Vec<Form> {
+    let mut forms = vec![Form::Plain];
+    #[cfg(target_arch = "x86_64")]
+    forms.extend([Form::Avx2, Form::Avx512].into_iter().filter(|f| *f <= Form::best()));
+    forms
+}
+
+/// Numbers that look random, the same for a seed.
+fn noise(seed: u64) -> impl FnMut() -> u8 {
+    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+    move || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        (state >> 24) as u8
+    }
+}
+
+/// A pair with structure: smooth, noisy and saturated parts, shifted by a disparity that changes with the row.
+fn pair(w: usize, h: usize, stride: usize, seed: u64) -> [Vec<u8>; 2] {
+    let mut next = noise(seed);
+    let mut left = vec![0; stride * h];
+    let mut right = vec![0; stride * h];
+    for y in 0..h {
+        let (kind, shift) = (next() % 4, usize::from(next()) % w.max(2));
+        let row: Vec<u8> = (0..2 * w)
+            .map(|x| match kind {
+                0 => next(),
+                1 => (x * 5 + y) as u8,
+                2 => 255 * (next() & 1),
+                _ => 128 + (next() & 3),
+            })
+            .collect();
+        left[y * stride..][..w].copy_from_slice(&row[..w]);
+        right[y * stride..][..w].copy_from_slice(&row[shift.min(w)..][..w]);
+        // What is between rows is nobody's.
+        left[y * stride + w..(y + 1) * stride].fill(next());
+    }
+    [left, right]
+}
+
+fn check_passes(w: usize, h: usize, extra: usize, costs: Costs, threads: usize, seed: u64) {
+    let stride = w + extra;
+    let [left, right] = pair(w, h, stride, seed);
+    let picture = |pixels| Picture { pixels, width: w, height: h, stride };
+    let want = model::winners(&picture(&left), &picture(&right), &costs);
+    let gray = |pixels| Gray { pixels, width: w, height: h, stride };
+    let pair = StereoPair::new(gray(&left), gray(&right));
+    let pool = (threads > 1).then(|| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap());
+    for form in forms() {
+        let mut passes = Passes::new(form, (w, h), costs, threads);
+        // The second time, memory is not zero any more.
+        for _ in 0..2 {
+            let (winners, mirrored) = passes.run(&pair, pool.as_ref());
+            let case = format!("{form:?} {w}x{h}+{extra} {costs:?} {threads} threads");
+            if let Some(i) = (0..w * h).find(|i| winners[*i] != want.0[*i]) {
+                panic!("{case}: pixel {}, {}: {:?}, not {:?}", i % w, i / w, winners[i], want.0[i]);
+            }
+            assert_eq!(mirrored, want.1, "{case}");
+        }
+    }
+}
+
+const COSTS: Costs = Costs { disparities: 64, small: 6, large: Penalties { most: 50, least: 15, slack: 4 } };
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 60, ..ProptestConfig::default() })]
+
+    #[test]
+    fn the_passes_find_what_the_model_finds(
+        (w, h, extra) in (1_usize..70, 1_usize..14, 0_usize..9),
+        disparities in 1_usize..=256,
+        (small, least, most) in (1_u8..=63, 0_u8..=63, 0_u8..=63),
+        slack in 0_u8..=255,
+        threads in 1_usize..4,
+        seed in any::<u64>(),
+    ) {
+        let least = least.max(small);
+        let large = Penalties { most: most.max(least), least, slack };
+        check_passes(w, h, extra, Costs { disparities, small, large }, threads, seed);
+    }
+}
+
+#[test]
+fn every_number_of_vectors_and_every_edge() {
+    for disparities in [1, 2, 31, 32, 33, 63, 64, 65, 96, 127, 128, 129, 160, 161, 192, 193, 255, 256] {
+        check_passes(41, 5, 3, Costs { disparities, ..COSTS }, 1, disparities as u64);
+    }
+    for (w, h) in [(1, 1), (1, 9), (9, 1), (2, 2), (3, 5), (300, 3)] {
+        check_passes(w, h, 0, COSTS, 1, 7);
+        check_passes(w, h, 1, Costs { disparities: 256, ..COSTS }, 3, 8);
+    }
+}
+
+#[test]
+fn threads_change_nothing() {
+    // Wide enough that rows wait for each other within a row.
+    for threads in [2, 3, 5] {
+        check_passes(333, 11, 0, Costs { disparities: 40, ..COSTS }, threads, 3);
+    }
+}
+
+#[test]
+fn sums_beyond_a_byte_stop_at_255() {
+    // Penalties at their largest on noise: eight paths of up to 63.
+    let large = Penalties { most: 63, least: 63, slack: 255 };
+    check_passes(60, 12, 0, Costs { disparities: 128, small: 63, large }, 1, 11);
+}
+
+fn map_of(w: usize, h: usize, seed: u64, holes: u8) -> Vec<u16> {
+    let mut next = noise(seed);
+    (0..w * h)
+        .map(|_| if next() < holes { NONE } else { u16::from(next() % 8) * 96 + u16::from(next() % 3) })
+        .collect()
+}
+
+proptest! {
+    #[test]
+    fn the_median_is_the_fifth_of_nine(w in 1_usize..40, h in 1_usize..9, seed in any::<u64>(), holes in 0_u8..200) {
+        let map = map_of(w, h, seed, holes);
+        let mut out = vec![0; w * h];
+        filter::median(w, &map, &mut out);
+        for (i, got) in out.iter().enumerate() {
+            let (x, y) = (i % w, i / w);
+            let inside = x > 0 && y > 0 && x + 1 < w && y + 1 < h;
+            let mut nine: Vec<u16> = if inside {
+                (0..9).map(|k| map[(y + k / 3 - 1) * w + x + k % 3 - 1]).map(|v| if v == NONE { map[i] } else { v }).collect()
+            } else {
+                vec![map[i]]
+            };
+            nine.sort_unstable();
+            prop_assert_eq!(*got, nine[nine.len() / 2]);
+        }
+    }
+
+    #[test]
+    fn speckles_are_small_regions(w in 1_usize..40, h in 1_usize..12, seed in any::<u64>(), most in 0_u32..40, step in 0_u16..200) {
+        let map = map_of(w, h, seed, 60);
+        let (mut got, mut sure) = (map.clone(), vec![9; w * h]);
+        Speckle::new(w * h).remove(w, &mut got, &mut sure, most, step);
+        // A region by flooding from each pixel.
+        for i in 0..w * h {
+            let mut seen = vec![false; w * h];
+            let mut todo = vec![i];
+            seen[i] = true;
+            while let Some(p) = todo.pop() {
+                let (x, y) = (p % w, p / w);
+                let beside = [(x > 0, p.wrapping_sub(1)), (x + 1 < w, p + 1), (y > 0, p.wrapping_sub(w)), (y + 1 < h, p + w)];
+                for q in beside.into_iter().filter(|b| b.0).map(|b| b.1) {
+                    if map[p] != NONE && map[q] != NONE && map[p].abs_diff(map[q]) <= step && !seen[q] {
+                        seen[q] = true;
+                        todo.push(q);
+                    }
+                }
+            }
+            let size = seen.iter().filter(|s| **s).count() as u32;
+            let want = if map[i] != NONE && size <= most { NONE } else { map[i] };
+            prop_assert_eq!((got[i], sure[i] == 0), (want, want == NONE && map[i] != NONE), "pixel {}", i);
+        }
+    }
+
+    #[test]
+    fn only_short_gaps_between_equals_are_filled(w in 1_usize..40, h in 1_usize..12, seed in any::<u64>(), most in 0_usize..6, step in 0_u16..300) {
+        let map = map_of(w, h, seed, 120);
+        let (mut got, mut sure) = (map.clone(), vec![9; w * h]);
+        filter::fill_gaps(w, &mut got, &mut sure, most, step, &mut vec![7; w]);
+        // Along one line: the ends of the gap that contains `i`, if it is one.
+        let gap = |line: &[u16], i: usize| -> Option<u16> {
+            let before = line[..i].iter().rposition(|v| *v != NONE)?;
+            let after = i + line[i..].iter().position(|v| *v != NONE)?;
+            let (a, b) = (line[before], line[after]);
+            (after - before - 1 <= most && a.abs_diff(b) <= step).then(|| {
+                let way = (f64::from(b) - f64::from(a)) * (i - before) as f64 / (after - before) as f64;
+                (f64::from(a) + way.trunc()) as u16
+            })
+        };
+        let mut rows = map.clone();
+        for i in (0..w * h).filter(|i| map[*i] == NONE) {
+            let row = &map[i / w * w..][..w];
+            rows[i] = gap(row, i % w).unwrap_or(NONE);
+        }
+        for i in 0..w * h {
+            let column: Vec<u16> = rows.iter().skip(i % w).step_by(w).copied().collect();
+            let want = if rows[i] == NONE { gap(&column, i / w).unwrap_or(NONE) } else { rows[i] };
+            prop_assert_eq!(got[i], want, "pixel {}", i);
+            prop_assert_eq!(sure[i], if map[i] == NONE && want != NONE { 1 } else { 9 });
+        }
+    }
+
+    #[test]
+    fn half_is_the_mean_of_four(w in 1_usize..20, h in 1_usize..9, extra in 0_usize..4, seed in any::<u64>()) {
+        let mut next = noise(seed);
+        let pixels: Vec<u8> = (0..(w + extra) * h).map(|_| next()).collect();
+        let picture = Picture { pixels: &pixels, width: w, height: h, stride: w + extra };
+        let mut out = vec![0; w.div_ceil(2) * h.div_ceil(2)];
+        filter::halve(&Gray { pixels: &pixels, width: w, height: h, stride: w + extra }, &mut out);
+        for (i, got) in out.iter().enumerate() {
+            let (x, y) = (2 * (i % w.div_ceil(2)) as isize, 2 * (i / w.div_ceil(2)) as isize);
+            let four = [(0, 0), (1, 0), (0, 1), (1, 1)].iter().map(|(i, j)| picture.at(x + i, y + j)).sum::<i32>();
+            prop_assert_eq!(i32::from(*got), (four + 2) / 4);
+        }
+    }
+}
+
+#[test]
+fn doubling_goes_on_a_plane_and_keeps_edges() {
+    // Disparity 10 + x/4 on the left, a step to 40, a hole at the end.
+    let (w, h) = (12, 4);
+    let value = |x: usize| {
+        if x == 11 {
+            NONE
+        } else if x < 6 {
+            10 * ONE + x as u16 * 64
+        } else {
+            40 * ONE
+        }
+    };
+    let map: Vec<u16> = (0..w * h).map(|i| value(i % w)).collect();
+    let sure: Vec<u8> = (0..w * h).map(|i| (i % w) as u8).collect();
+    let (mut out, mut out_sure) = (vec![0; 23 * 7], vec![0; 23 * 7]);
+    filter::double((w, h), (&map, &sure), (23, 7), &mut out, &mut out_sure);
+    let row: Vec<f32> = out[3 * 23..4 * 23].iter().map(|d| f32::from(*d) / 256.0).collect();
+    // Pixel 5 of the full picture lies at 2.25 of the half one: twice 10.5625.
+    assert_eq!((row[4], row[5]), (20.875, 21.125));
+    assert_eq!((row[11], row[12]), (22.5, 80.0));
+    assert_eq!(out[3 * 23 + 22], NONE);
+    assert_eq!((out_sure[0], out_sure[23 + 9]), (0, 4));
+}
+
+#[test]
+fn the_fit_meets_between() {
+    let parameters = Parameters::preset(super::super::Preset::Quality, 64);
+    let row = |winner: Winner| {
+        let (mut out, mut sure) = ([0; 30], [0; 30]);
+        choose::choose(&[winner; 30], &[winner.disparity; 30], &parameters, 63, &mut out, &mut sure);
+        (out[29], sure[29], out[19])
+    };
+    let w = Winner { disparity: 20, cost: 10, before: 30, after: 30, second: 60 };
+    // Left of column 20 it would lead out of the picture.
+    assert_eq!(row(w), (20 * ONE, 101, NONE));
+    // Costs rise by 20 to the left and by 10 to the right: the tip lies a quarter towards the right.
+    assert_eq!(row(Winner { after: 20, ..w }).0, 20 * ONE + 64);
+    assert_eq!(row(Winner { before: 10, after: 10, ..w }).0, 20 * ONE);
+    assert_eq!(row(Winner { before: 10, after: 50, ..w }).0, 20 * ONE - 128);
+    assert_eq!(row(Winner { disparity: 0, before: 255, after: 10, ..w }).0, 0);
+    assert_eq!(row(Winner { second: 10, ..w }).1, 1);
+}
+
+#[test]
+fn views_that_disagree_give_nothing() {
+    let winner = Winner { disparity: 3, cost: 10, before: 30, after: 30, second: 20 };
+    let mut parameters = Parameters::preset(super::super::Preset::Quality, 64);
+    let valid = |parameters: &Parameters, mirrored: u8| {
+        let (mut out, mut sure) = ([0; 8], [0; 8]);
+        choose::choose(&[winner; 8], &[mirrored; 8], parameters, 63, &mut out, &mut sure);
+        assert_eq!(out[7] == NONE, sure[7] == 0);
+        out[7] != NONE
+    };
+    parameters.left_right_px = 1;
+    assert!(valid(&parameters, 4) && valid(&parameters, 2));
+    assert!(!valid(&parameters, 5) && !valid(&parameters, 1));
+    parameters.uniqueness_percent = 100;
+    assert!(valid(&parameters, 3));
+    parameters.uniqueness_percent = 101;
+    assert!(!valid(&parameters, 3));
+}
