@@ -44,7 +44,38 @@ pub const MAX_LENT: usize = 8;
 /// Loans of one publisher at a time: the frame that a driver is writing, and those that the device fills.
 const MAX_LOANS: usize = 1 + MAX_LENT;
 const MAX_NODES: usize = 32;
-const NEW_FRAME: EventId = EventId::new(1);
+const NEW_FRAME: EventId = EventId::new(crate::external::EVENT_ID);
+
+/// The limits of a channel, and the version of what travels on it. iceoryx2 fixes the limits while anybody holds the
+/// channel, so that all who open it must say the same.
+#[derive(Debug, Clone, Copy)]
+pub struct Form {
+    pub schema: &'static str,
+    pub publishers: usize,
+    pub subscribers: usize,
+    pub buffer: usize,
+    pub held: usize,
+    pub history: usize,
+    pub nodes: usize,
+    pub notifiers: usize,
+    pub listeners: usize,
+    /// Loans of one publisher at a time.
+    pub loans: usize,
+}
+
+/// The channels of a rig.
+pub const RIG: Form = Form {
+    schema: SCHEMA,
+    publishers: MAX_PUBLISHERS,
+    subscribers: MAX_SUBSCRIBERS,
+    buffer: BUFFER,
+    held: MAX_HELD,
+    history: 1,
+    nodes: MAX_NODES,
+    notifiers: MAX_PUBLISHERS,
+    listeners: MAX_SUBSCRIBERS,
+    loans: MAX_LOANS,
+};
 
 /// What a header type must be to travel.
 pub trait Header: Debug + Default + Copy + ZeroCopySend + 'static {}
@@ -54,49 +85,45 @@ impl<T: Debug + Default + Copy + ZeroCopySend + 'static> Header for T {}
 pub struct Channel<H> {
     name: String,
     what: String,
+    form: Form,
     header: PhantomData<H>,
 }
 
 impl<H: Header> Channel<H> {
-    pub const fn new(name: String, what: String) -> Self {
-        Self { name, what, header: PhantomData }
+    pub const fn new(form: Form, name: String, what: String) -> Self {
+        Self { name, what, form, header: PhantomData }
     }
 
     /// Opens the channel for writing, making it when it is not there.
     pub fn sender(&self, node: &Node<IoxService>, max_bytes: usize, slots: usize) -> Result<Sender<H>> {
-        let name = self.service_name()?;
-        let service = retry(|| {
-            let schema =
-                AttributeVerifier::new().require(&key()?, &value()?).map_err(OpenOrCreate::attribute)?;
-            node.service_builder(&name)
-                .publish_subscribe::<[u8]>()
-                .user_header::<H>()
-                .max_publishers(MAX_PUBLISHERS)
-                .max_subscribers(MAX_SUBSCRIBERS)
-                .max_nodes(MAX_NODES)
-                .subscriber_max_buffer_size(BUFFER)
-                .subscriber_max_borrowed_samples(MAX_HELD)
-                .history_size(1)
-                .enable_safe_overflow(true)
-                .open_or_create_with_attributes(&schema)
-                .map_err(OpenOrCreate::from)
-        })
-        .map_err(|e| self.open_error(&e))?;
-        let events = self.event_service(node, &name)?;
-        let max_bytes = max_bytes.max(1);
+        let out = self.outlet(node, max_bytes, slots)?;
+        Ok(Sender { out, notifier: self.notifier(node)? })
+    }
+
+    /// Opens the channel for reading; somebody else has made it.
+    pub fn receiver(&self, node: &Node<IoxService>) -> Result<Receiver<H>> {
+        let inlet = self.inlet(node, false)?;
+        Ok(Receiver { inlet, listener: self.listener(node)? })
+    }
+
+    /// What of the channel writes, without the event.
+    pub fn outlet(&self, node: &Node<IoxService>, max_bytes: usize, slots: usize) -> Result<Outlet<H>> {
+        let service = self.service(node, true)?;
+        let (max_bytes, loans) = (max_bytes.max(1), self.form.loans);
         let port = service
             .publisher_builder()
             .initial_max_slice_len(max_bytes)
             .allocation_strategy(AllocationStrategy::Static)
-            .max_loaned_samples(MAX_LOANS)
+            .max_loaned_samples(loans)
             .override_sample_preallocation(move |_| slots)
             .create()
             .map_err(|e| {
                 use iceoryx2::port::publisher::PublisherCreateError as E;
                 let (kind, why) = match e {
-                    E::ExceedsMaxSupportedPublishers => {
-                        (ErrorKind::LimitReached, format!("it has {MAX_PUBLISHERS} publishers already"))
-                    }
+                    E::ExceedsMaxSupportedPublishers => (
+                        ErrorKind::LimitReached,
+                        format!("it has {} publishers already", self.form.publishers),
+                    ),
                     _ => (
                         ErrorKind::NoSpace,
                         format!("no shared memory for {slots} slots of {max_bytes} bytes"),
@@ -104,35 +131,59 @@ impl<H: Header> Channel<H> {
                 };
                 Error::new(kind, format!("{} cannot be published: {why}", self.what)).with_source(e)
             })?;
-        let notifier =
-            events.notifier_builder().default_event_id(NEW_FRAME).create().map_err(|e| {
-                self.error(ErrorKind::LimitReached, "its event cannot be raised").with_source(e)
-            })?;
-        Ok(Sender { port, notifier, what: self.what.clone() })
+        Ok(Outlet { port, loans, what: self.what.clone() })
     }
 
-    /// Opens the channel for reading.
-    pub fn receiver(&self, node: &Node<IoxService>) -> Result<Receiver<H>> {
-        let name = self.service_name()?;
-        let service = retry(|| {
-            let schema =
-                AttributeVerifier::new().require(&key()?, &value()?).map_err(OpenOrCreate::attribute)?;
-            node.service_builder(&name)
-                .publish_subscribe::<[u8]>()
-                .user_header::<H>()
-                .open_with_attributes(&schema)
-                .map_err(OpenOrCreate::Open)
-        })
-        .map_err(|e| self.open_error(&e))?;
-        let events = self.event_service(node, &name)?;
+    /// What of the channel reads, without the event. With `make` it is made when it is not there.
+    pub fn inlet(&self, node: &Node<IoxService>, make: bool) -> Result<Inlet<H>> {
+        let service = self.service(node, make)?;
         let port = service.subscriber_builder().create().map_err(|e| {
-            let why = format!("it has {MAX_SUBSCRIBERS} subscribers already");
+            let why = format!("it has {} subscribers already", self.form.subscribers);
             self.error(ErrorKind::LimitReached, &why).with_source(e)
         })?;
-        let listener = events.listener_builder().create().map_err(|e| {
+        Ok(Inlet { port, service, held: self.form.held, what: self.what.clone() })
+    }
+
+    /// What raises the event of the channel.
+    pub fn notifier(&self, node: &Node<IoxService>) -> Result<Notifier<IoxService>> {
+        let events = self.event_service(node, &self.service_name()?)?;
+        events
+            .notifier_builder()
+            .default_event_id(NEW_FRAME)
+            .create()
+            .map_err(|e| self.error(ErrorKind::LimitReached, "its event cannot be raised").with_source(e))
+    }
+
+    /// What sleeps until the event of the channel.
+    pub fn listener(&self, node: &Node<IoxService>) -> Result<Listener<IoxService>> {
+        let events = self.event_service(node, &self.service_name()?)?;
+        events.listener_builder().create().map_err(|e| {
             self.error(ErrorKind::LimitReached, "its event cannot be listened to").with_source(e)
-        })?;
-        Ok(Receiver { port, listener, service, what: self.what.clone() })
+        })
+    }
+
+    fn service(&self, node: &Node<IoxService>, make: bool) -> Result<Factory<H>> {
+        let (name, form) = (self.service_name()?, self.form);
+        let opened = retry(|| {
+            let schema = AttributeVerifier::new()
+                .require(&key()?, &value(form.schema)?)
+                .map_err(OpenOrCreate::attribute)?;
+            let builder = node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<H>();
+            if !make {
+                return builder.open_with_attributes(&schema).map_err(OpenOrCreate::Open);
+            }
+            builder
+                .max_publishers(form.publishers)
+                .max_subscribers(form.subscribers)
+                .max_nodes(form.nodes)
+                .subscriber_max_buffer_size(form.buffer)
+                .subscriber_max_borrowed_samples(form.held)
+                .history_size(form.history)
+                .enable_safe_overflow(true)
+                .open_or_create_with_attributes(&schema)
+                .map_err(OpenOrCreate::from)
+        });
+        opened.map_err(|e| self.open_error(&e))
     }
 
     fn event_service(&self, node: &Node<IoxService>, name: &ServiceName) -> Result<EventFactory> {
@@ -141,9 +192,9 @@ impl<H: Header> Channel<H> {
             let opened = node
                 .service_builder(name)
                 .event()
-                .max_listeners(MAX_SUBSCRIBERS)
-                .max_notifiers(MAX_PUBLISHERS)
-                .max_nodes(MAX_NODES)
+                .max_listeners(self.form.listeners)
+                .max_notifiers(self.form.notifiers)
+                .max_nodes(self.form.nodes)
                 .open_or_create();
             match opened {
                 Ok(service) => return Ok(service),
@@ -188,7 +239,7 @@ impl<H: Header> Channel<H> {
                 "it belongs to another user; daemon and subscribers run as one".to_owned(),
             ),
             OpenOrCreate::Open(OpenError::ExceedsMaxNumberOfNodes) => {
-                (ErrorKind::LimitReached, format!("{MAX_NODES} processes have it open already"))
+                (ErrorKind::LimitReached, format!("{} processes have it open already", self.form.nodes))
             }
             OpenOrCreate::Open(
                 OpenError::DoesNotSupportRequestedMinBufferSize
@@ -258,26 +309,72 @@ fn key() -> Result<attribute::AttributeKey, OpenOrCreate> {
     "schema".try_into().map_err(OpenOrCreate::attribute)
 }
 
-fn value() -> Result<attribute::AttributeValue, OpenOrCreate> {
-    SCHEMA.try_into().map_err(OpenOrCreate::attribute)
+fn value(schema: &'static str) -> Result<attribute::AttributeValue, OpenOrCreate> {
+    schema.try_into().map_err(OpenOrCreate::attribute)
 }
 
 /// The writing end of a channel.
 #[derive(Debug)]
 pub struct Sender<H: Header> {
-    port: Publisher<IoxService, [u8], H>,
+    out: Outlet<H>,
     notifier: Notifier<IoxService>,
-    what: String,
 }
 
 impl<H: Header> Sender<H> {
+    /// A free slot with `len` bytes.
+    pub fn loan(&self, len: usize) -> Result<Loan<H>> {
+        self.out.loan(len)
+    }
+
+    /// Gives subscribers that came since the last sample that one. Sending does it as well.
+    pub fn welcome(&self) {
+        if let Err(e) = self.out.port.update_connections() {
+            tracing::debug!(channel = self.out.what, error = ?e, "a new subscriber could not be connected");
+        }
+    }
+
+    /// Publishes a slot whose every byte has been written, then wakes sleepers. Never blocks on one.
+    pub fn send(&self, loan: Loan<H>) -> Result<usize> {
+        let receivers = self.out.send(loan)?;
+        ring(&self.notifier, &self.out.what);
+        Ok(receivers)
+    }
+}
+
+/// Wakes who sleeps on an event.
+pub fn ring(notifier: &Notifier<IoxService>, what: &str) {
+    // A sleeper that cannot be woken finds the frame at its next time-out.
+    if let Err(e) = notifier.notify() {
+        tracing::debug!(channel = what, error = ?e, "a subscriber could not be woken");
+    }
+}
+
+/// Sleeps until the event is raised or `timeout` has passed. A signal counts as raised.
+pub fn sleep(listener: &Listener<IoxService>, timeout: Duration, what: &str) -> Result<()> {
+    match listener.timed_wait(|_| {}, timeout) {
+        Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(()),
+        Err(e) => {
+            Err(Error::new(ErrorKind::Other, format!("{what}: waiting for a frame failed")).with_source(e))
+        }
+    }
+}
+
+/// The writing end of a channel, without its event.
+#[derive(Debug)]
+pub struct Outlet<H: Header> {
+    port: Publisher<IoxService, [u8], H>,
+    loans: usize,
+    what: String,
+}
+
+impl<H: Header> Outlet<H> {
     /// A free slot with `len` bytes.
     pub fn loan(&self, len: usize) -> Result<Loan<H>> {
         self.port.loan_slice_uninit(len).map_err(|e| {
             let (kind, why) = match e {
                 LoanError::OutOfMemory => (ErrorKind::NoSpace, "subscribers hold every slot".to_owned()),
                 LoanError::ExceedsMaxLoans => {
-                    (ErrorKind::LimitReached, format!("{MAX_LOANS} frames are being written"))
+                    (ErrorKind::LimitReached, format!("{} frames are being written", self.loans))
                 }
                 LoanError::ExceedsMaxLoanSize => (
                     ErrorKind::LimitReached,
@@ -292,27 +389,20 @@ impl<H: Header> Sender<H> {
         })
     }
 
-    /// Gives subscribers that came since the last sample that one. Sending does it as well.
-    pub fn welcome(&self) {
-        if let Err(e) = self.port.update_connections() {
-            tracing::debug!(channel = self.what, error = ?e, "a new subscriber could not be connected");
-        }
-    }
-
-    /// Publishes a slot whose every byte has been written, then wakes sleepers. Never blocks on one.
+    /// Publishes a slot whose every byte has been written. Wakes nobody.
     #[allow(unsafe_code)]
     pub fn send(&self, loan: Loan<H>) -> Result<usize> {
         // SAFETY: the payload is `[u8]` in memory that the kernel handed out zeroed, and every access to it goes
         // through `bytes_mut`, which only writes `u8`: each byte holds some `u8`, which is all that `u8` asks.
         let sample = unsafe { loan.assume_init() };
-        let receivers = sample.send().map_err(|e| {
+        sample.send().map_err(|e| {
             Error::new(ErrorKind::Other, format!("{}: the frame could not be sent", self.what)).with_source(e)
-        })?;
-        // A sleeper that cannot be woken finds the frame at its next time-out.
-        if let Err(e) = self.notifier.notify() {
-            tracing::debug!(channel = self.what, error = ?e, "a subscriber could not be woken");
-        }
-        Ok(receivers)
+        })
+    }
+
+    /// The channel's name for messages.
+    pub fn what(&self) -> &str {
+        &self.what
     }
 }
 
@@ -328,20 +418,49 @@ pub fn bytes_mut<H: Header>(loan: &mut Loan<H>) -> &mut [u8] {
 /// The reading end of a channel.
 #[derive(Debug)]
 pub struct Receiver<H: Header> {
-    port: Subscriber<IoxService, [u8], H>,
+    inlet: Inlet<H>,
     listener: Listener<IoxService>,
-    service: Factory<H>,
-    what: String,
 }
 
 impl<H: Header> Receiver<H> {
+    /// The oldest unread sample, if there is one.
+    pub fn try_receive(&self) -> Result<Option<Received<H>>> {
+        self.inlet.try_receive()
+    }
+
+    /// Sleeps until something was sent or `timeout` has passed. A signal counts as something sent.
+    pub fn wait(&self, timeout: Duration) -> Result<()> {
+        sleep(&self.listener, timeout, &self.inlet.what)
+    }
+
+    /// Whether anybody publishes at all.
+    pub fn has_publisher(&self) -> bool {
+        self.inlet.service.dynamic_config().number_of_publishers() > 0
+    }
+
+    /// The channel's name for messages.
+    pub fn what(&self) -> &str {
+        &self.inlet.what
+    }
+}
+
+/// The reading end of a channel, without its event.
+#[derive(Debug)]
+pub struct Inlet<H: Header> {
+    port: Subscriber<IoxService, [u8], H>,
+    service: Factory<H>,
+    held: usize,
+    what: String,
+}
+
+impl<H: Header> Inlet<H> {
     /// The oldest unread sample, if there is one.
     pub fn try_receive(&self) -> Result<Option<Received<H>>> {
         self.port.receive().map_err(|e| {
             let (kind, why) = match e {
                 ReceiveError::ExceedsMaxBorrows => (
                     ErrorKind::LimitReached,
-                    format!("{MAX_HELD} frames are held already; release one first"),
+                    format!("{} frames are held already; release one first", self.held),
                 ),
                 ReceiveError::ConnectionFailure(_) => {
                     (ErrorKind::Other, "the publisher's memory cannot be mapped".to_owned())
@@ -349,24 +468,5 @@ impl<H: Header> Receiver<H> {
             };
             Error::new(kind, format!("{}: {why}", self.what)).with_source(e)
         })
-    }
-
-    /// Sleeps until something was sent or `timeout` has passed. A signal counts as something sent.
-    pub fn wait(&self, timeout: Duration) -> Result<()> {
-        match self.listener.timed_wait(|_| {}, timeout) {
-            Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(()),
-            Err(e) => Err(Error::new(ErrorKind::Other, format!("{}: waiting for a frame failed", self.what))
-                .with_source(e)),
-        }
-    }
-
-    /// Whether anybody publishes at all.
-    pub fn has_publisher(&self) -> bool {
-        self.service.dynamic_config().number_of_publishers() > 0
-    }
-
-    /// The channel's name for messages.
-    pub fn what(&self) -> &str {
-        &self.what
     }
 }

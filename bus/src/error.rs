@@ -18,6 +18,8 @@ pub enum ErrorKind {
     PermissionDenied,
     /// A limit of the channel was reached (subscribers, held samples, sample size).
     LimitReached,
+    /// The other side refuses, and says why.
+    Refused,
     /// The operating system or iceoryx2 refused for another reason.
     Other,
 }

@@ -1,19 +1,32 @@
 //! Cameras that another process serves: the hand-shake between that process and the daemon.
 //!
+//! Start at [`ExternalCamera`], the side of the process, or at [`ExternalLink`], the side of the daemon.
 //! docs/external.md is the contract; [`ExternalOffer`], [`ExternalMode`], [`ExternalAnswer`] and [`ExternalFrame`] are its
 //! bytes. Whatever comes from the other side is checked before it is believed.
 
+mod camera;
 mod codes;
 mod fields;
 mod layout;
+mod link;
 mod lock;
+mod mode;
+mod place;
+mod plain;
+mod session;
+mod text;
 
+pub use camera::ExternalCamera;
 pub use codes::{
     ExternalClock, ExternalFrameFlags, ExternalModeFlags, ExternalReason, ExternalState, ExternalWant,
 };
 pub use fields::{ANSWER_FIELDS, FRAME_FIELDS, MODE_FIELDS, OFFER_FIELDS};
 pub use layout::{ExternalAnswer, ExternalFrame, ExternalMode, ExternalOffer};
+pub use link::{Answer, Beat, ExternalLink, FrameInlet, Offer, Said, SentFrame};
 pub use lock::{ExternalLock, holder, lock};
+pub use mode::{About, Mode};
+pub use place::Place;
+pub use session::{FrameSlot, Session};
 
 use core::time::Duration;
 

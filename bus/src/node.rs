@@ -1,6 +1,6 @@
 //! A process's place on the bus: opens the channels of one rig.
 
-use crate::channel::{Channel, IoxService};
+use crate::channel::{Channel, IoxService, RIG};
 use crate::runtime::RuntimeDir;
 use crate::{
     Error, ErrorKind, FrameHeader, HostTime, Publisher, Result, RigName, SetHeader, SetPublisher,
@@ -156,12 +156,25 @@ impl Bus {
         self.node.try_cleanup_dead_nodes().cleanups
     }
 
+    /// The node, for channels of other forms.
+    pub(crate) const fn node(&self) -> &Node<IoxService> {
+        &self.node
+    }
+
     fn stream_channel(&self, id: &StreamId) -> Channel<FrameHeader> {
-        Channel::new(format!("depthrig/{}/{id}", self.rig), format!("stream {id} of rig \"{}\"", self.rig))
+        Channel::new(
+            RIG,
+            format!("depthrig/{}/{id}", self.rig),
+            format!("stream {id} of rig \"{}\"", self.rig),
+        )
     }
 
     fn set_channel(&self) -> Channel<SetHeader> {
-        Channel::new(format!("depthrig/{}/sets", self.rig), format!("the frame sets of rig \"{}\"", self.rig))
+        Channel::new(
+            RIG,
+            format!("depthrig/{}/sets", self.rig),
+            format!("the frame sets of rig \"{}\"", self.rig),
+        )
     }
 
     /// Adds to a "not found" what could have been meant.

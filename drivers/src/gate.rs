@@ -67,6 +67,9 @@ const REORDER_WINDOW: u64 = 64;
 /// So many frames behind the newest, each the successor of the last, are no stragglers: the counter restarted.
 const RESTARTING_FRAMES: u32 = 4;
 
+/// No camera loses so many frames in a row; a counter that jumps farther was set anew.
+const FARTHEST_GAP: u64 = 1 << 32;
+
 /// The gate of one stream.
 #[derive(Debug)]
 pub struct Gate {
@@ -82,6 +85,8 @@ pub struct Gate {
     newest: Option<(u64, u64)>,
     /// The last frame behind the newest, and how many in a row came before it, itself included.
     behind: Option<(u64, u32)>,
+    /// Frames before the next one whose loss is known already, and what for.
+    known_lost: (u64, DropReason),
     captured: u64,
     delivered: u64,
     drops: DropCounts,
@@ -105,6 +110,7 @@ impl Gate {
             clock: ClockMap::new(clock),
             newest: None,
             behind: None,
+            known_lost: (0, DropReason::DeviceGap),
             captured: 0,
             delivered: 0,
             drops: DropCounts::default(),
@@ -131,6 +137,12 @@ impl Gate {
     /// The stream's clock map, for its quality and for two-way probes.
     pub const fn clock(&mut self) -> &mut ClockMap {
         &mut self.clock
+    }
+
+    /// Says that up to `n` of the frames that the counter of the next one skips were lost for `reason` and not by the
+    /// device. Only the last word before a frame counts.
+    pub const fn explain_gap(&mut self, n: u64, reason: DropReason) {
+        self.known_lost = (n, reason);
     }
 
     /// Passes one frame: checks and counts it, maps its time, and has `fill` write the pixels into memory on
@@ -248,6 +260,7 @@ impl Gate {
     /// Unwraps the frame counter and counts the frames that it skipped. `None`: counted before; `Err`: not
     /// to be delivered.
     fn account(&mut self, raw: &RawFrame, sink: &mut dyn FrameSink) -> Option<Result<u64, DropReason>> {
+        let (known, why) = core::mem::replace(&mut self.known_lost, (0, DropReason::DeviceGap));
         let Some((newest, seen)) = self.newest else {
             self.newest = Some((raw.device_sequence, 1));
             self.capture(1, sink);
@@ -257,14 +270,22 @@ impl Gate {
         let shift = 64 - bits;
         // Signed distance on the counter's own circle.
         let step = ((raw.device_sequence << shift).wrapping_sub(newest << shift) as i64) >> shift;
+        if step > 0 && step as u64 > FARTHEST_GAP {
+            self.capture(1, sink);
+            self.behind = None;
+            self.newest = Some((raw.device_sequence, 1));
+            return Some(Ok(raw.device_sequence));
+        }
         if step > 0 {
             self.behind = None;
             let step = step as u64;
             self.capture(step, sink);
-            self.lose(DropReason::DeviceGap, step - 1, sink);
+            let known = known.min(step - 1);
+            self.lose(why, known, sink);
+            self.lose(DropReason::DeviceGap, step - 1 - known, sink);
             let seen = if step >= 64 { 1 } else { (seen << step) | 1 };
-            self.newest = Some((newest + step, seen));
-            return Some(Ok(newest + step));
+            self.newest = Some((newest.saturating_add(step), seen));
+            return Some(Ok(newest.saturating_add(step)));
         }
         let back = step.unsigned_abs();
         let in_a_row = match self.behind {

@@ -12,6 +12,7 @@ pub mod clock;
 pub mod conformance;
 mod device;
 mod error;
+pub mod external;
 pub mod files;
 #[doc(hidden)]
 pub mod fuzzing;

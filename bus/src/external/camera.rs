@@ -1,0 +1,346 @@
+//! The side of the process: a camera that it serves.
+
+use super::mode::{check_all, invalid};
+use super::{
+    About, ExternalAnswer, ExternalLock, ExternalMode, ExternalOffer, ExternalReason, ExternalState,
+    ExternalWant, HEARTBEAT, MAX_MODES, MODE_BYTES, Mode, Place, SILENCE, Session, VERSION, lock, plain,
+    text,
+};
+use crate::channel::{self, Inlet, IoxService, Outlet};
+use crate::{Bus, Error, ErrorKind, HostTime, Result};
+use core::sync::atomic::{AtomicBool, Ordering};
+use core::time::Duration;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+
+/// How often the heart-beat's thread looks whether it is to end.
+const LOOK: Duration = Duration::from_millis(50);
+/// Slots of the offers: one being written, the unread ones of each subscriber, and one that is kept for latecomers.
+const OFFER_SLOTS: usize = 24;
+
+/// A camera that this process serves to a rig.
+///
+/// ```no_run
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// use depthrig_bus::{Name, PixelFormat, external::{About, ExternalCamera, ExternalFrame, Mode, Place}};
+/// let modes = [Mode::new(Name::new("color")?, PixelFormat::Rgb8, (640, 480), 30.0)];
+/// let about = About { model: "Webcam".into(), serial: "1".into(), ..About::default() };
+/// let mut camera = ExternalCamera::offer(&Place::from_environment()?, &about, &modes)?;
+/// loop {
+///     let Some(mut session) = camera.next_session(std::time::Duration::from_secs(1))? else { continue };
+///     // Start the device in the modes of `session.modes()`; on failure: `session.refuse(reason, "…")`.
+///     session.started();
+///     while session.is_wanted() {
+///         let picture = [0; 640 * 480 * 3]; // from the device
+///         session.send_copy(0, &ExternalFrame { device_time: 0, ..ExternalFrame::default() }, &picture)?;
+///     }
+///     // Stop the device.
+/// }
+/// # }
+/// ```
+///
+/// Its heart-beat has a thread of its own, so that an SDK may take as long as it likes for a call. Dropping it ends the
+/// camera and frees its place.
+#[derive(Debug)]
+pub struct ExternalCamera {
+    pub(super) shared: Arc<Shared>,
+    pub(super) place: Place,
+    pub(super) bus: Bus,
+    pub(super) taken: u64,
+    thread: Option<JoinHandle<()>>,
+    _lock: ExternalLock,
+}
+
+/// What the process's threads share.
+#[derive(Debug)]
+pub(super) struct Shared {
+    pub(super) modes: Vec<Mode>,
+    pub(super) instance: u64,
+    pub(super) bell: Notifier<IoxService>,
+    station: Mutex<Station>,
+    wanted: Mutex<Wanted>,
+    changed: Condvar,
+    end: AtomicBool,
+}
+
+/// What is said, and the port to say it.
+#[derive(Debug)]
+struct Station {
+    out: Outlet<ExternalOffer>,
+    offer: ExternalOffer,
+    records: Vec<u8>,
+}
+
+/// What the daemon wants now.
+#[derive(Debug, Clone, Default)]
+struct Wanted {
+    session: u64,
+    /// Indices of the modes that are to run; empty for none.
+    modes: Vec<usize>,
+    refusal: Option<String>,
+    heard: Option<HostTime>,
+}
+
+impl ExternalCamera {
+    /// Offers a camera at `place` in these modes; the first of each stream is its default.
+    ///
+    /// # Errors
+    /// [`ErrorKind::InUse`] naming the process that serves it already, [`ErrorKind::Other`] for modes that cannot be,
+    /// [`ErrorKind::VersionMismatch`] when the daemon runs with another version, else as [`Bus::open`].
+    pub fn offer(place: &Place, about: &About, modes: &[Mode]) -> Result<Self> {
+        let in_camera = |e: Error| {
+            Error::new(e.kind(), format!("camera \"{}\" cannot be offered: {e}", place.camera)).with_source(e)
+        };
+        check_all(modes).map_err(in_camera)?;
+        let records: Vec<ExternalMode> = modes.iter().map(Mode::encode).collect();
+        for record in &records {
+            Mode::decode(record).map_err(in_camera)?;
+        }
+        let pid = std::process::id();
+        let mut offer = ExternalOffer {
+            instance: (HostTime::now().ns() as u64) << 16 | u64::from(pid & 0xFFFF) | 1,
+            modes: modes.len() as u32,
+            pid,
+            ..ExternalOffer::default()
+        };
+        about.encode(&mut offer);
+        About::decode(&offer).map_err(in_camera)?;
+        let who = format!("process {pid} ({})", text::shown(&offer.program));
+        let lock = lock(&place.runtime, &place.rig, &place.camera, &who)?;
+        let bus = Bus::open(&place.runtime, &place.rig)?;
+        bus.clean_dead();
+        let (offers, answers) = (place.offers(), place.answers());
+        let station = Station {
+            out: offers.outlet(bus.node(), records.len() * MODE_BYTES, OFFER_SLOTS)?,
+            offer,
+            records: records.iter().flat_map(plain::bytes_of).collect(),
+        };
+        let shared = Arc::new(Shared {
+            modes: modes.to_vec(),
+            instance: offer.instance,
+            bell: offers.notifier(bus.node())?,
+            station: Mutex::new(station),
+            wanted: Mutex::default(),
+            changed: Condvar::new(),
+            end: AtomicBool::new(false),
+        });
+        let (inlet, listener) = (answers.inlet(bus.node(), true)?, answers.listener(bus.node())?);
+        shared.say()?;
+        let theirs = Arc::clone(&shared);
+        let thread = std::thread::Builder::new()
+            .name("heartbeat".to_owned())
+            .spawn(move || theirs.beat(&inlet, &listener))
+            .map_err(|e| Error::new(ErrorKind::Other, "no thread for the heart-beat").with_source(e))?;
+        Ok(Self { shared, place: place.clone(), bus, taken: 0, thread: Some(thread), _lock: lock })
+    }
+
+    /// The modes that are offered, in their order.
+    pub fn modes(&self) -> &[Mode] {
+        &self.shared.modes
+    }
+
+    /// Waits until the daemon wants frames; `None` when it wanted none within `timeout`.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Refused`] with the daemon's reason when it cannot use the offer; it stays refused. Else as
+    /// [`Bus::publisher`].
+    pub fn next_session(&mut self, timeout: Duration) -> Result<Option<Session<'_>>> {
+        let deadline = HostTime::now().plus(timeout);
+        let mut wanted = self.shared.wanted();
+        let (number, modes) = loop {
+            if let (0, Some(why)) = (wanted.session, &wanted.refusal) {
+                let why = format!("the daemon refuses camera \"{}\": {why}", self.place.camera);
+                return Err(Error::new(ErrorKind::Refused, why));
+            }
+            if wanted.session > self.taken && !wanted.modes.is_empty() {
+                break (wanted.session, wanted.modes.clone());
+            }
+            let left = deadline.from_now();
+            if left.is_zero() {
+                return Ok(None);
+            }
+            let waited = self.shared.changed.wait_timeout(wanted, left);
+            wanted = waited.unwrap_or_else(PoisonError::into_inner).0;
+        };
+        drop(wanted);
+        self.taken = number;
+        self.shared.stand(number, ExternalState::Starting, ExternalReason::None, "")?;
+        Session::new(self, number, modes).map(Some)
+    }
+
+    /// Says that the camera cannot be had now, and why: it is unplugged, or somebody else holds it. The process stays.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Other`] when the daemon cannot be told.
+    pub fn unavailable(&mut self, reason: ExternalReason, why: &str) -> Result<()> {
+        self.shared.stand(0, ExternalState::Refused, reason, why)
+    }
+
+    /// Says that the camera can be had again.
+    ///
+    /// # Errors
+    /// As [`Self::unavailable`].
+    pub fn available(&mut self) -> Result<()> {
+        self.shared.stand(0, ExternalState::Idle, ExternalReason::None, "")
+    }
+
+    /// Ends the camera and says why.
+    pub fn end(self, reason: ExternalReason, why: &str) {
+        self.shared.last_words(reason, why);
+    }
+}
+
+impl Drop for ExternalCamera {
+    fn drop(&mut self) {
+        self.shared.end.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+        self.shared.last_words(ExternalReason::None, "the process let go of the camera");
+    }
+}
+
+impl Shared {
+    fn wanted(&self) -> MutexGuard<'_, Wanted> {
+        self.wanted.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether the daemon still wants frames of `session`.
+    pub(super) fn wants(&self, session: u64) -> bool {
+        let wanted = self.wanted();
+        wanted.session == session && !wanted.modes.is_empty()
+    }
+
+    /// Why the daemon refused `session`, if it did.
+    pub(super) fn refusal(&self, session: u64) -> Option<String> {
+        let wanted = self.wanted();
+        wanted.refusal.clone().filter(|_| wanted.session == session)
+    }
+
+    /// Says how the process stands from now on.
+    pub(super) fn stand(
+        &self,
+        session: u64,
+        state: ExternalState,
+        reason: ExternalReason,
+        why: &str,
+    ) -> Result<()> {
+        {
+            let mut station = self.station.lock().unwrap_or_else(PoisonError::into_inner);
+            if station.offer.state == ExternalState::Ended as u32 {
+                return Ok(());
+            }
+            let offer = &mut station.offer;
+            (offer.session, offer.state, offer.reason) = (session, state as u32, reason as u32);
+            text::set(&mut offer.text, why);
+        }
+        self.say()
+    }
+
+    fn last_words(&self, reason: ExternalReason, why: &str) {
+        if let Err(e) = self.stand(0, ExternalState::Ended, reason, why) {
+            tracing::debug!(error = %e, "the last message could not be sent");
+        }
+    }
+
+    /// Sends the offer as it is now.
+    fn say(&self) -> Result<()> {
+        let mut station = self.station.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut loan = station.out.loan(station.records.len())?;
+        channel::bytes_mut(&mut loan).copy_from_slice(&station.records);
+        station.offer.number += 1;
+        station.offer.sent_ns = HostTime::now().ns();
+        *loan.user_header_mut() = station.offer;
+        station.out.send(loan)?;
+        channel::ring(&self.bell, station.out.what());
+        Ok(())
+    }
+
+    /// The thread of the heart-beat: says that the process is there, and hears what the daemon wants.
+    fn beat(&self, inlet: &Inlet<ExternalAnswer>, listener: &Listener<IoxService>) {
+        let mut due = HostTime::now().plus(HEARTBEAT);
+        while !self.end.load(Ordering::Relaxed) {
+            if let Err(e) = channel::sleep(listener, due.from_now().min(LOOK), "the daemon's answers") {
+                tracing::debug!(error = %e, "cannot wait");
+                std::thread::sleep(LOOK);
+            }
+            self.hear(inlet);
+            if due.from_now().is_zero() {
+                due = HostTime::now().plus(HEARTBEAT);
+                if let Err(e) = self.say() {
+                    tracing::warn!(error = %e, "no heart-beat could be sent");
+                }
+            }
+        }
+    }
+
+    /// Takes in what the daemon said since.
+    fn hear(&self, inlet: &Inlet<ExternalAnswer>) {
+        let mut newest: Option<Wanted> = None;
+        loop {
+            match inlet.try_receive() {
+                Ok(Some(sample)) => {
+                    if let Some(wanted) = self.understand(sample.user_header(), sample.payload()) {
+                        newest = Some(wanted);
+                    }
+                }
+                Ok(None) => break,
+                Err(e) => {
+                    tracing::debug!(error = %e, "an answer cannot be read");
+                    break;
+                }
+            }
+        }
+        let mut wanted = self.wanted();
+        // Of two that answer, such as a thread of the daemon that was given up, the later session counts.
+        if let Some(newest) = newest.filter(|n| n.session == 0 || n.session >= wanted.session) {
+            let changed = (wanted.session, &wanted.modes, &wanted.refusal)
+                != (newest.session, &newest.modes, &newest.refusal);
+            *wanted = newest;
+            if changed {
+                self.changed.notify_all();
+            }
+        } else if wanted.heard.is_some_and(|t| t.elapsed() > SILENCE) {
+            // The daemon is gone. A session is not taken up twice, so what was wanted then is wanted no more.
+            wanted.modes.clear();
+            wanted.heard = None;
+            self.changed.notify_all();
+        }
+    }
+
+    /// What an answer says, if it is one to this process.
+    fn understand(&self, answer: &ExternalAnswer, payload: &[u8]) -> Option<Wanted> {
+        let mut wanted = Wanted { heard: Some(HostTime::now()), ..Wanted::default() };
+        if answer.magic != super::ANSWER_MAGIC || answer.instance != self.instance {
+            return None;
+        }
+        if answer.version != VERSION || usize::from(answer.size) != size_of::<ExternalAnswer>() {
+            let why = format!(
+                "it speaks version {} of the hand-shake, this program version {VERSION}",
+                answer.version
+            );
+            return Some(Wanted { refusal: Some(why), ..wanted });
+        }
+        // An answer of before must not stop what runs now.
+        if HostTime::from_ns(answer.sent_ns).elapsed() > SILENCE {
+            return None;
+        }
+        wanted.session = answer.session;
+        match ExternalWant::from_code(answer.want)? {
+            ExternalWant::Stop => {}
+            ExternalWant::Refused => wanted.refusal = Some(text::shown(&answer.text)),
+            ExternalWant::Run => {
+                let flags = payload.iter().take(self.modes.len().min(MAX_MODES));
+                wanted.modes = flags.enumerate().filter(|(_, f)| **f == 1).map(|(i, _)| i).collect();
+            }
+        }
+        Some(wanted)
+    }
+}
+
+/// What cannot be offered, and what has no such mode.
+pub(super) fn no_such_mode(mode: usize) -> Error {
+    invalid(&format!("mode {mode} is not one that the session runs"))
+}

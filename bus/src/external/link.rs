@@ -1,0 +1,261 @@
+//! The side of the daemon: hears the process, tells it what is wanted, reads its frames.
+
+use super::mode::{check_all, invalid};
+use super::{
+    About, ExternalAnswer, ExternalFrame, ExternalOffer, ExternalReason, ExternalState, ExternalWant,
+    MODE_BYTES, Mode, OFFER_MAGIC, Place, TEXT_BYTES, VERSION, plain, text,
+};
+use crate::channel::{self, Inlet, IoxService, Outlet, Received};
+use crate::{Bus, Error, ErrorKind, HostTime, Result, StreamName};
+use core::time::Duration;
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+
+/// Slots of the answers.
+const ANSWER_SLOTS: usize = 24;
+/// Messages that are read at a time; the channel keeps no more.
+const MOST_AT_A_TIME: usize = 64;
+
+/// The daemon's end of the hand-shake with the process that serves a camera.
+#[derive(Debug)]
+pub struct ExternalLink {
+    offers: Inlet<ExternalOffer>,
+    bell: Listener<IoxService>,
+    out: Outlet<ExternalAnswer>,
+    notifier: Notifier<IoxService>,
+    number: u64,
+    place: Place,
+    bus: Bus,
+}
+
+/// What a process said last.
+#[derive(Debug, Clone, Copy)]
+pub struct Beat {
+    /// Which start of the process.
+    pub instance: u64,
+    /// Number of the message.
+    pub number: u64,
+    /// The session that the state is about.
+    pub session: u64,
+    /// How it stands; `None` for a state of a later version.
+    pub state: Option<ExternalState>,
+    /// Why.
+    pub reason: ExternalReason,
+    /// Process number.
+    pub pid: u32,
+    /// When it was sent, at the latest now.
+    pub sent: HostTime,
+    text: [u8; TEXT_BYTES],
+}
+
+impl Beat {
+    /// Why, in words; what is not text is left out.
+    pub fn text(&self) -> String {
+        text::shown(&self.text)
+    }
+
+    fn of(offer: &ExternalOffer) -> Self {
+        Self {
+            instance: offer.instance,
+            number: offer.number,
+            session: offer.session,
+            state: ExternalState::from_code(offer.state),
+            reason: ExternalReason::from_code(offer.reason).unwrap_or(ExternalReason::None),
+            pid: offer.pid,
+            sent: HostTime::from_ns(offer.sent_ns).min(HostTime::now()),
+            text: offer.text,
+        }
+    }
+}
+
+/// What a process offers.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Offer {
+    /// What it says of the camera.
+    pub about: About,
+    /// The modes, in the order that answers refer to.
+    pub modes: Vec<Mode>,
+}
+
+/// A message of the process: what it says at a glance, and the whole of it.
+#[derive(Debug)]
+pub struct Said {
+    /// What it says of itself.
+    pub beat: Beat,
+    sample: Received<ExternalOffer>,
+}
+
+impl Said {
+    /// What it offers, checked.
+    ///
+    /// # Errors
+    /// [`ErrorKind::VersionMismatch`] naming both versions, [`ErrorKind::Other`] naming what of it cannot be.
+    pub fn offer(&self) -> Result<Offer> {
+        let header = *self.sample.user_header();
+        if header.magic != OFFER_MAGIC {
+            return Err(invalid("its offer does not begin as one does"));
+        }
+        if header.version != VERSION || usize::from(header.size) != size_of::<ExternalOffer>() {
+            return Err(Error::new(
+                ErrorKind::VersionMismatch,
+                format!(
+                    "it speaks version {} of the hand-shake ({} bytes), this daemon version {VERSION} ({} bytes)",
+                    header.version,
+                    header.size,
+                    size_of::<ExternalOffer>()
+                ),
+            ));
+        }
+        let payload = self.sample.payload();
+        let (records, rest) = payload.as_chunks::<MODE_BYTES>();
+        if records.len() != header.modes as usize || !rest.is_empty() {
+            let (n, bytes) = (header.modes, payload.len());
+            return Err(invalid(&format!(
+                "it says {n} modes of {MODE_BYTES} bytes, and sends {bytes} bytes"
+            )));
+        }
+        if header.instance == 0 {
+            return Err(invalid("its field `instance` is 0"));
+        }
+        let about = About::decode(&header)?;
+        let modes = records.iter().map(|r| Mode::decode(&plain::mode_of(r))).collect::<Result<Vec<_>>>()?;
+        check_all(&modes)?;
+        Ok(Offer { about, modes })
+    }
+}
+
+/// What to tell a process.
+#[derive(Debug, Clone, Copy)]
+pub struct Answer<'a> {
+    /// The start of the process that is meant.
+    pub instance: u64,
+    /// The session.
+    pub session: u64,
+    /// What is wanted.
+    pub want: ExternalWant,
+    /// Why it is refused.
+    pub reason: ExternalReason,
+    /// The same in words.
+    pub text: &'a str,
+    /// One byte for each mode of the offer: 1 when it is to run.
+    pub modes: &'a [u8],
+}
+
+impl ExternalLink {
+    /// Joins the hand-shake of the camera at `place`, whether or not a process serves it yet.
+    ///
+    /// # Errors
+    /// [`ErrorKind::VersionMismatch`] when a process of another version has the channels open, else as
+    /// [`Bus::subscriber`].
+    pub fn open(place: &Place) -> Result<Self> {
+        let bus = Bus::open(&place.runtime, &place.rig)?;
+        let (offers, answers) = (place.offers(), place.answers());
+        Ok(Self {
+            offers: offers.inlet(bus.node(), true)?,
+            bell: offers.listener(bus.node())?,
+            out: answers.outlet(bus.node(), super::MAX_MODES, ANSWER_SLOTS)?,
+            notifier: answers.notifier(bus.node())?,
+            number: 0,
+            place: place.clone(),
+            bus,
+        })
+    }
+
+    /// The newest message of the process since the last call. `wanted` says of which messages; others are passed over.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Other`] when the process's memory cannot be mapped.
+    pub fn newest(&self, wanted: impl Fn(&Beat) -> bool) -> Result<Option<Said>> {
+        let mut newest = None;
+        for _ in 0..MOST_AT_A_TIME {
+            let Some(sample) = self.offers.try_receive()? else { break };
+            let beat = Beat::of(sample.user_header());
+            if wanted(&beat) {
+                newest = Some(Said { beat, sample });
+            }
+        }
+        Ok(newest)
+    }
+
+    /// Sleeps until the process sent something or `timeout` has passed.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Other`] when the event cannot be waited for.
+    pub fn sleep(&self, timeout: Duration) -> Result<()> {
+        channel::sleep(&self.bell, timeout, "the process's event")
+    }
+
+    /// Tells the process what is wanted.
+    ///
+    /// # Errors
+    /// [`ErrorKind::NoSpace`] or [`ErrorKind::Other`] when it cannot be sent.
+    pub fn tell(&mut self, answer: &Answer<'_>) -> Result<()> {
+        let mut loan = self.out.loan(answer.modes.len())?;
+        channel::bytes_mut(&mut loan).copy_from_slice(answer.modes);
+        self.number += 1;
+        let mut header = ExternalAnswer {
+            instance: answer.instance,
+            number: self.number,
+            sent_ns: HostTime::now().ns(),
+            session: answer.session,
+            want: answer.want as u32,
+            reason: answer.reason as u32,
+            modes: answer.modes.len() as u32,
+            pid: std::process::id(),
+            ..ExternalAnswer::default()
+        };
+        text::set(&mut header.text, answer.text);
+        *loan.user_header_mut() = header;
+        self.out.send(loan)?;
+        channel::ring(&self.notifier, self.out.what());
+        Ok(())
+    }
+
+    /// The frames of a stream, from now on.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn frames(&self, stream: &StreamName) -> Result<FrameInlet> {
+        Ok(FrameInlet { inlet: self.place.frames(stream).inlet(self.bus.node(), true)? })
+    }
+
+    /// Frees what killed processes left behind.
+    pub fn clean_dead(&self) {
+        self.bus.clean_dead();
+    }
+}
+
+/// The frames of one stream as they come from the process.
+#[derive(Debug)]
+pub struct FrameInlet {
+    inlet: Inlet<ExternalFrame>,
+}
+
+impl FrameInlet {
+    /// The oldest unread frame, if there is one.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Other`] when the process's memory cannot be mapped.
+    pub fn try_next(&self) -> Result<Option<SentFrame>> {
+        Ok(self.inlet.try_receive()?.map(|sample| SentFrame { header: *sample.user_header(), sample }))
+    }
+}
+
+/// A frame in the process's memory. Nothing of it is checked.
+#[derive(Debug)]
+pub struct SentFrame {
+    header: ExternalFrame,
+    sample: Received<ExternalFrame>,
+}
+
+impl SentFrame {
+    /// What it said of itself when it was read; the process cannot change this any more.
+    pub const fn header(&self) -> &ExternalFrame {
+        &self.header
+    }
+
+    /// Its pixels. The process could still write to them.
+    pub fn pixels(&self) -> &[u8] {
+        self.sample.payload()
+    }
+}

@@ -1,0 +1,74 @@
+//! Cameras that another process serves over the bus: docs/external.md.
+//!
+//! The process is never believed: its offer is checked field by field, each frame against its mode, and how it stands by
+//! its heart-beat and by a lock that the kernel frees with it. Nothing here waits for it without a limit. What it sends is
+//! copied once, into the slot that subscribers read.
+
+mod backend;
+mod device;
+mod intake;
+mod log;
+mod pace;
+mod process;
+mod stream;
+
+pub use backend::ExternalBackend;
+pub use depthrig_bus::external::{Place, holder};
+
+use core::time::Duration;
+use depthrig_bus::external::ExternalReason;
+use std::path::PathBuf;
+
+/// The back end's name in a rig file.
+pub const NAME: &str = "external";
+
+/// How a camera is served.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ExternalConfig {
+    /// What to start, with its arguments; empty when somebody else starts it.
+    pub command: Vec<String>,
+    /// Where it runs.
+    pub directory: PathBuf,
+    /// How long it may take from being wanted to the first frame.
+    pub start_timeout: Duration,
+    /// Silence after which it is taken for hung.
+    pub heartbeat_timeout: Duration,
+}
+
+impl Default for ExternalConfig {
+    fn default() -> Self {
+        Self {
+            command: Vec::new(),
+            directory: PathBuf::from("."),
+            start_timeout: Duration::from_secs(10),
+            heartbeat_timeout: Duration::from_secs(2),
+        }
+    }
+}
+
+/// What the supervisor makes of a reason that the process gives.
+const fn kind_of(reason: ExternalReason) -> crate::ErrorKind {
+    use crate::ErrorKind;
+    match reason {
+        ExternalReason::Version | ExternalReason::Unsupported => ErrorKind::Unsupported,
+        ExternalReason::Invalid => ErrorKind::BadInput,
+        ExternalReason::NotFound => ErrorKind::NotFound,
+        ExternalReason::Busy => ErrorKind::Busy,
+        ExternalReason::Permission => ErrorKind::PermissionDenied,
+        ExternalReason::Device => ErrorKind::Io,
+        _ => ErrorKind::Disconnected,
+    }
+}
+
+/// An error of the bus as one of a driver.
+fn of_bus(e: depthrig_bus::Error) -> crate::Error {
+    use depthrig_bus::ErrorKind as Bus;
+    let kind = match e.kind() {
+        Bus::NotFound => crate::ErrorKind::NotFound,
+        Bus::InUse => crate::ErrorKind::Busy,
+        Bus::PermissionDenied => crate::ErrorKind::PermissionDenied,
+        Bus::VersionMismatch => crate::ErrorKind::Protocol,
+        _ => crate::ErrorKind::Io,
+    };
+    crate::Error::new(kind, e.to_string()).with_source(e)
+}

@@ -1,0 +1,151 @@
+//! A camera that a process offers: its modes, and how it is started.
+
+use super::process::Keeper;
+use super::stream::{ExternalStream, Started};
+use super::{ExternalConfig, NAME, Place, kind_of, of_bus};
+use crate::{
+    Device, DeviceClock, DeviceInfo, Error, ErrorKind, Result, Stream, StreamProfile, StreamRequest,
+    choose_profiles,
+};
+use depthrig_bus::external::{Beat, ExternalClock, ExternalLink, ExternalState, Mode, Offer};
+use depthrig_bus::{ClockDomain, HostTime, MetadataLevel};
+use std::sync::{Arc, Mutex};
+
+/// The process of a camera, if the daemon runs it.
+pub(super) type SharedKeeper = Option<Arc<Mutex<Keeper>>>;
+
+/// A camera whose process answers.
+#[derive(Debug)]
+pub(super) struct ExternalDevice {
+    config: ExternalConfig,
+    place: Place,
+    keeper: SharedKeeper,
+    link: ExternalLink,
+    beat: Beat,
+    modes: Vec<Mode>,
+    info: DeviceInfo,
+    profiles: Vec<StreamProfile>,
+}
+
+impl ExternalDevice {
+    /// The camera that `offer` describes, last heard of in `beat`.
+    ///
+    /// # Errors
+    /// The reason of the process when it says that its camera cannot be had now.
+    pub(super) fn new(
+        (config, place, keeper): (&ExternalConfig, &Place, SharedKeeper),
+        link: ExternalLink,
+        beat: Beat,
+        offer: Offer,
+    ) -> Result<Self> {
+        if beat.session == 0 && beat.state == Some(ExternalState::Refused) {
+            return Err(Error::new(kind_of(beat.reason), refusal(&beat)));
+        }
+        let about = &offer.about;
+        let info = DeviceInfo {
+            backend: NAME,
+            model: about.model.clone(),
+            serial: about.serial.clone(),
+            firmware: about.firmware.clone(),
+            port: if about.port.is_empty() { format!("process {}", beat.pid) } else { about.port.clone() },
+            calibration: if about.calibration.is_empty() {
+                "none".to_owned()
+            } else {
+                about.calibration.clone()
+            },
+        };
+        let profiles = offer.modes.iter().map(profile).collect();
+        let (config, place) = (config.clone(), place.clone());
+        Ok(Self { config, place, keeper, link, beat, modes: offer.modes, info, profiles })
+    }
+}
+
+/// What the process says that it refuses, for a message.
+pub(super) fn refusal(beat: &Beat) -> String {
+    let (text, reason) = (beat.text(), beat.reason.name());
+    if text.is_empty() {
+        return format!("its process {} refuses ({reason})", beat.pid);
+    }
+    format!("its process {} says ({reason}): {text}", beat.pid)
+}
+
+/// The profile of a mode.
+fn profile(mode: &Mode) -> StreamProfile {
+    let (domain, metadata) = match mode.clock {
+        ExternalClock::Device => (ClockDomain::Device, MetadataLevel::Full),
+        ExternalClock::DeviceHeader => (ClockDomain::Device, MetadataLevel::Header),
+        ExternalClock::Host => (ClockDomain::Kernel, MetadataLevel::Kernel),
+        _ => (ClockDomain::Arrival, MetadataLevel::Arrival),
+    };
+    let metadata = if mode.simulated { MetadataLevel::Simulated } else { metadata };
+    let mut pose = mode.pose;
+    let norm = pose.rotation_xyzw.iter().map(|c| c * c).sum::<f64>().sqrt();
+    pose.rotation_xyzw = pose.rotation_xyzw.map(|c| c / norm);
+    StreamProfile {
+        stream: mode.stream.clone(),
+        format: mode.format,
+        width: mode.width,
+        height: mode.height,
+        rate_hz: mode.rate_hz,
+        depth_unit_m: mode.depth_unit_m,
+        intrinsics: mode.intrinsics,
+        pose_in_device: pose,
+        clock: DeviceClock { counter_bits: mode.counter_bits, tick_ps: mode.tick_ps, domain },
+        sequence_bits: if mode.sequence_bits == 0 { 64 } else { mode.sequence_bits },
+        metadata,
+    }
+}
+
+impl Device for ExternalDevice {
+    fn info(&self) -> &DeviceInfo {
+        &self.info
+    }
+
+    fn profiles(&self) -> &[StreamProfile] {
+        &self.profiles
+    }
+
+    fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
+        let name = format!("{} {}", self.info.model, self.info.serial);
+        let chosen = choose_profiles(name.trim_end(), &self.profiles, requests)?;
+        let mut wanted = vec![0; self.modes.len()];
+        let mut inlets = Vec::new();
+        for profile in &chosen {
+            let Some(mode) = self.profiles.iter().position(|p| p == profile) else { continue };
+            if let Some(flag) = wanted.get_mut(mode) {
+                *flag = 1;
+            }
+            let has_counter = self.modes.get(mode).is_some_and(|m| m.sequence_bits > 0);
+            // Before the process is told to run, so that its first frame has somebody to go to.
+            inlets.push((self.link.frames(&profile.stream).map_err(of_bus)?, has_counter));
+        }
+        let started = Started {
+            instance: self.beat.instance,
+            // Higher than any before, this daemon's or another's, because the clock only rises.
+            session: HostTime::now().ns().max(1) as u64,
+            wanted,
+            heartbeat: self.config.heartbeat_timeout,
+            pid: self.beat.pid,
+        };
+        let mut stream = ExternalStream::new(self.place, self.link, self.keeper, started, chosen, inlets);
+        stream.wait_for_first_frame(self.config.start_timeout)?;
+        Ok(Box::new(stream))
+    }
+}
+
+/// A process that does not answer is killed, if it is the daemon's.
+pub(super) fn kill(keeper: &SharedKeeper, why: &str) {
+    if let Some(keeper) = keeper {
+        keeper.lock().unwrap_or_else(std::sync::PoisonError::into_inner).kill(why);
+    }
+}
+
+/// A message that ends with what can be done.
+pub(super) fn stalled(kind: ErrorKind, keeper: &SharedKeeper, pid: u32, what: &str) -> Error {
+    let cure = if keeper.is_some() {
+        "it is killed and started again".to_owned()
+    } else {
+        format!("if it hangs, end it (kill -9 {pid}) and start it again")
+    };
+    Error::new(kind, format!("its process {pid} {what}; {cure}"))
+}
