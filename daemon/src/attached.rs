@@ -6,11 +6,13 @@
 
 mod ask;
 mod classify;
+mod served;
 #[cfg(test)]
 pub(crate) mod tests;
 
-pub use ask::{Ask, NodeFacts, System};
+pub use ask::{Ask, NodeFacts, Served, System};
 pub use classify::Family;
+pub(crate) use served::place as place_of_served;
 
 use crate::status::{CameraStatus, RigStatus};
 use classify::Candidate;
@@ -34,7 +36,7 @@ pub struct Attached {
 /// One camera.
 #[derive(Debug, Clone, Serialize)]
 pub struct AttachedCamera {
-    /// The driver that it is for: `realsense`, `zed`, `v4l2`.
+    /// The driver that it is for: `realsense`, `zed`, `v4l2`, `external`.
     pub backend: &'static str,
     /// Model, else what the device calls itself.
     pub model: String,
@@ -44,7 +46,7 @@ pub struct AttachedCamera {
     pub firmware: Option<String>,
     /// Where its calibration comes from; `None` when it could not be asked.
     pub calibration: Option<String>,
-    /// Port path on the USB, or the kernel's name of the device.
+    /// Port path on the USB, or the kernel's name of the device; RIG/CAMERA of one that another process serves.
     pub port: String,
     /// Vendor and product, such as `8086:0b07`; `None` on no USB.
     pub usb_id: Option<String>,
@@ -189,7 +191,8 @@ pub fn look(root: &SysRoot, ask: &dyn Ask) -> crate::Result<Attached> {
         Err(_) => (node.parent.clone(), node),
     });
     let (candidates, unusable) = classify::cameras(&devices, platform);
-    let cameras: Vec<_> = candidates.into_iter().map(|c| camera(root, ask, &rigs, c)).collect();
+    let mut cameras: Vec<_> = candidates.into_iter().map(|c| camera(root, ask, &rigs, c)).collect();
+    cameras.extend(ask.served().into_iter().map(|s| served::camera(s, &rigs)));
     for c in cameras.iter().filter(|c| c.state == UseState::Denied) {
         not_asked.push(format!("{}: this user may not open it; {}", c.describe(), health::RULE_CURE));
     }

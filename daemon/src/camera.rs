@@ -378,7 +378,7 @@ fn open_session(
         let mut backend = backend.lock().unwrap_or_else(PoisonError::into_inner);
         let backend = match backend.as_ref() {
             Some(backend) => backend,
-            None => backend.insert(make_backend(&camera.config.backend, shared.began).map_err(in_camera)?),
+            None => backend.insert(make_backend(camera, shared).map_err(in_camera)?),
         };
         backend.open(None).map_err(in_camera)?
     };
@@ -442,23 +442,32 @@ fn open_lane(camera: &Camera, shared: &Shared, info: &DeviceInfo) -> Result<()> 
     Ok(())
 }
 
-/// The driver of a camera; `began` is the beginning of time for simulated ones.
-pub fn make_backend(
-    config: &BackendConfig,
-    began: HostTime,
-) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {
+/// The driver of a camera.
+fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {
     use depthrig_drivers::{
-        files::FilesBackend, realsense::RealsenseBackend, realsense::l515::L515Backend,
-        synthetic::SyntheticBackend, v4l2::V4l2Backend, zed::ZedBackend,
+        external::{ExternalBackend, Place},
+        files::FilesBackend,
+        realsense::RealsenseBackend,
+        realsense::l515::L515Backend,
+        synthetic::SyntheticBackend,
+        v4l2::V4l2Backend,
+        zed::ZedBackend,
     };
-    Ok(match config {
+    Ok(match &camera.config.backend {
         // One beginning for all cameras of the rig, or each would see the world at another moment.
-        BackendConfig::Synthetic(c) => Box::new(SyntheticBackend::starting_at(vec![c.clone()], began)?),
+        BackendConfig::Synthetic(c) => {
+            Box::new(SyntheticBackend::starting_at(vec![c.clone()], shared.began)?)
+        }
         BackendConfig::Files(c) => Box::new(FilesBackend::new(c.clone())),
         BackendConfig::L515(c) => Box::new(L515Backend::new(c.clone())),
         BackendConfig::Realsense(c) => Box::new(RealsenseBackend::new(c.clone())),
         BackendConfig::V4l2(c) => Box::new(V4l2Backend::new(c.clone())),
         BackendConfig::Zed(c) => Box::new(ZedBackend::new(c.clone())),
+        BackendConfig::External(c) => {
+            let (runtime, rig) = (shared.bus.runtime().clone(), shared.bus.rig().clone());
+            let place = Place { runtime, rig, camera: camera.config.name.clone() };
+            Box::new(ExternalBackend::new(c.clone(), place))
+        }
     })
 }
 

@@ -7,6 +7,7 @@
 mod camera;
 mod controls;
 mod error;
+mod external;
 mod l515;
 mod read;
 mod realsense;
@@ -19,6 +20,7 @@ mod v4l2;
 mod zed;
 
 pub use depthrig_cdm::Precision;
+pub use depthrig_drivers::external::ExternalConfig as ExternalSettings;
 pub use depthrig_drivers::files::FilesConfig as FilesSettings;
 pub use depthrig_drivers::realsense::RealsenseConfig as RealsenseSettings;
 pub use depthrig_drivers::realsense::l515::L515Config as L515Settings;
@@ -278,6 +280,8 @@ pub enum BackendConfig {
     V4l2(V4l2Settings),
     /// A Stereolabs ZED.
     Zed(ZedSettings),
+    /// A camera that another process serves.
+    External(ExternalSettings),
 }
 
 impl BackendConfig {
@@ -290,6 +294,7 @@ impl BackendConfig {
             Self::L515(_) => depthrig_drivers::realsense::l515::NAME,
             Self::V4l2(_) => "v4l2",
             Self::Zed(_) => "zed",
+            Self::External(_) => depthrig_drivers::external::NAME,
         }
     }
 }

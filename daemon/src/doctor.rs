@@ -7,6 +7,7 @@ mod bandwidth;
 mod cameras;
 mod clock;
 mod disk;
+mod external;
 mod finding;
 mod host;
 mod memory;

@@ -13,7 +13,7 @@ mod process;
 mod stream;
 
 pub use backend::ExternalBackend;
-pub use depthrig_bus::external::{Place, holder};
+pub use depthrig_bus::external::{Place, served};
 
 use core::time::Duration;
 use depthrig_bus::external::ExternalReason;

@@ -1,7 +1,8 @@
 //! Who serves a camera: a lock that the kernel frees with the process, however that ends.
 
 use super::LOCK_SUFFIX;
-use crate::{CameraName, ErrorKind, Result, RigName, RuntimeDir};
+use super::Place;
+use crate::{CameraName, ErrorKind, Name, Result, RigName, RuntimeDir};
 use std::path::PathBuf;
 
 /// The right to serve a camera; dropping it frees the camera.
@@ -36,4 +37,53 @@ pub fn lock(runtime: &RuntimeDir, rig: &RigName, camera: &CameraName, who: &str)
 /// Who serves `camera` of `rig` now, as that process described itself; `None` when nobody does.
 pub fn holder(runtime: &RuntimeDir, rig: &RigName, camera: &CameraName) -> Option<String> {
     crate::runtime::holder_of(&path(runtime, rig, camera))
+}
+
+/// The cameras below `runtime` that a process serves now, each with that process as it described itself; sorted.
+pub fn served(runtime: &RuntimeDir) -> Vec<(Place, String)> {
+    let Ok(entries) = std::fs::read_dir(runtime.path()) else { return Vec::new() };
+    let place = |name: &str| {
+        let (rig, camera) = name.strip_suffix(LOCK_SUFFIX)?.split_once('.')?;
+        let (rig, camera) = (Name::new(rig).ok()?, Name::new(camera).ok()?);
+        Some(Place { runtime: runtime.clone(), rig, camera })
+    };
+    let mut served: Vec<_> = entries
+        .filter_map(|e| {
+            let place = place(e.ok()?.file_name().to_str()?)?;
+            let holder = place.holder()?;
+            Some((place, holder))
+        })
+        .collect();
+    served.sort_by(|(a, _), (b, _)| (&a.rig, &a.camera).cmp(&(&b.rig, &b.camera)));
+    served
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_camera_is_served_once_and_by_whom_is_known() {
+        let tmp = tempfile::tempdir().unwrap();
+        let runtime = RuntimeDir::at(tmp.path()).unwrap();
+        let name = |n: &str| Name::new(n).unwrap();
+        let (rig, front, back) = (name("mount"), name("front"), name("back"));
+        assert_eq!(holder(&runtime, &rig, &front), None);
+        let first = lock(&runtime, &rig, &front, "process 42 (cam)").unwrap();
+        let e = lock(&runtime, &rig, &front, "process 43 (cam)").unwrap_err();
+        assert_eq!(e.kind(), ErrorKind::InUse);
+        assert!(e.to_string().contains("process 42 (cam)"), "{e}");
+        let _other = lock(&runtime, &rig, &back, "process 43 (cam)").unwrap();
+        let _other_rig = lock(&runtime, &name("a"), &front, "process 44 (cam)").unwrap();
+        let all: Vec<_> =
+            served(&runtime).into_iter().map(|(p, who)| format!("{}/{} {who}", p.rig, p.camera)).collect();
+        assert_eq!(
+            all,
+            ["a/front process 44 (cam)", "mount/back process 43 (cam)", "mount/front process 42 (cam)"]
+        );
+        assert!(runtime.running_rigs().is_empty(), "a camera's lock is no rig's");
+        drop(first);
+        assert_eq!(holder(&runtime, &rig, &front), None);
+        lock(&runtime, &rig, &front, "process 43 (cam)").unwrap();
+    }
 }

@@ -4,6 +4,7 @@ use super::Family;
 use crate::client::Client;
 use crate::status::RigStatus;
 use depthrig_bus::RuntimeDir;
+use depthrig_drivers::external::{self, ExternalBackend, ExternalConfig, Place};
 use depthrig_drivers::realsense::l515::{L515Backend, L515Config};
 use depthrig_drivers::realsense::{RealsenseBackend, RealsenseConfig};
 use depthrig_drivers::v4l2::{Node, V4l2Backend, V4l2Config};
@@ -24,6 +25,17 @@ pub struct NodeFacts {
     pub used_elsewhere: bool,
 }
 
+/// A camera that another process serves.
+#[derive(Debug)]
+pub struct Served {
+    /// Which one of which rig.
+    pub place: Place,
+    /// The process, as it described itself.
+    pub holder: String,
+    /// What it offers.
+    pub offered: Result<(DeviceInfo, Vec<StreamProfile>)>,
+}
+
 /// Who answers.
 pub trait Ask {
     /// Asks the kernel about a node; the camera notices nothing.
@@ -35,6 +47,11 @@ pub trait Ask {
     /// Opens the camera at a port, which nobody has, and asks what it is and can. `None` when there is no driver for
     /// its family.
     fn device(&self, family: Family, port: &str) -> Option<Result<(DeviceInfo, Vec<StreamProfile>)>>;
+
+    /// The cameras that other processes serve now, and what these say of them.
+    fn served(&self) -> Vec<Served> {
+        Vec::new()
+    }
 
     /// The rigs of this user that run, and what could not be asked.
     fn rigs(&self) -> (Vec<RigStatus>, Vec<String>);
@@ -77,9 +94,20 @@ impl Ask for System {
                 Box::new(V4l2Backend::new(V4l2Config { port, ..V4l2Config::default() }))
             }
             Family::L515 => Box::new(L515Backend::new(L515Config { port, ..L515Config::default() })),
+            // It is at no port; see `served`.
+            Family::External => return None,
         };
         let told = |device: Box<dyn Device>| (device.info().clone(), device.profiles().to_vec());
         Some(backend.open(None).map(told))
+    }
+
+    fn served(&self) -> Vec<Served> {
+        let Some(runtime) = &self.runtime else { return Vec::new() };
+        let asked = |(place, holder): (Place, String)| {
+            let offered = ExternalBackend::new(ExternalConfig::default(), place.clone()).offered();
+            Served { place, holder, offered }
+        };
+        external::served(runtime).into_iter().map(asked).collect()
     }
 
     fn rigs(&self) -> (Vec<RigStatus>, Vec<String>) {

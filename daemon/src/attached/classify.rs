@@ -26,6 +26,8 @@ pub enum Family {
     Uvc,
     /// A video device that is on no USB.
     Platform,
+    /// What another process serves.
+    External,
 }
 
 impl Family {
@@ -36,6 +38,7 @@ impl Family {
             Self::L515 => "l515",
             Self::Zed => "zed",
             Self::Uvc | Self::Platform => "v4l2",
+            Self::External => depthrig_drivers::external::NAME,
         }
     }
 }

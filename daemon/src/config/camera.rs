@@ -2,7 +2,9 @@
 
 use super::read::{Found, Section};
 use super::rig::{not_empty, rate, resolve};
-use super::{BackendConfig, CameraConfig, FilesSettings, l515, realsense, refine, synthetic, v4l2, zed};
+use super::{
+    BackendConfig, CameraConfig, FilesSettings, external, l515, realsense, refine, synthetic, v4l2, zed,
+};
 use depthrig_bus::{CameraName, Name, PixelFormat, Pose, StreamName};
 use depthrig_drivers::StreamRequest;
 use std::path::{Path, PathBuf};
@@ -15,6 +17,7 @@ enum Driver {
     L515,
     V4l2,
     Zed,
+    External,
 }
 
 /// Reads one camera; `None` after a problem without which there is no camera. `taken` are the names so far.
@@ -37,6 +40,7 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         ("l515", Driver::L515),
         ("v4l2", Driver::V4l2),
         ("zed", Driver::Zed),
+        ("external", Driver::External),
     ];
     if !s.has("backend") {
         s.required::<String>("backend", "\"synthetic\"");
@@ -57,6 +61,7 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         Some(Driver::L515) => Some(BackendConfig::L515(l515::read(&s, &wanted))),
         Some(Driver::V4l2) => Some(BackendConfig::V4l2(v4l2::read(&s))),
         Some(Driver::Zed) => Some(BackendConfig::Zed(zed::read(&s, base, &wanted))),
+        Some(Driver::External) => Some(BackendConfig::External(external::read(&s, base))),
         // Which keys belong to an unknown driver is unknown too.
         None => return None,
     };
@@ -77,7 +82,8 @@ pub(super) fn fastest_rate_hz(camera: &CameraConfig) -> Option<f64> {
         BackendConfig::Realsense(_)
         | BackendConfig::L515(_)
         | BackendConfig::V4l2(_)
-        | BackendConfig::Zed(_) => fastest_given_rate(&camera.streams),
+        | BackendConfig::Zed(_)
+        | BackendConfig::External(_) => fastest_given_rate(&camera.streams),
         BackendConfig::Synthetic(config) => synthetic::fastest_rate_hz(config, &camera.streams).ok(),
     }
 }

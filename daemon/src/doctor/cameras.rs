@@ -1,5 +1,6 @@
 //! The cameras of the rig file against what is attached: found or not, with which modes, in which state.
 
+use super::external;
 use super::finding::{Finding, Severity};
 use crate::attached::{Attached, AttachedCamera, Family, ModeReport, UseState};
 use crate::config::{BackendConfig, CameraConfig, RigConfig};
@@ -62,7 +63,7 @@ pub(super) struct Wanted<'c> {
 /// What of a plan is read from the rig file alone; `None` for cameras that are on no bus.
 fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
     match backend {
-        BackendConfig::Synthetic(_) | BackendConfig::Files(_) => None,
+        BackendConfig::Synthetic(_) | BackendConfig::Files(_) | BackendConfig::External(_) => None,
         BackendConfig::Realsense(c) => Some(Wanted {
             serial: c.serial.as_deref(),
             port: c.port.as_deref(),
@@ -92,14 +93,15 @@ fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
 
 /// Plans every camera of `config`.
 pub(super) fn plan(config: &RigConfig, attached: &Attached) -> Vec<Planned> {
-    let plan_one = |camera: &CameraConfig| match wanted(&camera.backend) {
-        Some(wanted) => plan_device(camera, camera.backend.name(), &wanted, attached),
-        None => plan_made(camera),
+    let plan_one = |camera: &CameraConfig| match (wanted(&camera.backend), &camera.backend) {
+        (Some(wanted), _) => plan_device(camera, camera.backend.name(), &wanted, attached),
+        (None, BackendConfig::External(c)) => external::plan(camera, config.rig.as_str(), c, attached),
+        (None, _) => plan_made(camera),
     };
     config.cameras.iter().map(plan_one).collect()
 }
 
-fn no_plan(camera: &CameraConfig, backend: &'static str) -> CameraPlan {
+pub(super) fn no_plan(camera: &CameraConfig, backend: &'static str) -> CameraPlan {
     CameraPlan {
         name: camera.name.to_string(),
         backend,
@@ -136,7 +138,7 @@ pub(super) fn plan_device(
     Planned { plan, findings }
 }
 
-fn mode_missing(device: &AttachedCamera, what: &str) -> Finding {
+pub(super) fn mode_missing(device: &AttachedCamera, what: &str) -> Finding {
     let cure = "write one of its modes into [[camera.stream]]";
     Finding::new(
         Severity::Error,
@@ -166,7 +168,8 @@ fn plan_made(camera: &CameraConfig) -> Planned {
             BackendConfig::Realsense(_)
             | BackendConfig::L515(_)
             | BackendConfig::V4l2(_)
-            | BackendConfig::Zed(_) => (camera.backend.name().to_owned(), Vec::new()),
+            | BackendConfig::Zed(_)
+            | BackendConfig::External(_) => (camera.backend.name().to_owned(), Vec::new()),
         })
     };
     let chosen = profiles().and_then(|(device, all)| {
@@ -193,7 +196,7 @@ fn plan_made(camera: &CameraConfig) -> Planned {
     Planned { plan, findings }
 }
 
-fn set_streams(
+pub(super) fn set_streams(
     plan: &mut CameraPlan,
     camera: &CameraConfig,
     chosen: Vec<StreamProfile>,

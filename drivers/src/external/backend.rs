@@ -4,7 +4,7 @@ use super::device::{ExternalDevice, SharedKeeper, kill, stalled};
 use super::process::Keeper;
 use super::stream::is_of;
 use super::{ExternalConfig, NAME, Place, of_bus};
-use crate::{Backend, Device, DeviceInfo, Error, ErrorKind, Result};
+use crate::{Backend, Device, DeviceInfo, Error, ErrorKind, Result, StreamProfile};
 use core::time::Duration;
 use depthrig_bus::HostTime;
 use depthrig_bus::external::{
@@ -103,8 +103,21 @@ impl ExternalBackend {
         }
     }
 
-    /// Hears what is offered; an offer that cannot be is refused, with the reason to both sides.
-    fn meet(&self) -> Result<(ExternalLink, Beat, Offer)> {
+    /// What the process offers now. It is asked nothing and told nothing, so whoever uses the camera is not disturbed.
+    ///
+    /// # Errors
+    /// [`ErrorKind::NotFound`] when no process serves it, [`ErrorKind::Disconnected`] when that says nothing,
+    /// [`ErrorKind::Protocol`] when its offer cannot be, else the reason for which it says that there is no camera.
+    pub fn offered(&self) -> Result<(DeviceInfo, Vec<StreamProfile>)> {
+        if self.place.holder().is_none() {
+            return Err(Error::new(ErrorKind::NotFound, "no process serves it"));
+        }
+        let device = self.device(false)?;
+        Ok((device.info().clone(), device.profiles().to_vec()))
+    }
+
+    /// Hears what is offered. An offer that cannot be is refused, with the reason to the process too if `tell`.
+    fn meet(&self, tell: bool) -> Result<(ExternalLink, Beat, Offer)> {
         let mut link = ExternalLink::open(&self.place).map_err(of_bus)?;
         let (beat, offer) = self.hear(&link)?;
         let why = match offer {
@@ -124,15 +137,15 @@ impl ExternalBackend {
             text: &text,
             modes: &[0],
         };
-        if let Err(e) = link.tell(&refusal) {
+        if tell && let Err(e) = link.tell(&refusal) {
             tracing::debug!(error = %e, "the process could not be told");
         }
         let what = format!("what its process {} offers cannot be used: {text}", beat.pid);
         Err(Error::new(ErrorKind::Protocol, what).with_source(why))
     }
 
-    fn device(&self) -> Result<ExternalDevice> {
-        let (link, beat, offer) = self.meet()?;
+    fn device(&self, tell: bool) -> Result<ExternalDevice> {
+        let (link, beat, offer) = self.meet(tell)?;
         ExternalDevice::new((&self.config, &self.place, self.keeper.clone()), link, beat, offer)
     }
 }
@@ -143,15 +156,16 @@ impl Backend for ExternalBackend {
     }
 
     fn discover(&self) -> Result<Vec<DeviceInfo>> {
-        if self.place.holder().is_none() {
-            return Ok(Vec::new());
+        match self.offered() {
+            Ok((info, _)) => Ok(vec![info]),
+            Err(e) if e.kind() == ErrorKind::NotFound => Ok(Vec::new()),
+            Err(e) => Err(e),
         }
-        Ok(vec![self.device()?.info().clone()])
     }
 
     fn open(&self, serial: Option<&str>) -> Result<Box<dyn Device>> {
         self.find_process()?;
-        let device = self.device()?;
+        let device = self.device(true)?;
         if let Some(serial) = serial
             && serial != device.info().serial
         {
