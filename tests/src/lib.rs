@@ -5,6 +5,8 @@ pub mod disk;
 pub mod made;
 pub mod scene;
 
+pub use depthrig_kinect_fixture as kinect;
+
 use depthrig_bus::{HostTime, RuntimeDir};
 use depthrig_daemon::config::RigConfig;
 use depthrig_daemon::rig::{Rig, RigOptions};

@@ -163,8 +163,9 @@ pub fn child_text(body: &[u8], id: u32) -> Option<String> {
 }
 
 /// How several frames share a block. RFC 9559, section 10.3.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 enum Lacing {
+    #[default]
     None,
     Xiph,
     Fixed,
@@ -197,7 +198,7 @@ pub fn block(body: &[u8]) -> Option<Block<'_>> {
 }
 
 /// The frames of a block, one after the other.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Frames<'a> {
     lacing: Lacing,
     /// Where the sizes are that are still to be read.

@@ -1,0 +1,412 @@
+//! Recordings of an Azure Kinect as they are made, in early forms, from other writers, cut, damaged and lying.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+use depthrig_drivers::ErrorKind;
+use depthrig_drivers::kinect::recording::{Losses, Pixels, TrackKind, motion_samples};
+use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, Recording, WiredSync};
+use depthrig_kinect_fixture::{CALIBRATION, Fixture, Lacing, Pattern, Pictures, element, motion};
+use std::path::PathBuf;
+
+fn open(bytes: Vec<u8>) -> depthrig_drivers::Result<Recording> {
+    Recording::read(Box::new(bytes), "test.mkv")
+}
+
+/// What a recording holds: kind, time and bytes of each frame.
+fn all(recording: &mut Recording) -> Vec<(TrackKind, u64, Vec<u8>)> {
+    let kinds: Vec<_> = recording.tracks().iter().map(|t| t.kind).collect();
+    let mut out = Vec::new();
+    while let Some(block) = recording.next_block().unwrap() {
+        out.extend(block.frames().map(|f| (kinds[block.track], block.device_us, f.to_vec())));
+    }
+    out
+}
+
+/// Says where two readings differ, without their bytes.
+fn same(got: &[(TrackKind, u64, Vec<u8>)], wanted: &[(TrackKind, u64, Vec<u8>)]) {
+    let short = |frames: &[(TrackKind, u64, Vec<u8>)]| -> Vec<_> {
+        frames.iter().map(|f| (f.0, f.1, f.2.len())).filter(|f| f.0 != TrackKind::Motion).collect()
+    };
+    assert_eq!(short(got), short(wanted));
+    assert!(got == wanted, "bytes differ");
+}
+
+fn of(frames: &[(TrackKind, u64, Vec<u8>)], kind: TrackKind) -> Vec<(u64, &[u8])> {
+    frames.iter().filter(|f| f.0 == kind).map(|f| (f.1, f.2.as_slice())).collect()
+}
+
+/// All of `fixture` is in `bytes`, at its times.
+fn check(fixture: &Fixture, bytes: Vec<u8>) {
+    let mut recording = open(bytes).unwrap();
+    let frames = all(&mut recording);
+    let mut made = Pattern::new(fixture);
+    let there: Vec<u32> = (0..fixture.captures).filter(|n| !fixture.lost.contains(n)).collect();
+    let (color, depth) = (of(&frames, TrackKind::Color), of(&frames, TrackKind::Depth));
+    let infrared = of(&frames, TrackKind::Infrared);
+    assert_eq!(color.len(), if fixture.color.is_some() { there.len() } else { 0 });
+    for (n, (at, data)) in there.iter().zip(&color) {
+        assert_eq!(*at, fixture.times_us(*n).0, "color {n}");
+        assert!(*data == made.color(*n), "color {n}");
+    }
+    let words = |data: &[u8]| -> Vec<u16> {
+        let pairs = data.as_chunks::<2>().0.iter();
+        pairs.map(|b| if fixture.early { u16::from_le_bytes(*b) } else { u16::from_be_bytes(*b) }).collect()
+    };
+    let has_depth = fixture.depth.is_some_and(DepthMode::has_depth);
+    assert_eq!(depth.len(), if has_depth { there.len() } else { 0 });
+    assert_eq!(infrared.len(), if fixture.depth.is_some() { there.len() } else { 0 });
+    for (n, (at, data)) in there.iter().zip(&depth) {
+        assert_eq!(*at, fixture.times_us(*n).1, "depth {n}");
+        assert!(words(data) == made.depth(*n), "depth {n}");
+    }
+    for (n, (_, data)) in there.iter().zip(&infrared) {
+        assert!(words(data) == made.infrared(*n), "infrared {n}");
+    }
+    let samples: Vec<_> =
+        frames.iter().filter(|f| f.0 == TrackKind::Motion).flat_map(|f| motion_samples(&f.2)).collect();
+    if fixture.motion {
+        let wanted = f64::from(fixture.captures) / f64::from(fixture.rate_hz) * 1600.0;
+        assert!((samples.len() as f64 - wanted).abs() < 2.0, "{} samples", samples.len());
+    }
+    for (i, s) in (0..).zip(&samples) {
+        let (at, acceleration, rotation) = motion(fixture, i);
+        assert_eq!((s.accelerometer_ns, s.gyroscope_ns), (at, at));
+        assert_eq!((s.acceleration, s.rotation), (acceleration, rotation));
+    }
+    assert_eq!(recording.losses(), Losses::default());
+    assert!(recording.next_block().unwrap().is_none(), "the end stays the end");
+}
+
+#[test]
+fn what_the_sdk_writes_is_read() {
+    let fixture = Fixture { captures: 40, lost: vec![7, 8], depth_delay_ns: 160_000, ..Fixture::small() };
+    let bytes = fixture.bytes();
+    let recording = open(bytes.clone()).unwrap();
+    let facts = recording.facts();
+    assert_eq!(facts.serial, "000123456789");
+    assert_eq!((facts.color_firmware.as_str(), facts.depth_firmware.as_str()), ("1.6.110", "1.6.79"));
+    assert_eq!((facts.color_mode, facts.depth_mode), (fixture.color, fixture.depth));
+    assert_eq!((facts.start_offset_ns, facts.depth_delay_ns), (336_277_000, 160_000));
+    assert_eq!((facts.wired_sync, facts.is_cut), (WiredSync::Standalone, false));
+    assert_eq!(facts.calibration.as_deref(), Some(CALIBRATION.as_bytes()));
+    assert_eq!(facts.date_utc_ns, Some(1_767_225_600_000_000_000), "2026-01-01");
+    let duration = facts.duration_ns.unwrap() as f64 / 1e9;
+    assert!((duration - 40.0 / 30.0).abs() < 0.05, "{duration}");
+    assert!(recording.calibration().is_ok());
+    let (i, color) = recording.track(TrackKind::Color).unwrap();
+    assert_eq!((i, color.name.as_str(), color.width, color.height), (0, "COLOR", 1280, 720));
+    assert_eq!((color.pixels, color.period_ns), (Some(Pixels::Nv12), Some(33_333_333)));
+    check(&fixture, bytes);
+}
+
+#[test]
+fn every_mode_and_every_form_is_read() {
+    let small = Fixture::small;
+    let color = |format, resolution| Some(ColorMode { format, resolution });
+    let forms = [
+        Fixture { color: color(ColorFormat::Mjpg, ColorResolution::P720), captures: 3, ..small() },
+        Fixture {
+            color: color(ColorFormat::Yuy2, ColorResolution::P720),
+            depth_delay_ns: -500_000,
+            ..small()
+        },
+        Fixture { color: color(ColorFormat::Bgra, ColorResolution::P720), captures: 2, ..small() },
+        Fixture { color: None, depth: Some(DepthMode::NfovUnbinned), ..small() },
+        Fixture { color: None, depth: Some(DepthMode::WfovUnbinned), rate_hz: 15, captures: 2, ..small() },
+        Fixture { color: None, depth: Some(DepthMode::Wfov2x2Binned), motion: false, ..small() },
+        Fixture { color: None, depth: Some(DepthMode::PassiveIr), captures: 2, ..small() },
+        Fixture { depth: None, ..small() },
+        Fixture { early: true, ..small() },
+        Fixture { checksums: false, index: false, ..small() },
+        Fixture { tags_behind: true, ..small() },
+        Fixture { open_sizes: true, ..small() },
+        Fixture { open_sizes: true, tags_behind: true, index: false, checksums: false, ..small() },
+        Fixture { lacing: Lacing::None, ..small() },
+        Fixture { lacing: Lacing::Xiph, ..small() },
+        Fixture { lacing: Lacing::Ebml, ..small() },
+        Fixture { start_offset_ns: 0, rate_hz: 5, ..small() },
+    ];
+    for fixture in forms {
+        println!("{fixture:?}");
+        check(&fixture, fixture.bytes());
+    }
+}
+
+#[test]
+fn early_recordings_name_infrared_and_the_mode_differently() {
+    let recording = open(Fixture { early: true, ..Fixture::small() }.bytes()).unwrap();
+    let (_, infrared) = recording.track(TrackKind::Infrared).unwrap();
+    assert_eq!((infrared.name.as_str(), infrared.pixels), ("DEPTH_IR", Some(Pixels::Gray16Le)));
+    assert_eq!(recording.facts().depth_mode, Some(DepthMode::Nfov2x2Binned));
+}
+
+#[test]
+fn memory_is_that_of_a_cluster_whatever_the_length() {
+    let memory = |captures| {
+        let mut recording = open(Fixture { captures, ..Fixture::small() }.bytes()).unwrap();
+        while recording.next_block().unwrap().is_some() {}
+        recording.memory_bytes()
+    };
+    let few = memory(4);
+    assert!(few < 2_500_000, "{few}");
+    assert_eq!(memory(60), few);
+}
+
+#[test]
+fn seeking_finds_the_first_block_at_or_after_a_time() {
+    for fixture in [
+        Fixture { captures: 90, motion: false, ..Fixture::small() },
+        Fixture { captures: 90, motion: false, index: false, ..Fixture::small() },
+        Fixture { captures: 45, motion: false, open_sizes: true, ..Fixture::small() },
+    ] {
+        let mut recording = open(fixture.bytes()).unwrap();
+        let last = fixture.captures - 1;
+        for n in [30, last, 0, 31, 17, 44] {
+            let at = fixture.times_us(n).0;
+            for (from, wanted) in [(at, n), (at - 1, n), (at - 20_000, n)] {
+                recording.seek(from).unwrap();
+                let block = recording.next_block().unwrap().unwrap();
+                assert_eq!(block.device_us, fixture.times_us(wanted).0, "from {from}, of {fixture:?}");
+            }
+        }
+        recording.seek(fixture.times_us(last).1 + 1).unwrap();
+        assert!(recording.next_block().unwrap().is_none(), "behind the end");
+        recording.seek(0).unwrap();
+        let frames = all(&mut recording);
+        assert_eq!(frames.len(), 3 * fixture.captures as usize, "from the start");
+        assert_eq!(recording.losses(), Losses::default());
+    }
+}
+
+#[test]
+fn an_index_that_lies_is_not_believed() {
+    let fixture = Fixture { captures: 90, motion: false, ..Fixture::small() };
+    let (mut bytes, written) = fixture.bytes_and_places();
+    // Every position of the index points into the middle of a picture.
+    let index = written.clusters_end as usize;
+    let mark = [0xF1_u8];
+    let mut at = index;
+    while let Some(found) = bytes[at..].windows(1).position(|w| w == mark) {
+        at += found + 2;
+        bytes[at] ^= 0x15;
+    }
+    let mut recording = open(bytes).unwrap();
+    recording.seek(fixture.times_us(60).0).unwrap();
+    assert_eq!(recording.next_block().unwrap().unwrap().device_us, fixture.times_us(60).0);
+}
+
+#[test]
+fn a_file_that_is_cut_is_read_up_to_its_last_whole_cluster() {
+    let fixture = Fixture { captures: 8, motion: false, ..Fixture::small() };
+    let (bytes, written) = fixture.bytes_and_places();
+    let ends: Vec<u64> = written.clusters[1..].iter().copied().chain([written.clusters_end]).collect();
+    let whole = all(&mut open(bytes.clone()).unwrap());
+    let first = written.clusters[0];
+    for cut in [
+        first + 8,
+        first + 700_000,
+        ends[0] - 1,
+        ends[0],
+        ends[0] + 3,
+        ends[3] + 5,
+        ends[5] - 100,
+        ends[7] + 2,
+    ] {
+        let mut recording = open(bytes[..cut as usize].to_vec()).unwrap();
+        assert!(recording.facts().is_cut && recording.facts().duration_ns.is_none());
+        let frames = all(&mut recording);
+        let good = ends.iter().filter(|end| **end <= cut).count();
+        let captures = frames.iter().filter(|f| f.0 == TrackKind::Color).count();
+        assert_eq!(captures, good, "cut at {cut}: {ends:?}");
+        same(&frames, &whole[..frames.len()]);
+        let lost = cut - ends.get(good.wrapping_sub(1)).map_or(first, |end| *end);
+        assert_eq!(
+            recording.losses().bytes,
+            if lost > 0 && good < ends.len() { lost } else { recording.losses().bytes }
+        );
+    }
+}
+
+#[test]
+fn a_file_that_is_cut_before_its_first_picture_says_so() {
+    let (bytes, written) = Fixture::small().bytes_and_places();
+    for cut in [0, 1, 30, 45, 60, 300, 1000, written.clusters[0] as usize - 100, written.clusters[0] as usize]
+    {
+        let e = open(bytes[..cut].to_vec()).unwrap_err();
+        let text = e.to_string();
+        assert_eq!(e.kind(), ErrorKind::BadInput, "{text}");
+        assert!(
+            text.starts_with("test.mkv: ") && (text.contains("cut off") || text.contains("no Matroska")),
+            "{cut}: {text}"
+        );
+    }
+}
+
+#[test]
+fn a_damaged_cluster_is_left_out_and_counted() {
+    let fixture = Fixture { captures: 8, motion: false, ..Fixture::small() };
+    let (bytes, written) = fixture.bytes_and_places();
+    let size = |i: usize| written.clusters[i + 1] - written.clusters[i];
+    let whole = all(&mut open(bytes.clone()).unwrap());
+    let without = |n: u64| -> Vec<_> {
+        // Capture n is cluster n: the period is longer than a cluster.
+        let at = fixture.times_us(n as u32).0;
+        let of_cluster = |t: u64| t >= at && t < at + 33_333;
+        whole.iter().filter(|f| !of_cluster(f.1)).cloned().collect()
+    };
+    let damage = |at: u64, with: &[u8]| {
+        let mut bytes = bytes.clone();
+        bytes[at as usize..at as usize + with.len()].copy_from_slice(with);
+        let mut recording = open(bytes).unwrap();
+        (all(&mut recording), recording.losses())
+    };
+    let third = written.clusters[3];
+    // A flipped bit in a picture; a lying size of a block; the cluster's own size, too long and too short; its name.
+    let pixel = third + 500_000;
+    let (frames, losses) = damage(pixel, &[bytes[pixel as usize] ^ 4]);
+    same(&frames, &without(3));
+    assert_eq!(losses, Losses { places: 1, bytes: size(3) });
+    for (at, with) in [(third + 4, &[0x18, 0, 0, 0][..]), (third + 4, &[0x20, 0x10, 0]), (third, &[0; 12])] {
+        let (frames, losses) = damage(at, with);
+        same(&frames, &without(3));
+        assert_eq!(losses, Losses { places: 1, bytes: size(3) }, "{with:?} at {at}");
+    }
+    // Without checksums what is damaged inside of a picture shows to nobody, but its structure does.
+    let plain = Fixture { checksums: false, ..fixture.clone() };
+    let (mut bytes, written) = plain.bytes_and_places();
+    let at = written.clusters[2] as usize;
+    let block = bytes[at..].windows(1).position(|w| w == [0xA3]).unwrap() + at;
+    bytes[block + 1] = 0x1F;
+    let mut recording = open(bytes).unwrap();
+    assert_eq!(all(&mut recording).iter().filter(|f| f.0 == TrackKind::Color).count(), 7);
+    assert_eq!(recording.losses().places, 1);
+}
+
+#[test]
+fn rubbish_between_clusters_is_passed_over() {
+    let fixture = Fixture { captures: 4, open_sizes: true, ..Fixture::small() };
+    let (bytes, written) = fixture.bytes_and_places();
+    let whole = all(&mut open(bytes.clone()).unwrap());
+    let at = written.clusters[2] as usize;
+    // Things that begin as a cluster does, and are none.
+    let mut rubbish = vec![0x55; 3_000_000];
+    for place in (0..3_000_000).step_by(9999) {
+        rubbish[place..][..4].copy_from_slice(&[0x1F, 0x43, 0xB6, 0x75]);
+    }
+    let mixed = [&bytes[..at], &rubbish, &bytes[at..]].concat();
+    let mut recording = open(mixed).unwrap();
+    same(&all(&mut recording), &whole);
+    assert_eq!(recording.losses(), Losses { places: 1, bytes: 3_000_000 });
+}
+
+#[test]
+fn sizes_that_lie_take_no_memory() {
+    let fixture = Fixture { captures: 3, motion: false, open_sizes: true, ..Fixture::small() };
+    let (mut bytes, written) = fixture.bytes_and_places();
+    let at = written.clusters[1] as usize + 4;
+    bytes[at..at + 8].copy_from_slice(&[0x01, 0x7F, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFE]);
+    let mut recording = open(bytes).unwrap();
+    let frames = all(&mut recording);
+    assert_eq!(frames.iter().filter(|f| f.0 == TrackKind::Color).count(), 2, "the first and the third");
+    assert!(recording.memory_bytes() < 3_000_000);
+    // A header that claims more than the file has.
+    let (mut bytes, _) = Fixture::small().bytes_and_places();
+    // The first place is in the table of contents.
+    let tracks = (0..5000).filter(|i| bytes[*i..*i + 4] == [0x16, 0x54, 0xAE, 0x6B]).nth(1).unwrap();
+    bytes[tracks + 4] = 0x01;
+    let e = open(bytes).unwrap_err().to_string();
+    assert!(e.contains("Tracks at byte") && e.contains("claims"), "{e}");
+}
+
+#[test]
+fn a_file_of_somebody_else_is_refused_by_name() {
+    let error = |bytes: Vec<u8>| open(bytes).unwrap_err().to_string();
+    assert!(error(b"RIFF....AVI LIST".to_vec()).contains("this is no Matroska file"));
+    assert!(error(Vec::new()).contains("this is no Matroska file"));
+    let replaced = |from: &str, to: &str| {
+        let mut bytes = Fixture::small().bytes();
+        let n = from.len();
+        assert_eq!(n, to.len());
+        for i in 0..20_000 {
+            if &bytes[i..i + n] == from.as_bytes() {
+                bytes[i..i + n].copy_from_slice(to.as_bytes());
+            }
+        }
+        bytes
+    };
+    let e = error(replaced("K4A_", "XYZ_"));
+    assert!(
+        e.contains("no recording of an Azure Kinect: it has no tags K4A_")
+            && e.contains("\"COLOR\", \"DEPTH\""),
+        "{e}"
+    );
+    let e = error(replaced("V_MS/VFW/FOURCC", "V_MPEG4/ISO/AVC"));
+    assert!(e.contains("COLOR is stored as \"V_MPEG4/ISO/AVC\""), "{e}");
+    let e = error(replaced("b16g", "H264"));
+    assert!(e.contains("DEPTH are stored as \"H264\""), "{e}");
+    let e = error(replaced("NFOV_2X2BINNED", "WFOV_2X2BINNED"));
+    assert!(
+        e.contains("K4A_DEPTH_MODE is \"WFOV_2X2BINNED\", which does not fit pictures of 320x288"),
+        "{e}"
+    );
+    let e = error(replaced("STANDALONE", "OUTOFORDER"));
+    assert!(e.contains("K4A_WIRED_SYNC_MODE = \"OUTOFORDER\" is unknown"), "{e}");
+    let e = error(replaced("336277000", "336277x00"));
+    assert!(e.contains("K4A_START_OFFSET_NS = \"336277x00\" is no number of nanoseconds"), "{e}");
+}
+
+#[test]
+fn a_calibration_that_is_missing_or_wrong_is_an_error_of_its_own() {
+    let recording = open(Fixture { calibration: None, ..Fixture::small() }.bytes()).unwrap();
+    let e = recording.calibration().unwrap_err();
+    assert!(e.to_string().contains("test.mkv: the recording has no calibration.json"), "{e}");
+    let recording = open(Fixture { calibration: Some("{}".into()), ..Fixture::small() }.bytes()).unwrap();
+    let e = recording.calibration().unwrap_err();
+    assert!(
+        e.to_string().contains("test.mkv: the Kinect's calibration: no object CalibrationInformation"),
+        "{e}"
+    );
+    // Its tracks are read all the same.
+    assert_eq!(recording.tracks().len(), 4);
+}
+
+#[test]
+fn tracks_are_told_by_their_tags_not_by_their_order_or_name() {
+    let mut bytes = Fixture { motion: false, ..Fixture::small() }.bytes();
+    // A user's own track that is called COLOR, in the place of the real one.
+    let name = element::text(0x536E, "COLOR");
+    let at = bytes.windows(name.len()).position(|w| w == name).unwrap();
+    bytes[at + 3..at + 8].copy_from_slice(b"RGBRG");
+    let recording = open(bytes).unwrap();
+    assert_eq!(recording.track(TrackKind::Color).map(|(_, t)| t.name.as_str()), Some("RGBRG"));
+}
+
+/// A public recording of an Azure Kinect, if `DEPTHRIG_KINECT_SAMPLE` names it: `tests/assets/recording.mkv` of pyk4a. It
+/// shows somebody's room, so it is not kept here.
+#[test]
+fn a_recording_of_a_real_device() {
+    let Some(path) = std::env::var_os("DEPTHRIG_KINECT_SAMPLE").map(PathBuf::from) else {
+        println!("skipped: DEPTHRIG_KINECT_SAMPLE names no recording");
+        return;
+    };
+    let mut recording = Recording::open(&path).unwrap();
+    let facts = recording.facts().clone();
+    assert_eq!((facts.serial.as_str(), facts.start_offset_ns), ("001514394512", 336_277_000));
+    assert_eq!(facts.depth_mode, Some(DepthMode::NfovUnbinned));
+    let k = recording.calibration().unwrap().depth_intrinsics(DepthMode::NfovUnbinned);
+    for (got, wanted) in [(k.cx, 332.78), (k.cy, 348.83), (k.fx, 504.61), (k.fy, 504.73)] {
+        assert!((got - wanted).abs() < 0.01, "{got} {wanted}");
+    }
+    let frames = all(&mut recording);
+    assert_eq!(recording.losses(), Losses::default(), "the checksums of its clusters are right");
+    let depth = of(&frames, TrackKind::Depth);
+    let mut mm: Vec<u16> =
+        depth[0].1.as_chunks::<2>().0.iter().map(|b| u16::from_be_bytes(*b)).filter(|d| *d > 0).collect();
+    mm.sort_unstable();
+    assert_eq!((mm.len(), mm[0], mm[mm.len() / 2], mm[mm.len() - 1]), (281_945, 165, 1491, 3690));
+    assert_eq!(depth[0].0, 463_945 + 336_277);
+    let motion = of(&frames, TrackKind::Motion);
+    let sample = motion_samples(motion[0].1).next().unwrap();
+    assert_eq!(sample.accelerometer_ns, 336_277_000);
+    let length = sample.acceleration.iter().map(|a| a * a).sum::<f32>().sqrt();
+    assert!((length - 9.87).abs() < 0.01, "{length}");
+}
