@@ -55,15 +55,15 @@ pub use error::{Error, ErrorKind, Result};
 pub use frame::{Pixels, PushError, RecordFrame, RecordSet, SetDrop};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
 pub use options::{ColorCodec, Compression, DepthCodec, RecorderOptions};
-pub use recorder::{DiskStatus, Progress, Recorder, Summary, UtcSource};
+pub use recorder::{DiskStatus, Progress, Recorder, Resumed, Summary, UtcSource};
 pub use recover::{
     LostBytes, RecoverAction, RecoverOptions, RecoverProgress, RecoverReport, RecoveredSegment, recover,
     recover_with, unfinished_in,
 };
 pub use select::{Edge, Moment, SetSpan};
 pub use session::{
-    Edit, FORMAT, Note, Outcome, SESSION_FILE, Session, SessionChanges, StreamRecord, check_name, edit,
-    rename,
+    Computed, Edit, FORMAT, Note, Outcome, SESSION_FILE, Session, SessionChanges, StreamRecord, check_name,
+    edit, rename,
 };
 pub use slice::{Derived, SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, npy_file, still};

@@ -17,6 +17,7 @@ use std::thread::JoinHandle;
 
 mod guard;
 mod progress;
+mod resume;
 mod ticket;
 pub(crate) mod topics;
 mod worker;
@@ -24,6 +25,8 @@ mod writer;
 
 pub use guard::DiskStatus;
 pub use progress::{Progress, Summary};
+use resume::Past;
+pub use resume::Resumed;
 use ticket::{Job, Load, Ticket};
 use topics::Topics;
 use writer::Writer;
@@ -63,6 +66,17 @@ struct Shared {
     io_since_ns: AtomicI64,
     /// Tells others that the dataset is being recorded.
     _lock: Option<Box<dyn Send + Sync>>,
+}
+
+/// What a recorder begins with.
+struct Begin {
+    fs: Arc<dyn Fs>,
+    utc: UtcSource,
+    topics: Topics,
+    free_bytes: u64,
+    lock: Option<Box<dyn Send + Sync>>,
+    segment: crate::container::segment::Segment,
+    past: Past,
 }
 
 struct State {
@@ -130,7 +144,39 @@ impl Recorder {
                 let _ = fs.remove_file(&dir.join(name));
             }
         })?;
+        let begin = Begin { fs, utc, topics, free_bytes, lock, segment, past: Past::new(session) };
+        Self::start(begin, dir, options)
+    }
 
+    /// Goes on with the dataset `dir` whose recorder was killed: after the sets of its finished segments, which stay as
+    /// they are. What an unfinished segment holds is removed and has to be recorded again, with the same numbers. For
+    /// makers of datasets who can; what a camera gave is not to be had again, that is what [`crate::recover`] is for.
+    ///
+    /// # Errors
+    /// [`ErrorKind::AlreadyExists`] when the dataset is whole, [`ErrorKind::InUse`] when somebody else works on it,
+    /// [`ErrorKind::Corrupt`] when a finished segment cannot be read or is missing, [`ErrorKind::BadInput`] when it had
+    /// lost sets before, and as [`Recorder::create`].
+    pub fn resume(
+        fs: Arc<dyn Fs>,
+        utc: UtcSource,
+        dir: &Path,
+        options: RecorderOptions,
+    ) -> Result<(Self, Resumed)> {
+        let lock = lock_folder(&*fs, dir)?;
+        let past = resume::past(&fs, dir)?;
+        let free_bytes = free_space(&*fs, dir, &options)?;
+        let topics = Topics::new(&past.session, &options);
+        make_reserve(&*fs, dir, options.reserve_bytes)?;
+        let preamble = topics.preamble(&past.session, past.segments)?;
+        let segment = crate::container::segment::Segment::create(&*fs, dir, past.segments, &preamble)?;
+        let resumed = past.told();
+        let begin = Begin { fs, utc, topics, free_bytes, lock, segment, past };
+        Ok((Self::start(begin, dir, options)?, resumed))
+    }
+
+    fn start(begin: Begin, dir: &Path, options: RecorderOptions) -> Result<Self> {
+        let Begin { fs, utc, topics, free_bytes, lock, segment, past } = begin;
+        let session = past.session;
         let workers = options.workers.max(1);
         let queue_sets = options.queue_sets.max(1);
         let (jobs, job_queue) = bounded(queue_sets * session.streams.len());
@@ -142,15 +188,15 @@ impl Recorder {
             options,
             topics,
             state: Mutex::new(State {
-                counts: SetCounts::default(),
-                frames: 0,
-                bytes: 0,
-                segments: 1,
-                last_id: None,
-                anchor: None,
-                last_log_time: i64::MIN,
-                first_tick: None,
-                last_tick: None,
+                counts: SetCounts { offered: past.sets, recorded: past.sets, ..SetCounts::default() },
+                frames: past.frames,
+                bytes: past.bytes,
+                segments: past.segments + 1,
+                last_id: past.last_id,
+                anchor: past.anchor,
+                last_log_time: past.last_log_time,
+                first_tick: past.first_tick,
+                last_tick: past.last_tick,
                 ended: None,
                 error: None,
                 end_because: None,
@@ -183,7 +229,7 @@ impl Recorder {
         let guard = std::thread::Builder::new().name("rec-disk".into());
         let guard = guard.spawn(move || guard::run(&watched, &stopped)).map_err(no_thread)?;
         recorder.guard = Some((stop, guard));
-        let writer = Writer::new(shared, ticket_queue, segment);
+        let writer = Writer::new(shared, ticket_queue, segment, past.segments);
         recorder.writer = Some(thread.spawn(move || writer.run()).map_err(no_thread)?);
         Ok(recorder)
     }
@@ -398,6 +444,11 @@ fn prepare_folder(fs: &dyn Fs, dir: &Path, options: &RecorderOptions) -> Result<
         }
         Err(e) => return Err(Error::io("use the folder", dir, e)),
     }
+    free_space(fs, dir, options)
+}
+
+/// The bytes that are free in the folder, if they are enough to begin with.
+fn free_space(fs: &dyn Fs, dir: &Path, options: &RecorderOptions) -> Result<u64> {
     let free = fs.available_space(dir).map_err(|e| Error::io("ask for the free space of", dir, e))?;
     let needed = options.min_free_bytes.saturating_add(options.reserve_bytes);
     if free < needed {

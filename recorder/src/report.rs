@@ -69,6 +69,9 @@ pub struct Report {
     pub notes: Vec<Note>,
     /// What was changed afterwards.
     pub history: Vec<Edit>,
+    /// Streams that no camera gave, with what computed them.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub computed: Vec<crate::Computed>,
     /// What is to be thought of it.
     pub verdict: Verdict,
     /// Its sets.

@@ -61,6 +61,9 @@ pub struct Session {
     /// What it was cut from or joined from, oldest first; empty for a recording as it was made.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub derived: Vec<crate::Derived>,
+    /// Streams that no camera gave, with what computed them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub computed: Vec<Computed>,
     /// The recorded streams; a frame names its stream by the index here.
     pub streams: Vec<StreamRecord>,
     /// Keys that this version does not know: a user's own, or a later version's. They are kept.
@@ -84,6 +87,36 @@ pub struct Edit {
     /// The version of depthrig that changed it.
     #[serde(default)]
     pub depthrig_version: String,
+}
+
+/// What computed a stream, such as depth out of two pictures: in `session.toml` under `[[computed]]`, and in the metadata
+/// of the stream's channels.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Computed {
+    /// The stream, `camera/stream`.
+    pub stream: StreamId,
+    /// What it is called, such as `mimic_quality`.
+    pub name: String,
+    /// The program or network with its version.
+    pub producer: String,
+    /// Every setting that the pixels depend on.
+    #[serde(default)]
+    pub parameters: String,
+    /// The streams that it was computed from.
+    #[serde(default)]
+    pub from: Vec<StreamId>,
+}
+
+impl core::fmt::Display for Computed {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let from: Vec<_> = self.from.iter().map(ToString::to_string).collect();
+        let from = from.join(" and ");
+        write!(f, "{} is {} by {}", self.stream, self.name, self.producer)?;
+        if !from.is_empty() {
+            write!(f, " from {from}")?;
+        }
+        if self.parameters.is_empty() { Ok(()) } else { write!(f, ": {}", self.parameters) }
+    }
 }
 
 /// A note of the operator.
@@ -210,6 +243,7 @@ impl Session {
             notes: Vec::new(),
             history: Vec::new(),
             derived: Vec::new(),
+            computed: Vec::new(),
             streams: Vec::new(),
             extra: toml::Table::new(),
         }

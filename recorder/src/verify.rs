@@ -126,6 +126,9 @@ pub struct VerifyReport {
     pub decoded: bool,
     /// Whether it was stopped before the end; the rest was not looked at.
     pub stopped: bool,
+    /// Streams that no camera gave, with what computed them.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub computed: Vec<crate::Computed>,
 }
 
 impl VerifyReport {
@@ -191,6 +194,7 @@ pub fn verify_watched(
         segments: segments.len() as u32,
         decoded: options.decode,
         stopped,
+        computed: session.computed,
     })
 }
 
@@ -277,6 +281,11 @@ fn open(fs: &Arc<dyn Fs>, path: &Path, findings: &mut Findings) -> Result<(Sessi
 }
 
 fn check_session(session: &Session, findings: &mut Findings) {
+    let is_there = |id: &depthrig_bus::StreamId| session.streams.iter().any(|s| s.id == *id);
+    for made in session.computed.iter().filter(|made| !is_there(&made.stream)) {
+        let what = format!("{} is said to be {}, but there is no such stream", made.stream, made.name);
+        findings.add(Severity::Broken, SESSION_FILE, None, what);
+    }
     for s in &session.streams {
         if s.format.is_depth() && s.depth_unit_m <= 0.0 {
             let what = format!("{} is depth without a unit: its numbers mean nothing", s.id);

@@ -3,7 +3,7 @@
 use super::{Dataset, PixelMode, SetRange};
 use crate::msgs::accounts;
 use crate::msgs::schemas::Schema;
-use crate::{ErrorKind, Result, SetCounts, StreamAccount};
+use crate::{Computed, ErrorKind, Result, SetCounts, StreamAccount};
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -41,6 +41,9 @@ pub struct DatasetInfo {
     pub spread: SpreadStats,
     /// Per stream.
     pub streams: Vec<StreamInfo>,
+    /// Streams that no camera gave, with what computed them.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub computed: Vec<Computed>,
     /// The last account of the sets in the file.
     pub set_counts: Option<SetCounts>,
     /// The last account of each stream in the file.
@@ -116,6 +119,7 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         problems: Vec::new(),
         spread: SpreadStats::default(),
         streams: Vec::new(),
+        computed: session.computed.clone(),
         set_counts: None,
         accounts: Vec::new(),
     };

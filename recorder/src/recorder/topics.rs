@@ -168,6 +168,14 @@ impl Topics {
             ];
             let mut metadata: BTreeMap<_, _> = facts.map(|(k, v)| (k.to_owned(), v)).into();
             metadata.extend([qos(false)]);
+            for made in session.computed.iter().filter(|c| c.stream == s.id) {
+                let facts = [
+                    ("computed", &made.name),
+                    ("producer", &made.producer),
+                    ("parameters", &made.parameters),
+                ];
+                metadata.extend(facts.map(|(k, v)| (k.to_owned(), v.clone())));
+            }
             let id = image_channel(i);
             let topics =
                 [(picture, schema), ("camera_info", Schema::CameraInfo), ("frame_info", Schema::FrameInfo)];

@@ -39,14 +39,19 @@ pub(super) struct Writer {
 }
 
 impl Writer {
-    pub(super) fn new(shared: Arc<Shared>, tickets: Receiver<Arc<Ticket>>, segment: Segment) -> Self {
-        shared.lock().bytes = segment.len();
+    pub(super) fn new(
+        shared: Arc<Shared>,
+        tickets: Receiver<Arc<Ticket>>,
+        segment: Segment,
+        index: u32,
+    ) -> Self {
+        shared.lock().bytes += segment.len();
         let next_sync = HostTime::now().plus_ns(shared.options.sync_interval_ns);
         Self {
             shared,
             tickets,
             segment: Some(segment),
-            index: 0,
+            index,
             in_segment: None,
             builder: ChunkBuilder::new(),
             sequence: 0,

@@ -297,6 +297,7 @@ fn put_together(dataset: &Dataset, pass: Pass, told: Told, looked: Looked) -> Re
         started_utc_ns: session.started_utc_ns,
         notes: session.notes.clone(),
         history: session.history.clone(),
+        computed: session.computed.clone(),
         verdict: verdict::unknown(),
         sets,
         bins,

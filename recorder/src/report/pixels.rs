@@ -172,7 +172,7 @@ impl<'a> Picture<'a> {
 
     /// The greatest of some of the pixels of 16-bit grey or disparity, at least 1.
     fn brightest(&self) -> f32 {
-        let mut rows = (0..self.height).step_by(4).map(|y| self.row(y));
+        let rows = (0..self.height).step_by(4).map(|y| self.row(y));
         if self.format == PixelFormat::DisparityF32 {
             let xs = || (0..self.width as usize).step_by(4);
             return rows.flat_map(|r| xs().map(|x| disparity(r, x))).fold(1.0, f32::max);

@@ -14,6 +14,7 @@ mod kill;
 mod lerobot;
 mod recover;
 mod report;
+mod resume;
 mod round_trip;
 mod set_reader;
 mod slice;

@@ -89,6 +89,7 @@ pub fn text(info: &DatasetInfo) -> String {
             }),
         ),
     ];
+    lines.extend(info.computed.iter().map(|made| format!("computed: {made}")));
     lines.extend(info.unfinished.iter().map(|file| format!("unfinished: {file}")));
     lines.extend(info.problems.iter().map(|problem| format!("problem: {problem}")));
     lines.join("\n")

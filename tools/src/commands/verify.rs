@@ -73,6 +73,11 @@ pub fn run(args: &VerifyArgs, context: &Context) -> Result<Exit> {
             }
         }
         out::line(summary(&report))?;
+        if context.global.quiet == 0 {
+            for made in &report.computed {
+                out::line(format_args!("computed: {made}"))?;
+            }
+        }
     }
     Ok(exit(&report))
 }

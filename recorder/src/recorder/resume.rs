@@ -1,0 +1,114 @@
+//! What the finished segments of a recording hold whose recorder was killed.
+
+use super::RESERVE_FILE;
+use super::topics::SEGMENT_METADATA;
+use crate::dataset::{Dataset, PixelMode, SetRange, segment_number};
+use crate::fs::Fs;
+use crate::session::SESSION_TMP;
+use crate::{Error, ErrorKind, Result, Session};
+use depthrig_bus::{HostTime, UtcPair};
+use std::path::Path;
+use std::sync::Arc;
+
+/// What was there when a recording went on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Resumed {
+    /// Sets in the finished segments.
+    pub sets: u64,
+    /// Their frames.
+    pub frames: u64,
+    /// Id of the last of them; the next set must have a greater one.
+    pub last_set: Option<u64>,
+}
+
+/// The same as the recorder needs it.
+pub(super) struct Past {
+    pub(super) session: Session,
+    /// Finished segments.
+    pub(super) segments: u32,
+    pub(super) sets: u64,
+    pub(super) frames: u64,
+    pub(super) bytes: u64,
+    pub(super) last_id: Option<u64>,
+    pub(super) anchor: Option<UtcPair>,
+    pub(super) last_log_time: i64,
+    pub(super) first_tick: Option<HostTime>,
+    pub(super) last_tick: Option<HostTime>,
+}
+
+impl Past {
+    /// That of a new dataset: nothing.
+    pub(super) const fn new(session: Session) -> Self {
+        Self {
+            session,
+            segments: 0,
+            sets: 0,
+            frames: 0,
+            bytes: 0,
+            last_id: None,
+            anchor: None,
+            last_log_time: i64::MIN,
+            first_tick: None,
+            last_tick: None,
+        }
+    }
+
+    pub(super) const fn told(&self) -> Resumed {
+        Resumed { sets: self.sets, frames: self.frames, last_set: self.last_id }
+    }
+}
+
+/// Removes what a killed recorder left unfinished in `dir` and reads what is finished. Pictures are not read.
+pub(super) fn past(fs: &Arc<dyn Fs>, dir: &Path) -> Result<Past> {
+    let session = Session::load(&**fs, dir)?;
+    if session.outcome.is_some() {
+        let message = format!("{} is whole already; nothing can be recorded into it", dir.display());
+        return Err(Error::new(ErrorKind::AlreadyExists, message));
+    }
+    let entries = fs.read_dir(dir).map_err(|e| Error::io("read the folder", dir, e))?;
+    let (mut numbers, mut bytes) = (Vec::new(), 0);
+    for entry in entries {
+        let number = segment_number(&entry.name);
+        let unfinished = number.is_some() && entry.name.ends_with(".part");
+        if unfinished || entry.name == RESERVE_FILE || entry.name == SESSION_TMP {
+            let path = dir.join(&entry.name);
+            fs.remove_file(&path).map_err(|e| Error::io("remove", &path, e))?;
+        } else if let Some(number) = number {
+            numbers.push(number);
+            bytes += entry.len;
+        }
+    }
+    numbers.sort_unstable();
+    if let Some(missing) = (0u32..).zip(&numbers).find(|(i, n)| i != *n).map(|(i, _)| i) {
+        return Err(Error::new(
+            ErrorKind::Corrupt,
+            format!("{} has no segment number {missing}, but later ones; begin anew", dir.display()),
+        ));
+    }
+    let mut past = Past { segments: numbers.len() as u32, bytes, ..Past::new(session) };
+    if numbers.is_empty() {
+        return Ok(past);
+    }
+    let dataset = Dataset::open_with(Arc::clone(fs), dir)?;
+    for set in dataset.sets_with(SetRange::ALL, PixelMode::None) {
+        let set = set?;
+        past.sets += 1;
+        past.frames += set.frames.len() as u64;
+        past.last_id = Some(set.id);
+        past.last_log_time = set.utc_ns;
+        let offset = set.tick.ns().saturating_add(set.utc_offset_ns);
+        past.anchor.get_or_insert(UtcPair { mono: set.tick, utc_ns: offset, width_ns: 0 });
+        past.first_tick.get_or_insert(set.tick);
+        past.last_tick = Some(set.tick);
+    }
+    if let Some(last) = dataset.open_segment(numbers.len() - 1) {
+        let facts = last?.metadata(SEGMENT_METADATA).cloned().unwrap_or_default();
+        if let Some((key, n)) = facts.iter().find(|(key, _)| key.starts_with("sets_dropped_")) {
+            return Err(Error::new(
+                ErrorKind::BadInput,
+                format!("{} had lost sets before ({key} {n}); begin anew", dir.display()),
+            ));
+        }
+    }
+    Ok(past)
+}

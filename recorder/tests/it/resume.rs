@@ -1,0 +1,151 @@
+//! Recordings that go on where their recorder was killed.
+
+use crate::support::*;
+use depthrig_bus::{StreamId, UtcPair};
+use depthrig_recorder::fs::{Fs, MemFs};
+use depthrig_recorder::{
+    CompareOptions, Computed, ErrorKind, Recorder, RecorderOptions, Session, UtcSource, VerifyOptions,
+    compare, verify_with,
+};
+use std::path::Path;
+use std::sync::Arc;
+
+const SETS: u64 = 17;
+
+fn limits() -> RecorderOptions {
+    // Only sets close segments, and the clock of the host is in no file.
+    RecorderOptions { segment_max_ns: 4 * PERIOD, sync_interval_ns: i64::MAX / 4, ..options() }
+}
+
+fn clock() -> UtcSource {
+    Arc::new(|| UtcPair { utc_ns: T0, ..UtcPair::default() })
+}
+
+fn computed() -> Session {
+    let mut s = session();
+    let from = vec![StreamId::new("zed", "left").unwrap(), StreamId::new("zed", "right").unwrap()];
+    let of = |stream: &StreamId| Computed {
+        stream: stream.clone(),
+        name: "mimic_quality".into(),
+        producer: "a matcher 1.0".into(),
+        parameters: "paths=8".into(),
+        from: from.clone(),
+    };
+    s.computed = vec![of(&s.streams[1].id)];
+    s
+}
+
+fn push(r: &Recorder, sets: std::ops::Range<u64>) {
+    for n in sets {
+        r.push(set(&session(), n)).unwrap();
+        settle(r);
+    }
+}
+
+fn begin(fs: &MemFs) -> Recorder {
+    let started = Session { started_utc_ns: T0, ..computed() };
+    Recorder::create_with(Arc::new(fs.clone()), clock(), &dir(), started, limits()).unwrap()
+}
+
+fn sizes(fs: &MemFs) -> Vec<(String, u64)> {
+    fs.read_dir(&dir()).unwrap().into_iter().map(|e| (e.name, e.len)).collect()
+}
+
+/// Killed anywhere, and as often as one likes, it ends as one that was not.
+#[test]
+fn a_resumed_recording_is_the_one_that_was_never_killed() {
+    let whole = MemFs::new();
+    let r = begin(&whole);
+    push(&r, 0..SETS);
+    assert!(r.finish().unwrap().complete);
+    let strict = CompareOptions { strict: true, ..CompareOptions::default() };
+    for first in [0, 1, 3, 4, 5, 8, 11, 16, 17] {
+        for second in [0, 2, 6] {
+            let fs = MemFs::new();
+            let r = begin(&fs);
+            push(&r, 0..first);
+            drop(r);
+            let mut done = 0;
+            for more in [second, SETS] {
+                let (r, resumed) = Recorder::resume(Arc::new(fs.clone()), clock(), &dir(), limits()).unwrap();
+                assert!(
+                    resumed.sets >= done && resumed.sets.is_multiple_of(4),
+                    "{first} {second}: {resumed:?}"
+                );
+                assert_eq!(resumed.last_set, (resumed.sets > 0).then_some(resumed.sets));
+                done = resumed.sets;
+                push(&r, done..(done + more).min(SETS));
+                if more == SETS {
+                    let summary = r.finish().unwrap();
+                    assert!(summary.complete, "{:?}", summary.lost);
+                    assert_eq!(summary.sets.recorded, SETS);
+                    assert_eq!(summary.duration_ns, (SETS as i64 - 1) * PERIOD);
+                }
+            }
+            // Segments end at the same sets; the messages between sets are numbered anew in each run.
+            assert_eq!(sizes(&fs), sizes(&whole), "{first} {second}");
+            let same = compare(&open(&fs), &open(&whole), &strict).unwrap();
+            assert!(same.equal, "{first} {second}: {:?}", same.differences);
+            let shared: Arc<dyn Fs> = Arc::new(fs);
+            let report = verify_with(&shared, &dir(), &VerifyOptions { decode: true, ..Default::default() });
+            assert!(report.as_ref().is_ok_and(depthrig_recorder::VerifyReport::is_whole), "{report:?}");
+        }
+    }
+}
+
+#[test]
+fn what_cannot_go_on_is_refused() {
+    let resume =
+        |fs: &MemFs| Recorder::resume(Arc::new(fs.clone()), clock(), &dir(), limits()).err().unwrap();
+    assert_eq!(resume(&MemFs::new()).kind(), ErrorKind::NotFound);
+    let fs = MemFs::new();
+    let r = begin(&fs);
+    push(&r, 0..9);
+    assert_eq!(resume(&fs).kind(), ErrorKind::InUse);
+    drop(r);
+    let gap = copy(&fs);
+    gap.remove_file(&segment(0)).unwrap();
+    let e = resume(&gap);
+    assert_eq!(e.kind(), ErrorKind::Corrupt, "{e}");
+    let (r, _) = Recorder::resume(Arc::new(fs.clone()), clock(), &dir(), limits()).unwrap();
+    r.finish().unwrap();
+    assert_eq!(resume(&fs).kind(), ErrorKind::AlreadyExists);
+}
+
+/// What computed a stream is in the session, in the channels, and in what tells of a dataset.
+#[test]
+fn provenance_is_told() {
+    let fs = MemFs::new();
+    let r = begin(&fs);
+    push(&r, 0..2);
+    r.finish().unwrap();
+    let dataset = open(&fs);
+    let made = computed().computed;
+    assert_eq!(dataset.session().computed, made);
+    assert_eq!(dataset.info().unwrap().computed, made);
+    let shared: Arc<dyn Fs> = Arc::new(fs.clone());
+    let report = verify_with(&shared, &dir(), &VerifyOptions::default()).unwrap();
+    assert!(report.is_whole());
+    assert_eq!(report.computed, made);
+    let bytes = contents(&fs, &segment(0));
+    let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
+    let facts = |key: &str| {
+        let channels =
+            summary.channels.values().filter_map(|c| Some((c.topic.clone(), c.metadata.get(key)?.clone())));
+        channels.collect::<Vec<_>>()
+    };
+    assert_eq!(facts("computed").len(), 3, "{:?}", facts("computed"));
+    assert!(facts("producer").iter().all(|(_, v)| v == "a matcher 1.0"));
+    assert!(facts("parameters").iter().all(|(_, v)| v == "paths=8"));
+    let told = made[0].to_string();
+    assert!(told.ends_with("mimic_quality by a matcher 1.0 from zed/left and zed/right: paths=8"), "{told}");
+
+    let mut wrong = computed();
+    wrong.computed[0].stream = StreamId::new("no", "stream").unwrap();
+    let dir = Path::new("/wrong");
+    let r = Recorder::create(Arc::new(fs.clone()), dir, wrong, limits()).unwrap();
+    r.push(set(&session(), 0)).unwrap();
+    r.finish().unwrap();
+    let report = verify_with(&shared, dir, &VerifyOptions::default()).unwrap();
+    assert!(report.findings.iter().any(|f| f.message.contains("no such stream")), "{:?}", report.findings);
+}
