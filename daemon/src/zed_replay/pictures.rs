@@ -1,0 +1,131 @@
+//! From raw pictures of both eyes to rectified ones, and from disparity to the frames of a dataset.
+
+use depthrig_bus::PixelFormat;
+use depthrig_calib::rectify::{Rectifier, View};
+use depthrig_calib::stereo::{DisparityMap, Gray, StereoPair, depth_from_disparity};
+use depthrig_recorder::{Error, ErrorKind, Pixels, Result};
+use std::sync::Arc;
+
+/// Both eyes as they were recorded, without padding.
+pub(super) struct Raw {
+    pub(super) format: PixelFormat,
+    pub(super) left: Vec<u8>,
+    pub(super) right: Vec<u8>,
+}
+
+/// Both eyes rectified.
+pub(super) struct Views {
+    width: usize,
+    height: usize,
+    left: Vec<u8>,
+    right: Vec<u8>,
+    /// Colour of the left eye: what is recorded.
+    pub(super) color: Vec<u8>,
+    /// Colour of the right eye, for networks.
+    right_color: Option<Vec<u8>>,
+}
+
+impl Views {
+    /// As matchers take it.
+    pub(super) fn pair(&self) -> StereoPair<'_> {
+        StereoPair {
+            left: Gray::packed(&self.left, self.width, self.height),
+            right: Gray::packed(&self.right, self.width, self.height),
+            left_rgb: Some(&self.color),
+            right_rgb: self.right_color.as_deref(),
+        }
+    }
+}
+
+/// What a mode made of a pair.
+pub(super) struct Made {
+    /// In units; 0 is a hole.
+    pub(super) depth: Vec<u16>,
+    pub(super) confidence: Vec<u8>,
+    /// Pixels; NaN is a hole. Only when it was asked for.
+    pub(super) disparity: Option<Vec<f32>>,
+}
+
+/// Numbers as the bytes of a frame, which are little-endian as this computer's are.
+pub(super) struct Numbers<T>(pub(super) Vec<T>);
+
+impl<T: bytemuck::Pod + Send> Pixels for Numbers<T> {
+    fn bytes(&self) -> &[u8] {
+        bytemuck::cast_slice(&self.0)
+    }
+}
+
+/// The colour of rectified views.
+pub(super) struct Color(pub(super) Arc<Views>);
+
+impl Pixels for Color {
+    fn bytes(&self) -> &[u8] {
+        &self.0.color
+    }
+}
+
+/// What is the same for all pairs.
+pub(super) struct Maker {
+    pub(super) rectifier: Rectifier,
+    /// A network wants the right eye's colour too.
+    pub(super) colors: bool,
+    pub(super) depth_unit_m: f64,
+    pub(super) range_m: (f64, f64),
+    pub(super) disparity: bool,
+}
+
+fn failed(e: depthrig_calib::Error) -> Error {
+    Error::new(ErrorKind::BadInput, e.to_string()).with_source(e)
+}
+
+impl Maker {
+    /// Bytes of a rectified pair with its raw pictures and all that is made of it by `modes` modes.
+    pub(super) fn pair_bytes(&self, modes: usize) -> u64 {
+        let (w, h) = self.rectifier.size();
+        let per_pixel = 2 * 3 + 2 + 2 * 3 + modes * (2 + 1 + 4 * usize::from(self.disparity));
+        u64::from(w) * u64::from(h) * per_pixel as u64
+    }
+
+    /// Rectifies both eyes.
+    pub(super) fn rectify(&self, raw: &Raw) -> Result<Views> {
+        let (width, height) = self.rectifier.size();
+        let (width, height) = (width as usize, height as usize);
+        let grey = |view, picture: &[u8]| {
+            let mut out = vec![0; width * height];
+            match raw.format {
+                PixelFormat::Yuyv => self.rectifier.grey_from_yuyv(view, picture, &mut out),
+                PixelFormat::Mono8 => self.rectifier.grey(view, picture, &mut out),
+                _ => self.rectifier.grey_from_rgb(view, picture, &mut out),
+            }
+            .map_err(failed)?;
+            Ok::<_, Error>(out)
+        };
+        let color = |view, picture: &[u8], grey: &[u8]| {
+            let mut out = vec![0; width * height * 3];
+            match raw.format {
+                PixelFormat::Yuyv => self.rectifier.rgb_from_yuyv(view, picture, &mut out),
+                PixelFormat::Mono8 => {
+                    out.as_chunks_mut().0.iter_mut().zip(grey).for_each(|(p, v)| *p = [*v; 3]);
+                    Ok(())
+                }
+                _ => self.rectifier.rgb(view, picture, &mut out),
+            }
+            .map_err(failed)?;
+            Ok::<_, Error>(out)
+        };
+        let (left, right) = (grey(View::Left, &raw.left)?, grey(View::Right, &raw.right)?);
+        let left_color = color(View::Left, &raw.left, &left)?;
+        let right_color = if self.colors { Some(color(View::Right, &raw.right, &right)?) } else { None };
+        Ok(Views { width, height, left, right, color: left_color, right_color })
+    }
+
+    /// Depth of a disparity.
+    pub(super) fn depth(&self, map: &DisparityMap) -> Result<Made> {
+        let mut depth = vec![0; map.disparity.len()];
+        let (focal, baseline) = (self.rectifier.intrinsics().fx, self.rectifier.baseline_m());
+        depth_from_disparity(&map.disparity, focal, baseline, self.depth_unit_m, self.range_m, &mut depth)
+            .map_err(failed)?;
+        let disparity = self.disparity.then(|| map.disparity.clone());
+        Ok(Made { depth, confidence: map.confidence.clone(), disparity })
+    }
+}

@@ -1,0 +1,139 @@
+//! The folder beside the output in which it grows, and what a later run needs to know of this one.
+
+use depthrig_bus::UtcPair;
+use depthrig_recorder::fs::{Fs, RealFs};
+use depthrig_recorder::{Error, ErrorKind, RecordSet, Result, UtcSource};
+use serde_json::Value;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+const PLAN_FILE: &str = "plan.json";
+
+/// `OUT.zedreplay`, locked against other runs.
+pub(super) struct Work {
+    dir: PathBuf,
+    _lock: Box<dyn Send + Sync>,
+}
+
+fn failed(what: &str, path: &Path, e: std::io::Error) -> Error {
+    let kind = match e.kind() {
+        std::io::ErrorKind::PermissionDenied => ErrorKind::PermissionDenied,
+        std::io::ErrorKind::StorageFull => ErrorKind::DiskFull,
+        _ => ErrorKind::Io,
+    };
+    Error::new(kind, format!("cannot {what} {}: {e}", path.display())).with_source(e)
+}
+
+impl Work {
+    /// Makes the folder or finds that of a run with the same `plan`.
+    pub(super) fn open(out: &Path, plan: &Value) -> Result<Self> {
+        let Some(name) = out.file_name() else {
+            let what = format!("{} is no name for a new dataset", out.display());
+            return Err(Error::new(ErrorKind::BadInput, what));
+        };
+        let mut name = name.to_os_string();
+        name.push(".zedreplay");
+        let dir = out.with_file_name(name);
+        std::fs::create_dir_all(&dir).map_err(|e| failed("create the folder", &dir, e))?;
+        let lock = RealFs.lock(&dir).map_err(|e| {
+            if e.kind() == std::io::ErrorKind::WouldBlock {
+                let what = format!("another run works in {}; wait for it, or choose another name", dir.display());
+                return Error::new(ErrorKind::InUse, what);
+            }
+            failed("lock", &dir, e)
+        })?;
+        let work = Self { dir, _lock: lock };
+        work.agree(plan)?;
+        Ok(work)
+    }
+
+    fn agree(&self, plan: &Value) -> Result<()> {
+        let path = self.dir.join(PLAN_FILE);
+        let found = match std::fs::read(&path) {
+            Ok(bytes) => bytes,
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
+                if self.dataset().exists() {
+                    return Err(self.stranger("a dataset is there without its plan"));
+                }
+                return self.write(&path, plan);
+            }
+            Err(e) => return Err(failed("read", &path, e)),
+        };
+        let Ok(Value::Object(found)) = serde_json::from_slice(&found) else {
+            return Err(self.stranger("its plan cannot be read"));
+        };
+        let differs = plan.as_object().and_then(|p| p.iter().find(|(key, value)| found.get(*key) != Some(value)));
+        match differs {
+            None => Ok(()),
+            Some((key, _)) => Err(self.stranger(&format!("it was begun with another {key}"))),
+        }
+    }
+
+    fn stranger(&self, why: &str) -> Error {
+        let what = format!(
+            "{} is what is left of another run ({why}): run that one to its end, remove the folder, or choose another name",
+            self.dir.display()
+        );
+        Error::new(ErrorKind::AlreadyExists, what)
+    }
+
+    fn write(&self, path: &Path, plan: &Value) -> Result<()> {
+        let tmp = path.with_extension("tmp");
+        let text = format!("{plan:#}\n");
+        let write = || {
+            let mut file = std::fs::File::create(&tmp)?;
+            file.write_all(text.as_bytes())?;
+            file.sync_all()?;
+            std::fs::rename(&tmp, path)?;
+            RealFs.sync_dir(&self.dir)
+        };
+        write().map_err(|e| failed("write", path, e))
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.dir
+    }
+
+    /// Where the dataset grows.
+    pub(super) fn dataset(&self) -> PathBuf {
+        self.dir.join("dataset")
+    }
+
+    /// Gives the dataset its name and removes the rest.
+    pub(super) fn finish(self, out: &Path) -> Result<()> {
+        let copy = self.dataset();
+        RealFs.rename(&copy, out).map_err(|e| failed("rename", &copy, e))?;
+        let parent = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        RealFs.sync_dir(parent).map_err(|e| failed("sync the folder", parent, e))?;
+        std::fs::remove_dir_all(&self.dir).map_err(|e| failed("remove", &self.dir, e))
+    }
+}
+
+/// The clock of what is recorded: the recorder's own readings must be of the recorded time, not of today's.
+pub(super) struct RecordedClock(Arc<Mutex<UtcPair>>);
+
+impl RecordedClock {
+    pub(super) fn new(started_utc_ns: i64) -> Self {
+        Self(Arc::new(Mutex::new(UtcPair { utc_ns: started_utc_ns, ..UtcPair::default() })))
+    }
+
+    pub(super) fn source(&self) -> UtcSource {
+        let pair = Arc::clone(&self.0);
+        Arc::new(move || *pair.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// It is the time of this set.
+    pub(super) fn set(&self, set: &RecordSet) {
+        let now = UtcPair { mono: set.tick, utc_ns: set.utc.utc_ns(set.tick), width_ns: set.utc.width_ns };
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = now;
+    }
+}
+
+/// Memory that can be had without swapping, bytes; 4 GiB where the system does not tell.
+pub(super) fn available_memory() -> u64 {
+    let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
+    let line = text.lines().find_map(|l| l.strip_prefix("MemAvailable:"));
+    let kib = line.and_then(|l| l.trim().strip_suffix("kB")?.trim().parse::<u64>().ok());
+    kib.map_or(4 << 30, |kib| kib.saturating_mul(1024))
+}
