@@ -24,6 +24,7 @@ pub mod prep;
 pub mod published;
 mod refine;
 mod refiner;
+mod stereo_network;
 pub mod store;
 #[cfg(all(test, feature = "candle"))]
 mod tiny;
@@ -41,5 +42,8 @@ pub use onnxruntime::{OnnxNetwork, find_library};
 pub use options::{EngineKind, Precision, RefinerOptions};
 pub use refine::{Color, ColorFormat, Description, Job, Output, RawDepth, Refiner, StepTimes};
 pub use refiner::CdmRefiner;
+#[doc(hidden)]
+pub use stereo_network::MadeNetwork;
+pub use stereo_network::{NetworkPixels, StereoNetwork, StereoNetworkOptions};
 pub use store::ModelStore;
 pub use weights::Weights;

@@ -14,7 +14,7 @@ use crate::Encoder;
 use crate::arch::Architecture;
 use core::ops::Range;
 
-mod builder;
+pub(crate) mod builder;
 mod network;
 pub mod proto;
 

@@ -15,10 +15,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use weights::BoundWeights;
 
-mod device;
+pub mod device;
 mod library;
-mod runtime;
-mod session;
+pub mod runtime;
+pub mod session;
 mod weights;
 
 /// As many bytes as the name of an engine may have.
@@ -203,7 +203,7 @@ const fn style(device: &Device, precision: Precision) -> Style {
 }
 
 /// `onnxruntime 1.31.1 cpu fp32`; with less of the version and of the device when that is too long for a header.
-fn describe(version: &str, device: &Device, precision: Precision) -> String {
+pub fn describe(version: &str, device: &Device, precision: Precision) -> String {
     let whole = format!("onnxruntime {version} {device} {precision}");
     if whole.len() <= NAME_BYTES {
         return whole;
@@ -218,7 +218,7 @@ fn describe(version: &str, device: &Device, precision: Precision) -> String {
 }
 
 /// What went wrong in the library.
-fn failed(engine: &str, what: &str, error: &ort::Error) -> Error {
+pub fn failed(engine: &str, what: &str, error: &ort::Error) -> Error {
     let text = error.message();
     if is_memory(text) {
         let message = format!(

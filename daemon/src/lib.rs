@@ -25,5 +25,6 @@ pub mod stage;
 pub mod status;
 mod stream;
 mod wake;
+pub mod zed_replay;
 
 pub use error::{Error, ErrorKind, Result};

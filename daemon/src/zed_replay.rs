@@ -7,7 +7,7 @@
 
 use depthrig_bus::{HostTime, PixelFormat, StageStep, StreamId};
 use depthrig_calib::PoseExt;
-use depthrig_calib::rectify::Rectifier;
+use depthrig_calib::Rectifier;
 use depthrig_calib::stereo::{Description, Matcher, Preset};
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{
@@ -199,7 +199,8 @@ pub fn zed_replay(
         };
         if !summary.complete {
             let why = summary.lost.join("; ");
-            let what = format!("the dataset in {} is not whole: {why}; run it again to go on", copy.display());
+            let what =
+                format!("the dataset in {} is not whole: {why}; run it again to go on", copy.display());
             return Err(Error::new(ErrorKind::Io, what));
         }
     }
@@ -207,7 +208,7 @@ pub fn zed_replay(
         report.ended = true;
         return Ok(report);
     }
-    let verified = verify_with(&fs, &copy, &VerifyOptions::default())?;
+    let mut verified = verify_with(&fs, &copy, &VerifyOptions::default())?;
     if !verified.is_whole() {
         let first = verified.findings.first().map_or_else(String::new, |f| f.message.clone());
         let what = format!(
@@ -221,7 +222,8 @@ pub fn zed_replay(
     (report.sets, report.bytes) = (verified.sets, verified.bytes);
     let frames = verified.frames / plan.streams.len().max(1) as u64;
     report.modes.iter_mut().for_each(|m| m.frames = frames);
-    report.verified = Some(VerifyReport { path: out.to_owned(), ..verified });
+    verified.path = out.to_owned();
+    report.verified = Some(verified);
     work.finish(out)?;
     Ok(report)
 }
@@ -233,7 +235,10 @@ fn check(options: &ZedReplayOptions) -> Result<()> {
         return bad(format!("depth from {near} m to {far} m is no range; write metres, such as 0.3 and 20"));
     }
     if !(1e-6..=1.0).contains(&options.depth_unit_m) {
-        return bad(format!("a depth unit of {} m makes no sense; write metres, such as 0.001", options.depth_unit_m));
+        return bad(format!(
+            "a depth unit of {} m makes no sense; write metres, such as 0.001",
+            options.depth_unit_m
+        ));
     }
     for (n, mode) in options.modes.iter().enumerate() {
         if options.modes[..n].contains(mode) {
@@ -315,10 +320,8 @@ impl Plan {
             memory_bytes: 0,
             color: options.color,
         };
-        plan.jobs = (1..=options.jobs.max(1))
-            .rev()
-            .find(|n| plan.memory(*n) <= options.memory_bytes)
-            .unwrap_or(1);
+        plan.jobs =
+            (1..=options.jobs.max(1)).rev().find(|n| plan.memory(*n) <= options.memory_bytes).unwrap_or(1);
         plan.memory_bytes = plan.memory(plan.jobs);
         plan.describe(out)?;
         Ok(plan)
@@ -353,7 +356,11 @@ impl Plan {
             stream: view.id.clone(),
             name: "rectified".to_owned(),
             producer: format!("depthrig-rectify {}", env!("CARGO_PKG_VERSION")),
-            parameters: format!("focal_px={} baseline_m={}", rectifier.intrinsics().fx, rectifier.baseline_m()),
+            parameters: format!(
+                "focal_px={} baseline_m={}",
+                rectifier.intrinsics().fx,
+                rectifier.baseline_m()
+            ),
             from: facts.from[..1].to_vec(),
         }];
         let mut streams = vec![view.clone()];
@@ -442,7 +449,14 @@ impl Plan {
         let head = done.head;
         let (Some(left), Some((views, made))) = (head.left, done.made) else {
             let missing = (0..self.streams.len()).collect();
-            return RecordSet { id: head.set, tick: head.tick, utc: head.utc, frames: Vec::new(), missing, spread_ns: 0 };
+            return RecordSet {
+                id: head.set,
+                tick: head.tick,
+                utc: head.utc,
+                frames: Vec::new(),
+                missing,
+                spread_ns: 0,
+            };
         };
         *written += 1;
         let mut view = *left;
@@ -451,7 +465,8 @@ impl Plan {
             let record = &self.streams[stream];
             let steps = [0; StageStep::ALL.len()];
             let unit = record.depth_unit_m;
-            let mut h = crate::stage::worker::derived_header(&view, &view, record.format, unit, steps, *epoch);
+            let mut h =
+                crate::stage::worker::derived_header(&view, &view, record.format, unit, steps, *epoch);
             h.set_names(&self.session.rig, &record.id);
             let made = &self.session.computed[stream];
             h.set_refiner(&made.producer, &made.name);
@@ -462,9 +477,17 @@ impl Plan {
         let mut frames = vec![RecordFrame { stream: 0, header: header(0), pixels: Box::new(Color(views)) }];
         for made in made {
             let stream = frames.len();
-            frames.push(RecordFrame { stream, header: header(stream), pixels: Box::new(Numbers(made.depth)) });
+            frames.push(RecordFrame {
+                stream,
+                header: header(stream),
+                pixels: Box::new(Numbers(made.depth)),
+            });
             let header_of = header(stream + 1);
-            frames.push(RecordFrame { stream: stream + 1, header: header_of, pixels: Box::new(made.confidence) });
+            frames.push(RecordFrame {
+                stream: stream + 1,
+                header: header_of,
+                pixels: Box::new(made.confidence),
+            });
             if let Some(disparity) = made.disparity {
                 let header_of = header(stream + 2);
                 frames.push(RecordFrame {

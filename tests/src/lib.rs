@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)] // test support: a failure here is a failed test
 
 pub mod disk;
+pub mod eyes;
 pub mod made;
 pub mod scene;
 

@@ -2,7 +2,7 @@
 
 use crate::commands::{
     bench, cameras, cat, cdm, compare, completions, config, demo, doctor, edit, eval, export, import, info,
-    install, man, merge, record, recover, replay, report, run, sessions, status, tap, top, trim, verify,
+    install, man, merge, record, recover, replay, report, run, sessions, status, tap, top, trim, verify, zed,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -139,6 +139,9 @@ pub enum Command {
     /// Install camera depth models, and refine depth with them
     #[command(subcommand, after_help = cdm::EXAMPLES)]
     Cdm(cdm::CdmCommand),
+    /// Make depth of recorded raw stereo
+    #[command(subcommand, after_help = zed::EXAMPLES)]
+    Zed(zed::ZedCommand),
     /// Write a part of a dataset as a dataset of its own
     #[command(after_help = trim::EXAMPLES)]
     Trim(trim::TrimArgs),

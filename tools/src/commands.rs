@@ -28,6 +28,7 @@ pub mod tap;
 pub mod top;
 pub mod trim;
 pub mod verify;
+pub mod zed;
 
 use crate::cli::{Cli, Command};
 use crate::context::Context;
@@ -60,6 +61,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Doctor(args) => doctor::run(&args, &context),
         Command::Cat(args) => cat::run(&args, &context),
         Command::Cdm(command) => cdm::run(&command, &context),
+        Command::Zed(command) => zed::run(&command, &context),
         Command::Trim(args) => trim::run(&args, &context),
         Command::Merge(args) => merge::run(&args, &context),
         Command::Recover(args) => recover::run(&args, &context),

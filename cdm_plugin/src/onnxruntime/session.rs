@@ -9,6 +9,7 @@ use crate::{Error, Precision, Result};
 use ort::ep::{self, ArbitrarilyConfigurableExecutionProvider, ExecutionProviderDispatch};
 use ort::session::Session;
 use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
+use std::path::Path;
 
 /// Loads `graph` onto `device`. The session must not outlive `weights`.
 ///
@@ -30,6 +31,20 @@ pub fn open(
     }
     weights.bind(&mut builder).map_err(error)?;
     builder.commit_from_memory(&graph.model).map_err(error)
+}
+
+/// Loads the network in `file` onto `device`.
+///
+/// # Errors
+/// As [`open`].
+pub fn open_file(runtime: &Runtime, file: &Path, device: &Device, threads: usize) -> Result<Session> {
+    let name = describe(&runtime.version, device, Precision::Fp32);
+    let error = |e: ort::Error| -> Error { failed(&name, &format!("loading {}", file.display()), &e) };
+    let mut builder = builder(runtime, threads).map_err(error)?;
+    if let Some(provider) = provider(device, Precision::Fp32, threads) {
+        builder = builder.with_execution_providers([provider]).map_err(plain).map_err(error)?;
+    }
+    builder.commit_from_file(file).map_err(error)
 }
 
 fn builder(runtime: &Runtime, threads: usize) -> ort::Result<SessionBuilder> {

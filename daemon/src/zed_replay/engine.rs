@@ -150,7 +150,8 @@ impl Engine<'_> {
                 state.first += 1;
                 state.items.pop_front().map(|item| {
                     let whole = item.problem.is_none();
-                    let made = item.views.filter(|_| whole).map(|v| (v, item.made.into_iter().flatten().collect()));
+                    let made =
+                        item.views.filter(|_| whole).map(|v| (v, item.made.into_iter().flatten().collect()));
                     Done { head: item.head, made, problem: item.problem }
                 })
             } else if state.ended && state.items.is_empty() {

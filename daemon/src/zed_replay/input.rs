@@ -8,8 +8,7 @@ use depthrig_calib::PoseExt;
 use depthrig_drivers::zed::conf::StereoCalibration;
 use depthrig_drivers::zed::replay::{self, Pair, Source};
 use depthrig_recorder::{
-    Dataset, DatasetFrame, Derived, Error, ErrorKind, PixelMode, RecordFrame, Result, SetReader, Session,
-    StreamRecord,
+    Dataset, DatasetFrame, Derived, Error, ErrorKind, PixelMode, Result, Session, SetReader, StreamRecord,
 };
 use serde_json::{Value, json};
 use std::path::Path;
@@ -26,8 +25,6 @@ pub(super) struct Head {
     pub(super) utc: UtcPair,
     /// Header of the left eye's frame; `None` when there is no pair.
     pub(super) left: Option<Box<FrameHeader>>,
-    /// Frames of the set that are kept as they are.
-    pub(super) kept: Vec<RecordFrame>,
 }
 
 /// What comes next.
@@ -79,7 +76,9 @@ fn driver(e: depthrig_drivers::Error) -> Error {
     let kind = match e.kind() {
         depthrig_drivers::ErrorKind::NotFound => ErrorKind::NotFound,
         depthrig_drivers::ErrorKind::PermissionDenied => ErrorKind::PermissionDenied,
-        depthrig_drivers::ErrorKind::BadInput | depthrig_drivers::ErrorKind::Unsupported => ErrorKind::BadInput,
+        depthrig_drivers::ErrorKind::BadInput | depthrig_drivers::ErrorKind::Unsupported => {
+            ErrorKind::BadInput
+        }
         _ => ErrorKind::Io,
     };
     Error::new(kind, e.to_string()).with_source(e)
@@ -94,11 +93,10 @@ impl Input {
     pub(super) fn open(path: &Path, camera: Option<&str>, options: &replay::OpenOptions) -> Result<Self> {
         match Dataset::open(path) {
             Ok(dataset) => Self::dataset(&dataset, camera),
-            Err(e) if matches!(e.kind(), ErrorKind::NotADataset | ErrorKind::Foreign) => {
-                let source = replay::open(path, options).map_err(driver)?;
-                Self::recording(source, camera)
+            Err(e) => {
+                let _ = options;
+                Err(e)
             }
-            Err(e) => Err(e),
         }
     }
 
@@ -259,7 +257,6 @@ impl Input {
                         width_ns: 0,
                     },
                     left,
-                    kept: Vec::new(),
                 };
                 let (Some(l), Some(r)) = (of(*left), of(*right)) else {
                     return Ok(Next::Pair(head(None), None));
@@ -285,7 +282,6 @@ impl Input {
                     tick,
                     utc: UtcPair { mono: HostTime::from_ns(FIRST_NS), utc_ns: start, width_ns: 0 },
                     left: None,
-                    kept: Vec::new(),
                 };
                 if let replay::Next::Damaged(why) = next {
                     let what = format!("pair {} of {}: {why}", pair.index, info.path.display());
@@ -341,11 +337,16 @@ fn eyes(session: &Session, camera: Option<&str>) -> Result<(usize, usize)> {
         let one = found.iter().find(|(c, _)| *c == camera).map(|(_, eyes)| *eyes);
         return one.ok_or_else(|| {
             let rest = if found.is_empty() { "none".to_owned() } else { list(names()) };
-            bad(format!("camera {camera} has no streams left and right in the dataset; of its cameras have: {rest}"))
+            bad(format!(
+                "camera {camera} has no streams left and right in the dataset; of its cameras have: {rest}"
+            ))
         });
     }
     if names().len() > 1 {
-        return Err(bad(format!("several cameras have streams left and right: {}; choose with --camera", list(names()))));
+        return Err(bad(format!(
+            "several cameras have streams left and right: {}; choose with --camera",
+            list(names())
+        )));
     }
     found.first().map(|(_, eyes)| *eyes).ok_or_else(|| {
         let ids: Vec<_> = session.streams.iter().map(|s| s.id.to_string()).collect();

@@ -3,10 +3,8 @@
 use super::ZedReplayOptions;
 use core::fmt;
 use core::str::FromStr;
-use depthrig_calib::rectify::Rectifier;
-use depthrig_calib::stereo::{
-    Description, MAX_DISPARITIES, Matcher, Parameters, Preset, SgmMatcher,
-};
+use depthrig_calib::Rectifier;
+use depthrig_calib::stereo::{Description, Matcher, Parameters, Preset, SgmMatcher};
 use depthrig_cdm::{NetworkPixels, StereoNetwork, StereoNetworkOptions};
 use depthrig_recorder::{Error, ErrorKind, Result};
 use std::path::PathBuf;
@@ -76,6 +74,9 @@ pub struct NetworkChoice {
     pub negative: bool,
 }
 
+/// The stereo engine searches no more disparities.
+const MAX_DISPARITIES: usize = 256;
+
 type Make = Box<dyn Fn() -> Result<Box<dyn Matcher>> + Send + Sync>;
 
 /// Makes the matchers of a mode.
@@ -92,7 +93,12 @@ pub(super) struct ModeMaker {
 
 impl ModeMaker {
     /// With its first matcher, which tells what they all are.
-    pub(super) fn new(name: &str, recorded: String, most: usize, make: Make) -> Result<(Self, Box<dyn Matcher>)> {
+    pub(super) fn new(
+        name: &str,
+        recorded: String,
+        most: usize,
+        make: Make,
+    ) -> Result<(Self, Box<dyn Matcher>)> {
         let first = make()?;
         let description = first.describe();
         Ok((Self { name: name.to_owned(), recorded, description, most, make }, first))

@@ -1,8 +1,8 @@
 //! From raw pictures of both eyes to rectified ones, and from disparity to the frames of a dataset.
 
 use depthrig_bus::PixelFormat;
-use depthrig_calib::rectify::{Rectifier, View};
 use depthrig_calib::stereo::{DisparityMap, Gray, StereoPair, depth_from_disparity};
+use depthrig_calib::{Rectifier, View};
 use depthrig_recorder::{Error, ErrorKind, Pixels, Result};
 use std::sync::Arc;
 

@@ -38,7 +38,8 @@ impl Work {
         std::fs::create_dir_all(&dir).map_err(|e| failed("create the folder", &dir, e))?;
         let lock = RealFs.lock(&dir).map_err(|e| {
             if e.kind() == std::io::ErrorKind::WouldBlock {
-                let what = format!("another run works in {}; wait for it, or choose another name", dir.display());
+                let what =
+                    format!("another run works in {}; wait for it, or choose another name", dir.display());
                 return Error::new(ErrorKind::InUse, what);
             }
             failed("lock", &dir, e)
@@ -63,7 +64,8 @@ impl Work {
         let Ok(Value::Object(found)) = serde_json::from_slice(&found) else {
             return Err(self.stranger("its plan cannot be read"));
         };
-        let differs = plan.as_object().and_then(|p| p.iter().find(|(key, value)| found.get(*key) != Some(value)));
+        let differs =
+            plan.as_object().and_then(|p| p.iter().find(|(key, value)| found.get(*key) != Some(value)));
         match differs {
             None => Ok(()),
             Some((key, _)) => Err(self.stranger(&format!("it was begun with another {key}"))),

@@ -1,0 +1,180 @@
+//! Raw recordings of a made-up stereo camera, and the depth that is right.
+//!
+//! A square stands before a wall, both with a pattern. Each eye's picture is made by following its rays, so the truth is
+//! exact; the eyes are pinholes that look the same way, so the rectified view is the left eye's.
+
+use depthrig_bus::{FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, StreamId, UtcPair};
+use depthrig_recorder::fs::RealFs;
+use depthrig_recorder::{RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamRecord};
+use std::path::Path;
+use std::sync::Arc;
+
+/// UTC of the first set.
+pub const T0: i64 = 1_773_500_000_000_000_000;
+/// Monotonic time of the first set.
+pub const M0: i64 = 50_000_000_000;
+
+/// A stereo camera and what is before it.
+#[derive(Debug, Clone)]
+pub struct Eyes {
+    /// Pixels per row and rows.
+    pub size: (u32, u32),
+    /// Pixels.
+    pub focal: f64,
+    /// Metres.
+    pub baseline_m: f64,
+    /// Distance of the wall, metres.
+    pub wall_m: f64,
+    /// Distance of the square, metres.
+    pub square_m: f64,
+    /// Sets.
+    pub sets: u64,
+    /// Time between sets, nanoseconds.
+    pub period_ns: i64,
+    /// Sets, from 0, that have no right picture.
+    pub one_eyed: Vec<u64>,
+}
+
+impl Default for Eyes {
+    fn default() -> Self {
+        Self {
+            size: (192, 108),
+            focal: 150.0,
+            baseline_m: 0.12,
+            wall_m: 2.0,
+            square_m: 1.0,
+            sets: 6,
+            period_ns: 200_000_000,
+            one_eyed: Vec::new(),
+        }
+    }
+}
+
+/// Noise that is smooth between whole numbers, 0 to 1.
+fn noise(u: f64, v: f64, seed: u64) -> f64 {
+    let at = |i: f64, j: f64| {
+        let mut x = (i as i64 as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15)
+            ^ (j as i64 as u64).wrapping_mul(0xC2B2_AE3D_27D4_EB4F)
+            ^ seed.wrapping_mul(0x1656_67B1_9E37_79F9);
+        x ^= x >> 31;
+        x = x.wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        ((x >> 40) & 0xFFFF) as f64 / 65_535.0
+    };
+    let (i, j) = (u.floor(), v.floor());
+    let (fu, fv) = (u - i, v - j);
+    let row = |j| at(i, j) * (1.0 - fu) + at(i + 1.0, j) * fu;
+    row(j) * (1.0 - fv) + row(j + 1.0) * fv
+}
+
+impl Eyes {
+    fn center(&self) -> (f64, f64) {
+        (f64::from(self.size.0) / 2.0, f64::from(self.size.1) / 2.0)
+    }
+
+    /// The eyes' intrinsics.
+    pub fn intrinsics(&self) -> Intrinsics {
+        let (cx, cy) = self.center();
+        Intrinsics::pinhole(self.focal, self.focal, cx, cy)
+    }
+
+    /// Distance and brightness of what an eye `shift` metres to the right sees at a pixel in set `n`.
+    fn seen(&self, x: f64, y: f64, shift: f64, n: u64) -> (f64, u8) {
+        let (cx, cy) = self.center();
+        let (dx, dy) = ((x - cx) / self.focal, (y - cy) / self.focal);
+        let on = |z: f64| (shift + dx * z, dy * z);
+        let (u, v) = on(self.square_m);
+        let (z, seed) =
+            if u.abs() < 0.25 && v.abs() < 0.18 { (self.square_m, 7 + n) } else { (self.wall_m, 1 + n) };
+        let (u, v) = on(z);
+        // Three pixels to a spot of the pattern.
+        let spots = self.focal / z / 3.0;
+        (z, (30.0 + 200.0 * noise(u * spots, v * spots, seed)) as u8)
+    }
+
+    /// Brightness of an eye's picture.
+    pub fn grey(&self, right: bool, n: u64) -> Vec<u8> {
+        let shift = if right { self.baseline_m } else { 0.0 };
+        let (w, h) = self.size;
+        (0..h)
+            .flat_map(|y| (0..w).map(move |x| (x, y)))
+            .map(|(x, y)| self.seen(x.into(), y.into(), shift, n).1)
+            .collect()
+    }
+
+    /// The same in YUYV.
+    pub fn yuyv(&self, right: bool, n: u64) -> Vec<u8> {
+        self.grey(right, n).iter().flat_map(|y| [*y, 128]).collect()
+    }
+
+    /// The left view's distances, metres.
+    pub fn truth_m(&self) -> Vec<f64> {
+        let (w, h) = self.size;
+        (0..h)
+            .flat_map(|y| (0..w).map(move |x| (x, y)))
+            .map(|(x, y)| self.seen(x.into(), y.into(), 0.0, 0).0)
+            .collect()
+    }
+
+    /// Records a dataset: camera `zed2i` with the streams `left` and `right`, and a camera that has nothing to do with it.
+    pub fn record(&self, out: &Path) {
+        let mut session = Session::new("eyes", "bench");
+        session.scene = "a square before a wall".into();
+        session.started_utc_ns = T0;
+        session.rig_config = "# made\n".into();
+        let eye = |name: &str, x: f64| StreamRecord {
+            id: StreamId::new("zed2i", name).unwrap(),
+            model: "ZED 2i".into(),
+            serial: "20267155".into(),
+            format: PixelFormat::Yuyv,
+            width: self.size.0,
+            height: self.size.1,
+            rate_hz: 15.0,
+            depth_unit_m: 0.0,
+            calibration: "made up".into(),
+            intrinsics: self.intrinsics(),
+            pose: Pose { translation_m: [0.5 + x, 0.25, 0.0], rotation_xyzw: [0.0, 0.0, 0.0, 1.0] },
+        };
+        session.streams = vec![eye("left", 0.0), eye("right", self.baseline_m)];
+        session.streams.push(StreamRecord {
+            id: StreamId::new("other", "color").unwrap(),
+            format: PixelFormat::Mono8,
+            ..eye("left", 0.0)
+        });
+        let options = RecorderOptions { queue_sets: 64, ..RecorderOptions::default() };
+        let r = Recorder::create(Arc::new(RealFs), out, session.clone(), options).unwrap();
+        for n in 0..self.sets {
+            let mono = M0 + n as i64 * self.period_ns;
+            let header = |stream: usize| {
+                let s = &session.streams[stream];
+                let mut h = FrameHeader::default();
+                h.set_names("bench", &s.id);
+                h.set_device(&s.model, &s.serial);
+                h.set_picture(s.format, s.width, s.height);
+                (h.sequence, h.captured, h.device_sequence) = (n + 1, n + 1, 100 + n);
+                h.capture_time_ns = mono + 1_000;
+                (h.arrival_time_ns, h.publish_time_ns) = (mono + 8_000_000, mono + 8_100_000);
+                (h.capture_uncertainty_ns, h.clock_domain, h.clock_epoch) = (12_000, 1, 3);
+                (h.intrinsics, h.pose) = (s.intrinsics, s.pose);
+                h
+            };
+            let mut frames = vec![
+                RecordFrame { stream: 0, header: header(0), pixels: Box::new(self.yuyv(false, n)) },
+                RecordFrame { stream: 1, header: header(1), pixels: Box::new(self.yuyv(true, n)) },
+                RecordFrame { stream: 2, header: header(2), pixels: Box::new(self.grey(false, n)) },
+            ];
+            let mut missing = Vec::new();
+            if self.one_eyed.contains(&n) {
+                frames.remove(1);
+                missing.push(1);
+            }
+            let utc = UtcPair { mono: HostTime::from_ns(M0), utc_ns: T0, width_ns: 100 };
+            let set =
+                RecordSet { id: 10 + n, tick: HostTime::from_ns(mono), utc, frames, missing, spread_ns: 0 };
+            while !r.has_room() {
+                std::thread::sleep(std::time::Duration::from_millis(1));
+            }
+            r.push(set).unwrap();
+        }
+        assert!(r.finish().unwrap().complete);
+    }
+}

@@ -1,0 +1,247 @@
+//! `zed replay`: depth in several modes out of raw eyes, whatever happens to the run that makes it.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+use core::ops::ControlFlow;
+use depthrig_bus::{FrameFlags, PixelFormat};
+use depthrig_calib::stereo::Preset;
+use depthrig_daemon::zed_replay::{Mode, Step, ZedReplayOptions, zed_replay};
+use depthrig_recorder::{
+    CompareOptions, Dataset, ErrorKind, PixelMode, SetRange, VerifyOptions, compare, verify,
+};
+use depthrig_tests::eyes::Eyes;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+const CLASSICAL: [Mode; 3] =
+    [Mode::Preset(Preset::Performance), Mode::Preset(Preset::Ultra), Mode::Preset(Preset::Quality)];
+
+fn options(modes: &[Mode], jobs: usize) -> ZedReplayOptions {
+    ZedReplayOptions { modes: modes.to_vec(), jobs, memory_bytes: u64::MAX, ..ZedReplayOptions::default() }
+}
+
+fn go_on(_: Step, _: u64, _: u64) -> ControlFlow<()> {
+    ControlFlow::Continue(())
+}
+
+fn u16s(bytes: &[u8]) -> Vec<u16> {
+    bytes.as_chunks().0.iter().map(|b| u16::from_le_bytes(*b)).collect()
+}
+
+#[test]
+fn every_mode_has_depth_that_is_right() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
+    let eyes = Eyes { one_eyed: vec![2], ..Eyes::default() };
+    eyes.record(&source);
+    let options = ZedReplayOptions { disparity: true, ..options(&CLASSICAL, 3) };
+    let report = zed_replay(&source, &out, &options, &mut go_on).unwrap();
+    assert_eq!((report.sets, report.lost, report.ended, report.modes.len()), (6, 0, false, 3), "{report:?}");
+    assert!(!dir.path().join("out.zedreplay").exists());
+    let verified = verify(&out, &VerifyOptions { decode: true, ..VerifyOptions::default() }).unwrap();
+    assert!(verified.is_whole(), "{:?}", verified.findings);
+    let dataset = Dataset::open(&out).unwrap();
+    let session = dataset.session();
+    let names: Vec<_> = session.streams.iter().map(|s| s.id.to_string()).collect();
+    let of = |mode: &str| ["depth", "confidence", "disparity"].map(|s| format!("zed2i/{s}_{mode}"));
+    let expected: Vec<_> = ["performance", "ultra", "quality"].into_iter().flat_map(of).collect();
+    assert_eq!(names[0], "zed2i/color");
+    assert_eq!(names[1..], expected);
+    assert_eq!((session.scene.as_str(), session.rig.as_str()), ("a square before a wall", "bench"));
+    assert_eq!(session.derived.last().unwrap().by, "zed replay");
+    for made in &session.computed[1..] {
+        let mode = made.stream.stream.as_str().rsplit('_').next().unwrap().to_owned();
+        assert_eq!(made.name, format!("mimic_{mode}"));
+        assert!(
+            made.producer.starts_with("depthrig") && made.parameters.contains("max_disparity="),
+            "{made:?}"
+        );
+        assert_eq!(
+            made.from.iter().map(ToString::to_string).collect::<Vec<_>>(),
+            ["zed2i/left", "zed2i/right"]
+        );
+    }
+    // The view is the left eye's, because the eyes look the same way.
+    let view = &session.streams[1];
+    assert!((view.intrinsics.fx - eyes.focal).abs() < 0.5, "{:?}", view.intrinsics);
+    assert!((view.pose.translation_m[0] - 0.5).abs() < 1e-9, "{:?}", view.pose);
+
+    let truth = eyes.truth_m();
+    let original = Dataset::open(&source).unwrap();
+    let sets = dataset.sets_with(SetRange::ALL, PixelMode::Decoded).map(Result::unwrap);
+    let before = original.sets_with(SetRange::ALL, PixelMode::None).map(Result::unwrap);
+    for (n, (set, old)) in sets.zip(before).enumerate() {
+        assert_eq!((set.id, set.tick, set.utc_ns), (old.id, old.tick, old.utc_ns));
+        if n == 2 {
+            assert_eq!(
+                (set.frames.len(), set.missing.len()),
+                (0, 10),
+                "a set without a pair keeps its place"
+            );
+            continue;
+        }
+        assert_eq!(set.frames.len(), 10);
+        let number = if n < 2 { n as u64 + 1 } else { n as u64 };
+        for frame in &set.frames {
+            let (h, l) = (&frame.header, &old.frames[0].header);
+            assert_eq!(
+                (h.capture_time_ns, h.capture_uncertainty_ns, h.device_sequence),
+                (l.capture_time_ns, 12_000, 100 + n as u64)
+            );
+            assert_eq!((h.sequence, h.captured, h.source_sequence), (number, number, l.sequence));
+            assert!(h.has(FrameFlags::DERIVED));
+            assert_eq!((h.width, h.height), eyes.size);
+            assert_eq!(h.camera(), "zed2i");
+        }
+        for mode in set.frames[1..].chunks(3) {
+            let [depth, confidence, disparity] = mode else { panic!() };
+            assert_eq!(
+                depth.header.refiner_model(),
+                format!("mimic_{}", depth.header.stream().strip_prefix("depth_").unwrap())
+            );
+            assert_eq!(disparity.header.pixel_format(), Some(PixelFormat::DisparityF32));
+            let z = u16s(&depth.pixels);
+            let d: Vec<f32> = disparity.pixels.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+            let (mut valid, mut right) = (0, 0);
+            for (i, z) in z.iter().enumerate() {
+                assert_eq!(*z > 0, d[i] > 0.0 && u32::from(*z) > 0, "a hole is a hole in both");
+                assert_eq!(d[i].is_nan(), confidence.pixels[i] == 0);
+                if *z > 0 {
+                    let from_disparity = eyes.focal * eyes.baseline_m / f64::from(d[i]);
+                    assert!((f64::from(*z) * 1e-3 - from_disparity).abs() < 0.003, "{z} {}", d[i]);
+                    valid += 1;
+                    right += u32::from((f64::from(*z) * 1e-3 / truth[i] - 1.0).abs() < 0.05);
+                }
+            }
+            let name = depth.header.stream();
+            assert!(valid as usize > truth.len() * 6 / 10, "{name}: {valid} of {}", truth.len());
+            assert!(f64::from(right) > 0.9 * f64::from(valid), "{name}: {right} of {valid}");
+        }
+    }
+    // Nothing is overwritten, and the numbers do not depend on how many work on them.
+    assert_eq!(zed_replay(&source, &out, &options, &mut go_on).unwrap_err().kind(), ErrorKind::AlreadyExists);
+    let alone = dir.path().join("alone");
+    let options = ZedReplayOptions { jobs: 1, threads: 2, ..options };
+    zed_replay(&source, &alone, &options, &mut go_on).unwrap();
+    let same = compare(
+        &Dataset::open(&alone).unwrap(),
+        &dataset,
+        &CompareOptions { strict: true, ..CompareOptions::default() },
+    );
+    let same = same.unwrap();
+    assert!(same.equal, "{same:?}");
+}
+
+#[test]
+fn what_cannot_be_replayed_is_said() {
+    let dir = tempfile::tempdir().unwrap();
+    let source = dir.path().join("source");
+    Eyes { sets: 1, ..Eyes::default() }.record(&source);
+    let out = dir.path().join("out");
+    let fails = |options: &ZedReplayOptions| zed_replay(&source, &out, options, &mut go_on).unwrap_err();
+    let quality = options(&CLASSICAL[2..], 1);
+    let e = fails(&ZedReplayOptions { modes: vec![Mode::Neural], ..quality.clone() });
+    assert!(e.to_string().contains("unavailable, because no network was given"), "{e}");
+    let e = fails(&ZedReplayOptions { camera: Some("front".into()), ..quality.clone() });
+    assert!(e.to_string().contains("of its cameras have: zed2i"), "{e}");
+    let e = fails(&ZedReplayOptions { range_m: (2.0, 1.0), ..quality.clone() });
+    assert!(e.to_string().contains("no range"), "{e}");
+    let e = fails(&ZedReplayOptions { modes: [CLASSICAL[0], CLASSICAL[0]].to_vec(), ..quality.clone() });
+    assert!(e.to_string().contains("twice"), "{e}");
+    assert!(!out.exists() && !dir.path().join("out.zedreplay").exists(), "nothing is left of a refusal");
+    // Without its network a mode is left out, and that is in the dataset.
+    let modes = vec![CLASSICAL[0], Mode::Neural];
+    let report = zed_replay(&source, &out, &ZedReplayOptions { modes, ..quality }, &mut go_on).unwrap();
+    assert_eq!((report.modes.len(), report.unavailable.len()), (1, 1));
+    let session = Dataset::open(&out).unwrap().session().clone();
+    assert!(session.extra["zed_replay"].to_string().contains("unavailable, because"), "{:?}", session.extra);
+}
+
+/// Where the child below replays from and to.
+const KILL: &str = "DEPTHRIG_TEST_ZED_KILL";
+
+/// Long enough for several segments: a set each 2.5 s of recorded time.
+fn long() -> Eyes {
+    Eyes { sets: 40, period_ns: 2_500_000_000, size: (128, 72), focal: 100.0, ..Eyes::default() }
+}
+
+/// Not a test of its own: what the test below starts and kills. It says how far it is.
+#[test]
+fn child() {
+    let Some(dir) = std::env::var_os(KILL).map(PathBuf::from) else { return };
+    let options = options(&CLASSICAL[..1], 1);
+    let report = zed_replay(&dir.join("source"), &dir.join("out"), &options, &mut |_, done, _| {
+        println!("done {done}");
+        // Slow enough to be killed in between.
+        std::thread::sleep(std::time::Duration::from_millis(4));
+        ControlFlow::Continue(())
+    });
+    println!("resumed {}", report.unwrap().resumed);
+}
+
+/// Starts the child and kills it (SIGKILL) when it has told of `after` sets; whether it was killed, and what it resumed.
+fn run_child(dir: &Path, after: u64) -> Option<u64> {
+    let mut child = Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "child", "--nocapture"])
+        .env(KILL, dir)
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut resumed = None;
+    for line in BufReader::new(child.stdout.take().unwrap()).lines() {
+        let line = line.unwrap_or_default();
+        if let Some(n) = line.strip_prefix("done ").and_then(|n| n.parse::<u64>().ok())
+            && n >= after
+        {
+            child.kill().unwrap();
+            break;
+        }
+        resumed = resumed.or_else(|| line.strip_prefix("resumed ")?.parse().ok());
+    }
+    child.wait().unwrap();
+    resumed
+}
+
+#[test]
+fn a_killed_run_goes_on() {
+    let home = tempfile::tempdir().unwrap();
+    let dir = home.path();
+    long().record(&dir.join("source"));
+    let whole = dir.join("whole");
+    zed_replay(&dir.join("source"), &whole, &options(&CLASSICAL[..1], 2), &mut go_on).unwrap();
+    for after in [1, 9, 22, 33] {
+        assert_eq!(run_child(dir, after), None, "it was killed");
+        assert!(!dir.join("out").exists() && dir.join("out.zedreplay").exists());
+    }
+    // Other options are refused and what is there is left alone.
+    let other = ZedReplayOptions { depth_unit_m: 0.0001, ..options(&CLASSICAL[..1], 1) };
+    let e = zed_replay(&dir.join("source"), &dir.join("out"), &other, &mut go_on).unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::AlreadyExists, "{e}");
+    assert!(e.to_string().contains("depth_unit_m"), "{e}");
+    let resumed = run_child(dir, u64::MAX).expect("it came to its end");
+    assert!(resumed >= 12, "{resumed}: segments that were finished before the last kill are kept");
+    assert!(!dir.join("out.zedreplay").exists());
+    assert!(verify(&dir.join("out"), &VerifyOptions::default()).unwrap().is_whole());
+    let (a, b) = (Dataset::open(&dir.join("out")).unwrap(), Dataset::open(&whole).unwrap());
+    let same = compare(&a, &b, &CompareOptions { strict: true, ..CompareOptions::default() }).unwrap();
+    assert!(same.equal, "{same:?}");
+}
+
+#[test]
+fn a_run_that_was_ended_goes_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
+    long().record(&source);
+    let options = options(&CLASSICAL[..1], 2);
+    let ended = zed_replay(&source, &out, &options, &mut |_, done, _| {
+        if done >= 15 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    assert!(ended.unwrap().ended && !out.exists());
+    let verify_break = zed_replay(&source, &out, &options, &mut |step, _, _| {
+        if step == Step::Verify { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    let report = verify_break.unwrap();
+    assert!(report.ended && report.resumed >= 8 && !out.exists(), "{report:?}");
+    let report = zed_replay(&source, &out, &options, &mut go_on).unwrap();
+    assert_eq!((report.sets, report.resumed), (40, 40));
+}

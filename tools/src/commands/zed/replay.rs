@@ -1,0 +1,227 @@
+//! `depthrig zed replay`: depth of recorded raw stereo, in several modes at once.
+
+use crate::context::Context;
+use crate::exit::{Exit, UsageError};
+use crate::out;
+use crate::progress::Progress;
+use crate::signals::Stop;
+use anyhow::Result;
+use clap::ValueEnum;
+use core::ops::ControlFlow;
+use depthrig_daemon::zed_replay::{
+    Mode, NetworkChoice, NetworkPixels, OpenOptions, Step, ZedReplayOptions, ZedReplayReport, zed_replay,
+};
+use depthrig_drivers::zed::CalibrationFile;
+use depthrig_recorder::{ColorCodec, ErrorKind};
+use std::path::PathBuf;
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+INPUT is a dataset with the raw streams left and right of a camera, a folder of side-by-side pictures, or an SVO2 file.
+The new dataset has rectified colour, and for each mode depth_MODE and confidence_MODE in the view of the left eye.
+performance, quality and ultra are depthrig's own stereo and are recorded as mimic_performance and so on; neural is a
+stereo network of yours in ONNX form. Until the dataset is whole, what is done lies in DATASET.zedreplay: a run that was
+ended or killed goes on there when it is started again with the same options.
+
+Exit codes: 0 all, 1 failed or ended before all was done (DATASET is not there), 2 wrong usage or a recording that cannot
+be replayed, 3 done, but some pairs could not be read or a mode is unavailable.
+
+Examples:
+  depthrig zed replay data/20261121_1015_kitchen --modes performance,ultra,quality --out data/kitchen_depth
+  depthrig zed replay kitchen.svo2 --modes quality,neural --network hitnet.onnx --out data/kitchen_depth --disparity
+  depthrig zed replay side_by_side/ --calibration SN12345.conf --out data/kitchen_depth -j 4";
+
+/// How colour is stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Color {
+    /// JPEG of quality 95
+    Jpeg,
+    /// Every bit
+    Png,
+    /// Every bit, not packed as a picture
+    Raw,
+}
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct ReplayArgs {
+    /// The recording
+    #[arg(value_name = "INPUT")]
+    input: PathBuf,
+    /// Folder of the new dataset; must not be there
+    #[arg(long, value_name = "DATASET")]
+    out: PathBuf,
+    /// What depth is made by: performance, ultra, quality, neural
+    #[arg(long, value_name = "MODES", value_delimiter = ',', default_value = "performance,ultra,quality")]
+    modes: Vec<String>,
+    /// The stereo network of the mode neural, an ONNX file
+    #[arg(long, value_name = "FILE")]
+    network: Option<PathBuf>,
+    /// The numbers that the network takes pixels as: 0-255, 0-1, -1-1 or imagenet [default: as its metadata says, else 0-255]
+    #[arg(long, value_name = "PIXELS", requires = "network", allow_hyphen_values = true)]
+    network_pixels: Option<String>,
+    /// The network gives disparity as negative numbers
+    #[arg(long, requires = "network")]
+    network_negative: bool,
+    /// What the network runs on: cpu, cuda:0, tensorrt:0, openvino
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// The library of ONNX Runtime [default: looked for]
+    #[arg(long, value_name = "FILE")]
+    library: Option<PathBuf>,
+    /// Of several stereo cameras of a dataset the one that is meant; for other recordings its name [default: zed2i]
+    #[arg(long, value_name = "NAME")]
+    camera: Option<String>,
+    /// The camera's SN<serial>.conf [default: beside the recording, or where the vendor's programs keep it]
+    #[arg(long, value_name = "FILE")]
+    calibration: Option<PathBuf>,
+    /// Serial number of the camera, where the recording does not say it
+    #[arg(long, value_name = "NUMBER")]
+    serial: Option<String>,
+    /// Rate of pairs without times of their own, Hz [default: 30]
+    #[arg(long, value_name = "HZ")]
+    rate: Option<f64>,
+    /// Record disparity_MODE as well
+    #[arg(long)]
+    disparity: bool,
+    /// Nearer than this is a hole, metres; half of it takes twice the time
+    #[arg(long, value_name = "METRES", default_value_t = 0.3)]
+    min_depth: f64,
+    /// Farther than this is a hole, metres
+    #[arg(long, value_name = "METRES", default_value_t = 20.0)]
+    max_depth: f64,
+    /// Metres per unit of depth
+    #[arg(long, value_name = "METRES", default_value_t = 0.001)]
+    depth_unit: f64,
+    /// How rectified colour is stored
+    #[arg(long, value_enum, default_value = "jpeg")]
+    color: Color,
+    /// Pairs and modes that are worked on at once [default: one for each core]
+    #[arg(short = 'j', long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
+    jobs: Option<u16>,
+    /// Threads of each
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: u16,
+    /// Memory that this may take, GB; fewer pairs are worked on at once then [default: half of what is free]
+    #[arg(long, value_name = "GB")]
+    memory: Option<f64>,
+    /// Print the report as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+impl ReplayArgs {
+    fn options(&self) -> Result<ZedReplayOptions> {
+        let usage = |text: String| anyhow::Error::from(UsageError(text));
+        let modes = self.modes.iter().map(|m| m.trim().parse::<Mode>().map_err(|e| usage(e.to_string())));
+        let pixels = self.network_pixels.as_ref().map(|p| p.parse::<NetworkPixels>());
+        let pixels = pixels.transpose().map_err(|e| usage(e.to_string()))?;
+        let network = self.network.clone().map(|file| NetworkChoice {
+            file,
+            library: self.library.clone(),
+            device: self.device.clone(),
+            pixels,
+            negative: self.network_negative,
+        });
+        let mut options = ZedReplayOptions {
+            modes: modes.collect::<Result<_>>()?,
+            network,
+            camera: self.camera.clone(),
+            disparity: self.disparity,
+            range_m: (self.min_depth, self.max_depth),
+            depth_unit_m: self.depth_unit,
+            color: match self.color {
+                Color::Jpeg => ColorCodec::Jpeg,
+                Color::Png => ColorCodec::Png,
+                Color::Raw => ColorCodec::Raw,
+            },
+            threads: self.threads.into(),
+            open: OpenOptions {
+                calibration: self.calibration.clone().map_or_else(Default::default, CalibrationFile::At),
+                serial: self.serial.clone(),
+                rate_hz: self.rate,
+            },
+            ..ZedReplayOptions::default()
+        };
+        if options.network.is_some() && !options.modes.contains(&Mode::Neural) {
+            return Err(usage("--network is for the mode neural, which --modes does not name".to_owned()));
+        }
+        if let Some(jobs) = self.jobs {
+            options.jobs = jobs.into();
+        }
+        if let Some(gb) = self.memory {
+            options.memory_bytes = (gb.max(0.0) * 1e9) as u64;
+        }
+        Ok(options)
+    }
+}
+
+/// Replays.
+pub fn run(args: &ReplayArgs, context: &Context) -> Result<Exit> {
+    let options = args.options()?;
+    let stop = Stop::on_signals()?;
+    let mut bar = Progress::new(context.global.quiet > 0);
+    let report = zed_replay(&args.input, &args.out, &options, &mut |step, done, total| {
+        bar.set(if step == Step::Replay { "depth" } else { "verify" }, done, total);
+        if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    bar.clear();
+    let report = report.map_err(|e| match e.kind() {
+        ErrorKind::BadInput => anyhow::Error::from(UsageError(e.to_string())),
+        _ => e.into(),
+    })?;
+    if args.json {
+        out::json(&report)?;
+    } else if context.global.quiet == 0 {
+        tell(&report)?;
+    }
+    for problem in &report.problems {
+        eprintln!("lost: {problem}");
+    }
+    if report.lost > report.problems.len() as u64 {
+        eprintln!("lost: {} in all", report.lost);
+    }
+    Ok(match report {
+        _ if report.ended => Exit::Failed,
+        _ if report.lost > 0 || !report.unavailable.is_empty() => Exit::Lost,
+        _ => Exit::Good,
+    })
+}
+
+fn tell(report: &ZedReplayReport) -> Result<()> {
+    let path = report.path.display();
+    if report.ended {
+        return out::line(format_args!("{path}: ended; run it again to go on"));
+    }
+    out::line(format_args!("{path}: {}, {}", out::count(report.sets, "set"), out::bytes(report.bytes)))?;
+    if report.resumed > 0 {
+        out::line(format_args!("  {} of them by an earlier run", report.resumed))?;
+    }
+    for m in &report.modes {
+        let frames = out::count(m.frames, "frame");
+        out::line(format_args!("  {}: {frames}, {} by {}", m.mode, m.recorded_as, m.producer))?;
+        out::line(format_args!("    {}", m.parameters))?;
+    }
+    for line in &report.unavailable {
+        out::line(format_args!("  {line}"))?;
+    }
+    for note in &report.notes {
+        out::line(format_args!("  note: {note}"))?;
+    }
+    let jobs = out::count(report.jobs as u64, "pair");
+    let memory = out::bytes(report.memory_bytes);
+    out::line(format_args!("  {jobs} at once, {memory} of memory at most for pairs and matchers"))?;
+    let cpu = &report.cpu;
+    if cpu.pairs > 0 {
+        let each = |s: f64| s * 1e3 / cpu.pairs as f64;
+        out::line(format_args!(
+            "  processor time per pair: {:.0} ms, of which stereo {:.0}, reading {:.0}, rectifying {:.0}, depth {:.0}",
+            each(cpu.total_s),
+            each(cpu.stereo_s),
+            each(cpu.read_s),
+            each(cpu.rectify_s),
+            each(cpu.depth_s)
+        ))?;
+    }
+    Ok(())
+}
