@@ -16,6 +16,8 @@ PEERS := tests/peers
 PEERS_VENV := .venv-peers
 # Other transports to carry pictures with.
 FEED := .venv-feed
+# The vendor's SDK of OAK cameras, 450 MB.
+OAK := .venv-oak
 REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt
 
 .PHONY: help demo test test-long vm fuzz lint bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
@@ -28,7 +30,7 @@ demo: setup-build ## the seven-camera rig with synthetic cameras: record, verify
 	cargo build --release --package depthrig
 	target/release/depthrig demo $(ARGS)
 
-test: setup-test $(VENV)/.stamp $(LEROBOT)/.stamp $(READERS)/node_modules/.stamp ## every test there is: Rust, Python, readers that are not ours, the virtual machine
+test: setup-test $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(READERS)/node_modules/.stamp ## every test there is: Rust, Python, readers that are not ours, the virtual machine
 	@tools/onnxruntime.sh || true
 	tools/test.sh
 
@@ -67,7 +69,7 @@ bench-feed: setup-build $(FEED)/.stamp ## from one process to a NumPy array in a
 
 clean: ## remove what was built
 	cargo clean
-	rm -rf $(VENV) $(LEROBOT) $(PEERS_VENV) $(FEED) $(READERS)/node_modules
+	rm -rf $(VENV) $(LEROBOT) $(PEERS_VENV) $(FEED) $(OAK) $(READERS)/node_modules
 
 setup-build:
 	@tools/setup.sh build
@@ -103,6 +105,11 @@ $(PEERS_VENV)/.stamp: $(PEERS)/requirements.txt
 $(FEED)/.stamp: $(PEERS)/requirements-feed.txt python/pyproject.toml
 	python3 -m venv $(FEED)
 	$(FEED)/bin/pip install --quiet --requirement $< --editable ./python
+	touch $@
+
+$(OAK)/.stamp: python/requirements-oak.txt
+	python3 -m venv --clear $(OAK)
+	$(OAK)/bin/pip install --quiet --no-compile --no-cache-dir --requirement $<
 	touch $@
 
 $(READERS)/node_modules/.stamp: $(READERS)/package.json $(READERS)/package-lock.json

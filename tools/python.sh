@@ -3,6 +3,8 @@
 #
 #   tools/python.sh versions   types, then the wheel's tests on every Python from 3.9 on that this computer has
 #   tools/python.sh torch      the tests that need PyTorch, with that of .venv-lerobot; 77 when it is not there
+#   tools/python.sh oak        the OAK bridge with the vendor's SDK in .venv-oak: tests, and types against its stubs; 77
+#                              when it is not there
 #
 # Looked for are python3.9, python3.10, … and pyenv's; DEPTHRIG_PYTHONS="3.9 3.13" chooses. Environments are made once,
 # below target/python. The tests start a publisher: DEPTHRIG_TEST_PUBLISHER, else cargo builds it.
@@ -87,10 +89,23 @@ torch() {
         python/tests/test_torch.py python/tests/test_policy.py
 }
 
+oak() {
+    local python=$PWD/.venv-oak/bin/python
+    if ! "$python" -c 'import depthai' >/dev/null 2>&1; then
+        echo "the OAK SDK is not in .venv-oak; make test puts it there"
+        return 77
+    fi
+    # Without a camera the calls that only a camera answers are held against the SDK's own stubs.
+    PYTHONPATH=$PWD/python/src "$python" -m mypy --config-file python/pyproject.toml --cache-dir "$envs/mypy-oak" \
+        python/src/depthrig
+    PYTHONPATH=$PWD/python/src "$python" -m pytest --quiet -p no:cacheprovider \
+        python/tests/test_oak.py python/tests/test_oak_parts.py
+}
+
 case ${1:-} in
-versions | torch) "$1" ;;
+versions | torch | oak) "$1" ;;
 *)
-    sed -n '2,8s/^# \{0,1\}//p' "$0" >&2
+    sed -n '2,10s/^# \{0,1\}//p' "$0" >&2
     exit 2
     ;;
 esac

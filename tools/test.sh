@@ -46,6 +46,14 @@ torch() {
 }
 step python-torch torch
 if grep -q '^PyTorch skipped' "$logs/python-torch.log"; then skipped+=", 1 skipped: tests with PyTorch"; fi
+oak() {
+    tools/python.sh oak
+    local status=$?
+    [ "$status" -ne 77 ] || echo "OAK skipped"
+    [ "$status" -eq 0 ] || [ "$status" -eq 77 ]
+}
+step python-oak oak
+if grep -q '^OAK skipped' "$logs/python-oak.log"; then skipped+=", 1 skipped: the OAK bridge with its SDK"; fi
 step daemon "$python" -m pytest --quiet tests/python
 
 # Readers that are not ours must find the same pixels.
@@ -69,7 +77,7 @@ step vm vm
 if grep -q '^virtual machine skipped' "$logs/vm.log"; then skipped+=", 1 skipped: the virtual machine"; fi
 
 # Every test that cargo and pytest counted, every check of the virtual machine, and one for each of the other steps.
-count() { grep -ohE "[0-9]+ $1" "$logs"/{rust,python,python-versions,python-torch,daemon,vm}.log | awk '{n += $1} END {print n + 0}'; }
+count() { grep -ohE "[0-9]+ $1" "$logs"/{rust,python,python-versions,python-torch,python-oak,daemon,vm}.log | awk '{n += $1} END {print n + 0}'; }
 passed=$(count passed)
 failed=$(count failed)
 for name in {golden,reader-python,reader-node}{,-stereo}; do

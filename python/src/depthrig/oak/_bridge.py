@@ -1,0 +1,191 @@
+"""The loop between the SDK's queues and the daemon: what the frames are, and each on its way."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import math
+import time
+from typing import Any
+
+import depthai as dai
+import numpy as np
+import numpy.typing as npt
+
+from .._external import ExternalCamera
+from .._external_mode import ExternalMode
+from .._external_session import ExternalSession
+from .._layout import ExternalClock, PixelFormat
+from . import _lens
+from ._errors import Exit, OakError
+from ._source import Source
+
+log = logging.getLogger("depthrig.oak")
+
+_FORMATS = {
+    "BGR888i": PixelFormat.BGR8,
+    "RGB888i": PixelFormat.RGB8,
+    "NV12": PixelFormat.NV12,
+    "GRAY8": PixelFormat.MONO8,
+    "RAW8": PixelFormat.MONO8,
+    "RAW16": PixelFormat.Z16,
+}
+_TICK_PS = 1_000_000
+"""The SDK gives times to the microsecond."""
+_FIRST_FRAME_S = 15.0
+"""How long a pipeline may take to its first frame: an RVC4 loads for some seconds."""
+_WAIT = datetime.timedelta(milliseconds=100)
+
+
+def microseconds(value: datetime.timedelta) -> int:
+    """Return a time of the SDK in whole microseconds, without rounding."""
+    return (value.days * 86_400 + value.seconds) * 1_000_000 + value.microseconds
+
+
+def pixels(frame: dai.ImgFrame) -> npt.NDArray[Any]:
+    """Return a frame's pixels where the SDK has them, without a copy: `(H, W, 3)` u8, `(H, W)` u8 or u16, rows padded.
+
+    Raises OakError when there are fewer than the frame says.
+    """
+    kind = _FORMATS[frame.getType().name]
+    data: npt.NDArray[Any] = np.asarray(frame.getData())
+    width, height, stride = frame.getWidth(), frame.getHeight(), frame.getStride()
+    size = {PixelFormat.BGR8: 3, PixelFormat.RGB8: 3, PixelFormat.Z16: 2}.get(kind, 1)
+    rows = height * 3 // 2 if kind is PixelFormat.NV12 else height
+    if kind is PixelFormat.NV12 and frame.getPlaneHeight() != height:
+        # The planes are apart: the one way of storing that is no single array.
+        plane = stride * frame.getPlaneHeight()
+        bright, tint = data[: stride * height], data[plane : plane + stride * height // 2]
+        data = np.concatenate((bright, tint))
+    if stride < width * size or data.size < (rows - 1) * stride + width * size:
+        raise OakError(
+            f"a frame of {width}x{height} {kind.name.lower()} with rows of {stride} bytes has only {data.size} bytes"
+        )
+    if data.size < rows * stride:  # the last row has no padding
+        array = np.lib.stride_tricks.as_strided(data, (rows, width * size), (stride, 1))
+    else:
+        array = data[: rows * stride].reshape(rows, stride)[:, : width * size]
+    if kind is PixelFormat.Z16:
+        return array.view(np.uint16)
+    return array.reshape(rows, width, 3) if size == 3 else array
+
+
+def mode_of(stream: str, frame: dai.ImgFrame, source: Source, undistorted: bool) -> ExternalMode:
+    """Return the mode that a first frame shows."""
+    name = frame.getType().name
+    kind = _FORMATS.get(name)
+    if kind is None or (kind is PixelFormat.Z16) != (stream == "depth"):
+        raise OakError(f"stream {stream} gives frames of type {name}, which the bridge does not know", Exit.USAGE)
+    width, height = frame.getWidth(), frame.getHeight()
+    lens = _lens.of_frame(frame)
+    if lens is None and source.calibration is not None:
+        lens = _lens.of_calibration(source.calibration, source.sockets[stream], width, height, undistorted)
+    # Without an exposure time the stamp stays where the SDK puts it, at the end of the exposure.
+    known = microseconds(frame.getExposureTime()) > 0
+    return ExternalMode(
+        stream,
+        kind,
+        width,
+        height,
+        source.rate_hz,
+        depth_unit_m=0.001 if kind is PixelFormat.Z16 else None,
+        intrinsics=lens or _lens.unknown(),
+        clock=ExternalClock.DEVICE if known else ExternalClock.DEVICE_HEADER,
+        tick_ps=_TICK_PS,
+        counter_bits=64,
+        sequence_bits=64,
+    )
+
+
+class Bridge:
+    """A running pipeline and what it is served as."""
+
+    def __init__(self, source: Source, *, undistorted: bool) -> None:
+        self._source = source
+        self._undistorted = undistorted
+        self.modes: list[ExternalMode] = []
+        self.sent = dict.fromkeys(source.outputs, 0)
+        """Frames that were sent, by stream."""
+
+    def start(self) -> None:
+        """Start the pipeline and look at a frame of each stream.
+
+        Raises OakError when a stream gives none, or the pipeline cannot start.
+        """
+        source = self._source
+        source.open_queues()
+        try:
+            source.pipeline.start()
+        except RuntimeError as e:
+            raise OakError(f"the camera's pipeline cannot start ({e})") from e
+        deadline = time.monotonic() + _FIRST_FRAME_S
+        first: dict[str, dai.ImgFrame] = {}
+        while len(first) < len(source.queues):
+            for stream, frame in self._frames():
+                first.setdefault(stream, frame)
+            silent = [stream for stream in source.queues if stream not in first]
+            if silent and time.monotonic() > deadline:
+                raise OakError(f"no frame of {' and '.join(silent)} came within {_FIRST_FRAME_S:g} s", Exit.LOST)
+            if silent and not source.pipeline.isRunning():
+                raise OakError(
+                    f"the pipeline ended before a frame of {' and '.join(silent)} came; the SDK's log has the reason",
+                    Exit.LOST,
+                )
+        self.modes = [mode_of(stream, frame, source, self._undistorted) for stream, frame in first.items()]
+
+    def _frames(self) -> list[tuple[str, dai.ImgFrame]]:
+        """Wait a moment for frames; return those there are, with their streams."""
+        queues = self._source.queues
+        try:
+            dai.MessageQueue.waitAny(list(queues.values()), _WAIT)
+            found = [(stream, frame) for stream, queue in queues.items() for frame in queue.tryGetAll()]
+        except dai.MessageQueue.QueueException:  # closed: the pipeline is at its end
+            return []
+        return [(stream, frame) for stream, frame in found if isinstance(frame, dai.ImgFrame)]
+
+    @property
+    def is_running(self) -> bool:
+        """Whether frames may still come."""
+        return bool(self._source.pipeline.isRunning())
+
+    def serve(self, camera: ExternalCamera) -> None:
+        """Send frames as long as the daemon wants them, until the camera is stopped or the pipeline ends."""
+        while not camera.stopped:
+            session = camera.wait(0.0)
+            if session is not None:
+                with session:
+                    log.info("session %d: %s", session.number, ", ".join(map(str, session.streams.values())))
+                    session.start()
+                    while session.wanted:
+                        if not self._pass_on(session):
+                            return
+            # Nobody wants them: they are taken all the same, or a session would begin with old ones.
+            elif not self._frames() and not self.is_running:
+                return
+
+    def _pass_on(self, session: ExternalSession) -> bool:
+        """Send what came; false when no more will come."""
+        frames = self._frames()
+        arrival_ns = time.monotonic_ns()
+        for stream, frame in frames:
+            if stream in session.streams:
+                self._send(session, stream, frame, arrival_ns)
+        return bool(frames) or self.is_running
+
+    def _send(self, session: ExternalSession, stream: str, frame: dai.ImgFrame, arrival_ns: int) -> None:
+        exposure_us = microseconds(frame.getExposureTime())
+        # The SDK stamps the end of the exposure (depthai-core `ImgFrame.cpp`, MIT).
+        middle = session.streams[stream].clock is ExternalClock.DEVICE
+        temperature = frame.getSensorTemperature()
+        sent = session.send(
+            stream,
+            pixels(frame),
+            device_time=microseconds(frame.getTimestampDevice()) - (exposure_us // 2 if middle else 0),
+            device_sequence=frame.getSequenceNum(),
+            arrival_ns=arrival_ns,
+            exposure_ns=exposure_us * 1000,
+            # ISO 100 is a gain of 1.
+            gain=frame.getSensitivity() / 100,
+            temperature_c=math.nan if temperature is None else float(temperature),
+        )
+        self.sent[stream] += sent

@@ -1,0 +1,31 @@
+"""What ends the bridge, and with which exit code."""
+
+from __future__ import annotations
+
+import enum
+
+from ..errors import DepthrigError
+
+
+class Exit(enum.IntEnum):
+    """Exit codes of the bridge. The daemon starts it again after each; `USAGE` is what only a human can cure."""
+
+    DONE = 0
+    """It was asked to stop, or its files are at their end."""
+    FAILED = 1
+    """Something else; the message says what."""
+    USAGE = 2
+    """The command line, the files or the installation cannot work."""
+    NO_CAMERA = 3
+    """The camera is not there, or somebody else has it."""
+    LOST = 4
+    """The camera was there and is gone: unplugged, or its firmware stopped."""
+
+
+class OakError(DepthrigError):
+    """The camera cannot be served; the message says why and what to do."""
+
+    def __init__(self, message: str, code: Exit = Exit.FAILED) -> None:
+        super().__init__(message)
+        self.code = code
+        """What the process ends with."""

@@ -1,0 +1,49 @@
+"""Where frames come from: a running pipeline of the SDK with a queue for each stream, be it a camera's or of files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import depthai as dai
+
+CALIBRATION = "calibration.json"
+"""The file with the calibration, beside recordings and pictures."""
+QUEUE = 4
+"""Frames that may wait for the bridge; the oldest gives way, and its number is missing from the camera's count."""
+
+
+@dataclass
+class Identity:
+    """What the camera says of itself."""
+
+    model: str
+    serial: str
+    firmware: str = ""
+    port: str = ""
+    calibration: str = "none"
+    """Where the calibration comes from."""
+
+
+@dataclass
+class Source:
+    """A pipeline that can be started, and its queues by stream name."""
+
+    pipeline: dai.Pipeline
+    outputs: dict[str, dai.Node.Output]
+    """What the queues are fed by, for recording."""
+    identity: Identity
+    rate_hz: float
+    calibration: dai.CalibrationHandler | None = None
+    """Of the camera; None when there is none."""
+    sockets: dict[str, dai.CameraBoardSocket] = field(default_factory=dict)
+    """The sensor that each stream looks from."""
+    notes: list[str] = field(default_factory=list)
+    """What the user should know, one line each."""
+    queues: dict[str, dai.MessageQueue] = field(default_factory=dict)
+
+    def open_queues(self) -> None:
+        """Make a queue for each output; before the pipeline is started."""
+        for name, output in self.outputs.items():
+            self.queues[name] = output.createOutputQueue(maxSize=QUEUE, blocking=False)
