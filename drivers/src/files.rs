@@ -30,8 +30,8 @@ use crate::{
 use std::path::PathBuf;
 
 mod manifest;
-mod pattern;
-mod picture;
+pub(crate) mod pattern;
+pub(crate) mod picture;
 mod play;
 mod source;
 

@@ -11,7 +11,7 @@ pub mod y411;
 pub mod y8i;
 
 pub use alpha::drop_alpha;
-pub use mjpeg::{decode_jpeg, jpeg_span, keep_jpeg};
+pub use mjpeg::{decode_grey_jpeg, decode_jpeg, jpeg_size, jpeg_span, keep_jpeg};
 pub use side_by_side::{Half, copy_half};
 
 use core::sync::atomic::{AtomicU64, Ordering};

@@ -28,10 +28,10 @@ enum Part {
 
 /// What a file is sorted and paired by: the text that the `*` of its pattern stand for, read as people read it.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub(super) struct Key(Vec<Part>);
+pub(crate) struct Key(Vec<Part>);
 
 impl Key {
-    pub(super) fn new(captures: &[&str]) -> Self {
+    pub(crate) fn new(captures: &[&str]) -> Self {
         let mut parts = Vec::new();
         // A character that no file name has keeps the pieces of two `*` apart.
         for (i, mut rest) in captures.iter().copied().enumerate() {

@@ -13,7 +13,7 @@ const MAX_PIXEL_BYTES: u64 = 1 << 28;
 
 /// How the pixels of a picture are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(crate) enum Kind {
     Rgb8,
     Grey8,
     Grey16,
@@ -41,14 +41,14 @@ impl fmt::Display for Kind {
 
 /// What a picture is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Info {
-    pub(super) width: u32,
-    pub(super) height: u32,
-    pub(super) kind: Kind,
+pub(crate) struct Info {
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+    pub(crate) kind: Kind,
 }
 
 impl Info {
-    pub(super) const fn bytes(&self) -> u64 {
+    pub(crate) const fn bytes(&self) -> u64 {
         self.width as u64 * self.height as u64 * self.kind.bytes_per_pixel()
     }
 }
@@ -60,13 +60,13 @@ impl fmt::Display for Info {
 }
 
 /// Reads what `path` is from its header and checks that the file does not end early. Pixels stay undecoded.
-pub(super) fn probe(path: &Path) -> Result<Info> {
+pub(crate) fn probe(path: &Path) -> Result<Info> {
     let file = File::open(path).map_err(|e| io_error(path, e))?;
     inspect(BufReader::new(file)).map_err(|bad| bad.into_error(path))
 }
 
 /// Decodes `path` into `pixels`, which has the size that `expected` says; 16-bit pixels as little-endian.
-pub(super) fn decode(path: &Path, expected: &Info, pixels: &mut [u8]) -> Result<()> {
+pub(crate) fn decode(path: &Path, expected: &Info, pixels: &mut [u8]) -> Result<()> {
     let bytes = std::fs::read(path).map_err(|e| io_error(path, e))?;
     let info = inspect(BufReader::new(Cursor::new(&bytes))).map_err(|bad| bad.into_error(path))?;
     if info != *expected {
@@ -96,7 +96,7 @@ pub(super) fn decode(path: &Path, expected: &Info, pixels: &mut [u8]) -> Result<
 }
 
 /// An input or output error at `path`, with the kind that the supervisor acts on.
-pub(super) fn io_error(path: &Path, e: io::Error) -> Error {
+pub(crate) fn io_error(path: &Path, e: io::Error) -> Error {
     let kind = match e.kind() {
         io::ErrorKind::NotFound => ErrorKind::NotFound,
         io::ErrorKind::PermissionDenied => ErrorKind::PermissionDenied,

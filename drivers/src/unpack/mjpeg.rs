@@ -43,12 +43,30 @@ pub fn keep_jpeg(picture: &[u8], to: &mut [u8]) -> Result<(), DropReason> {
 /// # Errors
 /// [`DropReason::WrongSize`] when it is damaged, of another size, or not in colour.
 pub fn decode_jpeg(picture: &[u8], width: u32, height: u32, to: &mut [u8]) -> Result<(), DropReason> {
+    decode(picture, (width, height), ColorType::Rgb8, to)
+}
+
+/// Decodes a grey picture of `width` x `height` pixels into `to`, one byte a pixel.
+///
+/// # Errors
+/// [`DropReason::WrongSize`] when it is damaged, of another size, or in colour.
+pub fn decode_grey_jpeg(picture: &[u8], width: u32, height: u32, to: &mut [u8]) -> Result<(), DropReason> {
+    decode(picture, (width, height), ColorType::L8, to)
+}
+
+/// Width and height of a picture, as far as its header says them.
+pub fn jpeg_size(picture: &[u8]) -> Option<(u32, u32)> {
+    let read = || JpegDecoder::new(Cursor::new(picture)).ok().map(|d| d.dimensions());
+    catch_unwind(AssertUnwindSafe(read)).ok().flatten()
+}
+
+fn decode(picture: &[u8], size: (u32, u32), color: ColorType, to: &mut [u8]) -> Result<(), DropReason> {
     // zune-jpeg 0.4.21, which `image` decodes with, panics on a few damaged pictures; as does the reader of
     // datasets, this gives up what it worked on then.
     let decoded = catch_unwind(AssertUnwindSafe(|| {
         let decoder = JpegDecoder::new(Cursor::new(picture)).ok()?;
-        let fits = decoder.dimensions() == (width, height)
-            && decoder.color_type() == ColorType::Rgb8
+        let fits = decoder.dimensions() == size
+            && decoder.color_type() == color
             && decoder.total_bytes() == to.len() as u64;
         if !fits {
             return None;
@@ -80,14 +98,14 @@ mod tests {
         out
     }
 
-    fn decode(jpeg: &[u8]) -> Result<Vec<u8>, DropReason> {
+    fn decoded(jpeg: &[u8]) -> Result<Vec<u8>, DropReason> {
         let mut to = vec![0xA5; (SIZE.0 * SIZE.1 * 3) as usize];
         decode_jpeg(jpeg, SIZE.0, SIZE.1, &mut to).map(|()| to)
     }
 
     #[test]
     fn a_picture_is_decoded_to_its_pixels() {
-        let pixels = decode(&picture([200, 40, 90])).unwrap();
+        let pixels = decoded(&picture([200, 40, 90])).unwrap();
         let near = |at: usize, want: u8| pixels[at].abs_diff(want) <= 3;
         assert!(
             pixels.chunks(3).count() == 512 && near(0, 200) && near(1, 40) && near(2, 90),
@@ -112,7 +130,7 @@ mod tests {
         }
         bare.extend(&whole[at..]);
         assert!(bare.len() < whole.len() - 400, "the tables are gone");
-        assert_eq!(decode(&bare), decode(&whole));
+        assert_eq!(decoded(&bare), decoded(&whole));
     }
 
     #[test]
@@ -136,7 +154,12 @@ mod tests {
         let mut grey = Vec::new();
         let mut encoder = JpegEncoder::new(&mut grey);
         encoder.encode(&[7; 512], SIZE.0, SIZE.1, image::ExtendedColorType::L8).unwrap();
-        assert_eq!(decode(&grey), Err(DropReason::WrongSize));
+        assert_eq!(decoded(&grey), Err(DropReason::WrongSize));
+        let mut one = vec![0xA5; 512];
+        decode_grey_jpeg(&grey, SIZE.0, SIZE.1, &mut one).unwrap();
+        assert!(one.iter().all(|v| v.abs_diff(7) <= 1) && jpeg_size(&grey) == Some(SIZE));
+        assert_eq!(decode_grey_jpeg(&picture([9; 3]), 32, 16, &mut one), Err(DropReason::WrongSize));
+        assert_eq!(jpeg_size(b"no picture"), None);
     }
 
     proptest! {
@@ -147,7 +170,7 @@ mod tests {
             jpeg[at % n] = value;
             jpeg.truncate(cut % n);
             let _ = jpeg_span(&jpeg);
-            let _ = decode(&jpeg);
+            let _ = decoded(&jpeg);
         }
     }
 }

@@ -1,14 +1,28 @@
 //! Recordings of a ZED's two eyes: pairs of pictures out of a folder of side-by-side images or an SVO2 file.
 //!
-//! A [`Source`] gives pairs in the order of the recording, as they were recorded: not rectified, not resized. `open`
+//! A [`Source`] gives pairs in the order of the recording, as they were recorded: not rectified, not resized. [`open`]
 //! finds out what a path is. The same trait is what other recordings (a dataset with raw `left` and `right`) implement.
 
 use super::CalibrationFile;
-use super::conf::StereoCalibration;
-use super::mode::Eye;
-use crate::Result;
+use super::conf::{FactoryCalibration, StereoCalibration, how_to_get, known_paths};
+use super::mode::{Eye, Mode};
+use crate::files::picture::io_error;
+use crate::{Error, ErrorKind, Result};
 use depthrig_bus::PixelFormat;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+
+mod backend;
+mod folder;
+#[doc(hidden)]
+pub mod made;
+pub mod svo2;
+
+pub use backend::{ReplayBackend, ReplayConfig};
+
+/// Rate of pairs whose recording says nothing of it.
+const DEFAULT_RATE_HZ: f64 = 30.0;
+/// The fastest rate that is believed.
+const MAX_RATE_HZ: f64 = 1000.0;
 
 /// What a recording is, known once it is open.
 #[derive(Debug, Clone, PartialEq)]
@@ -110,3 +124,122 @@ pub struct OpenOptions {
     /// Rate of pairs that have no times of their own; 30 Hz without it.
     pub rate_hz: Option<f64>,
 }
+
+/// Opens the recording at `path`: a folder of side-by-side images or an SVO2 file.
+///
+/// # Errors
+/// [`ErrorKind::NotFound`], [`ErrorKind::PermissionDenied`], [`ErrorKind::Io`]; [`ErrorKind::Unsupported`] for a
+/// recording whose pictures cannot be decoded here (H.265, encrypted); [`ErrorKind::BadInput`] for what is no recording,
+/// pictures that are no two eyes, and a calibration that is another camera's or has not their size.
+pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn Source>> {
+    let what = std::fs::metadata(path).map_err(|e| io_error(path, e))?;
+    if let Some(rate) = options.rate_hz
+        && !(rate > 0.0 && rate <= MAX_RATE_HZ)
+    {
+        let what = format!("a rate of {rate} Hz is impossible: choose one above 0 and at most {MAX_RATE_HZ}");
+        return Err(Error::new(ErrorKind::BadInput, what));
+    }
+    Ok(if what.is_dir() {
+        Box::new(folder::Folder::open(path, options)?)
+    } else {
+        Box::new(svo2::Svo2::open(path, options)?)
+    })
+}
+
+/// The calibration of the camera `serial` (empty when it is not known) for eyes of `size`, where it comes from, and the
+/// serial number that its name says.
+fn calibration(
+    path: &Path,
+    options: &OpenOptions,
+    serial: &str,
+    (width, height): (u32, u32),
+) -> Result<(Option<StereoCalibration>, String, Option<String>)> {
+    let found = match &options.calibration {
+        CalibrationFile::None => None,
+        CalibrationFile::At(file) => Some(file.clone()),
+        CalibrationFile::Known => beside(path, serial)?.or_else(|| {
+            let home = std::env::var_os("HOME").map(PathBuf::from);
+            let known = if serial.is_empty() { Vec::new() } else { known_paths(serial, home.as_deref()) };
+            known.into_iter().find(|p| p.exists())
+        }),
+    };
+    let Some(file) = found else { return Ok((None, "none".to_owned(), None)) };
+    let of = serial_of(&file);
+    if let Some(of) = &of
+        && !serial.is_empty()
+        && of.trim_start_matches('0') != serial.trim_start_matches('0')
+    {
+        let what = format!(
+            "{} is the calibration of the camera {of}, and {} was taken with {serial}: {}",
+            file.display(),
+            path.display(),
+            how_to_get(serial)
+        );
+        return Err(Error::new(ErrorKind::BadInput, what));
+    }
+    let all = FactoryCalibration::load(&file).map_err(|e| {
+        let what = format!("{e}; {} needs it for rectification", path.display());
+        Error::new(ErrorKind::BadInput, what).with_source(e)
+    })?;
+    let fitting = Mode::of_eye(width, height).and_then(|m| all.at(m));
+    let Some(fitting) = fitting else {
+        let sizes: Vec<_> =
+            Mode::ALL.into_iter().filter(|m| all.at(*m).is_some()).map(Mode::eye_size).collect();
+        let sizes: Vec<_> = sizes.into_iter().map(|(w, h)| format!("{w}x{h}")).collect();
+        let what = format!(
+            "{}: each eye has {width}x{height} pixels, and {} is for {}; pictures must not be resized, or give \
+             calibration = \"none\" to play them as they are",
+            path.display(),
+            file.display(),
+            sizes.join(", ")
+        );
+        return Err(Error::new(ErrorKind::BadInput, what));
+    };
+    Ok((Some(*fitting), format!("factory {}", file.display()), of))
+}
+
+/// The factory calibration that lies in the folder of the recording (or in the recording, when that is a folder).
+fn beside(path: &Path, serial: &str) -> Result<Option<PathBuf>> {
+    let folder = if path.is_dir() { Some(path) } else { path.parent() };
+    let Some(folder) = folder.filter(|f| !f.as_os_str().is_empty()) else { return Ok(None) };
+    let entries = std::fs::read_dir(folder).map_err(|e| io_error(folder, e))?;
+    let mut found: Vec<_> = entries
+        .filter_map(|e| Some(e.ok()?.path()))
+        .filter(|p| p.extension().is_some_and(|e| e == "conf"))
+        .filter(|p| serial.is_empty() || serial_of(p).is_none_or(|of| of == serial))
+        .collect();
+    found.sort();
+    // One that is called after the camera comes before others.
+    if let Some(i) =
+        found.iter().position(|p| !serial.is_empty() && serial_of(p).is_some_and(|of| of == serial))
+    {
+        return Ok(Some(found.swap_remove(i)));
+    }
+    // A recording that is a file has neighbours that it has nothing to do with.
+    if !path.is_dir() {
+        return Ok(None);
+    }
+    match found.as_slice() {
+        [] => Ok(None),
+        [one] => Ok(Some(one.clone())),
+        [a, b, ..] => {
+            let what = format!(
+                "{} has several calibrations, such as {} and {}; keep one, or name it with calibration = \"…\"",
+                folder.display(),
+                a.display(),
+                b.display()
+            );
+            Err(Error::new(ErrorKind::BadInput, what))
+        }
+    }
+}
+
+/// The serial number in the name `SN<serial>.conf`.
+fn serial_of(file: &Path) -> Option<String> {
+    let stem = file.file_stem()?.to_str()?;
+    let digits = stem.strip_prefix("SN")?;
+    (!digits.is_empty() && digits.bytes().all(|c| c.is_ascii_digit())).then(|| digits.to_owned())
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,379 @@
+//! The threads of stereo: one rectifies, one per mode matches. Pairs go in, what was made of them comes out.
+//!
+//! Each thread has a box for one pair; a newer pair takes the place of one that still lies there. Everything that pictures
+//! are in is made once and goes round.
+
+use super::{Geometry, StereoMode, StereoOptions, has_color};
+use crate::{Error, ErrorKind, Result};
+use core::time::Duration;
+use depthrig_bus::PixelFormat;
+use depthrig_calib::stereo::{DisparityMap, Gray, Matcher, StereoPair, depth_from_disparity};
+use depthrig_calib::{Rectifier, View};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+
+/// What the threads are given below those that capture and those that somebody waits for.
+const NICE: i32 = 10;
+/// Results of one mode that may be on their way at once.
+const PRODUCTS: usize = 2;
+
+/// The raw pictures of a pair.
+#[derive(Debug, Default)]
+pub(super) struct Raw {
+    pub(super) ticket: u64,
+    pub(super) left: Vec<u8>,
+    pub(super) right: Vec<u8>,
+}
+
+/// The rectified pictures of a pair.
+#[derive(Debug, Default)]
+pub(super) struct Views {
+    pub(super) ticket: u64,
+    left: Vec<u8>,
+    right: Vec<u8>,
+    /// Empty where the eyes have no colour.
+    pub(super) left_rgb: Vec<u8>,
+    /// Filled when a mode wants colour.
+    right_rgb: Vec<u8>,
+}
+
+/// What a mode made of a pair.
+#[derive(Debug, Default)]
+pub(super) struct Product {
+    pub(super) ticket: u64,
+    pub(super) map: DisparityMap,
+    pub(super) depth: Vec<u16>,
+}
+
+/// What the threads report.
+#[derive(Debug)]
+pub(super) enum Event {
+    /// A pair is rectified.
+    Rectified(Arc<Views>),
+    /// Mode number .0 has matched a pair.
+    Matched(usize, Product),
+    /// Mode number .0 gave the pair .1 up for a newer one.
+    Skipped(usize, u64),
+    /// Mode number .0 failed at the pair .1.
+    Failed(usize, u64, String),
+}
+
+/// A box for the newest of what comes.
+struct Newest<T> {
+    slot: Mutex<Slot<T>>,
+    changed: Condvar,
+    /// Wait until there is room, and replace nothing.
+    keeps_all: bool,
+}
+
+struct Slot<T> {
+    item: Option<T>,
+    closed: bool,
+}
+
+impl<T> Newest<T> {
+    fn new(keeps_all: bool) -> Arc<Self> {
+        let slot = Mutex::new(Slot { item: None, closed: false });
+        Arc::new(Self { slot, changed: Condvar::new(), keeps_all })
+    }
+
+    /// Puts `item` in and returns what it took the place of.
+    fn put(&self, item: T) -> Option<T> {
+        let mut slot = self.slot.lock().unwrap_or_else(PoisonError::into_inner);
+        while self.keeps_all && slot.item.is_some() && !slot.closed {
+            slot = self.changed.wait(slot).unwrap_or_else(PoisonError::into_inner);
+        }
+        let old = slot.item.replace(item);
+        self.changed.notify_all();
+        old
+    }
+
+    /// Waits for an item; `None` when the box was closed.
+    fn take(&self) -> Option<T> {
+        let mut slot = self.slot.lock().unwrap_or_else(PoisonError::into_inner);
+        loop {
+            if slot.closed {
+                return None;
+            }
+            if let Some(item) = slot.item.take() {
+                self.changed.notify_all();
+                return Some(item);
+            }
+            slot = self.changed.wait(slot).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    fn close(&self) {
+        self.slot.lock().unwrap_or_else(PoisonError::into_inner).closed = true;
+        self.changed.notify_all();
+    }
+}
+
+/// The threads of one camera. Dropping it ends them when they are done with what they work on; it does not wait.
+pub(super) struct Crew {
+    raw: Arc<Newest<Raw>>,
+    /// Used pictures, for the next pair.
+    spare: Vec<Raw>,
+    spared: Receiver<Raw>,
+    views: Vec<Arc<Newest<Arc<Views>>>>,
+    events: Receiver<Event>,
+    /// Where each mode's products go back.
+    back: Vec<SyncSender<Product>>,
+}
+
+impl Crew {
+    /// Makes every matcher, then starts the threads.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] when a mode's matcher cannot be made, [`ErrorKind::Io`] when the system refuses a thread.
+    pub(super) fn start(
+        camera: &str,
+        rectifier: Rectifier,
+        format: PixelFormat,
+        options: &StereoOptions,
+    ) -> Result<Self> {
+        let (width, height) = rectifier.size();
+        let geometry = Geometry {
+            width: width as usize,
+            height: height as usize,
+            focal_px: rectifier.intrinsics().fx,
+            baseline_m: rectifier.baseline_m(),
+        };
+        let matchers =
+            options.modes.iter().map(|m| make(camera, m, &geometry)).collect::<Result<Vec<_>>>()?;
+        // Every pair that is on its way can say something to each mode, and once more.
+        let (send, events) = sync_channel(8 * (matchers.len() + 1));
+        let (spare, spared) = sync_channel(4);
+        let raw = Newest::new(options.every_pair);
+        let views: Vec<_> = matchers.iter().map(|_| Newest::new(options.every_pair)).collect();
+        let rectify = Rectify {
+            rectifier,
+            format,
+            wants_color: options.modes.iter().any(|m| m.wants_color),
+            input: Arc::clone(&raw),
+            spare,
+            outputs: views.clone(),
+            events: send.clone(),
+            pool: Vec::new(),
+            most: matchers.len() + 4,
+        };
+        spawn(camera, "rectify", move || rectify.run())?;
+        let mut back = Vec::new();
+        for (i, (matcher, mode)) in matchers.into_iter().zip(&options.modes).enumerate() {
+            let (give, free) = sync_channel(PRODUCTS);
+            for _ in 0..PRODUCTS {
+                // There is room for all of them.
+                let _ = give.try_send(Product::default());
+            }
+            back.push(give);
+            let work = Match {
+                number: i,
+                matcher,
+                geometry,
+                unit_m: options.depth_unit_m,
+                range_m: options.range_m,
+                input: Arc::clone(&views[i]),
+                free,
+                events: send.clone(),
+            };
+            spawn(camera, &mode.name, move || work.run())?;
+        }
+        Ok(Self { raw, spare: Vec::new(), spared, views, events, back })
+    }
+
+    /// Memory for the pictures of a pair.
+    pub(super) fn blank(&mut self) -> Raw {
+        self.spared.try_recv().ok().or_else(|| self.spare.pop()).unwrap_or_default()
+    }
+
+    /// Hands a pair on. The ticket of one that gave way to it.
+    pub(super) fn offer(&mut self, raw: Raw) -> Option<u64> {
+        let old = self.raw.put(raw)?;
+        let ticket = old.ticket;
+        self.spare.push(old);
+        Some(ticket)
+    }
+
+    /// What there is to report, waiting for it for at most `timeout`.
+    pub(super) fn next(&self, timeout: Duration) -> Option<Event> {
+        if timeout.is_zero() { self.events.try_recv().ok() } else { self.events.recv_timeout(timeout).ok() }
+    }
+
+    /// Gives the product of mode `number` back.
+    pub(super) fn give_back(&self, number: usize, product: Product) {
+        // There is room for every product that there is.
+        let _ = self.back.get(number).map(|b| b.try_send(product));
+    }
+}
+
+impl Drop for Crew {
+    fn drop(&mut self) {
+        self.raw.close();
+        self.views.iter().for_each(|v| v.close());
+    }
+}
+
+fn make(camera: &str, mode: &StereoMode, geometry: &Geometry) -> Result<Box<dyn Matcher>> {
+    let matcher = (mode.make)(geometry).map_err(|e| {
+        let what = format!("{camera}: the stereo mode \"{}\" cannot be made: {e}", mode.name);
+        Error::new(ErrorKind::BadInput, what).with_source(e)
+    })?;
+    let d = matcher.describe();
+    let (mode, mib) = (&mode.name, d.memory_bytes / (1 << 20));
+    tracing::info!(camera, mode, producer = d.producer, parameters = d.parameters, mib, "stereo");
+    Ok(matcher)
+}
+
+fn spawn(camera: &str, name: &str, work: impl FnOnce() + Send + 'static) -> Result<()> {
+    let lowered = move || {
+        // Of this thread alone on Linux; refused, it is merely as urgent as others.
+        if let Err(e) = rustix::process::nice(NICE) {
+            tracing::debug!(error = %e, "a stereo thread keeps its priority");
+        }
+        work();
+    };
+    let thread = std::thread::Builder::new().name(format!("st-{name}")).spawn(lowered);
+    thread.map(drop).map_err(|e| {
+        Error::new(ErrorKind::Io, format!("{camera}: no thread for stereo could be started")).with_source(e)
+    })
+}
+
+/// The thread that rectifies.
+struct Rectify {
+    rectifier: Rectifier,
+    format: PixelFormat,
+    wants_color: bool,
+    input: Arc<Newest<Raw>>,
+    spare: SyncSender<Raw>,
+    outputs: Vec<Arc<Newest<Arc<Views>>>>,
+    events: SyncSender<Event>,
+    /// All views that there are; those that nobody else has are free.
+    pool: Vec<Arc<Views>>,
+    most: usize,
+}
+
+impl Rectify {
+    fn run(mut self) {
+        while let Some(raw) = self.input.take() {
+            let Some(mut views) = self.free() else { return };
+            if let Some(v) = Arc::get_mut(&mut views) {
+                self.fill(&raw, v);
+            }
+            // When the camera is given up, nobody takes it any more.
+            let _ = self.spare.try_send(raw);
+            for (i, output) in self.outputs.iter().enumerate() {
+                if let Some(old) = output.put(Arc::clone(&views))
+                    && self.events.send(Event::Skipped(i, old.ticket)).is_err()
+                {
+                    return;
+                }
+            }
+            self.pool.push(Arc::clone(&views));
+            if self.events.send(Event::Rectified(views)).is_err() {
+                return;
+            }
+        }
+    }
+
+    /// Views that nobody has. There always are some: each mode has one at most that it works on, one waits for all of
+    /// them, and those that were reported are taken soon.
+    fn free(&mut self) -> Option<Arc<Views>> {
+        loop {
+            if let Some(i) = self.pool.iter().position(|v| Arc::strong_count(v) == 1) {
+                return Some(self.pool.swap_remove(i));
+            }
+            if self.pool.len() < self.most {
+                return Some(Arc::default());
+            }
+            if self.input.slot.lock().unwrap_or_else(PoisonError::into_inner).closed {
+                return None;
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    fn fill(&self, raw: &Raw, views: &mut Views) {
+        let (width, height) = self.rectifier.size();
+        let pixels = width as usize * height as usize;
+        let (r, color) = (&self.rectifier, has_color(self.format));
+        views.ticket = raw.ticket;
+        views.left.resize(pixels, 0);
+        views.right.resize(pixels, 0);
+        views.left_rgb.resize(if color { 3 * pixels } else { 0 }, 0);
+        views.right_rgb.resize(if color && self.wants_color { 3 * pixels } else { 0 }, 0);
+        let eyes = [
+            (View::Left, &raw.left, &mut views.left, &mut views.left_rgb),
+            (View::Right, &raw.right, &mut views.right, &mut views.right_rgb),
+        ];
+        for (view, picture, grey, rgb) in eyes {
+            let done = match self.format {
+                PixelFormat::Yuyv => r.grey_from_yuyv(view, picture, grey),
+                PixelFormat::Rgb8 => r.grey_from_rgb(view, picture, grey),
+                _ => r.grey(view, picture, grey),
+            };
+            let colored = match self.format {
+                _ if rgb.is_empty() => Ok(()),
+                PixelFormat::Yuyv => r.rgb_from_yuyv(view, picture, rgb),
+                _ => r.rgb(view, picture, rgb),
+            };
+            // The sizes were checked when the camera was started and when the pictures came.
+            if let Err(e) = done.and(colored) {
+                tracing::error!(error = %e, "a picture was not rectified");
+            }
+        }
+    }
+}
+
+/// The thread of a mode.
+struct Match {
+    number: usize,
+    matcher: Box<dyn Matcher>,
+    geometry: Geometry,
+    unit_m: f64,
+    range_m: (f64, f64),
+    input: Arc<Newest<Arc<Views>>>,
+    free: Receiver<Product>,
+    events: SyncSender<Event>,
+}
+
+impl Match {
+    fn run(mut self) {
+        let mut kept: Option<Product> = None;
+        while let Some(views) = self.input.take() {
+            // Both products are on their way: whoever takes them gives one back soon, or is gone.
+            let Some(mut product) = kept.take().or_else(|| self.free.recv().ok()) else { return };
+            let (number, ticket) = (self.number, views.ticket);
+            let done = self.run_one(&views, &mut product);
+            drop(views);
+            let event = match done {
+                Ok(()) => Event::Matched(number, product),
+                Err(e) => {
+                    kept = Some(product);
+                    Event::Failed(number, ticket, e.to_string())
+                }
+            };
+            if self.events.send(event).is_err() {
+                return;
+            }
+        }
+    }
+
+    fn run_one(&mut self, views: &Views, product: &mut Product) -> depthrig_calib::Result<()> {
+        let Geometry { width, height, focal_px, baseline_m } = self.geometry;
+        let rgb = |picture: &'_ Vec<u8>| !picture.is_empty();
+        let pair = StereoPair {
+            left: Gray::packed(&views.left, width, height),
+            right: Gray::packed(&views.right, width, height),
+            left_rgb: Some(views.left_rgb.as_slice()).filter(|_| rgb(&views.left_rgb)),
+            right_rgb: Some(views.right_rgb.as_slice()).filter(|_| rgb(&views.right_rgb)),
+        };
+        product.ticket = views.ticket;
+        self.matcher.run(&pair, &mut product.map)?;
+        product.depth.resize(width * height, 0);
+        let Product { map, depth, .. } = product;
+        depth_from_disparity(&map.disparity, focal_px, baseline_m, self.unit_m, self.range_m, depth)?;
+        // No depth, no confidence in it.
+        map.confidence.iter_mut().zip(depth).filter(|(_, z)| **z == 0).for_each(|(c, _)| *c = 0);
+        Ok(())
+    }
+}

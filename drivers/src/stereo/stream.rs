@@ -1,0 +1,376 @@
+//! A running camera with stereo: its own frames go their way and are copied for the threads, what these make comes after.
+
+use super::crew::{Crew, Event, Product, Raw, Views};
+use super::ledger::{Ledger, Step};
+use super::{COLOR, PREFIXES, StereoOptions};
+use crate::clock::ClockQuality;
+use crate::{FrameMeta, FrameSink, Poll, Result, Stream, StreamProfile};
+use core::time::Duration;
+use depthrig_bus::{DropReason, FrameFlags, HostTime};
+
+/// How often the threads' results are looked for while the camera is waited for.
+const SLICE: Duration = Duration::from_millis(2);
+/// Pairs that may be on their way in a group of streams when nothing is to give way.
+const AHEAD: usize = 2;
+
+/// A running camera with stereo.
+pub(super) struct StereoStream {
+    profiles: Vec<StreamProfile>,
+    inner: Box<dyn Stream>,
+    pairing: Pairing,
+    every_pair: bool,
+    ended: bool,
+}
+
+/// Up to three streams: where they are asked for, their number among those that are delivered and the bytes of a frame.
+type Outlets = [Option<(usize, usize)>; 3];
+
+/// Streams that are made together.
+struct Group {
+    /// `color` alone, or depth, confidence, disparity.
+    streams: Outlets,
+    ledger: Ledger<FrameMeta>,
+    /// Times that its matcher failed.
+    failures: u64,
+}
+
+/// Where the camera's frames are gathered into pairs.
+struct Pairing {
+    name: String,
+    /// Numbers of the eyes among the camera's streams.
+    eyes: [usize; 2],
+    /// Where each of the camera's streams is delivered, if it is.
+    own: Vec<Option<usize>>,
+    /// Memory that the camera writes into.
+    lent: Vec<Vec<u8>>,
+    /// The pair that is being gathered, and of which eyes there is a picture.
+    raw: Raw,
+    have: [Option<FrameMeta>; 2],
+    /// How far apart both eyes' pictures may be.
+    near_ns: i64,
+    ticket: u64,
+    /// `color`, then the modes.
+    groups: Vec<Group>,
+    crew: Crew,
+}
+
+impl StereoStream {
+    /// Of `inner`, whose streams number `eyes` are left and right; `profiles` are delivered.
+    pub(super) fn new(
+        name: String,
+        inner: Box<dyn Stream>,
+        eyes: [usize; 2],
+        profiles: Vec<StreamProfile>,
+        mut crew: Crew,
+        options: &StereoOptions,
+    ) -> Self {
+        let find = |name: &str| profiles.iter().position(|p| p.stream.as_str() == name);
+        let own: Vec<_> = inner.profiles().iter().map(|p| find(p.stream.as_str())).collect();
+        let group = |streams| Group { streams, ledger: Ledger::new(), failures: 0 };
+        let outlet = |name: &str| find(name).map(|i| (i, profiles[i].frame_bytes()));
+        let mut groups = vec![group([outlet(COLOR), None, None])];
+        for mode in &options.modes {
+            groups.push(group(PREFIXES.map(|prefix| outlet(&format!("{prefix}{}", mode.name)))));
+        }
+        let near_ns = inner.profiles().get(eyes[0]).map_or(0, |p| p.period_ns() as i64 / 4);
+        let raw = crew.blank();
+        let lent: Vec<_> = own.iter().map(|_| Vec::new()).collect();
+        let pairing =
+            Pairing { name, eyes, own, lent, raw, have: [None; 2], near_ns, ticket: 0, groups, crew };
+        Self { profiles, inner, pairing, every_pair: options.every_pair, ended: false }
+    }
+}
+
+impl Stream for StereoStream {
+    fn profiles(&self) -> &[StreamProfile] {
+        &self.profiles
+    }
+
+    fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
+        let deadline = HostTime::now().plus(timeout);
+        let mut came = false;
+        loop {
+            let (left, open) = (deadline.from_now(), self.pairing.open());
+            if self.ended && open == 0 {
+                return Ok(if came { Poll::Frame } else { Poll::End });
+            }
+            let wait = if self.ended || (self.every_pair && open >= AHEAD) {
+                left
+            } else {
+                // While threads are at work the camera is waited for in short pieces, so that results do not wait for it.
+                let slice = if open > 0 { left.min(SLICE) } else { left };
+                match self.inner.poll(slice, &mut Tee { pairing: &mut self.pairing, sink })? {
+                    Poll::Frame => came = true,
+                    Poll::Idle => {}
+                    Poll::End => {
+                        self.ended = true;
+                        self.pairing.end(sink);
+                    }
+                }
+                Duration::ZERO
+            };
+            let mut event = self.pairing.crew.next(wait);
+            while let Some(e) = event {
+                came = true;
+                self.pairing.take(e, sink);
+                event = self.pairing.crew.next(Duration::ZERO);
+            }
+            if came || deadline.from_now().is_zero() {
+                let over = self.ended && self.pairing.open() == 0 && !came;
+                return Ok(if came {
+                    Poll::Frame
+                } else if over {
+                    Poll::End
+                } else {
+                    Poll::Idle
+                });
+            }
+        }
+    }
+}
+
+impl Pairing {
+    /// The most pairs that any group of streams still waits for.
+    fn open(&self) -> usize {
+        self.groups.iter().map(|g| g.ledger.open()).max().unwrap_or(0)
+    }
+
+    /// A picture of eye number `eye` is in the memory that was lent for it.
+    fn gathered(&mut self, eye: usize, meta: &FrameMeta, sink: &mut dyn FrameSink) {
+        if eye == 0 && self.have[0].is_some() {
+            // The left picture before never met its partner.
+            self.lose(DropReason::Incomplete, 1, sink);
+        }
+        let place = if eye == 0 { &mut self.raw.left } else { &mut self.raw.right };
+        core::mem::swap(place, &mut self.lent[self.eyes[eye]]);
+        self.have[eye] = Some(*meta);
+        let [Some(left), Some(right)] = self.have else { return };
+        let apart = left.capture_time.since_ns(right.capture_time);
+        if apart < -self.near_ns {
+            self.have[0] = None;
+            self.lose(DropReason::Incomplete, 1, sink);
+        } else if apart > self.near_ns {
+            self.have[1] = None;
+        } else {
+            self.have = [None; 2];
+            self.submit(&left, sink);
+        }
+    }
+
+    fn submit(&mut self, meta: &FrameMeta, sink: &mut dyn FrameSink) {
+        self.ticket += 1;
+        let blank = self.crew.blank();
+        let mut raw = core::mem::replace(&mut self.raw, blank);
+        raw.ticket = self.ticket;
+        for group in &mut self.groups {
+            group.ledger.begin(self.ticket, *meta);
+        }
+        if let Some(old) = self.crew.offer(raw) {
+            for group in &mut self.groups {
+                group.fail(old, DropReason::QueueFull, sink);
+            }
+        }
+    }
+
+    /// Pairs of which the left eye gives nothing.
+    fn lose(&mut self, reason: DropReason, n: u64, sink: &mut dyn FrameSink) {
+        for group in &mut self.groups {
+            let streams = group.streams;
+            group.ledger.lose(reason, n, &mut |step| announce(streams, step, sink));
+        }
+    }
+
+    /// The camera sends no more.
+    fn end(&mut self, sink: &mut dyn FrameSink) {
+        if self.have[0].take().is_some() {
+            self.lose(DropReason::Incomplete, 1, sink);
+        }
+        self.have = [None; 2];
+    }
+
+    fn take(&mut self, event: Event, sink: &mut dyn FrameSink) {
+        match event {
+            Event::Rectified(views) => {
+                if let Some(color) = self.groups.first_mut() {
+                    color.deliver_color(&views, sink);
+                }
+            }
+            Event::Matched(mode, product) => {
+                if let Some(group) = self.groups.get_mut(mode + 1) {
+                    group.deliver_depth(&product, sink);
+                }
+                self.crew.give_back(mode, product);
+            }
+            Event::Skipped(mode, ticket) => {
+                if let Some(group) = self.groups.get_mut(mode + 1) {
+                    group.fail(ticket, DropReason::QueueFull, sink);
+                }
+            }
+            Event::Failed(mode, ticket, why) => {
+                if let Some(group) = self.groups.get_mut(mode + 1) {
+                    group.failures += 1;
+                    if group.failures.is_power_of_two() {
+                        let n = group.failures;
+                        tracing::error!(
+                            camera = self.name,
+                            times = n,
+                            error = why,
+                            "stereo failed at a pair"
+                        );
+                    }
+                    group.fail(ticket, DropReason::DeviceError, sink);
+                }
+            }
+        }
+    }
+}
+
+impl Group {
+    fn fail(&mut self, ticket: u64, reason: DropReason, sink: &mut dyn FrameSink) {
+        let streams = self.streams;
+        self.ledger.fail(ticket, reason, &mut |step| announce(streams, step, sink));
+    }
+
+    fn deliver_color(&mut self, views: &Views, sink: &mut dyn FrameSink) {
+        self.deliver(views.ticket, sink, |_, memory| {
+            if memory.len() != views.left_rgb.len() {
+                return Err(DropReason::WrongSize);
+            }
+            memory.copy_from_slice(&views.left_rgb);
+            Ok(())
+        });
+    }
+
+    fn deliver_depth(&mut self, product: &Product, sink: &mut dyn FrameSink) {
+        let Product { ticket, map, depth } = product;
+        self.deliver(*ticket, sink, |kind, memory| match kind {
+            0 => write(memory, depth, u16::to_le_bytes),
+            1 => write(memory, &map.confidence, |c| [c]),
+            _ => write(memory, &map.disparity, f32::to_le_bytes),
+        });
+    }
+
+    /// Delivers the pair `ticket` on each stream of the group; `fill` writes the picture of the stream of a kind.
+    fn deliver(
+        &mut self,
+        ticket: u64,
+        sink: &mut dyn FrameSink,
+        fill: impl Fn(usize, &mut [u8]) -> Result<(), DropReason>,
+    ) {
+        let streams = self.streams;
+        self.ledger.settle(ticket, &mut |step| {
+            let Step::Done(facts, captured) = step else {
+                announce(streams, step, sink);
+                return;
+            };
+            let meta = FrameMeta { captured, flags: facts.flags.with(FrameFlags::DERIVED), ..facts };
+            for (kind, stream) in streams.into_iter().enumerate() {
+                let Some((stream, bytes)) = stream else { continue };
+                sink.captured(stream, 1);
+                let Some(memory) = sink.loan(stream, bytes) else {
+                    sink.dropped(stream, DropReason::NoSlot, 1);
+                    continue;
+                };
+                if let Err(reason) = fill(kind, memory) {
+                    sink.discard(stream);
+                    sink.dropped(stream, reason, 1);
+                } else {
+                    sink.commit(stream, &meta);
+                }
+            }
+        });
+    }
+}
+
+/// Writes `values` as bytes.
+fn write<T: Copy, const N: usize>(
+    memory: &mut [u8],
+    values: &[T],
+    bytes: impl Fn(T) -> [u8; N],
+) -> Result<(), DropReason> {
+    if memory.len() != values.len() * N {
+        return Err(DropReason::WrongSize);
+    }
+    for (to, v) in memory.chunks_exact_mut(N).zip(values) {
+        to.copy_from_slice(&bytes(*v));
+    }
+    Ok(())
+}
+
+/// Says what is missing from each of `streams`.
+fn announce(streams: Outlets, step: Step<FrameMeta>, sink: &mut dyn FrameSink) {
+    let Step::Lost(reason, n) = step else { return };
+    for (stream, _) in streams.into_iter().flatten() {
+        sink.captured(stream, n);
+        sink.dropped(stream, reason, n);
+    }
+}
+
+/// What the camera's frames go to: on their way, and into pairs.
+struct Tee<'a> {
+    pairing: &'a mut Pairing,
+    sink: &'a mut dyn FrameSink,
+}
+
+impl Tee<'_> {
+    /// Where the camera's stream is delivered.
+    fn own(&self, stream: usize) -> Option<usize> {
+        self.pairing.own.get(stream).copied().flatten()
+    }
+}
+
+impl FrameSink for Tee<'_> {
+    fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]> {
+        let memory = self.pairing.lent.get_mut(stream)?;
+        memory.resize(len, 0);
+        Some(memory)
+    }
+
+    fn commit(&mut self, stream: usize, meta: &FrameMeta) {
+        let own = self.own(stream);
+        let Self { pairing, sink } = self;
+        let Some(picture) = pairing.lent.get(stream) else { return };
+        if let Some(own) = own {
+            // A slot is asked for now and not before the picture came, since the picture is needed either way.
+            if let Some(memory) = sink.loan(own, picture.len()) {
+                memory.copy_from_slice(picture);
+                sink.commit(own, meta);
+            } else {
+                sink.dropped(own, DropReason::NoSlot, 1);
+            }
+        }
+        if let Some(eye) = pairing.eyes.iter().position(|e| *e == stream) {
+            pairing.gathered(eye, meta, *sink);
+        }
+    }
+
+    fn discard(&mut self, _: usize) {}
+
+    fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
+        if let Some(own) = self.own(stream) {
+            self.sink.dropped(own, reason, n);
+        }
+        if stream == self.pairing.eyes[0] {
+            // A left picture that still waits came before these.
+            self.pairing.end(self.sink);
+            self.pairing.lose(reason, n, self.sink);
+        }
+    }
+
+    fn captured(&mut self, stream: usize, n: u64) {
+        if let Some(own) = self.own(stream) {
+            self.sink.captured(own, n);
+        }
+    }
+
+    fn clock_quality(&mut self, stream: usize, quality: &ClockQuality) {
+        if let Some(own) = self.own(stream) {
+            self.sink.clock_quality(own, quality);
+        }
+        if stream == self.pairing.eyes[0] {
+            for (made, _) in self.pairing.groups.iter().flat_map(|g| g.streams).flatten() {
+                self.sink.clock_quality(made, quality);
+            }
+        }
+    }
+}

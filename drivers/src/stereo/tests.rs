@@ -1,0 +1,461 @@
+//! A camera of two eyes that is made by hand, and matchers that are slow, hang and fail.
+
+use super::*;
+use crate::clock::ClockQuality;
+use crate::{DeviceClock, FrameMeta, FrameSink, Gate, MemorySink, Poll, RawFrame};
+use core::time::Duration;
+use depthrig_bus::{ClockDomain, DropReason, FrameFlags, HostTime, MetadataLevel};
+use depthrig_calib::stereo::{Description, DisparityMap, StereoPair};
+use std::sync::Mutex;
+use std::sync::mpsc::{Receiver, Sender, channel};
+
+const W: u32 = 160;
+const H: u32 = 96;
+/// Pixels, metres: 20 pixels of disparity are 1.2 m.
+const FOCAL: f64 = 200.0;
+const BASELINE: f64 = 0.12;
+
+/// What the made camera sends with one poll.
+#[derive(Debug, Clone, Copy)]
+enum Shot {
+    /// Both eyes see a wall at this disparity.
+    Wall(usize),
+    /// Only this eye's picture comes.
+    Only(usize),
+    /// The left picture comes damaged, the right one is whole.
+    LeftDamaged,
+    /// So many pictures of both eyes are skipped.
+    Gap(u64),
+}
+
+struct Made {
+    info: DeviceInfo,
+    profiles: Vec<StreamProfile>,
+    shots: Vec<Shot>,
+    pause: Duration,
+}
+
+impl Made {
+    fn new(format: PixelFormat, shots: &[Shot]) -> Self {
+        let profile = |name: &str, x: f64| StreamProfile {
+            stream: Name::new(name).unwrap(),
+            format,
+            width: W,
+            height: H,
+            rate_hz: 30.0,
+            depth_unit_m: 0.0,
+            intrinsics: Intrinsics::pinhole(FOCAL, FOCAL, 79.5, 47.5),
+            pose_in_device: Pose { translation_m: [x, 0.0, 0.0], ..Pose::IDENTITY },
+            clock: DeviceClock { counter_bits: 64, tick_ps: 1000, domain: ClockDomain::Kernel },
+            sequence_bits: 64,
+            metadata: MetadataLevel::Kernel,
+        };
+        let info = DeviceInfo { backend: "made", model: "Made".into(), ..DeviceInfo::default() };
+        let profiles = vec![profile("left", 0.0), profile("right", BASELINE)];
+        Self { info, profiles, shots: shots.to_vec(), pause: Duration::ZERO }
+    }
+}
+
+impl Device for Made {
+    fn info(&self) -> &DeviceInfo {
+        &self.info
+    }
+
+    fn profiles(&self) -> &[StreamProfile] {
+        &self.profiles
+    }
+
+    fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
+        let profiles = choose_profiles("made", &self.profiles, requests)?;
+        let gates = profiles.iter().enumerate().map(|(i, p)| Gate::new(i, p)).collect();
+        Ok(Box::new(MadeStream { profiles, gates, shots: self.shots, at: 0, sequence: 0, pause: self.pause }))
+    }
+}
+
+struct MadeStream {
+    profiles: Vec<StreamProfile>,
+    gates: Vec<Gate>,
+    shots: Vec<Shot>,
+    at: usize,
+    sequence: u64,
+    pause: Duration,
+}
+
+/// A picture of noise, `shift` pixels to the left.
+fn noise(format: PixelFormat, shift: usize) -> Vec<u8> {
+    let grey = |x: usize, y: usize| (((x * 7919 + y * 104_729) * 2_654_435_761) >> 7) as u8;
+    let pixels = (0..W as usize * H as usize).map(|i| (i % W as usize + shift, i / W as usize));
+    pixels
+        .flat_map(|(x, y)| match format {
+            PixelFormat::Yuyv => vec![grey(x, y), 128],
+            PixelFormat::Rgb8 => vec![grey(x, y); 3],
+            _ => vec![grey(x, y)],
+        })
+        .collect()
+}
+
+impl Stream for MadeStream {
+    fn profiles(&self) -> &[StreamProfile] {
+        &self.profiles
+    }
+
+    fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
+        let Some(shot) = self.shots.get(self.at).copied() else { return Ok(Poll::End) };
+        std::thread::sleep(self.pause.min(timeout));
+        self.at += 1;
+        self.sequence += if let Shot::Gap(n) = shot { n } else { 1 };
+        // Stamps of a camera at 30 Hz, all of them in the past.
+        let ticks = 1_000_000_000 + self.sequence * 33_333_333;
+        for (i, gate) in self.gates.iter_mut().enumerate() {
+            let format = self.profiles[i].format;
+            let picture = match shot {
+                Shot::Gap(_) => continue,
+                Shot::Only(eye) if eye != i => continue,
+                Shot::Wall(d) if i == 1 => noise(format, d),
+                _ => noise(format, 0),
+            };
+            let arrival = HostTime::from_ns(ticks as i64 + 1000);
+            let mut raw = RawFrame::new(self.sequence, ticks, arrival, picture.len());
+            raw.damaged = i == 0 && matches!(shot, Shot::LeftDamaged);
+            raw.exposure_ns = 5000;
+            gate.deliver(&raw, sink, |memory| {
+                memory.copy_from_slice(&picture);
+                Ok(())
+            });
+        }
+        Ok(Poll::Frame)
+    }
+}
+
+/// A sink that holds the accounts of every frame to the rule.
+#[derive(Default)]
+struct Strict(MemorySink);
+
+impl FrameSink for Strict {
+    fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]> {
+        self.0.loan(stream, len)
+    }
+    fn commit(&mut self, stream: usize, meta: &FrameMeta) {
+        let captured = self.0.captured[stream];
+        let decided = self.0.delivered(stream) + 1 + self.0.drops_of(stream).total();
+        assert_eq!(captured, decided, "stream {stream} in the header of a frame");
+        assert_eq!(meta.captured, captured, "stream {stream}");
+        self.0.commit(stream, meta);
+    }
+    fn discard(&mut self, stream: usize) {
+        self.0.discard(stream);
+    }
+    fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
+        self.0.dropped(stream, reason, n);
+    }
+    fn captured(&mut self, stream: usize, n: u64) {
+        self.0.captured(stream, n);
+    }
+    fn clock_quality(&mut self, _: usize, _: &ClockQuality) {}
+}
+
+/// Runs to the end and returns what came, with the delivered profiles.
+fn play(device: Made, options: StereoOptions, requests: &[&str]) -> (MemorySink, Vec<StreamProfile>) {
+    let requests: Vec<_> = requests.iter().map(|r| StreamRequest::any(Name::new(*r).unwrap())).collect();
+    let mut stream = wrap(Box::new(device), options).unwrap().start(&requests).unwrap();
+    let mut sink = Strict::default();
+    let limit = HostTime::now().plus(Duration::from_secs(60));
+    while stream.poll(Duration::from_millis(20), &mut sink).unwrap() != Poll::End {
+        assert!(!limit.from_now().is_zero(), "it does not come to an end");
+    }
+    let profiles = stream.profiles().to_vec();
+    for i in 0..profiles.len() {
+        let of = |list: &[u64]| list.get(i).copied().unwrap_or(0);
+        let decided = sink.0.delivered(i) + sink.0.drops_of(i).total();
+        assert_eq!(of(&sink.0.captured), decided, "{}", profiles[i].stream);
+    }
+    (sink.0, profiles)
+}
+
+fn options(modes: Vec<StereoMode>) -> StereoOptions {
+    StereoOptions { modes, disparity: true, every_pair: true, ..StereoOptions::default() }
+}
+
+fn presets() -> Vec<StereoMode> {
+    Preset::ALL.map(|p| StereoMode::preset(p, 0.5, 1)).into()
+}
+
+/// A matcher that does what it is told to.
+struct Puppet {
+    work: Box<dyn FnMut() -> depthrig_calib::Result<()> + Send>,
+}
+
+impl Matcher for Puppet {
+    fn describe(&self) -> Description {
+        let text = String::new;
+        Description { producer: text(), name: text(), parameters: text(), memory_bytes: 0 }
+    }
+
+    fn run(&mut self, pair: &StereoPair<'_>, out: &mut DisparityMap) -> depthrig_calib::Result<()> {
+        (self.work)()?;
+        out.resize(pair.left.width, pair.left.height);
+        out.disparity.fill(20.0);
+        out.confidence.fill(200);
+        Ok(())
+    }
+}
+
+fn puppet<W: FnMut() -> depthrig_calib::Result<()> + Send + 'static>(
+    name: &str,
+    make: impl Fn() -> W + Send + Sync + 'static,
+) -> StereoMode {
+    let make = move |_: &Geometry| -> depthrig_calib::Result<Box<dyn Matcher>> {
+        Ok(Box::new(Puppet { work: Box::new(make()) }))
+    };
+    StereoMode { name: name.to_owned(), wants_color: false, make: Arc::new(make) }
+}
+
+fn index(profiles: &[StreamProfile], name: &str) -> usize {
+    profiles.iter().position(|p| p.stream.as_str() == name).unwrap_or_else(|| panic!("no {name}"))
+}
+
+#[test]
+fn a_wall_has_its_depth_in_every_preset_and_format() {
+    for format in [PixelFormat::Yuyv, PixelFormat::Rgb8, PixelFormat::Mono8] {
+        let shots = [Shot::Wall(20), Shot::Wall(24), Shot::Wall(16)];
+        let (sink, profiles) = play(Made::new(format, &shots), options(presets()), &[]);
+        let expected = if format == PixelFormat::Mono8 { 11 } else { 12 };
+        assert_eq!(profiles.len(), expected, "{format:?}: two eyes, colour, three times three");
+        for mode in ["performance", "quality", "ultra"] {
+            let i = index(&profiles, &format!("depth_{mode}"));
+            assert_eq!((profiles[i].format, profiles[i].depth_unit_m), (PixelFormat::Z16, 0.001));
+            assert!((profiles[i].intrinsics.fx - FOCAL).abs() < 1e-6, "nothing is bent, so nothing changes");
+            let walls: Vec<_> = sink.frames.iter().filter(|f| f.0 == i).collect();
+            assert_eq!(walls.len(), 3);
+            for ((_, meta, pixels), d) in walls.iter().zip([20.0, 24.0, 16.0]) {
+                let mut depth: Vec<_> = pixels.chunks(2).map(|z| u16::from_le_bytes([z[0], z[1]])).collect();
+                depth.retain(|z| *z > 0);
+                let seen = depth.len() as f64 / f64::from(W * H);
+                depth.sort_unstable();
+                let (middle, want) = (f64::from(depth[depth.len() / 2]), FOCAL * BASELINE / d * 1000.0);
+                assert!(seen > 0.6, "{mode}: {seen} of the wall is seen");
+                assert!(
+                    (middle - want).abs() < 0.02 * want,
+                    "{format:?} {mode}: {middle} mm is not {want} mm"
+                );
+                assert!(meta.flags.has(FrameFlags::DERIVED) && meta.exposure_ns == 5000);
+            }
+            let (c, d) = (
+                index(&profiles, &format!("confidence_{mode}")),
+                index(&profiles, &format!("disparity_{mode}")),
+            );
+            let of = |i: usize| sink.frames.iter().find(|f| f.0 == i).map(|f| &f.2).unwrap();
+            for ((z, c), d) in walls[0].2.chunks(2).zip(of(c)).zip(of(d).chunks(4)) {
+                let d = f32::from_le_bytes(d.try_into().unwrap());
+                assert!((z != [0, 0]) == (*c > 0), "confidence is that of depth");
+                assert!(z == [0, 0] || d > 0.0);
+            }
+        }
+        // Each frame has the time and the number of its pair.
+        let pairs: Vec<_> = sink.frames.iter().filter(|f| f.0 == 0).map(|f| f.1).collect();
+        for i in 2..profiles.len() {
+            let times =
+                sink.frames.iter().filter(|f| f.0 == i).map(|f| (f.1.capture_time, f.1.device_sequence));
+            assert!(times.eq(pairs.iter().map(|m| (m.capture_time, m.device_sequence))));
+        }
+        if format != PixelFormat::Mono8 {
+            let color = index(&profiles, "color");
+            let first = &sink.frames.iter().find(|f| f.0 == color).unwrap().2;
+            assert_eq!(first.len(), (W * H * 3) as usize);
+            let raw = noise(PixelFormat::Rgb8, 0);
+            if format == PixelFormat::Rgb8 {
+                assert_eq!(*first, raw, "nothing is bent, so nothing changes");
+            }
+        }
+    }
+}
+
+#[test]
+fn only_what_is_asked_for_comes_and_the_eyes_are_read_all_the_same() {
+    let made = Made::new(PixelFormat::Yuyv, &[Shot::Wall(20); 2]);
+    let (sink, profiles) = play(made, options(presets()), &["depth_quality", "left"]);
+    let names: Vec<_> = profiles.iter().map(|p| p.stream.as_str()).collect();
+    assert_eq!(names, ["depth_quality", "left"], "in the order in which they were asked for");
+    assert_eq!((sink.delivered(0), sink.delivered(1), sink.frames.len()), (2, 2, 4));
+}
+
+/// A mode whose matcher waits until the sender is dropped.
+fn waits(name: &str) -> (StereoMode, Sender<()>) {
+    let (release, gate): (Sender<()>, Receiver<()>) = channel();
+    let gate = Arc::new(Mutex::new(gate));
+    let mode = puppet(name, move || {
+        let gate = Arc::clone(&gate);
+        move || {
+            let _ = gate.lock().unwrap().recv();
+            Ok(())
+        }
+    });
+    (mode, release)
+}
+
+#[test]
+fn a_slow_mode_skips_pairs_counts_them_and_holds_up_nobody() {
+    let (slow, release) = waits("slow");
+    let mut made = Made::new(PixelFormat::Yuyv, &[Shot::Wall(3); 60]);
+    made.pause = Duration::from_millis(2);
+    let options = StereoOptions { every_pair: false, ..options(vec![slow, puppet("quick", || || Ok(()))]) };
+    let mut stream = wrap(Box::new(made), options).unwrap().start(&[]).unwrap();
+    let profiles = stream.profiles().to_vec();
+    let i = |name| index(&profiles, name);
+    let mut sink = Strict::default();
+    // Until the quick mode has had its last pair; the slow one is still at its first.
+    let limit = HostTime::now().plus(Duration::from_secs(60));
+    while sink.0.captured.get(i("depth_quick")).is_none_or(|n| *n < 60) {
+        let _ = stream.poll(Duration::from_millis(5), &mut sink).unwrap();
+        assert!(!limit.from_now().is_zero());
+    }
+    assert_eq!(sink.0.delivered(i("left")), 60, "capture goes on");
+    assert_eq!(sink.0.delivered(i("depth_slow")), 0);
+    let quick = sink.0.delivered(i("depth_quick"));
+    drop(release);
+    while stream.poll(Duration::from_millis(5), &mut sink).unwrap() != Poll::End {}
+    let sink = sink.0;
+    // The first that came through, and the newest that waited for it.
+    assert_eq!(sink.delivered(i("depth_slow")), if quick > 1 { 2 } else { 1 }, "of {quick}");
+    let skipped = sink.drops_of(i("depth_slow"));
+    assert_eq!(skipped.total(), skipped.get(DropReason::QueueFull));
+    for name in ["color", "depth_slow", "confidence_slow", "disparity_quick"] {
+        assert_eq!(sink.captured[i(name)], 60, "{name} counts every pair");
+    }
+}
+
+#[test]
+fn with_every_pair_nothing_gives_way() {
+    let slow = puppet("slow", || {
+        || {
+            std::thread::sleep(Duration::from_millis(5));
+            Ok(())
+        }
+    });
+    let (sink, profiles) = play(
+        Made::new(PixelFormat::Yuyv, &[Shot::Wall(3); 30]),
+        options(vec![slow, puppet("quick", || || Ok(()))]),
+        &[],
+    );
+    for i in 0..profiles.len() {
+        assert_eq!((sink.delivered(i), sink.drops_of(i).total()), (30, 0), "{}", profiles[i].stream);
+    }
+}
+
+#[test]
+fn pairs_that_lack_an_eye_are_counted() {
+    let shots = [
+        Shot::Wall(3),
+        Shot::Only(0),
+        Shot::Wall(3),
+        Shot::Only(1),
+        Shot::LeftDamaged,
+        Shot::Wall(3),
+        Shot::Gap(4),
+        Shot::Wall(3),
+        Shot::Only(0),
+    ];
+    let (sink, profiles) =
+        play(Made::new(PixelFormat::Yuyv, &shots), options(vec![puppet("quick", || || Ok(()))]), &[]);
+    let (left, depth) = (index(&profiles, "left"), index(&profiles, "depth_quick"));
+    assert_eq!(sink.delivered(depth), 4);
+    let drops = sink.drops_of(depth);
+    assert_eq!(drops.get(DropReason::Incomplete), 2, "the two that have no right picture");
+    assert_eq!(drops.get(DropReason::DeviceError), 1);
+    assert_eq!(drops.get(DropReason::DeviceGap), 5, "four, and the one of which only the right picture came");
+    assert_eq!(sink.captured[depth], sink.captured[left], "one for every left picture");
+}
+
+#[test]
+fn a_mode_that_fails_loses_its_frames_alone() {
+    let flaky = puppet("flaky", || {
+        let mut n = 0;
+        move || {
+            n += 1;
+            if n % 3 == 0 {
+                let e = depthrig_calib::ErrorKind::BadInput;
+                return Err(depthrig_calib::Error::new(e, "it does not want to"));
+            }
+            Ok(())
+        }
+    });
+    let (sink, profiles) = play(
+        Made::new(PixelFormat::Yuyv, &[Shot::Wall(3); 9]),
+        options(vec![flaky, puppet("quick", || || Ok(()))]),
+        &[],
+    );
+    let i = |name| index(&profiles, name);
+    assert_eq!(sink.delivered(i("depth_flaky")), 6);
+    assert_eq!(sink.drops_of(i("depth_flaky")).get(DropReason::DeviceError), 3);
+    assert_eq!(sink.delivered(i("depth_quick")), 9);
+}
+
+/// A matcher that does not come back stops its own streams, neither capture nor the end of the camera.
+#[test]
+fn a_mode_that_hangs_is_left_behind() {
+    let (hangs, release) = waits("hangs");
+    let made = Made::new(PixelFormat::Yuyv, &[Shot::Wall(3); 40]);
+    let options = StereoOptions { every_pair: false, ..options(vec![hangs]) };
+    let mut stream = wrap(Box::new(made), options).unwrap().start(&[]).unwrap();
+    let mut sink = Strict::default();
+    let limit = HostTime::now().plus(Duration::from_secs(60));
+    while sink.0.delivered(0) < 40 || sink.0.delivered(2) < 1 {
+        let _ = stream.poll(Duration::from_millis(2), &mut sink).unwrap();
+        assert!(!limit.from_now().is_zero());
+    }
+    let i = |name| index(stream.profiles(), name);
+    assert_eq!((i("left"), i("color")), (0, 2), "colour is made without it");
+    let depth = i("depth_hangs");
+    assert_eq!(sink.0.delivered(depth), 0);
+    assert!(sink.0.captured.get(depth).copied().unwrap_or(0) < 40, "what came after it is not decided");
+    drop(stream);
+    drop(release);
+}
+
+#[test]
+fn what_cannot_be_is_said() {
+    let refused = |device: Made, options: StereoOptions| match wrap(Box::new(device), options) {
+        Err(e) => e.to_string(),
+        Ok(d) => d.start(&[]).err().map(|e| e.to_string()).unwrap_or_default(),
+    };
+    let made = || Made::new(PixelFormat::Yuyv, &[]);
+    let said = |text: String, wanted: &str| assert!(text.contains(wanted), "{text}");
+    let mut uncalibrated = made();
+    uncalibrated.profiles.iter_mut().for_each(|p| p.intrinsics = Intrinsics::default());
+    said(refused(uncalibrated, options(presets())), "no calibration of its eyes at 160x96");
+    let mut swapped = made();
+    swapped.profiles[1].pose_in_device.translation_m[0] = -BASELINE;
+    said(refused(swapped, options(presets())), "left and right are swapped");
+    let mut one_eyed = made();
+    one_eyed.profiles.truncate(1);
+    said(refused(one_eyed, options(presets())), "no streams \"left\" and \"right\"");
+    let mut odd = made();
+    odd.profiles.iter_mut().for_each(|p| p.width = 161);
+    said(refused(odd, options(presets())), "161 is odd");
+    let mut colored = made();
+    let color = StreamProfile { stream: Name::new("color").unwrap(), ..colored.profiles[0].clone() };
+    colored.profiles.push(color);
+    said(refused(colored, options(presets())), "has a stream \"color\" itself");
+    said(refused(Made::new(PixelFormat::Nv12, &[]), options(presets())), "its eyes come as nv12");
+    let quick = || puppet("quick", || || Ok(()));
+    said(refused(made(), options(vec![quick(), quick()])), "\"quick\" is listed twice");
+    said(refused(made(), options(vec![puppet("No!", || || Ok(()))])), "cannot be called \"No!\"");
+    said(
+        refused(made(), StereoOptions { range_m: (2.0, 1.0), ..options(presets()) }),
+        "cannot see from 2 m to 1 m",
+    );
+    let broken = StereoMode {
+        make: Arc::new(|_| {
+            Err(depthrig_calib::Error::new(depthrig_calib::ErrorKind::BadInput, "no such file"))
+        }),
+        ..quick()
+    };
+    said(refused(made(), options(vec![broken])), "\"quick\" cannot be made: no such file");
+}
+
+#[test]
+fn near_things_need_more_disparities() {
+    let g = Geometry { width: 1280, height: 720, focal_px: 540.0, baseline_m: 0.12 };
+    assert_eq!(g.disparities(0.5), 144, "129.6 pixels at half a metre");
+    assert_eq!((g.disparities(20.0), g.disparities(0.01)), (16, 256));
+}
