@@ -36,7 +36,7 @@ pub struct Attached {
 /// One camera.
 #[derive(Debug, Clone, Serialize)]
 pub struct AttachedCamera {
-    /// The driver that it is for: `realsense`, `zed`, `v4l2`, `external`.
+    /// The driver that it is for: `realsense`, `zed`, `kinect`, `v4l2`, `external`.
     pub backend: &'static str,
     /// Model, else what the device calls itself.
     pub model: String,
@@ -233,7 +233,7 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
     let mut found = AttachedCamera {
         backend: c.family.backend(),
         model: c.model,
-        serial: None,
+        serial: c.serial,
         firmware: None,
         calibration: None,
         port: c.port,
@@ -247,7 +247,7 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
         kernel_metadata: metadata,
         nodes,
         modes: Vec::new(),
-        problems: c.usb.as_ref().and_then(health::slow_link).into_iter().collect(),
+        problems: c.usb.as_ref().and_then(health::slow_link).into_iter().chain(c.problem).collect(),
         usb: c.usb,
         family: c.family,
         profiles: Vec::new(),
@@ -257,7 +257,7 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
         Some((_, camera)) => {
             found.state = UseState::InUse;
             let said = |text: &str| (!text.is_empty()).then(|| text.to_owned());
-            found.serial = said(&camera.serial);
+            found.serial = said(&camera.serial).or(found.serial);
             found.firmware = said(&camera.firmware);
             found.calibration = said(&camera.calibration);
             if !camera.model.is_empty() {
@@ -279,7 +279,7 @@ fn ask_device(found: &mut AttachedCamera, ask: &dyn Ask) {
                 found.model = model;
             }
             let said = |text: String| (!text.is_empty()).then_some(text);
-            (found.serial, found.firmware) = (said(serial), said(firmware));
+            (found.serial, found.firmware) = (said(serial).or(found.serial.take()), said(firmware));
             found.calibration = said(calibration);
             found.modes = profiles.iter().map(ModeReport::from).collect();
             found.profiles = profiles;

@@ -447,6 +447,7 @@ fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, de
     use depthrig_drivers::{
         external::{ExternalBackend, Place},
         files::FilesBackend,
+        kinect::{KinectConfig, live::LiveBackend},
         realsense::RealsenseBackend,
         realsense::l515::L515Backend,
         synthetic::SyntheticBackend,
@@ -468,6 +469,7 @@ fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, de
             let place = Place { runtime, rig, camera: camera.config.name.clone() };
             Box::new(ExternalBackend::new(c.clone(), place))
         }
+        BackendConfig::Kinect(KinectConfig::Live(c)) => Box::new(LiveBackend::new(c.clone())),
     })
 }
 

@@ -8,6 +8,7 @@ mod camera;
 mod controls;
 mod error;
 mod external;
+mod kinect;
 mod l515;
 mod read;
 mod realsense;
@@ -22,6 +23,7 @@ mod zed;
 pub use depthrig_cdm::Precision;
 pub use depthrig_drivers::external::ExternalConfig as ExternalSettings;
 pub use depthrig_drivers::files::FilesConfig as FilesSettings;
+pub use depthrig_drivers::kinect::KinectConfig as KinectSettings;
 pub use depthrig_drivers::realsense::RealsenseConfig as RealsenseSettings;
 pub use depthrig_drivers::realsense::l515::L515Config as L515Settings;
 pub use depthrig_drivers::synthetic::SyntheticConfig as SyntheticSettings;
@@ -282,6 +284,8 @@ pub enum BackendConfig {
     Zed(ZedSettings),
     /// A camera that another process serves.
     External(ExternalSettings),
+    /// An Azure Kinect.
+    Kinect(KinectSettings),
 }
 
 impl BackendConfig {
@@ -295,6 +299,7 @@ impl BackendConfig {
             Self::V4l2(_) => "v4l2",
             Self::Zed(_) => "zed",
             Self::External(_) => depthrig_drivers::external::NAME,
+            Self::Kinect(_) => depthrig_drivers::kinect::NAME,
         }
     }
 }

@@ -10,6 +10,7 @@ mod disk;
 mod external;
 mod finding;
 mod host;
+mod kinect;
 mod memory;
 mod refine;
 #[cfg(test)]
@@ -21,6 +22,7 @@ pub use clock::ClockSync;
 pub use disk::{DiskFacts, DiskPlan};
 pub use finding::{Finding, Severity};
 pub use host::Host;
+pub use kinect::{KinectFacts, Missing};
 
 use crate::attached::{Ask, Attached, look};
 use crate::config::RigConfig;
@@ -90,6 +92,7 @@ fn judge(config: &RigConfig, attached: &Attached, plans: Vec<cameras::Planned>, 
     let shm_needed_bytes = memory::check(config, &plans, host, &mut findings);
     host.check(config, &mut findings);
     refine::check(config, &plans, &mut findings);
+    host.kinect.check(config, &mut findings);
     findings.sort_by_key(|f| (core::cmp::Reverse(f.severity), f.camera.is_some()));
     for p in &mut plans {
         p.worst = findings.iter().filter(|f| f.camera.as_deref() == Some(&*p.name)).map(|f| f.severity).max();

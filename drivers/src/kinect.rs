@@ -16,3 +16,11 @@ pub use recording::Recording;
 
 /// The name of the back end, of a camera that is attached and of one that was recorded.
 pub const NAME: &str = "kinect";
+
+/// Which Kinect a rig means.
+#[derive(Debug, Clone, PartialEq)]
+#[allow(clippy::large_enum_variant)] // one per camera of a rig
+pub enum KinectConfig {
+    /// One that is attached.
+    Live(live::LiveConfig),
+}

@@ -2,9 +2,11 @@
 
 use super::Family;
 use crate::client::Client;
+use crate::config::{BackendConfig, KinectSettings, RigConfig};
 use crate::status::RigStatus;
 use depthrig_bus::RuntimeDir;
 use depthrig_drivers::external::{self, ExternalBackend, ExternalConfig, Place};
+use depthrig_drivers::kinect::live::{LiveBackend, LiveConfig, Places};
 use depthrig_drivers::realsense::l515::{L515Backend, L515Config};
 use depthrig_drivers::realsense::{RealsenseBackend, RealsenseConfig};
 use depthrig_drivers::v4l2::{Node, V4l2Backend, V4l2Config};
@@ -62,6 +64,19 @@ pub trait Ask {
 pub struct System {
     /// Where the rigs of this user are; `None`: none are asked.
     pub runtime: Option<RuntimeDir>,
+    /// Where Microsoft's libraries are, which an Azure Kinect is asked through.
+    pub kinect: Places,
+}
+
+impl System {
+    /// The system for a rig: libraries are those that its first Kinect names.
+    pub fn of_rig(config: &RigConfig, runtime: Option<RuntimeDir>) -> Self {
+        let named = config.cameras.iter().find_map(|c| match &c.backend {
+            BackendConfig::Kinect(KinectSettings::Live(live)) => Some(live.places.clone()),
+            _ => None,
+        });
+        Self { runtime, kinect: named.unwrap_or_default() }
+    }
 }
 
 impl Ask for System {
@@ -88,6 +103,10 @@ impl Ask for System {
                     allow_uncalibrated: true,
                     ..RealsenseConfig::default()
                 }))
+            }
+            Family::Kinect => {
+                let places = self.kinect.clone();
+                Box::new(LiveBackend::new(LiveConfig { port, places, ..LiveConfig::default() }))
             }
             Family::Zed => Box::new(ZedBackend::new(ZedConfig { port, ..ZedConfig::default() })),
             Family::Uvc | Family::Platform => {

@@ -1,6 +1,7 @@
 //! Which devices are cameras, and of which family.
 
 use super::{UsbDevice, VideoNode};
+use depthrig_drivers::kinect::live::find as kinect;
 use depthrig_drivers::realsense::models as d400;
 use std::path::PathBuf;
 
@@ -22,6 +23,8 @@ pub enum Family {
     L515,
     /// ZED 2i.
     Zed,
+    /// Azure Kinect.
+    Kinect,
     /// Any other USB video camera.
     Uvc,
     /// A video device that is on no USB.
@@ -37,6 +40,7 @@ impl Family {
             Self::D400 => "realsense",
             Self::L515 => "l515",
             Self::Zed => "zed",
+            Self::Kinect => depthrig_drivers::kinect::NAME,
             Self::Uvc | Self::Platform => "v4l2",
             Self::External => depthrig_drivers::external::NAME,
         }
@@ -51,6 +55,10 @@ pub(super) struct Candidate {
     pub(super) usb: Option<UsbDevice>,
     pub(super) nodes: Vec<VideoNode>,
     pub(super) hidraw: Vec<PathBuf>,
+    /// The serial number as rig files have it, where the bus already tells it.
+    pub(super) serial: Option<String>,
+    /// What is wrong with how it is attached.
+    pub(super) problem: Option<String>,
 }
 
 /// The cameras among `devices` and `platform` nodes, each with where it is, and what is attached and of no use.
@@ -60,7 +68,16 @@ pub(super) fn cameras(
 ) -> (Vec<Candidate>, Vec<String>) {
     let mut cameras = Vec::new();
     let mut unusable = Vec::new();
+    let kinects = kinect::cameras(devices);
     for d in devices {
+        // The halves of a Kinect are one camera, which goes by its depth half.
+        if let Some(found) = kinects.iter().find(|k| k.depth == *d) {
+            cameras.push(kinect_camera(found));
+            continue;
+        }
+        if kinects.iter().any(|k| k.color.as_ref() == Some(d)) {
+            continue;
+        }
         match family(d) {
             Ok(Some((family, model))) => cameras.push(Candidate {
                 family,
@@ -69,6 +86,8 @@ pub(super) fn cameras(
                 nodes: d.video_nodes().cloned().collect(),
                 hidraw: hidraw(d, devices),
                 usb: Some(d.clone()),
+                serial: None,
+                problem: None,
             }),
             Ok(None) => {}
             Err(why) => unusable.push(format!("{}: {why}", d.describe())),
@@ -84,10 +103,30 @@ pub(super) fn cameras(
                 usb: None,
                 nodes: vec![node],
                 hidraw: Vec::new(),
+                serial: None,
+                problem: None,
             }),
         }
     }
     (cameras, unusable)
+}
+
+fn kinect_camera(found: &kinect::Found) -> Candidate {
+    let color = found.color.as_ref();
+    Candidate {
+        family: Family::Kinect,
+        model: kinect::MODEL.to_owned(),
+        port: found.depth.port.clone(),
+        nodes: color.into_iter().flat_map(|d| d.video_nodes().cloned()).collect(),
+        hidraw: Vec::new(),
+        usb: Some(found.depth.clone()),
+        serial: found.serial().map(str::to_owned),
+        problem: color.is_none().then(|| {
+            "its colour camera is not on the bus, without which libk4a does not open it: plug it in again, with its power \
+             supply"
+                .to_owned()
+        }),
+    }
 }
 
 /// The family of a device with its model; `None` when it is no camera, an error when it is one of no use.
@@ -105,6 +144,11 @@ fn family(d: &UsbDevice) -> Result<Option<(Family, String)>, &'static str> {
         if let Some(why) = d400::undriven(d.product_id) {
             return Err(why);
         }
+    }
+    if (d.vendor_id, d.product_id) == (kinect::VENDOR, kinect::COLOR) {
+        return Err(
+            "it is an Azure Kinect whose depth camera is not on the bus: plug it in again, with its power supply",
+        );
     }
     if (d.vendor_id, d.product_id) == (STEREOLABS, ZED_2I.0) {
         return Ok(Some((Family::Zed, "ZED 2i".to_owned())));

@@ -281,3 +281,55 @@ fn a_busy_node_counts_when_its_holder_cannot_be_seen() {
     assert_eq!(found.cameras[0].state, UseState::InUse);
     assert!(found.cameras[0].held_words().contains("another user"));
 }
+
+/// A half of a Kinect.
+pub(crate) fn kinect_half(port: &str, product: u16, serial: &'static str, node: u32) -> MadeDevice {
+    let interfaces = match product {
+        0x097d => vec![(0, 0x0e, 1, "uvcvideo", vec![node, node + 1], vec![])],
+        _ => vec![(0, 0xff, 0, "", vec![], vec![])],
+    };
+    MadeDevice {
+        id: (0x045e, product),
+        strings: ["Microsoft Corp.", "Azure Kinect", serial],
+        interfaces,
+        ..MadeDevice::new(port, 0)
+    }
+}
+
+#[test]
+fn the_halves_of_a_kinect_are_one_camera() {
+    let halves = [
+        kinect_half("2-1.1", 0x097c, "000123456789", 0),
+        kinect_half("2-1.2", 0x097d, "000123456789", 10),
+        kinect_half("2-2.1", 0x097c, "", 0),
+        kinect_half("2-3.2", 0x097d, "000987654321", 20),
+    ];
+    // Without libk4a none can be asked, and what the bus tells is all there is.
+    let failing = ["2-1.1", "2-2.1"].map(|p| (p.to_owned(), ErrorKind::BadInput)).into();
+    let found = look_at(&halves[..3], &Made { failing, ..Made::default() }, |_| {});
+    let told: Vec<_> = found
+        .cameras
+        .iter()
+        .map(|c| (c.backend, c.model.as_str(), c.port.as_str(), c.serial.as_deref(), c.state))
+        .collect();
+    let expected = [
+        ("kinect", "Azure Kinect", "2-1.1", Some("000123456789"), UseState::Failed),
+        ("kinect", "Azure Kinect", "2-2.1", None, UseState::Failed),
+    ];
+    assert_eq!(told, expected);
+    assert!(found.cameras[0].nodes.iter().any(|n| n.path.ends_with("video10")), "{found:?}");
+    assert!(found.cameras[1].problems[0].contains("colour camera is not on the bus"), "{found:?}");
+    let found = look_at(&halves[3..], &Made::default(), |_| {});
+    assert!(
+        found.cameras.is_empty() && found.unusable[0].contains("depth camera is not on the bus"),
+        "{found:?}"
+    );
+    // Asked, it is called what it says; and a Kinect on USB2 is told.
+    let slow = MadeDevice { speed: 480, version: " 2.00", ..halves[0].clone() };
+    let found = look_at(&[slow, halves[1].clone()], &Made::default(), |_| {});
+    assert_eq!(
+        (found.cameras[0].serial.as_deref(), found.cameras[0].state),
+        (Some("sn2-1.1"), UseState::Free)
+    );
+    assert!(found.cameras[0].problems[0].contains("runs it as USB2"), "{found:?}");
+}

@@ -3,7 +3,8 @@
 use super::read::{Found, Section};
 use super::rig::{not_empty, rate, resolve};
 use super::{
-    BackendConfig, CameraConfig, FilesSettings, external, l515, realsense, refine, synthetic, v4l2, zed,
+    BackendConfig, CameraConfig, FilesSettings, external, kinect, l515, realsense, refine, synthetic, v4l2,
+    zed,
 };
 use depthrig_bus::{CameraName, Name, PixelFormat, Pose, StreamName};
 use depthrig_drivers::StreamRequest;
@@ -18,6 +19,7 @@ enum Driver {
     V4l2,
     Zed,
     External,
+    Kinect,
 }
 
 /// Reads one camera; `None` after a problem without which there is no camera. `taken` are the names so far.
@@ -41,6 +43,7 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         ("v4l2", Driver::V4l2),
         ("zed", Driver::Zed),
         ("external", Driver::External),
+        ("kinect", Driver::Kinect),
     ];
     if !s.has("backend") {
         s.required::<String>("backend", "\"synthetic\"");
@@ -62,6 +65,7 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         Some(Driver::V4l2) => Some(BackendConfig::V4l2(v4l2::read(&s))),
         Some(Driver::Zed) => Some(BackendConfig::Zed(zed::read(&s, base, &wanted))),
         Some(Driver::External) => Some(BackendConfig::External(external::read(&s, base))),
+        Some(Driver::Kinect) => Some(BackendConfig::Kinect(kinect::read(&s, base, &wanted))),
         // Which keys belong to an unknown driver is unknown too.
         None => return None,
     };
@@ -83,7 +87,8 @@ pub(super) fn fastest_rate_hz(camera: &CameraConfig) -> Option<f64> {
         | BackendConfig::L515(_)
         | BackendConfig::V4l2(_)
         | BackendConfig::Zed(_)
-        | BackendConfig::External(_) => fastest_given_rate(&camera.streams),
+        | BackendConfig::External(_)
+        | BackendConfig::Kinect(_) => fastest_given_rate(&camera.streams),
         BackendConfig::Synthetic(config) => synthetic::fastest_rate_hz(config, &camera.streams).ok(),
     }
 }

@@ -288,6 +288,54 @@ fn a_zed_is_set_as_the_file_says() {
 }
 
 #[test]
+fn an_attached_kinect_is_set_as_the_file_says() {
+    let rig = parse(
+        r#"
+        rig = "r"
+        [[camera]]
+        name = "a"
+        backend = "kinect"
+        serial = "000123456789"
+        port = "2-1.1"
+        library = "k4a"
+        depth_engine = "/opt/k4a"
+        depth_mode = "wfov_2x2binned"
+        sync = "subordinate"
+        subordinate_delay_us = 160
+        depth_delay_us = -80
+        color_controls = { exposure_us = 8330, white_balance_k = "auto" }
+        led = false
+        [[camera.stream]]
+        name = "ir"
+        [[camera.stream]]
+        name = "color"
+        format = "mjpeg"
+        [[camera]]
+        name = "b"
+        backend = "kinect"
+        "#,
+    )
+    .unwrap();
+    use depthrig_drivers::kinect::live::{LiveConfig, Places};
+    use depthrig_drivers::kinect::{DepthMode, WiredSync};
+    use depthrig_drivers::v4l2::ControlValue::{Integer, Item};
+    let controls = [("exposure_us", Integer(8330)), ("white_balance_k", Item("auto".into()))];
+    let wanted = LiveConfig {
+        serial: Some("000123456789".into()),
+        port: Some("2-1.1".into()),
+        places: Places { library: Some("/rigs/k4a".into()), engine: Some("/opt/k4a".into()) },
+        depth_mode: Some(DepthMode::Wfov2x2Binned),
+        sync: WiredSync::Subordinate,
+        subordinate_delay_us: 160,
+        depth_delay_us: -80,
+        color_controls: controls.map(|(n, v)| (n.to_owned(), v)).into(),
+        dark: true,
+    };
+    assert_eq!(rig.cameras[0].backend, BackendConfig::Kinect(KinectSettings::Live(wanted)));
+    assert_eq!(rig.cameras[1].backend, BackendConfig::Kinect(KinectSettings::Live(LiveConfig::default())));
+}
+
+#[test]
 fn angles_turn_about_x_then_y_then_z() {
     let pose = |rpy: &str| {
         let text = format!(
@@ -367,6 +415,12 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (second("name = \"b\"\nbackend = \"zed\"\ncalibration = \"\""), "8:15: \"calibration\" in [[camera]] \"b\" is empty"),
         (second("name = \"b\"\nbackend = \"zed\"\nstream = [{ name = \"depth\" }]"), "8:11: a ZED has no stream \"depth\"; it has: left, right"),
         (second("name = \"b\"\nbackend = \"zed\"\nmodel = \"zed2i\""), "only another backend has it"),
+        (second("name = \"b\"\nbackend = \"kinect\"\ndepth_mode = \"wfov\""), "cannot be \"wfov\"; did you mean \"wfov_"),
+        (second("name = \"b\"\nbackend = \"kinect\"\nsubordinate_delay_us = 160"), "only sync = \"subordinate\" has it"),
+        (second("name = \"b\"\nbackend = \"kinect\"\ncolor_controls = { exposure = 5 }"), "has \"exposure\", which a Kinect has not; it has: exposure_us, "),
+        (second("name = \"b\"\nbackend = \"kinect\"\nstream = [{ name = \"left\" }]"), "8:11: a Kinect has no stream \"left\"; it has: color, depth, ir"),
+        (second("name = \"b\"\nbackend = \"kinect\"\nstream = [{ name = \"ir\" }]\ncolor_controls = { gain = 5 }"), "color is not among the streams"),
+        (second("name = \"b\"\nbackend = \"kinect\"\ndepth_mode = \"passive_ir\"\nstream = [{ name = \"depth\" }]"), "gives no depth"),
         (top("sets.rate_hz = 31"), "1:16: \"rate_hz\" in [sets] is 31 sets a second, but the fastest camera gives 30 frames a second"),
         (top("sets.rate_hz = 0.0"), "1:16: \"rate_hz\" in [sets] is 0; it must be above 0"),
         (top("control.tcp = \"0.0.0.0:80\""), "1:15: \"tcp\" in [control] must be a loopback address such as 127.0.0.1:80, not 0.0.0.0:80: the API has no password"),

@@ -5,6 +5,7 @@ use super::finding::{Finding, Severity};
 use crate::attached::{Attached, AttachedCamera, Family, ModeReport, UseState};
 use crate::config::{BackendConfig, CameraConfig, RigConfig};
 use depthrig_drivers::files::FilesBackend;
+use depthrig_drivers::kinect::{self, KinectConfig};
 use depthrig_drivers::realsense::config::TransportChoice;
 use depthrig_drivers::usb::health::{self, RULE_CURE};
 use depthrig_drivers::{Backend, Result, StreamProfile, choose_profiles, synthetic};
@@ -79,6 +80,13 @@ fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
         BackendConfig::Zed(c) => Some(Wanted {
             serial: c.serial.as_deref(),
             port: c.port.as_deref(),
+            libusb: false,
+            needs_calibration: false,
+        }),
+        BackendConfig::Kinect(KinectConfig::Live(c)) => Some(Wanted {
+            serial: c.serial.as_deref(),
+            port: c.port.as_deref(),
+            // Its transfers count against the same limit of the kernel; how large they are, libk4a decides.
             libusb: false,
             needs_calibration: false,
         }),
@@ -169,7 +177,8 @@ fn plan_made(camera: &CameraConfig) -> Planned {
             | BackendConfig::L515(_)
             | BackendConfig::V4l2(_)
             | BackendConfig::Zed(_)
-            | BackendConfig::External(_) => (camera.backend.name().to_owned(), Vec::new()),
+            | BackendConfig::External(_)
+            | BackendConfig::Kinect(KinectConfig::Live(_)) => (camera.backend.name().to_owned(), Vec::new()),
         })
     };
     let chosen = profiles().and_then(|(device, all)| {
@@ -214,9 +223,15 @@ pub(super) fn set_streams(
         let recorded = camera.records(&p.stream);
         (p, recorded)
     });
-    for (p, recorded) in captured.collect::<Vec<_>>().into_iter().chain(made) {
+    let captured: Vec<_> = captured.collect();
+    let with_depth = captured.iter().any(|(p, _)| p.stream.as_str() == "depth");
+    for (p, recorded) in captured.into_iter().chain(made) {
         let on_usb = on_usb && !crate::stage::is_derived(&p.stream);
-        let usb_mbit_s = if on_usb { super::wire_bits_per_s(&p) / 1e6 } else { 0.0 };
+        let bits_per_s = match plan.backend {
+            kinect::NAME => kinect::live::wire_bits_per_s(&p, with_depth),
+            _ => super::wire_bits_per_s(&p),
+        };
+        let usb_mbit_s = if on_usb { bits_per_s / 1e6 } else { 0.0 };
         plan.streams.push(PlannedStream { mode: ModeReport::from(&p), usb_mbit_s, recorded });
         plan.profiles.push((p, recorded));
     }

@@ -3,6 +3,7 @@
 use super::clock::{ClockSync, clock_sync};
 use super::disk::DiskFacts;
 use super::finding::{Finding, Severity};
+use super::kinect::KinectFacts;
 use super::{CameraPlan, Surroundings};
 use crate::config::RigConfig;
 use crate::priority;
@@ -26,6 +27,8 @@ pub struct Host {
     pub rig_holder: Option<String>,
     /// The disk of the recordings.
     pub disk: DiskFacts,
+    /// What attached Kinects would miss.
+    pub kinect: KinectFacts,
 }
 
 impl Host {
@@ -45,6 +48,7 @@ impl Host {
             clock: clock_sync(),
             rig_holder: around.runtime.as_ref().and_then(|r| r.holder(&config.rig)),
             disk: DiskFacts::gather(&config.recording.directory, reserve_bytes(&config.recording), measure),
+            kinect: KinectFacts::gather(config),
         }
     }
 

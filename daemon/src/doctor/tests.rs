@@ -4,7 +4,7 @@
 use super::cameras::{self, Planned};
 use super::*;
 use crate::attached::look;
-use crate::attached::tests::{Made, profile, rig_with};
+use crate::attached::tests::{Made, kinect_half, profile, rig_with};
 use crate::attached::{Attached, UseState};
 use depthrig_bus::PixelFormat;
 use depthrig_drivers::ErrorKind;
@@ -27,6 +27,7 @@ fn config(text: &str) -> RigConfig {
 /// A computer on which all is well.
 fn well(root: SysRoot) -> Host {
     Host {
+        kinect: KinectFacts { missing: Vec::new(), has_display: true },
         root,
         shm_free_bytes: Some(64 << 30),
         realtime_refusal: None,
@@ -489,4 +490,87 @@ fn what_keeps_depth_from_being_refined_is_found() {
             assert_eq!(f.camera.as_deref(), of, "{f:?}");
         }
     }
+}
+
+const KINECT: &str = r#"
+rig = "mount"
+[recording]
+directory = "/data"
+[[camera]]
+name = "overhead"
+backend = "kinect"
+serial = "000123456789"
+"#;
+
+/// The report of [`KINECT`] with a Kinect attached.
+fn kinect_report(text: &str, made: &Made, change: impl FnOnce(&mut Host)) -> Report {
+    let home = tempfile::tempdir().unwrap();
+    let tree = MadeTree::new(home.path());
+    tree.plug(&kinect_half("2-1.1", 0x097c, "000123456789", 0));
+    tree.plug(&kinect_half("2-1.2", 0x097d, "000123456789", 10));
+    let config = config(text);
+    let mut host = well(tree.root().clone());
+    change(&mut host);
+    let attached = look(tree.root(), made).unwrap();
+    judge(&config, &attached, cameras::plan(&config, &attached), &host)
+}
+
+#[test]
+fn what_a_kinect_misses_is_said_once() {
+    let named = KINECT.replace("serial = \"000123456789\"", "port = \"2-1.1\"");
+    assert_eq!(ids(&kinect_report(&named, &Made::default(), |_| {})), []);
+    let failing = vec![("2-1.1".to_owned(), ErrorKind::BadInput)];
+    let made = Made { failing, ..Made::default() };
+    let no_library = |h: &mut Host| {
+        h.kinect.missing = vec![("overhead".into(), Missing::Library, "libk4a is not installed".into())];
+        h.kinect.has_display = false;
+    };
+    let report = kinect_report(KINECT, &made, no_library);
+    assert_eq!(ids(&report), [("kinect_library", Severity::Error)], "neither that it failed nor a display");
+    assert!(report.findings[0].cure.contains("packages.microsoft.com"));
+    assert_eq!(report.cameras[0].device.as_deref(), Some("Azure Kinect 000123456789 at USB port 2-1.1"));
+    let no_engine =
+        |h: &mut Host| h.kinect.missing = vec![("overhead".into(), Missing::Engine, "no engine".into())];
+    assert_eq!(
+        ids(&kinect_report(&named, &Made::default(), no_engine)),
+        [("kinect_engine", Severity::Error)]
+    );
+    let report = kinect_report(&named, &Made::default(), |h| h.kinect.has_display = false);
+    assert_eq!(ids(&report), [("kinect_display", Severity::Warning)]);
+    let color = format!("{named}[[camera.stream]]\nname = \"color\"\n");
+    assert_eq!(ids(&kinect_report(&color, &Made::default(), |h| h.kinect.has_display = false)), []);
+}
+
+#[test]
+fn depth_of_a_kinect_takes_of_the_bus_what_its_raw_phases_take() {
+    let named = KINECT.replace("serial = \"000123456789\"", "port = \"2-1.1\"");
+    let depth = format!("{named}[[camera.stream]]\nname = \"depth\"\nwidth = 640\nheight = 480\n");
+    let report = kinect_report(&depth, &Made::default(), |_| {});
+    let load = report.cameras[0].streams[0].usb_mbit_s;
+    assert!((load - 5_310_760.0 * 8.0 * 30.0 / 1e6).abs() < 0.1, "{load}");
+}
+
+#[test]
+fn two_kinects_need_more_memory_for_transfers_than_the_kernel_gives() {
+    let home = tempfile::tempdir().unwrap();
+    let tree = MadeTree::new(home.path());
+    tree.file("sys/module/usbcore/parameters/usbfs_memory_mb", "16");
+    let plan = |port: &str| CameraPlan {
+        name: port.into(),
+        backend: "kinect",
+        device: None,
+        port: Some(port.into()),
+        streams: Vec::new(),
+        worst: None,
+        libusb: false,
+        profiles: Vec::new(),
+    };
+    let plans = [plan("2-1.1"), plan("2-3.1")];
+    let found = |plans: &[CameraPlan]| {
+        let mut findings = Vec::new();
+        bandwidth::check_usbfs(plans, &well(tree.root().clone()), &mut findings);
+        all_text(&findings)
+    };
+    assert_eq!(found(&plans[..1]), "");
+    assert!(found(&plans).contains("32 MB are needed"), "{}", found(&plans));
 }

@@ -76,8 +76,11 @@ pub fn slow_link(device: &UsbDevice) -> Option<String> {
 /// Whether the device could run at USB3 speed: known cameras, and any device of USB 2.1 or later, which a USB3 device
 /// calls itself on a USB2 link (USB 3.2 specification, section 9.2.6.6).
 pub fn is_usb3_device(device: &UsbDevice) -> bool {
-    /// RealSense D400 and L515, and ZED 2i (librealsense `ds/d400/d400-private.h`; zed-open-capture `defines.hpp`).
-    const KNOWN: [(u16, u16); 17] = [
+    /// RealSense D400 and L515, ZED 2i and Azure Kinect (librealsense `ds/d400/d400-private.h`; zed-open-capture
+    /// `defines.hpp`; Azure-Kinect-Sensor-SDK `99-k4a.rules`).
+    const KNOWN: [(u16, u16); 19] = [
+        (0x045e, 0x097c),
+        (0x045e, 0x097d),
         (0x8086, 0x0ad1),
         (0x8086, 0x0ad2),
         (0x8086, 0x0ad3),

@@ -70,7 +70,7 @@ pub unsafe extern "C" fn k4a_device_open(index: u32, handle: *mut Handle) -> u32
         return fails("usb_cmd_create(). Unable to open LIBUSB at index: LIBUSB_ERROR_NO_DEVICE");
     };
     let refused = if camera.denied {
-        Some("usb_cmd_create (372): libusb_open returned LIBUSB_ERROR_ACCESS in find_libusb_device")
+        Some("libusb device(s) are all unavalable. Is the device being used by another application?")
     } else if camera.open.is_some() || camera.busy_until > now {
         Some("usb_cmd_create (421): libusb_claim_interface returned LIBUSB_ERROR_BUSY in usb_cmd_create")
     } else {

@@ -5,6 +5,7 @@ use crate::exit::Exit;
 use crate::{out, screen};
 use anyhow::Result;
 use depthrig_daemon::attached::{Attached, AttachedCamera, ModeReport, System, UseState, look};
+use depthrig_drivers::kinect::live::Places;
 use depthrig_drivers::realsense::{RealsenseBackend, RealsenseConfig};
 use depthrig_drivers::usb::SysRoot;
 use std::path::PathBuf;
@@ -51,7 +52,7 @@ pub fn run(args: &CamerasArgs, context: &Context) -> Result<Exit> {
         out::line(format_args!("{model} {serial} at USB port {port} restarts and is back in some seconds"))?;
         return Ok(Exit::Good);
     }
-    let ask = System { runtime: context.runtime().ok() };
+    let ask = System { runtime: context.runtime().ok(), kinect: Places::default() };
     let mut attached = look(&SysRoot::new(&args.sys_root), &ask)?;
     if let Some(part) = &args.only {
         let part = part.to_lowercase();

@@ -48,7 +48,7 @@ pub fn run(args: &DoctorArgs, context: &Context) -> Result<Exit> {
     let runtime = context.runtime().ok();
     let root = SysRoot::new(&args.sys_root);
     let around = Surroundings { root, runtime: runtime.clone(), measure_disk: !args.no_disk };
-    let report = examine(&config, &around, &System { runtime })?;
+    let report = examine(&config, &around, &System::of_rig(&config, runtime))?;
     if args.json {
         out::json(&report)?;
     } else {

@@ -84,6 +84,9 @@ fn the_rules_name_every_camera_that_has_a_driver() {
     for id in ["f880", "f881"] {
         assert!(rules.contains(id), "ZED {id}");
     }
+    for id in ["097c", "097d"] {
+        assert!(rules.contains(id), "Azure Kinect {id}");
+    }
     // Every line that is none of a comment, a label or a jump matches a subsystem first.
     let mut continued = false;
     for line in rules.lines().filter(|l| !l.starts_with('#') && !l.is_empty()) {

@@ -88,9 +88,11 @@ pub enum Cause {
 
 /// What each message tells: a part of it, as the sources of libk4a 1.4 have it (`usbcommand.c`, `usbstreaming.c`,
 /// `deloader.cpp`, `dewrapper.c`, `depth.c`, `k4a.c`). The first that is found counts.
-const TELLING: [(&str, Cause); 13] = [
+const TELLING: [(&str, Cause); 14] = [
     ("LIBUSB_ERROR_BUSY", Cause::Busy),
     ("LIBUSB_ERROR_ACCESS", Cause::Denied),
+    // Said when every camera refused this user, and spelt like this.
+    ("device(s) are all unava", Cause::Denied),
     ("LIBUSB_ERROR_NO_MEM", Cause::NoUsbMemory),
     ("Failed to Load Depth Engine Plugin", Cause::NoEngine),
     ("Failed to load depth engine plugin", Cause::NoEngine),
