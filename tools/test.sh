@@ -65,6 +65,9 @@ step reader-node node tests/readers/check_node.mjs "$work/dataset" "$work/expect
 step golden-stereo "$target/examples/golden" "$work/stereo" "$work/stereo-expected" stereo
 step reader-python-stereo "$python" tests/readers/check_python.py "$work/stereo" "$work/stereo-expected"
 step reader-node-stereo node tests/readers/check_node.mjs "$work/stereo" "$work/stereo-expected"
+step golden-zed "$target/examples/zed_replay_golden" "$work/zed" "$work/zed-expected"
+step reader-python-zed "$python" tests/readers/check_python.py "$work/zed" "$work/zed-expected"
+step reader-node-zed node tests/readers/check_node.mjs "$work/zed" "$work/zed-expected"
 
 # The drivers and the daemon on a real kernel. 77: what that needs is not installed, which DEPTHRIG_REQUIRE_VM forbids.
 vm() {
@@ -80,7 +83,7 @@ if grep -q '^virtual machine skipped' "$logs/vm.log"; then skipped+=", 1 skipped
 count() { grep -ohE "[0-9]+ $1" "$logs"/{rust,python,python-versions,python-torch,python-oak,daemon,vm}.log | awk '{n += $1} END {print n + 0}'; }
 passed=$(count passed)
 failed=$(count failed)
-for name in {golden,reader-python,reader-node}{,-stereo}; do
+for name in {golden,reader-python,reader-node}{,-stereo,-zed}; do
     case "$failed_steps " in
     *" $name "*) failed=$((failed + 1)) ;;
     *) passed=$((passed + 1)) ;;

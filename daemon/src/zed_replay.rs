@@ -26,6 +26,7 @@ mod engine;
 mod input;
 mod modes;
 mod pictures;
+mod swapped;
 mod work;
 
 pub use depthrig_cdm::NetworkPixels;
@@ -184,6 +185,7 @@ pub fn zed_replay(
     check(options)?;
     let mut input = Input::open(input, options.camera.as_deref(), &options.open)?;
     let mut plan = Plan::new(&mut input, out, options)?;
+    swapped::check(&mut input, &plan.maker, options)?;
     let fs: Arc<dyn Fs> = Arc::new(RealFs);
     let work = work::Work::open(out, &plan.identity(options))?;
     let mut report = plan.report(out);

@@ -33,6 +33,10 @@ pub struct Eyes {
     pub period_ns: i64,
     /// Sets, from 0, that have no right picture.
     pub one_eyed: Vec<u64>,
+    /// Each eye's pictures are the other one's.
+    pub swapped: bool,
+    /// Difference between the brightest and the darkest of the patterns.
+    pub contrast: f64,
 }
 
 impl Default for Eyes {
@@ -46,6 +50,8 @@ impl Default for Eyes {
             sets: 6,
             period_ns: 200_000_000,
             one_eyed: Vec::new(),
+            swapped: false,
+            contrast: 200.0,
         }
     }
 }
@@ -88,12 +94,12 @@ impl Eyes {
         let (u, v) = on(z);
         // Three pixels to a spot of the pattern.
         let spots = self.focal / z / 3.0;
-        (z, (30.0 + 200.0 * noise(u * spots, v * spots, seed)) as u8)
+        (z, (30.0 + self.contrast * noise(u * spots, v * spots, seed)) as u8)
     }
 
     /// Brightness of an eye's picture.
     pub fn grey(&self, right: bool, n: u64) -> Vec<u8> {
-        let shift = if right { self.baseline_m } else { 0.0 };
+        let shift = if right != self.swapped { self.baseline_m } else { 0.0 };
         let (w, h) = self.size;
         (0..h)
             .flat_map(|y| (0..w).map(move |x| (x, y)))

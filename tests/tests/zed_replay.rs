@@ -4,7 +4,7 @@
 use core::ops::ControlFlow;
 use depthrig_bus::{FrameFlags, PixelFormat};
 use depthrig_calib::stereo::Preset;
-use depthrig_daemon::zed_replay::{Mode, Step, ZedReplayOptions, zed_replay};
+use depthrig_daemon::zed_replay::{Mode, NetworkChoice, Step, ZedReplayOptions, zed_replay};
 use depthrig_recorder::{
     CompareOptions, Dataset, ErrorKind, PixelMode, SetRange, VerifyOptions, compare, verify,
 };
@@ -155,6 +155,71 @@ fn what_cannot_be_replayed_is_said() {
     assert_eq!((report.modes.len(), report.unavailable.len()), (1, 1));
     let session = Dataset::open(&out).unwrap().session().clone();
     assert!(session.extra["zed_replay"].to_string().contains("unavailable, because"), "{:?}", session.extra);
+}
+
+/// Eyes that were exchanged are found out, and only they.
+#[test]
+fn swapped_eyes_are_said() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
+    Eyes { sets: 3, one_eyed: vec![0], swapped: true, ..Eyes::default() }.record(&source);
+    let e = zed_replay(&source, &out, &options(&CLASSICAL, 1), &mut go_on).unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::BadInput);
+    assert!(e.to_string().starts_with("left and right are swapped"), "{e}");
+    assert!(!out.exists() && !dir.path().join("out.zedreplay").exists());
+    // A wall without a pattern matches in neither order, and that is no reason to refuse it.
+    let plain = dir.path().join("plain");
+    Eyes { sets: 1, contrast: 0.0, ..Eyes::default() }.record(&plain);
+    zed_replay(&plain, &out, &options(&CLASSICAL[..1], 1), &mut go_on).unwrap();
+}
+
+/// A network of one's own beside the classical modes; skipped, with a line that says so, without ONNX Runtime.
+#[test]
+fn a_network_is_a_mode_like_any_other() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
+    let eyes = Eyes { sets: 3, ..Eyes::default() };
+    eyes.record(&source);
+    let file = dir.path().join("made.onnx");
+    let made = depthrig_cdm::MadeNetwork { disparities: 24, confidence: true, ..Default::default() };
+    std::fs::write(&file, made.file()).unwrap();
+    let network = NetworkChoice {
+        file: file.clone(),
+        library: None,
+        device: "cpu".into(),
+        pixels: None,
+        negative: false,
+    };
+    let modes = vec![CLASSICAL[2], Mode::Neural];
+    let options = ZedReplayOptions { modes, network: Some(network), ..options(&[], 2) };
+    let report = match zed_replay(&source, &out, &options, &mut go_on) {
+        Err(e) if e.to_string().contains("ONNX Runtime was not found") => {
+            assert!(std::env::var_os("DEPTHRIG_REQUIRE_ONNXRUNTIME").is_none(), "{e}");
+            println!("skipped: {e}");
+            return;
+        }
+        report => report.unwrap(),
+    };
+    assert_eq!(report.modes[1].recorded_as, "mimic_neural");
+    assert!(report.modes[1].parameters.contains("network=made.onnx sha256="), "{:?}", report.modes[1]);
+    let dataset = Dataset::open(&out).unwrap();
+    let truth = eyes.truth_m();
+    for set in dataset.sets_with(SetRange::ALL, PixelMode::Decoded).map(Result::unwrap) {
+        let depth = set.frames.iter().find(|f| f.header.stream() == "depth_neural").unwrap();
+        assert!(depth.header.refiner().starts_with("onnxruntime"), "{}", depth.header.refiner());
+        let z = u16s(&depth.pixels);
+        let right =
+            z.iter().zip(&truth).filter(|(z, t)| (f64::from(**z) * 1e-3 / **t - 1.0).abs() < 0.05).count();
+        assert!(right * 10 > truth.len() * 7, "{right} of {}", truth.len());
+    }
+    // One with other inputs is refused before anything is written.
+    let wrong = depthrig_cdm::MadeNetwork { channels: 4, ..Default::default() };
+    std::fs::write(&file, wrong.file()).unwrap();
+    let second = dir.path().join("second");
+    let e = zed_replay(&source, &second, &options, &mut go_on).unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::BadInput);
+    assert!(e.to_string().contains("another number of channels; taken are two inputs"), "{e}");
+    assert!(!second.exists() && !dir.path().join("second.zedreplay").exists());
 }
 
 /// Where the child below replays from and to.

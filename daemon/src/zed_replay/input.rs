@@ -210,6 +210,18 @@ impl Input {
         }
     }
 
+    /// Goes back to the first pair.
+    pub(super) fn rewind(&mut self) -> Result<()> {
+        match &mut self.kind {
+            Kind::Recording { source, .. } => source.seek(0).map_err(driver),
+            Kind::Dataset { number, lost, reader, .. } => {
+                *number = 0;
+                *lost = reader.problems().to_vec();
+                Ok(())
+            }
+        }
+    }
+
     /// Goes to what follows set `last` of the output; how many sets lie before.
     pub(super) fn go_behind(&mut self, last: u64) -> Result<u64> {
         match &mut self.kind {

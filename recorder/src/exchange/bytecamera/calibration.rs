@@ -40,6 +40,9 @@ pub(super) struct StreamFacts {
     pub folder: String,
     pub prefix: String,
     pub ending: String,
+    /// Other folders with the same files: the colour of a stereo camera is in the folder of each of its depth modes.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub copies: Vec<String>,
     /// The pixel format in the recording, where the files have another one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recorded_format: Option<String>,
@@ -103,7 +106,8 @@ impl Calibration {
             if !size.iter().all(|side| (1..=MAX_SIDE).contains(side)) {
                 return Err(bad(format!("stream {id} is {}x{}, which is no picture", size[0], size[1])));
             }
-            if s.folder.contains(['/', ',']) || s.prefix.contains(['/', ',']) || s.folder.starts_with('.') {
+            let is_folder = |name: &String| !name.contains(['/', ',']) && !name.starts_with('.');
+            if !is_folder(&s.folder) || s.prefix.contains(['/', ',']) || !s.copies.iter().all(is_folder) {
                 return Err(bad(format!("stream {id} lies in \"{}\", which is no folder here", s.folder)));
             }
         }

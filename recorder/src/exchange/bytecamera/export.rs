@@ -69,18 +69,30 @@ impl ByteCameraExport {
         let mut streams = Vec::new();
         for s in &session.streams {
             let camera = s.id.camera.as_str();
-            let known = cameras.iter().find(|(name, _)| name == camera).map(|(_, folder)| folder.clone());
-            let of_camera = known.unwrap_or_else(|| {
+            let mut folder_of = |mode: Option<&str>| {
+                let key = mode.map_or_else(|| camera.to_owned(), |m| format!("{camera}/{m}"));
+                if let Some((_, folder)) = cameras.iter().find(|(k, _)| *k == key) {
+                    return folder.clone();
+                }
                 let plain = names::of_model(&s.model, camera, self.names == CameraNames::Long);
+                let plain = mode.map_or_else(|| plain.clone(), |m| format!("{plain}_{m}"));
                 let mut name = format!("camera_{plain}");
                 let mut n = 2;
                 while cameras.iter().any(|(_, folder)| *folder == name) {
                     name = format!("camera_{plain}_{n}");
                     n += 1;
                 }
-                cameras.push((camera.to_owned(), name.clone()));
+                cameras.push((key, name.clone()));
                 name
-            });
+            };
+            // A stereo camera with several depth modes has a folder for each, with its colour in all of them.
+            let modes = if s.id.stream.as_str() == "color" { modes_of(session, camera) } else { Vec::new() };
+            let mut copies: Vec<_> = modes.iter().map(|mode| folder_of(Some(mode))).collect();
+            let of_camera = if copies.is_empty() {
+                folder_of(names::mode_of(s.id.stream.as_str()))
+            } else {
+                copies.remove(0)
+            };
             let wanted = match s.format {
                 PixelFormat::Z16 => "depth",
                 PixelFormat::DepthF32 => "raw_depth",
@@ -129,10 +141,14 @@ impl ByteCameraExport {
                 ));
             }
             let (folder, ending) = (of_camera, ending.to_owned());
+            if !copies.is_empty() {
+                losses.push(format!("{}: the same pictures are in {folder} and {}", s.id, copies.join(", ")));
+            }
             streams.push(StreamFacts {
                 folder,
                 prefix,
                 ending,
+                copies,
                 recorded_format,
                 recorded_depth_unit_m,
                 stream,
@@ -204,6 +220,11 @@ impl ByteCameraExport {
                             differs.into(),
                         );
                         out.file(&format!("{}/{}", layout.folder, row.file), &file)?;
+                        for copy in &facts.copies {
+                            let name =
+                                format!("{}/{copy}/{}_{n}.{}", layout.folder, facts.prefix, facts.ending);
+                            out.file(&name, &file)?;
+                        }
                         out.frame(stream);
                     }
                     Err(e) => out.lose(format!("set {}: {e}", set.id)),
@@ -213,6 +234,12 @@ impl ByteCameraExport {
         }
         Ok(())
     }
+}
+
+/// The depth modes of a camera, in the order of its streams.
+fn modes_of<'a>(session: &'a Session, camera: &str) -> Vec<&'a str> {
+    let of_camera = session.streams.iter().filter(|s| s.id.camera.as_str() == camera && s.format.is_depth());
+    of_camera.filter_map(|s| names::mode_of(s.id.stream.as_str())).collect()
 }
 
 /// Depth in other units: the pixels, how many were rounded, and how many do not fit.
@@ -272,7 +299,8 @@ impl Exporter for ByteCameraExport {
                 ));
             }
             let layout = self.layout(source.session(), &mut taken, &mut plan.losses);
-            let folders: BTreeSet<_> = layout.streams.iter().map(|s| &s.folder).collect();
+            let folders: BTreeSet<_> =
+                layout.streams.iter().flat_map(|s| s.copies.iter().chain([&s.folder])).collect();
             plan.folders.push(layout.folder.clone());
             plan.folders.extend(folders.into_iter().map(|f| format!("{}/{f}", layout.folder)));
             self.sessions.push(layout);

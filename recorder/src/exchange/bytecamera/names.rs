@@ -59,6 +59,16 @@ pub(super) fn of_model(model: &str, camera: &str, long: bool) -> String {
     }
 }
 
+/// Depth modes of stereo cameras that have a folder of their own.
+const DEPTH_MODES: [&str; 6] = ["performance", "quality", "ultra", "neural", "neural_light", "neural_plus"];
+
+/// The depth mode that a stream is of, such as `quality` for `depth_quality`.
+pub(super) fn mode_of(stream: &str) -> Option<&str> {
+    let kinds = ["depth_", "confidence_", "disparity_"];
+    let mode = kinds.iter().find_map(|kind| stream.strip_prefix(kind))?;
+    DEPTH_MODES.contains(&mode).then_some(mode)
+}
+
 /// Camera name and model for the folder `camera_<part>`; a depth mode such as `zed2i_quality` stays in both.
 pub(super) fn camera_of(part: &str) -> (Name, String) {
     let lower = part.to_lowercase();
@@ -137,6 +147,15 @@ mod tests {
         assert_eq!(usual_depth_unit_m("D405"), Some(0.0001));
         assert_eq!(usual_depth_unit_m("Intel RealSense L515"), Some(0.000_25));
         assert_eq!(usual_depth_unit_m("Test 1"), None);
+    }
+
+    #[test]
+    fn depth_modes_are_known_by_their_streams() {
+        assert_eq!(mode_of("depth_quality"), Some("quality"));
+        assert_eq!(mode_of("confidence_neural"), Some("neural"));
+        for other in ["depth", "depth_refined", "color", "color_quality", "depth_"] {
+            assert_eq!(mode_of(other), None, "{other}");
+        }
     }
 
     #[test]

@@ -99,7 +99,7 @@ fn an_export_imported_is_the_dataset_again() {
         let fs = recorded(&session, 7, color);
         let report = exported(&fs, CameraNames::Short, None).unwrap();
         assert_eq!((report.sets, report.lost), (7, 0), "{report:?}");
-        assert_eq!(report.frames, 10 * 7 - 1 - 9);
+        assert_eq!(report.frames, 11 * 7 - 1 - 10);
         let names: Vec<_> = files(&fs).into_keys().collect();
         for wanted in [
             "camera_d455/color_0.png",
@@ -111,6 +111,7 @@ fn an_export_imported_is_the_dataset_again() {
             "camera_zed2i/raw_depth_4.npy",
             "camera_zed2i/color_4.npy",
             "camera_zed2i/confidence_4.png",
+            "camera_zed2i/disparity_4.npy",
             "camera_kinect/ir_1.png",
             "frames.csv",
             "calibration.json",
@@ -325,4 +326,48 @@ fn what_is_no_such_folder_is_refused() {
             }
         }
     }
+}
+
+/// A stereo camera with depth in several modes: a folder for each, as the published dataset has them, and back again.
+#[test]
+fn a_folder_for_each_depth_mode() {
+    let mut session = everything();
+    let eye = stream("zed/color", PixelFormat::Rgb8, 32, 24);
+    let mut of = |name: &str, format| {
+        let mut s = stream(&format!("zed/{name}"), format, 32, 24);
+        s.model = "ZED 2i".into();
+        session.streams.push(s);
+    };
+    of("left", PixelFormat::Yuyv);
+    of("color", eye.format);
+    for mode in ["performance", "quality"] {
+        of(&format!("depth_{mode}"), PixelFormat::Z16);
+        of(&format!("confidence_{mode}"), PixelFormat::Confidence8);
+        of(&format!("disparity_{mode}"), PixelFormat::DisparityF32);
+    }
+    let fs = recorded(&session, 5, ColorCodec::Png);
+    let report = exported(&fs, CameraNames::Short, None).unwrap();
+    let folders = fs.read_dir(&session_dir()).unwrap().into_iter().filter(|e| e.is_dir).map(|e| e.name);
+    let folders: Vec<_> = folders.filter(|f| f.contains("zed2i")).collect();
+    // The camera of the other streams is a ZED 2i as well.
+    assert_eq!(
+        folders,
+        ["camera_zed2i", "camera_zed2i_2", "camera_zed2i_performance", "camera_zed2i_quality"]
+    );
+    let color = |mode: &str| contents(&fs, &session_dir().join(format!("camera_zed2i_{mode}/color_4.png")));
+    assert_eq!(color("performance"), color("quality"));
+    for mode in ["performance", "quality"] {
+        for file in ["depth_4.png", "confidence_4.png", "disparity_4.npy"] {
+            assert!(!contents(&fs, &session_dir().join(format!("camera_zed2i_{mode}/{file}"))).is_empty());
+        }
+    }
+    assert!(
+        report.losses.iter().any(|l| l.contains("camera_zed2i_performance and camera_zed2i_quality")),
+        "{:?}",
+        report.losses
+    );
+    let imported = imported(&fs, &session_dir(), ByteCameraOptions::default()).unwrap();
+    assert!(!imported.facts.stated.iter().any(|s| s.contains("left out")), "{:?}", imported.facts.stated);
+    let same = compare(&open(&fs), &reopened(&fs), &CompareOptions::default()).unwrap();
+    assert!(same.equal, "{:?}", same.differences);
 }

@@ -14,6 +14,9 @@ impl ByteCameraImport {
     pub(super) fn described(&mut self, calibration: Calibration, mut found: Found) -> Result<()> {
         for s in calibration.streams {
             let files = found.remove(&(s.folder.clone(), s.prefix.clone(), s.ending.clone()));
+            for copy in &s.copies {
+                found.remove(&(copy.clone(), s.prefix.clone(), s.ending.clone()));
+            }
             let mut record = s.stream;
             let given = self.given_unit(record.id.camera.as_str(), &s.folder);
             let given = given.filter(|u| record.format == PixelFormat::Z16 && *u != record.depth_unit_m);
