@@ -291,15 +291,13 @@ impl Plan {
         if modes.is_empty() {
             return Err(Error::new(ErrorKind::BadInput, unavailable.join("; ")));
         }
-        let nearest = rectifier.intrinsics().fx * rectifier.baseline_m()
-            / modes::disparities(&rectifier, options.range_m.0) as f64;
+        let searched = modes::geometry(&rectifier).disparities(options.range_m.0);
+        let nearest = rectifier.intrinsics().fx * rectifier.baseline_m() / searched as f64;
         let mut notes = Vec::new();
-        if nearest > options.range_m.0 * 1.05 {
+        if nearest > options.range_m.0 {
+            let (w, h) = facts.size;
             notes.push(format!(
-                "at {}x{} the presets see no nearer than {nearest:.2} m: they search {} disparities at most",
-                facts.size.0,
-                facts.size.1,
-                modes::disparities(&rectifier, options.range_m.0)
+                "at {w}x{h} the presets see no nearer than {nearest:.2} m: they search {searched} disparities at most"
             ));
         }
         let maker = Maker {

@@ -91,12 +91,15 @@ fn name_of(path: &Path) -> String {
 impl Input {
     /// Opens a dataset with the raw eyes of a stereo camera, a folder of side-by-side pictures, or an SVO2 file.
     pub(super) fn open(path: &Path, camera: Option<&str>, options: &replay::OpenOptions) -> Result<Self> {
+        let recording = || Self::recording(replay::open(path, options).map_err(driver)?, camera);
+        // An SVO2 file is an MCAP file, as a segment of a dataset is; its name tells even when it is damaged.
+        if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("svo2") || e.eq_ignore_ascii_case("svo")) {
+            return recording();
+        }
         match Dataset::open(path) {
             Ok(dataset) => Self::dataset(&dataset, camera),
-            Err(e) => {
-                let _ = options;
-                Err(e)
-            }
+            Err(e) if matches!(e.kind(), ErrorKind::NotADataset | ErrorKind::Foreign) => recording(),
+            Err(e) => Err(e),
         }
     }
 

@@ -4,8 +4,9 @@ use super::ZedReplayOptions;
 use core::fmt;
 use core::str::FromStr;
 use depthrig_calib::Rectifier;
-use depthrig_calib::stereo::{Description, Matcher, Parameters, Preset, SgmMatcher};
+use depthrig_calib::stereo::{Description, Matcher, Preset};
 use depthrig_cdm::{NetworkPixels, StereoNetwork, StereoNetworkOptions};
+use depthrig_drivers::stereo::{Geometry, StereoMode};
 use depthrig_recorder::{Error, ErrorKind, Result};
 use std::path::PathBuf;
 
@@ -74,9 +75,6 @@ pub struct NetworkChoice {
     pub negative: bool,
 }
 
-/// The stereo engine searches no more disparities.
-const MAX_DISPARITIES: usize = 256;
-
 type Make = Box<dyn Fn() -> Result<Box<dyn Matcher>> + Send + Sync>;
 
 /// Makes the matchers of a mode.
@@ -109,11 +107,10 @@ impl ModeMaker {
     }
 }
 
-/// Disparities to search so that things at `nearest_m` are found: a multiple of 16, as many as the engine has at most.
-pub(super) fn disparities(rectifier: &Rectifier, nearest_m: f64) -> usize {
-    let wanted = rectifier.intrinsics().fx * rectifier.baseline_m() / nearest_m;
-    let wanted = if wanted.is_finite() { wanted.clamp(1.0, 65_536.0) as usize + 2 } else { MAX_DISPARITIES };
-    wanted.next_multiple_of(16).min(MAX_DISPARITIES)
+/// What matchers need to know of the rectified pairs.
+pub(super) fn geometry(rectifier: &Rectifier) -> Geometry {
+    let ((width, height), focal_px) = (rectifier.size(), rectifier.intrinsics().fx);
+    Geometry { width: width as usize, height: height as usize, focal_px, baseline_m: rectifier.baseline_m() }
 }
 
 fn failed(mode: Mode, e: &dyn fmt::Display) -> Error {
@@ -130,11 +127,9 @@ pub(super) fn open(
     let (width, height, threads) = (width as usize, height as usize, options.threads.max(1));
     match mode {
         Mode::Preset(preset) => {
-            let parameters = Parameters::preset(preset, disparities(rectifier, options.range_m.0));
-            let make = move || {
-                let made = SgmMatcher::new(width, height, &parameters, threads);
-                made.map(|m| Box::new(m) as Box<dyn Matcher>).map_err(|e| failed(mode, &e).with_source(e))
-            };
+            let (made, geometry) =
+                (StereoMode::preset(preset, options.range_m.0, threads), geometry(rectifier));
+            let make = move || (made.make)(&geometry).map_err(|e| failed(mode, &e).with_source(e));
             ModeMaker::new(mode.name(), mode.recorded_name(), usize::MAX, Box::new(make))
         }
         Mode::Neural => {

@@ -1,10 +1,11 @@
 //! Whether the left eye's pictures are the right eye's: found out before any depth is made of them.
 
 use super::input::{Input, Next};
-use super::modes::disparities;
+use super::modes::geometry;
 use super::pictures::Maker;
 use super::{MAX_PROBLEMS, ZedReplayOptions};
-use depthrig_calib::stereo::{DisparityMap, Matcher, Parameters, Preset, SgmMatcher, StereoPair};
+use depthrig_calib::stereo::{DisparityMap, Preset, StereoPair};
+use depthrig_drivers::stereo::StereoMode;
 use depthrig_recorder::{Error, ErrorKind, Result};
 
 /// Exchanged eyes match in at least this share of the pixels, and the others in less than half of that.
@@ -27,10 +28,8 @@ pub(super) fn check(input: &mut Input, maker: &Maker, options: &ZedReplayOptions
     let views = maker.rectify(&raw)?;
     let pair = views.pair();
     let failed = |e: depthrig_calib::Error| Error::new(ErrorKind::BadInput, e.to_string()).with_source(e);
-    let parameters =
-        Parameters::preset(Preset::Performance, disparities(&maker.rectifier, options.range_m.0));
-    let mut matcher = SgmMatcher::new(pair.left.width, pair.left.height, &parameters, options.jobs.max(1))
-        .map_err(failed)?;
+    let mode = StereoMode::preset(Preset::Performance, options.range_m.0, options.jobs.max(1));
+    let mut matcher = (mode.make)(&geometry(&maker.rectifier)).map_err(failed)?;
     let mut map = DisparityMap::default();
     matcher.run(&StereoPair::new(pair.left, pair.right), &mut map).map_err(failed)?;
     let as_it_is = map.fill();
