@@ -305,7 +305,7 @@ impl Supervisor {
     /// Whether an opening failed for good: files that are not there are a mistake, not an unplugged camera.
     fn never_will(&self, e: &depthrig_drivers::Error) -> bool {
         e.kind() == DriverErrorKind::NotFound
-            && matches!(self.camera.config.backend, BackendConfig::Files(_))
+            && matches!(self.camera.config.backend, BackendConfig::Files(_) | BackendConfig::ZedReplay(_))
             && self.camera.state().streams.is_empty()
     }
 
@@ -419,7 +419,7 @@ fn open_lane(camera: &Camera, shared: &Shared, info: &DeviceInfo) -> Result<()> 
         (state.streams.clone(), state.made.clone(), state.lane.is_some())
     };
     let find = |name: &str| streams.iter().find(|s| s.id.stream.as_str() == name);
-    let (Some(color), Some(depth)) = (find("color"), find("depth")) else { return Ok(()) };
+    let (Some(color), Some(depth)) = (find("color"), find(&config.depth)) else { return Ok(()) };
     let [refined, aligned @ ..] = made.as_slice() else { return Ok(()) };
     if begun {
         return Ok(());
@@ -450,11 +450,12 @@ fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, de
         kinect::{KinectConfig, live::LiveBackend},
         realsense::RealsenseBackend,
         realsense::l515::L515Backend,
+        stereo::StereoBackend,
         synthetic::SyntheticBackend,
         v4l2::V4l2Backend,
-        zed::ZedBackend,
+        zed::{ZedBackend, replay::ReplayBackend},
     };
-    Ok(match &camera.config.backend {
+    let backend: Box<dyn Backend> = match &camera.config.backend {
         // One beginning for all cameras of the rig, or each would see the world at another moment.
         BackendConfig::Synthetic(c) => {
             Box::new(SyntheticBackend::starting_at(vec![c.clone()], shared.began)?)
@@ -464,12 +465,17 @@ fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, de
         BackendConfig::Realsense(c) => Box::new(RealsenseBackend::new(c.clone())),
         BackendConfig::V4l2(c) => Box::new(V4l2Backend::new(c.clone())),
         BackendConfig::Zed(c) => Box::new(ZedBackend::new(c.clone())),
+        BackendConfig::ZedReplay(c) => Box::new(ReplayBackend::new(c.clone())),
         BackendConfig::External(c) => {
             let (runtime, rig) = (shared.bus.runtime().clone(), shared.bus.rig().clone());
             let place = Place { runtime, rig, camera: camera.config.name.clone() };
             Box::new(ExternalBackend::new(c.clone(), place))
         }
         BackendConfig::Kinect(KinectConfig::Live(c)) => Box::new(LiveBackend::new(c.clone())),
+    };
+    Ok(match &camera.config.stereo {
+        Some(stereo) => Box::new(StereoBackend::new(backend, stereo.options())),
+        None => backend,
     })
 }
 

@@ -14,6 +14,7 @@ mod read;
 mod realsense;
 mod refine;
 mod rig;
+mod stereo;
 mod synthetic;
 #[cfg(test)]
 mod tests;
@@ -29,10 +30,12 @@ pub use depthrig_drivers::realsense::l515::L515Config as L515Settings;
 pub use depthrig_drivers::synthetic::SyntheticConfig as SyntheticSettings;
 pub use depthrig_drivers::v4l2::V4l2Config as V4l2Settings;
 pub use depthrig_drivers::zed::ZedConfig as ZedSettings;
+pub use depthrig_drivers::zed::replay::ReplayConfig as ZedReplaySettings;
 pub use depthrig_recorder::{ColorCodec, DepthCodec};
 pub use error::{ConfigError, Problem};
 
 use depthrig_bus::{CameraName, PixelFormat, Pose, RigName, StreamName};
+use depthrig_drivers::stereo::StereoOptions;
 use depthrig_drivers::{StreamProfile, StreamRequest};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -158,6 +161,8 @@ pub struct CameraConfig {
     pub streams: Vec<StreamRequest>,
     /// Streams to record; `None`: all.
     pub record: Option<Vec<StreamName>>,
+    /// How depth is made of its two eyes; `None`: not at all.
+    pub stereo: Option<StereoConfig>,
     /// How its depth is refined; `None`: not at all.
     pub refine: Option<RefineConfig>,
     /// Its driver and what that needs.
@@ -175,6 +180,25 @@ pub struct CdmConfig {
     pub models: Option<PathBuf>,
     /// A refiner that needs longer than this for a picture, and than ten times what it ever needed, hangs, seconds.
     pub hang_s: f64,
+}
+
+/// How depth is made of the two eyes of a camera.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StereoConfig {
+    /// The modes, in the order of their streams.
+    pub modes: Vec<crate::zed_replay::Mode>,
+    /// Threads of each mode.
+    pub threads: usize,
+    /// Nearest and farthest depth, metres.
+    pub range_m: (f64, f64),
+    /// Whether disparity is published as well.
+    pub disparity: bool,
+    /// A recording waits for the slowest mode, and nothing is skipped.
+    pub every_pair: bool,
+    /// The network of the mode `neural`; absolute.
+    pub network: Option<PathBuf>,
+    /// The library of ONNX Runtime, as `[cdm]` has it.
+    pub library: Option<PathBuf>,
 }
 
 /// How a camera's depth is refined.
@@ -201,6 +225,8 @@ pub struct RefineConfig {
     pub align: bool,
     /// The camera gives depth in the view of colour, whatever calibration says or does not say.
     pub is_aligned: bool,
+    /// The stream that is refined.
+    pub depth: String,
 }
 
 /// What refines depth.
@@ -247,6 +273,7 @@ impl Default for RefineConfig {
             record: false,
             align: false,
             is_aligned: false,
+            depth: "depth".to_owned(),
         }
     }
 }
@@ -255,6 +282,24 @@ impl CameraConfig {
     /// Whether frames of `stream` belong into recordings.
     pub fn records(&self, stream: &StreamName) -> bool {
         self.record.as_ref().is_none_or(|list| list.contains(stream))
+    }
+
+    /// Whether frames of `stream` come so much later than those that they are made of that no set waits for them: they
+    /// join the set of their pair when it is recorded, as refined depth does.
+    pub(crate) fn joins_late(&self, stream: &StreamName) -> bool {
+        // Without a stream that comes at once there would be no set to join.
+        let at_once = |name: &str| {
+            name == depthrig_drivers::stereo::COLOR || depthrig_drivers::stereo::EYES.contains(&name)
+        };
+        self.stereo.is_some()
+            && StereoOptions::is_late(stream.as_str())
+            && (self.streams.is_empty() || self.streams.iter().any(|s| at_once(s.stream.as_str())))
+    }
+
+    /// Whether `stream` is made of others of the camera here, and does not come from the device.
+    pub(crate) fn is_made_here(&self, stream: &StreamName) -> bool {
+        let stereo = self.stereo.as_ref().is_some_and(|s| s.streams().iter().any(|n| n == stream.as_str()));
+        stereo || crate::stage::is_derived(stream)
     }
 
     /// The streams that are made of `profiles`, and whether each is recorded.
@@ -282,6 +327,8 @@ pub enum BackendConfig {
     V4l2(V4l2Settings),
     /// A Stereolabs ZED.
     Zed(ZedSettings),
+    /// A recording of one, which plays as that camera.
+    ZedReplay(ZedReplaySettings),
     /// A camera that another process serves.
     External(ExternalSettings),
     /// An Azure Kinect.
@@ -297,7 +344,7 @@ impl BackendConfig {
             Self::Realsense(_) => depthrig_drivers::realsense::NAME,
             Self::L515(_) => depthrig_drivers::realsense::l515::NAME,
             Self::V4l2(_) => "v4l2",
-            Self::Zed(_) => "zed",
+            Self::Zed(_) | Self::ZedReplay(_) => "zed",
             Self::External(_) => depthrig_drivers::external::NAME,
             Self::Kinect(_) => depthrig_drivers::kinect::NAME,
         }

@@ -246,14 +246,15 @@ pub fn profiles(
         profiles.iter().find(|p| p.stream.as_str() == name).ok_or_else(|| {
             let has: Vec<_> = profiles.iter().map(|p| p.stream.to_string()).collect();
             let text = format!(
-                "[camera.refine] needs the streams color and depth; it has {}: ask for both in [[camera.stream]] tables, \
+                "[camera.refine] needs the streams color and {}; it has {}: ask for both in [[camera.stream]] tables, \
                  or remove [camera.refine]",
+                refine.depth,
                 has.join(", ")
             );
             Error::new(ErrorKind::BadInput, text)
         })
     };
-    let (color, depth) = (find("color")?, find("depth")?);
+    let (color, depth) = (find("color")?, find(&refine.depth)?);
     let most = color.rate_hz.min(depth.rate_hz);
     let made = |name: &str, format: PixelFormat| -> Result<_> {
         Ok(StreamProfile {

@@ -204,31 +204,37 @@ impl Backend for StereoBackend {
 /// [`ErrorKind::BadInput`] for options that cannot be, [`ErrorKind::Unsupported`] when the camera has no `left` and
 /// `right` of one size, or a stream of a name that stereo gives.
 pub fn wrap(device: Box<dyn Device>, options: StereoOptions) -> Result<Box<dyn Device>> {
-    options.check()?;
     let name = describe(device.info());
+    let profiles = offered(&name, device.profiles(), &options)?;
+    Ok(Box::new(StereoDevice { name, inner: device, profiles, options }))
+}
+
+/// The streams `own` of the camera `name` and those that `options` ask for. The intrinsics of what is made are known when
+/// the camera is started.
+///
+/// # Errors
+/// As [`wrap`].
+pub fn offered(name: &str, own: &[StreamProfile], options: &StereoOptions) -> Result<Vec<StreamProfile>> {
+    options.check()?;
     let names = options.streams()?;
-    let own = device.profiles();
     if let Some(taken) = own.iter().find(|p| names.contains(&p.stream)) {
         let what =
             format!("{name} has a stream \"{}\" itself; take [camera.stereo] out of the rig", taken.stream);
         return Err(Error::new(ErrorKind::Unsupported, what));
     }
     let mut profiles = own.to_vec();
-    let mut pairs = 0;
     for left in own.iter().filter(|p| p.stream.as_str() == EYES[0]) {
         if own.iter().any(|p| p.stream.as_str() == EYES[1] && same_mode(p, left)) {
-            // What the views' intrinsics are is known when the camera is started.
-            profiles.extend(made(left, &options, &Intrinsics::default(), Pose::IDENTITY)?);
-            pairs += 1;
+            profiles.extend(made(left, options, &Intrinsics::default(), Pose::IDENTITY)?);
         }
     }
-    if pairs == 0 {
+    if profiles.len() == own.len() {
         let what = format!(
             "{name} has no streams \"left\" and \"right\" of one size and format, which stereo needs"
         );
         return Err(Error::new(ErrorKind::Unsupported, what));
     }
-    Ok(Box::new(StereoDevice { name, inner: device, profiles, options }))
+    Ok(profiles)
 }
 
 fn same_mode(a: &StreamProfile, b: &StreamProfile) -> bool {

@@ -3,8 +3,8 @@
 use super::read::{Found, Section};
 use super::rig::{not_empty, rate, resolve};
 use super::{
-    BackendConfig, CameraConfig, FilesSettings, external, kinect, l515, realsense, refine, synthetic, v4l2,
-    zed,
+    BackendConfig, CameraConfig, FilesSettings, StereoConfig, external, kinect, l515, realsense, refine,
+    stereo, synthetic, v4l2, zed,
 };
 use depthrig_bus::{CameraName, Name, PixelFormat, Pose, StreamName};
 use depthrig_drivers::StreamRequest;
@@ -52,7 +52,14 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
     let pose = pose(&s);
     let wanted = streams(&s);
     let streams: Vec<_> = wanted.iter().map(|w| w.request.clone()).collect();
-    let refine = refine::read(&s, base, &wanted);
+    let stereo = stereo::read(&s, base);
+    if stereo.is_some() && !matches!(driver, None | Some(Driver::Zed | Driver::External)) {
+        let what =
+            format!("{} is for cameras with streams \"left\" and \"right\": zed, external", stereo::TABLE);
+        s.problem(s.at_key("stereo"), what);
+    }
+    let depth = stereo.as_ref().map_or_else(|| "depth".to_owned(), StereoConfig::first_depth);
+    let refine = refine::read(&s, base, &wanted, &depth);
     let record = record(&s, &streams, refine.is_some());
     let backend = match driver {
         Some(Driver::Synthetic) => {
@@ -63,7 +70,7 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         Some(Driver::Realsense) => Some(BackendConfig::Realsense(realsense::read(&s, base, &wanted))),
         Some(Driver::L515) => Some(BackendConfig::L515(l515::read(&s, &wanted))),
         Some(Driver::V4l2) => Some(BackendConfig::V4l2(v4l2::read(&s))),
-        Some(Driver::Zed) => Some(BackendConfig::Zed(zed::read(&s, base, &wanted))),
+        Some(Driver::Zed) => Some(zed::read(&s, base, &wanted, stereo.as_ref())),
         Some(Driver::External) => Some(BackendConfig::External(external::read(&s, base))),
         Some(Driver::Kinect) => Some(BackendConfig::Kinect(kinect::read(&s, base, &wanted))),
         // Which keys belong to an unknown driver is unknown too.
@@ -76,13 +83,14 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         Some(BackendConfig::L515(_)) if streams.is_empty() => l515::default_streams(),
         _ => streams,
     };
-    Some(CameraConfig { name: name?.value, pose, streams, record, refine, backend: backend? })
+    Some(CameraConfig { name: name?.value, pose, streams, record, stereo, refine, backend: backend? })
 }
 
 /// The highest rate among the camera's streams, as far as the file says.
 pub(super) fn fastest_rate_hz(camera: &CameraConfig) -> Option<f64> {
     match &camera.backend {
         BackendConfig::Files(files) => files.rate_hz,
+        BackendConfig::ZedReplay(replay) => replay.rate_hz,
         BackendConfig::Realsense(_)
         | BackendConfig::L515(_)
         | BackendConfig::V4l2(_)

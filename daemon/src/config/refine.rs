@@ -21,8 +21,13 @@ const ENGINES: [(&str, EngineChoice); 5] = [
 ];
 const FORMATS: [(&str, PixelFormat); 2] = [("z16", PixelFormat::Z16), ("depth_f32", PixelFormat::DepthF32)];
 
-/// Reads `[camera.refine]` of a camera that is asked for `streams`; `None` when there is no such table.
-pub(super) fn read(camera: &Section<'_, '_>, base: &Path, streams: &[WantedStream]) -> Option<RefineConfig> {
+/// Reads `[camera.refine]` of a camera that is asked for `streams` and whose depth is in `depth` if nothing else is said; `None` when there is no such table.
+pub(super) fn read(
+    camera: &Section<'_, '_>,
+    base: &Path,
+    streams: &[WantedStream],
+    depth: &str,
+) -> Option<RefineConfig> {
     let present = camera.has("refine");
     let s = camera.table("refine", TABLE);
     let d = RefineConfig::default();
@@ -48,6 +53,14 @@ pub(super) fn read(camera: &Section<'_, '_>, base: &Path, streams: &[WantedStrea
         record: s.or("record", d.record, |_| Ok(())),
         align: s.or("align", d.align, |_| Ok(())),
         is_aligned: s.or("is_aligned", d.is_aligned, |_| Ok(())),
+        depth: s.or("depth", depth.to_owned(), |name: &String| {
+            let starts = name == "depth" || name.starts_with("depth_");
+            if starts {
+                Ok(())
+            } else {
+                Err(format!("is \"{name}\"; streams of depth are called depth or depth_…"))
+            }
+        }),
     };
     let at = s.at;
     if present && config.engine == EngineChoice::Fill && config.model.is_some() {
@@ -65,7 +78,7 @@ pub(super) fn read(camera: &Section<'_, '_>, base: &Path, streams: &[WantedStrea
         return None;
     }
     // Both are needed; where no stream is asked for, the camera gives all that it has.
-    for needed in ["color", "depth"] {
+    for needed in ["color", config.depth.as_str()] {
         if !streams.is_empty() && streams.iter().all(|w| w.request.stream.as_str() != needed) {
             let what = format!(
                 "{TABLE} needs the stream \"{needed}\", which is not among its [[camera.stream]] tables; add it"

@@ -49,7 +49,11 @@ pub(super) fn read(report: &Report<'_>, text: &str, path: Option<&Path>) -> Opti
     top.finish();
     let text = text.to_owned();
     let path = path.map(Path::to_owned);
-    let cameras = cameras.into_iter().collect::<Option<Vec<_>>>()?;
+    let mut cameras = cameras.into_iter().collect::<Option<Vec<_>>>()?;
+    // Networks run in the library that is named once for all of them.
+    for stereo in cameras.iter_mut().filter_map(|c| c.stereo.as_mut()) {
+        stereo.library.clone_from(&cdm.library);
+    }
     Some(RigConfig { rig: rig?.value, bus, sets, recording, control, supervisor, cdm, cameras, text, path })
 }
 

@@ -8,6 +8,7 @@ use depthrig_drivers::files::FilesBackend;
 use depthrig_drivers::kinect::{self, KinectConfig};
 use depthrig_drivers::realsense::config::TransportChoice;
 use depthrig_drivers::usb::health::{self, RULE_CURE};
+use depthrig_drivers::zed::replay::ReplayBackend;
 use depthrig_drivers::{Backend, Result, StreamProfile, choose_profiles, synthetic};
 use serde::Serialize;
 
@@ -64,7 +65,10 @@ pub(super) struct Wanted<'c> {
 /// What of a plan is read from the rig file alone; `None` for cameras that are on no bus.
 fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
     match backend {
-        BackendConfig::Synthetic(_) | BackendConfig::Files(_) | BackendConfig::External(_) => None,
+        BackendConfig::Synthetic(_)
+        | BackendConfig::Files(_)
+        | BackendConfig::ZedReplay(_)
+        | BackendConfig::External(_) => None,
         BackendConfig::Realsense(c) => Some(Wanted {
             serial: c.serial.as_deref(),
             port: c.port.as_deref(),
@@ -96,6 +100,14 @@ fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
             libusb: false,
             needs_calibration: true,
         }),
+    }
+}
+
+/// What the camera gives when the rig runs: its own streams, and those that are made of its eyes.
+fn with_stereo(camera: &CameraConfig, device: &str, own: Vec<StreamProfile>) -> Result<Vec<StreamProfile>> {
+    match &camera.stereo {
+        Some(stereo) => depthrig_drivers::stereo::offered(device, &own, &stereo.options()),
+        None => Ok(own),
     }
 }
 
@@ -136,7 +148,9 @@ pub(super) fn plan_device(
         plan.port = Some(device.port.clone());
         check_device(device, wanted, &mut findings);
         if !device.profiles.is_empty() {
-            match choose_profiles(&device.describe(), &device.profiles, &camera.streams) {
+            let name = device.describe();
+            let offered = with_stereo(camera, &name, device.profiles.clone());
+            match offered.and_then(|all| choose_profiles(&name, &all, &camera.streams)) {
                 Ok(chosen) => set_streams(&mut plan, camera, chosen, device.usb.is_some(), &mut findings),
                 Err(e) => findings.push(mode_missing(device, &e.to_string())),
             }
@@ -172,6 +186,10 @@ fn plan_made(camera: &CameraConfig) -> Planned {
                 let device = FilesBackend::new(c.clone()).open(None)?;
                 (format!("pictures of {}", device.info().port), device.profiles().to_vec())
             }
+            BackendConfig::ZedReplay(c) => {
+                let device = ReplayBackend::new(c.clone()).open(None)?;
+                (format!("recording {}", device.info().port), device.profiles().to_vec())
+            }
             // Devices are planned with what is attached.
             BackendConfig::Realsense(_)
             | BackendConfig::L515(_)
@@ -182,7 +200,7 @@ fn plan_made(camera: &CameraConfig) -> Planned {
         })
     };
     let chosen = profiles().and_then(|(device, all)| {
-        let chosen = choose_profiles(&device, &all, &camera.streams)?;
+        let chosen = choose_profiles(&device, &with_stereo(camera, &device, all)?, &camera.streams)?;
         Ok((device, chosen))
     });
     let mut findings = Vec::new();
@@ -226,7 +244,7 @@ pub(super) fn set_streams(
     let captured: Vec<_> = captured.collect();
     let with_depth = captured.iter().any(|(p, _)| p.stream.as_str() == "depth");
     for (p, recorded) in captured.into_iter().chain(made) {
-        let on_usb = on_usb && !crate::stage::is_derived(&p.stream);
+        let on_usb = on_usb && !camera.is_made_here(&p.stream);
         let bits_per_s = match plan.backend {
             kinect::NAME => kinect::live::wire_bits_per_s(&p, with_depth),
             _ => super::wire_bits_per_s(&p),

@@ -81,7 +81,8 @@ impl Assembly {
         for camera in &self.inner.cameras {
             let state = camera.state();
             let known = self.inputs.iter().filter(|i| Arc::ptr_eq(&i.camera, camera)).count();
-            for stream in state.streams.iter().skip(known) {
+            let at_once = state.streams.iter().filter(|s| !camera.config.joins_late(&s.id.stream));
+            for stream in at_once.skip(known) {
                 let Some(subscriber) = stream.books().reader.take() else {
                     break; // its channel is just being made
                 };

@@ -1,4 +1,7 @@
-//! Refined depth in recordings: frames that are made of others join the set that their source is in.
+//! Refined depth, and depth by stereo, in recordings: frames that are made of others join the set that their source is in.
+//!
+//! Stereo: a frame of a pair joins the set that the pair's rectified colour (or the left eye, or the right one) is in; when
+//! that pair was skipped, the nearest that was not. The rest is as for refined depth, of which this speaks:
 //!
 //! A refined frame is later than its set by what refining takes. The set goes out on the channel of sets without waiting.
 //! On its way to the recorder it waits until the refined frame of each camera that records one is there or is known not
@@ -12,10 +15,11 @@
 use super::Inner;
 use crate::camera::{Camera, State};
 use crate::config::RigConfig;
-use crate::status::{RefineState, SetAccount};
+use crate::status::{CameraState, RefineState, SetAccount};
 use crate::stream::Stream;
 use core::time::Duration;
 use depthrig_bus::{Frame, HostTime, StreamId, Subscriber};
+use depthrig_drivers::stereo::{COLOR, EYES};
 use depthrig_recorder::RecorderOptions;
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -61,6 +65,8 @@ struct Joint {
     camera: Arc<Camera>,
     depth: StreamId,
     near_ns: i64,
+    /// It is made of a pair of eyes by the camera itself, so its times are those of the pair to the nanosecond.
+    of_pair: bool,
     subscriber: Subscriber,
     waiting: VecDeque<Frame>,
     account: SetAccount,
@@ -84,6 +90,7 @@ pub struct Joints {
     held: VecDeque<Held>,
     max_sets: usize,
     max_age: Duration,
+    set_ns: i64,
 }
 
 impl Joints {
@@ -96,23 +103,37 @@ impl Joints {
         let taken = ASSEMBLING + config.recording.queue_sets + workers;
         let max_sets = MAX_HELD.saturating_sub(taken).clamp(1, MAX_SETS);
         let max_age = Duration::from_secs_f64(max_sets as f64 / config.sets.rate_hz).min(PATIENCE / 2);
-        Self { streams: Vec::new(), held: VecDeque::new(), max_sets, max_age }
+        Self {
+            streams: Vec::new(),
+            held: VecDeque::new(),
+            max_sets,
+            max_age,
+            set_ns: (1e9 / config.sets.rate_hz) as i64,
+        }
     }
 
     /// Takes in the streams that `camera` makes, once they are there.
     pub fn find(&mut self, camera: &Arc<Camera>, state: &State) {
-        for stream in &state.made {
-            let Some(subscriber) = stream.books().reader.take() else { continue };
-            let Some(depth) = state.streams.iter().find(|s| s.id.stream.as_str() == "depth") else {
+        let source = |name: &str| state.streams.iter().find(|s| s.id.stream.as_str() == name).map(|s| &s.id);
+        let late = state.streams.iter().filter(|s| camera.config.joins_late(&s.id.stream));
+        for (stream, of_pair) in late.map(|s| (s, true)).chain(state.made.iter().map(|s| (s, false))) {
+            let depth = camera.config.refine.as_ref().map_or("depth", |r| r.depth.as_str());
+            let depth = Some(depth).filter(|_| !of_pair).and_then(source);
+            // Depth that is made of a pair is in no set itself; what is made of it goes by the pair.
+            let depth = depth.filter(|id| !camera.config.joins_late(&id.stream));
+            let Some(depth) = depth.or_else(|| [COLOR, EYES[0], EYES[1]].into_iter().find_map(source)) else {
                 continue;
             };
+            let Some(subscriber) = stream.books().reader.take() else { continue };
+            let period_ns = stream.profile.period_ns() as i64;
             self.streams.push(Joint {
-                near_ns: near_ns(stream.profile.period_ns() as i64),
+                near_ns: near_ns(if of_pair { period_ns.max(self.set_ns) } else { period_ns }),
+                of_pair,
                 stream: Arc::clone(stream),
                 camera: Arc::clone(camera),
-                depth: depth.id.clone(),
+                depth: depth.clone(),
                 subscriber,
-                waiting: VecDeque::with_capacity(MAX_WAITING + 1),
+                waiting: VecDeque::with_capacity(MAX_HELD + 1),
                 account: SetAccount::default(),
                 before: None,
             });
@@ -126,7 +147,8 @@ impl Joints {
 
     /// Reads what came.
     pub fn read(&mut self) {
-        self.streams.iter_mut().for_each(Joint::read);
+        let held = &self.held;
+        self.streams.iter_mut().for_each(|j| j.read(held));
     }
 
     /// Lets a set wait.
@@ -173,11 +195,24 @@ impl Joints {
 }
 
 impl Joint {
-    fn read(&mut self) {
+    /// Reads what came; frames that a set still waits for are kept, however many came after them.
+    fn read(&mut self, held: &VecDeque<Held>) {
         while let Ok(Some(frame)) = self.subscriber.try_next() {
             self.before.get_or_insert(frame.header().sequence - 1);
             self.waiting.push_back(frame);
-            self.keep(MAX_WAITING);
+            let awaited = |f: &Frame| {
+                let at = f.header().capture_time_ns;
+                held.iter().any(|set| set.moment_of(&self.depth) == at)
+            };
+            // From the oldest on, so that times keep rising.
+            while self.waiting.len() > MAX_WAITING {
+                let Some(i) = self.waiting.iter().position(|f| !awaited(f)).filter(|_| self.of_pair) else {
+                    break;
+                };
+                self.waiting.remove(i);
+                self.account.decimated += 1;
+            }
+            self.keep(if self.of_pair { MAX_HELD - MAX_WAITING } else { MAX_WAITING });
         }
     }
 
@@ -193,9 +228,18 @@ impl Joint {
         let stamps = self.waiting.iter().map(|f| f.header().capture_time_ns);
         let runs = || {
             let state = self.camera.state();
+            if self.of_pair {
+                return matches!(state.phase, CameraState::Opening | CameraState::Streaming);
+            }
             state.lane.as_ref().is_some_and(|lane| lane.state() == RefineState::Running)
         };
-        match nearest(stamps, set.moment_of(&self.depth), self.near_ns) {
+        let moment = set.moment_of(&self.depth);
+        let found = if self.of_pair {
+            of_pair(stamps, moment, self.near_ns)
+        } else {
+            nearest(stamps, moment, self.near_ns)
+        };
+        match found {
             Found::Coming if !runs() => Found::Never,
             found => found,
         }
@@ -235,9 +279,27 @@ fn nearest(stamps: impl Iterator<Item = i64>, moment: i64, near_ns: i64) -> Foun
     }
 }
 
+/// The same for frames that are of `moment` itself, or whose pair was skipped: then one later than it comes.
+fn of_pair(stamps: impl Iterator<Item = i64> + Clone, moment: i64, near_ns: i64) -> Found {
+    if let Some(i) = stamps.clone().position(|stamp| stamp == moment) {
+        return Found::At(i);
+    }
+    let later = stamps.clone().any(|stamp| stamp > moment);
+    if later { nearest(stamps, moment, near_ns) } else { Found::Coming }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn depth_of_a_pair_is_that_pairs_unless_it_was_skipped() {
+        let find = |stamps: &[i64], moment| of_pair(stamps.iter().copied(), moment, 90);
+        assert_eq!(find(&[967], 1000), Found::Coming, "the one before is not it");
+        assert_eq!(find(&[967, 1000, 1033], 1000), Found::At(1));
+        assert_eq!(find(&[967, 1060], 1000), Found::At(0), "it was skipped");
+        assert_eq!(find(&[800, 1200], 1000), Found::Never);
+    }
 
     #[test]
     fn a_set_takes_its_own_refined_frame_waits_for_it_and_knows_when_it_will_not_come() {

@@ -169,7 +169,7 @@ fn strips_are_both_eyes() {
 fn a_cut_file_gives_what_is_whole() {
     let dir = folder();
     let path = dir.path().join("a.svo2");
-    let whole = MadeSvo::strips(VGA, 8).build();
+    let whole = MadeSvo { per_chunk: 1, ..MadeSvo::strips(VGA, 8) }.build();
     let mut most = 0;
     for part in [30, 60, 90] {
         std::fs::write(&path, &whole[..whole.len() * part / 100]).unwrap();

@@ -1,7 +1,8 @@
 //! The MCAP container of an SVO2 file: which messages are there, and one after the other.
 //!
 //! The file is walked once by the heads of its records, so that a cut end costs what is cut and nothing else. Chunks are
-//! then read one record at a time by the `mcap` crate, which checks their checksums. Memory stays that of one message.
+//! then read one record at a time by the `mcap` crate, which checks their checksums first. Memory stays that of
+//! one chunk.
 //! The crate's own reader of the index at the end is not used: a file that was not finished has none.
 
 use crate::bytes::{u16_at, u32_at, u64_at};
@@ -19,7 +20,7 @@ const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 const HEAD: u64 = 9;
 /// Bytes of a message before its data: channel, sequence and two times.
 const MESSAGE_HEAD: usize = 22;
-/// No pair of pictures is longer: 2208x1242 twice in YUYV has 22 MB.
+/// No pair of pictures is longer, nor a chunk: 2208x1242 twice in YUYV has 22 MB.
 const MAX_RECORD: u64 = 256 << 20;
 /// The longest record whose contents are read while walking.
 const MAX_SMALL: u64 = 16 << 20;
@@ -308,7 +309,7 @@ impl Reading {
         let options = LinearReaderOptions::default()
             .with_skip_start_magic(true)
             .with_skip_end_magic(true)
-            .with_validate_chunk_crcs(true)
+            .with_prevalidate_chunk_crcs(true)
             .with_record_length_limit(MAX_RECORD as usize);
         Self { reader: LinearReader::new_with_options(options), position: stretch.begin, end: stretch.end }
     }
