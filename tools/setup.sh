@@ -26,6 +26,8 @@ for part in "$@"; do
         need python3-venv python3 -c 'import ensurepip, venv'
         need nodejs command -v node
         need npm command -v npm
+        # Decodes H.264 of SVO2 recordings; loaded at run time.
+        need libopenh264-7 eval 'ldconfig -p | grep -q libopenh264.so || compgen -G "/usr/lib/*/libopenh264.so*"'
         ;;
     vm)
         need qemu-system-x86 command -v qemu-system-x86_64

@@ -262,6 +262,10 @@ impl Supervisor {
         self.heard.resize(state.streams.len(), unheard);
         let mut longest = None;
         for (stream, heard) in state.streams.iter().zip(&mut self.heard) {
+            // How long matching takes says nothing of the device.
+            if self.camera.config.joins_late(&stream.id.stream) {
+                continue;
+            }
             let captured = stream.books().captured;
             // A camera that was opened again starts with all its time.
             if heard.captured != captured || heard.at < self.opened_at {

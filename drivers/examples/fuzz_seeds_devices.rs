@@ -18,6 +18,7 @@ use depthrig_drivers::realsense::protocol::metadata::{
     build_record,
 };
 use depthrig_drivers::realsense::protocol::tables::{Coefficients, Pinhole, RectifiedItem, RgbTable, SIZES};
+use depthrig_drivers::zed::replay::made::MadeSvo;
 use std::path::{Path, PathBuf};
 
 const TURNED: [f32; 9] = [0.8, -0.6, 0.0, 0.6, 0.8, 0.0, 0.0, 0.0, 1.0];
@@ -153,6 +154,12 @@ fn main() {
     put(&root, "realsense_preset", "near", preset.as_bytes());
     let every = r#"{"groups": {"census_radius": [9, 9], "ae_control": [400], "hdad": [26.0, 800.0, 0], "rsm": [0, 3.8, 1, 71]}}"#;
     put(&root, "realsense_preset", "groups", every.as_bytes());
+
+    let svo = MadeSvo { per_chunk: 2, ..MadeSvo::strips((16, 16), 3) };
+    put(&root, "zed_svo2", "chunks", &svo.build());
+    put(&root, "zed_svo2", "no_index", &MadeSvo { indexed: false, ..svo.clone() }.build());
+    put(&root, "zed_svo2", "loose", &MadeSvo { chunked: false, ..svo }.build());
+    put_found(&root, "zed_svo2", "h264", &MadeSvo::h264((16, 16), 4).build());
 }
 
 /// A seed, which must reach something.

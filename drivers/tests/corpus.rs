@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 use depthrig_drivers::fuzzing::realsense;
+use depthrig_drivers::zed;
 use std::path::{Path, PathBuf};
 
 /// Changes an input by up to four bytes, by cutting it, or by repeating a part of it.
@@ -85,4 +86,9 @@ fn realsense_l515() {
 #[test]
 fn realsense_preset() {
     run("realsense_preset", realsense::preset);
+}
+
+#[test]
+fn svo2_files_of_a_zed() {
+    run("zed_svo2", zed::replay::svo2::fuzz);
 }

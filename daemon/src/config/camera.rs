@@ -52,12 +52,9 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
     let pose = pose(&s);
     let wanted = streams(&s);
     let streams: Vec<_> = wanted.iter().map(|w| w.request.clone()).collect();
-    let stereo = stereo::read(&s, base);
-    if stereo.is_some() && !matches!(driver, None | Some(Driver::Zed | Driver::External)) {
-        let what =
-            format!("{} is for cameras with streams \"left\" and \"right\": zed, external", stereo::TABLE);
-        s.problem(s.at_key("stereo"), what);
-    }
+    // Those that may have a left and a right eye.
+    let has_eyes = matches!(driver, Some(Driver::Zed | Driver::External));
+    let stereo = if has_eyes { stereo::read(&s, base) } else { None };
     let depth = stereo.as_ref().map_or_else(|| "depth".to_owned(), StereoConfig::first_depth);
     let refine = refine::read(&s, base, &wanted, &depth);
     let record = record(&s, &streams, refine.is_some());

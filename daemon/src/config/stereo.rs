@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// The table.
-pub(super) const TABLE: &str = "[camera.stereo]";
+const TABLE: &str = "[camera.stereo]";
 /// Farther than a camera of this size sees anything.
 const FARTHEST_M: f64 = 1000.0;
 

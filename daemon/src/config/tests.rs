@@ -336,6 +336,79 @@ fn an_attached_kinect_is_set_as_the_file_says() {
 }
 
 #[test]
+fn a_recording_of_a_zed_and_its_stereo_are_set_as_the_file_says() {
+    use crate::zed_replay::Mode;
+    use depthrig_calib::stereo::Preset;
+    let rig = parse(
+        r#"
+        rig = "r"
+        [cdm]
+        library = "libonnxruntime.so"
+        [[camera]]
+        name = "a"
+        backend = "zed"
+        input = "recordings/a.svo2"
+        calibration = "SN5.conf"
+        serial = "5"
+        rate_hz = 5
+        loop = true
+        [camera.stereo]
+        modes = ["performance", "neural"]
+        threads = 2
+        min_depth_m = 0.3
+        max_depth_m = 8
+        disparity = true
+        every_pair = true
+        network = "net.onnx"
+        [camera.refine]
+        [[camera]]
+        name = "b"
+        backend = "zed"
+        [camera.stereo]
+        [camera.refine]
+        depth = "depth_quality"
+        [[camera.stream]]
+        name = "color"
+        [[camera.stream]]
+        name = "depth_quality"
+        "#,
+    )
+    .unwrap();
+    let BackendConfig::ZedReplay(a) = &rig.cameras[0].backend else { panic!("{:?}", rig.cameras[0].backend) };
+    let b = ZedReplaySettings {
+        input: "/rigs/recordings/a.svo2".into(),
+        serial: Some("5".into()),
+        calibration: depthrig_drivers::zed::CalibrationFile::At("/rigs/SN5.conf".into()),
+        rate_hz: Some(5.0),
+        looped: true,
+    };
+    assert_eq!((a, rig.cameras[0].backend.name()), (&b, "zed"));
+    let wanted = StereoConfig {
+        modes: vec![Mode::Preset(Preset::Performance), Mode::Neural],
+        threads: 2,
+        range_m: (0.3, 8.0),
+        disparity: true,
+        every_pair: true,
+        network: Some("/rigs/net.onnx".into()),
+        library: Some("/rigs/libonnxruntime.so".into()),
+    };
+    assert_eq!(rig.cameras[0].stereo, Some(wanted.clone()));
+    let made = ["color", "depth_performance", "confidence_performance", "disparity_performance"];
+    assert_eq!(wanted.streams()[..4], made);
+    assert_eq!(rig.cameras[0].refine.as_ref().unwrap().depth, "depth_performance", "the first mode");
+    assert_eq!(rig.cameras[1].refine.as_ref().unwrap().depth, "depth_quality");
+    assert_eq!(
+        rig.cameras[1].stereo,
+        Some(StereoConfig { library: wanted.library, ..StereoConfig::default() })
+    );
+    // What comes late is in no set that is waited for; without anything else there would be none.
+    let late = |camera: usize, name: &str| rig.cameras[camera].joins_late(&StreamName::new(name).unwrap());
+    assert!(
+        late(0, "depth_neural") && late(1, "confidence_quality") && !late(0, "color") && !late(0, "left")
+    );
+}
+
+#[test]
 fn angles_turn_about_x_then_y_then_z() {
     let pose = |rpy: &str| {
         let text = format!(
@@ -413,6 +486,17 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (second("name = \"b\"\nbackend = \"zed\"\nexposure_percent = 101"), "8:20: \"exposure_percent\" in [[camera]] \"b\" is 101; it must be within 0 and 100"),
         (second("name = \"b\"\nbackend = \"zed\"\nauto_exposure = true\ngain_percent = 16"), "9:16: \"gain_percent\" in [[camera]] \"b\" cannot be set while auto_exposure is true"),
         (second("name = \"b\"\nbackend = \"zed\"\ncalibration = \"\""), "8:15: \"calibration\" in [[camera]] \"b\" is empty"),
+        (second("name = \"b\"\nbackend = \"zed\"\nstream = [{ name = \"depth_quality\" }]"), "it has: left, right; depth and rectified colour need [camera.stereo]"),
+        (second("name = \"b\"\nbackend = \"zed\"\nstereo = { modes = [\"best\"] }"), "there is no mode \"best\"; it is one of: performance, ultra, quality, neural"),
+        (second("name = \"b\"\nbackend = \"zed\"\nstereo = { modes = [] }"), "is empty; name at least one mode"),
+        (second("name = \"b\"\nbackend = \"zed\"\nstereo = { modes = [\"ultra\", \"ultra\"] }"), "has \"ultra\" twice; keep one"),
+        (second("name = \"b\"\nbackend = \"zed\"\nstereo = { modes = [\"neural\"] }"), "needs network = \"FILE.onnx\""),
+        (second("name = \"b\"\nbackend = \"zed\"\nstereo = { network = \"a.onnx\" }"), "has no use without the mode \"neural\""),
+        (second("name = \"b\"\nbackend = \"zed\"\nstereo = { min_depth_m = 9, max_depth_m = 3 }"), "leaves nothing: from 9 m to 3 m"),
+        (second("name = \"b\"\nbackend = \"zed\"\nstereo = { every_pair = true }"), "every_pair = true is for a recording (input)"),
+        (second("name = \"b\"\nbackend = \"zed\"\ncalibration = \"none\"\nstereo = { }"), "stereo needs the factory calibration"),
+        (second("name = \"b\"\nbackend = \"zed\"\ninput = \"x\"\nled = true"), "is for a camera that is attached, and input plays a recording"),
+        (second("name = \"b\"\nbackend = \"realsense\"\nstereo = { }"), "unknown key \"stereo\" in [[camera]] \"b\""),
         (second("name = \"b\"\nbackend = \"zed\"\nstream = [{ name = \"depth\" }]"), "8:11: a ZED has no stream \"depth\"; it has: left, right"),
         (second("name = \"b\"\nbackend = \"zed\"\nmodel = \"zed2i\""), "only another backend has it"),
         (second("name = \"b\"\nbackend = \"kinect\"\ndepth_mode = \"wfov\""), "cannot be \"wfov\"; did you mean \"wfov_"),

@@ -8,12 +8,16 @@ use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::PixelFormat;
 use depthrig_calib::stereo::{DisparityMap, Gray, Matcher, StereoPair, depth_from_disparity};
-use depthrig_calib::{Rectifier, View};
+use depthrig_calib::{EyeOrder, Rectifier, View, eye_order};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
 /// What the threads are given below those that capture and those that somebody waits for.
 const NICE: i32 = 10;
+/// Pairs whose eyes must look exchanged, one after the other, before it is believed.
+const BELIEVED: u32 = 3;
+/// Pairs from one look at the order of the eyes to the next, after the first.
+const LOOK_EVERY: u64 = 100;
 /// Results of one mode that may be on their way at once.
 const PRODUCTS: usize = 2;
 
@@ -56,6 +60,8 @@ pub(super) enum Event {
     Skipped(usize, u64),
     /// Mode number .0 failed at the pair .1.
     Failed(usize, u64, String),
+    /// The eyes are exchanged.
+    Swapped,
 }
 
 /// A box for the newest of what comes.
@@ -156,6 +162,8 @@ impl Crew {
             events: send.clone(),
             pool: Vec::new(),
             most: matchers.len() + 4,
+            pairs: 0,
+            swapped: 0,
         };
         spawn(camera, "rectify", move || rectify.run())?;
         let mut back = Vec::new();
@@ -250,6 +258,9 @@ struct Rectify {
     /// All views that there are; those that nobody else has are free.
     pool: Vec<Arc<Views>>,
     most: usize,
+    pairs: u64,
+    /// Pairs in a row whose eyes look exchanged.
+    swapped: u32,
 }
 
 impl Rectify {
@@ -258,6 +269,9 @@ impl Rectify {
             let Some(mut views) = self.free() else { return };
             if let Some(v) = Arc::get_mut(&mut views) {
                 self.fill(&raw, v);
+            }
+            if self.look(&views) && self.events.send(Event::Swapped).is_err() {
+                return;
             }
             // When the camera is given up, nobody takes it any more.
             let _ = self.spare.try_send(raw);
@@ -273,6 +287,20 @@ impl Rectify {
                 return;
             }
         }
+    }
+
+    /// Looks at the order of the eyes now and then; whether they are exchanged.
+    fn look(&mut self, views: &Views) -> bool {
+        self.pairs += 1;
+        if self.swapped == 0 && self.pairs % LOOK_EVERY != 1 {
+            return false;
+        }
+        let (width, height) = self.rectifier.size();
+        match eye_order(&views.left, &views.right, (width as usize, height as usize)) {
+            EyeOrder::Swapped => self.swapped += 1,
+            _ => self.swapped = 0,
+        }
+        self.swapped == BELIEVED
     }
 
     /// Views that nobody has. There always are some: each mode has one at most that it works on, one waits for all of

@@ -4,7 +4,7 @@ use super::crew::{Crew, Event, Product, Raw, Views};
 use super::ledger::{Ledger, Step};
 use super::{COLOR, PREFIXES, StereoOptions};
 use crate::clock::ClockQuality;
-use crate::{FrameMeta, FrameSink, Poll, Result, Stream, StreamProfile};
+use crate::{Error, ErrorKind, FrameMeta, FrameSink, Poll, Result, Stream, StreamProfile};
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime};
 
@@ -52,6 +52,8 @@ struct Pairing {
     /// `color`, then the modes.
     groups: Vec<Group>,
     crew: Crew,
+    /// The pictures show that the eyes are exchanged.
+    swapped: bool,
 }
 
 impl StereoStream {
@@ -75,8 +77,19 @@ impl StereoStream {
         let near_ns = inner.profiles().get(eyes[0]).map_or(0, |p| p.period_ns() as i64 / 4);
         let raw = crew.blank();
         let lent: Vec<_> = own.iter().map(|_| Vec::new()).collect();
-        let pairing =
-            Pairing { name, eyes, own, lent, raw, have: [None; 2], near_ns, ticket: 0, groups, crew };
+        let pairing = Pairing {
+            name,
+            eyes,
+            own,
+            lent,
+            raw,
+            have: [None; 2],
+            near_ns,
+            ticket: 0,
+            groups,
+            crew,
+            swapped: false,
+        };
         Self { profiles, inner, pairing, every_pair: options.every_pair, ended: false }
     }
 }
@@ -114,6 +127,14 @@ impl Stream for StereoStream {
                 came = true;
                 self.pairing.take(e, sink);
                 event = self.pairing.crew.next(Duration::ZERO);
+            }
+            if self.pairing.swapped {
+                let what = format!(
+                    "{}: its pictures show that left and right are swapped: what is near lies further right in the right one. \
+                     Exchange the halves of the images, or the names of the streams",
+                    self.pairing.name
+                );
+                return Err(Error::new(ErrorKind::BadInput, what));
             }
             if came || deadline.from_now().is_zero() {
                 let over = self.ended && self.pairing.open() == 0 && !came;
@@ -206,6 +227,7 @@ impl Pairing {
                     group.fail(ticket, DropReason::QueueFull, sink);
                 }
             }
+            Event::Swapped => self.swapped = true,
             Event::Failed(mode, ticket, why) => {
                 if let Some(group) = self.groups.get_mut(mode + 1) {
                     group.failures += 1;

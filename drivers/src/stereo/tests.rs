@@ -33,6 +33,7 @@ struct Made {
     profiles: Vec<StreamProfile>,
     shots: Vec<Shot>,
     pause: Duration,
+    swapped: bool,
 }
 
 impl Made {
@@ -52,7 +53,7 @@ impl Made {
         };
         let info = DeviceInfo { backend: "made", model: "Made".into(), ..DeviceInfo::default() };
         let profiles = vec![profile("left", 0.0), profile("right", BASELINE)];
-        Self { info, profiles, shots: shots.to_vec(), pause: Duration::ZERO }
+        Self { info, profiles, shots: shots.to_vec(), pause: Duration::ZERO, swapped: false }
     }
 }
 
@@ -68,7 +69,15 @@ impl Device for Made {
     fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
         let profiles = choose_profiles("made", &self.profiles, requests)?;
         let gates = profiles.iter().enumerate().map(|(i, p)| Gate::new(i, p)).collect();
-        Ok(Box::new(MadeStream { profiles, gates, shots: self.shots, at: 0, sequence: 0, pause: self.pause }))
+        Ok(Box::new(MadeStream {
+            profiles,
+            gates,
+            shots: self.shots,
+            at: 0,
+            sequence: 0,
+            pause: self.pause,
+            swapped: self.swapped,
+        }))
     }
 }
 
@@ -79,6 +88,7 @@ struct MadeStream {
     at: usize,
     sequence: u64,
     pause: Duration,
+    swapped: bool,
 }
 
 /// A picture of noise, `shift` pixels to the left.
@@ -111,7 +121,7 @@ impl Stream for MadeStream {
             let picture = match shot {
                 Shot::Gap(_) => continue,
                 Shot::Only(eye) if eye != i => continue,
-                Shot::Wall(d) if i == 1 => noise(format, d),
+                Shot::Wall(d) if (i == 1) != self.swapped => noise(format, d),
                 _ => noise(format, 0),
             };
             let arrival = HostTime::from_ns(ticks as i64 + 1000);
@@ -410,6 +420,27 @@ fn a_mode_that_hangs_is_left_behind() {
     assert!(sink.0.captured.get(depth).copied().unwrap_or(0) < 40, "what came after it is not decided");
     drop(stream);
     drop(release);
+}
+
+#[test]
+fn eyes_that_are_exchanged_are_found_in_the_pictures() {
+    let mut made = Made::new(PixelFormat::Yuyv, &[Shot::Wall(12); 200]);
+    // The pictures of a wall, but each eye's under the other's name: the pose is that of eyes in order.
+    made.swapped = true;
+    let mut stream = wrap(Box::new(made), options(presets())).unwrap().start(&[]).unwrap();
+    let mut sink = Strict::default();
+    let said = loop {
+        match stream.poll(Duration::from_millis(20), &mut sink) {
+            Ok(Poll::End) => panic!("nobody noticed"),
+            Ok(_) => {}
+            Err(e) => break e,
+        }
+    };
+    assert!(
+        said.kind() == ErrorKind::BadInput && said.to_string().contains("left and right are swapped"),
+        "{said}"
+    );
+    // In their order nothing is said, as the other tests show; there the walls are the same.
 }
 
 #[test]

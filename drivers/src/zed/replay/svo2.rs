@@ -162,6 +162,46 @@ fn first_picture(
     }))
 }
 
+/// What the fuzz target `zed_svo2` calls, and the test that runs its corpus: how many pairs were decoded.
+///
+/// # Panics
+/// When more pairs come than the file says, or a picture has another size than its strips.
+#[doc(hidden)]
+pub fn fuzz(bytes: &[u8]) -> u64 {
+    const MOST: u64 = 64;
+    const SMALL: usize = 1 << 16;
+    let file = Box::new(std::io::Cursor::new(bytes.to_vec()));
+    let _ = Payload::parse(bytes);
+    let Ok(mut container) = Container::new(file, bytes.len() as u64, Path::new("fuzz")) else { return 0 };
+    if let Ok(header) = Header::parse(container.header()) {
+        let _ = (header.describe(), header.serial());
+    }
+    let (mut message, mut came, mut decoded) = (Message::default(), 0, 0);
+    while came < MOST && container.next(&mut message).unwrap_or(false) {
+        came += 1;
+        assert!(came <= container.frames(), "more pairs than there are");
+        if let Payload::Strips(parts) = Payload::parse(&message.data)
+            && message.damaged.is_none()
+            && let Some((width, height)) =
+                strips::size(&parts).filter(|(w, h)| (*w as usize) * (*h as usize) <= SMALL)
+        {
+            let eye = vec![0; width as usize * height as usize];
+            let mut pair = Pair { left: eye.clone(), right: eye, ..Pair::default() };
+            decoded += u64::from(Strips::new((width, height)).decode(&parts, &mut pair).is_ok());
+        }
+    }
+    // From the middle on there are as many as were left.
+    let half = container.frames() / 2;
+    if container.frames() <= MOST && container.seek(half).is_ok() {
+        let mut rest = 0;
+        while rest < MOST && container.next(&mut message).unwrap_or(false) {
+            rest += 1;
+        }
+        assert!(rest <= container.frames() - half, "{rest} pairs from {half} on");
+    }
+    decoded
+}
+
 impl Source for Svo2 {
     fn info(&self) -> &SourceInfo {
         &self.info
