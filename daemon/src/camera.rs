@@ -26,6 +26,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// How long an opening may take before its thread is given up for hung.
 const OPEN_PATIENCE: Duration = Duration::from_secs(15);
+/// How long a recording may be silent that waits for its modes.
+const WAITS_FOR_MODES: Duration = Duration::from_secs(60);
 /// A stalled camera is opened again after this many stall times without a frame.
 const STALLS_UNTIL_RESTART: u32 = 4;
 
@@ -280,6 +282,10 @@ impl Supervisor {
     }
 
     fn stall_time(&self) -> Duration {
+        // A recording that waits for its slowest mode is silent for as long as that takes.
+        if self.camera.config.stereo.as_ref().is_some_and(|s| s.every_pair) {
+            return WAITS_FOR_MODES;
+        }
         let slowest = self.camera.state().streams.iter().map(|s| s.profile.period_ns()).max().unwrap_or(0);
         Duration::from_secs_f64(self.shared.supervisor.stall_s).max(Duration::from_nanos(3 * slowest))
     }

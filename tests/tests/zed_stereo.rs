@@ -90,7 +90,7 @@ fn rig(input: &Path, more: &str) -> String {
 fn a_folder_of_raw_pairs_is_recorded_in_three_modes() {
     let home = Home::default();
     folder(&home.path("pairs"), 3);
-    let stereo = "[camera.stereo]\nmodes = [\"performance\", \"quality\", \"ultra\"]\nmin_depth_m = 0.6\nevery_pair = true";
+    let stereo = "[camera.stereo]\nmodes = [\"performance\", \"quality\", \"ultra\"]\nmin_depth_m = 1.0\nevery_pair = true";
     let rig = home.start(&rig(&home.path("pairs"), stereo)).unwrap();
     let last = "zed/depth_ultra";
     let delivered = |s: &depthrig_daemon::status::RigStatus, id: &str| {
@@ -104,7 +104,11 @@ fn a_folder_of_raw_pairs_is_recorded_in_three_modes() {
         ..<_>::default()
     };
     rig.control().record_start(&request).unwrap();
-    wait_until(&rig, "sets", |s| s.recording.as_ref().is_some_and(|r| r.sets >= 6));
+    // On a busy machine a mode may be too late for a set; then it is in one of the next.
+    wait_until(&rig, "each stream in recorded sets", |s| {
+        let sets = s.recording.as_ref().is_some_and(|r| r.sets >= 3);
+        sets && camera(s, "zed").streams.iter().all(|x| x.in_sets.used >= 2)
+    });
     rig.control().record_stop().unwrap();
     let summary = rig.stop();
     assert_balanced(&summary.status);
@@ -121,11 +125,10 @@ fn a_folder_of_raw_pairs_is_recorded_in_three_modes() {
     assert_eq!(names.len(), 9, "two eyes, colour, depth and confidence of three modes: {names:?}");
     assert!(streams.iter().all(|s| s.serial == "12345678"));
     let truth = truth(&calibration());
-    let (mut sets, mut whole) = (0, 0);
+    let mut frames = [0; 9];
     for set in dataset.sets(SetRange::ALL) {
         let set = set.unwrap();
-        sets += 1;
-        whole += usize::from(set.frames.len() == 9);
+        set.frames.iter().for_each(|f| frames[f.stream] += 1);
         let left = set.frames.iter().find(|f| names[f.stream] == "left").unwrap().header.capture_time_ns;
         for f in &set.frames {
             let name = &names[f.stream];
@@ -152,7 +155,7 @@ fn a_folder_of_raw_pairs_is_recorded_in_three_modes() {
             assert!(middle < 0.005 && most < 0.03, "{name}: half are within {middle}, most within {most}");
         }
     }
-    assert!(sets >= 6 && whole >= 1, "{whole} of {sets} sets have everything");
+    assert!(frames.iter().all(|n| *n >= 1), "{frames:?} of {names:?}");
     for mode in MODES {
         assert!(names.contains(&format!("depth_{mode}")) && names.contains(&format!("confidence_{mode}")));
     }
@@ -166,7 +169,7 @@ fn an_svo2_file_is_a_camera_whose_chosen_depth_is_refined() {
     let file = home.path("svo").join("a.svo2");
     std::fs::write(&file, MadeSvo::strips(SIZE, 4).build()).unwrap();
     std::fs::write(home.path("svo").join(format!("SN{}.conf", made::SERIAL)), CONF).unwrap();
-    let more = "[camera.stereo]\nmodes = [\"performance\", \"quality\"]\nmin_depth_m = 0.6\n[camera.refine]\nengine = \"fill\"\n\
+    let more = "[camera.stereo]\nmodes = [\"performance\", \"quality\"]\nmin_depth_m = 1.0\n[camera.refine]\nengine = \"fill\"\n\
                 depth = \"depth_performance\"\nrate_hz = 0\n[[camera.stream]]\nname = \"color\"\n[[camera.stream]]\nname = \"depth_performance\"";
     let rig = home.start(&rig(&file, more)).unwrap();
     let status = wait_until(&rig, "refined depth", |s| {
@@ -190,9 +193,9 @@ fn a_recording_that_cannot_be_played_stops_the_rig_with_why() {
     folder(&home.path("pairs"), 1);
     std::fs::remove_file(home.path("pairs").join("SN12345678.conf")).unwrap();
     said(
-        &rig(&home.path("pairs"), "[camera.stereo]\nmin_depth_m = 0.6"),
+        &rig(&home.path("pairs"), "[camera.stereo]\nmin_depth_m = 1.0"),
         "no calibration of its eyes at 672x376",
     );
     std::fs::write(home.path("pairs").join("SN1.conf"), CONF.replace("[STEREO]", "[STEREOS]")).unwrap();
-    said(&rig(&home.path("pairs"), "[camera.stereo]\nmin_depth_m = 0.6"), "STEREO");
+    said(&rig(&home.path("pairs"), "[camera.stereo]\nmin_depth_m = 1.0"), "STEREO");
 }

@@ -753,6 +753,7 @@ fn how_depth_is_refined_is_read_with_all_its_keys() {
         record: true,
         align: true,
         is_aligned: true,
+        depth: "depth".into(),
     };
     assert_eq!(rig.cameras[0].refine.as_ref(), Some(&written_out));
     let model = Some(RefineModel::Installed("cdm-d435".into()));
