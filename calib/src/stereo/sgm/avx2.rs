@@ -93,11 +93,10 @@ impl Lanes for Avx2 {
         }
     }
     #[inline(always)]
-    unsafe fn beside(self, other: Self) -> Self {
+    unsafe fn min_outside(self, other: Self, place: Self, span: Self) -> Self {
         unsafe {
-            let difference =
-                _mm256_or_si256(_mm256_subs_epu8(self.0, other.0), _mm256_subs_epu8(other.0, self.0));
-            Self(_mm256_cmpeq_epi8(_mm256_min_epu8(difference, _mm256_set1_epi8(1)), difference))
+            let inside = _mm256_cmpeq_epi8(_mm256_min_epu8(place.0, span.0), place.0);
+            Self(_mm256_min_epu8(self.0, _mm256_or_si256(other.0, inside)))
         }
     }
     #[inline(always)]

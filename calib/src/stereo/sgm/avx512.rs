@@ -92,11 +92,10 @@ impl Lanes for Avx512 {
         }
     }
     #[inline(always)]
-    unsafe fn beside(self, other: Self) -> Self {
+    unsafe fn min_outside(self, other: Self, place: Self, span: Self) -> Self {
         unsafe {
-            let difference =
-                _mm512_or_si512(_mm512_subs_epu8(self.0, other.0), _mm512_subs_epu8(other.0, self.0));
-            Self(_mm512_movm_epi8(_mm512_cmple_epu8_mask(difference, _mm512_set1_epi8(1))))
+            let outside = _mm512_cmpgt_epu8_mask(place.0, span.0);
+            Self(_mm512_mask_min_epu8(self.0, outside, self.0, other.0))
         }
     }
     #[inline(always)]

@@ -21,25 +21,18 @@ const EDGE: u8 = 190;
 pub struct Row {
     /// Pixels of the row.
     pub width: usize,
-    /// [`PLANES`] of the left picture, `width` apart.
+    /// [`PLANES`] of the left picture, together for each pixel.
     pub left: *const u8,
+    /// Penalties of larger steps for the four paths, together for each pixel.
+    pub large: *const u8,
     /// [`PLANES`] of the right picture, mirrored: pixel `width - 1 - k` is byte `k / n` of phase `k % n`, with `n`
-    /// vectors a pixel. Beyond the picture's left edge its first column is repeated.
-    pub right: *const u8,
+    /// vectors a pixel. Phase `n + q` is phase `q` one byte on, so that the vectors of a pixel are `reach` apart. Beyond the
+    /// picture's left edge its first column is repeated.
+    pub right: [*const u8; PLANES],
     /// Bytes of a phase.
     pub reach: usize,
     /// Penalty of a step of one disparity.
     pub small: u8,
-    /// Penalties of larger steps for the four paths, `width` apart.
-    pub large: *const u8,
-    /// Three rings of cells: the paths from the row before, each cell where its path goes on.
-    pub cells: [*mut u8; 3],
-    /// The least of each cell.
-    pub least: [*mut u8; 3],
-    /// Cells of a ring.
-    pub ring: usize,
-    /// Place of step 0 in each ring.
-    pub base: [usize; 3],
     /// Sums of the first pass.
     pub sums: *mut u8,
     /// For each vector the disparities of its lanes, then [`u8::MAX`] in lanes that are beyond the last disparity.
@@ -72,7 +65,6 @@ pub struct Winner {
 #[derive(Clone, Copy)]
 pub struct Carry<S: Lanes, const N: usize> {
     along: [S; N],
-    least: S,
     window: [[S::Keys; 2]; N],
 }
 
@@ -81,13 +73,13 @@ impl<S: Lanes, const N: usize> Carry<S, N> {
     #[inline(always)]
     pub unsafe fn new() -> Self {
         // SAFETY: as the caller promises.
-        unsafe { Self { along: [S::splat(0); N], least: S::splat(0), window: [S::no_keys(); N] } }
+        unsafe { Self { along: [S::splat(0); N], window: [S::no_keys(); N] } }
     }
 }
 
-/// What a path adds to the cost: `before` are the path's costs one pixel earlier, `least` the least of them.
+/// What a path adds to the cost: `before` are the path's costs one pixel earlier, the least of which is 0.
 #[inline(always)]
-unsafe fn step<S: Lanes, const N: usize>(before: &[S; N], least: S, small: S, large: S) -> [S; N] {
+unsafe fn step<S: Lanes, const N: usize>(before: &[S; N], small: S, large: S) -> [S; N] {
     // SAFETY: as the caller promises.
     unsafe {
         let edge = S::splat(EDGE);
@@ -96,15 +88,15 @@ unsafe fn step<S: Lanes, const N: usize>(before: &[S; N], least: S, small: S, la
         for i in 0..N {
             let lower = if i == 0 { first } else { before[i - 1] };
             let upper = if i == N - 1 { last } else { before[i + 1] };
-            more[i] = before[i].min(lower.min(upper).add(small)).sub(least).min(large);
+            more[i] = before[i].min(lower.min(upper).add(small)).min(large);
         }
         more
     }
 }
 
-/// Costs along a path, and the least of each lane.
+/// Costs along a path, less the least of them.
 #[inline(always)]
-unsafe fn grown<S: Lanes, const N: usize>(cost: &[S; N], more: &[S; N]) -> ([S; N], S) {
+unsafe fn grown<S: Lanes, const N: usize>(cost: &[S; N], more: &[S; N]) -> [S; N] {
     // SAFETY: as the caller promises.
     unsafe {
         let mut path = *cost;
@@ -113,40 +105,71 @@ unsafe fn grown<S: Lanes, const N: usize>(cost: &[S; N], more: &[S; N]) -> ([S; 
             path[i] = cost[i].add(more[i]);
             least = least.min(path[i]);
         }
-        (path, least)
+        let least = least.least_everywhere();
+        for i in 0..N {
+            path[i] = path[i].sub(least);
+        }
+        path
     }
 }
 
-/// Some steps of a row: `BACK` is the second pass.
+/// One of the three paths from the row before, through the cell `here`.
+#[inline(always)]
+unsafe fn across<S: Lanes, const N: usize>(
+    here: *mut u8,
+    cost: &[S; N],
+    (small, large): (S, S),
+    sum: &mut [S; N],
+) {
+    // SAFETY: as the caller promises.
+    unsafe {
+        let mut before = [small; N];
+        for i in 0..N {
+            before[i] = S::load(here.add(i * S::LANES));
+        }
+        let more = step(&before, small, large);
+        let path = grown(cost, &more);
+        for i in 0..N {
+            path[i].store(here.add(i * S::LANES));
+            sum[i] = sum[i].add(more[i]);
+        }
+    }
+}
+
+/// Some steps of a row: `BACK` is the second pass. Cell `s` of `cells[p]` is where path `p` from the row before goes on at
+/// step `s`: the path from behind, the one from beside, the one from ahead.
 ///
 /// # Safety
-/// The processor has what `S` needs; every pointer of `row` reaches as its comment says; nobody else writes there.
+/// The processor has what `S` needs; every pointer of `row` reaches as its comment says, and so do the cells of these
+/// steps; nobody else writes there.
 #[inline(always)]
 pub unsafe fn run<S: Lanes, const N: usize, const BACK: bool>(
     row: &Row,
     carry: &mut Carry<S, N>,
+    cells: [*mut u8; 3],
     steps: core::ops::Range<usize>,
 ) {
     let cell = N * S::LANES;
     let w = row.width;
+    let right = row.right;
     // SAFETY: as the caller promises.
     unsafe {
         let small = S::splat(row.small);
         let grey_most = S::splat(GREY_MOST);
-        let Carry { mut along, mut least, mut window } = *carry;
+        let Carry { mut along, mut window } = *carry;
         for s in steps {
             let x = if BACK { w - 1 - s } else { s };
-            let here = row.left.add(x);
-            let left = [S::splat(*here), S::splat(*here.add(w)), S::splat(*here.add(2 * w))];
-            let grey = S::splat(*here.add(3 * w));
+            let (left, large) = (row.left.add(x * PLANES), row.large.add(x * PLANES));
+            let bits = [S::splat(*left), S::splat(*left.add(1)), S::splat(*left.add(2))];
+            let grey = S::splat(*left.add(3));
+            let k = w - 1 - x;
+            let first = (k % N) * row.reach + k / N;
             let mut cost = [small; N];
             for i in 0..N {
-                let k = w - 1 - x + i;
-                let at = row.right.add((k % N) * row.reach + k / N);
-                let plane = N * row.reach;
-                let right = [S::load(at), S::load(at.add(plane)), S::load(at.add(2 * plane))];
-                let difference = grey.quarter_of_difference(S::load(at.add(3 * plane)));
-                cost[i] = S::hamming(left, right).add(difference.min(grey_most));
+                let at = first + i * row.reach;
+                let there = [S::load(right[0].add(at)), S::load(right[1].add(at)), S::load(right[2].add(at))];
+                let difference = grey.quarter_of_difference(S::load(right[3].add(at)));
+                cost[i] = S::hamming(bits, there).add(difference.min(grey_most));
             }
             if !row.full {
                 let beyond = S::splat(BEYOND);
@@ -156,27 +179,11 @@ pub unsafe fn run<S: Lanes, const N: usize, const BACK: bool>(
                 }
             }
 
-            let more = step(&along, least, small, S::splat(*row.large.add(x)));
-            let lowest;
-            (along, lowest) = grown(&cost, &more);
-            least = lowest.least_everywhere();
-            let mut sum = more;
-            for p in 0..3 {
-                let at = row.base[p] + s;
-                let at = if at >= row.ring { at - row.ring } else { at };
-                let (here, low) = (row.cells[p].add(at * cell), row.least[p].add(at));
-                let mut before = [small; N];
-                for i in 0..N {
-                    before[i] = S::load(here.add(i * S::LANES));
-                }
-                let large = S::splat(*row.large.add((p + 1) * w + x));
-                let more = step(&before, S::splat(*low), small, large);
-                let (path, lowest) = grown(&cost, &more);
-                for i in 0..N {
-                    path[i].store(here.add(i * S::LANES));
-                    sum[i] = sum[i].add(more[i]);
-                }
-                *low = lowest.least();
+            let mut sum = step(&along, small, S::splat(*large));
+            along = grown(&cost, &sum);
+            for (p, cells) in [(1, cells[0]), (2, cells[1]), (3, cells[2])] {
+                let here = cells.wrapping_add(s * cell);
+                across(here, &cost, (small, S::splat(*large.add(p))), &mut sum);
             }
 
             let sums = row.sums.add(x * cell);
@@ -196,7 +203,7 @@ pub unsafe fn run<S: Lanes, const N: usize, const BACK: bool>(
             }
             choose(row, x, &total, &mut window);
         }
-        *carry = Carry { along, least, window };
+        *carry = Carry { along, window };
     }
 }
 
@@ -229,13 +236,14 @@ unsafe fn choose<S: Lanes, const N: usize>(
 
         let key = S::least_key(best);
         let disparity = key as u8;
-        let around = S::splat(disparity);
+        let (low, span) = (disparity.saturating_sub(1), if disparity == 0 { 1 } else { 2 });
+        let (low, span) = (S::splat(low), S::splat(span));
         let mut other = S::splat(u8::MAX);
         // At most 256 bytes, as MAX_DISPARITIES is; every byte that is read was written.
         let mut costs = MaybeUninit::<[u8; 256]>::uninit();
         let costs = costs.as_mut_ptr().cast::<u8>();
         for i in 0..N {
-            other = other.min(total[i].or(number[i].beside(around)));
+            other = other.min_outside(total[i], number[i].sub(low), span);
             total[i].store(costs.add(i * S::LANES));
         }
         let d = usize::from(disparity);

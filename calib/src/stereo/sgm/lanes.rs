@@ -38,8 +38,8 @@ pub trait Lanes: Copy {
     unsafe fn quarter_of_difference(self, other: Self) -> Self;
     /// In how many bits the three differ from the other three.
     unsafe fn hamming(left: [Self; 3], right: [Self; 3]) -> Self;
-    /// Where `self` and `other` differ by at most 1 all bits set, else none.
-    unsafe fn beside(self, other: Self) -> Self;
+    /// The lesser of `self` and `other` where `place` is above `span`, else `self`.
+    unsafe fn min_outside(self, other: Self, place: Self, span: Self) -> Self;
     /// Lane `j` gets lane `j - 1`; lane 0 gets `fill`'s.
     unsafe fn up(self, fill: Self) -> Self;
     /// Lane `j` gets lane `j + 1`; the last gets `fill`'s.
@@ -138,8 +138,9 @@ impl Lanes for Plain {
         Self(core::array::from_fn(|j| bits(0, j) + bits(1, j) + bits(2, j)))
     }
     #[inline(always)]
-    unsafe fn beside(self, other: Self) -> Self {
-        self.each(other, |a, b| if a.abs_diff(b) <= 1 { 255 } else { 0 })
+    unsafe fn min_outside(self, other: Self, place: Self, span: Self) -> Self {
+        let outside = place.each(span, |p, s| if p > s { 0 } else { u8::MAX });
+        self.each(other.each(outside, |v, o| v | o), u8::min)
     }
     #[inline(always)]
     unsafe fn up(self, fill: Self) -> Self {

@@ -7,7 +7,7 @@
 
 use super::kernel::{self, Carry, PLANES, Row, Winner};
 use super::lanes::{Lanes, Plain};
-use super::planes::{Padded, Penalties, mirror};
+use super::planes::{Padded, Penalties, mirror, together};
 use super::volume::Aligned;
 use crate::stereo::{Gray, StereoPair};
 use core::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -91,13 +91,13 @@ pub struct Passes {
     width: usize,
     height: usize,
     vectors: usize,
+    phases: usize,
     reach: usize,
     ring: usize,
     padded: [Padded; 2],
     left: Vec<u8>,
     right: Vec<u8>,
     cells: Aligned,
-    least: Vec<u8>,
     sums: Aligned,
     lanes: Vec<u8>,
     winners: Vec<Winner>,
@@ -116,7 +116,6 @@ struct Band {
 /// What the rows of a pass write. Rows write their own part; of what they share, [`Order`] keeps them apart.
 struct Targets {
     cells: *mut u8,
-    least: *mut u8,
     sums: *mut u8,
     winners: *mut Winner,
     mirrored: *mut u8,
@@ -141,6 +140,7 @@ impl Passes {
         let vectors = [1, 2, 3, 4, 6, 8].into_iter().find(|n| *n >= needed).unwrap_or(8);
         let reach = width / vectors + lanes + 2;
         let cell = vectors * lanes;
+        let phases = 2 * vectors - 1;
         let ring = width + threads;
         let place = |at: usize| at / lanes + (at % lanes) * vectors;
         let number = (0..cell).map(|at| place(at) as u8);
@@ -152,13 +152,13 @@ impl Passes {
             width,
             height,
             vectors,
+            phases,
             reach,
             ring,
             padded: [Padded::new(width, height), Padded::new(width, height)],
             left: vec![0; PLANES * width * height],
-            right: vec![0; PLANES * vectors * reach * height],
+            right: vec![0; PLANES * phases * reach * height],
             cells: Aligned::new(3 * ring * cell),
-            least: vec![0; 3 * ring],
             sums: Aligned::new(width * height * cell),
             lanes: number.chain(beyond).collect(),
             winners: vec![Winner::default(); width * height],
@@ -182,7 +182,7 @@ impl Passes {
     pub fn bytes(&self) -> usize {
         let bands = self.bands.len() * self.width * 2 * PLANES;
         let found = self.winners.len() * size_of::<Winner>() + self.mirrored.len();
-        let rings = self.cells.bytes() + self.least.len();
+        let rings = self.cells.bytes();
         let pictures =
             self.padded.iter().map(Padded::bytes).sum::<usize>() + self.left.len() + self.right.len();
         self.sums.bytes()
@@ -199,7 +199,6 @@ impl Passes {
         self.look(&pair.left, &pair.right, pool);
         for back in [false, true] {
             self.cells.zero();
-            self.least.fill(0);
             for d in &self.done {
                 d.store(0, Ordering::Relaxed);
             }
@@ -207,7 +206,6 @@ impl Passes {
             let count = bands.len();
             let to = Targets {
                 cells: self.cells.as_mut_ptr(),
-                least: self.least.as_mut_ptr(),
                 sums: self.sums.as_mut_ptr(),
                 winners: self.winners.as_mut_ptr(),
                 mirrored: self.mirrored.as_mut_ptr(),
@@ -239,12 +237,13 @@ impl Passes {
         self.padded[1].fill(right);
         let [left, right] = &self.padded;
         let (w, vectors, reach) = (self.width, self.vectors, self.reach);
-        let part = (PLANES * w, PLANES * vectors * reach);
+        let part = (PLANES * w, PLANES * self.phases * reach);
         let bands = self.bands.len();
         let rows = self.height.div_ceil(bands);
         let work = |i: usize, (l, r, band): (&mut [u8], &mut [u8], &mut Band)| {
             for (y, (l, r)) in l.chunks_exact_mut(part.0).zip(r.chunks_exact_mut(part.1)).enumerate() {
-                left.planes(i * rows + y, l);
+                left.planes(i * rows + y, &mut band.planes);
+                together(&band.planes, w, l);
                 right.planes(i * rows + y, &mut band.planes);
                 mirror(&band.planes, w, vectors, reach, r);
             }
@@ -264,45 +263,35 @@ impl Passes {
     fn row(&self, r: usize, back: bool, band: &mut Band, to: &Targets, failed: &AtomicBool) {
         let (w, cell, ring) = (self.width, self.vectors * self.form.lanes(), self.ring);
         let y = if back { self.height - 1 - r } else { r };
-        self.costs.large.row(&self.padded[0], y, back, &mut band.penalties);
+        self.costs.large.row(&self.padded[0], y, back, &mut band.planes);
+        together(&band.planes, w, &mut band.penalties);
         let base = [(ring - r % ring) % ring, 0, r % ring];
-        // SAFETY: a ring of cells is `ring * cell` bytes, one of minima `ring`; the sums are `width * height` cells. A
-        // row writes only its own cells of the rings: `done` keeps the rows in order, see `wait`.
+        let right = &self.right[PLANES * self.phases * self.reach * y..];
+        // SAFETY: a ring is `ring * cell` bytes; the sums are `width * height` cells. A row writes only its own cells of the
+        // rings, which `Order` keeps from the rows before and after it.
         unsafe {
             let rings = [0, 1, 2].map(|p| to.cells.add(p * ring * cell));
-            let minima = [0, 1, 2].map(|p| to.least.add(p * ring));
             // Paths that begin here: the one that comes from the side behind at the first step, and the one that comes
             // from the side ahead at the last. No row in work has these cells: a ring has as many more than a row as
             // there are threads.
             for (p, s) in [(0, 0), (2, w - 1)] {
-                let at = (base[p] + s) % ring;
-                rings[p].add(at * cell).write_bytes(0, cell);
-                minima[p].add(at).write(0);
+                rings[p].add((base[p] + s) % ring * cell).write_bytes(0, cell);
             }
             let row = Row {
                 width: w,
                 left: self.left.as_ptr().add(PLANES * w * y),
-                right: self.right.as_ptr().add(PLANES * self.vectors * self.reach * y),
+                large: band.penalties.as_ptr(),
+                right: [0, 1, 2, 3].map(|p| right.as_ptr().add(p * self.phases * self.reach)),
                 reach: self.reach,
                 small: self.costs.small,
-                large: band.penalties.as_ptr(),
-                cells: rings,
-                least: minima,
-                ring,
-                base,
                 sums: to.sums.add(w * y * cell),
                 lanes: self.lanes.as_ptr(),
                 full: self.costs.disparities == cell,
                 winners: to.winners.add(w * y),
                 mirrored: to.mirrored.add(w * y),
             };
-            let order = Order {
-                done: &self.done,
-                r,
-                width: w,
-                chunk: if self.bands.len() > 1 { CHUNK } else { w },
-                failed,
-            };
+            let chunk = if self.bands.len() > 1 { CHUNK } else { w };
+            let order = Order { done: &self.done, r, width: w, chunk, rings, base, ring, failed };
             self.dispatch(&row, back, &order);
         }
     }
@@ -348,10 +337,32 @@ struct Order<'a> {
     r: usize,
     width: usize,
     chunk: usize,
+    /// Where the rings of cells begin.
+    rings: [*mut u8; 3],
+    /// Place of step 0 in each ring.
+    base: [usize; 3],
+    /// Cells of a ring.
+    ring: usize,
     failed: &'a AtomicBool,
 }
 
 impl Order<'_> {
+    /// Where cell 0 of each ring would lie for step `s` to lie where it does, and the first step after `s` for which it
+    /// lies elsewhere: a ring ends and goes on at its beginning.
+    fn cells(&self, s: usize, cell: usize) -> ([*mut u8; 3], usize) {
+        let mut end = self.width;
+        let cells = [0, 1, 2].map(|p| {
+            let (ring, base) = (self.ring, self.base[p]);
+            let around = base + s >= ring;
+            if !around {
+                end = end.min(ring - base);
+            }
+            let first = self.rings[p].wrapping_add(base * cell);
+            if around { first.wrapping_sub(ring * cell) } else { first }
+        });
+        (cells, end)
+    }
+
     /// Waits until the row before has passed what step `end - 1` needs of it.
     #[inline(always)]
     fn wait(&self, end: usize) {
@@ -378,10 +389,16 @@ unsafe fn steps<S: Lanes, const N: usize>(row: &Row, back: bool, order: &Order<'
         while start < order.width {
             let end = (start + order.chunk).min(order.width);
             order.wait(end);
-            if back {
-                kernel::run::<S, N, true>(row, &mut carry, start..end);
-            } else {
-                kernel::run::<S, N, false>(row, &mut carry, start..end);
+            let mut s = start;
+            while s < end {
+                let (cells, until) = order.cells(s, N * S::LANES);
+                let until = until.min(end);
+                if back {
+                    kernel::run::<S, N, true>(row, &mut carry, cells, s..until);
+                } else {
+                    kernel::run::<S, N, false>(row, &mut carry, cells, s..until);
+                }
+                s = until;
             }
             if end == order.width && !back {
                 S::fence();

@@ -90,9 +90,9 @@ for_every_processor! {
 
 /// Puts the [`PLANES`] of a right row where [`super::kernel::Row::right`] has them.
 pub fn mirror(planes: &[u8], width: usize, vectors: usize, reach: usize, out: &mut [u8]) {
-    for (plane, out) in planes.chunks_exact(width).zip(out.chunks_exact_mut(vectors * reach)) {
+    for (plane, out) in planes.chunks_exact(width).zip(out.chunks_exact_mut((2 * vectors - 1) * reach)) {
         for (q, phase) in out.chunks_exact_mut(reach).enumerate() {
-            let inside = (width.saturating_sub(q)).div_ceil(vectors).min(reach);
+            let inside = width.saturating_sub(q).div_ceil(vectors).min(reach);
             let (inside, beyond) = phase.split_at_mut(inside);
             for (to, from) in
                 inside.iter_mut().zip(plane[..width - q.min(width)].iter().rev().step_by(vectors))
@@ -100,6 +100,24 @@ pub fn mirror(planes: &[u8], width: usize, vectors: usize, reach: usize, out: &m
                 *to = *from;
             }
             beyond.fill(plane[0]);
+        }
+    }
+}
+
+/// Puts the bytes of [`PLANES`] of a row together for each pixel.
+pub fn together(planes: &[u8], width: usize, out: &mut [u8]) {
+    let (a, rest) = planes.split_at(width);
+    let (b, rest) = rest.split_at(width);
+    let (c, d) = rest.split_at(width);
+    zip(a, b, c, d, out.as_chunks_mut().0);
+}
+
+for_every_processor! {
+    fn zip(a: &[u8], b: &[u8], c: &[u8], d: &[u8], out: &mut [[u8; PLANES]]) {
+        let n = out.len();
+        let (a, b, c, d) = (&a[..n], &b[..n], &c[..n], &d[..n]);
+        for x in 0..n {
+            out[x] = [a[x], b[x], c[x], d[x]];
         }
     }
 }
