@@ -24,11 +24,13 @@
 use crate::{Error, ErrorKind, Result};
 
 mod depth;
+mod order;
 mod parameters;
 mod sgm;
 
 pub use depth::{depth_from_disparity, metres_from_disparity};
-pub use parameters::{Parameters, Preset};
+pub use order::{Order, OrderCheck};
+pub use parameters::{MAX_DISPARITIES, Parameters, Preset, Resolution};
 pub use sgm::SgmMatcher;
 
 /// A grey picture, one byte a pixel.

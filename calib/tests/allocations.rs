@@ -4,6 +4,9 @@
 
 use core::cell::Cell;
 use depthrig_bus::{Distortion, Intrinsics, Pose};
+use depthrig_calib::stereo::{
+    DisparityMap, Gray, Matcher, Order, OrderCheck, Parameters, Preset, SgmMatcher, StereoPair,
+};
 use depthrig_calib::{Deprojection, Method, PointCloud, Rectifier, Registration, Undistortion, View};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -107,4 +110,23 @@ fn a_frame_takes_no_memory() {
         }),
         0
     );
+    let pair = StereoPair::new(Gray::packed(&grey, 160, 120), Gray::packed(&yuyv, 160, 120));
+    for preset in Preset::ALL {
+        let parameters = Parameters::preset(preset, 48);
+        let mut map = DisparityMap::default();
+        let mut one = SgmMatcher::new(160, 120, &parameters, 1).unwrap();
+        one.run(&pair, &mut map).unwrap();
+        assert_eq!(allocations(|| one.run(&pair, &mut map).unwrap()), 0, "{preset}");
+        let mut several = SgmMatcher::new(160, 120, &parameters, 3).unwrap();
+        for _ in 0..5 {
+            several.run(&pair, &mut map).unwrap();
+        }
+        // Each pair is handed over four or eight times.
+        let taken = all_allocations(|| (0..31).for_each(|_| several.run(&pair, &mut map).unwrap()));
+        assert!(taken <= 16, "{preset}: {taken} in 31 pairs");
+    }
+    let mut order = OrderCheck::new(800, 24, 48).unwrap();
+    let pair = StereoPair::new(Gray::packed(&grey, 800, 24), Gray::packed(&grey, 800, 24));
+    order.check(&pair).unwrap();
+    assert_eq!(allocations(|| assert_eq!(order.check(&pair).unwrap(), Order::Unclear)), 0);
 }

@@ -8,11 +8,11 @@ use core::str::FromStr;
 /// `mimic_performance` and so on: they are nobody's closed algorithm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Preset {
-    /// Matching at half the resolution.
+    /// Matched at half the resolution.
     Performance,
-    /// Matching at full resolution along eight paths.
+    /// Matched at full resolution.
     Quality,
-    /// As quality, with what costs more than it gains for most.
+    /// Matched at both: what full resolution leaves open is taken from half.
     Ultra,
 }
 
@@ -49,6 +49,27 @@ impl FromStr for Preset {
     }
 }
 
+/// At which resolutions pictures are matched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Resolution {
+    /// Their own.
+    Full,
+    /// Half of it: an eighth of the work. Disparities are doubled, and lie on planes between those of neighbours.
+    Half,
+    /// Their own, and half of it where that gives nothing.
+    Both,
+}
+
+impl fmt::Display for Resolution {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Self::Full => "full",
+            Self::Half => "half",
+            Self::Both => "both",
+        })
+    }
+}
+
 /// Largest number of disparities: a winner is kept in a byte.
 pub const MAX_DISPARITIES: usize = 256;
 
@@ -61,8 +82,8 @@ pub struct Parameters {
     /// Disparities that are searched, in pixels of the full picture: 0 to this number less one. 1 to 256; nearer things
     /// than `focal_px * baseline_m / max_disparity` get none.
     pub max_disparity: usize,
-    /// Match at half the resolution.
-    pub half_resolution: bool,
+    /// At which resolutions the pictures are matched.
+    pub resolution: Resolution,
     /// Penalty of a step of one disparity between neighbours along a path, in census bits.
     pub p1: u8,
     /// Penalty of a larger step where grey does not change along the path, in census bits; at most 63.
@@ -93,7 +114,11 @@ impl Parameters {
         Self {
             preset,
             max_disparity,
-            half_resolution: matches!(preset, Preset::Performance),
+            resolution: match preset {
+                Preset::Performance => Resolution::Half,
+                Preset::Quality => Resolution::Full,
+                Preset::Ultra => Resolution::Both,
+            },
             p1: 6,
             p2: 50,
             p2_least: 15,
@@ -110,11 +135,11 @@ impl Parameters {
 
     /// Every number as `key=value` words, for the metadata of what is made with them.
     pub fn describe(&self) -> String {
-        let Self { preset, max_disparity, half_resolution, p1, p2, p2_least, p2_slack, .. } = self;
+        let Self { preset, max_disparity, resolution, p1, p2, p2_least, p2_slack, .. } = self;
         let Self { uniqueness_percent, left_right_px, speckle_px, speckle_step_px, .. } = self;
         let Self { median, gap_px, gap_step_px, .. } = self;
         format!(
-            "preset={preset} max_disparity={max_disparity} half_resolution={half_resolution} p1={p1} p2={p2} \
+            "preset={preset} max_disparity={max_disparity} resolution={resolution} p1={p1} p2={p2} \
              p2_least={p2_least} p2_slack={p2_slack} uniqueness_percent={uniqueness_percent} \
              left_right_px={left_right_px} speckle_px={speckle_px} speckle_step_px={speckle_step_px} median={median} \
              gap_px={gap_px} gap_step_px={gap_step_px}"

@@ -1,6 +1,6 @@
 //! Semi-global matching: census, eight paths, the best sum, and what removes the doubtful.
 
-use super::{Description, DisparityMap, Gray, Matcher, Parameters, StereoPair};
+use super::{Description, DisparityMap, Gray, Matcher, Parameters, Resolution, StereoPair};
 use crate::{Error, ErrorKind, Result};
 use choose::{NONE, ONE};
 use filter::Speckle;
@@ -24,15 +24,130 @@ mod planes;
 mod tests;
 mod volume;
 
+pub(super) use filter::halve;
+
 /// Largest side of a picture.
 const MAX_SIDE: usize = 16_384;
 
-/// Half of a pair, where half of it is matched.
+/// Matches pictures of one size, and removes what is doubtful.
+#[derive(Debug)]
+struct Engine {
+    size: (usize, usize),
+    passes: Passes,
+    /// Disparities in 256ths of a pixel, and what the median makes of them.
+    maps: [Vec<u16>; 2],
+    speckle: Speckle,
+    columns: Vec<u32>,
+}
+
+impl Engine {
+    fn new(
+        form: Form,
+        size: (usize, usize),
+        disparities: usize,
+        parameters: &Parameters,
+        threads: usize,
+    ) -> Self {
+        let Parameters { p1: small, p2: most, p2_least: least, p2_slack: slack, .. } = *parameters;
+        let costs = Costs { disparities, small, large: Penalties { most, least, slack } };
+        let pixels = size.0 * size.1;
+        Self {
+            size,
+            passes: Passes::new(form, size, costs, threads),
+            maps: [vec![NONE; pixels], vec![NONE; pixels]],
+            speckle: Speckle::new(if parameters.speckle_px > 0 { pixels } else { 0 }),
+            columns: vec![0; size.0],
+        }
+    }
+
+    fn bytes(&self) -> usize {
+        self.passes.bytes() + 4 * self.maps[0].len() + self.speckle.bytes() + 4 * self.columns.len()
+    }
+
+    /// Disparities of a pair in 256ths of a pixel, or [`NONE`]; and how sure each is.
+    fn run(
+        &mut self,
+        pair: &StereoPair<'_>,
+        parameters: &Parameters,
+        pool: Option<&rayon::ThreadPool>,
+        confidence: &mut [u8],
+    ) -> &mut [u16] {
+        let Self { size: (width, height), passes, maps: [map, other], speckle, columns } = self;
+        let (width, height) = (*width, *height);
+        let last = (passes.disparities() - 1) as u8;
+        let (winners, mirrored) = passes.run(pair, pool);
+        let rows = height.div_ceil(pool.map_or(1, rayon::ThreadPool::current_num_threads)) * width;
+        let part = |(i, (out, sure)): (usize, (&mut [u16], &mut [u8]))| {
+            let all = out.chunks_exact_mut(width).zip(sure.chunks_exact_mut(width));
+            for (y, (out, sure)) in all.enumerate() {
+                let of = i * rows + y * width..i * rows + (y + 1) * width;
+                choose::choose(&winners[of.clone()], &mirrored[of], parameters, last, out, sure);
+            }
+        };
+        match pool {
+            Some(pool) => pool.install(|| {
+                map.par_chunks_mut(rows).zip(confidence.par_chunks_mut(rows)).enumerate().for_each(part);
+            }),
+            None => part((0, (map.as_mut_slice(), &mut *confidence))),
+        }
+        if parameters.median {
+            filter::median(width, map, other);
+            core::mem::swap(map, other);
+            // Those that it filled.
+            for (sure, d) in confidence.iter_mut().zip(map.iter()) {
+                *sure = (*sure).max(u8::from(*d != NONE));
+            }
+        }
+        let step = |pixels: f32| (pixels * f32::from(ONE)).min(f32::from(u16::MAX)) as u16;
+        if parameters.speckle_px > 0 {
+            let step = step(parameters.speckle_step_px);
+            speckle.remove(width, map, confidence, parameters.speckle_px, step);
+        }
+        if parameters.gap_px > 0 {
+            let step = step(parameters.gap_step_px);
+            filter::fill_gaps(width, map, confidence, parameters.gap_px as usize, step, columns);
+        }
+        map
+    }
+}
+
+/// The engine at half the resolution, with what is around it.
 #[derive(Debug)]
 struct Half {
+    engine: Engine,
     pictures: [Vec<u8>; 2],
-    map: Vec<u16>,
     confidence: Vec<u8>,
+    /// At full resolution again.
+    map: Vec<u16>,
+    sure: Vec<u8>,
+}
+
+impl Half {
+    fn new(form: Form, (width, height): (usize, usize), parameters: &Parameters, threads: usize) -> Self {
+        let size = (width.div_ceil(2), height.div_ceil(2));
+        let pixels = size.0 * size.1;
+        Self {
+            engine: Engine::new(form, size, parameters.max_disparity.div_ceil(2), parameters, threads),
+            pictures: [vec![0; pixels], vec![0; pixels]],
+            confidence: vec![0; pixels],
+            map: vec![NONE; width * height],
+            sure: vec![0; width * height],
+        }
+    }
+
+    fn bytes(&self) -> usize {
+        self.engine.bytes() + 3 * self.confidence.len() + 3 * self.map.len()
+    }
+
+    fn run(&mut self, pair: &StereoPair<'_>, parameters: &Parameters, pool: Option<&rayon::ThreadPool>) {
+        let (w, h) = self.engine.size;
+        filter::halve(&pair.left, &mut self.pictures[0]);
+        filter::halve(&pair.right, &mut self.pictures[1]);
+        let [left, right] = self.pictures.each_ref().map(|p| Gray::packed(p, w, h));
+        let map = self.engine.run(&StereoPair::new(left, right), parameters, pool, &mut self.confidence);
+        let full = (pair.left.width, pair.left.height);
+        filter::double((w, h), (map, &self.confidence), full, &mut self.map, &mut self.sure);
+    }
 }
 
 /// The engine for pairs of one size. Everything is allocated when it is made; a pair takes no more on one thread, and
@@ -42,14 +157,9 @@ pub struct SgmMatcher {
     parameters: Parameters,
     width: usize,
     height: usize,
-    /// Size of what is matched.
-    size: (usize, usize),
-    passes: Passes,
-    /// Disparities in 256ths of a pixel, and what the median makes of them.
-    maps: [Vec<u16>; 2],
+    full: Option<Engine>,
     half: Option<Half>,
-    speckle: Speckle,
-    columns: Vec<u32>,
+    form: Form,
     pool: Option<rayon::ThreadPool>,
 }
 
@@ -78,36 +188,17 @@ impl SgmMatcher {
                 format!("pictures of {width}x{height} pixels cannot be matched: sides are 1 to {MAX_SIDE}"),
             ));
         }
-        let (size, disparities) = if parameters.half_resolution {
-            ((width.div_ceil(2), height.div_ceil(2)), parameters.max_disparity.div_ceil(2))
-        } else {
-            ((width, height), parameters.max_disparity)
-        };
-        let threads = threads.clamp(1, size.1.min(64));
+        let threads = threads.clamp(1, height.div_ceil(2).min(64));
         let pool =
             rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|i| format!("stereo-{i}"));
         let pool = if threads > 1 { pool.build().ok() } else { None };
         let threads = if pool.is_some() { threads } else { 1 };
-        let Parameters { p1: small, p2: most, p2_least: least, p2_slack: slack, .. } = *parameters;
-        let costs = Costs { disparities, small, large: Penalties { most, least, slack } };
-        let pixels = size.0 * size.1;
-        let half = parameters.half_resolution.then(|| Half {
-            pictures: [vec![0; pixels], vec![0; pixels]],
-            map: vec![NONE; pixels],
-            confidence: vec![0; pixels],
-        });
-        Ok(Self {
-            parameters: parameters.clone(),
-            width,
-            height,
-            size,
-            passes: Passes::new(form, size, costs, threads),
-            maps: [vec![NONE; width * height], vec![NONE; width * height]],
-            half,
-            speckle: Speckle::new(if parameters.speckle_px > 0 { pixels } else { 0 }),
-            columns: vec![0; width],
-            pool,
-        })
+        let size = (width, height);
+        let wants = parameters.resolution;
+        let full = (wants != Resolution::Half)
+            .then(|| Engine::new(form, size, parameters.max_disparity, parameters, threads));
+        let half = (wants != Resolution::Full).then(|| Half::new(form, size, parameters, threads));
+        Ok(Self { parameters: parameters.clone(), width, height, full, half, form, pool })
     }
 
     /// Width and height of the pairs.
@@ -122,51 +213,13 @@ impl SgmMatcher {
 
     /// The vectors that it uses: `plain`, `avx2` or `avx512`. The result is the same with all.
     pub const fn form(&self) -> &'static str {
-        self.passes.form().name()
-    }
-
-    /// Matches pictures of [`SgmMatcher::size`]'s own, into the first of the maps.
-    fn matched(&mut self, pair: &StereoPair<'_>, confidence: &mut [u8]) {
-        let Self { parameters, passes, maps: [map, other], speckle, columns, pool, .. } = self;
-        let (width, height) = self.size;
-        let pixels = width * height;
-        let (map, other) = (&mut map[..pixels], &mut other[..pixels]);
-        let last = (passes.disparities() - 1) as u8;
-        let (winners, mirrored) = passes.run(pair, pool.as_ref());
-        let rows = height.div_ceil(pool.as_ref().map_or(1, rayon::ThreadPool::current_num_threads)) * width;
-        let part = |(i, (out, sure)): (usize, (&mut [u16], &mut [u8]))| {
-            let all = out.chunks_exact_mut(width).zip(sure.chunks_exact_mut(width));
-            for (y, (out, sure)) in all.enumerate() {
-                let of = i * rows + y * width..i * rows + (y + 1) * width;
-                choose::choose(&winners[of.clone()], &mirrored[of], parameters, last, out, sure);
-            }
-        };
-        match pool {
-            Some(pool) => pool.install(|| {
-                map.par_chunks_mut(rows).zip(confidence.par_chunks_mut(rows)).enumerate().for_each(part);
-            }),
-            None => part((0, (map, confidence))),
-        }
-        if parameters.median {
-            filter::median(width, map, other);
-            map.copy_from_slice(other);
-        }
-        if parameters.speckle_px > 0 {
-            let step = (parameters.speckle_step_px * f32::from(ONE)).min(f32::from(u16::MAX)) as u16;
-            speckle.remove(width, map, confidence, parameters.speckle_px, step);
-        }
-        if parameters.gap_px > 0 {
-            let step = (parameters.gap_step_px * f32::from(ONE)).min(f32::from(u16::MAX)) as u16;
-            filter::fill_gaps(width, map, confidence, parameters.gap_px as usize, step, columns);
-        }
+        self.form.name()
     }
 }
 
 impl Matcher for SgmMatcher {
     fn describe(&self) -> Description {
-        let maps = self.maps.iter().map(|m| 2 * m.len()).sum::<usize>();
-        let half = self.half.as_ref().map_or(0, |h| 5 * h.map.len());
-        let bytes = self.passes.bytes() + maps + half + self.speckle.bytes() + 4 * self.columns.len();
+        let bytes = self.full.as_ref().map_or(0, Engine::bytes) + self.half.as_ref().map_or(0, Half::bytes);
         Description {
             producer: format!("depthrig-sgm {}", env!("CARGO_PKG_VERSION")),
             name: self.parameters.preset.name().to_owned(),
@@ -179,26 +232,23 @@ impl Matcher for SgmMatcher {
         pair.left.check("left", self.width, self.height)?;
         pair.right.check("right", self.width, self.height)?;
         out.resize(self.width, self.height);
-        if let Some(mut half) = self.half.take() {
-            let (w, h) = self.size;
-            filter::halve(&pair.left, &mut half.pictures[0]);
-            filter::halve(&pair.right, &mut half.pictures[1]);
-            let [left, right] = half.pictures.each_ref().map(|p| Gray::packed(p, w, h));
-            self.matched(&StereoPair::new(left, right), &mut half.confidence);
-            half.map.copy_from_slice(&self.maps[0][..w * h]);
-            let full = (self.width, self.height);
-            filter::double(
-                self.size,
-                (&half.map, &half.confidence),
-                full,
-                &mut self.maps[0],
-                &mut out.confidence,
-            );
-            self.half = Some(half);
-        } else {
-            self.matched(pair, &mut out.confidence);
-        }
-        for (to, d) in out.disparity.iter_mut().zip(&self.maps[0]) {
+        let (parameters, pool) = (&self.parameters, self.pool.as_ref());
+        let map = match (&mut self.full, &mut self.half) {
+            (Some(full), None) => full.run(pair, parameters, pool, &mut out.confidence),
+            (None, Some(half)) => {
+                half.run(pair, parameters, pool);
+                out.confidence.copy_from_slice(&half.sure);
+                &mut half.map
+            }
+            (Some(full), Some(half)) => {
+                half.run(pair, parameters, pool);
+                let map = full.run(pair, parameters, pool, &mut out.confidence);
+                filter::fill_from((map, &mut out.confidence), (&half.map, &half.sure));
+                map
+            }
+            (None, None) => return Ok(()),
+        };
+        for (to, d) in out.disparity.iter_mut().zip(map) {
             *to = if *d == NONE { f32::NAN } else { f32::from(*d) / f32::from(ONE) };
         }
         Ok(())

@@ -12,7 +12,8 @@ for_every_processor! {
         let (d, e, f) = (&row[..n], &row[1..=n], &row[2..n + 2]);
         let (g, h, i) = (&below[..n], &below[1..=n], &below[2..n + 2]);
         for x in 0..n {
-            let m = e[x];
+            // A hole counts as infinitely far, and is filled when most around it is known.
+            let m = if e[x] == NONE { 0 } else { e[x] };
             let [a, b, c] = sorted(or(a[x], m), or(b[x], m), or(c[x], m));
             let [d, e, f] = sorted(or(d[x], m), m, or(f[x], m));
             let [g, h, i] = sorted(or(g[x], m), or(h[x], m), or(i[x], m));
@@ -20,7 +21,8 @@ for_every_processor! {
             let low = a.max(d).max(g);
             let middle = sorted(b, e, h)[1];
             let high = c.min(f).min(i);
-            out[x] = sorted(low, middle, high)[1];
+            let median = sorted(low, middle, high)[1];
+            out[x] = if row[x + 1] == NONE && median == 0 { NONE } else { median };
         }
     }
 }
@@ -38,8 +40,9 @@ fn sorted(a: u16, b: u16, c: u16) -> [u16; 3] {
     [low.min(c), high.min(low.max(c)), high.max(c)]
 }
 
-/// The median of 3x3 around each disparity; where a neighbour has none, the middle stands in for it. The outermost
-/// pixels stay.
+/// The median of 3x3 around each disparity; where a neighbour has none, the middle stands in for it. A hole with five
+/// neighbours or more that have one gets the fifth of them, counted from the nearest: the surface behind rather than the
+/// one before it. The outermost pixels stay.
 pub fn median(width: usize, from: &[u16], to: &mut [u16]) {
     to.copy_from_slice(from);
     let height = from.len() / width;
@@ -242,6 +245,15 @@ pub fn double(
             } else {
                 four[0] * 2
             };
+        }
+    }
+}
+
+/// Where `map` has none, takes what `other` has, half as sure.
+pub fn fill_from((map, sure): (&mut [u16], &mut [u8]), (other, other_sure): (&[u16], &[u8])) {
+    for (((d, sure), other), other_sure) in map.iter_mut().zip(sure).zip(other).zip(other_sure) {
+        if *d == NONE && *other != NONE {
+            (*d, *sure) = (*other, (*other_sure / 2).max(1));
         }
     }
 }

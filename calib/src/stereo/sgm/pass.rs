@@ -168,11 +168,6 @@ impl Passes {
         }
     }
 
-    /// The vectors that are used.
-    pub const fn form(&self) -> Form {
-        self.form
-    }
-
     /// Number of disparities.
     pub const fn disparities(&self) -> usize {
         self.costs.disparities

@@ -1,5 +1,6 @@
 //! The passes beside the model, in every form that the processor has; the filters beside plain ones.
 
+use super::super::Preset;
 use super::kernel::Winner;
 use super::model::{self, Picture};
 use super::*;
@@ -130,13 +131,21 @@ proptest! {
         for (i, got) in out.iter().enumerate() {
             let (x, y) = (i % w, i / w);
             let inside = x > 0 && y > 0 && x + 1 < w && y + 1 < h;
-            let mut nine: Vec<u16> = if inside {
-                (0..9).map(|k| map[(y + k / 3 - 1) * w + x + k % 3 - 1]).map(|v| if v == NONE { map[i] } else { v }).collect()
-            } else {
-                vec![map[i]]
-            };
+            if !inside {
+                prop_assert_eq!(*got, map[i]);
+                continue;
+            }
+            let mut nine: Vec<u16> = (0..9).map(|k| map[(y + k / 3 - 1) * w + x + k % 3 - 1]).collect();
+            if map[i] == NONE {
+                nine.retain(|v| *v != NONE);
+                nine.sort_unstable_by(|a, b| b.cmp(a));
+                let fifth = nine.get(4).copied().filter(|v| *v > 0);
+                prop_assert_eq!(*got, fifth.unwrap_or(NONE));
+                continue;
+            }
+            nine.iter_mut().filter(|v| **v == NONE).for_each(|v| *v = map[i]);
             nine.sort_unstable();
-            prop_assert_eq!(*got, nine[nine.len() / 2]);
+            prop_assert_eq!(*got, nine[4]);
         }
     }
 
@@ -236,7 +245,7 @@ fn doubling_goes_on_a_plane_and_keeps_edges() {
 
 #[test]
 fn the_fit_meets_between() {
-    let parameters = Parameters::preset(super::super::Preset::Quality, 64);
+    let parameters = Parameters::preset(Preset::Quality, 64);
     let row = |winner: Winner| {
         let (mut out, mut sure) = ([0; 30], [0; 30]);
         choose::choose(&[winner; 30], &[winner.disparity; 30], &parameters, 63, &mut out, &mut sure);
@@ -256,7 +265,7 @@ fn the_fit_meets_between() {
 #[test]
 fn views_that_disagree_give_nothing() {
     let winner = Winner { disparity: 3, cost: 10, before: 30, after: 30, second: 20 };
-    let mut parameters = Parameters::preset(super::super::Preset::Quality, 64);
+    let mut parameters = Parameters::preset(Preset::Quality, 64);
     let valid = |parameters: &Parameters, mirrored: u8| {
         let (mut out, mut sure) = ([0; 8], [0; 8]);
         choose::choose(&[winner; 8], &[mirrored; 8], parameters, 63, &mut out, &mut sure);
@@ -270,4 +279,143 @@ fn views_that_disagree_give_nothing() {
     assert!(valid(&parameters, 3));
     parameters.uniqueness_percent = 101;
     assert!(!valid(&parameters, 3));
+}
+
+/// Bits, since NaN is not equal to itself.
+fn bits(map: &DisparityMap) -> (Vec<u32>, Vec<u8>) {
+    (map.disparity.iter().map(|d| d.to_bits()).collect(), map.confidence.clone())
+}
+
+fn matched(parameters: &Parameters, (w, h): (usize, usize), threads: usize, form: Form) -> DisparityMap {
+    let [left, right] = pair(w, h, w + 3, 5);
+    let gray = |pixels| Gray { pixels, width: w, height: h, stride: w + 3 };
+    let mut matcher = SgmMatcher::with_form(w, h, parameters, threads, form).unwrap();
+    let mut out = DisparityMap::default();
+    matcher.run(&StereoPair::new(gray(&left), gray(&right)), &mut out).unwrap();
+    let first = out.clone();
+    matcher.run(&StereoPair::new(gray(&left), gray(&right)), &mut out).unwrap();
+    assert_eq!(bits(&first), bits(&out), "the second pair of a matcher");
+    out
+}
+
+#[test]
+fn presets_are_the_same_in_every_form_and_with_every_number_of_threads() {
+    for preset in Preset::ALL {
+        for size in [(1, 1), (2, 3), (37, 21), (150, 40)] {
+            let parameters = Parameters::preset(preset, 48);
+            let want = matched(&parameters, size, 1, Form::Plain);
+            for form in forms() {
+                for threads in [1, 3] {
+                    let got = matched(&parameters, size, threads, form);
+                    assert_eq!(bits(&got), bits(&want), "{preset} {size:?} {form:?} {threads}");
+                }
+            }
+            for (d, c) in want.disparity.iter().zip(&want.confidence) {
+                assert_eq!(d.is_nan(), *c == 0);
+                assert!(d.is_nan() || (0.0..48.0).contains(d), "{d}");
+            }
+        }
+    }
+}
+
+/// A wall with a box before it, of noise that differs by what a sensor adds; returns the pair and the disparity.
+fn scene(w: usize, h: usize) -> ([Vec<u8>; 2], Vec<f32>) {
+    let mut next = noise(99);
+    let texture: Vec<u8> = (0..2 * w * h).map(|_| next()).collect();
+    let inside = |x: usize, y: usize| (w / 3..w / 2).contains(&x) && (h / 4..3 * h / 4).contains(&y);
+    let truth: Vec<f32> = (0..w * h).map(|i| if inside(i % w, i / w) { 30.0 } else { 10.0 }).collect();
+    let mut right = vec![0; w * h];
+    let mut left = vec![0; w * h];
+    for y in 0..h {
+        for near in [10, 30] {
+            for x in (0..w).filter(|x| truth[y * w + x] == near as f32) {
+                left[y * w + x] = texture[y * 2 * w + x + near].saturating_add(next() % 8);
+                if x >= near {
+                    right[y * w + x - near] = texture[y * 2 * w + x + near].saturating_add(next() % 8);
+                }
+            }
+        }
+    }
+    ([left, right], truth)
+}
+
+#[test]
+fn a_box_before_a_wall_is_found_and_what_it_hides_is_not() {
+    let (w, h) = (180, 80);
+    let ([left, right], truth) = scene(w, h);
+    let pair = StereoPair::new(Gray::packed(&left, w, h), Gray::packed(&right, w, h));
+    for (preset, wrong_most, missing_most) in
+        [(Preset::Performance, 0.06, 0.08), (Preset::Quality, 0.02, 0.03), (Preset::Ultra, 0.03, 0.03)]
+    {
+        let mut matcher = SgmMatcher::new(w, h, &Parameters::preset(preset, 48), 1).unwrap();
+        let mut out = DisparityMap::default();
+        matcher.run(&pair, &mut out).unwrap();
+        // What the right eye sees too: not the first columns, and not the strip left of the box.
+        let seen = |i: &usize| i % w >= 10 && !(w / 3 - 20..w / 3).contains(&(i % w));
+        let all: Vec<usize> = (0..w * h).filter(seen).collect();
+        let share = |f: &dyn Fn(&&usize) -> bool| all.iter().filter(f).count() as f64 / all.len() as f64;
+        let missing = share(&|i| out.disparity[**i].is_nan());
+        let wrong = share(&|i| (out.disparity[**i] - truth[**i]).abs() > 1.0);
+        assert!(
+            wrong <= wrong_most && missing <= missing_most,
+            "{preset}: {wrong:.3} wrong, {missing:.3} missing"
+        );
+        let hidden = (h / 4..3 * h / 4).flat_map(|y| (w / 3 - 18..w / 3 - 2).map(move |x| y * w + x));
+        let kept =
+            hidden.clone().filter(|i| !out.disparity[*i].is_nan()).count() as f64 / hidden.count() as f64;
+        // Half resolution sees less of it.
+        let most = if preset == Preset::Quality { 0.3 } else { 0.6 };
+        assert!(kept <= most, "{preset}: {kept:.2} of what is hidden has a disparity");
+    }
+}
+
+#[test]
+fn ultra_is_quality_with_what_half_resolution_adds() {
+    let size = (150, 40);
+    let [quality, half, ultra] = [Preset::Quality, Preset::Performance, Preset::Ultra]
+        .map(|p| matched(&Parameters::preset(p, 48), size, 1, Form::best()));
+    for i in 0..size.0 * size.1 {
+        let want = if quality.disparity[i].is_nan() { half.disparity[i] } else { quality.disparity[i] };
+        assert_eq!(ultra.disparity[i].to_bits(), want.to_bits());
+    }
+    assert!(ultra.fill() > quality.fill());
+}
+
+#[test]
+fn memory_is_told_before_and_bounded() {
+    let at = |width, disparities| {
+        let parameters = Parameters::preset(Preset::Quality, disparities);
+        SgmMatcher::with_form(width, 100, &parameters, 1, Form::Plain).unwrap().describe().memory_bytes
+    };
+    // A byte for each pixel and disparity, and at most 80 bytes a pixel besides.
+    assert!((640 * 100 * 128..640 * 100 * (128 + 80)).contains(&at(640, 128)), "{}", at(640, 128));
+    assert!(at(640, 128) - at(640, 64) >= 640 * 100 * 64);
+}
+
+#[test]
+fn what_cannot_be_is_refused() {
+    let good = Parameters::preset(Preset::Quality, 64);
+    let refused = |w, h, change: fn(&mut Parameters)| {
+        let mut parameters = good.clone();
+        change(&mut parameters);
+        SgmMatcher::new(w, h, &parameters, 1).unwrap_err().to_string()
+    };
+    assert!(refused(0, 5, |_| ()).contains("0x5"));
+    assert!(refused(20_000, 5, |_| ()).contains("16384"));
+    assert!(refused(9, 9, |p| p.max_disparity = 257).contains("257"));
+    assert!(refused(9, 9, |p| p.max_disparity = 0).contains("1 to 256"));
+    assert!(refused(9, 9, |p| p.p1 = 0).contains("p1 0"));
+    assert!(refused(9, 9, |p| p.p2 = 64).contains("64"));
+    assert!(refused(9, 9, |p| p.gap_step_px = f32::NAN).contains("gap_step_px"));
+    let mut matcher = SgmMatcher::new(9, 9, &good, 1).unwrap();
+    let pixels = [0; 90];
+    let mut out = DisparityMap::default();
+    let mut run =
+        |left, right| matcher.run(&StereoPair::new(left, right), &mut out).map_err(|e| e.to_string());
+    let whole = Gray::packed(&pixels, 9, 9);
+    assert!(run(whole, Gray::packed(&pixels, 9, 10)).unwrap_err().contains("right"));
+    assert!(run(Gray { stride: 8, ..whole }, whole).unwrap_err().contains("left"));
+    assert!(run(Gray { pixels: &pixels[..80], ..whole }, whole).unwrap_err().contains("80 bytes"));
+    assert!(run(Gray { stride: usize::MAX, ..whole }, whole).is_err());
+    run(Gray { pixels: &pixels[..89], stride: 10, ..whole }, whole).unwrap();
 }
