@@ -1,0 +1,103 @@
+//! What a frame of an attached Kinect costs: one write of its bytes, and no memory.
+#![allow(unsafe_code)] // a counting allocator is unsafe to write
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "support/kinect.rs"]
+mod kinect;
+
+use core::cell::Cell;
+use depthrig_bus::{DropReason, Name, PixelFormat};
+use depthrig_drivers::clock::ClockQuality;
+use depthrig_drivers::kinect::live::{LiveBackend, LiveConfig};
+use depthrig_drivers::{Backend, FrameMeta, FrameSink, Stream, StreamRequest, unpack};
+use kinect::Fake;
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::time::Duration;
+
+struct Counting;
+
+thread_local! {
+    static TAKEN: Cell<u64> = const { Cell::new(0) };
+}
+
+// SAFETY: everything is handed on to the system's allocator unchanged. The made libk4a has an allocator of its own.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        TAKEN.set(TAKEN.get() + 1);
+        // SAFETY: as the caller promises.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        // SAFETY: as the caller promises.
+        unsafe { System.dealloc(ptr, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+const A: &str = "000111111111";
+
+fn all_streams(color: PixelFormat) -> [StreamRequest; 3] {
+    let wish = |stream: &str, size, format| StreamRequest {
+        stream: Name::new(stream).unwrap(),
+        size: Some(size),
+        rate_hz: Some(30.0),
+        format: Some(format),
+    };
+    let small = (320, 288);
+    [
+        wish("color", (1280, 720), color),
+        wish("depth", small, PixelFormat::Z16),
+        wish("ir", small, PixelFormat::Mono16),
+    ]
+}
+
+fn start(config: LiveConfig, requests: &[StreamRequest]) -> Box<dyn Stream> {
+    LiveBackend::new(config).open(Some(A)).unwrap().start(requests).unwrap()
+}
+
+/// One test alone: what others copy would be counted too.
+#[test]
+fn a_picture_is_written_once_and_costs_no_memory() {
+    /// Lends the same memory again and again.
+    struct Slot(Vec<u8>, u64, u64);
+    impl FrameSink for Slot {
+        fn loan(&mut self, _: usize, len: usize) -> Option<&mut [u8]> {
+            self.1 += len as u64;
+            self.0.get_mut(..len)
+        }
+        fn commit(&mut self, _: usize, _: &FrameMeta) {
+            self.2 += 1;
+        }
+        fn discard(&mut self, _: usize) {}
+        fn dropped(&mut self, _: usize, reason: DropReason, _: u64) {
+            // What a busy machine leaves lying too long is lost in libk4a.
+            assert_eq!(reason, DropReason::DeviceGap);
+        }
+        fn captured(&mut self, _: usize, _: u64) {}
+        fn clock_quality(&mut self, _: usize, _: &ClockQuality) {}
+    }
+    let fake = Fake::new(&[A]);
+    for color in [PixelFormat::Yuyv, PixelFormat::Nv12, PixelFormat::Bgr8, PixelFormat::Mjpeg] {
+        let mut stream = start(fake.config(), &all_streams(color));
+        let mut slot = Slot(vec![0; 4 << 20], 0, 0);
+        let mut taken = 0;
+        while slot.2 < 60 {
+            // The clock map grows to its size with the first frames.
+            let warm = slot.2 > 15;
+            let before = TAKEN.get();
+            stream.poll(Duration::from_millis(50), &mut slot).unwrap();
+            taken += if warm { TAKEN.get() - before } else { 0 };
+        }
+        assert_eq!(taken, 0, "{color:?}");
+    }
+    let before = unpack::copied_bytes();
+    let mut stream = start(fake.config(), &all_streams(PixelFormat::Rgb8));
+    let mut slot = Slot(vec![0; 4 << 20], 0, 0);
+    while slot.2 < 12 {
+        stream.poll(Duration::from_millis(50), &mut slot).unwrap();
+    }
+    assert_eq!(unpack::copied_bytes() - before, slot.1, "bytes written, of bytes lent");
+}

@@ -1,0 +1,360 @@
+//! What the driver of an attached Kinect does beyond the suite: references, times, choices, messages.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "support/kinect.rs"]
+mod kinect;
+
+use depthrig_bus::{Distortion, DropReason, FrameFlags, HostTime, MetadataLevel, Name, PixelFormat};
+use depthrig_drivers::capture::{Capture, Session, StopOutcome};
+use depthrig_drivers::kinect::live::{LiveBackend, LiveConfig, Places};
+use depthrig_drivers::kinect::{DepthMode, WiredSync};
+use depthrig_drivers::usb::made::{MadeDevice, MadeTree};
+use depthrig_drivers::v4l2::ControlValue;
+use depthrig_drivers::{
+    Backend, DeviceInfo, Error, ErrorKind, MemorySink, Poll, Result, Stream, StreamRequest,
+};
+use kinect::{Census, Fake};
+use std::time::Duration;
+
+const A: &str = "000111111111";
+const B: &str = "000222222222";
+
+fn wish(stream: &str, size: (u32, u32), format: PixelFormat) -> StreamRequest {
+    StreamRequest {
+        stream: Name::new(stream).unwrap(),
+        size: Some(size),
+        rate_hz: Some(30.0),
+        format: Some(format),
+    }
+}
+
+fn all_streams(color: PixelFormat) -> [StreamRequest; 3] {
+    let small = (320, 288);
+    [
+        wish("color", (1280, 720), color),
+        wish("depth", small, PixelFormat::Z16),
+        wish("ir", small, PixelFormat::Mono16),
+    ]
+}
+
+fn start(config: LiveConfig, serial: &str, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
+    LiveBackend::new(config).open(Some(serial))?.start(requests)
+}
+
+fn error<T>(result: Result<T>) -> Error {
+    match result {
+        Ok(_) => panic!("it should have been refused"),
+        Err(e) => e,
+    }
+}
+
+/// Polls until stream 0 has `n` more frames, delivered or dropped.
+fn poll_frames(stream: &mut dyn Stream, sink: &mut MemorySink, n: u64) {
+    let seen = |sink: &MemorySink| sink.captured.first().copied().unwrap_or(0);
+    let (until, deadline) = (seen(sink) + n, HostTime::now().plus(Duration::from_secs(20)));
+    while seen(sink) < until {
+        assert!(!deadline.from_now().is_zero(), "no frames");
+        stream.poll(Duration::from_millis(50), sink).unwrap();
+    }
+}
+
+#[test]
+fn every_capture_and_every_picture_is_given_back() {
+    let fake = Fake::new(&[A]);
+    for color in [PixelFormat::Mjpeg, PixelFormat::Rgb8, PixelFormat::Yuyv] {
+        let mut stream = start(fake.config(), A, &all_streams(color)).unwrap();
+        let mut sink = MemorySink::default();
+        for trouble in ["half", "wrong_size", "damaged", "repeated", "only_color", "only_depth"] {
+            fake.command(A, trouble, 2);
+            poll_frames(stream.as_mut(), &mut sink, 3);
+        }
+        sink.refuse = 4;
+        poll_frames(stream.as_mut(), &mut sink, 2);
+        let held = fake.census();
+        assert_eq!((held.captures, held.images, held.misuse), (0, 0, 0), "{held:?}");
+        fake.command(A, "unplug", 200_000_000);
+        while stream.poll(Duration::from_millis(50), &mut sink).is_ok() {}
+        drop(stream);
+        std::thread::sleep(Duration::from_millis(250));
+    }
+    let Census { cameras, captures, images, all_captures, all_images, misuse } = fake.census();
+    assert_eq!((cameras, captures, images, misuse), (0, 0, 0, 0));
+    assert!(all_captures >= 60 && all_images >= 150, "{all_captures} {all_images}");
+}
+
+#[test]
+fn frames_tell_what_the_device_told() {
+    let fake = Fake::new(&[A]);
+    fake.command(A, "sync_in", 1);
+    let config = LiveConfig { sync: WiredSync::Subordinate, subordinate_delay_us: 160, ..fake.config() };
+    let mut stream = start(config, A, &all_streams(PixelFormat::Yuyv)).unwrap();
+    assert!(stream.profiles().iter().all(|p| p.metadata == MetadataLevel::Full));
+    let mut sink = MemorySink::default();
+    poll_frames(stream.as_mut(), &mut sink, 5);
+    for (of, meta, _) in &sink.frames {
+        assert!(meta.flags.has(FrameFlags::HARDWARE_TRIGGERED));
+        assert_eq!(meta.exposure_ns, if *of == 0 { 8_330_000 } else { 12_800_000 });
+        assert!((meta.temperature_c - 31.5).abs() < 1e-6);
+        // The stamp of the end of the transfer, not of our reading it.
+        let exposed = fake.exposed(A, meta.arrival).unwrap();
+        assert_eq!(meta.arrival.since_ns(exposed), 20_000_000);
+    }
+    // All three have the device's time of one exposure.
+    let times: Vec<u64> = sink.frames.iter().take(3).map(|(_, m, _)| m.device_time).collect();
+    assert!(times.windows(2).all(|t| t[0] == t[1]) && times[0] >= 3_000_000, "{times:?}");
+    fake.command(A, "no_host_stamp", 3);
+    sink.frames.clear();
+    poll_frames(stream.as_mut(), &mut sink, 5);
+    let arrivals: Vec<_> = sink.frames.iter().filter(|f| f.0 == 0).map(|(_, m, _)| m.arrival).collect();
+    assert!(arrivals.windows(2).all(|a| a[0] <= a[1]), "an arrival goes never back");
+}
+
+#[test]
+fn padded_rows_and_captures_in_part_are_read() {
+    let fake = Fake::new(&[A]);
+    for color in [PixelFormat::Yuyv, PixelFormat::Nv12, PixelFormat::Bgr8] {
+        let mut plain = MemorySink::default();
+        let mut stream = start(fake.config(), A, &all_streams(color)).unwrap();
+        poll_frames(stream.as_mut(), &mut plain, 2);
+        drop(stream);
+        fake.command(A, "padding", 48);
+        let mut padded = MemorySink::default();
+        let mut stream = start(fake.config(), A, &all_streams(color)).unwrap();
+        poll_frames(stream.as_mut(), &mut padded, 2);
+        for i in 0..3 {
+            assert!(plain.frames[i].2 == padded.frames[i].2, "{color:?}, stream {i}");
+        }
+        fake.command(A, "padding", 0);
+    }
+    let mut stream = start(fake.config(), A, &all_streams(PixelFormat::Mjpeg)).unwrap();
+    let mut sink = MemorySink::default();
+    poll_frames(stream.as_mut(), &mut sink, 2);
+    fake.command(A, "only_depth", 2);
+    poll_frames(stream.as_mut(), &mut sink, 4);
+    assert_eq!(sink.drops_of(0).get(DropReason::DeviceGap), 2);
+    assert_eq!(sink.drops_of(1).total(), 0);
+}
+
+#[test]
+fn intrinsics_and_poses_are_those_of_the_calibration() {
+    let fake = Fake::new(&[A]);
+    let device = LiveBackend::new(fake.config()).open(None).unwrap();
+    assert_eq!(device.info().calibration, "factory");
+    assert_eq!(device.info().firmware, "color 1.6.110, depth 1.6.79");
+    let find = |stream: &str, size: (u32, u32)| {
+        let found =
+            device.profiles().iter().find(|p| p.stream.as_str() == stream && (p.width, p.height) == size);
+        found.unwrap().clone()
+    };
+    // By hand from the made numbers: cx 0.5125, cy 0.516, fx 0.4925, fy 0.493 of a sensor of 1024x1024, of which
+    // 640x576 begins at 192, 180.
+    let narrow = find("depth", (640, 576)).intrinsics;
+    let by_hand = [0.5125 * 1024.0 - 192.5, 0.516 * 1024.0 - 180.5, 0.4925 * 1024.0, 0.493 * 1024.0];
+    let got = [narrow.cx, narrow.cy, narrow.fx, narrow.fy];
+    assert!(got.iter().zip(by_hand).all(|(a, b)| (a - b).abs() < 1e-9), "{got:?} {by_hand:?}");
+    assert_eq!(narrow.model, Distortion::Rational as u32);
+    // k1, k2, p1, p2, k3 to k6, as OpenCV has them; the calibration has p2 before p1.
+    assert_eq!(narrow.coeffs, [0.9, 0.25, 0.000_09, -0.000_03, 0.012, 1.22, 0.4, 0.06]);
+    assert_eq!(find("ir", (640, 576)).intrinsics, narrow);
+    // Depth as colour sees it is t, and nothing is turned, so colour stands at -t.
+    let color = find("color", (1920, 1080)).pose_in_device;
+    let off: f64 = color.translation_m.iter().zip([0.032, 0.002, -0.004]).map(|(a, b)| (a - b).abs()).sum();
+    assert!(off < 1e-9, "{color:?}");
+    drop(device);
+    // One that cannot be read is missing, and the camera streams all the same.
+    fake.calibration(A, b"{}");
+    let device = LiveBackend::new(fake.config()).open(None).unwrap();
+    assert_eq!(device.info().calibration, "none");
+    assert!(device.profiles().iter().all(|p| p.intrinsics.model == Distortion::Unknown as u32));
+    let mut sink = MemorySink::default();
+    poll_frames(device.start(&[]).unwrap().as_mut(), &mut sink, 1);
+}
+
+#[test]
+fn colour_controls_are_checked_set_and_read_back() {
+    let fake = Fake::new(&[A]);
+    let with = |controls: &[(&str, ControlValue)]| {
+        let color_controls = controls.iter().map(|(n, v)| ((*n).to_owned(), v.clone())).collect();
+        start(LiveConfig { color_controls, ..fake.config() }, A, &[]).map(drop)
+    };
+    use ControlValue::{Boolean, Integer, Item};
+    with(&[
+        ("exposure_us", Integer(3000)),
+        ("white_balance_k", Item("auto".into())),
+        ("gain", Integer(255)),
+        ("backlight_compensation", Boolean(true)),
+        ("power_line_frequency", Item("50 Hz".into())),
+    ])
+    .unwrap();
+    // 3000 us is not among the camera's exposures; it takes the next.
+    let set = [0, 6, 8, 7, 9].map(|command| fake.control(A, command));
+    assert_eq!(set, [8330, -1, 255, 1, 1]);
+    for (name, value, part) in [
+        ("gain", Integer(256), "from 0 to 255"),
+        ("white_balance_k", Integer(4505), "in steps of 10"),
+        ("brightness", Item("auto".into()), "does not regulate"),
+        ("exposure", Integer(1), "exposure_us"),
+    ] {
+        let e = error(with(&[(name, value)]));
+        assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains(part), "{e}");
+        assert!(e.to_string().contains(A), "{e}");
+    }
+    assert_eq!(fake.control(A, 8), 255, "a wrong value changes nothing");
+}
+
+#[test]
+fn cables_and_delays_are_checked_before_the_start() {
+    let fake = Fake::new(&[A]);
+    let with = |sync| start(LiveConfig { sync, ..fake.config() }, A, &[]).map(drop);
+    let e = error(with(WiredSync::Master));
+    assert!(e.to_string().contains("\"Sync out\"") && e.kind().is_transient(), "{e}");
+    let e = error(with(WiredSync::Subordinate));
+    assert!(e.to_string().contains("\"Sync in\""), "{e}");
+    fake.command(A, "sync_out", 1);
+    with(WiredSync::Master).unwrap();
+    let passive = LiveConfig { depth_mode: Some(DepthMode::PassiveIr), ..fake.config() };
+    let mut stream = start(passive, A, &[]).unwrap();
+    let mut sink = MemorySink::default();
+    poll_frames(stream.as_mut(), &mut sink, 2);
+    assert!(sink.delivered(1) > 0 && stream.profiles()[1].describe().starts_with("ir 1024x1024"));
+}
+
+#[test]
+fn the_one_that_is_meant_is_opened_and_the_others_are_let_go() {
+    let fake = Fake::new(&[A, B]);
+    let backend = LiveBackend::new(fake.config());
+    let serials: Vec<_> = backend.discover().unwrap().into_iter().map(|i| i.serial).collect();
+    assert_eq!(serials, [A, B]);
+    assert_eq!(backend.open(Some(B)).unwrap().info().serial, B);
+    let e = error(backend.open(None));
+    assert!(e.kind() == ErrorKind::NotFound && e.to_string().contains(A) && e.to_string().contains(B), "{e}");
+    // One that streams is not disturbed by looking for the other.
+    let mut stream = start(fake.config(), A, &all_streams(PixelFormat::Yuyv)).unwrap();
+    let mut sink = MemorySink::default();
+    poll_frames(stream.as_mut(), &mut sink, 2);
+    let other = backend.open(Some(B)).unwrap();
+    let e = error(backend.open(Some(A)));
+    assert_eq!(e.kind(), ErrorKind::Busy, "{e}");
+    assert!(e.to_string().contains("libk4a says: "), "{e}");
+    poll_frames(stream.as_mut(), &mut sink, 2);
+    // A slow machine may leave pictures lying meanwhile; the camera sent them all, and none came damaged.
+    for (i, of) in [(0, 0), (1, 1)] {
+        let (drops, ledger) = (sink.drops_of(i), fake.ledger(A, of));
+        assert_eq!((sink.delivered(i), drops.get(DropReason::DeviceGap)), (ledger.good, ledger.lost));
+        assert_eq!(drops.total(), ledger.lost);
+    }
+    drop((other, stream));
+    fake.command(A, "denied", 1);
+    let e = error(backend.open(Some(A)));
+    assert!(e.kind() == ErrorKind::PermissionDenied && e.to_string().contains("depthrig install"), "{e}");
+    assert_eq!(fake.census().cameras, 0);
+}
+
+#[test]
+fn a_port_is_looked_up_on_the_bus() {
+    let fake = Fake::new(&[A, B]);
+    let home = tempfile::tempdir().unwrap();
+    let tree = MadeTree::new(home.path());
+    for (port, product, serial) in
+        [("2-1.1", 0x097c, A), ("2-1.2", 0x097d, A), ("2-3.1", 0x097c, B), ("2-3.2", 0x097d, B)]
+    {
+        let strings = ["", "", serial];
+        let id = (0x045e, product);
+        tree.plug(&MadeDevice { id, strings, interfaces: vec![], ..MadeDevice::new(port, 0) });
+    }
+    let at = |port: &str| {
+        let config = LiveConfig { port: Some(port.into()), ..fake.config() };
+        LiveBackend::new(config).with_root(tree.root().clone())
+    };
+    let device = at("2-3.1").open(None).unwrap();
+    assert_eq!((device.info().serial.as_str(), device.info().port.as_str()), (B, "2-3.1"));
+    let e = error(at("2-9.1").open(None));
+    assert!(e.kind() == ErrorKind::NotFound && e.to_string().contains("2-3.1"), "{e}");
+    // A serial number that the bus does not show is not there, whoever holds the others.
+    let e = error(at("2-3.1").open(Some("000999999999")));
+    assert_eq!(e.kind(), ErrorKind::NotFound, "{e}");
+    let e = error(at("2-3.1").open(None));
+    assert!(e.kind() == ErrorKind::Busy && e.to_string().contains("held by"), "{e}");
+}
+
+#[test]
+fn without_its_libraries_it_says_what_to_install() {
+    let home = tempfile::tempdir().unwrap();
+    let nowhere = Places { library: Some(home.path().into()), engine: None };
+    let e = error(LiveBackend::new(LiveConfig { places: nowhere, ..LiveConfig::default() }).open(None));
+    assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains("libk4a1.4"), "{e}");
+    // A library of somebody else's.
+    let libc = std::fs::read_dir("/lib/x86_64-linux-gnu").ok().and_then(|entries| {
+        entries.flatten().map(|e| e.path()).find(|p| p.file_name().is_some_and(|n| n == "libm.so.6"))
+    });
+    if let Some(libm) = libc {
+        let places = Places { library: Some(libm), engine: None };
+        let e = error(LiveBackend::new(LiveConfig { places, ..LiveConfig::default() }).open(None));
+        assert!(e.to_string().contains("has no k4a_device_get_installed_count"), "{e}");
+    }
+    // Depth needs the engine, colour does not. An engine may also lie elsewhere on this computer.
+    let fake = Fake::without_engine(&[A]);
+    let places = Places { engine: Some(home.path().into()), ..fake.places() };
+    let config = LiveConfig { places, ..fake.config() };
+    let e = error(start(config.clone(), A, &[]));
+    assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains("depth engine"), "{e}");
+    start(config, A, &[wish("color", (1280, 720), PixelFormat::Yuyv)]).unwrap();
+    // libk4a has its own opinion of the engine.
+    let fake = Fake::new(&[A]);
+    fake.command(A, "engine", 1);
+    let e = error(start(fake.config(), A, &[]));
+    assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains("packages.microsoft.com"), "{e}");
+    fake.command(A, "engine", 2);
+    let e = error(start(fake.config(), A, &[]));
+    assert!(e.kind().is_transient() && e.to_string().contains("DISPLAY"), "{e}");
+    fake.command(A, "engine", 0);
+    start(fake.config(), A, &[]).unwrap();
+}
+
+#[test]
+fn a_camera_that_hangs_while_it_stops_is_left_behind_in_time() {
+    for hang in ["stop_hang", "close_hang"] {
+        let fake = Fake::new(&[A]);
+        let config = fake.config();
+        let capture = Capture::spawn("kinect", move || {
+            let stream = start(config, A, &all_streams(PixelFormat::Yuyv))?;
+            Ok(Session { info: DeviceInfo::default(), stream, sink: Box::new(MemorySink::default()) })
+        })
+        .unwrap();
+        let deadline = HostTime::now().plus(Duration::from_secs(20));
+        while capture.last_frame().is_none() {
+            assert!(!deadline.from_now().is_zero());
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        fake.command(A, hang, 1_500_000_000);
+        let began = HostTime::now();
+        let outcome = capture.stop(Duration::from_millis(400));
+        assert!(matches!(outcome, StopOutcome::Abandoned), "{hang}: {outcome:?}");
+        assert!(began.elapsed() < Duration::from_millis(1200), "{hang}");
+        // The thread ends when libk4a lets it, and gives everything back.
+        while fake.census().cameras > 0 {
+            assert!(!deadline.from_now().is_zero(), "{hang}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        assert_eq!((fake.census().captures, fake.census().images, fake.census().misuse), (0, 0, 0));
+    }
+}
+
+#[test]
+fn a_dead_camera_stays_dead_and_the_next_opening_works() {
+    let fake = Fake::new(&[A]);
+    let mut stream = start(fake.config(), A, &all_streams(PixelFormat::Yuyv)).unwrap();
+    let mut sink = MemorySink::default();
+    poll_frames(stream.as_mut(), &mut sink, 1);
+    fake.command(A, "unplug", 300_000_000);
+    let e = error(stream.poll(Duration::from_millis(100), &mut sink));
+    assert!(e.kind() == ErrorKind::Disconnected && e.to_string().contains(A), "{e}");
+    let e = error(LiveBackend::new(fake.config()).open(Some(A)));
+    assert_eq!(e.kind(), ErrorKind::NotFound, "{e}");
+    std::thread::sleep(Duration::from_millis(350));
+    assert!(stream.poll(Duration::ZERO, &mut sink).is_err());
+    drop(stream);
+    let mut again = start(fake.config(), A, &[]).unwrap();
+    poll_frames(again.as_mut(), &mut sink, 1);
+    assert_eq!(again.poll(Duration::ZERO, &mut sink).unwrap(), Poll::Idle);
+}
