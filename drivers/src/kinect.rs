@@ -1,13 +1,15 @@
 //! The `kinect` backend: Azure Kinect cameras and what was recorded with them.
 //!
 //! [`modes`] is what the device can be set to, [`calibration`] what its factory measured, for every mode; [`live`] is a
-//! camera that is attached, [`recording`] what was recorded with one.
+//! camera that is attached, [`recording`] what was recorded with one, and [`playback`] plays that
+//! as a camera.
 
 pub mod calibration;
 #[doc(hidden)]
 pub mod ebml;
 pub mod live;
 pub mod modes;
+pub mod playback;
 pub mod recording;
 
 pub use calibration::Calibration;

@@ -6,6 +6,7 @@
 mod alpha;
 mod mjpeg;
 mod side_by_side;
+mod swap;
 pub mod turn;
 pub mod y411;
 pub mod y8i;
@@ -13,6 +14,7 @@ pub mod y8i;
 pub use alpha::drop_alpha;
 pub use mjpeg::{decode_grey_jpeg, decode_jpeg, jpeg_size, jpeg_span, keep_jpeg};
 pub use side_by_side::{Half, copy_half};
+pub use swap::copy_swapped;
 
 use core::sync::atomic::{AtomicU64, Ordering};
 use depthrig_bus::DropReason;

@@ -16,7 +16,7 @@
 mod backend;
 mod config;
 mod controls;
-mod counter;
+pub(super) mod counter;
 mod ffi;
 pub mod find;
 mod handle;

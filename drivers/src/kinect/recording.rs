@@ -161,6 +161,14 @@ impl<'a> Block<'a> {
     }
 }
 
+/// A block that was found and is still in the file's cluster.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Pending {
+    pub(super) track: usize,
+    pub(super) device_us: u64,
+    place: cluster::Place,
+}
+
 /// An open recording.
 pub struct Recording {
     name: String,
@@ -224,16 +232,27 @@ impl Recording {
     /// # Errors
     /// [`ErrorKind::Io`] when the file cannot be read. Damage is no error, see [`Self::losses`].
     pub fn next_block(&mut self) -> Result<Option<Block<'_>>> {
+        let Some(found) = self.advance()? else { return Ok(None) };
+        let Pending { track, device_us, .. } = found;
+        Ok(Some(Block { track, device_us, frames: self.frames(&found) }))
+    }
+
+    /// [`Self::next_block`] without its frames, which stay where they are until it is called again.
+    pub(super) fn advance(&mut self) -> Result<Option<Pending>> {
         let (scale, offset) = (self.clusters.scale_ns(), self.facts.start_offset_ns);
-        let (place, track, device_us) = loop {
+        loop {
             let Some(place) = self.clusters.advance()? else { return Ok(None) };
             let device_us = (place.time.saturating_mul(scale)).saturating_add(offset) / 1000;
             let known = self.facts.tracks.iter().position(|t| t.number == place.track);
             if let Some(track) = known.filter(|_| device_us >= self.from_us) {
-                break (place, track, device_us);
+                return Ok(Some(Pending { track, device_us, place }));
             }
-        };
-        Ok(Some(Block { track, device_us, frames: self.clusters.frames(&place) }))
+        }
+    }
+
+    /// The frames of the block that was found last.
+    pub(super) fn frames(&self, block: &Pending) -> ebml::Frames<'_> {
+        self.clusters.frames(&block.place)
     }
 
     /// Goes to the first block at or after `device_us` on the device's clock; back, too. By the file's index if it has

@@ -1,0 +1,289 @@
+//! Playing a recording: each picture when it is due, written once into the receiver's memory.
+
+use super::PlaybackConfig;
+use super::ahead::Ahead;
+use super::cursor::{Cursor, Next};
+use crate::kinect::live::counter::FrameCounter;
+use crate::kinect::recording::{Pixels, Recording};
+use crate::{FrameSink, Gate, Poll, RawFrame, Result, Stream, StreamProfile, unpack};
+use core::time::Duration;
+use depthrig_bus::{DropReason, FrameFlags, HostTime, PixelFormat};
+
+/// A recording that plays.
+pub(super) struct Player {
+    profiles: Vec<StreamProfile>,
+    lanes: Vec<Lane>,
+    cursor: Cursor,
+    /// The next block of the lanes that `ahead` does not serve.
+    next: Option<Next>,
+    /// Decoded colour and its lane.
+    ahead: Option<(usize, Ahead)>,
+    pace: Pace,
+}
+
+/// One stream.
+struct Lane {
+    track: usize,
+    gate: Gate,
+    counter: FrameCounter,
+    how: How,
+    flags: FrameFlags,
+}
+
+/// How a picture gets into lent memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum How {
+    Copy,
+    Swap,
+    WithoutAlpha {
+        row: usize,
+    },
+    Keep,
+    /// By [`Ahead`].
+    Decode,
+}
+
+impl Player {
+    pub(super) fn new(
+        name: String,
+        profiles: Vec<StreamProfile>,
+        tracks: &[usize],
+        is_triggered: bool,
+        recording: Recording,
+        config: &PlaybackConfig,
+    ) -> Result<Self> {
+        let flags = if is_triggered { FrameFlags::HARDWARE_TRIGGERED } else { FrameFlags(0) };
+        let mut lanes = Vec::new();
+        let mut ahead = None;
+        for (i, (profile, track)) in profiles.iter().zip(tracks).enumerate() {
+            let pixels = recording.tracks().get(*track).and_then(|t| t.pixels);
+            let how = How::of(pixels, profile);
+            if how == How::Decode {
+                let again = Recording::open(&config.recording)?;
+                ahead = Some((i, Ahead::new(again, config.looped, *track, (profile.width, profile.height))?));
+            }
+            let period_us =
+                recording.tracks().get(*track).and_then(|t| t.period_ns).unwrap_or(super::PERIOD_NS) / 1000;
+            let (gate, counter) = (Gate::new(i, profile), FrameCounter::new(period_us));
+            lanes.push(Lane { track: *track, gate, counter, how, flags });
+        }
+        let pace = Pace::new(name, config.rate, &profiles);
+        Ok(Self { profiles, lanes, cursor: Cursor::new(recording, config.looped), next: None, ahead, pace })
+    }
+
+    /// The time of the next frame, and whether it is one of `ahead`; `None` at the end.
+    fn peek(&mut self) -> Result<Option<(u64, bool)>> {
+        if self.next.is_none() {
+            let lanes = &self.lanes;
+            self.next =
+                self.cursor.next(|track| lanes.iter().any(|l| l.track == track && l.how != How::Decode))?;
+        }
+        let ahead = match &mut self.ahead {
+            Some((_, ahead)) => ahead.peek()?,
+            None => None,
+        };
+        Ok(match (self.next.map(|n| n.at_us), ahead) {
+            (Some(a), Some(b)) => Some(if b <= a { (b, true) } else { (a, false) }),
+            (Some(a), None) => Some((a, false)),
+            (None, Some(b)) => Some((b, true)),
+            (None, None) => None,
+        })
+    }
+}
+
+impl Stream for Player {
+    fn profiles(&self) -> &[StreamProfile] {
+        &self.profiles
+    }
+
+    fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
+        let deadline = HostTime::now().plus(timeout);
+        let Some((at_us, is_ahead)) = self.peek()? else { return Ok(Poll::End) };
+        let now = HostTime::now();
+        let due = self.pace.due(at_us, now);
+        if due > now {
+            std::thread::sleep(due.min(deadline).from_now());
+            if due > deadline.max(now) {
+                return Ok(Poll::Idle);
+            }
+        }
+        let now = HostTime::now();
+        let ticks = self.pace.ticks(at_us, now);
+        if is_ahead {
+            let Some((i, ahead)) = &mut self.ahead else { return Ok(Poll::End) };
+            let lane = self.lanes.get_mut(*i);
+            ahead.take(|job| {
+                let Some(lane) = lane else { return };
+                lane.deliver(at_us, ticks, now, job.pixels.len(), sink, |to| {
+                    job.outcome?;
+                    unpack::copy_rows(&job.pixels, to.len(), to.len(), to)
+                });
+            })?;
+            return Ok(Poll::Frame);
+        }
+        let Some(next) = self.next.take() else { return Ok(Poll::End) };
+        for data in self.cursor.recording.frames(&next.block) {
+            for lane in self.lanes.iter_mut().filter(|l| l.track == next.block.track) {
+                let how = lane.how;
+                let (data, bytes) = how.measure(data);
+                lane.deliver(at_us, ticks, now, bytes, sink, |to| how.fill(data, to));
+            }
+        }
+        Ok(Poll::Frame)
+    }
+}
+
+impl Lane {
+    fn deliver(
+        &mut self,
+        at_us: u64,
+        ticks: u64,
+        now: HostTime,
+        bytes: usize,
+        sink: &mut dyn FrameSink,
+        fill: impl FnOnce(&mut [u8]) -> core::result::Result<(), DropReason>,
+    ) {
+        let mut raw = RawFrame::new(self.counter.number(at_us), ticks, now, bytes);
+        raw.flags = self.flags;
+        self.gate.deliver(&raw, sink, fill);
+    }
+}
+
+impl How {
+    fn of(pixels: Option<Pixels>, profile: &StreamProfile) -> Self {
+        match (pixels, profile.format) {
+            (Some(Pixels::Mjpg), PixelFormat::Mjpeg) => Self::Keep,
+            (Some(Pixels::Mjpg), _) => Self::Decode,
+            (Some(Pixels::Gray16Be), _) => Self::Swap,
+            (Some(Pixels::Bgra), _) => Self::WithoutAlpha { row: profile.width as usize },
+            _ => Self::Copy,
+        }
+    }
+
+    /// What of the bytes is the picture, and how many bytes of a delivered frame that stands for.
+    fn measure(self, data: &[u8]) -> (&[u8], usize) {
+        match self {
+            Self::Copy | Self::Swap | Self::Decode => (data, data.len()),
+            Self::WithoutAlpha { .. } => (data, data.len() / 4 * 3 + data.len() % 4),
+            Self::Keep => match unpack::jpeg_span(data) {
+                Ok(picture) => (picture, picture.len()),
+                Err(DropReason::Incomplete) => (&[], 0),
+                // It is no JPEG at all.
+                Err(_) => (&[], usize::MAX),
+            },
+        }
+    }
+
+    fn fill(self, data: &[u8], to: &mut [u8]) -> core::result::Result<(), DropReason> {
+        match self {
+            Self::Copy | Self::Decode => unpack::copy_rows(data, to.len(), to.len(), to),
+            Self::Swap => unpack::copy_swapped(data, to),
+            Self::WithoutAlpha { row } => unpack::drop_alpha(data, row * 4, row, to),
+            Self::Keep => unpack::keep_jpeg(data, to),
+        }
+    }
+}
+
+/// When each frame is due.
+struct Pace {
+    name: String,
+    rate: f64,
+    /// The longest period, nanoseconds: how late the host may be before the times of all that follows move.
+    period_ns: i64,
+    /// Time of the first frame on the device's clock.
+    first_us: Option<u64>,
+    /// A moment, and the time of the frame that is due then.
+    origin: Option<(HostTime, u64)>,
+    moved: u64,
+}
+
+impl Pace {
+    fn new(name: String, rate: f64, profiles: &[StreamProfile]) -> Self {
+        let period_ns =
+            profiles.iter().map(StreamProfile::period_ns).max().unwrap_or(super::PERIOD_NS) as i64;
+        Self { name, rate, period_ns, first_us: None, origin: None, moved: 0 }
+    }
+
+    /// When the frame of `at_us` is due. A host that is more than a period late moves what follows rather than send it
+    /// in a burst.
+    fn due(&mut self, at_us: u64, now: HostTime) -> HostTime {
+        self.first_us.get_or_insert(at_us);
+        if !self.rate.is_finite() {
+            return now;
+        }
+        let (origin, from_us) = *self.origin.get_or_insert((now, at_us));
+        // A stream that is late in the file may be earlier than the first.
+        let after_us = at_us as i64 - from_us as i64;
+        let due = origin.plus_ns((after_us as f64 * 1000.0 / self.rate).round() as i64);
+        if now.since_ns(due) <= self.period_ns {
+            return due;
+        }
+        self.moved += 1;
+        if self.moved.is_power_of_two() {
+            let late_ms = now.since_ns(due) as f64 / 1e6;
+            tracing::warn!(
+                "{}: plays {late_ms:.1} ms late (the {}. time); a lower rate helps",
+                self.name,
+                self.moved
+            );
+        }
+        self.origin = Some((now, at_us));
+        now
+    }
+
+    /// The device's clock of the frame of `at_us`: stretched when it plays at another rate; that of the host when it
+    /// plays as fast as it can.
+    fn ticks(&self, at_us: u64, now: HostTime) -> u64 {
+        if !self.rate.is_finite() {
+            return u64::try_from(now.ns()).unwrap_or(0);
+        }
+        if self.rate == 1.0 {
+            return at_us;
+        }
+        let first_us = self.first_us.unwrap_or(at_us);
+        let after_us = (at_us as i64).saturating_sub(first_us as i64) as f64 / self.rate;
+        first_us.saturating_add_signed(after_us.round() as i64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const T0: HostTime = HostTime::from_ns(1_000_000_000);
+
+    fn pace(rate: f64) -> Pace {
+        let (name, moved) = (String::new(), 0);
+        Pace { name, rate, period_ns: 33_333_333, first_us: None, origin: None, moved }
+    }
+
+    #[test]
+    fn frames_are_due_by_the_recordings_clock() {
+        let mut p = pace(1.0);
+        assert_eq!(p.due(800_000, T0), T0);
+        assert_eq!(p.due(833_340, T0), T0.plus_ns(33_340_000));
+        assert_eq!(p.due(799_840, T0), T0.plus_ns(-160_000), "depth before colour");
+        assert_eq!(p.ticks(833_340, T0), 833_340);
+        assert_eq!(p.moved, 0);
+    }
+
+    #[test]
+    fn another_rate_stretches_the_clock() {
+        let mut p = pace(2.0);
+        assert_eq!(p.due(800_000, T0), T0);
+        assert_eq!(p.due(900_000, T0), T0.plus_ns(50_000_000));
+        assert_eq!((p.ticks(800_000, T0), p.ticks(900_000, T0)), (800_000, 850_000));
+        let mut p = pace(f64::INFINITY);
+        assert_eq!((p.due(800_000, T0), p.ticks(800_000, T0)), (T0, 1_000_000_000));
+    }
+
+    #[test]
+    fn a_late_host_moves_what_follows() {
+        let mut p = pace(1.0);
+        p.due(0, T0);
+        let late = T0.plus_ns(500_000_000);
+        assert_eq!(p.due(33_333, late), late);
+        assert_eq!(p.due(66_666, late), late.plus_ns(33_333_000));
+        assert_eq!(p.moved, 1);
+    }
+}
