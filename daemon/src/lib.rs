@@ -13,6 +13,7 @@ pub mod control;
 pub mod doctor;
 mod error;
 mod house;
+pub mod import_kinect;
 pub mod metrics;
 mod priority;
 mod recording;
