@@ -2,7 +2,7 @@
 //! mended.
 #![allow(clippy::unwrap_used)]
 
-use depthrig_drivers::fuzzing::realsense;
+use depthrig_drivers::fuzzing::{kinect, realsense};
 use depthrig_drivers::zed;
 use std::path::{Path, PathBuf};
 
@@ -56,6 +56,16 @@ fn run(target: &str, reached: impl Fn(&[u8]) -> u64) {
         }
     }
     assert!(seeds > 0, "{target} has no seeds");
+}
+
+#[test]
+fn kinect_mkv() {
+    run("kinect_mkv", kinect::recording);
+}
+
+#[test]
+fn kinect_calibration() {
+    run("kinect_calibration", kinect::calibration);
 }
 
 #[test]

@@ -1,0 +1,9 @@
+//! A recording of an Azure Kinect.
+#![no_main]
+
+use depthrig_drivers::fuzzing::kinect;
+use libfuzzer_sys::fuzz_target;
+
+fuzz_target!(|bytes: &[u8]| {
+    kinect::recording(bytes);
+});
