@@ -10,7 +10,7 @@
 //! "No frame" is said of each stream: one that is silent alone, while the others go on, has its camera stalled and
 //! opened again all the same.
 
-use crate::config::{BackendConfig, CameraConfig, SupervisorConfig};
+use crate::config::{BackendConfig, CameraConfig, KinectSettings, SupervisorConfig};
 use crate::sink::BusSink;
 use crate::stage::{Entrance, Lane};
 use crate::status::CameraState;
@@ -315,7 +315,12 @@ impl Supervisor {
     /// Whether an opening failed for good: files that are not there are a mistake, not an unplugged camera.
     fn never_will(&self, e: &depthrig_drivers::Error) -> bool {
         e.kind() == DriverErrorKind::NotFound
-            && matches!(self.camera.config.backend, BackendConfig::Files(_) | BackendConfig::ZedReplay(_))
+            && matches!(
+                self.camera.config.backend,
+                BackendConfig::Files(_)
+                    | BackendConfig::ZedReplay(_)
+                    | BackendConfig::Kinect(KinectSettings::Recorded(_))
+            )
             && self.camera.state().streams.is_empty()
     }
 
@@ -457,7 +462,7 @@ fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, de
     use depthrig_drivers::{
         external::{ExternalBackend, Place},
         files::FilesBackend,
-        kinect::{KinectConfig, live::LiveBackend},
+        kinect::{KinectConfig, live::LiveBackend, playback::PlaybackBackend},
         realsense::RealsenseBackend,
         realsense::l515::L515Backend,
         stereo::StereoBackend,
@@ -482,6 +487,7 @@ fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, de
             Box::new(ExternalBackend::new(c.clone(), place))
         }
         BackendConfig::Kinect(KinectConfig::Live(c)) => Box::new(LiveBackend::new(c.clone())),
+        BackendConfig::Kinect(KinectConfig::Recorded(c)) => Box::new(PlaybackBackend::new(c.clone())),
     };
     Ok(match &camera.config.stereo {
         Some(stereo) => Box::new(StereoBackend::new(backend, stereo.options())),

@@ -25,4 +25,6 @@ pub const NAME: &str = "kinect";
 pub enum KinectConfig {
     /// One that is attached.
     Live(live::LiveConfig),
+    /// One that was recorded.
+    Recorded(playback::PlaybackConfig),
 }

@@ -6,12 +6,17 @@ use super::camera::WantedStream;
 use super::controls;
 use super::read::Section;
 use super::rig::{not_empty, resolve, within};
+use core::ops::RangeInclusive;
 use depthrig_drivers::kinect::live::{CONTROLS, LiveConfig, Places, STREAMS};
+use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackConfig};
 use depthrig_drivers::kinect::{DepthMode, WiredSync};
 use std::path::{Path, PathBuf};
 
 /// The longest period of pictures, microseconds; at a faster rate the camera is refused when it is started.
 const LONGEST_PERIOD_US: i32 = 200_000;
+
+/// How fast a recording may play, seconds of it per second.
+const RATES: RangeInclusive<f64> = 0.05..=20.0;
 
 /// Reads the settings of a camera that is asked for `streams`.
 pub(super) fn read(s: &Section<'_, '_>, base: &Path, streams: &[WantedStream]) -> KinectSettings {
@@ -22,7 +27,25 @@ pub(super) fn read(s: &Section<'_, '_>, base: &Path, streams: &[WantedStream]) -
             s.problem(wanted.at, why);
         }
     }
+    if s.has("recording") {
+        return KinectSettings::Recorded(recorded(s, base));
+    }
     KinectSettings::Live(live(s, base, streams))
+}
+
+/// A recording that plays: its device is not asked for anything.
+fn recorded(s: &Section<'_, '_>, base: &Path) -> PlaybackConfig {
+    let path = |key| s.or(key, None, |p: &Option<PathBuf>| p.as_deref().map_or(Ok(()), not_empty));
+    PlaybackConfig {
+        recording: path("recording").map(|p| resolve(base, &p)).unwrap_or_default(),
+        looped: s.get::<bool>("loop").is_some_and(|looped| looped.value),
+        rate: s.or("rate", 1.0, within(RATES)),
+        calibration: match path("calibration") {
+            None => CalibrationSource::Recorded,
+            Some(none) if none.as_os_str() == "none" => CalibrationSource::None,
+            Some(path) => CalibrationSource::At(resolve(base, &path)),
+        },
+    }
 }
 
 fn live(s: &Section<'_, '_>, base: &Path, streams: &[WantedStream]) -> LiveConfig {

@@ -409,6 +409,30 @@ fn a_recording_of_a_zed_and_its_stereo_are_set_as_the_file_says() {
 }
 
 #[test]
+fn a_recorded_kinect_is_played_as_the_file_says() {
+    use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackConfig};
+    let text = |keys: &str| {
+        format!("rig = \"r\"\n[[camera]]\nname = \"a\"\nbackend = \"kinect\"\nrecording = \"a.mkv\"\n{keys}")
+    };
+    let backend = |keys: &str| {
+        let rig = RigConfig::parse(&text(keys), Some(Path::new("/rigs/kinect.toml"))).unwrap();
+        rig.cameras[0].backend.clone()
+    };
+    let recorded = |config| BackendConfig::Kinect(KinectSettings::Recorded(config));
+    assert_eq!(backend(""), recorded(PlaybackConfig::new("/rigs/a.mkv")));
+    let calibration = CalibrationSource::At("/rigs/device.json".into());
+    let wanted =
+        PlaybackConfig { looped: true, rate: 0.5, calibration, ..PlaybackConfig::new("/rigs/a.mkv") };
+    assert_eq!(backend("loop = true\nrate = 0.5\ncalibration = \"device.json\""), recorded(wanted));
+    let none = PlaybackConfig { calibration: CalibrationSource::None, ..PlaybackConfig::new("/rigs/a.mkv") };
+    assert_eq!(backend("calibration = \"none\""), recorded(none));
+    let problem = |keys: &str| RigConfig::parse(&text(keys), None).unwrap_err().to_string();
+    assert!(problem("rate = 0").contains("it must be within 0.05 and 20"), "{}", problem("rate = 0"));
+    // What only an attached one has.
+    assert!(problem("sync = \"master\"").contains("sync"), "{}", problem("sync = \"master\""));
+}
+
+#[test]
 fn angles_turn_about_x_then_y_then_z() {
     let pose = |rpy: &str| {
         let text = format!(

@@ -5,6 +5,7 @@ use super::finding::{Finding, Severity};
 use crate::attached::{Attached, AttachedCamera, Family, ModeReport, UseState};
 use crate::config::{BackendConfig, CameraConfig, RigConfig};
 use depthrig_drivers::files::FilesBackend;
+use depthrig_drivers::kinect::playback::PlaybackBackend;
 use depthrig_drivers::kinect::{self, KinectConfig};
 use depthrig_drivers::realsense::config::TransportChoice;
 use depthrig_drivers::usb::health::{self, RULE_CURE};
@@ -68,7 +69,8 @@ fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
         BackendConfig::Synthetic(_)
         | BackendConfig::Files(_)
         | BackendConfig::ZedReplay(_)
-        | BackendConfig::External(_) => None,
+        | BackendConfig::External(_)
+        | BackendConfig::Kinect(KinectConfig::Recorded(_)) => None,
         BackendConfig::Realsense(c) => Some(Wanted {
             serial: c.serial.as_deref(),
             port: c.port.as_deref(),
@@ -174,7 +176,7 @@ pub(super) fn mode_missing(device: &AttachedCamera, what: &str) -> Finding {
     )
 }
 
-/// A camera that is no device: synthetic, or a folder of pictures.
+/// A camera that is no device: synthetic, a folder of pictures, or a recording.
 fn plan_made(camera: &CameraConfig) -> Planned {
     let mut plan = no_plan(camera, camera.backend.name());
     let profiles = || -> Result<(String, Vec<StreamProfile>)> {
@@ -189,6 +191,11 @@ fn plan_made(camera: &CameraConfig) -> Planned {
             BackendConfig::ZedReplay(c) => {
                 let device = ReplayBackend::new(c.clone()).open(None)?;
                 (format!("recording {}", device.info().port), device.profiles().to_vec())
+            }
+            BackendConfig::Kinect(KinectConfig::Recorded(c)) => {
+                let device = PlaybackBackend::new(c.clone()).open(None)?;
+                let (serial, port) = (&device.info().serial, &device.info().port);
+                (format!("Azure Kinect {serial} as recorded in {port}"), device.profiles().to_vec())
             }
             // Devices are planned with what is attached.
             BackendConfig::Realsense(_)

@@ -283,8 +283,9 @@ impl<'a, W: Write + Seek> Writer<'a, W> {
         let mut rest = frames;
         while let Some(first) = rest.first() {
             let is_motion = self.tracks[first.track] == Kind::Motion;
-            let laced = is_motion && self.fixture.lacing != Lacing::None;
             let same = rest.iter().take_while(|w| w.track == first.track).count();
+            // One alone needs no lace.
+            let laced = is_motion && self.fixture.lacing != Lacing::None && same > 1;
             let n = if laced { same.min(256) } else { 1 };
             let (these, later) = rest.split_at(n);
             let time = (first.time_ns / SCALE_NS - start) as i16;

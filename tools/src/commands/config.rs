@@ -4,9 +4,10 @@ use crate::exit::Exit;
 use crate::out;
 use anyhow::Result;
 use depthrig_daemon::ErrorKind;
-use depthrig_daemon::config::{BackendConfig, RigConfig};
+use depthrig_daemon::config::{BackendConfig, KinectSettings, RigConfig};
 use depthrig_drivers::Backend;
 use depthrig_drivers::files::FilesBackend;
+use depthrig_drivers::kinect::playback::PlaybackBackend;
 use std::path::PathBuf;
 
 /// Examples for `--help`.
@@ -35,12 +36,17 @@ pub fn run(command: &ConfigCommand) -> Result<Exit> {
             let config = RigConfig::load(file).map_err(depthrig_daemon::Error::from)?;
             // Pictures are part of what must be right, and cost little to look at; cameras may be unplugged now.
             for camera in &config.cameras {
-                if let BackendConfig::Files(settings) = &camera.backend {
-                    FilesBackend::new(settings.clone()).discover().map_err(|e| {
-                        let message = format!("camera \"{}\": {e}", camera.name);
-                        depthrig_daemon::Error::new(ErrorKind::BadInput, message).with_source(e)
-                    })?;
-                }
+                let found = match &camera.backend {
+                    BackendConfig::Files(settings) => FilesBackend::new(settings.clone()).discover(),
+                    BackendConfig::Kinect(KinectSettings::Recorded(settings)) => {
+                        PlaybackBackend::new(settings.clone()).discover()
+                    }
+                    _ => continue,
+                };
+                found.map_err(|e| {
+                    let message = format!("camera \"{}\": {e}", camera.name);
+                    depthrig_daemon::Error::new(ErrorKind::BadInput, message).with_source(e)
+                })?;
             }
             out::line(format_args!(
                 "{}: good: rig \"{}\", {}, sets at {} Hz",
