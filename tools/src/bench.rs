@@ -4,3 +4,4 @@ pub mod bus;
 pub mod capture;
 pub mod conditions;
 pub mod stats;
+pub mod stereo;

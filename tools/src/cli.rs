@@ -2,7 +2,8 @@
 
 use crate::commands::{
     bench, cameras, cat, cdm, compare, completions, config, demo, doctor, edit, eval, export, import, info,
-    install, man, merge, record, recover, replay, report, run, sessions, status, tap, top, trim, verify, zed,
+    install, man, merge, record, recover, replay, report, run, sessions, status, stereo, tap, top, trim,
+    verify, zed,
 };
 use clap::{ArgAction, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
@@ -142,6 +143,9 @@ pub enum Command {
     /// Make depth of recorded raw stereo
     #[command(subcommand, after_help = zed::EXAMPLES)]
     Zed(zed::ZedCommand),
+    /// Find the disparity of a rectified pair of pictures
+    #[command(after_help = stereo::EXAMPLES)]
+    Stereo(stereo::StereoArgs),
     /// Write a part of a dataset as a dataset of its own
     #[command(after_help = trim::EXAMPLES)]
     Trim(trim::TrimArgs),

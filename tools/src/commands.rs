@@ -24,6 +24,7 @@ pub mod report;
 pub mod run;
 pub mod sessions;
 pub mod status;
+pub mod stereo;
 pub mod tap;
 pub mod top;
 pub mod trim;
@@ -62,6 +63,7 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Cat(args) => cat::run(&args, &context),
         Command::Cdm(command) => cdm::run(&command, &context),
         Command::Zed(command) => zed::run(&command, &context),
+        Command::Stereo(args) => stereo::run(&args),
         Command::Trim(args) => trim::run(&args, &context),
         Command::Merge(args) => merge::run(&args, &context),
         Command::Recover(args) => recover::run(&args, &context),

@@ -1,9 +1,10 @@
 //! What is written to the standard output: lines, JSON, tables, and numbers as people read them.
 
-use anyhow::Result;
+use anyhow::{Context as _, Result};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use serde::Serialize;
 use std::io::Write;
+use std::path::Path;
 
 /// Writes `text` and a newline.
 ///
@@ -28,6 +29,18 @@ pub fn json(value: &impl Serialize) -> Result<()> {
 /// As [`line`].
 pub fn json_line(value: &impl Serialize) -> Result<()> {
     line(serde_json::to_string(value)?)
+}
+
+/// Writes a file, which is there when it is whole.
+///
+/// # Errors
+/// When it cannot be written; the message names it.
+pub fn file(path: &Path, bytes: &[u8]) -> Result<()> {
+    let mut part = path.as_os_str().to_owned();
+    part.push(".part");
+    std::fs::write(&part, bytes)
+        .and_then(|()| std::fs::rename(&part, path))
+        .with_context(|| format!("{} cannot be written", path.display()))
 }
 
 /// `n` of `what`, which takes an `s` unless there is one: `1 set`, `2 sets`.

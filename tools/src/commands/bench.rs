@@ -2,6 +2,8 @@
 
 use crate::bench::bus::{self, Plan, report};
 use crate::bench::capture;
+use crate::bench::stereo;
+use crate::commands::stereo::Picture;
 use crate::context::Context;
 use crate::exit::Exit;
 use crate::out;
@@ -24,6 +26,7 @@ Examples:
   depthrig bench bus --check     exit code 1 when a promise is not kept
   depthrig bench record --json
   depthrig bench capture --port 1-2 --check
+  depthrig bench stereo --check
   depthrig bench soak --check    ten minutes of recording as fast as it goes; 12 GB of disk, removed again";
 
 /// What to measure.
@@ -35,6 +38,8 @@ pub enum BenchCommand {
     Record(RecordArgs),
     /// Taking pictures from a camera at the kernel's nodes: CPU beside a bare loop, and copies
     Capture(CaptureArgs),
+    /// Stereo: what a pair costs with each preset
+    Stereo(StereoArgs),
     /// A long recording, faster than real time: memory must stay where it is and every set be accounted for
     Soak(SoakArgs),
 }
@@ -93,6 +98,29 @@ pub struct CaptureArgs {
     bench: BenchArgs,
 }
 
+/// What to match, and how often.
+#[derive(Debug, clap::Args)]
+pub struct StereoArgs {
+    /// The left picture of a rectified pair; without it a made pair of 1280x720
+    #[arg(long, value_name = "FILE", requires = "right")]
+    left: Option<PathBuf>,
+    /// The right picture
+    #[arg(long, value_name = "FILE", requires = "left")]
+    right: Option<PathBuf>,
+    /// Disparities to search, pixels
+    #[arg(long, value_name = "N", default_value_t = 128, value_parser = clap::value_parser!(u16).range(1..=256))]
+    max_disparity: u16,
+    /// Threads of a matcher
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64))]
+    threads: u16,
+    /// Pairs with each preset
+    #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u16).range(1..=10_000))]
+    rounds: u16,
+    /// How much, and in which form; --quick is three rounds
+    #[command(flatten)]
+    bench: BenchArgs,
+}
+
 /// How long to record.
 #[derive(Debug, clap::Args)]
 pub struct SoakArgs {
@@ -115,6 +143,7 @@ pub fn run(command: &BenchCommand, context: &Context) -> Result<Exit> {
     match command {
         BenchCommand::Bus(args) => run_bus(args, context),
         BenchCommand::Record(args) => run_record(args),
+        BenchCommand::Stereo(args) => run_stereo(args, context),
         BenchCommand::Soak(args) => run_soak(args, context),
         BenchCommand::Capture(args) => run_capture(args, context),
     }
@@ -136,6 +165,27 @@ fn run_capture(args: &CaptureArgs, context: &Context) -> Result<Exit> {
         out::line(capture::text(&result))?;
     }
     let kept = capture::bars(&result).iter().all(|bar| bar.kept);
+    Ok(if args.bench.check && !kept { Exit::Failed } else { Exit::Good })
+}
+
+fn run_stereo(args: &StereoArgs, context: &Context) -> Result<Exit> {
+    let max_disparity = usize::from(args.max_disparity);
+    let [left, right] = match (&args.left, &args.right) {
+        (Some(left), Some(right)) => [Picture::read(left)?, Picture::read(right)?],
+        _ => stereo::made(1280, 720, max_disparity),
+    };
+    let rounds = if args.bench.quick { args.rounds.min(3) } else { args.rounds }.into();
+    let plan = stereo::Plan { max_disparity, threads: args.threads.into(), rounds };
+    let mut progress = Progress::new(context.global.quiet > 0);
+    let result = stereo::run(&left, &right, plan, |what, done, total| progress.set(what, done, total));
+    progress.clear();
+    let report = result?;
+    if args.bench.json {
+        out::json(&report)?;
+    } else {
+        out::line(stereo::text(&report))?;
+    }
+    let kept = stereo::bars(&report).iter().all(|bar| bar.kept);
     Ok(if args.bench.check && !kept { Exit::Failed } else { Exit::Good })
 }
 

@@ -309,7 +309,7 @@ fn read_depth(path: &Path, rgb: &Path, size: (usize, usize)) -> Result<Vec<u16>>
     }
 }
 
-/// Writes the result; the file is there when it is whole.
+/// Writes the result.
 fn write(path: &Path, refined: &Refined, width: usize, height: usize) -> Result<()> {
     let bytes = match refined {
         Refined::Floats(pixels) => {
@@ -329,9 +329,5 @@ fn write(path: &Path, refined: &Refined, width: usize, height: usize) -> Result<
             file
         }
     };
-    let mut part = path.as_os_str().to_owned();
-    part.push(".part");
-    std::fs::write(&part, bytes)
-        .and_then(|()| std::fs::rename(&part, path))
-        .with_context(|| format!("{} cannot be written", path.display()))
+    out::file(path, &bytes)
 }

@@ -1,0 +1,208 @@
+//! `depthrig stereo`: the disparity of one rectified pair of pictures.
+
+use crate::exit::{Exit, UsageError};
+use crate::out;
+use anyhow::{Context as _, Result};
+use depthrig_bus::clock::thread_cpu_ns;
+use depthrig_calib::stereo::{
+    DisparityMap, Gray, Matcher, OrderCheck, Parameters, Preset, SgmMatcher, StereoPair,
+};
+use image::{ExtendedColorType, ImageEncoder, codecs::png};
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+/// Examples for `--help`.
+pub const EXAMPLES: &str = "\
+The pictures are rectified: what is seen at (x, y) in the left one is seen at (x - disparity, y) in the right one. Colour
+is made grey.
+
+OUT.npy holds 32-bit floats, pixels of the left picture, NaN where there is none. OUT.png holds 16 bits, 256 a pixel, 0
+where there is none (as KITTI has it). Confidence is a PNG of 8 bits: 0 where there is none, 255 for the surest.
+
+Exit codes: 0 good, 1 failed, 2 wrong usage or pictures that do not fit, or that are swapped.
+
+Examples:
+  depthrig stereo left.png right.png --out disparity.npy
+  depthrig stereo left.jpg right.jpg --preset ultra --max-disparity 224 --out disparity.png --confidence sure.png";
+
+/// Arguments.
+#[derive(Debug, clap::Args)]
+pub struct StereoArgs {
+    /// The left picture, PNG or JPEG
+    left: PathBuf,
+    /// The right picture, of the same size
+    right: PathBuf,
+    /// A point between fast and good: performance, quality or ultra
+    #[arg(long, value_name = "PRESET", default_value = "quality", value_parser = preset)]
+    preset: Preset,
+    /// Disparities to search, pixels; what is nearer gets none
+    #[arg(long, value_name = "N", default_value_t = 128, value_parser = clap::value_parser!(u16).range(1..=256))]
+    max_disparity: u16,
+    /// The file to write, .npy or .png
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// A PNG of how sure each disparity is
+    #[arg(long, value_name = "FILE")]
+    confidence: Option<PathBuf>,
+    /// Threads
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64))]
+    threads: u16,
+    /// Match even if left and right look swapped
+    #[arg(long)]
+    even_if_swapped: bool,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Reads the name of a preset.
+///
+/// # Errors
+/// When there is none of that name.
+pub fn preset(text: &str) -> Result<Preset, String> {
+    text.parse().map_err(|e: depthrig_calib::Error| e.to_string())
+}
+
+/// A grey picture of its own.
+pub struct Picture {
+    pixels: Vec<u8>,
+    width: usize,
+    height: usize,
+}
+
+impl Picture {
+    /// Reads a PNG or JPEG.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    pub fn read(path: &Path) -> Result<Self> {
+        let told = || format!("{}: cannot be read as a picture", path.display());
+        let reader =
+            image::ImageReader::open(path).with_context(told)?.with_guessed_format().with_context(told)?;
+        let grey = reader.decode().with_context(told)?.into_luma8();
+        let (width, height) = (grey.width() as usize, grey.height() as usize);
+        Ok(Self { pixels: grey.into_raw(), width, height })
+    }
+
+    /// One of these pixels, rows without padding.
+    pub const fn made(pixels: Vec<u8>, width: usize, height: usize) -> Self {
+        Self { pixels, width, height }
+    }
+
+    /// As the engine takes it.
+    pub fn gray(&self) -> Gray<'_> {
+        Gray::packed(&self.pixels, self.width, self.height)
+    }
+
+    /// Refuses another picture that is of another size.
+    ///
+    /// # Errors
+    /// A usage error that says both sizes.
+    pub fn fits(&self, other: &Self) -> Result<()> {
+        if (self.width, self.height) == (other.width, other.height) {
+            return Ok(());
+        }
+        let text = format!(
+            "the left picture is {}x{} and the right one {}x{}: a rectified pair is of one size",
+            self.width, self.height, other.width, other.height
+        );
+        Err(UsageError(text).into())
+    }
+}
+
+/// What was done.
+#[derive(Debug, Serialize)]
+struct Report<'a> {
+    out: &'a Path,
+    width: usize,
+    height: usize,
+    producer: String,
+    parameters: String,
+    vectors: &'static str,
+    memory_bytes: u64,
+    /// Pixels that have a disparity, percent.
+    filled_percent: f64,
+    /// CPU time of the calling thread, for the first pair of a matcher; `bench stereo` measures properly.
+    cpu_ms: f64,
+}
+
+/// Matches a pair.
+pub fn run(args: &StereoArgs) -> Result<Exit> {
+    let as_png = form(&args.out)?;
+    let (left, right) = (Picture::read(&args.left)?, Picture::read(&args.right)?);
+    left.fits(&right)?;
+    let pair = StereoPair::new(left.gray(), right.gray());
+    let usage = |e: depthrig_calib::Error| UsageError(e.to_string());
+    if !args.even_if_swapped {
+        let mut order = OrderCheck::new(left.width, left.height, args.max_disparity.into()).map_err(usage)?;
+        order.refuse_swapped(&pair).map_err(usage)?;
+    }
+    let parameters = Parameters::preset(args.preset, args.max_disparity.into());
+    let mut matcher =
+        SgmMatcher::new(left.width, left.height, &parameters, args.threads.into()).map_err(usage)?;
+    let mut map = DisparityMap::default();
+    let start = thread_cpu_ns();
+    matcher.run(&pair, &mut map)?;
+    let cpu_ms = (thread_cpu_ns() - start) as f64 / 1e6;
+    out::file(&args.out, &if as_png { png(&map)? } else { npy(&map) })?;
+    if let Some(path) = &args.confidence {
+        out::file(path, &encoded(&map.confidence, &map, ExtendedColorType::L8)?)?;
+    }
+    let described = matcher.describe();
+    let report = Report {
+        out: &args.out,
+        width: map.width,
+        height: map.height,
+        producer: described.producer,
+        parameters: described.parameters,
+        vectors: matcher.form(),
+        memory_bytes: described.memory_bytes,
+        filled_percent: 100.0 * map.fill(),
+        cpu_ms,
+    };
+    if args.json {
+        out::json(&report)?;
+    } else {
+        out::line(format_args!(
+            "{}: {}x{}, {} of {} disparities, in {:.1} % of the pixels; {:.0} ms, {} of memory",
+            report.out.display(),
+            report.width,
+            report.height,
+            args.preset,
+            args.max_disparity,
+            report.filled_percent,
+            report.cpu_ms,
+            out::bytes(report.memory_bytes)
+        ))?;
+    }
+    Ok(Exit::Good)
+}
+
+/// Whether a PNG is asked for.
+fn form(path: &Path) -> Result<bool> {
+    match path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase().as_str() {
+        "npy" => Ok(false),
+        "png" => Ok(true),
+        _ => Err(UsageError(format!("{}: the result is a .npy or a .png", path.display())).into()),
+    }
+}
+
+fn npy(map: &DisparityMap) -> Vec<u8> {
+    let data: Vec<_> = map.disparity.iter().flat_map(|d| d.to_le_bytes()).collect();
+    depthrig_recorder::npy_file("<f4", &[map.height, map.width], &data)
+}
+
+/// 16 bits, 256 a pixel; a disparity of less than half of that becomes the smallest one, for 0 is none.
+fn png(map: &DisparityMap) -> Result<Vec<u8>> {
+    let units =
+        map.disparity.iter().map(|d| if d.is_nan() { 0 } else { ((d * 256.0).round() as u16).max(1) });
+    // PNG is big-endian; the encoder takes the order of this computer.
+    let data: Vec<_> = units.flat_map(u16::to_ne_bytes).collect();
+    encoded(&data, map, ExtendedColorType::L16)
+}
+
+fn encoded(data: &[u8], map: &DisparityMap, color: ExtendedColorType) -> Result<Vec<u8>> {
+    let mut file = Vec::new();
+    png::PngEncoder::new(&mut file).write_image(data, map.width as u32, map.height as u32, color)?;
+    Ok(file)
+}

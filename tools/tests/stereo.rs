@@ -1,0 +1,97 @@
+//! `depthrig stereo` and `depthrig bench stereo` as a person meets them.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "support/home.rs"]
+mod support;
+
+use std::path::{Path, PathBuf};
+use support::Home;
+
+/// Noise as seen `shift` pixels further to the right.
+fn picture(path: &Path, width: u32, height: u32, shift: u32) {
+    let noise = |x: u32, y: u32| {
+        let v = (x / 2).wrapping_mul(7919) ^ (y / 2).wrapping_mul(104_729);
+        (v.wrapping_mul(2_654_435_761) >> 13) as u8
+    };
+    image::GrayImage::from_fn(width, height, |x, y| image::Luma([noise(x + shift, y)])).save(path).unwrap();
+}
+
+fn pair(folder: &Path) -> [String; 2] {
+    let [left, right] = ["left.png", "right.png"].map(|f| folder.join(f));
+    picture(&left, 241, 90, 0);
+    picture(&right, 241, 90, 14);
+    [left, right].map(|p: PathBuf| p.to_str().unwrap().to_owned())
+}
+
+#[test]
+fn a_pair_becomes_floats_or_sixteen_bits() {
+    let folder = tempfile::tempdir().unwrap();
+    let [left, right] = pair(folder.path());
+    let file = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let (npy, png, sure) = (file("d.npy"), file("d.png"), file("sure.png"));
+    for preset in ["performance", "quality", "ultra"] {
+        let common = ["stereo", &left, &right, "--preset", preset, "--max-disparity", "64", "--out"];
+        Home::new().run(&[&common[..], &[&npy]].concat()).good();
+        let told = Home::new().run(&[&common[..], &[&png, "--confidence", &sure, "--json"]].concat()).good();
+        let told: serde_json::Value = serde_json::from_str(&told).unwrap();
+        assert!(told["parameters"].as_str().unwrap().contains(&format!("preset={preset} max_disparity=64")));
+        assert!(told["memory_bytes"].as_u64().unwrap() > 0);
+        let bytes = std::fs::read(&npy).unwrap();
+        let data = &bytes[bytes.len() - 4 * 241 * 90..];
+        assert!(
+            String::from_utf8_lossy(&bytes[..128])
+                .contains("'<f4', 'fortran_order': False, 'shape': (90, 241)")
+        );
+        let floats: Vec<f32> = data.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+        let units = image::open(&png).unwrap().into_luma16().into_raw();
+        let sure = image::open(&sure).unwrap().into_luma8().into_raw();
+        for ((d, u), c) in floats.iter().zip(&units).zip(&sure) {
+            assert_eq!((d.is_nan(), d.is_nan()), (*u == 0, *c == 0));
+            assert!(d.is_nan() || (d * 256.0 - f32::from(*u)).abs() < 1.0, "{d} {u}");
+        }
+        // All of it lies at 14, but for what the right eye does not see.
+        let right_ones = floats.iter().filter(|d| (**d - 14.0).abs() < 0.5).count();
+        assert!(right_ones * 10 > 8 * floats.len(), "{preset}: {right_ones} of {}", floats.len());
+    }
+}
+
+#[test]
+fn what_is_no_pair_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let [left, right] = pair(folder.path());
+    let small = folder.path().join("small.png");
+    picture(&small, 120, 90, 0);
+    let out = folder.path().join("d.npy").to_str().unwrap().to_owned();
+    let small = small.to_str().unwrap();
+    for (args, said) in [
+        (vec!["stereo", &left, small, "--out", &out], "241x90"),
+        (vec!["stereo", &right, &left, "--max-disparity", "64", "--out", &out], "swapped"),
+        (vec!["stereo", &left, &right, "--out", "d.tiff"], ".npy or a .png"),
+        (vec!["stereo", &left, &right, "--preset", "best", "--out", &out], "performance, quality or ultra"),
+        (vec!["stereo", &left, &right, "--max-disparity", "300", "--out", &out], "256"),
+        (vec!["bench", "stereo", "--left", &left], "--right"),
+    ] {
+        let ran = Home::new().run(&args);
+        assert_eq!(ran.code, 2, "{args:?}: {}", ran.err);
+        assert!(ran.err.contains(said), "{args:?}: {}", ran.err);
+        assert!(!Path::new(&out).exists());
+    }
+    let forced = ["stereo", &right, &left, "--max-disparity", "64", "--even-if-swapped", "--out", &out];
+    Home::new().run(&forced).good();
+    let ran = Home::new().run(&["stereo", &left, "/nonexistent.png", "--out", &out]);
+    assert_eq!(ran.code, 1);
+    assert!(ran.err.contains("/nonexistent.png"), "{}", ran.err);
+}
+
+#[test]
+fn the_bench_says_what_each_preset_costs() {
+    let folder = tempfile::tempdir().unwrap();
+    let [left, right] = pair(folder.path());
+    let args =
+        ["bench", "stereo", "--left", &left, "--right", &right, "--rounds", "2", "--threads", "2", "--json"];
+    let told: serde_json::Value = serde_json::from_str(&Home::new().run(&args).good()).unwrap();
+    assert_eq!((told["width"].as_u64(), told["threads"].as_u64()), (Some(241), Some(2)));
+    let costs = told["costs"].as_array().unwrap();
+    assert_eq!(costs.len(), 3);
+    assert!(costs.iter().all(|c| c["cpu_ms_best"].as_f64().unwrap() > 0.0 && c["filled_percent"].as_f64().unwrap() > 50.0));
+}
