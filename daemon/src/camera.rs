@@ -21,7 +21,9 @@ use core::time::Duration;
 use depthrig_bus::{Bus, FrameHeader, HostTime, StreamId, shm};
 use depthrig_calib::PoseExt;
 use depthrig_drivers::capture::{Capture, End, Session, StopOutcome};
+use depthrig_drivers::stereo::{Descriptions, EYES, PREFIXES, StereoOptions};
 use depthrig_drivers::{Backend, DeviceInfo, ErrorKind as DriverErrorKind, StreamProfile};
+use depthrig_recorder::Computed;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// How long an opening may take before its thread is given up for hung.
@@ -36,6 +38,8 @@ const STALLS_UNTIL_RESTART: u32 = 4;
 pub struct Camera {
     /// Its part of the configuration.
     pub config: CameraConfig,
+    /// What computes each mode of its stereo, once it was open.
+    pub computed: Descriptions,
     state: Mutex<State>,
 }
 
@@ -68,7 +72,7 @@ pub struct State {
 
 impl Camera {
     /// A camera that was never opened.
-    pub const fn new(config: CameraConfig) -> Self {
+    pub fn new(config: CameraConfig) -> Self {
         let state = State {
             phase: CameraState::Opening,
             since: HostTime::from_ns(0),
@@ -82,7 +86,23 @@ impl Camera {
             short_of_memory: false,
             reconnects: 0,
         };
-        Self { config, state: Mutex::new(state) }
+        Self { config, computed: Descriptions::default(), state: Mutex::new(state) }
+    }
+
+    /// What computed `stream`, if it is made of the eyes: for the dataset that it is recorded in.
+    pub fn computed(&self, stream: &StreamId) -> Option<Computed> {
+        let all = self.computed.lock().unwrap_or_else(PoisonError::into_inner);
+        let mode = PREFIXES.iter().find_map(|p| stream.stream.as_str().strip_prefix(p))?;
+        let d = all.get(mode)?;
+        let eye = |name: &&str| StreamId::new(stream.camera.as_str(), name).ok();
+        Some(Computed {
+            stream: stream.clone(),
+            // It is nobody's closed algorithm, and says so.
+            name: format!("mimic_{mode}"),
+            producer: d.producer.clone(),
+            parameters: d.parameters.clone(),
+            from: EYES.iter().filter_map(eye).collect(),
+        })
     }
 
     /// What is known of it now.
@@ -490,7 +510,10 @@ fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, de
         BackendConfig::Kinect(KinectConfig::Recorded(c)) => Box::new(PlaybackBackend::new(c.clone())),
     };
     Ok(match &camera.config.stereo {
-        Some(stereo) => Box::new(StereoBackend::new(backend, stereo.options())),
+        Some(stereo) => {
+            let options = StereoOptions { computed: Arc::clone(&camera.computed), ..stereo.options() };
+            Box::new(StereoBackend::new(backend, options))
+        }
         None => backend,
     })
 }

@@ -8,6 +8,7 @@ use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::{Frame, HostTime, StreamId, UtcPair};
 use depthrig_calib::PoseExt;
+use depthrig_drivers::stereo::StereoOptions;
 use depthrig_recorder::{
     Diagnostic, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamAccount,
     StreamRecord, Summary, UtcSource, fs,
@@ -92,6 +93,8 @@ pub struct StreamFacts {
     pub calibration: String,
     /// Pose of its camera on the mount.
     pub camera_pose: depthrig_bus::Pose,
+    /// What computed it, if it is no camera's.
+    pub computed: Option<depthrig_recorder::Computed>,
 }
 
 impl Begun {
@@ -123,7 +126,12 @@ impl Begun {
         session.started_utc_ns = utc.utc_ns;
         session.host = rustix::system::uname().nodename().to_string_lossy().into_owned();
         session.rig_config.clone_from(&config.text);
-        session.max_spread_ns = max_spread_ns(streams.iter().map(|s| s.stream.profile.rate_hz));
+        // Depth by stereo joins a set from the nearest pair that was matched.
+        let late = |s: &StreamFacts| StereoOptions::is_late(s.stream.id.stream.as_str());
+        let rates = streams.iter().map(|s| (late(s), s.stream.profile.rate_hz));
+        session.max_spread_ns =
+            max_spread_ns(rates.map(|(late, hz)| if late { hz.min(sets_hz) } else { hz }));
+        session.computed = streams.iter().filter_map(|s| s.computed.clone()).collect();
         session.streams = streams.iter().map(record_of).collect();
         let mut options = options_of(&config.recording);
         options.backlog_max_bytes = outside.backlog_max_bytes.unwrap_or(options.backlog_max_bytes);

@@ -362,6 +362,7 @@ impl Inner {
                 serial: info.serial.clone(),
                 calibration: info.calibration.clone(),
                 camera_pose: camera.config.pose,
+                computed: camera.computed(&stream.id),
             }));
         }
         facts

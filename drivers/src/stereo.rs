@@ -19,9 +19,10 @@ use crate::{
 };
 use core::fmt;
 use depthrig_bus::{Intrinsics, Name, PixelFormat, Pose, StreamName};
-use depthrig_calib::stereo::{Matcher, Parameters, Preset, SgmMatcher};
+use depthrig_calib::stereo::{Description, Matcher, Parameters, Preset, SgmMatcher};
 use depthrig_calib::{PoseExt, Rectifier};
-use std::sync::Arc;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
 
 mod crew;
 mod ledger;
@@ -60,6 +61,9 @@ impl Geometry {
         wanted.next_multiple_of(16).clamp(16, MAX_DISPARITY)
     }
 }
+
+/// What computes each mode, by its name; filled when the camera is started.
+pub type Descriptions = Arc<Mutex<BTreeMap<String, Description>>>;
 
 /// Makes the matcher of a mode, once per start of the camera.
 pub type Maker = Arc<dyn Fn(&Geometry) -> depthrig_calib::Result<Box<dyn Matcher>> + Send + Sync>;
@@ -114,6 +118,8 @@ pub struct StereoOptions {
     pub range_m: (f64, f64),
     /// Nothing gives way: for recordings alone, since a camera does not wait.
     pub every_pair: bool,
+    /// Where it is told what computes each mode.
+    pub computed: Descriptions,
 }
 
 impl Default for StereoOptions {
@@ -125,6 +131,7 @@ impl Default for StereoOptions {
             depth_unit_m: 0.001,
             range_m: (0.5, 20.0),
             every_pair: false,
+            computed: Descriptions::default(),
         }
     }
 }

@@ -124,6 +124,15 @@ fn a_folder_of_raw_pairs_is_recorded_in_three_modes() {
     let names: Vec<_> = streams.iter().map(|s| s.id.stream.to_string()).collect();
     assert_eq!(names.len(), 9, "two eyes, colour, depth and confidence of three modes: {names:?}");
     assert!(streams.iter().all(|s| s.serial == "12345678"));
+    let computed = &dataset.session().computed;
+    assert_eq!(computed.len(), 6, "{computed:?}");
+    assert!(
+        computed.iter().any(|c| c.name == "mimic_ultra"
+            && c.producer.contains("sgm")
+            && c.parameters.contains("preset=ultra")),
+        "{computed:?}"
+    );
+    assert!(computed.iter().all(|c| c.from.iter().map(ToString::to_string).eq(["zed/left", "zed/right"])));
     let truth = truth(&calibration());
     let mut frames = [0; 9];
     for set in dataset.sets(SetRange::ALL) {
@@ -151,8 +160,10 @@ fn a_folder_of_raw_pairs_is_recorded_in_three_modes() {
             errors.sort_by(f64::total_cmp);
             let (middle, most) = (errors[errors.len() / 2], errors[errors.len() * 9 / 10]);
             assert!(seen > 0.7, "{name}: {seen} of the wall");
-            // A sixteenth of a pixel at 1.5 m is 0.3 %.
-            assert!(middle < 0.005 && most < 0.03, "{name}: half are within {middle}, most within {most}");
+            // A quarter of a pixel at 1.5 m is 1.2 %; the performance preset matches at half the resolution.
+            let limit = if name.ends_with("performance") { 0.024 } else { 0.012 };
+            println!("{name}: {seen:.3} of the wall, half within {middle:.4}, most within {most:.4}");
+            assert!(middle < limit && most < 3.0 * limit, "{name}: half are within {middle}, most within {most}");
         }
     }
     assert!(frames.iter().all(|n| *n >= 1), "{frames:?} of {names:?}");

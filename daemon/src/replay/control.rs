@@ -150,6 +150,7 @@ impl Inner {
                 serial: record.serial.clone(),
                 calibration: record.calibration.clone(),
                 camera_pose: Pose::IDENTITY,
+                computed: None,
             };
         self.records.iter().zip(&self.streams).map(facts).collect()
     }

@@ -3,7 +3,7 @@
 //! Each thread has a box for one pair; a newer pair takes the place of one that still lies there. Everything that pictures
 //! are in is made once and goes round.
 
-use super::{Geometry, StereoMode, StereoOptions, has_color};
+use super::{Descriptions, Geometry, StereoMode, StereoOptions, has_color};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::PixelFormat;
@@ -145,8 +145,8 @@ impl Crew {
             focal_px: rectifier.intrinsics().fx,
             baseline_m: rectifier.baseline_m(),
         };
-        let matchers =
-            options.modes.iter().map(|m| make(camera, m, &geometry)).collect::<Result<Vec<_>>>()?;
+        let made = |m| make(camera, m, &geometry, &options.computed);
+        let matchers = options.modes.iter().map(made).collect::<Result<Vec<_>>>()?;
         // Every pair that is on its way can say something to each mode, and once more.
         let (send, events) = sync_channel(8 * (matchers.len() + 1));
         let (spare, spared) = sync_channel(4);
@@ -221,7 +221,12 @@ impl Drop for Crew {
     }
 }
 
-fn make(camera: &str, mode: &StereoMode, geometry: &Geometry) -> Result<Box<dyn Matcher>> {
+fn make(
+    camera: &str,
+    mode: &StereoMode,
+    geometry: &Geometry,
+    computed: &Descriptions,
+) -> Result<Box<dyn Matcher>> {
     let matcher = (mode.make)(geometry).map_err(|e| {
         let what = format!("{camera}: the stereo mode \"{}\" cannot be made: {e}", mode.name);
         Error::new(ErrorKind::BadInput, what).with_source(e)
@@ -229,6 +234,7 @@ fn make(camera: &str, mode: &StereoMode, geometry: &Geometry) -> Result<Box<dyn 
     let d = matcher.describe();
     let (mode, mib) = (&mode.name, d.memory_bytes / (1 << 20));
     tracing::info!(camera, mode, producer = d.producer, parameters = d.parameters, mib, "stereo");
+    computed.lock().unwrap_or_else(PoisonError::into_inner).insert(mode.clone(), d);
     Ok(matcher)
 }
 

@@ -281,6 +281,17 @@ fn a_wall_has_its_depth_in_every_preset_and_format() {
 }
 
 #[test]
+fn it_is_told_what_computes_each_mode() {
+    let options = options(presets());
+    let computed = Arc::clone(&options.computed);
+    let _ = play(Made::new(PixelFormat::Yuyv, &[Shot::Wall(20)]), options, &["depth_quality"]);
+    let computed = computed.lock().unwrap();
+    let names: Vec<_> = computed.iter().map(|(mode, d)| (mode.as_str(), d.name.as_str())).collect();
+    assert_eq!(names, [("performance", "performance"), ("quality", "quality"), ("ultra", "ultra")]);
+    assert!(computed["ultra"].parameters.contains("max_disparity=64"), "{}", computed["ultra"].parameters);
+}
+
+#[test]
 fn only_what_is_asked_for_comes_and_the_eyes_are_read_all_the_same() {
     let made = Made::new(PixelFormat::Yuyv, &[Shot::Wall(20); 2]);
     let (sink, profiles) = play(made, options(presets()), &["depth_quality", "left"]);
