@@ -163,7 +163,10 @@ fn a_folder_of_raw_pairs_is_recorded_in_three_modes() {
             // A quarter of a pixel at 1.5 m is 1.2 %; the performance preset matches at half the resolution.
             let limit = if name.ends_with("performance") { 0.024 } else { 0.012 };
             println!("{name}: {seen:.3} of the wall, half within {middle:.4}, most within {most:.4}");
-            assert!(middle < limit && most < 3.0 * limit, "{name}: half are within {middle}, most within {most}");
+            assert!(
+                middle < limit && most < 3.0 * limit,
+                "{name}: half are within {middle}, most within {most}"
+            );
         }
     }
     assert!(frames.iter().all(|n| *n >= 1), "{frames:?} of {names:?}");
