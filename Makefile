@@ -25,10 +25,9 @@ REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt
 help: ## show this list
 	@sed -nE 's/^([a-z-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-12s %s\n", $$1, $$2}'
 
-demo: setup-build ## the seven-camera rig with synthetic cameras: record, verify, replay, report
+demo: setup-build ## the mount of seven cameras with ten depth modes, without a camera: record, verify, replay, report
 	@tools/onnxruntime.sh || true
-	cargo build --release --package depthrig
-	target/release/depthrig demo $(ARGS)
+	tools/demo.sh $(ARGS)
 
 test: setup-test $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(READERS)/node_modules/.stamp ## every test there is: Rust, Python, readers that are not ours, the virtual machine
 	@tools/onnxruntime.sh || true
@@ -40,7 +39,7 @@ test-long: ## the long forms: every test with DEPTHRIG_LONG=1, ten minutes of re
 	target/release/depthrig bench soak --check
 	$(MAKE) fuzz
 
-vm: setup-build setup-vm ## drivers and daemon on a real kernel, in a virtual machine; one scenario: make vm ARGS="vivid-smoke"
+vm: setup-build setup-vm $(VENV)/.stamp ## drivers and daemon on a real kernel, in a virtual machine; one scenario: make vm ARGS="vivid-smoke"
 	tests/vm/run --require $(ARGS)
 
 # How long for each target, and which: make fuzz FUZZ="600 segment"

@@ -1,9 +1,9 @@
-//! `depthrig demo`: the whole way of a frame once, with synthetic cameras.
+//! `depthrig demo`: the whole way of a frame once, with synthetic cameras, or with those of a rig file.
 
 use crate::commands::run::{self, Started};
 use crate::context::{Context, private_folder};
 use crate::demo::live::{Seen, Watcher};
-use crate::demo::report::DemoReport;
+use crate::demo::report::{self, DemoReport};
 use crate::demo::{replayed, seeded, sheet};
 use crate::exit::Exit;
 use crate::out;
@@ -13,10 +13,13 @@ use anyhow::{Context as _, Result, anyhow, bail};
 use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
 use depthrig_bus::{Bus, HostTime, Name, RuntimeDir, StreamId, UtcPair};
+use depthrig_cdm::Precision;
 use depthrig_daemon::config::{BackendConfig, EngineChoice, RefineConfig, RigConfig};
 use depthrig_daemon::control::RecordRequest;
 use depthrig_daemon::rig::{Rig, RigSummary};
 use depthrig_daemon::status::RigStatus;
+use depthrig_daemon::zed_replay::Mode;
+use depthrig_drivers::StreamRequest;
 use depthrig_recorder::report::REPORT_FILE;
 use depthrig_recorder::{Dataset, VerifyOptions, verify};
 use std::path::{Path, PathBuf};
@@ -28,7 +31,8 @@ It needs no camera and no daemon, and leaves a running one alone.
 Examples:
   depthrig demo
   depthrig demo --seconds 60 --out /data/demo
-  depthrig demo --json | jq .replay";
+  depthrig demo --json | jq .replay
+  depthrig demo --config rig.toml      the cameras of a rig file instead; `make demo` makes one with recordings";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
@@ -39,6 +43,9 @@ pub struct DemoArgs {
     /// A new folder for the dataset, the pictures and the report [default: demo-data/DATE_TIME]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// A rig file, instead of seven simulated cameras
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
     /// Print everything as JSON
     #[arg(long)]
     json: bool,
@@ -55,7 +62,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
         bail!("{}: there is a dataset already; name another folder with --out", folder.display());
     }
     std::fs::create_dir_all(&folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
-    let config = configuration()?;
+    let (config, unavailable) = configuration(args.config.as_deref())?;
     let private = private_folder()?;
     let runtime = RuntimeDir::at(private.path())?;
     let name = config.rig.clone();
@@ -73,9 +80,11 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
     let seeded = seeded::run()?;
     progress.clear();
 
+    let info = Dataset::open(&dataset)?.info()?;
     let contact_sheet = folder.join("contact-sheet.png");
     let cameras = recorded.live.cameras.iter().filter_map(|c| recorded.seen.pictures.get(&c.name));
-    sheet::contact_sheet(cameras.map(|pictures| pictures.each_ref().map(Option::as_ref)))
+    // In the order of their names, in which colour is the first.
+    sheet::contact_sheet(cameras.map(|pictures| pictures.values().map(Some).collect()))
         .save(&contact_sheet)
         .with_context(|| format!("{}: cannot be written", contact_sheet.display()))?;
     let report = DemoReport {
@@ -86,6 +95,8 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
         refined: recorded.seen.refined,
         seeded,
         units_mm: recorded.seen.units_mm,
+        recorded: report::modes(info.streams.iter().map(|s| (s.stream.as_str(), s.frames))),
+        unavailable,
         sets_seen: recorded.seen.sets,
         frames_unread: recorded.seen.unread,
         summary: recorded.summary,
@@ -110,14 +121,20 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
 /// Refined pictures of each camera a second: all seven share what the cores have left.
 const REFINE_HZ: f64 = 2.0;
 
-/// The default rig, with the true depth and, by the engine that needs no model, refined depth as streams of their own
-/// that are not recorded.
-fn configuration() -> Result<RigConfig> {
-    let mut config =
-        RigConfig::parse(RigConfig::default_text(), None).map_err(depthrig_daemon::Error::from)?;
+/// The rig of `file`, else the default rig; and the depth modes that are taken out of it, with the reason. Simulated cameras
+/// give their true depth and, by the engine that needs no model, refined depth as streams of their own that are not recorded.
+fn configuration(file: Option<&Path>) -> Result<(RigConfig, Vec<String>)> {
+    let read = file.map_or_else(|| RigConfig::parse(RigConfig::default_text(), None), RigConfig::load);
+    let mut config = read.map_err(depthrig_daemon::Error::from)?;
     for camera in &mut config.cameras {
         if let BackendConfig::Synthetic(settings) = &mut camera.backend {
             settings.truth = true;
+            // Where the rig names streams, those of the truth are among them, in the modes of what they are true of.
+            for (of, truth) in [("depth", "depth_true"), ("color", "depth_true_color")] {
+                if let Some(mode) = camera.streams.iter().find(|s| s.stream.as_str() == of).cloned() {
+                    camera.streams.push(StreamRequest { stream: Name::new(truth)?, format: None, ..mode });
+                }
+            }
             camera.refine = Some(RefineConfig {
                 engine: EngineChoice::Fill,
                 rate_hz: REFINE_HZ,
@@ -126,7 +143,24 @@ fn configuration() -> Result<RigConfig> {
             camera.record = Some(vec![Name::new("color")?, Name::new("depth")?]);
         }
     }
-    Ok(config)
+    let unavailable = without_library(&mut config);
+    Ok((config, unavailable))
+}
+
+/// Takes the mode of cameras' stereo that is a network out of a rig that has no library to run it; says so of each.
+fn without_library(config: &mut RigConfig) -> Vec<String> {
+    let found = depthrig_cdm::find_library(config.cdm.library.as_deref(), "cpu", Precision::Fp32);
+    let Err(why) = found else { return Vec::new() };
+    let mut unavailable = Vec::new();
+    for camera in &mut config.cameras {
+        let Some(stereo) = camera.stereo.as_mut().filter(|s| s.modes.contains(&Mode::Neural)) else {
+            continue;
+        };
+        stereo.modes.retain(|mode| *mode != Mode::Neural);
+        stereo.network = None;
+        unavailable.push(format!("{} {} is unavailable, because {why}", camera.name, Mode::Neural));
+    }
+    unavailable
 }
 
 struct Recorded {

@@ -1,6 +1,6 @@
 //! A subscriber of the live rig: takes frame sets as a policy would, checks them and looks at their depth.
 
-use super::{Checksums, checksum};
+use super::{Checksums, checksum, is_depth, mode_name};
 use crate::picture;
 use anyhow::Result;
 use core::time::Duration;
@@ -47,16 +47,16 @@ pub struct Seen {
     pub sets: u64,
     /// Members of sets whose frame was gone before it was read.
     pub unread: u64,
-    /// Checksums of the depth pictures of all sets.
+    /// Checksums of all depth pictures.
     pub checksums: Checksums,
-    /// Depth by camera.
+    /// Depth by mode.
     pub depth: BTreeMap<String, DepthSeen>,
-    /// Millimetres per unit of depth, by camera.
+    /// Millimetres per unit of depth, by mode.
     pub units_mm: BTreeMap<String, f64>,
     /// Refined depth by camera.
     pub refined: BTreeMap<String, RefinedSeen>,
-    /// The newest pictures by camera: colour, depth and refined depth as colours.
-    pub pictures: BTreeMap<String, [Option<RgbImage>; 3]>,
+    /// The newest pictures by camera and stream: colour, each depth and refined depth, as colours.
+    pub pictures: BTreeMap<String, BTreeMap<String, RgbImage>>,
 }
 
 /// What was seen of one camera's refined depth.
@@ -118,30 +118,24 @@ impl Watcher {
     /// Takes frames and sets until `ended`.
     pub fn run(mut self, ended: impl Fn() -> bool) -> Result<Seen> {
         while !ended() {
-            for input in self.inputs.values_mut() {
-                input.pump()?;
-            }
+            self.pump()?;
             self.take_refined()?;
             // Frames come at up to 60 Hz and four wait unread: a look every 20 ms loses none.
             if let Some(set) = self.sets.next_timeout(Duration::from_millis(20))? {
                 let members = set.members()?;
-                for input in self.inputs.values_mut() {
-                    input.pump()?;
-                }
+                self.pump()?;
                 self.take(&members)?;
             }
         }
+        self.look_at_late_modes();
         // Pictures for the report, from the last frames; nothing waits for this any more.
         for (id, input) in &self.inputs {
             let Some(frame) = input.kept.back() else { continue };
-            let pictures = self.seen.pictures.entry(id.camera.to_string()).or_default();
-            match id.stream.as_str() {
-                "color" => pictures[0] = Some(picture::to_rgb(frame.header(), frame.pixels())?),
-                "depth" => pictures[1] = Some(picture::to_rgb(frame.header(), frame.pixels())?),
-                "depth_refined" => {
-                    pictures[2] = Some(picture::to_rgb(frame.header(), frame.pixels())?);
-                }
-                _ => {}
+            let stream = id.stream.as_str();
+            if stream == "color" || stream == "depth_refined" || is_depth(stream) {
+                let picture = picture::to_rgb(frame.header(), frame.pixels())?;
+                let pictures = self.seen.pictures.entry(id.camera.to_string()).or_default();
+                pictures.insert(stream.to_owned(), picture);
             }
         }
         for (refined, truth) in &self.refined {
@@ -149,7 +143,8 @@ impl Watcher {
             seen.depth.add(refined, Some(truth), SAME_MOMENT_IN_COLOR_NS)?;
         }
         for (depth, truth) in self.to_compare.iter().flatten() {
-            let seen = self.seen.depth.entry(depth.header.camera().to_owned()).or_default();
+            let mode = mode_name(depth.header.camera(), depth.header.stream());
+            let seen = self.seen.depth.entry(mode).or_default();
             seen.add(depth, truth.as_ref(), SAME_MOMENT_NS)?;
         }
         for depth in self.seen.depth.values_mut().chain(self.seen.refined.values_mut().map(|r| &mut r.depth))
@@ -160,6 +155,36 @@ impl Watcher {
             depth.strict_l1_mm = depth.strict_l1_mm.map(mean);
         }
         Ok(self.seen)
+    }
+
+    /// Has the newest picture of each depth mode looked at that comes too late for the sets of the bus.
+    fn look_at_late_modes(&mut self) {
+        let looked_at = |id: &StreamId| {
+            let same = |(depth, _): &(Copied, Option<Copied>)| depth.header.stream_id().as_ref() == Some(id);
+            self.to_compare.iter().flatten().any(same)
+        };
+        let late = self.inputs.iter().filter(|(id, _)| is_depth(id.stream.as_str()) && !looked_at(id));
+        let newest = late.filter_map(|(_, input)| Some((Copied::of(input.kept.back()?), None)));
+        let newest: Vec<_> = newest.collect();
+        self.to_compare.push(newest);
+    }
+
+    /// Takes what has come. Every depth picture is noted at once: a set that waits for a slow mode is told of when the
+    /// frames of fast cameras are gone.
+    fn pump(&mut self) -> Result<()> {
+        for (id, input) in &mut self.inputs {
+            if !is_depth(id.stream.as_str()) {
+                input.pump(|_| ())?;
+                continue;
+            }
+            let Seen { checksums, units_mm, .. } = &mut self.seen;
+            let unit = units_mm.entry(mode_name(id.camera.as_str(), id.stream.as_str())).or_default();
+            input.pump(|frame| {
+                *unit = frame.header().depth_unit_m * 1e3;
+                checksums.insert((id.clone(), frame.header().capture_time_ns), checksum(frame.pixels()));
+            })?;
+        }
+        Ok(())
     }
 
     /// Counts refined frames, and keeps some with the truth of their moment.
@@ -192,14 +217,11 @@ impl Watcher {
             let sequence = members.iter().find(|m| m.id == *id)?.sequence?;
             self.inputs.get(id)?.kept.iter().find(|f| f.header().sequence == sequence)
         };
-        for member in members.iter().filter(|m| m.sequence.is_some() && m.id.stream.as_str() == "depth") {
+        for member in members.iter().filter(|m| m.sequence.is_some() && is_depth(m.id.stream.as_str())) {
             let Some(depth) = frame(&member.id) else {
                 self.seen.unread += 1;
                 continue;
             };
-            let key = (member.id.clone(), depth.header().capture_time_ns);
-            self.seen.checksums.insert(key, checksum(depth.pixels()));
-            self.seen.units_mm.insert(member.id.camera.to_string(), depth.header().depth_unit_m * 1e3);
             if compare {
                 let truth = StreamId::new(member.id.camera.as_str(), "depth_true")?;
                 pairs.push((Copied::of(depth), frame(&truth).map(Copied::of)));
@@ -213,14 +235,15 @@ impl Watcher {
 }
 
 impl Input {
-    /// Takes what has come; the oldest are let go.
-    fn pump(&mut self) -> Result<()> {
+    /// Takes what has come, and shows it to `look`; the oldest are let go.
+    fn pump(&mut self, mut look: impl FnMut(&Frame)) -> Result<()> {
         loop {
             match self.subscriber.try_next() {
                 Ok(Some(frame)) => {
                     if self.kept.len() == KEEP {
                         self.kept.pop_front();
                     }
+                    look(&frame);
                     self.kept.push_back(frame);
                 }
                 Ok(None) => return Ok(()),

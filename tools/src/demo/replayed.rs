@@ -1,6 +1,6 @@
 //! A subscriber of the replay: every frame must be the recorded one, and depth must be the live one bit by bit.
 
-use super::{Checksums, checksum};
+use super::{Checksums, checksum, is_depth};
 use anyhow::Result;
 use core::time::Duration;
 use depthrig_bus::{Bus, FrameFlags, RuntimeDir, StreamId, Subscriber};
@@ -105,7 +105,7 @@ impl Input {
                 && header.stream_id().as_ref() == Some(&self.id);
             seen.wrong_headers += u64::from(!is_right);
             self.last_ns = header.capture_time_ns;
-            if self.id.stream.as_str() == "depth" {
+            if is_depth(self.id.stream.as_str()) {
                 match live.get(&(self.id.clone(), header.capture_time_ns)) {
                     Some(sum) if *sum == checksum(frame.pixels()) => seen.depth_equal += 1,
                     Some(_) => seen.depth_different += 1,

@@ -3,6 +3,7 @@
 use super::live::{DepthSeen, RefinedSeen};
 use super::replayed::Replayed;
 use super::seeded::Seeded;
+use super::{is_depth, mode_name};
 use crate::commands::verify;
 use crate::exit::Exit;
 use crate::out;
@@ -22,14 +23,18 @@ pub struct DemoReport {
     pub stop_s: f64,
     /// The rig while it was recording.
     pub live: RigStatus,
-    /// Depth as a subscriber saw it, by camera.
+    /// Depth as a subscriber saw it, by depth mode: the name of a camera, with the mode's where it has several.
     pub depth: BTreeMap<String, DepthSeen>,
     /// Refined depth as a subscriber saw it, by camera.
     pub refined: BTreeMap<String, RefinedSeen>,
     /// A camera depth model of random weights, end to end.
     pub seeded: Seeded,
-    /// Millimetres per unit of depth, by camera.
+    /// Millimetres per unit of depth, by depth mode.
     pub units_mm: BTreeMap<String, f64>,
+    /// Pictures of each depth mode in the recording.
+    pub recorded: BTreeMap<String, u64>,
+    /// Depth modes that the rig asks for and that are not there, with the reason.
+    pub unavailable: Vec<String>,
     /// Sets that the subscriber got.
     pub sets_seen: u64,
     /// Frames of those sets that the subscriber did not have: those of the first set were sent before it subscribed.
@@ -58,8 +63,17 @@ impl DemoReport {
         }
         let whole = self.summary.lost.is_empty()
             && verify::exit(&self.verify) == Exit::Good
-            && self.replay.is_complete();
+            && self.replay.is_complete()
+            && self.has_every_mode();
         if whole { Exit::Good } else { Exit::Lost }
+    }
+
+    /// Whether pictures of each depth mode of the live rig are in the recording.
+    fn has_every_mode(&self) -> bool {
+        self.live.cameras.iter().all(|camera| {
+            depth_streams(camera)
+                .all(|(_, mode)| self.recorded.get(&mode).is_some_and(|pictures| *pictures > 0))
+        })
     }
 
     /// The report for people.
@@ -69,12 +83,12 @@ impl DemoReport {
         let recording = self.summary.recording.as_ref();
         let mut lines = vec![
             out::table(
-                &["camera", "model", "colour", "depth", "unit mm", "Hz", "frames", "lost", "p99 ms", "ppm", "±us", "fill", "error"],
-                4,
-                self.live.cameras.iter().map(|camera| self.row(camera)),
+                &["depth mode", "model", "driver", "colour", "depth", "unit mm", "Hz", "frames", "lost", "p99 ms", "ppm", "±us", "fill", "error"],
+                5,
+                self.live.cameras.iter().flat_map(|camera| self.rows(camera)),
             ),
-            "Hz, p99 (capture to published), ppm and ± (device clock against host) are of depth; error is the mean \
-             distance from the true depth"
+            "Hz, frames, lost, p99 (capture to published), ppm and ± (device clock against host) are of depth; error is \
+             the mean distance from the true depth, where that is known"
                 .to_owned(),
             String::new(),
             format!("{} start    every camera streaming after {:.2} s, stopped in {:.2} s", ok(true), self.start_s, self.stop_s),
@@ -93,6 +107,12 @@ impl DemoReport {
                 recording.map_or(0, |r| r.frames),
                 out::bytes(recording.map_or(0, |r| r.bytes))
             ),
+            format!(
+                "{} modes    {} depth modes in it: {}",
+                ok(self.has_every_mode()),
+                self.recorded.len(),
+                self.recorded.iter().map(|(mode, n)| format!("{mode} {n}")).collect::<Vec<_>>().join(", ")
+            ),
             format!("{} verify   {}", ok(self.verify.is_whole()), verify::summary(&self.verify)),
             format!(
                 "{} replay   {} of {} frames received; {} depth pictures equal the live ones bit by bit, {} differ",
@@ -103,11 +123,15 @@ impl DemoReport {
                 self.replay.depth_different
             ),
         ];
+        lines.extend(self.unavailable.iter().map(|why| format!("--   mode     {why}")));
         lines.extend(self.refined_lines());
         let lost = self.summary.lost.iter().chain(&self.replay.lost);
         lines.extend(lost.map(|lost| format!("lost      {lost}")));
         lines.push(String::new());
-        lines.push(format!("pictures  {}  (colour, depth, refined depth)", self.contact_sheet.display()));
+        lines.push(format!(
+            "pictures  {}  (colour, depth by mode, refined depth)",
+            self.contact_sheet.display()
+        ));
         lines.push(format!("report    {}", self.quality_report.display()));
         if let Some(segment) = self.segments.first() {
             lines.push(format!(
@@ -131,7 +155,7 @@ impl DemoReport {
         let percent = |d: &DepthSeen| format!("{:.0} %", d.fill_percent);
         let error = |d: &DepthSeen| d.strict_l1_mm.map_or_else(|| "-".into(), |mm| format!("{mm:.0} mm"));
         let row = |(name, refined): (&String, &RefinedSeen)| {
-            let raw = self.depth.get(name).cloned().unwrap_or_default();
+            let raw = self.depth.get(name);
             let live = self.live.cameras.iter().find(|c| c.name == *name).and_then(|c| c.refine.as_ref());
             let step = |s: &str| {
                 live.and_then(|r| r.steps_p50_ms.get(s)).map_or("-".into(), |ms| format!("{ms:.1}"))
@@ -140,9 +164,9 @@ impl DemoReport {
             let seen = made.pictures > 0;
             vec![
                 name.clone(),
-                percent(&raw),
+                raw.map_or_else(|| "-".into(), percent),
                 if seen { percent(made) } else { "-".into() },
-                error(&raw),
+                raw.map_or_else(|| "-".into(), error),
                 error(made),
                 step("wait"),
                 step("register"),
@@ -168,35 +192,64 @@ impl DemoReport {
         lines
     }
 
-    fn row(&self, camera: &CameraStatus) -> Vec<String> {
-        let stream = |name: &str| camera.streams.iter().find(|s| s.id.ends_with(&format!("/{name}")));
-        let size =
-            |s: Option<&StreamStatus>| s.map_or_else(|| "-".into(), |s| format!("{}x{}", s.width, s.height));
-        let (color, depth) = (stream("color"), stream("depth"));
-        let of_depth = |tell: &dyn Fn(&StreamStatus) -> String| depth.map_or_else(|| "-".into(), tell);
-        let sum = |count: fn(&StreamStatus) -> u64| {
-            camera.streams.iter().filter(|s| !s.derived).map(count).sum::<u64>().to_string()
+    /// A row for each depth mode of a camera.
+    fn rows(&self, camera: &CameraStatus) -> Vec<Vec<String>> {
+        let size = |s: &StreamStatus| format!("{}x{}", s.width, s.height);
+        let color = camera.streams.iter().find(|s| s.id.ends_with("/color"));
+        let row = |(depth, mode): (&StreamStatus, String)| {
+            let seen = self.depth.get(&mode);
+            vec![
+                mode.clone(),
+                camera.model.clone(),
+                camera.backend.clone(),
+                color.map_or_else(|| "-".into(), size),
+                size(depth),
+                self.units(&mode),
+                format!("{:.1}", depth.rate_hz),
+                depth.delivered.to_string(),
+                depth.dropped.values().sum::<u64>().to_string(),
+                format!("{:.1}", depth.latency_p99_ms),
+                format!("{:+.1}", depth.clock.rate_ppm),
+                format!("{:.0}", depth.clock.uncertainty_us),
+                seen.map_or_else(|| "-".into(), |d| format!("{:.0} %", d.fill_percent)),
+                seen.and_then(|d| d.l1_mm).map_or_else(|| "-".into(), |mm| format!("{mm:.1} mm")),
+            ]
         };
-        let seen = self.depth.get(&camera.name);
-        vec![
-            camera.name.clone(),
-            camera.model.clone(),
-            size(color),
-            size(depth),
-            self.units(camera),
-            of_depth(&|s| format!("{:.1}", s.rate_hz)),
-            sum(|s| s.delivered),
-            sum(|s| s.dropped.values().sum()),
-            of_depth(&|s| format!("{:.1}", s.latency_p99_ms)),
-            of_depth(&|s| format!("{:+.1}", s.clock.rate_ppm)),
-            of_depth(&|s| format!("{:.0}", s.clock.uncertainty_us)),
-            seen.map_or_else(|| "-".into(), |d| format!("{:.0} %", d.fill_percent)),
-            seen.and_then(|d| d.l1_mm).map_or_else(|| "-".into(), |mm| format!("{mm:.1} mm")),
-        ]
+        depth_streams(camera).map(row).collect()
     }
 
-    fn units(&self, camera: &CameraStatus) -> String {
-        let unit = self.units_mm.get(&camera.name).copied();
+    fn units(&self, mode: &str) -> String {
+        let unit = self.units_mm.get(mode).copied();
         unit.map_or_else(|| "-".into(), |mm| format!("{}", (mm * 1e6).round() / 1e6))
+    }
+}
+
+/// The streams of a camera that are depth modes, with their names.
+fn depth_streams(camera: &CameraStatus) -> impl Iterator<Item = (&StreamStatus, String)> {
+    camera.streams.iter().filter_map(|s| {
+        let (_, stream) = s.id.split_once('/')?;
+        is_depth(stream).then(|| (s, mode_name(&camera.name, stream)))
+    })
+}
+
+/// Pictures of each depth mode in a dataset whose streams have so many.
+pub fn modes<'a>(streams: impl IntoIterator<Item = (&'a str, u64)>) -> BTreeMap<String, u64> {
+    let mode = |(id, frames): (&str, u64)| {
+        let (camera, stream) = id.split_once('/')?;
+        is_depth(stream).then(|| (mode_name(camera, stream), frames))
+    };
+    streams.into_iter().filter_map(mode).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_modes_of_a_dataset_are_its_depth_streams() {
+        let found =
+            modes([("d435/color", 5), ("d435/depth", 4), ("zed2i/depth_ultra", 3), ("zed2i/left", 5)]);
+        let wanted = [("d435".to_owned(), 4), ("zed2i ultra".to_owned(), 3)];
+        assert_eq!(found, BTreeMap::from(wanted));
     }
 }

@@ -1,0 +1,228 @@
+//! A folder of side-by-side images as a ZED 2i sends them: lenses that bend, eyes that are not quite parallel, and the
+//! factory calibration that says so.
+//!
+//! Each eye is a simulated camera of its own in the same world. What it sees without a lens is bent by the lens of the
+//! calibration, so that only who rectifies by that calibration finds rows that agree.
+
+use anyhow::{Context, Result, ensure};
+use depthrig_bus::{Distortion, HostTime, Intrinsics, Name, Pose};
+use depthrig_calib::{Camera, PoseExt};
+use depthrig_drivers::synthetic::{SyntheticBackend, SyntheticConfig};
+use depthrig_drivers::{Backend, MemorySink, Stream, StreamRequest};
+use glam::{DQuat, DVec2, DVec3};
+use image::RgbImage;
+use std::fmt::Write as _;
+use std::path::Path;
+use std::time::Duration;
+
+/// Pixels of one eye: the mode VGA.
+pub const SIZE: (u32, u32) = (672, 376);
+/// Serial number of the camera that does not exist.
+pub const SERIAL: &str = "39999999";
+/// Different pairs; shown in a loop they swing to and fro.
+const PAIRS: usize = 22;
+const POSES: u32 = 12;
+/// Rays for each pixel, in either direction.
+const RAYS: u32 = 2;
+
+/// The lens of an eye. Barrel distortion as these lenses have it.
+fn lens(focal_px: f64, cx: f64, cy: f64, k1: f64) -> Intrinsics {
+    let mut lens = Intrinsics::pinhole(focal_px, focal_px, cx, cy);
+    lens.coeffs[..5].copy_from_slice(&[k1, 0.004, 0.0002, -0.0001, 0.0]);
+    lens.model = Distortion::BrownConrady as u32;
+    lens
+}
+
+/// Left and right.
+pub fn lenses() -> [Intrinsics; 2] {
+    [lens(303.1, 338.4, 186.2, -0.031), lens(302.4, 333.7, 189.9, -0.029)]
+}
+
+/// The right eye in the left one: some tenths of a degree off, as they come out of the factory.
+pub fn right_in_left() -> Pose {
+    let turn = DQuat::from_scaled_axis(DVec3::new(0.0031, -0.0042, 0.0018));
+    Pose { translation_m: [0.1198, 0.0002, -0.0003], rotation_xyzw: turn.to_array() }
+}
+
+/// The factory calibration's text, in the vendor's units and order (docs of the format: drivers/src/zed/conf.rs).
+pub fn conf() -> Result<String> {
+    let mut text = String::new();
+    for (eye, k) in ["LEFT", "RIGHT"].into_iter().zip(lenses()) {
+        let (fx, fy, cx, cy) = (k.fx, k.fy, k.cx, k.cy);
+        let [k1, k2, p1, p2, k3, ..] = k.coeffs;
+        writeln!(text, "[{eye}_CAM_VGA]\nfx={fx}\nfy={fy}\ncx={cx}\ncy={cy}")?;
+        writeln!(text, "k1={k1}\nk2={k2}\np1={p1}\np2={p2}\nk3={k3}\n")?;
+    }
+    // From left to right a point moves by p_right = R p_left - t, with R = exp(r), t in millimetres.
+    let to_right = right_in_left().inverse();
+    let (r, t) = (
+        DQuat::from_array(to_right.rotation_xyzw).to_scaled_axis(),
+        DVec3::from_array(to_right.translation_m) * -1000.0,
+    );
+    writeln!(text, "[STEREO]\nBaseline={}\nTY={}\nTZ={}", t.x, t.y, t.z)?;
+    writeln!(text, "CV_VGA={}\nRX_VGA={}\nRZ_VGA={}", r.y, r.x, r.z)?;
+    Ok(text)
+}
+
+/// Writes the images and `SN39999999.conf` into `folder`.
+pub fn write(folder: &Path) -> Result<()> {
+    std::fs::create_dir_all(folder)?;
+    std::fs::write(folder.join(format!("SN{SERIAL}.conf")), conf()?)?;
+    let [left, right] = shoot()?;
+    let warps = lenses().map(|k| Warp::new(&k, &left.view));
+    let [to_left, to_right] = warps.map(|w| w.context("a lens that forms no picture"));
+    let (to_left, to_right) = (to_left?, to_right?);
+    for (i, (l, r)) in left.pictures.iter().zip(&right.pictures).enumerate() {
+        let mut both = RgbImage::new(2 * SIZE.0, SIZE.1);
+        image::imageops::replace(&mut both, &to_left.bend(l), 0, 0);
+        image::imageops::replace(&mut both, &to_right.bend(r), SIZE.0.into(), 0);
+        let path = folder.join(format!("pair_{i:03}.png"));
+        both.save(&path).with_context(|| format!("{}: cannot be written", path.display()))?;
+    }
+    Ok(())
+}
+
+/// What an eye sees without a lens.
+pub struct Seen {
+    view: Intrinsics,
+    pictures: Vec<RgbImage>,
+}
+
+/// Both eyes at the same moments, while the mount swings to and fro once.
+pub fn shoot() -> Result<[Seen; 2]> {
+    let eye = |name: &str, pose_on_mount| SyntheticConfig {
+        model: "zed2i".into(),
+        serial: name.into(),
+        pose_on_mount,
+        poses: POSES,
+        ..SyntheticConfig::default()
+    };
+    let mount =
+        Pose { translation_m: [0.0, -0.05, 0.0], rotation_xyzw: DQuat::from_rotation_x(-0.0716).to_array() };
+    let configs = vec![eye("left", mount), eye("right", mount.compose(&right_in_left()))];
+    let backend = SyntheticBackend::starting_at(configs, HostTime::now())?;
+    let request = StreamRequest {
+        rate_hz: Some(30.0),
+        size: Some((1280, 720)),
+        ..StreamRequest::any(Name::new("color")?)
+    };
+    let start = |name| -> Result<Box<dyn Stream>> {
+        Ok(backend.open(Some(name))?.start(std::slice::from_ref(&request))?)
+    };
+    let mut eyes = [(start("left")?, MemorySink::default()), (start("right")?, MemorySink::default())];
+    // Two frames for each pose, and some that have no partner.
+    while eyes.iter().any(|(_, sink)| sink.frames.len() < 2 * PAIRS + 12) {
+        for (stream, sink) in &mut eyes {
+            stream.poll(Duration::from_millis(10), sink)?;
+        }
+    }
+    let [(stream, left), (_, right)] = &eyes;
+    let view = stream.profiles().first().context("no colour")?.intrinsics;
+    let mut seen = [(); 2].map(|()| Seen { view, pictures: Vec::new() });
+    let picture =
+        |pixels: &[u8]| RgbImage::from_raw(1280, 720, pixels.to_vec()).context("a picture of another size");
+    let mut matched = 0;
+    for (_, l, pixels) in &left.frames {
+        let same =
+            |r: &depthrig_drivers::FrameMeta| r.capture_time.since_ns(l.capture_time).abs() < 8_000_000;
+        let partner = right.frames.iter().find(|(_, r, _)| same(r));
+        if let Some((_, _, other)) = partner {
+            matched += 1;
+            if matched % 2 == 1 && seen[0].pictures.len() < PAIRS {
+                seen[0].pictures.push(picture(pixels)?);
+                seen[1].pictures.push(picture(other)?);
+            }
+        }
+    }
+    ensure!(seen[0].pictures.len() == PAIRS, "only {} pairs were taken", seen[0].pictures.len());
+    Ok(seen)
+}
+
+/// Where each ray of a lens lies in the picture without one.
+struct Warp {
+    places: Vec<DVec2>,
+}
+
+impl Warp {
+    fn new(lens: &Intrinsics, view: &Intrinsics) -> Option<Self> {
+        let (lens, view) = (Camera::new(lens).ok()?, Camera::new(view).ok()?);
+        let mut places = Vec::with_capacity((SIZE.0 * SIZE.1 * RAYS * RAYS) as usize);
+        let part = |i: u32| (f64::from(i % RAYS) + 0.5) / f64::from(RAYS) - 0.5;
+        for y in 0..SIZE.1 {
+            for x in 0..SIZE.0 {
+                for ray in 0..RAYS * RAYS {
+                    let pixel = DVec2::new(f64::from(x) + part(ray), f64::from(y) + part(ray / RAYS));
+                    places.push(view.project(lens.unproject(pixel)?)?);
+                }
+            }
+        }
+        Some(Self { places })
+    }
+
+    /// The picture through the lens. Beyond its edge it goes on as at the edge.
+    fn bend(&self, from: &RgbImage) -> RgbImage {
+        let rays = (RAYS * RAYS) as usize;
+        let mut out = RgbImage::new(SIZE.0, SIZE.1);
+        for (pixel, places) in out.pixels_mut().zip(self.places.chunks_exact(rays)) {
+            let mut sum = [0.0; 3];
+            for place in places {
+                let x = place.x.clamp(0.0, f64::from(from.width() - 1) - 1e-3);
+                let y = place.y.clamp(0.0, f64::from(from.height() - 1) - 1e-3);
+                let (u, v, fx, fy) = (x as u32, y as u32, x.fract(), y.fract());
+                for (dx, dy, share) in [
+                    (0, 0, (1.0 - fx) * (1.0 - fy)),
+                    (1, 0, fx * (1.0 - fy)),
+                    (0, 1, (1.0 - fx) * fy),
+                    (1, 1, fx * fy),
+                ] {
+                    let at = from.get_pixel(u + dx, v + dy).0;
+                    (0..3).for_each(|c| sum[c] += share * f64::from(at[c]));
+                }
+            }
+            pixel.0 = sum.map(|s| (s / rays as f64).round() as u8);
+        }
+        out
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use depthrig_drivers::zed::conf::FactoryCalibration;
+    use depthrig_drivers::zed::mode::Mode;
+
+    /// The text is read as what it was made of.
+    #[test]
+    fn the_calibration_is_the_cameras() {
+        let read = FactoryCalibration::parse(&conf().unwrap(), "it").unwrap();
+        let vga = read.at(Mode::Vga).unwrap();
+        for (got, made) in [vga.left, vga.right].into_iter().zip(lenses()) {
+            assert_eq!(
+                (got.fx, got.fy, got.cx, got.cy, got.coeffs),
+                (made.fx, made.fy, made.cx, made.cy, made.coeffs)
+            );
+        }
+        let (got, made) = (vga.right_in_left, right_in_left());
+        for p in [DVec3::ZERO, DVec3::new(0.3, -0.2, 2.0)] {
+            assert!((got.transform_point(p) - made.transform_point(p)).length() < 1e-12);
+        }
+    }
+
+    /// A flat picture of columns comes out with the column that the lens sees.
+    #[test]
+    fn a_lens_bends_as_it_says() {
+        let view = Intrinsics::pinhole(530.0, 530.0, 640.0, 360.0);
+        let k = lenses()[0];
+        let warp = Warp::new(&k, &view).unwrap();
+        let slope = RgbImage::from_fn(1280, 720, |x, y| image::Rgb([(x / 5) as u8, (y / 3) as u8, 0]));
+        let bent = warp.bend(&slope);
+        let camera = Camera::new(&k).unwrap();
+        for (x, y) in [(100, 50), (336, 188), (600, 300)] {
+            let ray = camera.unproject(DVec2::new(f64::from(x), f64::from(y))).unwrap();
+            let (u, v) = (530.0 * ray.x / ray.z + 640.0, 530.0 * ray.y / ray.z + 360.0);
+            let [r, g, _] = bent.get_pixel(x, y).0;
+            assert!((f64::from(r) - (u - 2.0) / 5.0).abs() < 1.0, "{r} at {u}");
+            assert!((f64::from(g) - (v - 1.0) / 3.0).abs() < 1.0, "{g} at {v}");
+        }
+    }
+}
