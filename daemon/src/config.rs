@@ -412,6 +412,11 @@ impl RigConfig {
         include_str!("../default_rig.toml")
     }
 
+    /// The commented rig of the paper: its seven real cameras and their ten depth modes. It needs them to run.
+    pub const fn paper_text() -> &'static str {
+        include_str!("../paper_rig.toml")
+    }
+
     /// The camera `name`.
     pub fn camera(&self, name: &str) -> Option<&CameraConfig> {
         self.cameras.iter().find(|c| c.name.as_str() == name)

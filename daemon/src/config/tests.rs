@@ -7,6 +7,8 @@ use super::*;
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
+mod paper;
+
 fn parse(text: &str) -> Result<RigConfig, ConfigError> {
     RigConfig::parse(text, Some(Path::new("/rigs/rig.toml")))
 }

@@ -14,6 +14,7 @@ use std::path::PathBuf;
 pub const EXAMPLES: &str = "\
 Examples:
   depthrig config show > rig.toml    the commented default: seven synthetic cameras
+  depthrig config show paper         the rig of the paper: seven real cameras, ten depth modes
   depthrig config check rig.toml     every problem with its line; exit code 2 when there is one";
 
 /// What to do.
@@ -24,14 +25,28 @@ pub enum ConfigCommand {
         /// The configuration
         file: PathBuf,
     },
-    /// Print the commented default configuration, which runs as it is
-    Show,
+    /// Print a commented configuration
+    Show {
+        /// "default" runs as it is; "paper" is for the seven real cameras of the paper's mount
+        #[arg(value_enum, default_value = "default")]
+        which: Shown,
+    },
+}
+
+/// A configuration that comes with depthrig.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Shown {
+    /// Seven synthetic cameras.
+    Default,
+    /// The seven cameras of the paper.
+    Paper,
 }
 
 /// Checks or prints.
 pub fn run(command: &ConfigCommand) -> Result<Exit> {
     match command {
-        ConfigCommand::Show => out::line(RigConfig::default_text().trim_end())?,
+        ConfigCommand::Show { which: Shown::Default } => out::line(RigConfig::default_text().trim_end())?,
+        ConfigCommand::Show { which: Shown::Paper } => out::line(RigConfig::paper_text().trim_end())?,
         ConfigCommand::Check { file } => {
             let config = RigConfig::load(file).map_err(depthrig_daemon::Error::from)?;
             // Pictures are part of what must be right, and cost little to look at; cameras may be unplugged now.
