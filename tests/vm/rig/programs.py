@@ -9,6 +9,8 @@ from pathlib import Path
 from . import Broken
 
 ROOT = Path(__file__).parents[3]
+# Those of the wanted programs that are examples.
+EXAMPLES = ("external",)
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ def build(wanted: list[str]) -> list[Path]:
     is compiled a second time with other features."""
     command = ["cargo", "build", "--quiet", "--workspace"]
     for program in wanted:
-        command += ["--bin", program]
+        command += ["--example" if program in EXAMPLES else "--bin", program]
     if subprocess.run(command, cwd=ROOT).returncode:
         raise Broken("the programs under test do not build")
     return built(wanted)
@@ -34,10 +36,11 @@ def build(wanted: list[str]) -> list[Path]:
 def built(wanted: list[str]) -> list[Path]:
     """The paths of programs that have been built."""
     folder = Path(os.environ.get("CARGO_TARGET_DIR") or ROOT / "target") / "debug"
-    missing = [program for program in wanted if not (folder / program).exists()]
+    paths = [folder / "examples" / program if program in EXAMPLES else folder / program for program in wanted]
+    missing = [path.name for path in paths if not path.exists()]
     if missing:
         raise Broken(f"{', '.join(missing)}: not in {folder}")
-    return [folder / program for program in wanted]
+    return paths
 
 
 def scenarios(guest: Path) -> list[Scenario]:

@@ -12,8 +12,10 @@
 mod boot;
 mod checks;
 mod daemon;
+mod eyes;
 mod feed;
 mod mount;
+mod outside;
 mod subject;
 mod system;
 mod tally;
@@ -41,6 +43,7 @@ mod scenarios {
     pub mod v4l2_faults;
     pub mod v4l2_formats;
     pub mod vivid_smoke;
+    pub mod whole_mount;
     pub mod zed;
     pub mod zed_records;
 }
@@ -89,6 +92,7 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::zed::SCENARIO,
     scenarios::zed_records::SCENARIO,
     scenarios::fourteen::SCENARIO,
+    scenarios::whole_mount::SCENARIO,
     scenarios::replug::SCENARIO,
     scenarios::daemon_life::SCENARIO,
     scenarios::faults::SCENARIO,

@@ -1,0 +1,302 @@
+//! The mount of seven cameras, as far as it can be had without one: emulated RealSense and ZED through the kernel's own
+//! drivers, the ZED's depth by our stereo, a Kinect's recording, and an eighth camera that another process serves. All of
+//! it in one recording, which is brought out of the guest.
+
+use crate::checks::Checks;
+use crate::daemon::{self, Daemon, streams};
+use crate::eyes::Eyes;
+use crate::mount::{Compared, Mount};
+use crate::{Scenario, outside, system};
+use anyhow::Context;
+use depthrig_bus::{Bus, HostTime, RigName, StreamId};
+use depthrig_calib::stereo::Preset;
+use depthrig_daemon::status::RigStatus;
+use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode};
+use depthrig_drivers::zed::mode::Mode;
+use depthrig_emulator::{Camera, Stamp};
+use depthrig_kinect_fixture::{Fixture, Pattern, Pictures};
+use depthrig_recorder::{Dataset, PixelMode, SetRange, Severity, VerifyOptions, verify};
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::path::Path;
+use std::time::Duration;
+
+/// See the module.
+pub const SCENARIO: Scenario = Scenario {
+    name: "whole-mount",
+    about: "five RealSense, a ZED with stereo, a Kinect's recording and another process's camera, in one recording",
+    cost: 60,
+    limit_s: 120,
+    run,
+};
+
+/// What is plugged in.
+const MODELS: [&str; 6] = ["d405", "d415", "d435", "d455", "l515", "zed2i"];
+const KINECT: &str = "/tmp/kinect.mkv";
+/// The nearest that stereo looks for. Few disparities: the guest has one slow processor.
+const NEAR_M: f64 = 3.0;
+/// Depth pictures that are made once more, and pairs of eyes that are kept until theirs comes.
+const COMPARED: usize = 4;
+const KEPT: usize = 24;
+const PATIENCE: Duration = Duration::from_secs(5);
+/// How long is recorded, and how many sets a second.
+const SECONDS: u64 = 6;
+const SET_RATE_HZ: u64 = 1;
+
+fn run(checks: &mut Checks) -> anyhow::Result<()> {
+    system::modprobe("usbhid", &[])?;
+    system::modprobe("hid-generic", &[])?;
+    let mount = Mount::plug(&MODELS, |_| 0)?;
+    let cameras: BTreeMap<_, _> = MODELS.into_iter().zip(&mount.cameras).collect();
+    let fixture = kinect()?;
+
+    let daemon = Daemon::start(&rig(&mount)?)?;
+    let status = daemon.wait_until_streaming()?;
+    checks.equal("eight cameras stream", status.cameras.len(), 8);
+    let path = daemon.record("mount")?;
+    let pairs = pairs(&daemon, Duration::from_secs(SECONDS))?;
+    let recording = daemon.record_stop()?;
+    let before = status;
+    let status = daemon.status()?;
+    checks.that("all of them still do", status.cameras.iter().all(streams), daemon::told(&status));
+    books(checks, &status);
+    lost(checks, &before, &status);
+    checks.that("sets are recorded", recording.sets >= SET_RATE_HZ * SECONDS - 2, recording.sets);
+    checks.equal("none is dropped", recording.dropped, BTreeMap::new());
+    let (ended, took) = daemon.stop()?;
+    // 3: frames were lost, as some are while so many cameras open, and pairs that stereo had no time for.
+    let well = matches!(ended.code(), Some(0 | 3));
+    checks.that("SIGTERM ends it, other processes too", well, format!("{ended} after {took:?}"));
+
+    let report = verify(&path, &VerifyOptions { decode: true, ..VerifyOptions::default() })?;
+    let broken: Vec<_> = report.findings.iter().filter(|f| f.severity > Severity::Lost).collect();
+    let what = "every picture of the dataset decodes, and it is what it says";
+    checks.that(what, broken.is_empty(), format!("{broken:?}"));
+    for finding in &report.findings {
+        checks.note(&finding.message);
+    }
+    stereo(checks, cameras["zed2i"], &pairs)?;
+    contents(checks, &cameras, &path, recording.frames, &fixture)?;
+    if let Some(pictures) = outside::bring(SCENARIO.name, &path)? {
+        checks.note(format!("{pictures} pictures are brought to the host"));
+    }
+    Ok(())
+}
+
+/// A recording of an Azure Kinect: 720p Motion JPEG and the binned narrow view, 15 Hz.
+fn kinect() -> anyhow::Result<Fixture> {
+    let color = ColorMode { format: ColorFormat::Mjpg, resolution: ColorResolution::P720 };
+    let fixture = Fixture {
+        color: Some(color),
+        depth: Some(DepthMode::Nfov2x2Binned),
+        rate_hz: 15,
+        captures: 3 * Pattern::DIFFERENT,
+        ..Fixture::default()
+    };
+    fixture.write(Path::new(KINECT), &mut Pattern::new(&fixture))?;
+    Ok(fixture)
+}
+
+/// The rig file's part after the head that every scenario has.
+fn rig(mount: &Mount) -> anyhow::Result<String> {
+    let mut text = format!("[sets]\nrate_hz = {SET_RATE_HZ}.0\n");
+    for (model, camera) in MODELS.iter().zip(&mount.cameras) {
+        let serial = camera.serial();
+        let (backend, modes): (_, &[(&str, u32, u32, u32)]) = match *model {
+            "l515" => ("l515", &[("depth", 320, 240, 30), ("color", 640, 360, 15)]),
+            "zed2i" => ("zed", &[("left", 672, 376, 15), ("right", 672, 376, 15)]),
+            _ => ("realsense", &[("depth", 424, 240, 15), ("color", 424, 240, 15)]),
+        };
+        write!(text, "[[camera]]\nname = \"{model}\"\nbackend = \"{backend}\"\nserial = \"{serial}\"\n")?;
+        if *model == "zed2i" {
+            let conf = format!("/tmp/SN{serial}.conf");
+            std::fs::write(&conf, camera.calibration().zed_conf())?;
+            write!(
+                text,
+                "calibration = \"{conf}\"\n[camera.stereo]\nmodes = [\"performance\"]\nmin_depth_m = {NEAR_M:?}\n\
+                 [[camera.stream]]\nname = \"depth_performance\"\n"
+            )?;
+        }
+        for (stream, width, height, rate) in modes {
+            write!(
+                text,
+                "[[camera.stream]]\nname = \"{stream}\"\nwidth = {width}\nheight = {height}\nrate_hz = {rate}.0\n"
+            )?;
+        }
+    }
+    write!(
+        text,
+        "[[camera]]\nname = \"kinect\"\nbackend = \"kinect\"\nrecording = \"{KINECT}\"\nloop = true\n\
+         [[camera.stream]]\nname = \"color\"\nformat = \"mjpeg\"\n[[camera.stream]]\nname = \"depth\"\n"
+    )?;
+    write!(
+        text,
+        "[[camera]]\nname = \"other\"\nbackend = \"external\"\ncommand = [\"/bin/external\", \"--size\", \"320x240\", \"--rate\", \"15\"]\n"
+    )?;
+    Ok(text)
+}
+
+/// Every frame that a camera captured was delivered or counted as lost, and every delivered one has an end in the sets.
+fn books(checks: &mut Checks, status: &RigStatus) {
+    let all = || status.cameras.iter().flat_map(|c| &c.streams);
+    let wrong = all().filter(|s| {
+        let i = &s.in_sets;
+        let taken = i.used + i.decimated + i.late + i.out_of_order + i.overflow + i.missed + i.pending;
+        s.captured != s.delivered + s.dropped.values().sum::<u64>() || s.delivered != taken
+    });
+    let wrong: Vec<_> = wrong.map(|s| format!("{s:?}")).collect();
+    let what = format!(
+        "captured = delivered + dropped in {} streams, and delivered = in sets + left out",
+        all().count()
+    );
+    checks.equal(&what, wrong.join(", "), "");
+}
+
+/// While it was recorded, nothing was lost but pairs that stereo had no time for.
+fn lost(checks: &mut Checks, before: &RigStatus, after: &RigStatus) {
+    let drops = |status: &RigStatus| -> BTreeMap<String, u64> {
+        let streams = status.cameras.iter().flat_map(|c| &c.streams);
+        streams.map(|s| (s.id.clone(), s.dropped.values().sum())).collect()
+    };
+    let (was, mut is) = (drops(before), drops(after));
+    is.retain(|id, n| was.get(id) != Some(n));
+    let skipped = is.remove("zed2i/depth_performance").unwrap_or_default();
+    checks.note(format!("stereo had no time for {skipped} pairs"));
+    checks.equal("no other stream has lost a frame since all streamed", is, BTreeMap::new());
+}
+
+/// Both eyes, and the depth that was made of them.
+type Matched = ([Vec<u8>; 2], Vec<u8>);
+
+/// Takes the ZED's eyes and depth from the bus for `time`; some depth pictures with the pair of each.
+fn pairs(daemon: &Daemon, time: Duration) -> anyhow::Result<Vec<Matched>> {
+    let bus = Bus::open(&daemon.runtime, &RigName::new(daemon::RIG)?)?;
+    let subscribe =
+        |name| -> anyhow::Result<_> { Ok(bus.subscriber_within(&StreamId::new("zed2i", name)?, PATIENCE)?) };
+    let (mut left, mut right, mut depth) =
+        (subscribe("left")?, subscribe("right")?, subscribe("depth_performance")?);
+    let end = HostTime::now().plus(time);
+    let (mut eyes, mut pairs) = (BTreeMap::<u64, [Vec<u8>; 2]>::new(), Vec::new());
+    while HostTime::now() < end {
+        for (i, eye) in [&mut left, &mut right].into_iter().enumerate() {
+            while let Some(frame) = eye.try_next()? {
+                let both = eyes.entry(frame.header().device_sequence).or_default();
+                both[i] = frame.pixels().to_vec();
+            }
+        }
+        while let Some(frame) = depth.try_next()? {
+            if let Some(pair) =
+                eyes.remove(&frame.header().device_sequence).filter(|_| pairs.len() < COMPARED)
+            {
+                pairs.push((pair, frame.pixels().to_vec()));
+            }
+        }
+        while eyes.len() > KEPT {
+            eyes.pop_first();
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    Ok(pairs)
+}
+
+/// Makes depth once more of the pairs that it was made of.
+fn stereo(checks: &mut Checks, zed: &Camera, pairs: &[Matched]) -> anyhow::Result<()> {
+    let mut by_hand = Eyes::new(&zed.calibration().zed_conf(), Mode::Vga, Preset::Performance, NEAR_M)?;
+    let (mut matched, mut seen) = (Tally::default(), 0);
+    for ([left, right], depth) in pairs {
+        let (wanted, pixels) = by_hand.depth(left, right)?;
+        matched.add(*depth == wanted);
+        seen += pixels;
+    }
+    matched.check(checks, "depth of the ZED is what the engine makes of its pair, bit by bit");
+    checks.note(format!("{seen} pixels of it have a depth"));
+    Ok(())
+}
+
+/// Each frame in the dataset is what its camera sent.
+fn contents(
+    checks: &mut Checks,
+    cameras: &BTreeMap<&str, &Camera>,
+    path: &Path,
+    frames: u64,
+    fixture: &Fixture,
+) -> anyhow::Result<()> {
+    let dataset = Dataset::open(path)?;
+    let session = dataset.session().clone();
+    let (mut found, mut compared) = (BTreeMap::<String, u64>::new(), Compared::default());
+    let (mut stamped, mut eyes) = (Tally::default(), Tally::default());
+    let (mut played, shown) = (Tally::default(), Shown::new(fixture));
+    for set in dataset.sets_with(SetRange::ALL, PixelMode::DecodedAndStored) {
+        let set = set?;
+        for frame in &set.frames {
+            let stream = &session.streams[frame.stream].id;
+            *found.entry(stream.to_string()).or_default() += 1;
+            let (name, stream) = (stream.camera.as_str(), stream.stream.as_str());
+            match (name, stream) {
+                ("zed2i", "left" | "right") => {
+                    let stamp = Stamp::read(&frame.pixels).context("an eye without a stamp")?;
+                    let sent = cameras[name].expected("stereo", stamp.index)?;
+                    let row = sent.len() / frame.header.height as usize;
+                    let at = if stream == "left" { 0 } else { row / 2 };
+                    let half = sent.chunks_exact(row).flat_map(|r| &r[at..at + row / 2]);
+                    eyes.add(half.eq(&frame.pixels));
+                }
+                ("kinect", "depth") => played.add(shown.depth.contains(&frame.pixels)),
+                ("kinect", "color") => {
+                    played.add(shown.color.contains(frame.jpeg.as_ref().unwrap_or(&frame.pixels)));
+                }
+                ("zed2i" | "kinect" | "other", _) => {}
+                // An L515 turns depth; its scenario compares the bytes.
+                ("l515", _) => {
+                    let stamp = Stamp::read(&frame.pixels);
+                    stamped.add(stamp.is_some_and(|s| s.serial_hash == cameras[name].serial_hash()));
+                }
+                _ => compared.frame(cameras[name], frame)?,
+            }
+        }
+    }
+    checks.equal("the dataset has every frame that was recorded", found.values().sum::<u64>(), frames);
+    let none: Vec<_> =
+        session.streams.iter().map(|s| s.id.to_string()).filter(|id| !found.contains_key(id)).collect();
+    checks.equal("and some of every stream", none.join(", "), "");
+    checks.note(found.iter().map(|(id, n)| format!("{id} {n}")).collect::<Vec<_>>().join(", "));
+    compared.check(checks, "frames of D405, D415, D435 and D455 are those that were sent, byte by byte");
+    stamped.check(checks, "frames of the L515 have their stamps");
+    eyes.check(checks, "both eyes of the ZED are those that were sent, byte by byte");
+    played.check(checks, "depth and JPEGs of the Kinect are those of its recording, byte by byte");
+    Ok(())
+}
+
+/// The pictures that the Kinect's recording shows again and again.
+struct Shown {
+    color: Vec<Vec<u8>>,
+    depth: Vec<Vec<u8>>,
+}
+
+impl Shown {
+    fn new(fixture: &Fixture) -> Self {
+        let mut pictures = Pattern::new(fixture);
+        let all = 0..Pattern::DIFFERENT;
+        let color = all.clone().map(|n| pictures.color(n)).collect();
+        let depth = all.map(|n| pictures.depth(n).iter().flat_map(|d| d.to_le_bytes()).collect());
+        Self { color, depth: depth.collect() }
+    }
+}
+
+/// How many were right.
+#[derive(Default)]
+struct Tally {
+    right: u64,
+    all: u64,
+}
+
+impl Tally {
+    fn add(&mut self, right: bool) {
+        self.all += 1;
+        self.right += u64::from(right);
+    }
+
+    fn check(&self, checks: &mut Checks, what: &str) {
+        checks.that(what, self.all > 0 && self.right == self.all, format!("{} of {}", self.right, self.all));
+    }
+}
