@@ -197,7 +197,9 @@ impl PlaybackBackend {
         let mut all = profiles(facts, calibration.as_ref(), rate)?;
         if !config.is_paced() {
             let clock = DeviceClock { counter_bits: 64, tick_ps: 1000, domain: ClockDomain::Kernel };
-            all.iter_mut().for_each(|(_, p)| (p.clock, p.metadata) = (clock, MetadataLevel::Kernel));
+            for (_, p) in &mut all {
+                (p.clock, p.metadata) = (clock, MetadataLevel::Kernel);
+            }
         }
         let profiles = all.iter().map(|(_, p)| p.clone()).collect();
         let info = info(facts, &config);

@@ -20,7 +20,7 @@ use std::time::Duration;
 /// Memory that is used again, and counts.
 #[derive(Default)]
 struct Slots {
-    slots: Vec<Vec<u8>>,
+    memory: Vec<Vec<u8>>,
     frames: u64,
     lost: u64,
     bytes: u64,
@@ -28,10 +28,10 @@ struct Slots {
 
 impl FrameSink for Slots {
     fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]> {
-        while self.slots.len() <= stream {
-            self.slots.push(Vec::new());
+        while self.memory.len() <= stream {
+            self.memory.push(Vec::new());
         }
-        let slot = &mut self.slots[stream];
+        let slot = &mut self.memory[stream];
         if slot.len() < len {
             slot.resize(len, 0);
         }

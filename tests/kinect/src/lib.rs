@@ -33,6 +33,7 @@ pub enum Lacing {
 
 /// A recording to be made.
 #[derive(Debug, Clone)]
+#[allow(clippy::struct_excessive_bools)] // each is a form of its own
 pub struct Fixture {
     /// What the colour camera was set to.
     pub color: Option<ColorMode>,
@@ -147,7 +148,7 @@ impl Fixture {
         out: &mut (impl Write + Seek),
         pictures: &mut dyn Pictures,
     ) -> io::Result<Written> {
-        writer::Writer::new(self, out)?.run(pictures)
+        writer::Writer::new(self, out).run(pictures)
     }
 
     /// Its bytes, with pictures that follow from their number.

@@ -5,7 +5,7 @@ use depthrig_bus::{Name, PixelFormat, Pose};
 use depthrig_calib::PoseExt;
 use depthrig_drivers::kinect::calibration::{Calibration, CameraCalibration, LensModel, RawIntrinsics};
 use depthrig_drivers::kinect::modes::Cut;
-use depthrig_drivers::kinect::{ColorFormat, ColorMode};
+use depthrig_drivers::kinect::{ColorFormat, ColorMode, DepthMode};
 use depthrig_drivers::synthetic::{SyntheticBackend, SyntheticConfig};
 use depthrig_drivers::{Backend, MemorySink, StreamProfile, StreamRequest};
 use image::ExtendedColorType;
@@ -37,7 +37,7 @@ impl Pattern {
 
     /// The pictures of `fixture`.
     pub fn new(fixture: &Fixture) -> Self {
-        let depth_size = fixture.depth.map_or((0, 0), |m| m.size());
+        let depth_size = fixture.depth.map_or((0, 0), DepthMode::size);
         Self { color: fixture.color, depth_size, jpegs: HashMap::new() }
     }
 
@@ -52,7 +52,7 @@ impl Pattern {
                 noise ^= noise >> 17;
                 noise ^= noise << 5;
                 let grain = (noise & 15) as i32 - 8;
-                let edge = if ((x + 20 * n) / 40 + y / 48) % 2 == 0 { 60 } else { 0 };
+                let edge = if ((x + 20 * n) / 40 + y / 48).is_multiple_of(2) { 60 } else { 0 };
                 let at = |base: u32| (base as i32 + edge + grain).clamp(0, 255) as u8;
                 out.extend([at(x * 150 / width), at(y * 150 / height), at(90 + 20 * n)]);
             }
@@ -83,7 +83,7 @@ impl Pictures for Pattern {
     fn depth(&mut self, n: u32) -> Vec<u16> {
         let ((width, height), n) = (self.depth_size, n % Self::DIFFERENT);
         let at = |x: u32, y: u32| {
-            if (x / 16 + y / 16) % 13 == 0 { 0 } else { (500 + 37 * n + 3 * x + 2 * y) as u16 }
+            if (x / 16 + y / 16).is_multiple_of(13) { 0 } else { (500 + 37 * n + 3 * x + 2 * y) as u16 }
         };
         (0..height).flat_map(|y| (0..width).map(move |x| at(x, y))).collect()
     }

@@ -52,7 +52,7 @@ pub(super) struct Writer<'a, W> {
 }
 
 impl<'a, W: Write + Seek> Writer<'a, W> {
-    pub(super) fn new(fixture: &'a Fixture, out: &'a mut W) -> io::Result<Self> {
+    pub(super) fn new(fixture: &'a Fixture, out: &'a mut W) -> Self {
         let mut tracks = Vec::new();
         if fixture.color.is_some() {
             tracks.push(Kind::Color);
@@ -66,15 +66,7 @@ impl<'a, W: Write + Seek> Writer<'a, W> {
         if fixture.motion {
             tracks.push(Kind::Motion);
         }
-        Ok(Self {
-            fixture,
-            out,
-            tracks,
-            origin: 0,
-            cues: Vec::new(),
-            written: Written::default(),
-            last_ns: 0,
-        })
+        Self { fixture, out, tracks, origin: 0, cues: Vec::new(), written: Written::default(), last_ns: 0 }
     }
 
     pub(super) fn run(mut self, pictures: &mut dyn Pictures) -> io::Result<Written> {
@@ -405,7 +397,9 @@ fn block(track: u64, time: i16, is_simple: bool, lacing: Lacing, frames: &[Frame
             }
         }
     }
-    frames.iter().for_each(|w| out.extend(&w.data));
+    for w in frames {
+        out.extend(&w.data);
+    }
     out
 }
 
@@ -416,9 +410,9 @@ fn gray(pixels: &[u16], early: bool) -> Vec<u8> {
 fn sample(fixture: &Fixture, i: u64) -> Vec<u8> {
     let (at, acceleration, rotation) = motion(fixture, i);
     let mut out = at.to_le_bytes().to_vec();
-    acceleration.iter().for_each(|a| out.extend(a.to_le_bytes()));
+    out.extend(acceleration.iter().flat_map(|a| a.to_le_bytes()));
     out.extend(at.to_le_bytes());
-    rotation.iter().for_each(|r| out.extend(r.to_le_bytes()));
+    out.extend(rotation.iter().flat_map(|r| r.to_le_bytes()));
     out
 }
 

@@ -84,10 +84,11 @@ impl Rig for Eyes {
         Err(Cannot(match trouble {
             Trouble::Unplug(_) | Trouble::Busy(_) => "a file is neither plugged in nor held by one process",
             Trouble::Stall(_) | Trouble::Hang(_) => "reading a file cannot be made to wait",
-            Trouble::HalfFrame(_) | Trouble::WrongSize(_) | Trouble::Damaged(_) => {
-                "what is in the file is what comes"
-            }
-            Trouble::Repeated(_) | Trouble::Skip(_) => "what is in the file is what comes",
+            Trouble::HalfFrame(_)
+            | Trouble::WrongSize(_)
+            | Trouble::Damaged(_)
+            | Trouble::Repeated(_)
+            | Trouble::Skip(_) => "what is in the file is what comes",
             Trouble::TimeBackwards(_) | Trouble::ClockReset => "the clock goes on from round to round",
         }))
     }

@@ -1,5 +1,7 @@
 //! The calibration against numbers computed by hand and by OpenCV.
 
+#![allow(clippy::unreadable_literal)] // numbers as OpenCV prints them
+
 use super::*;
 use depthrig_calib::{Camera, CameraExt};
 use glam::DVec2;

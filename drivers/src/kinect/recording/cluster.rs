@@ -344,7 +344,7 @@ fn prove(body: &[u8]) -> Option<u64> {
     let mut elements = ebml::children(body);
     let mut time = None;
     let mut first = true;
-    while let Some((of, inside)) = elements.next() {
+    for (of, inside) in elements.by_ref() {
         match of {
             // RFC 8794, section 11.3.1: of all that follows it, the low byte first.
             id::CRC_32 if first => {
