@@ -31,6 +31,8 @@ for part in "$@"; do
         # Other readers of recordings of an Azure Kinect.
         need ffmpeg command -v ffprobe
         need mkvtoolnix command -v mkvinfo
+        # The bindings below drivers/oak are C++.
+        need g++ command -v c++
         ;;
     vm)
         need qemu-system-x86 command -v qemu-system-x86_64

@@ -34,6 +34,14 @@ target=${CARGO_TARGET_DIR:-$PWD/target}/debug
 export DEPTHRIG_BIN=$target/depthrig
 export DEPTHRIG_TEST_PUBLISHER=$target/examples/publish
 
+# The OAK program in Rust cannot be linked without a built depthai-core; its types can be looked at.
+oak_crate() {
+    CARGO_TARGET_DIR=$(dirname "$target")/oak cargo check --manifest-path drivers/oak/Cargo.toml --locked --quiet \
+        --features no-native --all-targets &&
+        CARGO_TARGET_DIR=$(dirname "$target")/oak cargo test --manifest-path drivers/oak/Cargo.toml --locked --quiet
+}
+step oak-crate oak_crate
+
 step python "$python" -m pytest --quiet python/tests
 # The wheel on other versions of Python, and with PyTorch.
 step python-versions tools/python.sh versions
@@ -80,7 +88,7 @@ step vm vm
 if grep -q '^virtual machine skipped' "$logs/vm.log"; then skipped+=", 1 skipped: the virtual machine"; fi
 
 # Every test that cargo and pytest counted, every check of the virtual machine, and one for each of the other steps.
-count() { grep -ohE "[0-9]+ $1" "$logs"/{rust,python,python-versions,python-torch,python-oak,daemon,vm}.log | awk '{n += $1} END {print n + 0}'; }
+count() { grep -ohE "[0-9]+ $1" "$logs"/{rust,oak-crate,python,python-versions,python-torch,python-oak,daemon,vm}.log | awk '{n += $1} END {print n + 0}'; }
 passed=$(count passed)
 failed=$(count failed)
 for name in {golden,reader-python,reader-node}{,-stereo,-zed}; do

@@ -265,9 +265,20 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
             }
         }
         None if in_use => found.state = UseState::InUse,
+        None if found.family == Family::Oak => known_oak(&mut found, ask),
         None => ask_device(&mut found, ask),
     }
     found
+}
+
+/// What can be said of an OAK without starting its firmware.
+fn known_oak(found: &mut AttachedCamera, ask: &dyn Ask) {
+    if let Some(usb) = &found.usb {
+        found.serial = classify::oak_serial(usb);
+        if !ask.may_open(&usb.node) {
+            found.state = UseState::Denied;
+        }
+    }
 }
 
 /// Opens a camera that nobody has and takes down what it says.

@@ -51,7 +51,7 @@ def play(session: depthrig.ExternalSession) -> None:
     due = time.monotonic()
     number = 0
     while session.wanted:
-        due += 1 / RATE_HZ
+        due = max(due + 1 / RATE_HZ, time.monotonic())  # what is late is not made good by a burst
         time.sleep(max(0.0, due - time.monotonic()))
         number += 1
         facts = {"device_time": time.monotonic_ns(), "device_sequence": number}

@@ -283,7 +283,7 @@ def test_another_session_ends_the_one_before(camera: ExternalCamera, daemon: Fak
 
 @pytest.mark.parametrize(
     "change",
-    [{"instance": 5}, {"version": 2}, {"size": 384}, {"magic": b"NOPE"}, {"want": 99}, {"modes": 3}, {"sent_ns": 1}],
+    [{"instance": 5}, {"magic": b"NOPE"}, {"want": 99}, {"modes": 3}, {"sent_ns": 1}],
     ids=lambda c: next(iter(c)),
 )
 def test_an_answer_that_is_none_is_ignored(camera: ExternalCamera, daemon: FakeDaemon, change: dict[str, Any]) -> None:
@@ -299,6 +299,32 @@ def test_a_refusal_is_an_error_with_the_daemons_words(camera: ExternalCamera, da
         depthrig.CameraRefused, match=r"rig 'mount' refuses camera 'front': stream color: its rate is no number"
     ):
         camera.wait(WAIT_S)
+
+
+@pytest.mark.parametrize("change", [{"version": 2}, {"size": 384}], ids=["version", "size"])
+def test_a_daemon_of_another_version_is_an_error(camera: ExternalCamera, daemon: FakeDaemon, change: Any) -> None:
+    daemon.run(1, change=change)
+    with pytest.raises(depthrig.CameraRefused, match=r"it speaks version \d of the hand-shake, this package version 1"):
+        camera.wait(WAIT_S)
+
+
+def test_an_answer_to_an_older_session_changes_nothing(camera: ExternalCamera, daemon: FakeDaemon) -> None:
+    daemon.run(5)
+    assert _session(camera).number == 5
+    daemon.say(ExternalWant.STOP, 4)
+    time.sleep(0.4)
+    assert camera._answer is not None
+    assert camera._answer.session == 5
+
+
+def test_a_camera_that_is_not_there_is_offered_all_the_same(camera: ExternalCamera, daemon: FakeDaemon) -> None:
+    camera.unavailable("unplugged")
+    offer = daemon.until(state=ExternalState.REFUSED)
+    assert (offer["session"], offer["reason"], offer["text"]) == (0, ExternalReason.NOT_FOUND, "unplugged")
+    camera.available()
+    daemon.until(state=ExternalState.IDLE, session=0, reason=0, text="")
+    with pytest.raises(ValueError, match="what model is it"):
+        ExternalCamera("other", [COLOR], model="", serial="7", rig="mount")
 
 
 def test_a_refused_session_may_be_followed_by_another(camera: ExternalCamera, daemon: FakeDaemon) -> None:

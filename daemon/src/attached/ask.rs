@@ -12,6 +12,7 @@ use depthrig_drivers::realsense::{RealsenseBackend, RealsenseConfig};
 use depthrig_drivers::v4l2::{Node, V4l2Backend, V4l2Config};
 use depthrig_drivers::zed::{ZedBackend, ZedConfig};
 use depthrig_drivers::{Backend, Device, DeviceInfo, Result, StreamProfile};
+use rustix::fs::Access;
 use std::path::Path;
 
 /// What is learned of a node by asking the kernel.
@@ -54,6 +55,9 @@ pub trait Ask {
     fn served(&self) -> Vec<Served> {
         Vec::new()
     }
+
+    /// Whether this user may read and write a USB device.
+    fn may_open(&self, node: &Path) -> bool;
 
     /// The rigs of this user that run, and what could not be asked.
     fn rigs(&self) -> (Vec<RigStatus>, Vec<String>);
@@ -113,8 +117,8 @@ impl Ask for System {
                 Box::new(V4l2Backend::new(V4l2Config { port, ..V4l2Config::default() }))
             }
             Family::L515 => Box::new(L515Backend::new(L515Config { port, ..L515Config::default() })),
-            // It is at no port; see `served`.
-            Family::External => return None,
+            // The one is driven by another process, the other is at no port; see `served`.
+            Family::Oak | Family::External => return None,
         };
         let told = |device: Box<dyn Device>| (device.info().clone(), device.profiles().to_vec());
         Some(backend.open(None).map(told))
@@ -127,6 +131,10 @@ impl Ask for System {
             Served { place, holder, offered }
         };
         external::served(runtime).into_iter().map(asked).collect()
+    }
+
+    fn may_open(&self, node: &Path) -> bool {
+        rustix::fs::access(node, Access::READ_OK | Access::WRITE_OK).is_ok()
     }
 
     fn rigs(&self) -> (Vec<RigStatus>, Vec<String>) {

@@ -14,6 +14,12 @@ const ZED_2I: (u16, u16) = (0xf880, 0xf881);
 const L515: u16 = 0x0b64;
 const L515_RECOVERY: u16 = 0x0b55;
 
+/// OAK cameras, whose processor is a Movidius Myriad X: before its firmware is uploaded, with it, in its boot loader, and
+/// started from flash (XLink `src/pc/protocols/usb_host.cpp`, Apache-2.0).
+const MOVIDIUS: u16 = 0x03e7;
+const OAK_UNBOOTED: u16 = 0x2485;
+const OAK_BOOTED: [u16; 3] = [0xf63b, 0xf63c, 0xf63d];
+
 /// A family of cameras: what is common to how they are driven.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Family {
@@ -29,6 +35,8 @@ pub enum Family {
     Uvc,
     /// A video device that is on no USB.
     Platform,
+    /// OAK, which another process drives.
+    Oak,
     /// What another process serves.
     External,
 }
@@ -42,7 +50,7 @@ impl Family {
             Self::Zed => "zed",
             Self::Kinect => depthrig_drivers::kinect::NAME,
             Self::Uvc | Self::Platform => "v4l2",
-            Self::External => depthrig_drivers::external::NAME,
+            Self::Oak | Self::External => depthrig_drivers::external::NAME,
         }
     }
 }
@@ -153,9 +161,20 @@ fn family(d: &UsbDevice) -> Result<Option<(Family, String)>, &'static str> {
     if (d.vendor_id, d.product_id) == (STEREOLABS, ZED_2I.0) {
         return Ok(Some((Family::Zed, "ZED 2i".to_owned())));
     }
+    if d.vendor_id == MOVIDIUS && d.product_id == OAK_UNBOOTED {
+        return Ok(Some((Family::Oak, "OAK, not booted".to_owned())));
+    }
+    if d.vendor_id == MOVIDIUS && OAK_BOOTED.contains(&d.product_id) {
+        return Ok(Some((Family::Oak, "OAK".to_owned())));
+    }
     let is_video = d.interfaces.iter().any(|i| (i.class, i.subclass) == VIDEO_CONTROL);
     let name = if d.product.is_empty() { d.id() } else { d.product.clone() };
     Ok(is_video.then_some((Family::Uvc, name)))
+}
+
+/// The serial number that the descriptors of an OAK have: only its firmware has one.
+pub(super) fn oak_serial(d: &UsbDevice) -> Option<String> {
+    (d.product_id != OAK_UNBOOTED && !d.serial.is_empty()).then(|| d.serial.clone())
 }
 
 /// The raw HID nodes of a camera; a ZED 2i has them on a device beside itself.

@@ -86,6 +86,10 @@ impl Ask for Made {
         Some(Ok((info, profiles)))
     }
 
+    fn may_open(&self, node: &Path) -> bool {
+        !self.denied.iter().any(|d| node.ends_with(d))
+    }
+
     fn rigs(&self) -> (Vec<RigStatus>, Vec<String>) {
         (self.rigs.clone(), Vec::new())
     }
@@ -332,4 +336,47 @@ fn the_halves_of_a_kinect_are_one_camera() {
         (Some("sn2-1.1"), UseState::Free)
     );
     assert!(found.cameras[0].problems[0].contains("runs it as USB2"), "{found:?}");
+}
+
+/// An OAK: its ports, product and serial number.
+pub(crate) fn oak(port: &str, product: u16) -> MadeDevice {
+    MadeDevice {
+        id: (0x03e7, product),
+        strings: ["Movidius Ltd.", "Movidius MyriadX", "18443010B1D25A0F00"],
+        interfaces: vec![(0, 0xff, 0, "", vec![], vec![])],
+        ..MadeDevice::new(port, 0)
+    }
+}
+
+#[test]
+fn an_oak_is_listed_for_what_it_is_and_left_alone() {
+    let made = Made::default();
+    let found = look_at(&[oak("4-1", 0xf63b), oak("4-2", 0x2485), oak("4-3", 0xf63d)], &made, |tree| {
+        tree.process(4711, "python3", &["/dev/bus/usb/004/006"]);
+    });
+    let told: Vec<_> =
+        found.cameras.iter().map(|c| (c.model.as_str(), c.serial.as_deref(), c.state)).collect();
+    let serial = Some("18443010B1D25A0F00");
+    let expected = [
+        ("OAK", serial, UseState::Free),
+        ("OAK, not booted", None, UseState::Free),
+        ("OAK", None, UseState::InUse),
+    ];
+    assert_eq!(told, expected, "{:?}", found.cameras);
+    assert!(found.cameras.iter().all(|c| (c.backend, c.family) == ("external", Family::Oak)));
+    assert_eq!(found.cameras[2].held_words(), "python3 (process 4711)");
+    assert!(made.opened.borrow().is_empty(), "its firmware is not started for a list");
+    let made = Made { denied: vec!["002".into()], ..Made::default() };
+    let found = look_at(&[oak("4-1", 0x2485)], &made, |_| {});
+    assert_eq!(found.cameras[0].state, UseState::Denied);
+    assert!(found.not_asked[0].contains("depthrig install"), "{:?}", found.not_asked);
+}
+
+#[test]
+fn an_oak_that_the_rig_has_through_its_process_is_the_rigs() {
+    let mut rig = rig_with("4-1");
+    rig.cameras[0].backend = "external".into();
+    let made = Made { rigs: vec![rig], ..Made::default() };
+    let found = look_at(&[oak("4-1", 0xf63b)], &made, |_| {});
+    assert_eq!(found.cameras[0].held_words(), "rig \"mount\", camera \"front\"");
 }

@@ -437,7 +437,11 @@ pub(super) fn check_unnamed(attached: &Attached, plans: &[CameraPlan], findings:
     if plans.iter().all(|p| p.port.is_none()) {
         return;
     }
-    let named = |c: &AttachedCamera| plans.iter().any(|p| p.port.as_deref() == Some(&*c.port));
+    // Which OAK a process will open, only that process knows.
+    let served = plans.iter().any(|p| p.backend == Family::Oak.backend());
+    let named = |c: &AttachedCamera| {
+        plans.iter().any(|p| p.port.as_deref() == Some(&*c.port)) || (served && c.family == Family::Oak)
+    };
     for c in attached.cameras.iter().filter(|c| !named(c) && c.usb.is_some()) {
         findings.push(Finding::new(
             Severity::Info,

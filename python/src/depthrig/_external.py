@@ -32,6 +32,8 @@ from .errors import BusError, CameraRefused, CameraServed
 _LOCK_ATTEMPTS, _LOCK_PAUSE_S = 20, 0.01
 # A channel whose other end was just killed may need to be cleaned up first.
 _ENDED_GRACE_S = 0.05
+# One being written, the unread and held ones of each subscriber, and one that is kept for latecomers.
+_OFFER_SLOTS = 24
 
 
 class ExternalCamera:
@@ -74,6 +76,8 @@ class ExternalCamera:
                 raise ValueError("which camera of the rig? Name it, or let the daemon start this program")
         self.name = check_name(name, "camera")
         self.modes = _checked(modes)
+        if not model:
+            raise ValueError(f"camera {name!r}: what model is it? The daemon takes none without a name")
         folder = _runtime_dir(runtime_dir)
         self.rig = pick_rig(folder, rig if rig is not None else os.environ.get(layout.EXTERNAL_RIG_VARIABLE))
         self._pid = os.getpid()
@@ -87,7 +91,7 @@ class ExternalCamera:
             self._prefix = prefix
             length = len(self.modes) * layout.EXTERNAL_MODE_SIZE
             self._letters = Letters(self._bus, f"{prefix}/answer", ANSWER, layout.EXTERNAL_ANSWER_SIZE)
-            self._offers = Sender(self._bus, f"{prefix}/offer", OFFER, length, layout.EXTERNAL_FRAME_SLOTS, 1)
+            self._offers = Sender(self._bus, f"{prefix}/offer", OFFER, length, _OFFER_SLOTS, 1)
             self._bell = Bell(self._bus, f"{prefix}/offer")
             self._wake = Bell(self._bus, f"{prefix}/answer")
         except BaseException:
@@ -106,6 +110,7 @@ class ExternalCamera:
         self._changed = threading.Condition()
         self._number = 0
         self._taken = 0
+        self._about = 0
         self._state = (ExternalState.IDLE, ExternalReason.NONE, "")
         self._answer: Answer | None = None
         self._failure: BaseException | None = None
@@ -143,6 +148,10 @@ class ExternalCamera:
             newest = read_answer(message, self._instance, len(self.modes)) or newest
         if newest is not None:
             with self._changed:
+                # Of two that answer, such as a thread of the daemon that was given up, the later session counts.
+                known = self._answer.session if self._answer is not None else 0
+                if 0 < newest.session < known:
+                    return
                 self._answer = newest
                 self._changed.notify_all()
 
@@ -163,7 +172,7 @@ class ExternalCamera:
                 "instance": self._instance,
                 "number": self._number,
                 "sent_ns": time.monotonic_ns(),
-                "session": self._taken,
+                "session": self._about,
                 "state": int(state),
                 "reason": int(reason),
                 "modes": len(self.modes),
@@ -176,9 +185,16 @@ class ExternalCamera:
             slot.send()
         self._bell.ring()
 
-    def _set_state(self, state: ExternalState, reason: ExternalReason = ExternalReason.NONE, text: str = "") -> None:
+    def _set_state(
+        self,
+        state: ExternalState,
+        reason: ExternalReason = ExternalReason.NONE,
+        text: str = "",
+        session: int | None = None,
+    ) -> None:
         with self._changed:
             self._state = (state, reason, text)
+            self._about = self._taken if session is None else session
         self._send_offer()
 
     # What the program asks for.
@@ -229,6 +245,16 @@ class ExternalCamera:
                 yield session
             finally:
                 session.close()
+
+    def unavailable(self, text: str, reason: ExternalReason = ExternalReason.NOT_FOUND) -> None:
+        """Say that the camera cannot be had now, and why: unplugged, or held by another. The process stays."""
+        self._check()
+        self._set_state(ExternalState.REFUSED, reason, text, 0)
+
+    def available(self) -> None:
+        """Say that the camera can be had again."""
+        self._check()
+        self._set_state(ExternalState.IDLE, session=0)
 
     def stop(self) -> None:
         """Let :meth:`wait` and :meth:`sessions` end, and the session be no longer wanted. Safe in a signal handler."""

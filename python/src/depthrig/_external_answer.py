@@ -13,11 +13,10 @@ from ._layout import ExternalReason, ExternalWant
 class Answer:
     """What the daemon wants, as it was read."""
 
-    __slots__ = ("heard", "modes", "reason", "sent_ns", "session", "text", "want")
+    __slots__ = ("heard", "modes", "reason", "session", "text", "want")
 
     def __init__(self, values: dict[str, Any], modes: bytes) -> None:
         self.session: int = values["session"]
-        self.sent_ns: int = values["sent_ns"]
         self.want = ExternalWant(values["want"])
         self.reason: int = values["reason"]
         self.text: str = values["text"]
@@ -36,13 +35,20 @@ class Answer:
 
 
 def read_answer(message: tuple[bytes, bytes], instance: int, modes: int) -> Answer | None:
-    """Read an answer; None for one that is not meant for this process, or that it cannot understand."""
+    """Read an answer; None for one that is not meant for this process, is of before, or cannot be understood.
+
+    One of another version is a refusal: nobody will understand the other.
+    """
     head, payload = message
     values = unpack_fields(layout.EXTERNAL_ANSWER_FIELDS, head)
     if values["magic"] != layout.EXTERNAL_ANSWER_MAGIC or values["instance"] != instance:
         return None
     if values["version"] != layout.EXTERNAL_VERSION or values["size"] != layout.EXTERNAL_ANSWER_SIZE:
-        return None
+        text = (
+            f"it speaks version {values['version']} of the hand-shake, this package version {layout.EXTERNAL_VERSION}; "
+            "install the `depthrig` package of the daemon's version"
+        )
+        return Answer({"session": 0, "want": ExternalWant.REFUSED, "reason": 1, "text": text}, b"")
     if values["want"] not in list(ExternalWant):
         return None
     if time.monotonic_ns() - values["sent_ns"] > layout.EXTERNAL_SILENCE_S * 1e9:

@@ -87,6 +87,9 @@ fn the_rules_name_every_camera_that_has_a_driver() {
     for id in ["097c", "097d"] {
         assert!(rules.contains(id), "Azure Kinect {id}");
     }
+    for id in ["2485", "f63b", "f63c", "f63d"] {
+        assert!(rules.contains(id), "OAK {id}");
+    }
     // Every line that is none of a comment, a label or a jump matches a subsystem first.
     let mut continued = false;
     for line in rules.lines().filter(|l| !l.starts_with('#') && !l.is_empty()) {

@@ -185,7 +185,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--replay", type=Path, metavar="FOLDER", help="play the files of FOLDER in place of a camera")
     parser.add_argument("--once", action="store_true", help="play them once and end")
     parser.add_argument("--record", type=Path, metavar="FOLDER", help="also write every frame into FOLDER for --replay")
-    parser.add_argument("--wait", type=float, default=10.0, metavar="SECONDS", help="how long to look for the camera")
+    parser.add_argument("--wait", type=float, default=5.0, metavar="SECONDS", help="how long to look for the camera")
     parser.add_argument("--list", action="store_true", help="list the cameras that are attached, and end")
     parser.add_argument("--streams", nargs="+", choices=("color", "depth"), default=["color", "depth"])
     parser.add_argument("--size", type=_size, default=(1280, 720), metavar="WxH", help="of colour, and so of depth")

@@ -32,8 +32,8 @@ _FORMATS = {
 }
 _TICK_PS = 1_000_000
 """The SDK gives times to the microsecond."""
-_FIRST_FRAME_S = 15.0
-"""How long a pipeline may take to its first frame: an RVC4 loads for some seconds."""
+_FIRST_FRAME_S = 8.0
+"""How long a pipeline may take to its first frame; the daemon waits 14 s at most for all of it, and knows no reason."""
 _WAIT = datetime.timedelta(milliseconds=100)
 
 

@@ -34,7 +34,7 @@ class Wishes:
     undistorted: bool = True
     usb2: bool = False
     """Keep to USB2 also on a USB3 port."""
-    patience_s: float = 10.0
+    patience_s: float = 5.0
     """How long to look for the camera: after a firmware upload, or a restart, it enumerates anew."""
 
 
