@@ -40,7 +40,7 @@ const COMPARED: usize = 4;
 const KEPT: usize = 24;
 const PATIENCE: Duration = Duration::from_secs(5);
 /// How long is recorded, and how many sets a second.
-const SECONDS: u64 = 6;
+const SECONDS: u64 = 8;
 const SET_RATE_HZ: u64 = 1;
 
 fn run(checks: &mut Checks) -> anyhow::Result<()> {
