@@ -46,6 +46,9 @@ fn main() -> Result<(), Box<dyn Error>> {
             println!("session {} begins", session.number());
             sent = serve(&mut session, &options, sent)?;
             println!("session ends after frame {sent}");
+            if sent >= options.frames {
+                session.refuse(ExternalReason::Finished, "that was the last frame");
+            }
         }
     }
     camera.end(ExternalReason::Finished, "that was the last frame");

@@ -263,7 +263,10 @@ impl Gate {
         let (known, why) = core::mem::replace(&mut self.known_lost, (0, DropReason::DeviceGap));
         let Some((newest, seen)) = self.newest else {
             self.newest = Some((raw.device_sequence, 1));
-            self.capture(1, sink);
+            // Nobody but the transport can know of frames before the first.
+            let known = if known > FARTHEST_GAP { 0 } else { known };
+            self.capture(1 + known, sink);
+            self.lose(why, known, sink);
             return Some(Ok(raw.device_sequence));
         };
         let bits = self.sequence_bits.clamp(1, 64);
@@ -284,8 +287,8 @@ impl Gate {
             self.lose(why, known, sink);
             self.lose(DropReason::DeviceGap, step - 1 - known, sink);
             let seen = if step >= 64 { 1 } else { (seen << step) | 1 };
-            self.newest = Some((newest.saturating_add(step), seen));
-            return Some(Ok(newest.saturating_add(step)));
+            self.newest = Some((newest.wrapping_add(step), seen));
+            return Some(Ok(newest.wrapping_add(step)));
         }
         let back = step.unsigned_abs();
         let in_a_row = match self.behind {

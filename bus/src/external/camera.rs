@@ -3,8 +3,7 @@
 use super::mode::{check_all, invalid};
 use super::{
     About, ExternalAnswer, ExternalLock, ExternalMode, ExternalOffer, ExternalReason, ExternalState,
-    ExternalWant, HEARTBEAT, MAX_MODES, MODE_BYTES, Mode, Place, SILENCE, Session, VERSION, lock, plain,
-    text,
+    ExternalWant, HEARTBEAT, MAX_MODES, Mode, Place, SILENCE, Session, VERSION, lock, plain, text,
 };
 use crate::channel::{self, Inlet, IoxService, Outlet};
 use crate::{Bus, Error, ErrorKind, HostTime, Result};
@@ -98,25 +97,30 @@ impl ExternalCamera {
         for record in &records {
             Mode::decode(record).map_err(in_camera)?;
         }
-        let pid = std::process::id();
-        let mut offer = ExternalOffer {
-            instance: (HostTime::now().ns() as u64) << 16 | u64::from(pid & 0xFFFF) | 1,
-            modes: modes.len() as u32,
-            pid,
-            ..ExternalOffer::default()
-        };
+        let mut offer = ExternalOffer { modes: modes.len() as u32, ..ExternalOffer::default() };
         about.encode(&mut offer);
         About::decode(&offer).map_err(in_camera)?;
+        let records = records.iter().flat_map(plain::bytes_of).collect();
+        Self::offer_unchecked(place, modes, offer, records)
+    }
+
+    /// Offers what need not be what it says, for tests of the other side.
+    #[doc(hidden)]
+    pub fn offer_unchecked(
+        place: &Place,
+        modes: &[Mode],
+        mut offer: ExternalOffer,
+        records: Vec<u8>,
+    ) -> Result<Self> {
+        let pid = std::process::id();
+        offer.instance = (HostTime::now().ns() as u64) << 16 | u64::from(pid & 0xFFFF) | 1;
+        offer.pid = pid;
         let who = format!("process {pid} ({})", text::shown(&offer.program));
         let lock = lock(&place.runtime, &place.rig, &place.camera, &who)?;
         let bus = Bus::open(&place.runtime, &place.rig)?;
         bus.clean_dead();
         let (offers, answers) = (place.offers(), place.answers());
-        let station = Station {
-            out: offers.outlet(bus.node(), records.len() * MODE_BYTES, OFFER_SLOTS)?,
-            offer,
-            records: records.iter().flat_map(plain::bytes_of).collect(),
-        };
+        let station = Station { out: offers.outlet(bus.node(), records.len(), OFFER_SLOTS)?, offer, records };
         let shared = Arc::new(Shared {
             modes: modes.to_vec(),
             instance: offer.instance,

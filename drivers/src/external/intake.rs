@@ -96,9 +96,7 @@ impl Intake {
         let now = HostTime::now();
         let raw = self.raw(&header, frame.pixels().len(), now);
         let gap = header.sequence.saturating_sub(self.last_sequence).saturating_sub(1);
-        if self.last_sequence > 0 {
-            self.gate.explain_gap(gap, DropReason::QueueFull);
-        }
+        self.gate.explain_gap(gap, DropReason::QueueFull);
         self.last_sequence = self.last_sequence.max(header.sequence);
         let takes = self.pace.takes(now);
         let outcome = self.gate.deliver(&raw, sink, |memory| {
@@ -146,6 +144,7 @@ impl Intake {
             usize::MAX
         };
         let sequence = if self.has_counter { header.device_sequence } else { header.sequence };
+        let sequence = sequence & (u64::MAX >> (64 - self.profile.sequence_bits.clamp(1, 64)));
         let mut raw = RawFrame::new(sequence, 0, arrival, bytes);
         let flags = ExternalFrameFlags(header.flags);
         raw.damaged = flags.has(ExternalFrameFlags::DAMAGED);

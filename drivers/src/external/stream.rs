@@ -87,6 +87,9 @@ impl ExternalStream {
         let session = self.session();
         loop {
             self.attend()?;
+            if self.over.is_some() {
+                return Ok(()); // finished before it began
+            }
             for intake in &mut self.intakes {
                 if intake.has_frame(session).map_err(of_bus)? {
                     return Ok(());
