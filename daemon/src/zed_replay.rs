@@ -524,6 +524,10 @@ fn record(
     };
     let clock = work::RecordedClock::new(plan.session.started_utc_ns);
     let source: UtcSource = clock.source();
+    if !copy.join(depthrig_recorder::SESSION_FILE).exists() {
+        // Killed before there was anything to go on with.
+        work::remove(copy)?;
+    }
     let (recorder, resumed) = if copy.exists() {
         Recorder::resume(Arc::clone(fs), source, copy, options)?
     } else {

@@ -154,8 +154,7 @@ impl Recorder {
     ///
     /// # Errors
     /// [`ErrorKind::AlreadyExists`] when the dataset is whole, [`ErrorKind::InUse`] when somebody else works on it,
-    /// [`ErrorKind::Corrupt`] when a finished segment cannot be read or is missing, [`ErrorKind::BadInput`] when it had
-    /// lost sets before, and as [`Recorder::create`].
+    /// [`ErrorKind::Corrupt`] when a finished segment cannot be read or is missing, and as [`Recorder::create`].
     pub fn resume(
         fs: Arc<dyn Fs>,
         utc: UtcSource,

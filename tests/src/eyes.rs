@@ -121,6 +121,40 @@ impl Eyes {
             .collect()
     }
 
+    /// The factory calibration of such a camera in every mode, with this one's at the size of VGA.
+    pub fn conf(&self) -> String {
+        use core::fmt::Write;
+        const MODES: [(&str, f64); 4] = [("2K", 2208.0), ("FHD", 1920.0), ("HD", 1280.0), ("VGA", 672.0)];
+        let mut text = format!("[STEREO]\nBaseline={}\nTY=0\nTZ=0\n", self.baseline_m * 1e3);
+        for (name, _) in MODES {
+            let _ = write!(text, "CV_{name}=0\nRX_{name}=0\nRZ_{name}=0\n");
+        }
+        let (cx, cy) = self.center();
+        for (name, width) in MODES {
+            let scale = width / 672.0;
+            for eye in ["LEFT", "RIGHT"] {
+                let (f, cx, cy) = (self.focal * scale, cx * scale, cy * scale);
+                let lens = "k1=0\nk2=0\np1=0\np2=0\nk3=0";
+                let _ = write!(text, "[{eye}_CAM_{name}]\nfx={f}\nfy={f}\ncx={cx}\ncy={cy}\n{lens}\n");
+            }
+        }
+        text
+    }
+
+    /// Writes a folder of side-by-side grey PNGs with the camera's calibration.
+    pub fn write_folder(&self, dir: &Path) {
+        std::fs::create_dir_all(dir).unwrap();
+        let (w, h) = self.size;
+        for n in 0..self.sets {
+            let (left, right) = (self.grey(false, n), self.grey(true, n));
+            let rows = left.chunks(w as usize).zip(right.chunks(w as usize));
+            let both: Vec<u8> = rows.flat_map(|(l, r)| l.iter().chain(r).copied()).collect();
+            let picture = image::GrayImage::from_raw(2 * w, h, both).unwrap();
+            picture.save(dir.join(format!("{}.png", T0 + n as i64 * self.period_ns))).unwrap();
+        }
+        std::fs::write(dir.join("SN20267155.conf"), self.conf()).unwrap();
+    }
+
     /// Records a dataset: camera `zed2i` with the streams `left` and `right`, and a camera that has nothing to do with it.
     pub fn record(&self, out: &Path) {
         let mut session = Session::new("eyes", "bench");

@@ -5,6 +5,7 @@ use core::ops::ControlFlow;
 use depthrig_bus::{FrameFlags, PixelFormat};
 use depthrig_calib::stereo::Preset;
 use depthrig_daemon::zed_replay::{Mode, NetworkChoice, Step, ZedReplayOptions, zed_replay};
+use depthrig_drivers::zed::replay::made;
 use depthrig_recorder::{
     CompareOptions, Dataset, ErrorKind, PixelMode, SetRange, VerifyOptions, compare, verify,
 };
@@ -171,6 +172,64 @@ fn swapped_eyes_are_said() {
     let plain = dir.path().join("plain");
     Eyes { sets: 1, contrast: 0.0, ..Eyes::default() }.record(&plain);
     zed_replay(&plain, &out, &options(&CLASSICAL[..1], 1), &mut go_on).unwrap();
+}
+
+/// A folder of side-by-side pictures: depth by the factory calibration, times by the names.
+#[test]
+fn a_folder_of_pictures() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
+    let eyes = Eyes { size: (672, 376), focal: 300.0, sets: 3, ..Eyes::default() };
+    eyes.write_folder(&source);
+    let options = options(&CLASSICAL[..1], 2);
+    let report = zed_replay(&source, &out, &options, &mut go_on).unwrap();
+    assert_eq!((report.sets, report.lost, report.notes.len()), (3, 0, 0), "{report:?}");
+    let dataset = Dataset::open(&out).unwrap();
+    let s = &dataset.session().streams[1];
+    assert_eq!((s.id.to_string().as_str(), s.serial.as_str()), ("zed2i/depth_performance", "20267155"));
+    assert!(s.calibration.contains("SN20267155.conf"), "{}", s.calibration);
+    assert_eq!(dataset.session().started_utc_ns, depthrig_tests::eyes::T0);
+    let truth = eyes.truth_m();
+    for (n, set) in dataset.sets_with(SetRange::ALL, PixelMode::Decoded).map(Result::unwrap).enumerate() {
+        assert_eq!(set.utc_ns, depthrig_tests::eyes::T0 + n as i64 * eyes.period_ns);
+        assert_eq!(set.frames[1].header.device_sequence, n as u64);
+        let z = u16s(&set.frames[1].pixels);
+        let right =
+            z.iter().zip(&truth).filter(|(z, t)| (f64::from(**z) * 1e-3 / **t - 1.0).abs() < 0.05).count();
+        assert!(right * 10 > truth.len() * 6, "{right} of {}", truth.len());
+    }
+    // Pixels of an odd width are no two eyes, and a folder without calibration gives no depth.
+    std::fs::remove_file(source.join("SN20267155.conf")).unwrap();
+    let e = zed_replay(&source, &dir.path().join("second"), &options, &mut go_on).unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::BadInput, "{e}");
+    assert!(e.to_string().contains("has no calibration"), "{e}");
+    let empty = dir.path().join("empty");
+    std::fs::create_dir(&empty).unwrap();
+    assert!(zed_replay(&empty, &dir.path().join("third"), &options, &mut go_on).is_err());
+}
+
+/// An SVO2 file, whole and cut; killed or not, a resumed run goes on by the number of the pair.
+#[test]
+fn an_svo2_file() {
+    let dir = tempfile::tempdir().unwrap();
+    let source = dir.path().join("kitchen.svo2");
+    let eyes = Eyes { size: (672, 376), focal: 300.0, ..Eyes::default() };
+    let bytes = made::MadeSvo::strips(eyes.size, 4).build();
+    std::fs::write(&source, &bytes).unwrap();
+    std::fs::write(dir.path().join(format!("SN{}.conf", made::SERIAL)), eyes.conf()).unwrap();
+    let options = options(&CLASSICAL[..1], 2);
+    let out = dir.path().join("out");
+    let report = zed_replay(&source, &out, &options, &mut go_on).unwrap();
+    assert_eq!((report.sets, report.lost), (4, 0), "{report:?}");
+    let dataset = Dataset::open(&out).unwrap();
+    assert_eq!(dataset.session().derived.last().unwrap().from, ["kitchen.svo2"]);
+    assert_eq!(dataset.session().streams[0].serial, made::SERIAL.to_string());
+    let times: Vec<_> = dataset.sets(SetRange::ALL).map(|s| s.unwrap().utc_ns).collect();
+    assert_eq!(times, (0..4).map(made::time_of).collect::<Vec<_>>());
+    // What is no recording is refused.
+    std::fs::write(&source, &bytes[..40]).unwrap();
+    let e = zed_replay(&source, &dir.path().join("cut"), &options, &mut go_on).unwrap_err();
+    assert!(e.to_string().contains("kitchen.svo2"), "{e}");
 }
 
 /// A network of one's own beside the classical modes; skipped, with a line that says so, without ONNX Runtime.

@@ -108,7 +108,15 @@ impl Work {
         RealFs.rename(&copy, out).map_err(|e| failed("rename", &copy, e))?;
         let parent = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
         RealFs.sync_dir(parent).map_err(|e| failed("sync the folder", parent, e))?;
-        std::fs::remove_dir_all(&self.dir).map_err(|e| failed("remove", &self.dir, e))
+        remove(&self.dir)
+    }
+}
+
+/// Removes a folder, if it is there.
+pub(super) fn remove(dir: &Path) -> Result<()> {
+    match std::fs::remove_dir_all(dir) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(failed("remove", dir, e)),
+        _ => Ok(()),
     }
 }
 

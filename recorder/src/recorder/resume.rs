@@ -89,7 +89,18 @@ pub(super) fn past(fs: &Arc<dyn Fs>, dir: &Path) -> Result<Past> {
     if numbers.is_empty() {
         return Ok(past);
     }
-    let dataset = Dataset::open_with(Arc::clone(fs), dir)?;
+    let dataset = loop {
+        let dataset = Dataset::open_with(Arc::clone(fs), dir)?;
+        // A recording that ended because the disk was full or failed closed its last segment and counted there what it
+        // could not write: that is recorded again.
+        let Some(last) = dataset.segments().last().filter(|_| loses(&dataset)) else { break dataset };
+        let size = fs.open(last).and_then(|f| f.size()).unwrap_or(0);
+        fs.remove_file(last).map_err(|e| Error::io("remove", last, e))?;
+        (past.segments, past.bytes) = (past.segments - 1, past.bytes - size.min(past.bytes));
+        if past.segments == 0 {
+            return Ok(past);
+        }
+    };
     for set in dataset.sets_with(SetRange::ALL, PixelMode::None) {
         let set = set?;
         past.sets += 1;
@@ -101,14 +112,12 @@ pub(super) fn past(fs: &Arc<dyn Fs>, dir: &Path) -> Result<Past> {
         past.first_tick.get_or_insert(set.tick);
         past.last_tick = Some(set.tick);
     }
-    if let Some(last) = dataset.open_segment(numbers.len() - 1) {
-        let facts = last?.metadata(SEGMENT_METADATA).cloned().unwrap_or_default();
-        if let Some((key, n)) = facts.iter().find(|(key, _)| key.starts_with("sets_dropped_")) {
-            return Err(Error::new(
-                ErrorKind::BadInput,
-                format!("{} had lost sets before ({key} {n}); begin anew", dir.display()),
-            ));
-        }
-    }
     Ok(past)
+}
+
+/// Whether the last segment tells of sets that were not recorded.
+fn loses(dataset: &Dataset) -> bool {
+    let last = dataset.segments().len().checked_sub(1).and_then(|n| dataset.open_segment(n));
+    let Some(Ok(last)) = last else { return false };
+    last.metadata(SEGMENT_METADATA).is_some_and(|facts| facts.keys().any(|k| k.starts_with("sets_dropped_")))
 }

@@ -89,6 +89,39 @@ fn a_resumed_recording_is_the_one_that_was_never_killed() {
     }
 }
 
+/// A disk that was full took some sets and not the others; with room, those are recorded again.
+#[test]
+fn a_recording_goes_on_after_a_full_disk() {
+    let whole = MemFs::new();
+    let r = begin(&whole);
+    push(&r, 0..SETS);
+    r.finish().unwrap();
+    let all: u64 = whole.read_dir(&dir()).unwrap().iter().map(|e| e.len).sum();
+    for percent in [30, 55, 80, 95] {
+        let small = MemFs::new().with_capacity(all * percent / 100);
+        let r = begin(&small);
+        let mut refused = false;
+        for n in 0..SETS {
+            refused |= r.push(set(&session(), n)).is_err();
+            settle(&r);
+        }
+        assert!(refused || r.progress().error.is_some(), "{percent} %: the disk was never full");
+        drop(r);
+        let fs = MemFs::new();
+        fs.create_dir_all(&dir()).unwrap();
+        for name in names(&small) {
+            fs.put(&dir().join(&name), contents(&small, &dir().join(&name)));
+        }
+        let (r, resumed) = Recorder::resume(Arc::new(fs.clone()), clock(), &dir(), limits()).unwrap();
+        push(&r, resumed.sets..SETS);
+        assert!(r.finish().unwrap().complete);
+        let same = compare(&open(&fs), &open(&whole), &CompareOptions::default()).unwrap();
+        assert!(same.equal, "{percent} %: {:?}", same.differences);
+        let shared: Arc<dyn Fs> = Arc::new(fs);
+        assert!(verify_with(&shared, &dir(), &VerifyOptions::default()).unwrap().is_whole());
+    }
+}
+
 #[test]
 fn what_cannot_go_on_is_refused() {
     let resume =
