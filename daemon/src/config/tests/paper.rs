@@ -58,9 +58,12 @@ fn an_oak_comes_in_by_taking_its_comment_away() {
 #[test]
 fn a_misspelt_key_in_it_is_refused() {
     let text = RigConfig::paper_text();
-    for (good, bad) in
-        [("depth_mode", "dept_mode"), ("emitter", "emiter"), ("network", "net"), ("calibration =", "conf =")]
-    {
+    for (good, bad) in [
+        ("\ndepth_mode =", "\ndept_mode ="),
+        ("\nemitter =", "\nemiter ="),
+        ("\nnetwork =", "\nnet ="),
+        ("\ncalibration =", "\nconf ="),
+    ] {
         assert!(text.contains(good));
         let error = parse(&text.replacen(good, bad, 1)).map(|_| ());
         assert!(error.is_err(), "{bad} was taken");
