@@ -221,7 +221,7 @@ impl StereoNetwork {
         Ok(())
     }
 
-    fn fill(&mut self, pair: &StereoPair<'_>) -> ort::Result<()> {
+    fn fill(&mut self, pair: &StereoPair<'_>) {
         let fit = pictures::Fit { size: self.size, inner: self.inner, resized: self.resized };
         let channels = self.form.channels;
         for (eye, (grey, rgb)) in
@@ -245,7 +245,6 @@ impl StereoNetwork {
                 pictures::fill(fit, &picture, c, self.pixels.scale(c), place, numbers);
             }
         }
-        Ok(())
     }
 }
 
@@ -269,8 +268,7 @@ impl Matcher for StereoNetwork {
             }
         }
         let failed = |e: Error| Calib::new(Kind::BadInput, e.to_string()).with_source(e);
-        self.fill(pair)
-            .map_err(|e| failed(crate::onnxruntime::failed(&self.engine, "filling the input", &e)))?;
+        self.fill(pair);
         self.infer(out).map_err(failed)
     }
 }
@@ -292,7 +290,7 @@ fn hash(file: &Path) -> Result<String> {
             Err(e) => return Err(error(e)),
         }
     }
-    Ok(sha.finalize().iter().map(|b| format!("{b:02x}")).collect())
+    Ok(crate::durable::hex(&sha.finalize()))
 }
 
 fn outlet(of: &OrtOutlet) -> Outlet {

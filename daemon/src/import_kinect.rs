@@ -9,6 +9,7 @@ use depthrig_bus::{
 };
 use depthrig_drivers::kinect::playback::{CalibrationSource, recorded_profiles, serial};
 use depthrig_drivers::kinect::recording::{Pixels, Recording, TrackKind, motion_samples};
+use depthrig_drivers::kinect::{ColorMode, DepthMode};
 use depthrig_drivers::unpack;
 use depthrig_recorder::exchange::{ImportFacts, ImportProgress, Importer};
 use depthrig_recorder::{
@@ -296,7 +297,7 @@ impl Stream {
             }
             Some(Pixels::Gray16Be) => unpack::copy_swapped(data, &mut pixels)?,
             Some(Pixels::Bgra) => {
-                unpack::drop_alpha(data, r.width as usize * 4, r.width as usize, &mut pixels)?
+                unpack::drop_alpha(data, r.width as usize * 4, r.width as usize, &mut pixels)?;
             }
             _ if data.len() > pixels.len() => return Err(DropReason::WrongSize),
             _ => unpack::copy_rows(data, pixels.len(), pixels.len(), &mut pixels)?,
@@ -349,8 +350,8 @@ impl Importer for KinectImport {
         put("written_by", facts.written_by.clone().into());
         put("color_firmware", facts.color_firmware.clone().into());
         put("depth_firmware", facts.depth_firmware.clone().into());
-        put("color_mode", facts.color_mode.map(|m| m.tag()).unwrap_or_default().into());
-        put("depth_mode", facts.depth_mode.map(|m| m.name()).unwrap_or_default().into());
+        put("color_mode", facts.color_mode.map(ColorMode::tag).unwrap_or_default().into());
+        put("depth_mode", facts.depth_mode.map(DepthMode::name).unwrap_or_default().into());
         put("wired_sync", facts.wired_sync.name().into());
         put("depth_delay_ns", facts.depth_delay_ns.into());
         put("subordinate_delay_ns", i64::try_from(facts.subordinate_delay_ns).unwrap_or(i64::MAX).into());

@@ -224,7 +224,7 @@ pub fn zed_replay(
     (report.sets, report.bytes) = (verified.sets, verified.bytes);
     let frames = verified.frames / plan.streams.len().max(1) as u64;
     report.modes.iter_mut().for_each(|m| m.frames = frames);
-    verified.path = out.to_owned();
+    out.clone_into(&mut verified.path);
     report.verified = Some(verified);
     work.finish(out)?;
     Ok(report)

@@ -99,7 +99,7 @@ impl Eyes {
 
     /// Brightness of an eye's picture.
     pub fn grey(&self, right: bool, n: u64) -> Vec<u8> {
-        let shift = if right != self.swapped { self.baseline_m } else { 0.0 };
+        let shift = if right == self.swapped { 0.0 } else { self.baseline_m };
         let (w, h) = self.size;
         (0..h)
             .flat_map(|y| (0..w).map(move |x| (x, y)))

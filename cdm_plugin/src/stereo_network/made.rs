@@ -4,7 +4,8 @@ use crate::onnx::Numbers;
 use crate::onnx::builder::{Attribute, Builder, Dimension, Value};
 use std::collections::BTreeMap;
 
-/// A network to be made. What it computes is the shift with the least sum of absolute differences in 5x5 pixels.
+/// A network to be made. Each flag is one form that real networks have. What it computes is the shift with the least sum of absolute differences in 5x5 pixels.
+#[allow(clippy::struct_excessive_bools)] // forms that are independent of each other
 #[derive(Debug, Clone)]
 pub struct MadeNetwork {
     /// Shifts that are tried: 0 to this number less one.

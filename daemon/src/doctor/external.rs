@@ -22,7 +22,7 @@ pub(super) fn plan(
     let place = place_of_served(rig, camera.name.as_str());
     let found = attached.cameras.iter().find(|c| c.backend == plan.backend && c.port == place);
     match found {
-        None => findings.extend(not_served(settings)),
+        None => findings.push(not_served(settings)),
         Some(device) => {
             plan.device = Some(device.describe());
             plan.port = Some(place);
@@ -57,26 +57,26 @@ fn finish(plan: super::CameraPlan, findings: Vec<Finding>) -> Planned {
 }
 
 /// What to say when no process serves the camera now.
-fn not_served(settings: &ExternalSettings) -> Option<Finding> {
+fn not_served(settings: &ExternalSettings) -> Finding {
     let Some(program) = settings.command.first() else {
-        return Some(Finding::new(
+        return Finding::new(
             Severity::Error,
             "camera_missing",
             "no process serves it",
             INCOMPLETE,
             "start the process that does (docs/external.md), or name it in the rig file as `command`",
-        ));
+        );
     };
     if can_run(program, &settings.directory) {
-        return Some(Finding::new(
+        return Finding::new(
             Severity::Info,
             "external_not_running",
             format!("its process, {program}, starts with the rig"),
             "its modes are known only when it runs, so disk and shared memory are planned without them",
             "nothing, or start it by itself for a check",
-        ));
+        );
     }
-    Some(Finding::new(
+    Finding::new(
         Severity::Error,
         "command_missing",
         format!(
@@ -85,7 +85,7 @@ fn not_served(settings: &ExternalSettings) -> Option<Finding> {
         ),
         "the rig does not start with a camera that cannot work",
         "correct `command` or `directory`, or install the program",
-    ))
+    )
 }
 
 /// Whether `program` would be found: by its path from `directory`, or in `PATH`.

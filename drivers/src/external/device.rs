@@ -32,6 +32,7 @@ impl ExternalDevice {
     ///
     /// # Errors
     /// The reason of the process when it says that its camera cannot be had now.
+    #[allow(clippy::large_types_passed_by_value)] // it is kept, once for each opening
     pub(super) fn new(
         (config, place, keeper): (&ExternalConfig, &Place, SharedKeeper),
         link: ExternalLink,

@@ -60,6 +60,7 @@ impl Fake {
         let file = home.path().join("libk4a.so.1.4");
         // A copy and not a link: the loader takes one file for one library.
         std::fs::copy(built(), &file).unwrap();
+        // SAFETY: the library is the made one, whose loading runs nothing.
         let library = unsafe { Library::new(file.canonicalize().unwrap()) }.unwrap();
         let fake = Self { home, library };
         for serial in serials {
@@ -87,6 +88,7 @@ impl Fake {
     pub fn command(&self, serial: &str, what: &str, n: u64) {
         type Command = unsafe extern "C" fn(*const c_char, *const c_char, u64) -> u32;
         let (serial, text) = (CString::new(serial).unwrap(), CString::new(what).unwrap());
+        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
         let done = unsafe {
             self.library.get::<Command>(b"fake_k4a_command\0").unwrap()(serial.as_ptr(), text.as_ptr(), n)
         };
@@ -97,6 +99,7 @@ impl Fake {
     pub fn calibration(&self, serial: &str, text: &[u8]) {
         type Set = unsafe extern "C" fn(*const c_char, *const u8, usize) -> u32;
         let serial = CString::new(serial).unwrap();
+        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
         let done = unsafe {
             self.library.get::<Set>(b"fake_k4a_calibration\0").unwrap()(
                 serial.as_ptr(),
@@ -112,7 +115,9 @@ impl Fake {
         type Ask = unsafe extern "C" fn(*const c_char, usize, *mut Ledger) -> u32;
         let serial = CString::new(serial).unwrap();
         let mut ledger = Ledger::default();
+        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
         let ask = unsafe { self.library.get::<Ask>(b"fake_k4a_ledger\0") }.unwrap();
+        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
         assert_eq!(unsafe { ask(serial.as_ptr(), stream, &raw mut ledger) }, 0);
         ledger
     }
@@ -121,7 +126,9 @@ impl Fake {
     pub fn census(&self) -> Census {
         let mut census = Census::default();
         let ask =
+            // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
             unsafe { self.library.get::<unsafe extern "C" fn(*mut Census)>(b"fake_k4a_census\0") }.unwrap();
+        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
         unsafe { ask(&raw mut census) };
         census
     }
@@ -130,6 +137,7 @@ impl Fake {
     pub fn control(&self, serial: &str, command: u32) -> i32 {
         type Ask = unsafe extern "C" fn(*const c_char, u32) -> i32;
         let serial = CString::new(serial).unwrap();
+        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
         unsafe { self.library.get::<Ask>(b"fake_k4a_control\0").unwrap()(serial.as_ptr(), command) }
     }
 
@@ -137,6 +145,7 @@ impl Fake {
     pub fn exposed(&self, serial: &str, at: HostTime) -> Option<HostTime> {
         type Ask = unsafe extern "C" fn(*const c_char, i64) -> i64;
         let serial = CString::new(serial).unwrap();
+        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
         let ns = unsafe { self.library.get::<Ask>(b"fake_k4a_exposed\0").unwrap()(serial.as_ptr(), at.ns()) };
         (ns != 0).then(|| HostTime::from_ns(ns))
     }

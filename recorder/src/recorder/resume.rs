@@ -69,7 +69,7 @@ pub(super) fn past(fs: &Arc<dyn Fs>, dir: &Path) -> Result<Past> {
     let (mut numbers, mut bytes) = (Vec::new(), 0);
     for entry in entries {
         let number = segment_number(&entry.name);
-        let unfinished = number.is_some() && entry.name.ends_with(".part");
+        let unfinished = number.is_some() && Path::new(&entry.name).extension().is_some_and(|e| e == "part");
         if unfinished || entry.name == RESERVE_FILE || entry.name == SESSION_TMP {
             let path = dir.join(&entry.name);
             fs.remove_file(&path).map_err(|e| Error::io("remove", &path, e))?;

@@ -182,7 +182,7 @@ impl Backend for LiveBackend {
         let (mut meant, others): (Vec<_>, Vec<_>) = opened.into_iter().partition(|(_, i)| is_meant(i));
         let is_only = wanted.is_some() || failed.is_empty();
         match (meant.len(), meant.pop()) {
-            (1, Some((camera, info))) if is_only => LiveDevice::new(camera, info, self),
+            (1, Some((camera, info))) if is_only => LiveDevice::boxed(camera, info, self),
             (_, last) => {
                 let rest = meant.into_iter().chain(last).chain(others).map(|(_, i)| i).collect::<Vec<_>>();
                 Err(self.not_found(wanted.as_deref(), &rest, failed))
@@ -202,7 +202,7 @@ struct LiveDevice {
 }
 
 impl LiveDevice {
-    fn new(camera: Handle, info: DeviceInfo, of: &LiveBackend) -> Result<Box<dyn Device>> {
+    fn boxed(camera: Handle, info: DeviceInfo, of: &LiveBackend) -> Result<Box<dyn Device>> {
         let name = find::describe(&info.serial, &info.port);
         let calibration = calibration(&camera);
         if let Err(e) = &calibration {

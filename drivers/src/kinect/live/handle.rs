@@ -263,7 +263,6 @@ fn failed(library: &Loaded, what: &str, otherwise: ErrorKind) -> Error {
     let (kind, cure) = match journal::cause(&lines) {
         Cause::Busy => (ErrorKind::Busy, "; another program has it: end that".to_owned()),
         Cause::Denied => (ErrorKind::PermissionDenied, format!("; {RULE_CURE} and plug the camera in again")),
-        Cause::Gone => (otherwise, String::new()),
         Cause::NoEngine => (
             ErrorKind::BadInput,
             format!("; the depth engine was not found: {}", super::library::CURE),
@@ -282,7 +281,7 @@ fn failed(library: &Loaded, what: &str, otherwise: ErrorKind) -> Error {
             otherwise,
             format!("; the kernel gives no more memory for USB transfers: raise /{}", crate::usb::health::USBFS_LIMIT),
         ),
-        Cause::Unknown => (otherwise, String::new()),
+        Cause::Gone | Cause::Unknown => (otherwise, String::new()),
     };
     Error::new(kind, format!("{what}{cure}{}", journal::quote(&lines)))
 }

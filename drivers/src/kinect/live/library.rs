@@ -173,14 +173,12 @@ pub fn load_engine(places: &Places, library: &Path) -> Result<Option<PathBuf>> {
         let file = if path.is_dir() { path.join(ENGINE) } else { path.to_owned() };
         file.is_file().then_some(file)
     };
-    let found = match &places.engine {
-        Some(path) => Some(at(path).ok_or_else(|| explain(format!("is not at {}", path.display())))?),
-        None => {
-            let beside = library.parent().into_iter().map(Path::to_owned);
-            let mut folders = beside.chain(loader_folders());
-            folders
-                .find_map(|folder| ENGINE_FOLDERS.iter().find_map(|sub| at(&folder.join(sub).join(ENGINE))))
-        }
+    let found = if let Some(path) = &places.engine {
+        Some(at(path).ok_or_else(|| explain(format!("is not at {}", path.display())))?)
+    } else {
+        let beside = library.parent().into_iter().map(Path::to_owned);
+        let mut folders = beside.chain(loader_folders());
+        folders.find_map(|folder| ENGINE_FOLDERS.iter().find_map(|sub| at(&folder.join(sub).join(ENGINE))))
     };
     let name = found.clone().unwrap_or_else(|| PathBuf::from(ENGINE));
     // SAFETY: as for libk4a; libk4a is about to load the same.

@@ -135,7 +135,9 @@ pub fn plan(
         // The slowest default: 3072p and the unbinned wide view have no more than that.
         let first = choose_profiles(name, available, &wishes)?;
         let slowest = first.iter().map(|p| p.rate_hz).fold(f64::INFINITY, f64::min);
-        wishes.iter_mut().for_each(|w| w.rate_hz = Some(slowest));
+        for wish in &mut wishes {
+            wish.rate_hz = Some(slowest);
+        }
     }
     let profiles = choose_profiles(name, available, &wishes)?;
     let Some(first) = profiles.first() else { return Err(refuse("no stream was asked for".to_owned())) };
@@ -154,7 +156,7 @@ pub fn plan(
     let configuration = configuration(config, find("color"), find("depth").or(find("ir")), first.rate_hz)
         .ok_or_else(|| refuse("it has no such mode".to_owned()))?;
     check_sync(config, &configuration, period_us).map_err(refuse)?;
-    Ok(Plan { configuration, profiles })
+    Ok(Plan { profiles, configuration })
 }
 
 fn configuration(
@@ -225,9 +227,8 @@ pub fn wire_bits_per_s(profile: &StreamProfile, with_depth: bool) -> f64 {
     let raw_bytes = match (profile.stream.as_str(), profile.width) {
         ("ir", _) if with_depth => 0.0,
         ("depth" | "ir", 512) => 3_777_232.0,
-        ("depth", 1024) => 9_438_664.0,
         // Passive infrared and the unbinned wide view have one size; this is the larger of both.
-        ("ir", 1024) => 9_438_664.0,
+        ("depth" | "ir", 1024) => 9_438_664.0,
         ("depth" | "ir", _) => 5_310_760.0,
         (_, width) => {
             let bits = match profile.format {
