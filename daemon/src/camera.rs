@@ -29,7 +29,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 /// How long an opening may take before its thread is given up for hung.
 const OPEN_PATIENCE: Duration = Duration::from_secs(15);
 /// How long a recording may be silent that waits for its modes.
-const WAITS_FOR_MODES: Duration = Duration::from_secs(60);
+const WAITS_FOR_MODES: Duration = Duration::from_mins(1);
 /// A stalled camera is opened again after this many stall times without a frame.
 const STALLS_UNTIL_RESTART: u32 = 4;
 

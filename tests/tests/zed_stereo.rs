@@ -82,7 +82,8 @@ fn folder(dir: &Path, n: usize) {
 
 fn rig(input: &Path, more: &str) -> String {
     format!(
-        "rig = \"test\"\n[[camera]]\nname = \"zed\"\nbackend = \"zed\"\ninput = {input:?}\nrate_hz = 5\nloop = true\n{more}\n"
+        "rig = \"test\"\n[[camera]]\nname = \"zed\"\nbackend = \"zed\"\ninput = \"{}\"\nrate_hz = 5\nloop = true\n{more}\n",
+        input.display()
     )
 }
 

@@ -164,7 +164,7 @@ fn undistort(eye: &Intrinsics, pixel: DVec2) -> Result<DVec2> {
         _ => {
             let ray = Camera::new(eye)?.unproject(pixel);
             return ray
-                .map(|r| r.truncate())
+                .map(DVec3::truncate)
                 .ok_or_else(|| bad("the lens shows no point at the picture's edge"));
         }
     };

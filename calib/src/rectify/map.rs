@@ -126,7 +126,7 @@ impl Map {
 
 impl Entry {
     /// The mean of upper left, upper right, lower left and lower right, by their weights.
-    #[inline(always)]
+    #[inline]
     fn mix(self, [a, b, c, d]: [u8; 4]) -> u8 {
         let (r, l) = (u32::from(self.right), 256 - u32::from(self.right));
         let top = u32::from(a) * l + u32::from(b) * r;
@@ -136,13 +136,13 @@ impl Entry {
 }
 
 /// Luminance by BT.601, in 14 bits as `OpenCV`'s `cvtColor` has it.
-#[inline(always)]
+#[inline]
 fn luma([r, g, b]: [u8; 3]) -> u8 {
     ((4899 * u32::from(r) + 9617 * u32::from(g) + 1868 * u32::from(b) + (1 << 13)) >> 14) as u8
 }
 
 /// Red, green, blue by BT.601 with luminance within 16 and 235, in 20 bits as `OpenCV`'s `cvtColor` has it.
-#[inline(always)]
+#[inline]
 fn rgb_of_yuv(y: u8, u: u8, v: u8) -> [u8; 3] {
     const HALF: i32 = 1 << 19;
     let y = (i32::from(y) - 16).max(0) * 1_220_542;

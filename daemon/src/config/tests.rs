@@ -456,6 +456,7 @@ fn angles_turn_about_x_then_y_then_z() {
 const ONE_CAMERA: &str = "rig = \"r\"\n[[camera]]\nname = \"d435\"\nbackend = \"synthetic\"\n";
 
 #[test]
+#[allow(clippy::too_many_lines)] // a table
 fn each_problem_has_its_place_and_says_what_to_write() {
     let top = |line: &str| format!("{line}\n{ONE_CAMERA}");
     let camera = |line: &str| format!("{ONE_CAMERA}{line}\n");

@@ -147,15 +147,15 @@ impl Device for ReplayDevice {
     }
 }
 
-/// Where a round through the recording lies in time.
+/// Where a round through the recording lies in time, nanoseconds.
 #[derive(Debug, Clone, Copy, Default)]
 struct Round {
     /// Time of the recording's first pair.
-    first_ns: Option<i64>,
+    first: Option<i64>,
     /// What the time within this round is added to.
-    begins_ns: i64,
+    begins: i64,
     /// The newest pair's time since the first one.
-    newest_ns: i64,
+    newest: i64,
 }
 
 /// A recording that plays.
@@ -186,7 +186,7 @@ impl Player {
         let mut next = self.source.next(&mut self.pair)?;
         if next == Next::End && self.looped && self.count > 0 {
             self.source.seek(0)?;
-            self.round.begins_ns += self.round.newest_ns + self.period_ns;
+            self.round.begins += self.round.newest + self.period_ns;
             next = self.source.next(&mut self.pair)?;
         }
         self.ready = match next {
@@ -216,9 +216,9 @@ impl Player {
             return self.pace.due(self.count, now);
         }
         let time = self.pair.capture_time_ns;
-        let since = time.saturating_sub(*self.round.first_ns.get_or_insert(time)).max(0);
-        self.round.newest_ns = since.max(self.round.newest_ns);
-        self.pace.due_at(self.round.begins_ns.saturating_add(since), now)
+        let since = time.saturating_sub(*self.round.first.get_or_insert(time)).max(0);
+        self.round.newest = since.max(self.round.newest);
+        self.pace.due_at(self.round.begins.saturating_add(since), now)
     }
 }
 

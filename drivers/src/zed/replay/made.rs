@@ -154,7 +154,9 @@ pub fn strips(eye: (u32, u32), pair: &(Vec<u8>, Vec<u8>)) -> Vec<u8> {
         parts.push(jpeg);
     }
     let mut message = vec![0; 8];
-    parts.iter().for_each(|p| message.extend((p.len() as u64).to_le_bytes()));
+    for p in &parts {
+        message.extend((p.len() as u64).to_le_bytes());
+    }
     message.extend(parts.concat());
     message
 }
@@ -194,7 +196,7 @@ impl Bits {
 
     /// Unsigned Exp-Golomb.
     fn ue(&mut self, value: u32) -> &mut Self {
-        let n = 31 - (value + 1).leading_zeros();
+        let n = (value + 1).ilog2();
         self.u(n, 0).u(n + 1, value + 1)
     }
 

@@ -135,7 +135,7 @@ fn first_picture(
                 match size {
                     Some(size) => return Ok((Decoder::H264(decoder), size)),
                     None => {
-                        last = Some(Error::new(ErrorKind::BadInput, "its first pictures are damaged H.264"))
+                        last = Some(Error::new(ErrorKind::BadInput, "its first pictures are damaged H.264"));
                     }
                 }
             }

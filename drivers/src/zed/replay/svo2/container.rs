@@ -77,11 +77,14 @@ struct Reading {
     end: u64,
 }
 
+/// How many messages each channel has, if an index says so.
+type Counts = Option<Vec<(u16, u64)>>;
+
 /// What the walk through the file finds.
 #[derive(Default)]
 struct Walk {
     /// Begin and end of each chunk or run of messages, and how many messages of each channel it has, if an index says so.
-    runs: Vec<(u64, u64, Option<Vec<(u16, u64)>>)>,
+    runs: Vec<(u64, u64, Counts)>,
     channels: Vec<(u16, String)>,
 }
 
@@ -197,7 +200,7 @@ impl Container {
             match found {
                 Ok(true) => self.reading = Some(reading),
                 Ok(false) => {
-                    message.damaged = Some("a chunk has fewer messages than its index says".to_owned())
+                    message.damaged = Some("a chunk has fewer messages than its index says".to_owned());
                 }
                 Err(Fault::Io(e)) => return Err(io_error(&self.path, e)),
                 Err(Fault::Damage(why)) => message.damaged = Some(format!("its chunk is damaged: {why}")),
