@@ -507,6 +507,7 @@ fn stream_id(camera: &str, stream: &str) -> Result<StreamId> {
 }
 
 /// Makes depth of all pairs that are not in `copy` yet; `None` when it was ended.
+#[allow(clippy::too_many_lines)] // one loop, and what each thread of it is given
 fn record(
     input: &mut Input,
     plan: &mut Plan,

@@ -11,7 +11,7 @@ use depthrig_drivers::external::{ExternalBackend, ExternalConfig};
 use depthrig_drivers::{
     Backend, Device, DeviceInfo, FrameSink, Poll, Result, Stream, StreamProfile, StreamRequest,
 };
-use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
@@ -39,7 +39,7 @@ struct Script {
 }
 
 #[derive(Clone)]
-struct Shared(Arc<Mutex<Script>>, Arc<Mutex<Sender<Sender<()>>>>);
+struct Shared(Arc<Mutex<Script>>, Arc<Mutex<SyncSender<SyncSender<()>>>>);
 
 impl Shared {
     fn script(&self) -> MutexGuard<'_, Script> {
@@ -48,7 +48,7 @@ impl Shared {
 
     /// Has the process send what is due, and waits until it has.
     fn produce(&self) {
-        let (done, wait) = channel();
+        let (done, wait) = sync_channel(1024);
         if self.1.lock().unwrap().send(done).is_ok() {
             let _ = wait.recv_timeout(Duration::from_secs(5));
         }
@@ -68,7 +68,7 @@ fn picture(stream: usize, number: u64) -> Vec<u8> {
 }
 
 /// The process: serves until the test's end is gone.
-fn process(place: &Place, shared: &Shared, orders: &Receiver<Sender<()>>) {
+fn process(place: &Place, shared: &Shared, orders: &Receiver<SyncSender<()>>) {
     let about = About { model: "Bench".into(), serial: "bench".into(), ..About::default() };
     let mut camera = ExternalCamera::offer(place, &about, &modes()).unwrap();
     let mut gone = false;
@@ -102,7 +102,7 @@ fn process(place: &Place, shared: &Shared, orders: &Receiver<Sender<()>>) {
     }
 }
 
-fn serve(session: &mut Session<'_>, shared: &Shared, orders: &Receiver<Sender<()>>) {
+fn serve(session: &mut Session<'_>, shared: &Shared, orders: &Receiver<SyncSender<()>>) {
     let running: Vec<usize> = session.modes().map(|(i, _)| i).collect();
     {
         let mut script = shared.script();
@@ -256,11 +256,11 @@ impl Subject for External {
         let dir = Arc::new(tempfile::tempdir().unwrap());
         let runtime = RuntimeDir::at(dir.path()).unwrap();
         let place = Place { runtime, rig: Name::new("rig").unwrap(), camera: Name::new("cam").unwrap() };
-        let (orders, theirs) = channel();
+        let (orders, theirs) = sync_channel(1024);
         let shared = Shared(Arc::default(), Arc::new(Mutex::new(orders)));
         let (at, of) = (place.clone(), shared.clone());
         // The thread ends when the last sender is gone; it must not keep one itself.
-        let script = Shared(of.0, Arc::new(Mutex::new(channel().0)));
+        let script = Shared(of.0, Arc::new(Mutex::new(sync_channel(1).0)));
         std::thread::spawn(move || process(&at, &script, &theirs));
         let backend = ExternalBackend::new(ExternalConfig::default(), place);
         while backend.discover().is_ok_and(|d| d.is_empty()) {

@@ -172,12 +172,12 @@ fn intrinsics_and_poses_are_those_of_the_calibration() {
 
 #[test]
 fn colour_controls_are_checked_set_and_read_back() {
+    use ControlValue::{Boolean, Integer, Item};
     let fake = Fake::new(&[A]);
     let with = |controls: &[(&str, ControlValue)]| {
         let color_controls = controls.iter().map(|(n, v)| ((*n).to_owned(), v.clone())).collect();
         start(LiveConfig { color_controls, ..fake.config() }, A, &[]).map(drop)
     };
-    use ControlValue::{Boolean, Integer, Item};
     with(&[
         ("exposure_us", Integer(3000)),
         ("white_balance_k", Item("auto".into())),

@@ -8,7 +8,7 @@ use depthrig_daemon::status::{CameraState, CameraStatus, RigStatus};
 use depthrig_tests::{Home, RigText, all_stream, assert_balanced, camera, wait_until};
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
-use std::sync::mpsc::{Receiver, channel};
+use std::sync::mpsc::{Receiver, sync_channel};
 use std::time::Duration;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_external_camera");
@@ -31,7 +31,7 @@ impl Process {
             .spawn()
             .unwrap();
         let out = BufReader::new(child.stdout.take().unwrap());
-        let (tell, lines) = channel();
+        let (tell, lines) = sync_channel(1024);
         std::thread::spawn(move || out.lines().map_while(Result::ok).all(|line| tell.send(line).is_ok()));
         Self { child, lines }
     }

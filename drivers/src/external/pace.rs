@@ -68,6 +68,6 @@ mod tests {
         let mut pace = Pace::new(30.0);
         let start = pace.at;
         assert_eq!(taken(&mut pace, start, 0, 100), 8);
-        assert_eq!(taken(&mut pace, start.plus(Duration::from_secs(60)), 0, 100), 8);
+        assert_eq!(taken(&mut pace, start.plus(Duration::from_mins(1)), 0, 100), 8);
     }
 }

@@ -7,7 +7,7 @@ use core::time::Duration;
 use depthrig_bus::{ClockDomain, DropReason, FrameFlags, HostTime, MetadataLevel};
 use depthrig_calib::stereo::{Description, DisparityMap, StereoPair};
 use std::sync::Mutex;
-use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
 const W: u32 = 160;
 const H: u32 = 96;
@@ -169,15 +169,15 @@ fn play(device: Made, options: StereoOptions, requests: &[&str]) -> (MemorySink,
     let requests: Vec<_> = requests.iter().map(|r| StreamRequest::any(Name::new(*r).unwrap())).collect();
     let mut stream = wrap(Box::new(device), options).unwrap().start(&requests).unwrap();
     let mut sink = Strict::default();
-    let limit = HostTime::now().plus(Duration::from_secs(60));
+    let limit = HostTime::now().plus(Duration::from_mins(1));
     while stream.poll(Duration::from_millis(20), &mut sink).unwrap() != Poll::End {
         assert!(!limit.from_now().is_zero(), "it does not come to an end");
     }
     let profiles = stream.profiles().to_vec();
-    for i in 0..profiles.len() {
+    for (i, profile) in profiles.iter().enumerate() {
         let of = |list: &[u64]| list.get(i).copied().unwrap_or(0);
         let decided = sink.0.delivered(i) + sink.0.drops_of(i).total();
-        assert_eq!(of(&sink.0.captured), decided, "{}", profiles[i].stream);
+        assert_eq!(of(&sink.0.captured), decided, "{}", profile.stream);
     }
     (sink.0, profiles)
 }
@@ -301,8 +301,8 @@ fn only_what_is_asked_for_comes_and_the_eyes_are_read_all_the_same() {
 }
 
 /// A mode whose matcher waits until the sender is dropped.
-fn waits(name: &str) -> (StereoMode, Sender<()>) {
-    let (release, gate): (Sender<()>, Receiver<()>) = channel();
+fn waits(name: &str) -> (StereoMode, SyncSender<()>) {
+    let (release, gate): (SyncSender<()>, Receiver<()>) = sync_channel(1024);
     let gate = Arc::new(Mutex::new(gate));
     let mode = puppet(name, move || {
         let gate = Arc::clone(&gate);
@@ -325,7 +325,7 @@ fn a_slow_mode_skips_pairs_counts_them_and_holds_up_nobody() {
     let i = |name| index(&profiles, name);
     let mut sink = Strict::default();
     // Until the quick mode has had its last pair; the slow one is still at its first.
-    let limit = HostTime::now().plus(Duration::from_secs(60));
+    let limit = HostTime::now().plus(Duration::from_mins(1));
     while sink.0.captured.get(i("depth_quick")).is_none_or(|n| *n < 60) {
         let _ = stream.poll(Duration::from_millis(5), &mut sink).unwrap();
         assert!(!limit.from_now().is_zero());
@@ -358,8 +358,8 @@ fn with_every_pair_nothing_gives_way() {
         options(vec![slow, puppet("quick", || || Ok(()))]),
         &[],
     );
-    for i in 0..profiles.len() {
-        assert_eq!((sink.delivered(i), sink.drops_of(i).total()), (30, 0), "{}", profiles[i].stream);
+    for (i, profile) in profiles.iter().enumerate() {
+        assert_eq!((sink.delivered(i), sink.drops_of(i).total()), (30, 0), "{}", profile.stream);
     }
 }
 
@@ -419,7 +419,7 @@ fn a_mode_that_hangs_is_left_behind() {
     let options = StereoOptions { every_pair: false, ..options(vec![hangs]) };
     let mut stream = wrap(Box::new(made), options).unwrap().start(&[]).unwrap();
     let mut sink = Strict::default();
-    let limit = HostTime::now().plus(Duration::from_secs(60));
+    let limit = HostTime::now().plus(Duration::from_mins(1));
     while sink.0.delivered(0) < 40 || sink.0.delivered(2) < 1 {
         let _ = stream.poll(Duration::from_millis(2), &mut sink).unwrap();
         assert!(!limit.from_now().is_zero());

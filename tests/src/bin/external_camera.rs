@@ -28,11 +28,11 @@ fn main() {
     let modes = [mode("color", PixelFormat::Rgb8), mode("depth", PixelFormat::Z16)];
     match behaviour.as_str() {
         "crash_at_once" => std::process::exit(7),
-        "never_offers" => std::thread::sleep(Duration::from_secs(600)),
+        "never_offers" => std::thread::sleep(Duration::from_mins(10)),
         "locked_and_silent" => {
             let who = format!("process {} (external_camera)", std::process::id());
             let _lock = lock(&place.runtime, &place.rig, &place.camera, &who).unwrap();
-            std::thread::sleep(Duration::from_secs(600));
+            std::thread::sleep(Duration::from_mins(10));
         }
         _ => {}
     }
@@ -61,7 +61,7 @@ fn main() {
             "refuses" => session.refuse(ExternalReason::Unsupported, "this sensor has no such mode today"),
             "finishes" => {
                 serve(session, "normal", 20);
-                std::thread::sleep(Duration::from_secs(600));
+                std::thread::sleep(Duration::from_mins(10));
             }
             "mute" => {
                 while session.is_wanted() {
