@@ -49,7 +49,7 @@ pub(crate) struct Info {
 
 impl Info {
     pub(crate) const fn bytes(&self) -> u64 {
-        self.width as u64 * self.height as u64 * self.kind.bytes_per_pixel()
+        (self.width as u64 * self.height as u64).saturating_mul(self.kind.bytes_per_pixel())
     }
 }
 

@@ -106,7 +106,7 @@ fn check(
     };
     let ControlRange { min, max, step, .. } = range;
     let outside = value < i64::from(min) || value > i64::from(max);
-    let between = step > 1 && (value - i64::from(min)) % i64::from(step) != 0;
+    let between = !outside && step > 1 && (value - i64::from(min)) % i64::from(step) != 0;
     if outside || between {
         let steps = if step > 1 { format!(", in steps of {step}") } else { String::new() };
         return Err(format!("color_controls.{key} = {value}: it goes from {min} to {max}{steps}"));

@@ -95,7 +95,7 @@ pub struct ReplayArgs {
     depth_unit: f64,
     /// How rectified colour is stored
     #[arg(long, value_enum, default_value = "jpeg")]
-    color: Color,
+    color_codec: Color,
     /// Pairs and modes that are worked on at once [default: one for each core]
     #[arg(short = 'j', long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     jobs: Option<u16>,
@@ -130,7 +130,7 @@ impl ReplayArgs {
             disparity: self.disparity,
             range_m: (self.min_depth, self.max_depth),
             depth_unit_m: self.depth_unit,
-            color: match self.color {
+            color: match self.color_codec {
                 Color::Jpeg => ColorCodec::Jpeg,
                 Color::Png => ColorCodec::Png,
                 Color::Raw => ColorCodec::Raw,
