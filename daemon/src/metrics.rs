@@ -184,7 +184,7 @@ fn clock(f: &mut Families, labels: &Labels, c: &ClockStatus) {
 }
 
 fn set_frames(f: &mut Families, labels: &Labels, a: &SetAccount) {
-    let SetAccount { used, decimated, late, out_of_order, overflow, missed, pending } = *a;
+    let SetAccount { used, decimated, late, out_of_order, overflow, missed, pending, unread } = *a;
     for (fate, n) in [
         ("used", used),
         ("decimated", decimated),
@@ -203,6 +203,8 @@ fn set_frames(f: &mut Families, labels: &Labels, a: &SetAccount) {
         );
     }
     f.gauge("set_frames_pending", "Frames waiting for their set.", Unit::None, labels, pending as f64);
+    let help = "Delivered frames that the set assembler has not yet read.";
+    f.gauge("set_frames_unread", help, Unit::None, labels, unread as f64);
 }
 
 fn sets(f: &mut Families, s: &SetStatus) {

@@ -272,7 +272,7 @@ pub struct ClockStatus {
 }
 
 /// What became of a stream's frames in the set assembler:
-/// `delivered = used + decimated + late + out_of_order + overflow + missed + pending`.
+/// `delivered = used + decimated + late + out_of_order + overflow + missed + pending + unread`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct SetAccount {
     /// Became part of a set.
@@ -289,6 +289,23 @@ pub struct SetAccount {
     pub missed: u64,
     /// Waiting for their set now.
     pub pending: u64,
+    /// Delivered, and not yet seen by the assembler, which reads when it next wakes.
+    #[serde(default)]
+    pub unread: u64,
+}
+
+impl SetAccount {
+    /// The frames that have an end in the assembler, or wait there.
+    pub const fn taken(&self) -> u64 {
+        let Self { used, decimated, late, out_of_order, overflow, missed, pending, unread: _ } = *self;
+        used + decimated + late + out_of_order + overflow + missed + pending
+    }
+
+    /// This account, taken before `delivered` was read, with the frames that came since then.
+    #[must_use]
+    pub const fn with_delivered(self, delivered: u64) -> Self {
+        Self { unread: delivered.saturating_sub(self.taken()), ..self }
+    }
 }
 
 /// The set assembler.

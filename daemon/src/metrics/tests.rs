@@ -57,6 +57,7 @@ fn rig() -> RigStatus {
             overflow: 0,
             missed: 2,
             pending: 1,
+            unread: 0,
         },
     };
     let camera = |name: &str, state, streams| CameraStatus {

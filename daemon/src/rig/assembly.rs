@@ -223,5 +223,6 @@ fn add(base: &SetAccount, a: &crate::sets::Account) -> SetAccount {
         overflow: base.overflow + a.overflow,
         missed: base.missed,
         pending: a.pending,
+        unread: 0,
     }
 }

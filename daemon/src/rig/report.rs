@@ -73,7 +73,12 @@ fn camera(inner: &Inner, camera: &Camera, now: HostTime) -> CameraStatus {
         refine: state.lane.as_ref().map(|lane| lane.status()),
         streams: state
             .all_streams()
-            .map(|s| stream(s, accounts.streams.get(&s.id).copied().unwrap_or_default(), now))
+            .map(|s| {
+                // The account is older than the books that are read here, and never ahead of them.
+                let mut told = stream(s, accounts.streams.get(&s.id).copied().unwrap_or_default(), now);
+                told.in_sets = told.in_sets.with_delivered(told.delivered);
+                told
+            })
             .collect(),
     }
 }

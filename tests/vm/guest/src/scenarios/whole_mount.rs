@@ -16,7 +16,7 @@ use depthrig_drivers::zed::mode::Mode;
 use depthrig_emulator::{Camera, Stamp};
 use depthrig_kinect_fixture::{Fixture, Pattern, Pictures};
 use depthrig_recorder::{Dataset, PixelMode, SetRange, Severity, VerifyOptions, verify};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 use std::path::Path;
 use std::time::Duration;
@@ -59,7 +59,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let before = status;
     let status = daemon.status()?;
     checks.that("all of them still do", status.cameras.iter().all(streams), daemon::told(&status));
-    books(checks, &status);
+    books(checks, &daemon, &status)?;
     lost(checks, &before, &status);
     checks.that("sets are recorded", recording.sets >= SET_RATE_HZ * SECONDS - 2, recording.sets);
     checks.equal("none is dropped", recording.dropped, BTreeMap::new());
@@ -136,20 +136,34 @@ fn rig(mount: &Mount) -> anyhow::Result<String> {
     Ok(text)
 }
 
-/// Every frame that a camera captured was delivered or counted as lost, and every delivered one has an end in the sets.
-fn books(checks: &mut Checks, status: &RigStatus) {
-    let all = || status.cameras.iter().flat_map(|c| &c.streams);
-    let wrong = all().filter(|s| {
-        let i = &s.in_sets;
-        let taken = i.used + i.decimated + i.late + i.out_of_order + i.overflow + i.missed + i.pending;
-        s.captured != s.delivered + s.dropped.values().sum::<u64>() || s.delivered != taken
+/// Every frame that a camera captured was delivered or counted as lost, and every delivered one has an end in the sets:
+/// at once, or as soon as the set thread has read it.
+fn books(checks: &mut Checks, daemon: &Daemon, status: &RigStatus) -> anyhow::Result<()> {
+    let of = |status: &RigStatus| -> Vec<_> {
+        status.cameras.iter().flat_map(|c| c.streams.iter().cloned()).collect()
+    };
+    let all = of(status);
+    let unbalanced = all.iter().filter(|s| {
+        s.captured != s.delivered + s.dropped.values().sum::<u64>()
+            || s.delivered != s.in_sets.taken() + s.in_sets.unread
     });
-    let wrong: Vec<_> = wrong.map(|s| format!("{s:?}")).collect();
+    let unbalanced: Vec<_> = unbalanced.map(|s| format!("{s:?}")).collect();
     let what = format!(
         "captured = delivered + dropped in {} streams, and delivered = in sets + left out",
-        all().count()
+        all.len()
     );
-    checks.equal(&what, wrong.join(", "), "");
+    checks.equal(&what, unbalanced.join(", "), "");
+
+    let mut unread: BTreeSet<_> = all.into_iter().filter(|s| s.in_sets.unread > 0).map(|s| s.id).collect();
+    let end = HostTime::now().plus(PATIENCE);
+    while !unread.is_empty() && HostTime::now() < end {
+        std::thread::sleep(Duration::from_millis(20));
+        for read in of(&daemon.status()?).iter().filter(|s| s.in_sets.unread == 0) {
+            unread.remove(&read.id);
+        }
+    }
+    checks.equal("no frame stays unread", unread, BTreeSet::new());
+    Ok(())
 }
 
 /// While it was recorded, nothing was lost but pairs that stereo had no time for.
