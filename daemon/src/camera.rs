@@ -511,7 +511,11 @@ fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, de
     };
     Ok(match &camera.config.stereo {
         Some(stereo) => {
-            let options = StereoOptions { computed: Arc::clone(&camera.computed), ..stereo.options() };
+            let options = StereoOptions {
+                computed: Arc::clone(&camera.computed),
+                sets: Arc::clone(&shared.stage.sets),
+                ..stereo.options()
+            };
             Box::new(StereoBackend::new(backend, options))
         }
         None => backend,

@@ -193,6 +193,8 @@ pub struct StereoConfig {
     pub range_m: (f64, f64),
     /// Whether disparity is published as well.
     pub disparity: bool,
+    /// Pairs that are matched, a second at most; 0: every one.
+    pub rate_hz: f64,
     /// A recording waits for the slowest mode, and nothing is skipped.
     pub every_pair: bool,
     /// The network of the mode `neural`; absolute.

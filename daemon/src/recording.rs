@@ -8,7 +8,7 @@ use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::{Frame, HostTime, StreamId, UtcPair};
 use depthrig_calib::PoseExt;
-use depthrig_drivers::stereo::StereoOptions;
+use depthrig_drivers::stereo::{COLOR, EYES, StereoOptions};
 use depthrig_recorder::{
     Diagnostic, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamAccount,
     StreamRecord, Summary, UtcSource, fs,
@@ -111,7 +111,7 @@ impl Begun {
         outside: &Outside,
     ) -> Result<Self> {
         budget::check_duration(request)?;
-        let streams: Vec<_> = streams.into_iter().filter(|s| s.stream.record).collect();
+        let (streams, others): (Vec<_>, Vec<_>) = streams.into_iter().partition(|s| s.stream.record);
         if streams.is_empty() {
             return Err(Error::new(
                 ErrorKind::WrongState,
@@ -126,11 +126,8 @@ impl Begun {
         session.started_utc_ns = utc.utc_ns;
         session.host = rustix::system::uname().nodename().to_string_lossy().into_owned();
         session.rig_config.clone_from(&config.text);
-        // Depth by stereo joins a set from the nearest pair that was matched.
-        let late = |s: &StreamFacts| StereoOptions::is_late(s.stream.id.stream.as_str());
-        let rates = streams.iter().map(|s| (late(s), s.stream.profile.rate_hz));
         session.max_spread_ns =
-            max_spread_ns(rates.map(|(late, hz)| if late { hz.min(sets_hz) } else { hz }));
+            max_spread_ns(streams.iter().map(|s| reach_hz(s, streams.iter().chain(&others))));
         session.computed = streams.iter().filter_map(|s| s.computed.clone()).collect();
         session.streams = streams.iter().map(record_of).collect();
         let mut options = options_of(&config.recording);
@@ -447,6 +444,20 @@ fn record_of(s: &StreamFacts) -> StreamRecord {
         intrinsics: p.intrinsics,
         pose: s.camera_pose.compose(&p.pose_in_device),
     }
+}
+
+/// The rate of a stream as its place in a set goes by it. Depth by stereo is of a pair of the set or of the one beside it:
+/// one and a half periods of the eyes from the tick, and a little, instead of half a one.
+fn reach_hz<'s>(of: &StreamFacts, mut streams: impl Iterator<Item = &'s StreamFacts>) -> f64 {
+    let hz = of.stream.profile.rate_hz;
+    if !StereoOptions::is_late(of.stream.id.stream.as_str()) {
+        return hz;
+    }
+    let is_source = |s: &&StreamFacts| {
+        let (id, name) = (&s.stream.id, s.stream.id.stream.as_str());
+        id.camera == of.stream.id.camera && (name == COLOR || EYES.contains(&name))
+    };
+    streams.find(is_source).map_or(hz, |s| s.stream.profile.rate_hz / 3.2)
 }
 
 /// How far apart the frames of one set may be: each lies within half of its stream's period and a millisecond of the

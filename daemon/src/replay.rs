@@ -214,13 +214,7 @@ impl Replay {
             let inner = Arc::clone(&replay.inner);
             let cdm = inner.config.cdm.clone();
             let refiners = Arc::new(Installed::new(cdm.clone()));
-            let stage = Stage::new(
-                Arc::clone(&inner.entrance),
-                refiners,
-                cdm,
-                Arc::default(),
-                inner.config.sets.rate_hz,
-            );
+            let stage = Stage::new(Arc::clone(&inner.entrance), refiners, cdm, Arc::default());
             lanes.iter().cloned().for_each(|lane| inner.entrance.enter(lane));
             *lock(&inner.lanes) = lanes;
             replay.spawn("stage", move || stage.run(&inner.stop))?;

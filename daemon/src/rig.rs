@@ -197,7 +197,7 @@ impl Rig {
         if rig.inner.config.cameras.iter().any(|c| c.refine.is_some()) {
             let (config, shared) = (&rig.inner.config, &rig.inner.shared);
             let (entrance, frames) = (Arc::clone(&shared.stage), Arc::clone(&shared.frames));
-            let stage = Stage::new(entrance, refiners, config.cdm.clone(), frames, config.sets.rate_hz);
+            let stage = Stage::new(entrance, refiners, config.cdm.clone(), frames);
             rig.spawn("stage", move |stop| stage.run(stop))?;
         }
         rig.spawn("sets", move |stop| assembly.run(stop))?;

@@ -17,7 +17,6 @@ mod crew;
 mod engines;
 mod lane;
 pub(crate) mod models;
-mod pace;
 mod pair;
 pub(crate) mod pixels;
 pub(crate) mod view;
@@ -34,10 +33,10 @@ use core::time::Duration;
 use crew::Crew;
 use depthrig_bus::{Frame, HostTime, PixelFormat, StreamName, Subscriber};
 use depthrig_drivers::StreamProfile;
+use depthrig_drivers::moments::{Pace, SetTimes};
 use lane::Pair;
-use pace::Pace;
 use pair::{Paired, Pairer};
-use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// The name of the stream of refined depth.
@@ -61,8 +60,8 @@ pub struct Entrance {
     pub bell: Arc<Wake>,
     /// Cameras that have opened, in the order in which they did.
     lanes: Mutex<Vec<Arc<Lane>>>,
-    /// The moment of the newest frame set, nanoseconds; 0 before the first.
-    tick_ns: AtomicI64,
+    /// When frame sets are made.
+    pub sets: Arc<SetTimes>,
 }
 
 impl Entrance {
@@ -70,11 +69,6 @@ impl Entrance {
     pub fn enter(&self, lane: Arc<Lane>) {
         self.lanes().push(lane);
         self.bell.raise();
-    }
-
-    /// Notes the moment of a frame set.
-    pub fn tick(&self, at: HostTime) {
-        self.tick_ns.store(at.ns(), Ordering::Relaxed);
     }
 
     fn lanes(&self) -> std::sync::MutexGuard<'_, Vec<Arc<Lane>>> {
@@ -100,7 +94,6 @@ pub struct Stage {
     config: CdmConfig,
     /// Rung after each refined frame.
     frames: Arc<Wake>,
-    sets_ns: i64,
     /// Threads of all refiners together.
     threads: usize,
     feeds: Vec<Feed>,
@@ -110,21 +103,18 @@ pub struct Stage {
 }
 
 impl Stage {
-    /// The stage behind `entrance`, of refiners out of `refiners`; `frames` is rung after each refined frame, and the
-    /// rig's sets are `sets_hz` a second.
+    /// The stage behind `entrance`, of refiners out of `refiners`; `frames` is rung after each refined frame.
     pub fn new(
         entrance: Arc<Entrance>,
         refiners: Arc<dyn Refiners>,
         config: CdmConfig,
         frames: Arc<Wake>,
-        sets_hz: f64,
     ) -> Self {
-        let sets_ns = (1e9 / sets_hz).round() as i64;
         // Asked once: it reads files.
         let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
         let threads = if config.threads == 0 { cores.saturating_sub(1) } else { config.threads };
         let (feeds, crews) = (Vec::new(), Vec::new());
-        Self { entrance, refiners, config, frames, sets_ns, threads, feeds, crews, known: 0 }
+        Self { entrance, refiners, config, frames, threads, feeds, crews, known: 0 }
     }
 
     /// Runs until `stop` is set.
@@ -164,7 +154,7 @@ impl Stage {
             let period = lane.color_ns;
             // Frames of the slower of the two streams are all there is.
             let frame_ns = lane.frame_ns.max(period);
-            let pace = Pace::new(lane.config.rate_hz, frame_ns, self.sets_ns);
+            let pace = Pace::new(lane.config.rate_hz, frame_ns);
             let pairer = Pairer::new(lane.tolerance_ns, COLOR_PERIODS * period);
             self.feeds.push(Feed { lane, color, depth, pace, pairer, crew });
         }
@@ -193,7 +183,6 @@ impl Stage {
     /// Reads what came of a camera and offers what became a pair.
     fn feed(&mut self, i: usize, now: HostTime) {
         let Feed { lane, color, depth, pace, pairer, crew } = &mut self.feeds[i];
-        let tick = Some(self.entrance.tick_ns.load(Ordering::Relaxed)).filter(|t| *t != 0);
         let Some(crew) = *crew else {
             // Read all the same: a subscriber that does not would look as if it were too slow.
             while let Ok(Some(_)) = depth.try_next() {}
@@ -210,7 +199,7 @@ impl Stage {
         };
         while let Ok(Some(frame)) = depth.try_next() {
             let stamp = frame.header().capture_time_ns;
-            if !pace.is_due(stamp, tick) {
+            if !pace.is_due(stamp, &self.entrance.sets) {
                 lane.not_due();
             } else if let Some(fate) = pairer.depth(stamp, now.ns(), frame) {
                 settle(fate);

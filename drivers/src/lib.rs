@@ -19,6 +19,7 @@ pub mod fuzzing;
 mod gate;
 pub mod kinect;
 pub mod libusb;
+pub mod moments;
 mod pace;
 pub mod realsense;
 mod sink;

@@ -6,13 +6,18 @@
 //! of, and the flag `derived`.
 //!
 //! **Threads.** One rectifies, and each mode has one of its own; the thread that captures only copies pictures. The newest
-//! pair wins: one that had to give way counts as dropped (`queue_full`) in each stream that it is missing from. With
+//! pair wins, but one of the moment of a frame set ([`StereoOptions::sets`]) waits for its turn: a mode that is slower than
+//! the camera and faster than the sets has depth in each of them. A pair that had to give way counts as dropped
+//! (`queue_full`) in each stream that it is missing from. With [`StereoOptions::rate_hz`] only so many pairs are matched at
+//! all, those of sets where the rates divide each other. With
 //! [`StereoOptions::every_pair`] nothing gives way, and the camera, which must be a recording, is read as fast as the
 //! slowest mode is done.
 //!
-//! **Accounts.** Each of these streams has captured as many frames as the left eye, and `captured = delivered + Σ dropped`
-//! holds after every frame, in the order of the pairs: what a slow mode is still to decide is not counted before.
+//! **Accounts.** Each of these streams has captured as many frames as the left eye, or as many as were to be matched, and
+//! `captured = delivered + Σ dropped` holds after every frame, in the order of the pairs: what a slow mode is still to
+//! decide is not counted before.
 
+use crate::moments::SetTimes;
 use crate::{
     Backend, Device, DeviceInfo, Error, ErrorKind, Result, Stream, StreamProfile, StreamRequest,
     choose_profiles,
@@ -26,6 +31,7 @@ use std::sync::{Arc, Mutex};
 
 mod crew;
 mod ledger;
+mod newest;
 mod stream;
 
 use crew::Crew;
@@ -116,10 +122,14 @@ pub struct StereoOptions {
     pub depth_unit_m: f64,
     /// Nearest and farthest depth, metres; outside of it there is none.
     pub range_m: (f64, f64),
+    /// Pairs that are matched, a second at most; 0: every one. Colour is rectified of all.
+    pub rate_hz: f64,
     /// Nothing gives way: for recordings alone, since a camera does not wait.
     pub every_pair: bool,
     /// Where it is told what computes each mode.
     pub computed: Descriptions,
+    /// The moments whose pairs are preferred.
+    pub sets: Arc<SetTimes>,
 }
 
 impl Default for StereoOptions {
@@ -130,8 +140,10 @@ impl Default for StereoOptions {
             disparity: false,
             depth_unit_m: 0.001,
             range_m: (0.5, 20.0),
+            rate_hz: 0.0,
             every_pair: false,
             computed: Descriptions::default(),
+            sets: Arc::default(),
         }
     }
 }
@@ -170,6 +182,9 @@ impl StereoOptions {
             return bad(format!(
                 "stereo cannot see from {near} m to {far} m; the nearest depth is above 0 and below the farthest"
             ));
+        }
+        if !(self.rate_hz >= 0.0 && self.rate_hz.is_finite()) {
+            return bad(format!("stereo cannot be made {} times a second; 0 is of every pair", self.rate_hz));
         }
         if !(1e-6..1.0).contains(&self.depth_unit_m) {
             return bad(format!("{} m is no unit of depth; most use 0.001", self.depth_unit_m));
@@ -342,7 +357,11 @@ impl Device for StereoDevice {
         let (l, r) = (&inner.profiles()[left], &inner.profiles()[right]);
         let rectifier = rectifier(&name, l, r)?;
         let pose = l.pose_in_device.compose(&rectifier.left_view_in_left());
-        let running = made(l, &options, rectifier.intrinsics(), pose)?;
+        let mut running = made(l, &options, rectifier.intrinsics(), pose)?;
+        if options.rate_hz > 0.0 {
+            let matched = running.iter_mut().filter(|p| StereoOptions::is_late(p.stream.as_str()));
+            matched.for_each(|p| p.rate_hz = p.rate_hz.min(options.rate_hz));
+        }
         let chosen = wanted
             .iter()
             .map(|p| {

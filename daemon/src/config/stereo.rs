@@ -34,6 +34,10 @@ pub(super) fn read(camera: &Section<'_, '_>, base: &Path) -> Option<StereoConfig
             s.or("max_depth_m", d.range_m.1, above_zero(FARTHEST_M)),
         ),
         disparity: s.or("disparity", d.disparity, |_| Ok(())),
+        rate_hz: s.or("rate_hz", d.rate_hz, |hz| match hz {
+            hz if (0.0..=1000.0).contains(hz) => Ok(()),
+            _ => Err("is outside of 0 to 1000; 0 is every pair".to_owned()),
+        }),
         every_pair: s.or("every_pair", d.every_pair, |_| Ok(())),
         network: network.map(|p| resolve(base, &p)),
         library: None,
@@ -118,6 +122,7 @@ impl StereoConfig {
             modes: self.modes.iter().map(mode).collect(),
             disparity: self.disparity,
             range_m: self.range_m,
+            rate_hz: self.rate_hz,
             every_pair: self.every_pair,
             ..StereoOptions::default()
         }
@@ -151,6 +156,7 @@ impl Default for StereoConfig {
             threads: 1,
             range_m: StereoOptions::default().range_m,
             disparity: false,
+            rate_hz: 0.0,
             every_pair: false,
             network: None,
             library: None,

@@ -360,6 +360,7 @@ fn a_recording_of_a_zed_and_its_stereo_are_set_as_the_file_says() {
         min_depth_m = 0.3
         max_depth_m = 8
         disparity = true
+        rate_hz = 2.5
         every_pair = true
         network = "net.onnx"
         [camera.refine]
@@ -390,6 +391,7 @@ fn a_recording_of_a_zed_and_its_stereo_are_set_as_the_file_says() {
         threads: 2,
         range_m: (0.3, 8.0),
         disparity: true,
+        rate_hz: 2.5,
         every_pair: true,
         network: Some("/rigs/net.onnx".into()),
         library: Some("/rigs/libonnxruntime.so".into()),

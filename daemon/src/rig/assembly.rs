@@ -118,8 +118,7 @@ impl Assembly {
         }
         let sets = &self.inner.config.sets;
         let periods: Vec<i64> = self.inputs.iter().map(|i| i.stream.profile.period_ns() as i64).collect();
-        let period_ns = (1e9 / sets.rate_hz).round() as i64;
-        let mut config = AssemblerConfig::new(period_ns, periods);
+        let mut config = AssemblerConfig::new(self.period_ns(), periods);
         config.max_pending = MAX_PENDING;
         if let Some(ms) = sets.max_wait_ms {
             config.max_wait_ns = (ms * 1e6) as i64;
@@ -129,6 +128,11 @@ impl Assembly {
             Phase::Fixed => PhasePolicy::Fixed,
         };
         self.assembler = Some(Assembler::new(config));
+    }
+
+    /// From one set to the next.
+    fn period_ns(&self) -> i64 {
+        (1e9 / self.inner.config.sets.rate_hz).round() as i64
     }
 
     fn read_frames(&mut self) {
@@ -186,7 +190,7 @@ impl Assembly {
             tracing::error!(set = id, error = %e, "a frame set could not be sent");
         }
         self.inner.spreads().add(set.spread_ns);
-        self.inner.shared.stage.tick(set.tick);
+        self.inner.shared.stage.sets.note(set.tick, self.period_ns());
         let frames =
             self.inputs.iter().zip(set.members).map(|(i, m)| (Arc::clone(&i.stream), m.map(|m| m.item)));
         let closing = self.inner.closing.load(Ordering::Relaxed);

@@ -1,7 +1,8 @@
 //! Refined depth, and depth by stereo, in recordings: frames that are made of others join the set that their source is in.
 //!
 //! Stereo: a frame of a pair joins the set that the pair's rectified colour (or the left eye, or the right one) is in; when
-//! that pair was skipped, the nearest that was not. The rest is as for refined depth, of which this speaks:
+//! that pair was skipped, the one beside it if that was not. Stereo prefers the pairs of sets. The rest is as for refined
+//! depth, of which this speaks:
 //!
 //! A refined frame is later than its set by what refining takes. The set goes out on the channel of sets without waiting.
 //! On its way to the recorder it waits until the refined frame of each camera that records one is there or is known not
@@ -26,7 +27,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 /// How long the end of a recording waits for sets that wait; longer than any set does.
-pub const PATIENCE: Duration = Duration::from_secs(2);
+pub const PATIENCE: Duration = Duration::from_secs(4);
 /// Frames of one stream that a subscriber may hold, less one to read with.
 const MAX_HELD: usize = 15;
 /// Frames that the assembler holds.
@@ -90,7 +91,6 @@ pub struct Joints {
     held: VecDeque<Held>,
     max_sets: usize,
     max_age: Duration,
-    set_ns: i64,
 }
 
 impl Joints {
@@ -103,13 +103,7 @@ impl Joints {
         let taken = ASSEMBLING + config.recording.queue_sets + workers;
         let max_sets = MAX_HELD.saturating_sub(taken).clamp(1, MAX_SETS);
         let max_age = Duration::from_secs_f64(max_sets as f64 / config.sets.rate_hz).min(PATIENCE / 2);
-        Self {
-            streams: Vec::new(),
-            held: VecDeque::new(),
-            max_sets,
-            max_age,
-            set_ns: (1e9 / config.sets.rate_hz) as i64,
-        }
+        Self { streams: Vec::new(), held: VecDeque::new(), max_sets, max_age }
     }
 
     /// Takes in the streams that `camera` makes, once they are there.
@@ -125,9 +119,11 @@ impl Joints {
                 continue;
             };
             let Some(subscriber) = stream.books().reader.take() else { continue };
-            let period_ns = stream.profile.period_ns() as i64;
+            // Depth of a pair is that pair's or of the one beside it; refined depth may have a rate of its own.
+            let pairs = state.streams.iter().find(|s| s.id == *depth);
+            let period_ns = pairs.filter(|_| of_pair).unwrap_or(stream).profile.period_ns() as i64;
             self.streams.push(Joint {
-                near_ns: near_ns(if of_pair { period_ns.max(self.set_ns) } else { period_ns }),
+                near_ns: if of_pair { period_ns + period_ns / 10 } else { near_ns(period_ns) },
                 of_pair,
                 stream: Arc::clone(stream),
                 camera: Arc::clone(camera),

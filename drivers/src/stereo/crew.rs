@@ -1,16 +1,18 @@
 //! The threads of stereo: one rectifies, one per mode matches. Pairs go in, what was made of them comes out.
 //!
-//! Each thread has a box for one pair; a newer pair takes the place of one that still lies there. Everything that pictures
-//! are in is made once and goes round.
+//! Each thread has a box for one pair; a newer pair takes the place of one that still lies there, unless that is of the
+//! moment of a frame set. Everything that pictures are in is made once and goes round.
 
+use super::newest::{ForSet, Newest};
 use super::{Descriptions, Geometry, StereoMode, StereoOptions, has_color};
+use crate::moments::Due;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::PixelFormat;
 use depthrig_calib::stereo::{DisparityMap, Gray, Matcher, StereoPair, depth_from_disparity};
 use depthrig_calib::{EyeOrder, Rectifier, View, eye_order};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::{Arc, PoisonError};
 
 /// What the threads are given below those that capture and those that somebody waits for.
 const NICE: i32 = 10;
@@ -25,6 +27,10 @@ const PRODUCTS: usize = 2;
 #[derive(Debug, Default)]
 pub(super) struct Raw {
     pub(super) ticket: u64,
+    /// The frame set that it is for.
+    pub(super) due: Option<Due>,
+    /// Whether it is to be matched, and not merely rectified.
+    pub(super) matched: bool,
     pub(super) left: Vec<u8>,
     pub(super) right: Vec<u8>,
 }
@@ -33,12 +39,25 @@ pub(super) struct Raw {
 #[derive(Debug, Default)]
 pub(super) struct Views {
     pub(super) ticket: u64,
+    due: Option<Due>,
     left: Vec<u8>,
     right: Vec<u8>,
     /// Empty where the eyes have no colour.
     pub(super) left_rgb: Vec<u8>,
     /// Filled when a mode wants colour.
     right_rgb: Vec<u8>,
+}
+
+impl ForSet for Raw {
+    fn due(&self) -> Option<&Due> {
+        self.due.as_ref()
+    }
+}
+
+impl ForSet for Views {
+    fn due(&self) -> Option<&Due> {
+        self.due.as_ref()
+    }
 }
 
 /// What a mode made of a pair.
@@ -56,63 +75,12 @@ pub(super) enum Event {
     Rectified(Arc<Views>),
     /// Mode number .0 has matched a pair.
     Matched(usize, Product),
-    /// Mode number .0 gave the pair .1 up for a newer one.
+    /// Mode number .0 gave the pair .1 up for another one.
     Skipped(usize, u64),
     /// Mode number .0 failed at the pair .1.
     Failed(usize, u64, String),
     /// The eyes are exchanged.
     Swapped,
-}
-
-/// A box for the newest of what comes.
-struct Newest<T> {
-    slot: Mutex<Slot<T>>,
-    changed: Condvar,
-    /// Wait until there is room, and replace nothing.
-    keeps_all: bool,
-}
-
-struct Slot<T> {
-    item: Option<T>,
-    closed: bool,
-}
-
-impl<T> Newest<T> {
-    fn new(keeps_all: bool) -> Arc<Self> {
-        let slot = Mutex::new(Slot { item: None, closed: false });
-        Arc::new(Self { slot, changed: Condvar::new(), keeps_all })
-    }
-
-    /// Puts `item` in and returns what it took the place of.
-    fn put(&self, item: T) -> Option<T> {
-        let mut slot = self.slot.lock().unwrap_or_else(PoisonError::into_inner);
-        while self.keeps_all && slot.item.is_some() && !slot.closed {
-            slot = self.changed.wait(slot).unwrap_or_else(PoisonError::into_inner);
-        }
-        let old = slot.item.replace(item);
-        self.changed.notify_all();
-        old
-    }
-
-    /// Waits for an item; `None` when the box was closed.
-    fn take(&self) -> Option<T> {
-        let mut slot = self.slot.lock().unwrap_or_else(PoisonError::into_inner);
-        loop {
-            if slot.closed {
-                return None;
-            }
-            if let Some(item) = slot.item.take() {
-                self.changed.notify_all();
-                return Some(item);
-            }
-            slot = self.changed.wait(slot).unwrap_or_else(PoisonError::into_inner);
-        }
-    }
-
-    fn close(&self) {
-        self.slot.lock().unwrap_or_else(PoisonError::into_inner).closed = true;
-        self.changed.notify_all();
-    }
 }
 
 /// The threads of one camera. Dropping it ends them when they are done with what they work on; it does not wait.
@@ -194,7 +162,7 @@ impl Crew {
         self.spared.try_recv().ok().or_else(|| self.spare.pop()).unwrap_or_default()
     }
 
-    /// Hands a pair on. The ticket of one that gave way to it.
+    /// Hands a pair on. The ticket of the one that gave way: an older one, or this.
     pub(super) fn offer(&mut self, raw: Raw) -> Option<u64> {
         let old = self.raw.put(raw)?;
         let ticket = old.ticket;
@@ -279,9 +247,10 @@ impl Rectify {
             if self.look(&views) && self.events.send(Event::Swapped).is_err() {
                 return;
             }
+            let matched = raw.matched;
             // When the camera is given up, nobody takes it any more.
             let _ = self.spare.try_send(raw);
-            for (i, output) in self.outputs.iter().enumerate() {
+            for (i, output) in self.outputs.iter().enumerate().filter(|_| matched) {
                 if let Some(old) = output.put(Arc::clone(&views))
                     && self.events.send(Event::Skipped(i, old.ticket)).is_err()
                 {
@@ -319,7 +288,7 @@ impl Rectify {
             if self.pool.len() < self.most {
                 return Some(Arc::default());
             }
-            if self.input.slot.lock().unwrap_or_else(PoisonError::into_inner).closed {
+            if self.input.is_closed() {
                 return None;
             }
             std::thread::sleep(Duration::from_millis(1));
@@ -330,7 +299,7 @@ impl Rectify {
         let (width, height) = self.rectifier.size();
         let pixels = width as usize * height as usize;
         let (r, color) = (&self.rectifier, has_color(self.format));
-        views.ticket = raw.ticket;
+        (views.ticket, views.due) = (raw.ticket, raw.due);
         views.left.resize(pixels, 0);
         views.right.resize(pixels, 0);
         views.left_rgb.resize(if color { 3 * pixels } else { 0 }, 0);

@@ -4,9 +4,11 @@ use super::crew::{Crew, Event, Product, Raw, Views};
 use super::ledger::{Ledger, Step};
 use super::{COLOR, PREFIXES, StereoOptions};
 use crate::clock::ClockQuality;
+use crate::moments::{Due, Pace, SetTimes};
 use crate::{Error, ErrorKind, FrameMeta, FrameSink, Poll, Result, Stream, StreamProfile};
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime};
+use std::sync::Arc;
 
 /// How often the threads' results are looked for while the camera is waited for.
 const SLICE: Duration = Duration::from_millis(2);
@@ -46,8 +48,14 @@ struct Pairing {
     /// The pair that is being gathered, and of which eyes there is a picture.
     raw: Raw,
     have: [Option<FrameMeta>; 2],
+    /// From one pair to the next.
+    frame_ns: i64,
     /// How far apart both eyes' pictures may be.
     near_ns: i64,
+    /// Moments whose pairs are preferred.
+    sets: Arc<SetTimes>,
+    /// Which pairs are matched.
+    pace: Pace,
     ticket: u64,
     /// `color`, then the modes.
     groups: Vec<Group>,
@@ -74,7 +82,7 @@ impl StereoStream {
         for mode in &options.modes {
             groups.push(group(PREFIXES.map(|prefix| outlet(&format!("{prefix}{}", mode.name)))));
         }
-        let near_ns = inner.profiles().get(eyes[0]).map_or(0, |p| p.period_ns() as i64 / 4);
+        let frame_ns = inner.profiles().get(eyes[0]).map_or(0, |p| p.period_ns() as i64);
         let raw = crew.blank();
         let lent: Vec<_> = own.iter().map(|_| Vec::new()).collect();
         let pairing = Pairing {
@@ -84,7 +92,10 @@ impl StereoStream {
             lent,
             raw,
             have: [None; 2],
-            near_ns,
+            frame_ns,
+            near_ns: frame_ns / 4,
+            sets: Arc::clone(&options.sets),
+            pace: Pace::new(options.rate_hz, frame_ns),
             ticket: 0,
             groups,
             crew,
@@ -183,7 +194,15 @@ impl Pairing {
         let blank = self.crew.blank();
         let mut raw = core::mem::replace(&mut self.raw, blank);
         raw.ticket = self.ticket;
-        for group in &mut self.groups {
+        let at = meta.capture_time;
+        raw.matched = self.pace.is_due(at.ns(), &self.sets);
+        raw.due = self.sets.due(at, self.frame_ns);
+        if let Some(period_ns) = self.pace.period_ns() {
+            raw.due = raw.due.filter(|_| raw.matched).or(raw.matched.then(|| Due::alone(at, period_ns)));
+        }
+        // Pairs that are not to be matched are pictures of colour alone.
+        let groups = if raw.matched { self.groups.len() } else { 1 };
+        for group in self.groups.iter_mut().take(groups) {
             group.ledger.begin(self.ticket, *meta);
         }
         if let Some(old) = self.crew.offer(raw) {
@@ -193,9 +212,10 @@ impl Pairing {
         }
     }
 
-    /// Pairs of which the left eye gives nothing.
+    /// Pairs of which the left eye gives nothing. Where not all are matched, the next one is instead of one of these.
     fn lose(&mut self, reason: DropReason, n: u64, sink: &mut dyn FrameSink) {
-        for group in &mut self.groups {
+        let groups = if self.pace.period_ns().is_none() { self.groups.len() } else { 1 };
+        for group in self.groups.iter_mut().take(groups) {
             let streams = group.streams;
             group.ledger.lose(reason, n, &mut |step| announce(streams, step, sink));
         }

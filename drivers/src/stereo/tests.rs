@@ -9,6 +9,8 @@ use depthrig_calib::stereo::{Description, DisparityMap, StereoPair};
 use std::sync::Mutex;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 
+mod choice;
+
 const W: u32 = 160;
 const H: u32 = 96;
 /// Pixels, metres: 20 pixels of disparity are 1.2 m.

@@ -240,8 +240,16 @@ fn contents(
     let (mut found, mut compared) = (BTreeMap::<String, u64>::new(), Compared::default());
     let (mut stamped, mut eyes) = (Tally::default(), Tally::default());
     let (mut played, shown) = (Tally::default(), Shown::new(fixture));
+    let mut beside: Vec<f64> = Vec::new();
     for set in dataset.sets_with(SetRange::ALL, PixelMode::DecodedAndStored) {
         let set = set?;
+        let captured = |name: &str| {
+            let frame = set.frames.iter().find(|f| session.streams[f.stream].id.to_string() == name);
+            frame.map(|f| f.header.capture_time_ns)
+        };
+        if let (Some(eye), Some(depth)) = (captured("zed2i/left"), captured("zed2i/depth_performance")) {
+            beside.push((eye - depth).abs() as f64 / 1e6);
+        }
         for frame in &set.frames {
             let stream = &session.streams[frame.stream].id;
             *found.entry(stream.to_string()).or_default() += 1;
@@ -274,6 +282,10 @@ fn contents(
         session.streams.iter().map(|s| s.id.to_string()).filter(|id| !found.contains_key(id)).collect();
     checks.equal("and some of every stream", none.join(", "), "");
     checks.note(found.iter().map(|(id, n)| format!("{id} {n}")).collect::<Vec<_>>().join(", "));
+    // Stereo is slower than the camera here, and faster than the sets.
+    checks.that("most sets have depth by stereo", beside.len() as u64 > SECONDS / 2, beside.len());
+    let near = beside.iter().all(|ms| *ms < 1100.0 / 15.0);
+    checks.that("of the set's own pair, or of the one beside it", near, format!("{beside:?} ms apart"));
     compared.check(checks, "frames of D405, D415, D435 and D455 are those that were sent, byte by byte");
     stamped.check(checks, "frames of the L515 have their stamps");
     eyes.check(checks, "both eyes of the ZED are those that were sent, byte by byte");
