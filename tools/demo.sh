@@ -26,7 +26,7 @@ cargo build --release --package depthrig --package depthrig-demo-recordings --pa
 # The camera of another process: depthrig's bridge for OAK where Luxonis' library is installed, else a test pattern.
 oak=(env "PYTHONPATH=$PWD/python/src" "$PWD/.venv-oak/bin/python")
 if [ -x "${oak[-1]}" ] && "${oak[@]}" -c 'import depthai, depthrig.oak' >/dev/null 2>&1; then
-    command=("${oak[@]}" -m depthrig.oak --replay oak --fps 5)
+    command=("${oak[@]}" -m depthrig.oak --replay oak --fps 15)
 else
     command=("$target/release/examples/external" --size 640x360 --rate 15)
     say "oak: a test pattern, because .venv-oak is not there (make .venv-oak/.stamp)"

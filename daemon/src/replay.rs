@@ -45,7 +45,7 @@ use depthrig_bus::{
     Bus, ClockDomain, HostTime, MetadataLevel, RigName, RuntimeDir, SUBSCRIBER_BUFFER, UtcPair, shm,
 };
 use depthrig_drivers::StreamProfile;
-use depthrig_recorder::StreamRecord;
+use depthrig_recorder::{Computed, StreamRecord};
 use player::Player;
 use source::{Moment, Sources};
 use std::path::PathBuf;
@@ -135,6 +135,8 @@ struct Inner {
     stop_asked: AtomicBool,
     done: AtomicBool,
     records: Vec<StreamRecord>,
+    /// What computed some of them.
+    computed: Vec<Computed>,
     streams: Vec<Arc<Stream>>,
     /// Where depth is refined, and whose.
     entrance: Arc<Entrance>,
@@ -351,6 +353,7 @@ impl Inner {
             stop_asked: AtomicBool::new(false),
             done: AtomicBool::new(false),
             records: sources.streams().to_vec(),
+            computed: sources.computed(),
             streams: sources.streams().iter().map(stream).collect(),
             entrance: Arc::default(),
             lanes: Mutex::default(),

@@ -13,6 +13,7 @@ use depthrig_recorder::{
 };
 use depthrig_tests::Home;
 use depthrig_tests::made::{Made, SECOND};
+use std::fmt::Write;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
@@ -299,6 +300,26 @@ fn a_recorded_replay_is_the_dataset_that_was_replayed() {
         assert_eq!(b.session().rig_config, a.session().rig_config);
         assert_eq!(b.session().started_utc_ns, a.session().started_utc_ns, "the time is the original's");
     }
+}
+
+#[test]
+fn a_recorded_replay_says_what_computed_its_streams() {
+    let home = Home::default();
+    let path = made(&home, "computed", &Made::default());
+    let session = path.join("session.toml");
+    let mut text = std::fs::read_to_string(&session).unwrap();
+    let id = Dataset::open(&path).unwrap().session().streams[1].id.to_string();
+    write!(
+        text,
+        "\n[[computed]]\nstream = \"{id}\"\nname = \"mimic_quality\"\nproducer = \"a matcher 1.0\"\n\
+         parameters = \"paths=8\"\nfrom = [\"left/color\"]\n"
+    )
+    .unwrap();
+    std::fs::write(&session, text).unwrap();
+    let was = Dataset::open(&path).unwrap().session().computed.clone();
+    assert_eq!(was.len(), 1);
+    let again = record_again(&home, path, "again", FAST);
+    assert_eq!(Dataset::open(&again).unwrap().session().computed, was);
 }
 
 #[test]

@@ -150,7 +150,7 @@ impl Inner {
                 serial: record.serial.clone(),
                 calibration: record.calibration.clone(),
                 camera_pose: Pose::IDENTITY,
-                computed: None,
+                computed: self.computed.iter().find(|c| c.stream == record.id).cloned(),
             };
         self.records.iter().zip(&self.streams).map(facts).collect()
     }

@@ -4,7 +4,8 @@ use super::timeline::{Part, Timeline};
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{HostTime, PixelFormat, RigName};
 use depthrig_recorder::{
-    ColorCodec, Dataset, DatasetFrame, DatasetSet, DepthCodec, PixelMode, Session, SetReader, StreamRecord,
+    ColorCodec, Computed, Dataset, DatasetFrame, DatasetSet, DepthCodec, PixelMode, Session, SetReader,
+    StreamRecord,
 };
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -105,6 +106,11 @@ impl Sources {
     /// The streams of all of them.
     pub fn streams(&self) -> &[StreamRecord] {
         &self.streams
+    }
+
+    /// What computed those streams that no camera gave.
+    pub fn computed(&self) -> Vec<Computed> {
+        self.list.iter().flat_map(|s| &s.dataset.session().computed).cloned().collect()
     }
 
     /// The session of the first one.

@@ -16,10 +16,10 @@ use std::process::ExitCode;
 
 /// The rig of the demo, which names the files beside it.
 const RIG: &str = include_str!("../rig.toml");
-/// Pictures a second of the Kinect, as many as the sets have.
-const KINECT_HZ: u32 = 5;
+/// Pictures a second of the Kinect, as a Kinect can.
+const KINECT_HZ: u32 = 15;
 /// Captures of the Kinect's recording, 1.6 MB each; it plays without end.
-const KINECT_CAPTURES: u32 = 24;
+const KINECT_CAPTURES: u32 = 36;
 /// Different pictures in it, which come again and again.
 const KINECT_SHOTS: usize = 12;
 
