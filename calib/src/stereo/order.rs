@@ -49,6 +49,7 @@ impl OrderCheck {
             resolution: Resolution::Full,
             // Only what is found counts here, and both views must say the same.
             left_right_px: 1,
+            rematch: false,
             gap_px: 0,
             ..Parameters::preset(Preset::Quality, disparities)
         };

@@ -96,12 +96,14 @@ pub struct Parameters {
     pub uniqueness_percent: u8,
     /// Largest difference between the left and the right view's disparity, in pixels.
     pub left_right_px: u8,
+    /// Where the views disagree, a pixel that some pixel of the right view has as its match takes that disparity.
+    pub rematch: bool,
     /// Regions of at most this many pixels that differ from what surrounds them are removed; 0 keeps all.
     pub speckle_px: u32,
     /// Step of disparity, in pixels, at which a region ends.
     pub speckle_step_px: f32,
-    /// Median of 3x3 over what is valid.
-    pub median: bool,
+    /// How many times a median of 3x3 over what is valid is taken.
+    pub median_rounds: u8,
     /// Gaps of at most this many pixels in a row or a column are filled when both ends are of one surface; 0 fills none.
     pub gap_px: u32,
     /// By how many pixels of disparity the ends of such a gap may differ.
@@ -119,17 +121,18 @@ impl Parameters {
                 Preset::Quality => Resolution::Full,
                 Preset::Ultra => Resolution::Both,
             },
-            p1: 6,
+            p1: 9,
             p2: 50,
             p2_least: 15,
             p2_slack: 4,
             uniqueness_percent: 0,
             left_right_px: 2,
+            rematch: true,
             speckle_px: 100,
             speckle_step_px: 1.0,
-            median: true,
-            gap_px: 16,
-            gap_step_px: 2.0,
+            median_rounds: 3,
+            gap_px: 32,
+            gap_step_px: 4.0,
         }
     }
 
@@ -137,12 +140,12 @@ impl Parameters {
     pub fn describe(&self) -> String {
         let Self { preset, max_disparity, resolution, p1, p2, p2_least, p2_slack, .. } = self;
         let Self { uniqueness_percent, left_right_px, speckle_px, speckle_step_px, .. } = self;
-        let Self { median, gap_px, gap_step_px, .. } = self;
+        let Self { rematch, median_rounds, gap_px, gap_step_px, .. } = self;
         format!(
             "preset={preset} max_disparity={max_disparity} resolution={resolution} p1={p1} p2={p2} \
              p2_least={p2_least} p2_slack={p2_slack} uniqueness_percent={uniqueness_percent} \
-             left_right_px={left_right_px} speckle_px={speckle_px} speckle_step_px={speckle_step_px} median={median} \
-             gap_px={gap_px} gap_step_px={gap_step_px}"
+             left_right_px={left_right_px} rematch={rematch} speckle_px={speckle_px} \
+             speckle_step_px={speckle_step_px} median_rounds={median_rounds} gap_px={gap_px} gap_step_px={gap_step_px}"
         )
     }
 

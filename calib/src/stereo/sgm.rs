@@ -81,7 +81,11 @@ impl Engine {
             let all = out.chunks_exact_mut(width).zip(sure.chunks_exact_mut(width));
             for (y, (out, sure)) in all.enumerate() {
                 let of = i * rows + y * width..i * rows + (y + 1) * width;
-                choose::choose(&winners[of.clone()], &mirrored[of], parameters, last, out, sure);
+                let (winners, mirrored) = (&winners[of.clone()], &mirrored[of]);
+                choose::choose(winners, mirrored, parameters, last, out, sure);
+                if parameters.rematch {
+                    choose::rematch(winners, mirrored, parameters.left_right_px, out, sure);
+                }
             }
         };
         match pool {
@@ -90,9 +94,11 @@ impl Engine {
             }),
             None => part((0, (map.as_mut_slice(), &mut *confidence))),
         }
-        if parameters.median {
-            filter::median(width, map, other);
-            core::mem::swap(map, other);
+        if parameters.median_rounds > 0 {
+            for _ in 0..parameters.median_rounds {
+                filter::median(width, map, other);
+                core::mem::swap(map, other);
+            }
             // Those that it filled.
             for (sure, d) in confidence.iter_mut().zip(map.iter()) {
                 *sure = (*sure).max(u8::from(*d != NONE));
@@ -115,6 +121,8 @@ impl Engine {
 #[derive(Debug)]
 struct Half {
     engine: Engine,
+    /// With the lengths and steps of gaps in its own pixels.
+    parameters: Parameters,
     pictures: [Vec<u8>; 2],
     confidence: Vec<u8>,
     /// At full resolution again.
@@ -126,8 +134,14 @@ impl Half {
     fn new(form: Form, (width, height): (usize, usize), parameters: &Parameters, threads: usize) -> Self {
         let size = (width.div_ceil(2), height.div_ceil(2));
         let pixels = size.0 * size.1;
+        let parameters = Parameters {
+            gap_px: parameters.gap_px / 2,
+            gap_step_px: parameters.gap_step_px / 2.0,
+            ..parameters.clone()
+        };
         Self {
-            engine: Engine::new(form, size, parameters.max_disparity.div_ceil(2), parameters, threads),
+            engine: Engine::new(form, size, parameters.max_disparity.div_ceil(2), &parameters, threads),
+            parameters,
             pictures: [vec![0; pixels], vec![0; pixels]],
             confidence: vec![0; pixels],
             map: vec![NONE; width * height],
@@ -139,12 +153,13 @@ impl Half {
         self.engine.bytes() + 3 * self.confidence.len() + 3 * self.map.len()
     }
 
-    fn run(&mut self, pair: &StereoPair<'_>, parameters: &Parameters, pool: Option<&rayon::ThreadPool>) {
+    fn run(&mut self, pair: &StereoPair<'_>, pool: Option<&rayon::ThreadPool>) {
         let (w, h) = self.engine.size;
         filter::halve(&pair.left, &mut self.pictures[0]);
         filter::halve(&pair.right, &mut self.pictures[1]);
         let [left, right] = self.pictures.each_ref().map(|p| Gray::packed(p, w, h));
-        let map = self.engine.run(&StereoPair::new(left, right), parameters, pool, &mut self.confidence);
+        let Self { engine, parameters, confidence, .. } = self;
+        let map = engine.run(&StereoPair::new(left, right), parameters, pool, confidence);
         let full = (pair.left.width, pair.left.height);
         filter::double((w, h), (map, &self.confidence), full, &mut self.map, &mut self.sure);
     }
@@ -236,12 +251,12 @@ impl Matcher for SgmMatcher {
         let map = match (&mut self.full, &mut self.half) {
             (Some(full), None) => full.run(pair, parameters, pool, &mut out.confidence),
             (None, Some(half)) => {
-                half.run(pair, parameters, pool);
+                half.run(pair, pool);
                 out.confidence.copy_from_slice(&half.sure);
                 &mut half.map
             }
             (Some(full), Some(half)) => {
-                half.run(pair, parameters, pool);
+                half.run(pair, pool);
                 let map = full.run(pair, parameters, pool, &mut out.confidence);
                 filter::fill_from((map, &mut out.confidence), (&half.map, &half.sure));
                 map

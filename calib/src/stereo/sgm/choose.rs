@@ -36,6 +36,27 @@ pub fn choose(
     }
 }
 
+/// Gives disparities to pixels that [`choose`] left without one because the views disagree: that of the right view's pixel
+/// which has the pixel as its match, the nearest of several, and with the least confidence. What the right eye does not see
+/// has none there (Hirschmueller 2008, section 2.6, tells mismatches from occlusions by this). A pixel whose own winner is the
+/// same was refused for another reason and stays without.
+pub fn rematch(
+    winners: &[Winner],
+    mirrored: &[u8],
+    left_right_px: u8,
+    out: &mut [u16],
+    confidence: &mut [u8],
+) {
+    // From the left: of several pixels with one match the first has the largest disparity.
+    for (x, d) in mirrored.iter().enumerate() {
+        let to = x + usize::from(*d);
+        let (Some(w), Some(out)) = (winners.get(to), out.get_mut(to)) else { continue };
+        if *out == NONE && w.disparity.abs_diff(*d) > left_right_px {
+            (*out, confidence[to]) = (u16::from(*d) * ONE, 1);
+        }
+    }
+}
+
 /// Where two lines of equal and opposite slope through the three costs meet, in 256ths of a pixel from the middle one
 /// (the equiangular fit, Shimizu and Okutomi 2005); 0 at both ends of the search.
 fn fraction(w: Winner, last: u8) -> i32 {

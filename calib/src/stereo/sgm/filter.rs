@@ -44,14 +44,19 @@ fn sorted(a: u16, b: u16, c: u16) -> [u16; 3] {
 /// neighbours or more that have one gets the fifth of them, counted from the nearest: the surface behind rather than the
 /// one before it. The outermost pixels stay.
 pub fn median(width: usize, from: &[u16], to: &mut [u16]) {
-    to.copy_from_slice(from);
     let height = from.len() / width;
-    if width < 3 {
+    if width < 3 || height < 3 {
+        to.copy_from_slice(from);
         return;
     }
-    for y in 1..height.max(2) - 1 {
-        let row = |y: usize| &from[y * width..][..width];
-        median_row(row(y - 1), row(y), row(y + 1), &mut to[y * width + 1..][..width - 2]);
+    let row = |y: usize| &from[y * width..][..width];
+    for (y, to) in to.chunks_exact_mut(width).enumerate() {
+        if y == 0 || y == height - 1 {
+            to.copy_from_slice(row(y));
+            continue;
+        }
+        (to[0], to[width - 1]) = (row(y)[0], row(y)[width - 1]);
+        median_row(row(y - 1), row(y), row(y + 1), &mut to[1..width - 1]);
     }
 }
 

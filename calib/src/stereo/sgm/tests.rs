@@ -281,6 +281,63 @@ fn views_that_disagree_give_nothing() {
     assert!(!valid(&parameters, 3));
 }
 
+#[test]
+fn what_the_right_view_matches_is_taken_where_the_views_disagree() {
+    // All pixels of the left view say 9; what the right view says follows.
+    let winner = Winner { disparity: 9, cost: 10, before: 30, after: 30, second: 20 };
+    let rematched = |mirrored: [u8; 6], uniqueness: u8| {
+        let mut parameters = Parameters::preset(Preset::Quality, 64);
+        parameters.uniqueness_percent = uniqueness;
+        let (mut out, mut sure) = ([0; 6], [0; 6]);
+        choose::choose(&[winner; 6], &mirrored, &parameters, 63, &mut out, &mut sure);
+        choose::rematch(&[winner; 6], &mirrored, 2, &mut out, &mut sure);
+        (out.map(|d| if d == NONE { None } else { Some(d / ONE) }), sure)
+    };
+    // Nobody reaches left of column 9, so all disagree. Pixel 0 claims 3 and pixel 1 claims 4 for columns 3 and 5, pixel 2
+    // claims 1 for column 3 too: the nearer stays. What is claimed beyond the picture is nobody's.
+    let (found, sure) = rematched([3, 4, 1, 60, 200, 255], 0);
+    assert_eq!(found, [None, None, None, Some(3), None, Some(4)]);
+    assert_eq!(sure, [0, 0, 0, 1, 0, 1]);
+
+    // The same disparity, but refused since it is not unique: stays refused. 3 more or less counts as another.
+    let winner = Winner { disparity: 1, cost: 10, before: 30, after: 30, second: 10 };
+    let mut parameters = Parameters::preset(Preset::Quality, 64);
+    parameters.uniqueness_percent = 50;
+    for (claimed, taken) in [(1, false), (3, false), (4, true)] {
+        let (mut out, mut sure) = ([0; 8], [0; 8]);
+        let mut mirrored = [1; 8];
+        mirrored[2] = claimed;
+        choose::choose(&[winner; 8], &mirrored, &parameters, 63, &mut out, &mut sure);
+        assert!(out.iter().all(|d| *d == NONE));
+        choose::rematch(&[winner; 8], &mirrored, 2, &mut out, &mut sure);
+        let found: Vec<usize> = (0..8).filter(|x| out[*x] != NONE).collect();
+        assert_eq!(found, if taken { vec![2 + usize::from(claimed)] } else { vec![] }, "{claimed}");
+    }
+}
+
+#[test]
+fn the_median_is_taken_as_often_as_is_said() {
+    let size = (90, 30);
+    let with = |rounds: u8| {
+        let mut parameters = Parameters::preset(Preset::Quality, 48);
+        (parameters.speckle_px, parameters.gap_px, parameters.median_rounds) = (0, 0, rounds);
+        matched(&parameters, size, 1, Form::best())
+    };
+    let units = |map: &DisparityMap| -> Vec<u16> {
+        let unit = |d: &f32| if d.is_nan() { NONE } else { (d * f32::from(ONE)) as u16 };
+        map.disparity.iter().map(unit).collect()
+    };
+    let mut want = units(&with(0));
+    for rounds in 1..4 {
+        let before = want.clone();
+        filter::median(size.0, &before, &mut want);
+        assert_ne!(before, want);
+        let got = with(rounds);
+        assert_eq!(units(&got), want, "{rounds}");
+        assert!(got.disparity.iter().zip(&got.confidence).all(|(d, c)| d.is_nan() == (*c == 0)));
+    }
+}
+
 /// Bits, since NaN is not equal to itself.
 fn bits(map: &DisparityMap) -> (Vec<u32>, Vec<u8>) {
     (map.disparity.iter().map(|d| d.to_bits()).collect(), map.confidence.clone())
