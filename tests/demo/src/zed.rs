@@ -69,9 +69,10 @@ pub fn write(folder: &Path) -> Result<()> {
     std::fs::create_dir_all(folder)?;
     std::fs::write(folder.join(format!("SN{SERIAL}.conf")), conf()?)?;
     let [left, right] = shoot()?;
-    let warps = lenses().map(|k| Warp::new(&k, &left.view));
-    let [to_left, to_right] = warps.map(|w| w.context("a lens that forms no picture"));
-    let (to_left, to_right) = (to_left?, to_right?);
+    let [left_lens, right_lens] = lenses();
+    // Each simulated camera has its own optical centre, as each real one has.
+    let to_left = Warp::new(&left_lens, &left.view).context("a lens that forms no picture")?;
+    let to_right = Warp::new(&right_lens, &right.view).context("a lens that forms no picture")?;
     for (i, (l, r)) in left.pictures.iter().zip(&right.pictures).enumerate() {
         let mut both = RgbImage::new(2 * SIZE.0, SIZE.1);
         image::imageops::replace(&mut both, &to_left.bend(l), 0, 0);
@@ -116,9 +117,12 @@ pub fn shoot() -> Result<[Seen; 2]> {
             stream.poll(Duration::from_millis(10), sink)?;
         }
     }
-    let [(stream, left), (_, right)] = &eyes;
-    let view = stream.profiles().first().context("no colour")?.intrinsics;
-    let mut seen = [(); 2].map(|()| Seen { view, pictures: Vec::new() });
+    let [(left_stream, left), (right_stream, right)] = &eyes;
+    let seen_by = |stream: &dyn Stream| -> Result<Seen> {
+        let view = stream.profiles().first().context("no colour")?.intrinsics;
+        Ok(Seen { view, pictures: Vec::new() })
+    };
+    let mut seen = [seen_by(left_stream.as_ref())?, seen_by(right_stream.as_ref())?];
     let picture =
         |pixels: &[u8]| RgbImage::from_raw(1280, 720, pixels.to_vec()).context("a picture of another size");
     let mut matched = 0;
