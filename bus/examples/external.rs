@@ -46,8 +46,9 @@ fn main() -> Result<(), Box<dyn Error>> {
             println!("session {} begins", session.number());
             sent = serve(&mut session, &options, sent)?;
             println!("session ends after frame {sent}");
-            if sent >= options.frames {
-                session.refuse(ExternalReason::Finished, "that was the last frame");
+            // So that the daemon has the last frames too before this process and its memory are gone.
+            if sent >= options.frames && !session.finish("that was the last frame", Duration::from_secs(5)) {
+                eprintln!("the daemon did not say that it has the last frames");
             }
         }
     }

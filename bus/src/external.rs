@@ -7,6 +7,7 @@
 mod camera;
 mod codes;
 mod fields;
+pub mod fuzzing;
 mod layout;
 mod link;
 mod lock;

@@ -15,6 +15,8 @@ pub const RUNTIME_DIR_VARIABLE: &str = "DEPTHRIG_RUNTIME_DIR";
 /// iceoryx2 puts Unix sockets below the folder, and their paths have at most 107 bytes.
 const MAX_PATH_LEN: usize = 40;
 const LOCK_ATTEMPTS: u32 = 20;
+/// Bytes that are read of what a lock's holder wrote.
+const MOST_OF_A_HOLDER: u64 = 256;
 const LOCK_PAUSE: Duration = Duration::from_millis(5);
 
 /// The private folder of a user's rigs.
@@ -132,13 +134,14 @@ pub struct RigLock {
 
 /// Who holds the lock `path`, as that process described itself; `None` when nobody does.
 pub(crate) fn holder_of(path: &Path) -> Option<String> {
-    let mut file = std::fs::File::open(path).ok()?;
+    let file = std::fs::File::open(path).ok()?;
     if flock(&file, FlockOperation::NonBlockingLockShared).is_ok() {
         return None;
     }
-    let mut text = String::new();
-    file.read_to_string(&mut text).ok()?;
-    Some(text)
+    let mut text = Vec::new();
+    file.take(MOST_OF_A_HOLDER).read_to_end(&mut text).ok()?;
+    // Another program wrote it, so it may be anything; whoever holds the lock holds it all the same.
+    Some(String::from_utf8_lossy(&text).chars().filter(|c| !c.is_control()).collect())
 }
 
 /// Takes the lock `path` and writes `who` into it; `None` when somebody else holds it.

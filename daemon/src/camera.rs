@@ -214,7 +214,7 @@ impl Supervisor {
             // Not a frame yet: opening, or open and silent.
             let open = !self.camera.state().streams.is_empty();
             let silence = Duration::from_nanos(now.since_ns(self.opened_at).max(0) as u64);
-            if heartbeat_age > OPEN_PATIENCE {
+            if heartbeat_age > open_patience(&self.camera.config.backend) {
                 self.give_up(now, "the device did not come back from being opened");
             } else if open && silence > stall * STALLS_UNTIL_RESTART && heartbeat_age < stall {
                 self.restart(now, &format!("open, but not one frame in {:.1} s", silence.as_secs_f64()));
@@ -475,6 +475,15 @@ fn open_lane(camera: &Camera, shared: &Shared, info: &DeviceInfo) -> Result<()> 
     camera.state().lane = Some(Arc::clone(&lane));
     shared.stage.enter(lane);
     Ok(())
+}
+
+/// How long opening this camera may take. The driver of another process's camera waits for the process, for its first
+/// message and for its first frame, each with a limit of its own that the rig file sets.
+fn open_patience(backend: &BackendConfig) -> Duration {
+    match backend {
+        BackendConfig::External(c) => OPEN_PATIENCE + c.start_timeout * 2 + c.heartbeat_timeout,
+        _ => OPEN_PATIENCE,
+    }
 }
 
 /// The driver of a camera.

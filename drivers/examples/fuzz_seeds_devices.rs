@@ -5,6 +5,8 @@
 //! that the fuzzer found lie too.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stdout)]
 
+use depthrig_bus::external::{About, ExternalAnswer, ExternalClock, ExternalFrame, Mode, fuzzing};
+use depthrig_bus::{Intrinsics, Name, PixelFormat};
 use depthrig_drivers::realsense::protocol::firmware::Firmware;
 use depthrig_drivers::realsense::protocol::gvd::{Gvd, L515Gvd, Shutter};
 use depthrig_drivers::realsense::protocol::hwm::{
@@ -93,8 +95,52 @@ fn odd(mut table: Vec<u8>) -> Vec<u8> {
     table
 }
 
+/// What a process that serves a camera says, as the target `external` takes it: a byte for the kind of message first.
+fn hand_shake(root: &Path) {
+    let of = |kind: u8, bytes: Vec<u8>| [vec![kind], bytes].concat();
+    let name = |n: &str| Name::new(n).unwrap();
+    let color = Mode::new(name("color"), PixelFormat::Rgb8, (64, 48), 30.0);
+    let depth =
+        Mode::new(name("depth"), PixelFormat::Z16, (64, 48), 30.0).with_device_clock(32, 1_000_000, 16);
+    let lens = Intrinsics::pinhole(50.0, 51.0, 31.5, 23.5);
+    let jpeg = Mode { intrinsics: lens, ..Mode::new(name("jpeg"), PixelFormat::Mjpeg, (64, 48), 15.0) };
+    let stamped = Mode { clock: ExternalClock::Host, ..color.clone() };
+    let about =
+        About { model: "Fake".into(), serial: "7".into(), program: "seed".into(), ..About::default() };
+    let offer = |modes: &[Mode]| of(0, fuzzing::offer_bytes(&about, modes));
+    put(root, "external", "offer", &offer(&[color, depth.clone(), jpeg]));
+    put(root, "external", "offer_of_one", &offer(&[depth.clone()]));
+    let run = ExternalAnswer { instance: 7, session: 9, want: 1, modes: 3, ..ExternalAnswer::default() };
+    put(root, "external", "answer", &of(1, fuzzing::answer_bytes(&run, &[1, 0, 1])));
+    let mut refusal = ExternalAnswer { want: 2, reason: 2, ..run };
+    refusal.text[..3].copy_from_slice(b"why");
+    put(root, "external", "answer_refused", &of(1, fuzzing::answer_bytes(&refusal, &[])));
+    for (seed, mode) in [("frames", depth), ("frames_host", stamped)] {
+        let mut bytes = fuzzing::mode_bytes(&mode).to_vec();
+        for n in [1u64, 2, 3, 5, 6] {
+            let header = ExternalFrame {
+                instance: 7,
+                session: 9,
+                sequence: n,
+                device_sequence: n,
+                device_time: 999_990_000_000 + n * 33_000_000,
+                format: mode.format as u32,
+                width: mode.width,
+                height: mode.height,
+                payload_len: mode.frame_bytes() as u32,
+                ..ExternalFrame::default()
+            };
+            bytes.extend(header.payload_len.to_le_bytes());
+            bytes.extend(33u16.to_le_bytes());
+            bytes.extend(fuzzing::frame_bytes(&header));
+        }
+        put(root, "external", seed, &of(2, bytes));
+    }
+}
+
 fn main() {
     let root: PathBuf = std::env::args().nth(1).expect("the folder of the corpus").into();
+    hand_shake(&root);
     let gvd = Gvd {
         version: 5,
         firmware: Firmware::new(5, 16, 0, 1),

@@ -5,7 +5,8 @@
 //! copied once, into the slot that subscribers read.
 
 mod backend;
-mod device;
+pub(crate) mod device;
+pub(crate) mod facts;
 mod intake;
 mod log;
 mod pace;

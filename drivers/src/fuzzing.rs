@@ -4,5 +4,6 @@
 //! A panic is a finding; so is a broken promise, which is why there are assertions here. Each function returns how
 //! far its input came, so that a corpus which no longer reaches anything is noticed.
 
+pub mod external;
 pub mod kinect;
 pub mod realsense;

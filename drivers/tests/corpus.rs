@@ -2,7 +2,7 @@
 //! mended.
 #![allow(clippy::unwrap_used)]
 
-use depthrig_drivers::fuzzing::{kinect, realsense};
+use depthrig_drivers::fuzzing::{external, kinect, realsense};
 use depthrig_drivers::zed;
 use std::path::{Path, PathBuf};
 
@@ -56,6 +56,11 @@ fn run(target: &str, reached: impl Fn(&[u8]) -> u64) {
         }
     }
     assert!(seeds > 0, "{target} has no seeds");
+}
+
+#[test]
+fn messages_of_a_process_that_serves_a_camera() {
+    run("external", external::handshake);
 }
 
 #[test]

@@ -18,10 +18,11 @@ import numpy as np
 import pytest
 
 import depthrig
-from daemon import FakeDaemon, fake_daemon
+from daemon import ANSWER, FakeDaemon, fake_daemon
 from depthrig import ExternalCamera, ExternalClock, ExternalMode, ExternalReason, PixelFormat
 from depthrig import _layout as layout
-from depthrig._header import Intrinsics, Pose
+from depthrig._external_answer import read_answer
+from depthrig._header import Intrinsics, Pose, pack_fields
 from depthrig._layout import Distortion, ExternalFrameFlags, ExternalState, ExternalWant
 from rig import WAIT_S
 
@@ -283,14 +284,79 @@ def test_another_session_ends_the_one_before(camera: ExternalCamera, daemon: Fak
 
 @pytest.mark.parametrize(
     "change",
-    [{"instance": 5}, {"magic": b"NOPE"}, {"want": 99}, {"modes": 3}, {"sent_ns": 1}],
+    [{"instance": 5}, {"magic": b"NOPE"}, {"sent_ns": 1}],
     ids=lambda c: next(iter(c)),
 )
-def test_an_answer_that_is_none_is_ignored(camera: ExternalCamera, daemon: FakeDaemon, change: dict[str, Any]) -> None:
+def test_an_answer_that_is_for_another_is_ignored(camera: ExternalCamera, daemon: FakeDaemon, change: dict[str, Any]) -> None:
     daemon.run(1, change=change)
     assert camera.wait(0.5) is None
     daemon.run(1)
     assert _session(camera).number == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"want": 99}, "it wants 99, which this package does not know"),
+        ({"modes": 3}, "it answers for 3 modes in 2 bytes, and this camera has 2"),
+    ],
+    ids=["want", "modes"],
+)
+def test_an_answer_that_cannot_be_is_an_error(
+    camera: ExternalCamera, daemon: FakeDaemon, change: dict[str, Any], text: str
+) -> None:
+    daemon.run(1, change=change)
+    with pytest.raises(depthrig.CameraRefused, match=text):
+        camera.wait(WAIT_S)
+    daemon.run(1)
+    _until(lambda: camera._answer is not None and camera._answer.want is ExternalWant.RUN)
+    assert _session(camera).number == 1, "a good one is taken all the same"
+
+
+def test_whatever_an_answer_holds_it_is_read_or_refused() -> None:
+    head = pack_fields(
+        layout.EXTERNAL_ANSWER_FIELDS,
+        layout.EXTERNAL_ANSWER_SIZE,
+        {**ANSWER, "instance": 7, "session": 3, "want": 1, "modes": 2, "sent_ns": time.monotonic_ns()},
+    )
+    good = read_answer((head, b"\1\0"), 7, 2)
+    assert good is not None
+    assert (good.session, good.want) == (3, ExternalWant.RUN)
+    random = np.random.default_rng(6)
+    seen = set()
+    for _ in range(5000):
+        bad = bytearray(head)
+        for at in random.integers(0, len(bad), random.integers(1, 5)):
+            bad[at] = random.choice([0, 1, 0x7F, 0x80, 0xFF, 0x1B])
+        answer = read_answer((bytes(bad), bytes(random.integers(0, 4, random.integers(0, 5)).astype(np.uint8))), 7, 2)
+        if answer is not None:
+            assert all(c.isprintable() for c in answer.text)
+            seen.add((answer.want, answer.reason_name))
+    assert {(ExternalWant.REFUSED, "version"), (ExternalWant.REFUSED, "invalid")} <= seen
+    assert any(want is ExternalWant.RUN for want, _ in seen)
+
+
+def test_files_at_their_end_lose_nothing(camera: ExternalCamera, daemon: FakeDaemon) -> None:
+    daemon.run(1)
+    session = _session(camera)
+    session.start(lossless=True)
+    sender = threading.Thread(target=lambda: [session.send("color", RED + i) for i in range(20)])
+    sender.start()
+    time.sleep(0.3)
+    assert sender.is_alive(), "it waits, because no more than 4 may be unread"
+    heads = [daemon.frame("color")[0] for _ in range(20)]
+    assert [h["sequence"] for h in heads] == list(range(1, 21)), "none gave way and none was counted as lost"
+    sender.join(WAIT_S)
+    assert session.no_slot == {"color": 0}
+    assert not session.finish("all played", timeout=0.3), "the daemon has not said that it has them"
+    daemon.until(state=ExternalState.REFUSED, reason=ExternalReason.FINISHED, session=1, text="all played")
+    daemon.run(2)
+    session = _session(camera)
+    stop = threading.Timer(0.2, lambda: daemon.say(ExternalWant.STOP, 2))
+    stop.start()
+    assert session.finish("all played", timeout=WAIT_S)
+    assert not session.wanted
+    stop.join()
 
 
 def test_a_refusal_is_an_error_with_the_daemons_words(camera: ExternalCamera, daemon: FakeDaemon) -> None:

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,6 +34,7 @@ from PIL import Image  # noqa: E402
 from depthrig.oak import __main__ as program  # noqa: E402
 from depthrig.oak import _bridge, _device, _lens, _replay  # noqa: E402
 from depthrig.oak._errors import Exit, OakError  # noqa: E402
+from depthrig.oak._hopper import Hopper  # noqa: E402
 
 SOCKET = dai.CameraBoardSocket
 WIDTH, HEIGHT, PICTURES = 64, 48, 5
@@ -133,12 +135,88 @@ def test_pictures_are_served_as_a_camera(folder: Path, pictures: Path) -> None:
         assert process.wait(WAIT_S) == Exit.DONE
 
 
+def play_once(daemon: FakeDaemon, folder: Path, rate_hz: float) -> None:
+    """Be the daemon of files that are played once: each frame comes, from the first one to the last."""
+    daemon.until(state=ExternalState.IDLE)
+    time.sleep(0.3)  # what nobody wants yet is not lost
+    daemon.run(1, ("color", "depth"))
+    time.sleep(0.3)  # nor what is not read at once
+    for number in range(PICTURES):  # in turn, as a stream that is not read holds up the other
+        for stream in ("color", "depth"):
+            assert check(daemon, folder, stream, 1, rate_hz) == [number]
+    daemon.until(state=ExternalState.REFUSED, reason=ExternalReason.FINISHED, session=1)
+    daemon.say(0, 1)
+    daemon.until(state=ExternalState.ENDED, reason=ExternalReason.FINISHED, text="the files are at their end")
+
+
+@pytest.mark.parametrize("kind", ["pictures", "recordings"])
+def test_files_that_are_played_once_come_to_the_last_frame(folder: Path, pictures: Path, tmp_path: Path, kind: str) -> None:
+    played = pictures
+    if kind == "recordings":
+        played = tmp_path / "kept"
+        with bridge(folder, "--replay", str(pictures), "--once", "--fps", "50", "--record", str(played)) as process:
+            with fake_daemon(folder, camera="oak") as daemon:
+                play_once(daemon, pictures, 50.0)
+            assert process.wait(WAIT_S) == Exit.DONE
+        assert _replay._messages(played / "depth.mcap") == PICTURES
+    for _ in range(3):  # the end of two files is a race inside of the SDK
+        with bridge(folder, "--replay", str(played), "--once", "--fps", "50") as process:
+            with fake_daemon(folder, camera="oak") as daemon:
+                daemon.until(pid=process.pid)
+                play_once(daemon, pictures, 50.0)
+            assert process.wait(WAIT_S) == Exit.DONE
+
+
+def test_what_a_daemon_did_not_take_is_no_success(caplog: pytest.LogCaptureFixture) -> None:
+    done = SimpleNamespace(missing={}, confirmed=True)
+    assert program._account(done) is Exit.DONE
+    assert program._account(SimpleNamespace(missing={}, confirmed=False)) is Exit.UNDELIVERED
+    assert "did not say that it has taken the last ones" in caplog.text
+    assert program._account(SimpleNamespace(missing={"depth": 2}, confirmed=True)) is Exit.UNDELIVERED
+    assert "that the daemon did not get: 2 depth" in caplog.text
+
+
+def test_a_recording_that_was_cut_is_not_played_once(folder: Path, pictures: Path) -> None:
+    shutil.copy(pictures / "calibration.json", pictures / "color.mcap")
+    with bridge(folder, "--replay", str(pictures), "--once") as process:
+        _, errors = process.communicate(timeout=WAIT_S)
+    assert process.returncode == Exit.USAGE
+    assert "color.mcap has no summary" in errors
+
+
+def test_a_hopper_lets_no_stream_run_ahead() -> None:
+    hopper = Hopper(["color", "depth"])
+    took: list[str] = []
+
+    def feed(stream: str, frames: int) -> None:
+        for i in range(frames):
+            hopper.put(stream, f"{stream}{i}")
+
+    threads = [threading.Thread(target=feed, args=(s, 3), daemon=True) for s in ("color", "depth")]
+    threads[0].start()
+    time.sleep(0.1)
+    assert [f for _, f in hopper.take(1.0)] == ["color0"]
+    assert hopper.take(0.1) == [], "it waits for depth0"
+    threads[1].start()
+    while len(took) < 5:
+        took += [f for _, f in hopper.take(1.0)]
+    assert sorted(took) == ["color1", "color2", "depth0", "depth1", "depth2"]
+    for thread in threads:
+        thread.join(WAIT_S)
+    assert hopper.came == {"color": 3, "depth": 3}
+    last = threading.Thread(target=feed, args=("color", 2), daemon=True)
+    last.start()
+    hopper.close()
+    last.join(WAIT_S)
+    assert not last.is_alive(), "its end lets the SDK go"
+
+
 def test_what_was_recorded_is_replayed_as_it_was(folder: Path, pictures: Path, tmp_path: Path) -> None:
     """The SDK's own writer and player: numbers, times, pixels and calibration come back."""
     kept = tmp_path / "kept"
     with bridge(folder, "--replay", str(pictures), "--once", "--fps", "20", "--record", str(kept)) as process:
         with fake_daemon(folder, camera="oak") as daemon:
-            daemon.until(state=ExternalState.ENDED, reason=ExternalReason.FINISHED, text="the files are at their end")
+            play_once(daemon, pictures, 20.0)
         assert process.wait(WAIT_S) == Exit.DONE
     assert sorted(p.name for p in kept.iterdir()) == ["calibration.json", "color.mcap", "depth.mcap"]
     options = ("--replay", str(kept), "--serial", "184430", "--streams", "depth", "color")
@@ -442,6 +520,7 @@ def test_a_camera_that_goes_away_ends_the_bridge(
 
     def gone(wishes: Any) -> tuple[Any, Any]:
         source = _replay.open_folder(pictures, serial="1", rate_hz=50.0, loop=False)
+        source.frames = None  # a camera's frames do not wait
         return source, SimpleNamespace(close=lambda: closed.append(True))
 
     closed: list[bool] = []

@@ -170,6 +170,8 @@ fn a_stopped_process_is_hung_and_goes_on_when_it_wakes() {
     process.signal("STOP");
     let status = wait_until(&rig, "the silence", |s| says(s, "has said nothing for"));
     assert!(says(&status, "kill -9") || says(&status, "end it"), "{:?}", ext(&status).message);
+    // Its last message still lies there, and is not taken for a sign of life.
+    wait_until(&rig, "that nobody answers", |s| says(s, "serves it and has said nothing for 1.0 s"));
     process.signal("CONT");
     wait_until(&rig, "streaming again", all_stream);
     assert_eq!(ext(&stop(rig)).reconnects, 1);
@@ -249,6 +251,10 @@ fn a_second_process_for_a_camera_is_refused_and_names_the_first() {
 fn offers_that_cannot_be_are_refused_by_name() {
     for (lie, part) in [
         ("another_version", "it speaks version 2 of the hand-shake"),
+        (
+            "another_size",
+            "it speaks version 1 of the hand-shake (100 bytes), this daemon version 1 (568 bytes)",
+        ),
         ("fewer_modes", "it says 1 modes of 320 bytes, and sends 640 bytes"),
         ("no_name", "its field `stream` does not end with a zero byte"),
         ("nan_rate", "stream color: its field `rate_hz` is NaN"),
@@ -282,9 +288,10 @@ fn what_the_process_says_is_what_the_status_says() {
     ] {
         let home = Home::default();
         let rig = home.start(&text("")).unwrap(); // a camera that has failed by then would fail the start
-        let _process = Process::start(&home, behaviour);
+        let process = Process::start(&home, behaviour);
         let status = wait_until(&rig, behaviour, |s| ext(s).state == state && says(s, part));
         if behaviour == "finishes" {
+            process.says("the daemon has it all: true");
             assert_eq!(ext(&status).streams.iter().map(|s| s.captured).collect::<Vec<_>>(), [20, 20]);
         }
         stop(rig);

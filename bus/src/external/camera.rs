@@ -16,6 +16,8 @@ use std::thread::JoinHandle;
 
 /// How often the heart-beat's thread looks whether it is to end.
 const LOOK: Duration = Duration::from_millis(50);
+/// Answers that are read at a time; the channel keeps no more.
+const MOST_AT_A_TIME: usize = 64;
 /// Slots of the offers: one being written, the unread ones of each subscriber, and one that is kept for latecomers.
 const OFFER_SLOTS: usize = 24;
 
@@ -74,11 +76,11 @@ struct Station {
 
 /// What the daemon wants now.
 #[derive(Debug, Clone, Default)]
-struct Wanted {
-    session: u64,
+pub(super) struct Wanted {
+    pub(super) session: u64,
     /// Indices of the modes that are to run; empty for none.
-    modes: Vec<usize>,
-    refusal: Option<String>,
+    pub(super) modes: Vec<usize>,
+    pub(super) refusal: Option<String>,
     heard: Option<HostTime>,
 }
 
@@ -100,7 +102,7 @@ impl ExternalCamera {
         let mut offer = ExternalOffer { modes: modes.len() as u32, ..ExternalOffer::default() };
         about.encode(&mut offer);
         About::decode(&offer).map_err(in_camera)?;
-        let records = records.iter().flat_map(plain::bytes_of).collect();
+        let records = records.iter().flat_map(plain::bytes_of_mode).collect();
         Self::offer_unchecked(place, modes, offer, records)
     }
 
@@ -223,6 +225,24 @@ impl Shared {
         wanted.refusal.clone().filter(|_| wanted.session == session)
     }
 
+    /// Waits until the daemon says that `session` is to stop; whether it did.
+    pub(super) fn wait_for_stop(&self, session: u64, patience: Duration) -> bool {
+        let deadline = HostTime::now().plus(patience);
+        let mut wanted = self.wanted();
+        loop {
+            // Of a daemon that is gone nothing was heard, and nothing is wanted either.
+            if wanted.session == session && wanted.modes.is_empty() && wanted.heard.is_some() {
+                return wanted.refusal.is_none();
+            }
+            let left = deadline.from_now();
+            if left.is_zero() {
+                return false;
+            }
+            let waited = self.changed.wait_timeout(wanted, left);
+            wanted = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
     /// Says how the process stands from now on.
     pub(super) fn stand(
         &self,
@@ -283,10 +303,17 @@ impl Shared {
     /// Takes in what the daemon said since.
     fn hear(&self, inlet: &Inlet<ExternalAnswer>) {
         let mut newest: Option<Wanted> = None;
-        loop {
+        // No more than that at a time: whoever floods the channel must not keep the heart-beat from being sent.
+        for _ in 0..MOST_AT_A_TIME {
             match inlet.try_receive() {
                 Ok(Some(sample)) => {
-                    if let Some(wanted) = self.understand(sample.user_header(), sample.payload()) {
+                    let said = Wanted::decode(
+                        sample.user_header(),
+                        sample.payload(),
+                        self.instance,
+                        self.modes.len(),
+                    );
+                    if let Some(wanted) = said {
                         newest = Some(wanted);
                     }
                 }
@@ -313,31 +340,56 @@ impl Shared {
             self.changed.notify_all();
         }
     }
+}
 
-    /// What an answer says, if it is one to this process.
-    fn understand(&self, answer: &ExternalAnswer, payload: &[u8]) -> Option<Wanted> {
-        let mut wanted = Wanted { heard: Some(HostTime::now()), ..Wanted::default() };
-        if answer.magic != super::ANSWER_MAGIC || answer.instance != self.instance {
+impl Wanted {
+    /// What an answer that may hold anything says, if it is one to start `instance` of a process with so many modes.
+    pub(super) fn decode(
+        answer: &ExternalAnswer,
+        payload: &[u8],
+        instance: u64,
+        modes: usize,
+    ) -> Option<Self> {
+        let answer = *answer; // a copy, which the daemon cannot change any more
+        let mut wanted = Self { heard: Some(HostTime::now()), ..Self::default() };
+        if answer.magic != super::ANSWER_MAGIC || answer.instance != instance {
             return None;
         }
         if answer.version != VERSION || usize::from(answer.size) != size_of::<ExternalAnswer>() {
             let why = format!(
-                "it speaks version {} of the hand-shake, this program version {VERSION}",
-                answer.version
+                "it speaks version {} of the hand-shake ({} bytes), this program version {VERSION} ({} bytes)",
+                answer.version,
+                answer.size,
+                size_of::<ExternalAnswer>()
             );
-            return Some(Wanted { refusal: Some(why), ..wanted });
+            return Some(Self { refusal: Some(why), ..wanted });
         }
         // An answer of before must not stop what runs now.
         if HostTime::from_ns(answer.sent_ns).elapsed() > SILENCE {
             return None;
         }
+        let Some(want) = ExternalWant::from_code(answer.want) else {
+            let why = format!("it wants {}, which this program does not know", answer.want);
+            return Some(Self { refusal: Some(why), ..wanted });
+        };
+        let counted = (payload.len(), answer.modes as usize) == (modes, modes);
+        if want == ExternalWant::Run && !counted {
+            let (says, bytes) = (answer.modes, payload.len());
+            let why = format!("it answers for {says} modes in {bytes} bytes, and this camera has {modes}");
+            return Some(Self { refusal: Some(why), ..wanted });
+        }
         wanted.session = answer.session;
-        match ExternalWant::from_code(answer.want)? {
+        match want {
             ExternalWant::Stop => {}
             ExternalWant::Refused => wanted.refusal = Some(text::shown(&answer.text)),
             ExternalWant::Run => {
-                let flags = payload.iter().take(self.modes.len().min(MAX_MODES));
-                wanted.modes = flags.enumerate().filter(|(_, f)| **f == 1).map(|(i, _)| i).collect();
+                wanted.modes = payload
+                    .iter()
+                    .take(MAX_MODES)
+                    .enumerate()
+                    .filter(|(_, f)| **f == 1)
+                    .map(|(i, _)| i)
+                    .collect();
             }
         }
         Some(wanted)
@@ -348,3 +400,6 @@ impl Shared {
 pub(super) fn no_such_mode(mode: usize) -> Error {
     invalid(&format!("mode {mode} is not one that the session runs"))
 }
+
+#[cfg(test)]
+mod tests;

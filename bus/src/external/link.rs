@@ -1,6 +1,6 @@
 //! The side of the daemon: hears the process, tells it what is wanted, reads its frames.
 
-use super::mode::{check_all, invalid};
+use super::mode::{check_all, check_count, invalid};
 use super::{
     About, ExternalAnswer, ExternalFrame, ExternalOffer, ExternalReason, ExternalState, ExternalWant,
     MODE_BYTES, Mode, OFFER_MAGIC, Place, TEXT_BYTES, VERSION, plain, text,
@@ -77,21 +77,13 @@ pub struct Offer {
     pub modes: Vec<Mode>,
 }
 
-/// A message of the process: what it says at a glance, and the whole of it.
-#[derive(Debug)]
-pub struct Said {
-    /// What it says of itself.
-    pub beat: Beat,
-    sample: Received<ExternalOffer>,
-}
-
-impl Said {
-    /// What it offers, checked.
+impl Offer {
+    /// The offer of a header and a payload that may hold anything.
     ///
     /// # Errors
-    /// [`ErrorKind::VersionMismatch`] naming both versions, [`ErrorKind::Other`] naming what of it cannot be.
-    pub fn offer(&self) -> Result<Offer> {
-        let header = *self.sample.user_header();
+    /// As [`Said::offer`].
+    pub fn decode(header: &ExternalOffer, payload: &[u8]) -> Result<Self> {
+        let header = *header; // a copy, which the process cannot change any more
         if header.magic != OFFER_MAGIC {
             return Err(invalid("its offer does not begin as one does"));
         }
@@ -106,8 +98,9 @@ impl Said {
                 ),
             ));
         }
-        let payload = self.sample.payload();
         let (records, rest) = payload.as_chunks::<MODE_BYTES>();
+        // Before any is read: a process may send as much as the computer has memory.
+        check_count(header.modes as usize)?;
         if records.len() != header.modes as usize || !rest.is_empty() {
             let (n, bytes) = (header.modes, payload.len());
             return Err(invalid(&format!(
@@ -120,7 +113,25 @@ impl Said {
         let about = About::decode(&header)?;
         let modes = records.iter().map(|r| Mode::decode(&plain::mode_of(r))).collect::<Result<Vec<_>>>()?;
         check_all(&modes)?;
-        Ok(Offer { about, modes })
+        Ok(Self { about, modes })
+    }
+}
+
+/// A message of the process: what it says at a glance, and the whole of it.
+#[derive(Debug)]
+pub struct Said {
+    /// What it says of itself.
+    pub beat: Beat,
+    sample: Received<ExternalOffer>,
+}
+
+impl Said {
+    /// What it offers, checked.
+    ///
+    /// # Errors
+    /// [`ErrorKind::VersionMismatch`] naming both versions, [`ErrorKind::Other`] naming what of it cannot be.
+    pub fn offer(&self) -> Result<Offer> {
+        Offer::decode(self.sample.user_header(), self.sample.payload())
     }
 }
 

@@ -286,9 +286,7 @@ impl Mode {
 /// # Errors
 /// [`ErrorKind::Other`] when there are none, too many, or too many streams among them.
 pub(super) fn check_all(modes: &[Mode]) -> Result<()> {
-    if modes.is_empty() || modes.len() > MAX_MODES {
-        return Err(invalid(&format!("it has {} modes; it must have 1 to {MAX_MODES}", modes.len())));
-    }
+    check_count(modes.len())?;
     let mut streams: Vec<_> = modes.iter().map(|m| &m.stream).collect();
     streams.sort();
     streams.dedup();
@@ -296,6 +294,17 @@ pub(super) fn check_all(modes: &[Mode]) -> Result<()> {
         return Err(invalid(&format!("it has {} streams; {MAX_STREAMS} is the most", streams.len())));
     }
     Ok(())
+}
+
+/// Whether a camera may have so many modes.
+///
+/// # Errors
+/// [`ErrorKind::Other`] when it may not.
+pub(super) fn check_count(modes: usize) -> Result<()> {
+    if (1..=MAX_MODES).contains(&modes) {
+        return Ok(());
+    }
+    Err(invalid(&format!("it has {modes} modes; it must have 1 to {MAX_MODES}")))
 }
 
 pub(super) fn invalid(what: &str) -> Error {

@@ -1,17 +1,30 @@
-//! Mode records as bytes and back: the payload of an offer is bytes, so that each record is checked before it is used.
-#![allow(unsafe_code)] // two transmutes between a record and its bytes
+//! Records of the hand-shake as bytes and back: what another process wrote is bytes, and each record is checked before it is
+//! used.
+#![allow(unsafe_code)] // transmutes between a record and its bytes
 
-use super::{ExternalMode, MODE_BYTES};
+use super::{ExternalAnswer, ExternalFrame, ExternalMode, ExternalOffer};
 
-/// The bytes of a record.
-pub fn bytes_of(mode: &ExternalMode) -> [u8; MODE_BYTES] {
-    // SAFETY: the type is `#[repr(C)]` and its fields cover every byte (checked at compile time in `fields`), so no byte
-    // is uninitialised padding; the sizes are equal or this would not compile.
-    unsafe { core::mem::transmute::<ExternalMode, [u8; MODE_BYTES]>(*mode) }
+macro_rules! records {
+    ($($record:ident: $of_bytes:ident, $bytes_of:ident;)*) => {$(
+        #[doc = concat!("The `", stringify!($record), "` of these bytes, whatever they are.")]
+        pub const fn $of_bytes(bytes: &[u8; size_of::<$record>()]) -> $record {
+            // SAFETY: all fields are integers, floats and arrays of them, for which every bit pattern is a value; the
+            // sizes are equal or this would not compile.
+            unsafe { core::mem::transmute::<[u8; size_of::<$record>()], $record>(*bytes) }
+        }
+
+        #[doc = concat!("The bytes of an `", stringify!($record), "`.")]
+        pub const fn $bytes_of(record: &$record) -> [u8; size_of::<$record>()] {
+            // SAFETY: the type is `#[repr(C)]` and its fields cover every byte (checked at compile time in `fields`), so
+            // no byte is uninitialised padding; the sizes are equal or this would not compile.
+            unsafe { core::mem::transmute::<$record, [u8; size_of::<$record>()]>(*record) }
+        }
+    )*};
 }
 
-/// The record of these bytes, whatever they are.
-pub fn mode_of(bytes: &[u8; MODE_BYTES]) -> ExternalMode {
-    // SAFETY: all fields are integers, floats and arrays of them, for which every bit pattern is a value.
-    unsafe { core::mem::transmute::<[u8; MODE_BYTES], ExternalMode>(*bytes) }
+records! {
+    ExternalMode: mode_of, bytes_of_mode;
+    ExternalOffer: offer_of, bytes_of_offer;
+    ExternalAnswer: answer_of, bytes_of_answer;
+    ExternalFrame: frame_of, bytes_of_frame;
 }

@@ -4,6 +4,7 @@ use super::camera::no_such_mode;
 use super::{ExternalCamera, ExternalFrame, ExternalReason, ExternalState, FRAME_SLOTS, Mode};
 use crate::channel::{self, Loan, Outlet};
 use crate::{ErrorKind, Result};
+use core::time::Duration;
 
 /// From when the daemon wanted frames until it wants none: see [`ExternalCamera::next_session`].
 #[derive(Debug)]
@@ -60,6 +61,15 @@ impl<'a> Session<'a> {
     pub fn refuse(mut self, reason: ExternalReason, why: &str) {
         self.refused = true;
         self.stand(ExternalState::Refused, reason, why);
+    }
+
+    /// Says that there are no more frames, as files at their end have it, and waits up to `patience` until the daemon has
+    /// taken those that were sent; returns whether it says so. `why` is shown to the user.
+    pub fn finish(mut self, why: &str, patience: Duration) -> bool {
+        self.refused = true;
+        self.stand(ExternalState::Refused, ExternalReason::Finished, why);
+        // The channels stay until then, for a daemon that has not looked into them yet.
+        self.camera.shared.wait_for_stop(self.number, patience)
     }
 
     /// Whether the daemon still wants frames.

@@ -6,8 +6,10 @@ use super::rig::{not_empty, resolve};
 use core::time::Duration;
 use std::path::{Path, PathBuf};
 
-/// The longest that a process may be waited for, seconds: the supervisor gives an opening 15.
-const LONGEST_START_S: f64 = 14.0;
+/// The longest that a process may be waited for, seconds: what boots longer is better started before the rig.
+const LONGEST_START_S: f64 = 120.0;
+/// The longest silence, seconds: a process that hangs keeps its camera from the rig for so long.
+const LONGEST_SILENCE_S: f64 = 14.0;
 
 /// Reads the settings of a camera that another process serves; relative paths are taken from `base`.
 pub(super) fn read(s: &Section<'_, '_>, base: &Path) -> ExternalSettings {
@@ -33,6 +35,6 @@ pub(super) fn read(s: &Section<'_, '_>, base: &Path) -> ExternalSettings {
         command,
         directory: resolve(base, directory.as_deref().unwrap_or(Path::new("."))),
         start_timeout: seconds("start_timeout_s", d.start_timeout, 0.1, LONGEST_START_S),
-        heartbeat_timeout: seconds("heartbeat_timeout_s", d.heartbeat_timeout, 0.5, LONGEST_START_S),
+        heartbeat_timeout: seconds("heartbeat_timeout_s", d.heartbeat_timeout, 0.5, LONGEST_SILENCE_S),
     }
 }

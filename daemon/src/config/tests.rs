@@ -820,3 +820,55 @@ fn what_is_wrong_with_refining_is_named_at_its_line() {
     let recorded = rig("").replace("[camera.refine]", "record = [\"depth_refined\"]");
     assert!(problems(&recorded)[0].contains("which only a camera with [camera.refine] has"));
 }
+
+#[test]
+fn an_external_camera_is_read_with_all_its_keys() {
+    use std::time::Duration;
+    let rig = parse(
+        r#"
+        rig = "lab"
+        [[camera]]
+        name = "a"
+        backend = "external"
+        command = ["bin/cam", "--serial", "7"]
+        directory = "oak"
+        start_timeout_s = 3
+        heartbeat_timeout_s = 0.5
+        stream = [{ name = "color", rate_hz = 15 }]
+        [[camera]]
+        name = "b"
+        backend = "external"
+        "#,
+    )
+    .unwrap();
+    let wanted = ExternalSettings {
+        command: ["bin/cam", "--serial", "7"].map(str::to_owned).into(),
+        directory: "/rigs/oak".into(),
+        start_timeout: Duration::from_secs(3),
+        heartbeat_timeout: Duration::from_millis(500),
+    };
+    assert_eq!(rig.cameras[0].backend, BackendConfig::External(wanted));
+    let plain = ExternalSettings { directory: "/rigs".into(), ..ExternalSettings::default() };
+    assert_eq!(rig.cameras[1].backend, BackendConfig::External(plain));
+    assert_eq!(rig.cameras[1].backend.name(), "external");
+}
+
+#[test]
+fn what_is_wrong_with_an_external_camera_is_named_at_its_line() {
+    for (line, said) in [
+        ("command = []", "\"command\" in [[camera]] \"a\" is empty; write [\"program\","),
+        ("command = [\" \"]", "names no program"),
+        ("command = \"cam\"", "\"command\" in [[camera]] \"a\" must be"),
+        ("directory = \"x\"", "is where `command` runs, which is not given"),
+        ("start_timeout_s = 121", "is 121 s; it must be within 0.1 and 120"),
+        ("heartbeat_timeout_s = 0.1", "is 0.1 s; it must be within 0.5 and 14"),
+        ("comand = [\"cam\"]", "did you mean \"command\"?"),
+    ] {
+        let text = format!("rig = \"r\"\n[[camera]]\nname = \"a\"\nbackend = \"external\"\n{line}\n");
+        let all = problems(&text);
+        assert!(
+            all.len() == 1 && all[0].starts_with("/rigs/rig.toml:5:") && all[0].contains(said),
+            "{line}: {all:#?}"
+        );
+    }
+}

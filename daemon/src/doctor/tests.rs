@@ -11,6 +11,8 @@ use depthrig_drivers::ErrorKind;
 use depthrig_drivers::usb::made::{MadeDevice, MadeTree};
 use std::path::PathBuf;
 
+mod external;
+
 const FILES: &str = r#"
 rig = "mount"
 [recording]

@@ -71,7 +71,7 @@ pub(super) fn refusal(beat: &Beat) -> String {
 }
 
 /// The profile of a mode.
-fn profile(mode: &Mode) -> StreamProfile {
+pub(crate) fn profile(mode: &Mode) -> StreamProfile {
     let (domain, metadata) = match mode.clock {
         ExternalClock::Device => (ClockDomain::Device, MetadataLevel::Full),
         ExternalClock::DeviceHeader => (ClockDomain::Device, MetadataLevel::Header),

@@ -303,7 +303,8 @@ impl Stream for ExternalStream {
 
 impl Drop for ExternalStream {
     fn drop(&mut self) {
-        if self.over.is_none()
+        // At the end of files too: it is how the process learns that its last frames were taken.
+        if !matches!(self.over, Some(Over::Failed(_)))
             && let Err(e) = self.tell(ExternalWant::Stop, ExternalReason::None, "")
         {
             tracing::debug!(error = %e, "the process could not be told to stop");

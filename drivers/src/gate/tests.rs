@@ -37,6 +37,34 @@ fn feed(gate: &mut Gate, sink: &mut MemorySink, raw: &RawFrame) -> Outcome {
 }
 
 #[test]
+fn a_gap_whose_reason_is_known_is_counted_for_it() {
+    let (mut gate, mut sink) = (Gate::new(0, &profile(32, ClockDomain::Device)), MemorySink::default());
+    gate.explain_gap(2, DropReason::QueueFull); // before the first, which the counter alone cannot tell
+    feed(&mut gate, &mut sink, &raw(10, 0));
+    gate.explain_gap(1, DropReason::QueueFull);
+    feed(&mut gate, &mut sink, &raw(14, 1)); // 11 to 13 are missing, one of them by the host
+    let lost =
+        |gate: &Gate| (gate.drops().get(DropReason::QueueFull), gate.drops().get(DropReason::DeviceGap));
+    assert_eq!(lost(&gate), (3, 2));
+    gate.explain_gap(100, DropReason::QueueFull);
+    feed(&mut gate, &mut sink, &raw(16, 2)); // no more than are missing
+    assert_eq!(lost(&gate), (4, 2));
+    feed(&mut gate, &mut sink, &raw(18, 3)); // said once, it counts for one frame
+    assert_eq!(lost(&gate), (4, 3));
+    assert_eq!(gate.captured(), gate.delivered() + gate.drops().total());
+}
+
+#[test]
+fn a_counter_that_jumps_by_more_than_any_camera_loses_was_set_anew() {
+    let (mut gate, mut sink) = (Gate::new(0, &profile(64, ClockDomain::Device)), MemorySink::default());
+    for (i, sequence) in [1, 2, u64::MAX / 2, u64::MAX - 1, u64::MAX, 3].into_iter().enumerate() {
+        feed(&mut gate, &mut sink, &raw(sequence, i as i64));
+    }
+    assert_eq!(gate.captured(), gate.delivered() + gate.drops().total());
+    assert!(gate.captured() < 100, "{}", gate.captured());
+}
+
+#[test]
 fn gaps_duplicates_and_late_frames_are_told_apart() {
     let (mut gate, mut sink) = (Gate::new(0, &profile(8, ClockDomain::Device)), MemorySink::default());
     let outcomes: Vec<_> = [250, 251, 251, 255, 253, 1, 1]

@@ -32,6 +32,8 @@ from .errors import BusError, CameraRefused, CameraServed
 _LOCK_ATTEMPTS, _LOCK_PAUSE_S = 20, 0.01
 # A channel whose other end was just killed may need to be cleaned up first.
 _ENDED_GRACE_S = 0.05
+# Answers that are read at a time; the channel keeps no more.
+_ANSWERS_AT_A_TIME = 64
 # One being written, the unread and held ones of each subscriber, and one that is kept for latecomers.
 _OFFER_SLOTS = 24
 
@@ -141,7 +143,8 @@ class ExternalCamera:
 
     def _read_answers(self) -> None:
         newest = None
-        while True:
+        # No more than that at a time: whoever floods the channel must not keep the heart-beat from being sent.
+        for _ in range(_ANSWERS_AT_A_TIME):
             message = self._letters.take()
             if message is None:
                 break
@@ -234,6 +237,20 @@ class ExternalCamera:
         if self._current is not None:
             self._set_state(ExternalState.STARTING)
         return self._current
+
+    def _wait_for_stop(self, number: int, timeout: float) -> bool:
+        """Wait until the daemon says that session `number` is over; whether it did."""
+        deadline = time.monotonic() + timeout
+        with self._changed:
+            while self._failure is None and not self._stopped:
+                answer = self._answer
+                if answer is not None and (answer.session, answer.want) == (number, ExternalWant.STOP):
+                    return True
+                rest = deadline - time.monotonic()
+                if rest <= 0:
+                    break
+                self._changed.wait(min(rest, 0.1))
+        return False
 
     def sessions(self) -> Iterator[ExternalSession]:
         """Yield each session as the daemon asks for it, until :meth:`stop`. One that was left open is closed."""

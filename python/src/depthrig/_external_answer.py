@@ -35,24 +35,37 @@ class Answer:
 
 
 def read_answer(message: tuple[bytes, bytes], instance: int, modes: int) -> Answer | None:
-    """Read an answer; None for one that is not meant for this process, is of before, or cannot be understood.
+    """Read an answer that may hold anything; None for one that is not meant for this process, or is of before.
 
-    One of another version is a refusal: nobody will understand the other.
+    One of another version, or that cannot be, is a refusal: nobody will understand the other.
     """
     head, payload = message
     values = unpack_fields(layout.EXTERNAL_ANSWER_FIELDS, head)
     if values["magic"] != layout.EXTERNAL_ANSWER_MAGIC or values["instance"] != instance:
         return None
     if values["version"] != layout.EXTERNAL_VERSION or values["size"] != layout.EXTERNAL_ANSWER_SIZE:
-        text = (
+        return _refusal(
+            ExternalReason.VERSION,
             f"it speaks version {values['version']} of the hand-shake, this package version {layout.EXTERNAL_VERSION}; "
-            "install the `depthrig` package of the daemon's version"
+            "install the `depthrig` package of the daemon's version",
         )
-        return Answer({"session": 0, "want": ExternalWant.REFUSED, "reason": 1, "text": text}, b"")
-    if values["want"] not in list(ExternalWant):
-        return None
     if time.monotonic_ns() - values["sent_ns"] > layout.EXTERNAL_SILENCE_S * 1e9:
         return None
+    if values["want"] not in list(ExternalWant):
+        return _refusal(
+            ExternalReason.INVALID,
+            f"it wants {values['want']}, which this package does not know; install the `depthrig` package of the "
+            "daemon's version",
+        )
     if values["want"] == ExternalWant.RUN and not (len(payload) == values["modes"] == modes):
-        return None
+        return _refusal(
+            ExternalReason.INVALID,
+            f"it answers for {values['modes']} modes in {len(payload)} bytes, and this camera has {modes}",
+        )
+    values["text"] = "".join(c if c.isprintable() else " " for c in values["text"])
     return Answer(values, payload)
+
+
+def _refusal(reason: ExternalReason, text: str) -> Answer:
+    """Return what stands for an answer that cannot be used: it is about no session, so that whoever waits hears it."""
+    return Answer({"session": 0, "want": ExternalWant.REFUSED, "reason": int(reason), "text": text}, b"")

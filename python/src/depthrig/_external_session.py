@@ -21,6 +21,8 @@ from ._ports import FRAME, Sender, Slot
 if TYPE_CHECKING:
     from ._external import ExternalCamera
 
+# How often a slot is looked for that the daemon has not given back yet.
+_SLOT_PAUSE_S = 0.002
 _FRAME_HEAD = struct.Struct("<4sHHQQQQQqQff5II32x")
 assert _FRAME_HEAD.size == layout.EXTERNAL_FRAME_SIZE
 
@@ -41,6 +43,7 @@ class ExternalSession:
         """The modes that are to run, by stream."""
         self._channels: dict[str, _Channel] = {}
         self._running = False
+        self._lossless = False
         self._over = False
 
     @property
@@ -57,15 +60,22 @@ class ExternalSession:
             and answer.session == self.number
         )
 
-    def start(self) -> None:
-        """Say that the camera runs, and make the channels; the first :meth:`send` does it as well."""
+    def start(self, *, lossless: bool = False) -> None:
+        """Say that the camera runs, and make the channels; the first :meth:`send` does it as well.
+
+        A live camera cannot wait: a frame that nobody has read gives way to newer ones. With `lossless`, for files,
+        :meth:`send` and :meth:`lend` wait until the daemon has read earlier ones, and none gives way.
+        """
         self._camera._check()
         if self._over:
             raise ValueError("this session is over")
         if not self._running:
             bus, prefix = self._camera._bus, self._camera._prefix
+            # With no more slots than may wait unread, there is no slot for the frame that would replace one.
+            slots = layout.EXTERNAL_BUFFER if lossless else layout.EXTERNAL_FRAME_SLOTS
             for stream, mode in self.streams.items():
-                self._channels[stream] = _Channel(bus, f"{prefix}/frames/{stream}", mode)
+                self._channels[stream] = _Channel(bus, f"{prefix}/frames/{stream}", mode, slots)
+            self._lossless = lossless
             self._running = True
             self._camera._set_state(ExternalState.RUNNING)
 
@@ -113,8 +123,13 @@ class ExternalSession:
         return channel
 
     def _lend(self, channel: _Channel, length: int) -> Lent | None:
-        channel.sequence += 1
         slot = channel.sender.loan(length)
+        while slot is None and self._lossless:
+            if not self.wanted:
+                return None  # it was not sent, and is not lost: the next session may have it
+            time.sleep(_SLOT_PAUSE_S)
+            slot = channel.sender.loan(length)
+        channel.sequence += 1
         if slot is None:
             channel.no_slot += 1
             return None
@@ -126,6 +141,23 @@ class ExternalSession:
         After UNSUPPORTED and INVALID the camera is `failed`, after other reasons it is tried again.
         """
         self._finish(ExternalState.REFUSED, reason, text)
+
+    def finish(self, text: str, timeout: float = 10.0) -> bool:
+        """Say that there are no more frames, and wait until the daemon has taken those that were sent.
+
+        For files at their end; `text` is shown to the user. Returns whether the daemon said within `timeout` seconds
+        that it has them all. The session is over then; close the camera with `ExternalReason.FINISHED`.
+        """
+        if self._over:
+            return False
+        self._over = True
+        camera = self._camera
+        camera._set_state(ExternalState.REFUSED, ExternalReason.FINISHED, text)
+        # The channels stay until then, for a daemon that has not looked into them yet.
+        taken = camera._wait_for_stop(self.number, timeout)
+        camera._current = None
+        self._channels.clear()
+        return taken
 
     def close(self) -> None:
         """Say that the camera has stopped."""
@@ -158,11 +190,11 @@ class ExternalSession:
 class _Channel:
     """A stream of a session: where its frames go, and how many there were."""
 
-    def __init__(self, bus: Bus, name: str, mode: ExternalMode) -> None:
+    def __init__(self, bus: Bus, name: str, mode: ExternalMode, slots: int) -> None:
         self.mode = mode
         self.length = mode.frame_bytes
         self.shape, self.dtype = mode.shape, mode.dtype
-        self.sender = Sender(bus, name, FRAME, self.length, layout.EXTERNAL_FRAME_SLOTS, 0)
+        self.sender = Sender(bus, name, FRAME, self.length, slots, 0)
         self.sequence = 0
         self.no_slot = 0
 

@@ -120,7 +120,8 @@ fn serve(mut session: Session<'_>, behaviour: &str, frames: u64) {
             session.send(slot).unwrap();
         }
     }
-    session.refuse(ExternalReason::Finished, "the file is at its end");
+    let taken = session.finish("the file is at its end", Duration::from_secs(10));
+    println!("the daemon has it all: {taken}");
 }
 
 /// Offers something that cannot be, and prints what the daemon says to it.
@@ -152,6 +153,7 @@ fn offer_lie(place: &Place, modes: &[Mode], lie: &str) {
     match lie {
         "nothing_wrong" => {}
         "another_version" => offer.version = 2,
+        "another_size" => offer.size = 100,
         "fewer_modes" => offer.modes = 1,
         "no_name" => records[..32].copy_from_slice(&[0xFF; 32]),
         "nan_rate" => records[32..40].copy_from_slice(&f64::NAN.to_le_bytes()),

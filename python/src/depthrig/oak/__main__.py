@@ -20,6 +20,7 @@ from . import _sdk
 from ._errors import Exit, OakError
 
 if TYPE_CHECKING:
+    from ._bridge import Bridge
     from ._source import Source
 
 log = logging.getLogger("depthrig.oak")
@@ -31,7 +32,8 @@ in a rig file:
   backend = "external"
   command = ["python3", "-m", "depthrig.oak", "--serial", "18443010B1D25A0F00"]
 
-exit codes: 0 asked to stop, or files at their end; 2 this cannot work; 3 no such camera; 4 the camera is gone.
+exit codes: 0 asked to stop, or files at their end and all delivered; 2 this cannot work; 3 no such camera; 4 the camera
+is gone; 5 files at their end, and the daemon does not have all of their frames.
 """
 
 
@@ -97,9 +99,21 @@ def _run(options: argparse.Namespace) -> Exit:
                 return Exit.DONE
             if options.replay is not None:
                 camera.close(ExternalReason.FINISHED, "the files are at their end")
-                return Exit.DONE
+                return _account(bridge)
             camera.close(ExternalReason.DISCONNECTED, "the camera is gone: unplugged, or its firmware stopped")
     raise OakError("the camera is gone: unplugged, or its firmware stopped", Exit.LOST)
+
+
+def _account(bridge: Bridge) -> Exit:
+    """Return whether the daemon has all that was played."""
+    if bridge.missing:
+        what = ", ".join(f"{n} {stream}" for stream, n in bridge.missing.items())
+        log.error("frames of the files that the daemon did not get: %s", what)
+        return Exit.UNDELIVERED
+    if not bridge.confirmed:
+        log.error("every frame was sent, but the daemon did not say that it has taken the last ones")
+        return Exit.UNDELIVERED
+    return Exit.DONE
 
 
 def _source(options: argparse.Namespace, stack: contextlib.ExitStack) -> Source:
@@ -183,7 +197,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--runtime-dir", help="the runtime folder; by default this user's")
     parser.add_argument("--serial", help="the camera's serial number; needed when there are several")
     parser.add_argument("--replay", type=Path, metavar="FOLDER", help="play the files of FOLDER in place of a camera")
-    parser.add_argument("--once", action="store_true", help="play them once and end")
+    parser.add_argument("--once", action="store_true", help="play them once, from when the daemon wants frames, and end")
     parser.add_argument("--record", type=Path, metavar="FOLDER", help="also write every frame into FOLDER for --replay")
     parser.add_argument("--wait", type=float, default=5.0, metavar="SECONDS", help="how long to look for the camera")
     parser.add_argument("--list", action="store_true", help="list the cameras that are attached, and end")

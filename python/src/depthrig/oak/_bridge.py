@@ -6,6 +6,7 @@ import datetime
 import logging
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import depthai as dai
@@ -18,6 +19,7 @@ from .._external_session import ExternalSession
 from .._layout import ExternalClock, PixelFormat
 from . import _lens
 from ._errors import Exit, OakError
+from ._hopper import Hopper
 from ._source import Source
 
 log = logging.getLogger("depthrig.oak")
@@ -33,8 +35,8 @@ _FORMATS = {
 _TICK_PS = 1_000_000
 """The SDK gives times to the microsecond."""
 _FIRST_FRAME_S = 8.0
-"""How long a pipeline may take to its first frame; the daemon waits 14 s at most for all of it, and knows no reason."""
-_WAIT = datetime.timedelta(milliseconds=100)
+"""How long a pipeline may take to its first frame: less than the daemon's `start_timeout_s`, so that it learns why."""
+_WAIT_S = 0.1
 
 
 def microseconds(value: datetime.timedelta) -> int:
@@ -106,6 +108,11 @@ class Bridge:
         self.modes: list[ExternalMode] = []
         self.sent = dict.fromkeys(source.outputs, 0)
         """Frames that were sent, by stream."""
+        self.confirmed = False
+        """Whether the daemon said at the end of the files that it has taken what was sent."""
+        self._wanted: set[str] = set()
+        self._hopper = None if source.frames is None else Hopper(source.outputs)
+        self._held: list[tuple[str, dai.ImgFrame]] = []
 
     def start(self) -> None:
         """Start the pipeline and look at a frame of each stream.
@@ -114,6 +121,9 @@ class Bridge:
         """
         source = self._source
         source.open_queues()
+        if self._hopper is not None:
+            for name, queue in source.queues.items():
+                queue.addCallback(_into(self._hopper, name))
         try:
             source.pipeline.start()
         except RuntimeError as e:
@@ -123,6 +133,8 @@ class Bridge:
         while len(first) < len(source.queues):
             for stream, frame in self._frames():
                 first.setdefault(stream, frame)
+                if self._hopper is not None:
+                    self._held.append((stream, frame))
             silent = [stream for stream in source.queues if stream not in first]
             if silent and time.monotonic() > deadline:
                 raise OakError(f"no frame of {' and '.join(silent)} came within {_FIRST_FRAME_S:g} s", Exit.LOST)
@@ -135,9 +147,11 @@ class Bridge:
 
     def _frames(self) -> list[tuple[str, dai.ImgFrame]]:
         """Wait a moment for frames; return those there are, with their streams."""
+        if self._hopper is not None:
+            return self._hopper.take(_WAIT_S)
         queues = self._source.queues
         try:
-            dai.MessageQueue.waitAny(list(queues.values()), _WAIT)
+            dai.MessageQueue.waitAny(list(queues.values()), datetime.timedelta(seconds=_WAIT_S))
             found = [(stream, frame) for stream, queue in queues.items() for frame in queue.tryGetAll()]
         except dai.MessageQueue.QueueException:  # closed: the pipeline is at its end
             return []
@@ -148,31 +162,58 @@ class Bridge:
         """Whether frames may still come."""
         return bool(self._source.pipeline.isRunning())
 
+    @property
+    def missing(self) -> dict[str, int]:
+        """Frames of the files that the daemon did not get, of the streams that it wanted; all of them when it never did."""
+        frames = self._source.frames or {}
+        left = {stream: frames[stream] - self.sent[stream] for stream in self._wanted or frames}
+        return {stream: n for stream, n in left.items() if n > 0}
+
     def serve(self, camera: ExternalCamera) -> None:
         """Send frames as long as the daemon wants them, until the camera is stopped or the pipeline ends."""
-        while not camera.stopped:
-            session = camera.wait(0.0)
-            if session is not None:
-                with session:
-                    log.info("session %d: %s", session.number, ", ".join(map(str, session.streams.values())))
-                    session.start()
-                    while session.wanted:
-                        if not self._pass_on(session):
+        once = self._hopper is not None
+        try:
+            while not camera.stopped:
+                session = camera.wait(_WAIT_S if once else 0.0)
+                if session is not None:
+                    with session:
+                        if not self._play(session, once):
                             return
-            # Nobody wants them: they are taken all the same, or a session would begin with old ones.
-            elif not self._frames() and not self.is_running:
-                return
+                # Nobody wants them: they are taken all the same, or a session would begin with old ones. Those of files
+                # that are played once wait for somebody.
+                elif not once and not self._frames() and not self.is_running:
+                    return
+        finally:
+            if self._hopper is not None:
+                self._hopper.close()
+
+    def _play(self, session: ExternalSession, once: bool) -> bool:
+        """Send frames while the session lasts; false when no more will come."""
+        log.info("session %d: %s", session.number, ", ".join(map(str, session.streams.values())))
+        session.start(lossless=once)
+        self._wanted |= set(session.streams)
+        while session.wanted:
+            if not self._pass_on(session):
+                if once:
+                    self.confirmed = session.finish("the files are at their end")
+                return False
+        return True
 
     def _pass_on(self, session: ExternalSession) -> bool:
         """Send what came; false when no more will come."""
-        frames = self._frames()
+        running = self.is_running  # before looking: what comes at the very end is taken too
+        frames = self._held or self._frames()
+        self._held = []
         arrival_ns = time.monotonic_ns()
-        for stream, frame in frames:
-            if stream in session.streams:
-                self._send(session, stream, frame, arrival_ns)
-        return bool(frames) or self.is_running
+        for i, (stream, frame) in enumerate(frames):
+            if stream not in session.streams:
+                continue
+            if not self._send(session, stream, frame, arrival_ns) and self._hopper is not None:
+                self._held = frames[i:]  # for the next session
+                break
+        return bool(frames) or running
 
-    def _send(self, session: ExternalSession, stream: str, frame: dai.ImgFrame, arrival_ns: int) -> None:
+    def _send(self, session: ExternalSession, stream: str, frame: dai.ImgFrame, arrival_ns: int) -> bool:
         exposure_us = microseconds(frame.getExposureTime())
         # The SDK stamps the end of the exposure (depthai-core `ImgFrame.cpp`, MIT).
         middle = session.streams[stream].clock is ExternalClock.DEVICE
@@ -189,3 +230,14 @@ class Bridge:
             temperature_c=math.nan if temperature is None else float(temperature),
         )
         self.sent[stream] += sent
+        return sent
+
+
+def _into(hopper: Hopper, stream: str) -> Callable[[str, Any], None]:
+    """Return what the SDK calls with each message of a queue."""
+
+    def put(_: str, message: Any) -> None:
+        if isinstance(message, dai.ImgFrame):
+            hopper.put(stream, message)
+
+    return put

@@ -11,7 +11,7 @@ class Exit(enum.IntEnum):
     """Exit codes of the bridge. The daemon starts it again after each; `USAGE` is what only a human can cure."""
 
     DONE = 0
-    """It was asked to stop, or its files are at their end."""
+    """It was asked to stop, or its files are at their end and the daemon has every frame."""
     FAILED = 1
     """Something else; the message says what."""
     USAGE = 2
@@ -20,6 +20,8 @@ class Exit(enum.IntEnum):
     """The camera is not there, or somebody else has it."""
     LOST = 4
     """The camera was there and is gone: unplugged, or its firmware stopped."""
+    UNDELIVERED = 5
+    """Files were played to their end, and the daemon does not have all of their frames; the message says how many."""
 
 
 class OakError(DepthrigError):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import datetime
 import importlib
+import struct
 import time
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,12 @@ from ._source import CALIBRATION, Identity, Source
 
 _LAST_FRAMES_S = 0.5
 """How long the last frames have to be taken before the pipeline ends, and its queues with it."""
+# Of an MCAP file: a record is an opcode and a length; the footer is the last one, with the place of the summary.
+_RECORD = struct.Struct("<BQ")
+_FOOTER = struct.Struct("<BQQQI8s")
+_MAGIC = b"\x89MCAP0\r\n"
+_FOOTER_OPCODE, _STATISTICS_OPCODE = 2, 11
+_MOST_OF_A_SUMMARY = 64 << 20
 _PICTURES = (".png", ".jpg", ".jpeg")
 _STREAMS = ("color", "depth")
 _CLOCK_BEGINS = 100.0
@@ -44,8 +51,9 @@ def open_folder(
     files = {name: folder / f"{name}.mcap" for name in streams if (folder / f"{name}.mcap").is_file()}
     if files:
         outputs = _recordings(pipeline, files, loop)
+        counts = {} if loop else {name: _messages(path) for name, path in files.items()}
     else:
-        outputs = _pictures(pipeline, folder, streams, calibration, rate_hz, loop)
+        outputs, counts = _pictures(pipeline, folder, streams, calibration, rate_hz, loop)
     data = calibration.getEepromData() if calibration is not None else None
     model = (data.productName or data.deviceName or data.boardName) if data is not None else ""
     identity = Identity(
@@ -62,6 +70,7 @@ def open_folder(
         rate_hz=rate_hz,
         calibration=calibration,
         sockets=dict.fromkeys(outputs, dai.CameraBoardSocket.CAM_A),
+        frames=None if loop else counts,
         notes=[f"no camera: files of {folder} are played"],
     )
 
@@ -93,8 +102,8 @@ def _pictures(
     calibration: dai.CalibrationHandler | None,
     rate_hz: float,
     loop: bool,
-) -> dict[str, dai.Node.Output]:
-    """Add a node that makes frames of pictures."""
+) -> tuple[dict[str, dai.Node.Output], dict[str, int]]:
+    """Add a node that makes frames of pictures; returns its outputs and how many pictures each has."""
     paths = {name: _listed(folder / name) for name in streams}
     paths = {name: found for name, found in paths.items() if found}
     if not paths:
@@ -119,11 +128,13 @@ def _pictures(
             self.ports = {name: self.createOutput() for name in frames}
 
         def run(self) -> None:
-            began = time.monotonic()
+            began = start = time.monotonic()
             number = 0
             while self.isRunning() and (loop or number < next(iter(counts.values()))):
                 due = number / rate_hz
-                time.sleep(max(0.0, began + due - time.monotonic()))
+                if not loop:  # whoever takes the frames may have let this wait: what is late is not made good by a burst
+                    start = max(start, time.monotonic() - due)
+                time.sleep(max(0.0, start + due - time.monotonic()))
                 for name, port in self.ports.items():
                     pictures = frames[name]
                     picture = pictures[number % len(pictures)]
@@ -140,7 +151,33 @@ def _pictures(
             time.sleep(_LAST_FRAMES_S)
             self.stopPipeline()
 
-    return dict(pipeline.create(Pictures).ports)
+    return dict(pipeline.create(Pictures).ports), counts
+
+
+def _messages(path: Path) -> int:
+    """Return how many messages a recording says it has: the statistics in the summary of an MCAP file (mcap.dev/spec).
+
+    Raises OakError for a file that has none, as one has that was not written to its end.
+    """
+    with path.open("rb") as file:
+        size = file.seek(0, 2)
+        file.seek(max(0, size - _FOOTER.size))
+        end = file.read()
+        if len(end) == _FOOTER.size:
+            opcode, length, start, _, _, magic = _FOOTER.unpack(end)
+            if (opcode, length, magic) == (_FOOTER_OPCODE, 20, _MAGIC) and 0 < start < size:
+                file.seek(start)
+                summary = file.read(min(size - start, _MOST_OF_A_SUMMARY))
+                at = 0
+                while at + 9 <= len(summary):
+                    opcode, length = _RECORD.unpack_from(summary, at)
+                    if opcode == _STATISTICS_OPCODE and at + 17 <= len(summary):
+                        return int.from_bytes(summary[at + 9 : at + 17], "little")
+                    at += 9 + length
+    raise OakError(
+        f"{path} has no summary, so it was not written to its end; play it without --once, or record it again",
+        Exit.USAGE,
+    )
 
 
 def _listed(folder: Path) -> list[Path]:

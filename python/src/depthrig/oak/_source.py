@@ -41,6 +41,8 @@ class Source:
     """The sensor that each stream looks from."""
     notes: list[str] = field(default_factory=list)
     """What the user should know, one line each."""
+    frames: dict[str, int] | None = None
+    """Frames of each stream, for files that are played once; None for what never ends."""
     queues: dict[str, dai.MessageQueue] = field(default_factory=dict)
 
     def open_queues(self) -> None:
