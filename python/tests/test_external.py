@@ -347,7 +347,7 @@ def test_files_at_their_end_lose_nothing(camera: ExternalCamera, daemon: FakeDae
     heads = [daemon.frame("color")[0] for _ in range(20)]
     assert [h["sequence"] for h in heads] == list(range(1, 21)), "none gave way and none was counted as lost"
     sender.join(WAIT_S)
-    assert session.no_slot == {"color": 0}
+    assert session.no_slot["color"] == 0
     assert not session.finish("all played", timeout=0.3), "the daemon has not said that it has them"
     daemon.until(state=ExternalState.REFUSED, reason=ExternalReason.FINISHED, session=1, text="all played")
     daemon.run(2)
@@ -432,6 +432,11 @@ def test_how_a_process_ends_is_said(folder: Path) -> None:
     done = (ExternalReason.FINISHED, "the files are at their end")
     assert last(lambda camera: camera.close(*done)) == (0, *done)
     assert last(fail) == (0, ExternalReason.DEVICE, "KeyError: 'lens'")
+
+
+def test_without_a_rig_it_says_how_to_come_first(folder: Path) -> None:
+    with pytest.raises(depthrig.RigNotRunning, match=r"no rig is running in .*, or name the rig with rig=…"):
+        ExternalCamera("front", [COLOR], model="X1", serial="7", runtime_dir=folder)
 
 
 def test_stop_ends_the_sessions_from_any_thread(camera: ExternalCamera, daemon: FakeDaemon) -> None:

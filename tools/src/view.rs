@@ -234,8 +234,10 @@ fn trouble(camera: &CameraStatus, style: Style) -> Option<String> {
     for stream in camera.streams.iter().filter(|s| s.clock.metadata_lost > 0) {
         told.push(format!("{} had {} frames without metadata", stream.id, stream.clock.metadata_lost));
     }
-    if camera.reconnects > 0 {
-        told.push(format!("came back {} times", camera.reconnects));
+    match camera.reconnects {
+        0 => {}
+        1 => told.push("came back once".to_owned()),
+        n => told.push(format!("came back {n} times")),
     }
     for stream in camera.streams.iter().filter(|s| !s.derived && s.dropped.values().any(|n| *n > 0)) {
         told.push(format!("{} lost {}", stream.id, out::reasons(&stream.dropped)));

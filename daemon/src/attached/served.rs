@@ -55,7 +55,8 @@ pub(super) fn camera(served: Served, rigs: &[RigStatus]) -> AttachedCamera {
                 ErrorKind::PermissionDenied => UseState::Denied,
                 _ => UseState::Failed,
             };
-            camera.problems.push(format!("{holder}: {e}"));
+            let why = e.to_string();
+            camera.problems.push(if why.contains(&holder) { why } else { format!("{holder}: {why}") });
         }
     }
     camera

@@ -26,7 +26,7 @@ from ._header import blank_fields, pack_fields
 from ._layout import ExternalReason, ExternalState, ExternalWant
 from ._ports import ANSWER, OFFER, Bell, Letters, Sender
 from ._runtime import PathLike, check_name, pick_rig, runtime_dir
-from .errors import BusError, CameraRefused, CameraServed
+from .errors import BusError, CameraRefused, CameraServed, RigNotRunning
 
 # Who looks whether the lock is held holds it for an instant, so one refusal proves nothing.
 _LOCK_ATTEMPTS, _LOCK_PAUSE_S = 20, 0.01
@@ -81,7 +81,10 @@ class ExternalCamera:
         if not model:
             raise ValueError(f"camera {name!r}: what model is it? The daemon takes none without a name")
         folder = _runtime_dir(runtime_dir)
-        self.rig = pick_rig(folder, rig if rig is not None else os.environ.get(layout.EXTERNAL_RIG_VARIABLE))
+        try:
+            self.rig = pick_rig(folder, rig if rig is not None else os.environ.get(layout.EXTERNAL_RIG_VARIABLE))
+        except RigNotRunning as e:
+            raise RigNotRunning(f"{e}, or name the rig with rig=…: then this camera may come first") from None
         self._pid = os.getpid()
         self._program = program or os.path.basename(sys.argv[0]) or "python"
         self._lock = _lock(folder, self.rig, self.name, self._program)

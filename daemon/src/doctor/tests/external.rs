@@ -82,6 +82,10 @@ fn cameras_of_other_processes_are_planned_by_what_those_offer() {
         "{:?}",
         report.findings
     );
+    let text = "process 4711 (oak) serves it and has said nothing for 2.0 s";
+    let e = depthrig_drivers::Error::new(ErrorKind::Disconnected, text);
+    let report = served_report(SERVED, Some(Err(e)));
+    assert_eq!(report.findings[0].what, text, "it is named once");
 }
 
 #[test]
