@@ -18,11 +18,16 @@ command -v cargo-fuzz >/dev/null ||
 mode=${1:-3600}
 shift || true
 targets=("$@")
-[ ${#targets[@]} -gt 0 ] || mapfile -t targets < <(sed -nE 's/^name = "([a-z_]+)"$/\1/p' Cargo.toml)
+built=("$@")
+# Without a name cargo-fuzz builds all of them at once.
+[ ${#built[@]} -gt 0 ] || built=("")
+[ ${#targets[@]} -gt 0 ] || mapfile -t targets < <(sed -nE 's/^name = "([a-z0-9_]+)"$/\1/p' Cargo.toml)
 
 # Without a sanitizer: depthrig's code is safe Rust, where a bad access is a panic.
 # With --release cargo-fuzz leaves assertions to the profiles in Cargo.toml; without it, it switches on those of all crates.
-cargo fuzz build --fuzz-dir . --release --sanitizer none
+for target in "${built[@]}"; do
+    cargo fuzz build --fuzz-dir . --release --sanitizer none ${target:+"$target"}
+done
 binaries=target/$(rustc -vV | sed -n 's/host: //p')/release
 
 mkdir -p logs
