@@ -3,13 +3,16 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use core::cell::Cell;
-use depthrig_bus::external::{About, ExternalCamera, ExternalFrame, Mode, Place};
+use depthrig_bus::external::{About, ExternalCamera, ExternalFrame, HEARTBEAT, Mode, Place};
 use depthrig_bus::{DropReason, HostTime, Name, PixelFormat, RuntimeDir};
 use depthrig_drivers::clock::ClockQuality;
 use depthrig_drivers::external::{ExternalBackend, ExternalConfig};
 use depthrig_drivers::{Backend, FrameMeta, FrameSink, Poll};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::time::Duration;
+
+const RATE_HZ: u64 = 200;
+const FRAMES: u64 = 500;
 
 struct Counting;
 
@@ -55,7 +58,7 @@ fn a_frame_takes_no_memory() {
     let dir = tempfile::tempdir().unwrap();
     let runtime = RuntimeDir::at(dir.path()).unwrap();
     let place = Place { runtime, rig: Name::new("rig").unwrap(), camera: Name::new("cam").unwrap() };
-    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Rgb8, (64, 48), 200.0);
+    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Rgb8, (64, 48), RATE_HZ as f64);
     let mode = mode.with_device_clock(32, 1_000_000, 32);
     let about = About { model: "Bench".into(), ..About::default() };
     let mut camera = ExternalCamera::offer(&place, &about, &[mode]).unwrap();
@@ -87,10 +90,17 @@ fn a_frame_takes_no_memory() {
     };
     // The clock map takes its memory in its first seconds.
     run(&mut stream, &mut sink, 1500);
-    let before = OWN.get();
-    run(&mut stream, &mut sink, 500);
+    let (before, began) = (OWN.get(), HostTime::now());
+    run(&mut stream, &mut sink, FRAMES);
     let taken = OWN.get() - before;
-    assert_eq!(taken, 0, "500 frames and the heart-beats between them took memory {taken} times");
+    // What comes a few times a second may: a heart-beat of each side, and a word on the clock once in `RATE_HZ` frames.
+    let beats = began.elapsed().as_secs_f64() / HEARTBEAT.as_secs_f64();
+    let others = 2 * (beats as u64 + 1) + FRAMES / RATE_HZ + 1;
+    assert!(others < FRAMES / 2, "the computer is so slow that this says nothing: {beats} heart-beats");
+    assert!(
+        taken <= others,
+        "{FRAMES} frames, {beats:.0} heart-beats between them: memory was taken {taken} times"
+    );
     drop(stream);
     process.join().unwrap();
 }

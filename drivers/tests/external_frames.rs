@@ -138,3 +138,31 @@ fn frames_at_the_end_of_files_are_taken_and_the_process_hears_it() {
     drop(stream);
     assert!(process.join().unwrap());
 }
+
+#[test]
+fn a_process_that_stops_by_itself_is_disconnected() {
+    let dir = tempfile::tempdir().unwrap();
+    let place = place(&dir);
+    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Mono8, (8, 6), 100.0);
+    let about = About { model: "Bench".into(), ..About::default() };
+    let mut camera = ExternalCamera::offer(&place, &about, &[mode]).unwrap();
+    let (done, wait) = std::sync::mpsc::channel::<()>();
+    let process = std::thread::spawn(move || {
+        let mut session = camera.next_session(WAIT).unwrap().unwrap();
+        send(&mut session, 1, |_| ());
+        drop(session);
+        let _ = wait.recv(); // it goes on offering
+    });
+    let (mut stream, mut sink) = (open(&place), MemorySink::default());
+    let deadline = HostTime::now().plus(WAIT);
+    let e = loop {
+        assert!(!deadline.from_now().is_zero(), "nothing was noticed");
+        if let Err(e) = stream.poll(Duration::from_millis(20), &mut sink) {
+            break e;
+        }
+    };
+    assert_eq!((e.kind(), sink.frames.len()), (ErrorKind::Disconnected, 1));
+    assert!(e.to_string().contains("stopped the camera by itself"), "{e}");
+    drop(done);
+    process.join().unwrap();
+}

@@ -144,8 +144,10 @@ impl FactoryCalibration {
         for (i, (name, c)) in known().enumerate() {
             let to_right = DQuat::from_array(c.right_in_left.rotation_xyzw).inverse();
             let t = to_right * DVec3::from_array(c.right_in_left.translation_m) * 1000.0;
-            let r = to_right.to_scaled_axis();
+            // To picometres and picoradians: what turning them left of rounding would put a number at its limit beyond it.
+            let r = (to_right.to_scaled_axis() * 1e12).round() / 1e12;
             if i == 0 {
+                let t = (t * 1e9).round() / 1e9;
                 let _ = writeln!(text, "Baseline={}\nTY={}\nTZ={}", t.x, t.y, t.z);
             }
             let _ = writeln!(text, "CV_{name}={}\nRX_{name}={}\nRZ_{name}={}", r.y, r.x, r.z);
