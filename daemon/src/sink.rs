@@ -1,6 +1,6 @@
 //! From a driver to the bus: pixels are written once, into the slot that subscribers read.
 
-use crate::stream::{Books, Stream};
+use crate::stream::{Books, Reached, Stream};
 use crate::wake::Wake;
 use depthrig_bus::{DropReason, FrameFlags, FrameHeader, FrameMut, HostTime, MetadataLevel, Publisher};
 use depthrig_drivers::clock::ClockQuality;
@@ -137,6 +137,19 @@ impl FrameSink for BusSink {
         if books.may_log_loss(HostTime::now()) {
             let (id, total) = (&port.stream.id, books.dropped.total());
             tracing::error!(stream = %id, reason = reason.name(), frames = n, total, "frames lost");
+        }
+    }
+
+    fn gave_way(&mut self, stream: usize, n: u64) {
+        let Some(port) = self.streams.get(stream) else { return };
+        let Some(mut books) = port.books() else { return };
+        books.dropped.add(DropReason::QueueFull, n);
+        if let Some(Reached { made_hz, of_hz }) = books.gave_way(HostTime::now()) {
+            let (id, reason) = (&port.stream.id, DropReason::QueueFull.name());
+            tracing::info!(
+                stream = %id,
+                "computed at {made_hz:.1} of {of_hz:.1} Hz, the newest first; what gives way is counted as {reason}"
+            );
         }
     }
 

@@ -13,6 +13,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Frames over which latency and rate are measured.
 const WINDOW: usize = 256;
+/// How long frames of a computed stream give way until the rate that is reached is told.
+const SETTLED_NS: i64 = 10_000_000_000;
 
 /// One stream of a rig.
 #[derive(Debug)]
@@ -62,6 +64,28 @@ pub struct Books {
     pub clock: Option<ClockQuality>,
     recent: VecDeque<(HostTime, i64)>,
     loss_logged: Option<HostTime>,
+    gives_way: GivesWay,
+}
+
+/// Of a computed stream: since when its frames give way to newer ones, and whether that was said.
+#[derive(Debug, Clone, Copy, Default)]
+enum GivesWay {
+    /// None did.
+    #[default]
+    Never,
+    /// Since this moment, when so many frames were captured and delivered.
+    Since(HostTime, u64, u64),
+    /// It was said.
+    Said,
+}
+
+/// How many frames of a computed stream are made, of how many that could be.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reached {
+    /// Delivered, frames a second.
+    pub made_hz: f64,
+    /// Captured, frames a second.
+    pub of_hz: f64,
 }
 
 impl Stream {
@@ -80,6 +104,10 @@ impl Books {
     /// Begins a new opening of the camera and returns its number.
     pub fn begin_session(&mut self) -> u64 {
         self.session += 1;
+        if let GivesWay::Since(..) = self.gives_way {
+            // The time without a camera must not count.
+            self.gives_way = GivesWay::Never;
+        }
         if self.session > 1 {
             self.epoch_base = self.epoch + 1;
         }
@@ -102,6 +130,24 @@ impl Books {
             self.loss_logged = Some(now);
         }
         may
+    }
+
+    /// Notes that a frame of this stream, which is computed, gave way to a newer one at `now`. Returns what to tell of
+    /// it, once: the rate that was reached over the ten seconds since the first one, or a little more.
+    pub fn gave_way(&mut self, now: HostTime) -> Option<Reached> {
+        match self.gives_way {
+            GivesWay::Never => self.gives_way = GivesWay::Since(now, self.captured, self.delivered),
+            GivesWay::Since(since, captured, delivered) if now.since_ns(since) >= SETTLED_NS => {
+                self.gives_way = GivesWay::Said;
+                let hz = |n: u64| n as f64 * 1e9 / now.since_ns(since) as f64;
+                return Some(Reached {
+                    made_hz: hz(self.delivered - delivered),
+                    of_hz: hz(self.captured - captured),
+                });
+            }
+            GivesWay::Since(..) | GivesWay::Said => {}
+        }
+        None
     }
 
     /// Notes a published frame.
@@ -159,6 +205,28 @@ mod tests {
         assert_eq!(books.captured, books.delivered + books.dropped.total());
         assert_eq!(books.dropped.get(DropReason::Abandoned), 1);
         assert_ne!(books.session, session);
+    }
+
+    #[test]
+    fn that_computed_frames_give_way_is_told_once_with_the_rate() {
+        let mut books = Books::default();
+        let at = |ms: i64| HostTime::from_ns(1_000_000_000 + ms * 1_000_000);
+        assert_eq!(books.gave_way(at(0)), None);
+        // The camera goes away for an hour, which is no time of computing.
+        books.begin_session();
+        let (hour, mut told) = (3_600_000, Vec::new());
+        for i in 0..600 {
+            books.captured += 1;
+            if i % 4 == 3 {
+                books.delivered += 1;
+                continue;
+            }
+            books.dropped.add(DropReason::QueueFull, 1);
+            told.extend(books.gave_way(at(hour + i * 100 / 3)).map(|r| (i, r)));
+        }
+        let [(300, Reached { made_hz, of_hz })] = told[..] else { panic!("{told:?}") };
+        assert!((made_hz - 7.5).abs() < 0.1 && (of_hz - 30.0).abs() < 0.1, "{told:?}");
+        assert!(books.may_log_loss(at(hour)), "no loss was logged");
     }
 
     #[test]

@@ -234,6 +234,15 @@ impl FrameSink for Guarded<'_> {
         self.sink.dropped(stream, reason, n);
     }
 
+    fn gave_way(&mut self, stream: usize, n: u64) {
+        self.note_frame();
+        if self.is_abandoned() {
+            self.sink.dropped(stream, DropReason::Abandoned, n);
+        } else {
+            self.sink.gave_way(stream, n);
+        }
+    }
+
     fn captured(&mut self, stream: usize, n: u64) {
         self.sink.captured(stream, n);
     }

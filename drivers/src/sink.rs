@@ -34,6 +34,12 @@ pub trait FrameSink {
     /// Says that `n` frames of `stream` were lost.
     fn dropped(&mut self, stream: usize, reason: DropReason, n: u64);
 
+    /// Says that `n` frames of `stream`, which is computed, were not made because newer ones came first. That is by
+    /// design and no fault: it is counted as [`DropReason::QueueFull`], and a log need not speak of it again and again.
+    fn gave_way(&mut self, stream: usize, n: u64) {
+        self.dropped(stream, DropReason::QueueFull, n);
+    }
+
     /// Says that the device captured `n` more frames on `stream`; each of them is committed or dropped next.
     fn captured(&mut self, stream: usize, n: u64);
 

@@ -15,9 +15,9 @@ impl<F: FnMut(Duration, &mut dyn FrameSink) -> Result<Poll> + Send> Stream for A
     }
 }
 
-/// Counts commits and remembers what was dropped.
+/// Counts commits, remembers what was dropped and counts what gave way.
 #[derive(Clone, Default)]
-struct Counting(Arc<Mutex<(u64, Vec<DropReason>)>>);
+struct Counting(Arc<Mutex<(u64, Vec<DropReason>, u64)>>);
 
 impl FrameSink for Counting {
     fn loan(&mut self, _: usize, _: usize) -> Option<&mut [u8]> {
@@ -29,6 +29,9 @@ impl FrameSink for Counting {
     fn discard(&mut self, _: usize) {}
     fn dropped(&mut self, _: usize, reason: DropReason, _: u64) {
         self.0.lock().unwrap().1.push(reason);
+    }
+    fn gave_way(&mut self, _: usize, n: u64) {
+        self.0.lock().unwrap().2 += n;
     }
     fn captured(&mut self, _: usize, _: u64) {}
     fn clock_quality(&mut self, _: usize, _: &ClockQuality) {}
@@ -72,6 +75,21 @@ fn a_quiet_device_stops_at_once() {
 }
 
 #[test]
+fn what_gives_way_is_no_loss_while_somebody_listens() {
+    let sink = Counting::default();
+    let capture = start(&sink, |_, sink| {
+        sink.gave_way(0, 1);
+        std::thread::sleep(Duration::from_millis(1));
+        Ok(Poll::Idle)
+    });
+    while sink.0.lock().unwrap().2 < 3 {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    assert!(matches!(capture.stop(Duration::from_secs(5)), StopOutcome::Ended(End::Stopped)));
+    assert!(sink.0.lock().unwrap().1.is_empty());
+}
+
+#[test]
 fn a_failing_and_a_panicking_driver_end_with_their_reason() {
     for panics in [false, true] {
         let capture = start(&Counting::default(), move |_, _| {
@@ -107,10 +125,10 @@ fn a_hung_device_is_abandoned_and_publishes_nothing_when_it_wakes() {
     assert!(matches!(capture.stop(Duration::from_millis(100)), StopOutcome::Abandoned));
     assert!(began.elapsed() < Duration::from_secs(2));
     wake.store(true, Ordering::SeqCst);
-    while *sink.0.lock().unwrap() == (0, vec![]) {
+    while *sink.0.lock().unwrap() == (0, vec![], 0) {
         std::thread::sleep(Duration::from_millis(1));
     }
-    assert_eq!(*sink.0.lock().unwrap(), (0, vec![DropReason::Abandoned]));
+    assert_eq!(*sink.0.lock().unwrap(), (0, vec![DropReason::Abandoned], 0));
 }
 
 #[test]

@@ -221,11 +221,16 @@ impl Pairing {
         }
     }
 
-    /// The camera sends no more.
-    fn end(&mut self, sink: &mut dyn FrameSink) {
+    /// The left picture that waits, if one does, will have no partner.
+    fn give_up_left(&mut self, sink: &mut dyn FrameSink) {
         if self.have[0].take().is_some() {
             self.lose(DropReason::Incomplete, 1, sink);
         }
+    }
+
+    /// The camera sends no more.
+    fn end(&mut self, sink: &mut dyn FrameSink) {
+        self.give_up_left(sink);
         self.have = [None; 2];
     }
 
@@ -344,7 +349,10 @@ fn announce(streams: Outlets, step: Step<FrameMeta>, sink: &mut dyn FrameSink) {
     let Step::Lost(reason, n) = step else { return };
     for (stream, _) in streams.into_iter().flatten() {
         sink.captured(stream, n);
-        sink.dropped(stream, reason, n);
+        match reason {
+            DropReason::QueueFull => sink.gave_way(stream, n),
+            reason => sink.dropped(stream, reason, n),
+        }
     }
 }
 
@@ -393,8 +401,9 @@ impl FrameSink for Tee<'_> {
             self.sink.dropped(own, reason, n);
         }
         if stream == self.pairing.eyes[0] {
-            // A left picture that still waits came before these.
-            self.pairing.end(self.sink);
+            // A left picture that still waits came before these. A right one may belong to the next left one, of which
+            // a gap before it is told first.
+            self.pairing.give_up_left(self.sink);
             self.pairing.lose(reason, n, self.sink);
         }
     }

@@ -28,6 +28,9 @@ enum Shot {
     LeftDamaged,
     /// So many pictures of both eyes are skipped.
     Gap(u64),
+    /// One eye's picture of this number alone, so much later than others of its number, whole or damaged; its pixels
+    /// are its number.
+    One(usize, u64, i64, bool),
 }
 
 struct Made {
@@ -115,13 +118,25 @@ impl Stream for MadeStream {
         let Some(shot) = self.shots.get(self.at).copied() else { return Ok(Poll::End) };
         std::thread::sleep(self.pause.min(timeout));
         self.at += 1;
+        if let Shot::One(eye, number, late_ns, is_whole) = shot {
+            let ticks = (1_000_000_000 + number * 33_333_333).saturating_add_signed(late_ns);
+            let picture = vec![number as u8; self.profiles[eye].frame_bytes()];
+            let arrival = HostTime::from_ns(ticks as i64 + 1000);
+            let mut raw = RawFrame::new(number, ticks, arrival, picture.len());
+            raw.damaged = !is_whole;
+            self.gates[eye].deliver(&raw, sink, |memory| {
+                memory.copy_from_slice(&picture);
+                Ok(())
+            });
+            return Ok(Poll::Frame);
+        }
         self.sequence += if let Shot::Gap(n) = shot { n } else { 1 };
         // Stamps of a camera at 30 Hz, all of them in the past.
         let ticks = 1_000_000_000 + self.sequence * 33_333_333;
         for (i, gate) in self.gates.iter_mut().enumerate() {
             let format = self.profiles[i].format;
             let picture = match shot {
-                Shot::Gap(_) => continue,
+                Shot::Gap(_) | Shot::One(..) => continue,
                 Shot::Only(eye) if eye != i => continue,
                 Shot::Wall(d) if (i == 1) != self.swapped => noise(format, d),
                 _ => noise(format, 0),
@@ -139,9 +154,9 @@ impl Stream for MadeStream {
     }
 }
 
-/// A sink that holds the accounts of every frame to the rule.
+/// A sink that holds the accounts of every frame to the rule, and counts what gave way by design.
 #[derive(Default)]
-struct Strict(MemorySink);
+struct Strict(MemorySink, u64);
 
 impl FrameSink for Strict {
     fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]> {
@@ -159,6 +174,10 @@ impl FrameSink for Strict {
     }
     fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
         self.0.dropped(stream, reason, n);
+    }
+    fn gave_way(&mut self, stream: usize, n: u64) {
+        self.1 += n;
+        self.0.dropped(stream, DropReason::QueueFull, n);
     }
     fn captured(&mut self, stream: usize, n: u64) {
         self.0.captured(stream, n);
@@ -337,7 +356,9 @@ fn a_slow_mode_skips_pairs_counts_them_and_holds_up_nobody() {
     let quick = sink.0.delivered(i("depth_quick"));
     drop(release);
     while stream.poll(Duration::from_millis(5), &mut sink).unwrap() != Poll::End {}
-    let sink = sink.0;
+    let Strict(sink, by_design) = sink;
+    let queue_full: u64 = sink.drops.iter().map(|d| d.get(DropReason::QueueFull)).sum();
+    assert!(by_design > 0 && by_design == queue_full, "{by_design} of {queue_full} are said to be no fault");
     // The first that came through, and the newest that waited for it.
     assert_eq!(sink.delivered(i("depth_slow")), if quick > 1 { 2 } else { 1 }, "of {quick}");
     let skipped = sink.drops_of(i("depth_slow"));
@@ -387,6 +408,110 @@ fn pairs_that_lack_an_eye_are_counted() {
     assert_eq!(drops.get(DropReason::DeviceError), 1);
     assert_eq!(drops.get(DropReason::DeviceGap), 5, "four, and the one of which only the right picture came");
     assert_eq!(sink.captured[depth], sink.captured[left], "one for every left picture");
+}
+
+/// A matcher that fails unless both pictures have the same number.
+struct SameNumber;
+
+impl Matcher for SameNumber {
+    fn describe(&self) -> Description {
+        let text = String::new;
+        Description { producer: text(), name: text(), parameters: text(), memory_bytes: 0 }
+    }
+
+    fn run(&mut self, pair: &StereoPair<'_>, out: &mut DisparityMap) -> depthrig_calib::Result<()> {
+        let middle = pair.left.pixels.len() / 2 + 80;
+        if pair.left.pixels[middle] != pair.right.pixels[middle] {
+            let e = depthrig_calib::ErrorKind::BadInput;
+            return Err(depthrig_calib::Error::new(e, "pictures of two pairs"));
+        }
+        out.resize(pair.left.width, pair.left.height);
+        Ok(())
+    }
+}
+
+/// Plays `shots`; the numbers of the pairs that depth was made of, each with its time after the left picture's, and
+/// what was lost.
+fn pairs(shots: &[Shot]) -> (Vec<(u64, i64)>, depthrig_bus::DropCounts) {
+    let make: Maker = Arc::new(|_| Ok(Box::new(SameNumber)));
+    let mode = StereoMode { name: "same".into(), wants_color: false, make };
+    let (sink, profiles) = play(Made::new(PixelFormat::Mono8, shots), options(vec![mode]), &[]);
+    let depth = index(&profiles, "depth_same");
+    let drops = sink.drops_of(depth);
+    assert_eq!(drops.get(DropReason::DeviceError), shots.iter().filter(|s| is_bad_left(s)).count() as u64);
+    assert_eq!(sink.captured[depth], sink.captured[index(&profiles, "left")], "one for every left picture");
+    let made = sink.frames.iter().filter(|f| f.0 == depth).map(|(_, meta, _)| {
+        let n = meta.device_sequence;
+        (n, meta.capture_time.ns() - (1_000_000_000 + n as i64 * 33_333_333))
+    });
+    (made.collect(), drops)
+}
+
+fn is_bad_left(shot: &Shot) -> bool {
+    matches!(shot, Shot::One(0, _, _, false))
+}
+
+const L: usize = 0;
+const R: usize = 1;
+
+/// The picture `n` of an eye.
+fn one(eye: usize, n: u64) -> Shot {
+    Shot::One(eye, n, 0, true)
+}
+
+#[test]
+fn either_eye_may_come_first() {
+    let left_first = (1..6).flat_map(|n| [one(L, n), one(R, n)]).collect::<Vec<_>>();
+    let right_first = (1..6).flat_map(|n| [one(R, n), one(L, n)]).collect::<Vec<_>>();
+    let in_turn =
+        (1..6).flat_map(|n| if n % 2 == 0 { [one(R, n), one(L, n)] } else { [one(L, n), one(R, n)] });
+    for shots in [left_first, right_first, in_turn.collect()] {
+        let (made, drops) = pairs(&shots);
+        assert_eq!(made, [(1, 0), (2, 0), (3, 0), (4, 0), (5, 0)], "{shots:?}");
+        assert_eq!(drops.total(), 0);
+    }
+}
+
+#[test]
+fn an_eye_that_is_lost_costs_its_own_pair_alone() {
+    // The right one of the second, then the left one of the fourth, in either order of arrival.
+    for order in [[L, R], [R, L]] {
+        let shots: Vec<_> = (1..7)
+            .flat_map(|n| order.map(|eye| one(eye, n)))
+            .filter(|s| !matches!(s, Shot::One(R, 2, ..) | Shot::One(L, 4, ..)))
+            .collect();
+        let (made, drops) = pairs(&shots);
+        assert_eq!(made, [(1, 0), (3, 0), (5, 0), (6, 0)], "{order:?}");
+        let counts = [DropReason::Incomplete, DropReason::DeviceGap].map(|r| drops.get(r));
+        assert_eq!(counts, [1, 1], "{order:?}");
+    }
+    // A left picture whose partner is still to come gives way to what is known of the next one.
+    let late = [one(L, 1), Shot::One(L, 2, 0, false), one(R, 1), one(R, 2), one(L, 3), one(R, 3)];
+    let (made, drops) = pairs(&late);
+    assert_eq!((made.as_slice(), drops.get(DropReason::Incomplete)), (&[(3, 0)][..], 1));
+    // At the end nobody waits any longer.
+    let (made, drops) = pairs(&[one(R, 1), one(L, 1), one(L, 2)]);
+    assert_eq!((made.len(), drops.get(DropReason::Incomplete)), (1, 1));
+}
+
+#[test]
+fn a_pair_is_two_pictures_within_a_quarter_of_a_period() {
+    for order in [[L, R], [R, L]] {
+        for late_ns in [-8_300_000, -1, 1, 8_300_000, -8_400_000, 8_400_000, 16_000_000] {
+            let at = |eye, n| Shot::One(eye, n, if eye == R { late_ns } else { 0 }, true);
+            let shots: Vec<_> = (1..5).flat_map(|n| order.map(|eye| at(eye, n))).collect();
+            let (made, drops) = pairs(&shots);
+            // Its time is the left one's, and its number.
+            let whole = [(1, 0), (2, 0), (3, 0), (4, 0)];
+            let near = i64::abs(late_ns) < 8_333_333;
+            assert_eq!(made, if near { &whole[..] } else { &[] }, "{order:?}, {late_ns} ns apart");
+            assert_eq!(
+                drops.get(DropReason::Incomplete),
+                if near { 0 } else { 4 },
+                "{order:?}, {late_ns} ns apart"
+            );
+        }
+    }
 }
 
 #[test]
