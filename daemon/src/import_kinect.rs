@@ -15,7 +15,7 @@ use depthrig_recorder::exchange::{ImportFacts, ImportProgress, Importer};
 use depthrig_recorder::{
     Error, ErrorKind, RecordFrame, RecordSet, Result, Session, StreamAccount, StreamRecord,
 };
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 
 /// The name of the layout.
@@ -50,7 +50,11 @@ pub struct KinectImport {
     /// UTC at the device's time 0, nanoseconds.
     origin_ns: i64,
     sets: u64,
+    motion_track: Option<usize>,
+    /// Samples of motion that were left out.
     motion: u64,
+    /// Blocks of tracks that are no camera's, which were left out.
+    others: u64,
     ended: bool,
     facts: ImportFacts,
 }
@@ -122,7 +126,9 @@ impl KinectImport {
             delays_us,
             origin_ns: facts.date_utc_ns.unwrap_or(0).saturating_sub(start_ns),
             sets: 0,
+            motion_track: recording.track(TrackKind::Motion).map(|(track, _)| track),
             motion: 0,
+            others: 0,
             ended: false,
             facts: ImportFacts::default(),
             path: path.to_path_buf(),
@@ -153,7 +159,7 @@ impl KinectImport {
         }
         if facts.tracks.iter().any(|t| t.kind == TrackKind::Motion) {
             stated.push(
-                "samples of accelerometer and gyroscope are left out, a dataset holds pictures".to_owned(),
+                "the track of accelerometer and gyroscope is left out, a dataset holds pictures".to_owned(),
             );
         }
         for t in facts.tracks.iter().filter(|t| t.kind == TrackKind::Other) {
@@ -167,7 +173,11 @@ impl KinectImport {
         let Some(block) = self.recording.next_block().map_err(of_driver)? else { return Ok(false) };
         let (device_us, track) = (block.device_us, block.track);
         let Some(at) = self.streams.iter().position(|s| s.track == track) else {
-            self.motion += block.frames().map(|f| motion_samples(f).count() as u64).sum::<u64>();
+            if self.motion_track == Some(track) {
+                self.motion += block.frames().map(|f| motion_samples(f).count() as u64).sum::<u64>();
+            } else {
+                self.others += 1;
+            }
             return Ok(true);
         };
         let pixels: Vec<_> = block.frames().map(<[u8]>::to_vec).collect();
@@ -255,14 +265,18 @@ impl KinectImport {
         if losses.places > 0 {
             let (places, bytes) = (losses.places, losses.bytes);
             let cut = if self.recording.facts().is_cut { "; the file was cut off" } else { "" };
+            let places = if places == 1 { "one place".to_owned() } else { format!("{places} places") };
             self.facts.lose(format!(
-                "{}: {bytes} bytes at {places} places are damaged or cut off and left out{cut}",
+                "{}: {bytes} bytes at {places} are damaged or cut off and left out{cut}",
                 self.path.display()
             ));
         }
-        if self.motion > 0 {
-            self.facts.stated.push(format!("{} samples of motion were left out", self.motion));
-        }
+    }
+
+    /// How much of what was read a dataset does not hold.
+    fn left_out(&self) -> BTreeMap<String, u64> {
+        let counts = [("motion_samples", self.motion), ("blocks_of_other_tracks", self.others)];
+        counts.into_iter().filter(|(_, n)| *n > 0).map(|(what, n)| (what.to_owned(), n)).collect()
     }
 }
 
@@ -385,6 +399,12 @@ impl Importer for KinectImport {
 
     fn facts(&self) -> ImportFacts {
         let mut facts = self.facts.clone();
+        if self.motion > 0 {
+            let what =
+                format!("{} samples of accelerometer and gyroscope were left out with it", self.motion);
+            facts.stated.push(what);
+        }
+        facts.left_out = self.left_out();
         let account = |s: &Stream| StreamAccount {
             stream: s.record.id.clone(),
             captured: s.sequence.saturating_add(s.dropped.total()),

@@ -4,10 +4,11 @@
 use depthrig_bus::{DropReason, Name, PixelFormat};
 use depthrig_daemon::import_kinect::{KinectImport, KinectOptions};
 use depthrig_drivers::kinect::playback::CalibrationSource;
+use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
 use depthrig_kinect_fixture::{Fixture, Pattern, Pictures};
 use depthrig_recorder::exchange::{ImportReport, import};
 use depthrig_recorder::fs::RealFs;
-use depthrig_recorder::{Dataset, ErrorKind, PixelMode, RecorderOptions, Result};
+use depthrig_recorder::{ColorCodec, Dataset, DatasetSet, ErrorKind, PixelMode, RecorderOptions, Result};
 use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
@@ -21,7 +22,8 @@ fn options(calibration: CalibrationSource) -> KinectOptions {
 
 fn run(path: &Path, out: &Path, calibration: CalibrationSource) -> Result<ImportReport> {
     let mut importer = KinectImport::open(path, options(calibration))?;
-    let recorder = RecorderOptions::default();
+    // As the program does it when it is not told otherwise.
+    let recorder = RecorderOptions { color: ColorCodec::Raw, ..RecorderOptions::default() };
     import(&mut importer, Arc::new(RealFs), out, recorder, &mut |p| {
         assert!(p.done <= p.total);
         ControlFlow::Continue(())
@@ -111,4 +113,187 @@ fn without_a_calibration_it_says_what_to_do() {
     std::fs::write(&path, b"<html>404</html>").unwrap();
     let e = run(&path, &dir.path().join("b"), CalibrationSource::Recorded).unwrap_err();
     assert!(e.to_string().contains("no Matroska file"), "{e}");
+}
+
+/// Writes `fixture` and imports it into a folder of this name.
+fn imported(dir: &Path, name: &str, fixture: &Fixture) -> (ImportReport, Dataset) {
+    let (path, out) = (dir.join(format!("{name}.mkv")), dir.join(name));
+    fixture.write(&path, &mut Pattern::new(fixture)).unwrap();
+    let report = run(&path, &out, CalibrationSource::Recorded).unwrap();
+    assert!(report.verified.is_whole(), "{name}: {:?}", report.verified);
+    (report, Dataset::open(&out).unwrap())
+}
+
+fn words(pixels: Vec<u16>) -> Vec<u8> {
+    pixels.into_iter().flat_map(u16::to_le_bytes).collect()
+}
+
+fn sets(dataset: &Dataset, mode: PixelMode) -> Vec<DatasetSet> {
+    let mut reader = dataset.set_reader().unwrap();
+    (0..reader.times().len()).map(|i| reader.read(i, mode).unwrap()).collect()
+}
+
+#[test]
+fn every_colour_format_and_every_depth_mode_keeps_its_pixels() {
+    let dir = tempfile::tempdir().unwrap();
+    let color = |format| Some(ColorMode { format, resolution: ColorResolution::P720 });
+    let small = || Fixture { captures: 3, motion: false, ..Fixture::small() };
+    let forms = [
+        ("nv12", PixelFormat::Nv12, Fixture { color: color(ColorFormat::Nv12), ..small() }),
+        ("yuy2", PixelFormat::Yuyv, Fixture { color: color(ColorFormat::Yuy2), early: true, ..small() }),
+        ("bgra", PixelFormat::Bgr8, Fixture { color: color(ColorFormat::Bgra), ..small() }),
+        ("wide", PixelFormat::Z16, Fixture { color: None, depth: Some(DepthMode::Wfov2x2Binned), ..small() }),
+        (
+            "unbinned",
+            PixelFormat::Z16,
+            Fixture { color: None, depth: Some(DepthMode::WfovUnbinned), rate_hz: 15, ..small() },
+        ),
+        (
+            "narrow",
+            PixelFormat::Z16,
+            Fixture { color: None, depth: Some(DepthMode::NfovUnbinned), ..small() },
+        ),
+        (
+            "passive",
+            PixelFormat::Mono16,
+            Fixture { color: None, depth: Some(DepthMode::PassiveIr), ..small() },
+        ),
+        ("colour", PixelFormat::Nv12, Fixture { depth: None, ..small() }),
+    ];
+    for (name, first, fixture) in forms {
+        let (report, dataset) = imported(dir.path(), name, &fixture);
+        let session = dataset.session();
+        assert_eq!(session.streams[0].format, first, "{name}");
+        let mut made = Pattern::new(&fixture);
+        let sets = sets(&dataset, PixelMode::Decoded);
+        assert_eq!((sets.len(), report.facts.lost), (3, 0), "{name}");
+        for (set, n) in sets.iter().zip(0..) {
+            assert_eq!(set.frames.len(), session.streams.len(), "{name}");
+            for f in &set.frames {
+                let wanted = match session.streams[f.stream].id.to_string().as_str() {
+                    "kinect/depth" => words(made.depth(n)),
+                    "kinect/ir" => words(made.infrared(n)),
+                    _ if first == PixelFormat::Bgr8 => {
+                        made.color(n).chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect()
+                    }
+                    _ => made.color(n),
+                };
+                assert!(f.pixels == wanted, "{name}: {} of {n}", session.streams[f.stream].id);
+            }
+        }
+    }
+}
+
+#[test]
+fn samples_of_motion_are_counted_in_the_report_and_in_the_dataset() {
+    let dir = tempfile::tempdir().unwrap();
+    let (report, dataset) = imported(dir.path(), "moved", &Fixture::small());
+    // 6 captures at 30 Hz, of 1.6 kHz.
+    let n = report.facts.left_out["motion_samples"];
+    assert!((318..=322).contains(&n), "{n}");
+    let said =
+        |stated: &[String]| stated.iter().any(|s| s.contains(&format!("{n} samples of accelerometer")));
+    assert!(said(&report.facts.stated), "{:?}", report.facts.stated);
+    let import = dataset.session().extra["import"].as_table().unwrap();
+    assert_eq!(import["left_out"]["motion_samples"].as_integer(), Some(n as i64));
+    let stated: Vec<String> =
+        import["stated"].as_array().unwrap().iter().map(|s| s.as_str().unwrap().to_owned()).collect();
+    assert!(said(&stated) && stated == report.facts.stated, "{stated:?}");
+    assert_eq!((import["lost"].as_integer(), import["ended_early"].as_bool()), (Some(0), Some(false)));
+    let still = Fixture { motion: false, ..Fixture::small() };
+    let (report, dataset) = imported(dir.path(), "still", &still);
+    assert!(report.facts.left_out.is_empty() && !report.facts.stated.iter().any(|s| s.contains("gyroscope")));
+    assert!(dataset.session().extra["import"].get("left_out").is_none());
+}
+
+#[test]
+fn depth_that_is_exposed_long_after_colour_is_in_its_set() {
+    let dir = tempfile::tempdir().unwrap();
+    // More than half a period, which without the delay would make other pairs.
+    for (name, depth_delay_ns) in [("after", 20_000_000), ("before", -20_000_000)] {
+        let fixture =
+            Fixture { depth_delay_ns, wired_sync: WiredSync::Subordinate, captures: 8, ..Fixture::small() };
+        let (_, dataset) = imported(dir.path(), name, &fixture);
+        let import = dataset.session().extra["import"].as_table().unwrap();
+        assert_eq!(import["wired_sync"].as_str(), Some("subordinate"));
+        assert_eq!(import["depth_delay_ns"].as_integer(), Some(depth_delay_ns));
+        let sets = sets(&dataset, PixelMode::Stored);
+        assert_eq!(sets.len(), 8, "{name}");
+        for (set, n) in sets.iter().zip(0..8) {
+            let times: Vec<_> = set.frames.iter().map(|f| f.header.device_time).collect();
+            let (color, depth) = fixture.times_us(n);
+            assert_eq!(times, [color, depth, depth], "{name}, capture {n}");
+        }
+    }
+}
+
+#[test]
+fn pictures_that_are_damaged_or_come_twice_are_in_the_accounts() {
+    let dir = tempfile::tempdir().unwrap();
+    let fixture = Fixture {
+        captures: 6,
+        lost: vec![3],
+        checksums: false,
+        motion: false,
+        open_sizes: true,
+        ..Fixture::default()
+    };
+    let (mut bytes, written) = fixture.bytes_and_places();
+    let find = |bytes: &[u8], from: usize, what: &[u8]| {
+        bytes[from..].windows(what.len()).position(|w| w == what).unwrap() + from
+    };
+    // The second JPEG has no start; the last capture is in the file twice.
+    let second = find(&bytes, written.clusters[1] as usize, &[0xFF, 0xD8]);
+    bytes[second] = 0;
+    let last = bytes[written.clusters[4] as usize..written.clusters_end as usize].to_vec();
+    bytes.splice(written.clusters_end as usize..written.clusters_end as usize, last);
+    let (path, out) = (dir.path().join("a.mkv"), dir.path().join("out"));
+    std::fs::write(&path, bytes).unwrap();
+    let report = run(&path, &out, CalibrationSource::Recorded).unwrap();
+    assert!(report.verified.is_whole(), "{:?}", report.verified);
+    let [color, depth, ir] = report.facts.accounts.as_slice() else { panic!("three streams") };
+    // Six exposures, one of which the recorder lost, and one more that is a repetition.
+    for (a, delivered) in [(color, 4), (depth, 5), (ir, 5)] {
+        assert_eq!((a.captured, a.delivered), (7, delivered), "{}", a.stream);
+        assert_eq!(a.captured, a.delivered + a.dropped.total());
+        assert_eq!((a.dropped.get(DropReason::DeviceGap), a.dropped.get(DropReason::OutOfOrder)), (1, 1));
+    }
+    assert_eq!(color.dropped.get(DropReason::WrongSize), 1);
+    // The damaged one and three repetitions are told, each with its place.
+    assert_eq!(report.facts.lost, 4, "{:?}", report.facts.problems);
+    assert!(report.facts.problems[0].contains("kinect/color: the picture at"), "{:?}", report.facts.problems);
+    let dataset = Dataset::open(&out).unwrap();
+    assert_eq!(dataset.session().extra["import"]["lost"].as_integer(), Some(4));
+    let sets = sets(&dataset, PixelMode::Stored);
+    let missing: Vec<_> = sets.iter().map(|s| s.frames.len()).collect();
+    assert_eq!(missing, [3, 2, 3, 3, 3], "the second lacks its colour");
+    let h = &sets[3].frames[0].header;
+    let dropped = [DropReason::WrongSize, DropReason::DeviceGap].map(|r| h.dropped[r as usize]);
+    assert_eq!((h.sequence, h.captured, dropped), (3, 5, [1, 1]), "the account of the fourth set's colour");
+}
+
+#[test]
+fn what_is_there_is_not_overwritten_and_an_import_may_be_ended() {
+    let dir = tempfile::tempdir().unwrap();
+    let fixture = Fixture { captures: 30, motion: true, ..Fixture::small() };
+    let (path, out) = (dir.path().join("a.mkv"), dir.path().join("out"));
+    fixture.write(&path, &mut Pattern::new(&fixture)).unwrap();
+    let mut importer = KinectImport::open(&path, options(CalibrationSource::Recorded)).unwrap();
+    let mut seen = 0;
+    let report = import(&mut importer, Arc::new(RealFs), &out, RecorderOptions::default(), &mut |_| {
+        seen += 1;
+        if seen == 10 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    })
+    .unwrap();
+    assert!(report.ended && report.verified.is_whole(), "{:?}", report.verified);
+    let dataset = Dataset::open(&out).unwrap();
+    assert_eq!(dataset.set_reader().unwrap().times().len(), 10, "what was read until then");
+    let table = &dataset.session().extra["import"];
+    assert_eq!(table["ended_early"].as_bool(), Some(true));
+    assert!(table["left_out"]["motion_samples"].as_integer().unwrap() > 0);
+    let before = std::fs::read(out.join("session.toml")).unwrap();
+    let e = run(&path, &out, CalibrationSource::Recorded).unwrap_err();
+    assert!(e.to_string().contains(&out.display().to_string()), "{e}");
+    assert_eq!(std::fs::read(out.join("session.toml")).unwrap(), before, "it stays as it was");
+    assert_eq!(Dataset::open(&out).unwrap().set_reader().unwrap().times().len(), 10);
 }

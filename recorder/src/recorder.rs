@@ -321,6 +321,12 @@ impl Recorder {
         Ok(())
     }
 
+    /// Puts a table of facts into `session.toml`, in place of one of this name: what is known only at the end. It is
+    /// written with the outcome.
+    pub fn state(&self, name: &str, table: toml::Table) {
+        self.shared.lock().session.extra.insert(name.to_owned(), table.into());
+    }
+
     /// Hands over the present account of each stream; the last one given is written each second and at the
     /// end of each segment.
     pub fn update_accounts(&self, accounts: Vec<StreamAccount>) {

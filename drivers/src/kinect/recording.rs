@@ -220,7 +220,8 @@ impl Recording {
     /// [`ErrorKind::BadInput`] when the recording has none, or none that can be.
     pub fn calibration(&self) -> Result<Calibration> {
         let text = self.facts.calibration.as_deref().ok_or_else(|| {
-            let why = "the recording has no calibration.json; give the one of the device, or say that there is none";
+            let why = "the recording has no calibration.json; name the device's own as `calibration`, or write \"none\" there to do \
+                 without intrinsics";
             Error::new(ErrorKind::BadInput, format!("{}: {why}", self.name))
         })?;
         Calibration::parse(text)

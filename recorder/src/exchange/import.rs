@@ -8,6 +8,7 @@ use crate::{
 };
 use depthrig_bus::UtcPair;
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -58,6 +59,9 @@ pub struct ImportFacts {
     pub problems: Vec<String>,
     /// What was assumed, inferred or left out, a sentence each.
     pub stated: Vec<String>,
+    /// How much of what was there a dataset does not hold, by what it is, such as `motion_samples`.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub left_out: BTreeMap<String, u64>,
 }
 
 impl ImportFacts {
@@ -102,6 +106,7 @@ pub fn import(
     progress: &mut dyn FnMut(ImportProgress) -> ControlFlow<()>,
 ) -> Result<ImportReport> {
     let session = importer.session()?;
+    let mut told = session.extra.get("import").and_then(toml::Value::as_table).cloned().unwrap_or_default();
     let start = UtcPair { utc_ns: session.started_utc_ns, ..UtcPair::default() };
     let pair = Arc::new(Mutex::new(start));
     let clock = {
@@ -141,11 +146,26 @@ pub fn import(
     }
     let facts = importer.facts();
     recorder.update_accounts(facts.accounts.clone());
+    conclude(&mut told, &facts, ended);
+    recorder.state("import", told);
     let summary = recorder.finish()?;
     let verified = verify_with(&fs, out, &VerifyOptions::default())?;
     // A dataset that was verified can be opened.
     drop(Dataset::open_with(fs, out)?);
     Ok(ImportReport { format: importer.format().to_owned(), summary, facts, verified, ended })
+}
+
+/// Puts into the table `import` what is known at the end: all that is stated, what could not be imported and what was left
+/// out.
+fn conclude(table: &mut toml::Table, facts: &ImportFacts, ended: bool) {
+    let number = |n: u64| toml::Value::from(i64::try_from(n).unwrap_or(i64::MAX));
+    table.insert("stated".to_owned(), facts.stated.clone().into());
+    table.insert("ended_early".to_owned(), ended.into());
+    table.insert("lost".to_owned(), number(facts.lost));
+    if !facts.left_out.is_empty() {
+        let left_out = facts.left_out.iter().map(|(what, n)| (what.clone(), number(*n)));
+        table.insert("left_out".to_owned(), left_out.collect::<toml::Table>().into());
+    }
 }
 
 /// The table `import` of a session: from where, and what was assumed.

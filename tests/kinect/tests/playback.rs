@@ -1,10 +1,10 @@
 //! A recording of an Azure Kinect as a camera: the suite of all drivers, its pixels, times, counts and rounds.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
-use depthrig_bus::{Distortion, DropReason, HostTime, Name, PixelFormat};
+use depthrig_bus::{Distortion, DropReason, FrameFlags, HostTime, Name, PixelFormat};
 use depthrig_drivers::conformance::{self, Bench, Cannot, Rig, Sent, Subject, Trouble};
 use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackBackend, PlaybackConfig};
-use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode};
+use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
 use depthrig_drivers::{Backend, DeviceInfo, ErrorKind, MemorySink, Poll, Stream, StreamRequest};
 use depthrig_kinect_fixture::{Fixture, Pattern, Pictures};
 use std::path::{Path, PathBuf};
@@ -145,6 +145,19 @@ fn every_format_comes_as_it_was_recorded() {
         assert!(of(0).all(|(f, n)| f.2 == color(&fixture, n)), "{format:?}");
         assert!(of(1).all(|(f, n)| f.2 == words(&made.depth(n))), "{format:?}");
         assert!(of(2).all(|(f, n)| f.2 == words(&made.infrared(n))), "{format:?}");
+    }
+}
+
+#[test]
+fn frames_of_a_recorded_subordinate_were_triggered() {
+    let dir = tempfile::tempdir().unwrap();
+    for wired_sync in WiredSync::ALL {
+        let fixture = Fixture { captures: 2, wired_sync, ..Fixture::small() };
+        let sink = all(&write(dir.path(), &fixture), &[]);
+        let is_triggered = |f: &FrameFlags| f.has(FrameFlags::HARDWARE_TRIGGERED);
+        let wanted = wired_sync == WiredSync::Subordinate;
+        assert!(sink.frames.iter().all(|f| is_triggered(&f.1.flags) == wanted), "{wired_sync:?}");
+        assert_eq!(sink.frames.len(), 6);
     }
 }
 

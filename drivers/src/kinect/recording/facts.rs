@@ -32,7 +32,11 @@ pub(super) fn facts(parts: &Parts, name: &str) -> Result<Facts> {
         .collect::<core::result::Result<_, String>>()
         .map_err(bad)?;
     if !tags.iter().any(|t| t.name.starts_with("K4A_")) {
-        let names: Vec<_> = tracks.iter().map(|t| format!("\"{}\"", t.name)).collect();
+        let called = |t: &Track| match t.name.as_str() {
+            "" => "one without a name".to_owned(),
+            name => format!("\"{name}\""),
+        };
+        let names: Vec<_> = tracks.iter().map(called).collect();
         return Err(bad(format!(
             "a Matroska file, but no recording of an Azure Kinect: it has no tags K4A_…; its tracks are {}",
             if names.is_empty() { "none".to_owned() } else { names.join(", ") }

@@ -79,6 +79,9 @@ impl Reader<'_> {
 /// Reads them.
 pub(super) fn read(source: &dyn ReadAt, name: &str) -> Result<Parts> {
     let mut r = Reader { source, name, end: source.size() };
+    if r.end == 0 {
+        return Err(r.bad("the file is empty, and so no Matroska file (.mkv)"));
+    }
     let start = r.head(0)?.filter(|h| h.id == id::EBML);
     let Some(start) = start else { return Err(r.bad("this is no Matroska file (.mkv)")) };
     let doc_type = ebml::child_text(&r.body(0, start)?, id::DOC_TYPE).unwrap_or_default();
