@@ -9,6 +9,7 @@ use depthrig_drivers::external::{self, ExternalBackend, ExternalConfig, Place};
 use depthrig_drivers::kinect::live::{LiveBackend, LiveConfig, Places};
 use depthrig_drivers::realsense::l515::{L515Backend, L515Config};
 use depthrig_drivers::realsense::{RealsenseBackend, RealsenseConfig};
+use depthrig_drivers::usb::SysRoot;
 use depthrig_drivers::v4l2::{Node, V4l2Backend, V4l2Config};
 use depthrig_drivers::zed::{ZedBackend, ZedConfig};
 use depthrig_drivers::{Backend, Device, DeviceInfo, Result, StreamProfile};
@@ -70,6 +71,8 @@ pub struct System {
     pub runtime: Option<RuntimeDir>,
     /// Where Microsoft's libraries are, which an Azure Kinect is asked through.
     pub kinect: Places,
+    /// The folder that `/sys` is in, by which an Azure Kinect is found at its port.
+    pub root: SysRoot,
 }
 
 impl System {
@@ -79,7 +82,7 @@ impl System {
             BackendConfig::Kinect(KinectSettings::Live(live)) => Some(live.places.clone()),
             _ => None,
         });
-        Self { runtime, kinect: named.unwrap_or_default() }
+        Self { runtime, kinect: named.unwrap_or_default(), root: SysRoot::default() }
     }
 }
 
@@ -110,7 +113,8 @@ impl Ask for System {
             }
             Family::Kinect => {
                 let places = self.kinect.clone();
-                Box::new(LiveBackend::new(LiveConfig { port, places, ..LiveConfig::default() }))
+                let config = LiveConfig { port, places, ..LiveConfig::default() };
+                Box::new(LiveBackend::new(config).with_root(self.root.clone()))
             }
             Family::Zed => Box::new(ZedBackend::new(ZedConfig { port, ..ZedConfig::default() })),
             Family::Uvc | Family::Platform => {

@@ -141,6 +141,27 @@ impl Fake {
         unsafe { self.library.get::<Ask>(b"fake_k4a_control\0").unwrap()(serial.as_ptr(), command) }
     }
 
+    /// The commands of the colour controls in the order in which they were set.
+    pub fn set(&self, serial: &str) -> Vec<i32> {
+        type Ask = unsafe extern "C" fn(*const c_char, usize) -> i32;
+        let serial = CString::new(serial).unwrap();
+        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        let ask = unsafe { self.library.get::<Ask>(b"fake_k4a_set\0") }.unwrap();
+        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        (0..).map(|i| unsafe { ask(serial.as_ptr(), i) }).take_while(|c| *c >= 0).collect()
+    }
+
+    /// What the camera streams with.
+    pub fn configuration(&self, serial: &str) -> Option<fake_k4a::abi::Configuration> {
+        type Ask = unsafe extern "C" fn(*const c_char, *mut fake_k4a::abi::Configuration) -> u32;
+        let serial = CString::new(serial).unwrap();
+        let mut to = core::mem::MaybeUninit::uninit();
+        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        let ask = unsafe { self.library.get::<Ask>(b"fake_k4a_configuration\0") }.unwrap();
+        // SAFETY: the same; it is written to when the result is 0.
+        unsafe { (ask(serial.as_ptr(), to.as_mut_ptr()) == 0).then(|| to.assume_init()) }
+    }
+
     /// True mid-exposure of the newest picture that had arrived at `at`.
     pub fn exposed(&self, serial: &str, at: HostTime) -> Option<HostTime> {
         type Ask = unsafe extern "C" fn(*const c_char, i64) -> i64;

@@ -52,6 +52,10 @@ pub struct Troubles {
     pub no_host_stamp: u64,
     /// Bytes between the rows.
     pub padding: u64,
+    /// It is silent as a subordinate while no master streams.
+    pub needs_master: bool,
+    /// Pictures say another format than was asked for.
+    pub wrong_format: u64,
 }
 
 /// A picture as it is handed over.
@@ -80,6 +84,10 @@ pub struct Camera {
     pub troubles: Troubles,
     /// Colour controls by command: whether automatic, and the value.
     pub controls: BTreeMap<u32, (bool, i32)>,
+    /// The commands of the controls that were set, in that order.
+    pub set: Vec<u32>,
+    /// How long opening it takes.
+    pub open_takes_ns: i64,
     pub running: Option<Running>,
     pub ledgers: [Ledger; 3],
     jpegs: BTreeMap<(u32, u32, u64), Arc<Vec<u8>>>,
@@ -124,6 +132,8 @@ impl Camera {
             jacks: (false, false),
             troubles: Troubles::default(),
             controls: BTreeMap::new(),
+            set: Vec::new(),
+            open_takes_ns: 0,
             running: None,
             ledgers: [Ledger::default(); 3],
             jpegs: BTreeMap::new(),
@@ -186,6 +196,16 @@ impl Camera {
             }
         }
         Ok(())
+    }
+
+    /// Whether it streams as this part of a wired group, `k4a_wired_sync_mode_t`.
+    pub fn plays(&self, part: u32) -> bool {
+        self.running.as_ref().is_some_and(|r| r.configuration.wired_sync_mode == part)
+    }
+
+    /// What it was last started with.
+    pub fn configuration(&self) -> Option<Configuration> {
+        self.running.as_ref().map(|r| r.configuration)
     }
 
     /// Sets the device's clock back by `back_us`, or, without it, to its beginning.
@@ -255,6 +275,7 @@ impl Camera {
             (take(|t| &mut t.half), take(|t| &mut t.wrong_size), take(|t| &mut t.damaged));
         let (only_color, only_depth, no_stamp) =
             (take(|t| &mut t.only_color), take(|t| &mut t.only_depth), take(|t| &mut t.no_host_stamp));
+        let wrong_format = take(|t| &mut t.wrong_format);
         let padding = self.troubles.padding as u32;
         let mut streams = Vec::new();
         if let Some(size) = abi::color_size(c.color_resolution) {
@@ -293,8 +314,11 @@ impl Camera {
                     .flat_map(|r| r.iter().copied().chain(core::iter::repeat_n(0xEE, padding as usize)));
                 bytes = Arc::new(padded.collect());
             }
+            let format = if wrong_format { (format + 1) % 6 } else { format };
             let ledger = &mut self.ledgers[stream];
-            if half {
+            if wrong_format {
+                ledger.damaged += 1;
+            } else if half {
                 bytes = Arc::new(bytes[..bytes.len() / 2].to_vec());
                 ledger.half += 1;
             } else if wrong {

@@ -80,13 +80,15 @@ pub unsafe extern "C" fn k4a_device_open(index: u32, handle: *mut Handle) -> u32
         drop(world);
         return fails(why);
     }
-    let serial = camera.serial.clone();
+    let (serial, takes_ns) = (camera.serial.clone(), camera.open_takes_ns);
     let new = world.hand_out(Thing::Camera { serial: serial.clone(), is_dead: false });
     world.census.cameras += 1;
     if let Some(camera) = world.cameras.iter_mut().find(|c| c.serial == serial) {
         camera.open = Some(new);
         camera.running = None;
     }
+    drop(world);
+    sleep_until(now + takes_ns);
     // SAFETY: the caller promises that it is writable.
     unsafe { handle.write(new as Handle) };
     SUCCEEDED
@@ -134,7 +136,13 @@ pub unsafe extern "C" fn k4a_device_get_capture(
     loop {
         let mut world = world();
         let now = now();
-        let Some(step) = world.camera(handle as usize).and_then(|c| c.step(now)) else {
+        let has_master = world.cameras.iter().any(|c| c.absent_until <= now && c.plays(1));
+        let next = |c: &mut Camera| {
+            // A subordinate takes its pictures by the master's pulse.
+            let waits = c.plays(2) && c.troubles.needs_master && !has_master;
+            if waits { Some(Step::Wait(now + 5_000_000)) } else { c.step(now) }
+        };
+        let Some(step) = world.camera(handle as usize).and_then(next) else {
             drop(world);
             return fails(
                 "usb_stream_callback(). LibUSB transfer status of LIBUSB_TRANSFER_NO_DEVICE unexpected",
@@ -351,6 +359,7 @@ pub unsafe extern "C" fn k4a_device_set_color_control(
         _ => value,
     };
     camera.controls.insert(command, (auto, value));
+    camera.set.push(command);
     SUCCEEDED
 }
 

@@ -1,5 +1,6 @@
 //! The functions by which a test commands the cameras of the library that it loaded.
 
+use crate::abi::Configuration;
 use crate::camera::{Camera, Ledger};
 use crate::world::{Census, now, world};
 use core::ffi::{CStr, c_char};
@@ -35,6 +36,7 @@ pub unsafe extern "C" fn fake_k4a_command(serial: *const c_char, what: *const c_
         "unplug" => camera.absent_until = until,
         "busy" => camera.busy_until = until,
         "denied" => camera.denied = n != 0,
+        "open_takes" => camera.open_takes_ns = n as i64,
         "stall" => t.stall_until = until,
         "hang" => t.hang_until = until,
         "stop_hang" => t.stop_hang_ns = n as i64,
@@ -49,6 +51,8 @@ pub unsafe extern "C" fn fake_k4a_command(serial: *const c_char, what: *const c_
         "only_depth" => t.only_depth += n,
         "no_host_stamp" => t.no_host_stamp += n,
         "padding" => t.padding = n,
+        "needs_master" => t.needs_master = n != 0,
+        "wrong_format" => t.wrong_format += n,
         "clock_back" => camera.set_clock(Some(n as i64 / 1000)),
         "clock_reset" => camera.set_clock(None),
         "sync_in" => camera.jacks.0 = n != 0,
@@ -111,6 +115,35 @@ pub unsafe extern "C" fn fake_k4a_control(serial: *const c_char, command: u32) -
     let world = world();
     let set = world.cameras.iter().find(|c| c.serial == serial).and_then(|c| c.controls.get(&command));
     set.map_or(-2, |(auto, value)| if *auto { -1 } else { *value })
+}
+
+/// The command of the colour control that was set as number `i`; -1 when there were not so many.
+///
+/// # Safety
+/// `serial` must end with a zero byte.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fake_k4a_set(serial: *const c_char, i: usize) -> i32 {
+    // SAFETY: as the caller promises.
+    let serial = unsafe { text(serial) };
+    let world = world();
+    let set = world.cameras.iter().find(|c| c.serial == serial).and_then(|c| c.set.get(i).copied());
+    set.map_or(-1, |command| command as i32)
+}
+
+/// What the camera streams with; not 0 when it does not.
+///
+/// # Safety
+/// `serial` must end with a zero byte, `to` be writable.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fake_k4a_configuration(serial: *const c_char, to: *mut Configuration) -> u32 {
+    // SAFETY: as the caller promises.
+    let serial = unsafe { text(serial) };
+    let world = world();
+    let found = world.cameras.iter().find(|c| c.serial == serial);
+    let Some(configuration) = found.and_then(Camera::configuration) else { return 1 };
+    // SAFETY: as the caller promises.
+    unsafe { to.write(configuration) };
+    0
 }
 
 /// What was handed out and what came back.

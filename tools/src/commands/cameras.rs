@@ -52,8 +52,9 @@ pub fn run(args: &CamerasArgs, context: &Context) -> Result<Exit> {
         out::line(format_args!("{model} {serial} at USB port {port} restarts and is back in some seconds"))?;
         return Ok(Exit::Good);
     }
-    let ask = System { runtime: context.runtime().ok(), kinect: Places::default() };
-    let mut attached = look(&SysRoot::new(&args.sys_root), &ask)?;
+    let root = SysRoot::new(&args.sys_root);
+    let ask = System { runtime: context.runtime().ok(), kinect: Places::default(), root: root.clone() };
+    let mut attached = look(&root, &ask)?;
     if let Some(part) = &args.only {
         let part = part.to_lowercase();
         let has = |text: &str| text.to_lowercase().contains(&part);

@@ -91,6 +91,19 @@ fn every_color_resolution_is_a_crop_of_the_same_view() {
         let wanted = (whole + 0.5) * scale - 0.5 - DVec2::new(f64::from(offset.0), f64::from(offset.1));
         near(c.color_intrinsics(resolution).project(p).unwrap(), wanted.to_array());
     }
+    // Rows of the whole sensor at each width, and those above the picture: half of what 16:9 leaves of 4:3.
+    for (resolution, rows, above) in [
+        (ColorResolution::P720, 960.0, 120.0),
+        (ColorResolution::P1080, 1440.0, 180.0),
+        (ColorResolution::P1440, 1920.0, 240.0),
+        (ColorResolution::P1536, 1536.0, 0.0),
+        (ColorResolution::P2160, 2880.0, 360.0),
+        (ColorResolution::P3072, 3072.0, 0.0),
+    ] {
+        let (k, raw) = (c.color_intrinsics(resolution), c.color.intrinsics);
+        assert!((k.cy - (raw.cy * rows - above - 0.5)).abs() < 1e-9, "{resolution:?}: {}", k.cy);
+        assert!((k.fy - raw.fy * rows).abs() < 1e-9, "{resolution:?}: {}", k.fy);
+    }
     let k = c.color_intrinsics(ColorResolution::P1080);
     // 0.49985 * 1920 - 0.5, 0.50662 * 1440 - 180 - 0.5, 0.47797 * 1920, 0.63742 * 1440.
     for (got, wanted) in [(k.cx, 959.212), (k.cy, 549.0328), (k.fx, 917.7024), (k.fy, 917.8848)] {
