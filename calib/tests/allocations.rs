@@ -1,55 +1,15 @@
 //! What is done for every frame takes no memory: counted by an allocator.
-#![allow(unsafe_code)] // a global allocator is unsafe to write
 #![allow(clippy::unwrap_used)]
 
-use core::cell::Cell;
 use depthrig_bus::{Distortion, Intrinsics, Pose};
 use depthrig_calib::stereo::{
     DisparityMap, Gray, Matcher, Order, OrderCheck, Parameters, Preset, SgmMatcher, StereoPair,
 };
 use depthrig_calib::{Deprojection, Method, PointCloud, Rectifier, Registration, Undistortion, View};
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::sync::atomic::{AtomicU64, Ordering};
-
-struct Counting;
-
-static COUNT: AtomicU64 = AtomicU64::new(0);
-
-thread_local! {
-    static OWN: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: everything is handed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        COUNT.fetch_add(1, Ordering::Relaxed);
-        OWN.set(OWN.get() + 1);
-        // SAFETY: as the caller promises.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
-        // SAFETY: as the caller promises.
-        unsafe { System.dealloc(ptr, layout) }
-    }
-}
+use depthrig_counting::{Counting, during, in_process_during};
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
-
-/// How often `work` takes memory on this thread.
-fn allocations(work: impl FnOnce()) -> u64 {
-    let before = OWN.get();
-    work();
-    OWN.get() - before
-}
-
-/// How often anything takes memory while `work` runs.
-fn all_allocations(work: impl FnOnce()) -> u64 {
-    let before = COUNT.load(Ordering::Relaxed);
-    work();
-    COUNT.load(Ordering::Relaxed) - before
-}
+static COUNTING: Counting = Counting;
 
 /// One test alone: others in this program would be counted too.
 #[test]
@@ -67,7 +27,7 @@ fn a_frame_takes_no_memory() {
         for (d, c) in [(&k, &k), (&k, &bent), (&bent, &bent)] {
             let mut one = Registration::new(d, size, c, size, &pose, method).unwrap();
             assert_eq!(
-                allocations(|| for _ in 0..3 {
+                during(|| for _ in 0..3 {
                     one.depth_to_color(&depth, 0.001, &mut z).unwrap();
                     one.color_to_depth(&depth, 0.001, &color, &mut rgb).unwrap();
                 }),
@@ -79,7 +39,7 @@ fn a_frame_takes_no_memory() {
             for _ in 0..5 {
                 several.depth_to_color(&depth, 0.001, &mut z).unwrap();
             }
-            let taken = all_allocations(|| {
+            let taken = in_process_during(|| {
                 for _ in 0..62 {
                     several.depth_to_color(&depth, 0.001, &mut z).unwrap();
                 }
@@ -90,10 +50,10 @@ fn a_frame_takes_no_memory() {
     let deprojection = Deprojection::new(&bent, size).unwrap();
     let mut cloud = PointCloud::default();
     deprojection.cloud(&depth, 0.001, Some(&color), &mut cloud).unwrap();
-    assert_eq!(allocations(|| deprojection.cloud(&depth, 0.001, Some(&color), &mut cloud).unwrap()), 0);
+    assert_eq!(during(|| deprojection.cloud(&depth, 0.001, Some(&color), &mut cloud).unwrap()), 0);
     let map = Undistortion::new((&bent, size), (&k, size), glam::DMat3::IDENTITY).unwrap();
     assert_eq!(
-        allocations(|| {
+        during(|| {
             map.bytes::<3>(&color, &mut rgb).unwrap();
             map.depth(&depth, &mut z).unwrap();
         }),
@@ -102,7 +62,7 @@ fn a_frame_takes_no_memory() {
     let rectifier = Rectifier::new(&bent, &k, &pose, size).unwrap();
     let (yuyv, mut grey) = (vec![90; 160 * 120 * 2], vec![0; 160 * 120]);
     assert_eq!(
-        allocations(|| for view in View::BOTH {
+        during(|| for view in View::BOTH {
             rectifier.grey_from_yuyv(view, &yuyv, &mut grey).unwrap();
             rectifier.rgb_from_yuyv(view, &yuyv, &mut rgb).unwrap();
             rectifier.grey_from_rgb(view, &color, &mut grey).unwrap();
@@ -116,17 +76,17 @@ fn a_frame_takes_no_memory() {
         let mut map = DisparityMap::default();
         let mut one = SgmMatcher::new(160, 120, &parameters, 1).unwrap();
         one.run(&pair, &mut map).unwrap();
-        assert_eq!(allocations(|| one.run(&pair, &mut map).unwrap()), 0, "{preset}");
+        assert_eq!(during(|| one.run(&pair, &mut map).unwrap()), 0, "{preset}");
         let mut several = SgmMatcher::new(160, 120, &parameters, 3).unwrap();
         for _ in 0..5 {
             several.run(&pair, &mut map).unwrap();
         }
         // Each pair is handed over four or eight times.
-        let taken = all_allocations(|| (0..31).for_each(|_| several.run(&pair, &mut map).unwrap()));
+        let taken = in_process_during(|| (0..31).for_each(|_| several.run(&pair, &mut map).unwrap()));
         assert!(taken <= 16, "{preset}: {taken} in 31 pairs");
     }
     let mut order = OrderCheck::new(800, 24, 48).unwrap();
     let pair = StereoPair::new(Gray::packed(&grey, 800, 24), Gray::packed(&grey, 800, 24));
     order.check(&pair).unwrap();
-    assert_eq!(allocations(|| assert_eq!(order.check(&pair).unwrap(), Order::Unclear)), 0);
+    assert_eq!(during(|| assert_eq!(order.check(&pair).unwrap(), Order::Unclear)), 0);
 }

@@ -2,44 +2,17 @@
 //!
 //! One test in a binary of its own: the counter sees every thread of the process.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
-// The allocator is what is tested, and a GlobalAlloc cannot be written without.
-#![allow(unsafe_code)]
 
 use depthrig_cdm::{
     CdmRefiner, ChannelOrder, Color, ColorFormat, Encoder, FillRefiner, Job, Model, NetShape, Network,
     Output, PositionEmbeddings, RawDepth, Refiner, Result, StepTimes, Weights,
 };
+use depthrig_counting::{Counting, of_process};
 use safetensors::tensor::{Dtype, TensorView};
-use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
-
-static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
-
-struct Counting;
 
 #[global_allocator]
 static COUNTING: Counting = Counting;
-
-// SAFETY: every call is passed on to the system's allocator as it came.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
-        // SAFETY: the caller keeps the contract of `GlobalAlloc::alloc`, which is that of `System`.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
-        // SAFETY: `ptr` came from `System` with this layout, through `alloc` or `realloc`.
-        unsafe { System.dealloc(ptr, layout) }
-    }
-
-    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
-        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
-        // SAFETY: `ptr` came from `System` with this layout, through `alloc` or `realloc`.
-        unsafe { System.realloc(ptr, layout, new_size) }
-    }
-}
 
 /// Gives back inverse depth as it came.
 struct Mirror(NetShape);
@@ -107,7 +80,7 @@ fn refine_often(refiner: &mut dyn Refiner) -> (Vec<u16>, Vec<f32>, Vec<f32>) {
     let mut before = 0;
     for round in 0..6 {
         if round == 2 {
-            before = ALLOCATIONS.load(Ordering::Relaxed);
+            before = of_process();
         }
         let outputs = [
             Output::Units { pixels: &mut units, unit_m: 0.0005 },
@@ -134,7 +107,7 @@ fn refine_often(refiner: &mut dyn Refiner) -> (Vec<u16>, Vec<f32>, Vec<f32>) {
         });
         refiner.refine(&mut jobs).unwrap();
     }
-    let allocated = ALLOCATIONS.load(Ordering::Relaxed) - before;
+    let allocated = of_process() - before;
     assert!(before > 0, "the counter counts");
     assert_eq!(allocated, 0);
     (units, metres, inverse)

@@ -1,41 +1,19 @@
 //! What a frame of an attached Kinect costs: one write of its bytes, and no memory.
-#![allow(unsafe_code)] // a counting allocator is unsafe to write
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/kinect.rs"]
 mod kinect;
 
-use core::cell::Cell;
 use depthrig_bus::{DropReason, Name, PixelFormat};
+use depthrig_counting::{Counting, of_thread};
 use depthrig_drivers::clock::ClockQuality;
 use depthrig_drivers::kinect::live::{LiveBackend, LiveConfig};
 use depthrig_drivers::{Backend, FrameMeta, FrameSink, Stream, StreamRequest, unpack};
 use kinect::Fake;
-use std::alloc::{GlobalAlloc, Layout, System};
 use std::time::Duration;
 
-struct Counting;
-
-thread_local! {
-    static TAKEN: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: everything is handed on to the system's allocator unchanged. The made libk4a has an allocator of its own.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        TAKEN.set(TAKEN.get() + 1);
-        // SAFETY: as the caller promises.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
-        // SAFETY: as the caller promises.
-        unsafe { System.dealloc(ptr, layout) }
-    }
-}
-
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static COUNTING: Counting = Counting;
 
 const A: &str = "000111111111";
 
@@ -87,9 +65,9 @@ fn a_picture_is_written_once_and_costs_no_memory() {
         while slot.2 < 60 {
             // The clock map grows to its size with the first frames.
             let warm = slot.2 > 15;
-            let before = TAKEN.get();
+            let before = of_thread();
             stream.poll(Duration::from_millis(50), &mut slot).unwrap();
-            taken += if warm { TAKEN.get() - before } else { 0 };
+            taken += if warm { of_thread() - before } else { 0 };
         }
         assert_eq!(taken, 0, "{color:?}");
     }

@@ -1,45 +1,19 @@
 //! Once it runs, stereo takes no memory for a pair: on the thread that captures, and on those that rectify and match.
-#![allow(unsafe_code)] // a global allocator is unsafe to write
 #![allow(clippy::unwrap_used)]
 
-use core::cell::Cell;
 use core::time::Duration;
 use depthrig_bus::{ClockDomain, DropReason, HostTime, Intrinsics, MetadataLevel, Name, PixelFormat, Pose};
 use depthrig_calib::stereo::Preset;
+use depthrig_counting::{Counting, of_process, of_thread};
 use depthrig_drivers::clock::ClockQuality;
 use depthrig_drivers::stereo::{StereoMode, StereoOptions, wrap};
 use depthrig_drivers::{
     Device, DeviceClock, DeviceInfo, FrameMeta, FrameSink, Gate, Poll, RawFrame, Result, Stream,
     StreamProfile, StreamRequest, choose_profiles,
 };
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::sync::atomic::{AtomicU64, Ordering};
-
-struct Counting;
-
-static COUNT: AtomicU64 = AtomicU64::new(0);
-
-thread_local! {
-    static OWN: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: everything is handed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        COUNT.fetch_add(1, Ordering::Relaxed);
-        OWN.set(OWN.get() + 1);
-        // SAFETY: as the caller promises.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
-        // SAFETY: as the caller promises.
-        unsafe { System.dealloc(ptr, layout) }
-    }
-}
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static COUNTING: Counting = Counting;
 
 const SIZE: (u32, u32) = (160, 96);
 
@@ -147,9 +121,9 @@ fn a_pair_takes_no_memory() {
         }
     };
     until(20);
-    let (own, all) = (OWN.get(), COUNT.load(Ordering::Relaxed));
+    let (own, all) = (of_thread(), of_process());
     until(60);
-    assert_eq!(OWN.get() - own, 0, "on the thread that captures");
-    let all = COUNT.load(Ordering::Relaxed) - all;
+    assert_eq!(of_thread() - own, 0, "on the thread that captures");
+    let all = of_process() - all;
     assert!(all <= 2, "{all} by the threads in 40 pairs");
 }

@@ -4,56 +4,13 @@
 //!
 //! A test binary of its own, because its allocator counts.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
-#![allow(unsafe_code)] // an allocator is unsafe by its nature
 
-use core::alloc::{GlobalAlloc, Layout};
-use core::cell::Cell;
 use depthrig_cdm::{Description, EngineKind, Job, Output, Precision, Refiner, Result};
+use depthrig_counting::{Counting, of_thread, of_watched, watch_thread};
 use depthrig_daemon::config::RefineConfig;
 use depthrig_daemon::stage::{Opened, Plan, Refiners};
 use depthrig_tests::{Home, RigText, wait_until};
-use std::alloc::System;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-    /// This is the stage's thread.
-    static IS_STAGE: Cell<bool> = const { Cell::new(false) };
-}
-
-/// Allocations of the stage's thread since it began to be counted.
-static OF_STAGE: AtomicU64 = AtomicU64::new(0);
-
-struct Counting;
-
-fn count() {
-    // A thread that is being torn down has no counter any more.
-    let _ = ALLOCATIONS.try_with(|n| n.set(n.get() + 1));
-    if IS_STAGE.try_with(Cell::get) == Ok(true) {
-        OF_STAGE.fetch_add(1, Ordering::Relaxed);
-    }
-}
-
-// SAFETY: everything is handed to the system's allocator as it came.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        count();
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
-        // SAFETY: likewise.
-        unsafe { System.dealloc(ptr, layout) }
-    }
-
-    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        count();
-        // SAFETY: likewise.
-        unsafe { System.realloc(ptr, layout, size) }
-    }
-}
 
 #[global_allocator]
 static COUNTING: Counting = Counting;
@@ -80,7 +37,7 @@ impl Refiner for Noting {
                 pixels.copy_from_slice(job.depth.pixels);
             }
         }
-        let so_far = (ALLOCATIONS.with(Cell::get), OF_STAGE.load(Ordering::Relaxed), pairs);
+        let so_far = (of_thread(), of_watched(), pairs);
         let mut list = self.0.lock().unwrap();
         if list.len() < list.capacity() {
             list.push(so_far);
@@ -94,7 +51,7 @@ struct Source(Arc<Mutex<Vec<Seen>>>);
 impl Refiners for Source {
     fn plan(&self, config: &RefineConfig, _: &str) -> Plan {
         // It is the stage that asks.
-        IS_STAGE.set(true);
+        watch_thread();
         Plan {
             engine: EngineKind::Fill,
             model: None,

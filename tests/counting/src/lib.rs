@@ -1,0 +1,115 @@
+//! An allocator that counts how often memory is taken, for tests of what must take none.
+//!
+//! It depends on nothing, so that the tests of every floor can have it. A test binary of its own says
+//! `#[global_allocator] static COUNTING: depthrig_counting::Counting = depthrig_counting::Counting;`
+#![allow(unsafe_code)] // a global allocator is unsafe to write
+
+use core::cell::Cell;
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// The system's allocator, which counts.
+#[derive(Debug, Clone, Copy)]
+pub struct Counting;
+
+static ALL: AtomicU64 = AtomicU64::new(0);
+static WATCHED: AtomicU64 = AtomicU64::new(0);
+
+thread_local! {
+    static OWN: Cell<u64> = const { Cell::new(0) };
+    static IS_WATCHED: Cell<bool> = const { Cell::new(false) };
+}
+
+fn count() {
+    ALL.fetch_add(1, Ordering::Relaxed);
+    // A thread that is being torn down has no counter any more.
+    let _ = OWN.try_with(|n| n.set(n.get() + 1));
+    if IS_WATCHED.try_with(Cell::get) == Ok(true) {
+        WATCHED.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+// SAFETY: everything is handed on to the system's allocator as it came.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count();
+        // SAFETY: as the caller promises.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        // SAFETY: as the caller promises; all memory comes from `System`.
+        unsafe { System.dealloc(ptr, layout) }
+    }
+
+    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        count();
+        // SAFETY: as the caller promises; all memory comes from `System`.
+        unsafe { System.realloc(ptr, layout, size) }
+    }
+}
+
+/// How often this thread has taken memory.
+pub fn of_thread() -> u64 {
+    OWN.with(Cell::get)
+}
+
+/// How often any thread of the process has.
+pub fn of_process() -> u64 {
+    ALL.load(Ordering::Relaxed)
+}
+
+/// From now on this thread is one of those that [`of_watched`] counts.
+pub fn watch_thread() {
+    IS_WATCHED.set(true);
+}
+
+/// How often threads have taken memory since they were watched.
+pub fn of_watched() -> u64 {
+    WATCHED.load(Ordering::Relaxed)
+}
+
+/// How often `work` takes memory on this thread.
+pub fn during(work: impl FnOnce()) -> u64 {
+    let before = of_thread();
+    work();
+    of_thread() - before
+}
+
+/// How often anything takes memory while `work` runs.
+pub fn in_process_during(work: impl FnOnce()) -> u64 {
+    let before = of_process();
+    work();
+    of_process() - before
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[global_allocator]
+    static COUNTING: Counting = Counting;
+
+    /// One test alone: others would be counted too.
+    #[test]
+    fn what_is_taken_is_counted_where_it_is_taken() {
+        let take = || drop(std::hint::black_box(Vec::<u8>::with_capacity(100)));
+        assert_eq!((during(|| ()), during(take)), (0, 1));
+        let grown = during(|| {
+            let mut v = std::hint::black_box(vec![0_u8; 10]);
+            v.reserve_exact(10_000);
+        });
+        assert_eq!(grown, 2, "what grows is taken anew");
+        let (own, watched) = (of_thread(), of_watched());
+        let thread = std::thread::spawn(move || {
+            take();
+            watch_thread();
+            let before = (of_thread(), of_watched());
+            take();
+            (of_thread() - before.0, of_watched() - before.1)
+        });
+        assert_eq!(thread.join().ok(), Some((1, 1)));
+        assert!(of_watched() > watched && of_thread() - own < 100);
+        assert!(in_process_during(|| std::thread::scope(|s| drop(s.spawn(take)))) > 0);
+    }
+}
