@@ -5,27 +5,24 @@
 //! dataset grows beside its final name, segment by segment: a run that was killed goes on behind the last finished one.
 //! What the modes are and what they are not: docs/zed-replay.md.
 
-use depthrig_bus::{HostTime, PixelFormat, StageStep, StreamId};
-use depthrig_calib::PoseExt;
-use depthrig_calib::Rectifier;
-use depthrig_calib::stereo::{Description, Matcher, Preset};
+use depthrig_calib::stereo::Preset;
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{
-    ColorCodec, Computed, Dataset, Error, ErrorKind, RecordFrame, RecordSet, Recorder, RecorderOptions,
-    Result, StreamAccount, StreamRecord, Summary, UtcSource, VerifyOptions, VerifyReport, verify_with,
+    ColorCodec, Dataset, Error, ErrorKind, Result, VerifyOptions, VerifyReport, verify_with,
 };
-use engine::{Done, Engine, State};
-use input::{Facts, Input};
-use pictures::{Color, Maker, Numbers};
+use input::Input;
+use plan::Plan;
 use serde::Serialize;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 mod engine;
 mod input;
 mod modes;
 mod pictures;
+mod plan;
+mod record;
 mod swapped;
 mod work;
 
@@ -33,12 +30,8 @@ pub use depthrig_cdm::NetworkPixels;
 pub use depthrig_drivers::zed::replay::OpenOptions;
 pub use modes::{Mode, NetworkChoice};
 
-/// What a killed run repeats at most: the pairs of this much recorded time.
-const SEGMENT_NS: i64 = 10_000_000_000;
-/// Pairs in work beyond one for each thread.
-const AHEAD: usize = 2;
-/// Sets that wait for the recorder's encoders.
-const QUEUE_SETS: usize = 2;
+/// Problems that a report names; the rest is counted.
+const MAX_PROBLEMS: usize = 20;
 
 /// How a recording is replayed.
 #[derive(Debug, Clone, PartialEq)]
@@ -131,6 +124,16 @@ pub struct ZedReplayReport {
     pub verified: Option<VerifyReport>,
 }
 
+impl ZedReplayReport {
+    /// Counts what could not be read, and keeps it in words while there is room.
+    fn lose(&mut self, problem: String) {
+        self.lost += 1;
+        if self.problems.len() < MAX_PROBLEMS {
+            self.problems.push(problem);
+        }
+    }
+}
+
 /// A mode of a replay.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ModeReport {
@@ -194,7 +197,7 @@ pub fn zed_replay(
     if whole {
         report.resumed = plan.facts.total;
     } else {
-        let summary = record(&mut input, &mut plan, &fs, &copy, &mut report, progress)?;
+        let summary = record::record(&mut input, &mut plan, &fs, &copy, &mut report, progress)?;
         let Some(summary) = summary else {
             report.ended = true;
             return Ok(report);
@@ -252,378 +255,3 @@ fn check(options: &ZedReplayOptions) -> Result<()> {
     }
     Ok(())
 }
-
-/// All that is known before the first pair is matched.
-struct Plan {
-    facts: Facts,
-    maker: Arc<Maker>,
-    modes: Vec<modes::ModeMaker>,
-    /// The first matcher of each mode.
-    first: Vec<Box<dyn Matcher>>,
-    unavailable: Vec<String>,
-    notes: Vec<String>,
-    /// The streams of the output: colour, then those of each mode.
-    streams: Vec<StreamRecord>,
-    session: depthrig_recorder::Session,
-    jobs: usize,
-    memory_bytes: u64,
-    color: ColorCodec,
-}
-
-impl Plan {
-    fn new(input: &mut Input, out: &Path, options: &ZedReplayOptions) -> Result<Self> {
-        let facts = input.facts().clone();
-        let c = &facts.calibration;
-        let rectifier = Rectifier::new(&c.left, &c.right, &c.right_in_left, facts.size).map_err(|e| {
-            Error::new(ErrorKind::BadInput, format!("the calibration ({}): {e}", facts.calibration_origin))
-                .with_source(e)
-        })?;
-        let (mut modes, mut first, mut unavailable) = (Vec::new(), Vec::new(), Vec::new());
-        for mode in &options.modes {
-            if *mode == Mode::Neural && options.network.is_none() {
-                unavailable.push(format!("{mode}: {}", modes::NO_NETWORK));
-                continue;
-            }
-            let (maker, matcher) = modes::open(*mode, &rectifier, options)?;
-            modes.push(maker);
-            first.push(matcher);
-        }
-        if modes.is_empty() {
-            return Err(Error::new(ErrorKind::BadInput, unavailable.join("; ")));
-        }
-        let searched = modes::geometry(&rectifier).disparities(options.range_m.0);
-        let nearest = rectifier.intrinsics().fx * rectifier.baseline_m() / searched as f64;
-        let mut notes = Vec::new();
-        if nearest > options.range_m.0 {
-            let (w, h) = facts.size;
-            notes.push(format!(
-                "at {w}x{h} the presets see no nearer than {nearest:.2} m: they search {searched} disparities at most"
-            ));
-        }
-        let maker = Maker {
-            rectifier,
-            colors: options.modes.contains(&Mode::Neural) && options.network.is_some(),
-            depth_unit_m: options.depth_unit_m,
-            range_m: options.range_m,
-            disparity: options.disparity,
-        };
-        let mut plan = Self {
-            facts,
-            maker: Arc::new(maker),
-            modes,
-            first,
-            unavailable,
-            notes,
-            streams: Vec::new(),
-            session: depthrig_recorder::Session::new("", ""),
-            jobs: 1,
-            memory_bytes: 0,
-            color: options.color,
-        };
-        plan.jobs =
-            (1..=options.jobs.max(1)).rev().find(|n| plan.memory(*n) <= options.memory_bytes).unwrap_or(1);
-        plan.memory_bytes = plan.memory(plan.jobs);
-        plan.describe(out)?;
-        Ok(plan)
-    }
-
-    /// Bytes that `jobs` threads take: matchers, and pairs from reading to encoding.
-    fn memory(&self, jobs: usize) -> u64 {
-        let of = |m: &modes::ModeMaker| m.description.memory_bytes.saturating_mul(m.most.min(jobs) as u64);
-        let matchers: u64 = self.modes.iter().map(of).sum();
-        let pairs = (jobs + AHEAD + QUEUE_SETS + 1) as u64;
-        matchers.saturating_add(self.maker.pair_bytes(self.modes.len()).saturating_mul(pairs))
-    }
-
-    /// The session and its streams.
-    fn describe(&mut self, out: &Path) -> Result<()> {
-        let facts = &self.facts;
-        let rectifier = &self.maker.rectifier;
-        let view = StreamRecord {
-            id: stream_id(&facts.camera, "color")?,
-            model: facts.model.clone(),
-            serial: facts.serial.clone(),
-            format: PixelFormat::Rgb8,
-            width: facts.size.0,
-            height: facts.size.1,
-            rate_hz: facts.rate_hz,
-            depth_unit_m: 0.0,
-            calibration: format!("rectified with: {}", facts.calibration_origin),
-            intrinsics: *rectifier.intrinsics(),
-            pose: facts.pose.compose(&rectifier.left_view_in_left()),
-        };
-        let mut computed = vec![Computed {
-            stream: view.id.clone(),
-            name: "rectified".to_owned(),
-            producer: format!("depthrig-rectify {}", env!("CARGO_PKG_VERSION")),
-            parameters: format!(
-                "focal_px={} baseline_m={}",
-                rectifier.intrinsics().fx,
-                rectifier.baseline_m()
-            ),
-            from: facts.from[..1].to_vec(),
-        }];
-        let mut streams = vec![view.clone()];
-        let unit = self.maker.depth_unit_m;
-        for mode in &self.modes {
-            let mut add = |what: &str, format, depth_unit_m| {
-                let id = stream_id(&facts.camera, &format!("{what}_{}", mode.name))?;
-                let Description { producer, parameters, .. } = &mode.description;
-                let (near, far) = self.maker.range_m;
-                computed.push(Computed {
-                    stream: id.clone(),
-                    name: mode.recorded.clone(),
-                    producer: producer.clone(),
-                    parameters: format!("{parameters} min_depth_m={near} max_depth_m={far}"),
-                    from: facts.from.clone(),
-                });
-                streams.push(StreamRecord { id, format, depth_unit_m, ..view.clone() });
-                Ok::<_, Error>(())
-            };
-            add("depth", PixelFormat::Z16, unit)?;
-            add("confidence", PixelFormat::Confidence8, 0.0)?;
-            if self.maker.disparity {
-                add("disparity", PixelFormat::DisparityF32, 0.0)?;
-            }
-        }
-        let mut session = facts.session.clone();
-        session.name = out.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        (session.streams, session.computed) = (streams.clone(), computed);
-        if !self.unavailable.is_empty() {
-            let all: Vec<_> = self.unavailable.iter().cloned().map(toml::Value::from).collect();
-            let table = toml::Table::from_iter([("unavailable".to_owned(), all.into())]);
-            session.extra.insert("zed_replay".to_owned(), table.into());
-        }
-        (self.session, self.streams) = (session, streams);
-        Ok(())
-    }
-
-    /// What decides the pixels: a run goes on only with the same.
-    fn identity(&self, options: &ZedReplayOptions) -> serde_json::Value {
-        let mode = |m: &modes::ModeMaker| {
-            let d = &m.description;
-            serde_json::json!({ "name": m.name, "producer": d.producer, "parameters": d.parameters })
-        };
-        let c = &self.facts.calibration;
-        serde_json::json!({
-            "depthrig_version": env!("CARGO_PKG_VERSION"),
-            "input": self.facts.identity,
-            "modes": self.modes.iter().map(mode).collect::<Vec<_>>(),
-            "calibration": format!("{:?} {:?} {:?}", c.left, c.right, c.right_in_left),
-            "disparity": options.disparity,
-            "range_m": options.range_m,
-            "depth_unit_m": options.depth_unit_m,
-            "color": options.color,
-        })
-    }
-
-    fn report(&self, out: &Path) -> ZedReplayReport {
-        let mode = |m: &modes::ModeMaker| ModeReport {
-            mode: m.name.clone(),
-            recorded_as: m.recorded.clone(),
-            producer: m.description.producer.clone(),
-            parameters: m.description.parameters.clone(),
-            frames: 0,
-            stereo_s: 0.0,
-        };
-        ZedReplayReport {
-            path: out.to_owned(),
-            sets: 0,
-            bytes: 0,
-            modes: self.modes.iter().map(mode).collect(),
-            unavailable: self.unavailable.clone(),
-            lost: 0,
-            problems: Vec::new(),
-            notes: self.notes.clone(),
-            resumed: 0,
-            jobs: self.jobs,
-            memory_bytes: self.memory_bytes,
-            cpu: CpuReport::default(),
-            ended: false,
-            verified: None,
-        }
-    }
-
-    /// The frames of a pair as a set.
-    fn set(&self, done: Done, written: &mut u64, epoch: &mut Option<u32>) -> RecordSet {
-        let head = done.head;
-        let (Some(left), Some((views, made))) = (head.left, done.made) else {
-            let missing = (0..self.streams.len()).collect();
-            return RecordSet {
-                id: head.set,
-                tick: head.tick,
-                utc: head.utc,
-                frames: Vec::new(),
-                missing,
-                spread_ns: 0,
-            };
-        };
-        *written += 1;
-        let mut view = *left;
-        (view.intrinsics, view.pose) = (self.streams[0].intrinsics, self.streams[0].pose);
-        let header = |stream: usize| {
-            let record = &self.streams[stream];
-            let steps = [0; StageStep::ALL.len()];
-            let unit = record.depth_unit_m;
-            let mut h =
-                crate::stage::worker::derived_header(&view, &view, record.format, unit, steps, *epoch);
-            h.set_names(&self.session.rig, &record.id);
-            let made = &self.session.computed[stream];
-            h.set_refiner(&made.producer, &made.name);
-            (h.sequence, h.captured) = (*written, *written);
-            h.dropped = [0; 8];
-            h
-        };
-        let mut frames = vec![RecordFrame { stream: 0, header: header(0), pixels: Box::new(Color(views)) }];
-        for made in made {
-            let stream = frames.len();
-            frames.push(RecordFrame {
-                stream,
-                header: header(stream),
-                pixels: Box::new(Numbers(made.depth)),
-            });
-            let header_of = header(stream + 1);
-            frames.push(RecordFrame {
-                stream: stream + 1,
-                header: header_of,
-                pixels: Box::new(made.confidence),
-            });
-            if let Some(disparity) = made.disparity {
-                let header_of = header(stream + 2);
-                frames.push(RecordFrame {
-                    stream: stream + 2,
-                    header: header_of,
-                    pixels: Box::new(Numbers(disparity)),
-                });
-            }
-        }
-        *epoch = Some(left.clock_epoch);
-        RecordSet { id: head.set, tick: head.tick, utc: head.utc, frames, missing: Vec::new(), spread_ns: 0 }
-    }
-}
-
-fn stream_id(camera: &str, stream: &str) -> Result<StreamId> {
-    StreamId::new(camera, stream).map_err(|e| Error::new(ErrorKind::BadInput, e.to_string()))
-}
-
-/// Makes depth of all pairs that are not in `copy` yet; `None` when it was ended.
-#[allow(clippy::too_many_lines)] // one loop, and what each thread of it is given
-fn record(
-    input: &mut Input,
-    plan: &mut Plan,
-    fs: &Arc<dyn Fs>,
-    copy: &Path,
-    report: &mut ZedReplayReport,
-    progress: ZedReplayProgress<'_>,
-) -> Result<Option<Summary>> {
-    let options = RecorderOptions {
-        color: plan.color,
-        segment_max_ns: SEGMENT_NS,
-        queue_sets: QUEUE_SETS,
-        workers: plan.jobs.min(4),
-        ..RecorderOptions::default()
-    };
-    let clock = work::RecordedClock::new(plan.session.started_utc_ns);
-    let source: UtcSource = clock.source();
-    if !copy.join(depthrig_recorder::SESSION_FILE).exists() {
-        // Killed before there was anything to go on with.
-        work::remove(copy)?;
-    }
-    let (recorder, resumed) = if copy.exists() {
-        Recorder::resume(Arc::clone(fs), source, copy, options)?
-    } else {
-        let new = Recorder::create_with(Arc::clone(fs), source, copy, plan.session.clone(), options)?;
-        (new, depthrig_recorder::Resumed { sets: 0, frames: 0, last_set: None })
-    };
-    let total = plan.facts.total;
-    let mut at = 0;
-    if let Some(last) = resumed.last_set {
-        at = input.go_behind(last)?;
-    }
-    report.resumed = resumed.sets;
-    let per_set = plan.streams.len().max(1) as u64;
-    let mut written = resumed.frames / per_set;
-    if resumed.sets > written {
-        report.notes.push(format!("{} sets of earlier runs are without a pair", resumed.sets - written));
-    }
-    let (mut epoch, mut failure) = (None, None);
-    let (begin, began) = (depthrig_bus::clock::process_cpu_ns(), HostTime::now());
-    let first = std::mem::take(&mut plan.first);
-    let plan = &*plan;
-    let engine = Engine {
-        input: Mutex::new(input),
-        maker: &plan.maker,
-        modes: &plan.modes,
-        most: plan.modes.iter().map(|m| m.most.min(plan.jobs)).collect(),
-        jobs: plan.jobs,
-        window: plan.jobs + AHEAD,
-        state: Mutex::new(State::new(first)),
-        wake: std::sync::Condvar::new(),
-    };
-    let before = written;
-    let mut sink = |done: Option<Done>| -> Result<ControlFlow<()>> {
-        if let Some(mut done) = done {
-            at += 1;
-            if let Some(problem) = done.problem.take() {
-                report.lost += 1;
-                if report.problems.len() < MAX_PROBLEMS {
-                    report.problems.push(problem);
-                }
-            }
-            let set = plan.set(done, &mut written, &mut epoch);
-            clock.set(&set);
-            while !recorder.has_room() {
-                std::thread::sleep(PAUSE);
-            }
-            if let Err(e) = recorder.push(set) {
-                let cause = recorder.progress().error;
-                let kind = cause.as_ref().map_or(ErrorKind::BadInput, |e| e.kind());
-                failure = Some(Error::new(kind, e.to_string()));
-                return Ok(ControlFlow::Break(()));
-            }
-        }
-        Ok(progress(Step::Replay, at, total.max(at)))
-    };
-    let all = engine.run(&mut sink)?;
-    if let Some(e) = failure {
-        return Err(e);
-    }
-    if !all {
-        // Dropped unfinished: its finished segments are gone on with.
-        return Ok(None);
-    }
-    let account = |s: &StreamRecord| StreamAccount {
-        stream: s.id.clone(),
-        captured: written,
-        delivered: written,
-        dropped: depthrig_bus::DropCounts::default(),
-    };
-    recorder.update_accounts(plan.streams.iter().map(account).collect());
-    let summary = recorder.finish()?;
-    let cpu = engine.into_cpu();
-    for problem in input.take_lost() {
-        report.lost += 1;
-        if report.problems.len() < MAX_PROBLEMS {
-            report.problems.push(problem);
-        }
-    }
-    let seconds = |ns: i64| ns as f64 / 1e9;
-    for (mode, ns) in report.modes.iter_mut().zip(&cpu.stereo) {
-        mode.stereo_s = seconds(*ns);
-    }
-    report.cpu = CpuReport {
-        pairs: written - before,
-        read_s: seconds(cpu.read),
-        rectify_s: seconds(cpu.rectify),
-        stereo_s: seconds(cpu.stereo.iter().sum()),
-        depth_s: seconds(cpu.depth),
-        total_s: seconds(depthrig_bus::clock::process_cpu_ns() - begin),
-    };
-    tracing::info!(sets = summary.sets.recorded, after_s = began.elapsed().as_secs_f64(), "depth is made");
-    Ok(Some(summary))
-}
-
-/// Problems that a report names; the rest is counted.
-const MAX_PROBLEMS: usize = 20;
-/// Time between looks at a recorder that has no room.
-const PAUSE: std::time::Duration = std::time::Duration::from_millis(2);

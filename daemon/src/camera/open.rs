@@ -1,0 +1,201 @@
+//! Opening a camera: its driver, its streams, its channels on the bus.
+
+use super::{Camera, Shared};
+use crate::Result;
+use crate::config::BackendConfig;
+use crate::sink::BusSink;
+use crate::stage::Lane;
+use crate::stream::Stream;
+use depthrig_bus::{FrameHeader, StreamId, shm};
+use depthrig_calib::PoseExt;
+use depthrig_drivers::capture::Session;
+use depthrig_drivers::stereo::StereoOptions;
+use depthrig_drivers::{Backend, DeviceInfo, ErrorKind as DriverErrorKind, StreamProfile};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// A camera's driver, made at the first opening and kept for the later ones.
+pub(super) type SharedBackend = Arc<Mutex<Option<Box<dyn Backend>>>>;
+
+/// Opens the device and its channels; runs on the camera's own thread.
+pub(super) fn open_session(
+    camera: &Camera,
+    shared: &Shared,
+    backend: &Mutex<Option<Box<dyn Backend>>>,
+) -> Result<Session, depthrig_drivers::Error> {
+    let name = &camera.config.name;
+    let in_camera = |e: depthrig_drivers::Error| {
+        depthrig_drivers::Error::new(e.kind(), format!("camera \"{name}\": {e}")).with_source(e)
+    };
+    let device = {
+        // Held for the opening alone; a thread that hangs in it keeps its successors waiting, not the rig.
+        let mut backend = backend.lock().unwrap_or_else(PoisonError::into_inner);
+        let backend = match backend.as_ref() {
+            Some(backend) => backend,
+            None => backend.insert(make_backend(camera, shared).map_err(in_camera)?),
+        };
+        backend.open(None).map_err(in_camera)?
+    };
+    let info = device.info().clone();
+    let stream = device.start(&camera.config.streams).map_err(in_camera)?;
+    let streams = adopt(camera, shared, stream.profiles(), &info).map_err(in_camera)?;
+    let mut ports = Vec::new();
+    for s in streams {
+        let mut header = FrameHeader::default();
+        header.set_picture(s.profile.format, s.profile.width, s.profile.height);
+        header.set_names(shared.bus.rig().as_str(), &s.id);
+        header.set_device(&info.model, &info.serial);
+        header.depth_unit_m = s.profile.depth_unit_m;
+        header.device_tick_ns = s.profile.clock.tick_ns();
+        header.intrinsics = s.profile.intrinsics;
+        header.pose = camera.config.pose.compose(&s.profile.pose_in_device);
+        let publisher = publisher_of(shared, &s).map_err(|e| {
+            let kind = match e.kind() {
+                crate::ErrorKind::NoSpace => DriverErrorKind::Unsupported,
+                _ => DriverErrorKind::Io,
+            };
+            in_camera(depthrig_drivers::Error::new(kind, e.to_string()).with_source(e))
+        })?;
+        ports.push((s, publisher, header));
+    }
+    open_lane(camera, shared, &info).map_err(|e| {
+        in_camera(depthrig_drivers::Error::new(DriverErrorKind::Io, e.to_string()).with_source(e))
+    })?;
+    Ok(Session { info, stream, sink: Box::new(BusSink::new(ports, Arc::clone(&shared.frames))) })
+}
+
+/// Opens the way from the camera's streams to those that are made of them, at its first opening. All of it is there
+/// before the first frame, so that no publisher waits for a subscriber that is half made.
+fn open_lane(camera: &Camera, shared: &Shared, info: &DeviceInfo) -> Result<()> {
+    let Some(config) = &camera.config.refine else { return Ok(()) };
+    let (streams, made, begun) = {
+        let state = camera.state();
+        (state.streams.clone(), state.made.clone(), state.lane.is_some())
+    };
+    let find = |name: &str| streams.iter().find(|s| s.id.stream.as_str() == name);
+    let (Some(color), Some(depth)) = (find("color"), find(&config.depth)) else { return Ok(()) };
+    let [refined, aligned @ ..] = made.as_slice() else { return Ok(()) };
+    if begun {
+        return Ok(());
+    }
+    for stream in &made {
+        publisher_of(shared, stream)?;
+    }
+    let readers = (shared.bus.subscriber(&color.id)?, shared.bus.subscriber(&depth.id)?);
+    let color_ns = color.profile.period_ns() as i64;
+    let lane = Arc::new(Lane::new(
+        (camera.config.name.clone(), info.model.clone()),
+        config.clone(),
+        (Arc::clone(refined), aligned.first().cloned()),
+        (color_ns, depth.profile.period_ns() as i64),
+        color_ns / 2 + 1_000_000,
+        readers,
+    ));
+    camera.state().lane = Some(Arc::clone(&lane));
+    shared.stage.enter(lane);
+    Ok(())
+}
+
+/// The driver of a camera.
+fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {
+    use depthrig_drivers::{
+        external::{ExternalBackend, Place},
+        files::FilesBackend,
+        kinect::{KinectConfig, live::LiveBackend, playback::PlaybackBackend},
+        realsense::RealsenseBackend,
+        realsense::l515::L515Backend,
+        stereo::StereoBackend,
+        synthetic::SyntheticBackend,
+        v4l2::V4l2Backend,
+        zed::{ZedBackend, replay::ReplayBackend},
+    };
+    let backend: Box<dyn Backend> = match &camera.config.backend {
+        // One beginning for all cameras of the rig, or each would see the world at another moment.
+        BackendConfig::Synthetic(c) => {
+            Box::new(SyntheticBackend::starting_at(vec![c.clone()], shared.began)?)
+        }
+        BackendConfig::Files(c) => Box::new(FilesBackend::new(c.clone())),
+        BackendConfig::L515(c) => Box::new(L515Backend::new(c.clone())),
+        BackendConfig::Realsense(c) => Box::new(RealsenseBackend::new(c.clone())),
+        BackendConfig::V4l2(c) => Box::new(V4l2Backend::new(c.clone())),
+        BackendConfig::Zed(c) => Box::new(ZedBackend::new(c.clone())),
+        BackendConfig::ZedReplay(c) => Box::new(ReplayBackend::new(c.clone())),
+        BackendConfig::External(c) => {
+            let (runtime, rig) = (shared.bus.runtime().clone(), shared.bus.rig().clone());
+            let place = Place { runtime, rig, camera: camera.config.name.clone() };
+            Box::new(ExternalBackend::new(c.clone(), place))
+        }
+        BackendConfig::Kinect(KinectConfig::Live(c)) => Box::new(LiveBackend::new(c.clone())),
+        BackendConfig::Kinect(KinectConfig::Recorded(c)) => Box::new(PlaybackBackend::new(c.clone())),
+    };
+    Ok(match &camera.config.stereo {
+        Some(stereo) => {
+            let options = StereoOptions {
+                computed: Arc::clone(&camera.computed),
+                sets: Arc::clone(&shared.stage.sets),
+                ..stereo.options()
+            };
+            Box::new(StereoBackend::new(backend, options))
+        }
+        None => backend,
+    })
+}
+
+fn publisher_of(shared: &Shared, stream: &Stream) -> Result<Arc<depthrig_bus::Publisher>> {
+    let mut books = stream.books();
+    if let Some(publisher) = &books.publisher {
+        return Ok(Arc::clone(publisher));
+    }
+    let publisher = Arc::new(shared.bus.publisher(&stream.id, stream.profile.frame_bytes(), stream.slots)?);
+    if books.session == 0 {
+        books.reader = Some(shared.bus.subscriber(&stream.id)?);
+    }
+    books.publisher = Some(Arc::clone(&publisher));
+    Ok(publisher)
+}
+
+/// Makes the camera's streams at its first opening, and holds later openings to them.
+fn adopt(
+    camera: &Camera,
+    shared: &Shared,
+    profiles: &[StreamProfile],
+    info: &DeviceInfo,
+) -> Result<Vec<Arc<Stream>>, depthrig_drivers::Error> {
+    let mut state = camera.state();
+    state.info = Some(info.clone());
+    if state.streams.is_empty() {
+        let made = camera.config.makes(profiles).map_err(|e| {
+            depthrig_drivers::Error::new(DriverErrorKind::BadInput, e.to_string()).with_source(e)
+        })?;
+        let all = profiles.iter().chain(made.iter().map(|(p, _)| p));
+        state.set_bytes = all.map(|p| p.frame_bytes() as u64).sum();
+        let slots = shm::slots_that_fit(shared.slots, state.set_bytes, shared.memory_share);
+        state.short_of_memory = slots.is_err();
+        let slots = slots.map_err(|e| {
+            depthrig_drivers::Error::new(DriverErrorKind::Unsupported, e.to_string()).with_source(e)
+        })?;
+        let stream = |p: &StreamProfile, record: bool| {
+            let id = StreamId { camera: camera.config.name.clone(), stream: p.stream.clone() };
+            Arc::new(Stream::new(id, p.clone(), record, slots))
+        };
+        state.streams = profiles.iter().map(|p| stream(p, camera.config.records(&p.stream))).collect();
+        state.made = made.iter().map(|(p, record)| stream(p, *record)).collect();
+    } else if state.streams.len() != profiles.len()
+        || state.streams.iter().zip(profiles).any(|(s, p)| !same_mode(&s.profile, p))
+    {
+        let had: Vec<_> = state.streams.iter().map(|s| s.profile.describe()).collect();
+        let has: Vec<_> = profiles.iter().map(StreamProfile::describe).collect();
+        return Err(depthrig_drivers::Error::new(
+            DriverErrorKind::Unsupported,
+            format!(
+                "it came back with other modes: had {}, has {}; restart the daemon to use them",
+                had.join(", "),
+                has.join(", ")
+            ),
+        ));
+    }
+    Ok(state.streams.clone())
+}
+
+fn same_mode(a: &StreamProfile, b: &StreamProfile) -> bool {
+    a.stream == b.stream && a.format == b.format && (a.width, a.height) == (b.width, b.height)
+}

@@ -1,0 +1,282 @@
+//! A camera under supervision: opened, watched, lost, opened again. The other cameras do not notice.
+//!
+//! ```text
+//! opening ──frame──▶ streaming ──no frame──▶ stalled ──still none──▶ reconnecting ──▶ (opened again)
+//!    │                   │  ▲──────frame───────┘                          ▲
+//!    └──────error────────┴──────────────────error, hang───────────────────┘
+//! an error that cannot pass (wrong settings) ──▶ failed      end of the files ──▶ finished
+//! ```
+//!
+//! "No frame" is said of each stream: one that is silent alone, while the others go on, has its camera stalled and
+//! opened again all the same.
+
+use super::open::{SharedBackend, open_session};
+use super::{Camera, Shared};
+use crate::config::{BackendConfig, KinectSettings};
+use crate::priority;
+use crate::status::CameraState;
+use core::time::Duration;
+use depthrig_bus::HostTime;
+use depthrig_drivers::ErrorKind as DriverErrorKind;
+use depthrig_drivers::capture::{Capture, End, StopOutcome};
+use std::sync::Arc;
+
+/// How long an opening may take before its thread is given up for hung.
+const OPEN_PATIENCE: Duration = Duration::from_secs(15);
+/// How long a recording may be silent that waits for its modes.
+const WAITS_FOR_MODES: Duration = Duration::from_mins(1);
+/// A stalled camera is opened again after this many stall times without a frame.
+const STALLS_UNTIL_RESTART: u32 = 4;
+
+/// Drives one [`Camera`]; owned by the rig's supervisor thread.
+pub struct Supervisor {
+    camera: Arc<Camera>,
+    shared: Arc<Shared>,
+    backend: SharedBackend,
+    capture: Option<Capture>,
+    opened_at: HostTime,
+    retry_at: HostTime,
+    backoff: Duration,
+    lost: bool,
+    heard: Vec<Heard>,
+}
+
+/// When a stream last announced a frame, kept or lost.
+#[derive(Debug, Clone, Copy)]
+struct Heard {
+    captured: u64,
+    at: HostTime,
+}
+
+impl Supervisor {
+    /// A supervisor that opens its camera at its first [`Self::step`].
+    pub fn new(camera: Arc<Camera>, shared: Arc<Shared>) -> Self {
+        let backoff = Duration::from_secs_f64(shared.supervisor.backoff_min_s);
+        Self {
+            camera,
+            shared,
+            backend: SharedBackend::default(),
+            capture: None,
+            opened_at: HostTime::from_ns(0),
+            retry_at: HostTime::from_ns(0),
+            backoff,
+            lost: false,
+            heard: Vec::new(),
+        }
+    }
+
+    /// Looks at the camera and does what is due. Never blocks on the device.
+    pub fn step(&mut self, now: HostTime) {
+        let name = self.camera.config.name.clone();
+        let Some(capture) = &self.capture else {
+            let waiting =
+                matches!(self.camera.state().phase, CameraState::Opening | CameraState::Reconnecting);
+            if waiting && now >= self.retry_at {
+                self.open(now);
+            }
+            return;
+        };
+        if capture.has_ended() {
+            if let Some(StopOutcome::Ended(end)) = self.capture.take().map(|c| c.stop(Duration::ZERO)) {
+                self.ended(now, end);
+            }
+            return;
+        }
+        let stall = self.stall_time();
+        let heartbeat_age = Duration::from_nanos(now.since_ns(capture.heartbeat()).max(0) as u64);
+        let Some(last_frame) = capture.last_frame().filter(|t| *t >= self.opened_at) else {
+            // Not a frame yet: opening, or open and silent.
+            let open = !self.camera.state().streams.is_empty();
+            let silence = Duration::from_nanos(now.since_ns(self.opened_at).max(0) as u64);
+            if heartbeat_age > open_patience(&self.camera.config.backend) {
+                self.give_up(now, "the device did not come back from being opened");
+            } else if open && silence > stall * STALLS_UNTIL_RESTART && heartbeat_age < stall {
+                self.restart(now, &format!("open, but not one frame in {:.1} s", silence.as_secs_f64()));
+            }
+            return;
+        };
+        let silence = Duration::from_nanos(now.since_ns(last_frame).max(0) as u64);
+        if heartbeat_age > stall * 2 {
+            let hang = heartbeat_age.as_secs_f64();
+            self.give_up(now, &format!("the driver hangs in the device for {hang:.1} s"));
+        } else if silence > stall * STALLS_UNTIL_RESTART {
+            self.restart(
+                now,
+                &format!("no frame for {:.1} s, the device is opened again", silence.as_secs_f64()),
+            );
+        } else if silence > stall {
+            let mut state = self.camera.state();
+            if state.phase != CameraState::Stalled {
+                let why = format!("no frame for {:.1} s although the device answers", stall.as_secs_f64());
+                state.enter(name.as_str(), CameraState::Stalled, Some(why));
+            }
+        } else if let Some((stream, silence)) = self.mute_stream(now).filter(|(_, silence)| *silence > stall)
+        {
+            let why =
+                format!("no frame of {stream} for {:.1} s while other streams go on", silence.as_secs_f64());
+            if silence > stall * STALLS_UNTIL_RESTART {
+                self.restart(now, &format!("{why}, the device is opened again"));
+            } else if self.camera.state().phase != CameraState::Stalled {
+                self.camera.state().enter(name.as_str(), CameraState::Stalled, Some(why));
+            }
+        } else {
+            let mut state = self.camera.state();
+            if state.phase != CameraState::Streaming {
+                if self.lost {
+                    state.reconnects += 1;
+                    self.lost = false;
+                }
+                state.enter(name.as_str(), CameraState::Streaming, None);
+            }
+            self.backoff = Duration::from_secs_f64(self.shared.supervisor.backoff_min_s);
+        }
+    }
+
+    /// Asks the camera thread to end, without waiting.
+    pub fn request_stop(&self) {
+        if let Some(capture) = &self.capture {
+            capture.request_stop();
+        }
+    }
+
+    /// Ends the camera thread, waiting for at most `patience`.
+    pub fn stop(&mut self, patience: Duration) {
+        let name = self.camera.config.name.clone();
+        if self.end_capture(patience) {
+            tracing::warn!(camera = %name, "the device hangs; its thread is left behind");
+        }
+        let mut state = self.camera.state();
+        if !matches!(state.phase, CameraState::Failed | CameraState::Finished) {
+            state.enter(name.as_str(), CameraState::Stopped, None);
+        }
+    }
+
+    /// The stream that has announced no frame for the longest, and for how long.
+    fn mute_stream(&mut self, now: HostTime) -> Option<(String, Duration)> {
+        let state = self.camera.state();
+        let unheard = Heard { captured: u64::MAX, at: now };
+        self.heard.resize(state.streams.len(), unheard);
+        let mut longest = None;
+        for (stream, heard) in state.streams.iter().zip(&mut self.heard) {
+            // How long matching takes says nothing of the device.
+            if self.camera.config.joins_late(&stream.id.stream) {
+                continue;
+            }
+            let captured = stream.books().captured;
+            // A camera that was opened again starts with all its time.
+            if heard.captured != captured || heard.at < self.opened_at {
+                *heard = Heard { captured, at: now };
+            }
+            let silence = Duration::from_nanos(now.since_ns(heard.at).max(0) as u64);
+            if longest.as_ref().is_none_or(|(_, most)| silence > *most) {
+                longest = Some((stream.id.stream.to_string(), silence));
+            }
+        }
+        longest
+    }
+
+    fn stall_time(&self) -> Duration {
+        // A recording that waits for its slowest mode is silent for as long as that takes.
+        if self.camera.config.stereo.as_ref().is_some_and(|s| s.every_pair) {
+            return WAITS_FOR_MODES;
+        }
+        let slowest = self.camera.state().streams.iter().map(|s| s.profile.period_ns()).max().unwrap_or(0);
+        Duration::from_secs_f64(self.shared.supervisor.stall_s).max(Duration::from_nanos(3 * slowest))
+    }
+
+    fn ended(&mut self, now: HostTime, end: End) {
+        let name = self.camera.config.name.as_str();
+        match end {
+            End::Failed(e) if e.kind().is_transient() && !self.never_will(&e) => {
+                self.lose(now, &e.to_string(), Some(e));
+            }
+            End::Failed(e) => {
+                let mut state = self.camera.state();
+                state.enter(name, CameraState::Failed, Some(e.to_string()));
+                state.error = Some(e.into());
+            }
+            End::Finished => {
+                self.camera.state().enter(
+                    name,
+                    CameraState::Finished,
+                    Some("the files are at their end".into()),
+                );
+            }
+            End::Stopped => self.camera.state().enter(name, CameraState::Stopped, None),
+        }
+    }
+
+    /// Whether an opening failed for good: files that are not there are a mistake, not an unplugged camera.
+    fn never_will(&self, e: &depthrig_drivers::Error) -> bool {
+        e.kind() == DriverErrorKind::NotFound
+            && matches!(
+                self.camera.config.backend,
+                BackendConfig::Files(_)
+                    | BackendConfig::ZedReplay(_)
+                    | BackendConfig::Kinect(KinectSettings::Recorded(_))
+            )
+            && self.camera.state().streams.is_empty()
+    }
+
+    /// The camera is lost; it is tried again after a pause.
+    fn lose(&mut self, now: HostTime, why: &str, error: Option<depthrig_drivers::Error>) {
+        let mut state = self.camera.state();
+        self.lost |= state.phase != CameraState::Opening;
+        state.enter(self.camera.config.name.as_str(), CameraState::Reconnecting, Some(why.to_owned()));
+        state.error = error.map(Into::into);
+        drop(state);
+        self.retry_at = now.plus(self.backoff);
+        self.backoff = (self.backoff * 2).min(Duration::from_secs_f64(self.shared.supervisor.backoff_max_s));
+    }
+
+    /// Ends a thread that still answers, then opens the device again.
+    fn restart(&mut self, now: HostTime, why: &str) {
+        self.end_capture(Duration::from_millis(200));
+        self.lose(now, why, None);
+    }
+
+    /// Leaves a hung thread behind.
+    fn give_up(&mut self, now: HostTime, why: &str) {
+        self.end_capture(Duration::ZERO);
+        self.lose(now, why, None);
+    }
+
+    /// Ends the camera thread if there is one; whether it had to be left behind.
+    fn end_capture(&mut self, patience: Duration) -> bool {
+        let abandoned =
+            self.capture.take().is_some_and(|c| matches!(c.stop(patience), StopOutcome::Abandoned));
+        if abandoned {
+            for stream in &self.camera.state().streams {
+                stream.books().close();
+            }
+        }
+        abandoned
+    }
+
+    fn open(&mut self, now: HostTime) {
+        self.opened_at = now;
+        let (camera, shared) = (Arc::clone(&self.camera), Arc::clone(&self.shared));
+        let backend = Arc::clone(&self.backend);
+        let opening = Capture::spawn(self.camera.config.name.as_str(), move || {
+            // Ordinary until it streams: opening is work, and must not keep other cameras' threads from theirs.
+            let session = open_session(&camera, &shared, &backend)?;
+            if shared.supervisor.raise_priority {
+                priority::raise_current_thread();
+            }
+            Ok(session)
+        });
+        match opening {
+            Ok(capture) => self.capture = Some(capture),
+            Err(e) => self.lose(now, &e.to_string(), Some(e)),
+        }
+    }
+}
+
+/// How long opening this camera may take. The driver of another process's camera waits for the process, for its first
+/// message and for its first frame, each with a limit of its own that the rig file sets.
+fn open_patience(backend: &BackendConfig) -> Duration {
+    match backend {
+        BackendConfig::External(c) => OPEN_PATIENCE + c.start_timeout * 2 + c.heartbeat_timeout,
+        _ => OPEN_PATIENCE,
+    }
+}
