@@ -19,6 +19,7 @@ mod screen;
 mod signals;
 mod turbo;
 mod view;
+mod watched;
 
 use clap::Parser;
 

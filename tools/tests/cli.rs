@@ -30,7 +30,7 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
     assert!(help.contains("Exit codes:"));
     let folder = tempfile::tempdir().unwrap();
     Home::new().run(&["man", "--out", folder.path().to_str().unwrap()]).good();
-    for command in [
+    let commands = [
         "demo",
         "run",
         "record",
@@ -52,15 +52,32 @@ fn every_command_has_help_that_fits_and_an_entry_in_the_manual() {
         "cameras",
         "doctor",
         "tap",
+        "import",
+        "stereo",
+        "zed",
+        "cdm",
+        "eval",
+        "recover",
         "bench",
         "completions",
         "man",
-    ] {
-        assert!(help.lines().any(|l| l.trim_start().starts_with(command)), "{command} is not in --help");
+    ];
+    // A command is one word behind two spaces, and what it does behind more of them.
+    let listed = help.lines().skip_while(|l| *l != "Commands:").skip(1).take_while(|l| !l.is_empty());
+    let mut listed: Vec<_> = listed.filter_map(|l| l.strip_prefix("  ")?.split(' ').next()).collect();
+    listed.retain(|name| !name.is_empty() && *name != "help");
+    listed.sort_unstable();
+    let mut known = commands.to_vec();
+    known.sort_unstable();
+    assert_eq!(listed, known, "the commands of --help and those that are looked at here");
+    for command in commands {
         let text = Home::new().run(&[command, "--help"]).good();
         assert!(text.lines().all(|l| l.chars().count() <= 120), "{command} --help has a long line");
         assert!(folder.path().join(format!("depthrig-{command}.1")).exists(), "{command} has no manual page");
     }
+    let text = Home::new().run(&["zed", "replay", "--help"]).good();
+    assert!(text.contains("Exit codes:") && text.lines().all(|l| l.chars().count() <= 120), "{text}");
+    assert!(folder.path().join("depthrig-zed-replay.1").exists());
     assert!(!help.contains("bench-reader"));
     for shell in ["bash", "zsh", "fish"] {
         assert!(Home::new().run(&["completions", shell]).good().contains("depthrig"), "{shell}");

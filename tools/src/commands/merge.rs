@@ -1,8 +1,9 @@
 //! `depthrig merge`: parts of one recording as one dataset again.
 
-use super::trim::{report, watched};
+use super::trim::report;
 use crate::context::Context;
 use crate::exit::Exit;
+use crate::watched::watched;
 use anyhow::Result;
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{Dataset, SliceOptions, merge};
@@ -39,8 +40,9 @@ pub struct MergeArgs {
 pub fn run(args: &MergeArgs, context: &Context) -> Result<Exit> {
     let inputs = args.inputs.iter().map(|path| Dataset::open(path)).collect::<Result<Vec<_>, _>>()?;
     report(args.json, || {
-        watched(context, "merge", |progress| {
-            merge(&RealFs, &inputs, &args.out, &SliceOptions::default(), progress)
+        watched(context, |tell| {
+            let mut progress = |done, total| tell("merge", done, total);
+            merge(&RealFs, &inputs, &args.out, &SliceOptions::default(), &mut progress)
         })
     })
 }

@@ -1,14 +1,12 @@
 //! `depthrig trim`: a part of a dataset as a dataset of its own.
 
 use crate::context::Context;
-use crate::exit::{Exit, UsageError};
+use crate::exit::Exit;
 use crate::out;
-use crate::progress::Progress;
-use crate::signals::Stop;
+use crate::watched::watched;
 use anyhow::Result;
-use core::ops::ControlFlow;
 use depthrig_recorder::fs::RealFs;
-use depthrig_recorder::{Dataset, Edge, ErrorKind, Moment, SetSpan, SliceOptions, SliceReport, trim};
+use depthrig_recorder::{Dataset, Edge, Moment, SetSpan, SliceOptions, SliceReport, trim};
 use std::path::PathBuf;
 
 /// Examples for `--help`.
@@ -57,28 +55,10 @@ pub fn run(args: &TrimArgs, context: &Context) -> Result<Exit> {
     let span = SetSpan { from: edge(args.from, args.first_set), to: edge(args.to, args.last_set) };
     let dataset = Dataset::open(&args.dataset)?;
     report(args.json, || {
-        watched(context, "trim", |progress| {
-            trim(&RealFs, &dataset, &args.out, span, &SliceOptions::default(), progress)
+        watched(context, |tell| {
+            let mut progress = |done, total| tell("trim", done, total);
+            trim(&RealFs, &dataset, &args.out, span, &SliceOptions::default(), &mut progress)
         })
-    })
-}
-
-/// Runs work that is told of in bytes and that a signal ends.
-pub(super) fn watched<T>(
-    context: &Context,
-    what: &str,
-    work: impl FnOnce(&mut dyn FnMut(u64, u64) -> ControlFlow<()>) -> depthrig_recorder::Result<T>,
-) -> Result<T> {
-    let stop = Stop::on_signals()?;
-    let mut bar = Progress::new(context.global.quiet > 0);
-    let result = work(&mut |done, total| {
-        bar.set(what, done, total);
-        if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-    });
-    bar.clear();
-    result.map_err(|e| match e.kind() {
-        ErrorKind::BadInput => UsageError(e.to_string()).into(),
-        _ => e.into(),
     })
 }
 

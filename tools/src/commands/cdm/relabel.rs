@@ -4,14 +4,12 @@ use super::store::Models;
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
 use crate::out;
-use crate::progress::Progress;
-use crate::signals::Stop;
+use crate::watched::{Remade, watched};
 use anyhow::Result;
 use clap::ValueEnum;
-use core::ops::ControlFlow;
 use depthrig_daemon::config::{CdmConfig, EngineChoice, RefineConfig, RefineModel};
 use depthrig_daemon::relabel::{RelabelOptions, RelabelReport, Step, relabel};
-use depthrig_recorder::{Dataset, ErrorKind};
+use depthrig_recorder::Dataset;
 use std::path::PathBuf;
 
 /// Examples for `--help`.
@@ -124,38 +122,24 @@ pub fn run(args: &RelabelArgs, context: &Context) -> Result<Exit> {
         return Err(UsageError("say where the new dataset is to be: --out OUT".to_owned()).into());
     };
     let dataset = Dataset::open(&args.dataset)?;
-    let stop = Stop::on_signals()?;
-    let mut bar = Progress::new(context.global.quiet > 0);
-    let report = relabel(&dataset, out, &args.options(), &mut |step, done, total| {
-        bar.set(if step == Step::Refine { "refine" } else { "write" }, done, total);
-        if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-    });
-    bar.clear();
-    let report = report.map_err(|e| match e.kind() {
-        ErrorKind::BadInput => anyhow::Error::from(UsageError(e.to_string())),
-        _ => e.into(),
+    let report = watched(context, |tell| {
+        relabel(&dataset, out, &args.options(), &mut |step, done, total| {
+            tell(if step == Step::Refine { "refine" } else { "write" }, done, total)
+        })
     })?;
-    if args.json {
-        out::json(&report)?;
-    } else if context.global.quiet == 0 {
-        tell(&report)?;
-    }
-    for problem in &report.problems {
-        eprintln!("lost: {problem}");
-    }
-    Ok(match report {
-        _ if report.ended => Exit::Failed,
-        _ if report.lost > 0 => Exit::Lost,
-        _ => Exit::Good,
-    })
+    let remade = Remade {
+        path: &report.path,
+        sets: report.sets,
+        bytes: report.bytes,
+        ended: report.ended,
+        lost: report.lost,
+        problems: &report.problems,
+        lacks: false,
+    };
+    remade.told(context, args.json.then_some(&report), || tell_streams(&report))
 }
 
-fn tell(report: &RelabelReport) -> Result<()> {
-    let path = report.path.display();
-    if report.ended {
-        return out::line(format_args!("{path}: ended; run it again to go on"));
-    }
-    out::line(format_args!("{path}: {}, {}", out::count(report.sets, "set"), out::bytes(report.bytes)))?;
+fn tell_streams(report: &RelabelReport) -> Result<()> {
     for s in &report.streams {
         let with = if s.model.is_empty() { String::new() } else { format!(" with {}", s.model) };
         out::line(format_args!("  {}: {} by {}{with}", s.stream, out::count(s.frames, "frame"), s.engine))?;

@@ -3,16 +3,14 @@
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
 use crate::out;
-use crate::progress::Progress;
-use crate::signals::Stop;
+use crate::watched::{Remade, watched};
 use anyhow::Result;
 use clap::ValueEnum;
-use core::ops::ControlFlow;
 use depthrig_daemon::zed_replay::{
     Mode, NetworkChoice, NetworkPixels, OpenOptions, Step, ZedReplayOptions, ZedReplayReport, zed_replay,
 };
 use depthrig_drivers::zed::CalibrationFile;
-use depthrig_recorder::{ColorCodec, ErrorKind};
+use depthrig_recorder::ColorCodec;
 use std::path::PathBuf;
 
 /// Examples for `--help`.
@@ -159,41 +157,24 @@ impl ReplayArgs {
 /// Replays.
 pub fn run(args: &ReplayArgs, context: &Context) -> Result<Exit> {
     let options = args.options()?;
-    let stop = Stop::on_signals()?;
-    let mut bar = Progress::new(context.global.quiet > 0);
-    let report = zed_replay(&args.input, &args.out, &options, &mut |step, done, total| {
-        bar.set(if step == Step::Replay { "depth" } else { "verify" }, done, total);
-        if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-    });
-    bar.clear();
-    let report = report.map_err(|e| match e.kind() {
-        ErrorKind::BadInput => anyhow::Error::from(UsageError(e.to_string())),
-        _ => e.into(),
+    let report = watched(context, |tell| {
+        zed_replay(&args.input, &args.out, &options, &mut |step, done, total| {
+            tell(if step == Step::Replay { "depth" } else { "verify" }, done, total)
+        })
     })?;
-    if args.json {
-        out::json(&report)?;
-    } else if context.global.quiet == 0 {
-        tell(&report)?;
-    }
-    for problem in &report.problems {
-        eprintln!("lost: {problem}");
-    }
-    if report.lost > report.problems.len() as u64 {
-        eprintln!("lost: {} in all", report.lost);
-    }
-    Ok(match report {
-        _ if report.ended => Exit::Failed,
-        _ if report.lost > 0 || !report.unavailable.is_empty() => Exit::Lost,
-        _ => Exit::Good,
-    })
+    let remade = Remade {
+        path: &report.path,
+        sets: report.sets,
+        bytes: report.bytes,
+        ended: report.ended,
+        lost: report.lost,
+        problems: &report.problems,
+        lacks: !report.unavailable.is_empty(),
+    };
+    remade.told(context, args.json.then_some(&report), || tell_modes(&report))
 }
 
-fn tell(report: &ZedReplayReport) -> Result<()> {
-    let path = report.path.display();
-    if report.ended {
-        return out::line(format_args!("{path}: ended; run it again to go on"));
-    }
-    out::line(format_args!("{path}: {}, {}", out::count(report.sets, "set"), out::bytes(report.bytes)))?;
+fn tell_modes(report: &ZedReplayReport) -> Result<()> {
     if report.resumed > 0 {
         out::line(format_args!("  {} of them by an earlier run", report.resumed))?;
     }
