@@ -12,10 +12,8 @@ use glam::{DMat3, DQuat};
 
 mod geometry;
 mod map;
-mod order;
 
 use map::Map;
-pub use order::{EyeOrder, eye_order};
 
 /// One of the two rectified views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

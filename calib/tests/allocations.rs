@@ -85,7 +85,7 @@ fn a_frame_takes_no_memory() {
         let taken = in_process_during(|| (0..31).for_each(|_| several.run(&pair, &mut map).unwrap()));
         assert!(taken <= 16, "{preset}: {taken} in 31 pairs");
     }
-    let mut order = OrderCheck::new(800, 24, 48).unwrap();
+    let mut order = OrderCheck::new(800, 24).unwrap();
     let pair = StereoPair::new(Gray::packed(&grey, 800, 24), Gray::packed(&grey, 800, 24));
     order.check(&pair).unwrap();
     assert_eq!(during(|| assert_eq!(order.check(&pair).unwrap(), Order::Unclear)), 0);

@@ -188,7 +188,7 @@ pub fn zed_replay(
     check(options)?;
     let mut input = Input::open(input, options.camera.as_deref(), &options.open)?;
     let mut plan = Plan::new(&mut input, out, options)?;
-    swapped::check(&mut input, &plan.maker, options)?;
+    swapped::check(&mut input, &plan.maker)?;
     let fs: Arc<dyn Fs> = Arc::new(RealFs);
     let work = work::Work::open(out, &plan.identity(options))?;
     let mut report = plan.report(out);

@@ -1,7 +1,11 @@
-//! Whether left and right are what they are said to be: swapped pictures give disparities that nothing agrees with.
+//! Whether left and right are what they are said to be: a thing is never further right in the right eye's picture.
+//!
+//! One search over both directions lets them compete for each pixel, and a pixel counts when one place is clearly the
+//! best. What repeats fools that: of a fence whose next post is nearer than the right one, every pixel says the wrong
+//! thing. So a picture that looks like itself elsewhere says nothing.
 
-use super::sgm::SgmMatcher;
-use super::{DisparityMap, Gray, Matcher, Parameters, Preset, Resolution, StereoPair};
+use super::sgm::{SgmMatcher, halve};
+use super::{DisparityMap, Gray, MAX_DISPARITIES, Matcher, Parameters, Preset, Resolution, StereoPair};
 use crate::{Error, ErrorKind, Result};
 
 /// What a pair looks like.
@@ -11,50 +15,75 @@ pub enum Order {
     AsNamed,
     /// The picture that is called left is the right one.
     Swapped,
-    /// Too little was found either way: a wall without texture, a covered lens, or pictures that are not rectified.
+    /// Nothing says either: a wall without texture or of one pattern, a covered lens, everything far away, or pictures that
+    /// are not rectified.
     Unclear,
 }
 
-/// Least share of the pixels that must be matched, in the order that is believed.
-const ENOUGH: f64 = 0.15;
-/// How many times as much must be matched in one order as in the other.
-const CLEARLY: f64 = 1.6;
+/// Least share of the pixels that must say the same.
+const ENOUGH: f64 = 0.12;
+/// How many times as many they must be as those that say the opposite.
+const CLEARLY: f64 = 8.0;
+/// Share of them by which as many may look like others in their own picture. Pictures of rooms have 0.25 and patterns 0.65.
+const REPEATED: f64 = 0.45;
+/// By how many percent another place must be worse.
+const UNIQUE_PERCENT: u8 = 15;
+/// Disparities up to this say nothing: rectification errs by as much.
+const NEAR_PX: f32 = 1.5;
+/// What is found this near the end of the search would often be found beyond it: of a slope any place is as good.
+const END_PX: f32 = 2.0;
+/// A pixel looks like those beside it; only what is farther away than this is a repetition.
+const APART_PX: usize = 3;
 /// Pictures are halved until they are no wider than this.
 const WIDTH: usize = 360;
 
-/// Compares how much is found with left and right as they are named and with them exchanged. A check costs less than a
-/// pair with [`Preset::Performance`].
+/// Both pictures in some size.
+#[derive(Debug)]
+struct Level {
+    size: (usize, usize),
+    eyes: [Vec<u8>; 2],
+}
+
+/// Looks whether things lie further left in the right picture, as they must, or further right. A check costs less than a
+/// pair with [`Preset::Performance`] and allocates nothing.
 #[derive(Debug)]
 pub struct OrderCheck {
     size: (usize, usize),
-    /// Each half as large as the one before, of the left and the right picture.
-    pictures: Vec<(usize, usize, [Vec<u8>; 2])>,
+    /// Each half as large as the one before.
+    levels: Vec<Level>,
+    /// A picture of the last size whose pixels were moved.
+    moved: Vec<u8>,
+    /// Disparities to look for in each direction, in the last size.
+    reach: usize,
     matcher: SgmMatcher,
     map: DisparityMap,
 }
 
 impl OrderCheck {
-    /// Prepares for pairs of a size that are searched for `max_disparity` disparities.
+    /// Prepares for pairs of a size. What is nearer than a sixth of the width in disparity says nothing.
     ///
     /// # Errors
     /// As [`SgmMatcher::new`].
-    pub fn new(width: usize, height: usize, max_disparity: usize) -> Result<Self> {
-        let mut pictures = Vec::new();
-        let (mut w, mut h, mut disparities) = (width, height, max_disparity);
+    pub fn new(width: usize, height: usize) -> Result<Self> {
+        let mut levels = Vec::new();
+        let (mut w, mut h) = (width, height);
         while w > WIDTH {
-            (w, h, disparities) = (w.div_ceil(2), h.div_ceil(2), disparities.div_ceil(2));
-            pictures.push((w, h, [vec![0; w * h], vec![0; w * h]]));
+            (w, h) = (w.div_ceil(2), h.div_ceil(2));
+            levels.push(Level { size: (w, h), eyes: [vec![0; w * h], vec![0; w * h]] });
         }
+        let reach = (w / 6).clamp(1, MAX_DISPARITIES / 2);
         let parameters = Parameters {
             resolution: Resolution::Full,
+            uniqueness_percent: UNIQUE_PERCENT,
             // Only what is found counts here, and both views must say the same.
             left_right_px: 1,
             rematch: false,
             gap_px: 0,
-            ..Parameters::preset(Preset::Quality, disparities)
+            ..Parameters::preset(Preset::Quality, 2 * reach)
         };
         let matcher = SgmMatcher::new(w, h, &parameters, 1)?;
-        Ok(Self { size: (width, height), pictures, matcher, map: DisparityMap::default() })
+        let moved = vec![0; w * h];
+        Ok(Self { size: (width, height), levels, moved, reach, matcher, map: DisparityMap::default() })
     }
 
     /// What `pair` looks like.
@@ -64,36 +93,36 @@ impl OrderCheck {
     pub fn check(&mut self, pair: &StereoPair<'_>) -> Result<Order> {
         pair.left.check("left", self.size.0, self.size.1)?;
         pair.right.check("right", self.size.0, self.size.1)?;
-        let Self { pictures, matcher, map, .. } = self;
-        for i in 0..pictures.len() {
-            let (before, here) = pictures.split_at_mut(i);
-            let Some((_, _, to)) = here.first_mut() else { break };
-            let from = match before.last() {
-                Some((w, h, [left, right])) => [Gray::packed(left, *w, *h), Gray::packed(right, *w, *h)],
-                None => [pair.left, pair.right],
-            };
-            for (from, to) in from.iter().zip(to) {
-                super::sgm::halve(from, to);
+        let Self { levels, moved, reach, matcher, map, .. } = self;
+        for i in 0..levels.len() {
+            let (before, here) = levels.split_at_mut(i);
+            let Some(level) = here.first_mut() else { break };
+            let from = before.last().map_or([pair.left, pair.right], Level::both);
+            for (from, to) in from.iter().zip(&mut level.eyes) {
+                halve(from, to);
             }
         }
-        let [left, right] = match pictures.last() {
-            Some((w, h, [left, right])) => [Gray::packed(left, *w, *h), Gray::packed(right, *w, *h)],
-            None => [pair.left, pair.right],
-        };
-        let mut found = |left, right| {
-            matcher.run(&StereoPair::new(left, right), map)?;
-            // What is at the far end of both orders says nothing.
-            let some = map.disparity.iter().filter(|d| **d >= 1.0).count();
-            Ok::<_, Error>(some as f64 / map.disparity.len() as f64)
-        };
-        let (named, exchanged) = (found(left, right)?, found(right, left)?);
-        Ok(if named >= ENOUGH && named >= CLEARLY * exchanged {
-            Order::AsNamed
+        let [left, right] = levels.last().map_or([pair.left, pair.right], Level::both);
+        // What lies `reach` further right than it should is found at 0, and what lies as far to the left at `2 * reach`.
+        shift(&right, -(*reach as isize), moved);
+        matcher.run(&StereoPair::new(left, Gray::packed(moved, left.width, left.height)), map)?;
+        // Of the others a part of the search lies beside the picture.
+        let whole = 2 * *reach..left.width - *reach;
+        let middle = *reach as f32;
+        let named = share(map, whole.clone(), |d| d > middle + NEAR_PX && d < 2.0 * middle - END_PX);
+        let exchanged = share(map, whole, |d| d < middle - NEAR_PX && d > END_PX);
+        let (order, most) = if named >= ENOUGH && named >= CLEARLY * exchanged {
+            (Order::AsNamed, named)
         } else if exchanged >= ENOUGH && exchanged >= CLEARLY * named {
-            Order::Swapped
+            (Order::Swapped, exchanged)
         } else {
-            Order::Unclear
-        })
+            return Ok(Order::Unclear);
+        };
+        shift(&left, APART_PX as isize, moved);
+        matcher.run(&StereoPair::new(left, Gray::packed(moved, left.width, left.height)), map)?;
+        // At the near end are those that merely look like what is beside them.
+        let repeated = share(map, 2 * *reach..left.width, |d| d > APART_PX as f32);
+        Ok(if repeated < REPEATED * most { order } else { Order::Unclear })
     }
 
     /// Refuses a pair whose pictures are swapped.
@@ -104,11 +133,41 @@ impl OrderCheck {
         if self.check(pair)? == Order::Swapped {
             return Err(Error::new(
                 ErrorKind::BadInput,
-                "left and right are swapped: with the pictures exchanged far more is found than as they are; exchange them",
+                "left and right are swapped: what is near lies further right in the right picture; exchange them",
             ));
         }
         Ok(())
     }
+}
+
+impl Level {
+    fn both(&self) -> [Gray<'_>; 2] {
+        let (w, h) = self.size;
+        [Gray::packed(&self.eyes[0], w, h), Gray::packed(&self.eyes[1], w, h)]
+    }
+}
+
+/// The picture moved to the right by `by` pixels; black where nothing is left.
+fn shift(picture: &Gray<'_>, by: isize, to: &mut [u8]) {
+    for (y, to) in to.chunks_mut(picture.width.max(1)).enumerate() {
+        let row = picture.row(y);
+        let n = by.unsigned_abs().min(row.len());
+        let kept = row.len() - n;
+        if by < 0 {
+            to[..kept].copy_from_slice(&row[n..]);
+            to[kept..].fill(0);
+        } else {
+            to[n..].copy_from_slice(&row[..kept]);
+            to[..n].fill(0);
+        }
+    }
+}
+
+/// Share of the pixels in these columns whose disparity is one of those that count.
+fn share(map: &DisparityMap, columns: core::ops::Range<usize>, counts: impl Fn(f32) -> bool) -> f64 {
+    let rows = map.disparity.chunks(map.width.max(1));
+    let found = rows.clone().filter_map(|r| r.get(columns.clone())).flatten().filter(|d| counts(**d)).count();
+    found as f64 / (columns.len() * rows.len()).max(1) as f64
 }
 
 #[cfg(test)]
@@ -127,7 +186,7 @@ mod tests {
         for (w, h) in [(200, 60), (1001, 90)] {
             let (a, b) = (picture(w, h, 0), picture(w, h, 24));
             let (a, b) = (Gray::packed(&a, w, h), Gray::packed(&b, w, h));
-            let mut check = OrderCheck::new(w, h, 64).unwrap();
+            let mut check = OrderCheck::new(w, h).unwrap();
             assert_eq!(check.check(&StereoPair::new(a, b)).unwrap(), Order::AsNamed);
             assert_eq!(check.check(&StereoPair::new(b, a)).unwrap(), Order::Swapped);
             check.refuse_swapped(&StereoPair::new(a, b)).unwrap();
@@ -141,12 +200,36 @@ mod tests {
         let (w, h) = (200, 60);
         let grey = vec![90; w * h];
         let grey = Gray::packed(&grey, w, h);
-        let mut check = OrderCheck::new(w, h, 64).unwrap();
+        let mut check = OrderCheck::new(w, h).unwrap();
         assert_eq!(check.check(&StereoPair::new(grey, grey)).unwrap(), Order::Unclear);
         // Infinitely far: no order is better.
         let far = picture(w, h, 0);
         let far = Gray::packed(&far, w, h);
         assert_eq!(check.check(&StereoPair::new(far, far)).unwrap(), Order::Unclear);
         assert!(check.check(&StereoPair::new(far, Gray::packed(far.pixels, h, w))).is_err());
+        // Too small to look for anything.
+        for (w, h) in [(1, 1), (5, 3), (16, 1)] {
+            let small = picture(w, h, 0);
+            let small = Gray::packed(&small, w, h);
+            let Ok(mut check) = OrderCheck::new(w, h) else { continue };
+            assert_eq!(check.check(&StereoPair::new(small, small)).unwrap(), Order::Unclear, "{w}x{h}");
+        }
+    }
+
+    #[test]
+    fn pictures_are_moved_as_far_as_they_go() {
+        let pixels = [1, 2, 3, 9, 4, 5, 6, 9];
+        let picture = Gray { pixels: &pixels, width: 3, height: 2, stride: 4 };
+        let mut out = [7; 6];
+        for (by, expected) in [
+            (1, [0, 1, 2, 0, 4, 5]),
+            (-2, [3, 0, 0, 6, 0, 0]),
+            (0, [1, 2, 3, 4, 5, 6]),
+            (5, [0; 6]),
+            (-5, [0; 6]),
+        ] {
+            shift(&picture, by, &mut out);
+            assert_eq!(out, expected, "{by}");
+        }
     }
 }

@@ -9,8 +9,10 @@ use crate::moments::Due;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::PixelFormat;
-use depthrig_calib::stereo::{DisparityMap, Gray, Matcher, StereoPair, depth_from_disparity};
-use depthrig_calib::{EyeOrder, Rectifier, View, eye_order};
+use depthrig_calib::stereo::{
+    DisparityMap, Gray, Matcher, Order, OrderCheck, StereoPair, depth_from_disparity,
+};
+use depthrig_calib::{Rectifier, View};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, PoisonError};
 
@@ -120,6 +122,8 @@ impl Crew {
         let (spare, spared) = sync_channel(4);
         let raw = Newest::new(options.every_pair);
         let views: Vec<_> = matchers.iter().map(|_| Newest::new(options.every_pair)).collect();
+        let order = OrderCheck::new(geometry.width, geometry.height)
+            .map_err(|e| Error::new(ErrorKind::BadInput, format!("{camera}: {e}")).with_source(e))?;
         let rectify = Rectify {
             rectifier,
             format,
@@ -130,6 +134,7 @@ impl Crew {
             events: send.clone(),
             pool: Vec::new(),
             most: matchers.len() + 4,
+            order,
             pairs: 0,
             swapped: 0,
         };
@@ -232,6 +237,7 @@ struct Rectify {
     /// All views that there are; those that nobody else has are free.
     pool: Vec<Arc<Views>>,
     most: usize,
+    order: OrderCheck,
     pairs: u64,
     /// Pairs in a row whose eyes look exchanged.
     swapped: u32,
@@ -271,8 +277,9 @@ impl Rectify {
             return false;
         }
         let (width, height) = self.rectifier.size();
-        match eye_order(&views.left, &views.right, (width as usize, height as usize)) {
-            EyeOrder::Swapped => self.swapped += 1,
+        let eye = |picture| Gray::packed(picture, width as usize, height as usize);
+        match self.order.check(&StereoPair::new(eye(&views.left), eye(&views.right))) {
+            Ok(Order::Swapped) => self.swapped += 1,
             _ => self.swapped = 0,
         }
         self.swapped == BELIEVED

@@ -134,7 +134,7 @@ pub fn run(args: &StereoArgs) -> Result<Exit> {
     let pair = StereoPair::new(left.gray(), right.gray());
     let usage = |e: depthrig_calib::Error| UsageError(e.to_string());
     if !args.even_if_swapped {
-        let mut order = OrderCheck::new(left.width, left.height, args.max_disparity.into()).map_err(usage)?;
+        let mut order = OrderCheck::new(left.width, left.height).map_err(usage)?;
         order.refuse_swapped(&pair).map_err(usage)?;
     }
     let parameters = Parameters::preset(args.preset, args.max_disparity.into());
