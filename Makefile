@@ -56,6 +56,7 @@ bench: setup-build ## the numbers of docs/performance.md
 	cargo build --release --package depthrig
 	target/release/depthrig bench bus
 	target/release/depthrig bench record
+	cargo run --release --package depthrig-tests --example zed_replay_ratio
 
 bench-peers: setup-peers $(PEERS_VENV)/.stamp ## beside Python mcap, foxglove-sdk, rosbag and PNG files, in one run
 	cargo build --release --package depthrig-recorder --example bench_frames
