@@ -33,7 +33,7 @@ fn u16s(bytes: &[u8]) -> Vec<u16> {
 fn every_mode_has_depth_that_is_right() {
     let dir = tempfile::tempdir().unwrap();
     let (source, out) = (dir.path().join("source"), dir.path().join("out"));
-    let eyes = Eyes { one_eyed: vec![2], ..Eyes::default() };
+    let eyes = Eyes { one_eyed: vec![2, 5], ..Eyes::default() };
     eyes.record(&source);
     let options = ZedReplayOptions { disparity: true, ..options(&CLASSICAL, 3) };
     let report = zed_replay(&source, &out, &options, &mut go_on).unwrap();
@@ -54,9 +54,11 @@ fn every_mode_has_depth_that_is_right() {
         let mode = made.stream.stream.as_str().rsplit('_').next().unwrap().to_owned();
         assert_eq!(made.name, format!("mimic_{mode}"));
         assert!(
-            made.producer.starts_with("depthrig") && made.parameters.contains("max_disparity="),
+            made.producer.starts_with("depthrig-sgm ") && made.parameters.contains("max_disparity="),
             "{made:?}"
         );
+        assert!(made.parameters.starts_with(&format!("preset={mode} ")), "{made:?}");
+        assert!(made.parameters.ends_with(" min_depth_m=0.3 max_depth_m=20"), "{made:?}");
         assert_eq!(
             made.from.iter().map(ToString::to_string).collect::<Vec<_>>(),
             ["zed2i/left", "zed2i/right"]
@@ -73,7 +75,7 @@ fn every_mode_has_depth_that_is_right() {
     let before = original.sets_with(SetRange::ALL, PixelMode::None).map(Result::unwrap);
     for (n, (set, old)) in sets.zip(before).enumerate() {
         assert_eq!((set.id, set.tick, set.utc_ns), (old.id, old.tick, old.utc_ns));
-        if n == 2 {
+        if eyes.one_eyed.contains(&(n as u64)) {
             assert_eq!(
                 (set.frames.len(), set.missing.len()),
                 (0, 10),

@@ -212,8 +212,13 @@ fn a_pair_that_cannot_be_read_is_lost_and_said() {
     let home = Home::new();
     let (input, out) = (folder(&home, "in", 3, false), path(&home, "out"));
     let damaged = Path::new(&input).join("pair_001.png");
-    let bytes = std::fs::read(&damaged).unwrap();
+    let mut bytes = std::fs::read(&damaged).unwrap();
+    // One that is cut off is seen at once, when all of them are looked at.
     std::fs::write(&damaged, &bytes[..bytes.len() / 2]).unwrap();
+    refused(&home, &input, &[], &["pair_001.png", "cut off"]);
+    let middle = bytes.len() / 2;
+    bytes[middle..middle + 64].fill(0xff);
+    std::fs::write(&damaged, bytes).unwrap();
     let ran = home.run(&["zed", "replay", &input, "--out", &out, "--modes", "performance", "--json", "-q"]);
     assert_eq!(ran.code, 3, "{}", ran.err);
     assert!(ran.err.contains("lost: pair 1 of") && ran.err.contains("pair_001.png"), "{}", ran.err);
