@@ -98,7 +98,8 @@ struct MadeStream {
 
 /// A picture of noise, `shift` pixels to the left.
 fn noise(format: PixelFormat, shift: usize) -> Vec<u8> {
-    let grey = |x: usize, y: usize| (((x * 7919 + y * 104_729) * 2_654_435_761) >> 7) as u8;
+    // Not a sum, which would repeat along a row.
+    let grey = |x: usize, y: usize| ((((x * 7919) ^ (y * 104_729)) * 2_654_435_761) >> 13) as u8;
     let pixels = (0..W as usize * H as usize).map(|i| (i % W as usize + shift, i / W as usize));
     pixels
         .flat_map(|(x, y)| match format {
