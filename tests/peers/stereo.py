@@ -3,10 +3,19 @@
     cargo build --release -p depthrig
     python tests/peers/stereo.py --depthrig target/release/depthrig --pair ALOE_L ALOE_R ALOE_GT 1 224 [--pair ...]
 
-Each --pair is: left picture, right picture, true disparity of the left one (a picture or .npy), the number that its
-values are divided by, and how many disparities to search. Said for each pair are bad-2.0 (share of the pixels whose disparity
+Each --pair is: left picture, right picture, true disparity of the left one (a picture of 8 or 16 bits, .pfm or .npy), the
+number that its values are divided by, how many disparities to search, and if there is one a sixth: mask:FILE, a picture that is
+255 where both eyes see (Middlebury's mask0nocc.png), or right:FILE, the true disparity of the right picture. 0 and what is not
+finite is unknown. Pairs that need more than 256 disparities are halved first. For example, of Middlebury's:
+
+    --pair view1.png view5.png disp1.png 1 240 right:disp5.png       2005, 2006, full size (half: 2, third: 3)
+    --pair im2.ppm im6.ppm disp2.pgm 8 32                             2001
+    --pair im0.png im1.png disp0GT.pfm 1 144 mask:mask0nocc.png       2014, evaluation 3
+
+Said for each pair are bad-2.0 (share of the pixels whose disparity
 is wrong by more than two), invalid (share that has none), and their sum, over the pixels with a true disparity that the right eye
-sees too; and for pictures of 1280x720 with 128 disparities the CPU time on one core, the best of rounds that take turns. OpenCV's
+sees too: those of the mask; else those whose disparity the right truth repeats within one; else those that no nearer one of the
+left truth hides. And for pictures of 1280x720 with 128 disparities the CPU time on one core, the best of rounds that take turns. OpenCV's
 pictures are made wider on the left by as many pixels as disparities are searched, so that it gives no pixel up; its speed is
 measured without that, which it gains a tenth by. Exit code 1 when one of these is not kept:
 
@@ -30,6 +39,7 @@ MODES = {
     "SGBM_3WAY": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     "SGBM": cv2.STEREO_SGBM_MODE_SGBM,
     "HH": cv2.STEREO_SGBM_MODE_HH,
+    "HH4": cv2.STEREO_SGBM_MODE_HH4,
 }
 PRESETS = ["performance", "quality", "ultra"]
 
@@ -55,6 +65,15 @@ def seen_by_both(truth: np.ndarray) -> np.ndarray:
     return seen
 
 
+def seen_by_right_truth(truth: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Pixels whose true disparity is that of the right picture's pixel too, within one."""
+    rows, columns = np.indices(truth.shape)
+    known = np.isfinite(truth)
+    there = np.where(known, np.round(columns - np.where(known, truth, 0)), -1).astype(int)
+    other = right[rows, np.clip(there, 0, truth.shape[1] - 1)]
+    return known & (there >= 0) & (np.abs(other - truth) <= 1.01)
+
+
 def score(disparity: np.ndarray, truth: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
     """Percent of the seen pixels that are wrong by more than 2, and that have none."""
     valid = np.isfinite(disparity)
@@ -62,13 +81,47 @@ def score(disparity: np.ndarray, truth: np.ndarray, seen: np.ndarray) -> tuple[f
     return 100 * wrong[seen].mean(), 100 * (~valid)[seen].mean()
 
 
+def picture(path: str, how: int) -> np.ndarray:
+    read = cv2.imread(path, how)
+    if read is None:
+        sys.exit(f"{path}: there is no picture that OpenCV can read")
+    return read
+
+
+def pfm(path: str) -> np.ndarray:
+    """One channel of floats, rows from the bottom; a scale below 0 means little-endian."""
+    kind, size, scale, data = Path(path).read_bytes().split(b"\n", 3)
+    if kind.strip() != b"Pf":
+        sys.exit(f"{path}: is no PFM of one channel")
+    width, height = (int(n) for n in size.split())
+    return np.frombuffer(data, "<f4" if float(scale) < 0 else ">f4", width * height).reshape(height, width)[::-1]
+
+
 def true_disparity(path: str, scale: float) -> np.ndarray:
     if path.endswith(".npy"):
-        truth = np.load(path).astype(np.float32)
+        truth = np.load(path)
+    elif path.endswith(".pfm"):
+        truth = pfm(path)
     else:
-        truth = cv2.imread(path, cv2.IMREAD_UNCHANGED).astype(np.float32)
-    truth[truth == 0] = np.nan
+        truth = picture(path, cv2.IMREAD_UNCHANGED)
+        truth = truth[..., 0] if truth.ndim == 3 else truth
+    truth = truth.astype(np.float32)
+    truth[(truth == 0) | ~np.isfinite(truth)] = np.nan
     return truth / scale
+
+
+def seen_by(sixth: str | None, truth: np.ndarray, scale: float) -> np.ndarray:
+    """The pixels that count, by what a --pair says or does not say of them."""
+    if sixth is None:
+        return seen_by_both(truth)
+    kind, _, path = sixth.partition(":")
+    if kind == "mask":
+        seen = np.isfinite(truth) & (picture(path, cv2.IMREAD_GRAYSCALE) == 255)
+    elif kind == "right":
+        seen = seen_by_right_truth(truth, true_disparity(path, scale))
+    else:
+        sys.exit(f"{sixth}: the sixth of a --pair is mask:FILE or right:FILE")
+    return seen
 
 
 def ours(args: argparse.Namespace, left: Path, right: Path, preset: str, disparities: int, folder: Path) -> np.ndarray:
@@ -80,10 +133,17 @@ def ours(args: argparse.Namespace, left: Path, right: Path, preset: str, dispari
 
 def quality(args: argparse.Namespace, folder: Path) -> bool:
     kept = True
-    for left_path, right_path, truth_path, scale, disparities in args.pair:
-        left, right = (cv2.imread(p, cv2.IMREAD_GRAYSCALE) for p in (left_path, right_path))
+    for left_path, right_path, truth_path, scale, disparities, *sixth in args.pair:
+        left, right = (picture(p, cv2.IMREAD_GRAYSCALE) for p in (left_path, right_path))
         truth, disparities = true_disparity(truth_path, float(scale)), int(disparities)
-        seen = seen_by_both(truth)
+        if not left.shape == right.shape == truth.shape:
+            sys.exit(f"{left_path}: left {left.shape}, right {right.shape} and truth {truth.shape} are of several sizes")
+        seen = seen_by(sixth[0] if sixth else None, truth, float(scale))
+        while disparities > 256:
+            size = (left.shape[1] // 2, left.shape[0] // 2)
+            left, right = (cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in (left, right))
+            truth, seen = (a[1 : 2 * size[1] : 2, 1 : 2 * size[0] : 2] for a in (truth / 2, seen))
+            disparities = -(-disparities // 2)
         # Both sides get the same grey pictures.
         files = [folder / "left.png", folder / "right.png"]
         for file, picture in zip(files, (left, right), strict=True):
@@ -110,7 +170,7 @@ def quality(args: argparse.Namespace, folder: Path) -> bool:
 
 
 def speed(args: argparse.Namespace, folder: Path) -> bool:
-    left, right = (cv2.imread(p, cv2.IMREAD_GRAYSCALE) for p in args.pair[0][:2])
+    left, right = (picture(p, cv2.IMREAD_GRAYSCALE) for p in args.pair[0][:2])
     size = (1280, round(left.shape[0] * 1280 / left.shape[1]))
     left, right = (cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in (left, right))
     if size[1] < 720:
@@ -149,16 +209,27 @@ def speed(args: argparse.Namespace, folder: Path) -> bool:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--depthrig", default="target/release/depthrig")
-    parser.add_argument("--pair", nargs=5, action="append", metavar=("LEFT", "RIGHT", "TRUTH", "SCALE", "DISPARITIES"))
+    parser.add_argument(
+        "--pair",
+        nargs="+",
+        action="append",
+        metavar="FILE",
+        help="LEFT RIGHT TRUTH SCALE DISPARITIES [mask:FILE | right:FILE]",
+    )
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--no-speed", action="store_true", help="only the disparities, not what they cost")
     args = parser.parse_args()
+    for pair in args.pair or []:
+        if len(pair) not in (5, 6):
+            parser.error("a --pair is LEFT RIGHT TRUTH SCALE DISPARITIES [mask:FILE | right:FILE]")
     if not args.pair:
         data = Path(__file__).resolve().parents[2] / "../shared/data/opencv_aloe_stereo"
         args.pair = [[str(data / "aloeL.jpg"), str(data / "aloeR.jpg"), str(data / "aloeGT.png"), "1", "224"]]
     cv2.setNumThreads(1)
     print(f"OpenCV {cv2.__version__}")
     with tempfile.TemporaryDirectory() as folder:
-        fast, good = speed(args, Path(folder)), quality(args, Path(folder))
+        fast = args.no_speed or speed(args, Path(folder))
+        good = quality(args, Path(folder))
     sys.exit(0 if fast and good else 1)
 
 

@@ -10,59 +10,69 @@ use core::arch::x86_64::*;
 #[derive(Clone, Copy)]
 pub struct Avx2(__m256i);
 
-// SAFETY of every block here: the caller promises a processor with AVX2 and pointers that reach.
-#[allow(clippy::undocumented_unsafe_blocks, reason = "one reason for all, above")]
 impl Lanes for Avx2 {
     const LANES: usize = 32;
     type Keys = __m256i;
 
     #[inline(always)]
     unsafe fn splat(value: u8) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         Self(unsafe { _mm256_set1_epi8(value as i8) })
     }
     #[inline(always)]
     unsafe fn load(from: *const u8) -> Self {
+        // SAFETY: the caller can read 32 bytes at `from`; this load asks for no alignment.
         Self(unsafe { _mm256_loadu_si256(from.cast()) })
     }
     #[inline(always)]
     unsafe fn store(self, to: *mut u8) {
+        // SAFETY: the caller may write 32 bytes at `to`; this store asks for no alignment.
         unsafe { _mm256_storeu_si256(to.cast(), self.0) }
     }
     #[inline(always)]
     unsafe fn stream(self, to: *mut u8) {
+        // SAFETY: the caller may write 32 bytes at `to`, a multiple of 32, as this store asks.
         unsafe { _mm256_stream_si256(to.cast(), self.0) }
     }
     #[inline(always)]
     unsafe fn add(self, other: Self) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         Self(unsafe { _mm256_add_epi8(self.0, other.0) })
     }
     #[inline(always)]
     unsafe fn sub(self, other: Self) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         Self(unsafe { _mm256_sub_epi8(self.0, other.0) })
     }
     #[inline(always)]
     unsafe fn min(self, other: Self) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         Self(unsafe { _mm256_min_epu8(self.0, other.0) })
     }
     #[inline(always)]
     unsafe fn or(self, other: Self) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         Self(unsafe { _mm256_or_si256(self.0, other.0) })
     }
     #[inline(always)]
     unsafe fn add_saturating(self, other: Self) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         Self(unsafe { _mm256_adds_epu8(self.0, other.0) })
     }
     #[inline(always)]
     unsafe fn average(self, other: Self) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         Self(unsafe { _mm256_avg_epu8(self.0, other.0) })
     }
     #[inline(always)]
     unsafe fn times_8(self) -> Self {
         // No bit of a value below 32 leaves its byte.
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         Self(unsafe { _mm256_slli_epi16::<3>(self.0) })
     }
     #[inline(always)]
     unsafe fn quarter_of_difference(self, other: Self) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         unsafe {
             let difference =
                 _mm256_or_si256(_mm256_subs_epu8(self.0, other.0), _mm256_subs_epu8(other.0, self.0));
@@ -71,6 +81,7 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     unsafe fn hamming(left: [Self; 3], right: [Self; 3]) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         unsafe {
             let a = _mm256_xor_si256(left[0].0, right[0].0);
             let b = _mm256_xor_si256(left[1].0, right[1].0);
@@ -94,6 +105,7 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     unsafe fn min_outside(self, other: Self, place: Self, span: Self) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         unsafe {
             let inside = _mm256_cmpeq_epi8(_mm256_min_epu8(place.0, span.0), place.0);
             Self(_mm256_min_epu8(self.0, _mm256_or_si256(other.0, inside)))
@@ -101,6 +113,7 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     unsafe fn up(self, fill: Self) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         unsafe {
             let before = _mm256_permute2x128_si256::<0x20>(fill.0, self.0);
             // Byte 15 of `before` is taken: any of a splat.
@@ -109,6 +122,7 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     unsafe fn down(self, fill: Self) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         unsafe {
             let after = _mm256_permute2x128_si256::<0x21>(self.0, fill.0);
             Self(_mm256_alignr_epi8::<1>(after, self.0))
@@ -116,27 +130,33 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     unsafe fn least(self) -> u8 {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         unsafe { _mm_cvtsi128_si32(least(self.0)) as u8 }
     }
     #[inline(always)]
     unsafe fn least_everywhere(self) -> Self {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         Self(unsafe { _mm256_broadcastb_epi8(least(self.0)) })
     }
 
     #[inline(always)]
     unsafe fn keys(self, of: Self) -> [Self::Keys; 2] {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         unsafe { [_mm256_unpacklo_epi8(of.0, self.0), _mm256_unpackhi_epi8(of.0, self.0)] }
     }
     #[inline(always)]
     unsafe fn no_keys() -> [Self::Keys; 2] {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         [unsafe { _mm256_set1_epi8(-1) }; 2]
     }
     #[inline(always)]
     unsafe fn min_keys(a: [Self::Keys; 2], b: [Self::Keys; 2]) -> [Self::Keys; 2] {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         unsafe { [_mm256_min_epu16(a[0], b[0]), _mm256_min_epu16(a[1], b[1])] }
     }
     #[inline(always)]
     unsafe fn least_key(keys: [Self::Keys; 2]) -> u16 {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         unsafe {
             let both = _mm256_min_epu16(keys[0], keys[1]);
             let half = _mm_min_epu16(_mm256_castsi256_si128(both), _mm256_extracti128_si256::<1>(both));
@@ -145,10 +165,12 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     unsafe fn first_key(keys: [Self::Keys; 2]) -> u16 {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         unsafe { _mm_cvtsi128_si32(_mm256_castsi256_si128(keys[0])) as u16 }
     }
     #[inline(always)]
     unsafe fn keys_down(keys: [Self::Keys; 2]) -> [Self::Keys; 2] {
+        // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
         unsafe {
             let [low, high] = keys;
             // Lanes 0 to 7 and 16 to 23 are in `low`, so that 8 follows 7 in `high`, and 16 follows 15 in `low`.
@@ -158,6 +180,7 @@ impl Lanes for Avx2 {
     }
     #[inline(always)]
     unsafe fn fence() {
+        // SAFETY: touches no memory of ours; every x86-64 has it.
         unsafe { _mm_sfence() }
     }
 }
@@ -165,7 +188,7 @@ impl Lanes for Avx2 {
 /// The least byte, in byte 0.
 #[inline(always)]
 unsafe fn least(v: __m256i) -> __m128i {
-    // SAFETY: as the caller promises.
+    // SAFETY: AVX2, which the caller has seen that the processor has; nothing but registers.
     unsafe {
         let half = _mm_min_epu8(_mm256_castsi256_si128(v), _mm256_extracti128_si256::<1>(v));
         _mm_minpos_epu16(_mm_min_epu8(half, _mm_srli_epi16::<8>(half)))

@@ -72,7 +72,7 @@ impl<S: Lanes, const N: usize> Carry<S, N> {
     /// Before the first step.
     #[inline(always)]
     pub unsafe fn new() -> Self {
-        // SAFETY: as the caller promises.
+        // SAFETY: registers alone; the caller has seen that the processor has what `S` needs.
         unsafe { Self { along: [S::splat(0); N], window: [S::no_keys(); N] } }
     }
 }
@@ -80,7 +80,8 @@ impl<S: Lanes, const N: usize> Carry<S, N> {
 /// What a path adds to the cost: `before` are the path's costs one pixel earlier, the least of which is 0.
 #[inline(always)]
 unsafe fn step<S: Lanes, const N: usize>(before: &[S; N], small: S, large: S) -> [S; N] {
-    // SAFETY: as the caller promises.
+    // SAFETY: registers alone, as in `Carry::new`. No sum leaves its byte: costs of a path are at most BEYOND + 63,
+    // which is EDGE, and a penalty is at most 63.
     unsafe {
         let edge = S::splat(EDGE);
         let (first, last) = (before[N - 1].up(edge), before[0].down(edge));
@@ -97,7 +98,7 @@ unsafe fn step<S: Lanes, const N: usize>(before: &[S; N], small: S, large: S) ->
 /// Costs along a path, less the least of them.
 #[inline(always)]
 unsafe fn grown<S: Lanes, const N: usize>(cost: &[S; N], more: &[S; N]) -> [S; N] {
-    // SAFETY: as the caller promises.
+    // SAFETY: registers alone, as in `Carry::new`. A cost is at most BEYOND, and what is added to it at most 63.
     unsafe {
         let mut path = *cost;
         let mut least = cost[0].add(more[0]);
@@ -113,7 +114,7 @@ unsafe fn grown<S: Lanes, const N: usize>(cost: &[S; N], more: &[S; N]) -> [S; N
     }
 }
 
-/// One of the three paths from the row before, through the cell `here`.
+/// One of the three paths from the row before, through the cell `here`: `N` vectors that nobody else uses meanwhile.
 #[inline(always)]
 unsafe fn across<S: Lanes, const N: usize>(
     here: *mut u8,
@@ -121,7 +122,7 @@ unsafe fn across<S: Lanes, const N: usize>(
     (small, large): (S, S),
     sum: &mut [S; N],
 ) {
-    // SAFETY: as the caller promises.
+    // SAFETY: vector `i < N` of the cell is read and written, and the cell has `N`, by the caller.
     unsafe {
         let mut before = [small; N];
         for i in 0..N {
@@ -152,7 +153,14 @@ pub unsafe fn run<S: Lanes, const N: usize, const BACK: bool>(
     let cell = N * S::LANES;
     let w = row.width;
     let right = row.right;
-    // SAFETY: as the caller promises.
+    // SAFETY: with `x < w`, since `steps` ends at `w` at most:
+    // - `left` and `large` have PLANES bytes for each pixel of the row, of which bytes 0 to 3 of pixel `x` are read;
+    // - `right` has 2 N - 1 phases of `reach` bytes. Phase `k % N + i` is at most 2 N - 2, and the LANES bytes from `k / N` end
+    //   before `reach`, which is more than `w / N + LANES`;
+    // - `lanes` has two cells, and a load ends with the second at the latest;
+    // - `sums`, `winners` and `mirrored` have `w` entries for the row; a sum begins at a multiple of a cell, so of LANES, of
+    //   memory that is aligned to 64, as `stream` asks;
+    // - the cells of these steps are the caller's to promise: see `Order::cells`.
     unsafe {
         let small = S::splat(row.small);
         let grey_most = S::splat(GREY_MOST);
@@ -209,6 +217,9 @@ pub unsafe fn run<S: Lanes, const N: usize, const BACK: bool>(
 
 /// The best of the costs of pixel `x`, and what the right view makes of them. `window[i]` has the best keys of the right pixels
 /// that pixel `x` is compared with, each in the lane of its disparity.
+///
+/// # Safety
+/// As [`run`], of which it is the end; `x` is below the row's width.
 #[inline(always)]
 unsafe fn choose<S: Lanes, const N: usize>(
     row: &Row,
@@ -216,7 +227,9 @@ unsafe fn choose<S: Lanes, const N: usize>(
     total: &[S; N],
     window: &mut [[S::Keys; 2]; N],
 ) {
-    // SAFETY: as the caller promises.
+    // SAFETY: `lanes`, `winners` and `mirrored` as in `run`. `costs` has 256 bytes, and `Passes::new` takes no more vectors than
+    // hold 256 disparities; all N LANES bytes are written before any is read. `disparity` is a number from `lanes`, so below
+    // N LANES; the places of `d - 1` and `d + 1` are looked at where there are such disparities, and lie below N LANES too.
     unsafe {
         let mut number = *total;
         let mut best = S::no_keys();

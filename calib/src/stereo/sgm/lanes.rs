@@ -87,17 +87,17 @@ impl Lanes for Plain {
     }
     #[inline(always)]
     unsafe fn load(from: *const u8) -> Self {
-        // SAFETY: as the caller promises.
+        // SAFETY: the caller can read 32 bytes at `from`; unaligned.
         Self(unsafe { from.cast::<[u8; PLAIN]>().read_unaligned() })
     }
     #[inline(always)]
     unsafe fn store(self, to: *mut u8) {
-        // SAFETY: as the caller promises.
+        // SAFETY: the caller may write 32 bytes at `to`; unaligned.
         unsafe { to.cast::<[u8; PLAIN]>().write_unaligned(self.0) }
     }
     #[inline(always)]
     unsafe fn stream(self, to: *mut u8) {
-        // SAFETY: as the caller promises.
+        // SAFETY: the caller may write 32 bytes at `to`.
         unsafe { self.store(to) }
     }
     #[inline(always)]
@@ -156,7 +156,7 @@ impl Lanes for Plain {
     }
     #[inline(always)]
     unsafe fn least_everywhere(self) -> Self {
-        // SAFETY: this form is safe.
+        // SAFETY: neither looks at memory, and every processor has this form.
         unsafe { Self::splat(self.least()) }
     }
 

@@ -120,7 +120,9 @@ struct Targets {
     winners: *mut Winner,
     mirrored: *mut u8,
 }
-// SAFETY: see above.
+// SAFETY: the pointers are to memory that `Passes::run` borrows mutably for as long as the threads run. Of the sums, winners and
+// mirrored each row writes its own part, and a row is one thread's; of the cells `Order::wait` lets a row have only what the
+// row before it has left for good.
 unsafe impl Sync for Targets {}
 
 /// Dropped by a thread that does not come to its end, so that the others do not wait for it.
@@ -262,8 +264,10 @@ impl Passes {
         together(&band.planes, w, &mut band.penalties);
         let base = [(ring - r % ring) % ring, 0, r % ring];
         let right = &self.right[PLANES * self.phases * self.reach * y..];
-        // SAFETY: a ring is `ring * cell` bytes; the sums are `width * height` cells. A row writes only its own cells of the
-        // rings, which `Order` keeps from the rows before and after it.
+        // SAFETY: three rings of `ring * cell` bytes are what `cells` has, so `(base + s) % ring * cell` begins a cell of one. The
+        // offsets of row `y < height` are inside `left`, `sums`, `winners` and `mirrored`, which have `height` rows; `right` was
+        // cut at row `y` by a slice, and has PLANES planes of `phases * reach` from there. `penalties` has PLANES bytes a
+        // pixel, and `lanes` two cells. Nobody else writes the row's part (see `Targets`).
         unsafe {
             let rings = [0, 1, 2].map(|p| to.cells.add(p * ring * cell));
             // Paths that begin here: the one that comes from the side behind at the first step, and the one that comes
@@ -291,10 +295,13 @@ impl Passes {
         }
     }
 
+    /// The loop for the form and the number of vectors.
+    ///
     /// # Safety
-    /// As [`kernel::run`].
+    /// As [`kernel::run`], for every step of the row.
     unsafe fn dispatch(&self, row: &Row, back: bool, order: &Order<'_>) {
-        // SAFETY: `Form::best` or a test that asked it said that the processor has it.
+        // SAFETY: `Form::best` said that the processor has the form, to `SgmMatcher::new` or to the test that chose it; the
+        // row reaches as `row` above argues. The number of vectors is one that `Passes::new` took, so a cell is N LANES.
         unsafe {
             match self.form {
                 Form::Plain => match self.vectors {
@@ -377,7 +384,8 @@ impl Order<'_> {
 
 #[inline(always)]
 unsafe fn steps<S: Lanes, const N: usize>(row: &Row, back: bool, order: &Order<'_>) {
-    // SAFETY: as the caller promises.
+    // SAFETY: processor and row by the caller. `s..until` is below the width, and `Order::cells` gives cells that lie in their
+    // rings for all of it; `wait` has seen the row before go beyond them.
     unsafe {
         let mut carry = Carry::<S, N>::new();
         let mut start = 0;
@@ -405,20 +413,20 @@ unsafe fn steps<S: Lanes, const N: usize>(row: &Row, back: bool, order: &Order<'
 }
 
 unsafe fn plain<const N: usize>(row: &Row, back: bool, order: &Order<'_>) {
-    // SAFETY: as the caller promises.
+    // SAFETY: every processor has this form; the row by the caller.
     unsafe { steps::<Plain, N>(row, back, order) }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
 unsafe fn avx2<const N: usize>(row: &Row, back: bool, order: &Order<'_>) {
-    // SAFETY: as the caller promises.
+    // SAFETY: AVX2 and the row by the caller.
     unsafe { steps::<super::avx2::Avx2, N>(row, back, order) }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,avx512f,avx512bw,avx512vl,avx512vbmi,avx512bitalg")]
 unsafe fn avx512<const N: usize>(row: &Row, back: bool, order: &Order<'_>) {
-    // SAFETY: as the caller promises.
+    // SAFETY: the features above and the row by the caller.
     unsafe { steps::<super::avx512::Avx512, N>(row, back, order) }
 }
