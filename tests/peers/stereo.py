@@ -81,11 +81,11 @@ def score(disparity: np.ndarray, truth: np.ndarray, seen: np.ndarray) -> tuple[f
     return 100 * wrong[seen].mean(), 100 * (~valid)[seen].mean()
 
 
-def picture(path: str, how: int) -> np.ndarray:
-    read = cv2.imread(path, how)
-    if read is None:
+def read(path: str, how: int) -> np.ndarray:
+    found = cv2.imread(path, how)
+    if found is None:
         sys.exit(f"{path}: there is no picture that OpenCV can read")
-    return read
+    return found
 
 
 def pfm(path: str) -> np.ndarray:
@@ -103,7 +103,7 @@ def true_disparity(path: str, scale: float) -> np.ndarray:
     elif path.endswith(".pfm"):
         truth = pfm(path)
     else:
-        truth = picture(path, cv2.IMREAD_UNCHANGED)
+        truth = read(path, cv2.IMREAD_UNCHANGED)
         truth = truth[..., 0] if truth.ndim == 3 else truth
     truth = truth.astype(np.float32)
     truth[(truth == 0) | ~np.isfinite(truth)] = np.nan
@@ -116,7 +116,7 @@ def seen_by(sixth: str | None, truth: np.ndarray, scale: float) -> np.ndarray:
         return seen_by_both(truth)
     kind, _, path = sixth.partition(":")
     if kind == "mask":
-        seen = np.isfinite(truth) & (picture(path, cv2.IMREAD_GRAYSCALE) == 255)
+        seen = np.isfinite(truth) & (read(path, cv2.IMREAD_GRAYSCALE) == 255)
     elif kind == "right":
         seen = seen_by_right_truth(truth, true_disparity(path, scale))
     else:
@@ -134,7 +134,7 @@ def ours(args: argparse.Namespace, left: Path, right: Path, preset: str, dispari
 def quality(args: argparse.Namespace, folder: Path) -> bool:
     kept = True
     for left_path, right_path, truth_path, scale, disparities, *sixth in args.pair:
-        left, right = (picture(p, cv2.IMREAD_GRAYSCALE) for p in (left_path, right_path))
+        left, right = (read(p, cv2.IMREAD_GRAYSCALE) for p in (left_path, right_path))
         truth, disparities = true_disparity(truth_path, float(scale)), int(disparities)
         if not left.shape == right.shape == truth.shape:
             sys.exit(f"{left_path}: left {left.shape}, right {right.shape} and truth {truth.shape} are of several sizes")
@@ -170,7 +170,7 @@ def quality(args: argparse.Namespace, folder: Path) -> bool:
 
 
 def speed(args: argparse.Namespace, folder: Path) -> bool:
-    left, right = (picture(p, cv2.IMREAD_GRAYSCALE) for p in args.pair[0][:2])
+    left, right = (read(p, cv2.IMREAD_GRAYSCALE) for p in args.pair[0][:2])
     size = (1280, round(left.shape[0] * 1280 / left.shape[1]))
     left, right = (cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in (left, right))
     if size[1] < 720:

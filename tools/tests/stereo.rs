@@ -56,6 +56,61 @@ fn a_pair_becomes_floats_or_sixteen_bits() {
 }
 
 #[test]
+fn a_pair_is_the_same_in_every_lossless_form() {
+    let folder = tempfile::tempdir().unwrap();
+    let pictures = pair(folder.path()).map(|p| image::open(p).unwrap().into_luma8());
+    let out = folder.path().join("d.npy");
+    let matched = |name: &str, save: &dyn Fn(&image::GrayImage, &Path)| {
+        let files = ["left", "right"].map(|side| folder.path().join(format!("{side}-{name}")));
+        for (picture, file) in pictures.iter().zip(&files) {
+            save(picture, file);
+        }
+        let [left, right] = files.each_ref().map(|f| f.to_str().unwrap());
+        let common = ["stereo", left, right, "--out", out.to_str().unwrap(), "--max-disparity", "77"];
+        Home::new().run(&common).good();
+        std::fs::read(&out).unwrap()
+    };
+    let want = matched("8.png", &|p, file| p.save(file).unwrap());
+    let scaled = |p: &image::GrayImage, by: u16, file: &Path| {
+        let wide = |x, y| image::Luma([u16::from(p.get_pixel(x, y).0[0]) * by]);
+        image::ImageBuffer::from_fn(p.width(), p.height(), wide).save(file).unwrap();
+    };
+    assert_eq!(matched("8.pgm", &|p, file| p.save(file).unwrap()), want);
+    assert_eq!(matched("16.png", &|p, file| scaled(p, 257, file)), want);
+    // 12 bits in the lower ones of 16.
+    assert_eq!(matched("12.png", &|p, file| scaled(p, 16, file)), want);
+    let as_pgm = |p: &image::GrayImage, file: &Path| {
+        let mut bytes = format!("P5\n{} {}\n65535\n", p.width(), p.height()).into_bytes();
+        bytes.extend(p.as_raw().iter().flat_map(|v| (u16::from(*v) * 16).to_be_bytes()));
+        std::fs::write(file, bytes).unwrap();
+    };
+    assert_eq!(matched("12.pgm", &as_pgm), want);
+    let colour = |p: &image::GrayImage, file: &Path| {
+        image::DynamicImage::ImageLuma8(p.clone()).to_rgb8().save(file).unwrap();
+    };
+    assert_eq!(matched("8.ppm", &colour), want);
+}
+
+#[test]
+fn pictures_of_every_size_are_matched() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let (left, right, out) = (file("l.png"), file("r.png"), file("d.npy"));
+    // Narrower than the search is wide, and smaller than what describes a pixel.
+    for (width, height) in [(1, 1), (5, 3), (1, 90), (99, 1), (67, 31)] {
+        picture(Path::new(&left), width, height, 0);
+        picture(Path::new(&right), width, height, 3);
+        for preset in ["performance", "quality", "ultra"] {
+            let args = ["stereo", &left, &right, "--max-disparity", "201", "--preset", preset, "--out", &out];
+            Home::new().run(&args).good();
+            let bytes = std::fs::read(&out).unwrap();
+            let shape = format!("'shape': ({height}, {width})");
+            assert!(String::from_utf8_lossy(&bytes[..128]).contains(&shape), "{width}x{height}");
+        }
+    }
+}
+
+#[test]
 fn what_is_no_pair_is_said() {
     let folder = tempfile::tempdir().unwrap();
     let [left, right] = pair(folder.path());

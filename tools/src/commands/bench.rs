@@ -171,7 +171,7 @@ fn run_capture(args: &CaptureArgs, context: &Context) -> Result<Exit> {
 fn run_stereo(args: &StereoArgs, context: &Context) -> Result<Exit> {
     let max_disparity = usize::from(args.max_disparity);
     let [left, right] = match (&args.left, &args.right) {
-        (Some(left), Some(right)) => [Picture::read(left)?, Picture::read(right)?],
+        (Some(left), Some(right)) => Picture::pair(left, right)?,
         _ => stereo::made(1280, 720, max_disparity),
     };
     let rounds = if args.bench.quick { args.rounds.min(3) } else { args.rounds }.into();

@@ -7,14 +7,14 @@ use depthrig_bus::clock::thread_cpu_ns;
 use depthrig_calib::stereo::{
     DisparityMap, Gray, Matcher, OrderCheck, Parameters, Preset, SgmMatcher, StereoPair,
 };
-use image::{ExtendedColorType, ImageEncoder, codecs::png};
+use image::{ColorType, DynamicImage, ExtendedColorType, ImageEncoder, codecs::png};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
 The pictures are rectified: what is seen at (x, y) in the left one is seen at (x - disparity, y) in the right one. Colour
-is made grey.
+is made grey; pictures of 16 bits count from the highest bit that one of the two uses.
 
 OUT.npy holds 32-bit floats, pixels of the left picture, NaN where there is none. OUT.png holds 16 bits, 256 a pixel, 0
 where there is none (as KITTI has it). Confidence is a PNG of 8 bits: 0 where there is none, 255 for the surest.
@@ -28,7 +28,7 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct StereoArgs {
-    /// The left picture, PNG or JPEG
+    /// The left picture: PNG, JPEG, PGM or PPM
     left: PathBuf,
     /// The right picture, of the same size
     right: PathBuf,
@@ -71,17 +71,28 @@ pub struct Picture {
 }
 
 impl Picture {
-    /// Reads a PNG or JPEG.
+    /// Reads a pair of PNG, JPEG, PGM or PPM. Of 16 bits those 8 count that begin with the highest which either picture uses:
+    /// a camera's 10 or 12 bits are mostly kept in the lower ones.
     ///
     /// # Errors
-    /// When it cannot be read.
-    pub fn read(path: &Path) -> Result<Self> {
-        let told = || format!("{}: cannot be read as a picture", path.display());
-        let reader =
-            image::ImageReader::open(path).with_context(told)?.with_guessed_format().with_context(told)?;
-        let grey = reader.decode().with_context(told)?.into_luma8();
-        let (width, height) = (grey.width() as usize, grey.height() as usize);
-        Ok(Self { pixels: grey.into_raw(), width, height })
+    /// When one cannot be read.
+    pub fn pair(left: &Path, right: &Path) -> Result<[Self; 2]> {
+        let pictures = [decoded(left)?, decoded(right)?];
+        if pictures.iter().all(|p| !wide(p)) {
+            return Ok(pictures.map(|p| {
+                let (width, height) = (p.width() as usize, p.height() as usize);
+                Self { pixels: p.into_luma8().into_raw(), width, height }
+            }));
+        }
+        let most = pictures.iter().map(most).max().unwrap_or(0);
+        let shift = (u16::BITS - most.leading_zeros()).saturating_sub(u8::BITS);
+        Ok(pictures.map(|p| {
+            let (width, height) = (p.width() as usize, p.height() as usize);
+            // One of 8 bits has been spread to 16.
+            let shift = if wide(&p) { shift } else { u8::BITS };
+            let pixels = p.into_luma16().into_raw().into_iter().map(|v| (v >> shift) as u8).collect();
+            Self { pixels, width, height }
+        }))
     }
 
     /// One of these pixels, rows without padding.
@@ -110,6 +121,27 @@ impl Picture {
     }
 }
 
+/// The picture in a file.
+fn decoded(path: &Path) -> Result<DynamicImage> {
+    let told = || format!("{}: cannot be read as a picture; PNG, JPEG, PGM and PPM can", path.display());
+    let reader =
+        image::ImageReader::open(path).with_context(told)?.with_guessed_format().with_context(told)?;
+    reader.decode().with_context(told)
+}
+
+/// Whether it has more than 8 bits.
+fn wide(picture: &DynamicImage) -> bool {
+    matches!(picture.color(), ColorType::L16 | ColorType::La16 | ColorType::Rgb16 | ColorType::Rgba16)
+}
+
+/// The largest grey value of one of 16 bits, else 0.
+fn most(picture: &DynamicImage) -> u16 {
+    if !wide(picture) {
+        return 0;
+    }
+    picture.to_luma16().into_raw().into_iter().max().unwrap_or(0)
+}
+
 /// What was done.
 #[derive(Debug, Serialize)]
 struct Report<'a> {
@@ -129,7 +161,7 @@ struct Report<'a> {
 /// Matches a pair.
 pub fn run(args: &StereoArgs) -> Result<Exit> {
     let as_png = form(&args.out)?;
-    let (left, right) = (Picture::read(&args.left)?, Picture::read(&args.right)?);
+    let [left, right] = Picture::pair(&args.left, &args.right)?;
     left.fits(&right)?;
     let pair = StereoPair::new(left.gray(), right.gray());
     let usage = |e: depthrig_calib::Error| UsageError(e.to_string());
