@@ -14,12 +14,12 @@ pub struct SetTimes {
     period_ns: AtomicI64,
 }
 
-/// A moment of a set, and how far from it something is.
+/// A moment of a set, and how far from it something is, all in nanoseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Due {
-    moment_ns: i64,
-    off_ns: i64,
-    period_ns: i64,
+    moment: i64,
+    off: i64,
+    period: i64,
 }
 
 impl SetTimes {
@@ -47,11 +47,11 @@ impl SetTimes {
         let since = at.since_ns(newest);
         let moment = since.saturating_add(period_ns / 2).div_euclid(period_ns).saturating_mul(period_ns);
         // A quarter more, because stamps tremble and moments move: two pictures may be for one set, and the nearer is.
-        let off_ns = (since - moment).abs();
-        (off_ns <= frame_ns / 2 + frame_ns / 4).then(|| Due {
-            moment_ns: newest.ns().saturating_add(moment),
-            off_ns,
-            period_ns,
+        let off = (since - moment).abs();
+        (off <= frame_ns / 2 + frame_ns / 4).then(|| Due {
+            moment: newest.ns().saturating_add(moment),
+            off,
+            period: period_ns,
         })
     }
 }
@@ -59,14 +59,14 @@ impl SetTimes {
 impl Due {
     /// Of a picture that is due for itself.
     pub(crate) const fn alone(at: HostTime, period_ns: i64) -> Self {
-        Self { moment_ns: at.ns(), off_ns: 0, period_ns }
+        Self { moment: at.ns(), off: 0, period: period_ns }
     }
 
     /// Whether a picture that is for this set stays when one comes that is for `newer`.
     pub(crate) fn stays(&self, newer: Option<&Self>) -> bool {
         newer.is_none_or(|n| {
-            let same = n.moment_ns.abs_diff(self.moment_ns) < self.period_ns as u64 / 2;
-            same && self.off_ns <= n.off_ns
+            let same = n.moment.abs_diff(self.moment) < self.period as u64 / 2;
+            same && self.off <= n.off
         })
     }
 }
@@ -96,7 +96,7 @@ mod tests {
         for moment in (800..10_000).step_by(200) {
             let nearest = pictures.iter().copied().min_by_key(|p: &i64| (p - moment).abs()).unwrap();
             let due = sets.due(at(nearest), 33 * MS).unwrap();
-            assert_eq!((due.moment_ns, due.off_ns), (moment * MS, (nearest - moment).abs() * MS));
+            assert_eq!((due.moment, due.off), (moment * MS, (nearest - moment).abs() * MS));
         }
         let many = pictures.iter().filter(|p| sets.due(at(**p), 33 * MS).is_some()).count();
         let sets_seen = (pictures[299] - pictures[0]) / 200;
@@ -105,8 +105,7 @@ mod tests {
 
     #[test]
     fn the_nearer_of_two_for_one_set_stays_and_a_newer_set_wins() {
-        let due =
-            |moment: i64, off: i64| Due { moment_ns: moment * MS, off_ns: off * MS, period_ns: 200 * MS };
+        let due = |moment: i64, off: i64| Due { moment: moment * MS, off: off * MS, period: 200 * MS };
         assert!(due(1000, 20).stays(None), "before one that is for no set");
         assert!(due(1000, 3).stays(Some(&due(1000, 20))));
         assert!(due(1000, 3).stays(Some(&due(1002, 4))), "the moments have moved a little");
