@@ -39,11 +39,13 @@ fn record() -> ExternalMode {
     record
 }
 
+/// What is made wrong about a record.
+type Change = fn(&mut ExternalMode);
+
 #[test]
 fn a_mode_that_cannot_be_is_refused_by_its_field() {
     let good = Mode::decode(&record()).unwrap();
     assert_eq!((good.describe().as_str(), good.frame_bytes()), ("depth 640x480 z16", 614_400));
-    type Change = fn(&mut ExternalMode);
     let cases: [(Change, &str); 29] = [
         (|r| r.stream = [b'a'; 32], "`stream` does not end with a zero byte"),
         (|r| r.stream[0] = b'D', "cannot be a name"),

@@ -109,7 +109,7 @@ fn hand_shake(root: &Path) {
         About { model: "Fake".into(), serial: "7".into(), program: "seed".into(), ..About::default() };
     let offer = |modes: &[Mode]| of(0, fuzzing::offer_bytes(&about, modes));
     put(root, "external", "offer", &offer(&[color, depth.clone(), jpeg]));
-    put(root, "external", "offer_of_one", &offer(&[depth.clone()]));
+    put(root, "external", "offer_of_one", &offer(std::slice::from_ref(&depth)));
     let run = ExternalAnswer { instance: 7, session: 9, want: 1, modes: 3, ..ExternalAnswer::default() };
     put(root, "external", "answer", &of(1, fuzzing::answer_bytes(&run, &[1, 0, 1])));
     let mut refusal = ExternalAnswer { want: 2, reason: 2, ..run };

@@ -146,7 +146,7 @@ fn a_process_that_stops_by_itself_is_disconnected() {
     let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Mono8, (8, 6), 100.0);
     let about = About { model: "Bench".into(), ..About::default() };
     let mut camera = ExternalCamera::offer(&place, &about, &[mode]).unwrap();
-    let (done, wait) = std::sync::mpsc::channel::<()>();
+    let (done, wait) = std::sync::mpsc::sync_channel::<()>(1);
     let process = std::thread::spawn(move || {
         let mut session = camera.next_session(WAIT).unwrap().unwrap();
         send(&mut session, 1, |_| ());

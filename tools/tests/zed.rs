@@ -23,8 +23,7 @@ fn conf(without: &[&str]) -> String {
         |e: &str| format!("[{e}_CAM_VGA]\nfx=300\nfy=300\ncx=336\ncy=188\nk1=0\nk2=0\np1=0\np2=0\nk3=0\n");
     let stereo = "[STEREO]\nBaseline=120\nTY=0\nTZ=0\nCV_VGA=0\nRX_VGA=0\nRZ_VGA=0\n";
     let text = format!("{stereo}{}{}", eye("LEFT"), eye("RIGHT"));
-    let kept = text.lines().filter(|l| !without.iter().any(|w| l.starts_with(w)));
-    kept.map(|l| format!("{l}\n")).collect()
+    text.split_inclusive('\n').filter(|l| !without.iter().any(|w| l.starts_with(w))).collect()
 }
 
 /// Both eyes beside each other: a wall of noise, another one for each `n`, in `width` pixels.

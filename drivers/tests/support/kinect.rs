@@ -148,7 +148,7 @@ impl Fake {
         // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
         let ask = unsafe { self.library.get::<Ask>(b"fake_k4a_set\0") }.unwrap();
         // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
-        (0..).map(|i| unsafe { ask(serial.as_ptr(), i) }).take_while(|c| *c >= 0).collect()
+        (0..4096).map(|i| unsafe { ask(serial.as_ptr(), i) }).take_while(|c| *c >= 0).collect()
     }
 
     /// What the camera streams with.
