@@ -316,6 +316,31 @@ fn what_the_right_view_matches_is_taken_where_the_views_disagree() {
 }
 
 #[test]
+fn the_matcher_rematches_when_told() {
+    let with = |rematch: bool| {
+        let mut parameters = Parameters::preset(Preset::Quality, 48);
+        (parameters.speckle_px, parameters.gap_px, parameters.median_rounds) = (0, 0, 0);
+        parameters.rematch = rematch;
+        matched(&parameters, (90, 30), 1, Form::best())
+    };
+    let (without, with) = (with(false), with(true));
+    let added: Vec<usize> =
+        (0..90 * 30).filter(|i| with.disparity[*i].to_bits() != without.disparity[*i].to_bits()).collect();
+    assert!(!added.is_empty());
+    assert!(added.iter().all(|i| without.disparity[*i].is_nan() && with.confidence[*i] == 1));
+}
+
+#[test]
+fn doubling_keeps_a_step_of_more_than_a_pixel() {
+    for (step, kept) in [(ONE, false), (ONE + 1, true)] {
+        let map = [10 * ONE, 10 * ONE + step];
+        let (mut out, mut sure) = ([0; 8], [0; 8]);
+        filter::double((2, 1), (&map, &[7, 7]), (4, 2), &mut out, &mut sure);
+        assert_eq!(out[1] == 20 * ONE, kept, "{step}");
+    }
+}
+
+#[test]
 fn the_median_is_taken_as_often_as_is_said() {
     let size = (90, 30);
     let with = |rounds: u8| {
