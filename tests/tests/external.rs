@@ -168,7 +168,8 @@ fn a_stopped_process_is_hung_and_goes_on_when_it_wakes() {
     let rig = home.start(&text("")).unwrap();
     wait_until(&rig, "streaming", all_stream);
     process.signal("STOP");
-    let status = wait_until(&rig, "the silence", |s| says(s, "has said nothing for"));
+    let said = format!("its process {} has said nothing for", process.child.id());
+    let status = wait_until(&rig, "the silence", |s| says(s, &said));
     assert!(says(&status, "kill -9") || says(&status, "end it"), "{:?}", ext(&status).message);
     // Its last message still lies there, and is not taken for a sign of life.
     wait_until(&rig, "that nobody answers", |s| says(s, "serves it and has said nothing for 1.0 s"));
