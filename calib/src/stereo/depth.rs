@@ -3,6 +3,9 @@
 use crate::error::check_len;
 use crate::{Error, ErrorKind, Result};
 
+/// Units that 16 bits cannot hold.
+const BEYOND: f32 = 70_000.0;
+
 /// Depth in units of `unit_m` metres from disparity in pixels: `focal_px * baseline_m / disparity`, to the nearest unit.
 /// 0, a hole, where disparity is NaN or not positive and where depth is outside `range_m` or the 16 bits.
 ///
@@ -29,11 +32,13 @@ pub fn depth_from_disparity(
         ));
     }
     let units = (focal_px * baseline_m / unit_m) as f32;
-    let (near, far) = ((range_m.0 / unit_m) as f32, (range_m.1 / unit_m).min(65_535.0) as f32);
+    let (near, far) = (((range_m.0 / unit_m) as f32).max(1.0), (range_m.1 / unit_m).min(65_535.0) as f32);
     for (z, d) in out.iter_mut().zip(disparity) {
-        // NaN and 0 fail the comparisons, as they should.
-        let depth = (units / d).round();
-        *z = if depth >= near.max(1.0) && depth <= far { depth as u16 } else { 0 };
+        // NaN and 0 become the bound, which is too far. `round` would be a call for each pixel.
+        let exact = (units / d).min(BEYOND);
+        let whole = exact as i32;
+        let depth = (whole + i32::from(exact - whole as f32 >= 0.5)) as f32;
+        *z = if depth >= near && depth <= far { depth as u16 } else { 0 };
     }
     Ok(())
 }
@@ -77,6 +82,7 @@ fn check_geometry(focal_px: f64, baseline_m: f64) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
 
     #[test]
     fn depth_is_focal_times_baseline_over_disparity() {
@@ -91,6 +97,25 @@ mod tests {
         metres_from_disparity(&d, 700.0, 0.12, (0.15, 20.0), &mut m).unwrap();
         assert_eq!(m[0], 7.0);
         assert!(m[1..].iter().all(|z| z.is_nan()), "{m:?}");
+    }
+
+    proptest! {
+        /// To the nearest unit, half a unit away from 0, as `round` does.
+        #[test]
+        fn depth_is_rounded(
+            d in prop::collection::vec(prop_oneof![0.0005f32..300.0, prop::num::f32::ANY], 1..200),
+            halves in prop::collection::vec(1u16..4000, 1..50),
+        ) {
+            let halves = halves.into_iter().map(|n| 84_000.0 / (f32::from(n) + 0.5));
+            let d: Vec<_> = d.into_iter().chain(halves).collect();
+            let mut z = vec![0; d.len()];
+            depth_from_disparity(&d, 700.0, 0.12, 0.001, (0.0, 100.0), &mut z).unwrap();
+            for (d, z) in d.into_iter().zip(z) {
+                let depth = (84_000.0 / d).round();
+                let expected = if (1.0..=65_535.0).contains(&depth) { depth as u16 } else { 0 };
+                prop_assert_eq!(z, expected, "{} px", d);
+            }
+        }
     }
 
     #[test]
