@@ -30,6 +30,7 @@ use depthrig_bus::runtime::{RigLock, RuntimeDir};
 use depthrig_bus::{Bus, HostTime, StreamId, UtcPair, shm};
 use depthrig_recorder::UtcSource;
 use depthrig_recorder::fs::{Fs, RealFs};
+pub use join::near_pair_ns;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};

@@ -91,6 +91,7 @@ pub struct Joints {
     held: VecDeque<Held>,
     max_sets: usize,
     max_age: Duration,
+    set_ns: i64,
 }
 
 impl Joints {
@@ -103,7 +104,13 @@ impl Joints {
         let taken = ASSEMBLING + config.recording.queue_sets + workers;
         let max_sets = MAX_HELD.saturating_sub(taken).clamp(1, MAX_SETS);
         let max_age = Duration::from_secs_f64(max_sets as f64 / config.sets.rate_hz).min(PATIENCE / 2);
-        Self { streams: Vec::new(), held: VecDeque::new(), max_sets, max_age }
+        Self {
+            streams: Vec::new(),
+            held: VecDeque::new(),
+            max_sets,
+            max_age,
+            set_ns: (1e9 / config.sets.rate_hz) as i64,
+        }
     }
 
     /// Takes in the streams that `camera` makes, once they are there.
@@ -123,7 +130,7 @@ impl Joints {
             let pairs = state.streams.iter().find(|s| s.id == *depth);
             let period_ns = pairs.filter(|_| of_pair).unwrap_or(stream).profile.period_ns() as i64;
             self.streams.push(Joint {
-                near_ns: if of_pair { period_ns + period_ns / 10 } else { near_ns(period_ns) },
+                near_ns: if of_pair { near_pair_ns(period_ns, self.set_ns) } else { near_ns(period_ns) },
                 of_pair,
                 stream: Arc::clone(stream),
                 camera: Arc::clone(camera),
@@ -257,6 +264,12 @@ fn near_ns(period_ns: i64) -> i64 {
     (period_ns as f64 * NEAR) as i64
 }
 
+/// How far from a set's pair the one may be whose depth stands in for it, when pairs are `period_ns` apart and sets
+/// `set_ns`: it is the pair beside it, and not one of another set.
+pub fn near_pair_ns(period_ns: i64, set_ns: i64) -> i64 {
+    (period_ns + period_ns / 10).min(near_ns(set_ns))
+}
+
 /// Which of the frames with these rising `stamps` is the one for `moment`.
 fn nearest(stamps: impl Iterator<Item = i64>, moment: i64, near_ns: i64) -> Found {
     let mut later = false;
@@ -295,6 +308,13 @@ mod tests {
         assert_eq!(find(&[967, 1000, 1033], 1000), Found::At(1));
         assert_eq!(find(&[967, 1060], 1000), Found::At(0), "it was skipped");
         assert_eq!(find(&[800, 1200], 1000), Found::Never);
+    }
+
+    #[test]
+    fn the_pair_beside_stands_in_and_the_one_of_another_set_does_not() {
+        let (sets, frame) = (200_000_000, 33_333_333);
+        assert!((frame..2 * frame).contains(&near_pair_ns(frame, sets)));
+        assert!(near_pair_ns(sets, sets) < sets / 2, "pairs as rare as sets");
     }
 
     #[test]

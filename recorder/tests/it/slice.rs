@@ -515,8 +515,10 @@ fn a_damaged_set_costs_itself_and_is_named() {
     recording(&fs, 6, quick(100), |_| 0);
     let reference = copy(&fs);
     let mut bytes = contents(&fs, &segment(0));
-    let middle = bytes.len() / 2;
-    bytes[middle] ^= 1;
+    let chunks = mcap::Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
+    // The largest is one of pictures.
+    let chunk = chunks.iter().max_by_key(|c| c.chunk_length).unwrap();
+    bytes[(chunk.chunk_start_offset + chunk.chunk_length / 2) as usize] ^= 1;
     fs.put(&segment(0), bytes);
     let report = cut(&fs, "part", SetSpan::default()).unwrap();
     assert_eq!(report.sets, 5);
