@@ -114,6 +114,16 @@ impl Daemon {
         self.wait_for(PATIENCE, "every camera streams", |status| status.cameras.iter().all(streams))
     }
 
+    /// Waits until every camera streams and has captured a dozen frames of each stream. Its first frames come while others
+    /// still open and the guest is busy: those that are not read then are told of by the next ones.
+    ///
+    /// # Errors
+    /// As [`Self::wait_for`].
+    pub fn wait_until_settled(&self) -> anyhow::Result<RigStatus> {
+        let settled = |c: &CameraStatus| streams(c) && c.streams.iter().all(|s| s.captured >= 12);
+        self.wait_for(PATIENCE, "a dozen frames of every stream", |s| s.cameras.iter().all(settled))
+    }
+
     /// Starts a recording called `name`.
     ///
     /// # Errors

@@ -23,7 +23,7 @@ const SECONDS: u64 = 3;
 fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let mount = Mount::plug(&MODELS, |_| 0)?;
     let daemon = Daemon::start(&mount.rig(SIZE))?;
-    daemon.wait_until_streaming()?;
+    daemon.wait_until_settled()?;
     let ids = Mount::streams(0..MODELS.len())?;
     let (late, unread) = mount::not_sent(&mount, &ids)?;
     checks.note(format!("while the cameras opened, {late} frames were sent late and {unread} were not read"));

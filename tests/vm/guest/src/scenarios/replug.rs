@@ -33,7 +33,7 @@ const BACK_WITHIN: Duration = Duration::from_secs(2);
 fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let mount = Mount::plug(&MODELS, |_| 0)?;
     let daemon = Daemon::start(&mount.rig(SIZE))?;
-    daemon.wait_until_streaming()?;
+    daemon.wait_until_settled()?;
     let six: Vec<usize> = (0..MODELS.len()).filter(|i| *i != VICTIM).collect();
     let before = daemon.status()?;
     let six = Mount::streams(six)?;

@@ -51,7 +51,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let fixture = kinect()?;
 
     let daemon = Daemon::start(&rig(&mount)?)?;
-    let status = daemon.wait_until_streaming()?;
+    let status = daemon.wait_until_settled()?;
     checks.equal("eight cameras stream", status.cameras.len(), 8);
     let path = daemon.record("mount")?;
     let pairs = pairs(&daemon, Duration::from_secs(SECONDS))?;
