@@ -61,8 +61,8 @@ pub fn jpeg_size(picture: &[u8]) -> Option<(u32, u32)> {
 }
 
 fn decode(picture: &[u8], size: (u32, u32), color: ColorType, to: &mut [u8]) -> Result<(), DropReason> {
-    // zune-jpeg 0.4.21, which `image` decodes with, panics on a few damaged pictures; as does the reader of
-    // datasets, this gives up what it worked on then.
+    // zune-jpeg, which `image` decodes with, has panicked on damaged pictures (0.4.21; none is known for 0.5.15); as does
+    // the reader of datasets, this gives up what it worked on then.
     let decoded = catch_unwind(AssertUnwindSafe(|| {
         let decoder = JpegDecoder::new(Cursor::new(picture)).ok()?;
         let fits = decoder.dimensions() == size
