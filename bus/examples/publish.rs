@@ -57,7 +57,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         let capture_ns = if options.step { step_ns(sequence) } else { HostTime::now().ns() };
         let mut members = vec![missing()?];
         for (id, format, publisher) in &streams {
-            members.push(send(&options, (id, *format, publisher), sequence, capture_ns)?);
+            let sent = send(&options, (id, *format, publisher), sequence, capture_ns)?;
+            // Motion is no part of sets.
+            members.extend((!format.is_motion()).then_some(sent));
         }
         let header = SetHeader {
             set_id: sequence,
@@ -129,6 +131,12 @@ const fn step_ns(sequence: u64) -> i64 {
 fn picture(options: &Options, format: PixelFormat) -> FrameHeader {
     let mut header = distinct();
     let (width, height) = options.size;
+    if format.is_motion() {
+        // Samples follow each other without padding.
+        header.set_picture(format, width, 1);
+        header.depth_unit_m = 0.0;
+        return header;
+    }
     header.set_picture(format, width, height);
     if format == PixelFormat::Mjpeg {
         header.payload_len = 1000;

@@ -222,7 +222,8 @@ impl<H: Header> Channel<H> {
 
     fn open_error(&self, e: &OpenOrCreate) -> Error {
         const OTHER_VERSION: &str = "it was made by another version of depthrig or iceoryx2 (this is depthrig bus \
-             version 1 on iceoryx2 0.10); run the daemon and its subscribers with the same version";
+             version 1 on iceoryx2 0.10); run the daemon and its subscribers with the same version, and end programs \
+             that still hold it in the other one";
         let (kind, why) = match e {
             OpenOrCreate::Open(OpenError::DoesNotExist) => {
                 (ErrorKind::NotFound, "nobody publishes it".to_owned())

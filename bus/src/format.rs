@@ -32,11 +32,13 @@ pub enum PixelFormat {
     Confidence8 = 11,
     /// 32-bit float disparity of the left picture of a rectified pair, pixels; NaN is "no match".
     DisparityF32 = 12,
+    /// No picture: samples of a motion unit ([`crate::MotionSample`]), `width` of them in one row.
+    Motion = 13,
 }
 
 impl PixelFormat {
     /// Every format, in wire order.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::Rgb8,
         Self::Bgr8,
         Self::Mono8,
@@ -49,6 +51,7 @@ impl PixelFormat {
         Self::Mjpeg,
         Self::Confidence8,
         Self::DisparityF32,
+        Self::Motion,
     ];
 
     /// The format of a wire code, if this version knows it.
@@ -71,6 +74,7 @@ impl PixelFormat {
             Self::Mjpeg => "mjpeg",
             Self::Confidence8 => "confidence8",
             Self::DisparityF32 => "disparity_f32",
+            Self::Motion => "motion",
         }
     }
 
@@ -82,6 +86,7 @@ impl PixelFormat {
             Self::Mono16 | Self::Z16 | Self::Yuyv | Self::Uyvy => width * 2,
             Self::DepthF32 | Self::DisparityF32 => width * 4,
             Self::Mjpeg => 0,
+            Self::Motion => width * crate::MOTION_SAMPLE_BYTES as u32,
         }
     }
 
@@ -97,6 +102,11 @@ impl PixelFormat {
     /// Whether the pixels are depth, in metres or units of metres. Disparity is not.
     pub const fn is_depth(self) -> bool {
         matches!(self, Self::Z16 | Self::DepthF32)
+    }
+
+    /// Whether the frames are no pictures but batches of motion samples. Such a stream is no part of frame sets.
+    pub const fn is_motion(self) -> bool {
+        matches!(self, Self::Motion)
     }
 }
 

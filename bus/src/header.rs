@@ -17,13 +17,21 @@ pub const HEADER_VERSION: u16 = 1;
 pub const SCHEMA: &str = "depthrig.frame/1";
 /// Bytes of a [`FrameHeader`].
 pub const HEADER_SIZE: usize = 768;
+/// Pixels begin at a multiple of this many bytes in every slot: a cache line, and the widest vector of a processor.
+///
+/// The header is aligned to it and as long as 12 of it, and bytes follow their header at once; iceoryx2 then also begins
+/// every slot at a multiple of it.
+pub const PIXEL_ALIGN: usize = 64;
 const MAGIC: [u8; 4] = *b"DRFH";
 
 /// The header of one frame.
 ///
 /// Times are nanoseconds on the host's `CLOCK_MONOTONIC` (see [`crate::clock`]). A replayed frame keeps the
 /// times of its recording and carries [`FrameFlags::REPLAYED`].
+///
+/// Its alignment is that of the pixels behind it, [`PIXEL_ALIGN`].
 #[repr(C)]
+#[repr(align(64))] // a line of its own: iceoryx2's derive looks for a plain `C`
 #[derive(Clone, Copy, PartialEq, ZeroCopySend)]
 #[type_name("depthrig.FrameHeader.v1")]
 pub struct FrameHeader {
@@ -114,7 +122,7 @@ pub struct FrameHeader {
 }
 
 const _: () = assert!(size_of::<FrameHeader>() == HEADER_SIZE, "the header's size is part of the contract");
-const _: () = assert!(align_of::<FrameHeader>() == 8);
+const _: () = assert!(align_of::<FrameHeader>() == PIXEL_ALIGN && HEADER_SIZE.is_multiple_of(PIXEL_ALIGN));
 
 impl Default for FrameHeader {
     fn default() -> Self {
@@ -298,7 +306,8 @@ pub struct FrameFlags(pub u32);
 impl FrameFlags {
     /// Published by a replay; the times are those of the recording.
     pub const REPLAYED: Self = Self(1);
-    /// The capture time may be wrong by more than its uncertainty: a clock restart is being decided.
+    /// The capture time may be wrong by more than its uncertainty: a clock restart is being decided, or the device was
+    /// asked for its clock and has not answered yet.
     pub const TIME_UNCERTAIN: Self = Self(1 << 1);
     /// The clock map has less than 5 s of history.
     pub const CLOCK_WARMUP: Self = Self(1 << 2);

@@ -15,6 +15,7 @@ mod geometry;
 mod header;
 mod ids;
 mod metadata;
+mod motion;
 mod node;
 mod publisher;
 pub mod runtime;
@@ -29,10 +30,12 @@ pub use error::{Error, ErrorKind, Result};
 pub use format::PixelFormat;
 pub use geometry::{Distortion, Intrinsics, Pose};
 pub use header::{
-    ClockDomain, FIELDS, Field, FrameFlags, FrameHeader, HEADER_SIZE, HEADER_VERSION, SCHEMA, StageStep,
+    ClockDomain, FIELDS, Field, FrameFlags, FrameHeader, HEADER_SIZE, HEADER_VERSION, PIXEL_ALIGN, SCHEMA,
+    StageStep,
 };
 pub use ids::{CameraName, Name, RigName, StreamId, StreamName};
 pub use metadata::MetadataLevel;
+pub use motion::{MOTION_FIELDS, MOTION_SAMPLE_BYTES, MotionFlags, MotionSample};
 pub use node::{Bus, IOX_FOLDER, SHM_PREFIX};
 pub use publisher::{FrameMut, Publisher};
 pub use runtime::RuntimeDir;

@@ -69,7 +69,7 @@ impl FrameMut {
         self.loan.user_header_mut()
     }
 
-    /// The pixels, for writing.
+    /// The pixels, for writing. They begin at a multiple of [`crate::PIXEL_ALIGN`].
     pub fn pixels_mut(&mut self) -> &mut [u8] {
         channel::bytes_mut(&mut self.loan)
     }

@@ -124,7 +124,7 @@ impl Frame {
         self.sample.user_header()
     }
 
-    /// Its pixels, where the driver wrote them.
+    /// Its pixels, where the driver wrote them. They begin at a multiple of [`crate::PIXEL_ALIGN`].
     pub fn pixels(&self) -> &[u8] {
         self.sample.payload()
     }

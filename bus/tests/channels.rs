@@ -58,7 +58,6 @@ fn frames_arrive_in_order_with_their_header() {
         let frame = subscriber.next_timeout(WAIT).unwrap().unwrap();
         assert_eq!(whole(&frame), sequence);
         assert!(frame.header().publish_time_ns >= before && frame.header().is_valid());
-        assert_eq!(frame.pixels().as_ptr().align_offset(8), 0, "u16 and f32 views need aligned pixels");
     }
     assert!(subscriber.next_timeout(Duration::from_millis(20)).unwrap().is_none());
     assert_eq!(f.bus.streams().unwrap(), vec![f.id]);

@@ -46,13 +46,17 @@ type Change = fn(&mut ExternalMode);
 fn a_mode_that_cannot_be_is_refused_by_its_field() {
     let good = Mode::decode(&record()).unwrap();
     assert_eq!((good.describe().as_str(), good.frame_bytes()), ("depth 640x480 z16", 614_400));
-    let cases: [(Change, &str); 29] = [
+    let cases: [(Change, &str); 30] = [
         (|r| r.stream = [b'a'; 32], "`stream` does not end with a zero byte"),
         (|r| r.stream[0] = b'D', "cannot be a name"),
         (|r| r.stream[20] = b'x', "`stream` has bytes after its end"),
         (|r| r.stream[0] = 0xFF, "`stream` is not UTF-8"),
         (|r| r.format = 0, "stream depth: its field `format` is 0"),
         (|r| r.format = 999, "`format` is 999"),
+        (
+            |r| (r.format, r.depth_unit_m, r.height) = (PixelFormat::Motion as u32, 0.0, 1),
+            "stream depth: its field `format` is motion; a camera of another process gives pictures only",
+        ),
         (|r| r.width = 0, "`width` is 0"),
         (|r| r.height = 16_385, "`height` is 16385"),
         (|r| (r.width, r.height) = (16_384, 16_384), "more than 256 MiB"),

@@ -11,8 +11,8 @@ use depthrig_bus::external::{
 };
 use depthrig_bus::{
     ClockDomain, Distortion, DropReason, FIELDS, Field, FrameFlags, FrameHeader, HEADER_SIZE, HEADER_VERSION,
-    IOX_FOLDER, PixelFormat, RECORD_BYTES, SCHEMA, SHM_PREFIX, SetHeader, StageStep,
-    runtime::RUNTIME_DIR_VARIABLE,
+    IOX_FOLDER, MOTION_FIELDS, MOTION_SAMPLE_BYTES, MotionFlags, PixelFormat, RECORD_BYTES, SCHEMA,
+    SHM_PREFIX, SetHeader, StageStep, runtime::RUNTIME_DIR_VARIABLE,
 };
 use iceoryx2::prelude::ZeroCopySend;
 use std::path::Path;
@@ -67,6 +67,7 @@ fn mirror() -> String {
     enums(&mut out);
     table(&mut out, "FIELDS", FIELDS);
     table(&mut out, "SET_FIELDS", &sets);
+    table(&mut out, "MOTION_FIELDS", MOTION_FIELDS);
     table(&mut out, "EXTERNAL_OFFER_FIELDS", OFFER_FIELDS);
     table(&mut out, "EXTERNAL_MODE_FIELDS", MODE_FIELDS);
     table(&mut out, "EXTERNAL_ANSWER_FIELDS", ANSWER_FIELDS);
@@ -106,6 +107,7 @@ fn constants(out: &mut String) {
         ("SET_HEADER_SIZE", size_of::<SetHeader>().to_string()),
         ("SET_HEADER_ALIGN", align_of::<SetHeader>().to_string()),
         ("SET_RECORD_SIZE", RECORD_BYTES.to_string()),
+        ("MOTION_SAMPLE_SIZE", MOTION_SAMPLE_BYTES.to_string()),
         ("SHM_PREFIX", format!("{SHM_PREFIX:?}")),
         ("IOX_FOLDER", format!("{IOX_FOLDER:?}")),
         ("RUNTIME_DIR_VARIABLE", format!("{RUNTIME_DIR_VARIABLE:?}")),
@@ -185,6 +187,13 @@ fn enums(out: &mut String) {
         &steps,
     );
     enumeration(out, "IntFlag", "FrameFlags", "Facts about a frame, one bit each.", &flags);
+    let flags = [
+        ("frame_sync", MotionFlags::FRAME_SYNC),
+        ("accel_clipped", MotionFlags::ACCEL_CLIPPED),
+        ("gyro_clipped", MotionFlags::GYRO_CLIPPED),
+    ]
+    .map(|(name, flag)| (name.to_owned(), flag.0));
+    enumeration(out, "IntFlag", "MotionFlags", "Facts about a motion sample, one bit each.", &flags);
     external_enums(out);
 }
 

@@ -196,8 +196,10 @@ impl Camera {
             return shown;
         }
         let (mut low, mut high) = (0.0, self.max_radius);
-        let mut r = wanted.min(high);
-        for _ in 0..60 {
+        // Not at the end itself: there a rational lens may have its pole, and rounding decides the sign.
+        let mut r = if wanted < high { wanted } else { 0.5 * high };
+        let mut last = high;
+        for _ in 0..100 {
             let (value, slope) = self.lens.radial(r);
             let error = value - wanted;
             if error.abs() <= 1e-9 {
@@ -208,8 +210,15 @@ impl Camera {
             } else {
                 low = r;
             }
-            let newton = r - error / slope;
-            r = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
+            // Beside a pole of a rational lens Newton's steps begin tiny and double: a step that is not half of the last
+            // one gives way to halving (Press et al., Numerical Recipes 9.4).
+            let step = error / slope;
+            let inside = r - step > low && r - step < high;
+            (r, last) = if inside && step.abs() <= 0.5 * last {
+                (r - step, step.abs())
+            } else {
+                (0.5 * (low + high), 0.5 * (high - low))
+            };
         }
         shown * (r / wanted)
     }

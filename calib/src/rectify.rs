@@ -7,7 +7,7 @@
 
 use crate::error::check_len;
 use crate::{Camera, Error, ErrorKind, PoseExt, Result};
-use depthrig_bus::{Intrinsics, Pose};
+use depthrig_bus::{Intrinsics, PixelFormat, Pose};
 use glam::{DMat3, DQuat};
 
 mod geometry;
@@ -103,56 +103,54 @@ impl Rectifier {
         inside.then(|| self.maps[view as usize].source(y as usize * self.size.0 as usize + x as usize))?
     }
 
-    /// The rectified picture of one byte a pixel, out of one of one byte a pixel; 0 where the eye sees nothing.
+    /// The rectified grey picture and, where it is wanted, the rectified picture in red, green, blue, out of an eye's own
+    /// picture in `format`: [`PixelFormat::Mono8`], [`PixelFormat::Rgb8`] or [`PixelFormat::Yuyv`]. 0 where the eye sees
+    /// nothing.
+    ///
+    /// Grey is the mean of BT.601 of red, green, blue, and of YUYV its luminance as it is. Colour of YUYV is as BT.601 with
+    /// its limited range has it, which is what `OpenCV` makes of it and what USB cameras send; of grey it is grey.
     ///
     /// # Errors
-    /// [`ErrorKind::SizeMismatch`] for pictures of another size.
-    pub fn grey(&self, view: View, picture: &[u8], out: &mut [u8]) -> Result<()> {
-        self.check("the grey picture", picture, 1, out, 1)?;
-        self.maps[view as usize].bytes::<1>(picture, out);
-        Ok(())
-    }
-
-    /// The rectified picture in three bytes a pixel, out of one in three bytes a pixel.
-    ///
-    /// # Errors
-    /// [`ErrorKind::SizeMismatch`] for pictures of another size.
-    pub fn rgb(&self, view: View, picture: &[u8], out: &mut [u8]) -> Result<()> {
-        self.check("the colour picture", picture, 3, out, 3)?;
-        self.maps[view as usize].bytes::<3>(picture, out);
-        Ok(())
-    }
-
-    /// The rectified grey picture out of a colour picture in three bytes (red, green, blue) a pixel.
-    ///
-    /// # Errors
-    /// [`ErrorKind::SizeMismatch`] for pictures of another size.
-    pub fn grey_from_rgb(&self, view: View, picture: &[u8], out: &mut [u8]) -> Result<()> {
-        self.check("the colour picture", picture, 3, out, 1)?;
-        self.maps[view as usize].grey_from_rgb(picture, out);
-        Ok(())
-    }
-
-    /// The rectified grey picture out of YUYV: its luminance as it is.
-    ///
-    /// # Errors
-    /// [`ErrorKind::SizeMismatch`] for pictures of another size, [`ErrorKind::BadInput`] for an odd width.
-    pub fn grey_from_yuyv(&self, view: View, picture: &[u8], out: &mut [u8]) -> Result<()> {
-        self.check_pairs()?;
-        self.check("the YUYV picture", picture, 2, out, 1)?;
-        self.maps[view as usize].grey_from_yuyv(picture, out);
-        Ok(())
-    }
-
-    /// The rectified colour picture (red, green, blue) out of YUYV as BT.601 with its limited range has it, which is
-    /// what `OpenCV` makes of it and what USB cameras send.
-    ///
-    /// # Errors
-    /// [`ErrorKind::SizeMismatch`] for pictures of another size, [`ErrorKind::BadInput`] for an odd width.
-    pub fn rgb_from_yuyv(&self, view: View, picture: &[u8], out: &mut [u8]) -> Result<()> {
-        self.check_pairs()?;
-        self.check("the YUYV picture", picture, 2, out, 3)?;
-        self.maps[view as usize].rgb_from_yuyv(picture, out);
+    /// [`ErrorKind::SizeMismatch`] for pictures of another size; [`ErrorKind::BadInput`] for other formats, and for YUYV of
+    /// an odd width.
+    pub fn rectify(
+        &self,
+        view: View,
+        format: PixelFormat,
+        picture: &[u8],
+        grey: &mut [u8],
+        rgb: Option<&mut [u8]>,
+    ) -> Result<()> {
+        let size = (self.size.0 as usize, self.size.1 as usize);
+        let bytes = match format {
+            PixelFormat::Mono8 => 1,
+            PixelFormat::Yuyv => 2,
+            PixelFormat::Rgb8 => 3,
+            other => {
+                return Err(bad(format!(
+                    "a picture in {other:?} cannot be rectified; Mono8, Rgb8 and Yuyv can"
+                )));
+            }
+        };
+        check_len("the picture of an eye", picture.len(), size, bytes)?;
+        check_len("the rectified grey picture", grey.len(), size, 1)?;
+        if let Some(rgb) = &rgb {
+            check_len("the rectified colour picture", rgb.len(), size, 3)?;
+        }
+        let map = &self.maps[view as usize];
+        match format {
+            PixelFormat::Yuyv => {
+                self.check_pairs()?;
+                map.yuyv(picture, grey, rgb);
+            }
+            PixelFormat::Rgb8 => map.rgb(picture, grey, rgb),
+            _ => {
+                map.grey(picture, grey);
+                if let Some(rgb) = rgb {
+                    rgb.as_chunks_mut().0.iter_mut().zip(grey).for_each(|(p, v)| *p = [*v; 3]);
+                }
+            }
+        }
         Ok(())
     }
 
@@ -165,12 +163,6 @@ impl Rectifier {
         Err(bad(format!(
             "a picture of {width}x{height} pixels cannot be YUYV, which has pairs of pixels: its width is odd"
         )))
-    }
-
-    fn check(&self, what: &str, picture: &[u8], from: usize, out: &[u8], to: usize) -> Result<()> {
-        let size = (self.size.0 as usize, self.size.1 as usize);
-        check_len(what, picture.len(), size, from)?;
-        check_len("the rectified picture", out.len(), size, to)
     }
 }
 

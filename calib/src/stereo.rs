@@ -26,12 +26,15 @@ use crate::{Error, ErrorKind, Result};
 mod depth;
 mod order;
 mod parameters;
+mod pyramid;
+mod rows;
 mod sgm;
 
 pub use depth::{depth_from_disparity, metres_from_disparity};
 pub use order::{Order, OrderCheck};
 pub use parameters::{MAX_DISPARITIES, Parameters, Preset, Resolution};
-pub use sgm::SgmMatcher;
+pub use rows::{RowCheck, RowOffset};
+pub use sgm::{SgmMatcher, SgmPresets};
 
 /// A grey picture, one byte a pixel.
 #[derive(Debug, Clone, Copy)]

@@ -1,9 +1,9 @@
 //! What is done for every frame takes no memory: counted by an allocator.
 #![allow(clippy::unwrap_used)]
 
-use depthrig_bus::{Distortion, Intrinsics, Pose};
+use depthrig_bus::{Distortion, Intrinsics, PixelFormat, Pose};
 use depthrig_calib::stereo::{
-    DisparityMap, Gray, Matcher, Order, OrderCheck, Parameters, Preset, SgmMatcher, StereoPair,
+    DisparityMap, Gray, Matcher, Order, OrderCheck, Parameters, Preset, RowCheck, SgmMatcher, StereoPair,
 };
 use depthrig_calib::{Deprojection, Method, PointCloud, Rectifier, Registration, Undistortion, View};
 use depthrig_counting::{Counting, during, in_process_during};
@@ -64,10 +64,8 @@ fn a_frame_takes_no_memory() {
     let (yuyv, mut grey) = (vec![90; 160 * 120 * 2], vec![0; 160 * 120]);
     assert_eq!(
         during(|| for view in View::BOTH {
-            rectifier.grey_from_yuyv(view, &yuyv, &mut grey).unwrap();
-            rectifier.rgb_from_yuyv(view, &yuyv, &mut rgb).unwrap();
-            rectifier.grey_from_rgb(view, &color, &mut grey).unwrap();
-            rectifier.rgb(view, &color, &mut rgb).unwrap();
+            rectifier.rectify(view, PixelFormat::Rgb8, &color, &mut grey, Some(&mut rgb)).unwrap();
+            rectifier.rectify(view, PixelFormat::Yuyv, &yuyv, &mut grey, Some(&mut rgb)).unwrap();
         }),
         0
     );
@@ -90,4 +88,22 @@ fn a_frame_takes_no_memory() {
     let pair = StereoPair::new(Gray::packed(&grey, 800, 24), Gray::packed(&grey, 800, 24));
     order.check(&pair).unwrap();
     assert_eq!(during(|| assert_eq!(order.check(&pair).unwrap(), Order::Unclear)), 0);
+    // Noise, so that there is much to look at, and more pairs than count at once.
+    let mut state = 1_u32;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 17;
+        state ^= state << 5;
+        (state >> 24) as u8
+    };
+    let noise: Vec<u8> = (0..400 * 240).map(|_| next()).collect();
+    let pair = StereoPair::new(Gray::packed(&noise, 400, 240), Gray::packed(&noise, 400, 240));
+    let mut rows = RowCheck::new(400, 240);
+    let taken = during(|| {
+        for _ in 0..RowCheck::PAIRS + 2 {
+            assert!(rows.look(&pair).unwrap() > 50);
+            assert!(rows.offset().is_some_and(|o| !o.is_bad()));
+        }
+    });
+    assert_eq!(taken, 0, "looking at rows");
 }

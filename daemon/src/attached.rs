@@ -16,11 +16,12 @@ pub(crate) use served::place as place_of_served;
 
 use crate::status::{CameraStatus, RigStatus};
 use classify::Candidate;
+use depthrig_bus::PixelFormat;
 use depthrig_drivers::usb::holder::{Holder, Holders, holders_of};
 use depthrig_drivers::usb::{SysRoot, UsbDevice, VideoNode, health, scan, video_nodes};
 use depthrig_drivers::{DeviceInfo, ErrorKind, StreamProfile};
 use serde::Serialize;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Everything that is attached.
 #[derive(Debug, Clone, Serialize)]
@@ -151,6 +152,13 @@ pub struct ModeReport {
     pub rate_hz: f64,
 }
 
+impl ModeReport {
+    /// Samples a second of a motion unit; `None` of pictures.
+    pub fn samples_hz(&self) -> Option<f64> {
+        (self.format == PixelFormat::Motion.name()).then(|| self.rate_hz * f64::from(self.width))
+    }
+}
+
 impl From<&StreamProfile> for ModeReport {
     fn from(p: &StreamProfile) -> Self {
         let (width, height) = (p.width, p.height);
@@ -223,6 +231,7 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
         .collect();
     let hid = c.hidraw.iter().map(|p| NodeReport { path: shown(p), role: "hid", formats: Vec::new() });
     nodes.extend(hid);
+    let unit = if c.family == Family::Zed { unreadable_unit(&c.hidraw, ask) } else { None };
     let holders = holders(root, &c);
     if let Some(usb) = &c.usb {
         nodes.push(NodeReport { path: shown(&usb.node), role: "usb", formats: Vec::new() });
@@ -247,7 +256,14 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
         kernel_metadata: metadata,
         nodes,
         modes: Vec::new(),
-        problems: c.usb.as_ref().and_then(health::slow_link).into_iter().chain(c.problem).collect(),
+        problems: c
+            .usb
+            .as_ref()
+            .and_then(health::slow_link)
+            .into_iter()
+            .chain(unit)
+            .chain(c.problem)
+            .collect(),
         usb: c.usb,
         family: c.family,
         profiles: Vec::new(),
@@ -269,6 +285,16 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
         None => ask_device(&mut found, ask),
     }
     found
+}
+
+/// What to say of the raw HID nodes of a ZED when its motion unit cannot be read through them.
+fn unreadable_unit(nodes: &[PathBuf], ask: &dyn Ask) -> Option<String> {
+    let denied = nodes.iter().find(|node| !ask.may_open(node))?;
+    Some(format!(
+        "its motion unit {} may not be opened, so that it has no stream imu: {} and plug the camera in again",
+        denied.display(),
+        health::RULE_CURE
+    ))
 }
 
 /// What can be said of an OAK without starting its firmware.

@@ -8,7 +8,7 @@ use crate::stream::Stream;
 use crate::wake::Wake;
 use depthrig_bus::{Bus, HostTime, StreamId};
 use depthrig_drivers::DeviceInfo;
-use depthrig_drivers::stereo::{Descriptions, EYES, PREFIXES};
+use depthrig_drivers::stereo::{Descriptions, EYES, Notice, PREFIXES};
 use depthrig_recorder::Computed;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -24,6 +24,8 @@ pub struct Camera {
     pub config: CameraConfig,
     /// What computes each mode of its stereo, once it was open.
     pub computed: Descriptions,
+    /// What is wrong with its eyes although it streams.
+    pub notice: Notice,
     state: Mutex<State>,
 }
 
@@ -70,7 +72,12 @@ impl Camera {
             short_of_memory: false,
             reconnects: 0,
         };
-        Self { config, computed: Descriptions::default(), state: Mutex::new(state) }
+        Self {
+            config,
+            computed: Descriptions::default(),
+            notice: Notice::default(),
+            state: Mutex::new(state),
+        }
     }
 
     /// What computed `stream`, if it is made of the eyes: for the dataset that it is recorded in.

@@ -3,20 +3,25 @@
 //! Read once, block by block. Pictures of one capture become one set: colour and depth whose times, the delay between
 //! them left out, lie within half a period; a capture that lacks one is a set that lacks it. Memory is that of the few
 //! captures that are not complete yet.
+//!
+//! Samples of accelerometer and gyroscope come over in batches ([`motion`]): all of them, those before the first capture
+//! with the first set and those after the last with the last.
 
 use depthrig_bus::{
     CameraName, ClockDomain, DropCounts, DropReason, FrameHeader, HostTime, PixelFormat, StreamId, UtcPair,
 };
-use depthrig_drivers::kinect::playback::{CalibrationSource, recorded_profiles, serial};
-use depthrig_drivers::kinect::recording::{Pixels, Recording, TrackKind, motion_samples};
+use depthrig_drivers::kinect::playback::{CalibrationSource, recorded_motion, recorded_profiles, serial};
+use depthrig_drivers::kinect::recording::{Pixels, Recording, TrackKind};
 use depthrig_drivers::kinect::{ColorMode, DepthMode};
 use depthrig_drivers::unpack;
 use depthrig_recorder::exchange::{ImportFacts, ImportProgress, Importer};
 use depthrig_recorder::{
-    Error, ErrorKind, RecordFrame, RecordSet, Result, Session, StreamAccount, StreamRecord,
+    Error, ErrorKind, MotionRecord, RecordFrame, RecordSet, Result, Session, StreamAccount, StreamRecord,
 };
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
+
+mod motion;
 
 /// The name of the layout.
 pub const FORMAT: &str = "kinect";
@@ -50,9 +55,9 @@ pub struct KinectImport {
     /// UTC at the device's time 0, nanoseconds.
     origin_ns: i64,
     sets: u64,
-    motion_track: Option<usize>,
-    /// Samples of motion that were left out.
-    motion: u64,
+    /// The newest set, which may be the last and then takes what is left of motion.
+    held: Option<RecordSet>,
+    motion: Option<motion::Unit>,
     /// Blocks of tracks that are no camera's, which were left out.
     others: u64,
     ended: bool,
@@ -116,6 +121,20 @@ impl KinectImport {
             let dropped = DropCounts::default();
             streams.push(Stream { record, track, kind, pixels, sequence: 0, newest: None, dropped });
         }
+        let motion = recorded_motion(facts, calibration.as_ref()).map_err(of_driver)?;
+        let motion = motion.map(|(track, profile)| {
+            let id = StreamId { camera: options.camera.clone(), stream: profile.stream.clone() };
+            let record = MotionRecord {
+                id,
+                model: "Azure Kinect".to_owned(),
+                serial: serial(facts, path),
+                rate_hz: profile.samples_hz(),
+                batch: profile.width,
+                calibration: from.clone(),
+                pose: profile.pose_in_device,
+            };
+            motion::Unit::new(record, track, calibration.as_ref())
+        });
         let rate_hz = streams.iter().map(|s| s.record.rate_hz).fold(f64::INFINITY, f64::min);
         let delay_us = facts.depth_delay_ns / 1000;
         let delays_us = (delay_us.max(0).unsigned_abs(), delay_us.min(0).unsigned_abs());
@@ -126,8 +145,8 @@ impl KinectImport {
             delays_us,
             origin_ns: facts.date_utc_ns.unwrap_or(0).saturating_sub(start_ns),
             sets: 0,
-            motion_track: recording.track(TrackKind::Motion).map(|(track, _)| track),
-            motion: 0,
+            held: None,
+            motion,
             others: 0,
             ended: false,
             facts: ImportFacts::default(),
@@ -159,7 +178,9 @@ impl KinectImport {
         }
         if facts.tracks.iter().any(|t| t.kind == TrackKind::Motion) {
             stated.push(
-                "the track of accelerometer and gyroscope is left out, a dataset holds pictures".to_owned(),
+                "a sample of accelerometer and gyroscope has the gyroscope's time, and its number follows from that; it \
+                 is with the first set that is not earlier, or with the last"
+                    .to_owned(),
             );
         }
         for t in facts.tracks.iter().filter(|t| t.kind == TrackKind::Other) {
@@ -173,10 +194,11 @@ impl KinectImport {
         let Some(block) = self.recording.next_block().map_err(of_driver)? else { return Ok(false) };
         let (device_us, track) = (block.device_us, block.track);
         let Some(at) = self.streams.iter().position(|s| s.track == track) else {
-            if self.motion_track == Some(track) {
-                self.motion += block.frames().map(|f| motion_samples(f).count() as u64).sum::<u64>();
-            } else {
-                self.others += 1;
+            match &mut self.motion {
+                Some(unit) if unit.track() == track => {
+                    block.frames().for_each(|f| unit.take(f, self.origin_ns));
+                }
+                _ => self.others += 1,
             }
             return Ok(true);
         };
@@ -253,6 +275,7 @@ impl KinectImport {
             // Times of an import count from 1970: its own zero of the monotonic clock.
             utc: UtcPair::default(),
             missing,
+            motion: Vec::new(),
             spread_ns: times().max().unwrap_or(0).saturating_sub(first),
             frames,
         }
@@ -275,7 +298,8 @@ impl KinectImport {
 
     /// How much of what was read a dataset does not hold.
     fn left_out(&self) -> BTreeMap<String, u64> {
-        let counts = [("motion_samples", self.motion), ("blocks_of_other_tracks", self.others)];
+        let motion = self.motion.as_ref().map_or(0, motion::Unit::left_out);
+        let counts = [("motion_samples", motion), ("blocks_of_other_tracks", self.others)];
         counts.into_iter().filter(|(_, n)| *n > 0).map(|(what, n)| (what.to_owned(), n)).collect()
     }
 }
@@ -355,6 +379,7 @@ impl Importer for KinectImport {
         let start_ns = i64::try_from(facts.start_offset_ns).unwrap_or(0);
         session.started_utc_ns = self.origin_ns.saturating_add(start_ns);
         session.streams = self.streams.iter().map(|s| s.record.clone()).collect();
+        session.motion = self.motion.iter().map(|unit| unit.record().clone()).collect();
         let mut table = toml::Table::new();
         let mut put = |key: &str, value: toml::Value| drop(table.insert(key.to_owned(), value));
         put("format", FORMAT.into());
@@ -381,10 +406,19 @@ impl Importer for KinectImport {
     fn next(&mut self) -> Result<Option<RecordSet>> {
         loop {
             if let Some(capture) = self.ready() {
-                return Ok(Some(self.set(capture)));
+                let newest = self.set(capture);
+                let Some(mut set) = self.held.replace(newest) else { continue };
+                if let Some(unit) = &mut self.motion {
+                    unit.hand_over(&mut set);
+                }
+                return Ok(Some(set));
             }
             if self.ended {
-                return Ok(None);
+                let mut last = self.held.take();
+                if let Some(unit) = &mut self.motion {
+                    unit.end(last.as_mut());
+                }
+                return Ok(last);
             }
             if !self.block()? {
                 self.finish();
@@ -399,10 +433,12 @@ impl Importer for KinectImport {
 
     fn facts(&self) -> ImportFacts {
         let mut facts = self.facts.clone();
-        if self.motion > 0 {
-            let what =
-                format!("{} samples of accelerometer and gyroscope were left out with it", self.motion);
-            facts.stated.push(what);
+        if let Some(unit) = &self.motion {
+            facts.stated.push(format!(
+                "{} samples of accelerometer and gyroscope came over, {} were left out",
+                unit.samples(),
+                unit.left_out()
+            ));
         }
         facts.left_out = self.left_out();
         let account = |s: &Stream| StreamAccount {
@@ -412,6 +448,7 @@ impl Importer for KinectImport {
             dropped: s.dropped,
         };
         facts.accounts = self.streams.iter().map(account).collect();
+        facts.accounts.extend(self.motion.as_ref().map(motion::Unit::account));
         facts
     }
 }

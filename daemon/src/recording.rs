@@ -2,7 +2,7 @@
 
 use crate::config::{RecordingConfig, RigConfig};
 use crate::control::RecordRequest;
-use crate::status::RecordingStatus;
+use crate::status::{RecordingStatus, SetAccount};
 use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
@@ -19,6 +19,7 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 pub mod budget;
+mod motion;
 mod place;
 mod recovery;
 mod report;
@@ -32,6 +33,8 @@ pub struct Recording {
     active: Option<Active>,
     last: Option<RecordingStatus>,
     summary: Option<Summary>,
+    /// What became of motion samples, recorded or not.
+    motion: motion::Books,
 }
 
 /// What recordings have of the computer: its disk and its clocks.
@@ -59,6 +62,7 @@ struct Active {
     status: RecordingStatus,
     indices: HashMap<StreamId, usize>,
     streams: Vec<Recorded>,
+    motion: motion::Units,
     started: HostTime,
     /// When it ends by itself.
     ends: Option<HostTime>,
@@ -113,6 +117,9 @@ impl Begun {
     ) -> Result<Self> {
         budget::check_duration(request)?;
         let (streams, others): (Vec<_>, Vec<_>) = streams.into_iter().partition(|s| s.stream.record);
+        // Motion rides with the sets of the others.
+        let (units, streams): (Vec<_>, Vec<_>) =
+            streams.into_iter().partition(|s| s.stream.profile.format.is_motion());
         if streams.is_empty() {
             return Err(Error::new(
                 ErrorKind::WrongState,
@@ -131,10 +138,13 @@ impl Begun {
             max_spread_ns(streams.iter().map(|s| reach_ns(s, streams.iter().chain(&others), sets_hz)));
         session.computed = streams.iter().filter_map(|s| s.computed.clone()).collect();
         session.streams = streams.iter().map(record_of).collect();
+        session.motion = units.iter().map(motion::record_of).collect();
         let mut options = options_of(&config.recording);
         options.backlog_max_bytes = outside.backlog_max_bytes.unwrap_or(options.backlog_max_bytes);
         let raw = streams.iter().map(|s| (s.stream.profile.format, s.stream.profile.frame_bytes()));
-        let rate = budget::bytes_per_s(raw, sets_hz, &config.recording);
+        let samples_hz: f64 = units.iter().map(|s| s.stream.profile.samples_hz()).sum();
+        let rate =
+            budget::bytes_per_s(raw, sets_hz, &config.recording) + budget::motion_bytes_per_s(samples_hz);
         let reserve = reserve_bytes(&config.recording);
         budget::check(&*outside.fs, &path, request, rate, reserve, &config.recording)?;
         let (fs, clock) = (Arc::clone(&outside.fs), Arc::clone(&outside.utc));
@@ -142,7 +152,7 @@ impl Begun {
         if !request.notes.is_empty() {
             recorder.add_note(request.notes.as_str()).map_err(of_recorder)?;
         }
-        tracing::info!(path = %path.display(), streams = streams.len(), "recording");
+        tracing::info!(path = %path.display(), streams = streams.len(), motion_units = units.len(), "recording");
         let status = RecordingStatus {
             active: true,
             path: path.display().to_string(),
@@ -166,6 +176,7 @@ impl Begun {
             recorder,
             indices: streams.iter().enumerate().map(|(i, s)| (s.stream.id.clone(), i)).collect(),
             streams: streams.iter().map(recorded).collect(),
+            motion: motion::Units::new(&units, sets_hz),
             started,
             ends: request.max_duration_s.map(|s| started.plus(Duration::from_secs_f64(s))),
             utc: Arc::clone(&outside.utc),
@@ -191,14 +202,32 @@ impl Recording {
     /// From now on sets go to `begun`.
     pub fn begin(&mut self, begun: Begun) -> RecordingStatus {
         let active = self.active.insert(begun.0);
+        active.motion.begin();
         active.refresh();
         self.summary = None;
         self.last.insert(active.status.clone()).clone()
     }
 
-    /// Hands a set to the recorder, if one is running. Never blocks.
-    pub fn offer(&self, id: u64, tick: HostTime, frames: impl Iterator<Item = (Arc<Stream>, Option<Frame>)>) {
-        let Some(active) = &self.active else { return };
+    /// Takes in a batch of the motion unit `id`, before which `missed` batches were replaced on the channel. While a
+    /// recording runs it waits for the next set.
+    pub fn hear_motion(&mut self, id: &StreamId, frame: &Frame, missed: u64) {
+        self.motion.hear(self.active.as_mut().map(|a| &mut a.motion), id, frame, missed);
+    }
+
+    /// What became of the batches of each motion unit that was heard: `used` went with sets, `overflow` waited too long,
+    /// `decimated` came while nothing was recorded or after a recording's last set.
+    pub fn motion_accounts(&self) -> Vec<(StreamId, SetAccount)> {
+        self.motion.accounts().map(|(id, account)| (id.clone(), account)).collect()
+    }
+
+    /// Hands a set to the recorder, with the motion that came since the set before, if a recording is running. Never blocks.
+    pub fn offer(
+        &mut self,
+        id: u64,
+        tick: HostTime,
+        frames: impl Iterator<Item = (Arc<Stream>, Option<Frame>)>,
+    ) {
+        let Some(active) = &mut self.active else { return };
         let (mut present, mut missing) = (Vec::new(), Vec::new());
         for (stream, frame) in frames {
             let Some(&index) = active.indices.get(&stream.id) else { continue };
@@ -215,14 +244,16 @@ impl Recording {
         let times = present.iter().map(|f| f.header.capture_time_ns);
         let spread_ns = times.clone().max().unwrap_or(0) - times.min().unwrap_or(0);
         let utc = (active.utc)();
-        self.push(RecordSet { id, tick, utc, frames: present, missing, spread_ns });
+        let motion = self.motion.take(&mut active.motion);
+        self.push(RecordSet { id, tick, utc, frames: present, missing, motion, spread_ns });
     }
 
-    /// Hands a set to the recorder, if one is running; its streams are those that the recording was begun with.
-    /// Never blocks.
-    pub fn push(&self, set: RecordSet) {
-        let Some(active) = &self.active else { return };
+    /// Hands a set to the recorder, if one is running; its streams and motion units are those that the recording was begun
+    /// with, in their order. Never blocks.
+    pub fn push(&mut self, set: RecordSet) {
+        let Some(active) = &mut self.active else { return };
         let id = set.id;
+        active.motion.hand_over(&set.motion);
         if let Err(e) = active.recorder.push(set) {
             tracing::error!(set = id, reason = e.reason.name(), "a frame set was not recorded: {e}");
         }
@@ -251,7 +282,8 @@ impl Recording {
     /// `WrongState` when no recording is going on.
     pub fn take(&mut self) -> Result<Finishing> {
         self.refresh();
-        let active = self.active.take().ok_or_else(none_active)?;
+        let mut active = self.active.take().ok_or_else(none_active)?;
+        self.motion.end(&mut active.motion);
         active.hand_over_accounts();
         Ok(Finishing { active })
     }
@@ -334,7 +366,8 @@ impl Active {
                 dropped,
             }
         };
-        self.recorder.update_accounts(self.streams.iter().map(account).collect());
+        let streams = self.streams.iter().map(account);
+        self.recorder.update_accounts(streams.chain(self.motion.accounts()).collect());
     }
 }
 

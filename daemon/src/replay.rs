@@ -42,10 +42,11 @@ use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::runtime::RigLock;
 use depthrig_bus::{
-    Bus, ClockDomain, HostTime, MetadataLevel, RigName, RuntimeDir, SUBSCRIBER_BUFFER, UtcPair, shm,
+    Bus, ClockDomain, HostTime, Intrinsics, MetadataLevel, PixelFormat, RigName, RuntimeDir,
+    SUBSCRIBER_BUFFER, UtcPair, shm,
 };
 use depthrig_drivers::StreamProfile;
-use depthrig_recorder::{Computed, StreamRecord};
+use depthrig_recorder::{Computed, MotionRecord, StreamRecord};
 use player::Player;
 use source::{Moment, Sources};
 use std::path::PathBuf;
@@ -135,6 +136,9 @@ struct Inner {
     stop_asked: AtomicBool,
     done: AtomicBool,
     records: Vec<StreamRecord>,
+    units: Vec<MotionRecord>,
+    /// Their channels.
+    unit_streams: Vec<Arc<Stream>>,
     /// What computed some of them.
     computed: Vec<Computed>,
     streams: Vec<Arc<Stream>>,
@@ -330,6 +334,7 @@ impl Inner {
     ) -> Self {
         let slots = if options.as_fast_as_possible { SUBSCRIBER_BUFFER } else { shm::DEFAULT_SLOTS };
         let stream = |r: &StreamRecord| Arc::new(Stream::new(r.id.clone(), profile(r), true, slots));
+        let unit = |r: &MotionRecord| Arc::new(Stream::new(r.id.clone(), unit_profile(r), true, slots));
         let begin = Begin {
             by_clock: !options.as_fast_as_possible,
             rate: options.rate,
@@ -353,6 +358,8 @@ impl Inner {
             stop_asked: AtomicBool::new(false),
             done: AtomicBool::new(false),
             records: sources.streams().to_vec(),
+            units: sources.units().to_vec(),
+            unit_streams: sources.units().iter().map(unit).collect(),
             computed: sources.computed(),
             streams: sources.streams().iter().map(stream).collect(),
             entrance: Arc::default(),
@@ -426,6 +433,23 @@ fn profile(r: &StreamRecord) -> StreamProfile {
         rate_hz: r.rate_hz,
         depth_unit_m: r.depth_unit_m,
         intrinsics: r.intrinsics,
+        pose_in_device: r.pose,
+        clock: depthrig_drivers::DeviceClock { counter_bits: 64, tick_ps: 1000, domain: ClockDomain::Device },
+        sequence_bits: 64,
+        metadata: MetadataLevel::Full,
+    }
+}
+
+/// The same of a motion unit.
+fn unit_profile(r: &MotionRecord) -> StreamProfile {
+    StreamProfile {
+        stream: r.id.stream.clone(),
+        format: PixelFormat::Motion,
+        width: r.batch,
+        height: 1,
+        rate_hz: r.rate_hz / f64::from(r.batch.max(1)),
+        depth_unit_m: 0.0,
+        intrinsics: Intrinsics::default(),
         pose_in_device: r.pose,
         clock: depthrig_drivers::DeviceClock { counter_bits: 64, tick_ps: 1000, domain: ClockDomain::Device },
         sequence_bits: 64,

@@ -11,6 +11,7 @@
 
 mod assembly;
 mod join;
+mod motion;
 pub(crate) mod report;
 
 use crate::api::{self, ServerHandle};

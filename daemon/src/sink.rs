@@ -2,7 +2,10 @@
 
 use crate::stream::{Books, Reached, Stream};
 use crate::wake::Wake;
-use depthrig_bus::{DropReason, FrameFlags, FrameHeader, FrameMut, HostTime, MetadataLevel, Publisher};
+use depthrig_bus::{
+    DropReason, FrameFlags, FrameHeader, FrameMut, HostTime, MOTION_SAMPLE_BYTES, MetadataLevel, PixelFormat,
+    Publisher,
+};
 use depthrig_drivers::clock::ClockQuality;
 use depthrig_drivers::{FrameMeta, FrameSink, Loan};
 use std::sync::{Arc, MutexGuard};
@@ -49,6 +52,11 @@ impl Port {
             return;
         }
         let payload_len = frame.header().payload_len;
+        let mut template = self.template;
+        if self.stream.profile.format.is_motion() {
+            // A batch is as wide as it has samples.
+            template.set_picture(PixelFormat::Motion, payload_len / MOTION_SAMPLE_BYTES as u32, 1);
+        }
         *frame.header_mut() = FrameHeader {
             sequence: books.delivered + 1,
             device_sequence: meta.device_sequence,
@@ -65,7 +73,7 @@ impl Port {
             gain: meta.gain,
             temperature_c: meta.temperature_c,
             payload_len,
-            ..self.template
+            ..template
         };
         if let Err(e) = self.publisher.send(frame) {
             books.dropped.add(DropReason::NoSlot, 1);
@@ -78,7 +86,8 @@ impl Port {
         books.uncertainty_ns = meta.capture_uncertainty_ns;
         books.uncertain += u64::from(meta.flags.has(FrameFlags::TIME_UNCERTAIN));
         books.note_metadata(MetadataLevel::of(meta.clock_domain, meta.flags), meta.flags);
-        books.note(now, now.since_ns(meta.capture_time));
+        let samples = if self.stream.profile.format.is_motion() { template.width } else { 1 };
+        books.note(now, now.since_ns(meta.capture_time), samples);
     }
 }
 

@@ -140,6 +140,9 @@ pub struct CameraStatus {
     pub state_for_s: f64,
     /// Why it is in a state other than streaming.
     pub message: Option<String>,
+    /// What is wrong although it streams, such as a calibration that does not fit.
+    #[serde(default)]
+    pub warnings: Vec<String>,
     /// Times it was lost and came back.
     pub reconnects: u64,
     /// Its streams; those that are made of them come last.
@@ -227,6 +230,9 @@ pub struct StreamStatus {
     pub nominal_hz: f64,
     /// Rate delivered over the last seconds, Hz.
     pub rate_hz: f64,
+    /// Of a motion unit, whose frames are batches: samples a second, over the last seconds. `None` of pictures.
+    #[serde(default)]
+    pub samples_hz: Option<f64>,
     /// Frames the device captured.
     pub captured: u64,
     /// Frames published.
@@ -271,13 +277,13 @@ pub struct ClockStatus {
     pub uncertain_frames: u64,
 }
 
-/// What became of a stream's frames in the set assembler:
+/// What became of a stream's frames in the set assembler; of a motion unit's batches in recordings:
 /// `delivered = used + decimated + late + out_of_order + overflow + missed + pending + unread`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct SetAccount {
-    /// Became part of a set.
+    /// Became part of a set. Of a motion unit: went with a recorded set.
     pub used: u64,
-    /// Between two ticks, as most frames are.
+    /// Between two ticks, as most frames are. Of a motion unit: came while nothing was recorded.
     pub decimated: u64,
     /// Came after their set had been sent.
     pub late: u64,

@@ -62,7 +62,8 @@ pub struct Books {
     pub metadata_lost: u64,
     /// The clock map's own word.
     pub clock: Option<ClockQuality>,
-    recent: VecDeque<(HostTime, i64)>,
+    /// When the newest frames were published, how long after their capture, and how many samples each has.
+    recent: VecDeque<(HostTime, i64, u32)>,
     loss_logged: Option<HostTime>,
     gives_way: GivesWay,
 }
@@ -150,12 +151,12 @@ impl Books {
         None
     }
 
-    /// Notes a published frame.
-    pub fn note(&mut self, published: HostTime, latency_ns: i64) {
+    /// Notes a published frame; a batch of a motion unit has more than one sample.
+    pub fn note(&mut self, published: HostTime, latency_ns: i64, samples: u32) {
         if self.recent.len() == WINDOW {
             self.recent.pop_front();
         }
-        self.recent.push_back((published, latency_ns));
+        self.recent.push_back((published, latency_ns, samples));
         self.last_frame = Some(published);
     }
 
@@ -170,15 +171,29 @@ impl Books {
 
     /// Frames per second over the last two seconds or the last 256 frames.
     pub fn rate_hz(&self, now: HostTime) -> f64 {
+        self.per_second(now, |_| 1)
+    }
+
+    /// Samples per second over the same time.
+    pub fn samples_hz(&self, now: HostTime) -> f64 {
+        self.per_second(now, |samples| samples)
+    }
+
+    fn per_second(&self, now: HostTime, weight: impl Fn(u32) -> u32) -> f64 {
         let from = now.plus_ns(-2_000_000_000);
-        let mut recent = self.recent.iter().map(|r| r.0).filter(|t| *t >= from);
-        let (Some(first), Some((last, _))) = (recent.next(), self.recent.back()) else { return 0.0 };
-        let intervals = recent.count() as f64;
-        let span_ns = last.since_ns(first) as f64;
+        let mut recent = self.recent.iter().filter(|r| r.0 >= from);
+        let (Some((first, ..)), Some((last, ..))) = (recent.next(), self.recent.back()) else { return 0.0 };
+        // Those of the first frame were made before it.
+        let (mut intervals, mut made) = (0.0_f64, 0.0);
+        for (_, _, samples) in recent {
+            intervals += 1.0;
+            made += f64::from(weight(*samples));
+        }
+        let span_ns = last.since_ns(*first) as f64;
         // A stream that just stopped must not look alive: from two missing frames on the silence counts.
         let silent = now.since_ns(*last) as f64 > 3.0 * span_ns / intervals.max(1.0);
-        let span_ns = if silent { now.since_ns(first) as f64 } else { span_ns };
-        if span_ns > 0.0 { intervals * 1e9 / span_ns } else { 0.0 }
+        let span_ns = if silent { now.since_ns(*first) as f64 } else { span_ns };
+        if span_ns > 0.0 { made * 1e9 / span_ns } else { 0.0 }
     }
 
     /// The latency from capture to publish that a share of `quantile` of the last frames stayed below, ms.
@@ -242,10 +257,11 @@ mod tests {
         let mut books = Books::default();
         let at = |ms: i64| HostTime::from_ns(10_000_000_000 + ms * 1_000_000);
         for i in 0..30 {
-            books.note(at(i * 33), 5_000_000);
+            books.note(at(i * 33), 5_000_000, 8);
         }
         for late in [0, 10, 33, 66] {
             assert!((books.rate_hz(at(29 * 33 + late)) - 1000.0 / 33.0).abs() < 0.01, "{late}");
+            assert!((books.samples_hz(at(29 * 33 + late)) - 8000.0 / 33.0).abs() < 0.01, "{late}");
         }
         assert!(books.rate_hz(at(29 * 33 + 500)) < 21.0);
         assert!(books.rate_hz(at(5000)).abs() < 1e-9);

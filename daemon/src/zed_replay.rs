@@ -18,12 +18,12 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 mod engine;
+mod eyes;
 mod input;
 mod modes;
 mod pictures;
 mod plan;
 mod record;
-mod swapped;
 mod work;
 
 pub use depthrig_cdm::NetworkPixels;
@@ -147,7 +147,10 @@ pub struct ModeReport {
     pub parameters: String,
     /// Frames in the new dataset.
     pub frames: u64,
-    /// Processor time of its matching in this run, seconds; of a matcher with several threads the calling one's.
+    /// Modes that came out of the same matching.
+    pub shared_with: Vec<String>,
+    /// Processor time of the matching that it came out of, in this run, seconds; of a matcher with several threads the
+    /// calling one's. A matching that modes share is in each of them and once in [`CpuReport::stereo_s`].
     pub stereo_s: f64,
 }
 
@@ -160,7 +163,7 @@ pub struct CpuReport {
     pub read_s: f64,
     /// Rectifying.
     pub rectify_s: f64,
-    /// Matching, all modes.
+    /// Matching, all modes; presets share theirs.
     pub stereo_s: f64,
     /// Disparity to depth.
     pub depth_s: f64,
@@ -188,7 +191,8 @@ pub fn zed_replay(
     check(options)?;
     let mut input = Input::open(input, options.camera.as_deref(), &options.open)?;
     let mut plan = Plan::new(&mut input, out, options)?;
-    swapped::check(&mut input, &plan.maker)?;
+    let rows = eyes::check(&mut input, &plan.maker)?;
+    plan.tell_rows(rows.as_ref());
     let fs: Arc<dyn Fs> = Arc::new(RealFs);
     let work = work::Work::open(out, &plan.identity(options))?;
     let mut report = plan.report(out);

@@ -5,10 +5,13 @@ use depthrig_bus::{DropReason, Name, PixelFormat};
 use depthrig_daemon::import_kinect::{KinectImport, KinectOptions};
 use depthrig_drivers::kinect::playback::CalibrationSource;
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
-use depthrig_kinect_fixture::{Fixture, Pattern, Pictures};
-use depthrig_recorder::exchange::{ImportReport, import};
+use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Lacing, Pattern, Pictures, motion};
+use depthrig_recorder::exchange::{ImportFacts, ImportReport, Importer, import};
 use depthrig_recorder::fs::RealFs;
-use depthrig_recorder::{ColorCodec, Dataset, DatasetSet, ErrorKind, PixelMode, RecorderOptions, Result};
+use depthrig_recorder::{
+    ColorCodec, Dataset, DatasetSet, ErrorKind, PixelMode, RecordSet, RecorderOptions, Result, Session,
+    StreamAccount,
+};
 use std::ops::ControlFlow;
 use std::path::Path;
 use std::sync::Arc;
@@ -39,7 +42,8 @@ fn a_recording_becomes_a_dataset_with_its_own_jpeg() {
     let report = run(&path, &out, CalibrationSource::Recorded).unwrap();
     assert!(report.verified.is_whole(), "{:?}", report.verified);
     assert_eq!((report.facts.lost, report.summary.complete), (0, true), "{:?}", report.facts);
-    for account in &report.facts.accounts {
+    let of_pictures = |a: &&StreamAccount| a.stream.stream.as_str() != "imu";
+    for account in report.facts.accounts.iter().filter(of_pictures) {
         assert_eq!((account.captured, account.delivered), (12, 11), "{}", account.stream);
         assert_eq!(account.dropped.get(DropReason::DeviceGap), 1);
     }
@@ -184,26 +188,112 @@ fn every_colour_format_and_every_depth_mode_keeps_its_pixels() {
     }
 }
 
+/// What the importer gives, before any recorder.
+fn handed_over(fixture: &Fixture, dir: &Path) -> (Session, Vec<RecordSet>, ImportFacts) {
+    let path = dir.join("source.mkv");
+    fixture.write(&path, &mut Pattern::new(fixture)).unwrap();
+    let mut importer = KinectImport::open(&path, options(CalibrationSource::Recorded)).unwrap();
+    let session = importer.session().unwrap();
+    let mut sets = Vec::new();
+    while let Some(set) = importer.next().unwrap() {
+        sets.push(set);
+    }
+    (session, sets, importer.facts())
+}
+
+/// All samples come over, in order, with the values that the file was given, each with the first set that is not earlier.
 #[test]
-fn samples_of_motion_are_counted_in_the_report_and_in_the_dataset() {
+fn samples_of_motion_come_over_with_their_sets() {
+    let dir = tempfile::tempdir().unwrap();
+    for lacing in [Lacing::None, Lacing::Xiph, Lacing::Fixed, Lacing::Ebml] {
+        // Depth is exposed before colour, so that the first samples are earlier than the first set.
+        let fixture =
+            Fixture { lacing, lost: vec![2], depth_delay_ns: -20_000_000, captures: 9, ..Fixture::small() };
+        let (session, sets, facts) = handed_over(&fixture, dir.path());
+        let [unit] = session.motion.as_slice() else { panic!("one unit") };
+        assert_eq!((unit.id.to_string().as_str(), unit.rate_hz, unit.batch), ("kinect/imu", 1600.0, 64));
+        assert_eq!((unit.model.as_str(), unit.serial.as_str()), ("Azure Kinect", "000123456789"));
+        assert_eq!(unit.calibration, session.streams[0].calibration);
+        // The accelerometer of the attached calibration: rotation (0 -1 0, 0 0 -1, 1 0 0) and t; the pose is its inverse.
+        let at = unit.pose.translation_m;
+        let want = [-0.0015, -0.051, 0.0034];
+        assert!(at.iter().zip(want).all(|(a, b)| (a - b).abs() < 1e-6), "{at:?}");
+        let (mut i, mut batches, mut last_tick) = (0u64, 0u64, i64::MIN);
+        for (n, set) in sets.iter().enumerate() {
+            let is_last = n + 1 == sets.len();
+            for batch in &set.motion {
+                batches += 1;
+                let h = &batch.header;
+                assert_eq!((batch.unit, h.sequence, h.captured), (0, batches, batches));
+                assert_eq!(
+                    (h.width, h.height, h.pixel_format()),
+                    (batch.samples.len() as u32, 1, Some(PixelFormat::Motion))
+                );
+                assert_eq!((h.payload_len, h.stride), (64 * h.width, 64 * h.width));
+                assert_eq!(h.pose, unit.pose);
+                let newest = batch.samples.last().unwrap();
+                assert_eq!((h.capture_time_ns, h.device_sequence), (newest.time_ns, newest.sequence));
+                assert_eq!(h.device_time, newest.device_time);
+                assert!(newest.time_ns > last_tick || n == 0, "it belongs to a set before");
+                assert!(newest.time_ns <= set.tick.ns() || is_last, "it belongs to a later set");
+                for s in &batch.samples {
+                    let (device_ns, acceleration, rotation) = motion(&fixture, i);
+                    assert_eq!((s.sequence, s.device_time), (i, device_ns / 1000));
+                    assert_eq!(
+                        s.time_ns,
+                        session.started_utc_ns + (device_ns - fixture.start_offset_ns) as i64
+                    );
+                    assert_eq!((s.gyro_rad_s, s.accel_m_s2), (rotation, acceleration));
+                    assert_eq!(s.accel_offset_ns, ACCEL_LATE_NS as i32);
+                    assert!(s.temperature_c.is_nan(), "a recording does not say it");
+                    i += 1;
+                }
+            }
+            last_tick = set.tick.ns();
+        }
+        let (_, written) = fixture.bytes_and_places();
+        assert_eq!(i, written.motion, "none is left out");
+        assert!(
+            sets.last().unwrap().motion.iter().any(|b| b.samples.len() < 64),
+            "the rest that fills no batch"
+        );
+        assert!(facts.left_out.is_empty(), "{:?}", facts.left_out);
+        let said = format!("{i} samples of accelerometer and gyroscope came over, 0 were left out");
+        assert!(facts.stated.contains(&said), "{:?}", facts.stated);
+        let account = facts.accounts.iter().find(|a| a.stream == unit.id).unwrap();
+        assert_eq!((account.captured, account.delivered, account.dropped.total()), (batches, batches, 0));
+    }
+    let still = Fixture { motion: false, ..Fixture::small() };
+    let (session, sets, facts) = handed_over(&still, dir.path());
+    assert!(session.motion.is_empty() && sets.iter().all(|s| s.motion.is_empty()));
+    assert!(!facts.stated.iter().any(|s| s.contains("gyroscope")) && facts.accounts.len() == 3);
+}
+
+/// A dataset of a recording says how much of it came over.
+#[test]
+fn samples_of_motion_are_told_in_the_report_and_in_the_dataset() {
     let dir = tempfile::tempdir().unwrap();
     let (report, dataset) = imported(dir.path(), "moved", &Fixture::small());
-    // 6 captures at 30 Hz, of 1.6 kHz.
-    let n = report.facts.left_out["motion_samples"];
-    assert!((318..=322).contains(&n), "{n}");
+    let (_, written) = Fixture::small().bytes_and_places();
     let said =
-        |stated: &[String]| stated.iter().any(|s| s.contains(&format!("{n} samples of accelerometer")));
-    assert!(said(&report.facts.stated), "{:?}", report.facts.stated);
+        format!("{} samples of accelerometer and gyroscope came over, 0 were left out", written.motion);
+    assert!(report.facts.stated.contains(&said), "{:?}", report.facts.stated);
+    assert!(report.facts.left_out.is_empty());
     let import = dataset.session().extra["import"].as_table().unwrap();
-    assert_eq!(import["left_out"]["motion_samples"].as_integer(), Some(n as i64));
+    assert!(import.get("left_out").is_none());
     let stated: Vec<String> =
         import["stated"].as_array().unwrap().iter().map(|s| s.as_str().unwrap().to_owned()).collect();
-    assert!(said(&stated) && stated == report.facts.stated, "{stated:?}");
+    assert_eq!(stated, report.facts.stated);
     assert_eq!((import["lost"].as_integer(), import["ended_early"].as_bool()), (Some(0), Some(false)));
-    let still = Fixture { motion: false, ..Fixture::small() };
-    let (report, dataset) = imported(dir.path(), "still", &still);
-    assert!(report.facts.left_out.is_empty() && !report.facts.stated.iter().any(|s| s.contains("gyroscope")));
-    assert!(dataset.session().extra["import"].get("left_out").is_none());
+    assert_eq!(dataset.session().motion.len(), 1);
+    let sets = sets(&dataset, PixelMode::Stored);
+    let samples: Vec<_> = sets.iter().flat_map(|s| &s.motion).flat_map(|b| &b.samples).collect();
+    assert_eq!(samples.len() as u64, written.motion);
+    for (i, s) in (0..).zip(samples) {
+        let (device_ns, acceleration, rotation) = motion(&Fixture::small(), i);
+        assert_eq!((s.sequence, s.device_time), (i, device_ns / 1000));
+        assert_eq!((s.accel_m_s2, s.gyro_rad_s), (acceleration, rotation));
+    }
 }
 
 #[test]
@@ -290,7 +380,6 @@ fn what_is_there_is_not_overwritten_and_an_import_may_be_ended() {
     assert_eq!(dataset.set_reader().unwrap().times().len(), 10, "what was read until then");
     let table = &dataset.session().extra["import"];
     assert_eq!(table["ended_early"].as_bool(), Some(true));
-    assert!(table["left_out"]["motion_samples"].as_integer().unwrap() > 0);
     let before = std::fs::read(out.join("session.toml")).unwrap();
     let e = run(&path, &out, CalibrationSource::Recorded).unwrap_err();
     assert!(e.to_string().contains(&out.display().to_string()), "{e}");

@@ -17,7 +17,8 @@
 //! 2. Between frames of a warm epoch the line moves by at most 200 µs per second of time, unless it must fall
 //!    to keep 1.
 //! 3. A frame whose device time is in doubt (clock step, restart, backward stamp) carries
-//!    [`FrameFlags::TIME_UNCERTAIN`]; the decision takes five frames.
+//!    [`FrameFlags::TIME_UNCERTAIN`]; the decision takes five frames. So does one of a device that is asked for its clock
+//!    ([`ClockMap::expect_probes`]) and has not answered yet.
 //! 4. Memory is bounded, and a frame costs amortised constant time.
 
 mod hull;
@@ -103,6 +104,8 @@ pub struct ClockMap {
     latency: Option<Latency>,
     /// The latency is that of probes in an epoch that is over.
     is_carried: bool,
+    /// Somebody asks the device for its clock, so that not to know the latency is a state that passes.
+    is_asked: bool,
     shown_latency: f64,
     /// Frames that may be the first of a restarted device.
     pending: Vec<Seen>,
@@ -130,6 +133,7 @@ impl ClockMap {
             probes: Probes::default(),
             latency: known.then_some(Latency { ns: config.latency_ns, bound_ns: 0 }),
             is_carried: false,
+            is_asked: false,
             shown_latency: config.latency_ns as f64,
             pending: Vec::with_capacity(DECIDING_FRAMES),
             last_capture: HostTime::from_ns(i64::MIN),
@@ -175,6 +179,13 @@ impl ClockMap {
         mapped
     }
 
+    /// Says that probes of this device will come. Until the first one has, its frames carry
+    /// [`FrameFlags::TIME_UNCERTAIN`]: they may be late by a latency that only a probe can tell, such as the queue of a
+    /// computer that is busy when the camera starts.
+    pub const fn expect_probes(&mut self) {
+        self.is_asked = true;
+    }
+
     /// Takes a two-way probe: the device read its counter somewhere between two readings of the host's clock.
     ///
     /// From then on capture times are free of the constant latency, up to half the width of the tightest probes,
@@ -196,6 +207,11 @@ impl ClockMap {
             self.latency = Some(self.probes.add(x, offset_ns, width_ns, epoch.line));
             self.is_carried = false;
         }
+    }
+
+    /// Host rate over device rate, minus one, as it is believed now; 0 until it is known.
+    pub const fn rate(&self) -> f64 {
+        self.rate
     }
 
     /// How the map is doing.
@@ -314,7 +330,8 @@ impl ClockMap {
         if epoch.newest_x < WARM_NS {
             // The lowest of n frames is some n-th of the mean jitter high; a quarter period stands for what is
             // not known yet. An unknown rate turns the line by up to its largest value.
-            let lowest_ns = 5.0 * (self.config.period_ns as f64 / 4.0 / frames + jitter_ns) / frames;
+            let period_ns = self.config.period_ns as f64 * f64::from(self.config.bunch);
+            let lowest_ns = 5.0 * (period_ns / 4.0 / frames + jitter_ns) / frames;
             let rate = if self.rate_known { PAUSE_DRIFT } else { MAX_RATE };
             return lowest_ns + rate * epoch.newest_x as f64 + tick_ns;
         }
@@ -325,7 +342,7 @@ impl ClockMap {
     fn publish(&mut self, mut epoch: Epoch, seen: Seen) -> Mapped {
         let x = self.counter.ns(seen.ticks);
         let y = arrival_y(&epoch, seen);
-        let period = self.period_ns;
+        let period = self.period_ns * f64::from(self.config.bunch);
         let dx = (x - epoch.shown_x) as f64;
         let target_d = epoch.line.at(x);
         let target_latency = self.latency.map_or(0.0, |l| l.ns as f64);
@@ -394,7 +411,12 @@ impl ClockMap {
         if backward {
             uncertainty += seen.arrival.since_ns(capture) as f64;
         }
-        if backward || epoch.frames <= DECIDING_FRAMES as u64 || forced_ns > self.claim_ns + owed {
+        let unanswered = self.is_asked && self.latency.is_none();
+        if unanswered
+            || backward
+            || epoch.frames <= DECIDING_FRAMES as u64
+            || forced_ns > self.claim_ns + owed
+        {
             flags = flags.with(FrameFlags::TIME_UNCERTAIN);
         }
         if seen.arrival.since_ns(capture) as f64 > 2.0 * period {

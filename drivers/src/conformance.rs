@@ -40,7 +40,7 @@ pub struct Bench {
     pub backend: Box<dyn Backend>,
     /// Serial number of the device.
     pub serial: String,
-    /// What to start; empty for the default modes.
+    /// What to start; empty for the default modes. A motion unit that is not among them is started for the case `motion`.
     pub requests: Vec<StreamRequest>,
     /// The hands that make it fail, and the eyes that see what it does.
     pub rig: Box<dyn Rig>,

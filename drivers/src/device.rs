@@ -91,11 +91,11 @@ pub struct StreamProfile {
     pub stream: StreamName,
     /// Pixel format.
     pub format: PixelFormat,
-    /// Pixels per row.
+    /// Pixels per row; of a motion unit the most samples of a batch.
     pub width: u32,
-    /// Rows.
+    /// Rows; 1 of a motion unit.
     pub height: u32,
-    /// Nominal frame rate.
+    /// Nominal frame rate; of a motion unit full batches a second.
     pub rate_hz: f64,
     /// Metres per unit of depth; 0 when the pixels are no depth.
     pub depth_unit_m: f64,
@@ -123,9 +123,17 @@ impl StreamProfile {
         (1e9 / self.rate_hz).round() as u64
     }
 
-    /// `depth 1280x720 z16 30 Hz`, for messages.
+    /// Most samples a second of a motion unit.
+    pub fn samples_hz(&self) -> f64 {
+        self.rate_hz * f64::from(self.width)
+    }
+
+    /// `depth 1280x720 z16 30 Hz`, for messages; of a motion unit `imu motion 200 Hz in batches of up to 8`.
     pub fn describe(&self) -> String {
         let Self { stream, width, height, rate_hz, .. } = self;
+        if self.format.is_motion() {
+            return format!("{stream} motion {} Hz in batches of up to {width}", self.samples_hz());
+        }
         format!("{stream} {width}x{height} {} {rate_hz} Hz", self.format.name())
     }
 }

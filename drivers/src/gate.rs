@@ -154,14 +154,26 @@ impl Gate {
         sink: &mut dyn FrameSink,
         fill: impl FnOnce(&mut [u8]) -> Result<(), DropReason>,
     ) -> Outcome {
+        self.deliver_timed(raw, sink, |memory, _| fill(memory))
+    }
+
+    /// As [`Self::deliver`] for what has times in its payload: `fill` is told the frame's facts, and may change those that
+    /// the gate knows nothing of.
+    pub fn deliver_timed(
+        &mut self,
+        raw: &RawFrame,
+        sink: &mut dyn FrameSink,
+        fill: impl FnOnce(&mut [u8], &mut FrameMeta) -> Result<(), DropReason>,
+    ) -> Outcome {
         let stream = self.stream;
         self.pass(raw, sink, |meta, sink| {
             let memory = sink.loan(stream, raw.bytes).ok_or(DropReason::NoSlot)?;
-            if let Err(reason) = fill(memory) {
+            let mut meta = *meta;
+            if let Err(reason) = fill(memory, &mut meta) {
                 sink.discard(stream);
                 return Err(reason);
             }
-            sink.commit(stream, meta);
+            sink.commit(stream, &meta);
             Ok(())
         })
     }

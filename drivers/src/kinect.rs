@@ -9,6 +9,7 @@ pub mod calibration;
 pub mod ebml;
 pub mod live;
 pub mod modes;
+pub mod motion;
 pub mod playback;
 pub mod recording;
 

@@ -20,6 +20,7 @@ mod gate;
 pub mod kinect;
 pub mod libusb;
 pub mod moments;
+pub mod motion;
 mod pace;
 pub mod realsense;
 mod sink;

@@ -9,7 +9,8 @@
 //! pair wins, but one of the moment of a frame set ([`StereoOptions::sets`]) waits for its turn: a mode that is slower than
 //! the camera and faster than the sets has depth in each of them. A pair that had to give way counts as dropped
 //! (`queue_full`) in each stream that it is missing from. With [`StereoOptions::rate_hz`] only so many pairs are matched at
-//! all, those of sets where the rates divide each other. With
+//! all, those of sets where the rates divide each other. One more thread measures now and then whether the eyes' rows
+//! agree, and says so ([`StereoOptions::notice`]) when they do not. With
 //! [`StereoOptions::every_pair`] nothing gives way, and the camera, which must be a recording, is read as fast as the
 //! slowest mode is done.
 //!
@@ -32,6 +33,7 @@ use std::sync::{Arc, Mutex};
 mod crew;
 mod ledger;
 mod newest;
+mod rows;
 mod stream;
 
 use crew::Crew;
@@ -70,6 +72,9 @@ impl Geometry {
 
 /// What computes each mode, by its name; filled when the camera is started.
 pub type Descriptions = Arc<Mutex<BTreeMap<String, Description>>>;
+
+/// What is wrong with the eyes and does not end the camera, in words; filled while it runs.
+pub type Notice = Arc<Mutex<Option<String>>>;
 
 /// Makes the matcher of a mode, once per start of the camera.
 pub type Maker = Arc<dyn Fn(&Geometry) -> depthrig_calib::Result<Box<dyn Matcher>> + Send + Sync>;
@@ -128,6 +133,8 @@ pub struct StereoOptions {
     pub every_pair: bool,
     /// Where it is told what computes each mode.
     pub computed: Descriptions,
+    /// Where it is told that the eyes' rows are apart.
+    pub notice: Notice,
     /// The moments whose pairs are preferred.
     pub sets: Arc<SetTimes>,
 }
@@ -143,6 +150,7 @@ impl Default for StereoOptions {
             rate_hz: 0.0,
             every_pair: false,
             computed: Descriptions::default(),
+            notice: Notice::default(),
             sets: Arc::default(),
         }
     }
@@ -327,11 +335,13 @@ impl Device for StereoDevice {
         } else {
             requests
         };
-        let (size, rate_hz) = (requests.iter().find_map(|r| r.size), requests.iter().find_map(|r| r.rate_hz));
-        let filled = |r: &StreamRequest| StreamRequest {
-            size: r.size.or(size),
-            rate_hz: r.rate_hz.or(rate_hz),
-            ..r.clone()
+        // A motion unit has a mode of its own.
+        let is_picture = |r: &&StreamRequest| r.stream.as_str() != crate::motion::IMU;
+        let pictures = || requests.iter().filter(is_picture);
+        let (size, rate_hz) = (pictures().find_map(|r| r.size), pictures().find_map(|r| r.rate_hz));
+        let filled = |r: &StreamRequest| {
+            let (size, rate_hz) = if is_picture(&r) { (size, rate_hz) } else { (None, None) };
+            StreamRequest { size: r.size.or(size), rate_hz: r.rate_hz.or(rate_hz), ..r.clone() }
         };
         let wanted = choose_profiles(&name, &profiles, &requests.iter().map(filled).collect::<Vec<_>>())?;
         let is_made = {

@@ -11,6 +11,7 @@ mod cache;
 mod color;
 mod config;
 mod depth;
+pub mod imu;
 pub mod models;
 mod motion;
 mod noise;

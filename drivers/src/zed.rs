@@ -3,7 +3,8 @@
 //! **What it is here.** A camera of two streams, `left` and `right`, YUYV, each half of the side-by-side picture as it
 //! comes, *not rectified*; the camera's frame is that of the left eye. Intrinsics and the right eye's pose are those of
 //! the factory calibration, a file that must be there already: nothing is ever downloaded. Without it the camera
-//! streams, its calibration is `none` and its intrinsics are unknown.
+//! streams, its calibration is `none` and its intrinsics are unknown. Its motion unit is a stream `imu` ([`imu`]), where it
+//! can be read.
 //!
 //! **Time.** The camera sends no time that is known, so the frames' time is the kernel's stamp, taken when a picture's
 //! first bytes came ([`depthrig_bus::ClockDomain::Kernel`]). That is later than the middle of the exposure by half of
@@ -21,6 +22,7 @@ pub mod find;
 #[doc(hidden)]
 pub mod fuzzing;
 pub mod hid;
+pub mod imu;
 mod ini;
 pub mod mode;
 pub mod motion;

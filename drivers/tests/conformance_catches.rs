@@ -1,7 +1,7 @@
 //! The conformance suite can fail: for each promise a back end that breaks just it, and the case that says so.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
-use depthrig_bus::{DropReason, HostTime, Name};
+use depthrig_bus::{DropReason, HostTime, MOTION_SAMPLE_BYTES, MotionSample, Name};
 use depthrig_drivers::clock::ClockQuality;
 use depthrig_drivers::conformance::{self, Bench, Cannot, Rig, Sent, Subject, Trouble};
 use depthrig_drivers::synthetic::{
@@ -28,6 +28,10 @@ enum Sin {
     AnyModeWillDo,
     KeepsTheDevice,
     LivesOnAfterUnplug,
+    SamplesSwapped,
+    SampleLost,
+    HeaderOfTheOldest,
+    NotANumber,
 }
 
 struct Sinner(Sin, Box<dyn Backend>);
@@ -73,7 +77,7 @@ impl Stream for SinfulStream {
         if self.sin == Sin::SlowPoll {
             std::thread::sleep(Duration::from_millis(150));
         }
-        let got = self.inner.as_mut().unwrap().poll(timeout, &mut Spoiler(self.sin, sink));
+        let got = self.inner.as_mut().unwrap().poll(timeout, &mut Spoiler(self.sin, sink, Vec::new()));
         match (self.sin, &got) {
             (Sin::StallIsAnError, Ok(Poll::Idle)) => {
                 self.idle += 1;
@@ -93,10 +97,42 @@ impl Drop for SinfulStream {
     }
 }
 
-struct Spoiler<'a>(Sin, &'a mut dyn FrameSink);
+/// What a driver of a motion unit might do to a batch of it.
+fn spoil(sin: Sin, batch: &mut [u8], meta: &mut FrameMeta) {
+    let n = batch.len() / MOTION_SAMPLE_BYTES;
+    let at = |i: usize| i * MOTION_SAMPLE_BYTES..(i + 1) * MOTION_SAMPLE_BYTES;
+    match sin {
+        Sin::SamplesSwapped => batch[at(0).start..at(1).end].rotate_left(MOTION_SAMPLE_BYTES),
+        // A number is passed over without time: samples that were thrown away would look like the unit's own gaps.
+        Sin::SampleLost => {
+            for i in 0..n {
+                let mut s = MotionSample::all_in(&batch[at(i)]).next().unwrap();
+                s.sequence *= 2;
+                batch[at(i)].copy_from_slice(&s.to_bytes());
+            }
+            meta.device_sequence *= 2;
+        }
+        Sin::HeaderOfTheOldest => {
+            meta.capture_time = MotionSample::all_in(batch).next().unwrap().time();
+        }
+        Sin::NotANumber => {
+            let mut s = MotionSample::all_in(batch).next().unwrap();
+            s.gyro_rad_s[1] = f32::NAN;
+            batch[at(0)].copy_from_slice(&s.to_bytes());
+        }
+        _ => {}
+    }
+}
+
+/// Keeps a batch until it is committed, so that it can be spoilt.
+struct Spoiler<'a>(Sin, &'a mut dyn FrameSink, Vec<u8>);
 
 impl FrameSink for Spoiler<'_> {
     fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]> {
+        if is_of_motion(self.0) {
+            self.2.resize(len, 0);
+            return Some(&mut self.2);
+        }
         let memory = self.1.loan(stream, len)?;
         // What the driver does not get, it does not write.
         if self.0 == Sin::LastByteUnwritten {
@@ -107,6 +143,10 @@ impl FrameSink for Spoiler<'_> {
     }
     fn commit(&mut self, stream: usize, meta: &FrameMeta) {
         let mut meta = *meta;
+        if is_of_motion(self.0) {
+            spoil(self.0, &mut self.2, &mut meta);
+            self.1.loan(stream, self.2.len()).unwrap().copy_from_slice(&self.2);
+        }
         match self.0 {
             Sin::FromTheFuture => meta.capture_time = meta.arrival.plus_ns(1),
             Sin::TimeGoesBack if meta.device_sequence.is_multiple_of(3) => {
@@ -135,6 +175,10 @@ impl FrameSink for Spoiler<'_> {
     }
 }
 
+const fn is_of_motion(sin: Sin) -> bool {
+    matches!(sin, Sin::SamplesSwapped | Sin::SampleLost | Sin::HeaderOfTheOldest | Sin::NotANumber)
+}
+
 struct Sinful(Sin);
 
 impl Subject for Sinful {
@@ -151,11 +195,13 @@ impl Subject for Sinful {
             serial: "s".into(),
             cheap: true,
             streams: vec![depth],
+            motion: is_of_motion(self.0),
             ..SyntheticConfig::default()
         };
         let backend = SyntheticBackend::new(vec![config]).unwrap();
         let rig = Box::new(Hands(backend.truth("s").unwrap()));
-        let requests = vec![StreamRequest::any(Name::new("depth").unwrap())];
+        let wanted = if is_of_motion(self.0) { "imu" } else { "depth" };
+        let requests = vec![StreamRequest::any(Name::new(wanted).unwrap())];
         Bench { backend: Box::new(Sinner(self.0, Box::new(backend))), serial: "s".into(), requests, rig }
     }
 }
@@ -206,6 +252,7 @@ fn an_honest_back_end_passes_and_says_what_it_cannot() {
         "clock_reset",
         "busy",
         "hang",
+        "motion",
     ];
     assert_eq!(report.not_applicable(), cannot);
     assert_eq!(report.verdicts.len(), conformance::cases().len());
@@ -236,4 +283,11 @@ fn wrong_answers_to_trouble_are_caught() {
     caught(Sin::StallIsAnError, &["stall"]);
     caught(Sin::SlowPoll, &["poll_timeout"]);
     caught(Sin::LivesOnAfterUnplug, &["unplug"]);
+}
+
+#[test]
+fn batches_of_motion_that_lie_are_caught() {
+    for sin in [Sin::SamplesSwapped, Sin::SampleLost, Sin::HeaderOfTheOldest, Sin::NotANumber] {
+        caught(sin, &["motion"]);
+    }
 }

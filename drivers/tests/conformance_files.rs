@@ -95,6 +95,6 @@ fn files_passes_every_case_that_a_folder_can_be_put_to() {
     println!("{report}");
     assert!(report.is_good(), "{report}");
     let device_faults = ["half_frame", "wrong_size", "damaged", "repeated", "skip", "stall"];
-    let device_life = ["time_backwards", "clock_reset", "unplug", "busy", "hang"];
+    let device_life = ["time_backwards", "clock_reset", "unplug", "busy", "hang", "motion"];
     assert_eq!(report.not_applicable(), [&["clock"][..], &device_faults, &device_life].concat());
 }

@@ -1,7 +1,9 @@
 //! Frames of another process that are not the running session's, or no frames at all. The process is a thread here.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
-use depthrig_bus::external::{About, ExternalCamera, ExternalFrame, Mode, Place, Session};
+use depthrig_bus::external::{
+    About, ExternalCamera, ExternalFrame, ExternalFrameFlags, ExternalReason, Mode, Place, Session,
+};
 use depthrig_bus::{DropReason, HostTime, Name, PixelFormat, RuntimeDir};
 use depthrig_drivers::external::{ExternalBackend, ExternalConfig};
 use depthrig_drivers::{Backend, ErrorKind, MemorySink, Poll, Stream};
@@ -32,6 +34,11 @@ fn serve(place: &Place, play: impl Fn(&mut Session<'_>) + Send + 'static) -> std
 
 /// Sends a frame of `value` whose header `lie` has changed.
 fn send(session: &mut Session<'_>, value: u8, lie: impl FnOnce(&mut ExternalFrame)) {
+    send_at_once(session, value, lie);
+    std::thread::sleep(Duration::from_millis(8));
+}
+
+fn send_at_once(session: &mut Session<'_>, value: u8, lie: impl FnOnce(&mut ExternalFrame)) {
     let now = HostTime::now().ns();
     let mut slot = session.frame(0, 48).unwrap().unwrap();
     slot.set_facts(&ExternalFrame {
@@ -43,7 +50,6 @@ fn send(session: &mut Session<'_>, value: u8, lie: impl FnOnce(&mut ExternalFram
     slot.pixels_mut().fill(value);
     lie(slot.header_mut());
     session.send(slot).unwrap();
-    std::thread::sleep(Duration::from_millis(8));
 }
 
 fn open(place: &Place) -> Box<dyn Stream> {
@@ -106,15 +112,89 @@ fn headers_that_are_none_end_the_session() {
         assert!(session.refusal().unwrap().contains("8 frames in a row are not color 8x6"));
     });
     let (mut stream, mut sink) = (open(&place(&dir)), MemorySink::default());
-    let e = loop {
-        if let Err(e) = stream.poll(Duration::from_millis(20), &mut sink) {
-            break e;
-        }
-    };
+    let e = end_of(&mut stream, &mut sink);
     assert_eq!((e.kind(), sink.frames.len()), (ErrorKind::Protocol, 1));
     assert!(e.to_string().contains("does not send what it announced"), "{e}");
     drop(stream);
     process.join().unwrap();
+}
+
+/// The error that the stream ends with.
+fn end_of(stream: &mut Box<dyn Stream>, sink: &mut MemorySink) -> depthrig_drivers::Error {
+    let deadline = HostTime::now().plus(WAIT);
+    loop {
+        assert!(!deadline.from_now().is_zero(), "nothing was noticed");
+        if let Err(e) = stream.poll(Duration::from_millis(20), sink) {
+            return e;
+        }
+    }
+}
+
+#[test]
+fn damaged_and_half_frames_are_counted_and_end_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let process = serve(&place(&dir), |session| {
+        send(session, 1, |_| ());
+        for value in 2..=11 {
+            send(session, value, |h| h.flags |= ExternalFrameFlags::DAMAGED.0);
+        }
+        for value in 12..=21 {
+            send(session, value, |h| h.payload_len /= 2);
+        }
+        send(session, 22, |_| ());
+    });
+    let (mut stream, mut sink) = (open(&place(&dir)), MemorySink::default());
+    take(&mut stream, &mut sink, 2);
+    drop(stream);
+    assert_eq!(sink.frames.iter().map(|f| f.2[0]).collect::<Vec<_>>(), [1, 22]);
+    let drops = sink.drops[0];
+    assert_eq!((drops.get(DropReason::DeviceError), drops.get(DropReason::Incomplete)), (10, 10));
+    process.join().unwrap();
+}
+
+#[test]
+fn a_flood_is_dropped_as_too_much_for_the_queue() {
+    const SENT: u8 = 200;
+    let dir = tempfile::tempdir().unwrap();
+    let process = serve(&place(&dir), |session| {
+        for value in 1..SENT {
+            send_at_once(session, value, |_| ());
+            std::thread::sleep(Duration::from_micros(500));
+        }
+        // The last one is in time again.
+        std::thread::sleep(Duration::from_millis(200));
+        send_at_once(session, SENT, |_| ());
+    });
+    let (mut stream, mut sink) = (open(&place(&dir)), MemorySink::default());
+    let deadline = HostTime::now().plus(WAIT);
+    while sink.frames.last().is_none_or(|f| f.2[0] != SENT) {
+        assert!(!deadline.from_now().is_zero(), "{} frames, {:?}", sink.frames.len(), sink.drops[0]);
+        stream.poll(Duration::from_millis(20), &mut sink).unwrap();
+    }
+    drop(stream);
+    let (frames, lost) = (sink.frames.len() as u64, sink.drops[0].get(DropReason::QueueFull));
+    assert_eq!((frames + lost, sink.captured[0]), (SENT.into(), SENT.into()), "{:?}", sink.drops[0]);
+    assert!(lost > 50, "{frames} frames at 2 kHz where 100 Hz were announced");
+    process.join().unwrap();
+}
+
+#[test]
+fn a_process_that_ends_because_it_is_done_is_no_failure() {
+    let dir = tempfile::tempdir().unwrap();
+    let place = place(&dir);
+    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Mono8, (8, 6), 100.0);
+    let about = About { model: "Bench".into(), ..About::default() };
+    let mut camera = ExternalCamera::offer(&place, &about, &[mode]).unwrap();
+    let process = std::thread::spawn(move || {
+        let mut session = camera.next_session(WAIT).unwrap().unwrap();
+        send(&mut session, 1, |_| ());
+        drop(session);
+        camera.end(ExternalReason::Finished, "that was all");
+    });
+    let (mut stream, mut sink) = (open(&place), MemorySink::default());
+    process.join().unwrap();
+    while stream.poll(Duration::from_millis(20), &mut sink).unwrap() != Poll::End {}
+    assert_eq!(sink.frames.len(), 1);
 }
 
 #[test]
@@ -154,13 +234,7 @@ fn a_process_that_stops_by_itself_is_disconnected() {
         let _ = wait.recv(); // it goes on offering
     });
     let (mut stream, mut sink) = (open(&place), MemorySink::default());
-    let deadline = HostTime::now().plus(WAIT);
-    let e = loop {
-        assert!(!deadline.from_now().is_zero(), "nothing was noticed");
-        if let Err(e) = stream.poll(Duration::from_millis(20), &mut sink) {
-            break e;
-        }
-    };
+    let e = end_of(&mut stream, &mut sink);
     assert_eq!((e.kind(), sink.frames.len()), (ErrorKind::Disconnected, 1));
     assert!(e.to_string().contains("stopped the camera by itself"), "{e}");
     drop(done);

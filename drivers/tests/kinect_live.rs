@@ -4,7 +4,9 @@
 #[path = "support/kinect.rs"]
 mod kinect;
 
-use depthrig_bus::{Distortion, DropReason, FrameFlags, HostTime, MetadataLevel, Name, PixelFormat};
+use depthrig_bus::{
+    Distortion, DropReason, FrameFlags, HostTime, MetadataLevel, MotionSample, Name, PixelFormat,
+};
 use depthrig_drivers::capture::{Capture, Session, StopOutcome};
 use depthrig_drivers::kinect::live::{LiveBackend, LiveConfig, Places};
 use depthrig_drivers::kinect::{DepthMode, WiredSync};
@@ -428,4 +430,85 @@ fn a_dead_camera_stays_dead_and_the_next_opening_works() {
     poll_frames(again.as_mut(), &mut sink, 1);
     // A frame or none, as the machine is fast: it lives.
     assert_ne!(again.poll(Duration::ZERO, &mut sink).unwrap(), Poll::End);
+}
+
+/// Every sample that the made library gave, with its values and its times, while pictures come too.
+#[test]
+fn samples_of_motion_are_those_of_the_device() {
+    let fake = Fake::new(&[A]);
+    let mut requests = all_streams(PixelFormat::Yuyv).to_vec();
+    requests.insert(1, StreamRequest::any(Name::new("imu").unwrap()));
+    let mut stream = start(fake.config(), A, &requests).unwrap();
+    assert_eq!(stream.profiles()[1].describe(), "imu motion 1600 Hz in batches of up to 64");
+    let began = HostTime::now();
+    let mut sink = MemorySink::default();
+    let batches = |sink: &MemorySink| sink.frames.iter().filter(|f| f.0 == 1).count();
+    let mut poll_until = |sink: &mut MemorySink, n: usize| {
+        let deadline = HostTime::now().plus(Duration::from_secs(20));
+        while batches(sink) < n {
+            assert!(!deadline.from_now().is_zero(), "no motion");
+            stream.poll(Duration::from_millis(50), sink).unwrap();
+        }
+    };
+    poll_until(&mut sink, 15);
+    fake.command(A, "imu_skip", 10);
+    poll_until(&mut sink, 30);
+    let samples: Vec<_> =
+        sink.frames.iter().filter(|f| f.0 == 1).flat_map(|f| MotionSample::all_in(&f.2)).collect();
+    let mut lost = 0;
+    for pair in samples.windows(2) {
+        let (a, b) = (pair[0], pair[1]);
+        assert!(a.time_ns < b.time_ns && a.sequence < b.sequence);
+        assert_eq!(
+            b.sequence - a.sequence,
+            (b.device_time - a.device_time) / 625,
+            "numbers are those of the clock"
+        );
+        lost += b.sequence - a.sequence - 1;
+    }
+    // A busy machine may lose more, in the library's own queue.
+    assert!(lost >= 10, "{lost} are missing");
+    for s in &samples {
+        let (rotation, acceleration) = fake_k4a::motion(s.device_time);
+        assert_eq!((s.gyro_rad_s, s.accel_m_s2), (rotation, acceleration));
+        assert_eq!((s.accel_offset_ns, s.temperature_c), (40_000, 33.5));
+        // The unit's clock is that of the pictures, which began at 3 s.
+        assert!((3_000_000..60_000_000).contains(&s.device_time));
+        assert!(s.time() > began && s.time() < HostTime::now());
+    }
+    // The time of a sample is that of its measurement, late by what the transport takes at least: 4 ms.
+    let truth = |s: &MotionSample| {
+        let color = sink.frames.iter().find(|f| f.0 == 0).unwrap().1;
+        let exposed = fake.exposed(A, color.arrival).unwrap();
+        exposed.plus_ns((s.device_time as i64 - color.device_time as i64) * 1000)
+    };
+    let late = |s: &MotionSample| s.time().since_ns(truth(s));
+    assert!(
+        samples.iter().all(|s| (0..60_000_000).contains(&late(s))),
+        "{:?}",
+        samples.iter().map(late).max()
+    );
+    assert_eq!(sink.captured[1], sink.delivered(1));
+    assert_eq!(sink.drops_of(0).total() + sink.drops_of(2).total(), 0);
+
+    // It breaks off, and pictures go on.
+    fake.command(A, "imu_ends", 1);
+    poll_frames(stream.as_mut(), &mut sink, 5);
+    let before = batches(&sink);
+    poll_frames(stream.as_mut(), &mut sink, 5);
+    assert!(batches(&sink) <= before + 1, "what was left");
+    drop(stream);
+    assert_eq!(fake.census().misuse, 0);
+}
+
+#[test]
+fn the_motion_unit_alone_is_refused_and_by_default_it_streams() {
+    let fake = Fake::new(&[A]);
+    let alone = [StreamRequest::any(Name::new("imu").unwrap())];
+    let e = error(start(fake.config(), A, &alone));
+    assert_eq!(e.kind(), ErrorKind::Unsupported);
+    assert!(e.to_string().contains("runs only while a camera does: ask for color, depth or ir too"), "{e}");
+    let stream = start(fake.config(), A, &[]).unwrap();
+    let names: Vec<_> = stream.profiles().iter().map(|p| p.stream.as_str()).collect();
+    assert_eq!(names, ["color", "depth", "imu"]);
 }

@@ -121,9 +121,14 @@ fn a_pair_takes_no_memory() {
         }
     };
     until(20);
-    let (own, all) = (of_thread(), of_process());
-    until(60);
-    assert_eq!(of_thread() - own, 0, "on the thread that captures");
-    let all = of_process() - all;
-    assert!(all <= 2, "{all} by the threads in 40 pairs");
+    // A thread that the scheduler did not let run before makes its buffers when it does, so the steady state may come late on
+    // a busy computer. Once is enough: what each pair took would be taken in every stretch.
+    let mut by_threads = Vec::new();
+    while by_threads.last().is_none_or(|n| *n > 2) {
+        assert!(by_threads.len() < 5, "{by_threads:?} by the threads, in 40 pairs each time");
+        let (own, all) = (of_thread(), of_process());
+        until(60 + 40 * by_threads.len() as u64);
+        assert_eq!(of_thread() - own, 0, "on the thread that captures");
+        by_threads.push(of_process() - all);
+    }
 }

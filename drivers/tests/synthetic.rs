@@ -2,12 +2,12 @@
 //! repaired, clocks and faults as scheduled.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
-use depthrig_bus::{DropReason, Name, Pose};
+use depthrig_bus::{DropReason, HostTime, MotionSample, Name, Pose};
 use depthrig_calib::{CameraExt, PoseExt};
 use depthrig_drivers::synthetic::{
-    FaultKind, ScheduledFault, StreamOverride, SyntheticBackend, SyntheticConfig, overlay, prepare,
+    FaultKind, ScheduledFault, StreamOverride, SyntheticBackend, SyntheticConfig, imu, overlay, prepare,
 };
-use depthrig_drivers::{Backend, ErrorKind, MemorySink, Stream, StreamProfile};
+use depthrig_drivers::{Backend, ErrorKind, MemorySink, Stream, StreamProfile, StreamRequest};
 use glam::DVec2;
 use std::path::Path;
 use std::sync::Mutex;
@@ -392,4 +392,69 @@ fn a_colour_picture_tells_its_number_and_the_mount_moves() {
     assert_eq!(shown.len(), 3);
     let all: Vec<_> = shown.values().collect();
     assert!(all[0] != all[1] && all[1] != all[2]);
+}
+
+/// Samples as read against the truth at the time that they claim; the camera is reset and unplugged meanwhile.
+#[test]
+fn a_motion_unit_measures_the_truth_of_the_moment_that_its_samples_claim() {
+    let fault = |at_s, kind| ScheduledFault { at_s, kind, duration_s: 0.2, count: 2 };
+    let mut config = SyntheticConfig {
+        motion: true,
+        faults: vec![
+            fault(0.5, FaultKind::Skip),
+            fault(1.0, FaultKind::ClockReset),
+            fault(1.6, FaultKind::Unplug),
+        ],
+        ..cheap(30.0)
+    };
+    config.clock.drift_ppm = 80.0;
+    let began = HostTime::now();
+    let backend = SyntheticBackend::starting_at(vec![config], began).unwrap();
+    let imu = StreamRequest::any(Name::new(imu::STREAM).unwrap());
+    let mut sink = MemorySink::default();
+    let deadline = began.plus(Duration::from_secs(20));
+    for last in [false, true] {
+        let device = loop {
+            match backend.open(None) {
+                Ok(device) => break device,
+                Err(e) => assert!(!deadline.from_now().is_zero(), "{e}"),
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        };
+        let mut stream = device.start(std::slice::from_ref(&imu)).unwrap();
+        assert_eq!(stream.profiles().len(), 1, "asked for alone");
+        let enough = if last { sink.delivered(0) + 10 } else { u64::MAX };
+        while sink.delivered(0) < enough {
+            assert!(!deadline.from_now().is_zero(), "{} batches", sink.delivered(0));
+            if stream.poll(Duration::from_millis(50), &mut sink).is_err() {
+                break;
+            }
+        }
+    }
+    let mut last: Option<(u32, MotionSample)> = None;
+    let mut gaps = Vec::new();
+    for (_, meta, payload) in &sink.frames {
+        let samples: Vec<_> = MotionSample::all_in(payload).collect();
+        let newest = samples.last().unwrap();
+        assert_eq!((samples.len(), newest.sequence), (8, meta.device_sequence));
+        assert_eq!(newest.time(), meta.capture_time);
+        for s in samples {
+            // The least latency is what a one-way map cannot know; jitter comes on top at first.
+            let fits = |late_ns: i64| {
+                let (gyro, accel) = imu::truth((s.time_ns - began.ns() - late_ns) as f64 * 1e-9);
+                let near = |a: [f64; 3], b: [f32; 3], by| (0..3).all(|i| (a[i] - f64::from(b[i])).abs() < by);
+                near(gyro, s.gyro_rad_s, 1e-3) && near(accel, s.accel_m_s2, 1e-2)
+            };
+            // A map that sees the device start afresh is unsure, and says so.
+            let unsure = i64::from(s.uncertainty_ns) / 500_000;
+            assert!((-unsure..=unsure + 12).any(|late| fits(late * 500_000)), "{s:?}");
+            if let Some((epoch, before)) = last {
+                assert!(before.sequence < s.sequence, "numbers rise: {before:?} {s:?}");
+                assert!(epoch != meta.clock_epoch || before.time_ns < s.time_ns, "{before:?} {s:?}");
+                gaps.extend((s.sequence > before.sequence + 1).then_some(s.sequence - before.sequence - 1));
+            }
+            last = Some((meta.clock_epoch, s));
+        }
+    }
+    assert!(gaps.len() >= 3 && gaps.contains(&16), "two batches skipped, a reset, an unplug: {gaps:?}");
 }

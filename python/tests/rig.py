@@ -80,7 +80,7 @@ def pattern_rows(header: Header) -> np.ndarray:
         rows, row_bytes = 1, header.payload_len
     else:
         rows = header.height * 3 // 2 if pixel_format is PixelFormat.NV12 else header.height
-        size = {1: 3, 2: 3, 3: 1, 4: 2, 5: 2, 6: 4, 7: 2, 8: 2, 9: 1, 11: 1, 12: 4}[int(pixel_format)]
+        size = {1: 3, 2: 3, 3: 1, 4: 2, 5: 2, 6: 4, 7: 2, 8: 2, 9: 1, 11: 1, 12: 4, 13: 64}[int(pixel_format)]
         row_bytes = header.width * size
     if pixel_format is PixelFormat.DEPTH_F32:
         metres = np.add.outer(np.arange(rows), np.arange(header.width)) + header.sequence

@@ -557,6 +557,7 @@ def test_channels_of_another_version_are_refused(folder: Path) -> None:
         ({"format": PixelFormat.Z16, "depth_unit_m": -0.001}, "no unit of depth"),
         ({"clock": ExternalClock.HOST, "tick_ps": 1_000_000}, "the host's clock has ticks of 1000 ps"),
         ({"format": 99}, "99 is not a valid PixelFormat"),
+        ({"format": PixelFormat.MOTION, "height": 1}, "motion samples of another process's camera are not taken yet"),
     ],
 )
 def test_a_mode_that_cannot_be_is_refused_where_it_is_made(change: dict[str, Any], text: str) -> None:

@@ -1,7 +1,8 @@
 //! Records the pictures of one file and says what that cost; depthrig's part of `make bench-peers`:
 //! `cargo run --release --example bench_frames -- OPTIONS FRAMES SETS OUT`.
 //!
-//! `OPTIONS` are `RecorderOptions` as JSON. The file is what `tests/peers/frames.py` writes. Measured is the CPU time
+//! `OPTIONS` are `RecorderOptions` as JSON; with `"lent": true` the recorder is told that others want the pixels' memory
+//! back, as they do on a rig, so that it may not keep them until the disk has taken them. The file is what `tests/peers/frames.py` writes. Measured is the CPU time
 //! of all threads from before the dataset is created until it is closed. Then every picture is read back, and where
 //! it was stored losslessly it must be the one that went in.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
@@ -10,7 +11,7 @@ use depthrig_bus::clock::process_cpu_ns;
 use depthrig_bus::{FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{
-    Dataset, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, SetRange, StreamRecord,
+    Dataset, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, SetRange, StreamRecord,
 };
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Read};
@@ -61,24 +62,43 @@ fn picture(pool: &[Pair], stream: usize, set: u64) -> &Arc<[u8]> {
     &pool[(set as usize + stream / 2) % pool.len()][stream % 2]
 }
 
-fn set(session: &Session, pool: &[Pair], n: u64, begin: HostTime, utc: UtcPair) -> RecordSet {
+/// Pixels in memory that others want back.
+struct Lent(Arc<[u8]>);
+
+impl Pixels for Lent {
+    fn bytes(&self) -> &[u8] {
+        &self.0
+    }
+}
+
+fn set(session: &Session, pool: &[Pair], lent: bool, n: u64, begin: HostTime, utc: UtcPair) -> RecordSet {
     let tick = begin.plus_ns(n as i64 * PERIOD_NS);
     let frames = session.streams.iter().enumerate().map(|(stream, s)| {
-        let pixels = picture(pool, stream, n);
+        let pixels = Arc::clone(picture(pool, stream, n));
+        let pixels: Box<dyn Pixels> = if lent { Box::new(Lent(pixels)) } else { Box::new(pixels) };
         let mut header = FrameHeader::default();
         header.set_names("bench", &s.id);
         header.set_picture(s.format, s.width, s.height);
         (header.sequence, header.capture_time_ns) = (n, tick.ns());
         (header.depth_unit_m, header.intrinsics) = (s.depth_unit_m, s.intrinsics);
-        RecordFrame { stream, header, pixels: Box::new(Arc::clone(pixels)) }
+        RecordFrame { stream, header, pixels }
     });
-    RecordSet { id: n + 1, tick, utc, frames: frames.collect(), missing: Vec::new(), spread_ns: 0 }
+    RecordSet {
+        id: n + 1,
+        tick,
+        utc,
+        frames: frames.collect(),
+        missing: Vec::new(),
+        motion: Vec::new(),
+        spread_ns: 0,
+    }
 }
 
 fn main() {
     let args: Vec<String> = std::env::args().skip(1).collect();
     let [options, frames, sets, out] = &args[..] else { panic!("OPTIONS FRAMES SETS OUT") };
-    let asked: Value = serde_json::from_str(options).unwrap();
+    let mut asked: Value = serde_json::from_str(options).unwrap();
+    let lent = asked.as_object_mut().unwrap().remove("lent").is_some_and(|lent| lent == true);
     let options: RecorderOptions = serde_json::from_value(asked.clone()).unwrap();
     let known = serde_json::to_value(&options).unwrap();
     for (key, value) in asked.as_object().unwrap() {
@@ -97,7 +117,7 @@ fn main() {
         while recorder.progress().encode_queue >= 2 || recorder.progress().backlog_bytes > 64 << 20 {
             std::thread::sleep(Duration::from_micros(500));
         }
-        recorder.push(set(&session, &pool, n, begin, utc)).unwrap();
+        recorder.push(set(&session, &pool, lent, n, begin, utc)).unwrap();
     }
     let summary = recorder.finish().unwrap();
     let (cpu, wall) = (process_cpu_ns() - cpu, HostTime::now().since_ns(begin));

@@ -81,8 +81,15 @@ fn record(dir: &Path, bytes: u64) {
         });
         let utc = UtcPair { mono: HostTime::from_ns(0), utc_ns: 1_700_000_000_000_000_000, width_ns: 0 };
         let tick = HostTime::from_ns(200_000_000 * n as i64);
-        let set =
-            RecordSet { id: n + 1, tick, utc, frames: frames.collect(), missing: Vec::new(), spread_ns: 0 };
+        let set = RecordSet {
+            id: n + 1,
+            tick,
+            utc,
+            frames: frames.collect(),
+            missing: Vec::new(),
+            motion: Vec::new(),
+            spread_ns: 0,
+        };
         r.push(set).unwrap();
         while r.progress().encode_queue > 2 {
             std::thread::sleep(Duration::from_millis(1));

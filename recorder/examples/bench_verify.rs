@@ -91,8 +91,15 @@ fn main() {
             header.intrinsics = s.intrinsics;
             RecordFrame { stream, header, pixels: Box::new(Arc::clone(picture)) }
         });
-        let set =
-            RecordSet { id: n + 1, tick, utc, frames: frames.collect(), missing: Vec::new(), spread_ns: 0 };
+        let set = RecordSet {
+            id: n + 1,
+            tick,
+            utc,
+            frames: frames.collect(),
+            missing: Vec::new(),
+            motion: Vec::new(),
+            spread_ns: 0,
+        };
         recorder.push(set).unwrap();
     }
     let summary = recorder.finish().unwrap();

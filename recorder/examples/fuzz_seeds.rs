@@ -5,14 +5,14 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stdout)]
 
 use core::ops::ControlFlow;
-use depthrig_bus::{DropCounts, FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
+use depthrig_bus::{DropCounts, FrameHeader, HostTime, Intrinsics, MotionSample, PixelFormat, Pose, UtcPair};
 use depthrig_recorder::codec::{DepthEncoder, DepthShape};
 use depthrig_recorder::exchange::{ByteCameraExport, CameraNames, ExportOptions, export};
 use depthrig_recorder::fs::{Fs, MemFs};
 use depthrig_recorder::fuzzing::mcap::File;
 use depthrig_recorder::{
-    ColorCodec, Compression, Dataset, DepthCodec, Diagnostic, Level, RecordFrame, RecordSet, Recorder,
-    RecorderOptions, Session, StreamAccount, StreamRecord,
+    ColorCodec, Compression, Dataset, DepthCodec, Diagnostic, Level, MotionRecord, RecordFrame, RecordMotion,
+    RecordSet, Recorder, RecorderOptions, Session, StreamAccount, StreamRecord,
 };
 use image::ImageFormat;
 use std::io::{Cursor, Write};
@@ -49,6 +49,25 @@ fn session(formats: &[PixelFormat]) -> Session {
     session
 }
 
+/// A batch of two samples of a motion unit.
+fn batch(session: &Session, unit: usize, n: u64) -> RecordMotion {
+    let record: &MotionRecord = &session.motion[unit];
+    let sample = |k: u64| MotionSample {
+        time_ns: MONO_NS + k as i64 * PERIOD_NS / 2,
+        device_time: k,
+        sequence: k + 1,
+        gyro_rad_s: [0.5, -0.5, k as f32],
+        ..MotionSample::default()
+    };
+    let samples = vec![sample(2 * n), sample(2 * n + 1)];
+    let mut header = FrameHeader::default();
+    header.set_names(&session.rig, &record.id);
+    header.set_picture(PixelFormat::Motion, 2, 1);
+    (header.sequence, header.captured) = (n + 1, n + 1);
+    header.capture_time_ns = samples[1].time_ns;
+    RecordMotion { unit, header, samples }
+}
+
 fn set(session: &Session, n: u64, missing: Option<usize>) -> RecordSet {
     let tick = MONO_NS + n as i64 * PERIOD_NS;
     let there = session.streams.iter().enumerate().filter(|(i, _)| Some(*i) != missing);
@@ -67,6 +86,7 @@ fn set(session: &Session, n: u64, missing: Option<usize>) -> RecordSet {
         id: n + 1,
         tick: HostTime::from_ns(tick),
         utc: UtcPair { mono: HostTime::from_ns(MONO_NS), utc_ns: UTC_NS, width_ns: 200 },
+        motion: (0..session.motion.len()).map(|unit| batch(session, unit, n)).collect(),
         spread_ns: 0,
         missing: missing.into_iter().collect(),
         frames: frames.collect(),
@@ -209,10 +229,22 @@ fn main() {
         ("seed_lossless", vec![PixelFormat::Rgb8, PixelFormat::Z16], lossless),
         ("seed_jpeg", vec![PixelFormat::Rgb8, PixelFormat::Z16], RecorderOptions::default()),
         ("seed_raw", vec![PixelFormat::Bgr8, PixelFormat::DepthF32, PixelFormat::Mono8], raw),
-        ("seed_plain", vec![PixelFormat::Z16, PixelFormat::Nv12], plain),
+        ("seed_plain", vec![PixelFormat::Z16, PixelFormat::Nv12], plain.clone()),
+        ("seed_motion", vec![PixelFormat::Z16, PixelFormat::Mono8], plain),
     ];
     for (name, formats, options) in kinds {
-        let session = session(&formats);
+        let mut session = session(&formats);
+        if name == "seed_motion" {
+            session.motion.push(MotionRecord {
+                id: "c/imu".parse().unwrap(),
+                model: "Seed".into(),
+                serial: "1".into(),
+                rate_hz: 10.0,
+                batch: 2,
+                calibration: "made up".into(),
+                pose: Pose::IDENTITY,
+            });
+        }
         let fs = record(&session, &options, 3, Some(1));
         let dir = Path::new("/d");
         let segment = fs.contents(&dir.join("seg_0000.mcap")).unwrap();

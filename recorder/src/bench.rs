@@ -183,7 +183,15 @@ fn set(sources: &[Source], id: u64, tick: HostTime, utc: UtcPair) -> RecordSet {
         header.intrinsics = record.intrinsics;
         RecordFrame { stream, header, pixels: Box::new(Arc::clone(picture)) }
     });
-    RecordSet { id, tick, utc, frames: frames.collect(), missing: Vec::new(), spread_ns: 0 }
+    RecordSet {
+        id,
+        tick,
+        utc,
+        frames: frames.collect(),
+        missing: Vec::new(),
+        motion: Vec::new(),
+        spread_ns: 0,
+    }
 }
 
 fn steady(options: &BenchOptions, pool: &pictures::Pool) -> Result<Steady> {

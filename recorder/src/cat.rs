@@ -14,7 +14,9 @@ use std::borrow::Cow;
 use std::ops::{ControlFlow, Range};
 use std::path::{Path, PathBuf};
 
+mod motion;
 mod row;
+pub use motion::{MotionForm, MotionRow, export_motion, list_motion};
 pub use row::FrameRow;
 
 /// The list beside the pictures.
@@ -34,6 +36,23 @@ pub enum SetChoice {
 impl Default for SetChoice {
     fn default() -> Self {
         Self::Span(SetSpan::default())
+    }
+}
+
+impl SetChoice {
+    /// The numbers of the chosen sets.
+    fn numbers(self, sets: &mut SetReader) -> Result<Range<usize>> {
+        Ok(match self {
+            Self::Span(span) => span.numbers(sets)?,
+            Self::Id(id) => {
+                let n = by_id(sets, id)?;
+                n..n + 1
+            }
+            Self::Nearest(moment) => {
+                let n = nearest(sets, moment)?;
+                n..n + 1
+            }
+        })
     }
 }
 
@@ -229,24 +248,21 @@ impl<'a> Chosen<'a> {
         for wanted in &choice.streams {
             if !known.iter().any(|s| s.id == *wanted) {
                 let names: Vec<_> = known.iter().map(|s| s.id.to_string()).collect();
-                let what = format!("there is no stream {wanted}; the dataset has {}", names.join(", "));
+                let unit = dataset.session().motion.iter().any(|u| u.id == *wanted);
+                let what = if unit {
+                    format!(
+                        "{wanted} is a motion unit and has no pictures; ask for motion units by themselves"
+                    )
+                } else {
+                    format!("there is no stream {wanted}; the dataset has {}", names.join(", "))
+                };
                 return Err(Error::new(ErrorKind::BadInput, what));
             }
         }
         let streams =
             known.iter().map(|s| choice.streams.is_empty() || choice.streams.contains(&s.id)).collect();
         let mut sets = dataset.set_reader()?;
-        let numbers = match choice.sets {
-            SetChoice::Span(span) => span.numbers(&mut sets)?,
-            SetChoice::Id(id) => {
-                let n = by_id(&mut sets, id)?;
-                n..n + 1
-            }
-            SetChoice::Nearest(moment) => {
-                let n = nearest(&sets, moment)?;
-                n..n + 1
-            }
-        };
+        let numbers = choice.sets.numbers(&mut sets)?;
         // Ids increase, so the last one is the longest.
         let digits = last_id(&mut sets)?.to_string().len().max(6);
         let mut problems = sets.problems().to_vec();
@@ -321,6 +337,24 @@ impl<'a> Chosen<'a> {
     }
 }
 
+/// Creates the folder, or finds it empty.
+fn new_folder(fs: &dyn Fs, dir: &Path) -> Result<()> {
+    match fs.read_dir(dir) {
+        Ok(entries) => {
+            if let Some(first) = entries.first() {
+                let what =
+                    format!("{} is not empty (it holds {}); choose a new folder", dir.display(), first.name);
+                return Err(Error::new(ErrorKind::AlreadyExists, what));
+            }
+        }
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
+            fs.create_dir_all(dir).map_err(|e| Error::io("create the folder", dir, e))?;
+        }
+        Err(e) => return Err(Error::io("use the folder", dir, e)),
+    }
+    Ok(())
+}
+
 /// The folder being written.
 struct Folder<'a> {
     fs: &'a dyn Fs,
@@ -336,22 +370,7 @@ const LINES: usize = 64 << 10;
 
 impl<'a> Folder<'a> {
     fn create(fs: &'a dyn Fs, dir: &Path) -> Result<Self> {
-        match fs.read_dir(dir) {
-            Ok(entries) => {
-                if let Some(first) = entries.first() {
-                    let what = format!(
-                        "{} is not empty (it holds {}); choose a new folder",
-                        dir.display(),
-                        first.name
-                    );
-                    return Err(Error::new(ErrorKind::AlreadyExists, what));
-                }
-            }
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
-                fs.create_dir_all(dir).map_err(|e| Error::io("create the folder", dir, e))?;
-            }
-            Err(e) => return Err(Error::io("use the folder", dir, e)),
-        }
+        new_folder(fs, dir)?;
         let part = dir.join(format!("{FRAMES_FILE}.part"));
         let list = fs.create_new(&part).map_err(|e| Error::io("create", &part, e))?;
         Ok(Self { fs, dir: dir.to_owned(), list, part, lines: Vec::new() })

@@ -47,11 +47,6 @@ impl<'a> Writer<'a> {
         self
     }
 
-    /// Appends an `uint8[]`: its length and the bytes.
-    pub fn bytes(&mut self, bytes: &[u8]) -> &mut Self {
-        self.u32(bytes.len() as u32).raw(bytes)
-    }
-
     /// Appends an `uint8[]` that `fill` writes at the end of the buffer.
     ///
     /// # Errors
@@ -213,7 +208,15 @@ mod tests {
     #[test]
     fn known_bytes() {
         let mut buf = vec![0xee]; // an odd start: alignment counts from the message, not from the buffer
-        Writer::new(&mut buf).time(1_500_000_002).str("ab").u8(7).u16(0x0102).f64(1.0).bytes(&[9, 8]).u64(3);
+        Writer::new(&mut buf)
+            .time(1_500_000_002)
+            .str("ab")
+            .u8(7)
+            .u16(0x0102)
+            .f64(1.0)
+            .u32(2)
+            .raw(&[9, 8])
+            .u64(3);
         #[rustfmt::skip]
         let expected: &[u8] = &[
             0xee, 0, 1, 0, 0,

@@ -7,10 +7,10 @@
 //! `PASSAGE` and [`CompareOptions::strict`] say which is which.
 
 use crate::dataset::{Dataset, DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};
-use crate::{ErrorKind, Result};
+use crate::{ErrorKind, RecordMotion, Result};
 use depthrig_bus::StreamId;
 use serde::Serialize;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 
@@ -72,6 +72,8 @@ pub struct Comparison {
     pub sets: u64,
     /// Frames that are in both.
     pub frames: u64,
+    /// Batches of motion units that are in both.
+    pub batches: u64,
     /// How many differences there are, by stream and field.
     pub counts: Vec<FieldCount>,
     /// The first of them.
@@ -85,7 +87,8 @@ pub struct Comparison {
 pub struct FieldCount {
     /// `camera/stream`; empty when it is about whole sets.
     pub stream: String,
-    /// What differs: a field of the header, `pixels`, `codec`, `frame` (it is in one dataset only), `set` (the
+    /// What differs: a field of the header, `pixels`, `codec`, `frame` (it is in one dataset only), `batch` (the same of a
+    /// motion unit's), `samples`, `set` (the
     /// same of a whole set), `unreadable`, or a field of the set or of the stream's description.
     pub field: String,
     /// Sets or frames; descriptions count once.
@@ -155,6 +158,7 @@ struct Walk<'a> {
     read: [u64; 2],
     sets: u64,
     frames: u64,
+    batches: u64,
     counts: BTreeMap<(String, String), u64>,
     differences: Vec<Difference>,
     pixels: BTreeMap<String, PixelDifference>,
@@ -177,6 +181,7 @@ impl<'a> Walk<'a> {
             read: [0; 2],
             sets: 0,
             frames: 0,
+            batches: 0,
             counts: BTreeMap::new(),
             differences: Vec::new(),
             pixels: BTreeMap::new(),
@@ -222,6 +227,47 @@ impl<'a> Walk<'a> {
                 };
                 check("calibration", &x.calibration, &y.calibration);
                 check("rate_hz", &x.rate_hz.to_string(), &y.rate_hz.to_string());
+            }
+        }
+        self.units();
+    }
+
+    /// What `session.toml` says of the motion units.
+    fn units(&mut self) {
+        let [a, b] = self.datasets.map(|d| &d.session().motion);
+        let ids: BTreeSet<&StreamId> = a.iter().chain(b).map(|u| &u.id).collect();
+        for id in ids {
+            let name = id.to_string();
+            let (x, y) = match (a.iter().find(|u| u.id == *id), b.iter().find(|u| u.id == *id)) {
+                (Some(x), Some(y)) => (x, y),
+                (x, _) => {
+                    self.add_on(
+                        if x.is_some() { A } else { B },
+                        At::default(),
+                        &name,
+                        "unit",
+                        "recorded".into(),
+                    );
+                    continue;
+                }
+            };
+            let mut check = |field: &str, x: String, y: String| {
+                if x != y {
+                    self.add(At::default(), &name, &format!("description.{field}"), x, y);
+                }
+            };
+            check("model", x.model.clone(), y.model.clone());
+            check("serial", x.serial.clone(), y.serial.clone());
+            check("pose", format!("{:?}", x.pose), format!("{:?}", y.pose));
+            if self.options.strict {
+                let mut check = |field: &str, x: String, y: String| {
+                    if x != y {
+                        self.add(At::default(), &name, &format!("description.{field}"), x, y);
+                    }
+                };
+                check("batch", x.batch.to_string(), y.batch.to_string());
+                check("calibration", x.calibration.clone(), y.calibration.clone());
+                check("rate_hz", x.rate_hz.to_string(), y.rate_hz.to_string());
             }
         }
     }
@@ -296,6 +342,7 @@ impl<'a> Walk<'a> {
             check("utc_ns", a.utc_ns, b.utc_ns);
             check("utc_offset_ns", a.utc_offset_ns, b.utc_offset_ns);
         }
+        self.motion(at, a, b);
         let [a, b] = [(A, a), (B, b)].map(|(side, set)| self.by_name(side, set));
         for (name, x) in &a {
             match b.get(name) {
@@ -305,6 +352,48 @@ impl<'a> Walk<'a> {
         }
         for (name, y) in b.iter().filter(|(name, _)| !a.contains_key(*name)) {
             self.add_on(B, at, name, "frame", format!("number {}", y.header.sequence));
+        }
+    }
+
+    /// The batches of a set, those of each unit in their order.
+    fn motion(&mut self, at: At, a: &DatasetSet, b: &DatasetSet) {
+        let [mut x, mut y] = [(A, a), (B, b)].map(|(side, set)| {
+            let units = &self.datasets[side].session().motion;
+            let mut of: BTreeMap<String, VecDeque<&RecordMotion>> = BTreeMap::new();
+            for batch in &set.motion {
+                if let Some(unit) = units.get(batch.unit) {
+                    of.entry(unit.id.to_string()).or_default().push_back(batch);
+                }
+            }
+            of
+        });
+        let names: BTreeSet<String> = x.keys().chain(y.keys()).cloned().collect();
+        for name in names {
+            let (x, y) = (x.remove(&name).unwrap_or_default(), y.remove(&name).unwrap_or_default());
+            for (a, b) in x.iter().zip(&y) {
+                self.batch(at, &name, a, b);
+            }
+            for (side, lone) in [(A, x.iter().skip(y.len())), (B, y.iter().skip(x.len()))] {
+                for batch in lone {
+                    self.add_on(side, at, &name, "batch", format!("number {}", batch.header.sequence));
+                }
+            }
+        }
+    }
+
+    /// Two batches of one unit: the headers as those of frames, the samples bit by bit.
+    fn batch(&mut self, at: At, name: &str, a: &RecordMotion, b: &RecordMotion) {
+        self.batches += 1;
+        for (field, x, y) in self.header.differing(&a.header, &b.header) {
+            self.add(at, name, field, x, y);
+        }
+        let mut pairs = a.samples.iter().zip(&b.samples);
+        let differs = pairs.position(|(x, y)| x.to_bytes() != y.to_bytes());
+        let at_sample =
+            differs.or((a.samples.len() != b.samples.len()).then_some(a.samples.len().min(b.samples.len())));
+        if let Some(n) = at_sample {
+            let [x, y] = [a, b].map(|m| m.samples.get(n).map_or(NOTHING.to_owned(), |s| format!("{s:?}")));
+            self.add(at, name, "samples", x, y);
         }
     }
 
@@ -386,6 +475,7 @@ impl<'a> Walk<'a> {
             sets_b: self.read[B],
             sets: self.sets,
             frames: self.frames,
+            batches: self.batches,
             counts: self.counts.into_iter().map(count).collect(),
             differences: self.differences,
             pixel_differences: self.pixels.into_values().filter(|p| p.frames_differing > 0).collect(),

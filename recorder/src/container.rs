@@ -9,6 +9,7 @@
 
 pub(crate) mod chunk;
 pub(crate) mod copy;
+pub(crate) mod pool;
 pub(crate) mod record;
 pub(crate) mod scan;
 pub(crate) mod segment;

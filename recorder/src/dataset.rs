@@ -14,7 +14,8 @@ mod sets;
 
 pub(crate) use decode::{check_stored, color_decodes, jpeg_pixels};
 pub use index::SetReader;
-pub use info::{DatasetInfo, SpreadStats, StreamInfo};
+pub(crate) use info::MotionCount;
+pub use info::{DatasetInfo, MotionInfo, SpreadStats, StreamInfo};
 pub use sets::{DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};
 pub(crate) use sets::{Kind, kind_of, kinds};
 

@@ -1,7 +1,8 @@
 //! A frame becomes a chunk: JPEG or lossless pixels in a ROS image message, packed and ready to be appended.
 
 use crate::codec::{DEPTH_CODEC, DepthEncoder, DepthShape};
-use crate::container::chunk::{Chunk, ChunkBuilder, MessageHead};
+use crate::container::chunk::{Chunk, ChunkBuilder, MessageHead, Tail};
+use crate::container::pool::Pool;
 use crate::frame::RecordFrame;
 use crate::msgs::image;
 use crate::options::{ColorCodec, Compression, DepthCodec};
@@ -10,6 +11,7 @@ use ::image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use ::image::{ExtendedColorType, ImageEncoder};
 use depthrig_bus::{FrameHeader, PixelFormat};
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
+use std::sync::Arc;
 
 /// How the pixels of a stream are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -56,7 +58,7 @@ impl Codec {
 
 /// What a worker needs to know of a stream and a set to encode one frame.
 pub(crate) struct FrameJob<'a> {
-    pub(crate) frame: &'a RecordFrame,
+    pub(crate) frame: RecordFrame,
     pub(crate) channel: u16,
     pub(crate) frame_id: &'a str,
     pub(crate) log_time: u64,
@@ -80,22 +82,35 @@ pub(crate) struct FrameEncoder {
 }
 
 impl FrameEncoder {
-    pub(crate) fn new(options: &RecorderOptions) -> Self {
-        Self { builder: ChunkBuilder::new(), options: options.clone(), repacked: Vec::new(), depth: None }
+    /// An encoder whose chunks are in buffers of `pool`.
+    pub(crate) fn new(options: &RecorderOptions, pool: &Arc<Pool>) -> Self {
+        Self {
+            builder: ChunkBuilder::with_pool(pool),
+            options: options.clone(),
+            repacked: Vec::new(),
+            depth: None,
+        }
     }
 
-    pub(crate) fn encode(&mut self, job: &FrameJob<'_>) -> Result<EncodedFrame> {
+    pub(crate) fn encode(&mut self, job: FrameJob<'_>) -> Result<EncodedFrame> {
         let h = &job.frame.header;
         let (pixels, stored) = (job.frame.pixels.bytes(), job.frame.pixels.jpeg());
         let format = image::check_picture(h, pixels.len())?;
         let pixels = &pixels[..h.payload_len as usize];
         let codec = Codec::of(format, &self.options);
+        let compress = codec == Codec::Raw && self.options.compression == Compression::Zstd1;
         let head = MessageHead {
             channel: job.channel,
             sequence: h.sequence as u32,
             log_time: job.log_time,
             publish_time: u64::try_from(job.stamp_utc_ns).unwrap_or(0),
         };
+        if codec == Codec::Raw && !compress {
+            if job.frame.pixels.may_wait() {
+                return self.by_reference(job, head, format);
+            }
+            self.builder.expect(image::room(job.frame_id, pixels));
+        }
         let (quality, repacked) = (self.options.jpeg_quality.clamp(1, 100), &mut self.repacked);
         let (stamp, frame_id, depth) = (job.stamp_utc_ns, job.frame_id, &mut self.depth);
         let (message_bytes, message_crc32) =
@@ -104,10 +119,7 @@ impl FrameEncoder {
                     image::write_image(buf, stamp, frame_id, h, encoding, pixels);
                     Ok(())
                 }
-                (Codec::Raw, None) => Err(Error::new(
-                    ErrorKind::BadInput,
-                    format!("{} pictures cannot be stored as they are", format.name()),
-                )),
+                (Codec::Raw, None) => Err(as_they_are(format)),
                 (Codec::Mjpeg, _) => image::write_compressed(buf, stamp, frame_id, "jpeg", |out| {
                     out.extend_from_slice(pixels);
                     Ok(())
@@ -130,9 +142,30 @@ impl FrameEncoder {
                     })
                 }
             })?;
-        let compress = codec == Codec::Raw && self.options.compression == Compression::Zstd1;
         Ok(EncodedFrame { chunk: self.builder.pack(compress)?, message_bytes, message_crc32 })
     }
+
+    /// Stores pixels as they are, from where they lie.
+    fn by_reference(
+        &mut self,
+        job: FrameJob<'_>,
+        head: MessageHead,
+        format: PixelFormat,
+    ) -> Result<EncodedFrame> {
+        let encoding = image::encoding(format).ok_or_else(|| as_they_are(format))?;
+        let h = &job.frame.header;
+        let tail = Tail::new(job.frame.pixels, h.payload_len as usize);
+        let tail =
+            tail.ok_or_else(|| Error::new(ErrorKind::BadInput, cannot(h, "message: it is too short")))?;
+        let (message_bytes, message_crc32) = self.builder.message_with_tail(head, tail, |buf| {
+            image::write_image_head(buf, job.stamp_utc_ns, job.frame_id, h, encoding, h.payload_len);
+        });
+        Ok(EncodedFrame { chunk: self.builder.pack(false)?, message_bytes, message_crc32 })
+    }
+}
+
+fn as_they_are(format: PixelFormat) -> Error {
+    Error::new(ErrorKind::BadInput, format!("{} pictures cannot be stored as they are", format.name()))
 }
 
 /// The pixels without row padding.
@@ -193,4 +226,70 @@ fn jpeg(
     encoder
         .encode(tight, width, height, color)
         .map_err(|e| Error::new(ErrorKind::Codec, cannot(h, "JPEG")).with_source(e))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frame::Pixels;
+
+    /// Pixels in a place that others want back.
+    struct Lent(Vec<u8>);
+
+    impl Pixels for Lent {
+        fn bytes(&self) -> &[u8] {
+            &self.0
+        }
+    }
+
+    fn encode(
+        options: &RecorderOptions,
+        format: PixelFormat,
+        pixels: Box<dyn Pixels>,
+    ) -> Result<EncodedFrame> {
+        let mut header = FrameHeader::default();
+        header.set_picture(format, 40, 30);
+        (header.sequence, header.depth_unit_m) = (17, 0.001);
+        let frame = RecordFrame { stream: 0, header, pixels };
+        let job = FrameJob { frame, channel: 3, frame_id: "a_frame", log_time: 5, stamp_utc_ns: 4 };
+        FrameEncoder::new(options, &Pool::new(1 << 20)).encode(job)
+    }
+
+    #[test]
+    fn pixels_that_may_wait_are_stored_as_those_that_may_not_but_without_a_copy() {
+        let plain = RecorderOptions {
+            color: ColorCodec::Raw,
+            compression: Compression::None,
+            ..RecorderOptions::default()
+        };
+        for (options, by_reference) in [(&plain, true), (&RecorderOptions::default(), false)] {
+            for format in [PixelFormat::Rgb8, PixelFormat::Z16, PixelFormat::Mono8] {
+                // Three bytes behind the picture are not of it.
+                let bytes: Vec<u8> = (0..format.frame_bytes(40, 30) + 3).map(|i| (i * 7) as u8).collect();
+                let at = bytes.as_ptr();
+                let lent = encode(options, format, Box::new(Lent(bytes.clone()))).unwrap();
+                let kept = encode(options, format, Box::new(bytes)).unwrap();
+                let [_, tail] = kept.chunk.parts();
+                assert_eq!(tail.as_ptr() == at, by_reference, "{}", format.name());
+                assert!(lent.chunk.parts()[1].is_empty());
+                let same = |f: &EncodedFrame| {
+                    let bytes = f.chunk.parts().concat();
+                    assert_eq!(f.chunk.len(), bytes.len() as u64);
+                    assert_eq!(f.chunk.crc, crc32fast::hash(&bytes));
+                    (
+                        bytes,
+                        f.message_bytes,
+                        f.message_crc32,
+                        f.chunk.uncompressed_size,
+                        f.chunk.compressed_size,
+                    )
+                };
+                assert_eq!(same(&lent), same(&kept), "{}", format.name());
+            }
+        }
+        let short = encode(&plain, PixelFormat::Z16, Box::new(vec![0; 40])).unwrap_err();
+        assert_eq!(short.kind(), ErrorKind::BadInput, "{short}");
+        let no_picture = encode(&plain, PixelFormat::Motion, Box::new(vec![0; 4096 * 64])).unwrap_err();
+        assert_eq!(no_picture.kind(), ErrorKind::BadInput, "{no_picture}");
+    }
 }

@@ -1,8 +1,9 @@
 //! What is handed to the recorder: a set of frames whose pixels still lie in shared memory.
 
-use depthrig_bus::{FrameHeader, HostTime, UtcPair};
+use depthrig_bus::{FrameHeader, HostTime, MOTION_SAMPLE_BYTES, MotionSample, UtcPair};
 
-/// The pixels of a frame, wherever they lie. The recorder drops the box as soon as it has encoded them.
+/// The pixels of a frame, wherever they lie. The recorder drops the box as soon as it has encoded them, or where they
+/// [may wait](Pixels::may_wait) and are stored as they are, written them.
 pub trait Pixels: Send {
     /// The payload: at least `FrameHeader::payload_len` bytes.
     fn bytes(&self) -> &[u8];
@@ -12,17 +13,31 @@ pub trait Pixels: Send {
     fn jpeg(&self) -> Option<&[u8]> {
         None
     }
+
+    /// Whether these bytes are nobody else's, and may be kept until the disk has taken them: then they are not copied.
+    /// Pixels in shared memory may not, because a slow disk would keep their slots from the live feed.
+    fn may_wait(&self) -> bool {
+        false
+    }
 }
 
 impl Pixels for Vec<u8> {
     fn bytes(&self) -> &[u8] {
         self
     }
+
+    fn may_wait(&self) -> bool {
+        true
+    }
 }
 
 impl Pixels for std::sync::Arc<[u8]> {
     fn bytes(&self) -> &[u8] {
         self
+    }
+
+    fn may_wait(&self) -> bool {
+        true
     }
 }
 
@@ -34,6 +49,32 @@ pub struct RecordFrame {
     pub header: FrameHeader,
     /// Its pixels.
     pub pixels: Box<dyn Pixels>,
+}
+
+/// A batch of samples of a motion unit, as its channel carried it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RecordMotion {
+    /// Index of the unit in `Session::motion`.
+    pub unit: usize,
+    /// The batch's header; `set_id` is filled in by the recorder.
+    pub header: FrameHeader,
+    /// Its samples, as many as the header's `width`.
+    pub samples: Vec<MotionSample>,
+}
+
+/// The motion of a set takes at most this many bytes in the file, see [`RecordMotion::stored_bytes`]: some minutes of one
+/// unit. A caller whose sets are further apart leaves out batches, and counts them.
+pub const SET_MOTION_MAX_BYTES: u64 = 64 << 20;
+
+impl RecordMotion {
+    /// About how many bytes this batch takes in the file, before the chunk is packed.
+    pub fn stored_bytes(&self) -> u64 {
+        // Each message has 31 bytes before its data: `frame_info` is 768 bytes and three short texts, an `Imu` 312 and
+        // the name of its frame.
+        const BATCH: u64 = 1024;
+        const SAMPLE: u64 = MOTION_SAMPLE_BYTES as u64 + 448;
+        BATCH + SAMPLE * self.samples.len() as u64
+    }
 }
 
 /// One set: at most one frame of each stream, all of about the same moment.
@@ -49,6 +90,9 @@ pub struct RecordSet {
     pub frames: Vec<RecordFrame>,
     /// Indices of the streams that have no frame in this set.
     pub missing: Vec<usize>,
+    /// What the motion units sent since the set before, in the order in which it came. A set that is not recorded takes
+    /// its motion with it, so that the numbers of batches and samples show the gap.
+    pub motion: Vec<RecordMotion>,
     /// Latest minus earliest capture time, nanoseconds.
     pub spread_ns: i64,
 }

@@ -40,7 +40,10 @@ mod slice;
 mod still;
 mod verify;
 
-pub use cat::{FRAMES_FILE, FrameChoice, FrameRow, FramesDone, SetChoice, export_frames, list_frames};
+pub use cat::{
+    FRAMES_FILE, FrameChoice, FrameRow, FramesDone, MotionForm, MotionRow, SetChoice, export_frames,
+    export_motion, list_frames, list_motion,
+};
 pub use catalog::{CatalogEntry, Health, catalog, look_at};
 pub use clock::utc_text;
 pub use compare::{
@@ -48,11 +51,11 @@ pub use compare::{
     compare, compare_with,
 };
 pub use dataset::{
-    Dataset, DatasetFrame, DatasetInfo, DatasetSet, PixelMode, SetRange, SetReader, Sets, SpreadStats,
-    StreamInfo,
+    Dataset, DatasetFrame, DatasetInfo, DatasetSet, MotionInfo, PixelMode, SetRange, SetReader, Sets,
+    SpreadStats, StreamInfo,
 };
 pub use error::{Error, ErrorKind, Result};
-pub use frame::{Pixels, PushError, RecordFrame, RecordSet, SetDrop};
+pub use frame::{Pixels, PushError, RecordFrame, RecordMotion, RecordSet, SET_MOTION_MAX_BYTES, SetDrop};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
 pub use options::{ColorCodec, Compression, DepthCodec, RecorderOptions};
 pub use recorder::{DiskStatus, Progress, Recorder, Resumed, Summary, UtcSource};
@@ -62,8 +65,8 @@ pub use recover::{
 };
 pub use select::{Edge, Moment, SetSpan};
 pub use session::{
-    Computed, Edit, FORMAT, Note, Outcome, SESSION_FILE, Session, SessionChanges, StreamRecord, check_name,
-    edit, rename,
+    Computed, Edit, FORMAT, MotionRecord, Note, Outcome, SESSION_FILE, Session, SessionChanges, StreamRecord,
+    check_name, edit, rename,
 };
 pub use slice::{Derived, SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, npy_file, still};

@@ -6,6 +6,7 @@ pub(crate) mod diagnostics;
 pub(crate) mod frame_info;
 pub(crate) mod frame_set;
 pub(crate) mod image;
+pub(crate) mod motion;
 pub(crate) mod schemas;
 pub(crate) mod tf;
 

@@ -3,7 +3,10 @@
 //! Invariants: [`Recorder::push`] does a bounded amount of work and never waits for the disk or an encoder;
 //! `offered = recorded + Σ dropped(reason)` once nothing is in flight; sets reach the file in the order in
 //! which they were pushed; the file is touched by the writer thread alone.
+//!
+//! More than 500 lines, because creating, pushing, closing and abandoning keep these over one shared state.
 
+use crate::container::pool::Pool;
 use crate::frame::{PushError, RecordSet, SetDrop};
 use crate::fs::{self, Fs};
 use crate::msgs::{Diagnostic, SetCounts, StreamAccount};
@@ -35,6 +38,8 @@ use writer::Writer;
 pub(crate) const RESERVE_FILE: &str = ".reserve";
 /// Encoded sets that may wait to be written, beside the limit on their bytes.
 const BACKLOG_MAX_SETS: usize = 4096;
+/// Bytes of buffers that are kept for frames to come: two sets of seven cameras of 1280x720 that are not compressed.
+const POOL_BYTES: usize = 64 << 20;
 /// Notes that may wait for the writer.
 const NOTES_MAX: usize = 256;
 
@@ -60,6 +65,7 @@ struct Shared {
     topics: Topics,
     state: Mutex<State>,
     load: Arc<Load>,
+    pool: Arc<Pool>,
     /// The writer leaves the segment unfinished.
     abandoned: AtomicBool,
     /// Since when the writer waits for the disk, on the host's clock; 0 when it does not.
@@ -85,6 +91,8 @@ struct State {
     bytes: u64,
     segments: u32,
     last_id: Option<u64>,
+    /// Number of the last batch of each motion unit.
+    last_batches: Vec<Option<u64>>,
     /// Places the recording in UTC.
     anchor: Option<UtcPair>,
     last_log_time: i64,
@@ -192,6 +200,7 @@ impl Recorder {
                 bytes: past.bytes,
                 segments: past.segments + 1,
                 last_id: past.last_id,
+                last_batches: past.last_batches,
                 anchor: past.anchor,
                 last_log_time: past.last_log_time,
                 first_tick: past.first_tick,
@@ -209,6 +218,7 @@ impl Recorder {
                 jobs: Some(jobs),
             }),
             load: Arc::default(),
+            pool: Pool::new(POOL_BYTES),
             abandoned: AtomicBool::new(false),
             io_since_ns: AtomicI64::new(0),
             _lock: lock,
@@ -252,7 +262,7 @@ impl Recorder {
             };
             return refused(&mut state, reason, why);
         }
-        if let Err(why) = self.shared.topics.check(&set, state.last_id) {
+        if let Err(why) = self.shared.topics.check(&set, state.last_id, &state.last_batches) {
             return refused(&mut state, SetDrop::BadSet, why);
         }
         let options = &self.shared.options;
@@ -277,10 +287,14 @@ impl Recorder {
         let (ticket, frames) = Ticket::new(set, &anchor, log_time, state.counts.offered, load);
         let ticket = Arc::new(ticket);
         if tickets.try_send(Arc::clone(&ticket)).is_err() {
+            load.backlog_bytes.fetch_sub(ticket.taken_bytes(), Ordering::Relaxed);
             state.counts.dropped[SetDrop::DiskSlow as usize] += 1;
             return Err(PushError { reason: SetDrop::DiskSlow, message: slow });
         }
         state.last_id = Some(ticket.id);
+        for batch in &ticket.motion {
+            state.last_batches[batch.unit] = Some(batch.header.sequence);
+        }
         state.last_log_time = log_time;
         state.first_tick.get_or_insert(ticket.tick);
         state.last_tick = Some(ticket.tick);

@@ -80,6 +80,9 @@ pub struct Report {
     pub bins: TimeBins,
     /// Its streams.
     pub streams: Vec<StreamReport>,
+    /// Its motion units.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub motion: Vec<MotionReport>,
     /// The two clocks of the host.
     pub host_clock: HostClock,
     /// Bytes of its segments.
@@ -192,6 +195,31 @@ pub struct StreamReport {
     pub clock: ClockReport,
     /// How much of its pictures has depth; `None` when it is no depth or none was looked at.
     pub fill: Option<Fill>,
+}
+
+/// One motion unit of a dataset.
+#[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
+pub struct MotionReport {
+    /// What the session says of it.
+    #[serde(flatten)]
+    pub record: crate::MotionRecord,
+    /// Batches in the dataset.
+    pub batches: u64,
+    /// Batches between the first and the last that are not in it.
+    pub lost_batches: u64,
+    /// Samples in the dataset.
+    pub samples: u64,
+    /// Samples between those that the device never gave.
+    pub never_given: u64,
+    /// Samples per second between the first and the last.
+    pub samples_hz: f64,
+    /// Length of the angular velocity over time, rad/s.
+    pub rotation_series: Vec<Option<Range>>,
+    /// Length of the acceleration over time, m/s².
+    pub acceleration_series: Vec<Option<Range>>,
+    /// `captured = delivered + Σ dropped` of its batches over the recording, from the last account in the file.
+    pub account: Option<StreamAccount>,
 }
 
 /// The capture clock of a stream.

@@ -66,6 +66,9 @@ pub struct Session {
     pub computed: Vec<Computed>,
     /// The recorded streams; a frame names its stream by the index here.
     pub streams: Vec<StreamRecord>,
+    /// The recorded motion units, which are no part of sets; a batch names its unit by the index here.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub motion: Vec<MotionRecord>,
     /// Keys that this version does not know: a user's own, or a later version's. They are kept.
     #[serde(flatten)]
     pub extra: toml::Table,
@@ -193,6 +196,29 @@ pub struct StreamRecord {
     pub pose: Pose,
 }
 
+/// One recorded motion unit.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct MotionRecord {
+    /// Its stream's name, such as `zed2i/imu`.
+    pub id: StreamId,
+    /// Camera model.
+    #[serde(default)]
+    pub model: String,
+    /// Camera serial number.
+    #[serde(default)]
+    pub serial: String,
+    /// Nominal number of samples a second.
+    #[serde(default)]
+    pub rate_hz: f64,
+    /// Most samples of one batch.
+    pub batch: u32,
+    /// Where its pose comes from: factory, file and date, none.
+    #[serde(default)]
+    pub calibration: String,
+    /// Pose of the unit on the mount.
+    pub pose: Pose,
+}
+
 fn format() -> String {
     FORMAT.to_owned()
 }
@@ -244,6 +270,7 @@ impl Session {
             history: Vec::new(),
             derived: Vec::new(),
             computed: Vec::new(),
+            motion: Vec::new(),
             streams: Vec::new(),
             extra: toml::Table::new(),
         }
@@ -259,6 +286,18 @@ impl Session {
         for (i, s) in self.streams.iter().enumerate() {
             if self.streams[..i].iter().any(|other| other.id == s.id) {
                 return Err(bad(format!("stream {} is there twice", s.id)));
+            }
+            if s.format.is_motion() {
+                return Err(bad(format!("{} is a motion unit; it belongs into [[motion]]", s.id)));
+            }
+        }
+        for (i, u) in self.motion.iter().enumerate() {
+            let mut others = self.motion[..i].iter().map(|u| &u.id).chain(self.streams.iter().map(|s| &s.id));
+            if others.any(|other| *other == u.id) {
+                return Err(bad(format!("motion unit {} is there twice", u.id)));
+            }
+            if u.batch == 0 {
+                return Err(bad(format!("motion unit {} has batches of no samples", u.id)));
             }
         }
         Ok(())

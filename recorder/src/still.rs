@@ -134,17 +134,31 @@ fn npy(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Vec<u8> {
 /// `<f4` for 32-bit floats. <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>.
 pub fn npy_file(kind: &str, shape: &[usize], data: &[u8]) -> Vec<u8> {
     let shape: Vec<_> = shape.iter().map(ToString::to_string).collect();
-    let mut text =
-        format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({}), }}", shape.join(", "));
+    let mut out = npy_head(&format!("'{kind}'"), &shape.join(", "));
+    out.extend_from_slice(data);
+    out
+}
+
+/// The head of an NPY file of `n` records; `fields` are their names, NumPy's name of their numbers, and how many of them. The
+/// records follow without padding.
+pub(crate) fn npy_records(fields: &[(&str, &str, usize)], n: u64) -> Vec<u8> {
+    let fields = fields.iter().map(|(name, kind, count)| match count {
+        1 => format!("('{name}', '{kind}')"),
+        n => format!("('{name}', '{kind}', ({n},))"),
+    });
+    npy_head(&format!("[{}]", fields.collect::<Vec<_>>().join(", ")), &format!("{n},"))
+}
+
+fn npy_head(descr: &str, shape: &str) -> Vec<u8> {
+    let mut text = format!("{{'descr': {descr}, 'fortran_order': False, 'shape': ({shape}), }}");
     // Magic, version and length are ten bytes; the data begins at a multiple of 64, after a newline.
     let padding = (64 - (10 + text.len() + 1) % 64) % 64;
     text.extend(std::iter::repeat_n(' ', padding));
     text.push('\n');
-    let mut out = Vec::with_capacity(10 + text.len() + data.len());
+    let mut out = Vec::with_capacity(10 + text.len());
     out.extend_from_slice(b"\x93NUMPY\x01\x00");
     out.extend_from_slice(&(text.len() as u16).to_le_bytes());
     out.extend_from_slice(text.as_bytes());
-    out.extend_from_slice(data);
     out
 }
 

@@ -3,8 +3,8 @@
 //! Checked are: the checksums of data, summary, chunks and attachments; the index against the data, record by
 //! record; that every set has what its commit mark lists, of the length and with the checksum that it lists, and
 //! that the mark lists or excuses every stream; order, times and spreads; the accounts, of sets, of streams and in
-//! the header of each frame; that segments follow each other; calibration; and on request that every picture
-//! decodes.
+//! the header of each frame; what motion units sent; that segments follow each other; calibration; and on request that
+//! every picture decodes and every single sample says what its batch does.
 //!
 //! Without that request a picture is unpacked only where nothing else proves its bytes, see `segment`.
 
@@ -17,6 +17,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 mod index;
+mod motion;
 mod pictures;
 mod records;
 mod segment;
@@ -118,6 +119,8 @@ pub struct VerifyReport {
     pub sets: u64,
     /// Their frames.
     pub frames: u64,
+    /// Samples of motion units.
+    pub motion_samples: u64,
     /// Bytes read.
     pub bytes: u64,
     /// Segments read.
@@ -190,6 +193,7 @@ pub fn verify_watched(
         findings: findings.sorted(),
         sets: walk.sets,
         frames: walk.frames,
+        motion_samples: walk.units.samples(),
         bytes: walk.bytes,
         segments: segments.len() as u32,
         decoded: options.decode,
@@ -285,6 +289,10 @@ fn check_session(session: &Session, findings: &mut Findings) {
     for made in session.computed.iter().filter(|made| !is_there(&made.stream)) {
         let what = format!("{} is said to be {}, but there is no such stream", made.stream, made.name);
         findings.add(Severity::Broken, SESSION_FILE, None, what);
+    }
+    for u in session.motion.iter().filter(|u| u.calibration.is_empty()) {
+        let what = format!("{} does not say where its pose comes from", u.id);
+        findings.add(Severity::Note, SESSION_FILE, None, what);
     }
     for s in &session.streams {
         if s.format.is_depth() && s.depth_unit_m <= 0.0 {

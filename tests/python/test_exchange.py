@@ -35,7 +35,9 @@ def test_real_pictures_come_back_as_they_were(binary: str, runtime: Path, rig_fi
     out = tmp_path / "out"
     report = json.loads(command(binary, runtime, "export", "bytecameradepth", str(recorded), str(out), "--json"))
     assert report["lost"] == 0
-    assert report["frames"] == 2 * len(CAMERAS) * report["sets"] > 0
+    # All that was recorded; on a busy machine a set may lack a frame.
+    info = json.loads(command(binary, runtime, "info", str(recorded), "--json"))
+    assert report["frames"] == sum(stream["frames"] for stream in info["streams"]) > 0
     (session,) = (p for p in out.iterdir() if p.is_dir())
     calibration = json.loads((session / "calibration.json").read_text())
     described = {s["id"]: s for s in calibration["streams"]}

@@ -111,7 +111,7 @@ def test_node(segments: list[Path], tmp_path: Path) -> None:
                 "file": file,
             }
         )
-    index = {"sets": len(sets), "first_set": sets[0], "pictures": pictures}
+    index = {"sets": len(sets), "first_set": sets[0], "pictures": pictures, "motion": []}
     (tmp_path / "index.json").write_text(json.dumps(index))
     command = ["node", "check_node.mjs", str(segments[0].parent), str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT / "tests" / "readers", capture_output=True, text=True, check=False)

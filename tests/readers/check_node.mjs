@@ -3,7 +3,7 @@
 //
 // usage: node check_node.mjs DATASET EXPECTED
 //
-// EXPECTED is a folder with index.json and bare pixels as `recorder/examples/golden.rs` writes it. Lossless
+// EXPECTED is a folder with index.json and bare pixels as `tests/src/expected.rs` writes it. Lossless
 // pictures must agree bit by bit, JPEGs within 35 dB of what depthrig itself decodes (jpeg-js rounds more
 // coarsely than the decoders in common use). Exits with 1 and says which picture differs otherwise.
 
@@ -31,12 +31,21 @@ for (const p of index.pictures) {
 const names = (await readdir(dataset)).filter((n) => /^seg_\d+\.mcap$/.test(n)).sort();
 assert(names.length > 0, `${dataset} has no segments`);
 
+const motion = index.motion;
+
+/** Numbers must be equal to the last bit; null is no number. */
+function same(got, want) {
+  got.forEach((g, i) => assert(want[i] === null ? Number.isNaN(g) : g === want[i], `${got} is not ${want}`));
+}
+
 /** Collects what one way of reading finds. */
 class Check {
   constructor(reader) {
     this.reader = reader;
     this.seen = new Set();
     this.sets = 0n;
+    this.samples = 0;
+    this.batched = 0;
     this.schemas = new Map();
     this.channels = new Map();
   }
@@ -58,8 +67,18 @@ class Check {
     const { channel, reader } = this.channels.get(message.channelId);
     const ros = reader.readMessage(message.data);
     if (channel.topic.endsWith("/frame_set")) {
-      assert.equal(ros.id, BigInt(index.first_set ?? 1) + this.sets, "set ids");
+      assert.equal(ros.id, BigInt(index.first_set) + this.sets, "set ids");
       this.sets++;
+    }
+    if (channel.topic.endsWith("/data_raw")) {
+      this.sample(channel, message, ros);
+    } else if (channel.topic.endsWith("/samples")) {
+      for (const s of ros.samples) {
+        const want = motion[this.batched++];
+        assert.equal(String(s.time_ns), want.time_ns, `${this.reader}: sample ${want.sequence}`);
+        assert.equal(s.sequence, BigInt(want.sequence));
+        same([...s.gyro_rad_s, ...s.accel_m_s2], [...want.gyro, ...want.accel]);
+      }
     }
     const key = `${channel.topic} ${message.logTime}`;
     const p = pictures.get(key);
@@ -87,7 +106,18 @@ class Check {
     this.seen.add(key);
   }
 
+  /** A sample of a motion unit by itself. */
+  sample(channel, message, ros) {
+    const want = motion[this.samples++];
+    assert.equal(`${channel.topic} ${message.logTime}`, `${want.base}/data_raw ${want.log_time}`);
+    assert.equal(String(message.publishTime), want.stamp, `${this.reader}: time of sample ${want.sequence}`);
+    const [w, a] = [ros.angular_velocity, ros.linear_acceleration];
+    same([w.x, w.y, w.z, a.x, a.y, a.z], [...want.gyro, ...want.accel]);
+    assert.equal(ros.orientation_covariance[0], -1);
+  }
+
   done() {
+    assert.deepEqual([this.samples, this.batched], [motion.length, motion.length], `${this.reader}: motion samples`);
     const missing = [...pictures.keys()].filter((k) => !this.seen.has(k));
     assert.deepEqual(missing, [], `${this.reader}: pictures are missing`);
     assert.equal(this.sets, BigInt(index.sets));

@@ -3,7 +3,7 @@
 usage: python check_python.py DATASET EXPECTED
 
 DATASET is a dataset of depthrig, EXPECTED a folder with index.json and bare pixels as
-`recorder/examples/golden.rs` writes it. Each reader must find every picture: lossless ones bit by bit, JPEGs
+`tests/src/expected.rs` writes it. Each reader must find every picture: lossless ones bit by bit, JPEGs
 within 40 dB of what depthrig itself decodes; depth in our own codec by way of the Python package depthrig, which
 only rerun cannot ask. Exits with 1 and says which picture differs otherwise.
 """
@@ -92,6 +92,45 @@ def check_poses(transforms, index):
         assert t.header.frame_id == f"{index['rig']}_mount", t.header.frame_id
         v, q = t.transform.translation, t.transform.rotation
         assert [v.x, v.y, v.z] == p["translation"] and [q.x, q.y, q.z, q.w] == p["rotation"]
+    for u in index["units"]:
+        t = poses[u["frame_id"]].transform
+        v, q = t.translation, t.rotation
+        assert [v.x, v.y, v.z] == u["translation"] and [q.x, q.y, q.z, q.w] == u["rotation"]
+
+
+def check_motion(reader, index, singles, batches):
+    """Every sample of a motion unit, one by one and in its batch. Numbers are compared exactly; None is no number."""
+
+    def same(want, got):
+        return all((w is None and np.isnan(g)) or w == g for w, g in zip(want, got, strict=True))
+
+    def xyz(v):
+        return [v.x, v.y, v.z]
+
+    wanted = index["motion"]
+    assert len(singles) == len(wanted), f"{reader}: {len(singles)} of {len(wanted)} samples"
+    for want, (topic, time, imu) in zip(wanted, singles, strict=True):
+        what = f"{reader}: sample {want['sequence']}"
+        assert (topic, time) == (want["base"] + "/data_raw", int(want["log_time"])), f"{what}: {topic} at {time}"
+        assert nanoseconds(imu.header.stamp) == int(want["stamp"]), f"{what}: stamp"
+        _, _, camera, unit = want["base"].split("/")
+        assert imu.header.frame_id == f"{camera}_{unit}_frame", f"{what}: {imu.header.frame_id}"
+        assert same(want["gyro"], xyz(imu.angular_velocity)), f"{what}: {imu.angular_velocity}"
+        assert same(want["accel"], xyz(imu.linear_acceleration)), f"{what}: {imu.linear_acceleration}"
+        assert imu.orientation_covariance[0] == -1, f"{what}: it has no orientation"
+        assert imu.linear_acceleration_covariance[0] == (-1 if want["accel"][0] is None else 0), what
+    samples = [(topic, time, batch.sequence, s) for topic, time, batch in batches for s in batch.samples]
+    assert len(samples) == len(wanted), f"{reader}: {len(samples)} of {len(wanted)} samples in batches"
+    for want, (topic, time, batch, s) in zip(wanted, samples, strict=True):
+        what = f"{reader}: sample {want['sequence']} of batch {batch}"
+        assert (topic, time, batch) == (want["base"] + "/samples", int(want["log_time"]), want["batch"]), what
+        assert s.time_ns == int(want["time_ns"]), what
+        for field in ("device_time", "sequence", "uncertainty_ns", "accel_offset_ns", "flags"):
+            assert getattr(s, field) == want[field], f"{what}: {field}"
+        assert same(want["gyro"], s.gyro_rad_s) and same(want["accel"], s.accel_m_s2), what
+        assert same([want["temperature_c"]], [s.temperature_c]), what
+    if wanted:
+        print(f"{reader}: {len(wanted)} motion samples agree")
 
 
 def check_projection(info):
@@ -105,6 +144,7 @@ def check_mcap(segments, index, pictures):
     """mcap + mcap-ros2-support: through the index and as a stream, with every checksum."""
     for kind in (make_reader, NonSeekingReader):
         seen, infos, sets, notes, frames = set(), {}, [], [], set()
+        singles, batches = [], []
         for segment in segments:
             with segment.open("rb") as f:
                 reader = kind(f, decoder_factories=[DecoderFactory()], validate_crcs=True)
@@ -124,6 +164,11 @@ def check_mcap(segments, index, pictures):
                         infos[topic.removesuffix("/camera_info"), message.log_time] = ros
                     elif topic.endswith("/frame_info"):
                         frames.add((topic.removesuffix("/frame_info"), message.log_time, ros.sequence, ros.set_id))
+                    elif topic.endswith("/data_raw"):
+                        assert nanoseconds(ros.header.stamp) == message.publish_time
+                        singles.append((topic, message.log_time, ros))
+                    elif topic.endswith("/samples"):
+                        batches.append((topic, message.log_time, ros))
                     elif topic.endswith("/frame_set"):
                         sets.append(ros)
                     elif topic.endswith("/notes"):
@@ -136,7 +181,7 @@ def check_mcap(segments, index, pictures):
                         assert status.level == 0 and status.message == "streaming", status
                         assert [(v.key, v.value) for v in status.values] == [("drift_ppm", "1.5")]
         assert seen == pictures.keys(), f"mcap: {len(pictures.keys() - seen)} pictures are missing"
-        wanted = [index["note"]] if "note" in index else []
+        wanted = [index["note"]] if index["note"] is not None else []
         assert len(sets) == index["sets"] and notes == wanted, (len(sets), notes)
         for (_, time), p in pictures.items():
             assert list(infos[p["base"], time].k) == p["k"], f"intrinsics of {p['base']}"
@@ -144,11 +189,12 @@ def check_mcap(segments, index, pictures):
             check_projection(infos[p["base"], time])
             assert (p["base"], time, p["sequence"], p["set"]) in frames, f"frame_info of {p['base']}"
         print(f"mcap {kind.__name__}: {len(seen)} pictures agree")
+        check_motion(f"mcap {kind.__name__}", index, singles, batches)
 
 
-def check_rosbags(segments, pictures):
+def check_rosbags(segments, index, pictures):
     """rosbags: ROS 2 types, our own included, taken from the file alone."""
-    seen, ours = set(), 0
+    seen, ours, singles, batches = set(), 0, [], []
     for segment in segments:
         with AnyReader([segment]) as reader:
             for connection, time, raw in reader.messages():
@@ -158,6 +204,11 @@ def check_rosbags(segments, pictures):
                 if key in pictures:
                     compare("rosbags", pictures[key], from_message(pictures[key], message))
                     seen.add(key)
+                elif connection.topic.endswith("/data_raw"):
+                    singles.append((connection.topic, time, message))
+                elif connection.topic.endswith("/samples"):
+                    batches.append((connection.topic, time, message))
+    check_motion("rosbags", index, singles, batches)
     assert seen == pictures.keys(), f"rosbags: {len(pictures.keys() - seen)} pictures are missing"
     assert ours > 0
     print(f"rosbags: {len(seen)} pictures agree, {ours} messages of our own types")
@@ -213,7 +264,7 @@ def main():
     assert segments, f"{dataset} has no segments"
     index, pictures = load(expected)
     check_mcap(segments, index, pictures)
-    check_rosbags(segments, pictures)
+    check_rosbags(segments, index, pictures)
     check_rerun(segments, pictures)
 
 

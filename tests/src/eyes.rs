@@ -3,9 +3,11 @@
 //! A square stands before a wall, both with a pattern. Each eye's picture is made by following its rays, so the truth is
 //! exact; the eyes are pinholes that look the same way, so the rectified view is the left eye's.
 
-use depthrig_bus::{FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, StreamId, UtcPair};
+use depthrig_bus::{FrameHeader, HostTime, Intrinsics, MotionSample, PixelFormat, Pose, StreamId, UtcPair};
 use depthrig_recorder::fs::RealFs;
-use depthrig_recorder::{RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamRecord};
+use depthrig_recorder::{
+    MotionRecord, RecordFrame, RecordMotion, RecordSet, Recorder, RecorderOptions, Session, StreamRecord,
+};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -33,6 +35,8 @@ pub struct Eyes {
     pub period_ns: i64,
     /// Sets, from 0, that have no right picture.
     pub one_eyed: Vec<u64>,
+    /// Rows by which the right picture lies lower than its calibration says.
+    pub rows_apart: f64,
     /// Each eye's pictures are the other one's.
     pub swapped: bool,
     /// Difference between the brightest and the darkest of the patterns.
@@ -50,6 +54,7 @@ impl Default for Eyes {
             sets: 6,
             period_ns: 200_000_000,
             one_eyed: Vec::new(),
+            rows_apart: 0.0,
             swapped: false,
             contrast: 200.0,
         }
@@ -100,10 +105,11 @@ impl Eyes {
     /// Brightness of an eye's picture.
     pub fn grey(&self, right: bool, n: u64) -> Vec<u8> {
         let shift = if right == self.swapped { 0.0 } else { self.baseline_m };
+        let lower = if right { self.rows_apart } else { 0.0 };
         let (w, h) = self.size;
         (0..h)
             .flat_map(|y| (0..w).map(move |x| (x, y)))
-            .map(|(x, y)| self.seen(x.into(), y.into(), shift, n).1)
+            .map(|(x, y)| self.seen(x.into(), f64::from(y) - lower, shift, n).1)
             .collect()
     }
 
@@ -156,6 +162,7 @@ impl Eyes {
     }
 
     /// Records a dataset: camera `zed2i` with the streams `left` and `right`, and a camera that has nothing to do with it.
+    /// Both have a motion unit.
     pub fn record(&self, out: &Path) {
         let mut session = Session::new("eyes", "bench");
         session.scene = "a square before a wall".into();
@@ -180,6 +187,7 @@ impl Eyes {
             format: PixelFormat::Mono8,
             ..eye("left", 0.0)
         });
+        session.motion = ["other", "zed2i"].map(unit).to_vec();
         let options = RecorderOptions { queue_sets: 64, ..RecorderOptions::default() };
         let r = Recorder::create(Arc::new(RealFs), out, session.clone(), options).unwrap();
         for n in 0..self.sets {
@@ -208,8 +216,15 @@ impl Eyes {
                 missing.push(1);
             }
             let utc = UtcPair { mono: HostTime::from_ns(M0), utc_ns: T0, width_ns: 100 };
-            let set =
-                RecordSet { id: 10 + n, tick: HostTime::from_ns(mono), utc, frames, missing, spread_ns: 0 };
+            let set = RecordSet {
+                id: 10 + n,
+                tick: HostTime::from_ns(mono),
+                utc,
+                frames,
+                missing,
+                motion: session.motion.iter().enumerate().map(|(i, u)| batch(i, u, n, mono)).collect(),
+                spread_ns: 0,
+            };
             while !r.has_room() {
                 std::thread::sleep(std::time::Duration::from_millis(1));
             }
@@ -217,4 +232,35 @@ impl Eyes {
         }
         assert!(r.finish().unwrap().complete);
     }
+}
+
+/// The motion unit of a camera.
+fn unit(camera: &str) -> MotionRecord {
+    MotionRecord {
+        id: StreamId::new(camera, "imu").unwrap(),
+        model: "made up".into(),
+        serial: "20267155".into(),
+        rate_hz: 30.0,
+        batch: 2,
+        calibration: "made up".into(),
+        pose: Pose::IDENTITY,
+    }
+}
+
+/// What a unit sent before set `n`: two samples.
+fn batch(index: usize, unit: &MotionRecord, n: u64, mono: i64) -> RecordMotion {
+    let sample = |k: u64| MotionSample {
+        time_ns: mono - 10_000_000 + 5_000_000 * k as i64,
+        sequence: 2 * n + k + 1,
+        gyro_rad_s: [index as f32, n as f32, k as f32],
+        ..MotionSample::default()
+    };
+    let samples = vec![sample(0), sample(1)];
+    let mut header = FrameHeader::default();
+    header.set_names("bench", &unit.id);
+    header.set_device(&unit.model, &unit.serial);
+    header.set_picture(PixelFormat::Motion, 2, 1);
+    (header.sequence, header.captured, header.device_sequence) = (n + 1, n + 1, samples[1].sequence);
+    header.capture_time_ns = samples[1].time_ns;
+    RecordMotion { unit: index, header, samples }
 }

@@ -2,8 +2,10 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)] // test support: a failure here is a failed test
 
 pub mod disk;
+pub mod expected;
 pub mod eyes;
 pub mod made;
+pub mod pairs;
 pub mod scene;
 
 pub use depthrig_kinect_fixture as kinect;

@@ -1,9 +1,10 @@
 //! Datasets made without a rig: every header and picture follows from the stream and the number of the set.
 
-use depthrig_bus::{FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, StreamId, UtcPair};
+use depthrig_bus::{FrameHeader, HostTime, Intrinsics, MotionSample, PixelFormat, Pose, StreamId, UtcPair};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{
-    ColorCodec, DepthCodec, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamRecord, Summary,
+    ColorCodec, DepthCodec, MotionRecord, RecordFrame, RecordMotion, RecordSet, Recorder, RecorderOptions,
+    Session, StreamRecord, Summary,
 };
 use std::path::Path;
 use std::sync::Arc;
@@ -35,6 +36,8 @@ pub struct Made {
     pub color: ColorCodec,
     /// How depth is stored.
     pub depth: DepthCodec,
+    /// Whether the first camera has a motion unit, `imu`.
+    pub motion: bool,
 }
 
 impl Default for Made {
@@ -49,6 +52,7 @@ impl Default for Made {
             size: (64, 48),
             color: ColorCodec::Raw,
             depth: DepthCodec::default(),
+            motion: false,
         }
     }
 }
@@ -83,7 +87,55 @@ impl Made {
             }
         };
         session.streams = self.streams().into_iter().map(record).collect();
+        if self.motion {
+            session.motion.push(MotionRecord {
+                id: self.unit(),
+                model: "Made".into(),
+                serial: "7".into(),
+                rate_hz: 8e9 / self.period_ns as f64,
+                batch: 4,
+                calibration: "made up".into(),
+                pose: Pose { translation_m: [0.3, 0.2, -0.1], ..Pose::IDENTITY },
+            });
+        }
         session
+    }
+
+    /// The motion unit of the first camera.
+    pub fn unit(&self) -> StreamId {
+        StreamId::new(self.cameras[0], "imu").unwrap()
+    }
+
+    /// What the unit sends between set `n` and the one before: two batches of four samples.
+    fn batches(&self, session: &Session, n: u64) -> Vec<RecordMotion> {
+        let batch = |record: &MotionRecord, b: u64| {
+            let sample = |k: u64| MotionSample {
+                time_ns: self.tick(n).ns() - self.period_ns + (k - 8 * n) as i64 * (self.period_ns / 8) + 5,
+                device_time: 1000 * k,
+                sequence: k + 1,
+                uncertainty_ns: 30_000,
+                gyro_rad_s: [k as f32 / 64.0, -1.5, 0.25],
+                accel_m_s2: if k % 7 == 3 { [f32::NAN; 3] } else { [0.1, 9.8, k as f32 / 128.0] },
+                temperature_c: 36.5,
+                ..MotionSample::default()
+            };
+            let samples: Vec<_> = (4 * b..4 * b + 4).map(sample).collect();
+            let mut header = FrameHeader::default();
+            header.set_names(self.rig, &record.id);
+            header.set_device(&record.model, &record.serial);
+            header.set_picture(PixelFormat::Motion, 4, 1);
+            // Now and then a batch is lost before its channel.
+            (header.sequence, header.captured) = (b + 1, b + 1 + b / 3);
+            header.dropped[1] = b / 3;
+            header.device_sequence = 4 * b + 4;
+            header.capture_time_ns = samples[3].time_ns;
+            header.arrival_time_ns = header.capture_time_ns + 1_000_000;
+            header.publish_time_ns = header.capture_time_ns + 1_100_000;
+            header.pose = record.pose;
+            header.temperature_c = 36.5;
+            RecordMotion { unit: 0, header, samples }
+        };
+        session.motion.iter().flat_map(|r| [2 * n, 2 * n + 1].map(|b| batch(r, b))).collect()
     }
 
     /// When set `n` is, on the monotonic clock.
@@ -130,6 +182,7 @@ impl Made {
             id: 3 * n + 5,
             tick: self.tick(n),
             utc: UtcPair { mono: self.tick(0), utc_ns: T0 + self.at_ns, width_ns: 100 },
+            motion: self.batches(session, n),
             spread_ns: times.clone().max().unwrap_or(0) - times.min().unwrap_or(0),
             missing: Vec::new(),
             frames,

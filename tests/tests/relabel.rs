@@ -2,11 +2,12 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use core::ops::ControlFlow;
-use depthrig_bus::FrameFlags;
+use depthrig_bus::{FrameFlags, FrameHeader, MOTION_SAMPLE_BYTES, MotionSample};
 use depthrig_daemon::config::{CdmConfig, EngineChoice, RefineConfig};
 use depthrig_daemon::relabel::{RelabelOptions, Step, relabel};
 use depthrig_recorder::{
-    CompareOptions, Dataset, ErrorKind, PixelMode, SetRange, VerifyOptions, compare, verify,
+    CompareOptions, Dataset, DatasetSet, ErrorKind, PixelMode, RecordMotion, SetRange, VerifyOptions,
+    compare, verify,
 };
 use depthrig_tests::made::Made;
 use std::collections::BTreeMap;
@@ -41,11 +42,17 @@ fn refined(path: &Path) -> Vec<(u64, String, Vec<u8>)> {
     .collect()
 }
 
+/// The batches of a set bit by bit, since a sample may say NaN.
+fn motion(set: &DatasetSet) -> Vec<(usize, FrameHeader, Vec<[u8; MOTION_SAMPLE_BYTES]>)> {
+    let samples = |m: &RecordMotion| m.samples.iter().map(MotionSample::to_bytes).collect();
+    set.motion.iter().map(|m| (m.unit, m.header, samples(m))).collect()
+}
+
 #[test]
 fn a_copy_with_refined_depth() {
     let dir = tempfile::tempdir().unwrap();
     let (source, out) = (dir.path().join("source"), dir.path().join("out"));
-    Made { sets: 25, ..Made::default() }.record(&source);
+    Made { sets: 25, motion: true, ..Made::default() }.record(&source);
     let before = bytes_of(&source);
     let report = relabel(&Dataset::open(&source).unwrap(), &out, &options(2), &mut go_on).unwrap();
     assert_eq!((report.sets, report.lost, report.ended, report.streams.len()), (25, 0, false, 2));
@@ -62,6 +69,7 @@ fn a_copy_with_refined_depth() {
     for (number, (new, old)) in sets.0.zip(of_source).enumerate() {
         let (new, old) = (new.unwrap(), old.unwrap());
         assert_eq!((new.id, new.tick, new.utc_ns, new.frames.len()), (old.id, old.tick, old.utc_ns, 6));
+        assert_eq!((new.motion.len(), motion(&new)), (2, motion(&old)));
         for (a, b) in new.frames.iter().zip(&old.frames) {
             assert_eq!((&a.header, &a.pixels, a.codec), (&b.header, &b.pixels, b.codec));
         }

@@ -9,9 +9,11 @@ use depthrig_daemon::control::{Control, RecordRequest, ReplayControl, SeekReques
 use depthrig_daemon::replay::{Replay, ReplayOptions};
 use depthrig_daemon::status::CameraState;
 use depthrig_recorder::{
-    ColorCodec, CompareOptions, Dataset, DepthCodec, PixelCheck, Severity, VerifyOptions, compare, verify,
+    ColorCodec, CompareOptions, Dataset, DepthCodec, PixelCheck, SetRange, Severity, VerifyOptions, compare,
+    verify,
 };
 use depthrig_tests::Home;
+use depthrig_tests::disk::Tmpfs;
 use depthrig_tests::made::{Made, SECOND};
 use std::fmt::Write;
 use std::path::PathBuf;
@@ -230,6 +232,41 @@ fn two_runs_give_a_subscriber_the_same_bytes_and_a_slow_one_misses_nothing() {
 }
 
 #[test]
+fn motion_comes_with_its_set_and_a_slow_reader_misses_none_of_it() {
+    let home = Home::default();
+    let dataset = Made { sets: 12, motion: true, ..Made::default() };
+    let path = made(&home, "a", &dataset);
+    let original = Dataset::open(&path).unwrap().sets(SetRange::ALL).map(|s| s.unwrap().motion);
+    let original: Vec<_> = original.flatten().collect();
+    assert_eq!(original.len(), 24);
+    let mut channels = vec![dataset.unit()];
+    channels.extend(dataset.streams());
+    let replay = start(&home, std::slice::from_ref(&path), FAST);
+    let status = replay.control().status();
+    assert!(status.cameras[0].streams.iter().any(|s| s.id == "left/imu"), "{:?}", status.cameras);
+    let mut bench = Bench::new(&home, "bench", channels);
+    // A step shows a set, and what the unit sent before it.
+    steer(&replay, |r| r.step(1)).unwrap();
+    bench.read_sets(1);
+    assert_eq!(bench.seen.iter().map(Vec::len).collect::<Vec<_>>(), [2, 1, 1, 1, 1, 1]);
+    resume(&replay);
+    bench.read_all(&replay, Some(5));
+    assert_eq!(bench.streams[0].1.missed(), 0);
+    assert!(replay.stop().status.lost.is_empty());
+    let wanted = original.iter().zip(1..).map(|(batch, sequence)| {
+        let h = FrameHeader {
+            sequence,
+            captured: sequence + batch.header.drops().total(),
+            flags: batch.header.flags | FrameFlags::REPLAYED.0,
+            ..batch.header
+        };
+        let bytes: Vec<u8> = batch.samples.iter().flat_map(depthrig_bus::MotionSample::to_bytes).collect();
+        format!("{}{bytes:?}", whole(&h))
+    });
+    assert!(bench.seen[0] == wanted.collect::<Vec<_>>(), "bit by bit, but for what a replay counts anew");
+}
+
+#[test]
 fn a_subscriber_that_does_not_read_is_waited_for_and_named() {
     let home = Home::default();
     let dataset = Made { sets: 9, ..Made::default() };
@@ -280,14 +317,17 @@ fn a_recorded_replay_is_the_dataset_that_was_replayed() {
         ("png", ColorCodec::Png, DepthCodec::default(), FAST),
         ("by_clock", ColorCodec::Jpeg, DepthCodec::default(), by_clock),
     ] {
-        let path = made(&home, name, &Made { color, depth, ..Made::default() });
+        let path = made(&home, name, &Made { color, depth, motion: true, ..Made::default() });
         let again = record_again(&home, path.clone(), name, options);
         let (a, b) = (Dataset::open(&path).unwrap(), Dataset::open(&again).unwrap());
         // Stored pictures byte by byte: a JPEG is kept and not encoded a second time.
         let exact = CompareOptions { pixels: PixelCheck::Stored, ..CompareOptions::default() };
         let c = compare(&a, &b, &exact).unwrap();
         assert!(c.equal, "{name}: {:#?}", c.differences);
-        assert_eq!((c.sets, c.frames), (12, 48));
+        assert_eq!((c.sets, c.frames, c.batches), (12, 48, 24));
+        let info = b.info().unwrap();
+        let unit = info.accounts.iter().find(|a| a.stream.to_string() == "left/imu").unwrap();
+        assert_eq!((unit.captured, unit.delivered), (24, 24), "{name}");
         // What the way gives anew, and nothing else.
         let c = compare(&a, &b, &CompareOptions { strict: true, ..exact }).unwrap();
         let mut fields: Vec<_> = c.counts.iter().map(|c| c.field.as_str()).collect();
@@ -357,6 +397,46 @@ fn a_recording_never_goes_back_in_time() {
         .map(|s| s.unwrap().tick)
         .collect();
     assert_eq!(sets, [Made::default().tick(9), Made::default().tick(10)]);
+}
+
+#[test]
+fn a_recording_of_a_replay_ends_by_itself_and_begins_only_where_it_fits() {
+    let home = Home::default();
+    let path = made(&home, "a", &Made { sets: 300, ..Made::default() });
+    let replay = start(&home, &[path], ReplayOptions { paused: true, ..ReplayOptions::default() });
+    let control = replay.control();
+    let asks = |directory, max_duration_s: f64| RecordRequest {
+        directory: Some(directory),
+        max_duration_s: Some(max_duration_s),
+        ..RecordRequest::default()
+    };
+    let e = control.record_start(&asks(home.path("again"), -1.0)).unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::BadInput);
+    if let Some(small) = Tmpfs::mount(&home.path("small"), 8 << 20) {
+        let e = control.record_start(&asks(small.path().to_owned(), 3600.0)).unwrap_err();
+        assert_eq!(e.kind(), ErrorKind::NoSpace, "{e}");
+        assert_eq!(std::fs::read_dir(small.path()).unwrap().count(), 0, "nothing was begun");
+    }
+    control.record_start(&asks(home.path("again"), 1.0)).unwrap();
+    resume(&replay);
+    let end = HostTime::now().plus(PATIENCE);
+    let recorded = loop {
+        let recorded = control.status().recording.unwrap();
+        if !recorded.active {
+            break recorded;
+        }
+        assert!(!end.from_now().is_zero(), "it goes on: {recorded:?}");
+        std::thread::sleep(Duration::from_millis(20));
+    };
+    assert!(recorded.error.is_none() && recorded.dropped.is_empty(), "{recorded:?}");
+    assert_eq!(control.record_stop().unwrap_err().kind(), ErrorKind::WrongState);
+    let progress = replay.progress();
+    assert!(!progress.done && !progress.paused, "the replay goes on");
+    let dataset = Dataset::open(recorded.path.as_ref()).unwrap();
+    let sets = dataset.sets(depthrig_recorder::SetRange::ALL).map(Result::unwrap).count() as u64;
+    // Of 60 s a second was asked for; a loaded machine may be late to end it.
+    assert!(sets == recorded.sets && (1..150).contains(&sets), "{sets} sets of {}", recorded.sets);
+    assert!(dataset.session().outcome.as_ref().unwrap().complete);
 }
 
 #[test]

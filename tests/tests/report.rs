@@ -61,7 +61,15 @@ fn the_fill_rate_of_a_report_is_that_of_the_metrics() {
     let utc = UtcPair { mono: HostTime::from_ns(1), utc_ns: 1_700_000_000_000_000_000, width_ns: 1 };
     let frames = frames.collect();
     recorder
-        .push(RecordSet { id: 1, tick: HostTime::from_ns(1), utc, frames, missing: vec![], spread_ns: 0 })
+        .push(RecordSet {
+            id: 1,
+            tick: HostTime::from_ns(1),
+            utc,
+            frames,
+            missing: vec![],
+            motion: Vec::new(),
+            spread_ns: 0,
+        })
         .unwrap();
     recorder.finish().unwrap();
 

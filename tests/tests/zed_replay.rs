@@ -2,12 +2,13 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use core::ops::ControlFlow;
-use depthrig_bus::{FrameFlags, PixelFormat};
+use depthrig_bus::{FrameFlags, FrameHeader, MotionSample, PixelFormat};
 use depthrig_calib::stereo::Preset;
 use depthrig_daemon::zed_replay::{Mode, NetworkChoice, Step, ZedReplayOptions, zed_replay};
 use depthrig_drivers::zed::replay::made;
 use depthrig_recorder::{
-    CompareOptions, Dataset, ErrorKind, PixelMode, SetRange, VerifyOptions, compare, verify,
+    CompareOptions, Dataset, DatasetSet, ErrorKind, PixelMode, RecordMotion, Session, SetRange,
+    VerifyOptions, compare, verify,
 };
 use depthrig_tests::eyes::Eyes;
 use std::io::{BufRead, BufReader};
@@ -27,6 +28,16 @@ fn go_on(_: Step, _: u64, _: u64) -> ControlFlow<()> {
 
 fn u16s(bytes: &[u8]) -> Vec<u16> {
     bytes.as_chunks().0.iter().map(|b| u16::from_le_bytes(*b)).collect()
+}
+
+/// A set has what the camera's unit, the second of the original, sent before it, and nothing of the other camera's.
+fn check_motion(set: &DatasetSet, old: &DatasetSet, session: &Session, original: &Dataset) {
+    assert_eq!(original.session().motion[1..], session.motion);
+    let (mine, theirs) = (&set.motion[0], &old.motion[1]);
+    let samples = |m: &RecordMotion| m.samples.iter().map(MotionSample::to_bytes).collect::<Vec<_>>();
+    assert_eq!((set.motion.len(), mine.unit, samples(mine)), (1, 0, samples(theirs)));
+    let times = |h: &FrameHeader| (h.sequence, h.device_sequence, h.capture_time_ns, h.captured);
+    assert_eq!(times(&mine.header), times(&theirs.header));
 }
 
 #[test]
@@ -75,6 +86,7 @@ fn every_mode_has_depth_that_is_right() {
     let before = original.sets_with(SetRange::ALL, PixelMode::None).map(Result::unwrap);
     for (n, (set, old)) in sets.zip(before).enumerate() {
         assert_eq!((set.id, set.tick, set.utc_ns), (old.id, old.tick, old.utc_ns));
+        check_motion(&set, &old, session, &original);
         if eyes.one_eyed.contains(&(n as u64)) {
             assert_eq!(
                 (set.frames.len(), set.missing.len()),
@@ -176,6 +188,29 @@ fn swapped_eyes_are_said() {
     zed_replay(&plain, &out, &options(&CLASSICAL[..1], 1), &mut go_on).unwrap();
 }
 
+/// A calibration that leaves rows apart is said, and kept with what was made by it.
+#[test]
+fn rows_that_are_apart_are_said() {
+    let dir = tempfile::tempdir().unwrap();
+    for (rows_apart, is_bad) in [(0.0, false), (-1.5, true)] {
+        let [source, out] = ["source", "out"].map(|name| dir.path().join(format!("{name}{is_bad}")));
+        // Two looks at the rows: the first pair and the fifth.
+        Eyes { rows_apart, ..Eyes::default() }.record(&source);
+        let report = zed_replay(&source, &out, &options(&CLASSICAL[..1], 1), &mut go_on).unwrap();
+        let noted = report
+            .notes
+            .iter()
+            .any(|n| n.starts_with("zed2i: left and right are not rectified to the same rows"));
+        assert_eq!(noted, is_bad, "{:?}", report.notes);
+        let session = Dataset::open(&out).unwrap().session().clone();
+        let kept = &session.extra["zed_replay"];
+        assert_eq!(kept.get("warning").is_some(), is_bad, "{kept}");
+        let rows = kept["rows"].as_str().unwrap();
+        let said = if is_bad { ["lies 1.5", "px higher"] } else { ["lies 0.0", " 2 pairs)"] };
+        assert!(said.iter().all(|s| rows.contains(s)), "{rows}");
+    }
+}
+
 /// A folder of side-by-side pictures: depth by the factory calibration, times by the names.
 #[test]
 fn a_folder_of_pictures() {
@@ -234,6 +269,42 @@ fn an_svo2_file() {
     assert!(e.to_string().contains("kitchen.svo2"), "{e}");
 }
 
+/// Each mode of `at_once`, which `options` made, has the frames that it has alone.
+fn modes_are_those_alone(source: &Path, at_once: &Dataset, options: &ZedReplayOptions, dir: &Path) {
+    let frames = |dataset: &Dataset, mode: &str| {
+        let mut all = Vec::new();
+        for set in dataset.sets_with(SetRange::ALL, PixelMode::Decoded).map(Result::unwrap) {
+            let of_mode = set.frames.into_iter().filter(|f| f.header.stream().ends_with(&format!("_{mode}")));
+            all.extend(of_mode.map(|f| {
+                (set.id, f.header.stream().to_owned(), f.header.refiner_model().to_owned(), f.pixels)
+            }));
+        }
+        assert!(!all.is_empty(), "{mode}");
+        all
+    };
+    for mode in &options.modes {
+        let out = dir.join(format!("only_{mode}"));
+        let report =
+            zed_replay(source, &out, &ZedReplayOptions { modes: vec![*mode], ..options.clone() }, &mut go_on);
+        assert!(report.unwrap().modes[0].shared_with.is_empty());
+        let same = frames(at_once, mode.name()) == frames(&Dataset::open(&out).unwrap(), mode.name());
+        assert!(same, "{mode} is not what it is alone");
+    }
+}
+
+#[test]
+fn presets_share_their_matching_and_stay_what_they_are_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
+    Eyes { sets: 3, one_eyed: vec![1], ..Eyes::default() }.record(&source);
+    let options = options(&CLASSICAL, 2);
+    let report = zed_replay(&source, &out, &options, &mut go_on).unwrap();
+    assert_eq!(report.modes[1].shared_with, ["performance", "quality"]);
+    let once: Vec<_> = report.modes.iter().map(|m| m.stereo_s).collect();
+    assert!(once.iter().all(|s| (s - report.cpu.stereo_s).abs() < 1e-9), "{once:?} {:?}", report.cpu);
+    modes_are_those_alone(&source, &Dataset::open(&out).unwrap(), &options, dir.path());
+}
+
 /// A network of one's own beside the classical modes; skipped, with a line that says so, without ONNX Runtime.
 #[test]
 fn a_network_is_a_mode_like_any_other() {
@@ -251,7 +322,8 @@ fn a_network_is_a_mode_like_any_other() {
         pixels: None,
         negative: false,
     };
-    let modes = vec![CLASSICAL[2], Mode::Neural];
+    // The network between two presets, whose matching is shared.
+    let modes = vec![CLASSICAL[2], Mode::Neural, CLASSICAL[0]];
     let options = ZedReplayOptions { modes, network: Some(network), ..options(&[], 2) };
     let report = match zed_replay(&source, &out, &options, &mut go_on) {
         Err(e) if e.to_string().contains("ONNX Runtime was not found") => {
@@ -273,6 +345,7 @@ fn a_network_is_a_mode_like_any_other() {
             z.iter().zip(&truth).filter(|(z, t)| (f64::from(**z) * 1e-3 / **t - 1.0).abs() < 0.05).count();
         assert!(right * 10 > truth.len() * 7, "{right} of {}", truth.len());
     }
+    modes_are_those_alone(&source, &dataset, &options, dir.path());
     // One with other inputs is refused before anything is written.
     let wrong = depthrig_cdm::MadeNetwork { channels: 4, ..Default::default() };
     std::fs::write(&file, wrong.file()).unwrap();

@@ -71,6 +71,11 @@ pub fn to_rgb(header: &FrameHeader, pixels: &[u8]) -> Result<RgbImage> {
         }
         Some(PixelFormat::Mono16) => stretched(rows(header, pixels)?),
         Some(PixelFormat::DisparityF32) => disparity_colors(rows(header, pixels)?),
+        Some(PixelFormat::Motion) => bail!(
+            "{}/{} gives motion samples and no pictures; depthrig tap prints them",
+            header.camera(),
+            header.stream()
+        ),
         Some(other) => bail!("{} frames cannot be shown yet", other.name()),
         None => bail!("the frame's pixel format is unknown to this version"),
     };

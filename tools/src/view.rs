@@ -214,8 +214,11 @@ fn narrow(camera: &CameraStatus, stream: &StreamStatus) -> Vec<String> {
             Some(refine) if stream.derived => refine.state.name().to_owned(),
             _ => camera.state.name().to_owned(),
         },
-        format!("{}x{}", stream.width, stream.height),
-        format!("{:.1}", stream.rate_hz),
+        // A motion unit has no picture; its rate is that of its samples, its frames are batches.
+        stream
+            .samples_hz
+            .map_or_else(|| format!("{}x{}", stream.width, stream.height), |_| "motion".to_owned()),
+        format!("{:.1}", stream.samples_hz.unwrap_or(stream.rate_hz)),
         lost.to_string(),
         format!("{:.1}", stream.latency_p99_ms),
         format!("{:+.1}", stream.clock.rate_ppm),
@@ -231,6 +234,7 @@ fn trouble(camera: &CameraStatus, style: Style) -> Option<String> {
         let text = format!("{} for {}{why}", camera.state.name(), out::seconds(camera.state_for_s));
         told.push(color_of(camera.state).map_or_else(|| text.clone(), |color| style.paint(color, &text)));
     }
+    told.extend(camera.warnings.iter().map(|w| style.paint(YELLOW, w)));
     for stream in camera.streams.iter().filter(|s| s.clock.metadata_lost > 0) {
         told.push(format!("{} had {} frames without metadata", stream.id, stream.clock.metadata_lost));
     }

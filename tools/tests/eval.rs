@@ -7,7 +7,7 @@ mod support;
 use serde_json::Value;
 use std::path::Path;
 use std::process::Command;
-use support::Home;
+use support::{Home, Ran};
 
 type Depth = image::ImageBuffer<image::Luma<u16>, Vec<u16>>;
 
@@ -63,11 +63,19 @@ fn folders(home: &Home) {
 }
 
 fn evaluate(home: &Home, args: &[&str]) -> Value {
+    serde_json::from_str(&evaluation(home, args).good()).unwrap()
+}
+
+fn evaluate_recorded(home: &Home, args: &[&str]) -> Value {
+    serde_json::from_str(&evaluation(home, args).done()).unwrap()
+}
+
+fn evaluation(home: &Home, args: &[&str]) -> Ran {
     let at = |a: &&str| a.replace("@/", &format!("{}/", home.path().display()));
     let args: Vec<String> = args.iter().map(at).collect();
     let args: Vec<&str> =
         ["eval", "-q", "--json"].into_iter().chain(args.iter().map(String::as_str)).collect();
-    serde_json::from_str(&home.run(&args).good()).unwrap()
+    home.run(&args)
 }
 
 /// The definitions once more, with arrays.
@@ -260,11 +268,11 @@ fn a_recording_with_truth_is_compared_in_one_view() {
         let out = home.path().join(name);
         let said =
             home.run(&["run", &rig, "--record", out.to_str().unwrap(), "--seconds", "2", "--json", "-q"]);
-        let summary: Value = serde_json::from_str(&said.good()).unwrap();
+        let summary: Value = serde_json::from_str(&said.done()).unwrap();
         summary["recording"]["path"].as_str().unwrap().to_owned()
     };
     let path = record("with", true);
-    let got = evaluate(&home, &[&path, "--pred", "depth", "--pred", "depth_true"]);
+    let got = evaluate_recorded(&home, &[&path, "--pred", "depth", "--pred", "depth_true"]);
     let row = |name: &str| {
         let rows = got["rows"].as_array().unwrap();
         rows.iter().find(|r| r["name"] == name).unwrap_or_else(|| panic!("{name} in {got}")).clone()
@@ -277,7 +285,7 @@ fn a_recording_with_truth_is_compared_in_one_view() {
     assert!(value(&moved, "delta_1") > 0.98 && value(&moved, "l1_m") < 0.02, "{}", moved["mean_of_pictures"]);
     assert!(value(&raw, "strict_l1_m") > 2.0 * value(&moved, "strict_l1_m"), "{got}");
     // In depth's own view nothing moves, and the truth is perfect.
-    let own = evaluate(&home, &[&path, "--pred", "depth_true", "--truth", "depth_true"]);
+    let own = evaluate_recorded(&home, &[&path, "--pred", "depth_true", "--truth", "depth_true"]);
     assert_eq!(own["rows"][0]["mean_of_pictures"]["strict_l1_m"], 0.0);
 
     let without = record("without", false);

@@ -51,6 +51,7 @@ fn record(dir: &Path, scene: &str, started_utc_ns: i64) -> Recorder {
         utc,
         frames: vec![frame],
         missing: vec![],
+        motion: Vec::new(),
         spread_ns: 0,
     };
     r.push(set).unwrap();

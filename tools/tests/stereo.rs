@@ -56,6 +56,27 @@ fn a_pair_becomes_floats_or_sixteen_bits() {
 }
 
 #[test]
+fn rows_that_are_apart_are_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let [left, right] = pair(folder.path());
+    let low = folder.path().join("low.png").to_str().unwrap().to_owned();
+    let picture = image::open(&right).unwrap().into_luma8();
+    image::GrayImage::from_fn(241, 90, |x, y| *picture.get_pixel(x, y.saturating_sub(2))).save(&low).unwrap();
+    let out = folder.path().join("d.npy").to_str().unwrap().to_owned();
+    for (right, rows) in [(&right, 0.0), (&low, 2.0)] {
+        let ran =
+            Home::new().run(&["stereo", &left, right, "--max-disparity", "64", "--out", &out, "--json"]);
+        let told: serde_json::Value = serde_json::from_str(&ran.out).unwrap();
+        let middle = told["rows"]["middle_px"].as_f64().unwrap();
+        assert!((middle - rows).abs() < 0.1, "{told}");
+        let warnings = told["warnings"].as_array().unwrap();
+        assert_eq!(warnings.len(), usize::from(rows > 0.0), "{told}");
+        assert_eq!(ran.err.contains("not rectified to the same rows"), rows > 0.0, "{}", ran.err);
+        ran.good();
+    }
+}
+
+#[test]
 fn a_pair_is_the_same_in_every_lossless_form() {
     let folder = tempfile::tempdir().unwrap();
     let pictures = pair(folder.path()).map(|p| image::open(p).unwrap().into_luma8());

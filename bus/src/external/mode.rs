@@ -181,6 +181,10 @@ impl Mode {
 
     /// Whether every number can be; else which field cannot, and why.
     fn check(&self) -> Result<(), (&'static str, String)> {
+        if self.format.is_motion() {
+            let why = "is motion; a camera of another process gives pictures only".to_owned();
+            return Err(("format", why));
+        }
         for (field, side) in [("width", self.width), ("height", self.height)] {
             if !(1..=MAX_SIDE).contains(&side) {
                 return Err((field, format!("is {side}; it must be within 1 and {MAX_SIDE}")));

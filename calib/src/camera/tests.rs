@@ -98,6 +98,32 @@ fn differences(f: impl Fn(f64) -> Option<DVec2>) -> Option<DVec2> {
     Some((8.0 * a - b) / (12.0 * h))
 }
 
+/// The radius of this one ends at a pole, where what is shown goes to infinity.
+#[test]
+fn a_point_comes_back_from_beside_a_pole() {
+    let rational = [
+        0.095_178_666_268_142_54,
+        0.0,
+        0.0,
+        0.0,
+        0.038_650_026_012_146_725,
+        -0.263_642_456_444_254_3,
+        0.087_952_951_089_679_15,
+        -0.026_241_839_974_975_808,
+    ];
+    let k = Intrinsics {
+        coeffs: rational,
+        model: Distortion::Rational as u32,
+        ..Intrinsics::pinhole(600.0, 610.0, 320.5, 239.0)
+    };
+    let camera = Camera::new(&k).unwrap();
+    for i in 1..970 {
+        let p = DVec3::new(camera.max_radius() * f64::from(i) / 1000.0, 0.0, 1.0);
+        let there = camera.unproject(camera.project(p).unwrap());
+        assert!(there.is_some_and(|t| (t - p).length() < 1e-9), "{there:?}, not {p}");
+    }
+}
+
 proptest! {
     #[test]
     fn a_pixel_comes_back(k in lenses(), pixel in pixels()) {

@@ -1,7 +1,7 @@
 //! Against `OpenCV`, against the eyes' own projection, and with what is no stereo camera.
 
 use super::*;
-use depthrig_bus::Distortion;
+use depthrig_bus::{Distortion, PixelFormat};
 use glam::{DAffine3, DVec2, DVec3};
 use proptest::prelude::*;
 use serde::Deserialize;
@@ -128,15 +128,13 @@ fn pictures_are_those_of_opencv() {
                 assert!(most <= 2, "{} {view:?} {what}: {most} levels apart", theirs.name);
             };
             let (mut one, mut three) = (vec![7; n], vec![7; 3 * n]);
-            own.grey(view, &grey, &mut one).unwrap();
+            own.rectify(view, PixelFormat::Mono8, &grey, &mut one, None).unwrap();
             same("grey", &one, 1);
-            own.rgb(view, &rgb, &mut three).unwrap();
+            own.rectify(view, PixelFormat::Rgb8, &rgb, &mut one, Some(&mut three)).unwrap();
             same("rgb", &three, 3);
-            own.grey_from_rgb(view, &rgb, &mut one).unwrap();
             same("luma", &one, 1);
-            own.rgb_from_yuyv(view, &yuyv, &mut three).unwrap();
+            own.rectify(view, PixelFormat::Yuyv, &yuyv, &mut one, Some(&mut three)).unwrap();
             same("yuyv", &three, 3);
-            own.grey_from_yuyv(view, &yuyv, &mut one).unwrap();
             same("grey", &one, 1);
         }
     }
@@ -202,12 +200,18 @@ fn what_is_no_stereo_camera_is_refused() {
     said(message(&left, &pose, (1_000_000, 720)), "is no size");
     assert_eq!(message(&Intrinsics::default(), &pose, size).0, ErrorKind::NoCalibration);
     let own = theirs.rectifier();
-    let mut out = vec![0; 1280 * 720];
-    let short = own.grey(View::Left, &[0; 100], &mut out).unwrap_err();
-    assert_eq!(short.kind(), ErrorKind::SizeMismatch);
+    let n = 1280 * 720;
+    let refused = |format, bytes: usize, grey: usize, rgb: usize| {
+        let (mut grey, mut rgb) = (vec![0; grey], vec![0; rgb]);
+        own.rectify(View::Left, format, &vec![0; bytes], &mut grey, Some(&mut rgb)).unwrap_err().kind()
+    };
+    for (bytes, grey, rgb) in [(100, n, 3 * n), (n, n - 1, 3 * n), (n, n, 3 * n + 1)] {
+        assert_eq!(refused(PixelFormat::Mono8, bytes, grey, rgb), ErrorKind::SizeMismatch);
+    }
+    assert_eq!(refused(PixelFormat::Z16, 2 * n, n, 3 * n), ErrorKind::BadInput);
     let odd = Rectifier::new(&left, &right, &pose, (1279, 720)).unwrap();
-    let e =
-        odd.rgb_from_yuyv(View::Left, &vec![0; 1279 * 720 * 2], &mut vec![0; 1279 * 720 * 3]).unwrap_err();
+    let n = 1279 * 720;
+    let e = odd.rectify(View::Left, PixelFormat::Yuyv, &vec![0; n * 2], &mut vec![0; n], None).unwrap_err();
     assert!(e.to_string().contains("its width is odd"), "{e}");
-    odd.grey(View::Left, &vec![9; 1279 * 720], &mut vec![0; 1279 * 720]).unwrap();
+    odd.rectify(View::Left, PixelFormat::Mono8, &vec![9; n], &mut vec![0; n], None).unwrap();
 }

@@ -1,6 +1,7 @@
 //! Disparity to depth: `focal * baseline / disparity`, in whole units as a sensor gives it, or in metres.
 
 use crate::error::check_len;
+use crate::simd::for_every_processor;
 use crate::{Error, ErrorKind, Result};
 
 /// Units that 16 bits cannot hold.
@@ -33,14 +34,20 @@ pub fn depth_from_disparity(
     }
     let units = (focal_px * baseline_m / unit_m) as f32;
     let (near, far) = (((range_m.0 / unit_m) as f32).max(1.0), (range_m.1 / unit_m).min(65_535.0) as f32);
-    for (z, d) in out.iter_mut().zip(disparity) {
-        // NaN and 0 become the bound, which is too far. `round` would be a call for each pixel.
-        let exact = (units / d).min(BEYOND);
-        let whole = exact as i32;
-        let depth = (whole + i32::from(exact - whole as f32 >= 0.5)) as f32;
-        *z = if depth >= near && depth <= far { depth as u16 } else { 0 };
-    }
+    to_units(disparity, units, near, far, out);
     Ok(())
+}
+
+for_every_processor! {
+    fn to_units(disparity: &[f32], units: f32, near: f32, far: f32, out: &mut [u16]) {
+        for (z, d) in out.iter_mut().zip(disparity) {
+            // NaN and 0 become the bound, which is too far. `round` would be a call for each pixel.
+            let exact = (units / d).min(BEYOND);
+            let whole = exact as i32;
+            let depth = (whole + i32::from(exact - whole as f32 >= 0.5)) as f32;
+            *z = if depth >= near && depth <= far { depth as u16 } else { 0 };
+        }
+    }
 }
 
 /// Depth in metres from disparity in pixels: `focal_px * baseline_m / disparity`; NaN where there is none and where
@@ -109,12 +116,14 @@ mod tests {
             let halves = halves.into_iter().map(|n| 84_000.0 / (f32::from(n) + 0.5));
             let d: Vec<_> = d.into_iter().chain(halves).collect();
             let mut z = vec![0; d.len()];
-            depth_from_disparity(&d, 700.0, 0.12, 0.001, (0.0, 100.0), &mut z).unwrap();
-            for (d, z) in d.into_iter().zip(z) {
-                let depth = (84_000.0 / d).round();
-                let expected = if (1.0..=65_535.0).contains(&depth) { depth as u16 } else { 0 };
-                prop_assert_eq!(z, expected, "{} px", d);
-            }
+            crate::simd::in_every_width(|width| {
+                depth_from_disparity(&d, 700.0, 0.12, 0.001, (0.0, 100.0), &mut z).unwrap();
+                for (d, z) in d.iter().zip(&z) {
+                    let depth = (84_000.0 / d).round();
+                    let expected = if (1.0..=65_535.0).contains(&depth) { depth as u16 } else { 0 };
+                    assert_eq!(*z, expected, "{d} px {width:?}");
+                }
+            });
         }
     }
 

@@ -4,7 +4,8 @@
 //! best. What repeats fools that: of a fence whose next post is nearer than the right one, every pixel says the wrong
 //! thing. So a picture that looks like itself elsewhere says nothing.
 
-use super::sgm::{SgmMatcher, halve};
+use super::pyramid::Pyramid;
+use super::sgm::SgmMatcher;
 use super::{DisparityMap, Gray, MAX_DISPARITIES, Matcher, Parameters, Preset, Resolution, StereoPair};
 use crate::{Error, ErrorKind, Result};
 use core::ops::Range;
@@ -38,20 +39,12 @@ const APART_PX: usize = 3;
 /// Pictures are halved until they are no wider than this.
 const WIDTH: usize = 360;
 
-/// Both pictures in some size.
-#[derive(Debug)]
-struct Level {
-    size: (usize, usize),
-    eyes: [Vec<u8>; 2],
-}
-
 /// Looks whether things lie further left in the right picture, as they must, or further right. A check costs about
 /// as much as a pair with [`Preset::Performance`] and allocates nothing after the first.
 #[derive(Debug)]
 pub struct OrderCheck {
     size: (usize, usize),
-    /// Each half as large as the one before.
-    levels: Vec<Level>,
+    pyramid: Pyramid,
     /// A picture of the last size whose pixels were moved.
     moved: Vec<u8>,
     /// Disparities to look for in each direction, in the last size.
@@ -66,12 +59,8 @@ impl OrderCheck {
     /// # Errors
     /// As [`SgmMatcher::new`].
     pub fn new(width: usize, height: usize) -> Result<Self> {
-        let mut levels = Vec::new();
-        let (mut w, mut h) = (width, height);
-        while w > WIDTH {
-            (w, h) = (w.div_ceil(2), h.div_ceil(2));
-            levels.push(Level { size: (w, h), eyes: [vec![0; w * h], vec![0; w * h]] });
-        }
+        let pyramid = Pyramid::new((width, height), WIDTH);
+        let (w, h) = pyramid.smallest((width, height));
         let reach = (w / 6).clamp(1, MAX_DISPARITIES / 2);
         let parameters = Parameters {
             resolution: Resolution::Full,
@@ -84,7 +73,7 @@ impl OrderCheck {
         };
         let matcher = SgmMatcher::new(w, h, &parameters, 1)?;
         let moved = vec![0; w * h];
-        Ok(Self { size: (width, height), levels, moved, reach, matcher, map: DisparityMap::default() })
+        Ok(Self { size: (width, height), pyramid, moved, reach, matcher, map: DisparityMap::default() })
     }
 
     /// What `pair` looks like.
@@ -94,16 +83,9 @@ impl OrderCheck {
     pub fn check(&mut self, pair: &StereoPair<'_>) -> Result<Order> {
         pair.left.check("left", self.size.0, self.size.1)?;
         pair.right.check("right", self.size.0, self.size.1)?;
-        let Self { levels, moved, reach, matcher, map, .. } = self;
-        for i in 0..levels.len() {
-            let (before, here) = levels.split_at_mut(i);
-            let Some(level) = here.first_mut() else { break };
-            let from = before.last().map_or([pair.left, pair.right], Level::both);
-            for (from, to) in from.iter().zip(&mut level.eyes) {
-                halve(from, to);
-            }
-        }
-        let [left, right] = levels.last().map_or([pair.left, pair.right], Level::both);
+        let Self { pyramid, moved, reach, matcher, map, .. } = self;
+        pyramid.fill(pair);
+        let [left, right] = pyramid.level(pair, pyramid.halvings());
         let mut look = |left: &Gray<'_>, right: &Gray<'_>| sides(matcher, map, moved, *reach, left, right);
         // The search ends at the sides of the picture, which draws what fits everywhere to one of them; with the pictures
         // exchanged it is drawn there again, and what was found is found on the other side.
@@ -139,13 +121,6 @@ impl OrderCheck {
             ));
         }
         Ok(())
-    }
-}
-
-impl Level {
-    fn both(&self) -> [Gray<'_>; 2] {
-        let (w, h) = self.size;
-        [Gray::packed(&self.eyes[0], w, h), Gray::packed(&self.eyes[1], w, h)]
     }
 }
 

@@ -20,11 +20,13 @@ mod lanes;
 mod model;
 mod pass;
 mod planes;
+mod presets;
 #[cfg(test)]
 mod tests;
 mod volume;
 
 pub(super) use filter::halve;
+pub use presets::SgmPresets;
 
 /// Largest side of a picture.
 const MAX_SIDE: usize = 16_384;
@@ -232,6 +234,65 @@ impl SgmMatcher {
     }
 }
 
+/// Where the results of each resolution go that somebody wants.
+#[derive(Default)]
+struct Outs<'a> {
+    full: Option<&'a mut DisparityMap>,
+    half: Option<&'a mut DisparityMap>,
+    both: Option<&'a mut DisparityMap>,
+}
+
+impl<'a> Outs<'a> {
+    fn of(&mut self, resolution: Resolution) -> &mut Option<&'a mut DisparityMap> {
+        match resolution {
+            Resolution::Full => &mut self.full,
+            Resolution::Half => &mut self.half,
+            Resolution::Both => &mut self.both,
+        }
+    }
+}
+
+/// Disparities in pixels from those in 256ths.
+fn to_pixels(map: &[u16], out: &mut [f32]) {
+    for (to, d) in out.iter_mut().zip(map) {
+        *to = if *d == NONE { f32::NAN } else { f32::from(*d) / f32::from(ONE) };
+    }
+}
+
+impl SgmMatcher {
+    /// Fills what of `outs` is wanted; the engines that it takes are there.
+    fn run_into(&mut self, pair: &StereoPair<'_>, outs: Outs<'_>) -> Result<()> {
+        pair.left.check("left", self.width, self.height)?;
+        pair.right.check("right", self.width, self.height)?;
+        let (parameters, pool) = (&self.parameters, self.pool.as_ref());
+        let Outs { mut full, mut half, mut both } = outs;
+        for out in [&mut full, &mut half, &mut both].into_iter().flatten() {
+            out.resize(self.width, self.height);
+        }
+        if let Some(engine) = &mut self.half {
+            engine.run(pair, pool);
+            if let Some(out) = half {
+                out.confidence.copy_from_slice(&engine.sure);
+                to_pixels(&engine.map, &mut out.disparity);
+            }
+        }
+        let Some(engine) = &mut self.full else { return Ok(()) };
+        let Some(first) = full.as_mut().or(both.as_mut()) else { return Ok(()) };
+        let map = engine.run(pair, parameters, pool, &mut first.confidence);
+        if let Some(out) = &mut full {
+            to_pixels(map, &mut out.disparity);
+        }
+        if let (Some(out), Some(half)) = (both, &self.half) {
+            if let Some(full) = full {
+                out.confidence.copy_from_slice(&full.confidence);
+            }
+            filter::fill_from((map, &mut out.confidence), (&half.map, &half.sure));
+            to_pixels(map, &mut out.disparity);
+        }
+        Ok(())
+    }
+}
+
 impl Matcher for SgmMatcher {
     fn describe(&self) -> Description {
         let bytes = self.full.as_ref().map_or(0, Engine::bytes) + self.half.as_ref().map_or(0, Half::bytes);
@@ -244,28 +305,8 @@ impl Matcher for SgmMatcher {
     }
 
     fn run(&mut self, pair: &StereoPair<'_>, out: &mut DisparityMap) -> Result<()> {
-        pair.left.check("left", self.width, self.height)?;
-        pair.right.check("right", self.width, self.height)?;
-        out.resize(self.width, self.height);
-        let (parameters, pool) = (&self.parameters, self.pool.as_ref());
-        let map = match (&mut self.full, &mut self.half) {
-            (Some(full), None) => full.run(pair, parameters, pool, &mut out.confidence),
-            (None, Some(half)) => {
-                half.run(pair, pool);
-                out.confidence.copy_from_slice(&half.sure);
-                &mut half.map
-            }
-            (Some(full), Some(half)) => {
-                half.run(pair, pool);
-                let map = full.run(pair, parameters, pool, &mut out.confidence);
-                filter::fill_from((map, &mut out.confidence), (&half.map, &half.sure));
-                map
-            }
-            (None, None) => return Ok(()),
-        };
-        for (to, d) in out.disparity.iter_mut().zip(map) {
-            *to = if *d == NONE { f32::NAN } else { f32::from(*d) / f32::from(ONE) };
-        }
-        Ok(())
+        let mut outs = Outs::default();
+        *outs.of(self.parameters.resolution) = Some(out);
+        self.run_into(pair, outs)
     }
 }

@@ -108,6 +108,7 @@ pub(crate) fn rig_with(port: &str) -> RigStatus {
         state: CameraState::Streaming,
         state_for_s: 1.0,
         message: None,
+        warnings: Vec::new(),
         reconnects: 0,
         refine: None,
         streams: Vec::new(),
@@ -253,8 +254,30 @@ fn families_are_told_apart_and_hubs_are_no_cameras() {
         found.cameras[0].nodes.iter().any(|n| n.role == "hid" && n.path.ends_with("hidraw2")),
         "{found:?}"
     );
+    assert!(found.cameras[0].problems.is_empty(), "{:?}", found.cameras[0].problems);
     assert_eq!(found.cameras[3].nodes.len(), 2);
     assert!(found.unusable[0].contains("recovery"), "{:?}", found.unusable);
+}
+
+#[test]
+fn a_motion_unit_that_may_not_be_opened_is_told() {
+    let video = MadeDevice {
+        id: (0x2b03, 0xf880),
+        interfaces: vec![(0, 0x0e, 1, "uvcvideo", vec![10, 11], vec![])],
+        ..MadeDevice::new("4-4.1", 0)
+    };
+    let unit = MadeDevice {
+        id: (0x2b03, 0xf881),
+        interfaces: vec![(0, 3, 0, "usbhid", vec![], vec![2])],
+        ..MadeDevice::new("3-4.2", 0)
+    };
+    let made = Made { denied: vec!["hidraw2".into()], ..Made::default() };
+    let found = look_at(&[video, unit], &made, |_| {});
+    let told = found.cameras[0].problems.join("; ");
+    assert!(
+        told.contains("hidraw2 may not be opened") && told.contains("depthrig install --print"),
+        "{told}"
+    );
 }
 
 #[test]

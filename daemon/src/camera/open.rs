@@ -6,11 +6,11 @@ use crate::config::BackendConfig;
 use crate::sink::BusSink;
 use crate::stage::Lane;
 use crate::stream::Stream;
-use depthrig_bus::{FrameHeader, StreamId, shm};
+use depthrig_bus::{FrameHeader, StreamId, StreamName, shm};
 use depthrig_calib::PoseExt;
 use depthrig_drivers::capture::Session;
 use depthrig_drivers::stereo::StereoOptions;
-use depthrig_drivers::{Backend, DeviceInfo, ErrorKind as DriverErrorKind, StreamProfile};
+use depthrig_drivers::{Backend, DeviceInfo, ErrorKind as DriverErrorKind, StreamProfile, StreamRequest};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// A camera's driver, made at the first opening and kept for the later ones.
@@ -36,7 +36,8 @@ pub(super) fn open_session(
         backend.open(None).map_err(in_camera)?
     };
     let info = device.info().clone();
-    let stream = device.start(&camera.config.streams).map_err(in_camera)?;
+    let wanted = requests(camera, device.profiles());
+    let stream = device.start(&wanted).map_err(in_camera)?;
     let streams = adopt(camera, shared, stream.profiles(), &info).map_err(in_camera)?;
     let mut ports = Vec::new();
     for s in streams {
@@ -61,6 +62,18 @@ pub(super) fn open_session(
         in_camera(depthrig_drivers::Error::new(DriverErrorKind::Io, e.to_string()).with_source(e))
     })?;
     Ok(Session { info, stream, sink: Box::new(BusSink::new(ports, Arc::clone(&shared.frames))) })
+}
+
+/// What is asked of the device: what the rig lists. Without a list it is every stream, at later openings but for a motion
+/// unit that was not there at the first: its stream would be one that nobody knows of.
+fn requests(camera: &Camera, offered: &[StreamProfile]) -> Vec<StreamRequest> {
+    let state = camera.state();
+    let known = |name: &StreamName| state.streams.iter().any(|s| s.id.stream == *name);
+    let is_new = offered.iter().any(|p| p.format.is_motion() && !known(&p.stream));
+    if camera.config.streams.is_empty() && !state.streams.is_empty() && is_new {
+        return state.streams.iter().map(|s| StreamRequest::any(s.id.stream.clone())).collect();
+    }
+    camera.config.streams.clone()
 }
 
 /// Opens the way from the camera's streams to those that are made of them, at its first opening. All of it is there
@@ -131,6 +144,7 @@ fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, de
         Some(stereo) => {
             let options = StereoOptions {
                 computed: Arc::clone(&camera.computed),
+                notice: Arc::clone(&camera.notice),
                 sets: Arc::clone(&shared.stage.sets),
                 ..stereo.options()
             };
@@ -179,9 +193,13 @@ fn adopt(
         };
         state.streams = profiles.iter().map(|p| stream(p, camera.config.records(&p.stream))).collect();
         state.made = made.iter().map(|(p, record)| stream(p, *record)).collect();
-    } else if state.streams.len() != profiles.len()
-        || state.streams.iter().zip(profiles).any(|(s, p)| !same_mode(&s.profile, p))
-    {
+        return Ok(state.streams.clone());
+    }
+    // A motion unit that did not come back with its camera is silent; its pictures matter more.
+    let is_back =
+        |s: &&Arc<Stream>| !s.profile.format.is_motion() || profiles.iter().any(|p| p.stream == s.id.stream);
+    let back: Vec<_> = state.streams.iter().filter(is_back).cloned().collect();
+    if back.len() != profiles.len() || back.iter().zip(profiles).any(|(s, p)| !same_mode(&s.profile, p)) {
         let had: Vec<_> = state.streams.iter().map(|s| s.profile.describe()).collect();
         let has: Vec<_> = profiles.iter().map(StreamProfile::describe).collect();
         return Err(depthrig_drivers::Error::new(
@@ -193,7 +211,7 @@ fn adopt(
             ),
         ));
     }
-    Ok(state.streams.clone())
+    Ok(back)
 }
 
 fn same_mode(a: &StreamProfile, b: &StreamProfile) -> bool {

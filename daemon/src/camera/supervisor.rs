@@ -158,8 +158,9 @@ impl Supervisor {
         self.heard.resize(state.streams.len(), unheard);
         let mut longest = None;
         for (stream, heard) in state.streams.iter().zip(&mut self.heard) {
-            // How long matching takes says nothing of the device.
-            if self.camera.config.joins_late(&stream.id.stream) {
+            // How long matching takes says nothing of the device. A motion unit that is silent alone is told of in the
+            // status: to open the camera again would cost its pictures, which matter more.
+            if self.camera.config.joins_late(&stream.id.stream) || stream.profile.format.is_motion() {
                 continue;
             }
             let captured = stream.books().captured;
@@ -180,7 +181,9 @@ impl Supervisor {
         if self.camera.config.stereo.as_ref().is_some_and(|s| s.every_pair) {
             return WAITS_FOR_MODES;
         }
-        let slowest = self.camera.state().streams.iter().map(|s| s.profile.period_ns()).max().unwrap_or(0);
+        let state = self.camera.state();
+        let pictures = state.streams.iter().filter(|s| !s.profile.format.is_motion());
+        let slowest = pictures.map(|s| s.profile.period_ns()).max().unwrap_or(0);
         Duration::from_secs_f64(self.shared.supervisor.stall_s).max(Duration::from_nanos(3 * slowest))
     }
 

@@ -9,7 +9,7 @@ use super::read::{Found, FromToml, Section, nearest};
 use super::rig::resolve;
 use depthrig_bus::Pose;
 use depthrig_drivers::synthetic::models::MODELS;
-use depthrig_drivers::synthetic::{ClockSim, FaultKind, ScheduledFault, StreamOverride, profiles};
+use depthrig_drivers::synthetic::{ClockSim, FaultKind, ScheduledFault, StreamOverride, imu, profiles};
 use depthrig_drivers::{Result, StreamRequest, choose_profiles};
 use std::path::{Path, PathBuf};
 
@@ -31,6 +31,9 @@ pub(super) fn read(
         pose_on_mount: pose,
         streams: Vec::new(),
         truth: field(s, "truth", d.truth, |c, v| c.truth = v),
+        // Who asks for its stream by name need not switch it on besides.
+        motion: field(s, "motion", d.motion, |c, v| c.motion = v)
+            || streams.iter().any(|w| w.request.stream.as_str() == imu::STREAM),
         clock: clock(s),
         faults: s.tables("fault", "[[camera.fault]]").into_iter().flatten().filter_map(fault).collect(),
         poses: field(s, "poses", d.poses, |c, v| c.poses = v),
@@ -46,6 +49,7 @@ pub(super) fn read(
         // Each alone, so that each has its own problem; what is wrong elsewhere was reported already.
         let problem = problem_of(|c| {
             (c.model, c.truth, c.cheap) = (config.model.clone(), config.truth, config.cheap);
+            c.motion = config.motion;
             c.streams.extend(config.streams.last().cloned());
         });
         let problem = problem.or_else(|| {
@@ -62,7 +66,8 @@ pub(super) fn read(
 /// The highest rate among the streams that `config` starts on `requests`, Hz.
 pub(super) fn fastest_rate_hz(config: &SyntheticSettings, requests: &[StreamRequest]) -> Result<f64> {
     let chosen = choose_profiles("", &profiles(config)?, requests)?;
-    Ok(chosen.iter().map(|p| p.rate_hz).fold(0.0, f64::max))
+    let pictures = chosen.iter().filter(|p| !p.format.is_motion());
+    Ok(pictures.map(|p| p.rate_hz).fold(0.0, f64::max))
 }
 
 fn model(s: &Section<'_, '_>, default: String) -> String {

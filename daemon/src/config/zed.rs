@@ -6,6 +6,7 @@ use super::read::Section;
 use super::rig::{not_empty, rate, resolve, within};
 use super::{BackendConfig, StereoConfig, ZedReplaySettings, ZedSettings};
 use super::{controls, stereo};
+use depthrig_drivers::motion::IMU;
 use depthrig_drivers::zed::{CalibrationFile, STREAMS};
 use std::path::{Path, PathBuf};
 
@@ -27,7 +28,9 @@ pub(super) fn read(
         Some(none) if none.as_os_str() == "none" => CalibrationFile::None,
         Some(path) => CalibrationFile::At(resolve(base, &path)),
     };
-    stereo::check_streams(s, "a ZED", &STREAMS, depth, streams);
+    // A recording is of the eyes alone.
+    let own: &[&str] = if s.has("input") { &STREAMS } else { &[STREAMS[0], STREAMS[1], IMU] };
+    stereo::check_streams(s, "a ZED", own, depth, streams);
     if depth.is_some() && calibration == CalibrationFile::None {
         let why = "stereo needs the factory calibration; remove calibration = \"none\", or [camera.stereo]";
         s.problem(s.at_key("calibration"), why);

@@ -56,6 +56,10 @@ pub struct LinkLoad {
 /// What a stream takes of the USB, bits a second. Colour is sent as YUYV or UYVY, 2 bytes a pixel, whatever it is turned
 /// into afterwards; the rest is sent as it is delivered.
 pub fn wire_bits_per_s(p: &StreamProfile) -> f64 {
+    // Its reports are some kilobytes a second on an endpoint of their own.
+    if p.format.is_motion() {
+        return 0.0;
+    }
     let bits = match p.format {
         PixelFormat::Mono8 | PixelFormat::Confidence8 => 8.0,
         PixelFormat::Nv12 => 12.0,

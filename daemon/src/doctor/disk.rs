@@ -119,9 +119,11 @@ pub(super) fn check(
     host: &Host,
     findings: &mut Vec<Finding>,
 ) -> DiskPlan {
-    let recorded = plans.iter().flat_map(|p| &p.profiles).filter(|(_, recorded)| *recorded);
-    let streams = recorded.map(|(p, _)| (p.format, p.frame_bytes()));
-    let needed = budget::bytes_per_s(streams, config.sets.rate_hz, &config.recording);
+    let recorded = plans.iter().flat_map(|p| &p.profiles).filter(|(_, recorded)| *recorded).map(|(p, _)| p);
+    let (units, pictures): (Vec<_>, Vec<_>) = recorded.partition(|p| p.format.is_motion());
+    let streams = pictures.iter().map(|p| (p.format, p.frame_bytes()));
+    let needed = budget::bytes_per_s(streams, config.sets.rate_hz, &config.recording)
+        + budget::motion_bytes_per_s(units.iter().map(|p| p.samples_hz()).sum());
     let disk = &host.disk;
     let directory = config.recording.directory.display();
     let reserve = reserve_bytes(&config.recording);

@@ -11,8 +11,12 @@ use std::path::Path;
 /// The longest time that can be asked for, seconds: ten years.
 const MAX_DURATION_S: f64 = 3.2e8;
 
+/// What a motion sample takes on the disk, bytes: its 64 exact ones, and the message for other readers (about 330 bytes, most
+/// of them zero).
+const SAMPLE_BYTES: f64 = 160.0;
+
 /// By how much a codec is taken to shrink a picture. Each is about two thirds of what was measured on recordings of
-/// real cameras (depth: zstd 3.5, rank 6.6; colour: JPEG of quality 95 with 4:4:4 11, PNG 2.4, zstd 2.0): a busier
+/// real cameras (depth: zstd 3.5, rank 7.0; colour: JPEG of quality 95 with 4:4:4 11, PNG 2.4, zstd 2.0): a busier
 /// scene packs worse, and to have been told too little costs a recording. Above quality 95 JPEG grows fast.
 fn ratio(format: PixelFormat, config: &RecordingConfig) -> f64 {
     match (format, config.color, config.depth) {
@@ -36,6 +40,11 @@ pub fn bytes_per_s(
     config: &RecordingConfig,
 ) -> f64 {
     streams.map(|(format, bytes)| bytes as f64 / ratio(format, config)).sum::<f64>() * sets_hz
+}
+
+/// About how many bytes a second the motion units write that measure `samples_hz` times a second together.
+pub fn motion_bytes_per_s(samples_hz: f64) -> f64 {
+    samples_hz * SAMPLE_BYTES
 }
 
 /// Refuses a time that no recording can have.

@@ -173,7 +173,8 @@ impl Importer for Write<'_> {
                 .collect();
             frames.append(&mut made);
             let utc = UtcPair { mono: tick, utc_ns, width_ns: 0 };
-            return Ok(Some(RecordSet { id, tick, utc, frames, missing, spread_ns }));
+            let motion = set.motion;
+            return Ok(Some(RecordSet { id, tick, utc, frames, missing, motion, spread_ns }));
         }
         Ok(None)
     }

@@ -101,8 +101,11 @@ impl Inner {
         let now = HostTime::now();
         let status = self.replay_status();
         let mut cameras: Vec<CameraStatus> = Vec::new();
-        for (record, stream) in self.records.iter().zip(&self.streams) {
-            let name = record.id.camera.to_string();
+        let pictures = self.records.iter().map(|r| (&r.id, &r.model, &r.serial, &r.calibration));
+        let units = self.units.iter().map(|r| (&r.id, &r.model, &r.serial, &r.calibration));
+        let streams = self.streams.iter().chain(&self.unit_streams);
+        for ((id, model, serial, calibration), stream) in pictures.chain(units).zip(streams) {
+            let name = id.camera.to_string();
             let used = stream.books().delivered;
             let told = report::stream(stream, SetAccount { used, ..SetAccount::default() }, now);
             if let Some(camera) = cameras.iter_mut().find(|c| c.name == name) {
@@ -112,14 +115,15 @@ impl Inner {
             cameras.push(CameraStatus {
                 name,
                 backend: "replay".to_owned(),
-                model: record.model.clone(),
-                serial: record.serial.clone(),
+                model: model.clone(),
+                serial: serial.clone(),
                 firmware: String::new(),
                 port: String::new(),
-                calibration: record.calibration.clone(),
+                calibration: calibration.clone(),
                 state: if status.done { CameraState::Finished } else { CameraState::Streaming },
                 state_for_s: self.started.elapsed().as_secs_f64(),
                 message: status.paused.then(|| format!("paused at {:.3} s", status.position_s)),
+                warnings: Vec::new(),
                 reconnects: 0,
                 streams: vec![told],
                 refine: None,
@@ -152,7 +156,17 @@ impl Inner {
                 camera_pose: Pose::IDENTITY,
                 computed: self.computed.iter().find(|c| c.stream == record.id).cloned(),
             };
-        self.records.iter().zip(&self.streams).map(facts).collect()
+        let unit =
+            |(record, stream): (&depthrig_recorder::MotionRecord, &Arc<crate::stream::Stream>)| StreamFacts {
+                stream: Arc::clone(stream),
+                model: record.model.clone(),
+                serial: record.serial.clone(),
+                calibration: record.calibration.clone(),
+                camera_pose: Pose::IDENTITY,
+                computed: None,
+            };
+        let units = self.units.iter().zip(&self.unit_streams).map(unit);
+        self.records.iter().zip(&self.streams).map(facts).chain(units).collect()
     }
 }
 
@@ -186,7 +200,12 @@ impl Control for Inner {
             shared_memory: SharedMemoryStatus {
                 free_bytes: shm::free_bytes(shm::SHM_DIR.as_ref()).unwrap_or(0),
                 slots,
-                reserved_bytes: self.streams.iter().map(|s| (slots * s.profile.frame_bytes()) as u64).sum(),
+                reserved_bytes: self
+                    .streams
+                    .iter()
+                    .chain(&self.unit_streams)
+                    .map(|s| (slots * s.profile.frame_bytes()) as u64)
+                    .sum(),
             },
             cpu_cores: self.cpu_millicores.load(Ordering::Relaxed) as f64 / 1000.0,
             replay: Some(self.replay_status()),

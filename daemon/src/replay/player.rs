@@ -10,7 +10,7 @@ use depthrig_bus::{
     Bus, DropReason, ErrorKind, FrameFlags, FrameHeader, HostTime, MemberRecord, Publisher,
     SUBSCRIBER_BUFFER, SetHeader, SetPublisher, UtcPair, shm,
 };
-use depthrig_recorder::{DatasetFrame, PixelMode, Pixels, RecordFrame, RecordSet};
+use depthrig_recorder::{PixelMode, Pixels, RecordFrame, RecordMotion, RecordSet};
 use std::sync::Arc;
 
 /// How often a replay that has nothing to publish looks for new subscribers, who are to see the last set.
@@ -27,6 +27,10 @@ pub struct Player {
     inner: Arc<Inner>,
     bus: Arc<Bus>,
     outputs: Vec<Output>,
+    /// The channels of the motion units.
+    units: Vec<Output>,
+    /// Batches that were published, and go into the next set that is recorded.
+    carried: Vec<RecordMotion>,
     sets: SetPublisher,
 }
 
@@ -59,17 +63,18 @@ impl Player {
     /// `NoSpace` when shared memory is too small, and those of opening a channel.
     pub fn new(inner: Arc<Inner>, bus: Arc<Bus>) -> Result<Self> {
         let bytes = |s: &Stream| s.profile.frame_bytes();
-        let set_bytes = inner.streams.iter().map(|s| bytes(s) as u64).sum();
+        let set_bytes = inner.streams.iter().chain(&inner.unit_streams).map(|s| bytes(s) as u64).sum();
         let free = shm::free_bytes(shm::SHM_DIR.as_ref())?;
         let fit = shm::slots_that_fit(inner.slots(), set_bytes, free)?;
-        let mut outputs = Vec::new();
-        for stream in &inner.streams {
+        let open = |stream: &Arc<Stream>| -> Result<Output> {
             let publisher = bus.publisher(&stream.id, bytes(stream), fit)?;
-            outputs.push(Output { stream: Arc::clone(stream), publisher, sequence: 0 });
-        }
+            Ok(Output { stream: Arc::clone(stream), publisher, sequence: 0 })
+        };
+        let outputs = inner.streams.iter().map(open).collect::<Result<_>>()?;
+        let units = inner.unit_streams.iter().map(open).collect::<Result<_>>()?;
         let sets =
             if inner.lossless() { bus.set_publisher_with(SUBSCRIBER_BUFFER)? } else { bus.set_publisher()? };
-        Ok(Self { inner, bus, outputs, sets })
+        Ok(Self { inner, bus, outputs, units, carried: Vec::new(), sets })
     }
 
     /// Runs until the replay is stopped. The channels stay until then, so that subscribers can read the last frames.
@@ -104,7 +109,7 @@ impl Player {
     /// Sleeps until a command comes or `length` has passed.
     fn idle(&self, length: Duration) {
         self.inner.wake.wait(length);
-        self.outputs.iter().for_each(|o| o.publisher.welcome());
+        self.outputs.iter().chain(&self.units).for_each(|o| o.publisher.welcome());
         self.sets.welcome();
     }
 
@@ -112,7 +117,7 @@ impl Player {
         for problem in std::mem::take(&mut moment.problems) {
             self.inner.lose(problem);
         }
-        if moment.frames.is_empty() {
+        if !self.publish_motion(&mut moment) || moment.frames.is_empty() {
             return;
         }
         let mut members: Vec<_> = self
@@ -131,7 +136,7 @@ impl Player {
             else {
                 continue;
             };
-            match send(&self.inner, &self.bus, output, &frame) {
+            match send(&self.inner, &self.bus, output, &frame.header, &frame.pixels) {
                 Ok(Some(header)) => {
                     member.sequence = Some(header.sequence);
                     member.capture_time_ns = header.capture_time_ns;
@@ -163,10 +168,34 @@ impl Player {
         self.record(id.set, &moment, recorded);
     }
 
+    /// Publishes what the motion units sent before a set; `false` when the replay was stopped while it waited.
+    fn publish_motion(&mut self, moment: &mut Moment) -> bool {
+        let mut bytes = Vec::new();
+        for mut batch in std::mem::take(&mut moment.motion) {
+            let Some(output) = self.units.get_mut(batch.unit) else { continue };
+            bytes.clear();
+            batch.samples.iter().for_each(|s| bytes.extend_from_slice(&s.to_bytes()));
+            match send(&self.inner, &self.bus, output, &batch.header, &bytes) {
+                Ok(Some(header)) => {
+                    batch.header = header;
+                    if lock(&self.inner.recording).is_active() {
+                        self.carried.push(batch);
+                    } else {
+                        self.carried.clear();
+                    }
+                }
+                Ok(None) => return false,
+                Err(e) => self.inner.lose(format!("set {}: {e}", moment.id)),
+            }
+        }
+        true
+    }
+
     /// Hands the set to the recorder, if one is running, and waits until it has room: a recording of a replay loses
     /// nothing.
-    fn record(&self, id: u64, moment: &Moment, frames: Vec<RecordFrame>) {
-        let inner = &self.inner;
+    fn record(&mut self, id: u64, moment: &Moment, frames: Vec<RecordFrame>) {
+        let inner = Arc::clone(&self.inner);
+        let motion = std::mem::take(&mut self.carried);
         while !lock(&inner.recording).has_room() && !inner.stopping() {
             std::thread::sleep(ASK);
         }
@@ -176,7 +205,7 @@ impl Player {
         let utc = UtcPair { mono: moment.tick, utc_ns, width_ns: 0 };
         *lock(&inner.clock) = utc;
         let (tick, spread_ns) = (moment.tick, moment.spread_ns);
-        lock(&inner.recording).push(RecordSet { id, tick, utc, frames, missing, spread_ns });
+        lock(&inner.recording).push(RecordSet { id, tick, utc, frames, missing, motion, spread_ns });
     }
 }
 
@@ -185,30 +214,26 @@ fn send(
     inner: &Inner,
     bus: &Bus,
     output: &mut Output,
-    frame: &DatasetFrame,
+    original: &FrameHeader,
+    payload: &[u8],
 ) -> depthrig_bus::Result<Option<FrameHeader>> {
     let stream = Arc::clone(&output.stream);
     let mut books = stream.books();
     books.captured += 1;
     drop(books);
     let name = stream.id.to_string();
-    let loan = patiently(
-        inner,
-        bus,
-        &name,
-        || output.publisher.loan(frame.pixels.len()),
-        || output.publisher.welcome(),
-    );
+    let loan =
+        patiently(inner, bus, &name, || output.publisher.loan(payload.len()), || output.publisher.welcome());
     let sent = loan.and_then(|slot| {
         let Some(mut slot) = slot else { return Ok(None) };
-        slot.pixels_mut().copy_from_slice(&frame.pixels);
+        slot.pixels_mut().copy_from_slice(payload);
         let sequence = output.sequence + 1;
         let header = FrameHeader {
             sequence,
-            captured: sequence + frame.header.drops().total(),
-            flags: frame.header.flags | FrameFlags::REPLAYED.0,
-            payload_len: frame.pixels.len() as u32,
-            ..frame.header
+            captured: sequence + original.drops().total(),
+            flags: original.flags | FrameFlags::REPLAYED.0,
+            payload_len: payload.len() as u32,
+            ..*original
         };
         *slot.header_mut() = header;
         output.publisher.send_unstamped(slot)?;
@@ -224,7 +249,8 @@ fn send(
             books.uncertainty_ns = h.capture_uncertainty_ns;
             books.uncertain += u64::from(h.has(FrameFlags::TIME_UNCERTAIN));
             books.note_metadata(h.metadata_level(), FrameFlags(h.flags));
-            books.note(HostTime::now(), h.publish_time_ns.saturating_sub(h.capture_time_ns));
+            let samples = if stream.profile.format.is_motion() { h.width } else { 1 };
+            books.note(HostTime::now(), h.publish_time_ns.saturating_sub(h.capture_time_ns), samples);
         }
         _ => books.dropped.add(DropReason::NoSlot, 1),
     }

@@ -2,10 +2,10 @@
 
 use super::timeline::{Part, Timeline};
 use crate::{Error, ErrorKind, Result};
-use depthrig_bus::{HostTime, PixelFormat, RigName};
+use depthrig_bus::{FrameHeader, HostTime, PixelFormat, RigName};
 use depthrig_recorder::{
-    ColorCodec, Computed, Dataset, DatasetFrame, DatasetSet, DepthCodec, PixelMode, Session, SetReader,
-    StreamRecord,
+    ColorCodec, Computed, Dataset, DatasetFrame, DatasetSet, DepthCodec, MotionRecord, PixelMode,
+    RecordMotion, Session, SetReader, StreamRecord,
 };
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -21,6 +21,7 @@ pub struct Sources {
     list: Vec<Source>,
     rig: RigName,
     streams: Vec<StreamRecord>,
+    units: Vec<MotionRecord>,
     /// Added to a monotonic time of the replay this gives UTC.
     utc_offset_ns: i64,
 }
@@ -30,6 +31,8 @@ struct Source {
     reader: SetReader,
     /// The rig's stream of each stream of this dataset.
     streams: Vec<usize>,
+    /// The rig's motion unit of each of this dataset.
+    units: Vec<usize>,
 }
 
 /// One moment of a replay: a set, or several that were paired.
@@ -43,6 +46,8 @@ pub struct Moment {
     pub spread_ns: i64,
     /// The frames; `stream` is the rig's stream.
     pub frames: Vec<DatasetFrame>,
+    /// What its motion units sent since the moment before; `unit` is the rig's unit.
+    pub motion: Vec<RecordMotion>,
     /// Sets of this moment that could not be read.
     pub problems: Vec<String>,
 }
@@ -56,6 +61,7 @@ impl Sources {
     pub fn open(paths: &[PathBuf], rig: Option<RigName>) -> Result<Self> {
         let mut sources = Vec::new();
         let mut streams: Vec<StreamRecord> = Vec::new();
+        let mut units: Vec<MotionRecord> = Vec::new();
         for path in paths {
             let dataset = Dataset::open(path).map_err(of_dataset)?;
             let reader = dataset.set_reader().map_err(of_dataset)?;
@@ -68,7 +74,9 @@ impl Sources {
             for record in &dataset.session().streams {
                 indices.push(join(&mut streams, record, &dataset)?);
             }
-            sources.push(Source { dataset, reader, streams: indices });
+            let of_rig =
+                dataset.session().motion.iter().map(|record| join_unit(&mut units, record)).collect();
+            sources.push(Source { dataset, reader, streams: indices, units: of_rig });
         }
         let Some(first) = sources.first_mut() else {
             return Err(bad("name a dataset to replay"));
@@ -78,7 +86,7 @@ impl Sources {
             Some(rig) => rig,
             None => rig_of(&sources)?,
         };
-        Ok(Self { list: sources, rig, streams, utc_offset_ns })
+        Ok(Self { list: sources, rig, streams, units, utc_offset_ns })
     }
 
     /// The moments of a replay of them.
@@ -106,6 +114,11 @@ impl Sources {
     /// The streams of all of them.
     pub fn streams(&self) -> &[StreamRecord] {
         &self.streams
+    }
+
+    /// The motion units of all of them.
+    pub fn units(&self) -> &[MotionRecord] {
+        &self.units
     }
 
     /// What computed those streams that no camera gave.
@@ -158,7 +171,7 @@ impl Sources {
             match source.reader.read(member.set as usize, mode) {
                 Ok(set) => {
                     let shift_ns = shift(set.utc_offset_ns, self.utc_offset_ns);
-                    take(&mut read, set, &source.streams, shift_ns, sets == 0);
+                    take(&mut read, set, (&source.streams, &source.units), shift_ns, sets == 0);
                     sets += 1;
                 }
                 Err(e) => read.problems.push(e.to_string()),
@@ -222,6 +235,16 @@ fn join(streams: &mut Vec<StreamRecord>, record: &StreamRecord, dataset: &Datase
     )))
 }
 
+/// The rig's unit for `record`; a new one unless a dataset before it has it. Batches of both fit into its channel.
+fn join_unit(units: &mut Vec<MotionRecord>, record: &MotionRecord) -> usize {
+    if let Some(i) = units.iter().position(|u| u.id == record.id) {
+        units[i].batch = units[i].batch.max(record.batch);
+        return i;
+    }
+    units.push(record.clone());
+    units.len() - 1
+}
+
 fn rig_of(sources: &[Source]) -> Result<RigName> {
     let mut names: Vec<&str> = sources.iter().map(|s| s.dataset.session().rig.as_str()).collect();
     names.dedup();
@@ -243,7 +266,18 @@ fn shift(offset_ns: i64, base_ns: i64) -> i64 {
 }
 
 /// Adds a set to a moment.
-fn take(moment: &mut Moment, set: DatasetSet, streams: &[usize], shift_ns: i64, first: bool) {
+fn take(
+    moment: &mut Moment,
+    set: DatasetSet,
+    (streams, units): (&[usize], &[usize]),
+    shift_ns: i64,
+    first: bool,
+) {
+    let move_header = |h: &mut FrameHeader| {
+        for t in [&mut h.capture_time_ns, &mut h.arrival_time_ns, &mut h.publish_time_ns] {
+            *t = t.saturating_add(shift_ns);
+        }
+    };
     let tick = set.tick.plus_ns(shift_ns);
     if first {
         (moment.id, moment.tick, moment.spread_ns) = (set.id, tick, set.spread_ns);
@@ -252,11 +286,15 @@ fn take(moment: &mut Moment, set: DatasetSet, streams: &[usize], shift_ns: i64, 
     for mut frame in set.frames {
         let Some(stream) = streams.get(frame.stream) else { continue };
         frame.stream = *stream;
-        let h = &mut frame.header;
-        for t in [&mut h.capture_time_ns, &mut h.arrival_time_ns, &mut h.publish_time_ns] {
-            *t = t.saturating_add(shift_ns);
-        }
+        move_header(&mut frame.header);
         moment.frames.push(frame);
+    }
+    for mut batch in set.motion {
+        let Some(unit) = units.get(batch.unit) else { continue };
+        batch.unit = *unit;
+        move_header(&mut batch.header);
+        batch.samples.iter_mut().for_each(|s| s.time_ns = s.time_ns.saturating_add(shift_ns));
+        moment.motion.push(batch);
     }
 }
 

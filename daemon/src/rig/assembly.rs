@@ -4,6 +4,7 @@
 
 use super::Inner;
 use super::join::{Held, Joints};
+use super::motion::Units;
 use crate::camera::Camera;
 use crate::config::Phase;
 use crate::sets::{Assembler, AssemblerConfig, FrameSet, PhasePolicy};
@@ -39,6 +40,8 @@ pub struct Assembly {
     publisher: SetPublisher,
     /// Streams that are made of others join the sets that are recorded.
     joints: Joints,
+    /// Motion units, which are no part of sets.
+    motion: Units,
     next_id: u64,
     incomplete: u64,
 }
@@ -51,7 +54,16 @@ impl Assembly {
     pub fn new(inner: Arc<Inner>) -> crate::Result<Self> {
         let publisher = inner.shared.bus.set_publisher()?;
         let joints = Joints::new(&inner.config);
-        Ok(Self { inner, inputs: Vec::new(), assembler: None, publisher, joints, next_id: 1, incomplete: 0 })
+        Ok(Self {
+            inner,
+            inputs: Vec::new(),
+            assembler: None,
+            publisher,
+            joints,
+            motion: Units::default(),
+            next_id: 1,
+            incomplete: 0,
+        })
     }
 
     /// Runs until the rig stops.
@@ -62,6 +74,7 @@ impl Assembly {
             let sleep = deadline.map_or(IDLE, |d| d.from_now().min(IDLE)).max(Duration::from_millis(1));
             self.inner.shared.frames.wait(sleep);
             self.read_frames();
+            self.motion.read(&self.inner);
             self.joints.read();
             // While the cameras are being stopped, sets would miss those that ended first.
             if !self.inner.ending.load(Ordering::Relaxed) {
@@ -71,6 +84,7 @@ impl Assembly {
         }
         // Frames that were on their way when the cameras stopped still count.
         self.read_frames();
+        self.motion.read(&self.inner);
         self.joints.read();
         self.report();
     }
@@ -81,7 +95,10 @@ impl Assembly {
         for camera in &self.inner.cameras {
             let state = camera.state();
             let known = self.inputs.iter().filter(|i| Arc::ptr_eq(&i.camera, camera)).count();
-            let at_once = state.streams.iter().filter(|s| !camera.config.joins_late(&s.id.stream));
+            let at_once = state
+                .streams
+                .iter()
+                .filter(|s| !camera.config.joins_late(&s.id.stream) && !s.profile.format.is_motion());
             for stream in at_once.skip(known) {
                 let Some(subscriber) = stream.books().reader.take() else {
                     break; // its channel is just being made
@@ -96,6 +113,7 @@ impl Assembly {
                 found = true;
             }
             self.joints.find(camera, &state);
+            self.motion.find(&state);
         }
         if found {
             self.rebuild();
@@ -205,8 +223,10 @@ impl Assembly {
 
     /// Puts the accounts where `status` finds them.
     fn report(&self) {
-        let Some(assembler) = &self.assembler else { return };
+        let motion = self.motion.accounts(&self.inner);
         let mut accounts = self.inner.set_accounts();
+        accounts.streams.extend(motion);
+        let Some(assembler) = &self.assembler else { return };
         accounts.sent = self.next_id - 1;
         accounts.incomplete = self.incomplete;
         for (input, account) in self.inputs.iter().zip(assembler.accounts()) {

@@ -1,7 +1,7 @@
 //! The rig in numbers: its status, the diagnostics that go into a recording, and what was lost.
 
 use super::{Inner, lock};
-use crate::camera::Camera;
+use crate::camera::{Camera, State};
 use crate::stage;
 use crate::status::{
     CameraState, CameraStatus, ClockStatus, RefineState, RigStatus, SetAccount, SetStatus,
@@ -10,6 +10,7 @@ use crate::status::{
 use crate::stream::Stream;
 use depthrig_bus::{ClockDomain, HostTime, UtcPair, shm};
 use depthrig_recorder::{Diagnostic, Level};
+use std::sync::PoisonError;
 use std::sync::atomic::Ordering;
 
 /// Everything there is to know about the rig now.
@@ -69,6 +70,10 @@ fn camera(inner: &Inner, camera: &Camera, now: HostTime) -> CameraStatus {
         state: state.phase,
         state_for_s: state.since.elapsed().as_secs_f64(),
         message: state.message.clone(),
+        warnings: {
+            let notice = camera.notice.lock().unwrap_or_else(PoisonError::into_inner);
+            notice.iter().cloned().chain(silent_units(inner, &state, now)).collect()
+        },
         reconnects: state.reconnects,
         refine: state.lane.as_ref().map(|lane| lane.status()),
         streams: state
@@ -81,6 +86,19 @@ fn camera(inner: &Inner, camera: &Camera, now: HostTime) -> CameraStatus {
             })
             .collect(),
     }
+}
+
+/// What to say of motion units that are silent while their camera streams.
+fn silent_units<'s>(inner: &'s Inner, state: &'s State, now: HostTime) -> impl Iterator<Item = String> + 's {
+    let stall_s = inner.config.supervisor.stall_s;
+    let streaming = state.phase == CameraState::Streaming;
+    let units = state.streams.iter().filter(move |s| streaming && s.profile.format.is_motion());
+    units.filter_map(move |s| {
+        let since = s.books().last_frame.map_or(state.since, |t| t.max(state.since));
+        let silent_s = now.since_ns(since) as f64 * 1e-9;
+        (silent_s > stall_s.max(3.0 / s.profile.rate_hz))
+            .then(|| format!("no motion samples of {} for {silent_s:.1} s; its pictures go on", s.id.stream))
+    })
 }
 
 /// A stream in numbers.
@@ -97,6 +115,7 @@ pub fn stream(stream: &Stream, in_sets: SetAccount, now: HostTime) -> StreamStat
         height: p.height,
         nominal_hz: p.rate_hz,
         rate_hz: books.rate_hz(now),
+        samples_hz: p.format.is_motion().then(|| books.samples_hz(now)),
         captured: books.captured,
         delivered: books.delivered,
         dropped: books.dropped.nonzero().map(|(r, n)| (r.name().to_owned(), n)).collect(),
@@ -147,6 +166,9 @@ fn diagnose(rig: &str, camera: &CameraStatus) -> Diagnostic {
         let name = s.id.rsplit('/').next().unwrap_or(&s.id);
         let mut value = |key: &str, text: String| values.push((format!("{name}.{key}"), text));
         value("rate_hz", format!("{:.2}", s.rate_hz));
+        if let Some(hz) = s.samples_hz {
+            value("samples_hz", format!("{hz:.1}"));
+        }
         value("captured", s.captured.to_string());
         value("delivered", s.delivered.to_string());
         for (reason, n) in &s.dropped {
@@ -158,6 +180,7 @@ fn diagnose(rig: &str, camera: &CameraStatus) -> Diagnostic {
         value("clock_uncertainty_us", format!("{:.1}", s.clock.uncertainty_us));
         value("clock_residual_p99_us", format!("{:.1}", s.clock.residual_p99_us));
     }
+    values.extend(camera.warnings.iter().map(|w| ("warning".to_owned(), w.clone())));
     if let Some(refine) = &camera.refine {
         values.push(("refine.state".to_owned(), refine.state.name().to_owned()));
         values.push(("refine.engine".to_owned(), refine.engine.clone()));
@@ -168,7 +191,7 @@ fn diagnose(rig: &str, camera: &CameraStatus) -> Diagnostic {
     }
     Diagnostic {
         level: match camera.state {
-            CameraState::Streaming => Level::Ok,
+            CameraState::Streaming if camera.warnings.is_empty() => Level::Ok,
             CameraState::Failed => Level::Error,
             _ => Level::Warn,
         },
@@ -194,8 +217,9 @@ pub fn lost(status: &RigStatus) -> Vec<String> {
         // A pair that gave way to a newer one is no loss: that is how the stage keeps up.
         for s in camera.streams.iter().filter(|s| !s.derived && !s.dropped.is_empty()) {
             let reasons: Vec<_> = s.dropped.iter().map(|(r, n)| format!("{n} {r}")).collect();
+            let what = if s.samples_hz.is_some() { "batches" } else { "frames" };
             lost.push(format!(
-                "{}: {} of {} frames ({})",
+                "{}: {} of {} {what} ({})",
                 s.id,
                 s.dropped.values().sum::<u64>(),
                 s.captured,

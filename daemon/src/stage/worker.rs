@@ -421,6 +421,6 @@ fn publish_on(
     books.uncertainty_ns = header.capture_uncertainty_ns;
     books.uncertain += u64::from(header.has(FrameFlags::TIME_UNCERTAIN));
     books.note_metadata(header.metadata_level(), FrameFlags(header.flags));
-    books.note(HostTime::now(), published.saturating_sub(header.capture_time_ns));
+    books.note(HostTime::now(), published.saturating_sub(header.capture_time_ns), 1);
     Ok(total)
 }

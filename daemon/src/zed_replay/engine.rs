@@ -1,13 +1,13 @@
 //! Many pairs and many modes at once: each thread takes what is to be done next, and what is done comes out in order.
 //!
-//! A pair is read and rectified once, whatever number of modes work on it. The pairs between reading and handing on are
+//! A pair is read and rectified once, whatever number of modes work on it, and presets share their matching. The pairs between reading and handing on are
 //! bounded, and so are the matchers, which hold most of the memory.
 
 use super::input::{Head, Input, Next};
-use super::modes::ModeMaker;
+use super::modes::{Group, Worker};
 use super::pictures::{Made, Maker, Views};
 use depthrig_bus::clock::thread_cpu_ns;
-use depthrig_calib::stereo::{DisparityMap, Matcher};
+use depthrig_calib::stereo::DisparityMap;
 use depthrig_recorder::{Error, ErrorKind, Result};
 use std::collections::VecDeque;
 use std::ops::ControlFlow;
@@ -32,7 +32,7 @@ pub(super) struct Done {
 pub(super) struct Cpu {
     pub(super) read: i64,
     pub(super) rectify: i64,
-    /// By mode.
+    /// By group of modes.
     pub(super) stereo: Vec<i64>,
     /// Disparity to depth and bytes.
     pub(super) depth: i64,
@@ -41,8 +41,10 @@ pub(super) struct Cpu {
 pub(super) struct Engine<'a> {
     pub(super) input: Mutex<&'a mut Input>,
     pub(super) maker: &'a Maker,
-    pub(super) modes: &'a [ModeMaker],
-    /// Matchers of each mode at most.
+    pub(super) groups: &'a [Group],
+    /// How many modes there are in all groups.
+    pub(super) modes: usize,
+    /// Workers of each group at most.
     pub(super) most: Vec<usize>,
     /// Threads.
     pub(super) jobs: usize,
@@ -57,8 +59,9 @@ struct Item {
     head: Head,
     views: Option<Arc<Views>>,
     problem: Option<String>,
-    /// Modes that nobody has begun.
+    /// Groups that nobody has begun.
     todo: Vec<bool>,
+    /// By mode.
     made: Vec<Option<Made>>,
 }
 
@@ -77,20 +80,20 @@ pub(super) struct State {
     ended: bool,
     stop: bool,
     failed: Option<Error>,
-    /// Matchers that nobody uses, and how many there are, by mode.
-    free: Vec<Vec<Box<dyn Matcher>>>,
+    /// Workers that nobody uses, and how many there are, by group.
+    free: Vec<Vec<Worker>>,
     there: Vec<usize>,
     pub(super) cpu: Cpu,
 }
 
 impl State {
-    /// With the matchers that are there already, one of each mode.
-    pub(super) fn new(matchers: Vec<Box<dyn Matcher>>) -> Self {
-        let modes = matchers.len();
+    /// With the workers that are there already, one of each group.
+    pub(super) fn new(workers: Vec<Worker>) -> Self {
+        let groups = workers.len();
         Self {
-            free: matchers.into_iter().map(|m| vec![m]).collect(),
-            there: vec![1; modes],
-            cpu: Cpu { stereo: vec![0; modes], ..Cpu::default() },
+            free: workers.into_iter().map(|w| vec![w]).collect(),
+            there: vec![1; groups],
+            cpu: Cpu { stereo: vec![0; groups], ..Cpu::default() },
             ..Self::default()
         }
     }
@@ -107,7 +110,7 @@ impl State {
 
 /// What a thread does next.
 enum Task {
-    Match { number: u64, mode: usize, views: Arc<Views>, matcher: Option<Box<dyn Matcher>> },
+    Match { number: u64, group: usize, views: Arc<Views>, worker: Option<Worker> },
     Read,
     Wait,
     End,
@@ -146,7 +149,7 @@ impl Engine<'_> {
             if let Some(e) = state.failed.take() {
                 return Err(e);
             }
-            let done = if state.items.front().is_some_and(|i| i.is_done(self.modes.len())) {
+            let done = if state.items.front().is_some_and(|i| i.is_done(self.modes)) {
                 state.first += 1;
                 state.items.pop_front().map(|item| {
                     let whole = item.problem.is_none();
@@ -172,7 +175,7 @@ impl Engine<'_> {
     }
 
     fn work(&self) {
-        let mut map = DisparityMap::default();
+        let mut maps = Vec::new();
         loop {
             let task = {
                 let mut state = self.lock();
@@ -184,8 +187,8 @@ impl Engine<'_> {
                 }
             };
             let run = || match task {
-                Task::Match { number, mode, views, matcher } => {
-                    self.run_mode(number, mode, &views, matcher, &mut map)
+                Task::Match { number, group, views, worker } => {
+                    self.run_group(number, group, &views, worker, &mut maps)
                 }
                 Task::Read => self.read(),
                 Task::Wait | Task::End => Ok(false),
@@ -212,14 +215,14 @@ impl Engine<'_> {
         let State { items, free, there, first, .. } = state;
         for (n, item) in items.iter_mut().enumerate() {
             let Some(views) = &item.views else { continue };
-            for mode in 0..self.modes.len() {
-                if !item.todo[mode] || (free[mode].is_empty() && there[mode] >= self.most[mode]) {
+            for group in 0..self.groups.len() {
+                if !item.todo[group] || (free[group].is_empty() && there[group] >= self.most[group]) {
                     continue;
                 }
-                item.todo[mode] = false;
-                let matcher = free[mode].pop();
-                there[mode] += usize::from(matcher.is_none());
-                return Task::Match { number: *first + n as u64, mode, views: Arc::clone(views), matcher };
+                item.todo[group] = false;
+                let worker = free[group].pop();
+                there[group] += usize::from(worker.is_none());
+                return Task::Match { number: *first + n as u64, group, views: Arc::clone(views), worker };
             }
         }
         if !state.reading && !state.ended && state.items.len() < self.window {
@@ -246,9 +249,8 @@ impl Engine<'_> {
             Next::Damaged(head, problem) => (head, None, Some(problem)),
         };
         let number = state.first + state.items.len() as u64;
-        let modes = self.modes.len();
-        let todo = vec![raw.is_some(); modes];
-        let made = (0..modes).map(|_| None).collect();
+        let todo = vec![raw.is_some(); self.groups.len()];
+        let made = (0..self.modes).map(|_| None).collect();
         state.items.push_back(Item { head, views: None, problem, todo, made });
         drop(state);
         self.wake.notify_all();
@@ -264,33 +266,38 @@ impl Engine<'_> {
         Ok(true)
     }
 
-    fn run_mode(
+    fn run_group(
         &self,
         number: u64,
-        mode: usize,
+        group: usize,
         views: &Views,
-        matcher: Option<Box<dyn Matcher>>,
-        map: &mut DisparityMap,
+        worker: Option<Worker>,
+        maps: &mut Vec<DisparityMap>,
     ) -> Result<bool> {
-        let mut matcher = match matcher {
-            Some(matcher) => matcher,
-            None => self.modes[mode].make()?,
+        let of = &self.groups[group];
+        let mut worker = match worker {
+            Some(worker) => worker,
+            None => of.make()?,
         };
+        maps.resize_with(maps.len().max(of.modes.len()), DisparityMap::default);
+        let maps = &mut maps[..of.modes.len()];
         let begin = thread_cpu_ns();
         let failed = |e: depthrig_calib::Error| {
-            let what = format!("{} of pair {number}: {e}", self.modes[mode].name);
+            let what = format!("{} of pair {number}: {e}", of.name);
             Error::new(ErrorKind::BadInput, what).with_source(e)
         };
-        matcher.run(&views.pair(), map).map_err(failed)?;
+        worker.run(&views.pair(), maps).map_err(failed)?;
         let matched = thread_cpu_ns();
-        let made = self.maker.depth(map)?;
+        let made = maps.iter().map(|map| self.maker.depth(map)).collect::<Result<Vec<_>>>()?;
         let end = thread_cpu_ns();
         let mut state = self.lock();
-        state.cpu.stereo[mode] += matched - begin;
+        state.cpu.stereo[group] += matched - begin;
         state.cpu.depth += end - matched;
-        state.free[mode].push(matcher);
+        state.free[group].push(worker);
         if let Some(item) = state.item(number) {
-            item.made[mode] = Some(made);
+            for (mode, made) in of.modes.iter().zip(made) {
+                item.made[*mode] = Some(made);
+            }
         }
         Ok(true)
     }

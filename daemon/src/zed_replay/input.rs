@@ -8,7 +8,8 @@ use depthrig_calib::PoseExt;
 use depthrig_drivers::zed::conf::StereoCalibration;
 use depthrig_drivers::zed::replay::{self, Pair, Source};
 use depthrig_recorder::{
-    Dataset, DatasetFrame, Derived, Error, ErrorKind, PixelMode, Result, Session, SetReader, StreamRecord,
+    Dataset, DatasetFrame, Derived, Error, ErrorKind, PixelMode, RecordMotion, Result, Session, SetReader,
+    StreamRecord,
 };
 use serde_json::{Value, json};
 use std::path::Path;
@@ -25,6 +26,8 @@ pub(super) struct Head {
     pub(super) utc: UtcPair,
     /// Header of the left eye's frame; `None` when there is no pair.
     pub(super) left: Option<Box<FrameHeader>>,
+    /// What the camera's motion unit sent since the set before.
+    pub(super) motion: Vec<RecordMotion>,
 }
 
 /// What comes next.
@@ -59,8 +62,21 @@ pub(super) struct Facts {
 }
 
 enum Kind {
-    Dataset { reader: Box<SetReader>, left: usize, right: usize, number: usize, lost: Vec<String> },
-    Recording { source: Box<dyn Source>, pair: Pair, first_ns: i64, timed_utc: Option<i64> },
+    Dataset {
+        reader: Box<SetReader>,
+        left: usize,
+        right: usize,
+        /// The motion unit of what is made that each unit of the dataset is, if it is one.
+        units: Vec<Option<usize>>,
+        number: usize,
+        lost: Vec<String>,
+    },
+    Recording {
+        source: Box<dyn Source>,
+        pair: Pair,
+        first_ns: i64,
+        timed_utc: Option<i64>,
+    },
 }
 
 pub(super) struct Input {
@@ -122,6 +138,9 @@ impl Input {
         let mut made = session.clone();
         made.outcome = None;
         made.streams.clear();
+        // Of other cameras there will be nothing that their motion belongs to.
+        made.motion.retain(|u| u.id.camera == l.id.camera);
+        let units = session.motion.iter().map(|u| made.motion.iter().position(|m| m.id == u.id)).collect();
         made.computed.clear();
         made.derived.push(derived(
             dataset.path(),
@@ -148,7 +167,7 @@ impl Input {
         };
         known(&facts.calibration.left, &facts.calibration.right, dataset.path())?;
         let lost = reader.problems().to_vec();
-        let kind = Kind::Dataset { reader: Box::new(reader), left, right, number: 0, lost };
+        let kind = Kind::Dataset { reader: Box::new(reader), left, right, units, number: 0, lost };
         Ok(Self { facts, kind })
     }
 
@@ -248,13 +267,13 @@ impl Input {
     /// The next pair.
     pub(super) fn next(&mut self) -> Result<Next> {
         match &mut self.kind {
-            Kind::Dataset { reader, left, right, number, lost } => loop {
+            Kind::Dataset { reader, left, right, units, number, lost } => loop {
                 if *number >= reader.times().len() {
                     return Ok(Next::End);
                 }
                 let read = reader.read(*number, PixelMode::Stored);
                 *number += 1;
-                let set = match read {
+                let mut set = match read {
                     Ok(set) => set,
                     Err(e) if e.kind() == ErrorKind::Io => return Err(e),
                     Err(e) => {
@@ -262,8 +281,14 @@ impl Input {
                         continue;
                     }
                 };
+                let motion = std::mem::take(&mut set.motion);
+                let motion = motion.into_iter().filter_map(|m| {
+                    let unit = units.get(m.unit).copied().flatten()?;
+                    Some(RecordMotion { unit, ..m })
+                });
+                let motion: Vec<_> = motion.collect();
                 let of = |stream| set.frames.iter().find(|f| f.stream == stream);
-                let head = |left: Option<Box<FrameHeader>>| Head {
+                let head = |left: Option<Box<FrameHeader>>, motion| Head {
                     set: set.id,
                     tick: set.tick,
                     utc: UtcPair {
@@ -272,15 +297,18 @@ impl Input {
                         width_ns: 0,
                     },
                     left,
+                    motion,
                 };
                 let (Some(l), Some(r)) = (of(*left), of(*right)) else {
-                    return Ok(Next::Pair(head(None), None));
+                    return Ok(Next::Pair(head(None, motion), None));
                 };
                 return Ok(match (packed(l), packed(r)) {
                     (Ok((format, left)), Ok((_, right))) => {
-                        Next::Pair(head(Some(Box::new(l.header))), Some(Raw { format, left, right }))
+                        Next::Pair(head(Some(Box::new(l.header)), motion), Some(Raw { format, left, right }))
                     }
-                    (Err(e), _) | (_, Err(e)) => Next::Damaged(head(None), format!("set {}: {e}", set.id)),
+                    (Err(e), _) | (_, Err(e)) => {
+                        Next::Damaged(head(None, motion), format!("set {}: {e}", set.id))
+                    }
                 });
             },
             Kind::Recording { source, pair, first_ns, timed_utc } => {
@@ -297,6 +325,7 @@ impl Input {
                     tick,
                     utc: UtcPair { mono: HostTime::from_ns(FIRST_NS), utc_ns: start, width_ns: 0 },
                     left: None,
+                    motion: Vec::new(),
                 };
                 if let replay::Next::Damaged(why) = next {
                     let what = format!("pair {} of {}: {why}", pair.index, info.path.display());

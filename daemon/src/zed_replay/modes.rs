@@ -4,9 +4,11 @@ use super::ZedReplayOptions;
 use core::fmt;
 use core::str::FromStr;
 use depthrig_calib::Rectifier;
-use depthrig_calib::stereo::{Description, Matcher, Preset};
+use depthrig_calib::stereo::{
+    Description, DisparityMap, Matcher, Parameters, Preset, SgmPresets, StereoPair,
+};
 use depthrig_cdm::{NetworkPixels, StereoNetwork, StereoNetworkOptions};
-use depthrig_drivers::stereo::{Geometry, StereoMode};
+use depthrig_drivers::stereo::Geometry;
 use depthrig_recorder::{Error, ErrorKind, Result};
 use std::path::PathBuf;
 
@@ -75,35 +77,114 @@ pub struct NetworkChoice {
     pub negative: bool,
 }
 
-type Make = Box<dyn Fn() -> Result<Box<dyn Matcher>> + Send + Sync>;
+/// What makes depth of one pair at a time, in one mode or in several at once.
+pub(super) enum Worker {
+    /// One mode.
+    One(Box<dyn Matcher>),
+    /// Presets that share their matching.
+    Presets(Box<SgmPresets>),
+}
 
-/// Makes the matchers of a mode.
-pub(super) struct ModeMaker {
+impl Worker {
+    /// Fills a map for each of its modes.
+    pub(super) fn run(
+        &mut self,
+        pair: &StereoPair<'_>,
+        out: &mut [DisparityMap],
+    ) -> depthrig_calib::Result<()> {
+        match (self, out) {
+            (Self::One(matcher), [out]) => matcher.run(pair, out),
+            (Self::Presets(presets), out) => presets.run(pair, out),
+            (Self::One(_), out) => {
+                let what = format!("{} maps for one mode", out.len());
+                Err(depthrig_calib::Error::new(depthrig_calib::ErrorKind::SizeMismatch, what))
+            }
+        }
+    }
+
+    fn describe(&self) -> Vec<Description> {
+        match self {
+            Self::One(matcher) => vec![matcher.describe()],
+            Self::Presets(presets) => presets.describe(),
+        }
+    }
+}
+
+type Make = Box<dyn Fn() -> Result<Worker> + Send + Sync>;
+
+/// What is known of a mode.
+pub(super) struct ModeFacts {
     /// The end of its streams' names.
-    pub(super) name: String,
+    pub(super) name: &'static str,
     /// What recordings call it.
     pub(super) recorded: String,
     pub(super) description: Description,
-    /// Matchers at once at most, whatever memory there is.
+}
+
+/// Modes that one matching gives.
+pub(super) struct Group {
+    /// Numbers of its modes, rising.
+    pub(super) modes: Vec<usize>,
+    /// Their names, for messages.
+    pub(super) name: String,
+    /// Workers at once at most, whatever memory there is.
     pub(super) most: usize,
+    /// Bytes that each takes.
+    pub(super) memory_bytes: u64,
     make: Make,
 }
 
-impl ModeMaker {
-    /// With its first matcher, which tells what they all are.
-    pub(super) fn new(
-        name: &str,
-        recorded: String,
-        most: usize,
-        make: Make,
-    ) -> Result<(Self, Box<dyn Matcher>)> {
-        let first = make()?;
-        let description = first.describe();
-        Ok((Self { name: name.to_owned(), recorded, description, most, make }, first))
-    }
-
-    pub(super) fn make(&self) -> Result<Box<dyn Matcher>> {
+impl Group {
+    pub(super) fn make(&self) -> Result<Worker> {
         (self.make)()
+    }
+}
+
+/// All modes that can be made, and how.
+pub(super) struct Modes {
+    /// In the order in which they were asked for.
+    pub(super) facts: Vec<ModeFacts>,
+    pub(super) groups: Vec<Group>,
+    /// The first worker of each group.
+    pub(super) first: Vec<Worker>,
+    /// Modes that cannot be made, each with why.
+    pub(super) unavailable: Vec<String>,
+}
+
+impl Modes {
+    /// The modes that `options` ask for, for pictures of the rectifier's size. The first workers are made, so that what
+    /// cannot be made is found out before anything is written.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] when a mode cannot be made or none is left.
+    pub(super) fn open(rectifier: &Rectifier, options: &ZedReplayOptions) -> Result<Self> {
+        let network = options.network.as_ref();
+        let (there, missing): (Vec<Mode>, Vec<Mode>) =
+            options.modes.iter().partition(|m| **m != Mode::Neural || network.is_some());
+        let unavailable: Vec<_> = missing.iter().map(|m| format!("{m}: {NO_NETWORK}")).collect();
+        if there.is_empty() {
+            return Err(Error::new(ErrorKind::BadInput, unavailable.join("; ")));
+        }
+        let numbers = |classical: bool| -> Vec<usize> {
+            (0..there.len()).filter(|i| matches!(there[*i], Mode::Preset(_)) == classical).collect()
+        };
+        let mut groups = vec![presets(&there, numbers(true), rectifier, options)];
+        groups.extend(network.map(|n| neural(n.clone(), numbers(false), rectifier, options)));
+        groups.retain(|g| !g.modes.is_empty());
+        let (mut first, mut descriptions) = (Vec::new(), vec![None; there.len()]);
+        for group in &mut groups {
+            let worker = group.make()?;
+            for (i, told) in group.modes.iter().zip(worker.describe()) {
+                group.memory_bytes = told.memory_bytes;
+                descriptions[*i] = Some(told);
+            }
+            first.push(worker);
+        }
+        let facts = |(mode, told): (&Mode, Option<Description>)| {
+            Some(ModeFacts { name: mode.name(), recorded: mode.recorded_name(), description: told? })
+        };
+        let facts = there.iter().zip(descriptions).filter_map(facts).collect();
+        Ok(Self { facts, groups, first, unavailable })
     }
 }
 
@@ -113,45 +194,50 @@ pub(super) fn geometry(rectifier: &Rectifier) -> Geometry {
     Geometry { width: width as usize, height: height as usize, focal_px, baseline_m: rectifier.baseline_m() }
 }
 
-fn failed(mode: Mode, e: &dyn fmt::Display) -> Error {
-    Error::new(ErrorKind::BadInput, format!("mode {mode}: {e}"))
+fn failed(modes: &str, e: impl std::error::Error + Send + Sync + 'static) -> Error {
+    Error::new(ErrorKind::BadInput, format!("mode {modes}: {e}")).with_source(e)
 }
 
-/// The mode for pictures of the rectifier's size.
-pub(super) fn open(
-    mode: Mode,
+/// Those of `all` that are presets, as one matching.
+fn presets(all: &[Mode], modes: Vec<usize>, rectifier: &Rectifier, options: &ZedReplayOptions) -> Group {
+    let g = geometry(rectifier);
+    let disparities = g.disparities(options.range_m.0);
+    let presets = all.iter().filter_map(|m| if let Mode::Preset(p) = m { Some(*p) } else { None });
+    let name = presets.clone().map(Preset::name).collect::<Vec<_>>().join(", ");
+    let wanted: Vec<_> = presets.map(|p| Parameters::preset(p, disparities)).collect();
+    let threads = options.threads.max(1);
+    let make: Make = {
+        let name = name.clone();
+        Box::new(move || {
+            let made = SgmPresets::new(g.width, g.height, &wanted, threads);
+            made.map(|m| Worker::Presets(Box::new(m))).map_err(|e| failed(&name, e))
+        })
+    };
+    Group { modes, name, most: usize::MAX, memory_bytes: 0, make }
+}
+
+/// The user's network.
+fn neural(
+    choice: NetworkChoice,
+    modes: Vec<usize>,
     rectifier: &Rectifier,
     options: &ZedReplayOptions,
-) -> Result<(ModeMaker, Box<dyn Matcher>)> {
-    let (width, height) = rectifier.size();
-    let (width, height, threads) = (width as usize, height as usize, options.threads.max(1));
-    match mode {
-        Mode::Preset(preset) => {
-            let (made, geometry) =
-                (StereoMode::preset(preset, options.range_m.0, threads), geometry(rectifier));
-            let make = move || (made.make)(&geometry).map_err(|e| failed(mode, &e).with_source(e));
-            ModeMaker::new(mode.name(), mode.recorded_name(), usize::MAX, Box::new(make))
-        }
-        Mode::Neural => {
-            let Some(choice) = options.network.clone() else {
-                return Err(failed(mode, &NO_NETWORK));
-            };
-            // A network keeps its threads busy with one picture; a second one would take as much memory again.
-            let threads = options.jobs.max(1) * threads;
-            let make = move || {
-                let options = StereoNetworkOptions {
-                    library: choice.library.clone(),
-                    device: choice.device.clone(),
-                    threads,
-                    pixels: choice.pixels,
-                    negative: choice.negative,
-                };
-                let opened = StereoNetwork::open(&choice.file, (width, height), &options);
-                opened.map(|m| Box::new(m) as Box<dyn Matcher>).map_err(|e| failed(mode, &e).with_source(e))
-            };
-            ModeMaker::new(mode.name(), mode.recorded_name(), 1, Box::new(make))
-        }
-    }
+) -> Group {
+    let Geometry { width, height, .. } = geometry(rectifier);
+    // A network keeps its threads busy with one picture; a second one would take as much memory again.
+    let (most, threads) = (1, options.jobs.max(1) * options.threads.max(1));
+    let make = move || {
+        let options = StereoNetworkOptions {
+            library: choice.library.clone(),
+            device: choice.device.clone(),
+            threads,
+            pixels: choice.pixels,
+            negative: choice.negative,
+        };
+        let opened = StereoNetwork::open(&choice.file, (width, height), &options);
+        opened.map(|m| Worker::One(Box::new(m))).map_err(|e| failed(Mode::Neural.name(), e))
+    };
+    Group { modes, name: Mode::Neural.name().to_owned(), most, memory_bytes: 0, make: Box::new(make) }
 }
 
 /// Why there is no mode `neural`.

@@ -90,33 +90,18 @@ impl Maker {
     pub(super) fn rectify(&self, raw: &Raw) -> Result<Views> {
         let (width, height) = self.rectifier.size();
         let (width, height) = (width as usize, height as usize);
-        let grey = |view, picture: &[u8]| {
-            let mut out = vec![0; width * height];
-            match raw.format {
-                PixelFormat::Yuyv => self.rectifier.grey_from_yuyv(view, picture, &mut out),
-                PixelFormat::Mono8 => self.rectifier.grey(view, picture, &mut out),
-                _ => self.rectifier.grey_from_rgb(view, picture, &mut out),
-            }
-            .map_err(failed)?;
-            Ok::<_, Error>(out)
+        let eye = |view, picture: &[u8], colored: bool| {
+            let mut grey = vec![0; width * height];
+            let mut rgb = colored.then(|| vec![0; width * height * 3]);
+            self.rectifier
+                .rectify(view, raw.format, picture, &mut grey, rgb.as_deref_mut())
+                .map_err(failed)?;
+            Ok::<_, Error>((grey, rgb))
         };
-        let color = |view, picture: &[u8], grey: &[u8]| {
-            let mut out = vec![0; width * height * 3];
-            match raw.format {
-                PixelFormat::Yuyv => self.rectifier.rgb_from_yuyv(view, picture, &mut out),
-                PixelFormat::Mono8 => {
-                    out.as_chunks_mut().0.iter_mut().zip(grey).for_each(|(p, v)| *p = [*v; 3]);
-                    Ok(())
-                }
-                _ => self.rectifier.rgb(view, picture, &mut out),
-            }
-            .map_err(failed)?;
-            Ok::<_, Error>(out)
-        };
-        let (left, right) = (grey(View::Left, &raw.left)?, grey(View::Right, &raw.right)?);
-        let left_color = color(View::Left, &raw.left, &left)?;
-        let right_color = if self.colors { Some(color(View::Right, &raw.right, &right)?) } else { None };
-        Ok(Views { width, height, left, right, color: left_color, right_color })
+        let (left, color) = eye(View::Left, &raw.left, true)?;
+        let (right, right_color) = eye(View::Right, &raw.right, self.colors)?;
+        let color = color.unwrap_or_default();
+        Ok(Views { width, height, left, right, color, right_color })
     }
 
     /// Depth of a disparity.

@@ -4,7 +4,7 @@ use super::input::{Facts, Input};
 use super::pictures::Maker;
 use super::{CpuReport, Mode, ModeReport, ZedReplayOptions, ZedReplayReport, modes, record};
 use depthrig_bus::{PixelFormat, StreamId};
-use depthrig_calib::stereo::{Description, Matcher};
+use depthrig_calib::stereo::{Description, RowOffset};
 use depthrig_calib::{PoseExt, Rectifier};
 use depthrig_recorder::{ColorCodec, Computed, Error, ErrorKind, Result, StreamRecord};
 use std::path::Path;
@@ -14,9 +14,10 @@ use std::sync::Arc;
 pub(super) struct Plan {
     pub(super) facts: Facts,
     pub(super) maker: Arc<Maker>,
-    pub(super) modes: Vec<modes::ModeMaker>,
-    /// The first matcher of each mode.
-    pub(super) first: Vec<Box<dyn Matcher>>,
+    pub(super) modes: Vec<modes::ModeFacts>,
+    pub(super) groups: Vec<modes::Group>,
+    /// The first worker of each group.
+    pub(super) first: Vec<modes::Worker>,
     unavailable: Vec<String>,
     notes: Vec<String>,
     /// The streams of the output: colour, then those of each mode.
@@ -36,19 +37,8 @@ impl Plan {
             Error::new(ErrorKind::BadInput, format!("the calibration ({}): {e}", facts.calibration_origin))
                 .with_source(e)
         })?;
-        let (mut modes, mut first, mut unavailable) = (Vec::new(), Vec::new(), Vec::new());
-        for mode in &options.modes {
-            if *mode == Mode::Neural && options.network.is_none() {
-                unavailable.push(format!("{mode}: {}", modes::NO_NETWORK));
-                continue;
-            }
-            let (maker, matcher) = modes::open(*mode, &rectifier, options)?;
-            modes.push(maker);
-            first.push(matcher);
-        }
-        if modes.is_empty() {
-            return Err(Error::new(ErrorKind::BadInput, unavailable.join("; ")));
-        }
+        let modes::Modes { facts: modes, groups, first, unavailable } =
+            modes::Modes::open(&rectifier, options)?;
         let searched = modes::geometry(&rectifier).disparities(options.range_m.0);
         let nearest = rectifier.intrinsics().fx * rectifier.baseline_m() / searched as f64;
         let mut notes = Vec::new();
@@ -69,6 +59,7 @@ impl Plan {
             facts,
             maker: Arc::new(maker),
             modes,
+            groups,
             first,
             unavailable,
             notes,
@@ -87,8 +78,8 @@ impl Plan {
 
     /// Bytes that `jobs` threads take: matchers, and pairs from reading to encoding.
     fn memory(&self, jobs: usize) -> u64 {
-        let of = |m: &modes::ModeMaker| m.description.memory_bytes.saturating_mul(m.most.min(jobs) as u64);
-        let matchers: u64 = self.modes.iter().map(of).sum();
+        let of = |g: &modes::Group| g.memory_bytes.saturating_mul(g.most.min(jobs) as u64);
+        let matchers: u64 = self.groups.iter().map(of).sum();
         let pairs = (jobs + record::AHEAD + record::QUEUE_SETS + 1) as u64;
         matchers.saturating_add(self.maker.pair_bytes(self.modes.len()).saturating_mul(pairs))
     }
@@ -156,9 +147,21 @@ impl Plan {
         Ok(())
     }
 
+    /// Keeps with the session how far the eyes' rows were found to be apart, and says so where that is too far.
+    pub(super) fn tell_rows(&mut self, rows: Option<&RowOffset>) {
+        let Some(rows) = rows else { return };
+        let warning = rows.warning();
+        let table = self.session.extra.entry("zed_replay").or_insert_with(|| toml::Table::new().into());
+        if let Some(table) = table.as_table_mut() {
+            table.insert("rows".to_owned(), rows.to_string().into());
+            table.extend(warning.clone().map(|w| ("warning".to_owned(), w.into())));
+        }
+        self.notes.extend(warning.map(|w| format!("{}: {w}", self.facts.camera)));
+    }
+
     /// What decides the pixels: a run goes on only with the same.
     pub(super) fn identity(&self, options: &ZedReplayOptions) -> serde_json::Value {
-        let mode = |m: &modes::ModeMaker| {
+        let mode = |m: &modes::ModeFacts| {
             let d = &m.description;
             serde_json::json!({ "name": m.name, "producer": d.producer, "parameters": d.parameters })
         };
@@ -176,12 +179,13 @@ impl Plan {
     }
 
     pub(super) fn report(&self, out: &Path) -> ZedReplayReport {
-        let mode = |m: &modes::ModeMaker| ModeReport {
-            mode: m.name.clone(),
+        let mode = |m: &modes::ModeFacts| ModeReport {
+            mode: m.name.to_owned(),
             recorded_as: m.recorded.clone(),
             producer: m.description.producer.clone(),
             parameters: m.description.parameters.clone(),
             frames: 0,
+            shared_with: Vec::new(),
             stereo_s: 0.0,
         };
         ZedReplayReport {

@@ -2,6 +2,7 @@
 
 use super::engine::{Cpu, Done, Engine, State};
 use super::input::Input;
+use super::modes::Group;
 use super::pictures::{Color, Numbers};
 use super::plan::Plan;
 use super::work::{self, RecordedClock};
@@ -52,8 +53,9 @@ pub(super) fn record(
     let engine = Engine {
         input: Mutex::new(input),
         maker: &plan.maker,
-        modes: &plan.modes,
-        most: plan.modes.iter().map(|m| m.most.min(plan.jobs)).collect(),
+        groups: &plan.groups,
+        modes: plan.modes.len(),
+        most: plan.groups.iter().map(|g| g.most.min(plan.jobs)).collect(),
         jobs: plan.jobs,
         window: plan.jobs + AHEAD,
         state: Mutex::new(State::new(first)),
@@ -84,7 +86,7 @@ pub(super) fn record(
     for problem in input.take_lost() {
         report.lose(problem);
     }
-    tell_cost(report, &cpu, pairs.1, process_cpu_ns() - begin);
+    tell_cost(report, &plan.groups, &cpu, pairs.1, process_cpu_ns() - begin);
     tracing::info!(sets = summary.sets.recorded, after_s = began.elapsed().as_secs_f64(), "depth is made");
     Ok(Some(summary))
 }
@@ -109,10 +111,15 @@ fn open(plan: &Plan, fs: &Arc<dyn Fs>, copy: &Path, clock: &RecordedClock) -> Re
     Ok((new, Resumed { sets: 0, frames: 0, last_set: None }))
 }
 
-fn tell_cost(report: &mut ZedReplayReport, cpu: &Cpu, pairs: u64, total_ns: i64) {
+fn tell_cost(report: &mut ZedReplayReport, groups: &[Group], cpu: &Cpu, pairs: u64, total_ns: i64) {
     let seconds = |ns: i64| ns as f64 / 1e9;
-    for (mode, ns) in report.modes.iter_mut().zip(&cpu.stereo) {
-        mode.stereo_s = seconds(*ns);
+    for (group, ns) in groups.iter().zip(&cpu.stereo) {
+        let names: Vec<_> = group.modes.iter().map(|i| report.modes[*i].mode.clone()).collect();
+        for i in &group.modes {
+            let mode = &mut report.modes[*i];
+            mode.stereo_s = seconds(*ns);
+            mode.shared_with = names.iter().filter(|n| **n != mode.mode).cloned().collect();
+        }
     }
     report.cpu = CpuReport {
         pairs,
@@ -167,6 +174,7 @@ impl Sink<'_> {
                 utc: head.utc,
                 frames: Vec::new(),
                 missing,
+                motion: head.motion,
                 spread_ns: 0,
             };
         };
@@ -200,6 +208,14 @@ impl Sink<'_> {
             }
         }
         self.epoch = Some(left.clock_epoch);
-        RecordSet { id: head.set, tick: head.tick, utc: head.utc, frames, missing: Vec::new(), spread_ns: 0 }
+        RecordSet {
+            id: head.set,
+            tick: head.tick,
+            utc: head.utc,
+            frames,
+            missing: Vec::new(),
+            motion: head.motion,
+            spread_ns: 0,
+        }
     }
 }

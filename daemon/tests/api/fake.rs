@@ -120,6 +120,7 @@ impl Fake {
             state: inner.all.unwrap_or(state),
             state_for_s: 1.5,
             message: message.map(str::to_owned),
+            warnings: vec!["rows are 1.5 px apart".to_owned()],
             reconnects: 2,
             refine: (name == "d435").then(refine),
             streams: vec![
@@ -155,6 +156,7 @@ fn stream(id: &str, age: Option<f64>) -> StreamStatus {
         height: 720,
         nominal_hz: 30.0,
         rate_hz: 29.97,
+        samples_hz: None,
         captured: 12,
         delivered: 10,
         dropped: [("no_slot".to_owned(), 2)].into(),

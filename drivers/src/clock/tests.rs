@@ -5,6 +5,7 @@ use proptest::prelude::*;
 use sim::{HEAVY, NOMINAL, Sample, Scenario, THERMAL, generate};
 
 mod sim;
+mod young;
 
 const SEEDS: core::ops::Range<u64> = 0..20;
 
@@ -354,7 +355,6 @@ fn probes_make_the_time_absolute() {
                 let since_stamp_ns = 5e6;
                 let read_ns = frame.truth_ns + since_stamp_ns;
                 let raw = frame.raw.wrapping_add((since_stamp_ns / 1000.0) as u64) & 0xffff_ffff;
-                let host = |ns: f64| HostTime::from_ns(ns as i64);
                 map.probe(host(read_ns - there), raw, host(read_ns + back));
             }
             if i == 1500 {
@@ -374,11 +374,14 @@ fn probes_make_the_time_absolute() {
     assert!(least_cover >= 0.99);
 }
 
+fn host(ns: f64) -> HostTime {
+    HostTime::from_ns(ns as i64)
+}
+
 /// A probe of `frame`'s device 5 ms after its stamp: a round trip of 0.3 ms and more.
 fn probe(map: &mut ClockMap, rng: &mut sim::Rng, frame: &Sample) {
     let (there, back) = (150e3 + rng.exponential(100e3), 150e3 + rng.exponential(100e3));
     let read_ns = frame.truth_ns + 5e6;
-    let host = |ns: f64| HostTime::from_ns(ns as i64);
     map.probe(host(read_ns - there), frame.raw.wrapping_add(5000) & 0xffff_ffff, host(read_ns + back));
 }
 

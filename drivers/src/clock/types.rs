@@ -18,12 +18,15 @@ pub struct ClockConfig {
     /// Least time from the device's stamp to the arrival, when it is known from elsewhere, nanoseconds; 0 when it
     /// is not.
     pub latency_ns: i64,
+    /// How many frames commonly come together, of which the newest alone is observed; 1 to 4096. What is late, and how far
+    /// the line may move from one to the next, is reckoned by so many periods.
+    pub bunch: u32,
 }
 
 impl ClockConfig {
-    /// A window of 60 s and a latency that nobody knows.
+    /// A window of 60 s, frames that come one by one, and a latency that nobody knows.
     pub fn new(counter_bits: u32, tick_ns: f64, period_ns: u64) -> Self {
-        Self { counter_bits, tick_ns, period_ns, window_ns: 60_000_000_000, latency_ns: 0 }
+        Self { counter_bits, tick_ns, period_ns, window_ns: 60_000_000_000, latency_ns: 0, bunch: 1 }
     }
 
     /// The same with each value in its range.
@@ -33,6 +36,7 @@ impl ClockConfig {
         self.period_ns = self.period_ns.clamp(1, 3_600_000_000_000);
         self.window_ns = self.window_ns.clamp(10_000_000_000, 120_000_000_000);
         self.latency_ns = self.latency_ns.clamp(0, 10_000_000_000);
+        self.bunch = self.bunch.clamp(1, 4096);
         self
     }
 }

@@ -1,11 +1,12 @@
 //! The cases of the suite.
 
-use super::probe::{Books, Probe, wait_for};
+use super::probe::{Books, Probe, Published, wait_for};
 use super::{Bench, Cannot, Trouble};
 use crate::capture::{Capture, End, Session, StopOutcome};
+use crate::motion::LONGEST;
 use crate::{Error, ErrorKind, Poll, Stream, StreamRequest};
 use core::time::Duration;
-use depthrig_bus::{DropReason, HostTime, Name};
+use depthrig_bus::{DropReason, HostTime, MotionSample, Name};
 
 /// Why a case did not pass.
 pub(super) enum Stop {
@@ -48,6 +49,7 @@ pub(super) const ALL: &[(&str, Case)] = &[
     ("unplug", unplug),
     ("busy", busy),
     ("hang", hang),
+    ("motion", motion),
 ];
 
 /// How long a device may take for what takes it no time.
@@ -76,14 +78,18 @@ struct Running {
 
 impl Running {
     fn start(bench: &Bench) -> Result<Self, Stop> {
+        Self::start_with(bench, &bench.requests)
+    }
+
+    fn start_with(bench: &Bench, requests: &[StreamRequest]) -> Result<Self, Stop> {
         let device = bench.backend.open(Some(&bench.serial)).map_err(failed("open"))?;
-        let stream = device.start(&bench.requests).map_err(failed("start"))?;
+        let stream = device.start(requests).map_err(failed("start"))?;
         let probe = Probe::new(stream.profiles());
         Ok(Self { stream, probe })
     }
 
     /// Polls until the books satisfy `is_done`; the device must do that in time.
-    fn poll_until(&mut self, what: &str, mut is_done: impl FnMut(&Books) -> bool) -> Outcome {
+    fn poll_until(&mut self, what: &str, mut is_done: impl FnMut(&mut Books) -> bool) -> Outcome {
         let deadline = HostTime::now().plus(PATIENCE);
         while !self.probe.with(|b| is_done(b)) {
             let mut sink = self.probe.clone();
@@ -160,8 +166,11 @@ fn open_unknown(bench: &Bench) -> Outcome {
 fn profiles(bench: &Bench) -> Outcome {
     let device = bench.backend.open(Some(&bench.serial)).map_err(failed("open"))?;
     let all = device.profiles().to_vec();
-    check(!all.is_empty(), || "the device has no mode".to_owned())?;
-    let wanted = all[all.len() - 1].clone();
+    // A motion unit may need a camera that runs.
+    let pictures = || all.iter().filter(|p| !p.format.is_motion());
+    let Some(wanted) = pictures().next_back().or(all.last()).cloned() else {
+        return fail("the device has no mode");
+    };
     let request = StreamRequest {
         stream: wanted.stream.clone(),
         size: Some((wanted.width, wanted.height)),
@@ -439,4 +448,87 @@ fn hang(bench: &Bench) -> Outcome {
     let delivered = probe.with(|b| b.delivered.clone());
     std::thread::sleep(hang);
     check(probe.with(|b| b.delivered == delivered), || "the abandoned thread published a frame".to_owned())
+}
+
+/// Batches of a motion unit: as many samples as its rate says, in order, with rising times that the header repeats.
+fn motion(bench: &Bench) -> Outcome {
+    const BATCHES: usize = 12;
+    let device = bench.backend.open(Some(&bench.serial)).map_err(failed("open"))?;
+    let Some(unit) = device.profiles().iter().find(|p| p.format.is_motion()).cloned() else {
+        return Err(Stop::NotApplicable("the device has no motion unit".to_owned()));
+    };
+    drop(device);
+    check((1..=1024).contains(&unit.width) && unit.height == 1, || {
+        format!("a batch of {}x{} samples", unit.width, unit.height)
+    })?;
+    let mut requests = bench.requests.clone();
+    if !requests.is_empty() && requests.iter().all(|r| r.stream != unit.stream) {
+        requests.push(StreamRequest::any(unit.stream.clone()));
+    }
+    let mut running = Running::start_with(bench, &requests)?;
+    let Some(stream) = running.stream.profiles().iter().position(|p| p.format.is_motion()) else {
+        return fail("the motion unit was not started");
+    };
+    let mut batches: Vec<Published> = Vec::new();
+    running.poll_until("batches of motion", |b| {
+        let (ours, rest) = b.published.drain(..).partition(|p| p.stream == stream);
+        b.published = rest;
+        batches.extend::<Vec<_>>(ours);
+        batches.len() >= BATCHES
+    })?;
+    running.check_books(bench)?;
+    let mut last: Option<(u32, MotionSample)> = None;
+    let (mut count, mut first) = (0u64, None);
+    for (n, batch) in batches.iter().enumerate() {
+        let wrong = |what: String| Stop::Failed(format!("batch {n}: {what}"));
+        let samples: Vec<_> = MotionSample::all_in(&batch.pixels).collect();
+        let (Some(oldest), Some(newest)) = (samples.first(), samples.last()) else {
+            return Err(wrong("it is empty".to_owned()));
+        };
+        for s in &samples {
+            if let Some((epoch, before)) = &last {
+                if s.sequence <= before.sequence {
+                    return Err(wrong(format!("sample {} comes after {}", s.sequence, before.sequence)));
+                }
+                if *epoch == batch.meta.clock_epoch && s.time_ns <= before.time_ns {
+                    return Err(wrong(format!("the time of sample {} does not rise", s.sequence)));
+                }
+            }
+            let is_measured = |v: &[f32; 3]| v.iter().all(|v| v.is_finite()) || v.iter().all(|v| v.is_nan());
+            if !is_measured(&s.gyro_rad_s) || !is_measured(&s.accel_m_s2) {
+                return Err(wrong(format!("sample {} is no measurement: {s:?}", s.sequence)));
+            }
+            last = Some((batch.meta.clock_epoch, *s));
+            first.get_or_insert(s.sequence);
+            count += 1;
+        }
+        let m = &batch.meta;
+        let told = (m.device_sequence, m.device_time, m.capture_time);
+        if told != (newest.sequence, newest.device_time, newest.time()) {
+            return Err(wrong(format!("its header says {told:?}, its newest sample is {newest:?}")));
+        }
+        if m.capture_uncertainty_ns < u64::from(newest.uncertainty_ns) {
+            return Err(wrong("its header claims more than its newest sample".to_owned()));
+        }
+        // No sample waits for longer than a batch may, but for what a busy machine takes to poll.
+        let span_ns = newest.time_ns - oldest.time_ns;
+        if span_ns > LONGEST.as_nanos() as i64 + POLL.as_nanos() as i64 {
+            return Err(wrong(format!("its oldest sample is {span_ns} ns older than its newest")));
+        }
+    }
+    // By the samples' own clock, so that a busy machine changes nothing.
+    let (Some(begin), Some((_, end))) =
+        (batches.first().and_then(|b| MotionSample::all_in(&b.pixels).next()), last)
+    else {
+        return fail("there are no samples");
+    };
+    let numbers = end.sequence - first.unwrap_or_default() + 1;
+    check(count <= numbers, || format!("{count} samples with {numbers} numbers"))?;
+    let passed_s = end.device_time.saturating_sub(begin.device_time) as f64 * unit.clock.tick_ns() / 1e9;
+    let expected = passed_s * unit.samples_hz() + 1.0;
+    check((numbers as f64 - expected).abs() <= 2.0 + expected * 0.05, || {
+        format!(
+            "{numbers} numbers in {passed_s:.3} s of the unit's clock; at its rate they are {expected:.0}"
+        )
+    })
 }

@@ -3,7 +3,9 @@
 use crate::clock::ClockQuality;
 use crate::{FrameMeta, FrameSink, StreamProfile};
 use core::time::Duration;
-use depthrig_bus::{DropCounts, DropReason, FrameFlags, HostTime, MetadataLevel, PixelFormat};
+use depthrig_bus::{
+    DropCounts, DropReason, FrameFlags, HostTime, MOTION_SAMPLE_BYTES, MetadataLevel, PixelFormat,
+};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// What memory on loan holds before the driver writes: two different fills in turn, so that a byte that a
@@ -82,7 +84,14 @@ impl Books {
             self.broken.push(format!("a frame of stream {stream}, which was not started"));
             return;
         };
-        if p.format != PixelFormat::Mjpeg && bytes != p.frame_bytes() {
+        let sized = match p.format {
+            PixelFormat::Mjpeg => true,
+            PixelFormat::Motion => {
+                bytes.is_multiple_of(MOTION_SAMPLE_BYTES) && (1..=p.frame_bytes()).contains(&bytes)
+            }
+            _ => bytes == p.frame_bytes(),
+        };
+        if !sized {
             broken.push(format!("it has {bytes} bytes, not {}", p.frame_bytes()));
         }
         if meta.capture_time > meta.arrival {

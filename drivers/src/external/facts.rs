@@ -111,7 +111,7 @@ impl Facts {
     }
 
     /// Whether a frame is of the format and size of the mode.
-    pub(super) fn is_announced(&self, header: &ExternalFrame) -> bool {
+    fn is_announced(&self, header: &ExternalFrame) -> bool {
         let p = &self.profile;
         (header.format, header.width, header.height) == (p.format as u32, p.width, p.height)
     }

@@ -119,7 +119,6 @@ impl Intake {
     fn judge(&mut self, header: &ExternalFrame, sent: usize, outcome: Outcome) {
         let strange = match outcome {
             Outcome::Dropped(DropReason::WrongSize) => true,
-            Outcome::Dropped(DropReason::Incomplete) => !self.facts.is_announced(header),
             Outcome::Dropped(_) | Outcome::AlreadyCounted => return,
             Outcome::Delivered => false,
         };

@@ -3,7 +3,8 @@
 //! **Streams** are `color`, `depth` (Z16, millimetres) and `ir` (16-bit grey), as of the camera itself. Colour recorded as
 //! JPEG is decoded to `rgb8`, or kept as `mjpeg` where that is asked for; NV12 and YUY2 stay what they are; of BGRA the
 //! unused byte is left out. Depth and infrared are written once, with their bytes swapped, into the receiver's memory.
-//! Decoding has threads and a reader of its own, which are a few pictures ahead.
+//! Decoding has threads and a reader of its own, which are a few pictures ahead. A track of motion is the stream `imu`
+//! ([`super::motion`]), played by the same clock.
 //!
 //! **Time.** Frames carry the device's clock of the recording, microseconds at mid-exposure, and come when that clock says,
 //! counted from the first; so capture times have the spacing of the recording. There is no frame counter in the file:
@@ -105,7 +106,20 @@ pub fn recorded_profiles(
     calibration: Option<&Calibration>,
 ) -> Result<Vec<(usize, StreamProfile)>> {
     let all = profiles(facts, calibration, 1.0)?;
-    Ok(all.into_iter().filter(|(_, p)| p.format != PixelFormat::Rgb8).collect())
+    let is_stored = |p: &StreamProfile| p.format != PixelFormat::Rgb8 && !p.format.is_motion();
+    Ok(all.into_iter().filter(|(_, p)| is_stored(p)).collect())
+}
+
+/// The motion unit of a recording with its track, if it has one.
+///
+/// # Errors
+/// None that can happen: the name is a good one.
+pub fn recorded_motion(
+    facts: &Facts,
+    calibration: Option<&Calibration>,
+) -> Result<Option<(usize, StreamProfile)>> {
+    let all = profiles(facts, calibration, 1.0)?;
+    Ok(all.into_iter().find(|(_, p)| p.format.is_motion()))
 }
 
 /// Every way in which the streams of a recording can be delivered, that of the default first, with their tracks.
@@ -116,6 +130,11 @@ fn profiles(
 ) -> Result<Vec<(usize, StreamProfile)>> {
     let mut all = Vec::new();
     for (i, track) in facts.tracks.iter().enumerate() {
+        if track.kind == TrackKind::Motion {
+            let clock = DeviceClock::microseconds(64);
+            all.push((i, super::motion::profile(calibration, rate, clock, MetadataLevel::Full)?));
+            continue;
+        }
         let (name, formats): (_, &[PixelFormat]) = match (track.kind, track.pixels) {
             (TrackKind::Color, Some(Pixels::Mjpg)) => ("color", &[PixelFormat::Rgb8, PixelFormat::Mjpeg]),
             (TrackKind::Color, Some(Pixels::Nv12)) => ("color", &[PixelFormat::Nv12]),
@@ -203,7 +222,7 @@ impl PlaybackBackend {
         }
         let profiles = all.iter().map(|(_, p)| p.clone()).collect();
         let info = info(facts, &config);
-        Ok(RecordedDevice { info, all, profiles, recording, config })
+        Ok(RecordedDevice { info, all, profiles, recording, calibration, config })
     }
 }
 
@@ -269,6 +288,7 @@ struct RecordedDevice {
     all: Vec<(usize, StreamProfile)>,
     profiles: Vec<StreamProfile>,
     recording: Recording,
+    calibration: Option<Calibration>,
     config: PlaybackConfig,
 }
 
@@ -288,6 +308,8 @@ impl Device for RecordedDevice {
             chosen.iter().filter_map(|p| self.all.iter().find(|(_, a)| a == p).map(|(track, _)| *track));
         let tracks = tracks.collect::<Vec<_>>();
         let is_triggered = self.recording.facts().wired_sync == WiredSync::Subordinate;
-        Ok(Box::new(play::Player::new(name, chosen, &tracks, is_triggered, self.recording, &self.config)?))
+        let Self { recording, calibration, config, .. } = *self;
+        let what = (recording, calibration.as_ref());
+        Ok(Box::new(play::Player::new(name, chosen, &tracks, is_triggered, what, &config)?))
     }
 }

@@ -13,20 +13,24 @@ pub(super) const FACTORY: &str = "factory";
 /// [`crate::DeviceInfo::calibration`] of a camera without.
 pub(super) const NONE: &str = "none";
 
-/// How often a table is read before it is called damaged: a reply can be cut or belong to another program's request.
+/// How often a table is read before it is called damaged or missing: a reply can be cut or belong to another program's
+/// request, and a refusal can be a wrong reply too. A camera that is called uncalibrated is not opened again.
 const READINGS: usize = 3;
 
-/// Reads a table again when what came is no such table.
+/// Reads a table again when what came is no such table, or a refusal.
 fn until_sound<T>(mut read: impl FnMut() -> Result<T>) -> Result<T> {
+    let is_answer =
+        |e: &Error| matches!(e.kind(), ErrorKind::Protocol | ErrorKind::Unsupported | ErrorKind::NotFound);
     for _ in 1..READINGS {
         match read() {
-            Err(e) if e.kind() == ErrorKind::Protocol => {
-                tracing::debug!("a calibration table is read again: {e}");
-            }
+            Err(e) if is_answer(&e) => tracing::debug!("a calibration table is read again: {e}"),
             done => return done,
         }
     }
-    read()
+    read().map_err(|e| {
+        let text = format!("asked {READINGS} times: {e}");
+        if is_answer(&e) { Error::new(e.kind(), text).with_source(e) } else { e }
+    })
 }
 
 /// A stream of the device, as far as its geometry goes.

@@ -71,7 +71,10 @@ pub(super) struct RealsenseStream {
 
 impl RealsenseStream {
     pub(super) fn new(parts: Parts) -> Self {
-        let Parts { label, pictures, profiles, lanes, sources, control, memory } = parts;
+        let Parts { label, pictures, profiles, mut lanes, sources, control, memory } = parts;
+        for lane in &mut lanes {
+            lane.gate.clock().expect_probes();
+        }
         Self {
             pictures: Some(pictures),
             label,

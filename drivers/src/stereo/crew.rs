@@ -1,9 +1,10 @@
-//! The threads of stereo: one rectifies, one per mode matches. Pairs go in, what was made of them comes out.
+//! The threads of stereo: one rectifies, one per mode matches, one looks at the rows now and then. Pairs go in, what was made of them comes out.
 //!
 //! Each thread has a box for one pair; a newer pair takes the place of one that still lies there, unless that is of the
 //! moment of a frame set. Everything that pictures are in is made once and goes round.
 
 use super::newest::{ForSet, Newest};
+use super::rows::{self, Rows};
 use super::{Descriptions, Geometry, StereoMode, StereoOptions, has_color};
 use crate::moments::Due;
 use crate::{Error, ErrorKind, Result};
@@ -42,8 +43,8 @@ pub(super) struct Raw {
 pub(super) struct Views {
     pub(super) ticket: u64,
     due: Option<Due>,
-    left: Vec<u8>,
-    right: Vec<u8>,
+    pub(super) left: Vec<u8>,
+    pub(super) right: Vec<u8>,
     /// Empty where the eyes have no colour.
     pub(super) left_rgb: Vec<u8>,
     /// Filled when a mode wants colour.
@@ -92,6 +93,7 @@ pub(super) struct Crew {
     spare: Vec<Raw>,
     spared: Receiver<Raw>,
     views: Vec<Arc<Newest<Arc<Views>>>>,
+    rows: Arc<Newest<Arc<Views>>>,
     events: Receiver<Event>,
     /// Where each mode's products go back.
     back: Vec<SyncSender<Product>>,
@@ -124,6 +126,9 @@ impl Crew {
         let views: Vec<_> = matchers.iter().map(|_| Newest::new(options.every_pair)).collect();
         let order = OrderCheck::new(geometry.width, geometry.height)
             .map_err(|e| Error::new(ErrorKind::BadInput, format!("{camera}: {e}")).with_source(e))?;
+        let rows = Newest::new(options.every_pair);
+        let look = Rows::new(camera, &geometry, Arc::clone(&rows), &options.notice);
+        spawn(camera, "rows", move || look.run())?;
         let rectify = Rectify {
             rectifier,
             format,
@@ -131,9 +136,10 @@ impl Crew {
             input: Arc::clone(&raw),
             spare,
             outputs: views.clone(),
+            rows: Arc::clone(&rows),
             events: send.clone(),
             pool: Vec::new(),
-            most: matchers.len() + 4,
+            most: matchers.len() + 6,
             order,
             pairs: 0,
             swapped: 0,
@@ -159,7 +165,7 @@ impl Crew {
             };
             spawn(camera, &mode.name, move || work.run())?;
         }
-        Ok(Self { raw, spare: Vec::new(), spared, views, events, back })
+        Ok(Self { raw, spare: Vec::new(), spared, views, rows, events, back })
     }
 
     /// Memory for the pictures of a pair.
@@ -191,6 +197,7 @@ impl Drop for Crew {
     fn drop(&mut self) {
         self.raw.close();
         self.views.iter().for_each(|v| v.close());
+        self.rows.close();
     }
 }
 
@@ -233,6 +240,8 @@ struct Rectify {
     input: Arc<Newest<Raw>>,
     spare: SyncSender<Raw>,
     outputs: Vec<Arc<Newest<Arc<Views>>>>,
+    /// For whoever looks at the rows.
+    rows: Arc<Newest<Arc<Views>>>,
     events: SyncSender<Event>,
     /// All views that there are; those that nobody else has are free.
     pool: Vec<Arc<Views>>,
@@ -252,6 +261,10 @@ impl Rectify {
             }
             if self.look(&views) && self.events.send(Event::Swapped).is_err() {
                 return;
+            }
+            if rows::is_looked_at(self.pairs) {
+                // One that nobody had time for is no loss.
+                drop(self.rows.put(Arc::clone(&views)));
             }
             let matched = raw.matched;
             // When the camera is given up, nobody takes it any more.
@@ -316,18 +329,10 @@ impl Rectify {
             (View::Right, &raw.right, &mut views.right, &mut views.right_rgb),
         ];
         for (view, picture, grey, rgb) in eyes {
-            let done = match self.format {
-                PixelFormat::Yuyv => r.grey_from_yuyv(view, picture, grey),
-                PixelFormat::Rgb8 => r.grey_from_rgb(view, picture, grey),
-                _ => r.grey(view, picture, grey),
-            };
-            let colored = match self.format {
-                _ if rgb.is_empty() => Ok(()),
-                PixelFormat::Yuyv => r.rgb_from_yuyv(view, picture, rgb),
-                _ => r.rgb(view, picture, rgb),
-            };
+            let rgb = Some(rgb.as_mut_slice()).filter(|rgb| !rgb.is_empty());
+            let done = r.rectify(view, self.format, picture, grey, rgb);
             // The sizes were checked when the camera was started and when the pictures came.
-            if let Err(e) = done.and(colored) {
+            if let Err(e) = done {
                 tracing::error!(error = %e, "a picture was not rectified");
             }
         }

@@ -22,6 +22,8 @@ const BASELINE: f64 = 0.12;
 enum Shot {
     /// Both eyes see a wall at this disparity.
     Wall(usize),
+    /// The same, and the right eye sees it so many rows lower.
+    LowWall(usize, usize),
     /// Only this eye's picture comes.
     Only(usize),
     /// The left picture comes damaged, the right one is whole.
@@ -140,6 +142,12 @@ impl Stream for MadeStream {
                 Shot::Gap(_) | Shot::One(..) => continue,
                 Shot::Only(eye) if eye != i => continue,
                 Shot::Wall(d) if (i == 1) != self.swapped => noise(format, d),
+                Shot::LowWall(d, rows) if i == 1 => {
+                    let mut picture = noise(format, d);
+                    let row = picture.len() / H as usize;
+                    picture.rotate_right(rows * row);
+                    picture
+                }
                 _ => noise(format, 0),
             };
             let arrival = HostTime::from_ns(ticks as i64 + 1000);
@@ -580,6 +588,36 @@ fn eyes_that_are_exchanged_are_found_in_the_pictures() {
         "{said}"
     );
     // In their order nothing is said, as the other tests show; there the walls are the same.
+}
+
+#[test]
+fn rows_that_are_apart_are_told_once_there_are_enough_pairs() {
+    let told = |shots: &[Shot]| {
+        let options = options(vec![StereoMode::preset(Preset::Performance, 0.5, 1)]);
+        let notice = Arc::clone(&options.notice);
+        // Of an earlier start, and no longer true.
+        *notice.lock().unwrap() = Some("old".to_owned());
+        let mut stream =
+            wrap(Box::new(Made::new(PixelFormat::Yuyv, shots)), options).unwrap().start(&[]).unwrap();
+        let mut sink = Strict::default();
+        while stream.poll(Duration::from_millis(20), &mut sink).unwrap() != Poll::End {}
+        // The last look may still be under way.
+        let limit = HostTime::now().plus(Duration::from_secs(10));
+        let text = || notice.lock().unwrap().clone();
+        while matches!(shots, [Shot::LowWall(..), ..])
+            && shots.len() >= 40
+            && text().is_none_or(|t| t == "old")
+        {
+            assert!(!limit.from_now().is_zero(), "nothing was told");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        text()
+    };
+    let text = told(&[Shot::LowWall(12, 2); 60]).unwrap();
+    assert!(text.contains("2.00 ± 0.05 px lower"), "{text}");
+    assert!(text.contains("calibrate it anew"), "{text}");
+    assert_eq!(told(&[Shot::LowWall(12, 2); 29]), None, "two looks are too few");
+    assert_eq!(told(&[Shot::Wall(12); 60]), None);
 }
 
 #[test]

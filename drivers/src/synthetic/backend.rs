@@ -1,6 +1,7 @@
 //! The synthetic back end: simulated cameras behind the traits of every other one.
 
 use super::config::{FaultKind, SyntheticConfig};
+use super::imu::{Batch, Filler};
 use super::pattern::Pattern;
 use super::profiles::Content;
 use super::queue::{Queue, Waiting};
@@ -122,7 +123,9 @@ impl Device for SyntheticDevice {
         let profiles = choose_profiles(&config.label(), &unit.profiles, requests)?;
         let mut sources = Vec::new();
         for p in &profiles {
-            sources.push(if config.cheap {
+            sources.push(if p.format.is_motion() {
+                Source::Motion(Filler::default())
+            } else if config.cheap {
                 Source::Pattern(Pattern::new(config.seed, p.stream.as_str(), p.format, p.width, p.height))
             } else {
                 Source::Pictures(render::pictures(config, p, &|_, _| ())?)
@@ -132,7 +135,9 @@ impl Device for SyntheticDevice {
         let boot = unit.state().boot;
         let lanes = profiles.iter().zip(sources).enumerate().map(|(i, (p, source))| {
             let content = Content::of(&p.stream).unwrap_or(Content::Color);
-            let exposure_ns = unit.model.exposure_ns[usize::from(!content.is_color_view())];
+            let motion = p.format.is_motion();
+            let exposure_ns =
+                if motion { 0 } else { unit.model.exposure_ns[usize::from(!content.is_color_view())] };
             Lane {
                 gate: Gate::new(i, p),
                 queue: Queue::new(
@@ -147,7 +152,7 @@ impl Device for SyntheticDevice {
                 source,
                 width: p.width,
                 frame_bytes: p.frame_bytes(),
-                has_strip: content == Content::Color,
+                has_strip: content == Content::Color && !motion,
             }
         });
         let lanes = lanes.collect();
@@ -155,11 +160,12 @@ impl Device for SyntheticDevice {
     }
 }
 
-/// Where the pixels of a stream come from.
+/// Where the pixels of a stream come from, or its samples.
 #[derive(Debug)]
 enum Source {
     Pattern(Pattern),
     Pictures(Pictures),
+    Motion(Filler),
 }
 
 /// One stream of a running camera.
@@ -265,7 +271,11 @@ impl SyntheticStream {
         let config = &unit.config;
         let steps = motion::steps(unit.world_start, waiting.capture, config.pose_rate_hz);
         let pose = motion::to_and_fro(steps, config.poses);
-        let sequence = waiting.k & 0xFFFF_FFFF;
+        let counted = match &mut lane.source {
+            Source::Motion(filler) => filler.count(waiting.k, &waiting.boot),
+            _ => waiting.k,
+        };
+        let sequence = counted & 0xFFFF_FFFF;
         let whole = lane.frame_bytes;
         let bytes = match waiting.fault {
             Some(FaultKind::HalfFrame) => whole / 2,
@@ -275,15 +285,24 @@ impl SyntheticStream {
         let mut raw = RawFrame::new(sequence, waiting.ticks, waiting.arrival, bytes);
         raw.damaged = waiting.fault == Some(FaultKind::Damaged);
         raw.exposure_ns = waiting.exposure_ns;
-        raw.gain = 16.0;
+        raw.gain = if matches!(lane.source, Source::Motion(_)) { 0.0 } else { 16.0 };
         let warm_s = waiting.capture.since_ns(unit.world_start) as f32 * 1e-9;
         raw.temperature_c = 38.0 - 8.0 * (-warm_s / 300.0).exp();
         raw.flags = FrameFlags::SYNTHETIC;
         let Waiting { capture, arrival, fault, lost_before, .. } = *waiting;
         unit.state().book(SimFrame { stream: i, sequence, capture, arrival, pose, fault }, lost_before);
-        let (source, width, has_strip) = (&lane.source, lane.width, lane.has_strip);
-        lane.gate.deliver(&raw, sink, |memory| {
+        let (width, has_strip) = (lane.width, lane.has_strip);
+        let batch = Batch {
+            k: waiting.k,
+            boot: waiting.boot,
+            capture,
+            world_start: unit.world_start,
+            drift_ppm: config.clock.drift_ppm,
+        };
+        let source = &mut lane.source;
+        lane.gate.deliver_timed(&raw, sink, |memory, meta| {
             match source {
+                Source::Motion(filler) => filler.fill(&batch, meta, memory),
                 Source::Pattern(pattern) => pattern.fill(sequence, memory),
                 Source::Pictures(pictures) => {
                     let picture = pictures.get(pose);

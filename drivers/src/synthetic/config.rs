@@ -23,6 +23,8 @@ pub struct SyntheticConfig {
     pub streams: Vec<StreamOverride>,
     /// Whether the true depth is given too: `depth_true` in the view of `depth`, `depth_true_color` in that of `color`.
     pub truth: bool,
+    /// Whether it has a motion unit, as the stream `imu`: see [`super::imu`].
+    pub motion: bool,
     /// The device's clock and its transport.
     pub clock: ClockSim,
     /// What goes wrong, and when.
@@ -50,6 +52,7 @@ impl Default for SyntheticConfig {
             pose_on_mount: Pose::IDENTITY,
             streams: Vec::new(),
             truth: false,
+            motion: false,
             clock: ClockSim::default(),
             faults: Vec::new(),
             poses: 12,
@@ -77,7 +80,7 @@ pub fn default_cache_dir() -> PathBuf {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StreamOverride {
-    /// `color`, `depth`, `depth_true` or `depth_true_color`.
+    /// `color`, `depth`, `depth_true`, `depth_true_color` or `imu`, which has one mode only.
     pub stream: StreamName,
     /// Width and height in pixels.
     #[serde(default)]

@@ -2,7 +2,7 @@
 
 use super::config::SyntheticConfig;
 use super::models::{self, MODELS, Mode, Model};
-use super::noise;
+use super::{imu, noise};
 use crate::{DeviceClock, Error, ErrorKind, Result, StreamProfile, StreamRequest, choose_profiles};
 use depthrig_bus::{MetadataLevel, Name, PixelFormat, Pose};
 
@@ -90,10 +90,17 @@ pub fn profiles(config: &SyntheticConfig) -> Result<Vec<StreamProfile>> {
         put_override_first(config, model, content, modes, &mut own)?;
         all.append(&mut own);
     }
+    if config.motion {
+        all.push(imu::profile(Name::new(imu::STREAM).map_err(bad_name)?, config.clock.counter_bits));
+    }
     for o in &config.streams {
         if all.iter().all(|p| p.stream != o.stream) {
             let names: Vec<_> = contents.iter().map(|c| c.name()).collect();
-            let hint = if Content::of(&o.stream).is_some() { " (set truth = true)" } else { "" };
+            let hint = match Content::of(&o.stream) {
+                Some(_) => " (set truth = true)",
+                None if o.stream.as_str() == imu::STREAM => " (set motion = true)",
+                None => "",
+            };
             let message = format!(
                 "{}: it has no stream \"{}\"{hint}; it has {}",
                 config.label(),
@@ -233,6 +240,18 @@ mod tests {
         assert!(e.to_string().contains("depth 1280x720 z16 30 Hz"), "{e}");
         c.cheap = true;
         assert_eq!(default_profiles(&c).unwrap()[1].describe(), "depth 850x480 z16 60 Hz");
+    }
+
+    #[test]
+    fn a_motion_unit_is_there_when_it_is_asked_for() {
+        let mut c = config("d435");
+        assert!(profiles(&c).unwrap().iter().all(|p| !p.format.is_motion()));
+        c.streams.push(StreamOverride { stream: Name::new("imu").unwrap(), size: None, rate_hz: None });
+        assert!(profiles(&c).unwrap_err().to_string().contains("motion = true"));
+        c.motion = true;
+        let last = default_profiles(&c).unwrap().pop().unwrap();
+        assert_eq!(last.describe(), "imu motion 200 Hz in batches of up to 8");
+        assert_eq!((last.frame_bytes(), last.height), (512, 1));
     }
 
     #[test]

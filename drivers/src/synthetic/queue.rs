@@ -16,7 +16,7 @@ const IN_FLIGHT: usize = 64;
 pub(crate) struct Waiting {
     /// Number of the frame since the device's boot.
     pub(crate) k: u64,
-    boot: u32,
+    pub(crate) boot: Boot,
     pub(crate) capture: HostTime,
     pub(crate) ticks: u64,
     pub(crate) arrival: HostTime,
@@ -118,7 +118,7 @@ impl Queue {
         let twice = spoil == Some(FaultKind::Repeated);
         let frame = Waiting {
             k,
-            boot: self.boot.number,
+            boot: self.boot,
             capture,
             ticks,
             arrival,
@@ -152,7 +152,7 @@ impl Queue {
             let Some(oldest) = self.waiting.pop_front() else { return };
             let gone = oldest.lost_before + u64::from(oldest.fault != Some(FaultKind::Repeated));
             match self.waiting.front_mut() {
-                Some(next) if next.boot != oldest.boot => {}
+                Some(next) if next.boot.number != oldest.boot.number => {}
                 // The other copy of a repeated frame is the frame now.
                 Some(next) if next.fault == Some(FaultKind::Repeated) && next.k == oldest.k => {
                     next.fault = None;
@@ -264,7 +264,7 @@ mod tests {
         q.expose_until(ms(46), &t, Boot { number: 1, at: ms(30), set_back_us: 0 });
         let got = drain(&mut q, ms(46));
         assert_eq!(
-            got.iter().map(|w| (w.k, w.boot, w.lost_before)).take(3).collect::<Vec<_>>(),
+            got.iter().map(|w| (w.k, w.boot.number, w.lost_before)).take(3).collect::<Vec<_>>(),
             [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
         );
     }

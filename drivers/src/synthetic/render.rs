@@ -58,7 +58,7 @@ pub fn prepare_all(configs: &[SyntheticConfig], progress: Progress<'_>) -> Resul
                         && Content::of(&q.stream) == Some(Content::Depth)
                         && (q.width, q.height, q.intrinsics) == (p.width, p.height, p.intrinsics)
                 });
-            if !config.cheap && !is_done {
+            if !config.cheap && !is_done && !p.format.is_motion() {
                 jobs.push((config, p));
             }
         }

@@ -35,7 +35,13 @@ impl V4l2Device {
         let nodes = found.open(&root)?;
         let mut modes: Vec<Vec<Mode>> = Vec::new();
         for pair in &nodes {
-            modes.push(pair.video.modes(super::offer::is_offered)?);
+            let offered = pair.video.modes(super::offer::is_offered)?;
+            // Only one may set the mode of a node: who streams already keeps everybody else from it. Better said now than
+            // at the start.
+            if let Some(mode) = offered.first() {
+                pair.video.set_mode(mode).map_err(|e| named(&root, &found, e))?;
+            }
+            modes.push(offered);
         }
         let offers = offers(&modes, &config);
         if offers.is_empty() {

@@ -383,7 +383,9 @@ impl ControlPort for Node {
                     (ErrorKind::Protocol, "the camera refused")
                 }
                 Some(Errno::BUSY | Errno::AGAIN) => (ErrorKind::Busy, "the camera is not ready; ask again"),
-                Some(Errno::TIMEDOUT) => (ErrorKind::Stalled, "the camera did not answer"),
+                Some(Errno::TIMEDOUT) => {
+                    (ErrorKind::Stalled, "the camera did not answer; if that stays so, plug it in anew")
+                }
                 _ => return self.error(&what, e),
             };
             Error::new(kind, format!("{}: {what}: {why} ({e})", self.path.display())).with_source(e)

@@ -155,7 +155,7 @@ fn mapped(
     });
     let mut source = Source::start(wanted.collect(), config.buffers)?;
     let samples = if (0..profiles.len()).any(|i| source.metadata(i) != MetadataFormat::None) {
-        first_stamps(&mut source, profiles.len())?
+        first_stamps(&mut source, profiles.len(), clock_hz)?
     } else {
         Vec::new()
     };
@@ -182,13 +182,13 @@ fn mapped(
 }
 
 /// The time stamps in the first payload headers of each stream. The pictures themselves are not captured yet.
-fn first_stamps(source: &mut Source, streams: usize) -> Result<Vec<Vec<Sample>>> {
+fn first_stamps(source: &mut Source, streams: usize, clock_hz: Option<u32>) -> Result<Vec<Vec<Sample>>> {
     let mut samples: Vec<Vec<Sample>> = vec![Vec::new(); streams];
     let until = HostTime::now().plus(TICK_PATIENCE);
-    while samples.iter().any(|s| s.len() < tick::SAMPLES) && !until.from_now().is_zero() {
+    while !samples.iter().all(|s| tick::is_settled(s, clock_hz)) && !until.from_now().is_zero() {
         source.poll(until.from_now(), &mut |p| {
             let sample = pts(p).map(|ticks| Sample { ticks, host: p.kernel_time.unwrap_or(p.arrival) });
-            if let Some(of) = samples.get_mut(p.source).filter(|s| s.len() < tick::SAMPLES) {
+            if let Some(of) = samples.get_mut(p.source).filter(|s| !tick::is_settled(s, clock_hz)) {
                 of.extend(sample);
             }
         })?;

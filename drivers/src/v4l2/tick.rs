@@ -7,12 +7,13 @@
 
 use depthrig_bus::HostTime;
 
-/// Pictures that are looked at.
-pub(super) const SAMPLES: usize = 5;
+/// Pictures that are looked at, and how many where these do not tell: while cameras open, the host may be so busy that it
+/// stamps a picture 10 ms late, which is a tenth of the time between the first and the last of a few.
+const SAMPLES: usize = 5;
+const SAMPLES_MOST: usize = 15;
 /// The least time between the first and the last of them.
 const SPAN_NS: i64 = 50_000_000;
-/// How far the measured rate may be from the named one. The stamps of the host are late by milliseconds at worst, and
-/// the wrong rates that are known are wrong by a factor.
+/// How far the measured rate may be from the named one. The wrong rates that are known are wrong by a factor.
 const TOLERANCE: f64 = 0.1;
 const MICROSECONDS_HZ: u32 = 1_000_000;
 
@@ -21,6 +22,11 @@ const MICROSECONDS_HZ: u32 = 1_000_000;
 pub(super) struct Sample {
     pub(super) ticks: u32,
     pub(super) host: HostTime,
+}
+
+/// Whether looking at more pictures than `samples` would not help.
+pub(super) fn is_settled(samples: &[Sample], named: Option<u32>) -> bool {
+    samples.len() >= SAMPLES_MOST || (samples.len() >= SAMPLES && frequency_hz(samples, named).is_some())
 }
 
 /// Ticks a second in `samples`; `None` when there is too little to tell.
@@ -49,7 +55,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn samples(start: u32, hz: f64, jitter_ns: [i64; 5]) -> Vec<Sample> {
+    fn samples<const N: usize>(start: u32, hz: f64, jitter_ns: [i64; N]) -> Vec<Sample> {
         let one = |(i, jitter): (usize, i64)| {
             let ns = i as f64 * 33_366_700.0;
             Sample {
@@ -84,6 +90,18 @@ mod tests {
     }
 
     proptest! {
+        /// What `first_stamps` does with a busy host's stamps.
+        #[test]
+        fn stamps_that_are_20_ms_late_at_random_are_seen_through(
+            start: u32, jitter in proptest::array::uniform15(0i64..20_000_000), true_hz in prop_oneof![Just(48e6), Just(1e6), Just(27e6), Just(90e3)]
+        ) {
+            let (named, all) = (Some(48_000_000), samples(start, true_hz, jitter));
+            let enough = (0..=all.len()).find(|n| is_settled(&all[..*n], named)).unwrap();
+            let found = frequency_hz(&all[..enough], named);
+            prop_assert_eq!(found, [48_000_000, 1_000_000].into_iter().find(|hz| f64::from(*hz) == true_hz));
+            prop_assert!(found.is_some() || enough == SAMPLES_MOST);
+        }
+
         #[test]
         fn jitter_of_two_milliseconds_never_misleads(start: u32, jitter in proptest::array::uniform5(-2_000_000i64..2_000_000)) {
             let named = Some(48_000_000);

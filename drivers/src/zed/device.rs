@@ -5,9 +5,10 @@ use super::conf::{FactoryCalibration, how_to_get, known_paths};
 use super::find::{self, Found};
 use super::hid::HidNode;
 use super::mode::Eye;
-use super::motion::Motion;
+use super::motion::{Motion, Sample};
 use super::stream::ZedStream;
-use super::{CalibrationFile, ZedConfig, profiles, settings};
+use super::{CalibrationFile, ZedConfig, imu, profiles, settings};
+use crate::motion::IMU;
 use crate::usb::holder::holders_of;
 use crate::usb::{SysRoot, scan};
 use crate::v4l2::{DEFAULT_BUFFERS, FourCc, Mode, Node, Source, Stamp, Wanted};
@@ -15,6 +16,11 @@ use crate::{Backend, Device, DeviceInfo, Error, ErrorKind, Result, Stream, Strea
 use depthrig_bus::{ClockDomain, MetadataLevel};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, sync_channel};
+
+mod unit;
+
+/// Begins what is said of a calibration that was loaded.
+const FACTORY: &str = "factory ";
 
 /// The backend `zed`.
 #[derive(Debug, Clone, Default)]
@@ -85,7 +91,8 @@ struct ZedDevice {
     node: Node,
     modes: Vec<Mode>,
     profiles: Vec<StreamProfile>,
-    motion: Option<PathBuf>,
+    /// The motion unit, or why it cannot be read.
+    unit: Result<HidNode>,
     config: ZedConfig,
     root: SysRoot,
 }
@@ -103,10 +110,7 @@ impl ZedDevice {
                 None => return Err(e),
             },
         };
-        // Both halves have the camera's number, so it decides over what the ports say.
-        if found.serial() != Some(&serial) {
-            found.motion = find::motion_unit(&scan(root)?, found.model, &serial).cloned();
-        }
+        let unit = unit::open(&mut found, &serial, config.without_motion, root);
         let (calibration, source) = calibration(&config.calibration, &serial)?;
         let name = find::describe(found.model.name, &serial, &found.video.port);
         if calibration.is_none() && config.calibration == CalibrationFile::Known {
@@ -124,11 +128,14 @@ impl ZedDevice {
             );
         }
         let modes = node.modes(|f| f == FourCc(*b"YUYV"))?;
-        let profiles = profiles::profiles(&name, &modes, calibration.as_ref())?;
-        let motion =
-            found.motion.iter().flat_map(|m| &m.interfaces).flat_map(|i| &i.hidraw_nodes).next().cloned();
+        let mut profiles = profiles::profiles(&name, &modes, calibration.as_ref())?;
+        match &unit {
+            Ok(_) => profiles.push(imu::profile()?),
+            Err(_) if config.without_motion || found.model.motion.is_none() => {}
+            Err(e) => tracing::warn!(camera = name, error = %e, "the motion unit is not read"),
+        }
         let info = info(&found, serial, source);
-        Ok(Self { info, node, modes, profiles, motion, config: config.clone(), root: root.clone() })
+        Ok(Self { info, node, modes, profiles, unit, config: config.clone(), root: root.clone() })
     }
 
     fn name(&self) -> String {
@@ -147,11 +154,21 @@ impl Device for ZedDevice {
 
     fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
         let name = self.name();
-        let Self { node, modes, profiles, motion, config, root, .. } = *self;
-        let mut chosen = profiles::choose(&name, &profiles, requests)?;
-        let mode = chosen.first().and_then(|p| modes.iter().find(|m| is_mode_of(m, p)));
-        let Some(mode) = mode else {
-            return Err(Error::new(ErrorKind::Unsupported, format!("{name}: no stream was asked for")));
+        let Self { node, modes, profiles, unit, config, root, .. } = *self;
+        if let (Some(_), Err(e)) = (requests.iter().find(|r| r.stream.as_str() == IMU), &unit) {
+            return Err(Error::new(e.kind(), format!("{name}: there is no stream \"{IMU}\": {e}")));
+        }
+        let chosen = profiles::choose(&name, &profiles, requests)?;
+        let (imu, mut eyes): (Vec<_>, Vec<_>) = chosen.into_iter().partition(|p| p.format.is_motion());
+        let imu = imu.into_iter().next();
+        let Some(eye) = eyes.first() else {
+            let (Some(motion), Some((profile, samples))) = start_unit(&name, unit, imu)? else {
+                return Err(Error::new(ErrorKind::Unsupported, format!("{name}: no stream was asked for")));
+            };
+            return Ok(Box::new(ZedStream::without_pictures(name, motion).with_imu(profile, samples)));
+        };
+        let Some(mode) = modes.iter().find(|m| is_mode_of(m, eye)) else {
+            return Err(Error::new(ErrorKind::Unsupported, format!("{name}: has no {}", eye.describe())));
         };
         let path = node.path().to_owned();
         let named = |e: Error| named(&name, &root, &path, e);
@@ -159,17 +176,22 @@ impl Device for ZedDevice {
         let layout = node.set_mode(mode).map_err(named)?;
         // Nothing is asked of the camera on this thread once it streams.
         let vendor = settings::has_commands(&config).then(|| vendor(&path, &name)).transpose()?;
-        let motion = motion.filter(|_| !config.without_motion).and_then(|node| start_motion(&name, &node));
+        // Not before it is clear that nobody else has the pictures: who has them has the unit too.
+        let (motion, imu) = start_unit(&name, unit, imu)?;
         let stride = (layout.bytes_per_line as usize).max(2 * mode.width as usize);
         let pictures = Source::start(vec![Wanted::plain(node)], DEFAULT_BUFFERS).map_err(named)?;
         if pictures.stamp(0) == Stamp::Unknown {
-            for p in &mut chosen {
+            for p in &mut eyes {
                 (p.clock, p.metadata) = (profiles::clock(ClockDomain::Arrival), MetadataLevel::Arrival);
             }
         }
         let settled = vendor.map(|v| settle(&name, v, &config, mode)).transpose()?;
-        let eyes = chosen.into_iter().map(|p| (eye_of(&p), p)).collect();
-        Ok(Box::new(ZedStream::new(name, eyes, Box::new(pictures), stride, motion, settled)))
+        let eyes = eyes.into_iter().map(|p| (eye_of(&p), p)).collect();
+        let stream = ZedStream::new(name, eyes, Box::new(pictures), stride, motion, settled);
+        Ok(Box::new(match imu {
+            Some((profile, samples)) => stream.with_imu(profile, samples),
+            None => stream,
+        }))
     }
 }
 
@@ -182,7 +204,10 @@ fn eye_of(profile: &StreamProfile) -> Eye {
     if profile.stream.as_str() == profiles::STREAMS[1] { Eye::Right } else { Eye::Left }
 }
 
-fn info(found: &Found, serial: String, calibration: String) -> DeviceInfo {
+fn info(found: &Found, serial: String, mut calibration: String) -> DeviceInfo {
+    if calibration.starts_with(FACTORY) && found.model.motion.is_some() {
+        calibration += imu::NO_POSE;
+    }
     DeviceInfo {
         backend: "zed",
         model: found.model.name.to_owned(),
@@ -255,7 +280,7 @@ fn calibration(wanted: &CalibrationFile, serial: &str) -> Result<(Option<Factory
         let what = format!("{e}; {}", how_to_get(serial));
         Error::new(ErrorKind::BadInput, what).with_source(e)
     })?;
-    Ok((Some(loaded), format!("factory {}", path.display())))
+    Ok((Some(loaded), format!("{FACTORY}{}", path.display())))
 }
 
 /// Sets the camera on a thread of its own, after it began to stream, because starting may set it anew and because
@@ -280,9 +305,22 @@ fn settle(
     Ok(receive)
 }
 
-fn start_motion(name: &str, node: &Path) -> Option<Motion> {
-    let started = HidNode::open(node).and_then(|hid| Motion::start(Box::new(hid), name));
-    started.inspect_err(|e| tracing::warn!(camera = name, error = %e, "the motion unit is not read")).ok()
+/// Starts the motion unit: with a queue of its samples when `imu` is delivered, else for the temperatures alone, without
+/// which the camera is as good.
+#[allow(clippy::type_complexity)] // a stream and what feeds it
+fn start_unit(
+    name: &str,
+    unit: Result<HidNode>,
+    imu: Option<StreamProfile>,
+) -> Result<(Option<Motion>, Option<(StreamProfile, Receiver<Sample>)>)> {
+    let Ok(hid) = unit else { return Ok((None, None)) };
+    if let Some(profile) = imu {
+        let (motion, samples) = Motion::start_streaming(Box::new(hid), name)?;
+        return Ok((Some(motion), Some((profile, samples))));
+    }
+    let started = Motion::start(Box::new(hid), name);
+    let warn = |e: &Error| tracing::warn!(camera = name, error = %e, "the motion unit is not read");
+    Ok((started.inspect_err(warn).ok(), None))
 }
 
 /// The error with the camera's name, and for a camera that is held with that of the holder.

@@ -23,7 +23,8 @@ pub fn conf(bytes: &[u8]) -> bool {
             assert!(i.fx > 0.0 && i.fy > 0.0 && inside && i.coeffs.iter().all(|k| k.is_finite()), "{i:?}");
         }
         let t = c.right_in_left.translation_m;
-        assert!((0.02..0.4).contains(&c.baseline_m()) && t[0] > 0.0, "{t:?}");
+        // A shortest baseline that was turned may have lost a rounding.
+        assert!((0.02 - 1e-12..0.4).contains(&c.baseline_m()) && t[0] > 0.0, "{t:?}");
     }
     // A file may have a baseline for each mode; what is written has one.
     let first = known.first().map(|(_, c)| c.baseline_m());

@@ -1,20 +1,24 @@
 //! The motion unit of a camera that streams: a thread of its own reads its records and keeps it awake.
 //!
-//! What it gives today: the temperatures of both image sensors for the frames' headers, and, for a program that links
-//! this crate, the latest sample with its time on the host's clock. There is no motion stream on the bus: a channel
-//! carries pictures, and a record of 62 bytes 400 times a second is none.
+//! It gives the temperatures of both image sensors for the frames' headers, the samples of the stream `imu` through a queue
+//! of [`QUEUE`] of them, and, for a program that links this crate, the latest sample.
 //!
 //! **Time.** The unit counts 25600 ticks a second. Each record's ticks and arrival go into a [`ClockMap`], as those of a
 //! camera do. A record that says `frame_sync` is the first after an exposure began, so its time is that of the
 //! exposure's start, late by at most the 2.5 ms between records.
+//!
+//! **Numbers.** The unit has no counter. Samples are numbered by its clock, so that a record that never came is a gap. A
+//! sample for which the queue has no room is a gap too, and the next one tells of it ([`Sample::lost_before`]), so that
+//! whoever reads the queue can count it as lost here and not by the unit.
 
 use super::hid::Reports;
 use super::sensors::{self, Record};
-use crate::clock::{ClockConfig, ClockMap};
+use crate::clock::{ClockConfig, ClockMap, ClockQuality};
 use crate::{Error, ErrorKind, Result};
 use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
-use depthrig_bus::HostTime;
+use depthrig_bus::{FrameFlags, HostTime, MotionFlags, MotionSample};
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// How often the unit is told that somebody listens. It stops after a few seconds without.
@@ -25,16 +29,56 @@ const WAIT: Duration = Duration::from_millis(50);
 const SILENCE: Duration = Duration::from_millis(500);
 /// Nanoseconds from one record to the next.
 const PERIOD_NS: u64 = 2_500_000;
+/// Samples that may wait for whoever reads them: 2.5 s of them.
+pub const QUEUE: usize = 1024;
+/// Records between two looks at how the clock's map is doing: a second of them.
+const QUALITY_EVERY: u64 = 400;
 
 /// A record and when it was measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sample {
     /// What the unit measured.
     pub record: Record,
+    /// Its number by the unit's clock, from 1.
+    pub number: u64,
     /// When, on the host's clock.
     pub time: HostTime,
-    /// The time is right within this much.
+    /// The time is right within this much, but for the constant least latency of the transport, which nobody knows.
     pub uncertainty_ns: u64,
+    /// The unit's clock, ticks, unwrapped.
+    pub device_time: u64,
+    /// Number of the clock's map.
+    pub epoch: u32,
+    /// Facts about the time.
+    pub flags: FrameFlags,
+    /// When it had arrived.
+    pub arrival: HostTime,
+    /// Samples just before it for which the queue had no room.
+    pub lost_before: u64,
+}
+
+impl Sample {
+    /// It as the bus carries samples: rad/s and m/s² along the unit's own axes.
+    pub fn for_bus(&self) -> MotionSample {
+        let Record { motion_valid, gyro_raw, acceleration_raw, frame_sync, .. } = self.record;
+        let three = |v: [f64; 3]| if motion_valid { v.map(|v| v as f32) } else { [f32::NAN; 3] };
+        // An end of the range of 16 bits is said for all that lies beyond it.
+        let clipped = |raw: [i16; 3]| motion_valid && raw.iter().any(|v| matches!(*v, i16::MIN | i16::MAX));
+        let flag = |is: bool, flag: MotionFlags| if is { flag.0 } else { 0 };
+        MotionSample {
+            time_ns: self.time.ns(),
+            device_time: self.device_time,
+            sequence: self.number,
+            uncertainty_ns: u32::try_from(self.uncertainty_ns).unwrap_or(u32::MAX),
+            accel_offset_ns: 0,
+            gyro_rad_s: three(self.record.gyro_rad_s()),
+            accel_m_s2: three(self.record.acceleration_m_s2()),
+            temperature_c: self.record.own_c().map_or(f32::NAN, |c| c as f32),
+            flags: flag(frame_sync, MotionFlags::FRAME_SYNC)
+                | flag(clipped(acceleration_raw), MotionFlags::ACCEL_CLIPPED)
+                | flag(clipped(gyro_raw), MotionFlags::GYRO_CLIPPED),
+        }
+    }
 }
 
 /// What came so far.
@@ -48,6 +92,8 @@ pub struct Tally {
     pub frame_syncs: u64,
     /// Records that the unit's clock says should have come in between and did not.
     pub missed: u64,
+    /// Samples for which the queue had no room.
+    pub overflowed: u64,
 }
 
 #[derive(Default)]
@@ -57,6 +103,7 @@ struct State {
     /// The last record that began an exposure.
     exposure: Option<Sample>,
     eyes_c: [Option<f64>; 2],
+    quality: Option<ClockQuality>,
     ended: Option<String>,
 }
 
@@ -77,14 +124,27 @@ impl Motion {
     ///
     /// # Errors
     /// [`ErrorKind::Io`] when the system refuses a thread.
-    pub fn start(mut reports: Box<dyn Reports>, device: &str) -> Result<Self> {
+    pub fn start(reports: Box<dyn Reports>, device: &str) -> Result<Self> {
+        Self::spawn(reports, device, None)
+    }
+
+    /// The same, and every sample in order through a queue.
+    ///
+    /// # Errors
+    /// As [`Self::start`].
+    pub fn start_streaming(reports: Box<dyn Reports>, device: &str) -> Result<(Self, Receiver<Sample>)> {
+        let (send, samples) = sync_channel(QUEUE);
+        Ok((Self::spawn(reports, device, Some(send))?, samples))
+    }
+
+    fn spawn(mut reports: Box<dyn Reports>, device: &str, send: Option<SyncSender<Sample>>) -> Result<Self> {
         let shared = Arc::new(Shared::default());
         let theirs = Arc::clone(&shared);
         let name = device.to_owned();
         std::thread::Builder::new()
             .name("zed-motion".to_owned())
             .spawn(move || {
-                let end = run(reports.as_mut(), &theirs);
+                let end = run(reports.as_mut(), &theirs, send.as_ref());
                 if let Err(e) = &end {
                     tracing::warn!(camera = name, error = %e, "the motion unit is no longer read");
                 }
@@ -116,6 +176,11 @@ impl Motion {
         lock(&self.shared.state).eyes_c
     }
 
+    /// How the map of its clock was doing, a second ago at the most.
+    pub fn quality(&self) -> Option<ClockQuality> {
+        lock(&self.shared.state).quality
+    }
+
     /// Why the unit is no longer read, if so.
     pub fn problem(&self) -> Option<String> {
         lock(&self.shared.state).ended.clone()
@@ -133,7 +198,7 @@ fn lock(state: &Mutex<State>) -> std::sync::MutexGuard<'_, State> {
     state.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-fn run(reports: &mut dyn Reports, shared: &Shared) -> Result<()> {
+fn run(reports: &mut dyn Reports, shared: &Shared, queue: Option<&SyncSender<Sample>>) -> Result<()> {
     let tick_ns = sensors::TICK_PS as f64 / 1000.0;
     let mut clock = ClockMap::new(ClockConfig::new(64, tick_ns, PERIOD_NS));
     reports.send_feature(sensors::stream_report(true))?;
@@ -141,7 +206,7 @@ fn run(reports: &mut dyn Reports, shared: &Shared) -> Result<()> {
     let mut silent_at = HostTime::now().plus(SILENCE);
     let mut buffer = [0; 64];
     let mut last_ticks: Option<u64> = None;
-    let mut sequence = 0;
+    let (mut sequence, mut lost_before) = (0, 0);
     while !shared.stop.load(Ordering::Relaxed) {
         if awake_until.from_now().is_zero() {
             reports.send_feature(sensors::keep_alive())?;
@@ -166,10 +231,26 @@ fn run(reports: &mut dyn Reports, shared: &Shared) -> Result<()> {
         last_ticks = Some(record.ticks);
         sequence += steps;
         let mapped = clock.observe(record.ticks, sequence, arrival);
-        let sample = Sample { record, time: mapped.capture_time, uncertainty_ns: mapped.uncertainty_ns };
+        let sample = Sample {
+            record,
+            number: sequence,
+            time: mapped.capture_time,
+            uncertainty_ns: mapped.uncertainty_ns,
+            device_time: mapped.device_time,
+            epoch: mapped.epoch,
+            flags: mapped.flags,
+            arrival,
+            lost_before,
+        };
+        let is_full = queue.is_some_and(|queue| matches!(queue.try_send(sample), Err(TrySendError::Full(_))));
+        lost_before = if is_full { lost_before + 1 } else { 0 };
         let mut state = lock(&shared.state);
         state.tally.records += 1;
         state.tally.missed += steps - 1;
+        state.tally.overflowed += u64::from(is_full);
+        if state.tally.records.is_multiple_of(QUALITY_EVERY) {
+            state.quality = Some(clock.quality());
+        }
         state.latest = Some(sample);
         if record.frame_sync {
             state.tally.frame_syncs += 1;
@@ -244,7 +325,10 @@ mod tests {
         }
         send.send(vec![9, 9, 9]).unwrap();
         wait_for(|| motion.tally().rejected == 1);
-        assert_eq!(motion.tally(), Tally { records: 10, rejected: 1, frame_syncs: 1, missed: 3 });
+        assert_eq!(
+            motion.tally(),
+            Tally { records: 10, rejected: 1, frame_syncs: 1, missed: 3, overflowed: 0 }
+        );
         assert_eq!(motion.eyes_c(), [Some(41.0), Some(42.5)], "said once, kept since");
         let (latest, exposure) = (motion.latest().unwrap(), motion.exposure().unwrap());
         assert_eq!((latest.record.ticks, exposure.record.frame_count), (1000 + 64 * 12, 77));

@@ -2,6 +2,7 @@
 
 use super::conf::FactoryCalibration;
 use super::mode::{Eye, Mode as SensorMode};
+use crate::motion::IMU;
 use crate::v4l2::Mode;
 use crate::{DeviceClock, Error, ErrorKind, Result, StreamProfile, StreamRequest, choose_profiles};
 use depthrig_bus::{ClockDomain, Intrinsics, MetadataLevel, Name, PixelFormat, Pose, StreamName};
@@ -69,7 +70,7 @@ pub fn profiles(
     Ok(profiles)
 }
 
-/// The profiles that are asked for, which are of one mode, because both eyes come in one picture: what one of the
+/// The profiles that are asked for; the eyes' are of one mode, because both eyes come in one picture: what one of their
 /// requests leaves open, it takes from the other.
 ///
 /// # Errors
@@ -79,14 +80,18 @@ pub fn choose(
     available: &[StreamProfile],
     requests: &[StreamRequest],
 ) -> Result<Vec<StreamProfile>> {
-    let size = requests.iter().find_map(|r| r.size);
-    let rate_hz = requests.iter().find_map(|r| r.rate_hz);
-    let filled: Vec<_> = requests
-        .iter()
-        .map(|r| StreamRequest { size: r.size.or(size), rate_hz: r.rate_hz.or(rate_hz), ..r.clone() })
-        .collect();
+    let is_eye = |r: &&StreamRequest| r.stream.as_str() != IMU;
+    let size = requests.iter().filter(is_eye).find_map(|r| r.size);
+    let rate_hz = requests.iter().filter(is_eye).find_map(|r| r.rate_hz);
+    let fill = |r: &StreamRequest| StreamRequest {
+        size: r.size.or(size),
+        rate_hz: r.rate_hz.or(rate_hz),
+        ..r.clone()
+    };
+    let filled: Vec<_> = requests.iter().map(|r| if is_eye(&r) { fill(r) } else { r.clone() }).collect();
     let chosen = choose_profiles(device, available, &filled)?;
-    if let [a, b] = chosen.as_slice()
+    let eyes: Vec<_> = chosen.iter().filter(|p| !p.format.is_motion()).collect();
+    if let [a, b] = eyes.as_slice()
         && (a.width, a.height, a.rate_hz) != (b.width, b.height, b.rate_hz)
     {
         let what = format!(

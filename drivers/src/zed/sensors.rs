@@ -142,6 +142,11 @@ impl Record {
         f64::from(self.temperature_raw) / 100.0
     }
 
+    /// The same where it is known.
+    pub fn own_c(&self) -> Option<f64> {
+        (self.temperature_raw != NO_TEMPERATURE).then(|| self.temperature_c())
+    }
+
     /// Temperatures of the left and the right image sensor, °C, where known.
     pub fn eyes_c(&self) -> [Option<f64>; 2] {
         self.eyes_raw.map(|v| (v != NO_TEMPERATURE && self.air_raw.is_some()).then(|| f64::from(v) / 100.0))

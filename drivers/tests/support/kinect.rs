@@ -201,7 +201,7 @@ impl Rig for Hands {
     }
 
     fn sent(&self, stream: usize) -> Option<Sent> {
-        let l = self.fake.ledger(self.serial, self.streams[stream]);
+        let l = self.fake.ledger(self.serial, *self.streams.get(stream)?);
         let mut drops = DropCounts::default();
         for (reason, n) in [
             (DropReason::Incomplete, l.half),

@@ -11,7 +11,7 @@ from __future__ import annotations
 from ._external import ExternalCamera
 from ._external_mode import ExternalMode
 from ._external_session import ExternalSession, Lent
-from ._frame import Frame
+from ._frame import MOTION_DTYPE, Frame
 from ._group import FrameGroup, SetReader
 from ._header import Header, Intrinsics, Pose, Refinement
 from ._layout import (
@@ -21,6 +21,7 @@ from ._layout import (
     ExternalClock,
     ExternalReason,
     FrameFlags,
+    MotionFlags,
     PixelFormat,
     StageStep,
 )
@@ -46,6 +47,7 @@ from .errors import (
 __version__ = "0.1.0"
 
 __all__ = [
+    "MOTION_DTYPE",
     "AmbiguousRig",
     "BadFrame",
     "BusError",
@@ -68,6 +70,7 @@ __all__ = [
     "HoldingTooMany",
     "Intrinsics",
     "Lent",
+    "MotionFlags",
     "PixelFormat",
     "Pose",
     "Refinement",

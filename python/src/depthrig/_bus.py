@@ -35,7 +35,11 @@ _OTHER_VERSION = (
 
 
 def _header_type(name: str, size: int, align: int) -> type[ctypes.Structure]:
-    """Make the type that iceoryx2 compares with Rust's header: name, size and alignment."""
+    """Make the type that iceoryx2 compares with Rust's header: name, size and alignment.
+
+    Who opens a channel may ask for a smaller alignment than it has, and gets samples as they lie there. ctypes cannot ask
+    for more than a field has before Python 3.13.
+    """
 
     class HeaderType(ctypes.Structure):
         _fields_ = (("words", ctypes.c_uint64 * (size // 8)),)
@@ -44,7 +48,7 @@ def _header_type(name: str, size: int, align: int) -> type[ctypes.Structure]:
         def type_name() -> str:
             return name
 
-    if (ctypes.sizeof(HeaderType), ctypes.alignment(HeaderType)) != (size, align):
+    if ctypes.sizeof(HeaderType) != size or ctypes.alignment(HeaderType) > align:
         raise ImportError(f"{name} cannot be laid out as in Rust on this machine")
     return HeaderType
 

@@ -58,7 +58,8 @@ class ExternalMode:
     def __post_init__(self) -> None:
         """Check what can be checked here."""
         check_name(self.stream, "stream")
-        PixelFormat(self.format)
+        if PixelFormat(self.format) is PixelFormat.MOTION:
+            raise ValueError(f"stream {self.stream!r}: motion samples of another process's camera are not taken yet")
         if not (0 < self.width <= _MAX_SIDE and 0 < self.height <= _MAX_SIDE):
             raise ValueError(
                 f"stream {self.stream!r}: {self.width}x{self.height} is no size, at most {_MAX_SIDE} a side"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from . import _torch
+from . import _layout, _torch
 from ._header import Header
 from ._layout import FrameFlags, PixelFormat
 from .errors import BadFrame, VersionMismatch
@@ -38,6 +38,19 @@ _ELEMENTS = {
     PixelFormat.DISPARITY_F32: ("<f4", 4, 1),
 }
 _FORMATS = frozenset(int(f) for f in PixelFormat)
+_KINDS = {"u8": "u1", "u16": "<u2", "u32": "<u4", "i32": "<i4", "u64": "<u8", "i64": "<i8", "f32": "<f4", "f64": "<f8"}
+
+MOTION_DTYPE = np.dtype(
+    {
+        "names": [name for name, _, _, _ in _layout.MOTION_FIELDS],
+        "formats": [
+            _KINDS[kind] if count == 1 else (_KINDS[kind], (count,)) for _, _, kind, count in _layout.MOTION_FIELDS
+        ],
+        "offsets": [offset for _, offset, _, _ in _layout.MOTION_FIELDS],
+        "itemsize": _layout.MOTION_SAMPLE_SIZE,
+    }
+)
+"""A sample of a motion unit as NumPy sees it; `MotionSample` in bus/src/motion.rs says what its fields are."""
 
 
 class _Owner:
@@ -74,6 +87,11 @@ def shape_of(code: int, width: int, height: int, stride: int, length: int) -> Sh
     pixel_format = PixelFormat(code)
     if pixel_format is PixelFormat.MJPEG:
         return Shape("|u1", (length,), None, length)
+    if pixel_format is PixelFormat.MOTION:
+        needed = width * _layout.MOTION_SAMPLE_SIZE
+        if (height, stride, length) != (1, needed, needed):
+            raise BadFrame(f"{width} motion samples in {height} rows of {stride} bytes are not its {length} bytes")
+        return Shape(f"|V{_layout.MOTION_SAMPLE_SIZE}", (width,), None, length)
     typestr, size, channels = _ELEMENTS[pixel_format]
     rows = height * 3 // 2 if pixel_format is PixelFormat.NV12 else height
     row_bytes = width * size * channels
@@ -141,7 +159,8 @@ class Frame:
         typestr, shape, strides, _ = self._shape
         data = (self._address, read_only)
         interface = {"version": 3, "data": data, "typestr": typestr, "shape": shape, "strides": strides}
-        return np.asarray(_Owner(self._sample, interface))
+        array = np.asarray(_Owner(self._sample, interface))
+        return array.view(MOTION_DTYPE) if typestr[1] == "V" else array
 
     @property
     def array(self) -> npt.NDArray[Any]:
@@ -149,9 +168,26 @@ class Frame:
 
         Shapes: `(H, W, 3)` u8 for rgb8 and bgr8; `(H, W)` u16 for z16 and mono16; `(H, W)` f32 for depth_f32 and
         disparity_f32; `(H, W)` u8 for mono8 and confidence8; `(H, W, 2)` u8 for yuyv and uyvy; `(H * 3 // 2, W)` u8
-        for nv12; `(bytes,)` u8 for mjpeg.
+        for nv12; `(bytes,)` u8 for mjpeg; `(samples,)` of :data:`MOTION_DTYPE` for motion.
         """
         return self._array(read_only=True)
+
+    @property
+    def is_motion(self) -> bool:
+        """Whether it is a batch of a motion unit, and no picture."""
+        return self._shape.typestr[1] == "V"
+
+    @property
+    def motion(self) -> npt.NDArray[Any]:
+        """The samples of a motion unit's batch as a read-only structured array without a copy, oldest first.
+
+        `frame.motion["gyro_rad_s"]` is `(n, 3)` f32; the other fields are `time_ns`, `device_time`, `sequence` (a gap
+        is samples that the device never gave), `uncertainty_ns`, `accel_offset_ns`, `accel_m_s2`, `temperature_c` and
+        `flags` (:class:`depthrig.MotionFlags`); NaN is "not measured". Raises TypeError for a picture.
+        """
+        if not self.is_motion:
+            raise TypeError(f"{self.header.stream_id} carries {self.header.format_name} pictures and no motion samples")
+        return self.array
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         array = self.array
@@ -203,8 +239,11 @@ class Frame:
         * `copy=False` (CPU only) shares the memory: it holds the frame's slot as an array does, and PyTorch knows no
           read-only tensors, so **writing to such a tensor ends the process** with a segmentation fault.
 
-        16-bit pixels are `torch.uint16`, which PyTorch has since 2.3. Raises ImportError without PyTorch.
+        16-bit pixels are `torch.uint16`, which PyTorch has since 2.3. Raises ImportError without PyTorch, and TypeError
+        for a batch of motion samples, which are no pixels: take a field of :attr:`motion`.
         """
+        if self.is_motion:
+            raise TypeError(f"{self.header.stream_id} carries motion samples: use torch.tensor(frame.motion[FIELD])")
         return _torch.tensor(self, device, metres, out, copy)
 
     @property

@@ -222,6 +222,11 @@ class SetReader:
                     continue
                 if frame is None:
                     break
+                if frame.is_motion:
+                    raise TypeError(
+                        f"{name} carries motion samples, which belong to no moment: read it with depthrig.Stream, and "
+                        "choose samples by their time_ns"
+                    )
                 if frame.capture_time_ns <= self._reached.get(name, _NEVER):
                     # A replay that was wound back, or a computer's clock after a restart: begin anew.
                     kept.clear()

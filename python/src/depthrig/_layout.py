@@ -13,12 +13,13 @@ SCHEMA = "depthrig.frame/1"
 HEADER_TYPE = "depthrig.FrameHeader.v1"
 HEADER_VERSION = 1
 HEADER_SIZE = 768
-HEADER_ALIGN = 8
+HEADER_ALIGN = 64
 HEADER_MAGIC = b"DRFH"
 SET_HEADER_TYPE = "depthrig.SetHeader.v1"
 SET_HEADER_SIZE = 40
 SET_HEADER_ALIGN = 8
 SET_RECORD_SIZE = 96
+MOTION_SAMPLE_SIZE = 64
 SHM_PREFIX = "depthrig_"
 IOX_FOLDER = "iox2"
 RUNTIME_DIR_VARIABLE = "DEPTHRIG_RUNTIME_DIR"
@@ -73,6 +74,7 @@ class PixelFormat(enum.IntEnum):
     MJPEG = 10
     CONFIDENCE8 = 11
     DISPARITY_F32 = 12
+    MOTION = 13
 
 
 class DropReason(enum.IntEnum):
@@ -131,6 +133,14 @@ class FrameFlags(enum.IntFlag):
     SYNTHETIC = 128
     HEADER_TIME = 256
     METADATA_LOST = 512
+
+
+class MotionFlags(enum.IntFlag):
+    """Facts about a motion sample, one bit each."""
+
+    FRAME_SYNC = 1
+    ACCEL_CLIPPED = 2
+    GYRO_CLIPPED = 4
 
 
 class ExternalState(enum.IntEnum):
@@ -249,6 +259,20 @@ SET_FIELDS = (
     ("incomplete", 24, "u64", 1),
     ("members", 32, "u32", 1),
     ("present", 36, "u32", 1),
+)
+
+
+# (name, offset, element type, elements)
+MOTION_FIELDS = (
+    ("time_ns", 0, "i64", 1),
+    ("device_time", 8, "u64", 1),
+    ("sequence", 16, "u64", 1),
+    ("uncertainty_ns", 24, "u32", 1),
+    ("accel_offset_ns", 28, "i32", 1),
+    ("gyro_rad_s", 32, "f32", 3),
+    ("accel_m_s2", 44, "f32", 3),
+    ("temperature_c", 56, "f32", 1),
+    ("flags", 60, "u32", 1),
 )
 
 

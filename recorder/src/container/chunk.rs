@@ -1,7 +1,11 @@
 //! One chunk, packed in memory by whoever has its messages, ready to be appended to a file.
 
+use super::pool::{Buffer, Pool};
 use super::record::{op, put_le, put_str};
+use crate::frame::Pixels;
 use crate::{Error, ErrorKind, Result};
+use core::convert::Infallible;
+use std::sync::Arc;
 
 /// Messages below this many bytes are not worth compressing.
 const SMALL: usize = 512;
@@ -9,9 +13,10 @@ const SMALL: usize = 512;
 /// A chunk record and what the index must know of it.
 #[derive(Debug)]
 pub(crate) struct Chunk {
-    /// The record, behind `start` bytes that are not of it.
-    record: Vec<u8>,
+    /// The record, behind `start` bytes that are not of it, up to its tail.
+    record: Buffer,
     start: usize,
+    tail: Option<Tail>,
     /// CRC-32 of the record.
     pub(crate) crc: u32,
     pub(crate) start_time: u64,
@@ -21,6 +26,29 @@ pub(crate) struct Chunk {
     pub(crate) uncompressed_size: u64,
     /// Channel, log time and offset of each message.
     pub(crate) messages: Vec<(u16, u64, u64)>,
+}
+
+/// Bytes at the end of a record that are written from where they lie.
+pub(crate) struct Tail {
+    pixels: Box<dyn Pixels>,
+    len: usize,
+}
+
+impl Tail {
+    /// The first `len` bytes of `pixels`; `None` where there are fewer.
+    pub(crate) fn new(pixels: Box<dyn Pixels>, len: usize) -> Option<Self> {
+        (pixels.bytes().len() >= len).then_some(Self { pixels, len })
+    }
+
+    fn bytes(&self) -> &[u8] {
+        &self.pixels.bytes()[..self.len]
+    }
+}
+
+impl core::fmt::Debug for Tail {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        write!(f, "Tail of {} bytes", self.len)
+    }
 }
 
 /// What goes before a message's data.
@@ -33,15 +61,20 @@ pub(crate) struct MessageHead {
 }
 
 /// Collects messages and packs them; buffers are reused from chunk to chunk.
-#[derive(Default)]
 pub(crate) struct ChunkBuilder {
     /// Room for the chunk's head (longest form), then the message records.
-    buf: Vec<u8>,
+    buf: Buffer,
+    /// `buf` becomes the record itself if it is not compressed; otherwise the record is a copy, of its true size.
+    hand_over: bool,
+    /// The end of the last message, which is not in `buf`.
+    tail: Option<Tail>,
+    /// Where records come from.
+    pool: Arc<Pool>,
     messages: Vec<(u16, u64, u64)>,
     /// Of the message records so far. Each byte is hashed once; the other checksums are combined from that.
     crc: crc32fast::Hasher,
     zstd: Option<zstd::bulk::Compressor<'static>>,
-    /// Where the compressor writes; the record is copied out of it at its true size.
+    /// Where the compressor writes.
     packed: Vec<u8>,
 }
 
@@ -50,10 +83,35 @@ const fn head_len(compression: &str) -> usize {
     1 + 8 + 8 + 8 + 8 + 4 + 4 + compression.len() + 8
 }
 const ROOM: usize = head_len("zstd");
+/// Opcode, length, channel, sequence and two times of a message record.
+const MESSAGE_HEAD: usize = 1 + 8 + 2 + 4 + 8 + 8;
 
 impl ChunkBuilder {
+    /// A builder that lets go of what was written.
     pub(crate) fn new() -> Self {
-        Self::default()
+        Self::with_pool(&Pool::new(0))
+    }
+
+    /// A builder that takes buffers from a pool, to which they go back once their chunk was written.
+    pub(crate) fn with_pool(pool: &Arc<Pool>) -> Self {
+        Self {
+            buf: Buffer::default(),
+            hand_over: false,
+            tail: None,
+            pool: Arc::clone(pool),
+            messages: Vec::new(),
+            crc: crc32fast::Hasher::new(),
+            zstd: None,
+            packed: Vec::new(),
+        }
+    }
+
+    /// Says of an empty chunk that it will be of one message of about `len` bytes, and not be compressed: it is
+    /// written where it stays.
+    pub(crate) fn expect(&mut self, len: usize) {
+        if self.messages.is_empty() {
+            (self.buf, self.hand_over) = (self.pool.take(ROOM + MESSAGE_HEAD + len), true);
+        }
     }
 
     /// Appends a message whose data `fill` writes; returns length and CRC-32 of the data.
@@ -62,22 +120,52 @@ impl ChunkBuilder {
         head: MessageHead,
         fill: impl FnOnce(&mut Vec<u8>) -> Result<(), E>,
     ) -> Result<(u64, u32), E> {
-        self.buf.resize(self.buf.len().max(ROOM), 0);
+        self.make_room();
         let at = self.buf.len();
         self.buf.push(op::MESSAGE);
         put_le!(self.buf, 0u64, head.channel, head.sequence, head.log_time, head.publish_time);
         let data = self.buf.len();
         if let Err(e) = fill(&mut self.buf) {
             self.buf.truncate(at);
+            self.hand_over = false;
             return Err(e);
         }
-        let len = (self.buf.len() - at - 9) as u64;
+        Ok(self.end_message(head, at, data))
+    }
+
+    /// The only message of an empty chunk, whose data `fill` begins and `tail` ends; otherwise as [`Self::message`]. It
+    /// is not compressed.
+    pub(crate) fn message_with_tail(
+        &mut self,
+        head: MessageHead,
+        tail: Tail,
+        fill: impl FnOnce(&mut Vec<u8>),
+    ) -> (u64, u32) {
+        debug_assert!(self.messages.is_empty() && self.tail.is_none());
+        self.tail = Some(tail);
+        let begun = self.message::<Infallible>(head, |buf| {
+            fill(buf);
+            Ok(())
+        });
+        match begun {
+            Ok(told) => told,
+            Err(never) => match never {},
+        }
+    }
+
+    /// Puts the length of the message at `at` right, whose data begins at `data`.
+    fn end_message(&mut self, head: MessageHead, at: usize, data: usize) -> (u64, u32) {
+        let tail = self.tail.as_ref().map_or(&[][..], Tail::bytes);
+        let data_len = (self.buf.len() - data + tail.len()) as u64;
+        let len = (data - at - 9) as u64 + data_len;
         self.buf[at + 1..at + 9].copy_from_slice(&len.to_le_bytes());
         self.messages.push((head.channel, head.log_time, (at - ROOM) as u64));
-        let (data_len, data_crc) = ((self.buf.len() - data) as u64, crc32fast::hash(&self.buf[data..]));
+        let mut crc = crc32fast::Hasher::new();
+        crc.update(&self.buf[data..]);
+        crc.update(tail);
         self.crc.update(&self.buf[at..data]);
-        self.crc.combine(&crc32fast::Hasher::new_with_initial_len(data_crc, data_len));
-        Ok((data_len, data_crc))
+        self.crc.combine(&crc);
+        (data_len, crc.finalize())
     }
 
     /// Packs what was collected and begins anew.
@@ -86,26 +174,30 @@ impl ChunkBuilder {
     /// [`ErrorKind::Codec`] when the compressor fails.
     pub(crate) fn pack(&mut self, compress: bool) -> Result<Chunk> {
         let messages = std::mem::take(&mut self.messages);
-        self.buf.resize(self.buf.len().max(ROOM), 0);
-        let records = &self.buf[ROOM..];
-        let uncompressed_size = records.len() as u64;
+        self.make_room();
+        let tail = self.tail.take();
+        let tail_len = tail.as_ref().map_or(0, |t| t.len);
+        let records = self.buf.len() - ROOM;
+        let uncompressed_size = (records + tail_len) as u64;
         let records_crc = std::mem::take(&mut self.crc);
         let uncompressed_crc = records_crc.clone().finalize();
         let start_time = messages.iter().map(|m| m.1).min().unwrap_or(0);
         let end_time = messages.iter().map(|m| m.1).max().unwrap_or(0);
-        let packed = if compress && records.len() >= SMALL { self.compress()? } else { None };
+        let packed = if compress && records >= SMALL && tail_len == 0 { self.compress()? } else { None };
 
         let (compression, mut record) = match packed {
             Some(record) => ("zstd", record),
-            None => ("", std::mem::take(&mut self.buf)),
+            None if self.hand_over => ("", std::mem::take(&mut self.buf)),
+            None => ("", self.copy(&[], &self.buf)),
         };
         self.buf.clear();
+        self.hand_over = false;
         // Without compression the head is shorter than the room left for it: what is before it goes.
         let spare = ROOM - head_len(compression);
-        let compressed_size = (record.len() - ROOM) as u64;
+        let compressed_size = (record.len() - ROOM + tail_len) as u64;
         let mut head = Vec::with_capacity(ROOM);
         head.push(op::CHUNK);
-        put_le!(head, (record.len() - spare - 9) as u64, start_time, end_time);
+        put_le!(head, (record.len() - spare - 9 + tail_len) as u64, start_time, end_time);
         put_le!(head, uncompressed_size, uncompressed_crc);
         put_str(&mut head, compression);
         put_le!(head, compressed_size);
@@ -120,6 +212,7 @@ impl ChunkBuilder {
         Ok(Chunk {
             record,
             start: spare,
+            tail,
             crc: crc.finalize(),
             start_time,
             end_time,
@@ -130,8 +223,22 @@ impl ChunkBuilder {
         })
     }
 
+    /// An empty head before the first message.
+    fn make_room(&mut self) {
+        let len = self.buf.len().max(ROOM);
+        self.buf.resize(len, 0);
+    }
+
+    /// Both in a buffer of their size.
+    fn copy(&self, head: &[u8], rest: &[u8]) -> Buffer {
+        let mut record = self.pool.take(head.len() + rest.len());
+        record.extend_from_slice(head);
+        record.extend_from_slice(rest);
+        record
+    }
+
     /// The compressed records behind an empty head, or `None` when that saves nothing.
-    fn compress(&mut self) -> Result<Option<Vec<u8>>> {
+    fn compress(&mut self) -> Result<Option<Buffer>> {
         let fail = |e| Error::new(ErrorKind::Codec, "zstd failed").with_source(e);
         if self.zstd.is_none() {
             self.zstd = Some(zstd::bulk::Compressor::new(1).map_err(fail)?);
@@ -144,20 +251,22 @@ impl ChunkBuilder {
         if self.packed.len() >= records.len() {
             return Ok(None);
         }
-        let mut record = Vec::with_capacity(ROOM + self.packed.len());
-        record.resize(ROOM, 0);
-        record.extend_from_slice(&self.packed);
-        Ok(Some(record))
+        Ok(Some(self.copy(&[0; ROOM], &self.packed)))
     }
 }
 
 impl Chunk {
-    /// The bytes of the record.
-    pub(crate) fn bytes(&self) -> &[u8] {
-        &self.record[self.start..]
+    /// The bytes of the record, in two parts.
+    pub(crate) fn parts(&self) -> [&[u8]; 2] {
+        [&self.record[self.start..], self.tail.as_ref().map_or(&[], Tail::bytes)]
     }
 
-    /// The fields of the record.
+    /// Bytes of the record.
+    pub(crate) fn len(&self) -> u64 {
+        self.parts().iter().map(|p| p.len() as u64).sum()
+    }
+
+    /// The fields of a record that was read.
     pub(crate) fn body(&self) -> &[u8] {
         &self.record[self.start + 9..]
     }
@@ -169,8 +278,9 @@ impl Chunk {
         let head = ChunkHead::read(&record)?;
         (head.record_len() == record.len() as u64).then(|| Self {
             crc: crc32fast::hash(&record),
-            record,
+            record: record.into(),
             start: 0,
+            tail: None,
             start_time: head.start_time,
             end_time: head.end_time,
             compression: head.compression,

@@ -280,7 +280,11 @@ impl<'a> Groups<'a> {
         })?;
         if next < self.proven {
             let after = self.listed(&mut chunk, next)?;
-            if self.role(&chunk) == Some(Role::Picture) {
+            // A picture is alone in its chunk and gives it its times. Where the index says otherwise, the chunk itself is
+            // asked: what else it is said to hold would be looked for in it later.
+            let alone =
+                matches!(chunk.messages[..], [(_, t, _)] if (t, t) == (chunk.start_time, chunk.end_time));
+            if alone && self.role(&chunk) == Some(Role::Picture) {
                 self.picture(chunk, at, None);
                 return Ok(after);
             }
@@ -409,8 +413,8 @@ impl<'a> Groups<'a> {
     }
 
     fn torn(&mut self, mark: Option<(u64, &Chunk)>, set: Option<u64>, why: String) {
-        let spans = self.pending.iter().map(|p| (p.offset, p.offset + p.chunk.bytes().len() as u64));
-        let spans = spans.chain(mark.map(|(at, c)| (at, at + c.bytes().len() as u64)));
+        let spans = self.pending.iter().map(|p| (p.offset, p.offset + p.chunk.len()));
+        let spans = spans.chain(mark.map(|(at, c)| (at, at + c.len())));
         let (from, to) = spans.fold((u64::MAX, 0), |(a, b), (from, to)| (a.min(from), b.max(to)));
         self.pending.clear();
         self.ready.push_back(Group::Damage(Damage { from, to, kind: DamageKind::Torn, set, why }));

@@ -110,7 +110,7 @@ impl Segment {
         }
         segment.stats.metadata = segment.metadata.len() as u32;
         segment.stats.attachments = segment.attachments.len() as u32;
-        segment.append(&[(&head, crc32fast::hash(&head))])?;
+        segment.append(&[([&head, &[]], crc32fast::hash(&head))])?;
         sync_folder_of(fs, &segment.part)?;
         Ok(segment)
     }
@@ -148,7 +148,7 @@ impl Segment {
             for (channel, time, offset) in &chunk.messages {
                 per_channel.entry(*channel).or_default().push((*time, *offset));
             }
-            let length = chunk.bytes().len() as u64;
+            let length = chunk.len();
             let mut index = Vec::new();
             let mut offsets = Vec::with_capacity(per_channel.len());
             for (channel, times) in &per_channel {
@@ -169,12 +169,12 @@ impl Segment {
             at += length + index.len() as u64;
             indexes.push(index);
         }
-        let mut parts: Vec<(&[u8], u32)> = Vec::with_capacity(2 * chunks.len());
+        let mut records: Vec<([&[u8]; 2], u32)> = Vec::with_capacity(2 * chunks.len());
         for (chunk, index) in chunks.iter().zip(&indexes) {
-            parts.push((chunk.bytes(), chunk.crc));
-            parts.push((index, crc32fast::hash(index)));
+            records.push((chunk.parts(), chunk.crc));
+            records.push(([index, &[]], crc32fast::hash(index)));
         }
-        self.append(&parts)?;
+        self.append(&records)?;
         self.chunks.extend(entries);
         for chunk in chunks {
             self.stats.chunks += 1;
@@ -200,7 +200,7 @@ impl Segment {
         let mut bytes = Vec::new();
         record::metadata(&mut bytes, name, map);
         let at = self.len;
-        self.append(&[(&bytes, crc32fast::hash(&bytes))])?;
+        self.append(&[([&bytes, &[]], crc32fast::hash(&bytes))])?;
         self.metadata.push((at, bytes.len() as u64, name.to_owned()));
         self.stats.metadata += 1;
         Ok(())
@@ -226,7 +226,7 @@ impl Segment {
     /// Writes index and footer and makes the file durable under the name that it has.
     pub(crate) fn seal(mut self) -> Result<PathBuf> {
         let tail = self.tail();
-        self.append(&[(&tail, 0)])?;
+        self.append(&[([&tail, &[]], 0)])?;
         self.file.sync_all().map_err(|e| Error::io("sync", &self.part, e))?;
         if self.doubtful {
             return Err(Error::new(
@@ -274,8 +274,8 @@ impl Segment {
         b
     }
 
-    /// Appends parts with their CRCs: all or, after cutting back, none.
-    fn append(&mut self, parts: &[(&[u8], u32)]) -> Result<()> {
+    /// Appends records, in up to two pieces each, with their CRCs: all or, after cutting back, none.
+    fn append(&mut self, records: &[([&[u8]; 2], u32)]) -> Result<()> {
         if self.torn {
             // An earlier cut failed; nothing may follow a torn record.
             let cut = self.file.truncate(self.len);
@@ -284,13 +284,14 @@ impl Segment {
         }
         let mut len = self.len;
         let mut crc = self.crc.clone();
-        for (bytes, part_crc) in parts {
-            if let Err(e) = fs::write_all(&mut *self.file, bytes) {
+        for (pieces, record_crc) in records {
+            if let Err(e) = pieces.iter().try_for_each(|bytes| fs::write_all(&mut *self.file, bytes)) {
                 self.torn = self.file.truncate(self.len).is_err();
                 return Err(Error::io("write", &self.part, e));
             }
-            len += bytes.len() as u64;
-            crc.combine(&crc32fast::Hasher::new_with_initial_len(*part_crc, bytes.len() as u64));
+            let bytes = pieces.iter().map(|p| p.len() as u64).sum();
+            len += bytes;
+            crc.combine(&crc32fast::Hasher::new_with_initial_len(*record_crc, bytes));
         }
         (self.len, self.crc) = (len, crc);
         Ok(())

@@ -65,8 +65,8 @@ fn wrong(h: &FrameHeader, what: impl core::fmt::Display) -> Error {
 /// The pixels of a colour JPEG, three bytes each without row padding.
 pub(crate) fn jpeg_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
     let damaged = |e: ::image::ImageError| wrong(h, "its JPEG is damaged").with_source(e);
-    // zune-jpeg 0.4.21 panics on a few damaged files, such as a narrow one with odd sampling
-    // factors; what it worked on is given up then.
+    // zune-jpeg has panicked on damaged files, such as a narrow one with odd sampling factors (0.4.21; none is known
+    // for 0.5.15); what it worked on is given up then.
     catch_unwind(AssertUnwindSafe(|| {
         let decoder = JpegDecoder::new(Cursor::new(stored)).map_err(damaged)?;
         color_pixels(decoder, "JPEG", h)

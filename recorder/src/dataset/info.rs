@@ -3,7 +3,10 @@
 use super::{Dataset, PixelMode, SetRange};
 use crate::msgs::accounts;
 use crate::msgs::schemas::Schema;
-use crate::{Computed, ErrorKind, Result, SetCounts, StreamAccount};
+use crate::{
+    Computed, ErrorKind, MotionRecord, RecordMotion, Result, SetCounts, StreamAccount, StreamRecord,
+};
+use depthrig_bus::FrameFlags;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -41,6 +44,9 @@ pub struct DatasetInfo {
     pub spread: SpreadStats,
     /// Per stream.
     pub streams: Vec<StreamInfo>,
+    /// Per motion unit.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub motion: Vec<MotionInfo>,
     /// Streams that no camera gave, with what computed them.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub computed: Vec<Computed>,
@@ -101,6 +107,106 @@ pub struct StreamInfo {
     pub rate_hz: f64,
 }
 
+/// One motion unit of a dataset.
+#[derive(Debug, Clone, Serialize)]
+#[non_exhaustive]
+pub struct MotionInfo {
+    /// `camera/stream`.
+    pub unit: String,
+    /// Camera model.
+    pub model: String,
+    /// Batches in the dataset.
+    pub batches: u64,
+    /// Batches between the first and the last that are not in it.
+    pub lost_batches: u64,
+    /// Samples in the dataset.
+    pub samples: u64,
+    /// Samples per second between the first and the last, by their times.
+    pub rate_hz: f64,
+}
+
+/// What is counted of a motion unit while its batches pass.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct MotionCount {
+    /// Batches that passed.
+    pub(crate) batches: u64,
+    /// Batches that are missing between those.
+    pub(crate) lost_batches: u64,
+    /// Samples that passed.
+    pub(crate) samples: u64,
+    /// Samples that are missing between those and were not lost with a batch: the device never gave them.
+    pub(crate) never_given: u64,
+    last_batch: Option<(u64, [u64; 8])>,
+    last_sample: Option<u64>,
+    times: Option<(i64, i64)>,
+}
+
+impl MotionCount {
+    pub(crate) fn take(&mut self, batch: &RecordMotion) {
+        let sequence = batch.header.sequence;
+        let skipped = self.last_batch.map_or(0, |(last, _)| sequence.saturating_sub(last.saturating_add(1)));
+        self.lost_batches = self.lost_batches.saturating_add(skipped);
+        // A recorded replay may begin again at any batch.
+        let replayed = batch.header.flags & FrameFlags::REPLAYED.0 != 0;
+        let mut kept = skipped == 0
+            && !replayed
+            && self.last_batch.is_none_or(|(_, dropped)| dropped == batch.header.dropped);
+        self.last_batch = Some((sequence, batch.header.dropped));
+        for sample in &batch.samples {
+            let before = self.last_sample.replace(sample.sequence);
+            let gap = before.map_or(0, |before| sample.sequence.saturating_sub(before.saturating_add(1)));
+            self.never_given = self.never_given.saturating_add(if kept { gap } else { 0 });
+            // Within a batch nothing else is lost.
+            kept = true;
+        }
+        self.batches += 1;
+        self.samples += batch.samples.len() as u64;
+        if let (Some(first), Some(last)) = (batch.samples.first(), batch.samples.last()) {
+            let (began, _) = self.times.unwrap_or((first.time_ns, 0));
+            self.times = Some((began, last.time_ns));
+        }
+    }
+
+    /// Samples per second, 0 without two.
+    pub(crate) fn rate_hz(&self) -> f64 {
+        let span = self.times.map_or(0, |(first, last)| last.saturating_sub(first));
+        if span > 0 { self.samples.saturating_sub(1) as f64 * 1e9 / span as f64 } else { 0.0 }
+    }
+}
+
+impl StreamInfo {
+    /// Of a stream of which nothing was read yet.
+    fn new(s: &StreamRecord) -> Self {
+        Self {
+            stream: s.id.to_string(),
+            model: s.model.clone(),
+            format: s.format.name(),
+            width: s.width,
+            height: s.height,
+            codec: "",
+            depth_unit_m: s.depth_unit_m,
+            frames: 0,
+            missing: 0,
+            bytes: 0,
+            raw_bytes: 0,
+            rate_hz: 0.0,
+        }
+    }
+}
+
+impl MotionInfo {
+    fn new(unit: &MotionRecord, count: &MotionCount) -> Self {
+        Self {
+            unit: unit.id.to_string(),
+            model: unit.model.clone(),
+            batches: count.batches,
+            lost_batches: count.lost_batches,
+            samples: count.samples,
+            rate_hz: count.rate_hz(),
+        }
+    }
+}
+
 pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
     let session = dataset.session();
     let mut info = DatasetInfo {
@@ -119,28 +225,15 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         problems: Vec::new(),
         spread: SpreadStats::default(),
         streams: Vec::new(),
+        motion: Vec::new(),
         computed: session.computed.clone(),
         set_counts: None,
         accounts: Vec::new(),
     };
-    for s in &session.streams {
-        info.streams.push(StreamInfo {
-            stream: s.id.to_string(),
-            model: s.model.clone(),
-            format: s.format.name(),
-            width: s.width,
-            height: s.height,
-            codec: "",
-            depth_unit_m: s.depth_unit_m,
-            frames: 0,
-            missing: 0,
-            bytes: 0,
-            raw_bytes: 0,
-            rate_hz: 0.0,
-        });
-    }
+    info.streams.extend(session.streams.iter().map(StreamInfo::new));
     let mut spreads = Vec::new();
     let mut ticks = None;
+    let mut units = vec![MotionCount::default(); session.motion.len()];
     let mut captures = vec![None; info.streams.len()];
     for set in dataset.sets_with(SetRange::ALL, PixelMode::None) {
         let set = match set {
@@ -156,6 +249,9 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         spreads.push(set.spread_ns);
         let (first, _) = ticks.unwrap_or((set.tick, set.tick));
         ticks = Some((first, set.tick));
+        for batch in &set.motion {
+            units[batch.unit].take(batch);
+        }
         for s in set.missing {
             info.streams[s].missing += 1;
         }
@@ -176,6 +272,7 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
             s.rate_hz = (s.frames - 1) as f64 * 1e9 / span as f64;
         }
     }
+    info.motion = session.motion.iter().zip(&units).map(|(u, count)| MotionInfo::new(u, count)).collect();
     info.spread = SpreadStats::of(spreads);
     info.duration_ns = ticks.map_or(0, |(first, last)| last.since_ns(first));
     for i in 0..dataset.segments().len() {

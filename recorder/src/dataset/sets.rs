@@ -3,11 +3,11 @@
 use super::{Dataset, decode};
 use crate::container::scan::{ChannelInfo, ChunkEntry, SegmentReader};
 use crate::encode::Codec;
-use crate::msgs::frame_info;
 use crate::msgs::frame_set::FrameSetMsg;
 use crate::msgs::schemas::Schema;
-use crate::{Error, ErrorKind, Result};
-use depthrig_bus::{FrameHeader, HostTime, StreamId};
+use crate::msgs::{frame_info, motion};
+use crate::{Error, ErrorKind, RecordMotion, Result};
+use depthrig_bus::{FrameHeader, HostTime, PixelFormat, StreamId};
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::{Bound, RangeBounds};
 
@@ -78,6 +78,8 @@ pub struct DatasetSet {
     pub frames: Vec<DatasetFrame>,
     /// Indices of the streams without a frame.
     pub missing: Vec<usize>,
+    /// What the motion units sent since the set before.
+    pub motion: Vec<RecordMotion>,
 }
 
 /// A frame read from a dataset.
@@ -135,6 +137,12 @@ pub(super) struct Open {
 pub(crate) enum Kind {
     Picture(StreamId),
     Info(StreamId),
+    /// The header of a batch of a motion unit.
+    UnitInfo(StreamId),
+    /// The samples of a batch.
+    Samples(StreamId),
+    /// A sample, for readers that do not know batches.
+    Imu(StreamId),
     Set,
 }
 
@@ -143,6 +151,15 @@ pub(crate) enum Kind {
 struct Partial {
     pictures: BTreeMap<StreamId, (u64, Vec<u8>)>,
     infos: BTreeMap<StreamId, (u64, Vec<u8>)>,
+    batches: Vec<PartialBatch>,
+}
+
+/// A batch of a motion unit, as far as it was read.
+struct PartialBatch {
+    unit: StreamId,
+    log_time: u64,
+    info: Vec<u8>,
+    samples: Option<Vec<u8>>,
 }
 
 impl Sets {
@@ -239,6 +256,19 @@ impl Open {
                 Some(Kind::Info(id)) => {
                     partial.infos.insert(id.clone(), (m.log_time, m.data.to_vec()));
                 }
+                Some(Kind::UnitInfo(id)) => partial.batches.push(PartialBatch {
+                    unit: id.clone(),
+                    log_time: m.log_time,
+                    info: m.data.to_vec(),
+                    samples: None,
+                }),
+                Some(Kind::Samples(id)) => {
+                    // It follows its header.
+                    let last = partial.batches.iter_mut().rfind(|b| b.unit == *id);
+                    if let Some(last) = last.filter(|b| b.samples.is_none() && b.log_time == m.log_time) {
+                        last.samples = Some(m.data.to_vec());
+                    }
+                }
                 Some(Kind::Set) => {
                     let partial = std::mem::take(partial);
                     let inside = (range.from_utc_ns..=range.to_utc_ns).contains(&(m.log_time as i64));
@@ -305,6 +335,8 @@ fn assemble(
         let stored_bytes = member.message_bytes;
         frames.push(DatasetFrame { stream, header, codec: codec.name(), stored_bytes, pixels, jpeg });
     }
+    let batches = partial.batches.into_iter().filter(|b| b.log_time == log_time);
+    let motion = batches.map(|b| batch(b, set.id, dataset)).collect::<Result<_>>()?;
     Ok(DatasetSet {
         id: set.id,
         tick: HostTime::from_ns(set.tick_ns),
@@ -313,7 +345,26 @@ fn assemble(
         spread_ns: set.spread_ns,
         frames,
         missing: set.missing.iter().map(|name| index(name)).collect::<Result<_>>()?,
+        motion,
     })
+}
+
+/// A batch of set `set`, restored.
+fn batch(partial: PartialBatch, set: u64, dataset: &Dataset) -> Result<RecordMotion> {
+    let PartialBatch { unit, info, samples, .. } = partial;
+    let corrupt = |what: String| Error::new(ErrorKind::Corrupt, format!("set {set}: {what}"));
+    let index = dataset.session().motion.iter().position(|u| u.id == unit);
+    let index = index.ok_or_else(|| corrupt(format!("{unit} is no motion unit of the session")))?;
+    let (header, _) = frame_info::read(&info)?;
+    let n = header.sequence;
+    let samples = samples.ok_or_else(|| corrupt(format!("batch {n} of {unit} has no samples")))?;
+    let samples = motion::read_samples(&samples)?;
+    if samples.sequence != n || samples.samples.len() != header.width as usize {
+        let (has, of, width) = (samples.samples.len(), samples.sequence, header.width);
+        let what = format!("batch {n} of {unit} has {width} samples, {has} of batch {of} are there");
+        return Err(corrupt(what));
+    }
+    Ok(RecordMotion { unit: index, header, samples: samples.samples })
 }
 
 /// What the channels of a segment carry, by type and by the `stream` in their metadata.
@@ -329,7 +380,14 @@ pub(crate) fn kind_of(channel: &ChannelInfo) -> Option<Kind> {
     }
     let stream = channel.metadata.get("stream").and_then(|s| s.parse().ok())?;
     if is(Schema::FrameInfo) {
-        return Some(Kind::Info(stream));
+        let motion = channel.metadata.get("format").is_some_and(|f| f == PixelFormat::Motion.name());
+        return Some(if motion { Kind::UnitInfo(stream) } else { Kind::Info(stream) });
+    }
+    if is(Schema::MotionSamples) {
+        return Some(Kind::Samples(stream));
+    }
+    if is(Schema::Imu) {
+        return Some(Kind::Imu(stream));
     }
     Schema::PICTURES.into_iter().any(is).then_some(Kind::Picture(stream))
 }

@@ -258,7 +258,7 @@ pub fn export(
         frames: 0,
         files: 0,
         bytes: 0,
-        losses: plan.losses.clone(),
+        losses: plan.losses.iter().cloned().chain(sources.iter().filter_map(motion)).collect(),
         counters: std::collections::BTreeMap::new(),
         lost: 0,
         problems: Vec::new(),
@@ -311,6 +311,15 @@ pub fn export(
         .map_err(|e| Error::new(ErrorKind::BadInput, "the report cannot be written").with_source(e))?;
     out.close(&told)?;
     Ok(report)
+}
+
+/// What no layout takes of a dataset with motion units.
+fn motion(source: &Source) -> Option<String> {
+    let units: Vec<_> = source.session().motion.iter().map(|u| u.id.to_string()).collect();
+    (!units.is_empty()).then(|| {
+        let (name, units) = (&source.session().name, units.join(", "));
+        format!("{name}: the motion samples of {units} are left out; `depthrig cat --stream` writes them")
+    })
 }
 
 fn streams(sources: &[Source], parts: &Parts<'_>) -> Vec<StreamCount> {

@@ -21,6 +21,12 @@ pub(crate) const fn encoding(format: PixelFormat) -> Option<&'static str> {
     })
 }
 
+/// Bytes that are enough for an `Image`, or for a `CompressedImage` of these bytes.
+pub(crate) const fn room(frame_id: &str, pixels: &[u8]) -> usize {
+    // A stamp, six numbers of 32 bits, two strings' ends and the encoding's name are far below.
+    128 + frame_id.len() + pixels.len()
+}
+
 pub(crate) fn write_image(
     buf: &mut Vec<u8>,
     stamp_utc_ns: i64,
@@ -29,10 +35,22 @@ pub(crate) fn write_image(
     encoding: &str,
     pixels: &[u8],
 ) {
-    buf.reserve(pixels.len() + 128);
+    buf.reserve(room(frame_id, pixels));
+    write_image_head(buf, stamp_utc_ns, frame_id, h, encoding, pixels.len() as u32);
+    buf.extend_from_slice(pixels);
+}
+
+/// An `Image` up to its pixels, which are so many bytes.
+pub(crate) fn write_image_head(
+    buf: &mut Vec<u8>,
+    stamp_utc_ns: i64,
+    frame_id: &str,
+    h: &FrameHeader,
+    encoding: &str,
+    bytes: u32,
+) {
     let mut w = Writer::new(buf);
-    w.header(stamp_utc_ns, frame_id).u32(h.height).u32(h.width).str(encoding).u8(0).u32(h.stride);
-    w.bytes(pixels);
+    w.header(stamp_utc_ns, frame_id).u32(h.height).u32(h.width).str(encoding).u8(0).u32(h.stride).u32(bytes);
 }
 
 /// The pixels of an `Image`.

@@ -2,7 +2,7 @@
 //! The standard ones follow `common_interfaces` and `rcl_interfaces` (Apache-2.0), without their comments.
 
 use crate::container::record::SchemaRecord;
-use depthrig_bus::{DropReason, FIELDS};
+use depthrig_bus::{DropReason, FIELDS, Field, MOTION_FIELDS};
 use std::borrow::Cow;
 use std::fmt::Write;
 
@@ -21,10 +21,12 @@ pub(crate) enum Schema {
     Accounts,
     Checkpoint,
     CompressedDepth,
+    MotionSamples,
+    Imu,
 }
 
 impl Schema {
-    pub(crate) const ALL: [Self; 12] = [
+    pub(crate) const ALL: [Self; 14] = [
         Self::Image,
         Self::CompressedImage,
         Self::CameraInfo,
@@ -37,10 +39,15 @@ impl Schema {
         Self::Accounts,
         Self::Checkpoint,
         Self::CompressedDepth,
+        Self::MotionSamples,
+        Self::Imu,
     ];
 
     /// The types that carry a picture.
     pub(crate) const PICTURES: [Self; 3] = [Self::Image, Self::CompressedImage, Self::CompressedDepth];
+
+    /// The types that only a dataset with a motion unit has.
+    const MOTION: [Self; 2] = [Self::MotionSamples, Self::Imu];
 
     /// The id of the schema record: 1, 2, … in the order of [`Self::ALL`].
     pub(crate) const fn id(self) -> u16 {
@@ -61,6 +68,8 @@ impl Schema {
             Self::Accounts => "depthrig_msgs/msg/Accounts",
             Self::Checkpoint => "depthrig_msgs/msg/Checkpoint",
             Self::CompressedDepth => "depthrig_msgs/msg/CompressedDepth",
+            Self::MotionSamples => "depthrig_msgs/msg/MotionSamples",
+            Self::Imu => "sensor_msgs/msg/Imu",
         }
     }
 
@@ -85,25 +94,27 @@ impl Schema {
             Self::Accounts => with(&accounts(), &[TIME_DEP, STREAM_ACCOUNT_DEP]),
             Self::Checkpoint => with(CHECKPOINT, &[TIME_DEP]),
             Self::CompressedDepth => with(COMPRESSED_DEPTH, &[HEADER_DEP, TIME_DEP]),
+            Self::MotionSamples => with(MOTION_SAMPLES, &[TIME_DEP, (MOTION_SAMPLE, &motion_sample())]),
+            Self::Imu => with(IMU, &[HEADER_DEP, TIME_DEP, QUATERNION_DEP, VECTOR3_DEP]),
         }
     }
 
-    /// The records of all types, as they stand at the head of a segment.
-    pub(crate) fn records() -> Vec<SchemaRecord> {
+    /// The records of all types, as they stand at the head of a segment of a recording that has motion units or not.
+    pub(crate) fn records(motion: bool) -> Vec<SchemaRecord> {
         let record = |s: Self| SchemaRecord {
             id: s.id(),
             name: s.name().to_owned(),
             encoding: "ros2msg".to_owned(),
             data: s.text().into_bytes(),
         };
-        Self::ALL.into_iter().map(record).collect()
+        Self::ALL.into_iter().filter(|s| motion || !Self::MOTION.contains(s)).map(record).collect()
     }
 }
 
 /// A definition that others use: its name and its text.
-type Dep = (&'static str, &'static str);
+type Dep<'a> = (&'a str, &'a str);
 
-fn with(text: &str, deps: &[Dep]) -> String {
+fn with(text: &str, deps: &[Dep<'_>]) -> String {
     let rule = "=".repeat(80);
     let mut all = text.to_owned();
     for (name, text) in deps {
@@ -112,23 +123,23 @@ fn with(text: &str, deps: &[Dep]) -> String {
     all
 }
 
-const TIME_DEP: Dep = ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n");
-const HEADER_DEP: Dep = ("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n");
-const ROI_DEP: Dep = (
+const TIME_DEP: Dep<'_> = ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n");
+const HEADER_DEP: Dep<'_> = ("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n");
+const ROI_DEP: Dep<'_> = (
     "sensor_msgs/RegionOfInterest",
     "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify\n",
 );
-const VECTOR3_DEP: Dep = ("geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z\n");
-const QUATERNION_DEP: Dep =
+const VECTOR3_DEP: Dep<'_> = ("geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z\n");
+const QUATERNION_DEP: Dep<'_> =
     ("geometry_msgs/Quaternion", "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n");
-const TRANSFORM_DEP: Dep =
+const TRANSFORM_DEP: Dep<'_> =
     ("geometry_msgs/Transform", "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n");
-const TRANSFORM_STAMPED_DEP: Dep = (
+const TRANSFORM_STAMPED_DEP: Dep<'_> = (
     "geometry_msgs/TransformStamped",
     "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n",
 );
-const KEY_VALUE_DEP: Dep = ("diagnostic_msgs/KeyValue", "string key\nstring value\n");
-const STATUS_DEP: Dep = (
+const KEY_VALUE_DEP: Dep<'_> = ("diagnostic_msgs/KeyValue", "string key\nstring value\n");
+const STATUS_DEP: Dep<'_> = (
     "diagnostic_msgs/DiagnosticStatus",
     "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\n\
      byte level\nstring name\nstring message\nstring hardware_id\ndiagnostic_msgs/KeyValue[] values\n",
@@ -205,7 +216,7 @@ uint64 file_bytes
 uint32 crc32
 ";
 
-const MEMBER_DEP: Dep = (
+const MEMBER_DEP: Dep<'_> = (
     "depthrig_msgs/FrameMember",
     "# camera/stream\nstring stream\nuint64 sequence\nint64 capture_time_ns\n\
      # Size and CRC-32 of the image message of this member.\nuint64 message_bytes\nuint32 message_crc32\n",
@@ -233,7 +244,7 @@ string codec
 uint8[] data
 ";
 
-const STREAM_ACCOUNT_DEP: Dep = (
+const STREAM_ACCOUNT_DEP: Dep<'_> = (
     "depthrig_msgs/StreamAccount",
     "# captured = delivered + sum(dropped) since the stream began; dropped by reason as in FrameInfo.\n\
      string stream\nuint64 captured\nuint64 delivered\nuint64[8] dropped\n",
@@ -244,21 +255,56 @@ fn frame_info() -> String {
     let mut text = "# Every field of depthrig's frame header, bit by bit, in its order.\n".to_owned();
     let reasons: Vec<_> = DropReason::ALL.iter().map(|r| r.name()).collect();
     let _ = writeln!(text, "# dropped[i]: {}.", reasons.join(", "));
-    for f in FIELDS {
+    fields(&mut text, FIELDS);
+    text.push_str(
+        "# Capture time as UTC, and the name of the optical frame.\nbuiltin_interfaces/Time stamp\n\
+         string frame_id\n# How the pixels are stored: raw, jpeg, mjpeg, png or rank.\nstring codec\n",
+    );
+    text
+}
+
+const MOTION_SAMPLES: &str = "\
+# A batch of samples of a motion unit, oldest first. stamp is the time of the newest as UTC, sequence the number of the
+# batch on its channel; frame_info has the rest. The array is the bytes of the batch.
+builtin_interfaces/Time stamp
+uint64 sequence
+depthrig_msgs/MotionSample[] samples
+";
+
+const MOTION_SAMPLE: &str = "depthrig_msgs/MotionSample";
+
+const IMU: &str = "\
+std_msgs/Header header
+geometry_msgs/Quaternion orientation
+float64[9] orientation_covariance
+geometry_msgs/Vector3 angular_velocity
+float64[9] angular_velocity_covariance
+geometry_msgs/Vector3 linear_acceleration
+float64[9] linear_acceleration_covariance
+";
+
+/// The definition of `MotionSample`, from the layout of the sample.
+fn motion_sample() -> String {
+    let mut text = "# Times in nanoseconds on the host clock, the unit's own time in ticks; rad/s and m/s2, NaN is none.\n\
+                    # flags: 1 first after an exposure, 2 acceleration clipped, 4 rotation clipped.\n"
+        .to_owned();
+    fields(&mut text, MOTION_FIELDS);
+    text
+}
+
+/// A line for each field of a layout.
+fn fields(text: &mut String, fields: &[Field]) {
+    for f in fields {
         let kind: Cow<str> = match f.kind {
             "f32" => "float32".into(),
             "f64" => "float64".into(),
+            "i32" => "int32".into(),
             "i64" => "int64".into(),
             unsigned => unsigned.replace('u', "uint").into(),
         };
         let array = if f.count > 1 { format!("[{}]", f.count) } else { String::new() };
         let _ = writeln!(text, "{kind}{array} {}", f.name.replace('.', "_"));
     }
-    text.push_str(
-        "# Capture time as UTC, and the name of the optical frame.\nbuiltin_interfaces/Time stamp\n\
-         string frame_id\n# How the pixels are stored: raw, jpeg, mjpeg, png or rank.\nstring codec\n",
-    );
-    text
 }
 
 fn accounts() -> String {

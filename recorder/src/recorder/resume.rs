@@ -30,6 +30,8 @@ pub(super) struct Past {
     pub(super) frames: u64,
     pub(super) bytes: u64,
     pub(super) last_id: Option<u64>,
+    /// Number of the last batch of each motion unit.
+    pub(super) last_batches: Vec<Option<u64>>,
     pub(super) anchor: Option<UtcPair>,
     pub(super) last_log_time: i64,
     pub(super) first_tick: Option<HostTime>,
@@ -38,8 +40,9 @@ pub(super) struct Past {
 
 impl Past {
     /// That of a new dataset: nothing.
-    pub(super) const fn new(session: Session) -> Self {
+    pub(super) fn new(session: Session) -> Self {
         Self {
+            last_batches: vec![None; session.motion.len()],
             session,
             segments: 0,
             sets: 0,
@@ -106,6 +109,9 @@ pub(super) fn past(fs: &Arc<dyn Fs>, dir: &Path) -> Result<Past> {
         past.sets += 1;
         past.frames += set.frames.len() as u64;
         past.last_id = Some(set.id);
+        for batch in &set.motion {
+            past.last_batches[batch.unit] = Some(batch.header.sequence);
+        }
         past.last_log_time = set.utc_ns;
         let offset = set.tick.ns().saturating_add(set.utc_offset_ns);
         past.anchor.get_or_insert(UtcPair { mono: set.tick, utc_ns: offset, width_ns: 0 });

@@ -1,7 +1,7 @@
 //! A set on its way: the workers fill its slots in any order, the writer takes tickets in order.
 
 use crate::encode::EncodedFrame;
-use crate::frame::{RecordFrame, RecordSet};
+use crate::frame::{RecordFrame, RecordMotion, RecordSet};
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{FrameHeader, HostTime, UtcPair};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -29,6 +29,8 @@ pub(super) struct Ticket {
     pub(super) missing: Vec<usize>,
     /// Stream and header of each frame, `set_id` filled in.
     pub(super) frames: Vec<(usize, FrameHeader)>,
+    /// The batches of the motion units, `set_id` filled in.
+    pub(super) motion: Vec<RecordMotion>,
     slots: Mutex<Slots>,
     ready: Condvar,
     load: Arc<Load>,
@@ -59,6 +61,13 @@ impl Ticket {
         for f in &mut frames {
             f.header.set_id = set.id;
         }
+        let mut motion = set.motion;
+        for batch in &mut motion {
+            batch.header.set_id = set.id;
+        }
+        // Samples wait for the writer as encoded pictures do.
+        let bytes = motion.iter().map(RecordMotion::stored_bytes).sum();
+        load.backlog_bytes.fetch_add(bytes, Ordering::Relaxed);
         let done = frames.iter().map(|_| None).collect();
         let ticket = Self {
             id: set.id,
@@ -69,8 +78,9 @@ impl Ticket {
             spread_ns: set.spread_ns,
             offered,
             missing: set.missing,
-            slots: Mutex::new(Slots { left: frames.len(), bytes: 0, done }),
+            slots: Mutex::new(Slots { left: frames.len(), bytes, done }),
             frames: frames.iter().map(|f| (f.stream, f.header)).collect(),
+            motion,
             ready: Condvar::new(),
             load: Arc::clone(load),
         };
@@ -103,7 +113,7 @@ impl Ticket {
     fn fill(&self, slot: usize, result: Result<EncodedFrame>) {
         let mut slots = self.lock();
         let Some(place) = slots.done.get_mut(slot).filter(|p| p.is_none()) else { return };
-        let bytes = result.as_ref().map_or(0, |f| f.chunk.bytes().len() as u64);
+        let bytes = result.as_ref().map_or(0, |f| f.chunk.len());
         self.load.backlog_bytes.fetch_add(bytes, Ordering::Relaxed);
         *place = Some(result);
         slots.bytes += bytes;
@@ -124,11 +134,10 @@ impl Job {
         &self.ticket
     }
 
-    /// Encodes the frame, lets go of its pixels, and only then fills the slot.
-    pub(super) fn run(mut self, encode: impl FnOnce(&RecordFrame) -> Result<EncodedFrame>) {
+    /// Encodes the frame, which lets go of its pixels unless they may wait, and only then fills the slot.
+    pub(super) fn run(mut self, encode: impl FnOnce(RecordFrame) -> Result<EncodedFrame>) {
         let Some(frame) = self.frame.take() else { return };
-        let result = encode(&frame);
-        drop(frame);
+        let result = encode(frame);
         self.ticket.fill(self.slot, result);
     }
 }

@@ -3,17 +3,20 @@
 use crate::container::record::Channel;
 use crate::container::segment::Preamble;
 use crate::encode::Codec;
-use crate::frame::RecordSet;
+use crate::frame::{RecordMotion, RecordSet, SET_MOTION_MAX_BYTES};
 use crate::msgs::image;
 use crate::msgs::schemas::Schema;
-use crate::msgs::tf::{mount_frame, optical_frame};
-use crate::{RecorderOptions, Result, Session};
+use crate::msgs::tf::{mount_frame, optical_frame, unit_frame};
+use crate::{MotionRecord, RecorderOptions, Result, Session};
+use depthrig_bus::{FrameHeader, MOTION_SAMPLE_BYTES, PixelFormat};
 use std::collections::BTreeMap;
 
 /// The metadata record that makes an MCAP file one of ours.
 pub(crate) const SESSION_METADATA: &str = "depthrig.session";
 /// The metadata record at the end of a segment.
 pub(crate) const SEGMENT_METADATA: &str = "depthrig.segment";
+/// What `frame_info` says of how a batch of motion samples is stored.
+pub(crate) const MOTION_CODEC: &str = "samples";
 /// The attachment with the rig's configuration.
 const RIG_ATTACHMENT: &str = "rig.toml";
 
@@ -74,12 +77,28 @@ pub(crate) const fn image_channel(stream: usize) -> u16 {
     (Global::ALL.len() + 1 + 3 * stream) as u16
 }
 
+/// The frame information of the motion unit of this index; its batches and its samples follow.
+const fn motion_channel(streams: usize, unit: usize) -> u16 {
+    image_channel(streams) + 3 * unit as u16
+}
+
+/// A motion unit.
+pub(super) struct Unit {
+    name: String,
+    pub(super) frame_id: String,
+    /// The channel of its frame information; those of batches and samples follow.
+    pub(super) channel: u16,
+    /// Most samples of one batch.
+    batch: u32,
+}
+
 pub(crate) struct Topics {
     frame_ids: Vec<String>,
     /// Picture formats as announced, with width and height.
-    formats: Vec<depthrig_bus::PixelFormat>,
+    formats: Vec<PixelFormat>,
     names: Vec<String>,
     codecs: Vec<Codec>,
+    units: Vec<Unit>,
 }
 
 impl Topics {
@@ -90,7 +109,19 @@ impl Topics {
             formats: streams.iter().map(|s| s.format).collect(),
             names: streams.iter().map(|s| s.id.to_string()).collect(),
             codecs: streams.iter().map(|s| Codec::of(s.format, options)).collect(),
+            units: (session.motion.iter().enumerate())
+                .map(|(i, u)| Unit {
+                    name: u.id.to_string(),
+                    frame_id: unit_frame(&u.id),
+                    channel: motion_channel(streams.len(), i),
+                    batch: u.batch,
+                })
+                .collect(),
         }
+    }
+
+    pub(super) fn unit(&self, unit: usize) -> &Unit {
+        &self.units[unit]
     }
 
     pub(super) fn frame_id(&self, stream: usize) -> &str {
@@ -105,8 +136,13 @@ impl Topics {
         self.codecs[stream]
     }
 
-    /// What makes a set impossible to record, in words.
-    pub(super) fn check(&self, set: &RecordSet, last_id: Option<u64>) -> Result<(), String> {
+    /// What makes a set impossible to record, in words; after the set `last_id` and these batches of each motion unit.
+    pub(super) fn check(
+        &self,
+        set: &RecordSet,
+        last_id: Option<u64>,
+        last_batches: &[Option<u64>],
+    ) -> Result<(), String> {
         if last_id.is_some_and(|last| set.id <= last) {
             return Err(format!("its id is not greater than that of the set before, {last_id:?}"));
         }
@@ -130,6 +166,29 @@ impl Topics {
                     announced.name()
                 ));
             }
+        }
+        self.check_motion(&set.motion, last_batches)
+    }
+
+    /// What is wrong with the batches of a set, in words.
+    fn check_motion(&self, motion: &[RecordMotion], last_batches: &[Option<u64>]) -> Result<(), String> {
+        let mut last = last_batches.to_vec();
+        let mut bytes = 0;
+        for batch in motion {
+            let Some((unit, last)) = self.units.get(batch.unit).zip(last.get_mut(batch.unit)) else {
+                return Err(format!("motion unit number {} is not in the session", batch.unit));
+            };
+            let (h, name) = (&batch.header, &unit.name);
+            check_batch(h, batch.samples.len(), unit.batch)
+                .map_err(|why| format!("batch {} of {name}: {why}", h.sequence))?;
+            if let Some(before) = last.filter(|before| h.sequence <= *before) {
+                return Err(format!("batch {} of {name} follows batch {before}", h.sequence));
+            }
+            *last = Some(h.sequence);
+            bytes += batch.stored_bytes();
+        }
+        if bytes > SET_MOTION_MAX_BYTES {
+            return Err(format!("its motion takes {bytes} bytes, {SET_MOTION_MAX_BYTES} is the limit"));
         }
         Ok(())
     }
@@ -188,6 +247,9 @@ impl Topics {
                 });
             }
         }
+        for (unit, u) in session.motion.iter().zip(&self.units) {
+            channels.extend(unit_channels(rig, unit, u));
+        }
         let facts = [
             ("format", session.format.clone()),
             ("name", session.name.clone()),
@@ -203,12 +265,58 @@ impl Topics {
         let time = u64::try_from(session.started_utc_ns).unwrap_or(0);
         let config = session.rig_config.clone().into_bytes();
         Ok(Preamble {
-            schemas: Schema::records(),
+            schemas: Schema::records(!session.motion.is_empty()),
             channels,
             metadata: vec![(SESSION_METADATA.to_owned(), facts.map(|(k, v)| (k.to_owned(), v)).into())],
             attachments: vec![(time, RIG_ATTACHMENT.to_owned(), "application/toml".to_owned(), config)],
         })
     }
+}
+
+/// What is wrong with a batch of `n` samples under this header, where a batch has `most` at most; in words.
+pub(crate) fn check_batch(header: &FrameHeader, n: usize, most: u32) -> Result<(), String> {
+    let FrameHeader { width, height, stride, payload_len, format, .. } = *header;
+    if PixelFormat::from_code(format) != Some(PixelFormat::Motion) {
+        return Err(format!("its format is {format}, motion is {}", PixelFormat::Motion as u32));
+    }
+    if n == 0 || width as usize != n || height != 1 || width > most {
+        return Err(format!(
+            "its header says {width} x {height} samples, {n} are there, the session announced at most {most}"
+        ));
+    }
+    let bytes = u64::from(width) * MOTION_SAMPLE_BYTES as u64;
+    if u64::from(payload_len) != bytes || u64::from(stride) != bytes {
+        return Err(format!(
+            "{n} samples are {bytes} bytes, its header says {payload_len} in rows of {stride}"
+        ));
+    }
+    Ok(())
+}
+
+/// The three channels of a motion unit.
+fn unit_channels(rig: &str, unit: &MotionRecord, u: &Unit) -> [Channel; 3] {
+    let facts = [
+        ("stream", u.name.clone()),
+        ("model", unit.model.clone()),
+        ("serial", unit.serial.clone()),
+        ("format", PixelFormat::Motion.name().to_owned()),
+        ("rate_hz", unit.rate_hz.to_string()),
+        ("batch", unit.batch.to_string()),
+        ("frame_id", u.frame_id.clone()),
+        ("parent_frame_id", mount_frame(rig)),
+        ("calibration", unit.calibration.clone()),
+    ];
+    let mut metadata: BTreeMap<_, _> = facts.map(|(k, v)| (k.to_owned(), v)).into();
+    metadata.extend([qos(false)]);
+    let mut id = u.channel;
+    let topics =
+        [("frame_info", Schema::FrameInfo), ("samples", Schema::MotionSamples), ("data_raw", Schema::Imu)];
+    topics.map(|(name, schema)| {
+        let topic = format!("/{rig}/{}/{}/{name}", unit.id.camera, unit.id.stream);
+        let channel = Channel { id, schema: schema.id(), topic, metadata: metadata.clone() };
+        id += 1;
+        channel
+    })
 }
 
 /// The QoS profile that profile `ros2` demands, as rosbag2 writes it: keep the last ten, reliable, volatile;

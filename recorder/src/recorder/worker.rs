@@ -15,23 +15,23 @@ const NICE: i32 = 2;
 pub(super) fn run(shared: &Shared, queue: &Receiver<Job>) {
     // On Linux this is the calling thread. Being refused costs nothing but the politeness.
     let _ = rustix::process::setpriority_process(None, NICE);
-    let mut encoder = FrameEncoder::new(&shared.options);
+    let mut encoder = FrameEncoder::new(&shared.options, &shared.pool);
     while let Ok(job) = queue.recv() {
         let ticket = Arc::clone(job.ticket());
         let encode = AssertUnwindSafe(|| {
             job.run(|frame| {
-                encoder.encode(&FrameJob {
-                    frame,
+                encoder.encode(FrameJob {
                     channel: image_channel(frame.stream),
                     frame_id: shared.topics.frame_id(frame.stream),
                     log_time: u64::try_from(ticket.log_time).unwrap_or(0),
                     stamp_utc_ns: ticket.utc_ns(frame.header.capture_time_ns),
+                    frame,
                 })
             });
         });
         // A picture that makes an encoder panic must cost one set, not the recording.
         if catch_unwind(encode).is_err() {
-            encoder = FrameEncoder::new(&shared.options);
+            encoder = FrameEncoder::new(&shared.options, &shared.pool);
             tracing::error!(set = ticket.id, "an encoder panicked; the set is lost");
         }
     }

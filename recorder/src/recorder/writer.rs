@@ -1,7 +1,7 @@
 //! The writer thread: it alone owns the file.
 
 use super::ticket::Ticket;
-use super::topics::{Global, SEGMENT_METADATA, image_channel};
+use super::topics::{Global, MOTION_CODEC, SEGMENT_METADATA, image_channel};
 use super::{RESERVE_FILE, Shared, Summary};
 use crate::container::chunk::{Chunk, ChunkBuilder, MessageHead};
 use crate::container::segment::Segment;
@@ -9,6 +9,7 @@ use crate::encode::EncodedFrame;
 use crate::frame::SetDrop;
 use crate::msgs::frame_info::{self, Extra};
 use crate::msgs::frame_set::{self, Checkpoint, FrameSetMsg, Member};
+use crate::msgs::motion::{self, Imu};
 use crate::msgs::{accounts, diagnostics, image, tf};
 use crate::{Error, Outcome, Result};
 use crossbeam::channel::{Receiver, RecvTimeoutError};
@@ -173,7 +174,7 @@ impl Writer {
         let session = self.shared.lock().session.clone();
         let log_time = ticket.log_time;
         self.message(Global::TfStatic, log_time, log_time, |b| {
-            tf::write(b, log_time, &session.rig, session.streams.iter().map(|s| (&s.id, &s.pose)));
+            tf::write(b, log_time, &session);
         });
         self.clock_pair(log_time, ticket.utc_ns(ticket.utc.mono.ns()), &ticket.utc);
         self.builder.pack(true)
@@ -219,8 +220,34 @@ impl Writer {
                 message_crc32: *message_crc32,
             });
         }
+        self.motion(ticket);
         self.message(Global::FrameSet, ticket.log_time, ticket.log_time, |b| set.write(b));
         self.builder.pack(true)
+    }
+
+    /// What the motion units sent since the set before: a batch as its channel carried it, then its samples one by one.
+    fn motion(&mut self, ticket: &Ticket) {
+        let shared = Arc::clone(&self.shared);
+        for batch in &ticket.motion {
+            let (h, unit) = (&batch.header, shared.topics.unit(batch.unit));
+            let stamp_utc_ns = ticket.utc_ns(h.capture_time_ns);
+            let extra = Extra { stamp_utc_ns, frame_id: &unit.frame_id, codec: MOTION_CODEC };
+            let head = |channel, sequence: u64, stamp_utc_ns: i64| MessageHead {
+                channel,
+                sequence: sequence as u32,
+                log_time: ticket.log_time as u64,
+                publish_time: u64::try_from(stamp_utc_ns).unwrap_or(0),
+            };
+            self.put(head(unit.channel, h.sequence, stamp_utc_ns), |b| frame_info::write(b, h, &extra));
+            self.put(head(unit.channel + 1, h.sequence, stamp_utc_ns), |b| {
+                motion::write_samples(b, stamp_utc_ns, h.sequence, &batch.samples);
+            });
+            for sample in &batch.samples {
+                let imu = Imu::of(sample, ticket.utc_offset_ns);
+                let head = head(unit.channel + 2, sample.sequence, imu.stamp_utc_ns);
+                self.put(head, |b| imu.write(b, &unit.frame_id));
+            }
+        }
     }
 
     fn message(&mut self, what: Global, log_time: i64, publish_time: i64, fill: impl FnOnce(&mut Vec<u8>)) {
@@ -231,6 +258,10 @@ impl Writer {
             log_time: log_time as u64,
             publish_time: u64::try_from(publish_time).unwrap_or(0),
         };
+        self.put(head, fill);
+    }
+
+    fn put(&mut self, head: MessageHead, fill: impl FnOnce(&mut Vec<u8>)) {
         let filled = self.builder.message(head, |b| {
             fill(b);
             Ok::<_, std::convert::Infallible>(())

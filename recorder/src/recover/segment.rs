@@ -205,7 +205,7 @@ impl Rebuild<'_> {
             if let (Group::Set(set), Some(copy), false) = (&group, copy.as_deref_mut(), head) {
                 // Damage took the chunk that says where the cameras are.
                 let chunk = head_chunk(preamble, set.log_time, self.path)?;
-                copied.push((None, copy.len(), chunk.bytes().len() as u64));
+                copied.push((None, copy.len(), chunk.len()));
                 copy.append_chunks(&[chunk])?;
             }
             head |= matches!(&group, Group::Set(_)) || matches!(&group, Group::Between(b) if b.head);
@@ -255,7 +255,7 @@ impl Rebuild<'_> {
                     _ => (&[], &[]),
                 };
                 for (chunk, from) in chunks.iter().zip(offsets) {
-                    let len = chunk.bytes().len() as u64;
+                    let len = chunk.len();
                     copied.push((Some(*from), to, len));
                     to += len + Segment::index_len(chunk);
                 }
@@ -401,7 +401,7 @@ fn head_chunk(preamble: &Preamble, log_time: u64, path: &Path) -> Result<Chunk> 
     if let Some(channel) = channel {
         let head = MessageHead { channel: channel.id, sequence: 0, log_time, publish_time: log_time };
         builder.message(head, |b| {
-            tf::write(b, log_time as i64, &session.rig, session.streams.iter().map(|s| (&s.id, &s.pose)));
+            tf::write(b, log_time as i64, &session);
             Ok::<_, Error>(())
         })?;
     }

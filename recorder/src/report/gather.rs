@@ -14,6 +14,7 @@ use std::collections::BTreeMap;
 use told::{Told, read_told};
 
 mod looked;
+mod motion;
 mod told;
 
 /// Bars of the histogram of spreads.
@@ -161,6 +162,7 @@ struct Pass {
     /// Log time of the first set.
     t0_ns: i64,
     streams: Vec<Stream>,
+    units: Vec<motion::Unit>,
     sets: u64,
     incomplete: u64,
     at: Counts,
@@ -193,6 +195,10 @@ impl Pass {
             let interval = set.tick.ns() - before;
             self.interval.add(interval);
             self.at.spread(bins, t_ns - interval, t_ns, 1.0);
+        }
+        let offset_ns = set.utc_offset_ns.saturating_sub(self.t0_ns);
+        for batch in &set.motion {
+            self.units[batch.unit].batch(bins, offset_ns, batch);
         }
         for s in set.missing {
             let s = &mut self.streams[s];
@@ -227,6 +233,7 @@ pub(super) fn gather(
         bins,
         t0_ns,
         streams: session.streams.iter().map(|_| Stream::new(bins)).collect(),
+        units: session.motion.iter().map(|_| motion::Unit::new(bins)).collect(),
         sets: 0,
         incomplete: 0,
         at: Counts::new(bins),
@@ -271,6 +278,12 @@ fn put_together(dataset: &Dataset, pass: Pass, told: Told, looked: Looked) -> Re
             s.report(bins, record, account)
         })
         .collect();
+    let motion = (pass.units.into_iter().zip(&session.motion))
+        .map(|(u, record)| {
+            let account = accounts.remove(&record.id.to_string());
+            u.report(record.clone(), account)
+        })
+        .collect();
     for (s, samples) in streams.iter_mut().zip(looked.fill) {
         s.fill = fill_of(samples);
     }
@@ -302,6 +315,7 @@ fn put_together(dataset: &Dataset, pass: Pass, told: Told, looked: Looked) -> Re
         sets,
         bins,
         streams,
+        motion,
         host_clock: told.clock.report(),
         bytes: told.bytes,
         segments: dataset.segments().len(),

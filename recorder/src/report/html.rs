@@ -77,6 +77,7 @@ pub(super) fn page(r: &Report) -> String {
     plots::spreads(&mut out, r);
     plots::clocks(&mut out, r);
     plots::fill(&mut out, r);
+    plots::motion(&mut out, r);
     pictures(&mut out, r);
     calibration(&mut out, r);
     footer(&mut out, r);

@@ -34,7 +34,9 @@ pub(super) fn of(report: &Report, catalog: Option<&CatalogEntry>) -> Verdict {
         why.push(format!("{lost} sets were not recorded"));
     }
     let balanced = report.sets.counts.is_none_or(|c| c.balances())
-        && report.streams.iter().filter_map(|s| s.account.as_ref()).all(crate::StreamAccount::balances);
+        && (report.streams.iter().filter_map(|s| s.account.as_ref()))
+            .chain(report.motion.iter().filter_map(|u| u.account.as_ref()))
+            .all(crate::StreamAccount::balances);
     if !balanced {
         health = Health::Damaged;
         why.push("an account does not balance: a frame or a set vanished without a reason".to_owned());
@@ -78,6 +80,9 @@ fn headline(report: &Report, health: Health, lost: u64, plain: bool) -> String {
 
 fn remarks(report: &Report) -> Vec<String> {
     let mut remarks = Vec::new();
+    for u in report.motion.iter().filter(|u| u.lost_batches > 0) {
+        remarks.push(format!("{}: {} batches of samples were not recorded.", u.record.id, u.lost_batches));
+    }
     let sets = &report.sets;
     // Streams of one camera tell the same story once.
     let mut told: Vec<(Vec<String>, String)> = Vec::new();

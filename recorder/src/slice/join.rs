@@ -6,6 +6,7 @@ use super::lane::{self, Input, Item, Lane, Loose, Range, Source};
 use super::output::{Losses, Output};
 use super::session::{IN_NO_INPUT, lost_in_words};
 use super::{SliceOptions, SliceProgress, SliceReport};
+use crate::container::chunk::Chunk;
 use crate::container::copy::SetGroup;
 use crate::fs::Fs;
 use crate::msgs::accounts;
@@ -139,7 +140,7 @@ impl<'a> Join<'a> {
             for i in due {
                 let head = &mut heads[i];
                 let (Some(set), Some(source)) = (head.next.take(), head.source.clone()) else { continue };
-                done += set.chunks.iter().map(|c| c.bytes().len() as u64).sum::<u64>();
+                done += set.chunks.iter().map(Chunk::len).sum::<u64>();
                 let clock = head.clock.take();
                 if i == chosen {
                     output.set(&set, &source, clock, &self.losses)?;

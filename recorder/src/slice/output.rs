@@ -167,9 +167,8 @@ impl<'a> Output<'a> {
         let log_time = set.log_time;
         if let Some(channel) = source.channel(Schema::TfMessage) {
             let session = &self.session;
-            let poses = session.streams.iter().map(|s| (&s.id, &s.pose));
             message(&mut self.builder, &mut self.sequence, channel, log_time, log_time, |b| {
-                tf::write(b, log_time as i64, &session.rig, poses);
+                tf::write(b, log_time as i64, session);
             })?;
         }
         if let (Some(channel), Some(clock)) = (source.channel(Schema::ClockPair), &self.clock) {

@@ -82,6 +82,15 @@ pub(super) fn must_be_one(a: &Dataset, b: &Dataset) -> Result<()> {
         let rest = (&s.calibration, s.rate_hz) == (&t.calibration, t.rate_hz);
         check(format!("{} is described otherwise", s.id), rest);
     }
+    let names = |s: &Session| s.motion.iter().map(|u| u.id.to_string()).collect::<Vec<_>>();
+    let (xs, ys) = (names(x), names(y));
+    check(format!("the motion units are [{}] and [{}]", xs.join(", "), ys.join(", ")), xs == ys);
+    for (u, v) in x.motion.iter().zip(&y.motion).filter(|(u, v)| u.id == v.id && u != v) {
+        check(
+            format!("the motion unit {} has another pose or device, or is described otherwise", u.id),
+            u == v,
+        );
+    }
     if differ.is_empty() {
         return Ok(());
     }

@@ -6,6 +6,7 @@
 //! nothing proves, and every picture when it is to be decoded, are unpacked by workers, see `pictures`.
 
 use super::index::Contents;
+use super::motion::{self, Messages};
 use super::pictures::{Pictures, with_workers};
 use super::records::Records;
 use super::sets::{Picture, Proof, Walk};
@@ -43,6 +44,7 @@ pub(super) struct Pass<'a> {
     pub(super) pictures: BTreeMap<StreamId, Picture>,
     pub(super) infos: BTreeMap<StreamId, (u64, Vec<u8>)>,
     pub(super) calibrated: BTreeSet<StreamId>,
+    pub(super) motion: Messages,
     contents: Contents,
     stands_alone: bool,
     /// Channel, time and offset of each message of the last chunk that no index record has named yet.
@@ -132,6 +134,7 @@ impl<'a> Pass<'a> {
             pictures: BTreeMap::new(),
             infos: BTreeMap::new(),
             calibrated: BTreeSet::new(),
+            motion: Messages::default(),
             contents: Contents::default(),
             stands_alone: false,
             unlisted: BTreeSet::new(),
@@ -158,6 +161,9 @@ impl<'a> Pass<'a> {
         }
         if !self.stands_alone {
             self.broken(None, "it does not stand alone: the session is not in it");
+        }
+        for what in walk.units.channels(&self.kinds.values()) {
+            self.broken(None, what);
         }
         if !self.pictures.is_empty() {
             let n = self.pictures.len();
@@ -371,6 +377,7 @@ impl<'a> Pass<'a> {
             return Ok(());
         }
         match self.kinds.get(&m.channel) {
+            Some(kind) if self.motion.take(kind, m, walk.options.decode)? => {}
             Some(Kind::Picture(id)) => {
                 let (len, proof) = (m.data.len() as u64, Proof::Crc(crc32fast::hash(m.data)));
                 let picture = Picture { offset, channel: m.channel, log_time: m.log_time, len, proof };
@@ -382,9 +389,10 @@ impl<'a> Pass<'a> {
             Some(Kind::Set) => {
                 let set = FrameSetMsg::read(m.data)?;
                 walk.set(self, &set, m.log_time, offset, pictures);
+                motion::set(walk, self, &set, m.log_time, offset);
                 (self.pictures, self.infos, self.calibrated) = Default::default();
             }
-            None => {}
+            Some(_) | None => {}
         }
         Ok(())
     }

@@ -1,5 +1,6 @@
 //! What spans segments: sets in their order, the accounts, and the frame headers of each stream.
 
+use super::motion::Units;
 use super::pictures::{Job, Pictures};
 use super::segment::{MESSAGE_HEAD, Pass};
 use super::{Findings, Severity, VerifyOptions};
@@ -35,6 +36,7 @@ pub(super) struct Walk {
     accounts: BTreeMap<StreamId, StreamAccount>,
     /// What the last frame of each stream says was captured and lost.
     books: BTreeMap<StreamId, Books>,
+    pub(super) units: Units,
     /// The first and the last reading of the host's clocks.
     clocks: Option<(UtcPair, UtcPair)>,
 }
@@ -88,6 +90,7 @@ impl Walk {
             dropped: None,
             accounts: BTreeMap::new(),
             books: BTreeMap::new(),
+            units: Units::new(session),
             clocks: None,
         }
     }
@@ -243,7 +246,7 @@ impl Walk {
     }
 
     /// What is wrong with the account in a frame's header: `captured = sequence + Σ dropped`, and nothing falls.
-    fn header(&mut self, id: &StreamId, h: &FrameHeader) -> Option<String> {
+    pub(super) fn header(&mut self, id: &StreamId, h: &FrameHeader) -> Option<String> {
         let now = Books { sequence: h.sequence, captured: h.captured, dropped: h.dropped };
         let lost = h.dropped.iter().fold(0u64, |sum, n| sum.saturating_add(*n));
         let before = self.books.insert(id.clone(), now);
@@ -350,6 +353,7 @@ impl Walk {
             );
             findings.add(Severity::Note, "accounts", None, what);
         }
+        self.units.finish(findings);
         let Some(session) = whole else { return };
         let file = crate::SESSION_FILE;
         let Some(o) = &session.outcome else {

@@ -93,6 +93,12 @@ fn plain(fs: &MemFs, workers: usize) -> Result<ExportReport> {
     run(fs, &mut sums, workers, &mut |_| ControlFlow::Continue(()))
 }
 
+#[test]
+fn an_export_says_that_it_leaves_out_motion() {
+    let left_out = "session: the motion samples of front/imu, side/imu are left out; `depthrig cat --stream` writes them";
+    assert_eq!(plain(&dataset(2), 1).unwrap().losses, ["pictures", left_out]);
+}
+
 /// Every file below the folder of the export.
 fn files(fs: &MemFs) -> BTreeMap<String, Vec<u8>> {
     fn walk(fs: &MemFs, dir: &Path, into: &mut BTreeMap<String, Vec<u8>>) {

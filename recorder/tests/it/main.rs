@@ -12,6 +12,7 @@ mod exchange;
 mod failures;
 mod kill;
 mod lerobot;
+mod motion;
 mod recover;
 mod report;
 mod resume;

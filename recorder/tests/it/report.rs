@@ -68,6 +68,21 @@ fn the_numbers_are_those_of_the_recording() {
     assert!(r.streams[0].fill.is_none());
     assert_eq!((r.sampled.sets, r.host_clock.steps.len()), (25, 0));
     assert!(r.streams[0].account.as_ref().unwrap().balances() && r.streams[1].account.is_none());
+    // The page shows what the units measured.
+    let u = &r.motion[0];
+    assert_eq!((u.samples, u.lost_batches, u.never_given), (25 * BATCHES * SAMPLES, 0, 0));
+    assert!((u.samples_hz - 40.0).abs() < 1e-9, "{}", u.samples_hz);
+    let length = |v: [f32; 3]| v.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+    let most = (0..u.samples).map(|k| length(sample(0, k).accel_m_s2)).fold(0.0, f64::max);
+    let drawn = u.acceleration_series.iter().flatten().map(|v| v.max).fold(0.0, f64::max);
+    assert!((most - drawn).abs() < 1e-9, "{most} {drawn}");
+    assert!(u.rotation_series.iter().flatten().all(|v| v.min.is_finite()), "what is no number is not drawn");
+    let page = r.to_html();
+    assert!(
+        page.contains("<h2>Motion</h2>") && page.contains("acceleration, at most"),
+        "no motion on the page"
+    );
+    check_page(&page);
     // JSON has no pictures and can be read.
     let json = serde_json::to_value(&r).unwrap();
     assert_eq!(json["verdict"]["health"], "whole");
@@ -278,7 +293,7 @@ fn pictures_of_every_format_are_shown() {
     let mut session = session();
     session.streams = PixelFormat::ALL
         .into_iter()
-        .filter(|f| *f != PixelFormat::Mjpeg)
+        .filter(|f| *f != PixelFormat::Mjpeg && !f.is_motion())
         .enumerate()
         .map(|(i, f)| stream(&format!("cam{i}/x"), f, 32, 24))
         .collect();

@@ -56,7 +56,7 @@ fn every_header_and_pixel_comes_back() {
 
 #[test]
 fn every_pixel_format_comes_back() {
-    for format in PixelFormat::ALL {
+    for format in PixelFormat::ALL.into_iter().filter(|f| !f.is_motion()) {
         let fs = MemFs::new();
         let mut session = session();
         session.streams = vec![stream("cam/any", format, 32, 24)];

@@ -1,9 +1,12 @@
 //! A small rig whose pictures and headers follow from the set's number.
 
-use depthrig_bus::{FrameFlags, FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
+use depthrig_bus::{
+    FrameFlags, FrameHeader, HostTime, Intrinsics, MotionFlags, MotionSample, PixelFormat, Pose, UtcPair,
+};
 use depthrig_recorder::fs::{Fs, MemFs};
 use depthrig_recorder::{
-    Dataset, DatasetSet, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamRecord, Summary,
+    Dataset, DatasetSet, MotionRecord, RecordFrame, RecordMotion, RecordSet, Recorder, RecorderOptions,
+    Session, StreamRecord, Summary,
 };
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -53,7 +56,64 @@ pub fn session() -> Session {
         stream("front/depth", PixelFormat::Z16, 64, 48),
         stream("side/ir_left", PixelFormat::Mono8, 40, 30),
     ];
+    s.motion = vec![unit("front/imu"), unit("side/imu")];
     s
+}
+
+/// Samples of one batch of a motion unit, and batches of one set.
+pub const SAMPLES: u64 = 4;
+pub const BATCHES: u64 = 2;
+/// Time from sample to sample.
+pub const SAMPLE_PERIOD: i64 = PERIOD / (SAMPLES * BATCHES) as i64;
+
+pub fn unit(id: &str) -> MotionRecord {
+    MotionRecord {
+        id: id.parse().unwrap(),
+        model: "Test 1".into(),
+        serial: "0042".into(),
+        rate_hz: 1e9 / SAMPLE_PERIOD as f64,
+        batch: SAMPLES as u32 + 1,
+        calibration: "made up".into(),
+        pose: Pose { translation_m: [0.2, -0.1, 0.4], ..Pose::IDENTITY },
+    }
+}
+
+/// Sample number `k` of a unit; now and then it lacks something.
+pub fn sample(unit: usize, k: u64) -> MotionSample {
+    let v = k as f32 / 8.0 + unit as f32;
+    MotionSample {
+        time_ns: M0 + k as i64 * SAMPLE_PERIOD,
+        device_time: 1000 * k,
+        sequence: k + 1,
+        uncertainty_ns: 20_000,
+        accel_offset_ns: -7,
+        gyro_rad_s: if k % 5 == 4 { [f32::NAN; 3] } else { [v, -v, 0.1] },
+        accel_m_s2: [0.3, 9.81 + v, -v / 3.0],
+        temperature_c: if unit == 0 { 31.5 } else { f32::NAN },
+        flags: if k.is_multiple_of(4) { MotionFlags::FRAME_SYNC.0 } else { 0 },
+    }
+}
+
+/// Batch number `b` of a unit, counted from 0.
+pub fn batch(session: &Session, unit: usize, b: u64) -> RecordMotion {
+    let record = &session.motion[unit];
+    let samples: Vec<_> = (b * SAMPLES..(b + 1) * SAMPLES).map(|k| sample(unit, k)).collect();
+    let mut header = FrameHeader::default();
+    header.set_names("rig", &record.id);
+    header.set_device(&record.model, &record.serial);
+    header.set_picture(PixelFormat::Motion, SAMPLES as u32, 1);
+    header.sequence = b + 1;
+    header.captured = b + 1;
+    header.device_sequence = (b + 1) * SAMPLES;
+    header.capture_time_ns = samples.last().unwrap().time_ns;
+    header.pose = record.pose;
+    RecordMotion { unit, header, samples }
+}
+
+/// What the units send between set `n` and the one before.
+pub fn motion(session: &Session, n: u64) -> Vec<RecordMotion> {
+    let batches = n * BATCHES..(n + 1) * BATCHES;
+    batches.flat_map(|b| (0..session.motion.len()).map(move |u| batch(session, u, b))).collect()
 }
 
 /// Smooth pictures with an edge, as a camera gives them, different for each set.
@@ -119,6 +179,7 @@ pub fn set_of(session: &Session, n: u64, streams: &[usize]) -> RecordSet {
         id: n + 1,
         tick: HostTime::from_ns(M0 + n as i64 * PERIOD),
         utc: UtcPair { mono: HostTime::from_ns(M0), utc_ns: T0, width_ns: 100 },
+        motion: motion(session, n),
         spread_ns: times.iter().max().unwrap_or(&0) - times.iter().min().unwrap_or(&0),
         missing: (0..session.streams.len()).filter(|i| !streams.contains(i)).collect(),
         frames,

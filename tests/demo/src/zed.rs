@@ -296,6 +296,45 @@ mod tests {
         }
     }
 
+    /// What live stereo says of a folder's pairs, shown again and again.
+    fn said_of(folder: &Path) -> Option<String> {
+        let config = ReplayConfig {
+            input: folder.to_owned(),
+            serial: None,
+            calibration: CalibrationFile::Known,
+            rate_hz: Some(15.0),
+            looped: true,
+        };
+        // It is about the eyes alone: a matcher that does nothing.
+        let options = StereoOptions { every_pair: true, ..<_>::default() };
+        let notice = std::sync::Arc::clone(&options.notice);
+        let wrapped = StereoBackend::new(Box::new(ReplayBackend::new(config)), options);
+        let mut stream = wrapped.open(None).unwrap().start(&[]).unwrap();
+        let mut sink = MemorySink::default();
+        // Enough for more looks than are believed.
+        while sink.frames.iter().filter(|f| f.0 == 0).count() < 60 {
+            assert!(stream.poll(Duration::from_millis(20), &mut sink).unwrap() != Poll::End);
+        }
+        // The last look may still be under way.
+        std::thread::sleep(Duration::from_millis(500));
+        notice.lock().unwrap().clone()
+    }
+
+    /// Both eyes were once pictured with the left one's optical centre: 1.5 px between their rows, which only a smaller
+    /// share of filled pixels showed.
+    #[test]
+    fn an_optical_centre_of_the_other_eye_is_said() {
+        let folder = tempfile::tempdir().unwrap();
+        let (good, wrong) = (folder.path().join("good"), folder.path().join("wrong"));
+        write_pairs(&good, shoot(4, 4).unwrap()).unwrap();
+        let mut seen = shoot(4, 4).unwrap();
+        seen[1].view = seen[0].view;
+        write_pairs(&wrong, seen).unwrap();
+        assert_eq!(said_of(&good), None);
+        let said = said_of(&wrong).unwrap();
+        assert!(said.contains("1.5") && said.contains("higher in the right one"), "{said}");
+    }
+
     /// A flat picture of columns comes out with the column that the lens sees.
     #[test]
     fn a_lens_bends_as_it_says() {

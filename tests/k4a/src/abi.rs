@@ -40,6 +40,18 @@ pub struct Configuration {
     pub disable_streaming_indicator: u8,
 }
 
+/// `k4a_imu_sample_t`.
+#[derive(Debug, Clone, Copy, Default)]
+#[repr(C)]
+#[allow(missing_docs)] // named as in the header
+pub struct ImuSample {
+    pub temperature: f32,
+    pub acc_sample: [f32; 3],
+    pub acc_timestamp_usec: u64,
+    pub gyro_sample: [f32; 3],
+    pub gyro_timestamp_usec: u64,
+}
+
 /// Width and height of `k4a_color_resolution_t`; `None` when it is off.
 pub fn color_size(resolution: u32) -> Option<(u32, u32)> {
     let sizes = [(1280, 720), (1920, 1080), (2560, 1440), (2048, 1536), (3840, 2160), (4096, 3072)];

@@ -8,6 +8,14 @@ use std::sync::Arc;
 const QUEUE: u64 = 16;
 /// From mid-exposure to the end of the transfer.
 const LATENCY_NS: i64 = 20_000_000;
+/// Samples of motion a second.
+const IMU_HZ: i64 = 1600;
+/// Samples that wait for a late reader, as in the real library (half a second of them).
+const IMU_QUEUE: u64 = 800;
+/// From a sample to when it can be read. The device sends many at once.
+const IMU_LATENCY_NS: i64 = 4_000_000;
+/// How much later than the gyroscope the accelerometer is read, microseconds.
+const ACCEL_LATE_US: u64 = 40;
 /// Microseconds of the device's clock when the first camera starts.
 const CLOCK_START_US: i64 = 3_000_000;
 
@@ -56,6 +64,10 @@ pub struct Troubles {
     pub needs_master: bool,
     /// Pictures say another format than was asked for.
     pub wrong_format: u64,
+    /// So many samples of motion never come.
+    pub imu_skip: u64,
+    /// The motion unit breaks off and says so.
+    pub imu_ends: bool,
 }
 
 /// A picture as it is handed over.
@@ -69,6 +81,12 @@ pub struct Picture {
     pub device_us: u64,
     pub system_ns: u64,
     pub exposure_us: u64,
+}
+
+/// What the motion unit measures at this time of the device's clock: rotation (rad/s) and acceleration (m/s²).
+pub fn motion(device_us: u64) -> ([f32; 3], [f32; 3]) {
+    let n = (device_us / 625 % 65_536) as f32;
+    ([n / 1024.0, -0.5, 0.25], [0.2, -9.81, n])
 }
 
 /// A camera.
@@ -108,6 +126,18 @@ pub struct Running {
     /// The clock was set since the last picture, so that nobody knows what was lost.
     set: bool,
     again: Option<Vec<(usize, Picture)>>,
+    /// Number of the next sample of motion, while the unit runs.
+    imu: Option<u64>,
+}
+
+/// What comes of asking for a sample of motion.
+pub enum Moved {
+    /// This.
+    Sample(abi::ImuSample),
+    /// Nothing before this moment.
+    Wait(i64),
+    /// Nothing any more.
+    Over,
 }
 
 /// What comes of asking for a capture.
@@ -187,6 +217,7 @@ impl Camera {
             handed: false,
             set: false,
             again: None,
+            imu: None,
         });
         self.ledgers = [Ledger::default(); 3];
         // JPEG takes a while to make, which is no time of the camera's.
@@ -196,6 +227,61 @@ impl Camera {
             }
         }
         Ok(())
+    }
+
+    /// Starts the motion unit, or says what is wrong, in the words of the real library.
+    pub fn start_imu(&mut self, now: i64) -> Result<(), String> {
+        let Some(r) = &mut self.running else {
+            let why =
+                "k4a_device_start_imu called while the color/depth camera is not running is not supported";
+            return Err(why.to_owned());
+        };
+        if r.imu.is_some() {
+            return Err("Invalid argument to k4a_device_start_imu(). imu_started is true".to_owned());
+        }
+        r.imu = Some(((now - r.began_ns) * IMU_HZ / 1_000_000_000).max(0) as u64);
+        Ok(())
+    }
+
+    /// Stops it.
+    pub fn stop_imu(&mut self) {
+        if let Some(r) = &mut self.running {
+            r.imu = None;
+        }
+    }
+
+    /// The next sample of motion, if it is there.
+    pub fn imu_step(&mut self, now: i64) -> Option<Moved> {
+        let t = &mut self.troubles;
+        let r = self.running.as_mut()?;
+        let Some(next) = &mut r.imu else { return Some(Moved::Over) };
+        if core::mem::take(&mut t.imu_ends) {
+            r.imu = None;
+            return Some(Moved::Over);
+        }
+        let stalled = t.hang_until.max(t.stall_until);
+        if stalled > now {
+            return Some(Moved::Wait(stalled));
+        }
+        let at_ns = |n: u64| n as i64 * 1_000_000_000 / IMU_HZ;
+        let newest = ((now - r.began_ns - IMU_LATENCY_NS) * IMU_HZ).div_euclid(1_000_000_000);
+        *next += core::mem::take(&mut t.imu_skip);
+        // What a late reader loses.
+        *next = (*next).max((newest + 1).max(0) as u64 - IMU_QUEUE.min((newest + 1).max(0) as u64));
+        let n = *next;
+        if (n as i64) > newest {
+            return Some(Moved::Wait(r.began_ns + at_ns(n) + IMU_LATENCY_NS));
+        }
+        *next += 1;
+        let us = (at_ns(n) / 1000 + r.offset_us).max(0) as u64;
+        let (rotation, acceleration) = motion(us);
+        Some(Moved::Sample(abi::ImuSample {
+            temperature: 33.5,
+            acc_sample: acceleration,
+            acc_timestamp_usec: us + ACCEL_LATE_US,
+            gyro_sample: rotation,
+            gyro_timestamp_usec: us,
+        }))
     }
 
     /// Whether it streams as this part of a wired group, `k4a_wired_sync_mode_t`.

@@ -1,7 +1,7 @@
 //! The C functions of the header that a program needs which reads pictures.
 
-use crate::abi::{self, Configuration, FAILED, LOG_ERROR, SUCCEEDED, TIMEOUT, TOO_SMALL};
-use crate::camera::{Camera, Picture, Step};
+use crate::abi::{self, Configuration, FAILED, ImuSample, LOG_ERROR, SUCCEEDED, TIMEOUT, TOO_SMALL};
+use crate::camera::{Camera, Moved, Picture, Step};
 use crate::world::{MessageHandler, Thing, now, say, world};
 use core::ffi::{c_char, c_int};
 use core::time::Duration;
@@ -213,6 +213,56 @@ pub unsafe extern "C" fn k4a_device_stop_cameras(handle: Handle) {
     drop(world);
     if let Some(ns) = hang.filter(|ns| *ns > 0) {
         sleep_until(now() + ns);
+    }
+}
+
+/// # Safety
+/// None is needed: a handle is a number.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn k4a_device_start_imu(handle: Handle) -> u32 {
+    let mut world = world();
+    let started = world.camera(handle as usize).map(|c| c.start_imu(now()));
+    drop(world);
+    match started {
+        Some(Ok(())) => SUCCEEDED,
+        Some(Err(why)) => fails(&why),
+        None => fails("colormcu_imu_start_streaming(). LIBUSB_ERROR_NO_DEVICE"),
+    }
+}
+
+/// # Safety
+/// None is needed: a handle is a number.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn k4a_device_stop_imu(handle: Handle) {
+    if let Some(camera) = world().camera(handle as usize) {
+        camera.stop_imu();
+    }
+}
+
+/// # Safety
+/// `sample` must be writable.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn k4a_device_get_imu_sample(
+    handle: Handle,
+    sample: *mut ImuSample,
+    timeout_ms: i32,
+) -> u32 {
+    let deadline = if timeout_ms < 0 { i64::MAX } else { now() + i64::from(timeout_ms) * 1_000_000 };
+    loop {
+        let mut world = world();
+        let now = now();
+        let step = world.camera(handle as usize).and_then(|c| c.imu_step(now));
+        drop(world);
+        match step {
+            Some(Moved::Sample(found)) => {
+                // SAFETY: the caller promises that it is writable.
+                unsafe { sample.write(found) };
+                return SUCCEEDED;
+            }
+            Some(Moved::Wait(_)) if now >= deadline => return TIMEOUT,
+            Some(Moved::Wait(until)) => sleep_until(until.min(deadline).min(now + 5_000_000)),
+            Some(Moved::Over) | None => return fails("imu_get_sample(). queue_pop failed: it was stopped"),
+        }
     }
 }
 

@@ -16,6 +16,7 @@
 pub mod abi;
 mod calibration;
 mod camera;
+pub use camera::motion;
 mod exports;
 pub mod pictures;
 mod script;

@@ -52,6 +52,8 @@ pub unsafe extern "C" fn fake_k4a_command(serial: *const c_char, what: *const c_
         "no_host_stamp" => t.no_host_stamp += n,
         "padding" => t.padding = n,
         "needs_master" => t.needs_master = n != 0,
+        "imu_skip" => t.imu_skip += n,
+        "imu_ends" => t.imu_ends = n != 0,
         "wrong_format" => t.wrong_format += n,
         "clock_back" => camera.set_clock(Some(n as i64 / 1000)),
         "clock_reset" => camera.set_clock(None),

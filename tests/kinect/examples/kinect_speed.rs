@@ -5,6 +5,8 @@
 //! memory that is used again, as the slots of a channel are. Two numbers each: by the wall clock, which other programs on
 //! the computer spoil, and by the processor time of all threads shared by two cores, which they do not. `taskset -c 0,1`
 //! makes it two cores for the first one too.
+//!
+//! Exit code 1 when frames are lost, or when a made recording is slower by processor time than it must be.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stdout)] // a measuring program: any failure ends it
 
 use depthrig_bus::{DropReason, HostTime, Name, PixelFormat};
@@ -71,7 +73,9 @@ fn main() {
         let any = |name| StreamRequest::any(Name::new(name).unwrap());
         vec![StreamRequest { format: Some(format), ..any("color") }, any("depth"), any("ir")]
     };
-    for (name, format) in [("decoding JPEG", PixelFormat::Rgb8), ("passing JPEG through", PixelFormat::Mjpeg)]
+    let mut good = true;
+    for (name, format, least_times) in
+        [("decoding JPEG", PixelFormat::Rgb8, 10.0), ("passing JPEG through", PixelFormat::Mjpeg, 50.0)]
     {
         // The best of three: the first also fills the page cache.
         let runs: Vec<_> = (0..3).map(|_| play(&path, &streams(format))).collect();
@@ -89,6 +93,14 @@ fn main() {
             slots.bytes as f64 / 1e6,
             slots.lost
         );
+        if runs.iter().any(|r| r.slots.lost > 0) || (made.is_some() && length_s / two_s < least_times) {
+            println!("  that is lost frames, or less than {least_times} x real time");
+            good = false;
+        }
+    }
+    drop(made);
+    if !good {
+        std::process::exit(1);
     }
 }
 

@@ -17,6 +17,8 @@ pub use pictures::{Pattern, Pictures, Simulated};
 pub const CALIBRATION: &str = include_str!("../../data/kinect_calibration.json");
 /// Time from one sample of motion to the next, nanoseconds: 1.6 kHz.
 pub const MOTION_NS: u64 = 625_000;
+/// How much later than the gyroscope the accelerometer is read, nanoseconds.
+pub const ACCEL_LATE_NS: u64 = 12_000;
 
 /// How several samples of motion share a block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -174,7 +176,8 @@ impl Fixture {
     }
 }
 
-/// Sample `i` of motion: times on the device's clock in nanoseconds, acceleration and rotation.
+/// Sample `i` of motion: the gyroscope's time on the device's clock in nanoseconds, acceleration and rotation. The
+/// accelerometer is [`ACCEL_LATE_NS`] later.
 pub fn motion(fixture: &Fixture, i: u64) -> (u64, [f32; 3], [f32; 3]) {
     let at = fixture.start_offset_ns + i * MOTION_NS;
     let swing = (i as f32 * 0.01).sin();

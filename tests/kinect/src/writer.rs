@@ -1,7 +1,7 @@
 //! Writes the file: headers, clusters of 32 ms, an index. As the SDK's `src/record` does, but for the forms asked for.
 
 use super::element::{element, id as id_bytes, master, size, text, uint, uint8, vint};
-use super::{Fixture, Lacing, MOTION_NS, Pictures, Written, motion};
+use super::{ACCEL_LATE_NS, Fixture, Lacing, MOTION_NS, Pictures, Written, motion};
 use depthrig_drivers::kinect::ebml::id;
 use std::io::{self, Seek, SeekFrom, Write};
 
@@ -409,7 +409,7 @@ fn gray(pixels: &[u16], early: bool) -> Vec<u8> {
 
 fn sample(fixture: &Fixture, i: u64) -> Vec<u8> {
     let (at, acceleration, rotation) = motion(fixture, i);
-    let mut out = at.to_le_bytes().to_vec();
+    let mut out = (at + ACCEL_LATE_NS).to_le_bytes().to_vec();
     out.extend(acceleration.iter().flat_map(|a| a.to_le_bytes()));
     out.extend(at.to_le_bytes());
     out.extend(rotation.iter().flat_map(|r| r.to_le_bytes()));

@@ -1,12 +1,12 @@
 //! A recording of an Azure Kinect as a camera: the suite of all drivers, its pixels, times, counts and rounds.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
-use depthrig_bus::{Distortion, DropReason, FrameFlags, HostTime, Name, PixelFormat};
+use depthrig_bus::{Distortion, DropReason, FrameFlags, HostTime, MotionSample, Name, PixelFormat, Pose};
 use depthrig_drivers::conformance::{self, Bench, Cannot, Rig, Sent, Subject, Trouble};
 use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackBackend, PlaybackConfig};
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
 use depthrig_drivers::{Backend, DeviceInfo, ErrorKind, MemorySink, Poll, Stream, StreamRequest};
-use depthrig_kinect_fixture::{Fixture, Pattern, Pictures};
+use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Lacing, Pattern, Pictures, motion};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tempfile::TempDir;
@@ -70,7 +70,8 @@ impl Subject for Recorded {
         Bench {
             backend: Box::new(PlaybackBackend::new(config)),
             serial: "000123456789".into(),
-            requests: vec![],
+            // The motion unit has a case of its own.
+            requests: ["color", "depth", "ir"].map(|s| StreamRequest::any(Name::new(s).unwrap())).into(),
             rig: Box::new(Eyes(dir)),
         }
     }
@@ -156,8 +157,9 @@ fn frames_of_a_recorded_subordinate_were_triggered() {
         let sink = all(&write(dir.path(), &fixture), &[]);
         let is_triggered = |f: &FrameFlags| f.has(FrameFlags::HARDWARE_TRIGGERED);
         let wanted = wired_sync == WiredSync::Subordinate;
-        assert!(sink.frames.iter().all(|f| is_triggered(&f.1.flags) == wanted), "{wired_sync:?}");
-        assert_eq!(sink.frames.len(), 6);
+        let pictures: Vec<_> = sink.frames.iter().filter(|f| f.0 < 3).collect();
+        assert!(pictures.iter().all(|f| is_triggered(&f.1.flags) == wanted), "{wired_sync:?}");
+        assert_eq!(pictures.len(), 6);
     }
 }
 
@@ -234,7 +236,7 @@ fn intrinsics_and_poses_follow_the_calibration() {
     let fixture = Fixture { depth: Some(DepthMode::NfovUnbinned), captures: 2, ..Fixture::small() };
     let path = write(dir.path(), &fixture);
     let (_, stream) = start(PlaybackConfig::new(&path), &[]);
-    let [color, depth, ir] = stream.profiles() else { panic!("three streams") };
+    let [color, depth, ir, _imu] = stream.profiles() else { panic!("three cameras and a motion unit") };
     assert!((depth.intrinsics.cx - 332.78128).abs() < 1e-9 && depth.intrinsics == ir.intrinsics);
     assert_eq!((color.intrinsics.distortion(), depth.depth_unit_m), (Distortion::Rational, 0.001));
     assert!((color.pose_in_device.translation_m[0] - 0.032).abs() < 1e-3);
@@ -280,4 +282,98 @@ fn a_picture_that_cannot_be_decoded_is_a_counted_loss() {
     let sink = all(&path, &[kept]);
     let drops = sink.drops_of(0);
     assert_eq!((drops.get(DropReason::WrongSize), drops.get(DropReason::Incomplete)), (1, 1));
+}
+
+fn motion_of(sink: &MemorySink, stream: usize) -> Vec<MotionSample> {
+    sink.frames.iter().filter(|f| f.0 == stream).flat_map(|f| MotionSample::all_in(&f.2)).collect()
+}
+
+fn request(stream: &str) -> StreamRequest {
+    StreamRequest::any(Name::new(stream).unwrap())
+}
+
+/// All samples of the file, however they share blocks, at its own pace, as fast as they are taken, and alone.
+#[test]
+fn samples_of_motion_are_played_with_the_pictures() {
+    let dir = tempfile::tempdir().unwrap();
+    for lacing in [Lacing::None, Lacing::Xiph, Lacing::Fixed, Lacing::Ebml] {
+        let fixture = Fixture { lacing, captures: 8, lost: vec![3], ..Fixture::small() };
+        let path = write(dir.path(), &fixture);
+        let (_, written) = fixture.bytes_and_places();
+        let check = |sink: &MemorySink, stream: usize, is_paced: bool| {
+            let samples = motion_of(sink, stream);
+            assert_eq!(samples.len() as u64, written.motion, "{lacing:?}");
+            for (i, s) in (0..).zip(&samples) {
+                let (at_ns, acceleration, rotation) = motion(&fixture, i);
+                assert_eq!((s.sequence, s.gyro_rad_s, s.accel_m_s2), (i, rotation, acceleration));
+                assert_eq!((s.accel_offset_ns, s.temperature_c.is_nan()), (ACCEL_LATE_NS as i32, true));
+                if is_paced {
+                    assert_eq!(s.device_time, at_ns / 1000);
+                }
+            }
+            assert!(samples.is_sorted_by(|a, b| a.time_ns < b.time_ns), "times rise");
+            let of = |s: usize| sink.frames.iter().filter(move |f| f.0 == s);
+            assert!(of(stream).all(|f| f.1.capture_time <= f.1.arrival && f.2.len() <= 64 * 64));
+            assert_eq!((sink.captured[stream], sink.drops_of(stream).total()), (sink.delivered(stream), 0));
+        };
+        let fast = all(&path, &[]);
+        check(&fast, 3, false);
+        assert_eq!([0, 1, 2].map(|s| fast.delivered(s)), [7; 3]);
+        check(&all(&path, &[request("imu")]), 0, false);
+        check(&all(&path, &[request("imu"), request("color")]), 0, false);
+        let config = PlaybackConfig { rate: 2.0, ..PlaybackConfig::new(&path) };
+        let (_, mut stream) = start(config, &[request("depth"), request("imu")]);
+        check(&play(stream.as_mut(), usize::MAX), 1, false);
+        let (_, mut stream) = start(PlaybackConfig::new(&path), &[request("depth"), request("imu")]);
+        assert_eq!(stream.profiles()[1].describe(), "imu motion 1600 Hz in batches of up to 64");
+        let sink = play(stream.as_mut(), usize::MAX);
+        check(&sink, 1, true);
+        // Samples and pictures of one moment of the device have nearly one time of the host, since both come when they
+        // are due: within a period and what a busy machine adds.
+        let depth = &sink.frames.iter().rfind(|f| f.0 == 0).unwrap().1;
+        let near = motion_of(&sink, 1)
+            .into_iter()
+            .min_by_key(|s| s.device_time.abs_diff(depth.device_time))
+            .unwrap();
+        let apart_ns = near.time().since_ns(depth.capture_time).abs();
+        assert!(apart_ns < 40_000_000, "{apart_ns} ns apart");
+    }
+}
+
+/// Round after round numbers and times go on.
+#[test]
+fn samples_of_a_recording_that_is_played_without_end_never_go_back() {
+    let dir = tempfile::tempdir().unwrap();
+    let fixture = Fixture { captures: 4, ..Fixture::small() };
+    let path = write(dir.path(), &fixture);
+    let config = PlaybackConfig { looped: true, rate: 8.0, ..PlaybackConfig::new(&path) };
+    let (_, mut stream) = start(config, &[request("imu"), request("depth")]);
+    let sink = play(stream.as_mut(), 60);
+    let samples = motion_of(&sink, 0);
+    let rounds = samples.iter().filter(|s| s.gyro_rad_s[2] == 0.0).count();
+    assert!(rounds >= 3, "{rounds} rounds");
+    for pair in samples.windows(2) {
+        assert!(pair[0].sequence < pair[1].sequence && pair[0].time_ns < pair[1].time_ns, "{pair:?}");
+        assert!(pair[1].sequence - pair[0].sequence <= 2, "{pair:?}");
+    }
+}
+
+#[test]
+fn where_the_motion_unit_sits_is_in_the_calibration() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = write(dir.path(), &Fixture::small());
+    let imu = |calibration| {
+        let config = PlaybackConfig { calibration, ..PlaybackConfig::new(&path) };
+        let device = PlaybackBackend::new(config).open(None).unwrap();
+        device.profiles().iter().find(|p| p.stream.as_str() == "imu").unwrap().pose_in_device
+    };
+    // Rows of the accelerometer's rotation: 0 -1 0, 0 0 -1, 1 0 0; its inverse turned by the translation.
+    let t = imu(CalibrationSource::Recorded).translation_m;
+    assert!(t.iter().zip([-0.0015, -0.051, 0.0034]).all(|(a, b)| (a - b).abs() < 1e-6), "{t:?}");
+    assert_eq!(imu(CalibrationSource::None), Pose::IDENTITY);
+    let still = Fixture { motion: false, ..Fixture::small() };
+    let path = write(dir.path(), &still);
+    let e =
+        PlaybackBackend::new(PlaybackConfig::new(&path)).open(None).unwrap().start(&[request("imu")]).err();
+    assert!(e.unwrap().to_string().contains("no such mode of \"imu\""));
 }

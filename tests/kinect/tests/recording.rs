@@ -4,7 +4,9 @@
 use depthrig_drivers::ErrorKind;
 use depthrig_drivers::kinect::recording::{Losses, Pixels, ReadAt, TrackKind, motion_samples};
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, Recording, WiredSync};
-use depthrig_kinect_fixture::{CALIBRATION, Fixture, Lacing, Pattern, Pictures, element, motion};
+use depthrig_kinect_fixture::{
+    ACCEL_LATE_NS, CALIBRATION, Fixture, Lacing, Pattern, Pictures, element, motion,
+};
 use std::path::PathBuf;
 
 fn open(bytes: Vec<u8>) -> depthrig_drivers::Result<Recording> {
@@ -69,7 +71,7 @@ fn check(fixture: &Fixture, bytes: Vec<u8>) {
     }
     for (i, s) in (0..).zip(&samples) {
         let (at, acceleration, rotation) = motion(fixture, i);
-        assert_eq!((s.accelerometer_ns, s.gyroscope_ns), (at, at));
+        assert_eq!((s.accelerometer_ns, s.gyroscope_ns), (at + ACCEL_LATE_NS, at));
         assert_eq!((s.acceleration, s.rotation), (acceleration, rotation));
     }
     assert_eq!(recording.losses(), Losses::default());

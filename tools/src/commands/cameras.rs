@@ -160,10 +160,13 @@ fn speed(c: &AttachedCamera) -> String {
 fn modes(all: &[ModeReport]) -> Vec<String> {
     let mut lines: Vec<(String, Vec<f64>)> = Vec::new();
     for m in all {
-        let what = format!("{} {} {}x{}", m.stream, m.format, m.width, m.height);
+        let (what, rate_hz) = match m.samples_hz() {
+            Some(hz) => (format!("{} {}", m.stream, m.format), hz),
+            None => (format!("{} {} {}x{}", m.stream, m.format, m.width, m.height), m.rate_hz),
+        };
         match lines.iter_mut().find(|(w, _)| *w == what) {
-            Some((_, rates)) => rates.push(m.rate_hz),
-            None => lines.push((what, vec![m.rate_hz])),
+            Some((_, rates)) => rates.push(rate_hz),
+            None => lines.push((what, vec![rate_hz])),
         }
     }
     let line = |(what, mut rates): (String, Vec<f64>)| {

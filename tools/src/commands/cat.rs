@@ -11,8 +11,8 @@ use core::ops::ControlFlow;
 use depthrig_bus::StreamId;
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{
-    Dataset, Edge, FrameChoice, FrameRow, FramesDone, Moment, SetChoice, SetSpan, StillFormat, export_frames,
-    list_frames,
+    Dataset, Edge, FrameChoice, FrameRow, FramesDone, Moment, MotionForm, MotionRow, SetChoice, SetSpan,
+    StillFormat, export_frames, export_motion, list_frames, list_motion,
 };
 use std::path::PathBuf;
 
@@ -27,20 +27,26 @@ PNG is 8 or 16 bits; depth is in the camera's units (times depth_unit_m of frame
 depth). NPY is the array as the camera's channel carried it. Without --format each stream gets PNG, or NPY
 where a PNG would lose bits (depth_f32, yuyv, uyvy, nv12).
 
+A motion unit (--stream zed2i/imu) has samples and no pictures: without --out they are printed as CSV (--json: an object
+each), with --out DIR they become DIR/CAM/imu.csv, or .npy, an array of records, with --format npy. The columns are the
+set that they came with, UTC, the time on the host's monotonic clock and on the unit's, number, uncertainty,
+rotation in rad/s, acceleration in m/s2, temperature and flags; what a sample does not have is empty (NaN in NPY).
+
 Exit codes: 0 all, 1 failed, 2 wrong usage, 3 written, but some frames of the dataset could not be read.
 
 Examples:
   depthrig cat data/20261121_1015_kitchen | head
   depthrig cat data/20261121_1015_kitchen --at 12.5 --out shot
   depthrig cat data/20261121_1015_kitchen --stream d435/depth --from 10 --to 20 --every 5 --format npy --out d
-  depthrig cat data/20261121_1015_kitchen --set 17 --stream d435/color --format jpg --out as_stored";
+  depthrig cat data/20261121_1015_kitchen --set 17 --stream d435/color --format jpg --out as_stored
+  depthrig cat data/20261121_1015_kitchen --stream zed2i/imu > imu.csv";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct CatArgs {
     /// The dataset's folder, or one segment
     dataset: PathBuf,
-    /// Only this stream (CAM/STREAM); may be given several times
+    /// Only this stream (CAM/STREAM), or this motion unit; may be given several times
     #[arg(long = "stream", value_name = "CAM/STREAM")]
     streams: Vec<StreamId>,
     /// The set of this id
@@ -89,6 +95,11 @@ pub fn run(args: &CatArgs, context: &Context) -> Result<Exit> {
         _ => SetChoice::Span(SetSpan { from: args.from.map(Edge::Moment), to: args.to.map(Edge::Moment) }),
     };
     let choice = FrameChoice { sets, every: args.every as usize, streams: args.streams.clone() };
+    let units = dataset.session().motion.iter();
+    let units: Vec<_> = units.map(|u| &u.id).filter(|id| args.streams.contains(id)).cloned().collect();
+    if !units.is_empty() && units.len() == args.streams.len() {
+        return motion(args, &dataset, &units, sets);
+    }
     let done = match &args.out {
         None => list(args, &dataset, &choice)?,
         Some(_) => export(args, context, &dataset, &choice)?,
@@ -101,6 +112,68 @@ pub fn run(args: &CatArgs, context: &Context) -> Result<Exit> {
         _ if done.lost > 0 => Exit::Lost,
         _ => Exit::Good,
     })
+}
+
+/// Lists or writes samples.
+fn motion(args: &CatArgs, dataset: &Dataset, units: &[StreamId], sets: SetChoice) -> Result<Exit> {
+    let form = match args.format {
+        None => MotionForm::Csv,
+        Some(Form::Npy) => MotionForm::Npy,
+        Some(Form::Png | Form::Jpg) => {
+            return Err(
+                UsageError(format!("{} has no pictures; leave out --format or say npy", units[0])).into()
+            );
+        }
+    };
+    if args.every > 1 {
+        return Err(UsageError("--every chooses pictures; a motion unit is listed whole".into()).into());
+    }
+    let done = if let Some(dir) = &args.out {
+        let stop = Stop::on_signals()?;
+        let mut go = |_| if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
+        let done = export_motion(&RealFs, dataset, units, sets, form, dir, &mut go).map_err(usage)?;
+        if args.json {
+            out::json(&done)?;
+        } else {
+            let (samples, bytes) = (out::count(done.frames, "sample"), out::bytes(done.bytes));
+            out::line(format_args!("{}: {samples}, {bytes}", dir.display()))?;
+        }
+        done
+    } else {
+        let [unit] = units else {
+            return Err(
+                UsageError("one motion unit at a time is listed; name a folder with --out".into()).into()
+            );
+        };
+        list_samples(args, dataset, unit, sets)?
+    };
+    for problem in &done.problems {
+        eprintln!("lost: {problem}");
+    }
+    Ok(match done {
+        _ if done.ended => Exit::Failed,
+        _ if done.lost > 0 => Exit::Lost,
+        _ => Exit::Good,
+    })
+}
+
+fn list_samples(args: &CatArgs, dataset: &Dataset, unit: &StreamId, sets: SetChoice) -> Result<FramesDone> {
+    if !args.json {
+        out::line(MotionRow::COLUMNS.join(","))?;
+    }
+    let mut failed = None;
+    let done = list_motion(dataset, unit, sets, &mut |row| {
+        let told = if args.json { out::json_line(&row) } else { out::line(row.csv()) };
+        match told {
+            Ok(()) => ControlFlow::Continue(()),
+            Err(e) => {
+                failed = Some(e);
+                ControlFlow::Break(())
+            }
+        }
+    })
+    .map_err(usage)?;
+    failed.map_or(Ok(done), Err)
 }
 
 fn list(args: &CatArgs, dataset: &Dataset, choice: &FrameChoice) -> Result<FramesDone> {

@@ -71,7 +71,12 @@ fn text(r: &Report, style: Style) -> String {
             let streams: Vec<_> = c
                 .streams
                 .iter()
-                .map(|s| format!("{} {}x{}@{}", s.mode.stream, s.mode.width, s.mode.height, s.mode.rate_hz))
+                .map(|s| match s.mode.samples_hz() {
+                    Some(hz) => format!("{} motion@{hz}", s.mode.stream),
+                    None => {
+                        format!("{} {}x{}@{}", s.mode.stream, s.mode.width, s.mode.height, s.mode.rate_hz)
+                    }
+                })
                 .collect();
             let load: f64 = c.streams.iter().map(|s| s.usb_mbit_s).sum();
             vec![

@@ -89,6 +89,23 @@ pub fn text(info: &DatasetInfo) -> String {
             }),
         ),
     ];
+    if !info.motion.is_empty() {
+        lines.push(String::new());
+        lines.push(out::table(
+            &["motion unit", "model", "samples", "Hz", "batches", "lost"],
+            2,
+            info.motion.iter().map(|m| {
+                vec![
+                    m.unit.clone(),
+                    m.model.clone(),
+                    m.samples.to_string(),
+                    format!("{:.1}", m.rate_hz),
+                    m.batches.to_string(),
+                    m.lost_batches.to_string(),
+                ]
+            }),
+        ));
+    }
     lines.extend(info.computed.iter().map(|made| format!("computed: {made}")));
     lines.extend(info.unfinished.iter().map(|file| format!("unfinished: {file}")));
     lines.extend(info.problems.iter().map(|problem| format!("problem: {problem}")));

@@ -5,7 +5,7 @@ use crate::out;
 use anyhow::{Context as _, Result};
 use depthrig_bus::clock::thread_cpu_ns;
 use depthrig_calib::stereo::{
-    DisparityMap, Gray, Matcher, OrderCheck, Parameters, Preset, SgmMatcher, StereoPair,
+    DisparityMap, Gray, Matcher, OrderCheck, Parameters, Preset, RowCheck, RowOffset, SgmMatcher, StereoPair,
 };
 use image::{ColorType, DynamicImage, ExtendedColorType, ImageEncoder, codecs::png};
 use serde::Serialize;
@@ -63,6 +63,11 @@ pub fn preset(text: &str) -> Result<Preset, String> {
     text.parse().map_err(|e: depthrig_calib::Error| e.to_string())
 }
 
+/// Rec. 709 luma. `image` makes grey of colour in ways that differ from version to version; depth shall not.
+const fn luma([r, g, b]: [u32; 3]) -> u32 {
+    (2126 * r + 7152 * g + 722 * b) / 10_000
+}
+
 /// A grey picture of its own.
 pub struct Picture {
     pixels: Vec<u8>,
@@ -81,7 +86,11 @@ impl Picture {
         if pictures.iter().all(|p| !wide(p)) {
             return Ok(pictures.map(|p| {
                 let (width, height) = (p.width() as usize, p.height() as usize);
-                Self { pixels: p.into_luma8().into_raw(), width, height }
+                let pixels = match p {
+                    DynamicImage::ImageLuma8(p) => p.into_raw(),
+                    p => p.into_rgb8().pixels().map(|p| luma(p.0.map(u32::from)) as u8).collect(),
+                };
+                Self { pixels, width, height }
             }));
         }
         let most = pictures.iter().map(most).max().unwrap_or(0);
@@ -90,7 +99,7 @@ impl Picture {
             let (width, height) = (p.width() as usize, p.height() as usize);
             // One of 8 bits has been spread to 16.
             let shift = if wide(&p) { shift } else { u8::BITS };
-            let pixels = p.into_luma16().into_raw().into_iter().map(|v| (v >> shift) as u8).collect();
+            let pixels = p.into_rgb16().pixels().map(|p| (luma(p.0.map(u32::from)) >> shift) as u8).collect();
             Self { pixels, width, height }
         }))
     }
@@ -154,8 +163,30 @@ struct Report<'a> {
     memory_bytes: u64,
     /// Pixels that have a disparity, percent.
     filled_percent: f64,
+    /// How far the rows of the two are apart, where the pictures say it.
+    rows: Option<Rows>,
+    warnings: Vec<String>,
     /// CPU time of the calling thread, for the first pair of a matcher; `bench stereo` measures properly.
     cpu_ms: f64,
+}
+
+/// How much lower things lie in the right picture, pixels. Each may be off by `unsure_px`.
+#[derive(Debug, Serialize)]
+struct Rows {
+    middle_px: f64,
+    /// From the left side to the right one.
+    across_px: f64,
+    /// From top to bottom.
+    down_px: f64,
+    unsure_px: [f64; 3],
+    places: usize,
+}
+
+impl Rows {
+    const fn of(offset: &RowOffset) -> Self {
+        let RowOffset { middle_px, across_px, down_px, unsure_px, places, .. } = *offset;
+        Self { middle_px, across_px, down_px, unsure_px, places }
+    }
 }
 
 /// Matches a pair.
@@ -169,6 +200,9 @@ pub fn run(args: &StereoArgs) -> Result<Exit> {
         let mut order = OrderCheck::new(left.width, left.height).map_err(usage)?;
         order.refuse_swapped(&pair).map_err(usage)?;
     }
+    let mut rows = RowCheck::new(left.width, left.height);
+    rows.look(&pair).map_err(usage)?;
+    let offset = rows.offset();
     let parameters = Parameters::preset(args.preset, args.max_disparity.into());
     let mut matcher =
         SgmMatcher::new(left.width, left.height, &parameters, args.threads.into()).map_err(usage)?;
@@ -190,8 +224,13 @@ pub fn run(args: &StereoArgs) -> Result<Exit> {
         vectors: matcher.form(),
         memory_bytes: described.memory_bytes,
         filled_percent: 100.0 * map.fill(),
+        rows: offset.as_ref().map(Rows::of),
+        warnings: offset.and_then(|o| o.warning()).into_iter().collect(),
         cpu_ms,
     };
+    for warning in &report.warnings {
+        eprintln!("warning: {}, {}: {warning}", args.left.display(), args.right.display());
+    }
     if args.json {
         out::json(&report)?;
     } else {

@@ -1,5 +1,7 @@
 //! `depthrig tap`: looks at one live stream from a terminal.
 
+mod motion;
+
 use crate::context::Context;
 use crate::exit::Exit;
 use crate::signals::Stop;
@@ -14,7 +16,8 @@ pub const EXAMPLES: &str = "\
 Examples:
   depthrig tap d435/depth                          a line per frame until Ctrl-C
   depthrig tap d435/depth --count 1                the next frame
-  depthrig tap d435/depth --png pictures --count 5 16-bit PNGs, and previews in colours";
+  depthrig tap d435/depth --png pictures --count 5 16-bit PNGs, and previews in colours
+  depthrig tap zed/imu --json | jq .samples[].gyro_rad_s  every sample of a motion unit";
 
 /// How long a stream may be silent before that is worth a line.
 const SILENCE: Duration = Duration::from_secs(2);
@@ -28,6 +31,9 @@ pub struct TapArgs {
     /// Write each frame into this folder as PNG; depth as 16 bits with a preview in colours beside it
     #[arg(long, value_name = "DIR")]
     png: Option<PathBuf>,
+    /// Print every sample of a motion unit, one JSON object per batch
+    #[arg(long, conflicts_with = "png")]
+    json: bool,
     /// End after so many frames
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
@@ -38,6 +44,7 @@ pub fn run(args: &TapArgs, context: &Context) -> Result<Exit> {
     let runtime = context.runtime()?;
     let bus = Bus::open(&runtime, &context.running_rig(&runtime)?)?;
     let mut subscriber = bus.subscriber(&args.stream)?;
+    let mut newest = None;
     if let Some(folder) = &args.png {
         std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
     }
@@ -46,7 +53,22 @@ pub fn run(args: &TapArgs, context: &Context) -> Result<Exit> {
     while args.count.is_none_or(|count| seen < count) {
         let Some(frame) = next(&mut subscriber, &stop, args)? else { break };
         seen += 1;
-        out::line(describe(frame.header()))?;
+        let is_motion = frame.header().pixel_format().is_some_and(PixelFormat::is_motion);
+        anyhow::ensure!(
+            is_motion || !args.json,
+            "{} gives pictures; --json prints the samples of motion units",
+            args.stream
+        );
+        anyhow::ensure!(
+            !is_motion || args.png.is_none(),
+            "{} gives motion samples and no pictures; leave --png out, or print them with --json",
+            args.stream
+        );
+        match (is_motion, args.json) {
+            (true, true) => out::json_line(&motion::Batch::of(&frame))?,
+            (true, false) => out::line(motion::describe(&frame, &mut newest))?,
+            _ => out::line(describe(frame.header()))?,
+        }
         if let Some(folder) = &args.png {
             let header = frame.header();
             let stem = format!("{}_{}_{:08}", header.camera(), header.stream(), header.sequence);
@@ -87,8 +109,6 @@ fn next(subscriber: &mut Subscriber, stop: &Stop, args: &TapArgs) -> Result<Opti
 /// One line: what a person at a camera wants to know of a frame.
 fn describe(h: &FrameHeader) -> String {
     let ms = |ns: i64| ns as f64 / 1e6;
-    let flags: Vec<_> = FrameFlags::ALL.iter().filter(|(_, f)| h.has(*f)).map(|(name, _)| *name).collect();
-    let drops: Vec<_> = h.drops().nonzero().map(|(why, n)| format!("{} {n}", why.name())).collect();
     let unit =
         if h.depth_unit_m > 0.0 { format!(" unit {} mm", h.depth_unit_m * 1e3) } else { String::new() };
     format!(
@@ -103,9 +123,21 @@ fn describe(h: &FrameHeader) -> String {
         h.capture_uncertainty_ns as f64 / 1e6,
         ms(h.publish_time_ns - h.capture_time_ns),
         h.clock_epoch,
-        if drops.is_empty() { "0".to_owned() } else { drops.join(",") },
-        if flags.is_empty() { "-".to_owned() } else { flags.join(",") },
+        drops(h),
+        flags(h),
     )
+}
+
+/// The reasons for which frames were lost, with their counts; `0` when none was.
+fn drops(h: &FrameHeader) -> String {
+    let drops: Vec<_> = h.drops().nonzero().map(|(why, n)| format!("{} {n}", why.name())).collect();
+    if drops.is_empty() { "0".to_owned() } else { drops.join(",") }
+}
+
+/// The flags' names; `-` when there are none.
+fn flags(h: &FrameHeader) -> String {
+    let flags: Vec<_> = FrameFlags::ALL.iter().filter(|(_, f)| h.has(*f)).map(|(name, _)| *name).collect();
+    if flags.is_empty() { "-".to_owned() } else { flags.join(",") }
 }
 
 #[cfg(test)]

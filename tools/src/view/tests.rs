@@ -12,6 +12,7 @@ fn stream(id: &str, lost: u64) -> StreamStatus {
         height: 720,
         nominal_hz: 30.0,
         rate_hz: 29.97,
+        samples_hz: None,
         captured: 903,
         delivered: 903 - lost,
         dropped: [("device_gap".to_owned(), lost)].into(),
@@ -41,6 +42,7 @@ fn camera(name: &str, state: CameraState, message: Option<&str>, lost: u64) -> C
         state,
         state_for_s: 2.5,
         message: message.map(Into::into),
+        warnings: Vec::new(),
         reconnects: 0,
         refine: None,
         streams: vec![stream(&format!("{name}/depth"), lost)],
@@ -63,6 +65,27 @@ fn rig() -> RigStatus {
         shared_memory: SharedMemoryStatus { free_bytes: 1 << 30, slots: 48, reserved_bytes: 1 << 29 },
         cpu_cores: 0.5,
         replay: None,
+    }
+}
+
+#[test]
+fn a_motion_unit_has_no_picture_and_the_rate_of_its_samples() {
+    let mut rig = rig();
+    let imu = StreamStatus {
+        format: "motion".into(),
+        width: 64,
+        height: 1,
+        nominal_hz: 6.25,
+        rate_hz: 10.0,
+        samples_hz: Some(400.0),
+        ..stream("d435/imu", 0)
+    };
+    rig.cameras[0].streams.push(imu);
+    for width in [80, 160] {
+        let text = status(&rig, Style { width, color: false });
+        let line = text.lines().find(|l| l.starts_with("d435/imu")).unwrap();
+        let words: Vec<_> = line.split_whitespace().collect();
+        assert!(words.contains(&"motion") && words.contains(&"400.0") && !line.contains("64x1"), "{line}");
     }
 }
 

@@ -464,6 +464,58 @@ fn ultra_is_quality_with_what_half_resolution_adds() {
 }
 
 #[test]
+fn presets_at_once_are_those_alone() {
+    use Preset::{Performance, Quality, Ultra};
+    let groups: [&[Preset]; 7] = [
+        &[Performance],
+        &[Quality],
+        &[Ultra],
+        &[Quality, Performance],
+        &[Performance, Ultra],
+        &[Ultra, Quality],
+        &[Performance, Ultra, Quality],
+    ];
+    for (w, h) in [(1, 1), (37, 21), (150, 40)] {
+        let pairs = [5, 6].map(|seed| pair(w, h, w, seed));
+        let gray = |pixels| Gray::packed(pixels, w, h);
+        for (presets, threads) in groups.into_iter().zip([1, 1, 3, 1, 3, 1, 3]) {
+            let parameters: Vec<_> = presets.iter().map(|p| Parameters::preset(*p, 48)).collect();
+            let mut at_once = SgmPresets::new(w, h, &parameters, threads).unwrap();
+            let mut got = vec![DisparityMap::default(); presets.len()];
+            let mut alone: Vec<_> = parameters.iter().map(|p| SgmMatcher::new(w, h, p, 1).unwrap()).collect();
+            for [left, right] in &pairs {
+                let pair = StereoPair::new(gray(left), gray(right));
+                at_once.run(&pair, &mut got).unwrap();
+                for ((preset, matcher), got) in presets.iter().zip(&mut alone).zip(&got) {
+                    let mut want = DisparityMap::default();
+                    matcher.run(&pair, &mut want).unwrap();
+                    assert_eq!(bits(got), bits(&want), "{preset} of {presets:?}, {w}x{h}");
+                }
+            }
+            for ((d, matcher), p) in at_once.describe().into_iter().zip(&alone).zip(&parameters) {
+                let one = matcher.describe();
+                assert_eq!((d.name, d.parameters), (one.name, p.describe()));
+                assert!(d.memory_bytes >= one.memory_bytes);
+            }
+            assert!(at_once.run(&StereoPair::new(gray(&pairs[0][0]), gray(&pairs[0][1])), &mut []).is_err());
+        }
+    }
+}
+
+#[test]
+fn presets_that_cannot_be_matched_at_once_are_refused() {
+    let [a, b] = [Preset::Quality, Preset::Ultra].map(|p| Parameters::preset(p, 64));
+    let other = Parameters { p1: b.p1 + 1, ..b.clone() };
+    for (bad, says) in
+        [(vec![], "no preset"), (vec![a.clone(), other], "different"), (vec![b.clone(), b], "same")]
+    {
+        let e = SgmPresets::new(64, 48, &bad, 1).unwrap_err();
+        assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains(says), "{e}");
+    }
+    assert!(SgmPresets::new(0, 48, &[a], 1).is_err());
+}
+
+#[test]
 fn memory_is_told_before_and_bounded() {
     let at = |width, disparities| {
         let parameters = Parameters::preset(Preset::Quality, disparities);

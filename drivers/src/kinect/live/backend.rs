@@ -197,6 +197,7 @@ struct LiveDevice {
     info: DeviceInfo,
     camera: Handle,
     profiles: Vec<StreamProfile>,
+    calibration: Option<Calibration>,
     config: LiveConfig,
     library: &'static Loaded,
 }
@@ -213,9 +214,10 @@ impl LiveDevice {
         {
             tracing::warn!(camera = name, "{slow}");
         }
-        let profiles = profiles::profiles(&of.config, calibration.as_ref().ok())?;
+        let calibration = calibration.ok();
+        let profiles = profiles::profiles(&of.config, calibration.as_ref())?;
         let library = library::load(&of.config.places)?;
-        Ok(Box::new(Self { name, info, camera, profiles, config: of.config.clone(), library }))
+        Ok(Box::new(Self { name, info, camera, profiles, calibration, config: of.config.clone(), library }))
     }
 }
 
@@ -229,7 +231,7 @@ impl Device for LiveDevice {
     }
 
     fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
-        let Self { name, camera, profiles, config, library, .. } = *self;
+        let Self { name, camera, profiles, calibration, config, library, .. } = *self;
         let named = |e: Error| Error::new(e.kind(), format!("{name}: {e}")).with_source(e);
         let plan = profiles::plan(&name, &config, &profiles, requests)?;
         check_jacks(&camera, config.sync).map_err(named)?;
@@ -238,10 +240,13 @@ impl Device for LiveDevice {
         }
         controls::apply(&name, &camera, &config.color_controls)?;
         camera.start(&plan.configuration).map_err(named)?;
+        if plan.profiles.iter().any(|p| p.format.is_motion()) {
+            camera.start_imu().map_err(named)?;
+        }
         for p in &plan.profiles {
             tracing::info!(camera = %name, library = %library.path.display(), "started {}", p.describe());
         }
-        Ok(Box::new(LiveStream::new(name, camera, plan.profiles, config.sync)))
+        Ok(Box::new(LiveStream::new(name, camera, plan.profiles, config.sync, calibration.as_ref())))
     }
 }
 

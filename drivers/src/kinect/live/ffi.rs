@@ -109,6 +109,22 @@ pub struct HardwareVersion {
     pub firmware_signature: u32,
 }
 
+/// `k4a_imu_sample_t`.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[repr(C)]
+pub struct ImuSample {
+    /// °C.
+    pub temperature: f32,
+    /// m/s² along the accelerometer's axes.
+    pub acc_sample: [f32; 3],
+    /// When it was measured, microseconds of the device's clock.
+    pub acc_timestamp_usec: u64,
+    /// rad/s about the gyroscope's axes.
+    pub gyro_sample: [f32; 3],
+    /// When it was measured, microseconds of the device's clock.
+    pub gyro_timestamp_usec: u64,
+}
+
 /// `k4a_logging_message_cb_t`: context, level, file, line, message.
 pub type MessageHandler = unsafe extern "C" fn(*mut c_void, u32, *const c_char, c_int, *const c_char);
 
@@ -152,6 +168,9 @@ functions! {
     device_get_capture(DeviceHandle, *mut CaptureHandle, i32) -> u32;
     device_start_cameras(DeviceHandle, *const DeviceConfiguration) -> u32;
     device_stop_cameras(DeviceHandle);
+    device_start_imu(DeviceHandle) -> u32;
+    device_stop_imu(DeviceHandle);
+    device_get_imu_sample(DeviceHandle, *mut ImuSample, i32) -> u32;
     device_get_serialnum(DeviceHandle, *mut c_char, *mut usize) -> u32;
     device_get_version(DeviceHandle, *mut HardwareVersion) -> u32;
     device_get_raw_calibration(DeviceHandle, *mut u8, *mut usize) -> u32;
@@ -209,5 +228,14 @@ mod tests {
             offset_of!(HardwareVersion, firmware_signature),
         ];
         assert_eq!(offsets, [0, 12, 24, 36, 48, 52]);
+        assert_eq!((size_of::<ImuSample>(), align_of::<ImuSample>()), (48, 8));
+        let offsets = [
+            offset_of!(ImuSample, temperature),
+            offset_of!(ImuSample, acc_sample),
+            offset_of!(ImuSample, acc_timestamp_usec),
+            offset_of!(ImuSample, gyro_sample),
+            offset_of!(ImuSample, gyro_timestamp_usec),
+        ];
+        assert_eq!(offsets, [0, 4, 16, 24, 40]);
     }
 }

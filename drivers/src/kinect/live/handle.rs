@@ -5,6 +5,7 @@
 use super::ffi::{self, DeviceConfiguration, HardwareVersion, Opaque};
 use super::journal::{self, Cause};
 use super::library::Loaded;
+use crate::kinect::motion::Measured;
 use crate::usb::health::RULE_CURE;
 use crate::{Error, ErrorKind, Result};
 use core::ffi::c_char;
@@ -224,6 +225,48 @@ impl Handle {
     pub fn stop(&self) {
         // SAFETY: the handle is open; a camera that does not run is left as it is.
         unsafe { (self.library.functions.device_stop_cameras)(self.raw.as_ptr()) }
+    }
+
+    /// Starts the motion unit; the cameras must run, because that of colour sets the unit's clock when it starts.
+    ///
+    /// # Errors
+    /// As [`Self::start`].
+    pub fn start_imu(&self) -> Result<()> {
+        self.library.journal.clear();
+        // SAFETY: the handle is open.
+        let result = unsafe { (self.library.functions.device_start_imu)(self.raw.as_ptr()) };
+        if result == ffi::SUCCEEDED {
+            Ok(())
+        } else {
+            Err(self.failed("its motion unit cannot be started", ErrorKind::Io))
+        }
+    }
+
+    /// Stops the motion unit.
+    pub fn stop_imu(&self) {
+        // SAFETY: the handle is open; a unit that does not run is left as it is.
+        unsafe { (self.library.functions.device_stop_imu)(self.raw.as_ptr()) }
+    }
+
+    /// The next sample of motion, if there is one now.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Disconnected`]: nothing more will come.
+    pub fn imu_sample(&self) -> Result<Option<Measured>> {
+        let mut sample = ffi::ImuSample::default();
+        let get = self.library.functions.device_get_imu_sample;
+        // SAFETY: the handle is open, and `sample` is written to during the call alone.
+        match unsafe { get(self.raw.as_ptr(), &raw mut sample, 0) } {
+            ffi::WAIT_TIMEOUT => Ok(None),
+            ffi::SUCCEEDED => Ok(Some(Measured {
+                gyroscope_ns: sample.gyro_timestamp_usec.saturating_mul(1000),
+                accelerometer_ns: sample.acc_timestamp_usec.saturating_mul(1000),
+                rotation: sample.gyro_sample,
+                acceleration: sample.acc_sample,
+                temperature_c: sample.temperature,
+            })),
+            _ => Err(self.failed("its motion unit stopped sending", ErrorKind::Disconnected)),
+        }
     }
 
     /// Waits at most `patience` for the next capture.

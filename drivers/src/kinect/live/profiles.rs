@@ -4,11 +4,13 @@ use super::config::LiveConfig;
 use super::ffi::DeviceConfiguration;
 use crate::kinect::calibration::Calibration;
 use crate::kinect::modes::{ColorFormat, ColorResolution, DepthMode, WiredSync};
+use crate::kinect::motion;
+use crate::motion::IMU;
 use crate::{DeviceClock, Error, ErrorKind, Result, StreamProfile, StreamRequest, choose_profiles};
 use depthrig_bus::{Intrinsics, MetadataLevel, Name, PixelFormat, Pose, StreamName};
 
 /// Names of the streams.
-pub const STREAMS: [&str; 3] = ["color", "depth", "ir"];
+pub const STREAMS: [&str; 4] = ["color", "depth", "ir", IMU];
 
 /// Rates, with `k4a_fps_t`; the default first, as of the other depth cameras: it is enough for 5 sets a second, and
 /// leaves room on the bus.
@@ -44,7 +46,7 @@ pub struct Plan {
 /// None that can happen: the names are good ones.
 pub fn profiles(config: &LiveConfig, calibration: Option<&Calibration>) -> Result<Vec<StreamProfile>> {
     let mut all = Vec::new();
-    let [color, depth, ir] = STREAMS.map(stream_name);
+    let [color, depth, ir, _] = STREAMS.map(stream_name);
     let (color, depth, ir) = (color?, depth?, ir?);
     for resolution in ColorResolution::ALL {
         for (format, wire) in COLOR {
@@ -78,6 +80,8 @@ pub fn profiles(config: &LiveConfig, calibration: Option<&Calibration>) -> Resul
             }
         }
     }
+    let clock = DeviceClock::microseconds(64);
+    all.push(motion::profile(calibration, 1.0, clock, MetadataLevel::Full)?);
     Ok(all)
 }
 
@@ -103,7 +107,8 @@ fn profile(stream: StreamName, format: PixelFormat, size: (u32, u32), rate_hz: u
 }
 
 /// What is started for `requests`: all streams have one rate, depth and infrared one size; what a request leaves open it
-/// takes from the others. `name` is the camera's, for messages. Without a request depth and colour are started.
+/// takes from the others. `name` is the camera's, for messages. Without a request depth, colour and the motion unit are
+/// started.
 ///
 /// # Errors
 /// [`ErrorKind::Unsupported`] when there is no such mode, when streams do not go together, and when the part in a wired
@@ -117,10 +122,19 @@ pub fn plan(
     let refuse = |what: String| Error::new(ErrorKind::Unsupported, format!("{name}: {what}"));
     let has = |stream: &str| available.iter().any(|p| p.stream.as_str() == stream);
     let default = || {
-        let wanted = if has("depth") { ["color", "depth"] } else { ["color", "ir"] };
+        let wanted = if has("depth") { ["color", "depth", IMU] } else { ["color", "ir", IMU] };
         wanted.into_iter().map(|s| stream_name(s).map(StreamRequest::any)).collect::<Result<Vec<_>>>()
     };
     let requests = if requests.is_empty() { default()? } else { requests.to_vec() };
+    let order: Vec<_> = requests.iter().map(|r| r.stream.clone()).collect();
+    // The motion unit has a mode of its own.
+    let (units, requests): (Vec<_>, Vec<_>) = requests.into_iter().partition(|r| r.stream.as_str() == IMU);
+    let units = if units.is_empty() { Vec::new() } else { choose_profiles(name, available, &units)? };
+    if requests.is_empty() {
+        return Err(refuse(
+            "the motion unit runs only while a camera does: ask for color, depth or ir too".to_owned(),
+        ));
+    }
     let is_color = |r: &StreamRequest| r.stream.as_str() == "color";
     let rate_hz = requests.iter().find_map(|r| r.rate_hz);
     let size = requests.iter().filter(|r| !is_color(r)).find_map(|r| r.size);
@@ -139,7 +153,7 @@ pub fn plan(
             wish.rate_hz = Some(slowest);
         }
     }
-    let profiles = choose_profiles(name, available, &wishes)?;
+    let mut profiles = choose_profiles(name, available, &wishes)?;
     let Some(first) = profiles.first() else { return Err(refuse("no stream was asked for".to_owned())) };
     if let Some(other) = profiles.iter().find(|p| p.rate_hz != first.rate_hz) {
         let (a, b) = (first.describe(), other.describe());
@@ -156,6 +170,8 @@ pub fn plan(
     let configuration = configuration(config, find("color"), find("depth").or(find("ir")), first.rate_hz)
         .ok_or_else(|| refuse("it has no such mode".to_owned()))?;
     check_sync(config, &configuration, period_us).map_err(refuse)?;
+    profiles.extend(units);
+    profiles.sort_by_key(|p| order.iter().position(|s| *s == p.stream));
     Ok(Plan { profiles, configuration })
 }
 

@@ -1,15 +1,20 @@
-//! A streaming Kinect: each picture of a capture through its stream's gate, written once.
+//! A streaming Kinect: each picture of a capture through its stream's gate, written once, and the motion unit's samples in
+//! batches.
 
 use super::counter::FrameCounter;
 use super::ffi::image_format;
 use super::handle::{Handle, Image};
+use crate::kinect::Calibration;
 use crate::kinect::modes::WiredSync;
+use crate::kinect::motion::{Measured, Unit};
 use crate::{Error, ErrorKind, FrameSink, Gate, Poll, RawFrame, Result, Stream, StreamProfile, unpack};
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime, PixelFormat};
 
 /// So many captures are handed on by one poll: what libk4a may have kept for a reader that was late.
 const AT_ONCE: usize = 8;
+/// How long pictures are waited for before the motion unit is looked at again.
+const SLICE: Duration = Duration::from_millis(20);
 /// A stamp of the host that is older than this is none.
 const OLDEST: Duration = Duration::from_secs(5);
 
@@ -19,9 +24,21 @@ pub(super) struct LiveStream {
     profiles: Vec<StreamProfile>,
     lanes: Vec<Lane>,
     camera: Handle,
+    imu: Option<Imu>,
     /// It sends nothing any more.
     is_gone: bool,
 }
+
+/// The motion unit, and room for what one look at it finds.
+struct Imu {
+    unit: Unit,
+    found: Vec<Measured>,
+    /// It says that nothing more will come, which the cameras may not know.
+    is_over: bool,
+}
+
+/// Samples that one look takes at the most, more than libk4a keeps (half a second of them).
+const MOST_SAMPLES: usize = 1024;
 
 /// One stream.
 struct Lane {
@@ -57,10 +74,42 @@ enum Unpack {
 }
 
 impl LiveStream {
-    /// Frames of `profiles` out of `camera`, which was started in their modes.
-    pub(super) fn new(name: String, camera: Handle, profiles: Vec<StreamProfile>, sync: WiredSync) -> Self {
-        let lanes = profiles.iter().enumerate().map(|(i, p)| Lane::new(i, p, sync)).collect();
-        Self { name, profiles, lanes, camera, is_gone: false }
+    /// Frames of `profiles` out of `camera`, which was started in their modes and has this calibration.
+    pub(super) fn new(
+        name: String,
+        camera: Handle,
+        profiles: Vec<StreamProfile>,
+        sync: WiredSync,
+        calibration: Option<&Calibration>,
+    ) -> Self {
+        let of = |motion: bool| {
+            let all = profiles.iter().enumerate();
+            all.filter(move |(_, p)| p.format.is_motion() == motion)
+        };
+        let lanes = of(false).map(|(i, p)| Lane::new(i, p, sync)).collect();
+        let imu = of(true).next().map(|(i, p)| Imu {
+            unit: Unit::new(i, p, calibration, 1.0),
+            found: Vec::with_capacity(MOST_SAMPLES),
+            is_over: false,
+        });
+        Self { name, profiles, lanes, camera, imu, is_gone: false }
+    }
+
+    /// Hands on the samples of motion that have come. Whether a batch went.
+    fn poll_imu(&mut self, sink: &mut dyn FrameSink) -> bool {
+        let Some(imu) = &mut self.imu else { return false };
+        imu.found.clear();
+        while !imu.is_over && imu.found.len() < MOST_SAMPLES {
+            match self.camera.imu_sample() {
+                Ok(Some(sample)) => imu.found.push(sample),
+                Ok(None) => break,
+                Err(e) => {
+                    imu.is_over = true;
+                    tracing::warn!(camera = %self.name, error = %e, "no more samples of motion; pictures go on");
+                }
+            }
+        }
+        imu.unit.take(&imu.found, HostTime::now(), |us| us, sink)
     }
 
     fn gone(&self, why: &Error) -> Error {
@@ -70,6 +119,9 @@ impl LiveStream {
 
 impl Drop for LiveStream {
     fn drop(&mut self) {
+        if self.imu.is_some() {
+            self.camera.stop_imu();
+        }
         // Every picture was given back, for which libk4a would wait. Closing comes after it, with the handle.
         self.camera.stop();
     }
@@ -84,6 +136,24 @@ impl Stream for LiveStream {
         if self.is_gone {
             return Err(self.gone(&Error::new(ErrorKind::Disconnected, "it is gone")));
         }
+        // Samples that wait for a picture are mapped by the newest alone; they are read at least this often.
+        let slice = if self.imu.is_some() { timeout.min(SLICE) } else { timeout };
+        let deadline = HostTime::now().plus(timeout);
+        loop {
+            let any = self.poll_captures(slice.min(deadline.from_now()), sink)?;
+            if self.poll_imu(sink) || any {
+                return Ok(Poll::Frame);
+            }
+            if deadline.from_now().is_zero() {
+                return Ok(Poll::Idle);
+            }
+        }
+    }
+}
+
+impl LiveStream {
+    /// Waits for a capture, and hands on what else has come. Whether there was a picture.
+    fn poll_captures(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<bool> {
         let (mut patience, mut any) = (timeout, false);
         for _ in 0..AT_ONCE {
             match self.camera.capture(patience) {
@@ -109,7 +179,7 @@ impl Stream for LiveStream {
             }
             patience = Duration::ZERO;
         }
-        Ok(if any { Poll::Frame } else { Poll::Idle })
+        Ok(any)
     }
 }
 

@@ -1,21 +1,24 @@
 //! JPEG pictures of a recording, decoded by threads that are a few pictures ahead of the playing.
 //!
-//! Each thread has one picture in hand, and they take turns; so pictures come back in their order, memory is that of one
-//! picture for each thread, and nothing is allocated once each had the largest.
+//! Threads take turns, so pictures come back in their order. There are two pictures more than threads: while the oldest is
+//! given out, its thread has its next one already. Nothing is allocated once each had the largest.
 
 use super::cursor::Cursor;
 use crate::kinect::recording::Recording;
 use crate::{Error, ErrorKind, Result, unpack};
 use depthrig_bus::DropReason;
+use std::collections::VecDeque;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
 /// Threads at the most: four decode 4K at 30 Hz.
 const MOST: usize = 4;
 
+/// Pictures beyond one for each thread. With one the threads of two cores wait a tenth of their time, with two a twentieth.
+const WAITING: usize = 2;
+
 /// A picture on its way through a thread.
 pub(super) struct Job {
-    pub(super) at_us: u64,
     /// Bytes of it in the recording.
     jpeg: Vec<u8>,
     pub(super) pixels: Vec<u8>,
@@ -26,10 +29,6 @@ struct Worker {
     to: SyncSender<Job>,
     from: Receiver<Job>,
     thread: Option<JoinHandle<()>>,
-    /// Its picture, when it was decoded or not yet given out.
-    done: Option<Job>,
-    /// The time of the picture it has in hand.
-    at_us: Option<u64>,
 }
 
 /// Decodes ahead.
@@ -37,8 +36,12 @@ pub(super) struct Ahead {
     cursor: Cursor,
     track: usize,
     workers: Vec<Worker>,
-    /// Who has the oldest picture.
+    /// Who gets the next picture, and who has the oldest.
+    give: usize,
     head: usize,
+    /// The times of the pictures in hand, the oldest first.
+    at_us: VecDeque<u64>,
+    spare: Vec<Job>,
     ended: bool,
 }
 
@@ -51,8 +54,8 @@ impl Ahead {
         let count = std::thread::available_parallelism().map_or(2, core::num::NonZero::get).clamp(1, MOST);
         let mut workers = Vec::new();
         for i in 0..count {
-            let (to, jobs) = sync_channel::<Job>(1);
-            let (results, from) = sync_channel(1);
+            let (to, jobs) = sync_channel::<Job>(WAITING);
+            let (results, from) = sync_channel(WAITING);
             let work = move || {
                 while let Ok(mut job) = jobs.recv() {
                     let span = unpack::jpeg_span(&job.jpeg);
@@ -67,37 +70,47 @@ impl Ahead {
                 std::thread::Builder::new().name(format!("kinect-jpeg-{i}")).spawn(work).map_err(|e| {
                     Error::new(ErrorKind::Io, "no thread for decoding could be started").with_source(e)
                 })?;
-            let pixels = vec![0; size.0 as usize * size.1 as usize * 3];
-            let done = Job { at_us: 0, jpeg: Vec::new(), pixels, outcome: Ok(()) };
-            workers.push(Worker { to, from, thread: Some(thread), done: Some(done), at_us: None });
+            workers.push(Worker { to, from, thread: Some(thread) });
         }
-        Ok(Self { cursor: Cursor::new(recording, looped), track, workers, head: 0, ended: false })
+        let in_hand = count + WAITING;
+        let job = || Job {
+            jpeg: Vec::new(),
+            pixels: vec![0; size.0 as usize * size.1 as usize * 3],
+            outcome: Ok(()),
+        };
+        Ok(Self {
+            cursor: Cursor::new(recording, looped),
+            track,
+            workers,
+            give: 0,
+            head: 0,
+            at_us: VecDeque::with_capacity(in_hand),
+            spare: core::iter::repeat_with(job).take(in_hand).collect(),
+            ended: false,
+        })
     }
 
-    /// The time of the next picture, after every idle thread was given one; `None` at the end.
+    /// The time of the next picture, after every thread was given what it can have in hand; `None` at the end.
     ///
     /// # Errors
     /// Those of reading the file.
     pub(super) fn peek(&mut self) -> Result<Option<u64>> {
-        let n = self.workers.len();
-        for i in 0..n {
-            let Some(worker) = self.workers.get_mut((self.head + i) % n) else { break };
-            if worker.at_us.is_some() || self.ended {
-                continue;
-            }
+        while !self.ended && !self.spare.is_empty() {
             let track = self.track;
             let Some(next) = self.cursor.next(|t| t == track)? else {
                 self.ended = true;
                 break;
             };
-            let Some(mut job) = worker.done.take() else { break };
-            job.at_us = next.at_us;
+            let (Some(worker), Some(mut job)) = (self.workers.get(self.give), self.spare.pop()) else {
+                break;
+            };
             job.jpeg.clear();
             job.jpeg.extend_from_slice(self.cursor.recording.frames(&next.block).next().unwrap_or_default());
-            worker.at_us = Some(next.at_us);
             worker.to.send(job).map_err(|_| died())?;
+            self.at_us.push_back(next.at_us);
+            self.give = (self.give + 1) % self.workers.len();
         }
-        Ok(self.workers.get(self.head).and_then(|w| w.at_us))
+        Ok(self.at_us.front().copied())
     }
 
     /// Hands the next picture to `take`, waiting for it.
@@ -105,11 +118,11 @@ impl Ahead {
     /// # Errors
     /// [`ErrorKind::Protocol`] when a thread died.
     pub(super) fn take(&mut self, take: impl FnOnce(&Job)) -> Result<()> {
-        let Some(worker) = self.workers.get_mut(self.head) else { return Ok(()) };
-        if worker.at_us.take().is_some() {
+        let Some(worker) = self.workers.get(self.head) else { return Ok(()) };
+        if self.at_us.pop_front().is_some() {
             let job = worker.from.recv().map_err(|_| died())?;
             take(&job);
-            worker.done = Some(job);
+            self.spare.push(job);
             self.head = (self.head + 1) % self.workers.len();
         }
         Ok(())

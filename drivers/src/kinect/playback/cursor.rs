@@ -60,14 +60,20 @@ impl Cursor {
                 self.is_fruitful = false;
                 continue;
             };
+            let at_us = block.device_us.saturating_add(self.shift_us);
             if self.recording.tracks().get(block.track).is_none_or(|t| t.pixels.is_none()) {
+                // Samples of motion, if they are wanted; how long a round is follows from pictures alone.
+                if wanted(block.track) {
+                    self.is_fruitful = true;
+                    return Ok(Some(Next { block, at_us }));
+                }
                 continue;
             }
             self.first_us.get_or_insert(block.device_us);
             self.last_us = self.last_us.max(block.device_us);
             if wanted(block.track) {
                 self.is_fruitful = true;
-                return Ok(Some(Next { block, at_us: block.device_us.saturating_add(self.shift_us) }));
+                return Ok(Some(Next { block, at_us }));
             }
         }
         Ok(None)

@@ -3,8 +3,10 @@
 use super::PlaybackConfig;
 use super::ahead::Ahead;
 use super::cursor::{Cursor, Next};
+use crate::kinect::Calibration;
 use crate::kinect::live::counter::FrameCounter;
-use crate::kinect::recording::{Pixels, Recording};
+use crate::kinect::motion::{self, Measured, Unit};
+use crate::kinect::recording::{Pixels, Recording, motion_samples};
 use crate::{FrameSink, Gate, Poll, RawFrame, Result, Stream, StreamProfile, unpack};
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime, PixelFormat};
@@ -18,8 +20,34 @@ pub(super) struct Player {
     next: Option<Next>,
     /// Decoded colour and its lane.
     ahead: Option<(usize, Ahead)>,
+    /// The motion unit and what of it was read and is not due.
+    motion: Option<Motion>,
     pace: Pace,
 }
+
+/// The motion unit of a recording.
+struct Motion {
+    track: usize,
+    unit: Unit,
+    /// Samples in the order of the file, this round's shift included.
+    waiting: Vec<Measured>,
+    /// Time of the last one that was read.
+    newest_ns: u64,
+}
+
+/// What is played next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Event {
+    /// The picture that was read.
+    Picture,
+    /// The picture that was decoded.
+    Decoded,
+    /// So many samples of motion.
+    Motion(usize),
+}
+
+/// Samples that are read ahead at the most while no picture comes.
+const MOST_WAITING: usize = 8 * motion::BATCH as usize;
 
 /// One stream.
 struct Lane {
@@ -49,18 +77,28 @@ impl Player {
         profiles: Vec<StreamProfile>,
         tracks: &[usize],
         is_triggered: bool,
-        recording: Recording,
+        (recording, calibration): (Recording, Option<&Calibration>),
         config: &PlaybackConfig,
     ) -> Result<Self> {
         let flags = if is_triggered { FrameFlags::HARDWARE_TRIGGERED } else { FrameFlags(0) };
         let mut lanes = Vec::new();
-        let mut ahead = None;
+        let (mut ahead, mut motion) = (None, None);
         for (i, (profile, track)) in profiles.iter().zip(tracks).enumerate() {
+            if profile.format.is_motion() {
+                let speed = if config.rate.is_finite() { config.rate } else { 1.0 };
+                let unit = Unit::new(i, profile, calibration, speed);
+                let waiting = Vec::with_capacity(2 * MOST_WAITING);
+                motion = Some(Motion { track: *track, unit, waiting, newest_ns: 0 });
+                continue;
+            }
             let pixels = recording.tracks().get(*track).and_then(|t| t.pixels);
             let how = How::of(pixels, profile);
             if how == How::Decode {
                 let again = Recording::open(&config.recording)?;
-                ahead = Some((i, Ahead::new(again, config.looped, *track, (profile.width, profile.height))?));
+                ahead = Some((
+                    lanes.len(),
+                    Ahead::new(again, config.looped, *track, (profile.width, profile.height))?,
+                ));
             }
             let period_us =
                 recording.tracks().get(*track).and_then(|t| t.period_ns).unwrap_or(super::PERIOD_NS) / 1000;
@@ -68,26 +106,88 @@ impl Player {
             lanes.push(Lane { track: *track, gate, counter, how, flags });
         }
         let pace = Pace::new(name, config.rate, &profiles);
-        Ok(Self { profiles, lanes, cursor: Cursor::new(recording, config.looped), next: None, ahead, pace })
+        let cursor = Cursor::new(recording, config.looped);
+        Ok(Self { profiles, lanes, cursor, next: None, ahead, motion, pace })
     }
 
-    /// The time of the next frame, and whether it is one of `ahead`; `None` at the end.
-    fn peek(&mut self) -> Result<Option<(u64, bool)>> {
-        if self.next.is_none() {
-            let lanes = &self.lanes;
-            self.next =
-                self.cursor.next(|track| lanes.iter().any(|l| l.track == track && l.how != How::Decode))?;
+    /// Reads on until the next picture is known, keeping samples of motion that come before it.
+    fn read(&mut self) -> Result<()> {
+        while self.next.is_none() && self.motion.as_ref().is_none_or(|m| m.waiting.len() < MOST_WAITING) {
+            let (lanes, motion_track) = (&self.lanes, self.motion.as_ref().map(|m| m.track));
+            let is_picture = |track| lanes.iter().any(|l| l.track == track && l.how != How::Decode);
+            let Some(next) = self.cursor.next(|track| Some(track) == motion_track || is_picture(track))?
+            else {
+                break;
+            };
+            match &mut self.motion {
+                Some(motion) if motion.track == next.block.track => {
+                    motion.read(&self.cursor.recording, &next);
+                }
+                _ => self.next = Some(next),
+            }
         }
+        Ok(())
+    }
+
+    /// The time of the next event, and which it is; `None` at the end.
+    fn peek(&mut self) -> Result<Option<(u64, Event)>> {
+        self.read()?;
         let ahead = match &mut self.ahead {
             Some((_, ahead)) => ahead.peek()?,
             None => None,
         };
-        Ok(match (self.next.map(|n| n.at_us), ahead) {
-            (Some(a), Some(b)) => Some(if b <= a { (b, true) } else { (a, false) }),
-            (Some(a), None) => Some((a, false)),
-            (None, Some(b)) => Some((b, true)),
-            (None, None) => None,
+        let picture = match (self.next.map(|n| n.at_us), ahead) {
+            (Some(a), Some(b)) if b > a => Some((a, Event::Picture)),
+            (_, Some(b)) => Some((b, Event::Decoded)),
+            (a, None) => a.map(|a| (a, Event::Picture)),
+        };
+        // Samples go with the picture after them, or as a batch that is full when that comes sooner.
+        let full = self.motion.as_ref().and_then(|m| m.full(picture.is_none()));
+        Ok(match (picture, full) {
+            (Some((at, _)), Some((full, n))) if full < at => Some((full, Event::Motion(n))),
+            (None, Some((full, n))) => Some((full, Event::Motion(n))),
+            (picture, _) => picture,
         })
+    }
+
+    /// Hands on the samples that were measured until `at_us`, or the first `n`. Whether a batch went.
+    fn play_motion(&mut self, at_us: u64, n: Option<usize>, now: HostTime, sink: &mut dyn FrameSink) -> bool {
+        let (Some(motion), pace) = (&mut self.motion, &self.pace) else { return false };
+        let due = motion.waiting.iter().take_while(|m| m.gyroscope_ns / 1000 <= at_us).count();
+        let n = n.unwrap_or(due);
+        let went = motion.unit.take(
+            motion.waiting.get(..n).unwrap_or_default(),
+            now,
+            |us| pace.ticks(us, now),
+            sink,
+        );
+        motion.waiting.drain(..n);
+        went
+    }
+}
+
+impl Motion {
+    /// Keeps the samples of a block.
+    fn read(&mut self, recording: &Recording, next: &Next) {
+        let shift_ns = next.at_us.saturating_sub(next.block.device_us).saturating_mul(1000);
+        for s in recording.frames(&next.block).flat_map(motion_samples) {
+            let mut m = Measured::from(s);
+            m.gyroscope_ns = m.gyroscope_ns.saturating_add(shift_ns);
+            m.accelerometer_ns = m.accelerometer_ns.saturating_add(shift_ns);
+            // A round is as long as its pictures; samples beyond that give way to those of the next.
+            if shift_ns > 0 && m.gyroscope_ns <= self.newest_ns {
+                continue;
+            }
+            self.newest_ns = m.gyroscope_ns;
+            self.waiting.push(m);
+        }
+    }
+
+    /// The time of the sample that fills a batch, and how many they are; of what there is when nothing else comes.
+    fn full(&self, is_all: bool) -> Option<(u64, usize)> {
+        let n = self.waiting.len().min(motion::BATCH as usize);
+        let newest = self.waiting.get(n.checked_sub(1)?)?;
+        (n == motion::BATCH as usize || is_all).then_some((newest.gyroscope_ns / 1000, n))
     }
 }
 
@@ -98,7 +198,10 @@ impl Stream for Player {
 
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
         let deadline = HostTime::now().plus(timeout);
-        let Some((at_us, is_ahead)) = self.peek()? else { return Ok(Poll::End) };
+        let Some((at_us, event)) = self.peek()? else {
+            let went = self.motion.as_mut().is_some_and(|m| m.unit.end(sink));
+            return Ok(if went { Poll::Frame } else { Poll::End });
+        };
         let now = HostTime::now();
         let due = self.pace.due(at_us, now);
         if due > now {
@@ -108,8 +211,13 @@ impl Stream for Player {
             }
         }
         let now = HostTime::now();
+        if let Event::Motion(n) = event {
+            self.play_motion(at_us, Some(n), now, sink);
+            return Ok(Poll::Frame);
+        }
+        self.play_motion(at_us, None, now, sink);
         let ticks = self.pace.ticks(at_us, now);
-        if is_ahead {
+        if event == Event::Decoded {
             let Some((i, ahead)) = &mut self.ahead else { return Ok(Poll::End) };
             let lane = self.lanes.get_mut(*i);
             ahead.take(|job| {

@@ -12,6 +12,8 @@ struct Made {
     rgb: Vec<u8>,
     sizes: Option<Vec<u8>>,
     gone: bool,
+    /// This reading is refused: with which kind of error.
+    refusal: Option<(usize, ErrorKind)>,
     /// Replies in a row that are damaged before one is whole.
     bad_replies: usize,
     asked: usize,
@@ -23,6 +25,9 @@ impl HardwareMonitor for Made {
             return Err(Error::new(ErrorKind::Disconnected, "gone"));
         }
         self.asked += 1;
+        if let Some((_, kind)) = self.refusal.filter(|(at, _)| *at == self.asked) {
+            return Err(Error::new(kind, "refused once"));
+        }
         let bad = !self.asked.is_multiple_of(self.bad_replies + 1);
         let spoiled = |mut table: Vec<u8>| {
             if let Some(last) = table.last_mut() {
@@ -55,7 +60,15 @@ fn made() -> Made {
         rectified_translation_mm: [14.7, 0.1, 0.2],
         ..RgbTable::default()
     };
-    Made { stereo: stereo.build(), rgb: rgb.build(), sizes: None, gone: false, bad_replies: 0, asked: 0 }
+    Made {
+        stereo: stereo.build(),
+        rgb: rgb.build(),
+        sizes: None,
+        gone: false,
+        refusal: None,
+        bad_replies: 0,
+        asked: 0,
+    }
 }
 
 fn read(mut made: Made, config: &RealsenseConfig) -> Result<Option<Calibration>> {
@@ -124,6 +137,19 @@ fn a_damaged_reply_is_asked_for_again_and_a_damaged_table_is_not_for_ever() {
         "it",
     )
     .unwrap_err();
-    assert!(e.to_string().contains("checksum"), "{e}");
+    assert!(e.to_string().contains("checksum") && e.to_string().contains("asked 3 times"), "{e}");
     assert_eq!(damaged.asked, READINGS);
+}
+
+#[test]
+fn one_refusal_of_a_table_does_not_make_a_camera_uncalibrated() {
+    // The first request is for the stereo table; the last of five, after three for the sizes that it has not, for colour.
+    for at in [1, 5] {
+        for kind in [ErrorKind::Unsupported, ErrorKind::NotFound, ErrorKind::Protocol] {
+            let camera = Made { refusal: Some((at, kind)), ..made() };
+            assert!(read(camera, &RealsenseConfig::default()).unwrap().is_some(), "{kind:?} at {at}");
+        }
+    }
+    let camera = Made { refusal: Some((1, ErrorKind::Busy)), ..made() };
+    assert_eq!(read(camera, &RealsenseConfig::default()).unwrap_err().kind(), ErrorKind::Busy, "that passes");
 }

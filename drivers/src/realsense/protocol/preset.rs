@@ -108,7 +108,13 @@ impl Preset {
                 Ok(Written { group: *group, before, after })
             };
             written.push(one().map_err(|e: Error| {
-                let text = format!("preset \"{}\", group {}: {e}", self.name, group.name());
+                let cure = match e.kind() {
+                    ErrorKind::Unsupported | ErrorKind::Protocol => {
+                        ". Correct it in the file, or leave it out"
+                    }
+                    _ => "",
+                };
+                let text = format!("preset \"{}\", group {}: {e}{cure}", self.name, group.name());
                 Error::new(e.kind(), text).with_source(e)
             })?);
         }

@@ -115,8 +115,18 @@ impl SyncMode {
     /// # Errors
     /// Those of [`HardwareMonitor::command`]; [`ErrorKind::Protocol`] when the camera says another mode afterwards.
     pub fn write(self, monitor: &mut dyn HardwareMonitor) -> Result<()> {
-        monitor.command(&Request::set_sync(self.code()))?;
-        let now = Self::read(monitor)?;
+        let mut set_and_read = || {
+            monitor.command(&Request::set_sync(self.code()))?;
+            Self::read(monitor)
+        };
+        let now = set_and_read().map_err(|e| {
+            let cure = match e.kind() {
+                ErrorKind::Unsupported | ErrorKind::Protocol => ". Choose another mode, or leave it out",
+                ErrorKind::Busy => ". It takes none while it streams; plug it in anew if that stays so",
+                _ => "",
+            };
+            Error::new(e.kind(), format!("sync mode {self}: {e}{cure}")).with_source(e)
+        })?;
         if now == self {
             return Ok(());
         }

@@ -79,3 +79,26 @@ fn both_eyes_have_one_mode() {
         chosen(&[wanted("depth", None, None)]).unwrap_err().to_string().contains("it has: left 1280x720")
     );
 }
+
+/// The motion unit has a mode of its own, which no eye's wish changes, and the other way round.
+#[test]
+fn the_motion_unit_is_chosen_beside_the_eyes() {
+    let mut all = profiles("ZED", &modes(), None).unwrap();
+    all.push(crate::zed::imu::profile().unwrap());
+    let chosen = |r: &[StreamRequest]| choose("ZED", &all, r).map(|c| described(&c));
+    let imu = || wanted("imu", None, None);
+    let small = Some((672, 376));
+    let unit = "imu motion 400 Hz in batches of up to 16";
+    assert_eq!(
+        chosen(&[wanted("left", small, None), imu(), wanted("right", None, None)]).unwrap(),
+        ["left 672x376 yuyv 100 Hz", unit, "right 672x376 yuyv 100 Hz"]
+    );
+    assert_eq!(chosen(&[imu()]).unwrap(), [unit]);
+    assert_eq!(
+        chosen(&[]).unwrap(),
+        ["left 1280x720 yuyv 30 Hz", "right 1280x720 yuyv 30 Hz", unit],
+        "by default it is delivered"
+    );
+    let apart = [wanted("left", small, None), wanted("right", Some((1280, 720)), None), imu()];
+    assert_eq!(chosen(&apart).unwrap_err().kind(), ErrorKind::Unsupported);
+}

@@ -1,9 +1,12 @@
 use super::*;
 use crate::v4l2::{FourCc, Interval, Mode};
+use crate::zed::hid::Reports;
+use crate::zed::imu;
 use crate::zed::profiles::profiles;
+use crate::zed::sensors::Record;
 use crate::{ErrorKind, MemorySink};
-use depthrig_bus::{ClockDomain, DropReason, HostTime};
-use std::sync::mpsc::sync_channel;
+use depthrig_bus::{ClockDomain, DropReason, HostTime, MotionFlags, MotionSample};
+use std::sync::mpsc::{SyncSender, sync_channel};
 
 /// Pictures of 8x3 pixels of both eyes, with two bytes between rows.
 const STRIDE: usize = 18;
@@ -175,4 +178,177 @@ fn sizes_are_told_apart() {
     assert_eq!(sizes, [50, 51, 0, 49, 49, 1]);
     // Rows with much padding: half of what came could be more than an eye has.
     assert_eq!(own_bytes(199, 200, 50), 49);
+}
+
+/// A motion unit that says what it is given, and is gone when nobody gives any more.
+struct Unit(std::sync::mpsc::Receiver<Record>);
+
+impl Reports for Unit {
+    fn send_feature(&mut self, _: [u8; 2]) -> Result<()> {
+        Ok(())
+    }
+
+    fn read(&mut self, into: &mut [u8], timeout: Duration) -> Result<Option<usize>> {
+        use std::sync::mpsc::RecvTimeoutError;
+        match self.0.recv_timeout(timeout) {
+            Ok(record) => {
+                let bytes = record.build();
+                into[..bytes.len()].copy_from_slice(&bytes);
+                Ok(Some(bytes.len()))
+            }
+            Err(RecvTimeoutError::Timeout) => Ok(None),
+            Err(RecvTimeoutError::Disconnected) => Err(Error::new(ErrorKind::Disconnected, "pulled")),
+        }
+    }
+}
+
+/// Record number `n`, 2.5 ms after the one before.
+fn record(n: u64) -> Record {
+    Record {
+        motion_valid: n % 50 != 49,
+        ticks: 900 + 64 * n,
+        gyro_raw: [n as i16, -1, if n == 7 { i16::MAX } else { 3 }],
+        acceleration_raw: [1, 3337, if n == 9 { i16::MIN } else { n as i16 }],
+        frame_sync: n.is_multiple_of(13),
+        temperature_raw: if n < 5 { -27_315 } else { 3000 + n as i16 },
+        ..Record::default()
+    }
+}
+
+/// A camera with a unit that has sent the records in `numbers`, all of which were read from it.
+fn with_unit(made: Vec<Made>, numbers: impl Iterator<Item = u64>) -> (ZedStream, SyncSender<Record>) {
+    let (send, records) = sync_channel(4096);
+    let wanted = numbers.map(|n| send.send(record(n)).unwrap()).count() as u64;
+    let (unit, samples) = Motion::start_streaming(Box::new(Unit(records)), "ZED 2i 7").unwrap();
+    let until = HostTime::now().plus(Duration::from_secs(20));
+    while unit.tally().records < wanted {
+        assert!(!until.from_now().is_zero(), "the records are not read");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    let mut s = stream(&Eye::BOTH, made, None);
+    s.motion = Some(unit);
+    (s.with_imu(imu::profile().unwrap(), samples), send)
+}
+
+fn motion_of(sink: &MemorySink, stream: usize) -> Vec<MotionSample> {
+    sink.frames.iter().filter(|f| f.0 == stream).flat_map(|f| MotionSample::all_in(&f.2)).collect()
+}
+
+#[test]
+fn every_sample_of_the_unit_is_in_a_batch_with_its_values() {
+    // Numbers 20 to 22 never come.
+    let (mut s, _unit) = with_unit(vec![Made::new(1)], (0..20).chain(23..100));
+    assert_eq!(s.profiles()[2].describe(), imu::profile().unwrap().describe());
+    let mut sink = MemorySink::default();
+    assert_eq!(s.poll(Duration::ZERO, &mut sink).unwrap(), Poll::Frame);
+    // What does not fill a batch goes when it is old.
+    s.pictures = Some(Box::new(Silent));
+    std::thread::sleep(crate::motion::LONGEST);
+    assert_eq!(s.poll(Duration::ZERO, &mut sink).unwrap(), Poll::Frame);
+    assert_eq!((sink.delivered(0), sink.delivered(1)), (1, 1));
+    let samples = motion_of(&sink, 2);
+    let numbers: Vec<_> = samples.iter().map(|m| m.sequence).collect();
+    assert_eq!(numbers, (1..21).chain(24..101).collect::<Vec<_>>(), "a gap where the unit gave none");
+    let sizes: Vec<_> = sink.frames.iter().filter(|f| f.0 == 2).map(|f| f.2.len() / 64).collect();
+    assert_eq!(sizes, [16, 16, 16, 16, 16, 16, 1]);
+    assert_eq!(sink.drops_of(2).total(), 0);
+    assert_eq!((sink.captured[2], sink.delivered(2)), (7, 7));
+    for m in &samples {
+        let r = record(m.sequence - 1);
+        assert_eq!(m.device_time, r.ticks);
+        if r.motion_valid {
+            assert_eq!(m.gyro_rad_s, r.gyro_rad_s().map(|v| v as f32));
+            assert_eq!(m.accel_m_s2, r.acceleration_m_s2().map(|v| v as f32));
+        } else {
+            assert!(m.gyro_rad_s.iter().chain(&m.accel_m_s2).all(|v| v.is_nan()));
+        }
+        assert_eq!(m.has(MotionFlags::FRAME_SYNC), r.frame_sync);
+        assert_eq!(m.has(MotionFlags::GYRO_CLIPPED), m.sequence == 8);
+        assert_eq!(m.has(MotionFlags::ACCEL_CLIPPED), m.sequence == 10);
+        assert_eq!(m.temperature_c.is_nan(), m.sequence <= 5);
+        assert!(m.temperature_c.is_nan() || (m.temperature_c - r.temperature_c() as f32).abs() < 1e-6);
+    }
+    assert!(samples.is_sorted_by(|a, b| a.time_ns < b.time_ns), "times rise");
+    for (_, meta, payload) in sink.frames.iter().filter(|f| f.0 == 2) {
+        let newest = MotionSample::all_in(payload).last().unwrap();
+        assert_eq!((meta.device_sequence, meta.capture_time), (newest.sequence, newest.time()));
+        assert_eq!((meta.clock_domain, meta.device_time), (ClockDomain::Device, newest.device_time));
+        assert!(meta.capture_time <= meta.arrival);
+    }
+}
+
+/// Nobody reads for longer than the queue is: what had no room is counted as lost here.
+#[test]
+fn a_queue_that_is_full_costs_whole_batches_that_are_counted() {
+    const SENT: u64 = 1024 + 40;
+    let (mut s, unit) = with_unit(Vec::new(), 0..SENT);
+    s.pictures = Some(Box::new(Silent));
+    let mut sink = MemorySink::default();
+    s.poll(Duration::ZERO, &mut sink).unwrap();
+    assert_eq!(motion_of(&sink, 2).len(), 1024);
+    assert_eq!(sink.drops_of(2).total(), 0, "not known before the next sample tells");
+    for n in SENT..SENT + 16 {
+        unit.send(record(n)).unwrap();
+    }
+    let until = HostTime::now().plus(Duration::from_secs(20));
+    while motion_of(&sink, 2).len() < 1040 {
+        assert!(!until.from_now().is_zero(), "the last batch does not come");
+        s.poll(Duration::from_millis(5), &mut sink).unwrap();
+    }
+    // 40 samples are two batches and a half.
+    assert_eq!(sink.drops_of(2).get(DropReason::QueueFull), 3);
+    assert_eq!(sink.drops_of(2).total(), 3);
+    assert_eq!(sink.captured[2], sink.delivered(2) + 3);
+    let samples = motion_of(&sink, 2);
+    assert_eq!((samples[1023].sequence, samples[1024].sequence), (1024, SENT + 1));
+    assert_eq!(s.motion().unwrap().tally().overflowed, 40);
+}
+
+/// Pictures that do not come.
+struct Silent;
+
+impl PictureSource for Silent {
+    fn poll(&mut self, patience: Duration, _: &mut dyn FnMut(&Picture<'_>)) -> Result<bool> {
+        std::thread::sleep(patience);
+        Ok(false)
+    }
+}
+
+#[test]
+fn a_unit_that_is_gone_ends_no_pictures_but_a_camera_of_nothing_else() {
+    let (mut s, unit) = with_unit(vec![Made::new(1)], 0..3);
+    drop(unit);
+    let until = HostTime::now().plus(Duration::from_secs(20));
+    while s.motion().unwrap().problem().is_none() {
+        assert!(!until.from_now().is_zero());
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    let mut sink = MemorySink::default();
+    assert_eq!(s.poll(Duration::ZERO, &mut sink).unwrap(), Poll::Frame);
+    assert_eq!((sink.delivered(0), sink.delivered(1)), (1, 1));
+    s.pictures = Some(Box::new(Silent));
+    assert_eq!(s.poll(Duration::from_millis(150), &mut sink).unwrap(), Poll::Frame, "the last three samples");
+    assert_eq!(motion_of(&sink, 2).len(), 3);
+    assert_eq!(s.poll(Duration::from_millis(5), &mut sink).unwrap(), Poll::Idle);
+
+    let (send, records) = sync_channel(64);
+    (0..16).for_each(|n| send.send(record(n)).unwrap());
+    let (motion, samples) = Motion::start_streaming(Box::new(Unit(records)), "ZED 2i 7").unwrap();
+    let alone = ZedStream::without_pictures("ZED 2i 7 at USB port 1-1".to_owned(), motion);
+    let mut alone = alone.with_imu(imu::profile().unwrap(), samples);
+    assert_eq!(alone.profiles().len(), 1);
+    let mut sink = MemorySink::default();
+    while sink.delivered(0) == 0 {
+        alone.poll(Duration::from_millis(20), &mut sink).unwrap();
+    }
+    assert_eq!(motion_of(&sink, 0).len(), 16);
+    drop(send);
+    let gone = loop {
+        match alone.poll(Duration::from_millis(20), &mut sink) {
+            Err(e) => break e,
+            Ok(_) => assert!(!until.from_now().is_zero()),
+        }
+    };
+    assert_eq!(gone.kind(), ErrorKind::Disconnected);
+    assert!(gone.to_string().contains("its motion unit is no longer read: pulled"), "{gone}");
 }

@@ -47,7 +47,8 @@ fn recorded(sets: u64) -> (MemFs, PathBuf) {
         let utc = UtcPair { mono: HostTime::from_ns(0), utc_ns: 1, width_ns: 0 };
         let tick = HostTime::from_ns(n as i64 + 1);
         let frames = session.streams.iter().enumerate().map(frame).collect();
-        r.push(RecordSet { id: n, tick, utc, frames, missing: Vec::new(), spread_ns: 0 }).unwrap();
+        r.push(RecordSet { id: n, tick, utc, frames, missing: Vec::new(), motion: Vec::new(), spread_ns: 0 })
+            .unwrap();
         while r.progress().sets.recorded <= n {
             std::thread::sleep(Duration::from_millis(1));
         }
@@ -120,7 +121,7 @@ fn untouched(bytes: &[u8], at: u64) -> Vec<u64> {
     while let Some(group) = groups.next().unwrap() {
         let Group::Set(set) = group else { continue };
         let mut spans = set.offsets.iter().zip(&set.chunks);
-        if !spans.any(|(from, c)| (*from..from + c.bytes().len() as u64).contains(&at)) {
+        if !spans.any(|(from, c)| (*from..from + c.len()).contains(&at)) {
             ids.push(set.mark.id);
         }
     }

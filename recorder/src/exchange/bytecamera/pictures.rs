@@ -159,7 +159,8 @@ mod tests {
 
     #[test]
     fn what_is_written_is_read() {
-        for format in PixelFormat::ALL.into_iter().filter(|f| *f != PixelFormat::Mjpeg) {
+        let pictures = |f: &PixelFormat| *f != PixelFormat::Mjpeg && !f.is_motion();
+        for format in PixelFormat::ALL.into_iter().filter(pictures) {
             let mut h = FrameHeader::default();
             h.set_picture(format, 6, 4);
             let pixels: Vec<u8> = (0..format.frame_bytes(6, 4)).map(|i| (i * 37) as u8).collect();

@@ -369,6 +369,7 @@ impl Importer for RosbagImport {
             utc: UtcPair::default(),
             frames: Vec::new(),
             missing: Vec::new(),
+            motion: Vec::new(),
             spread_ns: 0,
         };
         for (stream, frame) in set.frames.iter().enumerate() {

@@ -2,8 +2,11 @@
 
 use super::{END_TABLE, count, escape, ms, row, table};
 use crate::report::svg::{self, Strip, Time, Trace, nice_end, number};
-use crate::report::{Quantiles, Range, Report, StreamReport};
+use crate::report::{MotionReport, Quantiles, Range, Report, StreamReport};
 use std::fmt::Write;
+
+/// What a unit at rest measures, m/s² (standard gravity).
+const GRAVITY: f64 = 9.806_65;
 
 fn time(r: &Report) -> Time {
     Time { span_ns: r.bins.span_ns, bin_ns: r.bins.width_ns }
@@ -99,9 +102,10 @@ pub(super) fn losses(out: &mut String, r: &Report) {
         check(out, c.balances());
         out.push_str("</tr>");
     }
-    for s in &r.streams {
-        let _ = write!(out, "<tr><td>{}</td>", escape(&s.record.id.to_string()));
-        let Some(a) = &s.account else {
+    let units = r.motion.iter().map(|u| (&u.record.id, &u.account));
+    for (id, account) in r.streams.iter().map(|s| (&s.record.id, &s.account)).chain(units) {
+        let _ = write!(out, "<tr><td>{}</td>", escape(&id.to_string()));
+        let Some(a) = account else {
             out.push_str("<td colspan=\"2\">no account in the file</td></tr>");
             continue;
         };
@@ -257,6 +261,54 @@ fn host_clock(out: &mut String, r: &Report) {
         number(c.width_ns as f64 / 1e3)
     );
     out.push_str(&svg::strips("Wall clock against monotonic clock", "ms", time(r), &[strip]));
+}
+
+pub(super) fn motion(out: &mut String, r: &Report) {
+    const COLUMNS: [&str; 6] =
+        ["unit", "#samples", "#samples/s", "#nominal", "#batches not recorded", "#samples never given"];
+    if r.motion.is_empty() {
+        return;
+    }
+    out.push_str("<section><h2>Motion</h2>");
+    table(out, &COLUMNS);
+    for u in &r.motion {
+        let cells = [
+            u.record.id.to_string(),
+            u.samples.to_string(),
+            format!("{:.1}", u.samples_hz),
+            number(u.record.rate_hz),
+            u.lost_batches.to_string(),
+            u.never_given.to_string(),
+        ];
+        row(out, &COLUMNS, &cells);
+    }
+    out.push_str(END_TABLE);
+    if r.bins.span_ns > 0 {
+        out.push_str(
+            "<p class=\"cap\">Length of the angular velocity and of the acceleration, least, mean and greatest in steps; \
+             dashed is gravity.</p>",
+        );
+        let strip = |u: &MotionReport, what: &str, series: &[Option<Range>], nominal: Option<f64>| {
+            let top = series.iter().flatten().map(|v| v.max).fold(nominal.unwrap_or(0.0), f64::max);
+            Strip {
+                label: u.record.id.to_string(),
+                note: format!(
+                    "{what}, at most {}",
+                    number(series.iter().flatten().map(|v| v.max).fold(0.0, f64::max))
+                ),
+                trace: Trace::Steps(series.iter().map(|v| v.map(|v| (v.min, v.mean, v.max))).collect()),
+                y: (0.0, nice_end(top * 1.05)),
+                nominal,
+                marks: [Vec::new(), Vec::new()],
+            }
+        };
+        let turns: Vec<_> = r.motion.iter().map(|u| strip(u, "rotation", &u.rotation_series, None)).collect();
+        out.push_str(&svg::strips("Angular velocity over time, per motion unit", "rad/s", time(r), &turns));
+        let pushes = r.motion.iter().map(|u| strip(u, "acceleration", &u.acceleration_series, Some(GRAVITY)));
+        let pushes: Vec<_> = pushes.collect();
+        out.push_str(&svg::strips("Acceleration over time, per motion unit", "m/s²", time(r), &pushes));
+    }
+    out.push_str("</section>");
 }
 
 pub(super) fn fill(out: &mut String, r: &Report) {

@@ -62,6 +62,7 @@ impl Calibration {
             },
             Family::L515 => Self { l515: Some(L515::new(&spread)), ..Self::default() },
             Family::Zed | Family::ZedMcu => Self { zed: zed::modes(&spread), ..Self::default() },
+            Family::Plain => Self::default(),
         }
     }
 

@@ -4,7 +4,7 @@ use crate::calibration::Calibration;
 use crate::content::{self, hash};
 use crate::device::{Device, spawn};
 use crate::fault::Fault;
-use crate::firmware::Identity;
+use crate::firmware::{Asked, Identity};
 use crate::model::{Mode, Model};
 use crate::shared::{Command, Presence, Session, Shared};
 use crate::{Accounts, Error, Result, vhci};
@@ -199,6 +199,11 @@ impl Camera {
     /// How often each kind of fault was asked for.
     pub fn faults(&self) -> BTreeMap<&'static str, u64> {
         self.shared.lock().faults.clone()
+    }
+
+    /// The requests of the hardware monitor that came, oldest first, but for readings of the clock; of very many the latest.
+    pub fn asked(&self) -> Vec<Asked> {
+        self.shared.lock().asked.iter().cloned().collect()
     }
 
     /// The bytes of a frame as they travelled, by its stamp's index.

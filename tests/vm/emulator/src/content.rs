@@ -35,10 +35,10 @@ impl Stamp {
         bytes
     }
 
-    /// Reads the stamp of a picture that has been unpacked (and turned upright); `None` when there is none, or when it
-    /// is damaged.
+    /// Reads the stamp of a picture that has been unpacked (and turned upright), or of a JPEG picture as it came; `None`
+    /// when there is none, or when it is damaged.
     pub fn read(picture: &[u8]) -> Option<Self> {
-        let bytes: &[u8; STAMP] = picture.first_chunk()?;
+        let bytes: &[u8; STAMP] = picture.strip_prefix(&JPEG_HEAD).unwrap_or(picture).first_chunk()?;
         let long = |at: usize| Some(u64::from_le_bytes(*bytes.get(at..)?.first_chunk()?));
         let crc = u32::from_le_bytes([bytes[24], bytes[25], bytes[26], bytes[27]]);
         if bytes[..4] != MAGIC || crc32fast::hash(&bytes[..24]) != crc {
@@ -54,6 +54,11 @@ pub fn hash(text: &str) -> u64 {
     text.bytes().fold(0xCBF2_9CE4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01B3))
 }
 
+/// What comes before the stamp of a JPEG picture: start of image, then a comment with room for it (ITU-T T.81, B.1.1).
+const JPEG_HEAD: [u8; 6] = [0xFF, 0xD8, 0xFF, 0xFE, 0, STAMP as u8 + 2];
+/// Of JPEG pictures, percent.
+const JPEG_QUALITY: u8 = 95;
+
 /// The bytes of a frame as they travel.
 pub fn frame(serial: &str, stream: u16, mode: &Mode, index: u64) -> Vec<u8> {
     let mut bytes = pattern(serial, stream, mode);
@@ -64,7 +69,10 @@ pub fn frame(serial: &str, stream: u16, mode: &Mode, index: u64) -> Vec<u8> {
 
 /// The pattern of a stream, without stamps.
 pub(crate) fn pattern(serial: &str, stream: u16, mode: &Mode) -> Vec<u8> {
-    let seed = (hash(serial) ^ u64::from(stream).wrapping_mul(0x9E37_79B9)) as u32;
+    if mode.layout == Layout::Jpeg {
+        return jpeg(serial, stream, mode);
+    }
+    let seed = seed(serial, stream);
     let (row, height) = (mode.row(), usize::from(mode.height));
     let mut bytes = vec![0; row * height];
     let wide = mode.fourcc == *b"Z16 ";
@@ -86,6 +94,33 @@ pub(crate) fn pattern(serial: &str, stream: u16, mode: &Mode) -> Vec<u8> {
     bytes
 }
 
+fn seed(serial: &str, stream: u16) -> u32 {
+    (hash(serial) ^ u64::from(stream).wrapping_mul(0x9E37_79B9)) as u32
+}
+
+/// The picture that a JPEG of a stream was made of: red, green, blue, row after row. It is smooth, so that decoding it gives
+/// nearly the same, and no two places of it look alike.
+pub fn painted(serial: &str, stream: u16, mode: &Mode) -> Vec<u8> {
+    let seed = seed(serial, stream);
+    let (width, height) = (u32::from(mode.width), u32::from(mode.height));
+    let ramp = |at: u32, of: u32| (at * 200 / of.max(1)) as u8 + 28;
+    let blue = 40 + (seed % 160) as u8;
+    let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+    pixels.flat_map(|(x, y)| [ramp(x, width), ramp(y, height), blue]).collect()
+}
+
+/// [`painted`] as a JPEG picture with room for a stamp; empty when it cannot be encoded.
+fn jpeg(serial: &str, stream: u16, mode: &Mode) -> Vec<u8> {
+    let mut coded = Vec::new();
+    let encoder = jpeg_encoder::Encoder::new(&mut coded, JPEG_QUALITY);
+    let pixels = painted(serial, stream, mode);
+    if encoder.encode(&pixels, mode.width, mode.height, jpeg_encoder::ColorType::Rgb).is_err() {
+        return Vec::new();
+    }
+    let rest = coded.get(2..).unwrap_or_default();
+    [&JPEG_HEAD[..], &[0; STAMP], rest].concat()
+}
+
 /// Writes the stamp into a frame, where its layout has it.
 pub(crate) fn put_stamp(frame: &mut [u8], mode: &Mode, stamp: &Stamp) {
     let bytes = stamp.bytes();
@@ -97,6 +132,7 @@ pub(crate) fn put_stamp(frame: &mut [u8], mode: &Mode, stamp: &Stamp) {
     for (i, value) in bytes.into_iter().enumerate() {
         match mode.layout {
             Layout::Plain => put(i, value),
+            Layout::Jpeg => put(JPEG_HEAD.len() + i, value),
             Layout::Interleaved => {
                 put(2 * i, value);
                 put(2 * i + 1, value);
@@ -151,6 +187,19 @@ mod tests {
         assert_eq!((Stamp::read(&left), Stamp::read(&right)), (Some(stamp), Some(stamp)));
         let sbs = frame("a", 1, &mode(Layout::SideBySide, 16), 9);
         assert_eq!((Stamp::read(&sbs), Stamp::read(&sbs[64..])), (Some(stamp), Some(stamp)));
+    }
+
+    #[test]
+    fn a_jpeg_has_its_stamp_in_a_comment_and_is_the_picture_that_was_painted() {
+        let mode = Mode { fourcc: *b"MJPG", ..mode(Layout::Jpeg, 16) };
+        let sent = frame("a", 1, &mode, 9);
+        assert_eq!(Stamp::read(&sent), Some(Stamp { serial_hash: hash("a"), stream: 1, index: 9 }));
+        assert_eq!(Stamp::read(&sent[2..]), None);
+        let mut seen = vec![0; 64 * 48 * 3];
+        depthrig_drivers::unpack::decode_jpeg(&sent, 64, 48, &mut seen).unwrap();
+        let off = seen.iter().zip(painted("a", 1, &mode)).map(|(a, b)| a.abs_diff(b)).max();
+        assert!(off.unwrap() <= 8, "{off:?}");
+        assert_ne!(painted("a", 1, &mode), painted("b", 1, &mode));
     }
 
     #[test]

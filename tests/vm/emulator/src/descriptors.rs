@@ -2,7 +2,7 @@
 //!
 //! Layouts: USB 3.2 chapter 9; UVC 1.5 class specification, chapter 3 and its payload documents.
 
-use crate::model::{Control, Format, Function, Model, Stream, Unit, UnitKind, from_hex};
+use crate::model::{Control, Format, Function, Layout, Model, Stream, Unit, UnitKind, from_hex};
 use crate::{Result, Speed};
 
 const CS_INTERFACE: u8 = 0x24;
@@ -193,10 +193,16 @@ pub(crate) fn offered(stream: &Stream, speed: Speed) -> Vec<&Format> {
 
 fn format_descriptors(format: &Format, index: u8, speed: Speed) -> Result<Vec<u8>> {
     let sizes = format.sizes(speed);
-    let guid = format.guid_bytes()?;
-    let subtype = if format.frame_based { 0x10 } else { 0x04 };
-    let head = Bytes::default().u8(&[CS_INTERFACE, subtype, index, sizes.len() as u8]).u8(&guid);
-    let head = head.u8(&[format.bits, 1, 0, 0, 0, 0]);
+    let jpeg = format.layout == Layout::Jpeg;
+    let subtype = match (jpeg, format.frame_based) {
+        (true, _) => 0x06,
+        (false, true) => 0x10,
+        (false, false) => 0x04,
+    };
+    let head = Bytes::default().u8(&[CS_INTERFACE, subtype, index, sizes.len() as u8]);
+    // Motion JPEG has a descriptor of its own in place of an identifier; its pictures differ in size.
+    let head = if jpeg { head.u8(&[0]) } else { head.u8(&format.guid_bytes()?).u8(&[format.bits]) };
+    let head = head.u8(&[1, 0, 0, 0, 0]);
     // Frame-based payloads end with bVariableSize: 0, every frame has the same size.
     let mut bytes = if format.frame_based { head.u8(&[0]).sized() } else { head.sized() };
     for (at, size) in sizes.iter().enumerate() {

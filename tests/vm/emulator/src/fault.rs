@@ -36,6 +36,8 @@ pub enum Fault {
     Reply {
         /// How.
         wrong: WrongReply,
+        /// Those to requests with this opcode; `None`: to every request.
+        to: Option<u32>,
         /// How many.
         times: u32,
     },
@@ -152,7 +154,12 @@ impl FromStr for Fault {
                     Some(&"truncated") => (WrongReply::Truncated, 1),
                     _ => return Err(Error::new("a wrong reply is opcode, code N, garbage or truncated")),
                 };
-                Ok(Self::Reply { wrong, times: number(rest.get(used), "a number of replies")? })
+                let times = number(rest.get(used), "a number of replies")?;
+                let to = match rest.get(used + 1) {
+                    Some(&"to") => Some(number(rest.get(used + 2), "an opcode")?),
+                    _ => None,
+                };
+                Ok(Self::Reply { wrong, to, times })
             }
             "clock-jump" => Ok(Self::ClockJump(number(rest.first(), "a number of microseconds")?)),
             "clock-reset" => Ok(Self::ClockReset),
@@ -187,6 +194,7 @@ mod tests {
             "reply code -7 2",
             "reply garbage 1",
             "reply truncated 1",
+            "reply truncated 1 to 21",
             "clock-jump -5000",
             "clock-reset",
             "damaged-table 25",
@@ -200,7 +208,11 @@ mod tests {
         }
         assert_eq!(
             "reply code -7 2".parse::<Fault>().unwrap(),
-            Fault::Reply { wrong: WrongReply::Code(-7), times: 2 }
+            Fault::Reply { wrong: WrongReply::Code(-7), to: None, times: 2 }
+        );
+        assert_eq!(
+            "reply code -7 2 to 21".parse::<Fault>().unwrap(),
+            Fault::Reply { wrong: WrongReply::Code(-7), to: Some(0x15), times: 2 }
         );
         for wrong in [
             "",
@@ -208,6 +220,7 @@ mod tests {
             "short",
             "reply",
             "reply code",
+            "reply garbage 1 to",
             "control-timeout x",
             "control-timeout -1",
             "x",

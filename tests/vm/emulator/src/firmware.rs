@@ -33,7 +33,7 @@ impl Identity {
             }
             // The same on every unit: the bridge has no serial of its own.
             Family::Zed => "OV0001".to_owned(),
-            Family::ZedMcu => serial.to_owned(),
+            Family::ZedMcu | Family::Plain => serial.to_owned(),
         };
         Self { serial: serial.to_owned(), chip_serial, calibration: Calibration::new(model, serial) }
     }
@@ -47,6 +47,20 @@ pub(crate) struct World<'a> {
     pub now: HostTime,
     /// A stream is running.
     pub streaming: bool,
+}
+
+/// The request by which the clock is read.
+const READ_MEMORY: u32 = 0x01;
+
+/// A request of the hardware monitor that came.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Asked {
+    /// Its opcode.
+    pub opcode: u32,
+    /// Its parameters.
+    pub params: [u32; 4],
+    /// The data behind them.
+    pub data: Vec<u8>,
 }
 
 /// What a command of the host leads to.
@@ -63,12 +77,21 @@ pub(crate) struct Flash {
     pub uncalibrated: bool,
 }
 
+/// Replies that are to be wrong.
+#[derive(Debug, Clone, Copy)]
+struct Wrong {
+    how: WrongReply,
+    /// To this request; `None`: to each.
+    to: Option<u32>,
+    times: u32,
+}
+
 /// A camera's firmware.
 pub(crate) struct Firmware {
     d400: d400::State,
     l515: l515::State,
     flash: Flash,
-    wrong: Option<(WrongReply, u32)>,
+    wrong: Option<Wrong>,
     seed: u64,
 }
 
@@ -87,7 +110,9 @@ impl Firmware {
     /// Takes a fault that is the firmware's.
     pub fn fault(&mut self, fault: &Fault) {
         match fault {
-            Fault::Reply { wrong, times } => self.wrong = Some((*wrong, *times)).filter(|w| w.1 > 0),
+            Fault::Reply { wrong, to, times } => {
+                self.wrong = Some(Wrong { how: *wrong, to: *to, times: *times }).filter(|w| w.times > 0);
+            }
             Fault::DamagedTable(id) => drop(self.flash.damaged.insert(*id)),
             Fault::Uncalibrated => self.flash.uncalibrated = true,
             Fault::Clear => {
@@ -101,23 +126,27 @@ impl Firmware {
     /// Answers a request of the hardware monitor.
     pub fn monitor(&mut self, bytes: &[u8], world: &World<'_>) -> Answer {
         let Some(request) = Request::parse(bytes) else {
-            return Answer::Reply(self.spoil(monitor::error(monitor::WRONG_COMMAND)));
+            return Answer::Reply(self.spoil(None, monitor::error(monitor::WRONG_COMMAND)));
         };
         let answer = match world.model.family {
             Family::D400 => self.d400.answer(&request, world, &self.flash),
             Family::L515 => self.l515.answer(&request, world),
-            Family::Zed | Family::ZedMcu => Some(Err(monitor::WRONG_COMMAND)),
+            Family::Zed | Family::ZedMcu | Family::Plain => Some(Err(monitor::WRONG_COMMAND)),
         };
         match answer {
-            Some(answer) => Answer::Reply(self.spoil(monitor::reply(request.opcode, answer))),
+            Some(answer) => {
+                Answer::Reply(self.spoil(Some(request.opcode), monitor::reply(request.opcode, answer)))
+            }
             None => Answer::Restart,
         }
     }
 
-    fn spoil(&mut self, mut reply: Vec<u8>) -> Vec<u8> {
-        let Some((wrong, times)) = self.wrong else { return reply };
-        self.wrong = (times > 1).then_some((wrong, times - 1));
-        match wrong {
+    /// The reply to a request, or what it becomes while a fault says so.
+    fn spoil(&mut self, opcode: Option<u32>, mut reply: Vec<u8>) -> Vec<u8> {
+        let Some(wrong) = self.wrong.filter(|w| w.to.is_none() || w.to == opcode) else { return reply };
+        let times = wrong.times - 1;
+        self.wrong = (times > 0).then_some(Wrong { times, ..wrong });
+        match wrong.how {
             WrongReply::Opcode => {
                 if let Some(byte) = reply.first_mut() {
                     *byte ^= 0x40;
@@ -137,6 +166,12 @@ impl Firmware {
         }
         reply
     }
+}
+
+/// A request to be remembered: each but readings of the clock, of which there is one a second.
+pub(crate) fn asked(bytes: &[u8]) -> Option<Asked> {
+    let request = Request::parse(bytes).filter(|r| r.opcode != READ_MEMORY)?;
+    Some(Asked { opcode: request.opcode, params: request.params, data: request.data.to_vec() })
 }
 
 /// A reply of the hardware monitor as the extension unit hands it out.

@@ -28,6 +28,7 @@ pub use calibration::Calibration;
 pub use camera::{Camera, Hub, Options, Speed};
 pub use content::Stamp;
 pub use fault::{Damage, Fault, WrongReply};
+pub use firmware::Asked;
 pub use model::Model;
 
 /// What goes wrong in the emulator itself.

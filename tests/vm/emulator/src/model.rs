@@ -71,6 +71,8 @@ pub enum Family {
     Zed,
     /// The sensor half of a ZED 2i.
     ZedMcu,
+    /// Nobody's: a camera of the video class alone.
+    Plain,
 }
 
 /// The vendor's part of the payload header.
@@ -219,6 +221,8 @@ pub enum Layout {
     SideBySide,
     /// One picture, transposed and flipped, as the L515 sends it.
     Turned,
+    /// One JPEG picture, with its stamp in a comment.
+    Jpeg,
 }
 
 /// A HID interface.
@@ -246,13 +250,14 @@ pub struct Vendor {
 }
 
 /// The models that come with the emulator.
-const BUILT_IN: [(&str, &str); 8] = [
+const BUILT_IN: [(&str, &str); 9] = [
     ("d405", include_str!("../models/d405.toml")),
     ("d415", include_str!("../models/d415.toml")),
     ("d435", include_str!("../models/d435.toml")),
     ("d435i", include_str!("../models/d435i.toml")),
     ("d455", include_str!("../models/d455.toml")),
     ("l515", include_str!("../models/l515.toml")),
+    ("uvc", include_str!("../models/uvc.toml")),
     ("zed2i", include_str!("../models/zed2i.toml")),
     ("zed2i-mcu", include_str!("../models/zed2i-mcu.toml")),
 ];

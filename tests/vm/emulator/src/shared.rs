@@ -2,6 +2,7 @@
 
 use crate::clock::DeviceClock;
 use crate::fault::Fault;
+use crate::firmware::Asked;
 use crate::model::Mode;
 use crate::{Accounts, Error, Result};
 use core::time::Duration;
@@ -16,6 +17,8 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 const COMMANDS: usize = 64;
 /// Starts of a stream that are remembered.
 const SESSIONS: usize = 8192;
+/// Requests of the hardware monitor that are remembered.
+const ASKED: usize = 1024;
 
 /// From the start of an exposure to its middle, where nothing else is known.
 const HALF_EXPOSURE_NS: i64 = 4_000_000;
@@ -63,6 +66,7 @@ pub(crate) struct State {
     pub accounts: Vec<Accounts>,
     pub sessions: Vec<VecDeque<Session>>,
     pub faults: BTreeMap<&'static str, u64>,
+    pub asked: VecDeque<Asked>,
     /// Which streams are running.
     pub running: Vec<bool>,
     pub presence: Presence,
@@ -85,6 +89,7 @@ impl Shared {
             accounts: vec![Accounts::default(); streams],
             sessions: vec![VecDeque::new(); streams],
             faults: BTreeMap::new(),
+            asked: VecDeque::new(),
             running: vec![false; streams],
             presence: Presence::Unplugged,
             trouble: None,
@@ -135,6 +140,14 @@ impl Shared {
 
     pub fn count_fault(&self, name: &'static str) {
         *self.lock().faults.entry(name).or_default() += 1;
+    }
+
+    pub fn remember(&self, asked: Asked) {
+        let mut state = self.lock();
+        if state.asked.len() >= ASKED {
+            state.asked.pop_front();
+        }
+        state.asked.push_back(asked);
     }
 
     pub fn begin_session(&self, stream: usize, session: Session) {

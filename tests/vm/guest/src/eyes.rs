@@ -1,6 +1,7 @@
 //! What depth by stereo must be: made once more of the pictures that were recorded with it, one step after the other.
 
 use anyhow::Context;
+use depthrig_bus::PixelFormat;
 use depthrig_calib::stereo::{DisparityMap, Gray, Matcher, Preset, StereoPair, depth_from_disparity};
 use depthrig_calib::{Rectifier, View};
 use depthrig_drivers::stereo::{Geometry, StereoMode, StereoOptions};
@@ -43,8 +44,8 @@ impl Eyes {
     pub fn depth(&mut self, left: &[u8], right: &[u8]) -> anyhow::Result<(Vec<u8>, usize)> {
         let Geometry { width, height, focal_px, baseline_m } = self.geometry;
         let (mut l, mut r) = (vec![0; width * height], vec![0; width * height]);
-        self.rectifier.grey_from_yuyv(View::Left, left, &mut l)?;
-        self.rectifier.grey_from_yuyv(View::Right, right, &mut r)?;
+        self.rectifier.rectify(View::Left, PixelFormat::Yuyv, left, &mut l, None)?;
+        self.rectifier.rectify(View::Right, PixelFormat::Yuyv, right, &mut r, None)?;
         let pair = StereoPair {
             left: Gray::packed(&l, width, height),
             right: Gray::packed(&r, width, height),

@@ -36,8 +36,11 @@ mod scenarios {
     pub mod realsense_clock;
     pub mod realsense_conformance;
     pub mod realsense_control;
+    pub mod realsense_infrared;
     pub mod replug;
+    pub mod service;
     pub mod udev;
+    pub mod uvc;
     pub mod v4l2_cost;
     pub mod v4l2_daemon;
     pub mod v4l2_faults;
@@ -74,6 +77,7 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::cameras::SCENARIO,
     scenarios::doctor::SCENARIO,
     scenarios::udev::SCENARIO,
+    scenarios::service::SCENARIO,
     scenarios::emulator::SCENARIO,
     scenarios::realsense_calibration::SCENARIO,
     scenarios::realsense_clock::SCENARIO,
@@ -84,11 +88,15 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::v4l2_faults::SCENARIO,
     scenarios::v4l2_cost::SCENARIO,
     scenarios::v4l2_daemon::SCENARIO,
+    scenarios::realsense_conformance::V4L2,
+    scenarios::uvc::SCENARIO,
     scenarios::libusb::SCENARIO,
     scenarios::libusb::END,
     scenarios::libusb::SEVEN,
+    scenarios::libusb::DAEMON,
     scenarios::realsense_conformance::LIBUSB,
     scenarios::realsense_control::SCENARIO,
+    scenarios::realsense_infrared::SCENARIO,
     scenarios::zed::SCENARIO,
     scenarios::zed_records::SCENARIO,
     scenarios::fourteen::SCENARIO,

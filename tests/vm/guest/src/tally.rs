@@ -15,8 +15,6 @@ pub struct Frame {
     pub meta: FrameMeta,
     /// Index of the emulator's stamp; `None` when its pixels have none.
     pub index: Option<u64>,
-    /// Whether the clock map knew the latency of its frames by then.
-    pub latency_known: bool,
 }
 
 /// What came out of a stream.
@@ -29,7 +27,6 @@ pub struct Tally {
     /// Frames captured, by stream.
     pub captured: Vec<u64>,
     memory: Vec<u8>,
-    latency_known: Vec<bool>,
 }
 
 impl Tally {
@@ -73,8 +70,7 @@ impl FrameSink for Tally {
 
     fn commit(&mut self, stream: usize, meta: &FrameMeta) {
         let index = Stamp::read(&self.memory).map(|s| s.index);
-        let latency_known = *Self::at(&mut self.latency_known, stream);
-        self.frames.push(Frame { stream, meta: *meta, index, latency_known });
+        self.frames.push(Frame { stream, meta: *meta, index });
     }
 
     fn discard(&mut self, _: usize) {}
@@ -87,7 +83,5 @@ impl FrameSink for Tally {
         *Self::at(&mut self.captured, stream) += n;
     }
 
-    fn clock_quality(&mut self, stream: usize, quality: &ClockQuality) {
-        *Self::at(&mut self.latency_known, stream) = quality.latency_known;
-    }
+    fn clock_quality(&mut self, _: usize, _: &ClockQuality) {}
 }

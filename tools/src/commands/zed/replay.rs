@@ -182,6 +182,9 @@ fn tell_modes(report: &ZedReplayReport) -> Result<()> {
         let frames = out::count(m.frames, "frame");
         out::line(format_args!("  {}: {frames}, {} by {}", m.mode, m.recorded_as, m.producer))?;
         out::line(format_args!("    {}", m.parameters))?;
+        if !m.shared_with.is_empty() {
+            out::line(format_args!("    matched at once with {}", m.shared_with.join(" and ")))?;
+        }
     }
     for line in &report.unavailable {
         out::line(format_args!("  {line}"))?;

@@ -26,11 +26,14 @@ fn described(plan: &Plan) -> Vec<String> {
     plan.profiles.iter().map(StreamProfile::describe).collect()
 }
 
+/// The motion unit, which streams beside whatever else does unless it is not wished for.
+const IMU: &str = "imu motion 1600 Hz in batches of up to 64";
+
 #[test]
-fn without_wishes_colour_and_depth_start_at_15_hz() {
+fn without_wishes_colour_depth_and_motion_start_at_15_hz() {
     let config = LiveConfig::default();
     let plan = planned(&config, &[]).unwrap();
-    assert_eq!(described(&plan), ["color 1280x720 yuyv 15 Hz", "depth 640x576 z16 15 Hz"]);
+    assert_eq!(described(&plan), ["color 1280x720 yuyv 15 Hz", "depth 640x576 z16 15 Hz", IMU]);
     let c = plan.configuration;
     assert_eq!((c.color_format, c.color_resolution, c.depth_mode, c.camera_fps), (2, 1, 2, 1));
     assert!(!c.synchronized_images_only && !c.disable_streaming_indicator);
@@ -83,7 +86,7 @@ fn what_does_not_go_together_is_refused() {
 fn passive_infrared_is_asked_for_by_name() {
     let config = LiveConfig { depth_mode: Some(DepthMode::PassiveIr), ..LiveConfig::default() };
     let plan = planned(&config, &[]).unwrap();
-    assert_eq!(described(&plan), ["color 1280x720 yuyv 15 Hz", "ir 1024x1024 mono16 15 Hz"]);
+    assert_eq!(described(&plan), ["color 1280x720 yuyv 15 Hz", "ir 1024x1024 mono16 15 Hz", IMU]);
     assert_eq!(plan.configuration.depth_mode, 5);
     assert!(planned(&config, &[wish("depth", None, None, None)]).unwrap_err().contains("depth"));
     let fast = planned(&config, &[wish("ir", None, Some(30.0), None)]).unwrap();
@@ -124,7 +127,12 @@ fn every_mode_can_be_started_alone() {
     let of = |stream: &str| all.iter().filter(|p| p.stream.as_str() == stream).count();
     // Three rates each, two where 30 Hz is too fast; five formats at 720p, else three.
     assert_eq!((of("depth"), of("ir"), of("color")), (3 * 3 + 2, 3 * 3 + 2, 5 * 3 + 4 * 3 * 3 + 3 * 2));
-    for p in &all {
+    let unit = all.iter().filter(|p| p.format.is_motion()).map(StreamProfile::describe).collect::<Vec<_>>();
+    assert_eq!(unit, [IMU]);
+    assert!(
+        planned(&config, &[wish("imu", None, None, None)]).unwrap_err().contains("only while a camera does")
+    );
+    for p in all.iter().filter(|p| !p.format.is_motion()) {
         let one = wish(p.stream.as_str(), Some((p.width, p.height)), Some(p.rate_hz), Some(p.format));
         let plan = planned(&config, &[one]).unwrap();
         assert_eq!(described(&plan), [p.describe()]);

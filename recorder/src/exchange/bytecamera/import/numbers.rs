@@ -75,6 +75,7 @@ impl ByteCameraImport {
             utc: UtcPair { utc_ns: start, ..UtcPair::default() },
             frames: Vec::new(),
             missing: Vec::new(),
+            motion: Vec::new(),
             spread_ns: 0,
         };
         for i in 0..self.streams.len() {

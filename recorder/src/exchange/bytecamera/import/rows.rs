@@ -91,6 +91,7 @@ impl ByteCameraImport {
             utc: UtcPair { utc_ns: first.utc_offset_ns, ..UtcPair::default() },
             frames: Vec::new(),
             missing: Vec::new(),
+            motion: Vec::new(),
             spread_ns: first.spread_ns,
         };
         let id = first.set;

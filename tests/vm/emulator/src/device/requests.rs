@@ -174,6 +174,9 @@ impl Device {
         let streaming = self.streaming();
         let (model, identity, clock) = (&*self.model, &self.identity, &self.clock);
         let world = World { model, identity, clock, now: HostTime::now(), streaming };
+        if let Some(asked) = firmware::asked(data) {
+            self.shared.remember(asked);
+        }
         self.firmware.monitor(data, &world)
     }
 

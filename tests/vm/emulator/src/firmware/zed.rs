@@ -107,17 +107,18 @@ impl Motion {
         if now < self.next {
             return None;
         }
-        // A record that came too late is not made up for.
+        // The unit measures on its own clock, whenever it may speak; what it could not say in time is lost.
         let behind = now.since_ns(self.next) / PERIOD_NS;
-        self.next = self.next.plus_ns((behind + 1) * PERIOD_NS);
-        self.count += 1;
+        let measured = self.next.plus_ns(behind * PERIOD_NS);
+        self.next = measured.plus_ns(PERIOD_NS);
+        self.count += behind.cast_unsigned() + 1;
         let new = frames.is_some_and(|frames| frames > self.frames);
         self.frames = frames.unwrap_or(self.frames);
         let wave = (self.count % 400) as i16 - 200;
         let record = Record {
             motion_valid: true,
             // 39.0625 µs a tick.
-            ticks: (now.ns() as u64).saturating_mul(2) / 78_125,
+            ticks: (measured.ns() as u64).saturating_mul(2) / 78_125,
             gyro_raw: [wave, -wave, 3],
             acceleration_raw: [0, 4096, wave],
             frame_sync: new,

@@ -16,7 +16,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "cameras",
     about: "depthrig cameras: free, on USB2, held by a process or a rig, forbidden, unplugged; every model",
-    cost: 12,
+    cost: 16,
     limit_s: 60,
     run,
 };
@@ -103,7 +103,10 @@ fn every_model(checks: &mut Checks) -> anyhow::Result<()> {
     ] {
         cameras.push((Camera::plug(model, Options::default())?, name, backend));
     }
-    // Enumerated one after the other, and the drivers take them later still.
+    // Enumerated one after the other, and the drivers take them later still. Counting nodes is cheap, listing is not.
+    let nodes: usize = cameras.iter().map(|(c, ..)| 2 * c.model().streams().count()).sum();
+    let there = || system::video_nodes().is_ok_and(|there| there.len() == nodes);
+    checks.that("each has its nodes", system::wait_until(ENUMERATION, there), nodes);
     let free = || {
         let states =
             listed(None).ok().and_then(|(_, v)| v["cameras"].as_array().cloned()).unwrap_or_default();

@@ -18,7 +18,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "daemon-life",
     about: "a hub reset, a camera that comes late, SIGTERM while streaming, kill -9 and recovery",
-    cost: 25,
+    cost: 12,
     limit_s: 120,
     run,
 };

@@ -11,7 +11,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "daemon-smoke",
     about: "the daemon with two simulated cameras: streams, records, ends",
-    cost: 10,
+    cost: 4,
     limit_s: 60,
     run,
 };

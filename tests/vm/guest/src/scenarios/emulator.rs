@@ -15,7 +15,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "emulator",
     about: "an emulated D435 under uvcvideo: nodes, frames and metadata, identity, faults, unplugging",
-    cost: 8,
+    cost: 1,
     limit_s: 60,
     run,
 };

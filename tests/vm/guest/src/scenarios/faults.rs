@@ -14,7 +14,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "faults",
     about: "every fault of an emulated D435 under the daemon: the state it ends in, what is said, and that it comes back",
-    cost: 60,
+    cost: 23,
     limit_s: 240,
     run,
 };
@@ -25,6 +25,12 @@ const PATIENCE: Duration = Duration::from_secs(10);
 const AWAY: Duration = Duration::from_millis(600);
 /// More wrong replies than an opening asks for, with all its retries.
 const MANY: u32 = 10_000;
+/// Opcodes: a calibration table, a group of advanced mode that is written, a sync mode that is set.
+const TABLE: u32 = 0x15;
+const SET_GROUP: u32 = 0x2B;
+const SET_SYNC: u32 = 0x69;
+/// What the victim is told at every opening.
+const PRESET: &str = "/tmp/preset.json";
 
 struct Bench {
     cameras: Vec<Camera>,
@@ -38,9 +44,15 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     for hub in [0, 0, 1] {
         cameras.push(plug("d435", Options { hub, ..Options::default() })?);
     }
+    std::fs::write(PRESET, r#"{ "name": "wide census", "groups": { "census_radius": [9, 9] } }"#)?;
     let rig = "[supervisor]\nstall_s = 0.5\nbackoff_min_s = 0.1\nbackoff_max_s = 0.5\n".to_owned();
-    let tables = cameras.iter().zip(NAMES).map(|(camera, name)| table(name, camera.serial(), 424, 240));
-    let daemon = Daemon::start(&(rig + &tables.collect::<String>()))?;
+    let tables = cameras.iter().zip(NAMES).map(|(camera, name)| {
+        // The slowest that a D435 has for those that only show that they stream.
+        let rate_hz = if name == NAMES[0] { 15 } else { 6 };
+        table_at(name, camera.serial(), 424, 240, rate_hz)
+    });
+    let tables = with(&tables.collect::<String>(), &format!("preset = \"{PRESET}\""));
+    let daemon = Daemon::start(&(rig + &tables))?;
     daemon.wait_until_streaming()?;
     let bench = Bench { cameras, daemon };
     bench.streams_that_end(checks)?;
@@ -60,18 +72,33 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     usb2(checks)
 }
 
+/// What a stream's table begins with.
+const STREAM: &str = "[[camera.stream]]";
+
+/// The first camera of `tables` with another key.
+fn with(tables: &str, key: &str) -> String {
+    tables.replacen(STREAM, &format!("{key}\n{STREAM}"), 1)
+}
+
 fn table(name: &str, serial: &str, width: u32, height: u32) -> String {
-    let stream = |stream: &str, rate: u32| {
-        format!(
-            "[[camera.stream]]\nname = \"{stream}\"\nwidth = {width}\nheight = {height}\nrate_hz = {rate}.0\n"
-        )
+    table_at(name, serial, width, height, 15)
+}
+
+fn table_at(name: &str, serial: &str, width: u32, height: u32, rate_hz: u32) -> String {
+    let stream = |stream: &str| {
+        format!("{STREAM}\nname = \"{stream}\"\nwidth = {width}\nheight = {height}\nrate_hz = {rate_hz}.0\n")
     };
     let head = format!("[[camera]]\nname = \"{name}\"\nbackend = \"realsense\"\nserial = \"{serial}\"\n");
-    head + &stream("depth", 15) + &stream("color", 15)
+    head + &stream("depth") + &stream("color")
 }
 
 fn of<'a>(status: &'a RigStatus, name: &str) -> anyhow::Result<&'a CameraStatus> {
     status.cameras.iter().find(|c| c.name == name).with_context(|| format!("no camera {name} in the status"))
+}
+
+/// Why a wait was in vain; empty when it was not.
+fn message(found: &anyhow::Result<RigStatus>) -> String {
+    found.as_ref().err().map_or(String::new(), ToString::to_string)
 }
 
 /// What is checked of a message: each of these words, without regard to case.
@@ -126,11 +153,7 @@ impl Bench {
             })
         };
         let found = self.daemon.wait_for(PATIENCE, "it streams again", more);
-        checks.that(
-            &format!("{fault}: the {name} streams again"),
-            found.is_ok(),
-            found.err().map_or(String::new(), |e| e.to_string()),
-        );
+        checks.that(&format!("{fault}: the {name} streams again"), found.is_ok(), message(&found));
         Ok(())
     }
 
@@ -221,13 +244,71 @@ impl Bench {
         ];
         for (wrong, word) in wrong {
             self.victim().unplug()?;
-            self.victim().fault(Fault::Reply { wrong, times: MANY })?;
+            self.victim().fault(Fault::Reply { wrong, to: None, times: MANY })?;
             self.victim().replug()?;
             self.ends_in(checks, &format!("reply {wrong:?}"), Reconnecting, &[word, "d435"])?;
             self.victim().fault(Fault::Clear)?;
             self.streams_again(checks, &format!("reply {wrong:?}"), "victim")?;
         }
+        self.a_table_that_comes_wrong_once(checks)?;
+        self.a_preset_that_is_refused(checks)?;
+        self.no_answer_to_an_opening(checks)
+    }
+
+    /// One wrong reply in place of a calibration table is not the end of a camera: the table is read again.
+    fn a_table_that_comes_wrong_once(&self, checks: &mut Checks) -> anyhow::Result<()> {
+        for wrong in [WrongReply::Code(-1), WrongReply::Truncated] {
+            let what = format!("table {wrong:?} once");
+            let readings = || self.victim().asked().iter().filter(|a| a.opcode == TABLE).count();
+            let (before, opened) = (readings(), self.camera("victim")?.reconnects);
+            self.victim().unplug()?;
+            self.victim().fault(Fault::Reply { wrong, to: Some(TABLE), times: 1 })?;
+            self.victim().replug()?;
+            let back = |s: &RigStatus| of(s, "victim").is_ok_and(|c| c.reconnects > opened);
+            let found = self.daemon.wait_for(PATIENCE, &what, back);
+            checks.that(&format!("{what}: the victim comes back"), found.is_ok(), message(&found));
+            self.streams_again(checks, &what, "victim")?;
+            checks.equal(&format!("{what}: two tables were read in three readings"), readings() - before, 3);
+        }
         Ok(())
+    }
+
+    /// A camera that refuses its preset does not stream with another one.
+    fn a_preset_that_is_refused(&self, checks: &mut Checks) -> anyhow::Result<()> {
+        let what = "preset refused";
+        self.victim().unplug()?;
+        self.victim().fault(Fault::Reply {
+            wrong: WrongReply::Code(-6),
+            to: Some(SET_GROUP),
+            times: MANY,
+        })?;
+        self.victim().replug()?;
+        let words =
+            ["preset \"wide census\"", "census_radius", "code -6", "leave it out", self.victim().serial()];
+        self.ends_in(checks, what, CameraState::Reconnecting, &words)?;
+        self.victim().fault(Fault::Clear)?;
+        self.streams_again(checks, what, "victim")?;
+        let told = self.victim().asked();
+        let last = told.iter().rfind(|a| a.opcode == SET_GROUP).map(|a| a.data.clone());
+        checks.equal("and it was told its preset again", last, Some(vec![9, 0, 0, 0, 9, 0, 0, 0]));
+        Ok(())
+    }
+
+    /// A camera that answers no control while it is opened.
+    fn no_answer_to_an_opening(&self, checks: &mut Checks) -> anyhow::Result<()> {
+        let what = "control-timeout at opening";
+        // It stays on the bus, or the kernel's driver would wait before anybody else could.
+        self.victim().fault(Fault::ControlTimeout(Duration::from_secs(20)))?;
+        self.victim().fault(Fault::Silence)?;
+        self.ends_in(checks, what, CameraState::Reconnecting, &["opened again"])?;
+        self.ends_in(
+            checks,
+            what,
+            CameraState::Reconnecting,
+            &["did not answer", "plug it in anew", "d435"],
+        )?;
+        self.victim().fault(Fault::Clear)?;
+        self.streams_again(checks, what, "victim")
     }
 
     /// A hub that resets takes all its cameras along, and they come back.
@@ -254,12 +335,16 @@ fn usb2(checks: &mut Checks) -> anyhow::Result<()> {
     raw.fault(Fault::Uncalibrated)?;
     // Half a GVD is enough; half a table is not.
     let cut = plug("d435", Options::default())?;
-    cut.fault(Fault::Reply { wrong: WrongReply::Truncated, times: MANY })?;
+    cut.fault(Fault::Reply { wrong: WrongReply::Truncated, to: None, times: MANY })?;
+    // A setting that this unit says it has not.
+    let alone = plug("d435", Options::default())?;
+    alone.fault(Fault::Reply { wrong: WrongReply::Code(-58), to: Some(SET_SYNC), times: MANY })?;
     let fine = plug("d435", Options::default())?;
     let rig = table("fine", fine.serial(), 424, 240)
         + &table("slow", slow.serial(), 848, 480)
         + &table("raw", raw.serial(), 424, 240)
-        + &table("cut", cut.serial(), 424, 240);
+        + &table("cut", cut.serial(), 424, 240)
+        + &with(&table("alone", alone.serial(), 424, 240), "sync = \"master\"");
     // Settings that cannot work end the start, however good the other cameras are: better now than after an hour.
     let (code, said) = Daemon::refused(&rig)?;
     checks.equal("the daemon does not start", code, Some(2));
@@ -268,7 +353,8 @@ fn usb2(checks: &mut Checks) -> anyhow::Result<()> {
     for (name, words) in [
         ("slow", vec!["no such mode", port.as_str()]),
         ("raw", vec!["calibrat", "allow_uncalibrated"]),
-        ("cut", vec!["checksum", "vendor's calibration tool"]),
+        ("cut", vec!["checksum", "asked 3 times", "vendor's calibration tool"]),
+        ("alone", vec!["does not support it (code -58)", "Choose another", alone.serial()]),
     ] {
         let line = reasons.lines().find(|l| l.contains(&format!("camera \"{name}\""))).unwrap_or_default();
         let holds = words.iter().all(|w| line.contains(w));

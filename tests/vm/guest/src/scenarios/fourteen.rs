@@ -11,7 +11,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "fourteen",
     about: "seven cameras, depth and colour, 640x480 at 30 Hz, recorded: nothing is lost, every byte is right",
-    cost: 32,
+    cost: 20,
     limit_s: 120,
     run,
 };

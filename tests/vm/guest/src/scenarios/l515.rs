@@ -16,7 +16,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "l515",
     about: "an emulated L515 by its back end: calibration, turned pictures, confidence, Y411, unplugging",
-    cost: 12,
+    cost: 2,
     limit_s: 60,
     run,
 };

@@ -1,5 +1,6 @@
 //! The libusb path against the kernel's usbfs: bulk transfers, faults on the bus, and the kernel's driver afterwards.
 
+mod daemon;
 mod end;
 mod faults;
 mod seven;
@@ -21,6 +22,7 @@ use emulator::{Options, Stamp};
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+pub use daemon::SCENARIO as DAEMON;
 pub use end::SCENARIO as END;
 pub use seven::SCENARIO as SEVEN;
 
@@ -28,7 +30,7 @@ pub use seven::SCENARIO as SEVEN;
 pub const SCENARIO: Scenario = Scenario {
     name: "libusb",
     about: "a D435 through libusb: frames byte by byte, controls, vendor channel, damaged frames, stall, silence, unplug",
-    cost: 14,
+    cost: 2,
     limit_s: 90,
     run,
 };

@@ -17,7 +17,7 @@ use depthrig_emulator::{Camera, Fault, Options};
 pub const SCENARIO: Scenario = Scenario {
     name: "realsense-clock",
     about: "capture times of a D435 stay within their stated uncertainty across a wrap, a clock reset and a restart",
-    cost: 20,
+    cost: 3,
     limit_s: 180,
     run,
 };
@@ -101,7 +101,7 @@ fn shown_us(camera: &Camera, stream: &mut dyn Stream) -> anyhow::Result<i64> {
 /// Of the frames whose time is claimed to be known, 99 of 100 are right within their claim: what the clock map promises
 /// (its own tests hold it to that on simulated clocks), and what a busy host makes of this emulated one.
 fn judge(checks: &mut Checks, camera: &Camera, when: &str, frames: &[Frame]) {
-    let claimed = |f: &&Frame| f.latency_known && !f.meta.flags.has(FrameFlags::TIME_UNCERTAIN);
+    let claimed = |f: &&Frame| !f.meta.flags.has(FrameFlags::TIME_UNCERTAIN);
     let (mut judged, mut wrong, mut worst_us, mut claim_us) = (0, 0, 0.0_f64, 0.0_f64);
     let mut which = String::new();
     let began = frames.first().map(|f| f.meta.arrival);

@@ -1,7 +1,8 @@
-//! The conformance suite on an emulated D435, behind the kernel's own driver and through libusb.
+//! The conformance suite on emulated cameras: a D435 behind the kernel's own driver and through libusb, and a camera that is
+//! nothing but a USB video camera by the back end `v4l2`.
 
 use crate::checks::Checks;
-use crate::subject::EmulatedD400;
+use crate::subject::{Emulated, Way};
 use crate::{Scenario, system};
 use depthrig_drivers::conformance::{self, Verdict};
 use depthrig_drivers::realsense::config::TransportChoice;
@@ -10,7 +11,7 @@ use depthrig_drivers::realsense::config::TransportChoice;
 pub const SCENARIO: Scenario = Scenario {
     name: "realsense-conformance",
     about: "the conformance suite on a D435 through uvcvideo",
-    cost: 40,
+    cost: 10,
     limit_s: 300,
     run,
 };
@@ -19,27 +20,44 @@ pub const SCENARIO: Scenario = Scenario {
 pub const LIBUSB: Scenario = Scenario {
     name: "libusb-conformance",
     about: "the conformance suite on a D435 through libusb",
-    cost: 40,
+    cost: 18,
     limit_s: 300,
     run: through_libusb,
 };
 
-/// What each transport cannot show, and no more.
-const NOT_APPLICABLE: [&str; 5] = ["half_frame", "wrong_size", "damaged", "repeated", "hang"];
-const NOT_THROUGH_LIBUSB: [&str; 1] = ["hang"];
+/// The same by the back end for any camera.
+pub const V4L2: Scenario = Scenario {
+    name: "v4l2-conformance",
+    about: "the conformance suite on a plain USB camera by the back end v4l2: YUYV and Z16",
+    cost: 6,
+    limit_s: 300,
+    run: by_v4l2,
+};
+
+/// What each way cannot show, and no more.
+const NOT_APPLICABLE: [&str; 6] = ["half_frame", "wrong_size", "damaged", "repeated", "hang", "motion"];
+const NOT_THROUGH_LIBUSB: [&str; 2] = ["hang", "motion"];
 
 fn run(checks: &mut Checks) -> anyhow::Result<()> {
-    over(checks, TransportChoice::Kernel, &NOT_APPLICABLE)
+    over(checks, Emulated { model: "d435", way: Way::Realsense(TransportChoice::Kernel) }, &NOT_APPLICABLE)
 }
 
 fn through_libusb(checks: &mut Checks) -> anyhow::Result<()> {
-    over(checks, TransportChoice::Libusb, &NOT_THROUGH_LIBUSB)
+    over(
+        checks,
+        Emulated { model: "d435", way: Way::Realsense(TransportChoice::Libusb) },
+        &NOT_THROUGH_LIBUSB,
+    )
 }
 
-fn over(checks: &mut Checks, transport: TransportChoice, cannot: &[&str]) -> anyhow::Result<()> {
+fn by_v4l2(checks: &mut Checks) -> anyhow::Result<()> {
+    over(checks, Emulated { model: "uvc", way: Way::V4l2 }, &NOT_APPLICABLE)
+}
+
+#[allow(clippy::needless_pass_by_value)] // made for the call
+fn over(checks: &mut Checks, subject: Emulated, cannot: &[&str]) -> anyhow::Result<()> {
     system::modprobe("vhci-hcd", &[])?;
     system::modprobe("uvcvideo", &[])?;
-    let subject = EmulatedD400 { model: "d435", transport };
     let mut not_applicable = Vec::new();
     // One by one, so that each is reported when it is done.
     for case in conformance::cases() {
@@ -55,6 +73,6 @@ fn over(checks: &mut Checks, transport: TransportChoice, cannot: &[&str]) -> any
             }
         }
     }
-    checks.equal("what this transport cannot show", not_applicable, cannot);
+    checks.equal("what this way cannot show", not_applicable, cannot);
     Ok(())
 }

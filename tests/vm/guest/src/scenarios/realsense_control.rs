@@ -1,5 +1,7 @@
 //! What a rig asks of a D435 reaches it, what the kernel withholds is said, and controls that hang do not stop pictures.
 
+mod presets;
+
 use crate::checks::Checks;
 use crate::subject::{plug, small};
 use crate::tally::Tally;
@@ -17,8 +19,8 @@ use depthrig_emulator::{Camera, Damage, Fault, Options};
 /// See the module.
 pub const SCENARIO: Scenario = Scenario {
     name: "realsense-control",
-    about: "a D435: settings read back, metadata levels, controls that hang, exact accounts, what it reports of itself",
-    cost: 15,
+    about: "a D435: settings, presets and sync mode read back, metadata levels, controls that hang, exact accounts, what it reports of itself",
+    cost: 10,
     limit_s: 120,
     run,
 };
@@ -30,6 +32,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     system::modprobe("uvcvideo", &[])?;
     let camera = plug("d435", Options::default())?;
     settings(checks, &camera)?;
+    presets::run(checks, &camera)?;
     metadata_levels(checks, &camera)?;
     hanging_controls(checks, &camera)?;
     accounts(checks, &camera)?;

@@ -14,7 +14,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "udev",
     about: "depthrig install --apply under udev: who may open a camera, and that it is left awake",
-    cost: 8,
+    cost: 1,
     limit_s: 60,
     run,
 };
@@ -44,8 +44,10 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     fs::write("/etc/group", format!("root:x:0:\nvideo:x:{VIDEO}:\n"))?;
     fs::write("/etc/passwd", "root:x:0:0:root:/root:/bin/sh\n")?;
     system::run(Command::new("depthrig").args(["install", "--apply", "--user", "root"]))?;
-    // One program under two names.
-    std::os::unix::fs::symlink(UDEVADM, "/bin/systemd-udevd")?;
+    // One program under two names; another scenario of this boot may have made the second.
+    if !Path::new("/bin/systemd-udevd").exists() {
+        std::os::unix::fs::symlink(UDEVADM, "/bin/systemd-udevd")?;
+    }
     system::run(Command::new("/bin/systemd-udevd").arg("--daemon"))?;
     camera.replug()?;
     checks.that("six nodes again", system::wait_until(PATIENCE, six), "");

@@ -13,7 +13,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "v4l2-daemon",
     about: "the daemon with two vivid cameras, mmap and userptr: streams, records, reopens after a fatal error",
-    cost: 15,
+    cost: 2,
     limit_s: 60,
     run,
 };

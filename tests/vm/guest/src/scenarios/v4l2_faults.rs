@@ -17,7 +17,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "v4l2-faults",
     about: "vivid's faults through the back end v4l2: error flags, lost buffers, refusals, a fatal error, unplug",
-    cost: 15,
+    cost: 2,
     limit_s: 90,
     run,
 };

@@ -16,7 +16,7 @@ use v4l::video::Capture;
 pub const SCENARIO: Scenario = Scenario {
     name: "v4l2-formats",
     about: "vivid through the back end v4l2: every format to the byte, controls, clocks, one copy or none",
-    cost: 15,
+    cost: 1,
     limit_s: 60,
     run,
 };

@@ -14,7 +14,7 @@ use v4l::{Device, FourCC};
 pub const SCENARIO: Scenario = Scenario {
     name: "vivid-smoke",
     about: "two virtual cameras of the kernel's own vivid driver: nodes, and ten frames of each",
-    cost: 5,
+    cost: 1,
     limit_s: 20,
     run,
 };

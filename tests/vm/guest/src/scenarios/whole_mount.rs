@@ -25,7 +25,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "whole-mount",
     about: "five RealSense, a ZED with stereo, a Kinect's recording and another process's camera, in one recording",
-    cost: 60,
+    cost: 38,
     limit_s: 120,
     run,
 };
@@ -33,14 +33,20 @@ pub const SCENARIO: Scenario = Scenario {
 /// What is plugged in.
 const MODELS: [&str; 6] = ["d405", "d415", "d435", "d455", "l515", "zed2i"];
 const KINECT: &str = "/tmp/kinect.mkv";
+/// Pictures of the recording, which is played again and again. To make one takes the guest half a second.
+const PLAYED: u32 = 3;
 /// The nearest that stereo looks for. Few disparities: the guest has one slow processor.
 const NEAR_M: f64 = 3.0;
 /// Depth pictures that are made once more, and pairs of eyes that are kept until theirs comes.
-const COMPARED: usize = 4;
+const COMPARED: usize = 2;
 const KEPT: usize = 24;
 const PATIENCE: Duration = Duration::from_secs(5);
-/// How long is recorded, and how many sets a second.
-const SECONDS: u64 = 8;
+/// How long is recorded at least, and how many sets a second.
+const SECONDS: u64 = 3;
+/// Recorded sets that shall have depth by stereo, and how long is recorded at most until they do: how many pairs it has time
+/// for depends on the host, whose one core emulates stereo and every camera.
+const WITH_DEPTH: u64 = 2;
+const AT_MOST_S: u64 = 30;
 const SET_RATE_HZ: u64 = 1;
 
 fn run(checks: &mut Checks) -> anyhow::Result<()> {
@@ -48,25 +54,23 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     system::modprobe("hid-generic", &[])?;
     let mount = Mount::plug(&MODELS, |_| 0)?;
     let cameras: BTreeMap<_, _> = MODELS.into_iter().zip(&mount.cameras).collect();
-    let fixture = kinect()?;
+    let mut pictures = kinect()?;
 
     let daemon = Daemon::start(&rig(&mount)?)?;
     let status = daemon.wait_until_settled()?;
     checks.equal("eight cameras stream", status.cameras.len(), 8);
     let path = daemon.record("mount")?;
-    let pairs = pairs(&daemon, Duration::from_secs(SECONDS))?;
+    let pairs = pairs(&daemon)?;
     let recording = daemon.record_stop()?;
     let before = status;
     let status = daemon.status()?;
     checks.that("all of them still do", status.cameras.iter().all(streams), daemon::told(&status));
     books(checks, &daemon, &status)?;
     lost(checks, &before, &status);
-    checks.that("sets are recorded", recording.sets >= SET_RATE_HZ * SECONDS - 2, recording.sets);
+    checks.that("sets are recorded", recording.sets >= SET_RATE_HZ * SECONDS - 1, recording.sets);
     checks.equal("none is dropped", recording.dropped, BTreeMap::new());
-    let (ended, took) = daemon.stop()?;
-    // 3: frames were lost, as some are while so many cameras open, and pairs that stereo had no time for.
-    let well = matches!(ended.code(), Some(0 | 3));
-    checks.that("SIGTERM ends it, other processes too", well, format!("{ended} after {took:?}"));
+    // Its end is shown elsewhere; here it would first write the dataset's report, which takes seconds.
+    daemon.kill()?;
 
     let report = verify(&path, &VerifyOptions { decode: true, ..VerifyOptions::default() })?;
     let broken: Vec<_> = report.findings.iter().filter(|f| f.severity > Severity::Lost).collect();
@@ -76,25 +80,26 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
         checks.note(&finding.message);
     }
     stereo(checks, cameras["zed2i"], &pairs)?;
-    contents(checks, &cameras, &path, recording.frames, &fixture)?;
+    contents(checks, &cameras, &path, recording.frames, &Shown::new(&mut pictures))?;
     if let Some(pictures) = outside::bring(SCENARIO.name, &path)? {
         checks.note(format!("{pictures} pictures are brought to the host"));
     }
     Ok(())
 }
 
-/// A recording of an Azure Kinect: 720p Motion JPEG and the binned narrow view, 15 Hz.
-fn kinect() -> anyhow::Result<Fixture> {
+/// A recording of an Azure Kinect: 720p Motion JPEG and the binned narrow view, 5 Hz. Its pictures.
+fn kinect() -> anyhow::Result<Pattern> {
     let color = ColorMode { format: ColorFormat::Mjpg, resolution: ColorResolution::P720 };
     let fixture = Fixture {
         color: Some(color),
         depth: Some(DepthMode::Nfov2x2Binned),
-        rate_hz: 15,
-        captures: 3 * Pattern::DIFFERENT,
+        rate_hz: 5,
+        captures: PLAYED,
         ..Fixture::default()
     };
-    fixture.write(Path::new(KINECT), &mut Pattern::new(&fixture))?;
-    Ok(fixture)
+    let mut pictures = Pattern::new(&fixture);
+    fixture.write(Path::new(KINECT), &mut pictures)?;
+    Ok(pictures)
 }
 
 /// The rig file's part after the head that every scenario has.
@@ -102,10 +107,12 @@ fn rig(mount: &Mount) -> anyhow::Result<String> {
     let mut text = format!("[sets]\nrate_hz = {SET_RATE_HZ}.0\n");
     for (model, camera) in MODELS.iter().zip(&mount.cameras) {
         let serial = camera.serial();
+        // The slowest that each has: stereo shall get the guest's one processor. `fourteen` has them at 30 Hz.
         let (backend, modes): (_, &[(&str, u32, u32, u32)]) = match *model {
             "l515" => ("l515", &[("depth", 320, 240, 30), ("color", 640, 360, 15)]),
             "zed2i" => ("zed", &[("left", 672, 376, 15), ("right", 672, 376, 15)]),
-            _ => ("realsense", &[("depth", 424, 240, 15), ("color", 424, 240, 15)]),
+            "d405" | "d455" => ("realsense", &[("depth", 424, 240, 5), ("color", 424, 240, 5)]),
+            _ => ("realsense", &[("depth", 424, 240, 6), ("color", 424, 240, 6)]),
         };
         write!(text, "[[camera]]\nname = \"{model}\"\nbackend = \"{backend}\"\nserial = \"{serial}\"\n")?;
         if *model == "zed2i" {
@@ -131,7 +138,7 @@ fn rig(mount: &Mount) -> anyhow::Result<String> {
     )?;
     write!(
         text,
-        "[[camera]]\nname = \"other\"\nbackend = \"external\"\ncommand = [\"/bin/external\", \"--size\", \"320x240\", \"--rate\", \"15\"]\n"
+        "[[camera]]\nname = \"other\"\nbackend = \"external\"\ncommand = [\"/bin/external\", \"--size\", \"320x240\", \"--rate\", \"5\"]\n"
     )?;
     Ok(text)
 }
@@ -182,16 +189,25 @@ fn lost(checks: &mut Checks, before: &RigStatus, after: &RigStatus) {
 /// Both eyes, and the depth that was made of them.
 type Matched = ([Vec<u8>; 2], Vec<u8>);
 
-/// Takes the ZED's eyes and depth from the bus for `time`; some depth pictures with the pair of each.
-fn pairs(daemon: &Daemon, time: Duration) -> anyhow::Result<Vec<Matched>> {
+/// Takes the ZED's eyes and depth from the bus until enough is recorded; some depth pictures with the pair of each.
+fn pairs(daemon: &Daemon) -> anyhow::Result<Vec<Matched>> {
     let bus = Bus::open(&daemon.runtime, &RigName::new(daemon::RIG)?)?;
     let subscribe =
         |name| -> anyhow::Result<_> { Ok(bus.subscriber_within(&StreamId::new("zed2i", name)?, PATIENCE)?) };
     let (mut left, mut right, mut depth) =
         (subscribe("left")?, subscribe("right")?, subscribe("depth_performance")?);
-    let end = HostTime::now().plus(time);
+    let before = in_sets(daemon)?;
+    let (began, mut looked) = (HostTime::now(), 0);
     let (mut eyes, mut pairs) = (BTreeMap::<u64, [Vec<u8>; 2]>::new(), Vec::new());
-    while HostTime::now() < end {
+    loop {
+        let passed = began.elapsed().as_secs();
+        if passed > looked {
+            looked = passed;
+            let enough = passed >= SECONDS && !pairs.is_empty() && in_sets(daemon)? >= before + WITH_DEPTH;
+            if enough || passed >= AT_MOST_S {
+                return Ok(pairs);
+            }
+        }
         for (i, eye) in [&mut left, &mut right].into_iter().enumerate() {
             while let Some(frame) = eye.try_next()? {
                 let both = eyes.entry(frame.header().device_sequence).or_default();
@@ -210,7 +226,14 @@ fn pairs(daemon: &Daemon, time: Duration) -> anyhow::Result<Vec<Matched>> {
         }
         std::thread::sleep(Duration::from_millis(10));
     }
-    Ok(pairs)
+}
+
+/// How many recorded sets have had depth by stereo.
+fn in_sets(daemon: &Daemon) -> anyhow::Result<u64> {
+    let status = daemon.status()?;
+    let mut streams = status.cameras.iter().flat_map(|c| &c.streams);
+    let depth = streams.find(|s| s.id == "zed2i/depth_performance").context("a ZED without depth")?;
+    Ok(depth.in_sets.used)
 }
 
 /// Makes depth once more of the pairs that it was made of.
@@ -233,13 +256,13 @@ fn contents(
     cameras: &BTreeMap<&str, &Camera>,
     path: &Path,
     frames: u64,
-    fixture: &Fixture,
+    shown: &Shown,
 ) -> anyhow::Result<()> {
     let dataset = Dataset::open(path)?;
     let session = dataset.session().clone();
     let (mut found, mut compared) = (BTreeMap::<String, u64>::new(), Compared::default());
     let (mut stamped, mut eyes) = (Tally::default(), Tally::default());
-    let (mut played, shown) = (Tally::default(), Shown::new(fixture));
+    let mut played = Tally::default();
     let mut beside: Vec<f64> = Vec::new();
     for set in dataset.sets_with(SetRange::ALL, PixelMode::DecodedAndStored) {
         let set = set?;
@@ -282,8 +305,7 @@ fn contents(
         session.streams.iter().map(|s| s.id.to_string()).filter(|id| !found.contains_key(id)).collect();
     checks.equal("and some of every stream", none.join(", "), "");
     checks.note(found.iter().map(|(id, n)| format!("{id} {n}")).collect::<Vec<_>>().join(", "));
-    // Stereo is slower than the camera here, and faster than the sets.
-    checks.that("most sets have depth by stereo", beside.len() as u64 > SECONDS / 2, beside.len());
+    checks.that("some sets have depth by stereo", beside.len() as u64 >= WITH_DEPTH, beside.len());
     let near = beside.iter().all(|ms| *ms < 1100.0 / 15.0);
     checks.that("of the set's own pair, or of the one beside it", near, format!("{beside:?} ms apart"));
     compared.check(checks, "frames of D405, D415, D435 and D455 are those that were sent, byte by byte");
@@ -300,9 +322,8 @@ struct Shown {
 }
 
 impl Shown {
-    fn new(fixture: &Fixture) -> Self {
-        let mut pictures = Pattern::new(fixture);
-        let all = 0..Pattern::DIFFERENT;
+    fn new(pictures: &mut Pattern) -> Self {
+        let all = 0..PLAYED;
         let color = all.clone().map(|n| pictures.color(n)).collect();
         let depth = all.map(|n| pictures.depth(n).iter().flat_map(|d| d.to_le_bytes()).collect());
         Self { color, depth: depth.collect() }

@@ -9,6 +9,7 @@ use depthrig_drivers::usb::{SysRoot, scan};
 use depthrig_drivers::v4l2::{ControlValue, Node};
 use depthrig_drivers::zed::command::Vendor;
 use depthrig_drivers::zed::hid::HidNode;
+use depthrig_drivers::zed::imu::NO_POSE;
 use depthrig_drivers::zed::mode::Eye;
 use depthrig_drivers::zed::motion::Motion;
 use depthrig_drivers::zed::{CalibrationFile, ZedBackend, ZedConfig, find};
@@ -23,7 +24,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "zed",
     about: "a ZED 2i: serial, calibration, both eyes byte by byte, exposure and gain, motion unit, replug",
-    cost: 12,
+    cost: 7,
     limit_s: 90,
     run,
 };
@@ -74,13 +75,18 @@ fn identity(checks: &mut Checks, camera: &Camera, conf: &std::path::Path) -> any
     checks.equal("its serial", info.serial.as_str(), SERIAL);
     checks.equal("its model", info.model.as_str(), "ZED 2i");
     checks.equal("its port", Some(info.port.clone()), camera.port_path());
-    checks.equal("its calibration", info.calibration.clone(), format!("factory {}", conf.display()));
+    checks.equal("its calibration", info.calibration.clone(), format!("factory {}{NO_POSE}", conf.display()));
 
     let device = backend(with_conf(conf)).open(Some(SERIAL))?;
     checks.equal("the serial in its flash", device.info().serial.as_str(), SERIAL);
     let mut modes: Vec<_> = device.profiles().iter().map(StreamProfile::describe).collect();
     modes.sort();
-    checks.that("it lists its modes for each eye", modes.len() == 20, modes.join(", "));
+    let unit = modes.iter().any(|m| m == "imu motion 400 Hz in batches of up to 16");
+    checks.that(
+        "it lists its modes for each eye, and its motion unit",
+        unit && modes.len() == 21,
+        modes.join(", "),
+    );
     let (mut pixels, mut poses): (f64, f64) = (0.0, 0.0);
     for mode in camera.calibration().zed {
         let width = match mode.name {

@@ -24,7 +24,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "libusb-end",
     about: "after libusb: the kernel's nodes come back and stream, also after kill -9; too little memory for transfers",
-    cost: 14,
+    cost: 2,
     limit_s: 90,
     run,
 };

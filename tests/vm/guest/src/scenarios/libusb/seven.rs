@@ -16,7 +16,7 @@ use std::time::Duration;
 pub const SCENARIO: Scenario = Scenario {
     name: "libusb-seven",
     about: "seven D435 through libusb at once, depth and colour at 640x480 and 30 Hz: nothing is lost",
-    cost: 30,
+    cost: 5,
     limit_s: 60,
     run,
 };

@@ -1,21 +1,22 @@
-//! Writes a short dataset that is always the same, and the pixels that readers must find in it:
-//! `cargo run --example golden -- DATASET EXPECTED [raw|rank|stereo]`: colour as JPEG, as it is, as PNG with
-//! depth in our own codec, or as JPEG beside a raw stereo pair.
-//!
-//! `EXPECTED/index.json` lists each picture: topic, log time, size, encoding, the file with its pixels, how
-//! they are to be compared (`exact` or `jpeg`) and the intrinsics. The files hold bare pixels, row by row.
-#![allow(clippy::unwrap_used, clippy::print_stdout)]
+//! Writes a short dataset that is always the same, and what readers must find in it:
+//! `cargo run -p depthrig-tests --example golden -- DATASET EXPECTED [raw|rank|stereo]`: colour as JPEG, as it is, as
+//! PNG with depth in our own codec, or as JPEG beside a raw stereo pair. EXPECTED is as `depthrig_tests::expected`
+//! writes it.
+#![allow(missing_docs, clippy::unwrap_used, clippy::print_stdout)]
 
-use depthrig_bus::{DropCounts, FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
+use depthrig_bus::{
+    DropCounts, FrameHeader, HostTime, Intrinsics, MotionFlags, MotionSample, PixelFormat, Pose, UtcPair,
+};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{
-    ColorCodec, Dataset, DepthCodec, Diagnostic, Level, RecordFrame, RecordSet, Recorder, RecorderOptions,
-    Session, SetRange, StreamAccount, StreamRecord,
+    ColorCodec, Dataset, DepthCodec, Diagnostic, Level, MotionRecord, RecordFrame, RecordMotion, RecordSet,
+    Recorder, RecorderOptions, Session, SetRange, StreamAccount, StreamRecord,
 };
-use serde_json::json;
+use depthrig_tests::expected;
 use std::path::Path;
 use std::sync::Arc;
 
+const NOTE: &str = "the golden note";
 const SETS: u64 = 6;
 const PERIOD_NS: i64 = 200_000_000;
 const UTC_NS: i64 = 1_700_000_000_000_000_000;
@@ -62,7 +63,39 @@ fn pixels(s: &StreamRecord, n: u64) -> Vec<u8> {
     out
 }
 
-fn write(dir: &Path, color: ColorCodec, depth: DepthCodec, stereo: bool) -> Session {
+/// What the motion unit sends between set `n` and the one before: two batches, of five samples and of three.
+fn motion(unit: &MotionRecord, n: u64) -> Vec<RecordMotion> {
+    let sample = |k: u64| {
+        let v = k as f32;
+        MotionSample {
+            time_ns: MONO_NS + k as i64 * PERIOD_NS / 8 - PERIOD_NS,
+            device_time: 3_000_000_000 + 25_000 * k,
+            sequence: k + 1,
+            uncertainty_ns: 40_000,
+            accel_offset_ns: 1_250_000,
+            gyro_rad_s: [0.1 * v, -0.25, 1e-3 / (v + 1.0)],
+            // One has no acceleration.
+            accel_m_s2: if k == 6 { [f32::NAN; 3] } else { [0.02, 9.806_65, -0.1 * v] },
+            temperature_c: 33.25,
+            flags: if k.is_multiple_of(8) { MotionFlags::FRAME_SYNC.0 } else { 0 },
+        }
+    };
+    let batch = |b: u64, from: u64, to: u64| {
+        let samples: Vec<_> = (from..to).map(|k| sample(8 * n + k)).collect();
+        let mut header = FrameHeader::default();
+        header.set_names("golden", &unit.id);
+        header.set_device(&unit.model, &unit.serial);
+        header.set_picture(PixelFormat::Motion, samples.len() as u32, 1);
+        (header.sequence, header.captured) = (2 * n + b, 2 * n + b);
+        header.device_sequence = 8 * n + to;
+        header.capture_time_ns = samples[samples.len() - 1].time_ns;
+        header.pose = unit.pose;
+        RecordMotion { unit: 0, header, samples }
+    };
+    vec![batch(1, 0, 5), batch(2, 5, 8)]
+}
+
+fn write(dir: &Path, color: ColorCodec, depth: DepthCodec, stereo: bool) {
     let mut session = Session::new(dir.file_name().unwrap().to_string_lossy(), "golden");
     (session.scene, session.started_utc_ns) = ("a gradient with an edge".into(), UTC_NS);
     session.rig_config = "# the golden rig\n".into();
@@ -80,6 +113,15 @@ fn write(dir: &Path, color: ColorCodec, depth: DepthCodec, stereo: bool) -> Sess
         right.pose.translation_m[1] -= 0.12;
         session.streams.extend([left, right]);
     }
+    session.motion = vec![MotionRecord {
+        id: "front/imu".parse().unwrap(),
+        model: "Golden".into(),
+        serial: "1".into(),
+        rate_hz: 8e9 / PERIOD_NS as f64,
+        batch: 5,
+        calibration: "made up for the golden dataset".into(),
+        pose: Pose { translation_m: [0.2, 0.01, 0.45], rotation_xyzw: [0.0, 0.6, 0.0, 0.8] },
+    }];
     // Two segments, and room on any disk.
     let options = RecorderOptions {
         color,
@@ -90,7 +132,7 @@ fn write(dir: &Path, color: ColorCodec, depth: DepthCodec, stereo: bool) -> Sess
         ..RecorderOptions::default()
     };
     let recorder = Recorder::create(Arc::new(RealFs), dir, session.clone(), options).unwrap();
-    recorder.add_note("the golden note").unwrap();
+    recorder.add_note(NOTE).unwrap();
     recorder.diagnostics(vec![Diagnostic {
         level: Level::Ok,
         name: "golden/front".into(),
@@ -131,6 +173,7 @@ fn write(dir: &Path, color: ColorCodec, depth: DepthCodec, stereo: bool) -> Sess
             id: n + 1,
             tick: HostTime::from_ns(tick),
             utc: UtcPair { mono: HostTime::from_ns(MONO_NS), utc_ns: UTC_NS, width_ns: 200 },
+            motion: motion(&session.motion[0], n),
             spread_ns: times.iter().max().unwrap() - times.iter().min().unwrap(),
             missing: if n == 2 { vec![3] } else { Vec::new() },
             frames,
@@ -139,49 +182,6 @@ fn write(dir: &Path, color: ColorCodec, depth: DepthCodec, stereo: bool) -> Sess
     }
     let summary = recorder.finish().unwrap();
     assert!(summary.complete, "{:?}", summary.lost);
-    session
-}
-
-/// Writes what our own reader finds; where pixels are stored losslessly that is checked against the source.
-fn expect(dir: &Path, expected: &Path, session: &Session) {
-    std::fs::create_dir_all(expected).unwrap();
-    let mut pictures = Vec::new();
-    for set in Dataset::open(dir).unwrap().sets(SetRange::ALL) {
-        let set = set.unwrap();
-        for f in set.frames {
-            let s = &session.streams[f.stream];
-            let exact = f.codec != "jpeg";
-            assert!(!exact || f.pixels == pixels(s, set.id - 1));
-            let file = format!("{}_{}_{}.bin", set.id, s.id.camera, s.id.stream);
-            std::fs::write(expected.join(&file), &f.pixels).unwrap();
-            let encoding = match s.format {
-                PixelFormat::Z16 => "16UC1",
-                PixelFormat::Rgb8 => "rgb8",
-                PixelFormat::Yuyv => "yuv422_yuy2",
-                _ => "mono8",
-            };
-            let last = match f.codec {
-                "raw" => "image_raw",
-                "rank" => "depth_compressed",
-                _ => "image_compressed",
-            };
-            let base = format!("/golden/{}/{}", s.id.camera, s.id.stream);
-            let i = &f.header.intrinsics;
-            pictures.push(json!({
-                "topic": format!("{base}/{last}"), "base": base, "set": set.id, "file": file,
-                // As text: 64-bit times do not survive JavaScript's numbers.
-                "log_time": set.utc_ns.to_string(),
-                "stamp": (f.header.capture_time_ns + set.utc_offset_ns).to_string(),
-                "width": s.width, "height": s.height, "encoding": encoding,
-                "codec": f.codec, "compare": if exact { "exact" } else { "jpeg" },
-                "sequence": f.header.sequence, "depth_unit_m": f.header.depth_unit_m,
-                "k": [i.fx, 0.0, i.cx, 0.0, i.fy, i.cy, 0.0, 0.0, 1.0], "d": i.coeffs[..5],
-                "translation": s.pose.translation_m, "rotation": s.pose.rotation_xyzw,
-            }));
-        }
-    }
-    let index = json!({ "rig": "golden", "sets": SETS, "note": "the golden note", "pictures": pictures });
-    std::fs::write(expected.join("index.json"), serde_json::to_vec_pretty(&index).unwrap()).unwrap();
 }
 
 fn main() {
@@ -196,6 +196,11 @@ fn main() {
             std::process::exit(2);
         }
     };
-    let session = write(Path::new(dataset), color, depth, stereo);
-    expect(Path::new(dataset), Path::new(expected), &session);
+    let dataset = Path::new(dataset);
+    write(dataset, color, depth, stereo);
+    assert!(Dataset::open(dataset).unwrap().sets(SetRange::ALL).all(|set| set.unwrap().motion.len() == 2));
+    // Where pixels are stored losslessly they are those of the source.
+    expected::write(dataset, Path::new(expected), Some(NOTE), &mut |stream, set, stored| {
+        assert!(stored == pixels(stream, set - 1), "{} of set {set}", stream.id);
+    });
 }

@@ -1,0 +1,304 @@
+//! Whether rows of the left picture are rows of the right one, as matching takes for granted.
+//!
+//! After rectification with a calibration that fits, what both eyes see lies in one row. One that is stale, or of another
+//! camera, leaves them tenths to several pixels apart: matching then finds less and less, and what it finds is wrong. Here
+//! many distinctive places are searched for in other rows too. Their offsets are a plane over the picture: pitch moves all
+//! rows, roll more on one side than on the other, another focal length more at the bottom than at the top.
+
+use super::pyramid::Pyramid;
+use super::{Gray, StereoPair};
+use crate::Result;
+use core::fmt;
+use fit::{PAIRS, Point};
+use track::Reach;
+
+mod fit;
+mod track;
+
+/// Pictures are halved until they are no wider than this.
+const WIDTH: usize = 360;
+/// Rows that are searched up and down, pixels of the full size, at least.
+const ROWS_PX: usize = 6;
+/// Fewer places say nothing.
+const POINTS: usize = 40;
+/// So few squares of the picture say nothing of it.
+const SQUARES: usize = 8;
+/// Share of the places that must agree.
+const AGREE: f64 = 0.6;
+/// An offset that is less certain than this is none.
+const UNSURE_PX: f64 = 0.25;
+/// A slope counts when it is so many standard deviations from none.
+const SHOWN: f64 = 3.0;
+/// Standard deviations that are stated, for 95 %.
+const STATED: f64 = 2.0;
+/// What is beyond the scatter of the places: interpolation, and what the eyes see differently.
+const FLOOR_PX: f64 = 0.05;
+/// Rows that are further apart than this on the whole are worth a word: see docs/stereo.md for what they cost.
+const LIMIT_PX: f64 = 0.4;
+
+/// How far the eyes' rows are apart. A positive number is for what lies lower in the right picture.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RowOffset {
+    /// In the middle of the picture, pixels.
+    pub middle_px: f64,
+    /// How much more it is at the right side than at the left one, pixels; 0 when that cannot be shown.
+    pub across_px: f64,
+    /// How much more it is at the bottom than at the top, pixels; likewise.
+    pub down_px: f64,
+    /// How far each of them may be off, pixels: in 95 of 100 cases it is less.
+    pub unsure_px: [f64; 3],
+    /// Places that were found in both pictures.
+    pub places: usize,
+    /// Pairs that they are of.
+    pub pairs: usize,
+}
+
+impl RowOffset {
+    /// The offset at a place of the picture, given as shares of its width and height.
+    pub fn at(&self, across: f64, down: f64) -> f64 {
+        self.middle_px + self.across_px * (across - 0.5) + self.down_px * (down - 0.5)
+    }
+
+    /// The root of the mean square over the picture, pixels.
+    pub fn overall_px(&self) -> f64 {
+        overall([self.middle_px, self.across_px, self.down_px])
+    }
+
+    /// Whether rows are so far apart that depth suffers, beyond what is uncertain of it.
+    pub fn is_bad(&self) -> bool {
+        self.overall_px() - overall(self.unsure_px) > LIMIT_PX
+    }
+
+    /// What to say of it where something is wrong: what was measured, what it does and what to do about it. The camera is
+    /// the caller's to name.
+    pub fn warning(&self) -> Option<String> {
+        self.is_bad().then(|| {
+            format!(
+                "left and right are not rectified to the same rows: {self}. Depth has holes and errors that grow with this; from \
+                 1 px on little of it can be used. The calibration does not fit the camera: calibrate it anew with its maker's \
+                 tool, or take the factory calibration of this very serial number and resolution (that of another unit does this)"
+            )
+        })
+    }
+}
+
+/// Of a plane's terms.
+fn overall([middle, across, down]: [f64; 3]) -> f64 {
+    (middle * middle + (across * across + down * down) / 12.0).sqrt()
+}
+
+impl fmt::Display for RowOffset {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (side, middle) = (if self.middle_px < 0.0 { "higher" } else { "lower" }, self.middle_px.abs());
+        let unsure = self.unsure_px[0];
+        write!(f, "what both see lies {middle:.2} ± {unsure:.2} px {side} in the right one")?;
+        let sign = if self.middle_px < 0.0 { -1.0 } else { 1.0 };
+        for (slope, from, to, ends) in [
+            (self.across_px, (0.0, 0.5), (1.0, 0.5), ["left", "right"]),
+            (self.down_px, (0.5, 0.0), (0.5, 1.0), ["top", "bottom"]),
+        ] {
+            if slope != 0.0 {
+                let [a, b] = [from, to].map(|(x, y)| sign * self.at(x, y));
+                write!(f, ", {a:.2} at the {} and {b:.2} at the {}", ends[0], ends[1])?;
+            }
+        }
+        let pairs = if self.pairs == 1 { "pair" } else { "pairs" };
+        write!(f, " ({} places, {} {pairs})", self.places, self.pairs)
+    }
+}
+
+/// Measures how far the rows of rectified pairs of one size are apart. Looking at a pair allocates nothing.
+#[derive(Debug)]
+pub struct RowCheck {
+    size: (usize, usize),
+    pyramid: Pyramid,
+    reach: Reach,
+    places: Vec<(u16, u16)>,
+    scores: Vec<f32>,
+    /// Those of the last pairs, oldest first.
+    points: Vec<Point>,
+    /// How many of each pair.
+    counts: [usize; PAIRS],
+    pairs: usize,
+    scratch: Vec<f64>,
+}
+
+/// Places of a pair at most.
+const PLACES: usize = 512;
+
+impl RowCheck {
+    /// Pairs whose places count at once: those of one more replace the oldest pair's.
+    pub const PAIRS: usize = PAIRS;
+
+    /// Prepares for pairs of a size.
+    pub fn new(width: usize, height: usize) -> Self {
+        let pyramid = Pyramid::new((width, height), WIDTH);
+        let scale = 1_usize << pyramid.halvings();
+        let (w, _) = pyramid.smallest((width, height));
+        // The outermost rows are searched only to know that the best is not beyond them.
+        let rows = ROWS_PX.div_ceil(scale).max(3) as isize + 1;
+        let reach = Reach { near: -4, far: (w / 5).max(8) as isize, rows };
+        let scores = ((2 * reach.far + 1) * (2 * rows + 1)).unsigned_abs();
+        Self {
+            size: (width, height),
+            pyramid,
+            reach,
+            places: Vec::with_capacity(PLACES),
+            scores: Vec::with_capacity(scores),
+            points: Vec::with_capacity(PLACES * PAIRS),
+            counts: [0; PAIRS],
+            pairs: 0,
+            scratch: Vec::with_capacity(PLACES * PAIRS),
+        }
+    }
+
+    /// Measures in one more pair, and returns in how many places that could be done.
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::SizeMismatch`] for pictures of another size.
+    pub fn look(&mut self, pair: &StereoPair<'_>) -> Result<usize> {
+        pair.left.check("left", self.size.0, self.size.1)?;
+        pair.right.check("right", self.size.0, self.size.1)?;
+        let slot = self.pairs % PAIRS;
+        if self.pairs >= PAIRS {
+            self.points.drain(..self.counts[slot]);
+        }
+        let before = self.points.len();
+        let (number, (width, height)) = (self.pairs, self.size);
+        let Self { pyramid, reach, places, scores, points, .. } = self;
+        pyramid.fill(pair);
+        let last = pyramid.halvings();
+        let [left, right] = pyramid.level(pair, last);
+        track::places(&left, places);
+        for &(x, y) in &*places {
+            let small = (isize::try_from(x).unwrap_or(0), isize::try_from(y).unwrap_or(0));
+            let mut found = track::coarse([&left, &right], small, *reach, scores);
+            for halvings in (0..last).rev() {
+                let [left, right]: [Gray<'_>; 2] = pyramid.level(pair, halvings);
+                let by = last - halvings;
+                // The middle of what was halved.
+                let at = (small.0 << by, small.1 << by);
+                found = found.and_then(|found| track::follow([&left, &right], at, found));
+            }
+            let at = (small.0 << last, small.1 << last);
+            let rows = found.and_then(|found| track::fine([&pair.left, &pair.right], at, found));
+            points.extend(rows.map(|rows| Point {
+                at: (at.0 as f64 / width as f64 - 0.5, at.1 as f64 / height as f64 - 0.5),
+                rows,
+                pair: number,
+            }));
+        }
+        let found = self.points.len() - before;
+        self.counts[slot] = found;
+        self.pairs += 1;
+        Ok(found)
+    }
+
+    /// What the pairs say together; `None` when that is too little: pictures without texture, of patterns that repeat, of
+    /// nothing that both eyes see.
+    pub fn offset(&mut self) -> Option<RowOffset> {
+        let Self { points, scratch, .. } = self;
+        if points.len() < POINTS {
+            return None;
+        }
+        let flat = fit::fit(points, true, scratch)?;
+        let shown = |p: &fit::Plane| {
+            let (terms, deviations) = (p.terms, p.deviations);
+            (terms.y.abs() > SHOWN * deviations.y.max(FLOOR_PX))
+                || (terms.z.abs() > SHOWN * deviations.z.max(FLOOR_PX))
+        };
+        let plane = fit::fit(points, false, scratch).filter(shown).unwrap_or(flat);
+        let unsure = plane.deviations.map(|d| (STATED * d).hypot(FLOOR_PX)).to_array();
+        let is_known = plane.agree >= AGREE && plane.squares >= SQUARES && overall(unsure) <= UNSURE_PX;
+        let [middle_px, across_px, down_px] = plane.terms.to_array();
+        let pairs = self.pairs.min(PAIRS);
+        is_known.then_some(RowOffset {
+            middle_px,
+            across_px,
+            down_px,
+            unsure_px: unsure,
+            places: self.points.len(),
+            pairs,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Between -1 and 1.
+    fn noise(a: usize, b: usize) -> f64 {
+        let mixed = (a as u64 + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15)
+            ^ (b as u64).wrapping_mul(0xD1B5_4A32_D192_ED03);
+        let mixed = (mixed ^ (mixed >> 31)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        (mixed >> 40) as f64 / f64::from(1 << 23) - 1.0
+    }
+
+    /// What is made of `n` places in a grid over `part` of the picture, of four pairs.
+    fn offset(n: usize, part: f64, rows: impl Fn(usize, usize) -> f64) -> Option<RowOffset> {
+        let mut check = RowCheck::new(400, 240);
+        check.pairs = 4;
+        let side = (n as f64).sqrt().ceil();
+        check.points.extend((0..n).map(|i| {
+            let at = |i: f64| ((i + 0.5) / side - 0.5) * part;
+            let at = (at((i as f64 / side).floor()), at(i as f64 % side));
+            Point { at, rows: rows(i, i % 4), pair: i % 4 }
+        }));
+        check.offset()
+    }
+
+    #[test]
+    fn too_little_says_nothing() {
+        let good = |i: usize, _: usize| 1.0 + 0.05 * noise(i, 1);
+        let said = offset(40, 1.0, good).unwrap();
+        assert!((said.middle_px - 1.0).abs() < 0.05 && said.is_bad(), "{said}");
+        assert_eq!(offset(39, 1.0, good), None, "too few places");
+        assert!(offset(400, 0.9, good).is_some());
+        assert_eq!(offset(400, 0.2, good), None, "of one corner");
+        let most_disagree = |i: usize, _: usize| {
+            if i.is_multiple_of(2) { 1.0 + 0.02 * noise(i, 1) } else { 9.0 * noise(i, 2) }
+        };
+        assert_eq!(offset(400, 1.0, most_disagree), None, "half of it is something else");
+        assert_eq!(
+            offset(400, 1.0, |i, pair| 2.0 * noise(pair, 7) + 0.05 * noise(i, 1)),
+            None,
+            "pairs that differ"
+        );
+    }
+
+    #[test]
+    fn a_slope_is_said_where_it_can_be_shown() {
+        let flat = offset(60, 1.0, |i, _| 0.3 * noise(i, 4)).unwrap();
+        assert_eq!((flat.across_px, flat.down_px), (0.0, 0.0), "{flat}");
+        assert!(!flat.to_string().contains(" at the "), "{flat}");
+        // Column by column from the left.
+        let sloping =
+            offset(400, 1.0, |i, _| ((i / 20) as f64 + 0.5) / 10.0 - 1.0 + 0.05 * noise(i, 4)).unwrap();
+        assert!((sloping.across_px - 2.0).abs() < 0.1 && sloping.is_bad(), "{sloping}");
+        assert!(sloping.to_string().contains("at the left and"), "{sloping}");
+        assert!(sloping.warning().is_some_and(|w| w.contains("calibrate it anew")));
+    }
+
+    /// A camera that was put right says so after as many pairs as count at once.
+    #[test]
+    fn old_pairs_are_forgotten() {
+        let (w, h) = (240, 160);
+        let left: Vec<u8> = (0..w * h).map(|i| (127.0 + 120.0 * noise(i, 3)) as u8).collect();
+        let mut low = left.clone();
+        low.rotate_right(2 * w);
+        let [left, low] = [&left, &low].map(|p| Gray::packed(p, w, h));
+        let mut check = RowCheck::new(w, h);
+        for _ in 0..PAIRS {
+            check.look(&StereoPair::new(left, low)).unwrap();
+        }
+        let before = check.offset().unwrap();
+        assert!((before.middle_px - 2.0).abs() < 0.05 && before.is_bad(), "{before}");
+        for _ in 0..PAIRS {
+            check.look(&StereoPair::new(left, left)).unwrap();
+        }
+        let after = check.offset().unwrap();
+        assert!(after.overall_px() < 0.05 && after.places < before.places * 3 / 2, "{before}, then {after}");
+        assert!(check.look(&StereoPair::new(left, Gray::packed(low.pixels, h, w))).is_err());
+    }
+}

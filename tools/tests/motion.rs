@@ -1,0 +1,61 @@
+//! A motion unit as a person meets it: tapped, in the status, in a dataset.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+
+#[path = "support/home.rs"]
+mod support;
+
+use support::Home;
+
+#[test]
+fn a_motion_unit_is_tapped_shown_and_recorded() {
+    let home = Home::new();
+    let rig = home.path().join("rig.toml");
+    let text = "rig = \"moved\"\n[recording]\nreserve_mb = 0\nmin_minutes = 0\n[[camera]]\nname = \"cam\"\n\
+                backend = \"synthetic\"\ncheap = true\n[[camera.stream]]\nname = \"color\"\nwidth = 64\nheight = 48\n\
+                [[camera.stream]]\nname = \"imu\"\n";
+    std::fs::write(&rig, text).unwrap();
+    let planned = home.run(&["doctor", rig.to_str().unwrap()]).out;
+    assert!(planned.contains("imu motion@200"), "{planned}");
+    let running = home.start(&["run", rig.to_str().unwrap(), "-q"]);
+    home.wait_for_rig("moved");
+
+    let lines = home.run(&["tap", "cam/imu", "--count", "3"]).good();
+    assert_eq!(
+        lines.lines().filter(|l| l.starts_with("cam/imu #") && l.contains(" 8 samples ")).count(),
+        3,
+        "{lines}"
+    );
+    let json = home.run(&["tap", "cam/imu", "--count", "2", "--json"]).good();
+    let batches: Vec<serde_json::Value> = json.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    assert_eq!(batches.len(), 2);
+    let numbers: Vec<u64> = batches
+        .iter()
+        .flat_map(|b| b["samples"].as_array().unwrap())
+        .map(|s| s["sequence"].as_u64().unwrap())
+        .collect();
+    assert!(numbers.len() == 16 && numbers.windows(2).all(|w| w[1] == w[0] + 1), "{numbers:?}");
+    for (wrong, why) in [
+        (
+            &["tap", "cam/imu", "--count", "1", "--png", "pictures"][..],
+            "cam/imu gives motion samples and no pictures",
+        ),
+        (&["tap", "cam/color", "--count", "1", "--json"], "cam/color gives pictures"),
+    ] {
+        let refused = home.run(wrong);
+        assert!(refused.code == 1 && refused.err.contains(why), "{}", refused.err);
+    }
+    let status = home.run(&["status"]).good();
+    let row = status.lines().find(|l| l.starts_with("cam/imu")).unwrap();
+    assert!(row.contains("motion") && !row.contains("8x1"), "{row}");
+
+    let out = home.path().join("data");
+    home.run(&["record", "start", "--out", out.to_str().unwrap(), "--name", "moving"]).good();
+    home.wait_for_sets(5);
+    home.run(&["record", "stop"]).good();
+    let data = out.join("moving");
+    let info = home.run(&["info", data.to_str().unwrap()]).good();
+    let row = info.lines().find(|l| l.starts_with("cam/imu")).unwrap();
+    assert!(row.split_whitespace().last() == Some("0"), "no batch is lost: {info}");
+    home.run(&["verify", data.to_str().unwrap(), "--decode"]).good();
+    assert_eq!(running.signal("TERM").code, 0);
+}
