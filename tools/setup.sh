@@ -41,6 +41,8 @@ for part in "$@"; do
         need zstd command -v zstd
         # Whose rules a scenario checks.
         need udev command -v udevadm
+        # Under which a scenario runs the service; nothing of it is started on this computer.
+        need systemd test -x /lib/systemd/systemd
         need binutils command -v objcopy
         need python3 command -v python3
         ;;

@@ -1,6 +1,7 @@
 """Reads the guest's report as it grows, and prints one line for each check."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,14 +15,16 @@ class Outcome:
     passed: int = 0
     failed: int = 0
     guest_s: float = 0.0
+    cpu_s: float = 0.0
     failures: list[str] = field(default_factory=list)
 
 
 class Report:
     """The report of one boot. The guest appends one JSON object for each line."""
 
-    def __init__(self, path: Path, scenarios: list[str], say):
+    def __init__(self, path: Path, scenarios: list[str], say, used_s: Callable[[], float]):
         self.path = path
+        self.used_s = used_s  # the processor time of QEMU so far
         self.outcomes = {name: Outcome() for name in scenarios}
         self.say = say
         self.read = 0
@@ -43,6 +46,7 @@ class Report:
         match entry["kind"]:
             case "start":
                 outcome.started = True
+                outcome.cpu_s = -self.used_s()
             case "check":
                 detail = f" ({entry['detail']})" if entry["detail"] else ""
                 line = f"{entry['scenario']}: {entry['check']}{detail}"
@@ -57,4 +61,6 @@ class Report:
             case "end":
                 outcome.ended = True
                 outcome.guest_s = entry["guest_s"]
-                self.say(f"  -- {entry['scenario']}: {entry['guest_s']:.1f} s of guest time")
+                outcome.cpu_s += self.used_s()
+                took = f"{entry['guest_s']:.1f} s of guest time, {outcome.cpu_s:.0f} s of QEMU's"
+                self.say(f"  -- {entry['scenario']}: {took}")
