@@ -33,10 +33,11 @@ test: setup-test $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(READERS)/node_
 	@tools/onnxruntime.sh || true
 	tools/test.sh
 
-test-long: ## the long forms: every test with DEPTHRIG_LONG=1, ten minutes of recording, an hour of fuzzing per target
+test-long: ## the long forms: every test with DEPTHRIG_LONG=1, ten minutes of recording, twelve of the daemon, an hour of fuzzing per target
 	DEPTHRIG_LONG=1 $(MAKE) test
 	cargo build --release --package depthrig
 	target/release/depthrig bench soak --check
+	tests/soak.py target/release/depthrig
 	$(MAKE) fuzz
 
 vm: setup-build setup-vm $(VENV)/.stamp ## drivers and daemon on a real kernel, in a virtual machine; one scenario: make vm ARGS="vivid-smoke"
@@ -57,6 +58,7 @@ bench: setup-build ## the numbers of docs/performance.md
 	target/release/depthrig bench bus
 	target/release/depthrig bench record
 	cargo run --release --package depthrig-tests --example zed_replay_ratio
+	cargo run --release --package depthrig-kinect-fixture --example kinect_speed
 
 bench-peers: setup-peers $(PEERS_VENV)/.stamp ## beside Python mcap, foxglove-sdk, rosbag and PNG files, in one run
 	cargo build --release --package depthrig-recorder --example bench_frames
