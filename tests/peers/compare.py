@@ -19,6 +19,8 @@ import frames
 HERE = Path(__file__).resolve().parent
 DEPTHRIG = {
     "depthrig, none": {"color": "raw", "compression": "none"},
+    # As from a rig, where the live feed wants the memory of the pixels back before the disk has taken them.
+    "depthrig, none, memory lent": {"color": "raw", "compression": "none", "lent": True},
     "depthrig, zstd": {"color": "raw"},
     "depthrig, PNG and zstd": {"color": "png"},
     "depthrig, PNG and rank": {"color": "png", "depth": "rank"},

@@ -17,7 +17,8 @@ is wrong by more than two), invalid (share that has none), and their sum, over t
 sees too: those of the mask; else those whose disparity the right truth repeats within one; else those that no nearer one of the
 left truth hides. And for pictures of 1280x720 with 128 disparities the CPU time on one core, the best of rounds that take turns. OpenCV's
 pictures are made wider on the left by as many pixels as disparities are searched, so that it gives no pixel up; its speed is
-measured without that, which it gains a tenth by. Exit code 1 when one of these is not kept:
+measured without that, which it gains a tenth by. With --rows 0.5 1 ... nothing is compared: it is said what depthrig makes of
+the pairs when the right picture lies so many pixels lower than it should. Exit code 1 when one of these is not kept:
 
 - quality: at most 0.25 of MODE_HH's and 0.6 of MODE_SGBM_3WAY's CPU time,
 - performance: at most 1/2.5 of quality's,
@@ -131,24 +132,55 @@ def ours(args: argparse.Namespace, left: Path, right: Path, preset: str, dispari
     return np.load(out)
 
 
+def pair_of(pair: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
+    """Left, right, truth, which pixels count, and how many disparities to search: 256 at most."""
+    left_path, right_path, truth_path, scale, disparities, *sixth = pair
+    left, right = (read(p, cv2.IMREAD_GRAYSCALE) for p in (left_path, right_path))
+    truth, disparities = true_disparity(truth_path, float(scale)), int(disparities)
+    if not left.shape == right.shape == truth.shape:
+        sys.exit(f"{left_path}: left {left.shape}, right {right.shape} and truth {truth.shape} are of several sizes")
+    seen = seen_by(sixth[0] if sixth else None, truth, float(scale))
+    while disparities > 256:
+        size = (left.shape[1] // 2, left.shape[0] // 2)
+        left, right = (cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in (left, right))
+        truth, seen = (a[1 : 2 * size[1] : 2, 1 : 2 * size[0] : 2] for a in (truth / 2, seen))
+        disparities = -(-disparities // 2)
+    return left, right, truth, seen, disparities
+
+
+def lowered(picture: np.ndarray, by: float) -> np.ndarray:
+    """The picture moved down by so many pixels, parts of them by cubic interpolation."""
+    rows, columns = np.indices(picture.shape, np.float32)
+    return cv2.remap(picture, columns, rows - np.float32(by), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def apart(args: argparse.Namespace, folder: Path) -> None:
+    """What rows that are apart cost."""
+    files = [folder / "left.png", folder / "right.png"]
+    for pair in args.pair:
+        left, right, truth, seen, disparities = pair_of(pair)
+        print(f"{pair[0]} ({left.shape[1]}x{left.shape[0]}, {disparities} disparities)")
+        cv2.imwrite(str(files[0]), left)
+        for by in args.rows:
+            cv2.imwrite(str(files[1]), lowered(right, by))
+            line = []
+            for preset in PRESETS:
+                found = ours(args, *files, preset, disparities, folder)
+                bad, invalid = score(found, truth, seen)
+                filled = 100 * np.isfinite(found).mean()
+                line.append(f"{preset} bad-2.0 {bad:5.2f} invalid {invalid:5.2f} filled {filled:5.1f}")
+            print(f"  {by:5.2f} px: " + ", ".join(line))
+
+
 def quality(args: argparse.Namespace, folder: Path) -> bool:
     kept = True
-    for left_path, right_path, truth_path, scale, disparities, *sixth in args.pair:
-        left, right = (read(p, cv2.IMREAD_GRAYSCALE) for p in (left_path, right_path))
-        truth, disparities = true_disparity(truth_path, float(scale)), int(disparities)
-        if not left.shape == right.shape == truth.shape:
-            sys.exit(f"{left_path}: left {left.shape}, right {right.shape} and truth {truth.shape} are of several sizes")
-        seen = seen_by(sixth[0] if sixth else None, truth, float(scale))
-        while disparities > 256:
-            size = (left.shape[1] // 2, left.shape[0] // 2)
-            left, right = (cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p in (left, right))
-            truth, seen = (a[1 : 2 * size[1] : 2, 1 : 2 * size[0] : 2] for a in (truth / 2, seen))
-            disparities = -(-disparities // 2)
+    for pair in args.pair:
+        left, right, truth, seen, disparities = pair_of(pair)
         # Both sides get the same grey pictures.
         files = [folder / "left.png", folder / "right.png"]
         for file, picture in zip(files, (left, right), strict=True):
             cv2.imwrite(str(file), picture)
-        print(f"{left_path} ({left.shape[1]}x{left.shape[0]}, {disparities} disparities)")
+        print(f"{pair[0]} ({left.shape[1]}x{left.shape[0]}, {disparities} disparities)")
         sums = {}
         for mode in MODES:
             rounded = -(-disparities // 16) * 16
@@ -217,6 +249,7 @@ def main() -> None:
         help="LEFT RIGHT TRUTH SCALE DISPARITIES [mask:FILE | right:FILE]",
     )
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rows", nargs="+", type=float, metavar="PX", help="only what rows cost that are so far apart")
     parser.add_argument("--no-speed", action="store_true", help="only the disparities, not what they cost")
     args = parser.parse_args()
     for pair in args.pair or []:
@@ -228,6 +261,9 @@ def main() -> None:
     cv2.setNumThreads(1)
     print(f"OpenCV {cv2.__version__}")
     with tempfile.TemporaryDirectory() as folder:
+        if args.rows:
+            apart(args, Path(folder))
+            return
         fast = args.no_speed or speed(args, Path(folder))
         good = quality(args, Path(folder))
     sys.exit(0 if fast and good else 1)
