@@ -202,13 +202,19 @@ impl RowCheck {
             return None;
         }
         let flat = fit::fit(points, true, scratch)?;
-        let shown = |p: &fit::Plane| {
-            let (terms, deviations) = (p.terms, p.deviations);
-            (terms.y.abs() > SHOWN * deviations.y.max(FLOOR_PX))
-                || (terms.z.abs() > SHOWN * deviations.z.max(FLOOR_PX))
-        };
-        let plane = fit::fit(points, false, scratch).filter(shown).unwrap_or(flat);
-        let unsure = plane.deviations.map(|d| (STATED * d).hypot(FLOOR_PX)).to_array();
+        let sloping = fit::fit(points, false, scratch)?;
+        let is_shown = |term: f64, deviation: f64| term.abs() > SHOWN * deviation.max(FLOOR_PX);
+        let (terms, deviations) = (sloping.terms, sloping.deviations);
+        let is_sloping = is_shown(terms.y, deviations.y) || is_shown(terms.z, deviations.z);
+        let plane = if is_sloping { sloping } else { flat };
+        let stated = |deviation: f64| (STATED * deviation).hypot(FLOOR_PX);
+        let mut unsure = plane.deviations.map(stated);
+        if !is_sloping {
+            // A slope that is there and could not be shown is what it looked like, as far as that is sure.
+            unsure.y = terms.y.abs() + stated(deviations.y);
+            unsure.z = terms.z.abs() + stated(deviations.z);
+        }
+        let unsure = unsure.to_array();
         let is_known = plane.agree >= AGREE && plane.squares >= SQUARES && overall(unsure) <= UNSURE_PX;
         let [middle_px, across_px, down_px] = plane.terms.to_array();
         let pairs = self.pairs.min(PAIRS);
@@ -272,6 +278,10 @@ mod tests {
         let flat = offset(60, 1.0, |i, _| 0.3 * noise(i, 4)).unwrap();
         assert_eq!((flat.across_px, flat.down_px), (0.0, 0.0), "{flat}");
         assert!(!flat.to_string().contains(" at the "), "{flat}");
+        // One that is there and too small to be shown lies within what is stated.
+        let slight = offset(400, 1.0, |i, _| 0.14 * (((i / 20) as f64 + 0.5) / 20.0 - 0.5)).unwrap();
+        assert!(slight.across_px == 0.0 && (0.14..0.25).contains(&slight.unsure_px[1]), "{slight:?}");
+        assert!(slight.unsure_px[2] < 0.06 && slight.unsure_px[0] < 0.06, "{slight:?}");
         // Column by column from the left.
         let sloping =
             offset(400, 1.0, |i, _| ((i / 20) as f64 + 0.5) / 10.0 - 1.0 + 0.05 * noise(i, 4)).unwrap();
