@@ -94,7 +94,7 @@ impl Picture {
             }));
         }
         let most = pictures.iter().map(most).max().unwrap_or(0);
-        let shift = (u16::BITS - most.leading_zeros()).saturating_sub(u8::BITS);
+        let shift = (u32::BITS - most.leading_zeros()).saturating_sub(u8::BITS);
         Ok(pictures.map(|p| {
             let (width, height) = (p.width() as usize, p.height() as usize);
             // One of 8 bits has been spread to 16.
@@ -143,12 +143,12 @@ fn wide(picture: &DynamicImage) -> bool {
     matches!(picture.color(), ColorType::L16 | ColorType::La16 | ColorType::Rgb16 | ColorType::Rgba16)
 }
 
-/// The largest grey value of one of 16 bits, else 0.
-fn most(picture: &DynamicImage) -> u16 {
+/// The largest grey value of one of 16 bits, else 0. It is of the same luma as the pixels: a larger one would not fit in 8 bits.
+fn most(picture: &DynamicImage) -> u32 {
     if !wide(picture) {
         return 0;
     }
-    picture.to_luma16().into_raw().into_iter().max().unwrap_or(0)
+    picture.to_rgb16().pixels().map(|p| luma(p.0.map(u32::from))).max().unwrap_or(0)
 }
 
 /// What was done.
@@ -276,4 +276,37 @@ fn encoded(data: &[u8], map: &DisparityMap, color: ExtendedColorType) -> Result<
     let mut file = Vec::new();
     png::PngEncoder::new(&mut file).write_image(data, map.width as u32, map.height as u32, color)?;
     Ok(file)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The pixels that two files of this picture are read as.
+    fn read(picture: &DynamicImage) -> Vec<u8> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("p.png");
+        picture.save(&path).unwrap();
+        let [left, right] = Picture::pair(&path, &path).unwrap();
+        assert_eq!(left.pixels, right.pixels);
+        left.pixels
+    }
+
+    #[test]
+    fn colour_becomes_the_grey_of_rec_709() {
+        let colours = [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255], [200, 100, 50], [77, 77, 77]];
+        let picture = image::RgbImage::from_fn(6, 1, |x, _| image::Rgb(colours[x as usize]));
+        assert_eq!(read(&picture.into()), [54, 182, 18, 255, 117, 77]);
+    }
+
+    /// A brightest of 255 takes 8 bits, whatever another formula rounds it to.
+    #[test]
+    fn the_brightest_of_16_bits_is_that_of_the_same_grey() {
+        let of = |pixel: [u16; 3]| {
+            read(&DynamicImage::ImageRgb16(image::ImageBuffer::from_pixel(2, 1, image::Rgb(pixel))))
+        };
+        assert_eq!(of([256, 256, 254]), [255; 2]); // 255.86
+        assert_eq!(of([256; 3]), [128; 2]);
+        assert_eq!(of([u16::MAX; 3]), [255; 2]);
+    }
 }
