@@ -22,6 +22,11 @@ for part in "$@"; do
         need "libclang-common-${clang:-14}-dev" compgen -G '/usr/lib/*/lib/clang/*/include/stddef.h'
         ;;
     test)
+        # Compiled tests, and Python environments of which that with PyTorch is the largest.
+        free_gb=$(df --output=avail --block-size=1G . | tail -1)
+        if [ ! -d target/test-logs ] && [ "$free_gb" -lt 15 ]; then
+            echo "the tests take about 15 GB of disk, and $((free_gb)) GB are free in $PWD" >&2
+        fi
         need python3 command -v python3
         need python3-venv python3 -c 'import ensurepip, venv'
         need nodejs command -v node
