@@ -7,10 +7,9 @@ use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::{Frame, HostTime, StreamId, UtcPair};
-use depthrig_calib::PoseExt;
 use depthrig_recorder::{
-    Diagnostic, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamAccount,
-    StreamRecord, Summary, UtcSource, fs,
+    Diagnostic, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamAccount, Summary,
+    UtcSource, fs,
 };
 use place::place;
 pub use recovery::recover_left;
@@ -19,12 +18,14 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 pub mod budget;
+mod facts;
 mod motion;
 mod place;
 mod recovery;
 mod report;
 mod spread;
 
+pub use facts::StreamFacts;
 pub use report::Reports;
 
 /// The recordings of a rig: at most one at a time, and what became of the last.
@@ -86,22 +87,6 @@ impl Pixels for SharedPixels {
     }
 }
 
-/// What a recording needs to know of a camera's stream.
-pub struct StreamFacts {
-    /// The stream.
-    pub stream: Arc<Stream>,
-    /// Model and serial number of its camera.
-    pub model: String,
-    /// Serial number of its camera.
-    pub serial: String,
-    /// Where its calibration comes from.
-    pub calibration: String,
-    /// Pose of its camera on the mount.
-    pub camera_pose: depthrig_bus::Pose,
-    /// What computed it, if it is no camera's.
-    pub computed: Option<depthrig_recorder::Computed>,
-}
-
 impl Begun {
     /// Makes the dataset for a recording of `streams`, of about `sets_hz` sets a second.
     ///
@@ -137,7 +122,7 @@ impl Begun {
         session.max_spread_ns =
             max_spread_ns(streams.iter().map(|s| reach_ns(s, streams.iter().chain(&others), sets_hz)));
         session.computed = streams.iter().filter_map(|s| s.computed.clone()).collect();
-        session.streams = streams.iter().map(record_of).collect();
+        session.streams = streams.iter().map(facts::record_of).collect();
         session.motion = units.iter().map(motion::record_of).collect();
         let mut options = options_of(&config.recording);
         options.backlog_max_bytes = outside.backlog_max_bytes.unwrap_or(options.backlog_max_bytes);
@@ -461,23 +446,6 @@ fn of_recorder(e: depthrig_recorder::Error) -> Error {
         _ => ErrorKind::Other,
     };
     Error::new(kind, e.to_string()).with_source(e)
-}
-
-fn record_of(s: &StreamFacts) -> StreamRecord {
-    let p = &s.stream.profile;
-    StreamRecord {
-        id: s.stream.id.clone(),
-        model: s.model.clone(),
-        serial: s.serial.clone(),
-        format: p.format,
-        width: p.width,
-        height: p.height,
-        rate_hz: p.rate_hz,
-        depth_unit_m: p.depth_unit_m,
-        calibration: s.calibration.clone(),
-        intrinsics: p.intrinsics,
-        pose: s.camera_pose.compose(&p.pose_in_device),
-    }
 }
 
 /// Bytes of its disk that a recording never uses.

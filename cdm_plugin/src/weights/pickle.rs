@@ -7,6 +7,8 @@
 //!
 //! Operations: `pickletools.py` and `pickle.py` of CPython. What tensors are made of: `torch/_utils.py` and
 //! `torch/serialization.py` of PyTorch.
+//!
+//! More than 500 lines, because the operations share one machine.
 
 use super::{Dtype, Parsed};
 use std::collections::HashMap;

@@ -1,4 +1,6 @@
 //! The cases of the suite.
+//!
+//! More than 500 lines, because all cases lie side by side in one table with what each does.
 
 use super::probe::{Books, Probe, Published, wait_for};
 use super::{Bench, Cannot, Trouble};

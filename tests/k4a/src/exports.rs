@@ -1,4 +1,6 @@
 //! The C functions of the header that a program needs which reads pictures.
+//!
+//! More than 500 lines, because they are one interface, function by function as the header has them.
 
 use crate::abi::{self, Configuration, FAILED, ImuSample, LOG_ERROR, SUCCEEDED, TIMEOUT, TOO_SMALL};
 use crate::camera::{Camera, Moved, Picture, Step};
