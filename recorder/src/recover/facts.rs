@@ -122,13 +122,19 @@ fn facts_of(reader: &SegmentReader) -> Result<Facts> {
             Ok(())
         })?;
     }
-    if let Some(entry) = with(counts).next_back() {
+    // One that cannot be read is none; `verify` tells of it.
+    for entry in with(counts).rev() {
         reader.messages(entry, |m| {
-            if Some(m.channel) == counts {
-                facts.counts = Some(accounts::read(m.data)?.0);
+            if Some(m.channel) == counts
+                && let Ok((said, _)) = accounts::read(m.data)
+            {
+                facts.counts = Some(said);
             }
             Ok(())
         })?;
+        if facts.counts.is_some() {
+            break;
+        }
     }
     for (name, map) in &reader.metadata {
         match name.as_str() {

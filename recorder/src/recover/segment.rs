@@ -191,9 +191,7 @@ impl Rebuild<'_> {
         lost: &mut Lost,
         tell: Tell<'_>,
     ) -> Result<(Facts, Vec<Copied>)> {
-        let schema = |s: Schema| preamble.schemas.iter().find(|r| r.name == s.name()).map(|r| r.id);
-        let accounts_channel = schema(Schema::Accounts)
-            .and_then(|id| preamble.channels.iter().find(|c| c.schema == id).map(|c| c.id));
+        let accounts_channel = channel_of(preamble, Schema::Accounts);
         let mut facts = Facts { bytes: reader.size, ..Facts::default() };
         let mut said = BTreeMap::new();
         let mut copied = Vec::new();
@@ -232,8 +230,10 @@ impl Rebuild<'_> {
                 }
                 Group::Between(between) => {
                     reader.chunk_messages(between.chunk.body(), between.offset, |m| {
-                        if Some(m.channel) == accounts_channel {
-                            facts.counts = Some(accounts::read(m.data)?.0);
+                        if Some(m.channel) == accounts_channel
+                            && let Ok((counts, _)) = accounts::read(m.data)
+                        {
+                            facts.counts = Some(counts);
                         }
                         Ok(())
                     })?;
@@ -386,6 +386,13 @@ impl Rebuild<'_> {
     }
 }
 
+/// The channel of this type, as whoever reads the index finds it: of schemas and channels with one number the last counts.
+fn channel_of(preamble: &Preamble, schema: Schema) -> Option<u16> {
+    let names: BTreeMap<_, _> = preamble.schemas.iter().map(|s| (s.id, s.name.as_str())).collect();
+    let channels: BTreeMap<_, _> = preamble.channels.iter().map(|c| (c.id, c.schema)).collect();
+    channels.into_iter().find(|(_, of)| names.get(of) == Some(&schema.name())).map(|(id, _)| id)
+}
+
 fn out_of_order(set: &SetGroup, before: Option<u64>, last_time: Option<u64>) -> bool {
     before.is_some_and(|b| set.mark.id <= b) || last_time.is_some_and(|t| set.log_time <= t)
 }
@@ -395,11 +402,9 @@ fn head_chunk(preamble: &Preamble, log_time: u64, path: &Path) -> Result<Chunk> 
     let metadata = preamble.metadata.iter().find(|(name, _)| name == SESSION_METADATA);
     let text = metadata.and_then(|(_, m)| m.get("session_toml"));
     let session = Session::from_toml(text.map(String::as_str).unwrap_or_default(), path)?;
-    let schema = preamble.schemas.iter().find(|s| s.name == Schema::TfMessage.name());
-    let channel = preamble.channels.iter().find(|c| Some(c.schema) == schema.map(|s| s.id));
     let mut builder = ChunkBuilder::new();
-    if let Some(channel) = channel {
-        let head = MessageHead { channel: channel.id, sequence: 0, log_time, publish_time: log_time };
+    if let Some(channel) = channel_of(preamble, Schema::TfMessage) {
+        let head = MessageHead { channel, sequence: 0, log_time, publish_time: log_time };
         builder.message(head, |b| {
             tf::write(b, log_time as i64, &session);
             Ok::<_, Error>(())
