@@ -2,7 +2,8 @@
 //!
 //! A unit measures hundreds of times a second, so its frames are batches: `width` samples in one row, in the order of
 //! their times. The header's times are those of the newest sample, its pose is that of the unit, and it counts batches as
-//! it counts pictures; samples have numbers of their own, whose gaps are samples that the device never gave.
+//! it counts pictures; samples have numbers of their own, whose gaps are samples that the device never gave, or that were
+//! lost with a batch.
 
 use crate::{Field, Frame, HostTime};
 use core::mem::offset_of;
@@ -20,7 +21,7 @@ pub struct MotionSample {
     pub time_ns: i64,
     /// The same on the unit's clock, ticks, unwrapped.
     pub device_time: u64,
-    /// Number of the sample; a gap is samples that the device never gave.
+    /// Number of the sample; a gap is samples that the device never gave, or that were lost with a batch.
     pub sequence: u64,
     /// The time is right within this much, nanoseconds; [`u32::MAX`] is that or more.
     pub uncertainty_ns: u32,

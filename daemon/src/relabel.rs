@@ -189,10 +189,14 @@ pub fn relabel_with(
     for (stream, frames) in report.streams.iter_mut().zip(write.written()) {
         stream.frames = *frames;
     }
-    if !copied.verified.is_whole() {
-        let first = copied.verified.findings.first().map_or_else(String::new, |f| f.message.clone());
-        let message = format!("the copy in {} does not verify: {first}", copy.display());
+    if let Some(broken) = copied.verified.broken() {
+        let message = format!("the copy in {} does not verify: {}", copy.display(), broken.message);
         return Err(Error::new(ErrorKind::Corrupt, message));
+    }
+    // What the source lacks, the copy lacks too.
+    for lost in copied.verified.lost() {
+        report.lost += 1;
+        report.problems.push(lost.message.clone());
     }
     report.verified = Some(copied.verified);
     fs.rename(&copy, out).map_err(|e| failed("rename", &copy, e))?;

@@ -218,15 +218,17 @@ pub fn zed_replay(
         return Ok(report);
     }
     let mut verified = verify_with(&fs, &copy, &VerifyOptions::default())?;
-    if !verified.is_whole() {
-        let first = verified.findings.first().map_or_else(String::new, |f| f.message.clone());
+    if let Some(broken) = verified.broken() {
         let what = format!(
-            "the dataset in {} does not verify: {first}; remove {} and begin anew",
+            "the dataset in {} does not verify: {}; remove {} and begin anew",
             copy.display(),
+            broken.message,
             work.path().display()
         );
         return Err(Error::new(ErrorKind::Corrupt, what));
     }
+    // What the recording lacks, this one lacks too.
+    verified.lost().for_each(|f| report.lose(f.message.clone()));
     let _ = progress(Step::Verify, 1, 1);
     (report.sets, report.bytes) = (verified.sets, verified.bytes);
     let frames = verified.frames / plan.streams.len().max(1) as u64;

@@ -69,11 +69,16 @@ pub const SET_MOTION_MAX_BYTES: u64 = 64 << 20;
 impl RecordMotion {
     /// About how many bytes this batch takes in the file, before the chunk is packed.
     pub fn stored_bytes(&self) -> u64 {
+        Self::stored_bytes_of(self.samples.len() as u64)
+    }
+
+    /// The same of a batch of this many samples.
+    pub const fn stored_bytes_of(samples: u64) -> u64 {
         // Each message has 31 bytes before its data: `frame_info` is 768 bytes and three short texts, an `Imu` 312 and
         // the name of its frame.
         const BATCH: u64 = 1024;
         const SAMPLE: u64 = MOTION_SAMPLE_BYTES as u64 + 448;
-        BATCH + SAMPLE * self.samples.len() as u64
+        BATCH.saturating_add(SAMPLE.saturating_mul(samples))
     }
 }
 

@@ -1,7 +1,7 @@
 //! `session.toml`: who recorded what with which rig, and how it was calibrated.
 
 use crate::fs::{self, Fs};
-use crate::{Error, ErrorKind, Result, SetCounts};
+use crate::{Error, ErrorKind, RecordMotion, Result, SET_MOTION_MAX_BYTES, SetCounts};
 use depthrig_bus::{Distortion, Intrinsics, Name, PixelFormat, Pose, StreamId};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -17,6 +17,8 @@ pub const FORMAT: &str = "depthrig.dataset/1";
 pub const SESSION_FILE: &str = "session.toml";
 /// Its name while it is written.
 pub(crate) const SESSION_TMP: &str = "session.tmp";
+/// Streams and motion units at most: each has three of the 65535 channels of a file, and the file has some itself.
+const STREAMS_MAX: usize = 21_000;
 
 /// What `session.toml` says.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -300,7 +302,18 @@ impl Session {
                 return Err(bad(format!("motion unit {} has batches of no samples", u.id)));
             }
         }
-        Ok(())
+        self.too_much().map_or(Ok(()), |why| Err(bad(why)))
+    }
+
+    /// What of it is more than a dataset can hold, in words.
+    fn too_much(&self) -> Option<String> {
+        let listed = self.streams.len() + self.motion.len();
+        if listed > STREAMS_MAX {
+            return Some(format!("it lists {listed} streams and motion units, {STREAMS_MAX} is the limit"));
+        }
+        let fits = |u: &&MotionRecord| RecordMotion::stored_bytes_of(u.batch.into()) <= SET_MOTION_MAX_BYTES;
+        let long = self.motion.iter().find(|u| !fits(u))?;
+        Some(format!("motion unit {} has batches of {} samples, no set can hold one", long.id, long.batch))
     }
 
     /// The text of `session.toml`.
@@ -332,6 +345,10 @@ impl Session {
                     session.format
                 ),
             ));
+        }
+        if let Some(why) = session.too_much() {
+            let message = format!("{} cannot be read as a session: {why}", path.display());
+            return Err(Error::new(ErrorKind::Corrupt, message));
         }
         Ok(session)
     }

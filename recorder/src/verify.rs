@@ -140,6 +140,16 @@ impl VerifyReport {
         self.findings.iter().map(|f| f.severity).max()
     }
 
+    /// The first that is not what it should be; `None` when all of the dataset is what it says it is.
+    pub fn broken(&self) -> Option<&Finding> {
+        self.findings.iter().find(|f| f.severity == Severity::Broken)
+    }
+
+    /// What was lost.
+    pub fn lost(&self) -> impl Iterator<Item = &Finding> {
+        self.findings.iter().filter(|f| f.severity == Severity::Lost)
+    }
+
     /// Whether the dataset is what it says it is and lost nothing.
     pub fn is_whole(&self) -> bool {
         self.worst() < Some(Severity::Lost)

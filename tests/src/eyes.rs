@@ -3,10 +3,13 @@
 //! A square stands before a wall, both with a pattern. Each eye's picture is made by following its rays, so the truth is
 //! exact; the eyes are pinholes that look the same way, so the rectified view is the left eye's.
 
-use depthrig_bus::{FrameHeader, HostTime, Intrinsics, MotionSample, PixelFormat, Pose, StreamId, UtcPair};
+use depthrig_bus::{
+    DropCounts, FrameHeader, HostTime, Intrinsics, MotionSample, PixelFormat, Pose, StreamId, UtcPair,
+};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{
-    MotionRecord, RecordFrame, RecordMotion, RecordSet, Recorder, RecorderOptions, Session, StreamRecord,
+    MotionRecord, RecordFrame, RecordMotion, RecordSet, Recorder, RecorderOptions, Session, StreamAccount,
+    StreamRecord,
 };
 use std::path::Path;
 use std::sync::Arc;
@@ -35,6 +38,8 @@ pub struct Eyes {
     pub period_ns: i64,
     /// Sets, from 0, that have no right picture.
     pub one_eyed: Vec<u64>,
+    /// Sets, from 0, that were not recorded.
+    pub lost: Vec<u64>,
     /// Rows by which the right picture lies lower than its calibration says.
     pub rows_apart: f64,
     /// Each eye's pictures are the other one's.
@@ -54,6 +59,7 @@ impl Default for Eyes {
             sets: 6,
             period_ns: 200_000_000,
             one_eyed: Vec::new(),
+            lost: Vec::new(),
             rows_apart: 0.0,
             swapped: false,
             contrast: 200.0,
@@ -190,7 +196,7 @@ impl Eyes {
         session.motion = ["other", "zed2i"].map(unit).to_vec();
         let options = RecorderOptions { queue_sets: 64, ..RecorderOptions::default() };
         let r = Recorder::create(Arc::new(RealFs), out, session.clone(), options).unwrap();
-        for n in 0..self.sets {
+        for n in (0..self.sets).filter(|n| !self.lost.contains(n)) {
             let mono = M0 + n as i64 * self.period_ns;
             let header = |stream: usize| {
                 let s = &session.streams[stream];
@@ -230,6 +236,14 @@ impl Eyes {
             }
             r.push(set).unwrap();
         }
+        let batches = self.sets - self.lost.len() as u64;
+        let account = |u: &MotionRecord| StreamAccount {
+            stream: u.id.clone(),
+            captured: batches + 1,
+            delivered: batches,
+            dropped: DropCounts([1, 0, 0, 0, 0, 0, 0, 0]),
+        };
+        r.update_accounts(session.motion.iter().map(account).collect());
         assert!(r.finish().unwrap().complete);
     }
 }

@@ -30,6 +30,10 @@ pub struct Made {
     pub period_ns: i64,
     /// Sets.
     pub sets: u64,
+    /// Sets, from 0, that were not recorded.
+    pub lost: Vec<u64>,
+    /// How far the frames of a set may be apart, nanoseconds; they are, by a millisecond from stream to stream.
+    pub max_spread_ns: Option<i64>,
     /// Pixels per row and rows.
     pub size: (u32, u32),
     /// How colour is stored.
@@ -49,6 +53,8 @@ impl Default for Made {
             mono_ns: 50 * SECOND,
             period_ns: SECOND / 5,
             sets: 12,
+            lost: Vec::new(),
+            max_spread_ns: None,
             size: (64, 48),
             color: ColorCodec::Raw,
             depth: DepthCodec::default(),
@@ -69,6 +75,7 @@ impl Made {
         session.scene = "made up".into();
         session.started_utc_ns = T0 + self.at_ns;
         session.rig_config = "# made\n".into();
+        session.max_spread_ns = self.max_spread_ns;
         let (width, height) = self.size;
         let record = |id: StreamId| {
             let depth = id.stream.as_str() == "depth";
@@ -192,14 +199,15 @@ impl Made {
     /// Records it into the new folder `dir`.
     pub fn record(&self, dir: &Path) -> Summary {
         let summary = self.recorder(dir).finish().unwrap();
-        assert_eq!((summary.complete, summary.sets.recorded), (true, self.sets), "{:?}", summary.lost);
+        let sets = self.sets - self.lost.len() as u64;
+        assert_eq!((summary.complete, summary.sets.recorded), (true, sets), "{:?}", summary.lost);
         summary
     }
 
     /// Records it into the new folder `dir`, all but the end: what a crash of the process leaves.
     pub fn record_and_crash(&self, dir: &Path) {
         let recorder = self.recorder(dir);
-        while recorder.progress().sets.recorded < self.sets {
+        while recorder.progress().sets.recorded < self.sets - self.lost.len() as u64 {
             std::thread::sleep(Duration::from_millis(1));
         }
     }
@@ -218,7 +226,7 @@ impl Made {
         };
         let session = self.session();
         let recorder = Recorder::create(Arc::new(RealFs), dir, session.clone(), options).unwrap();
-        for n in 0..self.sets {
+        for n in (0..self.sets).filter(|n| !self.lost.contains(n)) {
             while !recorder.has_room() {
                 std::thread::sleep(Duration::from_millis(1));
             }

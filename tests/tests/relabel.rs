@@ -103,6 +103,24 @@ fn a_copy_with_refined_depth() {
     assert_eq!(over.kind(), ErrorKind::AlreadyExists);
 }
 
+/// What a recording lacks cannot be made up: the copy lacks it too, and says so.
+#[test]
+fn a_recording_that_lost_something_is_copied_with_its_gaps() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
+    Made { sets: 9, lost: vec![3, 4], motion: true, ..Made::default() }.record(&source);
+    let report = relabel(&Dataset::open(&source).unwrap(), &out, &options(2), &mut go_on).unwrap();
+    assert_eq!((report.sets, report.lost), (7, 0), "{:?}", report.problems);
+    let gap = "4 batches of left/imu were not recorded";
+    assert!(verify(&out, &VerifyOptions::default()).unwrap().findings.iter().any(|f| f.message == gap));
+
+    let (source, out) = (dir.path().join("wide"), dir.path().join("wide_out"));
+    Made { sets: 3, max_spread_ns: Some(1_000_000), ..Made::default() }.record(&source);
+    let report = relabel(&Dataset::open(&source).unwrap(), &out, &options(2), &mut go_on).unwrap();
+    assert_eq!((report.sets, report.lost, report.problems.len()), (3, 3, 3));
+    assert!(report.problems[0].contains("is the limit"), "{:?}", report.problems);
+}
+
 #[test]
 fn a_run_that_was_ended_goes_on() {
     let dir = tempfile::tempdir().unwrap();

@@ -402,6 +402,21 @@ fn run_child(dir: &Path, after: u64) -> Option<u64> {
 }
 
 #[test]
+fn a_recording_that_lost_sets_is_replayed_with_its_gaps() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
+    Eyes { lost: vec![2], ..Eyes::default() }.record(&source);
+    let report = zed_replay(&source, &out, &options(&CLASSICAL[..1], 1), &mut go_on).unwrap();
+    assert_eq!((report.sets, report.lost), (5, 0), "{:?}", report.problems);
+    let accounts = |path: &Path| Dataset::open(path).unwrap().info().unwrap().accounts;
+    let unit = accounts(&source).into_iter().find(|a| a.stream.to_string() == "zed2i/imu").unwrap();
+    assert!(unit.dropped.total() == 1 && accounts(&out).contains(&unit), "{:?}", accounts(&out));
+    assert!(!accounts(&out).iter().any(|a| a.stream.to_string() == "other/imu"));
+    let gap = "1 batches of zed2i/imu were not recorded";
+    assert!(report.verified.unwrap().findings.iter().any(|f| f.message == gap));
+}
+
+#[test]
 fn a_killed_run_goes_on() {
     let home = tempfile::tempdir().unwrap();
     let dir = home.path();

@@ -1,15 +1,15 @@
 //! Motion samples on their way into a recording: batches wait for the next set that is handed over, in the order in which
 //! they came.
 //!
-//! Of a unit at most [`PATIENCE_S`] of batches wait, or those of two sets where sets are rarer than that; the oldest go
-//! first, and are counted. What still waits when a recording ends came after its last set and is no part of it.
+//! Of a unit at most [`PATIENCE_S`] of batches wait, or those of two sets where sets are rarer than that, but no more than
+//! its share of what one set may hold; the oldest go first, and are counted. What still waits when a recording ends came after its last set and is no part of it.
 
 use super::StreamFacts;
 use crate::status::SetAccount;
 use crate::stream::Stream;
 use depthrig_bus::{DropCounts, DropReason, Frame, StreamId};
 use depthrig_calib::PoseExt;
-use depthrig_recorder::{MotionRecord, RecordMotion, StreamAccount};
+use depthrig_recorder::{MotionRecord, RecordMotion, SET_MOTION_MAX_BYTES, StreamAccount};
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
@@ -51,9 +51,16 @@ enum Heard {
 impl Units {
     /// The units among the streams of a recording of about `sets_hz` sets a second.
     pub(super) fn new(units: &[StreamFacts], sets_hz: f64) -> Self {
+        let share = SET_MOTION_MAX_BYTES / units.len().max(1) as u64;
+        let most = |s: &StreamFacts| {
+            let profile = &s.stream.profile;
+            let of_sets = (profile.rate_hz.max(LEAST_HZ) * PATIENCE_S.max(2.0 / sets_hz)).ceil();
+            let fit = share / RecordMotion::stored_bytes_of(profile.width.into());
+            (of_sets as u64).min(fit).max(1) as usize
+        };
         let unit = |s: &StreamFacts| Unit {
             stream: Arc::clone(&s.stream),
-            most: (s.stream.profile.rate_hz.max(LEAST_HZ) * PATIENCE_S.max(2.0 / sets_hz)).ceil() as usize,
+            most: most(s),
             waiting: 0,
             handed: 0,
             lost: 0,

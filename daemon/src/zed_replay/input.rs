@@ -9,7 +9,7 @@ use depthrig_drivers::zed::conf::StereoCalibration;
 use depthrig_drivers::zed::replay::{self, Pair, Source};
 use depthrig_recorder::{
     Dataset, DatasetFrame, Derived, Error, ErrorKind, PixelMode, RecordMotion, Result, Session, SetReader,
-    StreamRecord,
+    StreamAccount, StreamRecord,
 };
 use serde_json::{Value, json};
 use std::path::Path;
@@ -54,6 +54,8 @@ pub(super) struct Facts {
     pub(super) pose: Pose,
     /// The session that the output's begins as: without streams.
     pub(super) session: Session,
+    /// What became of the batches of its motion units, as the recording says.
+    pub(super) accounts: Vec<StreamAccount>,
     /// Streams that depth is computed from.
     pub(super) from: Vec<StreamId>,
     /// What tells this input from any other, and from itself after a change.
@@ -141,6 +143,8 @@ impl Input {
         // Of other cameras there will be nothing that their motion belongs to.
         made.motion.retain(|u| u.id.camera == l.id.camera);
         let units = session.motion.iter().map(|u| made.motion.iter().position(|m| m.id == u.id)).collect();
+        let mut accounts = if made.motion.is_empty() { Vec::new() } else { dataset.info()?.accounts };
+        accounts.retain(|a| made.motion.iter().any(|u| u.id == a.stream));
         made.computed.clear();
         made.derived.push(derived(
             dataset.path(),
@@ -161,6 +165,7 @@ impl Input {
             calibration_origin: l.calibration.clone(),
             pose: l.pose,
             session: made,
+            accounts,
             from: vec![l.id.clone(), r.id.clone()],
             identity,
             total: reader.times().len() as u64,
@@ -204,6 +209,7 @@ impl Input {
             calibration_origin: info.calibration_origin.clone(),
             pose: Pose::IDENTITY,
             session,
+            accounts: Vec::new(),
             from: vec![id("left")?, id("right")?],
             identity: json!({
                 "kind": info.kind,

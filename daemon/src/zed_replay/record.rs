@@ -80,7 +80,8 @@ pub(super) fn record(
         delivered: pairs.0,
         dropped: depthrig_bus::DropCounts::default(),
     };
-    recorder.update_accounts(plan.streams.iter().map(account).collect());
+    let units = plan.facts.accounts.iter().cloned();
+    recorder.update_accounts(plan.streams.iter().map(account).chain(units).collect());
     let summary = recorder.finish()?;
     let cpu = engine.into_cpu();
     for problem in input.take_lost() {

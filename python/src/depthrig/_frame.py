@@ -182,8 +182,8 @@ class Frame:
         """The samples of a motion unit's batch as a read-only structured array without a copy, oldest first.
 
         `frame.motion["gyro_rad_s"]` is `(n, 3)` f32; the other fields are `time_ns`, `device_time`, `sequence` (a gap
-        is samples that the device never gave), `uncertainty_ns`, `accel_offset_ns`, `accel_m_s2`, `temperature_c` and
-        `flags` (:class:`depthrig.MotionFlags`); NaN is "not measured". Raises TypeError for a picture.
+        is samples that the device never gave, or that were lost with a batch), `uncertainty_ns`, `accel_offset_ns`,
+        `accel_m_s2`, `temperature_c` and `flags` (:class:`depthrig.MotionFlags`); NaN is "not measured". Raises TypeError for a picture.
         """
         if not self.is_motion:
             raise TypeError(f"{self.header.stream_id} carries {self.header.format_name} pictures and no motion samples")

@@ -242,8 +242,11 @@ pub fn export_motion(
         total.sets = total.sets.max(done.sets);
         total.frames = before + done.frames;
         total.bytes += file.bytes;
-        total.lost += done.lost;
-        total.problems.extend(done.problems);
+        // Of the same sets for each unit.
+        total.lost = total.lost.max(done.lost);
+        if total.problems.is_empty() {
+            total.problems = done.problems;
+        }
         if done.ended {
             total.ended = true;
             return Ok(total);

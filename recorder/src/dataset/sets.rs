@@ -6,7 +6,7 @@ use crate::encode::Codec;
 use crate::msgs::frame_set::FrameSetMsg;
 use crate::msgs::schemas::Schema;
 use crate::msgs::{frame_info, motion};
-use crate::{Error, ErrorKind, RecordMotion, Result};
+use crate::{Error, ErrorKind, RecordMotion, Result, SET_MOTION_MAX_BYTES};
 use depthrig_bus::{FrameHeader, HostTime, PixelFormat, StreamId};
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::{Bound, RangeBounds};
@@ -146,12 +146,21 @@ pub(crate) enum Kind {
     Set,
 }
 
+impl Kind {
+    /// Whether it is of a motion unit.
+    pub(crate) const fn is_motion(&self) -> bool {
+        matches!(self, Self::UnitInfo(_) | Self::Samples(_) | Self::Imu(_))
+    }
+}
+
 /// The messages since the last set's end.
 #[derive(Default)]
 struct Partial {
     pictures: BTreeMap<StreamId, (u64, Vec<u8>)>,
     infos: BTreeMap<StreamId, (u64, Vec<u8>)>,
     batches: Vec<PartialBatch>,
+    /// Bytes of these.
+    motion_bytes: u64,
 }
 
 /// A batch of a motion unit, as far as it was read.
@@ -249,7 +258,17 @@ impl Open {
     ) -> Result<()> {
         let Self { reader, kinds, partial, .. } = self;
         reader.messages(entry, |m| {
-            match kinds.get(&m.channel) {
+            let kind = kinds.get(&m.channel);
+            if kind.is_some_and(Kind::is_motion) {
+                partial.motion_bytes = partial.motion_bytes.saturating_add(m.data.len() as u64);
+                if partial.motion_bytes > SET_MOTION_MAX_BYTES {
+                    *partial = Partial::default();
+                    let what =
+                        format!("a set has more than {SET_MOTION_MAX_BYTES} bytes of motion before its mark");
+                    return Err(reader.error(ErrorKind::Corrupt, entry.offset, what));
+                }
+            }
+            match kind {
                 Some(Kind::Picture(id)) if mode != PixelMode::None => {
                     partial.pictures.insert(id.clone(), (m.log_time, m.data.to_vec()));
                 }

@@ -8,14 +8,17 @@ use crate::dataset::{Kind, MotionCount};
 use crate::msgs::frame_info;
 use crate::msgs::frame_set::FrameSetMsg;
 use crate::msgs::motion::{Batch, Imu, read_samples};
-use crate::recorder::topics::check_batch;
-use crate::{RecordMotion, Result, Session};
+use crate::msgs::tf::unit_frame;
+use crate::recorder::topics::{MOTION_CODEC, check_batch};
+use crate::{Error, ErrorKind, RecordMotion, Result, SET_MOTION_MAX_BYTES, Session};
 use depthrig_bus::{FrameFlags, FrameHeader, StreamId};
 use std::collections::BTreeMap;
 
 /// The messages of motion units since the last commit mark.
 #[derive(Default)]
 pub(super) struct Messages {
+    /// Bytes of all of them.
+    bytes: u64,
     batches: Vec<Waiting>,
     /// Samples without a header before them, by unit.
     stray: BTreeMap<StreamId, u64>,
@@ -29,6 +32,8 @@ struct Waiting {
     log_time: u64,
     header: Box<FrameHeader>,
     stamp_utc_ns: i64,
+    /// Frame and codec are those of a motion unit.
+    is_named: bool,
     samples: Option<Batch>,
 }
 
@@ -44,8 +49,17 @@ struct Single {
 }
 
 impl Messages {
-    /// Takes a message of a motion unit; whether it is one.
+    /// Takes a message of a motion unit; whether it is one. More than a set may have is not kept.
     pub(super) fn take(&mut self, kind: &Kind, m: &Message<'_>, decode: bool) -> Result<bool> {
+        if kind.is_motion() {
+            self.bytes = self.bytes.saturating_add(m.data.len() as u64);
+            if self.bytes > SET_MOTION_MAX_BYTES {
+                *self = Self::default();
+                let what =
+                    format!("a set has more than {SET_MOTION_MAX_BYTES} bytes of motion before its mark");
+                return Err(Error::new(ErrorKind::Corrupt, what));
+            }
+        }
         match kind {
             Kind::UnitInfo(unit) => {
                 let (header, extra) = frame_info::read(m.data)?;
@@ -54,6 +68,7 @@ impl Messages {
                     log_time: m.log_time,
                     header: Box::new(header),
                     stamp_utc_ns: extra.stamp_utc_ns,
+                    is_named: extra.codec == MOTION_CODEC && extra.frame_id == unit_frame(unit),
                     samples: None,
                 });
             }
@@ -134,12 +149,13 @@ impl Units {
         problems
     }
 
-    /// What is to be said at the end.
+    /// What is to be said at the end. A gap is a note, as frames are that were lost live: the numbers show it, and what was
+    /// handed to the recorder and is not here is said of its set.
     pub(super) fn finish(&self, findings: &mut Findings) {
         for (id, unit) in &self.0 {
             if unit.count.lost_batches > 0 {
                 let what = format!("{} batches of {id} were not recorded", unit.count.lost_batches);
-                findings.add(Severity::Lost, crate::SESSION_FILE, None, what);
+                findings.add(Severity::Note, crate::SESSION_FILE, None, what);
             }
             if unit.count.never_given > 0 {
                 let what = format!(
@@ -195,15 +211,22 @@ impl Unit {
 
 /// Takes the motion of a set by its mark, which lies in the chunk at `offset`.
 pub(super) fn set(walk: &mut Walk, pass: &mut Pass<'_>, set: &FrameSetMsg, log_time: u64, offset: u64) {
-    let Messages { batches, stray, mut single } = std::mem::take(&mut pass.motion);
+    let Messages { batches, stray, mut single, .. } = std::mem::take(&mut pass.motion);
     let mut problems = Vec::new();
     for (unit, n) in stray {
         problems.push(format!("{n} batches of {unit} have no frame_info"));
     }
     let mut expected: BTreeMap<StreamId, Vec<Imu>> = BTreeMap::new();
-    for batch in batches.into_iter().filter(|b| b.log_time == log_time) {
-        let Waiting { unit: id, header, stamp_utc_ns, samples, .. } = batch;
+    for batch in batches {
+        let Waiting { unit: id, log_time: at, header, stamp_utc_ns, is_named, samples } = batch;
         let mut say = |what: &str| problems.push(format!("batch {} of {id}: {what}", header.sequence));
+        if at != log_time {
+            say("it has another log time than its set");
+            continue;
+        }
+        if !is_named {
+            say("its frame_info names another frame or codec than a motion unit's");
+        }
         if header.set_id != set.id {
             say("its frame_info is of another set");
         }

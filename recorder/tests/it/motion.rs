@@ -131,15 +131,41 @@ fn the_motion_of_a_set_has_a_bound() {
         let r = Recorder::create(Arc::new(MemFs::new()), &dir(), session.clone(), options()).unwrap();
         (session, r)
     };
-    let most = (SET_MOTION_MAX_BYTES / 512) as u32;
+    let most = (SET_MOTION_MAX_BYTES / 512) as u32 - 2;
     let (session, r) = create(most);
     let mut long = set(&session, 0);
     let samples = (0..u64::from(most)).map(|k| sample(0, k)).collect();
     let mut header = long.motion[0].header;
     header.set_picture(PixelFormat::Motion, most, 1);
-    long.motion = vec![RecordMotion { unit: 0, header, samples }];
+    let whole = RecordMotion { unit: 0, header, samples };
+    long.motion = vec![whole, batch(&session, 1, 0)];
     let refused = r.push(long).unwrap_err();
     assert!(refused.message.contains("is the limit"), "{}", refused.message);
+}
+
+/// A file whose motion no set ever ends must not fill the memory of whoever reads it.
+#[test]
+fn motion_without_an_end_is_not_kept() {
+    let fs = MemFs::new();
+    record(&fs, 2, options());
+    let mut again = None;
+    rewrite(&fs, |m| {
+        if m.channel.topic == "/rig/front/imu/samples" && again.is_none() {
+            // The longest batch that a file says it has, and the set that it belongs to never ends.
+            let mut long = m.clone();
+            let n = SET_MOTION_MAX_BYTES as usize / 64;
+            long.data.to_mut()[4 + 16..4 + 20].copy_from_slice(&(n as u32).to_le_bytes());
+            long.data.to_mut().resize(28 + 64 * n, 0);
+            again = Some(());
+            *m = long;
+        }
+        true
+    });
+    let limit = format!("a set has more than {SET_MOTION_MAX_BYTES} bytes of motion before its mark");
+    assert_eq!(found(&fs).iter().filter(|f| **f == limit).count(), 1, "{:?}", found(&fs));
+    let sets: Vec<_> = open(&fs).sets(SetRange::ALL).collect();
+    assert!(sets.iter().any(|s| s.as_ref().is_err_and(|e| e.to_string().contains(&limit))));
+    assert!(sets.last().unwrap().is_ok(), "what follows is read");
 }
 
 #[test]
@@ -157,6 +183,21 @@ fn a_session_with_a_unit_in_the_wrong_place_is_refused() {
     assert!(among_pictures.contains("top/imu is a motion unit"), "{among_pictures}");
     let empty = create(|s| s.motion[0].batch = 0);
     assert!(empty.contains("batches of no samples"), "{empty}");
+    let long = create(|s| s.motion[1].batch = u32::MAX / 64 + 1);
+    assert!(long.contains("side/imu has batches of 67108864 samples, no set can hold one"), "{long}");
+    let many = create(|s| s.motion = (0..22_000).map(|i| unit(&format!("c{i}/imu"))).collect());
+    assert!(many.contains("22003 streams and motion units, 21000 is the limit"), "{many}");
+    // What another program wrote is read as far as a dataset can hold it.
+    let fs = MemFs::new();
+    record(&fs, 1, options());
+    let path = dir().join("session.toml");
+    let text = String::from_utf8(contents(&fs, &path)).unwrap();
+    fs.put(&path, text.replacen("batch = 5", "batch = 67108864", 1).into_bytes());
+    let refused = Dataset::open_with(Arc::new(fs), &dir()).err().unwrap();
+    assert!(
+        refused.kind() == ErrorKind::Corrupt && refused.to_string().contains("no set can hold one"),
+        "{refused}"
+    );
 }
 
 /// Readers that know ROS alone find the samples, and where the unit sits.
@@ -263,7 +304,7 @@ fn what_is_wrong_with_batches_and_samples_is_found() {
 #[test]
 fn what_is_not_there_is_told() {
     let lost = spoiled(|n, motion| motion.retain(|m| n != 1 || m.unit == 0));
-    assert_eq!(told(&lost), [(Severity::Lost, "2 batches of side/imu were not recorded".to_owned())]);
+    assert_eq!(told(&lost), [(Severity::Note, "2 batches of side/imu were not recorded".to_owned())]);
     // The device never gave these; of those that were lost before the channel its account tells.
     let gap = spoiled(|n, motion| {
         let mine = motion.iter_mut().filter(|m| n == 2 && m.unit == 0);
@@ -336,6 +377,22 @@ fn messages_that_lack_or_contradict_are_found() {
         true
     });
     assert_eq!(found(&fs), ["set 1: batch 2 of front/imu: its stamp is not its time"]);
+    let fs = of("/rig/front/imu/frame_info", &mut |n, m| {
+        if n == 2 {
+            let last = m.data.len() - 2; // of its codec
+            m.data.to_mut()[last] ^= 1;
+        }
+        true
+    });
+    let named =
+        "set 1: batch 2 of front/imu: its frame_info names another frame or codec than a motion unit's";
+    assert_eq!(found(&fs), [named]);
+    let fs = of("/rig/front/imu/frame_info", &mut |n, m| {
+        m.log_time += u64::from(n == 2);
+        true
+    });
+    let late = "set 1: batch 2 of front/imu: it has another log time than its set";
+    assert!(found(&fs).iter().any(|f| f == late), "{:?}", found(&fs));
     let fs = of("/rig/side/imu/data_raw", &mut |n, _| n != 9);
     assert_eq!(found(&fs), ["set 2: side/imu has 8 samples in its batches, 7 single ones"]);
     // Nothing else tells of a single sample that says otherwise than its batch: that takes decoding.

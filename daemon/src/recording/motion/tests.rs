@@ -62,19 +62,24 @@ impl Channel {
     }
 }
 
-fn with_two(rate_hz: f64, test: impl FnOnce(&mut Channel, &mut Channel, &mut Units, &mut Books)) {
-    let dir = tempfile::Builder::new().prefix("dr").tempdir_in("/tmp").unwrap();
-    let runtime = RuntimeDir::at(&dir.path().join("r")).unwrap();
-    let bus = Bus::open(&runtime, &Name::new("motion").unwrap()).unwrap();
-    let (mut a, mut b) = (Channel::new(&bus, "a", rate_hz), Channel::new(&bus, "b", rate_hz));
-    let facts = [&a, &b].map(|c| StreamFacts {
-        stream: Arc::clone(&c.facts.stream),
+/// Of a stream of which nothing else is known.
+fn facts_of(stream: &Arc<Stream>) -> StreamFacts {
+    StreamFacts {
+        stream: Arc::clone(stream),
         model: String::new(),
         serial: String::new(),
         calibration: String::new(),
         camera_pose: Pose::IDENTITY,
         computed: None,
-    });
+    }
+}
+
+fn with_two(rate_hz: f64, test: impl FnOnce(&mut Channel, &mut Channel, &mut Units, &mut Books)) {
+    let dir = tempfile::Builder::new().prefix("dr").tempdir_in("/tmp").unwrap();
+    let runtime = RuntimeDir::at(&dir.path().join("r")).unwrap();
+    let bus = Bus::open(&runtime, &Name::new("motion").unwrap()).unwrap();
+    let (mut a, mut b) = (Channel::new(&bus, "a", rate_hz), Channel::new(&bus, "b", rate_hz));
+    let facts = [&a, &b].map(|c| facts_of(&c.facts.stream));
     let mut units = Units::new(&facts, 5.0);
     units.begin();
     test(&mut a, &mut b, &mut units, &mut Books::default());
@@ -176,16 +181,18 @@ fn between_recordings_nothing_is_kept_and_every_batch_is_counted() {
 #[test]
 fn rare_sets_have_patience_for_two_of_them() {
     with_two(2.0, |a, _, _, _| {
-        let facts = [StreamFacts {
-            stream: Arc::clone(&a.facts.stream),
-            model: String::new(),
-            serial: String::new(),
-            calibration: String::new(),
-            camera_pose: Pose::IDENTITY,
-            computed: None,
-        }];
+        let facts = [facts_of(&a.facts.stream)];
         // Batches are at most 100 ms old, so that ten a second may come.
         assert_eq!(Units::new(&facts, 5.0).units[0].most, 40);
         assert_eq!(Units::new(&facts, 0.1).units[0].most, 200);
+        // What two sets that are an hour apart would have is more than one may hold.
+        let rare = Units::new(&facts, 1.0 / 3600.0).units[0].most;
+        let bytes = rare as u64 * RecordMotion::stored_bytes_of(4);
+        assert!(
+            bytes <= SET_MOTION_MAX_BYTES && bytes > SET_MOTION_MAX_BYTES * 9 / 10,
+            "{rare} batches of {bytes} bytes"
+        );
+        let two = [facts_of(&a.facts.stream), facts_of(&a.facts.stream)];
+        assert_eq!(Units::new(&two, 1.0 / 3600.0).units[0].most, rare / 2, "both share it");
     });
 }
