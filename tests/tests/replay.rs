@@ -2,18 +2,22 @@
 //! says. Long because a rig, its recording and two readers are set up for all of it.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
+use core::ops::ControlFlow;
 use depthrig_bus::{Bus, FrameFlags, FrameHeader, HostTime, RigName, SetSubscriber, StreamId, Subscriber};
+use depthrig_calib::stereo::Preset;
 use depthrig_daemon::ErrorKind;
 use depthrig_daemon::client::Client;
 use depthrig_daemon::control::{Control, RecordRequest, ReplayControl, SeekRequest};
 use depthrig_daemon::replay::{Replay, ReplayOptions};
 use depthrig_daemon::status::CameraState;
+use depthrig_daemon::zed_replay::{Mode, ZedReplayOptions, zed_replay};
 use depthrig_recorder::{
     ColorCodec, CompareOptions, Dataset, DepthCodec, PixelCheck, SetRange, Severity, VerifyOptions, compare,
     verify,
 };
 use depthrig_tests::Home;
 use depthrig_tests::disk::Tmpfs;
+use depthrig_tests::eyes::Eyes;
 use depthrig_tests::made::{Made, SECOND};
 use std::fmt::Write;
 use std::path::PathBuf;
@@ -596,6 +600,26 @@ fn datasets_of_different_cameras_are_one_rig() {
     assert!(h.contains(&format!("({right}, 15000,")), "{h}");
     let members = &bench.seen[4][1];
     assert!(streams.iter().all(|s| members.contains(&format!("{:?}", s.camera))), "{members}");
+}
+
+/// A recording beside the depth that was made of it: both have the unit's samples, and they come once.
+#[test]
+fn motion_that_two_datasets_have_comes_once() {
+    let home = Home::default();
+    let (raw, depth) = (home.path("raw"), home.path("depth"));
+    let eyes = Eyes::default();
+    eyes.record(&raw);
+    let modes = vec![Mode::Preset(Preset::Performance)];
+    let options = ZedReplayOptions { modes, ..ZedReplayOptions::default() };
+    zed_replay(&raw, &depth, &options, &mut |_, _, _| ControlFlow::Continue(())).unwrap();
+    let replay = start(&home, &[raw, depth], FAST);
+    let id = |name| StreamId::new("zed2i", name).unwrap();
+    let mut bench = Bench::new(&home, "bench", vec![id("imu"), id("left"), id("depth_performance")]);
+    resume(&replay);
+    bench.read_all(&replay, None);
+    let status = replay.stop().status;
+    assert_eq!((status.sets, status.lost.len()), (eyes.sets, 0), "{:?}", status.lost);
+    assert_eq!(bench.seen.iter().map(Vec::len).collect::<Vec<_>>()[..3], [eyes.sets as usize; 3]);
 }
 
 #[test]

@@ -293,7 +293,8 @@ fn patiently<T>(
             told = true;
             tracing::warn!(
                 channel,
-                "the replay waits: a subscriber reads no further, or holds more than {} frames",
+                "the replay waits: a subscriber reads no further, or holds more than {} frames (a motion unit sends more \
+                 batches than that before a set: whoever waits for the set must read it meanwhile)",
                 SUBSCRIBER_BUFFER - 1
             );
         }

@@ -31,8 +31,9 @@ struct Source {
     reader: SetReader,
     /// The rig's stream of each stream of this dataset.
     streams: Vec<usize>,
-    /// The rig's motion unit of each of this dataset.
-    units: Vec<usize>,
+    /// The rig's motion unit of each of this dataset; `None` where a dataset before it gives the same unit at the same
+    /// times, as a recording beside what was computed of it does.
+    units: Vec<Option<usize>>,
 }
 
 /// One moment of a replay: a set, or several that were paired.
@@ -74,8 +75,14 @@ impl Sources {
             for record in &dataset.session().streams {
                 indices.push(join(&mut streams, record, &dataset)?);
             }
-            let of_rig =
-                dataset.session().motion.iter().map(|record| join_unit(&mut units, record)).collect();
+            let overlaps = |s: &Source| overlap(s.reader.times(), reader.times());
+            let given: BTreeSet<usize> = sources
+                .iter()
+                .filter(|s| overlaps(s))
+                .flat_map(|s| s.units.iter().flatten().copied())
+                .collect();
+            let mut unit = |record| Some(join_unit(&mut units, record)).filter(|i| !given.contains(i));
+            let of_rig = dataset.session().motion.iter().map(&mut unit).collect();
             sources.push(Source { dataset, reader, streams: indices, units: of_rig });
         }
         let Some(first) = sources.first_mut() else {
@@ -265,11 +272,17 @@ fn shift(offset_ns: i64, base_ns: i64) -> i64 {
     if shift.saturating_abs() < SAME_CLOCK_NS { 0 } else { shift }
 }
 
+/// Whether there is a time between the first and the last of both.
+fn overlap(a: &[i64], b: &[i64]) -> bool {
+    let ends = |t: &[i64]| t.first().copied().zip(t.last().copied());
+    ends(a).zip(ends(b)).is_some_and(|((a0, a1), (b0, b1))| a0 <= b1 && b0 <= a1)
+}
+
 /// Adds a set to a moment.
 fn take(
     moment: &mut Moment,
     set: DatasetSet,
-    (streams, units): (&[usize], &[usize]),
+    (streams, units): (&[usize], &[Option<usize>]),
     shift_ns: i64,
     first: bool,
 ) {
@@ -290,8 +303,8 @@ fn take(
         moment.frames.push(frame);
     }
     for mut batch in set.motion {
-        let Some(unit) = units.get(batch.unit) else { continue };
-        batch.unit = *unit;
+        let Some(unit) = units.get(batch.unit).copied().flatten() else { continue };
+        batch.unit = unit;
         move_header(&mut batch.header);
         batch.samples.iter_mut().for_each(|s| s.time_ns = s.time_ns.saturating_add(shift_ns));
         moment.motion.push(batch);
