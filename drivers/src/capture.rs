@@ -107,7 +107,7 @@ impl Capture {
         HostTime::from_ns(self.shared.heartbeat_ns.load(Ordering::Relaxed))
     }
 
-    /// When a frame was last delivered or dropped; `None` before the first.
+    /// When a frame was last delivered or dropped, of a camera with pictures a picture; `None` before the first.
     pub fn last_frame(&self) -> Option<HostTime> {
         match self.shared.last_frame_ns.load(Ordering::Relaxed) {
             0 => None,
@@ -165,7 +165,10 @@ fn run(open: impl FnOnce() -> Result<Session>, shared: &Shared) -> End {
         Ok(session) => session,
         Err(e) => return End::Failed(e),
     };
-    let mut guarded = Guarded { sink: sink.as_mut(), shared };
+    // Of a camera that has pictures these say whether it runs: its motion unit talks on when it sends none.
+    let has_pictures = stream.profiles().iter().any(|p| !p.format.is_motion());
+    let counts = stream.profiles().iter().map(|p| !(has_pictures && p.format.is_motion())).collect();
+    let mut guarded = Guarded { sink: sink.as_mut(), shared, counts };
     while !shared.stop.load(Ordering::Relaxed) {
         shared.beat();
         match stream.poll(POLL_TIMEOUT, &mut guarded) {
@@ -181,6 +184,8 @@ fn run(open: impl FnOnce() -> Result<Session>, shared: &Shared) -> End {
 struct Guarded<'a> {
     sink: &'a mut dyn FrameSink,
     shared: &'a Shared,
+    /// Of each stream whether its frames are a sign of life.
+    counts: Vec<bool>,
 }
 
 impl Guarded<'_> {
@@ -188,7 +193,10 @@ impl Guarded<'_> {
         self.shared.abandoned.load(Ordering::SeqCst)
     }
 
-    fn note_frame(&self) {
+    fn note_frame(&self, stream: usize) {
+        if self.counts.get(stream) == Some(&false) {
+            return;
+        }
         self.shared.last_frame_ns.store(HostTime::now().ns(), Ordering::Relaxed);
     }
 }
@@ -199,7 +207,7 @@ impl FrameSink for Guarded<'_> {
     }
 
     fn commit(&mut self, stream: usize, meta: &FrameMeta) {
-        self.note_frame();
+        self.note_frame(stream);
         let _no_abandoning_meanwhile = self.shared.end.lock().unwrap_or_else(PoisonError::into_inner);
         if self.is_abandoned() {
             self.sink.discard(stream);
@@ -218,7 +226,7 @@ impl FrameSink for Guarded<'_> {
     }
 
     fn commit_lent(&mut self, stream: usize, loan: Loan, meta: &FrameMeta) {
-        self.note_frame();
+        self.note_frame(stream);
         let _no_abandoning_meanwhile = self.shared.end.lock().unwrap_or_else(PoisonError::into_inner);
         if self.is_abandoned() {
             drop(loan);
@@ -229,13 +237,13 @@ impl FrameSink for Guarded<'_> {
     }
 
     fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
-        self.note_frame();
+        self.note_frame(stream);
         let reason = if self.is_abandoned() { DropReason::Abandoned } else { reason };
         self.sink.dropped(stream, reason, n);
     }
 
     fn gave_way(&mut self, stream: usize, n: u64) {
-        self.note_frame();
+        self.note_frame(stream);
         if self.is_abandoned() {
             self.sink.dropped(stream, DropReason::Abandoned, n);
         } else {

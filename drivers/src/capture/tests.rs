@@ -4,11 +4,11 @@ use super::*;
 use crate::StreamProfile;
 
 /// A device that behaves as `act` says at every poll.
-struct Act<F>(F);
+struct Act<F>(F, Vec<StreamProfile>);
 
 impl<F: FnMut(Duration, &mut dyn FrameSink) -> Result<Poll> + Send> Stream for Act<F> {
     fn profiles(&self) -> &[StreamProfile] {
-        &[]
+        &self.1
     }
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
         (self.0)(timeout, sink)
@@ -41,11 +41,52 @@ fn start(
     sink: &Counting,
     act: impl FnMut(Duration, &mut dyn FrameSink) -> Result<Poll> + Send + 'static,
 ) -> Capture {
+    start_with(Vec::new(), sink, act)
+}
+
+fn start_with(
+    profiles: Vec<StreamProfile>,
+    sink: &Counting,
+    act: impl FnMut(Duration, &mut dyn FrameSink) -> Result<Poll> + Send + 'static,
+) -> Capture {
     let sink = sink.clone();
     Capture::spawn("cam", move || {
-        Ok(Session { info: DeviceInfo::default(), stream: Box::new(Act(act)), sink: Box::new(sink) })
+        Ok(Session {
+            info: DeviceInfo::default(),
+            stream: Box::new(Act(act, profiles)),
+            sink: Box::new(sink),
+        })
     })
     .unwrap()
+}
+
+/// A unit that talks says nothing of whether the pictures come, unless there are none.
+#[test]
+fn motion_is_no_sign_of_pictures() {
+    let clock = crate::DeviceClock::microseconds(64);
+    let pose = depthrig_bus::Pose::IDENTITY;
+    let unit = crate::motion::profile(100.0, 8, pose, clock, depthrig_bus::MetadataLevel::Simulated).unwrap();
+    let picture = StreamProfile { format: depthrig_bus::PixelFormat::Mono8, ..unit.clone() };
+    for (profiles, is_seen) in [(vec![unit.clone()], true), (vec![picture, unit], false)] {
+        let (sink, motion) = (Counting::default(), profiles.len() - 1);
+        let (go, shown) = (Arc::new(AtomicBool::new(false)), Arc::clone(&sink.0));
+        let gone = Arc::clone(&go);
+        let capture = start_with(profiles, &sink, move |_, sink| {
+            let stream = if gone.load(Ordering::SeqCst) { 0 } else { motion };
+            sink.commit(stream, &meta());
+            std::thread::sleep(Duration::from_millis(1));
+            Ok(Poll::Frame)
+        });
+        while shown.lock().unwrap().0 < 3 {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        assert_eq!(capture.last_frame().is_some(), is_seen);
+        go.store(true, Ordering::SeqCst);
+        while capture.last_frame().is_none() {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        assert!(matches!(capture.stop(Duration::from_secs(5)), StopOutcome::Ended(End::Stopped)));
+    }
 }
 
 fn meta() -> FrameMeta {
