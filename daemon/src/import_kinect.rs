@@ -196,7 +196,7 @@ impl KinectImport {
         let Some(at) = self.streams.iter().position(|s| s.track == track) else {
             match &mut self.motion {
                 Some(unit) if unit.track() == track => {
-                    block.frames().for_each(|f| unit.take(f, self.origin_ns));
+                    block.frames().for_each(|f| unit.take(f, device_us, self.origin_ns));
                 }
                 _ => self.others += 1,
             }
@@ -441,13 +441,18 @@ impl Importer for KinectImport {
             ));
         }
         facts.left_out = self.left_out();
-        let account = |s: &Stream| StreamAccount {
-            stream: s.record.id.clone(),
-            captured: s.sequence.saturating_add(s.dropped.total()),
-            delivered: s.sequence,
-            dropped: s.dropped,
+        let account = |(i, s): (usize, &Stream)| {
+            // A set that was not handed on when the import was ended is not in the dataset.
+            let held = self.held.iter().flat_map(|set| &set.frames).filter(|f| f.stream == i).count() as u64;
+            let delivered = s.sequence - held;
+            StreamAccount {
+                stream: s.record.id.clone(),
+                captured: delivered.saturating_add(s.dropped.total()),
+                delivered,
+                dropped: s.dropped,
+            }
         };
-        facts.accounts = self.streams.iter().map(account).collect();
+        facts.accounts = self.streams.iter().enumerate().map(account).collect();
         facts.accounts.extend(self.motion.as_ref().map(motion::Unit::account));
         facts
     }

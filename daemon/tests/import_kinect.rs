@@ -5,7 +5,7 @@ use depthrig_bus::{DropReason, Name, PixelFormat};
 use depthrig_daemon::import_kinect::{KinectImport, KinectOptions};
 use depthrig_drivers::kinect::playback::CalibrationSource;
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
-use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Lacing, Pattern, Pictures, motion};
+use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Lacing, Pattern, Pictures, damage_time, motion};
 use depthrig_recorder::exchange::{ImportFacts, ImportReport, Importer, import};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{
@@ -269,6 +269,22 @@ fn samples_of_motion_come_over_with_their_sets() {
     assert!(!facts.stated.iter().any(|s| s.contains("gyroscope")) && facts.accounts.len() == 3);
 }
 
+/// A sample of another century is left out; those around it come over, and the dataset is whole.
+#[test]
+fn a_sample_whose_time_is_damaged_is_left_out_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let fixture = Fixture { checksums: false, captures: 9, ..Fixture::small() };
+    let (path, out) = (dir.path().join("a.mkv"), dir.path().join("out"));
+    fixture.write(&path, &mut Pattern::new(&fixture)).unwrap();
+    damage_time(&path, &fixture, 70);
+    let mut importer = KinectImport::open(&path, options(CalibrationSource::Recorded)).unwrap();
+    let go_on = &mut |_| ControlFlow::Continue(());
+    let report = import(&mut importer, Arc::new(RealFs), &out, RecorderOptions::default(), go_on).unwrap();
+    assert_eq!(report.facts.left_out["motion_samples"], 1);
+    assert_eq!(report.verified.motion_samples, fixture.bytes_and_places().1.motion - 1);
+    assert!(report.verified.broken().is_none(), "{:?}", report.verified.findings);
+}
+
 /// A dataset of a recording says how much of it came over.
 #[test]
 fn samples_of_motion_are_told_in_the_report_and_in_the_dataset() {
@@ -378,6 +394,22 @@ fn what_is_there_is_not_overwritten_and_an_import_may_be_ended() {
     assert!(report.ended && report.verified.is_whole(), "{:?}", report.verified);
     let dataset = Dataset::open(&out).unwrap();
     assert_eq!(dataset.set_reader().unwrap().times().len(), 10, "what was read until then");
+    // Accounts are of what is there, and what was read and is not there was left out.
+    let delivered: Vec<_> =
+        report.facts.accounts.iter().map(|a| (a.stream.to_string(), a.captured, a.delivered)).collect();
+    let in_sets = sets(&dataset, PixelMode::None);
+    for (at, (stream, captured, delivered)) in delivered.iter().enumerate() {
+        let there = match dataset.session().streams.get(at) {
+            Some(_) => in_sets.iter().flat_map(|s| &s.frames).filter(|f| f.stream == at).count(),
+            None => in_sets.iter().map(|s| s.motion.len()).sum(),
+        };
+        assert_eq!((*captured, *delivered), (there as u64, there as u64), "{stream}");
+    }
+    let samples: usize = in_sets.iter().flat_map(|s| &s.motion).map(|b| b.samples.len()).sum();
+    let left_out = report.facts.left_out["motion_samples"];
+    let said =
+        format!("{samples} samples of accelerometer and gyroscope came over, {left_out} were left out");
+    assert!(left_out > 0 && report.facts.stated.contains(&said), "{said} {:?}", report.facts.stated);
     let table = &dataset.session().extra["import"];
     assert_eq!(table["ended_early"].as_bool(), Some(true));
     let before = std::fs::read(out.join("session.toml")).unwrap();

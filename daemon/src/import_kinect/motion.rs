@@ -5,7 +5,7 @@
 
 use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameHeader, MotionSample, PixelFormat};
 use depthrig_drivers::kinect::Calibration;
-use depthrig_drivers::kinect::motion::{Measured, Samples};
+use depthrig_drivers::kinect::motion::{Measured, Samples, is_plausible};
 use depthrig_drivers::kinect::recording::motion_samples;
 use depthrig_drivers::motion::LONGEST;
 use depthrig_recorder::{MotionRecord, RecordMotion, RecordSet, StreamAccount};
@@ -23,6 +23,8 @@ pub(super) struct Unit {
     numbers: Samples,
     /// The batch in the making.
     open: Vec<MotionSample>,
+    /// The device's time of the newest sample.
+    newest_ns: Option<u64>,
     waiting: VecDeque<RecordMotion>,
     batches: u64,
     samples: u64,
@@ -38,6 +40,7 @@ impl Unit {
             record,
             track,
             numbers: Samples::new(calibration),
+            newest_ns: None,
             waiting: VecDeque::new(),
             batches: 0,
             samples: 0,
@@ -56,29 +59,41 @@ impl Unit {
         self.track
     }
 
-    /// Samples that are in sets, or wait for one.
-    pub(super) const fn samples(&self) -> u64 {
-        self.samples
+    /// Samples that are in sets.
+    pub(super) fn samples(&self) -> u64 {
+        self.samples - self.waiting_samples()
     }
 
     /// Samples that are in none.
-    pub(super) const fn left_out(&self) -> u64 {
-        self.left_out
+    pub(super) fn left_out(&self) -> u64 {
+        self.left_out + self.waiting_samples() + self.open.len() as u64
+    }
+
+    fn waiting_samples(&self) -> u64 {
+        self.waiting.iter().map(|b| b.samples.len() as u64).sum()
     }
 
     /// What became of its batches.
     pub(super) fn account(&self) -> StreamAccount {
+        let delivered = self.batches - self.waiting.len() as u64;
         StreamAccount {
             stream: self.record.id.clone(),
-            captured: self.batches.saturating_add(self.dropped.total()),
-            delivered: self.batches,
+            captured: delivered.saturating_add(self.dropped.total()),
+            delivered,
             dropped: self.dropped,
         }
     }
 
-    /// Takes the samples of a block's frame; UTC at the device's time 0 is `origin_ns`.
-    pub(super) fn take(&mut self, frame: &[u8], origin_ns: i64) {
+    /// Takes the samples of a frame of the block at `device_us`; UTC at the device's time 0 is `origin_ns`.
+    pub(super) fn take(&mut self, frame: &[u8], device_us: u64, origin_ns: i64) {
         for raw in motion_samples(frame) {
+            // As pictures: what is not later than the one before has no place, nor what cannot be its time.
+            let is_late = self.newest_ns.is_some_and(|newest| raw.gyroscope_ns < newest);
+            if is_late || !is_plausible(raw.gyroscope_ns, device_us) {
+                self.left_out += 1;
+                continue;
+            }
+            self.newest_ns = Some(raw.gyroscope_ns);
             let Some(mut sample) = self.numbers.take(&Measured::from(raw)) else { continue };
             let device_ns = i64::try_from(raw.gyroscope_ns).unwrap_or(i64::MAX);
             sample.time_ns = origin_ns.saturating_add(device_ns);

@@ -78,6 +78,12 @@ pub fn pose(calibration: Option<&Calibration>) -> Pose {
     sensor.map_or(Pose::IDENTITY, |s| s.sensor_from_device.inverse())
 }
 
+/// Whether a sample of a recorded block at `device_us` can have been measured at `gyroscope_ns`: blocks hold some milliseconds,
+/// and what lies a minute later is damaged. Believed, it would hold up all samples after it.
+pub const fn is_plausible(gyroscope_ns: u64, device_us: u64) -> bool {
+    gyroscope_ns <= device_us.saturating_mul(1000).saturating_add(60_000_000_000)
+}
+
 /// Numbers samples and brings them into the unit's frame.
 #[derive(Debug, Clone)]
 pub struct Samples {

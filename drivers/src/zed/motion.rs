@@ -31,6 +31,8 @@ const SILENCE: Duration = Duration::from_millis(500);
 const PERIOD_NS: u64 = 2_500_000;
 /// Samples that may wait for whoever reads them: 2.5 s of them.
 pub const QUEUE: usize = 1024;
+/// Records that may be missing at once: an hour of them.
+const JUMP: u64 = 3600 * 400;
 /// Records between two looks at how the clock's map is doing: a second of them.
 const QUALITY_EVERY: u64 = 400;
 
@@ -206,6 +208,7 @@ fn run(reports: &mut dyn Reports, shared: &Shared, queue: Option<&SyncSender<Sam
     let mut silent_at = HostTime::now().plus(SILENCE);
     let mut buffer = [0; 64];
     let mut last_ticks: Option<u64> = None;
+    let mut last: Option<(u32, HostTime)> = None;
     let (mut sequence, mut lost_before) = (0, 0);
     while !shared.stop.load(Ordering::Relaxed) {
         if awake_until.from_now().is_zero() {
@@ -226,15 +229,23 @@ fn run(reports: &mut dyn Reports, shared: &Shared, queue: Option<&SyncSender<Sam
         // The unit has no counter; how many records there should have been follows from its clock.
         let steps = last_ticks.map_or(1, |last| {
             let ticks = record.ticks.saturating_sub(last);
-            (ticks as f64 * tick_ns / PERIOD_NS as f64).round().max(1.0) as u64
+            let steps = (ticks as f64 * tick_ns / PERIOD_NS as f64).round().max(1.0) as u64;
+            // So much is no gap, its clock jumped.
+            if steps > JUMP { 1 } else { steps }
         });
         last_ticks = Some(record.ticks);
         sequence += steps;
         let mapped = clock.observe(record.ticks, sequence, arrival);
+        // Ticks that stand still are another sample all the same, and samples of an epoch rise.
+        let time = match last {
+            Some((epoch, last)) if epoch == mapped.epoch && mapped.capture_time <= last => last.plus_ns(1),
+            _ => mapped.capture_time,
+        };
+        last = Some((mapped.epoch, time));
         let sample = Sample {
             record,
             number: sequence,
-            time: mapped.capture_time,
+            time,
             uncertainty_ns: mapped.uncertainty_ns,
             device_time: mapped.device_time,
             epoch: mapped.epoch,

@@ -183,3 +183,16 @@ pub fn motion(fixture: &Fixture, i: u64) -> (u64, [f32; 3], [f32; 3]) {
     let swing = (i as f32 * 0.01).sin();
     (at, [0.2 * swing, -9.81, 0.1], [0.01, 0.02 * swing, i as f32])
 }
+
+/// Puts the gyroscope's time of sample `i` of a written recording without checksums into another century.
+pub fn damage_time(path: &Path, fixture: &Fixture, i: u64) {
+    let (at_ns, acceleration, _) = motion(fixture, i);
+    let mut sample = acceleration.map(f32::to_le_bytes).concat();
+    sample.extend(at_ns.to_le_bytes());
+    let mut bytes = std::fs::read(path).unwrap();
+    let places: Vec<_> =
+        (0..bytes.len() - sample.len()).filter(|at| bytes[*at..].starts_with(&sample)).collect();
+    assert_eq!(places.len(), 1, "where the sample is");
+    bytes[places[0] + sample.len() - 2] ^= 0x40;
+    std::fs::write(path, bytes).unwrap();
+}

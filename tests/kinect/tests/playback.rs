@@ -6,7 +6,7 @@ use depthrig_drivers::conformance::{self, Bench, Cannot, Rig, Sent, Subject, Tro
 use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackBackend, PlaybackConfig};
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
 use depthrig_drivers::{Backend, DeviceInfo, ErrorKind, MemorySink, Poll, Stream, StreamRequest};
-use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Lacing, Pattern, Pictures, motion};
+use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Lacing, Pattern, Pictures, damage_time, motion};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tempfile::TempDir;
@@ -338,6 +338,43 @@ fn samples_of_motion_are_played_with_the_pictures() {
         let apart_ns = near.time().since_ns(depth.capture_time).abs();
         assert!(apart_ns < 40_000_000, "{apart_ns} ns apart");
     }
+}
+
+/// Colour alone is decoded from a pass over the file of its own; the other pass must not run ahead to the end.
+#[test]
+fn colour_alone_begins_before_the_file_is_read() {
+    let read_by_me = || {
+        let io = std::fs::read_to_string("/proc/thread-self/io").unwrap();
+        let first = io.lines().next().unwrap().strip_prefix("rchar: ").unwrap();
+        first.parse::<u64>().unwrap()
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let color = Some(ColorMode { format: ColorFormat::Mjpg, resolution: ColorResolution::P720 });
+    let path = write(dir.path(), &Fixture { color, captures: 30, ..Fixture::small() });
+    let bytes = path.metadata().unwrap().len();
+    let (_, mut stream) = start(PlaybackConfig::new(&path), &[request("color")]);
+    let before = read_by_me();
+    let sink = play(stream.as_mut(), 1);
+    let read = read_by_me() - before;
+    assert_eq!(sink.delivered(0), 1);
+    assert!(read < bytes / 4, "{read} of {bytes} bytes were read for the first picture");
+    assert_eq!(all(&path, &[request("color")]).delivered(0), 30);
+}
+
+/// A sample of another century is left out; those around it are played.
+#[test]
+fn a_sample_whose_time_is_damaged_does_not_hold_up_the_others() {
+    let dir = tempfile::tempdir().unwrap();
+    let fixture = Fixture { checksums: false, captures: 8, ..Fixture::small() };
+    let path = write(dir.path(), &fixture);
+    let written = fixture.bytes_and_places().1.motion;
+    damage_time(&path, &fixture, 70);
+    let samples = motion_of(&all(&path, &[request("imu")]), 0);
+    assert_eq!(samples.len() as u64, written - 1);
+    assert!(samples.is_sorted_by(|a, b| a.sequence < b.sequence && a.time_ns < b.time_ns));
+    let config = PlaybackConfig { looped: true, rate: f64::INFINITY, ..PlaybackConfig::new(&path) };
+    let sink = play(start(config, &[request("depth"), request("imu")]).1.as_mut(), 60);
+    assert!(motion_of(&sink, 1).len() as u64 > written, "rounds after the first have samples");
 }
 
 /// Round after round numbers and times go on.

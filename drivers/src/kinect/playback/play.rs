@@ -5,7 +5,7 @@ use super::ahead::Ahead;
 use super::cursor::{Cursor, Next};
 use crate::kinect::Calibration;
 use crate::kinect::live::counter::FrameCounter;
-use crate::kinect::motion::{self, Measured, Unit};
+use crate::kinect::motion::{self, Measured, Unit, is_plausible};
 use crate::kinect::recording::{Pixels, Recording, motion_samples};
 use crate::{FrameSink, Gate, Poll, RawFrame, Result, Stream, StreamProfile, unpack};
 use core::time::Duration;
@@ -112,6 +112,10 @@ impl Player {
 
     /// Reads on until the next picture is known, keeping samples of motion that come before it.
     fn read(&mut self) -> Result<()> {
+        if self.motion.is_none() && self.lanes.iter().all(|l| l.how == How::Decode) {
+            // Nothing is wanted of this pass over the file, which would go on to the end.
+            return Ok(());
+        }
         while self.next.is_none() && self.motion.as_ref().is_none_or(|m| m.waiting.len() < MOST_WAITING) {
             let (lanes, motion_track) = (&self.lanes, self.motion.as_ref().map(|m| m.track));
             let is_picture = |track| lanes.iter().any(|l| l.track == track && l.how != How::Decode);
@@ -171,6 +175,9 @@ impl Motion {
     fn read(&mut self, recording: &Recording, next: &Next) {
         let shift_ns = next.at_us.saturating_sub(next.block.device_us).saturating_mul(1000);
         for s in recording.frames(&next.block).flat_map(motion_samples) {
+            if !is_plausible(s.gyroscope_ns, next.block.device_us) {
+                continue;
+            }
             let mut m = Measured::from(s);
             m.gyroscope_ns = m.gyroscope_ns.saturating_add(shift_ns);
             m.accelerometer_ns = m.accelerometer_ns.saturating_add(shift_ns);
