@@ -41,7 +41,7 @@ const LIMIT_PX: f64 = 0.4;
 pub struct RowOffset {
     /// In the middle of the picture, pixels.
     pub middle_px: f64,
-    /// How much more it is at the right side than at the left one, pixels; 0 when that cannot be shown.
+    /// How much more it is at the right side than at the left one, pixels; 0 when neither this nor the next can be shown.
     pub across_px: f64,
     /// How much more it is at the bottom than at the top, pixels; likewise.
     pub down_px: f64,
@@ -123,9 +123,6 @@ pub struct RowCheck {
     scratch: Vec<f64>,
 }
 
-/// Places of a pair at most.
-const PLACES: usize = 512;
-
 impl RowCheck {
     /// Pairs whose places count at once: those of one more replace the oldest pair's.
     pub const PAIRS: usize = PAIRS;
@@ -134,7 +131,8 @@ impl RowCheck {
     pub fn new(width: usize, height: usize) -> Self {
         let pyramid = Pyramid::new((width, height), WIDTH);
         let scale = 1_usize << pyramid.halvings();
-        let (w, _) = pyramid.smallest((width, height));
+        let (w, h) = pyramid.smallest((width, height));
+        let places = track::most_places(w, h);
         // The outermost rows are searched only to know that the best is not beyond them.
         let rows = ROWS_PX.div_ceil(scale).max(3) as isize + 1;
         let reach = Reach { near: -4, far: (w / 5).max(8) as isize, rows };
@@ -143,12 +141,12 @@ impl RowCheck {
             size: (width, height),
             pyramid,
             reach,
-            places: Vec::with_capacity(PLACES),
+            places: Vec::with_capacity(places),
             scores: Vec::with_capacity(scores),
-            points: Vec::with_capacity(PLACES * PAIRS),
+            points: Vec::with_capacity(places * PAIRS),
             counts: [0; PAIRS],
             pairs: 0,
-            scratch: Vec::with_capacity(PLACES * PAIRS),
+            scratch: Vec::with_capacity(places * PAIRS),
         }
     }
 

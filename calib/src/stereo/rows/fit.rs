@@ -69,6 +69,11 @@ pub fn fit(points: &[Point], is_flat: bool, scratch: &mut Vec<f64>) -> Option<Pl
         let share = error / (TUKEY * scale);
         (1.0 - share * share).max(0.0).powi(2)
     };
+    // Of `weight` times the error.
+    let slope = |error: f64, scale: f64| {
+        let square = (error / (TUKEY * scale)).powi(2);
+        (1.0 - square) * (1.0 - 5.0 * square)
+    };
     for _ in 0..ROUNDS {
         scratch.clear();
         scratch.extend(points.iter().map(|p| (p.rows - row(p).dot(terms)).abs()));
@@ -97,11 +102,14 @@ pub fn fit(points: &[Point], is_flat: bool, scratch: &mut Vec<f64>) -> Option<Pl
     let mut by_pair = [DVec3::ZERO; PAIRS];
     let (mut used, mut pairs) = ([false; SQUARES.0 * SQUARES.1], [false; PAIRS]);
     let mut agree = 0_usize;
+    let (mut weights, mut slopes) = (0.0, 0.0);
     for p in points {
         let r = row(p);
         let error = p.rows - r.dot(terms);
         let w = weight(error, scale);
         if w > 0.0 {
+            weights += w;
+            slopes += slope(error, scale);
             let (square, pair) = (p.square(), p.pair % PAIRS);
             by_square[square] += r * (w * error);
             by_pair[pair] += r * (w * error);
@@ -115,7 +123,10 @@ pub fn fit(points: &[Point], is_flat: bool, scratch: &mut Vec<f64>) -> Option<Pl
         if n > 1.0 { bread * all * bread * (n / (n - 1.0)) } else { DMat3::ZERO }
     };
     let v = spread(&by_square, &used) + spread(&by_pair, &pairs);
-    let deviations = DVec3::new(v.x_axis.x, v.y_axis.y, v.z_axis.z).max(DVec3::ZERO).map(f64::sqrt);
+    // Such an estimate divides by the slopes of what is summed, `normal` has the weights in their place (Huber 1981, 7.6).
+    let steeper = weights / slopes.max(0.5 * weights).max(f64::MIN_POSITIVE);
+    let variances = DVec3::new(v.x_axis.x, v.y_axis.y, v.z_axis.z).max(DVec3::ZERO);
+    let deviations = variances.map(f64::sqrt) * steeper.max(1.0);
     let squares = used.iter().filter(|u| **u).count();
     Some(Plane { terms, deviations, agree: agree as f64 / points.len() as f64, squares })
 }

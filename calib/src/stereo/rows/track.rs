@@ -94,15 +94,25 @@ impl Part {
     }
 }
 
+/// Left or upper sides of the squares along a side of the small copy.
+fn squares(side: usize) -> impl ExactSizeIterator<Item = usize> {
+    let margin = PATCH / 2 + 1;
+    (margin..side.saturating_sub(margin).max(margin)).step_by(CELL)
+}
+
+/// Places that a small copy gives at most.
+pub fn most_places(width: usize, height: usize) -> usize {
+    squares(width).len() * squares(height).len()
+}
+
 /// The most distinctive place of each square of the small copy: where grey changes most along the direction in which it
-/// changes least (Shi and Tomasi 1994).
+/// changes least (Shi and Tomasi 1994). `out` has room for [`most_places`].
 pub fn places(picture: &Gray<'_>, out: &mut Vec<(u16, u16)>) {
     out.clear();
     let half = PATCH as isize / 2;
     let (w, h) = (picture.width as isize, picture.height as isize);
-    let cells = |side: isize| (half + 1..side - half - 1).step_by(CELL);
-    for top in cells(h) {
-        for left in cells(w) {
+    for top in squares(picture.height).map(|at| at as isize) {
+        for left in squares(picture.width).map(|at| at as isize) {
             let mut best = (TEXTURE, None);
             for y in (top..(top + CELL as isize).min(h - half - 1)).step_by(2) {
                 for x in (left..(left + CELL as isize).min(w - half - 1)).step_by(2) {
@@ -112,7 +122,7 @@ pub fn places(picture: &Gray<'_>, out: &mut Vec<(u16, u16)>) {
                     }
                 }
             }
-            out.extend(best.1.filter(|_| out.len() < out.capacity()));
+            out.extend(best.1);
         }
     }
 }
@@ -145,7 +155,7 @@ struct Best {
 }
 
 /// The best place in `picture` for a part around `(x, y)`, and the best correlations of places that are no neighbours of it:
-/// in other rows, and in its own. Places within `apart` of `(x, y)` are left out.
+/// in other rows, and in its own.
 fn search(
     part: &Part,
     picture: &Gray<'_>,
