@@ -70,7 +70,7 @@ for part in "$@"; do
 done
 
 if ! command -v cargo >/dev/null; then
-    echo "Rust is missing: install the stable toolchain (1.91 or later) with rustup, see https://rustup.rs" >&2
+    echo "Rust is missing: install the stable toolchain (1.92 or later) with rustup, see https://rustup.rs" >&2
     exit 1
 fi
 [ ${#missing[@]} -eq 0 ] && exit 0

@@ -1,6 +1,6 @@
 //! Prints how good the depth of the simulated cameras is, raw and filled, and writes pictures of it.
 //!
-//! `cargo run --release --workspace --example fill [-- FOLDER [MODEL...]]`; without a folder no pictures are written.
+//! `cargo run --release -p depthrig-tests --example fill [-- FOLDER [MODEL...]]`; without a folder no pictures are written.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stdout)] // a measuring program: any failure ends it
 
 use depthrig_cdm::metrics::{Dataset, Depth, DepthRange, Measured};

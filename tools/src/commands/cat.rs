@@ -97,7 +97,7 @@ pub fn run(args: &CatArgs, context: &Context) -> Result<Exit> {
     let choice = FrameChoice { sets, every: args.every as usize, streams: args.streams.clone() };
     let units = dataset.session().motion.iter();
     let units: Vec<_> = units.map(|u| &u.id).filter(|id| args.streams.contains(id)).cloned().collect();
-    if !units.is_empty() && units.len() == args.streams.len() {
+    if !units.is_empty() && args.streams.iter().all(|s| units.contains(s)) {
         return motion(args, &dataset, &units, sets);
     }
     let done = match &args.out {

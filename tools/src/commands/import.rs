@@ -56,8 +56,8 @@ Examples:
   depthrig import rosbag 20260314_151200.bag data/small --color-codec jpeg --json";
 
 const KINECT_EXAMPLES: &str = "\
-JPEG, depth and infrared come over as they are, with the device's times, calibration and serial
-number; samples of motion do not. A file that was cut or damaged gives every cluster that is whole.
+JPEG, depth, infrared and samples of motion come over as they are, with the device's times, calibration
+and serial number. A file that was cut or damaged gives every cluster that is whole.
 
 Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage or input, 3 imported, but
 some of the file could not be.

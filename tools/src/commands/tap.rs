@@ -45,9 +45,6 @@ pub fn run(args: &TapArgs, context: &Context) -> Result<Exit> {
     let bus = Bus::open(&runtime, &context.running_rig(&runtime)?)?;
     let mut subscriber = bus.subscriber(&args.stream)?;
     let mut newest = None;
-    if let Some(folder) = &args.png {
-        std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
-    }
     let stop = Stop::on_signals()?;
     let mut seen = 0;
     while args.count.is_none_or(|count| seen < count) {
@@ -70,6 +67,10 @@ pub fn run(args: &TapArgs, context: &Context) -> Result<Exit> {
             _ => out::line(describe(frame.header()))?,
         }
         if let Some(folder) = &args.png {
+            if seen == 1 {
+                std::fs::create_dir_all(folder)
+                    .with_context(|| format!("{}: cannot be made", folder.display()))?;
+            }
             let header = frame.header();
             let stem = format!("{}_{}_{:08}", header.camera(), header.stream(), header.sequence);
             for path in picture::write_png(header, frame.pixels(), folder, &stem)? {

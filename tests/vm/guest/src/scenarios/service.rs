@@ -65,9 +65,12 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
         })
     };
     checks.that("sets are recorded", recorded(5), &recording);
+    // Below its root: `/run` is its own.
+    let runtime = PathBuf::from(format!("/proc/{}/root/run/depthrig", systemd.pid));
+    checks.that("it has a runtime folder", runtime.exists(), runtime.display());
     systemd.control(&["stop", UNIT])?;
     checks.equal("stopped, its result is", systemd.show("Result")?, "success");
-    checks.equal("the runtime folder is gone", Path::new("/run/depthrig").exists(), false);
+    checks.equal("the runtime folder is gone", runtime.exists(), false);
     let dataset = PathBuf::from(DATA).join("datasets/served");
     checks.equal("whose the dataset is", fs::metadata(&dataset)?.uid(), USER.1);
     whole(checks, &systemd, "served")?;
@@ -293,7 +296,12 @@ impl Systemd {
 
 impl Drop for Systemd {
     fn drop(&mut self) {
-        let _ = system::run(Command::new("kill").args(["-9", &self.pid.to_string()]));
+        if self.pid == 0 {
+            // It has not begun, or has ended; `kill 0` would end this scenario.
+            let _ = self.unshare.kill();
+        } else {
+            let _ = system::run(Command::new("kill").args(["-9", &self.pid.to_string()]));
+        }
         let _ = self.unshare.wait();
     }
 }
