@@ -66,7 +66,7 @@ def test_without_the_sdk_it_says_what_to_install(
     monkeypatch.setitem(sys.modules, "depthai", None)
     assert main(["--list"]) == Exit.USAGE
     assert "the `depthai` package cannot be imported" in caplog.text
-    assert "pip install 'depthrig[oak]'" in caplog.text
+    assert "pip install './python[oak]'" in caplog.text
 
 
 @pytest.mark.parametrize(

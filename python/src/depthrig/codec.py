@@ -5,7 +5,7 @@ The format is in ``docs/dataset-format.md``, "Depth codec". With Python's ``mcap
 >>> from mcap.reader import make_reader
 >>> from depthrig.codec import decode_depth
 >>> with open("seg_0000.mcap", "rb") as f:
-...     for _, channel, message in make_reader(f).iter_messages(topics=["/rig/d435/depth/depth_compressed"]):
+...     for _, channel, message in make_reader(f).iter_messages(topics=["/mount/d435/depth/depth_compressed"]):
 ...         metres = decode_depth(message.data) * float(channel.metadata["depth_unit_m"])  # 0 is "no depth"
 """
 

@@ -11,7 +11,7 @@ from ._errors import Exit, OakError
 if TYPE_CHECKING:
     from types import ModuleType
 
-INSTALL = "pip install 'depthrig[oak]'"
+INSTALL = "pip install './python[oak]' in a checkout of depthrig"
 _LEAST = (3, 12)
 
 
