@@ -63,6 +63,9 @@ def main() -> int:
     if seconds < WARM_UP_S + 60:
         print(f"at least {(WARM_UP_S + 60) / 60:.0f} minutes: the first {WARM_UP_S} s are left out")
         return 2
+    if not args.depthrig.is_file():
+        print(f"{args.depthrig} is not there: cargo build --release --bin depthrig")
+        return 2
     with tempfile.TemporaryDirectory(prefix="rig", dir="/tmp") as name:
         folder = Path(name)
         os.environ["DEPTHRIG_RUNTIME_DIR"] = str(folder / "run")
