@@ -1,4 +1,5 @@
-//! What the driver of an attached Kinect does beyond the suite: references, times, choices, messages.
+//! What the driver of an attached Kinect does beyond the suite: references, times, choices, messages. Long because
+//! they share one made library.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/kinect.rs"]

@@ -1,4 +1,5 @@
-//! Refined depth in a running rig: what is published, what it says of itself, and what happens when something fails.
+//! Refined depth in a running rig: what is published, what it says of itself, and what happens when something fails. Long
+//! because all of it shares one rig.
 //!
 //! Faults come from a refiner of these tests, through the one place where a rig takes its refiners from.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]

@@ -1,4 +1,5 @@
-//! Every finding appears when its cause is made, and none on a computer where all is well.
+//! Every finding appears when its cause is made, and none on a computer where all is well. Long because every
+//! finding has its case.
 #![allow(clippy::type_complexity, clippy::too_many_lines, clippy::format_collect)] // tables of cases
 
 use super::cameras::{self, Planned};

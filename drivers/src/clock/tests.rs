@@ -1,4 +1,4 @@
-//! The acceptance list of the clock map, on a simulated camera (`tests/sim.rs`), seeds 0 to 19.
+//! The acceptance list of the clock map, on a simulated camera (`tests/sim.rs`), seeds 0 to 19. Long because the list is.
 
 use super::*;
 use proptest::prelude::*;

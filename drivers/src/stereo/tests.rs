@@ -1,4 +1,5 @@
-//! A camera of two eyes that is made by hand, and matchers that are slow, hang and fail.
+//! A camera of two eyes that is made by hand, and matchers that are slow, hang and fail. Long because all cases
+//! share both.
 
 use super::*;
 use crate::clock::ClockQuality;

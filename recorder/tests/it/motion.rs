@@ -1,4 +1,5 @@
-//! Motion units: what they send is in the dataset bit by bit, with the set that it came with.
+//! Motion units: what they send is in the dataset bit by bit, with the set that it came with. Long because every way
+//! through a dataset has motion.
 
 use crate::support::*;
 use crate::verify::{check, found, rewrite};

@@ -1,4 +1,5 @@
-//! Recordings of an Azure Kinect as they are made, in early forms, from other writers, cut, damaged and lying.
+//! Recordings of an Azure Kinect as they are made, in early forms, from other writers, cut, damaged and lying. Long
+//! because each form is a case.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_drivers::ErrorKind;

@@ -1,4 +1,5 @@
-//! The passes beside the model, in every form that the processor has; the filters beside plain ones.
+//! The passes beside the model, in every form that the processor has; the filters beside plain ones. Long
+//! because each pass has a model of its own here.
 
 use super::super::Preset;
 use super::kernel::Winner;
