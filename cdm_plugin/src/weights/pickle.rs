@@ -1,5 +1,4 @@
-//! The pickles in which PyTorch keeps the names and places of tensors, read without running anything. Long because the
-//! machine and what it understands belong together, with their tests.
+//! The pickles in which PyTorch keeps the names and places of tensors, read without running anything.
 //!
 //! A pickle is a program for a stack machine that may call any function of Python. Here only the operations that state
 //! dicts are made of are understood, and only the few functions in [`Global`], which are recognised and not called. The
