@@ -169,7 +169,7 @@ impl RosbagImport {
             });
         }
         for (topic, n) in scan.others {
-            self.state(format!("{topic}: {n} messages are left out, a dataset holds pictures"));
+            self.state(format!("{topic}: {n} messages are left out: motion and poses of a bag are not imported"));
         }
         for ((device, sensor), options) in scan.options {
             let table = options.into_iter().map(|(k, v)| (k, f64::from(v).into())).collect::<toml::Table>();

@@ -80,6 +80,38 @@ fn the_real_bag_comes_in_whole() {
     }
 }
 
+/// A record of a bag: fields with their names, and data.
+fn record(fields: &[(&str, &[u8])], data: &[u8]) -> Vec<u8> {
+    let field = |(name, value): &(&str, &[u8])| {
+        let text = [name.as_bytes(), b"=", value].concat();
+        [&(text.len() as u32).to_le_bytes(), &text[..]].concat()
+    };
+    let head: Vec<u8> = fields.iter().flat_map(field).collect();
+    [&(head.len() as u32).to_le_bytes(), &head[..], &(data.len() as u32).to_le_bytes(), data].concat()
+}
+
+/// A D435i records its motion unit too: three messages, put in before the pictures.
+#[test]
+fn motion_of_a_bag_is_told_and_left_out() {
+    let topic = "/device_0/sensor_2/Gyro_0/imu/data";
+    let conn = 9999_u32.to_le_bytes();
+    let mut inner = record(&[("op", &[7]), ("conn", &conn), ("topic", topic.as_bytes())], b"");
+    for _ in 0..3 {
+        inner.extend(record(&[("op", &[2]), ("conn", &conn), ("time", &[0; 8])], b"a sensor_msgs/Imu"));
+    }
+    let size = (inner.len() as u32).to_le_bytes();
+    let chunk = record(&[("op", &[5]), ("compression", b"none"), ("size", &size)], &inner);
+    let mut bytes = real_bag();
+    bytes.splice(13..13, chunk);
+    let (fs, report) = imported(bytes);
+    let report = report.unwrap();
+    assert_eq!((report.facts.lost, report.summary.frames), (0, 3), "{:?}", report.facts);
+    let told = format!("{topic}: 3 messages are left out: motion and poses of a bag are not imported");
+    let dataset = Dataset::open_with(Arc::new(fs), &dir()).unwrap();
+    let stated = dataset.session().extra["import"]["stated"].as_array().unwrap();
+    assert!(stated.iter().any(|s| s.as_str() == Some(&told)), "{stated:?}");
+}
+
 /// Cut anywhere: an error that says so, or what is before it with the loss counted; never a panic, never silence.
 #[test]
 fn a_bag_that_was_cut_is_told() {
