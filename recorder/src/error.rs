@@ -40,6 +40,11 @@ pub enum ErrorKind {
     Io,
 }
 
+/// What Linux says when the device itself fails, as at a sector that cannot be read (`errno(3)`).
+const EIO: i32 = 5;
+const DISK_FAILS: &str =
+    ": the disk fails there (input/output error); copy what it still gives with `ddrescue` and go on with the copy";
+
 depthrig_bus::error_type! {
     /// An error of the recorder.
 }
@@ -62,6 +67,7 @@ impl Error {
             io::ErrorKind::UnexpectedEof => (ErrorKind::Truncated, ": it ends too early"),
             _ => (ErrorKind::Io, ""),
         };
+        let advice = if e.raw_os_error() == Some(EIO) { DISK_FAILS } else { advice };
         let detail = if advice.is_empty() { format!(": {e}") } else { advice.to_owned() };
         Self::new(kind, format!("cannot {what} {}{detail}", path.display())).with_source(e)
     }

@@ -456,8 +456,19 @@ fn prepare_folder(fs: &dyn Fs, dir: &Path, options: &RecorderOptions) -> Result<
             }
         }
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
+            // A new folder is a name in its parent. Where that is new too, its own name must last as well, or a
+            // power cut takes all that is below it; so look how far up folders are missing before they are made.
+            let mut parents = Vec::new();
+            for parent in dir.ancestors().skip(1) {
+                parents.push(parent);
+                // An empty one is the working folder, which is there.
+                let missing = |e: std::io::Error| e.kind() == std::io::ErrorKind::NotFound;
+                if parent.as_os_str().is_empty() || !fs.read_dir(parent).is_err_and(missing) {
+                    break;
+                }
+            }
             fs.create_dir_all(dir).map_err(|e| Error::io("create the folder", dir, e))?;
-            if let Some(parent) = dir.parent() {
+            for parent in parents {
                 fs.sync_dir(parent).map_err(|e| Error::io("sync the folder", parent, e))?;
             }
         }

@@ -16,12 +16,13 @@ use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-mod facts;
+pub(crate) mod facts;
+mod lost;
 mod segment;
 mod session;
 
 use facts::Facts;
-use segment::Rebuild;
+use segment::{Before, Rebuild};
 
 /// What a copy is called until it is proven.
 const TEMPORARY: &str = "mcap.recovering";
@@ -90,6 +91,8 @@ pub struct RecoveredSegment {
     pub lost_bytes: Vec<LostBytes>,
     /// Ids between the whole sets around a damaged place, first and last.
     pub sets_missing: Vec<(u64, u64)>,
+    /// Sets that are lost, at most: those ids, and what the accounts count beyond them.
+    pub sets_lost: u64,
     /// What was lost, in words.
     pub lost: Vec<String>,
 }
@@ -208,7 +211,8 @@ pub fn unfinished_in(fs: &Arc<dyn Fs>, folder: &Path, rig: &str) -> Result<Vec<P
         entries => entries.map_err(|e| Error::io("open the folder", folder, e))?,
     };
     let mut found = Vec::new();
-    for entry in entries.iter().filter(|e| e.is_dir) {
+    // `NAME.part` is what `trim` or `merge` has not finished: no recording.
+    for entry in entries.iter().filter(|e| e.is_dir && !e.name.ends_with(".part")) {
         let dir = folder.join(&entry.name);
         let Ok(inside) = fs.read_dir(&dir) else { continue };
         let part = inside
@@ -284,11 +288,12 @@ impl Job<'_> {
             Err(e) => return Err(e),
         };
         let segments = segments_in(entries, self.dir);
-        let mut all = Vec::new();
+        let mut all: Vec<Facts> = Vec::new();
+        let mut before = Before::of(&segments);
         for path in &segments {
-            let before = all.last().and_then(|f: &Facts| f.last_set);
             let facts = self.segment(path, &segments, session.as_ref(), before)?;
             self.report.sets += facts.sets;
+            before.add(&facts);
             all.push(facts);
         }
         self.tell(self.total)?;
@@ -333,7 +338,7 @@ impl Job<'_> {
         path: &Path,
         segments: &[PathBuf],
         session: Option<&Session>,
-        before: Option<u64>,
+        before: Before,
     ) -> Result<Facts> {
         let fs = Arc::clone(self.fs);
         let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
@@ -351,10 +356,15 @@ impl Job<'_> {
             torn_sets: 0,
             lost_bytes: Vec::new(),
             sets_missing: Vec::new(),
+            sets_lost: 0,
             lost: Vec::new(),
         };
+        // What an error kept from its final name may be whole in memory and not on the disk, and a later sync that
+        // succeeds says nothing of that: such a one is copied.
+        let doubtful = |f: &Facts| f.error.is_some() || session.is_none_or(|s| s.outcome.is_some());
         let whole = match whole {
-            Some(whole) if !part || self.options.dry_run || self.finish(path)? => Some(whole),
+            Some(whole) if !part => Some(whole),
+            Some(whole) if !doubtful(&whole) && (self.options.dry_run || self.finish(path)?) => Some(whole),
             _ => None,
         };
         let facts = if let Some(whole) = whole {

@@ -64,6 +64,21 @@ impl Segment {
     /// The same under the name `part`, to be finished as `path` in the same folder.
     pub(crate) fn create_as(fs: &dyn Fs, part: PathBuf, path: PathBuf, preamble: &Preamble) -> Result<Self> {
         let file = fs.create_new(&part).map_err(|e| Error::io("create", &part, e))?;
+        let created = Self::begin(fs, file, part.clone(), path, preamble);
+        if created.is_err() {
+            // A file without a head is no segment, and would be in the way of one.
+            let _ = fs.remove_file(&part);
+        }
+        created
+    }
+
+    fn begin(
+        fs: &dyn Fs,
+        file: Box<dyn WriteFile>,
+        part: PathBuf,
+        path: PathBuf,
+        preamble: &Preamble,
+    ) -> Result<Self> {
         let mut segment = Self {
             file,
             part,
@@ -215,9 +230,15 @@ impl Segment {
     }
 
     /// Writes index and footer, makes the file durable and gives it its final name.
-    pub(crate) fn finish(self, fs: &dyn Fs) -> Result<PathBuf> {
+    pub(crate) fn finish(mut self, fs: &dyn Fs) -> Result<PathBuf> {
+        self.write_index()?;
+        self.publish(fs)
+    }
+
+    /// Makes a file that has its index durable and gives it its final name.
+    pub(crate) fn publish(self, fs: &dyn Fs) -> Result<PathBuf> {
         let path = self.path.clone();
-        let part = self.seal()?;
+        let part = self.durable()?;
         fs.rename(&part, &path).map_err(|e| Error::io("rename", &part, e))?;
         sync_folder_of(fs, &path)?;
         Ok(path)
@@ -225,8 +246,17 @@ impl Segment {
 
     /// Writes index and footer and makes the file durable under the name that it has.
     pub(crate) fn seal(mut self) -> Result<PathBuf> {
+        self.write_index()?;
+        self.durable()
+    }
+
+    /// Writes index and footer: all of it, or, when there is no room, nothing, so that it can be tried again.
+    pub(crate) fn write_index(&mut self) -> Result<()> {
         let tail = self.tail();
-        self.append(&[([&tail, &[]], 0)])?;
+        self.append(&[([&tail, &[]], 0)])
+    }
+
+    fn durable(mut self) -> Result<PathBuf> {
         self.file.sync_all().map_err(|e| Error::io("sync", &self.part, e))?;
         if self.doubtful {
             return Err(Error::new(

@@ -290,7 +290,7 @@ impl Writer {
     fn sync_when_due(&mut self) {
         let end_because = self.shared.lock().end_because.take();
         if let Some(e) = end_because {
-            self.try_io(|_| Err(e));
+            self.end(e);
         }
         let now = HostTime::now();
         if now < self.next_sync {
@@ -348,16 +348,15 @@ impl Writer {
 
     /// Ends the present segment with its accounts and index, under its final name.
     fn close_segment(&mut self) -> Result<()> {
-        let sets = self.in_segment.take();
-        if let Some(log_time) = self.last_log_time.filter(|_| sets.is_some()) {
+        if let Some(log_time) = self.last_log_time.filter(|_| self.in_segment.is_some()) {
             self.between(log_time)?;
         }
-        self.finish_file(sets)
+        self.finish_file()
     }
 
-    fn finish_file(&mut self, sets: Option<(u64, u64, u64)>) -> Result<()> {
+    fn finish_file(&mut self) -> Result<()> {
         let Some(mut segment) = self.segment.take() else { return Ok(()) };
-        let (n, first, last) = sets.unwrap_or_default();
+        let (n, first, last) = self.in_segment.unwrap_or_default();
         let counts = self.shared.lock().counts;
         let mut facts = BTreeMap::from([
             ("segment".to_owned(), self.index.to_string()),
@@ -376,15 +375,43 @@ impl Writer {
             facts.insert("final".to_owned(), "true".to_owned());
         }
         let part = segment.part().display().to_string();
-        let done =
-            segment.append_metadata(SEGMENT_METADATA, &facts).and_then(|()| segment.finish(&*self.shared.fs));
+        let closed = segment.append_metadata(SEGMENT_METADATA, &facts).and_then(|()| segment.write_index());
+        if let Err(e) = closed {
+            if self.failed {
+                self.unfinished.push(part);
+            } else {
+                // There may be room once the reserve is gone: `try_io` tries it again.
+                self.segment = Some(segment);
+            }
+            return Err(e);
+        }
+        self.in_segment = None;
         self.index += 1;
         self.dirty = false;
-        if let Err(e) = done {
+        if let Err(e) = segment.publish(&*self.shared.fs) {
             self.unfinished.push(part);
             return Err(e);
         }
         Ok(())
+    }
+
+    /// Ends the recording while there is still room: closed as ever, with its last accounts and notes.
+    fn end(&mut self, e: Error) {
+        if self.failed {
+            return;
+        }
+        self.ended_by(e);
+        self.ending = true;
+        self.try_io(Self::close_segment);
+        self.failed = true;
+        let _ = self.shared.fs.remove_file(&self.shared.dir.join(RESERVE_FILE));
+    }
+
+    fn ended_by(&self, e: Error) {
+        tracing::error!(dataset = %self.shared.dir.display(), "the recording ended: {e}");
+        let mut state = self.shared.lock();
+        state.ended = Some(SetDrop::WriteFailed);
+        state.error = Some(Arc::new(e));
     }
 
     /// Runs an operation on the file unless the recording has failed; its first failure ends the recording.
@@ -398,16 +425,11 @@ impl Writer {
         let Err(e) = done else { return };
         self.failed = true;
         self.builder = ChunkBuilder::new();
-        tracing::error!(dataset = %self.shared.dir.display(), "the recording ended: {e}");
-        let mut state = self.shared.lock();
-        state.ended = Some(SetDrop::WriteFailed);
-        state.error = Some(Arc::new(e));
-        drop(state);
+        self.ended_by(e);
         // The reserve makes room for the index; what was cut back is a whole number of sets.
         let _ = self.shared.fs.remove_file(&self.shared.dir.join(RESERVE_FILE));
-        let sets = self.in_segment.take();
-        if let Err(e) = self.finish_file(sets) {
-            tracing::error!(dataset = %self.shared.dir.display(), "its last segment has no index: {e}");
+        if let Err(e) = self.finish_file() {
+            tracing::error!(dataset = %self.shared.dir.display(), "its last segment is not finished: {e}");
         }
     }
 
@@ -437,7 +459,7 @@ impl Writer {
             lost.push(format!("{n} of {} sets were not recorded: {}", counts.offered, reason.name()));
         }
         for part in &self.unfinished {
-            lost.push(format!("{part} has no index: only its data up to the error can be read"));
+            lost.push(format!("{part} could not be finished; `depthrig recover` makes it whole"));
         }
         let ended = self.last_log_time.unwrap_or(state.session.started_utc_ns);
         state.session.outcome = Some(Outcome::new(ended, &counts, lost.clone()));

@@ -31,6 +31,8 @@ pub(super) struct Facts {
     pub(super) error: Option<String>,
     /// What a recovery found lost in it.
     pub(super) lost: Vec<String>,
+    /// Sets that recoveries found lost in it, at most.
+    pub(super) sets_lost: u64,
 }
 
 impl Facts {
@@ -49,7 +51,13 @@ impl Facts {
 
     pub(super) fn recovered(&mut self, facts: &BTreeMap<String, String>) {
         self.lost.extend(facts.get("lost").into_iter().flat_map(|l| l.lines()).map(str::to_owned));
+        self.sets_lost = self.sets_lost.saturating_add(sets_lost(facts));
     }
+}
+
+/// Sets that a recovery found lost, at most, as the segment's metadata says.
+pub(crate) fn sets_lost(recovered: &BTreeMap<String, String>) -> u64 {
+    recovered.get("sets_lost").and_then(|n| n.parse().ok()).unwrap_or(0)
 }
 
 /// What the segment holds if it is finished and whole; `None` when there is anything to do about it. With

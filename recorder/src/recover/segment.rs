@@ -1,7 +1,8 @@
 //! One segment: whether it is whole, and if not, a proven copy of what is.
 
 use super::facts::Facts;
-use super::{LostBytes, RECOVERED_METADATA, RecoveredSegment, TEMPORARY};
+use super::lost::Lost;
+use super::{RECOVERED_METADATA, TEMPORARY};
 use crate::container::MAGIC;
 use crate::container::chunk::{Chunk, ChunkBuilder, MessageHead};
 use crate::container::copy::{Damage, DamageKind, Group, Groups, SetGroup, read_preamble};
@@ -14,7 +15,6 @@ use crate::msgs::schemas::Schema;
 use crate::msgs::{accounts, frame_info, tf};
 use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA, Topics, image_channel};
 use crate::{ColorCodec, DepthCodec, Error, ErrorKind, RecorderOptions, Result, Session};
-use depthrig_bus::UtcPair;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -41,84 +41,33 @@ pub(super) struct Rebuild<'a> {
     /// All segments of the dataset: each has channels and session.
     pub(super) segments: &'a [PathBuf],
     pub(super) session: Option<&'a Session>,
-    /// The last set of the segment before.
-    pub(super) before: Option<u64>,
+    pub(super) before: Before,
 }
 
-/// What did not make it into the copy.
-#[derive(Debug, Default)]
-pub(super) struct Lost {
-    bytes: u64,
-    damage: Vec<Damage>,
-    missing: Vec<(u64, u64)>,
-    /// Whether the file has lost something after its last set.
-    at_end: bool,
-    head_rebuilt: bool,
-    file: String,
+/// What the segments before one hold.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Before {
+    /// Id of the last set.
+    last_set: Option<u64>,
+    /// Sets that are there and sets that are known to be lost: what the accounts count. `None` where the first
+    /// segments are not here.
+    counted: Option<u64>,
+    /// Of these, sets that are known to be lost.
+    lost: u64,
 }
 
-impl Lost {
-    fn tail_bytes(&self) -> u64 {
-        self.damage.iter().filter(|d| d.kind == DamageKind::Tail).map(|d| d.to - d.from).sum()
+impl Before {
+    /// Before the first of these segments.
+    pub(super) fn of(segments: &[PathBuf]) -> Self {
+        let first = segments.first().and_then(|p| segment_number(&p.file_name()?.to_string_lossy()));
+        Self { last_set: None, counted: (first == Some(0)).then_some(0), lost: 0 }
     }
 
-    fn torn_sets(&self) -> u64 {
-        self.damage.iter().filter(|d| d.kind == DamageKind::Torn).count() as u64
-    }
-
-    fn words(&self) -> Vec<String> {
-        let mut words = Vec::new();
-        let file = &self.file;
-        if self.head_rebuilt {
-            words.push(format!("{file}: its head was damaged and was made anew from the session"));
-        }
-        for d in &self.damage {
-            let (n, why) = (d.to - d.from, &d.why);
-            words.push(match d.kind {
-                DamageKind::Tail => format!("{file}: its last {n} bytes are no whole record"),
-                DamageKind::Torn => format!("{file}: {n} bytes from byte {} are {why}", d.from),
-                DamageKind::Bytes => format!("{file}: {n} bytes from byte {} are damaged: {why}", d.from),
-            });
-        }
-        for (first, last) in &self.missing {
-            let n = last - first + 1;
-            words.push(match n {
-                1 => format!("{file}: set {first} is lost"),
-                _ => format!("{file}: sets {first} to {last} are lost, {n} of them at most"),
-            });
-        }
-        words
-    }
-
-    pub(super) fn tell(&self, segment: &mut RecoveredSegment) {
-        segment.bytes = self.bytes;
-        segment.tail_bytes = self.tail_bytes();
-        segment.torn_sets = self.torn_sets();
-        segment.lost_bytes =
-            self.damage.iter().map(|d| LostBytes { from: d.from, to: d.to, why: d.why.clone() }).collect();
-        segment.sets_missing.clone_from(&self.missing);
-        segment.lost = self.words();
-    }
-
-    fn metadata(&self) -> BTreeMap<String, String> {
-        let list = |parts: Vec<String>| parts.join(" ");
-        let bytes = |d: &Damage| format!("{}-{}", d.from, d.to);
-        let ids = |(a, b): &(u64, u64)| if a == b { a.to_string() } else { format!("{a}-{b}") };
-        let damaged = self.damage.iter().filter(|d| d.kind != DamageKind::Tail).map(bytes).collect();
-        [
-            ("when_utc_ns", UtcPair::sample().utc_ns.to_string()),
-            ("depthrig_version", env!("CARGO_PKG_VERSION").to_owned()),
-            ("file", self.file.clone()),
-            ("file_bytes", self.bytes.to_string()),
-            ("tail_bytes", self.tail_bytes().to_string()),
-            ("torn_sets", self.torn_sets().to_string()),
-            ("damaged", list(damaged)),
-            ("sets_missing", list(self.missing.iter().map(ids).collect())),
-            ("sets_lost", self.missing.iter().map(|(a, b)| b - a + 1).sum::<u64>().to_string()),
-            ("lost", self.words().join("\n")),
-        ]
-        .map(|(k, v)| (k.to_owned(), v))
-        .into()
+    /// Goes past a segment.
+    pub(super) fn add(&mut self, facts: &Facts) {
+        self.last_set = facts.last_set.or(self.last_set);
+        self.lost = self.lost.saturating_add(facts.sets_lost);
+        self.counted = self.counted.map(|n| n.saturating_add(facts.sets).saturating_add(facts.sets_lost));
     }
 }
 
@@ -196,8 +145,8 @@ impl Rebuild<'_> {
         let mut said = BTreeMap::new();
         let mut copied = Vec::new();
         let mut groups = Groups::new(reader, preamble, first)?;
-        let mut before = self.before;
-        let mut last_time = None;
+        let mut before = self.before.last_set;
+        let (mut last_time, mut recorded) = (None, 0);
         let mut head = false;
         while let Some(group) = groups.next()? {
             if let (Group::Set(set), Some(copy), false) = (&group, copy.as_deref_mut(), head) {
@@ -234,6 +183,7 @@ impl Rebuild<'_> {
                             && let Ok((counts, _)) = accounts::read(m.data)
                         {
                             facts.counts = Some(counts);
+                            recorded = counts.recorded.saturating_sub(facts.sets).max(recorded);
                         }
                         Ok(())
                     })?;
@@ -262,7 +212,21 @@ impl Rebuild<'_> {
             }
             tell(groups.offset())?;
         }
+        if lost.at_end {
+            let next = self.next_sets()?;
+            if let (Some(last), Some(first)) = (before, next.first)
+                && first > last + 1
+            {
+                lost.missing.push((last + 1, first - 1));
+            }
+            let counted = next.recorded_before.map_or(0, |n| n.saturating_sub(facts.sets));
+            recorded = recorded.max(counted);
+        }
+        if let Some(counted) = self.before.counted.filter(|_| !lost.damage.is_empty()) {
+            lost.uncounted = recorded.saturating_sub(counted).saturating_sub(facts.sets_lost);
+        }
         facts.lost.extend(lost.words());
+        facts.sets_lost = facts.sets_lost.saturating_add(lost.sets());
         if let Some(copy) = copy {
             copy.append_metadata(RECOVERED_METADATA, &lost.metadata())?;
             said.extend(
@@ -277,6 +241,47 @@ impl Rebuild<'_> {
             copy.append_metadata(SEGMENT_METADATA, &said)?;
         }
         Ok((facts, copied))
+    }
+
+    /// What comes after this segment says of the end of this one, as far as it is not damaged itself.
+    fn next_sets(&self) -> Result<Next> {
+        let after = self.segments.iter().skip_while(|p| *p != self.path).skip(1);
+        let (mut first, mut sets) = (None, 0);
+        for path in after {
+            let unknown = Next { first, recorded_before: None };
+            let reader = SegmentReader::open_any(self.fs, path)?;
+            let Some((preamble, begin)) = self.own_preamble(&reader)? else { return Ok(unknown) };
+            let accounts_channel = channel_of(&preamble, Schema::Accounts);
+            let mut groups = Groups::new(&reader, &preamble, begin)?;
+            while let Some(group) = groups.next()? {
+                match group {
+                    Group::Damage(_) => return Ok(Next { first, recorded_before: None }),
+                    Group::Set(set) => {
+                        first.get_or_insert(set.mark.id);
+                        sets += 1;
+                    }
+                    Group::Between(between) => {
+                        let mut recorded = None;
+                        reader.chunk_messages(between.chunk.body(), between.offset, |m| {
+                            if Some(m.channel) == accounts_channel
+                                && let Ok((counts, _)) = accounts::read(m.data)
+                            {
+                                recorded = Some(counts.recorded);
+                            }
+                            Ok(())
+                        })?;
+                        if let Some(n) = recorded {
+                            return Ok(Next { first, recorded_before: Some(n.saturating_sub(sets)) });
+                        }
+                    }
+                    Group::Metadata(..) => {}
+                }
+            }
+        }
+        // A recording that was closed says how many sets there were.
+        let outcome = self.session.and_then(|s| s.outcome.as_ref());
+        let recorded = outcome.map(|o| o.sets_recorded.saturating_add(self.before.lost).saturating_sub(sets));
+        Ok(Next { first, recorded_before: recorded })
     }
 
     /// Reads the copy back: its index must be readable, its data must have the checksum that was computed while
@@ -384,6 +389,14 @@ impl Rebuild<'_> {
         }
         Ok(guess)
     }
+}
+
+/// Where the segments after a damaged one begin.
+struct Next {
+    /// Id of their first set.
+    first: Option<u64>,
+    /// Sets that were recorded before them, if an account tells.
+    recorded_before: Option<u64>,
 }
 
 /// The channel of this type, as whoever reads the index finds it: of schemas and channels with one number the last counts.

@@ -32,13 +32,18 @@ pub(super) fn settle(
         lost.push(words);
         session
     };
-    let rebuilt = job.report.session_rebuilt;
-    if !changed && !rebuilt && session.outcome.is_some() {
+    let as_it_was = !changed && !job.report.session_rebuilt;
+    let says = |o: &Outcome| lost.iter().all(|l| o.lost.contains(l));
+    if as_it_was && session.outcome.as_ref().is_some_and(says) {
         return Ok(());
     }
     let outcome = outcome(&session, all, lost, job);
     if session.outcome.as_ref() == Some(&outcome) {
         return Ok(());
+    }
+    if let Some(before) = session.outcome.as_ref().filter(|_| as_it_was) {
+        // A recovery before this one copied the segment and was ended before it could say so here.
+        job.report.lost.extend(outcome.lost.iter().filter(|l| !before.lost.contains(l)).cloned());
     }
     session.outcome = Some(outcome);
     job.report.changed = true;
@@ -86,8 +91,10 @@ fn outcome(session: &Session, all: &[Facts], mut lost: Vec<String>, job: &mut Jo
         None => counts.dropped_by_reason().map(|(r, n)| (r.name().to_owned(), n)).collect(),
     };
     dropped.remove(IN_CRASH);
-    // What a damaged file says may not fit.
+    // What a damaged file says may not fit. And where disk or encoders were behind, the last account has sets that were
+    // refused after those that waited, which the marks then count without them.
     let known = dropped.values().fold(recorded, |sum, n| sum.saturating_add(*n));
+    let offered = offered.max(known);
     let missing = offered.saturating_sub(known);
     let mut say = |what: String, new: bool| {
         if new {
@@ -102,8 +109,8 @@ fn outcome(session: &Session, all: &[Facts], mut lost: Vec<String>, job: &mut Jo
             Some(Facts { error: Some(e), .. }) => say(format!("the recording ended before its time: {e}"), true),
             Some(Facts { last: true, .. }) => {}
             _ => say(
-                "the recording was cut off: the sets that were still in memory then, about a second's at most, are \
-                 lost"
+                "the recording was cut off: the sets that were still in memory then are lost, about a second's at \
+                 most unless the disk or the encoders were behind"
                     .to_owned(),
                 true,
             ),

@@ -19,6 +19,7 @@ use crate::msgs::frame_set::{Checkpoint, FrameSetMsg, read_clock_pair};
 use crate::msgs::schemas::Schema;
 use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA};
 use crate::recover::RECOVERED_METADATA;
+use crate::recover::facts::sets_lost;
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::StreamId;
 use mcap::records::Record;
@@ -90,8 +91,10 @@ fn read(
         Ok(()) => {}
     }
     let finished = reader.finished && index.is_ok();
-    let recovered = reader.metadata(RECOVERED_METADATA).and_then(|m| m.get("sets_lost")?.parse::<u64>().ok());
-    walk.lost = walk.lost.saturating_add(recovered.unwrap_or(0));
+    // One record for each time it was recovered.
+    for (_, said) in reader.metadata.iter().filter(|(name, _)| name == RECOVERED_METADATA) {
+        walk.lost = walk.lost.saturating_add(sets_lost(said));
+    }
     // With decoding every picture is unpacked anyway. Without, a first pass shows what the checksums prove; where
     // they do not prove all, a second one takes its place.
     let mut unproven = if walk.options.decode { 0 } else { u64::MAX };

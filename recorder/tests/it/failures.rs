@@ -1,5 +1,6 @@
 //! What goes wrong is said, counted and survived.
 
+use crate::recover::{ids, recover};
 use crate::support::*;
 use depthrig_bus::PixelFormat;
 use depthrig_recorder::fs::{DirEntry, Fault, Fs, MemFs, ReadFile, WriteFile};
@@ -216,6 +217,69 @@ fn a_recording_stops_while_there_is_still_room() {
     assert!(names(&fs).contains(&"seg_0000.mcap".to_owned()));
 }
 
+/// What ends because of its limit has room to say everything: the accounts of its last moment, and the notes.
+#[test]
+fn a_recording_that_stops_at_its_limit_says_how_it_stands() {
+    let fs = MemFs::new().with_capacity(300_000);
+    // No account comes but the last.
+    let sync_interval_ns = i64::MAX / 4;
+    let r = recorder(&fs, RecorderOptions { min_free_bytes: 200_000, sync_interval_ns, ..options() });
+    r.add_note("the cup fell").unwrap();
+    for n in 0..60 {
+        drop(r.push(set(&session(), n)));
+        settle(&r);
+        std::thread::sleep(Duration::from_millis(50));
+        if r.progress().error.is_some() {
+            break;
+        }
+    }
+    assert_eq!(r.progress().error.expect("the limit is reached").kind(), ErrorKind::DiskFull);
+    let summary = r.finish().unwrap();
+    let counts = open(&fs).info().unwrap().set_counts.expect("an account");
+    assert_eq!(counts.recorded, summary.sets.recorded);
+    let file = mcap_messages(&contents(&fs, &segment(0)), "/notes");
+    assert_eq!(file, 1, "the note is in the file");
+    assert_eq!(worst(&fs), Some(Severity::Lost));
+}
+
+/// Messages of topics that end in `topic`.
+fn mcap_messages(bytes: &[u8], topic: &str) -> usize {
+    let messages = mcap::MessageStream::new(bytes).unwrap().map(Result::unwrap);
+    messages.filter(|m| m.channel.topic.ends_with(topic)).count()
+}
+
+/// Sets that waited when others were refused: the last account counts the refused ones, the marks of those that
+/// waited do not.
+#[test]
+fn what_was_refused_while_others_waited_is_counted_after_a_crash() {
+    let (fs, gate) = (MemFs::new(), Gate::default());
+    let sync_interval_ns = 200_000_000;
+    let r = recorder(&fs, RecorderOptions { workers: 1, queue_sets: 2, sync_interval_ns, ..options() });
+    r.push(set(&session(), 0)).unwrap();
+    settle(&r);
+    for n in 1..3 {
+        let mut held = set(&session(), n);
+        for f in &mut held.frames {
+            let pixels = f.pixels.bytes().to_vec();
+            f.pixels = Box::new(Held(pixels, gate.clone(), AtomicUsize::new(0)));
+        }
+        r.push(held).unwrap();
+    }
+    for n in 3..8 {
+        assert_eq!(r.push(set(&session(), n)).unwrap_err().reason, SetDrop::EncoderBusy);
+    }
+    // An account of one set and five refused ones.
+    std::thread::sleep(Duration::from_millis(500));
+    gate.open();
+    settle(&r);
+    drop(r);
+    recover(&fs).unwrap();
+    assert_eq!(ids(&fs), [1, 2, 3]);
+    let o = open(&fs).session().outcome.clone().unwrap();
+    assert_eq!((o.sets_offered, o.sets_recorded), (8, 3), "{o:?}");
+    assert_eq!(o.sets_dropped["encoder_busy"], 5, "{o:?}");
+}
+
 #[test]
 fn folders_that_cannot_take_a_dataset_are_refused_with_the_reason() {
     let create =
@@ -246,6 +310,22 @@ fn folders_that_cannot_take_a_dataset_are_refused_with_the_reason() {
     let e = create(&MemFs::new().with_capacity(2_000_000), limits).expect("refused");
     assert_eq!(e.kind(), ErrorKind::DiskFull);
     assert!(e.to_string().contains("2 MB left, a recording stops at 5 MB"), "{e}");
+}
+
+/// A new folder is as durable as its name, and so on upwards to the first that was there.
+#[test]
+fn every_new_folder_is_durable_in_its_parent() {
+    let synced = |there: Option<&Path>| {
+        let fs = MemFs::new();
+        if let Some(there) = there {
+            fs.create_dir_all(there).unwrap();
+        }
+        drop(recorder(&fs, options()));
+        let log = fs.log();
+        ["syncdir /data", "syncdir /"].map(|op| log.iter().any(|o| o == op))
+    };
+    assert_eq!(synced(None), [true, true]);
+    assert_eq!(synced(Some(Path::new("/data"))), [true, false]);
 }
 
 #[test]
@@ -413,6 +493,15 @@ fn whichever_operation_fails_the_rest_is_whole() {
                     if fs.ops() <= n {
                         assert!(summary.complete, "{summary:?}");
                         break;
+                    }
+                    let operation = fs.log().get(n as usize).cloned().unwrap_or_default();
+                    let full = kinds[n as usize % 2] == io::ErrorKind::StorageFull;
+                    if full && operation.starts_with("write ") && operation.ends_with(".part") {
+                        // The room of the reserve is enough for an index.
+                        let part = names(&clean).into_iter().find(|n| n.ends_with(".part"));
+                        let once = matches!(fault(0, kinds[0]), Fault::FailOnce(..));
+                        assert!(!once || part.is_none(), "operation {n}, {operation}: {part:?} is left");
+                        assert!(!once || worst(&clean) < Some(Severity::Broken), "operation {n}, {operation}");
                     }
                     if summary.complete {
                         assert_eq!(worst(&clean), None, "operation {n} cost something that nobody says");

@@ -332,6 +332,9 @@ fn a_sync_that_fails_fails_the_recovery() {
     // One that is copied, and one that only lacks its name.
     let unnamed = MemFs::new();
     record(&unnamed, 4, options());
+    let mut session = open(&unnamed).session().clone();
+    session.outcome = None;
+    unnamed.put(&dir().join("session.toml"), session.to_toml().unwrap().into_bytes());
     unnamed.rename(&segment(0), &segment(0).with_extension("mcap.part")).unwrap();
     for fs in [crashed(5, 100), unnamed] {
         let log = {
@@ -366,4 +369,129 @@ fn a_copy_that_is_not_what_was_written_takes_nobodys_place() {
     });
     assert!(e.is_err(), "{e:?}");
     assert!(contents(&fs, &part) == before && ids(&fs) == [1, 2, 3, 4, 5]);
+}
+
+/// A byte of each chunk in turn, and a cut after each: whatever a set's place in its segment, the dataset is whole
+/// afterwards, its losses are as many as they are, and a second recovery changes nothing.
+#[test]
+fn whichever_chunk_is_damaged_the_dataset_is_whole_again() {
+    for synced_ns in [i64::MAX / 4, 1] {
+        let fs = MemFs::new();
+        let limits =
+            RecorderOptions { segment_max_ns: 3 * PERIOD, sync_interval_ns: synced_ns, ..options() };
+        let r = recorder(&fs, limits);
+        for k in 0..9 {
+            r.push(set(&session(), k)).unwrap();
+            settle(&r);
+            // So that an account comes after many a set.
+            std::thread::sleep(std::time::Duration::from_millis(2));
+        }
+        assert!(r.finish().unwrap().complete);
+        let mut lossy = 0;
+        for number in 0..3 {
+            let whole = contents(&fs, &segment(number));
+            for chunk in mcap::Summary::read(&whole).unwrap().unwrap().chunk_indexes {
+                let middle = (chunk.chunk_start_offset + chunk.chunk_length / 2) as usize;
+                let mut flipped = whole.clone();
+                flipped[middle] ^= 0x10;
+                for (damage, bytes) in [("byte", flipped), ("cut", whole[..middle].to_vec())] {
+                    let case = format!("{damage} {middle} of segment {number}");
+                    let fs = copy(&fs);
+                    fs.put(&segment(number), bytes);
+                    let report = recover(&fs).unwrap_or_else(|e| panic!("{case}: {e}"));
+                    assert_eq!(findings(&fs), [""; 0], "{case}: {:?}", report.lost);
+                    let left = ids(&fs);
+                    let o = outcome(&fs);
+                    let gone = 9 - left.len() as u64;
+                    assert_eq!((o.sets_offered, o.sets_recorded), (9, left.len() as u64), "{case}");
+                    assert_eq!(o.sets_dropped.values().sum::<u64>(), gone, "{case}");
+                    assert_eq!(report.segments[number as usize].sets_lost, gone, "{case}: {:?}", report.lost);
+                    assert!(!recover(&fs).unwrap().changed, "{case}");
+                    lossy += usize::from(gone > 0);
+                }
+            }
+        }
+        assert!(lossy > 40, "{lossy}");
+    }
+}
+
+#[test]
+fn a_segment_that_is_recovered_twice_has_lost_both_times() {
+    let fs = MemFs::new();
+    let r = recorder(&fs, RecorderOptions { sync_interval_ns: 1, ..options() });
+    for k in 0..9 {
+        r.push(set(&session(), k)).unwrap();
+        settle(&r);
+        // So that an account comes after the last set as well.
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    drop(r);
+    recover(&fs).unwrap();
+    for picture in [6, 12] {
+        let mut bytes = contents(&fs, &segment(0));
+        let chunks = mcap::Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
+        let mut pictures = chunks.iter().filter(|c| c.message_index_offsets.len() == 1);
+        let hit = pictures.nth(picture).unwrap();
+        bytes[(hit.chunk_start_offset + hit.chunk_length / 2) as usize] ^= 0x10;
+        fs.put(&segment(0), bytes);
+        let report = recover(&fs).unwrap();
+        assert!(report.segments[0].sets_lost > 0, "{:?}", report.lost);
+        assert_eq!(findings(&fs), [""; 0], "{:?}", report.lost);
+    }
+    assert_eq!(ids(&fs).len(), 7);
+}
+
+/// The damaged segment is copied, and before the last one is looked at the recovery is ended.
+#[test]
+fn a_recovery_that_was_ended_between_two_segments_is_told_by_the_next() {
+    let fs = MemFs::new();
+    record(&fs, 9, RecorderOptions { segment_max_ns: 3 * PERIOD, ..options() });
+    let mut bytes = contents(&fs, &segment(1));
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 0x10;
+    fs.put(&segment(1), bytes.clone());
+    let shared: Arc<dyn Fs> = Arc::new(fs.clone());
+    let e = recover_with(&shared, &dir(), &RecoverOptions::default(), &mut |_| {
+        let copied = contents(&fs, &segment(1)) != bytes;
+        if copied { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+    });
+    assert_eq!(e.unwrap_err().kind(), ErrorKind::Interrupted);
+    assert!(outcome(&fs).complete, "nothing was said yet");
+    let report = recover(&fs).unwrap();
+    assert!(report.changed && report.lost.iter().any(|l| l.contains("lost")), "{report:?}");
+    let o = outcome(&fs);
+    let left = ids(&fs).len() as u64;
+    assert!(left < 9 && !o.complete && o.sets_recorded == left, "{o:?}");
+    assert_eq!(findings(&fs), [""; 0]);
+    assert!(!recover(&fs).unwrap().changed);
+}
+
+/// What a failed sync was for may never reach the disk, whatever succeeds later: the file is copied, not renamed.
+#[test]
+fn a_file_whose_sync_failed_is_copied() {
+    let limits = || RecorderOptions { segment_max_ns: 3 * PERIOD, sync_interval_ns: i64::MAX / 4, ..options() };
+    let log = {
+        let fs = MemFs::new();
+        record(&fs, 5, limits());
+        fs.log()
+    };
+    let of_segment = |o: &String| o.starts_with("sync ") && o.ends_with(".mcap.part");
+    let syncs: Vec<u64> = (0..).zip(&log).filter(|(_, o)| of_segment(o)).map(|(n, _)| n).collect();
+    assert!(syncs.len() >= 2, "{log:?}");
+    for n in syncs {
+        let fs = MemFs::new().with_fault(Fault::FailOnce(n, io::ErrorKind::Other));
+        let r = recorder(&fs, limits());
+        for k in 0..5 {
+            // Refused once the recording has ended.
+            let _ = r.push(set(&session(), k));
+            settle(&r);
+        }
+        let summary = r.finish().unwrap();
+        assert!(!summary.complete && names(&fs).iter().any(|n| n.ends_with(".part")), "{summary:?}");
+        let recorded: Vec<u64> = (1..=summary.sets.recorded).collect();
+        recover(&fs).unwrap();
+        assert_eq!(ids(&fs.after_crash(|_| 0)), recorded, "sync {n}: what is on the disk");
+        assert_eq!(findings(&fs), [""; 0]);
+        assert!(!recover(&fs).unwrap().changed);
+    }
 }
