@@ -8,7 +8,7 @@ use crate::fs::{self, Fs, WriteFile};
 use crate::select::{Moment, SetSpan, by_id, last_id, nearest};
 use crate::still::{StillFormat, still};
 use crate::{Error, ErrorKind, Result};
-use depthrig_bus::StreamId;
+use depthrig_bus::{PixelFormat, StreamId};
 use serde::Serialize;
 use std::borrow::Cow;
 use std::ops::{ControlFlow, Range};
@@ -316,7 +316,11 @@ impl<'a> Chosen<'a> {
             let fits = match form {
                 StillFormat::Npy => true,
                 StillFormat::Png => StillFormat::of(s.format) == StillFormat::Png,
-                StillFormat::Jpeg => frame.is_some_and(|f| matches!(f.codec, "jpeg" | "mjpeg")),
+                // A camera may be missing in the first set: each later frame is looked at by itself.
+                StillFormat::Jpeg => frame.map_or_else(
+                    || matches!(s.format, PixelFormat::Rgb8 | PixelFormat::Bgr8 | PixelFormat::Mjpeg),
+                    |f| matches!(f.codec, "jpeg" | "mjpeg"),
+                ),
             };
             if !fits {
                 let what = match form {

@@ -5,7 +5,7 @@
 
 use crate::dataset::{segment_number, segments_in};
 use crate::fs::Fs;
-use crate::{Error, ErrorKind, Result, SESSION_FILE, Session};
+use crate::{Error, ErrorKind, Outcome, Result, SESSION_FILE, Session};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -177,12 +177,23 @@ pub fn look_at(fs: &dyn Fs, dir: &Path) -> CatalogEntry {
                 entry.is(Health::Damaged, what);
             }
             if !o.complete {
-                entry.is(Health::Lost, format!("{} sets were not recorded", entry.sets_lost));
-                entry.why.extend(o.lost.iter().cloned());
+                for words in losses(entry.sets_lost, o) {
+                    entry.is(Health::Lost, words);
+                }
             }
         }
     }
     entry
+}
+
+/// What a recording that is not complete lost: how many sets, if any were counted, then its own words.
+fn losses(sets: u64, outcome: &Outcome) -> Vec<String> {
+    let count = (sets > 0).then(|| format!("{sets} sets were not recorded"));
+    let mut words: Vec<_> = count.into_iter().chain(outcome.lost.iter().cloned()).collect();
+    if words.is_empty() {
+        words.push("the recording is not complete and does not say why".to_owned());
+    }
+    words
 }
 
 /// Sets, times and state of the segments.

@@ -139,18 +139,23 @@ pub(crate) fn write_all(file: &mut dyn WriteFile, mut bytes: &[u8]) -> io::Resul
     Ok(())
 }
 
-/// Replaces the small file `path` so that a crash leaves the old or the new one, never a mixture.
+/// Replaces the small file `path` so that a crash leaves the old or the new one, never a mixture. Only where a
+/// file of this name with the ending `tmp` can be nobody else's: it is removed.
 pub(crate) fn replace(fs: &dyn Fs, path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let tmp = path.with_extension("tmp");
-    match fs.remove_file(&tmp) {
+    replace_by(fs, &path.with_extension("tmp"), path, bytes)
+}
+
+/// The same by way of the file `tmp` in the same folder, which is removed if it is there.
+pub(crate) fn replace_by(fs: &dyn Fs, tmp: &Path, path: &Path, bytes: &[u8]) -> io::Result<()> {
+    match fs.remove_file(tmp) {
         Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(e),
         _ => {}
     }
-    let mut file = fs.create_new(&tmp)?;
+    let mut file = fs.create_new(tmp)?;
     write_all(&mut *file, bytes)?;
     file.sync_all()?;
     drop(file);
-    fs.rename(&tmp, path)?;
+    fs.rename(tmp, path)?;
     path.parent().map_or(Ok(()), |dir| fs.sync_dir(dir))
 }
 

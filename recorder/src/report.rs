@@ -6,12 +6,14 @@
 use crate::catalog::Health;
 use crate::dataset::Dataset;
 use crate::fs::{self, Fs};
-use crate::{Edit, Error, Note, Result, SetCounts, StreamAccount};
+use crate::{Edit, Error, Note, Result, StreamAccount};
 use core::ops::ControlFlow;
 use serde::Serialize;
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
+mod account;
 pub mod curves;
 mod gather;
 mod html;
@@ -21,6 +23,7 @@ mod series;
 mod svg;
 mod verdict;
 
+pub use account::SetsAccount;
 pub use series::{Quantiles, Range, TimeBins};
 
 /// The name of the report in a dataset's folder.
@@ -133,8 +136,9 @@ pub struct SetsReport {
     pub duration_ns: i64,
     /// Time from set to set, nanoseconds.
     pub interval_ns: Quantiles,
-    /// Sets handed over, recorded and dropped by reason: `offered = recorded + Σ dropped`.
-    pub counts: Option<SetCounts>,
+    /// Sets handed over, recorded and dropped by reason: by the last account in the file, or by the session's
+    /// outcome where that tells of more.
+    pub counts: Option<SetsAccount>,
     /// Sets per second over time.
     pub per_second: Vec<Option<f64>>,
     /// Latest minus earliest capture time of a set, nanoseconds.
@@ -320,6 +324,20 @@ impl Report {
     /// # Errors
     /// What the file system says.
     pub fn write(&self, fs: &dyn Fs, path: &Path) -> Result<()> {
-        fs::replace(fs, path, self.to_html().as_bytes()).map_err(|e| Error::io("write", path, e))
+        let tmp = temporary(path);
+        fs::replace_by(fs, &tmp, path, self.to_html().as_bytes()).map_err(|e| {
+            // Nobody would find a hidden file. One that stays all the same, the next report removes.
+            let _ = fs.remove_file(&tmp);
+            Error::io("write", path, e)
+        })
     }
+}
+
+/// What `path` is called while it is written. It may lie among files that are not ours, and a hidden name that
+/// has all of its own in it is none of theirs.
+fn temporary(path: &Path) -> PathBuf {
+    let mut name = OsString::from(".");
+    name.push(path.file_name().unwrap_or_default());
+    name.push(".tmp");
+    path.with_file_name(name)
 }

@@ -115,11 +115,11 @@ def running(binary: str, runtime: Path, log: Path, *arguments: str) -> Iterator[
     assert code == 0, f"{arguments[0]} ended with {code}:\n{log.read_text(errors='replace')}"
 
 
-def command(binary: str, runtime: Path, *arguments: str) -> str:
+def command(binary: str, runtime: Path, *arguments: str, codes: tuple[int, ...] = (0,)) -> str:
     done = subprocess.run(
         [binary, *arguments], env=environment(runtime), capture_output=True, text=True, timeout=WAIT_S, check=False
     )
-    assert done.returncode == 0, f"{arguments} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
+    assert done.returncode in codes, f"{arguments} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
     return done.stdout
 
 

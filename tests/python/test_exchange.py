@@ -36,7 +36,7 @@ def test_real_pictures_come_back_as_they_were(binary: str, runtime: Path, rig_fi
     report = json.loads(command(binary, runtime, "export", "bytecameradepth", str(recorded), str(out), "--json"))
     assert report["lost"] == 0
     # All that was recorded; on a busy machine a set may lack a frame.
-    info = json.loads(command(binary, runtime, "info", str(recorded), "--json"))
+    info = json.loads(command(binary, runtime, "info", str(recorded), "--json", codes=(0, 3)))
     assert report["frames"] == sum(stream["frames"] for stream in info["streams"]) > 0
     (session,) = (p for p in out.iterdir() if p.is_dir())
     calibration = json.loads((session / "calibration.json").read_text())

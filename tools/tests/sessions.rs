@@ -39,13 +39,19 @@ fn record(dir: &Path, scene: &str, started_utc_ns: i64) -> Recorder {
         pose: Pose::IDENTITY,
     }];
     let options = RecorderOptions { min_free_bytes: 0, ..RecorderOptions::default() };
-    let r = Recorder::create(Arc::new(RealFs), dir, session.clone(), options).unwrap();
+    let r = Recorder::create(Arc::new(RealFs), dir, session, options).unwrap();
+    r.push(set(started_utc_ns)).unwrap();
+    r
+}
+
+/// The set that [`record`] pushes.
+fn set(started_utc_ns: i64) -> RecordSet {
     let mut header = FrameHeader::default();
     header.set_picture(PixelFormat::Z16, 8, 8);
-    header.set_names("rig", &session.streams[0].id);
+    header.set_names("rig", &"desk/depth".parse().unwrap());
     let utc = UtcPair { mono: HostTime::from_ns(1), utc_ns: started_utc_ns, width_ns: 1 };
     let frame = RecordFrame { stream: 0, header, pixels: Box::new(vec![1; 128]) };
-    let set = RecordSet {
+    RecordSet {
         id: 1,
         tick: HostTime::from_ns(1),
         utc,
@@ -53,9 +59,7 @@ fn record(dir: &Path, scene: &str, started_utc_ns: i64) -> Recorder {
         missing: vec![],
         motion: Vec::new(),
         spread_ns: 0,
-    };
-    r.push(set).unwrap();
-    r
+    }
 }
 
 /// Every file of a folder: its bytes and when they were last written.
@@ -129,6 +133,29 @@ fn an_edit_shows_in_info_and_leaves_its_history() {
 }
 
 #[test]
+fn info_tells_what_a_dataset_says_that_it_lost() {
+    let home = Home::new();
+    let dir = home.path().join("data");
+    let started = 1_700_000_000_000_000_000;
+    write(&dir, "sink", started);
+    assert!(!home.run(&["info", dir.to_str().unwrap()]).good().contains("lost: "));
+
+    let dir = home.path().join("less");
+    let recorder = record(&dir, "sink", started);
+    recorder.push(set(started)).unwrap_err(); // this id is taken
+    recorder.finish().unwrap();
+    for (path, said) in [
+        (dir.clone(), "lost: 1 of 2 sets were not recorded: bad_set"),
+        // Its last account has it too.
+        (dir.join("seg_0000.mcap"), "lost: 1 sets were not recorded: bad_set"),
+    ] {
+        let ran = home.run(&["info", path.to_str().unwrap()]);
+        assert_eq!(ran.code, 3, "{}{}", ran.out, ran.err);
+        assert_eq!(ran.out.lines().filter(|l| l.starts_with("lost: ")).collect::<Vec<_>>(), [said]);
+    }
+}
+
+#[test]
 fn a_report_is_a_page_or_json_and_its_exit_code_says_how_it_is() {
     let home = Home::new();
     let dir = home.path().join("data");
@@ -187,7 +214,9 @@ fn a_crash_is_recovered_once_and_the_exit_code_says_what_it_cost() {
     assert!(done["lost"][0].as_str().unwrap().contains("cut off"), "{done}");
     let recovered = files(&dir);
     assert_eq!(recovered.keys().collect::<Vec<_>>(), ["seg_0000.mcap", "session.toml"]);
-    assert!(home.run(&["info", at]).good().contains("sink"));
+    let told = json(home.run(&["info", at, "--json"]), 3);
+    assert_eq!((&told["sets"], &told["scene"]), (&1.into(), &"sink".into()));
+    assert_eq!(told["lost"][0], done["lost"][0], "{told}");
 
     let again = json(home.run(&["recover", at, "--json", "-q"]), 0);
     assert_eq!((&again["changed"], &again["lost"]), (&false.into(), &serde_json::json!([])));

@@ -2,8 +2,8 @@
 
 use super::series::{Counts, Histogram, TimeBins, Values};
 use super::{
-    ClockReport, Fill, LinearHistogram, OnProgress, PROBLEMS_MAX, Report, ReportOptions, SetsReport,
-    StreamReport, TOLD_MAX, verdict,
+    ClockReport, Fill, LinearHistogram, OnProgress, PROBLEMS_MAX, Report, ReportOptions, SetsAccount,
+    SetsReport, StreamReport, TOLD_MAX, verdict,
 };
 use crate::catalog::look_at;
 use crate::dataset::{Dataset, DatasetSet, PixelMode, SetRange};
@@ -287,12 +287,14 @@ fn put_together(dataset: &Dataset, pass: Pass, told: Told, looked: Looked) -> Re
     for (s, samples) in streams.iter_mut().zip(looked.fill) {
         s.fill = fill_of(samples);
     }
+    // Of one segment the outcome says nothing.
+    let outcome = session.outcome.as_ref().filter(|_| dataset.is_folder());
     let sets = SetsReport {
         count: pass.sets,
         incomplete: pass.incomplete,
         duration_ns: bins.span_ns,
         interval_ns: pass.interval.quantiles(),
-        counts: told.counts,
+        counts: SetsAccount::known(told.counts.as_ref(), outcome),
         per_second: pass.at.per_second(bins, 0, bins.span_ns),
         spread_ns: pass.spread.quantiles(),
         spread_histogram: linear(&pass.spread, pass.limit_ns),

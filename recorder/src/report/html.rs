@@ -122,13 +122,11 @@ fn head(out: &mut String, r: &Report) {
     }
     out.push_str("</div><dl>");
     let rate = r.bytes as f64 / (r.sets.duration_ns.max(1) as f64 * 1e-9) / 1e6;
-    let lost =
-        r.sets.counts.map_or_else(|| "–".to_owned(), |c| format!("{} of {}", c.dropped_total(), c.offered));
     let per_s = if r.sets.interval_ns.p50 > 0 { 1e9 / r.sets.interval_ns.p50 as f64 } else { 0.0 };
     for (name, value) in [
         ("Length", length(r.sets.duration_ns)),
         ("Sets", format!("{} at {} Hz", r.sets.count, number(per_s))),
-        ("Sets lost", lost),
+        ("Sets lost", sets_lost(r)),
         ("Incomplete sets", r.sets.incomplete.to_string()),
         ("Size", format!("{} in {}", size(r.bytes), count(r.segments as u64, "segment"))),
         ("Data rate", if r.sets.duration_ns > 0 { format!("{rate:.1} MB/s") } else { "–".to_owned() }),
@@ -146,6 +144,14 @@ fn head(out: &mut String, r: &Report) {
         field => format!("{}: {field} “{}” became “{}”", utc_text(e.utc_ns), e.before, e.after),
     });
     named_list(out, "Changed after the recording", edits.collect());
+}
+
+fn sets_lost(r: &Report) -> String {
+    match &r.sets.counts {
+        None => "–".to_owned(),
+        Some(c) if r.verdict.health == Health::Lost && c.dropped_total() == 0 => "none counted".to_owned(),
+        Some(c) => format!("{} of {}", c.dropped_total(), c.offered),
+    }
 }
 
 fn named_list(out: &mut String, name: &str, mut lines: Vec<String>) {

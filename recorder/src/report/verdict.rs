@@ -1,7 +1,7 @@
 //! What is to be thought of a dataset, in sentences: the first thing that a reader sees.
 
 use super::html::count;
-use super::{Report, StreamReport, Verdict};
+use super::{Report, SetsAccount, StreamReport, Verdict};
 use crate::catalog::{CatalogEntry, Health};
 
 /// Sentences of each kind at most; the rest is counted.
@@ -28,12 +28,12 @@ pub(super) fn of(report: &Report, catalog: Option<&CatalogEntry>) -> Verdict {
         }
         why.extend(report.problems.iter().filter(|p| !unfinished || !p.contains(".part")).cloned());
     }
-    let lost = report.sets.counts.map_or(0, |c| c.dropped_total());
+    let lost = report.sets.counts.as_ref().map_or(0, SetsAccount::dropped_total);
     if lost > 0 && health == Health::Whole {
         health = Health::Lost;
         why.push(format!("{lost} sets were not recorded"));
     }
-    let balanced = report.sets.counts.is_none_or(|c| c.balances())
+    let balanced = report.sets.counts.as_ref().is_none_or(SetsAccount::balances)
         && (report.streams.iter().filter_map(|s| s.account.as_ref()))
             .chain(report.motion.iter().filter_map(|u| u.account.as_ref()))
             .all(crate::StreamAccount::balances);
@@ -63,8 +63,12 @@ fn headline(report: &Report, health: Health, lost: u64, plain: bool) -> String {
             format!("Whole: all {sets} sets are here, each with every stream. Read the remarks.")
         }
         Health::Recording => format!("Still being recorded: this is what is on disk so far, {sets} sets."),
+        // A crash takes sets that nobody had counted yet.
+        Health::Lost if lost == 0 => {
+            format!("Something was lost, although no set is counted as lost: {sets} sets are here.")
+        }
         Health::Lost => {
-            let offered = report.sets.counts.map_or(sets + lost, |c| c.offered);
+            let offered = report.sets.counts.as_ref().map_or(sets + lost, |c| c.offered);
             format!("Something was lost: {lost} of {offered} sets were not recorded.")
         }
         Health::Unfinished => {

@@ -108,6 +108,37 @@ fn a_stored_jpeg_comes_out_byte_by_byte() {
     }
 }
 
+/// A camera that came late is no reason to refuse its pictures, unless they can be no JPEG at all.
+#[test]
+fn a_stream_that_is_missing_first_is_judged_by_what_it_can_be() {
+    let late = |options: RecorderOptions, first: &[usize]| {
+        let fs = MemFs::new();
+        let r = recorder(&fs, options);
+        for (n, streams) in [(0, first), (1, &[0, 1, 2][..])] {
+            r.push(set_of(&session(), n, streams)).unwrap();
+            settle(&r);
+        }
+        r.finish().unwrap();
+        fs
+    };
+    let of = |id: &str| FrameChoice { streams: only(&[id]), ..Default::default() };
+    let fs = late(options(), &[1, 2]);
+    let done = export(&fs, &open(&fs), &of("front/color"), Some(StillFormat::Jpeg)).unwrap();
+    assert_eq!((done.sets, done.frames, done.lost), (2, 1, 0), "{done:?}");
+    assert_eq!(csv(&fs)[0]["file"], "front/color/000002.jpg");
+
+    // Colour that is stored as it is costs its frames, each by itself.
+    let fs = late(raw(), &[1, 2]);
+    let done = export(&fs, &open(&fs), &of("front/color"), Some(StillFormat::Jpeg)).unwrap();
+    assert_eq!((done.frames, done.lost), (0, 1));
+    assert!(done.problems[0].contains("is stored as raw, not as a JPEG"), "{:?}", done.problems);
+
+    let fs = late(options(), &[0]);
+    let e = export(&fs, &open(&fs), &of("front/depth"), Some(StillFormat::Jpeg)).unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::BadInput);
+    assert!(fs.read_dir(&out()).is_err(), "nothing is written");
+}
+
 #[test]
 fn what_cannot_be_written_as_asked_is_refused_before_anything_is_written() {
     let fs = MemFs::new();

@@ -30,7 +30,7 @@ fn entry<'a>(list: &'a [CatalogEntry], name: &str) -> &'a CatalogEntry {
 fn good_and_bad_ones_are_listed_with_the_reason() {
     let home = tempfile::tempdir().unwrap();
     let at = |name: &str| home.path().join(name);
-    for name in ["whole", "cut", "gap", "no_session", "bad_session", "less", "lost", "open", "part"] {
+    for name in ["whole", "cut", "full", "gap", "no_session", "bad_session", "less", "lost", "open", "part"] {
         write(&at(name), "a <b>", 5);
     }
     std::fs::create_dir_all(at("more")).unwrap();
@@ -58,6 +58,7 @@ fn good_and_bad_ones_are_listed_with_the_reason() {
         "complete = false\nlost = [\"2 of 7 sets were not recorded: disk_slow\"]",
     );
     edit("lost", "[outcome]", "[outcome.sets_dropped]\ndisk_slow = 2\n\n[outcome]");
+    edit("full", "complete = true", "complete = false\nlost = [\"the disk was full\"]");
     edit("open", "[outcome]", "[was_outcome]");
     edit("part", "[outcome]", "[was_outcome]");
     std::fs::rename(segment("part", 2), at("part").join("seg_0002.mcap.part")).unwrap();
@@ -65,8 +66,19 @@ fn good_and_bad_ones_are_listed_with_the_reason() {
     let list = catalog(&RealFs, home.path()).unwrap();
     let names: Vec<_> =
         list.iter().map(|e| e.path.strip_prefix(home.path()).unwrap().to_str().unwrap()).collect();
-    let expected =
-        ["bad_session", "cut", "gap", "less", "lost", "more/inner", "no_session", "open", "part", "whole"];
+    let expected = [
+        "bad_session",
+        "cut",
+        "full",
+        "gap",
+        "less",
+        "lost",
+        "more/inner",
+        "no_session",
+        "open",
+        "part",
+        "whole",
+    ];
     assert_eq!(names, expected);
     for (name, health, sets, why) in [
         ("whole", Health::Whole, 5, ""),
@@ -76,6 +88,7 @@ fn good_and_bad_ones_are_listed_with_the_reason() {
         ("less", Health::Damaged, 4, "says 5 sets, the segments hold 4"),
         ("no_session", Health::Damaged, 5, "session.toml is missing"),
         ("bad_session", Health::Damaged, 5, "session.toml cannot be read"),
+        ("full", Health::Lost, 5, "the disk was full"),
         ("lost", Health::Lost, 5, "2 sets were not recorded"),
         ("open", Health::Unfinished, 5, "depthrig recover"),
         ("part", Health::Unfinished, 4, "seg_0002.mcap.part was not finished: run depthrig recover"),
@@ -92,6 +105,7 @@ fn good_and_bad_ones_are_listed_with_the_reason() {
     assert_eq!((whole.scene.as_str(), whole.operator.as_str(), whole.streams), ("a <b>", "nobody", 3));
     assert_eq!((whole.started_utc_ns, whole.duration_ns, whole.segments), (Some(T0), 4 * PERIOD, 3));
     assert_eq!(entry(&list, "lost").sets_lost, 2);
+    assert_eq!(entry(&list, "full").why, ["the disk was full"], "no set is counted as lost");
     // A dataset may be named itself.
     assert_eq!(&catalog(&RealFs, &at("whole")).unwrap()[..], std::slice::from_ref(whole));
     // What the list calls whole is whole.

@@ -1,5 +1,6 @@
 //! The quality report: its numbers against what was recorded, its words about what went wrong, and its page.
 
+use crate::recover::recover;
 use crate::support::*;
 use core::ops::ControlFlow;
 use depthrig_bus::{DropCounts, PixelFormat};
@@ -43,7 +44,7 @@ fn the_numbers_are_those_of_the_recording() {
     assert_eq!(r.verdict.health, Health::Whole);
     assert_eq!((r.verdict.why.len(), r.verdict.remarks.len()), (0, 0), "{:?}", r.verdict);
     assert_eq!((r.sets.count, r.sets.incomplete, r.segments), (25, 0, 3));
-    assert_eq!((r.sets.duration_ns, r.sets.counts.unwrap().offered), (24 * PERIOD, 25));
+    assert_eq!((r.sets.duration_ns, r.sets.counts.as_ref().unwrap().offered), (24 * PERIOD, 25));
     assert!((r.sets.interval_ns.p50 - PERIOD).abs() < PERIOD / 250 && r.sets.interval_ns.max == PERIOD);
     // Capture times differ by the length of the names: 11, 11 and 12 characters.
     assert_eq!(r.sets.spread_ns.max, 1);
@@ -155,6 +156,81 @@ fn every_loss_has_its_reason_and_the_sums_are_checked() {
     assert_eq!(r.verdict.health, Health::Damaged);
     assert!(r.verdict.why[0].contains("does not balance"), "{:?}", r.verdict);
     assert!(r.to_html().contains("NOT exact"));
+}
+
+/// What the last account in the file does not tell, because nothing more could be written.
+#[test]
+fn what_a_full_disk_cost_is_told() {
+    let fs = MemFs::new().with_capacity(110_000);
+    let recorder = recorder(&fs, RecorderOptions { reserve_bytes: 30_000, ..options() });
+    for n in 0..40 {
+        drop(recorder.push(set(&session(), n)));
+        settle(&recorder);
+    }
+    let summary = recorder.finish().unwrap();
+    let (recorded, lost) = (summary.sets.recorded, summary.sets.dropped_total());
+    assert!(recorded > 0 && lost > 1 && recorded + lost == 40, "{summary:?}");
+
+    let r = report(&fs);
+    let c = r.sets.counts.as_ref().unwrap();
+    assert_eq!((c.offered, c.recorded, c.dropped_total(), c.balances()), (40, recorded, lost, true));
+    assert_eq!(c.dropped["write_failed"], lost);
+    assert_eq!(r.verdict.health, Health::Lost, "{:?}", r.verdict);
+    assert_eq!(r.verdict.headline, format!("Something was lost: {lost} of 40 sets were not recorded."));
+    let page = r.to_html();
+    for part in [
+        format!("<dd>{lost} of 40</dd>"),
+        format!("40 offered = {recorded} recorded + {lost} write_failed"),
+        "sets · write_failed".to_owned(),
+    ] {
+        assert!(page.contains(&part), "the page lacks {part}");
+    }
+    assert!(!page.contains("Nothing was lost"));
+    check_page(&page);
+
+    // Of a segment by itself the end of the recording says nothing.
+    let one = Dataset::open_with(Arc::new(fs.clone()), &segment(0)).unwrap();
+    let r = Report::of(&one, &ReportOptions::default(), &mut |_| ControlFlow::Continue(())).unwrap().unwrap();
+    assert!(r.sets.counts.is_none_or(|c| c.offered < 40));
+}
+
+#[test]
+fn what_a_crash_cost_is_told() {
+    // As a failing disk leaves it.
+    let fs = MemFs::new();
+    record(&fs, 9, RecorderOptions { segment_max_ns: 100 * PERIOD, ..options() });
+    let mut bytes = contents(&fs, &segment(0));
+    let at = bytes.len() * 2 / 5;
+    bytes[at..at + 512].fill(0xA5);
+    fs.put(&segment(0), bytes);
+    recover(&fs).unwrap();
+    let r = report(&fs);
+    let lost = 9 - r.sets.count;
+    assert!(lost > 0);
+    let c = r.sets.counts.as_ref().unwrap();
+    assert_eq!((c.offered, c.dropped["lost_in_crash"], c.balances()), (9, lost, true));
+    assert_eq!(r.verdict.health, Health::Lost, "{:?}", r.verdict);
+    assert_eq!(r.verdict.headline, format!("Something was lost: {lost} of 9 sets were not recorded."));
+    let page = r.to_html();
+    assert!(page.contains("sets · lost_in_crash") && !page.contains("Nothing was lost"));
+    check_page(&page);
+
+    // The recorder died; how many sets it still had in memory nobody knows.
+    let fs = MemFs::new();
+    let recorder = recorder(&fs, options());
+    for n in 0..6 {
+        recorder.push(set(&session(), n)).unwrap();
+        settle(&recorder);
+    }
+    drop(recorder);
+    recover(&fs).unwrap();
+    let r = report(&fs);
+    assert_eq!(r.verdict.health, Health::Lost, "{:?}", r.verdict);
+    assert!(r.verdict.headline.contains("6 sets are here"), "{}", r.verdict.headline);
+    assert!(r.verdict.why[0].contains("was cut off"), "{:?}", r.verdict.why);
+    let page = r.to_html();
+    assert!(page.contains("none counted") && !page.contains("Nothing was lost"));
+    check_page(&page);
 }
 
 #[test]
@@ -285,6 +361,24 @@ fn the_page_is_written_in_one_step_and_needs_nothing_but_itself() {
     let verified =
         depthrig_recorder::verify_with(&fs, &dir(), &depthrig_recorder::VerifyOptions::default()).unwrap();
     assert_eq!(verified.findings, []);
+}
+
+#[test]
+fn what_lies_beside_the_page_is_left_alone() {
+    let fs = MemFs::new();
+    record(&fs, 1, options());
+    let beside = |name: &str| dir().join(name);
+    fs.put(&beside("kitchen.tmp"), b"somebody's".to_vec());
+    fs.put(&beside(".kitchen.html.tmp"), b"what a killed report left".to_vec());
+    let r = report(&fs);
+    r.write(&fs, &beside("kitchen.html")).unwrap();
+    assert_eq!(contents(&fs, &beside("kitchen.html")), r.to_html().into_bytes());
+    assert_eq!(names(&fs), ["kitchen.html", "kitchen.tmp", "seg_0000.mcap", "session.toml"]);
+    assert_eq!(contents(&fs, &beside("kitchen.tmp")), b"somebody's");
+    // Where there is no room, the page stays as it was and nothing is left.
+    let full = copy(&fs).with_capacity(1);
+    r.write(&full, &beside("kitchen.html")).unwrap_err();
+    assert_eq!(names(&full), names(&fs));
 }
 
 /// Every kind of pixels makes a picture on the page.

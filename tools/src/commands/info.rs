@@ -4,6 +4,7 @@ use crate::exit::Exit;
 use crate::out;
 use anyhow::Result;
 use depthrig_recorder::{Dataset, DatasetInfo, utc_text};
+use serde::Serialize;
 use std::path::PathBuf;
 
 /// Arguments.
@@ -16,20 +17,45 @@ pub struct InfoArgs {
     json: bool,
 }
 
+/// What is in a dataset, and what it says that it lost.
+#[derive(Serialize)]
+struct Told<'a> {
+    #[serde(flatten)]
+    info: &'a DatasetInfo,
+    lost: &'a [String],
+}
+
 /// Prints it. Exit code 3 when the dataset says itself that something is missing.
 pub fn run(args: &InfoArgs) -> Result<Exit> {
-    let info = Dataset::open(&args.dataset)?.info()?;
+    let dataset = Dataset::open(&args.dataset)?;
+    let info = dataset.info()?;
+    let lost = lost(&dataset, &info);
     if args.json {
-        out::json(&info)?;
+        out::json(&Told { info: &info, lost: &lost })?;
     } else {
-        out::line(text(&info))?;
+        out::line(text(&info, &lost))?;
     }
-    let lost = !info.problems.is_empty() || !info.unfinished.is_empty();
-    Ok(if lost { Exit::Lost } else { Exit::Good })
+    let good = lost.is_empty() && info.problems.is_empty() && info.unfinished.is_empty();
+    Ok(if good { Exit::Good } else { Exit::Lost })
+}
+
+/// What the dataset says itself that it lost: in the words of its outcome, else by its last account.
+fn lost(dataset: &Dataset, info: &DatasetInfo) -> Vec<String> {
+    let outcome = dataset.session().outcome.as_ref().filter(|o| !o.complete);
+    let mut lost = outcome.map(|o| o.lost.clone()).unwrap_or_default();
+    if lost.is_empty() {
+        let counts = info.set_counts.unwrap_or_default();
+        let counted = counts.dropped_by_reason();
+        lost.extend(counted.map(|(reason, n)| format!("{n} sets were not recorded: {}", reason.name())));
+    }
+    if lost.is_empty() && outcome.is_some() {
+        lost.push("the recording is not complete and does not say why".to_owned());
+    }
+    lost
 }
 
 /// The dataset for people.
-pub fn text(info: &DatasetInfo) -> String {
+fn text(info: &DatasetInfo, lost: &[String]) -> String {
     let ms = |ns: i64| ns as f64 / 1e6;
     let or_none = |text: &str| if text.is_empty() { "-".to_owned() } else { text.to_owned() };
     let mut lines = vec![
@@ -107,6 +133,7 @@ pub fn text(info: &DatasetInfo) -> String {
         ));
     }
     lines.extend(info.computed.iter().map(|made| format!("computed: {made}")));
+    lines.extend(lost.iter().map(|what| format!("lost: {what}")));
     lines.extend(info.unfinished.iter().map(|file| format!("unfinished: {file}")));
     lines.extend(info.problems.iter().map(|problem| format!("problem: {problem}")));
     lines.join("\n")

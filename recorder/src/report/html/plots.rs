@@ -1,6 +1,7 @@
 //! The sections of the report that are plots: rates, losses, spreads, clocks, fill rates.
 
 use super::{END_TABLE, count, escape, ms, row, table};
+use crate::catalog::Health;
 use crate::report::svg::{self, Strip, Time, Trace, nice_end, number};
 use crate::report::{MotionReport, Quantiles, Range, Report, StreamReport};
 use std::fmt::Write;
@@ -92,13 +93,13 @@ pub(super) fn losses(out: &mut String, r: &Report) {
     out.push_str(
         "<div class=\"wide\"><table><thead><tr><th></th><th>account</th><th>checked</th></tr></thead><tbody>",
     );
-    if let Some(c) = r.sets.counts {
+    if let Some(c) = &r.sets.counts {
         let mut text = format!("{} offered = {} recorded", c.offered, c.recorded);
-        for (reason, n) in c.dropped_by_reason() {
-            let _ = write!(text, " + {n} {}", reason.name());
-            bars.push((format!("sets · {}", reason.name()), n));
+        for (reason, n) in &c.dropped {
+            let _ = write!(text, " + {n} {reason}");
+            bars.push((format!("sets · {reason}"), *n));
         }
-        let _ = write!(out, "<tr><td>sets</td><td>{text}</td>");
+        let _ = write!(out, "<tr><td>sets</td><td>{}</td>", escape(&text));
         check(out, c.balances());
         out.push_str("</tr>");
     }
@@ -120,7 +121,12 @@ pub(super) fn losses(out: &mut String, r: &Report) {
     }
     out.push_str(END_TABLE);
     if bars.is_empty() {
-        out.push_str("<p class=\"cap\">Nothing was lost for any reason.</p>");
+        let said = if r.verdict.health == Health::Whole {
+            "Nothing was lost for any reason."
+        } else {
+            "No loss is counted; what is known of one stands in the verdict."
+        };
+        let _ = write!(out, "<p class=\"cap\">{said}</p>");
     } else {
         out.push_str("<p class=\"cap\">Sets, and frames before their channel, that were lost:</p>");
         out.push_str(&svg::bars("Losses by stream and reason", &bars));
