@@ -6,6 +6,9 @@ cd "$(dirname "$0")/.."
 python=$PWD/.venv/bin/python
 logs=target/test-logs
 mkdir -p "$logs"
+# Tests in Rust that could not be done append a line here: cargo keeps to itself what a passing test prints.
+export DEPTHRIG_TEST_SKIPS=$PWD/$logs/skips
+rm -f "$DEPTHRIG_TEST_SKIPS"
 failed_steps=""
 step() { # NAME COMMAND...: runs it, keeps its output, remembers a failure
     local name=$1
@@ -73,6 +76,10 @@ trap 'rm -rf "$work"' EXIT
 step golden "$target/examples/golden" "$work/dataset" "$work/expected"
 step reader-python "$python" tests/readers/check_python.py "$work/dataset" "$work/expected"
 step reader-node node tests/readers/check_node.mjs "$work/dataset" "$work/expected"
+# Depth in our own codec, colour as PNG. Python's readers take it apart with the package depthrig; in JavaScript there
+# is no decoder of it.
+step golden-rank "$target/examples/golden" "$work/rank" "$work/rank-expected" rank
+step reader-python-rank "$python" tests/readers/check_python.py "$work/rank" "$work/rank-expected"
 step golden-stereo "$target/examples/golden" "$work/stereo" "$work/stereo-expected" stereo
 step reader-python-stereo "$python" tests/readers/check_python.py "$work/stereo" "$work/stereo-expected"
 step reader-node-stereo node tests/readers/check_node.mjs "$work/stereo" "$work/stereo-expected"
@@ -94,7 +101,14 @@ if grep -q '^virtual machine skipped' "$logs/vm.log"; then skipped+=", 1 skipped
 count() { grep -ohE "[0-9]+ $1" "$logs"/{rust,oak-crate,python,python-versions,python-torch,python-oak,daemon,vm}.log | awk '{n += $1} END {print n + 0}'; }
 passed=$(count passed)
 failed=$(count failed)
-for name in {golden,reader-python,reader-node}{,-stereo,-zed}; do
+# A test that found no small disk has passed for cargo. Nothing could be mounted, which DEPTHRIG_REQUIRE_TMPFS forbids.
+disks=0
+if [ -f "$DEPTHRIG_TEST_SKIPS" ]; then disks=$(grep -c '^tmpfs: ' "$DEPTHRIG_TEST_SKIPS"); fi
+if [ "$disks" -gt 0 ]; then
+    passed=$((passed - disks))
+    skipped+=", $disks skipped: tests with a small disk (tmpfs)"
+fi
+for name in {golden,reader-python,reader-node}{,-stereo,-zed} {golden,reader-python}-rank; do
     case "$failed_steps " in
     *" $name "*) failed=$((failed + 1)) ;;
     *) passed=$((passed + 1)) ;;

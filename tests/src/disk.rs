@@ -2,6 +2,7 @@
 
 use depthrig_bus::HostTime;
 use depthrig_recorder::fs::{DirEntry, Fs, ReadFile, RealFs, WriteFile};
+use std::fs::OpenOptions;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -147,29 +148,43 @@ impl Fs for Disk {
     }
 }
 
+/// Fails the test if it may not do without a small disk. If it may, that is said on stderr, and for tools/test.sh
+/// in a line of the file that `DEPTHRIG_TEST_SKIPS` names: cargo keeps to itself what a passing test prints.
+fn without_a_small_disk(why: &str) {
+    assert!(
+        std::env::var_os("DEPTHRIG_REQUIRE_TMPFS").is_none(),
+        "a small disk cannot be mounted here, which DEPTHRIG_REQUIRE_TMPFS forbids: {why}"
+    );
+    eprintln!("SKIPPED: a small disk cannot be mounted here: {why}");
+    if let Some(path) = std::env::var_os("DEPTHRIG_TEST_SKIPS") {
+        use std::io::Write as _;
+        let mut file = OpenOptions::new().create(true).append(true).open(path).unwrap();
+        // In one write, so that lines of tests that run at the same time do not mix.
+        file.write_all(format!("tmpfs: {why}\n").as_bytes()).unwrap();
+    }
+}
+
 /// A real file system in memory of a given size, unmounted at the end.
 #[derive(Debug)]
 pub struct Tmpfs(PathBuf);
 
 impl Tmpfs {
     /// Mounts one on the new folder `dir`; `None`, with the reason on stderr, where this user may not mount.
+    ///
+    /// # Panics
+    /// When it cannot be mounted and `DEPTHRIG_REQUIRE_TMPFS` is set.
     pub fn mount(dir: &Path, bytes: u64) -> Option<Self> {
         std::fs::create_dir_all(dir).unwrap();
         let size = format!("size={bytes},mode=0700");
         let mounted =
             Command::new("mount").args(["-t", "tmpfs", "-o", &size, "depthrig-test"]).arg(dir).output();
-        match mounted {
-            Ok(done) if done.status.success() => Some(Self(dir.to_owned())),
-            Ok(done) => {
-                let why = String::from_utf8_lossy(&done.stderr).into_owned();
-                eprintln!("SKIPPED: a small disk cannot be mounted here: {}", why.trim());
-                None
-            }
-            Err(e) => {
-                eprintln!("SKIPPED: there is no mount command: {e}");
-                None
-            }
-        }
+        let why = match mounted {
+            Ok(done) if done.status.success() => return Some(Self(dir.to_owned())),
+            Ok(done) => String::from_utf8_lossy(&done.stderr).trim().replace('\n', " "),
+            Err(e) => format!("there is no mount command: {e}"),
+        };
+        without_a_small_disk(&why);
+        None
     }
 
     /// Its folder.

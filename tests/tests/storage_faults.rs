@@ -2,6 +2,8 @@
 //!
 //! Each test watches every stream with a subscriber of its own, before the fault and during it. No frame may be lost,
 //! and frames may not come much later than before. `DEPTHRIG_LONG=1` makes the faults last three times as long.
+//! Where no tmpfs can be mounted, tests that need a small disk do nothing and tools/test.sh counts them;
+//! `DEPTHRIG_REQUIRE_TMPFS=1` makes that a failure.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{Bus, HostTime, RigName, StreamId, UtcPair};
