@@ -42,8 +42,7 @@ pub enum ErrorKind {
 
 /// What Linux says when the device itself fails, as at a sector that cannot be read (`errno(3)`).
 const EIO: i32 = 5;
-const DISK_FAILS: &str =
-    ": the disk fails there (input/output error); copy what it still gives with `ddrescue` and go on with the copy";
+const DISK_FAILS: &str = ": the disk fails there (input/output error); copy what it still gives with `ddrescue` and go on with the copy";
 
 depthrig_bus::error_type! {
     /// An error of the recorder.

@@ -4,8 +4,8 @@
 //! recording (accounts, checkpoints, the session's outcome) is written for what the new dataset holds. One thread
 //! reads each input ahead by a set; memory does not grow with the length of the datasets.
 //!
-//! The new dataset grows in a folder named `OUT.part`, which gets its name when everything in it is durable. So
-//! `OUT` is whole or not there, and the inputs are only read.
+//! The new dataset grows in a folder named `OUT.part`, which is locked, and gets its name when everything in it
+//! is durable. So `OUT` is whole or not there, and the inputs are only read.
 
 use crate::dataset::Dataset;
 use crate::fs::Fs;
@@ -95,9 +95,9 @@ pub type SliceProgress<'a> = &'a mut dyn FnMut(u64, u64) -> ControlFlow<()>;
 /// Writes the sets of `span` as the new dataset `out`.
 ///
 /// # Errors
-/// [`ErrorKind::BadInput`] when no set is in the span, [`ErrorKind::AlreadyExists`] when `out` or what is left of an
-/// earlier try is there, [`ErrorKind::DiskFull`], [`ErrorKind::Cancelled`], and as reading and writing do. `out` is
-/// not there then.
+/// [`ErrorKind::BadInput`] when no set is in the span, [`ErrorKind::AlreadyExists`] when `out` or what is left of
+/// an earlier try is there, [`ErrorKind::InUse`] while somebody else makes `out`, [`ErrorKind::DiskFull`],
+/// [`ErrorKind::Cancelled`], and as reading and writing do. `out` is not there then.
 pub fn trim(
     fs: &dyn Fs,
     dataset: &Dataset,
@@ -145,12 +145,12 @@ pub fn merge(
         session::must_be_one(first, other)?;
     }
     let inputs: Vec<_> = datasets.iter().map(Input::new).collect();
-    let Some(Lanes { lanes, times }) = lanes(&inputs)? else {
+    let Some(Lanes { lanes, times, unread }) = lanes(&inputs)? else {
         return Err(Error::new(ErrorKind::BadInput, "there is no set in what is to be merged"));
     };
     let mut session = session::merged(datasets, out);
     session.derived.push(derived("merge", &inputs, times));
-    Join::new(&inputs, lane::Range::ALL, *options).run(fs, &lanes, session, out, progress)
+    Join::new(&inputs, lane::Range::ALL, *options).without(unread).run(fs, &lanes, session, out, progress)
 }
 
 /// The provenance of what is made from `inputs`, with sets from one log time to another.

@@ -57,7 +57,8 @@ struct State {
     moves: Vec<Move>,
     next: u64,
     dirs: BTreeSet<PathBuf>,
-    locks: BTreeSet<PathBuf>,
+    /// Folders that are locked, each by a lock with a number of its own.
+    locks: BTreeMap<PathBuf, u64>,
     ops: u64,
     log: Vec<String>,
     faults: Vec<Fault>,
@@ -77,12 +78,12 @@ struct MemFile {
     file: u64,
 }
 
-/// Ends the lock.
-struct Unlock(MemFs, PathBuf);
+/// Ends the lock of this number, whatever its folder is called by then.
+struct Unlock(MemFs, u64);
 
 impl Drop for Unlock {
     fn drop(&mut self) {
-        self.0.state().locks.remove(&self.1);
+        self.0.state().locks.retain(|_, lock| *lock != self.1);
     }
 }
 
@@ -113,8 +114,11 @@ impl State {
             (m.from, m.to) = (m.from.take().map(moved), m.to.take().map(moved));
         }
         // Joining an empty rest leaves a slash at the end, which no path of a folder has here.
-        let tidy = |p: PathBuf| p.components().collect();
+        let tidy = |p: PathBuf| -> PathBuf { p.components().collect() };
         self.dirs = std::mem::take(&mut self.dirs).into_iter().map(moved).map(tidy).collect();
+        // A lock is one of the folder and not of its name.
+        let locks = std::mem::take(&mut self.locks).into_iter();
+        self.locks = locks.map(|(p, lock)| (tidy(moved(p)), lock)).collect();
         self.changes += 1;
         Ok(())
     }
@@ -355,6 +359,8 @@ impl Fs for MemFs {
         if state.names.keys().chain(&state.dirs).any(|p| p.parent() == Some(dir)) {
             return Err(io::ErrorKind::DirectoryNotEmpty.into());
         }
+        // Another folder of this name is not locked.
+        state.locks.remove(dir);
         if state.dirs.remove(dir) { Ok(()) } else { Err(io::ErrorKind::NotFound.into()) }
     }
 
@@ -398,10 +404,13 @@ impl Fs for MemFs {
 
     fn lock(&self, dir: &Path) -> io::Result<Box<dyn Send + Sync>> {
         let mut state = self.op("lock", dir)?;
-        if !state.locks.insert(dir.to_owned()) {
+        if state.locks.contains_key(dir) {
             return Err(io::ErrorKind::WouldBlock.into());
         }
-        Ok(Box::new(Unlock(self.clone(), dir.to_owned())))
+        let lock = state.next;
+        state.next += 1;
+        state.locks.insert(dir.to_owned(), lock);
+        Ok(Box::new(Unlock(self.clone(), lock)))
     }
 }
 

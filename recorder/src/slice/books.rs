@@ -43,7 +43,8 @@ impl Books {
     pub(super) fn account(&mut self, account: &SetCounts, losses: &mut [u64; REASONS]) {
         let before = self.seen.replace(account.dropped).unwrap_or(account.dropped);
         for ((credit, now), before) in self.credit.iter_mut().zip(account.dropped).zip(before) {
-            *credit += now.saturating_sub(before);
+            // What somebody wrote into a file may not fit.
+            *credit = credit.saturating_add(now.saturating_sub(before));
         }
         self.settle(losses);
     }
@@ -51,8 +52,13 @@ impl Books {
     /// The input has ended: losses that no gap shows came after its last set.
     pub(super) fn end(&mut self, losses: &mut [u64; REASONS]) {
         for (total, credit) in losses.iter_mut().zip(&mut self.credit) {
-            *total += std::mem::take(credit);
+            *total = total.saturating_add(std::mem::take(credit));
         }
+    }
+
+    /// Losses that accounts told of and no gap has shown: at the end of the input, those after its last set.
+    pub(super) fn beyond_gaps(&self) -> u64 {
+        self.credit.iter().fold(0, |sum, n| sum.saturating_add(*n))
     }
 
     /// Sets that are missing in the new dataset for a reason that nothing tells.

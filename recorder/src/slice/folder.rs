@@ -1,18 +1,25 @@
-//! The folder in which a new dataset grows: it is renamed when everything in it is durable.
+//! The folder in which a new dataset grows: locked all the while, and renamed when all in it is durable.
 
 use crate::fs::Fs;
 use crate::{Error, ErrorKind, Result};
 use std::io;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Beside the chunks there are heads, indexes and `session.toml`, bytes.
 const MARGIN_BYTES: u64 = 16 << 20;
+/// A process that is being started holds what its parent held until it runs its own program: a lock that is
+/// gone may look taken for a moment. So often, and so long each time, it is waited for.
+const LOCK_TRIES: u32 = 20;
+const LOCK_WAIT: Duration = Duration::from_millis(25);
 
 pub(super) struct Folder<'a> {
     fs: &'a dyn Fs,
     out: PathBuf,
     part: PathBuf,
     done: bool,
+    /// Keeps a recovery and another run out until it has its name; `None` where the file system has no locks.
+    _lock: Option<Box<dyn Send + Sync>>,
 }
 
 impl<'a> Folder<'a> {
@@ -25,15 +32,16 @@ impl<'a> Folder<'a> {
         part.push(".part");
         let part = out.with_file_name(part);
         must_be_free(fs, out, "choose another name")?;
-        must_be_free(
-            fs,
-            &part,
-            "it is being written by another process, or is left of one that was cut off; if nothing writes to it, \
-             remove it",
-        )?;
-        let made = fs.create_dir_all(&part);
-        made.map_err(|e| Error::io("create the folder", &part, e))?;
-        let folder = Self { fs, out: out.to_owned(), part, done: false };
+        fs.create_dir_all(&part).map_err(|e| Error::io("create the folder", &part, e))?;
+        // First: nothing is said of, or done with, a folder that somebody else writes to.
+        let lock = lock(fs, &part)?;
+        let advice = "it is left of a run that was cut off; if nothing writes to it, remove it";
+        if let Err(e) = must_be_free(fs, &part, advice) {
+            // Removes an empty folder, which is of our making, and nothing else.
+            let _ = fs.remove_dir(&part);
+            return Err(e);
+        }
+        let folder = Self { fs, out: out.to_owned(), part, done: false, _lock: lock };
         let free = fs.available_space(&folder.part);
         let free = free.map_err(|e| Error::io("ask for the free space of", &folder.part, e))?;
         let needed = bytes.saturating_add(MARGIN_BYTES);
@@ -79,6 +87,26 @@ impl Drop for Folder<'_> {
             tracing::warn!("{} is left unfinished: {e}", self.part.display());
         }
     }
+}
+
+/// Locks the folder. A file system that cannot lock is no reason not to write.
+fn lock(fs: &dyn Fs, part: &Path) -> Result<Option<Box<dyn Send + Sync>>> {
+    for _ in 0..LOCK_TRIES {
+        match fs.lock(part) {
+            Ok(lock) => return Ok(Some(lock)),
+            Err(e) if e.kind() == io::ErrorKind::WouldBlock => std::thread::sleep(LOCK_WAIT),
+            Err(e) => {
+                let part = part.display();
+                tracing::warn!("{part} cannot be locked: {e}; do not run `depthrig recover` on it now");
+                return Ok(None);
+            }
+        }
+    }
+    let what = format!(
+        "{} is being written by another process; wait until that has ended, or choose another name",
+        part.display()
+    );
+    Err(Error::new(ErrorKind::InUse, what))
 }
 
 /// Whether nothing of this name is there, or an empty folder.

@@ -2,9 +2,9 @@
 
 use super::books::Books;
 use super::folder::Folder;
-use super::lane::{self, Input, Item, Lane, Loose, Range, Source};
+use super::lane::{self, Input, Item, Lane, Loose, Origin, Range, Source};
 use super::output::{Losses, Output};
-use super::session::{IN_NO_INPUT, lost_in_words};
+use super::session::{BEFORE, IN_NO_INPUT, NOT_THERE, said};
 use super::{SliceOptions, SliceProgress, SliceReport};
 use crate::container::chunk::Chunk;
 use crate::container::copy::SetGroup;
@@ -15,6 +15,8 @@ use crate::{Error, ErrorKind, Result, Session};
 use crossbeam::channel::{Receiver, bounded};
 use std::path::Path;
 use std::sync::Arc;
+
+mod end;
 
 /// Items that a lane reads ahead. A set is one of them, so this bounds the memory.
 const AHEAD: usize = 1;
@@ -30,6 +32,8 @@ pub(super) struct Join<'a> {
     more_lost: u64,
     repeated: u64,
     unexplained: u64,
+    /// Inputs of which nothing can be read, and why.
+    unread: Vec<(usize, String)>,
 }
 
 /// Where a lane stands.
@@ -37,8 +41,8 @@ struct Head {
     items: Receiver<Item>,
     source: Option<Arc<Source>>,
     books: Books,
-    /// Id and offered sets of the set before, and its input.
-    before: Option<(u64, u64, usize)>,
+    /// Id and offered sets of the set before, and its segment.
+    before: Option<(u64, u64, Origin)>,
     next: Option<Box<SetGroup>>,
     /// The clock pair that the next set's segment begins with.
     clock: Option<Loose>,
@@ -59,7 +63,14 @@ impl<'a> Join<'a> {
             more_lost: 0,
             repeated: 0,
             unexplained: 0,
+            unread: Vec::new(),
         }
+    }
+
+    /// The same with inputs of which nothing can be read, and why.
+    pub(super) fn without(mut self, unread: Vec<(usize, String)>) -> Self {
+        self.unread = unread;
+        self
     }
 
     pub(super) fn run(
@@ -145,7 +156,7 @@ impl<'a> Join<'a> {
                 if i == chosen {
                     output.set(&set, &source, clock, &self.losses)?;
                 }
-                head.before = Some((set.mark.id, set.mark.sets_offered, source.input));
+                head.before = Some((set.mark.id, set.mark.sets_offered, source.origin));
                 drop(set);
                 let after = self.fill(head, output)?;
                 if i == chosen {
@@ -154,7 +165,7 @@ impl<'a> Join<'a> {
             }
             last = Some(chosen);
         }
-        self.end(&mut heads, last, output);
+        self.end(&mut heads, output);
         let lost = self.told();
         let lost = output.finish(&self.losses, lost)?;
         // What is not read is between sets and outside of the range.
@@ -180,17 +191,19 @@ impl<'a> Join<'a> {
                 head.books.gap(gap, false, &mut self.losses);
                 continue;
             }
+            let session = head.source.as_ref().map(|s| inputs[s.origin.input].dataset.session());
             let Some((id, _)) = output.last else {
                 // What was lost before the first set belongs to a whole recording and not to a part.
                 let counted = head.before.is_none() && self.range.begins;
-                let own = head.source.as_ref().filter(|s| counted && s.is_first);
-                output.begin(
-                    own.map_or(mark.sets_offered.saturating_sub(1), |s| inputs[s.input].offered_before()),
-                );
-                head.books.gap(gap, counted && damage.is_empty(), &mut self.losses);
-                if counted && gap > 0 && !damage.is_empty() {
-                    let why = damage.join("; ");
-                    self.lose(format!("{gap} sets before set {} are not there: {why}", mark.id));
+                let own = head.source.as_ref().filter(|s| counted && s.is_first());
+                output.begin(own.map_or(mark.sets_offered.saturating_sub(1), |s| {
+                    inputs[s.origin.input].offered_before()
+                }));
+                let knows = own.is_some();
+                let line = lost_before(mark.id, gap, &damage, knows, session).filter(|_| counted);
+                head.books.gap(gap, counted && line.is_none(), &mut self.losses);
+                if let Some(line) = line {
+                    self.lose(line);
                 }
                 continue;
             };
@@ -206,48 +219,26 @@ impl<'a> Join<'a> {
                 ));
             }
             // With the set of another input before it, its own accounts do not tell of the gap.
-            let same = head.before.zip(head.source.as_ref()).is_some_and(|((before, _, input), source)| {
-                before == id && inputs[input].shares_accounts(&inputs[source.input])
+            let same = head.before.zip(head.source.as_ref()).is_some_and(|((before, _, origin), source)| {
+                before == id && origin.goes_on(source.origin, inputs)
             });
             let missing = if same { gap } else { mark.sets_offered.saturating_sub(output.offered + 1) };
-            let between = format!("between set {id} and set {}", mark.id);
+            let between = format!("{missing} sets between set {id} and set {}", mark.id);
             if missing == 0 {
                 head.books.gap(gap, false, &mut self.losses);
             } else if !same {
                 head.books.gap(gap, false, &mut self.losses);
-                self.lose(format!("{missing} sets {between} are {IN_NO_INPUT}"));
-            } else if damage.is_empty() {
-                head.books.gap(gap, true, &mut self.losses);
+                self.lose(format!("{between} are {IN_NO_INPUT}"));
+            } else if !damage.is_empty() {
+                self.lose(format!("{between} {NOT_THERE}{}", damage.join("; ")));
+            } else if let Some(line) = said(session, &format!("{between} are ")) {
+                // The cut or join that it is from gave a reason that no account has.
+                self.lose(line);
             } else {
-                self.lose(format!("{missing} sets {between} are not there: {}", damage.join("; ")));
+                head.books.gap(gap, true, &mut self.losses);
             }
         }
         Ok(())
-    }
-
-    /// Takes what happened after the last set.
-    fn end(&mut self, heads: &mut [Head], last: Option<usize>, output: &Output<'_>) {
-        let head = last.map(|i| &mut heads[i]).filter(|head| self.range.ends && !head.beyond);
-        if let Some(head) = head {
-            head.books.end(&mut self.losses);
-            if !head.damage.is_empty() {
-                let after = output.last.map_or(0, |l| l.0);
-                let why = std::mem::take(&mut head.damage).join("; ");
-                self.lose(format!("what came after set {after} is not there: {why}"));
-            }
-        }
-        self.unexplained += heads.iter().map(|h| h.books.unexplained()).sum::<u64>();
-        if self.unexplained > 0 {
-            let n = self.unexplained;
-            self.lose(format!("{n} sets are not there, and no account tells why"));
-        }
-        if self.range.ends {
-            for line in self.inputs.iter().flat_map(|i| lost_in_words(i.dataset.session())) {
-                if !self.lost.contains(&line) {
-                    self.lose(line);
-                }
-            }
-        }
     }
 
     fn lose(&mut self, line: String) {
@@ -272,21 +263,23 @@ impl<'a> Join<'a> {
         while let Ok(item) = head.items.recv() {
             match item {
                 Item::Source(source, account) => {
-                    let goes_on = head
-                        .source
-                        .as_ref()
-                        .is_some_and(|s| self.inputs[s.input].shares_accounts(&self.inputs[source.input]));
+                    let goes_on =
+                        head.source.as_ref().is_some_and(|s| s.origin.goes_on(source.origin, self.inputs));
                     if !goes_on {
                         self.unexplained += head.books.unexplained();
+                        let counts = account.as_ref().map(|(counts, _)| counts);
                         head.books =
-                            if source.is_first { Books::from_zero() } else { Books::after(account.as_ref()) };
+                            if source.is_first() { Books::from_zero() } else { Books::after(counts) };
+                    }
+                    if let Some((_, streams)) = account.filter(|_| output.last.is_none()) {
+                        output.see_streams(streams);
                     }
                     head.source = Some(source);
                 }
                 Item::Skipped(id, offered) => {
                     let gap = head.gap(self.inputs, offered);
                     head.books.gap(gap, false, &mut self.losses);
-                    head.before = head.source.as_ref().map(|s| (id, offered, s.input));
+                    head.before = head.source.as_ref().map(|s| (id, offered, s.origin));
                     head.damage.clear();
                     for (source, message) in messages.drain(..) {
                         output.before(source, message);
@@ -316,8 +309,9 @@ impl<'a> Join<'a> {
                 Item::Damage(what) => head.damage.push(what),
                 Item::Beyond(account) => {
                     head.beyond = true;
-                    if let Some(account) = account {
-                        head.books.account(&account, &mut self.losses);
+                    if let Some((counts, streams)) = account {
+                        head.books.account(&counts, &mut self.losses);
+                        output.see_streams_beyond(streams);
                     }
                 }
                 Item::Failed(e) => return Err(e),
@@ -353,12 +347,32 @@ impl Head {
     /// lies between two inputs with accounts of their own is in neither.
     fn gap(&self, inputs: &[Input<'_>], offered: u64) -> u64 {
         let Some(source) = &self.source else { return 0 };
-        let own = &inputs[source.input];
-        match self.before.filter(|(.., input)| inputs[*input].shares_accounts(own)) {
+        match self.before.filter(|(.., origin)| origin.goes_on(source.origin, inputs)) {
             Some((_, before, _)) => offered.saturating_sub(before.saturating_add(1)),
-            None if source.is_first => offered.saturating_sub(own.offered_before().saturating_add(1)),
+            None if source.is_first() => {
+                let before = inputs[source.origin.input].offered_before();
+                offered.saturating_sub(before.saturating_add(1))
+            }
             None => 0,
         }
+    }
+}
+
+/// The line of what is missing before the first set, where no account tells of it; `knows` when that is `gap`
+/// sets.
+fn lost_before(
+    id: u64,
+    gap: u64,
+    damage: &[String],
+    knows: bool,
+    session: Option<&Session>,
+) -> Option<String> {
+    let sets = format!("{gap} sets before set {id}");
+    match (damage.is_empty(), knows) {
+        (true, _) => said(session, &format!("{sets} are ")),
+        // Of a beginning that cannot be read nobody knows how long it is.
+        (false, false) => Some(format!("{BEFORE}{id} is not there: {}", damage.join("; "))),
+        (false, true) => (gap > 0).then(|| format!("{sets} {NOT_THERE}{}", damage.join("; "))),
     }
 }
 

@@ -6,9 +6,10 @@ use crate::container::segment::Preamble;
 use crate::dataset::{Dataset, Kind, kinds, segment_number};
 use crate::msgs::accounts;
 use crate::msgs::schemas::Schema;
-use crate::recorder::topics::SESSION_METADATA;
-use crate::{Error, ErrorKind, Result, SetCounts};
+use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA};
+use crate::{Error, ErrorKind, Result, Session, SetCounts, StreamAccount};
 use crossbeam::channel::Sender;
+use std::path::Path;
 use std::sync::Arc;
 
 /// Which sets are wanted, by log time; which notes go with them.
@@ -70,16 +71,40 @@ pub(super) struct Piece {
 /// Segments whose sets follow each other in time.
 pub(super) type Lane = Vec<Piece>;
 
+/// What an account says: of the sets, and of each stream.
+pub(super) type Account = (SetCounts, Vec<StreamAccount>);
+
+/// Which segment something is from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Origin {
+    pub(super) input: usize,
+    /// The segment's number, by its name.
+    pub(super) number: Option<u32>,
+}
+
+impl Origin {
+    /// Whether the accounts of the segment `next` go on where those of this one end: both count from the same
+    /// beginning, and they are of one input, or no segment is missing between them.
+    pub(super) fn goes_on(self, next: Self, inputs: &[Input<'_>]) -> bool {
+        let follows = |(a, b): (u32, u32)| a == b || a.checked_add(1) == Some(b);
+        (self.input == next.input || self.number.zip(next.number).is_some_and(follows))
+            && inputs[self.input].shares_accounts(&inputs[next.input])
+    }
+}
+
 /// A segment that is being read.
 pub(super) struct Source {
     pub(super) reader: SegmentReader,
     pub(super) preamble: Preamble,
-    pub(super) input: usize,
-    /// It is the first segment of its dataset.
-    pub(super) is_first: bool,
+    pub(super) origin: Origin,
 }
 
 impl Source {
+    /// Whether it is the first segment of its dataset.
+    pub(super) fn is_first(&self) -> bool {
+        self.origin.number == Some(0)
+    }
+
     /// The channel whose messages are of this type.
     pub(super) fn channel(&self, schema: Schema) -> Option<u16> {
         channel(&self.preamble, schema)
@@ -102,8 +127,8 @@ pub(super) struct Loose {
 
 /// What a lane's thread hands on.
 pub(super) enum Item {
-    /// What follows is from this segment.
-    Source(Arc<Source>, Option<SetCounts>),
+    /// What follows is from this segment. With the last account before it, where none of it was handed on.
+    Source(Arc<Source>, Option<Account>),
     /// A set before the range: its id and how many sets were offered up to it.
     Skipped(u64, u64),
     Set(Box<SetGroup>),
@@ -115,7 +140,7 @@ pub(super) enum Item {
     /// What cannot be read, in words.
     Damage(String),
     /// There are sets beyond the range. With the next account: it tells of losses before them.
-    Beyond(Option<SetCounts>),
+    Beyond(Option<Account>),
     Failed(Error),
 }
 
@@ -124,28 +149,31 @@ pub(super) struct Lanes {
     pub(super) lanes: Vec<Lane>,
     /// Log times of the first and the last set.
     pub(super) times: (i64, i64),
+    /// Inputs of which nothing can be read, and why.
+    pub(super) unread: Vec<(usize, String)>,
 }
 
 /// Divides segments into as few lanes as possible, so that the sets of each lane follow each other in time. `None`
 /// when there is no set.
 pub(super) fn lanes(inputs: &[Input<'_>]) -> Result<Option<Lanes>> {
-    let mut spans = Vec::new();
+    let mut spans: Vec<(i64, i64, Piece)> = Vec::new();
+    let mut damaged: Vec<(Piece, Error)> = Vec::new();
     for (input, source) in inputs.iter().enumerate() {
         for segment in 0..source.dataset.segments().len() {
-            let Some(reader) = source.dataset.open_segment(segment) else { continue };
-            let reader = reader?;
-            let kinds = kinds(&reader);
-            let is_set = |id: &u16| kinds.get(id) == Some(&Kind::Set);
-            let marks = reader.chunks.iter().filter(|c| c.channels.iter().any(is_set));
-            let times = marks.map(|c| (c.start_time as i64, c.end_time as i64));
-            let span = times.reduce(|(a, b), (from, to)| (a.min(from), b.max(to)));
-            if let Some((from, to)) = span {
-                spans.push((from, to, Piece { input, segment }));
+            let Some(opened) = source.dataset.open_segment(segment) else { continue };
+            let piece = Piece { input, segment };
+            match opened {
+                Ok(reader) => spans.extend(span(&reader).map(|(from, to)| (from, to, piece))),
+                Err(e) if e.kind() == ErrorKind::Io => return Err(e),
+                // Another input may have all that is in it.
+                Err(e) => damaged.push((piece, e)),
             }
         }
     }
     spans.sort_by_key(|(from, to, piece)| (*from, *to, piece.input, piece.segment));
-    let Some(first) = spans.first().map(|s| s.0) else { return Ok(None) };
+    let Some(first) = spans.first().map(|s| s.0) else {
+        return damaged.into_iter().next().map_or(Ok(None), |(_, e)| Err(e));
+    };
     let last = spans.iter().map(|s| s.1).max().unwrap_or(first);
     let mut lanes: Vec<(i64, Lane)> = Vec::new();
     for (from, to, piece) in spans {
@@ -161,8 +189,40 @@ pub(super) fn lanes(inputs: &[Input<'_>]) -> Result<Option<Lanes>> {
             None => lanes.push((to, vec![piece])),
         }
     }
-    let lanes = lanes.into_iter().map(|(_, pieces)| pieces).collect();
-    Ok(Some(Lanes { lanes, times: (first, last) }))
+    let mut lanes: Vec<Lane> = lanes.into_iter().map(|(_, pieces)| pieces).collect();
+    let mut unread = Vec::new();
+    for (piece, e) in damaged {
+        if !put(&mut lanes, piece) {
+            unread.push((piece.input, e.to_string()));
+        }
+    }
+    Ok(Some(Lanes { lanes, times: (first, last), unread }))
+}
+
+/// Log times of the first and the last set of a segment, as its index says.
+fn span(reader: &SegmentReader) -> Option<(i64, i64)> {
+    let kinds = kinds(reader);
+    let is_set = |id: &u16| kinds.get(id) == Some(&Kind::Set);
+    let marks = reader.chunks.iter().filter(|c| c.channels.iter().any(is_set));
+    let times = marks.map(|c| (c.start_time as i64, c.end_time as i64));
+    times.reduce(|(a, b), (from, to)| (a.min(from), b.max(to)))
+}
+
+/// Puts a segment that cannot be opened, so that nobody knows its times, beside its neighbour of the same input:
+/// what is missing there has this reason. `false` when there is no neighbour.
+fn put(lanes: &mut [Lane], piece: Piece) -> bool {
+    // Segment, lane, and place in the lane.
+    let mut own: Vec<(usize, usize, usize)> = Vec::new();
+    for (lane, pieces) in lanes.iter().enumerate() {
+        let of_input = pieces.iter().enumerate().filter(|(_, p)| p.input == piece.input);
+        own.extend(of_input.map(|(at, p)| (p.segment, lane, at)));
+    }
+    let before = own.iter().filter(|(segment, ..)| *segment < piece.segment).max();
+    let place = before.map(|(_, lane, at)| (*lane, at + 1));
+    let place = place.or_else(|| own.iter().min().map(|(_, lane, at)| (*lane, *at)));
+    let Some((lane, at)) = place else { return false };
+    lanes[lane].insert(at, piece);
+    true
 }
 
 /// Bytes of the chunks that a lane will copy.
@@ -209,8 +269,8 @@ struct Reading<'a> {
     inputs: &'a [Input<'a>],
     range: &'a Range,
     items: &'a Sender<Item>,
-    /// The last account of the segments that were passed over.
-    account: Option<SetCounts>,
+    /// The last account before the next segment, where that is not handed on.
+    account: Option<Account>,
 }
 
 impl Reading<'_> {
@@ -219,7 +279,13 @@ impl Reading<'_> {
     }
 
     fn run(&mut self, lane: &[Piece]) -> Result<(), Stop> {
+        let mut before: Option<Piece> = None;
         for piece in lane {
+            let next = before.map(|b| Piece { segment: b.segment + 1, ..b });
+            if next != Some(*piece) {
+                self.account = self.account_before(*piece)?;
+            }
+            before = Some(*piece);
             let input = &self.inputs[piece.input];
             let Some(opened) = input.dataset.open_segment(piece.segment) else { continue };
             let reader = match opened {
@@ -232,7 +298,7 @@ impl Reading<'_> {
             };
             super::check_segment(input.dataset.session(), reader.metadata(SESSION_METADATA), &reader.path)?;
             if reader.chunks.iter().all(|c| (c.end_time as i64) < self.range.from_utc_ns) {
-                self.account = last_account(&reader)?.or(self.account);
+                self.account = last_account(&reader)?.or_else(|| self.account.take());
                 continue;
             }
             self.segment(reader, *piece)?;
@@ -240,16 +306,29 @@ impl Reading<'_> {
         Ok(())
     }
 
+    /// The last account of the segment before this one in its dataset, which another lane reads.
+    fn account_before(&self, piece: Piece) -> Result<Option<Account>> {
+        let Some(before) = piece.segment.checked_sub(1) else { return Ok(None) };
+        match self.inputs[piece.input].dataset.open_segment(before) {
+            Some(Ok(reader)) => last_account(&reader),
+            Some(Err(e)) if e.kind() == ErrorKind::Io => Err(e),
+            _ => Ok(None),
+        }
+    }
+
     fn segment(&mut self, reader: SegmentReader, piece: Piece) -> Result<(), Stop> {
         let (preamble, first) = read_preamble(&reader)?;
         let number = reader.path.file_name().and_then(|n| segment_number(&n.to_string_lossy()));
-        let is_first = number == Some(0);
-        let source = Arc::new(Source { reader, preamble, input: piece.input, is_first });
+        let source = Arc::new(Source { reader, preamble, origin: Origin { input: piece.input, number } });
         let account = self.account.take();
         self.send(Item::Source(Arc::clone(&source), account))?;
         let mut groups = Groups::new(&source.reader, &source.preamble, first)?;
         let file = &source.reader.path;
+        // Of a file that was cut off between two records nothing else shows that there was more to come.
+        let mut has_end = source.reader.finished || is_told(self.inputs[piece.input].dataset.session(), file);
+        let mut is_damaged = false;
         while let Some(group) = groups.next()? {
+            is_damaged = matches!(group, Group::Damage(_));
             match group {
                 Group::Set(set) if (set.log_time as i64) < self.range.from_utc_ns => {
                     self.send(Item::Skipped(set.mark.id, set.mark.sets_offered))?;
@@ -269,25 +348,36 @@ impl Reading<'_> {
                     })?;
                     self.send(Item::Between { messages, head: between.head })?;
                 }
-                Group::Metadata(..) => {}
+                // The last thing that is written before the index.
+                Group::Metadata(name, _) => has_end |= name == SEGMENT_METADATA,
                 Group::Damage(Damage { from, why, .. }) => {
                     self.send(Item::Damage(format!("{} at byte {from}: {why}", file.display())))?;
                 }
             }
         }
+        if !has_end && !is_damaged {
+            let why = source.reader.cut.as_ref().map_or("it has no end", |(_, why)| why.as_str());
+            self.send(Item::Damage(format!("{} was not finished: {why}", file.display())))?;
+        }
         Ok(())
     }
 }
 
+/// Whether the session says itself that a file was not finished.
+fn is_told(session: &Session, file: &Path) -> bool {
+    let name = file.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    session.outcome.iter().flat_map(|o| &o.lost).any(|line| line.contains(&name))
+}
+
 /// The next account in the segment, which is within about a second.
-fn next_account(source: &Source, groups: &mut Groups<'_>) -> Result<Option<SetCounts>> {
+fn next_account(source: &Source, groups: &mut Groups<'_>) -> Result<Option<Account>> {
     let channel = source.channel(Schema::Accounts);
     while let Some(group) = groups.next()? {
         let Group::Between(between) = group else { continue };
         let mut account = None;
         source.reader.chunk_messages(between.chunk.body(), between.offset, |m| {
             if channel == Some(m.channel) {
-                account = Some(accounts::read(m.data)?.0);
+                account = Some(accounts::read(m.data)?);
             }
             Ok(())
         })?;
@@ -299,7 +389,7 @@ fn next_account(source: &Source, groups: &mut Groups<'_>) -> Result<Option<SetCo
 }
 
 /// The last account in a segment.
-fn last_account(reader: &SegmentReader) -> Result<Option<SetCounts>> {
+fn last_account(reader: &SegmentReader) -> Result<Option<Account>> {
     let channel = reader.channels.iter().find(|(_, c)| c.schema == Schema::Accounts.name());
     let Some((channel, _)) = channel else { return Ok(None) };
     let Some(entry) = reader.chunks.iter().rev().find(|c| c.channels.contains(channel)) else {
@@ -308,7 +398,7 @@ fn last_account(reader: &SegmentReader) -> Result<Option<SetCounts>> {
     let mut last = None;
     let read = reader.messages(entry, |m| {
         if m.channel == *channel {
-            last = Some(accounts::read(m.data)?.0);
+            last = Some(accounts::read(m.data)?);
         }
         Ok(())
     });

@@ -123,6 +123,11 @@ impl<'a> Output<'a> {
         }
     }
 
+    /// What its marks count from.
+    pub(super) fn offered_before(&self) -> u64 {
+        self.session.derived.last().map_or(0, |step| step.offered_before)
+    }
+
     /// Takes what came after the set before.
     pub(super) fn hold(&mut self, mut messages: Vec<(Arc<Source>, Loose)>) {
         self.held.append(&mut messages);
@@ -151,6 +156,13 @@ impl<'a> Output<'a> {
                 Some(old) => *old = new,
                 None => self.streams.push(new),
             }
+        }
+    }
+
+    /// Notes an account from after the last set: better than none.
+    pub(super) fn see_streams_beyond(&mut self, streams: Vec<StreamAccount>) {
+        if self.streams.is_empty() {
+            self.streams = streams;
         }
     }
 
@@ -205,7 +217,7 @@ impl<'a> Output<'a> {
 
     fn counts(&self, losses: &Losses) -> SetCounts {
         let mut counts = SetCounts { offered: 0, recorded: self.recorded, dropped: *losses };
-        counts.offered = counts.recorded + counts.dropped_total();
+        counts.offered = counts.recorded.saturating_add(counts.dropped_total());
         counts
     }
 

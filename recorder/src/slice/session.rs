@@ -2,11 +2,24 @@
 
 use super::lane::Range;
 use crate::dataset::Dataset;
-use crate::{Error, ErrorKind, Result, Session};
+use crate::{Error, ErrorKind, Outcome, Result, Session, SetCounts, SetDrop};
 use std::path::Path;
 
-/// The end of the lines that a join itself writes of gaps. They are found anew from the sets each time.
+// Words of the lines that a join itself writes of gaps. These are found anew from the sets each time.
+
+/// The end of one of a gap between two inputs.
 pub(super) const IN_NO_INPUT: &str = "in none of the inputs";
+/// The end of the one of all gaps that nobody knows a reason of.
+pub(super) const UNEXPLAINED: &str = "and no account tells why";
+/// In one of a gap whose reason is in the file; the reason follows.
+pub(super) const NOT_THERE: &str = "are not there: ";
+
+// Beginnings of lines that hold as long as no set is on the other side; the id of the set follows.
+
+/// Nobody knows how many sets are missing before it.
+pub(super) const BEFORE: &str = "what came before set ";
+/// Nobody knows how many sets are missing after it.
+pub(super) const AFTER: &str = "what came after set ";
 
 /// The session of the part of a dataset, without its outcome.
 pub(super) fn trimmed(source: &Session, out: &Path, range: &Range) -> Session {
@@ -41,13 +54,57 @@ fn named(source: &Session, out: &Path) -> Session {
     session
 }
 
-/// What a source says was lost in words of its own: the counts are counted anew.
-pub(super) fn lost_in_words(source: &Session) -> Vec<String> {
+/// What a source says was lost in words of its own, as far as it holds of sets from `first` to `last`. Counts
+/// are counted anew.
+pub(super) fn lost_in_words(source: &Session, first: u64, last: u64) -> Vec<String> {
     let Some(outcome) = &source.outcome else { return Vec::new() };
-    let count = |(reason, n): (&String, &u64)| count_line(*n, outcome.sets_offered, reason);
-    let counts: Vec<_> = outcome.sets_dropped.iter().map(count).collect();
-    let lines = outcome.lost.iter().filter(|line| !counts.contains(line) && !line.ends_with(IN_NO_INPUT));
-    lines.cloned().collect()
+    let known = |reason: &str| SetDrop::ALL.iter().any(|r| r.name() == reason);
+    let dropped = outcome.sets_dropped.iter().filter(|(reason, _)| known(reason));
+    let counts: Vec<_> = dropped.map(|(reason, n)| count_line(*n, outcome.sets_offered, reason)).collect();
+    let holds = |line: &&String| !counts.contains(line) && !is_gap(line) && !is_filled(line, first, last);
+    outcome.lost.iter().filter(holds).cloned().collect()
+}
+
+/// Whether a line tells of a gap between sets, or before the first one.
+fn is_gap(line: &str) -> bool {
+    let between = [" sets before set ", " sets between set "].iter().any(|words| line.contains(*words));
+    (between && line.contains(NOT_THERE)) || line.ends_with(IN_NO_INPUT) || line.ends_with(UNEXPLAINED)
+}
+
+/// Whether a line tells of what is missing before or after a set, where others are now.
+fn is_filled(line: &str, first: u64, last: u64) -> bool {
+    let set = |begin: &str| line.strip_prefix(begin)?.split(' ').next()?.parse::<u64>().ok();
+    set(BEFORE).is_some_and(|id| first < id) || set(AFTER).is_some_and(|id| id < last)
+}
+
+/// Whether two lines tell of the same end.
+pub(super) fn is_same_end(a: &str, b: &str) -> bool {
+    [BEFORE, AFTER].iter().any(|begin| a.starts_with(*begin) && b.starts_with(*begin))
+}
+
+/// The line of a source that begins with these words.
+pub(super) fn said(source: Option<&Session>, begin: &str) -> Option<String> {
+    let outcome = source?.outcome.as_ref()?;
+    outcome.lost.iter().find(|line| line.starts_with(begin)).cloned()
+}
+
+/// How a recording ended, as the account that comes after all in its file: where a write failed, the file has
+/// none of what was lost from then on.
+pub(super) fn last_account(outcome: &Outcome) -> SetCounts {
+    let dropped = SetDrop::ALL.map(|reason| outcome.sets_dropped.get(reason.name()).copied().unwrap_or(0));
+    SetCounts { offered: outcome.sets_offered, recorded: outcome.sets_recorded, dropped }
+}
+
+/// Whether nothing came after the set of this time, because the recording itself was closed with it.
+pub(super) fn is_whole_end(source: &Session, utc_ns: i64) -> bool {
+    source.derived.is_empty() && source.outcome.as_ref().is_some_and(|o| o.ended_utc_ns <= utc_ns)
+}
+
+/// Whether all sets of a source are between these times, as it says itself; `begins` when no set was offered
+/// before.
+pub(super) fn is_between(source: &Session, first_utc_ns: i64, last_utc_ns: i64, begins: bool) -> bool {
+    let begins = source.derived.last().map_or(begins, |step| first_utc_ns <= step.first_utc_ns);
+    begins && source.outcome.as_ref().is_some_and(|o| o.ended_utc_ns <= last_utc_ns)
 }
 
 /// The line of `lost` that a recorder writes of a count.

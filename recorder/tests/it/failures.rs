@@ -501,7 +501,10 @@ fn whichever_operation_fails_the_rest_is_whole() {
                         let part = names(&clean).into_iter().find(|n| n.ends_with(".part"));
                         let once = matches!(fault(0, kinds[0]), Fault::FailOnce(..));
                         assert!(!once || part.is_none(), "operation {n}, {operation}: {part:?} is left");
-                        assert!(!once || worst(&clean) < Some(Severity::Broken), "operation {n}, {operation}");
+                        assert!(
+                            !once || worst(&clean) < Some(Severity::Broken),
+                            "operation {n}, {operation}"
+                        );
                     }
                     if summary.complete {
                         assert_eq!(worst(&clean), None, "operation {n} cost something that nobody says");

@@ -377,8 +377,7 @@ fn a_copy_that_is_not_what_was_written_takes_nobodys_place() {
 fn whichever_chunk_is_damaged_the_dataset_is_whole_again() {
     for synced_ns in [i64::MAX / 4, 1] {
         let fs = MemFs::new();
-        let limits =
-            RecorderOptions { segment_max_ns: 3 * PERIOD, sync_interval_ns: synced_ns, ..options() };
+        let limits = RecorderOptions { segment_max_ns: 3 * PERIOD, sync_interval_ns: synced_ns, ..options() };
         let r = recorder(&fs, limits);
         for k in 0..9 {
             r.push(set(&session(), k)).unwrap();
@@ -469,7 +468,8 @@ fn a_recovery_that_was_ended_between_two_segments_is_told_by_the_next() {
 /// What a failed sync was for may never reach the disk, whatever succeeds later: the file is copied, not renamed.
 #[test]
 fn a_file_whose_sync_failed_is_copied() {
-    let limits = || RecorderOptions { segment_max_ns: 3 * PERIOD, sync_interval_ns: i64::MAX / 4, ..options() };
+    let limits =
+        || RecorderOptions { segment_max_ns: 3 * PERIOD, sync_interval_ns: i64::MAX / 4, ..options() };
     let log = {
         let fs = MemFs::new();
         record(&fs, 5, limits());

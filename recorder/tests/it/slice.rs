@@ -4,8 +4,9 @@ use crate::support::*;
 use depthrig_recorder::fs::{Fault, Fs, MemFs, RealFs};
 use depthrig_recorder::{
     ColorCodec, CompareOptions, Dataset, DepthCodec, Edge, ErrorKind, FrameChoice, Moment, Recorder,
-    RecorderOptions, Session, SetSpan, Severity, SliceOptions, SliceReport, StreamAccount, VerifyOptions,
-    VerifyReport, compare, merge, trim, verify_with,
+    RecorderOptions, RecoverOptions, Session, SetDrop, SetSpan, Severity, SliceOptions, SliceReport,
+    StreamAccount, VerifyOptions, VerifyReport, compare, merge, recover_with, trim, unfinished_in,
+    verify_with,
 };
 use proptest::prelude::*;
 use std::io;
@@ -30,7 +31,11 @@ fn ids(from: u64, to: u64) -> SetSpan {
 }
 
 fn cut(fs: &MemFs, out: &str, span: SetSpan) -> depthrig_recorder::Result<SliceReport> {
-    trim(fs, &open(fs), &named(out), span, &SliceOptions::default(), &mut |_, _| ControlFlow::Continue(()))
+    cut_of(fs, &open(fs), out, span)
+}
+
+fn cut_of(fs: &MemFs, source: &Dataset, out: &str, span: SetSpan) -> depthrig_recorder::Result<SliceReport> {
+    trim(fs, source, &named(out), span, &SliceOptions::default(), &mut |_, _| ControlFlow::Continue(()))
 }
 
 fn join(fs: &MemFs, out: &str, inputs: &[Dataset]) -> depthrig_recorder::Result<SliceReport> {
@@ -326,6 +331,35 @@ fn a_gap_between_the_inputs_is_said() {
     assert_eq!(check(&fs, "all").findings, []);
 }
 
+/// Loose segments without the one between them; parts joined twice before the one between them comes; and a
+/// segment of such a dataset, which no longer knows what it was made from.
+#[test]
+fn what_a_later_merge_brings_is_not_lost_any_more() {
+    let fs = MemFs::new();
+    recording(&fs, 12, quick(3), |_| 0);
+    let gap = ["3 sets between set 3 and set 7 are in none of the inputs"];
+    let loose = |n: u32| at(&fs, segment(n));
+    let part = |name: &str| at(&fs, named(name));
+    assert_eq!(join(&fs, "ends", &[loose(0), loose(2)]).unwrap().lost, gap);
+    let report = join(&fs, "begin", &[part("ends"), loose(1)]).unwrap();
+    assert!(report.complete && report.sets == 9, "{:?}", report.lost);
+    assert_eq!(check(&fs, "begin").findings, []);
+
+    for (name, from, to) in [("a", 1, 3), ("b", 4, 6), ("c", 7, 9), ("d", 10, 12)] {
+        cut(&fs, name, ids(from, to)).unwrap();
+    }
+    assert_eq!(join(&fs, "ac", &[part("a"), part("c")]).unwrap().lost, gap);
+    assert_eq!(join(&fs, "acd", &[part("ac"), part("d")]).unwrap().lost, gap);
+    let report = join(&fs, "lone", &[part("ac/seg_0000.mcap")]).unwrap();
+    assert_eq!(report.lost, ["3 sets are not there, and no account tells why"]);
+    for (made_of, sets) in [("acd", 12), ("lone", 9)] {
+        let all = format!("{made_of}_and_b");
+        let report = join(&fs, &all, &[part("b"), part(made_of)]).unwrap();
+        assert!(report.complete && report.sets == sets, "{made_of}: {:?}", report.lost);
+        assert_eq!(check(&fs, &all).findings, [], "{made_of}");
+    }
+}
+
 /// A part's own losses stay its own: the gap before it does not use them up.
 #[test]
 fn a_gap_before_a_part_and_a_loss_after_it_are_two() {
@@ -436,6 +470,59 @@ fn nothing_is_written_over() {
 }
 
 #[test]
+fn a_folder_that_grows_is_left_alone() {
+    let fs = MemFs::new();
+    recording(&fs, 4, quick(2), |_| 0);
+    let grows = named("part.part");
+    let mut looked = false;
+    let options = SliceOptions::default();
+    let made = trim(&fs, &open(&fs), &named("part"), ids(1, 4), &options, &mut |done, _| {
+        // Before the first set nothing is in it that could be recovered.
+        if done > 0 && !std::mem::replace(&mut looked, true) {
+            assert_eq!(fs.lock(&grows).err().map(|e| e.kind()), Some(io::ErrorKind::WouldBlock));
+            let quiet = &mut |_| ControlFlow::Continue(());
+            let recovered = recover_with(&shared(&fs), &grows, &RecoverOptions::default(), quiet);
+            assert_eq!(recovered.unwrap_err().kind(), ErrorKind::InUse);
+            let unfinished = unfinished_in(&shared(&fs), &named(""), "rig").unwrap();
+            assert!(unfinished.is_empty(), "{unfinished:?}");
+        }
+        ControlFlow::Continue(())
+    });
+    assert!(made.unwrap().complete && looked);
+    drop(fs.lock(&named("part")).unwrap());
+
+    // What somebody writes to is not taken for what somebody left.
+    let other = named("other.part");
+    fs.create_dir_all(&other).unwrap();
+    fs.put(&other.join("seg_0000.mcap.part"), vec![1]);
+    let lock = fs.lock(&other).unwrap();
+    let e = cut(&fs, "other", ids(1, 2)).unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::InUse);
+    assert!(e.to_string().contains("/data/other.part is being written by another process"), "{e}");
+    drop(lock);
+    assert_eq!(cut(&fs, "other", ids(1, 2)).unwrap_err().kind(), ErrorKind::AlreadyExists);
+    assert_eq!(contents(&fs, &other.join("seg_0000.mcap.part")), [1]);
+}
+
+#[test]
+fn a_lock_goes_with_its_folder_to_another_name() {
+    let home = tempfile::tempdir().unwrap();
+    let memory = MemFs::new();
+    let places: [(&dyn Fs, &Path); 2] = [(&RealFs, home.path()), (&memory, Path::new("/data"))];
+    for (fs, place) in places {
+        let (from, to) = (place.join("out.part"), place.join("out"));
+        fs.create_dir_all(&from).unwrap();
+        let lock = fs.lock(&from).unwrap();
+        fs.rename(&from, &to).unwrap();
+        assert_eq!(fs.lock(&to).err().map(|e| e.kind()), Some(io::ErrorKind::WouldBlock), "{fs:?}");
+        fs.create_dir_all(&from).unwrap();
+        drop(fs.lock(&from).unwrap());
+        drop(lock);
+    }
+    drop(memory.lock(Path::new("/data/out")).unwrap());
+}
+
+#[test]
 fn a_disk_without_room_is_refused_before_and_leaves_nothing() {
     let fs = MemFs::new();
     recording(&fs, 3, quick(100), |_| 0);
@@ -502,7 +589,8 @@ fn any_failing_operation_leaves_the_whole_or_nothing() {
             }
         }
     }
-    // Only where the disk fails after the rename, and where a cut back after the last write is refused, is all there.
+    // Only where the disk fails after the rename, where a cut back after the last write is refused, and where the
+    // folder cannot be locked, is all there.
     assert!(
         failed + 4 > 2 * ops && nothing + 8 > 2 * ops,
         "{failed} failed, {nothing} left nothing of {ops}"
@@ -525,6 +613,11 @@ fn a_damaged_set_costs_itself_and_is_named() {
     assert!(report.lost.len() == 1 && report.lost[0].starts_with("1 sets between set "), "{:?}", report.lost);
     let verified = check(&fs, "part");
     assert_eq!(verified.worst(), Some(Severity::Lost), "{:?}", verified.findings);
+    // Cut again it says the same, once; and nothing more when a copy brings the set.
+    let part = at(&fs, named("part"));
+    assert_eq!(cut_of(&fs, &part, "again", SetSpan::default()).unwrap().lost, report.lost);
+    let brought = join(&fs, "brought", &[part, open(&reference)]).unwrap();
+    assert!(brought.complete && brought.sets == 6, "{:?}", brought.lost);
     // Another copy has the set that is damaged here.
     let report = join(&fs, "mended", &[open(&fs), open(&reference)]).unwrap();
     assert!(report.complete && report.sets == 6, "{:?}", report.lost);
@@ -544,8 +637,149 @@ fn an_unfinished_segment_can_be_joined_and_its_end_is_said() {
     fs.put(&dir().join("seg_0001.mcap.part"), bytes[..end].to_vec());
     let report = join(&fs, "joined", &[open(&fs)]).unwrap();
     assert!((4..6).contains(&report.sets), "{report:?}");
-    assert!(report.lost.iter().any(|l| l.starts_with("what came after set ")), "{:?}", report.lost);
+    let ends: Vec<_> = report.lost.iter().filter(|l| l.starts_with("what came after set ")).collect();
+    assert!(ends.len() == 1 && !ends[0].contains("was not finished"), "{:?}", report.lost);
     assert_eq!(check(&fs, "joined").worst(), Some(Severity::Lost));
+}
+
+/// As a killed process leaves it whose last write was whole: nothing in the file is damaged.
+#[test]
+fn the_end_of_a_recording_that_was_cut_off_is_said() {
+    let whole = MemFs::new();
+    recording(&whole, 6, quick(3), |_| 0);
+    let bytes = contents(&whole, &segment(1));
+    let chunks = mcap::Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
+    let of_last = chunks.iter().filter(|c| c.message_start_time == (T0 + 5 * PERIOD) as u64);
+    let end = of_last.map(|c| c.chunk_start_offset).min().unwrap() as usize;
+    let part = dir().join("seg_0001.mcap.part");
+    let session_file = dir().join("session.toml");
+    let mut killed = open(&whole).session().clone();
+    killed.outcome = None;
+    let killed = killed.to_toml().unwrap().into_bytes();
+    for closed in [false, true] {
+        let fs = copy(&whole);
+        fs.remove_file(&segment(1)).unwrap();
+        fs.put(&part, bytes[..end].to_vec());
+        if !closed {
+            fs.put(&session_file, killed.clone());
+        }
+        let said = |report: SliceReport| {
+            assert!(!report.complete && report.last_set == 5, "{report:?}");
+            let [line] = &report.lost[..] else { panic!("{:?}", report.lost) };
+            assert!(line.starts_with("what came after set 5 is not there: "), "{line}");
+            assert_eq!(line.matches("seg_0001.mcap.part was not finished").count(), 1, "{line}");
+        };
+        said(join(&fs, "joined", &[open(&fs)]).unwrap());
+        said(join(&fs, "loose", &[at(&fs, &part), at(&fs, segment(0))]).unwrap());
+        said(cut(&fs, "end", ids(2, 6)).unwrap());
+        assert_eq!(check(&fs, "end").worst(), Some(Severity::Lost));
+        // What says so already says it again, and not twice.
+        said(cut_of(&fs, &at(&fs, named("joined")), "part", ids(3, 9)).unwrap());
+        said(join(&fs, "again", &[at(&fs, named("end")), open(&fs)]).unwrap());
+        // What is wanted ends before, or comes from elsewhere.
+        let begin = cut(&fs, "begin", ids(1, 4)).unwrap();
+        assert!(begin.complete && begin.sets == 4, "{:?}", begin.lost);
+        for (name, first) in [("mended", open(&fs)), ("brought", at(&fs, named("joined")))] {
+            let report = join(&fs, name, &[first, open(&whole)]).unwrap();
+            assert!(report.complete && report.sets == 6, "{name}: {:?}", report.lost);
+        }
+    }
+    // Killed when one segment was finished and the next one not begun.
+    whole.put(&session_file, killed);
+    let expected = ["what came after set 6 is not there: the recording /data/session was not closed"];
+    assert_eq!(cut(&whole, "end", ids(5, 6)).unwrap().lost, expected);
+    assert!(cut(&whole, "begin", ids(1, 5)).unwrap().complete);
+}
+
+/// After a write that failed no account is written: only the session tells how many sets came after it.
+#[test]
+fn sets_lost_after_a_failed_write_stay_counted() {
+    let full = MemFs::new().with_capacity(110_000);
+    let r = recorder(&full, RecorderOptions { reserve_bytes: 30_000, ..options() });
+    for n in 0..40 {
+        drop(r.push(set(&session(), n)));
+        settle(&r);
+    }
+    let summary = r.finish().unwrap();
+    let failed = summary.sets.dropped[SetDrop::WriteFailed as usize];
+    assert!(summary.sets.recorded >= 3 && failed > 10, "{summary:?}");
+    let fs = copy(&full);
+    let told = |name: &str, report: SliceReport| {
+        let count = format!("{failed} of {} sets were not recorded: write_failed", report.sets + failed);
+        let [first, second] = &report.lost[..] else { panic!("{name}: {:?}", report.lost) };
+        assert_eq!(*first, count, "{name}");
+        assert!(second.starts_with("the recording ended before its time: "), "{name}: {second}");
+        assert_eq!(lost(&fs, name), (failed, 0), "{name}");
+        let verified = check(&fs, name);
+        assert_eq!(verified.worst(), Some(Severity::Lost), "{name}: {:?}", verified.findings);
+    };
+    let end = SetSpan { from: Some(Edge::Set(2)), to: None };
+    told("end", cut(&fs, "end", end).unwrap());
+    told("again", cut_of(&fs, &at(&fs, named("end")), "again", SetSpan::default()).unwrap());
+    // What came after the end is not of the beginning.
+    assert!(cut(&fs, "begin", ids(1, 2)).unwrap().complete);
+    assert_eq!(check(&fs, "begin").findings, []);
+    let part = |name: &str| at(&fs, named(name));
+    told("joined", join(&fs, "joined", &[part("begin"), part("end")]).unwrap());
+    told("twice", join(&fs, "twice", &[part("end"), open(&fs)]).unwrap());
+}
+
+/// One bit of the index of a segment: another copy has all that is in it.
+#[test]
+fn a_damaged_index_costs_nothing_that_another_copy_has() {
+    let why = "the summary's checksum does not agree with it";
+    let before = "what came before set 4 is not there: ";
+    let between = "3 sets between set 3 and set 7 are not there: ";
+    let after = "what came after set 6 is not there: ";
+    let cases = [(100, 0, None), (3, 0, Some(before)), (3, 1, Some(between)), (3, 2, Some(after))];
+    for (sets_per_segment, hit, alone) in cases {
+        let case = format!("segment {hit} of {sets_per_segment} sets");
+        let fs = MemFs::new();
+        recording(&fs, 9, quick(sets_per_segment), |_| 0);
+        let reference = copy(&fs);
+        let mut bytes = contents(&fs, &segment(hit));
+        // The footer takes the last 37; before it there is nothing but the summary.
+        let bit = bytes.len() - 60;
+        bytes[bit] ^= 1;
+        fs.put(&segment(hit), bytes);
+        for (name, inputs) in
+            [("first", [open(&fs), open(&reference)]), ("second", [open(&reference), open(&fs)])]
+        {
+            let report = join(&fs, name, &inputs).unwrap();
+            assert!(report.complete && report.sets == 9, "{case}: {:?}", report.lost);
+            assert_eq!(check(&fs, name).findings, [], "{case}");
+            let c = compare(&open(&reference), &at(&fs, named(name)), &strictly()).unwrap();
+            assert!(c.equal, "{case}: {:?}", c.differences);
+        }
+        if let Some(begin) = alone {
+            let report = join(&fs, "alone", &[open(&fs)]).unwrap();
+            let [line] = &report.lost[..] else { panic!("{case}: {:?}", report.lost) };
+            assert!(line.starts_with(begin) && line.contains(why), "{case}: {line}");
+            assert_eq!((report.sets, check(&fs, "alone").worst()), (6, Some(Severity::Lost)), "{case}");
+        } else {
+            let e = join(&fs, "alone", &[open(&fs)]).unwrap_err();
+            assert!(e.kind() == ErrorKind::Corrupt && e.to_string().contains(why), "{case}: {e}");
+            // A copy that has not all of it.
+            cut(&reference, "part", ids(1, 4)).unwrap();
+            let report = join(&fs, "some", &[open(&fs), at(&reference, named("part"))]).unwrap();
+            let [line] = &report.lost[..] else { panic!("{case}: {:?}", report.lost) };
+            assert!(line.starts_with("what /data/session holds is not there: "), "{case}: {line}");
+        }
+    }
+}
+
+/// Accounts of streams are a second apart, and a part may be shorter than that.
+#[test]
+fn a_short_part_has_the_accounts_of_its_streams() {
+    let fs = MemFs::new();
+    // An account at the end of each segment, and no other.
+    recording(&fs, 9, RecorderOptions { sync_interval_ns: 1 << 60, ..quick(3) }, |_| 0);
+    for (name, from, to) in [("begin", 1, 2), ("middle", 4, 5)] {
+        cut(&fs, name, ids(from, to)).unwrap();
+        let accounts = at(&fs, named(name)).info().unwrap().accounts;
+        assert_eq!(accounts, [account("front/depth", 3), account("front/color", 3)], "{name}");
+        assert_eq!(check(&fs, name).findings, [], "{name}");
+    }
 }
 
 /// What the child processes below work on; without it their tests do nothing.
