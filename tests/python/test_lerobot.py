@@ -181,12 +181,18 @@ def test_incomplete_sets_can_be_left_out(binary: str, golden: Golden, tmp_path: 
     report = export(binary, "--incomplete", "leave-out", golden.dataset, out)
     assert any("1 sets that lack a frame are left out" in loss for loss in report["losses"])
     assert any("1 gaps in time (1 sets)" in loss for loss in report["losses"])
+    assert (report["sets"], report["counters"], report["lost"]) == (5, {"sets that were left out": 1}, 0)
+    missing = [int(stream == MISSING[0]) for stream in GOLDEN]
+    assert [(s["frames"], s["missing"]) for s in report["streams"]] == [(5, m) for m in missing]
+    assert report["frames"] == 5 * len(GOLDEN)
     found = rows(out)
     assert [row["capture.set_id"] for row in found] == [1, 2, 4, 5, 6]
     assert [row["frame_index"] for row in found] == [0, 1, 2, 3, 4]
     # A set that lacks only what is not exported is whole.
-    export(binary, "--incomplete", "leave-out", "--stream", "front/depth", golden.dataset, tmp_path / "one")
-    assert len(rows(tmp_path / "one")) == 6
+    arguments = ["--incomplete", "leave-out", "--stream", "front/depth"]
+    report = export(binary, *arguments, golden.dataset, tmp_path / "one")
+    assert len(rows(tmp_path / "one")) == report["sets"] == 6
+    assert report["counters"] == {}
     assert [k for k in rows(tmp_path / "one")[0] if k.startswith("observation")] == ["observation.images.front_depth"]
 
 
@@ -195,7 +201,9 @@ def test_real_pictures_are_bit_equal(binary: str, recorded: Path, tmp_path: Path
     # On a busy machine a set may lack a frame.
     report = export(binary, "--incomplete", "leave-out", recorded, out)
     found = rows(out)
-    assert 3 <= len(found) <= report["sets"]
+    assert 3 <= len(found) == report["sets"]
+    lost = sum(report["counters"].values())
+    assert sum(dataset["sets"] for dataset in report["datasets"]) == report["sets"] + lost
     for row in found:
         for camera in CAMERAS:
             depth = picture(row[f"observation.images.{camera.name}_depth"])

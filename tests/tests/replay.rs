@@ -12,8 +12,8 @@ use depthrig_daemon::replay::{Replay, ReplayOptions};
 use depthrig_daemon::status::CameraState;
 use depthrig_daemon::zed_replay::{Mode, ZedReplayOptions, zed_replay};
 use depthrig_recorder::{
-    ColorCodec, CompareOptions, Dataset, DepthCodec, PixelCheck, SetRange, Severity, VerifyOptions, compare,
-    verify,
+    ColorCodec, CompareOptions, Dataset, DepthCodec, PixelCheck, PixelMode, SetRange, Severity,
+    VerifyOptions, compare, verify,
 };
 use depthrig_tests::Home;
 use depthrig_tests::disk::Tmpfs;
@@ -674,6 +674,45 @@ fn a_damaged_set_is_lost_and_named_and_the_others_come() {
     assert_eq!((status.sets, status.lost.len()), (11, 1));
     assert!(status.lost[0].contains("seg_0001.mcap"), "{:?}", status.lost);
     assert!(!bench.first.contains(&dataset.tick(6).ns()) && bench.first.len() == 11);
+}
+
+/// Flips a bit of the first chunk of `dataset` without which its first set has no numbers.
+fn damage_first_set(dataset: &std::path::Path) {
+    let segment = dataset.join("seg_0000.mcap");
+    let whole = std::fs::read(&segment).unwrap();
+    let unreadable = || {
+        let reader = Dataset::open(dataset).and_then(|d| d.set_reader());
+        reader.is_ok_and(|mut r| r.read(0, PixelMode::None).is_err())
+    };
+    // Behind the magic there are records: what it is, the length, and as many bytes.
+    let mut at = 8;
+    loop {
+        let end = at + 9 + u64::from_le_bytes(whole[at + 1..at + 9].try_into().unwrap()) as usize;
+        if whole[at] == 6 {
+            let mut bytes = whole.clone();
+            bytes[end - 1] ^= 1;
+            std::fs::write(&segment, bytes).unwrap();
+            if unreadable() {
+                return;
+            }
+        }
+        at = end;
+    }
+}
+
+#[test]
+fn times_stay_where_they_are_when_the_first_set_is_lost() {
+    let home = Home::default();
+    let dataset = Made::default();
+    let path = made(&home, "a", &dataset);
+    damage_first_set(&path);
+    let replay = start(&home, &[path], FAST);
+    let mut bench = Bench::new(&home, "bench", dataset.streams());
+    resume(&replay);
+    bench.read_all(&replay, None);
+    let status = replay.stop().status;
+    assert_eq!((status.sets, status.lost.len()), (11, 1), "{:?}", status.lost);
+    assert_eq!(bench.first, (1..12).map(|n| dataset.tick(n).ns()).collect::<Vec<_>>());
 }
 
 #[test]

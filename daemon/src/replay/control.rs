@@ -307,10 +307,13 @@ impl ReplayControl for Inner {
     }
 
     fn set_loop(&self, on: bool) -> Result<ReplayStatus> {
+        // A recording that is being made has looked at the loop, and is not there to be seen yet.
+        let one_at_a_time = lock(&self.starting);
         if on {
             self.must_not_be_recorded("beginning again")?;
         }
         lock(&self.transport).set_loop(on);
+        drop(one_at_a_time);
         Ok(self.settle())
     }
 }

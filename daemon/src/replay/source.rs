@@ -58,7 +58,7 @@ impl Sources {
     ///
     /// # Errors
     /// [`ErrorKind::NotFound`], [`ErrorKind::BadInput`] when one of them is no dataset or has no set, or when they
-    /// are not of one rig.
+    /// are not of one rig, [`ErrorKind::Other`] when the disk fails.
     pub fn open(paths: &[PathBuf], rig: Option<RigName>) -> Result<Self> {
         let mut sources = Vec::new();
         let mut streams: Vec<StreamRecord> = Vec::new();
@@ -85,10 +85,10 @@ impl Sources {
             let of_rig = dataset.session().motion.iter().map(&mut unit).collect();
             sources.push(Source { dataset, reader, streams: indices, units: of_rig });
         }
-        let Some(first) = sources.first_mut() else {
+        if sources.is_empty() {
             return Err(bad("name a dataset to replay"));
-        };
-        let utc_offset_ns = first.reader.read(0, PixelMode::None).map_or(0, |set| set.utc_offset_ns);
+        }
+        let utc_offset_ns = utc_offset_ns(&mut sources)?;
         let rig = match rig {
             Some(rig) => rig,
             None => rig_of(&sources)?,
@@ -250,6 +250,20 @@ fn join_unit(units: &mut Vec<MotionRecord>, record: &MotionRecord) -> usize {
     }
     units.push(record.clone());
     units.len() - 1
+}
+
+/// From the clock of the replay, which is that of the first set that can be read, to UTC; 0 where none can.
+fn utc_offset_ns(sources: &mut [Source]) -> Result<i64> {
+    for source in sources {
+        for n in 0..source.reader.times().len() {
+            match source.reader.read(n, PixelMode::None) {
+                Ok(set) => return Ok(set.utc_offset_ns),
+                Err(e) if e.kind() == depthrig_recorder::ErrorKind::Io => return Err(of_dataset(e)),
+                Err(_) => {}
+            }
+        }
+    }
+    Ok(0)
 }
 
 fn rig_of(sources: &[Source]) -> Result<RigName> {

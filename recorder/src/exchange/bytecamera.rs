@@ -19,6 +19,15 @@ pub(super) fn camera_name(model: &str, otherwise: &str) -> depthrig_bus::Name {
     names::name(&names::of_model(model, otherwise, false))
 }
 
+/// `plain`, or where that is taken, `plain` with the first number from `n` on that makes a free name of it.
+pub(super) fn free_name(
+    plain: &depthrig_bus::Name,
+    n: u32,
+    taken: impl Fn(&str) -> bool,
+) -> depthrig_bus::Name {
+    names::free(plain, n, taken)
+}
+
 /// The name of the layout.
 pub const FORMAT: &str = "bytecameradepth";
 /// Every number of every frame.

@@ -193,6 +193,12 @@ impl PartOut<'_> {
         self.record.frames[stream] += 1;
     }
 
+    /// Takes back that the set which was read last is exported: it is left out, which is counted.
+    pub fn leave_out(&mut self) {
+        self.record.sets = self.record.sets.saturating_sub(1);
+        self.count("sets that were left out", 1);
+    }
+
     /// Counts a frame that could not be exported.
     pub fn lose(&mut self, problem: String) {
         self.record.lose(problem);

@@ -1,6 +1,7 @@
 //! The framework of exports: resumed, failed at each operation, refused, with an exporter that is as small as can be.
 
 mod bytecamera;
+mod lerobot;
 mod rosbag;
 
 use crate::support::*;

@@ -21,6 +21,9 @@ mod numbers;
 mod rows;
 mod stream;
 
+/// Metres per unit of depth that make sense.
+const UNITS_M: core::ops::RangeInclusive<f64> = 1e-6..=1.0;
+
 /// What the folders do not say.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ByteCameraOptions {
@@ -68,7 +71,7 @@ impl ByteCameraImport {
     /// `calibration.json` or `frames.csv`, [`ErrorKind::Io`].
     pub fn open(fs: Arc<dyn Fs>, dir: &Path, options: ByteCameraOptions) -> Result<Self> {
         for unit in options.depth_unit_m.iter().chain(options.camera_depth_unit_m.values()) {
-            if !(1e-6..=1.0).contains(unit) {
+            if !UNITS_M.contains(unit) {
                 return Err(bad(dir, format_args!("a depth unit of {unit} m makes no sense; 1 mm is 0.001")));
             }
         }

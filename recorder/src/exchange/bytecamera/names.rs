@@ -102,6 +102,19 @@ pub(super) fn name(text: &str) -> Name {
     Name::new(plain).or_else(|_| Name::new("camera")).unwrap_or_else(|_| unreachable!())
 }
 
+/// `plain`, or where that is taken, `plain` with the first number from `n` on that makes a free name of it. It
+/// is cut so that the number fits.
+pub(super) fn free(plain: &Name, mut n: u32, taken: impl Fn(&str) -> bool) -> Name {
+    let mut found = plain.clone();
+    while taken(found.as_str()) {
+        let number = format!("_{n}");
+        let stem = plain.as_str().get(..NAME_MAX_BYTES - number.len()).unwrap_or(plain.as_str());
+        found = name(&format!("{stem}{number}"));
+        n = n.wrapping_add(1);
+    }
+    found
+}
+
 /// The parts of a file's name: `raw_depth_12.npy` is `raw_depth`, 12, `npy`.
 pub(super) fn file_parts(name: &str) -> Option<(&str, u32, &str)> {
     let (stem, ending) = name.rsplit_once('.')?;
@@ -156,6 +169,20 @@ mod tests {
         for other in ["depth", "depth_refined", "color", "color_quality", "depth_"] {
             assert_eq!(mode_of(other), None, "{other}");
         }
+    }
+
+    #[test]
+    fn a_number_makes_a_name_free_however_long_it_is() {
+        let found = |plain: &str, n: u32, taken: &[&str]| {
+            free(&name(plain), n, |name| taken.contains(&name)).to_string()
+        };
+        assert_eq!(found("d455", 2, &["d435"]), "d455");
+        assert_eq!(found("d455", 2, &["d455", "d455_2"]), "d455_3");
+        let (long, stem) = ("a".repeat(31), "a".repeat(29));
+        assert_eq!(found(&long, 2, &[&long]), format!("{stem}_2"));
+        assert_eq!(found(&long, 2, &[&long, &format!("{stem}_2")]), format!("{stem}_3"));
+        let last = format!("{}_4294967295", "a".repeat(20));
+        assert_eq!(found(&long, u32::MAX, &[&long, &last]), format!("{stem}_0"));
     }
 
     #[test]

@@ -67,6 +67,13 @@ pub(super) fn head() -> String {
     line
 }
 
+/// Whether this is the first line of a file of ours, of today or of before there were derived streams.
+pub(super) fn is_head(line: &str) -> bool {
+    let today = head();
+    let today = today.trim_end();
+    line == today || today.strip_suffix(OF_DERIVED) == Some(line)
+}
+
 /// A field of text as a column: what would end a column is replaced.
 fn plain(text: &str) -> String {
     text.trim().replace(|c: char| c == ',' || c == '"' || c.is_control(), "_")
@@ -202,6 +209,15 @@ mod tests {
             let bits = crate::msgs::frame_info::tests::memory;
             prop_assert_eq!(bits(&back.header), bits(&expected));
         }
+    }
+
+    #[test]
+    fn heads_of_today_and_of_before_are_known() {
+        let today = head();
+        let before = today.trim_end().strip_suffix(OF_DERIVED).unwrap();
+        assert!(before.ends_with(",temperature_c"), "{before}");
+        assert!(is_head(today.trim_end()) && is_head(before));
+        assert!(!is_head("") && !is_head(OF_SET) && !is_head(&format!("{before},")));
     }
 
     #[test]

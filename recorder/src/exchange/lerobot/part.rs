@@ -151,7 +151,10 @@ impl<'p, 'f> Rows<'p, 'f> {
         place: &[Option<usize>],
         out: &mut PartOut<'_>,
     ) -> Result<()> {
-        let Some(row) = self.episode.row_of(number) else { return Ok(()) };
+        let Some(row) = self.episode.row_of(number) else {
+            out.leave_out();
+            return Ok(());
+        };
         let sample = sampled(row, self.episode.rows);
         let mut captures = vec![None; self.pictures.len()];
         for (feature, capture) in captures.iter_mut().enumerate() {

@@ -45,7 +45,7 @@ pub(super) struct Message<'a> {
 /// Where a message lies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Place {
-    /// Offset of the chunk's record.
+    /// Offset of the record of the chunk, or of the message that lies in none.
     chunk: u64,
     /// Offset of the data in the unpacked chunk.
     at: usize,
@@ -127,12 +127,15 @@ impl Bag {
         Error::new(ErrorKind::Corrupt, what)
     }
 
+    fn cut(&self) -> Error {
+        let path = self.path.display();
+        let what = format!("{path}: it ends in the middle of a record, at byte {}", self.size);
+        Error::new(ErrorKind::Truncated, what)
+    }
+
     fn bytes(&self, offset: u64, len: u32) -> Result<Vec<u8>> {
         if offset.checked_add(u64::from(len)).is_none_or(|end| end > self.size) {
-            return Err(Error::new(
-                ErrorKind::Truncated,
-                format!("{}: it ends in the middle of a record, at byte {}", self.path.display(), self.size),
-            ));
+            return Err(self.cut());
         }
         let mut bytes = vec![0; len as usize];
         self.file.read_exact_at(&mut bytes, offset).map_err(|e| Error::io("read", &self.path, e))?;
@@ -144,7 +147,7 @@ impl Bag {
         Ok(bytes.first_chunk().map_or(0, |b| u32::from_le_bytes(*b)))
     }
 
-    /// Header, offset and length of the data of the record at `offset`.
+    /// Header, offset and length of the data of the record at `offset`, which is there as a whole.
     fn record_at(&self, offset: u64) -> Result<(Vec<u8>, u64, u32)> {
         let len = self.u32_at(offset)?;
         if len > HEAD_MAX {
@@ -152,27 +155,33 @@ impl Bag {
         }
         let head = self.bytes(offset + 4, len)?;
         let at = offset + 4 + u64::from(len);
-        Ok((head, at + 4, self.u32_at(at)?))
+        let len = self.u32_at(at)?;
+        if at + 4 + u64::from(len) > self.size {
+            return Err(self.cut());
+        }
+        Ok((head, at + 4, len))
     }
 
-    /// Unpacks the chunk of the record at `offset`; the offset of the next record.
-    fn unpack(&self, offset: u64, into: &mut Unpacked) -> Result<u64> {
-        let (head, at, len) = self.record_at(offset)?;
-        let next = at + u64::from(len);
+    /// Unpacks the chunk of the record at `offset`; a message that lies in no chunk is one of its own.
+    fn unpack(&self, offset: u64, into: &mut Unpacked) -> Result<()> {
         if into.chunk == Some(offset) {
-            return Ok(next);
+            return Ok(());
         }
-        let head = Head::parse(&head).filter(|h| h.op() == Some(OP_CHUNK));
+        let (head, at, len) = self.record_at(offset)?;
+        let head = Head::parse(&head).filter(|h| matches!(h.op(), Some(OP_CHUNK | OP_MESSAGE)));
         let head = head.ok_or_else(|| self.corrupt(offset, "no chunk where one was"))?;
+        let bare = head.op() == Some(OP_MESSAGE);
         let wrong = |what: String| self.corrupt(offset, what);
-        let size = head.u32("size").ok_or_else(|| wrong("a chunk without a size".to_owned()))?;
+        let size = if bare { Some(len) } else { head.u32("size") };
+        let size = size.ok_or_else(|| wrong("a chunk without a size".to_owned()))?;
         if size > CHUNK_MAX || len > CHUNK_MAX {
             return Err(wrong(format!("a chunk of {} bytes; {CHUNK_MAX} is the most", size.max(len))));
         }
         into.chunk = None;
         into.bytes.clear();
         let packed = self.bytes(at, len)?;
-        match head.text("compression") {
+        let packing = if bare { Some("none") } else { head.text("compression") };
+        match packing {
             Some("none") => into.bytes = packed,
             Some("lz4") => {
                 let mut decoder = lz4_flex::frame::FrameDecoder::new(&packed[..]).take(u64::from(size) + 1);
@@ -194,84 +203,43 @@ impl Bag {
             return Err(wrong(format!("a chunk has {} bytes, its header says {size}", into.bytes.len())));
         }
         into.chunk = Some(offset);
-        Ok(next)
+        Ok(())
     }
 
-    /// Calls `each` with every message in the order of the file. Chunks that are damaged are told to `damage` and passed
-    /// over; so is the end of a file that was cut.
+    /// Calls `each` with every message in the order of the file. Chunks that are damaged are told to `damage`
+    /// and passed over; so is the end of a file that was cut. Messages in no chunk are told and read.
     pub(super) fn messages(
         &self,
         each: &mut dyn FnMut(Message<'_>) -> Result<()>,
         damage: &mut dyn FnMut(String),
     ) -> Result<()> {
-        let mut connections: BTreeMap<u32, Connection> = BTreeMap::new();
-        let mut chunk = Unpacked::default();
+        let mut pass = Pass { bag: self, connections: BTreeMap::new(), unclosed: false, each, damage };
+        let mut content = Unpacked::default();
         let mut offset = MAGIC.len() as u64;
         while offset < self.size {
             let (head, at, len) = match self.record_at(offset) {
                 Ok(record) => record,
                 Err(e) if e.kind() == ErrorKind::Io => return Err(e),
                 Err(e) => {
-                    damage(e.to_string());
+                    pass.damaged(&e);
                     return Ok(());
                 }
             };
-            let op = Head::parse(&head).and_then(|h| h.op());
-            if op == Some(OP_CHUNK) {
-                match self.unpack(offset, &mut chunk) {
-                    Ok(_) => self.in_chunk(offset, &chunk.bytes, &mut connections, each, damage)?,
-                    Err(e) if matches!(e.kind(), ErrorKind::Io | ErrorKind::BadInput) => return Err(e),
-                    Err(e) => damage(e.to_string()),
-                }
-            } else if op == Some(OP_CONNECTION)
-                && let Some(head) = Head::parse(&head)
-            {
-                connect(&mut connections, &head);
-            } else if op.is_none() {
-                damage(self.corrupt(offset, "no record where one must be").to_string());
-                return Ok(());
-            }
-            offset = at + u64::from(len);
-        }
-        Ok(())
-    }
-
-    fn in_chunk(
-        &self,
-        offset: u64,
-        bytes: &[u8],
-        connections: &mut BTreeMap<u32, Connection>,
-        each: &mut dyn FnMut(Message<'_>) -> Result<()>,
-        damage: &mut dyn FnMut(String),
-    ) -> Result<()> {
-        let mut rest = bytes;
-        while !rest.is_empty() {
-            let Some((head, data, after)) = record(rest) else {
-                damage(self.corrupt(offset, "a chunk ends in the middle of a record").to_string());
+            let Some((op, head)) = Head::parse(&head).and_then(|h| Some((h.op()?, h))) else {
+                pass.damaged(&self.corrupt(offset, "no record where one must be"));
                 return Ok(());
             };
-            rest = after;
-            match head.op() {
-                Some(OP_CONNECTION) => connect(connections, &head),
-                Some(OP_MESSAGE) => {
-                    let connection = head.u32("conn").and_then(|id| connections.get(&id));
-                    let time = head.get("time").and_then(|t| t.first_chunk::<8>());
-                    let (Some(connection), Some([a, b, c, d, e, f, g, h])) = (connection, time) else {
-                        damage(
-                            self.corrupt(offset, "a message of a connection that is not described")
-                                .to_string(),
-                        );
-                        continue;
-                    };
-                    let (s, ns) =
-                        (u32::from_le_bytes([*a, *b, *c, *d]), u32::from_le_bytes([*e, *f, *g, *h]));
-                    let time_ns = i64::from(s) * 1_000_000_000 + i64::from(ns);
-                    let at = bytes.len() - rest.len() - data.len();
-                    let place = Place { chunk: offset, at, len: data.len() };
-                    each(Message { connection, time_ns, data, place })?;
-                }
+            match op {
+                OP_CHUNK | OP_MESSAGE => match self.unpack(offset, &mut content) {
+                    Ok(()) if op == OP_CHUNK => pass.chunk(offset, &content.bytes)?,
+                    Ok(()) => pass.bare(offset, &head, &content.bytes)?,
+                    Err(e) if matches!(e.kind(), ErrorKind::Io | ErrorKind::BadInput) => return Err(e),
+                    Err(e) => pass.damaged(&e),
+                },
+                OP_CONNECTION => connect(&mut pass.connections, &head),
                 _ => {}
             }
+            offset = at + u64::from(len);
         }
         Ok(())
     }
@@ -281,6 +249,65 @@ impl Bag {
         self.unpack(place.chunk, chunk)?;
         let data = chunk.bytes.get(place.at..).and_then(|b| b.get(..place.len));
         data.ok_or_else(|| self.corrupt(place.chunk, "the file is not as it was when it was opened"))
+    }
+}
+
+/// One way through the file, from front to back.
+struct Pass<'a> {
+    bag: &'a Bag,
+    connections: BTreeMap<u32, Connection>,
+    /// Messages were seen that lie in no chunk.
+    unclosed: bool,
+    each: &'a mut dyn FnMut(Message<'_>) -> Result<()>,
+    damage: &'a mut dyn FnMut(String),
+}
+
+impl Pass<'_> {
+    fn damaged(&mut self, e: &Error) {
+        (self.damage)(e.to_string());
+    }
+
+    /// The content of the chunk at `offset`.
+    fn chunk(&mut self, offset: u64, bytes: &[u8]) -> Result<()> {
+        let mut rest = bytes;
+        while !rest.is_empty() {
+            let Some((head, data, after)) = record(rest) else {
+                self.damaged(&self.bag.corrupt(offset, "a chunk ends in the middle of a record"));
+                return Ok(());
+            };
+            rest = after;
+            match head.op() {
+                Some(OP_CONNECTION) => connect(&mut self.connections, &head),
+                Some(OP_MESSAGE) => {
+                    let at = bytes.len() - rest.len() - data.len();
+                    self.message(&head, data, Place { chunk: offset, at, len: data.len() })?;
+                }
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// A message that lies in no chunk. The head of a chunk is written when it begins, and again with its
+    /// size when it ends: of a recorder that was killed the last head says 0, and bare records follow it.
+    fn bare(&mut self, offset: u64, head: &Head<'_>, data: &[u8]) -> Result<()> {
+        if !std::mem::replace(&mut self.unclosed, true) {
+            let what = "messages in no chunk: the recorder was ended before it closed its last chunk";
+            self.damaged(&self.bag.corrupt(offset, what));
+        }
+        self.message(head, data, Place { chunk: offset, at: 0, len: data.len() })
+    }
+
+    fn message(&mut self, head: &Head<'_>, data: &[u8], place: Place) -> Result<()> {
+        let connection = head.u32("conn").and_then(|id| self.connections.get(&id));
+        let time = head.get("time").and_then(|t| t.first_chunk::<8>());
+        let (Some(connection), Some([a, b, c, d, e, f, g, h])) = (connection, time) else {
+            self.damaged(&self.bag.corrupt(place.chunk, "a message of a connection that is not described"));
+            return Ok(());
+        };
+        let (s, ns) = (u32::from_le_bytes([*a, *b, *c, *d]), u32::from_le_bytes([*e, *f, *g, *h]));
+        let time_ns = i64::from(s) * 1_000_000_000 + i64::from(ns);
+        (self.each)(Message { connection, time_ns, data, place })
     }
 }
 

@@ -4,7 +4,7 @@ use super::FORMAT;
 use super::bag::{Bag, Unpacked};
 use super::messages::image;
 use super::sets::{Set, group};
-use crate::exchange::bytecamera::camera_name;
+use crate::exchange::bytecamera::{camera_name, free_name};
 use crate::exchange::{ImportFacts, ImportProgress, Importer, import as driver};
 use crate::fs::{Fs, ReadFile};
 use crate::{Error, ErrorKind, RecordFrame, RecordSet, Result, Session, StreamAccount, StreamRecord};
@@ -13,10 +13,11 @@ use depthrig_bus::{
     StreamId, UtcPair,
 };
 use pose::pose_of;
-use scan::{Frame, Scan};
+use scan::{Frame, Refused, Scan};
 use std::collections::BTreeMap;
 use std::path::Path;
 
+mod clocks;
 mod pose;
 mod scan;
 
@@ -80,7 +81,7 @@ impl RosbagImport {
             facts_of_devices: toml::Table::new(),
         };
         import.streams(scan)?;
-        import.clocks();
+        import.facts.stated.extend(clocks::place(&mut import.streams));
         let times: Vec<Vec<i64>> =
             import.streams.iter().map(|s| s.frames.iter().map(|f| f.capture_ns).collect()).collect();
         import.sets = group(&times);
@@ -97,6 +98,12 @@ impl RosbagImport {
         self.facts.stated.push(what);
     }
 
+    /// Counts pictures that cannot be imported, for one reason.
+    fn lose(&mut self, pictures: u64, problem: String) {
+        self.facts.lost = self.facts.lost.saturating_add(pictures.saturating_sub(1));
+        self.facts.lose(problem);
+    }
+
     /// What the first pass found, as streams of cameras.
     fn streams(&mut self, scan: Scan) -> Result<()> {
         let mut cameras: BTreeMap<u32, (String, String, String)> = BTreeMap::new();
@@ -106,10 +113,8 @@ impl RosbagImport {
             if !cameras.contains_key(&device) {
                 let model = fact("Name");
                 let plain = camera_name(&model, &format!("device_{device}"));
-                let mut camera = plain.to_string();
-                while cameras.values().any(|(taken, ..)| *taken == camera) {
-                    camera = format!("{plain}_{device}");
-                }
+                let taken = |name: &str| cameras.values().any(|(taken, ..)| taken == name);
+                let camera = free_name(&plain, device, taken).to_string();
                 cameras.insert(device, (camera, model, fact("Serial Number")));
             }
             let Some((camera, model, serial)) = cameras.get(&device).cloned() else { continue };
@@ -117,14 +122,16 @@ impl RosbagImport {
             let stream = if index == 0 { plain } else { format!("{plain}_{index}") };
             let stream = camera_name("", &stream);
             let topic = format!("/device_{device}/sensor_{sensor}/{kind}_{index}");
-            if let Some(refused) = found.refused {
-                self.facts.lose(format!("{topic}: {refused} cannot be imported"));
+            if let Some(Refused { pictures, first }) = found.refused {
+                let what = format!("{topic}: {pictures} pictures cannot be imported; the first: {first}");
+                self.lose(pictures, what);
             }
             let (Some(format), Some((width, height))) = (found.format, found.size) else { continue };
             let id = StreamId::new(&camera, stream.as_str())
                 .map_err(|e| Error::new(ErrorKind::BadInput, format!("{topic}: {e}")).with_source(e))?;
             if self.streams.iter().any(|s| s.record.id == id) {
-                self.facts.lose(format!("{topic}: there is a stream {id} already, this one is left out"));
+                let pictures = found.frames.len() as u64;
+                self.lose(pictures, format!("{topic}: there is a stream {id} already, this one is left out"));
                 continue;
             }
             let options = scan.options.get(&(device, sensor));
@@ -169,7 +176,9 @@ impl RosbagImport {
             });
         }
         for (topic, n) in scan.others {
-            self.state(format!("{topic}: {n} messages are left out: motion and poses of a bag are not imported"));
+            self.state(format!(
+                "{topic}: {n} messages are left out: motion and poses of a bag are not imported"
+            ));
         }
         for ((device, sensor), options) in scan.options {
             let table = options.into_iter().map(|(k, v)| (k, f64::from(v).into())).collect::<toml::Table>();
@@ -190,70 +199,6 @@ impl RosbagImport {
             ));
         }
         Ok(())
-    }
-
-    /// Places the device's times on the host's clock: what arrived fastest sets the offset, as in the live map.
-    fn clocks(&mut self) {
-        let mut devices: BTreeMap<String, (Vec<i64>, i64, i64)> = BTreeMap::new();
-        for s in &mut self.streams {
-            let mut last = 0;
-            for f in &mut s.frames {
-                // The device counts microseconds in 32 bits, which is 71 minutes.
-                let raw =
-                    f.sensor_us.or(f.sent_us).unwrap_or_else(|| f.stamp_ns.max(0).unsigned_abs() / 1000);
-                let mut us = raw;
-                if u32::try_from(raw).is_ok() {
-                    us = (last & !u64::from(u32::MAX)) | raw;
-                    // Near the end of 64 bits, where only a damaged file is, it stays as it is.
-                    if last.saturating_sub(us) > 1 << 31 {
-                        us = us.saturating_add(1 << 32);
-                    }
-                }
-                last = us;
-                f.device_us = us;
-                let device_ns = i64::try_from(us).unwrap_or(0).saturating_mul(1000);
-                let entry = devices.entry(s.record.id.camera.to_string());
-                let (late, first, end) = entry.or_insert((Vec::new(), device_ns, device_ns));
-                if let (Some(arrival), false) = (f.arrival_ns, f.host_clock) {
-                    late.push(arrival.saturating_sub(device_ns));
-                }
-                (*first, *end) = ((*first).min(device_ns), (*end).max(device_ns));
-            }
-        }
-        for (camera, (late, first, end)) in &devices {
-            let (Some(least), Some(most)) = (late.iter().min(), late.iter().max()) else {
-                self.facts
-                    .stated
-                    .push(format!("{camera}: no frame says when it arrived; times are those of the bag"));
-                continue;
-            };
-            self.facts.stated.push(format!(
-                "{camera}: capture times are device times plus the least delay seen, over {:.3} s; delays vary by {:.3} ms, \
-                 and a constant one cannot be seen",
-                (end - first) as f64 / 1e9,
-                most.abs_diff(*least) as f64 / 1e6
-            ));
-        }
-        for s in &mut self.streams {
-            let device = devices.get(s.record.id.camera.as_str());
-            let least = device.and_then(|(late, ..)| late.iter().min().copied());
-            let most = device.and_then(|(late, ..)| late.iter().max().copied());
-            let mut before = i64::MIN;
-            for f in &mut s.frames {
-                let device_ns = i64::try_from(f.device_us).unwrap_or(0).saturating_mul(1000);
-                f.capture_ns = match (least, f.host_clock) {
-                    (Some(least), false) => device_ns.saturating_add(least),
-                    (_, true) if f.stamp_ns > 0 => f.stamp_ns,
-                    _ => f.bag_ns,
-                };
-                // Two readings of a delay cannot say less than how far they lie apart.
-                let width = most.zip(least).map_or(0, |(most, least)| most.saturating_sub(least));
-                f.uncertainty_ns = width.unsigned_abs().max(1_000_000);
-                // A set's frames are in order; a frame that went back in time is at least not before the last one.
-                f.capture_ns = f.capture_ns.max(before);
-                before = f.capture_ns;
-            }
-        }
     }
 
     fn spread(&self, set: &Set) -> i64 {
@@ -302,8 +247,8 @@ impl RosbagImport {
         }
         s.last_counter = f.counter.or(s.last_counter);
         s.sequence += 1;
-        let domain =
-            if f.host_clock || f.arrival_ns.is_none() { ClockDomain::Arrival } else { ClockDomain::Device };
+        let by_host = f.host_clock == Some(true) || f.arrival_ns.is_none();
+        let domain = if by_host { ClockDomain::Arrival } else { ClockDomain::Device };
         let mut flags = 0;
         if domain == ClockDomain::Arrival {
             flags |= FrameFlags::TIME_UNCERTAIN.0;

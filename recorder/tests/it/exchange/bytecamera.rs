@@ -272,6 +272,70 @@ fn depth_units_and_rates_are_as_given() {
     assert_eq!(times, [0, 100_000_000]);
 }
 
+/// The list says the unit where there is no calibration and none is given: session and frames agree.
+#[test]
+fn a_list_without_a_calibration_says_the_unit() {
+    let mut session = everything();
+    session.streams.truncate(2);
+    let exports = recorded(&session, 3, ColorCodec::Raw);
+    exported(&exports, CameraNames::Short, None).unwrap();
+    let list = session_dir().join("frames.csv");
+    let rows = String::from_utf8(contents(&exports, &list)).unwrap();
+    assert_eq!(rows.matches(",0.0001,").count(), 2, "the unit of each depth picture");
+    for (given, in_list, unit, says) in [
+        (None, 0.0001, 0.0001, "depth unit 0.0001 m as frames.csv says"),
+        (Some(0.002), 0.0001, 0.002, "depth unit 0.002 m as given, frames.csv says 0.0001"),
+        (Some(0.0001), 0.0001, 0.0001, "depth unit 0.0001 m as given;"),
+        (None, 0.0, 0.001, "depth unit 0.001 m inferred from the model D455"),
+    ] {
+        let fs = copy(&exports);
+        fs.remove_file(&session_dir().join("calibration.json")).unwrap();
+        fs.put(&list, rows.replace(",0.0001,", &format!(",{in_list},")).into_bytes());
+        let options = ByteCameraOptions { depth_unit_m: given, ..Default::default() };
+        let made = imported(&fs, &session_dir(), options).unwrap();
+        assert_eq!(made.facts.lost, 0, "{:?}", made.facts);
+        assert!(made.facts.stated.iter().any(|s| s.contains(says)), "{says}: {:#?}", made.facts.stated);
+        let dataset = reopened(&fs);
+        let depth = dataset.session().streams.iter().position(|s| s.format == PixelFormat::Z16).unwrap();
+        assert_eq!(dataset.session().streams[depth].depth_unit_m, unit);
+        let sets: Vec<_> = dataset.sets(SetRange::ALL).map(Result::unwrap).collect();
+        let frames = sets.iter().flat_map(|s| &s.frames).filter(|f| f.stream == depth);
+        assert_eq!(frames.map(|f| f.header.depth_unit_m).collect::<Vec<_>>(), [unit; 2]);
+    }
+}
+
+#[test]
+fn a_list_of_before_there_were_derived_streams_is_read() {
+    let mut session = everything();
+    session.streams.truncate(2);
+    let fs = recorded(&session, 3, ColorCodec::Raw);
+    exported(&fs, CameraNames::Short, None).unwrap();
+    let path = session_dir().join("frames.csv");
+    let today = String::from_utf8(contents(&fs, &path)).unwrap();
+    let (head, rows) = today.split_once('\n').unwrap();
+    let head = head.split_once(",source_color_sequence,").unwrap().0;
+    fs.put(&path, format!("{head}\n{}", rows.replace(",,,,,\n", "\n")).into_bytes());
+    let made = imported(&fs, &session_dir(), ByteCameraOptions::default()).unwrap();
+    assert_eq!((made.facts.lost, made.summary.sets.recorded), (0, 3));
+    let strict = CompareOptions { strict: true, ..CompareOptions::default() };
+    let same = compare(&open(&fs), &reopened(&fs), &strict).unwrap();
+    assert!(same.equal, "{:#?}", same.differences);
+}
+
+/// Names are cut; what they were cut to must not be one name.
+#[test]
+fn folders_with_long_names_are_cameras_of_their_own() {
+    let fs = MemFs::new();
+    for end in ["x", "y", "z"] {
+        let folder = format!("camera_{}_{end}", "a".repeat(40));
+        foreign(&fs, &folder, "depth", &[1, 2], PixelFormat::Z16, "monday");
+    }
+    imported(&fs, Path::new("/in/monday"), ByteCameraOptions::default()).unwrap();
+    let cameras: Vec<_> = reopened(&fs).session().streams.iter().map(|s| s.id.camera.to_string()).collect();
+    let stem = "a".repeat(29);
+    assert_eq!(cameras, ["a".repeat(31), format!("{stem}_2"), format!("{stem}_3")]);
+}
+
 /// A list that ends early between two lines is no broken line: the files it does not name tell.
 #[test]
 fn a_list_that_lost_its_last_lines_is_told() {

@@ -1,5 +1,7 @@
 //! Bags of librealsense: a real one, the same one damaged everywhere, and small ones made here.
 
+mod made;
+
 use crate::support::*;
 use core::ops::ControlFlow;
 use depthrig_bus::{ClockDomain, Distortion, FrameFlags};

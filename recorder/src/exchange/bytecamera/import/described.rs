@@ -19,8 +19,8 @@ impl ByteCameraImport {
             }
             let mut record = s.stream;
             let given = self.given_unit(record.id.camera.as_str(), &s.folder);
-            let given = given.filter(|u| record.format == PixelFormat::Z16 && *u != record.depth_unit_m);
-            if let Some(unit) = given {
+            let given = given.filter(|_| record.format == PixelFormat::Z16);
+            if let Some(unit) = given.filter(|u| *u != record.depth_unit_m) {
                 let said = std::mem::replace(&mut record.depth_unit_m, unit);
                 let id = &record.id;
                 self.state(format!("{id}: depth unit {unit} m as given, {CALIBRATION_FILE} says {said}"));

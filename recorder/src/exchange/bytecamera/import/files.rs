@@ -25,8 +25,18 @@ impl Read for Bytes {
     }
 }
 
+/// Folder, prefix and ending: what the files of a stream have in common.
+pub(super) type Key = (String, String, String);
+
 /// The files of each folder, prefix and ending by their numbers, with the name where it is not the plain one.
-pub(super) type Found = BTreeMap<(String, String, String), BTreeMap<u32, Option<String>>>;
+pub(super) type Found = BTreeMap<Key, BTreeMap<u32, Option<String>>>;
+
+/// What a file, named from the folder of the session, has in common with the others of its stream.
+pub(super) fn key_of(file: &str) -> Option<Key> {
+    let (folder, name) = file.split_once('/')?;
+    let (prefix, _, ending) = names::file_parts(name)?;
+    Some((folder.to_owned(), prefix.to_owned(), ending.to_owned()))
+}
 
 pub(super) fn list(fs: &dyn Fs, dir: &Path) -> Result<Found> {
     let mut found = Found::new();

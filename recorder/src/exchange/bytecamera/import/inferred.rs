@@ -2,44 +2,48 @@
 
 use super::files::{Found, session_within};
 use super::stream::Stream;
-use super::{ByteCameraImport, bad};
+use super::{ByteCameraImport, FRAMES_FILE, UNITS_M, bad};
 use crate::exchange::bytecamera::names;
 use crate::exchange::bytecamera::pictures::{Picture, Want};
 use crate::{Result, StreamRecord};
 use depthrig_bus::{Intrinsics, PixelFormat, Pose, StreamId};
 use std::collections::BTreeMap;
 
+/// What the files of a name hold; `None` where a dataset has no such stream.
+fn want_of(prefix: &str, ending: &str) -> Option<Want> {
+    match (prefix, ending) {
+        ("raw_depth", "npy") => Some(Want::Metres),
+        (p, "png") if p == "depth" || p.starts_with("depth_") => Some(Want::Depth),
+        (p, "png") if p.ends_with("color") => Some(Want::Color),
+        (p, "png") if p.starts_with("ir") => Some(Want::Grey),
+        _ => None,
+    }
+}
+
 impl ByteCameraImport {
     /// Streams as the names of folders and files and the first picture of each tell them.
     pub(super) fn inferred(&mut self, found: Found) -> Result<()> {
-        let mut cameras: BTreeMap<String, (String, String)> = BTreeMap::new();
-        for ((folder, prefix, ending), files) in found {
-            let want = match (prefix.as_str(), ending.as_str()) {
-                ("raw_depth", "npy") => Want::Metres,
-                (p, "png") if p == "depth" || p.starts_with("depth_") => Want::Depth,
-                (p, "png") if p.ends_with("color") => Want::Color,
-                (p, "png") if p.starts_with("ir") => Want::Grey,
-                _ => {
-                    self.state(format!(
-                        "{folder}/{prefix}_N.{ending}: {} files are left out, a dataset has no such stream",
-                        files.len()
-                    ));
-                    continue;
-                }
+        let depth = found.keys().filter(|(_, prefix, ending)| want_of(prefix, ending) == Some(Want::Depth));
+        let units = self.units_of_rows(depth.cloned().collect())?;
+        let mut cameras: BTreeMap<String, String> = BTreeMap::new();
+        for (key, files) in found {
+            let told = units.get(&key).copied().filter(|unit| UNITS_M.contains(unit));
+            let (folder, prefix, ending) = key;
+            let Some(want) = want_of(&prefix, &ending) else {
+                self.state(format!(
+                    "{folder}/{prefix}_N.{ending}: {} files are left out, a dataset has no such stream",
+                    files.len()
+                ));
+                continue;
             };
             let part = folder.strip_prefix("camera_").unwrap_or(&folder);
-            let (mut name, model) = names::camera_of(part);
-            if let Some((known, _)) = cameras.get(&folder) {
-                name = names::name(known);
+            let (plain, model) = names::camera_of(part);
+            let name = if let Some(known) = cameras.get(&folder) {
+                names::name(known)
             } else {
-                let plain = name.clone();
-                let mut n = 2;
-                while cameras.values().any(|(taken, _)| taken == name.as_str()) {
-                    name = names::name(&format!("{plain}_{n}"));
-                    n += 1;
-                }
-                cameras.insert(folder.clone(), (name.to_string(), model.clone()));
-            }
+                names::free(&plain, 2, |name| cameras.values().any(|taken| taken == name))
+            };
+            cameras.insert(folder.clone(), name.to_string());
             let stream = match prefix.as_str() {
                 "R_color" => "color_right".to_owned(),
                 other => names::name(other).to_string(),
@@ -66,7 +70,9 @@ impl ByteCameraImport {
             let r = &mut stream.record;
             (r.format, r.width, r.height) = (first.format, first.width, first.height);
             if r.format == PixelFormat::Z16 {
-                r.depth_unit_m = self.unit(&id, &folder, &model, &first.pixels);
+                let given = self.given_unit(id.camera.as_str(), &folder);
+                r.depth_unit_m = self.unit(&id, &model, &first.pixels, (given, told));
+                stream.unit_given = given.is_some() || told.is_none();
             } else if r.format == PixelFormat::DepthF32 {
                 r.depth_unit_m = 1.0;
             }
@@ -102,14 +108,23 @@ impl ByteCameraImport {
         Ok(None)
     }
 
-    /// The depth unit as given, else as inferred; it is stated.
-    fn unit(&mut self, id: &StreamId, folder: &str, model: &str, pixels: &[u8]) -> f64 {
+    /// The depth unit as `given`, else as `frames.csv` has `told` it, else as inferred; it is stated.
+    fn unit(
+        &mut self,
+        id: &StreamId,
+        model: &str,
+        pixels: &[u8],
+        (given, told): (Option<f64>, Option<f64>),
+    ) -> f64 {
         let mut values: Vec<u16> = pixels.as_chunks().0.iter().map(|v| u16::from_le_bytes(*v)).collect();
         values.retain(|v| *v != 0 && *v != u16::MAX);
         let middle = values.len() / 2;
         let median = if values.is_empty() { 0 } else { *values.select_nth_unstable(middle).1 };
-        let (unit, why) = if let Some(unit) = self.given_unit(id.camera.as_str(), folder) {
-            (unit, "as given".to_owned())
+        let (unit, why) = if let Some(unit) = given {
+            let other = told.filter(|told| *told != unit);
+            (unit, other.map_or("as given".to_owned(), |told| format!("as given, {FRAMES_FILE} says {told}")))
+        } else if let Some(unit) = told {
+            (unit, format!("as {FRAMES_FILE} says"))
         } else if let Some(unit) = names::usual_depth_unit_m(model) {
             (unit, format!("inferred from the model {model}, which comes so"))
         } else {

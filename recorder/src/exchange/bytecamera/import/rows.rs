@@ -1,30 +1,59 @@
 //! Sets, times and counters from `frames.csv`, read line by line.
 
-use super::files::Bytes;
+use super::files::{Bytes, Key, key_of};
 use super::{ByteCameraImport, FRAMES_FILE, List, bad};
-use crate::exchange::bytecamera::rows::{Row, head};
+use crate::exchange::bytecamera::rows::{Row, is_head};
 use crate::fs::ReadFile;
 use crate::{Error, RecordFrame, RecordSet, Result};
 use depthrig_bus::{HostTime, UtcPair};
-use std::io::{BufRead, BufReader, Read};
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{self, BufRead, BufReader, Read};
 use std::path::Path;
 
 /// Longest line of `frames.csv`, bytes; ours have a few hundred.
 const LINE_MAX: u64 = 64 << 10;
 
 impl ByteCameraImport {
-    /// Sets from `frames.csv`, whose first lines are read.
-    pub(super) fn by_rows(&mut self, file: Box<dyn ReadFile>, path: &Path) -> Result<()> {
+    /// Begins to read `frames.csv`, whose first line names the columns.
+    fn begin_rows(&mut self, file: Box<dyn ReadFile>, path: &Path) -> Result<()> {
         let size = file.size().map_err(|e| Error::io("read", path, e))?;
         let lines = Box::new(BufReader::with_capacity(64 << 10, Bytes { file, at: 0, size }));
         self.list = List::Rows { lines, line: 0, next: None };
-        let first = self.line()?;
-        if first.as_deref() != Some(head().trim_end()) {
-            return Err(bad(
-                path,
-                "its first line does not name the columns that depthrig writes; remove the file to import without times",
-            ));
+        if self.line()?.is_some_and(|line| is_head(&line)) {
+            return Ok(());
         }
+        Err(bad(
+            path,
+            "its first line does not name the columns that depthrig writes; remove the file to import without times",
+        ))
+    }
+
+    /// The unit of depth of each of these streams as the first line with a file of it tells it, if there is
+    /// a `frames.csv`. It is read from its begin, no further than is needed.
+    pub(super) fn units_of_rows(&mut self, mut wanted: BTreeSet<Key>) -> Result<BTreeMap<Key, f64>> {
+        let mut units = BTreeMap::new();
+        let path = self.dir.join(FRAMES_FILE);
+        let file = match self.fs.open(&path) {
+            Ok(file) => file,
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(units),
+            Err(e) => return Err(Error::io("open", &path, e)),
+        };
+        self.begin_rows(file, &path)?;
+        while !wanted.is_empty()
+            && let Some(row) = self.row()?
+        {
+            if let Some(key) = key_of(&row.file)
+                && wanted.remove(&key)
+            {
+                units.insert(key, row.header.depth_unit_m);
+            }
+        }
+        Ok(units)
+    }
+
+    /// Sets from `frames.csv`, whose first lines are read.
+    pub(super) fn by_rows(&mut self, file: Box<dyn ReadFile>, path: &Path) -> Result<()> {
+        self.begin_rows(file, path)?;
         let row = self.row()?;
         let Some(row) = row else { return Err(bad(path, "it names no frames")) };
         if self.session.started_utc_ns == 0 {

@@ -14,7 +14,7 @@ pub(super) struct Stream {
     /// The name of each number's file where it is not the plain one (`depth_007.png`), and which numbers there are.
     pub(super) files: BTreeMap<u32, Option<String>>,
     pub(super) record: StreamRecord,
-    /// The unit of depth is another one than the files say.
+    /// The unit of depth is not that of the rows of `frames.csv`: every frame has the stream's.
     pub(super) unit_given: bool,
     pub(super) sequence: u64,
     pub(super) dropped: DropCounts,

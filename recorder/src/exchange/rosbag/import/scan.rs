@@ -21,7 +21,8 @@ pub(super) struct Frame {
     pub(super) arrival_ns: Option<i64>,
     pub(super) exposure_us: Option<u64>,
     pub(super) gain: Option<f32>,
-    pub(super) host_clock: bool,
+    /// Whether its stamp is of the host's clock, where the bag says it.
+    pub(super) host_clock: Option<bool>,
     /// Filled in when the clocks are mapped.
     pub(super) capture_ns: i64,
     pub(super) device_us: u64,
@@ -37,7 +38,14 @@ pub(super) struct Found {
     pub(super) info: Option<(u32, u32, Intrinsics)>,
     pub(super) to_color: Option<([f64; 3], [f64; 4])>,
     pub(super) rate_hz: f64,
-    pub(super) refused: Option<String>,
+    pub(super) refused: Option<Refused>,
+}
+
+/// Pictures that cannot be imported.
+pub(super) struct Refused {
+    pub(super) pictures: u64,
+    /// What the first of them is.
+    pub(super) first: String,
 }
 
 /// The first pass.
@@ -112,9 +120,9 @@ impl Scan {
                         let (place, bag_ns) = (Some(m.place), m.time_ns);
                         found.frames.push(Frame { place, bag_ns, stamp_ns: i.stamp_ns, ..Frame::default() });
                     }
-                    _ => found.refused = Some(format!("{}x{} {} pixels", i.width, i.height, i.encoding)),
+                    _ => found.refuse(|| format!("{}x{} {} pixels", i.width, i.height, i.encoding)),
                 },
-                None => found.refused = Some("an image that ends too early".to_owned()),
+                None => found.refuse(|| "an image that ends too early".to_owned()),
             },
             "image/metadata" => {
                 // Written after the picture, with the picture's time.
@@ -132,7 +140,29 @@ impl Scan {
     }
 }
 
+impl Found {
+    /// Counts a picture that cannot be imported; `what` it is, is asked of the first one.
+    fn refuse(&mut self, what: impl FnOnce() -> String) {
+        self.refused.get_or_insert_with(|| Refused { pictures: 0, first: what() }).pictures += 1;
+    }
+}
+
 impl Frame {
+    /// What the device counted, microseconds.
+    pub(super) fn counted_us(&self) -> Option<u64> {
+        self.sensor_us.or(self.sent_us)
+    }
+
+    /// The same, or where nothing is told of it the stamp of the picture.
+    pub(super) fn raw_us(&self) -> u64 {
+        self.counted_us().unwrap_or_else(|| self.stamp_ns.max(0).unsigned_abs() / 1000)
+    }
+
+    /// The time of the device, nanoseconds.
+    pub(super) fn device_ns(&self) -> i64 {
+        i64::try_from(self.device_us).unwrap_or(0).saturating_mul(1000)
+    }
+
     fn learn(&mut self, key: &str, value: &str) {
         let whole = || value.parse::<u64>().ok();
         match key {
@@ -144,7 +174,7 @@ impl Frame {
             // The same moment twice: to the microsecond, and to the millisecond.
             "system_time" => self.arrival_ns = milliseconds(value),
             "Time Of Arrival" if self.arrival_ns.is_none() => self.arrival_ns = milliseconds(value),
-            "timestamp_domain" => self.host_clock = value != "Hardware Clock",
+            "timestamp_domain" => self.host_clock = Some(value != "Hardware Clock"),
             _ => {}
         }
     }
