@@ -212,7 +212,7 @@ pub fn unfinished_in(fs: &Arc<dyn Fs>, folder: &Path, rig: &str) -> Result<Vec<P
     };
     let mut found = Vec::new();
     // `NAME.part` is what `trim` or `merge` has not finished: no recording.
-    for entry in entries.iter().filter(|e| e.is_dir && !e.name.ends_with(".part")) {
+    for entry in entries.iter().filter(|e| e.is_dir && !is_part(Path::new(&e.name))) {
         let dir = folder.join(&entry.name);
         let Ok(inside) = fs.read_dir(&dir) else { continue };
         let part = inside

@@ -145,7 +145,7 @@ pub fn merge(
         session::must_be_one(first, other)?;
     }
     let inputs: Vec<_> = datasets.iter().map(Input::new).collect();
-    let Some(Lanes { lanes, times, unread }) = lanes(&inputs)? else {
+    let Some(Lanes { all: lanes, times, unread }) = lanes(&inputs)? else {
         return Err(Error::new(ErrorKind::BadInput, "there is no set in what is to be merged"));
     };
     let mut session = session::merged(datasets, out);

@@ -58,16 +58,16 @@ impl Segment {
     /// Creates `seg_<index>.mcap.part` with everything that comes before the first chunk.
     pub(crate) fn create(fs: &dyn Fs, dir: &Path, index: u32, preamble: &Preamble) -> Result<Self> {
         let path = dir.join(file_name(index));
-        Self::create_as(fs, path.with_extension("mcap.part"), path, preamble)
+        Self::create_as(fs, &path.with_extension("mcap.part"), path, preamble)
     }
 
     /// The same under the name `part`, to be finished as `path` in the same folder.
-    pub(crate) fn create_as(fs: &dyn Fs, part: PathBuf, path: PathBuf, preamble: &Preamble) -> Result<Self> {
-        let file = fs.create_new(&part).map_err(|e| Error::io("create", &part, e))?;
-        let created = Self::begin(fs, file, part.clone(), path, preamble);
+    pub(crate) fn create_as(fs: &dyn Fs, part: &Path, path: PathBuf, preamble: &Preamble) -> Result<Self> {
+        let file = fs.create_new(part).map_err(|e| Error::io("create", part, e))?;
+        let created = Self::begin(fs, file, part.to_owned(), path, preamble);
         if created.is_err() {
             // A file without a head is no segment, and would be in the way of one.
-            let _ = fs.remove_file(&part);
+            let _ = fs.remove_file(part);
         }
         created
     }

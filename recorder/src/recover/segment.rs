@@ -93,16 +93,14 @@ impl Rebuild<'_> {
             return Ok((facts, lost));
         }
         self.check_room(reader.size)?;
-        let done =
-            Segment::create_as(self.fs, temporary.clone(), temporary.clone(), &preamble).and_then(|copy| {
-                let mut copy = copy;
-                let (facts, copied) =
-                    self.copy(&reader, &preamble, first, Some(&mut copy), &mut lost, tell)?;
-                let (end, crc) = copy.checkpoint();
-                copy.seal()?;
-                self.prove(&reader, &temporary, end, crc, &copied)?;
-                Ok(facts)
-            });
+        let done = Segment::create_as(self.fs, &temporary, temporary.clone(), &preamble).and_then(|copy| {
+            let mut copy = copy;
+            let (facts, copied) = self.copy(&reader, &preamble, first, Some(&mut copy), &mut lost, tell)?;
+            let (end, crc) = copy.checkpoint();
+            copy.seal()?;
+            self.prove(&reader, &temporary, end, crc, &copied)?;
+            Ok(facts)
+        });
         match done {
             Ok(facts) => Ok((facts, lost)),
             Err(e) => {

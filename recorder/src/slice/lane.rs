@@ -146,7 +146,7 @@ pub(super) enum Item {
 
 /// All that is to be read.
 pub(super) struct Lanes {
-    pub(super) lanes: Vec<Lane>,
+    pub(super) all: Vec<Lane>,
     /// Log times of the first and the last set.
     pub(super) times: (i64, i64),
     /// Inputs of which nothing can be read, and why.
@@ -196,7 +196,7 @@ pub(super) fn lanes(inputs: &[Input<'_>]) -> Result<Option<Lanes>> {
             unread.push((piece.input, e.to_string()));
         }
     }
-    Ok(Some(Lanes { lanes, times: (first, last), unread }))
+    Ok(Some(Lanes { all: lanes, times: (first, last), unread }))
 }
 
 /// Log times of the first and the last set of a segment, as its index says.
