@@ -226,6 +226,9 @@ fn a_crash_is_recovered_once_and_the_exit_code_says_what_it_cost() {
     // Killed between its index and its name: nothing is lost.
     let named = home.path().join("named");
     write(&named, "sink", 1_700_000_000_000_000_000);
+    let mut session = depthrig_recorder::Dataset::open(&named).unwrap().session().clone();
+    session.outcome = None;
+    std::fs::write(named.join("session.toml"), session.to_toml().unwrap()).unwrap();
     let whole = std::fs::read(named.join("seg_0000.mcap")).unwrap();
     std::fs::rename(named.join("seg_0000.mcap"), named.join("seg_0000.mcap.part")).unwrap();
     assert!(home.run(&["recover", named.to_str().unwrap(), "-q"]).good().contains("got its final name"));
