@@ -411,7 +411,8 @@ impl Writer {
         tracing::error!(dataset = %self.shared.dir.display(), "the recording ended: {e}");
         let mut state = self.shared.lock();
         state.ended = Some(SetDrop::WriteFailed);
-        state.error = Some(Arc::new(e));
+        // The first reason stays: what fails while the file is closed follows from it.
+        state.error.get_or_insert_with(|| Arc::new(e));
     }
 
     /// Runs an operation on the file unless the recording has failed; its first failure ends the recording.
