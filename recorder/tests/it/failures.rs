@@ -1,4 +1,4 @@
-//! What goes wrong is said, counted and survived.
+//! What goes wrong is said, counted and survived. Long because each failure has the same disks, encoders and checks.
 
 use crate::recover::{ids, recover};
 use crate::support::*;

@@ -4,9 +4,9 @@ use crate::support::*;
 use depthrig_recorder::fs::{Fault, Fs, MemFs, RealFs};
 use depthrig_recorder::{
     ColorCodec, CompareOptions, Dataset, DepthCodec, Edge, ErrorKind, FrameChoice, Moment, Recorder,
-    RecorderOptions, RecoverOptions, Session, SetDrop, SetSpan, Severity, SliceOptions, SliceReport,
-    StreamAccount, VerifyOptions, VerifyReport, compare, merge, recover_with, trim, unfinished_in,
-    verify_with,
+    RecorderOptions, RecoverAction, RecoverOptions, Session, SetDrop, SetSpan, Severity, SliceOptions,
+    SliceReport, StreamAccount, VerifyOptions, VerifyReport, compare, merge, recover, recover_with, trim,
+    unfinished_in, verify_with,
 };
 use proptest::prelude::*;
 use std::io;
@@ -893,6 +893,13 @@ fn memory_child() {
         quiet,
     );
     assert_eq!(done.unwrap().lost, 0);
+    // Without its footer all of it is copied.
+    let segment = dir.join("joined/seg_0000.mcap");
+    let file = std::fs::OpenOptions::new().write(true).open(&segment).unwrap();
+    file.set_len(file.metadata().unwrap().len() - 7).unwrap();
+    let quiet = &mut |_| ControlFlow::Continue(());
+    let done = recover(&dir.join("joined"), &RecoverOptions::default(), quiet).unwrap();
+    assert_eq!(done.segments[0].action, RecoverAction::Rebuilt);
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
     println!("\n{}", status.lines().find(|l| l.starts_with("VmHWM:")).unwrap());
 }
