@@ -3,6 +3,7 @@
 //! Writing is append only: nothing seeks back, so a torn file is always a good file with a bad end.
 
 use core::fmt;
+use core::time::Duration;
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::FileExt;
@@ -137,6 +138,22 @@ pub(crate) fn write_all(file: &mut dyn WriteFile, mut bytes: &[u8]) -> io::Resul
         }
     }
     Ok(())
+}
+
+/// How often a lock that is taken is asked for again, and how long after.
+const LOCK_TRIES: u32 = 20;
+const LOCK_WAIT: Duration = Duration::from_millis(25);
+
+/// Locks the folder as [`Fs::lock`]. A process that is being started holds what its parent held until it runs its
+/// own program: a lock that is gone may look taken for a moment, and is waited for.
+pub(crate) fn lock_patiently(fs: &dyn Fs, dir: &Path) -> io::Result<Box<dyn Send + Sync>> {
+    for _ in 0..LOCK_TRIES {
+        match fs.lock(dir) {
+            Err(e) if e.kind() == io::ErrorKind::WouldBlock => std::thread::sleep(LOCK_WAIT),
+            done => return done,
+        }
+    }
+    fs.lock(dir)
 }
 
 /// Replaces the small file `path` so that a crash leaves the old or the new one, never a mixture. Only where a

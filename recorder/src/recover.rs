@@ -7,7 +7,7 @@
 
 use crate::container::segment::{file_name, sync_folder_of};
 use crate::dataset::{segment_number, segments_in};
-use crate::fs::{DirEntry, Fs, RealFs};
+use crate::fs::{DirEntry, Fs, RealFs, lock_patiently};
 use crate::recorder::RESERVE_FILE;
 use crate::session::SESSION_TMP;
 use crate::{Error, ErrorKind, Result, SESSION_FILE, Session};
@@ -149,7 +149,7 @@ pub fn recover_with(
     let entries = fs.read_dir(path).map_err(|e| Error::io("open the folder", path, e))?;
     check_names(path, &entries)?;
     let mut notes = Vec::new();
-    let lock = lock(fs, path);
+    let lock = lock_patiently(&**fs, path);
     match &lock {
         Ok(_) => {}
         Err(e) if e.kind() == std::io::ErrorKind::WouldBlock => {
@@ -185,20 +185,6 @@ pub fn recover_with(
     let report = job.report;
     drop(lock);
     done.map(|()| report)
-}
-
-/// Locks the folder. A process that is being started holds what its parent held until it runs its own program: a
-/// lock that is gone may look taken for a moment.
-fn lock(fs: &Arc<dyn Fs>, path: &Path) -> std::io::Result<Box<dyn Send + Sync>> {
-    for _ in 0..20 {
-        match fs.lock(path) {
-            Err(e) if e.kind() == std::io::ErrorKind::WouldBlock => {
-                std::thread::sleep(core::time::Duration::from_millis(25));
-            }
-            done => return done,
-        }
-    }
-    fs.lock(path)
 }
 
 /// The datasets in `folder` that `rig` left unfinished and that nobody records now, sorted.

@@ -1,17 +1,12 @@
 //! The folder in which a new dataset grows: locked all the while, and renamed when all in it is durable.
 
-use crate::fs::Fs;
+use crate::fs::{Fs, lock_patiently};
 use crate::{Error, ErrorKind, Result};
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 /// Beside the chunks there are heads, indexes and `session.toml`, bytes.
 const MARGIN_BYTES: u64 = 16 << 20;
-/// A process that is being started holds what its parent held until it runs its own program: a lock that is
-/// gone may look taken for a moment. So often, and so long each time, it is waited for.
-const LOCK_TRIES: u32 = 20;
-const LOCK_WAIT: Duration = Duration::from_millis(25);
 
 pub(super) struct Folder<'a> {
     fs: &'a dyn Fs,
@@ -91,22 +86,19 @@ impl Drop for Folder<'_> {
 
 /// Locks the folder. A file system that cannot lock is no reason not to write.
 fn lock(fs: &dyn Fs, part: &Path) -> Result<Option<Box<dyn Send + Sync>>> {
-    for _ in 0..LOCK_TRIES {
-        match fs.lock(part) {
-            Ok(lock) => return Ok(Some(lock)),
-            Err(e) if e.kind() == io::ErrorKind::WouldBlock => std::thread::sleep(LOCK_WAIT),
-            Err(e) => {
-                let part = part.display();
-                tracing::warn!("{part} cannot be locked: {e}; do not run `depthrig recover` on it now");
-                return Ok(None);
-            }
+    let shown = part.display();
+    match lock_patiently(fs, part) {
+        Ok(lock) => Ok(Some(lock)),
+        Err(e) if e.kind() == io::ErrorKind::WouldBlock => {
+            let advice = "wait until that has ended, or choose another name";
+            let what = format!("{shown} is being written by another process; {advice}");
+            Err(Error::new(ErrorKind::InUse, what))
+        }
+        Err(e) => {
+            tracing::warn!("{shown} cannot be locked: {e}; do not run `depthrig recover` on it now");
+            Ok(None)
         }
     }
-    let what = format!(
-        "{} is being written by another process; wait until that has ended, or choose another name",
-        part.display()
-    );
-    Err(Error::new(ErrorKind::InUse, what))
 }
 
 /// Whether nothing of this name is there, or an empty folder.
