@@ -4,7 +4,7 @@ SHELL := /bin/bash
 
 # Extra arguments for the demo and the virtual machine: make demo ARGS="--seconds 30"
 ARGS ?=
-# Real sensor pictures for the tests.
+# Real sensor images for the tests.
 export DEPTHRIG_TEST_DATA ?= $(abspath ../shared/data)
 
 READERS := tests/readers
@@ -20,10 +20,10 @@ FEED := .venv-feed
 OAK := .venv-oak
 REQUIREMENTS := python/requirements-test.txt $(READERS)/requirements.txt
 
-.PHONY: help demo test test-long vm fuzz lint bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
+.PHONY: help demo test check-debian13 test-long vm fuzz lint bench bench-peers bench-feed clean setup-build setup-test setup-vm setup-peers setup-fuzz
 
 help: ## show this list
-	@sed -nE 's/^([a-z-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-12s %s\n", $$1, $$2}'
+	@sed -nE 's/^([a-z0-9-]+):.*## (.*)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-14s %s\n", $$1, $$2}'
 
 demo: setup-build ## the mount of seven cameras with ten depth modes, without a camera: record, verify, replay, report
 	@tools/onnxruntime.sh || true
@@ -48,9 +48,13 @@ FUZZ ?= 3600
 fuzz: setup-fuzz ## an hour for each fuzz target, or FUZZ="SECONDS [TARGET...]"
 	tools/fuzz.sh $(FUZZ)
 
+check-debian13: ## build in a clean Debian 13, as root: make check-debian13 ARGS="test --package depthrig-drivers"
+	tools/check_debian13.sh $(ARGS)
+
 lint: ## formatting and lints, as CI runs them
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets -- --deny warnings
+	tools/notice.py --check
 	@if command -v cargo-deny >/dev/null; then cargo deny check; else echo "cargo-deny is not installed: licences not checked"; fi
 
 bench: setup-build ## the numbers of docs/performance.md

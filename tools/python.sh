@@ -11,6 +11,8 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
+# Environments are made by who calls this, tests run as an ordinary user (tests/runner/box.py).
+box() { "$root/tests/runner/box.py" --limit 3600 -- "$@"; }
 envs=${CARGO_TARGET_DIR:-$PWD/target}/python
 
 interpreter() { # VERSION: the path of a Python of that version that can make environments
@@ -66,7 +68,7 @@ folder = pathlib.Path(depthrig.__file__).parent
 assert "site-packages" in str(folder) and (folder / "py.typed").exists(), folder
 print("==", sys.version.split()[0], "from", folder.relative_to(sys.prefix))')
         # Not from the folder python/, where the package lies as source.
-        (cd / && "$envs/$version/bin/python" -m pytest --quiet --config-file "$root/python/pyproject.toml" \
+        (cd / && box "$envs/$version/bin/python" -m pytest --quiet --config-file "$root/python/pyproject.toml" \
             --rootdir "$root/python" -p no:cacheprovider "$root/python/tests") || failed+=" $version"
     done
     [ -z "$failed" ] || { echo "failed on Python$failed" >&2; return 1; }
@@ -85,7 +87,7 @@ torch() {
             --requirement python/requirements-torch.txt
         touch "$envs/beside-torch/.stamp"
     fi
-    PYTHONPATH=$PWD/python/src:$envs/beside-torch "$python" -m pytest --quiet -p no:cacheprovider \
+    PYTHONPATH=$PWD/python/src:$envs/beside-torch box "$python" -m pytest --quiet -p no:cacheprovider \
         python/tests/test_torch.py python/tests/test_policy.py
 }
 
@@ -98,7 +100,7 @@ oak() {
     # Without a camera the calls that only a camera answers are held against the SDK's own stubs.
     PYTHONPATH=$PWD/python/src "$python" -m mypy --config-file python/pyproject.toml --cache-dir "$envs/mypy-oak" \
         python/src/depthrig
-    PYTHONPATH=$PWD/python/src "$python" -m pytest --quiet -p no:cacheprovider \
+    PYTHONPATH=$PWD/python/src box "$python" -m pytest --quiet -p no:cacheprovider \
         python/tests/test_oak.py python/tests/test_oak_parts.py
 }
 

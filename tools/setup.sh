@@ -4,6 +4,19 @@
 # everything is there.
 set -euo pipefail
 
+# How to run apt-get; empty when it may not be run.
+apt=()
+if command -v apt-get >/dev/null && [ "$(id -u)" -eq 0 ]; then
+    apt=(env DEBIAN_FRONTEND=noninteractive apt-get)
+elif command -v apt-get >/dev/null && sudo --non-interactive true 2>/dev/null; then
+    apt=(sudo --non-interactive env DEBIAN_FRONTEND=noninteractive apt-get)
+fi
+
+# The version of Clang that this release of Debian has. A computer that has never fetched lists of packages knows none.
+clang_version() {
+    apt-cache depends libclang1 2>/dev/null | sed -n 's/^ *Depends: libclang1-//p' || true
+}
+
 missing=()
 need() { # PACKAGE COMMAND...: the package when the command fails
     local package=$1
@@ -16,8 +29,15 @@ for part in "$@"; do
     build)
         need gcc command -v cc
         need libc6-dev test -e /usr/include/stdio.h
+        # libusb, a shared library; without these two it would be built from source and linked statically.
+        need pkg-config command -v pkg-config
+        need libusb-1.0-0-dev pkg-config --exists libusb-1.0
         # The bindings of the kernel's video interface are made from its header, by libclang and with Clang's own headers.
-        clang=$(apt-cache depends libclang1 2>/dev/null | sed -n 's/^ *Depends: libclang1-//p')
+        clang=$(clang_version)
+        if [ -z "$clang" ] && [ ${#apt[@]} -gt 0 ]; then
+            "${apt[@]}" update --quiet=2
+            clang=$(clang_version)
+        fi
         need "libclang1-${clang:-14}" eval '[ -n "${LIBCLANG_PATH:-}" ] || compgen -G "/usr/lib/*/libclang-[0-9]*.so*"'
         need "libclang-common-${clang:-14}-dev" compgen -G '/usr/lib/*/lib/clang/*/include/stddef.h'
         ;;
@@ -38,6 +58,10 @@ for part in "$@"; do
         need mkvtoolnix command -v mkvinfo
         # The bindings below drivers/oak are C++.
         need g++ command -v c++
+        # What a program asks of a computer.
+        need binutils command -v objdump
+        # The boxes that tests run in.
+        need util-linux command -v setpriv
         ;;
     vm)
         need qemu-system-x86 command -v qemu-system-x86_64
@@ -69,22 +93,40 @@ for part in "$@"; do
     esac
 done
 
+# Those real images for tests that a Debian package has; the others are no package's (CONTRIBUTING.md).
+images=${CARGO_TARGET_DIR:-target}/test-data/opencv_aloe_stereo
+fetch_images() {
+    local work
+    work=$(mktemp --directory) || return
+    (cd "$work" && apt-get download --quiet=2 opencv-doc >/dev/null 2>&1 && dpkg-deb --extract opencv-doc_*.deb .) &&
+        mkdir -p "$images.part" &&
+        find "$work/usr" -name 'aloe*' -type f -exec cp {} "$images.part" \; &&
+        [ -s "$images.part/aloeL.jpg" ] && rm -rf "$images" && mv "$images.part" "$images"
+    local status=$?
+    rm -rf "$work" "$images.part"
+    return "$status"
+}
+case " $* " in
+*" test "*)
+    if [ ! -d "${DEPTHRIG_TEST_DATA:-../shared/data}" ] && [ ! -d "$images" ] && command -v apt-get >/dev/null; then
+        echo "fetching images of Debian's opencv-doc (95 MB) for tests into $images"
+        fetch_images || echo "not fetched: tests of stereo on real images are skipped" >&2
+    fi
+    ;;
+esac
+
 if ! command -v cargo >/dev/null; then
     echo "Rust is missing: install the stable toolchain (1.92 or later) with rustup, see https://rustup.rs" >&2
     exit 1
 fi
 [ ${#missing[@]} -eq 0 ] && exit 0
 
-install=(apt-get install --yes --no-install-recommends "${missing[@]}")
-if command -v apt-get >/dev/null && [ "$(id -u)" -eq 0 ]; then
-    run=(env DEBIAN_FRONTEND=noninteractive)
-elif command -v apt-get >/dev/null && sudo --non-interactive true 2>/dev/null; then
-    run=(sudo --non-interactive env DEBIAN_FRONTEND=noninteractive)
-else
+install=(install --yes --no-install-recommends "${missing[@]}")
+if [ ${#apt[@]} -eq 0 ]; then
     echo "missing: ${missing[*]}. Install them, then run this again:" >&2
-    echo "  sudo ${install[*]}" >&2
+    echo "  sudo apt-get ${install[*]}" >&2
     exit 1
 fi
 echo "installing: ${missing[*]}"
-"${run[@]}" apt-get update --quiet=2
-"${run[@]}" "${install[@]}"
+"${apt[@]}" update --quiet=2
+"${apt[@]}" "${install[@]}"

@@ -1,119 +1,171 @@
 #!/usr/bin/env bash
 # Runs every test there is and ends with one line that counts them. `make test` prepares what it needs.
+#
+# Tests run as an ordinary user. Started by root, this script builds as root (the toolchain may lie where nobody else may
+# enter) and runs what was built as the user `depthrig-test`, which it creates; DEPTHRIG_TEST_USER=UID:GID:HOME names
+# another one. Each step runs in a box (tests/runner/box.py): with default signals and time limits that kill all that it
+# started. A part of the suite runs a second time beside two busy loops, with 256 MiB of /dev/shm and few descriptors.
+#
+# DEPTHRIG_REQUIRE_DATA, DEPTHRIG_REQUIRE_TMPFS and DEPTHRIG_REQUIRE_VM forbid to skip what needs these; .ci/run sets them.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 
+export PYTHONDONTWRITEBYTECODE=1
 python=$PWD/.venv/bin/python
+runner=tests/runner/rust.py
 logs=target/test-logs
 mkdir -p "$logs"
-# Tests in Rust that could not be done append a line here: cargo keeps to itself what a passing test prints.
-export DEPTHRIG_TEST_SKIPS=$PWD/$logs/skips
-rm -f "$DEPTHRIG_TEST_SKIPS"
+rm -f "$logs"/*
+target=${CARGO_TARGET_DIR:-$PWD/target}
+# The longest that a step may take; each test has a limit of its own.
+limit=${DEPTHRIG_STEP_LIMIT_S:-3600}
+if [ -n "${DEPTHRIG_LONG:-}" ]; then
+    limit=$((limit * 6))
+    export DEPTHRIG_TEST_LIMIT_S=${DEPTHRIG_TEST_LIMIT_S:-3600}
+fi
+
+# Short: sockets lie below it.
+home=$(mktemp --directory /tmp/dt.XXXXXX)
+trap 'rm -rf "$home"' EXIT
+mkdir "$home/t" "$home/r"
+chmod 0755 "$home"
+mkdir -p "$target/tmp" "$target/test-cache"
+if [ "$(id -u)" -eq 0 ]; then
+    . tools/test_user.sh
+fi
+box() { # [OPTION...] -- COMMAND...
+    tests/runner/box.py --limit "$limit" "$@"
+}
+# What could not be tested, in a line each, written by whoever runs the tests.
+export DEPTHRIG_TEST_SKIPS=$home/skips
+touch "$DEPTHRIG_TEST_SKIPS"
+chmod 0666 "$DEPTHRIG_TEST_SKIPS"
+
 failed_steps=""
 step() { # NAME COMMAND...: runs it, keeps its output, remembers a failure
     local name=$1
     shift
     printf '\n== %s\n' "$name"
+    local start=$SECONDS
     if ! "$@" 2>&1 | tee "$logs/$name.log"; then
         failed_steps+=" $name"
         echo "== $name FAILED"
     fi
+    echo "$name $((SECONDS - start))" >>"$logs/seconds"
+}
+optional() { # WHAT COMMAND...: as `step`, but for what ends with 77 because something is not installed
+    local what=$1
+    shift
+    "$@"
+    local status=$?
+    [ "$status" -ne 77 ] || echo "$what: not installed" >>"$DEPTHRIG_TEST_SKIPS"
+    [ "$status" -eq 0 ] || [ "$status" -eq 77 ]
 }
 
-if [ ! -d "$DEPTHRIG_TEST_DATA" ]; then
-    echo "the real pictures are not at $DEPTHRIG_TEST_DATA; set DEPTHRIG_TEST_DATA to their folder" >&2
-    exit 1
+if [ ! -d "$DEPTHRIG_TEST_DATA/lingbot_depth" ]; then
+    if [ -n "${DEPTHRIG_REQUIRE_DATA:-}" ]; then
+        echo "the real images are not at $DEPTHRIG_TEST_DATA; set DEPTHRIG_TEST_DATA to their folder" >&2
+        exit 1
+    fi
+    echo "the real images are not at $DEPTHRIG_TEST_DATA (DEPTHRIG_TEST_DATA): tests that need them are skipped"
+    # What a Debian package has of them, fetched by tools/setup.sh.
+    [ ! -d "$target/test-data" ] || export DEPTHRIG_TEST_DATA=$target/test-data
+    export DEPTHRIG_DATA_MISSING=1
 fi
 
 # Tests of the network in ONNX Runtime skip themselves where it could not be fetched, and nowhere else.
-if compgen -G "${CARGO_TARGET_DIR:-target}/onnxruntime/cpu/libonnxruntime.so*" >/dev/null; then
+if compgen -G "$target/onnxruntime/cpu/libonnxruntime.so*" >/dev/null; then
     export DEPTHRIG_REQUIRE_ONNXRUNTIME=1
 fi
 
 # Property tests draw the same cases each time, so that a failure is of the change at hand; the long form draws new ones.
 [ -n "${DEPTHRIG_LONG:-}" ] || export PROPTEST_RNG_SEED=${PROPTEST_RNG_SEED:-1}
 
-step rust cargo test --workspace --no-fail-fast --quiet
+built=$logs/rust.json
+cargo test --workspace --no-run --quiet --message-format=json-render-diagnostics >"$built" || exit 1
 # The same selection as above, so that nothing is compiled twice with other features.
 cargo build --workspace --bins --examples --quiet || exit 1
-target=${CARGO_TARGET_DIR:-$PWD/target}/debug
-export DEPTHRIG_BIN=$target/depthrig
-export DEPTHRIG_TEST_PUBLISHER=$target/examples/publish
+export DEPTHRIG_BIN=$target/debug/depthrig
+export DEPTHRIG_TEST_PUBLISHER=$target/debug/examples/publish
+
+tests=("$python" -m pytest --quiet -p no:cacheprovider)
+step runner box -- "${tests[@]}" tests/runner
+step rust "$runner" "$built"
+# rustdoc compiles these into a folder that only its own user can enter.
+step rust-doc box --as-root -- cargo test --workspace --doc --no-fail-fast --quiet
+step binary tools/check_binary.sh "$DEPTHRIG_BIN"
+# What talks to other processes and fills memory, where there is little of everything. A stream takes about ten descriptors in
+# the process that publishes it and ten in each that reads it: a rig and its readers in one process have more than 64.
+small=(--shm 256 --busy 2)
+# Left out of 64: what subscribes seventeen times in one process.
+step rust-small "$runner" "$built" "${small[@]}" --nofile 64 --only depthrig-bus:channels \
+    --skip a_dead_process_whose_description_is_gone --skip sixteen_subscribers_find_room
+step rust-busy "$runner" "$built" "${small[@]}" --nofile 256 --only depthrig-tests:dataset --only depthrig-tests:replay
 
 # The OAK program in Rust cannot be linked without a built depthai-core; its types can be looked at.
 oak_crate() {
-    CARGO_TARGET_DIR=$(dirname "$target")/oak cargo check --manifest-path drivers/oak/Cargo.toml --locked --quiet \
-        --features no-native --all-targets &&
-        CARGO_TARGET_DIR=$(dirname "$target")/oak cargo test --manifest-path drivers/oak/Cargo.toml --locked --quiet
+    local cargo=(env "CARGO_TARGET_DIR=$target/oak" cargo)
+    "${cargo[@]}" check --manifest-path drivers/oak/Cargo.toml --locked --quiet --features no-native --all-targets &&
+        "${cargo[@]}" test --manifest-path drivers/oak/Cargo.toml --locked --quiet --no-run \
+            --message-format=json-render-diagnostics >"$logs/oak.json" && "$runner" "$logs/oak.json"
 }
 step oak-crate oak_crate
 
-step python "$python" -m pytest --quiet python/tests
+step python box -- "${tests[@]}" python/tests
+step python-small box "${small[@]}" --nofile 64 -- "${tests[@]}" -m "not many_streams" \
+    python/tests/test_stream.py python/tests/test_fresh.py python/tests/test_motion.py
 # The wheel on other versions of Python, and with PyTorch.
 step python-versions tools/python.sh versions
-skipped=""
-torch() {
-    tools/python.sh torch
-    local status=$?
-    [ "$status" -ne 77 ] || echo "PyTorch skipped"
-    [ "$status" -eq 0 ] || [ "$status" -eq 77 ]
-}
-step python-torch torch
-if grep -q '^PyTorch skipped' "$logs/python-torch.log"; then skipped+=", 1 skipped: tests with PyTorch"; fi
-oak() {
-    tools/python.sh oak
-    local status=$?
-    [ "$status" -ne 77 ] || echo "OAK skipped"
-    [ "$status" -eq 0 ] || [ "$status" -eq 77 ]
-}
-step python-oak oak
-if grep -q '^OAK skipped' "$logs/python-oak.log"; then skipped+=", 1 skipped: the OAK bridge with its SDK"; fi
-step daemon "$python" -m pytest --quiet tests/python
+step python-torch optional "tests with PyTorch" tools/python.sh torch
+step python-oak optional "the OAK bridge with its SDK" tools/python.sh oak
+step daemon box -- "${tests[@]}" tests/python
 
 # Readers that are not ours must find the same pixels.
-work=$(mktemp --directory)
-trap 'rm -rf "$work"' EXIT
-step golden "$target/examples/golden" "$work/dataset" "$work/expected"
-step reader-python "$python" tests/readers/check_python.py "$work/dataset" "$work/expected"
-step reader-node node tests/readers/check_node.mjs "$work/dataset" "$work/expected"
+work=$home/t/readers
+box -- mkdir "$work"
+readers() { # NAME EXAMPLE OPTION READER...
+    local name=$1 example=$2 option=$3 reader
+    shift 3
+    step "golden$name" box -- "$target/debug/examples/$example" "$work/data$name" "$work/expected$name" $option
+    for reader in "$@"; do
+        case $reader in
+        python) step "reader-python$name" box -- "$python" tests/readers/check_python.py "$work/data$name" "$work/expected$name" ;;
+        node) step "reader-node$name" box -- node tests/readers/check_node.mjs "$work/data$name" "$work/expected$name" ;;
+        esac
+    done
+}
+readers "" golden "" python node
 # Depth in our own codec, colour as PNG. Python's readers take it apart with the package depthrig; in JavaScript there
 # is no decoder of it.
-step golden-rank "$target/examples/golden" "$work/rank" "$work/rank-expected" rank
-step reader-python-rank "$python" tests/readers/check_python.py "$work/rank" "$work/rank-expected"
-step golden-stereo "$target/examples/golden" "$work/stereo" "$work/stereo-expected" stereo
-step reader-python-stereo "$python" tests/readers/check_python.py "$work/stereo" "$work/stereo-expected"
-step reader-node-stereo node tests/readers/check_node.mjs "$work/stereo" "$work/stereo-expected"
-step golden-zed "$target/examples/zed_replay_golden" "$work/zed" "$work/zed-expected"
-step reader-python-zed "$python" tests/readers/check_python.py "$work/zed" "$work/zed-expected"
-step reader-node-zed node tests/readers/check_node.mjs "$work/zed" "$work/zed-expected"
+readers -rank golden rank python
+readers -stereo golden stereo python node
+readers -zed zed_replay_golden "" python node
 
-# The drivers and the daemon on a real kernel. 77: what that needs is not installed, which DEPTHRIG_REQUIRE_VM forbids.
-vm() {
-    tests/vm/run --no-build ${DEPTHRIG_REQUIRE_VM:+--require}
-    local status=$?
-    [ "$status" -ne 77 ] || echo "virtual machine skipped; tools/setup.sh vm installs what it needs"
-    [ "$status" -eq 0 ] || [ "$status" -eq 77 ]
-}
-step vm vm
-if grep -q '^virtual machine skipped' "$logs/vm.log"; then skipped+=", 1 skipped: the virtual machine"; fi
+# The drivers and the daemon on a real kernel.
+step vm optional "the virtual machine (tools/setup.sh vm)" \
+    box -- tests/vm/run --no-build ${DEPTHRIG_REQUIRE_VM:+--require}
 
 # Every test that cargo and pytest counted, every check of the virtual machine, and one for each of the other steps.
-count() { grep -ohE "[0-9]+ $1" "$logs"/{rust,oak-crate,python,python-versions,python-torch,python-oak,daemon,vm}.log | awk '{n += $1} END {print n + 0}'; }
+counted=(runner rust rust-doc rust-small rust-busy oak-crate python python-small python-versions python-torch python-oak daemon vm)
+count() { # WORD
+    local name
+    for name in "${counted[@]}"; do cat "$logs/$name.log"; done | grep -oE "[0-9]+ $1" | awk '{n += $1} END {print n + 0}'
+}
 passed=$(count passed)
-failed=$(count failed)
-# A test that found no small disk has passed for cargo. Nothing could be mounted, which DEPTHRIG_REQUIRE_TMPFS forbids.
-disks=0
-if [ -f "$DEPTHRIG_TEST_SKIPS" ]; then disks=$(grep -c '^tmpfs: ' "$DEPTHRIG_TEST_SKIPS"); fi
-if [ "$disks" -gt 0 ]; then
-    passed=$((passed - disks))
-    skipped+=", $disks skipped: tests with a small disk (tmpfs)"
-fi
-for name in {golden,reader-python,reader-node}{,-stereo,-zed} {golden,reader-python}-rank; do
+failed=$(($(count failed) + $(count 'errors?\b')))
+for log in "$logs"/binary.log "$logs"/golden*.log "$logs"/reader-*.log; do
+    name=$(basename "$log" .log)
     case "$failed_steps " in
     *" $name "*) failed=$((failed + 1)) ;;
     *) passed=$((passed + 1)) ;;
     esac
 done
+skipped=$(wc -l <"$DEPTHRIG_TEST_SKIPS")
+if [ "$skipped" -gt 0 ]; then
+    printf '\nskipped:\n'
+    sed 's/^/  /' "$DEPTHRIG_TEST_SKIPS"
+fi
 [ -z "$failed_steps" ] || printf '\nfailed:%s\n' "$failed_steps"
-printf '\n%d passed, %d failed%s\n' "$passed" "$failed" "$skipped"
+[ -z "$failed_steps" ] || [ "$failed" -gt 0 ] || failed=1
+printf '\n%d passed, %d failed%s\n' "$passed" "$failed" "$([ "$skipped" -eq 0 ] || echo ", $skipped skipped (named above)")"
 [ -z "$failed_steps" ]

@@ -1,0 +1,208 @@
+#!/usr/bin/env python3
+"""Runs test executables that cargo has built, each in a box (box.py), and counts what they say.
+
+    cargo test --workspace --no-run --message-format=json >MESSAGES
+    tests/runner/rust.py MESSAGES [--only CRATE[:TARGET][=FILTER]]... [--shm MIB] [--nofile N] [--busy N]
+
+A test that has not ended `DEPTHRIG_TEST_LIMIT_S` seconds (600) after the one before it is killed with all that it
+started, and named. A test that says "skipped: why" and passes is counted as skipped, and so is one that fails because it
+does not find the real images, which its message says (`DEPTHRIG_TEST_DATA`), where tools/test.sh has found that these are
+missing and may be (`DEPTHRIG_DATA_MISSING`). Names of skipped tests go to stdout and to the file of `DEPTHRIG_TEST_SKIPS`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+sys.dont_write_bytecode = True
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+from box import TIMED_OUT, Box  # noqa: E402
+
+LIMIT_S = float(os.environ.get("DEPTHRIG_TEST_LIMIT_S", "600"))
+NEEDS_MOUNTS = {("depthrig-tests", "storage_faults"), ("depthrig-tests", "replay")}
+"""Executables with tests that mount a small disk."""
+MISSING_DATA = "DEPTHRIG_DATA_MISSING" in os.environ
+"""The real images may be missing (tools/test.sh)."""
+RESULT = re.compile(r"^test (?P<name>.+?) \.\.\. (?P<result>ok|FAILED|ignored.*)$")
+ENDED = re.compile(r"^test result: .* (?P<filtered>\d+) filtered out")
+OUTPUT = re.compile(r"^---- (?P<name>.+?) stdout ----$")
+SKIPPED = re.compile(r"^\s*skipped: ", re.IGNORECASE)
+
+
+@dataclass
+class Executable:
+    """A test executable as cargo describes it."""
+
+    crate: str
+    target: str
+    kind: str
+    path: str
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.crate} {self.kind} {self.target}"
+
+    def environment(self, programs: dict[str, str]) -> dict[str, str]:
+        """What cargo would have set."""
+        env = dict(os.environ)
+        env["CARGO_MANIFEST_DIR"] = str(self.folder)
+        env["CARGO_MANIFEST_PATH"] = str(self.folder / "Cargo.toml")
+        env["CARGO_PKG_NAME"] = self.crate
+        return env | programs
+
+
+@dataclass
+class Outcome:
+    """What an executable's output says."""
+
+    results: dict[str, str] = field(default_factory=dict)
+    output: dict[str, list[str]] = field(default_factory=dict)
+    stray: list[str] = field(default_factory=list)
+    """Lines outside any test's captured output."""
+    ended: bool = False
+    _inside: str | None = None
+
+    def take(self, line: str) -> bool:
+        """Takes a line of output; whether it is a sign of progress."""
+        if found := RESULT.match(line):
+            self.results[found["name"]] = found["result"]
+            return True
+        if found := OUTPUT.match(line):
+            self._inside = found["name"]
+            self.output[self._inside] = []
+        elif ENDED.match(line):
+            self.ended = True
+        elif line in ("successes:", "failures:"):
+            self._inside = None
+        elif self._inside is not None:
+            self.output[self._inside].append(line)
+        elif line and not re.match(r"^(running \d+ tests?$|    \S)", line):
+            self.stray.append(line)
+        return False
+
+
+@dataclass
+class Totals:
+    """Counts over all executables."""
+
+    passed: int = 0
+    failed: int = 0
+    ignored: int = 0
+    skipped: list[str] = field(default_factory=list)
+
+
+def read_messages(path: Path) -> tuple[list[Executable], dict[str, str]]:
+    """The test executables, and the environment that names the programs beside them."""
+    executables, programs = [], {}
+    for line in path.read_text().splitlines():
+        if not line.startswith("{"):
+            continue
+        message = json.loads(line)
+        if message.get("reason") != "compiler-artifact" or not message.get("executable"):
+            continue
+        target = message["target"]
+        if message["profile"]["test"]:
+            manifest = Path(message["manifest_path"])
+            crate = message["package_id"].rpartition("#")[2].partition("@")[0]
+            if crate[:1].isdigit():
+                crate = manifest.parent.name
+            kind = target["kind"][0]
+            executables.append(Executable(crate, target["name"], kind, message["executable"], manifest.parent))
+        elif target["kind"] == ["bin"]:
+            programs[f"CARGO_BIN_EXE_{target['name']}"] = message["executable"]
+    return sorted(executables, key=lambda e: (e.crate, e.kind, e.target)), programs
+
+
+def names_of(executable: Executable, box: Box, filters: list[str], env: dict[str, str]) -> list[str]:
+    """The tests of an executable."""
+    lines: list[str] = []
+    argv = [executable.path, "--list", "--format=terse", *filters]
+    box.run(argv, limit_s=60, cwd=executable.folder, env=env, line=lambda line: lines.append(line) is None)
+    return [line.removesuffix(": test") for line in lines if line.endswith(": test")]
+
+
+def run(executable: Executable, box: Box, filters: list[str], programs: dict[str, str], totals: Totals) -> bool:
+    """Runs an executable and prints how it went; whether it went well."""
+    env = executable.environment(programs)
+    box.mounts = (executable.crate, executable.target) in NEEDS_MOUNTS
+    outcome = Outcome()
+    started = time.monotonic()
+    argv = [executable.path, "--show-output", "--color=never", *filters]
+    status = box.run(argv, idle_s=LIMIT_S, cwd=executable.folder, env=env, line=outcome.take)
+    skipped, failed = [], []
+    for name, result in outcome.results.items():
+        text = outcome.output.get(name, [])
+        if result == "FAILED" and MISSING_DATA and any("DEPTHRIG_TEST_DATA" in line for line in text):
+            skipped.append((name, "no real images"))
+        elif result == "FAILED":
+            failed.append(name)
+        elif result == "ok" and (why := next((line for line in text if SKIPPED.match(line)), None)):
+            skipped.append((name, why.strip().partition(" ")[2]))
+    passed = sum(result == "ok" for result in outcome.results.values()) - sum(
+        outcome.results[name] == "ok" for name, _ in skipped
+    )
+    ignored = sum(result.startswith("ignored") for result in outcome.results.values())
+    if not outcome.ended:
+        # It was killed, or died; what has no result was running, or never began.
+        unfinished = [name for name in names_of(executable, box, filters, env) if name not in outcome.results]
+        why = f"killed after {LIMIT_S:.0f} s without a result" if status == TIMED_OUT else f"died with status {status}"
+        print(f"{executable.name}: {why}; without a result: {', '.join(unfinished) or 'none'}")
+        print("\n".join(outcome.stray[-40:]))
+        failed += unfinished or [f"{executable.target} itself"]
+    for name in failed:
+        print(f"---- {executable.crate} {name}\n" + "\n".join(outcome.output.get(name, [])))
+    word = "FAILED" if failed else "ok"
+    took = time.monotonic() - started
+    line = f"test result: {word}. {passed} passed; {len(failed)} failed; {ignored} ignored; {len(skipped)} skipped"
+    print(f"{line}; {took:.1f} s: {executable.name}", flush=True)
+    totals.passed += passed
+    totals.failed += len(failed)
+    totals.ignored += ignored
+    totals.skipped += [f"{executable.crate} {name}: {why}" for name, why in skipped]
+    return not failed
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("messages", type=Path)
+    parser.add_argument("--only", action="append", metavar="CRATE[:TARGET][=FILTER]", help="run these alone")
+    parser.add_argument("--skip", action="append", default=[], metavar="TEST", help="leave out tests of this name")
+    parser.add_argument("--shm", type=int, metavar="MIB", help="size of /dev/shm")
+    parser.add_argument("--nofile", type=int, metavar="N", help="most descriptors of a process")
+    parser.add_argument("--busy", type=int, default=0, metavar="N", help="busy loops beside each executable")
+    args = parser.parse_args()
+    executables, programs = read_messages(args.messages)
+    wanted: list[tuple[Executable, list[str]]] = []
+    skips = [word for name in args.skip for word in ("--skip", name)]
+    for only in args.only or [""]:
+        selector, _, name = only.partition("=")
+        crate, _, target = selector.partition(":")
+        found = [e for e in executables if crate in ("", e.crate) and target in ("", e.target)]
+        if not found:
+            print(f"no test executable is {only}", file=sys.stderr)
+            return 1
+        wanted += [(e, ([name] if name else []) + skips) for e in found]
+    totals = Totals()
+    box = Box(shm_mib=args.shm, nofile=args.nofile, busy=args.busy)
+    failures = [e.name for e, filters in wanted if not run(e, box, filters, programs, totals)]
+    for line in totals.skipped:
+        print(f"skipped {line}")
+    if (path := os.environ.get("DEPTHRIG_TEST_SKIPS")) and totals.skipped:
+        with open(path, "a") as file:
+            file.writelines(f"{line}\n" for line in totals.skipped)
+    if failures:
+        print(f"failed: {', '.join(failures)}")
+    return 1 if failures or not wanted else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
