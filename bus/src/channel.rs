@@ -4,25 +4,28 @@
 //! The limits are the same for every channel of every rig, so that a daemon that comes back with another
 //! configuration never meets an old subscriber that holds the channel in another form.
 
-use crate::{Error, ErrorKind, Result, SCHEMA};
+mod opening;
+
+use crate::{Error, ErrorKind, Result, SCHEMA, limits, shm, umask};
 use core::fmt::Debug;
 use core::marker::PhantomData;
+use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
-use iceoryx2::port::listener::{Listener, ListenerWaitError};
-use iceoryx2::port::notifier::Notifier;
-use iceoryx2::port::publisher::Publisher;
-use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::listener::{Listener, ListenerCreateError, ListenerWaitError};
+use iceoryx2::port::notifier::{Notifier, NotifierCreateError};
+use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
+use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::port::{LoanError, ReceiveError};
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut_uninit::SampleMutUninit;
-use iceoryx2::service::attribute;
 use iceoryx2::service::builder::publish_subscribe::{
     PublishSubscribeCreateError as CreateError, PublishSubscribeOpenError as OpenError,
-    PublishSubscribeOpenOrCreateError as OpenOrCreateError,
 };
 use iceoryx2::service::port_factory::{event, publish_subscribe};
+use opening::{OpenOrCreate, RETRIES, RETRY_PAUSE, key, retry, value};
+use std::sync::Arc;
 
 /// The flavour of iceoryx2 whose ports and samples may move between threads; on the wire it is `ipc`.
 pub type IoxService = ipc_threadsafe::Service;
@@ -31,8 +34,10 @@ pub type Received<H> = Sample<IoxService, [u8], H>;
 type Factory<H> = publish_subscribe::PortFactory<IoxService, [u8], H>;
 type EventFactory = event::PortFactory<IoxService>;
 
-/// Subscribers of one channel at most.
+/// Subscribers of one channel at most, besides the daemon's own.
 pub const MAX_SUBSCRIBERS: usize = 16;
+/// The places of a channel: every subscriber's, and that of the daemon, which reads each stream for its sets.
+const PLACES: usize = MAX_SUBSCRIBERS + 1;
 /// Unread frames that the channel keeps per subscriber; older ones are replaced.
 pub const BUFFER: usize = 4;
 /// Frames that one subscriber may hold at once (frame stacks, sets in flight).
@@ -67,13 +72,13 @@ pub struct Form {
 pub const RIG: Form = Form {
     schema: SCHEMA,
     publishers: MAX_PUBLISHERS,
-    subscribers: MAX_SUBSCRIBERS,
+    subscribers: PLACES,
     buffer: BUFFER,
     held: MAX_HELD,
     history: 1,
     nodes: MAX_NODES,
     notifiers: MAX_PUBLISHERS,
-    listeners: MAX_SUBSCRIBERS,
+    listeners: PLACES,
     loans: MAX_LOANS,
 };
 
@@ -94,10 +99,16 @@ impl<H: Header> Channel<H> {
         Self { name, what, form, header: PhantomData }
     }
 
-    /// Opens the channel for writing, making it when it is not there.
-    pub fn sender(&self, node: &Node<IoxService>, max_bytes: usize, slots: usize) -> Result<Sender<H>> {
+    /// Opens the channel for writing, making it when it is not there. `starved` is set when no slot is free.
+    pub fn sender(
+        &self,
+        node: &Node<IoxService>,
+        max_bytes: usize,
+        slots: usize,
+        starved: &Arc<AtomicBool>,
+    ) -> Result<Sender<H>> {
         let out = self.outlet(node, max_bytes, slots)?;
-        Ok(Sender { out, notifier: self.notifier(node)? })
+        Ok(Sender { out, notifier: self.notifier(node)?, starved: Arc::clone(starved) })
     }
 
     /// Opens the channel for reading; somebody else has made it.
@@ -106,40 +117,68 @@ impl<H: Header> Channel<H> {
         Ok(Receiver { inlet, listener: self.listener(node)? })
     }
 
-    /// What of the channel writes, without the event.
+    /// The writing end without the event, with memory behind every slot: `slots` of them, or as many as still fit into
+    /// shared memory if that is at least [`shm::MIN_SLOTS`].
     pub fn outlet(&self, node: &Node<IoxService>, max_bytes: usize, slots: usize) -> Result<Outlet<H>> {
         let service = self.service(node, true)?;
-        let (max_bytes, loans) = (max_bytes.max(1), self.form.loans);
-        let port = service
+        let max_bytes = max_bytes.max(1);
+        let mut slots = slots;
+        loop {
+            let port = self.publisher(&service, max_bytes, slots)?;
+            let Some(lack) = shm::back(port.id().value(), slots)? else {
+                let loans = self.form.loans;
+                return Ok(Outlet { port, loans, slots, what: self.what.clone() });
+            };
+            // Its memory is free again before the next one is tried.
+            drop(port);
+            let fewer = lack.slots_that_fit()?;
+            if fewer < shm::MIN_SLOTS.min(slots) || fewer >= slots {
+                return Err(lack.refusal(&self.what, fewer));
+            }
+            tracing::warn!(
+                channel = self.what,
+                wanted = slots,
+                slots = fewer,
+                "another process took shared memory meanwhile, so it has fewer slots"
+            );
+            slots = fewer;
+        }
+    }
+
+    fn publisher(
+        &self,
+        service: &Factory<H>,
+        max_bytes: usize,
+        slots: usize,
+    ) -> Result<Publisher<IoxService, [u8], H>> {
+        let builder = service
             .publisher_builder()
             .initial_max_slice_len(max_bytes)
             .allocation_strategy(AllocationStrategy::Static)
-            .max_loaned_samples(loans)
-            .override_sample_preallocation(move |_| slots)
-            .create()
-            .map_err(|e| {
-                use iceoryx2::port::publisher::PublisherCreateError as E;
-                let (kind, why) = match e {
-                    E::ExceedsMaxSupportedPublishers => (
-                        ErrorKind::LimitReached,
-                        format!("it has {} publishers already", self.form.publishers),
-                    ),
-                    _ => (
-                        ErrorKind::NoSpace,
-                        format!("no shared memory for {slots} slots of {max_bytes} bytes"),
-                    ),
-                };
-                Error::new(kind, format!("{} cannot be published: {why}", self.what)).with_source(e)
-            })?;
-        Ok(Outlet { port, loans, what: self.what.clone() })
+            .max_loaned_samples(self.form.loans)
+            .override_sample_preallocation(move |_| slots);
+        builder.create().map_err(|e| {
+            let taken = e == PublisherCreateError::ExceedsMaxSupportedPublishers;
+            let no_memory = format!("no shared memory for {slots} slots of {max_bytes} bytes");
+            let e_kind = if taken || limits::descriptors().is_some() {
+                ErrorKind::LimitReached
+            } else {
+                ErrorKind::NoSpace
+            };
+            let taken = taken.then(|| format!("it has {} publishers already", self.form.publishers));
+            let why = taken.unwrap_or_else(|| limits::why(&no_memory));
+            Error::new(e_kind, format!("{} cannot be published: {why}", self.what)).with_source(e)
+        })
     }
 
-    /// What of the channel reads, without the event. With `make` it is made when it is not there.
+    /// The reading end without the event. With `make` the channel is made when it is not there.
     pub fn inlet(&self, node: &Node<IoxService>, make: bool) -> Result<Inlet<H>> {
         let service = self.service(node, make)?;
         let port = service.subscriber_builder().create().map_err(|e| {
-            let why = format!("it has {} subscribers already", self.form.subscribers);
-            self.error(ErrorKind::LimitReached, &why).with_source(e)
+            let taken = e == SubscriberCreateError::ExceedsMaxSupportedSubscribers;
+            let taken = taken
+                .then(|| format!("all of its {} places for subscribers are taken", self.form.subscribers));
+            self.port_error(taken, "it cannot be subscribed to").with_source(e)
         })?;
         Ok(Inlet { port, service, held: self.form.held, what: self.what.clone() })
     }
@@ -147,23 +186,36 @@ impl<H: Header> Channel<H> {
     /// What raises the event of the channel.
     pub fn notifier(&self, node: &Node<IoxService>) -> Result<Notifier<IoxService>> {
         let events = self.event_service(node, &self.service_name()?)?;
-        events
-            .notifier_builder()
-            .default_event_id(NEW_FRAME)
-            .create()
-            .map_err(|e| self.error(ErrorKind::LimitReached, "its event cannot be raised").with_source(e))
+        events.notifier_builder().default_event_id(NEW_FRAME).create().map_err(|e| {
+            let taken = e == NotifierCreateError::ExceedsMaxSupportedNotifiers;
+            let taken =
+                taken.then(|| format!("all {} places to raise its event are taken", self.form.notifiers));
+            self.port_error(taken, "its event cannot be raised").with_source(e)
+        })
     }
 
     /// What sleeps until the event of the channel.
     pub fn listener(&self, node: &Node<IoxService>) -> Result<Listener<IoxService>> {
-        let events = self.event_service(node, &self.service_name()?)?;
-        events.listener_builder().create().map_err(|e| {
-            self.error(ErrorKind::LimitReached, "its event cannot be listened to").with_source(e)
+        let name = self.service_name()?;
+        let events = self.event_service(node, &name)?;
+        umask::apart(|| events.listener_builder().create()).map_err(|e| {
+            let taken = e == ListenerCreateError::ExceedsMaxSupportedListeners;
+            let taken =
+                taken.then(|| format!("all {} places to listen to its event are taken", self.form.listeners));
+            self.port_error(taken, "its event cannot be listened to").with_source(e)
         })
     }
 
+    /// Why a port cannot be made: all places are `taken`, this process is out of descriptors, or else.
+    fn port_error(&self, taken: Option<String>, otherwise: &str) -> Error {
+        let why = taken.unwrap_or_else(|| limits::why(otherwise));
+        self.error(ErrorKind::LimitReached, &why)
+    }
+
     fn service(&self, node: &Node<IoxService>, make: bool) -> Result<Factory<H>> {
-        let (name, form) = (self.service_name()?, self.form);
+        shm::check_room()?;
+        let name = self.service_name()?;
+        let form = self.form;
         let opened = retry(|| {
             let schema = AttributeVerifier::new()
                 .require(&key()?, &value(form.schema)?)
@@ -187,6 +239,7 @@ impl<H: Header> Channel<H> {
     }
 
     fn event_service(&self, node: &Node<IoxService>, name: &ServiceName) -> Result<EventFactory> {
+        shm::check_room()?;
         let mut last = None;
         for _ in 0..RETRIES {
             let opened = node
@@ -202,7 +255,7 @@ impl<H: Header> Channel<H> {
             }
             std::thread::sleep(RETRY_PAUSE);
         }
-        let e = self.error(ErrorKind::Other, "its event service cannot be opened");
+        let e = self.error(ErrorKind::Other, &limits::why("its event service cannot be opened"));
         Err(match last {
             Some(source) => e.with_source(source),
             None => e,
@@ -251,67 +304,13 @@ impl<H: Header> Channel<H> {
                 | OpenError::DoesNotSupportRequestedAmountOfNodes
                 | OpenError::IncompatibleOverflowBehavior,
             ) => (ErrorKind::InUse, "a process holds it open with other limits; end that process".to_owned()),
-            OpenOrCreate::Other(why) => (ErrorKind::Other, format!("it cannot be opened ({why})")),
-            other => (ErrorKind::Other, format!("it cannot be opened ({other:?})")),
+            OpenOrCreate::Other(why) => {
+                (ErrorKind::Other, limits::why(&format!("it cannot be opened ({why})")))
+            }
+            other => (ErrorKind::Other, limits::why(&format!("it cannot be opened ({other:?})"))),
         };
         self.error(kind, &why)
     }
-}
-
-/// Everything that opening or creating can fail with.
-#[derive(Debug)]
-pub enum OpenOrCreate {
-    Open(OpenError),
-    Create(CreateError),
-    Other(String),
-}
-
-impl OpenOrCreate {
-    fn attribute(e: impl Debug) -> Self {
-        Self::Other(format!("{e:?}"))
-    }
-
-    /// States that pass by themselves: another process is just making or removing the service.
-    const fn is_passing(&self) -> bool {
-        matches!(
-            self,
-            Self::Open(
-                OpenError::IsMarkedForDestruction | OpenError::HangsInCreation | OpenError::InternalFailure
-            ) | Self::Create(CreateError::IsBeingCreatedByAnotherInstance | CreateError::HangsInCreation)
-                | Self::Other(_)
-        )
-    }
-}
-
-impl From<OpenOrCreateError> for OpenOrCreate {
-    fn from(e: OpenOrCreateError) -> Self {
-        match e {
-            OpenOrCreateError::PublishSubscribeOpenError(e) => Self::Open(e),
-            OpenOrCreateError::PublishSubscribeCreateError(e) => Self::Create(e),
-            other @ OpenOrCreateError::SystemInFlux => Self::Other(format!("{other:?}")),
-        }
-    }
-}
-
-const RETRIES: u32 = 20;
-const RETRY_PAUSE: Duration = Duration::from_millis(20);
-
-fn retry<T>(mut open: impl FnMut() -> Result<T, OpenOrCreate>) -> Result<T, OpenOrCreate> {
-    for _ in 1..RETRIES {
-        match open() {
-            Err(e) if e.is_passing() => std::thread::sleep(RETRY_PAUSE),
-            other => return other,
-        }
-    }
-    open()
-}
-
-fn key() -> Result<attribute::AttributeKey, OpenOrCreate> {
-    "schema".try_into().map_err(OpenOrCreate::attribute)
-}
-
-fn value(schema: &'static str) -> Result<attribute::AttributeValue, OpenOrCreate> {
-    schema.try_into().map_err(OpenOrCreate::attribute)
 }
 
 /// The writing end of a channel.
@@ -319,19 +318,27 @@ fn value(schema: &'static str) -> Result<attribute::AttributeValue, OpenOrCreate
 pub struct Sender<H: Header> {
     out: Outlet<H>,
     notifier: Notifier<IoxService>,
+    starved: Arc<AtomicBool>,
 }
 
 impl<H: Header> Sender<H> {
     /// A free slot with `len` bytes.
     pub fn loan(&self, len: usize) -> Result<Loan<H>> {
-        self.out.loan(len)
+        self.out.loan(len).inspect_err(|e| {
+            if e.kind() == ErrorKind::NoSpace {
+                self.starved.store(true, Ordering::Relaxed);
+            }
+        })
     }
 
     /// Gives subscribers that came since the last sample that one. Sending does it as well.
     pub fn welcome(&self) {
-        if let Err(e) = self.out.port.update_connections() {
-            tracing::debug!(channel = self.out.what, error = ?e, "a new subscriber could not be connected");
-        }
+        self.out.welcome();
+    }
+
+    /// Slots of shared memory that the channel has.
+    pub const fn slots(&self) -> usize {
+        self.out.slots
     }
 
     /// Publishes a slot whose every byte has been written, then wakes sleepers. Never blocks on one.
@@ -365,13 +372,22 @@ pub fn sleep(listener: &Listener<IoxService>, timeout: Duration, what: &str) -> 
 pub struct Outlet<H: Header> {
     port: Publisher<IoxService, [u8], H>,
     loans: usize,
+    slots: usize,
     what: String,
 }
 
 impl<H: Header> Outlet<H> {
     /// A free slot with `len` bytes.
     pub fn loan(&self, len: usize) -> Result<Loan<H>> {
-        self.port.loan_slice_uninit(len).map_err(|e| {
+        let loan = match self.port.loan_slice_uninit(len) {
+            Err(LoanError::OutOfMemory) => {
+                // Only this takes back what dead subscribers held; sending does it too, but needs a slot first.
+                self.welcome();
+                self.port.loan_slice_uninit(len)
+            }
+            loan => loan,
+        };
+        loan.map_err(|e| {
             let (kind, why) = match e {
                 LoanError::OutOfMemory => (ErrorKind::NoSpace, "subscribers hold every slot".to_owned()),
                 LoanError::ExceedsMaxLoans => {
@@ -399,6 +415,13 @@ impl<H: Header> Outlet<H> {
         sample.send().map_err(|e| {
             Error::new(ErrorKind::Other, format!("{}: the frame could not be sent", self.what)).with_source(e)
         })
+    }
+
+    /// Connects subscribers that came, and lets go of those that ended, since the last sample.
+    fn welcome(&self) {
+        if let Err(e) = self.port.update_connections() {
+            tracing::debug!(channel = self.what, error = ?e, "a new subscriber could not be connected");
+        }
     }
 
     /// The channel's name for messages.

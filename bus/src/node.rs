@@ -4,10 +4,13 @@ use crate::channel::{Channel, IoxService, RIG};
 use crate::runtime::RuntimeDir;
 use crate::{
     Error, ErrorKind, FrameHeader, HostTime, Publisher, Result, RigName, SetHeader, SetPublisher,
-    SetSubscriber, StreamId, Subscriber,
+    SetSubscriber, StreamId, Subscriber, limits, shm,
 };
+use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
+use iceoryx2::node::{DeadNodeView, NodeDetails, NodeState, NodeView};
 use iceoryx2::prelude::*;
+use std::sync::Arc;
 
 /// Names of shared memory begin with this, so that one sees whose they are; Python uses the same.
 pub const SHM_PREFIX: &str = "depthrig_";
@@ -20,6 +23,8 @@ pub struct Bus {
     node: Node<IoxService>,
     rig: RigName,
     runtime: RuntimeDir,
+    /// Set by a publisher that found no free slot.
+    starved: Arc<AtomicBool>,
 }
 
 impl Bus {
@@ -32,6 +37,7 @@ impl Bus {
         // iceoryx2 writes its own log to stderr; its errors come back as errors and are logged once, by us.
         set_log_level(LogLevel::Fatal);
         let config = config(runtime)?;
+        shm::check_room()?;
         let node = NodeBuilder::new()
             .signal_handling_mode(SignalHandlingMode::Disabled) // signals belong to the process, not to a library
             .config(&config)
@@ -44,10 +50,11 @@ impl Bus {
                     }
                     _ => ErrorKind::Other,
                 };
-                Error::new(kind, format!("the bus of rig \"{rig}\" could not be joined in {path}"))
+                let why = limits::descriptors().map_or_else(String::new, |why| format!(": {why}"));
+                Error::new(kind, format!("the bus of rig \"{rig}\" could not be joined in {path}{why}"))
                     .with_source(e)
             })?;
-        Ok(Self { node, rig: rig.clone(), runtime: runtime.clone() })
+        Ok(Self { node, rig: rig.clone(), runtime: runtime.clone(), starved: Arc::default() })
     }
 
     /// The rig's name.
@@ -61,7 +68,7 @@ impl Bus {
     }
 
     /// Opens the channel of `id` for writing frames of at most `max_bytes` bytes, with `slots` slots of
-    /// shared memory.
+    /// shared memory, or as many as still fit ([`Publisher::slots`]) if that is at least [`shm::MIN_SLOTS`].
     ///
     /// # Errors
     /// [`ErrorKind::VersionMismatch`] or [`ErrorKind::InUse`] when another process holds the channel in
@@ -69,7 +76,7 @@ impl Bus {
     /// [`ErrorKind::NoSpace`] or [`ErrorKind::Other`] when the memory cannot be made.
     pub fn publisher(&self, id: &StreamId, max_bytes: usize, slots: usize) -> Result<Publisher> {
         let channel = self.stream_channel(id);
-        Ok(Publisher::new(channel.sender(&self.node, max_bytes, slots)?))
+        Ok(Publisher::new(channel.sender(&self.node, max_bytes, slots, &self.starved)?))
     }
 
     /// Opens the channel of `id` for reading.
@@ -114,7 +121,7 @@ impl Bus {
     /// As [`Self::publisher`].
     pub fn set_publisher_with(&self, slots: usize) -> Result<SetPublisher> {
         let channel = self.set_channel();
-        Ok(SetPublisher::new(channel.sender(&self.node, SetPublisher::MAX_BYTES, slots)?))
+        Ok(SetPublisher::new(channel.sender(&self.node, SetPublisher::MAX_BYTES, slots, &self.starved)?))
     }
 
     /// Opens the rig's channel of frame sets for reading.
@@ -153,7 +160,35 @@ impl Bus {
     /// Frees what killed processes left behind; the daemon calls this once a second. Returns how many dead
     /// processes were cleaned up.
     pub fn clean_dead(&self) -> u64 {
-        self.node.try_cleanup_dead_nodes().cleanups
+        let config = self.node.config();
+        let mut cleaned = 0;
+        let listed = Node::<IoxService>::list(config, |state| {
+            if let NodeState::Dead(dead) = state {
+                // One that was killed while it was being removed has lost its own description. iceoryx2 would then look
+                // for it below its default folder, find nothing, and call that cleaned up, again and again.
+                let removed = match dead.details() {
+                    Some(_) => dead.try_remove_stale_resources(),
+                    None => DeadNodeView::<IoxService>::__internal_try_remove_stale_resources(
+                        *dead.id(),
+                        NodeDetails::__internal_new(&None, config),
+                    ),
+                };
+                match removed {
+                    Ok(()) => cleaned += 1,
+                    Err(e) => tracing::debug!(error = ?e, "a dead process cannot be cleaned up yet"),
+                }
+            }
+            CallbackProgression::Continue
+        });
+        if let Err(e) = listed {
+            tracing::debug!(error = ?e, "dead processes cannot be looked for");
+        }
+        cleaned
+    }
+
+    /// Whether a publisher found no free slot since the last call: a dead subscriber may hold them.
+    pub fn starved(&self) -> bool {
+        self.starved.swap(false, Ordering::Relaxed)
     }
 
     /// The node, for channels of other forms.

@@ -17,6 +17,11 @@ impl Publisher {
         Self { sender }
     }
 
+    /// Slots of shared memory that the channel has; fewer than were asked for when memory was short.
+    pub const fn slots(&self) -> usize {
+        self.sender.slots()
+    }
+
     /// A free slot for a frame of `len` bytes with arbitrary contents, and a default header.
     ///
     /// # Errors

@@ -4,9 +4,9 @@
 //! iceoryx2 lives below it or is named after it, so that no other user's process can stall a camera and
 //! depthrig never gets in the way of other iceoryx2 applications of the machine.
 
-use crate::{Error, ErrorKind, Result, RigName};
+use crate::{Error, ErrorKind, Result, RigName, umask};
 use core::time::Duration;
-use rustix::fs::{FlockOperation, Mode, OFlags, flock};
+use rustix::fs::{FileType, FlockOperation, Mode, OFlags, flock};
 use std::io::{Read, Seek, Write};
 use std::path::{Path, PathBuf};
 
@@ -62,16 +62,27 @@ impl RuntimeDir {
                 format!("runtime folder {shown}: {what}; set {RUNTIME_DIR_VARIABLE} to a folder of your own"),
             )
         };
-        std::fs::create_dir_all(&path).map_err(|e| denied("it cannot be made").with_source(e))?;
-        let stat = rustix::fs::stat(&path).map_err(|e| denied("it cannot be read").with_source(e))?;
         let uid = rustix::process::getuid().as_raw();
+        if let Some(link) = foreign_link(&path, uid) {
+            return Err(denied(&format!("{} is a symbolic link of another user", link.display())));
+        }
+        umask::create_dir_all(&path).map_err(|e| denied("it cannot be made").with_source(e))?;
+        // What was just seen or made is held from here on, so that nobody exchanges it.
+        let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
+        let folder = rustix::fs::open(&path, flags, Mode::empty());
+        let folder = folder.map_err(|e| denied("it cannot be opened").with_source(e))?;
+        if let Some(link) = foreign_link(&path, uid) {
+            return Err(denied(&format!("{} is a symbolic link of another user", link.display())));
+        }
+        let stat = rustix::fs::fstat(&folder).map_err(|e| denied("it cannot be read").with_source(e))?;
         if stat.st_uid != uid {
             return Err(denied(&format!(
                 "it belongs to user {}, you are user {uid}, and a rig and its subscribers run as one user",
                 stat.st_uid
             )));
         }
-        rustix::fs::chmod(&path, Mode::RWXU).map_err(|e| denied("its mode cannot be set").with_source(e))?;
+        rustix::fs::fchmod(&folder, Mode::RWXU)
+            .map_err(|e| denied("its mode cannot be set").with_source(e))?;
         Ok(Self(path))
     }
 
@@ -124,6 +135,16 @@ impl RuntimeDir {
     fn lock_path(&self, rig: &RigName) -> PathBuf {
         self.0.join(format!("{rig}.lock"))
     }
+}
+
+/// The first part of `path` that is a symbolic link of neither `uid` nor root. Who can put one into a folder that
+/// several may write to, such as `/tmp`, would choose which folder it is.
+fn foreign_link(path: &Path, uid: u32) -> Option<PathBuf> {
+    let is_foreign = |part: &&Path| {
+        let Ok(stat) = rustix::fs::lstat(*part) else { return false };
+        FileType::from_raw_mode(stat.st_mode) == FileType::Symlink && stat.st_uid != uid && stat.st_uid != 0
+    };
+    path.ancestors().find(is_foreign).map(Path::to_owned)
 }
 
 /// The right to run a rig; dropping it frees the rig.
@@ -205,6 +226,35 @@ mod tests {
             done.store(true, std::sync::atomic::Ordering::Relaxed);
             assert!(taken.iter().all(Result::is_ok), "{:?}", taken.iter().find(|t| t.is_err()));
         });
+    }
+
+    /// As root the link is given to another user; else links of root (which are followed) are all there is.
+    #[test]
+    fn a_link_of_another_user_is_refused_and_its_target_left_alone() {
+        use std::os::unix::fs::{PermissionsExt, lchown, symlink};
+        let tmp = tempfile::tempdir().unwrap();
+        let target = tmp.path().join("mine");
+        std::fs::create_dir(&target).unwrap();
+        std::fs::set_permissions(&target, std::fs::Permissions::from_mode(0o755)).unwrap();
+        let mode = || std::fs::metadata(&target).unwrap().permissions().mode() & 0o777;
+        let link = tmp.path().join("l");
+        symlink(&target, &link).unwrap();
+        let below = link.join("r");
+        assert_eq!(foreign_link(&below, rustix::process::getuid().as_raw()), None, "one's own link");
+        let own = rustix::process::getuid();
+        assert_eq!(foreign_link(&below, own.as_raw() + 1).is_some(), !own.is_root());
+        if rustix::process::getuid().is_root() {
+            lchown(&link, Some(4243), Some(4243)).unwrap();
+            for path in [&link, &below] {
+                let e = RuntimeDir::at(path).unwrap_err();
+                assert_eq!(e.kind(), ErrorKind::PermissionDenied);
+                assert!(e.to_string().contains("symbolic link of another user"), "{e}");
+            }
+            assert_eq!((mode(), target.join("r").exists()), (0o755, false));
+            lchown(&link, Some(0), Some(0)).unwrap();
+        }
+        RuntimeDir::at(&link).unwrap();
+        assert_eq!(mode(), 0o700);
     }
 
     #[test]

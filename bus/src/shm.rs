@@ -1,7 +1,13 @@
-//! How much shared memory there is: running out of it is a SIGBUS, not an error, so it is checked before.
+//! Shared memory: how much there is, and that what a channel has is really there.
+//!
+//! A file in `/dev/shm` has the size it was given, but gets memory only where it is written, and a write for which none is
+//! left kills the process (SIGBUS). So every slot gets its memory when the channel is made. What iceoryx2 makes besides
+//! (connections, events, services: some KiB each, written when it is made) is only begun when there is room.
 
-use crate::{Error, ErrorKind, Result};
-use std::path::Path;
+use crate::{Error, ErrorKind, Result, SHM_PREFIX};
+use rustix::fs::{FallocateFlags, Mode, OFlags, fallocate, fstat, open};
+use rustix::io::{Errno, retry_on_intr};
+use std::path::{Path, PathBuf};
 
 /// Where POSIX shared memory lives on Linux.
 pub const SHM_DIR: &str = "/dev/shm";
@@ -9,6 +15,13 @@ pub const SHM_DIR: &str = "/dev/shm";
 pub const DEFAULT_SLOTS: usize = 48;
 /// Fewer slots than this cannot carry the set assembler, a recorder and a subscriber at once.
 pub const MIN_SLOTS: usize = 16;
+
+const HOW_TO_ENLARGE: &str = "enlarge it (mount -o remount,size=4G /dev/shm; with Docker --ipc=host or --shm-size=4g), end \
+     another rig, or use smaller images or fewer cameras";
+/// Free bytes that nothing of depthrig is begun without.
+const ROOM: u64 = 1 << 20;
+/// Free bytes that the slots of a channel leave to the rest.
+const LEFT_OVER: u64 = 4 * ROOM;
 
 /// Bytes that can still be written below `path`.
 ///
@@ -28,23 +41,106 @@ pub fn free_bytes(path: &Path) -> Result<u64> {
 /// # Errors
 /// [`ErrorKind::NoSpace`] when that is fewer than [`MIN_SLOTS`], with the size that `/dev/shm` must have.
 pub fn slots_that_fit(wanted: usize, set_bytes: u64, free: u64) -> Result<usize> {
-    let fit = (free / 10 * 8).checked_div(set_bytes).unwrap_or(u64::MAX);
+    let fit = usable(free).checked_div(set_bytes).unwrap_or(u64::MAX);
     let slots = wanted.min(usize::try_from(fit).unwrap_or(usize::MAX));
     if slots >= MIN_SLOTS.min(wanted) {
         return Ok(slots);
     }
-    let mib = |bytes: u64| bytes.div_ceil(1 << 20);
     Err(Error::new(
         ErrorKind::NoSpace,
         format!(
             "{SHM_DIR} is too small: {} MiB are free, the streams of this rig need at least {} MiB ({} MiB a frame set, \
-             {MIN_SLOTS} slots); enlarge it (mount -o remount,size=4G {SHM_DIR}; with Docker --ipc=host or --shm-size=4g), \
-             or use smaller images or fewer cameras",
+             {MIN_SLOTS} slots); {HOW_TO_ENLARGE}",
             mib(free),
             mib(set_bytes * MIN_SLOTS as u64 / 8 * 10),
             mib(set_bytes),
         ),
     ))
+}
+
+/// What of `free` bytes slots may take.
+const fn usable(free: u64) -> u64 {
+    free / 10 * 8
+}
+
+const fn mib(bytes: u64) -> u64 {
+    bytes.div_ceil(1 << 20)
+}
+
+/// Whether there is room for what iceoryx2 makes besides the slots; else beginning it could kill the process.
+pub(crate) fn check_room() -> Result<()> {
+    match free_bytes(SHM_DIR.as_ref()) {
+        Ok(free) if free < ROOM => Err(Error::new(
+            ErrorKind::NoSpace,
+            format!(
+                "{SHM_DIR} is full ({} KiB are free); delete what fills it, or enlarge it (mount -o remount,size=4G {SHM_DIR})",
+                free >> 10
+            ),
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// Puts memory behind the data of the port `id`, which has `slots` slots. What is missing for it, if something is.
+pub(crate) fn back(id: u128, slots: usize) -> Result<Option<Lack>> {
+    let path = segment(id)?;
+    let failed = |what: &str, e: Errno| {
+        let why = format!("{}: its memory cannot be {what}", path.display());
+        Error::new(ErrorKind::Other, why).with_source(e)
+    };
+    let flags = OFlags::RDWR | OFlags::CLOEXEC | OFlags::NOFOLLOW;
+    let file = open(&path, flags, Mode::empty()).map_err(|e| failed("opened", e))?;
+    let bytes = fstat(&file).map_err(|e| failed("measured", e))?.st_size as u64;
+    let lack = Some(Lack { bytes, slots });
+    // The kernel would take all there is before it gives up, from everybody.
+    if bytes > free_bytes(SHM_DIR.as_ref())? {
+        return Ok(lack);
+    }
+    match retry_on_intr(|| fallocate(&file, FallocateFlags::empty(), 0, bytes)) {
+        Ok(()) if free_bytes(SHM_DIR.as_ref())? < LEFT_OVER => Ok(lack),
+        Ok(()) => Ok(None),
+        Err(Errno::NOSPC | Errno::NOMEM) => Ok(lack),
+        Err(e) => Err(failed("reserved", e)),
+    }
+}
+
+/// The file of the data of the port `id`.
+fn segment(id: u128) -> Result<PathBuf> {
+    let end = format!("_{id}.data");
+    let is_it = |name: &str| name.starts_with(SHM_PREFIX) && name.ends_with(&end);
+    let missing =
+        || Error::new(ErrorKind::Other, format!("{SHM_DIR} has no memory of a port that was just made"));
+    let entries = std::fs::read_dir(SHM_DIR).map_err(|e| missing().with_source(e))?;
+    let mut files = entries.filter_map(|e| Some(e.ok()?.path()));
+    files.find(|path| path.file_name().and_then(|n| n.to_str()).is_some_and(is_it)).ok_or_else(missing)
+}
+
+/// Slots for which memory is missing.
+#[derive(Debug)]
+pub(crate) struct Lack {
+    bytes: u64,
+    slots: usize,
+}
+
+impl Lack {
+    /// How many of the slots would fit now; what had memory already must have been given back.
+    pub(crate) fn slots_that_fit(&self) -> Result<usize> {
+        let free = free_bytes(SHM_DIR.as_ref())?.saturating_sub(LEFT_OVER);
+        let slot = self.bytes.div_ceil(self.slots.max(1) as u64).max(1);
+        Ok((usable(free) / slot) as usize)
+    }
+
+    /// The error of a channel that cannot have enough of them.
+    pub(crate) fn refusal(&self, what: &str, fit: usize) -> Error {
+        let Self { bytes, slots } = self;
+        Error::new(
+            ErrorKind::NoSpace,
+            format!(
+                "{what}: {SHM_DIR} has no room for its {slots} slots ({} MiB), {fit} would fit; {HOW_TO_ENLARGE}",
+                mib(*bytes)
+            ),
+        )
+    }
 }
 
 #[cfg(test)]

@@ -6,6 +6,7 @@ use depthrig_bus::{
     StreamId, shm,
 };
 use iceoryx2::prelude::*;
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
@@ -224,7 +225,16 @@ fn helper_process() {
     let dir = std::env::var("DEPTHRIG_BUS_TEST_DIR").unwrap();
     let bus = Bus::open(&RuntimeDir::at(dir.as_ref()).unwrap(), &rig()).unwrap();
     let id = StreamId::new("cam", "depth").unwrap();
-    if role == "publisher" {
+    if role == "out of descriptors" {
+        // All but four are taken: how many are open says nothing, because inherited ones have any number. An ordinary user
+        // may not raise the hard limit.
+        let maximum = getrlimit(Resource::Nofile).maximum;
+        setrlimit(Resource::Nofile, Rlimit { current: Some(maximum.map_or(256, |m| m.min(256))), maximum }).unwrap();
+        let mut taken: Vec<_> = std::iter::from_fn(|| std::fs::File::open("/dev/null").ok()).collect();
+        taken.truncate(taken.len().saturating_sub(4));
+        println!("ready");
+        println!("refused: {}", bus.subscriber(&id).map(drop).unwrap_err());
+    } else if role == "publisher" {
         let publisher = bus.publisher(&id, LEN, 16).unwrap();
         println!("ready");
         for sequence in 1.. {
@@ -239,7 +249,9 @@ fn helper_process() {
             held.extend(subscriber.next_timeout(WAIT).unwrap());
         }
         println!("holding");
-        std::thread::park(); // until it is killed
+        loop {
+            std::thread::park(); // until it is killed; making a listener may have left a wake-up behind
+        }
     }
 }
 
@@ -261,11 +273,11 @@ impl Helper {
         helper
     }
 
-    fn wait_for(&mut self, word: &str) {
+    fn wait_for(&mut self, word: &str) -> String {
         let mut line = String::new();
         while self.1.read_line(&mut line).unwrap() > 0 {
             if line.contains(word) {
-                return;
+                return line;
             }
             line.clear();
         }
@@ -311,7 +323,7 @@ fn a_killed_subscriber_gives_its_slots_back() {
         let mut reader = Helper::start(&f, "subscriber");
         let mut sequence = round * 100;
         let stop = std::thread::scope(|s| {
-            let waiting = s.spawn(|| reader.wait_for("holding"));
+            let waiting = s.spawn(|| drop(reader.wait_for("holding")));
             while !waiting.is_finished() {
                 sequence += 1;
                 publish(&publisher, sequence);
@@ -327,6 +339,82 @@ fn a_killed_subscriber_gives_its_slots_back() {
             publish(&publisher, sequence + i);
         }
     }
+}
+
+/// As it is left when the process that removes a dead one is killed over it.
+#[test]
+fn a_dead_process_whose_description_is_gone_is_removed_and_counted_once() {
+    let f = fixture();
+    let _publisher = f.bus.publisher(&f.id, LEN, 16).unwrap();
+    let nodes = f.dir.path().join("iox2/nodes");
+    let folders = || -> Vec<_> {
+        let entries = std::fs::read_dir(&nodes).unwrap().map(|e| e.unwrap().path());
+        entries.filter(|path| path.is_dir()).collect()
+    };
+    let own = folders();
+    let reader = Helper::start(&f, "subscriber");
+    let dead: Vec<_> = folders().into_iter().filter(|folder| !own.contains(folder)).collect();
+    assert_eq!(dead.len(), 1);
+    reader.kill();
+    std::fs::remove_file(dead[0].join("depthrig_node.details")).unwrap();
+    clean(&f.bus);
+    assert_eq!(f.bus.clean_dead(), 0, "what is gone is not cleaned up again");
+    assert_eq!(folders(), own);
+    let left = std::fs::read_dir(&nodes).unwrap().count();
+    assert_eq!(left, 4, "this process's folder and its three files");
+    // Its place is free again.
+    let all: Vec<_> = (0..17).map(|_| f.bus.subscriber(&f.id).unwrap()).collect();
+    drop(all);
+}
+
+#[test]
+fn sixteen_subscribers_find_room_beside_the_daemons_own() {
+    let f = fixture();
+    let publisher = f.bus.publisher(&f.id, LEN, 48).unwrap();
+    let daemon = f.bus.subscriber(&f.id).unwrap();
+    let mut subscribers: Vec<_> = (0..16).map(|_| f.bus.subscriber(&f.id).unwrap()).collect();
+    assert_eq!(publish(&publisher, 1), 17);
+    for subscriber in &mut subscribers {
+        assert_eq!(whole(&subscriber.next_timeout(WAIT).unwrap().unwrap()), 1);
+    }
+    let e = f.bus.subscriber(&f.id).unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::LimitReached);
+    assert!(e.to_string().contains("all of its 17 places for subscribers are taken"), "{e}");
+    drop(daemon);
+    f.bus.subscriber(&f.id).unwrap();
+}
+
+#[test]
+fn a_process_without_descriptors_is_told_so() {
+    let f = fixture();
+    let _publisher = f.bus.publisher(&f.id, LEN, 16).unwrap();
+    let said = Helper::start(&f, "out of descriptors").wait_for("refused");
+    assert!(said.contains("file descriptors open") && said.contains("ulimit -n"), "{said}");
+}
+
+#[test]
+fn every_slot_has_memory_and_what_has_none_is_refused() {
+    use std::os::unix::fs::MetadataExt;
+    // A size that no other test has, for they run at the same time.
+    const ODD: usize = 54_321;
+    let f = fixture();
+    let data = || -> Vec<_> {
+        let files = std::fs::read_dir(shm::SHM_DIR).unwrap().map(|e| e.unwrap().path());
+        files.filter(|path| path.extension().is_some_and(|e| e == "data")).collect()
+    };
+    let publisher = f.bus.publisher(&f.id, ODD, 16).unwrap();
+    assert_eq!(publisher.slots(), 16);
+    let sizes = data().into_iter().filter_map(|path| std::fs::metadata(path).ok());
+    let ours: Vec<_> = sizes.filter(|m| (16 * ODD as u64..18 * ODD as u64).contains(&m.size())).collect();
+    assert!(!ours.is_empty());
+    assert!(ours.iter().all(|m| m.blocks() * 512 >= m.size()), "{ours:?}");
+    let too_large = shm::free_bytes(shm::SHM_DIR.as_ref()).unwrap() as usize / 10;
+    let e = f.bus.publisher(&StreamId::new("cam", "large").unwrap(), too_large, 48).unwrap_err();
+    assert_eq!(e.kind(), ErrorKind::NoSpace);
+    assert!(
+        e.to_string().contains("has no room for its 48 slots") && e.to_string().contains("7 would fit"),
+        "{e}"
+    );
 }
 
 #[test]
