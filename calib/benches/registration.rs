@@ -3,7 +3,7 @@
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use depthrig_bus::{Distortion, Intrinsics, Pose};
-use depthrig_calib::{Method, Registration};
+use depthrig_calib::Registration;
 
 const SIZE: (u32, u32) = (1280, 720);
 const PIXELS: usize = 1280 * 720;
@@ -41,22 +41,16 @@ fn registration(c: &mut Criterion) {
         ("colour distorted", of_depth, lens),
         ("both distorted", wide, lens),
     ];
-    for method in [Method::Splat, Method::Triangles] {
-        for (name, depth_k, color_k) in &cases {
-            let mut r = Registration::new(depth_k, SIZE, color_k, SIZE, &pose, method).unwrap();
-            group.bench_function(format!("{method:?}, {name}"), |b| {
-                b.iter(|| r.depth_to_color(&depth, 0.001, &mut out).unwrap());
-            });
-        }
+    for (name, depth_k, color_k) in &cases {
+        let mut r = Registration::new(depth_k, SIZE, color_k, SIZE, &pose).unwrap();
+        group.bench_function(*name, |b| b.iter(|| r.depth_to_color(&depth, 0.001, &mut out).unwrap()));
     }
     let color = vec![77; PIXELS * 3];
     let mut painted = vec![0; PIXELS * 3];
-    for method in [Method::Splat, Method::Triangles] {
-        let mut r = Registration::new(&of_depth, SIZE, &straight, SIZE, &pose, method).unwrap();
-        group.bench_function(format!("{method:?}, colour to depth"), |b| {
-            b.iter(|| r.color_to_depth(&depth, 0.001, &color, &mut painted).unwrap());
-        });
-    }
+    let mut r = Registration::new(&of_depth, SIZE, &straight, SIZE, &pose).unwrap();
+    group.bench_function("colour to depth", |b| {
+        b.iter(|| r.color_to_depth(&depth, 0.001, &color, &mut painted).unwrap());
+    });
     group.finish();
 }
 

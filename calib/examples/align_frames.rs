@@ -1,10 +1,10 @@
-//! Registers one picture and says what it costs: what `tests/peers/align.py` compares librealsense with.
+//! Registers one image and prints what it costs: what `tests/peers/align.py` compares librealsense with.
 //!
 //! `align_frames SETUP.json DEPTH.z16 OUT.z16 TURNS THREADS` reads little-endian 16-bit depth, writes the registered
 //! depth, and prints one line of JSON with the CPU and wall time of each turn, nanoseconds.
 
 use depthrig_bus::{Distortion, HostTime, Intrinsics, Pose};
-use depthrig_calib::{Method, Registration};
+use depthrig_calib::Registration;
 use serde::Deserialize;
 use std::error::Error;
 
@@ -23,7 +23,6 @@ struct Setup {
     color: Side,
     color_from_depth: Pose,
     unit_m: f64,
-    method: String,
 }
 
 impl Side {
@@ -39,10 +38,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         return Err("usage: align_frames SETUP.json DEPTH.z16 OUT.z16 TURNS THREADS".into());
     };
     let setup: Setup = serde_json::from_slice(&std::fs::read(setup)?)?;
-    let method = if setup.method == "triangles" { Method::Triangles } else { Method::Splat };
     let (d, c) = (&setup.depth, &setup.color);
     let mut registration =
-        Registration::new(&d.intrinsics(), d.size, &c.intrinsics(), c.size, &setup.color_from_depth, method)?
+        Registration::new(&d.intrinsics(), d.size, &c.intrinsics(), c.size, &setup.color_from_depth)?
             .with_threads(threads.parse()?);
     let depth: Vec<u16> =
         std::fs::read(depth)?.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect();

@@ -19,6 +19,6 @@ pub use camera::{Camera, CameraExt, Projection, Ray};
 pub use cloud::{Deprojection, PointCloud, write_pcd, write_ply};
 pub use error::{Error, ErrorKind, Result};
 pub use pose::PoseExt;
-pub use rectify::{Rectifier, View};
-pub use registration::{Method, Registration, same_view};
+pub use rectify::{Rectifier, RowCorrector, View};
+pub use registration::{Registration, same_view};
 pub use undistort::Undistortion;

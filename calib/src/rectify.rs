@@ -6,6 +6,7 @@
 //! eye. A test holds it to numbers of `OpenCV`.
 
 use crate::error::check_len;
+use crate::stereo::{Gray, RowOffset};
 use crate::{Camera, Error, ErrorKind, PoseExt, Result};
 use depthrig_bus::{Intrinsics, PixelFormat, Pose};
 use glam::{DMat3, DQuat};
@@ -14,6 +15,7 @@ mod geometry;
 mod map;
 
 use map::Map;
+use std::sync::Arc;
 
 /// One of the two rectified views.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -40,7 +42,8 @@ pub struct Rectifier {
     intrinsics: Intrinsics,
     baseline_m: f64,
     rotations: [DMat3; 2],
-    maps: [Map; 2],
+    maps: [Arc<Map>; 2],
+    right: Camera,
 }
 
 impl Rectifier {
@@ -60,14 +63,24 @@ impl Rectifier {
         let (left, right) = (Camera::new(left)?, Camera::new(right)?);
         let right_from_left = right_in_left.to_affine().inverse();
         let made = geometry::rectify(left.intrinsics(), right.intrinsics(), &right_from_left, size)?;
-        let map = |camera: &Camera, rotation: DMat3| Map::new(camera, rotation, &made.intrinsics, size);
+        let map = |camera: &Camera, rotation: DMat3| {
+            Arc::new(Map::new(camera, rotation, &made.intrinsics, size, None))
+        };
         Ok(Self {
             size,
             intrinsics: made.intrinsics,
             baseline_m: made.baseline_m,
             maps: [map(&left, made.rotations[0]), map(&right, made.rotations[1])],
             rotations: made.rotations,
+            right,
         })
+    }
+
+    /// Moves the right view's rows by what was measured in rectified pairs, in place of what they were moved by before: what
+    /// lies lower there by `rows` comes into the row in which the left view has it.
+    pub fn correct_rows(&mut self, rows: &RowOffset) {
+        let rotation = self.rotations[1];
+        self.maps[1] = Arc::new(Map::new(&self.right, rotation, &self.intrinsics, self.size, Some(rows)));
     }
 
     /// Width and height of the raw and of the rectified pictures, pixels.
@@ -163,6 +176,41 @@ impl Rectifier {
         Err(bad(format!(
             "a picture of {width}x{height} pixels cannot be YUYV, which has pairs of pixels: its width is odd"
         )))
+    }
+}
+
+/// Moves the rows of right images that are rectified already, as [`Rectifier::correct_rows`] does while it rectifies.
+#[derive(Debug, Clone)]
+pub struct RowCorrector {
+    size: (u32, u32),
+    map: Map,
+}
+
+impl RowCorrector {
+    /// For images of a size (width, height), whose content lies lower by `rows` than it should.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadInput`] for images with a side below 2.
+    pub fn new(size: (u32, u32), rows: &RowOffset) -> Result<Self> {
+        if size.0 < 2 || size.1 < 2 {
+            return Err(bad(format!("rows of an image of {}x{} pixels cannot be moved", size.0, size.1)));
+        }
+        let same = Intrinsics::pinhole(1.0, 1.0, 0.0, 0.0);
+        let map = Map::new(&Camera::new(&same)?, DMat3::IDENTITY, &same, size, Some(rows));
+        Ok(Self { size, map })
+    }
+
+    /// The right image with its rows moved, without padding; 0 where they come from outside of it.
+    ///
+    /// # Errors
+    /// [`ErrorKind::SizeMismatch`] for images of another size.
+    pub fn correct(&self, right: &Gray<'_>, out: &mut Vec<u8>) -> Result<()> {
+        let size = (self.size.0 as usize, self.size.1 as usize);
+        right.check("right", size.0, size.1)?;
+        let packed: Vec<u8> = (0..size.1).flat_map(|y| right.row(y)).copied().collect();
+        out.resize(size.0 * size.1, 0);
+        self.map.grey(&packed, out);
+        Ok(())
     }
 }
 

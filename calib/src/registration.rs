@@ -1,10 +1,12 @@
 //! Registration: depth in the view of the colour camera, and colour in the view of depth.
 //!
-//! Everything that depends on the cameras alone is computed once. A frame costs one pass over its depth: SIMD where
-//! the processor has it, and the same bits where it has not. Nothing is allocated per frame.
+//! Registered depth is depth along colour's axis on the ray of colour's pixel, however the cameras are turned against each
+//! other, so that colour's intrinsics and pose make points of it. A row of depth takes two steps:
+//! 1. every depth pixel becomes a piece of the plane that it and its neighbours lie on, projected into colour ([`cover`]);
+//! 2. each piece is drawn with its depth on the ray of every colour pixel that it covers, and the nearest wins ([`splat`]).
 //!
-//! Sources: librealsense `src/proc/align.cpp` and `src/proc/sse/sse-align.cpp` (Apache-2.0) for [`Method::Splat`], Azure
-//! Kinect `src/transformation/rgbz.c` (MIT) for [`Method::Triangles`]; only the rules are theirs.
+//! Everything that depends on the cameras alone is computed once. SIMD is used where the processor has it, and the bits
+//! are the same where it has not. Nothing is allocated per frame.
 
 use crate::error::check_len;
 use crate::{Camera, Error, ErrorKind, PoseExt, Result};
@@ -12,39 +14,34 @@ use depthrig_bus::{Intrinsics, Pose};
 use rayon::prelude::*;
 use std::sync::Arc;
 
+mod cover;
+mod footprint;
 mod lens;
+mod paint;
 mod splat;
 mod target;
-mod triangles;
 mod warp;
 
+use paint::PaintRows;
 use splat::SplatRows;
 use target::Target;
-use triangles::TriangleRows;
 use warp::Warp;
-
-/// How depth is put into another view.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Method {
-    /// Each depth pixel covers the rectangle between its projected corners; the nearest wins. Where colour is the coarser
-    /// picture, a pixel alone: that of the first corner. Values are kept as they were measured, along depth's own axis.
-    /// As librealsense 2.59: right where both pictures have about the same scale and direction. Unlike it, colour's lens
-    /// is honoured whatever its model (librealsense ignores all but `MODIFIED_BROWN_CONRADY`), and so is a colour camera
-    /// that is mounted upside down.
-    Splat,
-    /// Each 2x2 neighbourhood is drawn as two triangles unless depth jumps inside it; the nearest wins. Values are
-    /// depth along colour's axis. As the Azure Kinect SDK: leaves no holes inside surfaces when colour has more pixels
-    /// than depth, and serves cameras that look in different directions.
-    Triangles,
-}
 
 /// The work of one thread.
 #[derive(Debug)]
 struct Band {
     splat: SplatRows,
-    triangles: TriangleRows,
+    paint: PaintRows,
     /// Where this thread draws when there are several.
     private: Vec<u16>,
+}
+
+/// What depends on the cameras alone.
+#[derive(Debug)]
+struct Tables {
+    warp: Warp,
+    /// Colour is the coarser image: a depth pixel covers one of its pixels.
+    is_point: bool,
 }
 
 /// Puts depth into colour's view and colour into depth's view, for one pair of cameras.
@@ -52,28 +49,27 @@ struct Band {
 /// # Example
 /// ```
 /// use depthrig_bus::{Intrinsics, Pose};
-/// use depthrig_calib::{Method, Registration};
+/// use depthrig_calib::Registration;
 ///
 /// let k = Intrinsics::pinhole(60.0, 60.0, 31.5, 23.5);
 /// let moved = Pose { translation_m: [0.105, 0.0, 0.0], ..Pose::IDENTITY };
-/// let mut registration = Registration::new(&k, (64, 48), &k, (64, 48), &moved, Method::Splat)?;
+/// let mut registration = Registration::new(&k, (64, 48), &k, (64, 48), &moved)?;
 /// let mut out = vec![0; 64 * 48];
 /// registration.depth_to_color(&[1000; 64 * 48], 0.001, &mut out)?;
-/// // 0.105 m at 1 m is 6.3 pixels: what colour sees to the left of depth's picture stays empty.
+/// // 0.105 m at 1 m is 6.3 pixels: what colour sees to the left of depth's image stays empty.
 /// assert_eq!((out[5], out[6]), (0, 1000));
 /// # Ok::<(), depthrig_calib::Error>(())
 /// ```
 #[derive(Debug)]
 pub struct Registration {
-    method: Method,
     depth_size: (usize, usize),
     color_size: (usize, usize),
-    warp: Arc<Warp>,
+    tables: Arc<Tables>,
     bands: Vec<Band>,
     pool: Option<Arc<rayon::ThreadPool>>,
 }
 
-/// Largest side of a picture: positions are kept in 16 bits.
+/// Largest side of an image: positions are kept in 16 bits.
 const MAX_SIDE: u32 = 16_384;
 
 impl Registration {
@@ -89,7 +85,6 @@ impl Registration {
         color: &Intrinsics,
         color_size: (u32, u32),
         color_from_depth: &Pose,
-        method: Method,
     ) -> Result<Self> {
         for (what, (w, h)) in [("depth", depth_size), ("colour", color_size)] {
             if w == 0 || h == 0 || w > MAX_SIDE || h > MAX_SIDE {
@@ -113,8 +108,11 @@ impl Registration {
         }
         let size = |(w, h): (u32, u32)| (w as usize, h as usize);
         let (depth_size, color_size) = (size(depth_size), size(color_size));
-        let warp = Arc::new(Warp::new(&depth, depth_size, &color, color_size, &pose, method));
-        let mut registration = Self { method, depth_size, color_size, warp, bands: Vec::new(), pool: None };
+        let tables = Arc::new(Tables {
+            warp: Warp::new(&depth, depth_size, &color, color_size, &pose),
+            is_point: footprint::is_point(&depth, depth_size, &color, &pose),
+        });
+        let mut registration = Self { depth_size, color_size, tables, bands: Vec::new(), pool: None };
         registration.bands.push(registration.band(false));
         Ok(registration)
     }
@@ -134,19 +132,10 @@ impl Registration {
     fn band(&self, private: bool) -> Band {
         let (w, h) = self.color_size;
         Band {
-            splat: SplatRows::new(self.depth_size.0),
-            triangles: TriangleRows::new(if self.method == Method::Triangles {
-                self.depth_size.0
-            } else {
-                0
-            }),
+            splat: SplatRows::new(self.depth_size.0, w),
+            paint: PaintRows::new(self.depth_size.0),
             private: if private { vec![0; w * h] } else { Vec::new() },
         }
-    }
-
-    /// The method.
-    pub const fn method(&self) -> Method {
-        self.method
     }
 
     /// Width and height of depth.
@@ -159,53 +148,49 @@ impl Registration {
         self.color_size
     }
 
-    /// Depth in the view and size of colour, in the same unit; 0 where no depth is seen. Rows lie without padding; 0 in
-    /// `depth` is a hole, and `unit_m` is metres per unit.
+    /// Depth in the view and size of colour, in the same unit and along colour's axis; 0 where no depth is seen. Rows lie
+    /// without padding; 0 in `depth` is a hole, and `unit_m` is metres per unit.
     ///
     /// # Errors
-    /// [`ErrorKind::SizeMismatch`] for a picture of another size, [`ErrorKind::BadInput`] for a unit that is not
+    /// [`ErrorKind::SizeMismatch`] for an image of another size, [`ErrorKind::BadInput`] for a unit that is not
     /// positive.
     pub fn depth_to_color(&mut self, depth: &[u16], unit_m: f64, out: &mut [u16]) -> Result<()> {
         check_len("depth", depth.len(), self.depth_size, 1)?;
         check_len("registered depth", out.len(), self.color_size, 1)?;
         let unit = check_unit(unit_m)?;
-        let (warp, method, (w, h)) = (&*self.warp, self.method, self.depth_size);
-        let (width, n) = (self.color_size.0, self.bands.len());
-        let draw = |band: &mut Band, rows: core::ops::Range<usize>, target: &mut Target<'_>| match method {
-            Method::Splat => band.splat.draw(warp, depth, unit, w, rows, target),
-            Method::Triangles => band.triangles.draw(warp, depth, unit, (w, h), rows, target),
+        let Tables { warp, is_point } = &*self.tables;
+        let h = self.depth_size.1;
+        let width = self.color_size.0;
+        let draw = |band: &mut SplatRows, rows: core::ops::Range<usize>, target: &mut Target<'_>| {
+            band.draw(warp, *is_point, depth, unit, rows, target);
         };
         let Some(pool) = &self.pool else {
             let mut target = Target::new(out, width);
-            draw(&mut self.bands[0], 0..h, &mut target);
-            target.finish();
+            draw(&mut self.bands[0].splat, 0..h, &mut target);
+            target::finish(out);
             return Ok(());
         };
         let bands = &mut self.bands;
+        let n = bands.len();
         pool.install(|| {
             bands.par_iter_mut().enumerate().for_each(|(i, band)| {
-                let mut private = core::mem::take(&mut band.private);
-                let mut target = Target::new(&mut private, width);
-                draw(band, i * h / n..(i + 1) * h / n, &mut target);
-                band.private = private;
+                let mut target = Target::new(&mut band.private, width);
+                draw(&mut band.splat, i * h / n..(i + 1) * h / n, &mut target);
             });
-            let rows = out.len().div_ceil(width).div_ceil(n).max(1) * width;
-            out.par_chunks_mut(rows).enumerate().for_each(|(i, part)| {
-                let of = i * rows..i * rows + part.len();
-                let all = bands.iter().map(|b| &b.private[of.clone()]);
-                target::merge(all, part);
+            let rows = out.len().div_ceil(width).div_ceil(n).max(1);
+            out.par_chunks_mut(rows * width).enumerate().for_each(|(i, part)| {
+                let from = i * rows * width;
+                let of = from..from + part.len();
+                target::merge(bands.iter().map(|b| &b.private[of.clone()]), part);
+                target::finish(part);
             });
         });
         Ok(())
     }
 
     /// Colour in the view and size of depth; black where depth has a hole or colour does not look. `color` and `out`
-    /// are 8-bit RGB or any other three bytes a pixel. What colour cannot see because something nearer hides it gets
-    /// the colour of what hides it.
-    ///
-    /// [`Method::Splat`] takes the pixel under the top left corner of depth's pixel, under the bottom right one when colour
-    /// has fewer rows and columns than depth: what librealsense does. [`Method::Triangles`] takes the four pixels around
-    /// its middle in proportion, as the Azure Kinect SDK does.
+    /// are 8-bit RGB or any other three bytes a pixel. A pixel gets the four pixels of colour around its middle in
+    /// proportion. What colour cannot see because something nearer hides it gets the colour of what hides it.
     ///
     /// # Errors
     /// As [`Registration::depth_to_color`].
@@ -214,18 +199,18 @@ impl Registration {
         check_len("colour", color.len(), self.color_size, 3)?;
         check_len("registered colour", out.len(), self.depth_size, 3)?;
         let unit = check_unit(unit_m)?;
-        let (warp, method, (w, h)) = (&*self.warp, self.method, self.depth_size);
-        let (size, n) = (self.color_size, self.bands.len());
-        let paint = |band: &mut Band, rows: core::ops::Range<usize>, part: &mut [u8]| match method {
-            Method::Splat => band.splat.paint(warp, depth, unit, (w, h), rows, color, size, part),
-            Method::Triangles => band.triangles.paint(warp, depth, unit, (w, h), rows, color, size, part),
+        let warp = &self.tables.warp;
+        let (w, h) = self.depth_size;
+        let size = self.color_size;
+        let paint = |band: &mut Band, rows: core::ops::Range<usize>, part: &mut [u8]| {
+            band.paint.paint(warp, depth, unit, w, rows, color, size, part);
         };
         let Some(pool) = &self.pool else {
             paint(&mut self.bands[0], 0..h, out);
             return Ok(());
         };
         let bands = &mut self.bands;
-        let rows = h.div_ceil(n);
+        let rows = h.div_ceil(bands.len());
         pool.install(|| {
             let parts = out.par_chunks_mut(rows * w * 3);
             bands.par_iter_mut().zip(parts).enumerate().for_each(|(i, (band, part))| {

@@ -5,7 +5,7 @@ use depthrig_bus::{Distortion, Intrinsics, PixelFormat, Pose};
 use depthrig_calib::stereo::{
     DisparityMap, Gray, Matcher, Order, OrderCheck, Parameters, Preset, RowCheck, SgmMatcher, StereoPair,
 };
-use depthrig_calib::{Deprojection, Method, PointCloud, Rectifier, Registration, Undistortion, View};
+use depthrig_calib::{Deprojection, PointCloud, Rectifier, Registration, Undistortion, View};
 use depthrig_counting::{Counting, during, in_process_during};
 
 #[global_allocator]
@@ -23,30 +23,27 @@ fn a_frame_takes_no_memory() {
         (0..160 * 120).map(|i| if i % 17 == 0 { 0 } else { 700 + (i % 160) as u16 }).collect();
     let color = vec![7; 160 * 120 * 3];
     let (mut z, mut rgb) = (vec![0; 160 * 120], vec![0; 160 * 120 * 3]);
-    for method in [Method::Splat, Method::Triangles] {
-        for (d, c) in [(&k, &k), (&k, &bent), (&bent, &bent)] {
-            let mut one = Registration::new(d, size, c, size, &pose, method).unwrap();
-            assert_eq!(
-                during(|| for _ in 0..3 {
-                    one.depth_to_color(&depth, 0.001, &mut z).unwrap();
-                    one.color_to_depth(&depth, 0.001, &color, &mut rgb).unwrap();
-                }),
-                0,
-                "{method:?}"
-            );
-            // Handing a frame over to threads takes a block of a queue every 31st time or more seldom.
-            let mut several = one.with_threads(3);
-            for _ in 0..5 {
+    for (d, c) in [(&k, &k), (&k, &bent), (&bent, &bent)] {
+        let mut one = Registration::new(d, size, c, size, &pose).unwrap();
+        assert_eq!(
+            during(|| for _ in 0..3 {
+                one.depth_to_color(&depth, 0.001, &mut z).unwrap();
+                one.color_to_depth(&depth, 0.001, &color, &mut rgb).unwrap();
+            }),
+            0
+        );
+        // Handing a frame over to threads takes a block of a queue every 31st time or more seldom.
+        let mut several = one.with_threads(3);
+        for _ in 0..5 {
+            several.depth_to_color(&depth, 0.001, &mut z).unwrap();
+        }
+        let taken = in_process_during(|| {
+            for _ in 0..62 {
                 several.depth_to_color(&depth, 0.001, &mut z).unwrap();
             }
-            let taken = in_process_during(|| {
-                for _ in 0..62 {
-                    several.depth_to_color(&depth, 0.001, &mut z).unwrap();
-                }
-            });
-            // The pool's own queues take some now and then, more on a busy computer: far from one for each frame.
-            assert!(taken <= 16, "{method:?}: {taken} in 62 frames");
-        }
+        });
+        // The pool's own queues take some now and then, more on a busy computer: far from one for each frame.
+        assert!(taken <= 16, "{taken} in 62 frames");
     }
     let deprojection = Deprojection::new(&bent, size).unwrap();
     let mut cloud = PointCloud::default();

@@ -5,6 +5,7 @@
 
 use crate::Camera;
 use crate::simd::for_every_processor;
+use crate::stereo::RowOffset;
 use depthrig_bus::Intrinsics;
 use glam::{DMat3, DVec3};
 
@@ -40,12 +41,20 @@ impl Channel {
 
 impl Map {
     /// For the eye `camera`, which `rotation` turns into a view with the intrinsics `view`; both have `size`, whose sides
-    /// are at least 2.
-    pub(super) fn new(camera: &Camera, rotation: DMat3, view: &Intrinsics, size: (u32, u32)) -> Self {
+    /// are at least 2. What lies lower in that view by `rows` is moved up.
+    pub(super) fn new(
+        camera: &Camera,
+        rotation: DMat3,
+        view: &Intrinsics,
+        size: (u32, u32),
+        rows: Option<&RowOffset>,
+    ) -> Self {
         let back = rotation.transpose();
         let (w, h) = (f64::from(size.0), f64::from(size.1));
         let entry = |x: u32, y: u32| {
-            let ray = DVec3::new((f64::from(x) - view.cx) / view.fx, (f64::from(y) - view.cy) / view.fy, 1.0);
+            let lower = rows.map_or(0.0, |rows| rows.at(f64::from(x) / w, f64::from(y) / h));
+            let row = f64::from(y) + lower;
+            let ray = DVec3::new((f64::from(x) - view.cx) / view.fx, (row - view.cy) / view.fy, 1.0);
             let at = camera.project(back * ray)?;
             // What is seen ends half a part outside of the last pixel's centre, which then rounds to it.
             let near = 0.5 / PARTS;

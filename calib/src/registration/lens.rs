@@ -4,6 +4,13 @@
 /// Where a lens shows the point (x, y) of the plane z = 1. The formulas are those of `camera/lens.rs`.
 pub(super) trait Lens32: Copy {
     fn shown(self, x: f32, y: f32) -> (f32, f32);
+
+    /// How far from `here`, where it shows (x, y), it shows what is (dx, dy) beside it.
+    #[inline(always)]
+    fn beside(self, x: f32, y: f32, here: (f32, f32), dx: f32, dy: f32) -> (f32, f32) {
+        let there = self.shown(x + dx, y + dy);
+        (there.0 - here.0, there.1 - here.1)
+    }
 }
 
 /// No distortion.
@@ -14,6 +21,11 @@ impl Lens32 for Straight {
     #[inline(always)]
     fn shown(self, x: f32, y: f32) -> (f32, f32) {
         (x, y)
+    }
+
+    #[inline(always)]
+    fn beside(self, _: f32, _: f32, _: (f32, f32), dx: f32, dy: f32) -> (f32, f32) {
+        (dx, dy)
     }
 }
 
@@ -30,6 +42,24 @@ impl Lens32 for Rational {
         let s = top / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)));
         let xy = 2.0 * x * y;
         (s * x + (p1 * xy + p2 * (r2 + 2.0 * x * x)), s * y + (p1 * (r2 + 2.0 * y * y) + p2 * xy))
+    }
+
+    /// By the derivative, whose divisions are those of [`Self::shown`].
+    #[inline(always)]
+    fn beside(self, x: f32, y: f32, _: (f32, f32), dx: f32, dy: f32) -> (f32, f32) {
+        let [k1, k2, p1, p2, k3, k4, k5, k6] = self.0;
+        let r2 = x * x + y * y;
+        let top = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+        let bottom = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6));
+        let s = top / bottom;
+        let d_r2 = 2.0 * (x * dx + y * dy);
+        let d_top = d_r2 * (k1 + r2 * (2.0 * k2 + r2 * (3.0 * k3)));
+        let d_bottom = d_r2 * (k4 + r2 * (2.0 * k5 + r2 * (3.0 * k6)));
+        let d_s = (d_top - s * d_bottom) / bottom;
+        let d_xy = 2.0 * (x * dy + y * dx);
+        let d_tangent_x = p1 * d_xy + p2 * (d_r2 + 4.0 * x * dx);
+        let d_tangent_y = p1 * (d_r2 + 4.0 * y * dy) + p2 * d_xy;
+        (s * dx + x * d_s + d_tangent_x, s * dy + y * d_s + d_tangent_y)
     }
 }
 

@@ -94,6 +94,11 @@ pub struct Parameters {
     pub p2_slack: u8,
     /// By how many percent the best cost must be below the best that is not its neighbour.
     pub uniqueness_percent: u8,
+    /// Mean margin, in a window of 13x13, between the best cost and the best that is not its neighbour below which there is no
+    /// texture and so no disparity; 0 keeps all.
+    pub texture_margin: u8,
+    /// The same at half the resolution, whose noise is half as large.
+    pub half_texture_margin: u8,
     /// Largest difference between the left and the right view's disparity, in pixels.
     pub left_right_px: u8,
     /// Where the views disagree, a pixel that some pixel of the right view has as its match takes that disparity.
@@ -126,6 +131,8 @@ impl Parameters {
             p2_least: 15,
             p2_slack: 4,
             uniqueness_percent: 0,
+            texture_margin: 15,
+            half_texture_margin: 20,
             left_right_px: 2,
             rematch: true,
             speckle_px: 100,
@@ -140,10 +147,12 @@ impl Parameters {
     pub fn describe(&self) -> String {
         let Self { preset, max_disparity, resolution, p1, p2, p2_least, p2_slack, .. } = self;
         let Self { uniqueness_percent, left_right_px, speckle_px, speckle_step_px, .. } = self;
-        let Self { rematch, median_rounds, gap_px, gap_step_px, .. } = self;
+        let Self { texture_margin, half_texture_margin, rematch, median_rounds, gap_px, gap_step_px, .. } =
+            self;
         format!(
             "preset={preset} max_disparity={max_disparity} resolution={resolution} p1={p1} p2={p2} \
              p2_least={p2_least} p2_slack={p2_slack} uniqueness_percent={uniqueness_percent} \
+             texture_margin={texture_margin} half_texture_margin={half_texture_margin} \
              left_right_px={left_right_px} rematch={rematch} speckle_px={speckle_px} \
              speckle_step_px={speckle_step_px} median_rounds={median_rounds} gap_px={gap_px} gap_step_px={gap_step_px}"
         )

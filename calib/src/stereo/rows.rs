@@ -36,6 +36,11 @@ const FLOOR_PX: f64 = 0.05;
 /// Rows that are further apart than this on the whole are worth a word: see docs/stereo.md for what they cost.
 const LIMIT_PX: f64 = 0.4;
 
+/// An offset is corrected when it is larger than this many times what is uncertain of it,
+const SIGNIFICANT: f64 = 2.0;
+/// and by more than this beyond that: less costs matching nothing that can be measured, and moving rows blurs them a little.
+const WORTH_PX: f64 = 0.15;
+
 /// How far the eyes' rows are apart. A positive number is for what lies lower in the right picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RowOffset {
@@ -69,13 +74,42 @@ impl RowOffset {
         self.overall_px() - overall(self.unsure_px) > LIMIT_PX
     }
 
+    /// Whether the offset is shown beyond what is uncertain of it, so that moving the right image's rows by it brings them
+    /// nearer to the left image's. Every offset that [`RowOffset::is_bad`] is.
+    pub fn is_significant(&self) -> bool {
+        let px = self.overall_px();
+        let unsure_px = overall(self.unsure_px);
+        px > SIGNIFICANT * unsure_px && px - unsure_px > WORTH_PX
+    }
+
+    /// The offset of images that were corrected by `self` when `rest` was measured in them.
+    #[must_use]
+    pub fn with_rest(&self, rest: &Self) -> Self {
+        Self {
+            middle_px: self.middle_px + rest.middle_px,
+            across_px: self.across_px + rest.across_px,
+            down_px: self.down_px + rest.down_px,
+            ..*rest
+        }
+    }
+
+    /// What was corrected as a `key=value` word, for the metadata of what is made of corrected images.
+    pub fn describe_correction(&self) -> String {
+        format!("rows_moved_px={:.3},{:.3},{:.3}", self.middle_px, self.across_px, self.down_px)
+    }
+
     /// What to say of it where something is wrong: what was measured, what it does and what to do about it. The camera is
-    /// the caller's to name.
-    pub fn warning(&self) -> Option<String> {
+    /// the caller's to name. `is_corrected`: the right image's rows are moved by it before they are matched.
+    pub fn warning(&self, is_corrected: bool) -> Option<String> {
+        let done = if is_corrected {
+            "The right image is moved by that before it is matched; where the offset is no plane over the image, depth has \
+             holes and errors"
+        } else {
+            "Depth has holes and errors that grow with this; from 1 px on little of it can be used"
+        };
         self.is_bad().then(|| {
             format!(
-                "left and right are not rectified to the same rows: {self}. Depth has holes and errors that grow with this; from \
-                 1 px on little of it can be used. The calibration does not fit the camera: calibrate it anew with its maker's \
+                "left and right are not rectified to the same rows: {self}. {done}. The calibration does not fit the camera: calibrate it anew with its maker's \
                  tool, or take the factory calibration of this very serial number and resolution (that of another unit does this)"
             )
         })
@@ -285,7 +319,41 @@ mod tests {
             offset(400, 1.0, |i, _| ((i / 20) as f64 + 0.5) / 10.0 - 1.0 + 0.05 * noise(i, 4)).unwrap();
         assert!((sloping.across_px - 2.0).abs() < 0.1 && sloping.is_bad(), "{sloping}");
         assert!(sloping.to_string().contains("at the left and"), "{sloping}");
-        assert!(sloping.warning().is_some_and(|w| w.contains("calibrate it anew")));
+        assert!(sloping.warning(false).is_some_and(|w| w.contains("calibrate it anew")));
+    }
+
+    #[test]
+    fn what_is_uncertain_or_small_is_not_corrected() {
+        let of = |middle_px: f64, unsure: f64| RowOffset {
+            middle_px,
+            across_px: 0.0,
+            down_px: 0.0,
+            unsure_px: [unsure; 3],
+            places: 100,
+            pairs: 4,
+        };
+        for (middle, unsure, is) in [
+            (0.0, 0.05, false),
+            (0.15, 0.05, false),
+            (0.19, 0.05, false),
+            (0.22, 0.05, true),
+            (-0.22, 0.05, true),
+            (0.4, 0.2, false),
+            (0.5, 0.2, true),
+            (1.0, 0.05, true),
+        ] {
+            assert_eq!(of(middle, unsure).is_significant(), is, "{middle} ± {unsure}");
+        }
+        // Whatever is warned about is corrected, up to the least certain offset that is stated.
+        for unsure in [0.05, 0.1, 0.2, UNSURE_PX / (7.0_f64 / 6.0).sqrt()] {
+            for step in 0..300 {
+                let offset = of(f64::from(step) / 100.0, unsure);
+                assert!(offset.is_significant() || !offset.is_bad(), "{offset:?}");
+            }
+        }
+        let total = of(1.0, 0.1).with_rest(&RowOffset { across_px: 0.5, ..of(-0.25, 0.05) });
+        assert_eq!((total.middle_px, total.across_px, total.unsure_px[0]), (0.75, 0.5, 0.05));
+        assert_eq!(total.describe_correction(), "rows_moved_px=0.750,0.500,0.000");
     }
 
     /// A camera that was put right says so after as many pairs as count at once.

@@ -7,6 +7,7 @@ use filter::Speckle;
 use pass::{Costs, Form, Passes};
 use planes::Penalties;
 use rayon::prelude::*;
+use texture::Texture;
 
 #[cfg(target_arch = "x86_64")]
 mod avx2;
@@ -23,6 +24,7 @@ mod planes;
 mod presets;
 #[cfg(test)]
 mod tests;
+mod texture;
 mod volume;
 
 pub(super) use filter::halve;
@@ -36,6 +38,7 @@ const MAX_SIDE: usize = 16_384;
 struct Engine {
     size: (usize, usize),
     passes: Passes,
+    texture: Texture,
     /// Disparities in 256ths of a pixel, and what the median makes of them.
     maps: [Vec<u16>; 2],
     speckle: Speckle,
@@ -56,6 +59,7 @@ impl Engine {
         Self {
             size,
             passes: Passes::new(form, size, costs, threads),
+            texture: Texture::new(size.0),
             maps: [vec![NONE; pixels], vec![NONE; pixels]],
             speckle: Speckle::new(if parameters.speckle_px > 0 { pixels } else { 0 }),
             columns: vec![0; size.0],
@@ -63,7 +67,11 @@ impl Engine {
     }
 
     fn bytes(&self) -> usize {
-        self.passes.bytes() + 4 * self.maps[0].len() + self.speckle.bytes() + 4 * self.columns.len()
+        self.passes.bytes()
+            + self.texture.bytes()
+            + 4 * self.maps[0].len()
+            + self.speckle.bytes()
+            + 4 * self.columns.len()
     }
 
     /// Disparities of a pair in 256ths of a pixel, or [`NONE`]; and how sure each is.
@@ -74,7 +82,7 @@ impl Engine {
         pool: Option<&rayon::ThreadPool>,
         confidence: &mut [u8],
     ) -> &mut [u16] {
-        let Self { size: (width, height), passes, maps: [map, other], speckle, columns } = self;
+        let Self { size: (width, height), passes, texture, maps: [map, other], speckle, columns } = self;
         let (width, height) = (*width, *height);
         let last = (passes.disparities() - 1) as u8;
         let (winners, mirrored) = passes.run(pair, pool);
@@ -95,6 +103,9 @@ impl Engine {
                 map.par_chunks_mut(rows).zip(confidence.par_chunks_mut(rows)).enumerate().for_each(part);
             }),
             None => part((0, (map.as_mut_slice(), &mut *confidence))),
+        }
+        if parameters.texture_margin > 0 {
+            texture.remove(winners, width, parameters.texture_margin, map, confidence);
         }
         if parameters.median_rounds > 0 {
             for _ in 0..parameters.median_rounds {
@@ -139,6 +150,7 @@ impl Half {
         let parameters = Parameters {
             gap_px: parameters.gap_px / 2,
             gap_step_px: parameters.gap_step_px / 2.0,
+            texture_margin: parameters.half_texture_margin,
             ..parameters.clone()
         };
         Self {
