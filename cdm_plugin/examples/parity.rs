@@ -34,7 +34,7 @@ fn main() -> Result<()> {
 fn numbers(file: &Weights, name: &str) -> Result<(Vec<usize>, Vec<f32>)> {
     let missing = || Error::new(ErrorKind::NotFound, format!("{}: no tensor {name}", file.path().display()));
     let shape = file.entries().get(name).ok_or_else(missing)?.shape.clone();
-    Ok((shape, file.to_f32(name).ok_or_else(missing)?))
+    Ok((shape, file.to_f32(name)?))
 }
 
 fn one(model: &Model, engine: EngineKind, path: &str) -> Result<()> {

@@ -2,7 +2,7 @@
 
 use crate::{Error, ErrorKind, Result};
 use sha2::{Digest, Sha256};
-use std::fs::File;
+use std::fs::{File, OpenOptions};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
@@ -45,7 +45,9 @@ pub(crate) fn create(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Resu
     let mut part = name.to_owned();
     part.push(format!(".{}.part", std::process::id()));
     let part = Leftover(Some(path.with_file_name(part)));
-    let file = File::create(part.path()).map_err(failed)?;
+    // What a killed process left under this name is ours to remove; a link is removed and not followed.
+    drop(std::fs::remove_file(part.path()));
+    let file = OpenOptions::new().write(true).create_new(true).open(part.path()).map_err(failed)?;
     let mut out = Hashing { inner: BufWriter::with_capacity(1 << 20, file), hash: Sha256::new(), bytes: 0 };
     write(&mut out).map_err(failed)?;
     out.flush().map_err(failed)?;

@@ -40,7 +40,16 @@ pub struct FetchOptions {
     pub retries: u32,
     /// How long it waits before the first of these; each time twice as long.
     pub wait: Duration,
+    /// No more bytes than this are fetched, whatever the server says or leaves unsaid.
+    pub max_bytes: u64,
 }
+
+/// Three times the largest network with the state of its optimizer beside it.
+const MAX_BYTES: u64 = 96 << 30;
+/// Room that a file of unknown size leaves on the disk.
+const SPARE: u64 = 1 << 30;
+/// How much of one is fetched before the room is looked at again.
+const LOOK_EVERY: u64 = 64 << 20;
 
 impl Default for FetchOptions {
     fn default() -> Self {
@@ -52,6 +61,7 @@ impl Default for FetchOptions {
             token: None,
             retries: 5,
             wait: Duration::from_secs(1),
+            max_bytes: MAX_BYTES,
         }
     }
 }
@@ -111,7 +121,7 @@ pub fn fetch(store: &ModelStore, name: &str, options: &FetchOptions, watch: Watc
         _ => (None, "nothing"),
     };
     let folder = store.dir().join(".downloads");
-    std::fs::create_dir_all(&folder).map_err(|e| durable::cannot_write(&folder, e))?;
+    depthrig_bus::umask::create_dir_all(&folder).map_err(|e| durable::cannot_write(&folder, e))?;
     let lock = folder.join(format!("{name}.lock"));
     let lock = File::create(&lock).map_err(|e| durable::cannot_write(&lock, e))?;
     flock(&lock, FlockOperation::NonBlockingLockExclusive).map_err(|e| {
@@ -290,7 +300,11 @@ impl Download<'_> {
     fn body(&self, answer: Answer, mut has: u64, now: &Progress, watch: Watch<'_>) -> Result<(), Ended> {
         let failed = |e: io::Error| Ended::Final(durable::cannot_write(&self.path, e));
         let total = answer.total;
-        self.room(total.unwrap_or(0).saturating_sub(has))?;
+        if total.is_some_and(|total| total > self.options.max_bytes) {
+            return Err(self.too_large(total));
+        }
+        self.room(total.map_or(SPARE, |total| total.saturating_sub(has)))?;
+        let mut looked = has;
         let text = serde_json::to_vec(now).unwrap_or_default();
         std::fs::write(self.path.with_extension("json"), text).map_err(failed)?;
         let mut file = OpenOptions::new().create(true).append(true).open(&self.path).map_err(failed)?;
@@ -309,6 +323,17 @@ impl Download<'_> {
             };
             file.write_all(&part[..n]).map_err(failed)?;
             has += n as u64;
+            if total.is_some_and(|total| has > total) {
+                break None;
+            }
+            if has > self.options.max_bytes {
+                forget(&self.path);
+                return Err(self.too_large(total));
+            }
+            if total.is_none() && has - looked >= LOOK_EVERY {
+                looked = has;
+                self.room(SPARE).inspect_err(|_| forget(&self.path))?;
+            }
         };
         file.sync_all().map_err(failed)?;
         match (broken, total) {
@@ -329,6 +354,19 @@ impl Download<'_> {
         }
     }
 
+    fn too_large(&self, total: Option<u64>) -> Ended {
+        let (most, url) = (self.options.max_bytes, &self.url);
+        let what = total.map_or_else(
+            || format!("the server sends more than {most} bytes without saying how many there are"),
+            |total| format!("the file has {total} bytes, and {most} is the most that is fetched"),
+        );
+        let message = format!(
+            "{url}: {what}; no checkpoint is so large: check the address, or download it by other means and install it with \
+             `depthrig cdm import`"
+        );
+        Ended::Final(Error::new(ErrorKind::Network, message))
+    }
+
     /// Whether there is room for what is still to come.
     fn room(&self, needed: u64) -> Result<(), Ended> {
         let folder = self.path.parent().unwrap_or(Path::new("."));
@@ -347,7 +385,7 @@ impl Download<'_> {
         let failed = |e: io::Error| {
             Error::new(ErrorKind::Io, format!("{}: cannot be read: {e}", self.path.display())).with_source(e)
         };
-        let mut file = File::open(&self.path).map_err(failed)?;
+        let mut file = depthrig_bus::files::open(&self.path).map_err(failed)?;
         let total = file.metadata().map_err(failed)?.len();
         let (mut hash, mut part, mut done) = (Sha256::new(), vec![0; 1 << 20], 0);
         loop {
@@ -377,7 +415,9 @@ impl Download<'_> {
     }
 
     fn progress(&self) -> Progress {
-        let text = std::fs::read(self.path.with_extension("json")).unwrap_or_default();
+        let text =
+            depthrig_bus::files::read(&self.path.with_extension("json"), depthrig_bus::files::TEXT_MAX_BYTES)
+                .unwrap_or_default();
         serde_json::from_slice(&text).unwrap_or_default()
     }
 }

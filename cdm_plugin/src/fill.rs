@@ -3,10 +3,12 @@
 //! Everything works on inverse depth (1/m), in which a plane is a linear function of the pixel, so that means and
 //! interpolation keep planes. The steps:
 //! 1. colour and depth are brought into one form ([`load`]); 0, 65535 and what lies beyond the range are holes;
-//! 2. pixels without support by their neighbours, and small islands, become holes ([`clean`]), and so does what a mirror or glass shows ([`behind`]);
+//! 2. pixels without support by their neighbours, small islands, and larger ones that hang in the air become holes
+//!    ([`clean`]), and so does what a mirror or glass shows ([`behind`]);
 //! 3. the picture is halved until one cell is left ([`pyramid`]); where a cell lies on two surfaces, the farther wins;
 //! 4. from the coarsest on, holes take the depth of those coarse cells around them that look like them, and are smoothed
-//!    within their surface ([`pull`]). What was measured and kept stays as it was measured.
+//!    within their surface ([`pull`]). What was measured and kept stays as it was measured;
+//! 5. what lies further from measured depth than [`REACH`] is unknown: 0 ([`reach`]).
 //!
 //! A picture without any depth stays without: its result is 0 everywhere, and no error.
 // The steps of a pixel must end up inside the loops that are compiled for AVX2, whatever their size.
@@ -18,6 +20,7 @@ use clean::Islands;
 use depthrig_bus::HostTime;
 use lanes::Crew;
 use pyramid::Level;
+use reach::Reach;
 
 mod behind;
 mod clean;
@@ -25,11 +28,20 @@ mod lanes;
 mod load;
 mod pull;
 mod pyramid;
+mod reach;
 
 /// Islands below this part of the picture are taken out: 60 pixels of 1280x720.
 const ISLAND: f64 = 65e-6;
 /// Islands below this are taken out of small pictures too, pixels.
 const LEAST_ISLAND: u32 = 8;
+
+/// An island below this part of the image that hangs in the air, at another depth than all around it, is taken out: 922
+/// pixels of 1280x720.
+const BODY: f64 = 1e-3;
+/// So far from measured depth holes are filled, a part of the image's width: 160 pixels of 1280.
+const REACH: f64 = 0.125;
+/// So far they are filled in small images too, pixels.
+const LEAST_REACH: usize = 48;
 
 /// The refiner that needs no model.
 ///
@@ -44,6 +56,8 @@ pub struct FillRefiner {
     cleaned: Vec<f32>,
     islands: Islands,
     behind: Behind,
+    reach: Reach,
+    fills_all: bool,
 }
 
 impl FillRefiner {
@@ -67,7 +81,14 @@ impl FillRefiner {
             cleaned: Vec::new(),
             islands: Islands::default(),
             behind: Behind::default(),
+            reach: Reach::default(),
+            fills_all: false,
         })
+    }
+
+    /// The same without a limit: every hole is filled, however far it is from what was measured.
+    pub fn filling_all(self) -> Self {
+        Self { fills_all: true, ..self }
     }
 
     fn run(&mut self, job: &mut Job<'_>) -> Result<()> {
@@ -75,12 +96,13 @@ impl FillRefiner {
         let began = HostTime::now();
         let (w, h) = (job.color.width, job.color.height);
         self.resize(w, h);
-        let Self { crew, levels, in_use, cleaned, islands, behind, .. } = self;
+        let Self { crew, levels, in_use, cleaned, islands, behind, reach, fills_all, .. } = self;
         let levels = &mut levels[..*in_use];
         let Some((full, _)) = levels.split_first_mut() else { return Ok(()) };
         load::load(crew, &job.color, &job.depth, cleaned, &mut full.color);
         crew.rows(&mut full.q, w, |y, row| clean::keep_supported(crew.wide, cleaned, w, y, row));
-        islands.remove(&mut full.q, w, LEAST_ISLAND.max((ISLAND * (w * h) as f64).round() as u32));
+        let part = |of: f64| (of * (w * h) as f64).round() as u32;
+        islands.remove(&mut full.q, w, LEAST_ISLAND.max(part(ISLAND)), part(BODY));
         behind.remove(&mut full.q, w);
         let loaded = HostTime::now();
 
@@ -92,6 +114,12 @@ impl FillRefiner {
                 pyramid::shrink(crew, fine, coarse);
             }
         }
+        // Filling writes into the cells' depth, but not into how much of them had some.
+        let cells = levels.get(2).filter(|_| !*fills_all);
+        if let Some(cells) = cells {
+            reach.measure(cells);
+        }
+        let is_limited = cells.is_some();
         let has_depth = levels.last().is_some_and(|l| l.q.iter().all(|q| *q > 0.0));
         if has_depth {
             for i in (1..levels.len()).rev() {
@@ -102,6 +130,9 @@ impl FillRefiner {
                     }
                 }
             }
+        }
+        if is_limited {
+            reach.forget(&mut levels[0].q, w, LEAST_REACH.max((REACH * w as f64) as usize));
         }
         let filled = HostTime::now();
 
@@ -122,6 +153,7 @@ impl FillRefiner {
         self.cleaned.resize(w * h, 0.0);
         self.islands.reserve(w * h);
         self.behind.resize(w, h);
+        self.reach.resize(w.div_ceil(reach::CELL), h.div_ceil(reach::CELL));
         let (mut size, mut count) = ((w, h), 1);
         while size != (1, 1) {
             size = (size.0.div_ceil(2), size.1.div_ceil(2));

@@ -54,7 +54,7 @@ impl Model {
         let weights = Weights::open(path.as_ref())?;
         let encoder = verify(&weights)?;
         let name = path.as_ref().file_stem().map_or_else(String::new, |s| s.to_string_lossy().into_owned());
-        let id = model_id(&name, &weights.sha256(), !weights.is_untrained());
+        let id = model_id(&name, &weights.sha256()?, !weights.is_untrained());
         Ok(Self::new(id, encoder, weights))
     }
 

@@ -13,6 +13,9 @@
 use crate::Encoder;
 use crate::arch::Architecture;
 use core::ops::Range;
+use prost::Message;
+use proto::{ModelProto, StringStringEntryProto};
+use std::collections::BTreeMap;
 
 pub(crate) mod builder;
 mod network;
@@ -80,6 +83,29 @@ impl Graph {
     /// The graph of a network of these sizes.
     pub fn of_architecture(arch: Architecture, style: Style) -> Self {
         network::build(arch, style)
+    }
+
+    /// The model with its weights at `places` of the file `name`, in the order of [`Self::weights`]. The engine is told
+    /// which folder the file lies in.
+    pub fn in_file(&self, name: &str, places: &[Range<usize>]) -> Vec<u8> {
+        // It was encoded by `finish`, so it can be decoded.
+        let Ok(mut model) = ModelProto::decode(self.model.as_slice()) else { return Vec::new() };
+        let at: BTreeMap<&str, &Range<usize>> =
+            self.weights.iter().map(|w| w.initializer.as_str()).zip(places).collect();
+        let initializers = model.graph.iter_mut().flat_map(|g| &mut g.initializer);
+        for initializer in initializers {
+            let Some(place) = initializer.name.as_deref().and_then(|name| at.get(name)) else { continue };
+            let entry = |key: &str, value: String| StringStringEntryProto {
+                key: Some(key.into()),
+                value: Some(value),
+            };
+            initializer.external_data = vec![
+                entry("location", name.into()),
+                entry("offset", place.start.to_string()),
+                entry("length", place.len().to_string()),
+            ];
+        }
+        model.encode_to_vec()
     }
 }
 

@@ -17,7 +17,7 @@ mod size;
 mod tests;
 
 pub use position::Positions;
-pub use size::net_size;
+pub use size::{check_input_size, net_size};
 
 use crate::{ChannelOrder, Color, Output, RawDepth, Result};
 use cubic::CubicResize;

@@ -1,6 +1,6 @@
 //! The refiner that is a network: pictures to its input, the network, its output to depth.
 
-use crate::prep::{Positions, Prep, net_size};
+use crate::prep::{Positions, Prep, check_input_size, net_size};
 use crate::{
     ChannelOrder, Description, Error, Job, Model, NetShape, Network, PositionEmbeddings, Refiner, Result,
     StepTimes,
@@ -79,7 +79,7 @@ impl CdmRefiner {
     /// model has no position embeddings.
     pub fn new(network: Box<dyn Network>, model: &Model, input_size: Option<u32>) -> Result<Self> {
         let input_size = input_size.unwrap_or(model.input_size);
-        net_size((1, 1), input_size)?;
+        check_input_size(input_size)?;
         let description = Description { engine: network.describe().into(), model: model.id.clone() };
         Ok(Self {
             network,

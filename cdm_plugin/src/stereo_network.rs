@@ -279,7 +279,7 @@ fn hash(file: &Path) -> Result<String> {
         let kind = if e.kind() == std::io::ErrorKind::NotFound { ErrorKind::NotFound } else { ErrorKind::Io };
         Error::new(kind, format!("the network {} cannot be read: {e}", file.display())).with_source(e)
     };
-    let mut source = std::fs::File::open(file).map_err(error)?;
+    let mut source = depthrig_bus::files::open(file).map_err(error)?;
     let mut sha = Sha256::new();
     let mut block = vec![0; 1 << 16];
     loop {

@@ -184,7 +184,7 @@ impl ModelStore {
         check_name(name)?;
         let path = self.dir.join(name);
         let file = path.join(RECORD);
-        let text = match std::fs::read_to_string(&file) {
+        let text = match depthrig_bus::files::read_to_string(&file, depthrig_bus::files::TEXT_MAX_BYTES) {
             Ok(text) => text,
             Err(e) if e.kind() == io::ErrorKind::NotFound && !path.exists() => {
                 return Err(self.not_installed(name));
@@ -298,7 +298,7 @@ impl ModelStore {
     pub fn check(&self, name: &str) -> Result<Report> {
         let installed = self.info(name)?;
         let weights = Self::weights(&installed)?;
-        let (has, said) = (weights.sha256(), &installed.record.weights.sha256);
+        let (has, said) = (weights.sha256()?, &installed.record.weights.sha256);
         if has != *said {
             let path = weights.path().display();
             let message = format!(
@@ -353,7 +353,7 @@ impl ModelStore {
     ) -> Result<Written> {
         let keep = |name: &str| !report.extra.iter().any(|e| e.name == name);
         let kept = weights.entries().iter().filter(|(name, _)| keep(name));
-        let total: u64 = kept.map(|(_, e)| e.bytes.len() as u64).sum();
+        let total: u64 = kept.map(|(_, e)| (e.count() * weights::kept_as(e.dtype).bytes()) as u64).sum();
         if let Ok(disk) = rustix::fs::statvfs(&self.dir) {
             let free = disk.f_bavail * disk.f_frsize;
             if free < total {
@@ -418,7 +418,7 @@ impl ModelStore {
     /// any.
     fn lock(&self) -> Result<File> {
         let path = self.dir.join(".lock");
-        std::fs::create_dir_all(&self.dir).map_err(|e| durable::cannot_write(&self.dir, e))?;
+        depthrig_bus::umask::create_dir_all(&self.dir).map_err(|e| durable::cannot_write(&self.dir, e))?;
         let file = File::create(&path).map_err(|e| durable::cannot_write(&path, e))?;
         flock(&file, FlockOperation::NonBlockingLockExclusive).map_err(|e| {
             let message = format!(

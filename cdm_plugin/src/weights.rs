@@ -1,31 +1,34 @@
-//! Named tensors in a file, mapped into memory: a `.safetensors` file or a PyTorch checkpoint.
+//! Named tensors in a file: a `.safetensors` file or a PyTorch checkpoint.
 
 use crate::{Error, ErrorKind, Result, durable};
 use core::ops::Range;
-use memmap2::Mmap;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::io;
+use std::path::Path;
+use stored::{ReadAt, Stored};
 
 mod floats;
 pub(crate) mod fuzzing;
-mod map;
 mod pickle;
 mod pth;
 mod safetensors;
 mod seeded;
+pub(crate) mod stored;
 mod verify;
 mod write;
 
 pub use seeded::write_seeded;
 pub use verify::{Extra, Misshaped, Missing, NotFinite, Report, examine, verify, verify_names};
-pub(crate) use write::copy;
 #[cfg(test)]
 pub(crate) use write::{Planned, write};
+pub(crate) use write::{copy, kept_as};
 
 /// How the numbers of a tensor are stored, little-endian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Dtype {
+    /// 64-bit float; the network computes with them rounded to 32 bits.
+    F64,
     /// 32-bit float.
     F32,
     /// 16-bit float of IEEE 754.
@@ -38,6 +41,7 @@ impl Dtype {
     /// Bytes of one number.
     pub const fn bytes(self) -> usize {
         match self {
+            Self::F64 => 8,
             Self::F32 => 4,
             Self::F16 | Self::Bf16 => 2,
         }
@@ -46,6 +50,7 @@ impl Dtype {
     /// The name that `.safetensors` files use.
     pub const fn name(self) -> &'static str {
         match self {
+            Self::F64 => "F64",
             Self::F32 => "F32",
             Self::F16 => "F16",
             Self::Bf16 => "BF16",
@@ -60,8 +65,17 @@ pub struct Entry {
     pub dtype: Dtype,
     /// Its shape, row-major.
     pub shape: Vec<usize>,
-    /// Its bytes in the file.
+    /// Its bytes in the file; with strides, from its first number to its last.
     pub bytes: Range<usize>,
+    /// Numbers from one index to the next, for each dimension, where it does not lie in the order of its shape.
+    pub strides: Option<Vec<usize>>,
+}
+
+impl Entry {
+    /// How many numbers it has.
+    pub fn count(&self) -> usize {
+        self.shape.iter().product()
+    }
 }
 
 /// The kind of file that weights lie in.
@@ -80,48 +94,43 @@ struct Contents {
     /// What is beside the tensors, by name: values that are no tensors, and tensors of other types.
     others: BTreeMap<String, String>,
     metadata: BTreeMap<String, String>,
-    /// Names as they were, when they did not begin with the prefix that was cut from all of them.
-    cut_blindly: Option<String>,
 }
 
 /// What is wrong with a file, without its name: [`Weights::open`] puts that in front.
 type Parsed<T> = Result<T, String>;
 
-/// Named tensors in a file that stays mapped.
+/// Named tensors in a file that stays open.
 #[derive(Debug)]
 pub struct Weights {
-    pub(crate) path: PathBuf,
-    pub(crate) map: Mmap,
+    file: Stored,
     pub(crate) entries: BTreeMap<String, Entry>,
     others: BTreeMap<String, String>,
     metadata: BTreeMap<String, String>,
     format: Format,
-    cut_blindly: Option<String>,
 }
 
 impl Weights {
     /// Opens a `.safetensors` file or a checkpoint of PyTorch; what it is decides, not how it is called. No code that
     /// is in a checkpoint is ever run, and no number is looked at: [`verify()`] does that.
     ///
-    /// Names are those of the network's own code. A checkpoint with tensors under `model` has the first seven
-    /// characters of every name cut off, as the official loader does (they are `module.`); in every other file
-    /// `module.` is cut off when all names begin with it.
+    /// Names are those of the network's own code: the tensors of a checkpoint may lie under `model`, and `module.`, which
+    /// a wrapper puts in front of every name, is cut off.
     ///
     /// # Errors
     /// [`ErrorKind::NotFound`] and [`ErrorKind::Io`] for the file, [`ErrorKind::BadModel`] with the cure for anything
     /// in it that is damaged, cut short or of another kind.
     pub fn open(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
-        let map = map::read_only(path)?;
-        let (format, contents) = parse(&map)
+        let file = Stored::open(path)?;
+        let (format, contents) = parse(&file)
             .map_err(|what| Error::new(ErrorKind::BadModel, format!("{}: {what}", path.display())))?;
-        let Contents { entries, others, metadata, cut_blindly } = contents;
-        Ok(Self { path: path.into(), map, entries, others, metadata, format, cut_blindly })
+        let Contents { entries, others, metadata } = contents;
+        Ok(Self { file, entries, others, metadata, format })
     }
 
     /// The file.
     pub fn path(&self) -> &Path {
-        &self.path
+        self.file.path()
     }
 
     /// The kind of file.
@@ -131,7 +140,7 @@ impl Weights {
 
     /// Bytes of the whole file.
     pub fn file_bytes(&self) -> u64 {
-        self.map.len() as u64
+        self.file.len() as u64
     }
 
     /// Every tensor by name, as the network's code calls it (a wrapper's prefix is gone).
@@ -149,27 +158,83 @@ impl Weights {
         &self.metadata
     }
 
-    /// The bytes of a tensor as they lie in the file; they may begin at any address.
-    pub fn bytes(&self, name: &str) -> Option<&[u8]> {
-        self.map.get(self.entries.get(name)?.bytes.clone())
+    /// The numbers of a tensor as they are stored, in the order of its shape.
+    ///
+    /// # Errors
+    /// [`ErrorKind::BadModel`] when there is no such tensor, [`ErrorKind::Io`] when it cannot be read, also because the
+    /// file became shorter.
+    pub fn read(&self, name: &str) -> Result<Vec<u8>> {
+        let missing = || {
+            let message = format!("{}: the tensor {name} is missing", self.path().display());
+            Error::new(ErrorKind::BadModel, message)
+        };
+        let entry = self.entries.get(name).ok_or_else(missing)?;
+        let span =
+            stored::part(&self.file, entry.bytes.clone()).map_err(|e| stored::failed(self.path(), e))?;
+        Ok(match &entry.strides {
+            Some(strides) => gathered(&span, entry, strides),
+            None => span,
+        })
+    }
+
+    /// The whole file, mapped into memory: for an engine that reads tensors where they lie.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Io`].
+    pub(crate) fn mapped(&self) -> Result<&[u8]> {
+        self.file.mapped()
     }
 
     /// SHA-256 of the whole file, in hexadecimal; reads all of it.
-    pub fn sha256(&self) -> String {
-        durable::hex(&Sha256::digest(&self.map))
+    ///
+    /// # Errors
+    /// [`ErrorKind::Io`] when it cannot be read, also because it became shorter.
+    pub fn sha256(&self) -> Result<String> {
+        let mut hash = Sha256::new();
+        let mut part = vec![0; 1 << 20];
+        let mut at = 0;
+        while at < self.file.len() {
+            let n = part.len().min(self.file.len() - at);
+            self.file.read_at(at, &mut part[..n]).map_err(|e| stored::failed(self.path(), e))?;
+            hash.update(&part[..n]);
+            at += n;
+        }
+        Ok(durable::hex(&hash.finalize()))
     }
 
     /// The numbers of a tensor as 32-bit floats, whatever they are stored as.
-    pub fn to_f32(&self, name: &str) -> Option<Vec<f32>> {
-        let bytes = self.bytes(name)?;
-        Some(match self.entries.get(name)?.dtype {
-            Dtype::F32 => {
-                bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
-            }
-            Dtype::F16 => halves(bytes).map(|h| half::f16::from_bits(h).to_f32()).collect(),
-            Dtype::Bf16 => halves(bytes).map(|h| half::bf16::from_bits(h).to_f32()).collect(),
+    ///
+    /// # Errors
+    /// As [`Self::read`].
+    pub fn to_f32(&self, name: &str) -> Result<Vec<f32>> {
+        let bytes = self.read(name)?;
+        Ok(match self.entries.get(name).map_or(Dtype::F32, |e| e.dtype) {
+            Dtype::F64 => bytes.as_chunks().0.iter().map(|b| f64::from_le_bytes(*b) as f32).collect(),
+            Dtype::F32 => bytes.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect(),
+            Dtype::F16 => halves(&bytes).map(|h| half::f16::from_bits(h).to_f32()).collect(),
+            Dtype::Bf16 => halves(&bytes).map(|h| half::bf16::from_bits(h).to_f32()).collect(),
         })
     }
+}
+
+/// The numbers of `span` that `entry` has, in the order of its shape.
+fn gathered(span: &[u8], entry: &Entry, strides: &[usize]) -> Vec<u8> {
+    let size = entry.dtype.bytes();
+    let count = entry.count();
+    let mut out = Vec::with_capacity(count * size);
+    let mut index = vec![0; entry.shape.len()];
+    for _ in 0..count {
+        let at: usize = index.iter().zip(strides).map(|(i, stride)| i * stride).sum();
+        out.extend_from_slice(&span[at * size..][..size]);
+        for dimension in (0..index.len()).rev() {
+            index[dimension] += 1;
+            if index[dimension] < entry.shape[dimension] {
+                break;
+            }
+            index[dimension] = 0;
+        }
+    }
+    out
 }
 
 fn halves(bytes: &[u8]) -> impl Iterator<Item = u16> {
@@ -177,7 +242,7 @@ fn halves(bytes: &[u8]) -> impl Iterator<Item = u16> {
 }
 
 /// Finds out what kind of file it is, and reads what it holds.
-fn parse(file: &[u8]) -> Parsed<(Format, Contents)> {
+fn parse(file: &dyn ReadAt) -> Parsed<(Format, Contents)> {
     /// First bytes that tell what a file is when it is none that can be read, with what to do.
     const STRANGERS: [(&[u8], &str); 5] = [
         (
@@ -189,19 +254,27 @@ fn parse(file: &[u8]) -> Parsed<(Format, Contents)> {
         (b"GGUF", "is a GGUF file; a .safetensors file or a checkpoint of PyTorch is needed"),
         (b"\x89HDF", "is an HDF5 file; a .safetensors file or a checkpoint of PyTorch is needed"),
     ];
-    if file.is_empty() {
+    if file.len() == 0 {
         return Err("is empty; was it being downloaded or copied? get it again".into());
     }
-    if file.starts_with(b"PK\x03\x04") || file.starts_with(b"PK\x05\x06") {
+    let start = stored::part(file, 0..file.len().min(START)).map_err(|e| unreadable(&e))?;
+    if start.starts_with(b"PK\x03\x04") || start.starts_with(b"PK\x05\x06") {
         return Ok((Format::PyTorch, pth::read(file)?));
     }
-    if pth::is_legacy(file) {
+    if pth::is_legacy(&start) {
         return Err(pth::LEGACY.into());
     }
-    if let Some((_, what)) = STRANGERS.iter().find(|(start, _)| file.starts_with(start)) {
+    if let Some((_, what)) = STRANGERS.iter().find(|(first, _)| start.starts_with(first)) {
         return Err((*what).into());
     }
     Ok((Format::Safetensors, safetensors::read(file)?))
+}
+
+/// As many bytes as tell what a file is.
+const START: usize = 512;
+
+fn unreadable(e: &io::Error) -> String {
+    format!("cannot be read: {e}; is it still being written or copied?")
 }
 
 /// Cuts `module.` off every name when all have it: a wrapper's prefix, and never the network's own.

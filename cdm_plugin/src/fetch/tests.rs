@@ -319,3 +319,22 @@ fn two_do_not_fetch_one_model() {
     let e = fetch(&s.store, NAME, &FetchOptions::default(), &mut quiet).unwrap_err();
     assert!(e.to_string().contains("another `depthrig cdm fetch`"), "{e}");
 }
+
+/// A server that says no length and sends without end, or says one and sends more.
+#[test]
+fn no_more_is_fetched_than_a_checkpoint_can_have() {
+    let endless = Server::new(|_, _| reply("200 OK", &[], &made_up(4 << 20)));
+    let large = Server::new(|_, _| {
+        reply("200 OK", &[("Content-Length", (1u64 << 60).to_string())], &made_up(1 << 20))
+    });
+    for (server, said) in [(&endless, "without saying how many"), (&large, "1152921504606846976 bytes")] {
+        let Setup { store, .. } = &setup();
+        let options = FetchOptions { max_bytes: 1 << 20, ..options(server) };
+        let e = fetch(store, "cdm-base", &options, &mut |_, _, _| ControlFlow::Continue(())).unwrap_err();
+        assert!(e.kind() == ErrorKind::Network && e.to_string().contains(said), "{e}");
+        assert!(e.to_string().contains("depthrig cdm import"), "{e}");
+        assert_eq!(server.requests().len(), 1, "it is not tried again");
+        let kept = store.dir().join(".downloads/cdm-base.part");
+        assert!(!kept.exists(), "and nothing of it is kept");
+    }
+}

@@ -67,6 +67,11 @@ struct Run {
     parent: u32,
     /// Pixels of the island, right for the run that stands for it.
     pixels: u32,
+    /// The island's first and last column and last row, likewise; its first row is that of the run.
+    left: u32,
+    right: u32,
+    bottom: u32,
+    is_removed: bool,
 }
 
 /// Finds islands: pixels that are connected by sides on one surface.
@@ -82,8 +87,9 @@ impl Islands {
         self.runs.reserve(pixels);
     }
 
-    /// Makes holes of the islands of fewer than `least` pixels.
-    pub(super) fn remove(&mut self, q: &mut [f32], w: usize, least: u32) {
+    /// Makes holes of the islands of fewer than `least` pixels, and of those of fewer than `body` that hang in the air:
+    /// around them so few pixels lie at about their depth that all of these together are no `body` either.
+    pub(super) fn remove(&mut self, q: &mut [f32], w: usize, least: u32, body: u32) {
         self.runs.clear();
         let mut before = 0..0;
         for (y, row) in q.chunks_exact(w).enumerate() {
@@ -95,7 +101,22 @@ impl Islands {
         }
         for i in 0..self.runs.len() {
             let root = self.root(i as u32) as usize;
-            if self.runs[root].pixels < least {
+            let Run { from, to, y, .. } = self.runs[i];
+            let island = &mut self.runs[root];
+            (island.left, island.right) = (island.left.min(from), island.right.max(to));
+            island.bottom = island.bottom.max(y);
+        }
+        // Who is looked at must not depend on who went before.
+        for i in 0..self.runs.len() {
+            let island = self.runs[i];
+            if island.parent as usize == i {
+                let is_small = island.pixels < body;
+                self.runs[i].is_removed = island.pixels < least || is_small && hangs(&island, q, w, body);
+            }
+        }
+        for i in 0..self.runs.len() {
+            let root = self.root(i as u32) as usize;
+            if self.runs[root].is_removed {
                 let Run { from, to, y, .. } = self.runs[i];
                 q[y as usize * w..][from as usize..to as usize].fill(0.0);
             }
@@ -145,6 +166,30 @@ impl Islands {
     }
 }
 
+/// What is within this part of an island's inverse depth may belong to the same thing.
+const ABOUT: f32 = 0.12;
+/// Pixels between those that are looked at around an island.
+const STEP: usize = 3;
+
+/// Whether the pixels at about the depth of `island`, in a window that reaches as far as a body is wide on each side of
+/// it, are fewer than `body`.
+fn hangs(island: &Run, q: &[f32], w: usize, body: u32) -> bool {
+    let reach = 2 * body.isqrt() as usize;
+    let depth = q[island.y as usize * w + island.from as usize];
+    let columns = (island.left as usize).saturating_sub(reach)..(island.right as usize + reach).min(w);
+    let rows =
+        (island.y as usize).saturating_sub(reach)..(island.bottom as usize + 1 + reach).min(q.len() / w);
+    let mut near = 0;
+    for y in rows.step_by(STEP) {
+        let row = &q[y * w..][columns.clone()];
+        near += row.iter().step_by(STEP).filter(|other| (**other - depth).abs() < ABOUT * depth).count();
+        if near * STEP * STEP >= body as usize {
+            return false;
+        }
+    }
+    true
+}
+
 fn find_runs(row: &[f32], y: u32, runs: &mut Vec<Run>) {
     let mut x = 0;
     while x < row.len() {
@@ -158,6 +203,17 @@ fn find_runs(row: &[f32], y: u32, runs: &mut Vec<Run>) {
             x += 1;
         }
         let parent = runs.len() as u32;
-        runs.push(Run { from: from as u32, to: x as u32, y, parent, pixels: (x - from) as u32 });
+        let (from, to) = (from as u32, x as u32);
+        runs.push(Run {
+            from,
+            to,
+            y,
+            parent,
+            pixels: to - from,
+            left: from,
+            right: to,
+            bottom: y,
+            is_removed: false,
+        });
     }
 }

@@ -76,6 +76,56 @@ fn flying_pixels_and_islands_go() {
     assert!(run(w, h, &vec![50; w * h * 3], &depth) == vec![1000; w * h]);
 }
 
+/// A wall at 2.94 m of 640x480 with discs of these columns, rows, radii and depths before or behind it.
+fn with_discs(discs: &[(i32, i32, i32, u16)]) -> Vec<u16> {
+    let mut depth = vec![2940; 640 * 480];
+    for (i, d) in depth.iter_mut().enumerate() {
+        let (x, y) = (i as i32 % 640, i as i32 / 640);
+        for (cx, cy, r, z) in discs {
+            let square = (x - cx).pow(2) + (y - cy).pow(2);
+            if square <= r * r {
+                *d = *z;
+            } else if square <= (r + 6) * (r + 6) {
+                *d = 0; // a shadow
+            }
+        }
+    }
+    depth
+}
+
+#[test]
+fn specks_that_hang_in_the_air_go_and_things_stay() {
+    let grey = vec![90; 640 * 480 * 3];
+    // Near and far ones, of 21 to 197 pixels, together 452 at 0.36 m, but far from each other.
+    let discs =
+        [(100, 100, 5, 360), (300, 80, 7, 360), (500, 300, 3, 360), (200, 350, 4, 6000), (420, 200, 5, 5200)];
+    assert!(run(640, 480, &grey, &with_discs(&discs)) == vec![2940; 640 * 480]);
+    // A hand, and a bump of the wall, are none.
+    for (r, z) in [(14, 360), (5, 2700), (5, 3200)] {
+        let depth = with_discs(&[(320, 240, r, z)]);
+        let out = run(640, 480, &grey, &depth);
+        let kept = depth.iter().zip(&out).filter(|(d, _)| **d == z).all(|(_, o)| *o == z);
+        assert!(kept, "{z} mm, radius {r}");
+    }
+}
+
+#[test]
+fn depth_far_from_what_was_measured_is_unknown() {
+    let (w, h) = (640, 480);
+    // Depth on the left 300 columns; an eighth of 640 is 80.
+    let depth: Vec<u16> = (0..w * h).map(|i| if i % w < 300 { 1000 } else { 0 }).collect();
+    let grey = vec![90; w * h * 3];
+    for (i, d) in run(w, h, &grey, &depth).into_iter().enumerate() {
+        match i % w {
+            0..376 => assert_eq!(d, 1000, "{}, {}", i % w, i / w),
+            388.. => assert_eq!(d, 0, "{}, {}", i % w, i / w),
+            _ => {}
+        }
+    }
+    let mut all = FillRefiner::new(1).unwrap().filling_all();
+    assert!(refined(&mut all, (w, h), &grey, &depth).iter().all(|d| (d - 1.0).abs() < 1e-6));
+}
+
 /// A small generator, so that pictures are the same everywhere.
 struct Rolls(u64);
 
@@ -141,15 +191,18 @@ proptest! {
         prop_assert!(bits(&refined(&mut plain, (w, h), &color, &depth)) == bits(&first), "without AVX2");
     }
 
-    /// Every pixel gets a depth between the nearest and the farthest that was measured, or none has any.
+    /// Every pixel gets a depth between the nearest and the farthest that was measured, or none.
     #[test]
     fn nothing_is_invented_beyond_what_was_measured(seed in any::<u64>(), w in 1usize..90, h in 1usize..70) {
         let (color, depth) = scene(seed, w, h);
         let out = refined(&mut FillRefiner::new(1).unwrap(), (w, h), &color, &depth);
         let seen = depth.iter().filter(|d| **d > 0 && **d < u16::MAX).map(|d| f32::from(*d) * 0.001);
         let (near, far) = seen.fold((f32::MAX, 0.0f32), |(a, b), d| (a.min(d), b.max(d)));
-        let is_none = out.iter().all(|d| *d == 0.0);
-        prop_assert!(is_none || out.iter().all(|d| *d >= near * 0.9999 && *d <= far * 1.0001), "{} to {}", near, far);
+        let is_none = |d: f32| d == 0.0;
+        let is_between = |d: f32| d >= near * 0.9999 && d <= far * 1.0001;
+        prop_assert!(out.iter().all(|d| is_none(*d) || is_between(*d)), "{} to {}", near, far);
+        let all = refined(&mut FillRefiner::new(1).unwrap().filling_all(), (w, h), &color, &depth);
+        prop_assert!(all.iter().all(|d| is_none(*d)) || all.iter().all(|d| is_between(*d)), "{} to {}", near, far);
     }
 
     /// Stride, order of the channels and form of the output change nothing else.
@@ -213,7 +266,7 @@ proptest! {
         let mut fast = q.clone();
         let mut islands = Islands::default();
         islands.reserve(w * h);
-        islands.remove(&mut fast, w, least);
+        islands.remove(&mut fast, w, least, 0);
         let joined = |a: usize, b: usize| {
             // In the order in which the rows are read: the later pixel is the measure.
             let (a, b) = (q[a.min(b)], q[a.max(b)]);

@@ -100,3 +100,19 @@ fn what_goes_in_and_out_is_in_32_bit_floats() {
         }
     }
 }
+
+/// Weights of 2.6 GB stay out of the message, which may have 2 GB.
+#[test]
+fn a_graph_with_its_weights_in_a_file_says_where_each_lies() {
+    let graph = Graph::of(Encoder::Vitl, Style::default());
+    let places: Vec<_> = (0..graph.weights.len()).map(|i| 1000 * i..1000 * i + 8).collect();
+    let bytes = graph.in_file("model.safetensors", &places);
+    assert!(bytes.len() < 2 << 20, "{} bytes", bytes.len());
+    let model = ModelProto::decode(bytes.as_slice()).unwrap();
+    let initializers = model.graph.unwrap().initializer;
+    for (weight, place) in graph.weights.iter().zip(&places) {
+        let found = initializers.iter().find(|t| t.name.as_deref() == Some(&weight.initializer)).unwrap();
+        let said: Vec<_> = found.external_data.iter().filter_map(|e| e.value.clone()).collect();
+        assert_eq!(said, ["model.safetensors".to_owned(), place.start.to_string(), "8".to_owned()]);
+    }
+}

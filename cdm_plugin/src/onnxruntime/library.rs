@@ -9,7 +9,6 @@ use super::device::Device;
 use crate::{Error, ErrorKind, Result};
 use core::ffi::{CStr, c_char, c_void};
 use std::ffi::OsStr;
-use std::fs::File;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
@@ -153,7 +152,7 @@ struct ApiBase {
 /// Whether every part of a 64-bit ELF file that is to be mapped is there.
 fn whole(path: &Path) -> Result<(), &'static str> {
     const CUT: &str = "is cut short";
-    let file = File::open(path).map_err(|_| "cannot be read")?;
+    let file = depthrig_bus::files::open(path).map_err(|_| "cannot be read")?;
     let length = file.metadata().map_err(|_| "cannot be read")?.len();
     let mut head = [0u8; 64];
     file.read_exact_at(&mut head, 0).map_err(|_| CUT)?;

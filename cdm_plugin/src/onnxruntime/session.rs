@@ -11,6 +11,9 @@ use ort::session::Session;
 use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
 use std::path::Path;
 
+/// The setting that names the folder of files with weights (onnxruntime_session_options_config_keys.h).
+const WEIGHTS_FOLDER: &str = "session.model_external_initializers_file_folder_path";
+
 /// Loads `graph` onto `device`. The session must not outlive `weights`.
 ///
 /// # Errors
@@ -29,7 +32,19 @@ pub fn open(
     if let Some(provider) = provider(device, precision, threads) {
         builder = builder.with_execution_providers([provider]).map_err(plain).map_err(error)?;
     }
-    weights.bind(&mut builder).map_err(error)?;
+    if matches!(device, Device::OpenVino(_)) {
+        // Of weights in memory it makes one message, which cannot have more than 2 GB; a file it maps.
+        let file = weights.in_file()?;
+        tracing::debug!(
+            folder = file.folder(),
+            made = file.is_made(),
+            "the engine opens the weights in a file"
+        );
+        let model = graph.in_file(file.name(), file.places());
+        builder = builder.with_config_entry(WEIGHTS_FOLDER, file.folder()).map_err(plain).map_err(error)?;
+        return builder.commit_from_memory(&model).map_err(error);
+    }
+    weights.bind(&mut builder)?.map_err(error)?;
     builder.commit_from_memory(&graph.model).map_err(error)
 }
 
@@ -85,6 +100,8 @@ fn provider(device: &Device, precision: Precision, threads: usize) -> Option<Exe
             .with_device_id(*n as i32)
             .with_fp16(precision == Precision::Fp16)
             .with_bf16(precision == Precision::Bf16)
+            // Weights beside the message with the graph, which cannot have more than 2 GB.
+            .with_arbitrary_config("trt_load_user_initializer", "1")
             .build()
             .error_on_failure(),
         Device::OpenVino(name) => {

@@ -27,3 +27,37 @@ fn too_little_memory_is_told_from_other_failures() {
     }
     assert!(!is_memory("Got invalid dimensions for input: x"));
 }
+
+/// An engine that opens the file finds the numbers that one is given in memory.
+#[test]
+fn weights_in_a_file_are_those_in_memory() {
+    let fixtures = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/torch");
+    let slice = |tensor: &str, rows: core::ops::Range<usize>, shape: &[usize]| crate::onnx::WeightSlice {
+        initializer: format!("{tensor}{rows:?}"),
+        tensor: tensor.into(),
+        rows,
+        shape: shape.to_vec(),
+    };
+    for (file, slices, made) in [
+        ("plain.pth", vec![slice("head.weight", 0..2, &[2, 3]), slice("head.weight", 1..2, &[1, 3])], false),
+        ("halves.pth", vec![slice("half", 1..3, &[2]), slice("double", 0..2, &[2])], true),
+        ("not_contiguous.pth", vec![slice("transposed", 1..3, &[2, 2])], true),
+    ] {
+        let weights = Arc::new(Weights::open(fixtures.join(file)).unwrap());
+        let bound = BoundWeights::new(&weights, &slices).unwrap();
+        let in_file = bound.in_file().unwrap();
+        assert_eq!(in_file.is_made(), made, "{file}");
+        let bytes = std::fs::read(std::path::Path::new(in_file.folder()).join(in_file.name())).unwrap();
+        for (slice, place) in slices.iter().zip(in_file.places()) {
+            let row = slice.shape.iter().skip(1).product::<usize>();
+            let expected =
+                &weights.to_f32(&slice.tensor).unwrap()[slice.rows.start * row..slice.rows.end * row];
+            let numbers: Vec<f32> =
+                bytes[place.clone()].as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
+            assert_eq!(numbers, expected, "{file}: {}", slice.initializer);
+        }
+        let folder = in_file.folder().to_owned();
+        drop(in_file);
+        assert_eq!(std::path::Path::new(&folder).exists(), !made, "what was made is removed");
+    }
+}

@@ -1,23 +1,27 @@
-//! The weights of a model where ONNX Runtime can read them: in the mapped file when they lie there as 32-bit floats.
+//! The weights of a model where ONNX Runtime can read them: in their own file when they lie there as 32-bit floats.
 // Hands addresses of the mapped file to the library.
 #![allow(unsafe_code)]
 
 use crate::onnx::WeightSlice;
-use crate::weights::Dtype;
-use crate::{Error, ErrorKind, Result, Weights};
+use crate::weights::{Dtype, Entry};
+use crate::{Error, ErrorKind, Result, Weights, durable};
 use core::ffi::c_void;
+use core::ops::Range;
+use core::sync::atomic::{AtomicU32, Ordering};
 use ort::AsPointer;
 use ort::memory::MemoryInfo;
 use ort::session::builder::SessionBuilder;
 use ort::value::{Shape, TensorRefMut};
 use std::collections::BTreeMap;
 use std::ffi::CString;
+use std::os::unix::fs::DirBuilderExt as _;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Weights that outlive the session that reads them.
 #[derive(Debug)]
 pub struct BoundWeights {
-    /// Keeps the file mapped.
+    /// Keeps the file open, and mapped where it is read in place.
     weights: Arc<Weights>,
     /// Tensors that do not lie in the file as they are needed: of 16-bit floats, or at an odd address.
     converted: BTreeMap<String, Vec<f32>>,
@@ -39,47 +43,99 @@ impl BoundWeights {
                 Error::new(ErrorKind::BadModel, message)
             };
             let entry = weights.entries().get(name).ok_or_else(|| wrong("is missing"))?;
-            let bytes = weights.bytes(name).ok_or_else(|| wrong("lies beyond the end of the file"))?;
             let rows = entry.shape.first().copied().unwrap_or(0);
             let needed = slice.shape.iter().product::<usize>();
             let there = entry.shape.iter().skip(1).product::<usize>() * slice.rows.len();
             if slice.rows.end > rows || needed != there {
                 return Err(wrong(&format!("has the shape {:?}", entry.shape)));
             }
-            let aligned = bytes.as_ptr().addr().is_multiple_of(align_of::<f32>());
-            let in_place = entry.dtype == Dtype::F32 && aligned;
-            if !in_place && !converted.contains_key(name) {
-                let numbers = weights.to_f32(name).ok_or_else(|| wrong("cannot be read"))?;
-                converted.insert(name.clone(), numbers);
+            if !in_place(entry) && !converted.contains_key(name) {
+                converted.insert(name.clone(), weights.to_f32(name)?);
             }
         }
         Ok(Self { weights: Arc::clone(weights), converted, slices: slices.to_vec() })
     }
 
     /// The numbers of one slice, little-endian 32-bit floats at an even address.
-    fn bytes(&self, slice: &WeightSlice) -> Option<*const u8> {
-        let row = 4 * slice.shape.iter().product::<usize>() / slice.rows.len().max(1);
-        let whole: (*const u8, usize) = if let Some(numbers) = self.converted.get(&slice.tensor) {
-            (numbers.as_ptr().cast(), size_of_val(numbers.as_slice()))
-        } else {
-            let bytes = self.weights.bytes(&slice.tensor)?;
-            (bytes.as_ptr(), bytes.len())
+    fn bytes(&self, slice: &WeightSlice) -> Result<Option<*const u8>> {
+        let rows = rows_of(slice);
+        if let Some(numbers) = self.converted.get(&slice.tensor) {
+            let numbers: &[u8] = bytemuck::cast_slice::<f32, u8>(numbers);
+            return Ok(numbers.get(rows).map(<[u8]>::as_ptr));
+        }
+        let Some(entry) = self.weights.entries().get(&slice.tensor) else { return Ok(None) };
+        let tensor = self.weights.mapped()?.get(entry.bytes.clone());
+        Ok(tensor.and_then(|bytes| bytes.get(rows)).map(<[u8]>::as_ptr))
+    }
+
+    /// Where each slice lies in a file: the weights' own, or, where that does not have them as they are needed, one
+    /// that is made for the time until the session is open.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Io`] when the file is gone, or cannot be made.
+    pub fn in_file(&self) -> Result<WeightsFile> {
+        let path = self.weights.path();
+        // The engine takes names in UTF-8.
+        if !self.converted.is_empty() || path.to_str().is_none() {
+            return self.copied();
+        }
+        let path = path.canonicalize().map_err(|e| {
+            Error::new(ErrorKind::Io, format!("{}: cannot be found again: {e}", path.display()))
+                .with_source(e)
+        })?;
+        let entries = self.weights.entries();
+        let place = |slice: &WeightSlice| {
+            let from = entries.get(&slice.tensor).map_or(0, |e| e.bytes.start);
+            let rows = rows_of(slice);
+            from + rows.start..from + rows.end
         };
-        // `wrapping_add` because only what is read has to be within bounds; it is, see `new`.
-        (slice.rows.end * row <= whole.1).then(|| whole.0.wrapping_add(slice.rows.start * row))
+        let places = self.slices.iter().map(place).collect();
+        Ok(WeightsFile { path, places, temporary: None })
+    }
+
+    fn copied(&self) -> Result<WeightsFile> {
+        let temporary = TemporaryFolder::new()?;
+        let path = temporary.0.join("weights");
+        let mut places = Vec::with_capacity(self.slices.len());
+        let mut at = 0;
+        durable::create(&path, |out| {
+            for slice in &self.slices {
+                let numbers = match self.converted.get(&slice.tensor) {
+                    Some(numbers) => bytemuck::cast_slice::<f32, u8>(numbers).to_vec(),
+                    None => self.weights.read(&slice.tensor).map_err(std::io::Error::other)?,
+                };
+                let part = numbers.get(rows_of(slice)).ok_or(std::io::ErrorKind::InvalidData)?;
+                out.write_all(part)?;
+                places.push(at..at + part.len());
+                at += part.len();
+            }
+            Ok(())
+        })?;
+        Ok(WeightsFile { path, places, temporary: Some(temporary) })
     }
 
     /// Puts the weights in their places in the session that `builder` will make, which must not outlive `self`.
-    pub fn bind(&self, builder: &mut SessionBuilder) -> ort::Result<()> {
+    ///
+    /// # Errors
+    /// [`ErrorKind::Io`] when the file cannot be mapped; inside, those of the library.
+    pub fn bind(&self, builder: &mut SessionBuilder) -> Result<ort::Result<()>> {
+        let mut data = Vec::with_capacity(self.slices.len());
+        for slice in &self.slices {
+            data.push(self.bytes(slice)?);
+        }
+        Ok(self.bind_at(&data, builder))
+    }
+
+    fn bind_at(&self, data: &[Option<*const u8>], builder: &mut SessionBuilder) -> ort::Result<()> {
         let mut names = Vec::with_capacity(self.slices.len());
         let mut values = Vec::with_capacity(self.slices.len());
-        for slice in &self.slices {
+        for (slice, data) in self.slices.iter().zip(data) {
             let missing = || ort::Error::new(format!("no numbers for {}", slice.initializer));
-            let data = self.bytes(slice).ok_or_else(missing)?.cast::<c_void>().cast_mut();
+            let data = data.ok_or_else(missing)?.cast::<c_void>().cast_mut();
             let shape = Shape::new(slice.shape.iter().map(|n| *n as i64));
             names.push(CString::new(slice.initializer.as_str()).map_err(|_| missing())?);
-            // SAFETY: `data` is aligned for 32-bit floats and as many of them as `shape` says follow it, both checked
-            // in `new`; the mapping and the vectors live as long as `self`. The library does not write to
+            // SAFETY: `data` is aligned for 32-bit floats (`in_place`: the mapping begins at a page) and as many of them
+            // as `shape` says follow it (`new`, `bytes`); the mapping and the vectors live as long as `self`. The library does not write to
             // initializers.
             values.push(unsafe { TensorRefMut::<f32>::from_raw(MemoryInfo::default(), data, shape)? });
         }
@@ -95,5 +151,70 @@ impl BoundWeights {
                 names.len(),
             ))
         }
+    }
+}
+
+/// Whether an engine can read the tensor where it lies in its file.
+fn in_place(entry: &Entry) -> bool {
+    let aligned = entry.bytes.start.is_multiple_of(align_of::<f32>());
+    entry.dtype == Dtype::F32 && entry.strides.is_none() && aligned
+}
+
+/// The bytes of a slice within those of its tensor, as 32-bit floats.
+fn rows_of(slice: &WeightSlice) -> Range<usize> {
+    let row = 4 * slice.shape.iter().product::<usize>() / slice.rows.len().max(1);
+    slice.rows.start * row..slice.rows.end * row
+}
+
+/// Weights in a file that an engine opens by its name.
+#[derive(Debug)]
+pub struct WeightsFile {
+    path: PathBuf,
+    places: Vec<Range<usize>>,
+    /// Removed with this; who has mapped the file keeps it.
+    temporary: Option<TemporaryFolder>,
+}
+
+impl WeightsFile {
+    /// The name of the file in its folder.
+    pub fn name(&self) -> &str {
+        self.path.file_name().and_then(|n| n.to_str()).unwrap_or_default()
+    }
+
+    /// The folder.
+    pub fn folder(&self) -> &str {
+        self.path.parent().and_then(Path::to_str).unwrap_or_default()
+    }
+
+    /// Where each slice lies, in the order in which they were given.
+    pub fn places(&self) -> &[Range<usize>] {
+        &self.places
+    }
+
+    /// Whether it was made for this.
+    pub const fn is_made(&self) -> bool {
+        self.temporary.is_some()
+    }
+}
+
+/// A folder that nobody else can enter, removed with this.
+#[derive(Debug)]
+struct TemporaryFolder(PathBuf);
+
+impl TemporaryFolder {
+    fn new() -> Result<Self> {
+        static MADE: AtomicU32 = AtomicU32::new(0);
+        let name = format!("depthrig-{}-{}", std::process::id(), MADE.fetch_add(1, Ordering::Relaxed));
+        let path = std::env::temp_dir().join(name);
+        // Fails where somebody else has put something of that name.
+        let made = std::fs::DirBuilder::new().mode(0o700).create(&path);
+        made.map_err(|e| durable::cannot_write(&path, e))?;
+        Ok(Self(path))
+    }
+}
+
+impl Drop for TemporaryFolder {
+    fn drop(&mut self) {
+        drop(std::fs::remove_dir_all(&self.0)); // what is left is in the folder of temporary files
     }
 }

@@ -6,22 +6,42 @@ use crate::{Color, Error, ErrorKind, Output, RawDepth, Result};
 /// The most patches of an input: 12 times as wide as high at 518. Attention grows with the square of it.
 const MAX_PATCHES: usize = 16384;
 
+/// The longest side of an image in multiples of the shorter one. The network sees the whole image with its shorter side at
+/// the input size: of a strip of 640x3 that would be 24 million pixels for 1920.
+const MAX_ASPECT: usize = 16;
+
+/// Checks the shorter side of the network's input, pixels.
+///
+/// # Errors
+/// [`ErrorKind::BadInput`] with the sizes that can be used.
+pub fn check_input_size(input_size: u32) -> Result<()> {
+    let most = MAX_PATCHES.isqrt() * PATCH;
+    if (PATCH..=most).contains(&(input_size as usize)) {
+        return Ok(());
+    }
+    let message =
+        format!("input size {input_size} is out of range {PATCH}..={most}; the official script uses 518");
+    Err(Error::new(ErrorKind::BadInput, message))
+}
+
 /// Width and height of the network's input for pictures of `picture` (width, height): both scaled alike, so that the
 /// shorter becomes `input_size`, then to the nearest multiple of 14 (halves to the even one), but not below `input_size`.
 ///
 /// The official `Resize(…, keep_aspect_ratio=True, ensure_multiple_of=14, resize_method="lower_bound")`.
 ///
 /// # Errors
-/// [`ErrorKind::BadInput`] for an empty picture, an input size below 14, and a picture so long and narrow that the
-/// network's memory would not hold it.
+/// [`ErrorKind::BadInput`] for an empty picture, an input size that cannot be used, and an image so long and narrow that
+/// the network's time and memory would not do.
 pub fn net_size(picture: (usize, usize), input_size: u32) -> Result<(usize, usize)> {
     let (width, height) = picture;
     if width == 0 || height == 0 {
         return Err(Error::new(ErrorKind::BadInput, format!("a picture of {width}x{height} has no pixels")));
     }
-    if (input_size as usize) < PATCH {
-        let message =
-            format!("an input size of {input_size} is less than one patch; use 14 or more, such as 518");
+    check_input_size(input_size)?;
+    if width.max(height) > MAX_ASPECT.saturating_mul(width.min(height)) {
+        let message = format!(
+            "an image of {width}x{height} is too narrow for the network, which takes at most {MAX_ASPECT}:1; crop it"
+        );
         return Err(Error::new(ErrorKind::BadInput, message));
     }
     let least = f64::from(input_size);

@@ -29,8 +29,10 @@ fn sizes_of_the_network() {
         ((1280, 0), 518, "1280x0"),
         ((640, 480), 13, "13"),
         ((6400, 480), 518, "too large"),
-        ((usize::MAX, 1), 518, "too large"),
-        ((640, 480), u32::MAX, "too large"),
+        ((usize::MAX, 1), 518, "too narrow"),
+        ((640, 3), 112, "640x3 is too narrow"),
+        ((640, 480), u32::MAX, "out of range 14..=1792"),
+        ((640, 480), 4000, "input size 4000 is out of range"),
     ] {
         let error = net_size(picture, input_size).unwrap_err();
         assert!(error.kind() == ErrorKind::BadInput && error.to_string().contains(text), "{error}");

@@ -87,9 +87,13 @@ pub enum Source {
 
 impl Source {
     /// The file of `weights`, all of which is read for its hash.
-    pub fn file(weights: &Weights) -> Self {
+    ///
+    /// # Errors
+    /// [`crate::ErrorKind::Io`] when it cannot be read.
+    pub fn file(weights: &Weights) -> crate::Result<Self> {
         let path = std::path::absolute(weights.path()).unwrap_or_else(|_| weights.path().to_owned());
-        Self::File { path: path.display().to_string(), sha256: weights.sha256(), bytes: weights.file_bytes() }
+        let sha256 = weights.sha256()?;
+        Ok(Self::File { path: path.display().to_string(), sha256, bytes: weights.file_bytes() })
     }
 }
 

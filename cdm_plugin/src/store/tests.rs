@@ -49,12 +49,13 @@ fn a_model_is_installed_listed_used_and_removed() {
     let original = Weights::open(seeded()).unwrap();
     assert_eq!(model.weights.metadata(), original.metadata());
     for name in ["pretrained.pos_embed", "crossAtts.3.out_proj.bias"] {
-        assert_eq!(model.weights.bytes(name), original.bytes(name));
+        assert_eq!(model.weights.read(name).unwrap(), original.read(name).unwrap());
     }
     // Removed while in use: whoever has it keeps it.
     store.remove("demo").unwrap();
     assert!(store.list().unwrap().is_empty());
-    assert_eq!(model.weights.bytes("pretrained.pos_embed"), original.bytes("pretrained.pos_embed"));
+    let [kept, was] = [&model.weights, &original].map(|w| w.read("pretrained.pos_embed").unwrap());
+    assert_eq!(kept, was);
     let e = store.model("demo").unwrap_err();
     assert!(e.kind() == ErrorKind::NotFound && e.to_string().contains("no model demo is installed"), "{e}");
     assert!(e.to_string().contains("(none is)") && e.to_string().contains("cdm import"), "{e}");
@@ -83,7 +84,7 @@ fn a_name_is_taken_once_and_replaced_in_one_step() {
     let again = Import { replace: true, input_size: 308, ..from_file("a") };
     install(&store, again).unwrap();
     assert_eq!((store.get("a").unwrap().input_size, old.input_size), (308, 518));
-    assert!(old.weights.bytes("pretrained.cls_token").is_some_and(|b| b.len() == 4 * 384));
+    assert!(old.weights.read("pretrained.cls_token").is_ok_and(|b| b.len() == 4 * 384));
     let left: Vec<_> = std::fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
     assert_eq!(left.len(), 2, "{left:?}: the model and the lock");
 }
@@ -160,13 +161,14 @@ fn extra_tensors_are_an_error_or_are_written_down() {
             |name: &str| weights::Planned { name: name.into(), dtype: weights::Dtype::F32, shape: vec![1] };
         planned.push(extra("depth_head.extra"));
         weights::write(out, &mut planned, original.metadata(), &mut |t, out| {
-            out.write_all(original.bytes(&t.name).unwrap_or(&[0; 4]))
+            out.write_all(&original.read(&t.name).unwrap_or_else(|_| vec![0; 4]))
         })
     })
     .unwrap();
     let more = Weights::open(&with_more).unwrap();
     let e = store.import(&more, from_file("a"), &mut quiet).unwrap_err();
     assert!(e.to_string().contains("1 not of the network (depth_head.extra"), "{e}");
+    assert!(e.to_string().contains("--drop-extra` installs the model without it"), "{e}");
     let import = Import { drop_extra: true, ..from_file("a") };
     let installed = store.import(&more, import, &mut quiet).unwrap();
     assert_eq!(installed.record.left_out, ["depth_head.extra"]);
@@ -203,4 +205,48 @@ fn bad_names_and_settings_are_refused() {
     let vitl = Import { encoder: Some(Encoder::Vitl), ..from_file("a") };
     assert!(install(&store, vitl).unwrap_err().to_string().contains("vitl was asked for"));
     assert!(store.list().unwrap().is_empty());
+}
+
+/// A mapped file that becomes shorter ends the process with SIGBUS where it is read.
+#[test]
+fn a_checkpoint_that_becomes_shorter_while_it_is_imported_is_an_error() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("shrinking.safetensors");
+    let store = ModelStore::open(Some(&dir.path().join("models"))).unwrap();
+    for step in ["check", "install"] {
+        std::fs::copy(seeded(), &path).unwrap();
+        let weights = Weights::open(&path).unwrap();
+        let half = weights.file_bytes() / 2;
+        let mut shrink = |what: &'static str, _: u64, _: u64| {
+            if what == step {
+                File::options().write(true).open(&path).unwrap().set_len(half).unwrap();
+            }
+            ControlFlow::Continue(())
+        };
+        let e = store.import(&weights, from_file("short"), &mut shrink).unwrap_err();
+        assert!(e.kind() == ErrorKind::Io && e.to_string().contains("became shorter"), "{step}: {e}");
+        assert!(weights.sha256().unwrap_err().to_string().contains("became shorter"));
+        assert!(store.list().unwrap().is_empty(), "{step}: nothing is installed");
+    }
+}
+
+/// As `torch.save` writes them; engines read 32-bit floats in the order of their shape, where they lie.
+#[test]
+fn a_copy_has_every_tensor_in_order_and_in_32_bits_at_most() {
+    let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/torch");
+    let dir = tempfile::tempdir().unwrap();
+    for name in ["halves.pth", "not_contiguous.pth"] {
+        let original = Weights::open(fixtures.join(name)).unwrap();
+        let path = dir.path().join(name);
+        durable::create(&path, |out| {
+            weights::copy(out, &original, |_| true, original.metadata(), &mut |_| true)
+        })
+        .unwrap();
+        let copy = Weights::open(&path).unwrap();
+        for (tensor, entry) in copy.entries() {
+            assert!(entry.strides.is_none() && entry.dtype.bytes() <= 4, "{name}: {tensor}");
+            assert_eq!(copy.to_f32(tensor).unwrap(), original.to_f32(tensor).unwrap(), "{name}: {tensor}");
+        }
+        assert_eq!(copy.entries().len(), original.entries().len());
+    }
 }

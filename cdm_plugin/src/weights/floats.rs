@@ -16,15 +16,13 @@ impl Weights {
             );
             Error::new(ErrorKind::BadModel, message)
         };
-        let (Some(entry), Some(numbers)) = (self.entries().get(name), self.to_f32(name)) else {
-            return Err(refused(format!("there is no tensor {name}")));
-        };
+        let entry = self.entries().get(name).ok_or_else(|| refused(format!("there is no tensor {name}")))?;
         if entry.shape != shape {
             return Err(refused(format!(
                 "the tensor {name} has the shape {:?} and not {shape:?}",
                 entry.shape
             )));
         }
-        Ok(numbers)
+        self.to_f32(name)
     }
 }

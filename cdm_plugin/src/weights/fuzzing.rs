@@ -1,19 +1,20 @@
 //! Ways in for the fuzz targets.
 
-use super::{Contents, parse, pickle, pth};
+use super::{Contents, gathered, parse, pickle, pth};
 
 fn check(file: &[u8], contents: &Contents) -> usize {
     for (name, entry) in &contents.entries {
-        let count: usize = entry.shape.iter().product();
-        let part = file.get(entry.bytes.clone()).map(<[u8]>::len);
-        assert_eq!(part, Some(count * entry.dtype.bytes()), "{name:?} lies outside of its file");
+        let part = file.get(entry.bytes.clone());
+        let part = part.unwrap_or_else(|| panic!("{name:?} lies outside of its file"));
+        let numbers = entry.strides.as_ref().map_or_else(|| part.to_vec(), |s| gathered(part, entry, s));
+        assert_eq!(numbers.len(), entry.count() * entry.dtype.bytes(), "{name:?}");
     }
     contents.entries.len()
 }
 
 /// A file of any kind.
 pub(crate) fn file(bytes: &[u8]) -> usize {
-    parse(bytes).map_or(0, |(_, contents)| check(bytes, &contents))
+    parse(&bytes).map_or(0, |(_, contents)| check(bytes, &contents))
 }
 
 /// A pickle alone.

@@ -121,14 +121,17 @@ impl<'a> Pickle<'a> {
     }
 }
 
+/// Refuses a pickle that is too long to be read.
+pub(super) fn check_size(bytes: usize) -> Parsed<()> {
+    if bytes <= MAX_BYTES {
+        return Ok(());
+    }
+    Err(format!("the list of its tensors has {bytes} bytes; {MAX_BYTES} is the most that is read here"))
+}
+
 /// Reads a pickle.
 pub(super) fn read(bytes: &[u8]) -> Parsed<Pickle<'_>> {
-    if bytes.len() > MAX_BYTES {
-        return Err(format!(
-            "the list of its tensors has {} bytes; {MAX_BYTES} is the most that is read here",
-            bytes.len()
-        ));
-    }
+    check_size(bytes.len())?;
     let mut machine = Machine {
         bytes,
         at: 0,
@@ -484,7 +487,7 @@ fn known_global(module: &str, name: &str) -> Parsed<Global> {
         ("torch", "FloatStorage") => Global::Storage(Float(Dtype::F32)),
         ("torch", "HalfStorage") => Global::Storage(Float(Dtype::F16)),
         ("torch", "BFloat16Storage") => Global::Storage(Float(Dtype::Bf16)),
-        ("torch", "DoubleStorage") => Global::Storage(Other("float64")),
+        ("torch", "DoubleStorage") => Global::Storage(Float(Dtype::F64)),
         ("torch", "LongStorage") => Global::Storage(Other("int64")),
         ("torch", "IntStorage") => Global::Storage(Other("int32")),
         ("torch", "ShortStorage") => Global::Storage(Other("int16")),

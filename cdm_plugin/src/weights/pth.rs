@@ -4,10 +4,11 @@
 //! `NAME/data/KEY` for each storage.
 
 use super::pickle::{self, Element, Pickle, Tensor, Value};
-use super::{Contents, Entry, Parsed, without_module};
+use super::stored::{ReadAt, Stream, part};
+use super::{Contents, Dtype, Entry, Parsed, unreadable, without_module};
 use core::ops::Range;
 use std::collections::HashMap;
-use std::io::Cursor;
+use std::io::BufReader;
 use zip::{CompressionMethod, ZipArchive};
 
 /// What to do about the form that PyTorch had before 1.6.
@@ -16,8 +17,6 @@ pub(super) const LEGACY: &str = "is a checkpoint in the form that PyTorch had be
 
 /// The key that wrapped checkpoints keep their tensors under.
 const WRAPPED: &str = "model";
-/// Characters that the official loader cuts off every name of a wrapped checkpoint: `module.`, which it does not check.
-const CUT: usize = 7;
 /// The largest network has 1214 tensors, and three storages for each with an optimizer.
 const MAX_MEMBERS: usize = 1 << 16;
 
@@ -31,7 +30,7 @@ pub(super) fn is_legacy(file: &[u8]) -> bool {
 }
 
 /// What the file holds.
-pub(super) fn read(file: &[u8]) -> Parsed<Contents> {
+pub(super) fn read(file: &dyn ReadAt) -> Parsed<Contents> {
     let members = members(file)?;
     let list = members.keys().filter_map(|name| Some((name.strip_suffix("data.pkl")?, name)));
     let mut lists: Vec<_> = list.filter(|(folder, _)| folder.matches('/').count() <= 1).collect();
@@ -45,21 +44,26 @@ pub(super) fn read(file: &[u8]) -> Parsed<Contents> {
     if members.contains_key(&format!("{folder}constants.pkl")) {
         return Err("is a TorchScript program; a checkpoint (torch.save of a state dict) is needed".into());
     }
-    let part = |range: &Range<usize>| file.get(range.clone()).unwrap_or_default();
-    if let Some(order) = members.get(&format!("{folder}byteorder")).filter(|m| part(m) != b"little") {
-        let order = String::from_utf8_lossy(part(order)).chars().take(20).collect::<String>();
-        return Err(format!(
-            "its numbers are stored in the byte order {order:?}; only \"little\" is read here"
-        ));
+    if let Some(range) = members.get(&format!("{folder}byteorder")) {
+        let order = part(file, range.start..range.end.min(range.start + 20)).map_err(|e| unreadable(&e))?;
+        if order != b"little" {
+            let order = String::from_utf8_lossy(&order).into_owned();
+            return Err(format!(
+                "its numbers are stored in the byte order {order:?}; only \"little\" is read here"
+            ));
+        }
     }
-    let pickle = pickle::read(members.get(*list).map(part).unwrap_or_default())?;
+    let range = members.get(*list).cloned().unwrap_or_default();
+    pickle::check_size(range.len())?;
+    let list = part(file, range).map_err(|e| unreadable(&e))?;
+    let pickle = pickle::read(&list)?;
     let place = |key: &str| members.get(&format!("{folder}data/{key}")).cloned();
     contents(&pickle, &place)
 }
 
 /// Where each member lies in the file.
-fn members(file: &[u8]) -> Parsed<HashMap<String, Range<usize>>> {
-    let mut zip = ZipArchive::new(Cursor::new(file)).map_err(|e| {
+fn members(file: &dyn ReadAt) -> Parsed<HashMap<String, Range<usize>>> {
+    let mut zip = ZipArchive::new(BufReader::new(Stream::new(file))).map_err(|e| {
         format!(
             "has {} bytes and is no whole zip archive ({e}): it was probably cut short; download or copy it again",
             file.len()
@@ -121,16 +125,12 @@ pub(super) fn contents(
         let Value::Text(key) = pickle.get(*key) else {
             return Err(format!("has a tensor whose name is {}", pickle.get(*key).kind()));
         };
-        let name = if wrapped.is_some() { cut(key) } else { key };
-        if wrapped.is_some() && !key.starts_with("module.") && contents.cut_blindly.is_none() {
-            contents.cut_blindly = Some((*key).to_owned());
-        }
+        let name = *key;
         let twice = match pickle.get(*value) {
             Value::Tensor(tensor) => match tensor.storage.element {
                 Element::Float(dtype) => {
-                    let bytes = bytes_of(tensor, dtype.bytes(), place)
-                        .map_err(|what| format!("its tensor {name:?} {what}"))?;
-                    let entry = Entry { dtype, shape: tensor.shape.clone(), bytes };
+                    let entry =
+                        entry(tensor, dtype, place).map_err(|what| format!("its tensor {name:?} {what}"))?;
                     contents.entries.insert(name.to_owned(), entry).is_some()
                 }
                 Element::Other(of) => {
@@ -147,12 +147,7 @@ pub(super) fn contents(
     if contents.entries.is_empty() {
         return Err(no_tensors(pickle, dict, wrapped.is_some()));
     }
-    Ok(if wrapped.is_some() { contents } else { without_module(contents) })
-}
-
-/// `key` without its first seven characters, as Python's `key[7:]`.
-fn cut(key: &str) -> &str {
-    key.char_indices().nth(CUT).map_or("", |(at, _)| &key[at..])
+    Ok(without_module(contents))
 }
 
 fn no_tensors(pickle: &Pickle<'_>, dict: &[(pickle::Id, pickle::Id)], wrapped: bool) -> String {
@@ -169,32 +164,35 @@ fn no_tensors(pickle: &Pickle<'_>, dict: &[(pickle::Id, pickle::Id)], wrapped: b
     )
 }
 
-/// The bytes of a tensor in the file.
-fn bytes_of(
-    tensor: &Tensor<'_>,
-    size: usize,
-    place: &dyn Fn(&str) -> Option<Range<usize>>,
-) -> Parsed<Range<usize>> {
+/// Where a tensor lies in the file.
+fn entry(tensor: &Tensor<'_>, dtype: Dtype, place: &dyn Fn(&str) -> Option<Range<usize>>) -> Parsed<Entry> {
     let Tensor { storage, offset, shape, strides } = tensor;
     let too_large = || format!("of shape {shape:?} does not fit into its storage; the file is damaged");
     let count = shape.iter().try_fold(1_usize, |n, d| n.checked_mul(*d)).ok_or_else(too_large)?;
+    let mut in_order = true;
     let mut stride = 1_u64;
+    // The place of the last number after the first.
+    let mut last = 0_u64;
     for (n, s) in shape.iter().zip(strides).rev() {
-        if *n > 1 && count > 0 && *s != stride {
-            return Err(format!(
-                "is not contiguous (shape {shape:?}, strides {strides:?}); save it with .contiguous()"
-            ));
-        }
+        in_order &= *n <= 1 || *s == stride;
         stride = stride.saturating_mul(*n as u64);
+        last = last.saturating_add(s.saturating_mul((*n as u64).saturating_sub(1)));
+    }
+    let span = if count == 0 { 0 } else { last.saturating_add(1) };
+    // More numbers than there are places is a tensor that was expanded, and could be of any size.
+    if count as u64 > storage.len {
+        return Err(format!("{}; if PyTorch reads it, save it with .contiguous()", too_large()));
     }
     let member = place(storage.key).ok_or_else(|| {
         let key: String = storage.key.chars().take(60).collect();
         format!("refers to data/{key}, which the file does not have: it is damaged, get it again")
     })?;
-    let end = offset.checked_add(count as u64).filter(|end| *end <= storage.len).ok_or_else(too_large)?;
-    let [from, to] = [*offset, end].map(|n| usize::try_from(n).ok()?.checked_mul(size));
-    match (from, to) {
-        (Some(from), Some(to)) if to <= member.len() => Ok(member.start + from..member.start + to),
-        _ => Err(too_large()),
-    }
+    let end = offset.checked_add(span).filter(|end| *end <= storage.len).ok_or_else(too_large)?;
+    let [from, to] = [*offset, end].map(|n| usize::try_from(n).ok()?.checked_mul(dtype.bytes()));
+    let bytes = match (from, to) {
+        (Some(from), Some(to)) if to <= member.len() => member.start + from..member.start + to,
+        _ => return Err(too_large()),
+    };
+    let out_of_order = (!in_order && count > 0).then(|| strides.iter().map(|s| *s as usize).collect());
+    Ok(Entry { dtype, shape: shape.clone(), bytes, strides: out_of_order })
 }

@@ -3,6 +3,7 @@
 use super::*;
 use proptest::prelude::*;
 use std::io::Write as _;
+use std::path::PathBuf;
 
 fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/torch").join(name)
@@ -52,14 +53,12 @@ fn open_bytes(bytes: &[u8]) -> Result<Weights> {
 }
 
 #[test]
-fn a_wrapped_checkpoint_is_read_as_the_official_loader_does() {
+fn a_wrapped_checkpoint_is_read_with_and_without_the_prefix_of_a_wrapper() {
     let w = open("wrapped.pth");
     assert_eq!(told(&w), [("head.bias", vec![2], count(20, 2)), ("head.weight", vec![2, 3], count(10, 6))]);
-    assert_eq!((w.format(), w.cut_blindly.as_deref(), w.others().len()), (Format::PyTorch, None, 0));
-    // Seven characters go, whatever they are.
+    assert_eq!((w.format(), w.others().len()), (Format::PyTorch, 0));
     let w = open("without_prefix.pth");
-    assert_eq!(w.entries().keys().collect::<Vec<_>>(), ["", "as", "ight"].iter().collect::<Vec<_>>());
-    assert_eq!(w.cut_blindly.as_deref(), Some("head.weight"));
+    assert_eq!(told(&w), told(&open("plain.pth")));
 }
 
 #[test]
@@ -76,15 +75,17 @@ fn plain_state_dicts_keep_their_names() {
 }
 
 #[test]
-fn half_floats_are_widened_and_other_types_are_named() {
+fn other_floats_are_converted_and_other_types_are_named() {
     let w = open("halves.pth");
-    assert_eq!(told(&w), [("brain", vec![4], count(1, 4)), ("half", vec![4], count(1, 4))]);
+    let expected =
+        [("brain", vec![4], count(1, 4)), ("double", vec![2], count(1, 2)), ("half", vec![4], count(1, 4))];
+    assert_eq!(told(&w), expected);
     let others: Vec<_> = w.others().iter().map(|(n, what)| format!("{n}: {what}")).collect();
-    assert_eq!(others, ["double: a tensor of float64, shape [2]", "steps: a tensor of int64, shape []"]);
+    assert_eq!(others, ["steps: a tensor of int64, shape []"]);
 }
 
 #[test]
-fn views_of_one_storage_are_read_and_transposed_ones_refused() {
+fn views_of_one_storage_are_read_in_the_order_of_their_shape() {
     let w = open("views.pth");
     let expected = [
         ("empty", vec![0, 3], vec![]),
@@ -94,8 +95,8 @@ fn views_of_one_storage_are_read_and_transposed_ones_refused() {
         ("whole", vec![4, 3], count(0, 12)),
     ];
     assert_eq!(told(&w), expected);
-    let e = refused("not_contiguous.pth");
-    assert!(e.contains("\"transposed\" is not contiguous (shape [3, 2], strides [1, 3])"), "{e}");
+    let transposed = vec![0.0, 3.0, 1.0, 4.0, 2.0, 5.0];
+    assert_eq!(told(&open("not_contiguous.pth")), [("transposed", vec![3, 2], transposed)]);
 }
 
 #[test]
@@ -182,20 +183,13 @@ fn safetensors_are_read_and_their_size_is_told() {
 fn a_checkpoint_cut_anywhere_is_an_error() {
     let whole = std::fs::read(fixture("wrapped.pth")).unwrap();
     for len in 0..whole.len() {
-        assert!(parse(&whole[..len]).is_err(), "{len} of {} bytes", whole.len());
+        assert!(parse(&&whole[..len]).is_err(), "{len} of {} bytes", whole.len());
     }
 }
 
 /// Reads whatever it is, and uses what comes out.
 fn survive(bytes: &[u8]) -> bool {
-    let Ok((_, contents)) = parse(bytes) else { return false };
-    for (name, entry) in &contents.entries {
-        let part =
-            bytes.get(entry.bytes.clone()).unwrap_or_else(|| panic!("{name} lies outside of the file"));
-        let count: usize = entry.shape.iter().product();
-        assert_eq!(part.len(), count * entry.dtype.bytes(), "{name}");
-    }
-    true
+    fuzzing::file(bytes) > 0
 }
 
 proptest! {
@@ -214,7 +208,7 @@ proptest! {
             let at = at.index(bytes.len());
             bytes[at] = to;
         }
-        survive(&bytes);
+        let _ = survive(&bytes);
     }
 
     #[test]

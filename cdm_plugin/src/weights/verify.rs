@@ -99,11 +99,10 @@ impl Report {
             self.encoder,
             self.summary()
         );
-        if let Some(name) = weights.cut_blindly.as_ref().filter(|_| !self.missing.is_empty()) {
-            let _ = write!(
-                message,
-                ". Its tensors lie under \"model\", where the official loader cuts seven characters (\"module.\") off every \
-                 name, and {name:?} does not begin with them; save the state dict without \"model\" around it"
+        if self.is_good_but_for_extra() {
+            message.push_str(
+                ". The official code ignores what it does not know; `depthrig cdm import FILE --drop-extra` installs the \
+                 model without it",
             );
         }
         Error::new(ErrorKind::BadModel, message)
@@ -155,11 +154,20 @@ fn good(weights: &Weights, report: &Report) -> Result<Encoder> {
 pub fn examine(weights: &Weights, encoder: Option<Encoder>) -> Result<Report> {
     let mut report = examine_names(weights, encoder)?;
     let entries: Vec<_> = weights.entries().iter().collect();
-    let found = entries.par_iter().filter_map(|(name, entry)| {
-        let (nan, infinite) = not_finite(weights.bytes(name)?, entry.dtype);
-        (nan + infinite > 0).then(|| NotFinite { name: (*name).clone(), nan, infinite })
+    let found = entries.par_iter().map(|(name, entry)| -> Result<Option<NotFinite>> {
+        let (nan, infinite) = match entry.dtype {
+            // As the network will have them: what does not fit into 32 bits is infinite there.
+            Dtype::F64 => {
+                let numbers = weights.to_f32(name)?;
+                let nan = numbers.iter().filter(|n| n.is_nan()).count() as u64;
+                (nan, numbers.iter().filter(|n| n.is_infinite()).count() as u64)
+            }
+            stored => not_finite(&weights.read(name)?, stored),
+        };
+        Ok((nan + infinite > 0).then(|| NotFinite { name: (*name).clone(), nan, infinite }))
     });
-    report.not_finite = found.collect();
+    let found: Result<Vec<_>> = found.collect();
+    report.not_finite = found?.into_iter().flatten().collect();
     Ok(report)
 }
 
@@ -240,6 +248,7 @@ fn not_finite(bytes: &[u8], dtype: Dtype) -> (u64, u64) {
     let wide = bytes.chunks_exact(4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
     let narrow = bytes.chunks_exact(2).map(|b| u32::from(u16::from_le_bytes([b[0], b[1]])));
     match dtype {
+        Dtype::F64 => (0, 0),
         Dtype::F32 => count(wide, 0x7f80_0000, 0x007f_ffff),
         Dtype::F16 => count(narrow, 0x7c00, 0x03ff),
         Dtype::Bf16 => count(narrow, 0x7f80, 0x007f),

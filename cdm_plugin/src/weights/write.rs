@@ -50,6 +50,14 @@ pub(crate) fn write(
     tensors.iter().try_for_each(|tensor| fill(tensor, out))
 }
 
+/// What numbers are stored as in a copy. Engines compute with 32 bits at the most, and read those where they lie.
+pub(crate) const fn kept_as(dtype: Dtype) -> Dtype {
+    match dtype {
+        Dtype::F64 => Dtype::F32,
+        other => other,
+    }
+}
+
 /// Writes the tensors of `weights` that `keep` wants.
 ///
 /// # Errors
@@ -62,14 +70,22 @@ pub(crate) fn copy(
     go_on: &mut dyn FnMut(u64) -> bool,
 ) -> io::Result<()> {
     let entries = weights.entries().iter().filter(|(name, _)| keep(name));
-    let planned =
-        entries.map(|(name, e)| Planned { name: name.clone(), dtype: e.dtype, shape: e.shape.clone() });
+    let planned = entries.map(|(name, e)| Planned {
+        name: name.clone(),
+        dtype: kept_as(e.dtype),
+        shape: e.shape.clone(),
+    });
     let mut planned: Vec<_> = planned.collect();
     let mut done = 0;
     write(out, &mut planned, metadata, &mut |tensor, out| {
-        let bytes = weights.bytes(&tensor.name).unwrap_or_default();
+        let bytes = if weights.entries().get(&tensor.name).is_some_and(|e| e.dtype == tensor.dtype) {
+            weights.read(&tensor.name)
+        } else {
+            weights.to_f32(&tensor.name).map(|n| n.iter().flat_map(|n| n.to_le_bytes()).collect())
+        };
+        let bytes = bytes.map_err(io::Error::other)?;
         done += bytes.len() as u64;
-        out.write_all(bytes)?;
+        out.write_all(&bytes)?;
         if go_on(done) { Ok(()) } else { Err(io::ErrorKind::Interrupted.into()) }
     })
 }
