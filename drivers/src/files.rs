@@ -12,10 +12,9 @@
 //! checksums. Pictures are decoded once and kept while `cache_mb` lasts; from then on, playing costs one copy
 //! into the sink's memory, and files that are kept may be deleted unnoticed.
 //!
-//! **Pixels** are those of the file: no scaling, no colour management, no rotation by EXIF. PNG is exact; JPEG
-//! decoders differ a little among themselves, and ours is `zune-jpeg` (against libjpeg-turbo, on real pictures with
-//! 4:2:0 colour: 0.1 to 0.2 levels on average, 13 at most). Pictures with an alpha channel or a palette are refused,
-//! because what is under transparent pixels is anybody's guess.
+//! **Pixels** are those of the file: no scaling, no colour management, no rotation by EXIF. PNG is exact; JPEG is decoded
+//! to the pixels that libjpeg-turbo gives, which are those of Pillow and OpenCV. Images with an alpha channel or a
+//! palette are refused, because what is under transparent pixels is anybody's guess.
 //!
 //! **Time**: there is no device clock, and none is pretended. Picture `k` is due at `start + k / rate_hz` on the
 //! host's monotonic clock, and that moment is its capture time, the same for all its streams; hence

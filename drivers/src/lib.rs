@@ -17,6 +17,7 @@ pub mod files;
 #[doc(hidden)]
 pub mod fuzzing;
 mod gate;
+pub mod iio;
 pub mod kinect;
 pub mod libusb;
 pub mod moments;

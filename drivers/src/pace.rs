@@ -1,6 +1,42 @@
 //! Playing pictures that were taken before: when each is due, without accumulating error.
 
+use core::time::Duration;
 use depthrig_bus::HostTime;
+
+/// A player that comes to a frame so much later than it was due did not run meanwhile: its process was stopped, or the computer
+/// slept. A real camera would have gone on, so that time is a gap; a recording that is merely slow to read only plays slower.
+pub(crate) const STOPPED: Duration = Duration::from_secs(1);
+
+/// Tells time in which a player did not run from time in which nobody asked it for a frame, which a recording can wait for.
+#[derive(Debug, Default)]
+pub(crate) struct Attendance {
+    left: Option<HostTime>,
+    /// Time that nobody asked in since the schedule was last looked at, nanoseconds.
+    unasked_ns: i64,
+}
+
+impl Attendance {
+    /// The player is asked for a frame.
+    pub(crate) fn enter(&mut self, now: HostTime) {
+        self.unasked_ns += self.left.take().map_or(0, |left| now.since_ns(left).max(0));
+    }
+
+    /// The player returns to whoever asked it.
+    pub(crate) const fn leave(&mut self, now: HostTime) {
+        self.left = Some(now);
+    }
+
+    /// A frame was handed over: what happened before it makes no later one late.
+    pub(crate) const fn delivered(&mut self) {
+        self.unasked_ns = 0;
+    }
+
+    /// Of `late_ns` those nanoseconds in which the player did not run, if they are a stop; else 0.
+    pub(crate) fn stopped_ns(&self, late_ns: i64) -> i64 {
+        let stopped_ns = late_ns.saturating_sub(self.unasked_ns);
+        if stopped_ns > STOPPED.as_nanos() as i64 { stopped_ns } else { 0 }
+    }
+}
 
 /// When each frame is due: so long after the first as it was taken after it, or on a grid of equal periods.
 pub(crate) struct Pace {
@@ -9,12 +45,27 @@ pub(crate) struct Pace {
     origin: Option<(HostTime, i64)>,
     /// Times that the schedule had to move.
     moved: u64,
+    /// When the player was asked for frames.
+    pub(crate) attendance: Attendance,
+    /// Periods that passed while the player was stopped.
+    missed: u64,
 }
 
 impl Pace {
     /// A schedule of frames at `rate_hz`.
     pub(crate) fn new(rate_hz: f64) -> Self {
-        Self { period_ns: 1e9 / rate_hz, origin: None, moved: 0 }
+        Self {
+            period_ns: 1e9 / rate_hz,
+            origin: None,
+            moved: 0,
+            attendance: Attendance::default(),
+            missed: 0,
+        }
+    }
+
+    /// Frames that a camera would have taken while the player was stopped: what frame numbers are ahead of the pictures.
+    pub(crate) const fn missed(&self) -> u64 {
+        self.missed
     }
 
     /// When frame `k` of a grid is due.
@@ -29,6 +80,17 @@ impl Pace {
         let due = origin.plus_ns(offset_ns.saturating_sub(first));
         if now.since_ns(due) as f64 <= self.period_ns {
             return due;
+        }
+        let stopped_ns = self.attendance.stopped_ns(now.since_ns(due));
+        if stopped_ns > 0 {
+            let periods = (stopped_ns as f64 / self.period_ns).round() as u64;
+            self.missed += periods;
+            self.origin = Some((now, offset_ns));
+            tracing::warn!(
+                "a player did not run for {:.1} s; {periods} frames of that time are counted as lost",
+                stopped_ns as f64 / 1e9
+            );
+            return now;
         }
         self.moved += 1;
         if self.moved.is_power_of_two() {
@@ -78,5 +140,41 @@ mod tests {
         pace.due(0, T0);
         let first = pace.due(1, T0);
         assert_eq!(pace.due(1, first.plus_ns(-1)), first);
+    }
+    /// What a camera would have taken while the process was stopped is missing; what nobody asked for, or what is slow to read, is
+    /// not, and neither is jitter.
+    #[test]
+    fn a_stop_is_a_gap_and_waiting_is_none() {
+        let ms = |n: i64| T0.plus_ns(n * 1_000_000);
+        for (rate_hz, stop_ms) in [(5.0, 2_000), (15.0, 10_000), (30.0, 10_000), (90.0, 1_777)] {
+            let mut pace = Pace::new(rate_hz);
+            pace.attendance.enter(T0);
+            pace.due(0, T0);
+            pace.attendance.delivered();
+            let next = (1000.0 / rate_hz) as i64;
+            pace.due(1, ms(next + stop_ms));
+            let exact = stop_ms as f64 * rate_hz / 1000.0;
+            assert!(
+                (pace.missed() as f64 - exact).abs() <= 1.0,
+                "{rate_hz} Hz: {} of {exact}",
+                pace.missed()
+            );
+        }
+        let mut pace = Pace::new(30.0);
+        pace.attendance.enter(T0);
+        pace.due(0, T0);
+        pace.attendance.delivered();
+        // Nobody asked for ten seconds.
+        pace.attendance.leave(ms(1));
+        pace.attendance.enter(ms(10_001));
+        assert_eq!((pace.due(1, ms(10_001)), pace.missed()), (ms(10_001), 0));
+        pace.attendance.delivered();
+        // Slow to read, time after time.
+        for k in 2..20_u64 {
+            let now = ms(10_001 + 900 * (k as i64 - 1));
+            pace.due(k, now);
+            pace.attendance.delivered();
+        }
+        assert_eq!(pace.missed(), 0);
     }
 }

@@ -10,6 +10,7 @@ mod control;
 mod device;
 mod family;
 mod find;
+mod imu;
 mod kernel;
 pub mod l515;
 mod launch;

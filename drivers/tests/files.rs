@@ -8,7 +8,8 @@ use depthrig_bus::{ClockDomain, Distortion, PixelFormat};
 use depthrig_drivers::capture::{Capture, Session, StopOutcome};
 use depthrig_drivers::files::{EXAMPLE_MANIFEST, FilesBackend, FilesConfig};
 use depthrig_drivers::{Backend, Error, ErrorKind, MemorySink, Poll, Stream, StreamRequest};
-use image::{ExtendedColorType, ImageFormat};
+use image::ExtendedColorType;
+use jpeg_encoder::{ColorType, Encoder};
 use std::fs;
 use std::path::Path;
 use tempfile::TempDir;
@@ -28,8 +29,13 @@ fn pixels(seed: usize, len: usize) -> Vec<u8> {
 }
 
 fn save(path: &Path, w: u32, h: u32, kind: ExtendedColorType, pixels: &[u8]) {
+    if path.extension().is_some_and(|e| e == "jpg") {
+        let kind = if kind == ExtendedColorType::L8 { ColorType::Luma } else { ColorType::Rgb };
+        Encoder::new_file(path, 75).unwrap().encode(pixels, w as u16, h as u16, kind).unwrap();
+        return;
+    }
     // The encoder wants 16-bit pixels in the host's order, which is little-endian wherever tests run.
-    image::save_buffer_with_format(path, pixels, w, h, kind, ImageFormat::from_path(path).unwrap()).unwrap();
+    image::save_buffer(path, pixels, w, h, kind).unwrap();
 }
 
 fn color(dir: &TempDir, name: &str, seed: usize) -> Vec<u8> {
@@ -108,6 +114,23 @@ fn the_documented_example_plays_and_shows_the_defaults() {
     assert_eq!(with_all.serial, "…");
     with_all.serial = info.serial.clone();
     assert_eq!((with_all, profiles_of_all), (info, profiles));
+}
+
+/// docs/files.md is all that a newcomer has: its manifests play, and its long one is the one that is tested above.
+#[test]
+fn the_manifests_of_the_documentation_play() {
+    let page = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/files.md")).unwrap();
+    assert!(page.contains(&format!("```toml\n{EXAMPLE_MANIFEST}```")), "the example is not that of the code");
+    let blocks: Vec<&str> = page.split("```toml\n").skip(1).map(|b| b.split("```").next().unwrap()).collect();
+    assert_eq!(blocks.len(), 2);
+    for block in blocks {
+        let text = block.lines().map(str::trim_start).collect::<Vec<_>>().join("\n");
+        let dir = folder(&text, 3);
+        fs::write(dir.path().join("intrinsics.txt"), "460 0 1.5\n0 461 1\n0 0 1\n").unwrap();
+        let mut sink = MemorySink::default();
+        play(&mut *start(&dir).unwrap_or_else(|e| panic!("{e}:\n{text}")), &mut sink, 3);
+        assert_eq!(sink.frames.len(), 6);
+    }
 }
 
 #[test]
@@ -498,7 +521,7 @@ fn damage_inside_a_png_is_found_when_it_is_played() {
     play(&mut *stream, &mut sink, 1);
     let error = stream.poll(PATIENCE, &mut sink).unwrap_err();
     assert_eq!(error.kind(), ErrorKind::BadInput);
-    assert!(error.to_string().contains("depth_0002.png: the picture is damaged"), "{error}");
+    assert!(error.to_string().contains("depth_0002.png: the image is damaged"), "{error}");
     assert_eq!(sink.frames.len(), 2, "nothing of the broken pair was published");
 }
 

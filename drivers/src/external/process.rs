@@ -5,9 +5,9 @@ use super::{ExternalConfig, Place, log};
 use crate::{Error, ErrorKind, Result};
 use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
-use depthrig_bus::HostTime;
 use depthrig_bus::external::{CAMERA_VARIABLE, RIG_VARIABLE};
 use depthrig_bus::runtime::RUNTIME_DIR_VARIABLE;
+use depthrig_bus::{HostTime, umask};
 use rustix::process::{Pid, Signal, kill_process_group};
 use std::os::unix::process::CommandExt;
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -238,6 +238,8 @@ fn spawn(config: &ExternalConfig, place: &Place) -> std::io::Result<Child> {
     // SAFETY: between fork and exec the closure makes two system calls and neither allocates nor takes a lock; an error
     // without a message allocates nothing either.
     unsafe { command.pre_exec(end_with_daemon) };
+    // It inherits the umask.
+    let _steady = umask::steady();
     command.spawn()
 }
 

@@ -2,7 +2,7 @@
 
 use super::picture::io_error;
 use crate::{Error, ErrorKind, Result};
-use depthrig_bus::{Distortion, Intrinsics, PixelFormat, Pose, StreamName};
+use depthrig_bus::{Distortion, Intrinsics, PixelFormat, Pose, StreamName, files};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use toml::Spanned;
@@ -94,7 +94,7 @@ impl Loaded {
     /// Reads the manifest at `path`, or `camera.toml` in the folder `path`.
     pub(super) fn read(path: &Path) -> Result<Self> {
         let path = if path.is_dir() { path.join("camera.toml") } else { path.to_owned() };
-        let text = std::fs::read_to_string(&path).map_err(|e| {
+        let text = files::read_to_string(&path, files::TEXT_MAX_BYTES).map_err(|e| {
             let error = io_error(&path, e);
             let message =
                 format!("the manifest of the files camera cannot be read: {error}; it is a TOML file");
@@ -157,7 +157,8 @@ impl Loaded {
             }
             (None, Some(file)) => {
                 let path = folder.join(file);
-                let text = std::fs::read_to_string(&path).map_err(|e| io_error(&path, e))?;
+                let text =
+                    files::read_to_string(&path, files::TEXT_MAX_BYTES).map_err(|e| io_error(&path, e))?;
                 parse_matrix(&text)
                     .map_err(|why| Error::new(ErrorKind::BadInput, format!("{}: {why}", path.display())))
             }

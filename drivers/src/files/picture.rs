@@ -2,9 +2,9 @@
 
 use crate::{Error, ErrorKind, Result};
 use core::fmt;
+use depthrig_bus::files;
 use image::ImageDecoder;
-use image::codecs::{jpeg::JpegDecoder, png::PngDecoder};
-use std::fs::File;
+use image::codecs::png::PngDecoder;
 use std::io::{self, BufReader, Cursor, Read, Seek};
 use std::path::Path;
 
@@ -61,38 +61,49 @@ impl fmt::Display for Info {
 
 /// Reads what `path` is from its header and checks that the file does not end early. Pixels stay undecoded.
 pub(crate) fn probe(path: &Path) -> Result<Info> {
-    let file = File::open(path).map_err(|e| io_error(path, e))?;
+    let file = files::open(path).map_err(|e| io_error(path, e))?;
     inspect(BufReader::new(file)).map_err(|bad| bad.into_error(path))
 }
 
 /// Decodes `path` into `pixels`, which has the size that `expected` says; 16-bit pixels as little-endian.
 pub(crate) fn decode(path: &Path, expected: &Info, pixels: &mut [u8]) -> Result<()> {
-    let bytes = std::fs::read(path).map_err(|e| io_error(path, e))?;
+    let bytes = files::read(path, files::IMAGE_MAX_BYTES).map_err(|e| io_error(path, e))?;
     let info = inspect(BufReader::new(Cursor::new(&bytes))).map_err(|bad| bad.into_error(path))?;
     if info != *expected {
         let message =
             format!("{}: it was {expected} when the camera was opened and is {info} now", path.display());
         return Err(Error::new(ErrorKind::BadInput, message + "; leave the folder alone while it plays"));
     }
-    let undecodable = |e: image::ImageError| {
-        let message = format!("{}: the picture is damaged ({e}); write it again", path.display());
-        Error::new(ErrorKind::BadInput, message).with_source(e)
-    };
-    let decoder: Box<dyn ImageDecoder> = if bytes.starts_with(&PNG_SIGNATURE) {
-        Box::new(PngDecoder::new(Cursor::new(&bytes)).map_err(undecodable)?)
-    } else {
-        Box::new(JpegDecoder::new(Cursor::new(&bytes)).map_err(undecodable)?)
-    };
+    if !bytes.starts_with(&PNG_SIGNATURE) {
+        return decode_jpeg(path, &bytes, &info, pixels);
+    }
+    let undecodable = |e: image::ImageError| undecodable(path, &e.to_string()).with_source(e);
+    let decoder = PngDecoder::new(Cursor::new(&bytes)).map_err(undecodable)?;
     if decoder.total_bytes() != pixels.len() as u64 {
         let message =
             format!("{}: the decoder sees other pixels than the header says ({info})", path.display());
         return Err(Error::new(ErrorKind::BadInput, message + "; save it as plain PNG"));
     }
-    decoder.read_image_boxed(pixels).map_err(undecodable)?;
+    decoder.read_image(pixels).map_err(undecodable)?;
     if info.kind == Kind::Grey16 && cfg!(target_endian = "big") {
         pixels.chunks_exact_mut(2).for_each(<[u8]>::reverse);
     }
     Ok(())
+}
+
+fn decode_jpeg(path: &Path, bytes: &[u8], info: &Info, pixels: &mut [u8]) -> Result<()> {
+    let form = match info.kind {
+        Kind::Rgb8 => depthrig_jpeg::Form::Rgb,
+        Kind::Grey8 | Kind::Grey16 => depthrig_jpeg::Form::Grey,
+    };
+    let expected = depthrig_jpeg::Info { width: info.width, height: info.height, form };
+    depthrig_jpeg::decode_into(bytes, expected, pixels)
+        .map_err(|e| undecodable(path, &e.to_string()).with_source(e))
+}
+
+fn undecodable(path: &Path, why: &str) -> Error {
+    let message = format!("{}: the image is damaged ({why}); write it again", path.display());
+    Error::new(ErrorKind::BadInput, message)
 }
 
 /// An input or output error at `path`, with the kind that the supervisor acts on.

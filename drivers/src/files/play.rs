@@ -108,6 +108,15 @@ impl Stream for Player {
     }
 
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
+        self.pace.attendance.enter(HostTime::now());
+        let polled = self.play(timeout, sink);
+        self.pace.attendance.leave(HostTime::now());
+        polled
+    }
+}
+
+impl Player {
+    fn play(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
         if !self.looped && self.next >= self.count as u64 {
             return Ok(Poll::End);
         }
@@ -119,11 +128,13 @@ impl Stream for Player {
         if due > deadline.max(now) {
             return Ok(Poll::Idle);
         }
+        self.pace.attendance.delivered();
         let i = self.picture();
+        let number = self.next + self.pace.missed();
         for track in &mut self.tracks {
             let pixels: &[u8] = track.kept[i].as_deref().unwrap_or(&track.passing);
             let ticks = u64::try_from(due.ns()).unwrap_or(0);
-            let raw = RawFrame::new(self.next, ticks, HostTime::now(), pixels.len());
+            let raw = RawFrame::new(number, ticks, HostTime::now(), pixels.len());
             track.gate.deliver(&raw, sink, |memory| {
                 if memory.len() != pixels.len() {
                     return Err(DropReason::WrongSize);

@@ -1,8 +1,9 @@
 //! The motion unit of a Kinect, attached or recorded, as the stream `imu`.
 //!
 //! **Frame.** Gyroscope and accelerometer have extrinsics of their own in the calibration; that of the gyroscope has no
-//! place, since a turn has none. The unit's frame is the accelerometer's, and where the two are turned against each other
-//! the angular velocity is turned into it; otherwise both are passed on bit by bit.
+//! place, since a rotation has none. The unit's frame is the accelerometer's. Both are passed on bit by bit, each along its
+//! own axes; how the gyroscope's are rotated in the unit's frame is stated where the calibration is, see
+//! [`gyroscope_in_unit`].
 //!
 //! **Time.** A sample's time is the gyroscope's, on the clock that also stamps the pictures, so that `device_time` of both
 //! can be compared. The map to the host's clock is the unit's own: a sample comes tens of milliseconds sooner than a
@@ -18,7 +19,7 @@ use crate::motion::{self, Batcher, Mark};
 use crate::{DeviceClock, FrameSink, Result, StreamProfile};
 use core::time::Duration;
 use depthrig_bus::{ClockDomain, FrameFlags, HostTime, MetadataLevel, MotionSample, Pose};
-use glam::{DMat3, DQuat, DVec3};
+use glam::DQuat;
 
 /// Samples a second.
 pub const RATE_HZ: f64 = 1600.0;
@@ -84,41 +85,67 @@ pub const fn is_plausible(gyroscope_ns: u64, device_us: u64) -> bool {
     gyroscope_ns <= device_us.saturating_mul(1000).saturating_add(60_000_000_000)
 }
 
-/// Numbers samples and brings them into the unit's frame.
+/// The rotation of a gyroscope's axes in its unit's frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GyroscopeRotation {
+    /// Unit quaternion x, y, z, w: `v_unit = q v_gyroscope`.
+    pub xyzw: [f64; 4],
+}
+
+impl core::fmt::Display for GyroscopeRotation {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let degrees = DQuat::from_array(self.xyzw).angle_between(DQuat::IDENTITY).to_degrees();
+        let [x, y, z, w] = self.xyzw;
+        write!(
+            f,
+            "gyro_rad_s is along the gyroscope's own axes, rotated by {degrees:.2} degrees in the unit's frame: \
+             v_unit = q v_gyroscope, q = [{x}, {y}, {z}, {w}] (x, y, z, w)"
+        )
+    }
+}
+
+/// How the gyroscope's axes lie in the unit's frame; `None` where they are its own, or nobody knows.
+pub fn gyroscope_in_unit(calibration: Option<&Calibration>) -> Option<GyroscopeRotation> {
+    let rotation = |p: Pose| DQuat::from_array(p.rotation_xyzw);
+    let calibration = calibration?;
+    let accelerometer = rotation(calibration.accelerometer?.sensor_from_device);
+    let gyroscope = rotation(calibration.gyroscope?.sensor_from_device);
+    let turn = (accelerometer * gyroscope.inverse()).normalize();
+    let differs = turn.angle_between(DQuat::IDENTITY) > SAME_RAD;
+    differs.then(|| GyroscopeRotation { xyzw: turn.to_array() })
+}
+
+/// Where a calibration comes from, `origin`, with the rotation of the gyroscope where there is one.
+pub fn stated(origin: &str, calibration: Option<&Calibration>) -> String {
+    gyroscope_in_unit(calibration).map_or_else(|| origin.to_owned(), |r| format!("{origin}; {r}"))
+}
+
+/// Numbers samples.
 #[derive(Debug, Clone)]
 pub struct Samples {
     counter: FrameCounter,
     last_us: Option<u64>,
-    /// The gyroscope's axes as the accelerometer sees them, if they are others.
-    turn: Option<DMat3>,
+}
+
+impl Default for Samples {
+    fn default() -> Self {
+        Self { counter: FrameCounter::new(PERIOD_US), last_us: None }
+    }
 }
 
 impl Samples {
-    /// Of a device with this calibration.
-    pub fn new(calibration: Option<&Calibration>) -> Self {
-        let turn = calibration.and_then(|c| {
-            let rotation = |p: Pose| DQuat::from_array(p.rotation_xyzw);
-            let (a, g) = (c.accelerometer?.sensor_from_device, c.gyroscope?.sensor_from_device);
-            let turn = rotation(a) * rotation(g).inverse();
-            (turn.angle_between(DQuat::IDENTITY) > SAME_RAD).then(|| DMat3::from_quat(turn.normalize()))
-        });
-        Self { counter: FrameCounter::new(PERIOD_US), last_us: None, turn }
-    }
-
     /// The sample as the bus carries it, all but its time; `None` for one that was there before.
     pub fn take(&mut self, s: &Measured) -> Option<MotionSample> {
         let us = s.gyroscope_ns / 1000;
         if self.last_us.replace(us) == Some(us) {
             return None;
         }
-        let turned =
-            |m: DMat3| (m * DVec3::from_array(s.rotation.map(f64::from))).to_array().map(|v| v as f32);
         let offset_ns = i128::from(s.accelerometer_ns) - i128::from(s.gyroscope_ns);
         Some(MotionSample {
             device_time: us,
             sequence: self.counter.number(us),
             accel_offset_ns: offset_ns.clamp(i32::MIN.into(), i32::MAX.into()) as i32,
-            gyro_rad_s: self.turn.map_or(s.rotation, turned),
+            gyro_rad_s: s.rotation,
             accel_m_s2: s.acceleration,
             temperature_c: s.temperature_c,
             ..MotionSample::default()
@@ -143,12 +170,7 @@ pub struct Unit {
 
 impl Unit {
     /// As stream number `stream`, which is `profile`, at `speed` times its own pace.
-    pub fn new(
-        stream: usize,
-        profile: &StreamProfile,
-        calibration: Option<&Calibration>,
-        speed: f64,
-    ) -> Self {
+    pub fn new(stream: usize, profile: &StreamProfile, speed: f64) -> Self {
         let period_ns = (PERIOD_US * 1000) as f64 / speed;
         let clock = ClockConfig {
             bunch: BATCH,
@@ -156,7 +178,7 @@ impl Unit {
         };
         Self {
             stream,
-            samples: Samples::new(calibration),
+            samples: Samples::default(),
             batcher: Batcher::new(stream, profile),
             clock: ClockMap::new(clock),
             domain: profile.clock.domain,

@@ -62,7 +62,8 @@ impl CalibrationSource {
                     let what = format!("the Kinect's calibration {} cannot be read: {e}", path.display());
                     Error::new(kind, what).with_source(e)
                 };
-                let text = std::fs::read(path).map_err(failed)?;
+                let text =
+                    depthrig_bus::files::read(path, depthrig_bus::files::TEXT_MAX_BYTES).map_err(failed)?;
                 let named =
                     |e: Error| Error::new(e.kind(), format!("{}: {e}", path.display())).with_source(e);
                 Calibration::parse(&text).map(Some).map_err(named)
@@ -221,8 +222,9 @@ impl PlaybackBackend {
             }
         }
         let profiles = all.iter().map(|(_, p)| p.clone()).collect();
-        let info = info(facts, &config);
-        Ok(RecordedDevice { info, all, profiles, recording, calibration, config })
+        let mut info = info(facts, &config);
+        info.calibration = super::motion::stated(&info.calibration, calibration.as_ref());
+        Ok(RecordedDevice { info, all, profiles, recording, config })
     }
 }
 
@@ -288,7 +290,6 @@ struct RecordedDevice {
     all: Vec<(usize, StreamProfile)>,
     profiles: Vec<StreamProfile>,
     recording: Recording,
-    calibration: Option<Calibration>,
     config: PlaybackConfig,
 }
 
@@ -308,8 +309,7 @@ impl Device for RecordedDevice {
             chosen.iter().filter_map(|p| self.all.iter().find(|(_, a)| a == p).map(|(track, _)| *track));
         let tracks = tracks.collect::<Vec<_>>();
         let is_triggered = self.recording.facts().wired_sync == WiredSync::Subordinate;
-        let Self { recording, calibration, config, .. } = *self;
-        let what = (recording, calibration.as_ref());
-        Ok(Box::new(play::Player::new(name, chosen, &tracks, is_triggered, what, &config)?))
+        let Self { recording, config, .. } = *self;
+        Ok(Box::new(play::Player::new(name, chosen, &tracks, is_triggered, recording, &config)?))
     }
 }

@@ -192,7 +192,7 @@ impl Backend for RealsenseBackend {
             return Err(Error::new(ErrorKind::Disconnected, text));
         }
         opened.transport.check_free()?;
-        let device = RealsenseDevice::new(opened, self.config.clone(), Arc::clone(&self.memory))?;
+        let device = RealsenseDevice::new(opened, self.config.clone(), &self.root, Arc::clone(&self.memory))?;
         Ok(Box::new(device))
     }
 }

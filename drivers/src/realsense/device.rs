@@ -4,15 +4,18 @@ use super::calibration::{Calibration, FACTORY, NONE, View};
 use super::config::RealsenseConfig;
 use super::family::Family;
 use super::find::Found;
+use super::imu::{Unit, choose_imu, separated};
 use super::launch::{Launch, in_camera};
 use super::memory::Memory;
 use super::profiles::{self, Basis};
 use super::protocol::advanced::{self, UnitOrigin};
 use super::protocol::gvd::Gvd;
 use super::protocol::hwm::HardwareMonitor;
+use super::protocol::imu::Place;
 use super::protocol::preset::Preset;
 use super::transport::{Function, Mode, Transport};
 use super::{NAME, options};
+use crate::usb::SysRoot;
 use crate::{Device, DeviceInfo, Error, ErrorKind, Result, Stream, StreamProfile, StreamRequest};
 use std::sync::Arc;
 
@@ -28,6 +31,8 @@ pub(super) struct RealsenseDevice {
     calibration: Option<Calibration>,
     profiles: Vec<StreamProfile>,
     memory: Arc<Memory>,
+    /// The IMU, or why it cannot be read; `None` for a model without one.
+    unit: Option<Result<Unit>>,
 }
 
 /// What a camera says of itself, and the link to it.
@@ -73,7 +78,12 @@ impl RealsenseDevice {
     ///
     /// # Errors
     /// [`ErrorKind::Unsupported`] when it is not calibrated and `config` does not allow that; those of the hardware monitor.
-    pub(super) fn new(mut opened: Opened, config: RealsenseConfig, memory: Arc<Memory>) -> Result<Self> {
+    pub(super) fn new(
+        mut opened: Opened,
+        config: RealsenseConfig,
+        root: &SysRoot,
+        memory: Arc<Memory>,
+    ) -> Result<Self> {
         let label = opened.label();
         let in_camera = |e: Error| Error::new(e.kind(), format!("{label}: {e}")).with_source(e);
         let (model, gvd) = (opened.found.model, &opened.gvd);
@@ -100,10 +110,26 @@ impl RealsenseDevice {
             depth_unit(&mut opened.monitor, &config, model.product, &label).map_err(in_camera)?;
         let modes = opened.transport.modes().to_vec();
         let basis = Basis { model, modes: &modes, calibration: calibration.as_ref(), depth_unit_m };
-        let profiles = profiles::offered(&basis).map_err(in_camera)?;
+        let mut profiles = profiles::offered(&basis).map_err(in_camera)?;
+        let unit = gvd.imu.then(|| {
+            let chip = gvd.accelerometer;
+            Unit::find(
+                root,
+                &opened.found.usb.port,
+                opened.monitor.as_mut(),
+                Place::D4xx,
+                chip,
+                model.product,
+            )
+        });
+        match &unit {
+            Some(Ok(unit)) => profiles.extend(unit.profiles()?),
+            Some(Err(e)) => tracing::info!(camera = %label, "it has no stream imu: {e}"),
+            None => {}
+        }
         let info = opened.info(if calibration.is_some() { FACTORY } else { NONE });
         let Opened { transport, monitor, found, gvd } = opened;
-        Ok(Self { transport, monitor, config, found, gvd, info, modes, calibration, profiles, memory })
+        Ok(Self { transport, monitor, config, found, gvd, info, modes, calibration, profiles, memory, unit })
     }
 
     fn label(&self) -> String {
@@ -168,12 +194,14 @@ impl Device for RealsenseDevice {
     fn start(mut self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
         let label = self.label();
         let in_camera = |e| in_camera(&label, e);
-        let (profiles, plan) = profiles::plan(&label, &self.profiles, &self.modes, requests)?;
+        let asked = separated(&label, requests)?;
+        let imu = choose_imu(&label, &self.profiles, asked.imu.as_ref(), self.unit.take())?;
+        let (profiles, plan) = profiles::plan(&label, &self.profiles, &self.modes, &asked.images)?;
         self.configure(&label, &profiles).map_err(in_camera)?;
         self.warn_of_scaled(&label, &profiles);
         let Self { mut transport, monitor, memory, .. } = *self;
         let family = Family::D4xx;
-        let launch = Launch { family, label: label.clone(), profiles, plan, monitor, memory };
+        let launch = Launch { family, label: label.clone(), profiles, plan, monitor, memory, imu };
         launch.start(transport.as_mut()).map_err(in_camera)
     }
 }
@@ -227,10 +255,12 @@ fn depth_unit(
 }
 
 fn read_preset(path: &std::path::Path) -> Result<Preset> {
-    let text = std::fs::read_to_string(path).map_err(|e| {
-        let kind = if e.kind() == std::io::ErrorKind::NotFound { ErrorKind::BadInput } else { ErrorKind::Io };
-        Error::new(kind, format!("preset {} cannot be read: {e}", path.display())).with_source(e)
-    })?;
+    let text =
+        depthrig_bus::files::read_to_string(path, depthrig_bus::files::TEXT_MAX_BYTES).map_err(|e| {
+            let kind =
+                if e.kind() == std::io::ErrorKind::NotFound { ErrorKind::BadInput } else { ErrorKind::Io };
+            Error::new(kind, format!("preset {} cannot be read: {e}", path.display())).with_source(e)
+        })?;
     Preset::parse(&text)
         .map_err(|e| Error::new(e.kind(), format!("preset {}: {e}", path.display())).with_source(e))
 }

@@ -2,6 +2,7 @@
 
 use super::control::Control;
 use super::family::Family;
+use super::imu::Unit;
 use super::memory::Memory;
 use super::profiles::{self, Plan};
 use super::protocol::hwm::HardwareMonitor;
@@ -19,6 +20,8 @@ pub(super) struct Launch {
     pub(super) plan: Plan,
     pub(super) monitor: Box<dyn HardwareMonitor>,
     pub(super) memory: Arc<Memory>,
+    /// The IMU and the mode that it is to have.
+    pub(super) imu: Option<(Unit, StreamProfile)>,
 }
 
 impl Launch {
@@ -27,10 +30,21 @@ impl Launch {
     /// # Errors
     /// Those of [`Transport::start`].
     pub(super) fn start(self, transport: &mut dyn Transport) -> Result<Box<dyn Stream>> {
-        let Self { family, label, mut profiles, plan, monitor, memory } = self;
+        let Self { family, label, mut profiles, plan, monitor, memory, imu } = self;
+        // The images' place in the list of streams is before that of the IMU.
+        let imu = match imu {
+            Some((unit, profile)) => {
+                if !unit.is_calibrated() {
+                    tracing::warn!(camera = %label, "its IMU is not calibrated; its samples are those of an ideal sensor");
+                }
+                Some((unit.start(profiles.len(), &profile, &label)?, profile))
+            }
+            None => None,
+        };
         let started = transport.start(&plan.modes)?;
         let sources = profiles::granted(&mut profiles, &plan, &started.headers);
-        for p in &profiles {
+        let (imu, imu_profile) = imu.unzip();
+        for p in profiles.iter().chain(&imu_profile) {
             tracing::info!(
                 camera = %label,
                 transport = transport.name(),
@@ -46,9 +60,11 @@ impl Launch {
             frame_bytes: p.frame_bytes(),
         });
         let lanes = lanes.collect();
+        profiles.extend(imu_profile);
         let port = transport.control(Function::Stereo)?;
         let control = Control::spawn(label.clone(), family, monitor, port)?;
-        let parts = Parts { label, pictures: started.pictures, profiles, lanes, sources, control, memory };
+        let parts =
+            Parts { label, pictures: started.pictures, profiles, lanes, sources, control, memory, imu };
         Ok(Box::new(RealsenseStream::new(parts)))
     }
 }

@@ -10,6 +10,7 @@ pub mod firmware;
 pub mod gvd;
 pub mod health;
 pub mod hwm;
+pub mod imu;
 pub mod intrinsics;
 pub mod l515;
 pub mod metadata;

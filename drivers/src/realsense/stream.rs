@@ -2,6 +2,7 @@
 
 use super::account::{Account, Facts, Stamped};
 use super::control::Control;
+use super::imu::Imu;
 use super::memory::Memory;
 use crate::video::{Picture, PictureSource};
 use crate::{Error, ErrorKind, FrameSink, Gate, Poll, RawFrame, Result, Stream, StreamProfile, unpack};
@@ -53,6 +54,7 @@ pub(super) struct Parts {
     pub(super) sources: Vec<Source>,
     pub(super) control: Control,
     pub(super) memory: Arc<Memory>,
+    pub(super) imu: Option<Imu>,
 }
 
 /// A streaming D400.
@@ -65,13 +67,14 @@ pub(super) struct RealsenseStream {
     sources: Vec<Source>,
     control: Control,
     memory: Arc<Memory>,
+    imu: Option<Imu>,
     began: HostTime,
     last_picture: Option<HostTime>,
 }
 
 impl RealsenseStream {
     pub(super) fn new(parts: Parts) -> Self {
-        let Parts { label, pictures, profiles, mut lanes, sources, control, memory } = parts;
+        let Parts { label, pictures, profiles, mut lanes, sources, control, memory, imu } = parts;
         for lane in &mut lanes {
             lane.gate.clock().expect_probes();
         }
@@ -83,6 +86,7 @@ impl RealsenseStream {
             sources,
             control,
             memory,
+            imu,
             began: HostTime::now(),
             last_picture: None,
         }
@@ -95,13 +99,16 @@ impl Stream for RealsenseStream {
     }
 
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
-        let Self { pictures, label, lanes, sources, control, last_picture, .. } = self;
+        let Self { pictures, label, lanes, sources, control, last_picture, imu, .. } = self;
         let Some(running) = pictures.as_mut() else {
             return Err(Error::new(ErrorKind::Disconnected, format!("{label} failed before; open it anew")));
         };
         for probe in control.probes() {
             for lane in lanes.iter_mut() {
                 lane.gate.clock().probe(probe.before, probe.ticks.into(), probe.after);
+            }
+            if let Some(imu) = imu {
+                imu.probe(probe);
             }
         }
         let temperature_c = control.temperature_c();
@@ -126,12 +133,15 @@ impl Stream for RealsenseStream {
         if let Some(e) = failed {
             // Whatever failed, the device is let go at once.
             self.pictures = None;
+            self.imu = None;
             return Err(Error::new(e.kind(), format!("{}: {e}", self.label)).with_source(e));
         }
         if any {
             self.memory.note_picture();
         }
-        Ok(if any { Poll::Frame } else { Poll::Idle })
+        // A batch is no sign that images come.
+        let batch = self.imu.as_mut().is_some_and(|imu| imu.drain(sink));
+        Ok(if any || batch { Poll::Frame } else { Poll::Idle })
     }
 }
 

@@ -4,7 +4,7 @@
 //! moment of a frame set. Everything that pictures are in is made once and goes round.
 
 use super::newest::{ForSet, Newest};
-use super::rows::{self, Rows};
+use super::rows::{self, Corrected, Rows};
 use super::{Descriptions, Geometry, StereoMode, StereoOptions, has_color};
 use crate::moments::Due;
 use crate::{Error, ErrorKind, Result};
@@ -43,6 +43,8 @@ pub(super) struct Raw {
 pub(super) struct Views {
     pub(super) ticket: u64,
     due: Option<Due>,
+    /// How many corrections of the rows went before.
+    pub(super) corrections: u64,
     pub(super) left: Vec<u8>,
     pub(super) right: Vec<u8>,
     /// Empty where the eyes have no colour.
@@ -127,10 +129,13 @@ impl Crew {
         let order = OrderCheck::new(geometry.width, geometry.height)
             .map_err(|e| Error::new(ErrorKind::BadInput, format!("{camera}: {e}")).with_source(e))?;
         let rows = Newest::new(options.every_pair);
-        let look = Rows::new(camera, &geometry, Arc::clone(&rows), &options.notice);
+        let corrected = Arc::new(Corrected::default());
+        let look = Rows::new(camera, &rectifier, &rows, &corrected, options);
         spawn(camera, "rows", move || look.run())?;
         let rectify = Rectify {
             rectifier,
+            corrected,
+            corrections: 0,
             format,
             wants_color: options.modes.iter().any(|m| m.wants_color),
             input: Arc::clone(&raw),
@@ -235,6 +240,9 @@ fn spawn(camera: &str, name: &str, work: impl FnOnce() + Send + 'static) -> Resu
 /// The thread that rectifies.
 struct Rectify {
     rectifier: Rectifier,
+    /// The next one, with rows that were found to be apart put together.
+    corrected: Arc<Corrected>,
+    corrections: u64,
     format: PixelFormat,
     wants_color: bool,
     input: Arc<Newest<Raw>>,
@@ -256,6 +264,10 @@ impl Rectify {
     fn run(mut self) {
         while let Some(raw) = self.input.take() {
             let Some(mut views) = self.free() else { return };
+            if let Some(rectifier) = self.corrected.take() {
+                self.rectifier = rectifier;
+                self.corrections += 1;
+            }
             if let Some(v) = Arc::get_mut(&mut views) {
                 self.fill(&raw, v);
             }
@@ -320,6 +332,7 @@ impl Rectify {
         let pixels = width as usize * height as usize;
         let (r, color) = (&self.rectifier, has_color(self.format));
         (views.ticket, views.due) = (raw.ticket, raw.due);
+        views.corrections = self.corrections;
         views.left.resize(pixels, 0);
         views.right.resize(pixels, 0);
         views.left_rgb.resize(if color { 3 * pixels } else { 0 }, 0);

@@ -596,6 +596,7 @@ fn rows_that_are_apart_are_told_once_there_are_enough_pairs() {
     let told = |shots: &[Shot]| {
         let options = options(vec![StereoMode::preset(Preset::Performance, 0.5, 1)]);
         let notice = Arc::clone(&options.notice);
+        let computed = Arc::clone(&options.computed);
         // Of an earlier start, and no longer true.
         *notice.lock().unwrap() = Some("old".to_owned());
         let mut stream =
@@ -612,6 +613,11 @@ fn rows_that_are_apart_are_told_once_there_are_enough_pairs() {
             assert!(!limit.from_now().is_zero(), "nothing was told");
             std::thread::sleep(Duration::from_millis(5));
         }
+        // Datasets say that rows were moved, and by how much.
+        let all = computed.lock().unwrap();
+        let moved =
+            |d: &depthrig_calib::stereo::Description| d.parameters.matches("rows_moved_px=").count() == 1;
+        assert_eq!(all.values().all(moved), text().is_some(), "{all:?}");
         text()
     };
     let text = told(&[Shot::LowWall(12, 2); 60]).unwrap();

@@ -1,6 +1,7 @@
 //! The synthetic back end: simulated cameras behind the traits of every other one.
 
 use super::config::{FaultKind, SyntheticConfig};
+use super::drawing::Drawing;
 use super::imu::{Batch, Filler};
 use super::pattern::Pattern;
 use super::profiles::Content;
@@ -41,9 +42,21 @@ impl SyntheticBackend {
     /// # Errors
     /// As [`Self::new`].
     pub fn starting_at(configs: Vec<SyntheticConfig>, world_start: HostTime) -> Result<Self> {
+        Self::with_drawing(configs, world_start, None)
+    }
+
+    /// The same with what renders scenes while the cameras stream; without it they wait for their scenes.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn with_drawing(
+        configs: Vec<SyntheticConfig>,
+        world_start: HostTime,
+        drawing: Option<&Arc<Drawing>>,
+    ) -> Result<Self> {
         let mut units: Vec<Arc<Unit>> = Vec::new();
         for config in configs {
-            let unit = Unit::new(config, world_start)?;
+            let unit = Unit::new(config, world_start, drawing.cloned())?;
             if units.iter().any(|u| u.info.serial == unit.info.serial) {
                 let message = format!(
                     "two synthetic cameras have the serial number \"{}\"; give each its own",
@@ -127,6 +140,8 @@ impl Device for SyntheticDevice {
                 Source::Motion(Filler::default())
             } else if config.cheap {
                 Source::Pattern(Pattern::new(config.seed, p.stream.as_str(), p.format, p.width, p.height))
+            } else if let Some(drawing) = &unit.drawing {
+                Source::Pictures(drawing.pictures(config, p)?)
             } else {
                 Source::Pictures(render::pictures(config, p, &|_, _| ())?)
             });

@@ -72,7 +72,7 @@ impl Wanted<'_> {
 impl PictureFile {
     /// Opens `path` if it holds what is wanted; `None` when it does not exist or must be made anew.
     pub(crate) fn open(path: &Path, wanted: &Wanted<'_>) -> Option<Self> {
-        let file = File::open(path).ok()?;
+        let file = depthrig_bus::files::open(path).ok()?;
         if file.metadata().ok()?.len() != wanted.file_bytes() as u64 {
             return None;
         }
@@ -99,11 +99,11 @@ impl PictureFile {
     /// Makes `path` of pictures that `picture(plane, pose)` yields, in that order, and opens it.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] naming the file when it cannot be written.
+    /// [`ErrorKind::Io`] naming the file when it cannot be written, and those of `picture`; no file is left then.
     pub(crate) fn create(
         path: &Path,
         wanted: &Wanted<'_>,
-        mut picture: impl FnMut(u32) -> Vec<Vec<u8>>,
+        mut picture: impl FnMut(u32) -> Result<Vec<Vec<u8>>>,
     ) -> Result<Self> {
         let io = |e: std::io::Error| {
             let what =
@@ -117,13 +117,13 @@ impl PictureFile {
             Error::new(ErrorKind::Io, format!("{what} ({e}); {advice}")).with_source(e)
         };
         if let Some(folder) = path.parent() {
-            std::fs::create_dir_all(folder).map_err(io)?;
+            depthrig_bus::umask::create_dir_all(folder).map_err(io)?;
         }
         let mut temporary = Temporary::beside(path);
         let mut file = File::create(&temporary.path).map_err(io)?;
         let mut sums = vec![0; wanted.pictures()];
         for pose in 0..wanted.poses {
-            for (plane, bytes) in picture(pose).iter().enumerate() {
+            for (plane, bytes) in picture(pose)?.iter().enumerate() {
                 if bytes.len() != wanted.bytes || plane >= wanted.planes as usize {
                     let message = format!("{}: a rendered picture has the wrong size", path.display());
                     return Err(Error::new(ErrorKind::Io, message));
@@ -204,7 +204,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("deep/er/file.pictures");
         assert!(PictureFile::open(&path, &WANTED).is_none());
-        let made = PictureFile::create(&path, &WANTED, picture).unwrap();
+        let made = PictureFile::create(&path, &WANTED, |pose| Ok(picture(pose))).unwrap();
         for pose in 0..3 {
             assert_eq!(made.get(0, pose), picture(pose)[0]);
             assert_eq!(made.get(1, pose), picture(pose)[1]);
@@ -243,7 +243,8 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("in_the_way");
         std::fs::write(&file, b"x").unwrap();
-        let e = PictureFile::create(&file.join("a.pictures"), &WANTED, picture).unwrap_err();
+        let e = PictureFile::create(&file.join("a.pictures"), &WANTED, |pose| Ok(picture(pose)));
+        let e = e.unwrap_err();
         assert!(e.to_string().contains("in_the_way") && e.to_string().contains("cache_dir"), "{e}");
         assert_eq!(e.kind(), ErrorKind::Io);
     }

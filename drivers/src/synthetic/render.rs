@@ -8,10 +8,10 @@ use super::profiles::{Content, default_profiles, model_of};
 use super::scene::World;
 use super::view::{Rays, View};
 use super::{color, depth, motion};
-use crate::{Result, StreamProfile};
+use crate::{Error, ErrorKind, Result, StreamProfile};
 use depthrig_calib::PoseExt;
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// Goes up with every change of what is rendered, so that older caches are not used.
 const RENDER_VERSION: u32 = 2;
@@ -19,17 +19,43 @@ const RENDER_VERSION: u32 = 2;
 /// Says how many of how many pictures are ready.
 pub type Progress<'a> = &'a (dyn Fn(usize, usize) + Sync);
 
+/// A sketch has this many times fewer pixels per row and column: a sixteenth of the work.
+const COARSE: u32 = 4;
+
+/// The pictures of one file: sketches until all are drawn.
+#[derive(Debug, Default)]
+pub(crate) struct Album {
+    /// By plane; empty where nobody looks before the file is there.
+    sketches: Vec<Vec<u8>>,
+    file: OnceLock<PictureFile>,
+}
+
+impl Album {
+    pub(crate) const fn sketched(sketches: Vec<Vec<u8>>) -> Self {
+        Self { sketches, file: OnceLock::new() }
+    }
+
+    /// From now on these are shown.
+    pub(crate) fn finish(&self, file: PictureFile) {
+        // Of two files of one scene either will do.
+        let _ = self.file.set(file);
+    }
+}
+
 /// The pictures of one stream, by pose.
 #[derive(Debug, Clone)]
 pub(crate) struct Pictures {
-    file: Arc<PictureFile>,
+    album: Arc<Album>,
     plane: u32,
 }
 
 impl Pictures {
     /// The picture at `pose`.
     pub(crate) fn get(&self, pose: u32) -> &[u8] {
-        self.file.get(self.plane, pose)
+        match self.album.file.get() {
+            Some(file) => file.get(self.plane, pose),
+            None => self.album.sketches.get(self.plane as usize).map(Vec::as_slice).unwrap_or_default(),
+        }
     }
 }
 
@@ -80,39 +106,121 @@ pub(crate) fn pictures(
     profile: &StreamProfile,
     progress: Progress<'_>,
 ) -> Result<Pictures> {
-    let model = model_of(config)?;
-    let content = Content::of(&profile.stream).unwrap_or(Content::Color);
-    let planes = if content.is_color_view() || !config.truth { 1 } else { 2 };
-    let key = key(config, model, profile, planes);
-    let wanted = Wanted { key: &key, planes, poses: config.poses, bytes: profile.frame_bytes() };
-    let path = path(config, profile, &key);
-    let plane = u32::from(content == Content::DepthTrue);
-    if let Some(file) = PictureFile::open(&path, &wanted) {
-        return Ok(Pictures { file: Arc::new(file), plane });
+    let scene = Scene::new(config, profile)?;
+    let file = match scene.cached() {
+        Some(file) => file,
+        None => scene.draw(progress, &|| true)?,
+    };
+    let album = Album::default();
+    album.finish(file);
+    Ok(scene.pictures(&Arc::new(album)))
+}
+
+/// What a stream shows, and the file where it is kept.
+#[derive(Debug)]
+pub(crate) struct Scene {
+    config: SyntheticConfig,
+    profile: StreamProfile,
+    model: &'static Model,
+    content: Content,
+    planes: u32,
+    key: String,
+    pub(crate) path: PathBuf,
+}
+
+impl Scene {
+    pub(crate) fn new(config: &SyntheticConfig, profile: &StreamProfile) -> Result<Self> {
+        let model = model_of(config)?;
+        let content = Content::of(&profile.stream).unwrap_or(Content::Color);
+        let planes = if content.is_color_view() || !config.truth { 1 } else { 2 };
+        let key = key(config, model, profile, planes);
+        let path = path(config, profile, &key);
+        Ok(Self { config: config.clone(), profile: profile.clone(), model, content, planes, key, path })
     }
-    if path.exists() {
-        tracing::warn!(file = %path.display(), "the render cache of a synthetic camera is damaged and is made anew");
+
+    /// Poses to be rendered.
+    pub(crate) const fn poses(&self) -> usize {
+        self.config.poses as usize
     }
-    let world = World::new();
-    let rays = Rays::new(&profile.intrinsics, profile.width, profile.height);
-    let camera = config.pose_on_mount.compose(&profile.pose_in_device).to_affine();
-    progress(0, config.poses as usize);
-    let file = PictureFile::create(&path, &wanted, |pose| {
-        let view = View::new(&rays, &(motion::mount(pose, config.poses) * camera));
+
+    fn wanted(&self) -> Wanted<'_> {
+        let bytes = self.profile.frame_bytes();
+        Wanted { key: &self.key, planes: self.planes, poses: self.config.poses, bytes }
+    }
+
+    /// The pictures of `album` that this stream shows.
+    pub(crate) fn pictures(&self, album: &Arc<Album>) -> Pictures {
+        Pictures { album: Arc::clone(album), plane: u32::from(self.content == Content::DepthTrue) }
+    }
+
+    pub(crate) fn cached(&self) -> Option<PictureFile> {
+        PictureFile::open(&self.path, &self.wanted())
+    }
+
+    /// Renders every pose into the cache, until `go_on` is false.
+    pub(crate) fn draw(&self, progress: Progress<'_>, go_on: &dyn Fn() -> bool) -> Result<PictureFile> {
+        if self.path.exists() {
+            tracing::warn!(file = %self.path.display(), "the render cache of a synthetic camera is damaged and is made anew");
+        }
+        let Self { profile, config, .. } = self;
+        let rays = Rays::new(&profile.intrinsics, profile.width, profile.height);
+        let world = World::new();
+        progress(0, self.poses());
+        PictureFile::create(&self.path, &self.wanted(), |pose| {
+            if !go_on() {
+                return Err(Error::new(ErrorKind::Io, "rendering was stopped"));
+            }
+            let made = self.render(&world, &rays, pose);
+            progress(pose as usize + 1, config.poses as usize);
+            Ok(made)
+        })
+    }
+
+    /// The first pose from a [`COARSE`]th of the rays per row and column: every plane, in the size of the stream.
+    pub(crate) fn sketch(&self) -> Vec<Vec<u8>> {
+        let p = &self.profile;
+        let small = |n: u32| n.div_ceil(COARSE);
+        let scale = 1.0 / f64::from(COARSE);
+        let mut k = p.intrinsics;
+        (k.fx, k.fy) = (k.fx * scale, k.fy * scale);
+        // Pixel centres are at whole numbers.
+        (k.cx, k.cy) = ((k.cx + 0.5) * scale - 0.5, (k.cy + 0.5) * scale - 0.5);
+        let rays = Rays::new(&k, small(p.width), small(p.height));
+        let planes = self.render(&World::new(), &rays, 0);
+        let pixel = p.frame_bytes() / (p.width as usize * p.height as usize);
+        planes.iter().map(|plane| enlarge(plane, pixel, p.width as usize, p.height as usize)).collect()
+    }
+
+    /// Every plane at `pose`.
+    fn render(&self, world: &World, rays: &Rays, pose: u32) -> Vec<Vec<u8>> {
+        let Self { config, model, .. } = self;
+        let camera = config.pose_on_mount.compose(&self.profile.pose_in_device).to_affine();
+        let view = View::new(rays, &(motion::mount(pose, config.poses) * camera));
         let seed = mix(text_seed(config.seed, &config.serial_or_default()).wrapping_add(u64::from(pose)));
         let bytes = |counts: Vec<u16>| counts.iter().flat_map(|z| z.to_le_bytes()).collect();
-        let made = match content {
-            Content::Color => vec![color::render(&world, &view, model.white, seed)],
-            Content::DepthTrueColor => vec![bytes(depth::truth(&view.cast(&world), model))],
+        match self.content {
+            Content::Color => vec![color::render(world, &view, model.white, seed)],
+            Content::DepthTrueColor => vec![bytes(depth::truth(&view.cast(world), model))],
             Content::Depth | Content::DepthTrue => {
-                let pair = depth::render(&world, &view, model, seed);
-                [pair.sensed, pair.truth].into_iter().take(planes as usize).map(bytes).collect()
+                let pair = depth::render(world, &view, model, seed);
+                [pair.sensed, pair.truth].into_iter().take(self.planes as usize).map(bytes).collect()
             }
-        };
-        progress(pose as usize + 1, config.poses as usize);
-        made
-    })?;
-    Ok(Pictures { file: Arc::new(file), plane })
+        }
+    }
+}
+
+/// Each pixel of `bytes` bytes [`COARSE`] times per row and column, up to this size.
+fn enlarge(small: &[u8], bytes: usize, width: usize, height: usize) -> Vec<u8> {
+    let coarse = COARSE as usize;
+    let small_row = width.div_ceil(coarse) * bytes;
+    let mut large = Vec::with_capacity(width * height * bytes);
+    for y in 0..height {
+        let row = &small[y / coarse * small_row..][..small_row];
+        for x in 0..width {
+            large.extend_from_slice(&row[x / coarse * bytes..][..bytes]);
+        }
+    }
+    large
 }
 
 /// Everything that the pictures depend on, as text.

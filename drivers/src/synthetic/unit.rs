@@ -5,6 +5,7 @@
 //! driver cannot see, which is what tests compare a driver's accounts with.
 
 use super::config::{FaultKind, ScheduledFault, SyntheticConfig};
+use super::drawing::Drawing;
 use super::models::Model;
 use super::profiles::model_of;
 use super::timeline::{Boot, Timeline};
@@ -27,6 +28,8 @@ pub(crate) struct Unit {
     pub(crate) timeline: Timeline,
     /// When the mount began to move; one moment for all cameras of a backend.
     pub(crate) world_start: HostTime,
+    /// Renders what the cache lacks while the unit streams; without it, before.
+    pub(crate) drawing: Option<Arc<Drawing>>,
     state: Mutex<State>,
 }
 
@@ -78,7 +81,11 @@ pub struct SimFrame {
 }
 
 impl Unit {
-    pub(crate) fn new(config: SyntheticConfig, world_start: HostTime) -> Result<Self> {
+    pub(crate) fn new(
+        config: SyntheticConfig,
+        world_start: HostTime,
+        drawing: Option<Arc<Drawing>>,
+    ) -> Result<Self> {
         let model = model_of(&config)?;
         let profiles = super::profiles::profiles(&config)?;
         let info = DeviceInfo {
@@ -100,7 +107,7 @@ impl Unit {
             history: VecDeque::new(),
         };
         let timeline = Timeline::new(&config);
-        Ok(Self { config, model, info, profiles, timeline, world_start, state: Mutex::new(state) })
+        Ok(Self { config, model, info, profiles, timeline, world_start, drawing, state: Mutex::new(state) })
     }
 
     pub(crate) fn state(&self) -> MutexGuard<'_, State> {

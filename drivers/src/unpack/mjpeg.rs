@@ -1,14 +1,10 @@
-//! One picture of Motion JPEG: kept as it came, or decoded to red, green, blue.
+//! One image of Motion JPEG: kept as it came, or decoded to red, green, blue.
 
 use super::count;
 use depthrig_bus::DropReason;
-use image::codecs::jpeg::JpegDecoder;
-use image::{ColorType, ImageDecoder};
-use std::io::Cursor;
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use depthrig_jpeg::{Form, Info, START};
 
-/// Start and end of a JPEG picture (ITU-T T.81, table B.1).
-const START: [u8; 2] = [0xFF, 0xD8];
+/// End of a JPEG image (ITU-T T.81, table B.1).
 const END: [u8; 2] = [0xFF, 0xD9];
 
 /// The picture in what a camera sent: from its start mark to its last end mark. Cameras pad behind it.
@@ -36,56 +32,39 @@ pub fn keep_jpeg(picture: &[u8], to: &mut [u8]) -> Result<(), DropReason> {
     Ok(())
 }
 
-/// Decodes a picture of `width` x `height` pixels into `to`, 3 bytes a pixel.
+/// Decodes an image of `width` x `height` pixels into `to`, 3 bytes a pixel.
 ///
-/// Pictures without Huffman tables are decoded when they are marked as such (`AVI1`), as those of cameras are.
+/// Images without Huffman tables, as those of cameras, are decoded with the standard ones.
 ///
 /// # Errors
 /// [`DropReason::WrongSize`] when it is damaged, of another size, or not in colour.
 pub fn decode_jpeg(picture: &[u8], width: u32, height: u32, to: &mut [u8]) -> Result<(), DropReason> {
-    decode(picture, (width, height), ColorType::Rgb8, to)
+    decode(picture, Info { width, height, form: Form::Rgb }, to)
 }
 
-/// Decodes a grey picture of `width` x `height` pixels into `to`, one byte a pixel.
+/// Decodes a grey image of `width` x `height` pixels into `to`, one byte a pixel.
 ///
 /// # Errors
 /// [`DropReason::WrongSize`] when it is damaged, of another size, or in colour.
 pub fn decode_grey_jpeg(picture: &[u8], width: u32, height: u32, to: &mut [u8]) -> Result<(), DropReason> {
-    decode(picture, (width, height), ColorType::L8, to)
+    decode(picture, Info { width, height, form: Form::Grey }, to)
 }
 
-/// Width and height of a picture, as far as its header says them.
+/// Width and height of an image, as its header has them.
 pub fn jpeg_size(picture: &[u8]) -> Option<(u32, u32)> {
-    let read = || JpegDecoder::new(Cursor::new(picture)).ok().map(|d| d.dimensions());
-    catch_unwind(AssertUnwindSafe(read)).ok().flatten()
+    depthrig_jpeg::info(picture).ok().map(|info| (info.width, info.height))
 }
 
-fn decode(picture: &[u8], size: (u32, u32), color: ColorType, to: &mut [u8]) -> Result<(), DropReason> {
-    // zune-jpeg, which `image` decodes with, has panicked on damaged pictures (0.4.21; none is known for 0.5.15); as does
-    // the reader of datasets, this gives up what it worked on then.
-    let decoded = catch_unwind(AssertUnwindSafe(|| {
-        let decoder = JpegDecoder::new(Cursor::new(picture)).ok()?;
-        let fits = decoder.dimensions() == size
-            && decoder.color_type() == color
-            && decoder.total_bytes() == to.len() as u64;
-        if !fits {
-            return None;
-        }
-        decoder.read_image(to).ok()
-    }));
-    match decoded {
-        Ok(Some(())) => {
-            count(to.len());
-            Ok(())
-        }
-        Ok(None) | Err(_) => Err(DropReason::WrongSize),
-    }
+fn decode(picture: &[u8], expected: Info, to: &mut [u8]) -> Result<(), DropReason> {
+    depthrig_jpeg::decode_into(picture, expected, to).map_err(|_| DropReason::WrongSize)?;
+    count(to.len());
+    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use image::codecs::jpeg::JpegEncoder;
+    use jpeg_encoder::{ColorType, Encoder};
     use proptest::prelude::*;
 
     const SIZE: (u32, u32) = (32, 16);
@@ -93,8 +72,7 @@ mod tests {
     fn picture(color: [u8; 3]) -> Vec<u8> {
         let pixels: Vec<u8> = color.into_iter().cycle().take((SIZE.0 * SIZE.1 * 3) as usize).collect();
         let mut out = Vec::new();
-        let mut encoder = JpegEncoder::new_with_quality(&mut out, 95);
-        encoder.encode(&pixels, SIZE.0, SIZE.1, image::ExtendedColorType::Rgb8).unwrap();
+        Encoder::new(&mut out, 95).encode(&pixels, SIZE.0 as u16, SIZE.1 as u16, ColorType::Rgb).unwrap();
         out
     }
 
@@ -152,8 +130,7 @@ mod tests {
         let mut to = vec![0; 31 * 16 * 3];
         assert_eq!(decode_jpeg(&picture([9; 3]), 31, 16, &mut to), Err(DropReason::WrongSize));
         let mut grey = Vec::new();
-        let mut encoder = JpegEncoder::new(&mut grey);
-        encoder.encode(&[7; 512], SIZE.0, SIZE.1, image::ExtendedColorType::L8).unwrap();
+        Encoder::new(&mut grey, 90).encode(&[7; 512], SIZE.0 as u16, SIZE.1 as u16, ColorType::Luma).unwrap();
         assert_eq!(decoded(&grey), Err(DropReason::WrongSize));
         let mut one = vec![0xA5; 512];
         decode_grey_jpeg(&grey, SIZE.0, SIZE.1, &mut one).unwrap();

@@ -62,6 +62,8 @@ plain!(
     sys::v4l2_capability,
     sys::v4l2_fmtdesc,
     sys::v4l2_format,
+    sys::v4l2_pix_format,
+    sys::v4l2_meta_format,
     sys::v4l2_requestbuffers,
     sys::v4l2_buffer,
     sys::v4l2_query_ext_ctrl,
@@ -156,8 +158,7 @@ pub(super) fn set_pix_format(fd: RawFd, width: u32, height: u32, fourcc: u32) ->
         height,
         pixelformat: fourcc,
         field: sys::v4l2_field_V4L2_FIELD_NONE,
-        // SAFETY: plain C data of the kernel's interface.
-        ..unsafe { mem::zeroed() }
+        ..Plain::zeroed()
     };
     plain_call(fd, vidioc::VIDIOC_S_FMT, &mut f)?;
     // SAFETY: every bit pattern is a value of this member, and `type_` says that it is the one in use.
@@ -175,7 +176,8 @@ pub(super) fn set_pix_format(fd: RawFd, width: u32, height: u32, fourcc: u32) ->
 pub(super) fn set_metadata_format(fd: RawFd, fourcc: u32) -> io::Result<(u32, u32)> {
     let mut f: sys::v4l2_format = Plain::zeroed();
     f.type_ = QueueKind::Metadata as u32;
-    f.fmt.meta = sys::v4l2_meta_format { dataformat: fourcc, buffersize: 0 };
+    // Newer kernels' headers have more members than older ones.
+    f.fmt.meta = sys::v4l2_meta_format { dataformat: fourcc, ..Plain::zeroed() };
     plain_call(fd, vidioc::VIDIOC_S_FMT, &mut f)?;
     // SAFETY: as in `set_pix_format`.
     let m = unsafe { f.fmt.meta };

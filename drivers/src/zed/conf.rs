@@ -114,7 +114,7 @@ impl FactoryCalibration {
             let what = format!("{shown} has {size} bytes; a factory calibration has a few thousand");
             return Err(Error::new(ErrorKind::BadInput, what));
         }
-        let bytes = std::fs::read(path).map_err(unreadable)?;
+        let bytes = depthrig_bus::files::read(path, MAX_FILE_BYTES).map_err(unreadable)?;
         let text = String::from_utf8(bytes).map_err(|e| {
             Error::new(ErrorKind::BadInput, format!("{shown} is no text: {e}")).with_source(e)
         })?;

@@ -1,23 +1,34 @@
 //! Headers that lie, kinds that are refused, and damage anywhere.
 
 use super::*;
-use image::{ExtendedColorType, ImageFormat, write_buffer_with_format};
+use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
+use jpeg_encoder::{ColorType, Encoder};
 use proptest::prelude::*;
 
-fn encode(format: ImageFormat, kind: ExtendedColorType, w: u32, h: u32) -> Vec<u8> {
-    let len = (w * h * u32::from(kind.bits_per_pixel()) / 8) as usize;
-    let pixels: Vec<u8> = (0..len).map(|i| (i * 7 + i / 13) as u8).collect();
-    let mut out = Cursor::new(Vec::new());
-    write_buffer_with_format(&mut out, &pixels, w, h, kind, format).unwrap();
-    out.into_inner()
+fn pixels(len: usize) -> Vec<u8> {
+    (0..len).map(|i| (i * 7 + i / 13) as u8).collect()
+}
+
+fn png_of(kind: ExtendedColorType, w: u32, h: u32) -> Vec<u8> {
+    let mut out = Vec::new();
+    let pixels = pixels((w * h * u32::from(kind.bits_per_pixel()) / 8) as usize);
+    PngEncoder::new(&mut out).write_image(&pixels, w, h, kind).unwrap();
+    out
+}
+
+fn jpeg_of(kind: ColorType, w: u16, h: u16) -> Vec<u8> {
+    let mut out = Vec::new();
+    let pixels = pixels(usize::from(w) * usize::from(h) * if kind == ColorType::Luma { 1 } else { 3 });
+    Encoder::new(&mut out, 75).encode(&pixels, w, h, kind).unwrap();
+    out
 }
 
 fn png() -> Vec<u8> {
-    encode(ImageFormat::Png, ExtendedColorType::Rgb8, 6, 5)
+    png_of(ExtendedColorType::Rgb8, 6, 5)
 }
 
 fn jpeg() -> Vec<u8> {
-    encode(ImageFormat::Jpeg, ExtendedColorType::Rgb8, 24, 16)
+    jpeg_of(ColorType::Rgb, 24, 16)
 }
 
 fn look(bytes: &[u8]) -> Result<Info, String> {
@@ -34,9 +45,9 @@ fn refused(bytes: &[u8], word: &str) {
 fn headers_are_read() {
     assert_eq!(look(&png()), Ok(Info { width: 6, height: 5, kind: Kind::Rgb8 }));
     assert_eq!(look(&jpeg()), Ok(Info { width: 24, height: 16, kind: Kind::Rgb8 }));
-    let deep = encode(ImageFormat::Png, ExtendedColorType::L16, 3, 9);
+    let deep = png_of(ExtendedColorType::L16, 3, 9);
     assert_eq!(look(&deep), Ok(Info { width: 3, height: 9, kind: Kind::Grey16 }));
-    let grey = encode(ImageFormat::Jpeg, ExtendedColorType::L8, 9, 3);
+    let grey = jpeg_of(ColorType::Luma, 9, 3);
     assert_eq!(look(&grey), Ok(Info { width: 9, height: 3, kind: Kind::Grey8 }));
 }
 
@@ -108,7 +119,7 @@ proptest! {
     /// A damaged PNG is never shown: its checksums tell.
     #[test]
     fn damaged_png_data_is_noticed(at in any::<prop::sample::Index>(), bit in 0..8u32) {
-        let whole = encode(ImageFormat::Png, ExtendedColorType::L16, 16, 16);
+        let whole = png_of(ExtendedColorType::L16, 16, 16);
         let start = whole.windows(4).position(|w| w == b"IDAT").unwrap() + 4;
         let end = whole.windows(4).rposition(|w| w == b"IEND").unwrap() - 4;
         let mut file = whole.clone();

@@ -10,6 +10,7 @@ use super::{controls, find::MODEL};
 use crate::kinect::NAME;
 use crate::kinect::calibration::Calibration;
 use crate::kinect::modes::WiredSync;
+use crate::kinect::motion;
 use crate::usb::holder::holders_of;
 use crate::usb::{SysRoot, health, scan};
 use crate::{Backend, Device, DeviceInfo, Error, ErrorKind, Result, Stream, StreamProfile, StreamRequest};
@@ -197,7 +198,6 @@ struct LiveDevice {
     info: DeviceInfo,
     camera: Handle,
     profiles: Vec<StreamProfile>,
-    calibration: Option<Calibration>,
     config: LiveConfig,
     library: &'static Loaded,
 }
@@ -217,7 +217,9 @@ impl LiveDevice {
         let calibration = calibration.ok();
         let profiles = profiles::profiles(&of.config, calibration.as_ref())?;
         let library = library::load(&of.config.places)?;
-        Ok(Box::new(Self { name, info, camera, profiles, calibration, config: of.config.clone(), library }))
+        let calibration = motion::stated(&info.calibration, calibration.as_ref());
+        let info = DeviceInfo { calibration, ..info };
+        Ok(Box::new(Self { name, info, camera, profiles, config: of.config.clone(), library }))
     }
 }
 
@@ -231,7 +233,7 @@ impl Device for LiveDevice {
     }
 
     fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
-        let Self { name, camera, profiles, calibration, config, library, .. } = *self;
+        let Self { name, camera, profiles, config, library, .. } = *self;
         let named = |e: Error| Error::new(e.kind(), format!("{name}: {e}")).with_source(e);
         let plan = profiles::plan(&name, &config, &profiles, requests)?;
         check_jacks(&camera, config.sync).map_err(named)?;
@@ -246,7 +248,7 @@ impl Device for LiveDevice {
         for p in &plan.profiles {
             tracing::info!(camera = %name, library = %library.path.display(), "started {}", p.describe());
         }
-        Ok(Box::new(LiveStream::new(name, camera, plan.profiles, config.sync, calibration.as_ref())))
+        Ok(Box::new(LiveStream::new(name, camera, plan.profiles, config.sync)))
     }
 }
 

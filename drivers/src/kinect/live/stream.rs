@@ -4,7 +4,6 @@
 use super::counter::FrameCounter;
 use super::ffi::image_format;
 use super::handle::{Handle, Image};
-use crate::kinect::Calibration;
 use crate::kinect::modes::WiredSync;
 use crate::kinect::motion::{Measured, Unit};
 use crate::{Error, ErrorKind, FrameSink, Gate, Poll, RawFrame, Result, Stream, StreamProfile, unpack};
@@ -74,21 +73,15 @@ enum Unpack {
 }
 
 impl LiveStream {
-    /// Frames of `profiles` out of `camera`, which was started in their modes and has this calibration.
-    pub(super) fn new(
-        name: String,
-        camera: Handle,
-        profiles: Vec<StreamProfile>,
-        sync: WiredSync,
-        calibration: Option<&Calibration>,
-    ) -> Self {
+    /// Frames of `profiles` out of `camera`, which was started in their modes.
+    pub(super) fn new(name: String, camera: Handle, profiles: Vec<StreamProfile>, sync: WiredSync) -> Self {
         let of = |motion: bool| {
             let all = profiles.iter().enumerate();
             all.filter(move |(_, p)| p.format.is_motion() == motion)
         };
         let lanes = of(false).map(|(i, p)| Lane::new(i, p, sync)).collect();
         let imu = of(true).next().map(|(i, p)| Imu {
-            unit: Unit::new(i, p, calibration, 1.0),
+            unit: Unit::new(i, p, 1.0),
             found: Vec::with_capacity(MOST_SAMPLES),
             is_over: false,
         });
@@ -214,7 +207,8 @@ impl Lane {
             // A picture of another mode.
             (&[][..], self.unpack.whole(self.size) + 1)
         };
-        let mut raw = RawFrame::new(self.counter.number(device_us), device_us, arrival, arrived);
+        let number = self.counter.number_exposed(device_us, image.exposure_us());
+        let mut raw = RawFrame::new(number, device_us, arrival, arrived);
         raw.damaged = bytes.is_none() || image.format() != self.unpack.wire();
         raw.exposure_ns = image.exposure_us().saturating_mul(1000);
         raw.temperature_c = temperature_c;

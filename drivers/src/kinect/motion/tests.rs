@@ -2,6 +2,7 @@ use super::*;
 use crate::MemorySink;
 use crate::kinect::calibration::MotionCalibration;
 use depthrig_bus::MOTION_SAMPLE_BYTES;
+use glam::DVec3;
 
 const TEXT: &[u8] = include_bytes!("../../../../tests/data/kinect_calibration.json");
 
@@ -21,7 +22,7 @@ fn measured(n: u64) -> Measured {
 
 fn unit(speed: f64) -> (Unit, StreamProfile) {
     let p = profile(Some(&calibration()), speed, DeviceClock::microseconds(64), MetadataLevel::Full).unwrap();
-    (Unit::new(0, &p, Some(&calibration()), speed), p)
+    (Unit::new(0, &p, speed), p)
 }
 
 fn out(sink: &MemorySink) -> Vec<MotionSample> {
@@ -106,7 +107,7 @@ fn a_clock_that_is_set_back_ends_nothing() {
 }
 
 #[test]
-fn the_frame_is_the_accelerometers_and_the_gyroscope_is_turned_into_it() {
+fn the_frame_is_the_accelerometers_and_the_rotation_of_the_gyroscope_is_stated() {
     use depthrig_calib::PoseExt as _;
     let mut c = calibration();
     let (a, g) = (c.accelerometer.unwrap(), c.gyroscope.unwrap());
@@ -114,19 +115,22 @@ fn the_frame_is_the_accelerometers_and_the_gyroscope_is_turned_into_it() {
     let at = pose(Some(&c)).transform_point(DVec3::ZERO);
     assert!(a.sensor_from_device.transform_point(at).length() < 1e-12 && at.length() > 0.01);
     assert_eq!(pose(None), Pose::IDENTITY);
-    let sample = measured(3);
-    assert_eq!(Samples::new(Some(&c)).take(&sample).unwrap().gyro_rad_s, sample.rotation, "bit by bit");
+    assert_eq!(gyroscope_in_unit(None), None);
     // The gyroscope is mounted a quarter turn about z from where it was.
     let quarter = Pose {
         rotation_xyzw: DQuat::from_rotation_z(core::f64::consts::FRAC_PI_2).to_array(),
         ..Pose::IDENTITY
     };
     c.gyroscope = Some(MotionCalibration { sensor_from_device: quarter.compose(&g.sensor_from_device) });
-    let turned = Samples::new(Some(&c)).take(&sample).unwrap();
-    let [x, y, z] = sample.rotation;
-    let want = [y, -x, z];
-    assert!(turned.gyro_rad_s.iter().zip(want).all(|(a, b)| (a - b).abs() < 1e-6), "{:?}", turned.gyro_rad_s);
-    assert_eq!(turned.accel_m_s2, sample.acceleration);
+    let stated_rotation = gyroscope_in_unit(Some(&c)).unwrap();
+    let found = DQuat::from_array(stated_rotation.xyzw) * DVec3::new(3.0, 0.5, -0.25);
+    // What the accelerometer's axes see of a rotation about the gyroscope's: back by the quarter turn.
+    let within = DQuat::from_array(a.sensor_from_device.rotation_xyzw)
+        * DQuat::from_array(g.sensor_from_device.rotation_xyzw).inverse();
+    assert!((found - within * DVec3::new(0.5, -3.0, -0.25)).length() < 1e-6, "{found:?}");
+    let words = stated("factory", Some(&c));
+    assert!(words.starts_with("factory; gyro_rad_s is along") && words.contains("90.0"), "{words}");
+    assert_eq!(stated("factory", None), "factory");
     c.accelerometer = None;
     assert_eq!(pose(Some(&c)), c.gyroscope.unwrap().sensor_from_device.inverse());
 }

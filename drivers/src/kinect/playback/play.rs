@@ -3,10 +3,10 @@
 use super::PlaybackConfig;
 use super::ahead::Ahead;
 use super::cursor::{Cursor, Next};
-use crate::kinect::Calibration;
 use crate::kinect::live::counter::FrameCounter;
 use crate::kinect::motion::{self, Measured, Unit, is_plausible};
 use crate::kinect::recording::{Pixels, Recording, motion_samples};
+use crate::pace::Attendance;
 use crate::{FrameSink, Gate, Poll, RawFrame, Result, Stream, StreamProfile, unpack};
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime, PixelFormat};
@@ -77,7 +77,7 @@ impl Player {
         profiles: Vec<StreamProfile>,
         tracks: &[usize],
         is_triggered: bool,
-        (recording, calibration): (Recording, Option<&Calibration>),
+        recording: Recording,
         config: &PlaybackConfig,
     ) -> Result<Self> {
         let flags = if is_triggered { FrameFlags::HARDWARE_TRIGGERED } else { FrameFlags(0) };
@@ -86,7 +86,7 @@ impl Player {
         for (i, (profile, track)) in profiles.iter().zip(tracks).enumerate() {
             if profile.format.is_motion() {
                 let speed = if config.rate.is_finite() { config.rate } else { 1.0 };
-                let unit = Unit::new(i, profile, calibration, speed);
+                let unit = Unit::new(i, profile, speed);
                 let waiting = Vec::with_capacity(2 * MOST_WAITING);
                 motion = Some(Motion { track: *track, unit, waiting, newest_ns: 0 });
                 continue;
@@ -158,7 +158,11 @@ impl Player {
     fn play_motion(&mut self, at_us: u64, n: Option<usize>, now: HostTime, sink: &mut dyn FrameSink) -> bool {
         let (Some(motion), pace) = (&mut self.motion, &self.pace) else { return false };
         let due = motion.waiting.iter().take_while(|m| m.gyroscope_ns / 1000 <= at_us).count();
-        let n = n.unwrap_or(due);
+        let n = n.unwrap_or(due).min(motion.waiting.len());
+        for m in &mut motion.waiting[..n] {
+            m.gyroscope_ns = m.gyroscope_ns.saturating_add(pace.stopped_us * 1000);
+            m.accelerometer_ns = m.accelerometer_ns.saturating_add(pace.stopped_us * 1000);
+        }
         let went = motion.unit.take(
             motion.waiting.get(..n).unwrap_or_default(),
             now,
@@ -204,6 +208,15 @@ impl Stream for Player {
     }
 
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
+        self.pace.attendance.enter(HostTime::now());
+        let polled = self.play(timeout, sink);
+        self.pace.attendance.leave(HostTime::now());
+        polled
+    }
+}
+
+impl Player {
+    fn play(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
         let deadline = HostTime::now().plus(timeout);
         let Some((at_us, event)) = self.peek()? else {
             let went = self.motion.as_mut().is_some_and(|m| m.unit.end(sink));
@@ -218,18 +231,20 @@ impl Stream for Player {
             }
         }
         let now = HostTime::now();
+        self.pace.attendance.delivered();
         if let Event::Motion(n) = event {
             self.play_motion(at_us, Some(n), now, sink);
             return Ok(Poll::Frame);
         }
         self.play_motion(at_us, None, now, sink);
-        let ticks = self.pace.ticks(at_us, now);
+        let device_us = self.pace.device_us(at_us);
+        let ticks = self.pace.ticks(device_us, now);
         if event == Event::Decoded {
             let Some((i, ahead)) = &mut self.ahead else { return Ok(Poll::End) };
             let lane = self.lanes.get_mut(*i);
             ahead.take(|job| {
                 let Some(lane) = lane else { return };
-                lane.deliver(at_us, ticks, now, job.pixels.len(), sink, |to| {
+                lane.deliver(device_us, ticks, now, job.pixels.len(), sink, |to| {
                     job.outcome?;
                     unpack::copy_rows(&job.pixels, to.len(), to.len(), to)
                 });
@@ -241,7 +256,7 @@ impl Stream for Player {
             for lane in self.lanes.iter_mut().filter(|l| l.track == next.block.track) {
                 let how = lane.how;
                 let (data, bytes) = how.measure(data);
-                lane.deliver(at_us, ticks, now, bytes, sink, |to| how.fill(data, to));
+                lane.deliver(device_us, ticks, now, bytes, sink, |to| how.fill(data, to));
             }
         }
         Ok(Poll::Frame)
@@ -251,14 +266,14 @@ impl Stream for Player {
 impl Lane {
     fn deliver(
         &mut self,
-        at_us: u64,
+        device_us: u64,
         ticks: u64,
         now: HostTime,
         bytes: usize,
         sink: &mut dyn FrameSink,
         fill: impl FnOnce(&mut [u8]) -> core::result::Result<(), DropReason>,
     ) {
-        let mut raw = RawFrame::new(self.counter.number(at_us), ticks, now, bytes);
+        let mut raw = RawFrame::new(self.counter.number(device_us), ticks, now, bytes);
         raw.flags = self.flags;
         self.gate.deliver(&raw, sink, fill);
     }
@@ -310,13 +325,25 @@ struct Pace {
     /// A moment, and the time of the frame that is due then.
     origin: Option<(HostTime, u64)>,
     moved: u64,
+    attendance: Attendance,
+    /// Time of the device's clock that passed while the player was stopped, as it would have on a camera.
+    stopped_us: u64,
 }
 
 impl Pace {
     fn new(name: String, rate: f64, profiles: &[StreamProfile]) -> Self {
         let period_ns =
             profiles.iter().map(StreamProfile::period_ns).max().unwrap_or(super::PERIOD_NS) as i64;
-        Self { name, rate, period_ns, first_us: None, origin: None, moved: 0 }
+        Self {
+            name,
+            rate,
+            period_ns,
+            first_us: None,
+            origin: None,
+            moved: 0,
+            attendance: Attendance::default(),
+            stopped_us: 0,
+        }
     }
 
     /// When the frame of `at_us` is due. A host that is more than a period late moves what follows rather than send it
@@ -333,6 +360,17 @@ impl Pace {
         if now.since_ns(due) <= self.period_ns {
             return due;
         }
+        let stopped_ns = self.attendance.stopped_ns(now.since_ns(due));
+        if stopped_ns > 0 {
+            self.stopped_us += (stopped_ns as f64 / 1000.0 * self.rate).round() as u64;
+            self.origin = Some((now, at_us));
+            tracing::warn!(
+                "{}: did not run for {:.1} s; the frames of that time are counted as lost",
+                self.name,
+                stopped_ns as f64 / 1e9
+            );
+            return now;
+        }
         self.moved += 1;
         if self.moved.is_power_of_two() {
             let late_ms = now.since_ns(due) as f64 / 1e6;
@@ -346,7 +384,12 @@ impl Pace {
         now
     }
 
-    /// The device's clock of the frame of `at_us`: stretched when it plays at another rate; that of the host when it
+    /// The device's own time of what the recording has at `at_us`.
+    const fn device_us(&self, at_us: u64) -> u64 {
+        at_us.saturating_add(self.stopped_us)
+    }
+
+    /// The device's clock at `at_us` of the device's time: stretched when it plays at another rate; that of the host when it
     /// plays as fast as it can.
     fn ticks(&self, at_us: u64, now: HostTime) -> u64 {
         if !self.rate.is_finite() {
@@ -368,8 +411,7 @@ mod tests {
     const T0: HostTime = HostTime::from_ns(1_000_000_000);
 
     fn pace(rate: f64) -> Pace {
-        let (name, moved) = (String::new(), 0);
-        Pace { name, rate, period_ns: 33_333_333, first_us: None, origin: None, moved }
+        Pace { period_ns: 33_333_333, ..Pace::new(String::new(), rate, &[]) }
     }
 
     #[test]
@@ -399,6 +441,25 @@ mod tests {
         let late = T0.plus_ns(500_000_000);
         assert_eq!(p.due(33_333, late), late);
         assert_eq!(p.due(66_666, late), late.plus_ns(33_333_000));
-        assert_eq!(p.moved, 1);
+        assert_eq!((p.moved, p.stopped_us), (1, 0));
+    }
+
+    /// The device's clock goes on while the process is stopped, at every rate, so that frames are numbered and timed as those of
+    /// an attached camera.
+    #[test]
+    fn a_stopped_process_is_a_gap_in_the_devices_time() {
+        for rate in [1.0, 2.0, 0.5] {
+            let mut p = pace(rate);
+            let mut counter = FrameCounter::new(33_333);
+            p.due(0, T0);
+            assert_eq!(counter.number(p.device_us(0)), 0);
+            let now = T0.plus_ns(10_000_000_000);
+            p.due(33_333, now);
+            let exact = 10e6 * rate / 33_333.0;
+            let number = counter.number(p.device_us(33_333));
+            assert!((number as f64 - exact).abs() <= 1.0, "{rate}: {number} of {exact}");
+            let passed = p.ticks(p.device_us(33_333), now) - p.ticks(0, now);
+            assert!(passed.abs_diff(10_000_000) <= 2, "{rate}: {passed}");
+        }
     }
 }

@@ -55,11 +55,8 @@ pub(super) fn open(path: &Path) -> Result<Box<dyn ReadAt>> {
         };
         Error::new(kind, format!("the recording {} cannot be opened: {e}", path.display())).with_source(e)
     };
-    let file = File::open(path).map_err(failed)?;
+    let file = depthrig_bus::files::open(path).map_err(failed)?;
     let facts = file.metadata().map_err(failed)?;
-    if facts.is_dir() {
-        return Err(failed(io::Error::from(io::ErrorKind::IsADirectory)));
-    }
     // It is read once, from front to back; the kernel may read ahead further than it would.
     let _ = rustix::fs::fadvise(&file, 0, None, rustix::fs::Advice::Sequential);
     Ok(Box::new(FileSource { file, size: facts.len() }))

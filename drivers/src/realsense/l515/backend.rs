@@ -98,6 +98,6 @@ impl Backend for L515Backend {
     fn open(&self, serial: Option<&str>) -> Result<Box<dyn Device>> {
         let mut opened = self.find(serial)?;
         opened.transport.check_free()?;
-        Ok(Box::new(L515Device::new(opened, self.config.clone(), Arc::clone(&self.memory))?))
+        Ok(Box::new(L515Device::new(opened, self.config.clone(), &self.root, Arc::clone(&self.memory))?))
     }
 }

@@ -5,13 +5,16 @@ use super::{L515Config, NAME};
 use crate::realsense::calibration::{FACTORY, NONE};
 use crate::realsense::family::Family;
 use crate::realsense::find::Found;
+use crate::realsense::imu::{Unit, choose_imu, separated};
 use crate::realsense::launch::{Launch, in_camera};
 use crate::realsense::memory::Memory;
 use crate::realsense::options;
 use crate::realsense::protocol::gvd::L515Gvd;
 use crate::realsense::protocol::hwm::HardwareMonitor;
+use crate::realsense::protocol::imu::Place;
 use crate::realsense::protocol::l515::Control;
 use crate::realsense::transport::{Function, Mode, Transport};
+use crate::usb::SysRoot;
 use crate::{Device, DeviceInfo, Error, ErrorKind, Result, Stream, StreamProfile, StreamRequest};
 use std::sync::Arc;
 
@@ -68,6 +71,8 @@ pub(super) struct L515Device {
     modes: Vec<Mode>,
     profiles: Vec<StreamProfile>,
     memory: Arc<Memory>,
+    /// The IMU, or why it cannot be read.
+    unit: Result<Unit>,
 }
 
 impl L515Device {
@@ -76,14 +81,26 @@ impl L515Device {
     /// # Errors
     /// [`ErrorKind::Unsupported`] when it is not calibrated; [`ErrorKind::Protocol`] when its tables are damaged; those
     /// of the hardware monitor.
-    pub(super) fn new(mut opened: Opened, config: L515Config, memory: Arc<Memory>) -> Result<Self> {
+    pub(super) fn new(
+        mut opened: Opened,
+        config: L515Config,
+        root: &SysRoot,
+        memory: Arc<Memory>,
+    ) -> Result<Self> {
         let label = opened.label();
         let in_camera = |e: Error| Error::new(e.kind(), format!("{label}: {e}")).with_source(e);
         let tables = Tables::read(&mut opened.monitor).map_err(in_camera)?;
         let modes = opened.transport.modes().to_vec();
-        let profiles = profiles::offered(&tables, &modes).map_err(in_camera)?;
+        let mut profiles = profiles::offered(&tables, &modes).map_err(in_camera)?;
+        let product = opened.found.model.product;
+        let port = opened.found.usb.port.clone();
+        let unit = Unit::find(root, &port, opened.monitor.as_mut(), Place::L515, 0, product);
+        match &unit {
+            Ok(unit) => profiles.extend(unit.profiles()?),
+            Err(e) => tracing::info!(camera = %label, "it has no stream imu: {e}"),
+        }
         let info = opened.info_with(FACTORY);
-        Ok(Self { opened, label, config, info, modes, profiles, memory })
+        Ok(Self { opened, label, config, info, modes, profiles, memory, unit })
     }
 
     /// Writes what the rig asks for into the camera, which does not stream yet.
@@ -129,10 +146,14 @@ impl Device for L515Device {
     fn start(mut self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
         let label = self.label.clone();
         let in_camera = |e| in_camera(&label, e);
-        let (profiles, plan) = profiles::plan(&label, &self.profiles, &self.modes, requests)?;
+        let asked = separated(&label, requests)?;
+        let (profiles, plan) = profiles::plan(&label, &self.profiles, &self.modes, &asked.images)?;
         self.configure(&profiles).map_err(in_camera)?;
-        let Self { opened: Opened { mut transport, monitor, .. }, memory, .. } = *self;
-        let launch = Launch { family: Family::L515, label: label.clone(), profiles, plan, monitor, memory };
+        let Self { opened: Opened { mut transport, monitor, .. }, memory, profiles: offered, unit, .. } =
+            *self;
+        let imu = choose_imu(&label, &offered, asked.imu.as_ref(), Some(unit))?;
+        let launch =
+            Launch { family: Family::L515, label: label.clone(), profiles, plan, monitor, memory, imu };
         launch.start(transport.as_mut()).map_err(in_camera)
     }
 }

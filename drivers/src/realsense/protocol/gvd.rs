@@ -31,6 +31,8 @@ pub struct Gvd {
     pub color: bool,
     /// Whether there is an inertial unit.
     pub imu: bool,
+    /// The chip of its accelerometer: 0xFA BMI055, 0x1F BMI085, 0x1E BMI088.
+    pub accelerometer: u8,
 }
 
 /// How the depth sensors expose.
@@ -54,6 +56,7 @@ const SHUTTER: usize = 166;
 const PROJECTOR: usize = 170;
 const COLOR: usize = 174;
 const IMU: usize = 178;
+const ACCELEROMETER: usize = 124;
 
 impl Gvd {
     /// Asks a D400.
@@ -100,6 +103,7 @@ impl Gvd {
             projector: set(PROJECTOR),
             color: set(COLOR),
             imu: set(IMU),
+            accelerometer: u8_at(data, ACCELEROMETER).unwrap_or(0),
         })
     }
 
@@ -121,6 +125,7 @@ impl Gvd {
         put(&mut data, PROJECTOR, &[self.projector.into()]);
         put(&mut data, COLOR, &[self.color.into()]);
         put(&mut data, IMU, &[self.imu.into()]);
+        put(&mut data, ACCELEROMETER, &[self.accelerometer]);
         data
     }
 }

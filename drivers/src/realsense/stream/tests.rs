@@ -136,6 +136,7 @@ fn stream(pictures: Vec<Made>, end: Option<ErrorKind>, both: bool) -> (Realsense
         )
         .unwrap(),
         memory: Arc::clone(&memory),
+        imu: None,
     };
     (RealsenseStream::new(parts), memory)
 }

@@ -228,6 +228,15 @@ impl Stream for Player {
     }
 
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
+        self.pace.attendance.enter(HostTime::now());
+        let polled = self.play(timeout, sink);
+        self.pace.attendance.leave(HostTime::now());
+        polled
+    }
+}
+
+impl Player {
+    fn play(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
         let deadline = HostTime::now().plus(timeout);
         if !self.prepare()? {
             return Ok(Poll::End);
@@ -238,11 +247,13 @@ impl Stream for Player {
         if due > deadline.max(now) {
             return Ok(Poll::Idle);
         }
+        self.pace.attendance.delivered();
         let whole = self.ready.take().unwrap_or(false);
+        let number = self.count + self.pace.missed();
         let ticks = u64::try_from(due.ns()).unwrap_or(0);
         for (eye, gate) in &mut self.ports {
             let picture = self.pair.eye(*eye);
-            let mut raw = RawFrame::new(self.count, ticks, HostTime::now(), picture.len().max(1));
+            let mut raw = RawFrame::new(number, ticks, HostTime::now(), picture.len().max(1));
             raw.damaged = !whole;
             gate.deliver(&raw, sink, |memory| {
                 if memory.len() != picture.len() {

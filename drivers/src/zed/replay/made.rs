@@ -6,8 +6,7 @@
 use crate::bytes::put;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
-use image::ExtendedColorType;
-use image::codecs::jpeg::JpegEncoder;
+use jpeg_encoder::{ColorType, Encoder};
 use std::io::Cursor;
 
 /// Serial number of the made camera.
@@ -149,8 +148,8 @@ pub fn strips(eye: (u32, u32), pair: &(Vec<u8>, Vec<u8>)) -> Vec<u8> {
         let end = if i == 3 { both.len() } else { (i + 1) * rows * row };
         let strip = &both[i * rows * row..end];
         let mut jpeg = Vec::new();
-        let mut encoder = JpegEncoder::new_with_quality(&mut jpeg, 95);
-        encoder.encode(strip, row as u32, (strip.len() / row) as u32, ExtendedColorType::L8).unwrap();
+        let encoder = Encoder::new(&mut jpeg, 95);
+        encoder.encode(strip, row as u16, (strip.len() / row) as u16, ColorType::Luma).unwrap();
         parts.push(jpeg);
     }
     let mut message = vec![0; 8];

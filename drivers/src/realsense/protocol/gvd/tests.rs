@@ -29,6 +29,7 @@ fn a_d400_by_hand() {
         projector: true,
         color: true,
         imu: false,
+        accelerometer: 0,
     };
     assert_eq!(gvd, expected);
     assert_eq!(expected.build(), by_hand());

@@ -46,6 +46,8 @@ opcodes! {
         GetAdvanced = 0x2C,
         /// UAMG: whether advanced mode is on.
         AdvancedStatus = 0x30,
+        /// MMER: reads the memory of the IMU, which has its calibration.
+        ImuMemory = 0x4F,
         /// SET_CAM_SYNC: the mode of synchronisation between cameras.
         SetSync = 0x69,
         /// GET_CAM_SYNC.
@@ -70,6 +72,8 @@ opcodes! {
         SetControl = 0x2B,
         /// AMCGET: reads the control of parameter 1.
         GetControl = 0x2C,
+        /// READ_TABLE: reads the table of parameter 1.
+        ReadTable = 0x43,
         /// TEMPERATURES_GET.
         Temperatures = 0x6A,
         /// DPT_INTRINSICS_FULL_GET: intrinsics of depth by size.

@@ -10,6 +10,11 @@ const D4XX_CLOCK: u32 = 0x0001_613C;
 /// Register of an L515's microsecond clock (librealsense v2.54 `src/l500/l500-private.h`).
 const L515_CLOCK: u32 = 0x9003_021C;
 
+/// Size of the larger of the two layouts that a D400's IMU memory may have (`eeprom_imu_table_size`).
+const IMU_MEMORY: u32 = 520;
+/// Number of an L515's table of the IMU (librealsense v2.54 `L515_IMU_TABLE`).
+const L515_IMU_TABLE: u32 = 0x243;
+
 /// One request, ready to be sent.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Request {
@@ -91,6 +96,16 @@ impl Request {
         }
         let request = Self::d4xx(D4xxOpcode::SetAdvanced, "SET_ADV", [group, 0, 0, 0]);
         Ok(Self { data: data.to_vec(), ..request })
+    }
+
+    /// The memory of a D400's IMU: as many bytes as the vendor's software asks for.
+    pub fn imu_memory() -> Self {
+        Self::d4xx(D4xxOpcode::ImuMemory, "MMER", [0, IMU_MEMORY, 0, 0])
+    }
+
+    /// The IMU's table of an L515.
+    pub fn l515_imu_table() -> Self {
+        Self::l515(L515Opcode::ReadTable, "READ_TABLE (IMU)", [L515_IMU_TABLE, 0, 0, 0])
     }
 
     /// The mode of synchronisation between cameras, as [`crate::realsense::protocol::sync`] codes it.

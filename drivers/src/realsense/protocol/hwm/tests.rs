@@ -19,6 +19,8 @@ fn every_request() -> Vec<Request> {
         Request::temperature(),
         Request::advanced_status(),
         Request::sync(),
+        Request::imu_memory(),
+        Request::l515_imu_table(),
         Request::l515_temperatures(),
         Request::l515_depth_intrinsics(),
         Request::l515_color_intrinsics(),
@@ -92,7 +94,7 @@ fn nothing_that_writes_calibration_flash_or_firmware_can_be_sent() {
     // There is no constructor that this test does not know.
     let source = include_str!("request.rs");
     let made = source.matches("-> Self {").count() + source.matches("-> Result<Self> {").count();
-    assert_eq!(made, 18 + 3, "a new constructor of Request belongs into every_request()");
+    assert_eq!(made, 20 + 3, "a new constructor of Request belongs into every_request()");
 }
 
 #[test]

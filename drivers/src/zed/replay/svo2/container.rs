@@ -10,7 +10,6 @@ use crate::files::picture::io_error;
 use crate::{Error, ErrorKind, Result};
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
-use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
@@ -95,7 +94,7 @@ impl Container {
     /// [`ErrorKind::NotFound`], [`ErrorKind::PermissionDenied`], [`ErrorKind::Io`]; [`ErrorKind::BadInput`] when it is no
     /// SVO2, or has neither video nor header.
     pub fn open(path: &Path) -> Result<Self> {
-        let file = File::open(path).map_err(|e| io_error(path, e))?;
+        let file = depthrig_bus::files::open(path).map_err(|e| io_error(path, e))?;
         let length = file.metadata().map_err(|e| io_error(path, e))?.len();
         Self::new(Box::new(file), length, path)
     }
