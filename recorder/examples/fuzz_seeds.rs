@@ -275,10 +275,12 @@ fn main() {
     }
     // The size, then the file, as `fuzzing::color_codec` reads it.
     let color: Vec<u8> = (0..8 * 6 * 3).map(|i| (i * 5) as u8).collect();
+    let mut jpeg = Vec::new();
+    jpeg_encoder::Encoder::new(&mut jpeg, 75).encode(&color, 8, 6, jpeg_encoder::ColorType::Rgb).unwrap();
+    let mut png = Vec::new();
     let color = image::RgbImage::from_raw(8, 6, color).unwrap();
-    for (name, format) in [("seed_png", ImageFormat::Png), ("seed_jpeg", ImageFormat::Jpeg)] {
-        let mut file = Vec::new();
-        color.write_to(&mut Cursor::new(&mut file), format).unwrap();
+    color.write_to(&mut Cursor::new(&mut png), ImageFormat::Png).unwrap();
+    for (name, file) in [("seed_png", png), ("seed_jpeg", jpeg)] {
         put("color_codec", name, &[&[8, 6], &file[..]].concat());
     }
     put("rosbag", "seed_plain", &bag(2, false));

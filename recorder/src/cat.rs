@@ -140,6 +140,7 @@ pub fn export_frames(
     out: &Path,
     progress: &mut dyn FnMut(u64, u64) -> ControlFlow<()>,
 ) -> Result<FramesDone> {
+    crate::check_outside(out, dataset.path())?;
     let mut chosen = Chosen::new(dataset, choice)?;
     chosen.check_form(form)?;
     let mut folder = Folder::create(fs, out)?;

@@ -181,6 +181,9 @@ pub fn look_at(fs: &dyn Fs, dir: &Path) -> CatalogEntry {
                     entry.is(Health::Lost, words);
                 }
             }
+            for words in session.import_losses() {
+                entry.is(Health::Lost, words);
+            }
         }
     }
     entry

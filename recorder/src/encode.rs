@@ -56,6 +56,15 @@ impl Codec {
     }
 }
 
+/// How much an encoder may take for a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Effort {
+    /// What the options say.
+    Full,
+    /// As little as possible: every bit of the image, hardly packed, in a message of the type that its channel has.
+    Least,
+}
+
 /// What a worker needs to know of a stream and a set to encode one frame.
 pub(crate) struct FrameJob<'a> {
     pub(crate) frame: RecordFrame,
@@ -69,6 +78,7 @@ pub(crate) struct FrameJob<'a> {
 #[derive(Debug)]
 pub(crate) struct EncodedFrame {
     pub(crate) chunk: Chunk,
+    pub(crate) codec: Codec,
     pub(crate) message_bytes: u64,
     pub(crate) message_crc32: u32,
 }
@@ -92,13 +102,22 @@ impl FrameEncoder {
         }
     }
 
-    pub(crate) fn encode(&mut self, job: FrameJob<'_>) -> Result<EncodedFrame> {
+    pub(crate) fn encode(&mut self, job: FrameJob<'_>, effort: Effort) -> Result<EncodedFrame> {
         let h = &job.frame.header;
         let (pixels, stored) = (job.frame.pixels.bytes(), job.frame.pixels.jpeg());
         let format = image::check_picture(h, pixels.len())?;
         let pixels = &pixels[..h.payload_len as usize];
-        let codec = Codec::of(format, &self.options);
-        let compress = codec == Codec::Raw && self.options.compression == Compression::Zstd1;
+        let mut codec = Codec::of(format, &self.options);
+        let mut compress = codec == Codec::Raw && self.options.compression == Compression::Zstd1;
+        let mut packing = CompressionType::Fast;
+        // Depth of the rank codec has a message type of its own, and a JPEG that is there already costs nothing.
+        if effort == Effort::Least {
+            compress = false;
+            packing = CompressionType::Uncompressed;
+            if codec == Codec::Jpeg && stored.is_none() {
+                codec = Codec::Png;
+            }
+        }
         let head = MessageHead {
             channel: job.channel,
             sequence: h.sequence as u32,
@@ -132,7 +151,7 @@ impl FrameEncoder {
                     jpeg(out, h, format, pixels, quality, repacked)
                 }),
                 (Codec::Png, _) => image::write_compressed(buf, stamp, frame_id, "png", |out| {
-                    png(out, h, format, pixels, repacked)
+                    png(out, h, format, pixels, packing, repacked)
                 }),
                 (Codec::Rank, _) => {
                     let shape = DepthShape { width: h.width, height: h.height, step: h.stride };
@@ -142,7 +161,7 @@ impl FrameEncoder {
                     })
                 }
             })?;
-        Ok(EncodedFrame { chunk: self.builder.pack(compress)?, message_bytes, message_crc32 })
+        Ok(EncodedFrame { chunk: self.builder.pack(compress)?, codec, message_bytes, message_crc32 })
     }
 
     /// Stores pixels as they are, from where they lie.
@@ -160,7 +179,7 @@ impl FrameEncoder {
         let (message_bytes, message_crc32) = self.builder.message_with_tail(head, tail, |buf| {
             image::write_image_head(buf, job.stamp_utc_ns, job.frame_id, h, encoding, h.payload_len);
         });
-        Ok(EncodedFrame { chunk: self.builder.pack(false)?, message_bytes, message_crc32 })
+        Ok(EncodedFrame { chunk: self.builder.pack(false)?, codec: Codec::Raw, message_bytes, message_crc32 })
     }
 }
 
@@ -189,6 +208,7 @@ fn png(
     h: &FrameHeader,
     format: PixelFormat,
     pixels: &[u8],
+    packing: CompressionType,
     repacked: &mut Vec<u8>,
 ) -> Result<()> {
     let rgb = if format == PixelFormat::Bgr8 {
@@ -201,7 +221,11 @@ fn png(
     } else {
         tight(h, format, pixels, repacked)
     };
-    PngEncoder::new_with_quality(out, CompressionType::Fast, FilterType::Paeth)
+    let filter = match packing {
+        CompressionType::Uncompressed => FilterType::NoFilter,
+        _ => FilterType::Paeth,
+    };
+    PngEncoder::new_with_quality(out, packing, filter)
         .write_image(rgb, h.width, h.height, ExtendedColorType::Rgb8)
         .map_err(|e| Error::new(ErrorKind::Codec, cannot(h, "PNG")).with_source(e))
 }
@@ -252,7 +276,7 @@ mod tests {
         (header.sequence, header.depth_unit_m) = (17, 0.001);
         let frame = RecordFrame { stream: 0, header, pixels };
         let job = FrameJob { frame, channel: 3, frame_id: "a_frame", log_time: 5, stamp_utc_ns: 4 };
-        FrameEncoder::new(options, &Pool::new(1 << 20)).encode(job)
+        FrameEncoder::new(options, &Pool::new(1 << 20)).encode(job, Effort::Full)
     }
 
     #[test]

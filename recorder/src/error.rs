@@ -49,6 +49,12 @@ depthrig_bus::error_type! {
 }
 
 impl Error {
+    /// Whether it says that a file is damaged, and not that it cannot be read.
+    pub(crate) fn is_damage(&self) -> bool {
+        use ErrorKind::{Corrupt, Foreign, NotADataset, Truncated, Version};
+        matches!(self.kind(), Corrupt | Truncated | Version | NotADataset | Foreign)
+    }
+
     /// A failed operation on `path`; `what` reads as in "cannot {what} {path}".
     pub(crate) fn io(what: &str, path: &Path, e: io::Error) -> Self {
         let (kind, advice) = match e.kind() {

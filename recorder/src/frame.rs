@@ -62,6 +62,10 @@ pub struct RecordMotion {
     pub samples: Vec<MotionSample>,
 }
 
+/// Largest image of a dataset, bytes as its channel carries it. Reading, verifying and recovering take about this much memory
+/// for each thread, whatever a file holds.
+pub const IMAGE_MAX_BYTES: u64 = 256 << 20;
+
 /// The motion of a set takes at most this many bytes in the file, see [`RecordMotion::stored_bytes`]: some minutes of one
 /// unit. A caller whose sets are further apart leaves out batches, and counts them.
 pub const SET_MOTION_MAX_BYTES: u64 = 64 << 20;

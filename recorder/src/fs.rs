@@ -4,6 +4,7 @@
 
 use core::fmt;
 use core::time::Duration;
+use depthrig_bus::files;
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::FileExt;
@@ -35,7 +36,7 @@ pub trait Fs: Send + Sync + fmt::Debug {
     /// # Errors
     /// `AlreadyExists` when the file exists, else as the operating system says.
     fn create_new(&self, path: &Path) -> io::Result<Box<dyn WriteFile>>;
-    /// Opens a file for reading.
+    /// Opens a regular file for reading, without waiting.
     ///
     /// # Errors
     /// As the operating system says.
@@ -111,7 +112,15 @@ pub trait WriteFile: Send {
     /// # Errors
     /// As the operating system says.
     fn sync_all(&mut self) -> io::Result<()>;
+    /// What makes the data written so far durable from another thread, while this one goes on writing; `None` where that
+    /// cannot be done.
+    fn sync_beside(&self) -> Option<SyncBeside> {
+        None
+    }
 }
+
+/// A sync to be run on a thread of its own.
+pub type SyncBeside = Box<dyn FnOnce() -> io::Result<()> + Send>;
 
 /// A file that is read at offsets.
 pub trait ReadFile: Send + Sync {
@@ -184,7 +193,7 @@ struct RealFile(File);
 
 impl Fs for RealFs {
     fn create_dir_all(&self, dir: &Path) -> io::Result<()> {
-        std::fs::create_dir_all(dir)
+        depthrig_bus::umask::create_dir_all(dir)
     }
 
     fn create_new(&self, path: &Path) -> io::Result<Box<dyn WriteFile>> {
@@ -193,7 +202,7 @@ impl Fs for RealFs {
     }
 
     fn open(&self, path: &Path) -> io::Result<Box<dyn ReadFile>> {
-        Ok(Box::new(RealFile(File::open(path)?)))
+        Ok(Box::new(RealFile(files::open(path)?)))
     }
 
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
@@ -210,7 +219,7 @@ impl Fs for RealFs {
 
     fn sync_dir(&self, dir: &Path) -> io::Result<()> {
         let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
-        File::open(dir)?.sync_all()
+        files::open_folder(dir)?.sync_all()
     }
 
     fn read_dir(&self, dir: &Path) -> io::Result<Vec<DirEntry>> {
@@ -234,13 +243,13 @@ impl Fs for RealFs {
     }
 
     fn lock(&self, dir: &Path) -> io::Result<Box<dyn Send + Sync>> {
-        let dir = File::open(dir)?;
+        let dir = files::open_folder(dir)?;
         dir.try_lock()?;
         Ok(Box::new(dir))
     }
 
     fn sync_file(&self, path: &Path) -> io::Result<()> {
-        File::open(path)?.sync_all()
+        files::open(path)?.sync_all()
     }
 }
 
@@ -259,6 +268,11 @@ impl WriteFile for RealFile {
 
     fn sync_all(&mut self) -> io::Result<()> {
         self.0.sync_all()
+    }
+
+    fn sync_beside(&self) -> Option<SyncBeside> {
+        let file = self.0.try_clone().ok()?;
+        Some(Box::new(move || file.sync_data()))
     }
 }
 

@@ -62,7 +62,10 @@ pub fn recover(bytes: &[u8]) -> u64 {
     let Ok(dataset) = Dataset::open_with(Arc::clone(&fs), dir) else {
         panic!("recovered and cannot be opened: {first:?}");
     };
-    // Fewer can be: chunks are taken over by their checksums, and the fuzzer forges those.
+    let report = verify_with(&fs, dir, &VerifyOptions::default());
+    let broken = report.as_ref().ok().and_then(crate::VerifyReport::broken);
+    assert!(report.is_ok() && broken.is_none(), "recovered, and verify finds {broken:?}\nafter {first:?}");
+    // Fewer can be: the pixels of a set are not decoded by a recovery.
     let sets = dataset.sets_with(SetRange::ALL, PixelMode::Stored).flatten().count();
     assert!(sets as u64 <= first.sets, "{first:?}, and then {sets} are read");
     let again = recover();

@@ -31,6 +31,7 @@ pub mod fs;
 pub mod fuzzing;
 mod msgs;
 mod options;
+mod outside;
 mod recorder;
 mod recover;
 pub mod report;
@@ -55,9 +56,12 @@ pub use dataset::{
     SpreadStats, StreamInfo,
 };
 pub use error::{Error, ErrorKind, Result};
-pub use frame::{Pixels, PushError, RecordFrame, RecordMotion, RecordSet, SET_MOTION_MAX_BYTES, SetDrop};
+pub use frame::{
+    IMAGE_MAX_BYTES, Pixels, PushError, RecordFrame, RecordMotion, RecordSet, SET_MOTION_MAX_BYTES, SetDrop,
+};
 pub use msgs::{Diagnostic, Level, SetCounts, StreamAccount};
-pub use options::{ColorCodec, Compression, DepthCodec, RecorderOptions};
+pub use options::{ColorCodec, Compression, DepthCodec, LIVE_LATE_NS, RecorderOptions, live_late_ns};
+pub use outside::check_outside;
 pub use recorder::{DiskStatus, Progress, Recorder, Resumed, Summary, UtcSource};
 pub use recover::{
     LostBytes, RecoverAction, RecoverOptions, RecoverProgress, RecoverReport, RecoveredSegment, recover,
@@ -65,8 +69,8 @@ pub use recover::{
 };
 pub use select::{Edge, Moment, SetSpan};
 pub use session::{
-    Computed, Edit, FORMAT, MotionRecord, Note, Outcome, SESSION_FILE, Session, SessionChanges, StreamRecord,
-    check_name, edit, rename,
+    Computed, Edit, FORMAT, MotionRecord, NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE, Session,
+    SessionChanges, StreamRecord, check_name, edit, rename,
 };
 pub use slice::{Derived, SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, npy_file, still};

@@ -37,6 +37,16 @@ pub enum Compression {
     None,
 }
 
+/// `RecorderOptions::late_after_ns` of a live recording: a fifth of the promised second is left for writing the set or
+/// the count.
+pub const LIVE_LATE_NS: i64 = 800_000_000;
+
+/// The same for sets this many nanoseconds apart: those rarer than two a second may wait longer for what is computed of
+/// them, and a kill then takes at most two of them without a trace.
+pub fn live_late_ns(period_ns: i64) -> i64 {
+    LIVE_LATE_NS.max(period_ns.saturating_mul(8) / 5)
+}
+
 /// How a dataset is written.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
@@ -61,6 +71,10 @@ pub struct RecorderOptions {
     pub backlog_max_bytes: u64,
     /// How often the file is made durable, nanoseconds: what a power cut can take.
     pub sync_interval_ns: i64,
+    /// A set that is not in the file this long after its tick, nanoseconds, is given up and counted, and the count is
+    /// written at once: what a kill can take without a trace is younger. For live recordings, whose ticks are times of
+    /// the host's clock ([`LIVE_LATE_NS`]); without it a set waits for as long as encoders and disk take.
+    pub late_after_ns: Option<i64>,
     /// The recording ends cleanly when the disk has less than this left, bytes.
     pub min_free_bytes: u64,
     /// Size of a file that is deleted to make room for the index when the disk is full nevertheless, bytes.
@@ -80,6 +94,7 @@ impl Default for RecorderOptions {
             queue_sets: 4,
             backlog_max_bytes: 256 << 20,
             sync_interval_ns: 1_000_000_000,
+            late_after_ns: None,
             min_free_bytes: 256 << 20,
             reserve_bytes: 2 << 20,
         }

@@ -18,6 +18,7 @@ use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
+mod drops;
 mod guard;
 mod progress;
 mod resume;
@@ -26,6 +27,7 @@ pub(crate) mod topics;
 mod worker;
 mod writer;
 
+use drops::DropLog;
 pub use guard::DiskStatus;
 pub use progress::{Progress, Summary};
 use resume::Past;
@@ -70,6 +72,8 @@ struct Shared {
     abandoned: AtomicBool,
     /// Since when the writer waits for the disk, on the host's clock; 0 when it does not.
     io_since_ns: AtomicI64,
+    /// Since when a sync beside the writer has not ended, as the writer knew last; 0 when none goes on.
+    sync_since_ns: AtomicI64,
     /// Tells others that the dataset is being recorded.
     _lock: Option<Box<dyn Send + Sync>>,
 }
@@ -87,6 +91,7 @@ struct Begin {
 
 struct State {
     counts: SetCounts,
+    drops: DropLog,
     frames: u64,
     bytes: u64,
     segments: u32,
@@ -196,6 +201,7 @@ impl Recorder {
             topics,
             state: Mutex::new(State {
                 counts: SetCounts { offered: past.sets, recorded: past.sets, ..SetCounts::default() },
+                drops: DropLog::default(),
                 frames: past.frames,
                 bytes: past.bytes,
                 segments: past.segments + 1,
@@ -221,6 +227,7 @@ impl Recorder {
             pool: Pool::new(POOL_BYTES),
             abandoned: AtomicBool::new(false),
             io_since_ns: AtomicI64::new(0),
+            sync_since_ns: AtomicI64::new(0),
             _lock: lock,
         });
         let mut recorder =
@@ -251,9 +258,10 @@ impl Recorder {
     pub fn push(&self, set: RecordSet) -> Result<(), PushError> {
         let mut state = self.shared.lock();
         state.counts.offered += 1;
+        let id = set.id;
         let refused = |state: &mut State, reason: SetDrop, message: String| {
-            state.counts.dropped[reason as usize] += 1;
-            Err(PushError { reason, message: format!("set {} was not recorded: {message}", set.id) })
+            state.drop_set(id, reason, &message);
+            Err(PushError { reason, message: format!("set {id} was not recorded: {message}") })
         };
         if let Some(reason) = state.ended {
             let why = match &state.error {
@@ -284,12 +292,12 @@ impl Recorder {
         let anchor = *state.anchor.get_or_insert(set.utc);
         // Strictly later than the set before, so that a log time names one set whatever the tick does.
         let log_time = anchor.utc_ns(set.tick).max(state.last_log_time.saturating_add(1)).max(0);
-        let (ticket, frames) = Ticket::new(set, &anchor, log_time, state.counts.offered, load);
+        let late_after_ns = options.late_after_ns;
+        let (ticket, frames) = Ticket::new(set, &anchor, log_time, state.counts.offered, late_after_ns, load);
         let ticket = Arc::new(ticket);
         if tickets.try_send(Arc::clone(&ticket)).is_err() {
             load.backlog_bytes.fetch_sub(ticket.taken_bytes(), Ordering::Relaxed);
-            state.counts.dropped[SetDrop::DiskSlow as usize] += 1;
-            return Err(PushError { reason: SetDrop::DiskSlow, message: slow });
+            return refused(&mut state, SetDrop::DiskSlow, slow);
         }
         state.last_id = Some(ticket.id);
         for batch in &ticket.motion {
@@ -321,10 +329,12 @@ impl Recorder {
     /// Adds a note of the operator, stamped now; it goes into the file and into `session.toml`.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`] when more notes wait to be written than anybody types.
+    /// [`ErrorKind::BadInput`] when it is longer than [`crate::NOTE_MAX_BYTES`], when the dataset holds as many notes as it
+    /// may, and when more of them wait to be written than anybody types.
     pub fn add_note(&self, text: impl Into<String>) -> Result<()> {
         let note = crate::Note { utc_ns: (self.shared.utc)().utc_ns, text: text.into() };
         let mut state = self.shared.lock();
+        state.session.check_note(&note.text)?;
         if state.pending_notes.len() >= NOTES_MAX {
             let message = format!("{NOTES_MAX} notes wait to be written already; try again in a second");
             return Err(Error::new(ErrorKind::BadInput, message));
@@ -424,6 +434,11 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Whether frames may go to the disk without being packed.
+    fn disk_keeps_up(&self) -> bool {
+        self.load.backlog_bytes.load(Ordering::Relaxed) < self.options.backlog_max_bytes / 4
+    }
+
     /// Takes no more sets; the threads end when the queues are empty.
     fn close(&self) {
         let mut state = self.lock();
@@ -434,6 +449,18 @@ impl Shared {
 }
 
 impl State {
+    /// Counts a set that is not recorded, and logs it unless its reason was logged just now.
+    fn drop_set(&mut self, id: u64, reason: SetDrop, why: &str) {
+        self.counts.dropped[reason as usize] += 1;
+        if self.drops.add(reason, HostTime::now()) {
+            tracing::error!(
+                set = id,
+                reason = reason.name(),
+                "a frame set was not recorded: {why}; further ones are counted once a minute"
+            );
+        }
+    }
+
     fn duration_ns(&self) -> i64 {
         self.last_tick.zip(self.first_tick).map_or(0, |(last, first)| last.since_ns(first))
     }

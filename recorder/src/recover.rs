@@ -10,22 +10,30 @@ use crate::dataset::{segment_number, segments_in};
 use crate::fs::{DirEntry, Fs, RealFs, lock_patiently};
 use crate::recorder::RESERVE_FILE;
 use crate::session::SESSION_TMP;
+use crate::verify::{Judge, broken_session};
 use crate::{Error, ErrorKind, Result, SESSION_FILE, Session};
 use core::ops::ControlFlow;
 use serde::Serialize;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 pub(crate) mod facts;
+mod head;
 mod lost;
 mod segment;
 mod session;
 
 use facts::Facts;
-use segment::{Before, Rebuild};
+use segment::{Before, Choice, Rebuild, Rebuilt};
+use session::Chosen;
 
 /// What a copy is called until it is proven.
 const TEMPORARY: &str = "mcap.recovering";
+/// Copies of one segment that are tried at most: each leaves out what the one before showed to be broken.
+const TRIES: u32 = 8;
+/// Segments at most in the place of which an empty one is put.
+const GONE_MAX: usize = 1000;
 /// The metadata record that says what was lost.
 pub(crate) const RECOVERED_METADATA: &str = "depthrig.recovered";
 
@@ -265,25 +273,67 @@ struct Job<'a> {
 impl Job<'_> {
     fn run(&mut self, entries: &[DirEntry]) -> Result<()> {
         self.remove_leftovers(entries)?;
-        let session = match Session::load(&**self.fs, self.dir) {
-            Ok(session) => Some(session),
-            Err(e) if session::is_damage(&e) => {
-                self.report.notes.push(e.to_string());
-                None
-            }
-            Err(e) => return Err(e),
-        };
-        let segments = segments_in(entries, self.dir);
+        let chosen = session::choose(self, &segments_in(entries, self.dir))?;
+        let segments = self.fill_gaps(entries)?;
+        let mut judge = Judge::new(&chosen.session);
         let mut all: Vec<Facts> = Vec::new();
         let mut before = Before::of(&segments);
         for path in &segments {
-            let facts = self.segment(path, &segments, session.as_ref(), before)?;
+            let facts = self.segment(path, &segments, &chosen, before, &mut judge)?;
             self.report.sets += facts.sets;
             before.add(&facts);
             all.push(facts);
         }
         self.tell(self.total)?;
-        session::settle(self, session, &segments, &all)
+        let broken = broken_session(&chosen.session);
+        session::settle(self, chosen.session, &all)?;
+        match broken.first() {
+            Some(finding) if self.options.unfinished_only => self.report.notes.push(finding.message.clone()),
+            Some(finding) => {
+                let file = self.dir.join(SESSION_FILE);
+                let what = format!(
+                    "the segments are complete, but {} is not what it should be: {}; correct that line and recover \
+                     again",
+                    file.display(),
+                    finding.message
+                );
+                return Err(Error::new(ErrorKind::Corrupt, what));
+            }
+            None => {}
+        }
+        Ok(())
+    }
+
+    /// The segments; an empty one in the place of each that is gone, so that its loss is stated as any other.
+    fn fill_gaps(&mut self, entries: &[DirEntry]) -> Result<Vec<PathBuf>> {
+        let segments = segments_in(entries, self.dir);
+        let there: BTreeSet<u32> = entries.iter().filter_map(|e| segment_number(&e.name)).collect();
+        let gone = there.last().map_or(0, |last| *last as usize + 1 - there.len());
+        if gone == 0 || self.options.unfinished_only {
+            return Ok(segments);
+        }
+        if gone > GONE_MAX {
+            let what = format!(
+                "{} cannot be recovered: {gone} of its segments are gone; put them back, or recover the segments on \
+                 their own in a folder each",
+                self.dir.display()
+            );
+            return Err(Error::new(ErrorKind::Corrupt, what));
+        }
+        let last = there.last().copied().unwrap_or(0);
+        let names = (0..last).filter(|n| !there.contains(n)).map(file_name);
+        for path in names.map(|name| self.dir.join(name)) {
+            self.report.changed = true;
+            if self.options.dry_run {
+                let name = path.file_name().unwrap_or_default().to_string_lossy();
+                self.report.lost.push(format!("{name} is gone"));
+                continue;
+            }
+            self.fs.create_new(&path).map_err(|e| Error::io("create", &path, e))?;
+            sync_folder_of(&**self.fs, &path)?;
+        }
+        let entries = self.fs.read_dir(self.dir).map_err(|e| Error::io("open the folder", self.dir, e))?;
+        Ok(segments_in(&entries, self.dir))
     }
 
     /// Tells how far it is.
@@ -323,16 +373,14 @@ impl Job<'_> {
         &mut self,
         path: &Path,
         segments: &[PathBuf],
-        session: Option<&Session>,
+        chosen: &Chosen,
         before: Before,
+        judge: &mut Judge,
     ) -> Result<Facts> {
         let fs = Arc::clone(self.fs);
         let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let part = is_part(path);
         let base = self.done;
-        let whole = facts::whole(&*fs, path, self.options.unfinished_only && !part, &mut |bytes| {
-            self.tell(base + bytes)
-        })?;
         let mut segment = RecoveredSegment {
             file: name,
             action: RecoverAction::None,
@@ -345,9 +393,19 @@ impl Job<'_> {
             sets_lost: 0,
             lost: Vec::new(),
         };
+        let mut whole = facts::indexed(&*fs, path)?;
+        let mut after = None;
+        if self.options.unfinished_only && !part && whole.is_some() {
+            // The ones after it are judged on their own, as this one was not read.
+            *judge = Judge::lone(&chosen.session);
+        } else if whole.is_some() {
+            let verdict = judge.look(&*fs, path, &mut |bytes| self.tell(base + bytes))?;
+            whole = whole.filter(|_| verdict.broken.is_empty());
+            after = Some(verdict.after);
+        }
         // What an error kept from its final name may be whole in memory and not on the disk, and a later sync that
         // succeeds says nothing of that: such a one is copied.
-        let doubtful = |f: &Facts| f.error.is_some() || session.is_none_or(|s| s.outcome.is_some());
+        let doubtful = |f: &Facts| f.error.is_some() || !chosen.stored || chosen.session.outcome.is_some();
         let whole = match whole {
             Some(whole) if !part => Some(whole),
             Some(whole) if !doubtful(&whole) && (self.options.dry_run || self.finish(path)?) => Some(whole),
@@ -356,10 +414,13 @@ impl Job<'_> {
         let facts = if let Some(whole) = whole {
             segment.action = if part { RecoverAction::Finished } else { RecoverAction::None };
             segment.bytes = whole.bytes;
+            if let Some(after) = after {
+                *judge = after;
+            }
             whole
         } else {
-            let job = Rebuild { fs: &*fs, dir: self.dir, path, segments, session, before };
-            let (facts, lost) = job.run(self.options.dry_run, &mut |bytes| self.tell(base + bytes))?;
+            let job = Rebuild { fs: &*fs, dir: self.dir, path, segments, session: &chosen.session, before };
+            let Rebuilt { facts, lost, .. } = self.rebuild(&job, base, judge)?;
             segment.action = RecoverAction::Rebuilt;
             lost.tell(&mut segment);
             if !self.options.dry_run {
@@ -373,6 +434,38 @@ impl Job<'_> {
         self.report.lost.extend(segment.lost.iter().cloned());
         self.report.segments.push(segment);
         Ok(facts)
+    }
+
+    /// Copies a segment under its temporary name until `verify` finds nothing broken in the copy: what it does is left out
+    /// of the next one. Chunks may have good checksums and yet contradict each other.
+    fn rebuild(&mut self, job: &Rebuild<'_>, base: u64, judge: &mut Judge) -> Result<Rebuilt> {
+        let fs = Arc::clone(self.fs);
+        let mut choice = Choice::default();
+        let mut tries = 0;
+        loop {
+            let rebuilt = job.run(&choice, self.options.dry_run, &mut |bytes| self.tell(base + bytes))?;
+            if self.options.dry_run {
+                return Ok(rebuilt);
+            }
+            let copy = segment::temporary(job.path);
+            let verdict = judge.look(&*fs, &copy, &mut |_| self.tell(base))?;
+            let Some(first) = verdict.broken.first() else {
+                *judge = verdict.after;
+                return Ok(rebuilt);
+            };
+            tries += 1;
+            if tries > TRIES || !choice.leave_out(&rebuilt, &verdict.broken) {
+                // The next recovery removes it if this cannot.
+                let _ = fs.remove_file(&copy);
+                let what = format!(
+                    "{} cannot be recovered: what can be read of it contradicts itself ({}); it was left as it is",
+                    job.path.display(),
+                    first.message
+                );
+                return Err(Error::new(ErrorKind::Corrupt, what));
+            }
+            fs.remove_file(&copy).map_err(|e| Error::io("remove", &copy, e))?;
+        }
     }
 
     /// Gives a whole `.part` its name; `false` when this file system cannot make it durable as it is.

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 mod edit;
+mod limits;
 
 pub use edit::{SessionChanges, check_name, edit, rename};
 
@@ -17,8 +18,13 @@ pub const FORMAT: &str = "depthrig.dataset/1";
 pub const SESSION_FILE: &str = "session.toml";
 /// Its name while it is written.
 pub(crate) const SESSION_TMP: &str = "session.tmp";
-/// Streams and motion units at most: each has three of the 65535 channels of a file, and the file has some itself.
-const STREAMS_MAX: usize = 21_000;
+/// Longest note, bytes.
+pub const NOTE_MAX_BYTES: usize = 4096;
+/// Most notes of a dataset, and most bytes of all of them: `session.toml` must stay small enough to be read.
+const NOTES_MAX: usize = 4096;
+const NOTES_MAX_BYTES: usize = 1 << 20;
+/// Streams and motion units at most: each has three tables of a session, and three of the 65535 channels of a file.
+const STREAMS_MAX: usize = 4_000;
 
 /// What `session.toml` says.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -278,6 +284,24 @@ impl Session {
         }
     }
 
+    /// Checks that `text` can be one more note.
+    pub(crate) fn check_note(&self, text: &str) -> Result<()> {
+        let total: usize = self.notes.iter().map(|n| n.text.len()).sum();
+        let why = if text.len() > NOTE_MAX_BYTES {
+            format!(
+                "the note has {} bytes, {NOTE_MAX_BYTES} is the limit; write it to a file and note its name",
+                text.len()
+            )
+        } else if self.notes.len() >= NOTES_MAX {
+            format!("the dataset has {NOTES_MAX} notes already, which is the limit")
+        } else if total + text.len() > NOTES_MAX_BYTES {
+            format!("the dataset's notes have {total} bytes already, {NOTES_MAX_BYTES} is the limit")
+        } else {
+            return Ok(());
+        };
+        Err(Error::new(ErrorKind::BadInput, why))
+    }
+
     /// Checks what the topics and the file are made from.
     pub(crate) fn check(&self) -> Result<()> {
         let bad = |why: String| Error::new(ErrorKind::BadInput, format!("session \"{}\": {why}", self.name));
@@ -303,6 +327,28 @@ impl Session {
             }
         }
         self.too_much().map_or(Ok(()), |why| Err(bad(why)))
+    }
+
+    /// Whether sets of `other` can be sets of this session: the same rig, streams and motion units, whatever their
+    /// calibration.
+    pub(crate) fn has_streams_of(&self, other: &Self) -> bool {
+        let stream = |s: &StreamRecord| (s.id.clone(), s.format, s.width, s.height);
+        let unit = |u: &MotionRecord| (u.id.clone(), u.batch);
+        self.rig == other.rig
+            && self.streams.iter().map(stream).eq(other.streams.iter().map(stream))
+            && self.motion.iter().map(unit).eq(other.motion.iter().map(unit))
+    }
+
+    /// What an import could not bring over, in words, as the table `import` has it; empty for a recording.
+    pub fn import_losses(&self) -> Vec<String> {
+        let Some(table) = self.extra.get("import").and_then(toml::Value::as_table) else { return Vec::new() };
+        let lost = table.get("lost").and_then(toml::Value::as_integer).filter(|n| *n > 0);
+        let mut words = Vec::new();
+        words.extend(lost.map(|n| format!("{n} parts of what was imported could not be read, see [import]")));
+        if table.get("ended_early").and_then(toml::Value::as_bool) == Some(true) {
+            words.push("the import was ended before all was read".to_owned());
+        }
+        words
     }
 
     /// What of it is more than a dataset can hold, in words.
@@ -332,6 +378,10 @@ impl Session {
 
     /// Reads the text of a `session.toml`; `path` is for the message.
     pub(crate) fn from_toml(text: &str, path: &Path) -> Result<Self> {
+        if let Some(why) = limits::exceeded(text) {
+            let message = format!("{} cannot be read as a session: {why}", path.display());
+            return Err(Error::new(ErrorKind::Corrupt, message));
+        }
         let session: Self = toml::from_str(text).map_err(|e| {
             let message = format!("{} cannot be read as a session: {e}", path.display());
             Error::new(ErrorKind::Corrupt, message).with_source(e)
@@ -357,6 +407,7 @@ impl Session {
     pub(crate) fn save(&self, fs: &dyn Fs, dir: &Path) -> Result<()> {
         let path = dir.join(SESSION_FILE);
         let text = self.to_toml()?;
+        check_size(&text, &path)?;
         fs::replace(fs, &path, text.as_bytes()).map_err(|e| Error::io("write", &path, e))
     }
 
@@ -367,16 +418,72 @@ impl Session {
     }
 }
 
+/// Refuses to write what could not be read.
+pub(crate) fn check_size(text: &str, path: &Path) -> Result<()> {
+    let Some(why) = limits::exceeded(text) else { return Ok(()) };
+    let message = format!("{} cannot be written: {why}; it is left as it is", path.display());
+    Err(Error::new(ErrorKind::BadInput, message))
+}
+
 /// The text of a `session.toml`.
 fn text_of(fs: &dyn Fs, path: &Path) -> Result<String> {
     let read = || {
         let file = fs.open(path)?;
-        // A session with every note of a long day is some kilobytes.
-        let mut bytes = vec![0; usize::try_from(file.size()?.min(64 << 20)).unwrap_or(0)];
+        let size = file.size()?;
+        // A session with every note of a long day is some kilobytes. What is longer is refused, and not read to the end.
+        let mut bytes = vec![0; usize::try_from(size.min(limits::TEXT_MAX_BYTES + 1)).unwrap_or(0)];
         file.read_exact_at(&mut bytes, 0)?;
-        Ok(bytes)
+        Ok((bytes, size))
     };
-    let bytes = read().map_err(|e: std::io::Error| Error::io("read", path, e))?;
+    let (bytes, size) = read().map_err(|e: std::io::Error| Error::io("read", path, e))?;
+    if size > limits::TEXT_MAX_BYTES {
+        let most = limits::TEXT_MAX_BYTES;
+        let what = format!("{} has {size} bytes, {most} is the limit", path.display());
+        return Err(Error::new(ErrorKind::Corrupt, what));
+    }
     String::from_utf8(bytes)
         .map_err(|e| Error::new(ErrorKind::Corrupt, format!("{} is not text", path.display())).with_source(e))
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(1000))]
+        #[test]
+        fn a_pose_is_written_and_read_bit_by_bit(
+            t in prop::array::uniform3(-5.0f64..5.0), q in prop::array::uniform4(-1.0f64..1.0),
+        ) {
+            let n = q.iter().map(|c| c * c).sum::<f64>().sqrt().max(1e-3);
+            let mut session = Session::new("s", "rig");
+            let mut stream = stream("a/color".parse().unwrap(), String::new(), PixelFormat::Rgb8);
+            stream.pose = Pose { translation_m: t, rotation_xyzw: q.map(|c| c / n) };
+            session.streams.push(stream);
+            let again = Session::from_toml(&session.to_toml().unwrap(), Path::new("s")).unwrap();
+            let bits = |s: &Session| {
+                let p = s.streams[0].pose;
+                (p.translation_m.map(f64::to_bits), p.rotation_xyzw.map(f64::to_bits))
+            };
+            prop_assert_eq!(bits(&again), bits(&session));
+        }
+    }
+
+    /// A stream of a small camera.
+    pub(crate) fn stream(id: StreamId, model: String, format: PixelFormat) -> StreamRecord {
+        StreamRecord {
+            id,
+            model,
+            serial: "1".to_owned(),
+            format,
+            width: 4,
+            height: 4,
+            rate_hz: 30.0,
+            depth_unit_m: if format.is_depth() { 0.001 } else { 0.0 },
+            calibration: String::new(),
+            intrinsics: Intrinsics::default(),
+            pose: Pose::IDENTITY,
+        }
+    }
 }

@@ -106,6 +106,7 @@ pub fn trim(
     options: &SliceOptions,
     progress: SliceProgress<'_>,
 ) -> Result<SliceReport> {
+    crate::check_outside(out, dataset.path())?;
     let mut sets = dataset.set_reader()?;
     let numbers = span.numbers(&mut sets)?;
     let times = sets.times();
@@ -141,6 +142,7 @@ pub fn merge(
     let Some(first) = datasets.first() else {
         return Err(Error::new(ErrorKind::BadInput, "there is nothing to merge"));
     };
+    datasets.iter().try_for_each(|d| crate::check_outside(out, d.path()))?;
     for other in &datasets[1..] {
         session::must_be_one(first, other)?;
     }

@@ -17,12 +17,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 mod index;
+mod judge;
 mod motion;
 mod pictures;
 mod records;
 mod segment;
 mod sets;
 
+pub(crate) use judge::{Judge, broken_session};
 use sets::Walk;
 
 /// Findings beyond these are counted and not kept: a file of noise must not fill the memory.

@@ -52,9 +52,7 @@ fn load(dir: &Path, w: u32, h: u32, pool: &mut Pool) -> Result<()> {
             continue;
         }
         let Some("png" | "jpg" | "jpeg") = path.extension().and_then(|e| e.to_str()) else { continue };
-        let image = image::open(&path).map_err(|e| {
-            Error::new(ErrorKind::BadInput, format!("{} cannot be read", path.display())).with_source(e)
-        })?;
+        let image = open(&path)?;
         let (iw, ih) = (image.width().max(1), image.height().max(1));
         // Tiled, not scaled: scaling would make real pictures smoother than they are.
         let places = (0..h).flat_map(|y| (0..w).map(move |x| (x % iw, y % ih)));
@@ -69,6 +67,23 @@ fn load(dir: &Path, w: u32, h: u32, pool: &mut Pool) -> Result<()> {
         }
     }
     Ok(())
+}
+
+fn open(path: &Path) -> Result<image::DynamicImage> {
+    let unreadable = || Error::new(ErrorKind::BadInput, format!("{} cannot be read", path.display()));
+    if path.extension().is_some_and(|e| e == "png") {
+        return image::open(path).map_err(|e| unreadable().with_source(e));
+    }
+    let bytes = std::fs::read(path).map_err(|e| Error::io("read", path, e))?;
+    let decoded = depthrig_jpeg::decode(&bytes).map_err(|e| unreadable().with_source(e))?;
+    let depthrig_jpeg::Info { width, height, form } = decoded.info;
+    let image = match form {
+        depthrig_jpeg::Form::Grey => {
+            image::GrayImage::from_raw(width, height, decoded.pixels).map(Into::into)
+        }
+        depthrig_jpeg::Form::Rgb => image::RgbImage::from_raw(width, height, decoded.pixels).map(Into::into),
+    };
+    image.ok_or_else(unreadable)
 }
 
 /// SplitMix64: a number that looks random and follows from `x`.

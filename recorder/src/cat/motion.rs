@@ -207,6 +207,7 @@ pub fn export_motion(
     out: &Path,
     progress: &mut dyn FnMut(u64) -> ControlFlow<()>,
 ) -> Result<FramesDone> {
+    crate::check_outside(out, dataset.path())?;
     let mut chosen: Vec<_> = units.iter().map(|u| Chosen::new(dataset, u, sets)).collect::<Result<_>>()?;
     new_folder(fs, out)?;
     let mut total = FramesDone::default();

@@ -76,6 +76,8 @@ pub(crate) enum DamageKind {
     Torn,
     /// Bytes that are no good record, with good ones after them.
     Bytes,
+    /// The file holds nothing at all.
+    Empty,
 }
 
 /// What a channel is to the walk.
@@ -201,6 +203,11 @@ impl<'a> Groups<'a> {
         };
         groups.prove(0, 0, first)?;
         Ok(groups)
+    }
+
+    /// Whether a checksum proves every byte before the first chunk.
+    pub(crate) const fn proves_head(&self) -> bool {
+        self.proven >= self.at
     }
 
     /// Where the walk stands.

@@ -9,8 +9,9 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// No record that we write comes near; a longer one is a damaged length.
-pub(crate) const RECORD_MAX: u64 = 1 << 30;
+/// Longest record, packed or unpacked: an image of [`crate::IMAGE_MAX_BYTES`] and what stands around it. A longer one is a
+/// damaged length, or made to fill the memory: a gigabyte of zeros is packed into some kilobytes.
+pub(crate) const RECORD_MAX: u64 = crate::IMAGE_MAX_BYTES + (1 << 20);
 /// Opcode and length.
 pub(crate) const HEAD: u64 = 9;
 /// Footer record and magic.
@@ -24,6 +25,8 @@ pub(crate) struct ChunkEntry {
     pub(crate) start_time: u64,
     pub(crate) end_time: u64,
     pub(crate) channels: Vec<u16>,
+    /// Whether it is compressed.
+    pub(crate) is_packed: bool,
 }
 
 /// A channel: its topic, its type and its metadata.
@@ -37,6 +40,7 @@ pub(crate) struct ChannelInfo {
 /// One message of a chunk.
 pub(crate) struct Message<'a> {
     pub(crate) channel: u16,
+    pub(crate) sequence: u32,
     pub(crate) log_time: u64,
     pub(crate) publish_time: u64,
     /// Where its record begins in the unpacked chunk.
@@ -267,9 +271,14 @@ impl SegmentReader {
                 let Record::Message { header, data } = self.parse(head[0], body, offset)? else {
                     return Err(cut());
                 };
-                let (channel, log_time) = (header.channel_id, header.log_time);
-                let publish_time = header.publish_time;
-                f(Message { channel, log_time, publish_time, offset: at as u64, data: &data })?;
+                f(Message {
+                    channel: header.channel_id,
+                    sequence: header.sequence,
+                    log_time: header.log_time,
+                    publish_time: header.publish_time,
+                    offset: at as u64,
+                    data: &data,
+                })?;
             }
             at += HEAD as usize + len;
         }
@@ -317,6 +326,7 @@ impl SegmentReader {
                     start_time: i.message_start_time,
                     end_time: i.message_end_time,
                     channels: i.message_index_offsets.keys().copied().collect(),
+                    is_packed: !i.compression.is_empty(),
                 }),
                 Record::Statistics(s) => c.message_count = Some(s.message_count),
                 Record::MetadataIndex(i) => c.metadata_offsets.push(i.offset),
@@ -361,7 +371,8 @@ impl SegmentReader {
         match opcode {
             op::DATA_END => return Ok(None),
             op::CHUNK => {
-                let times = self.read(offset + HEAD, 16)?;
+                // Two times, a size and a checksum, and the length of the compression's name.
+                let times = self.read(offset + HEAD, 32)?;
                 let time = |i: usize| times[i..i + 8].iter().rev().fold(0, |v, b| v << 8 | u64::from(*b));
                 c.chunks.push(ChunkEntry {
                     offset,
@@ -369,6 +380,7 @@ impl SegmentReader {
                     start_time: time(0),
                     end_time: time(8),
                     channels: Vec::new(),
+                    is_packed: times[28..] != [0; 4],
                 });
             }
             op::MESSAGE_INDEX => {

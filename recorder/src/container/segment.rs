@@ -8,6 +8,8 @@ use super::chunk::Chunk;
 use super::record::{self, AttachmentIndex, Channel, ChunkIndex, SchemaRecord, Statistics, op};
 use crate::fs::{self, Fs, WriteFile};
 use crate::{Error, Result};
+use crossbeam::channel::{Receiver, TryRecvError, bounded};
+use depthrig_bus::HostTime;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -19,7 +21,7 @@ pub(crate) fn file_name(index: u32) -> String {
 }
 
 /// What stands at the head of each segment so that it stands alone.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Preamble {
     pub(crate) schemas: Vec<SchemaRecord>,
     pub(crate) channels: Vec<Channel>,
@@ -52,6 +54,14 @@ pub(crate) struct Segment {
     /// A sync failed. What it was for may never reach the disk, and a later sync that succeeds says nothing of
     /// it (<https://wiki.postgresql.org/wiki/Fsync_Errors>): such a file must not pass for a durable one.
     doubtful: bool,
+    /// A sync on a thread of its own.
+    syncing: Option<Syncing>,
+}
+
+/// A sync that is going on: when it began, and where its result comes.
+struct Syncing {
+    since: HostTime,
+    result: Receiver<std::io::Result<()>>,
 }
 
 impl Segment {
@@ -93,6 +103,7 @@ impl Segment {
             stats: Statistics::default(),
             torn: false,
             doubtful: false,
+            syncing: None,
         };
         for s in &preamble.schemas {
             record::schema(&mut segment.schemas, s);
@@ -223,7 +234,45 @@ impl Segment {
 
     /// Makes what was appended durable.
     pub(crate) fn sync(&mut self) -> Result<()> {
-        self.file.sync_data().map_err(|e| {
+        let done = self.file.sync_data();
+        self.synced(done)
+    }
+
+    /// Begins to make what was appended durable on a thread of its own, so that a slow disk does not keep what comes next
+    /// from being written. While one such sync goes on, no other begins; whether one has begun.
+    ///
+    /// # Errors
+    /// As the file system says, also of a sync that began earlier.
+    pub(crate) fn begin_sync(&mut self) -> Result<bool> {
+        match self.syncing.as_ref().map(|s| s.result.try_recv()) {
+            Some(Err(TryRecvError::Empty)) => return Ok(false),
+            Some(ended) => {
+                self.syncing = None;
+                self.synced(ended.unwrap_or_else(|_| Err(std::io::Error::other("its thread died"))))?;
+            }
+            None => {}
+        }
+        let (sender, result) = bounded(1);
+        let begun = self.file.sync_beside().and_then(|sync| {
+            // The receiver may be gone with the segment.
+            let run = move || drop(sender.send(sync()));
+            std::thread::Builder::new().name("rec-sync".into()).spawn(run).ok()
+        });
+        match begun {
+            Some(_) => self.syncing = Some(Syncing { since: HostTime::now(), result }),
+            None => self.sync()?,
+        }
+        Ok(true)
+    }
+
+    /// Since when a sync goes on, if one does.
+    pub(crate) fn syncing_since(&self) -> Option<HostTime> {
+        let syncing = self.syncing.as_ref()?;
+        syncing.result.is_empty().then_some(syncing.since)
+    }
+
+    fn synced(&mut self, done: std::io::Result<()>) -> Result<()> {
+        done.map_err(|e| {
             self.doubtful = true;
             Error::io("sync", &self.part, e)
         })
@@ -257,6 +306,10 @@ impl Segment {
     }
 
     fn durable(mut self) -> Result<PathBuf> {
+        if let Some(syncing) = self.syncing.take() {
+            let ended = syncing.result.recv();
+            self.synced(ended.unwrap_or_else(|_| Err(std::io::Error::other("its thread died"))))?;
+        }
         self.file.sync_all().map_err(|e| Error::io("sync", &self.part, e))?;
         if self.doubtful {
             return Err(Error::new(

@@ -4,16 +4,12 @@ use crate::codec::{DEPTH_CODEC, DepthDecoder, DepthShape};
 use crate::encode::Codec;
 use crate::msgs::image;
 use crate::{Error, ErrorKind, Result};
-use ::image::codecs::jpeg::JpegDecoder;
 use ::image::codecs::png::PngDecoder;
 use ::image::{ColorType, ImageDecoder, Limits};
 use depthrig_bus::{FrameHeader, PixelFormat};
+use depthrig_jpeg::{Form, Info};
 use std::cell::RefCell;
 use std::io::Cursor;
-use std::panic::{AssertUnwindSafe, catch_unwind};
-
-/// Colour pictures above this many bytes are refused: 16384x16384.
-const COLOR_MAX: u64 = 3 << 28;
 
 thread_local! {
     /// One per thread that reads depth, so that its tables and buffers are made once.
@@ -64,14 +60,13 @@ fn wrong(h: &FrameHeader, what: impl core::fmt::Display) -> Error {
 
 /// The pixels of a colour JPEG, three bytes each without row padding.
 pub(crate) fn jpeg_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
-    let damaged = |e: ::image::ImageError| wrong(h, "its JPEG is damaged").with_source(e);
-    // zune-jpeg has panicked on damaged files, such as a narrow one with odd sampling factors (0.4.21; none is known
-    // for 0.5.15); what it worked on is given up then.
-    catch_unwind(AssertUnwindSafe(|| {
-        let decoder = JpegDecoder::new(Cursor::new(stored)).map_err(damaged)?;
-        color_pixels(decoder, "JPEG", h)
-    }))
-    .unwrap_or_else(|_| Err(wrong(h, "its JPEG is damaged: the decoder gave up")))
+    let damaged = |e: depthrig_jpeg::Error| wrong(h, "its JPEG is damaged").with_source(e);
+    let info = depthrig_jpeg::info(stored).map_err(damaged)?;
+    let expected = Info { width: h.width, height: h.height, form: Form::Rgb };
+    check_color("JPEG", info.width, info.height, info == expected, h)?;
+    let mut pixels = vec![0; expected.bytes()];
+    depthrig_jpeg::decode_into(stored, expected, &mut pixels).map_err(damaged)?;
+    Ok(pixels)
 }
 
 fn png_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
@@ -82,7 +77,7 @@ fn png_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
     if decoder.color_type() != ColorType::Rgb8 {
         return Err(wrong(h, "its PNG is not RGB of 8 bit"));
     }
-    color_pixels(decoder, "PNG", h)
+    color_pixels(decoder, h)
 }
 
 /// Whether this is a PNG or a JPEG of the header's size: for the fuzz targets.
@@ -90,20 +85,25 @@ pub(crate) fn color_decodes(stored: &[u8], h: &FrameHeader) -> bool {
     png_pixels(stored, h).is_ok() | jpeg_pixels(stored, h).is_ok()
 }
 
-fn color_pixels(decoder: impl ImageDecoder, kind: &str, h: &FrameHeader) -> Result<Vec<u8>> {
+fn color_pixels(decoder: impl ImageDecoder, h: &FrameHeader) -> Result<Vec<u8>> {
     let (width, height) = decoder.dimensions();
-    if (width, height) != (h.width, h.height) || decoder.color_type().bytes_per_pixel() != 3 {
+    let fits = (width, height) == (h.width, h.height) && decoder.color_type().bytes_per_pixel() == 3;
+    check_color("PNG", width, height, fits, h)?;
+    let mut pixels = vec![0; 3 * width as usize * height as usize];
+    let damaged = |e: ::image::ImageError| wrong(h, "its PNG is damaged").with_source(e);
+    decoder.read_image(&mut pixels).map_err(damaged)?;
+    Ok(pixels)
+}
+
+fn check_color(kind: &str, width: u32, height: u32, fits: bool, h: &FrameHeader) -> Result<()> {
+    if !fits {
         let said = format!("its header says {}x{} in colour", h.width, h.height);
         return Err(wrong(h, format_args!("its {kind} is {width}x{height}, {said}")));
     }
-    let bytes = 3 * u64::from(width) * u64::from(height);
-    if bytes > COLOR_MAX {
+    if 3 * u64::from(width) * u64::from(height) > crate::IMAGE_MAX_BYTES {
         return Err(wrong(h, format_args!("a {kind} of {width}x{height} is too large")));
     }
-    let mut pixels = vec![0; bytes as usize];
-    let damaged = |e: ::image::ImageError| wrong(h, format_args!("its {kind} is damaged")).with_source(e);
-    decoder.read_image(&mut pixels).map_err(damaged)?;
-    Ok(pixels)
+    Ok(())
 }
 
 /// The payload as the header describes it: same format, same stride, same length.

@@ -1,6 +1,7 @@
 //! What is in a dataset, without reading a picture.
 
 use super::{Dataset, PixelMode, SetRange};
+use crate::container::scan::SegmentReader;
 use crate::msgs::accounts;
 use crate::msgs::schemas::Schema;
 use crate::{
@@ -99,8 +100,12 @@ pub struct StreamInfo {
     pub frames: u64,
     /// Sets without a frame of this stream.
     pub missing: u64,
-    /// Bytes of its pictures before the chunks are packed.
+    /// Bytes of its images before the chunks are packed.
     pub bytes: u64,
+    /// Bytes of the chunks that hold its images, as they lie in the file.
+    pub packed_bytes: u64,
+    /// Whether chunks of it are packed by zstd.
+    pub is_packed: bool,
     /// Bytes that its pixels have on the channel.
     pub raw_bytes: u64,
     /// Frames per second between its first and its last frame, by capture time.
@@ -188,6 +193,8 @@ impl StreamInfo {
             frames: 0,
             missing: 0,
             bytes: 0,
+            packed_bytes: 0,
+            is_packed: false,
             raw_bytes: 0,
             rate_hz: 0.0,
         }
@@ -283,6 +290,7 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
             let name = reader.path.file_name().map(|n| n.to_string_lossy().into_owned());
             info.unfinished.extend(name);
         }
+        add_packed(&mut info, &reader);
         let channel = reader.channels.iter().find(|(_, c)| c.schema == Schema::Accounts.name());
         let Some((channel, _)) = channel else { continue };
         let last = reader.chunks.iter().rev().find(|c| c.channels.contains(channel));
@@ -299,6 +307,21 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
         }
     }
     Ok(info)
+}
+
+/// Adds what the chunks of a segment take that hold images alone.
+fn add_packed(info: &mut DatasetInfo, reader: &SegmentReader) {
+    for chunk in &reader.chunks {
+        let [channel] = chunk.channels[..] else { continue };
+        let Some(channel) = reader.channels.get(&channel) else { continue };
+        if !Schema::PICTURES.iter().any(|s| channel.schema == s.name()) {
+            continue;
+        }
+        let stream = channel.metadata.get("stream");
+        let Some(stream) = info.streams.iter_mut().find(|s| stream == Some(&s.stream)) else { continue };
+        stream.packed_bytes = stream.packed_bytes.saturating_add(chunk.length);
+        stream.is_packed |= chunk.is_packed;
+    }
 }
 
 #[cfg(test)]

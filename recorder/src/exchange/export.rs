@@ -252,6 +252,7 @@ pub fn export(
     options: ExportOptions,
     progress: &mut dyn FnMut(ExportProgress) -> ControlFlow<()>,
 ) -> Result<ExportReport> {
+    datasets.iter().try_for_each(|d| crate::check_outside(out, d.path()))?;
     let sources: Vec<_> = datasets.into_iter().map(Source::new).collect::<Result<_>>()?;
     let plan = exporter.plan(&sources)?;
     let mut report = ExportReport {

@@ -1,6 +1,6 @@
 //! The disk guard: free space and stalls, looked at each second by a thread that no write can block.
 
-use super::Shared;
+use super::{Shared, drops};
 use crate::{Diagnostic, Error, ErrorKind, Level};
 use crossbeam::channel::{Receiver, RecvTimeoutError};
 use depthrig_bus::HostTime;
@@ -100,10 +100,12 @@ impl Watch {
 pub(super) fn run(shared: &Shared, stop: &Receiver<()>) {
     let mut watch = Watch::default();
     let mut stalled = false;
+    let mut hurried = Hurried::default();
     let every = shared.options.sync_interval_ns.clamp(1_000_000, 1_000_000_000);
     while stop.recv_timeout(Duration::from_nanos(every as u64)) == Err(RecvTimeoutError::Timeout) {
         let now = HostTime::now();
-        let since = shared.io_since_ns.load(Ordering::Relaxed);
+        let waits = [&shared.io_since_ns, &shared.sync_since_ns].map(|ns| ns.load(Ordering::Relaxed));
+        let since = waits.into_iter().filter(|ns| *ns > 0).min().unwrap_or(0);
         let stalled_s = if since > 0 { now.since_ns(HostTime::from_ns(since)) as f64 * 1e-9 } else { 0.0 };
         let backlog = shared.load.backlog_bytes.load(Ordering::Relaxed);
         let stalls = stalled_s >= STALL_S;
@@ -123,7 +125,41 @@ pub(super) fn run(shared: &Shared, stop: &Receiver<()>) {
             state.disk.stalled_s = if stalls { stalled_s } else { 0.0 };
             state.disk.warning = stalls.then(|| format!("the disk has not answered for {stalled_s:.0} s"));
         }
+        if let Some(frames) = hurried.look(shared.load.hurried.load(Ordering::Relaxed), now) {
+            let dataset = shared.dir.display();
+            tracing::warn!(
+                %dataset,
+                frames,
+                "the encoders are behind: {frames} frames were stored unpacked, which takes several times the space"
+            );
+        }
+        let counts = shared.lock().drops.due(now);
+        for drops::Counted { reason, sets } in counts {
+            let dataset = shared.dir.display();
+            let reason = reason.name();
+            tracing::error!(%dataset, reason, sets, "{sets} more sets were not recorded since the last line about this");
+        }
         look(shared, &mut watch, backlog);
+    }
+}
+
+/// Frames that were encoded with the least effort, as far as the log has them.
+#[derive(Default)]
+struct Hurried {
+    logged: u64,
+    at: Option<HostTime>,
+}
+
+impl Hurried {
+    /// Frames since the last line; at once for the first ones, then once a minute.
+    fn look(&mut self, frames: u64, now: HostTime) -> Option<u64> {
+        const EVERY_NS: i64 = 60_000_000_000;
+        let more = frames - self.logged;
+        if more == 0 || self.at.is_some_and(|at| now.since_ns(at) < EVERY_NS) {
+            return None;
+        }
+        (self.logged, self.at) = (frames, Some(now));
+        Some(more)
     }
 }
 

@@ -1,10 +1,15 @@
 //! A set on its way: the workers fill its slots in any order, the writer takes tickets in order.
+//!
+//! Where a set has a deadline, frames whose turn comes in the second half of the time until then are encoded with the
+//! least effort, which makes encoders that are behind several times faster. When that does not do, they must not spend
+//! themselves on sets that miss their deadline: a set is given up before its first frame is encoded when even so it would
+//! take longer than it has left, and whenever its deadline passes.
 
-use crate::encode::EncodedFrame;
+use crate::encode::{Effort, EncodedFrame};
 use crate::frame::{RecordFrame, RecordMotion, RecordSet};
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{FrameHeader, HostTime, UtcPair};
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicI64, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -15,6 +20,20 @@ pub(super) struct Load {
     pub(super) unencoded: AtomicUsize,
     /// Encoded bytes that are not written yet.
     pub(super) backlog_bytes: AtomicU64,
+    /// How long encoding a set with the least effort takes at present, from its first frame to its last.
+    hurried_ns: AtomicI64,
+    /// Frames that were encoded so.
+    pub(super) hurried: AtomicU64,
+}
+
+/// What the encoders made of a set.
+pub(super) enum Encoded {
+    /// Its frames.
+    Frames(Vec<EncodedFrame>),
+    /// A frame could not be encoded.
+    Failed(Error),
+    /// It was given up: the encoders were behind.
+    Late,
 }
 
 pub(super) struct Ticket {
@@ -31,6 +50,9 @@ pub(super) struct Ticket {
     pub(super) frames: Vec<(usize, FrameHeader)>,
     /// The batches of the motion units, `set_id` filled in.
     pub(super) motion: Vec<RecordMotion>,
+    /// When it is given up.
+    pub(super) due: Option<HostTime>,
+    pushed: HostTime,
     slots: Mutex<Slots>,
     ready: Condvar,
     load: Arc<Load>,
@@ -40,6 +62,15 @@ struct Slots {
     left: usize,
     bytes: u64,
     done: Vec<Option<Result<EncodedFrame>>>,
+    begun: Option<Begun>,
+    given_up: bool,
+}
+
+/// When the first frame went to an encoder, and how.
+#[derive(Clone, Copy)]
+struct Begun {
+    at: HostTime,
+    effort: Effort,
 }
 
 /// One frame to be encoded into its slot.
@@ -55,6 +86,7 @@ impl Ticket {
         anchor: &UtcPair,
         log_time: i64,
         offered: u64,
+        late_after_ns: Option<i64>,
         load: &Arc<Load>,
     ) -> (Self, Vec<RecordFrame>) {
         let mut frames = set.frames;
@@ -78,7 +110,9 @@ impl Ticket {
             spread_ns: set.spread_ns,
             offered,
             missing: set.missing,
-            slots: Mutex::new(Slots { left: frames.len(), bytes, done }),
+            due: late_after_ns.map(|ns| set.tick.plus_ns(ns)),
+            pushed: HostTime::now(),
+            slots: Mutex::new(Slots { left: frames.len(), bytes, done, begun: None, given_up: false }),
             frames: frames.iter().map(|f| (f.stream, f.header)).collect(),
             motion,
             ready: Condvar::new(),
@@ -92,12 +126,64 @@ impl Ticket {
         mono_ns.saturating_add(self.utc_offset_ns)
     }
 
-    /// The encoded frames once all are there; `None` when they are not after `patience`.
-    pub(super) fn wait(&self, patience: Duration) -> Option<Result<Vec<EncodedFrame>>> {
+    /// What became of its frames; `None` when that is open after `timeout`.
+    pub(super) fn wait(&self, timeout: Duration) -> Option<Encoded> {
         let slots = self.lock();
-        let waited = self.ready.wait_timeout_while(slots, patience, |s| s.left > 0);
+        let waited = self.ready.wait_timeout_while(slots, timeout, |s| s.left > 0 && !s.given_up);
         let mut slots = waited.unwrap_or_else(PoisonError::into_inner).0;
-        (slots.left == 0).then(|| slots.done.drain(..).flatten().collect())
+        if slots.given_up {
+            return Some(Encoded::Late);
+        }
+        (slots.left == 0).then(|| {
+            let frames: Result<_> = slots.done.drain(..).flatten().collect();
+            frames.map_or_else(Encoded::Failed, Encoded::Frames)
+        })
+    }
+
+    /// Whether its deadline has passed.
+    pub(super) fn is_late(&self, now: HostTime) -> bool {
+        self.due.is_some_and(|due| now > due)
+    }
+
+    /// Gives the set up unless all its frames are encoded.
+    pub(super) fn give_up(&self) {
+        let mut slots = self.lock();
+        if slots.left > 0 {
+            self.give_up_locked(&mut slots);
+        }
+    }
+
+    fn give_up_locked(&self, slots: &mut Slots) {
+        slots.given_up = true;
+        // What was encoded already is of no use any more.
+        slots.done.iter_mut().filter(|d| d.is_some()).for_each(|d| *d = Some(Err(given_up())));
+        self.ready.notify_all();
+    }
+
+    /// How a frame of the set is to be encoded now; `None` when the set is given up. That is decided with its first frame: a
+    /// set that is expected to miss its deadline leaves its turn to the next one.
+    fn admit(&self) -> Option<Effort> {
+        let mut slots = self.lock();
+        if slots.given_up {
+            return None;
+        }
+        let now = HostTime::now();
+        let Some(due) = self.due else { return Some(Effort::Full) };
+        let budget = due.since_ns(self.pushed);
+        let left = due.since_ns(now);
+        let effort = if left > budget / 2 { Effort::Full } else { Effort::Least };
+        if slots.begun.is_none() {
+            let expected = self.load.hurried_ns.load(Ordering::Relaxed);
+            if effort == Effort::Least && expected > left {
+                // So that one is tried in the end, however slow the last ones were.
+                self.load.hurried_ns.store(expected / 8 * 7, Ordering::Relaxed);
+                self.give_up_locked(&mut slots);
+                return None;
+            }
+            slots.begun = Some(Begun { at: now, effort });
+        }
+        self.load.hurried.fetch_add(u64::from(effort == Effort::Least), Ordering::Relaxed);
+        Some(effort)
     }
 
     fn lock(&self) -> MutexGuard<'_, Slots> {
@@ -112,7 +198,9 @@ impl Ticket {
     /// Fills a slot, once; the last one makes the ticket ready.
     fn fill(&self, slot: usize, result: Result<EncodedFrame>) {
         let mut slots = self.lock();
+        let given_up_now = slots.given_up;
         let Some(place) = slots.done.get_mut(slot).filter(|p| p.is_none()) else { return };
+        let result = if given_up_now { Err(given_up()) } else { result };
         let bytes = result.as_ref().map_or(0, |f| f.chunk.len());
         self.load.backlog_bytes.fetch_add(bytes, Ordering::Relaxed);
         *place = Some(result);
@@ -120,6 +208,11 @@ impl Ticket {
         slots.left -= 1;
         if slots.left == 0 {
             self.load.unencoded.fetch_sub(1, Ordering::Relaxed);
+            if let Some(Begun { at, effort: Effort::Least }) = slots.begun {
+                let took = HostTime::now().since_ns(at);
+                let before = self.load.hurried_ns.load(Ordering::Relaxed);
+                self.load.hurried_ns.store(before / 4 * 3 + took / 4, Ordering::Relaxed);
+            }
             self.ready.notify_all();
         }
     }
@@ -135,11 +228,20 @@ impl Job {
     }
 
     /// Encodes the frame, which lets go of its pixels unless they may wait, and only then fills the slot.
-    pub(super) fn run(mut self, encode: impl FnOnce(RecordFrame) -> Result<EncodedFrame>) {
+    pub(super) fn run(mut self, encode: impl FnOnce(RecordFrame, Effort) -> Result<EncodedFrame>) {
         let Some(frame) = self.frame.take() else { return };
-        let result = encode(frame);
+        let result = if let Some(effort) = self.ticket.admit() {
+            encode(frame, effort)
+        } else {
+            drop(frame);
+            Err(given_up())
+        };
         self.ticket.fill(self.slot, result);
     }
+}
+
+fn given_up() -> Error {
+    Error::new(ErrorKind::Codec, "the set was given up")
 }
 
 impl Drop for Job {

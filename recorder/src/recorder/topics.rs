@@ -7,7 +7,7 @@ use crate::frame::{RecordMotion, RecordSet, SET_MOTION_MAX_BYTES};
 use crate::msgs::image;
 use crate::msgs::schemas::Schema;
 use crate::msgs::tf::{mount_frame, optical_frame, unit_frame};
-use crate::{MotionRecord, RecorderOptions, Result, Session};
+use crate::{IMAGE_MAX_BYTES, MotionRecord, RecorderOptions, Result, Session};
 use depthrig_bus::{FrameHeader, MOTION_SAMPLE_BYTES, PixelFormat};
 use std::collections::BTreeMap;
 
@@ -132,10 +132,6 @@ impl Topics {
         &self.names[stream]
     }
 
-    pub(super) fn codec(&self, stream: usize) -> Codec {
-        self.codecs[stream]
-    }
-
     /// What makes a set impossible to record, in words; after the set `last_id` and these batches of each motion unit.
     pub(super) fn check(
         &self,
@@ -157,6 +153,10 @@ impl Topics {
         for f in &set.frames {
             let format =
                 image::check_picture(&f.header, f.pixels.bytes().len()).map_err(|e| e.to_string())?;
+            if u64::from(f.header.payload_len) > IMAGE_MAX_BYTES {
+                let (name, bytes) = (&self.names[f.stream], f.header.payload_len);
+                return Err(format!("an image of {name} has {bytes} bytes, {IMAGE_MAX_BYTES} is the limit"));
+            }
             let announced = self.formats[f.stream];
             if format != announced {
                 return Err(format!(

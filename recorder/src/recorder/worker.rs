@@ -3,7 +3,7 @@
 use super::Shared;
 use super::ticket::Job;
 use super::topics::image_channel;
-use crate::encode::{FrameEncoder, FrameJob};
+use crate::encode::{Effort, FrameEncoder, FrameJob};
 use crossbeam::channel::Receiver;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -19,14 +19,16 @@ pub(super) fn run(shared: &Shared, queue: &Receiver<Job>) {
     while let Ok(job) = queue.recv() {
         let ticket = Arc::clone(job.ticket());
         let encode = AssertUnwindSafe(|| {
-            job.run(|frame| {
-                encoder.encode(FrameJob {
+            job.run(|frame, effort| {
+                let effort = if shared.disk_keeps_up() { effort } else { Effort::Full };
+                let job = FrameJob {
                     channel: image_channel(frame.stream),
                     frame_id: shared.topics.frame_id(frame.stream),
                     log_time: u64::try_from(ticket.log_time).unwrap_or(0),
                     stamp_utc_ns: ticket.utc_ns(frame.header.capture_time_ns),
                     frame,
-                })
+                };
+                encoder.encode(job, effort)
             });
         });
         // A picture that makes an encoder panic must cost one set, not the recording.

@@ -1,6 +1,6 @@
 //! The writer thread: it alone owns the file.
 
-use super::ticket::Ticket;
+use super::ticket::{Encoded, Ticket};
 use super::topics::{Global, MOTION_CODEC, SEGMENT_METADATA, image_channel};
 use super::{RESERVE_FILE, Shared, Summary};
 use crate::container::chunk::{Chunk, ChunkBuilder, MessageHead};
@@ -12,11 +12,29 @@ use crate::msgs::frame_set::{self, Checkpoint, FrameSetMsg, Member};
 use crate::msgs::motion::{self, Imu};
 use crate::msgs::{accounts, diagnostics, image, tf};
 use crate::{Error, Outcome, Result};
+use core::time::Duration;
 use crossbeam::channel::{Receiver, RecvTimeoutError};
 use depthrig_bus::{HostTime, UtcPair};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
+
+/// How long a count of dropped sets may wait until it is in the file.
+const SAY_EVERY_NS: i64 = 100_000_000;
+/// An operation that took this long was a stall of the disk.
+const STALL_NS: i64 = 300_000_000;
+/// Sets that waited for a stalled disk are written late all the same, but only once in this long: a disk that is slow for
+/// good must not let sets grow older and older.
+const FORGIVE_EVERY_NS: i64 = 10_000_000_000;
+
+/// What the present segment holds so far.
+#[derive(Default, Clone, Copy)]
+struct Within {
+    sets: u64,
+    /// Ids of the first and the last set; 0 without one.
+    first: u64,
+    last: u64,
+}
 
 pub(super) struct Writer {
     shared: Arc<Shared>,
@@ -24,12 +42,20 @@ pub(super) struct Writer {
     segment: Option<Segment>,
     /// Index of the present segment, or of the next one.
     index: u32,
-    /// Sets in the present segment, with the ids of the first and the last.
-    in_segment: Option<(u64, u64, u64)>,
+    /// What is in the present segment once it has its head chunk.
+    in_segment: Option<Within>,
     builder: ChunkBuilder,
     sequence: u32,
     last_log_time: Option<i64>,
     next_sync: HostTime,
+    /// Dropped sets as the file has them.
+    said: u64,
+    /// When they may be written again.
+    next_say: HostTime,
+    /// Sets with a tick before this are not late: the disk had stalled.
+    forgiven: HostTime,
+    /// When a stall may be forgiven again.
+    next_forgiven: HostTime,
     /// Something was written that is not durable yet.
     dirty: bool,
     /// The recording ended before its time; nothing more is written.
@@ -47,7 +73,8 @@ impl Writer {
         index: u32,
     ) -> Self {
         shared.lock().bytes += segment.len();
-        let next_sync = HostTime::now().plus_ns(shared.options.sync_interval_ns);
+        let now = HostTime::now();
+        let next_sync = now.plus_ns(shared.options.sync_interval_ns);
         Self {
             shared,
             tickets,
@@ -58,6 +85,10 @@ impl Writer {
             sequence: 0,
             last_log_time: None,
             next_sync,
+            said: 0,
+            next_say: now,
+            forgiven: HostTime::from_ns(i64::MIN),
+            next_forgiven: now,
             dirty: true,
             failed: false,
             ending: false,
@@ -67,12 +98,12 @@ impl Writer {
 
     pub(super) fn run(mut self) -> Summary {
         loop {
-            match self.tickets.recv_timeout(self.next_sync.from_now()) {
+            match self.tickets.recv_timeout(self.next_look().from_now()) {
                 Ok(ticket) => self.take(&ticket),
                 Err(RecvTimeoutError::Timeout) => {}
                 Err(RecvTimeoutError::Disconnected) => break,
             }
-            self.sync_when_due();
+            self.work_when_due();
         }
         if self.shared.abandoned.load(Ordering::Acquire) {
             self.try_io(|w| w.segment.as_mut().map_or(Ok(()), Segment::sync));
@@ -86,20 +117,31 @@ impl Writer {
     /// Waits for a set's frames and writes it, or counts why not.
     fn take(&mut self, ticket: &Ticket) {
         let encoded = loop {
-            let patience = self.next_sync.from_now();
-            match ticket.wait(patience) {
-                Some(encoded) => break encoded,
-                None => self.sync_when_due(),
+            let until = ticket.due.map_or(self.next_look(), |due| due.min(self.next_look()));
+            if let Some(encoded) = ticket.wait(until.from_now()) {
+                break encoded;
             }
+            if ticket.is_late(HostTime::now()) {
+                ticket.give_up();
+            }
+            self.work_when_due();
         };
         let bytes = ticket.taken_bytes();
+        let late = ticket.is_late(HostTime::now()) && ticket.tick >= self.forgiven;
         let dropped = match encoded {
-            _ if self.failed => Some(SetDrop::WriteFailed),
-            Ok(frames) => {
+            _ if self.failed => Some((SetDrop::WriteFailed, "the recording had ended".to_owned())),
+            Encoded::Late => {
+                Some((SetDrop::EncoderBusy, "the encoders were behind, it had become too old".to_owned()))
+            }
+            Encoded::Failed(e) => Some((SetDrop::EncodeFailed, e.to_string())),
+            Encoded::Frames(_) if late => {
+                Some((SetDrop::DiskSlow, "the disk was behind, it had become too old".to_owned()))
+            }
+            Encoded::Frames(frames) => {
                 let n = frames.len() as u64;
                 self.try_io(|w| w.write_set(ticket, frames));
                 if self.failed {
-                    Some(SetDrop::WriteFailed)
+                    Some((SetDrop::WriteFailed, "the recording ended with it".to_owned()))
                 } else {
                     let mut state = self.shared.lock();
                     state.counts.recorded += 1;
@@ -107,15 +149,55 @@ impl Writer {
                     None
                 }
             }
-            Err(e) => {
-                tracing::error!(set = ticket.id, "a set was not recorded: {e}");
-                Some(SetDrop::EncodeFailed)
-            }
         };
         self.shared.load.backlog_bytes.fetch_sub(bytes, Ordering::Relaxed);
-        if let Some(reason) = dropped {
-            self.shared.lock().counts.dropped[reason as usize] += 1;
+        if let Some((reason, why)) = dropped {
+            self.shared.lock().drop_set(ticket.id, reason, &why);
+            let live = self.shared.options.late_after_ns.is_some();
+            if live && self.in_segment.is_none() && self.segment.is_some() {
+                // The count needs a segment with a head to stand in.
+                self.try_io(|w| w.begin_segment(ticket));
+            }
         }
+    }
+
+    /// When there is something to do besides sets.
+    fn next_look(&self) -> HostTime {
+        match self.shared.options.late_after_ns {
+            Some(_) => self.next_sync.min(HostTime::now().plus_ns(SAY_EVERY_NS)),
+            None => self.next_sync,
+        }
+    }
+
+    fn work_when_due(&mut self) {
+        self.say_drops_when_due();
+        self.sync_when_due();
+    }
+
+    /// Writes how many sets were dropped soon after they were, so that a kill does not take the count.
+    fn say_drops_when_due(&mut self) {
+        if self.shared.options.late_after_ns.is_none() || self.next_say.from_now() > Duration::ZERO {
+            return;
+        }
+        let Some(log_time) = self.last_log_time.filter(|_| self.in_segment.is_some()) else { return };
+        if self.shared.lock().counts.dropped_total() == self.said {
+            return;
+        }
+        self.next_say = HostTime::now().plus_ns(SAY_EVERY_NS);
+        self.try_io(|w| {
+            w.accounts(log_time);
+            let chunk = w.builder.pack(true)?;
+            w.append(&[chunk])
+        });
+    }
+
+    /// Writes the head chunk of a segment before its first set.
+    fn begin_segment(&mut self, ticket: &Ticket) -> Result<()> {
+        let chunk = self.head_chunk(ticket)?;
+        self.append(&[chunk])?;
+        self.last_log_time = Some(ticket.log_time);
+        self.in_segment = Some(Within::default());
+        Ok(())
     }
 
     /// Writes a set whole: its pictures, then the chunk that describes them and ends in the commit mark.
@@ -134,17 +216,17 @@ impl Writer {
         if self.in_segment.is_none() {
             chunks.push(self.head_chunk(ticket)?);
         }
-        let (members, pictures): (Vec<_>, Vec<_>) =
-            frames.into_iter().map(|f| ((f.message_bytes, f.message_crc32), f.chunk)).unzip();
-        chunks.extend(pictures);
-        chunks.push(self.commit_chunk(ticket, &members)?);
+        let commit = self.commit_chunk(ticket, &frames)?;
+        chunks.extend(frames.into_iter().map(|f| f.chunk));
+        chunks.push(commit);
         if self.segment.is_none() {
             self.open_segment()?;
         }
         self.append(&chunks)?;
         self.last_log_time = Some(ticket.log_time);
-        let (n, first, _) = self.in_segment.unwrap_or((0, ticket.id, 0));
-        self.in_segment = Some((n + 1, first, ticket.id));
+        let within = self.in_segment.unwrap_or_default();
+        let first = if within.sets == 0 { ticket.id } else { within.first };
+        self.in_segment = Some(Within { sets: within.sets + 1, first, last: ticket.id });
         Ok(())
     }
 
@@ -180,7 +262,7 @@ impl Writer {
         self.builder.pack(true)
     }
 
-    fn commit_chunk(&mut self, ticket: &Ticket, members: &[(u64, u32)]) -> Result<Chunk> {
+    fn commit_chunk(&mut self, ticket: &Ticket, frames: &[EncodedFrame]) -> Result<Chunk> {
         let shared = Arc::clone(&self.shared);
         let topics = &shared.topics;
         let mut set = FrameSetMsg {
@@ -190,13 +272,13 @@ impl Writer {
             utc_offset_ns: ticket.utc_offset_ns,
             spread_ns: ticket.spread_ns,
             sets_offered: ticket.offered,
-            members: Vec::with_capacity(members.len()),
+            members: Vec::with_capacity(frames.len()),
             missing: ticket.missing.iter().map(|s| topics.name(*s).to_owned()).collect(),
         };
-        for ((stream, h), (message_bytes, message_crc32)) in ticket.frames.iter().zip(members) {
+        for ((stream, h), frame) in ticket.frames.iter().zip(frames) {
             let stamp_utc_ns = ticket.utc_ns(h.capture_time_ns);
             let frame_id = topics.frame_id(*stream);
-            let extra = Extra { stamp_utc_ns, frame_id, codec: topics.codec(*stream).name() };
+            let extra = Extra { stamp_utc_ns, frame_id, codec: frame.codec.name() };
             let head = |channel| MessageHead {
                 channel,
                 sequence: h.sequence as u32,
@@ -216,8 +298,8 @@ impl Writer {
                 stream: topics.name(*stream).to_owned(),
                 sequence: h.sequence,
                 capture_time_ns: h.capture_time_ns,
-                message_bytes: *message_bytes,
-                message_crc32: *message_crc32,
+                message_bytes: frame.message_bytes,
+                message_crc32: frame.message_crc32,
             });
         }
         self.motion(ticket);
@@ -282,6 +364,7 @@ impl Writer {
         let (mut counts, streams) = (state.counts, state.accounts.clone());
         drop(state);
         counts.offered = counts.recorded + counts.dropped_total();
+        self.said = counts.dropped_total();
         self.message(Global::Accounts, log_time, log_time, |b| {
             accounts::write(b, log_time, &counts, &streams);
         });
@@ -298,6 +381,8 @@ impl Writer {
         }
         self.next_sync = now.plus_ns(self.shared.options.sync_interval_ns.max(1_000_000));
         self.try_io(Self::each_second);
+        let since = self.segment.as_ref().and_then(Segment::syncing_since);
+        self.shared.sync_since_ns.store(since.map_or(0, HostTime::ns), Ordering::Relaxed);
         self.save_session_if_changed();
     }
 
@@ -305,8 +390,9 @@ impl Writer {
     fn each_second(&mut self) -> Result<()> {
         let Some(log_time) = self.last_log_time.filter(|_| self.in_segment.is_some()) else { return Ok(()) };
         self.between(log_time)?;
-        if let Some(segment) = self.segment.as_mut().filter(|_| self.dirty) {
-            segment.sync()?;
+        if let Some(segment) = self.segment.as_mut().filter(|_| self.dirty)
+            && segment.begin_sync()?
+        {
             self.dirty = false;
         }
         Ok(())
@@ -356,13 +442,13 @@ impl Writer {
 
     fn finish_file(&mut self) -> Result<()> {
         let Some(mut segment) = self.segment.take() else { return Ok(()) };
-        let (n, first, last) = self.in_segment.unwrap_or_default();
+        let within = self.in_segment.unwrap_or_default();
         let counts = self.shared.lock().counts;
         let mut facts = BTreeMap::from([
             ("segment".to_owned(), self.index.to_string()),
-            ("sets".to_owned(), n.to_string()),
-            ("first_set".to_owned(), first.to_string()),
-            ("last_set".to_owned(), last.to_string()),
+            ("sets".to_owned(), within.sets.to_string()),
+            ("first_set".to_owned(), within.first.to_string()),
+            ("last_set".to_owned(), within.last.to_string()),
             ("sets_recorded_so_far".to_owned(), counts.recorded.to_string()),
         ]);
         for (reason, n) in counts.dropped_by_reason() {
@@ -420,9 +506,15 @@ impl Writer {
         if self.failed {
             return;
         }
-        self.shared.io_since_ns.store(HostTime::now().ns(), Ordering::Relaxed);
+        let begun = HostTime::now();
+        self.shared.io_since_ns.store(begun.ns(), Ordering::Relaxed);
         let done = operation(self);
         self.shared.io_since_ns.store(0, Ordering::Relaxed);
+        let now = HostTime::now();
+        if now.since_ns(begun) >= STALL_NS && now >= self.next_forgiven {
+            self.forgiven = now;
+            self.next_forgiven = now.plus_ns(FORGIVE_EVERY_NS);
+        }
         let Err(e) = done else { return };
         self.failed = true;
         self.builder = ChunkBuilder::new();

@@ -1,15 +1,13 @@
 //! Whether a segment is whole, and what it says of itself.
 
 use super::RECOVERED_METADATA;
-use super::segment::{Tell, WINDOW};
-use crate::container::record::op;
-use crate::container::scan::{HEAD, SegmentReader};
+use crate::container::scan::SegmentReader;
 use crate::fs::Fs;
 use crate::msgs::accounts;
 use crate::msgs::frame_set::FrameSetMsg;
 use crate::msgs::schemas::Schema;
 use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA};
-use crate::{ErrorKind, Result, SetCounts};
+use crate::{Result, SetCounts};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -60,51 +58,20 @@ pub(crate) fn sets_lost(recovered: &BTreeMap<String, String>) -> u64 {
     recovered.get("sets_lost").and_then(|n| n.parse().ok()).unwrap_or(0)
 }
 
-/// What the segment holds if it is finished and whole; `None` when there is anything to do about it. With
-/// `believe`, its index is enough.
-pub(super) fn whole(fs: &dyn Fs, path: &Path, believe: bool, tell: Tell<'_>) -> Result<Option<Facts>> {
+/// What the segment says of itself by its index; `None` when it is unfinished or its index is damaged.
+pub(super) fn indexed(fs: &dyn Fs, path: &Path) -> Result<Option<Facts>> {
     let found = (|| {
         let mut reader = SegmentReader::open_bare(fs, path)?;
         reader.load_index()?;
         if !reader.finished || reader.metadata(SESSION_METADATA).is_none() {
             return Ok(None);
         }
-        if !believe && !data_is_whole(&reader, tell)? {
-            return Ok(None);
-        }
         facts_of(&reader).map(Some)
     })();
     match found {
-        Err(e) if matches!(e.kind(), ErrorKind::Corrupt | ErrorKind::Truncated | ErrorKind::NotADataset) => {
-            Ok(None)
-        }
+        Err(e) if e.is_damage() => Ok(None),
         found => found,
     }
-}
-
-/// Whether the data has the checksum that stands at its end, and records from the first to the last byte.
-fn data_is_whole(reader: &SegmentReader, tell: Tell<'_>) -> Result<bool> {
-    let mut at = 8;
-    let end = loop {
-        let (opcode, len) = reader.record_head(at)?;
-        if opcode == op::DATA_END {
-            break at;
-        }
-        at = at.saturating_add(HEAD).saturating_add(len);
-    };
-    let (opcode, body) = reader.record(end)?;
-    let mcap::records::Record::DataEnd(said) = reader.parse(opcode, &body, end)? else { return Ok(false) };
-    let mut crc = crc32fast::Hasher::new();
-    let mut buf = Vec::new();
-    let mut at = 0;
-    while at < end {
-        let len = WINDOW.min(end - at);
-        reader.read_into(&mut buf, at, len)?;
-        crc.update(&buf);
-        at += len;
-        tell(at)?;
-    }
-    Ok(said.data_section_crc == crc.finalize())
 }
 
 /// What a finished segment says, from its index and its last few chunks.

@@ -48,6 +48,7 @@ impl Lost {
             words.push(match d.kind {
                 DamageKind::Tail => format!("{file}: its last {n} bytes are no whole record"),
                 DamageKind::Torn => format!("{file}: {n} bytes from byte {} are {why}", d.from),
+                DamageKind::Empty => format!("{file}: {why}"),
                 DamageKind::Bytes => format!("{file}: {n} bytes from byte {} are damaged: {why}", d.from),
             });
         }

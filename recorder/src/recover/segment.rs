@@ -1,20 +1,21 @@
 //! One segment: whether it is whole, and if not, a proven copy of what is.
 
 use super::facts::Facts;
+use super::head::{Head, own_head};
 use super::lost::Lost;
 use super::{RECOVERED_METADATA, TEMPORARY};
-use crate::container::MAGIC;
 use crate::container::chunk::{Chunk, ChunkBuilder, MessageHead};
-use crate::container::copy::{Damage, DamageKind, Group, Groups, SetGroup, read_preamble};
+use crate::container::copy::{BetweenGroup, Damage, DamageKind, Group, Groups, SetGroup};
 use crate::container::scan::SegmentReader;
 use crate::container::segment::{Preamble, Segment};
 use crate::dataset::segment_number;
-use crate::encode::Codec;
 use crate::fs::Fs;
+use crate::msgs::frame_set::Checkpoint;
 use crate::msgs::schemas::Schema;
-use crate::msgs::{accounts, frame_info, tf};
-use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA, Topics, image_channel};
-use crate::{ColorCodec, DepthCodec, Error, ErrorKind, RecorderOptions, Result, Session};
+use crate::msgs::{accounts, tf};
+use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA};
+use crate::verify::Finding;
+use crate::{Error, ErrorKind, Result, Session};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -40,8 +41,47 @@ pub(super) struct Rebuild<'a> {
     pub(super) path: &'a Path,
     /// All segments of the dataset: each has channels and session.
     pub(super) segments: &'a [PathBuf],
-    pub(super) session: Option<&'a Session>,
+    pub(super) session: &'a Session,
     pub(super) before: Before,
+}
+
+/// What of a segment is not to be copied.
+#[derive(Default)]
+pub(super) struct Choice {
+    /// Why, by where its chunks begin in the original.
+    refused: BTreeMap<u64, String>,
+    /// Whether its own head is not to be used.
+    pub(super) foreign_head: bool,
+}
+
+impl Choice {
+    /// Leaves out what was found broken in a copy; whether that is more than before.
+    pub(super) fn leave_out(&mut self, copy: &Rebuilt, broken: &[Finding]) -> bool {
+        let known = self.refused.len();
+        for finding in broken {
+            if let Some(from) = finding.offset.and_then(|at| copy.original(at)) {
+                self.refused.entry(from).or_insert_with(|| finding.message.clone());
+            }
+        }
+        let more = self.refused.len() > known;
+        // What no chunk is to blame for is in the head.
+        more || !std::mem::replace(&mut self.foreign_head, true)
+    }
+
+    /// The damage that a group is, if one of its chunks is refused.
+    fn refusal(&self, group: &Group) -> Option<Damage> {
+        let (offsets, end, set): (&[u64], _, _) = match group {
+            Group::Set(set) => {
+                let end = set.offsets.last().zip(set.chunks.last()).map(|(at, c)| at + c.len());
+                (&set.offsets, end, Some(set.mark.id))
+            }
+            Group::Between(b) => (std::slice::from_ref(&b.offset), Some(b.offset + b.chunk.len()), None),
+            _ => return None,
+        };
+        let why = offsets.iter().find_map(|at| self.refused.get(at))?.clone();
+        let from = offsets.iter().copied().min()?;
+        Some(Damage { from, to: end?, kind: DamageKind::Bytes, set, why })
+    }
 }
 
 /// What the segments before one hold.
@@ -71,44 +111,76 @@ impl Before {
     }
 }
 
-/// A chunk of the copy: where it was in the original, unless it was made anew; where it is; its bytes.
-type Copied = (Option<u64>, u64, u64);
+/// A chunk of the copy.
+struct Copied {
+    /// Where the chunk that it comes from begins in the original; `None` for one that was not there.
+    from: Option<u64>,
+    /// Whether it is that chunk bit by bit.
+    same: bool,
+    /// Where it begins in the copy, and its bytes.
+    at: u64,
+    len: u64,
+}
+
+/// A copy under its temporary name, or what it would be.
+pub(super) struct Rebuilt {
+    pub(super) facts: Facts,
+    pub(super) lost: Lost,
+    copied: Vec<Copied>,
+}
+
+impl Rebuilt {
+    /// Where what lies at `at` in the copy was in the original.
+    pub(super) fn original(&self, at: u64) -> Option<u64> {
+        self.copied.iter().find(|c| (c.at..c.at + c.len).contains(&at)).and_then(|c| c.from)
+    }
+}
 
 impl Rebuild<'_> {
     /// Copies what is whole into the temporary file and proves that. With `dry_run` it only looks.
-    pub(super) fn run(&self, dry_run: bool, tell: Tell<'_>) -> Result<(Facts, Lost)> {
+    pub(super) fn run(&self, choice: &Choice, dry_run: bool, tell: Tell<'_>) -> Result<Rebuilt> {
         let reader = SegmentReader::open_any(self.fs, self.path)?;
         let file = self.path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let mut lost = Lost { bytes: reader.size, file, ..Lost::default() };
-        let (preamble, first) = if let Some(own) = self.own_preamble(&reader)? {
-            own
-        } else {
-            // A file that was only just created has nothing to lose.
-            lost.head_rebuilt = reader.size > 0;
-            (self.other_preamble(&reader)?, MAGIC.len().min(reader.size as usize) as u64)
-        };
+        let head = self.head(&reader, choice.foreign_head)?;
+        // A file that was only just created has nothing to lose.
+        lost.head_rebuilt = head.rebuilt && reader.size > 0;
+        if reader.size == 0 && self.had_content() {
+            let why = "the file is empty".to_owned();
+            lost.damage.push(Damage { from: 0, to: 0, kind: DamageKind::Empty, set: None, why });
+            lost.at_end = true;
+        }
         let temporary = temporary(self.path);
         if dry_run {
-            let (facts, _) = self.copy(&reader, &preamble, first, None, &mut lost, tell)?;
-            return Ok((facts, lost));
+            let done = self.copy(&reader, &head, choice, None, &mut lost, tell)?;
+            return Ok(Rebuilt { facts: done.facts, lost, copied: done.copied });
         }
         self.check_room(reader.size)?;
-        let done = Segment::create_as(self.fs, &temporary, temporary.clone(), &preamble).and_then(|copy| {
-            let mut copy = copy;
-            let (facts, copied) = self.copy(&reader, &preamble, first, Some(&mut copy), &mut lost, tell)?;
-            let (end, crc) = copy.checkpoint();
-            copy.seal()?;
-            self.prove(&reader, &temporary, end, crc, &copied)?;
-            Ok(facts)
-        });
+        let done =
+            Segment::create_as(self.fs, &temporary, temporary.clone(), &head.preamble).and_then(|copy| {
+                let mut copy = copy;
+                let done = self.copy(&reader, &head, choice, Some(&mut copy), &mut lost, tell)?;
+                let (end, crc) = copy.checkpoint();
+                copy.seal()?;
+                self.prove(&reader, &temporary, end, crc, &done.copied)?;
+                Ok(done)
+            });
         match done {
-            Ok(facts) => Ok((facts, lost)),
+            Ok(done) => Ok(Rebuilt { facts: done.facts, lost, copied: done.copied }),
             Err(e) => {
                 // The next recovery removes it if this cannot.
                 let _ = self.fs.remove_file(&temporary);
                 Err(e)
             }
         }
+    }
+
+    /// Whether an empty file stands where something was recorded: the last one of a recording that was cut off may have
+    /// been created a moment before.
+    fn had_content(&self) -> bool {
+        let is_last = self.segments.last().is_none_or(|last| last == self.path);
+        let is_part = self.path.extension().is_some_and(|e| e == "part");
+        self.session.outcome.is_some() || !is_last || !is_part
     }
 
     fn check_room(&self, bytes: u64) -> Result<()> {
@@ -132,17 +204,19 @@ impl Rebuild<'_> {
     fn copy(
         &self,
         reader: &SegmentReader,
-        preamble: &Preamble,
-        first: u64,
+        own: &Head,
+        choice: &Choice,
         mut copy: Option<&mut Segment>,
         lost: &mut Lost,
         tell: Tell<'_>,
-    ) -> Result<(Facts, Vec<Copied>)> {
+    ) -> Result<Done> {
+        let preamble = &own.preamble;
         let accounts_channel = channel_of(preamble, Schema::Accounts);
         let mut facts = Facts { bytes: reader.size, ..Facts::default() };
         let mut said = BTreeMap::new();
         let mut copied = Vec::new();
-        let mut groups = Groups::new(reader, preamble, first)?;
+        let checkpoints = channel_of(preamble, Schema::Checkpoint);
+        let mut groups = Groups::new(reader, preamble, own.first)?;
         let mut before = self.before.last_set;
         let (mut last_time, mut recorded) = (None, 0);
         let mut head = false;
@@ -150,11 +224,17 @@ impl Rebuild<'_> {
             if let (Group::Set(set), Some(copy), false) = (&group, copy.as_deref_mut(), head) {
                 // Damage took the chunk that says where the cameras are.
                 let chunk = head_chunk(preamble, set.log_time, self.path)?;
-                copied.push((None, copy.len(), chunk.len()));
+                copied.push(Copied { from: None, same: false, at: copy.len(), len: chunk.len() });
                 copy.append_chunks(&[chunk])?;
             }
             head |= matches!(&group, Group::Set(_)) || matches!(&group, Group::Between(b) if b.head);
             let at = copy.as_ref().map_or(0, |c| c.len());
+            if let Some(damage) = choice.refusal(&group) {
+                lost.at_end = true;
+                lost.damage.push(damage);
+                continue;
+            }
+            let mut renewed = None;
             match &group {
                 Group::Damage(d) => {
                     lost.at_end = true;
@@ -185,6 +265,9 @@ impl Rebuild<'_> {
                         }
                         Ok(())
                     })?;
+                    if let (Some(channel), Some(copy)) = (checkpoints, copy.as_deref()) {
+                        renewed = renew_checkpoint(reader, between, channel, copy)?;
+                    }
                 }
                 Group::Metadata(name, map) if name == SEGMENT_METADATA => {
                     facts.metadata(map);
@@ -195,18 +278,7 @@ impl Rebuild<'_> {
                 Group::Metadata(..) => {}
             }
             if let Some(copy) = copy.as_deref_mut() {
-                copy.append_group(&group)?;
-                let mut to = at;
-                let (chunks, offsets): (&[_], &[_]) = match &group {
-                    Group::Set(set) => (&set.chunks, &set.offsets),
-                    Group::Between(b) => (std::slice::from_ref(&b.chunk), std::slice::from_ref(&b.offset)),
-                    _ => (&[], &[]),
-                };
-                for (chunk, from) in chunks.iter().zip(offsets) {
-                    let len = chunk.len();
-                    copied.push((Some(*from), to, len));
-                    to += len + Segment::index_len(chunk);
-                }
+                append(copy, &group, renewed, at, &mut copied)?;
             }
             tell(groups.offset())?;
         }
@@ -226,19 +298,9 @@ impl Rebuild<'_> {
         facts.lost.extend(lost.words());
         facts.sets_lost = facts.sets_lost.saturating_add(lost.sets());
         if let Some(copy) = copy {
-            copy.append_metadata(RECOVERED_METADATA, &lost.metadata())?;
-            said.extend(
-                [
-                    ("segment", segment_number(&lost.file).unwrap_or_default() as u64),
-                    ("sets", facts.sets),
-                    ("first_set", facts.first_set.unwrap_or_default()),
-                    ("last_set", facts.last_set.unwrap_or_default()),
-                ]
-                .map(|(k, v)| (k.to_owned(), v.to_string())),
-            );
-            copy.append_metadata(SEGMENT_METADATA, &said)?;
+            append_facts(copy, &facts, lost, said)?;
         }
-        Ok((facts, copied))
+        Ok(Done { facts, copied })
     }
 
     /// What comes after this segment says of the end of this one, as far as it is not damaged itself.
@@ -248,7 +310,8 @@ impl Rebuild<'_> {
         for path in after {
             let unknown = Next { first, recorded_before: None };
             let reader = SegmentReader::open_any(self.fs, path)?;
-            let Some((preamble, begin)) = self.own_preamble(&reader)? else { return Ok(unknown) };
+            let Some(own) = own_head(&reader)? else { return Ok(unknown) };
+            let (preamble, begin) = (own.preamble, own.first);
             let accounts_channel = channel_of(&preamble, Schema::Accounts);
             let mut groups = Groups::new(&reader, &preamble, begin)?;
             while let Some(group) = groups.next()? {
@@ -277,7 +340,7 @@ impl Rebuild<'_> {
             }
         }
         // A recording that was closed says how many sets there were.
-        let outcome = self.session.and_then(|s| s.outcome.as_ref());
+        let outcome = self.session.outcome.as_ref();
         let recorded = outcome.map(|o| o.sets_recorded.saturating_add(self.before.lost).saturating_sub(sets));
         Ok(Next { first, recorded_before: recorded })
     }
@@ -299,14 +362,15 @@ impl Rebuild<'_> {
             reader.error(ErrorKind::Corrupt, at, what)
         };
         if !reader.finished
-            || !reader.chunks.iter().map(|c| (c.offset, c.length)).eq(copied.iter().map(|c| (c.1, c.2)))
+            || !reader.chunks.iter().map(|c| (c.offset, c.length)).eq(copied.iter().map(|c| (c.at, c.len)))
         {
             return Err(wrong(end, "its index is another one"));
         }
         let mut hasher = crc32fast::Hasher::new();
         let (mut ours, mut theirs) = (Vec::new(), Vec::new());
         let mut at = 0;
-        for &(from, to, len) in copied.iter().chain([&(None, end, 0)]) {
+        let tail = Copied { from: None, same: false, at: end, len: 0 };
+        for &Copied { from, same, at: to, len } in copied.iter().chain([&tail]) {
             while at < to {
                 let n = WINDOW.min(to - at);
                 reader.read_into(&mut ours, at, n)?;
@@ -317,7 +381,7 @@ impl Rebuild<'_> {
             while done < len {
                 let n = WINDOW.min(len - done);
                 reader.read_into(&mut ours, to + done, n)?;
-                if let Some(from) = from {
+                if let Some(from) = from.filter(|_| same) {
                     original.read_into(&mut theirs, from + done, n)?;
                     if ours != theirs {
                         return Err(wrong(to + done, "a chunk differs"));
@@ -330,63 +394,59 @@ impl Rebuild<'_> {
         }
         if hasher.finalize() == crc { Ok(()) } else { Err(wrong(end, "its checksum is another one")) }
     }
+}
 
-    /// Schemas, channels and session as they stand in the file, if they do.
-    fn own_preamble(&self, reader: &SegmentReader) -> Result<Option<(Preamble, u64)>> {
-        if reader.size < MAGIC.len() as u64 || reader.read(0, MAGIC.len() as u64)? != MAGIC {
-            return Ok(None);
-        }
-        let found = match read_preamble(reader) {
-            Ok(found) => found,
-            Err(e) if matches!(e.kind(), ErrorKind::Corrupt | ErrorKind::Truncated) => return Ok(None),
-            Err(e) => return Err(e),
-        };
-        let session = found.0.metadata.iter().find(|(name, _)| name == SESSION_METADATA);
-        let text = session.and_then(|(_, m)| m.get("session_toml"));
-        Ok(text.is_some_and(|t| Session::from_toml(t, self.path).is_ok()).then_some(found))
+/// Appends a group as it lies in the damaged segment, or its checkpoint `renewed`; `at` is the end of the copy.
+fn append(
+    copy: &mut Segment,
+    group: &Group,
+    renewed: Option<Chunk>,
+    at: u64,
+    copied: &mut Vec<Copied>,
+) -> Result<()> {
+    if let (Group::Between(between), Some(chunk)) = (group, renewed) {
+        copied.push(Copied { from: Some(between.offset), same: false, at, len: chunk.len() });
+        return copy.append_chunks(&[chunk]);
     }
+    copy.append_group(group)?;
+    let mut to = at;
+    let (chunks, offsets): (&[_], &[_]) = match group {
+        Group::Set(set) => (&set.chunks, &set.offsets),
+        Group::Between(b) => (std::slice::from_ref(&b.chunk), std::slice::from_ref(&b.offset)),
+        _ => (&[], &[]),
+    };
+    for (chunk, from) in chunks.iter().zip(offsets) {
+        let len = chunk.len();
+        copied.push(Copied { from: Some(*from), same: true, at: to, len });
+        to += len + Segment::index_len(chunk);
+    }
+    Ok(())
+}
 
-    /// The same from another segment, or from the session.
-    fn other_preamble(&self, reader: &SegmentReader) -> Result<Preamble> {
-        let number =
-            segment_number(&self.path.file_name().unwrap_or_default().to_string_lossy()).unwrap_or_default();
-        for other in self.segments.iter().filter(|p| *p != self.path) {
-            let other = SegmentReader::open_any(self.fs, other)?;
-            if let Some((mut preamble, _)) = self.own_preamble(&other)? {
-                for (name, map) in &mut preamble.metadata {
-                    if name == SESSION_METADATA {
-                        map.insert("segment".to_owned(), number.to_string());
-                    }
-                }
-                return Ok(preamble);
-            }
-        }
-        let Some(session) = self.session else {
-            return Err(Error::new(
-                ErrorKind::NotADataset,
-                format!(
-                    "nothing says what {} holds: its head is damaged, and so are session.toml and all other segments",
-                    self.path.display()
-                ),
-            ));
-        };
-        let preamble = |options: &RecorderOptions| {
-            let mut session = session.clone();
-            session.outcome = None;
-            Topics::new(&session, options).preamble(&session, number)
-        };
-        // How pictures are stored decides the types of their channels; the first set tells.
-        let mut options = RecorderOptions::default();
-        let guess = preamble(&options)?;
-        let mut groups = Groups::new(reader, &guess, MAGIC.len().min(reader.size as usize) as u64)?;
-        while let Some(group) = groups.next()? {
-            if let Group::Set(set) = group {
-                codecs(reader, &set, session, &mut options)?;
-                return preamble(&options);
-            }
-        }
-        Ok(guess)
-    }
+/// Appends what was lost, and what the segment has: `said` are the facts that it stated itself.
+fn append_facts(
+    copy: &mut Segment,
+    facts: &Facts,
+    lost: &Lost,
+    mut said: BTreeMap<String, String>,
+) -> Result<()> {
+    copy.append_metadata(RECOVERED_METADATA, &lost.metadata())?;
+    said.extend(
+        [
+            ("segment", segment_number(&lost.file).unwrap_or_default() as u64),
+            ("sets", facts.sets),
+            ("first_set", facts.first_set.unwrap_or_default()),
+            ("last_set", facts.last_set.unwrap_or_default()),
+        ]
+        .map(|(k, v)| (k.to_owned(), v.to_string())),
+    );
+    copy.append_metadata(SEGMENT_METADATA, &said)
+}
+
+/// What a copy came to.
+struct Done {
+    facts: Facts,
+    copied: Vec<Copied>,
 }
 
 /// Where the segments after a damaged one begin.
@@ -398,7 +458,7 @@ struct Next {
 }
 
 /// The channel of this type, as whoever reads the index finds it: of schemas and channels with one number the last counts.
-fn channel_of(preamble: &Preamble, schema: Schema) -> Option<u16> {
+pub(super) fn channel_of(preamble: &Preamble, schema: Schema) -> Option<u16> {
     let names: BTreeMap<_, _> = preamble.schemas.iter().map(|s| (s.id, s.name.as_str())).collect();
     let channels: BTreeMap<_, _> = preamble.channels.iter().map(|c| (c.id, c.schema)).collect();
     channels.into_iter().find(|(_, of)| names.get(of) == Some(&schema.name())).map(|(id, _)| id)
@@ -424,32 +484,36 @@ fn head_chunk(preamble: &Preamble, log_time: u64, path: &Path) -> Result<Chunk> 
     builder.pack(true)
 }
 
-/// Finds out how the pictures of a set are stored.
-fn codecs(
+/// The chunk of `between` with a checkpoint of the copy in place of its own; `None` where its own is right for both, or it
+/// has none. A checkpoint of another file would pass for damage of this one wherever their lengths agree.
+fn renew_checkpoint(
     reader: &SegmentReader,
-    set: &SetGroup,
-    session: &Session,
-    options: &mut RecorderOptions,
-) -> Result<()> {
-    let (Some(chunk), Some(offset)) = (set.chunks.last(), set.offsets.last()) else { return Ok(()) };
-    reader.chunk_messages(chunk.body(), *offset, |m| {
-        let stream = session.streams.iter().enumerate().find(|(i, _)| image_channel(*i) + 2 == m.channel);
-        let Some((_, stream)) = stream else { return Ok(()) };
-        let (header, extra) = frame_info::read(m.data)?;
-        let stored = Codec::from_name(extra.codec);
-        if header.format != stream.format as u32 {
-            return Ok(());
-        }
-        let agrees = |to: &RecorderOptions| Some(Codec::of(stream.format, to)) == stored;
-        let colors = [ColorCodec::Jpeg, ColorCodec::Raw, ColorCodec::Png]
-            .map(|color| RecorderOptions { color, ..options.clone() });
-        let depths =
-            [DepthCodec::Zstd, DepthCodec::Rank].map(|depth| RecorderOptions { depth, ..options.clone() });
-        if !agrees(options)
-            && let Some(found) = colors.into_iter().chain(depths).find(agrees)
-        {
-            *options = found;
-        }
+    between: &BetweenGroup,
+    channel: u16,
+    copy: &Segment,
+) -> Result<Option<Chunk>> {
+    let (file_bytes, crc32) = copy.checkpoint();
+    let here = Checkpoint { file_bytes, crc32 };
+    let mut stale = false;
+    let mut builder = ChunkBuilder::new();
+    reader.chunk_messages(between.chunk.body(), between.offset, |m| {
+        let head = MessageHead {
+            channel: m.channel,
+            sequence: m.sequence,
+            log_time: m.log_time,
+            publish_time: m.publish_time,
+        };
+        let is_checkpoint = m.channel == channel;
+        stale |= is_checkpoint && Checkpoint::read(m.data).ok() != Some(here);
+        builder.message(head, |b| {
+            if is_checkpoint {
+                here.write(b, i64::try_from(m.publish_time).unwrap_or(0));
+            } else {
+                b.extend_from_slice(m.data);
+            }
+            Ok::<_, Error>(())
+        })?;
         Ok(())
-    })
+    })?;
+    if stale { builder.pack(true).map(Some) } else { Ok(None) }
 }

@@ -1,39 +1,75 @@
 //! What `session.toml` says after a recovery.
 
 use super::facts::Facts;
+use super::head::{own_head, proven_head, session_in};
 use super::{Job, RecoverAction};
+use crate::container::scan::SegmentReader;
+use crate::verify::broken_session;
 use crate::{Dataset, Error, ErrorKind, Outcome, Result, SESSION_FILE, Session, SetCounts};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// The reason under which sets are counted that were handed over and are in no segment.
 const IN_CRASH: &str = "lost_in_crash";
 
-/// Whether `session.toml` is gone or torn, as opposed to unreadable for now.
-pub(super) fn is_damage(e: &Error) -> bool {
-    matches!(e.kind(), ErrorKind::NotFound | ErrorKind::Corrupt | ErrorKind::Truncated)
+/// The session that a recovery goes by.
+pub(super) struct Chosen {
+    pub(super) session: Session,
+    /// Whether it is that of `session.toml`.
+    pub(super) stored: bool,
 }
 
-/// Makes `session.toml` anew if it is gone, and writes how the recording ended if it does not say so.
-pub(super) fn settle(
-    job: &mut Job<'_>,
-    session: Option<Session>,
-    segments: &[PathBuf],
-    all: &[Facts],
-) -> Result<()> {
+/// The session: that of `session.toml`, or of a segment where that one is gone, damaged or not of these segments.
+pub(super) fn choose(job: &mut Job<'_>, segments: &[PathBuf]) -> Result<Chosen> {
+    let mut stored = match Session::load(&**job.fs, job.dir) {
+        Ok(session) => session,
+        Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::Corrupt | ErrorKind::Truncated) => {
+            job.report.notes.push(e.to_string());
+            return from_segments(job, segments);
+        }
+        Err(e) => return Err(e),
+    };
+    if job.options.unfinished_only {
+        return Ok(Chosen { session: stored, stored: true });
+    }
+    for path in segments {
+        let reader = SegmentReader::open_any(&**job.fs, path)?;
+        let Some(head) = proven_head(&reader)? else { continue };
+        let Some(said) = session_in(&head.preamble, &reader) else { continue };
+        let better = broken_session(&said).is_empty() && !broken_session(&stored).is_empty();
+        if !better && stored.has_streams_of(&said) {
+            break;
+        }
+        let words = format!(
+            "{SESSION_FILE} named another rig or other streams than its segments and was mended from {}",
+            file_name(path)
+        );
+        (stored.rig, stored.streams) = (said.rig, said.streams);
+        (stored.motion, stored.computed) = (said.motion, said.computed);
+        job.report.session_rebuilt = true;
+        job.report.lost.push(words);
+        break;
+    }
+    Ok(Chosen { session: stored, stored: true })
+}
+
+/// The name of a segment without what says that it is unfinished.
+fn file_name(path: &Path) -> String {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    name.strip_suffix(".part").unwrap_or(&name).to_owned()
+}
+
+/// Writes `session.toml` if it is another one now, or does not say how the recording ended.
+pub(super) fn settle(job: &mut Job<'_>, mut session: Session, all: &[Facts]) -> Result<()> {
     let changed = job.report.segments.iter().any(|s| s.action != RecoverAction::None);
     let mut lost: Vec<String> = all.iter().flat_map(|f| f.lost.iter().cloned()).collect();
-    let mut session = if let Some(session) = session {
-        session
-    } else {
-        let (session, words) = from_segments(job, segments)?;
-        job.report.session_rebuilt = true;
-        job.report.lost.push(words.clone());
-        lost.push(words);
-        session
-    };
+    if job.report.session_rebuilt {
+        // What was found so far is of the session; what segments lost follows.
+        lost.extend(job.report.lost.first().cloned());
+    }
     let as_it_was = !changed && !job.report.session_rebuilt;
-    let says = |o: &Outcome| lost.iter().all(|l| o.lost.contains(l));
+    let recorded: u64 = all.iter().map(|f| f.sets).sum();
+    let says = |o: &Outcome| o.sets_recorded == recorded && lost.iter().all(|l| o.lost.contains(l));
     if as_it_was && session.outcome.as_ref().is_some_and(says) {
         return Ok(());
     }
@@ -43,7 +79,13 @@ pub(super) fn settle(
     }
     if let Some(before) = session.outcome.as_ref().filter(|_| as_it_was) {
         // A recovery before this one copied the segment and was ended before it could say so here.
-        job.report.lost.extend(outcome.lost.iter().filter(|l| !before.lost.contains(l)).cloned());
+        let unsaid = |l: &&String| !before.lost.contains(l);
+        let new: Vec<_> = outcome.lost.iter().filter(unsaid).cloned().collect();
+        for words in new {
+            if !job.report.lost.contains(&words) {
+                job.report.lost.push(words);
+            }
+        }
     }
     session.outcome = Some(outcome);
     job.report.changed = true;
@@ -53,28 +95,31 @@ pub(super) fn settle(
     session.save(&**job.fs, job.dir)
 }
 
-/// The session as the last segment tells it that can: it has the most notes.
-fn from_segments(job: &Job<'_>, segments: &[PathBuf]) -> Result<(Session, String)> {
+/// The session as the last segment has it that can be read: it has the most notes.
+fn from_segments(job: &mut Job<'_>, segments: &[PathBuf]) -> Result<Chosen> {
     for path in segments.iter().rev() {
-        // It may have its final name by now.
-        for path in [path.clone(), path.with_extension("")] {
-            match Dataset::open_with(Arc::clone(job.fs), &path) {
-                Ok(dataset) => {
-                    let from = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-                    let words = format!(
-                        "{SESSION_FILE} was gone or damaged and was made anew from {from}; notes and changes after \
-                         its beginning are not in it"
-                    );
-                    return Ok((dataset.session().clone(), words));
-                }
-                Err(e) if e.kind() == ErrorKind::Io => return Err(e),
-                Err(_) => {}
-            }
-        }
+        let reader = SegmentReader::open_any(&**job.fs, path)?;
+        let session = match Dataset::open_with(Arc::clone(job.fs), path) {
+            Ok(dataset) => Some(dataset.session().clone()),
+            Err(e) if e.kind() == ErrorKind::Io => return Err(e),
+            Err(_) => own_head(&reader)?.and_then(|head| session_in(&head.preamble, &reader)),
+        };
+        let Some(session) = session else { continue };
+        let words = format!(
+            "{SESSION_FILE} was gone or damaged and was made anew from {}; notes and changes after its beginning are \
+             not in it",
+            file_name(path)
+        );
+        job.report.session_rebuilt = true;
+        job.report.lost.push(words);
+        return Ok(Chosen { session, stored: false });
     }
     Err(Error::new(
         ErrorKind::NotADataset,
-        format!("{}: {SESSION_FILE} is damaged, and no segment holds a copy of it", job.dir.display()),
+        format!(
+            "nothing says what {} holds: {SESSION_FILE} is gone or damaged, and so are the heads of its segments",
+            job.dir.display()
+        ),
     ))
 }
 
@@ -96,6 +141,7 @@ fn outcome(session: &Session, all: &[Facts], mut lost: Vec<String>, job: &mut Jo
     let known = dropped.values().fold(recorded, |sum, n| sum.saturating_add(*n));
     let offered = offered.max(known);
     let missing = offered.saturating_sub(known);
+    let unaccounted = unaccounted(before, recorded, all);
     let mut say = |what: String, new: bool| {
         if new {
             job.report.lost.push(what.clone());
@@ -119,6 +165,9 @@ fn outcome(session: &Session, all: &[Facts], mut lost: Vec<String>, job: &mut Jo
     for (reason, n) in &dropped {
         say(format!("{n} of {offered} sets were not recorded: {reason}"), false);
     }
+    if let Some(words) = unaccounted {
+        say(words, true);
+    }
     if missing > 0 {
         dropped.insert(IN_CRASH.to_owned(), missing);
         say(format!("{missing} of {offered} sets were handed over and are in no segment"), before.is_none());
@@ -131,4 +180,13 @@ fn outcome(session: &Session, all: &[Facts], mut lost: Vec<String>, job: &mut Jo
     let mut outcome = Outcome::new(ended, &SetCounts::default(), lost);
     (outcome.sets_offered, outcome.sets_recorded, outcome.sets_dropped) = (offered, recorded, dropped);
     outcome
+}
+
+/// Sets that `session.toml` counts and that segments do not account for themselves, as one that is gone cannot; in words.
+fn unaccounted(before: Option<&Outcome>, recorded: u64, all: &[Facts]) -> Option<String> {
+    let counted = before?.sets_recorded;
+    let gone = counted.saturating_sub(recorded);
+    let told = all.iter().fold(0u64, |sum, f| sum.saturating_add(f.sets_lost));
+    let words = format!("{gone} of the {counted} sets that {SESSION_FILE} counts are in no segment");
+    (gone > told).then_some(words)
 }

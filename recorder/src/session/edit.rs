@@ -39,6 +39,11 @@ pub fn edit(fs: &dyn Fs, dir: &Path, changes: &SessionChanges) -> Result<Vec<Edi
     let mut file = SessionText::open(fs, dir)?;
     for (key, value) in [("scene", &changes.scene), ("operator", &changes.operator)] {
         if let Some(value) = value {
+            if value.len() > super::NOTE_MAX_BYTES {
+                let message =
+                    format!("the {key} has {} bytes, {} is the limit", value.len(), super::NOTE_MAX_BYTES);
+                return Err(Error::new(ErrorKind::BadInput, message));
+            }
             file.set(key, value)?;
         }
     }
@@ -174,6 +179,7 @@ impl<'a> SessionText<'a> {
 
     fn note(&mut self, text: &str) -> Result<()> {
         let utc_ns = UtcPair::sample().utc_ns;
+        self.session.check_note(text)?;
         self.session.notes.push(Note { utc_ns, text: text.to_owned() });
         self.push("notes", [("utc_ns", Value::from(utc_ns)), ("text", Value::from(text))])?;
         self.log("notes", String::new(), text.to_owned())
@@ -221,6 +227,7 @@ impl<'a> SessionText<'a> {
             return Ok(Vec::new());
         }
         let text = self.document.to_string();
+        super::check_size(&text, &self.path)?;
         // Compared as text, in which a NaN of a hand-written key equals itself.
         if Session::from_toml(&text, &self.path)?.to_toml()? != self.session.to_toml()? {
             let what = format!("{} cannot be edited as text; nothing was changed", self.path.display());

@@ -255,7 +255,7 @@ pub(super) fn set(walk: &mut Walk, pass: &mut Pass<'_>, set: &FrameSetMsg, log_t
     }
     for (id, expected) in expected {
         let got = single.remove(&id).unwrap_or_default();
-        problems.extend(differing(&id, &expected, &got, walk.options.decode));
+        problems.extend(differing(&id, &expected, &got, walk.compares_singles));
     }
     for (id, got) in single {
         problems.push(format!("{} single samples of {id} belong to no batch", got.count));

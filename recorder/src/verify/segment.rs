@@ -64,10 +64,24 @@ pub(super) fn segment(
     findings: &mut Findings,
     watch: &mut Watch<'_>,
 ) {
-    let file = file_name(path);
-    if let Err(e) = read(walk, fs, path, findings, watch) {
-        findings.add(Severity::Broken, &file, None, e.to_string());
+    if let Err(e) = try_segment(walk, fs, path, findings, watch) {
+        findings.add(Severity::Broken, &file_name(path), None, e.to_string());
     }
+}
+
+/// The same, where a file that cannot be read is an error: damage alone is a finding.
+pub(super) fn try_segment(
+    walk: &mut Walk,
+    fs: &dyn Fs,
+    path: &Path,
+    findings: &mut Findings,
+    watch: &mut Watch<'_>,
+) -> Result<()> {
+    match read(walk, fs, path, findings, watch) {
+        Err(e) if e.is_damage() => findings.add(Severity::Broken, &file_name(path), None, e.to_string()),
+        done => return done,
+    }
+    Ok(())
 }
 
 fn read(
@@ -82,6 +96,7 @@ fn read(
     walk.bytes += reader.size;
     let index = reader.load_index();
     match &index {
+        Err(e) if !e.is_damage() => return index,
         Err(e) => findings.add(Severity::Broken, &file, None, e.to_string()),
         Ok(()) if !reader.finished => {
             let (offset, why) = reader.cut.clone().unwrap_or_default();
@@ -380,7 +395,7 @@ impl<'a> Pass<'a> {
             return Ok(());
         }
         match self.kinds.get(&m.channel) {
-            Some(kind) if self.motion.take(kind, m, walk.options.decode)? => {}
+            Some(kind) if self.motion.take(kind, m, walk.compares_singles)? => {}
             Some(Kind::Picture(id)) => {
                 let (len, proof) = (m.data.len() as u64, Proof::Crc(crc32fast::hash(m.data)));
                 let picture = Picture { offset, channel: m.channel, log_time: m.log_time, len, proof };

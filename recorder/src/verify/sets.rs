@@ -28,6 +28,10 @@ pub(super) struct Walk {
     pub(super) frames: u64,
     pub(super) bytes: u64,
     last: Option<Last>,
+    /// Whether segments before the first one are not looked at: accounts count their sets.
+    pub(super) lone: bool,
+    /// Whether single samples of motion units are compared with their batches.
+    pub(super) compares_singles: bool,
     /// Sets counted by the accounts minus those seen, fixed at the first account of a lone segment.
     account_base: Option<u64>,
     /// Sets that recoveries say they lost at most; the accounts, which are older, count them.
@@ -85,6 +89,8 @@ impl Walk {
             frames: 0,
             bytes: 0,
             last: None,
+            lone: false,
+            compares_singles: options.decode,
             account_base: None,
             lost: 0,
             dropped: None,
@@ -300,7 +306,8 @@ impl Walk {
             pass.broken(Some(offset), what);
         }
         // A segment on its own begins in the middle of the account.
-        let first_is_zero = self.last.as_ref().is_none_or(|_| pass.file.starts_with("seg_0000."));
+        let first_is_zero =
+            !self.lone && self.last.as_ref().is_none_or(|_| pass.file.starts_with("seg_0000."));
         let base = *self
             .account_base
             .get_or_insert_with(|| if first_is_zero { 0 } else { sets.recorded.saturating_sub(self.sets) });
@@ -363,6 +370,9 @@ impl Walk {
         if o.sets_recorded != self.sets {
             let what = format!("it says {} sets were recorded, {} are there", o.sets_recorded, self.sets);
             findings.add(Severity::Broken, file, None, what);
+        }
+        for lost in session.import_losses() {
+            findings.add(Severity::Lost, file, None, lost);
         }
         // What its segments say themselves was reported at its place.
         let said: BTreeSet<String> = findings.kept.iter().map(|f| f.message.clone()).collect();

@@ -3,7 +3,7 @@
 use crate::support::*;
 use depthrig_recorder::fs::{Fault, Fs, MemFs, RealFs};
 use depthrig_recorder::{
-    Dataset, Edit, ErrorKind, SESSION_FILE, Session, SessionChanges, check_name, edit, rename,
+    Dataset, Edit, ErrorKind, NOTE_MAX_BYTES, SESSION_FILE, Session, SessionChanges, check_name, edit, rename,
 };
 use proptest::prelude::*;
 use std::path::PathBuf;
@@ -252,4 +252,45 @@ proptest! {
         prop_assert_eq!(again.to_toml().unwrap(), session.to_toml().unwrap());
         prop_assert_eq!(again.extra.to_string(), unknown);
     }
+}
+
+/// What is taken can be read again: a note is short, and so are all of them together. The worst to write are characters
+/// that TOML escapes.
+#[test]
+fn notes_have_a_limit_each_and_all_together() {
+    let longest = "\u{1}".repeat(NOTE_MAX_BYTES);
+    let note = |text: &str| SessionChanges { notes: vec![text.to_owned()], ..SessionChanges::default() };
+    let fs = recorded();
+    let before = text(&fs);
+    let too_long = format!("{longest}x");
+    for bad in [note(&too_long), scene(&too_long)] {
+        let e = edit(&fs, &dir(), &bad).unwrap_err();
+        assert_eq!(e.kind(), ErrorKind::BadInput);
+        assert!(e.to_string().contains("4097 bytes, 4096 is the limit"), "{e}");
+        assert_eq!(text(&fs), before, "nothing was changed");
+    }
+    let fs = MemFs::new();
+    let r = recorder(&fs, options());
+    r.push(set(&session(), 0)).unwrap();
+    let mut taken = 0;
+    let e = loop {
+        match r.add_note(longest.as_str()) {
+            Ok(()) => taken += 1,
+            // The writer takes them once a second.
+            Err(e) if e.to_string().contains("wait to be written") => {
+                std::thread::sleep(std::time::Duration::from_millis(10));
+            }
+            Err(e) => break e,
+        }
+        assert!(taken < 1000, "no end of notes");
+    };
+    assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains("is the limit"), "{e}");
+    assert_eq!(r.add_note(too_long.as_str()).unwrap_err().kind(), ErrorKind::BadInput);
+    let summary = r.finish().unwrap();
+    assert!(summary.complete, "{:?}", summary.lost);
+    let dataset = open(&fs);
+    assert_eq!(dataset.session().notes.len(), taken);
+    assert!(dataset.session().notes.iter().all(|n| n.text == longest));
+    let e = edit(&fs, &dir(), &note(&longest)).unwrap_err();
+    assert!(e.to_string().contains("is the limit"), "the limit is one of the dataset: {e}");
 }

@@ -34,11 +34,11 @@ pub fn ids(fs: &MemFs) -> Vec<u64> {
     ids
 }
 
-fn outcome(fs: &MemFs) -> Outcome {
+pub fn outcome(fs: &MemFs) -> Outcome {
     open(fs).session().outcome.clone().expect("an outcome")
 }
 
-fn findings(fs: &MemFs) -> Vec<String> {
+pub fn findings(fs: &MemFs) -> Vec<String> {
     let fs: Arc<dyn Fs> = Arc::new(fs.clone());
     let report = verify_with(&fs, &dir(), &VerifyOptions { decode: true, ..Default::default() }).unwrap();
     report.findings.iter().filter(|f| f.severity == Severity::Broken).map(|f| f.message.clone()).collect()

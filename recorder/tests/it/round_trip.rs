@@ -123,6 +123,9 @@ fn missing_frames_stay_missing() {
     assert_eq!(sets[0].frames.iter().map(|f| f.stream).collect::<Vec<_>>(), [0, 2]);
     assert_eq!(sets[1].missing, [0, 1, 2]);
     let info = open(&fs).info().unwrap();
+    // JPEG is stored as it is, and grey pixels are packed by zstd.
+    let sizes: Vec<_> = info.streams.iter().map(|s| (s.is_packed, s.packed_bytes < s.bytes)).collect();
+    assert_eq!(sizes, [(false, false), (false, false), (true, true)], "{:?}", info.streams);
     assert_eq!((info.sets, info.incomplete_sets), (2, 2));
     assert_eq!(
         info.streams.iter().map(|s| (s.frames, s.missing)).collect::<Vec<_>>(),

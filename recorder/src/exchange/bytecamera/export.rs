@@ -87,7 +87,10 @@ impl ByteCameraExport {
             };
             // A stereo camera with several depth modes has a folder for each, with its colour in all of them.
             let modes = if s.id.stream.as_str() == "color" { modes_of(session, camera) } else { Vec::new() };
-            let mut copies: Vec<_> = modes.iter().map(|mode| folder_of(Some(mode))).collect();
+            // Two depth streams of one mode, of different formats, share its folder.
+            let mut named = BTreeSet::new();
+            let folders = modes.iter().map(|mode| folder_of(Some(mode)));
+            let mut copies: Vec<_> = folders.filter(|folder| named.insert(folder.clone())).collect();
             let of_camera = if copies.is_empty() {
                 folder_of(names::mode_of(s.id.stream.as_str()))
             } else {
@@ -101,15 +104,11 @@ impl ByteCameraExport {
                 PixelFormat::DisparityF32 => "disparity",
                 _ => "color",
             };
-            // A second stream of the same kind keeps its own name.
-            let mut prefix = wanted.to_owned();
-            let mut n = 2;
             let ending = StillFormat::of(s.format).extension();
-            while !files.insert((of_camera.clone(), prefix.clone())) {
-                let own = s.id.stream.as_str();
-                prefix = if prefix == wanted { own.to_owned() } else { format!("{own}_{n}") };
-                n += 1;
-            }
+            let folders = || copies.iter().chain([&of_camera]);
+            let is_free = |name: &str| !folders().any(|f| files.contains(&(f.clone(), name.to_owned())));
+            let prefix = free_prefix(wanted, s.id.stream.as_str(), is_free);
+            files.extend(folders().map(|f| (f.clone(), prefix.clone())));
             let mut stream = s.clone();
             let (mut recorded_format, mut recorded_depth_unit_m) = (None, None);
             if s.format == PixelFormat::Mjpeg {
@@ -236,6 +235,14 @@ impl ByteCameraExport {
     }
 }
 
+/// The first part of a stream's files: the name of its kind, or where that is taken its own name, or that with a number.
+fn free_prefix(kind: &str, own: &str, is_free: impl Fn(&str) -> bool) -> String {
+    let numbered = (2u64..).map(|n| format!("{own}_{n}"));
+    let mut names = [kind.to_owned(), own.to_owned()].into_iter().chain(numbered);
+    // The numbers never end, and what is taken does.
+    names.find(|name| is_free(name)).unwrap_or_else(|| own.to_owned())
+}
+
 /// The depth modes of a camera, in the order of its streams.
 fn modes_of<'a>(session: &'a Session, camera: &str) -> Vec<&'a str> {
     let of_camera = session.streams.iter().filter(|s| s.id.camera.as_str() == camera && s.format.is_depth());
@@ -342,7 +349,57 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    /// Folder and first part of the files of each stream of such cameras, copies included; ends in time or panics.
+    fn files_of(streams: Vec<(usize, &'static str, PixelFormat)>) -> Vec<(String, String)> {
+        let mut session = Session::new("20260314_1512", "rig");
+        for (camera, stream, format) in streams {
+            let id = format!("cam{camera}/{stream}").parse().unwrap();
+            let model = ["D435", "ZED 2i", "Test 1"][camera % 3].to_owned();
+            session.streams.push(crate::session::tests::stream(id, model, format));
+        }
+        let (done, ended) = std::sync::mpsc::sync_channel(1);
+        std::thread::spawn(move || {
+            let exporter = ByteCameraExport::new(CameraNames::Short, None).unwrap();
+            let layout = exporter.layout(&session, &mut BTreeSet::new(), &mut Vec::new());
+            let _ = done.send(layout.streams);
+        });
+        let streams = ended.recv_timeout(std::time::Duration::from_mins(1)).expect("the layout never ends");
+        let each = |s: &StreamFacts| {
+            let folders = s.copies.iter().chain([&s.folder]).cloned().collect::<Vec<_>>();
+            let prefix = s.prefix.clone();
+            folders.into_iter().map(move |folder| (folder, prefix.clone()))
+        };
+        streams.iter().flat_map(each).collect()
+    }
+
+    #[test]
+    fn a_stream_called_as_the_kind_of_one_before_gets_a_number() {
+        let files = files_of(vec![(2, "aux", PixelFormat::Rgb8), (2, "color", PixelFormat::Rgb8)]);
+        let prefixes: Vec<_> = files.iter().map(|(_, prefix)| prefix.as_str()).collect();
+        assert_eq!(prefixes, ["color", "color_2"]);
+    }
+
     proptest! {
+        /// Names that are names of kinds, of modes, or look like numbered ones.
+        #[test]
+        fn whatever_streams_are_called_no_two_have_the_same_files(
+            streams in proptest::collection::btree_map(
+                (0usize..4, proptest::sample::select(vec![
+                    "color", "color_2", "color_3", "aux", "depth", "depth_2", "ir", "ir_2", "raw_depth", "confidence",
+                    "disparity", "depth_quality", "depth_neural", "confidence_quality", "confidence_neural", "left",
+                ])),
+                proptest::sample::select(vec![
+                    PixelFormat::Rgb8, PixelFormat::Z16, PixelFormat::DepthF32, PixelFormat::Mono8, PixelFormat::Mono16,
+                    PixelFormat::Confidence8, PixelFormat::DisparityF32, PixelFormat::Yuyv, PixelFormat::Mjpeg,
+                ]),
+                1..20,
+            ).prop_map(|m| m.into_iter().map(|((c, s), f)| (c, s, f)).collect::<Vec<_>>()).prop_shuffle(),
+        ) {
+            let files = files_of(streams);
+            let unique: BTreeSet<_> = files.iter().collect();
+            prop_assert_eq!(unique.len(), files.len(), "{:?}", files);
+        }
+
         #[test]
         fn rescaled_depth_is_the_nearest_or_none(values: Vec<u16>, tenths in 1u32..40) {
             let pixels: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
