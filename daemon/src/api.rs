@@ -4,16 +4,23 @@
 //! with a single-threaded runtime, so the rest of the daemon knows nothing of async; calls of [`Control`] run on a
 //! few extra threads, so a recording that takes long to close does not make `status` wait.
 //!
-//! **Who may call.** The socket has mode 0600 in a folder of mode 0700: the user that runs the rig. A port has no
-//! such protection, so it must be loopback, and web pages in that user's browser are kept out by two rules: the
+//! **Who may call.** The socket has mode 0600 in a folder of mode 0700: the user that runs the rig. A port must be
+//! loopback and is open to every user of the computer, so its requests carry a token that only that user can read (file
+//! `RIG.token` beside the socket); `/metrics` needs none. Web pages in that user's browser are kept out by two rules: the
 //! `Host` must be a loopback name (against DNS rebinding), and a POST must be `application/json`, which a page of
 //! another origin may not send without asking first, and nobody answers that question (against CSRF).
+//!
+//! **Who may wait.** Socket and port have places of their own, so that nobody on the port can keep the socket from being
+//! answered; heads, bodies and answers have time limits, bodies a size limit.
 
+mod allowed;
 mod guard;
+mod limits;
 mod reply;
 mod routes;
 mod serve;
 mod socket;
+mod token;
 
 pub(crate) use reply::{ErrorBody, kind_of_name};
 pub use routes::{
@@ -29,7 +36,7 @@ use std::sync::Arc;
 
 /// The largest request body, bytes; notes are the longest thing anybody sends.
 pub const MAX_BODY_BYTES: usize = 64 << 10;
-/// The most connections at once; more wait until one ends.
+/// The most connections at once, of the socket and of the port each; more wait until one ends.
 pub const MAX_CONNECTIONS: usize = 64;
 /// The header in which every answer says what made it: `depthrig/0.1.0`.
 pub const SERVER_HEADER: &str = "server";

@@ -17,6 +17,7 @@ pub(crate) use served::place as place_of_served;
 use crate::status::{CameraStatus, RigStatus};
 use classify::Candidate;
 use depthrig_bus::PixelFormat;
+use depthrig_drivers::iio;
 use depthrig_drivers::usb::holder::{Holder, Holders, holders_of};
 use depthrig_drivers::usb::{SysRoot, UsbDevice, VideoNode, health, scan, video_nodes};
 use depthrig_drivers::{DeviceInfo, ErrorKind, StreamProfile};
@@ -231,7 +232,11 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
         .collect();
     let hid = c.hidraw.iter().map(|p| NodeReport { path: shown(p), role: "hid", formats: Vec::new() });
     nodes.extend(hid);
-    let unit = if c.family == Family::Zed { unreadable_unit(&c.hidraw, ask) } else { None };
+    let unit = match c.family {
+        Family::Zed => unreadable_unit(&c.hidraw, ask),
+        Family::D400 | Family::L515 => unreadable_imu(root, &c.port, ask),
+        _ => None,
+    };
     let holders = holders(root, &c);
     if let Some(usb) = &c.usb {
         nodes.push(NodeReport { path: shown(&usb.node), role: "usb", formats: Vec::new() });
@@ -292,6 +297,18 @@ fn unreadable_unit(nodes: &[PathBuf], ask: &dyn Ask) -> Option<String> {
     let denied = nodes.iter().find(|node| !ask.may_open(node))?;
     Some(format!(
         "its motion unit {} may not be opened, so that it has no stream imu: {} and plug the camera in again",
+        denied.display(),
+        health::RULE_CURE
+    ))
+}
+
+/// What to say of the sensors of a RealSense IMU when this user may not read them or switch them on.
+fn unreadable_imu(root: &SysRoot, port: &str, ask: &dyn Ask) -> Option<String> {
+    let sensors = iio::on_port(root, port);
+    let files = sensors.iter().flat_map(|s| s.switches().into_iter().chain([s.node.clone()]));
+    let denied = files.into_iter().find(|file| !ask.may_open(file))?;
+    Some(format!(
+        "its IMU cannot be read, because {} may not be opened, so that it has no stream imu: {} and plug the camera in again",
         denied.display(),
         health::RULE_CURE
     ))

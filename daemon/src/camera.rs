@@ -9,6 +9,7 @@ use crate::wake::Wake;
 use depthrig_bus::{Bus, HostTime, StreamId};
 use depthrig_drivers::DeviceInfo;
 use depthrig_drivers::stereo::{Descriptions, EYES, Notice, PREFIXES};
+use depthrig_drivers::synthetic::Drawing;
 use depthrig_recorder::Computed;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -139,6 +140,8 @@ pub struct Shared {
     pub began: HostTime,
     /// Supervision settings.
     pub supervisor: SupervisorConfig,
+    /// Renders the scenes of simulated cameras while they stream, if they are to stream at once.
+    pub drawing: Option<Arc<Drawing>>,
     /// Where depth is refined.
     pub stage: Arc<Entrance>,
 }

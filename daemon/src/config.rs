@@ -108,6 +108,8 @@ pub enum Phase {
 pub struct RecordingConfig {
     /// Folder that the folders of the datasets are made in; absolute.
     pub directory: PathBuf,
+    /// Folders besides it, absolute, in or below which `record start` may put a dataset.
+    pub allow: Vec<PathBuf>,
     /// JPEG quality of colour, 1 to 100.
     pub jpeg_quality: u8,
     /// How colour is stored.
@@ -369,6 +371,7 @@ impl Default for RecordingConfig {
     fn default() -> Self {
         Self {
             directory: PathBuf::from("datasets"),
+            allow: Vec::new(),
             jpeg_quality: 95,
             color: ColorCodec::Jpeg,
             depth: DepthCodec::Zstd,
@@ -385,7 +388,7 @@ impl Default for RecordingConfig {
 
 impl Default for SupervisorConfig {
     fn default() -> Self {
-        Self { stall_s: 1.0, backoff_min_s: 0.1, backoff_max_s: 2.0, raise_priority: true }
+        Self { stall_s: 1.0, backoff_min_s: 0.1, backoff_max_s: 1.0, raise_priority: true }
     }
 }
 
@@ -396,7 +399,8 @@ impl RigConfig {
     /// [`ConfigError`] when the file cannot be read (with the system's error as source), or with every problem
     /// that it has. It converts into [`crate::Error`] of kind `BadInput`, `NotFound` or `PermissionDenied`.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(path).map_err(|e| ConfigError::unreadable(path, e))?;
+        let text = depthrig_bus::files::read_to_string(path, depthrig_bus::files::TEXT_MAX_BYTES)
+            .map_err(|e| ConfigError::unreadable(path, e))?;
         Self::parse(&text, Some(path))
     }
 

@@ -14,6 +14,11 @@ pub trait Control: Send + Sync {
     /// The rig's configuration as TOML text.
     fn config_text(&self) -> String;
 
+    /// Folders in or below which a recording that is asked for over the API may go; none: anywhere.
+    fn recording_roots(&self) -> Vec<PathBuf> {
+        Vec::new()
+    }
+
     /// Starts a recording.
     ///
     /// # Errors

@@ -1,8 +1,9 @@
 //! The house thread of a rig or a replay: what must be done about once a second and by nobody in particular.
 
 use crate::recording::{self, Recording, Reports};
+use core::cell::Cell;
 use core::time::Duration;
-use depthrig_bus::{HostTime, clock};
+use depthrig_bus::{Bus, HostTime, clock, umask};
 use depthrig_recorder::Diagnostic;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,6 +12,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 /// How often it looks whether a recording is due to end, or whether it shall end itself.
 const LOOK: Duration = Duration::from_millis(50);
 const SECOND_NS: i64 = 1_000_000_000;
+/// How soon after the last time killed processes are looked for again when a stream has no free slot.
+const CLEAN_AGAIN_NS: i64 = SECOND_NS / 5;
 
 /// What every house thread looks after.
 pub struct House<'a> {
@@ -18,20 +21,18 @@ pub struct House<'a> {
     pub recording: &'a Mutex<Recording>,
     /// Where the report of such a recording is begun.
     pub reports: &'a Reports,
+    /// Cleaned up after killed processes.
+    pub bus: &'a Bus,
     /// Gets the CPU of this process over the last second, thousandths of a core.
     pub cpu_millicores: &'a AtomicU64,
 }
 
 impl House<'_> {
-    /// Keeps house until `stopping`; `each_second` is what this rig or replay wants done besides, and `diagnose` says
-    /// what belongs into a recording that is going on.
-    pub fn keep(
-        &self,
-        stopping: impl Fn() -> bool,
-        mut each_second: impl FnMut(),
-        diagnose: impl Fn() -> Vec<Diagnostic>,
-    ) {
-        let (mut last, mut last_cpu) = (HostTime::now(), clock::process_cpu_ns());
+    /// Keeps house until `stopping`; `diagnose` says what belongs into a recording that is going on.
+    pub fn keep(&self, stopping: impl Fn() -> bool, diagnose: impl Fn() -> Vec<Diagnostic>) {
+        let mut last = HostTime::now();
+        let mut last_cpu = clock::process_cpu_ns();
+        let cleaned = Cell::new(last);
         let due = || recording::is_due(self.recording);
         let close = || {
             // What goes wrong is logged and in the status.
@@ -39,18 +40,34 @@ impl House<'_> {
                 self.reports.begin(PathBuf::from(&status.path));
             }
         };
-        run(stopping, due, close, || {
+        let starved = || {
+            // Subscribers that are alive may hold every slot for long, so not each time.
+            if HostTime::now().since_ns(cleaned.get()) >= CLEAN_AGAIN_NS && self.bus.starved() {
+                self.clean(&cleaned);
+            }
+        };
+        run(stopping, due, close, starved, || {
             let (now, cpu) = (HostTime::now(), clock::process_cpu_ns());
             let passed_ns = now.since_ns(last).max(1);
             self.cpu_millicores.store(((cpu - last_cpu) * 1000 / passed_ns) as u64, Ordering::Relaxed);
             (last, last_cpu) = (now, cpu);
-            each_second();
+            self.clean(&cleaned);
+            umask::check();
             if lock(self.recording).is_active() {
                 // Before the recording is locked again: the rig's status asks it, too.
                 let diagnostics = diagnose();
                 lock(self.recording).housekeeping(diagnostics);
             }
         });
+    }
+
+    /// Frees what killed processes held; publishers get their slots back when they next need one.
+    fn clean(&self, cleaned: &Cell<HostTime>) {
+        let processes = self.bus.clean_dead();
+        if processes > 0 {
+            tracing::info!(processes, "cleaned up after processes that were killed");
+        }
+        cleaned.set(HostTime::now());
     }
 }
 
@@ -64,6 +81,7 @@ fn run(
     stopping: impl Fn() -> bool,
     due: impl Fn() -> bool,
     close: impl Fn() + Sync,
+    mut each_look: impl FnMut(),
     mut each_second: impl FnMut(),
 ) {
     std::thread::scope(|scope| {
@@ -76,6 +94,7 @@ fn run(
                     tracing::error!(error = %e, "no thread to end the recording, which is tried again");
                 }
             }
+            each_look();
             let now = HostTime::now();
             if now.since_ns(last) >= SECOND_NS {
                 last = now;
@@ -106,6 +125,7 @@ mod tests {
                 }
                 closed.store(true, Ordering::SeqCst);
             },
+            || {},
             || {
                 seen_open.fetch_add(usize::from(!closed.load(Ordering::SeqCst)), Ordering::SeqCst);
                 seconds.fetch_add(1, Ordering::SeqCst);

@@ -10,9 +10,10 @@
 use depthrig_bus::{
     CameraName, ClockDomain, DropCounts, DropReason, FrameHeader, HostTime, PixelFormat, StreamId, UtcPair,
 };
+use depthrig_drivers::kinect::motion as kinect_motion;
 use depthrig_drivers::kinect::playback::{CalibrationSource, recorded_motion, recorded_profiles, serial};
 use depthrig_drivers::kinect::recording::{Pixels, Recording, TrackKind};
-use depthrig_drivers::kinect::{ColorMode, DepthMode};
+use depthrig_drivers::kinect::{Calibration, ColorMode, DepthMode};
 use depthrig_drivers::unpack;
 use depthrig_recorder::exchange::{ImportFacts, ImportProgress, Importer};
 use depthrig_recorder::{
@@ -130,10 +131,10 @@ impl KinectImport {
                 serial: serial(facts, path),
                 rate_hz: profile.samples_hz(),
                 batch: profile.width,
-                calibration: from.clone(),
+                calibration: kinect_motion::stated(&from, calibration.as_ref()),
                 pose: profile.pose_in_device,
             };
-            motion::Unit::new(record, track, calibration.as_ref())
+            motion::Unit::new(record, track)
         });
         let rate_hz = streams.iter().map(|s| s.record.rate_hz).fold(f64::INFINITY, f64::min);
         let delay_us = facts.depth_delay_ns / 1000;
@@ -155,12 +156,12 @@ impl KinectImport {
             streams,
             recording,
         };
-        import.state_all(calibration.is_some());
+        import.state_all(calibration.as_ref());
         Ok(import)
     }
 
     /// What is assumed, before anything was read.
-    fn state_all(&mut self, is_calibrated: bool) {
+    fn state_all(&mut self, calibration: Option<&Calibration>) {
         let facts = self.recording.facts();
         let mut stated = vec![if facts.date_utc_ns.is_some() {
             "UTC is what the file says of when it was begun, in whole seconds; times from frame to frame are the device's"
@@ -169,7 +170,7 @@ impl KinectImport {
             "the file does not say when it was recorded: times count from 1970".to_owned()
         }];
         stated.push("capture times are the device's clock at mid-exposure; frames have no numbers, they follow from it".to_owned());
-        if !is_calibrated {
+        if calibration.is_none() {
             stated.push("there is no calibration: intrinsics are unknown".to_owned());
         }
         if facts.depth_delay_ns != 0 {
@@ -182,6 +183,8 @@ impl KinectImport {
                  is with the first set that is not earlier, or with the last"
                     .to_owned(),
             );
+            let rotation = kinect_motion::gyroscope_in_unit(calibration);
+            stated.extend(rotation.map(|r| r.to_string()));
         }
         for t in facts.tracks.iter().filter(|t| t.kind == TrackKind::Other) {
             stated.push(format!("the track {} is left out, it is no camera's", t.name));

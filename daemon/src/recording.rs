@@ -8,8 +8,8 @@ use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::{Frame, HostTime, StreamId, UtcPair};
 use depthrig_recorder::{
-    Diagnostic, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamAccount, Summary,
-    UtcSource, fs,
+    Diagnostic, NOTE_MAX_BYTES, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session,
+    StreamAccount, Summary, UtcSource, fs,
 };
 use place::place;
 pub use recovery::recover_left;
@@ -47,11 +47,18 @@ pub struct Outside {
     pub utc: UtcSource,
     /// Encoded bytes that may wait for the disk, unless the recorder's own limit is to hold.
     pub backlog_max_bytes: Option<u64>,
+    /// How old a set may become before it is given up; `None` where sets wait for encoders and disk.
+    pub late_after_ns: Option<i64>,
 }
 
 impl Default for Outside {
     fn default() -> Self {
-        Self { fs: Arc::new(fs::RealFs), utc: Arc::new(UtcPair::sample), backlog_max_bytes: None }
+        Self {
+            fs: Arc::new(fs::RealFs),
+            utc: Arc::new(UtcPair::sample),
+            backlog_max_bytes: None,
+            late_after_ns: None,
+        }
     }
 }
 
@@ -101,6 +108,7 @@ impl Begun {
         outside: &Outside,
     ) -> Result<Self> {
         budget::check_duration(request)?;
+        check_texts(request)?;
         let (streams, others): (Vec<_>, Vec<_>) = streams.into_iter().partition(|s| s.stream.record);
         // Motion rides with the sets of the others.
         let (units, streams): (Vec<_>, Vec<_>) =
@@ -126,6 +134,7 @@ impl Begun {
         session.motion = units.iter().map(motion::record_of).collect();
         let mut options = options_of(&config.recording);
         options.backlog_max_bytes = outside.backlog_max_bytes.unwrap_or(options.backlog_max_bytes);
+        options.late_after_ns = outside.late_after_ns;
         let raw = streams.iter().map(|s| (s.stream.profile.format, s.stream.profile.frame_bytes()));
         let samples_hz: f64 = units.iter().map(|s| s.stream.profile.samples_hz()).sum();
         let rate =
@@ -237,11 +246,9 @@ impl Recording {
     /// with, in their order. Never blocks.
     pub fn push(&mut self, set: RecordSet) {
         let Some(active) = &mut self.active else { return };
-        let id = set.id;
         active.motion.hand_over(&set.motion);
-        if let Err(e) = active.recorder.push(set) {
-            tracing::error!(set = id, reason = e.reason.name(), "a frame set was not recorded: {e}");
-        }
+        // A set that is refused is counted and logged by the recorder.
+        drop(active.recorder.push(set));
     }
 
     /// Whether the next set would find room, or needs none.
@@ -431,6 +438,22 @@ fn finish(recording: &Mutex<Recording>, finishing: Finishing) -> Result<Recordin
         recording.keep(status.clone(), result.as_ref().ok().cloned());
     }
     result.map(|_| status)
+}
+
+/// Refuses texts that no dataset takes, before there is one.
+fn check_texts(request: &RecordRequest) -> Result<()> {
+    let texts = [("scene", &request.scene), ("operator", &request.operator), ("notes", &request.notes)];
+    if let Some((name, text)) = texts.into_iter().find(|(_, text)| text.len() > NOTE_MAX_BYTES) {
+        let message = format!("invalid {name}: it has {} bytes, {NOTE_MAX_BYTES} is the limit", text.len());
+        return Err(Error::new(ErrorKind::BadInput, message));
+    }
+    let directory = request.directory.as_ref().map(|d| d.to_string_lossy());
+    if let Some(directory) = directory.filter(|d| d.contains(char::is_control)) {
+        let message =
+            format!("invalid directory \"{}\": it has control characters", directory.escape_debug());
+        return Err(Error::new(ErrorKind::BadInput, message));
+    }
+    Ok(())
 }
 
 fn none_active() -> Error {

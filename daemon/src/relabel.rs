@@ -135,6 +135,7 @@ pub fn relabel_with(
     progress: RelabelProgress<'_>,
 ) -> Result<RelabelReport> {
     let fs: Arc<dyn Fs> = Arc::new(RealFs);
+    depthrig_recorder::check_outside(out, dataset.path())?;
     let work = work_folder(out)?;
     if out.symlink_metadata().is_ok() {
         let message = format!("{} is there already; choose another name", out.display());

@@ -191,6 +191,7 @@ impl Replay {
         options: ReplayOptions,
     ) -> Result<Self> {
         transport::check_rate(options.rate)?;
+        depthrig_bus::umask::check();
         if options.refine.is_some() && options.as_fast_as_possible {
             return Err(Error::new(
                 ErrorKind::BadInput,
@@ -459,13 +460,11 @@ fn unit_profile(r: &MotionRecord) -> StreamProfile {
 
 /// The house thread.
 fn keep_house(inner: &Inner, bus: &Bus) {
-    let house =
-        House { recording: &inner.recording, reports: &inner.reports, cpu_millicores: &inner.cpu_millicores };
-    house.keep(
-        || inner.stopping(),
-        || {
-            bus.clean_dead();
-        },
-        || report::diagnostics(&inner.status()),
-    );
+    let house = House {
+        recording: &inner.recording,
+        reports: &inner.reports,
+        bus,
+        cpu_millicores: &inner.cpu_millicores,
+    };
+    house.keep(|| inner.stopping(), || report::diagnostics(&inner.status()));
 }

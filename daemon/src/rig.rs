@@ -28,9 +28,10 @@ use crate::{Error, ErrorKind, Result, priority};
 use assembly::Assembly;
 use core::time::Duration;
 use depthrig_bus::runtime::{RigLock, RuntimeDir};
-use depthrig_bus::{Bus, HostTime, StreamId, UtcPair, shm};
-use depthrig_recorder::UtcSource;
+use depthrig_bus::{Bus, HostTime, StreamId, UtcPair, shm, umask};
+use depthrig_drivers::synthetic::{Drawing, DrawingProgress};
 use depthrig_recorder::fs::{Fs, RealFs};
+use depthrig_recorder::{UtcSource, live_late_ns};
 pub use join::near_pair_ns;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -42,6 +43,8 @@ use std::thread::JoinHandle;
 const STEP: Duration = Duration::from_millis(20);
 /// How long the start waits for cameras that answer slowly; they come in later all the same.
 const START_PATIENCE: Duration = Duration::from_secs(10);
+/// How long a recovery of old datasets gets to end; cut off it begins anew at the next start.
+const RECOVER_TIMEOUT: Duration = Duration::from_secs(2);
 /// How long one camera thread gets to end; with it the whole stop stays below a second.
 const STOP_PATIENCE: Duration = Duration::from_millis(500);
 
@@ -70,6 +73,8 @@ pub struct RigOptions {
     /// Where what refines depth comes from; tests put something that fails or hangs here. The engines and models of this
     /// computer when `None`.
     pub refiners: Option<Arc<dyn Refiners>>,
+    /// Simulated cameras stream before their scenes are rendered, with coarse images until then.
+    pub draw_while_running: bool,
 }
 
 impl RigOptions {
@@ -84,6 +89,7 @@ impl RigOptions {
             utc: Arc::new(UtcPair::sample),
             backlog_max_bytes: None,
             refiners: None,
+            draw_while_running: false,
         }
     }
 }
@@ -104,6 +110,8 @@ pub struct Rig {
     inner: Arc<Inner>,
     /// Each with the flag that ends it.
     threads: Vec<(JoinHandle<()>, StopFlag)>,
+    /// It reads what others put into the recording folder, so that nobody waits for it for long.
+    recovery: Option<(JoinHandle<()>, StopFlag)>,
     api: Option<ServerHandle>,
     _lock: RigLock,
 }
@@ -151,6 +159,7 @@ impl Rig {
     /// small, [`ErrorKind::BadInput`] when a camera's settings cannot work (all such cameras are named).
     pub fn start(mut config: RigConfig, options: &RigOptions) -> Result<Self> {
         priority::raise_file_limit();
+        umask::check();
         let source =
             config.path.as_deref().map_or("built-in configuration".to_owned(), |p| p.display().to_string());
         let who = format!("process {} ({source})", std::process::id());
@@ -161,7 +170,12 @@ impl Rig {
         let entrance = Arc::new(Entrance::default());
         let refiners = options.refiners.clone();
         let refiners = refiners.unwrap_or_else(|| Arc::new(Installed::new(config.cdm.clone())));
+        let drawing = options.draw_while_running.then(Arc::<Drawing>::default);
+        if let Some(drawing) = &drawing {
+            plan(&config, drawing)?;
+        }
         let shared = Arc::new(Shared {
+            drawing: drawing.clone(),
             memory_share: shm::free_bytes(shm::SHM_DIR.as_ref())? / config.cameras.len().max(1) as u64,
             slots: config.bus.slots,
             began: HostTime::now(),
@@ -170,6 +184,7 @@ impl Rig {
             stage: entrance,
             bus,
         });
+        let late_after_ns = live_late_ns((1e9 / config.sets.rate_hz) as i64);
         let inner = Arc::new(Inner {
             cameras: config.cameras.iter().map(|c| Arc::new(Camera::new(c.clone()))).collect(),
             config,
@@ -184,6 +199,7 @@ impl Rig {
                 fs: Arc::clone(&options.fs),
                 utc: Arc::clone(&options.utc),
                 backlog_max_bytes: options.backlog_max_bytes,
+                late_after_ns: Some(late_after_ns),
             },
             starting: Mutex::default(),
             spreads: Mutex::default(),
@@ -193,7 +209,12 @@ impl Rig {
             held_sets: AtomicUsize::new(0),
         });
         let assembly = Assembly::new(Arc::clone(&inner))?;
-        let mut rig = Self { threads: Vec::new(), api: None, inner, _lock: lock };
+        let mut rig = Self { threads: Vec::new(), recovery: None, api: None, inner, _lock: lock };
+        // Before the cameras: what takes long at their start can be asked for.
+        if options.serve_api {
+            let socket = options.runtime.socket_path(&rig.inner.config.rig);
+            rig.api = Some(api::serve(rig.control(), &socket, rig.inner.config.control.tcp)?);
+        }
         let inner = Arc::clone(&rig.inner);
         rig.spawn("supervisor", move |stop| supervise(&inner, stop))?;
         if rig.inner.config.cameras.iter().any(|c| c.refine.is_some()) {
@@ -207,19 +228,33 @@ impl Rig {
         rig.spawn("house", move |stop| keep_house(&inner, stop))?;
         if rig.inner.config.recording.recover_on_start {
             let inner = Arc::clone(&rig.inner);
-            rig.spawn("recover", move |stop| recover_left(&inner.config, &inner.outside.fs, stop))?;
+            let recover = move |stop: &AtomicBool| recover_left(&inner.config, &inner.outside.fs, stop);
+            rig.recovery = Some(start_thread("recover", recover)?);
+        }
+        if let Some(drawing) = drawing {
+            rig.spawn("draw", move |stop| {
+                if let Err(e) = drawing.run(stop) {
+                    tracing::error!("the images of synthetic cameras stay coarse: {e}");
+                }
+            })?;
         }
         rig.wait_for_cameras()?;
-        if options.serve_api {
-            let socket = options.runtime.socket_path(&rig.inner.config.rig);
-            rig.api = Some(api::serve(rig.control(), &socket, rig.inner.config.control.tcp)?);
-        }
         Ok(rig)
+    }
+
+    /// How far the scenes of simulated cameras are rendered; `None` when there is nothing to render.
+    pub fn drawing(&self) -> Option<DrawingProgress> {
+        self.inner.drawing()
     }
 
     /// The rig's control.
     pub fn control(&self) -> Arc<dyn Control> {
         Arc::clone(&self.inner) as Arc<dyn Control>
+    }
+
+    /// Whether somebody asked the rig to stop.
+    pub fn is_stop_asked(&self) -> bool {
+        self.inner.stop_asked.load(Ordering::Relaxed)
     }
 
     /// Waits until somebody asks the rig to stop, until `deadline`, or until every camera is done (at the end of
@@ -260,6 +295,9 @@ impl Rig {
             api.stop();
         }
         self.inner.ending.store(true, Ordering::Relaxed);
+        if let Some((_, stop)) = &self.recovery {
+            stop.store(true, Ordering::Relaxed);
+        }
         // In the order of `spawn`: the cameras end first, then the set thread reads what they left.
         for (thread, stop) in self.threads.drain(..) {
             stop.store(true, Ordering::Relaxed);
@@ -268,16 +306,19 @@ impl Rig {
                 tracing::error!("a thread of the rig panicked");
             }
         }
+        let Some((recovery, _)) = self.recovery.take() else { return };
+        let deadline = HostTime::now().plus(RECOVER_TIMEOUT);
+        while !recovery.is_finished() && !deadline.from_now().is_zero() {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        if !recovery.is_finished() {
+            let folder = self.inner.config.recording.directory.display();
+            tracing::warn!("the recovery of old datasets in {folder} does not end and is left behind");
+        }
     }
 
     fn spawn(&mut self, name: &str, run: impl FnOnce(&AtomicBool) + Send + 'static) -> Result<()> {
-        let stop = StopFlag::default();
-        let theirs = Arc::clone(&stop);
-        let thread =
-            std::thread::Builder::new().name(name.to_owned()).spawn(move || run(&theirs)).map_err(|e| {
-                Error::new(ErrorKind::Other, format!("the {name} thread could not be started")).with_source(e)
-            })?;
-        self.threads.push((thread, stop));
+        self.threads.push(start_thread(name, run)?);
         Ok(())
     }
 
@@ -328,6 +369,25 @@ impl Drop for Rig {
 }
 
 impl Inner {
+    fn drawing(&self) -> Option<DrawingProgress> {
+        self.shared.drawing.as_ref()?.progress()
+    }
+
+    /// Refuses while simulated cameras show coarse images: a dataset of them would look like a broken one.
+    fn must_be_drawn(&self) -> Result<()> {
+        let Some(DrawingProgress { done, total, error }) = self.drawing() else { return Ok(()) };
+        let cure = match error {
+            Some(e) => e,
+            None => format!(
+                "{} % are done; try again when `depthrig status` no longer reports `preparing`",
+                100 * done / total
+            ),
+        };
+        let what =
+            format!("the images of simulated cameras are still being rendered and coarse until then: {cure}");
+        Err(Error::new(ErrorKind::WrongState, what))
+    }
+
     fn spreads(&self) -> MutexGuard<'_, SpreadStats> {
         lock(&self.spreads)
     }
@@ -380,9 +440,15 @@ impl Control for Inner {
         self.config.text.clone()
     }
 
+    fn recording_roots(&self) -> Vec<PathBuf> {
+        let config = &self.config.recording;
+        core::iter::once(&config.directory).chain(&config.allow).cloned().collect()
+    }
+
     fn record_start(&self, request: &RecordRequest) -> Result<RecordingStatus> {
         let _one_at_a_time = lock(&self.starting);
         self.recording().must_be_idle()?;
+        self.must_be_drawn()?;
         let sets_hz = self.config.sets.rate_hz;
         // Without the recording's lock: making a file must not keep the set thread waiting.
         let begun = Begun::new(&self.config, request, self.stream_facts(), sets_hz, &self.outside)?;
@@ -408,13 +474,40 @@ impl Control for Inner {
     }
 }
 
-/// Renders what synthetic cameras will show, so that the cameras themselves start at once.
+/// Plans the scenes of synthetic cameras.
+fn plan(config: &RigConfig, drawing: &Drawing) -> Result<()> {
+    for camera in &config.cameras {
+        if let BackendConfig::Synthetic(c) = &camera.backend {
+            drawing.plan(c)?;
+        }
+    }
+    Ok(())
+}
+
+fn start_thread(
+    name: &str,
+    run: impl FnOnce(&AtomicBool) + Send + 'static,
+) -> Result<(JoinHandle<()>, StopFlag)> {
+    let stop = StopFlag::default();
+    let theirs = Arc::clone(&stop);
+    let thread = std::thread::Builder::new().name(name.to_owned()).spawn(move || run(&theirs));
+    let thread = thread.map_err(|e| {
+        Error::new(ErrorKind::Other, format!("the {name} thread could not be started")).with_source(e)
+    })?;
+    Ok((thread, stop))
+}
+
+/// Sets the pose and the cache folder of synthetic cameras, and renders their scenes unless that is to be done while
+/// they stream.
 fn prepare(config: &mut RigConfig, options: &RigOptions) -> Result<()> {
     for camera in &mut config.cameras {
         let BackendConfig::Synthetic(c) = &mut camera.backend else { continue };
         c.pose_on_mount = camera.pose;
         if let Some(dir) = &options.cache_dir {
             c.cache_dir.clone_from(dir);
+        }
+        if options.draw_while_running {
+            continue;
         }
         let name = camera.name.as_str();
         depthrig_drivers::synthetic::prepare(c, &|done, total| {
@@ -448,16 +541,11 @@ fn supervise(inner: &Arc<Inner>, stop: &AtomicBool) {
 
 /// The house thread.
 fn keep_house(inner: &Inner, stop: &AtomicBool) {
-    let house =
-        House { recording: &inner.recording, reports: &inner.reports, cpu_millicores: &inner.cpu_millicores };
-    house.keep(
-        || stop.load(Ordering::Relaxed),
-        || {
-            let cleaned = inner.shared.bus.clean_dead();
-            if cleaned > 0 {
-                tracing::info!(processes = cleaned, "cleaned up after subscribers that were killed");
-            }
-        },
-        || report::diagnostics(&report::status(inner)),
-    );
+    let house = House {
+        recording: &inner.recording,
+        reports: &inner.reports,
+        bus: &inner.shared.bus,
+        cpu_millicores: &inner.cpu_millicores,
+    };
+    house.keep(|| stop.load(Ordering::Relaxed), || report::diagnostics(&report::status(inner)));
 }

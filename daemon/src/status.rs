@@ -16,6 +16,8 @@ pub struct RigStatus {
     pub uptime_s: f64,
     /// The moment of this status, nanoseconds since 1970 UTC.
     pub utc_ns: i64,
+    /// How far the scenes of simulated cameras are rendered, while they are: until then their images are coarse.
+    pub preparing: Option<PreparingStatus>,
     /// Cameras in the order of the configuration.
     pub cameras: Vec<CameraStatus>,
     /// The set assembler.
@@ -28,6 +30,19 @@ pub struct RigStatus {
     pub cpu_cores: f64,
     /// The replay, when the cameras are those of a dataset.
     pub replay: Option<ReplayStatus>,
+}
+
+/// How far the scenes of simulated cameras are rendered.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct PreparingStatus {
+    /// Images rendered.
+    pub images: u64,
+    /// Images to be rendered.
+    pub images_total: u64,
+    /// Share done, 0 to 1.
+    pub share: f64,
+    /// Why it does not go on, if so.
+    pub error: Option<String>,
 }
 
 /// A replay. Seconds and sets are counted from the first set that is replayed.

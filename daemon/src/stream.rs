@@ -25,7 +25,7 @@ pub struct Stream {
     pub profile: StreamProfile,
     /// Whether its frames belong into recordings.
     pub record: bool,
-    /// Slots of its channel.
+    /// Slots that its channel shall have.
     pub slots: usize,
     books: Mutex<Books>,
 }
@@ -93,6 +93,11 @@ impl Stream {
     /// A stream without a frame yet.
     pub fn new(id: StreamId, profile: StreamProfile, record: bool, slots: usize) -> Self {
         Self { id, profile, record, slots, books: Mutex::default() }
+    }
+
+    /// Slots that its channel has; fewer than it should when memory was short.
+    pub fn slots(&self) -> usize {
+        self.books().publisher.as_ref().map_or(self.slots, |publisher| publisher.slots())
     }
 
     /// The books, for reading or writing.

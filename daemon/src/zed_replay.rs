@@ -189,10 +189,11 @@ pub fn zed_replay(
         return Err(Error::new(ErrorKind::AlreadyExists, message));
     }
     check(options)?;
+    depthrig_recorder::check_outside(out, input)?;
     let mut input = Input::open(input, options.camera.as_deref(), &options.open)?;
     let mut plan = Plan::new(&mut input, out, options)?;
     let rows = eyes::check(&mut input, &plan.maker)?;
-    plan.tell_rows(rows.as_ref());
+    plan.take_rows(rows.as_ref());
     let fs: Arc<dyn Fs> = Arc::new(RealFs);
     let work = work::Work::open(out, &plan.identity(options))?;
     let mut report = plan.report(out);

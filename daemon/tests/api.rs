@@ -6,6 +6,8 @@
 mod fake;
 #[path = "api/schema.rs"]
 mod schema;
+#[path = "api/strangers.rs"]
+mod strangers;
 
 use depthrig_bus::clock::HostTime;
 use depthrig_bus::{RigName, RuntimeDir};
@@ -96,8 +98,19 @@ impl Served {
         exchange(self.unix(), request("POST", path, "localhost", Some("application/json"), body).as_bytes())
     }
 
+    fn port(&self) -> TcpStream {
+        TcpStream::connect(self.server.tcp().unwrap()).unwrap()
+    }
+
+    /// Sends a request with the token.
     fn on_port(&self, text: &str) -> Answer {
-        exchange(TcpStream::connect(self.server.tcp().unwrap()).unwrap(), text.as_bytes())
+        let with_token = format!("\r\nauthorization: Bearer {}\r\n", self.token());
+        exchange(self.port(), text.replacen("\r\n", &with_token, 1).as_bytes())
+    }
+
+    fn token(&self) -> String {
+        let text = std::fs::read_to_string(self.server.token_path().unwrap()).unwrap();
+        text.trim_end().to_owned()
     }
 }
 

@@ -50,6 +50,11 @@ impl Refusal {
         let kind = named.map_or("bad_input", |(_, name, _)| name);
         Self { status, kind, message: message.into() }
     }
+
+    /// Who asks may not.
+    pub(super) fn denied(status: StatusCode, message: impl Into<String>) -> Self {
+        Self { status, kind: "permission_denied", message: message.into() }
+    }
 }
 
 impl From<Error> for Refusal {

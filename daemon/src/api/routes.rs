@@ -1,14 +1,13 @@
 //! The calls of the API: one table that the router is built from and the OpenAPI document is compared with.
 
 use super::reply::Refusal;
-use super::{MAX_BODY_BYTES, SERVER_HEADER, guard};
+use super::{SERVER_HEADER, allowed, guard, limits};
 use crate::control::{Control, RecordRequest, ReplayControl, SeekRequest};
 use crate::metrics;
 use crate::status::{CameraState, CameraStatus, RecordingStatus, ReplayStatus, RigStatus};
 use crate::{Error, ErrorKind};
 use axum::body::Bytes;
-use axum::extract::rejection::BytesRejection;
-use axum::extract::{DefaultBodyLimit, Request, State};
+use axum::extract::{Request, State};
 use axum::http::{HeaderValue, Method, StatusCode, Uri, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
@@ -22,7 +21,6 @@ use std::sync::Arc;
 pub const OPENAPI: &str = include_str!("openapi.json");
 
 type Rig = Arc<dyn Control>;
-type Body = Result<Bytes, BytesRejection>;
 type Answer<T> = Result<T, Refusal>;
 
 /// A call of the API.
@@ -134,7 +132,7 @@ pub(super) fn router(control: Rig) -> Router {
         .fallback(unknown_path)
         .method_not_allowed_fallback(wrong_method)
         .with_state(control)
-        .layer(DefaultBodyLimit::max(MAX_BODY_BYTES))
+        .layer(middleware::from_fn(limits::whole_body))
         .layer(middleware::from_fn(guard::json_posts))
         .layer(middleware::from_fn(name_server))
 }
@@ -166,17 +164,24 @@ async fn record(State(rig): State<Rig>) -> Answer<Json<Option<RecordingStatus>>>
     call(rig, |rig| Ok(rig.status().recording)).await.map(Json)
 }
 
-async fn record_start(State(rig): State<Rig>, body: Body) -> Answer<Json<RecordingStatus>> {
-    let request: RecordRequest = parse(body)?;
-    call(rig, move |rig| rig.record_start(&request)).await.map(Json)
+async fn record_start(State(rig): State<Rig>, body: Bytes) -> Answer<Json<RecordingStatus>> {
+    let mut request: RecordRequest = parse(&body)?;
+    call(rig, move |rig| {
+        if let Some(directory) = &request.directory {
+            request.directory = Some(allowed::below(directory, &rig.recording_roots())?);
+        }
+        rig.record_start(&request)
+    })
+    .await
+    .map(Json)
 }
 
 async fn record_stop(State(rig): State<Rig>) -> Answer<Json<RecordingStatus>> {
     call(rig, |rig| rig.record_stop()).await.map(Json)
 }
 
-async fn record_note(State(rig): State<Rig>, body: Body) -> Answer<StatusCode> {
-    let note: NoteRequest = parse(body)?;
+async fn record_note(State(rig): State<Rig>, body: Bytes) -> Answer<StatusCode> {
+    let note: NoteRequest = parse(&body)?;
     call(rig, move |rig| rig.record_note(&note.text)).await?;
     Ok(StatusCode::NO_CONTENT)
 }
@@ -193,23 +198,23 @@ async fn replay_resume(State(rig): State<Rig>) -> Answer<Json<ReplayStatus>> {
     of_replay(rig, |replay| replay.resume()).await
 }
 
-async fn replay_seek(State(rig): State<Rig>, body: Body) -> Answer<Json<ReplayStatus>> {
-    let to: SeekRequest = parse(body)?;
+async fn replay_seek(State(rig): State<Rig>, body: Bytes) -> Answer<Json<ReplayStatus>> {
+    let to: SeekRequest = parse(&body)?;
     of_replay(rig, move |replay| replay.seek(&to)).await
 }
 
-async fn replay_step(State(rig): State<Rig>, body: Body) -> Answer<Json<ReplayStatus>> {
-    let step: StepRequest = parse(body)?;
+async fn replay_step(State(rig): State<Rig>, body: Bytes) -> Answer<Json<ReplayStatus>> {
+    let step: StepRequest = parse(&body)?;
     of_replay(rig, move |replay| replay.step(step.sets)).await
 }
 
-async fn replay_rate(State(rig): State<Rig>, body: Body) -> Answer<Json<ReplayStatus>> {
-    let request: RateRequest = parse(body)?;
+async fn replay_rate(State(rig): State<Rig>, body: Bytes) -> Answer<Json<ReplayStatus>> {
+    let request: RateRequest = parse(&body)?;
     of_replay(rig, move |replay| replay.set_rate(request.rate)).await
 }
 
-async fn replay_loop(State(rig): State<Rig>, body: Body) -> Answer<Json<ReplayStatus>> {
-    let request: LoopRequest = parse(body)?;
+async fn replay_loop(State(rig): State<Rig>, body: Bytes) -> Answer<Json<ReplayStatus>> {
+    let request: LoopRequest = parse(&body)?;
     of_replay(rig, move |replay| replay.set_loop(request.on)).await
 }
 
@@ -274,10 +279,8 @@ async fn call<T: Send + 'static>(
 }
 
 /// The body as JSON; an empty one is an empty object.
-fn parse<T: DeserializeOwned>(body: Body) -> Answer<T> {
-    let body =
-        body.map_err(|e| Refusal::new(e.status(), format!("the body cannot be read: {}", e.body_text())))?;
-    let text = if body.is_empty() { b"{}".as_slice() } else { &body };
+fn parse<T: DeserializeOwned>(body: &[u8]) -> Answer<T> {
+    let text = if body.is_empty() { b"{}".as_slice() } else { body };
     serde_json::from_slice(text)
         .map_err(|e| Refusal::new(StatusCode::BAD_REQUEST, format!("the body is wrong: {e}")))
 }

@@ -1,6 +1,8 @@
 //! The thread that serves: it accepts, keeps connections few and short-lived, and ends within half a second.
 
+use super::limits::{HEAD_TIMEOUT, Limited, WRITE_TIMEOUT};
 use super::socket::{self, SocketFile};
+use super::token::{self, Token};
 use super::{MAX_CONNECTIONS, guard, routes};
 use crate::control::Control;
 use crate::{Error, ErrorKind, Result};
@@ -16,8 +18,6 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, UnixListener};
 use tokio::sync::{Semaphore, watch};
 
-/// How long a client may take to send the head of its next request; an idle connection ends after it.
-const HEAD_PATIENCE: Duration = Duration::from_secs(30);
 /// How long requests that are under way when the service ends get.
 const STOP_PATIENCE: Duration = Duration::from_millis(300);
 /// The pause after a connection could not be accepted, which is when the process is out of file descriptors.
@@ -31,6 +31,7 @@ pub struct ServerHandle {
     stop: watch::Sender<bool>,
     thread: Option<JoinHandle<()>>,
     tcp: Option<SocketAddr>,
+    token: Option<Arc<Token>>,
     _socket: SocketFile,
 }
 
@@ -43,12 +44,14 @@ impl ServerHandle {
         let port = tcp.map(socket::bind_tcp).transpose()?;
         let (unix, socket) = socket::bind_unix(path)?;
         let tcp = port.as_ref().map(std::net::TcpListener::local_addr).transpose().map_err(failed)?;
+        let token = tcp.map(|_| Token::create(path.with_extension("token"))).transpose()?;
         let mut builder = tokio::runtime::Builder::new_current_thread();
         let runtime = builder.enable_all().max_blocking_threads(CALL_THREADS).thread_name("api-call").build();
         let runtime = runtime.map_err(failed)?;
         let (unix, port) = {
             let _inside = runtime.enter();
             let port = port.map(TcpListener::from_std).transpose().map_err(failed)?;
+            let port = port.zip(token.clone()).map(|(listener, token)| Port { listener, token });
             (UnixListener::from_std(unix).map_err(failed)?, port)
         };
         let (stop, stopped) = watch::channel(false);
@@ -59,7 +62,12 @@ impl ServerHandle {
         };
         let thread = std::thread::Builder::new().name("api".into()).spawn(serve).map_err(failed)?;
         tracing::debug!(socket = %path.display(), tcp = ?tcp, "control API is served");
-        Ok(Self { stop, thread: Some(thread), tcp, _socket: socket })
+        Ok(Self { stop, thread: Some(thread), tcp, token, _socket: socket })
+    }
+
+    /// The file with the token that requests over TCP carry, if a port is served.
+    pub fn token_path(&self) -> Option<&Path> {
+        self.token.as_deref().map(Token::path)
     }
 
     /// The address of the loopback port, if one is served.
@@ -84,24 +92,40 @@ impl Drop for ServerHandle {
     }
 }
 
+/// A loopback port with the token that its clients must know.
+struct Port {
+    listener: TcpListener,
+    token: Arc<Token>,
+}
+
 async fn run(
     control: Arc<dyn Control>,
     unix: UnixListener,
-    port: Option<TcpListener>,
+    port: Option<Port>,
     stopped: watch::Receiver<bool>,
 ) {
-    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     let router = routes::router(control);
-    let guarded = router.clone().layer(axum::middleware::from_fn(guard::loopback_host));
-    let on_port = Acceptor { places: Arc::clone(&places), router: guarded, stopped: stopped.clone() };
-    let on_socket = Acceptor { places: Arc::clone(&places), router, stopped };
+    // Connections of the port are anybody's on this computer: they must not take the places of the socket.
+    let port_places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     let on_port = async {
-        if let Some(port) = port {
-            on_port.run(async || port.accept().await.map(|(stream, _)| stream)).await;
+        if let Some(Port { listener, token }) = port {
+            let guarded = router
+                .clone()
+                .layer(axum::middleware::from_fn_with_state(token, token::bearer))
+                .layer(axum::middleware::from_fn(guard::loopback_host));
+            let places = Arc::clone(&port_places);
+            let acceptor = Acceptor { places, router: guarded, stopped: stopped.clone() };
+            acceptor.run(async || listener.accept().await.map(|(stream, _)| stream)).await;
         }
     };
+    let on_socket =
+        Acceptor { places: Arc::clone(&places), router: router.clone(), stopped: stopped.clone() };
     tokio::join!(on_port, on_socket.run(async || unix.accept().await.map(|(stream, _)| stream)));
-    let all = places.acquire_many(MAX_CONNECTIONS as u32);
+    let all = async {
+        let _ = places.acquire_many(MAX_CONNECTIONS as u32).await;
+        let _ = port_places.acquire_many(MAX_CONNECTIONS as u32).await;
+    };
     if tokio::time::timeout(STOP_PATIENCE, all).await.is_err() {
         tracing::debug!("requests under way were cut off because the rig ends");
     }
@@ -153,8 +177,9 @@ where
     S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
 {
     let mut http = hyper::server::conn::http1::Builder::new();
-    http.timer(TokioTimer::new()).header_read_timeout(HEAD_PATIENCE);
-    let connection = http.serve_connection(TokioIo::new(stream), TowerToHyperService::new(router));
+    http.timer(TokioTimer::new()).header_read_timeout(HEAD_TIMEOUT);
+    let stream = TokioIo::new(Limited::new(stream, WRITE_TIMEOUT));
+    let connection = http.serve_connection(stream, TowerToHyperService::new(router));
     tokio::pin!(connection);
     let ended = tokio::select! {
         ended = connection.as_mut() => ended,

@@ -61,7 +61,7 @@ fn make_way(path: &Path) -> Result<()> {
 pub(super) fn bind_tcp(address: SocketAddr) -> Result<TcpListener> {
     if !address.ip().is_loopback() {
         let message =
-            format!("control address {address} is not loopback; the API has no password, use 127.0.0.1");
+            format!("control address {address} is not loopback; the API is not encrypted, use 127.0.0.1");
         return Err(Error::new(ErrorKind::BadInput, message));
     }
     let bound = TcpListener::bind(address).and_then(|l| l.set_nonblocking(true).map(|()| l));

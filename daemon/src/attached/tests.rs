@@ -119,6 +119,7 @@ pub(crate) fn rig_with(port: &str) -> RigStatus {
         pid: 77,
         uptime_s: 1.0,
         utc_ns: 0,
+        preparing: None,
         cameras: vec![camera],
         sets: crate::status::SetStatus::default(),
         recording: None,

@@ -124,7 +124,7 @@ fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, de
     let backend: Box<dyn Backend> = match &camera.config.backend {
         // One beginning for all cameras of the rig, or each would see the world at another moment.
         BackendConfig::Synthetic(c) => {
-            Box::new(SyntheticBackend::starting_at(vec![c.clone()], shared.began)?)
+            Box::new(SyntheticBackend::with_drawing(vec![c.clone()], shared.began, shared.drawing.as_ref())?)
         }
         BackendConfig::Files(c) => Box::new(FilesBackend::new(c.clone())),
         BackendConfig::L515(c) => Box::new(L515Backend::new(c.clone())),

@@ -25,6 +25,9 @@ use std::sync::Arc;
 const OPEN_PATIENCE: Duration = Duration::from_secs(15);
 /// How long a recording may be silent that waits for its modes.
 const WAITS_FOR_MODES: Duration = Duration::from_mins(1);
+/// A supervisor that steps so late after its last step did not run meanwhile, and neither did the cameras' threads: the process
+/// was stopped or the computer slept. Silence of that time says nothing of a device.
+const STOPPED: Duration = Duration::from_secs(1);
 /// A stalled camera is opened again after this many stall times without a frame.
 const STALLS_UNTIL_RESTART: u32 = 4;
 
@@ -39,6 +42,9 @@ pub struct Supervisor {
     backoff: Duration,
     lost: bool,
     heard: Vec<Heard>,
+    stepped_at: HostTime,
+    /// Until then no silence counts.
+    excused_until: HostTime,
 }
 
 /// When a stream last announced a frame, kept or lost.
@@ -62,12 +68,17 @@ impl Supervisor {
             backoff,
             lost: false,
             heard: Vec::new(),
+            stepped_at: HostTime::from_ns(i64::MAX),
+            excused_until: HostTime::from_ns(0),
         }
     }
 
     /// Looks at the camera and does what is due. Never blocks on the device.
     pub fn step(&mut self, now: HostTime) {
         let name = self.camera.config.name.clone();
+        // Noted at every step, also while the camera is away, which is no sign of a supervisor that did not run.
+        let was_stopped = now.since_ns(self.stepped_at) > STOPPED.as_nanos() as i64;
+        self.stepped_at = now;
         let Some(capture) = &self.capture else {
             let waiting =
                 matches!(self.camera.state().phase, CameraState::Opening | CameraState::Reconnecting);
@@ -83,6 +94,12 @@ impl Supervisor {
             return;
         }
         let stall = self.stall_time();
+        if was_stopped {
+            self.excused_until = now.plus(stall);
+        }
+        if now < self.excused_until {
+            return;
+        }
         let heartbeat_age = Duration::from_nanos(now.since_ns(capture.heartbeat()).max(0) as u64);
         let Some(last_frame) = capture.last_frame().filter(|t| *t >= self.opened_at) else {
             // Not a frame yet: opening, or open and silent.

@@ -164,8 +164,9 @@ fn streams(camera: &Section<'_, '_>) -> Vec<WantedStream> {
         };
         let width = s.or("width", None, |w| w.as_ref().map_or(Ok(()), side));
         let height = s.or("height", None, |h| h.as_ref().map_or(Ok(()), side));
-        if width.is_some() != height.is_some() {
-            let (given, missing) = if width.is_some() { ("width", "height") } else { ("height", "width") };
+        // A side that is given and wrong has its own problem already.
+        if s.has("width") != s.has("height") {
+            let (given, missing) = if s.has("width") { ("width", "height") } else { ("height", "width") };
             s.problem(s.at, format!("{} needs {missing} as well", s.key_of(given)));
         }
         let rate_hz = s.or("rate_hz", None, |r| r.map_or(Ok(()), rate));

@@ -2,7 +2,7 @@
 
 use super::ExternalSettings;
 use super::read::Section;
-use super::rig::{not_empty, resolve};
+use super::rig::{not_empty, resolve, shown};
 use core::time::Duration;
 use std::path::{Path, PathBuf};
 
@@ -27,7 +27,11 @@ pub(super) fn read(s: &Section<'_, '_>, base: &Path) -> ExternalSettings {
     let seconds = |key, default: Duration, least: f64, most: f64| {
         let check = |v: &f64| {
             let good = (least..=most).contains(v);
-            if good { Ok(()) } else { Err(format!("is {v} s; it must be within {least} and {most}")) }
+            if good {
+                Ok(())
+            } else {
+                Err(format!("is {} s; it must be within {least} and {most}", shown(v)))
+            }
         };
         Duration::from_secs_f64(s.or(key, default.as_secs_f64(), check))
     };

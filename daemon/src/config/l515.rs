@@ -5,9 +5,10 @@ use super::camera::WantedStream;
 use super::controls;
 use super::read::Section;
 use depthrig_drivers::StreamRequest;
+use depthrig_drivers::motion::IMU;
 use depthrig_drivers::realsense::protocol::l515::Control;
 
-const STREAMS: [&str; 4] = ["depth", "color", "ir", "confidence"];
+const STREAMS: [&str; 5] = ["depth", "color", "ir", "confidence", IMU];
 
 /// Reads the settings of a camera that is asked for `streams`.
 pub(super) fn read(s: &Section<'_, '_>, streams: &[WantedStream]) -> L515Settings {

@@ -5,9 +5,10 @@ use super::RealsenseSettings;
 use super::camera::WantedStream;
 use super::controls;
 use super::read::Section;
-use super::rig::{not_empty, resolve, within};
+use super::rig::{not_empty, resolve, shown, within};
 use depthrig_bus::StreamName;
 use depthrig_drivers::StreamRequest;
+use depthrig_drivers::motion::IMU;
 use depthrig_drivers::realsense::config::{Emitter, MetadataWish, TransportChoice};
 use depthrig_drivers::realsense::protocol::sync::SyncMode;
 use std::path::{Path, PathBuf};
@@ -28,7 +29,7 @@ const SYNC: [(&str, SyncMode); 5] = [
     ("full_slave", SyncMode::FullSlave),
     ("genlock", SyncMode::Genlock(1)),
 ];
-const STREAMS: [&str; 4] = ["depth", "color", "ir_left", "ir_right"];
+const STREAMS: [&str; 5] = ["depth", "color", "ir_left", "ir_right", IMU];
 
 /// The longest exposure that any model takes, microseconds; a model may take less.
 const MAX_EXPOSURE_US: u32 = 200_000;
@@ -100,6 +101,6 @@ fn depth_unit(unit: &f64) -> Result<(), String> {
     if (1e-6..=0.01).contains(unit) {
         Ok(())
     } else {
-        Err(format!("is {unit}; it must be within 0.000001 and 0.01 (0.001 are millimetres)"))
+        Err(format!("is {}; it must be within 0.000001 and 0.01 (0.001 are millimetres)", shown(unit)))
     }
 }

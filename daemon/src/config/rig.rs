@@ -5,7 +5,7 @@ use super::{
     BusConfig, ColorCodec, ConfigError, ControlConfig, DepthCodec, MAX_CAMERAS, MAX_RATE_HZ, Phase,
     RecordingConfig, RigConfig, SetsConfig, SupervisorConfig, camera, refine,
 };
-use core::fmt::Display;
+use core::fmt::{Display, LowerExp};
 use core::ops::RangeInclusive;
 use depthrig_bus::RigName;
 use std::net::SocketAddr;
@@ -84,8 +84,10 @@ fn recording(top: &Section<'_, '_>, base: &Path) -> RecordingConfig {
     let d = RecordingConfig::default();
     let s = top.table("recording", "[recording]");
     let directory = s.or("directory", d.directory, |p| not_empty(p));
+    let allow = s.or("allow", d.allow, |paths: &Vec<PathBuf>| paths.iter().try_for_each(|p| not_empty(p)));
     let config = RecordingConfig {
         directory: resolve(base, &directory),
+        allow: allow.iter().map(|p| resolve(base, p)).collect(),
         jpeg_quality: s.or("jpeg_quality", d.jpeg_quality, within(1..=100)),
         color: s.choice("color", &COLOR, d.color),
         depth: s.choice("depth", &[("zstd", DepthCodec::Zstd), ("rank", DepthCodec::Rank)], d.depth),
@@ -105,8 +107,8 @@ fn control(top: &Section<'_, '_>) -> ControlConfig {
     let s = top.table("control", "[control]");
     let tcp = s.or("tcp", None, |tcp: &Option<SocketAddr>| match tcp {
         Some(a) if !a.ip().is_loopback() => Err(format!(
-            "must be a loopback address such as 127.0.0.1:{}, not {a}: the API has no password, and whoever reaches it \
-             controls the rig; forward a port over SSH instead",
+            "must be a loopback address such as 127.0.0.1:{}, not {a}: the API is not encrypted; forward a port over SSH \
+             instead",
             a.port()
         )),
         _ => Ok(()),
@@ -172,17 +174,27 @@ pub(super) fn above_zero(most: f64) -> impl Fn(&f64) -> Result<(), String> {
         if *v > 0.0 && *v <= most {
             Ok(())
         } else {
-            Err(format!("is {v}; it must be above 0 and at most {most}"))
+            Err(format!("is {}; it must be above 0 and at most {most}", shown(v)))
         }
     }
 }
 
-pub(super) fn within<T: PartialOrd + Display>(
+/// A number as a message shows it: with an exponent where it would have hundreds of digits.
+pub(super) fn shown<T: Display + LowerExp>(number: &T) -> String {
+    let plain = number.to_string();
+    if plain.len() <= 24 { plain } else { format!("{number:e}") }
+}
+
+pub(super) fn within<T: PartialOrd + Display + LowerExp>(
     range: RangeInclusive<T>,
 ) -> impl FnOnce(&T) -> Result<(), String> {
     move |v| {
         let (least, most) = (range.start(), range.end());
-        if range.contains(v) { Ok(()) } else { Err(format!("is {v}; it must be within {least} and {most}")) }
+        if range.contains(v) {
+            Ok(())
+        } else {
+            Err(format!("is {}; it must be within {least} and {most}", shown(v)))
+        }
     }
 }
 

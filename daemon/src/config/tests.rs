@@ -480,6 +480,9 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (camera("stream = [{ name = \"ir\" }]"), "it has no stream \"ir\""),
         (camera("stream = [{ name = \"color\", rate_hz = 0 }]"), "5:39: \"rate_hz\" in [[camera.stream]] \"color\" is 0; it must be above 0 and at most 1000"),
         (camera("stream = [{ name = \"color\", rate_hz = 1001 }]"), "is 1001; it must be above 0"),
+        (camera("stream = [{ name = \"color\", width = -1, height = 480 }]"), "must be a whole number within"),
+        (camera("stream = [{ name = \"color\", width = 640, height = 99999 }]"), "is 99999 pixels"),
+        (camera("stream = [{ name = \"color\", rate_hz = 1e300 }]"), "is 1e300; it must be above 0"),
         (camera("stream = [{ name = \"color\", width = 3 }]"), "\"width\" in [[camera.stream]] \"color\" needs height as well"),
         (camera("stream = [{ name = \"color\", format = \"rbg8\" }]"), "cannot be \"rbg8\"; did you mean \"rgb8\"?"),
         (camera("stream = [{ name = \"color\" }, { name = \"color\" }]"), "stream \"color\" is listed twice"),
@@ -510,7 +513,7 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (second("name = \"b\"\nbackend = \"realsense\"\ncolor_controls = { hue = 1.5 }"), "8:26: \"hue\" of \"color_controls\" in [[camera]] \"b\" must be a whole number, true, false"),
         (second("name = \"b\"\nbackend = \"realsense\"\ncolor_controls = 1"), "must be a table, color_controls = { }; it is the number 1"),
         (second("name = \"b\"\nbackend = \"realsense\"\ncolor_controls = { hue = 1 }\nstream = [{ name = \"depth\" }]"), "is set, but color is not among the streams"),
-        (second("name = \"b\"\nbackend = \"realsense\"\nstream = [{ name = \"ir\" }]"), "8:11: a RealSense D400 has no stream \"ir\"; it has: depth, color, ir_left, ir_right"),
+        (second("name = \"b\"\nbackend = \"realsense\"\nstream = [{ name = \"ir\" }]"), "8:11: a RealSense D400 has no stream \"ir\"; it has: depth, color, ir_left, ir_right, imu"),
         (second("name = \"b\"\nbackend = \"realsense\"\nseed = 1"), "only another backend has it"),
         (second("name = \"b\"\nbackend = \"zed\"\nexposure_percent = 101"), "8:20: \"exposure_percent\" in [[camera]] \"b\" is 101; it must be within 0 and 100"),
         (second("name = \"b\"\nbackend = \"zed\"\nauto_exposure = true\ngain_percent = 16"), "9:16: \"gain_percent\" in [[camera]] \"b\" cannot be set while auto_exposure is true"),
@@ -536,7 +539,7 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (second("name = \"b\"\nbackend = \"kinect\"\ndepth_mode = \"passive_ir\"\nstream = [{ name = \"depth\" }]"), "gives no depth"),
         (top("sets.rate_hz = 31"), "1:16: \"rate_hz\" in [sets] is 31 sets a second, but the fastest camera gives 30 frames a second"),
         (top("sets.rate_hz = 0.0"), "1:16: \"rate_hz\" in [sets] is 0; it must be above 0"),
-        (top("control.tcp = \"0.0.0.0:80\""), "1:15: \"tcp\" in [control] must be a loopback address such as 127.0.0.1:80, not 0.0.0.0:80: the API has no password"),
+        (top("control.tcp = \"0.0.0.0:80\""), "1:15: \"tcp\" in [control] must be a loopback address such as 127.0.0.1:80, not 0.0.0.0:80: the API is not encrypted"),
         (top("control.tcp = \"localhost\""), "must be an address and a port such as"),
         (top("bus.slots = 3"), "\"slots\" in [bus] is 3; it must be within 16 and 1024"),
         (top("recording.jpeg_quality = 101"), "is 101; it must be within 1 and 100"),
@@ -750,7 +753,7 @@ fn what_an_l515_has_not() {
         parse(&text).unwrap_err().to_string()
     };
     assert!(wrong("controls = { laser = 1 }").contains("laser_power"), "the names there are");
-    assert!(wrong("[[camera.stream]]\nname = \"ir_left\"").contains("depth, color, ir, confidence"));
+    assert!(wrong("[[camera.stream]]\nname = \"ir_left\"").contains("depth, color, ir, confidence, imu"));
     assert!(
         wrong("color_controls = { gamma = 1 }\n[[camera.stream]]\nname = \"depth\"")
             .contains("color_controls")

@@ -4,7 +4,6 @@
 //! after the last set with the last. So nothing is left out but of a file without a picture, or with a minute without one.
 
 use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameHeader, MotionSample, PixelFormat};
-use depthrig_drivers::kinect::Calibration;
 use depthrig_drivers::kinect::motion::{Measured, Samples, is_plausible};
 use depthrig_drivers::kinect::recording::motion_samples;
 use depthrig_drivers::motion::LONGEST;
@@ -34,12 +33,12 @@ pub(super) struct Unit {
 
 impl Unit {
     /// The unit whose samples are on `track`.
-    pub(super) fn new(record: MotionRecord, track: usize, calibration: Option<&Calibration>) -> Self {
+    pub(super) fn new(record: MotionRecord, track: usize) -> Self {
         Self {
             open: Vec::with_capacity(record.batch as usize),
             record,
             track,
-            numbers: Samples::new(calibration),
+            numbers: Samples::default(),
             newest_ns: None,
             waiting: VecDeque::new(),
             batches: 0,

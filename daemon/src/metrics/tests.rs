@@ -83,6 +83,7 @@ fn rig() -> RigStatus {
         pid: 42,
         uptime_s: 20.25,
         utc_ns: 1_700_000_000_000_000_000,
+        preparing: None,
         cameras: vec![
             camera(
                 "d435",

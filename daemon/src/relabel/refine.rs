@@ -4,7 +4,7 @@ use super::{Camera, Engine, RelabelOptions, cannot};
 use crate::stage::Refiners;
 use crate::stage::pixels;
 use crate::stage::view::View;
-use depthrig_bus::FrameHeader;
+use depthrig_bus::{FrameHeader, files};
 use depthrig_cdm::{Job, Output as Refined, RawDepth, Refiner, StepTimes};
 use depthrig_recorder::codec::{DepthEncoder, DepthShape};
 use depthrig_recorder::exchange::{Exporter, Output, Part, PartOut, PartSets, Parts, Plan, Source};
@@ -160,7 +160,7 @@ impl Store {
         if self.pictures.keys().next().is_some_and(|(first, _)| *first >= number) {
             return Ok(());
         }
-        let bytes = match std::fs::read(&path) {
+        let bytes = match files::read(&path, files::IMAGE_MAX_BYTES) {
             Ok(bytes) => bytes,
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(()),
             Err(e) => {

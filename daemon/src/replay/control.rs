@@ -186,6 +186,7 @@ impl Control for Inner {
             pid: std::process::id(),
             uptime_s: self.started.elapsed().as_secs_f64(),
             utc_ns: UtcPair::sample().utc_ns,
+            preparing: None,
             cameras: self.cameras(),
             sets: SetStatus {
                 nominal_hz: self.nominal_hz(),

@@ -21,13 +21,15 @@ use crate::stream::Stream;
 use core::time::Duration;
 use depthrig_bus::{Frame, HostTime, StreamId, Subscriber};
 use depthrig_drivers::stereo::{COLOR, EYES};
-use depthrig_recorder::RecorderOptions;
+use depthrig_recorder::{RecorderOptions, live_late_ns};
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 /// How long the end of a recording waits for sets that wait; longer than any set does.
 pub const PATIENCE: Duration = Duration::from_secs(4);
+/// How old a set may become while it waits, of the time that the recorder gives it: encoding and writing has the rest.
+const HOLD: f64 = 0.6875;
 /// Frames of one stream that a subscriber may hold, less one to read with.
 const MAX_HELD: usize = 15;
 /// Frames that the assembler holds.
@@ -91,6 +93,7 @@ pub struct Joints {
     held: VecDeque<Held>,
     max_sets: usize,
     max_age: Duration,
+    hold_max: Duration,
     set_ns: i64,
 }
 
@@ -104,12 +107,14 @@ impl Joints {
         let taken = ASSEMBLING + config.recording.queue_sets + workers;
         let max_sets = MAX_HELD.saturating_sub(taken).clamp(1, MAX_SETS);
         let max_age = Duration::from_secs_f64(max_sets as f64 / config.sets.rate_hz).min(PATIENCE / 2);
+        let set_ns = (1e9 / config.sets.rate_hz) as i64;
         Self {
             streams: Vec::new(),
             held: VecDeque::new(),
             max_sets,
             max_age,
-            set_ns: (1e9 / config.sets.rate_hz) as i64,
+            hold_max: Duration::from_nanos((HOLD * live_late_ns(set_ns) as f64) as u64),
+            set_ns,
         }
     }
 
@@ -165,7 +170,8 @@ impl Joints {
         while let Some(first) = self.held.front() {
             let waiting = self.streams.iter().filter(|j| j.stream.record);
             let decided = waiting.map(|j| j.find(first)).all(|f| f != Found::Coming);
-            let due = self.held.len() > self.max_sets || first.since.elapsed() > self.max_age;
+            let old = first.since.elapsed() > self.max_age || first.tick.elapsed() > self.hold_max;
+            let due = old || self.held.len() > self.max_sets;
             if recording && !decided && !due {
                 break;
             }

@@ -4,11 +4,12 @@ use super::{Inner, lock};
 use crate::camera::{Camera, State};
 use crate::stage;
 use crate::status::{
-    CameraState, CameraStatus, ClockStatus, RefineState, RigStatus, SetAccount, SetStatus,
+    CameraState, CameraStatus, ClockStatus, PreparingStatus, RefineState, RigStatus, SetAccount, SetStatus,
     SharedMemoryStatus, StreamStatus,
 };
 use crate::stream::Stream;
 use depthrig_bus::{ClockDomain, HostTime, UtcPair, shm};
+use depthrig_drivers::synthetic::DrawingProgress;
 use depthrig_recorder::{Diagnostic, Level};
 use std::sync::PoisonError;
 use std::sync::atomic::Ordering;
@@ -18,15 +19,16 @@ pub fn status(inner: &Inner) -> RigStatus {
     let now = HostTime::now();
     let cameras: Vec<_> = inner.cameras.iter().map(|c| camera(inner, c, now)).collect();
     let reserved = |c: &Camera| -> u64 {
-        c.state().all_streams().map(|s| (s.slots * s.profile.frame_bytes()) as u64).sum()
+        c.state().all_streams().map(|s| (s.slots() * s.profile.frame_bytes()) as u64).sum()
     };
-    let slots = inner.cameras.iter().filter_map(|c| c.state().streams.iter().map(|s| s.slots).min()).min();
+    let slots = inner.cameras.iter().filter_map(|c| c.state().streams.iter().map(|s| s.slots()).min()).min();
     RigStatus {
         rig: inner.config.rig.to_string(),
         version: env!("CARGO_PKG_VERSION").to_owned(),
         pid: std::process::id(),
         uptime_s: inner.started.elapsed().as_secs_f64(),
         utc_ns: UtcPair::sample().utc_ns(now),
+        preparing: inner.drawing().map(preparing),
         cameras,
         sets: sets(inner),
         recording: lock(&inner.recording).status(),
@@ -37,6 +39,15 @@ pub fn status(inner: &Inner) -> RigStatus {
         },
         cpu_cores: inner.cpu_millicores.load(Ordering::Relaxed) as f64 / 1000.0,
         replay: None,
+    }
+}
+
+fn preparing(progress: DrawingProgress) -> PreparingStatus {
+    PreparingStatus {
+        images: progress.done as u64,
+        images_total: progress.total as u64,
+        share: progress.done as f64 / progress.total.max(1) as f64,
+        error: progress.error,
     }
 }
 

@@ -3,11 +3,7 @@
 use super::pixels;
 use crate::config::RefineConfig;
 use depthrig_bus::{FrameHeader, Intrinsics, Pose};
-use depthrig_calib::{Method, PoseExt, Registration, same_view};
-
-/// Where colour has this many times the pixels of depth along a side, a rectangle is a coarse step and triangles, which
-/// cost ten times as much, go on smoothly. Every D400 is below it (a D435 has 1.42), the Azure Kinect at 1080p is not.
-const TRIANGLES_FROM: f64 = 1.5;
+use depthrig_calib::{PoseExt, Registration, same_view};
 
 /// What registration depends on.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -125,16 +121,8 @@ fn how(config: &RefineConfig, key: &Key) -> How {
         return How::AsItIs;
     }
     let color_from_depth = color.pose.inverse().compose(&depth.pose);
-    let magnified = color.intrinsics.fx / depth.intrinsics.fx;
-    let method = if magnified > TRIANGLES_FROM { Method::Triangles } else { Method::Splat };
-    let made = Registration::new(
-        &depth.intrinsics,
-        depth.size,
-        &color.intrinsics,
-        color.size,
-        &color_from_depth,
-        method,
-    );
+    let made =
+        Registration::new(&depth.intrinsics, depth.size, &color.intrinsics, color.size, &color_from_depth);
     match made {
         Ok(registration) => How::Registered(Box::new(registration)),
         Err(e) => How::Not(e.to_string()),

@@ -147,13 +147,24 @@ impl Plan {
         Ok(())
     }
 
-    /// Keeps with the session how far the eyes' rows were found to be apart, and says so where that is too far.
-    pub(super) fn tell_rows(&mut self, rows: Option<&RowOffset>) {
+    /// Keeps with the session how far the eyes' rows were found to be apart, corrects that where it is significant, and says so
+    /// where it is too far.
+    pub(super) fn take_rows(&mut self, rows: Option<&RowOffset>) {
         let Some(rows) = rows else { return };
-        let warning = rows.warning();
+        // Before the work begins nobody else has the maker.
+        let maker = Arc::get_mut(&mut self.maker).filter(|_| rows.is_significant());
+        let is_corrected = maker.is_some();
+        if let Some(maker) = maker {
+            maker.rectifier.correct_rows(rows);
+            for computed in self.session.computed.iter_mut().filter(|c| c.from.len() > 1) {
+                computed.parameters = format!("{} {}", computed.parameters, rows.describe_correction());
+            }
+        }
+        let warning = rows.warning(is_corrected);
         let table = self.session.extra.entry("zed_replay").or_insert_with(|| toml::Table::new().into());
         if let Some(table) = table.as_table_mut() {
             table.insert("rows".to_owned(), rows.to_string().into());
+            table.insert("rows_corrected".to_owned(), is_corrected.into());
             table.extend(warning.clone().map(|w| ("warning".to_owned(), w.into())));
         }
         self.notes.extend(warning.map(|w| format!("{}: {w}", self.facts.camera)));

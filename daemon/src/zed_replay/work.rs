@@ -1,6 +1,6 @@
 //! The folder beside the output in which it grows, and what a later run needs to know of this one.
 
-use depthrig_bus::UtcPair;
+use depthrig_bus::{UtcPair, files};
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{Error, ErrorKind, RecordSet, Result, UtcSource};
 use serde_json::Value;
@@ -35,7 +35,7 @@ impl Work {
         let mut name = name.to_os_string();
         name.push(".zedreplay");
         let dir = out.with_file_name(name);
-        std::fs::create_dir_all(&dir).map_err(|e| failed("create the folder", &dir, e))?;
+        depthrig_bus::umask::create_dir_all(&dir).map_err(|e| failed("create the folder", &dir, e))?;
         let lock = RealFs.lock(&dir).map_err(|e| {
             if e.kind() == std::io::ErrorKind::WouldBlock {
                 let what =
@@ -51,7 +51,7 @@ impl Work {
 
     fn agree(&self, plan: &Value) -> Result<()> {
         let path = self.dir.join(PLAN_FILE);
-        let found = match std::fs::read(&path) {
+        let found = match files::read(&path, files::TEXT_MAX_BYTES) {
             Ok(bytes) => bytes,
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
                 if self.dataset().exists() {

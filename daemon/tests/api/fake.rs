@@ -2,8 +2,8 @@
 
 use depthrig_daemon::control::{Control, RecordRequest, ReplayControl, SeekRequest};
 use depthrig_daemon::status::{
-    CameraState, CameraStatus, ClockStatus, RecordingStatus, RefineState, RefineStatus, ReplayStatus,
-    RigStatus, SetAccount, SetStatus, SharedMemoryStatus, StreamStatus,
+    CameraState, CameraStatus, ClockStatus, PreparingStatus, RecordingStatus, RefineState, RefineStatus,
+    ReplayStatus, RigStatus, SetAccount, SetStatus, SharedMemoryStatus, StreamStatus,
 };
 use depthrig_daemon::{Error, ErrorKind, Result};
 use std::sync::{Condvar, Mutex};
@@ -46,6 +46,7 @@ struct Inner {
     delay: Duration,
     calls: u32,
     stop: bool,
+    roots: Vec<std::path::PathBuf>,
     /// What a replay was asked for; none when this is a rig of cameras.
     replay: Option<Vec<String>>,
 }
@@ -68,6 +69,11 @@ impl Fake {
         let calls = inner.replay.as_mut().unwrap();
         calls.push(call);
         Ok(replay(calls))
+    }
+
+    /// Where recordings may go.
+    pub fn set_roots(&self, roots: &[&std::path::Path]) {
+        self.inner.lock().unwrap().roots = roots.iter().map(|r| r.to_path_buf()).collect();
     }
 
     pub fn set_all(&self, state: CameraState) {
@@ -134,6 +140,7 @@ impl Fake {
             pid: 42,
             uptime_s: 12.5,
             utc_ns: 1_700_000_000_123_456_789,
+            preparing: Some(PreparingStatus { images: 3, images_total: 12, share: 0.25, error: None }),
             cameras: vec![
                 camera("d435", CameraState::Streaming, None),
                 camera("d405", CameraState::Reconnecting, Some("unplugged")),
@@ -169,6 +176,10 @@ fn stream(id: &str, age: Option<f64>) -> StreamStatus {
 }
 
 impl Control for Fake {
+    fn recording_roots(&self) -> Vec<std::path::PathBuf> {
+        self.inner.lock().unwrap().roots.clone()
+    }
+
     fn status(&self) -> RigStatus {
         self.current()
     }
