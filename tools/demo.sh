@@ -20,16 +20,15 @@ say() { # on stdout, unless that is to be JSON alone
     if [ -n "$json" ]; then echo "$@" >&2; else echo "$@"; fi
 }
 
-cargo build --release --package depthrig --package depthrig-demo-recordings --package depthrig-bus \
-    --bin depthrig --bin demo-recordings --example external
+cargo build --release --package depthrig --package depthrig-demo-recordings --bin depthrig --bin demo-recordings
 
-# The camera of another process: depthrig's bridge for OAK where Luxonis' library is installed, else a test pattern.
+# The camera of another process: depthrig's bridge for OAK where Luxonis' library is installed, else a player of the images.
 oak=(env "PYTHONPATH=$PWD/python/src" "$PWD/.venv-oak/bin/python")
 if [ -x "${oak[-1]}" ] && "${oak[@]}" -c 'import depthai, depthrig.oak' >/dev/null 2>&1; then
     command=("${oak[@]}" -m depthrig.oak --replay oak --fps 15)
 else
-    command=("$target/release/examples/external" --size 640x360 --rate 15)
-    say "oak: a test pattern, because .venv-oak is not there (make .venv-oak/.stamp)"
+    command=("$target/release/demo-recordings" --play "$recordings/oak")
+    say "oak: its images without Luxonis' library, because .venv-oak is not there (make .venv-oak/.stamp)"
 fi
 rm -rf "$recordings"
 "$target/release/demo-recordings" "$recordings" "${command[@]}" >/dev/null

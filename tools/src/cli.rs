@@ -5,7 +5,7 @@ use crate::commands::{
     install, man, merge, record, recover, replay, report, run, sessions, status, stereo, tap, top, trim,
     verify, zed,
 };
-use clap::{ArgAction, Parser, Subcommand, ValueEnum};
+use clap::{ArgAction, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
 use std::path::PathBuf;
 
@@ -192,6 +192,36 @@ impl Command {
     }
 }
 
+/// The command line of this process. Ends it with 2 and a hint when the usage is wrong.
+pub fn parse() -> Cli {
+    let matches = with_negative_numbers(Cli::command()).get_matches();
+    Cli::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
+}
+
+/// Lets each option take a negative number as its value, to be refused for what it is and not as an unknown option.
+fn with_negative_numbers(mut command: clap::Command) -> clap::Command {
+    let names: Vec<_> = command.get_subcommands().map(|c| c.get_name().to_owned()).collect();
+    for name in names {
+        command = command.mut_subcommand(name, with_negative_numbers);
+    }
+    command.mut_args(|arg| {
+        let takes_value = arg.get_action().takes_values();
+        if takes_value { arg.allow_negative_numbers(true) } else { arg }
+    })
+}
+
+/// Metres per unit of depth, as cameras and files have it.
+///
+/// # Errors
+/// When `text` is none, or out of a micrometre to a metre.
+pub fn depth_unit_m(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(unit) if (1e-6..=1.0).contains(&unit) => Ok(unit),
+        Ok(_) => Err(format!("{text} m is out of range 0.000001..=1; write metres, such as 0.001")),
+        Err(_) => Err("write metres, such as 0.001".to_owned()),
+    }
+}
+
 /// A number of seconds above 0 and below ten years.
 ///
 /// # Errors
@@ -226,7 +256,32 @@ pub fn duration_s(text: &str) -> Result<f64, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::CommandFactory;
+    use clap::error::ErrorKind;
+
+    #[test]
+    fn a_negative_number_is_a_value() {
+        let parse = |line: &str| {
+            let args = line.split_whitespace();
+            with_negative_numbers(Cli::command()).try_get_matches_from(["depthrig"].into_iter().chain(args))
+        };
+        with_negative_numbers(Cli::command()).debug_assert();
+        parse("verify ds --max-spread-ms -3").unwrap();
+        for line in [
+            "cat ds --from -5",
+            "trim ds out --to -1.5",
+            "verify ds --threads -1",
+            "export bytecameradepth ds out --depth-unit -0.001",
+            "export bytecameradepth ds out --depth-unit 1e-300",
+            "import bytecameradepth a out --depth-unit d405=-1",
+            "cdm run --rgb a --depth b --depth-unit 1e-300 --model m --out o",
+            "eval --truth a --pred b --unit 1e-300",
+            "zed replay a --out out --modes quality --depth-unit 1e300",
+        ] {
+            let e = parse(line).expect_err(line);
+            assert!(matches!(e.kind(), ErrorKind::ValueValidation | ErrorKind::InvalidValue), "{line}: {e}");
+        }
+        assert_eq!(parse("verify ds --nothing").unwrap_err().kind(), ErrorKind::UnknownArgument);
+    }
 
     #[test]
     fn the_definition_is_sound() {

@@ -1,6 +1,7 @@
 //! Exit codes, how an error is told, and how the process ends.
 #![allow(unsafe_code)] // `_exit`, which the standard library does not have
 
+use crate::printable;
 use core::fmt;
 
 /// How a command ended.
@@ -58,7 +59,7 @@ pub fn report(error: &anyhow::Error) -> Exit {
     }
     let mut out = std::io::stderr().lock();
     // When even the standard error output is gone, the exit code has to do.
-    let _ = std::io::Write::write_all(&mut out, text(error).as_bytes());
+    let _ = std::io::Write::write_all(&mut out, printable::lines(&text(error)).as_bytes());
     of(error)
 }
 
@@ -80,9 +81,11 @@ fn of(error: &anyhow::Error) -> Exit {
 fn text(error: &anyhow::Error) -> String {
     let mut told = format!("depthrig: error: {error}");
     for cause in error.chain().skip(1).map(ToString::to_string) {
-        if !told.contains(&cause) {
+        // Errors of TOML end with a line break, which a message that quotes them leaves out.
+        let cause = cause.trim_end();
+        if !told.contains(cause) {
             told.push_str("\n  cause: ");
-            told.push_str(&cause);
+            told.push_str(cause);
         }
     }
     told.push('\n');
@@ -106,6 +109,14 @@ mod tests {
         let error =
             anyhow::Error::new(inner).context("d435 was lost: the disk is on fire").context("no luck");
         assert_eq!(text(&error), "depthrig: error: no luck\n  cause: d435 was lost: the disk is on fire\n");
+    }
+
+    #[test]
+    fn a_cause_that_ends_with_a_line_break_is_told_once() {
+        let inner = std::io::Error::other("TOML parse error at line 2\n  expected a value\n");
+        let outer = "camera.toml: TOML parse error at line 2\n  expected a value";
+        let told = text(&anyhow::Error::new(inner).context(outer));
+        assert_eq!(told, format!("depthrig: error: {outer}\n"));
     }
 
     #[test]

@@ -122,7 +122,7 @@ impl SystemFile {
     /// When what is there cannot be read.
     pub fn state(&self, root: &Path) -> Result<State> {
         let path = self.below(root);
-        match std::fs::read(&path) {
+        match depthrig_bus::files::read(&path, depthrig_bus::files::TEXT_MAX_BYTES) {
             Ok(bytes) if bytes == self.text.as_bytes() => Ok(State::Current),
             Ok(bytes) if std::str::from_utf8(&bytes).is_ok_and(is_ours) => Ok(State::Older),
             Ok(_) => Ok(State::Changed),

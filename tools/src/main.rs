@@ -10,10 +10,13 @@ mod context;
 mod demo;
 mod eval;
 mod exit;
+mod font;
 mod install;
 mod logging;
 mod out;
+mod outfile;
 mod picture;
+mod printable;
 mod progress;
 mod screen;
 mod signals;
@@ -21,10 +24,8 @@ mod turbo;
 mod view;
 mod watched;
 
-use clap::Parser;
-
 fn main() {
-    let cli = cli::Cli::parse(); // ends the process with 2 and a hint when the usage is wrong
+    let cli = cli::parse(); // ends the process with 2 and a hint when the usage is wrong
     logging::start(&cli.global, cli.command.loudness());
     let exit = commands::run(cli).unwrap_or_else(|error| exit::report(&error));
     exit::leave(exit)

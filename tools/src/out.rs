@@ -1,16 +1,34 @@
 //! What is written to the standard output: lines, JSON, tables, and numbers as people read them.
 
-use anyhow::{Context as _, Result};
+use crate::printable;
+use anyhow::Result;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use serde::Serialize;
 use std::io::Write;
-use std::path::Path;
 
-/// Writes `text` and a newline.
+/// Writes `text`, which may have several lines, and a newline; what would steer the terminal is shown and not sent.
 ///
 /// # Errors
 /// When the output is closed; a closed pipe ends a command quietly (see [`crate::exit`]).
 pub fn line(text: impl core::fmt::Display) -> Result<()> {
+    raw(&printable::lines(&text.to_string()))
+}
+
+/// The same of a text with depthrig's own colours.
+///
+/// # Errors
+/// As [`line`].
+pub fn styled(text: impl core::fmt::Display) -> Result<()> {
+    raw(&printable::styled(&text.to_string()))
+}
+
+/// Writes `text` and a newline to the standard error output, as [`line`]; where that is closed, nobody reads it.
+pub fn note(text: impl core::fmt::Display) {
+    let text = printable::lines(&text.to_string());
+    let _ = writeln!(std::io::stderr().lock(), "{text}");
+}
+
+fn raw(text: &str) -> Result<()> {
     writeln!(std::io::stdout().lock(), "{text}")?;
     Ok(())
 }
@@ -20,7 +38,7 @@ pub fn line(text: impl core::fmt::Display) -> Result<()> {
 /// # Errors
 /// As [`line`].
 pub fn json(value: &impl Serialize) -> Result<()> {
-    line(serde_json::to_string_pretty(value)?)
+    raw(&printable::json(&serde_json::to_string_pretty(value)?))
 }
 
 /// Writes `value` as JSON on one line, as streams of JSON want it.
@@ -28,19 +46,7 @@ pub fn json(value: &impl Serialize) -> Result<()> {
 /// # Errors
 /// As [`line`].
 pub fn json_line(value: &impl Serialize) -> Result<()> {
-    line(serde_json::to_string(value)?)
-}
-
-/// Writes a file, which is there when it is whole.
-///
-/// # Errors
-/// When it cannot be written; the message names it.
-pub fn file(path: &Path, bytes: &[u8]) -> Result<()> {
-    let mut part = path.as_os_str().to_owned();
-    part.push(".part");
-    std::fs::write(&part, bytes)
-        .and_then(|()| std::fs::rename(&part, path))
-        .with_context(|| format!("{} cannot be written", path.display()))
+    raw(&printable::json(&serde_json::to_string(value)?))
 }
 
 /// `n` of `what`, which takes an `s` unless there is one: `1 set`, `2 sets`.
@@ -56,7 +62,7 @@ pub fn table(header: &[&str], first_number: usize, rows: impl IntoIterator<Item 
     table.set_content_arrangement(ContentArrangement::Disabled);
     table.set_header(header.to_vec());
     for row in rows {
-        table.add_row(row);
+        table.add_row(row.iter().map(|cell| printable::line(cell)));
     }
     for (i, column) in table.column_iter_mut().enumerate() {
         column.set_padding((0, 2));

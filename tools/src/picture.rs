@@ -1,13 +1,52 @@
 //! A frame as picture files: colour as it is, depth as 16-bit PNG and as a preview in colours.
 
+use crate::outfile::{OutFile, Overwrite};
 use crate::turbo::depth_color;
 use anyhow::{Context, Result, bail};
-use depthrig_bus::{FrameHeader, PixelFormat};
-use image::{ExtendedColorType, ImageEncoder, RgbImage, codecs::png};
+use depthrig_bus::{FrameHeader, PixelFormat, files};
+use depthrig_jpeg::{Form, Image};
+use image::{
+    DynamicImage, ExtendedColorType, GrayImage, ImageEncoder, ImageFormat, ImageReader, RgbImage, codecs::png,
+};
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 /// Share of the depths of a picture that get the colours of the ends of the map.
 const TAIL: f64 = 0.02;
+
+/// The image in a file: PNG, JPEG, PGM or PPM, by its first bytes.
+///
+/// # Errors
+/// When it cannot be read, or is damaged or of another kind; the message names it.
+pub fn open(path: &Path) -> Result<DynamicImage> {
+    let unreadable = || format!("{}: cannot be read as an image; PNG, JPEG, PGM and PPM can", path.display());
+    let bytes = files::read(path, files::IMAGE_MAX_BYTES).with_context(unreadable)?;
+    if bytes.starts_with(&depthrig_jpeg::START) {
+        return jpeg(&bytes).with_context(unreadable);
+    }
+    let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().with_context(unreadable)?;
+    reader.decode().with_context(unreadable)
+}
+
+/// An image as a PNG file.
+///
+/// # Errors
+/// When it cannot be encoded.
+pub fn png(image: &RgbImage) -> Result<Vec<u8>> {
+    let mut file = Cursor::new(Vec::new());
+    image.write_to(&mut file, ImageFormat::Png)?;
+    Ok(file.into_inner())
+}
+
+/// A JPEG's pixels, those that libjpeg gives.
+fn jpeg(bytes: &[u8]) -> Result<DynamicImage> {
+    let Image { info, pixels } = depthrig_jpeg::decode(bytes)?;
+    let image = match info.form {
+        Form::Grey => GrayImage::from_raw(info.width, info.height, pixels).map(DynamicImage::from),
+        Form::Rgb => RgbImage::from_raw(info.width, info.height, pixels).map(DynamicImage::from),
+    };
+    image.context("the image is smaller than it says")
+}
 
 /// The rows of a frame without padding between them.
 fn rows<'a>(header: &FrameHeader, pixels: &'a [u8]) -> Result<impl Iterator<Item = &'a [u8]>> {
@@ -42,7 +81,7 @@ pub fn depth_m(header: &FrameHeader, pixels: &[u8]) -> Result<Option<Vec<f32>>> 
 }
 
 /// The range of colours that shows most of a picture: from one end of its depths to the other, without the tails.
-fn depth_range(depth: &[f32]) -> (f32, f32) {
+pub fn depth_range(depth: &[f32]) -> (f32, f32) {
     let mut some: Vec<f32> = depth.iter().copied().filter(|z| z.is_finite() && *z > 0.0).step_by(7).collect();
     some.sort_unstable_by(f32::total_cmp);
     let at = |share| crate::bench::stats::quantile(&some, share).unwrap_or(1.0);
@@ -59,8 +98,7 @@ pub fn to_rgb(header: &FrameHeader, pixels: &[u8]) -> Result<RgbImage> {
     }
     let data = match header.pixel_format() {
         Some(PixelFormat::Mjpeg) => {
-            let picture = image::load_from_memory_with_format(pixels, image::ImageFormat::Jpeg);
-            return Ok(picture.context("the frame's JPEG cannot be decoded")?.into_rgb8());
+            return Ok(jpeg(pixels).context("the frame's JPEG cannot be decoded")?.into_rgb8());
         }
         Some(PixelFormat::Rgb8) => rows(header, pixels)?.flatten().copied().collect(),
         Some(PixelFormat::Bgr8) => {
@@ -107,21 +145,24 @@ fn image_of(header: &FrameHeader, data: Vec<u8>) -> Result<RgbImage> {
 ///
 /// # Errors
 /// When the frame is not what its header says, its format cannot be shown, or a file cannot be written.
-pub fn write_png(header: &FrameHeader, pixels: &[u8], folder: &Path, stem: &str) -> Result<Vec<PathBuf>> {
+pub fn write_png(
+    header: &FrameHeader,
+    pixels: &[u8],
+    folder: &Path,
+    stem: &str,
+    overwrite: Overwrite,
+) -> Result<Vec<PathBuf>> {
     let mut written = Vec::new();
     let mut write = |name: String, data: &[u8], color: ExtendedColorType| -> Result<()> {
         let path = folder.join(name);
-        let file =
-            std::fs::File::create(&path).with_context(|| format!("{}: cannot be written", path.display()))?;
+        let mut file = Vec::new();
         // Pictures of a live stream: the fastest compression that still compresses.
-        let encoder = png::PngEncoder::new_with_quality(
-            std::io::BufWriter::new(file),
-            png::CompressionType::Fast,
-            png::FilterType::Sub,
-        );
+        let encoder =
+            png::PngEncoder::new_with_quality(&mut file, png::CompressionType::Fast, png::FilterType::Sub);
         encoder
             .write_image(data, header.width, header.height, color)
             .with_context(|| format!("{}: cannot be written", path.display()))?;
+        OutFile::new(&path, overwrite, &[])?.write(&file)?;
         written.push(path);
         Ok(())
     };
@@ -156,7 +197,14 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let values: Vec<u16> = (0..12).map(|i| i * 5461).collect();
         let pixels: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
-        let written = write_png(&header(PixelFormat::Z16, 4, 3), &pixels, folder.path(), "d").unwrap();
+        let written = write_png(
+            &header(PixelFormat::Z16, 4, 3),
+            &pixels,
+            folder.path(),
+            "d",
+            Overwrite { overwrite: false },
+        )
+        .unwrap();
         assert_eq!(written, [folder.path().join("d.png"), folder.path().join("d_preview.png")]);
         let read = image::open(&written[0]).unwrap();
         assert_eq!(read.as_luma16().unwrap().as_raw(), &values);

@@ -54,6 +54,7 @@ impl Screen {
     pub fn draw(&self, text: &str) -> Result<()> {
         let (width, height) = size().unwrap_or(USUAL);
         let mut page = HOME.to_owned();
+        let text = crate::printable::styled(text);
         for (i, line) in text.lines().take(height).enumerate() {
             page.push_str(if i == 0 { "" } else { "\r\n" });
             page.push_str(&crate::view::clip(line, width));

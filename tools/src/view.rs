@@ -1,17 +1,14 @@
 //! The status of a rig as text: what `status` prints and `top` refreshes.
 
 use crate::out;
+use crate::printable::{BOLD, GREEN, RED, RESET, YELLOW};
 use core::fmt::Write as _;
+use depthrig_bus::DropReason;
 use depthrig_daemon::status::{
-    CameraState, CameraStatus, RecordingStatus, RefineState, ReplayStatus, RigStatus, StreamStatus,
+    CameraState, CameraStatus, PreparingStatus, RecordingStatus, RefineState, ReplayStatus, RigStatus,
+    StreamStatus,
 };
 use std::collections::BTreeMap;
-
-const BOLD: &str = "\x1b[1m";
-const RED: &str = "\x1b[31m";
-const YELLOW: &str = "\x1b[33m";
-const GREEN: &str = "\x1b[32m";
-const RESET: &str = "\x1b[0m";
 
 /// How to draw.
 #[derive(Debug, Clone, Copy)]
@@ -30,6 +27,17 @@ impl Style {
     const fn is_wide(self) -> bool {
         self.width >= 126
     }
+}
+
+fn preparing(p: &PreparingStatus, style: Style) -> String {
+    let state = match &p.error {
+        Some(e) => e.clone(),
+        None => format!(
+            "{:.0} % of the simulated cameras' images are rendered; coarse until then",
+            100.0 * p.share
+        ),
+    };
+    format!("{}  {state}", style.paint(BOLD, "preparing"))
 }
 
 /// The whole status, without a newline at the end.
@@ -53,6 +61,7 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
             rig.sets.spread_max_ms
         ),
     ];
+    lines.extend(rig.preparing.as_ref().map(|p| preparing(p, style)));
     lines.extend(rig.replay.iter().map(|r| format!("replay  {}", replay(r))));
     lines.extend(rig.recording.iter().flat_map(|r| recording(r, style)));
     lines.push(format!(
@@ -193,6 +202,11 @@ fn refined(camera: &CameraStatus, style: Style) -> Option<String> {
     }
     if r.state == RefineState::Running {
         let _ = write!(told, ", {:.1} of {:.1} Hz", r.rate_hz, r.nominal_hz);
+        let camera_hz = camera.streams.iter().filter(|s| !s.derived && s.samples_hz.is_none());
+        let camera_hz = camera_hz.map(|s| s.nominal_hz).fold(f64::INFINITY, f64::min);
+        if camera_hz.is_finite() && r.nominal_hz < camera_hz {
+            let _ = write!(told, " (limited by rate_hz of [camera.refine]; camera {camera_hz:.1} Hz)");
+        }
         let step = |name: &str| r.steps_p50_ms.get(name).copied().unwrap_or(0.0);
         let steps = ["wait", "register", "prepare", "infer", "finish"].map(|s| format!("{s} {:.1}", step(s)));
         let _ = write!(told, ", {:.1} ms ({})", step("total"), steps.join(", "));
@@ -206,8 +220,15 @@ fn refined(camera: &CameraStatus, style: Style) -> Option<String> {
     Some(told)
 }
 
+/// Frames that a stream lost. Of a stream that the rig makes, a frame that a newer one superseded is none: that is how it
+/// keeps up.
+fn lost(stream: &StreamStatus) -> u64 {
+    let superseded = DropReason::QueueFull.name();
+    stream.dropped.iter().filter(|(reason, _)| !stream.derived || *reason != superseded).map(|(_, n)| n).sum()
+}
+
 fn narrow(camera: &CameraStatus, stream: &StreamStatus) -> Vec<String> {
-    let lost: u64 = stream.dropped.values().sum();
+    let lost = lost(stream);
     vec![
         stream.id.clone(),
         match &camera.refine {

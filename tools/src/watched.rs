@@ -76,10 +76,10 @@ impl Remade<'_> {
             more()?;
         }
         for problem in self.problems {
-            eprintln!("lost: {problem}");
+            out::note(format_args!("lost: {problem}"));
         }
         if self.lost > self.problems.len() as u64 {
-            eprintln!("lost: {} in all", self.lost);
+            out::note(format_args!("lost: {} in all", self.lost));
         }
         Ok(match self {
             _ if self.ended => Exit::Failed,

@@ -69,6 +69,7 @@ fn gives_the_official_numbers(engine: &str) -> bool {
             "--engine",
             engine,
             "--inverse",
+            "--overwrite",
             "--out",
             out.to_str().unwrap(),
         ]);
@@ -106,7 +107,7 @@ fn a_model_is_made_installed_listed_and_removed() {
     let said = home.run(&["cdm", "seeded", "vits", "--out", &file]).good();
     assert!(said.contains("never trained"), "{said}");
     let ran = home.run(&["cdm", "seeded", "vits", "--out", &file]);
-    assert!(ran.code == 2 && ran.err.contains("--replace"), "{}", ran.err);
+    assert!(ran.code == 2 && ran.err.contains("--overwrite"), "{}", ran.err);
     let with = |args: &[&str]| home.run(&[&["cdm"], args, &["--models", &models]].concat());
     assert!(with(&["list"]).good().contains("no model is installed"));
     let ran = with(&["import", &file, "--name", "demo", "--camera", "D405", "--input-size", "252", "--json"]);
@@ -248,4 +249,35 @@ fn pictures_that_do_not_fit_are_wrong_usage() {
     assert_eq!(raw.dimensions(), filled.dimensions());
     let same = raw.iter().zip(filled.iter()).filter(|(a, b)| **a > 0 && a.abs_diff(**b) < **a / 10).count();
     assert!(same * 2 > raw.len(), "the unit is the one that was asked for: {same} of {}", raw.len());
+}
+
+#[test]
+fn an_input_without_use_is_said_and_never_overwritten() {
+    let home = Home::new();
+    let file = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
+    let (rgb, depth, out) = (file("c.png"), file("z.png"), file("out.png"));
+    image::RgbImage::from_pixel(32, 24, image::Rgb([90, 120, 60])).save(&rgb).unwrap();
+    image::ImageBuffer::from_pixel(32, 24, image::Luma([0u16])).save(&depth).unwrap();
+    let run = |depth: &str, out: &str| {
+        let common =
+            ["cdm", "run", "--rgb", &rgb, "--depth", depth, "--depth-unit", "0.001", "--engine", "fill"];
+        home.run(&[&common[..], &["--overwrite", "--out", out]].concat())
+    };
+    let ran = run(&depth, &out);
+    assert!(
+        ran.code == 3 && ran.err.contains("none of its 768 pixels has depth"),
+        "{}: {}",
+        ran.code,
+        ran.err
+    );
+    for name in [&depth, &rgb] {
+        let before = std::fs::read(name).unwrap();
+        let ran = run(&depth, name);
+        assert!(ran.code == 2 && ran.err.contains("is the input"), "{}", ran.err);
+        assert_eq!(std::fs::read(name).unwrap(), before);
+    }
+    let shallow = file("z8.png");
+    image::GrayImage::from_pixel(32, 24, image::Luma([80])).save(&shallow).unwrap();
+    let ran = run(&shallow, &out);
+    assert!(ran.code == 2 && ran.err.contains("has 8 bits a pixel"), "{}", ran.err);
 }

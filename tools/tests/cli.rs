@@ -195,6 +195,10 @@ fn the_whole_way_of_a_small_rig() {
     let out = home.path().join("data");
     let none = home.run(&["record", "stop"]);
     assert_eq!(none.code, 1, "{}", none.err);
+    let elsewhere = home.path().join("elsewhere");
+    let refused = home.run(&["record", "start", "--out", elsewhere.to_str().unwrap()]);
+    assert!(refused.code != 0 && refused.err.contains("recording.allow"), "{}", refused.err);
+    assert!(!elsewhere.exists());
     // Nine years of these small pictures are 5 TB, more than a disk for temporary files has.
     let first = ["record", "start", "--out", out.to_str().unwrap(), "--name", "first", "--scene", "desk"];
     let long = [&first[..], &["--for", "80000h"]].concat();
@@ -320,4 +324,26 @@ fn a_run_that_lost_frames_ends_with_3_and_says_which() {
     let ran = home.run(&["run", &rig, "--seconds", "1.5", "-q"]);
     assert_eq!(ran.code, 3, "{}{}", ran.out, ran.err);
     assert!(ran.out.contains("lost: cam/color: 3 of") && ran.out.contains("3 device_gap"), "{}", ran.out);
+}
+
+/// What a refusal advises must be there to be done: `run --record` says `--force`, and takes it.
+#[test]
+fn a_run_that_will_not_fit_is_recorded_with_force() {
+    let home = Home::new();
+    let rig = home.path().join("rig.toml");
+    // Ten weeks of this are 180 TB.
+    let text = "rig = \"full\"\n[sets]\nrate_hz = 15.0\n[recording]\ncolor = \"raw\"\nreserve_mb = 16\nmin_minutes = \
+                100000\n[[camera]]\nname = \"cam\"\nbackend = \"synthetic\"\ncheap = true\n[[camera.stream]]\nname = \
+                \"color\"\nwidth = 1280\nheight = 720\n";
+    std::fs::write(&rig, text).unwrap();
+    let out = home.path().join("data");
+    let record = ["run", rig.to_str().unwrap(), "--record", out.to_str().unwrap(), "--seconds", "1"];
+    let refused = home.run(&record);
+    assert!(refused.code == 1 && refused.err.contains("--force"), "{}: {}", refused.code, refused.err);
+    assert!(!out.exists(), "nothing was begun");
+    let forced = home.run(&[&record[..], &["--force"]].concat());
+    // On a busy computer it may lose something, and says so.
+    assert!([0, 3].contains(&forced.code), "{}: {}", forced.code, forced.err);
+    assert_eq!(std::fs::read_dir(&out).unwrap().count(), 1);
+    assert_eq!(home.run(&["run", rig.to_str().unwrap(), "--force"]).code, 2, "there is nothing to force");
 }

@@ -184,7 +184,8 @@ fn folders_are_paired_and_the_page_stands_alone() {
     let at = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
     let (truth, model, page_text) = (at("truth"), at("model"), page.to_str().unwrap().to_owned());
     let raw = format!("sensor <raw>={}", at("raw"));
-    let args = ["eval", "-q", "--truth", &truth, "--pred", &raw, "--pred", &model, "--out", &page_text];
+    let inputs = ["eval", "-q", "--truth", &truth, "--pred", &raw, "--pred", &model];
+    let args = [&inputs[..], &["--overwrite", "--out", &page_text]].concat();
     let said = home.run(&args).good();
     assert!(said.contains("strict L1") && said.contains("sensor <raw>") && said.contains("page "), "{said}");
     let html = std::fs::read_to_string(&page).unwrap();

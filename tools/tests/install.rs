@@ -70,3 +70,34 @@ fn systemd_finds_nothing_wrong_with_the_service() {
     let ours: Vec<_> = said.lines().filter(|l| l.contains("depthrig.service")).collect();
     assert!(ours.is_empty(), "{ours:#?}");
 }
+
+/// Root without sudo is nobody who uses a rig.
+#[test]
+fn root_is_not_taken_for_the_rigs_user_unless_it_is_named() {
+    let home = Home::new();
+    let root = home.path().join("root");
+    let ask = |action: &str, more: &[&str], env: &[(&str, &str)]| {
+        let args = [&["install", action, "--root", root.to_str().unwrap()], more].concat();
+        let mut command = Command::new(env!("CARGO_BIN_EXE_depthrig"));
+        command.args(args).env_remove("SUDO_USER").env_remove("USER").envs(env.iter().copied());
+        command.output().unwrap()
+    };
+    for env in [&[][..], &[("USER", "root")], &[("SUDO_USER", "root"), ("USER", "root")]] {
+        let out = ask("--apply", &[], env);
+        assert_eq!(out.status.code(), Some(2), "{env:?}");
+        assert!(String::from_utf8_lossy(&out.stderr).contains("--user NAME"), "{out:?}");
+        assert!(!root.exists(), "nothing is written");
+    }
+    let unit = root.join("etc/systemd/system/depthrig.service");
+    for (more, env, user) in [
+        (&[][..], &[("SUDO_USER", "robot"), ("USER", "root")][..], "User=robot\n"),
+        (&["--user", "root"], &[], "User=root\n"),
+        (&[], &[("USER", "lab")], "User=lab\n"),
+    ] {
+        assert!(ask("--apply", more, env).status.success());
+        let text = std::fs::read_to_string(&unit).unwrap();
+        assert!(text.contains(user), "{env:?}: {text}");
+    }
+    assert!(ask("--remove", &[], &[]).status.success(), "who removes need name nobody");
+    assert!(!unit.exists());
+}

@@ -5,6 +5,7 @@
 #[path = "support/home.rs"]
 mod support;
 
+use depthrig_bus::HostTime;
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode};
 use depthrig_drivers::usb::made::{MadeDevice, MadeTree};
 use depthrig_kinect_fixture::{Fixture, Pattern};
@@ -108,17 +109,19 @@ fn recordings_that_cannot_be_imported_say_why_and_what_to_do() {
             foreign[i..i + 4].copy_from_slice(b"XYZ_");
         }
     }
+    // Where outputs go: one beside the inputs would lie in the input that is a folder.
+    let elsewhere = Home::new();
     for (file, code, parts) in [
         (write("empty.mkv", b""), 2, &["the file is empty"][..]),
         (write("text.mkv", b"hello"), 2, &["this is no Matroska file (.mkv)"]),
         (write("other.mkv", &foreign), 2, &["no recording of an Azure Kinect", "\"COLOR\""]),
         (write("head.mkv", &bytes[..2000]), 2, &["cut off or damaged before its first picture"]),
         (at(&home, "nowhere.mkv"), 1, &["nowhere.mkv cannot be opened: No such file"]),
-        (at(&home, ""), 1, &["cannot be opened: is a directory"]),
+        (at(&home, ""), 1, &["cannot be opened: it is a folder; a regular file is needed"]),
         (bare.clone(), 2, &["no calibration.json", "`calibration`", "\"none\""]),
         (odd, 2, &["the Kinect's calibration: no object CalibrationInformation"]),
     ] {
-        let out = at(&home, "out");
+        let out = at(&elsewhere, "out");
         let ran = home.run(&["import", "kinect", &file, &out]);
         assert_eq!(ran.code, code, "{file}: {}", ran.err);
         for part in parts {
@@ -135,7 +138,8 @@ fn recordings_that_cannot_be_imported_say_why_and_what_to_do() {
         ran.err
     );
     assert!(ran.out.contains("4 sets"), "{}", ran.out);
-    assert_eq!(home.run(&["verify", "--decode", &at(&home, "cut"), "-q"]).code, 0);
+    // What is there is sound, and it is not all.
+    assert_eq!(home.run(&["verify", "--decode", &at(&home, "cut"), "-q"]).code, 3);
     // With a calibration of its own, or without any, it goes.
     let calibration = home.write("device.json", depthrig_kinect_fixture::CALIBRATION);
     home.run(&["import", "kinect", &bare, &at(&home, "given"), "--calibration", &calibration]).good();
@@ -187,7 +191,7 @@ impl Computer {
     /// A rig of the Kinect; `library` is a folder below the home.
     fn rig(&self, library: &str) -> String {
         let text = format!(
-            "rig = \"kin\"\n[recording]\nreserve_mb = 16\n[[camera]]\nname = \"overhead\"\nbackend = \"kinect\"\nserial = \"{SERIAL}\"\n\
+            "rig = \"kin\"\n[recording]\nallow = [\"data\"]\nreserve_mb = 16\n[[camera]]\nname = \"overhead\"\nbackend = \"kinect\"\nserial = \"{SERIAL}\"\n\
              library = \"{library}\"\ndepth_engine = \"{library}\"\n[[camera.stream]]\nname = \"depth\"\nwidth = 320\nheight = 288\n"
         );
         self.home.write("rig.toml", &text)
@@ -287,4 +291,45 @@ fn a_rig_of_an_attached_kinect_runs_and_records() {
     std::fs::create_dir(computer.home.path().join("empty")).unwrap();
     let (code, _, err) = computer.run(&["run", &computer.rig("empty")]);
     assert!(code != 0 && err.contains("libk4a1.4") && err.contains("overhead"), "{code}: {err}");
+}
+
+/// A daemon that is stopped and goes on counts the frames of that time, of a camera that has no frame counter too.
+#[test]
+fn a_stopped_daemon_counts_the_frames_that_it_missed() {
+    let home = Home::new();
+    let fixture = Fixture { captures: 60, rate_hz: 15, motion: false, ..Fixture::small() };
+    let recording = written(&home, "a.mkv", &fixture);
+    let text = format!(
+        "rig = \"stopped\"\n[recording]\nreserve_mb = 16\n[[camera]]\nname = \"k\"\nbackend = \"kinect\"\n\
+         recording = \"{recording}\"\nloop = true\n"
+    );
+    let running = home.start(&["run", &home.write("rig.toml", &text), "-q"]);
+    // Delivered, lost and the reconnects of its first stream.
+    let account = || {
+        let status: Value = serde_json::from_str(&home.run(&["status", "--json"]).out).unwrap_or_default();
+        let camera = &status["cameras"][0];
+        let stream = &camera["streams"][0];
+        let lost = stream["dropped"]["device_gap"].as_u64().unwrap_or(0);
+        [stream["delivered"].as_u64().unwrap_or(0), lost, camera["reconnects"].as_u64().unwrap_or(0)]
+    };
+    wait(|| account()[0] > 5, "the recording does not play");
+    let [_, lost_before, _] = account();
+    let begin = HostTime::now();
+    running.send("STOP");
+    let stopped = HostTime::now();
+    std::thread::sleep(std::time::Duration::from_secs(4));
+    let woken = HostTime::now();
+    running.send("CONT");
+    let [delivered, ..] = account();
+    wait(|| account()[0] > delivered + 15, "it does not play on");
+    let end = HostTime::now();
+    let [_, lost, reconnects] = account();
+    // Exact within a frame; how long a busy computer takes to stop and wake it is measured.
+    let frames = |from: HostTime, to: HostTime| to.since_ns(from) as f64 / 1e9 * 15.0;
+    let least = frames(stopped, woken) - 2.0;
+    let most = frames(begin, end) + 2.0;
+    let counted = (lost - lost_before) as f64;
+    assert!((least..=most).contains(&counted), "{counted} counted, {least:.1} to {most:.1} missed");
+    assert_eq!(reconnects, 0);
+    let _ = running.interrupt();
 }

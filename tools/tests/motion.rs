@@ -10,7 +10,7 @@ use support::Home;
 fn a_motion_unit_is_tapped_shown_and_recorded() {
     let home = Home::new();
     let rig = home.path().join("rig.toml");
-    let text = "rig = \"moved\"\n[recording]\nreserve_mb = 0\nmin_minutes = 0\n[[camera]]\nname = \"cam\"\n\
+    let text = "rig = \"moved\"\n[recording]\nallow = [\"data\"]\nreserve_mb = 0\nmin_minutes = 0\n[[camera]]\nname = \"cam\"\n\
                 backend = \"synthetic\"\ncheap = true\n[[camera.stream]]\nname = \"color\"\nwidth = 64\nheight = 48\n\
                 [[camera.stream]]\nname = \"imu\"\n";
     std::fs::write(&rig, text).unwrap();

@@ -30,7 +30,8 @@ fn a_pair_becomes_floats_or_sixteen_bits() {
     let file = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
     let (npy, png, sure) = (file("d.npy"), file("d.png"), file("sure.png"));
     for preset in ["performance", "quality", "ultra"] {
-        let common = ["stereo", &left, &right, "--preset", preset, "--max-disparity", "64", "--out"];
+        let common =
+            ["stereo", &left, &right, "--preset", preset, "--max-disparity", "64", "--overwrite", "--out"];
         Home::new().run(&[&common[..], &[&npy]].concat()).good();
         let told = Home::new().run(&[&common[..], &[&png, "--confidence", &sure, "--json"]].concat()).good();
         let told: serde_json::Value = serde_json::from_str(&told).unwrap();
@@ -64,15 +65,36 @@ fn rows_that_are_apart_are_said() {
     image::GrayImage::from_fn(241, 90, |x, y| *picture.get_pixel(x, y.saturating_sub(2))).save(&low).unwrap();
     let out = folder.path().join("d.npy").to_str().unwrap().to_owned();
     for (right, rows) in [(&right, 0.0), (&low, 2.0)] {
-        let ran =
-            Home::new().run(&["stereo", &left, right, "--max-disparity", "64", "--out", &out, "--json"]);
+        let common =
+            ["stereo", &left, right, "--max-disparity", "64", "--overwrite", "--out", &out, "--json"];
+        let ran = Home::new().run(&common);
         let told: serde_json::Value = serde_json::from_str(&ran.out).unwrap();
         let middle = told["rows"]["middle_px"].as_f64().unwrap();
         assert!((middle - rows).abs() < 0.1, "{told}");
         let warnings = told["warnings"].as_array().unwrap();
         assert_eq!(warnings.len(), usize::from(rows > 0.0), "{told}");
         assert_eq!(ran.err.contains("not rectified to the same rows"), rows > 0.0, "{}", ran.err);
+        assert_eq!(told["rows_corrected"], rows > 0.0, "{told}");
+        assert_eq!(told["parameters"].as_str().unwrap().contains("rows_moved_px="), rows > 0.0, "{told}");
         ran.good();
+        // All of it lies at 14, in rows that were moved too.
+        let right_ones = || {
+            let bytes = std::fs::read(&out).unwrap();
+            let floats: &[[u8; 4]] = bytes[bytes.len() - 4 * 241 * 90..].as_chunks().0;
+            floats.iter().filter(|b| (f32::from_le_bytes(**b) - 14.0).abs() < 0.5).count()
+        };
+        let moved = right_ones();
+        assert!(moved * 10 > 8 * 241 * 90, "{moved}");
+        let kept = [&common[..], &["--keep-rows"]].concat();
+        let told: serde_json::Value = serde_json::from_str(&Home::new().run(&kept).good()).unwrap();
+        assert_eq!(told["rows_corrected"], false, "{told}");
+        if rows > 0.0 {
+            assert!(
+                right_ones() * 2 < moved,
+                "{} where rows are kept, {moved} where they are moved",
+                right_ones()
+            );
+        }
     }
 }
 
@@ -87,7 +109,8 @@ fn a_pair_is_the_same_in_every_lossless_form() {
             save(picture, file);
         }
         let [left, right] = files.each_ref().map(|f| f.to_str().unwrap());
-        let common = ["stereo", left, right, "--out", out.to_str().unwrap(), "--max-disparity", "77"];
+        let common =
+            ["stereo", left, right, "--overwrite", "--out", out.to_str().unwrap(), "--max-disparity", "77"];
         Home::new().run(&common).good();
         std::fs::read(&out).unwrap()
     };
@@ -122,7 +145,8 @@ fn pictures_of_every_size_are_matched() {
         picture(Path::new(&left), width, height, 0);
         picture(Path::new(&right), width, height, 3);
         for preset in ["performance", "quality", "ultra"] {
-            let args = ["stereo", &left, &right, "--max-disparity", "201", "--preset", preset, "--out", &out];
+            let common = ["stereo", &left, &right, "--max-disparity", "201", "--preset", preset];
+            let args = [&common[..], &["--overwrite", "--out", &out]].concat();
             Home::new().run(&args).good();
             let bytes = std::fs::read(&out).unwrap();
             let shape = format!("'shape': ({height}, {width})");
@@ -154,7 +178,7 @@ fn what_is_no_pair_is_said() {
     }
     let forced = ["stereo", &right, &left, "--max-disparity", "64", "--even-if-swapped", "--out", &out];
     Home::new().run(&forced).good();
-    let ran = Home::new().run(&["stereo", &left, "/nonexistent.png", "--out", &out]);
+    let ran = Home::new().run(&["stereo", &left, "/nonexistent.png", "--overwrite", "--out", &out]);
     assert_eq!(ran.code, 1);
     assert!(ran.err.contains("/nonexistent.png"), "{}", ran.err);
 }
@@ -170,4 +194,26 @@ fn the_bench_says_what_each_preset_costs() {
     let costs = told["costs"].as_array().unwrap();
     assert_eq!(costs.len(), 3);
     assert!(costs.iter().all(|c| c["cpu_ms_best"].as_f64().unwrap() > 0.0 && c["filled_percent"].as_f64().unwrap() > 50.0));
+}
+
+#[test]
+fn an_input_is_never_overwritten_and_nothing_else_unasked() {
+    let folder = tempfile::tempdir().unwrap();
+    let [left, right] = pair(folder.path());
+    let before = std::fs::read(&left).unwrap();
+    let link = folder.path().join("link.png");
+    std::os::unix::fs::symlink(&left, &link).unwrap();
+    let sure = folder.path().join("sure.png").to_str().unwrap().to_owned();
+    for out in [left.as_str(), link.to_str().unwrap()] {
+        let args = ["stereo", &left, &right, "--max-disparity", "64", "--overwrite", "--out", out];
+        let ran = Home::new().run(&args);
+        assert!(ran.code == 2 && ran.err.contains("is the input"), "{}", ran.err);
+    }
+    let ran = Home::new().run(&["stereo", &left, &right, "--out", &sure, "--confidence", &sure]);
+    assert!(ran.code == 2 && ran.err.contains("are one file"), "{}", ran.err);
+    std::fs::write(&sure, "somebody's").unwrap();
+    let ran = Home::new().run(&["stereo", &left, &right, "--out", &sure]);
+    assert!(ran.code == 2 && ran.err.contains("--overwrite"), "{}", ran.err);
+    assert_eq!(std::fs::read(&sure).unwrap(), b"somebody's");
+    assert_eq!(std::fs::read(&left).unwrap(), before);
 }

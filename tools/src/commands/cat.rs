@@ -105,7 +105,7 @@ pub fn run(args: &CatArgs, context: &Context) -> Result<Exit> {
         Some(_) => export(args, context, &dataset, &choice)?,
     };
     for problem in &done.problems {
-        eprintln!("lost: {problem}");
+        out::note(format_args!("lost: {problem}"));
     }
     Ok(match done {
         _ if done.ended => Exit::Failed,
@@ -148,7 +148,7 @@ fn motion(args: &CatArgs, dataset: &Dataset, units: &[StreamId], sets: SetChoice
         list_samples(args, dataset, unit, sets)?
     };
     for problem in &done.problems {
-        eprintln!("lost: {problem}");
+        out::note(format_args!("lost: {problem}"));
     }
     Ok(match done {
         _ if done.ended => Exit::Failed,

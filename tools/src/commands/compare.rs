@@ -3,6 +3,7 @@
 use crate::context::Context;
 use crate::exit::Exit;
 use crate::out;
+use crate::printable;
 use crate::progress::Progress;
 use crate::signals::Stop;
 use anyhow::{Result, bail};
@@ -102,9 +103,9 @@ fn text(c: &Comparison) -> String {
         c.sets,
         c.frames,
         c.sets_a,
-        c.a.display(),
+        printable::path(&c.a),
         c.sets_b,
-        c.b.display()
+        printable::path(&c.b)
     )];
     if c.equal {
         return lines.remove(0);
@@ -153,5 +154,5 @@ fn line(d: &Difference) -> String {
         (None, None) => String::new(),
     };
     let stream = if d.stream.is_empty() { String::new() } else { format!("{} ", d.stream) };
-    format!("{set}{stream}{}: {} | {}", d.field, d.a, d.b)
+    printable::line(&format!("{set}{stream}{}: {} | {}", d.field, d.a, d.b))
 }

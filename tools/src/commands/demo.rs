@@ -4,9 +4,10 @@ use crate::commands::run::{self, Started};
 use crate::context::{Context, private_folder};
 use crate::demo::live::{Seen, Watcher};
 use crate::demo::report::{self, DemoReport};
-use crate::demo::{replayed, seeded, sheet};
+use crate::demo::{is_depth, mode_name, replayed, seeded, sheet};
 use crate::exit::Exit;
 use crate::out;
+use crate::outfile::{OutFile, Overwrite};
 use crate::progress::Progress;
 use crate::signals::Stop;
 use anyhow::{Context as _, Result, anyhow, bail};
@@ -14,14 +15,15 @@ use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
 use depthrig_bus::{Bus, HostTime, Name, RuntimeDir, StreamId, UtcPair};
 use depthrig_cdm::Precision;
-use depthrig_daemon::config::{BackendConfig, EngineChoice, RefineConfig, RigConfig};
+use depthrig_daemon::config::{BackendConfig, CameraConfig, EngineChoice, RefineConfig, RigConfig};
 use depthrig_daemon::control::RecordRequest;
 use depthrig_daemon::rig::{Rig, RigSummary};
-use depthrig_daemon::status::RigStatus;
+use depthrig_daemon::status::{CameraStatus, RigStatus};
 use depthrig_daemon::zed_replay::Mode;
 use depthrig_drivers::StreamRequest;
 use depthrig_recorder::report::REPORT_FILE;
 use depthrig_recorder::{Dataset, VerifyOptions, verify};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Examples for `--help`.
@@ -61,8 +63,12 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
     if folder.join(DATASET).exists() {
         bail!("{}: there is a dataset already; name another folder with --out", folder.display());
     }
-    std::fs::create_dir_all(&folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
-    let (config, unavailable) = configuration(args.config.as_deref())?;
+    let keep = Overwrite { overwrite: false };
+    let contact_sheet = OutFile::new(&folder.join("contact-sheet.png"), keep, &[])?;
+    let saved = OutFile::new(&folder.join("report.json"), keep, &[])?;
+    depthrig_bus::umask::create_dir_all(&folder)
+        .with_context(|| format!("{}: cannot be made", folder.display()))?;
+    let Chosen { config, unavailable, untrained } = configuration(args.config.as_deref())?;
     let private = private_folder()?;
     let runtime = RuntimeDir::at(private.path())?;
     let name = config.rig.clone();
@@ -81,12 +87,13 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
     progress.clear();
 
     let info = Dataset::open(&dataset)?.info()?;
-    let contact_sheet = folder.join("contact-sheet.png");
-    let cameras = recorded.live.cameras.iter().filter_map(|c| recorded.seen.pictures.get(&c.name));
-    // In the order of their names, in which colour is the first.
-    sheet::contact_sheet(cameras.map(|pictures| pictures.values().map(Some).collect()))
-        .save(&contact_sheet)
-        .with_context(|| format!("{}: cannot be written", contact_sheet.display()))?;
+    let cameras: Vec<sheet::Camera<'_>> = recorded
+        .live
+        .cameras
+        .iter()
+        .filter_map(|c| Some(on_sheet(c, recorded.seen.shots.get(&c.name)?, &untrained)))
+        .collect();
+    contact_sheet.write(&crate::picture::png(&sheet::contact_sheet(&cameras))?)?;
     let report = DemoReport {
         start_s,
         stop_s: recorded.stop_s,
@@ -97,6 +104,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
         units_mm: recorded.seen.units_mm,
         recorded: report::modes(info.streams.iter().map(|s| (s.stream.as_str(), s.frames))),
         unavailable,
+        untrained,
         sets_seen: recorded.seen.sets,
         frames_unread: recorded.seen.unread,
         summary: recorded.summary,
@@ -105,11 +113,9 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
         segments: Dataset::open(&dataset)?.segments().to_vec(),
         quality_report: dataset.join(REPORT_FILE),
         dataset,
-        contact_sheet,
+        contact_sheet: contact_sheet.path().to_owned(),
     };
-    let saved = folder.join("report.json");
-    std::fs::write(&saved, serde_json::to_string_pretty(&report)?)
-        .with_context(|| format!("{}: cannot be written", saved.display()))?;
+    saved.write(serde_json::to_string_pretty(&report)?.as_bytes())?;
     if args.json {
         out::json(&report)?;
     } else {
@@ -121,9 +127,18 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
 /// Refined pictures of each camera a second: all seven share what the cores have left.
 const REFINE_HZ: f64 = 2.0;
 
-/// The rig of `file`, else the default rig; and the depth modes that are taken out of it, with the reason. Simulated cameras
-/// give their true depth and, by the engine that needs no model, refined depth as streams of their own that are not recorded.
-fn configuration(file: Option<&Path>) -> Result<(RigConfig, Vec<String>)> {
+/// The rig that the demo runs.
+struct Chosen {
+    config: RigConfig,
+    /// Depth modes that are taken out of it, with the reason.
+    unavailable: Vec<String>,
+    /// Depth modes whose network was never trained, as the name of its file says.
+    untrained: Vec<String>,
+}
+
+/// The rig of `file`, else the default rig. Simulated cameras give their true depth and, by the engine that needs no model,
+/// refined depth as streams of their own that are not recorded.
+fn configuration(file: Option<&Path>) -> Result<Chosen> {
     let read = file.map_or_else(|| RigConfig::parse(RigConfig::default_text(), None), RigConfig::load);
     let mut config = read.map_err(depthrig_daemon::Error::from)?;
     for camera in &mut config.cameras {
@@ -138,13 +153,60 @@ fn configuration(file: Option<&Path>) -> Result<(RigConfig, Vec<String>)> {
             camera.refine = Some(RefineConfig {
                 engine: EngineChoice::Fill,
                 rate_hz: REFINE_HZ,
+                // What it was before, in the same view.
+                align: true,
                 ..RefineConfig::default()
             });
             camera.record = Some(vec![Name::new("color")?, Name::new("depth")?]);
         }
     }
     let unavailable = without_library(&mut config);
-    Ok((config, unavailable))
+    let untrained = config.cameras.iter().filter(|c| has_untrained_network(c));
+    let untrained = untrained.map(|c| mode_name(c.name.as_str(), "depth_neural")).collect();
+    Ok(Chosen { config, unavailable, untrained })
+}
+
+/// Whether the file of the camera's stereo network says that it was never trained, as that of `make demo` does.
+fn has_untrained_network(camera: &CameraConfig) -> bool {
+    let network = camera.stereo.as_ref().and_then(|s| s.network.as_ref());
+    let stem = network.and_then(|file| file.file_stem()).and_then(|stem| stem.to_str());
+    stem.is_some_and(|stem| stem.starts_with("untrained"))
+}
+
+/// A camera of the contact sheet: colour, its depth modes in the view of colour where they are there, and filled depth. What an
+/// untrained network gives is left out: it would look like a broken camera.
+fn on_sheet<'a>(
+    camera: &CameraStatus,
+    shots: &'a BTreeMap<String, sheet::Shot>,
+    untrained: &[String],
+) -> sheet::Camera<'a> {
+    let how =
+        if camera.backend == "synthetic" { "simulated".into() } else { format!("driver {}", camera.backend) };
+    let mut tiles = Vec::new();
+    let mut add = |stream: &str, label: &str| {
+        if let Some(shot) = shots.get(stream) {
+            tiles.push(sheet::Tile { label: label.to_owned(), shot });
+        }
+    };
+    add("color", "colour");
+    let shown = |s: &&String| is_depth(s) && !untrained.contains(&mode_name(&camera.name, s));
+    let modes: Vec<&String> = shots.keys().filter(shown).collect();
+    let has_modes = modes.len() > 1;
+    if let [only] = modes[..]
+        && shots.contains_key("depth_aligned")
+        && only == "depth"
+    {
+        add("depth_aligned", "its depth, in the view of colour");
+    } else {
+        for mode in modes {
+            add(mode, mode.strip_prefix("depth_").unwrap_or("its depth"));
+        }
+    }
+    add("depth_refined", if has_modes { "one of them, holes filled" } else { "the same, holes filled" });
+    let model = Some(&camera.model).filter(|model| !model.eq_ignore_ascii_case(&camera.name));
+    let title =
+        model.map_or_else(|| format!("{}: {how}", camera.name), |m| format!("{}: {m}, {how}", camera.name));
+    sheet::Camera { title, tiles }
 }
 
 /// Takes the mode of cameras' stereo that is a network out of a rig that has no library to run it; says so of each.

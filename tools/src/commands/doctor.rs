@@ -53,7 +53,7 @@ pub fn run(args: &DoctorArgs, context: &Context) -> Result<Exit> {
         out::json(&report)?;
     } else {
         let style = Style { width: screen::size().map_or(120, |(width, _)| width), color: context.color() };
-        out::line(text(&report, style))?;
+        out::styled(text(&report, style))?;
     }
     Ok(match report.verdict {
         Severity::Error => Exit::Failed,

@@ -6,9 +6,10 @@ use crate::eval::files::{Files, HAMMER_RANGE_M, HAMMER_UNIT_M, Named};
 use crate::eval::{Evaluation, Options, Row, Source, page};
 use crate::exit::{Exit, UsageError};
 use crate::out;
+use crate::outfile::{OutFile, Overwrite};
 use crate::progress::Progress;
 use crate::signals::Stop;
-use anyhow::{Context as _, Result, bail};
+use anyhow::{Result, bail};
 use depthrig_bus::StreamName;
 use depthrig_cdm::metrics::DepthRange;
 use std::path::{Path, PathBuf};
@@ -45,10 +46,10 @@ pub struct EvalArgs {
     #[arg(long, value_name = "DIR")]
     rgb: Option<PathBuf>,
     /// Metres per unit of files with whole numbers
-    #[arg(long, value_name = "M", default_value_t = HAMMER_UNIT_M, value_parser = positive_metres)]
+    #[arg(long, value_name = "M", default_value_t = HAMMER_UNIT_M, value_parser = crate::cli::depth_unit_m)]
     unit: f64,
     /// The same for references [default: as --unit]
-    #[arg(long, value_name = "M", value_parser = positive_metres)]
+    #[arg(long, value_name = "M", value_parser = crate::cli::depth_unit_m)]
     truth_unit: Option<f64>,
     /// Nearest reference that counts, metres [default: 0; of HAMMER 0.1]
     #[arg(long, value_name = "M")]
@@ -62,6 +63,8 @@ pub struct EvalArgs {
     /// Write the page to this file [default: eval.html in the current folder]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+    #[command(flatten)]
+    overwrite: Overwrite,
     /// Print JSON instead of the table and writing a page (with --out, do both)
     #[arg(long)]
     json: bool,
@@ -91,6 +94,12 @@ pub fn run(args: &EvalArgs, context: &Context) -> Result<Exit> {
     if range.min_m.is_nan() || range.max_m.is_nan() || range.min_m > range.max_m {
         return Err(UsageError(format!("{} m to {} m is no range of depth", range.min_m, range.max_m)).into());
     }
+    let path = match (&args.out, args.json) {
+        (Some(path), _) => Some(path.clone()),
+        (None, true) => None,
+        (None, false) => Some(PathBuf::from(PAGE)),
+    };
+    let path = path.map(|path| OutFile::new(&path, args.overwrite, &[])).transpose()?;
     let cores = || std::thread::available_parallelism().map_or(1, usize::from);
     let options =
         Options { range, bins: (args.bin_m, BINS), threads: args.threads.map_or_else(cores, usize::from) };
@@ -106,25 +115,19 @@ pub fn run(args: &EvalArgs, context: &Context) -> Result<Exit> {
         let why = evaluation.failed.iter().chain(&evaluation.left_out).take(3).cloned().collect::<Vec<_>>();
         bail!("nothing could be compared: {}", why.join("; "));
     }
-    let path = match (&args.out, args.json) {
-        (Some(path), _) => Some(path.clone()),
-        (None, true) => None,
-        (None, false) => Some(PathBuf::from(PAGE)),
-    };
     if let Some(path) = &path {
-        std::fs::write(path, page::page(&title, &evaluation, &options))
-            .with_context(|| format!("{}: cannot be written", path.display()))?;
+        path.write(page::page(&title, &evaluation, &options).as_bytes())?;
     }
     if args.json {
         out::json(&evaluation)?;
     } else {
         out::line(text(&evaluation))?;
         if let Some(path) = &path {
-            out::line(format_args!("page      {}", path.display()))?;
+            out::line(format_args!("page      {}", path.path().display()))?;
         }
     }
     for line in evaluation.failed.iter().take(20) {
-        eprintln!("not compared: {line}");
+        out::note(format_args!("not compared: {line}"));
     }
     let all = evaluation.failed.is_empty() && evaluation.left_out.is_empty();
     Ok(if all { Exit::Good } else { Exit::Lost })

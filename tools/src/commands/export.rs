@@ -94,7 +94,7 @@ fn drive(exporter: &mut dyn Exporter, common: &Common, context: &Context) -> Res
         tell(&report, dir)?;
     }
     for problem in &report.problems {
-        eprintln!("lost: {problem}");
+        out::note(format_args!("lost: {problem}"));
     }
     Ok(match report {
         _ if report.ended => Exit::Failed,

@@ -15,7 +15,7 @@ use depthrig_recorder::exchange::{
     ByteCameraImport, ByteCameraOptions, ImportReport, Importer, RosbagImport, import,
 };
 use depthrig_recorder::fs::{Fs, RealFs};
-use depthrig_recorder::{ColorCodec, RecorderOptions};
+use depthrig_recorder::{ColorCodec, RecorderOptions, check_outside};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -78,6 +78,24 @@ pub enum ImportCommand {
     /// A recording of an Azure Kinect (.mkv) that k4arecorder or another program of its SDK made
     #[command(after_help = KINECT_EXAMPLES)]
     Kinect(KinectArgs),
+}
+
+impl ImportCommand {
+    fn input(&self) -> &Path {
+        match self {
+            Self::Bytecameradepth(args) => &args.input,
+            Self::Rosbag(args) => &args.input,
+            Self::Kinect(args) => &args.input,
+        }
+    }
+
+    const fn common(&self) -> &Common {
+        match self {
+            Self::Bytecameradepth(args) => &args.common,
+            Self::Rosbag(args) => &args.common,
+            Self::Kinect(args) => &args.common,
+        }
+    }
 }
 
 /// What every import has.
@@ -145,13 +163,14 @@ pub struct KinectArgs {
 
 fn depth_unit(text: &str) -> Result<(Option<String>, f64), String> {
     let (camera, unit) = text.rsplit_once('=').map_or((None, text), |(c, u)| (Some(c.to_owned()), u));
-    let unit: f64 = unit.parse().map_err(|_| "write metres, such as 0.001 or d405=0.0001".to_owned())?;
+    let unit = crate::cli::depth_unit_m(unit).map_err(|why| format!("{why}, or d405=0.0001"))?;
     Ok((camera, unit))
 }
 
 /// Imports.
 pub fn run(command: &ImportCommand, context: &Context) -> Result<Exit> {
     let fs: Arc<dyn Fs> = Arc::new(RealFs);
+    check_outside(&command.common().out, command.input()).map_err(super::export::usage)?;
     match command {
         ImportCommand::Bytecameradepth(args) => {
             let mut options = ByteCameraOptions { rate_hz: args.rate, ..ByteCameraOptions::default() };
@@ -217,10 +236,12 @@ fn drive(importer: &mut dyn Importer, fs: Arc<dyn Fs>, common: &Common, context:
     }
     if report.ended {
         let out = common.out.display();
-        eprintln!("ended: {out} holds what was read until then; for all, remove it and import again");
+        out::note(format_args!(
+            "ended: {out} holds what was read until then; for all, remove it and import again"
+        ));
     }
     for lost in report.facts.problems.iter().chain(&report.summary.lost) {
-        eprintln!("lost: {lost}");
+        out::note(format_args!("lost: {lost}"));
     }
     Ok(exit(&report))
 }

@@ -2,6 +2,7 @@
 
 use crate::exit::Exit;
 use crate::out;
+use crate::printable::{self, path};
 use anyhow::Result;
 use depthrig_recorder::{Dataset, DatasetInfo, utc_text};
 use serde::Serialize;
@@ -51,18 +52,19 @@ fn lost(dataset: &Dataset, info: &DatasetInfo) -> Vec<String> {
     if lost.is_empty() && outcome.is_some() {
         lost.push("the recording is not complete and does not say why".to_owned());
     }
+    lost.extend(dataset.session().import_losses());
     lost
 }
 
 /// The dataset for people.
 fn text(info: &DatasetInfo, lost: &[String]) -> String {
     let ms = |ns: i64| ns as f64 / 1e6;
-    let or_none = |text: &str| if text.is_empty() { "-".to_owned() } else { text.to_owned() };
+    let or_none = |text: &str| if text.is_empty() { "-".to_owned() } else { printable::line(text) };
     let mut lines = vec![
-        format!("dataset   {} ({})", info.name, info.path.display()),
+        format!("dataset   {} ({})", printable::line(&info.name), path(&info.path)),
         format!(
             "rig       {}, scene {}, operator {}",
-            info.rig,
+            printable::line(&info.rig),
             or_none(&info.scene),
             or_none(&info.operator)
         ),
@@ -98,18 +100,19 @@ fn text(info: &DatasetInfo, lost: &[String]) -> String {
             ],
             5,
             info.streams.iter().map(|s| {
-                let share = 100.0 * s.bytes as f64 / (s.raw_bytes.max(1) as f64);
+                let share = 100.0 * s.packed_bytes as f64 / (s.raw_bytes.max(1) as f64);
+                let packed = if s.is_packed { " + zstd" } else { "" };
                 vec![
                     s.stream.clone(),
                     s.model.clone(),
                     format!("{}x{}", s.width, s.height),
                     s.format.to_owned(),
-                    s.codec.to_owned(),
+                    format!("{}{packed}", s.codec),
                     s.frames.to_string(),
                     s.missing.to_string(),
                     format!("{:.2}", s.rate_hz),
                     if s.depth_unit_m > 0.0 { format!("{}", s.depth_unit_m * 1e3) } else { "-".to_owned() },
-                    out::bytes(s.bytes),
+                    out::bytes(s.packed_bytes),
                     format!("{share:.0} %"),
                 ]
             }),
@@ -132,9 +135,12 @@ fn text(info: &DatasetInfo, lost: &[String]) -> String {
             }),
         ));
     }
-    lines.extend(info.computed.iter().map(|made| format!("computed: {made}")));
-    lines.extend(lost.iter().map(|what| format!("lost: {what}")));
-    lines.extend(info.unfinished.iter().map(|file| format!("unfinished: {file}")));
-    lines.extend(info.problems.iter().map(|problem| format!("problem: {problem}")));
+    let mut tell = |what: &str, text: &str| lines.push(format!("{what}: {}", printable::line(text)));
+    info.computed.iter().for_each(|made| tell("computed", &made.to_string()));
+    for what in lost {
+        tell("lost", what);
+    }
+    info.unfinished.iter().for_each(|file| tell("unfinished", file));
+    info.problems.iter().for_each(|problem| tell("problem", problem));
     lines.join("\n")
 }

@@ -50,7 +50,7 @@ pub struct InstallArgs {
 /// Shows, writes or removes.
 pub fn run(args: &InstallArgs) -> Result<Exit> {
     let service = Service {
-        user: args.user.clone().unwrap_or_else(usual_user),
+        user: service_user(args)?,
         binary: std::env::current_exe().context("the path of this program is not known")?,
         rig_file: absolute(&args.rig_file)?,
         data: absolute(&args.data)?,
@@ -115,10 +115,24 @@ Then look: depthrig cameras, and depthrig doctor {rig_file}"
     )
 }
 
-/// Who asked for root: with sudo the user before it.
-fn usual_user() -> String {
+/// The user that the service runs as: the one that is named, else who asked for root with sudo, else who asks. Root
+/// itself must be named: a rig and its subscribers are one user's, and cameras need no root.
+fn service_user(args: &InstallArgs) -> Result<String> {
+    if let Some(user) = &args.user {
+        return Ok(user.clone());
+    }
     let named = |variable: &str| std::env::var(variable).ok().filter(|name| user_name(name).is_ok());
-    named("SUDO_USER").or_else(|| named("USER")).unwrap_or_else(|| "root".to_owned())
+    let user = named("SUDO_USER").or_else(|| named("USER")).filter(|name| name != "root");
+    match user {
+        Some(user) => Ok(user),
+        // What is removed does not depend on it.
+        None if args.remove => Ok("root".to_owned()),
+        None => Err(UsageError(
+            "the service's user is not known: name the user that uses the rig with --user NAME (root only if it is meant)"
+                .to_owned(),
+        )
+        .into()),
+    }
 }
 
 /// A user name as systemd takes it (systemd.io, "User/Group Name Syntax"), strict form.

@@ -3,6 +3,7 @@
 use crate::context::Context;
 use crate::exit::Exit;
 use crate::out;
+use crate::printable;
 use crate::progress::Progress;
 use crate::signals::Stop;
 use anyhow::Result;
@@ -57,7 +58,7 @@ pub fn run(args: &RecoverArgs, context: &Context) -> Result<Exit> {
 
 fn text(report: &RecoverReport) -> String {
     let mut told = String::new();
-    let path = report.path.display();
+    let path = printable::path(&report.path);
     // Writing to a string cannot fail.
     let _ = match (report.changed, report.dry_run) {
         (false, _) => write!(told, "{path}: nothing to do, {}", out::count(report.sets, "set")),
@@ -73,13 +74,13 @@ fn text(report: &RecoverReport) -> String {
             write!(told, "\n  {}: {done}, {}, {}", s.file, out::count(s.sets, "set"), out::bytes(s.bytes));
     }
     for name in &report.removed {
-        let _ = write!(told, "\n  {name}: a leftover, removed");
+        let _ = write!(told, "\n  {}: a leftover, removed", printable::line(name));
     }
     for what in &report.lost {
-        let _ = write!(told, "\n  lost: {what}");
+        let _ = write!(told, "\n  lost: {}", printable::line(what));
     }
     for what in &report.notes {
-        let _ = write!(told, "\n  note: {what}");
+        let _ = write!(told, "\n  note: {}", printable::line(what));
     }
     told
 }

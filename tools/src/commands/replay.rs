@@ -75,6 +75,9 @@ struct StartArgs {
     /// Record what is replayed, into a new folder below this one; nothing is encoded a second time
     #[arg(long, value_name = "DIR", conflicts_with = "looped")]
     record: Option<PathBuf>,
+    /// Record even if the disk is expected to be full too soon
+    #[arg(long, requires = "record")]
+    force: bool,
     /// Name of the recording's folder; made of date, time and scene when left out
     #[arg(long, requires = "record")]
     name: Option<String>,
@@ -216,6 +219,7 @@ fn replay(args: &StartArgs, context: &Context) -> Result<Exit> {
         let request = RecordRequest {
             directory: Some(directory.clone()),
             name: args.name.clone(),
+            force: args.force,
             ..RecordRequest::default()
         };
         let control = replay.control();

@@ -3,6 +3,7 @@
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
 use crate::out;
+use crate::outfile::{OutFile, Overwrite};
 use crate::progress::Progress;
 use crate::signals::Stop;
 use anyhow::{Result, bail};
@@ -10,7 +11,7 @@ use core::ops::ControlFlow;
 use depthrig_recorder::Dataset;
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::report::{REPORT_FILE, Report, ReportOptions};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
@@ -30,6 +31,8 @@ pub struct ReportArgs {
     /// Write the page to this file [default: report.html in the dataset]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+    #[command(flatten)]
+    overwrite: Overwrite,
     /// Frames of a set should not lie further apart [default: the session's limit, else half a period of the
     /// slowest camera]
     #[arg(long, value_name = "MS", value_parser = crate::cli::positive_seconds)]
@@ -51,6 +54,14 @@ pub fn run(args: &ReportArgs, context: &Context) -> Result<Exit> {
         None if args.dataset.is_dir() => Some(args.dataset.join(REPORT_FILE)),
         None => return Err(UsageError("a report of one segment needs --out FILE".to_owned()).into()),
     };
+    // The dataset's own report is written anew, which is what this is for; any other file is somebody's.
+    let out = args.out.as_deref().map(|path| {
+        let session = args.dataset.join(depthrig_recorder::SESSION_FILE);
+        let inputs: Vec<&Path> =
+            dataset.segments().iter().map(PathBuf::as_path).chain([session.as_path()]).collect();
+        OutFile::new(path, args.overwrite, &inputs)
+    });
+    let out = out.transpose()?;
     let options = ReportOptions {
         fill_sets: args.fill_sets,
         max_spread_ns: args.max_spread_ms.map(|ms| (ms * 1e6) as i64),
@@ -65,8 +76,10 @@ pub fn run(args: &ReportArgs, context: &Context) -> Result<Exit> {
         bail!("interrupted; no report was written");
     };
     bar.clear();
-    if let Some(path) = &page {
-        report.write(&RealFs, path)?;
+    match (&out, &page) {
+        (Some(out), _) => out.write(report.to_html().as_bytes())?,
+        (None, Some(path)) => report.write(&RealFs, path)?,
+        (None, None) => {}
     }
     if args.json {
         out::json(&report)?;

@@ -38,6 +38,9 @@ pub struct RunArgs {
     /// Who records
     #[arg(long, value_name = "NAME", requires = "record", default_value = "")]
     operator: String,
+    /// Record even if the disk is expected to be full too soon
+    #[arg(long, requires = "record")]
+    force: bool,
     /// End after so many seconds
     #[arg(long, value_name = "N", value_parser = crate::cli::positive_seconds)]
     seconds: Option<f64>,
@@ -55,11 +58,14 @@ pub fn run(args: &RunArgs, context: &Context) -> Result<Exit> {
     let stop = Stop::on_signals()?;
     let Started { rig, .. } = start(config, context.runtime()?, true, None, context.global.quiet > 0)?;
     let control = rig.control();
-    if let Some(directory) = &args.record {
+    if let Some(directory) = &args.record
+        && wait_until_drawn(&rig, &stop, context.global.quiet > 0)
+    {
         let request = RecordRequest {
             directory: Some(directory.clone()),
             scene: args.scene.clone(),
             operator: args.operator.clone(),
+            force: args.force,
             ..RecordRequest::default()
         };
         if let Err(e) = control.record_start(&request) {
@@ -75,6 +81,33 @@ pub fn run(args: &RunArgs, context: &Context) -> Result<Exit> {
         tell(&summary)?;
     }
     Ok(if summary.lost.is_empty() { Exit::Good } else { Exit::Lost })
+}
+
+/// Waits until simulated cameras show their scenes as rendered; coarse images are not recorded. Whether it was not asked
+/// to end meanwhile.
+fn wait_until_drawn(rig: &Rig, stop: &Stop, quiet: bool) -> bool {
+    const LOOK: Duration = Duration::from_millis(100);
+    let mut shown = Progress::new(quiet);
+    let mut announced = false;
+    // With an error it goes no further, and the recording is refused with it.
+    while let Some(p) = rig.drawing().filter(|p| p.error.is_none()) {
+        if quiet && !announced {
+            announce_rendering();
+        }
+        announced = true;
+        shown.set("rendering, then recording", p.done as u64, p.total as u64);
+        if rig.is_stop_asked() || stop.wait(LOOK) {
+            return false;
+        }
+    }
+    true
+}
+
+/// One line also where little is to be said: it can take minutes.
+fn announce_rendering() {
+    eprintln!(
+        "rendering the simulated cameras' images, once; minutes on a busy computer, then kept for next time"
+    );
 }
 
 /// A rig whose cameras stream.
@@ -98,15 +131,25 @@ pub fn start(
         f(&mut shared.lock().unwrap_or_else(PoisonError::into_inner));
     };
     let shown = shared.clone();
+    let announced = AtomicBool::new(!quiet);
     let progress = move |camera: &str, done: usize, total: usize| {
+        if done < total && !announced.swap(true, Ordering::Relaxed) {
+            announce_rendering();
+        }
         let what = format!("rendering {camera} (kept for next time)");
         lock(&shown, &|(bar, rendered)| {
             bar.set(&what, done as u64, total as u64);
             *rendered = HostTime::now();
         });
     };
-    let options =
-        RigOptions { serve_api, cache_dir, progress: Some(Box::new(progress)), ..RigOptions::new(runtime) };
+    let options = RigOptions {
+        serve_api,
+        cache_dir,
+        progress: Some(Box::new(progress)),
+        // Who can be asked how far it is streams at once.
+        draw_while_running: serve_api,
+        ..RigOptions::new(runtime)
+    };
     let rig = Rig::start(config, &options);
     let mut shared = shared.lock().unwrap_or_else(PoisonError::into_inner);
     shared.0.clear();

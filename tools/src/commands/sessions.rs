@@ -3,6 +3,7 @@
 use crate::context::Context;
 use crate::exit::Exit;
 use crate::out;
+use crate::printable;
 use anyhow::Result;
 use clap::ValueEnum;
 use depthrig_daemon::client::Client;
@@ -158,7 +159,8 @@ fn text(entries: &[CatalogEntry], folder: &str) -> String {
     lines.push(String::new());
     for e in &bad {
         let why = e.why.first().map_or("", String::as_str);
-        lines.push(format!("{}: {}: {why}", e.health.name(), e.path.display()));
+        let why = printable::line(why);
+        lines.push(format!("{}: {}: {why}", e.health.name(), printable::path(&e.path)));
     }
     let all = format!(
         "{}, {}, {}",

@@ -36,8 +36,8 @@ pub fn run(args: &StatusArgs, context: &Context) -> Result<Exit> {
     let print = |rig: &RigStatus| match (args.json, args.watch) {
         (true, false) => out::json(rig),
         (true, true) => out::json_line(rig),
-        (false, false) => out::line(view::status(rig, style)),
-        (false, true) => out::line(format_args!("{}\n", view::status(rig, style))),
+        (false, false) => out::styled(view::status(rig, style)),
+        (false, true) => out::styled(format_args!("{}\n", view::status(rig, style))),
     };
     let stop = args.watch.then(Stop::on_signals).transpose()?;
     loop {

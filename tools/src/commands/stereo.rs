@@ -1,9 +1,11 @@
 //! `depthrig stereo`: the disparity of one rectified pair of pictures.
 
 use crate::exit::{Exit, UsageError};
-use crate::out;
-use anyhow::{Context as _, Result};
+use crate::outfile::{OutFile, Overwrite};
+use crate::{out, picture};
+use anyhow::Result;
 use depthrig_bus::clock::thread_cpu_ns;
+use depthrig_calib::RowCorrector;
 use depthrig_calib::stereo::{
     DisparityMap, Gray, Matcher, OrderCheck, Parameters, Preset, RowCheck, RowOffset, SgmMatcher, StereoPair,
 };
@@ -44,12 +46,17 @@ pub struct StereoArgs {
     /// A PNG of how sure each disparity is
     #[arg(long, value_name = "FILE")]
     confidence: Option<PathBuf>,
+    #[command(flatten)]
+    overwrite: Overwrite,
     /// Threads
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64))]
     threads: u16,
     /// Match even if left and right look swapped
     #[arg(long)]
     even_if_swapped: bool,
+    /// Match rows as they are, even where they are measured to be apart
+    #[arg(long)]
+    keep_rows: bool,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -82,7 +89,7 @@ impl Picture {
     /// # Errors
     /// When one cannot be read.
     pub fn pair(left: &Path, right: &Path) -> Result<[Self; 2]> {
-        let pictures = [decoded(left)?, decoded(right)?];
+        let pictures = [picture::open(left)?, picture::open(right)?];
         if pictures.iter().all(|p| !wide(p)) {
             return Ok(pictures.map(|p| {
                 let (width, height) = (p.width() as usize, p.height() as usize);
@@ -130,14 +137,6 @@ impl Picture {
     }
 }
 
-/// The picture in a file.
-fn decoded(path: &Path) -> Result<DynamicImage> {
-    let told = || format!("{}: cannot be read as a picture; PNG, JPEG, PGM and PPM can", path.display());
-    let reader =
-        image::ImageReader::open(path).with_context(told)?.with_guessed_format().with_context(told)?;
-    reader.decode().with_context(told)
-}
-
 /// Whether it has more than 8 bits.
 fn wide(picture: &DynamicImage) -> bool {
     matches!(picture.color(), ColorType::L16 | ColorType::La16 | ColorType::Rgb16 | ColorType::Rgba16)
@@ -165,6 +164,8 @@ struct Report<'a> {
     filled_percent: f64,
     /// How far the rows of the two are apart, where the pictures say it.
     rows: Option<Rows>,
+    /// The right picture's rows were moved by that.
+    rows_corrected: bool,
     warnings: Vec<String>,
     /// CPU time of the calling thread, for the first pair of a matcher; `bench stereo` measures properly.
     cpu_ms: f64,
@@ -192,6 +193,11 @@ impl Rows {
 /// Matches a pair.
 pub fn run(args: &StereoArgs) -> Result<Exit> {
     let as_png = form(&args.out)?;
+    let inputs = [args.left.as_path(), args.right.as_path()];
+    let out = OutFile::new(&args.out, args.overwrite, &inputs)?;
+    let confidence = args.confidence.as_deref().map(|path| OutFile::new(path, args.overwrite, &inputs));
+    let confidence = confidence.transpose()?;
+    confidence.as_ref().map_or(Ok(()), |confidence| confidence.differs_from(&out))?;
     let [left, right] = Picture::pair(&args.left, &args.right)?;
     left.fits(&right)?;
     let pair = StereoPair::new(left.gray(), right.gray());
@@ -203,6 +209,18 @@ pub fn run(args: &StereoArgs) -> Result<Exit> {
     let mut rows = RowCheck::new(left.width, left.height);
     rows.look(&pair).map_err(usage)?;
     let offset = rows.offset();
+    let mut moved = Vec::new();
+    let corrected = offset.as_ref().filter(|o| o.is_significant() && !args.keep_rows);
+    if let Some(offset) = corrected {
+        let size = (left.width as u32, left.height as u32);
+        RowCorrector::new(size, offset).map_err(usage)?.correct(&right.gray(), &mut moved)?;
+    }
+    let is_corrected = corrected.is_some();
+    let pair = if is_corrected {
+        StereoPair::new(left.gray(), Gray::packed(&moved, left.width, left.height))
+    } else {
+        pair
+    };
     let parameters = Parameters::preset(args.preset, args.max_disparity.into());
     let mut matcher =
         SgmMatcher::new(left.width, left.height, &parameters, args.threads.into()).map_err(usage)?;
@@ -210,9 +228,9 @@ pub fn run(args: &StereoArgs) -> Result<Exit> {
     let start = thread_cpu_ns();
     matcher.run(&pair, &mut map)?;
     let cpu_ms = (thread_cpu_ns() - start) as f64 / 1e6;
-    out::file(&args.out, &if as_png { png(&map)? } else { npy(&map) })?;
-    if let Some(path) = &args.confidence {
-        out::file(path, &encoded(&map.confidence, &map, ExtendedColorType::L8)?)?;
+    out.write(&if as_png { png(&map)? } else { npy(&map) })?;
+    if let Some(confidence) = confidence {
+        confidence.write(&encoded(&map.confidence, &map, ExtendedColorType::L8)?)?;
     }
     let described = matcher.describe();
     let report = Report {
@@ -220,16 +238,20 @@ pub fn run(args: &StereoArgs) -> Result<Exit> {
         width: map.width,
         height: map.height,
         producer: described.producer,
-        parameters: described.parameters,
+        parameters: match &corrected {
+            Some(offset) => format!("{} {}", described.parameters, offset.describe_correction()),
+            None => described.parameters,
+        },
         vectors: matcher.form(),
         memory_bytes: described.memory_bytes,
         filled_percent: 100.0 * map.fill(),
         rows: offset.as_ref().map(Rows::of),
-        warnings: offset.and_then(|o| o.warning()).into_iter().collect(),
+        rows_corrected: is_corrected,
+        warnings: offset.and_then(|o| o.warning(is_corrected)).into_iter().collect(),
         cpu_ms,
     };
     for warning in &report.warnings {
-        eprintln!("warning: {}, {}: {warning}", args.left.display(), args.right.display());
+        out::note(format_args!("warning: {}, {}: {warning}", args.left.display(), args.right.display()));
     }
     if args.json {
         out::json(&report)?;

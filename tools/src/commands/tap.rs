@@ -4,6 +4,7 @@ mod motion;
 
 use crate::context::Context;
 use crate::exit::Exit;
+use crate::outfile::Overwrite;
 use crate::signals::Stop;
 use crate::{out, picture};
 use anyhow::{Context as _, Result};
@@ -31,6 +32,8 @@ pub struct TapArgs {
     /// Write each frame into this folder as PNG; depth as 16 bits with a preview in colours beside it
     #[arg(long, value_name = "DIR")]
     png: Option<PathBuf>,
+    #[command(flatten)]
+    overwrite: Overwrite,
     /// Print every sample of a motion unit, one JSON object per batch
     #[arg(long, conflicts_with = "png")]
     json: bool,
@@ -68,12 +71,12 @@ pub fn run(args: &TapArgs, context: &Context) -> Result<Exit> {
         }
         if let Some(folder) = &args.png {
             if seen == 1 {
-                std::fs::create_dir_all(folder)
+                depthrig_bus::umask::create_dir_all(folder)
                     .with_context(|| format!("{}: cannot be made", folder.display()))?;
             }
             let header = frame.header();
             let stem = format!("{}_{}_{:08}", header.camera(), header.stream(), header.sequence);
-            for path in picture::write_png(header, frame.pixels(), folder, &stem)? {
+            for path in picture::write_png(header, frame.pixels(), folder, &stem, args.overwrite)? {
                 out::line(format_args!("  {}", path.display()))?;
             }
         }

@@ -3,6 +3,7 @@
 use crate::context::Context;
 use crate::exit::Exit;
 use crate::out;
+use crate::printable;
 use crate::progress::Progress;
 use crate::signals::Stop;
 use anyhow::{Result, bail};
@@ -67,15 +68,15 @@ pub fn run(args: &VerifyArgs, context: &Context) -> Result<Exit> {
                 out::line(format_args!(
                     "{}: {}{at}: {}",
                     word(finding.severity),
-                    finding.file,
-                    finding.message
+                    printable::line(&finding.file),
+                    printable::line(&finding.message)
                 ))?;
             }
         }
         out::line(summary(&report))?;
         if context.global.quiet == 0 {
             for made in &report.computed {
-                out::line(format_args!("computed: {made}"))?;
+                out::line(format_args!("computed: {}", printable::line(&made.to_string())))?;
             }
         }
     }
@@ -94,7 +95,7 @@ pub fn summary(report: &VerifyReport) -> String {
     };
     format!(
         "{}: {verdict}; {}, {}{}, {} in {}",
-        report.path.display(),
+        printable::path(&report.path),
         out::count(report.sets, "set"),
         out::count(report.frames, "frame"),
         if report.decoded { " (every picture decoded)" } else { "" },

@@ -1,12 +1,12 @@
 //! A subscriber of the live rig: takes frame sets as a policy would, checks them and looks at their depth.
 
+use super::sheet::Shot;
 use super::{Checksums, checksum, is_depth, mode_name};
 use crate::picture;
 use anyhow::Result;
 use core::time::Duration;
 use depthrig_bus::{Bus, ErrorKind, Frame, FrameHeader, MemberRecord, SetSubscriber, StreamId, Subscriber};
 use depthrig_cdm::metrics::{Depth, DepthRange, compare, fill_rate};
-use image::RgbImage;
 use serde::Serialize;
 use std::collections::{BTreeMap, VecDeque};
 
@@ -23,6 +23,8 @@ const SAME_MOMENT_NS: i64 = 1_000_000;
 /// The same of depth and of the truth in colour's view: half of what their exposures differ by is latency that no clock
 /// map can know. Simulated streams of one rate expose at the same moments, 11 ms apart at the least.
 const SAME_MOMENT_IN_COLOR_NS: i64 = 5_000_000;
+/// Depths that are compared with the truth, metres.
+const COMPARED_M: core::ops::RangeInclusive<f32> = 0.1..=5.0;
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// What was seen of one camera's depth.
@@ -55,19 +57,53 @@ pub struct Seen {
     pub units_mm: BTreeMap<String, f64>,
     /// Refined depth by camera.
     pub refined: BTreeMap<String, RefinedSeen>,
-    /// The newest pictures by camera and stream: colour, each depth and refined depth, as colours.
-    pub pictures: BTreeMap<String, BTreeMap<String, RgbImage>>,
+    /// The newest images by camera and stream: colour, each depth, and depth before and after it was filled.
+    pub shots: BTreeMap<String, BTreeMap<String, Shot>>,
 }
 
-/// What was seen of one camera's refined depth.
+/// What was seen of one camera's refined depth: before and after, in the same view, on the same pixels.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct RefinedSeen {
     /// What refined it, as the frames say.
     pub engine: String,
     /// Frames that came.
     pub frames: u64,
-    /// Against the truth in the view of colour.
-    pub depth: DepthSeen,
+    /// Images compared.
+    pub compared: u64,
+    /// Share of pixels of colour's view with a depth before, percent.
+    pub before_percent: f64,
+    /// Share of pixels of colour's view with a depth after, percent.
+    pub after_percent: f64,
+    /// Mean of |depth - truth| before, over pixels with a depth before and after, millimetres; `None` without a truth.
+    pub before_mm: Option<f64>,
+    /// Mean of |depth - truth| after, over the same pixels.
+    pub after_mm: Option<f64>,
+    /// Mean of |depth - truth| over pixels that had no depth before and have one after; `None` without a truth or a hole.
+    pub holes_mm: Option<f64>,
+    #[serde(skip)]
+    sums: Sums,
+}
+
+/// Sums over the images compared.
+#[derive(Debug, Clone, Default)]
+struct Sums {
+    pixels: u64,
+    before: u64,
+    after: u64,
+    /// Pixels with a truth, and a depth before and after.
+    both: u64,
+    both_before_mm: f64,
+    both_after_mm: f64,
+    /// Pixels with a truth and a depth after alone.
+    holes: u64,
+    holes_mm: f64,
+}
+
+/// Refined depth with what it was made of, and the truth if there is one.
+struct Refined {
+    before: Copied,
+    after: Copied,
+    truth: Option<Copied>,
 }
 
 /// A frame that outlives its slot.
@@ -94,8 +130,8 @@ pub struct Watcher {
     seen: Seen,
     /// Depth and truth to be compared at the end.
     to_compare: Vec<Vec<(Copied, Option<Copied>)>>,
-    /// Refined depth and truth, likewise.
-    refined: Vec<(Copied, Copied)>,
+    /// Refined depth, likewise.
+    refined: Vec<Refined>,
 }
 
 impl Watcher {
@@ -128,27 +164,30 @@ impl Watcher {
             }
         }
         self.look_at_late_modes();
-        // Pictures for the report, from the last frames; nothing waits for this any more.
+        // Images for the report, from the last frames; nothing waits for this any more.
         for (id, input) in &self.inputs {
             let Some(frame) = input.kept.back() else { continue };
             let stream = id.stream.as_str();
-            if stream == "color" || stream == "depth_refined" || is_depth(stream) {
-                let picture = picture::to_rgb(frame.header(), frame.pixels())?;
-                let pictures = self.seen.pictures.entry(id.camera.to_string()).or_default();
-                pictures.insert(stream.to_owned(), picture);
+            if ["color", "depth_refined", "depth_aligned"].contains(&stream) || is_depth(stream) {
+                let header = frame.header();
+                let shot = match picture::depth_m(header, frame.pixels())? {
+                    Some(metres) => Shot::Depth { width: header.width, height: header.height, metres },
+                    None => Shot::Color(picture::to_rgb(header, frame.pixels())?),
+                };
+                let shots = self.seen.shots.entry(id.camera.to_string()).or_default();
+                shots.insert(stream.to_owned(), shot);
             }
         }
-        for (refined, truth) in &self.refined {
-            let seen = self.seen.refined.entry(refined.header.camera().to_owned()).or_default();
-            seen.depth.add(refined, Some(truth), SAME_MOMENT_IN_COLOR_NS)?;
+        for refined in &self.refined {
+            let seen = self.seen.refined.entry(refined.after.header.camera().to_owned()).or_default();
+            seen.add(refined)?;
         }
         for (depth, truth) in self.to_compare.iter().flatten() {
             let mode = mode_name(depth.header.camera(), depth.header.stream());
             let seen = self.seen.depth.entry(mode).or_default();
             seen.add(depth, truth.as_ref(), SAME_MOMENT_NS)?;
         }
-        for depth in self.seen.depth.values_mut().chain(self.seen.refined.values_mut().map(|r| &mut r.depth))
-        {
+        for depth in self.seen.depth.values_mut() {
             depth.fill_percent /= depth.pictures.max(1) as f64;
             let mean = |sum: f64| sum / depth.compared.max(1) as f64;
             depth.l1_mm = depth.l1_mm.map(mean);
@@ -187,23 +226,34 @@ impl Watcher {
         Ok(())
     }
 
-    /// Counts refined frames, and keeps some with the truth of their moment.
+    /// Counts refined frames, and keeps some with what they were made of and the truth of their moment.
     fn take_refined(&mut self) -> Result<()> {
         for (id, input) in self.inputs.iter().filter(|(id, _)| id.stream.as_str() == "depth_refined") {
             let Some(frame) = input.kept.back() else { continue };
             let seen = self.seen.refined.entry(id.camera.to_string()).or_default();
-            let before = core::mem::replace(&mut seen.frames, frame.header().sequence);
-            if before == seen.frames {
+            let last = core::mem::replace(&mut seen.frames, frame.header().sequence);
+            if last == seen.frames {
                 continue;
             }
             frame.header().refiner().clone_into(&mut seen.engine);
-            let truth = StreamId::new(id.camera.as_str(), "depth_true_color")?;
             let at = frame.header().capture_time_ns;
-            let same = |f: &&Frame| (f.header().capture_time_ns - at).abs() < SAME_MOMENT_IN_COLOR_NS;
-            let truth = self.inputs.get(&truth).and_then(|i| i.kept.iter().find(same));
-            let kept = self.refined.iter().filter(|(r, _)| r.header.camera() == id.camera.as_str()).count();
-            if let Some(truth) = truth.filter(|_| kept < REFINED_MOST) {
-                self.refined.push((Copied::of(frame), Copied::of(truth)));
+            let kept = |stream: &str, within_ns: i64| -> Result<Option<Copied>> {
+                let id = StreamId::new(id.camera.as_str(), stream)?;
+                let same = |f: &&Frame| (f.header().capture_time_ns - at).abs() < within_ns;
+                Ok(self.inputs.get(&id).and_then(|i| i.kept.iter().find(same)).map(Copied::of))
+            };
+            let of_camera = |r: &&Refined| r.after.header.camera() == id.camera.as_str();
+            if self.refined.iter().filter(of_camera).count() == REFINED_MOST {
+                continue;
+            }
+            if let Some(before) = kept("depth_aligned", SAME_MOMENT_NS)? {
+                let truth = kept("depth_true_color", SAME_MOMENT_IN_COLOR_NS)?;
+                // Where there is a truth it is waited for: a comparison without it says less.
+                let has_truth =
+                    self.inputs.contains_key(&StreamId::new(id.camera.as_str(), "depth_true_color")?);
+                if truth.is_some() || !has_truth {
+                    self.refined.push(Refined { before, after: Copied::of(frame), truth });
+                }
             }
         }
         Ok(())
@@ -256,6 +306,52 @@ impl Input {
     }
 }
 
+impl RefinedSeen {
+    /// Adds an image to the sums and brings the means up to date.
+    fn add(&mut self, refined: &Refined) -> Result<()> {
+        let metres = |c: &Copied| picture::depth_m(&c.header, &c.pixels);
+        let (Some(before), Some(after)) = (metres(&refined.before)?, metres(&refined.after)?) else {
+            return Ok(());
+        };
+        let truth = refined.truth.as_ref().map(metres).transpose()?.flatten().unwrap_or_default();
+        self.compared += 1;
+        self.sums.add(&before, &after, &truth);
+        let s = &self.sums;
+        let percent = |n: u64| 100.0 * n as f64 / s.pixels.max(1) as f64;
+        self.before_percent = percent(s.before);
+        self.after_percent = percent(s.after);
+        let mean = |sum: f64, n: u64| (n > 0).then(|| sum / n as f64);
+        self.before_mm = mean(s.both_before_mm, s.both);
+        self.after_mm = mean(s.both_after_mm, s.both);
+        self.holes_mm = mean(s.holes_mm, s.holes);
+        Ok(())
+    }
+}
+
+impl Sums {
+    /// Adds one image; `truth` is empty when there is none.
+    fn add(&mut self, before: &[f32], after: &[f32], truth: &[f32]) {
+        let is_depth = |z: f32| z.is_finite() && z > 0.0;
+        for (i, (before, after)) in before.iter().zip(after).enumerate() {
+            let was = is_depth(*before);
+            let is = is_depth(*after);
+            self.pixels += 1;
+            self.before += u64::from(was);
+            self.after += u64::from(is);
+            let Some(truth) = truth.get(i).copied().filter(|z| COMPARED_M.contains(z)) else { continue };
+            let off_mm = |z: f32| f64::from((z - truth).abs()) * 1e3;
+            if was && is {
+                self.both += 1;
+                self.both_before_mm += off_mm(*before);
+                self.both_after_mm += off_mm(*after);
+            } else if is {
+                self.holes += 1;
+                self.holes_mm += off_mm(*after);
+            }
+        }
+    }
+}
+
 impl DepthSeen {
     /// Sums are divided by the number of pictures at the end. The truth counts when it is `within` nanoseconds of `depth`.
     fn add(&mut self, depth: &Copied, truth: Option<&Copied>, within: i64) -> Result<()> {
@@ -267,7 +363,7 @@ impl DepthSeen {
         if let Some(truth) = truth.filter(same_moment)
             && let Some(true_metres) = picture::depth_m(&truth.header, &truth.pixels)?
         {
-            let range = DepthRange { min_m: 0.1, max_m: 5.0 };
+            let range = DepthRange { min_m: (*COMPARED_M.start()).into(), max_m: (*COMPARED_M.end()).into() };
             let metrics = compare(&Depth::Metres(&metres), &Depth::Metres(&true_metres), range)?;
             if metrics.valid > 0 {
                 self.compared += 1;
@@ -276,5 +372,26 @@ impl DepthSeen {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Filling that adds worse depth where there was none does not make the depth that was there look worse.
+    #[test]
+    fn before_and_after_are_told_on_the_same_pixels() {
+        let truth = [1.0, 1.0, 1.0, 2.0, 0.0];
+        let before = [1.1, 0.9, 0.0, 0.0, 1.0];
+        let after = [1.05, 0.9, 1.5, 0.0, 1.0];
+        let mut sums = Sums::default();
+        sums.add(&before, &after, &truth);
+        let near = |a: f64, b: f64| (a - b).abs() < 1e-3;
+        assert_eq!((sums.pixels, sums.before, sums.after, sums.both, sums.holes), (5, 3, 4, 2, 1));
+        assert!(near(sums.both_before_mm, 200.0) && near(sums.both_after_mm, 150.0), "{sums:?}");
+        assert!(near(sums.holes_mm, 500.0), "{sums:?}");
+        sums.add(&before, &after, &[]);
+        assert_eq!((sums.pixels, sums.both), (10, 2), "nothing is compared without a truth");
     }
 }

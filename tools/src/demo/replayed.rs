@@ -38,11 +38,6 @@ impl Replayed {
     pub const fn is_right(&self) -> bool {
         self.depth_different == 0 && self.wrong_headers == 0 && self.depth_equal > 0
     }
-
-    /// Whether everything was seen.
-    pub fn is_complete(&self) -> bool {
-        self.lost.is_empty() && self.received == self.published && self.depth_unknown == 0
-    }
 }
 
 /// Replays `dataset` as fast as it goes and checks what arrives.

@@ -8,8 +8,8 @@ use crate::commands::verify;
 use crate::exit::Exit;
 use crate::out;
 use depthrig_daemon::rig::RigSummary;
-use depthrig_daemon::status::{CameraStatus, RigStatus, StreamStatus};
-use depthrig_recorder::VerifyReport;
+use depthrig_daemon::status::{CameraState, CameraStatus, RefineState, RigStatus, StreamStatus};
+use depthrig_recorder::{SetDrop, VerifyReport};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -35,6 +35,8 @@ pub struct DemoReport {
     pub recorded: BTreeMap<String, u64>,
     /// Depth modes that the rig asks for and that are not there, with the reason.
     pub unavailable: Vec<String>,
+    /// Depth modes whose network was never trained.
+    pub untrained: Vec<String>,
     /// Sets that the subscriber got.
     pub sets_seen: u64,
     /// Frames of those sets that the subscriber did not have: those of the first set were sent before it subscribed.
@@ -56,24 +58,93 @@ pub struct DemoReport {
 }
 
 impl DemoReport {
-    /// 1 when something is wrong, 3 when something was lost.
+    /// 1 when something is wrong. Frames that a busy computer lost are counted and named, and nothing is wrong with that.
     pub fn exit(&self) -> Exit {
-        if verify::exit(&self.verify) == Exit::Failed || !self.replay.is_right() {
-            return Exit::Failed;
-        }
-        let whole = self.summary.lost.is_empty()
-            && verify::exit(&self.verify) == Exit::Good
-            && self.replay.is_complete()
-            && self.has_every_mode();
-        if whole { Exit::Good } else { Exit::Lost }
+        if self.wrong().is_empty() { Exit::Good } else { Exit::Failed }
     }
 
-    /// Whether pictures of each depth mode of the live rig are in the recording.
-    fn has_every_mode(&self) -> bool {
-        self.live.cameras.iter().all(|camera| {
-            depth_streams(camera)
-                .all(|(_, mode)| self.recorded.get(&mode).is_some_and(|pictures| *pictures > 0))
+    /// What is wrong, one line each.
+    fn wrong(&self) -> Vec<String> {
+        let mut wrong = Vec::new();
+        for camera in &self.summary.status.cameras {
+            let because =
+                |message: &Option<String>| message.clone().unwrap_or_else(|| "no reason known".into());
+            if camera.state == CameraState::Failed {
+                wrong.push(format!("camera {} failed: {}", camera.name, because(&camera.message)));
+            }
+            if let Some(refine) = camera.refine.as_ref().filter(|r| r.state == RefineState::Failed) {
+                wrong.push(format!("camera {}: no refined depth: {}", camera.name, because(&refine.message)));
+            }
+        }
+        wrong.extend(self.recording_fault());
+        if verify::exit(&self.verify) == Exit::Failed {
+            wrong.push(format!("the dataset: {}", verify::summary(&self.verify)));
+        }
+        if !self.replay.is_right() {
+            wrong.push("the replay differs from what was live".to_owned());
+        }
+        let silent =
+            self.summary.status.cameras.iter().flat_map(depth_streams).filter(|(s, _)| s.delivered == 0);
+        wrong.extend(silent.map(|(_, mode)| format!("{mode} gave no frame")));
+        wrong
+    }
+
+    /// Why the recording is not what it should be, unless the computer was only too busy for some of its sets.
+    fn recording_fault(&self) -> Option<String> {
+        let Some(summary) = &self.summary.recording else { return Some("nothing was recorded".to_owned()) };
+        let status = self.summary.status.recording.as_ref();
+        let is_busy =
+            |reason: &str| [SetDrop::EncoderBusy, SetDrop::DiskSlow].iter().any(|r| r.name() == reason);
+        let faults = status.map(|s| s.dropped.iter().filter(|(reason, n)| **n > 0 && !is_busy(reason)));
+        let faults: Vec<String> =
+            faults.into_iter().flatten().map(|(reason, n)| format!("{n} sets {reason}")).collect();
+        if faults.is_empty() && summary.sets.recorded > 0 {
+            return None;
+        }
+        let because = status.and_then(|s| s.error.as_deref()).unwrap_or("no set came");
+        Some(format!(
+            "the recording: {}{because}",
+            faults.iter().map(|f| format!("{f}; ")).collect::<Vec<_>>().concat()
+        ))
+    }
+
+    /// What was lost, in one line with what to do; `None` when nothing was. What gives way by design, as computed depth for
+    /// which a pair was too many, is not lost.
+    fn losses(&self) -> Option<String> {
+        let status = &self.summary.status;
+        let mut parts = Vec::new();
+        for camera in &status.cameras {
+            // The truth of a simulation is no camera's image.
+            let streams = camera.streams.iter().filter(|s| !s.id.contains("/depth_true"));
+            let frames: u64 = streams.map(lost_frames).sum();
+            if frames > 0 {
+                parts.push(format!("{frames} frames of {}", camera.name));
+            }
+        }
+        parts.extend(self.unrecorded().map(|mode| format!("every frame of {mode}")));
+        if let Some(recording) = &status.recording {
+            let sets: u64 = recording.dropped.values().sum();
+            if sets > 0 {
+                parts.push(format!("{sets} sets of the recording"));
+            }
+        }
+        let unpublished = self.replay.lost.len();
+        if unpublished > 0 {
+            parts.push(format!("{unpublished} reads of the replay"));
+        }
+        (!parts.is_empty()).then(|| {
+            format!(
+                "lost     {}: the computer was too busy, and each loss is counted in the dataset; close other programs and run it \
+                 again",
+                parts.join(", ")
+            )
         })
+    }
+
+    /// Depth modes of the live rig of which nothing is in the recording: each frame came too late for its set.
+    fn unrecorded(&self) -> impl Iterator<Item = String> {
+        let modes = self.live.cameras.iter().flat_map(depth_streams).map(|(_, mode)| mode);
+        modes.filter(|mode| self.recorded.get(mode).is_none_or(|images| *images == 0))
     }
 
     /// The report for people.
@@ -102,21 +173,21 @@ impl DemoReport {
             ),
             format!(
                 "{} record   {} sets, {} frames, {}",
-                ok(recording.is_some_and(|r| r.complete)),
+                ok(self.recording_fault().is_none()),
                 recording.map_or(0, |r| r.sets.recorded),
                 recording.map_or(0, |r| r.frames),
                 out::bytes(recording.map_or(0, |r| r.bytes))
             ),
             format!(
                 "{} modes    {} depth modes in it: {}",
-                ok(self.has_every_mode()),
+                ok(self.unrecorded().next().is_none()),
                 self.recorded.len(),
                 self.recorded.iter().map(|(mode, n)| format!("{mode} {n}")).collect::<Vec<_>>().join(", ")
             ),
-            format!("{} verify   {}", ok(self.verify.is_whole()), verify::summary(&self.verify)),
+            format!("{} verify   {}", ok(verify::exit(&self.verify) != Exit::Failed), verify::summary(&self.verify)),
             format!(
                 "{} replay   {} of {} frames received; {} depth pictures equal the live ones bit by bit, {} differ",
-                ok(self.replay.is_right() && self.replay.is_complete()),
+                ok(self.replay.is_right()),
                 self.replay.received,
                 self.replay.published,
                 self.replay.depth_equal,
@@ -125,11 +196,11 @@ impl DemoReport {
         ];
         lines.extend(self.unavailable.iter().map(|why| format!("--   mode     {why}")));
         lines.extend(self.refined_lines());
-        let lost = self.summary.lost.iter().chain(&self.replay.lost);
-        lines.extend(lost.map(|lost| format!("lost      {lost}")));
+        lines.extend(self.losses().map(|lost| format!("note {lost}")));
+        lines.extend(self.wrong().iter().map(|wrong| format!("LOOK wrong    {wrong}")));
         lines.push(String::new());
         lines.push(format!(
-            "pictures  {}  (colour, depth by mode, refined depth)",
+            "images    {}  (colour, depth, and depth with its holes filled, of each camera)",
             self.contact_sheet.display()
         ));
         lines.push(format!("report    {}", self.quality_report.display()));
@@ -152,32 +223,40 @@ impl DemoReport {
             "{verdict} refined  {frames} frames of depth_refined by {}, which fills holes along colour and uses no model",
             engine.unwrap_or("nothing")
         ));
-        let percent = |d: &DepthSeen| format!("{:.0} %", d.fill_percent);
-        let error = |d: &DepthSeen| d.strict_l1_mm.map_or_else(|| "-".into(), |mm| format!("{mm:.0} mm"));
+        let mm = |v: Option<f64>| v.map_or_else(|| "-".into(), |mm| format!("{mm:.1} mm"));
         let row = |(name, refined): (&String, &RefinedSeen)| {
-            let raw = self.depth.get(name);
             let live = self.live.cameras.iter().find(|c| c.name == *name).and_then(|c| c.refine.as_ref());
             let step = |s: &str| {
                 live.and_then(|r| r.steps_p50_ms.get(s)).map_or("-".into(), |ms| format!("{ms:.1}"))
             };
-            let made = &refined.depth;
-            let seen = made.pictures > 0;
+            let percent = |v: f64| if refined.compared > 0 { format!("{v:.0} %") } else { "-".into() };
             vec![
                 name.clone(),
-                raw.map_or_else(|| "-".into(), percent),
-                if seen { percent(made) } else { "-".into() },
-                raw.map_or_else(|| "-".into(), error),
-                error(made),
+                percent(refined.before_percent),
+                percent(refined.after_percent),
+                mm(refined.before_mm),
+                mm(refined.after_mm),
+                mm(refined.holes_mm),
                 step("wait"),
                 step("register"),
                 step("infer"),
             ]
         };
-        let header = &["camera", "raw", "filled", "raw error", "filled error", "wait ms", "register", "fill"];
+        let header = &[
+            "camera",
+            "before",
+            "after",
+            "error before",
+            "after",
+            "in holes",
+            "wait ms",
+            "register",
+            "fill",
+        ];
         lines.push(out::table(header, 1, self.refined.iter().map(row)));
         lines.push(
-            "raw and filled: pixels with depth; errors: mean distance from the true depth over every pixel that has one, a \
-             missing one counting as 0 m; raw in its own view, filled in that of colour, which sees more"
+            "before and after filling, both in the view of colour: pixels with a depth; mean distance from the true depth on \
+             the same pixels, those that had a depth before; and in the holes, which had none"
                 .to_owned(),
         );
         let s = &self.seeded;
@@ -198,8 +277,9 @@ impl DemoReport {
         let color = camera.streams.iter().find(|s| s.id.ends_with("/color"));
         let row = |(depth, mode): (&StreamStatus, String)| {
             let seen = self.depth.get(&mode);
+            let untrained = if self.untrained.contains(&mode) { " (untrained)" } else { "" };
             vec![
-                mode.clone(),
+                format!("{mode}{untrained}"),
                 camera.model.clone(),
                 camera.backend.clone(),
                 color.map_or_else(|| "-".into(), size),
@@ -207,7 +287,7 @@ impl DemoReport {
                 self.units(&mode),
                 format!("{:.1}", depth.rate_hz),
                 depth.delivered.to_string(),
-                depth.dropped.values().sum::<u64>().to_string(),
+                lost_frames(depth).to_string(),
                 format!("{:.1}", depth.latency_p99_ms),
                 format!("{:+.1}", depth.clock.rate_ppm),
                 format!("{:.0}", depth.clock.uncertainty_us),
@@ -222,6 +302,23 @@ impl DemoReport {
         let unit = self.units_mm.get(mode).copied();
         unit.map_or_else(|| "-".into(), |mm| format!("{}", (mm * 1e6).round() / 1e6))
     }
+}
+
+/// Frames of a stream that were lost.
+fn lost_frames(stream: &StreamStatus) -> u64 {
+    if stream.derived { 0 } else { lost(&stream.id, &stream.dropped) }
+}
+
+/// Frames of a stream that were lost, of those dropped. What is computed here from other streams gives way when it is too
+/// much, by design.
+fn lost(id: &str, dropped: &BTreeMap<String, u64>) -> u64 {
+    let by_design = |reason: &str| reason == "queue_full" && is_computed(id);
+    dropped.iter().filter(|(reason, _)| !by_design(reason)).map(|(_, n)| n).sum()
+}
+
+/// Whether a stream is made by stereo matching.
+fn is_computed(id: &str) -> bool {
+    id.split_once('/').is_some_and(|(_, s)| s.starts_with("depth_") || s.starts_with("confidence_"))
 }
 
 /// The streams of a camera that are depth modes, with their names.
@@ -244,6 +341,14 @@ pub fn modes<'a>(streams: impl IntoIterator<Item = (&'a str, u64)>) -> BTreeMap<
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_gives_way_by_design_is_not_lost() {
+        let dropped = BTreeMap::from([("queue_full".to_owned(), 7), ("device_error".to_owned(), 2)]);
+        assert_eq!(lost("d435/depth", &dropped), 9);
+        assert_eq!(lost("zed2i/depth_ultra", &dropped), 2);
+        assert_eq!(lost("zed2i/confidence_ultra", &dropped), 2);
+    }
 
     #[test]
     fn the_modes_of_a_dataset_are_its_depth_streams() {

@@ -6,7 +6,7 @@ use crate::context::private_folder;
 use anyhow::{Context as _, Result};
 use core::time::Duration;
 use depthrig_bus::{Bus, HostTime, Name, RuntimeDir, StageStep};
-use depthrig_cdm::Encoder;
+use depthrig_cdm::{Encoder, Precision};
 use depthrig_daemon::config::{EngineChoice, RefineConfig, RefineModel, RigConfig};
 use depthrig_daemon::rig::{Rig, RigOptions};
 use depthrig_daemon::status::RefineState;
@@ -38,6 +38,10 @@ pub struct Seeded {
 
 /// Makes a model of random numbers and runs it in a rig of one simulated camera until its first frame.
 pub fn run() -> Result<Seeded> {
+    // Looked for first: a rig that asks for the engine and does not find its library logs an error.
+    if let Err(why) = depthrig_cdm::find_library(None, "cpu", Precision::Fp32) {
+        return Ok(Seeded { missing: Some(why.to_string()), ..Seeded::default() });
+    }
     let folder = tempfile::tempdir().context("no folder for the random weights")?;
     let weights = folder.path().join("vits.safetensors");
     depthrig_cdm::weights::write_seeded(Encoder::Vits, 7, &weights)?;

@@ -5,7 +5,7 @@ use super::{Job, Loaded, Source};
 use crate::picture::depth_m;
 use anyhow::{Context, Result, bail};
 use depthrig_bus::{FrameHeader, PixelFormat, StreamName};
-use depthrig_calib::{Method, PoseExt, Registration, same_view};
+use depthrig_calib::{PoseExt, Registration, same_view};
 use depthrig_recorder::{Dataset, DatasetFrame, PixelMode, SetRange, Sets};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -180,10 +180,7 @@ impl Shared {
             registration
         } else {
             let between = pb.inverse().compose(&pa);
-            // Cameras that look in different directions need the surfaces; others the rule of their makers.
-            let is_parallel = between.rotation_xyzw[..3].iter().all(|v| v.abs() < 1e-3);
-            let method = if is_parallel { Method::Splat } else { Method::Triangles };
-            Registration::new(&ka, sa, &kb, sb, &between, method).with_context(what)?
+            Registration::new(&ka, sa, &kb, sb, &between).with_context(what)?
         };
         let pixels = rows(a, &frame.decoded()?)?;
         let mut out = vec![0u16; sb.0 as usize * sb.1 as usize];

@@ -190,7 +190,7 @@ impl Source for Files {
 }
 
 fn color(path: &Path) -> Result<(FrameHeader, Vec<u8>)> {
-    let image = image::open(path).with_context(|| format!("{}: cannot be read", path.display()))?.into_rgb8();
+    let image = crate::picture::open(path)?.into_rgb8();
     let mut header = FrameHeader::default();
     header.set_picture(PixelFormat::Rgb8, image.width(), image.height());
     Ok((header, image.into_raw()))

@@ -1,6 +1,7 @@
 //! Depth out of picture files: 16-bit PNG and TIFF in some unit, NPY and TIFF in metres.
 
 use anyhow::{Context, Result, bail};
+use depthrig_bus::files;
 use std::path::Path;
 
 /// The largest side of a picture that is read.
@@ -24,7 +25,7 @@ pub const ENDINGS: [&str; 4] = ["png", "npy", "tiff", "tif"];
 /// range ended, and is a hole.
 pub fn depth(path: &Path, unit_m: f64) -> Result<Metres> {
     let read = || -> Result<Metres> {
-        let bytes = std::fs::read(path)?;
+        let bytes = files::read(path, files::IMAGE_MAX_BYTES)?;
         match path.extension().and_then(|e| e.to_str()).map(str::to_lowercase).as_deref() {
             Some("npy") => npy(&bytes, unit_m),
             Some("tif" | "tiff") => tiff(&bytes, unit_m),

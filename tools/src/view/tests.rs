@@ -1,7 +1,7 @@
 //! What a status looks like.
 
 use super::*;
-use depthrig_daemon::status::{ClockStatus, SetAccount, SetStatus, SharedMemoryStatus};
+use depthrig_daemon::status::{ClockStatus, RefineStatus, SetAccount, SetStatus, SharedMemoryStatus};
 
 fn stream(id: &str, lost: u64) -> StreamStatus {
     StreamStatus {
@@ -56,6 +56,7 @@ fn rig() -> RigStatus {
         pid: 42,
         uptime_s: 30.1,
         utc_ns: 0,
+        preparing: None,
         cameras: vec![
             camera("d435", CameraState::Streaming, None, 0),
             camera("l515", CameraState::Reconnecting, Some("unplugged"), 3),
@@ -87,6 +88,38 @@ fn a_motion_unit_has_no_picture_and_the_rate_of_its_samples() {
         let words: Vec<_> = line.split_whitespace().collect();
         assert!(words.contains(&"motion") && words.contains(&"400.0") && !line.contains("64x1"), "{line}");
     }
+}
+
+#[test]
+fn superseded_refined_frames_are_not_lost() {
+    let mut rig = rig();
+    let refined = StreamStatus {
+        derived: true,
+        nominal_hz: 5.0,
+        dropped: [("queue_full".to_owned(), 70), ("no_slot".to_owned(), 2)].into(),
+        ..stream("d435/depth_refined", 0)
+    };
+    rig.cameras[0].streams.push(refined);
+    rig.cameras[0].refine = Some(RefineStatus {
+        state: RefineState::Running,
+        state_for_s: 60.0,
+        message: None,
+        engine: "fill".into(),
+        model: String::new(),
+        nominal_hz: 5.0,
+        rate_hz: 4.9,
+        skipped: BTreeMap::new(),
+        not_due: 1500,
+        restarts: 0,
+        steps_p50_ms: BTreeMap::new(),
+        steps_p99_ms: BTreeMap::new(),
+    });
+    let text = status(&rig, Style { width: 160, color: false });
+    let line = text.lines().find(|l| l.starts_with("d435/depth_refined")).unwrap();
+    let words: Vec<_> = line.split_whitespace().collect();
+    assert!(words.contains(&"2") && !words.contains(&"72"), "{line}");
+    let line = text.lines().find(|l| l.starts_with("refined")).unwrap();
+    assert!(line.contains("4.9 of 5.0 Hz (limited by rate_hz of [camera.refine]; camera 30.0 Hz)"), "{line}");
 }
 
 #[test]

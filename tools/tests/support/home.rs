@@ -117,7 +117,7 @@ impl Home {
         let manifest = include_str!("manifest.toml");
         self.write("pictures.toml", manifest);
         let text = format!(
-            "rig = \"{rig}\"\n[recording]\nreserve_mb = 16\n\n[[camera]]\nname = \"desk\"\nbackend = \"files\"\nmanifest = \"pictures.toml\"\n"
+            "rig = \"{rig}\"\n[recording]\nallow = [\"data\"]\nreserve_mb = 16\n\n[[camera]]\nname = \"desk\"\nbackend = \"files\"\nmanifest = \"pictures.toml\"\n"
         );
         self.write("rig.toml", &text)
     }

@@ -73,7 +73,10 @@ pub fn run(args: &FetchArgs, context: &Context) -> Result<Exit> {
     if let Some(p) =
         published::published(&args.name).filter(|_| args.url.is_none() && context.global.quiet == 0)
     {
-        eprintln!("{}: licence {}; see https://huggingface.co/{}", p.name, p.licence, p.repository);
+        out::note(format_args!(
+            "{}: licence {}; see https://huggingface.co/{}",
+            p.name, p.licence, p.repository
+        ));
     }
     let stop = Stop::on_signals()?;
     let mut bar = Progress::new(context.global.quiet > 0);

@@ -2,8 +2,9 @@
 
 use super::store::{Channels, Models, usage};
 use crate::exit::{Exit, UsageError};
-use crate::out;
-use anyhow::{Context as _, Result};
+use crate::outfile::{OutFile, Overwrite};
+use crate::{out, picture};
+use anyhow::Result;
 use depthrig_cdm::{
     Color, ColorFormat, EngineKind, Job, Output, Precision, RawDepth, RefinerOptions, StepTimes, refiner,
 };
@@ -18,7 +19,7 @@ Colour and depth must show the same view at the same size: depth registered to c
 OUT.npy holds 32-bit floats, metres (0 where there is none), or 1/m as the network gives them with --inverse.
 OUT.png holds 16 bits in units of --out-unit.
 
-Exit codes: 0 good, 1 failed, 2 wrong usage or pictures that do not fit.
+Exit codes: 0 good, 1 failed, 2 wrong usage or pictures that do not fit, 3 written, but it holds no depth.
 
 Examples:
   depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.001 --model cdm-d435 --out refined.npy
@@ -36,7 +37,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "FILE")]
     depth: PathBuf,
     /// Metres per unit of the raw depth
-    #[arg(long, value_name = "METRES", value_parser = unit)]
+    #[arg(long, value_name = "METRES", value_parser = crate::cli::depth_unit_m)]
     depth_unit: f64,
     /// The name of an installed model, or a checkpoint file
     #[arg(long, value_name = "NAME|FILE", required_unless_present = "engine")]
@@ -53,8 +54,10 @@ pub struct RunArgs {
     /// The file to write, .npy or .png
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
+    #[command(flatten)]
+    overwrite: Overwrite,
     /// Metres per unit of a PNG that is written
-    #[arg(long, value_name = "METRES", value_parser = unit, default_value_t = 0.001)]
+    #[arg(long, value_name = "METRES", value_parser = crate::cli::depth_unit_m, default_value_t = 0.001)]
     out_unit: f64,
     /// Order of the colour channels, in place of the model's
     #[arg(long, value_enum, value_name = "ORDER")]
@@ -98,13 +101,6 @@ pub fn precision(text: &str) -> Result<Precision, String> {
 }
 
 /// Metres per unit of depth.
-fn unit(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(unit) if unit > 0.0 && unit <= 1.0 => Ok(unit),
-        _ => Err("write the metres of one unit, such as 0.001 for millimetres".to_owned()),
-    }
-}
-
 fn metres(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(m) if m > 0.0 && m.is_finite() => Ok(m),
@@ -131,6 +127,8 @@ struct Report<'a> {
     raw_percent: f64,
     /// Pixels with refined depth, percent.
     refined_percent: f64,
+    /// What is wrong with what came out, or with what went in.
+    warnings: Vec<String>,
     prepare_ms: f64,
     infer_ms: f64,
     finish_ms: f64,
@@ -145,9 +143,13 @@ enum Refined {
 /// Refines.
 pub fn run(args: &RunArgs) -> Result<Exit> {
     let as_png = form(args)?;
+    let model = args.model.as_deref().map(Path::new);
+    let inputs: Vec<&Path> = [args.rgb.as_path(), &args.depth].into_iter().chain(model).collect();
+    let out = OutFile::new(&args.out, args.overwrite, &inputs)?;
     let (color, width, height) = read_color(&args.rgb)?;
     let depth = read_depth(&args.depth, &args.rgb, (width, height))?;
     let options = options(args)?;
+    let max_depth_m = options.model.as_ref().map_or(f64::INFINITY, |m| m.max_depth_m);
     let trained = options.model.as_ref().map(depthrig_cdm::Model::is_trained);
     let mut refiner = refiner(&options).map_err(usage)?;
     let mut refined =
@@ -164,8 +166,10 @@ pub fn run(args: &RunArgs) -> Result<Exit> {
     };
     refiner.refine(core::slice::from_mut(&mut job)).map_err(usage)?;
     let steps = job.steps;
-    write(&args.out, &refined, width, height)?;
+    out.write(&encoded(&refined, width, height)?)?;
     let described = refiner.describe();
+    let limit_m = (!described.model.is_empty()).then(|| args.max_depth.unwrap_or(max_depth_m));
+    let input = InputDepth::of(&depth, args.depth_unit, limit_m);
     let share = |n: usize| 100.0 * n as f64 / depth.len() as f64;
     let seen = match &refined {
         Refined::Units(p) => p.iter().filter(|d| **d > 0).count(),
@@ -188,12 +192,89 @@ pub fn run(args: &RunArgs) -> Result<Exit> {
         trained,
         raw_percent: share(depth.iter().filter(|d| **d > 0 && **d < u16::MAX).count()),
         refined_percent: share(seen),
+        warnings: [
+            input.warning(),
+            suspicious(&refined, args, !described.model.is_empty() && input.usable > 0),
+        ]
+        .into_iter()
+        .flatten()
+        .collect(),
         prepare_ms: steps.prepare_ns as f64 / 1e6,
         infer_ms: steps.infer_ns as f64 / 1e6,
         finish_ms: steps.finish_ns as f64 / 1e6,
     };
+    for warning in &report.warnings {
+        eprintln!("warning: {}: {warning}", args.depth.display());
+    }
     tell(&report, args.json)?;
-    Ok(Exit::Good)
+    Ok(if seen == 0 { Exit::Lost } else { Exit::Good })
+}
+
+/// Raw depth by what the refiner makes of it.
+struct InputDepth {
+    pixels: usize,
+    usable: usize,
+    /// Measured, and farther than the model looks.
+    beyond: usize,
+    limit_m: f64,
+    unit_m: f64,
+}
+
+impl InputDepth {
+    fn of(depth: &[u16], unit_m: f64, limit_m: Option<f64>) -> Self {
+        let limit_m = limit_m.unwrap_or(f64::INFINITY);
+        let measured = depth.iter().filter(|d| **d > 0 && **d < u16::MAX);
+        let all = measured.clone().count();
+        let beyond = measured.filter(|d| f64::from(**d) * unit_m > limit_m).count();
+        Self { pixels: depth.len(), usable: all - beyond, beyond, limit_m, unit_m }
+    }
+
+    fn warning(&self) -> Option<String> {
+        let Self { pixels, usable, beyond, limit_m, unit_m } = self;
+        let cure = format!(
+            "check --depth-unit, which is {unit_m} m (0.001 for millimetres, 0.0001 for most D405), or raise --max-depth"
+        );
+        match (usable, beyond) {
+            (0, 0) => Some(format!(
+                "none of its {pixels} pixels has depth: 0 and 65535 are holes. Nothing is refined without any; check the file"
+            )),
+            (0, _) => Some(format!(
+                "all depth in it ({beyond} pixels) lies beyond {limit_m} m, where the model takes it for holes: nothing is \
+                 refined; {cure}"
+            )),
+            (usable, beyond) if beyond > usable => Some(format!(
+                "{:.0} % of its depth lies beyond {limit_m} m and counts as holes; {cure}",
+                100.0 * *beyond as f64 / (beyond + usable) as f64
+            )),
+            _ => None,
+        }
+    }
+}
+
+/// The farthest depth that a model for cameras of arm's reach may be right about, metres: that of the official class.
+const FARTHEST_M: f32 = 20.0;
+/// The share of a result without plausible depth that is worth a warning.
+const IMPLAUSIBLE: f64 = 0.05;
+
+/// What a network with damaged weights gives: numbers, but no depth.
+fn suspicious(refined: &Refined, args: &RunArgs, is_model: bool) -> Option<String> {
+    let plausible = |metres: f32| metres > 0.0 && metres <= FARTHEST_M;
+    let good = |value: f32| plausible(if args.inverse { value.recip() } else { value });
+    let (total, wrong) = match refined {
+        Refined::Units(p) => {
+            let unit = args.out_unit as f32;
+            (p.len(), p.iter().filter(|d| !plausible(f32::from(**d) * unit)).count())
+        }
+        Refined::Floats(p) => (p.len(), p.iter().filter(|d| !good(**d)).count()),
+    };
+    let share = wrong as f64 / total.max(1) as f64;
+    (is_model && share > IMPLAUSIBLE).then(|| {
+        format!(
+            "{:.0} % of the result is missing or beyond {FARTHEST_M} m: the weights may be damaged or of another training \
+             (`depthrig cdm info NAME --check`), --channel-order may be another, or --out-unit too small",
+            share * 100.0
+        )
+    })
 }
 
 fn tell(r: &Report<'_>, json: bool) -> Result<()> {
@@ -260,16 +341,9 @@ fn options(args: &RunArgs) -> Result<RefinerOptions> {
     })
 }
 
-fn decode(path: &Path) -> Result<DynamicImage> {
-    let told = || format!("{}: cannot be read as a picture", path.display());
-    let reader =
-        image::ImageReader::open(path).with_context(told)?.with_guessed_format().with_context(told)?;
-    reader.decode().with_context(told)
-}
-
 /// Colour as red, green, blue, 8 bits each; grey becomes all three, and transparency is left out.
 fn read_color(path: &Path) -> Result<(Vec<u8>, usize, usize)> {
-    let picture = decode(path)?;
+    let picture = picture::open(path)?;
     if picture.color().bytes_per_pixel() / picture.color().channel_count() != 1 {
         let text = format!("{}: colour has more than 8 bits a channel; write it with 8", path.display());
         return Err(UsageError(text).into());
@@ -281,7 +355,7 @@ fn read_color(path: &Path) -> Result<(Vec<u8>, usize, usize)> {
 
 /// Depth of the size of its colour.
 fn read_depth(path: &Path, rgb: &Path, size: (usize, usize)) -> Result<Vec<u16>> {
-    let picture = decode(path)?;
+    let picture = picture::open(path)?;
     let has = (picture.width() as usize, picture.height() as usize);
     if has != size {
         return Err(UsageError(format!(
@@ -299,7 +373,12 @@ fn read_depth(path: &Path, rgb: &Path, size: (usize, usize)) -> Result<Vec<u16>>
     }
     match picture {
         DynamicImage::ImageLuma16(depth) => Ok(depth.into_raw()),
-        DynamicImage::ImageLuma8(depth) => Ok(depth.into_raw().into_iter().map(u16::from).collect()),
+        DynamicImage::ImageLuma8(_) => Err(UsageError(format!(
+            "{}: has 8 bits a pixel, which hold 255 depths at the most and are mostly a preview; depth is a PNG of one channel of \
+             16 bits",
+            path.display()
+        ))
+        .into()),
         other => Err(UsageError(format!(
             "{}: is a picture in {:?}; depth is a PNG of one channel of 16 bits",
             path.display(),
@@ -309,9 +388,9 @@ fn read_depth(path: &Path, rgb: &Path, size: (usize, usize)) -> Result<Vec<u16>>
     }
 }
 
-/// Writes the result.
-fn write(path: &Path, refined: &Refined, width: usize, height: usize) -> Result<()> {
-    let bytes = match refined {
+/// The file that holds the result.
+fn encoded(refined: &Refined, width: usize, height: usize) -> Result<Vec<u8>> {
+    Ok(match refined {
         Refined::Floats(pixels) => {
             let data: Vec<_> = pixels.iter().flat_map(|d| d.to_le_bytes()).collect();
             depthrig_recorder::npy_file("<f4", &[height, width], &data)
@@ -328,6 +407,5 @@ fn write(path: &Path, refined: &Refined, width: usize, height: usize) -> Result<
             )?;
             file
         }
-    };
-    out::file(path, &bytes)
+    })
 }

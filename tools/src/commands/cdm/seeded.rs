@@ -1,7 +1,8 @@
 //! `depthrig cdm seeded`: a model of random numbers, labelled as such.
 
-use crate::exit::{Exit, UsageError};
+use crate::exit::Exit;
 use crate::out;
+use crate::outfile::{OutFile, Overwrite};
 use anyhow::Result;
 use depthrig_cdm::Encoder;
 use depthrig_cdm::weights::write_seeded;
@@ -29,9 +30,9 @@ pub struct SeededArgs {
     /// What the numbers follow from
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
-    /// Replace a file that is there
-    #[arg(long)]
-    replace: bool,
+    /// Replace the file if it exists
+    #[arg(long, alias = "replace")]
+    overwrite: bool,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -55,11 +56,8 @@ pub fn encoder(text: &str) -> Result<Encoder, String> {
 
 /// Writes it.
 pub fn run(args: &SeededArgs) -> Result<Exit> {
-    let SeededArgs { encoder, out, seed, replace, json } = args;
-    if out.exists() && !replace {
-        let text = format!("{} is there already; name another file, or say --replace", out.display());
-        return Err(UsageError(text).into());
-    }
+    let SeededArgs { encoder, out, seed, overwrite, json } = args;
+    OutFile::new(out, Overwrite { overwrite: *overwrite }, &[])?;
     write_seeded(*encoder, *seed, out)?;
     if *json {
         out::json(&Report { path: out, encoder: *encoder, seed: *seed, trained: false })?;

@@ -210,7 +210,7 @@ pub fn import(args: &ImportArgs, context: &Context) -> Result<Exit> {
     let name = name.clone().map_or_else(|| name_of(file), Ok)?;
     let (store, stop) = (models.store()?, Stop::on_signals()?);
     let installed = Weights::open(file).and_then(|weights| {
-        let source = Source::file(&weights);
+        let source = Source::file(&weights)?;
         install(&store, &weights, settings.import(&name, *encoder, source), &stop, context)
     });
     let installed = match installed {

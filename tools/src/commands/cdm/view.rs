@@ -3,15 +3,15 @@
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
 use crate::out;
+use crate::outfile::{OutFile, Overwrite};
 use anyhow::{Context as _, Result, bail};
-use depthrig_bus::{FrameHeader, Intrinsics, PixelFormat};
-use depthrig_calib::{Method, PoseExt, Registration, same_view};
+use depthrig_bus::{FrameHeader, Intrinsics, PixelFormat, files};
+use depthrig_calib::{PoseExt, Registration, same_view};
 use depthrig_recorder::{Dataset, DatasetFrame, DatasetSet, PixelMode};
 use image::RgbImage;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
-mod font;
 mod page;
 mod panels;
 
@@ -51,7 +51,7 @@ pub struct ViewArgs {
     #[arg(long, value_name = "FILE", requires = "rgb")]
     depth: Option<PathBuf>,
     /// Metres per unit of raw depth, and of refined depth when that is a PNG
-    #[arg(long, value_name = "METRES", requires = "rgb")]
+    #[arg(long, value_name = "METRES", requires = "rgb", value_parser = crate::cli::depth_unit_m)]
     depth_unit: Option<f64>,
     /// Refined depth: .npy of 32-bit floats in metres, or a PNG of 16 bits
     #[arg(long, value_name = "FILE", requires = "rgb")]
@@ -62,6 +62,8 @@ pub struct ViewArgs {
     /// What the files are named, without their endings
     #[arg(long, value_name = "PREFIX")]
     out: PathBuf,
+    #[command(flatten)]
+    overwrite: Overwrite,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -101,27 +103,29 @@ struct Report {
 
 /// Looks.
 pub fn run(args: &ViewArgs, _: &Context) -> Result<Exit> {
-    let look = match &args.dataset {
-        Some(dataset) => from_dataset(args, dataset)?,
-        None => from_files(args)?,
-    };
     let with = |ending: &str| {
         let mut name = args.out.clone().into_os_string();
         name.push(ending);
         PathBuf::from(name)
     };
-    let (picture, page) = (with(".png"), with(".html"));
-    let cannot = |path: &Path| format!("{} cannot be written", path.display());
-    panels::draw(&look).save(&picture).with_context(|| cannot(&picture))?;
-    std::fs::write(&page, page::write(&look)?).with_context(|| cannot(&page))?;
+    let inputs: Vec<&Path> =
+        [&args.rgb, &args.depth, &args.refined].into_iter().flatten().map(AsRef::as_ref).collect();
+    let picture = OutFile::new(&with(".png"), args.overwrite, &inputs)?;
+    let page = OutFile::new(&with(".html"), args.overwrite, &inputs)?;
+    let look = match &args.dataset {
+        Some(dataset) => from_dataset(args, dataset)?,
+        None => from_files(args)?,
+    };
+    picture.write(&crate::picture::png(&panels::draw(&look))?)?;
+    page.write(page::write(&look)?.as_bytes())?;
     let filled =
         |depth: &[f32]| depth.iter().filter(|z| **z > 0.0).count() as f64 / depth.len().max(1) as f64;
     let report = Report {
         raw_filled: filled(&look.raw),
         refined_filled: filled(&look.refined),
         median_difference_m: median_difference(&look),
-        picture,
-        page,
+        picture: picture.path().to_owned(),
+        page: page.path().to_owned(),
     };
     if args.json {
         out::json(&report)?;
@@ -217,7 +221,7 @@ fn in_view(color: &DatasetFrame, depth: &DatasetFrame) -> Result<Vec<f32>> {
         raw.iter().map(|z| (f64::from(*z) / unit + 0.5).clamp(0.0, 65_535.0) as u16).collect();
     let between = c.pose.inverse().compose(&d.pose);
     let mut out = vec![0; c.width as usize * c.height as usize];
-    Registration::new(&d.intrinsics, d_size, &c.intrinsics, c_size, &between, Method::Splat)?
+    Registration::new(&d.intrinsics, d_size, &c.intrinsics, c_size, &between)?
         .depth_to_color(&units, unit, &mut out)?;
     Ok(out.iter().map(|z| (f64::from(*z) * unit) as f32).collect())
 }
@@ -228,10 +232,7 @@ fn from_files(args: &ViewArgs) -> Result<Look> {
     else {
         return Err(usage("give --dataset, or --rgb, --depth, --depth-unit and --refined".to_owned()));
     };
-    if unit.is_nan() || unit <= 0.0 {
-        return Err(usage(format!("a depth unit of {unit} m is none; 0.001 is a millimetre")));
-    }
-    let color = open(rgb)?.into_rgb8();
+    let color = crate::picture::open(rgb)?.into_rgb8();
     let size = color.dimensions();
     let raw = read_depth(depth, unit, size)?;
     let refined_depth = read_depth(refined, unit, size)?;
@@ -251,20 +252,17 @@ fn from_files(args: &ViewArgs) -> Result<Look> {
     })
 }
 
-fn open(path: &Path) -> Result<image::DynamicImage> {
-    image::open(path).with_context(|| format!("{} cannot be read as a picture", path.display()))
-}
-
 /// Depth of a file in metres: 32-bit floats of NumPy, or 16 bits in units.
 fn read_depth(path: &Path, unit: f64, (w, h): (u32, u32)) -> Result<Vec<f32>> {
     let pixels = w as usize * h as usize;
     if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("npy")) {
-        let bytes = std::fs::read(path).with_context(|| format!("{} cannot be read", path.display()))?;
+        let bytes = files::read(path, files::IMAGE_MAX_BYTES)
+            .with_context(|| format!("{} cannot be read", path.display()))?;
         return npy(&bytes, (w, h)).with_context(|| {
             format!("{} is no NumPy array of {h} rows and {w} columns of 32-bit floats", path.display())
         });
     }
-    let image::DynamicImage::ImageLuma16(picture) = open(path)? else {
+    let image::DynamicImage::ImageLuma16(picture) = crate::picture::open(path)? else {
         bail!("{} is not grey of 16 bits", path.display());
     };
     if picture.len() != pixels {

@@ -89,7 +89,7 @@ pub struct ReplayArgs {
     #[arg(long, value_name = "METRES", default_value_t = 20.0)]
     max_depth: f64,
     /// Metres per unit of depth
-    #[arg(long, value_name = "METRES", default_value_t = 0.001)]
+    #[arg(long, value_name = "METRES", default_value_t = 0.001, value_parser = crate::cli::depth_unit_m)]
     depth_unit: f64,
     /// How rectified colour is stored
     #[arg(long, value_enum, default_value = "jpeg")]

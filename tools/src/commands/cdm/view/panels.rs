@@ -1,7 +1,7 @@
 //! Four panels: colour, raw depth, refined depth, and their difference from 0 to 0.2 m, each with its legend.
 
 use super::Look;
-use super::font;
+use crate::font;
 use crate::turbo::{depth_color, turbo};
 use image::{Rgb, RgbImage};
 

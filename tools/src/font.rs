@@ -3,7 +3,7 @@
 use image::{Rgb, RgbImage};
 
 /// Pixels from one letter to the next.
-pub(super) const ADVANCE: u32 = 4;
+pub const ADVANCE: u32 = 4;
 
 /// Rows from the top, three bits each, the highest bit leftmost.
 const fn glyph(c: char) -> u16 {
@@ -59,7 +59,7 @@ const fn glyph(c: char) -> u16 {
 }
 
 /// Writes `text` in capitals with its top left corner at (x, y), each pixel of a letter `size` pixels wide.
-pub(super) fn text(image: &mut RgbImage, (x, y): (u32, u32), size: u32, color: Rgb<u8>, text: &str) {
+pub fn text(image: &mut RgbImage, (x, y): (u32, u32), size: u32, color: Rgb<u8>, text: &str) {
     for (n, c) in text.chars().enumerate() {
         let bits = glyph(c.to_ascii_uppercase());
         for at in (0..15u32).filter(|at| bits >> (14 - at) & 1 == 1) {
