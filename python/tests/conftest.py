@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from depthrig._bus import Bus
+from limits import *  # noqa: F403
 from rig import Publisher, build_publisher
 
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +29,16 @@ def build_publisher() -> str:
     paths = [m["executable"] for m in messages if m.get("target", {}).get("name") == "publish" and m.get("executable")]
     assert paths, "cargo built no example publisher"
     return paths[-1]
+
+
+@contextmanager
+def child(command: list[str], **options: Any) -> Iterator[subprocess.Popen[str]]:
+    """A process that ends with the block, whatever ends the block."""
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 class Publisher:

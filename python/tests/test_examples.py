@@ -16,7 +16,7 @@ from PIL import Image
 import depthrig
 from daemon import fake_daemon
 from depthrig._layout import ExternalState
-from rig import ROOT, WAIT_S, pattern_rows
+from rig import ROOT, WAIT_S, child, pattern_rows
 
 PYTHON = ROOT / "python"
 
@@ -75,10 +75,7 @@ def test_the_external_camera_serves_until_it_is_told_to_stop(folder: Path) -> No
     script = str(PYTHON / "examples" / "external_camera.py")
     env = {**os.environ, "DEPTHRIG_RUNTIME_DIR": str(folder)}
     command = [sys.executable, script, "--camera", "front", "--rig", "mount"]
-    with (
-        fake_daemon(folder) as daemon,
-        subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
-    ):
+    with fake_daemon(folder) as daemon, child(command, env=env) as process:
         daemon.until(state=ExternalState.IDLE)
         daemon.run(1, ("color", "depth"))
         head, color = daemon.frame("color")

@@ -189,6 +189,7 @@ def test_frames_too_far_apart_make_no_group(maker: Maker, folder: Path) -> None:
     assert (times(group), group.skew_s) == ({"a": 1025, "b": 1020}, 0.005)
 
 
+@pytest.mark.many_streams
 def test_partial_groups_are_asked_for_and_say_what_is_missing(maker: Maker, folder: Path) -> None:
     a, b = maker.channel("a/depth"), maker.channel("b/depth")
     strict, lenient = reader(folder), reader(folder, partial_after=0.05)
@@ -210,6 +211,7 @@ def test_partial_groups_are_asked_for_and_say_what_is_missing(maker: Maker, fold
     assert times(strict.next(WAIT_S)) == {"a": 1033, "b": 1034}
 
 
+@pytest.mark.many_streams
 def test_a_waiting_reader_of_groups_is_woken(maker: Maker, folder: Path) -> None:
     a, b = maker.channel("a/depth"), maker.channel("b/depth")
     r = reader(folder)
@@ -227,6 +229,7 @@ def test_a_waiting_reader_of_groups_is_woken(maker: Maker, folder: Path) -> None
     assert got == [{"a": 1000 + 33 * i, "b": 1000 + 33 * i} for i in range(10)]
 
 
+@pytest.mark.many_streams
 def test_fresh_groups(maker: Maker, folder: Path) -> None:
     a, b = maker.channel("a/depth"), maker.channel("b/depth")
     r = reader(folder, max_skew=10)
@@ -244,6 +247,7 @@ def test_fresh_groups(maker: Maker, folder: Path) -> None:
     assert r.wait_fresh(max_age=WAIT_S).age_s < WAIT_S
 
 
+@pytest.mark.many_streams
 def test_a_reader_of_groups_leaves_half_of_the_slots(maker: Maker, folder: Path) -> None:
     a, b = maker.channel("a/depth"), maker.channel("b/depth")
     r = reader(folder)
@@ -266,6 +270,7 @@ def test_a_reader_of_groups_leaves_half_of_the_slots(maker: Maker, folder: Path)
         np.testing.assert_array_equal(group["a/depth"].array, a.pixels(i + 1))
 
 
+@pytest.mark.many_streams
 def test_times_that_go_back_begin_anew(maker: Maker, folder: Path) -> None:
     a, b = maker.channel("a/depth"), maker.channel("b/depth")
     r = reader(folder)
@@ -276,6 +281,7 @@ def test_times_that_go_back_begin_anew(maker: Maker, folder: Path) -> None:
             assert times(r.next(WAIT_S)) == {"a": base + 33 * i, "b": base + 33 * i}
 
 
+@pytest.mark.many_streams
 def test_a_group_reader_says_who_is_gone(start: Start, folder: Path) -> None:
     publisher = start()
     r = SetReader(["pattern/z16", "pattern/rgb8"], runtime_dir=folder, timeout=WAIT_S)

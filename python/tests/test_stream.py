@@ -18,7 +18,7 @@ import pytest
 
 import depthrig
 from depthrig import Frame, PixelFormat, Stream, _layout
-from rig import WAIT_S, Publisher, assert_pixels
+from rig import WAIT_S, Publisher, assert_pixels, child
 
 Start = Callable[..., Publisher]
 
@@ -34,6 +34,7 @@ def whole(frame: Frame) -> int:
 
 
 @pytest.mark.parametrize("pad", ["0", "6"])
+@pytest.mark.many_streams
 def test_every_format_arrives_bit_by_bit(start: Start, folder: Path, pad: str) -> None:
     publisher = start("--formats", "all", "--pad", pad)
     names = [f.name.lower() for f in PixelFormat]
@@ -287,9 +288,7 @@ def test_ctrl_c_ends_a_wait(start: Start, folder: Path) -> None:
     except KeyboardInterrupt:
         print("interrupted")
     """
-    with subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as waiting:
+    with child([sys.executable, "-c", textwrap.dedent(code)]) as waiting:
         assert waiting.stdout is not None
         assert waiting.stdout.readline() == "waiting\n"
         time.sleep(0.2)

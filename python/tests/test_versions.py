@@ -99,7 +99,7 @@ def test_too_many_subscribers_is_an_error(folder: Path) -> None:
     channel = make_channel(folder, _bus.FRAME_HEADER, _layout.SCHEMA)
     limit = channel[0].static_config.max_subscribers
     streams = [open_stream(folder) for _ in range(limit)]
-    with pytest.raises(depthrig.BusError, match=f"it has {limit} subscribers already"):
+    with pytest.raises(depthrig.BusError, match=f"all of its {limit} places for subscribers are taken"):
         open_stream(folder)
     streams.pop().close()
     open_stream(folder)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import os
+import threading
 import time
 import weakref
 from typing import Any, ClassVar
 
 from . import _layout
+from ._memory import check_room, out_of_descriptors
 from ._runtime import holder, not_running
 from .errors import BusError, DepthrigError, HoldingTooMany, StreamNotFound, VersionMismatch
 
@@ -23,6 +25,9 @@ except ImportError as e:
         "(there are wheels for x86-64 Linux with glibc 2.34 or later; elsewhere pip builds it and needs Rust)"
     ) from e
 
+# iceoryx2 changes the umask of the whole process while it binds the socket of a listener: two threads that do it at
+# once could leave a umask with which new folders cannot be entered.
+BINDING = threading.Lock()
 # How long another process may take to make a channel that it has begun to make.
 _PATIENCE_S = 1.0
 _PASSING = ("IsMarkedForDestruction", "HangsInCreation", "InternalFailure")
@@ -97,6 +102,7 @@ class Bus:
         # Its errors come back as errors; its log would go to the user's stderr.
         iox2.set_log_level(iox2.LogLevel.Fatal)
         self.folder = folder
+        check_room()
         # In code, because iceoryx2 would otherwise read config/iceoryx2.toml of the working folder.
         config = iox2.config.default()
         parts = config.global_cfg
@@ -112,7 +118,8 @@ class Bus:
                 .create(iox2.ServiceType.Ipc)
             )
         except (iox2.NodeCreationFailure, iox2.SemanticStringError) as e:
-            raise BusError(f"the bus in {folder} cannot be joined ({e}); run as the daemon's user") from e
+            what = out_of_descriptors() or "run as the daemon's user"
+            raise BusError(f"the bus in {folder} cannot be joined ({e}); {what}") from e
 
     @classmethod
     def at(cls, folder: str) -> Bus:
@@ -160,17 +167,21 @@ class Receiver:
             self._service = _retry(open_service, iox2.PublishSubscribeOpenError, _PASSING)
         except iox2.PublishSubscribeOpenError as e:
             raise self._open_error(str(e), rig, channel) from e
+        check_room()
         # The publisher makes the channel first and its event right after.
         event_passing = (*_PASSING, "DoesNotExist")
         try:
             events = _retry(lambda: bus.node.service_builder(name).event().open(), iox2.EventOpenError, event_passing)
             self._subscriber: Any | None = self._service.subscriber_builder().create()
-            self._listener: Any | None = events.listener_builder().create()
+            with BINDING:
+                self._listener: Any | None = events.listener_builder().create()
         except iox2.EventOpenError as e:
             raise BusError(f"{what}: its event cannot be opened ({e})") from e
         except (iox2.SubscriberCreateError, iox2.ListenerCreateError) as e:
-            limit = self._service.static_config.max_subscribers
-            raise BusError(f"{what}: it has {limit} subscribers already, or {e}; end one of them") from e
+            if str(e).startswith("ExceedsMaxSupported"):
+                limit = self._service.static_config.max_subscribers
+                raise BusError(f"{what}: all of its {limit} places for subscribers are taken; end one of them") from e
+            raise BusError(f"{what}: it cannot be subscribed to ({e}); {out_of_descriptors() or 'try again'}") from e
 
     def _open_error(self, why: str, rig: str, channel: str) -> DepthrigError:
         if why == "DoesNotExist":
@@ -190,7 +201,7 @@ class Receiver:
             return BusError(f"{self.what}: it belongs to another user; daemon and subscribers run as one")
         if why == "ExceedsMaxNumberOfNodes":
             return BusError(f"{self.what}: too many processes have it open already; end one of them")
-        return BusError(f"{self.what}: it cannot be opened ({why})")
+        return BusError(f"{self.what}: it cannot be opened ({out_of_descriptors() or why})")
 
     def receive(self) -> Any | None:
         """Return the oldest unread sample, or None."""

@@ -11,7 +11,8 @@ from typing import Any
 import iceoryx2 as iox2
 
 from . import _layout as layout
-from ._bus import _OTHER_VERSION, _PASSING, Bus, _header_type, _retry
+from ._bus import _OTHER_VERSION, _PASSING, BINDING, Bus, _header_type, _retry
+from ._memory import back, check_room, out_of_descriptors
 from .errors import BusError, VersionMismatch
 
 OFFER = _header_type(layout.EXTERNAL_OFFER_TYPE, layout.EXTERNAL_OFFER_SIZE, layout.EXTERNAL_ALIGN)
@@ -24,6 +25,7 @@ _LOANS = 3
 
 def _service(bus: Bus, name: str, header: type[ctypes.Structure], history: int) -> Any:
     """Open or make a channel of the hand-shake."""
+    check_room()
     schema = iox2.AttributeVerifier.new().require(
         iox2.AttributeKey.new("schema"), iox2.AttributeValue.new(layout.EXTERNAL_SCHEMA)
     )
@@ -46,6 +48,7 @@ def _service(bus: Bus, name: str, header: type[ctypes.Structure], history: int) 
 
 def _events(bus: Bus, name: str) -> Any:
     """Open or make the event of a channel."""
+    check_room()
 
     def attempt() -> Any:
         builder = bus.node.service_builder(iox2.ServiceName.new(name)).event()
@@ -65,7 +68,8 @@ def _open_error(name: str, why: str) -> BusError | VersionMismatch:
             f"channel {name} was made by another version of depthrig or iceoryx2 ({why}); install the `depthrig` "
             "package of the daemon's version, and restart programs that still hold the channel in the other one"
         )
-    return BusError(f"channel {name} cannot be opened ({why}); is the folder this user's, and /dev/shm not full?")
+    cure = out_of_descriptors() or "is the folder this user's?"
+    return BusError(f"channel {name} cannot be opened ({why}); {cure}")
 
 
 class Slot:
@@ -98,19 +102,28 @@ class Sender:
         try:
             self._publisher = builder.override_sample_preallocation(slots).create()
         except iox2.PublisherCreateError as e:
-            raise BusError(
-                f"channel {name} cannot be written ({e}): {slots} slots of {length} bytes; is /dev/shm full, or does "
-                "another process still serve the camera?"
-            ) from e
+            cure = out_of_descriptors() or "does another process still serve the camera?"
+            raise BusError(f"channel {name} cannot be written ({e}): {slots} slots of {length} bytes; {cure}") from e
+        back(self._publisher.id.value, slots, name)
 
     def loan(self, length: int) -> Slot | None:
         """Lend a slot of `length` bytes; None when the other side holds them all."""
         try:
-            return Slot(self._publisher.loan_slice_uninit(length).assume_init(), length)
+            try:
+                sample = self._publisher.loan_slice_uninit(length)
+            except iox2.LoanError as e:
+                if str(e) != "OutOfMemory":
+                    raise
+                # Only this takes back what a killed reader held; sending does it too, but needs a slot first.
+                self._publisher.update_connections()
+                sample = self._publisher.loan_slice_uninit(length)
+            return Slot(sample.assume_init(), length)
         except iox2.LoanError as e:
             if str(e) in ("OutOfMemory", "ExceedsMaxLoans"):
                 return None
             raise BusError(f"channel {self.name}: no slot of {length} bytes can be had ({e})") from e
+        except iox2.ConnectionFailure:
+            return None  # a reader that is half made; the next frame tries again
 
 
 class Bell:
@@ -142,9 +155,10 @@ class Letters:
         self._events = _events(bus, name)
         try:
             self._subscriber = self._service.subscriber_builder().create()
-            self._listener = self._events.listener_builder().create()
+            with BINDING:
+                self._listener = self._events.listener_builder().create()
         except (iox2.SubscriberCreateError, iox2.ListenerCreateError) as e:
-            raise BusError(f"channel {name} cannot be read ({e})") from e
+            raise BusError(f"channel {name} cannot be read ({e}); {out_of_descriptors() or 'try again'}") from e
 
     def take(self) -> tuple[bytes, bytes] | None:
         """Return the oldest unread message's header and payload, or None."""
