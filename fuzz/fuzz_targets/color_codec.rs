@@ -7,10 +7,10 @@ use std::panic;
 
 fuzz_target!(
     init: {
-        // libFuzzer's hook ends the process at each panic. Those of zune-jpeg become errors in depthrig.
+        // libFuzzer's hook ends the process at each panic. Those of the JPEG decoder become errors in depthrig.
         let ends = panic::take_hook();
         panic::set_hook(Box::new(move |info| {
-            if !info.location().is_some_and(|at| at.file().contains("/zune-jpeg-")) {
+            if !info.location().is_some_and(|at| at.file().contains("/libjpeg-turbo-rs-")) {
                 ends(info);
             }
         }));

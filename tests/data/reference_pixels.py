@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
-"""Computes `reference_pixels.csv`: CRC-32 of the pixels of PNGs, decoded with nothing but Python's own library.
+"""Computes `reference_pixels.csv`: CRC-32 of the pixels of PNGs, decoded with nothing but Python's own library, and of
+JPEGs, decoded by Pillow (libjpeg-turbo).
 
-An independent witness for drivers/tests/files_real.rs: it shares no code with the decoder that the drivers use.
+An independent witness for drivers/tests/files_real.rs: it shares no code with the decoders that the drivers use.
 16-bit pixels count as little-endian, as they travel on the bus.
 
     python3 reference_pixels.py FOLDER_OF_THE_TEST_DATA > reference_pixels.csv
@@ -15,6 +16,8 @@ from pathlib import Path
 FILES = [
     "lingbot_depth/0/rgb.png",
     "lingbot_depth/2/rgb.png",
+    "lingbot_depth/1/rgb.jpg",
+    "lingbot_depth/3/rgb.jpg",
     *(f"lingbot_depth/{i}/raw_depth.png" for i in range(4)),
     "cdm_d405/color_26.png",
     "cdm_d405/depth_26.png",
@@ -25,6 +28,14 @@ def paeth(a: int, b: int, c: int) -> int:
     p = a + b - c
     pa, pb, pc = abs(p - a), abs(p - b), abs(p - c)
     return a if pa <= pb and pa <= pc else b if pb <= pc else c
+
+
+def decode_jpeg(path: Path) -> tuple[int, int, int, bytes]:
+    from PIL import Image
+
+    with Image.open(path) as image:
+        assert image.mode == "RGB"
+        return *image.size, 3, image.tobytes()
 
 
 def decode(data: bytes) -> tuple[int, int, int, bytes]:
@@ -65,7 +76,8 @@ def main() -> None:
     root = Path(sys.argv[1])
     print("file,width,height,bytes_per_pixel,crc32")
     for name in FILES:
-        width, height, bpp, pixels = decode((root / name).read_bytes())
+        path = root / name
+        width, height, bpp, pixels = decode_jpeg(path) if path.suffix == ".jpg" else decode(path.read_bytes())
         print(f"{name},{width},{height},{bpp},{zlib.crc32(pixels):08x}")
 
 

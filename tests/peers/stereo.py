@@ -125,9 +125,17 @@ def seen_by(sixth: str | None, truth: np.ndarray, scale: float) -> np.ndarray:
     return seen
 
 
-def ours(args: argparse.Namespace, left: Path, right: Path, preset: str, disparities: int, folder: Path) -> np.ndarray:
+def ours(
+    args: argparse.Namespace,
+    left: Path,
+    right: Path,
+    preset: str,
+    disparities: int,
+    folder: Path,
+    *more: str,
+) -> np.ndarray:
     out = folder / "disparity.npy"
-    command = [args.depthrig, "stereo", left, right, "--preset", preset, "--max-disparity", disparities, "--out", out]
+    command = [args.depthrig, "stereo", left, right, "--preset", preset, "--max-disparity", disparities, "--out", out, *more]
     subprocess.run([str(c) for c in command], check=True, stdout=subprocess.DEVNULL)
     return np.load(out)
 
@@ -165,7 +173,8 @@ def apart(args: argparse.Namespace, folder: Path) -> None:
             cv2.imwrite(str(files[1]), lowered(right, by))
             line = []
             for preset in PRESETS:
-                found = ours(args, *files, preset, disparities, folder)
+                kept = [] if args.correct_rows else ["--keep-rows"]
+                found = ours(args, *files, preset, disparities, folder, *kept)
                 bad, invalid = score(found, truth, seen)
                 filled = 100 * np.isfinite(found).mean()
                 line.append(f"{preset} bad-2.0 {bad:5.2f} invalid {invalid:5.2f} filled {filled:5.1f}")
@@ -250,6 +259,7 @@ def main() -> None:
     )
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--rows", nargs="+", type=float, metavar="PX", help="only what rows cost that are so far apart")
+    parser.add_argument("--correct-rows", action="store_true", help="with --rows: with the offset corrected")
     parser.add_argument("--no-speed", action="store_true", help="only the disparities, not what they cost")
     args = parser.parse_args()
     for pair in args.pair or []:

@@ -52,7 +52,9 @@ STREAMS = [(camera, stream) for camera in CAMERAS for stream in ("color", "depth
 
 @pytest.fixture(scope="module")
 def binary() -> str:
-    assert DATA.is_dir(), f"the test pictures are not at {DATA}; set DEPTHRIG_TEST_DATA"
+    if "DEPTHRIG_DATA_MISSING" in os.environ:
+        pytest.skip("no real images")
+    assert (DATA / "lingbot_depth").is_dir(), f"the real images are not at {DATA}; set DEPTHRIG_TEST_DATA"
     if "DEPTHRIG_BIN" in os.environ:
         return os.environ["DEPTHRIG_BIN"]
     command = ["cargo", "build", "--bin", "depthrig", "--message-format=json"]
@@ -135,10 +137,7 @@ def check_picture(frame: depthrig.Frame, camera: Camera, stream: str) -> None:
     assert header.intrinsics.is_known
     if stream == "color":
         assert header.format_name == "rgb8"
-        if camera.color.endswith(".png"):
-            np.testing.assert_array_equal(frame.array, source)
-        else:  # two JPEG decoders may round differently; a swap of channels or rows would be far more than this
-            assert np.abs(frame.array.astype(np.int16) - source).mean() < 2
+        np.testing.assert_array_equal(frame.array, source)
         return
     assert header.format_name == "z16"
     assert header.depth_unit_m == camera.depth_unit_m

@@ -63,6 +63,13 @@ impl Default for Made {
     }
 }
 
+/// A pose whose rotation has no short numbers: taken apart into a matrix and put together again it is another one.
+fn turned(translation_m: [f64; 3], n: f64) -> Pose {
+    let q = [0.3 + 0.1 * n, -0.7, 0.2 * n + 0.11, 0.53];
+    let length = q.iter().map(|c| c * c).sum::<f64>().sqrt();
+    Pose { translation_m, rotation_xyzw: q.map(|c| c / length) }
+}
+
 impl Made {
     /// The streams in their order.
     pub fn streams(&self) -> Vec<StreamId> {
@@ -77,7 +84,7 @@ impl Made {
         session.rig_config = "# made\n".into();
         session.max_spread_ns = self.max_spread_ns;
         let (width, height) = self.size;
-        let record = |id: StreamId| {
+        let record = |(i, id): (usize, StreamId)| {
             let depth = id.stream.as_str() == "depth";
             StreamRecord {
                 id,
@@ -90,10 +97,10 @@ impl Made {
                 depth_unit_m: if depth { 0.001 } else { 0.0 },
                 calibration: "made up".into(),
                 intrinsics: Intrinsics::pinhole(60.0, 61.0, 32.0, 24.0),
-                pose: Pose { translation_m: [0.1, -0.2, 0.3], ..Pose::IDENTITY },
+                pose: turned([0.1, -0.2, 0.3], (i / 2) as f64),
             }
         };
-        session.streams = self.streams().into_iter().map(record).collect();
+        session.streams = self.streams().into_iter().enumerate().map(record).collect();
         if self.motion {
             session.motion.push(MotionRecord {
                 id: self.unit(),
@@ -102,7 +109,7 @@ impl Made {
                 rate_hz: 8e9 / self.period_ns as f64,
                 batch: 4,
                 calibration: "made up".into(),
-                pose: Pose { translation_m: [0.3, 0.2, -0.1], ..Pose::IDENTITY },
+                pose: turned([0.3, 0.2, -0.1], 9.0),
             });
         }
         session

@@ -35,9 +35,10 @@ impl Pair {
         );
         let eyes = ["aloeL.jpg", "aloeR.jpg"].map(|name| {
             let path = data.join("opencv_aloe_stereo").join(name);
-            image::open(&path)
-                .unwrap_or_else(|e| panic!("{}: {e}; set DEPTHRIG_TEST_DATA", path.display()))
-                .into_rgb8()
+            let bytes = std::fs::read(&path)
+                .unwrap_or_else(|e| panic!("{}: {e}; set DEPTHRIG_TEST_DATA", path.display()));
+            let depthrig_jpeg::Image { info, pixels } = depthrig_jpeg::decode(&bytes).expect("a JPEG");
+            image::RgbImage::from_raw(info.width, info.height, pixels).expect("in colour")
         });
         // Rec. 709 luma in whole numbers: libraries turn colour into grey in ways that differ from version to version.
         let grey = |e: &image::RgbImage| {

@@ -1,7 +1,7 @@
 //! Pictures of the simulated cameras as a refiner is given them: colour, raw depth in its view, and the truth.
 
 use depthrig_bus::{Name, Pose};
-use depthrig_calib::{Method, PoseExt, Registration};
+use depthrig_calib::{PoseExt, Registration};
 use depthrig_drivers::synthetic::{StreamOverride, SyntheticBackend, SyntheticConfig};
 use depthrig_drivers::{Backend, MemorySink, StreamProfile, StreamRequest};
 use std::path::Path;
@@ -77,11 +77,7 @@ fn register(depth: &StreamProfile, color: &StreamProfile, from: &[u16], to: &mut
     let color_from_depth = color.pose_in_device.inverse().compose(&depth.pose_in_device);
     let size = |p: &StreamProfile| (p.width, p.height);
     let (d, c) = (&depth.intrinsics, &color.intrinsics);
-    // Cameras that look in different directions, or whose colour has more pixels, need the surfaces.
-    let is_parallel = color_from_depth.rotation_xyzw == Pose::IDENTITY.rotation_xyzw;
-    let method = if is_parallel { Method::Splat } else { Method::Triangles };
-    let mut registration =
-        Registration::new(d, size(depth), c, size(color), &color_from_depth, method).unwrap();
+    let mut registration = Registration::new(d, size(depth), c, size(color), &color_from_depth).unwrap();
     registration.depth_to_color(from, depth.depth_unit_m, to).unwrap();
 }
 

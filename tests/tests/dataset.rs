@@ -1,7 +1,7 @@
 //! From camera to disk and back: what a subscriber saw live is what the dataset and its replay hold.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
-use depthrig_bus::{Bus, Frame, FrameFlags, FrameHeader, RigName, StreamId};
+use depthrig_bus::{Bus, Frame, FrameFlags, FrameHeader, HostTime, RigName, StreamId};
 use depthrig_daemon::ErrorKind;
 use depthrig_daemon::control::RecordRequest;
 use depthrig_daemon::replay::{Replay, ReplayOptions};
@@ -42,11 +42,20 @@ impl Drop for StopAtEnd<'_> {
     }
 }
 
-/// Reads every stream until `stop`.
-fn watch(home: &Home, stop: &AtomicBool) -> Seen {
+fn wait_for(ready: &AtomicBool) {
+    let deadline = HostTime::now().plus(WAIT);
+    while !ready.load(Ordering::SeqCst) {
+        assert!(!deadline.from_now().is_zero(), "the test's own subscriber did not come");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// Reads every stream until `stop`; `ready` is set once it has subscribed to all.
+fn watch(home: &Home, ready: &AtomicBool, stop: &AtomicBool) -> Seen {
     let bus = Bus::open(&home.runtime(), &RigName::new("test").unwrap()).unwrap();
     let mut subscribers: Vec<_> =
         streams().iter().map(|id| bus.subscriber_within(id, WAIT).unwrap()).collect();
+    ready.store(true, Ordering::SeqCst);
     let mut seen = Seen::new();
     loop {
         let last = stop.load(Ordering::SeqCst);
@@ -69,10 +78,13 @@ fn live_recorded_and_replayed_frames_are_the_same() {
     let rig = home.start(&text()).unwrap();
     wait_until(&rig, "streaming", all_stream);
     let stop = AtomicBool::new(false);
+    let ready = AtomicBool::new(false);
     let control = rig.control();
     let (live, recorded) = std::thread::scope(|s| {
         let _stop = StopAtEnd(&stop);
-        let watcher = s.spawn(|| watch(&home, &stop));
+        let watcher = s.spawn(|| watch(&home, &ready, &stop));
+        wait_for(&ready);
+        // The first set may take frames that came a little before it was asked for.
         std::thread::sleep(Duration::from_millis(300));
         let request = RecordRequest {
             directory: Some(home.path("data")),
@@ -118,22 +130,23 @@ fn live_recorded_and_replayed_frames_are_the_same() {
 /// Replays the dataset and compares every frame with `expected`.
 fn replayed_is(home: &Home, path: &std::path::Path, expected: &Seen) {
     let stop = AtomicBool::new(false);
+    let ready = AtomicBool::new(false);
     let replayed = std::thread::scope(|s| {
-        let options = ReplayOptions { rate: 4.0, ..ReplayOptions::default() };
+        let options = ReplayOptions { as_fast_as_possible: true, paused: true, ..ReplayOptions::default() };
         let replay = Replay::start(&[path.to_owned()], &home.runtime(), None, options).unwrap();
         let _stop = StopAtEnd(&stop);
-        let watcher = s.spawn(|| watch(home, &stop));
+        let watcher = s.spawn(|| watch(home, &ready, &stop));
+        wait_for(&ready);
+        replay.control().replay().unwrap().resume().unwrap();
         while !replay.progress().done {
             std::thread::sleep(Duration::from_millis(20));
         }
-        std::thread::sleep(Duration::from_millis(200));
         stop.store(true, Ordering::SeqCst);
         let seen = watcher.join().unwrap();
         assert_eq!(replay.stop().status.lost, Vec::<String>::new());
         seen
     });
-    // The watcher joins when the replay has begun, so it may miss the first set.
-    assert!(replayed.len() + 8 >= expected.len(), "{} of {}", replayed.len(), expected.len());
+    assert_eq!(replayed.len(), expected.len());
     for (key, (header, pixels)) in &replayed {
         let (recorded, recorded_pixels) = &expected[key];
         assert!(header.has(FrameFlags::REPLAYED));

@@ -225,7 +225,8 @@ fn what_a_set_thread_that_is_behind_does_not_read_is_counted() {
             // Asked by the set thread for every set that it hands over.
             options.utc = Arc::new(move || {
                 if theirs.swap(false, Ordering::SeqCst) {
-                    std::thread::sleep(Duration::from_millis(900));
+                    // Shorter than what makes a set too late to be recorded, which would take its batches with it.
+                    std::thread::sleep(Duration::from_millis(500));
                 }
                 UtcPair::sample()
             });

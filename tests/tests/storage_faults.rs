@@ -2,7 +2,7 @@
 //!
 //! Each test watches every stream with a subscriber of its own, before the fault and during it. No frame may be lost,
 //! and frames may not come much later than before. `DEPTHRIG_LONG=1` makes the faults last three times as long.
-//! Where no tmpfs can be mounted, tests that need a small disk do nothing and tools/test.sh counts them;
+//! Tests that need a small disk mount one, which tools/test.sh allows them; where that is refused they are skipped, unless
 //! `DEPTHRIG_REQUIRE_TMPFS=1` makes that a failure.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
@@ -417,4 +417,26 @@ fn a_step_of_the_wall_clock_moves_no_recorded_time() {
         "placed by the first reading"
     );
     assert!(stopped.started_utc_ns < now);
+}
+
+/// Somebody put FIFOs in the names of a dataset into the recording folder: opening one would wait for ever.
+#[test]
+fn fifos_in_the_recording_folder_keep_nothing_from_ending() {
+    let _alone = alone();
+    let home = Home::default();
+    let old = home.path("data").join("20260101_0000");
+    std::fs::create_dir_all(&old).unwrap();
+    for name in ["session.toml", "seg_0000.mcap.part"] {
+        let made = std::process::Command::new("mkfifo").arg(old.join(name)).status().unwrap();
+        assert!(made.success());
+    }
+    let text = text() + &format!("directory = \"{}\"\n", home.path("data").display());
+    let (done, ended) = std::sync::mpsc::sync_channel(1);
+    std::thread::spawn(move || {
+        let rig = home.start(&text).unwrap();
+        wait_until(&rig, "streaming", all_stream);
+        rig.stop();
+        done.send(()).unwrap();
+    });
+    ended.recv_timeout(Duration::from_mins(1)).expect("the rig does not end");
 }

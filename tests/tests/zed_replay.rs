@@ -205,6 +205,11 @@ fn rows_that_are_apart_are_said() {
         let session = Dataset::open(&out).unwrap().session().clone();
         let kept = &session.extra["zed_replay"];
         assert_eq!(kept.get("warning").is_some(), is_bad, "{kept}");
+        assert_eq!(kept["rows_corrected"].as_bool(), Some(is_bad), "{kept}");
+        for computed in &session.computed {
+            let states = computed.parameters.contains("rows_moved_px=-1.");
+            assert_eq!(states, is_bad && computed.from.len() > 1, "{computed:?}");
+        }
         let rows = kept["rows"].as_str().unwrap();
         let said = if is_bad { ["lies 1.5", "px higher"] } else { ["lies 0.0", " 2 pairs)"] };
         assert!(said.iter().all(|s| rows.contains(s)), "{rows}");

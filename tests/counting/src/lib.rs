@@ -1,4 +1,4 @@
-//! An allocator that counts how often memory is taken, for tests of what must take none.
+//! An allocator that counts how often memory is taken, and how much, for tests of what must take none or only so much.
 //!
 //! It depends on nothing, so that the tests of every floor can have it. A test binary of its own says
 //! `#[global_allocator] static COUNTING: depthrig_counting::Counting = depthrig_counting::Counting;`
@@ -14,6 +14,8 @@ pub struct Counting;
 
 static ALL: AtomicU64 = AtomicU64::new(0);
 static WATCHED: AtomicU64 = AtomicU64::new(0);
+static LIVE: AtomicU64 = AtomicU64::new(0);
+static PEAK: AtomicU64 = AtomicU64::new(0);
 
 thread_local! {
     static OWN: Cell<u64> = const { Cell::new(0) };
@@ -29,24 +31,45 @@ fn count() {
     }
 }
 
+fn take(bytes: usize) {
+    let live = LIVE.fetch_add(bytes as u64, Ordering::Relaxed) + bytes as u64;
+    PEAK.fetch_max(live, Ordering::Relaxed);
+}
+
+fn give_back(bytes: usize) {
+    LIVE.fetch_sub(bytes as u64, Ordering::Relaxed);
+}
+
 // SAFETY: everything is handed on to the system's allocator as it came.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count();
+        take(layout.size());
         // SAFETY: as the caller promises.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        give_back(layout.size());
         // SAFETY: as the caller promises; all memory comes from `System`.
         unsafe { System.dealloc(ptr, layout) }
     }
 
     unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         count();
+        take(size);
+        give_back(layout.size());
         // SAFETY: as the caller promises; all memory comes from `System`.
         unsafe { System.realloc(ptr, layout, size) }
     }
+}
+
+/// Most bytes that were taken at once, in the whole process, while `work` ran and beyond those taken before.
+pub fn peak_of<R>(work: impl FnOnce() -> R) -> (R, u64) {
+    let before = LIVE.load(Ordering::Relaxed);
+    PEAK.store(before, Ordering::Relaxed);
+    let result = work();
+    (result, PEAK.load(Ordering::Relaxed).saturating_sub(before))
 }
 
 /// How often this thread has taken memory.

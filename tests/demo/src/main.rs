@@ -2,11 +2,13 @@
 //! of a ZED as it sends them with its factory calibration, a network for stereo, pictures for the OAK bridge, and the rig
 //! file that names them.
 //!
-//! usage: `demo-recordings FOLDER COMMAND [ARGUMENT…]`; the command is what serves the camera that lives in another process.
+//! usage: `demo-recordings FOLDER COMMAND [ARGUMENT…]`; the command is what serves the camera that lives in another process,
+//! which may be `demo-recordings --play FOLDER/oak`.
 //! Everything shows the table of the simulated cameras; nothing is of a real camera.
 
 mod network;
 mod oak;
+mod play;
 mod zed;
 
 use anyhow::{Context, Result};
@@ -33,11 +35,15 @@ fn main() -> Result<ExitCode> {
         eprintln!("usage: demo-recordings FOLDER COMMAND [ARGUMENT…]");
         return Ok(ExitCode::from(2));
     };
+    if folder.as_os_str() == "--play" {
+        play::run(Path::new(&command[0]))?;
+        return Ok(ExitCode::SUCCESS);
+    }
     std::fs::create_dir_all(&folder).with_context(|| format!("{}: cannot be made", folder.display()))?;
     kinect(&folder.join("kinect.mkv"))?;
     zed::write(&folder.join("zed"))?;
     oak::write(&folder.join("oak"))?;
-    std::fs::write(folder.join("block_matching.onnx"), network::block_matching(zed::SIZE))?;
+    std::fs::write(folder.join("untrained_block_matching.onnx"), network::block_matching(zed::SIZE))?;
     let rig = folder.join("rig.toml");
     std::fs::write(&rig, RIG.replace(COMMAND, &words(&command)))?;
     println!("{}", rig.display());

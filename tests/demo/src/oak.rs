@@ -1,9 +1,9 @@
 //! A folder of pictures as the OAK bridge replays it: `color/` and `depth/`, of one view, depth in millimetres.
 
 use anyhow::{Context, Result};
-use depthrig_bus::{Name, Pose};
+use depthrig_bus::{Intrinsics, Name, Pose};
 use depthrig_drivers::synthetic::{SyntheticBackend, SyntheticConfig};
-use depthrig_drivers::{Backend, MemorySink, StreamRequest};
+use depthrig_drivers::{Backend, Device, MemorySink, StreamRequest};
 use image::{ImageBuffer, Luma, RgbImage};
 use std::path::Path;
 use std::time::Duration;
@@ -16,8 +16,8 @@ const SIZE: (u32, u32) = (1280, 720);
 /// Every second pixel is kept, in either direction.
 const KEPT: u32 = 2;
 
-/// Writes the pictures into `folder`.
-pub fn write(folder: &Path) -> Result<()> {
+/// The camera that is simulated.
+fn camera() -> Result<Box<dyn Device>> {
     let config = SyntheticConfig {
         model: MODEL.into(),
         serial: "oak".into(),
@@ -25,8 +25,23 @@ pub fn write(folder: &Path) -> Result<()> {
         pose_on_mount: Pose { translation_m: [0.08, -0.10, 0.0], ..Pose::IDENTITY },
         ..SyntheticConfig::default()
     };
+    Ok(SyntheticBackend::new(vec![config])?.open(None)?)
+}
+
+/// Intrinsics of the written images.
+pub fn intrinsics() -> Result<Intrinsics> {
+    let device = camera()?;
+    let full = device.profiles().iter().find(|p| p.stream.as_str() == "depth" && (p.width, p.height) == SIZE);
+    let full = full.context("the simulated OAK has no depth of the size of its images")?.intrinsics;
+    // The kept pixel (x, y) is pixel (KEPT x, KEPT y).
+    let scale = 1.0 / f64::from(KEPT);
+    Ok(Intrinsics::pinhole(full.fx * scale, full.fy * scale, full.cx * scale, full.cy * scale))
+}
+
+/// Writes the pictures into `folder`.
+pub fn write(folder: &Path) -> Result<()> {
     let requests = [StreamRequest::any(Name::new("color")?), StreamRequest::any(Name::new("depth")?)];
-    let mut stream = SyntheticBackend::new(vec![config])?.open(None)?.start(&requests)?;
+    let mut stream = camera()?.start(&requests)?;
     let mut sink = MemorySink::default();
     while (0..2).any(|i| sink.delivered(i) < 2 * SHOTS as u64) {
         stream.poll(Duration::from_millis(50), &mut sink)?;

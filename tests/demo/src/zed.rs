@@ -291,8 +291,9 @@ mod tests {
             let near = errors.iter().filter(|e| **e < 0.05).count() as f64 / errors.len() as f64;
             let middle = errors[errors.len() / 2];
             println!("{name}: {seen:.3} of the scene, half within {middle:.4}, {near:.3} within 5 %");
-            // Wood and walls have little for stereo to see: half a pixel of disparity is 1.5 % here.
-            assert!(seen > 0.8 && middle < 0.03 && near > 0.75, "{name}: {seen}, {middle}, {near}");
+            // Wood and walls have little for stereo to see: half a pixel of disparity is 1.5 % here, and what has no texture
+            // gets no depth.
+            assert!(seen > 0.6 && middle < 0.03 && near > 0.8, "{name}: {seen}, {middle}, {near}");
         }
     }
 

@@ -8,8 +8,7 @@ use depthrig_drivers::kinect::modes::Cut;
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, DepthMode};
 use depthrig_drivers::synthetic::{SyntheticBackend, SyntheticConfig};
 use depthrig_drivers::{Backend, MemorySink, StreamProfile, StreamRequest};
-use image::ExtendedColorType;
-use image::codecs::jpeg::JpegEncoder;
+use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use std::collections::HashMap;
 use std::time::Duration;
 
@@ -96,8 +95,9 @@ impl Pictures for Pattern {
 
 fn jpeg(rgb: &[u8], width: u32, height: u32, quality: u8) -> Vec<u8> {
     let mut out = Vec::new();
-    let mut encoder = JpegEncoder::new_with_quality(&mut out, quality);
-    encoder.encode(rgb, width, height, ExtendedColorType::Rgb8).unwrap();
+    let mut encoder = Encoder::new(&mut out, quality);
+    encoder.set_sampling_factor(SamplingFactor::F_1_1);
+    encoder.encode(rgb, width as u16, height as u16, ColorType::Rgb).unwrap();
     out
 }
 

@@ -39,7 +39,7 @@ fn all(path: &Path, requests: &[StreamRequest]) -> MemorySink {
 fn color(fixture: &Fixture, n: u32) -> Vec<u8> {
     let bytes = Pattern::new(fixture).color(n);
     match fixture.color.unwrap().format {
-        ColorFormat::Mjpg => image::load_from_memory(&bytes).unwrap().into_rgb8().into_raw(),
+        ColorFormat::Mjpg => depthrig_jpeg::decode(&bytes).unwrap().pixels,
         ColorFormat::Bgra => bytes.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect(),
         ColorFormat::Nv12 | ColorFormat::Yuy2 => bytes,
     }

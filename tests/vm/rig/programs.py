@@ -20,6 +20,7 @@ class Scenario:
     name: str
     about: str
     cost: int  # processor seconds of the host, roughly
+    needs: str  # an archive beside those of every boot; empty: none
 
 
 def build(wanted: list[str]) -> list[Path]:

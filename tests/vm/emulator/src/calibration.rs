@@ -1,12 +1,14 @@
 //! The calibration of an emulated camera: numbers that follow from its serial, so that no two cameras have the same and
 //! a test can ask for them.
 
+mod imu;
 mod l515;
 mod zed;
 
 use crate::content::hash;
 use crate::model::{Family, Model};
 use depthrig_drivers::realsense::protocol::tables::{Coefficients, Pinhole, RgbTable, SIZES};
+pub use imu::{ImuAxes, ImuCalibration};
 pub use l515::{L515, L515Color, L515Depth};
 pub use zed::{Eye, ZedMode};
 
@@ -19,6 +21,8 @@ pub struct Calibration {
     pub rgb: Option<RgbTable>,
     /// The tables of an L515.
     pub l515: Option<L515>,
+    /// The IMU of a RealSense camera that has one.
+    pub imu: Option<ImuCalibration>,
     /// The modes of a ZED, largest first.
     pub zed: Vec<ZedMode>,
 }
@@ -54,13 +58,15 @@ impl Calibration {
     /// The calibration of a model with a serial.
     pub fn new(model: &Model, serial: &str) -> Self {
         let spread = Spread(serial);
+        let imu = model.imu.map(|_| ImuCalibration::new(&spread));
         match model.family {
             Family::D400 => Self {
                 coefficients: Some(coefficients(model, &spread)),
                 rgb: Some(rgb(model, &spread)),
+                imu,
                 ..Self::default()
             },
-            Family::L515 => Self { l515: Some(L515::new(&spread)), ..Self::default() },
+            Family::L515 => Self { l515: Some(L515::new(&spread)), imu, ..Self::default() },
             Family::Zed | Family::ZedMcu => Self { zed: zed::modes(&spread), ..Self::default() },
             Family::Plain => Self::default(),
         }

@@ -6,11 +6,11 @@ use crate::device::{Device, spawn};
 use crate::fault::Fault;
 use crate::firmware::{Asked, Identity};
 use crate::model::{Mode, Model};
-use crate::shared::{Command, Presence, Session, Shared};
+use crate::shared::{Command, ImuSample, Presence, Session, Shared};
 use crate::{Accounts, Error, Result, vhci};
 use core::time::Duration;
 use depthrig_bus::HostTime;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::os::unix::net::UnixStream;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -206,6 +206,11 @@ impl Camera {
         self.shared.lock().asked.iter().cloned().collect()
     }
 
+    /// Opcodes that the hardware monitor was asked for and does not know.
+    pub fn unknown_opcodes(&self) -> BTreeSet<u32> {
+        self.shared.lock().unknown.clone()
+    }
+
     /// The bytes of a frame as they travelled, by its stamp's index.
     ///
     /// # Errors
@@ -229,6 +234,21 @@ impl Camera {
     /// Those of [`Self::expected`].
     pub fn true_capture(&self, stream: &str, index: u64) -> Result<HostTime> {
         Ok(self.session(stream, index)?.captured(index))
+    }
+
+    /// What the camera's clock showed at the middle of a frame's exposure, microseconds.
+    ///
+    /// # Errors
+    /// Those of [`Self::expected`].
+    pub fn true_ticks(&self, stream: &str, index: u64) -> Result<u32> {
+        let session = self.session(stream, index)?;
+        let k = index.saturating_sub(session.first_index) as i64;
+        Ok(session.clock.shown_us(session.first_ns + k * session.period_ns))
+    }
+
+    /// What the IMU measured, oldest first; of very many samples the latest.
+    pub fn imu_samples(&self) -> Vec<ImuSample> {
+        self.shared.lock().imu.iter().copied().collect()
     }
 
     fn session(&self, stream: &str, index: u64) -> Result<Session> {

@@ -61,7 +61,7 @@ pub(crate) fn configuration(model: &Model, speed: Speed) -> Result<Vec<u8>> {
     }
     if let Some(hid) = &model.hid {
         interfaces += 1;
-        let report = from_hex(&hid.report_descriptor)?;
+        let report = model.report_descriptor()?;
         body.extend([9, 4, hid.interface, 0, 1, 3, 0, 0, 0]);
         let head = Bytes::default().u8(&[0x21]).u16(0x0111).u8(&[0, 1, 0x22]).u16(report.len() as u16);
         body.extend(head.sized());

@@ -9,6 +9,7 @@ mod requests;
 use crate::clock::DeviceClock;
 use crate::control::Units;
 use crate::fault::Fault;
+use crate::firmware::imu::Imu;
 use crate::firmware::zed::{Bridge, Motion};
 use crate::firmware::{Firmware, Identity};
 use crate::model::{Family, Mode, Model};
@@ -51,6 +52,7 @@ pub(crate) struct Device {
     firmware: Firmware,
     bridge: Bridge,
     motion: Motion,
+    imu: Option<Imu>,
     probes: Vec<Option<(Vec<u8>, Mode)>>,
     refusal: u8,
     // Faults that last.
@@ -91,6 +93,7 @@ impl Device {
             video,
             bridge: Bridge::default(),
             motion: Motion::default(),
+            imu: Imu::new(&model),
             refusal: 0,
             silent: false,
             nak: false,
@@ -202,6 +205,7 @@ impl Device {
         self.firmware.power_on(&self.model);
         self.bridge = Bridge::default();
         self.motion = Motion::default();
+        self.imu = Imu::new(&self.model);
         self.probes.fill(None);
         self.restart = false;
         self.shared.lock().trouble = None;
@@ -255,7 +259,8 @@ impl Device {
     /// When something is due by itself.
     fn next_event(&self) -> Option<HostTime> {
         let pumps = self.pumps.iter().filter_map(Pump::next_due);
-        pumps.chain(self.control_held).chain(self.motion.next_due()).min()
+        let imu = self.imu.as_ref().and_then(|imu| imu.next_due(&self.clock));
+        pumps.chain(self.control_held).chain(self.motion.next_due()).chain(imu).min()
     }
 
     /// Everything that is due now.
@@ -280,6 +285,7 @@ impl Device {
             let take = urb.length.min(reply.len());
             answer(line, urb.seq, 0, reply.get(..take).unwrap_or_default(), take)?;
         }
+        self.imu_reports(line, now)?;
         self.reports(line, now)
     }
 
@@ -288,8 +294,8 @@ impl Device {
         Settings {
             exposure_us: number(3, 3, 8000).clamp(1, 165_000) as u32,
             gain: number(2, 4, 16) as u32,
-            laser_mw: number(3, 4, 150) as u32,
-            emitter: number(3, 2, 1) as u8,
+            laser_mw: self.units.number(3, 4).map(|v| v as u32),
+            emitter: self.units.number(3, 2).map(|v| v as u8),
             auto_exposure: number(3, 0x0B, 1) as u32,
         }
     }
@@ -314,6 +320,11 @@ impl Device {
             Fault::Nak => self.nak = true,
             Fault::ControlTimeout(time) => self.control_held = Some(now.plus(*time)),
             Fault::ControlStall { times } => self.control_stalls = *times,
+            Fault::ImuSkip(samples) => {
+                if let Some(imu) = &mut self.imu {
+                    imu.skip = *samples;
+                }
+            }
             Fault::ClockJump(us) => self.clock.jump(*us),
             Fault::ClockReset => self.clock.zero(now),
             Fault::Restart => self.restart = true,

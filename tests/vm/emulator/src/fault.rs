@@ -41,6 +41,8 @@ pub enum Fault {
         /// How many.
         times: u32,
     },
+    /// The next samples of the gyroscope are not sent.
+    ImuSkip(u32),
     /// The device's clock jumps by so many microseconds.
     ClockJump(i64),
     /// The device's clock starts again at 0.
@@ -102,6 +104,7 @@ impl Fault {
             Self::ControlTimeout(_) => "control-timeout",
             Self::ControlStall { .. } => "control-stall",
             Self::Reply { .. } => "reply",
+            Self::ImuSkip(_) => "imu-skip",
             Self::ClockJump(_) => "clock-jump",
             Self::ClockReset => "clock-reset",
             Self::DamagedTable(_) => "damaged-table",
@@ -161,6 +164,7 @@ impl FromStr for Fault {
                 };
                 Ok(Self::Reply { wrong, to, times })
             }
+            "imu-skip" => Ok(Self::ImuSkip(number(rest.first(), "a number of samples")?)),
             "clock-jump" => Ok(Self::ClockJump(number(rest.first(), "a number of microseconds")?)),
             "clock-reset" => Ok(Self::ClockReset),
             "damaged-table" => Ok(Self::DamagedTable(number(rest.first(), "the number of a table")?)),
@@ -195,6 +199,7 @@ mod tests {
             "reply garbage 1",
             "reply truncated 1",
             "reply truncated 1 to 21",
+            "imu-skip 3",
             "clock-jump -5000",
             "clock-reset",
             "damaged-table 25",

@@ -1,6 +1,8 @@
 //! What answers the vendor's requests: the hardware monitor of RealSense cameras, the registers of a ZED.
 
 mod d400;
+pub(crate) mod imu;
+mod imu_table;
 mod l515;
 mod monitor;
 pub(crate) mod zed;
@@ -93,12 +95,21 @@ pub(crate) struct Firmware {
     flash: Flash,
     wrong: Option<Wrong>,
     seed: u64,
+    /// The opcode of the last request, if it was none that the firmware knows.
+    pub unknown: Option<u32>,
 }
 
 impl Firmware {
     pub fn new(model: &Model) -> Self {
         let flash = Flash::default();
-        Self { d400: d400::State::new(model), l515: l515::State::default(), flash, wrong: None, seed: 1 }
+        Self {
+            d400: d400::State::new(model),
+            l515: l515::State::default(),
+            flash,
+            wrong: None,
+            seed: 1,
+            unknown: None,
+        }
     }
 
     /// Everything but the flash starts again.
@@ -130,9 +141,10 @@ impl Firmware {
         };
         let answer = match world.model.family {
             Family::D400 => self.d400.answer(&request, world, &self.flash),
-            Family::L515 => self.l515.answer(&request, world),
+            Family::L515 => self.l515.answer(&request, world, &self.flash),
             Family::Zed | Family::ZedMcu | Family::Plain => Some(Err(monitor::WRONG_COMMAND)),
         };
+        self.unknown = matches!(answer, Some(Err(monitor::WRONG_COMMAND))).then_some(request.opcode);
         match answer {
             Some(answer) => {
                 Answer::Reply(self.spoil(Some(request.opcode), monitor::reply(request.opcode, answer)))

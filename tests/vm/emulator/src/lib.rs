@@ -29,7 +29,9 @@ pub use camera::{Camera, Hub, Options, Speed};
 pub use content::Stamp;
 pub use fault::{Damage, Fault, WrongReply};
 pub use firmware::Asked;
+pub use firmware::imu::ImuSensor;
 pub use model::Model;
+pub use shared::ImuSample;
 
 /// What goes wrong in the emulator itself.
 #[derive(Debug)]

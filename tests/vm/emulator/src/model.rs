@@ -45,9 +45,8 @@ pub struct Model {
     /// From the depth camera to the colour camera, millimetres along x.
     #[serde(default)]
     pub color_offset_mm: f32,
-    /// It has an inertial unit.
-    #[serde(default)]
-    pub imu: bool,
+    /// The chip of its IMU, if it has one.
+    pub imu: Option<ImuChip>,
     /// Video functions, in the order of their interfaces.
     #[serde(default)]
     pub functions: Vec<Function>,
@@ -73,6 +72,16 @@ pub enum Family {
     ZedMcu,
     /// Nobody's: a camera of the video class alone.
     Plain,
+}
+
+/// The chip of an IMU, which decides its rates.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ImuChip {
+    /// Bosch BMI055: acceleration at 62.5 or 250 Hz, rotation at 200 or 400 Hz.
+    Bmi055,
+    /// Bosch BMI085: both at 100, 200 or 400 Hz.
+    Bmi085,
 }
 
 /// The vendor's part of the payload header.
@@ -233,7 +242,8 @@ pub struct Hid {
     pub interface: u8,
     /// Its interrupt endpoint, direction included.
     pub endpoint: u8,
-    /// Its report descriptor, hexadecimal.
+    /// Its report descriptor, hexadecimal; empty for that of an IMU, which follows from the firmware.
+    #[serde(default)]
     pub report_descriptor: String,
 }
 
@@ -337,6 +347,15 @@ impl Model {
             from_hex(&hid.report_descriptor)?;
         }
         Ok(model)
+    }
+
+    /// The report descriptor of its HID interface.
+    pub(crate) fn report_descriptor(&self) -> Result<Vec<u8>> {
+        match (&self.hid, self.imu) {
+            (Some(hid), None) => from_hex(&hid.report_descriptor),
+            (Some(_), Some(_)) => Ok(crate::firmware::imu::descriptor(self)),
+            (None, _) => Err(Error::new(format!("{} has no HID interface", self.name))),
+        }
     }
 
     /// Every stream, in the order of their interfaces.

@@ -25,8 +25,10 @@ pub(crate) struct Header<'a> {
     pub sensor_us: u32,
     pub exposure_us: u32,
     pub gain: u32,
-    pub laser_mw: u32,
-    pub emitter: u8,
+    /// `None` without a projector.
+    pub laser_mw: Option<u32>,
+    /// Likewise.
+    pub emitter: Option<u8>,
     pub auto_exposure: u32,
 }
 
@@ -83,19 +85,21 @@ impl Header<'_> {
             w.words(&[0x8000_0005, 72, 1, 0x3FFF, 0, 50, 64, 50, 0, 4600, self.gain, 0, 300, 0]);
             w.words(&[self.exposure_us / 100, 4600, 3, 0]);
         } else {
+            // Laser power, emitter and LED are valid where there is a projector.
+            let flags = if self.laser_mw.is_some() { 0x1FF } else { 0x7B };
             w.words(&[
                 0x8000_0000,
                 60,
                 1,
-                0x1FF,
+                flags,
                 self.gain,
                 self.exposure_us,
-                self.laser_mw,
+                self.laser_mw.unwrap_or(0),
                 self.auto_exposure,
                 0,
             ]);
             w.words(&[0, u32::from(self.mode.width) - 1, 0, u32::from(self.mode.height) - 1, 0]);
-            w.put(&[self.emitter, 0, 0, 0]);
+            w.put(&[self.emitter.unwrap_or(0), 0, 0, 0]);
         }
         let rate = 10_000_000 / self.mode.interval.max(1);
         w.words(&[0x8000_0002, 40, 1, 0x7FF]);
@@ -108,7 +112,15 @@ impl Header<'_> {
 
     fn l515(&self, w: &mut Writer<'_>) {
         self.timing(w, 0x8000_0010);
-        w.words(&[0x8000_0012, 28, 1, 0x7, self.laser_mw, 0, self.emitter.into()]);
+        w.words(&[
+            0x8000_0012,
+            28,
+            1,
+            0x7,
+            self.laser_mw.unwrap_or(100),
+            0,
+            self.emitter.unwrap_or(1).into(),
+        ]);
     }
 
     /// Which pixel format: 0 depth, 1 the left infrared picture, 2 both, 3 YUYV.
@@ -140,8 +152,8 @@ mod tests {
             sensor_us: 9000,
             exposure_us: 8000,
             gain: 16,
-            laser_mw: 150,
-            emitter: 1,
+            laser_mw: Some(150),
+            emitter: Some(1),
             auto_exposure: 1,
         };
         let mut bytes = [0; 255];

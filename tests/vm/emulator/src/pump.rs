@@ -45,8 +45,10 @@ pub(crate) fn write_all(mut line: &UnixStream, mut slices: &mut [IoSlice<'_>]) -
 pub(crate) struct Settings {
     pub exposure_us: u32,
     pub gain: u32,
-    pub laser_mw: u32,
-    pub emitter: u8,
+    /// `None` without a projector.
+    pub laser_mw: Option<u32>,
+    /// Likewise.
+    pub emitter: Option<u8>,
     pub auto_exposure: u32,
 }
 

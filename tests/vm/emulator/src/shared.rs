@@ -3,13 +3,14 @@
 use crate::clock::DeviceClock;
 use crate::fault::Fault;
 use crate::firmware::Asked;
+use crate::firmware::imu::ImuSensor;
 use crate::model::Mode;
 use crate::{Accounts, Error, Result};
 use core::time::Duration;
 use depthrig_bus::HostTime;
 use rustix::event::{EventfdFlags, eventfd};
 use rustix::fd::OwnedFd;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::os::unix::net::UnixStream;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
@@ -22,6 +23,26 @@ const ASKED: usize = 1024;
 
 /// From the start of an exposure to its middle, where nothing else is known.
 const HALF_EXPOSURE_NS: i64 = 4_000_000;
+
+/// Samples of the IMU that are remembered.
+const IMU_SAMPLES: usize = 1 << 16;
+
+/// A sample that the IMU measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImuSample {
+    /// Which sensor.
+    pub sensor: ImuSensor,
+    /// Its number since power-on, from 0, sent or not.
+    pub index: u64,
+    /// What the camera's clock showed, microseconds.
+    pub ticks: u32,
+    /// When it was measured, on the host's clock.
+    pub captured: HostTime,
+    /// What the sensor counted along its own axes.
+    pub counts: [i32; 3],
+    /// It went into a report.
+    pub is_sent: bool,
+}
 
 /// What a handle asks of its camera's thread.
 pub(crate) enum Command {
@@ -67,6 +88,9 @@ pub(crate) struct State {
     pub sessions: Vec<VecDeque<Session>>,
     pub faults: BTreeMap<&'static str, u64>,
     pub asked: VecDeque<Asked>,
+    /// Opcodes of the hardware monitor that the firmware does not know.
+    pub unknown: BTreeSet<u32>,
+    pub imu: VecDeque<ImuSample>,
     /// Which streams are running.
     pub running: Vec<bool>,
     pub presence: Presence,
@@ -90,6 +114,8 @@ impl Shared {
             sessions: vec![VecDeque::new(); streams],
             faults: BTreeMap::new(),
             asked: VecDeque::new(),
+            unknown: BTreeSet::new(),
+            imu: VecDeque::new(),
             running: vec![false; streams],
             presence: Presence::Unplugged,
             trouble: None,
@@ -148,6 +174,16 @@ impl Shared {
             state.asked.pop_front();
         }
         state.asked.push_back(asked);
+    }
+
+    pub fn measured(&self, samples: Vec<ImuSample>) {
+        let mut state = self.lock();
+        for sample in samples {
+            if state.imu.len() >= IMU_SAMPLES {
+                state.imu.pop_front();
+            }
+            state.imu.push_back(sample);
+        }
     }
 
     pub fn begin_session(&self, stream: usize, session: Session) {

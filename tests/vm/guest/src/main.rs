@@ -31,6 +31,7 @@ mod scenarios {
     pub mod faults;
     pub mod fourteen;
     pub mod l515;
+    pub mod librealsense;
     pub mod libusb;
     pub mod realsense_calibration;
     pub mod realsense_clock;
@@ -66,6 +67,8 @@ pub struct Scenario {
     pub cost: u32,
     /// It is killed, and has failed, after so many seconds of guest time.
     pub limit_s: u64,
+    /// An archive of the host's that it needs (`tests/vm/rig/librealsense.py`); empty: none.
+    pub needs: &'static str,
     /// What it does. An error is a failed check.
     pub run: fn(&mut Checks) -> anyhow::Result<()>,
 }
@@ -84,6 +87,7 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::realsense_conformance::SCENARIO,
     scenarios::emulator_load::SCENARIO,
     scenarios::l515::SCENARIO,
+    scenarios::librealsense::SCENARIO,
     scenarios::v4l2_formats::SCENARIO,
     scenarios::v4l2_faults::SCENARIO,
     scenarios::v4l2_cost::SCENARIO,
@@ -118,7 +122,7 @@ fn main() -> anyhow::Result<ExitCode> {
         ["list", "--json"] => {
             let list: Vec<_> = SCENARIOS
                 .iter()
-                .map(|s| serde_json::json!({ "name": s.name, "about": s.about, "cost": s.cost }))
+                .map(|s| serde_json::json!({ "name": s.name, "about": s.about, "cost": s.cost, "needs": s.needs }))
                 .collect();
             println!("{}", serde_json::Value::from(list));
         }

@@ -15,6 +15,15 @@ impl Device {
     /// GET_REPORT, SET_REPORT, SET_IDLE (Device Class Definition for HID 1.11, section 7.2).
     pub(super) fn hid_request(&mut self, setup: &Setup, data: &[u8]) -> Reply {
         let of_motion_unit = self.model.family == Family::ZedMcu;
+        if let Some(imu) = &mut self.imu {
+            let running_ns = self.clock.running_ns(HostTime::now());
+            return match (setup.kind, setup.request, setup.value >> 8) {
+                (0xA1, 0x01, 3) => imu.read_feature(setup.value as u8),
+                (0x21, 0x09, 3) => imu.write_feature(data, running_ns).map(|()| Vec::new()),
+                (0x21, 0x0A, _) => Some(Vec::new()),
+                _ => None,
+            };
+        }
         match (setup.kind, setup.request) {
             (0xA1, 0x01) if of_motion_unit => Some(self.motion.read_feature(setup.value as u8)),
             (0x21, 0x09) if of_motion_unit => {
@@ -24,6 +33,24 @@ impl Device {
             (0x21, 0x0A) => Some(Vec::new()),
             _ => None,
         }
+    }
+
+    /// Measures with the IMU what is due, and sends its reports into the transfers that wait.
+    pub(super) fn imu_reports(&mut self, line: &UnixStream, now: HostTime) -> io::Result<()> {
+        let Some(endpoint) = self.model.hid.as_ref().map(|hid| hid.endpoint) else { return Ok(()) };
+        let Some(imu) = &mut self.imu else { return Ok(()) };
+        let measured = imu.advance(now, &self.clock, self.silent);
+        if !measured.is_empty() {
+            self.shared.measured(measured);
+        }
+        while imu.is_ready() {
+            let Some(at) = self.idle_urbs.iter().position(|(address, _)| *address == endpoint) else { break };
+            let (_, urb) = self.idle_urbs.remove(at);
+            let report = imu.take().unwrap_or_default();
+            let take = urb.length.min(report.len());
+            answer(line, urb.seq, 0, report.get(..take).unwrap_or_default(), take)?;
+        }
+        Ok(())
     }
 
     /// Sends the input reports that are due.

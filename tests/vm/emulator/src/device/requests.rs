@@ -97,8 +97,7 @@ impl Device {
     }
 
     fn report_descriptor(&self) -> Reply {
-        let hid = self.model.hid.as_ref()?;
-        crate::model::from_hex(&hid.report_descriptor).ok()
+        self.model.report_descriptor().ok()
     }
 
     fn clear_halt(&mut self, endpoint: u8) {
@@ -177,7 +176,11 @@ impl Device {
         if let Some(asked) = firmware::asked(data) {
             self.shared.remember(asked);
         }
-        self.firmware.monitor(data, &world)
+        let answer = self.firmware.monitor(data, &world);
+        if let Some(opcode) = self.firmware.unknown {
+            self.shared.lock().unknown.insert(opcode);
+        }
+        answer
     }
 
     /// A request of the hardware monitor over the vendor's endpoint.

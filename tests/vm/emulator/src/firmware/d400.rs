@@ -3,14 +3,12 @@
 //! Opcodes and structures: librealsense `src/ds/d400/d400-private.h` and `src/ds/ds-private.h` (Apache-2.0).
 
 use super::monitor::{EMPTY_TABLE, NO_DATA, NOT_READY, Request, UNSUPPORTED, WRONG_COMMAND, WRONG_PARAMETER};
-use super::{Flash, World, read_clock};
-use crate::model::{Model, from_hex};
+use super::{Flash, World, imu_table as imu, read_clock};
+use crate::model::{ImuChip, Model, from_hex};
 use depthrig_drivers::realsense::protocol::advanced::Group;
-use depthrig_drivers::realsense::protocol::tables::{self, Header, Pinhole, RectifiedItem, SIZES};
+use depthrig_drivers::realsense::protocol::tables::{self, Pinhole, RectifiedItem, SIZES};
 
 const CLOCK: u32 = 0x0001_613C;
-/// The table of the inertial unit, and the version that it begins with.
-const IMU: u32 = 34;
 const D405: u16 = 0x0B5B;
 const D415: u16 = 0x0AD3;
 
@@ -21,8 +19,19 @@ pub(crate) struct State {
     sync: u32,
     depth_roi: [u16; 4],
     color_roi: [u16; 4],
-    limits: [u32; 4],
+    limits: Limits,
     laser_constant: u32,
+    /// The sub-preset that was downloaded; empty: none.
+    sub_preset: Vec<u8>,
+}
+
+/// The limits of auto-exposure; 0 is no limit.
+#[derive(Debug, Clone, Copy, Default)]
+struct Limits {
+    least_exposure: u32,
+    most_exposure: u32,
+    least_gain: u32,
+    most_gain: u32,
 }
 
 impl State {
@@ -38,8 +47,9 @@ impl State {
             sync: 0,
             depth_roi: whole,
             color_roi: whole,
-            limits: [165_000, 248, 0, 0],
+            limits: Limits::default(),
             laser_constant: 0,
+            sub_preset: Vec::new(),
         }
     }
 
@@ -66,7 +76,7 @@ impl State {
             0x30 => Ok(vec![1, 0, 0, 0]),
             0x44 => set_roi(&mut self.depth_roi, request),
             0x45 => Ok(words16(self.depth_roi)),
-            0x4F if world.model.imu => Ok(imu(flash)),
+            0x4F if world.model.imu.is_some() => Ok(imu::eeprom(world, flash)),
             0x4F => Err(EMPTY_TABLE),
             0x69 | 0x6A if world.model.product_id == D405 => Err(UNSUPPORTED),
             0x69 if world.streaming => Err(NOT_READY),
@@ -77,25 +87,40 @@ impl State {
             0x6A => Ok(self.sync.to_le_bytes().to_vec()),
             0x75 => set_roi(&mut self.color_roi, request),
             0x76 => Ok(words16(self.color_roi)),
+            0x7B => {
+                self.sub_preset = request.data.to_vec();
+                Ok(Vec::new())
+            }
+            0x7C | 0x7D if self.sub_preset.is_empty() => Err(NO_DATA),
+            0x7C => Ok(self.sub_preset.clone()),
+            // The id is the second byte of its header (`src/hdr-config.h`, `SubPresetHeader`).
+            0x7D => Ok(vec![self.sub_preset.get(1).copied().unwrap_or(0), 0, 0, 0]),
             0x7E => Ok(RectifiedItem::build_all(&rectified(world, flash))),
             0x7F if p1 == 2 => Ok(self.laser_constant.to_le_bytes().to_vec()),
             0x7F => {
                 self.laser_constant = p1;
                 Ok(Vec::new())
             }
+            // The order of the reply is not that of the request (`src/ds/d400/d400-options.cpp`).
             0x89 => {
-                self.limits = request.params;
+                let Limits { least_exposure, most_exposure, least_gain, most_gain } = self.limits;
+                let words = [least_exposure, least_gain, most_exposure, most_gain];
+                Ok(words.iter().flat_map(|v| v.to_le_bytes()).collect())
+            }
+            0x8A => {
+                let [least_exposure, most_exposure, least_gain, most_gain] = request.params;
+                self.limits = Limits { least_exposure, most_exposure, least_gain, most_gain };
                 Ok(Vec::new())
             }
-            0x8A => Ok(self.limits.iter().flat_map(|v| v.to_le_bytes()).collect()),
             _ => Err(WRONG_COMMAND),
         })
     }
 
-    fn group(&self, group: u32, bound: u32) -> Result<Vec<u8>, i32> {
-        let group = self.groups.get(group as usize).ok_or(WRONG_PARAMETER)?;
+    fn group(&self, number: u32, bound: u32) -> Result<Vec<u8>, i32> {
+        let group = self.groups.get(number as usize).ok_or(WRONG_PARAMETER)?;
         match bound {
             0 => Ok(group.clone()),
+            1 | 2 if number == Group::DepthTable as u32 => Ok(depth_table_bound(bound == 2)),
             1 => Ok(vec![0; group.len()]),
             2 => Ok(vec![0x7F; group.len()]),
             _ => Err(WRONG_PARAMETER),
@@ -113,6 +138,13 @@ impl State {
         group.copy_from_slice(request.data);
         Ok(Vec::new())
     }
+}
+
+/// The least or the greatest values of the depth table. Units are 100 to 10000 um, which is what librealsense reports of
+/// a D400 (its issue 5587); what the firmware allows for the others is not documented: all of their types.
+fn depth_table_bound(most: bool) -> Vec<u8> {
+    let words = if most { [10_000, 65_535, 65_535, 1, 65_535] } else { [100, 0, 0, 0, 0] };
+    words.iter().flat_map(|v: &u32| v.to_le_bytes()).collect()
 }
 
 fn words16(values: [u16; 4]) -> Vec<u8> {
@@ -140,7 +172,6 @@ fn table(id: u32, world: &World<'_>, flash: &Flash) -> Result<Vec<u8>, i32> {
             coefficients.build()
         }
         32 => calibration.rgb.as_ref().ok_or(EMPTY_TABLE)?.build(),
-        IMU if world.model.imu => return Ok(imu(flash)),
         31 | 33..=36 => return Err(EMPTY_TABLE),
         _ => return Err(WRONG_PARAMETER),
     };
@@ -165,26 +196,6 @@ fn rectified(world: &World<'_>, flash: &Flash) -> Vec<RectifiedItem> {
     SIZES.into_iter().zip(&coefficients.rectified).filter_map(item).collect()
 }
 
-/// The table of the inertial unit (`dm_v2_calibration_table`): valid flags, pose of the depth camera, then sensitivity
-/// and bias of both sensors.
-fn imu(flash: &Flash) -> Vec<u8> {
-    let identity = [1.0f32, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
-    let pose = [-1.0f32, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, -0.005_52, 0.005_1, 0.011_74];
-    let accelerometer = [0.02f32, -0.11, 0.07];
-    let gyroscope = [0.001f32, -0.002, 0.0015];
-    let values = pose.iter().chain(&identity).chain(&accelerometer).chain(&identity).chain(&gyroscope);
-    let mut payload = vec![1, 1, 0, 0];
-    payload.extend(values.flat_map(|v| v.to_le_bytes()));
-    payload.resize(payload.len() + 96, 0);
-    let mut table = Header::close(IMU as u16, [1, 1], 0, &payload);
-    if flash.damaged.contains(&IMU)
-        && let Some(byte) = table.get_mut(30)
-    {
-        *byte ^= 0x10;
-    }
-    table
-}
-
 /// GVD: who the camera is and what it has.
 fn version_data(world: &World<'_>) -> Vec<u8> {
     let mut data = vec![0; 256];
@@ -199,12 +210,14 @@ fn version_data(world: &World<'_>) -> Vec<u8> {
     put(25, &[1]);
     put(48, &from_hex(&world.identity.serial).unwrap_or_default());
     put(64, &from_hex(&world.identity.chip_serial).unwrap_or_default());
+    // No fisheye, and no version of one.
+    put(112, &[0xFF, 0xFF]);
     put(166, &[if world.model.product_id == D415 { 1 } else { 2 }]);
     put(170, &[(world.model.product_id != D405).into()]);
     put(174, &[(world.model.functions.len() > 1).into()]);
-    put(178, &[world.model.imu.into()]);
-    if world.model.imu {
-        put(124, &[0x1F]);
+    put(178, &[world.model.imu.is_some().into()]);
+    if let Some(chip) = world.model.imu {
+        put(124, &[if chip == ImuChip::Bmi055 { 0xFA } else { 0x1F }]);
         put(212, &[5, 12, 1, 0]);
     }
     data

@@ -2,11 +2,15 @@
 //!
 //! Opcodes and structures: librealsense `src/l500/` at commit aa80741c (Apache-2.0).
 
-use super::monitor::{Request, WRONG_COMMAND, WRONG_PARAMETER};
-use super::{World, read_clock};
+use super::monitor::{NO_DATA, Request, WRONG_COMMAND, WRONG_PARAMETER};
+use super::{Flash, World, imu_table, read_clock};
 use crate::model::from_hex;
 
 const CLOCK: u32 = 0x9003_021C;
+/// The table of the IMU (`L515_IMU_TABLE`).
+const IMU_TABLE: u32 = 0x243;
+/// The receiver's gain trim on the I2C bus, which librealsense logs at the start: device, register and bytes.
+const GAIN_TRIM: [u32; 3] = [0x6C, 0x2, 0x1];
 /// Least, greatest, step and default of the controls, in the order of their numbers.
 const CONTROLS: [[i32; 4]; 9] = [
     [0, 3, 1, 1],
@@ -31,20 +35,35 @@ impl Default for State {
 
 impl State {
     /// What a request is answered; `None`: with a restart.
-    pub fn answer(&mut self, request: &Request<'_>, world: &World<'_>) -> Option<Result<Vec<u8>, i32>> {
-        let [p1, p2, ..] = request.params;
+    pub fn answer(
+        &mut self,
+        request: &Request<'_>,
+        world: &World<'_>,
+        flash: &Flash,
+    ) -> Option<Result<Vec<u8>, i32>> {
+        let [p1, p2, p3, _] = request.params;
         let tables = world.identity.calibration.l515.as_ref();
         let table = |read: fn(&crate::calibration::L515) -> Vec<u8>| tables.map(read).ok_or(WRONG_COMMAND);
         Some(match request.opcode {
             0x01 => read_clock(request, world, CLOCK),
+            0x03 if [p1, p2, p3] == GAIN_TRIM => Ok(vec![0x12]),
+            // Its log is empty.
+            0x0F => Err(NO_DATA),
             0x10 => Ok(version_data(world)),
-            0x19 => Ok(Vec::new()),
+            // The trigger by cable; whether a fall switches the laser off.
+            0x19 | 0x9D => Ok(Vec::new()),
             0x20 => return None,
             0x2B => self.set(p1, p2 as i32),
             0x2C => self.get(p1, p2),
+            0x43 if p1 == IMU_TABLE => {
+                let given = world.identity.calibration.imu.as_ref();
+                given.map(|given| imu_table::l515(given, flash)).ok_or(WRONG_PARAMETER)
+            }
+            0x03 | 0x43 => Err(WRONG_PARAMETER),
             0x6A => {
-                let celsius = [38.5f64, 36.25, 35.0, 37.75, 30.0, 38.0];
-                Ok(celsius.iter().flat_map(|v| v.to_le_bytes()).collect())
+                // Six temperatures, and from firmware 1.5.0.0 on the mean of the noise estimation (`extended_temperatures`).
+                let values = [38.5f64, 36.25, 35.0, 37.75, 30.0, 38.0, 1250.0];
+                Ok(values.iter().flat_map(|v| v.to_le_bytes()).collect())
             }
             0x7F => table(crate::calibration::L515::depth_table),
             0x81 => table(crate::calibration::L515::color_table),

@@ -18,6 +18,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "depthrig cameras: free, on USB2, held by a process or a rig, forbidden, unplugged; every model",
     cost: 16,
     limit_s: 60,
+    needs: "",
     run,
 };
 

@@ -20,6 +20,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "a hub reset, a camera that comes late, SIGTERM while streaming, kill -9 and recovery",
     cost: 12,
     limit_s: 120,
+    needs: "",
     run,
 };
 

@@ -13,6 +13,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "the daemon with two simulated cameras: streams, records, ends",
     cost: 4,
     limit_s: 60,
+    needs: "",
     run,
 };
 

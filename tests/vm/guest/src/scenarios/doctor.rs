@@ -15,6 +15,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "depthrig doctor: a good rig, and cameras that are missing, held, on USB2, asked for modes they lack",
     cost: 1,
     limit_s: 60,
+    needs: "",
     run,
 };
 

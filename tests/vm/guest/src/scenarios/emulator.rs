@@ -17,6 +17,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "an emulated D435 under uvcvideo: nodes, frames and metadata, identity, faults, unplugging",
     cost: 1,
     limit_s: 60,
+    needs: "",
     run,
 };
 

@@ -17,6 +17,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "seven emulated cameras, fourteen streams, a bare reader: what the emulator costs, and that it is never late",
     cost: 3,
     limit_s: 60,
+    needs: "",
     run,
 };
 

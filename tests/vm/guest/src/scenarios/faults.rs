@@ -16,6 +16,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "every fault of an emulated D435 under the daemon: the state it ends in, what is said, and that it comes back",
     cost: 23,
     limit_s: 240,
+    needs: "",
     run,
 };
 

@@ -13,6 +13,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "seven cameras, depth and colour, 640x480 at 30 Hz, recorded: nothing is lost, every byte is right",
     cost: 20,
     limit_s: 120,
+    needs: "",
     run,
 };
 

@@ -18,6 +18,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "an emulated L515 by its back end: calibration, turned pictures, confidence, Y411, unplugging",
     cost: 2,
     limit_s: 60,
+    needs: "",
     run,
 };
 
@@ -170,7 +171,7 @@ fn all_streams(checks: &mut Checks, backend: &L515Backend, camera: &Camera) -> a
 }
 
 /// Pixel (x, y) of a picture of rows of `width` pixels back to row `width - 1 - x`, column `height - 1 - y`.
-fn turned_back(upright: &[u8], width: usize, bytes: usize) -> Vec<u8> {
+pub fn turned_back(upright: &[u8], width: usize, bytes: usize) -> Vec<u8> {
     let height = upright.len() / (width * bytes);
     let mut wire = vec![0; upright.len()];
     for y in 0..height {
@@ -183,7 +184,7 @@ fn turned_back(upright: &[u8], width: usize, bytes: usize) -> Vec<u8> {
 }
 
 /// Two pixels of confidence, one below the other, back into one byte: the upper one is its low half.
-fn packed(pixels: &[u8], width: usize) -> Vec<u8> {
+pub fn packed(pixels: &[u8], width: usize) -> Vec<u8> {
     let rows: Vec<_> = pixels.chunks(width).collect();
     rows.chunks(2)
         .flat_map(|pair| pair[0].iter().zip(pair[1]).map(|(above, below)| above >> 4 | below))

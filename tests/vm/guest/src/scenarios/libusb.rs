@@ -32,6 +32,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "a D435 through libusb: frames byte by byte, controls, vendor channel, damaged frames, stall, silence, unplug",
     cost: 2,
     limit_s: 90,
+    needs: "",
     run,
 };
 

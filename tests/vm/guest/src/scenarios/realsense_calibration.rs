@@ -20,6 +20,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "intrinsics, extrinsics, depth units of every D400 model equal the emulator's tables, by the kernel and libusb",
     cost: 2,
     limit_s: 60,
+    needs: "",
     run,
 };
 

@@ -19,6 +19,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "capture times of a D435 stay within their stated uncertainty across a wrap, a clock reset and a restart",
     cost: 3,
     limit_s: 180,
+    needs: "",
     run,
 };
 

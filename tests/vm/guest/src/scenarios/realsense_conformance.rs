@@ -13,6 +13,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "the conformance suite on a D435 through uvcvideo",
     cost: 10,
     limit_s: 300,
+    needs: "",
     run,
 };
 
@@ -22,6 +23,7 @@ pub const LIBUSB: Scenario = Scenario {
     about: "the conformance suite on a D435 through libusb",
     cost: 18,
     limit_s: 300,
+    needs: "",
     run: through_libusb,
 };
 
@@ -31,6 +33,7 @@ pub const V4L2: Scenario = Scenario {
     about: "the conformance suite on a plain USB camera by the back end v4l2: YUYV and Z16",
     cost: 6,
     limit_s: 300,
+    needs: "",
     run: by_v4l2,
 };
 

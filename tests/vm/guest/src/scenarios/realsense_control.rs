@@ -22,6 +22,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "a D435: settings, presets and sync mode read back, metadata levels, controls that hang, exact accounts, what it reports of itself",
     cost: 10,
     limit_s: 120,
+    needs: "",
     run,
 };
 

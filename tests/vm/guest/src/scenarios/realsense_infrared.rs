@@ -17,6 +17,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "a D435's imagers, one alone and both out of one frame, by the kernel and libusb: every byte is right",
     cost: 1,
     limit_s: 60,
+    needs: "",
     run,
 };
 

@@ -18,6 +18,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "one of seven cameras unplugged and replugged 20 times while all are recorded: the six lose nothing",
     cost: 40,
     limit_s: 180,
+    needs: "",
     run,
 };
 

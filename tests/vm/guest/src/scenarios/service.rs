@@ -18,6 +18,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "the installed service under systemd: sandbox, a camera, a recording, stop, crash, bad configuration",
     cost: 9,
     limit_s: 120,
+    needs: "",
     run,
 };
 
@@ -117,7 +118,7 @@ fn configure() -> anyhow::Result<()> {
     fs::write(
         RIG_FILE,
         format!(
-            "rig = \"served\"\n[recording]\ndirectory = \"{DATA}/datasets\"\nreserve_mb = 1\n[[camera]]\nname = \"d435\"\n\
+            "rig = \"served\"\n[recording]\ndirectory = \"{DATA}/datasets\"\nallow = [\"/home/elsewhere\"]\nreserve_mb = 1\n[[camera]]\nname = \"d435\"\n\
              backend = \"realsense\"\n[[camera.stream]]\nname = \"depth\"\nwidth = 424\nheight = 240\nrate_hz = 15.0\n"
         ),
     )?;

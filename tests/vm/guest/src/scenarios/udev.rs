@@ -3,6 +3,8 @@
 use crate::checks::Checks;
 use crate::{Scenario, system};
 use anyhow::Context;
+use depthrig_drivers::iio;
+use depthrig_drivers::usb::SysRoot;
 use depthrig_emulator::{Camera, Options};
 use std::fs;
 use std::os::unix::fs::MetadataExt;
@@ -16,6 +18,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "depthrig install --apply under udev: who may open a camera, and that it is left awake",
     cost: 1,
     limit_s: 60,
+    needs: "",
     run,
 };
 
@@ -31,7 +34,10 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     }
     system::modprobe("vhci-hcd", &[])?;
     system::modprobe("uvcvideo", &[])?;
-    let camera = Camera::plug("d435", Options::default())?;
+    for module in ["usbhid", "hid-sensor-hub", "hid-sensor-accel-3d", "hid-sensor-gyro-3d"] {
+        system::modprobe(module, &[])?;
+    }
+    let camera = Camera::plug("d455", Options::default())?;
     let six = || system::video_nodes().is_ok_and(|nodes| nodes.len() == 6);
     checks.that("six nodes", system::wait_until(PATIENCE, six), "");
     let port = camera.port_path().context("a camera without a port")?;
@@ -60,6 +66,20 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
             modes(&node)?,
             ("660".to_owned(), VIDEO),
         );
+    }
+    let sensors = iio::on_port(&SysRoot::default(), &port);
+    checks.equal("the IMU has two sensors", sensors.len(), 2);
+    for sensor in sensors {
+        let name = &sensor.name;
+        checks.equal(
+            &format!("{name}: mode and group of its node"),
+            modes(&sensor.node)?,
+            ("660".to_owned(), VIDEO),
+        );
+        for file in sensor.switches() {
+            let wanted = ("664".to_owned(), VIDEO);
+            checks.equal(&format!("{name}: mode and group of {}", file.display()), modes(&file)?, wanted);
+        }
     }
     let number = |file: &str| -> anyhow::Result<u32> {
         Ok(fs::read_to_string(format!("/sys/bus/usb/devices/{port}/{file}"))?.trim().parse()?)

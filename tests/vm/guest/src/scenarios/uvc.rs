@@ -18,6 +18,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "the daemon with plain USB cameras: Motion JPEG kept as it came and decoded, Z16; recorded byte by byte",
     cost: 3,
     limit_s: 60,
+    needs: "",
     run,
 };
 

@@ -16,6 +16,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "depthrig bench capture on vivid at 1280x720x30: at most 1.2 x a bare loop, one copy or none",
     cost: 2,
     limit_s: 60,
+    needs: "",
     run,
 };
 

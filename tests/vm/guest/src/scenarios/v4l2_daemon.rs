@@ -15,6 +15,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "the daemon with two vivid cameras, mmap and userptr: streams, records, reopens after a fatal error",
     cost: 2,
     limit_s: 60,
+    needs: "",
     run,
 };
 

@@ -19,6 +19,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "vivid's faults through the back end v4l2: error flags, lost buffers, refusals, a fatal error, unplug",
     cost: 2,
     limit_s: 90,
+    needs: "",
     run,
 };
 

@@ -18,6 +18,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "vivid through the back end v4l2: every format to the byte, controls, clocks, one copy or none",
     cost: 1,
     limit_s: 60,
+    needs: "",
     run,
 };
 

@@ -16,6 +16,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "two virtual cameras of the kernel's own vivid driver: nodes, and ten frames of each",
     cost: 1,
     limit_s: 20,
+    needs: "",
     run,
 };
 

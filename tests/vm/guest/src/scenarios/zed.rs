@@ -26,6 +26,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "a ZED 2i: serial, calibration, both eyes byte by byte, exposure and gain, motion unit, replug",
     cost: 7,
     limit_s: 90,
+    needs: "",
     run,
 };
 

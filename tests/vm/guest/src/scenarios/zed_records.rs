@@ -19,6 +19,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "the daemon with a ZED 2i: recorded bit by bit with calibration; pulled and back while it records",
     cost: 13,
     limit_s: 90,
+    needs: "",
     run,
 };
 

@@ -20,6 +20,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "the daemon with D405, D415, D435 and D455 through libusb: recorded byte by byte, one replugged",
     cost: 9,
     limit_s: 90,
+    needs: "",
     run,
 };
 

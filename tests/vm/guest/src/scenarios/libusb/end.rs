@@ -26,6 +26,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "after libusb: the kernel's nodes come back and stream, also after kill -9; too little memory for transfers",
     cost: 2,
     limit_s: 90,
+    needs: "",
     run,
 };
 

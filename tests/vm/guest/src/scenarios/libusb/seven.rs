@@ -18,6 +18,7 @@ pub const SCENARIO: Scenario = Scenario {
     about: "seven D435 through libusb at once, depth and colour at 640x480 and 30 Hz: nothing is lost",
     cost: 5,
     limit_s: 60,
+    needs: "",
     run,
 };
 
