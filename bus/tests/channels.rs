@@ -229,7 +229,8 @@ fn helper_process() {
         // All but four are taken: how many are open says nothing, because inherited ones have any number. An ordinary user
         // may not raise the hard limit.
         let maximum = getrlimit(Resource::Nofile).maximum;
-        setrlimit(Resource::Nofile, Rlimit { current: Some(maximum.map_or(256, |m| m.min(256))), maximum }).unwrap();
+        setrlimit(Resource::Nofile, Rlimit { current: Some(maximum.map_or(256, |m| m.min(256))), maximum })
+            .unwrap();
         let mut taken: Vec<_> = std::iter::from_fn(|| std::fs::File::open("/dev/null").ok()).collect();
         taken.truncate(taken.len().saturating_sub(4));
         println!("ready");
