@@ -11,7 +11,9 @@ if [ "$newer" != "GLIBC_$promised" ]; then
     objdump -T "$program" | grep -F "$wanted" | awk '{print "  " $NF}' >&2
     exit 1
 fi
-if ! objdump -p "$program" | grep -q 'NEEDED *libusb-1.0.so'; then
+# Read whole: a reader that ends early ends objdump with SIGPIPE, which pipefail takes for a failure.
+needed=$(objdump -p "$program" | grep NEEDED)
+if ! grep -q 'libusb-1.0.so' <<<"$needed"; then
     echo "$program does not load libusb-1.0.so: it was linked statically (tools/setup.sh build installs what is missing)" >&2
     exit 1
 fi

@@ -52,7 +52,7 @@ for part in "$@"; do
         need nodejs command -v node
         need npm command -v npm
         # Decodes H.264 of SVO2 recordings; loaded at run time.
-        need libopenh264-7 eval 'ldconfig -p | grep -q libopenh264.so || compgen -G "/usr/lib/*/libopenh264.so*"'
+        need libopenh264-7 eval 'grep -q libopenh264.so <<<"$(ldconfig -p)" || compgen -G "/usr/lib/*/libopenh264.so*"'
         # Other readers of recordings of an Azure Kinect.
         need ffmpeg command -v ffprobe
         need mkvtoolnix command -v mkvinfo

@@ -23,8 +23,9 @@ use iceoryx2::sample_mut_uninit::SampleMutUninit;
 use iceoryx2::service::builder::publish_subscribe::{
     PublishSubscribeCreateError as CreateError, PublishSubscribeOpenError as OpenError,
 };
+use iceoryx2::service::messaging_pattern::MessagingPattern;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
-use opening::{OpenOrCreate, RETRIES, RETRY_PAUSE, key, retry, value};
+use opening::{OpenOrCreate, key, opened, value};
 use std::sync::Arc;
 
 /// The flavour of iceoryx2 whose ports and samples may move between threads; on the wire it is `ipc`.
@@ -216,7 +217,7 @@ impl<H: Header> Channel<H> {
         shm::check_room()?;
         let name = self.service_name()?;
         let form = self.form;
-        let opened = retry(|| {
+        let open = || {
             let schema = AttributeVerifier::new()
                 .require(&key()?, &value(form.schema)?)
                 .map_err(OpenOrCreate::attribute)?;
@@ -234,31 +235,22 @@ impl<H: Header> Channel<H> {
                 .enable_safe_overflow(true)
                 .open_or_create_with_attributes(&schema)
                 .map_err(OpenOrCreate::from)
-        });
-        opened.map_err(|e| self.open_error(&e))
+        };
+        opened(node, &name, MessagingPattern::PublishSubscribe, open).map_err(|e| self.open_error(&e))
     }
 
     fn event_service(&self, node: &Node<IoxService>, name: &ServiceName) -> Result<EventFactory> {
         shm::check_room()?;
-        let mut last = None;
-        for _ in 0..RETRIES {
-            let opened = node
-                .service_builder(name)
+        let open = || {
+            node.service_builder(name)
                 .event()
                 .max_listeners(self.form.listeners)
                 .max_notifiers(self.form.notifiers)
                 .max_nodes(self.form.nodes)
-                .open_or_create();
-            match opened {
-                Ok(service) => return Ok(service),
-                Err(e) => last = Some(e),
-            }
-            std::thread::sleep(RETRY_PAUSE);
-        }
-        let e = self.error(ErrorKind::Other, &limits::why("its event service cannot be opened"));
-        Err(match last {
-            Some(source) => e.with_source(source),
-            None => e,
+                .open_or_create()
+        };
+        opened(node, name, MessagingPattern::Event, open).map_err(|e| {
+            self.error(ErrorKind::Other, &limits::why("its event service cannot be opened")).with_source(e)
         })
     }
 

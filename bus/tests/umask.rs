@@ -1,8 +1,10 @@
-//! Threads that make listeners, and folders, at once. The umask is the process's, so this is the only test in its file.
-#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
+//! Threads that make listeners, and folders, at once. The umask is the process's, so no other test of this file may touch it.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, unsafe_code)]
 
 use depthrig_bus::{Bus, RigName, RuntimeDir, StreamId, umask};
 use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::CommandExt;
+use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 const THREADS: usize = 8;
@@ -53,4 +55,37 @@ fn threads_that_subscribe_leave_umask_and_folders_alone() {
     rustix::process::umask(rustix::fs::Mode::from_bits_truncate(0o177));
     umask::check();
     assert_eq!(now(), before);
+}
+
+/// Containers forbid `unshare` (Docker does by default), and then no thread can have a umask of its own.
+#[test]
+fn where_unshare_is_refused_umask_and_folders_stay_as_well() {
+    let mut again = Command::new(std::env::current_exe().unwrap());
+    again.args(["--exact", "threads_that_subscribe_leave_umask_and_folders_alone"]);
+    // SAFETY: between fork and exec it makes system calls alone, and allocates nothing.
+    unsafe { again.pre_exec(refuse_unshare) };
+    let done = again.output().unwrap();
+    let said = String::from_utf8_lossy(&done.stdout);
+    assert!(done.status.success() && said.contains("1 passed"), "{said}");
+}
+
+/// Makes the kernel answer `unshare` with EPERM from now on.
+fn refuse_unshare() -> std::io::Result<()> {
+    const fn instruction(code: u32, if_not: u8, k: u32) -> libc::sock_filter {
+        libc::sock_filter { code: code as u16, jt: 0, jf: if_not, k }
+    }
+    let mut filter = [
+        instruction(libc::BPF_LD | libc::BPF_W | libc::BPF_ABS, 0, 0), // the number of the call
+        instruction(libc::BPF_JMP | libc::BPF_JEQ | libc::BPF_K, 1, libc::SYS_unshare as u32),
+        instruction(libc::BPF_RET | libc::BPF_K, 0, libc::SECCOMP_RET_ERRNO | libc::EPERM as u32),
+        instruction(libc::BPF_RET | libc::BPF_K, 0, libc::SECCOMP_RET_ALLOW),
+    ];
+    let program = libc::sock_fprog { len: 4, filter: filter.as_mut_ptr() };
+    // SAFETY: the kernel copies the program, which lives until the calls return; it takes no rights but this one away.
+    let refused = unsafe {
+        libc::prctl(libc::PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0
+            && libc::prctl(libc::PR_SET_SECCOMP, libc::SECCOMP_MODE_FILTER, &raw const program) == 0
+            && libc::unshare(libc::CLONE_FS) == -1
+    };
+    if refused { Ok(()) } else { Err(std::io::Error::last_os_error()) }
 }

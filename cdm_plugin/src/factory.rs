@@ -14,7 +14,7 @@ use crate::{
 pub fn refiner(options: &RefinerOptions) -> Result<Box<dyn Refiner>> {
     let engine = options.engine_kind();
     if engine == EngineKind::Fill {
-        return Ok(Box::new(FillRefiner::new(options.threads)?));
+        return Ok(Box::new(FillRefiner::new(options.threads)?.with_reach(options.fill_reach)));
     }
     let Some(model) = &options.model else {
         let message = format!(

@@ -8,7 +8,7 @@
 //! 3. the picture is halved until one cell is left ([`pyramid`]); where a cell lies on two surfaces, the farther wins;
 //! 4. from the coarsest on, holes take the depth of those coarse cells around them that look like them, and are smoothed
 //!    within their surface ([`pull`]). What was measured and kept stays as it was measured;
-//! 5. what lies further from measured depth than [`REACH`] is unknown: 0 ([`reach`]).
+//! 5. what lies further from measured depth than the reach is unknown: 0 ([`reach`]).
 //!
 //! A picture without any depth stays without: its result is 0 everywhere, and no error.
 // The steps of a pixel must end up inside the loops that are compiled for AVX2, whatever their size.
@@ -38,8 +38,6 @@ const LEAST_ISLAND: u32 = 8;
 /// An island below this part of the image that hangs in the air, at another depth than all around it, is taken out: 922
 /// pixels of 1280x720.
 const BODY: f64 = 1e-3;
-/// So far from measured depth holes are filled, a part of the image's width: 160 pixels of 1280.
-const REACH: f64 = 0.125;
 /// So far they are filled in small images too, pixels.
 const LEAST_REACH: usize = 48;
 
@@ -57,10 +55,14 @@ pub struct FillRefiner {
     islands: Islands,
     behind: Behind,
     reach: Reach,
-    fills_all: bool,
+    /// A part of the image's width; 1 is without a limit.
+    limit: f64,
 }
 
 impl FillRefiner {
+    /// So far from measured depth holes are filled by default, as a part of the image's width: 160 pixels of 1280.
+    pub const REACH: f64 = 0.125;
+
     /// A refiner that uses `threads` threads; 0 and 1 mean the caller's own, and then nothing is allocated for a picture
     /// that is not larger than those before it. (With more, rayon's queue allocates a block now and then.)
     ///
@@ -82,13 +84,14 @@ impl FillRefiner {
             islands: Islands::default(),
             behind: Behind::default(),
             reach: Reach::default(),
-            fills_all: false,
+            limit: Self::REACH,
         })
     }
 
-    /// The same without a limit: every hole is filled, however far it is from what was measured.
-    pub fn filling_all(self) -> Self {
-        Self { fills_all: true, ..self }
+    /// The same refiner with another reach: holes are filled up to `part` of the image's width from measured depth (48 pixels
+    /// at least), depth further away is unknown. 0 to 1; with 1 every hole is filled.
+    pub fn with_reach(self, part: f64) -> Self {
+        Self { limit: part, ..self }
     }
 
     fn run(&mut self, job: &mut Job<'_>) -> Result<()> {
@@ -96,7 +99,7 @@ impl FillRefiner {
         let began = HostTime::now();
         let (w, h) = (job.color.width, job.color.height);
         self.resize(w, h);
-        let Self { crew, levels, in_use, cleaned, islands, behind, reach, fills_all, .. } = self;
+        let Self { crew, levels, in_use, cleaned, islands, behind, reach, limit, .. } = self;
         let levels = &mut levels[..*in_use];
         let Some((full, _)) = levels.split_first_mut() else { return Ok(()) };
         load::load(crew, &job.color, &job.depth, cleaned, &mut full.color);
@@ -115,7 +118,7 @@ impl FillRefiner {
             }
         }
         // Filling writes into the cells' depth, but not into how much of them had some.
-        let cells = levels.get(2).filter(|_| !*fills_all);
+        let cells = levels.get(2).filter(|_| *limit < 1.0);
         if let Some(cells) = cells {
             reach.measure(cells);
         }
@@ -132,7 +135,7 @@ impl FillRefiner {
             }
         }
         if is_limited {
-            reach.forget(&mut levels[0].q, w, LEAST_REACH.max((REACH * w as f64) as usize));
+            reach.forget(&mut levels[0].q, w, LEAST_REACH.max((*limit * w as f64) as usize));
         }
         let filled = HostTime::now();
 

@@ -114,6 +114,8 @@ pub struct RefinerOptions {
     pub threads: usize,
     /// The engine's library, when it is not to be looked for.
     pub library: Option<PathBuf>,
+    /// How far from measured depth `fill` fills holes, as a part of the image's width, 0 to 1; 1 fills every hole.
+    pub fill_reach: f64,
 }
 
 impl Default for RefinerOptions {
@@ -126,6 +128,7 @@ impl Default for RefinerOptions {
             device: "cpu".into(),
             threads: 0,
             library: None,
+            fill_reach: crate::FillRefiner::REACH,
         }
     }
 }

@@ -223,6 +223,8 @@ pub struct RefineConfig {
     pub device: String,
     /// `Z16` in the unit of the camera's depth, or `DepthF32`.
     pub format: PixelFormat,
+    /// How far from measured depth the engine `fill` fills holes, as a part of the image's width, 0 to 1; 1 fills every hole.
+    pub fill_reach: f64,
     /// Whether refined depth is recorded.
     pub record: bool,
     /// Whether depth in the view of colour is published as well, as it was before it was refined.
@@ -274,6 +276,7 @@ impl Default for RefineConfig {
             precision: Precision::Fp32,
             device: "cpu".to_owned(),
             format: PixelFormat::Z16,
+            fill_reach: depthrig_cdm::FillRefiner::REACH,
             record: false,
             align: false,
             is_aligned: false,

@@ -330,6 +330,21 @@ fn the_daemon_starts_the_process_starts_it_again_and_ends_it() {
 }
 
 #[test]
+fn a_process_inherits_no_descriptor_of_the_daemon() {
+    let home = Home::default();
+    let list = home.path("descriptors");
+    // Of `ls` itself is the folder that it reads.
+    let shell = format!("ls -l /proc/self/fd >{}; exec {PROGRAM} normal", list.display());
+    let rig = home.start(&text(&format!("command = [\"sh\", \"-c\", \"{shell}\"]"))).unwrap();
+    wait_until(&rig, "streaming", all_stream);
+    let listed = std::fs::read_to_string(list).unwrap();
+    let open: Vec<_> = listed.lines().filter(|line| line.contains(" -> ")).collect();
+    assert_eq!(open.len(), 4, "{open:#?}");
+    assert!(open[3].contains("/proc/"), "{open:#?}");
+    stop(rig);
+}
+
+#[test]
 fn a_process_that_does_not_end_when_asked_is_killed() {
     let home = Home::default();
     let rig = home.start(&text(&command("ignores_term"))).unwrap();

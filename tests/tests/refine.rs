@@ -53,6 +53,7 @@ impl Refiners for Scripted {
             input_size: config.input_size,
             precision: Precision::Fp32,
             device: config.device.clone(),
+            fill_reach: 1.0,
             may_fill: false,
             note: None,
         }

@@ -58,6 +58,7 @@ impl Refiners for Source {
             input_size: None,
             precision: Precision::Fp32,
             device: config.device.clone(),
+            fill_reach: 1.0,
             may_fill: false,
             note: None,
         }

@@ -1,12 +1,33 @@
-//! Opening or creating the service of a channel, while other processes do the same.
+//! Opening or creating the services of a channel, while other processes do the same, or were killed doing it.
 
+use crate::HostTime;
+use crate::channel::IoxService;
 use core::fmt::Debug;
 use core::time::Duration;
+use iceoryx2::node::Node;
 use iceoryx2::service::attribute;
+use iceoryx2::service::builder::event::{EventOpenError, EventOpenOrCreateError};
 use iceoryx2::service::builder::publish_subscribe::{
     PublishSubscribeCreateError as CreateError, PublishSubscribeOpenError as OpenError,
     PublishSubscribeOpenOrCreateError as OpenOrCreateError,
 };
+use iceoryx2::service::internal::ServiceInternal;
+use iceoryx2::service::messaging_pattern::MessagingPattern;
+use iceoryx2::service::service_name::ServiceName;
+
+const RETRIES: u32 = 20;
+const RETRY_PAUSE: Duration = Duration::from_millis(20);
+/// Making or removing a service takes microseconds; one that is half made or half removed for so long stays so.
+const HALF: Duration = Duration::from_secs(1);
+
+/// Why a service cannot be opened or created now.
+pub(super) trait Failure {
+    /// Whether it passes by itself: another process is just making or removing the service.
+    fn is_passing(&self) -> bool;
+
+    /// Whether the service is half made or half removed, and nobody can use it.
+    fn is_half(&self) -> bool;
+}
 
 /// Everything that opening or creating can fail with.
 #[derive(Debug)]
@@ -20,15 +41,24 @@ impl OpenOrCreate {
     pub(super) fn attribute(e: impl Debug) -> Self {
         Self::Other(format!("{e:?}"))
     }
+}
 
-    /// States that pass by themselves: another process is just making or removing the service.
-    const fn is_passing(&self) -> bool {
+impl Failure for OpenOrCreate {
+    fn is_passing(&self) -> bool {
+        self.is_half()
+            || matches!(
+                self,
+                Self::Open(OpenError::InternalFailure)
+                    | Self::Create(CreateError::IsBeingCreatedByAnotherInstance)
+                    | Self::Other(_)
+            )
+    }
+
+    fn is_half(&self) -> bool {
         matches!(
             self,
-            Self::Open(
-                OpenError::IsMarkedForDestruction | OpenError::HangsInCreation | OpenError::InternalFailure
-            ) | Self::Create(CreateError::IsBeingCreatedByAnotherInstance | CreateError::HangsInCreation)
-                | Self::Other(_)
+            Self::Open(OpenError::IsMarkedForDestruction | OpenError::HangsInCreation)
+                | Self::Create(CreateError::HangsInCreation)
         )
     }
 }
@@ -43,12 +73,51 @@ impl From<OpenOrCreateError> for OpenOrCreate {
     }
 }
 
-pub(super) const RETRIES: u32 = 20;
-pub(super) const RETRY_PAUSE: Duration = Duration::from_millis(20);
+impl Failure for EventOpenOrCreateError {
+    fn is_passing(&self) -> bool {
+        true
+    }
 
-pub(super) fn retry<T>(mut open: impl FnMut() -> Result<T, OpenOrCreate>) -> Result<T, OpenOrCreate> {
+    fn is_half(&self) -> bool {
+        matches!(
+            self,
+            Self::EventOpenError(EventOpenError::IsMarkedForDestruction | EventOpenError::HangsInCreation)
+        )
+    }
+}
+
+/// Opens or creates the service `name` of `node` with `open`, again while it is in a state that passes. Removes it first
+/// if it stays half made or half removed.
+///
+/// Whoever leaves a service last locks it, forgets that it had it, and only then removes its files. A process that is
+/// killed in between leaves files of which no dead process knows, and a channel that nobody can open any more.
+#[allow(unsafe_code)]
+pub(super) fn opened<T, E: Failure>(
+    node: &Node<IoxService>,
+    name: &ServiceName,
+    pattern: MessagingPattern,
+    open: impl Fn() -> Result<T, E>,
+) -> Result<T, E> {
+    let failure = match retry(&open) {
+        Err(e) if e.is_half() => e,
+        other => return other,
+    };
+    // SAFETY: nobody uses the service: it can be neither opened nor joined in this state. A process that is alive leaves it
+    // within microseconds, and it lasted for [`HALF`] or all of the retries.
+    let removed = unsafe { IoxService::__internal_force_remove_service(name, node.config(), pattern) };
+    if !matches!(removed, Ok(true)) {
+        return Err(failure);
+    }
+    tracing::warn!(channel = %name, "removed what a killed process had left of the channel, half made or half removed");
+    retry(open)
+}
+
+fn retry<T, E: Failure>(open: impl Fn() -> Result<T, E>) -> Result<T, E> {
+    // An attempt may wait by itself for what hangs.
+    let until = HostTime::now().plus(HALF);
     for _ in 1..RETRIES {
         match open() {
+            Err(e) if e.is_half() && until.from_now().is_zero() => return Err(e),
             Err(e) if e.is_passing() => std::thread::sleep(RETRY_PAUSE),
             other => return other,
         }

@@ -122,7 +122,7 @@ fn depth_far_from_what_was_measured_is_unknown() {
             _ => {}
         }
     }
-    let mut all = FillRefiner::new(1).unwrap().filling_all();
+    let mut all = FillRefiner::new(1).unwrap().with_reach(1.0);
     assert!(refined(&mut all, (w, h), &grey, &depth).iter().all(|d| (d - 1.0).abs() < 1e-6));
 }
 
@@ -201,7 +201,7 @@ proptest! {
         let is_none = |d: f32| d == 0.0;
         let is_between = |d: f32| d >= near * 0.9999 && d <= far * 1.0001;
         prop_assert!(out.iter().all(|d| is_none(*d) || is_between(*d)), "{} to {}", near, far);
-        let all = refined(&mut FillRefiner::new(1).unwrap().filling_all(), (w, h), &color, &depth);
+        let all = refined(&mut FillRefiner::new(1).unwrap().with_reach(1.0), (w, h), &color, &depth);
         prop_assert!(all.iter().all(|d| is_none(*d)) || all.iter().all(|d| is_between(*d)), "{} to {}", near, far);
     }
 

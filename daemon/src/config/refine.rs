@@ -50,6 +50,7 @@ pub(super) fn read(
         precision: s.choice("precision", &Precision::ALL.map(|p| (p.name(), p)), d.precision),
         device: s.or("device", d.device, |v| device(v)),
         format: s.choice("format", &FORMATS, d.format),
+        fill_reach: s.or("fill_reach", d.fill_reach, within(0.0..=1.0)),
         record: s.or("record", d.record, |_| Ok(())),
         align: s.or("align", d.align, |_| Ok(())),
         is_aligned: s.or("is_aligned", d.is_aligned, |_| Ok(())),

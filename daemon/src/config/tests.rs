@@ -763,7 +763,7 @@ fn what_an_l515_has_not() {
 const REFINED: &str = "rig = \"r\"\n[cdm]\nthreads = 3\nlibrary = \"lib/ort\"\nmodels = \"/models\"\nhang_s = 2.5\n\
     [[camera]]\nname = \"a\"\nbackend = \"synthetic\"\nrecord = [\"depth\", \"depth_aligned\"]\n\
     [camera.refine]\nengine = \"onnxruntime\"\nmodel = \"my/net.pth\"\nrate_hz = 0\ninput_size = 252\n\
-    precision = \"bf16\"\ndevice = \"tensorrt:1\"\nformat = \"depth_f32\"\nrecord = true\nalign = true\n\
+    precision = \"bf16\"\ndevice = \"tensorrt:1\"\nformat = \"depth_f32\"\nfill_reach = 0.5\nrecord = true\nalign = true\n\
     is_aligned = true\n\
     [[camera]]\nname = \"b\"\nbackend = \"synthetic\"\nrefine = { model = \"cdm-d435\" }\n\
     [[camera]]\nname = \"c\"\nbackend = \"synthetic\"\n";
@@ -782,6 +782,7 @@ fn how_depth_is_refined_is_read_with_all_its_keys() {
         precision: Precision::Bf16,
         device: "tensorrt:1".into(),
         format: PixelFormat::DepthF32,
+        fill_reach: 0.5,
         record: true,
         align: true,
         is_aligned: true,
@@ -812,6 +813,7 @@ fn what_is_wrong_with_refining_is_named_at_its_line() {
         ("rate_hz = -1", 6, "is -1; it must be above 0 and at most 1000, or 0 for every pair"),
         ("device = \"gpu\"", 6, "is \"gpu\"; it must be cpu, cuda, cuda:1, tensorrt, tensorrt:0 or openvino"),
         ("input_size = 8", 6, "is 8; it must be within 56 and 2044"),
+        ("fill_reach = 1.5", 6, "is 1.5; it must be within 0 and 1"),
         ("format = \"rgb8\"", 6, "it is one of: z16, depth_f32"),
         ("engine = \"fill\"\nmodel = \"x\"", 7, "has no use: the engine \"fill\" needs no model"),
         ("[[camera.stream]]\nname = \"depth\"", 5, "[camera.refine] needs the stream \"color\""),

@@ -43,7 +43,8 @@ impl Exporter for Refine<'_> {
         };
         let cameras: Vec<_> = self.cameras.iter().map(describe).collect();
         let refine = &self.options.refine;
-        json!({ "cameras": cameras, "input_size": refine.input_size, "is_aligned": refine.is_aligned })
+        json!({ "cameras": cameras, "input_size": refine.input_size, "is_aligned": refine.is_aligned,
+            "fill_reach": refine.fill_reach })
     }
 
     fn plan(&mut self, sources: &[Source]) -> Result<Plan> {

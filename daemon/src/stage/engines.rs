@@ -17,7 +17,7 @@ pub trait Refiners: Send + Sync {
 }
 
 /// What settings come to.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
     /// What runs.
     pub engine: EngineKind,
@@ -29,6 +29,8 @@ pub struct Plan {
     pub precision: Precision,
     /// What it runs on.
     pub device: String,
+    /// How far `fill` fills, as in [`RefineConfig`].
+    pub fill_reach: f64,
     /// Whether `fill` may stand in when this cannot be had.
     pub may_fill: bool,
     /// Why this and not what one would expect.
@@ -55,15 +57,16 @@ impl Installed {
     }
 }
 
-/// `fill`, with why.
-fn fill(may_fill: bool, note: Option<String>) -> Plan {
+/// `fill` with its reach, and why it runs.
+fn fill(fill_reach: f64, note: Option<String>) -> Plan {
     Plan {
         engine: EngineKind::Fill,
         model: None,
         input_size: None,
         precision: Precision::Fp32,
         device: "cpu".to_owned(),
-        may_fill,
+        fill_reach,
+        may_fill: false,
         note,
     }
 }
@@ -94,6 +97,7 @@ impl Refiners for Installed {
             input_size: config.input_size,
             precision: config.precision,
             device: config.device.clone(),
+            fill_reach: config.fill_reach,
             may_fill,
             note: None,
         };
@@ -103,13 +107,13 @@ impl Refiners for Installed {
             super::models::installed_for(&self.cdm, device_model).or_else(published)
         };
         match config.engine {
-            EngineChoice::Fill | EngineChoice::Off => fill(false, None),
+            EngineChoice::Fill | EngineChoice::Off => fill(config.fill_reach, None),
             EngineChoice::Auto if config.model.is_some() => {
                 network(EngineKind::OnnxRuntime, config.model.clone(), true)
             }
             EngineChoice::Auto => match super::models::installed_for(&self.cdm, device_model) {
                 Some(name) => network(EngineKind::OnnxRuntime, Some(RefineModel::Installed(name)), true),
-                None => fill(false, Some(missing(device_model))),
+                None => fill(config.fill_reach, Some(missing(device_model))),
             },
             EngineChoice::OnnxRuntime | EngineChoice::Candle => {
                 let engine = match config.engine {
@@ -127,7 +131,7 @@ impl Refiners for Installed {
         match made {
             Err(e) if plan.may_fill && stands_in(e.kind()) => {
                 let note = format!("fill stands in for {}: {e}", plan.describe());
-                let refiner = self.make(&fill(false, None), threads)?;
+                let refiner = self.make(&fill(plan.fill_reach, None), threads)?;
                 Ok(Opened { refiner, note: Some(note) })
             }
             // Cameras that share it may have come to it for different reasons; their plans tell those.
@@ -162,6 +166,7 @@ impl Installed {
             device: plan.device.clone(),
             threads,
             library: self.cdm.library.clone(),
+            fill_reach: plan.fill_reach,
         })
     }
 }

@@ -231,11 +231,15 @@ fn spawn(config: &ExternalConfig, place: &Place) -> std::io::Result<Child> {
         .process_group(0);
     let end_with_daemon = move || {
         rustix::process::set_parent_process_death_signal(Some(Signal::KILL))?;
+        // Sockets of iceoryx2 are not closed by exec; a camera's process would keep the daemon's open after its end. Older
+        // kernels lack the call, and inherit them as before.
+        // SAFETY: it takes numbers alone, and marks descriptors of this process, which is about to call exec.
+        unsafe { libc::close_range(3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC.cast_signed()) };
         // The daemon may have ended before that call; nobody would send the signal then.
         let parent = rustix::process::getppid().map(|p| p.as_raw_nonzero().get().cast_unsigned());
         if parent == Some(daemon) { Ok(()) } else { Err(std::io::ErrorKind::Interrupted.into()) }
     };
-    // SAFETY: between fork and exec the closure makes two system calls and neither allocates nor takes a lock; an error
+    // SAFETY: between fork and exec the closure makes three system calls and neither allocates nor takes a lock; an error
     // without a message allocates nothing either.
     unsafe { command.pre_exec(end_with_daemon) };
     // It inherits the umask.

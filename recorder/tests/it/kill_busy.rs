@@ -104,6 +104,7 @@ fn child() {
             header.set_names("rig", &record.id);
             header.set_picture(record.format, WIDTH, HEIGHT);
             header.sequence = n + 1;
+            header.captured = n + 1;
             header.capture_time_ns = tick.ns();
             header.depth_unit_m = record.depth_unit_m;
             RecordFrame { stream, header, pixels: Box::new(Lent(Arc::clone(image))) }
@@ -238,5 +239,6 @@ fn what_a_kill_takes_unseen_on_a_busy_computer_is_younger_than_a_second() {
         at(0.95),
         at(1.0)
     );
+    assert!(recorded > 0, "no set is in any of the files");
     assert!(lost.iter().all(|ns| *ns <= LOSS_MAX_NS), "nanoseconds lost: {lost:?}");
 }

@@ -226,6 +226,7 @@ fn measure(args: &BenchArgs, spec: &Spec) -> Result<Measured> {
         device: spec.device.clone(),
         threads: args.threads,
         library: args.library.clone(),
+        ..RefinerOptions::default()
     };
     let start = HostTime::now();
     let mut refiner = refiner(&options).map_err(usage)?;

@@ -7,6 +7,7 @@ use crate::out;
 use crate::watched::{Remade, watched};
 use anyhow::Result;
 use clap::ValueEnum;
+use depthrig_cdm::FillRefiner;
 use depthrig_daemon::config::{CdmConfig, EngineChoice, RefineConfig, RefineModel};
 use depthrig_daemon::relabel::{RelabelOptions, RelabelReport, Step, relabel};
 use depthrig_recorder::Dataset;
@@ -67,6 +68,9 @@ pub struct RelabelArgs {
     /// Depth lies in the view of colour, whatever the dataset says of its calibration
     #[arg(long)]
     is_aligned: bool,
+    /// How far from measured depth fill fills holes, part of the width; 1: all
+    #[arg(long, value_name = "PART", value_parser = super::run::fill_reach, default_value_t = FillRefiner::REACH)]
+    fill_reach: f64,
     /// Pictures that are worked on at once [default: one for each core; 1 with a network]
     #[arg(short = 'j', long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     jobs: Option<u16>,
@@ -98,6 +102,7 @@ impl RelabelArgs {
             input_size: self.input_size,
             device: self.device.clone(),
             is_aligned: self.is_aligned,
+            fill_reach: self.fill_reach,
             ..RefineConfig::default()
         };
         let cdm = CdmConfig {

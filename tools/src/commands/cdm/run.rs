@@ -6,7 +6,8 @@ use crate::outfile::{OutFile, Overwrite};
 use crate::{out, picture};
 use anyhow::Result;
 use depthrig_cdm::{
-    Color, ColorFormat, EngineKind, Job, Output, Precision, RawDepth, RefinerOptions, StepTimes, refiner,
+    Color, ColorFormat, EngineKind, FillRefiner, Job, Output, Precision, RawDepth, RefinerOptions, StepTimes,
+    refiner,
 };
 use image::{DynamicImage, ExtendedColorType, ImageEncoder, codecs::png};
 use serde::Serialize;
@@ -77,6 +78,9 @@ pub struct RunArgs {
     /// The library of ONNX Runtime, when it is not to be looked for
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
+    /// How far from measured depth fill fills holes, part of the width; 1: all
+    #[arg(long, value_name = "PART", value_parser = fill_reach, default_value_t = FillRefiner::REACH)]
+    fill_reach: f64,
     #[command(flatten)]
     models: Models,
     /// Print JSON
@@ -98,6 +102,17 @@ pub fn engine(text: &str) -> Result<EngineKind, String> {
 /// When there is none of that name.
 pub fn precision(text: &str) -> Result<Precision, String> {
     text.parse().map_err(|e: depthrig_cdm::Error| e.to_string())
+}
+
+/// Reads how far `fill` fills.
+///
+/// # Errors
+/// When it is out of range 0..=1.
+pub fn fill_reach(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(part) if (0.0..=1.0).contains(&part) => Ok(part),
+        _ => Err("out of range 0..=1".to_owned()),
+    }
 }
 
 /// Metres per unit of depth.
@@ -338,6 +353,7 @@ fn options(args: &RunArgs) -> Result<RefinerOptions> {
         device: args.device.clone(),
         threads: args.threads,
         library: args.library.clone(),
+        fill_reach: args.fill_reach,
     })
 }
 
