@@ -73,6 +73,13 @@ pub trait Fs: Send + Sync + fmt::Debug {
     /// # Errors
     /// As the operating system says.
     fn available_space(&self, dir: &Path) -> io::Result<u64>;
+    /// Whether this user may create, rename and remove files in `dir`, as far as that is known without doing it.
+    ///
+    /// # Errors
+    /// What such a change would be answered.
+    fn may_write(&self, _dir: &Path) -> io::Result<()> {
+        Ok(())
+    }
     /// Keeps other processes from locking the folder `dir` until the result is dropped; a process that is killed lets go
     /// of it. A file system that only one process sees needs none.
     ///
@@ -240,6 +247,11 @@ impl Fs for RealFs {
     fn available_space(&self, dir: &Path) -> io::Result<u64> {
         let s = rustix::fs::statvfs(dir)?;
         Ok(s.f_bavail * s.f_frsize)
+    }
+
+    fn may_write(&self, dir: &Path) -> io::Result<()> {
+        use rustix::fs::Access;
+        Ok(rustix::fs::access(dir, Access::WRITE_OK | Access::EXEC_OK)?)
     }
 
     fn lock(&self, dir: &Path) -> io::Result<Box<dyn Send + Sync>> {

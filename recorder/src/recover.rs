@@ -18,12 +18,14 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+mod dry;
 pub(crate) mod facts;
 mod head;
 mod lost;
 mod segment;
 mod session;
 
+use dry::DryFs;
 use facts::Facts;
 use segment::{Before, Choice, Rebuild, Rebuilt};
 use session::Chosen;
@@ -34,13 +36,17 @@ const TEMPORARY: &str = "mcap.recovering";
 const TRIES: u32 = 8;
 /// Segments at most in the place of which an empty one is put.
 const GONE_MAX: usize = 1000;
+/// What a dry run cannot know.
+const UNKNOWN_IN_DRY_RUN: &str =
+    "nothing was written: a disk that fails or fills up meanwhile would stop the recovery";
 /// The metadata record that says what was lost.
 pub(crate) const RECOVERED_METADATA: &str = "depthrig.recovered";
 
 /// How to recover.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RecoverOptions {
-    /// Say what would be done and change nothing.
+    /// Do all of it on a copy that is not written, and change nothing: what is said is what a recovery would say, but for
+    /// a disk that fails or fills up meanwhile.
     pub dry_run: bool,
     /// Of segments that have their index and their name, believe that they are whole: nothing that is long
     /// finished is read.
@@ -154,7 +160,7 @@ pub fn recover_with(
     options: &RecoverOptions,
     progress: &mut dyn FnMut(RecoverProgress) -> ControlFlow<()>,
 ) -> Result<RecoverReport> {
-    let entries = fs.read_dir(path).map_err(|e| Error::io("open the folder", path, e))?;
+    let entries = fs.read_dir(path).map_err(|e| Error::reading("open the folder", path, e))?;
     check_names(path, &entries)?;
     let mut notes = Vec::new();
     let lock = lock_patiently(&**fs, path);
@@ -169,9 +175,13 @@ pub fn recover_with(
         }
     }
     // Again, now that nobody else changes anything.
-    let entries = fs.read_dir(path).map_err(|e| Error::io("open the folder", path, e))?;
+    let entries = fs.read_dir(path).map_err(|e| Error::reading("open the folder", path, e))?;
+    let dry = options.dry_run.then(|| Arc::new(DryFs::new(Arc::clone(fs))));
+    let unchanged = dry.clone().map(|dry| dry as Arc<dyn Fs>);
+    let fs = unchanged.as_ref().unwrap_or(fs);
     let mut job = Job {
         fs,
+        dry,
         dir: path,
         options: *options,
         progress,
@@ -190,7 +200,10 @@ pub fn recover_with(
         },
     };
     let done = job.run(&entries);
-    let report = job.report;
+    let mut report = job.report;
+    if report.dry_run && report.changed {
+        report.notes.push(UNKNOWN_IN_DRY_RUN.to_owned());
+    }
     drop(lock);
     done.map(|()| report)
 }
@@ -202,7 +215,7 @@ pub fn recover_with(
 pub fn unfinished_in(fs: &Arc<dyn Fs>, folder: &Path, rig: &str) -> Result<Vec<PathBuf>> {
     let entries = match fs.read_dir(folder) {
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Vec::new()),
-        entries => entries.map_err(|e| Error::io("open the folder", folder, e))?,
+        entries => entries.map_err(|e| Error::reading("open the folder", folder, e))?,
     };
     let mut found = Vec::new();
     // `NAME.part` is what `trim` or `merge` has not finished: no recording.
@@ -262,6 +275,8 @@ fn is_part(path: &Path) -> bool {
 /// A recovery on its way.
 struct Job<'a> {
     fs: &'a Arc<dyn Fs>,
+    /// The same, when nothing is to be changed.
+    dry: Option<Arc<DryFs>>,
     dir: &'a Path,
     options: RecoverOptions,
     progress: &'a mut dyn FnMut(RecoverProgress) -> ControlFlow<()>,
@@ -324,15 +339,11 @@ impl Job<'_> {
         let names = (0..last).filter(|n| !there.contains(n)).map(file_name);
         for path in names.map(|name| self.dir.join(name)) {
             self.report.changed = true;
-            if self.options.dry_run {
-                let name = path.file_name().unwrap_or_default().to_string_lossy();
-                self.report.lost.push(format!("{name} is gone"));
-                continue;
-            }
             self.fs.create_new(&path).map_err(|e| Error::io("create", &path, e))?;
             sync_folder_of(&**self.fs, &path)?;
         }
-        let entries = self.fs.read_dir(self.dir).map_err(|e| Error::io("open the folder", self.dir, e))?;
+        let entries =
+            self.fs.read_dir(self.dir).map_err(|e| Error::reading("open the folder", self.dir, e))?;
         Ok(segments_in(&entries, self.dir))
     }
 
@@ -358,10 +369,8 @@ impl Job<'_> {
             if !ours {
                 continue;
             }
-            if !self.options.dry_run {
-                let path = self.dir.join(&e.name);
-                self.fs.remove_file(&path).map_err(|e| Error::io("remove", &path, e))?;
-            }
+            let path = self.dir.join(&e.name);
+            self.fs.remove_file(&path).map_err(|e| Error::io("remove", &path, e))?;
             self.report.changed = true;
             self.report.removed.push(e.name.clone());
         }
@@ -408,7 +417,7 @@ impl Job<'_> {
         let doubtful = |f: &Facts| f.error.is_some() || !chosen.stored || chosen.session.outcome.is_some();
         let whole = match whole {
             Some(whole) if !part => Some(whole),
-            Some(whole) if !doubtful(&whole) && (self.options.dry_run || self.finish(path)?) => Some(whole),
+            Some(whole) if !doubtful(&whole) && self.finish(path)? => Some(whole),
             _ => None,
         };
         let facts = if let Some(whole) = whole {
@@ -419,13 +428,20 @@ impl Job<'_> {
             }
             whole
         } else {
-            let job = Rebuild { fs: &*fs, dir: self.dir, path, segments, session: &chosen.session, before };
+            let dry = self.dry.clone();
+            let job = Rebuild {
+                fs: &*fs,
+                dry: dry.as_deref(),
+                dir: self.dir,
+                path,
+                segments,
+                session: &chosen.session,
+                before,
+            };
             let Rebuilt { facts, lost, .. } = self.rebuild(&job, base, judge)?;
             segment.action = RecoverAction::Rebuilt;
             lost.tell(&mut segment);
-            if !self.options.dry_run {
-                self.replace(path)?;
-            }
+            self.replace(path)?;
             facts
         };
         segment.sets = facts.sets;
@@ -443,10 +459,7 @@ impl Job<'_> {
         let mut choice = Choice::default();
         let mut tries = 0;
         loop {
-            let rebuilt = job.run(&choice, self.options.dry_run, &mut |bytes| self.tell(base + bytes))?;
-            if self.options.dry_run {
-                return Ok(rebuilt);
-            }
+            let rebuilt = job.run(&choice, &mut |bytes| self.tell(base + bytes))?;
             let copy = segment::temporary(job.path);
             let verdict = judge.look(&*fs, &copy, &mut |_| self.tell(base))?;
             let Some(first) = verdict.broken.first() else {

@@ -1,5 +1,6 @@
 //! One segment: whether it is whole, and if not, a proven copy of what is.
 
+use super::dry::{DryFs, Same};
 use super::facts::Facts;
 use super::head::{Head, own_head};
 use super::lost::Lost;
@@ -37,6 +38,8 @@ pub(super) fn temporary(path: &Path) -> PathBuf {
 /// A segment to be copied.
 pub(super) struct Rebuild<'a> {
     pub(super) fs: &'a dyn Fs,
+    /// The same, when nothing is to be changed.
+    pub(super) dry: Option<&'a DryFs>,
     pub(super) dir: &'a Path,
     pub(super) path: &'a Path,
     /// All segments of the dataset: each has channels and session.
@@ -137,8 +140,8 @@ impl Rebuilt {
 }
 
 impl Rebuild<'_> {
-    /// Copies what is whole into the temporary file and proves that. With `dry_run` it only looks.
-    pub(super) fn run(&self, choice: &Choice, dry_run: bool, tell: Tell<'_>) -> Result<Rebuilt> {
+    /// Copies what is whole into the temporary file and proves that.
+    pub(super) fn run(&self, choice: &Choice, tell: Tell<'_>) -> Result<Rebuilt> {
         let reader = SegmentReader::open_any(self.fs, self.path)?;
         let file = self.path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let mut lost = Lost { bytes: reader.size, file, ..Lost::default() };
@@ -151,18 +154,17 @@ impl Rebuild<'_> {
             lost.at_end = true;
         }
         let temporary = temporary(self.path);
-        if dry_run {
-            let done = self.copy(&reader, &head, choice, None, &mut lost, tell)?;
-            return Ok(Rebuilt { facts: done.facts, lost, copied: done.copied });
-        }
         self.check_room(reader.size)?;
         let done =
             Segment::create_as(self.fs, &temporary, temporary.clone(), &head.preamble).and_then(|copy| {
                 let mut copy = copy;
-                let done = self.copy(&reader, &head, choice, Some(&mut copy), &mut lost, tell)?;
+                let done = self.copy(&reader, &head, choice, &mut copy, &mut lost, tell)?;
                 let (end, crc) = copy.checkpoint();
                 copy.seal()?;
-                self.prove(&reader, &temporary, end, crc, &done.copied)?;
+                // What was not written cannot differ from what was to be.
+                if self.dry.is_none() {
+                    self.prove(&reader, &temporary, end, crc, &done.copied)?;
+                }
                 Ok(done)
             });
         match done {
@@ -206,7 +208,7 @@ impl Rebuild<'_> {
         reader: &SegmentReader,
         own: &Head,
         choice: &Choice,
-        mut copy: Option<&mut Segment>,
+        copy: &mut Segment,
         lost: &mut Lost,
         tell: Tell<'_>,
     ) -> Result<Done> {
@@ -221,14 +223,15 @@ impl Rebuild<'_> {
         let (mut last_time, mut recorded) = (None, 0);
         let mut head = false;
         while let Some(group) = groups.next()? {
-            if let (Group::Set(set), Some(copy), false) = (&group, copy.as_deref_mut(), head) {
+            if let (Group::Set(set), false) = (&group, head) {
                 // Damage took the chunk that says where the cameras are.
                 let chunk = head_chunk(preamble, set.log_time, self.path)?;
                 copied.push(Copied { from: None, same: false, at: copy.len(), len: chunk.len() });
                 copy.append_chunks(&[chunk])?;
             }
             head |= matches!(&group, Group::Set(_)) || matches!(&group, Group::Between(b) if b.head);
-            let at = copy.as_ref().map_or(0, |c| c.len());
+            let at = copy.len();
+            let known = copied.len();
             if let Some(damage) = choice.refusal(&group) {
                 lost.at_end = true;
                 lost.damage.push(damage);
@@ -265,7 +268,7 @@ impl Rebuild<'_> {
                         }
                         Ok(())
                     })?;
-                    if let (Some(channel), Some(copy)) = (checkpoints, copy.as_deref()) {
+                    if let Some(channel) = checkpoints {
                         renewed = renew_checkpoint(reader, between, channel, copy)?;
                     }
                 }
@@ -277,9 +280,8 @@ impl Rebuild<'_> {
                 Group::Metadata(name, map) if name == RECOVERED_METADATA => facts.recovered(map),
                 Group::Metadata(..) => {}
             }
-            if let Some(copy) = copy.as_deref_mut() {
-                append(copy, &group, renewed, at, &mut copied)?;
-            }
+            append(copy, &group, renewed, at, &mut copied)?;
+            self.forget(&copied[known..])?;
             tell(groups.offset())?;
         }
         if lost.at_end {
@@ -297,10 +299,17 @@ impl Rebuild<'_> {
         }
         facts.lost.extend(lost.words());
         facts.sets_lost = facts.sets_lost.saturating_add(lost.sets());
-        if let Some(copy) = copy {
-            append_facts(copy, &facts, lost, said)?;
-        }
+        append_facts(copy, &facts, lost, said)?;
         Ok(Done { facts, copied })
+    }
+
+    /// Has a dry run forget what it holds of a copy and the original has as well.
+    fn forget(&self, copied: &[Copied]) -> Result<()> {
+        let Some(dry) = self.dry else { return Ok(()) };
+        let same = copied.iter().filter(|c| c.same);
+        let same = same.filter_map(|c| Some(Same { at: c.at, from: c.from?, len: c.len }));
+        let refer = dry.refer(&temporary(self.path), self.path, &same.collect::<Vec<_>>());
+        refer.map_err(|e| Error::reading("read", self.path, e))
     }
 
     /// What comes after this segment says of the end of this one, as far as it is not damaged itself.

@@ -89,9 +89,6 @@ pub(super) fn settle(job: &mut Job<'_>, mut session: Session, all: &[Facts]) -> 
     }
     session.outcome = Some(outcome);
     job.report.changed = true;
-    if job.options.dry_run {
-        return Ok(());
-    }
     session.save(&**job.fs, job.dir)
 }
 

@@ -14,6 +14,30 @@ pub fn recover(fs: &MemFs) -> depthrig_recorder::Result<RecoverReport> {
     recover_as(fs, RecoverOptions::default())
 }
 
+/// A recovery that was preceded by a dry run, which changes nothing and says the same.
+pub fn planned_and_recovered(fs: &MemFs) -> depthrig_recorder::Result<RecoverReport> {
+    let changes = fs.changes();
+    let plan = recover_as(fs, RecoverOptions { dry_run: true, ..Default::default() });
+    assert_eq!(fs.changes(), changes, "a dry run changes nothing");
+    let done = recover(fs);
+    match (&plan, &done) {
+        (Ok(plan), Ok(done)) => {
+            assert_eq!(plan.lost, done.lost);
+            assert_eq!(plan.segments, done.segments);
+            assert_eq!((&plan.removed, plan.sets, plan.changed), (&done.removed, done.sets, done.changed));
+            assert_eq!(plan.session_rebuilt, done.session_rebuilt);
+            assert_eq!(plan.notes.iter().any(|n| n.starts_with("nothing was written")), plan.changed);
+            let told = plan.notes.len() - usize::from(plan.changed);
+            assert_eq!(plan.notes[..told], done.notes);
+        }
+        (Err(plan), Err(done)) => {
+            assert_eq!((plan.kind(), plan.to_string()), (done.kind(), done.to_string()));
+        }
+        _ => panic!("the dry run ended with {plan:?}, the recovery with {done:?}"),
+    }
+    done
+}
+
 fn recover_as(fs: &MemFs, options: RecoverOptions) -> depthrig_recorder::Result<RecoverReport> {
     let fs: Arc<dyn Fs> = Arc::new(fs.clone());
     recover_with(&fs, &dir(), &options, &mut |_| ControlFlow::Continue(()))
@@ -73,13 +97,8 @@ fn read_outside(fs: &MemFs) -> usize {
 fn an_unfinished_dataset_is_finished_and_says_that_it_was_cut_off() {
     let fs = crashed(7, 3);
     assert_eq!(names(&fs), ["seg_0000.mcap", "seg_0001.mcap", "seg_0002.mcap.part", "session.toml"]);
-    let plan = recover_as(&fs, RecoverOptions { dry_run: true, ..Default::default() }).unwrap();
-    assert!(plan.changed && plan.dry_run);
-    assert!(names(&fs).contains(&"seg_0002.mcap.part".to_owned()), "a dry run changes nothing");
-
-    let report = recover(&fs).unwrap();
+    let report = planned_and_recovered(&fs).unwrap();
     assert_eq!((report.sets, report.changed, report.session_rebuilt), (7, true, false));
-    assert_eq!(report.lost, plan.lost);
     assert_eq!(report.segments[1].action, RecoverAction::None);
     assert_eq!(report.segments[2].action, RecoverAction::Rebuilt);
     assert_eq!((report.segments[2].sets, report.segments[2].tail_bytes), (1, 0));
@@ -176,7 +195,7 @@ fn a_lost_head_and_a_lost_session_are_made_anew_from_what_is_left() {
         if !session {
             fs.remove_file(&dir().join("session.toml")).unwrap();
         }
-        let report = recover(&fs).unwrap();
+        let report = planned_and_recovered(&fs).unwrap();
         assert_eq!(ids(&fs), [1, 2, 3, 4], "{report:?}");
         assert_eq!(report.session_rebuilt, !session);
         assert!(!report.lost.is_empty() && !outcome(&fs).complete);
@@ -205,7 +224,7 @@ fn a_torn_session_is_made_anew_and_a_segment_without_a_set_stays_valid() {
     fs.put(&dir().join("seg_0001.mcap.recovering"), vec![0; 100]);
     // As a crash leaves it right after the next segment was begun.
     fs.put(&dir().join("seg_0002.mcap.part"), Vec::new());
-    let report = recover(&fs).unwrap();
+    let report = planned_and_recovered(&fs).unwrap();
     assert_eq!(report.removed, [".reserve", "seg_0001.mcap.recovering", "session.tmp"]);
     assert_eq!(names(&fs), ["seg_0000.mcap", "seg_0001.mcap", "seg_0002.mcap", "session.toml"]);
     assert_eq!((ids(&fs), read_outside(&fs)), (vec![1, 2, 3, 4], 4));
@@ -250,7 +269,7 @@ fn a_recovery_that_finds_no_room_or_is_interrupted_changes_nothing() {
     let part = dir().join("seg_0000.mcap.part");
     let before = contents(&fs, &part);
     let full = copy(&fs).with_capacity(before.len() as u64 * 3 / 2);
-    let e = recover(&full).unwrap_err();
+    let e = planned_and_recovered(&full).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::DiskFull);
     assert!(e.to_string().contains("free some space and try again (nothing was changed)"), "{e}");
     assert_eq!(names(&full), names(&fs));

@@ -1,7 +1,7 @@
 //! Damage to each kind of record in each way, with its checksums left as they were and put right: after `recover`, `verify`
 //! never finds anything broken, and what is lost is stated; or the dataset is refused with a reason.
 
-use crate::recover::{findings, ids, outcome, recover};
+use crate::recover::{findings, ids, outcome, planned_and_recovered, recover};
 use crate::support::*;
 use depthrig_recorder::RecorderOptions;
 use depthrig_recorder::fs::{Fs, MemFs};
@@ -106,7 +106,7 @@ enum Ended {
 
 /// Recovers and holds what is promised of it.
 fn check(case: &str, fs: &MemFs) -> Ended {
-    let report = match recover(fs) {
+    let report = match planned_and_recovered(fs) {
         Ok(report) => report,
         Err(e) => {
             let reason = e.to_string();
@@ -189,7 +189,7 @@ fn a_segment_that_is_empty_or_gone_is_a_stated_loss() {
     let fs = MemFs::new();
     record(&fs, 4, options());
     fs.put(&segment(0), Vec::new());
-    let report = recover(&fs).unwrap();
+    let report = planned_and_recovered(&fs).unwrap();
     assert_eq!((report.sets, report.segments[0].sets_lost), (0, 4), "{report:?}");
     assert_eq!(findings(&fs), [""; 0]);
 }

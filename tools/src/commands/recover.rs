@@ -16,7 +16,8 @@ use std::path::PathBuf;
 pub const EXAMPLES: &str = "\
 Each segment that is unfinished, torn or damaged is copied set by set; the copy is read back and compared, and only
 then takes the old file's place. It may be interrupted at any time and begun again; done twice it changes nothing.
-A segment's copy needs as much free space as the segment.
+A segment's copy needs as much free space as the segment. A dry run does the same but for writing: it reads as much,
+and what it refuses or finds lost is what a recovery refuses or finds lost.
 
 Exit codes: 0 nothing was lost or nothing to do, 3 recovered and something is lost, 1 not recovered, 2 wrong usage.
 
@@ -30,7 +31,7 @@ Examples:
 pub struct RecoverArgs {
     /// The dataset's folder
     dataset: PathBuf,
-    /// Say what would be done and change nothing
+    /// Say what would be done and lost, and change nothing; only a disk that fails or fills up is not foreseen
     #[arg(long)]
     dry_run: bool,
     /// Print JSON
