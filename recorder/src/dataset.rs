@@ -14,8 +14,8 @@ mod sets;
 
 pub(crate) use decode::{check_stored, color_decodes, jpeg_pixels};
 pub use index::SetReader;
-pub(crate) use info::MotionCount;
 pub use info::{DatasetInfo, MotionInfo, SpreadStats, StreamInfo};
+pub(crate) use info::{MotionCount, image_chunks};
 pub use sets::{DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};
 pub(crate) use sets::{Kind, kind_of, kinds};
 
@@ -46,7 +46,10 @@ impl Dataset {
         let entries = match fs.read_dir(path) {
             Ok(entries) => entries,
             Err(e) if e.kind() == std::io::ErrorKind::NotFound && fs.open(path).is_err() => {
-                return Err(Error::io("open", path, e));
+                return Err(Error::reading("open", path, e));
+            }
+            Err(e) if e.kind() == std::io::ErrorKind::PermissionDenied => {
+                return Err(Error::reading("open", path, e));
             }
             // A file: one segment on its own.
             Err(_) => {

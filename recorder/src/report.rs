@@ -175,8 +175,12 @@ pub struct StreamReport {
     pub frames: u64,
     /// Sets without a frame of it.
     pub missing: u64,
-    /// Bytes of its pictures before the chunks are packed.
+    /// Bytes of its images before the chunks are packed.
     pub bytes: u64,
+    /// Bytes of the chunks that hold its images, as they lie in the file.
+    pub packed_bytes: u64,
+    /// Whether chunks of it are packed by zstd.
+    pub is_packed: bool,
     /// Bytes that its pixels have on the channel.
     pub raw_bytes: u64,
     /// Frames per second on its channel between its first and its last recorded frame.

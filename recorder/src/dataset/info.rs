@@ -1,7 +1,7 @@
 //! What is in a dataset, without reading a picture.
 
 use super::{Dataset, PixelMode, SetRange};
-use crate::container::scan::SegmentReader;
+use crate::container::scan::{ChunkEntry, SegmentReader};
 use crate::msgs::accounts;
 use crate::msgs::schemas::Schema;
 use crate::{
@@ -311,17 +311,22 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
 
 /// Adds what the chunks of a segment take that hold images alone.
 fn add_packed(info: &mut DatasetInfo, reader: &SegmentReader) {
-    for chunk in &reader.chunks {
-        let [channel] = chunk.channels[..] else { continue };
-        let Some(channel) = reader.channels.get(&channel) else { continue };
-        if !Schema::PICTURES.iter().any(|s| channel.schema == s.name()) {
-            continue;
-        }
-        let stream = channel.metadata.get("stream");
-        let Some(stream) = info.streams.iter_mut().find(|s| stream == Some(&s.stream)) else { continue };
+    for (stream, chunk) in image_chunks(reader) {
+        let Some(stream) = info.streams.iter_mut().find(|s| s.stream == stream) else { continue };
         stream.packed_bytes = stream.packed_bytes.saturating_add(chunk.length);
         stream.is_packed |= chunk.is_packed;
     }
+}
+
+/// The chunks of a segment that hold images of one stream alone, each with that stream.
+pub(crate) fn image_chunks(reader: &SegmentReader) -> impl Iterator<Item = (&str, &ChunkEntry)> {
+    reader.chunks.iter().filter_map(|chunk| {
+        let [channel] = chunk.channels[..] else { return None };
+        let channel = reader.channels.get(&channel)?;
+        let is_image = Schema::PICTURES.iter().any(|s| channel.schema == s.name());
+        let stream = channel.metadata.get("stream").filter(|_| is_image)?;
+        Some((stream.as_str(), chunk))
+    })
 }
 
 #[cfg(test)]

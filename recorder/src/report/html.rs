@@ -207,25 +207,26 @@ fn streams(out: &mut String, r: &Report) {
     out.push_str("<section><h2>Streams</h2>");
     table(out, &COLUMNS);
     for s in &r.streams {
-        let share = 100.0 * s.bytes as f64 / s.raw_bytes.max(1) as f64;
+        let share = 100.0 * s.packed_bytes as f64 / s.raw_bytes.max(1) as f64;
+        let packed = if s.is_packed { " + zstd" } else { "" };
         let serial =
             if s.record.serial.is_empty() { String::new() } else { format!(" #{}", s.record.serial) };
         let cells = [
             s.record.id.to_string(),
             format!("{}{serial}", or_none(&s.record.model)),
             format!("{}×{} {}", s.record.width, s.record.height, s.record.format.name()),
-            or_none(s.codec).to_owned(),
+            format!("{}{packed}", or_none(s.codec)),
             s.frames.to_string(),
             s.missing.to_string(),
             format!("{:.2} ({})", s.live_hz, number(s.record.rate_hz)),
-            size(s.bytes),
+            size(s.packed_bytes),
             format!("{share:.0} %"),
         ];
         row(out, &COLUMNS, &cells);
     }
     out.push_str(END_TABLE);
     out.push_str(
-        "<p class=\"cap\">Size is that of the stored pictures before lossless packing; live Hz is the rate on the \
+        "<p class=\"cap\">Size is that of the stored images as they lie in the file; live Hz is the rate on the \
          camera’s channel, of which sets take a part.</p></section>",
     );
 }

@@ -36,6 +36,25 @@ fn account(stream: &str, captured: u64, delivered: u64, dropped: [u64; 8]) -> St
     StreamAccount { stream: stream.parse().unwrap(), captured, delivered, dropped: DropCounts(dropped) }
 }
 
+/// Depth is packed by zstd, JPEG is not; both as `info` shows them.
+#[test]
+fn sizes_are_those_of_the_file() {
+    let fs = record_with(&session(), 25, |_| vec![0, 1, 2], &[]);
+    let (r, info) = (report(&fs), open(&fs).info().unwrap());
+    let page = r.to_html();
+    assert_eq!(r.streams.iter().filter(|s| s.is_packed).count(), 2);
+    for (s, told) in r.streams.iter().zip(&info.streams) {
+        assert_eq!((s.packed_bytes, s.is_packed), (told.packed_bytes, told.is_packed), "{}", told.stream);
+        let packed = if s.is_packed { " + zstd" } else { "" };
+        let share = (100.0 * told.packed_bytes as f64 / told.raw_bytes as f64).round();
+        let row = page.split("<tr>").find(|row| row.contains(&format!(">{}</td>", told.stream))).unwrap();
+        assert!(row.contains(&format!("<td>{}{packed}</td>", told.codec)), "{row}");
+        assert!(row.contains(&format!(">{share} %</td>")), "{row}");
+        // What would be shown before packing is another number.
+        assert!(s.packed_bytes < s.bytes || !s.is_packed);
+    }
+}
+
 #[test]
 fn the_numbers_are_those_of_the_recording() {
     let accounts = [account("front/color", 60, 60, [0; 8])];

@@ -4,7 +4,7 @@ use super::super::series::{TimeBins, Values};
 use super::super::{HostClock, TOLD_MAX};
 use super::Pass;
 use crate::clock::{offset_ns, step_ns};
-use crate::dataset::Dataset;
+use crate::dataset::{Dataset, image_chunks};
 use crate::msgs::schemas::Schema;
 use crate::msgs::{accounts, frame_set};
 use crate::{ErrorKind, Result, SetCounts, StreamAccount};
@@ -77,7 +77,7 @@ impl Clock {
     }
 }
 
-/// Reads accounts and clock pairs of all segments.
+/// Reads accounts and clock pairs of all segments, and what their chunks of images take.
 pub(super) fn read_told(dataset: &Dataset, pass: &mut Pass) -> Result<Told> {
     let mut told = Told::default();
     for i in 0..dataset.segments().len() {
@@ -87,6 +87,13 @@ pub(super) fn read_told(dataset: &Dataset, pass: &mut Pass) -> Result<Told> {
         if !reader.finished {
             let name = reader.path.file_name().map(|n| n.to_string_lossy().into_owned());
             told.unfinished.extend(name);
+        }
+        for (id, chunk) in image_chunks(&reader) {
+            let streams = &dataset.session().streams;
+            let Some(at) = streams.iter().position(|s| s.id.to_string() == id) else { continue };
+            let stream = &mut pass.streams[at];
+            stream.packed_bytes = stream.packed_bytes.saturating_add(chunk.length);
+            stream.is_packed |= chunk.is_packed;
         }
         let channel = |schema: Schema| {
             reader.channels.iter().find(|(_, c)| c.schema == schema.name()).map(|(id, _)| *id)
