@@ -87,7 +87,7 @@ impl KinectImport {
     /// Opens the recording `path`.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`], [`ErrorKind::BadInput`] when it is no recording of an Azure Kinect or has no calibration
+    /// [`ErrorKind::NotFound`], [`ErrorKind::BadRecording`] when it is no recording of an Azure Kinect or has no calibration
     /// where one is wanted, [`ErrorKind::Io`].
     pub fn open(path: &Path, options: KinectOptions) -> Result<Self> {
         let recording = Recording::open(path).map_err(of_driver)?;
@@ -466,7 +466,7 @@ fn of_driver(e: depthrig_drivers::Error) -> Error {
         depthrig_drivers::ErrorKind::NotFound => ErrorKind::NotFound,
         depthrig_drivers::ErrorKind::PermissionDenied => ErrorKind::PermissionDenied,
         depthrig_drivers::ErrorKind::Io => ErrorKind::Io,
-        _ => ErrorKind::BadInput,
+        _ => ErrorKind::BadRecording,
     };
     Error::new(kind, e.to_string()).with_source(e)
 }

@@ -175,8 +175,8 @@ pub struct CpuReport {
 /// `OUT.zedreplay`.
 ///
 /// # Errors
-/// [`ErrorKind::BadInput`] when the input is no recording of two eyes with their calibration, when the eyes are swapped,
-/// and when a mode cannot be made; [`ErrorKind::AlreadyExists`] when `out` is there or what is left of another run does
+/// [`ErrorKind::BadRecording`] when the input is no recording, [`ErrorKind::BadInput`] when it has not two eyes with their
+/// calibration, when the eyes are swapped, and when a mode cannot be made; [`ErrorKind::AlreadyExists`] when `out` is there or what is left of another run does
 /// not fit; [`ErrorKind::InUse`] when another run works on it; and what reading and writing say.
 pub fn zed_replay(
     input: &Path,

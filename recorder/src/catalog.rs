@@ -86,11 +86,11 @@ pub struct CatalogEntry {
 /// # Errors
 /// When `dir` cannot be read.
 pub fn catalog(fs: &dyn Fs, dir: &Path) -> Result<Vec<CatalogEntry>> {
-    if is_dataset(fs, dir).map_err(|e| Error::io("list", dir, e))? {
+    if is_dataset(fs, dir).map_err(|e| Error::reading("list", dir, e))? {
         return Ok(vec![look_at(fs, dir)]);
     }
     let mut found = Vec::new();
-    for child in folders(fs, dir).map_err(|e| Error::io("list", dir, e))? {
+    for child in folders(fs, dir).map_err(|e| Error::reading("list", dir, e))? {
         if is_dataset(fs, &child).unwrap_or(false) {
             found.push(look_at(fs, &child));
             continue;
@@ -141,7 +141,7 @@ pub fn look_at(fs: &dyn Fs, dir: &Path) -> CatalogEntry {
             segments_in(&entries, dir)
         }
         Err(e) => {
-            entry.is(Health::Damaged, Error::io("list", dir, e).to_string());
+            entry.is(Health::Damaged, Error::reading("list", dir, e).to_string());
             return entry;
         }
     };

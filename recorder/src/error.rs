@@ -18,13 +18,15 @@ pub enum ErrorKind {
     Foreign,
     /// The file ends in the middle: it was cut, or its writer was killed.
     Truncated,
+    /// What is to be imported is not a recording of the format that was asked for, or is damaged beyond use.
+    BadRecording,
     /// A checksum or an index does not agree with the data.
     Corrupt,
     /// The dataset was written by a later version.
     Version,
     /// The disk is full.
     DiskFull,
-    /// The folder cannot be written by this user, or its file system is read-only.
+    /// This user may not read or write the path, or its file system is read-only.
     PermissionDenied,
     /// The dataset is being recorded or recovered right now.
     InUse,
@@ -55,7 +57,20 @@ impl Error {
         matches!(self.kind(), Corrupt | Truncated | Version | NotADataset | Foreign)
     }
 
-    /// A failed operation on `path`; `what` reads as in "cannot {what} {path}".
+    /// A failed operation that reads `path`; `what` reads as in "cannot {what} {path}".
+    pub(crate) fn reading(what: &str, path: &Path, e: io::Error) -> Self {
+        if e.kind() != io::ErrorKind::PermissionDenied {
+            return Self::io(what, path, e);
+        }
+        let path = path.display();
+        let message = format!(
+            "cannot {what} {path}: permission denied; this user may not read it, its owner changes that with: chmod -R \
+             a+rX {path}"
+        );
+        Self::new(ErrorKind::PermissionDenied, message).with_source(e)
+    }
+
+    /// A failed operation that changes `path`, or needs to; `what` reads as in "cannot {what} {path}".
     pub(crate) fn io(what: &str, path: &Path, e: io::Error) -> Self {
         let (kind, advice) = match e.kind() {
             io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {

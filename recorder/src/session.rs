@@ -435,7 +435,7 @@ fn text_of(fs: &dyn Fs, path: &Path) -> Result<String> {
         file.read_exact_at(&mut bytes, 0)?;
         Ok((bytes, size))
     };
-    let (bytes, size) = read().map_err(|e: std::io::Error| Error::io("read", path, e))?;
+    let (bytes, size) = read().map_err(|e: std::io::Error| Error::reading("read", path, e))?;
     if size > limits::TEXT_MAX_BYTES {
         let most = limits::TEXT_MAX_BYTES;
         let what = format!("{} has {size} bytes, {most} is the limit", path.display());

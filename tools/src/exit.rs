@@ -9,9 +9,9 @@ use core::fmt;
 pub enum Exit {
     /// Everything as asked: 0.
     Good,
-    /// It did not work: 1.
+    /// It did not work: 1. A dataset or recording that is missing, unreadable, empty, damaged or not one fails.
     Failed,
-    /// Wrong usage or configuration: 2.
+    /// Wrong usage or configuration: 2. Inputs that are readable and do not fit what was asked for are wrong usage.
     Usage,
     /// It worked, but something was lost on the way: 3.
     Lost,

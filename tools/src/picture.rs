@@ -20,7 +20,8 @@ const TAIL: f64 = 0.02;
 /// When it cannot be read, or is damaged or of another kind; the message names it.
 pub fn open(path: &Path) -> Result<DynamicImage> {
     let unreadable = || format!("{}: cannot be read as an image; PNG, JPEG, PGM and PPM can", path.display());
-    let bytes = files::read(path, files::IMAGE_MAX_BYTES).with_context(unreadable)?;
+    let bytes = files::read(path, files::IMAGE_MAX_BYTES)
+        .with_context(|| format!("{}: cannot be read", path.display()))?;
     if bytes.starts_with(&depthrig_jpeg::START) {
         return jpeg(&bytes).with_context(unreadable);
     }

@@ -57,8 +57,8 @@ impl Sources {
     /// Opens `paths` as the rig `rig`, or as the one that they were recorded from.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`], [`ErrorKind::BadInput`] when one of them is no dataset or has no set, or when they
-    /// are not of one rig, [`ErrorKind::Other`] when the disk fails.
+    /// [`ErrorKind::NotFound`], [`ErrorKind::PermissionDenied`], [`ErrorKind::BadInput`] when they are not of one rig,
+    /// [`ErrorKind::Other`] when one of them is no dataset or has no set, or the disk fails.
     pub fn open(paths: &[PathBuf], rig: Option<RigName>) -> Result<Self> {
         let mut sources = Vec::new();
         let mut streams: Vec<StreamRecord> = Vec::new();
@@ -69,7 +69,8 @@ impl Sources {
             if reader.times().is_empty() {
                 let shown = path.display();
                 let why = reader.problems().first().map_or(String::new(), |p| format!(": {p}"));
-                return Err(bad(format!("{shown} holds no frame set, there is nothing to replay{why}")));
+                let message = format!("{shown} holds no frame set, there is nothing to replay{why}");
+                return Err(Error::new(ErrorKind::Other, message));
             }
             let mut indices = Vec::new();
             for record in &dataset.session().streams {
@@ -334,7 +335,6 @@ fn of_dataset(e: depthrig_recorder::Error) -> Error {
     let kind = match e.kind() {
         Rec::NotFound => ErrorKind::NotFound,
         Rec::PermissionDenied => ErrorKind::PermissionDenied,
-        Rec::NotADataset | Rec::Foreign | Rec::Version => ErrorKind::BadInput,
         _ => ErrorKind::Other,
     };
     Error::new(kind, e.to_string()).with_source(e)

@@ -95,7 +95,7 @@ fn driver(e: depthrig_drivers::Error) -> Error {
         depthrig_drivers::ErrorKind::NotFound => ErrorKind::NotFound,
         depthrig_drivers::ErrorKind::PermissionDenied => ErrorKind::PermissionDenied,
         depthrig_drivers::ErrorKind::BadInput | depthrig_drivers::ErrorKind::Unsupported => {
-            ErrorKind::BadInput
+            ErrorKind::BadRecording
         }
         _ => ErrorKind::Io,
     };

@@ -42,7 +42,7 @@ pub(super) fn pool(images: Option<&Path>, w: u32, h: u32) -> Result<(Pool, Strin
 
 fn load(dir: &Path, w: u32, h: u32, pool: &mut Pool) -> Result<()> {
     let mut paths: Vec<_> = std::fs::read_dir(dir)
-        .map_err(|e| Error::io("read the folder", dir, e))?
+        .map_err(|e| Error::reading("read the folder", dir, e))?
         .filter_map(|e| Some(e.ok()?.path()))
         .collect();
     paths.sort();
@@ -74,7 +74,7 @@ fn open(path: &Path) -> Result<image::DynamicImage> {
     if path.extension().is_some_and(|e| e == "png") {
         return image::open(path).map_err(|e| unreadable().with_source(e));
     }
-    let bytes = std::fs::read(path).map_err(|e| Error::io("read", path, e))?;
+    let bytes = std::fs::read(path).map_err(|e| Error::reading("read", path, e))?;
     let decoded = depthrig_jpeg::decode(&bytes).map_err(|e| unreadable().with_source(e))?;
     let depthrig_jpeg::Info { width, height, form } = decoded.info;
     let image = match form {

@@ -24,7 +24,7 @@ pub(super) struct SegmentFacts {
 
 /// Reads them.
 pub(super) fn read(fs: &dyn Fs, path: &Path) -> Result<SegmentFacts> {
-    let io = |e| Error::io("read", path, e);
+    let io = |e| Error::reading("read", path, e);
     let wrong = |kind, what: &str| Error::new(kind, format!("{} {what}", path.display()));
     let damaged = || wrong(ErrorKind::Corrupt, "has a damaged summary");
     let file = fs.open(path).map_err(io)?;

@@ -98,7 +98,7 @@ impl SegmentReader {
         let reader = Self::open_any(fs, path)?;
         let mut magic = [0; 8];
         if reader.size >= 8 {
-            reader.file.read_exact_at(&mut magic, 0).map_err(|e| Error::io("read", path, e))?;
+            reader.file.read_exact_at(&mut magic, 0).map_err(|e| Error::reading("read", path, e))?;
         }
         if magic != MAGIC {
             return Err(Error::new(
@@ -111,8 +111,8 @@ impl SegmentReader {
 
     /// Opens a file of which even the beginning may be damaged.
     pub(crate) fn open_any(fs: &dyn Fs, path: &Path) -> Result<Self> {
-        let file = fs.open(path).map_err(|e| Error::io("open", path, e))?;
-        let size = file.size().map_err(|e| Error::io("open", path, e))?;
+        let file = fs.open(path).map_err(|e| Error::reading("open", path, e))?;
+        let size = file.size().map_err(|e| Error::reading("open", path, e))?;
         Ok(Self {
             file,
             path: path.to_owned(),
@@ -172,19 +172,19 @@ impl SegmentReader {
             ));
         }
         let mut bytes = vec![0; len as usize];
-        self.file.read_exact_at(&mut bytes, offset).map_err(|e| Error::io("read", &self.path, e))?;
+        self.file.read_exact_at(&mut bytes, offset).map_err(|e| Error::reading("read", &self.path, e))?;
         Ok(bytes)
     }
 
     /// Fills `buf` with bytes of the file, and uses its memory again.
     pub(crate) fn read_into(&self, buf: &mut Vec<u8>, offset: u64, len: u64) -> Result<()> {
         buf.resize(len as usize, 0);
-        self.file.read_exact_at(buf, offset).map_err(|e| Error::io("read", &self.path, e))
+        self.file.read_exact_at(buf, offset).map_err(|e| Error::reading("read", &self.path, e))
     }
 
     /// Fills `buf` with the bytes of the file from `offset`.
     pub(crate) fn read_at(&self, buf: &mut [u8], offset: u64) -> Result<()> {
-        self.file.read_exact_at(buf, offset).map_err(|e| Error::io("read", &self.path, e))
+        self.file.read_exact_at(buf, offset).map_err(|e| Error::reading("read", &self.path, e))
     }
 
     /// Opcode and length of the record at `offset`.

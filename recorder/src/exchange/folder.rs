@@ -133,7 +133,7 @@ impl<'a> Output<'a> {
         match self.fs.open(&path) {
             Ok(file) => Ok(Some(file)),
             Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(None),
-            Err(e) => Err(Error::io("open", &path, e)),
+            Err(e) => Err(Error::reading("open", &path, e)),
         }
     }
 
@@ -199,14 +199,14 @@ impl<'a> Output<'a> {
         let file = match self.fs.open(&path) {
             Ok(file) => file,
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-            Err(e) => return Err(Error::io("open", &path, e)),
+            Err(e) => return Err(Error::reading("open", &path, e)),
         };
         let read = || {
             let mut bytes = vec![0; usize::try_from(file.size()?.min(JSON_MAX)).unwrap_or(0)];
             file.read_exact_at(&mut bytes, 0)?;
             Ok(bytes)
         };
-        read().map(Some).map_err(|e| Error::io("read", &path, e))
+        read().map(Some).map_err(|e| Error::reading("read", &path, e))
     }
 
     fn read_json<T: DeserializeOwned>(&self, name: &str) -> Result<T> {
@@ -245,7 +245,7 @@ impl<'a> Output<'a> {
 
     /// Removes the marks; the state last, because without it the folder is nobody's.
     pub(super) fn clean(&self) -> Result<()> {
-        let entries = self.fs.read_dir(&self.dir).map_err(|e| Error::io("list", &self.dir, e))?;
+        let entries = self.fs.read_dir(&self.dir).map_err(|e| Error::reading("list", &self.dir, e))?;
         let marks = entries.iter().filter(|e| !e.is_dir && e.name.starts_with(".part_"));
         let state = entries.iter().filter(|e| e.name == STATE_FILE);
         for entry in marks.chain(state) {

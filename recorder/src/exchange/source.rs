@@ -79,7 +79,7 @@ impl Source {
     pub(super) fn identity(&self, fs: &dyn Fs) -> Result<DatasetIdentity> {
         let session = self.session();
         let segment = |path: &std::path::PathBuf| {
-            let size = fs.open(path).and_then(|f| f.size()).map_err(|e| Error::io("open", path, e))?;
+            let size = fs.open(path).and_then(|f| f.size()).map_err(|e| Error::reading("open", path, e))?;
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             Ok(SegmentIdentity { name, bytes: size })
         };

@@ -68,7 +68,7 @@ pub(super) fn past(fs: &Arc<dyn Fs>, dir: &Path) -> Result<Past> {
         let message = format!("{} is whole already; nothing can be recorded into it", dir.display());
         return Err(Error::new(ErrorKind::AlreadyExists, message));
     }
-    let entries = fs.read_dir(dir).map_err(|e| Error::io("read the folder", dir, e))?;
+    let entries = fs.read_dir(dir).map_err(|e| Error::reading("read the folder", dir, e))?;
     let (mut numbers, mut bytes) = (Vec::new(), 0);
     for entry in entries {
         let number = segment_number(&entry.name);

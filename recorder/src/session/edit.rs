@@ -115,7 +115,7 @@ struct SessionText<'a> {
 impl<'a> SessionText<'a> {
     fn open(fs: &'a dyn Fs, dir: &Path) -> Result<Self> {
         let lock = fs.lock(dir);
-        let entries = fs.read_dir(dir).map_err(|e| Error::io("open", dir, e))?;
+        let entries = fs.read_dir(dir).map_err(|e| Error::reading("open", dir, e))?;
         let part = |p: &PathBuf| p.extension().is_some_and(|e| e == "part");
         if let Some(part) = segments_in(&entries, dir).iter().find(|p| part(p)) {
             let file = part.file_name().unwrap_or_default().to_string_lossy().into_owned();

@@ -297,7 +297,7 @@ impl<'a> Output<'a> {
         let path = segment.finish(self.fs)?;
         self.index += 1;
         let file = self.fs.open(&path).and_then(|f| f.size());
-        self.bytes += file.map_err(|e| Error::io("open", &path, e))?;
+        self.bytes += file.map_err(|e| Error::reading("open", &path, e))?;
         Ok(())
     }
 

@@ -52,10 +52,10 @@ pub struct EvalArgs {
     #[arg(long, value_name = "M", value_parser = crate::cli::depth_unit_m)]
     truth_unit: Option<f64>,
     /// Nearest reference that counts, metres [default: 0; of HAMMER 0.1]
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = crate::cli::distance_m)]
     min_m: Option<f64>,
     /// Farthest reference that counts, metres [default: no limit; of HAMMER 6]
-    #[arg(long, value_name = "M")]
+    #[arg(long, value_name = "M", value_parser = crate::cli::distance_m)]
     max_m: Option<f64>,
     /// Width of the bins of distance, metres; what is beyond 48 of them is in the last
     #[arg(long, value_name = "M", default_value = "0.25", value_parser = positive_metres)]
@@ -144,7 +144,9 @@ fn source(args: &EvalArgs) -> Result<(Box<dyn Source>, DepthRange, String)> {
         return Ok((Box::new(files), DepthRange::ALL, truth.clone()));
     };
     let title = input.display().to_string();
-    if input.join(depthrig_recorder::SESSION_FILE).is_file() || input.is_file() {
+    // A folder that may not be listed is refused as a dataset is, with what makes it readable.
+    let is_closed = input.read_dir().is_err_and(|e| e.kind() == std::io::ErrorKind::PermissionDenied);
+    if is_closed || input.join(depthrig_recorder::SESSION_FILE).is_file() || input.is_file() {
         let names = args.pred.iter().map(|p| stream(p)).collect::<Result<Vec<_>>>()?;
         let truth = args.truth.as_deref().map(stream).transpose()?;
         let source = FromDataset::open(input, &names, truth.as_ref())?;

@@ -24,8 +24,8 @@ pub const EXAMPLES: &str = "\
 OUT is a new dataset, verified at the end. What was assumed or inferred is told, and is in the table
 [import] of its session.toml; docs/exchange.md describes each layout.
 
-Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage or input, 3 imported, but
-some of the input could not be.
+Exit codes: 0 all, 1 failed (also: no such recording) or ended before all was done, 2 wrong usage,
+3 imported, but some of the input could not be.
 
 Examples:
   depthrig import bytecameradepth recorded_data/20250314_1512 data/20250314_1512_kitchen
@@ -37,8 +37,8 @@ FOLDER holds camera_<model> folders with depth_N.png, color_N.png, ir_N.png and 
 the frames.csv and calibration.json of an export it becomes that dataset again; without them times
 follow from N, and units of depth from the models.
 
-Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage or input, 3 imported, but
-some of the input could not be.
+Exit codes: 0 all, 1 failed (also: no such recording) or ended before all was done, 2 wrong usage,
+3 imported, but some of the input could not be.
 
 Examples:
   depthrig import bytecameradepth recorded_data/20250314_1512 data/20250314_1512_kitchen
@@ -48,8 +48,8 @@ const ROSBAG_EXAMPLES: &str = "\
 Pictures with their counters, device times, exposure and gain, intrinsics, poses and options come
 over; messages of motion sensors do not. A bag that was cut or damaged gives what can be read.
 
-Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage or input, 3 imported, but
-some of the bag could not be.
+Exit codes: 0 all, 1 failed (also: no such bag) or ended before all was done, 2 wrong usage,
+3 imported, but some of the bag could not be.
 
 Examples:
   depthrig import rosbag 20260314_151200.bag data/20260314_1512_kitchen
@@ -59,8 +59,8 @@ const KINECT_EXAMPLES: &str = "\
 JPEG, depth, infrared and samples of motion come over as they are, with the device's times, calibration
 and serial number. A file that was cut or damaged gives every cluster that is whole.
 
-Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage or input, 3 imported, but
-some of the file could not be.
+Exit codes: 0 all, 1 failed (also: no such recording) or ended before all was done, 2 wrong usage,
+3 imported, but some of the file could not be.
 
 Examples:
   depthrig import kinect kitchen.mkv data/kitchen
@@ -131,7 +131,7 @@ pub struct ByteCameraArgs {
     #[arg(long = "depth-unit", value_name = "[CAM=]METRES", value_parser = depth_unit)]
     depth_units: Vec<(Option<String>, f64)>,
     /// Sets in a second, where there is no frames.csv [default: 5]
-    #[arg(long, value_name = "HZ")]
+    #[arg(long, value_name = "HZ", value_parser = crate::cli::rate_hz)]
     rate: Option<f64>,
 }
 

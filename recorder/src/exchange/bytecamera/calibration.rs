@@ -80,7 +80,7 @@ impl Calibration {
     }
 
     pub(super) fn parse(text: &[u8], path: &Path) -> Result<Self> {
-        let bad = |why: String| Error::new(ErrorKind::BadInput, format!("{}: {why}", path.display()));
+        let bad = |why: String| Error::new(ErrorKind::BadRecording, format!("{}: {why}", path.display()));
         let read: Self = serde_json::from_slice(text).map_err(|e| bad(format!("{e}")))?;
         if read.format != VERSION {
             return Err(bad(format!(

@@ -60,23 +60,25 @@ enum List {
 }
 
 fn bad(path: &Path, why: impl core::fmt::Display) -> Error {
-    Error::new(ErrorKind::BadInput, format!("{}: {why}", path.display()))
+    Error::new(ErrorKind::BadRecording, format!("{}: {why}", path.display()))
 }
 
 impl ByteCameraImport {
     /// Looks at the folder `dir` of a session, which holds `camera_…` folders. One picture of each kind is read.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`] or [`ErrorKind::BadInput`] when it holds no such folders or they contradict
-    /// `calibration.json` or `frames.csv`, [`ErrorKind::Io`].
+    /// [`ErrorKind::NotFound`], [`ErrorKind::BadRecording`] when it holds no such folders or they contradict
+    /// `calibration.json` or `frames.csv`, [`ErrorKind::BadInput`] for an option out of its range, [`ErrorKind::Io`].
     pub fn open(fs: Arc<dyn Fs>, dir: &Path, options: ByteCameraOptions) -> Result<Self> {
         for unit in options.depth_unit_m.iter().chain(options.camera_depth_unit_m.values()) {
             if !UNITS_M.contains(unit) {
-                return Err(bad(dir, format_args!("a depth unit of {unit} m makes no sense; 1 mm is 0.001")));
+                let message = format!("invalid depth unit {unit} m; a millimetre is 0.001");
+                return Err(Error::new(ErrorKind::BadInput, message));
             }
         }
         if options.rate_hz.is_some_and(|r| !(1e-3..=1e4).contains(&r)) {
-            return Err(bad(dir, "a rate is a number of sets in a second, such as 5"));
+            let message = "a rate is a number of sets in a second, such as 5";
+            return Err(Error::new(ErrorKind::BadInput, message));
         }
         let found = list(&*fs, dir)?;
         let calibration = match read_file(&*fs, &dir.join(CALIBRATION_FILE))? {
@@ -117,7 +119,7 @@ impl ByteCameraImport {
                 self.by_numbers();
                 Ok(())
             }
-            Err(e) => Err(Error::io("open", &path, e)),
+            Err(e) => Err(Error::reading("open", &path, e)),
         }
     }
 

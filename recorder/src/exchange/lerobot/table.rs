@@ -214,7 +214,7 @@ impl Table {
     /// The table `name` of an export; `None` when it is not there.
     pub(super) fn open(out: &Output<'_>, name: &str) -> Result<Option<Self>> {
         let Some(file) = out.open_file(name)? else { return Ok(None) };
-        let bytes = file.size().map_err(|e| Error::io("read", &out.dir().join(name), e))?;
+        let bytes = file.size().map_err(|e| Error::reading("read", &out.dir().join(name), e))?;
         Ok(Some(Self { file: file.into(), name: name.to_owned(), bytes }))
     }
 

@@ -106,9 +106,9 @@ fn record(bytes: &[u8]) -> Option<(Head<'_>, &[u8], &[u8])> {
 
 impl Bag {
     pub(super) fn open(file: Box<dyn ReadFile>, path: &Path) -> Result<Self> {
-        let size = file.size().map_err(|e| Error::io("read", path, e))?;
+        let size = file.size().map_err(|e| Error::reading("read", path, e))?;
         let mut begin = vec![0; (MAGIC.len() as u64).min(size) as usize];
-        file.read_exact_at(&mut begin, 0).map_err(|e| Error::io("read", path, e))?;
+        file.read_exact_at(&mut begin, 0).map_err(|e| Error::reading("read", path, e))?;
         if begin != MAGIC {
             let what = if begin.starts_with(b"#ROSBAG V1") {
                 "is a rosbag of version 1; convert it with `rosbag fix`"
@@ -117,7 +117,7 @@ impl Bag {
             } else {
                 "is no rosbag of version 2"
             };
-            return Err(Error::new(ErrorKind::BadInput, format!("{} {what}", path.display())));
+            return Err(Error::new(ErrorKind::BadRecording, format!("{} {what}", path.display())));
         }
         Ok(Self { file, path: path.to_owned(), size })
     }
@@ -138,7 +138,7 @@ impl Bag {
             return Err(self.cut());
         }
         let mut bytes = vec![0; len as usize];
-        self.file.read_exact_at(&mut bytes, offset).map_err(|e| Error::io("read", &self.path, e))?;
+        self.file.read_exact_at(&mut bytes, offset).map_err(|e| Error::reading("read", &self.path, e))?;
         Ok(bytes)
     }
 
@@ -195,7 +195,7 @@ impl Bag {
                      --lz4` on it first",
                     self.path.display()
                 );
-                return Err(Error::new(ErrorKind::BadInput, what));
+                return Err(Error::new(ErrorKind::BadRecording, what));
             }
             other => return Err(wrong(format!("a chunk packed with {other:?}"))),
         }
@@ -233,7 +233,7 @@ impl Bag {
                 OP_CHUNK | OP_MESSAGE => match self.unpack(offset, &mut content) {
                     Ok(()) if op == OP_CHUNK => pass.chunk(offset, &content.bytes)?,
                     Ok(()) => pass.bare(offset, &head, &content.bytes)?,
-                    Err(e) if matches!(e.kind(), ErrorKind::Io | ErrorKind::BadInput) => return Err(e),
+                    Err(e) if matches!(e.kind(), ErrorKind::Io | ErrorKind::BadRecording) => return Err(e),
                     Err(e) => pass.damaged(&e),
                 },
                 OP_CONNECTION => connect(&mut pass.connections, &head),

@@ -51,10 +51,10 @@ impl RosbagImport {
     /// Reads the bag `path` once from front to back; pictures are read later.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`], [`ErrorKind::BadInput`] when it is no rosbag of version 2, is packed with bz2 or holds no
+    /// [`ErrorKind::NotFound`], [`ErrorKind::BadRecording`] when it is no rosbag of version 2, is packed with bz2 or holds no
     /// frames of librealsense, [`ErrorKind::Io`]. Damage is counted in [`ImportFacts`].
     pub fn open(fs: &dyn Fs, path: &Path, name: String) -> Result<Self> {
-        let file = fs.open(path).map_err(|e| Error::io("open", path, e))?;
+        let file = fs.open(path).map_err(|e| Error::reading("open", path, e))?;
         Self::read(file, path, name)
     }
 
@@ -128,7 +128,7 @@ impl RosbagImport {
             }
             let (Some(format), Some((width, height))) = (found.format, found.size) else { continue };
             let id = StreamId::new(&camera, stream.as_str())
-                .map_err(|e| Error::new(ErrorKind::BadInput, format!("{topic}: {e}")).with_source(e))?;
+                .map_err(|e| Error::new(ErrorKind::BadRecording, format!("{topic}: {e}")).with_source(e))?;
             if self.streams.iter().any(|s| s.record.id == id) {
                 let pictures = found.frames.len() as u64;
                 self.lose(pictures, format!("{topic}: there is a stream {id} already, this one is left out"));
@@ -190,7 +190,7 @@ impl RosbagImport {
         }
         if self.streams.is_empty() {
             return Err(Error::new(
-                ErrorKind::BadInput,
+                ErrorKind::BadRecording,
                 format!(
                     "{} holds no pictures of librealsense (topics /device_0/sensor_0/Depth_0/image/data){}",
                     self.bag.path.display(),

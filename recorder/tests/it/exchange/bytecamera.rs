@@ -363,7 +363,7 @@ fn what_is_no_such_folder_is_refused() {
     assert_eq!(refused(&fs, "/nowhere", ByteCameraOptions::default()).0, ErrorKind::NotFound);
     fs.create_dir_all(Path::new("/empty")).unwrap();
     let (kind, why) = refused(&fs, "/empty", ByteCameraOptions::default());
-    assert!(kind == ErrorKind::BadInput && why.contains("no folder camera_<model>"), "{why}");
+    assert!(kind == ErrorKind::BadRecording && why.contains("no folder camera_<model>"), "{why}");
     foreign(&fs, "camera_d455", "depth", &[1], PixelFormat::Z16, "a");
     // The folder around it is one step off.
     let (_, why) = refused(&fs, "/in", ByteCameraOptions::default());
@@ -373,7 +373,7 @@ fn what_is_no_such_folder_is_refused() {
     let (_, why) = refused(&fs, "/in/a", ByteCameraOptions::default());
     assert!(why.contains("number 1 of depth_N.png is there twice"), "{why}");
     let unit = ByteCameraOptions { depth_unit_m: Some(1000.0), ..Default::default() };
-    assert!(refused(&fs, "/in/a", unit).1.contains("a depth unit of 1000 m makes no sense"));
+    assert!(refused(&fs, "/in/a", unit).1.contains("invalid depth unit 1000 m"));
 
     // Every line of frames.csv cut or changed, and every byte of calibration.json: an error or a dataset, no panic.
     let fs = recorded(&everything(), 2, ColorCodec::Raw);

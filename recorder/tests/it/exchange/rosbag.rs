@@ -128,7 +128,7 @@ fn a_bag_that_was_cut_is_told() {
                 // The index at the end is not needed; a cut exactly between records cannot be seen.
                 assert!(r.facts.lost > 0 || r.summary.frames == 3, "cut at {at}");
             }
-            Err(e) => assert_eq!(e.kind(), ErrorKind::BadInput, "cut at {at}: {e}"),
+            Err(e) => assert_eq!(e.kind(), ErrorKind::BadRecording, "cut at {at}: {e}"),
         }
     }
     assert!(with_frames > 5, "{with_frames}");
@@ -144,7 +144,7 @@ fn other_files_are_refused_with_advice() {
         (b"#ROSBAG V2.0\n", "holds no pictures"),
     ] {
         let e = imported(bytes.to_vec()).1.unwrap_err();
-        assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains(word), "{e}");
+        assert!(e.kind() == ErrorKind::BadRecording && e.to_string().contains(word), "{e}");
     }
     // Every chunk says it is packed with something else.
     let mut bz2 = real_bag();
@@ -153,7 +153,7 @@ fn other_files_are_refused_with_advice() {
         bz2[i + 12..i + 15].copy_from_slice(b"bz2");
     }
     let e = imported(bz2).1.unwrap_err();
-    assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains("rosbag decompress"), "{e}");
+    assert!(e.kind() == ErrorKind::BadRecording && e.to_string().contains("rosbag decompress"), "{e}");
 }
 
 /// A chunk that unpacks to more or less than its header says is damaged, whatever is in it.

@@ -21,8 +21,9 @@ performance, quality and ultra are depthrig's own stereo and are recorded as mim
 stereo network of yours in ONNX form. Until the dataset is whole, what is done lies in DATASET.zedreplay: a run that was
 ended or killed goes on there when it is started again with the same options.
 
-Exit codes: 0 all, 1 failed or ended before all was done (DATASET is not there), 2 wrong usage or a recording that cannot
-be replayed, 3 done, but some pairs could not be read or a mode is unavailable.
+Exit codes: 0 all, 1 failed (also: INPUT is not a recording) or ended before all was done (DATASET is not there), 2 wrong
+usage or a recording without two eyes and their calibration, 3 done, but some pairs could not be read or a mode is
+unavailable.
 
 Examples:
   depthrig zed replay data/20261121_1015_kitchen --modes performance,ultra,quality --out data/kitchen_depth
@@ -77,16 +78,16 @@ pub struct ReplayArgs {
     #[arg(long, value_name = "NUMBER")]
     serial: Option<String>,
     /// Rate of pairs without times of their own, Hz [default: 30]
-    #[arg(long, value_name = "HZ")]
+    #[arg(long, value_name = "HZ", value_parser = crate::cli::rate_hz)]
     rate: Option<f64>,
     /// Record disparity_MODE as well
     #[arg(long)]
     disparity: bool,
     /// Nearer than this is a hole, metres; half of it takes twice the time
-    #[arg(long, value_name = "METRES", default_value_t = 0.3)]
+    #[arg(long, value_name = "METRES", default_value_t = 0.3, value_parser = crate::cli::range_limit_m)]
     min_depth: f64,
     /// Farther than this is a hole, metres
-    #[arg(long, value_name = "METRES", default_value_t = 20.0)]
+    #[arg(long, value_name = "METRES", default_value_t = 20.0, value_parser = crate::cli::range_limit_m)]
     max_depth: f64,
     /// Metres per unit of depth
     #[arg(long, value_name = "METRES", default_value_t = 0.001, value_parser = crate::cli::depth_unit_m)]
@@ -101,7 +102,7 @@ pub struct ReplayArgs {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
     /// Memory that this may take, GB; fewer pairs are worked on at once then [default: half of what is free]
-    #[arg(long, value_name = "GB")]
+    #[arg(long, value_name = "GB", value_parser = crate::cli::memory_gb)]
     memory: Option<f64>,
     /// Print the report as JSON
     #[arg(long)]
@@ -148,7 +149,7 @@ impl ReplayArgs {
             options.jobs = jobs.into();
         }
         if let Some(gb) = self.memory {
-            options.memory_bytes = (gb.max(0.0) * 1e9) as u64;
+            options.memory_bytes = (gb * 1e9) as u64;
         }
         Ok(options)
     }

@@ -40,12 +40,12 @@ pub(super) fn key_of(file: &str) -> Option<Key> {
 
 pub(super) fn list(fs: &dyn Fs, dir: &Path) -> Result<Found> {
     let mut found = Found::new();
-    for folder in fs.read_dir(dir).map_err(|e| Error::io("list", dir, e))? {
+    for folder in fs.read_dir(dir).map_err(|e| Error::reading("list", dir, e))? {
         if !folder.is_dir || !folder.name.starts_with("camera_") {
             continue;
         }
         let path = dir.join(&folder.name);
-        for file in fs.read_dir(&path).map_err(|e| Error::io("list", &path, e))? {
+        for file in fs.read_dir(&path).map_err(|e| Error::reading("list", &path, e))? {
             let Some((prefix, n, ending)) = names::file_parts(&file.name).filter(|_| !file.is_dir) else {
                 continue;
             };
@@ -77,13 +77,13 @@ pub(super) fn read_file(fs: &dyn Fs, path: &Path) -> Result<Option<Vec<u8>>> {
     let file = match fs.open(path) {
         Ok(file) => file,
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-        Err(e) => return Err(Error::io("open", path, e)),
+        Err(e) => return Err(Error::reading("open", path, e)),
     };
-    let size = file.size().map_err(|e| Error::io("read", path, e))?;
+    let size = file.size().map_err(|e| Error::reading("read", path, e))?;
     if size > MAX_FILE {
         return Err(bad(path, format_args!("it has {size} bytes, more than any picture")));
     }
     let mut bytes = vec![0; size as usize];
-    file.read_exact_at(&mut bytes, 0).map_err(|e| Error::io("read", path, e))?;
+    file.read_exact_at(&mut bytes, 0).map_err(|e| Error::reading("read", path, e))?;
     Ok(Some(bytes))
 }

@@ -16,7 +16,7 @@ const LINE_MAX: u64 = 64 << 10;
 impl ByteCameraImport {
     /// Begins to read `frames.csv`, whose first line names the columns.
     fn begin_rows(&mut self, file: Box<dyn ReadFile>, path: &Path) -> Result<()> {
-        let size = file.size().map_err(|e| Error::io("read", path, e))?;
+        let size = file.size().map_err(|e| Error::reading("read", path, e))?;
         let lines = Box::new(BufReader::with_capacity(64 << 10, Bytes { file, at: 0, size }));
         self.list = List::Rows { lines, line: 0, next: None };
         if self.line()?.is_some_and(|line| is_head(&line)) {
@@ -36,7 +36,7 @@ impl ByteCameraImport {
         let file = match self.fs.open(&path) {
             Ok(file) => file,
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(units),
-            Err(e) => return Err(Error::io("open", &path, e)),
+            Err(e) => return Err(Error::reading("open", &path, e)),
         };
         self.begin_rows(file, &path)?;
         while !wanted.is_empty()
@@ -74,7 +74,7 @@ impl ByteCameraImport {
             .by_ref()
             .take(LINE_MAX)
             .read_until(b'\n', &mut bytes)
-            .map_err(|e| Error::io("read", &path, e))?;
+            .map_err(|e| Error::reading("read", &path, e))?;
         if bytes.is_empty() {
             return Ok(None);
         }
