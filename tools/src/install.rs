@@ -131,14 +131,15 @@ impl SystemFile {
         }
     }
 
-    /// Puts it in place; what somebody changed only with `force`.
+    /// Puts it in place; what somebody wrote or changed only with `overwrite`.
     ///
     /// # Errors
     /// When it cannot be written; what was there is then as it was.
-    pub fn install(&self, root: &Path, force: bool) -> Result<Done> {
-        match self.state(root)? {
+    pub fn install(&self, root: &Path, overwrite: bool) -> Result<Done> {
+        let state = self.state(root)?;
+        match state {
             State::Current => return Ok(Done::Unchanged),
-            State::Changed if !force => return Ok(Done::Refused),
+            State::Changed if !overwrite => return Ok(Done::Refused),
             _ => {}
         }
         let path = self.below(root);
@@ -151,21 +152,26 @@ impl SystemFile {
             let mode = std::os::unix::fs::PermissionsExt::from_mode(0o644);
             beside.as_file().set_permissions(mode)?;
             beside.as_file().sync_all()?;
-            beside.persist(&path)?;
+            if state == State::Missing {
+                // What came into being since is somebody's.
+                beside.persist_noclobber(&path)?;
+            } else {
+                beside.persist(&path)?;
+            }
             Ok(())
         };
         write().map_err(|e| refused(e, &path))?;
         Ok(Done::Written)
     }
 
-    /// Takes it away; what somebody changed only with `force`.
+    /// Takes it away; what somebody wrote or changed only with `overwrite`.
     ///
     /// # Errors
     /// When it cannot be removed.
-    pub fn remove(&self, root: &Path, force: bool) -> Result<Done> {
+    pub fn remove(&self, root: &Path, overwrite: bool) -> Result<Done> {
         match self.state(root)? {
             State::Missing => return Ok(Done::Absent),
-            State::Changed if !force => return Ok(Done::Refused),
+            State::Changed if !overwrite => return Ok(Done::Refused),
             _ => {}
         }
         let path = self.below(root);

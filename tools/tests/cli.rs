@@ -255,7 +255,9 @@ fn check_dataset(home: &Home, dataset: &Path) {
     let broken = home.run(&["verify", path]);
     assert_eq!(broken.code, 1, "{}{}", broken.out, broken.err);
     assert!(broken.out.contains("broken: seg_0000.mcap"), "{}", broken.out);
-    let report = home.run(&["report", path, "-q"]);
+    let kept = home.run(&["report", path, "-q"]);
+    assert!(kept.code == 2 && kept.err.contains("--overwrite"), "{}: {}", kept.code, kept.err);
+    let report = home.run(&["report", path, "--overwrite", "-q"]);
     let page = std::fs::read_to_string(dataset.join("report.html")).unwrap();
     assert_eq!(report.code == 3, page.contains("Damaged: "), "{}{}", report.out, report.err);
 }

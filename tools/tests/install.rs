@@ -34,10 +34,10 @@ fn what_is_shown_is_what_is_written_and_a_change_by_hand_survives() {
     for action in ["--apply", "--remove"] {
         let ran = run(action, &[]);
         assert_eq!(ran.code, 3, "{action}: {}", ran.out);
-        assert!(ran.out.contains("changed by hand") && ran.out.contains("--force"), "{}", ran.out);
+        assert!(ran.out.contains("changed by hand") && ran.out.contains("--overwrite"), "{}", ran.out);
         assert_eq!(std::fs::read_to_string(&rules).unwrap(), "# mine\n");
     }
-    run("--remove", &["--force"]).good();
+    run("--remove", &["--overwrite"]).good();
     assert!(!rules.exists());
 }
 

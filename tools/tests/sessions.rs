@@ -174,7 +174,13 @@ fn a_report_is_a_page_or_json_and_its_exit_code_says_how_it_is() {
     let segment = dir.join("seg_0000.mcap");
     assert_eq!(home.run(&["report", segment.to_str().unwrap(), "-q"]).code, 2, "where should the page be?");
     std::fs::rename(&segment, dir.join("seg_0000.mcap.part")).unwrap();
+    // What exists is somebody's, whatever it is called.
+    std::fs::write(dir.join("report.html"), "mine").unwrap();
     let ran = home.run(&["report", at, "-q"]);
+    assert!(ran.code == 2 && ran.err.contains("report.html: exists"), "{}: {}", ran.code, ran.err);
+    assert!(ran.err.contains("--overwrite"), "{}", ran.err);
+    assert_eq!(std::fs::read_to_string(dir.join("report.html")).unwrap(), "mine");
+    let ran = home.run(&["report", at, "--overwrite", "-q"]);
     assert_eq!(ran.code, 3, "{}", ran.err);
     assert!(ran.out.contains("depthrig recover"), "{}", ran.out);
     assert_eq!(home.run(&["report", "/no/such/dataset", "-q"]).code, 1);

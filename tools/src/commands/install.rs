@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-A file that somebody changed by hand is neither replaced nor removed without --force.
+A file that somebody wrote or changed by hand is neither replaced nor removed without --overwrite.
 Exit code 3 when such a file was left as it is.
 
 Examples:
@@ -30,9 +30,9 @@ pub struct InstallArgs {
     /// Remove the files (as root)
     #[arg(long, group = "action")]
     remove: bool,
-    /// Replace or remove also what somebody changed
-    #[arg(long)]
-    force: bool,
+    /// Replace or remove also what somebody changed by hand
+    #[arg(long, alias = "force")]
+    overwrite: bool,
     /// The user that the service runs as, which must be the one that uses the rig
     #[arg(long, value_name = "NAME", value_parser = user_name)]
     user: Option<String>,
@@ -73,9 +73,9 @@ pub fn run(args: &InstallArgs) -> Result<Exit> {
     let mut refused = false;
     for file in &files {
         let done = if args.apply {
-            file.install(&args.root, args.force)?
+            file.install(&args.root, args.overwrite)?
         } else {
-            file.remove(&args.root, args.force)?
+            file.remove(&args.root, args.overwrite)?
         };
         refused |= done == Done::Refused;
         let what = match done {
@@ -83,7 +83,7 @@ pub fn run(args: &InstallArgs) -> Result<Exit> {
             Done::Unchanged => "is as it should be",
             Done::Removed => "removed",
             Done::Absent => "was not there",
-            Done::Refused => "was changed by hand and is left as it is (--force takes it all the same)",
+            Done::Refused => "was changed by hand and is left as it is (--overwrite takes it all the same)",
         };
         out::line(format_args!("{} ({}): {what}", file.below(&args.root).display(), file.what))?;
     }

@@ -9,17 +9,16 @@ use crate::signals::Stop;
 use anyhow::{Result, bail};
 use core::ops::ControlFlow;
 use depthrig_recorder::Dataset;
-use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::report::{REPORT_FILE, Report, ReportOptions};
 use std::path::{Path, PathBuf};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-A recording writes its report at its end; this writes it anew, for instance after `depthrig recover`.
-Exit codes: 0 the dataset is whole, 1 no report could be made, 3 the report says that it is not.
+A recording writes its report at its end; --overwrite writes it anew, for instance after `depthrig recover`.
+Exit codes: 0 the dataset is whole, 1 no report could be made, 2 wrong usage, 3 the report says that it is not whole.
 
 Examples:
-  depthrig report data/20261121_1015_kitchen
+  depthrig report data/20261121_1015_kitchen --overwrite
   depthrig report data/20261121_1015_kitchen --out kitchen.html --max-spread-ms 20
   depthrig report data/20261121_1015_kitchen --json | jq .verdict";
 
@@ -35,7 +34,7 @@ pub struct ReportArgs {
     overwrite: Overwrite,
     /// Frames of a set should not lie further apart [default: the session's limit, else half a period of the
     /// slowest camera]
-    #[arg(long, value_name = "MS", value_parser = crate::cli::positive_seconds)]
+    #[arg(long, value_name = "MS", value_parser = crate::cli::spread_ms)]
     max_spread_ms: Option<f64>,
     /// Sets whose depth pictures are decoded for the fill rate
     #[arg(long, value_name = "N", default_value_t = ReportOptions::default().fill_sets)]
@@ -54,14 +53,10 @@ pub fn run(args: &ReportArgs, context: &Context) -> Result<Exit> {
         None if args.dataset.is_dir() => Some(args.dataset.join(REPORT_FILE)),
         None => return Err(UsageError("a report of one segment needs --out FILE".to_owned()).into()),
     };
-    // The dataset's own report is written anew, which is what this is for; any other file is somebody's.
-    let out = args.out.as_deref().map(|path| {
-        let session = args.dataset.join(depthrig_recorder::SESSION_FILE);
-        let inputs: Vec<&Path> =
-            dataset.segments().iter().map(PathBuf::as_path).chain([session.as_path()]).collect();
-        OutFile::new(path, args.overwrite, &inputs)
-    });
-    let out = out.transpose()?;
+    let session = args.dataset.join(depthrig_recorder::SESSION_FILE);
+    let inputs: Vec<&Path> =
+        dataset.segments().iter().map(PathBuf::as_path).chain([session.as_path()]).collect();
+    let page = page.map(|path| OutFile::new(&path, args.overwrite, &inputs)).transpose()?;
     let options = ReportOptions {
         fill_sets: args.fill_sets,
         max_spread_ns: args.max_spread_ms.map(|ms| (ms * 1e6) as i64),
@@ -76,10 +71,8 @@ pub fn run(args: &ReportArgs, context: &Context) -> Result<Exit> {
         bail!("interrupted; no report was written");
     };
     bar.clear();
-    match (&out, &page) {
-        (Some(out), _) => out.write(report.to_html().as_bytes())?,
-        (None, Some(path)) => report.write(&RealFs, path)?,
-        (None, None) => {}
+    if let Some(page) = &page {
+        page.write(report.to_html().as_bytes())?;
     }
     if args.json {
         out::json(&report)?;
@@ -88,8 +81,8 @@ pub fn run(args: &ReportArgs, context: &Context) -> Result<Exit> {
         for line in report.verdict.why.iter().chain(&report.verdict.remarks) {
             out::line(format_args!("  {line}"))?;
         }
-        if let Some(path) = &page {
-            out::line(format_args!("report    {}", path.display()))?;
+        if let Some(page) = &page {
+            out::line(format_args!("report    {}", page.path().display()))?;
         }
     }
     Ok(if report.verdict.health.is_bad() { Exit::Lost } else { Exit::Good })
