@@ -7,6 +7,7 @@ use crate::commands::{
 };
 use clap::{ArgAction, CommandFactory, FromArgMatches, Parser, Subcommand, ValueEnum};
 use depthrig_bus::RigName;
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 /// Captures, stamps, groups, shares, records and replays the cameras of a multi-camera RGB-D mount.
@@ -210,6 +211,74 @@ fn with_negative_numbers(mut command: clap::Command) -> clap::Command {
     })
 }
 
+/// A number within `range`, in `unit`; infinity and what is not a number are out of every range.
+///
+/// # Errors
+/// When `text` is not a number, or out of `range`.
+fn number_within(text: &str, unit: &str, range: RangeInclusive<f64>) -> Result<f64, String> {
+    let number: f64 = text.trim().parse().map_err(|_| format!("write a number of {unit}"))?;
+    if range.contains(&number) {
+        return Ok(number);
+    }
+    Err(format!("{text} {unit} is out of range {}..={}", range.start(), range.end()))
+}
+
+/// How far apart frames of a set may be captured, milliseconds.
+///
+/// # Errors
+/// When `text` is out of range 0..=3600000.
+pub fn spread_ms(text: &str) -> Result<f64, String> {
+    number_within(text, "ms", 0.0..=3.6e6)
+}
+
+/// A distance, metres.
+///
+/// # Errors
+/// When `text` is out of range 0..=1000000.
+pub fn distance_m(text: &str) -> Result<f64, String> {
+    number_within(text, "m", 0.0..=1e6)
+}
+
+/// A distance that is not 0, metres.
+///
+/// # Errors
+/// When `text` is out of range 0.001..=1000000.
+pub fn range_limit_m(text: &str) -> Result<f64, String> {
+    number_within(text, "m", 1e-3..=1e6)
+}
+
+/// A rate of frames, sets or pairs.
+///
+/// # Errors
+/// When `text` is out of range 0.001..=10000.
+pub fn rate_hz(text: &str) -> Result<f64, String> {
+    number_within(text, "Hz", 1e-3..=1e4)
+}
+
+/// Memory, GB.
+///
+/// # Errors
+/// When `text` is out of range 0..=1000000.
+pub fn memory_gb(text: &str) -> Result<f64, String> {
+    number_within(text, "GB", 0.0..=1e6)
+}
+
+/// Speed of a replay against the original.
+///
+/// # Errors
+/// When `text` is out of range 0.1..=10.
+pub fn replay_rate(text: &str) -> Result<f64, String> {
+    number_within(text, "times", depthrig_daemon::replay::RATES)
+}
+
+/// A number of seconds, such as after the first set.
+///
+/// # Errors
+/// When `text` is out of range 0..=9000000.
+pub fn seconds(text: &str) -> Result<f64, String> {
+    number_within(text, "s", 0.0..=9e6)
+}
+
 /// Metres per unit of depth, as cameras and files have it.
 ///
 /// # Errors
@@ -265,8 +334,8 @@ mod tests {
             with_negative_numbers(Cli::command()).try_get_matches_from(["depthrig"].into_iter().chain(args))
         };
         with_negative_numbers(Cli::command()).debug_assert();
-        parse("verify ds --max-spread-ms -3").unwrap();
         for line in [
+            "verify ds --max-spread-ms -3",
             "cat ds --from -5",
             "trim ds out --to -1.5",
             "verify ds --threads -1",
@@ -281,6 +350,52 @@ mod tests {
             assert!(matches!(e.kind(), ErrorKind::ValueValidation | ErrorKind::InvalidValue), "{line}: {e}");
         }
         assert_eq!(parse("verify ds --nothing").unwrap_err().kind(), ErrorKind::UnknownArgument);
+    }
+
+    /// Every option and argument of every command that is a number with a fraction.
+    #[test]
+    fn no_number_of_any_command_is_negative_infinite_or_not_a_number() {
+        /// The words before the value of each such argument of `command`, whose own words are `path`.
+        fn fractions(command: &clap::Command, path: &[String], found: &mut Vec<Vec<String>>) {
+            for arg in command.get_arguments() {
+                if arg.get_value_parser().type_id() == std::any::TypeId::of::<f64>() {
+                    let name = arg.get_long().map(|long| format!("--{long}"));
+                    found.push(path.iter().cloned().chain(name).collect());
+                }
+            }
+            for sub in command.get_subcommands() {
+                let path: Vec<_> = path.iter().cloned().chain([sub.get_name().to_owned()]).collect();
+                fractions(sub, &path, found);
+            }
+        }
+        let cli = with_negative_numbers(Cli::command());
+        let mut found = Vec::new();
+        fractions(&cli, &["depthrig".to_owned()], &mut found);
+        assert!(found.len() >= 25, "{found:?}");
+        for words in found {
+            for value in ["-3", "nan", "inf", "-inf", "1e308", "ten"] {
+                // Of an option the value may begin with a minus in any form behind `=`.
+                let mut words = words.clone();
+                match words.last_mut().filter(|last| last.starts_with("--")) {
+                    Some(option) => *option += &format!("={value}"),
+                    None if value == "-inf" => continue,
+                    None => words.push(value.to_owned()),
+                }
+                let e = cli.clone().try_get_matches_from(&words).expect_err(&words.join(" "));
+                assert_eq!(e.kind(), ErrorKind::ValueValidation, "{words:?}: {e}");
+            }
+        }
+        for (line, range) in [
+            ("verify ds --max-spread-ms -3", "-3 ms is out of range 0..=3600000"),
+            ("verify ds --max-spread-ms nan", "nan ms is out of range 0..=3600000"),
+            ("report ds --max-spread-ms=inf", "inf ms is out of range 0..=3600000"),
+            ("zed replay a --out b --memory -1", "-1 GB is out of range 0..=1000000"),
+            ("replay rate 100", "100 times is out of range 0.1..=10"),
+        ] {
+            let words = ["depthrig"].into_iter().chain(line.split_whitespace());
+            let e = cli.clone().try_get_matches_from(words).expect_err(line).to_string();
+            assert!(e.contains(range), "{line}: {e}");
+        }
     }
 
     #[test]

@@ -85,13 +85,13 @@ pub struct CaptureArgs {
     #[arg(long)]
     port: Option<String>,
     /// Pixels per row
-    #[arg(long, default_value_t = 1280)]
+    #[arg(long, default_value_t = 1280, value_parser = clap::value_parser!(u32).range(1..=16_384))]
     width: u32,
     /// Rows
-    #[arg(long, default_value_t = 720)]
+    #[arg(long, default_value_t = 720, value_parser = clap::value_parser!(u32).range(1..=16_384))]
     height: u32,
     /// Frame rate
-    #[arg(long, value_name = "HZ", default_value_t = 30.0)]
+    #[arg(long, value_name = "HZ", default_value_t = 30.0, value_parser = crate::cli::rate_hz)]
     rate_hz: f64,
     /// How much, and in which form
     #[command(flatten)]

@@ -51,10 +51,10 @@ pub struct BenchArgs {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64))]
     batch: u16,
     /// Threads on the CPU; all cores when not given
-    #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true)]
-    threads: usize,
+    #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true, value_parser = clap::value_parser!(u16).range(0..=1024))]
+    threads: u16,
     /// How long to measure each, seconds; at least three times are measured
-    #[arg(long, value_name = "SECONDS", default_value_t = 5.0)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 5.0, value_parser = crate::cli::seconds)]
     seconds: f64,
     /// The library of ONNX Runtime, when it is not to be looked for
     #[arg(long, value_name = "FILE")]
@@ -224,7 +224,7 @@ fn measure(args: &BenchArgs, spec: &Spec) -> Result<Measured> {
         input_size: args.input_sizes.first().copied(),
         precision: spec.precision,
         device: spec.device.clone(),
-        threads: args.threads,
+        threads: args.threads.into(),
         library: args.library.clone(),
         ..RefinerOptions::default()
     };

@@ -25,7 +25,7 @@ pub struct Args {
     #[arg(long, value_name = "TEXT")]
     task: Option<String>,
     /// Sets per second [default: as configured and recorded]
-    #[arg(long, value_name = "HZ", value_parser = rate)]
+    #[arg(long, value_name = "HZ", value_parser = crate::cli::rate_hz)]
     fps: Option<f64>,
     /// What to do with a set that lacks a frame
     #[arg(long, value_enum, default_value = "mark", value_name = "HOW")]
@@ -42,11 +42,6 @@ enum HowIncomplete {
     Mark,
     /// Leave the set out
     LeaveOut,
-}
-
-fn rate(text: &str) -> Result<f64, String> {
-    let rate = text.parse().ok().filter(|r| (0.001..=10_000.0).contains(r));
-    rate.ok_or_else(|| "write a number of sets per second, such as 5 or 2.5".to_owned())
 }
 
 impl Args {
