@@ -281,3 +281,56 @@ fn an_input_without_use_is_said_and_never_overwritten() {
     let ran = run(&shallow, &out);
     assert!(ran.code == 2 && ran.err.contains("has 8 bits a pixel"), "{}", ran.err);
 }
+
+/// A checkpoint of random numbers whose last layer is `louder` times what it was, as damage or another training leaves it:
+/// every number is finite.
+fn louder(home: &Home, louder: f32) -> PathBuf {
+    let mut bytes = std::fs::read(made_up(home)).unwrap();
+    let head = 8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    let tensors = json(std::str::from_utf8(&bytes[8..head]).unwrap());
+    let tensors = tensors.as_object().unwrap();
+    let last = tensors.iter().find(|(name, _)| name.ends_with("output_conv2.2.weight")).unwrap().1;
+    let at = |i: usize| head + last["data_offsets"][i].as_u64().unwrap() as usize;
+    for weight in bytes[at(0)..at(1)].as_chunks_mut::<4>().0 {
+        *weight = (f32::from_le_bytes(*weight) * louder).to_le_bytes();
+    }
+    let path = home.path().join(format!("louder-{louder}.safetensors"));
+    std::fs::write(&path, bytes).unwrap();
+    path
+}
+
+#[test]
+fn weights_that_give_numbers_and_no_depth_are_a_warning_with_its_cure() {
+    let home = Home::new();
+    let file = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
+    let (rgb, depth, out) = (file("c.png"), file("z.png"), file("out.npy"));
+    image::RgbImage::from_fn(112, 84, |x, y| image::Rgb([(x * 2) as u8, (y * 3) as u8, (x * y % 251) as u8]))
+        .save(&rgb)
+        .unwrap();
+    // What the network gives without damage is about 0.8 m.
+    image::ImageBuffer::from_fn(112, 84, |x, y| image::Luma([(800 + x + y) as u16])).save(&depth).unwrap();
+    let run = |weights: &Path| {
+        let weights = weights.to_str().unwrap();
+        let common =
+            ["cdm", "run", "--rgb", &rgb, "--depth", &depth, "--depth-unit", "0.001", "--input-size", "84"];
+        home.run(&[&common[..], &["--model", weights, "--overwrite", "--json", "--out", &out]].concat())
+    };
+    let ran = run(&made_up(&home));
+    let required = std::env::var_os("DEPTHRIG_REQUIRE_ONNXRUNTIME").is_some();
+    if ran.err.contains("ONNX Runtime was not found") && !required {
+        println!("skipped: {}", ran.err);
+        return;
+    }
+    let told = json(&ran.good());
+    assert_eq!(told["warnings"].as_array().map(Vec::len), Some(0), "{told}");
+    for (by, warned) in [(4.0, "differs from the result"), (6.0, "of the result is missing or beyond 20 m")] {
+        let ran = run(&louder(&home, by));
+        let (code, err) = (ran.code, ran.err.clone());
+        let told = json(&ran.good());
+        let warnings = told["warnings"].to_string();
+        println!("{by}: {warnings}");
+        assert!(warnings.contains(warned), "{by}: {warnings}");
+        assert!(warnings.contains("cdm info NAME --check"), "{by}: {warnings}");
+        assert!(code == 0 && err.contains("warning: ") && err.contains(warned), "{by}: {err}");
+    }
+}

@@ -64,7 +64,7 @@ pub struct RunArgs {
     #[arg(long, value_enum, value_name = "ORDER")]
     channel_order: Option<Channels>,
     /// Raw depth beyond this is a hole, metres, in place of the model's
-    #[arg(long, value_name = "METRES", value_parser = metres)]
+    #[arg(long, value_name = "METRES", value_parser = crate::cli::range_limit_m)]
     max_depth: Option<f64>,
     /// Numbers that the network computes with: fp32, fp16 or bf16
     #[arg(long, value_name = "PRECISION", default_value = "fp32", value_parser = precision)]
@@ -73,8 +73,8 @@ pub struct RunArgs {
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     device: String,
     /// Threads on the CPU; all cores when not given
-    #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true)]
-    threads: usize,
+    #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true, value_parser = clap::value_parser!(u16).range(0..=1024))]
+    threads: u16,
     /// The library of ONNX Runtime, when it is not to be looked for
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
@@ -112,14 +112,6 @@ pub fn fill_reach(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(part) if (0.0..=1.0).contains(&part) => Ok(part),
         _ => Err("out of range 0..=1".to_owned()),
-    }
-}
-
-/// Metres per unit of depth.
-fn metres(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(m) if m > 0.0 && m.is_finite() => Ok(m),
-        _ => Err("write metres above 0, such as 6".to_owned()),
     }
 }
 
@@ -190,6 +182,11 @@ pub fn run(args: &RunArgs) -> Result<Exit> {
         Refined::Units(p) => p.iter().filter(|d| **d > 0).count(),
         Refined::Floats(p) => p.iter().filter(|d| d.is_finite() && **d > 0.0).count(),
     };
+    let suspicions = if described.model.is_empty() || input.usable == 0 {
+        Vec::new()
+    } else {
+        Plausibility::of(&metres(&refined, args), &depth, &input).warnings()
+    };
     let report = Report {
         out: &args.out,
         width,
@@ -207,19 +204,13 @@ pub fn run(args: &RunArgs) -> Result<Exit> {
         trained,
         raw_percent: share(depth.iter().filter(|d| **d > 0 && **d < u16::MAX).count()),
         refined_percent: share(seen),
-        warnings: [
-            input.warning(),
-            suspicious(&refined, args, !described.model.is_empty() && input.usable > 0),
-        ]
-        .into_iter()
-        .flatten()
-        .collect(),
+        warnings: input.warning().into_iter().chain(suspicions).collect(),
         prepare_ms: steps.prepare_ns as f64 / 1e6,
         infer_ms: steps.infer_ns as f64 / 1e6,
         finish_ms: steps.finish_ns as f64 / 1e6,
     };
     for warning in &report.warnings {
-        eprintln!("warning: {}: {warning}", args.depth.display());
+        out::note(format_args!("warning: {}: {warning}", args.depth.display()));
     }
     tell(&report, args.json)?;
     Ok(if seen == 0 { Exit::Lost } else { Exit::Good })
@@ -242,6 +233,12 @@ impl InputDepth {
         let all = measured.clone().count();
         let beyond = measured.filter(|d| f64::from(**d) * unit_m > limit_m).count();
         Self { pixels: depth.len(), usable: all - beyond, beyond, limit_m, unit_m }
+    }
+
+    /// A raw depth that the refiner uses, metres.
+    fn metres(&self, raw: u16) -> Option<f32> {
+        let metres = f64::from(raw) * self.unit_m;
+        (raw > 0 && raw < u16::MAX && metres <= self.limit_m).then_some(metres as f32)
     }
 
     fn warning(&self) -> Option<String> {
@@ -270,26 +267,69 @@ impl InputDepth {
 const FARTHEST_M: f32 = 20.0;
 /// The share of a result without plausible depth that is worth a warning.
 const IMPLAUSIBLE: f64 = 0.05;
+/// A model mends raw depth; one that is right does not move much of it by this factor.
+const FACTOR: f32 = 2.0;
+/// The share of raw depth that is moved so far that is worth a warning.
+const MOVED: f64 = 0.1;
 
-/// What a network with damaged weights gives: numbers, but no depth.
-fn suspicious(refined: &Refined, args: &RunArgs, is_model: bool) -> Option<String> {
-    let plausible = |metres: f32| metres > 0.0 && metres <= FARTHEST_M;
-    let good = |value: f32| plausible(if args.inverse { value.recip() } else { value });
-    let (total, wrong) = match refined {
-        Refined::Units(p) => {
-            let unit = args.out_unit as f32;
-            (p.len(), p.iter().filter(|d| !plausible(f32::from(**d) * unit)).count())
+/// Whether a network's result can be depth. One with damaged weights gives numbers as well.
+#[derive(Debug, Default)]
+struct Plausibility {
+    pixels: usize,
+    /// Missing, or beyond [`FARTHEST_M`].
+    implausible: usize,
+    /// With raw depth and a plausible result.
+    compared: usize,
+    /// Of these, off by more than [`FACTOR`].
+    moved: usize,
+}
+
+impl Plausibility {
+    fn of(refined_m: &[f32], raw: &[u16], input: &InputDepth) -> Self {
+        let mut seen = Self { pixels: refined_m.len(), ..Self::default() };
+        for (refined, raw) in refined_m.iter().zip(raw) {
+            // Not a number is in no range.
+            if !(*refined > 0.0 && *refined <= FARTHEST_M) {
+                seen.implausible += 1;
+            } else if let Some(raw) = input.metres(*raw) {
+                seen.compared += 1;
+                let is_near = (raw / FACTOR..=raw * FACTOR).contains(refined);
+                seen.moved += usize::from(!is_near);
+            }
         }
-        Refined::Floats(p) => (p.len(), p.iter().filter(|d| !good(**d)).count()),
-    };
-    let share = wrong as f64 / total.max(1) as f64;
-    (is_model && share > IMPLAUSIBLE).then(|| {
-        format!(
-            "{:.0} % of the result is missing or beyond {FARTHEST_M} m: the weights may be damaged or of another training \
-             (`depthrig cdm info NAME --check`), --channel-order may be another, or --out-unit too small",
-            share * 100.0
-        )
-    })
+        seen
+    }
+
+    fn warnings(&self) -> Vec<String> {
+        let share = |n: usize, of: usize| n as f64 / of.max(1) as f64;
+        let missing = share(self.implausible, self.pixels);
+        let moved = share(self.moved, self.compared);
+        let mut warnings = Vec::new();
+        if missing > IMPLAUSIBLE {
+            warnings.push(format!(
+                "{:.0} % of the result is missing or beyond {FARTHEST_M} m: the weights may be damaged or of another training \
+                 (`depthrig cdm info NAME --check`), --channel-order may be another, or --out-unit too small",
+                missing * 100.0
+            ));
+        }
+        if moved > MOVED {
+            warnings.push(format!(
+                "{:.0} % of the raw depth differs from the result by more than a factor of {FACTOR}: the weights may be damaged \
+                 or of another training (`depthrig cdm info NAME --check`), or --depth-unit may be another",
+                moved * 100.0
+            ));
+        }
+        warnings
+    }
+}
+
+/// The result in metres.
+fn metres(refined: &Refined, args: &RunArgs) -> Vec<f32> {
+    match refined {
+        Refined::Units(units) => units.iter().map(|u| f32::from(*u) * args.out_unit as f32).collect(),
+        Refined::Floats(inverse) if args.inverse => inverse.iter().map(|v| v.recip()).collect(),
+        Refined::Floats(metres) => metres.clone(),
+    }
 }
 
 fn tell(r: &Report<'_>, json: bool) -> Result<()> {
@@ -351,7 +391,7 @@ fn options(args: &RunArgs) -> Result<RefinerOptions> {
         input_size: args.input_size,
         precision: args.precision,
         device: args.device.clone(),
-        threads: args.threads,
+        threads: args.threads.into(),
         library: args.library.clone(),
         fill_reach: args.fill_reach,
     })
@@ -424,4 +464,45 @@ fn encoded(refined: &Refined, width: usize, height: usize) -> Result<Vec<u8>> {
             file
         }
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The warnings for a result over raw depth of 1 m in units of 1 mm, and two pixels that no model uses.
+    fn warned(result: impl Fn(usize) -> f32) -> Vec<String> {
+        let mut raw = vec![1000u16; 100];
+        raw[98] = 0;
+        raw[99] = 30_000;
+        let refined: Vec<f32> = (0..raw.len()).map(result).collect();
+        let input = InputDepth::of(&raw, 0.001, Some(6.0));
+        Plausibility::of(&refined, &raw, &input).warnings()
+    }
+
+    #[test]
+    fn numbers_that_are_not_depth_are_a_warning_with_its_cure() {
+        assert_eq!(warned(|_| 1.0), [""; 0]);
+        for bad in [0.0, -1.0, 20.5, f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            assert_eq!(warned(|i| if i < 5 { bad } else { 1.0 }), [""; 0], "{bad}");
+            let told = warned(|i| if i < 17 { bad } else { 1.0 });
+            let [why] = &told[..] else { panic!("{bad}: {told:?}") };
+            assert!(why.starts_with("17 % of the result is missing or beyond 20 m"), "{why}");
+            assert!(why.contains("cdm info NAME --check"), "{why}");
+        }
+    }
+
+    /// What is in range and nowhere near what the camera measured is no depth either.
+    #[test]
+    fn depth_far_from_the_raw_depth_is_a_warning_with_its_cure() {
+        // What a model that mends depth does.
+        assert_eq!(warned(|i| if i < 9 { 3.0 } else { 0.6 }), [""; 0]);
+        for bad in [0.3, 3.0] {
+            let told = warned(|i| if i < 49 { bad } else { 1.2 });
+            let [why] = &told[..] else { panic!("{bad}: {told:?}") };
+            let begins = "50 % of the raw depth differs from the result by more than a factor of 2";
+            assert!(why.starts_with(begins) && why.contains("cdm info NAME --check"), "{why}");
+        }
+        assert_eq!(warned(|i| if i < 98 { 1.0 } else { 15.0 }), [""; 0], "where there is no raw depth");
+    }
 }
