@@ -302,3 +302,34 @@ fn default_folder() -> PathBuf {
     let (date, time) = digits.split_at(8);
     Path::new("demo-data").join(format!("{date}_{time}"))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A computer without the library runs the other modes, and is told which one it does not run and why.
+    #[test]
+    fn a_mode_without_its_library_is_taken_out_and_named() {
+        let text = r#"
+            rig = "r"
+            [cdm]
+            library = "/no/such/library"
+            [[camera]]
+            name = "zed2i"
+            backend = "zed"
+            input = "a.svo2"
+            [camera.stereo]
+            modes = ["performance", "neural"]
+            network = "untrained.onnx"
+        "#;
+        let mut config = RigConfig::parse(text, None).unwrap();
+        let unavailable = without_library(&mut config);
+        let [why] = &unavailable[..] else { panic!("{unavailable:?}") };
+        let named = "zed2i neural is unavailable, because ONNX Runtime was not found";
+        assert!(why.starts_with(named) && why.contains("tools/onnxruntime.sh"), "{why}");
+        let stereo = config.cameras[0].stereo.as_ref().unwrap();
+        assert_eq!(stereo.modes, ["performance".parse().unwrap()]);
+        assert_eq!(stereo.network, None);
+        assert!(without_library(&mut config).is_empty(), "it is said once");
+    }
+}

@@ -339,22 +339,4 @@ pub fn modes<'a>(streams: impl IntoIterator<Item = (&'a str, u64)>) -> BTreeMap<
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_gives_way_by_design_is_not_lost() {
-        let dropped = BTreeMap::from([("queue_full".to_owned(), 7), ("device_error".to_owned(), 2)]);
-        assert_eq!(lost("d435/depth", &dropped), 9);
-        assert_eq!(lost("zed2i/depth_ultra", &dropped), 2);
-        assert_eq!(lost("zed2i/confidence_ultra", &dropped), 2);
-    }
-
-    #[test]
-    fn the_modes_of_a_dataset_are_its_depth_streams() {
-        let found =
-            modes([("d435/color", 5), ("d435/depth", 4), ("zed2i/depth_ultra", 3), ("zed2i/left", 5)]);
-        let wanted = [("d435".to_owned(), 4), ("zed2i ultra".to_owned(), 3)];
-        assert_eq!(found, BTreeMap::from(wanted));
-    }
-}
+mod tests;
