@@ -1,5 +1,6 @@
 //! What goes wrong is said, counted and survived. Long because each failure has the same disks, encoders and checks.
 
+use crate::logged::errors;
 use crate::recover::{ids, recover};
 use crate::support::*;
 use depthrig_bus::PixelFormat;
@@ -189,6 +190,8 @@ fn a_full_disk_ends_in_a_closed_dataset() {
     assert!(e.to_string().contains("the disk is full; free some space"), "{e}");
     let refused = r.push(set(&session(), 40)).unwrap_err();
     assert_eq!(refused.reason, SetDrop::WriteFailed);
+    let logged = errors(|| (41..60).for_each(|n| drop(r.push(set(&session(), n)))));
+    assert_eq!(logged, [""; 0], "what is refused was logged with the first one");
     assert!(refused.message.contains("the recording had ended: cannot write"), "{refused}");
     let summary = r.finish().unwrap();
     assert!(summary.sets.recorded >= 3 && summary.sets.balances(), "{summary:?}");
@@ -265,9 +268,12 @@ fn what_was_refused_while_others_waited_is_counted_after_a_crash() {
         }
         r.push(held).unwrap();
     }
-    for n in 3..8 {
-        assert_eq!(r.push(set(&session(), n)).unwrap_err().reason, SetDrop::EncoderBusy);
-    }
+    let logged = errors(|| {
+        for n in 3..8 {
+            assert_eq!(r.push(set(&session(), n)).unwrap_err().reason, SetDrop::EncoderBusy);
+        }
+    });
+    assert!(logged.len() == 1 && logged[0].contains("encoder_busy"), "one line for all of them: {logged:?}");
     // An account of one set and five refused ones.
     std::thread::sleep(Duration::from_millis(500));
     gate.open();

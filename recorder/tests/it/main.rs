@@ -13,6 +13,7 @@ mod failures;
 mod kill;
 mod kill_busy;
 mod lerobot;
+mod logged;
 mod motion;
 mod recover;
 mod report;
