@@ -279,6 +279,14 @@ pub fn seconds(text: &str) -> Result<f64, String> {
     number_within(text, "s", 0.0..=9e6)
 }
 
+/// How far the engine `fill` fills holes, as a part of the image's width.
+///
+/// # Errors
+/// When it is out of range 0..=1.
+pub fn fill_reach(text: &str) -> Result<f64, String> {
+    number_within(text, "image widths", 0.0..=1.0)
+}
+
 /// Metres per unit of depth, as cameras and files have it.
 ///
 /// # Errors
@@ -377,7 +385,10 @@ mod tests {
                 // Of an option the value may begin with a minus in any form behind `=`.
                 let mut words = words.clone();
                 match words.last_mut().filter(|last| last.starts_with("--")) {
-                    Some(option) => *option += &format!("={value}"),
+                    Some(option) => {
+                        option.push('=');
+                        option.push_str(value);
+                    }
                     None if value == "-inf" => continue,
                     None => words.push(value.to_owned()),
                 }

@@ -33,7 +33,7 @@ struct NewFile(Arc<Mutex<Pieces>>);
 /// A file in pieces, in the order of their places.
 #[derive(Default)]
 struct Pieces {
-    pieces: Vec<Piece>,
+    parts: Vec<Piece>,
     len: u64,
     /// The file that pieces lie in that are not here.
     original: Option<Arc<dyn ReadFile>>,
@@ -213,21 +213,21 @@ impl Fs for DryFs {
 impl Pieces {
     fn append(&mut self, bytes: &[u8]) {
         self.len += bytes.len() as u64;
-        if let Some(Piece { len, bytes: Bytes::Here(here), .. }) = self.pieces.last_mut() {
+        if let Some(Piece { len, bytes: Bytes::Here(here), .. }) = self.parts.last_mut() {
             here.extend_from_slice(bytes);
             *len += bytes.len() as u64;
             return;
         }
         let at = self.len - bytes.len() as u64;
-        self.pieces.push(Piece { at, len: bytes.len() as u64, bytes: Bytes::Here(bytes.to_vec()) });
+        self.parts.push(Piece { at, len: bytes.len() as u64, bytes: Bytes::Here(bytes.to_vec()) });
     }
 
     /// Puts a reference in the place of bytes that are here, in one piece.
     fn refer(&mut self, same: Same) {
         let end = same.at + same.len;
         let holds = |p: &Piece| p.at <= same.at && end <= p.at + p.len;
-        let Some(index) = self.pieces.iter().rposition(holds) else { return };
-        let piece = &mut self.pieces[index];
+        let Some(index) = self.parts.iter().rposition(holds) else { return };
+        let piece = &mut self.parts[index];
         let Bytes::Here(here) = &mut piece.bytes else { return };
         let after = here.split_off((end - piece.at) as usize);
         here.truncate((same.at - piece.at) as usize);
@@ -238,7 +238,7 @@ impl Pieces {
             put.push(Piece { at: end, len: after.len() as u64, bytes: Bytes::Here(after) });
         }
         let first = if piece.len == 0 { index } else { index + 1 };
-        self.pieces.splice(first..=index, put);
+        self.parts.splice(first..=index, put);
     }
 
     fn read(&self, buf: &mut [u8], offset: u64) -> io::Result<()> {
@@ -246,9 +246,9 @@ impl Pieces {
             return Err(io::ErrorKind::UnexpectedEof.into());
         }
         let mut done = 0;
-        let mut index = self.pieces.partition_point(|p| p.at + p.len <= offset);
+        let mut index = self.parts.partition_point(|p| p.at + p.len <= offset);
         while done < buf.len() {
-            let piece = self.pieces.get(index).ok_or(io::ErrorKind::UnexpectedEof)?;
+            let piece = self.parts.get(index).ok_or(io::ErrorKind::UnexpectedEof)?;
             let skip = offset + done as u64 - piece.at;
             let n = (piece.len - skip).min((buf.len() - done) as u64) as usize;
             let to = &mut buf[done..done + n];
@@ -266,8 +266,8 @@ impl Pieces {
     }
 
     fn truncate(&mut self, len: u64) {
-        self.pieces.retain(|p| p.at < len);
-        if let Some(last) = self.pieces.last_mut().filter(|p| p.at + p.len > len) {
+        self.parts.retain(|p| p.at < len);
+        if let Some(last) = self.parts.last_mut().filter(|p| p.at + p.len > len) {
             last.len = len - last.at;
             if let Bytes::Here(here) = &mut last.bytes {
                 here.truncate(last.len as usize);

@@ -79,7 +79,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
     /// How far from measured depth fill fills holes, part of the width; 1: all
-    #[arg(long, value_name = "PART", value_parser = fill_reach, default_value_t = FillRefiner::REACH)]
+    #[arg(long, value_name = "PART", value_parser = crate::cli::fill_reach, default_value_t = FillRefiner::REACH)]
     fill_reach: f64,
     #[command(flatten)]
     models: Models,
@@ -102,17 +102,6 @@ pub fn engine(text: &str) -> Result<EngineKind, String> {
 /// When there is none of that name.
 pub fn precision(text: &str) -> Result<Precision, String> {
     text.parse().map_err(|e: depthrig_cdm::Error| e.to_string())
-}
-
-/// Reads how far `fill` fills.
-///
-/// # Errors
-/// When it is out of range 0..=1.
-pub fn fill_reach(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(part) if (0.0..=1.0).contains(&part) => Ok(part),
-        _ => Err("out of range 0..=1".to_owned()),
-    }
 }
 
 /// What was done.
