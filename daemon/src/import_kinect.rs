@@ -131,7 +131,11 @@ impl KinectImport {
                 serial: serial(facts, path),
                 rate_hz: profile.samples_hz(),
                 batch: profile.width,
-                calibration: kinect_motion::stated(&from, calibration.as_ref()),
+                calibration: format!(
+                    "{}; {}",
+                    kinect_motion::stated(&from, calibration.as_ref()),
+                    kinect_motion::CORRECTED
+                ),
                 pose: profile.pose_in_device,
             };
             motion::Unit::new(record, track)

@@ -418,13 +418,19 @@ impl Inner {
         for camera in &self.cameras {
             let state = camera.state();
             let Some(info) = &state.info else { continue };
-            facts.extend(state.all_streams().map(|stream| StreamFacts {
-                stream: Arc::clone(stream),
-                model: info.model.clone(),
-                serial: info.serial.clone(),
-                calibration: info.calibration.clone(),
-                camera_pose: camera.config.pose,
-                computed: camera.computed(&stream.id),
+            facts.extend(state.all_streams().map(|stream| {
+                let mut calibration = info.calibration.clone();
+                if stream.profile.format.is_motion() && !info.motion.is_empty() {
+                    calibration = format!("{calibration}; {}", info.motion);
+                }
+                StreamFacts {
+                    stream: Arc::clone(stream),
+                    model: info.model.clone(),
+                    serial: info.serial.clone(),
+                    calibration,
+                    camera_pose: camera.config.pose,
+                    computed: camera.computed(&stream.id),
+                }
             }));
         }
         facts

@@ -3,6 +3,7 @@
 
 use depthrig_bus::{DropReason, Name, PixelFormat};
 use depthrig_daemon::import_kinect::{KinectImport, KinectOptions};
+use depthrig_drivers::kinect::motion::CORRECTED;
 use depthrig_drivers::kinect::playback::CalibrationSource;
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
 use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Lacing, Pattern, Pictures, damage_time, motion};
@@ -219,7 +220,8 @@ fn samples_of_motion_come_over_with_their_sets() {
         let [unit] = session.motion.as_slice() else { panic!("one unit") };
         assert_eq!((unit.id.to_string().as_str(), unit.rate_hz, unit.batch), ("kinect/imu", 1600.0, 64));
         assert_eq!((unit.model.as_str(), unit.serial.as_str()), ("Azure Kinect", "000123456789"));
-        assert_eq!(unit.calibration, session.streams[0].calibration);
+        let corrected = format!("{}; {CORRECTED}", session.streams[0].calibration);
+        assert_eq!(unit.calibration, corrected);
         // The accelerometer of the attached calibration: rotation (0 -1 0, 0 0 -1, 1 0 0) and t; the pose is its inverse.
         let at = unit.pose.translation_m;
         let want = [-0.0015, -0.051, 0.0034];

@@ -19,7 +19,9 @@ use depthrig_drivers::realsense::protocol::metadata::{
     CaptureStats, CaptureTiming, ColorControl, Configuration, DepthControl, L515DepthControl, PayloadHeader,
     build_record,
 };
-use depthrig_drivers::realsense::protocol::tables::{Coefficients, Pinhole, RectifiedItem, RgbTable, SIZES};
+use depthrig_drivers::realsense::protocol::tables::{
+    Coefficients, Header, Pinhole, RectifiedItem, RgbTable, SIZES,
+};
 use depthrig_drivers::zed::replay::made::MadeSvo;
 use std::path::{Path, PathBuf};
 
@@ -87,6 +89,17 @@ fn lens(width: u32, height: u32) -> Lens {
         ppy: 240.0,
         distortion: [0.1, 0.2, 0.0, 0.0, 0.3],
     }
+}
+
+/// The IMU's table, with a little of everything.
+fn imu_table(version: [u8; 2]) -> Vec<u8> {
+    let mut numbers = vec![1, 1, 0, 0];
+    let place = TURNED.into_iter().chain([-0.005, 0.005, 0.012]);
+    let accelerometer = [1.01, 0.002, 0.0, -0.003, 0.99, 0.001, 0.0, 0.004, 1.0, 0.1, -0.2, 0.05];
+    let gyroscope = [1.0, 0.0, 0.001, 0.0, 1.02, 0.0, 0.002, 0.0, 0.98, 0.3, -0.1, 0.2];
+    numbers.extend(place.chain(accelerometer).chain(gyroscope).flat_map(f32::to_le_bytes));
+    numbers.resize(numbers.len() + 96, 0);
+    Header::close(0x20, version, 0, &numbers)
 }
 
 /// Puts a byte behind a table of an even length: with an odd number of bytes the target puts the checksum right.
@@ -194,6 +207,13 @@ fn main() {
     put(&root, "realsense_l515", "color", &color.build());
     let pose = ColorExtrinsics { rotation: TURNED, translation_mm: [0.1, 14.0, -6.0] };
     put(&root, "realsense_l515", "extrinsics", &pose.build());
+
+    let imu = imu_table([1, 1]);
+    let memory = |table: &[u8]| Header::close(0x09, [1, 1], 0, &Header::close(0x10, [1, 1], 0, table));
+    put(&root, "realsense_imu", "d400", &memory(&imu));
+    put(&root, "realsense_imu", "d400_odd", &odd(memory(&imu)));
+    put(&root, "realsense_imu", "l515", &imu_table([5, 1]));
+    put(&root, "realsense_imu", "l515_odd", &odd(imu_table([5, 1])));
 
     let preset =
         r#"{"name": "near", "groups": {"depth_table": [100, 0, 65535, 0, -3], "amplitude_factor": [0.08]}}"#;

@@ -82,6 +82,9 @@ pub struct DeviceInfo {
     pub port: String,
     /// Where its calibration comes from: `factory`, `simulated`, `file …`, `none`.
     pub calibration: String,
+    /// Whether its IMU's samples are corrected for bias and scale, and with which numbers, in words for a dataset; empty
+    /// when it has no IMU or nothing is known.
+    pub motion: String,
 }
 
 /// One stream mode: what the frames are and which clock stamps them.

@@ -99,6 +99,11 @@ fn realsense_l515() {
 }
 
 #[test]
+fn realsense_imu() {
+    run("realsense_imu", realsense::imu);
+}
+
+#[test]
 fn realsense_preset() {
     run("realsense_preset", realsense::preset);
 }

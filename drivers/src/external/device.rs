@@ -54,6 +54,7 @@ impl ExternalDevice {
             } else {
                 about.calibration.clone()
             },
+            motion: String::new(),
         };
         let profiles = offer.modes.iter().map(profile).collect();
         let (config, place) = (config.clone(), place.clone());

@@ -80,6 +80,7 @@ pub(super) fn load(config: &FilesConfig) -> Result<Source> {
         firmware: String::new(),
         port: place.display().to_string(),
         calibration: if calibrated { format!("file {}", loaded.path.display()) } else { "none".to_owned() },
+        motion: String::new(),
     };
     let looped = config.looped.unwrap_or(manifest.looped);
     let cache_bytes = manifest.cache_mb.saturating_mul(1_000_000);

@@ -7,6 +7,7 @@ use crate::realsense::protocol::hwm::{
     Code, D4xxOpcode, HardwareMonitor, L515Opcode, Received, Request, build_refusal, build_reply,
     build_unit_frame, reply_data, unit_reply,
 };
+use crate::realsense::protocol::imu::ImuCalibration;
 use crate::realsense::protocol::intrinsics;
 use crate::realsense::protocol::l515::{
     ColorExtrinsics, ColorIntrinsics, Control, DepthIntrinsics, Temperatures,
@@ -198,6 +199,30 @@ pub fn l515(bytes: &[u8]) -> u64 {
     let _ = (Temperatures::parse(bytes), Control::LaserPower.range(&mut parrot));
     let _ = Control::LaserPower.set(&mut parrot, 50);
     came
+}
+
+/// The IMU's table of a D400 or an L515. Of an odd number of bytes it gets its checksum put right. Whether it is taken.
+///
+/// # Panics
+/// When a pose, a sample or what is stated of the correction is no number.
+pub fn imu(bytes: &[u8]) -> u64 {
+    let mut table = bytes.to_vec();
+    if let (1, Some(payload)) = (bytes.len() % 2, bytes.get(tables::HEADER..)) {
+        put(&mut table, 12, &crc32fast::hash(payload).to_le_bytes());
+    }
+    let Ok(calibration) = ImuCalibration::parse(&table, 0x0B3A) else { return 0 };
+    assert!(good_pose(&calibration.pose), "{calibration:?}");
+    for counts in [[0; 3], [i32::MAX; 3], [i32::MIN, 1, i32::MAX]] {
+        let samples = [
+            calibration.acceleration_m_s2(counts),
+            calibration.rotation_rad_s(counts, 32),
+            calibration.rotation_rad_s(counts, 16),
+        ];
+        assert!(samples.iter().flatten().all(|v| v.is_finite()), "{calibration:?}: {samples:?}");
+    }
+    let stated = calibration.stated();
+    assert!(!stated.contains("NaN") && !stated.contains("inf"), "{stated}");
+    1
 }
 
 /// The text of a preset file; how many groups it sets.

@@ -2,6 +2,8 @@
 
 use super::find::Found;
 use super::scan::{Element, Layout, Scan};
+use crate::usb::SysRoot;
+use crate::usb::holder::{Holders, holders_of};
 use crate::{Error, ErrorKind, Result};
 use rustix::fs::OFlags;
 use std::fs::{File, OpenOptions};
@@ -38,19 +40,46 @@ fn failed(path: &Path, what: &str, e: std::io::Error) -> Error {
             "; `depthrig install --print` shows the udev rule that lets this user do it",
         ),
         std::io::ErrorKind::NotFound => (ErrorKind::Disconnected, "; is the camera plugged in?"),
+        // Settings of a buffer that is on are fixed, and it was switched off just before.
+        std::io::ErrorKind::ResourceBusy => (
+            ErrorKind::Busy,
+            "; another program switched the sensor on: end it (realsense-viewer, a ROS node, another depthrig)",
+        ),
         _ => (ErrorKind::Io, "; plug the camera in anew"),
     };
     Error::new(kind, format!("{} cannot be {what}: {e}{cure}", path.display())).with_source(e)
 }
 
+/// Why a node that is in use cannot be opened: the kernel lets one program read a sensor.
+fn in_use(node: &Path, holders: &Holders, e: std::io::Error) -> Error {
+    let node = node.display();
+    let text = if holders.own && holders.others.is_empty() {
+        format!(
+            "{node} is still held by this process, which reads it for another stream or has not ended the last one; try again"
+        )
+    } else {
+        format!(
+            "{node} is in use: one program at a time can read this sensor, and it is held by {}. End that program \
+             (realsense-viewer, a ROS node or another depthrig reads the IMU too), or take the stream imu out of the rig file",
+            holders.describe()
+        )
+    };
+    Error::new(ErrorKind::Busy, text).with_source(e)
+}
+
 impl Switch {
+    /// The switch of `found`, which it leaves as it is.
+    pub fn of(found: &Found) -> Self {
+        Self { folder: found.folder.clone() }
+    }
+
     /// Switches the sensor `found` off, so that it can be set, and lets every element of `axes` (`in_accel_x`, …) into its
     /// scans, with their time.
     ///
     /// # Errors
-    /// [`ErrorKind::PermissionDenied`] with the cure, [`ErrorKind::Disconnected`], [`ErrorKind::Io`].
+    /// [`ErrorKind::PermissionDenied`] and [`ErrorKind::Busy`] with the cure, [`ErrorKind::Disconnected`], [`ErrorKind::Io`].
     pub fn prepare(found: &Found, axes: [&str; 3]) -> Result<Self> {
-        let switch = Self { folder: found.folder.clone() };
+        let switch = Self::of(found);
         switch.off()?;
         for element in axes.into_iter().chain(["in_timestamp"]) {
             switch.write(&format!("scan_elements/{element}_en"), "1")?;
@@ -86,11 +115,12 @@ impl Switch {
 }
 
 impl Sensor {
-    /// Opens the node of a sensor that measures `axes`.
+    /// Opens the node of a sensor that measures `axes`. Nobody else can read it as long as it is open.
     ///
     /// # Errors
-    /// Those of [`Switch::prepare`]; [`ErrorKind::Protocol`] when its scans are of a kind that is not known.
-    pub fn open(found: &Found, axes: [&str; 3]) -> Result<Self> {
+    /// Those of [`Switch::prepare`], where [`ErrorKind::Busy`] names the program that has it; [`ErrorKind::Protocol`] when
+    /// its scans are of a kind that is not known.
+    pub fn open(root: &SysRoot, found: &Found, axes: [&str; 3]) -> Result<Self> {
         let read = |element: &str, what: &str| {
             let path = found.folder.join(format!("scan_elements/{element}_{what}"));
             std::fs::read_to_string(&path).map_err(|e| failed(&path, "read", e))
@@ -109,7 +139,10 @@ impl Sensor {
         let layout = Layout::new([element(x)?, element(y)?, element(z)?, element("in_timestamp")?]);
         let flags = OFlags::NONBLOCK.bits() as i32;
         let file = OpenOptions::new().read(true).custom_flags(flags).open(&found.node);
-        let file = file.map_err(|e| failed(&found.node, "opened", e))?;
+        let file = file.map_err(|e| match e.kind() {
+            std::io::ErrorKind::ResourceBusy => in_use(&found.node, &holders_of(root, &found.node), e),
+            _ => failed(&found.node, "opened", e),
+        })?;
         let bytes = vec![0; CHUNK * layout.bytes()];
         Ok(Self { file, node: found.node.clone(), layout, bytes, rest: 0 })
     }
@@ -149,6 +182,49 @@ impl Sensor {
             }
             self.bytes.copy_within(whole..end, 0);
             self.rest = end - whole;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::usb::holder::Holder;
+    use rustix::io::Errno;
+
+    fn busy(others: &[(u32, &str)], own: bool) -> Error {
+        let others =
+            others.iter().map(|(pid, name)| Holder { pid: *pid, name: (*name).to_owned() }).collect();
+        let e = std::io::Error::from_raw_os_error(Errno::BUSY.raw_os_error());
+        in_use(Path::new("/dev/iio:device0"), &Holders { others, own, hidden: 0 }, e)
+    }
+
+    #[test]
+    fn a_sensor_that_is_in_use_says_who_reads_it_and_what_to_end() {
+        let e = busy(&[(4711, "realsense-viewe")], false);
+        assert_eq!(e.kind(), ErrorKind::Busy);
+        let text = e.to_string();
+        for part in
+            ["/dev/iio:device0 is in use", "realsense-viewe (process 4711)", "End that program", "imu"]
+        {
+            assert!(text.contains(part), "{part}: {text}");
+        }
+        let own = busy(&[], true).to_string();
+        assert!(own.contains("this process") && !own.contains("End that program"), "{own}");
+    }
+
+    #[test]
+    fn a_setting_that_is_refused_says_what_to_do_about_the_reason() {
+        for (errno, kind, cure) in [
+            (Errno::BUSY, ErrorKind::Busy, "another program"),
+            (Errno::ACCESS, ErrorKind::PermissionDenied, "udev rule"),
+            (Errno::NOENT, ErrorKind::Disconnected, "plugged in?"),
+            (Errno::IO, ErrorKind::Io, "plug the camera in anew"),
+        ] {
+            let e = std::io::Error::from_raw_os_error(errno.raw_os_error());
+            let e = failed(Path::new("buffer/length"), "set to 1024", e);
+            assert_eq!(e.kind(), kind);
+            assert!(e.to_string().contains(cure), "{e}");
         }
     }
 }

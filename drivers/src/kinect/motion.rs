@@ -21,6 +21,10 @@ use core::time::Duration;
 use depthrig_bus::{ClockDomain, FrameFlags, HostTime, MetadataLevel, MotionSample, Pose};
 use glam::DQuat;
 
+/// For [`crate::DeviceInfo::motion`]. libk4a corrects each sample when it is asked for (its `src/imu/imu.c`,
+/// `imu_apply_intrinsic_calibration`), and recorders write what they were given.
+pub const CORRECTED: &str = "accel_m_s2 and gyro_rad_s are corrected for bias and scale by libk4a with the factory calibration: do not \
+                             correct them again";
 /// Samples a second.
 pub const RATE_HZ: f64 = 1600.0;
 /// Samples of a batch: 40 ms of them.

@@ -246,6 +246,7 @@ fn info(facts: &Facts, config: &PlaybackConfig) -> DeviceInfo {
             CalibrationSource::At(path) => format!("file {}", path.display()),
             CalibrationSource::None => "none".to_owned(),
         },
+        motion: super::motion::CORRECTED.to_owned(),
     }
 }
 

@@ -64,6 +64,7 @@ impl Opened {
             firmware: self.gvd.firmware.to_string(),
             port: self.found.usb.port.clone(),
             calibration: calibration.to_owned(),
+            motion: String::new(),
         }
     }
 
@@ -127,7 +128,8 @@ impl RealsenseDevice {
             Some(Err(e)) => tracing::info!(camera = %label, "it has no stream imu: {e}"),
             None => {}
         }
-        let info = opened.info(if calibration.is_some() { FACTORY } else { NONE });
+        let mut info = opened.info(if calibration.is_some() { FACTORY } else { NONE });
+        info.motion = unit.iter().flatten().map(Unit::stated).collect();
         let Opened { transport, monitor, found, gvd } = opened;
         Ok(Self { transport, monitor, config, found, gvd, info, modes, calibration, profiles, memory, unit })
     }
@@ -194,9 +196,12 @@ impl Device for RealsenseDevice {
     fn start(mut self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
         let label = self.label();
         let in_camera = |e| in_camera(&label, e);
-        let asked = separated(&label, requests)?;
+        let asked = separated(requests);
         let imu = choose_imu(&label, &self.profiles, asked.imu.as_ref(), self.unit.take())?;
-        let (profiles, plan) = profiles::plan(&label, &self.profiles, &self.modes, &asked.images)?;
+        let (profiles, plan) = match &asked.images {
+            Some(images) => profiles::plan(&label, &self.profiles, &self.modes, images)?,
+            None => Default::default(),
+        };
         self.configure(&label, &profiles).map_err(in_camera)?;
         self.warn_of_scaled(&label, &profiles);
         let Self { mut transport, monitor, memory, .. } = *self;

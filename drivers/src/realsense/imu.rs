@@ -12,8 +12,15 @@
 //!
 //! **Switching.** The kernel takes seconds to switch a sensor on, so a thread does it while images come already, and switches it
 //! off when the stream has ended.
+//!
+//! **Silence.** When a sensor falls silent, both are switched off and on again, with growing pauses, and are given up after a
+//! number of tries. Images go on meanwhile.
 
+#[cfg(test)]
+pub(super) mod fake;
 mod merge;
+mod revival;
+mod switch;
 mod unit;
 
 use super::control::Probe;
@@ -21,10 +28,11 @@ use super::protocol::imu::{ImuCalibration, Rates};
 use crate::clock::{ClockConfig, ClockMap};
 use crate::iio::{Scan, Sensor};
 use crate::motion::{Batcher, Mark};
-use crate::{Error, FrameSink, StreamProfile};
+use crate::{Error, ErrorKind, FrameSink, Result, StreamProfile};
 use depthrig_bus::{HostTime, MotionSample};
 use merge::{Merge, Reading};
-use std::sync::mpsc::{Receiver, SyncSender, TryRecvError};
+use revival::{Revival, Step};
+use switch::Switcher;
 pub(super) use unit::{Opening, Unit, choose_imu, separated};
 
 /// Samples of a batch: 40 ms of them at 400 Hz.
@@ -32,11 +40,27 @@ pub(super) const BATCH: u32 = 16;
 /// Between two statements of how the clock's map is doing.
 const QUALITY: core::time::Duration = core::time::Duration::from_secs(1);
 
-/// The sensors, once they are on.
+/// The sensors, which nobody else can read.
 #[derive(Debug)]
 pub(super) struct Sensors {
     accelerometer: Sensor,
     gyroscope: Sensor,
+}
+
+/// The sensors while they are looked after.
+#[derive(Debug)]
+struct Running {
+    sensors: Sensors,
+    switcher: Switcher,
+    revival: Revival,
+    /// They are being switched on or off.
+    is_switching: bool,
+    /// They were on at least once: before that, what they hold was left unread by somebody else.
+    was_on: bool,
+    /// When the accelerometer and the gyroscope last measured.
+    heard: [HostTime; 2],
+    /// Why they could not be switched on last.
+    refusal: Option<Error>,
 }
 
 /// A streaming IMU. Dropping it switches the sensors off.
@@ -45,11 +69,10 @@ pub(super) struct Imu {
     stream: usize,
     label: String,
     calibration: ImuCalibration,
-    starting: Receiver<crate::Result<Sensors>>,
-    sensors: Option<Sensors>,
-    /// Ends the thread that switches.
-    _stop: SyncSender<()>,
-    is_over: bool,
+    /// `None` when they were given up.
+    running: Option<Running>,
+    /// Why they were given up, until it is taken.
+    ended: Option<Error>,
     clock: ClockMap,
     merge: Merge,
     batcher: Batcher,
@@ -60,19 +83,20 @@ pub(super) struct Imu {
 
 impl Imu {
     fn new(stream: usize, profile: &StreamProfile, opening: Opening) -> Self {
-        let Opening { label, calibration, rates, starting, stop } = opening;
+        let Opening { label, calibration, rates, sensors, switcher, revival } = opening;
         let Rates { gyro_hz, .. } = rates;
         let period_ns = (1e9 / gyro_hz) as u64;
         let mut clock = ClockMap::new(ClockConfig::new(32, 1000.0, period_ns));
         clock.expect_probes();
+        let heard = [HostTime::now(); 2];
+        let running =
+            Running { sensors, switcher, revival, is_switching: true, was_on: false, heard, refusal: None };
         Self {
             stream,
             label,
             calibration,
-            starting,
-            sensors: None,
-            _stop: stop,
-            is_over: false,
+            running: Some(running),
+            ended: None,
             clock,
             merge: Merge::new(period_ns / 1000),
             batcher: Batcher::new(stream, profile),
@@ -87,22 +111,19 @@ impl Imu {
         self.clock.probe(probe.before, probe.ticks.into(), probe.after);
     }
 
+    /// Why the sensors were given up, once.
+    pub(super) const fn take_end(&mut self) -> Option<Error> {
+        self.ended.take()
+    }
+
     /// Hands on what has come, and what waited long enough. Whether a batch went.
     pub(super) fn drain(&mut self, sink: &mut dyn FrameSink) -> bool {
-        if self.is_over {
-            return self.batcher.tick(HostTime::now(), sink);
-        }
-        if self.sensors.is_none() {
-            match self.starting.try_recv() {
-                Ok(Ok(sensors)) => self.sensors = Some(sensors),
-                Ok(Err(e)) => self.end(&e),
-                Err(TryRecvError::Empty) => {}
-                Err(TryRecvError::Disconnected) => self.is_over = true,
-            }
-        }
         let mut went = false;
-        if let Err(e) = self.read(&mut went, sink) {
-            self.end(&e);
+        if let Err(e) = self.read(&mut went, sink).and_then(|()| self.look_after()) {
+            // Images go on without it; a camera that is gone says so by its images.
+            tracing::warn!(camera = %self.label, error = %e, "the IMU is no longer read");
+            self.running = None;
+            self.ended = Some(e);
         }
         let now = HostTime::now();
         went |= self.batcher.tick(now, sink);
@@ -113,17 +134,66 @@ impl Imu {
         went
     }
 
-    /// Images go on without it; a camera that is gone says so by its images.
-    fn end(&mut self, e: &Error) {
-        tracing::warn!(camera = %self.label, error = %e, "the IMU is no longer read");
-        self.is_over = true;
-        self.sensors = None;
+    /// Sees to it that the sensors are on and measure.
+    fn look_after(&mut self) -> Result<()> {
+        let Some(running) = &mut self.running else { return Ok(()) };
+        let now = HostTime::now();
+        if running.is_switching {
+            let Some(outcome) = running.switcher.outcome() else { return Ok(()) };
+            running.is_switching = false;
+            running.revival.switched(now);
+            running.refusal = match outcome {
+                Ok(()) => {
+                    running.was_on = true;
+                    None
+                }
+                Err(e) if matches!(e.kind(), ErrorKind::Disconnected | ErrorKind::PermissionDenied) => {
+                    return Err(e);
+                }
+                Err(e) => Some(e),
+            };
+        }
+        let [accelerometer, gyroscope] = running.heard;
+        let why = || match &running.refusal {
+            Some(e) => e.to_string(),
+            None if accelerometer < gyroscope => "its accelerometer is silent".to_owned(),
+            None => "its gyroscope is silent".to_owned(),
+        };
+        match running.revival.step(now, accelerometer.min(gyroscope)) {
+            Step::Wait => return Ok(()),
+            Step::Revived(tries) => {
+                tracing::info!(camera = %self.label, tries, "its IMU measures again");
+                return Ok(());
+            }
+            Step::GiveUp(tries) => {
+                let text = format!(
+                    "{}, although it was switched off and on {tries} times; plug the camera in anew",
+                    why()
+                );
+                return Err(Error::new(ErrorKind::Stalled, text));
+            }
+            Step::Restart(1) => {
+                let why = why();
+                tracing::warn!(camera = %self.label, "{why}; the IMU is switched off and on until it measures");
+            }
+            Step::Restart(tries) => tracing::debug!(camera = %self.label, tries, "{}", why()),
+        }
+        running.switcher.restart();
+        running.is_switching = true;
+        Ok(())
     }
 
-    fn read(&mut self, went: &mut bool, sink: &mut dyn FrameSink) -> crate::Result<()> {
-        let Some(Sensors { accelerometer, gyroscope }) = &mut self.sensors else { return Ok(()) };
+    fn read(&mut self, went: &mut bool, sink: &mut dyn FrameSink) -> Result<()> {
+        let Some(running) = &mut self.running else { return Ok(()) };
+        let Running { sensors: Sensors { accelerometer, gyroscope }, was_on, heard, .. } = running;
+        if !*was_on {
+            accelerometer.drain(|_| {})?;
+            return gyroscope.drain(|_| {});
+        }
+        let mut is_accelerometer_heard = false;
         // Acceleration first: what was measured before a rotation has come before it.
         accelerometer.drain(|scan| {
+            is_accelerometer_heard = true;
             let value = self.calibration.acceleration_m_s2(scan.axes);
             self.merge.acceleration(Reading { ticks: ticks(&scan), value });
         })?;
@@ -131,6 +201,10 @@ impl Imu {
         self.scans.clear();
         gyroscope.drain(|scan| self.scans.push(scan))?;
         let arrival = HostTime::now();
+        let is_heard = [is_accelerometer_heard, !self.scans.is_empty()];
+        for (heard, _) in heard.iter_mut().zip(is_heard).filter(|(_, is_heard)| *is_heard) {
+            *heard = arrival;
+        }
         for scan in &self.scans {
             let rotation =
                 Reading { ticks: ticks(scan), value: self.calibration.rotation_rad_s(scan.axes, bits) };
@@ -166,3 +240,6 @@ impl Imu {
 const fn ticks(scan: &Scan) -> u32 {
     (scan.time_ns / 1000) as u32
 }
+
+#[cfg(test)]
+mod tests;

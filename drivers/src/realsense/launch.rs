@@ -7,9 +7,14 @@ use super::memory::Memory;
 use super::profiles::{self, Plan};
 use super::protocol::hwm::HardwareMonitor;
 use super::stream::{Lane, Parts, RealsenseStream};
-use super::transport::{Function, Transport};
+use super::transport::{Function, Started, Transport};
+use crate::video::{Picture, PictureSource};
 use crate::{Error, Gate, Result, Stream, StreamProfile};
+use core::time::Duration;
 use std::sync::Arc;
+
+/// How long is waited for images that do not come before the IMU is looked at again.
+const SLICE: Duration = Duration::from_millis(20);
 
 /// What is to be started.
 pub(super) struct Launch {
@@ -41,7 +46,11 @@ impl Launch {
             }
             None => None,
         };
-        let started = transport.start(&plan.modes)?;
+        let started = if plan.modes.is_empty() {
+            Started { pictures: Box::new(NoImages), headers: Vec::new() }
+        } else {
+            transport.start(&plan.modes)?
+        };
         let sources = profiles::granted(&mut profiles, &plan, &started.headers);
         let (imu, imu_profile) = imu.unzip();
         for p in profiles.iter().chain(&imu_profile) {
@@ -66,6 +75,16 @@ impl Launch {
         let parts =
             Parts { label, pictures: started.pictures, profiles, lanes, sources, control, memory, imu };
         Ok(Box::new(RealsenseStream::new(parts)))
+    }
+}
+
+/// The images of a camera that delivers its IMU alone.
+struct NoImages;
+
+impl PictureSource for NoImages {
+    fn poll(&mut self, timeout: Duration, _: &mut dyn FnMut(&Picture<'_>)) -> Result<bool> {
+        std::thread::sleep(timeout.min(SLICE));
+        Ok(false)
     }
 }
 

@@ -103,8 +103,8 @@ pub(super) fn completed(requests: &[StreamRequest], offered: &[StreamProfile]) -
         .collect())
 }
 
-/// What has to be started for a choice of streams.
-#[derive(Debug, PartialEq)]
+/// What has to be started for a choice of streams; nothing by default.
+#[derive(Debug, PartialEq, Default)]
 pub(super) struct Plan {
     /// One mode for each sensor.
     pub(super) modes: Vec<Mode>,

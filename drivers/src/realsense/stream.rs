@@ -141,14 +141,21 @@ impl Stream for RealsenseStream {
         }
         // A batch is no sign that images come.
         let batch = self.imu.as_mut().is_some_and(|imu| imu.drain(sink));
+        // Of a camera that delivers nothing else, the end of its IMU is the end.
+        if let Some(e) = self.imu.as_mut().filter(|_| self.lanes.is_empty()).and_then(Imu::take_end) {
+            self.pictures = None;
+            self.imu = None;
+            return Err(Error::new(e.kind(), format!("{}: its IMU is no longer read: {e}", self.label))
+                .with_source(e));
+        }
         Ok(if any || batch { Poll::Frame } else { Poll::Idle })
     }
 }
 
 impl Drop for RealsenseStream {
     fn drop(&mut self) {
-        // What failed was no silence.
-        if self.pictures.take().is_some() {
+        // What failed was no silence, and an IMU says nothing of images.
+        if self.pictures.take().is_some() && !self.lanes.is_empty() {
             self.memory.note_end(self.last_picture.unwrap_or(self.began).elapsed());
         }
     }

@@ -95,6 +95,7 @@ impl Unit {
             firmware: "simulated".into(),
             port: format!("sim:{}", config.serial_or_default()),
             calibration: "simulated".into(),
+            motion: String::new(),
         };
         let state = State {
             boot: Boot { number: 0, at: world_start, set_back_us: 0 },

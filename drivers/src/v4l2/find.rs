@@ -66,6 +66,7 @@ fn on_usb(usb: UsbDevice) -> Option<Found> {
         firmware: format!("{:x}.{:02x}", usb.device_version >> 8, usb.device_version & 0xFF),
         port: usb.port.clone(),
         calibration: "none".to_owned(),
+        motion: String::new(),
     };
     Some(Found { info, nodes, usb: Some(usb) })
 }
@@ -78,6 +79,7 @@ fn elsewhere(capability: &Capability, node: VideoNode) -> Found {
         firmware: String::new(),
         port: capability.bus.clone(),
         calibration: "none".to_owned(),
+        motion: String::new(),
     };
     Found { info, nodes: vec![node], usb: None }
 }

@@ -215,6 +215,7 @@ fn info(found: &Found, serial: String, mut calibration: String) -> DeviceInfo {
         firmware: found.firmware(),
         port: found.video.port.clone(),
         calibration,
+        motion: found.model.motion.map_or_else(String::new, |_| imu::NOT_CORRECTED.to_owned()),
     }
 }
 

@@ -13,6 +13,10 @@ pub const BATCH: u32 = 16;
 /// What is said of a calibration that knows the eyes and not where the unit sits.
 pub const NO_POSE: &str = " (without the motion unit's pose)";
 
+/// For [`crate::DeviceInfo::motion`].
+pub const NOT_CORRECTED: &str =
+    "accel_m_s2 and gyro_rad_s are as the unit measures them, not corrected for bias and scale";
+
 /// The stream's one mode. Where the unit sits in the camera is not in the factory's file, so that its pose is that of the
 /// camera.
 ///

@@ -151,6 +151,7 @@ fn info(camera: &Handle, serial: &str, on_bus: &[Found]) -> DeviceInfo {
         firmware: camera.firmware(),
         port: found.map_or_else(String::new, |f| f.depth.port.clone()),
         calibration: if calibration(camera).is_ok() { "factory" } else { "none" }.to_owned(),
+        motion: motion::CORRECTED.to_owned(),
     }
 }
 

@@ -1,24 +1,23 @@
-//! The IMU of a camera that is opened, and switching it on.
+//! The IMU of a camera that is opened.
 
+use super::revival::Revival;
+use super::switch::{COLD, Pair, Switcher};
 use super::{BATCH, Imu, Sensors};
-use crate::iio::{self, Found, Sensor, Switch};
+use crate::iio::{self, Found, Sensor};
 use crate::motion::{self, IMU};
 use crate::realsense::protocol::hwm::HardwareMonitor;
 use crate::realsense::protocol::imu::{ImuCalibration, Place, Rates, rates_of};
 use crate::usb::SysRoot;
 use crate::{DeviceClock, Error, ErrorKind, Result, StreamProfile, StreamRequest, choose_profiles};
-use depthrig_bus::MetadataLevel;
-use std::collections::BTreeMap;
-use std::path::PathBuf;
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Mutex, PoisonError};
+use depthrig_bus::{HostTime, MetadataLevel};
 
-const ACCELERATION: [&str; 3] = ["in_accel_x", "in_accel_y", "in_accel_z"];
-const ROTATION: [&str; 3] = ["in_anglvel_x", "in_anglvel_y", "in_anglvel_z"];
+pub(super) const ACCELERATION: [&str; 3] = ["in_accel_x", "in_accel_y", "in_accel_z"];
+pub(super) const ROTATION: [&str; 3] = ["in_anglvel_x", "in_anglvel_y", "in_anglvel_z"];
 
 /// An IMU that is not streaming.
 #[derive(Debug, Clone)]
 pub(in crate::realsense) struct Unit {
+    root: SysRoot,
     accelerometer: Found,
     gyroscope: Found,
     calibration: ImuCalibration,
@@ -30,29 +29,23 @@ pub(in crate::realsense) struct Opening {
     pub(super) label: String,
     pub(super) calibration: ImuCalibration,
     pub(super) rates: Rates,
-    pub(super) starting: Receiver<Result<Sensors>>,
-    pub(super) stop: SyncSender<()>,
+    pub(super) sensors: Sensors,
+    pub(super) switcher: Switcher,
+    pub(super) revival: Revival,
 }
 
 /// The requests for images, and that for the IMU.
 pub(in crate::realsense) struct Separated {
-    pub(in crate::realsense) images: Vec<StreamRequest>,
+    /// `None`: no images at all. An empty list asks for the default streams.
+    pub(in crate::realsense) images: Option<Vec<StreamRequest>>,
     pub(in crate::realsense) imu: Option<StreamRequest>,
 }
 
-/// Separates the request for the IMU from those for images. It is delivered beside images alone: the clock of both is asked
-/// while they stream.
-///
-/// # Errors
-/// [`ErrorKind::Unsupported`] when the IMU is all that is asked for.
-pub(in crate::realsense) fn separated(label: &str, requests: &[StreamRequest]) -> Result<Separated> {
+/// Separates the request for the IMU from those for images.
+pub(in crate::realsense) fn separated(requests: &[StreamRequest]) -> Separated {
     let (imu, images): (Vec<_>, Vec<_>) = requests.iter().cloned().partition(|r| r.stream.as_str() == IMU);
-    if images.is_empty() && !imu.is_empty() {
-        let text =
-            format!("{label}: the stream \"{IMU}\" alone is not delivered; list depth or color beside it");
-        return Err(Error::new(ErrorKind::Unsupported, text));
-    }
-    Ok(Separated { images, imu: imu.into_iter().next() })
+    let is_alone = images.is_empty() && !imu.is_empty();
+    Separated { images: (!is_alone).then_some(images), imu: imu.into_iter().next() }
 }
 
 /// The IMU with the mode that was asked for; nothing where it was not.
@@ -100,12 +93,18 @@ impl Unit {
             return Err(Error::new(ErrorKind::NotFound, text));
         };
         let calibration = ImuCalibration::read(monitor, place, product)?;
-        Ok(Self { accelerometer, gyroscope, calibration, rates: rates_of(place, chip) })
+        let root = root.clone();
+        Ok(Self { root, accelerometer, gyroscope, calibration, rates: rates_of(place, chip) })
     }
 
     /// Whether sensitivity and bias are the camera's own.
     pub(in crate::realsense) const fn is_calibrated(&self) -> bool {
         self.calibration.is_calibrated
+    }
+
+    /// For [`crate::DeviceInfo::motion`].
+    pub(in crate::realsense) fn stated(&self) -> String {
+        self.calibration.stated()
     }
 
     /// The stream's modes, the default first.
@@ -119,10 +118,11 @@ impl Unit {
         self.rates.iter().map(profile).collect()
     }
 
-    /// Starts the thread that switches the sensors on, as stream number `stream`.
+    /// Opens the sensors and starts the thread that switches them on, as stream number `stream`.
     ///
     /// # Errors
-    /// [`ErrorKind::PermissionDenied`] with the cure when this user may not read them; [`ErrorKind::Io`].
+    /// [`ErrorKind::PermissionDenied`] with the cure when this user may not read them; [`ErrorKind::Busy`] naming the program
+    /// that does; [`ErrorKind::Io`].
     pub(in crate::realsense) fn start(
         self,
         stream: usize,
@@ -137,76 +137,19 @@ impl Unit {
                 format!("{label}: its IMU has no {samples_hz} samples a second"),
             )
         })?;
-        // Whether this user may is said at once, and not by the thread.
-        let mut sensors = Sensors {
-            accelerometer: Sensor::open(&self.accelerometer, ACCELERATION)?,
-            gyroscope: Sensor::open(&self.gyroscope, ROTATION)?,
+        let Self { root, accelerometer, gyroscope, calibration, .. } = self;
+        let open = |found: &Found, axes| {
+            Sensor::open(&root, found, axes)
+                .map_err(|e| Error::new(e.kind(), format!("{label}: its IMU: {e}")).with_source(e))
         };
-        let (send, starting) = sync_channel(1);
-        let (stop, stopped) = sync_channel::<()>(1);
-        let Self { accelerometer, gyroscope, calibration, .. } = self;
-        let thread = std::thread::Builder::new().name("realsense-imu".to_owned());
-        let run = move || {
-            let turn = switching(&accelerometer.folder);
-            let switches = switch_on([&accelerometer, &gyroscope], &mut sensors, &rates, turn);
-            let failed = match switches {
-                Ok(switches) => {
-                    // Nobody listens when the stream has ended meanwhile; then the wait below ends at once.
-                    let _ = send.send(Ok(sensors));
-                    // It ends when the stream is dropped.
-                    let _ = stopped.recv();
-                    switch_off(&accelerometer, turn, &switches)
-                }
-                Err(e) => {
-                    let _ = send.send(Err(e));
-                    Ok(())
-                }
-            };
-            if let Err(e) = failed {
-                tracing::debug!("the IMU is not switched off: {e}");
-            }
+        let sensors = Sensors {
+            accelerometer: open(&accelerometer, ACCELERATION)?,
+            gyroscope: open(&gyroscope, ROTATION)?,
         };
-        thread.spawn(run).map_err(|e| {
-            Error::new(ErrorKind::Io, format!("{label}: no thread for its IMU")).with_source(e)
-        })?;
-        let opening = Opening { label: label.to_owned(), calibration, rates, starting, stop };
+        let pair = Pair { accelerometer, gyroscope, rates, cold: COLD };
+        let switcher = Switcher::spawn(pair, label)?;
+        let revival = Revival::new(HostTime::now());
+        let opening = Opening { label: label.to_owned(), calibration, rates, sensors, switcher, revival };
         Ok(Imu::new(stream, profile, opening))
     }
-}
-
-/// Who switched which sensor on last: a stream that is ended late must not switch off the sensors of the next one.
-static TURNS: Mutex<BTreeMap<PathBuf, u64>> = Mutex::new(BTreeMap::new());
-
-fn switching(folder: &std::path::Path) -> u64 {
-    let mut turns = TURNS.lock().unwrap_or_else(PoisonError::into_inner);
-    let turn = turns.entry(folder.to_owned()).or_default();
-    *turn += 1;
-    *turn
-}
-
-fn switch_on(found: [&Found; 2], sensors: &mut Sensors, rates: &Rates, turn: u64) -> Result<[Switch; 2]> {
-    let [accelerometer, gyroscope] = found;
-    let turns = TURNS.lock().unwrap_or_else(PoisonError::into_inner);
-    let accel = Switch::prepare(accelerometer, ACCELERATION)?;
-    let gyro = Switch::prepare(gyroscope, ROTATION)?;
-    accel.write("in_accel_sampling_frequency", rates.accel_selector)?;
-    gyro.write("in_anglvel_sampling_frequency", rates.gyro_selector)?;
-    if turns.get(&accelerometer.folder) == Some(&turn) {
-        // What somebody left unread is not of this stream.
-        sensors.accelerometer.drain(|_| {})?;
-        sensors.gyroscope.drain(|_| {})?;
-        accel.on()?;
-        gyro.on()?;
-    }
-    Ok([accel, gyro])
-}
-
-fn switch_off(accelerometer: &Found, turn: u64, switches: &[Switch; 2]) -> Result<()> {
-    let turns = TURNS.lock().unwrap_or_else(PoisonError::into_inner);
-    if turns.get(&accelerometer.folder) == Some(&turn) {
-        for switch in switches {
-            switch.off()?;
-        }
-    }
-    Ok(())
 }

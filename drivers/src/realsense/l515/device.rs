@@ -58,6 +58,7 @@ impl Opened {
             firmware: self.gvd.firmware.to_string(),
             port: self.found.usb.port.clone(),
             calibration: calibration.to_owned(),
+            motion: String::new(),
         }
     }
 }
@@ -99,7 +100,8 @@ impl L515Device {
             Ok(unit) => profiles.extend(unit.profiles()?),
             Err(e) => tracing::info!(camera = %label, "it has no stream imu: {e}"),
         }
-        let info = opened.info_with(FACTORY);
+        let mut info = opened.info_with(FACTORY);
+        info.motion = unit.iter().map(Unit::stated).collect();
         Ok(Self { opened, label, config, info, modes, profiles, memory, unit })
     }
 
@@ -146,8 +148,11 @@ impl Device for L515Device {
     fn start(mut self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
         let label = self.label.clone();
         let in_camera = |e| in_camera(&label, e);
-        let asked = separated(&label, requests)?;
-        let (profiles, plan) = profiles::plan(&label, &self.profiles, &self.modes, &asked.images)?;
+        let asked = separated(requests);
+        let (profiles, plan) = match &asked.images {
+            Some(images) => profiles::plan(&label, &self.profiles, &self.modes, images)?,
+            None => Default::default(),
+        };
         self.configure(&profiles).map_err(in_camera)?;
         let Self { opened: Opened { mut transport, monitor, .. }, memory, profiles: offered, unit, .. } =
             *self;

@@ -5,17 +5,21 @@
 //! `src/proc/motion-transform.cpp` (units, and the order of correction); Apache-2.0.
 
 use super::hwm::{HardwareMonitor, Request};
+use super::intrinsics::{rigid, rotation};
 use super::protocol_error;
 use super::tables::HEADER;
 use crate::bytes::{f32_at, u16_at, u32_at};
 use crate::{ErrorKind, Result};
 use depthrig_bus::Pose;
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DMat3, DVec3};
 
 /// Standard gravity, m/s².
 const GRAVITY: f64 = 9.806_65;
 /// Bytes of `dm_v2_calibration_table` behind its header, without what is reserved.
 const NUMBERS: usize = 4 + 48 + 48 + 48;
+/// No sensor's sensitivity is as far from 1, nor its bias as far from 0 (m/s² or degrees per second).
+const LARGEST_SENSITIVITY: f64 = 10.0;
+const LARGEST_BIAS: f64 = 100.0;
 /// Versions that a table begins with: a D400's and an L515's.
 const D4XX_VERSION: u16 = 0x0101;
 const L515_VERSION: u16 = 0x0105;
@@ -31,6 +35,28 @@ pub struct Axes {
 
 impl Axes {
     const NONE: Self = Self { sensitivity: DMat3::IDENTITY, bias: DVec3::ZERO };
+
+    /// As a table has it, of the sensor `name`.
+    fn checked(self, name: &str) -> Result<Self> {
+        // Written so that what is not a number is refused too.
+        let is_within = |values: &[f64], most: f64| values.iter().all(|v| v.abs() <= most);
+        if is_within(&self.sensitivity.to_cols_array(), LARGEST_SENSITIVITY)
+            && is_within(&self.bias.to_array(), LARGEST_BIAS)
+        {
+            return Ok(self);
+        }
+        Err(protocol_error(format!(
+            "the IMU's table has a calibration of the {name} that no sensor has: {self}"
+        )))
+    }
+}
+
+/// `S = [[…], […], […]], b = […]`, S row after row, with the digits that the camera's table has.
+impl core::fmt::Display for Axes {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let rows = [0, 1, 2].map(|row| self.sensitivity.row(row).as_vec3().to_array());
+        write!(f, "S = {rows:?}, b = {:?}", self.bias.as_vec3().to_array())
+    }
 }
 
 /// The calibration of an IMU, along the axes of the depth camera.
@@ -71,7 +97,8 @@ impl ImuCalibration {
         Self {
             accelerometer: Axes::NONE,
             gyroscope: Axes::NONE,
-            pose: pose(DMat3::IDENTITY, drawn(product)),
+            // From the depth camera to the IMU; a pose is the other way round.
+            pose: Pose { translation_m: (-drawn(product)).to_array(), ..Pose::IDENTITY },
             is_calibrated: false,
         }
     }
@@ -97,7 +124,7 @@ impl ImuCalibration {
     /// Takes the reply of either family apart.
     ///
     /// # Errors
-    /// [`ErrorKind::Protocol`] when it is short, of an unknown version, or fails its checksum.
+    /// [`ErrorKind::Protocol`] when it is short, of an unknown version, fails its checksum, or holds numbers that no sensor has.
     pub fn parse(data: &[u8], product: u16) -> Result<Self> {
         let payload = data.get(HEADER..).unwrap_or_default();
         let start = match u16_at(data, 0) {
@@ -132,21 +159,33 @@ impl ImuCalibration {
         let vector = |at: usize| DVec3::new(float(at), float(at + 1), float(at + 2));
         let mut calibration = Self::drawn(product);
         if has_extrinsics {
-            calibration.pose = pose(matrix(0), vector(9));
+            // The table says `p_imu = R p_depth + t`; its columns, read as rows, are the rotation back.
+            let back = rotation(core::array::from_fn(|at| float(at) as f32))?;
+            calibration.pose = rigid(back, -(back * vector(9)))?;
         }
         if has_intrinsics {
-            calibration.accelerometer = Axes { sensitivity: matrix(12), bias: vector(21) };
+            calibration.accelerometer =
+                Axes { sensitivity: matrix(12), bias: vector(21) }.checked("accelerometer")?;
+            let Axes { sensitivity, bias } =
+                Axes { sensitivity: matrix(24), bias: vector(33) }.checked("gyroscope")?;
             // The table has degrees per second.
-            let bias = vector(33) * 1f64.to_radians();
-            calibration.gyroscope = Axes { sensitivity: matrix(24), bias };
+            calibration.gyroscope = Axes { sensitivity, bias: bias * 1f64.to_radians() };
         }
         calibration.is_calibrated = has_intrinsics;
-        let is_finite = |a: &Axes| a.sensitivity.is_finite() && a.bias.is_finite();
-        let finite_pose = calibration.pose.translation_m.iter().all(|v| v.is_finite());
-        if !is_finite(&calibration.accelerometer) || !is_finite(&calibration.gyroscope) || !finite_pose {
-            return Err(protocol_error("the IMU's table has numbers that are none"));
-        }
         Ok(calibration)
+    }
+
+    /// Whether samples are corrected, and with which numbers: for [`crate::DeviceInfo::motion`].
+    pub fn stated(&self) -> String {
+        if !self.is_calibrated {
+            return "accel_m_s2 and gyro_rad_s are not corrected for bias and scale: the camera has no calibration of its IMU"
+                .to_owned();
+        }
+        let Self { accelerometer, gyroscope, .. } = self;
+        format!(
+            "accel_m_s2 and gyro_rad_s are corrected with the camera's factory calibration, v = S m - b: do not correct them again; \
+             of accel_m_s2 {accelerometer} m/s^2, of gyro_rad_s {gyroscope} rad/s"
+        )
     }
 
     /// Acceleration of counts along the sensor's own axes, m/s² along those of the depth camera.
@@ -169,12 +208,6 @@ fn turned([x, y, z]: [i32; 3]) -> DVec3 {
 
 fn corrected(axes: &Axes, measured: DVec3) -> [f32; 3] {
     (axes.sensitivity * measured - axes.bias).to_array().map(|v| v as f32)
-}
-
-/// The table says `p_imu = R p_depth + t`; a pose is the other way round.
-fn pose(rotation: DMat3, translation: DVec3) -> Pose {
-    let turn = DQuat::from_mat3(&rotation.transpose()).normalize();
-    Pose { translation_m: (turn * -translation).to_array(), rotation_xyzw: turn.to_array() }
 }
 
 /// Two rates that go together, and what the kernel's sampling frequency is set to for them: the firmware takes it for a

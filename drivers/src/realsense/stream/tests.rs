@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::realsense::family::Family;
+use crate::realsense::imu::fake::FakeImu;
 use crate::realsense::protocol::hwm::{HardwareMonitor, Request};
 use crate::realsense::protocol::metadata::{CaptureTiming, Configuration, DepthControl, PayloadHeader};
 use crate::uvc::control::{ControlPort, Query};
@@ -233,4 +234,49 @@ fn a_stream_that_failed_stays_dead_and_names_its_camera() {
     assert_eq!((e.kind(), sink.delivered(0)), (ErrorKind::Disconnected, 1));
     assert!(e.to_string().starts_with("D435 1: "), "{e}");
     assert!(stream.poll(Duration::ZERO, &mut MemorySink::default()).is_err());
+}
+
+/// A camera that delivers the IMU `fake` alone.
+fn imu_alone(fake: &mut FakeImu) -> (RealsenseStream, Arc<Memory>) {
+    let (mut stream, memory) = stream(Vec::new(), None, false);
+    stream.lanes.clear();
+    stream.sources.clear();
+    stream.profiles = vec![FakeImu::profile()];
+    stream.imu = Some(fake.open(0));
+    (stream, memory)
+}
+
+#[test]
+fn an_imu_alone_is_streamed_until_it_ends_with_the_reason() {
+    let mut fake = FakeImu::new();
+    let (mut stream, _) = imu_alone(&mut fake);
+    let mut sink = MemorySink::default();
+    let until = HostTime::now().plus(Duration::from_secs(20));
+    while sink.delivered(0) < 3 {
+        assert!(!until.from_now().is_zero(), "no samples");
+        fake.measure(2);
+        stream.poll(Duration::from_millis(1), &mut sink).unwrap();
+    }
+    std::fs::remove_dir_all(fake.path().join("gyro_3d/buffer")).unwrap();
+    let end = loop {
+        assert!(!until.from_now().is_zero(), "it does not end");
+        if let Err(e) = stream.poll(Duration::from_millis(1), &mut sink) {
+            break e;
+        }
+    };
+    assert_eq!(end.kind(), ErrorKind::Disconnected);
+    assert!(end.to_string().starts_with("D435 1: its IMU is no longer read: "), "{end}");
+    assert!(stream.poll(Duration::ZERO, &mut sink).is_err());
+}
+
+#[test]
+fn a_camera_that_was_asked_for_no_images_is_not_restarted_for_sending_none() {
+    let mut fake = FakeImu::new();
+    let memory = Arc::new(Memory::default());
+    for _ in 0..3 {
+        let (mut stream, _) = imu_alone(&mut fake);
+        stream.memory = Arc::clone(&memory);
+        stream.began = stream.began.plus_ns(-60_000_000_000);
+    }
+    assert!(!memory.take_reset());
 }

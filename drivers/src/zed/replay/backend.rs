@@ -52,6 +52,7 @@ impl ReplayBackend {
             firmware: String::new(),
             port: s.path.display().to_string(),
             calibration: s.calibration_origin.clone(),
+            motion: String::new(),
         };
         let profiles = Eye::BOTH.into_iter().map(|eye| profile(s, eye)).collect::<Result<_>>()?;
         Ok(ReplayDevice { info, profiles, source, looped, on_grid: given })

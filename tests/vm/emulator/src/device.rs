@@ -325,12 +325,20 @@ impl Device {
                     imu.skip = *samples;
                 }
             }
+            Fault::ImuSilence(cycles) => {
+                if let Some(imu) = &mut self.imu {
+                    imu.silence(*cycles);
+                }
+            }
             Fault::ClockJump(us) => self.clock.jump(*us),
             Fault::ClockReset => self.clock.zero(now),
             Fault::Restart => self.restart = true,
             Fault::Clear => {
                 self.silent = false;
                 self.nak = false;
+                if let Some(imu) = &mut self.imu {
+                    imu.silence(0);
+                }
                 self.control_held = self.control_held.map(|_| now);
                 self.control_stalls = 0;
                 for pump in &mut self.pumps {

@@ -43,6 +43,8 @@ pub enum Fault {
     },
     /// The next samples of the gyroscope are not sent.
     ImuSkip(u32),
+    /// The sensors of the IMU send nothing until they have lost their power so many times.
+    ImuSilence(u32),
     /// The device's clock jumps by so many microseconds.
     ClockJump(i64),
     /// The device's clock starts again at 0.
@@ -105,6 +107,7 @@ impl Fault {
             Self::ControlStall { .. } => "control-stall",
             Self::Reply { .. } => "reply",
             Self::ImuSkip(_) => "imu-skip",
+            Self::ImuSilence(_) => "imu-silence",
             Self::ClockJump(_) => "clock-jump",
             Self::ClockReset => "clock-reset",
             Self::DamagedTable(_) => "damaged-table",
@@ -165,6 +168,7 @@ impl FromStr for Fault {
                 Ok(Self::Reply { wrong, to, times })
             }
             "imu-skip" => Ok(Self::ImuSkip(number(rest.first(), "a number of samples")?)),
+            "imu-silence" => Ok(Self::ImuSilence(number(rest.first(), "a number of power cycles")?)),
             "clock-jump" => Ok(Self::ClockJump(number(rest.first(), "a number of microseconds")?)),
             "clock-reset" => Ok(Self::ClockReset),
             "damaged-table" => Ok(Self::DamagedTable(number(rest.first(), "the number of a table")?)),
@@ -200,6 +204,7 @@ mod tests {
             "reply truncated 1",
             "reply truncated 1 to 21",
             "imu-skip 3",
+            "imu-silence 2",
             "clock-jump -5000",
             "clock-reset",
             "damaged-table 25",

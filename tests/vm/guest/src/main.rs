@@ -37,6 +37,7 @@ mod scenarios {
     pub mod realsense_clock;
     pub mod realsense_conformance;
     pub mod realsense_control;
+    pub mod realsense_imu;
     pub mod realsense_infrared;
     pub mod replug;
     pub mod service;
@@ -101,6 +102,7 @@ const SCENARIOS: &[Scenario] = &[
     scenarios::realsense_conformance::LIBUSB,
     scenarios::realsense_control::SCENARIO,
     scenarios::realsense_infrared::SCENARIO,
+    scenarios::realsense_imu::SCENARIO,
     scenarios::zed::SCENARIO,
     scenarios::zed_records::SCENARIO,
     scenarios::fourteen::SCENARIO,

@@ -1,6 +1,7 @@
 //! Emulated cameras as subjects of the conformance suite: a D400 by either transport, a plain USB camera by the back end
 //! `v4l2`.
 
+use crate::checks::Checks;
 use crate::system;
 use anyhow::Context;
 use core::time::Duration;
@@ -103,6 +104,17 @@ pub fn plug(model: &str, options: Options) -> anyhow::Result<Camera> {
     let ready = || nodes_of(&camera).is_ok_and(|n| n.len() == 2 * streams);
     anyhow::ensure!(system::wait_until(PATIENCE, ready), "a {model} has {:?}", nodes_of(&camera));
     Ok(camera)
+}
+
+/// Waits until the kernel has both sensors as devices of its industrial I/O.
+pub fn wait_for_imu(checks: &mut Checks, model: &str) {
+    let count = || {
+        std::fs::read_dir("/sys/bus/iio/devices").map_or(0, |all| {
+            all.flatten().filter(|e| e.file_name().to_string_lossy().starts_with("iio:device")).count()
+        })
+    };
+    let there = system::wait_until(Duration::from_secs(10), || count() == 2);
+    checks.that(&format!("{model}: the kernel's sensor hub has both sensors"), there, count());
 }
 
 /// The video nodes of a camera that can be opened.

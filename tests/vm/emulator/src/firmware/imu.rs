@@ -40,11 +40,22 @@ struct Sensor {
     /// When it measures next, nanoseconds of the device; `None` while it is off.
     next_ns: Option<i64>,
     index: u64,
+    /// It sends nothing until it has lost its power so many times.
+    silent: u32,
 }
 
 impl Sensor {
     fn new(kind: ImuSensor) -> Self {
-        Self { kind, reporting: 1, power: 6, interval: 1000, sensitivity: 0, next_ns: None, index: 0 }
+        Self {
+            kind,
+            reporting: 1,
+            power: 6,
+            interval: 1000,
+            sensitivity: 0,
+            next_ns: None,
+            index: 0,
+            silent: 0,
+        }
     }
 
     /// Nanoseconds between two samples. The host's selector is 100000 divided by the rate in Hz, rounded by the kernel.
@@ -115,6 +126,9 @@ impl Imu {
         sensor.interval = interval;
         sensor.sensitivity = u16::from_le_bytes([s0, s1]);
         let period = sensor.period_ns(chip);
+        if power != FULL_POWER && sensor.next_ns.is_some() {
+            sensor.silent = sensor.silent.saturating_sub(1);
+        }
         sensor.next_ns = match (power == FULL_POWER, sensor.next_ns) {
             (false, _) => None,
             (true, Some(next)) if !changed => Some(next),
@@ -140,11 +154,12 @@ impl Imu {
             let counts = sensor.counts(sensor.index, self.wide);
             let kind = sensor.kind;
             let index = sensor.index;
+            let is_silent = sensor.silent > 0;
             sensor.index += 1;
             sensor.next_ns = Some(at + sensor.period_ns(self.chip));
             let is_skipped = kind == ImuSensor::Gyroscope && self.skip > 0;
             self.skip -= u32::from(is_skipped);
-            let is_sent = !silent && !is_skipped && self.ready.len() < FIFO;
+            let is_sent = !silent && !is_silent && !is_skipped && self.ready.len() < FIFO;
             let ticks = clock.shown_us(at);
             if is_sent {
                 self.ready.push_back(report::input(kind as u8, ticks, counts, self.wide));
@@ -153,6 +168,13 @@ impl Imu {
             measured.push(ImuSample { sensor: kind, index, ticks, captured, counts, is_sent });
         }
         measured
+    }
+
+    /// Both sensors send nothing until they have lost their power `cycles` times.
+    pub fn silence(&mut self, cycles: u32) {
+        for sensor in &mut self.sensors {
+            sensor.silent = cycles;
+        }
     }
 
     /// The next report that waits for the host.
@@ -201,6 +223,21 @@ mod tests {
             rates.push(imu.advance(second, &clock, false).len());
         }
         assert_eq!(rates, [62, 250, 100, 400, 200, 100, 400]);
+    }
+
+    #[test]
+    fn silent_sensors_measure_again_when_they_had_no_power() {
+        let mut imu = imu("d435i");
+        let clock = DeviceClock::new(HostTime::from_ns(0), 0, 0.0);
+        let mut sent = Vec::new();
+        imu.silence(2);
+        for (at, power) in [FULL_POWER, FULL_POWER, 6, FULL_POWER, 6, 6, FULL_POWER].into_iter().enumerate() {
+            let begin = at as i64 * 100_000_000;
+            imu.write_feature(&[2, 0, 2, power, 0, 0xFA, 0, 0, 0], begin).unwrap();
+            let end = HostTime::from_ns(begin + 100_000_000);
+            sent.push(imu.advance(end, &clock, false).iter().filter(|s| s.is_sent).count() > 0);
+        }
+        assert_eq!(sent, [false, false, false, false, false, false, true]);
     }
 
     #[test]

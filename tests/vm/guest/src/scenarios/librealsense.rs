@@ -9,7 +9,7 @@ mod settings;
 mod vendor;
 
 use crate::checks::Checks;
-use crate::subject::plug;
+use crate::subject::{plug, wait_for_imu};
 use crate::{Scenario, system};
 use depthrig_drivers::Backend;
 use depthrig_drivers::realsense::RealsenseBackend;
@@ -44,7 +44,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     for (model, version) in MODELS {
         let camera = plug(model, Options { drift_ppm: 20.0, ..Options::default() })?;
         if camera.model().imu.is_some() {
-            imu::wait_for_sensors(checks, model);
+            wait_for_imu(checks, model);
         }
         let mut vendor = Vendor::start(version)?;
         let subject = Subject { checks, camera: &camera, vendor: &mut vendor, model };

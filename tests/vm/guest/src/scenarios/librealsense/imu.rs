@@ -4,8 +4,6 @@
 
 use super::Subject;
 use super::vendor::{entries, numbers, text, whole};
-use crate::checks::Checks;
-use crate::system;
 use core::time::Duration;
 use depthrig_bus::{FrameFlags, HostTime, MotionSample, Name};
 use depthrig_drivers::realsense::RealsenseBackend;
@@ -20,17 +18,6 @@ const GRAVITY: f64 = 9.806_65;
 const SAMPLES: u64 = 60;
 /// Numbers of 32 bits through two multiplications.
 const CLOSE: f64 = 2e-5;
-
-/// Waits until the kernel has both sensors as devices of its industrial I/O.
-pub fn wait_for_sensors(checks: &mut Checks, model: &str) {
-    let count = || {
-        std::fs::read_dir("/sys/bus/iio/devices").map_or(0, |all| {
-            all.flatten().filter(|e| e.file_name().to_string_lossy().starts_with("iio:device")).count()
-        })
-    };
-    let there = system::wait_until(Duration::from_secs(10), || count() == 2);
-    checks.that(&format!("{model}: the kernel's sensor hub has both sensors"), there, count());
-}
 
 /// What a sample is, in m/s² or rad/s along the axes of the depth camera.
 pub fn expected(subject: &Subject<'_>, sample: &ImuSample) -> Option<[f64; 3]> {
