@@ -204,7 +204,7 @@ fn what_is_no_dataset_is_said() {
     assert_eq!(e.kind(), ErrorKind::NotFound);
     std::fs::create_dir(home.path("empty")).unwrap();
     let Err(e) = start("empty", ReplayOptions::default()) else { panic!() };
-    assert_eq!(e.kind(), ErrorKind::BadInput);
+    assert_eq!(e.kind(), ErrorKind::Other);
     assert!(e.to_string().contains("is no dataset"), "{e}");
     let options = ReplayOptions { rate: 0.0, ..ReplayOptions::default() };
     let Err(e) = start("empty", options) else { panic!() };
