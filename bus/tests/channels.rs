@@ -123,6 +123,8 @@ fn when_every_slot_is_held_the_publisher_is_told_and_goes_on_later() {
     });
     let e = refused.expect("eight slots cannot hold twenty frames");
     assert_eq!(e.kind(), ErrorKind::NoSpace);
+    assert!(f.bus.starved(), "who cleans up after dead subscribers is told at once");
+    assert!(!f.bus.starved());
     assert!(e.to_string().contains("subscribers hold every slot"), "{e}");
     held.clear();
     publish(&publisher, 21);

@@ -87,11 +87,20 @@ impl KinectImport {
     /// Opens the recording `path`.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`], [`ErrorKind::BadRecording`] when it is no recording of an Azure Kinect or has no calibration
-    /// where one is wanted, [`ErrorKind::Io`].
+    /// [`ErrorKind::NotFound`], [`ErrorKind::BadRecording`] when it is no recording of an Azure Kinect, or the calibration is not
+    /// one, [`ErrorKind::BadInput`] when it has none and one is wanted, [`ErrorKind::Io`].
     pub fn open(path: &Path, options: KinectOptions) -> Result<Self> {
         let recording = Recording::open(path).map_err(of_driver)?;
-        let calibration = options.calibration.load(&recording).map_err(of_driver)?;
+        let lacks_calibration =
+            options.calibration == CalibrationSource::Recorded && recording.facts().calibration.is_none();
+        let calibration = options.calibration.load(&recording).map_err(|e| {
+            // An option can do without it.
+            if lacks_calibration {
+                Error::new(ErrorKind::BadInput, e.to_string()).with_source(e)
+            } else {
+                of_driver(e)
+            }
+        })?;
         let facts = recording.facts();
         let profiles = recorded_profiles(facts, calibration.as_ref()).map_err(of_driver)?;
         let from = match &options.calibration {

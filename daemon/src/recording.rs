@@ -8,8 +8,8 @@ use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::{Frame, HostTime, StreamId, UtcPair};
 use depthrig_recorder::{
-    Diagnostic, NOTE_MAX_BYTES, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session,
-    StreamAccount, Summary, UtcSource, fs,
+    Diagnostic, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamAccount, Summary,
+    UtcSource, fs,
 };
 use place::place;
 pub use recovery::recover_left;
@@ -24,6 +24,7 @@ mod place;
 mod recovery;
 mod report;
 mod spread;
+mod texts;
 
 pub use facts::StreamFacts;
 pub use report::Reports;
@@ -108,7 +109,7 @@ impl Begun {
         outside: &Outside,
     ) -> Result<Self> {
         budget::check_duration(request)?;
-        check_texts(request)?;
+        texts::check(request)?;
         let (streams, others): (Vec<_>, Vec<_>) = streams.into_iter().partition(|s| s.stream.record);
         // Motion rides with the sets of the others.
         let (units, streams): (Vec<_>, Vec<_>) =
@@ -438,22 +439,6 @@ fn finish(recording: &Mutex<Recording>, finishing: Finishing) -> Result<Recordin
         recording.keep(status.clone(), result.as_ref().ok().cloned());
     }
     result.map(|_| status)
-}
-
-/// Refuses texts that no dataset takes, before there is one.
-fn check_texts(request: &RecordRequest) -> Result<()> {
-    let texts = [("scene", &request.scene), ("operator", &request.operator), ("notes", &request.notes)];
-    if let Some((name, text)) = texts.into_iter().find(|(_, text)| text.len() > NOTE_MAX_BYTES) {
-        let message = format!("invalid {name}: it has {} bytes, {NOTE_MAX_BYTES} is the limit", text.len());
-        return Err(Error::new(ErrorKind::BadInput, message));
-    }
-    let directory = request.directory.as_ref().map(|d| d.to_string_lossy());
-    if let Some(directory) = directory.filter(|d| d.contains(char::is_control)) {
-        let message =
-            format!("invalid directory \"{}\": it has control characters", directory.escape_debug());
-        return Err(Error::new(ErrorKind::BadInput, message));
-    }
-    Ok(())
 }
 
 fn none_active() -> Error {

@@ -9,7 +9,8 @@ use core::fmt;
 pub enum Exit {
     /// Everything as asked: 0.
     Good,
-    /// It did not work: 1. A dataset or recording that is missing, unreadable, empty, damaged or not one fails.
+    /// It did not work: 1. A dataset, recording or calibration that is missing, unreadable, empty,
+    /// damaged or not one fails.
     Failed,
     /// Wrong usage or configuration: 2. Inputs that are readable and do not fit what was asked for are wrong usage.
     Usage,

@@ -43,7 +43,7 @@ fn one_terminal_replays_and_another_one_steers() {
     assert!(home.run(&["replay", "resume"]).good().starts_with("playing"));
     assert!(home.run(&["replay", "pause"]).good().starts_with("paused"));
     for (args, says) in [
-        (&["replay", "rate", "11"][..], "0.1 to 10"),
+        (&["replay", "rate", "11"][..], "out of range 0.1..=10"),
         (&["replay", "seek", "99"], "no set at 99 s"),
         (&["replay", "seek"], "required"),
         (&["replay", "seek", "1", "--set", "1"], "cannot be used"),

@@ -10,6 +10,8 @@ use depthrig_recorder::{
     fs::{Fs, RealFs},
 };
 use std::collections::BTreeMap;
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -205,6 +207,23 @@ fn a_crash_is_recovered_once_and_the_exit_code_says_what_it_cost() {
     assert_eq!(plan.code, 3, "{}", plan.err);
     assert!(plan.out.contains("can be recovered, 1 set") && plan.out.contains("lost: "), "{}", plan.out);
     assert!(files(&dir) == before, "a dry run changed something");
+    if rustix::process::geteuid().is_root() {
+        println!("skipped: root may write into every folder");
+    } else {
+        // What the folder does not take is known without writing into it.
+        let set_mode = |mode| std::fs::set_permissions(&dir, Permissions::from_mode(mode)).unwrap();
+        set_mode(0o555);
+        let refused = [&["recover", at, "-q"][..], &["recover", at, "--dry-run", "-q"]].map(|c| home.run(c));
+        set_mode(0o755);
+        for ran in &refused {
+            assert!(
+                ran.code == 1 && ran.err.contains("choose a folder that this user may write"),
+                "{}",
+                ran.err
+            );
+        }
+        assert_eq!(refused[0].err, refused[1].err);
+    }
     let lock = RealFs.lock(&dir).unwrap();
     assert_eq!(home.run(&["recover", at, "-q"]).code, 1);
     assert!(files(&dir) == before, "a refused recovery changed something");

@@ -2,6 +2,7 @@
 //! steer a terminal is shown, and what is read is not written to.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
+use depthrig_kinect_fixture::{Fixture, Pattern};
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use std::fs;
 use std::path::Path;
@@ -47,7 +48,9 @@ fn dataset(dir: &Path, name: &str, scene: &str, model: &str) {
     let text = format!(
         "name = \"{name}\"\nrig = \"rig\"\nstarted_utc_ns = 1\nscene = \"{scene}\"\n\n[[streams]]\nid = \"a/color\"\n\
          model = \"{model}\"\nformat = \"rgb8\"\nwidth = 4\nheight = 4\n\n[streams.intrinsics]\nfx = 1.0\nfy = 1.0\n\
-         cx = 1.0\ncy = 1.0\n\n[streams.pose]\ntranslation_m = [0.0, 0.0, 0.0]\nrotation_xyzw = [0.0, 0.0, 0.0, 1.0]\n"
+         cx = 1.0\ncy = 1.0\n\n[streams.pose]\ntranslation_m = [0.0, 0.0, 0.0]\nrotation_xyzw = [0.0, 0.0, 0.0, 1.0]\n\n\
+         [[motion]]\nid = \"a/imu\"\nbatch = 1\n\n[motion.pose]\ntranslation_m = [0.0, 0.0, 0.0]\n\
+         rotation_xyzw = [0.0, 0.0, 0.0, 1.0]\n"
     );
     fs::create_dir(dir.join(name)).unwrap();
     fs::write(dir.join(name).join("session.toml"), text).unwrap();
@@ -137,6 +140,43 @@ fn a_fifo_or_a_device_in_the_place_of_a_file_is_refused_and_not_waited_for() {
     assert!(said.contains("it is a FIFO; a regular file is needed"), "{said}");
 }
 
+/// Files that are named by others or read after them, each a FIFO beside what is as it should be.
+#[test]
+fn a_fifo_beside_what_is_good_is_refused_by_name() {
+    let home = tempfile::tempdir().unwrap();
+    let dir = home.path();
+    for name in ["f.conf", "f.json", "f.npy"] {
+        fifo(&dir.join(name));
+    }
+    for name in ["eyes", "lens", "models/x", "root/etc/udev/rules.d"] {
+        fs::create_dir_all(dir.join(name)).unwrap();
+    }
+    image::GrayImage::new(2 * 672, 376).save(dir.join("eyes/1.png")).unwrap();
+    image::RgbImage::new(8, 6).save(dir.join("c.png")).unwrap();
+    image::ImageBuffer::<image::Luma<u16>, _>::new(8, 6).save(dir.join("z.png")).unwrap();
+    let recording = Fixture::small();
+    recording.write(&dir.join("good.mkv"), &mut Pattern::new(&recording)).unwrap();
+    image::RgbImage::new(8, 6).save(dir.join("lens/c.png")).unwrap();
+    fifo(&dir.join("lens/k.txt"));
+    let manifest = "model = \"m\"\nrate_hz = 5.0\n[[stream]]\nname = \"color\"\nfiles = \"c.png\"\nintrinsics_file = \"k.txt\"\n";
+    fs::write(dir.join("lens/camera.toml"), manifest).unwrap();
+    let rig = "rig = \"r\"\n[[camera]]\nname = \"a\"\nbackend = \"files\"\nmanifest = \"lens\"\n";
+    fs::write(dir.join("lens.toml"), rig).unwrap();
+    fifo(&dir.join("models/x/model.toml"));
+    fifo(&dir.join("root/etc/udev/rules.d/70-depthrig.rules"));
+    for line in [
+        "zed replay eyes --out out --modes quality --calibration f.conf",
+        "import kinect good.mkv out --calibration f.json",
+        "cdm view --rgb c.png --depth z.png --depth-unit 0.001 --refined f.npy --out look",
+        "cdm list --models models",
+        "config check lens.toml",
+        "install --apply --user robot --root root",
+    ] {
+        let said = text(&run(dir, &line.split_whitespace().collect::<Vec<_>>()));
+        assert!(said.contains("it is a FIFO; a regular file is needed"), "{line}: {said}");
+    }
+}
+
 #[test]
 fn what_a_dataset_says_cannot_steer_the_terminal() {
     let home = tempfile::tempdir().unwrap();
@@ -186,6 +226,7 @@ fn nothing_is_written_into_what_is_read() {
         "trim ds ds/inner",
         "merge ds/inner ds ds",
         "cat ds --out ds/inner",
+        "cat ds --stream a/imu --out ds/inner",
         "cdm relabel ds ds/inner --engine fill",
         "zed replay ds --out ds/inner --modes quality",
         "zed replay pictures --out pictures/inner --modes quality",

@@ -6,6 +6,7 @@ mod support;
 
 use depthrig_cdm::MadeNetwork;
 use depthrig_drivers::zed::replay::made::{MadeSvo, SERIAL, noise};
+use rustix::fs::{CWD, FileType, Mode, mknodat};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -54,12 +55,23 @@ fn path(home: &Home, name: &str) -> String {
     home.path().join(name).to_str().unwrap().to_owned()
 }
 
-/// It is refused with exit code 2 and these words, and nothing is left of it.
+/// It is refused as wrong usage with these words, and nothing is left of it.
 #[track_caller]
 fn refused(home: &Home, input: &str, more: &[&str], words: &[&str]) {
+    ends(2, home, input, more, words);
+}
+
+/// It fails with these words, because a file is not what it must be, and nothing is left of it.
+#[track_caller]
+fn failed(home: &Home, input: &str, more: &[&str], words: &[&str]) {
+    ends(1, home, input, more, words);
+}
+
+#[track_caller]
+fn ends(code: i32, home: &Home, input: &str, more: &[&str], words: &[&str]) {
     let out = path(home, "refused");
     let ran = home.run(&[&["zed", "replay", input, "--out", &out], more].concat());
-    assert_eq!(ran.code, 2, "{more:?}: {}{}", ran.out, ran.err);
+    assert_eq!(ran.code, code, "{more:?}: {}{}", ran.out, ran.err);
     for word in words {
         assert!(ran.err.contains(word), "{word:?} is not in: {}", ran.err);
     }
@@ -186,6 +198,9 @@ fn a_network_of_another_kind() {
     refused(&home, &input, &args, &["mode neural", "another number of channels; taken are"]);
     std::fs::write(&file, "no network").unwrap();
     refused(&home, &input, &args, &["mode neural", "net.onnx"]);
+    std::fs::remove_file(&file).unwrap();
+    mknodat(CWD, &file, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
+    refused(&home, &input, &args, &["mode neural", "net.onnx", "it is a FIFO"]);
 }
 
 #[test]
@@ -197,10 +212,10 @@ fn pictures_that_will_not_do() {
     std::fs::create_dir(&odd).unwrap();
     side_by_side((2 * EYE.0 - 1, EYE.1), 0, false).save(odd.join("1.png")).unwrap();
     std::fs::write(odd.join("SN123.conf"), conf(&[])).unwrap();
-    refused(&home, odd.to_str().unwrap(), &[], &["an odd width is no two eyes", "1343x376"]);
+    failed(&home, odd.to_str().unwrap(), &[], &["an odd width is no two eyes", "1343x376"]);
     let empty = home.path().join("empty");
     std::fs::create_dir(&empty).unwrap();
-    refused(&home, empty.to_str().unwrap(), &[], &["no side-by-side images"]);
+    failed(&home, empty.to_str().unwrap(), &[], &["no side-by-side images"]);
     let ran = home.run(&["zed", "replay", "/nonexistent", "--out", &path(&home, "refused")]);
     assert_eq!(ran.code, 1, "{}", ran.err);
     assert!(ran.err.contains("/nonexistent"), "{}", ran.err);
@@ -214,7 +229,7 @@ fn a_pair_that_cannot_be_read_is_lost_and_said() {
     let mut bytes = std::fs::read(&damaged).unwrap();
     // One that is cut off is seen at once, when all of them are looked at.
     std::fs::write(&damaged, &bytes[..bytes.len() / 2]).unwrap();
-    refused(&home, &input, &[], &["pair_001.png", "cut off"]);
+    failed(&home, &input, &[], &["pair_001.png", "cut off"]);
     let middle = bytes.len() / 2;
     bytes[middle..middle + 64].fill(0xff);
     std::fs::write(&damaged, bytes).unwrap();
@@ -240,7 +255,7 @@ fn calibrations_that_will_not_do() {
         ("[RIGHT_CAM", &["has no [RIGHT_CAM_VGA]"]),
     ] {
         std::fs::write(&file, conf(&[without])).unwrap();
-        refused(&home, &input, &[], words);
+        failed(&home, &input, &[], words);
     }
     // Half as large: the file has nothing for it.
     let small = home.path().join("small");
@@ -248,10 +263,10 @@ fn calibrations_that_will_not_do() {
     side_by_side((EYE.0, EYE.1 / 2), 0, false).save(small.join("1.png")).unwrap();
     let whole = home.write("whole.conf", &conf(&[]));
     let args = ["--calibration", whole.as_str()];
-    refused(&home, small.to_str().unwrap(), &args, &["336x188", "672x376", "must not be resized"]);
+    failed(&home, small.to_str().unwrap(), &args, &["336x188", "672x376", "must not be resized"]);
     refused(&home, small.to_str().unwrap(), &[], &["has no calibration", "--calibration"]);
     let absent = path(&home, "absent.conf");
-    refused(&home, &input, &["--calibration", &absent], &["absent.conf"]);
+    failed(&home, &input, &["--calibration", &absent], &["absent.conf"]);
 }
 
 #[test]
@@ -265,15 +280,15 @@ fn svo2_files_that_will_not_do() {
     home.write(&format!("SN{SERIAL}.conf"), &conf(&[]));
     let mut secret = MadeSvo::new(EYE, (0..3).map(|_| noise(3000)).collect());
     secret.header = Some(MadeSvo::header_of(EYE, "5.0.1", true));
-    refused(
+    failed(
         &home,
         &write("secret.svo2", &secret.build()),
         &[],
         &["secret.svo2", "it is encrypted", "convert it"],
     );
     let whole = MadeSvo::strips(EYE, 3).build();
-    refused(&home, &write("cut.svo2", &whole[..40]), &[], &["cut.svo2"]);
-    refused(&home, &write("text.svo2", b"not a recording"), &[], &["text.svo2"]);
+    failed(&home, &write("cut.svo2", &whole[..40]), &[], &["cut.svo2"]);
+    failed(&home, &write("text.svo2", b"not a recording"), &[], &["text.svo2"]);
     let good = write("good.svo2", &whole);
     let out = path(&home, "out");
     home.run(&["zed", "replay", &good, "--out", &out, "--modes", "performance"]).good();

@@ -155,3 +155,22 @@ pub(crate) fn failed(path: &Path, e: io::Error) -> Error {
     };
     Error::new(kind, format!("{}: {what}", path.display())).with_source(e)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Reading what a map has no file behind would end the process.
+    #[test]
+    fn a_file_that_became_shorter_is_not_mapped() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("weights");
+        std::fs::write(&path, vec![7; 100_000]).unwrap();
+        let whole = Stored::open(&path).unwrap();
+        assert_eq!(whole.mapped().unwrap().len(), 100_000);
+        let shorter = Stored::open(&path).unwrap();
+        File::options().write(true).open(&path).unwrap().set_len(10).unwrap();
+        let e = shorter.mapped().unwrap_err();
+        assert!(e.kind() == ErrorKind::Io && e.to_string().contains("became shorter"), "{e}");
+    }
+}

@@ -43,10 +43,19 @@ fn exchange_rest(stream: TcpStream) -> Answer {
 }
 
 #[test]
-fn idle_connections_on_the_port_leave_the_sockets_places_free() {
+fn idle_connections_on_the_port_leave_the_sockets_places_free_and_end() {
     let served = served();
-    let _idle: Vec<_> = (0..2 * api::MAX_CONNECTIONS).map(|_| served.port()).collect();
+    let idle: Vec<_> = (0..2 * api::MAX_CONNECTIONS).map(|_| served.port()).collect();
+    let mut waiting = served.port();
+    waiting.write_all(request("GET", "/metrics", "localhost", None, "").as_bytes()).unwrap();
+    waiting.set_read_timeout(Some(Duration::from_millis(300))).unwrap();
+    let e = waiting.read(&mut [0]).expect_err("the port has a place left");
+    assert_eq!(e.kind(), std::io::ErrorKind::WouldBlock);
     assert_eq!(served.get("/v1/status").status, 200);
+    // Who sends no head is not waited for: those before this one, and then those before them, have ended.
+    waiting.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
+    assert_eq!(exchange_rest(waiting).status, 200);
+    drop(idle);
 }
 
 #[test]
@@ -64,6 +73,7 @@ fn without_the_token_the_port_serves_numbers_and_nothing_else() {
         format!("authorization: Basic {token}\r\n"),
         format!("authorization: {token}\r\n"),
         format!("authorization: Bearer {wrong}\r\nauthorization: Bearer {token}\r\n"),
+        format!("authorization: Bearer {token}\r\nauthorization: Bearer {wrong}\r\n"),
     ];
     let bare = |method: &str, path: &str, line: &str| {
         let text = request(method, path, "localhost", Some("application/json"), "{}");

@@ -257,6 +257,17 @@ proptest! {
 /// What is taken can be read again: a note is short, and so are all of them together. The worst to write are characters
 /// that TOML escapes.
 #[test]
+fn a_dataset_has_4096_notes_at_most() {
+    let fs = recorded();
+    let notes = |n: usize| SessionChanges { notes: vec!["n".to_owned(); n], ..SessionChanges::default() };
+    edit(&fs, &dir(), &notes(4096)).unwrap();
+    let before = text(&fs);
+    let e = edit(&fs, &dir(), &notes(1)).unwrap_err();
+    assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains("has 4096 notes already"), "{e}");
+    assert_eq!(text(&fs), before, "nothing was changed");
+}
+
+#[test]
 fn notes_have_a_limit_each_and_all_together() {
     let longest = "\u{1}".repeat(NOTE_MAX_BYTES);
     let note = |text: &str| SessionChanges { notes: vec![text.to_owned()], ..SessionChanges::default() };

@@ -166,6 +166,10 @@ fn a_stalled_disk_costs_sets_and_never_blocks_nor_grows() {
         }
     }
     assert!(refused.len() > 20 && refused.iter().all(|r| *r == SetDrop::DiskSlow), "{refused:?}");
+    // Nor do notes, of which the writer takes none now.
+    let taken = (0..1000).take_while(|_| r.add_note("is it slow?").is_ok()).count();
+    assert!((200..=300).contains(&taken), "{taken} notes wait");
+    assert!(r.add_note("one more").unwrap_err().to_string().contains("wait to be written already"));
     let backlog = r.progress().backlog_bytes;
     // A set: its pictures, and its motion as it waits.
     let one = 10_000 + motion(&session(), 0).iter().map(RecordMotion::stored_bytes).sum::<u64>();

@@ -183,6 +183,62 @@ fn damage_in_the_middle_costs_the_sets_it_hits_and_is_said() {
     assert_eq!(fs.changes(), before);
 }
 
+/// The file's bytes and their checksum that each checkpoint of a segment states.
+fn checkpoints(bytes: &[u8]) -> Vec<(u64, u32)> {
+    let messages = mcap::MessageStream::new(bytes).unwrap().map(Result::unwrap);
+    let messages = messages.filter(|m| m.channel.topic.ends_with("/checkpoint"));
+    // CDR: four bytes of its head, a time of two numbers of 32 bits, then these two.
+    let read = |m: mcap::Message<'_>| {
+        let file_bytes = u64::from_le_bytes(m.data[12..20].try_into().unwrap());
+        (file_bytes, u32::from_le_bytes(m.data[20..24].try_into().unwrap()))
+    };
+    messages.map(read).collect()
+}
+
+/// A checkpoint of the damaged file would pass for damage of the copy wherever their lengths agree.
+#[test]
+fn the_checkpoints_of_a_copy_are_its_own() {
+    let fs = MemFs::new();
+    let limits = RecorderOptions { segment_max_ns: 100 * PERIOD, sync_interval_ns: 1, ..options() };
+    let r = recorder(&fs, limits);
+    for k in 0..9 {
+        r.push(set(&session(), k)).unwrap();
+        settle(&r);
+        std::thread::sleep(std::time::Duration::from_millis(2));
+    }
+    r.finish().unwrap();
+    let mut damaged = contents(&fs, &segment(0));
+    let middle = damaged.len() * 2 / 5;
+    damaged[middle..middle + 512].fill(0xA5);
+    fs.put(&segment(0), damaged);
+    assert!(planned_and_recovered(&fs).unwrap().changed);
+    let bytes = contents(&fs, &segment(0));
+    let told = checkpoints(&bytes);
+    assert!(told.len() >= 4, "{told:?}");
+    for (file_bytes, crc32) in told {
+        let there = crc32fast::hash(&bytes[..file_bytes as usize]);
+        assert_eq!(there, crc32, "the checkpoint of the first {file_bytes} bytes");
+    }
+}
+
+/// What nothing proves is believed by nobody: the session stays what `session.toml` says.
+#[test]
+fn a_damaged_head_does_not_change_the_session() {
+    let fs = MemFs::new();
+    record(&fs, 4, RecorderOptions { segment_max_ns: 2 * PERIOD, ..options() });
+    let mut bytes = contents(&fs, &segment(0));
+    let rig = b"rig = \"rig\"";
+    let at = bytes.windows(rig.len()).position(|w| w == rig).unwrap();
+    bytes[at + rig.len() - 2] = b'h';
+    fs.put(&segment(0), bytes);
+    let report = planned_and_recovered(&fs).unwrap();
+    assert!(report.changed && !report.session_rebuilt, "{report:?}");
+    assert_eq!(open(&fs).session().rig, "rig");
+    assert_eq!((ids(&fs), findings(&fs)), (vec![1, 2, 3, 4], Vec::new()));
+    let bytes = contents(&fs, &segment(0));
+    assert!(!bytes.windows(rig.len()).any(|w| w == b"rig = \"rih\""), "the head is still damaged");
+}
+
 #[test]
 fn a_lost_head_and_a_lost_session_are_made_anew_from_what_is_left() {
     // The head of each segment in turn, with and without session.toml.

@@ -165,7 +165,8 @@ fn whatever_record_is_damaged_the_dataset_is_complete_again_or_refused() {
         }
     }
     println!("{cases} cases, {} refused: {refused:#?}, {lossless} without a loss", refused.len());
-    assert!(cases >= 352 && refused.len() * 20 < cases && lossless * 2 > cases);
+    // Most damage is to what is stored twice or can be made anew.
+    assert!(cases >= 352 && refused.is_empty() && lossless * 100 > cases * 88);
 }
 
 #[test]

@@ -153,6 +153,15 @@ def stream(sensors: list, frames: int, seconds: float, file: str) -> dict:
             kept = got.get((short(p.stream_type()), p.stream_index()))
             if kept is not None and len(kept) < frames:
                 kept.append(part)
+    temperatures = {}
+    for s in started:
+        names = [(OPTIONS[int(option)], option) for option in s.get_supported_options()]
+        for name, option in names:
+            if name.endswith("temperature"):
+                try:
+                    temperatures[name] = s.get_option(option)
+                except RuntimeError as error:
+                    temperatures[name] = str(error)
     for s in reversed(started):
         s.stop()
         s.close()
@@ -174,7 +183,7 @@ def stream(sensors: list, frames: int, seconds: float, file: str) -> dict:
                     entry |= {"offset": out.tell(), "length": len(pixels)}
                     out.write(pixels)
                 found.append(entry)
-    return {"frames": found}
+    return {"frames": found, "temperatures": temperatures}
 
 
 def depth_table() -> dict:
@@ -193,7 +202,14 @@ def set_depth_table(values: dict) -> dict:
     return depth_table()
 
 
+def firmware_log() -> dict:
+    """Whether the firmware's log has an entry; an empty one is no error."""
+    log = device.as_firmware_logger()
+    return {"entry": log.get_firmware_log(log.create_message())}
+
+
 COMMANDS = {
+    "firmware_log": firmware_log,
     "open": open_camera,
     "options": options,
     "set": set_option,

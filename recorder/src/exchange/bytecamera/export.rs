@@ -379,6 +379,28 @@ mod tests {
         assert_eq!(prefixes, ["color", "color_2"]);
     }
 
+    /// Depth of one mode in two streams: colour is in its folder once.
+    #[test]
+    fn streams_of_one_mode_share_its_folder() {
+        let files = files_of(vec![
+            (1, "color", PixelFormat::Rgb8),
+            (1, "depth_quality", PixelFormat::Z16),
+            (1, "disparity_quality", PixelFormat::DepthF32),
+        ]);
+        let prefixes: Vec<_> = files.iter().map(|(_, prefix)| prefix.as_str()).collect();
+        assert_eq!(prefixes, ["color", "depth", "raw_depth"], "{files:?}");
+        assert!(files.iter().all(|(folder, _)| folder == "camera_zed2i_quality"), "{files:?}");
+    }
+
+    #[test]
+    fn sessions_that_began_in_one_minute_have_folders_of_their_own() {
+        let session = Session::new("20260314_1512_kitchen", "rig");
+        let exporter = ByteCameraExport::new(CameraNames::Short, None).unwrap();
+        let mut taken = BTreeSet::new();
+        let mut folder = || exporter.layout(&session, &mut taken, &mut Vec::new()).folder;
+        assert_eq!([folder(), folder(), folder()], ["20260314_1512", "20260314_1512_2", "20260314_1512_3"]);
+    }
+
     proptest! {
         /// Names that are names of kinds, of modes, or look like numbered ones.
         #[test]

@@ -32,6 +32,8 @@ pub const SCENARIO: Scenario = Scenario {
 /// Each model, and the folder of the library's version that knows it.
 const MODELS: [(&str, &str); 5] =
     [("d435", "d400"), ("d405", "d400"), ("d455", "d400"), ("l515", "l515"), (ONLY_IMU, "d400")];
+/// Those with an IMU.
+const WITH_IMU: [&str; 3] = ["d455", "l515", ONLY_IMU];
 /// A D435 with an IMU of another kind than the D455's: the rest of it is compared with the D435.
 const ONLY_IMU: &str = "d435i";
 
@@ -43,7 +45,13 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     }
     for (model, version) in MODELS {
         let camera = plug(model, Options { drift_ppm: 20.0, ..Options::default() })?;
-        if camera.model().imu.is_some() {
+        let has_imu = camera.model().imu.is_some();
+        checks.equal(
+            &format!("{model}: an IMU is where real ones have it"),
+            has_imu,
+            WITH_IMU.contains(&model),
+        );
+        if has_imu {
             wait_for_imu(checks, model);
         }
         let mut vendor = Vendor::start(version)?;
@@ -111,6 +119,7 @@ fn compare(mut subject: Subject<'_>) -> anyhow::Result<()> {
     if subject.camera.model().imu.is_some() {
         imu::compare(&mut subject, &reported)?;
     }
+    settings::rare(&mut subject);
     let unknown = subject.camera.unknown_opcodes();
     subject.that(
         "the emulated camera knows every request of the library",

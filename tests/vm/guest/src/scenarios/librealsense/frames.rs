@@ -188,6 +188,7 @@ fn library(subject: &mut Subject<'_>, set: &Set) -> anyhow::Result<()> {
         .iter()
         .find(|f| text(f, "stream") == "depth")
         .map_or(&Value::Null, |f| &f["metadata"]);
+    temperatures(subject, &answer["temperatures"]);
     if !subject.is_l515() {
         let has_projector = subject.model != "d405";
         let said = ["frame_laser_power", "frame_emitter_mode"].map(|key| depth.get(key).is_some());
@@ -197,6 +198,23 @@ fn library(subject: &mut Subject<'_>, set: &Set) -> anyhow::Result<()> {
         judge(subject, &format!("library, {}: {name}", set.what), &tally);
     }
     Ok(())
+}
+
+/// Temperatures, which the cameras have only while they stream.
+fn temperatures(subject: &mut Subject<'_>, said: &Value) {
+    let given: &[(&str, f64)] = if subject.is_l515() {
+        &[
+            ("lld_temperature", 38.5),
+            ("mc_temperature", 36.25),
+            ("ma_temperature", 35.0),
+            ("apd_temperature", 37.75),
+            ("humidity_temperature", 30.0),
+        ]
+    } else {
+        &[("asic_temperature", 41.0)]
+    };
+    let is_same = |(name, value): &(&str, f64)| said[name].as_f64() == Some(*value);
+    subject.that("the library reads the camera's temperatures", given.iter().all(is_same), said);
 }
 
 /// The same streams by the driver, which has the camera as soon as the library let go of it.

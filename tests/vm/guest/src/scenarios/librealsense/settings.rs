@@ -19,8 +19,11 @@ const fn option(sensor: &'static str, name: &'static str, unit: u8, selector: u8
     Option_ { sensor, name, unit, selector, scale: 1.0 }
 }
 
+/// Takes the least and the most exposure, the least and the most gain.
+const SET_AE_LIMITS: u32 = 0x8A;
 const STEREO: &str = "Stereo Module";
 const RGB: &str = "RGB Camera";
+const L515: &str = "L500 Depth Sensor";
 
 /// What the models have in common: extension unit 3 and processing unit 2 (camera-protocol facts of librealsense
 /// `src/ds/ds-private.h`), and the colour module's units 6 and 7.
@@ -121,6 +124,10 @@ fn limits(subject: &mut Subject<'_>) -> anyhow::Result<()> {
     let again = subject.vendor.ask(&json!({ "do": "options", "sensor": STEREO }))?;
     let kept = again["auto_exposure_limit"]["value"].as_f64();
     subject.that("and does not disturb the other", kept == Some(50_000.0), format!("{kept:?}"));
+    // The library writes back what it read: a reply in another order would be put right by the request.
+    let asked = subject.camera.asked();
+    let told = asked.iter().rev().find(|a| a.opcode == SET_AE_LIMITS).map(|a| a.params);
+    subject.that("the camera was given both", told == Some([0, 50_000, 0, 120]), format!("{told:?}"));
     if subject.model == "d405" {
         return Ok(());
     }
@@ -156,4 +163,24 @@ pub fn advanced(subject: &mut Subject<'_>) -> anyhow::Result<()> {
         );
     }
     Ok(())
+}
+
+/// Requests that nothing but these make: the log of the firmware, which is empty, and two options of an L515.
+pub fn rare(subject: &mut Subject<'_>) {
+    let said = subject.vendor.ask(&json!({ "do": "firmware_log" })).err().map(|e| format!("{e:#}"));
+    let said = said.unwrap_or_default();
+    subject.that("the log of the firmware is empty", said.contains("No data to return"), &said);
+    if !subject.is_l515() {
+        return;
+    }
+    for (option, value) in [
+        ("freefall_detection_enabled", 0.0),
+        ("freefall_detection_enabled", 1.0),
+        ("enable_max_usable_range", 1.0),
+    ] {
+        let request = json!({ "do": "set", "sensor": L515, "option": option, "value": value });
+        let set = subject.vendor.ask(&request);
+        let is_kept = set.as_ref().is_ok_and(|set| set["value"].as_f64() == Some(value));
+        subject.that(&format!("{option} becomes {value}"), is_kept, format!("{set:?}"));
+    }
 }
