@@ -1,8 +1,8 @@
 //! Drawing depth pixels as rectangles of planes: the nearest wins.
 //!
-//! Neighbouring pixels of a row mostly cover the same rows of colour. Such a run is drawn once into a line, which holds the
-//! plane of the nearest depth pixel for every column, and the line into each of these rows: there the work is minima of
-//! whole vectors.
+//! Neighbouring pixels of a row mostly cover the same rows of colour. Such a run is drawn into a line first, which holds
+//! the plane of the nearest depth pixel for every column. The line is then drawn into each of these rows, a few columns at
+//! a time: a run of a real image is about ten columns long, and remainders of long vectors would take most of the time.
 #![allow(clippy::inline_always, reason = "what is not inlined is compiled for the oldest processor")]
 
 use super::cover::{Cover, NOWHERE, Planes, whole};
@@ -10,36 +10,36 @@ use super::target::{EMPTY, Target};
 use super::warp::Warp;
 use crate::simd::for_every_processor;
 
-/// What draws nothing.
+/// A depth that draws nothing.
 const BEYOND: f32 = 65_536.0;
+/// Columns that are drawn together.
+const CHUNK: usize = 8;
 
 /// The rows that one thread works with.
 #[derive(Debug)]
 pub(super) struct SplatRows {
     cover: Cover,
-    line: Line,
+    /// One slot per column of colour and a chunk beyond; free between runs.
+    line: Vec<Slot>,
 }
 
-/// A run of depth pixels in the columns of colour; empty between runs.
-#[derive(Debug)]
-struct Line {
+/// What a run of depth pixels draws into one column of colour. One store writes it whole.
+#[derive(Debug, Clone, Copy)]
+#[repr(align(16))]
+struct Slot {
     /// The key of the nearest pixel.
-    keys: Vec<u16>,
+    key: u16,
     /// Its depth in the first row of the run, and its change from row to row.
-    first: Vec<f32>,
-    by_row: Vec<f32>,
+    first: f32,
+    by_row: f32,
 }
+
+/// Draws nothing.
+const FREE: Slot = Slot { key: EMPTY, first: BEYOND, by_row: 0.0 };
 
 impl SplatRows {
     pub(super) fn new(depth_width: usize, color_width: usize) -> Self {
-        Self {
-            cover: Cover::new(depth_width),
-            line: Line {
-                keys: vec![EMPTY; color_width],
-                first: vec![BEYOND; color_width],
-                by_row: vec![0.0; color_width],
-            },
-        }
+        Self { cover: Cover::new(depth_width), line: vec![FREE; color_width + CHUNK] }
     }
 
     /// Draws some rows of depth.
@@ -59,8 +59,7 @@ impl SplatRows {
             if is_point {
                 draw_points(columns, rows, keys, target.pixels, target.width);
             } else {
-                let Line { keys: nearest, first, by_row } = line;
-                draw_row(columns, rows, keys, planes, nearest, first, by_row, target.pixels, target.width);
+                draw_row(columns, rows, keys, planes, line, target.pixels, target.width);
             }
         }
     }
@@ -77,7 +76,7 @@ fn draw_points(columns: &[u32], rows: &[u32], keys: &[u16], pixels: &mut [u16], 
     }
 }
 
-/// The key of a depth that is cut to 16 bits; that of nothing from [`BEYOND`] on.
+/// The key of a depth that is cut to 16 bits; that of a hole from [`BEYOND`] on.
 #[inline(always)]
 fn key_at(z: f32) -> u16 {
     let z = z + 0.5;
@@ -89,12 +88,11 @@ for_every_processor! {
     /// Draws the rectangles of a row.
     fn draw_row(
         columns: &[u32], rows: &[u32], keys: &[u16], planes: &Planes,
-        nearest: &mut [u16], first: &mut [f32], by_row: &mut [f32], pixels: &mut [u16], width: usize,
+        line: &mut [Slot], pixels: &mut [u16], width: usize,
     ) {
         let n = rows.len();
         let (columns, keys) = (&columns[..n], &keys[..n]);
-        let (u, v, z) = (&planes.u[..n], &planes.v[..n], &planes.z[..n]);
-        let (by_u, by_v) = (&planes.by_u[..n], &planes.by_v[..n]);
+        let (z, by_u, by_v) = (&planes.z[..n], &planes.by_u[..n], &planes.by_v[..n]);
         let mut i = 0;
         while i < n {
             let run = rows[i];
@@ -107,45 +105,54 @@ for_every_processor! {
             while i < n && rows[i] == run {
                 let (l, r) = ((columns[i] >> 16) as usize, (columns[i] & 0xffff) as usize);
                 (from, to) = (from.min(l), to.max(r + 1));
-                let (own, change) = (keys[i], by_u[i]);
-                let z = z[i] + (change * (l as f32 - u[i]) + by_v[i] * (top as f32 - v[i]));
-                put(own, z, change, by_v[i], nearest.get_mut(l..=r), first.get_mut(l..=r), by_row.get_mut(l..=r));
+                put(keys[i], z[i], by_u[i], by_v[i], line.get_mut(l..=r));
                 i += 1;
             }
-            let parts = (nearest.get_mut(from..to), first.get_mut(from..to), by_row.get_mut(from..to));
-            let (Some(nearest), Some(first), Some(by_row)) = parts else { continue };
-            for y in top..=bottom {
-                let Some(row) = pixels.get_mut(y * width + from..y * width + to) else { continue };
-                let down = (y - top) as f32;
-                for ((pixel, first), by_row) in row.iter_mut().zip(&*first).zip(&*by_row) {
-                    *pixel = (*pixel).min(key_at(first + by_row * down));
+            // Whole chunks where the image does not end: free slots draw nothing.
+            let end = from + (to - from).next_multiple_of(CHUNK);
+            let to = if bottom * width + end <= pixels.len() { end } else { to };
+            let Some(line) = line.get_mut(from..to) else { continue };
+            let mut at = top * width + from;
+            let (chunks, rest) = line.as_chunks_mut::<CHUNK>();
+            for chunk in chunks {
+                let (mut first, mut by_row) = ([0.0; CHUNK], [0.0; CHUNK]);
+                for k in 0..CHUNK {
+                    first[k] = chunk[k].first;
+                    by_row[k] = chunk[k].by_row;
+                    chunk[k] = FREE;
                 }
+                for row in 0..=bottom - top {
+                    let beyond = pixels.get_mut(at + row * width..);
+                    let Some(pixels) = beyond.and_then(|p| p.first_chunk_mut::<CHUNK>()) else { continue };
+                    for k in 0..CHUNK {
+                        pixels[k] = pixels[k].min(key_at(first[k] + by_row[k] * row as f32));
+                    }
+                }
+                at += CHUNK;
             }
-            nearest.fill(EMPTY);
-            first.fill(BEYOND);
-            by_row.fill(0.0);
+            for slot in rest {
+                for row in 0..=bottom - top {
+                    let Some(pixel) = pixels.get_mut(at + row * width) else { continue };
+                    *pixel = (*pixel).min(key_at(slot.first + slot.by_row * row as f32));
+                }
+                *slot = FREE;
+                at += 1;
+            }
         }
     }
 }
 
-/// Puts a depth pixel into those columns of the line in which it is the nearest: depth `z` in the first of them, `change`
-/// more in each further one.
+/// Puts a depth pixel into those slots in which it is the nearest: depth `z` in the first of them, `by_column` more in each
+/// further one.
 #[inline(always)]
-fn put(
-    key: u16,
-    z: f32,
-    change: f32,
-    down: f32,
-    nearest: Option<&mut [u16]>,
-    first: Option<&mut [f32]>,
-    by_row: Option<&mut [f32]>,
-) {
-    let (Some(nearest), Some(first), Some(by_row)) = (nearest, first, by_row) else { return };
-    let mut z = z;
-    for ((nearest, first), by_row) in nearest.iter_mut().zip(first).zip(by_row) {
-        if key < *nearest {
-            (*nearest, *first, *by_row) = (key, z, down);
+fn put(key: u16, z: f32, by_column: f32, by_row: f32, slots: Option<&mut [Slot]>) {
+    let mut first = z;
+    // Not `flatten`, which made all of drawing a tenth slower.
+    let Some(slots) = slots else { return };
+    for slot in slots {
+        if key < slot.key {
+            *slot = Slot { key, first, by_row };
         }
-        z += change;
+        first += by_column;
     }
 }
