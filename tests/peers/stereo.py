@@ -135,7 +135,7 @@ def ours(
     *more: str,
 ) -> np.ndarray:
     out = folder / "disparity.npy"
-    command = [args.depthrig, "stereo", left, right, "--preset", preset, "--max-disparity", disparities, "--out", out, *more]
+    command = [args.depthrig, "stereo", left, right, "--preset", preset, "--max-disparity", disparities, "--out", out, "--overwrite", *more]
     subprocess.run([str(c) for c in command], check=True, stdout=subprocess.DEVNULL)
     return np.load(out)
 
