@@ -236,7 +236,10 @@ impl<H: Header> Channel<H> {
                 .open_or_create_with_attributes(&schema)
                 .map_err(OpenOrCreate::from)
         };
-        opened(node, &name, MessagingPattern::PublishSubscribe, open).map_err(|e| self.open_error(&e))
+        let service = opened(node, &name, MessagingPattern::PublishSubscribe, open);
+        let service = service.map_err(|e| self.open_error(&e))?;
+        shm::back_registers()?;
+        Ok(service)
     }
 
     fn event_service(&self, node: &Node<IoxService>, name: &ServiceName) -> Result<EventFactory> {
@@ -249,9 +252,11 @@ impl<H: Header> Channel<H> {
                 .max_nodes(self.form.nodes)
                 .open_or_create()
         };
-        opened(node, name, MessagingPattern::Event, open).map_err(|e| {
+        let events = opened(node, name, MessagingPattern::Event, open).map_err(|e| {
             self.error(ErrorKind::Other, &limits::why("its event service cannot be opened")).with_source(e)
-        })
+        })?;
+        shm::back_registers()?;
+        Ok(events)
     }
 
     fn service_name(&self) -> Result<ServiceName> {

@@ -1,8 +1,9 @@
 //! Shared memory: how much there is, and that what a channel has is really there.
 //!
 //! A file in `/dev/shm` has the size it was given, but gets memory only where it is written, and a write for which none is
-//! left kills the process (SIGBUS). So every slot gets its memory when the channel is made. What iceoryx2 makes besides
-//! (connections, events, services: some KiB each, written when it is made) is only begun when there is room.
+//! left kills the process (SIGBUS). So every slot gets its memory when the channel is made, and so does what iceoryx2 keeps
+//! of who uses it. What else it makes (connections, events: some KiB each, written when it is made) is only begun when there
+//! is room.
 
 use crate::{Error, ErrorKind, Result, SHM_PREFIX};
 use rustix::fs::{FallocateFlags, Mode, OFlags, fallocate, fstat, open};
@@ -102,6 +103,31 @@ pub(crate) fn back(id: u128, slots: usize) -> Result<Option<Lack>> {
         Err(Errno::NOSPC | Errno::NOMEM) => Ok(lack),
         Err(e) => Err(failed("reserved", e)),
     }
+}
+
+/// Puts memory behind what iceoryx2 keeps of who uses the channels: the end of it is written by the last of many clients,
+/// long after it was made. Errors with [`ErrorKind::NoSpace`] when there is none.
+pub(crate) fn back_registers() -> Result<()> {
+    let entries = std::fs::read_dir(SHM_DIR).into_iter().flatten().flatten();
+    for path in entries.map(|e| e.path()) {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        if !(name.starts_with(SHM_PREFIX) && name.ends_with(".dynamic")) {
+            continue;
+        }
+        // One that is gone or belongs to another user is nothing to us.
+        let Ok(file) = open(&path, OFlags::RDWR | OFlags::CLOEXEC | OFlags::NOFOLLOW, Mode::empty()) else {
+            continue;
+        };
+        let Ok(stat) = fstat(&file) else { continue };
+        if stat.st_blocks as u64 * 512 >= stat.st_size as u64 {
+            continue;
+        }
+        retry_on_intr(|| fallocate(&file, FallocateFlags::empty(), 0, stat.st_size as u64)).map_err(|e| {
+            let why = format!("{SHM_DIR} has no room for what is kept of a channel; {HOW_TO_ENLARGE}");
+            Error::new(ErrorKind::NoSpace, why).with_source(e)
+        })?;
+    }
+    Ok(())
 }
 
 /// The file of the data of the port `id`.

@@ -2,12 +2,14 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{
-    Bus, ErrorKind, Frame, HostTime, MemberRecord, PixelFormat, Publisher, RigName, RuntimeDir, SetHeader,
-    StreamId, shm,
+    Bus, ErrorKind, Frame, HostTime, MemberRecord, PixelFormat, Publisher, RigName, RuntimeDir, SHM_PREFIX,
+    SetHeader, StreamId, shm,
 };
 use iceoryx2::prelude::*;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use std::collections::BTreeSet;
 use std::io::{BufRead, BufReader};
+use std::os::unix::fs::MetadataExt;
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
@@ -398,7 +400,6 @@ fn a_process_without_descriptors_is_told_so() {
 
 #[test]
 fn every_slot_has_memory_and_what_has_none_is_refused() {
-    use std::os::unix::fs::MetadataExt;
     // A size that no other test has, for they run at the same time.
     const ODD: usize = 54_321;
     let f = fixture();
@@ -419,6 +420,27 @@ fn every_slot_has_memory_and_what_has_none_is_refused() {
         e.to_string().contains("has no room for its 48 slots") && e.to_string().contains("7 would fit"),
         "{e}"
     );
+}
+
+/// Files of shared memory that are larger than the memory behind them.
+fn without_memory() -> BTreeSet<PathBuf> {
+    let files = std::fs::read_dir(shm::SHM_DIR).unwrap().flatten().map(|e| e.path());
+    let of_depthrig = files.filter(|p| p.file_name().unwrap().to_string_lossy().starts_with(SHM_PREFIX));
+    of_depthrig.filter(|p| std::fs::metadata(p).is_ok_and(|m| m.blocks() * 512 < m.len())).collect()
+}
+
+#[test]
+fn nothing_of_a_channel_gets_its_memory_later() {
+    let f = fixture();
+    let publisher = f.bus.publisher(&f.id, LEN, 16).unwrap();
+    let mut subscriber = f.bus.subscriber(&f.id).unwrap();
+    publish(&publisher, 1);
+    assert_eq!(whole(&subscriber.next_timeout(WAIT).unwrap().unwrap()), 1);
+    // Other tests are making channels: what they are in the middle of is whole, or gone, soon.
+    let lacking = without_memory();
+    std::thread::sleep(Duration::from_secs(1));
+    let still: Vec<_> = without_memory().intersection(&lacking).cloned().collect();
+    assert_eq!(still, Vec::<PathBuf>::new());
 }
 
 #[test]
