@@ -5,7 +5,7 @@
 //! of who uses it. What else it makes (connections, events: some KiB each, written when it is made) is only begun when there
 //! is room.
 
-use crate::{Error, ErrorKind, Result, SHM_PREFIX};
+use crate::{Error, ErrorKind, Result, SHM_PREFIX, limits};
 use rustix::fs::{FallocateFlags, Mode, OFlags, fallocate, fstat, open};
 use rustix::io::{Errno, retry_on_intr};
 use std::path::{Path, PathBuf};
@@ -106,36 +106,44 @@ pub(crate) fn back(id: u128, slots: usize) -> Result<Option<Lack>> {
 }
 
 /// Puts memory behind what iceoryx2 keeps of who uses the channels: the end of it is written by the last of many clients,
-/// long after it was made. Errors with [`ErrorKind::NoSpace`] when there is none.
+/// long after it was made.
 pub(crate) fn back_registers() -> Result<()> {
-    let entries = std::fs::read_dir(SHM_DIR).into_iter().flatten().flatten();
-    for path in entries.map(|e| e.path()) {
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        if !(name.starts_with(SHM_PREFIX) && name.ends_with(".dynamic")) {
-            continue;
+    let failed = |e: Errno| {
+        let why = limits::why("it has no room for what is kept of a channel");
+        Error::new(ErrorKind::NoSpace, format!("{SHM_DIR}: {why}; {HOW_TO_ENLARGE}")).with_source(e)
+    };
+    let no_list = |e: std::io::Error| failed(Errno::from_io_error(&e).unwrap_or(Errno::IO));
+    for entry in std::fs::read_dir(SHM_DIR).map_err(no_list)?.flatten() {
+        let name = entry.file_name();
+        let name = name.to_string_lossy();
+        if name.starts_with(SHM_PREFIX) && name.ends_with(".dynamic") {
+            back_register(&entry.path()).map_err(failed)?;
         }
-        // One that is gone or belongs to another user is nothing to us.
-        let Ok(file) = open(&path, OFlags::RDWR | OFlags::CLOEXEC | OFlags::NOFOLLOW, Mode::empty()) else {
-            continue;
-        };
-        let Ok(stat) = fstat(&file) else { continue };
-        if stat.st_blocks as u64 * 512 >= stat.st_size as u64 {
-            continue;
-        }
-        retry_on_intr(|| fallocate(&file, FallocateFlags::empty(), 0, stat.st_size as u64)).map_err(|e| {
-            let why = format!("{SHM_DIR} has no room for what is kept of a channel; {HOW_TO_ENLARGE}");
-            Error::new(ErrorKind::NoSpace, why).with_source(e)
-        })?;
     }
     Ok(())
+}
+
+fn back_register(path: &Path) -> rustix::io::Result<()> {
+    let file = match open(path, OFlags::RDWR | OFlags::CLOEXEC | OFlags::NOFOLLOW, Mode::empty()) {
+        // It was just removed, or is another user's.
+        Err(Errno::NOENT | Errno::ACCESS) => return Ok(()),
+        file => file?,
+    };
+    let stat = fstat(&file)?;
+    if stat.st_blocks as u64 * 512 >= stat.st_size as u64 {
+        return Ok(());
+    }
+    retry_on_intr(|| fallocate(&file, FallocateFlags::empty(), 0, stat.st_size as u64))
 }
 
 /// The file of the data of the port `id`.
 fn segment(id: u128) -> Result<PathBuf> {
     let end = format!("_{id}.data");
     let is_it = |name: &str| name.starts_with(SHM_PREFIX) && name.ends_with(&end);
-    let missing =
-        || Error::new(ErrorKind::Other, format!("{SHM_DIR} has no memory of a port that was just made"));
+    let missing = || {
+        let why = limits::why("the memory of a port that was just made is not there");
+        Error::new(ErrorKind::Other, format!("{SHM_DIR}: {why}"))
+    };
     let entries = std::fs::read_dir(SHM_DIR).map_err(|e| missing().with_source(e))?;
     let mut files = entries.filter_map(|e| Some(e.ok()?.path()));
     files.find(|path| path.file_name().and_then(|n| n.to_str()).is_some_and(is_it)).ok_or_else(missing)

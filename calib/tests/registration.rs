@@ -288,7 +288,7 @@ fn registered_depth_lies_along_the_axis_of_colour() {
                     // overlap most, and of rounded depths the least is drawn.
                     let allowed_m = match unit_m {
                         0.001 if rotation_name.starts_with("-45") => 0.00035,
-                        0.001 => 0.000305,
+                        0.001 => 0.000_305,
                         _ => 0.0001,
                     };
                     assert!(got.median_m <= allowed_m, "median {} m: {what}", got.median_m);

@@ -277,11 +277,13 @@ impl Rig {
         if active && let Err(e) = self.inner.record_stop() {
             tracing::error!(error = %e, "the recording could not be closed");
         }
+        // Why a camera is away is forgotten when it is stopped.
+        let mut lost = report::silent(&self.inner.status());
         self.end_threads();
         self.finish_reports();
         let status = self.inner.status();
         let recording = lock(&self.inner.recording).summary().cloned();
-        let lost = report::lost(&status);
+        lost.extend(report::lost(&status));
         RigSummary { status, recording, lost }
     }
 

@@ -76,6 +76,10 @@ impl Error {
             io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
                 (ErrorKind::DiskFull, ": the disk is full; free some space or record to another disk")
             }
+            io::ErrorKind::FileTooLarge => (
+                ErrorKind::DiskFull,
+                ": a file may not be so large here; raise the limit (ulimit -f) or use another disk",
+            ),
             io::ErrorKind::PermissionDenied => {
                 (ErrorKind::PermissionDenied, ": permission denied; choose a folder that this user may write")
             }

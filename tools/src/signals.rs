@@ -1,4 +1,4 @@
-//! SIGINT and SIGTERM: the first one asks for a clean end, the second one ends at once.
+//! SIGINT and SIGTERM: the first one asks for a clean end, the second one ends at once. SIGXFSZ ends nothing.
 
 use anyhow::{Context, Result};
 use core::sync::atomic::{AtomicBool, Ordering};
@@ -19,7 +19,7 @@ pub struct Stop {
 }
 
 impl Stop {
-    /// Takes over SIGINT and SIGTERM for the rest of the process's life.
+    /// Takes over SIGINT, SIGTERM and SIGXFSZ for the rest of the process's life.
     ///
     /// # Errors
     /// When the handlers cannot be installed.
@@ -32,8 +32,14 @@ impl Stop {
         let asked = stop.asked.clone();
         let (installed, is_installed) = bounded(1);
         let listen = async move {
-            let both = || Ok((signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?));
-            let (mut interrupt, mut terminate) = match both() {
+            // A write beyond the limit of a file's size (ulimit -f) is then an error and does not end the process. A handler stays
+            // when its stream is dropped.
+            let too_large = SignalKind::from_raw(rustix::process::Signal::XFSZ.as_raw());
+            let all = || {
+                drop(signal(too_large)?);
+                Ok((signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?))
+            };
+            let (mut interrupt, mut terminate) = match all() {
                 Ok(both) => both,
                 Err(e) => {
                     // The receiver waits for exactly this message.

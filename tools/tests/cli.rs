@@ -349,3 +349,44 @@ fn a_run_that_will_not_fit_is_recorded_with_force() {
     assert_eq!(std::fs::read_dir(&out).unwrap().count(), 1);
     assert_eq!(home.run(&["run", rig.to_str().unwrap(), "--force"]).code, 2, "there is nothing to force");
 }
+
+/// A run of one camera that is not there exits with 3 and names it; a script must not take it for a recording.
+#[test]
+fn a_run_in_which_a_camera_never_gave_a_frame_ends_with_3() {
+    let home = Home::new();
+    let rig = home.write(
+        "away.toml",
+        "rig = \"away\"\n[[camera]]\nname = \"cam\"\nbackend = \"synthetic\"\nmodel = \"generic\"\ncheap = true\n\
+         [[camera]]\nname = \"gone\"\nbackend = \"v4l2\"\nport = \"9-9.9\"\n[[camera.stream]]\nname = \"color\"\n",
+    );
+    let ran = home.run(&["run", &rig, "--seconds", "1", "-q"]);
+    assert_eq!(ran.code, 3, "{}{}", ran.out, ran.err);
+    assert!(ran.out.contains("lost: camera gone: no frame: "), "{}", ran.out);
+    assert!(!ran.out.contains("camera cam"), "{}", ran.out);
+}
+
+/// A limit of the size of files is to a recording what a full disk is: it ends, its file is closed, the rig goes on.
+#[test]
+fn a_limit_of_the_size_of_files_ends_the_recording_and_not_the_rig() {
+    let home = Home::new();
+    let rig = home.write(
+        "limited.toml",
+        // Shared memory is files too: its 16 slots of 230 kB fit.
+        "rig = \"limited\"\n[bus]\nslots = 16\n[sets]\nrate_hz = 30.0\n[recording]\ncolor = \"raw\"\nreserve_mb = 0\n\
+         [[camera]]\nname = \"cam\"\nbackend = \"synthetic\"\ncheap = true\n\
+         [[camera.stream]]\nname = \"color\"\nwidth = 320\nheight = 240\n",
+    );
+    let out = home.path().join("data");
+    let program = depthrig().get_program().to_str().unwrap().to_owned();
+    let limited = format!(
+        "ulimit -f 4096; exec {program} --runtime-dir {} run {rig} --record {} --seconds 3 -q",
+        home.path().join("run").display(),
+        out.display()
+    );
+    let ran = support::Ran::of(&std::process::Command::new("bash").args(["-c", &limited]).output().unwrap());
+    assert_eq!(ran.code, 3, "{}{}", ran.out, ran.err);
+    assert!(ran.out.contains("ulimit -f"), "{}{}", ran.out, ran.err);
+    let dataset = std::fs::read_dir(&out).unwrap().next().unwrap().unwrap().path();
+    let found = home.run(&["verify", dataset.to_str().unwrap()]);
+    assert!(found.code == 3 || found.code == 0, "{}{}", found.out, found.err);
+}

@@ -127,9 +127,10 @@ struct Finding<'a> {
 
 impl WithRow for Finding<'_> {
     fn run<Y: Lane, L: Lens32>(self, top: Edge<'_, Y>, bottom: Edge<'_, Y>, lens: L) {
-        match self.is_point {
-            true => self.find(Point, top, bottom, lens),
-            false => self.find(Area, top, bottom, lens),
+        if self.is_point {
+            self.find(Point, top, bottom, lens);
+        } else {
+            self.find(Area, top, bottom, lens);
         }
     }
 }

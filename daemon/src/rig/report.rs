@@ -213,6 +213,14 @@ fn diagnose(rig: &str, camera: &CameraStatus) -> Diagnostic {
     }
 }
 
+/// The cameras that are away and never gave a frame, one line each.
+pub fn silent(status: &RigStatus) -> Vec<String> {
+    let away = |c: &&CameraStatus| !matches!(c.state, CameraState::Streaming | CameraState::Failed);
+    let silent = |c: &&CameraStatus| c.streams.iter().all(|s| s.captured == 0);
+    let line = |c: &CameraStatus| Some(format!("camera {}: no frame: {}", c.name, c.message.as_ref()?));
+    status.cameras.iter().filter(away).filter(silent).filter_map(line).collect()
+}
+
 /// What was lost over the rig's life, one line each.
 pub fn lost(status: &RigStatus) -> Vec<String> {
     let mut lost = Vec::new();

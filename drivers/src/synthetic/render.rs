@@ -160,7 +160,7 @@ impl Scene {
     /// Renders every pose into the cache, until `go_on` is false.
     pub(crate) fn draw(&self, progress: Progress<'_>, go_on: &dyn Fn() -> bool) -> Result<PictureFile> {
         if self.path.exists() {
-            tracing::warn!(file = %self.path.display(), "the render cache of a synthetic camera is damaged and is made anew");
+            tracing::warn!(file = %self.path.display(), "the render cache of a synthetic camera is damaged or cannot be read; it is made anew");
         }
         let Self { profile, config, .. } = self;
         let rays = Rays::new(&profile.intrinsics, profile.width, profile.height);
