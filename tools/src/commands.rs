@@ -35,6 +35,7 @@ use crate::cli::{Cli, Command};
 use crate::context::Context;
 use crate::exit::Exit;
 use anyhow::Result;
+use clap::CommandFactory;
 
 /// Runs the command that was asked for.
 ///
@@ -71,8 +72,8 @@ pub fn run(cli: Cli) -> Result<Exit> {
         Command::Config(command) => config::run(&command),
         Command::Tap(args) => tap::run(&args, &context),
         Command::Bench(command) => bench::run(&command, &context),
-        Command::Completions(args) => completions::run(&args),
-        Command::Man(args) => man::run(&args),
+        Command::Completions(args) => completions::run(&args, Cli::command()),
+        Command::Man(args) => man::run(&args, Cli::command()),
         Command::BenchReader(args) => {
             crate::bench::bus::reader::run(&args, &context.runtime()?)?;
             Ok(Exit::Good)

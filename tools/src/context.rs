@@ -1,6 +1,6 @@
 //! Which rig a command is about, and how it may write.
 
-use crate::cli::{ColorChoice, Global};
+use crate::args::{ColorChoice, Global};
 use crate::exit::UsageError;
 use anyhow::Result;
 use depthrig_bus::{RigName, RuntimeDir};

@@ -1,6 +1,6 @@
 //! Logs on the standard error output: text for people, or JSON lines for machines.
 
-use crate::cli::{Global, LogFormat};
+use crate::args::{Global, LogFormat};
 use crate::context::wants_color;
 use core::fmt::Debug;
 use std::io::{self, IsTerminal};

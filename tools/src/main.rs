@@ -3,6 +3,7 @@
 //! Exit codes: 0 good, 1 failed, 2 wrong usage or configuration, 3 finished but something was lost.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
+mod args;
 mod bench;
 mod cli;
 mod commands;

@@ -68,7 +68,7 @@ pub struct RecordArgs {
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
     /// How long to record
-    #[arg(long, value_name = "N", default_value = "10", value_parser = crate::cli::positive_seconds)]
+    #[arg(long, value_name = "N", default_value = "10", value_parser = crate::args::positive_seconds)]
     seconds: f64,
     /// How much, and in which form
     #[command(flatten)]
@@ -91,7 +91,7 @@ pub struct CaptureArgs {
     #[arg(long, default_value_t = 720, value_parser = clap::value_parser!(u32).range(1..=16_384))]
     height: u32,
     /// Frame rate
-    #[arg(long, value_name = "HZ", default_value_t = 30.0, value_parser = crate::cli::rate_hz)]
+    #[arg(long, value_name = "HZ", default_value_t = 30.0, value_parser = crate::args::rate_hz)]
     rate_hz: f64,
     /// How much, and in which form
     #[command(flatten)]
@@ -131,7 +131,7 @@ pub struct SoakArgs {
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
     /// Recorded time, at 5 sets a second
-    #[arg(long, value_name = "SECONDS", default_value = "600", value_parser = crate::cli::positive_seconds)]
+    #[arg(long, value_name = "SECONDS", default_value = "600", value_parser = crate::args::positive_seconds)]
     seconds: f64,
     /// How much, and in which form; --quick is five minutes of small pictures
     #[command(flatten)]

@@ -1,9 +1,7 @@
 //! `depthrig completions`: completions for a shell.
 
-use crate::cli::Cli;
 use crate::exit::Exit;
 use anyhow::Result;
-use clap::CommandFactory;
 use clap_complete::Shell;
 
 /// Examples for `--help`.
@@ -20,10 +18,10 @@ pub struct CompletionsArgs {
     shell: Shell,
 }
 
-/// Prints them.
-pub fn run(args: &CompletionsArgs) -> Result<Exit> {
+/// Prints the completions of `program`.
+pub fn run(args: &CompletionsArgs, mut program: clap::Command) -> Result<Exit> {
     let mut script = Vec::new();
-    clap_complete::generate(args.shell, &mut Cli::command(), "depthrig", &mut script);
+    clap_complete::generate(args.shell, &mut program, "depthrig", &mut script);
     std::io::Write::write_all(&mut std::io::stdout().lock(), &script)?;
     Ok(Exit::Good)
 }

@@ -40,7 +40,7 @@ Examples:
 #[derive(Debug, clap::Args)]
 pub struct DemoArgs {
     /// How long to record
-    #[arg(long, value_name = "N", default_value = "10", value_parser = crate::cli::positive_seconds)]
+    #[arg(long, value_name = "N", default_value = "10", value_parser = crate::args::positive_seconds)]
     seconds: f64,
     /// A new folder for the dataset, the pictures and the report [default: demo-data/DATE_TIME]
     #[arg(long, value_name = "DIR")]

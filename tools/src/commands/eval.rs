@@ -46,16 +46,16 @@ pub struct EvalArgs {
     #[arg(long, value_name = "DIR")]
     rgb: Option<PathBuf>,
     /// Metres per unit of files with whole numbers
-    #[arg(long, value_name = "M", default_value_t = HAMMER_UNIT_M, value_parser = crate::cli::depth_unit_m)]
+    #[arg(long, value_name = "M", default_value_t = HAMMER_UNIT_M, value_parser = crate::args::depth_unit_m)]
     unit: f64,
     /// The same for references [default: as --unit]
-    #[arg(long, value_name = "M", value_parser = crate::cli::depth_unit_m)]
+    #[arg(long, value_name = "M", value_parser = crate::args::depth_unit_m)]
     truth_unit: Option<f64>,
     /// Nearest reference that counts, metres [default: 0; of HAMMER 0.1]
-    #[arg(long, value_name = "M", value_parser = crate::cli::distance_m)]
+    #[arg(long, value_name = "M", value_parser = crate::args::distance_m)]
     min_m: Option<f64>,
     /// Farthest reference that counts, metres [default: no limit; of HAMMER 6]
-    #[arg(long, value_name = "M", value_parser = crate::cli::distance_m)]
+    #[arg(long, value_name = "M", value_parser = crate::args::distance_m)]
     max_m: Option<f64>,
     /// Width of the bins of distance, metres; what is beyond 48 of them is in the last
     #[arg(long, value_name = "M", default_value = "0.25", value_parser = positive_metres)]

@@ -131,7 +131,7 @@ pub struct ByteCameraArgs {
     #[arg(long = "depth-unit", value_name = "[CAM=]METRES", value_parser = depth_unit)]
     depth_units: Vec<(Option<String>, f64)>,
     /// Sets in a second, where there is no frames.csv [default: 5]
-    #[arg(long, value_name = "HZ", value_parser = crate::cli::rate_hz)]
+    #[arg(long, value_name = "HZ", value_parser = crate::args::rate_hz)]
     rate: Option<f64>,
 }
 
@@ -163,7 +163,7 @@ pub struct KinectArgs {
 
 fn depth_unit(text: &str) -> Result<(Option<String>, f64), String> {
     let (camera, unit) = text.rsplit_once('=').map_or((None, text), |(c, u)| (Some(c.to_owned()), u));
-    let unit = crate::cli::depth_unit_m(unit).map_err(|why| format!("{why}, or d405=0.0001"))?;
+    let unit = crate::args::depth_unit_m(unit).map_err(|why| format!("{why}, or d405=0.0001"))?;
     Ok((camera, unit))
 }
 

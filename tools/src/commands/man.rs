@@ -1,10 +1,8 @@
 //! `depthrig man`: the manual page, made from the same definition as `--help`.
 
-use crate::cli::Cli;
 use crate::exit::Exit;
 use crate::outfile::{OutFile, Overwrite};
 use anyhow::{Context, Result};
-use clap::CommandFactory;
 use std::path::PathBuf;
 
 /// Arguments.
@@ -17,13 +15,13 @@ pub struct ManArgs {
     overwrite: Overwrite,
 }
 
-/// Prints or writes it.
-pub fn run(args: &ManArgs) -> Result<Exit> {
+/// Prints or writes the manual of `program`.
+pub fn run(args: &ManArgs, program: clap::Command) -> Result<Exit> {
     if let Some(folder) = &args.out {
         let unwritable = || format!("{}: the manual pages cannot be written there", folder.display());
         std::fs::create_dir_all(folder).with_context(unwritable)?;
         let made = tempfile::tempdir().context("no temporary folder can be made")?;
-        clap_mangen::generate_to(Cli::command(), made.path()).context("the manual pages cannot be made")?;
+        clap_mangen::generate_to(program, made.path()).context("the manual pages cannot be made")?;
         let mut pages = Vec::new();
         for entry in made.path().read_dir()? {
             let entry = entry?;
@@ -34,7 +32,7 @@ pub fn run(args: &ManArgs) -> Result<Exit> {
         }
     } else {
         let mut page = Vec::new();
-        clap_mangen::Man::new(Cli::command()).render(&mut page)?;
+        clap_mangen::Man::new(program).render(&mut page)?;
         std::io::Write::write_all(&mut std::io::stdout().lock(), &page)?;
     }
     Ok(Exit::Good)

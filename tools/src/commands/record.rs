@@ -60,7 +60,7 @@ pub struct StartArgs {
     #[arg(long, value_name = "TEXT", default_value = "")]
     notes: String,
     /// End by itself after so long, such as 90s, 10m or 1h30m; refused when that is not expected to fit on the disk
-    #[arg(long = "for", value_name = "DURATION", value_parser = crate::cli::duration_s)]
+    #[arg(long = "for", value_name = "DURATION", value_parser = crate::args::duration_s)]
     duration_s: Option<f64>,
     /// Begin even when the disk is expected to be full too soon
     #[arg(long)]

@@ -52,17 +52,17 @@ struct StartArgs {
     #[arg(required = true, value_name = "DATASET")]
     datasets: Vec<PathBuf>,
     /// Speed against the original, 0.1 to 10
-    #[arg(long, value_name = "R", default_value = "1", value_parser = crate::cli::replay_rate,
+    #[arg(long, value_name = "R", default_value = "1", value_parser = crate::args::replay_rate,
           conflicts_with = "as_fast_as_possible")]
     rate: f64,
     /// Begin again at the end
     #[arg(long = "loop")]
     looped: bool,
     /// Begin so many seconds after the first set
-    #[arg(long, value_name = "T", value_parser = crate::cli::seconds)]
+    #[arg(long, value_name = "T", value_parser = crate::args::seconds)]
     from: Option<f64>,
     /// End so many seconds after the first set
-    #[arg(long, value_name = "T", value_parser = crate::cli::seconds)]
+    #[arg(long, value_name = "T", value_parser = crate::args::seconds)]
     to: Option<f64>,
     /// Wait for the subscribers and not for the clock: none of them misses a frame
     #[arg(long)]
@@ -123,7 +123,7 @@ enum ReplayCommand {
     /// Change its speed
     Rate {
         /// Against the original, 0.1 to 10
-        #[arg(allow_negative_numbers = true, value_parser = crate::cli::replay_rate)]
+        #[arg(allow_negative_numbers = true, value_parser = crate::args::replay_rate)]
         rate: f64,
         #[command(flatten)]
         told: Told,
@@ -150,7 +150,7 @@ struct Told {
 #[group(id = "place", required = true, multiple = false, args = ["seconds", "set", "id"])]
 struct SeekArgs {
     /// The set at, or first after, so many seconds after the first
-    #[arg(allow_negative_numbers = true, value_parser = crate::cli::seconds)]
+    #[arg(allow_negative_numbers = true, value_parser = crate::args::seconds)]
     seconds: Option<f64>,
     /// The set of this number, from 0
     #[arg(long, value_name = "N")]

@@ -34,7 +34,7 @@ pub struct ReportArgs {
     overwrite: Overwrite,
     /// Frames of a set should not lie further apart [default: the session's limit, else half a period of the
     /// slowest camera]
-    #[arg(long, value_name = "MS", value_parser = crate::cli::spread_ms)]
+    #[arg(long, value_name = "MS", value_parser = crate::args::spread_ms)]
     max_spread_ms: Option<f64>,
     /// Sets whose depth pictures are decoded for the fill rate
     #[arg(long, value_name = "N", default_value_t = ReportOptions::default().fill_sets)]

@@ -42,7 +42,7 @@ pub struct RunArgs {
     #[arg(long, requires = "record")]
     force: bool,
     /// End after so many seconds
-    #[arg(long, value_name = "N", value_parser = crate::cli::positive_seconds)]
+    #[arg(long, value_name = "N", value_parser = crate::args::positive_seconds)]
     seconds: Option<f64>,
     /// At the end, print what happened as JSON
     #[arg(long)]

@@ -12,7 +12,7 @@ use core::time::Duration;
 #[derive(Debug, clap::Args)]
 pub struct TopArgs {
     /// Seconds between refreshes
-    #[arg(long, value_name = "S", default_value = "1", value_parser = crate::cli::positive_seconds)]
+    #[arg(long, value_name = "S", default_value = "1", value_parser = crate::args::positive_seconds)]
     interval: f64,
 }
 

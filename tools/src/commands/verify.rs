@@ -36,7 +36,7 @@ pub struct VerifyArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
     /// Report sets whose frames were captured further apart than this, in place of the rig's own limit
-    #[arg(long, value_name = "MS", value_parser = crate::cli::spread_ms)]
+    #[arg(long, value_name = "MS", value_parser = crate::args::spread_ms)]
     max_spread_ms: Option<f64>,
     /// Print JSON
     #[arg(long)]

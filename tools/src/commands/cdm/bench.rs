@@ -54,7 +54,7 @@ pub struct BenchArgs {
     #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true, value_parser = clap::value_parser!(u16).range(0..=1024))]
     threads: u16,
     /// How long to measure each, seconds; at least three times are measured
-    #[arg(long, value_name = "SECONDS", default_value_t = 5.0, value_parser = crate::cli::seconds)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 5.0, value_parser = crate::args::seconds)]
     seconds: f64,
     /// The library of ONNX Runtime, when it is not to be looked for
     #[arg(long, value_name = "FILE")]

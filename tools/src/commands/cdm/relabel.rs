@@ -69,7 +69,7 @@ pub struct RelabelArgs {
     #[arg(long)]
     is_aligned: bool,
     /// How far from measured depth fill fills holes, part of the width; 1: all
-    #[arg(long, value_name = "PART", value_parser = crate::cli::fill_reach, default_value_t = FillRefiner::REACH)]
+    #[arg(long, value_name = "PART", value_parser = crate::args::fill_reach, default_value_t = FillRefiner::REACH)]
     fill_reach: f64,
     /// Pictures that are worked on at once [default: one for each core; 1 with a network]
     #[arg(short = 'j', long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]

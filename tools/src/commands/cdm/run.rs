@@ -38,7 +38,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "FILE")]
     depth: PathBuf,
     /// Metres per unit of the raw depth
-    #[arg(long, value_name = "METRES", value_parser = crate::cli::depth_unit_m)]
+    #[arg(long, value_name = "METRES", value_parser = crate::args::depth_unit_m)]
     depth_unit: f64,
     /// The name of an installed model, or a checkpoint file
     #[arg(long, value_name = "NAME|FILE", required_unless_present = "engine")]
@@ -58,13 +58,13 @@ pub struct RunArgs {
     #[command(flatten)]
     overwrite: Overwrite,
     /// Metres per unit of a PNG that is written
-    #[arg(long, value_name = "METRES", value_parser = crate::cli::depth_unit_m, default_value_t = 0.001)]
+    #[arg(long, value_name = "METRES", value_parser = crate::args::depth_unit_m, default_value_t = 0.001)]
     out_unit: f64,
     /// Order of the colour channels, in place of the model's
     #[arg(long, value_enum, value_name = "ORDER")]
     channel_order: Option<Channels>,
     /// Raw depth beyond this is a hole, metres, in place of the model's
-    #[arg(long, value_name = "METRES", value_parser = crate::cli::range_limit_m)]
+    #[arg(long, value_name = "METRES", value_parser = crate::args::range_limit_m)]
     max_depth: Option<f64>,
     /// Numbers that the network computes with: fp32, fp16 or bf16
     #[arg(long, value_name = "PRECISION", default_value = "fp32", value_parser = precision)]
@@ -79,7 +79,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
     /// How far from measured depth fill fills holes, part of the width; 1: all
-    #[arg(long, value_name = "PART", value_parser = crate::cli::fill_reach, default_value_t = FillRefiner::REACH)]
+    #[arg(long, value_name = "PART", value_parser = crate::args::fill_reach, default_value_t = FillRefiner::REACH)]
     fill_reach: f64,
     #[command(flatten)]
     models: Models,

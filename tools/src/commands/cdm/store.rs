@@ -86,7 +86,7 @@ pub struct Settings {
     #[arg(long, value_name = "PIXELS", default_value_t = depthrig_cdm::INPUT_SIZE)]
     input_size: u32,
     /// Raw depth beyond this is a hole, metres
-    #[arg(long, value_name = "METRES", default_value_t = depthrig_cdm::MAX_DEPTH_M, value_parser = crate::cli::range_limit_m)]
+    #[arg(long, value_name = "METRES", default_value_t = depthrig_cdm::MAX_DEPTH_M, value_parser = crate::args::range_limit_m)]
     max_depth: f64,
     /// A camera model that it is for, such as D435; may be given several times
     #[arg(long = "camera", value_name = "MODEL")]

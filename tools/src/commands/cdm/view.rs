@@ -51,7 +51,7 @@ pub struct ViewArgs {
     #[arg(long, value_name = "FILE", requires = "rgb")]
     depth: Option<PathBuf>,
     /// Metres per unit of raw depth, and of refined depth when that is a PNG
-    #[arg(long, value_name = "METRES", requires = "rgb", value_parser = crate::cli::depth_unit_m)]
+    #[arg(long, value_name = "METRES", requires = "rgb", value_parser = crate::args::depth_unit_m)]
     depth_unit: Option<f64>,
     /// Refined depth: .npy of 32-bit floats in metres, or a PNG of 16 bits
     #[arg(long, value_name = "FILE", requires = "rgb")]

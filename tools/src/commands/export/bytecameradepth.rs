@@ -29,7 +29,7 @@ pub struct Args {
     #[arg(long, value_enum, default_value = "short")]
     names: Names,
     /// Rescale 16-bit depth to this unit instead of the camera's own; 0.001 is a millimetre
-    #[arg(long, value_name = "METRES", value_parser = crate::cli::depth_unit_m)]
+    #[arg(long, value_name = "METRES", value_parser = crate::args::depth_unit_m)]
     depth_unit: Option<f64>,
 }
 

@@ -25,7 +25,7 @@ pub struct Args {
     #[arg(long, value_name = "TEXT")]
     task: Option<String>,
     /// Sets per second [default: as configured and recorded]
-    #[arg(long, value_name = "HZ", value_parser = crate::cli::rate_hz)]
+    #[arg(long, value_name = "HZ", value_parser = crate::args::rate_hz)]
     fps: Option<f64>,
     /// What to do with a set that lacks a frame
     #[arg(long, value_enum, default_value = "mark", value_name = "HOW")]

@@ -78,19 +78,19 @@ pub struct ReplayArgs {
     #[arg(long, value_name = "NUMBER")]
     serial: Option<String>,
     /// Rate of pairs without times of their own, Hz [default: 30]
-    #[arg(long, value_name = "HZ", value_parser = crate::cli::rate_hz)]
+    #[arg(long, value_name = "HZ", value_parser = crate::args::rate_hz)]
     rate: Option<f64>,
     /// Record disparity_MODE as well
     #[arg(long)]
     disparity: bool,
     /// Nearer than this is a hole, metres; half of it takes twice the time
-    #[arg(long, value_name = "METRES", default_value_t = 0.3, value_parser = crate::cli::range_limit_m)]
+    #[arg(long, value_name = "METRES", default_value_t = 0.3, value_parser = crate::args::range_limit_m)]
     min_depth: f64,
     /// Farther than this is a hole, metres
-    #[arg(long, value_name = "METRES", default_value_t = 20.0, value_parser = crate::cli::range_limit_m)]
+    #[arg(long, value_name = "METRES", default_value_t = 20.0, value_parser = crate::args::range_limit_m)]
     max_depth: f64,
     /// Metres per unit of depth
-    #[arg(long, value_name = "METRES", default_value_t = 0.001, value_parser = crate::cli::depth_unit_m)]
+    #[arg(long, value_name = "METRES", default_value_t = 0.001, value_parser = crate::args::depth_unit_m)]
     depth_unit: f64,
     /// How rectified colour is stored
     #[arg(long, value_enum, default_value = "jpeg")]
@@ -102,7 +102,7 @@ pub struct ReplayArgs {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
     /// Memory that this may take, GB; fewer pairs are worked on at once then [default: half of what is free]
-    #[arg(long, value_name = "GB", value_parser = crate::cli::memory_gb)]
+    #[arg(long, value_name = "GB", value_parser = crate::args::memory_gb)]
     memory: Option<f64>,
     /// Print the report as JSON
     #[arg(long)]
