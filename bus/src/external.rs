@@ -24,9 +24,9 @@ pub use codes::{
 pub use fields::{ANSWER_FIELDS, FRAME_FIELDS, MODE_FIELDS, OFFER_FIELDS};
 pub use layout::{ExternalAnswer, ExternalFrame, ExternalMode, ExternalOffer};
 pub use link::{Answer, Beat, ExternalLink, FrameInlet, Offer, Said, SentFrame};
-pub use lock::{ExternalLock, holder, lock, served};
+pub use lock::{ExternalLock, holder, lock};
 pub use mode::{About, Mode};
-pub use place::Place;
+pub use place::{Place, served};
 pub use session::{FrameSlot, Session};
 
 use core::time::Duration;

@@ -39,8 +39,9 @@ pub use header::{
 pub use ids::{CameraName, Name, RigName, StreamId, StreamName};
 pub use metadata::MetadataLevel;
 pub use motion::{MOTION_FIELDS, MOTION_SAMPLE_BYTES, MotionFlags, MotionSample};
-pub use node::{Bus, IOX_FOLDER, SHM_PREFIX};
+pub use node::{Bus, IOX_FOLDER};
 pub use publisher::{FrameMut, Publisher};
 pub use runtime::RuntimeDir;
 pub use sets::{MemberRecord, RECORD_BYTES, SetFrame, SetHeader, SetPublisher, SetSubscriber};
+pub use shm::SHM_PREFIX;
 pub use subscriber::{Frame, Subscriber};

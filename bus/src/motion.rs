@@ -5,7 +5,7 @@
 //! it counts pictures; samples have numbers of their own, whose gaps are samples that the device never gave, or that were
 //! lost with a batch.
 
-use crate::{Field, Frame, HostTime};
+use crate::{Field, HostTime};
 use core::mem::offset_of;
 
 /// Bytes of one [`MotionSample`].
@@ -149,14 +149,6 @@ impl MotionSample {
     /// The samples in `payload`, the payload of a motion frame; bytes after the last whole one are left out.
     pub fn all_in(payload: &[u8]) -> impl ExactSizeIterator<Item = Self> + '_ {
         payload.as_chunks::<MOTION_SAMPLE_BYTES>().0.iter().map(Self::from_bytes)
-    }
-}
-
-impl Frame {
-    /// The samples of a motion frame; none of any other frame.
-    pub fn motion(&self) -> impl ExactSizeIterator<Item = MotionSample> + '_ {
-        let motion = self.header().pixel_format() == Some(crate::PixelFormat::Motion);
-        MotionSample::all_in(if motion { self.pixels() } else { &[] })
     }
 }
 

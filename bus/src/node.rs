@@ -12,8 +12,6 @@ use iceoryx2::node::{DeadNodeView, NodeDetails, NodeState, NodeView};
 use iceoryx2::prelude::*;
 use std::sync::Arc;
 
-/// Names of shared memory begin with this, so that one sees whose they are; Python uses the same.
-pub const SHM_PREFIX: &str = "depthrig_";
 /// The folder below the runtime folder that holds the files of iceoryx2.
 pub const IOX_FOLDER: &str = "iox2";
 
@@ -244,7 +242,7 @@ fn config(runtime: &RuntimeDir) -> Result<Config> {
     let root = Path::new(text.as_bytes()).map_err(|e| unusable(&e))?;
     let mut config = Config::default();
     config.global.set_root_path(&root);
-    config.global.prefix = FileName::new(SHM_PREFIX.as_bytes()).map_err(|e| unusable(&e))?;
+    config.global.prefix = FileName::new(shm::SHM_PREFIX.as_bytes()).map_err(|e| unusable(&e))?;
     // How long an opener waits for a creator that is half done; a publisher may wait as long for a broken reader.
     config.global.creation_timeout = Duration::from_millis(500);
     Ok(config)

@@ -5,11 +5,13 @@
 //! of who uses it. What else it makes (connections, events: some KiB each, written when it is made) is only begun when there
 //! is room.
 
-use crate::{Error, ErrorKind, Result, SHM_PREFIX, limits};
+use crate::{Error, ErrorKind, Result, limits};
 use rustix::fs::{FallocateFlags, Mode, OFlags, fallocate, fstat, open};
 use rustix::io::{Errno, retry_on_intr};
 use std::path::{Path, PathBuf};
 
+/// Names of shared memory begin with this, so that one sees whose they are; Python uses the same.
+pub const SHM_PREFIX: &str = "depthrig_";
 /// Where POSIX shared memory lives on Linux.
 pub const SHM_DIR: &str = "/dev/shm";
 /// Slots that a stream gets when memory is plenty.

@@ -1,7 +1,7 @@
 //! Subscribing: read frames where the driver wrote them.
 
 use crate::channel::{Received, Receiver};
-use crate::{Error, ErrorKind, FrameHeader, HostTime, Result};
+use crate::{Error, ErrorKind, FrameHeader, HostTime, MotionSample, PixelFormat, Result};
 use core::time::Duration;
 
 /// How often a blocked reader looks whether anybody still publishes.
@@ -127,5 +127,11 @@ impl Frame {
     /// Its pixels, where the driver wrote them. They begin at a multiple of [`crate::PIXEL_ALIGN`].
     pub fn pixels(&self) -> &[u8] {
         self.sample.payload()
+    }
+
+    /// The samples of an IMU frame; none of any other frame.
+    pub fn motion(&self) -> impl ExactSizeIterator<Item = MotionSample> + '_ {
+        let is_imu = self.header().pixel_format() == Some(PixelFormat::Motion);
+        MotionSample::all_in(if is_imu { self.pixels() } else { &[] })
     }
 }

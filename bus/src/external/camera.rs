@@ -3,7 +3,7 @@
 use super::mode::{check_all, invalid};
 use super::{
     About, ExternalAnswer, ExternalLock, ExternalMode, ExternalOffer, ExternalReason, ExternalState,
-    ExternalWant, HEARTBEAT, MAX_MODES, Mode, Place, SILENCE, Session, VERSION, lock, plain, text,
+    ExternalWant, HEARTBEAT, MAX_MODES, Mode, Place, SILENCE, VERSION, lock, plain, text,
 };
 use crate::channel::{self, Inlet, IoxService, Outlet};
 use crate::{Bus, Error, ErrorKind, HostTime, Result};
@@ -62,7 +62,7 @@ pub(super) struct Shared {
     pub(super) bell: Notifier<IoxService>,
     station: Mutex<Station>,
     wanted: Mutex<Wanted>,
-    changed: Condvar,
+    pub(super) changed: Condvar,
     end: AtomicBool,
 }
 
@@ -147,35 +147,6 @@ impl ExternalCamera {
         &self.shared.modes
     }
 
-    /// Waits until the daemon wants frames; `None` when it wanted none within `timeout`.
-    ///
-    /// # Errors
-    /// [`ErrorKind::Refused`] with the daemon's reason when it cannot use the offer; it stays refused. Else as
-    /// [`Bus::publisher`].
-    pub fn next_session(&mut self, timeout: Duration) -> Result<Option<Session<'_>>> {
-        let deadline = HostTime::now().plus(timeout);
-        let mut wanted = self.shared.wanted();
-        let (number, modes) = loop {
-            if let (0, Some(why)) = (wanted.session, &wanted.refusal) {
-                let why = format!("the daemon refuses camera \"{}\": {why}", self.place.camera);
-                return Err(Error::new(ErrorKind::Refused, why));
-            }
-            if wanted.session > self.taken && !wanted.modes.is_empty() {
-                break (wanted.session, wanted.modes.clone());
-            }
-            let left = deadline.from_now();
-            if left.is_zero() {
-                return Ok(None);
-            }
-            let waited = self.shared.changed.wait_timeout(wanted, left);
-            wanted = waited.unwrap_or_else(PoisonError::into_inner).0;
-        };
-        drop(wanted);
-        self.taken = number;
-        self.shared.stand(number, ExternalState::Starting, ExternalReason::None, "")?;
-        Session::new(self, number, modes).map(Some)
-    }
-
     /// Says that the camera cannot be had now, and why: it is unplugged, or somebody else holds it. The process stays.
     ///
     /// # Errors
@@ -209,7 +180,7 @@ impl Drop for ExternalCamera {
 }
 
 impl Shared {
-    fn wanted(&self) -> MutexGuard<'_, Wanted> {
+    pub(super) fn wanted(&self) -> MutexGuard<'_, Wanted> {
         self.wanted.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

@@ -1,8 +1,7 @@
 //! Who serves a camera: a lock that the kernel frees with the process, however that ends.
 
 use super::LOCK_SUFFIX;
-use super::Place;
-use crate::{CameraName, ErrorKind, Name, Result, RigName, RuntimeDir};
+use crate::{CameraName, ErrorKind, Result, RigName, RuntimeDir};
 use std::path::PathBuf;
 
 /// The right to serve a camera; dropping it frees the camera.
@@ -39,28 +38,11 @@ pub fn holder(runtime: &RuntimeDir, rig: &RigName, camera: &CameraName) -> Optio
     crate::runtime::holder_of(&path(runtime, rig, camera))
 }
 
-/// The cameras below `runtime` that a process serves now, each with that process as it described itself; sorted.
-pub fn served(runtime: &RuntimeDir) -> Vec<(Place, String)> {
-    let Ok(entries) = std::fs::read_dir(runtime.path()) else { return Vec::new() };
-    let place = |name: &str| {
-        let (rig, camera) = name.strip_suffix(LOCK_SUFFIX)?.split_once('.')?;
-        let (rig, camera) = (Name::new(rig).ok()?, Name::new(camera).ok()?);
-        Some(Place { runtime: runtime.clone(), rig, camera })
-    };
-    let mut served: Vec<_> = entries
-        .filter_map(|e| {
-            let place = place(e.ok()?.file_name().to_str()?)?;
-            let holder = place.holder()?;
-            Some((place, holder))
-        })
-        .collect();
-    served.sort_by(|(a, _), (b, _)| (&a.rig, &a.camera).cmp(&(&b.rig, &b.camera)));
-    served
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Name;
+    use crate::external::served;
 
     #[test]
     fn a_camera_is_served_once_and_by_whom_is_known() {

@@ -1,8 +1,8 @@
 //! Which camera of which rig a process serves, and the channels that it shares with the daemon.
 
 use super::{
-    BUFFER, CAMERA_VARIABLE, ExternalAnswer, ExternalFrame, ExternalOffer, MAX_EVENT_PORTS, MAX_HELD,
-    MAX_NODES, MAX_PUBLISHERS, MAX_SUBSCRIBERS, PREFIX, RIG_VARIABLE, SCHEMA,
+    BUFFER, CAMERA_VARIABLE, ExternalAnswer, ExternalFrame, ExternalOffer, LOCK_SUFFIX, MAX_EVENT_PORTS,
+    MAX_HELD, MAX_NODES, MAX_PUBLISHERS, MAX_SUBSCRIBERS, PREFIX, RIG_VARIABLE, SCHEMA,
 };
 use crate::channel::{Channel, Form};
 use crate::{CameraName, Error, ErrorKind, Name, Result, RigName, RuntimeDir, StreamName};
@@ -81,4 +81,23 @@ impl Place {
     fn what(&self, what: &str) -> String {
         format!("camera \"{}\" of rig \"{}\": {what}", self.camera, self.rig)
     }
+}
+
+/// The cameras below `runtime` that a process serves now, each with that process as it described itself; sorted.
+pub fn served(runtime: &RuntimeDir) -> Vec<(Place, String)> {
+    let Ok(entries) = std::fs::read_dir(runtime.path()) else { return Vec::new() };
+    let place = |name: &str| {
+        let (rig, camera) = name.strip_suffix(LOCK_SUFFIX)?.split_once('.')?;
+        let (rig, camera) = (Name::new(rig).ok()?, Name::new(camera).ok()?);
+        Some(Place { runtime: runtime.clone(), rig, camera })
+    };
+    let mut served: Vec<_> = entries
+        .filter_map(|e| {
+            let place = place(e.ok()?.file_name().to_str()?)?;
+            let holder = place.holder()?;
+            Some((place, holder))
+        })
+        .collect();
+    served.sort_by(|(a, _), (b, _)| (&a.rig, &a.camera).cmp(&(&b.rig, &b.camera)));
+    served
 }

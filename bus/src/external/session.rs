@@ -3,8 +3,9 @@
 use super::camera::no_such_mode;
 use super::{ExternalCamera, ExternalFrame, ExternalReason, ExternalState, FRAME_SLOTS, Mode};
 use crate::channel::{self, Loan, Outlet};
-use crate::{ErrorKind, Result};
+use crate::{Error, ErrorKind, HostTime, Result};
 use core::time::Duration;
+use std::sync::PoisonError;
 
 /// From when the daemon wanted frames until it wants none: see [`ExternalCamera::next_session`].
 #[derive(Debug)]
@@ -23,6 +24,37 @@ struct Port {
     mode: usize,
     out: Outlet<ExternalFrame>,
     sequence: u64,
+}
+
+impl ExternalCamera {
+    /// Waits until the daemon wants frames; `None` when it wanted none within `timeout`.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Refused`] with the daemon's reason when it cannot use the offer; it stays refused. Else as
+    /// [`Bus::publisher`].
+    pub fn next_session(&mut self, timeout: Duration) -> Result<Option<Session<'_>>> {
+        let deadline = HostTime::now().plus(timeout);
+        let mut wanted = self.shared.wanted();
+        let (number, modes) = loop {
+            if let (0, Some(why)) = (wanted.session, &wanted.refusal) {
+                let why = format!("the daemon refuses camera \"{}\": {why}", self.place.camera);
+                return Err(Error::new(ErrorKind::Refused, why));
+            }
+            if wanted.session > self.taken && !wanted.modes.is_empty() {
+                break (wanted.session, wanted.modes.clone());
+            }
+            let left = deadline.from_now();
+            if left.is_zero() {
+                return Ok(None);
+            }
+            let waited = self.shared.changed.wait_timeout(wanted, left);
+            wanted = waited.unwrap_or_else(PoisonError::into_inner).0;
+        };
+        drop(wanted);
+        self.taken = number;
+        self.shared.stand(number, ExternalState::Starting, ExternalReason::None, "")?;
+        Session::new(self, number, modes).map(Some)
+    }
 }
 
 impl<'a> Session<'a> {
