@@ -17,7 +17,7 @@ pub use backend::ExternalBackend;
 pub use depthrig_bus::external::{Place, served};
 
 use core::time::Duration;
-use depthrig_bus::external::ExternalReason;
+use depthrig_bus::external::{Beat, ExternalReason};
 use std::path::PathBuf;
 
 /// The back end's name in a rig file.
@@ -59,6 +59,15 @@ const fn kind_of(reason: ExternalReason) -> crate::ErrorKind {
         ExternalReason::Device => ErrorKind::Io,
         _ => ErrorKind::Disconnected,
     }
+}
+
+/// What the process says that it refuses, for a message.
+fn refusal(beat: &Beat) -> String {
+    let (text, reason) = (beat.text(), beat.reason.name());
+    if text.is_empty() {
+        return format!("its process {} refuses ({reason})", beat.pid);
+    }
+    format!("its process {} says ({reason}): {text}", beat.pid)
 }
 
 /// An error of the bus as one of a driver.

@@ -33,6 +33,7 @@ use std::sync::{Arc, Mutex};
 mod crew;
 mod ledger;
 mod newest;
+mod pair;
 mod rows;
 mod stream;
 

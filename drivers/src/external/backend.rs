@@ -1,7 +1,7 @@
 //! The back end: finds the process of its camera, or starts it.
 
-use super::device::{ExternalDevice, SharedKeeper, kill, stalled};
-use super::process::Keeper;
+use super::device::ExternalDevice;
+use super::process::{Keeper, SharedKeeper, kill, stalled};
 use super::stream::is_of;
 use super::{ExternalConfig, NAME, Place, of_bus};
 use crate::{Backend, Device, DeviceInfo, Error, ErrorKind, Result, StreamProfile};

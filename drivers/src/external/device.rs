@@ -1,18 +1,13 @@
 //! A camera that a process offers: its modes, and how it is started.
 
-use super::process::Keeper;
+use super::process::SharedKeeper;
 use super::stream::{ExternalStream, Started};
-use super::{ExternalConfig, NAME, Place, kind_of, of_bus};
+use super::{ExternalConfig, NAME, Place, kind_of, of_bus, refusal};
 use crate::{
-    Device, DeviceClock, DeviceInfo, Error, ErrorKind, Result, Stream, StreamProfile, StreamRequest,
-    choose_profiles,
+    Device, DeviceClock, DeviceInfo, Error, Result, Stream, StreamProfile, StreamRequest, choose_profiles,
 };
 use depthrig_bus::external::{Beat, ExternalClock, ExternalLink, ExternalState, Mode, Offer};
 use depthrig_bus::{ClockDomain, HostTime, MetadataLevel};
-use std::sync::{Arc, Mutex};
-
-/// The process of a camera, if the daemon runs it.
-pub(super) type SharedKeeper = Option<Arc<Mutex<Keeper>>>;
 
 /// A camera whose process answers.
 #[derive(Debug)]
@@ -60,15 +55,6 @@ impl ExternalDevice {
         let (config, place) = (config.clone(), place.clone());
         Ok(Self { config, place, keeper, link, beat, modes: offer.modes, info, profiles })
     }
-}
-
-/// What the process says that it refuses, for a message.
-pub(super) fn refusal(beat: &Beat) -> String {
-    let (text, reason) = (beat.text(), beat.reason.name());
-    if text.is_empty() {
-        return format!("its process {} refuses ({reason})", beat.pid);
-    }
-    format!("its process {} says ({reason}): {text}", beat.pid)
 }
 
 /// The profile of a mode.
@@ -133,21 +119,4 @@ impl Device for ExternalDevice {
         stream.wait_for_first_frame(self.config.start_timeout)?;
         Ok(Box::new(stream))
     }
-}
-
-/// A process that does not answer is killed, if it is the daemon's.
-pub(super) fn kill(keeper: &SharedKeeper, why: &str) {
-    if let Some(keeper) = keeper {
-        keeper.lock().unwrap_or_else(std::sync::PoisonError::into_inner).kill(why);
-    }
-}
-
-/// A message that ends with what can be done.
-pub(super) fn stalled(kind: ErrorKind, keeper: &SharedKeeper, pid: u32, what: &str) -> Error {
-    let cure = if keeper.is_some() {
-        "it is killed and started again".to_owned()
-    } else {
-        format!("if it hangs, end it (kill -9 {pid}) and start it again")
-    };
-    Error::new(kind, format!("its process {pid} {what}; {cure}"))
 }

@@ -24,6 +24,9 @@ const GOOD_RUN: Duration = Duration::from_mins(1);
 const GRACE: Duration = Duration::from_millis(500);
 const LOOK: Duration = Duration::from_millis(20);
 
+/// The process of a camera, if the daemon runs it.
+pub(super) type SharedKeeper = Option<Arc<Mutex<Keeper>>>;
+
 /// Keeps the process of one camera running. Dropping it ends the process.
 #[derive(Debug)]
 pub(super) struct Keeper {
@@ -260,4 +263,21 @@ fn copy_output(child: &mut Child, place: &Place, pid: u32) {
             tracing::warn!(camera = %place.camera, error = %e, "what its process prints cannot be read");
         }
     }
+}
+
+/// A process that does not answer is killed, if it is the daemon's.
+pub(super) fn kill(keeper: &SharedKeeper, why: &str) {
+    if let Some(keeper) = keeper {
+        keeper.lock().unwrap_or_else(PoisonError::into_inner).kill(why);
+    }
+}
+
+/// A message that ends with what can be done.
+pub(super) fn stalled(kind: ErrorKind, keeper: &SharedKeeper, pid: u32, what: &str) -> Error {
+    let cure = if keeper.is_some() {
+        "it is killed and started again".to_owned()
+    } else {
+        format!("if it hangs, end it (kill -9 {pid}) and start it again")
+    };
+    Error::new(kind, format!("its process {pid} {what}; {cure}"))
 }

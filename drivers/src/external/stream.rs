@@ -1,8 +1,8 @@
 //! A camera that streams out of another process.
 
-use super::device::{SharedKeeper, kill, refusal, stalled};
 use super::intake::{Intake, Look};
-use super::{Place, kind_of, of_bus};
+use super::process::{SharedKeeper, kill, stalled};
+use super::{Place, kind_of, of_bus, refusal};
 use crate::{Error, ErrorKind, FrameSink, Poll, Result, Stream, StreamProfile};
 use core::time::Duration;
 use depthrig_bus::HostTime;

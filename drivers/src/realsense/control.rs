@@ -4,7 +4,7 @@
 //! out reaches that thread through a bounded channel (probes) and a number that it reads (temperature).
 
 use super::family::Family;
-use super::protocol::hwm::HardwareMonitor;
+use super::protocol::hwm::{HardwareMonitor, UNIT_ID};
 use crate::uvc::control::{ControlPort, Query};
 use crate::{Error, ErrorKind, Result};
 use core::sync::atomic::{AtomicU32, AtomicU64, Ordering};
@@ -13,9 +13,6 @@ use depthrig_bus::HostTime;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
-
-/// Extension unit of the stereo module.
-pub(super) const UNIT: u8 = super::protocol::hwm::UNIT_ID;
 
 /// The first probes follow each other this fast, the others at [`SLOW`] (librealsense `global_timestamp_reader.cpp`).
 const FAST: Duration = Duration::from_millis(100);
@@ -203,7 +200,7 @@ impl Worker {
     /// Looks at the error report and the temperature.
     fn look(&mut self) -> Result<()> {
         let mut code = [0];
-        let asked = self.port.query(UNIT, self.family.error_selector(), Query::GetCur, &mut code);
+        let asked = self.port.query(UNIT_ID, self.family.error_selector(), Query::GetCur, &mut code);
         if asked.as_ref().is_err_and(|e| e.kind() == ErrorKind::Unsupported) {
             tracing::debug!(camera = %self.label, "this firmware has no error report");
             self.polls = false;

@@ -1,8 +1,7 @@
 //! What a D400 and an L515 are asked in different ways while they stream.
 
-use super::control::UNIT;
 use super::protocol::health::{self, Temperatures};
-use super::protocol::hwm::{HardwareMonitor, Request};
+use super::protocol::hwm::{HardwareMonitor, Request, UNIT_ID};
 use super::protocol::l515;
 use crate::Result;
 use crate::uvc::control::{ControlPort, Query};
@@ -53,7 +52,7 @@ impl Family {
         match self {
             Self::D4xx => {
                 let mut bytes = [0; 4];
-                port.query(UNIT, health::TEMPERATURES_SELECTOR, Query::GetCur, &mut bytes)?;
+                port.query(UNIT_ID, health::TEMPERATURES_SELECTOR, Query::GetCur, &mut bytes)?;
                 // The projector sits between the imagers; the processor is further away.
                 let Temperatures { projector_c, asic_c } = Temperatures::parse(bytes);
                 Ok(projector_c.or(asic_c).map_or(f32::NAN, f32::from))

@@ -1,7 +1,7 @@
 //! The settings of a rig, put into a camera: checked against its own ranges, read back, logged.
 
 use super::config::RealsenseConfig;
-use super::control::UNIT;
+use super::protocol::hwm::UNIT_ID;
 use super::transport::PictureControls;
 use crate::uvc::control::{ControlPort, Query};
 use crate::v4l2::{Control, ControlKind, ControlValue};
@@ -76,7 +76,7 @@ impl UnitControl {
             .with_source(e),
             _ => e,
         };
-        let length = patiently(|| port.length(UNIT, self.selector)).map_err(no_such)?;
+        let length = patiently(|| port.length(UNIT_ID, self.selector)).map_err(no_such)?;
         if !(1..=4).contains(&length) {
             return Err(Error::new(
                 ErrorKind::Protocol,
@@ -86,7 +86,7 @@ impl UnitControl {
         let mut read = |query: Query| -> Result<u32> {
             let mut bytes = [0; 4];
             let value = bytes.get_mut(..length).unwrap_or_default();
-            patiently(|| port.query(UNIT, self.selector, query, value))?;
+            patiently(|| port.query(UNIT_ID, self.selector, query, value))?;
             Ok(u32::from_le_bytes(bytes))
         };
         let (least, most) = (read(Query::GetMin)?, read(Query::GetMax)?);
@@ -101,10 +101,10 @@ impl UnitControl {
         }
         let mut bytes = value.to_le_bytes();
         let sent = bytes.get_mut(..length).unwrap_or_default();
-        patiently(|| port.query(UNIT, self.selector, Query::SetCur, sent))?;
+        patiently(|| port.query(UNIT_ID, self.selector, Query::SetCur, sent))?;
         let mut bytes = [0; 4];
         let got = bytes.get_mut(..length).unwrap_or_default();
-        patiently(|| port.query(UNIT, self.selector, Query::GetCur, got))?;
+        patiently(|| port.query(UNIT_ID, self.selector, Query::GetCur, got))?;
         kept(key, value.into(), u32::from_le_bytes(bytes).into())
     }
 }

@@ -3,10 +3,10 @@
 //! Each thread has a box for one pair; a newer pair takes the place of one that still lies there, unless that is of the
 //! moment of a frame set. Everything that pictures are in is made once and goes round.
 
-use super::newest::{ForSet, Newest};
+use super::newest::Newest;
+use super::pair::{Raw, Views};
 use super::rows::{self, Corrected, Rows};
 use super::{Descriptions, Geometry, StereoMode, StereoOptions, has_color};
-use crate::moments::Due;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::PixelFormat;
@@ -25,45 +25,6 @@ const BELIEVED: u32 = 3;
 const LOOK_EVERY: u64 = 100;
 /// Results of one mode that may be on their way at once.
 const PRODUCTS: usize = 2;
-
-/// The raw pictures of a pair.
-#[derive(Debug, Default)]
-pub(super) struct Raw {
-    pub(super) ticket: u64,
-    /// The frame set that it is for.
-    pub(super) due: Option<Due>,
-    /// Whether it is to be matched, and not merely rectified.
-    pub(super) matched: bool,
-    pub(super) left: Vec<u8>,
-    pub(super) right: Vec<u8>,
-}
-
-/// The rectified pictures of a pair.
-#[derive(Debug, Default)]
-pub(super) struct Views {
-    pub(super) ticket: u64,
-    due: Option<Due>,
-    /// How many corrections of the rows went before.
-    pub(super) corrections: u64,
-    pub(super) left: Vec<u8>,
-    pub(super) right: Vec<u8>,
-    /// Empty where the eyes have no colour.
-    pub(super) left_rgb: Vec<u8>,
-    /// Filled when a mode wants colour.
-    right_rgb: Vec<u8>,
-}
-
-impl ForSet for Raw {
-    fn due(&self) -> Option<&Due> {
-        self.due.as_ref()
-    }
-}
-
-impl ForSet for Views {
-    fn due(&self) -> Option<&Due> {
-        self.due.as_ref()
-    }
-}
 
 /// What a mode made of a pair.
 #[derive(Debug, Default)]

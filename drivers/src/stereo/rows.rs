@@ -1,8 +1,8 @@
 //! The thread that measures now and then whether the rows of the rectified eyes agree, beside those that have to be in time, and
 //! has them moved where they do not.
 
-use super::crew::Views;
 use super::newest::Newest;
+use super::pair::Views;
 use super::{Descriptions, Notice, StereoOptions};
 use depthrig_calib::Rectifier;
 use depthrig_calib::stereo::{Gray, RowCheck, RowOffset, StereoPair};

@@ -1,7 +1,8 @@
 //! A running camera with stereo: its own frames go their way and are copied for the threads, what these make comes after.
 
-use super::crew::{Crew, Event, Product, Raw, Views};
+use super::crew::{Crew, Event, Product};
 use super::ledger::{Ledger, Step};
+use super::pair::{Raw, Views};
 use super::{COLOR, PREFIXES, StereoOptions};
 use crate::clock::ClockQuality;
 use crate::moments::{Due, Pace, SetTimes};

@@ -3,9 +3,9 @@
 use super::config::V4l2Config;
 use super::controls::{ControlKind, ControlValue, find as find_control};
 use super::find::{Found, NodePair};
-use super::node::{Layout, Mode, Node};
+use super::node::{Mode, Node};
 use super::offer::{Offer, offers};
-use super::stream::V4l2Stream;
+use super::stream::{Ready, V4l2Stream};
 use crate::usb::{SysRoot, health};
 use crate::{
     Device, DeviceInfo, Error, ErrorKind, Result, Stream, StreamProfile, StreamRequest, choose_profiles,
@@ -20,14 +20,6 @@ pub(super) struct V4l2Device {
     nodes: Vec<NodePair>,
     offers: Vec<Offer>,
     profiles: Vec<StreamProfile>,
-}
-
-/// A node with the mode that was set on it.
-pub(super) struct Ready {
-    pub(super) video: Node,
-    pub(super) metadata: Option<Node>,
-    pub(super) offer: Offer,
-    pub(super) layout: Layout,
 }
 
 impl V4l2Device {

@@ -1,11 +1,10 @@
 //! A streaming camera: each picture through its stream's gate, into shared memory.
 
 use super::config::{ClockChoice, MemoryChoice, V4l2Config};
-use super::device::Ready;
 use super::lent::{Filled, LentSource, Refused};
 use super::metadata::MetadataFormat;
 use super::node::{Layout, Mode, Node};
-use super::offer::kernel_clock;
+use super::offer::{Offer, kernel_clock};
 use super::source::{Source, Stamp, Wanted};
 use super::tick::{self, Sample};
 use crate::uvc::payload::PayloadHeader;
@@ -19,6 +18,14 @@ use std::path::PathBuf;
 
 /// How long the pictures for [`tick`] may take to come, together.
 const TICK_PATIENCE: Duration = Duration::from_secs(1);
+
+/// A node with the mode that was set on it.
+pub(super) struct Ready {
+    pub(super) video: Node,
+    pub(super) metadata: Option<Node>,
+    pub(super) offer: Offer,
+    pub(super) layout: Layout,
+}
 
 /// A streaming camera.
 pub(super) struct V4l2Stream {

@@ -1,8 +1,8 @@
 //! An IMU in a folder: the files of its sensors, and pipes in place of their nodes.
 
 use super::revival::Revival;
-use super::switch::{Pair, Switcher};
-use super::unit::{ACCELERATION, Opening, ROTATION};
+use super::switch::{ACCELERATION, Pair, ROTATION, Switcher};
+use super::unit::Opening;
 use super::{BATCH, Imu, Sensors};
 use crate::iio::{Found, Sensor};
 use crate::motion;

@@ -4,7 +4,6 @@
 //! three to five seconds after a sensor was switched off (the delay of autosuspend in `hid-sensor-trigger.c`, rounded up), so
 //! that sensors that fell silent stay off until it says so, or for [`COLD`] where it says nothing.
 
-use super::unit::{ACCELERATION, ROTATION};
 use crate::iio::{Found, Switch};
 use crate::realsense::protocol::imu::Rates;
 use crate::{Error, ErrorKind, Result};
@@ -14,6 +13,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TryRecvError, sync_channel};
 use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// The attributes of an accelerometer and of a gyroscope, by axis.
+pub(super) const ACCELERATION: [&str; 3] = ["in_accel_x", "in_accel_y", "in_accel_z"];
+pub(super) const ROTATION: [&str; 3] = ["in_anglvel_x", "in_anglvel_y", "in_anglvel_z"];
 
 /// The longest that sensors stay off that fell silent.
 pub(super) const COLD: Duration = Duration::from_secs(6);

@@ -1,7 +1,7 @@
 //! The IMU of a camera that is opened.
 
 use super::revival::Revival;
-use super::switch::{COLD, Pair, Switcher};
+use super::switch::{ACCELERATION, COLD, Pair, ROTATION, Switcher};
 use super::{BATCH, Imu, Sensors};
 use crate::iio::{self, Found, Sensor};
 use crate::motion::{self, IMU};
@@ -10,9 +10,6 @@ use crate::realsense::protocol::imu::{ImuCalibration, Place, Rates, rates_of};
 use crate::usb::SysRoot;
 use crate::{DeviceClock, Error, ErrorKind, Result, StreamProfile, StreamRequest, choose_profiles};
 use depthrig_bus::{HostTime, MetadataLevel};
-
-pub(super) const ACCELERATION: [&str; 3] = ["in_accel_x", "in_accel_y", "in_accel_z"];
-pub(super) const ROTATION: [&str; 3] = ["in_anglvel_x", "in_anglvel_y", "in_anglvel_z"];
 
 /// An IMU that is not streaming.
 #[derive(Debug, Clone)]
