@@ -19,6 +19,8 @@ mod synthetic;
 #[cfg(test)]
 mod tests;
 mod v4l2;
+mod value;
+mod wanted;
 mod zed;
 
 pub use depthrig_cdm::Precision;

@@ -12,17 +12,18 @@ mod finding;
 mod host;
 mod kinect;
 mod memory;
+mod plan;
 mod refine;
 #[cfg(test)]
 mod tests;
 
 pub use bandwidth::{LinkLoad, wire_bits_per_s};
-pub use cameras::{CameraPlan, PlannedStream};
 pub use clock::ClockSync;
 pub use disk::{DiskFacts, DiskPlan};
 pub use finding::{Finding, Severity};
 pub use host::Host;
 pub use kinect::{KinectFacts, Missing};
+pub use plan::{CameraPlan, PlannedStream};
 
 use crate::attached::{Ask, Attached, look};
 use crate::config::RigConfig;
@@ -74,7 +75,7 @@ pub fn examine(config: &RigConfig, around: &Surroundings, ask: &dyn Ask) -> crat
 }
 
 /// Judges what was gathered.
-fn judge(config: &RigConfig, attached: &Attached, plans: Vec<cameras::Planned>, host: &Host) -> Report {
+fn judge(config: &RigConfig, attached: &Attached, plans: Vec<plan::Planned>, host: &Host) -> Report {
     let mut findings = Vec::new();
     let mut plans: Vec<_> = plans
         .into_iter()
@@ -88,7 +89,7 @@ fn judge(config: &RigConfig, attached: &Attached, plans: Vec<cameras::Planned>, 
     let links = bandwidth::loads(&plans, attached);
     bandwidth::check(&links, &mut findings);
     bandwidth::check_usbfs(&plans, host, &mut findings);
-    let disk = disk::check(config, &plans, host, &mut findings);
+    let disk = disk::check(config, &plans, &host.disk, &mut findings);
     let shm_needed_bytes = memory::check(config, &plans, host, &mut findings);
     host.check(config, &mut findings);
     refine::check(config, &plans, &mut findings);

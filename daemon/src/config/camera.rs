@@ -1,7 +1,8 @@
 //! From a `[[camera]]` table to [`CameraConfig`]: what all drivers share, and the `files` driver.
 
 use super::read::{Found, Section};
-use super::rig::{not_empty, rate, resolve};
+use super::value::{not_empty, rate, resolve};
+use super::wanted::WantedStream;
 use super::{
     BackendConfig, CameraConfig, FilesSettings, StereoConfig, external, kinect, l515, realsense, refine,
     stereo, synthetic, v4l2, zed,
@@ -139,12 +140,6 @@ fn quaternion_of_rpy_deg(angles: [f64; 3]) -> [f64; 4] {
         cr * cp * sy - sr * sp * cy,
         cr * cp * cy + sr * sp * sy,
     ]
-}
-
-/// A `[[camera.stream]]` and where it stands.
-pub(super) struct WantedStream {
-    pub(super) request: StreamRequest,
-    pub(super) at: usize,
 }
 
 fn streams(camera: &Section<'_, '_>) -> Vec<WantedStream> {

@@ -2,7 +2,7 @@
 
 use super::ExternalSettings;
 use super::read::Section;
-use super::rig::{not_empty, resolve, shown};
+use super::value::{not_empty, resolve, shown};
 use core::time::Duration;
 use std::path::{Path, PathBuf};
 

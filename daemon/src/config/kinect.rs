@@ -2,10 +2,10 @@
 //! is started.
 
 use super::KinectSettings;
-use super::camera::WantedStream;
 use super::controls;
 use super::read::Section;
-use super::rig::{not_empty, resolve, within};
+use super::value::{not_empty, resolve, within};
+use super::wanted::WantedStream;
 use core::ops::RangeInclusive;
 use depthrig_drivers::kinect::live::{CONTROLS, LiveConfig, Places, STREAMS};
 use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackConfig};

@@ -1,9 +1,9 @@
 //! The keys of an `l515` camera. The range of a control is checked by the camera when it is started.
 
 use super::L515Settings;
-use super::camera::WantedStream;
 use super::controls;
 use super::read::Section;
+use super::wanted::WantedStream;
 use depthrig_drivers::StreamRequest;
 use depthrig_drivers::motion::IMU;
 use depthrig_drivers::realsense::protocol::l515::Control;

@@ -2,10 +2,10 @@
 //! checked when it is started; here is what can be known without it.
 
 use super::RealsenseSettings;
-use super::camera::WantedStream;
 use super::controls;
 use super::read::Section;
-use super::rig::{not_empty, resolve, shown, within};
+use super::value::{not_empty, resolve, shown, within};
+use super::wanted::WantedStream;
 use depthrig_bus::StreamName;
 use depthrig_drivers::StreamRequest;
 use depthrig_drivers::motion::IMU;

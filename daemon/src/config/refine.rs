@@ -1,8 +1,8 @@
 //! `[camera.refine]` and `[cdm]`: whether and how a camera's depth is refined.
 
-use super::camera::WantedStream;
 use super::read::Section;
-use super::rig::{MAX_REFINE_HZ, above_zero, not_empty, resolve, within};
+use super::value::{MAX_REFINE_HZ, above_zero, not_empty, resolve, within};
+use super::wanted::WantedStream;
 use super::{CdmConfig, EngineChoice, Precision, RefineConfig, RefineModel};
 use depthrig_bus::PixelFormat;
 use std::path::{Path, PathBuf};

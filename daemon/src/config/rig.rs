@@ -1,12 +1,11 @@
 //! From the tables of the file to [`RigConfig`], with the checks that concern more than one key.
 
 use super::read::{FromToml, Report, Section};
+use super::value::{above_zero, not_empty, rate, resolve, within};
 use super::{
-    BusConfig, ColorCodec, ConfigError, ControlConfig, DepthCodec, MAX_CAMERAS, MAX_RATE_HZ, Phase,
-    RecordingConfig, RigConfig, SetsConfig, SupervisorConfig, camera, refine,
+    BusConfig, ColorCodec, ConfigError, ControlConfig, DepthCodec, MAX_CAMERAS, Phase, RecordingConfig,
+    RigConfig, SetsConfig, SupervisorConfig, camera, refine,
 };
-use core::fmt::{Display, LowerExp};
-use core::ops::RangeInclusive;
 use depthrig_bus::RigName;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -159,58 +158,6 @@ fn check_set_rate(top: &Section<'_, '_>, sets: &SetsConfig, cameras: &[Option<su
             format!("is {} sets a second, but the fastest camera gives {most} frames a second", sets.rate_hz);
         top.problem(at, format!("{} {why}; lower it", s.key_of("rate_hz")));
     }
-}
-
-/// The highest rate of refined depth that can be asked for, Hz; 0 asks for all that the camera gives.
-pub(super) const MAX_REFINE_HZ: f64 = MAX_RATE_HZ;
-
-/// A rate that a camera or the sets may have.
-pub(super) fn rate(hz: f64) -> Result<(), String> {
-    above_zero(MAX_RATE_HZ)(&hz)
-}
-
-pub(super) fn above_zero(most: f64) -> impl Fn(&f64) -> Result<(), String> {
-    move |v| {
-        if *v > 0.0 && *v <= most {
-            Ok(())
-        } else {
-            Err(format!("is {}; it must be above 0 and at most {most}", shown(v)))
-        }
-    }
-}
-
-/// A number as a message shows it: with an exponent where it would have hundreds of digits.
-pub(super) fn shown<T: Display + LowerExp>(number: &T) -> String {
-    let plain = number.to_string();
-    if plain.len() <= 24 { plain } else { format!("{number:e}") }
-}
-
-pub(super) fn within<T: PartialOrd + Display + LowerExp>(
-    range: RangeInclusive<T>,
-) -> impl FnOnce(&T) -> Result<(), String> {
-    move |v| {
-        let (least, most) = (range.start(), range.end());
-        if range.contains(v) {
-            Ok(())
-        } else {
-            Err(format!("is {}; it must be within {least} and {most}", shown(v)))
-        }
-    }
-}
-
-pub(super) fn not_empty(path: &Path) -> Result<(), String> {
-    if path.as_os_str().is_empty() { Err("is empty".to_owned()) } else { Ok(()) }
-}
-
-/// `path` as the file means it: `~/` is the home folder, anything relative starts at `base`.
-pub(super) fn resolve(base: &Path, path: &Path) -> PathBuf {
-    let home = path
-        .strip_prefix("~")
-        .ok()
-        .and_then(|rest| Some(PathBuf::from(std::env::var_os("HOME")?).join(rest)));
-    let path = home.unwrap_or_else(|| base.join(path));
-    // Without the `.` and double slashes that joining leaves behind.
-    path.components().collect()
 }
 
 fn absolute(path: &Path) -> PathBuf {

@@ -1,9 +1,9 @@
 //! `[camera.stereo]`: depth that is made of the two eyes of a camera.
 
 use super::StereoConfig;
-use super::camera::WantedStream;
 use super::read::Section;
-use super::rig::{above_zero, not_empty, resolve, within};
+use super::value::{above_zero, not_empty, resolve, within};
+use super::wanted::WantedStream;
 use crate::zed_replay::Mode;
 use depthrig_calib::stereo::{Matcher, Preset};
 use depthrig_cdm::{StereoNetwork, StereoNetworkOptions};

@@ -4,9 +4,9 @@
 //! otherwise default configuration, and what the driver says of that is reported at the key's own line.
 
 use super::SyntheticSettings;
-use super::camera::WantedStream;
 use super::read::{Found, FromToml, Section, nearest};
-use super::rig::resolve;
+use super::value::resolve;
+use super::wanted::WantedStream;
 use depthrig_bus::Pose;
 use depthrig_drivers::synthetic::models::MODELS;
 use depthrig_drivers::synthetic::{ClockSim, FaultKind, ScheduledFault, StreamOverride, imu, profiles};

@@ -2,7 +2,7 @@
 
 use super::V4l2Settings;
 use super::read::{Found, Section};
-use super::rig::within;
+use super::value::within;
 use depthrig_bus::{Distortion, Intrinsics, StreamName};
 use depthrig_drivers::v4l2::{
     BUFFERS, ClockChoice, ControlValue, GivenIntrinsics, MemoryChoice, MjpegChoice,
@@ -33,7 +33,7 @@ pub(super) fn read(s: &Section<'_, '_>) -> V4l2Settings {
         device_clock_hz: s.or("device_clock_hz", None, |v: &Option<u32>| {
             v.map_or(Ok(()), |hz| within(1000..=1_000_000_000)(&hz))
         }),
-        depth_unit_m: s.or("depth_unit_m", d.depth_unit_m, super::rig::above_zero(1.0)),
+        depth_unit_m: s.or("depth_unit_m", d.depth_unit_m, super::value::above_zero(1.0)),
         intrinsics: s
             .tables("intrinsics", "[[camera.intrinsics]]")
             .into_iter()
@@ -90,7 +90,7 @@ fn intrinsics(s: Section<'_, '_>) -> Option<GivenIntrinsics> {
     let (width, height) = (side("width", "1280"), side("height", "720"));
     let pixels = |key, example| {
         let found = s.required::<f64>(key, example);
-        found.filter(|f| check(&s, key, f, &super::rig::above_zero(1e5)(&f.value))).map(|f| f.value)
+        found.filter(|f| check(&s, key, f, &super::value::above_zero(1e5)(&f.value))).map(|f| f.value)
     };
     let (fx, fy) = (pixels("fx", "910.5"), pixels("fy", "909.8"));
     let (cx, cy) = (pixels("cx", "640.2"), pixels("cy", "361.7"));

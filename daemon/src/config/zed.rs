@@ -1,9 +1,9 @@
 //! The keys of a `zed` camera: one that is attached, or a recording of one (`input`). What the camera itself decides (its
 //! modes, its controls) is checked when it is started.
 
-use super::camera::WantedStream;
 use super::read::Section;
-use super::rig::{not_empty, rate, resolve, within};
+use super::value::{not_empty, rate, resolve, within};
+use super::wanted::WantedStream;
 use super::{BackendConfig, StereoConfig, ZedReplaySettings, ZedSettings};
 use super::{controls, stereo};
 use depthrig_drivers::motion::IMU;

@@ -3,9 +3,9 @@
 //! A camera's pictures go over its own link, over the link of every hub above it, and through its controller; each has a
 //! limit of its own.
 
-use super::cameras::CameraPlan;
 use super::finding::{Finding, Severity};
 use super::host::Host;
+use super::plan::CameraPlan;
 use crate::attached::Attached;
 use crate::stage;
 use depthrig_bus::PixelFormat;

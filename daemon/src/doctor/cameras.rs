@@ -2,56 +2,16 @@
 
 use super::external;
 use super::finding::{Finding, Severity};
-use crate::attached::{Attached, AttachedCamera, Family, ModeReport, UseState};
+use super::plan::{CameraPlan, Planned, mode_missing, no_plan, set_streams};
+use crate::attached::{Attached, AttachedCamera, Family, UseState};
 use crate::config::{BackendConfig, CameraConfig, RigConfig};
 use depthrig_drivers::files::FilesBackend;
+use depthrig_drivers::kinect::KinectConfig;
 use depthrig_drivers::kinect::playback::PlaybackBackend;
-use depthrig_drivers::kinect::{self, KinectConfig};
 use depthrig_drivers::realsense::config::TransportChoice;
 use depthrig_drivers::usb::health::{self, RULE_CURE};
 use depthrig_drivers::zed::replay::ReplayBackend;
 use depthrig_drivers::{Backend, Result, StreamProfile, choose_profiles, synthetic};
-use serde::Serialize;
-
-/// A camera of the rig and the device that it would be.
-#[derive(Debug, Clone, Serialize)]
-pub struct CameraPlan {
-    /// Its name in the rig.
-    pub name: String,
-    /// Its driver.
-    pub backend: &'static str,
-    /// The device that it would be, in words; `None` when none was found.
-    pub device: Option<String>,
-    /// Where that is attached.
-    pub port: Option<String>,
-    /// The streams it would deliver; empty when they are not known.
-    pub streams: Vec<PlannedStream>,
-    /// The worst of its findings.
-    pub worst: Option<Severity>,
-    /// Whether it would be read through libusb.
-    pub libusb: bool,
-    /// The modes of `streams`, with whether each is recorded.
-    #[serde(skip)]
-    pub profiles: Vec<(StreamProfile, bool)>,
-}
-
-/// A stream of a plan.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct PlannedStream {
-    /// Its mode.
-    #[serde(flatten)]
-    pub mode: ModeReport,
-    /// What it takes of the USB, Mbit/s; 0 when it is on none.
-    pub usb_mbit_s: f64,
-    /// Whether it is recorded.
-    pub recorded: bool,
-}
-
-/// A plan with what is wrong with it.
-pub(super) struct Planned {
-    pub(super) plan: CameraPlan,
-    pub(super) findings: Vec<Finding>,
-}
 
 /// Which device a camera of the rig means.
 pub(super) struct Wanted<'c> {
@@ -123,19 +83,6 @@ pub(super) fn plan(config: &RigConfig, attached: &Attached) -> Vec<Planned> {
     config.cameras.iter().map(plan_one).collect()
 }
 
-pub(super) fn no_plan(camera: &CameraConfig, backend: &'static str) -> CameraPlan {
-    CameraPlan {
-        name: camera.name.to_string(),
-        backend,
-        device: None,
-        port: None,
-        streams: Vec::new(),
-        worst: None,
-        libusb: false,
-        profiles: Vec::new(),
-    }
-}
-
 /// A camera that is a device of the family that `backend` drives.
 pub(super) fn plan_device(
     camera: &CameraConfig,
@@ -160,20 +107,6 @@ pub(super) fn plan_device(
     }
     let findings = findings.into_iter().map(|f| f.of(camera.name.as_str())).collect();
     Planned { plan, findings }
-}
-
-pub(super) fn mode_missing(device: &AttachedCamera, what: &str) -> Finding {
-    let cure = "write one of its modes into [[camera.stream]]";
-    Finding::new(
-        Severity::Error,
-        "mode_missing",
-        what,
-        "the camera is not started in a mode that it does not have, so it would be missing from every set",
-        match device.usb.as_ref().and_then(health::slow_link) {
-            Some(slow) => format!("{slow}; or {cure}"),
-            None => cure.to_owned(),
-        },
-    )
 }
 
 /// A camera that is no device: synthetic, a folder of pictures, or a recording.
@@ -228,38 +161,6 @@ fn plan_made(camera: &CameraConfig) -> Planned {
         ),
     }
     Planned { plan, findings }
-}
-
-pub(super) fn set_streams(
-    plan: &mut CameraPlan,
-    camera: &CameraConfig,
-    chosen: Vec<StreamProfile>,
-    on_usb: bool,
-    findings: &mut Vec<Finding>,
-) {
-    let made = camera.makes(&chosen).unwrap_or_else(|e| {
-        let (why, cure) =
-            ("the camera does not start: its depth cannot be refined", "correct what the message names");
-        let finding = Finding::new(Severity::Error, "refine_impossible", e.to_string(), why, cure);
-        findings.push(finding.of(camera.name.as_str()));
-        Vec::new()
-    });
-    let captured = chosen.into_iter().map(|p| {
-        let recorded = camera.records(&p.stream);
-        (p, recorded)
-    });
-    let captured: Vec<_> = captured.collect();
-    let with_depth = captured.iter().any(|(p, _)| p.stream.as_str() == "depth");
-    for (p, recorded) in captured.into_iter().chain(made) {
-        let on_usb = on_usb && !camera.is_made_here(&p.stream);
-        let bits_per_s = match plan.backend {
-            kinect::NAME => kinect::live::wire_bits_per_s(&p, with_depth),
-            _ => super::wire_bits_per_s(&p),
-        };
-        let usb_mbit_s = if on_usb { bits_per_s / 1e6 } else { 0.0 };
-        plan.streams.push(PlannedStream { mode: ModeReport::from(&p), usb_mbit_s, recorded });
-        plan.profiles.push((p, recorded));
-    }
 }
 
 /// The attached camera that is meant, or what to say when there is none.

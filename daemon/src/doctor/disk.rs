@@ -1,8 +1,7 @@
 //! The disk of the recordings: room, and how fast it takes what the rig writes.
 
-use super::cameras::CameraPlan;
 use super::finding::{Finding, Severity};
-use super::host::Host;
+use super::plan::CameraPlan;
 use crate::config::RigConfig;
 use crate::recording::{budget, reserve_bytes};
 use core::time::Duration;
@@ -116,7 +115,7 @@ fn write_rate(mut file: File) -> io::Result<f64> {
 pub(super) fn check(
     config: &RigConfig,
     plans: &[CameraPlan],
-    host: &Host,
+    disk: &DiskFacts,
     findings: &mut Vec<Finding>,
 ) -> DiskPlan {
     let recorded = plans.iter().flat_map(|p| &p.profiles).filter(|(_, recorded)| *recorded).map(|(p, _)| p);
@@ -124,7 +123,6 @@ pub(super) fn check(
     let streams = pictures.iter().map(|p| (p.format, p.frame_bytes()));
     let needed = budget::bytes_per_s(streams, config.sets.rate_hz, &config.recording)
         + budget::motion_bytes_per_s(units.iter().map(|p| p.samples_hz()).sum());
-    let disk = &host.disk;
     let directory = config.recording.directory.display();
     let reserve = reserve_bytes(&config.recording);
     let room = disk.free_bytes.map(|free| free.saturating_sub(reserve));

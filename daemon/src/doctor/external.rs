@@ -1,7 +1,7 @@
 //! Cameras that another process serves: whether it does, what it offers, and whether the daemon could start it.
 
-use super::cameras::{Planned, mode_missing, no_plan, set_streams};
 use super::finding::{Finding, Severity};
+use super::plan::{Planned, mode_missing, no_plan, set_streams};
 use crate::attached::{Attached, UseState, place_of_served};
 use crate::config::{CameraConfig, ExternalSettings};
 use depthrig_drivers::choose_profiles;

@@ -1,8 +1,8 @@
 //! Shared memory against the slots that the rig asks for.
 
-use super::cameras::CameraPlan;
 use super::finding::{Finding, Severity};
 use super::host::Host;
+use super::plan::CameraPlan;
 use crate::config::RigConfig;
 use depthrig_bus::shm;
 

@@ -1,7 +1,7 @@
 //! Refined depth: models that are not installed, a library that is not there, rates that a CPU does not reach.
 
-use super::cameras::CameraPlan;
 use super::finding::{Finding, Severity};
+use super::plan::CameraPlan;
 use crate::config::{CameraConfig, EngineChoice, RefineConfig, RigConfig};
 use crate::stage::{Installed, Plan, Refiners, models};
 use depthrig_cdm::{Encoder, EngineKind, find_library};

@@ -2,7 +2,8 @@
 //! finding has its case.
 #![allow(clippy::type_complexity, clippy::too_many_lines, clippy::format_collect)] // tables of cases
 
-use super::cameras::{self, Planned};
+use super::cameras;
+use super::plan::Planned;
 use super::*;
 use crate::attached::look;
 use crate::attached::tests::{Made, kinect_half, profile, rig_with};

@@ -2,13 +2,18 @@
 
 use super::input::{Facts, Input};
 use super::pictures::Maker;
-use super::{CpuReport, Mode, ModeReport, ZedReplayOptions, ZedReplayReport, modes, record};
+use super::{CpuReport, Mode, ModeReport, ZedReplayOptions, ZedReplayReport, modes};
 use depthrig_bus::{PixelFormat, StreamId};
 use depthrig_calib::stereo::{Description, RowOffset};
 use depthrig_calib::{PoseExt, Rectifier};
 use depthrig_recorder::{ColorCodec, Computed, Error, ErrorKind, Result, StreamRecord};
 use std::path::Path;
 use std::sync::Arc;
+
+/// Pairs in work beyond one for each thread.
+pub(super) const AHEAD: usize = 2;
+/// Sets that wait for the recorder's encoders.
+pub(super) const QUEUE_SETS: usize = 2;
 
 /// All that is known before the first pair is matched.
 pub(super) struct Plan {
@@ -80,7 +85,7 @@ impl Plan {
     fn memory(&self, jobs: usize) -> u64 {
         let of = |g: &modes::Group| g.memory_bytes.saturating_mul(g.most.min(jobs) as u64);
         let matchers: u64 = self.groups.iter().map(of).sum();
-        let pairs = (jobs + record::AHEAD + record::QUEUE_SETS + 1) as u64;
+        let pairs = (jobs + AHEAD + QUEUE_SETS + 1) as u64;
         matchers.saturating_add(self.maker.pair_bytes(self.modes.len()).saturating_mul(pairs))
     }
 

@@ -4,7 +4,7 @@ use super::engine::{Cpu, Done, Engine, State};
 use super::input::Input;
 use super::modes::Group;
 use super::pictures::{Color, Numbers};
-use super::plan::Plan;
+use super::plan::{AHEAD, Plan, QUEUE_SETS};
 use super::work::{self, RecordedClock};
 use super::{CpuReport, Step, ZedReplayProgress, ZedReplayReport};
 use depthrig_bus::clock::process_cpu_ns;
@@ -20,10 +20,6 @@ use std::time::Duration;
 
 /// What a killed run repeats at most: the pairs of this much recorded time.
 const SEGMENT_NS: i64 = 10_000_000_000;
-/// Pairs in work beyond one for each thread.
-pub(super) const AHEAD: usize = 2;
-/// Sets that wait for the recorder's encoders.
-pub(super) const QUEUE_SETS: usize = 2;
 /// Time between looks at a recorder that has no room.
 const PAUSE: Duration = Duration::from_millis(2);
 
