@@ -34,6 +34,7 @@ mod options;
 mod outside;
 mod recorder;
 mod recover;
+mod recovered;
 pub mod report;
 mod select;
 mod session;
@@ -69,10 +70,10 @@ pub use recover::{
 };
 pub use select::{Edge, Moment, SetSpan};
 pub use session::{
-    Computed, Edit, FORMAT, MotionRecord, NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE, Session,
+    Computed, Derived, Edit, FORMAT, MotionRecord, NOTE_MAX_BYTES, Note, Outcome, SESSION_FILE, Session,
     SessionChanges, StreamRecord, check_name, edit, rename,
 };
-pub use slice::{Derived, SliceOptions, SliceProgress, SliceReport, merge, trim};
+pub use slice::{SliceOptions, SliceProgress, SliceReport, merge, trim};
 pub use still::{StillFormat, npy_file, still};
 pub use verify::{
     Finding, Severity, VerifyOptions, VerifyProgress, VerifyReport, verify, verify_watched, verify_with,

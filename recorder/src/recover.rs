@@ -19,7 +19,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 mod dry;
-pub(crate) mod facts;
+mod facts;
 mod head;
 mod lost;
 mod segment;
@@ -39,8 +39,6 @@ const GONE_MAX: usize = 1000;
 /// What a dry run cannot know.
 const UNKNOWN_IN_DRY_RUN: &str =
     "nothing was written: a disk that fails or fills up meanwhile would stop the recovery";
-/// The metadata record that says what was lost.
-pub(crate) const RECOVERED_METADATA: &str = "depthrig.recovered";
 
 /// How to recover.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

@@ -17,6 +17,7 @@ mod account;
 pub mod curves;
 mod gather;
 mod html;
+mod markup;
 pub mod page;
 mod pixels;
 mod series;

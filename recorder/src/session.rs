@@ -68,7 +68,7 @@ pub struct Session {
     pub history: Vec<Edit>,
     /// What it was cut from or joined from, oldest first; empty for a recording as it was made.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub derived: Vec<crate::Derived>,
+    pub derived: Vec<Derived>,
     /// Streams that no camera gave, with what computed them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub computed: Vec<Computed>,
@@ -128,6 +128,26 @@ impl core::fmt::Display for Computed {
         }
         if self.parameters.is_empty() { Ok(()) } else { write!(f, ": {}", self.parameters) }
     }
+}
+
+/// One step of how a dataset came to be after its recording, in `session.toml` under `[[derived]]`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Derived {
+    /// `trim` or `merge`.
+    pub by: String,
+    /// When, UTC nanoseconds since 1970.
+    pub utc_ns: i64,
+    /// The version of depthrig that did it.
+    pub depthrig_version: String,
+    /// File names of what it was made from.
+    pub from: Vec<String>,
+    /// Log time of the first set, UTC nanoseconds since 1970.
+    pub first_utc_ns: i64,
+    /// Log time of the last set.
+    pub last_utc_ns: i64,
+    /// Sets that were offered to the recorder before its own begin: `FrameSet.sets_offered` counts these as well.
+    #[serde(default)]
+    pub offered_before: u64,
 }
 
 /// A note of the operator.

@@ -11,9 +11,9 @@ use crate::dataset::Dataset;
 use crate::fs::Fs;
 use crate::recorder::topics::SESSION_METADATA;
 use crate::select::SetSpan;
-use crate::{Error, ErrorKind, RecorderOptions, Result, Session};
+use crate::{Derived, Error, ErrorKind, RecorderOptions, Result, Session};
 use depthrig_bus::UtcPair;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
@@ -41,26 +41,6 @@ impl Default for SliceOptions {
         let o = RecorderOptions::default();
         Self { segment_max_bytes: o.segment_max_bytes, segment_max_ns: o.segment_max_ns }
     }
-}
-
-/// One step of how a dataset came to be after its recording, in `session.toml` under `[[derived]]`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Derived {
-    /// `trim` or `merge`.
-    pub by: String,
-    /// When, UTC nanoseconds since 1970.
-    pub utc_ns: i64,
-    /// The version of depthrig that did it.
-    pub depthrig_version: String,
-    /// File names of what it was made from.
-    pub from: Vec<String>,
-    /// Log time of the first set, UTC nanoseconds since 1970.
-    pub first_utc_ns: i64,
-    /// Log time of the last set.
-    pub last_utc_ns: i64,
-    /// Sets that were offered to the recorder before its own begin: `FrameSet.sets_offered` counts these as well.
-    #[serde(default)]
-    pub offered_before: u64,
 }
 
 /// What was made.

@@ -21,6 +21,7 @@ mod judge;
 mod motion;
 mod pictures;
 mod records;
+mod seen;
 mod segment;
 mod sets;
 

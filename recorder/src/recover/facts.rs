@@ -1,12 +1,12 @@
 //! Whether a segment is whole, and what it says of itself.
 
-use super::RECOVERED_METADATA;
 use crate::container::scan::SegmentReader;
 use crate::fs::Fs;
 use crate::msgs::accounts;
 use crate::msgs::frame_set::FrameSetMsg;
 use crate::msgs::schemas::Schema;
 use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA};
+use crate::recovered::{RECOVERED_METADATA, sets_lost};
 use crate::{Result, SetCounts};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -51,11 +51,6 @@ impl Facts {
         self.lost.extend(facts.get("lost").into_iter().flat_map(|l| l.lines()).map(str::to_owned));
         self.sets_lost = self.sets_lost.saturating_add(sets_lost(facts));
     }
-}
-
-/// Sets that a recovery found lost, at most, as the segment's metadata says.
-pub(crate) fn sets_lost(recovered: &BTreeMap<String, String>) -> u64 {
-    recovered.get("sets_lost").and_then(|n| n.parse().ok()).unwrap_or(0)
 }
 
 /// What the segment says of itself by its index; `None` when it is unfinished or its index is damaged.

@@ -4,16 +4,17 @@
 //! or in the first second of a recording, the head is compared with the one that the recorder writes for this session,
 //! and that one is taken where they differ.
 
-use super::segment::Rebuild;
 use crate::container::MAGIC;
 use crate::container::copy::{Group, Groups, SetGroup, read_preamble};
 use crate::container::scan::SegmentReader;
 use crate::container::segment::Preamble;
 use crate::dataset::segment_number;
 use crate::encode::Codec;
+use crate::fs::Fs;
 use crate::msgs::frame_info;
 use crate::recorder::topics::{SESSION_METADATA, Topics, image_channel};
 use crate::{ColorCodec, DepthCodec, RecorderOptions, Result, Session};
+use std::path::{Path, PathBuf};
 
 /// The head of a segment.
 pub(super) struct Head {
@@ -52,9 +53,19 @@ pub(super) fn session_in(preamble: &Preamble, reader: &SegmentReader) -> Option<
     Session::from_toml(text, &reader.path).ok()
 }
 
-impl Rebuild<'_> {
+/// Finds the head that a segment should have.
+pub(super) struct HeadSearch<'a> {
+    pub(super) fs: &'a dyn Fs,
+    /// The segment.
+    pub(super) path: &'a Path,
+    /// All segments of the dataset.
+    pub(super) segments: &'a [PathBuf],
+    pub(super) session: &'a Session,
+}
+
+impl HeadSearch<'_> {
     /// The head for a copy of `reader`, its own one unless it should be `foreign`.
-    pub(super) fn head(&self, reader: &SegmentReader, foreign: bool) -> Result<Head> {
+    pub(super) fn run(&self, reader: &SegmentReader, foreign: bool) -> Result<Head> {
         let own = if foreign { None } else { own_head(reader)? };
         let Some(own) = own else {
             let first = MAGIC.len().min(reader.size as usize) as u64;

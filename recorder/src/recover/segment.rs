@@ -1,10 +1,10 @@
 //! One segment: whether it is whole, and if not, a proven copy of what is.
 
+use super::TEMPORARY;
 use super::dry::{DryFs, Same};
 use super::facts::Facts;
-use super::head::{Head, own_head};
+use super::head::{Head, HeadSearch, own_head};
 use super::lost::Lost;
-use super::{RECOVERED_METADATA, TEMPORARY};
 use crate::container::chunk::{Chunk, ChunkBuilder, MessageHead};
 use crate::container::copy::{BetweenGroup, Damage, DamageKind, Group, Groups, SetGroup};
 use crate::container::scan::SegmentReader;
@@ -15,6 +15,7 @@ use crate::msgs::frame_set::Checkpoint;
 use crate::msgs::schemas::Schema;
 use crate::msgs::{accounts, tf};
 use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA};
+use crate::recovered::RECOVERED_METADATA;
 use crate::verify::Finding;
 use crate::{Error, ErrorKind, Result, Session};
 use std::collections::BTreeMap;
@@ -145,7 +146,9 @@ impl Rebuild<'_> {
         let reader = SegmentReader::open_any(self.fs, self.path)?;
         let file = self.path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let mut lost = Lost { bytes: reader.size, file, ..Lost::default() };
-        let head = self.head(&reader, choice.foreign_head)?;
+        let search =
+            HeadSearch { fs: self.fs, path: self.path, segments: self.segments, session: self.session };
+        let head = search.run(&reader, choice.foreign_head)?;
         // A file that was only just created has nothing to lose.
         lost.head_rebuilt = head.rebuilt && reader.size > 0;
         if reader.size == 0 && self.had_content() {

@@ -1,7 +1,7 @@
 //! Plots with several series side by side: curves over a value, and bars by class. Each series has a colour, a dash and
 //! its name, so that nothing is told by colour alone.
 
-use super::html::escape;
+use super::markup::escape;
 use super::svg::{begin, line, nice_step, number, text};
 use std::fmt::Write;
 

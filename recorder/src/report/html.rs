@@ -1,5 +1,6 @@
 //! The report as one page. Every text that somebody could have chosen goes through [`escape`].
 
+use super::markup::{END_TABLE, escape, row, table};
 use super::pixels::viridis;
 use super::svg::number;
 use super::{Report, Shown};
@@ -10,29 +11,8 @@ use std::fmt::Write;
 
 mod plots;
 
-/// The look of all pages.
-pub(super) const CSS: &str = include_str!("page.css");
-
 /// Notes and edits that are shown.
 const LISTED_MAX: usize = 50;
-
-/// Text as it stands in HTML and XML, in attributes too; control characters, which XML cannot hold, are replaced.
-pub fn escape(text: &str) -> String {
-    let mut out = String::with_capacity(text.len());
-    for c in text.chars() {
-        match c {
-            '&' => out.push_str("&amp;"),
-            '<' => out.push_str("&lt;"),
-            '>' => out.push_str("&gt;"),
-            '"' => out.push_str("&quot;"),
-            '\'' => out.push_str("&#39;"),
-            '\n' | '\t' => out.push(c),
-            c if c.is_control() || matches!(c, '\u{fffe}' | '\u{ffff}') => out.push('\u{fffd}'),
-            c => out.push(c),
-        }
-    }
-    out
-}
 
 fn length(ns: i64) -> String {
     let s = ns as f64 / 1e9;
@@ -166,31 +146,6 @@ fn named_list(out: &mut String, name: &str, mut lines: Vec<String>) {
     let _ = write!(out, "<p class=\"sub\">{name}</p>");
     list(out, &lines);
 }
-
-/// Begins a table; columns whose name begins with `#` are numbers.
-pub fn table(out: &mut String, columns: &[&str]) {
-    out.push_str("<div class=\"wide\"><table><thead><tr>");
-    for name in columns {
-        let _ = match name.strip_prefix('#') {
-            Some(name) => write!(out, "<th class=\"n\">{name}</th>"),
-            None => write!(out, "<th>{name}</th>"),
-        };
-    }
-    out.push_str("</tr></thead><tbody>");
-}
-
-/// A row; cells are escaped here.
-pub fn row(out: &mut String, columns: &[&str], cells: &[String]) {
-    out.push_str("<tr>");
-    for (name, cell) in columns.iter().zip(cells) {
-        let class = if name.starts_with('#') { " class=\"n\"" } else { "" };
-        let _ = write!(out, "<td{class}>{}</td>", escape(cell));
-    }
-    out.push_str("</tr>");
-}
-
-/// What ends a table.
-pub const END_TABLE: &str = "</tbody></table></div>";
 
 fn streams(out: &mut String, r: &Report) {
     const COLUMNS: [&str; 9] = [
@@ -372,11 +327,6 @@ fn footer(out: &mut String, r: &Report) {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn escaped_text_is_text_everywhere() {
-        assert_eq!(escape("<script>&\"'\0\u{1b}\n"), "&lt;script&gt;&amp;&quot;&#39;\u{fffd}\u{fffd}\n");
-    }
 
     #[test]
     fn numbers_read_well() {

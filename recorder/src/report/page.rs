@@ -2,12 +2,12 @@
 //!
 //! A page needs no script, no network and no other file, is well-formed XML, and reads well dark and on paper.
 
-use super::html::CSS;
+use super::markup::CSS;
 use super::pixels::{self, Picture, Small};
 use crate::Result;
 use depthrig_bus::FrameHeader;
 
-pub use super::html::{END_TABLE, escape, row, table};
+pub use super::markup::{END_TABLE, escape, row, table};
 pub use super::svg::{nice_end, nice_step, number};
 
 /// The beginning of a page of this title, which is text.

@@ -4,7 +4,7 @@
 //! Written here because it is short: `plotters` with its SVG back end brings fonts and colours of its own, which
 //! neither dark mode nor paper could change.
 
-use super::html::escape;
+use super::markup::escape;
 use std::fmt::Write;
 
 /// Width of every plot; the page scales it.

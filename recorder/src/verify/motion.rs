@@ -1,18 +1,19 @@
 //! Motion units: batches whole and in their order, and the single samples beside them.
 
-use super::segment::Pass;
-use super::sets::Walk;
+mod set;
+
 use super::{Findings, Severity};
 use crate::container::scan::Message;
 use crate::dataset::{Kind, MotionCount};
 use crate::msgs::frame_info;
-use crate::msgs::frame_set::FrameSetMsg;
 use crate::msgs::motion::{Batch, Imu, read_samples};
 use crate::msgs::tf::unit_frame;
-use crate::recorder::topics::{MOTION_CODEC, check_batch};
+use crate::recorder::topics::MOTION_CODEC;
 use crate::{Error, ErrorKind, RecordMotion, Result, SET_MOTION_MAX_BYTES, Session};
 use depthrig_bus::{FrameFlags, FrameHeader, StreamId};
 use std::collections::BTreeMap;
+
+pub(super) use set::set;
 
 /// The messages of motion units since the last commit mark.
 #[derive(Default)]
@@ -207,85 +208,4 @@ impl Unit {
         problems.truncate(3);
         problems
     }
-}
-
-/// Takes the motion of a set by its mark, which lies in the chunk at `offset`.
-pub(super) fn set(walk: &mut Walk, pass: &mut Pass<'_>, set: &FrameSetMsg, log_time: u64, offset: u64) {
-    let Messages { batches, stray, mut single, .. } = std::mem::take(&mut pass.motion);
-    let mut problems = Vec::new();
-    for (unit, n) in stray {
-        problems.push(format!("{n} batches of {unit} have no frame_info"));
-    }
-    let mut expected: BTreeMap<StreamId, Vec<Imu>> = BTreeMap::new();
-    for batch in batches {
-        let Waiting { unit: id, log_time: at, header, stamp_utc_ns, is_named, samples } = batch;
-        let mut say = |what: &str| problems.push(format!("batch {} of {id}: {what}", header.sequence));
-        if at != log_time {
-            say("it has another log time than its set");
-            continue;
-        }
-        if !is_named {
-            say("its frame_info names another frame or codec than a motion unit's");
-        }
-        if header.set_id != set.id {
-            say("its frame_info is of another set");
-        }
-        let stamp = header.capture_time_ns.saturating_add(set.utc_offset_ns);
-        if stamp_utc_ns != stamp || samples.as_ref().is_some_and(|s| s.stamp_utc_ns != stamp) {
-            say("its stamp is not its time");
-        }
-        if let Some(what) = walk.header(&id, &header) {
-            say(&what);
-        }
-        let Some(samples) = samples else {
-            say("it has no samples");
-            continue;
-        };
-        // Said of its channels already.
-        let Some(unit) = walk.units.0.get_mut(&id) else { continue };
-        if samples.sequence != header.sequence {
-            say(&format!("its samples are those of batch {}", samples.sequence));
-        }
-        if let Err(what) = check_batch(&header, samples.samples.len(), unit.most) {
-            say(&what);
-        }
-        let single = samples.samples.iter().map(|s| Imu::of(s, set.utc_offset_ns));
-        expected.entry(id.clone()).or_default().extend(single);
-        unit.follow(&header, samples).iter().for_each(|what| say(what));
-    }
-    for (id, expected) in expected {
-        let got = single.remove(&id).unwrap_or_default();
-        problems.extend(differing(&id, &expected, &got, walk.compares_singles));
-    }
-    for (id, got) in single {
-        problems.push(format!("{} single samples of {id} belong to no batch", got.count));
-    }
-    for problem in problems {
-        pass.broken(Some(offset), format!("set {}: {problem}", set.id));
-    }
-}
-
-/// What the single samples of a unit in a set say otherwise than its batches.
-fn differing(id: &StreamId, expected: &[Imu], got: &Single, decode: bool) -> Option<String> {
-    if got.count != expected.len() as u64 {
-        return Some(format!(
-            "{id} has {} samples in its batches, {} single ones",
-            expected.len(),
-            got.count
-        ));
-    }
-    if !decode {
-        return None;
-    }
-    let frame_id = crate::msgs::tf::unit_frame(id);
-    if got.frames_differ || got.frame_id != frame_id {
-        return Some(format!("a single sample of {id} is of another frame than {frame_id}"));
-    }
-    let mut pairs = expected.iter().zip(&got.values);
-    let at = pairs.position(|(e, (g, time))| {
-        let same_time =
-            e.stamp_utc_ns == g.stamp_utc_ns && u64::try_from(e.stamp_utc_ns).unwrap_or(0) == *time;
-        !(same_time && e.same_values(g))
-    });
-    at.map(|at| format!("single sample {} of {id} says otherwise than its batch", at + 1))
 }

@@ -6,10 +6,11 @@
 //! nothing proves, and every picture when it is to be decoded, are unpacked by workers, see `pictures`.
 
 use super::index::Contents;
-use super::motion::{self, Messages};
+use super::motion;
 use super::pictures::{Pictures, with_workers};
 use super::records::Records;
-use super::sets::{Picture, Proof, Walk};
+use super::seen::{MESSAGE_HEAD, Picture, Proof, Seen};
+use super::sets::Walk;
 use super::{Findings, Severity, Watch, file_name};
 use crate::container::record::op;
 use crate::container::scan::{ChannelInfo, HEAD, Message, SegmentReader};
@@ -18,34 +19,22 @@ use crate::fs::Fs;
 use crate::msgs::frame_set::{Checkpoint, FrameSetMsg, read_clock_pair};
 use crate::msgs::schemas::Schema;
 use crate::recorder::topics::{SEGMENT_METADATA, SESSION_METADATA};
-use crate::recover::RECOVERED_METADATA;
-use crate::recover::facts::sets_lost;
+use crate::recovered::{RECOVERED_METADATA, sets_lost};
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::StreamId;
 use mcap::records::Record;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// Opcode, length, channel, sequence, log time and publish time of a message.
-pub(super) const MESSAGE_HEAD: u64 = HEAD + 2 + 4 + 8 + 8;
-
 /// What one segment's pass collects.
 pub(super) struct Pass<'a> {
-    pub(super) file: String,
-    pub(super) findings: &'a mut Findings,
-    /// Pictures in chunks from here on are unpacked.
-    pub(super) unproven: u64,
+    seen: Seen<'a>,
     schemas: BTreeMap<u16, String>,
     kinds: BTreeMap<u16, Kind>,
     camera_infos: BTreeMap<u16, StreamId>,
     accounts_channel: Option<u16>,
     clock: Option<u16>,
     checkpoints: Option<u16>,
-    /// Messages since the last commit mark.
-    pub(super) pictures: BTreeMap<StreamId, Picture>,
-    pub(super) infos: BTreeMap<StreamId, (u64, Vec<u8>)>,
-    pub(super) calibrated: BTreeSet<StreamId>,
-    pub(super) motion: Messages,
     contents: Contents,
     stands_alone: bool,
     /// Channel, time and offset of each message of the last chunk that no index record has named yet.
@@ -140,29 +129,19 @@ fn read(
 impl<'a> Pass<'a> {
     fn new(file: &str, findings: &'a mut Findings, unproven: u64) -> Self {
         Self {
-            file: file.to_owned(),
-            findings,
-            unproven,
+            seen: Seen::new(file, findings, unproven),
             schemas: BTreeMap::new(),
             kinds: BTreeMap::new(),
             camera_infos: BTreeMap::new(),
             accounts_channel: None,
             clock: None,
             checkpoints: None,
-            pictures: BTreeMap::new(),
-            infos: BTreeMap::new(),
-            calibrated: BTreeSet::new(),
-            motion: Messages::default(),
             contents: Contents::default(),
             stands_alone: false,
             unlisted: BTreeSet::new(),
             crc: crc32fast::Hasher::new(),
             proven: 0,
         }
-    }
-
-    pub(super) fn broken(&mut self, offset: Option<u64>, what: impl Into<String>) {
-        self.findings.add(Severity::Broken, &self.file, offset, what);
     }
 
     fn run(
@@ -178,20 +157,20 @@ impl<'a> Pass<'a> {
             return Ok(());
         }
         if !self.stands_alone {
-            self.broken(None, "it does not stand alone: the session is not in it");
+            self.seen.broken(None, "it does not stand alone: the session is not in it");
         }
         for what in walk.units.channels(&self.kinds.values()) {
-            self.broken(None, what);
+            self.seen.broken(None, what);
         }
-        if !self.pictures.is_empty() {
-            let n = self.pictures.len();
-            let at = self.pictures.values().map(|p| p.offset).min();
-            self.broken(at, format!("a torn set: {n} pictures have no commit mark after them"));
+        if !self.seen.pictures.is_empty() {
+            let n = self.seen.pictures.len();
+            let at = self.seen.pictures.values().map(|p| p.offset).min();
+            self.seen.broken(at, format!("a torn set: {n} pictures have no commit mark after them"));
         }
         match ended {
             Ok(Some(summary)) => self.summary(reader, summary, finished),
             Ok(None) if finished => {
-                self.broken(None, "the data has no end record");
+                self.seen.broken(None, "the data has no end record");
                 Ok(())
             }
             // Said already: the file is unfinished and cut here.
@@ -218,7 +197,7 @@ impl<'a> Pass<'a> {
             if raw.opcode != op::MESSAGE_INDEX && !self.unlisted.is_empty() {
                 let what =
                     format!("{} messages of the chunk before are in no message index", self.unlisted.len());
-                self.broken(Some(offset), what);
+                self.seen.broken(Some(offset), what);
                 self.unlisted.clear();
             }
             match raw.opcode {
@@ -229,7 +208,7 @@ impl<'a> Pass<'a> {
                             self.proven = reader.size;
                         } else if saved != 0 {
                             let what = format!("the data's checksum is {crc:08x}, the file says {saved:08x}");
-                            self.broken(Some(offset), what);
+                            self.seen.broken(Some(offset), what);
                         }
                     }
                     return Ok(Some(offset + length));
@@ -242,7 +221,7 @@ impl<'a> Pass<'a> {
                             if !self.unlisted.remove(&(index.channel_id, e.log_time, e.offset)) {
                                 let channel = index.channel_id;
                                 let what = format!("a message index points to nothing (channel {channel})");
-                                self.broken(Some(offset), what);
+                                self.seen.broken(Some(offset), what);
                             }
                         }
                     }
@@ -279,11 +258,11 @@ impl<'a> Pass<'a> {
                 self.stands_alone |= m.name == SESSION_METADATA;
                 if let Some(error) = m.metadata.get("error").filter(|_| m.name == SEGMENT_METADATA) {
                     let what = format!("the recording ended before its time: {error}");
-                    self.findings.add(Severity::Lost, &self.file, Some(offset), what);
+                    self.seen.findings.add(Severity::Lost, &self.seen.file, Some(offset), what);
                 }
                 if let Some(lost) = m.metadata.get("lost").filter(|_| m.name == RECOVERED_METADATA) {
                     for what in lost.lines() {
-                        self.findings.add(Severity::Lost, &self.file, Some(offset), what);
+                        self.seen.findings.add(Severity::Lost, &self.seen.file, Some(offset), what);
                     }
                 }
             }
@@ -323,24 +302,24 @@ impl<'a> Pass<'a> {
         if let Some((id, picture)) = self.lone_picture(&header, offset, raw.after) {
             self.contents.message(picture.channel);
             self.unlisted.insert((picture.channel, picture.log_time, 0));
-            self.pictures.insert(id, picture);
+            self.seen.pictures.insert(id, picture);
             return Ok(());
         }
         let read = reader.chunk_messages(raw.body(), offset, |m| {
             self.contents.message(m.channel);
             self.unlisted.insert((m.channel, m.log_time, m.offset));
             if m.log_time < header.message_start_time || m.log_time > header.message_end_time {
-                self.broken(Some(offset), "a message lies outside of the times of its chunk");
+                self.seen.broken(Some(offset), "a message lies outside of the times of its chunk");
             }
             if let Err(e) = self.message(walk, pictures, &m, offset) {
-                self.broken(Some(offset), e.to_string());
+                self.seen.broken(Some(offset), e.to_string());
             }
             Ok(())
         });
         if let Err(e) = read {
             // The next chunk may be whole.
             self.unlisted.clear();
-            self.broken(Some(offset), e.to_string());
+            self.seen.broken(Some(offset), e.to_string());
         }
         Ok(())
     }
@@ -381,34 +360,34 @@ impl<'a> Pass<'a> {
         offset: u64,
     ) -> Result<()> {
         if self.accounts_channel == Some(m.channel) {
-            return walk.account(self, m.data, offset);
+            return walk.account(&mut self.seen, m.data, offset);
         }
         if self.clock == Some(m.channel) {
-            walk.clock(self, read_clock_pair(m.data)?, m.log_time, offset);
+            walk.clock(&mut self.seen, read_clock_pair(m.data)?, m.log_time, offset);
             return Ok(());
         }
         if self.checkpoints == Some(m.channel) {
             return self.checkpoint(Checkpoint::read(m.data)?, offset);
         }
         if let Some(id) = self.camera_infos.get(&m.channel) {
-            self.calibrated.insert(id.clone());
+            self.seen.calibrated.insert(id.clone());
             return Ok(());
         }
         match self.kinds.get(&m.channel) {
-            Some(kind) if self.motion.take(kind, m, walk.compares_singles)? => {}
+            Some(kind) if self.seen.motion.take(kind, m, walk.compares_singles)? => {}
             Some(Kind::Picture(id)) => {
                 let (len, proof) = (m.data.len() as u64, Proof::Crc(crc32fast::hash(m.data)));
                 let picture = Picture { offset, channel: m.channel, log_time: m.log_time, len, proof };
-                self.pictures.insert(id.clone(), picture);
+                self.seen.pictures.insert(id.clone(), picture);
             }
             Some(Kind::Info(id)) => {
-                self.infos.insert(id.clone(), (m.log_time, m.data.to_vec()));
+                self.seen.infos.insert(id.clone(), (m.log_time, m.data.to_vec()));
             }
             Some(Kind::Set) => {
                 let set = FrameSetMsg::read(m.data)?;
-                walk.set(self, &set, m.log_time, offset, pictures);
-                motion::set(walk, self, &set, m.log_time, offset);
-                (self.pictures, self.infos, self.calibrated) = Default::default();
+                walk.set(&mut self.seen, &set, m.log_time, offset, pictures);
+                motion::set(walk, &mut self.seen, &set, m.log_time, offset);
+                (self.seen.pictures, self.seen.infos, self.seen.calibrated) = Default::default();
             }
             Some(_) | None => {}
         }
@@ -439,12 +418,12 @@ impl<'a> Pass<'a> {
         loop {
             let offset = records.offset;
             let Some(raw) = records.record()? else {
-                self.broken(None, "the summary has no footer");
+                self.seen.broken(None, "the summary has no footer");
                 return Ok(());
             };
             let record = reader.parse(raw.opcode, raw.body(), offset)?;
             if let Some((at, what)) = self.contents.summary(&record, raw.whole)? {
-                self.broken(at, what);
+                self.seen.broken(at, what);
             }
             if raw.opcode == op::FOOTER {
                 break;
@@ -453,7 +432,7 @@ impl<'a> Pass<'a> {
             records.advance(length);
         }
         for (at, what) in self.contents.compare() {
-            self.broken(at, what);
+            self.seen.broken(at, what);
         }
         Ok(())
     }

@@ -2,7 +2,7 @@
 
 use super::motion::Units;
 use super::pictures::{Job, Pictures};
-use super::segment::{MESSAGE_HEAD, Pass};
+use super::seen::{MESSAGE_HEAD, Picture, Proof, Seen};
 use super::{Findings, Severity, VerifyOptions};
 use crate::clock::step_ns;
 use crate::container::record::{op, put_le};
@@ -61,24 +61,6 @@ struct Books {
     dropped: [u64; 8],
 }
 
-/// A picture that waits for its set's mark.
-pub(super) struct Picture {
-    /// Where its chunk begins.
-    pub(super) offset: u64,
-    pub(super) channel: u16,
-    pub(super) log_time: u64,
-    pub(super) len: u64,
-    pub(super) proof: Proof,
-}
-
-/// What is known of a picture's bytes.
-pub(super) enum Proof {
-    /// The CRC-32 of its message.
-    Crc(u32),
-    /// The CRC-32 of its message's whole record, as the head of its chunk says; it was not unpacked.
-    Packed(u32),
-}
-
 impl Walk {
     pub(super) fn new(session: &Session, options: VerifyOptions) -> Self {
         Self {
@@ -104,7 +86,7 @@ impl Walk {
     /// Takes a set by its mark, which lies in the chunk at `offset`.
     pub(super) fn set(
         &mut self,
-        pass: &mut Pass<'_>,
+        seen: &mut Seen<'_>,
         set: &FrameSetMsg,
         log_time: u64,
         offset: u64,
@@ -126,7 +108,7 @@ impl Walk {
                 problems.push(format!("\"{name}\" is no stream"));
                 continue;
             };
-            self.member(pass, set, member, &id, log_time, pictures, &mut problems);
+            self.member(seen, set, member, &id, log_time, pictures, &mut problems);
         }
         let spread =
             captures.iter().max().zip(captures.iter().min()).map_or(0, |(a, b)| a.saturating_sub(*b));
@@ -144,11 +126,11 @@ impl Walk {
         self.sets += 1;
         self.frames += set.members.len() as u64;
         for problem in problems {
-            pass.broken(Some(offset), format!("set {}: {problem}", set.id));
+            seen.broken(Some(offset), format!("set {}: {problem}", set.id));
         }
         if let Some(max) = self.max_spread_ns.filter(|max| spread.max(set.spread_ns) > *max) {
             let what = format!("set {}: its frames are {spread} ns apart, {max} is the limit", set.id);
-            pass.findings.add(Severity::Lost, &pass.file, Some(offset), what);
+            seen.findings.add(Severity::Lost, &seen.file, Some(offset), what);
         }
     }
 
@@ -173,7 +155,7 @@ impl Walk {
     #[allow(clippy::too_many_arguments)] // one call; a struct of them would be named once and never again
     fn member(
         &mut self,
-        pass: &Pass<'_>,
+        seen: &Seen<'_>,
         set: &FrameSetMsg,
         member: &Member,
         id: &StreamId,
@@ -182,10 +164,10 @@ impl Walk {
         problems: &mut Vec<String>,
     ) {
         let name = &member.stream;
-        if !pass.calibrated.contains(id) {
+        if !seen.calibrated.contains(id) {
             problems.push(format!("{name} has no camera_info"));
         }
-        let info = pass.infos.get(id).filter(|(t, _)| *t == log_time).map(|(_, m)| frame_info::read(m));
+        let info = seen.infos.get(id).filter(|(t, _)| *t == log_time).map(|(_, m)| frame_info::read(m));
         let info = match info {
             None => {
                 problems.push(format!("{name} has no frame_info"));
@@ -206,7 +188,7 @@ impl Walk {
                 Some((h, extra))
             }
         };
-        let Some(picture) = pass.pictures.get(id).filter(|p| p.log_time == log_time) else {
+        let Some(picture) = seen.pictures.get(id).filter(|p| p.log_time == log_time) else {
             problems.push(format!("{name} has no picture"));
             return;
         };
@@ -233,7 +215,7 @@ impl Walk {
         let unseen = match picture.proof {
             Proof::Crc(_) => false,
             Proof::Packed(crc) => {
-                picture.offset >= pass.unproven
+                picture.offset >= seen.unproven
                     || info.as_ref().is_none_or(|(_, extra)| expected(picture, member, extra) != crc)
             }
         };
@@ -271,7 +253,7 @@ impl Walk {
     }
 
     /// Takes a reading of the host's clocks from the chunk at `offset`.
-    pub(super) fn clock(&mut self, pass: &mut Pass<'_>, pair: UtcPair, log_time: u64, offset: u64) {
+    pub(super) fn clock(&mut self, seen: &mut Seen<'_>, pair: UtcPair, log_time: u64, offset: u64) {
         let (first, last) = self.clocks.get_or_insert((pair, pair));
         let passed_ns = pair.mono.since_ns(first.mono);
         let log_time = i64::try_from(log_time).unwrap_or(i64::MAX);
@@ -289,12 +271,12 @@ impl Walk {
                 by_ns as f64 / 1e6,
                 passed_ns as f64 / 1e9
             );
-            pass.findings.add(Severity::Note, &pass.file, Some(offset), what);
+            seen.findings.add(Severity::Note, &seen.file, Some(offset), what);
         }
     }
 
     /// Takes an account from the chunk at `offset`.
-    pub(super) fn account(&mut self, pass: &mut Pass<'_>, message: &[u8], offset: u64) -> Result<()> {
+    pub(super) fn account(&mut self, seen: &mut Seen<'_>, message: &[u8], offset: u64) -> Result<()> {
         let (sets, streams) = accounts::read(message)?;
         if !sets.balances() {
             let what = format!(
@@ -303,24 +285,24 @@ impl Walk {
                 sets.recorded,
                 sets.dropped_total()
             );
-            pass.broken(Some(offset), what);
+            seen.broken(Some(offset), what);
         }
         // A segment on its own begins in the middle of the account.
         let first_is_zero =
-            !self.lone && self.last.as_ref().is_none_or(|_| pass.file.starts_with("seg_0000."));
+            !self.lone && self.last.as_ref().is_none_or(|_| seen.file.starts_with("seg_0000."));
         let base = *self
             .account_base
             .get_or_insert_with(|| if first_is_zero { 0 } else { sets.recorded.saturating_sub(self.sets) });
         let there = base.saturating_add(self.sets);
         if !(there..=there.saturating_add(self.lost)).contains(&sets.recorded) {
             let what = format!("the account says {} sets were recorded, {there} are there", sets.recorded);
-            pass.broken(Some(offset), what);
+            seen.broken(Some(offset), what);
         }
         let fell = |b: &crate::SetCounts| {
             sets.offered < b.offered || sets.dropped.iter().zip(&b.dropped).any(|(now, before)| now < before)
         };
         if self.dropped.as_ref().is_some_and(fell) {
-            pass.broken(Some(offset), "the account of sets goes backwards");
+            seen.broken(Some(offset), "the account of sets goes backwards");
         }
         self.dropped = Some(sets);
         for a in streams {
@@ -332,11 +314,11 @@ impl Walk {
                     a.delivered,
                     a.dropped.total()
                 );
-                pass.broken(Some(offset), what);
+                seen.broken(Some(offset), what);
             }
             let fell = |b: &StreamAccount| a.captured < b.captured || a.delivered < b.delivered;
             if self.accounts.get(&a.stream).is_some_and(fell) {
-                pass.broken(Some(offset), format!("the account of {} goes backwards", a.stream));
+                seen.broken(Some(offset), format!("the account of {} goes backwards", a.stream));
             }
             self.accounts.insert(a.stream.clone(), a);
         }
