@@ -6,8 +6,8 @@ use crate::device::{Device, spawn};
 use crate::fault::Fault;
 use crate::firmware::{Asked, Identity};
 use crate::model::{Mode, Model};
-use crate::shared::{Command, ImuSample, Presence, Session, Shared};
-use crate::{Accounts, Error, Result, vhci};
+use crate::shared::{Command, Presence, Session, Shared};
+use crate::{Accounts, Error, ImuSample, Options, Result, Speed, vhci};
 use core::time::Duration;
 use depthrig_bus::HostTime;
 use std::collections::{BTreeMap, BTreeSet};
@@ -21,46 +21,6 @@ const FAULT_PATIENCE: Duration = Duration::from_secs(2);
 
 /// How long a device may take to come or to go.
 const PATIENCE: Duration = Duration::from_secs(5);
-
-/// How fast the bus is that a camera is plugged into.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Speed {
-    /// USB 3, 5 Gb/s.
-    Super,
-    /// USB 2, 480 Mb/s.
-    High,
-}
-
-/// What differs between two cameras of one model.
-#[derive(Debug, Clone)]
-pub struct Options {
-    /// The serial, in the model's own form: 12 digits for a D400, 8 hexadecimal digits for an L515, decimal for a ZED.
-    /// Without one, one is made up: the next in this process.
-    pub serial: Option<String>,
-    /// How much its clock gains, in parts per million.
-    pub drift_ppm: f64,
-    /// What its clock shows at power-on, in microseconds: near 2^32 for a wrap.
-    pub start_ticks: u32,
-    /// The largest delay of a frame on its way.
-    pub jitter: Duration,
-    /// The bus.
-    pub speed: Speed,
-    /// The virtual host controller that it hangs on, 0 to 7: cameras of one controller are those of one hub.
-    pub hub: u32,
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Self {
-            serial: None,
-            drift_ppm: 0.0,
-            start_ticks: 1_000_000,
-            jitter: Duration::from_micros(300),
-            speed: Speed::Super,
-            hub: 0,
-        }
-    }
-}
 
 /// An emulated camera. Dropping it unplugs it.
 pub struct Camera {

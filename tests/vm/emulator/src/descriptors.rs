@@ -2,6 +2,7 @@
 //!
 //! Layouts: USB 3.2 chapter 9; UVC 1.5 class specification, chapter 3 and its payload documents.
 
+use crate::firmware::imu::report_descriptor;
 use crate::model::{Control, Format, Function, Layout, Model, Stream, Unit, UnitKind, from_hex};
 use crate::{Result, Speed};
 
@@ -61,7 +62,7 @@ pub(crate) fn configuration(model: &Model, speed: Speed) -> Result<Vec<u8>> {
     }
     if let Some(hid) = &model.hid {
         interfaces += 1;
-        let report = model.report_descriptor()?;
+        let report = report_descriptor(model)?;
         body.extend([9, 4, hid.interface, 0, 1, 3, 0, 0, 0]);
         let head = Bytes::default().u8(&[0x21]).u16(0x0111).u8(&[0, 1, 0x22]).u16(report.len() as u16);
         body.extend(head.sized());

@@ -17,6 +17,7 @@ mod device;
 pub mod fault;
 mod firmware;
 pub mod model;
+mod options;
 mod payload;
 mod pump;
 mod shared;
@@ -25,13 +26,13 @@ mod vhci;
 
 pub use accounts::Accounts;
 pub use calibration::Calibration;
-pub use camera::{Camera, Hub, Options, Speed};
+pub use camera::{Camera, Hub};
 pub use content::Stamp;
 pub use fault::{Damage, Fault, WrongReply};
 pub use firmware::Asked;
-pub use firmware::imu::ImuSensor;
+pub use firmware::imu::{ImuSample, ImuSensor};
 pub use model::Model;
-pub use shared::ImuSample;
+pub use options::{Options, Speed};
 
 /// What goes wrong in the emulator itself.
 #[derive(Debug)]

@@ -349,15 +349,6 @@ impl Model {
         Ok(model)
     }
 
-    /// The report descriptor of its HID interface.
-    pub(crate) fn report_descriptor(&self) -> Result<Vec<u8>> {
-        match (&self.hid, self.imu) {
-            (Some(hid), None) => from_hex(&hid.report_descriptor),
-            (Some(_), Some(_)) => Ok(crate::firmware::imu::descriptor(self)),
-            (None, _) => Err(Error::new(format!("{} has no HID interface", self.name))),
-        }
-    }
-
     /// Every stream, in the order of their interfaces.
     pub fn streams(&self) -> impl Iterator<Item = &Stream> {
         self.functions.iter().flat_map(|f| &f.streams)

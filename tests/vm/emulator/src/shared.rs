@@ -3,7 +3,7 @@
 use crate::clock::DeviceClock;
 use crate::fault::Fault;
 use crate::firmware::Asked;
-use crate::firmware::imu::ImuSensor;
+use crate::firmware::imu::ImuSample;
 use crate::model::Mode;
 use crate::{Accounts, Error, Result};
 use core::time::Duration;
@@ -26,23 +26,6 @@ const HALF_EXPOSURE_NS: i64 = 4_000_000;
 
 /// Samples of the IMU that are remembered.
 const IMU_SAMPLES: usize = 1 << 16;
-
-/// A sample that the IMU measured.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct ImuSample {
-    /// Which sensor.
-    pub sensor: ImuSensor,
-    /// Its number since power-on, from 0, sent or not.
-    pub index: u64,
-    /// What the camera's clock showed, microseconds.
-    pub ticks: u32,
-    /// When it was measured, on the host's clock.
-    pub captured: HostTime,
-    /// What the sensor counted along its own axes.
-    pub counts: [i32; 3],
-    /// It went into a report.
-    pub is_sent: bool,
-}
 
 /// What a handle asks of its camera's thread.
 pub(crate) enum Command {

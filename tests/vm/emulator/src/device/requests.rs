@@ -2,6 +2,7 @@
 
 use super::{Device, answer};
 use crate::control::{Refusal, probe, query};
+use crate::firmware::imu::report_descriptor;
 use crate::firmware::{Answer, World, zed};
 use crate::model::{Family, Model, Stream};
 use crate::usbip::{self, Submit};
@@ -97,7 +98,7 @@ impl Device {
     }
 
     fn report_descriptor(&self) -> Reply {
-        self.model.report_descriptor().ok()
+        report_descriptor(&self.model).ok()
     }
 
     fn clear_halt(&mut self, endpoint: u8) {

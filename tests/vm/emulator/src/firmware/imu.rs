@@ -7,10 +7,9 @@
 mod report;
 
 use crate::clock::DeviceClock;
-use crate::model::{ImuChip, Model};
-use crate::shared::ImuSample;
+use crate::model::{ImuChip, Model, from_hex};
+use crate::{Error, Result};
 use depthrig_bus::HostTime;
-pub(crate) use report::descriptor;
 use std::collections::VecDeque;
 
 /// D0, full power: the second name of the power states, which count from 1.
@@ -27,6 +26,35 @@ pub enum ImuSensor {
     Accelerometer = 1,
     /// Report 2.
     Gyroscope = 2,
+}
+
+/// A sample that the IMU measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImuSample {
+    /// Which sensor.
+    pub sensor: ImuSensor,
+    /// Its number since power-on, from 0, sent or not.
+    pub index: u64,
+    /// What the camera's clock showed, microseconds.
+    pub ticks: u32,
+    /// When it was measured, on the host's clock.
+    pub captured: HostTime,
+    /// What the sensor counted along its own axes.
+    pub counts: [i32; 3],
+    /// It went into a report.
+    pub is_sent: bool,
+}
+
+/// The report descriptor of the HID interface of `model`.
+///
+/// # Errors
+/// When it has none.
+pub(crate) fn report_descriptor(model: &Model) -> Result<Vec<u8>> {
+    match (&model.hid, model.imu) {
+        (Some(hid), None) => from_hex(&hid.report_descriptor),
+        (Some(_), Some(_)) => Ok(report::descriptor(model)),
+        (None, _) => Err(Error::new(format!("{} has no HID interface", model.name))),
+    }
 }
 
 /// One sensor and its feature report.
