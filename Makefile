@@ -55,6 +55,7 @@ lint: ## formatting and lints, as CI runs them
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets -- --deny warnings
 	tools/notice.py --check
+	tools/cycles.py
 	@if command -v cargo-deny >/dev/null; then cargo deny check; else echo "cargo-deny is not installed: licences not checked"; fi
 
 bench: setup-build ## the numbers of docs/performance.md
