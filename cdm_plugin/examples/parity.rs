@@ -1,7 +1,7 @@
 //! How far the network's input, its output and the result lie from those of the official code, for files that
 //! `tests/peers/cdm_official.py` wrote:
 //!
-//! `cargo run --release -p depthrig-cdm --features candle --example parity -- ENCODER WEIGHTS ENGINE FILE...`
+//! `cargo run --release -p depthrig-cdm --example parity -- ENCODER WEIGHTS ENGINE FILE...`
 #![allow(clippy::print_stdout)]
 
 use depthrig_cdm::prep::Prep;

@@ -6,8 +6,6 @@
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 pub mod arch;
-#[cfg(feature = "candle")]
-mod candle;
 mod durable;
 mod error;
 mod factory;
@@ -26,13 +24,9 @@ mod refine;
 mod refiner;
 mod stereo_network;
 pub mod store;
-#[cfg(all(test, feature = "candle"))]
-mod tiny;
 pub mod weights;
 
 pub use arch::Encoder;
-#[cfg(feature = "candle")]
-pub use candle::CandleNetwork;
 pub use error::{Error, ErrorKind, Result};
 pub use factory::refiner;
 pub use fill::FillRefiner;

@@ -245,7 +245,7 @@ fn is_memory(text: &str) -> bool {
     TEXTS.iter().any(|t| text.contains(t))
 }
 
-#[cfg(all(test, feature = "candle"))]
-mod against_candle;
+#[cfg(test)]
+mod forms;
 #[cfg(test)]
 mod tests;

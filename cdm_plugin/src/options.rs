@@ -13,20 +13,17 @@ pub enum EngineKind {
     Fill,
     /// The network in ONNX Runtime, a native library that is loaded when it is needed.
     OnnxRuntime,
-    /// The network in pure Rust: slow, needs no library. Only in builds with the feature `candle`.
-    Candle,
 }
 
 impl EngineKind {
     /// Every engine.
-    pub const ALL: [Self; 3] = [Self::Fill, Self::OnnxRuntime, Self::Candle];
+    pub const ALL: [Self; 2] = [Self::Fill, Self::OnnxRuntime];
 
     /// The name used in configuration, on the command line and in headers.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Fill => "fill",
             Self::OnnxRuntime => "onnxruntime",
-            Self::Candle => "candle",
         }
     }
 
@@ -47,7 +44,7 @@ impl FromStr for EngineKind {
 
     fn from_str(s: &str) -> Result<Self> {
         Self::ALL.into_iter().find(|e| e.name() == s).ok_or_else(|| {
-            let message = format!("there is no engine {s:?}: it is one of fill, onnxruntime and candle");
+            let message = format!("unknown engine {s:?}: use fill or onnxruntime");
             Error::new(ErrorKind::BadInput, message)
         })
     }
@@ -167,7 +164,10 @@ mod tests {
             assert_eq!(precision.name().parse::<Precision>().unwrap(), precision);
         }
         let error = "tensorflow".parse::<EngineKind>().unwrap_err();
-        assert!(error.to_string().contains("tensorflow") && error.to_string().contains("candle"), "{error}");
+        assert!(
+            error.to_string().contains("tensorflow") && error.to_string().contains("onnxruntime"),
+            "{error}"
+        );
         let error = "int8".parse::<Precision>().unwrap_err();
         assert!(error.to_string().contains("int8") && error.to_string().contains("bf16"), "{error}");
     }
@@ -176,7 +176,8 @@ mod tests {
     fn without_a_model_it_is_fill() {
         assert_eq!(RefinerOptions::default().engine_kind(), EngineKind::Fill);
         assert!(RefinerOptions::default().thread_count() >= 1);
-        let options = RefinerOptions { engine: Some(EngineKind::Candle), threads: 3, ..Default::default() };
-        assert_eq!((options.engine_kind(), options.thread_count()), (EngineKind::Candle, 3));
+        let options =
+            RefinerOptions { engine: Some(EngineKind::OnnxRuntime), threads: 3, ..Default::default() };
+        assert_eq!((options.engine_kind(), options.thread_count()), (EngineKind::OnnxRuntime, 3));
     }
 }

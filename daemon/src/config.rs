@@ -247,8 +247,6 @@ pub enum EngineChoice {
     Fill,
     /// ONNX Runtime.
     OnnxRuntime,
-    /// The network in pure Rust.
-    Candle,
     /// Nothing: the stream is there and silent.
     Off,
 }

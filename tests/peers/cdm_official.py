@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """Runs the official camera depth model on one pair of pictures and writes what it saw and gave, for `cargo run -p depthrig-cdm
---features candle --example parity`.
+--example parity`.
 
 usage: PYTHONPATH=.../manip-as-in-sim-suite/cdm cdm_official.py ENCODER WEIGHTS.safetensors RGB.png DEPTH.png UNITS_PER_METRE INPUT_SIZE
        OUT.safetensors [--crop X,Y,WIDTH,HEIGHT] [--turn]

@@ -9,7 +9,7 @@ use std::os::unix::fs::PermissionsExt as _;
 use support::{Home, Ran};
 
 /// The commands, with IN for their input and OUT for what they make.
-const COMMANDS: [&str; 20] = [
+const COMMANDS: [&str; 19] = [
     "info IN",
     "verify IN",
     "report IN --out OUT",
@@ -26,7 +26,6 @@ const COMMANDS: [&str; 20] = [
     "export lerobot IN OUT",
     "eval IN --out OUT",
     "cdm relabel IN OUT --engine fill",
-    "cdm view --dataset IN --out OUT",
     "zed replay IN --out OUT --modes quality",
     "import kinect IN OUT",
     "import rosbag IN OUT",

@@ -167,7 +167,6 @@ fn a_fifo_beside_what_is_good_is_refused_by_name() {
     for line in [
         "zed replay eyes --out out --modes quality --calibration f.conf",
         "import kinect good.mkv out --calibration f.json",
-        "cdm view --rgb c.png --depth z.png --depth-unit 0.001 --refined f.npy --out look",
         "cdm list --models models",
         "config check lens.toml",
         "install --apply --user robot --root root",

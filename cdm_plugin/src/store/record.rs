@@ -25,7 +25,7 @@ pub struct Record {
     pub input_size: u32,
     /// Raw depth beyond this is taken for a hole, metres.
     pub max_depth_m: f64,
-    /// Whether its numbers were ever trained; those of `depthrig cdm seeded` were not.
+    /// Whether its numbers were ever trained; those of [`write_seeded`](crate::weights::write_seeded) were not.
     pub trained: bool,
     /// The cameras that it is for.
     #[serde(default)]

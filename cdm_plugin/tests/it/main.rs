@@ -4,8 +4,6 @@
 //! tests fail and say where they look.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
-#[cfg(feature = "candle")]
-mod candle;
 mod onnxruntime;
 mod prep;
 mod support;

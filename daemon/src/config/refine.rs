@@ -12,11 +12,10 @@ pub(super) const TABLE: &str = "[camera.refine]";
 /// The streams that it makes.
 pub(super) const MADE: [&str; 2] = [crate::stage::REFINED, crate::stage::ALIGNED];
 
-const ENGINES: [(&str, EngineChoice); 5] = [
+const ENGINES: [(&str, EngineChoice); 4] = [
     ("auto", EngineChoice::Auto),
     ("fill", EngineChoice::Fill),
     ("onnxruntime", EngineChoice::OnnxRuntime),
-    ("candle", EngineChoice::Candle),
     ("off", EngineChoice::Off),
 ];
 const FORMATS: [(&str, PixelFormat); 2] = [("z16", PixelFormat::Z16), ("depth_f32", PixelFormat::DepthF32)];

@@ -454,9 +454,11 @@ fn what_keeps_depth_from_being_refined_is_found() {
     let models = models_of(home.path());
     let checkpoint = home.path().join("net.pth");
     std::fs::write(&checkpoint, "").unwrap();
-    let net = format!("engine = \"candle\"\nmodel = \"{}\"", checkpoint.display());
+    let net = format!("engine = \"onnxruntime\"\nmodel = \"{}\"", checkpoint.display());
     let engine = ("engine_missing", Error);
-    let cases: [(&str, &str, &[(&str, Severity)], &str); 14] = [
+    let no_model = ("model_missing", Error);
+    let too_fast = ("refine_too_fast", Warning);
+    let cases: [(&str, &str, &[(&str, Severity)], &str); 13] = [
         ("d435", "engine = \"fill\"", &[], ""),
         ("d435", "engine = \"off\"", &[], ""),
         ("d435", "", &[("refine_fill", Info)], "cdm-d435"),
@@ -465,18 +467,12 @@ fn what_keeps_depth_from_being_refined_is_found() {
         ("d415", "rate_hz = 0.01", &[("engine_missing", Warning)], "fill stands in"),
         ("d415", "engine = \"onnxruntime\"\nrate_hz = 0.01", &[engine], "/none/such.so"),
         ("d415", "engine = \"onnxruntime\"\nrate_hz = 0.01\nmodel = \"lab\"", &[engine], "stays silent"),
-        ("d415", "engine = \"candle\"\nrate_hz = 0.01", &[], ""),
-        ("d415", "engine = \"candle\"\nrate_hz = 1", &[("refine_too_fast", Warning)], "threads of this CPU"),
-        ("d415", "engine = \"candle\"\nrate_hz = 1\ninput_size = 56\nmodel = \"lab\"", &[], ""),
-        ("d435", "engine = \"candle\"", &[("model_missing", Error)], "depthrig cdm fetch cdm-d435"),
-        ("generic", "engine = \"candle\"", &[("model_missing", Error)], "no camera depth model is known"),
-        (
-            "generic",
-            "engine = \"candle\"\nmodel = \"/none/x.pth\"",
-            &[("model_missing", Error)],
-            "/none/x.pth",
-        ),
-        ("generic", &net, &[], ""),
+        ("d415", "engine = \"onnxruntime\"\nrate_hz = 1", &[engine, too_fast], "threads of this CPU"),
+        ("d415", "engine = \"onnxruntime\"\nrate_hz = 1\ninput_size = 56\nmodel = \"lab\"", &[engine], ""),
+        ("d435", "engine = \"onnxruntime\"", &[no_model, engine], "depthrig cdm fetch cdm-d435"),
+        ("generic", "engine = \"onnxruntime\"", &[no_model, engine], "no camera depth model is known"),
+        ("generic", "engine = \"onnxruntime\"\nmodel = \"/none/x.pth\"", &[no_model, engine], "/none/x.pth"),
+        ("generic", &net, &[engine], ""),
     ];
     for (model, refine, expected, part) in cases {
         let text = format!(

@@ -115,13 +115,9 @@ impl Refiners for Installed {
                 Some(name) => network(EngineKind::OnnxRuntime, Some(RefineModel::Installed(name)), true),
                 None => fill(config.fill_reach, Some(missing(device_model))),
             },
-            EngineChoice::OnnxRuntime | EngineChoice::Candle => {
-                let engine = match config.engine {
-                    EngineChoice::Candle => EngineKind::Candle,
-                    _ => EngineKind::OnnxRuntime,
-                };
+            EngineChoice::OnnxRuntime => {
                 let model = config.model.clone().or_else(|| usual().map(RefineModel::Installed));
-                network(engine, model, false)
+                network(EngineKind::OnnxRuntime, model, false)
             }
         }
     }

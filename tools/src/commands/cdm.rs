@@ -8,9 +8,7 @@ pub mod bench;
 pub mod fetch;
 pub mod relabel;
 pub mod run;
-pub mod seeded;
 pub mod store;
-pub mod view;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
@@ -23,9 +21,7 @@ Examples:
   depthrig cdm import cdm_d435.ckpt
   depthrig cdm list
   depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.001 --model cdm-d435 --out refined.npy
-  depthrig cdm seeded vits --out untrained-vits.safetensors
-  depthrig cdm relabel data/kitchen data/kitchen_cdm
-  depthrig cdm view --dataset data/kitchen_cdm --out kitchen";
+  depthrig cdm relabel data/kitchen data/kitchen_cdm";
 
 /// What to do.
 #[derive(Debug, clap::Subcommand)]
@@ -50,15 +46,9 @@ pub enum CdmCommand {
     /// Measure how fast each engine refines, and with what memory
     #[command(after_help = bench::EXAMPLES)]
     Bench(bench::BenchArgs),
-    /// Write a model of random numbers, for demonstrations and tests: what it gives is no depth
-    #[command(after_help = seeded::EXAMPLES)]
-    Seeded(seeded::SeededArgs),
     /// Give a dataset refined depth, in a copy of it
     #[command(after_help = relabel::EXAMPLES)]
     Relabel(relabel::RelabelArgs),
-    /// Show refined depth beside raw depth: a picture of four panels, and points that turn
-    #[command(after_help = view::EXAMPLES)]
-    View(view::ViewArgs),
 }
 
 /// Runs the subcommand.
@@ -71,8 +61,6 @@ pub fn run(command: &CdmCommand, context: &Context) -> Result<Exit> {
         CdmCommand::Remove(args) => store::remove(args),
         CdmCommand::Run(args) => run::run(args),
         CdmCommand::Bench(args) => bench::run(args),
-        CdmCommand::Seeded(args) => seeded::run(args),
         CdmCommand::Relabel(args) => relabel::run(args, context),
-        CdmCommand::View(args) => view::run(args, context),
     }
 }

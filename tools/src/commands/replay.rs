@@ -82,7 +82,7 @@ struct StartArgs {
     /// Name of the recording's folder; made of date, time and scene when left out
     #[arg(long, requires = "record")]
     name: Option<String>,
-    /// Refine the depth of its cameras, by this engine: auto, fill, onnxruntime or candle
+    /// Refine the depth of its cameras, by this engine: auto, fill or onnxruntime
     #[arg(long, value_name = "ENGINE", num_args = 0..=1, default_missing_value = "auto", require_equals = true,
           value_parser = engine, conflicts_with = "as_fast_as_possible")]
     refine: Option<EngineChoice>,
@@ -96,8 +96,7 @@ fn engine(text: &str) -> Result<EngineChoice, String> {
         "auto" => EngineChoice::Auto,
         "fill" => EngineChoice::Fill,
         "onnxruntime" => EngineChoice::OnnxRuntime,
-        "candle" => EngineChoice::Candle,
-        _ => return Err("it is one of auto, fill, onnxruntime and candle".to_owned()),
+        _ => return Err("use auto, fill or onnxruntime".to_owned()),
     })
 }
 

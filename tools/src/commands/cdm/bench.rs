@@ -22,7 +22,7 @@ pub const EXAMPLES: &str = "\
 The picture is made up, with edges and holes; times do not depend on what it shows. Times are medians, on the clock and
 of the CPU (all threads). A busy computer makes the clock's longer; the CPU's less so.
 
-An engine is fill, candle, or onnxruntime with a device and a precision: onnxruntime/cpu/fp32,
+An engine is fill, or onnxruntime with a device and a precision: onnxruntime/cpu/fp32,
 onnxruntime/openvino/bf16, onnxruntime/cuda:0/fp16.
 
 Exit codes: 0 good, 1 an engine failed, 2 wrong usage.
@@ -102,7 +102,7 @@ impl Spec {
     fn text(&self) -> String {
         match self.engine {
             EngineKind::OnnxRuntime => format!("{}/{}/{}", self.engine, self.device, self.precision),
-            engine => engine.to_string(),
+            EngineKind::Fill => EngineKind::Fill.to_string(),
         }
     }
 }
@@ -377,7 +377,7 @@ mod tests {
             (spec.engine, &*spec.device, spec.precision),
             (EngineKind::OnnxRuntime, "cuda:0", Precision::Fp16)
         );
-        for text in ["fill", "candle", "onnxruntime/cpu/fp32", "onnxruntime/openvino/bf16"] {
+        for text in ["fill", "onnxruntime/cpu/fp32", "onnxruntime/openvino/bf16"] {
             assert_eq!(Spec::parse(text).unwrap().text(), text);
         }
         assert_eq!(Spec::parse("onnxruntime").unwrap().text(), "onnxruntime/cpu/fp32");

@@ -35,8 +35,6 @@ enum Engine {
     Fill,
     /// ONNX Runtime
     Onnxruntime,
-    /// The network in pure Rust
-    Candle,
 }
 
 /// Arguments.
@@ -90,7 +88,6 @@ impl RelabelArgs {
             Engine::Auto => EngineChoice::Auto,
             Engine::Fill => EngineChoice::Fill,
             Engine::Onnxruntime => EngineChoice::OnnxRuntime,
-            Engine::Candle => EngineChoice::Candle,
         };
         let model = self.model.as_ref().map(|name| {
             let path = PathBuf::from(name);

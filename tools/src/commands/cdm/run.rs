@@ -46,7 +46,7 @@ pub struct RunArgs {
     /// The shorter side of the network's input, pixels [default: the model's]
     #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(14..=8192))]
     input_size: Option<u32>,
-    /// What runs: onnxruntime, candle or fill (needs no model) [default: onnxruntime]
+    /// What runs: onnxruntime, or fill (needs no model) [default: onnxruntime]
     #[arg(long, value_name = "ENGINE", value_parser = engine)]
     engine: Option<EngineKind>,
     /// Write what the network gives: inverse depth, 1/m

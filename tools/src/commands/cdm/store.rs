@@ -118,6 +118,10 @@ impl Settings {
     }
 }
 
+fn encoder(text: &str) -> Result<Encoder, String> {
+    text.parse().map_err(|e: depthrig_cdm::Error| e.to_string())
+}
+
 /// Arguments of `cdm import`.
 #[derive(Debug, clap::Args)]
 pub struct ImportArgs {
@@ -127,7 +131,7 @@ pub struct ImportArgs {
     #[arg(long, value_name = "NAME")]
     name: Option<String>,
     /// The size that it must be of: vits, vitb, vitl or vitg
-    #[arg(long, value_name = "ENCODER", value_parser = super::seeded::encoder)]
+    #[arg(long, value_name = "ENCODER", value_parser = encoder)]
     encoder: Option<Encoder>,
     #[command(flatten)]
     settings: Settings,
