@@ -1,4 +1,4 @@
-# depthrig: `make demo` shows what it does, `make test` proves it. Both install what is missing (tools/setup.sh).
+# depthrig: `make demo` shows what it does, `make test` tests it. Both install missing dependencies (tools/setup.sh).
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
 
@@ -9,12 +9,12 @@ export DEPTHRIG_TEST_DATA ?= $(abspath ../shared/data)
 
 READERS := tests/readers
 VENV := .venv
-# LeRobot brings PyTorch, so it has an environment of its own, and a Python of 3.12 or later if there is one.
+# LeRobot brings PyTorch, so it has its own environment, with Python 3.12 or later if available.
 LEROBOT := .venv-lerobot
-# Other recorders to compare with; Debian's Python, because Debian's rosbag is for no other.
+# Other recorders for comparison; with Debian's Python, which Debian's rosbag requires.
 PEERS := tests/peers
 PEERS_VENV := .venv-peers
-# Other transports to carry pictures with.
+# Other image transports for comparison.
 FEED := .venv-feed
 # The vendor's SDK of OAK cameras, 450 MB.
 OAK := .venv-oak
@@ -29,7 +29,7 @@ demo: setup-build ## the mount of seven cameras with ten depth modes, without a 
 	@tools/onnxruntime.sh || true
 	tools/demo.sh $(ARGS)
 
-test: setup-test $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(READERS)/node_modules/.stamp ## every test there is: Rust, Python, readers that are not ours, the virtual machine
+test: setup-test $(VENV)/.stamp $(LEROBOT)/.stamp $(OAK)/.stamp $(READERS)/node_modules/.stamp ## every test: Rust, Python, third-party readers, the virtual machine
 	@tools/onnxruntime.sh || true
 	tools/test.sh
 
@@ -56,6 +56,7 @@ lint: ## formatting and lints, as CI runs them
 	cargo clippy --workspace --all-targets -- --deny warnings
 	tools/notice.py --check
 	tools/cycles.py
+	tools/words.py
 	@if command -v cargo-deny >/dev/null; then cargo deny check; else echo "cargo-deny is not installed: licences not checked"; fi
 
 bench: setup-build ## the numbers of docs/performance.md
@@ -65,16 +66,16 @@ bench: setup-build ## the numbers of docs/performance.md
 	cargo run --release --package depthrig-tests --example zed_replay_ratio
 	cargo run --release --package depthrig-kinect-fixture --example kinect_speed
 
-bench-peers: setup-peers $(PEERS_VENV)/.stamp ## beside Python mcap, foxglove-sdk, rosbag and PNG files, in one run
+bench-peers: setup-peers $(PEERS_VENV)/.stamp ## compare with Python mcap, foxglove-sdk, rosbag and PNG files, in one run
 	cargo build --release --package depthrig-recorder --example bench_frames
 	$(PEERS_VENV)/bin/python $(PEERS)/compare.py --depthrig target/release/examples/bench_frames \
 	    --json target/bench-peers.json $(ARGS)
 
-bench-feed: setup-build $(FEED)/.stamp ## from one process to a NumPy array in another, beside pyzmq, zenoh and dora-rs
+bench-feed: setup-build $(FEED)/.stamp ## latency to a NumPy array in another process, beside pyzmq, zenoh and dora-rs
 	cargo build --release --package depthrig-bus --example latency
 	$(FEED)/bin/python $(PEERS)/feed.py --latency target/release/examples/latency --json target/bench-feed.json $(ARGS)
 
-clean: ## remove what was built
+clean: ## remove build outputs
 	cargo clean
 	rm -rf $(VENV) $(LEROBOT) $(PEERS_VENV) $(FEED) $(OAK) $(READERS)/node_modules
 

@@ -1,7 +1,7 @@
 //! Refuses to build with libusb linked statically: it is LGPL, and users must be able to replace it.
 //!
-//! `libusb1-sys` builds its own copy where it does not find the system's, says nothing, and keeps it after the system's was
-//! installed.
+//! `libusb1-sys` builds its own copy where it does not find the system's, says nothing, and keeps it after the system's
+//! was installed.
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");

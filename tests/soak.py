@@ -27,7 +27,7 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("depthrig", type=Path, help="the program, a release")
     parser.add_argument("--minutes", type=float, default=12.0)
-    parser.add_argument("--config", type=Path, help="a rig file, with a stream d435/color, instead of the default one with cameras without pictures")
+    parser.add_argument("--config", type=Path, help="a rig file, with a stream d435/color, instead of the default one with cameras without images")
     return parser.parse_args()
 
 
@@ -89,11 +89,11 @@ def main() -> int:
             return 2
         verified = subprocess.run([args.depthrig, "verify", datasets[0], "--json"], capture_output=True, text=True)
         enough = args.config is not None or json.loads(verified.stdout)["sets"] >= SETS_PER_S * seconds / 2
-        return told(own, taps, code, verified, enough)
+        return report(own, taps, code, verified, enough)
 
 
 def ended(process: subprocess.Popen) -> int:
-    """Its exit status; one that does not end in a while is told to, and killed if it does not then."""
+    """Its exit status; one that does not end in a while is asked to, and then killed."""
     for last_word in (process.terminate, process.kill):
         try:
             return process.wait(CLOSING_S)
@@ -120,7 +120,7 @@ def watch(daemon: subprocess.Popen, depthrig: Path, seconds: float) -> tuple[lis
     return samples, [ended(subscriber) for subscriber in subscribers]
 
 
-def told(
+def report(
     samples: list[tuple[float, float, float]],
     taps: list[int],
     code: int,

@@ -4,7 +4,7 @@
 #
 #   tools/check_debian13.sh [CARGO ARGUMENT...]   default: build --locked --package depthrig
 #
-# The root is made once, below target/debian13; remove that folder to begin again.
+# The root is created once, in target/debian13; remove that folder to start over.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 suite=${DEBIAN_SUITE:-trixie}
@@ -30,7 +30,7 @@ sysroot=$(rustc --print sysroot)
 export root sysroot
 export cargo_home=${CARGO_HOME:-$HOME/.cargo}
 mkdir -p "$root/src" "$root/toolchain" "$root/cargo" "$root/build" "$cargo_home/registry"
-# Mounts of its own: nothing of them is left when it ends.
+# A private mount namespace: no mount is left behind.
 exec unshare --mount --propagation=private bash -euo pipefail -c '
     mount --rbind /dev "$root/dev"
     mount -t proc proc "$root/proc"
@@ -39,7 +39,7 @@ exec unshare --mount --propagation=private bash -euo pipefail -c '
     mount --bind "$sysroot" "$root/toolchain"
     mkdir -p "$root/cargo/registry"
     mount --bind "$cargo_home/registry" "$root/cargo/registry"
-    # A registry elsewhere, where this computer has one.
+    # A registry mirror, if this computer has one.
     [ ! -e "$cargo_home/config.toml" ] || cp "$cargo_home/config.toml" "$root/cargo/config.toml"
     cp /etc/resolv.conf "$root/etc/resolv.conf"
     exec env -i HOME=/root PATH=/toolchain/bin:/usr/sbin:/usr/bin:/sbin:/bin CARGO_HOME=/cargo CARGO_TARGET_DIR=/build \

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# The demo with recordings for the cameras that nobody has attached: makes them, runs `depthrig demo` on the rig that names
-# them, and has the dataset opened by readers that are not ours. Arguments are those of `depthrig demo`.
+# The demo with recordings in place of cameras: generates them, runs `depthrig demo` on a rig that plays them, and opens
+# the dataset with third-party readers. Arguments are those of `depthrig demo`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 target=${CARGO_TARGET_DIR:-$PWD/target}

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# tools/fuzz.sh [SECONDS [TARGET...]]: fuzzes each target, an hour if nothing is said, one after the other on one core,
+# tools/fuzz.sh [SECONDS [TARGET...]]: fuzzes each target, an hour by default, one after the other on one core,
 # and ends with a table. tools/fuzz.sh keep [TARGET...]: adds to the corpus, which is in the repository and runs in
-# `make test`, the shortest of what was found to be new, up to KEEP_BYTES a target.
-# docs/fuzzing.md explains. Exit code 1 when something was found.
+# `make test`, the shortest new inputs, up to KEEP_BYTES per target.
+# See docs/fuzzing.md. Exit code 1 if a failure was found.
 set -euo pipefail
 cd "$(dirname "$0")/../fuzz"
 

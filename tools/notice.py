@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Writes NOTICE: what the program `depthrig` is made of, from cargo's own tree, with copyright lines and licences.
+"""Writes NOTICE: the components of the program `depthrig` from cargo's dependency tree, with copyright lines and licences.
 
     tools/notice.py           write NOTICE
     tools/notice.py --check   exit 1 if NOTICE is not what would be written
@@ -130,13 +130,13 @@ def text() -> str:
 
 
 def main() -> int:
-    made = text()
+    generated = text()
     if sys.argv[1:] == ["--check"]:
-        if NOTICE.exists() and NOTICE.read_text() == made:
+        if NOTICE.exists() and NOTICE.read_text() == generated:
             return 0
         print("NOTICE is not that of the dependencies; write it with tools/notice.py", file=sys.stderr)
         return 1
-    NOTICE.write_text(made)
+    NOTICE.write_text(generated)
     return 0
 
 

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Fetches ONNX Runtime from PyPI into target/onnxruntime/, where the program looks for it: `cpu` (the default),
 # `openvino` (16-bit floats on CPUs that have them) or `gpu` (CUDA and TensorRT, without NVIDIA's own libraries).
-# Versions and hashes are pinned. Says nothing when everything is there; one message when it cannot be had.
+# Versions and hashes are pinned. Prints nothing if everything is there, one message if it is unavailable.
 #   tools/onnxruntime.sh [--into DIR] [cpu|openvino|gpu]...
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -19,7 +19,7 @@ fail() { # WHAT
     exit 1
 }
 
-download() { # PROJECT VERSION FILE DIR: through pip, which knows mirrors and proxies, or without it when there is none
+download() { # PROJECT VERSION FILE DIR: through pip, which knows mirrors and proxies, or directly if pip is missing
     local project=$1 version=$2 file=$3 dir=$4 url
     if python3 -m pip --version >/dev/null 2>&1; then
         python3 -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: \

@@ -1,17 +1,17 @@
 #!/usr/bin/env bash
-# The Python package as its users get it: builds the source archive and from it the wheel, and runs the tests.
+# Tests the Python package as users get it: builds the source archive, from it the wheel, and runs the tests.
 #
 #   tools/python.sh versions   types, then the wheel's tests on every Python from 3.9 on that this computer has
 #   tools/python.sh torch      the tests that need PyTorch, with that of .venv-lerobot; 77 when it is not there
 #   tools/python.sh oak        the OAK bridge with the vendor's SDK in .venv-oak: tests, and types against its stubs; 77
 #                              when it is not there
 #
-# Looked for are python3.9, python3.10, … and pyenv's; DEPTHRIG_PYTHONS="3.9 3.13" chooses. Environments are made once,
-# below target/python. The tests start a publisher: DEPTHRIG_TEST_PUBLISHER, else cargo builds it.
+# Looked for are python3.9, python3.10, … and pyenv's; DEPTHRIG_PYTHONS="3.9 3.13" chooses. Environments are created once,
+# in target/python. The tests start a publisher: DEPTHRIG_TEST_PUBLISHER, else cargo builds it.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 root=$PWD
-# Environments are made by who calls this, tests run as an ordinary user (tests/runner/box.py).
+# The caller creates the environments; tests run as an ordinary user (tests/runner/box.py).
 box() { "$root/tests/runner/box.py" --limit 3600 -- "$@"; }
 envs=${CARGO_TARGET_DIR:-$PWD/target}/python
 
@@ -27,7 +27,7 @@ interpreter() { # VERSION: the path of a Python of that version that can make en
     return 1
 }
 
-environment() { # NAME PYTHON REQUIREMENT...: an environment with these, made once
+environment() { # NAME PYTHON REQUIREMENT...: an environment with these, created once
     local folder=$envs/$1 python=$2
     shift 2
     local wanted
@@ -47,7 +47,7 @@ versions() {
     [ ${#found[@]} -gt 0 ] || { echo "no Python of $wanted was found" >&2; return 1; }
     echo "found: ${found[*]}; not there: $(comm -23 <(tr ' ' '\n' <<<"$wanted" | sort) <(printf '%s\n' "${found[@]}" | sort) | tr '\n' ' ')"
 
-    # What checks and builds needs a newer Python than what is checked.
+    # The type checker and the build need a newer Python than the package.
     python=$(for version in 3.14 3.13 3.12 3.11; do interpreter "$version" && break; done)
     environment tools "$python" build==1.6.1 mypy==2.4.1 numpy==2.4.6 'iceoryx2==0.10.*'
     "$envs/tools/bin/mypy" --config-file python/pyproject.toml --cache-dir "$envs/mypy" python/src

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Installs the Debian packages that building (`build`), testing (`test`), testing on a real kernel (`vm`), comparing with
-# other recorders (`peers`) and fuzzing (`fuzz`) need, when it may; else prints the one line to run. Says nothing when
-# everything is there.
+# Installs the Debian packages for building (`build`), testing (`test`), testing on a real kernel (`vm`), comparing with
+# other recorders (`peers`) and fuzzing (`fuzz`) if permitted; else prints the command to run. Prints nothing if all are
+# installed.
 set -euo pipefail
 
-# How to run apt-get; empty when it may not be run.
+# Prefix to run apt-get with; empty if not permitted.
 apt=()
 if command -v apt-get >/dev/null && [ "$(id -u)" -eq 0 ]; then
     apt=(env DEBIAN_FRONTEND=noninteractive apt-get)
@@ -12,7 +12,7 @@ elif command -v apt-get >/dev/null && sudo --non-interactive true 2>/dev/null; t
     apt=(sudo --non-interactive env DEBIAN_FRONTEND=noninteractive apt-get)
 fi
 
-# The version of Clang that this release of Debian has. A computer that has never fetched lists of packages knows none.
+# The version of Clang in this release of Debian; unknown on a computer without package lists.
 clang_version() {
     apt-cache depends libclang1 2>/dev/null | sed -n 's/^ *Depends: libclang1-//p' || true
 }
@@ -32,7 +32,7 @@ for part in "$@"; do
         # libusb, a shared library; without these two it would be built from source and linked statically.
         need pkg-config command -v pkg-config
         need libusb-1.0-0-dev pkg-config --exists libusb-1.0
-        # The bindings of the kernel's video interface are made from its header, by libclang and with Clang's own headers.
+        # The bindings of the kernel's video interface are generated from its header by libclang, with Clang's own headers.
         clang=$(clang_version)
         if [ -z "$clang" ] && [ ${#apt[@]} -gt 0 ]; then
             "${apt[@]}" update --quiet=2
@@ -58,7 +58,7 @@ for part in "$@"; do
         need mkvtoolnix command -v mkvinfo
         # The bindings below drivers/oak are C++.
         need g++ command -v c++
-        # What a program asks of a computer.
+        # Inspects the dependencies of a program.
         need binutils command -v objdump
         # The boxes that tests run in.
         need util-linux command -v setpriv
@@ -68,15 +68,15 @@ for part in "$@"; do
         need busybox-static command -v busybox
         need kmod command -v depmod
         need zstd command -v zstd
-        # Whose rules a scenario checks.
+        # A scenario checks its rules.
         need udev command -v udevadm
-        # Under which a scenario runs the service; nothing of it is started on this computer.
+        # A scenario runs the service under it; nothing is started on this computer.
         need systemd test -x /lib/systemd/systemd
         need binutils command -v objcopy
         need python3 command -v python3
         ;;
     peers)
-        # Debian's own Python: its rosbag is for no other.
+        # Debian's own Python: its rosbag works with no other.
         need python3 test -x /usr/bin/python3
         need python3-venv /usr/bin/python3 -c 'import ensurepip, venv'
         need python3-rosbag /usr/bin/python3 -c 'import importlib.util as u, sys; sys.exit(not u.find_spec("rosbag"))'
@@ -93,7 +93,7 @@ for part in "$@"; do
     esac
 done
 
-# Those real images for tests that a Debian package has; the others are no package's (CONTRIBUTING.md).
+# Real test images from a Debian package; CONTRIBUTING.md lists the others.
 images=${CARGO_TARGET_DIR:-target}/test-data/opencv_aloe_stereo
 fetch_images() {
     local work

@@ -12,7 +12,7 @@ if [ -z "${DEPTHRIG_TEST_USER:-}" ]; then
 fi
 IFS=: read -r uid gid _ <<<"$DEPTHRIG_TEST_USER"
 chown -R "$uid:$gid" "$home"
-# What tests keep from one run to the next: seeded weights, the virtual machine's kernel.
+# Caches that tests keep between runs: seeded weights, the virtual machine's kernel.
 chmod 1777 "$target/tmp"
 mkdir -p "$target/test-cache"
 chown "$uid:$gid" "$target/test-cache"

@@ -58,10 +58,11 @@ fn main() -> Result<(), Box<dyn Error>> {
 
 /// The modes of the pattern. A real camera has its factory calibration here.
 fn modes(options: &Options) -> Result<[Mode; 2], depthrig_bus::Error> {
-    let (width, height) = (f64::from(options.size.0), f64::from(options.size.1));
+    let width = f64::from(options.size.0);
+    let height = f64::from(options.size.1);
     let intrinsics = Intrinsics::pinhole(width, width, width / 2.0 - 0.5, height / 2.0 - 0.5);
     let mode = |name: &str, format| {
-        let mode = Mode::new(Name::new(name)?, format, options.size, options.rate_hz);
+        let mode = Mode::new(Name::new(name)?, format, options.size.0, options.size.1, options.rate_hz);
         let mode = mode.with_device_clock(32, 1_000_000, 32);
         Ok(Mode { intrinsics, simulated: true, ..mode })
     };
@@ -71,13 +72,14 @@ fn modes(options: &Options) -> Result<[Mode; 2], depthrig_bus::Error> {
 /// Sends frames as long as they are wanted; returns the number of the last one.
 fn serve(session: &mut Session<'_>, options: &Options, mut number: u64) -> Result<u64, depthrig_bus::Error> {
     let running: Vec<(usize, Mode)> = session.modes().map(|(i, mode)| (i, mode.clone())).collect();
-    let (start, first) = (HostTime::now(), number);
+    let start = HostTime::now();
+    let first = number;
     session.started();
     while session.is_wanted() && number < options.frames {
         number += 1;
         let due = start.plus(Duration::from_secs_f64((number - first) as f64 / options.rate_hz));
         std::thread::sleep(due.from_now());
-        // What the device would say: its counter, and its clock at mid-exposure.
+        // A real device would give these: its counter, and its clock at mid-exposure.
         let now = HostTime::now();
         let facts = ExternalFrame {
             device_sequence: number & 0xFFFF_FFFF,
@@ -130,7 +132,7 @@ fn options() -> Result<Options, Box<dyn Error>> {
             }
             "--rate" => options.rate_hz = value.parse()?,
             "--frames" => options.frames = value.parse()?,
-            _ => return Err(format!("there is no option {arg}").into()),
+            _ => return Err(format!("unknown option {arg}").into()),
         }
     }
     Ok(options)

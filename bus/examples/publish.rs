@@ -9,7 +9,7 @@
 //! to each row. `--step` waits for a number on stdin, publishes that many frames, prints the last sequence number, and
 //! so on until stdin ends; times are invented then, and every field of the header is filled. `--dump` publishes
 //! nothing and writes a header with a distinct value in every field: the bytes as they lie in shared memory, and as
-//! JSON; mirrors in other languages are tested with it.
+//! JSON; mirrors in other languages are tested against it.
 
 #![recursion_limit = "256"] // one JSON object with 42 fields
 
@@ -48,7 +48,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         .map(|format| {
             let id = StreamId::new("pattern", format.name())?;
             // 160 slots: eight readers may hold all they are allowed to, and none of them stops the pattern.
-            let publisher = bus.publisher(&id, picture(&options, *format).payload_len as usize, 160)?;
+            let publisher = bus.publisher(&id, image(&options, *format).payload_len as usize, 160)?;
             Ok((id, *format, publisher))
         })
         .collect::<Result<Vec<_>, depthrig_bus::Error>>()?;
@@ -58,7 +58,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let mut members = vec![missing()?];
         for (id, format, publisher) in &streams {
             let sent = send(&options, (id, *format, publisher), sequence, capture_ns)?;
-            // Motion is no part of sets.
+            // Sets exclude IMU streams.
             members.extend((!format.is_motion()).then_some(sent));
         }
         let header = SetHeader {
@@ -103,7 +103,7 @@ fn send(
     sequence: u64,
     capture_ns: i64,
 ) -> Result<MemberRecord, depthrig_bus::Error> {
-    let mut header = picture(options, format);
+    let mut header = image(options, format);
     if !options.step {
         (header.flags, header.dropped) = (FrameFlags::SYNTHETIC.0, [0; 8]);
     }
@@ -128,16 +128,16 @@ const fn step_ns(sequence: u64) -> i64 {
 }
 
 /// A header for `format` with a distinct value in every field and padded rows.
-fn picture(options: &Options, format: PixelFormat) -> FrameHeader {
+fn image(options: &Options, format: PixelFormat) -> FrameHeader {
     let mut header = distinct();
     let (width, height) = options.size;
     if format.is_motion() {
         // Samples follow each other without padding.
-        header.set_picture(format, width, 1);
+        header.set_image(format, width, 1);
         header.depth_unit_m = 0.0;
         return header;
     }
-    header.set_picture(format, width, height);
+    header.set_image(format, width, height);
     if format == PixelFormat::Mjpeg {
         header.payload_len = 1000;
         return header;
@@ -297,7 +297,7 @@ fn options() -> Result<Options, Box<dyn Error>> {
             "--frames" => options.frames = value()?.parse()?,
             "--step" => options.step = true,
             "--dump" => options.dump = Some(value()?.into()),
-            _ if arg.starts_with('-') => return Err(format!("there is no option {arg}").into()),
+            _ if arg.starts_with('-') => return Err(format!("unknown option {arg}").into()),
             _ => options.runtime = arg.into(),
         }
     }
@@ -314,7 +314,7 @@ fn formats(list: &str) -> Result<Vec<PixelFormat>, String> {
     list.split(',')
         .map(|name| {
             let known = PixelFormat::ALL.into_iter().find(|f| f.name() == name);
-            known.ok_or_else(|| format!("\"{name}\" is no pixel format"))
+            known.ok_or_else(|| format!("unknown pixel format \"{name}\""))
         })
         .collect()
 }

@@ -1,5 +1,5 @@
 //! One channel: a publish-subscribe service of bytes with a typed header, and an event service of the same
-//! name that wakes sleepers.
+//! name that wakes waiting readers.
 //!
 //! The limits are the same for every channel of every rig, so that a daemon that comes back with another
 //! configuration never meets an old subscriber that holds the channel in another form.
@@ -37,11 +37,11 @@ type EventFactory = event::PortFactory<IoxService>;
 
 /// Subscribers of one channel at most, besides the daemon's own.
 pub const MAX_SUBSCRIBERS: usize = 16;
-/// The places of a channel: every subscriber's, and that of the daemon, which reads each stream for its sets.
+/// Subscriber slots of a channel: every subscriber's, and the daemon's, which reads each stream for its sets.
 const PLACES: usize = MAX_SUBSCRIBERS + 1;
 /// Unread frames that the channel keeps per subscriber; older ones are replaced.
 pub const BUFFER: usize = 4;
-/// Frames that one subscriber may hold at once (frame stacks, sets in flight).
+/// Frames that one subscriber may hold at once (frame stacks, sets being processed).
 pub const MAX_HELD: usize = 16;
 /// A camera's publisher, one that replaces a hung thread's, and one to spare.
 const MAX_PUBLISHERS: usize = 3;
@@ -52,8 +52,8 @@ const MAX_LOANS: usize = 1 + MAX_LENT;
 const MAX_NODES: usize = 32;
 const NEW_FRAME: EventId = EventId::new(crate::external::EVENT_ID);
 
-/// The limits of a channel, and the version of what travels on it. iceoryx2 fixes the limits while anybody holds the
-/// channel, so that all who open it must say the same.
+/// The limits of a channel, and the version of what travels on it. iceoryx2 fixes the limits while a process holds the
+/// channel open, so every process must open it with the same ones.
 #[derive(Debug, Clone, Copy)]
 pub struct Form {
     pub schema: &'static str,
@@ -83,7 +83,7 @@ pub const RIG: Form = Form {
     loans: MAX_LOANS,
 };
 
-/// What a header type must be to travel.
+/// A header type that can be sent over a channel.
 pub trait Header: Debug + Default + Copy + ZeroCopySend + 'static {}
 impl<T: Debug + Default + Copy + ZeroCopySend + 'static> Header for T {}
 
@@ -100,7 +100,7 @@ impl<H: Header> Channel<H> {
         Self { name, what, form, header: PhantomData }
     }
 
-    /// Opens the channel for writing, making it when it is not there. `starved` is set when no slot is free.
+    /// Opens the channel for writing and creates it if it does not exist. `starved` is set when no slot is free.
     pub fn sender(
         &self,
         node: &Node<IoxService>,
@@ -112,7 +112,7 @@ impl<H: Header> Channel<H> {
         Ok(Sender { out, notifier: self.notifier(node)?, starved: Arc::clone(starved) })
     }
 
-    /// Opens the channel for reading; somebody else has made it.
+    /// Opens the channel for reading; another process has created it.
     pub fn receiver(&self, node: &Node<IoxService>) -> Result<Receiver<H>> {
         let inlet = self.inlet(node, false)?;
         Ok(Receiver { inlet, listener: self.listener(node)? })
@@ -172,7 +172,7 @@ impl<H: Header> Channel<H> {
         })
     }
 
-    /// The reading end without the event. With `make` the channel is made when it is not there.
+    /// The reading end without the event. With `make`, creates the channel if it does not exist.
     pub fn inlet(&self, node: &Node<IoxService>, make: bool) -> Result<Inlet<H>> {
         let service = self.service(node, make)?;
         let port = service.subscriber_builder().create().map_err(|e| {
@@ -184,7 +184,7 @@ impl<H: Header> Channel<H> {
         Ok(Inlet { port, service, held: self.form.held, what: self.what.clone() })
     }
 
-    /// What raises the event of the channel.
+    /// Opens the port that raises the channel's event.
     pub fn notifier(&self, node: &Node<IoxService>) -> Result<Notifier<IoxService>> {
         let events = self.event_service(node, &self.service_name()?)?;
         events.notifier_builder().default_event_id(NEW_FRAME).create().map_err(|e| {
@@ -195,7 +195,7 @@ impl<H: Header> Channel<H> {
         })
     }
 
-    /// What sleeps until the event of the channel.
+    /// Opens the port that waits for the channel's event.
     pub fn listener(&self, node: &Node<IoxService>) -> Result<Listener<IoxService>> {
         let name = self.service_name()?;
         let events = self.event_service(node, &name)?;
@@ -207,7 +207,8 @@ impl<H: Header> Channel<H> {
         })
     }
 
-    /// Why a port cannot be made: all places are `taken`, this process is out of descriptors, or else.
+    /// The error of a port that cannot be created: all places are `taken`, no file descriptors are left, or another
+    /// cause.
     fn port_error(&self, taken: Option<String>, otherwise: &str) -> Error {
         let why = taken.unwrap_or_else(|| limits::why(otherwise));
         self.error(ErrorKind::LimitReached, &why)
@@ -260,10 +261,9 @@ impl<H: Header> Channel<H> {
     }
 
     fn service_name(&self) -> Result<ServiceName> {
-        self.name
-            .as_str()
-            .try_into()
-            .map_err(|e| self.error(ErrorKind::BadName, "its name is no service name").with_source(e))
+        self.name.as_str().try_into().map_err(|e| {
+            self.error(ErrorKind::BadName, "its name is not a valid iceoryx2 service name").with_source(e)
+        })
     }
 
     fn error(&self, kind: ErrorKind, why: &str) -> Error {
@@ -328,7 +328,7 @@ impl<H: Header> Sender<H> {
         })
     }
 
-    /// Gives subscribers that came since the last sample that one. Sending does it as well.
+    /// Delivers the last sample to late joiners. Sending does it as well.
     pub fn welcome(&self) {
         self.out.welcome();
     }
@@ -338,7 +338,7 @@ impl<H: Header> Sender<H> {
         self.out.slots
     }
 
-    /// Publishes a slot whose every byte has been written, then wakes sleepers. Never blocks on one.
+    /// Publishes a slot whose every byte has been written, then wakes waiting readers. Never blocks on one.
     pub fn send(&self, loan: Loan<H>) -> Result<usize> {
         let receivers = self.out.send(loan)?;
         ring(&self.notifier, &self.out.what);
@@ -346,15 +346,15 @@ impl<H: Header> Sender<H> {
     }
 }
 
-/// Wakes who sleeps on an event.
+/// Wakes the readers that wait for an event.
 pub fn ring(notifier: &Notifier<IoxService>, what: &str) {
-    // A sleeper that cannot be woken finds the frame at its next time-out.
+    // A reader that cannot be woken finds the frame after its next timeout.
     if let Err(e) = notifier.notify() {
         tracing::debug!(channel = what, error = ?e, "a subscriber could not be woken");
     }
 }
 
-/// Sleeps until the event is raised or `timeout` has passed. A signal counts as raised.
+/// Waits until the event is raised or `timeout` has passed. A signal counts as raised.
 pub fn sleep(listener: &Listener<IoxService>, timeout: Duration, what: &str) -> Result<()> {
     match listener.timed_wait(|_| {}, timeout) {
         Ok(_) | Err(ListenerWaitError::InterruptSignal) => Ok(()),
@@ -414,7 +414,7 @@ impl<H: Header> Outlet<H> {
         })
     }
 
-    /// Connects subscribers that came, and lets go of those that ended, since the last sample.
+    /// Connects the subscribers that joined, and disconnects those that left, since the last sample.
     fn welcome(&self) {
         if let Err(e) = self.port.update_connections() {
             tracing::debug!(channel = self.what, error = ?e, "a new subscriber could not be connected");
@@ -449,12 +449,12 @@ impl<H: Header> Receiver<H> {
         self.inlet.try_receive()
     }
 
-    /// Sleeps until something was sent or `timeout` has passed. A signal counts as something sent.
+    /// Waits until a sample is sent or `timeout` has passed. A signal counts as a sample.
     pub fn wait(&self, timeout: Duration) -> Result<()> {
         sleep(&self.listener, timeout, &self.inlet.what)
     }
 
-    /// Whether anybody publishes at all.
+    /// Whether the channel has a publisher.
     pub fn has_publisher(&self) -> bool {
         self.inlet.service.dynamic_config().number_of_publishers() > 0
     }

@@ -1,4 +1,4 @@
-//! The one clock: `CLOCK_MONOTONIC` nanoseconds, and its pairing with UTC for what is written out.
+//! The only clock: `CLOCK_MONOTONIC` in nanoseconds, and its pairing with UTC for files and reports.
 //!
 //! Nothing else in depthrig reads a clock; `clippy.toml` forbids `Instant::now` and `SystemTime::now`.
 
@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 pub struct HostTime(i64);
 
 impl HostTime {
-    /// The present moment.
+    /// The current time.
     pub fn now() -> Self {
         Self(read_ns(ClockId::Monotonic))
     }

@@ -1,12 +1,12 @@
 //! The error of the bus: a kind to match on, what happened, and to which channel or path.
 
-/// What went wrong, for callers that decide on it.
+/// Kind of the error, for callers that match on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum ErrorKind {
     /// A rig, camera or stream name breaks the rules of [`crate::Name`].
     BadName,
-    /// Nobody publishes the channel.
+    /// The channel has no publisher.
     NotFound,
     /// Another process holds what can be held once.
     InUse,
@@ -24,10 +24,10 @@ pub enum ErrorKind {
     Other,
 }
 
-/// Makes the error of a crate around its `ErrorKind`: the struct `Error`, and `Result`.
+/// Defines a crate's `Error` and `Result` for its `ErrorKind`.
 ///
 /// Every crate of depthrig has an error of this form, and a type of its own, so that conversions between them are
-/// written down where one floor calls another.
+/// explicit where one layer calls another.
 #[doc(hidden)]
 #[macro_export]
 macro_rules! error_type {
@@ -55,7 +55,7 @@ macro_rules! error_type {
                 self
             }
 
-            /// What went wrong, for callers that decide on it.
+            /// Kind of the error, for callers that match on it.
             pub const fn kind(&self) -> ErrorKind {
                 self.kind
             }

@@ -23,7 +23,7 @@ pub use codes::{
 };
 pub use fields::{ANSWER_FIELDS, FRAME_FIELDS, MODE_FIELDS, OFFER_FIELDS};
 pub use layout::{ExternalAnswer, ExternalFrame, ExternalMode, ExternalOffer};
-pub use link::{Answer, Beat, ExternalLink, FrameInlet, Offer, Said, SentFrame};
+pub use link::{Answer, Beat, ExternalLink, FrameInlet, Offer, OfferMessage, SentFrame};
 pub use lock::{ExternalLock, holder, lock};
 pub use mode::{About, Mode};
 pub use place::{Place, served};
@@ -37,17 +37,17 @@ pub const VERSION: u16 = 1;
 pub const SCHEMA: &str = "depthrig.external/1";
 /// First part of the channels' names.
 pub const PREFIX: &str = "depthrig.external";
-/// What the name of a camera's lock ends with.
+/// Suffix of a camera's lock file.
 pub const LOCK_SUFFIX: &str = ".external";
-/// What an [`ExternalOffer`] begins with.
+/// First bytes of an [`ExternalOffer`].
 pub const OFFER_MAGIC: [u8; 4] = *b"DREO";
-/// What an [`ExternalAnswer`] begins with.
+/// First bytes of an [`ExternalAnswer`].
 pub const ANSWER_MAGIC: [u8; 4] = *b"DREA";
-/// What an [`ExternalFrame`] begins with.
+/// First bytes of an [`ExternalFrame`].
 pub const FRAME_MAGIC: [u8; 4] = *b"DREF";
-/// How often both sides say that they are there.
+/// Heartbeat interval of both sides.
 pub const HEARTBEAT: Duration = Duration::from_millis(200);
-/// Silence after which the daemon is taken for gone.
+/// Silence after which the daemon counts as gone.
 pub const SILENCE: Duration = Duration::from_secs(2);
 /// Modes of one camera at most.
 pub const MAX_MODES: usize = 64;

@@ -1,7 +1,7 @@
 //! Opens files that a user or a dataset names: regular files only, and without waiting.
 //!
-//! Opening a FIFO waits for its writer, and reading a device may never end. Whatever reads a path that it did not make
-//! itself opens it here.
+//! Opening a FIFO waits for its writer, and reading a device may never end. Every read of a path that depthrig did not
+//! create itself opens it here.
 //!
 //! ```
 //! # fn main() -> std::io::Result<()> {
@@ -17,7 +17,7 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
-/// Longest text that a person writes by hand, such as a rig file: 16 MiB.
+/// Largest file that a person writes by hand, such as a rig file: 16 MiB.
 pub const TEXT_MAX_BYTES: u64 = 16 << 20;
 /// Largest file of one image: 1 GiB.
 pub const IMAGE_MAX_BYTES: u64 = 1 << 30;
@@ -25,7 +25,7 @@ pub const IMAGE_MAX_BYTES: u64 = 1 << 30;
 /// Opens the regular file `path` for reading.
 ///
 /// # Errors
-/// As the operating system says; `InvalidInput` with what it is when it is no regular file.
+/// As the operating system reports; `InvalidInput` naming the file type if it is not a regular file.
 pub fn open(path: &Path) -> io::Result<File> {
     // Asked first, because opening alone already acts on some devices, and again of what was opened.
     regular(FileType::from_raw_mode(rustix::fs::stat(path)?.st_mode))?;
@@ -38,7 +38,7 @@ pub fn open(path: &Path) -> io::Result<File> {
 /// Opens the folder `path`, to lock or to sync it.
 ///
 /// # Errors
-/// As the operating system says.
+/// As the operating system reports.
 pub fn open_folder(path: &Path) -> io::Result<File> {
     let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
     Ok(File::from(rustix::fs::open(path, flags, Mode::empty())?))
@@ -97,10 +97,10 @@ mod tests {
 
     /// The error of reading `path`; panics when reading waits.
     fn refused(path: &Path) -> io::Error {
-        let (tell, told) = sync_channel(1);
+        let (sender, receiver) = sync_channel(1);
         let path = path.to_owned();
-        std::thread::spawn(move || tell.send(read(&path, 1 << 20)));
-        let read = told.recv_timeout(Duration::from_secs(30)).expect("reading waits for ever");
+        std::thread::spawn(move || sender.send(read(&path, 1 << 20)));
+        let read = receiver.recv_timeout(Duration::from_secs(30)).expect("reading waits for ever");
         read.expect_err("it was read")
     }
 

@@ -1,4 +1,4 @@
-//! Pixel formats and how many bytes a picture of each takes.
+//! Pixel formats and how many bytes an image of each takes.
 
 use serde::{Deserialize, Serialize};
 
@@ -26,13 +26,13 @@ pub enum PixelFormat {
     Uyvy = 8,
     /// Planar 4:2:0: Y plane, then interleaved UV.
     Nv12 = 9,
-    /// One JPEG picture; the payload length varies.
+    /// One JPEG image; the payload length varies.
     Mjpeg = 10,
     /// One byte of confidence, higher is surer.
     Confidence8 = 11,
-    /// 32-bit float disparity of the left picture of a rectified pair, pixels; NaN is "no match".
+    /// 32-bit float disparity of the left image of a rectified pair, pixels; NaN is "no match".
     DisparityF32 = 12,
-    /// No picture: samples of a motion unit ([`crate::MotionSample`]), `width` of them in one row.
+    /// No image: samples of an IMU ([`crate::MotionSample`]), `width` of them in one row.
     Motion = 13,
 }
 
@@ -90,7 +90,7 @@ impl PixelFormat {
         }
     }
 
-    /// Bytes of a whole picture without row padding; for MJPEG the most that is reserved for one.
+    /// Bytes of an image without row padding; for MJPEG the most that is reserved for one.
     pub const fn frame_bytes(self, width: u32, height: u32) -> usize {
         match self {
             Self::Nv12 => width as usize * height as usize * 3 / 2,
@@ -104,7 +104,7 @@ impl PixelFormat {
         matches!(self, Self::Z16 | Self::DepthF32)
     }
 
-    /// Whether the frames are no pictures but batches of motion samples. Such a stream is no part of frame sets.
+    /// Whether the frames are batches of IMU samples instead of images. Frame sets exclude such a stream.
     pub const fn is_motion(self) -> bool {
         matches!(self, Self::Motion)
     }

@@ -1,8 +1,8 @@
-//! What a frame says of itself: a fixed, versioned, self-sufficient header in shared memory.
+//! The frame header: a fixed, versioned, self-sufficient description of a frame in shared memory.
 //!
 //! The layout is the contract with every other process. A field is never moved or given another meaning
 //! within one [`HEADER_VERSION`]; new fields take space from `reserved`. Every field lies at a multiple of
-//! its size, so there is no hidden padding, and [`FIELDS`] lists them for mirrors in other languages.
+//! its size, so nothing is padded implicitly, and [`FIELDS`] lists them for mirrors in other languages.
 
 use crate::{DropCounts, Intrinsics, PixelFormat, Pose, StreamId};
 use core::fmt;
@@ -46,7 +46,7 @@ pub struct FrameHeader {
     pub sequence: u64,
     /// The device's own frame counter, unwrapped.
     pub device_sequence: u64,
-    /// The frame set this frame belongs to; 0 on the live path, where sets are made after publishing.
+    /// The frame set this frame belongs to; 0 on the live path, where sets are assembled after publishing.
     pub set_id: u64,
     /// Raw device time in ticks, unwrapped to 64 bits.
     pub device_time: u64,
@@ -67,12 +67,12 @@ pub struct FrameHeader {
     pub captured: u64,
     /// Frames lost so far, indexed by [`crate::DropReason`].
     pub dropped: [u64; 8],
-    /// For a derived stream, `sequence` of the frame that it was made from (the depth frame where there are several);
+    /// For a derived stream, `sequence` of its source frame (the depth frame where there are several);
     /// else 0.
     pub source_sequence: u64,
-    /// Metres per unit of depth; 0 when the pixels are no depth.
+    /// Metres per unit of depth; 0 when the pixels are not depth.
     pub depth_unit_m: f64,
-    /// Intrinsics of this picture at this size.
+    /// Intrinsics of this image at this size.
     pub intrinsics: Intrinsics,
     /// Pose of this stream's optical frame on the mount: `p_mount = R p_camera + t`.
     pub pose: Pose,
@@ -106,14 +106,14 @@ pub struct FrameHeader {
     pub model: [u8; 32],
     /// Camera serial number, zero-padded UTF-8.
     pub serial: [u8; 32],
-    /// For depth that was made from depth and colour, `sequence` of the colour frame; else 0.
+    /// For depth computed from depth and colour, `sequence` of the colour frame; else 0.
     pub source_color_sequence: u64,
     /// Middle of the exposure of that colour frame on the host clock; else 0. `capture_time_ns` is that of the depth
     /// frame.
     pub source_color_capture_time_ns: i64,
-    /// How long each step of making a derived frame took, nanoseconds, indexed by [`StageStep`]; else 0.
+    /// Duration of each step of computing a derived frame, nanoseconds, indexed by [`StageStep`]; else 0.
     pub stage_ns: [u64; StageStep::ALL.len()],
-    /// What made a derived frame, such as `fill` or `onnxruntime 1.31.1 cpu fp32`, zero-padded UTF-8.
+    /// Method that computed a derived frame, such as `fill` or `onnxruntime 1.31.1 cpu fp32`, zero-padded UTF-8.
     pub refiner: [u8; 32],
     /// The model that it used, such as `cdm-d435@1f2e3d4c`, zero-padded UTF-8; empty when it needs none.
     pub refiner_model: [u8; 32],
@@ -182,8 +182,8 @@ impl FrameHeader {
         PixelFormat::from_code(self.format)
     }
 
-    /// Sets format, size, a stride without padding, and the payload length of such a picture.
-    pub fn set_picture(&mut self, format: PixelFormat, width: u32, height: u32) {
+    /// Sets format, size, a stride without padding, and the payload length of such an image.
+    pub fn set_image(&mut self, format: PixelFormat, width: u32, height: u32) {
         self.format = format as u32;
         (self.width, self.height) = (width, height);
         self.stride = format.row_bytes(width);
@@ -218,24 +218,23 @@ impl FrameHeader {
         set_text(&mut self.serial, serial);
     }
 
-    /// Writes what made a derived frame and with which model; what does not fit in 31 bytes is cut at a character
-    /// boundary.
+    /// Writes the method and the model of a derived frame; each is cut to 31 bytes at a character boundary.
     pub fn set_refiner(&mut self, refiner: &str, model: &str) {
         set_text(&mut self.refiner, refiner);
         set_text(&mut self.refiner_model, model);
     }
 
-    /// What made this frame, such as `fill`; empty when it was captured.
+    /// Method that computed this frame, such as `fill`; empty when it was captured.
     pub fn refiner(&self) -> &str {
         text(&self.refiner)
     }
 
-    /// The model that it was made with; empty when none was needed.
+    /// The model that it used; empty when it needs none.
     pub fn refiner_model(&self) -> &str {
         text(&self.refiner_model)
     }
 
-    /// How long `step` of making this frame took, nanoseconds.
+    /// Duration of `step` of computing this frame, nanoseconds.
     pub const fn step_ns(&self, step: StageStep) -> u64 {
         self.stage_ns[step as usize]
     }
@@ -313,13 +312,13 @@ impl FrameFlags {
     pub const CLOCK_WARMUP: Self = Self(1 << 2);
     /// First frame of a new clock epoch.
     pub const EPOCH_CHANGED: Self = Self(1 << 3);
-    /// Made from other frames, not captured.
+    /// Computed from other frames, not captured.
     pub const DERIVED: Self = Self(1 << 4);
     /// Captured on a hardware trigger.
     pub const HARDWARE_TRIGGERED: Self = Self(1 << 5);
     /// Arrived more than two frame periods after its capture.
     pub const LATE: Self = Self(1 << 6);
-    /// Made by a simulated camera.
+    /// Generated by a simulated camera.
     pub const SYNTHETIC: Self = Self(1 << 7);
     /// The device time is that of the transport's header, which is later than mid-exposure.
     pub const HEADER_TIME: Self = Self(1 << 8);
@@ -351,19 +350,19 @@ impl FrameFlags {
     }
 }
 
-/// A step of making a derived frame. The discriminant is the index into `FrameHeader::stage_ns`; it is part of the wire
-/// format and never changes.
+/// A step of computing a derived frame. The discriminant is the index into `FrameHeader::stage_ns`; it is part of the
+/// wire format and never changes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u32)]
 #[non_exhaustive]
 pub enum StageStep {
     /// From when both frames were there until work on them began.
     Wait = 0,
-    /// Depth into the view of colour.
+    /// Registration of depth to the colour image.
     Register = 1,
-    /// From pictures to the engine's input.
+    /// Preparation of the engine's input from the images.
     Prepare = 2,
-    /// The engine.
+    /// Inference.
     Infer = 3,
     /// From the engine's output to the pixels of this frame.
     Finish = 4,

@@ -1,4 +1,4 @@
-//! Names of rigs, cameras and streams, and the channel name made of them.
+//! Names of rigs, cameras and streams, and the channel name built from them.
 
 use crate::{Error, ErrorKind, Result};
 use core::fmt;

@@ -1,8 +1,6 @@
 //! The frame bus: the vocabulary of depthrig and its channels in shared memory.
-//!
-//! Floor 1. Everything else speaks in the types of this crate; it knows no camera, no file and no model.
-//! Start at [`FrameHeader`] (what a frame says of itself), [`Bus`] (open a rig), [`Publisher`] and
-//! [`Subscriber`] (write and read a channel).
+//! The lowest layer: every other crate uses its types; it depends on no camera, file or model. Start at [`FrameHeader`]
+//! (describes a frame), [`Bus`] (open a rig), [`Publisher`] and [`Subscriber`] (write and read a channel).
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 mod channel;

@@ -1,4 +1,4 @@
-//! What a process runs out of, when iceoryx2 only says that something could not be made.
+//! Finds the exhausted limit of the process when iceoryx2 only reports that it could not create something.
 
 use rustix::io::Errno;
 use rustix::process::{Resource, getrlimit};
@@ -11,7 +11,7 @@ pub fn why(otherwise: &str) -> String {
     descriptors().unwrap_or_else(|| otherwise.to_owned())
 }
 
-/// What to do when so few file descriptors are left that opening a port can fail for it.
+/// Advice when so few file descriptors are left that opening a port can fail.
 pub fn descriptors() -> Option<String> {
     let most = getrlimit(Resource::Nofile).current?;
     let open = match std::fs::read_dir("/proc/self/fd") {

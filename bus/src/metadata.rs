@@ -1,10 +1,9 @@
-//! How much a camera says of a frame besides its pixels, from which follows how good its times can be.
+//! How much metadata a camera gives with a frame, which limits how good its times can be.
 
 use crate::{ClockDomain, FrameFlags, FrameHeader};
 
-/// What a frame's times come from, best first.
-///
-/// A frame says it with its clock domain and flags ([`FrameHeader::metadata_level`]), so that there is one source of it.
+/// Source of a frame's times, best first.
+/// It follows from a frame's clock domain and flags ([`FrameHeader::metadata_level`]), so it is stored nowhere else.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum MetadataLevel {
     /// The device's own frame counter, exposure and mid-exposure time.
@@ -14,7 +13,7 @@ pub enum MetadataLevel {
     Header,
     /// A stamp of the host: the kernel's when the first packet came, or the schedule of files that are played.
     Kernel,
-    /// Nothing but when the last byte arrived. Also a frame of a better stream whose metadata was lost on the way.
+    /// Only the arrival of the last byte. Also a frame of a better stream whose metadata was lost on the way.
     Arrival,
     /// The truth of a simulated camera.
     Simulated,
@@ -58,7 +57,7 @@ impl MetadataLevel {
 }
 
 impl FrameHeader {
-    /// What the frame's times come from.
+    /// Source of the frame's times.
     pub const fn metadata_level(&self) -> MetadataLevel {
         let domain = match self.clock_domain {
             1 => ClockDomain::Device,

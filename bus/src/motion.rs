@@ -1,9 +1,8 @@
-//! Samples of a motion unit: what a frame of format [`PixelFormat::Motion`](crate::PixelFormat::Motion) holds instead of pixels.
-//!
-//! A unit measures hundreds of times a second, so its frames are batches: `width` samples in one row, in the order of
-//! their times. The header's times are those of the newest sample, its pose is that of the unit, and it counts batches as
-//! it counts pictures; samples have numbers of their own, whose gaps are samples that the device never gave, or that were
-//! lost with a batch.
+//! IMU samples, which a frame of format [`PixelFormat::Motion`](crate::PixelFormat::Motion) holds instead of pixels.
+//! An IMU measures hundreds of times a second, so its frames are batches: `width` samples in one row, in the order of
+//! their times. The header's times are those of the newest sample, its pose is that of the IMU, and it counts batches
+//! as it counts images; samples have numbers of their own, whose gaps are samples that the device never gave, or that
+//! were lost with a batch.
 
 use crate::{Field, HostTime};
 use core::mem::offset_of;
@@ -11,7 +10,7 @@ use core::mem::offset_of;
 /// Bytes of one [`MotionSample`].
 pub const MOTION_SAMPLE_BYTES: usize = 64;
 
-/// One sample: how the unit turned and what pushed it, in the unit's own frame.
+/// One sample: angular velocity and acceleration in the IMU's own frame.
 ///
 /// Its layout is the contract with every other process, as that of the header is; all numbers are little-endian.
 #[repr(C)]
@@ -19,7 +18,7 @@ pub const MOTION_SAMPLE_BYTES: usize = 64;
 pub struct MotionSample {
     /// When the rotation was measured, nanoseconds on the host clock.
     pub time_ns: i64,
-    /// The same on the unit's clock, ticks, unwrapped.
+    /// The same on the IMU's clock, ticks, unwrapped.
     pub device_time: u64,
     /// Number of the sample; a gap is samples that the device never gave, or that were lost with a batch.
     pub sequence: u64,
@@ -29,9 +28,9 @@ pub struct MotionSample {
     pub accel_offset_ns: i32,
     /// Angular velocity about x, y and z, rad/s; NaN where the sample has none.
     pub gyro_rad_s: [f32; 3],
-    /// Acceleration along x, y and z, m/s²; a unit at rest measures 9.8 upwards. NaN where the sample has none.
+    /// Acceleration along x, y and z, m/s²; an IMU at rest measures 9.8 upwards. NaN where the sample has none.
     pub accel_m_s2: [f32; 3],
-    /// Temperature of the unit, °C; NaN when unknown.
+    /// Temperature of the IMU, °C; NaN when unknown.
     pub temperature_c: f32,
     /// [`MotionFlags`] bits.
     pub flags: u32,
@@ -119,7 +118,8 @@ impl MotionSample {
     pub fn from_bytes(bytes: &[u8; MOTION_SAMPLE_BYTES]) -> Self {
         let four = |at: usize| [bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]];
         let eight = |at: usize| {
-            let ([a, b, c, d], [e, f, g, h]) = (four(at), four(at + 4));
+            let [a, b, c, d] = four(at);
+            let [e, f, g, h] = four(at + 4);
             [a, b, c, d, e, f, g, h]
         };
         let three = |at: usize| [0, 4, 8].map(|i| f32::from_le_bytes(four(at + i)));
@@ -146,7 +146,7 @@ impl MotionSample {
         MotionFlags(self.flags).has(flag)
     }
 
-    /// The samples in `payload`, the payload of a motion frame; bytes after the last whole one are left out.
+    /// The samples in `payload`, the payload of a motion frame; bytes after the last complete one are left out.
     pub fn all_in(payload: &[u8]) -> impl ExactSizeIterator<Item = Self> + '_ {
         payload.as_chunks::<MOTION_SAMPLE_BYTES>().0.iter().map(Self::from_bytes)
     }
@@ -187,10 +187,11 @@ mod tests {
         assert_eq!(field("temperature_c"), 40.25f32.to_le_bytes());
         assert_eq!(field("flags"), 5u32.to_le_bytes());
         assert_eq!(MotionSample::from_bytes(&bytes), sample);
-        let (mut two, mut read) = ([bytes, bytes].concat(), Vec::new());
+        let mut two = [bytes, bytes].concat();
+        let mut read = Vec::new();
         two.extend([1; 9]);
         read.extend(MotionSample::all_in(&two));
-        assert_eq!(read, [sample; 2], "what is no whole sample is left out");
+        assert_eq!(read, [sample; 2], "an incomplete sample is left out");
         assert!(sample.has(MotionFlags::FRAME_SYNC) && !sample.has(MotionFlags::ACCEL_CLIPPED));
     }
 }

@@ -26,7 +26,7 @@ pub struct Bus {
 }
 
 impl Bus {
-    /// Joins the bus of `rig` below `runtime`. It makes no channel and needs no daemon to be running.
+    /// Joins the bus of `rig` below `runtime`. It creates no channel and needs no running daemon.
     ///
     /// # Errors
     /// [`ErrorKind::PermissionDenied`] when the folder is another user's, [`ErrorKind::Other`] when iceoryx2
@@ -80,7 +80,7 @@ impl Bus {
     /// Opens the channel of `id` for reading.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`] when nobody has made it (with the streams that there are),
+    /// [`ErrorKind::NotFound`] when it does not exist (listing the streams that do),
     /// [`ErrorKind::VersionMismatch`], [`ErrorKind::LimitReached`] when it has all its subscribers.
     pub fn subscriber(&self, id: &StreamId) -> Result<Subscriber> {
         let channel = self.stream_channel(id);
@@ -88,12 +88,12 @@ impl Bus {
         Ok(Subscriber::new(receiver))
     }
 
-    /// Like [`Self::subscriber`], waiting up to `patience` for the channel to be made.
+    /// Like [`Self::subscriber`], waiting up to `timeout` for the channel to appear.
     ///
     /// # Errors
-    /// As [`Self::subscriber`], [`ErrorKind::NotFound`] after `patience`.
-    pub fn subscriber_within(&self, id: &StreamId, patience: Duration) -> Result<Subscriber> {
-        let deadline = HostTime::now().plus(patience);
+    /// As [`Self::subscriber`], [`ErrorKind::NotFound`] after `timeout`.
+    pub fn subscriber_within(&self, id: &StreamId, timeout: Duration) -> Result<Subscriber> {
+        let deadline = HostTime::now().plus(timeout);
         loop {
             match self.subscriber(id) {
                 Err(e) if e.kind() == ErrorKind::NotFound && !deadline.from_now().is_zero() => {
@@ -130,7 +130,7 @@ impl Bus {
         Ok(SetSubscriber::new(self.set_channel().receiver(&self.node)?))
     }
 
-    /// The streams of this rig that somebody publishes or reads now, sorted.
+    /// The streams of this rig that have a publisher or a subscriber now, sorted.
     ///
     /// # Errors
     /// [`ErrorKind::Other`] when the channels cannot be listed.
@@ -210,7 +210,7 @@ impl Bus {
         )
     }
 
-    /// Adds to a "not found" what could have been meant.
+    /// Adds the existing streams to a "not found" error.
     fn name_streams(&self, e: Error) -> Error {
         if e.kind() != ErrorKind::NotFound {
             return e;
@@ -232,7 +232,7 @@ impl Bus {
 }
 
 /// The configuration that every process of a user's rigs shares. It is set in code, because iceoryx2 would
-/// otherwise read `config/iceoryx2.toml` of whatever folder the process was started in.
+/// otherwise read `config/iceoryx2.toml` from the process's working folder.
 fn config(runtime: &RuntimeDir) -> Result<Config> {
     let unusable = |e: &dyn core::fmt::Debug| {
         let path = runtime.path().display();
@@ -243,7 +243,7 @@ fn config(runtime: &RuntimeDir) -> Result<Config> {
     let mut config = Config::default();
     config.global.set_root_path(&root);
     config.global.prefix = FileName::new(shm::SHM_PREFIX.as_bytes()).map_err(|e| unusable(&e))?;
-    // How long an opener waits for a creator that is half done; a publisher may wait as long for a broken reader.
+    // How long an opener waits for an unfinished creator; a publisher may wait as long for a broken reader.
     config.global.creation_timeout = Duration::from_millis(500);
     Ok(config)
 }

@@ -34,8 +34,7 @@ impl Publisher {
         Ok(FrameMut { loan })
     }
 
-    /// Gives subscribers that came since the last frame that one. Sending does it as well, so only who pauses needs
-    /// it.
+    /// Delivers the last frame to late joiners. Sending does it as well, so only a pausing publisher needs it.
     pub fn welcome(&self) {
         self.sender.welcome();
     }
@@ -49,7 +48,7 @@ impl Publisher {
         self.sender.send(frame.loan)
     }
 
-    /// Publishes `frame` with the publish time that its header has: a replay keeps the original times.
+    /// Publishes `frame` with the publish time that its header has: a replay keeps the recorded times.
     ///
     /// # Errors
     /// As [`Self::send`].

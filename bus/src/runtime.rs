@@ -1,8 +1,8 @@
-//! Where a user's rigs keep their files: one private folder, and one lock per rig.
+//! The private folder in which a user's rigs keep their files, and the lock of each rig.
 //!
 //! Policy: the daemon and all its subscribers run as **one user**. The folder is mode 0700 and everything of
 //! iceoryx2 lives below it or is named after it, so that no other user's process can stall a camera and
-//! depthrig never gets in the way of other iceoryx2 applications of the machine.
+//! depthrig never disturbs other iceoryx2 applications on the machine.
 
 use crate::{Error, ErrorKind, Result, RigName, umask};
 use core::time::Duration;
@@ -15,7 +15,7 @@ pub const RUNTIME_DIR_VARIABLE: &str = "DEPTHRIG_RUNTIME_DIR";
 /// iceoryx2 puts Unix sockets below the folder, and their paths have at most 107 bytes.
 const MAX_PATH_LEN: usize = 40;
 const LOCK_ATTEMPTS: u32 = 20;
-/// Bytes that are read of what a lock's holder wrote.
+/// Bytes that are read of a lock holder's description.
 const MOST_OF_A_HOLDER: u64 = 256;
 const LOCK_PAUSE: Duration = Duration::from_millis(5);
 
@@ -25,7 +25,7 @@ pub struct RuntimeDir(PathBuf);
 
 impl RuntimeDir {
     /// The user's folder: `$DEPTHRIG_RUNTIME_DIR`, else `$XDG_RUNTIME_DIR/depthrig`, else
-    /// `/tmp/depthrig-<uid>`. It is made when missing.
+    /// `/tmp/depthrig-<uid>`. It is created if missing.
     ///
     /// # Errors
     /// As [`Self::at`].
@@ -39,10 +39,10 @@ impl RuntimeDir {
         Self::at(&path)
     }
 
-    /// The folder `path`, made with mode 0700 when missing.
+    /// The folder `path`, created with mode 0700 if missing.
     ///
     /// # Errors
-    /// [`ErrorKind::PermissionDenied`] when it belongs to another user or cannot be made,
+    /// [`ErrorKind::PermissionDenied`] when it belongs to another user or cannot be created,
     /// [`ErrorKind::LimitReached`] when its path is too long for the sockets below it.
     pub fn at(path: &Path) -> Result<Self> {
         let path = std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
@@ -66,8 +66,8 @@ impl RuntimeDir {
         if let Some(link) = foreign_link(&path, uid) {
             return Err(denied(&format!("{} is a symbolic link of another user", link.display())));
         }
-        umask::create_dir_all(&path).map_err(|e| denied("it cannot be made").with_source(e))?;
-        // What was just seen or made is held from here on, so that nobody exchanges it.
+        umask::create_dir_all(&path).map_err(|e| denied("it cannot be created").with_source(e))?;
+        // The open descriptor keeps the folder that was just checked or created, so that it cannot be replaced.
         let flags = OFlags::RDONLY | OFlags::DIRECTORY | OFlags::CLOEXEC;
         let folder = rustix::fs::open(&path, flags, Mode::empty());
         let folder = folder.map_err(|e| denied("it cannot be opened").with_source(e))?;
@@ -109,7 +109,7 @@ impl RuntimeDir {
         rigs
     }
 
-    /// Who runs `rig` now, as that process described itself.
+    /// The process that runs `rig` now, in its own words.
     pub fn holder(&self, rig: &RigName) -> Option<String> {
         holder_of(&self.lock_path(rig))
     }
@@ -137,8 +137,8 @@ impl RuntimeDir {
     }
 }
 
-/// The first part of `path` that is a symbolic link of neither `uid` nor root. Who can put one into a folder that
-/// several may write to, such as `/tmp`, would choose which folder it is.
+/// The first part of `path` that is a symbolic link of neither `uid` nor root. Otherwise whoever can create one in a
+/// shared folder such as `/tmp` would choose the target.
 fn foreign_link(path: &Path, uid: u32) -> Option<PathBuf> {
     let is_foreign = |part: &&Path| {
         let Ok(stat) = rustix::fs::lstat(*part) else { return false };
@@ -153,7 +153,7 @@ pub struct RigLock {
     _file: std::fs::File,
 }
 
-/// Who holds the lock `path`, as that process described itself; `None` when nobody does.
+/// The process that holds the lock `path`, in its own words; `None` if it is free.
 pub(crate) fn holder_of(path: &Path) -> Option<String> {
     let file = std::fs::File::open(path).ok()?;
     if flock(&file, FlockOperation::NonBlockingLockShared).is_ok() {
@@ -161,7 +161,7 @@ pub(crate) fn holder_of(path: &Path) -> Option<String> {
     }
     let mut text = Vec::new();
     file.take(MOST_OF_A_HOLDER).read_to_end(&mut text).ok()?;
-    // Another program wrote it, so it may be anything; whoever holds the lock holds it all the same.
+    // Another program wrote it, so it may be anything; the lock is held all the same.
     Some(String::from_utf8_lossy(&text).chars().filter(|c| !c.is_control()).collect())
 }
 
@@ -173,7 +173,7 @@ pub(crate) fn take(path: &Path, who: &str) -> Result<Option<std::fs::File>> {
             .with_source(e)
     })?;
     let mut file = std::fs::File::from(fd);
-    // Who looks whether it is held holds it for an instant, so one refusal proves nothing.
+    // A process that checks the lock holds it for an instant, so one refusal proves nothing.
     let taken = (0..LOCK_ATTEMPTS).any(|attempt| {
         if attempt > 0 {
             std::thread::sleep(LOCK_PAUSE);

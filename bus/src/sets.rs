@@ -23,7 +23,7 @@ pub struct SetHeader {
     pub tick_ns: i64,
     /// Latest minus earliest capture time of its frames, nanoseconds.
     pub spread_ns: i64,
-    /// Sets so far that missed a stream.
+    /// Sets so far that lacked a stream.
     pub incomplete: u64,
     /// Members in the payload, present and missing.
     pub members: u32,
@@ -31,7 +31,7 @@ pub struct SetHeader {
     pub present: u32,
 }
 
-/// One stream's part in a set.
+/// One stream's member of a set.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MemberRecord {
     /// The stream.
@@ -46,7 +46,8 @@ impl MemberRecord {
     /// The record's bytes: camera 32, stream 32, sequence 8, capture time 8, present 8, zero 8.
     fn encode(&self, out: &mut [u8]) {
         out.fill(0);
-        let (camera, stream) = (self.id.camera.as_str(), self.id.stream.as_str());
+        let camera = self.id.camera.as_str();
+        let stream = self.id.stream.as_str();
         out[..camera.len()].copy_from_slice(camera.as_bytes());
         out[32..32 + stream.len()].copy_from_slice(stream.as_bytes());
         out[64..72].copy_from_slice(&self.sequence.unwrap_or(0).to_le_bytes());
@@ -83,7 +84,7 @@ impl SetPublisher {
         Self { sender }
     }
 
-    /// Gives subscribers that came since the last set that one, as [`crate::Publisher::welcome`] does.
+    /// Delivers the last set to late joiners, as [`crate::Publisher::welcome`] does.
     pub fn welcome(&self) {
         self.sender.welcome();
     }

@@ -1,16 +1,16 @@
-//! Shared memory: how much there is, and that what a channel has is really there.
+//! Shared memory: how much is free, and that a channel's memory is really allocated.
 //!
 //! A file in `/dev/shm` has the size it was given, but gets memory only where it is written, and a write for which none is
-//! left kills the process (SIGBUS). So every slot gets its memory when the channel is made, and so does what iceoryx2 keeps
-//! of who uses it. What else it makes (connections, events: some KiB each, written when it is made) is only begun when there
-//! is room.
+//! left kills the process (SIGBUS). So every slot gets its memory when the channel is created, and so do iceoryx2's
+//! records of the channel's clients. Its other files (connections, events: some KiB each, written when created) are
+//! only begun when there is room.
 
 use crate::{Error, ErrorKind, Result, limits};
 use rustix::fs::{FallocateFlags, Mode, OFlags, fallocate, fstat, open};
 use rustix::io::{Errno, retry_on_intr};
 use std::path::{Path, PathBuf};
 
-/// Names of shared memory begin with this, so that one sees whose they are; Python uses the same.
+/// Prefix of shared-memory names, which identifies their owner; Python uses the same.
 pub const SHM_PREFIX: &str = "depthrig_";
 /// Where POSIX shared memory lives on Linux.
 pub const SHM_DIR: &str = "/dev/shm";
@@ -21,19 +21,18 @@ pub const MIN_SLOTS: usize = 16;
 
 const HOW_TO_ENLARGE: &str = "enlarge it (mount -o remount,size=4G /dev/shm; with Docker --ipc=host or --shm-size=4g), end \
      another rig, or use smaller images or fewer cameras";
-/// Free bytes that nothing of depthrig is begun without.
+/// Free bytes without which depthrig creates nothing.
 const ROOM: u64 = 1 << 20;
-/// Free bytes that the slots of a channel leave to the rest.
+/// Free bytes that a channel's slots leave for everything else.
 const LEFT_OVER: u64 = 4 * ROOM;
 
 /// Bytes that can still be written below `path`.
 ///
 /// # Errors
-/// [`ErrorKind::Other`] when the file system cannot be asked.
+/// [`ErrorKind::Other`] when the file system gives no answer.
 pub fn free_bytes(path: &Path) -> Result<u64> {
     let stat = rustix::fs::statvfs(path).map_err(|e| {
-        Error::new(ErrorKind::Other, format!("{}: cannot tell how much space is free", path.display()))
-            .with_source(e)
+        Error::new(ErrorKind::Other, format!("{}: cannot read its free space", path.display())).with_source(e)
     })?;
     Ok(stat.f_bavail * stat.f_frsize)
 }
@@ -61,7 +60,7 @@ pub fn slots_that_fit(wanted: usize, set_bytes: u64, free: u64) -> Result<usize>
     ))
 }
 
-/// What of `free` bytes slots may take.
+/// Bytes that slots may take of `free` bytes.
 const fn usable(free: u64) -> u64 {
     free / 10 * 8
 }
@@ -70,7 +69,8 @@ const fn mib(bytes: u64) -> u64 {
     bytes.div_ceil(1 << 20)
 }
 
-/// Whether there is room for what iceoryx2 makes besides the slots; else beginning it could kill the process.
+/// Checks that there is room for what iceoryx2 creates besides the slots; without it, creating that could kill the
+/// process.
 pub(crate) fn check_room() -> Result<()> {
     match free_bytes(SHM_DIR.as_ref()) {
         Ok(free) if free < ROOM => Err(Error::new(
@@ -84,7 +84,7 @@ pub(crate) fn check_room() -> Result<()> {
     }
 }
 
-/// Puts memory behind the data of the port `id`, which has `slots` slots. What is missing for it, if something is.
+/// Allocates the memory of the port `id`, which has `slots` slots. Returns what is missing for it, if anything.
 pub(crate) fn back(id: u128, slots: usize) -> Result<Option<Lack>> {
     let path = segment(id)?;
     let failed = |what: &str, e: Errno| {
@@ -95,7 +95,7 @@ pub(crate) fn back(id: u128, slots: usize) -> Result<Option<Lack>> {
     let file = open(&path, flags, Mode::empty()).map_err(|e| failed("opened", e))?;
     let bytes = fstat(&file).map_err(|e| failed("measured", e))?.st_size as u64;
     let lack = Some(Lack { bytes, slots });
-    // The kernel would take all there is before it gives up, from everybody.
+    // The kernel would take all free memory before it gives up.
     if bytes > free_bytes(SHM_DIR.as_ref())? {
         return Ok(lack);
     }
@@ -107,8 +107,8 @@ pub(crate) fn back(id: u128, slots: usize) -> Result<Option<Lack>> {
     }
 }
 
-/// Puts memory behind what iceoryx2 keeps of who uses the channels: the end of it is written by the last of many clients,
-/// long after it was made.
+/// Allocates the memory of iceoryx2's records of the channels' clients: their end is written by the last of many
+/// clients, long after they were created.
 pub(crate) fn back_registers() -> Result<()> {
     let failed = |e: Errno| {
         let why = limits::why("it has no room for what is kept of a channel");
@@ -143,7 +143,7 @@ fn segment(id: u128) -> Result<PathBuf> {
     let end = format!("_{id}.data");
     let is_it = |name: &str| name.starts_with(SHM_PREFIX) && name.ends_with(&end);
     let missing = || {
-        let why = limits::why("the memory of a port that was just made is not there");
+        let why = limits::why("the memory of a newly created port is missing");
         Error::new(ErrorKind::Other, format!("{SHM_DIR}: {why}"))
     };
     let entries = std::fs::read_dir(SHM_DIR).map_err(|e| missing().with_source(e))?;
@@ -159,14 +159,14 @@ pub(crate) struct Lack {
 }
 
 impl Lack {
-    /// How many of the slots would fit now; what had memory already must have been given back.
+    /// How many of the slots would fit now; memory that they already had must have been freed.
     pub(crate) fn slots_that_fit(&self) -> Result<usize> {
         let free = free_bytes(SHM_DIR.as_ref())?.saturating_sub(LEFT_OVER);
         let slot = self.bytes.div_ceil(self.slots.max(1) as u64).max(1);
         Ok((usable(free) / slot) as usize)
     }
 
-    /// The error of a channel that cannot have enough of them.
+    /// The error of a channel that cannot have enough slots.
     pub(crate) fn refusal(&self, what: &str, fit: usize) -> Error {
         let Self { bytes, slots } = self;
         Error::new(

@@ -4,7 +4,7 @@ use crate::channel::{Received, Receiver};
 use crate::{Error, ErrorKind, FrameHeader, HostTime, MotionSample, PixelFormat, Result};
 use core::time::Duration;
 
-/// How often a blocked reader looks whether anybody still publishes.
+/// How often a blocked reader checks for a publisher.
 const LIVENESS_INTERVAL: Duration = Duration::from_millis(500);
 
 /// The reading end of a stream's channel.
@@ -44,7 +44,7 @@ impl Subscriber {
             ));
         }
         let sequence = header.sequence;
-        // The first frame sets the mark; a smaller number means that the publisher was restarted.
+        // The first frame sets the reference; a smaller number means that the publisher was restarted.
         if self.last_sequence > 0 && sequence > self.last_sequence {
             self.missed += sequence - self.last_sequence - 1;
         }
@@ -70,10 +70,10 @@ impl Subscriber {
         }
     }
 
-    /// The oldest unread frame, waiting as long as somebody publishes the stream.
+    /// The oldest unread frame, waiting as long as the stream has a publisher.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`] when nobody publishes it any more, else as [`Self::try_next`].
+    /// [`ErrorKind::NotFound`] when its publisher has gone, else as [`Self::try_next`].
     #[allow(clippy::should_implement_trait)] // an iterator could not say why it ended
     pub fn next(&mut self) -> Result<Frame> {
         loop {
@@ -105,7 +105,7 @@ impl Subscriber {
         self.missed
     }
 
-    /// Whether anybody publishes the stream now. A killed publisher counts until somebody cleans up after it
+    /// Whether the stream has a publisher now. A killed publisher counts until a process cleans up after it
     /// ([`crate::Bus::clean_dead`]).
     pub fn is_live(&self) -> bool {
         self.receiver.has_publisher()
@@ -119,7 +119,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// What the frame says of itself.
+    /// The frame's header.
     pub fn header(&self) -> &FrameHeader {
         self.sample.user_header()
     }

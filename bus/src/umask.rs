@@ -1,29 +1,29 @@
 //! The process's umask, which iceoryx2 changes while it binds the socket of a listener.
 //!
 //! It sets the umask, binds, and sets it back. The umask belongs to the process: two threads that bind at once can leave
-//! it at 0177, and from then on every folder lacks the right to be entered, for everybody but root. Also between the two
-//! calls a thread that makes a folder, or starts a program, gets that umask. So binding happens on a thread with a umask
-//! of its own, one at a time; where the kernel refuses such a thread (containers that forbid `unshare`), whatever makes
-//! folders or starts programs waits for the same lock.
+//! it at 0177, and from then on nobody but root can enter a new folder. Between the two calls, a thread that creates a
+//! folder or starts a program also gets that umask. So binding happens on a thread with a umask of its own, one at a
+//! time; where the kernel refuses such a thread (containers that forbid `unshare`), whatever creates folders or starts
+//! programs waits for the same lock.
 
 use rustix::fs::Mode;
 use std::io;
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, Once, OnceLock, PoisonError};
 
-/// Held while the umask may be another, and by what must not meet that.
+/// Held while the umask may be changed, and by operations that depend on it.
 static CHANGING: Mutex<()> = Mutex::new(());
 /// The umask that the process had at first, less what keeps the owner out.
 static OWN: OnceLock<u32> = OnceLock::new();
-/// What a folder's owner must be able to do with it.
+/// Permissions that a folder's owner must keep.
 const OWNER: u32 = 0o700;
 
-/// Keeps the umask as it is until dropped: for starting programs and making folders.
+/// Keeps the umask unchanged until dropped, for starting programs and creating folders.
 #[must_use]
 #[derive(Debug)]
 pub struct Steady(#[allow(dead_code)] MutexGuard<'static, ()>);
 
-/// Waits until nothing changes the umask, and keeps it so.
+/// Waits until nothing changes the umask, then locks it.
 pub fn steady() -> Steady {
     Steady(CHANGING.lock().unwrap_or_else(PoisonError::into_inner))
 }
@@ -56,7 +56,7 @@ pub fn create_dir_all(path: &Path) -> io::Result<()> {
     std::fs::create_dir_all(path)
 }
 
-/// Gives the process back the umask that it had at first, if the one it has now keeps the owner out of new folders.
+/// Restores the process's first umask if the current one keeps the owner out of new folders.
 pub fn check() {
     mend(&steady());
 }

@@ -36,7 +36,7 @@ fn fixture() -> Fixture {
 fn publish(publisher: &Publisher, sequence: u64) -> usize {
     let mut frame = publisher.loan(LEN).unwrap();
     frame.pixels_mut().fill(sequence as u8);
-    frame.header_mut().set_picture(PixelFormat::Z16, 64, 48);
+    frame.header_mut().set_image(PixelFormat::Z16, 64, 48);
     frame.header_mut().sequence = sequence;
     publisher.send(frame).unwrap()
 }
@@ -125,7 +125,7 @@ fn when_every_slot_is_held_the_publisher_is_told_and_goes_on_later() {
     });
     let e = refused.expect("eight slots cannot hold twenty frames");
     assert_eq!(e.kind(), ErrorKind::NoSpace);
-    assert!(f.bus.starved(), "who cleans up after dead subscribers is told at once");
+    assert!(f.bus.starved(), "the process that cleans up after dead subscribers learns of it at once");
     assert!(!f.bus.starved());
     assert!(e.to_string().contains("subscribers hold every slot"), "{e}");
     held.clear();
@@ -164,7 +164,7 @@ fn an_unknown_stream_names_those_there_are() {
     assert!(e.to_string().contains("the rig has: cam/depth"), "{e}");
 }
 
-/// Makes the channel as another version of depthrig would: another schema, or another header.
+/// Creates the channel as another version of depthrig would: another schema, or another header.
 fn foreign_service(f: &Fixture, schema: &str) -> (Node<ipc::Service>, Box<dyn core::any::Any>) {
     let root = Path::new(f.dir.path().join("iox2").to_str().unwrap().as_bytes()).unwrap();
     let mut config = Config::default();
@@ -211,7 +211,7 @@ fn sets_travel() {
     let set = subscriber.next_timeout(WAIT).unwrap().unwrap();
     assert_eq!((set.header().set_id, set.header().members, set.header().present), (3, 2, 1));
     assert_eq!(set.members().unwrap(), members);
-    assert!(f.bus.streams().unwrap().is_empty(), "the set channel is no stream");
+    assert!(f.bus.streams().unwrap().is_empty(), "the set channel is not a stream");
 }
 
 /// Cleans up after one dead process, trying again as the daemon's timer does.
@@ -368,7 +368,7 @@ fn a_dead_process_whose_description_is_gone_is_removed_and_counted_once() {
     assert_eq!(folders(), own);
     let left = std::fs::read_dir(&nodes).unwrap().count();
     assert_eq!(left, 4, "this process's folder and its three files");
-    // Its place is free again.
+    // Its slot is free again.
     let all: Vec<_> = (0..17).map(|_| f.bus.subscriber(&f.id).unwrap()).collect();
     drop(all);
 }
@@ -436,7 +436,7 @@ fn nothing_of_a_channel_gets_its_memory_later() {
     let mut subscriber = f.bus.subscriber(&f.id).unwrap();
     publish(&publisher, 1);
     assert_eq!(whole(&subscriber.next_timeout(WAIT).unwrap().unwrap()), 1);
-    // Other tests are making channels: what they are in the middle of is whole, or gone, soon.
+    // Other tests are creating channels: an unfinished one is soon complete, or gone.
     let lacking = without_memory();
     std::thread::sleep(Duration::from_secs(1));
     let still: Vec<_> = without_memory().intersection(&lacking).cloned().collect();
@@ -466,7 +466,7 @@ fn a_channel_that_was_half_removed_is_made_anew() {
     let publisher = f.bus.publisher(&f.id, LEN, 16).unwrap();
     let links = tempfile::tempdir_in(shm::SHM_DIR).unwrap();
     let own = tempfile::tempdir_in(f.dir.path()).unwrap();
-    // Those of tests beside this one may be among them; brought back they are in nobody's way.
+    // Files of other tests may be among them; restoring them does no harm.
     let mut kept = Vec::new();
     for (i, file) in service_files(f.dir.path()).into_iter().filter(|file| !before.contains(file)).enumerate()
     {

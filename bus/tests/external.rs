@@ -17,10 +17,10 @@ fn place(dir: &tempfile::TempDir) -> Place {
 }
 
 fn mode(name: &str, format: PixelFormat) -> Mode {
-    Mode::new(Name::new(name).unwrap(), format, (32, 24), 30.0)
+    Mode::new(Name::new(name).unwrap(), format, 32, 24, 30.0)
 }
 
-/// A record of a mode in which all is well.
+/// A valid record of a mode.
 fn record() -> ExternalMode {
     let mut record = ExternalMode {
         rate_hz: 30.0,
@@ -39,11 +39,11 @@ fn record() -> ExternalMode {
     record
 }
 
-/// What is made wrong about a record.
+/// A change that makes a record invalid.
 type Change = fn(&mut ExternalMode);
 
 #[test]
-fn a_mode_that_cannot_be_is_refused_by_its_field() {
+fn an_invalid_mode_is_refused_by_its_field() {
     let good = Mode::decode(&record()).unwrap();
     assert_eq!((good.describe().as_str(), good.frame_bytes()), ("depth 640x480 z16", 614_400));
     let cases: [(Change, &str); 30] = [
@@ -55,7 +55,7 @@ fn a_mode_that_cannot_be_is_refused_by_its_field() {
         (|r| r.format = 999, "`format` is 999"),
         (
             |r| (r.format, r.depth_unit_m, r.height) = (PixelFormat::Motion as u32, 0.0, 1),
-            "stream depth: its field `format` is motion; a camera of another process gives pictures only",
+            "stream depth: its field `format` is motion; a camera of another process gives images only",
         ),
         (|r| r.width = 0, "`width` is 0"),
         (|r| r.height = 16_385, "`height` is 16385"),
@@ -92,7 +92,7 @@ fn a_mode_that_cannot_be_is_refused_by_its_field() {
 }
 
 proptest! {
-    /// Whatever lies in a record, reading it ends well, and what is taken can be worked with.
+    /// Reading a record with arbitrary content never panics, and an accepted one is usable.
     #[test]
     fn any_record_is_read_or_refused(
         numbers in prop::array::uniform8(any::<f64>()), words in prop::array::uniform8(any::<u32>()), ticks in any::<u64>()
@@ -111,7 +111,7 @@ proptest! {
 }
 
 #[test]
-fn what_cannot_be_is_not_offered_at_all() {
+fn invalid_modes_are_not_offered_at_all() {
     let dir = tempfile::tempdir().unwrap();
     let about = About { model: "Cam".into(), ..About::default() };
     let offer = |about: &About, modes: &[Mode]| {
@@ -136,11 +136,12 @@ fn files_at_their_end_are_taken_to_the_last_frame() {
     let mut link = ExternalLink::open(&place).unwrap();
     let mut camera = ExternalCamera::offer(&place, &about, &[mode("color", PixelFormat::Rgb8)]).unwrap();
     let instance = hear(&link, |_| true).beat.instance;
-    let (reason, text) = (ExternalReason::None, "");
+    let reason = ExternalReason::None;
+    let text = "";
     let answer = |session, want| Answer { instance, session, want, reason, text, modes: &[1] };
     for (session, confirmed) in [(1, true), (2, false)] {
         let inlet = link.frames(&Name::new("color").unwrap()).unwrap();
-        link.tell(&answer(session, ExternalWant::Run)).unwrap();
+        link.answer(&answer(session, ExternalWant::Run)).unwrap();
         let mut running = camera.next_session(WAIT).unwrap().unwrap();
         for _ in 0..3 {
             assert!(running.send_copy(0, &ExternalFrame::default(), &[1; 32 * 24 * 3]).unwrap());
@@ -152,27 +153,27 @@ fn files_at_their_end_are_taken_to_the_last_frame() {
                 (said.beat.reason, said.beat.text().as_str()),
                 (ExternalReason::Finished, "that was all")
             );
-            // The daemon looks into the channel only now.
+            // The daemon reads the channel only now.
             let frames = core::iter::from_fn(|| inlet.try_next().unwrap()).count();
             assert_eq!(frames, 3);
             if confirmed {
-                link.tell(&answer(session, ExternalWant::Stop)).unwrap();
+                link.answer(&answer(session, ExternalWant::Stop)).unwrap();
             }
             ending.join().unwrap()
         });
         assert_eq!(finished, confirmed, "session {session}");
     }
     // An answer that lists other modes than there are is an error, and not a session without modes.
-    link.tell(&Answer { modes: &[1, 1], ..answer(3, ExternalWant::Run) }).unwrap();
+    link.answer(&Answer { modes: &[1, 1], ..answer(3, ExternalWant::Run) }).unwrap();
     let e = camera.next_session(WAIT).unwrap_err();
     assert!(e.to_string().contains("it answers for 2 modes in 2 bytes, and this camera has 1"), "{e}");
 }
 
-/// Waits for a message that `wanted` takes.
+/// Waits for a message that `wanted` accepts.
 fn hear(
     link: &ExternalLink,
     wanted: impl Fn(&depthrig_bus::external::Beat) -> bool,
-) -> depthrig_bus::external::Said {
+) -> depthrig_bus::external::OfferMessage {
     let deadline = depthrig_bus::HostTime::now().plus(WAIT);
     loop {
         if let Some(said) = link.newest(&wanted).unwrap() {
@@ -214,9 +215,9 @@ fn both_sides_understand_each_other() {
         text: "",
         modes,
     };
-    link.tell(&Answer { instance: instance ^ 1, ..run(5, ExternalWant::Run, &[1, 1, 1]) }).unwrap();
+    link.answer(&Answer { instance: instance ^ 1, ..run(5, ExternalWant::Run, &[1, 1, 1]) }).unwrap();
     assert!(camera.next_session(Duration::from_millis(300)).unwrap().is_none(), "meant for another");
-    link.tell(&run(10, ExternalWant::Run, &[0, 1, 0])).unwrap();
+    link.answer(&run(10, ExternalWant::Run, &[0, 1, 0])).unwrap();
     let mut session = camera.next_session(WAIT).unwrap().unwrap();
     assert_eq!(
         session.modes().map(|(i, m)| (i, m.stream.to_string())).collect::<Vec<_>>(),
@@ -226,7 +227,7 @@ fn both_sides_understand_each_other() {
     session.started();
     hear(&link, |b| b.state == Some(ExternalState::Running) && b.session == 10);
 
-    // A frame that finds no memory counts, and so does one that is given up.
+    // A frame without free memory counts, and so does a discarded one.
     assert!(session.frame(0, 10).is_err(), "it does not run");
     drop(session.frame(1, 32 * 24 * 2).unwrap().unwrap());
     let facts = ExternalFrame { device_time: 77, gain: 2.0, ..ExternalFrame::default() };
@@ -241,11 +242,11 @@ fn both_sides_understand_each_other() {
     assert_eq!((h.format, h.width, h.height, h.payload_len), (PixelFormat::Z16 as u32, 32, 24, 1536));
     assert!(frame.pixels().iter().all(|b| *b == 9) && frame.pixels().len() == 1536);
 
-    // A later session ends this one; an earlier one, such as of a thread that was given up, does not.
-    link.tell(&run(9, ExternalWant::Stop, &[0, 0, 0])).unwrap();
+    // A later session ends this one; an earlier one, such as an abandoned thread's, does not.
+    link.answer(&run(9, ExternalWant::Stop, &[0, 0, 0])).unwrap();
     std::thread::sleep(Duration::from_millis(300));
     assert!(session.is_wanted());
-    link.tell(&Answer { text: "the frames lie", ..run(10, ExternalWant::Refused, &[0, 0, 0]) }).unwrap();
+    link.answer(&Answer { text: "the frames lie", ..run(10, ExternalWant::Refused, &[0, 0, 0]) }).unwrap();
     let deadline = depthrig_bus::HostTime::now().plus(WAIT);
     while session.is_wanted() {
         assert!(!deadline.from_now().is_zero());
@@ -255,7 +256,7 @@ fn both_sides_understand_each_other() {
     drop(session);
     hear(&link, |b| b.state == Some(ExternalState::Idle) && b.session == 10);
 
-    link.tell(&run(11, ExternalWant::Run, &[1, 0, 0])).unwrap();
+    link.answer(&run(11, ExternalWant::Run, &[1, 0, 0])).unwrap();
     let session = camera.next_session(WAIT).unwrap().unwrap();
     session.refuse(ExternalReason::Busy, "somebody has it");
     let said = hear(&link, |b| b.state == Some(ExternalState::Refused));
@@ -264,8 +265,8 @@ fn both_sides_understand_each_other() {
         (ExternalReason::Busy, "somebody has it", 11)
     );
 
-    // A daemon that says nothing for two seconds is gone, and the session with it.
-    link.tell(&run(12, ExternalWant::Run, &[1, 0, 0])).unwrap();
+    // A daemon that is silent for two seconds is gone, and the session with it.
+    link.answer(&run(12, ExternalWant::Run, &[1, 0, 0])).unwrap();
     let session = camera.next_session(WAIT).unwrap().unwrap();
     assert!(session.is_wanted());
     std::thread::sleep(Duration::from_millis(2700));
@@ -273,7 +274,7 @@ fn both_sides_understand_each_other() {
     drop(session);
 
     let refused = Answer { text: "no such lens", ..run(0, ExternalWant::Refused, &[0]) };
-    link.tell(&refused).unwrap();
+    link.answer(&refused).unwrap();
     let e = camera.next_session(WAIT).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::Refused);
     assert!(e.to_string().contains("no such lens"), "{e}");

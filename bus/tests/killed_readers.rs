@@ -101,7 +101,7 @@ impl Source {
         };
         self.sequence += 1;
         frame.pixels_mut().fill(self.sequence as u8);
-        frame.header_mut().set_picture(PixelFormat::Z16, 64, 48);
+        frame.header_mut().set_image(PixelFormat::Z16, 64, 48);
         frame.header_mut().sequence = self.sequence;
         self.publisher.send(frame).unwrap();
         Some(HostTime::now().since_ns(began))

@@ -47,11 +47,10 @@ fn read(frame: &Frame, sequence: u64, len: usize) -> usize {
     at
 }
 
-/// Pictures of usual sizes, and ones that are no multiple of anything.
+/// Images of usual sizes, and of sizes without a common factor.
 fn sizes() -> impl Iterator<Item = usize> {
-    let pictures = [(64, 48), (640, 480), (848, 480), (1280, 720), (1920, 1080)];
-    let bytes =
-        pictures.into_iter().flat_map(|(w, h)| [w * h, w * h * 3 / 2, w * h * 2, w * h * 3, w * h * 4]);
+    let images = [(64, 48), (640, 480), (848, 480), (1280, 720), (1920, 1080)];
+    let bytes = images.into_iter().flat_map(|(w, h)| [w * h, w * h * 3 / 2, w * h * 2, w * h * 3, w * h * 4]);
     bytes.chain([1, 7, 8, 9, 31, 63, 64, 65, 127, 4095, 4096, 4097, 614_401, 921_637])
 }
 
@@ -61,7 +60,9 @@ fn pixels_begin_at_a_multiple_of_64_in_every_slot() {
         let f = fixture();
         let publisher = f.bus.publisher(&f.id, max, SLOTS).unwrap();
         let mut subscriber = f.bus.subscriber(&f.id).unwrap();
-        let (mut written, mut received, mut held) = (HashSet::new(), HashSet::new(), Vec::new());
+        let mut written = HashSet::new();
+        let mut received = HashSet::new();
+        let mut held = Vec::new();
         // Held frames push the publisher through its slots; letting go in between takes it through them again.
         for sequence in 1..=3 * SLOTS as u64 {
             let len = if sequence % 3 == 0 { max.div_ceil(2) } else { max };

@@ -183,7 +183,7 @@ fn enums(out: &mut String) {
         out,
         "IntEnum",
         "StageStep",
-        "A step of making a derived frame, by its place in `stage_ns`.",
+        "A step of computing a derived frame, by its place in `stage_ns`.",
         &steps,
     );
     enumeration(out, "IntFlag", "FrameFlags", "Facts about a frame, one bit each.", &flags);
@@ -193,7 +193,7 @@ fn enums(out: &mut String) {
         ("gyro_clipped", MotionFlags::GYRO_CLIPPED),
     ]
     .map(|(name, flag)| (name.to_owned(), flag.0));
-    enumeration(out, "IntFlag", "MotionFlags", "Facts about a motion sample, one bit each.", &flags);
+    enumeration(out, "IntFlag", "MotionFlags", "Facts about an IMU sample, one bit each.", &flags);
     external_enums(out);
 }
 
@@ -211,8 +211,8 @@ fn external_enums(out: &mut String) {
         )*};
     }
     codes! {
-        ExternalState "How a process that serves a camera stands."
-        ExternalWant "What the daemon wants of a process that serves a camera."
+        ExternalState "State of a process that serves a camera."
+        ExternalWant "The daemon's request to a process that serves a camera."
         ExternalReason "Why one side refuses, or a process ends."
         ExternalClock "Which clock stamps the frames of a mode."
     }

@@ -51,7 +51,7 @@ fn threads_that_subscribe_leave_umask_and_folders_alone() {
     let wrong = folders.iter().filter(|mode| **mode != 0o777 & !before).count();
     assert_eq!(wrong, 0, "of {} folders so many have another mode", folders.len());
 
-    // Whoever else changes it, what keeps the owner out is taken back.
+    // Whoever changes it, bits that keep the owner out are removed.
     rustix::process::umask(rustix::fs::Mode::from_bits_truncate(0o177));
     umask::check();
     assert_eq!(now(), before);

@@ -1,4 +1,4 @@
-//! What registration costs at 1280x720: `cargo bench -p depthrig-calib`.
+//! Measures registration at 1280x720: `cargo bench -p depthrig-calib`.
 #![allow(clippy::unwrap_used)]
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
@@ -14,7 +14,8 @@ fn depth() -> Vec<u16> {
     (0..PIXELS)
         .map(|i| {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-            let (x, y) = (i % 1280, i / 1280);
+            let x = i % 1280;
+            let y = i / 1280;
             let is_box = (x / 160 + y / 120) % 3 == 0;
             let z = if is_box { 900 } else { 1500 + y as u32 };
             if state >> 24 < 6 { 0 } else { (z + (state >> 16) % 5) as u16 }

@@ -1,4 +1,4 @@
-//! Registers one image and prints what it costs: what `tests/peers/align.py` compares librealsense with.
+//! Registers one image and prints its cost, with which `tests/peers/align.py` compares librealsense.
 //!
 //! `align_frames SETUP.json DEPTH.z16 OUT.z16 TURNS THREADS` reads little-endian 16-bit depth, writes the registered
 //! depth, and prints one line of JSON with the CPU and wall time of each turn, nanoseconds.
@@ -38,14 +38,16 @@ fn main() -> Result<(), Box<dyn Error>> {
         return Err("usage: align_frames SETUP.json DEPTH.z16 OUT.z16 TURNS THREADS".into());
     };
     let setup: Setup = serde_json::from_slice(&std::fs::read(setup)?)?;
-    let (d, c) = (&setup.depth, &setup.color);
+    let d = &setup.depth;
+    let c = &setup.color;
     let mut registration =
         Registration::new(&d.intrinsics(), d.size, &c.intrinsics(), c.size, &setup.color_from_depth)?
             .with_threads(threads.parse()?);
     let depth: Vec<u16> =
         std::fs::read(depth)?.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect();
     let mut registered = vec![0; c.size.0 as usize * c.size.1 as usize];
-    let (mut cpu, mut wall) = (Vec::new(), Vec::new());
+    let mut cpu = Vec::new();
+    let mut wall = Vec::new();
     for _ in 0..turns.parse::<usize>()? {
         let began = (cpu_ns(), HostTime::now().ns());
         registration.depth_to_color(&depth, setup.unit_m, &mut registered)?;

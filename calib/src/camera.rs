@@ -1,7 +1,6 @@
 //! Camera models: from a point in the optical frame to a pixel and back.
-//!
-//! A [`Camera`] is made once from [`Intrinsics`]: it knows how far from its axis the lens can be trusted. The formulas
-//! of the lenses are in `camera/lens.rs`.
+//! A [`Camera`] is created once from [`Intrinsics`] and knows how far from its axis the lens model is valid. The
+//! formulas of the lenses are in `camera/lens.rs`.
 
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{Distortion, Intrinsics};
@@ -19,7 +18,7 @@ const TOLERANCE_PX: f64 = 1e-10;
 
 /// Intrinsics, ready for use.
 ///
-/// Every lens model is a polynomial or a ratio of two that was fitted within a picture. Further out it turns round and
+/// Every lens model is a polynomial or a ratio of two that was fitted within an image. Further out it turns round and
 /// would show points from far outside at a second place: [`Camera::max_radius`] is where that begins, and nothing is
 /// projected to or from beyond it.
 #[derive(Debug, Clone, Copy)]
@@ -54,7 +53,7 @@ impl Camera {
     /// Makes a camera ready.
     ///
     /// # Errors
-    /// [`ErrorKind::NoCalibration`] when nothing is known of the camera, [`ErrorKind::BadInput`] for numbers that are
+    /// [`ErrorKind::NoCalibration`] for a camera without calibration, [`ErrorKind::BadInput`] for numbers that are
     /// not finite or focal lengths that are not positive.
     pub fn new(intrinsics: &Intrinsics) -> Result<Self> {
         let k = *intrinsics;
@@ -69,7 +68,7 @@ impl Camera {
             return Err(Error::new(
                 ErrorKind::BadInput,
                 format!(
-                    "fx {}, fy {}, cx {}, cy {} with coefficients {:?} are no intrinsics",
+                    "invalid intrinsics fx {}, fy {}, cx {}, cy {} with coefficients {:?}",
                     k.fx, k.fy, k.cx, k.cy, k.coeffs
                 ),
             ));
@@ -83,7 +82,7 @@ impl Camera {
         Self { max_radius: self.max_radius.min(radius), ..self }
     }
 
-    /// What the camera was made from.
+    /// The camera's intrinsics.
     pub const fn intrinsics(&self) -> &Intrinsics {
         &self.intrinsics
     }
@@ -177,7 +176,7 @@ impl Camera {
             if size == 0.0 {
                 break;
             }
-            // What tangential terms add to the radial inverse is small; a long step leaves the valley.
+            // The tangential terms change the radial inverse little; a long step leaves the valley.
             let step = j.inverse() * error;
             at -= step * (0.5 / step.length().max(0.5));
             let r = at.length();
@@ -195,7 +194,8 @@ impl Camera {
         if wanted == 0.0 {
             return shown;
         }
-        let (mut low, mut high) = (0.0, self.max_radius);
+        let mut low = 0.0;
+        let mut high = self.max_radius;
         // Not at the end itself: there a rational lens may have its pole, and rounding decides the sign.
         let mut r = if wanted < high { wanted } else { 0.5 * high };
         let mut last = high;
@@ -211,7 +211,7 @@ impl Camera {
                 low = r;
             }
             // Beside a pole of a rational lens Newton's steps begin tiny and double: a step that is not half of the last
-            // one gives way to halving (Press et al., Numerical Recipes 9.4).
+            // one is replaced by halving (Press et al., Numerical Recipes 9.4).
             let step = error / slope;
             let inside = r - step > low && r - step < high;
             (r, last) = if inside && step.abs() <= 0.5 * last {
@@ -235,7 +235,7 @@ impl Camera {
     }
 }
 
-/// Projection straight from [`Intrinsics`], for a point or two: a [`Camera`] is made each time.
+/// Projection straight from [`Intrinsics`], for a point or two: each call creates a [`Camera`].
 pub trait CameraExt {
     /// As [`Camera::project`]; `None` as well when no calibration is known.
     fn project(&self, p: DVec3) -> Option<DVec2>;

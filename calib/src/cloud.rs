@@ -22,7 +22,7 @@ pub struct Deprojection {
 pub struct PointCloud {
     /// x, y, z.
     pub points: Vec<[f32; 3]>,
-    /// Red, green, blue of each point; empty when there is no colour.
+    /// Red, green, blue of each point; empty without colour.
     pub colors: Vec<[u8; 3]>,
 }
 
@@ -30,12 +30,12 @@ impl Deprojection {
     /// Prepares for one camera.
     ///
     /// # Errors
-    /// As [`Camera::new`]; [`ErrorKind::BadInput`] for an empty picture.
+    /// As [`Camera::new`]; [`ErrorKind::BadInput`] for an empty image.
     pub fn new(intrinsics: &Intrinsics, (width, height): (u32, u32)) -> Result<Self> {
         if width == 0 || height == 0 {
             return Err(Error::new(
                 ErrorKind::BadInput,
-                format!("a picture of {width}x{height} pixels has no points"),
+                format!("an image of {width}x{height} pixels has no points"),
             ));
         }
         let camera = Camera::new(intrinsics)?;
@@ -47,16 +47,16 @@ impl Deprojection {
         Ok(Self { size: (width as usize, height as usize), rays })
     }
 
-    /// Width and height of the pictures.
+    /// Width and height of the images.
     pub const fn size(&self) -> (usize, usize) {
         self.size
     }
 
-    /// The points of a depth picture in the camera's optical frame, in the order of the pixels; holes are left out.
+    /// The points of a depth image in the camera's optical frame, in the order of the pixels; holes are left out.
     /// `color` is 8-bit RGB in the same view.
     ///
     /// # Errors
-    /// [`ErrorKind::SizeMismatch`] for pictures of another size.
+    /// [`ErrorKind::SizeMismatch`] for images of another size.
     pub fn cloud(
         &self,
         depth: &[u16],

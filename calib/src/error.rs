@@ -1,14 +1,14 @@
 //! The error of the crate: a kind to match on, and what happened to what.
 
-/// What went wrong, for callers that decide on it.
+/// Kind of the error, for callers that match on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum ErrorKind {
     /// A camera has no calibration.
     NoCalibration,
-    /// A picture has another size than the one that was agreed on.
+    /// An image differs from the agreed size.
     SizeMismatch,
-    /// Numbers that cannot be those of a camera, a pose or a picture.
+    /// Invalid numbers for a camera, a pose or an image.
     BadInput,
     /// A file could not be written.
     Io,

@@ -1,8 +1,9 @@
-//! Camera geometry: lens models, poses, and pictures of one camera in the view of another.
+//! Camera geometry: lens models, poses, and images of one camera in the view of another.
 //!
-//! Floor 2. Mathematics on the types that travel in a frame header; no I/O. Start at [`Camera`] (from a point to a
-//! pixel and back) and [`Registration`] (depth in the view of colour). [`Deprojection`] makes point clouds, [`Undistortion`] other pictures of the same
-//! view; [`Rectifier`] makes the two pictures of a stereo camera a pair in which [`stereo`] finds depth.
+//! Layer 2. Mathematics on the types that travel in a frame header; no I/O. Start at [`Camera`] (maps a point to a
+//! pixel and back) and [`Registration`] (depth in the view of colour). [`Deprojection`] makes point clouds,
+//! [`Undistortion`] other images of the same view; [`Rectifier`] makes the two images of a stereo camera a pair in
+//! which [`stereo`] finds depth.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 mod camera;

@@ -91,7 +91,7 @@ mod tests {
         }
     }
 
-    /// Of what a dataset says, nothing may change on its way through a replay, whose cameras have no pose of their own.
+    /// A replay, whose cameras have no pose of their own, must not change the poses of a dataset.
     #[test]
     fn composed_with_the_identity_a_pose_stays_as_it_is_bit_by_bit() {
         let bits = |p: &Pose| (p.translation_m.map(f64::to_bits), p.rotation_xyzw.map(f64::to_bits));

@@ -36,7 +36,7 @@ struct Band {
     private: Vec<u16>,
 }
 
-/// What depends on the cameras alone.
+/// Tables that depend on the cameras alone.
 #[derive(Debug)]
 struct Tables {
     warp: Warp,
@@ -77,8 +77,8 @@ impl Registration {
     /// `color_pose.inverse().compose(&depth_pose)` of the poses in two frame headers.
     ///
     /// # Errors
-    /// [`ErrorKind::NoCalibration`] when one of the cameras has none, [`ErrorKind::BadInput`] for numbers that are none
-    /// of a camera, and for pictures that are empty or have a side beyond 16384.
+    /// [`ErrorKind::NoCalibration`] when one of the cameras has none, [`ErrorKind::BadInput`] for invalid numbers, and
+    /// for images that are empty or have a side beyond 16384.
     pub fn new(
         depth: &Intrinsics,
         depth_size: (u32, u32),
@@ -98,7 +98,8 @@ impl Registration {
             Camera::new(k)
                 .map_err(|e| Error::new(e.kind(), format!("registration: {what}: {e}")).with_source(e))
         };
-        let (depth, color) = (named("depth", depth)?, named("colour", color)?);
+        let depth = named("depth", depth)?;
+        let color = named("colour", color)?;
         let pose = color_from_depth.to_affine();
         if !pose.is_finite() {
             return Err(Error::new(
@@ -107,7 +108,8 @@ impl Registration {
             ));
         }
         let size = |(w, h): (u32, u32)| (w as usize, h as usize);
-        let (depth_size, color_size) = (size(depth_size), size(color_size));
+        let depth_size = size(depth_size);
+        let color_size = size(color_size);
         let tables = Arc::new(Tables {
             warp: Warp::new(&depth, depth_size, &color, color_size, &pose),
             is_point: footprint::is_point(&depth, depth_size, &color, &pose),
@@ -188,7 +190,7 @@ impl Registration {
         Ok(())
     }
 
-    /// Colour in the view and size of depth; black where depth has a hole or colour does not look. `color` and `out`
+    /// Colour in the view and size of depth; black where depth has a hole or colour sees nothing. `color` and `out`
     /// are 8-bit RGB or any other three bytes a pixel. A pixel gets the four pixels of colour around its middle in
     /// proportion. What colour cannot see because something nearer hides it gets the colour of what hides it.
     ///
@@ -226,7 +228,7 @@ fn check_unit(unit_m: f64) -> Result<f32> {
     if unit > 0.0 && unit.is_finite() {
         return Ok(unit);
     }
-    Err(Error::new(ErrorKind::BadInput, format!("a depth unit of {unit_m} m is none; 0.001 is a millimetre")))
+    Err(Error::new(ErrorKind::BadInput, format!("invalid depth unit {unit_m} m; 0.001 is a millimetre")))
 }
 
 /// Largest translation, metres, that two poses of one view may differ by: what a text with six digits loses.
@@ -249,13 +251,14 @@ pub fn same_view(
     if apart.is_nan() || apart > SAME_PLACE_M {
         return false;
     }
-    let (w, h) = (f64::from(depth_size.0) - 1.0, f64::from(depth_size.1) - 1.0);
-    // Lenses are smooth: corners, edges and the middle tell.
+    let w = f64::from(depth_size.0) - 1.0;
+    let h = f64::from(depth_size.1) - 1.0;
+    // Lenses are smooth: corners, edges and the middle suffice.
     (0..9).all(|i| {
         let pixel = glam::DVec2::new(w * f64::from(i % 3) / 2.0, h * f64::from(i / 3) / 2.0);
         match a.unproject(pixel).map(|ray| b.project(between.matrix3 * ray)) {
             Some(Some(there)) => (there - pixel).length() <= SAME_PIXEL,
-            // Neither lens forms a picture there.
+            // Neither lens forms an image there.
             None => b.unproject(pixel).is_none(),
             Some(None) => false,
         }

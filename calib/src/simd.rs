@@ -36,7 +36,7 @@ macro_rules! for_every_processor {
 }
 pub(crate) use for_every_processor;
 
-/// For which processors a loop is compiled.
+/// Vector width for which a loop is compiled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Width {
     /// Every one.
@@ -58,7 +58,7 @@ pub(crate) fn width() -> Width {
     widest()
 }
 
-/// What the processor has; the answer is kept by the standard library.
+/// Detects the processor's vectors; the standard library caches the answer.
 fn widest() -> Width {
     #[cfg(target_arch = "x86_64")]
     {

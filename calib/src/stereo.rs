@@ -1,9 +1,9 @@
-//! Stereo: from a rectified pair of pictures to the disparity of the left one, and from disparity to depth.
+//! Stereo: computes the disparity of the left image of a rectified pair, and depth from disparity.
 //!
-//! Both pictures are grey, of one size, and rectified: what is seen at `(x, y)` in the left one is seen at `(x - d, y)`
+//! Both images are grey, of one size, and rectified: what is seen at `(x, y)` in the left one is seen at `(x - d, y)`
 //! in the right one, with a disparity `d >= 0` in pixels. [`SgmMatcher`] finds `d` by semi-global matching over a census
-//! (Hirschmueller 2008, with the census of Zabih and Woodfill 1994); [`Matcher`] is what it has in common with a network.
-//! What the presets are, what they cost and where they fail: docs/stereo.md.
+//! (Hirschmueller 2008, with the census of Zabih and Woodfill 1994); [`Matcher`] is the interface that it shares with a
+//! network. Presets, their cost and their limits: docs/stereo.md.
 //!
 //! # Example
 //! ```
@@ -11,8 +11,8 @@
 //!
 //! // A wall of noise, 5 pixels away in disparity.
 //! let noise = |x: usize, y: usize| ((x * 7919 + y * 104_729) * 2_654_435_761 >> 7) as u8;
-//! let picture = |shift: usize| (0..96 * 32).map(|i| noise(i % 96 + shift, i / 96)).collect::<Vec<u8>>();
-//! let (left, right) = (picture(0), picture(5));
+//! let image = |shift: usize| (0..96 * 32).map(|i| noise(i % 96 + shift, i / 96)).collect::<Vec<u8>>();
+//! let (left, right) = (image(0), image(5));
 //! let pair = StereoPair::new(Gray::packed(&left, 96, 32), Gray::packed(&right, 96, 32));
 //! let mut matcher = SgmMatcher::new(96, 32, &Parameters::preset(Preset::Quality, 32), 1)?;
 //! let mut map = DisparityMap::default();
@@ -36,7 +36,7 @@ pub use parameters::{MAX_DISPARITIES, Parameters, Preset, Resolution};
 pub use rows::{RowCheck, RowOffset};
 pub use sgm::{SgmMatcher, SgmPresets};
 
-/// A grey picture, one byte a pixel.
+/// A grey image, one byte a pixel.
 #[derive(Debug, Clone, Copy)]
 pub struct Gray<'a> {
     /// Rows from the top, each `stride` bytes from the one before; the last may end after `width`.
@@ -50,26 +50,26 @@ pub struct Gray<'a> {
 }
 
 impl<'a> Gray<'a> {
-    /// A picture whose rows lie without padding.
+    /// An image whose rows lie without padding.
     pub const fn packed(pixels: &'a [u8], width: usize, height: usize) -> Self {
         Self { pixels, width, height, stride: width }
     }
 
-    /// Row `y`, `width` bytes. Only of a picture that [`Gray::check`] found whole.
+    /// Row `y`, `width` bytes. Only for an image that [`Gray::check`] accepted.
     pub(crate) fn row(&self, y: usize) -> &'a [u8] {
         &self.pixels[y * self.stride..][..self.width]
     }
 
-    /// Refuses a picture of another size than `width` x `height`, or one whose bytes do not reach.
+    /// Refuses an image of another size than `width` x `height`, or one whose bytes do not reach.
     ///
     /// # Errors
-    /// [`ErrorKind::SizeMismatch`], and it says which of them.
+    /// [`ErrorKind::SizeMismatch`], naming which of them.
     pub(crate) fn check(&self, what: &str, width: usize, height: usize) -> Result<()> {
         if (self.width, self.height) != (width, height) {
             return Err(Error::new(
                 ErrorKind::SizeMismatch,
                 format!(
-                    "the {what} picture is {}x{} where {width}x{height} was agreed on; both eyes must give pictures of that size",
+                    "the {what} image is {}x{} where {width}x{height} was agreed on; left and right images must both have that size",
                     self.width, self.height
                 ),
             ));
@@ -79,7 +79,7 @@ impl<'a> Gray<'a> {
             return Err(Error::new(
                 ErrorKind::SizeMismatch,
                 format!(
-                    "the {what} picture of {width}x{height} with rows {} bytes apart cannot have {} bytes",
+                    "the {what} image of {width}x{height} with rows {} bytes apart cannot have {} bytes",
                     self.stride,
                     self.pixels.len()
                 ),
@@ -89,16 +89,16 @@ impl<'a> Gray<'a> {
     }
 }
 
-/// What both eyes saw at one time, rectified.
+/// The left and right image of one moment, rectified.
 #[derive(Debug, Clone, Copy)]
 pub struct StereoPair<'a> {
-    /// The left eye's picture.
+    /// The left image.
     pub left: Gray<'a>,
-    /// The right eye's picture, of the same size.
+    /// The right image, of the same size.
     pub right: Gray<'a>,
-    /// The left picture in colour where there is one, for networks: RGB, 3 bytes a pixel, rows without padding.
+    /// The left image in colour where there is one, for networks: RGB, 3 bytes a pixel, rows without padding.
     pub left_rgb: Option<&'a [u8]>,
-    /// The right picture in colour, likewise.
+    /// The right image in colour, likewise.
     pub right_rgb: Option<&'a [u8]>,
 }
 
@@ -119,7 +119,7 @@ pub struct DisparityMap {
     pub height: usize,
     /// Disparity in pixels, `width * height`, rows without padding; NaN where none was found. Never negative.
     pub disparity: Vec<f32>,
-    /// How sure each is, `width * height`: 0 where there is none, else 1 (a guess) to 255.
+    /// Confidence of each, `width * height`: 0 for no disparity, else 1 (a guess) to 255.
     pub confidence: Vec<u8>,
 }
 
@@ -138,28 +138,28 @@ impl DisparityMap {
     }
 }
 
-/// What a matcher is, for logs and for what a recording says about where its depth came from.
+/// Description of a matcher, for logs and for the origin of depth in a recording.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Description {
-    /// What computes, with its version, such as `depthrig-sgm 0.1.0`.
+    /// Name and version of the method, such as `depthrig-sgm 0.1.0`.
     pub producer: String,
-    /// Which form of it, such as `quality`.
+    /// Its variant, such as `quality`.
     pub name: String,
-    /// Every number that the result depends on, as `key=value` words.
+    /// Every parameter of the result, as `key=value` words.
     pub parameters: String,
-    /// Bytes that it keeps from its making on; it takes no more while it runs.
+    /// Bytes that it allocates when created; it takes no more while it runs.
     pub memory_bytes: u64,
 }
 
-/// Finds the disparity of the left picture of rectified pairs of one size.
+/// Finds the disparity of the left image of rectified pairs of one size.
 pub trait Matcher: Send {
-    /// What it is.
+    /// Describes the matcher.
     fn describe(&self) -> Description;
 
     /// Fills `out` (which it resizes) from a pair of the agreed size.
     ///
     /// # Errors
-    /// [`ErrorKind::SizeMismatch`] for pictures of another size or with too few bytes; what else can fail is the
+    /// [`ErrorKind::SizeMismatch`] for images of another size or with too few bytes; what else can fail is the
     /// matcher's own.
     fn run(&mut self, pair: &StereoPair<'_>, out: &mut DisparityMap) -> Result<()>;
 }

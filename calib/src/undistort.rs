@@ -1,16 +1,16 @@
-//! Undistortion: a picture as another camera at the same place would have taken it.
+//! Undistortion: an image as another camera at the same place would have taken it.
 
 use crate::error::check_len;
 use crate::{Camera, Error, ErrorKind, Result};
 use depthrig_bus::Intrinsics;
 use glam::{DMat3, DVec2};
 
-/// Where each pixel of the new picture comes from, computed once. A picture costs one pass and allocates nothing.
+/// Where each pixel of the new image comes from, computed once. An image costs one pass and allocates nothing.
 #[derive(Debug, Clone)]
 pub struct Undistortion {
     from: (usize, usize),
     to: (usize, usize),
-    /// Per pixel of the new picture: column and row of the old one in 1/256 pixel; [`OUTSIDE`] where it shows nothing.
+    /// Per pixel of the new image: column and row of the old one in 1/256 pixel; [`OUTSIDE`] where it shows nothing.
     map: Vec<[i32; 2]>,
 }
 
@@ -19,21 +19,23 @@ const OUTSIDE: i32 = i32::MIN;
 const PARTS: i32 = 256;
 
 impl Undistortion {
-    /// From pictures of the camera `from` to pictures of the camera `to`, each with its size. `rotation` turns
+    /// From images of the camera `from` to images of the camera `to`, each with its size. `rotation` turns
     /// directions of `to` into directions of `from`; identity for undistortion alone, else for rectification.
     ///
     /// # Errors
-    /// As [`Camera::new`]; [`ErrorKind::BadInput`] for empty pictures.
+    /// As [`Camera::new`]; [`ErrorKind::BadInput`] for empty images.
     pub fn new(
         (from, from_size): (&Intrinsics, (u32, u32)),
         (to, to_size): (&Intrinsics, (u32, u32)),
         rotation: DMat3,
     ) -> Result<Self> {
         if [from_size.0, from_size.1, to_size.0, to_size.1].contains(&0) {
-            return Err(Error::new(ErrorKind::BadInput, "a picture without pixels cannot be undistorted"));
+            return Err(Error::new(ErrorKind::BadInput, "an image without pixels cannot be undistorted"));
         }
-        let (source, target) = (Camera::new(from)?, Camera::new(to)?);
-        let (w, h) = (f64::from(from_size.0) - 1.0, f64::from(from_size.1) - 1.0);
+        let source = Camera::new(from)?;
+        let target = Camera::new(to)?;
+        let w = f64::from(from_size.0) - 1.0;
+        let h = f64::from(from_size.1) - 1.0;
         let place = |x: u32, y: u32| {
             let ray = target.unproject(DVec2::new(f64::from(x), f64::from(y)))?;
             let at = source.project(rotation * ray)?;
@@ -48,29 +50,32 @@ impl Undistortion {
         })
     }
 
-    /// Width and height of the new pictures.
+    /// Width and height of the new images.
     pub const fn size(&self) -> (usize, usize) {
         self.to
     }
 
-    /// A picture of `N` bytes a pixel, between four pixels in proportion; 0 where the old one shows nothing.
+    /// An image of `N` bytes a pixel, between four pixels in proportion; 0 where the old one shows nothing.
     ///
     /// # Errors
-    /// [`ErrorKind::SizeMismatch`] for pictures of another size.
-    pub fn bytes<const N: usize>(&self, picture: &[u8], out: &mut [u8]) -> Result<()> {
-        check_len("the picture", picture.len(), self.from, N)?;
-        check_len("the undistorted picture", out.len(), self.to, N)?;
+    /// [`ErrorKind::SizeMismatch`] for images of another size.
+    pub fn bytes<const N: usize>(&self, image: &[u8], out: &mut [u8]) -> Result<()> {
+        check_len("the image", image.len(), self.from, N)?;
+        check_len("the undistorted image", out.len(), self.to, N)?;
         let (w, h) = self.from;
         for (out, [u, v]) in out.chunks_exact_mut(N).zip(&self.map) {
             if *u == OUTSIDE {
                 out.fill(0);
                 continue;
             }
-            let (x, y) = ((u / PARTS) as usize, (v / PARTS) as usize);
-            let (a, b) = ((u % PARTS) as u32, (v % PARTS) as u32);
-            let (right, below) = ((x + 1).min(w - 1), (y + 1).min(h - 1));
+            let x = (u / PARTS) as usize;
+            let y = (v / PARTS) as usize;
+            let a = (u % PARTS) as u32;
+            let b = (v % PARTS) as u32;
+            let right = (x + 1).min(w - 1);
+            let below = (y + 1).min(h - 1);
             for (c, out) in out.iter_mut().enumerate() {
-                let at = |x: usize, y: usize| u32::from(picture[(y * w + x) * N + c]);
+                let at = |x: usize, y: usize| u32::from(image[(y * w + x) * N + c]);
                 let top = at(x, y) * (256 - a) + at(right, y) * a;
                 let bottom = at(x, below) * (256 - a) + at(right, below) * a;
                 *out = ((top * (256 - b) + bottom * b + (1 << 15)) >> 16) as u8;
@@ -84,13 +89,13 @@ impl Undistortion {
     ///
     /// # Errors
     /// As [`Undistortion::bytes`].
-    pub fn depth(&self, picture: &[u16], out: &mut [u16]) -> Result<()> {
-        check_len("the picture", picture.len(), self.from, 1)?;
-        check_len("the undistorted picture", out.len(), self.to, 1)?;
+    pub fn depth(&self, image: &[u16], out: &mut [u16]) -> Result<()> {
+        check_len("the image", image.len(), self.from, 1)?;
+        check_len("the undistorted image", out.len(), self.to, 1)?;
         let width = self.from.0;
         for (out, [u, v]) in out.iter_mut().zip(&self.map) {
             let nearest = |at: &i32| ((at + PARTS / 2) / PARTS) as usize;
-            *out = if *u == OUTSIDE { 0 } else { picture[nearest(v) * width + nearest(u)] };
+            *out = if *u == OUTSIDE { 0 } else { image[nearest(v) * width + nearest(u)] };
         }
         Ok(())
     }
@@ -110,13 +115,13 @@ mod tests {
         let size = (64, 48);
         // The bent camera looks at brightness that grows with x: 40 per 0.1 of the plane z = 1.
         let brightness = |x: f64| 128.0 + 400.0 * x * 0.5;
-        let picture: Vec<u8> = (0..64 * 48)
+        let image: Vec<u8> = (0..64 * 48)
             .map(|i| camera.unproject(DVec2::new(f64::from(i % 64), f64::from(i / 64))).unwrap())
             .map(|ray| brightness(ray.x).round().clamp(0.0, 255.0) as u8)
             .collect();
         let map = Undistortion::new((&bent, size), (&ideal, size), DMat3::IDENTITY).unwrap();
         let mut out = vec![9; 64 * 48];
-        map.bytes::<1>(&picture, &mut out).unwrap();
+        map.bytes::<1>(&image, &mut out).unwrap();
         let mut seen = 0;
         for (i, v) in out.iter().enumerate().filter(|(_, v)| **v != 0) {
             let want = brightness(((i % 64) as f64 - 31.5) / 60.0).clamp(0.0, 255.0);
@@ -129,6 +134,6 @@ mod tests {
         let mut depth = vec![0; 64 * 48];
         map.depth(&steps, &mut depth).unwrap();
         assert!(depth.iter().all(|d| matches!(d, 0 | 500 | 900)));
-        assert!(map.bytes::<3>(&picture, &mut out).is_err());
+        assert!(map.bytes::<3>(&image, &mut out).is_err());
     }
 }

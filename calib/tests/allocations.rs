@@ -1,4 +1,4 @@
-//! What is done for every frame takes no memory: counted by an allocator.
+//! Per-frame work allocates no memory: counted by an allocator.
 #![allow(clippy::unwrap_used)]
 
 use depthrig_bus::{Distortion, Intrinsics, PixelFormat, Pose};
@@ -22,7 +22,8 @@ fn a_frame_takes_no_memory() {
     let depth: Vec<u16> =
         (0..160 * 120).map(|i| if i % 17 == 0 { 0 } else { 700 + (i % 160) as u16 }).collect();
     let color = vec![7; 160 * 120 * 3];
-    let (mut z, mut rgb) = (vec![0; 160 * 120], vec![0; 160 * 120 * 3]);
+    let mut z = vec![0; 160 * 120];
+    let mut rgb = vec![0; 160 * 120 * 3];
     for (d, c) in [(&k, &k), (&k, &bent), (&bent, &bent)] {
         let mut one = Registration::new(d, size, c, size, &pose).unwrap();
         assert_eq!(
@@ -58,7 +59,8 @@ fn a_frame_takes_no_memory() {
         0
     );
     let rectifier = Rectifier::new(&bent, &k, &pose, size).unwrap();
-    let (yuyv, mut grey) = (vec![90; 160 * 120 * 2], vec![0; 160 * 120]);
+    let yuyv = vec![90; 160 * 120 * 2];
+    let mut grey = vec![0; 160 * 120];
     assert_eq!(
         during(|| for view in View::BOTH {
             rectifier.rectify(view, PixelFormat::Rgb8, &color, &mut grey, Some(&mut rgb)).unwrap();

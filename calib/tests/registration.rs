@@ -8,7 +8,7 @@ use glam::{DQuat, DVec2, DVec3};
 /// How far depth sees along its axis.
 const MAX_RANGE_M: f64 = 6.0;
 
-/// What is looked at, in colour's optical frame, metres.
+/// The scene, in colour's optical frame, metres.
 #[derive(Debug, Clone, Copy)]
 enum Scene {
     /// Every point `p` with `normal · p = distance`.
@@ -44,7 +44,8 @@ impl Scene {
             Self::Plane { normal, distance } => plane(normal, distance),
             Self::Sphere { centre, radius, wall } => {
                 let to = origin - centre;
-                let (a, b) = (direction.length_squared(), to.dot(direction));
+                let a = direction.length_squared();
+                let b = to.dot(direction);
                 let root = (b * b - a * (to.length_squared() - radius * radius)).sqrt();
                 let s = (-b - root) / a;
                 if s > 0.0 { s } else { plane(DVec3::Z, wall) }
@@ -58,7 +59,8 @@ impl Scene {
 
 /// The normal of a plane that is turned away from facing the camera by `slope` degrees, towards `direction` degrees.
 fn sloped(slope: f64, direction: f64) -> DVec3 {
-    let (slope, direction) = (slope.to_radians(), direction.to_radians());
+    let slope = slope.to_radians();
+    let direction = direction.to_radians();
     DVec3::new(slope.sin() * direction.cos(), slope.sin() * direction.sin(), slope.cos())
 }
 
@@ -73,7 +75,8 @@ fn scenes(z: f64) -> Vec<(String, Scene)> {
     }
     let centre = DVec3::new(0.05 * z, -0.02 * z, z);
     scenes.push(("sphere".into(), Scene::Sphere { centre, radius: 0.25 * z, wall: 1.4 * z }));
-    let (left, right) = (sloped(40.0, 170.0), sloped(50.0, -10.0));
+    let left = sloped(40.0, 170.0);
+    let right = sloped(50.0, -10.0);
     let distance = left.dot(DVec3::new(0.0, 0.0, z)).min(right.dot(DVec3::new(0.0, 0.0, z)));
     scenes.push(("edge".into(), Scene::Edge { left, right, distance }));
     scenes.push(("corner".into(), Scene::Corner { left, right, distance }));
@@ -303,24 +306,28 @@ fn registered_depth_lies_along_the_axis_of_colour() {
         }
     }
     println!("worst median {:.3} mm: {}; least coverage {:.4}: {}", worst.0 * 1e3, worst.1, least.0, least.1);
-    // What a sphere hides from depth, colour may see.
+    // Colour may see points that a sphere hides from depth.
     assert!(least.0 >= 0.95, "{} covered: {}", least.0, least.1);
 }
 
 /// A splat as librealsense does it: how many pixels of colour have depth.
 fn splat(rig: &Rig, pose: &Pose, depth: &[u16], unit_m: f64) -> usize {
-    let (depth_camera, color_camera) = (Camera::new(&rig.depth).unwrap(), Camera::new(&rig.color).unwrap());
+    let depth_camera = Camera::new(&rig.depth).unwrap();
+    let color_camera = Camera::new(&rig.color).unwrap();
     let color_from_depth = pose.to_affine();
-    let (w, h) = (rig.color_size.0 as i32, rig.color_size.1 as i32);
+    let w = rig.color_size.0 as i32;
+    let h = rig.color_size.1 as i32;
     let mut drawn = vec![false; (w * h) as usize];
     for (i, d) in depth.iter().enumerate().filter(|(_, d)| **d > 0) {
-        let (x, y) = (i % rig.depth_size.0 as usize, i / rig.depth_size.0 as usize);
+        let x = i % rig.depth_size.0 as usize;
+        let y = i / rig.depth_size.0 as usize;
         let corner = |off: f64| {
             let ray = depth_camera.unproject(DVec2::new(x as f64 + off, y as f64 + off))?;
             color_camera.project(color_from_depth.transform_point3(ray * f64::from(*d) * unit_m))
         };
         let (Some(a), Some(b)) = (corner(-0.5), corner(0.5)) else { continue };
-        let (first, last) = ((a.min(b) + 0.5).floor(), (a.max(b) + 0.5).floor());
+        let first = (a.min(b) + 0.5).floor();
+        let last = (a.max(b) + 0.5).floor();
         for v in (first.y as i32).max(0)..=(last.y as i32).min(h - 1) {
             for u in (first.x as i32).max(0)..=(last.x as i32).min(w - 1) {
                 drawn[(v * w + u) as usize] = true;

@@ -63,9 +63,11 @@ fn main() -> Result<(), AnyError> {
             network.run(&numbers, &mut result)?;
             prepared = Some(shape);
         }
-        let (wall, cpu) = (HostTime::now(), process_cpu_ns());
+        let wall = HostTime::now();
+        let cpu = process_cpu_ns();
         network.run(&numbers, &mut result)?;
-        let (wall, cpu) = (wall.elapsed().as_secs_f64(), (process_cpu_ns() - cpu) as f64 / 1e9);
+        let wall = wall.elapsed().as_secs_f64();
+        let cpu = (process_cpu_ns() - cpu) as f64 / 1e9;
         std::fs::write(y, result.iter().flat_map(|n| n.to_le_bytes()).collect::<Vec<_>>())?;
         writeln!(out, "{wall} {cpu} {}", peak_mb().unwrap_or(0))?;
         out.flush()?;

@@ -52,7 +52,7 @@ fn one(model: &Model, engine: EngineKind, path: &str) -> Result<()> {
     let depth = RawDepth { pixels: &raw, unit_m };
 
     let (shape, official) = numbers(&file, "x")?;
-    let mut prep = Prep::new((width, height), input_size, model.max_depth_m)?;
+    let mut prep = Prep::new(width, height, input_size, model.max_depth_m)?;
     assert_eq!(prep.net(), (shape[3], shape[2]), "the size of the input");
     let mut x = vec![f32::NAN; official.len()];
     prep.prepare(&color, &depth, model.channel_order, &mut x)?;

@@ -53,7 +53,7 @@ impl core::str::FromStr for Encoder {
 
     fn from_str(s: &str) -> Result<Self> {
         Self::ALL.into_iter().find(|e| e.name() == s).ok_or_else(|| {
-            let message = format!("there is no encoder {s:?}: it is one of vits, vitb, vitl and vitg");
+            let message = format!("unknown encoder {s:?}; use vits, vitb, vitl or vitg");
             Error::new(ErrorKind::BadInput, message)
         })
     }

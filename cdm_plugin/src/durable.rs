@@ -1,4 +1,4 @@
-//! Files that are whole or not there: written under another name, synced, and renamed.
+//! Files that are complete or absent: written under another name, synced, and renamed.
 
 use crate::{Error, ErrorKind, Result};
 use sha2::{Digest, Sha256};
@@ -6,7 +6,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-/// What was written.
+/// A written file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Written {
     pub bytes: u64,
@@ -45,7 +45,7 @@ pub(crate) fn create(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Resu
     let mut part = name.to_owned();
     part.push(format!(".{}.part", std::process::id()));
     let part = Leftover(Some(path.with_file_name(part)));
-    // What a killed process left under this name is ours to remove; a link is removed and not followed.
+    // A leftover of a killed process under this name is removed; a link is removed and not followed.
     drop(std::fs::remove_file(part.path()));
     let file = OpenOptions::new().write(true).create_new(true).open(part.path()).map_err(failed)?;
     let mut out = Hashing { inner: BufWriter::with_capacity(1 << 20, file), hash: Sha256::new(), bytes: 0 };
@@ -100,7 +100,7 @@ impl Leftover {
 impl Drop for Leftover {
     fn drop(&mut self) {
         if let Some(path) = &self.0 {
-            drop(std::fs::remove_file(path)); // it may not have been made yet
+            drop(std::fs::remove_file(path)); // it may not exist yet
         }
     }
 }

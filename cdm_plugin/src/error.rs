@@ -1,18 +1,18 @@
 //! The error of the crate: a kind to match on, and what happened to what.
 
-/// What went wrong, for callers that decide on it.
+/// Kind of an error, for callers that react to it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum ErrorKind {
-    /// Two pictures that belong together have different sizes.
+    /// Two images that belong together have different sizes.
     SizeMismatch,
-    /// A setting or a picture cannot be used as it is.
+    /// A setting or an image cannot be used as it is.
     BadInput,
     /// A model, a file or a library is not where it should be.
     NotFound,
     /// A checkpoint is damaged, or is not of the network that it should be.
     BadModel,
-    /// What was asked for exists, but not in this engine, library or build.
+    /// This engine, library or build does not support the request.
     Unsupported,
     /// The engine's library is missing, or is of a version that cannot be used.
     NoEngine,

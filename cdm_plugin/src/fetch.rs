@@ -1,8 +1,8 @@
 //! Checkpoints from a server: resumed after a cut, and proven by their hash before anything is done with them.
 //!
-//! What was fetched so far lies in `.downloads` of the models' folder and stays there until all of it is there, so that
-//! the same command goes on where the last one ended. Servers of `huggingface.co` tell size and SHA-256 of a large file
-//! with the first answer (`X-Linked-Size`, `X-Linked-Etag`: `huggingface_hub`, `file_download.py`).
+//! A partial download stays in `.downloads` of the models' folder until it is complete, so that the same command
+//! resumes it. Servers of `huggingface.co` report size and SHA-256 of a large file with the first answer
+//! (`X-Linked-Size`, `X-Linked-Etag`: `huggingface_hub`, `file_download.py`).
 
 use crate::durable;
 use crate::published::Published;
@@ -32,11 +32,11 @@ pub struct FetchOptions {
     pub url: Option<String>,
     /// The version of the repository.
     pub revision: String,
-    /// What the SHA-256 of the file must be, in hexadecimal; in place of the one that is known.
+    /// Expected SHA-256 of the file, in hexadecimal; overrides the built-in one.
     pub sha256: Option<String>,
-    /// What proves to the server who asks; sent to no other one.
+    /// Access token for the server; sent to no other host.
     pub token: Option<String>,
-    /// How often it is tried again when nothing more came since the last time.
+    /// Number of retries without any progress in between.
     pub retries: u32,
     /// How long it waits before the first of these; each time twice as long.
     pub wait: Duration,
@@ -76,19 +76,19 @@ pub struct Fetched {
 }
 
 impl Fetched {
-    /// Removes the file: what is installed needs it no more.
+    /// Removes the file: the installed model does not need it.
     pub fn discard(&self) {
         forget(&self.path);
     }
 }
 
-/// What is kept beside a file that is not complete.
+/// State stored beside an incomplete file.
 #[derive(Debug, Default, PartialEq, Serialize, Deserialize)]
 struct Progress {
     url: String,
     /// The server's mark of the version of the file.
     etag: Option<String>,
-    /// The SHA-256 that the server told.
+    /// The SHA-256 that the server reported.
     sha256: Option<String>,
 }
 
@@ -177,7 +177,7 @@ fn sha256(text: &str) -> Result<String> {
     if text.len() == 64 && text.bytes().all(|b| b.is_ascii_hexdigit()) {
         return Ok(text.to_ascii_lowercase());
     }
-    let message = format!("{text:?} is no SHA-256: it is 64 hexadecimal digits");
+    let message = format!("invalid SHA-256 {text:?}; it has 64 hexadecimal digits");
     Err(Error::new(ErrorKind::BadInput, message))
 }
 
@@ -277,18 +277,18 @@ impl Download<'_> {
 
     /// Whether the server's own hash is the one that is expected: known before 5 GB were fetched in vain.
     fn compare_before(&mut self, answer: &Answer) -> Result<()> {
-        let Some(told) = &answer.sha256 else { return Ok(()) };
+        let Some(reported) = &answer.sha256 else { return Ok(()) };
         match &self.expected {
             None => {
-                self.expected = Some(told.clone());
+                self.expected = Some(reported.clone());
                 self.compared_with = "server";
                 Ok(())
             }
-            Some(expected) if expected == told => Ok(()),
+            Some(expected) if expected == reported => Ok(()),
             Some(expected) => {
                 let message = format!(
-                    "{}: the server has a file with the SHA-256 {told}, and {expected} ({}) is expected: it was changed since, \
-                     or it is another one. Nothing was fetched; if its page says that it is right, say --sha256 {told}",
+                    "{}: the server has a file with the SHA-256 {reported}, but {expected} ({}) is expected: it was replaced, \
+                     or it is another file. Nothing was fetched; if its page confirms it, use --sha256 {reported}",
                     self.url, self.compared_with
                 );
                 Err(Error::new(ErrorKind::Network, message))
@@ -355,7 +355,8 @@ impl Download<'_> {
     }
 
     fn too_large(&self, total: Option<u64>) -> Ended {
-        let (most, url) = (self.options.max_bytes, &self.url);
+        let most = self.options.max_bytes;
+        let url = &self.url;
         let what = total.map_or_else(
             || format!("the server sends more than {most} bytes without saying how many there are"),
             |total| format!("the file has {total} bytes, and {most} is the most that is fetched"),
@@ -367,7 +368,7 @@ impl Download<'_> {
         Ended::Final(Error::new(ErrorKind::Network, message))
     }
 
-    /// Whether there is room for what is still to come.
+    /// Checks that the disk has room for the rest.
     fn room(&self, needed: u64) -> Result<(), Ended> {
         let folder = self.path.parent().unwrap_or(Path::new("."));
         let Ok(disk) = rustix::fs::statvfs(folder) else { return Ok(()) };
@@ -387,7 +388,9 @@ impl Download<'_> {
         };
         let mut file = depthrig_bus::files::open(&self.path).map_err(failed)?;
         let total = file.metadata().map_err(failed)?.len();
-        let (mut hash, mut part, mut done) = (Sha256::new(), vec![0; 1 << 20], 0);
+        let mut hash = Sha256::new();
+        let mut part = vec![0; 1 << 20];
+        let mut done = 0;
         loop {
             let n = file.read(&mut part).map_err(failed)?;
             if n == 0 {
@@ -427,7 +430,7 @@ fn len(path: &Path) -> u64 {
     std::fs::metadata(path).map_or(0, |m| m.len())
 }
 
-/// Removes a file and what is kept beside it.
+/// Removes a file and its progress file.
 fn forget(path: &Path) {
     for path in [path.to_owned(), path.with_extension("json")] {
         drop(std::fs::remove_file(path)); // it need not be there

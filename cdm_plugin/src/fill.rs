@@ -1,16 +1,16 @@
-//! Refined depth without a model: wrong pixels taken out, holes filled along the colour picture, noise smoothed.
+//! Refined depth without a model: wrong pixels taken out, holes filled along the colour image, noise smoothed.
 //!
 //! Everything works on inverse depth (1/m), in which a plane is a linear function of the pixel, so that means and
 //! interpolation keep planes. The steps:
 //! 1. colour and depth are brought into one form ([`load`]); 0, 65535 and what lies beyond the range are holes;
 //! 2. pixels without support by their neighbours, small islands, and larger ones that hang in the air become holes
 //!    ([`clean`]), and so does what a mirror or glass shows ([`behind`]);
-//! 3. the picture is halved until one cell is left ([`pyramid`]); where a cell lies on two surfaces, the farther wins;
+//! 3. the image is halved until one cell is left ([`pyramid`]); where a cell lies on two surfaces, the farther wins;
 //! 4. from the coarsest on, holes take the depth of those coarse cells around them that look like them, and are smoothed
 //!    within their surface ([`pull`]). What was measured and kept stays as it was measured;
 //! 5. what lies further from measured depth than the reach is unknown: 0 ([`reach`]).
 //!
-//! A picture without any depth stays without: its result is 0 everywhere, and no error.
+//! An image without any depth stays without: its result is 0 everywhere, and no error.
 // The steps of a pixel must end up inside the loops that are compiled for AVX2, whatever their size.
 #![allow(clippy::inline_always)]
 
@@ -18,21 +18,21 @@ use crate::{Color, ColorFormat, Description, Error, ErrorKind, Job, Output, Refi
 use behind::Behind;
 use clean::Islands;
 use depthrig_bus::HostTime;
-use lanes::Crew;
 use pyramid::Level;
 use reach::Reach;
+use workers::Workers;
 
 mod behind;
 mod clean;
-mod lanes;
 mod load;
 mod pull;
 mod pyramid;
 mod reach;
+mod workers;
 
-/// Islands below this part of the picture are taken out: 60 pixels of 1280x720.
+/// Islands below this part of the image are taken out: 60 pixels of 1280x720.
 const ISLAND: f64 = 65e-6;
-/// Islands below this are taken out of small pictures too, pixels.
+/// Islands below this are taken out of small images too, pixels.
 const LEAST_ISLAND: u32 = 8;
 
 /// An island below this part of the image that hangs in the air, at another depth than all around it, is taken out: 922
@@ -47,8 +47,8 @@ const LEAST_REACH: usize = 48;
 #[derive(Debug)]
 pub struct FillRefiner {
     description: Description,
-    crew: Crew,
-    /// Those in use first, from the whole picture to one cell; kept when a smaller picture needs fewer.
+    workers: Workers,
+    /// Those in use first, from the whole image to one cell; kept when a smaller image needs fewer.
     levels: Vec<Level>,
     in_use: usize,
     cleaned: Vec<f32>,
@@ -63,21 +63,20 @@ impl FillRefiner {
     /// So far from measured depth holes are filled by default, as a part of the image's width: 160 pixels of 1280.
     pub const REACH: f64 = 0.125;
 
-    /// A refiner that uses `threads` threads; 0 and 1 mean the caller's own, and then nothing is allocated for a picture
+    /// A refiner that uses `threads` threads; 0 and 1 mean the caller's own, and then nothing is allocated for an image
     /// that is not larger than those before it. (With more, rayon's queue allocates a block now and then.)
     ///
     /// # Errors
     /// [`ErrorKind::Engine`] when the threads cannot be made.
     pub fn new(threads: usize) -> Result<Self> {
-        let crew = Crew::new(threads).map_err(|e| {
-            let message =
-                format!("the {threads} threads that fill depth cannot be made ({e}); ask for fewer");
+        let workers = Workers::new(threads).map_err(|e| {
+            let message = format!("the {threads} threads to fill depth cannot be started ({e}); use fewer");
             Error::new(ErrorKind::Engine, message).with_source(e)
         })?;
         let description = Description { engine: "fill".into(), model: String::new() };
         Ok(Self {
             description,
-            crew,
+            workers,
             levels: Vec::new(),
             in_use: 0,
             cleaned: Vec::new(),
@@ -97,24 +96,25 @@ impl FillRefiner {
     fn run(&mut self, job: &mut Job<'_>) -> Result<()> {
         check(job)?;
         let began = HostTime::now();
-        let (w, h) = (job.color.width, job.color.height);
+        let w = job.color.width;
+        let h = job.color.height;
         self.resize(w, h);
-        let Self { crew, levels, in_use, cleaned, islands, behind, reach, limit, .. } = self;
+        let Self { workers, levels, in_use, cleaned, islands, behind, reach, limit, .. } = self;
         let levels = &mut levels[..*in_use];
         let Some((full, _)) = levels.split_first_mut() else { return Ok(()) };
-        load::load(crew, &job.color, &job.depth, cleaned, &mut full.color);
-        crew.rows(&mut full.q, w, |y, row| clean::keep_supported(crew.wide, cleaned, w, y, row));
+        load::load(workers, &job.color, &job.depth, cleaned, &mut full.color);
+        workers.rows(&mut full.q, w, |y, row| clean::keep_supported(workers.wide, cleaned, w, y, row));
         let part = |of: f64| (of * (w * h) as f64).round() as u32;
         islands.remove(&mut full.q, w, LEAST_ISLAND.max(part(ISLAND)), part(BODY));
         behind.remove(&mut full.q, w);
         let loaded = HostTime::now();
 
-        crew.rows2((&mut full.share, &mut cleaned[..]), w, |y, share, _| {
-            load::share(crew.wide, &full.q[y * w..(y + 1) * w], share);
+        workers.rows2(&mut full.share, cleaned, w, |y, share, _| {
+            load::share(workers.wide, &full.q[y * w..(y + 1) * w], share);
         });
         for i in 1..levels.len() {
             if let [fine, coarse] = &mut levels[i - 1..=i] {
-                pyramid::shrink(crew, fine, coarse);
+                pyramid::shrink(workers, fine, coarse);
             }
         }
         // Filling writes into the cells' depth, but not into how much of them had some.
@@ -127,9 +127,9 @@ impl FillRefiner {
         if has_depth {
             for i in (1..levels.len()).rev() {
                 if let [fine, coarse] = &mut levels[i - 1..=i] {
-                    pull::fill(crew, coarse, fine);
+                    pull::fill(workers, coarse, fine);
                     if i > 1 {
-                        pull::smooth(crew, fine, cleaned);
+                        pull::smooth(workers, fine, cleaned);
                     }
                 }
             }
@@ -139,7 +139,7 @@ impl FillRefiner {
         }
         let filled = HostTime::now();
 
-        load::store(crew, &levels[0].q, w, &mut job.out);
+        load::store(workers, &levels[0].q, w, &mut job.out);
         job.steps = StepTimes {
             prepare_ns: loaded.since_ns(began).unsigned_abs(),
             infer_ns: filled.since_ns(loaded).unsigned_abs(),
@@ -148,7 +148,7 @@ impl FillRefiner {
         Ok(())
     }
 
-    /// Makes room for pictures of this size; nothing to do when the last one had it.
+    /// Allocates buffers for images of this size; does nothing if the size is unchanged.
     fn resize(&mut self, w: usize, h: usize) {
         if self.levels.first().is_some_and(|l| (l.w, l.h) == (w, h)) {
             return;
@@ -157,7 +157,8 @@ impl FillRefiner {
         self.islands.reserve(w * h);
         self.behind.resize(w, h);
         self.reach.resize(w.div_ceil(reach::CELL), h.div_ceil(reach::CELL));
-        let (mut size, mut count) = ((w, h), 1);
+        let mut size = (w, h);
+        let mut count = 1;
         while size != (1, 1) {
             size = (size.0.div_ceil(2), size.1.div_ceil(2));
             count += 1;
@@ -192,12 +193,12 @@ fn check(job: &Job<'_>) -> Result<()> {
     let Color { pixels, width, height, stride, format: ColorFormat::Rgb8 | ColorFormat::Bgr8 } = job.color;
     let bad = |message: String| Err(Error::new(ErrorKind::BadInput, message));
     if width == 0 || height == 0 {
-        return bad(format!("a colour picture of {width}x{height} has no pixels; give one that has"));
+        return bad(format!("a colour image of {width}x{height} has no pixels; give one that has"));
     }
     let needed = width.checked_mul(3).and_then(|row| stride.checked_mul(height - 1)?.checked_add(row));
     if stride < width.saturating_mul(3) || needed.is_none_or(|n| n > pixels.len()) {
         return bad(format!(
-            "a colour picture of {width}x{height} with {stride} bytes a row does not fit its {} bytes",
+            "a colour image of {width}x{height} with {stride} bytes a row does not fit its {} bytes",
             pixels.len()
         ));
     }
@@ -217,9 +218,7 @@ fn check(job: &Job<'_>) -> Result<()> {
     }
     for (what, unit_m) in [("raw depth", job.depth.unit_m), ("the output", out_unit_m)] {
         if !(unit_m.is_finite() && unit_m > 0.0) {
-            return bad(format!(
-                "{what}: {unit_m} metres is no unit of depth; it must be above 0, such as 0.001"
-            ));
+            return bad(format!("{what}: invalid depth unit {unit_m} m; it must be above 0, such as 0.001"));
         }
     }
     Ok(())

@@ -1,4 +1,4 @@
-//! What the fuzz targets in `fuzz/` call, and the test that runs their corpus: files of weights that may hold anything.
+//! Entry points of the fuzz targets in `fuzz/`, and the test that runs their corpus: arbitrary files of weights.
 //!
 //! A panic is a finding, and so is a tensor that lies outside of its file. Each function returns how far its input came.
 

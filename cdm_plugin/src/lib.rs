@@ -1,6 +1,6 @@
 //! Camera depth models: what refines the depth of a camera, and how good depth is.
 //!
-//! Floor 3. Start at [`Refiner`]: colour and raw depth of one view in, clean metric depth out. A camera depth model is
+//! Layer 3. Start at [`Refiner`]: colour and raw depth of one view in, clean metric depth out. A camera depth model is
 //! one network ([`Encoder`] says which size of it) with its [`Weights`]; a [`Network`] runs it. [`metrics`] are the
 //! measures by which depth is compared with a reference.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
@@ -37,7 +37,7 @@ pub use options::{EngineKind, Precision, RefinerOptions};
 pub use refine::{Color, ColorFormat, Description, Job, Output, RawDepth, Refiner, StepTimes};
 pub use refiner::CdmRefiner;
 #[doc(hidden)]
-pub use stereo_network::MadeNetwork;
+pub use stereo_network::FakeNetwork;
 pub use stereo_network::{NetworkPixels, StereoNetwork, StereoNetworkOptions};
 pub use store::ModelStore;
 pub use weights::Weights;

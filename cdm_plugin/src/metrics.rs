@@ -1,4 +1,4 @@
-//! How good depth is against a reference: L1, RMSE, `AbsRel`, δ0.5, δ1, what is missing, and the fill rate.
+//! Metrics of depth against a reference: L1, RMSE, `AbsRel`, δ0.5, δ1, missing pixels, and the fill rate.
 //!
 //! With reference depth `d*` and predicted depth `d`, both in metres:
 //! - a reference pixel *counts* when `d*` is finite, above 0 and within the [`DepthRange`];
@@ -13,7 +13,7 @@
 //! A measure over no pixels at all is NaN and [`DepthMetrics::is_empty`] says so; it is never 0, which would be
 //! perfect. Everything is summed in `f64`.
 //!
-//! Over a dataset, the *mean of pictures* and the *pixel-pooled* value differ; [`Dataset`] gives both by name.
+//! Over a dataset, the *mean of images* and the *pixel-pooled* value differ; [`Dataset`] gives both by name.
 
 use crate::{Error, ErrorKind, Result};
 use sums::{Sums, each};
@@ -25,7 +25,7 @@ mod sums;
 pub use dataset::{Dataset, DatasetMetrics};
 pub use measured::{DistanceBin, ERROR_BOUNDS_M, ErrorHistogram, Measured};
 
-/// A depth picture, row by row without padding.
+/// A depth image, row by row without padding.
 #[derive(Debug, Clone, Copy)]
 pub enum Depth<'a> {
     /// 16-bit depth in units of `unit_m` metres; 0 is a hole.
@@ -35,7 +35,7 @@ pub enum Depth<'a> {
         /// Metres per unit.
         unit_m: f64,
     },
-    /// Metres; NaN, infinity and what is not above 0 are holes.
+    /// Metres; NaN, infinity and values not above 0 are holes.
     Metres(&'a [f32]),
 }
 
@@ -66,7 +66,7 @@ impl Depth<'_> {
         match self {
             Self::Units { unit_m, .. } if !(unit_m.is_finite() && *unit_m > 0.0) => Err(Error::new(
                 ErrorKind::BadInput,
-                format!("{what}: {unit_m} metres is no unit of depth; it must be above 0, such as 0.001"),
+                format!("{what}: invalid depth unit {unit_m} m; it must be above 0, such as 0.001"),
             )),
             _ => Ok(()),
         }
@@ -110,11 +110,11 @@ pub struct DepthMetrics {
     pub delta_05: f64,
     /// Share of valid pixels within a factor of 1.25.
     pub delta_1: f64,
-    /// As `l1_m`, over the pixels that count; what is missing is off by its reference.
+    /// As `l1_m`, over all valid references; a missing pixel is off by its reference.
     pub strict_l1_m: f64,
-    /// As `rmse_m`, over the pixels that count; what is missing is off by its reference.
+    /// As `rmse_m`, over all valid references; a missing pixel is off by its reference.
     pub strict_rmse_m: f64,
-    /// As `abs_rel`, over the pixels that count; what is missing is off by 1.
+    /// As `abs_rel`, over all valid references; a missing pixel is off by 1.
     pub strict_abs_rel: f64,
     /// As `delta_05`, over the pixels that count.
     pub strict_delta_05: f64,
@@ -134,8 +134,8 @@ impl DepthMetrics {
 /// Compares `prediction` with `reference` where the reference lies in `range`.
 ///
 /// # Errors
-/// [`ErrorKind::SizeMismatch`] when they differ in the number of pixels, [`ErrorKind::BadInput`] for a unit or a
-/// range that is none.
+/// [`ErrorKind::SizeMismatch`] when they differ in the number of pixels, [`ErrorKind::BadInput`] for an invalid
+/// unit or range.
 pub fn compare(prediction: &Depth<'_>, reference: &Depth<'_>, range: DepthRange) -> Result<DepthMetrics> {
     let mut sums = Sums::default();
     each(prediction, reference, range, |_, seen, truth| sums.add(seen, truth))?;

@@ -20,7 +20,7 @@ pub enum ChannelOrder {
 /// A model ready for an engine.
 #[derive(Debug, Clone)]
 pub struct Model {
-    /// What headers and reports call it: its name and the beginning of its hash, such as `cdm-d435@1f2e3d4c`; at most
+    /// Id in headers and reports: its name and the beginning of its hash, such as `cdm-d435@1f2e3d4c`; at most
     /// 31 bytes.
     pub id: String,
     /// The size of the network.
@@ -41,7 +41,7 @@ pub const INPUT_SIZE: u32 = 518;
 pub const MAX_DEPTH_M: f64 = 6.0;
 /// The longest name of a model: with nine more bytes of its hash it fits into a header.
 pub(crate) const MAX_NAME: usize = 22;
-/// What the names of models without training begin with in headers and reports.
+/// Prefix of the ids of untrained models in headers and reports.
 const UNTRAINED: &str = "untrained-";
 
 impl Model {

@@ -1,11 +1,11 @@
-//! What runs the network: one trait, whatever library stands behind it.
+//! The trait of everything that runs a network, independent of the library.
 
 use crate::Result;
 
 /// The size of a network's input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct NetShape {
-    /// Pictures at a time.
+    /// Images at a time.
     pub batch: usize,
     /// Rows, a multiple of 14.
     pub height: usize,
@@ -14,7 +14,7 @@ pub struct NetShape {
 }
 
 impl NetShape {
-    /// Patches of one picture, without the class token.
+    /// Patches of one image, without the class token.
     pub const fn patches(self) -> usize {
         (self.height / crate::arch::PATCH) * (self.width / crate::arch::PATCH)
     }
@@ -45,13 +45,13 @@ pub trait Network: Send {
     /// The engine, its version, the device and the precision, such as `onnxruntime 1.31.1 cpu fp32`; at most 31 bytes.
     fn describe(&self) -> &str;
 
-    /// How many pictures at a time this engine gains from; 1 when it gains nothing.
+    /// How many images at a time this engine gains from; 1 when it gains nothing.
     fn best_batch(&self) -> usize {
         1
     }
 
     /// Gets ready for inputs of `shape`; called before the first [`Self::run`] at it, and again after another shape was
-    /// prepared: pictures of two sizes may take turns.
+    /// prepared: images of two sizes may take turns.
     ///
     /// # Errors
     /// [`crate::ErrorKind::OutOfMemory`] and [`crate::ErrorKind::Engine`].

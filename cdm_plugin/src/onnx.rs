@@ -3,7 +3,7 @@
 //! Exporting the official code does not give that. Exporters take heights and widths as dynamic and bake them in all
 //! the same, and the bicubic resize of the position embeddings that they leave in the graph is computed wrongly by
 //! some runtimes. Here the embeddings are inputs, already of the right size, and every size in the graph comes from the
-//! shape of the picture.
+//! shape of the image.
 //!
 //! Inputs: `x` `[batch, 4, height, width]`, `pos_rgb` and `pos_depth` `[tokens, width of the encoder]`, all in 32-bit
 //! floats. Output: `y` `[batch, height, width]`. The graph holds no weights: whoever runs it puts the tensors of a
@@ -69,7 +69,7 @@ pub struct WeightSlice {
 pub struct Graph {
     /// The encoded `ModelProto`.
     pub model: Vec<u8>,
-    /// What the initializers without data stand for.
+    /// Weights of the initializers without data.
     pub weights: Vec<WeightSlice>,
 }
 
@@ -85,8 +85,8 @@ impl Graph {
         network::build(arch, style)
     }
 
-    /// The model with its weights at `places` of the file `name`, in the order of [`Self::weights`]. The engine is told
-    /// which folder the file lies in.
+    /// The model with its weights at `places` of the file `name`, in the order of [`Self::weights`]. The engine gets
+    /// the folder of the file.
     pub fn in_file(&self, name: &str, places: &[Range<usize>]) -> Vec<u8> {
         // It was encoded by `finish`, so it can be decoded.
         let Ok(mut model) = ModelProto::decode(self.model.as_slice()) else { return Vec::new() };

@@ -28,7 +28,7 @@ const NAME_BYTES: usize = 31;
 /// the library or its folder; it is looked for without.
 ///
 /// # Errors
-/// [`ErrorKind::NoEngine`] when there is none that can be used, [`ErrorKind::BadInput`] for an unknown device,
+/// [`ErrorKind::NoEngine`] when no usable library is found, [`ErrorKind::BadInput`] for an unknown device,
 /// [`ErrorKind::Unsupported`] for a precision that the device has not.
 pub fn find_library(wanted: Option<&Path>, device: &str, precision: Precision) -> Result<(PathBuf, String)> {
     let device: Device = device.parse()?;
@@ -67,7 +67,7 @@ impl OnnxNetwork {
     /// and library.
     ///
     /// # Errors
-    /// [`ErrorKind::NoEngine`] when there is no library that can be used, [`ErrorKind::Unsupported`] when it lacks the
+    /// [`ErrorKind::NoEngine`] when no usable library is found, [`ErrorKind::Unsupported`] when it lacks the
     /// device or the precision, [`ErrorKind::BadInput`] for an unknown device, [`ErrorKind::BadModel`] when a tensor
     /// is missing, [`ErrorKind::OutOfMemory`] and [`ErrorKind::Engine`].
     pub fn open(model: &Model, options: &RefinerOptions) -> Result<Self> {
@@ -122,7 +122,7 @@ impl Network for OnnxNetwork {
 
     fn best_batch(&self) -> usize {
         match self.device {
-            // One picture keeps a CPU busy; waiting for others would make each later.
+            // One image keeps a CPU busy; waiting for others would make each later.
             Device::Cpu | Device::OpenVino(_) => 1,
             // Not measured: there was no GPU.
             Device::Cuda(_) | Device::TensorRt(_) => 4,
@@ -137,7 +137,7 @@ impl Network for OnnxNetwork {
         let fits = |numbers: &[f32]| !numbers.is_empty() && numbers.len().is_multiple_of(tokens);
         if shape.input_len() == 0 || !patches || !fits(&positions.rgb) || !fits(&positions.depth) {
             let message = format!(
-                "{} pictures of {}x{} with {} position embeddings are no input of the network, whose sides are \
+                "{} images of {}x{} with {} position embeddings do not fit the network, whose sides are \
                  multiples of 14",
                 shape.batch,
                 shape.width,
@@ -159,9 +159,10 @@ impl Network for OnnxNetwork {
             return not_prepared("run before it was prepared for a size".into());
         };
         if x.len() != shape.input_len() || y.len() != shape.output_len() {
-            let (height, width) = (shape.height, shape.width);
+            let height = shape.height;
+            let width = shape.width;
             return not_prepared(format!(
-                "{} numbers in and {} out do not fit {} pictures of {width}x{height}",
+                "{} numbers in and {} out do not fit {} images of {width}x{height}",
                 x.len(),
                 y.len(),
                 shape.batch
@@ -195,7 +196,7 @@ const fn style(device: &Device, precision: Precision) -> Style {
     match (device, precision) {
         (Device::Cuda(_), Precision::Fp16) => Style { attention: Attention::Fused, numbers: Numbers::Fp16 },
         (Device::Cpu | Device::Cuda(_), _) => Style { attention: Attention::Fused, numbers: Numbers::Fp32 },
-        // These two take a graph in 32-bit floats and choose the precision themselves, as they are told.
+        // These two take a graph in 32-bit floats and choose the precision themselves, by their options.
         (Device::TensorRt(_) | Device::OpenVino(_), _) => {
             Style { attention: Attention::Standard, numbers: Numbers::Fp32 }
         }
@@ -204,9 +205,9 @@ const fn style(device: &Device, precision: Precision) -> Style {
 
 /// `onnxruntime 1.31.1 cpu fp32`; with less of the version and of the device when that is too long for a header.
 pub fn describe(version: &str, device: &Device, precision: Precision) -> String {
-    let whole = format!("onnxruntime {version} {device} {precision}");
-    if whole.len() <= NAME_BYTES {
-        return whole;
+    let full = format!("onnxruntime {version} {device} {precision}");
+    if full.len() <= NAME_BYTES {
+        return full;
     }
     let version: Vec<&str> = version.split('.').take(2).collect();
     let mut device = device.to_string();
@@ -217,7 +218,7 @@ pub fn describe(version: &str, device: &Device, precision: Precision) -> String 
     format!("onnxruntime {version} {device} {precision}")
 }
 
-/// What went wrong in the library.
+/// Maps an error of the library.
 pub fn failed(engine: &str, what: &str, error: &ort::Error) -> Error {
     let text = error.message();
     if is_memory(text) {
@@ -230,7 +231,7 @@ pub fn failed(engine: &str, what: &str, error: &ort::Error) -> Error {
     Error::new(ErrorKind::Engine, format!("{engine}: {what} failed: {text}"))
 }
 
-/// Whether the text of an error tells of too little memory. There is no code for it; the texts are those of ONNX
+/// Returns whether the text of an error reports too little memory. No error code does; the texts are those of ONNX
 /// Runtime's arena (`bfc_arena.cc`), of the C++ library, and of CUDA and cuBLAS.
 fn is_memory(text: &str) -> bool {
     const TEXTS: [&str; 7] = [

@@ -1,11 +1,11 @@
-//! What a refiner is made from: engine, model, device and precision.
+//! Options of a refiner: engine, model, device and precision.
 
 use crate::{Error, ErrorKind, Model, Result};
 use core::fmt;
 use core::str::FromStr;
 use std::path::PathBuf;
 
-/// What runs.
+/// Engine of a refiner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum EngineKind {
@@ -88,16 +88,16 @@ impl FromStr for Precision {
 
     fn from_str(s: &str) -> Result<Self> {
         Self::ALL.into_iter().find(|p| p.name() == s).ok_or_else(|| {
-            let message = format!("there is no precision {s:?}: it is one of fp32, fp16 and bf16");
+            let message = format!("unknown precision {s:?}; use fp32, fp16 or bf16");
             Error::new(ErrorKind::BadInput, message)
         })
     }
 }
 
-/// What a refiner is made from; [`RefinerOptions::default`] is `fill` on the CPU.
+/// Options of a refiner; [`RefinerOptions::default`] is `fill` on the CPU.
 #[derive(Debug, Clone)]
 pub struct RefinerOptions {
-    /// What runs; `None` is ONNX Runtime when there is a model, else `fill`.
+    /// Engine; `None` selects ONNX Runtime if there is a model, else `fill`.
     pub engine: Option<EngineKind>,
     /// The model; every engine but `fill` needs one.
     pub model: Option<Model>,

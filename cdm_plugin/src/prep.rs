@@ -1,7 +1,7 @@
-//! Everything around the network: from pictures to its input, and from its output to depth.
+//! Everything around the network: from images to its input, and from its output to depth.
 //!
-//! What the official code does (`manip-as-in-sim-suite/cdm`, Apache-2.0) in one pass over each picture and without
-//! allocating: [`Prep`] holds the tables for one size of picture and one size of input. The numbers are those of the
+//! The steps of the official code (`manip-as-in-sim-suite/cdm`, Apache-2.0) in one pass over each image and without
+//! allocating: [`Prep`] holds the tables for one size of image and one size of input. The numbers are those of the
 //! official code, except that colour is summed in `f32` where it uses `f64` (about 1e-6 of the network's input), and
 //! that 65535 is a hole before it is a depth, which is the same with the official range of 6 m for every unit from
 //! 0.1 mm up (65535 of them are more than 6 m).
@@ -24,45 +24,45 @@ use cubic::CubicResize;
 use depth::DepthTable;
 use nearest::{index_like_opencv, index_like_torch};
 
-/// Tables and scratch memory for pictures of one size going to a network's input of one size.
+/// Tables and scratch memory for images of one size going to a network's input of one size.
 #[derive(Debug)]
 pub struct Prep {
-    picture: (usize, usize),
+    image: (usize, usize),
     net: (usize, usize),
     cubic: CubicResize,
-    /// For each column and row of the input, that of the picture.
+    /// For each column and row of the input, that of the image.
     depth_columns: Vec<u32>,
     depth_rows: Vec<u32>,
     inverse: DepthTable,
-    /// For each column and row of the picture, that of the output.
+    /// For each column and row of the image, that of the output.
     out_columns: Vec<u32>,
     out_rows: Vec<u32>,
     row: finish::Row,
 }
 
 impl Prep {
-    /// Tables for pictures of `picture` (width, height) with the input's shorter side near `input_size`.
+    /// Builds the tables for images of `width` and `height` with the input's shorter side near `input_size`.
     ///
     /// # Errors
     /// Those of [`net_size`].
-    pub fn new(picture: (usize, usize), input_size: u32, max_depth_m: f64) -> Result<Self> {
-        let net = net_size(picture, input_size)?;
+    pub fn new(width: usize, height: usize, input_size: u32, max_depth_m: f64) -> Result<Self> {
+        let net = net_size(width, height, input_size)?;
         Ok(Self {
-            picture,
+            image: (width, height),
             net,
-            cubic: CubicResize::new(picture, net),
-            depth_columns: index_like_opencv(picture.0, net.0),
-            depth_rows: index_like_opencv(picture.1, net.1),
+            cubic: CubicResize::new(width, height, net.0, net.1),
+            depth_columns: index_like_opencv(width, net.0),
+            depth_rows: index_like_opencv(height, net.1),
             inverse: DepthTable::new(max_depth_m),
-            out_columns: index_like_torch(net.0, picture.0),
-            out_rows: index_like_torch(net.1, picture.1),
+            out_columns: index_like_torch(net.0, width),
+            out_rows: index_like_torch(net.1, height),
             row: finish::Row::new(net.0),
         })
     }
 
-    /// Width and height of the pictures.
-    pub const fn picture(&self) -> (usize, usize) {
-        self.picture
+    /// Width and height of the images.
+    pub const fn image(&self) -> (usize, usize) {
+        self.image
     }
 
     /// Width and height of the network's input.
@@ -71,10 +71,10 @@ impl Prep {
     }
 
     /// Writes the network's input `[4, height, width]`: colour, normalised, and inverse depth in 1/m. Returns whether any
-    /// inverse depth is above 0: where there is none, the network would have nothing to measure by.
+    /// inverse depth is above 0: without any, the network would have no reference.
     ///
     /// # Errors
-    /// [`crate::ErrorKind::SizeMismatch`] and [`crate::ErrorKind::BadInput`] when the pictures are not of the size that
+    /// [`crate::ErrorKind::SizeMismatch`] and [`crate::ErrorKind::BadInput`] when the images are not of the size that
     /// this was made for, or are cut short.
     pub fn prepare(
         &mut self,
@@ -85,23 +85,23 @@ impl Prep {
     ) -> Result<bool> {
         color.check()?;
         depth.check(color)?;
-        size::check_picture(self.picture, color)?;
+        size::check_image(self.image.0, self.image.1, color)?;
         let plane = self.net.0 * self.net.1;
         size::check_len("the network's input", x.len(), 4 * plane)?;
         let (planes, inverse) = x.split_at_mut(3 * plane);
         self.cubic.run(color, order, planes);
         self.inverse.use_unit(depth.unit_m);
-        Ok(self.inverse.sample(depth.pixels, self.picture.0, &self.depth_rows, &self.depth_columns, inverse))
+        Ok(self.inverse.sample(depth.pixels, self.image.0, &self.depth_rows, &self.depth_columns, inverse))
     }
 
-    /// Writes depth at the picture's size from the network's output `[height, width]`, inverse depth in 1/m.
+    /// Writes depth at the image's size from the network's output `[height, width]`, inverse depth in 1/m.
     ///
     /// # Errors
     /// [`crate::ErrorKind::SizeMismatch`] and [`crate::ErrorKind::BadInput`] when `y` or `out` is of another size, or
-    /// for a unit that is none.
+    /// for an invalid unit.
     pub fn finish(&mut self, y: &[f32], out: &mut Output<'_>) -> Result<()> {
         size::check_len("the network's output", y.len(), self.net.0 * self.net.1)?;
-        out.check(self.picture)?;
+        out.check(self.image.0, self.image.1)?;
         self.row.write(y, &self.out_rows, &self.out_columns, out);
         Ok(())
     }

@@ -6,7 +6,7 @@
 /// A published checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Published {
-    /// What it is called here.
+    /// Name in depthrig.
     pub name: &'static str,
     /// Owner and name of its repository.
     pub repository: &'static str,
@@ -14,7 +14,7 @@ pub struct Published {
     pub file: &'static str,
     /// SHA-256 of the file, in hexadecimal, where it is known.
     pub sha256: Option<&'static str>,
-    /// Under what it may be used, as its page says.
+    /// Its licence, according to its page.
     pub licence: &'static str,
     /// Whether repository and file were seen on a page; else they are formed like the others.
     pub seen: bool,
@@ -108,7 +108,8 @@ pub fn serves(camera: &str, model: &str) -> bool {
     let plain = |text: &str| -> String {
         text.chars().filter(char::is_ascii_alphanumeric).map(|c| c.to_ascii_lowercase()).collect()
     };
-    let (camera, model) = (plain(camera), plain(model));
+    let camera = plain(camera);
+    let model = plain(model);
     !camera.is_empty() && model.contains(&camera)
 }
 

@@ -2,7 +2,7 @@
 
 use crate::Result;
 
-/// How the bytes of a colour picture are ordered.
+/// How the bytes of a colour image are ordered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ColorFormat {
     /// Red, green, blue.
@@ -11,7 +11,7 @@ pub enum ColorFormat {
     Bgr8,
 }
 
-/// A colour picture, three bytes a pixel.
+/// A colour image, three bytes a pixel.
 #[derive(Debug, Clone, Copy)]
 pub struct Color<'a> {
     /// The bytes.
@@ -26,7 +26,7 @@ pub struct Color<'a> {
     pub stride: usize,
 }
 
-/// Raw depth of the same view and size as its colour picture, without padding between rows; 0 is a hole, and so is 65535,
+/// Raw depth of the same view and size as its colour image, without padding between rows; 0 is a hole, and so is 65535,
 /// which cameras give where their range ends.
 #[derive(Debug, Clone, Copy)]
 pub struct RawDepth<'a> {
@@ -36,7 +36,7 @@ pub struct RawDepth<'a> {
     pub unit_m: f64,
 }
 
-/// Where refined depth goes: the size of the colour picture, without padding. What is not finite or cannot be expressed
+/// Where refined depth goes: the size of the colour image, without padding. What is not finite or cannot be expressed
 /// is 0.
 #[derive(Debug)]
 pub enum Output<'a> {
@@ -53,7 +53,7 @@ pub enum Output<'a> {
     Inverse(&'a mut [f32]),
 }
 
-/// One pair of pictures to be refined.
+/// One pair of images to be refined.
 #[derive(Debug)]
 pub struct Job<'a> {
     /// Colour.
@@ -69,7 +69,7 @@ pub struct Job<'a> {
 /// How long each step took, nanoseconds; of a batch, each job has its share.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct StepTimes {
-    /// From pictures to the engine's input.
+    /// From images to the engine's input.
     pub prepare_ns: u64,
     /// The engine.
     pub infer_ns: u64,
@@ -77,7 +77,7 @@ pub struct StepTimes {
     pub finish_ns: u64,
 }
 
-/// What a refiner is.
+/// Description of a refiner.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Description {
     /// The engine with version, device and precision, such as `onnxruntime 1.31.1 cpu fp32`, or `fill`; at most 31 bytes.
@@ -88,9 +88,9 @@ pub struct Description {
 
 /// Something that turns colour and raw depth into clean depth.
 ///
-/// It may keep memory from one call to the next, but no pictures: a result depends on its own job alone.
+/// It may keep memory from one call to the next, but no images: a result depends on its own job alone.
 pub trait Refiner: Send {
-    /// What it is.
+    /// Describes the refiner.
     fn describe(&self) -> &Description;
 
     /// How many jobs at a time it gains from; 1 when it gains nothing.
@@ -99,11 +99,11 @@ pub trait Refiner: Send {
     }
 
     /// Refines every job. After an error the outputs hold nothing of use. A job without any depth to go by comes out all
-    /// holes, and is no error: in a live view that is a hand before the lens.
+    /// holes and does not fail: in a live view that is a hand in front of the lens.
     ///
     /// # Errors
     /// [`crate::ErrorKind::SizeMismatch`] when colour, depth and output of a job differ in size,
-    /// [`crate::ErrorKind::BadInput`] for pictures that cannot be used, [`crate::ErrorKind::OutOfMemory`] and
+    /// [`crate::ErrorKind::BadInput`] for images that cannot be used, [`crate::ErrorKind::OutOfMemory`] and
     /// [`crate::ErrorKind::Engine`] from the engine.
     fn refine(&mut self, jobs: &mut [Job<'_>]) -> Result<()>;
 }

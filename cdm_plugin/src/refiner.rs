@@ -1,4 +1,4 @@
-//! The refiner that is a network: pictures to its input, the network, its output to depth.
+//! The refiner that is a network: images to its input, the network, its output to depth.
 
 use crate::prep::{Positions, Prep, check_input_size, net_size};
 use crate::{
@@ -7,13 +7,13 @@ use crate::{
 };
 use depthrig_bus::HostTime;
 
-/// Sizes of pictures, and of the network's input, that tables are kept for: more than a rig has.
+/// Sizes of images, and of the network's input, that tables are kept for: more than a rig has.
 const PREPS: usize = 16;
 const POSITIONS: usize = 8;
 
 /// A camera depth model: any [`Network`] with the official code's pre- and post-processing around it.
 ///
-/// Jobs whose pictures become inputs of one size run together, [`Network::best_batch`] at a time. A job without any raw
+/// Jobs whose images become inputs of one size run together, [`Network::best_batch`] at a time. A job without any raw
 /// depth that the network would see (all holes, full scale, or beyond [`Model::max_depth_m`]) comes out all holes, and the
 /// network does not run for it: it would invent depth that nothing was measured for.
 pub struct CdmRefiner {
@@ -33,7 +33,7 @@ pub struct CdmRefiner {
     batch: Vec<usize>,
 }
 
-/// What was worked out for sizes seen before; the oldest goes when there are too many.
+/// Cache of tables by image size; the oldest entry is evicted.
 #[derive(Default)]
 struct Kept {
     preps: Vec<(f64, Prep)>,
@@ -43,12 +43,13 @@ struct Kept {
 impl Kept {
     /// The tables for the size and the unit of `job`.
     fn prep(&mut self, job: &Job<'_>, input_size: u32, max_depth_m: f64) -> Result<&mut Prep> {
-        let (picture, unit_m) = ((job.color.width, job.color.height), job.depth.unit_m);
-        let known = self.preps.iter().position(|(unit, prep)| *unit == unit_m && prep.picture() == picture);
+        let image = (job.color.width, job.color.height);
+        let unit_m = job.depth.unit_m;
+        let known = self.preps.iter().position(|(unit, prep)| *unit == unit_m && prep.image() == image);
         let i = if let Some(i) = known {
             i
         } else {
-            let prep = Prep::new(picture, input_size, max_depth_m)?;
+            let prep = Prep::new(image.0, image.1, input_size, max_depth_m)?;
             if self.preps.len() == PREPS {
                 self.preps.remove(0);
             }
@@ -105,12 +106,14 @@ impl CdmRefiner {
         net: (usize, usize),
     ) -> Result<()> {
         let shape = |batch| NetShape { batch, height: net.1, width: net.0 };
-        let (x_len, y_len) = (shape(1).input_len(), shape(1).output_len());
+        let x_len = shape(1).input_len();
+        let y_len = shape(1).output_len();
         self.x.resize(self.x.len().max(order.len() * x_len), 0.0);
         self.y.resize(self.y.len().max(order.len() * y_len), 0.0);
         self.batch.clear();
         for (_, i) in order {
-            let (job, started) = (&mut jobs[*i], HostTime::now());
+            let job = &mut jobs[*i];
+            let started = HostTime::now();
             let x = &mut self.x[self.batch.len() * x_len..][..x_len];
             let prep = self.kept.prep(job, self.input_size, self.max_depth_m)?;
             if prep.prepare(&job.color, &job.depth, self.channel_order, x)? {
@@ -133,7 +136,8 @@ impl CdmRefiner {
         self.network.run(&self.x[..shape.input_len()], &mut self.y[..shape.output_len()])?;
         let share = since(started) / shape.batch as u64;
         for (i, y) in self.batch.iter().zip(self.y.chunks_exact(y_len)) {
-            let (job, started) = (&mut jobs[*i], HostTime::now());
+            let job = &mut jobs[*i];
+            let started = HostTime::now();
             job.steps.infer_ns = share;
             self.kept.prep(job, self.input_size, self.max_depth_m)?.finish(y, &mut job.out)?;
             job.steps.finish_ns = since(started);
@@ -141,13 +145,12 @@ impl CdmRefiner {
         Ok(())
     }
 
-    /// Whether the pictures of `job` can be used, and the size of its input.
+    /// Checks the images of `job`, and returns the size of the network's input.
     fn check(&self, job: &Job<'_>) -> Result<(usize, usize)> {
         job.color.check()?;
         job.depth.check(&job.color)?;
-        let picture = (job.color.width, job.color.height);
-        job.out.check(picture)?;
-        net_size(picture, self.input_size)
+        job.out.check(job.color.width, job.color.height)?;
+        net_size(job.color.width, job.color.height, self.input_size)
     }
 }
 

@@ -10,27 +10,27 @@ use crate::{Error, ErrorKind, Precision, Result};
 use core::fmt;
 use core::str::FromStr;
 use depthrig_calib::stereo::{Description, DisparityMap, Matcher, StereoPair};
-use form::{Form, Layout, Outlet, Pictures};
+use form::{Form, Images, Layout, Outlet};
 use ort::session::{Session, SessionInputValue};
 use ort::value::{Outlet as OrtOutlet, Tensor, TensorElementType, ValueType};
 use sha2::{Digest, Sha256};
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
+mod fake;
 mod form;
-mod made;
-mod pictures;
+mod images;
 #[cfg(test)]
 mod tests;
 
 #[doc(hidden)]
-pub use made::MadeNetwork;
+pub use fake::FakeNetwork;
 
 /// The key of a network's metadata that says which numbers it takes pixels as: a name of [`NetworkPixels`].
 const PIXELS_KEY: &str = "depthrig.pixels";
 /// The key that says, with the value `true`, that its disparities are negative numbers.
 const NEGATIVE_KEY: &str = "depthrig.negative";
-/// Sides of pictures for networks that take every size: a multiple of this, as all of the common ones need.
+/// Sides of images for networks that take every size: a multiple of this, as all of the common ones need.
 const SIDE_MULTIPLE: usize = 32;
 /// A network of which more than this share of the disparities is negative means them so.
 const NEGATIVE_SHARE: f64 = 0.5;
@@ -45,7 +45,7 @@ pub enum NetworkPixels {
     Unit,
     /// -1 to 1.
     Signed,
-    /// 0 to 1, less the mean and divided by the spread of the pictures of ImageNet, which most backbones were trained on:
+    /// 0 to 1, less the mean and divided by the spread of the images of ImageNet, which most backbones were trained on:
     /// means 0.485, 0.456, 0.406 and spreads 0.229, 0.224, 0.225 (torchvision, `transforms.Normalize`).
     ImageNet,
 }
@@ -64,15 +64,17 @@ impl NetworkPixels {
         }
     }
 
-    /// What a byte of the colour channel `c` is multiplied with, and what is added then.
-    pub(super) fn scale(self, c: usize) -> (f32, f32) {
+    /// Factor and offset for a byte of the colour channel `c`.
+    pub(super) fn scale(self, c: usize) -> images::Scale {
         const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
         const SPREAD: [f32; 3] = [0.229, 0.224, 0.225];
         match self {
-            Self::Bytes => (1.0, 0.0),
-            Self::Unit => (1.0 / 255.0, 0.0),
-            Self::Signed => (2.0 / 255.0, -1.0),
-            Self::ImageNet => (1.0 / (255.0 * SPREAD[c % 3]), -MEAN[c % 3] / SPREAD[c % 3]),
+            Self::Bytes => images::Scale { factor: 1.0, offset: 0.0 },
+            Self::Unit => images::Scale { factor: 1.0 / 255.0, offset: 0.0 },
+            Self::Signed => images::Scale { factor: 2.0 / 255.0, offset: -1.0 },
+            Self::ImageNet => {
+                images::Scale { factor: 1.0 / (255.0 * SPREAD[c % 3]), offset: -MEAN[c % 3] / SPREAD[c % 3] }
+            }
         }
     }
 }
@@ -89,7 +91,7 @@ impl FromStr for NetworkPixels {
     fn from_str(text: &str) -> Result<Self> {
         Self::ALL.into_iter().find(|p| p.name() == text).ok_or_else(|| {
             let known = Self::ALL.map(Self::name).join(", ");
-            Error::new(ErrorKind::BadInput, format!("there are no pixels {text:?}; they are one of: {known}"))
+            Error::new(ErrorKind::BadInput, format!("unknown pixel range {text:?}; use one of: {known}"))
         })
     }
 }
@@ -119,11 +121,11 @@ pub struct StereoNetwork {
     form: Form,
     pixels: NetworkPixels,
     negative: bool,
-    /// Width and height of the pictures that it is given.
+    /// Width and height of the images that it is given.
     size: (usize, usize),
-    /// Width and height of what the network sees.
+    /// Width and height of the network's input.
     inner: (usize, usize),
-    /// It sees the picture in another size, and not with a border.
+    /// It sees the image in another size, and not with a border.
     resized: bool,
     inputs: Vec<Tensor<f32>>,
     session: Session,
@@ -134,14 +136,15 @@ fn bad(file: &Path, what: impl fmt::Display) -> Error {
 }
 
 impl StereoNetwork {
-    /// Loads the network in `file` for pictures of `size` (width, height), and runs it once on black pictures, so that
-    /// one that does not fit is found out before any work is done.
+    /// Loads the network in `file` for images of `width` and `height`, and runs it once on black images, so that an
+    /// unsuitable network is rejected before any work is done.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`] without the file, [`ErrorKind::NoEngine`] without a library that can be used,
-    /// [`ErrorKind::BadModel`] for a network with other inputs or outputs than are taken, [`ErrorKind::BadInput`] for an
+    /// [`ErrorKind::NotFound`] without the file, [`ErrorKind::NoEngine`] without a usable library,
+    /// [`ErrorKind::BadModel`] for a network with unsupported inputs or outputs, [`ErrorKind::BadInput`] for an
     /// unknown device, [`ErrorKind::OutOfMemory`] and [`ErrorKind::Engine`].
-    pub fn open(file: &Path, size: (usize, usize), options: &StereoNetworkOptions) -> Result<Self> {
+    pub fn open(file: &Path, width: usize, height: usize, options: &StereoNetworkOptions) -> Result<Self> {
+        let size = (width, height);
         let sha256 = hash(file)?;
         let device: Device = options.device.parse()?;
         device.check(Precision::Fp32)?;
@@ -152,15 +155,15 @@ impl StereoNetwork {
         let form =
             Form::of(&outlets(session.inputs()), &outlets(session.outputs())).map_err(|e| bad(file, e))?;
         let says = |key: &str| session.metadata().ok().and_then(|m| m.custom(key));
-        let told = says(PIXELS_KEY).map(|text| text.parse()).transpose().map_err(|e| bad(file, e))?;
-        let pixels = options.pixels.or(told).unwrap_or_default();
+        let stated = says(PIXELS_KEY).map(|text| text.parse()).transpose().map_err(|e| bad(file, e))?;
+        let pixels = options.pixels.or(stated).unwrap_or_default();
         let negative = options.negative || says(NEGATIVE_KEY).is_some_and(|v| v == "true");
         let up = |side: usize| side.next_multiple_of(SIDE_MULTIPLE);
         let inner = (form.width.unwrap_or(up(size.0)), form.height.unwrap_or(up(size.1)));
         let resized =
             (form.width.is_some() && inner.0 != size.0) || (form.height.is_some() && inner.1 != size.1);
         let shape = form.shape(inner);
-        let inputs = (0..form.pictures.inputs()).map(|_| {
+        let inputs = (0..form.images.inputs()).map(|_| {
             let zeros = vec![0.0; shape.iter().product()];
             Tensor::from_array((shape.clone(), zeros)).map_err(|e| failed(&engine, "making room", &e))
         });
@@ -197,14 +200,14 @@ impl StereoNetwork {
             let (shape, numbers) = value
                 .try_extract_tensor::<f32>()
                 .map_err(|e| bad(file, format!("output {name} is not in 32-bit floats: {e}")))?;
-            let plane = form::plane(shape, numbers.len(), *inner)
+            let plane = form::plane(shape, numbers.len(), inner.0, inner.1)
                 .map_err(|e| bad(file, format!("output {name} {e}")))?;
             Ok::<_, Error>((plane, numbers))
         };
-        let fit = pictures::Fit { size: *size, inner: *inner, resized: *resized };
+        let fit = images::Fit { size: *size, inner: *inner, resized: *resized };
         let (disparity, numbers) = plane(&form.output)?;
         map.resize(size.0, size.1);
-        let below = pictures::disparity(fit, disparity, numbers, *negative, &mut map.disparity);
+        let below = images::disparity(fit, disparity, numbers, *negative, &mut map.disparity);
         if below > NEGATIVE_SHARE {
             let meant = if *negative { "positive" } else { "negative" };
             return Err(bad(
@@ -217,32 +220,32 @@ impl StereoNetwork {
             ));
         }
         let confidence = form.confidence.as_deref().map(plane).transpose()?;
-        pictures::confidence(fit, confidence, &map.disparity, &mut map.confidence);
+        images::confidence(fit, confidence, &map.disparity, &mut map.confidence);
         Ok(())
     }
 
     fn fill(&mut self, pair: &StereoPair<'_>) {
-        let fit = pictures::Fit { size: self.size, inner: self.inner, resized: self.resized };
+        let fit = images::Fit { size: self.size, inner: self.inner, resized: self.resized };
         let channels = self.form.channels;
-        for (eye, (grey, rgb)) in
+        for (side, (grey, rgb)) in
             [(pair.left, pair.left_rgb), (pair.right, pair.right_rgb)].into_iter().enumerate()
         {
-            let (input, first) = match self.form.pictures {
-                Pictures::Two => (eye, 0),
-                Pictures::Stacked => (0, eye * channels),
+            let (input, first) = match self.form.images {
+                Images::Two => (side, 0),
+                Images::Stacked => (0, side * channels),
             };
-            let all = channels * if self.form.pictures == Pictures::Stacked { 2 } else { 1 };
+            let all = channels * if self.form.images == Images::Stacked { 2 } else { 1 };
             let Some(tensor) = self.inputs.get_mut(input) else { continue };
             let numbers = tensor.extract_tensor_mut().1;
-            let picture = pictures::Picture { grey, rgb: rgb.filter(|_| channels == 3) };
+            let image = images::Image { grey, rgb: rgb.filter(|_| channels == 3) };
             for c in 0..channels {
                 let place = match self.form.layout {
                     Layout::ChannelsFirst => {
-                        pictures::Place { start: (first + c) * self.inner.0 * self.inner.1, step: 1 }
+                        images::Place { start: (first + c) * self.inner.0 * self.inner.1, step: 1 }
                     }
-                    Layout::ChannelsLast => pictures::Place { start: first + c, step: all },
+                    Layout::ChannelsLast => images::Place { start: first + c, step: all },
                 };
-                pictures::fill(fit, &picture, c, self.pixels.scale(c), place, numbers);
+                images::fill(fit, &image, c, self.pixels.scale(c), place, numbers);
             }
         }
     }
@@ -262,7 +265,7 @@ impl Matcher for StereoNetwork {
             let colored = rgb.is_none_or(|c| c.len() == width * height * 3);
             if (grey.width, grey.height) != self.size || !whole || !colored {
                 let what = format!(
-                    "the {what} picture is not one of {width}x{height}, which the network was opened for"
+                    "the {what} image is not one of {width}x{height}, which the network was opened for"
                 );
                 return Err(Calib::new(Kind::SizeMismatch, what));
             }

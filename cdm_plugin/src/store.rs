@@ -34,16 +34,16 @@ pub struct ModelStore {
 /// A model that is installed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Installed {
-    /// What it is called.
+    /// Name of the model.
     pub name: String,
     /// Its folder.
     pub path: PathBuf,
-    /// What is known of it.
+    /// Its record.
     pub record: Record,
 }
 
 impl Installed {
-    /// What headers and reports call it, [`Model::id`].
+    /// Id in headers and reports, [`Model::id`].
     pub fn id(&self) -> String {
         crate::model::model_id(&self.name, &self.record.weights.sha256, self.record.trained)
     }
@@ -52,9 +52,9 @@ impl Installed {
 /// How weights are to be installed.
 #[derive(Debug, Clone)]
 pub struct Import {
-    /// What the model is to be called; see [`check_name`].
+    /// Name of the new model; see [`check_name`].
     pub name: String,
-    /// The encoder that it must be of; `None` takes what it is.
+    /// Required encoder; `None` accepts any.
     pub encoder: Option<Encoder>,
     /// The order of the colour channels.
     pub channel_order: ChannelOrder,
@@ -64,7 +64,7 @@ pub struct Import {
     pub max_depth_m: f64,
     /// The cameras that it is for, as in [`crate::published::Published::cameras`].
     pub cameras: Vec<String>,
-    /// Leave out what is not of the network, and write down what that was; else it is an error.
+    /// Leave out superfluous tensors and record their names; otherwise they are an error.
     pub drop_extra: bool,
     /// Replace a model of that name.
     pub replace: bool,
@@ -92,7 +92,7 @@ impl Import {
     }
 }
 
-/// Told what is being done, how many bytes of it are done, and of how many; may say that it has to end.
+/// Receives the step, the bytes done and their total; decides whether to continue.
 pub type Watch<'a> = &'a mut dyn FnMut(&'static str, u64, u64) -> ControlFlow<()>;
 
 /// Where models are when nothing is said: `$DEPTHRIG_MODELS`, else `$XDG_DATA_HOME/depthrig/models`, else
@@ -176,7 +176,7 @@ impl ModelStore {
         Ok(names.into_iter().map(|name| (name.clone(), self.info(&name))).collect())
     }
 
-    /// What is known of a model.
+    /// Reads the record of a model.
     ///
     /// # Errors
     /// [`ErrorKind::NotFound`] with the names that there are, [`ErrorKind::BadModel`] when its record cannot be read.
@@ -280,7 +280,8 @@ impl ModelStore {
             Error::new(ErrorKind::BadModel, message)
         };
         if weights.file_bytes() != recorded.bytes {
-            let (has, said) = (weights.file_bytes(), recorded.bytes);
+            let has = weights.file_bytes();
+            let said = recorded.bytes;
             return Err(changed(format!("has {has} bytes and its record says {said}")));
         }
         let found = verify_names(&weights)?;
@@ -290,15 +291,16 @@ impl ModelStore {
         Ok(weights)
     }
 
-    /// Looks at every byte and number of an installed model.
+    /// Checks every byte and number of an installed model.
     ///
     /// # Errors
-    /// Those of [`Self::get`], and [`ErrorKind::BadModel`] for another hash than that of the record and for numbers that
-    /// are none.
+    /// Those of [`Self::get`], and [`ErrorKind::BadModel`] for a hash other than that of the record and for NaN or
+    /// infinite numbers.
     pub fn check(&self, name: &str) -> Result<Report> {
         let installed = self.info(name)?;
         let weights = Self::weights(&installed)?;
-        let (has, said) = (weights.sha256()?, &installed.record.weights.sha256);
+        let has = weights.sha256()?;
+        let said = &installed.record.weights.sha256;
         if has != *said {
             let path = weights.path().display();
             let message = format!(
@@ -329,7 +331,7 @@ impl ModelStore {
             );
             return Err(Error::new(ErrorKind::BadInput, message));
         }
-        told(watch, "check", 0, 1)?;
+        report_progress(watch, "check", 0, 1)?;
         let report = weights::examine(weights, import.encoder)?;
         let good = report.is_good() || (import.drop_extra && report.is_good_but_for_extra());
         if !good {
@@ -384,7 +386,7 @@ impl ModelStore {
                 Err(Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP) => {
                     let old = self.dir.join(".removed-replaced");
                     std::fs::rename(path, &old).and_then(|()| std::fs::rename(part, path)).map_err(failed)?;
-                    drop(std::fs::remove_dir_all(old)); // what is left is swept up by the next lock
+                    drop(std::fs::remove_dir_all(old)); // leftovers are removed under the next lock
                 }
                 exchanged => exchanged.map_err(|e| failed(e.into()))?,
             }
@@ -432,7 +434,7 @@ impl ModelStore {
             let name = entry.file_name();
             let name = name.to_string_lossy();
             if name.starts_with(".import-") || name.starts_with(".removed-") {
-                // What cannot be removed does no harm but for its room.
+                // A leftover that cannot be removed only takes up space.
                 drop(std::fs::remove_dir_all(entry.path()));
             }
         }
@@ -453,7 +455,7 @@ impl TemporaryFolder {
 
 impl Drop for TemporaryFolder {
     fn drop(&mut self) {
-        drop(std::fs::remove_dir_all(&self.0)); // it may be gone, and what is left is swept up by the next lock
+        drop(std::fs::remove_dir_all(&self.0)); // it may be gone; leftovers are removed under the next lock
     }
 }
 
@@ -468,12 +470,12 @@ fn check_settings(import: &Import) -> Result<()> {
     Ok(())
 }
 
-fn told(watch: Watch<'_>, what: &'static str, done: u64, total: u64) -> Result<()> {
+fn report_progress(watch: Watch<'_>, what: &'static str, done: u64, total: u64) -> Result<()> {
     if watch(what, done, total).is_break() { Err(ended()) } else { Ok(()) }
 }
 
 pub(crate) fn ended() -> Error {
-    Error::new(ErrorKind::Io, "ended before it was done; nothing was installed")
+    Error::new(ErrorKind::Io, "interrupted; nothing was installed")
 }
 
 #[cfg(test)]

@@ -87,16 +87,16 @@ pub enum Format {
     PyTorch,
 }
 
-/// What a file holds, without the file.
+/// Contents of a file, without the file.
 #[derive(Debug, Default)]
 struct Contents {
     entries: BTreeMap<String, Entry>,
-    /// What is beside the tensors, by name: values that are no tensors, and tensors of other types.
+    /// Other entries by name: values that are not tensors, and tensors of other types.
     others: BTreeMap<String, String>,
     metadata: BTreeMap<String, String>,
 }
 
-/// What is wrong with a file, without its name: [`Weights::open`] puts that in front.
+/// Result of parsing a file; the error lacks the file's name, which [`Weights::open`] prepends.
 type Parsed<T> = Result<T, String>;
 
 /// Named tensors in a file that stays open.
@@ -148,12 +148,12 @@ impl Weights {
         &self.entries
     }
 
-    /// What lies among the tensors and is none that a network can use, with what it is.
+    /// Entries that a network cannot use, with their descriptions.
     pub const fn others(&self) -> &BTreeMap<String, String> {
         &self.others
     }
 
-    /// What the file says about itself (`__metadata__` of a `.safetensors` file).
+    /// Metadata of the file (`__metadata__` of a `.safetensors` file).
     pub const fn metadata(&self) -> &BTreeMap<String, String> {
         &self.metadata
     }
@@ -241,9 +241,9 @@ fn halves(bytes: &[u8]) -> impl Iterator<Item = u16> {
     bytes.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]]))
 }
 
-/// Finds out what kind of file it is, and reads what it holds.
+/// Detects the format of a file, and reads its contents.
 fn parse(file: &dyn ReadAt) -> Parsed<(Format, Contents)> {
-    /// First bytes that tell what a file is when it is none that can be read, with what to do.
+    /// First bytes of known unsupported formats, with the cure.
     const STRANGERS: [(&[u8], &str); 5] = [
         (
             b"version https://git-lfs",
@@ -270,7 +270,7 @@ fn parse(file: &dyn ReadAt) -> Parsed<(Format, Contents)> {
     Ok((Format::Safetensors, safetensors::read(file)?))
 }
 
-/// As many bytes as tell what a file is.
+/// Number of bytes that identify a format.
 const START: usize = 512;
 
 fn unreadable(e: &io::Error) -> String {

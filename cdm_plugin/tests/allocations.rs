@@ -1,4 +1,4 @@
-//! Around a network, a picture of a size that was seen before costs no allocation.
+//! Around a network, an image of a size that was seen before costs no allocation.
 //!
 //! One test in a binary of its own: the counter sees every thread of the process.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
@@ -58,7 +58,7 @@ fn model() -> Model {
 }
 
 #[test]
-fn nothing_is_allocated_per_picture() {
+fn nothing_is_allocated_per_image() {
     let mirror = Mirror(NetShape { batch: 0, height: 0, width: 0 });
     let (units, metres, inverse) =
         refine_often(&mut CdmRefiner::new(Box::new(mirror), &model(), None).unwrap());
@@ -68,7 +68,7 @@ fn nothing_is_allocated_per_picture() {
     assert!(units.iter().all(|d| *d == 3000) && metres.iter().all(|d| *d == 1.5));
 }
 
-/// Refines pictures of two sizes again and again; only the first rounds may allocate.
+/// Refines images of two sizes again and again; only the first rounds may allocate.
 fn refine_often(refiner: &mut dyn Refiner) -> (Vec<u16>, Vec<f32>, Vec<f32>) {
     // Two cameras of one size and one of another, each with an output of its own kind.
     let sizes = [(128, 72), (128, 72), (64, 48)];

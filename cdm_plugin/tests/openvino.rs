@@ -8,7 +8,7 @@ use depthrig_cdm::{
 };
 use std::path::Path;
 
-/// What the network gives on `device`; `None`, with a line that says so, where the library is not installed.
+/// Output of the network on `device`; prints a line and returns `None` if the library is not installed.
 fn result(model: &Model, device: &str, shape: NetShape) -> Option<Vec<f32>> {
     let library = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/onnxruntime/openvino");
     let options = RefinerOptions {

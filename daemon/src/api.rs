@@ -38,7 +38,7 @@ use std::sync::Arc;
 pub const MAX_BODY_BYTES: usize = 64 << 10;
 /// The most connections at once, of the socket and of the port each; more wait until one ends.
 pub const MAX_CONNECTIONS: usize = 64;
-/// The header in which every answer says what made it: `depthrig/0.1.0`.
+/// The header of every answer that names the server: `depthrig/0.1.0`.
 pub const SERVER_HEADER: &str = "server";
 
 /// Serves `control` on the Unix socket `socket` and, if given, on the loopback address `tcp` (port 0: any).

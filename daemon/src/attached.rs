@@ -1,8 +1,8 @@
-//! What is attached: every camera on the USB and every other video node, without disturbing one that is in use.
+//! Attached cameras: every camera on the USB and every other video node, without disturbing one that is in use.
 //!
 //! The bus is read from `/sys`, so it is known whatever the permissions are. Nodes are opened only to ask the kernel
 //! what they are. A camera itself (serial number, firmware, calibration, modes) is asked only when nobody has it;
-//! what a running rig has open, that rig is asked about.
+//! about cameras that a running rig has open, that rig is asked.
 
 mod ask;
 mod classify;
@@ -29,9 +29,9 @@ use std::path::{Path, PathBuf};
 pub struct Attached {
     /// Cameras in the order of their ports, those on no USB after them.
     pub cameras: Vec<AttachedCamera>,
-    /// What is attached and no camera that can be used, one line each with what to do.
+    /// Attached devices that cannot be used as a camera, one line each with what to do.
     pub unusable: Vec<String>,
-    /// What could not be asked, one line each.
+    /// Cameras and rigs that could not be asked, one line each.
     pub not_asked: Vec<String>,
 }
 
@@ -40,7 +40,7 @@ pub struct Attached {
 pub struct AttachedCamera {
     /// The driver that it is for: `realsense`, `zed`, `kinect`, `v4l2`, `external`.
     pub backend: &'static str,
-    /// Model, else what the device calls itself.
+    /// Model, else the device's own name.
     pub model: String,
     /// Serial number as a rig file names it; `None` when it could not be asked.
     pub serial: Option<String>,
@@ -64,13 +64,13 @@ pub struct AttachedCamera {
     pub held_by: Vec<HeldBy>,
     /// The rig and camera that it is in a running rig of this user.
     pub rig: Option<String>,
-    /// What the kernel can give of the camera's metadata: `full`, `header` or `none`; `None` when it could not be asked.
+    /// The camera's metadata that the kernel can give: `full`, `header` or `none`; `None` when it could not be asked.
     pub kernel_metadata: Option<&'static str>,
     /// Its nodes.
     pub nodes: Vec<NodeReport>,
     /// Its modes as a rig file names them; empty when it could not be asked.
     pub modes: Vec<ModeReport>,
-    /// What is wrong with how it is attached, one line each with what to do.
+    /// Problems of how it is attached, one line each with what to do.
     pub problems: Vec<String>,
     /// The device on the bus.
     #[serde(skip)]
@@ -132,7 +132,7 @@ impl From<Holder> for HeldBy {
 pub struct NodeReport {
     /// Its path.
     pub path: String,
-    /// `pictures`, `metadata`, `other`, `hid`, `usb`, or `unknown` when it could not be asked.
+    /// `images`, `metadata`, `other`, `hid`, `usb`, or `unknown` when it could not be asked.
     pub role: &'static str,
     /// Its formats as V4L2 names them.
     pub formats: Vec<String>,
@@ -154,7 +154,7 @@ pub struct ModeReport {
 }
 
 impl ModeReport {
-    /// Samples a second of a motion unit; `None` of pictures.
+    /// Samples a second of an IMU; `None` of images.
     pub fn samples_hz(&self) -> Option<f64> {
         (self.format == PixelFormat::Motion.name()).then(|| self.rate_hz * f64::from(self.width))
     }
@@ -162,7 +162,8 @@ impl ModeReport {
 
 impl From<&StreamProfile> for ModeReport {
     fn from(p: &StreamProfile) -> Self {
-        let (width, height) = (p.width, p.height);
+        let width = p.width;
+        let height = p.height;
         Self { stream: p.stream.to_string(), format: p.format.name(), width, height, rate_hz: p.rate_hz }
     }
 }
@@ -175,7 +176,7 @@ impl AttachedCamera {
         format!("{}{serial} at {place}", self.model)
     }
 
-    /// `obs (process 4711)`, `camera "d435" of rig "mount"`, or what is known.
+    /// `obs (process 4711)`, `camera "d435" of rig "mount"`, or as much as is known.
     pub fn held_words(&self) -> String {
         let processes: Vec<_> =
             self.held_by.iter().map(|h| format!("{} (process {})", h.name, h.pid)).collect();
@@ -292,17 +293,17 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
     found
 }
 
-/// What to say of the raw HID nodes of a ZED when its motion unit cannot be read through them.
+/// Why the IMU of a ZED cannot be read through its raw HID nodes, if it cannot.
 fn unreadable_unit(nodes: &[PathBuf], ask: &dyn Ask) -> Option<String> {
     let denied = nodes.iter().find(|node| !ask.may_open(node))?;
     Some(format!(
-        "its motion unit {} may not be opened, so that it has no stream imu: {} and plug the camera in again",
+        "its IMU {} may not be opened, so that it has no stream imu: {} and plug the camera in again",
         denied.display(),
         health::RULE_CURE
     ))
 }
 
-/// What to say of the sensors of a RealSense IMU when this user may not read them or switch them on.
+/// Why this user cannot read or switch on the sensors of a RealSense IMU, if so.
 fn unreadable_imu(root: &SysRoot, port: &str, ask: &dyn Ask) -> Option<String> {
     let sensors = iio::on_port(root, port);
     let files = sensors.iter().flat_map(|s| s.switches().into_iter().chain([s.node.clone()]));
@@ -314,7 +315,7 @@ fn unreadable_imu(root: &SysRoot, port: &str, ask: &dyn Ask) -> Option<String> {
     ))
 }
 
-/// What can be said of an OAK without starting its firmware.
+/// Fills in the facts about an OAK that are known without starting its firmware.
 fn known_oak(found: &mut AttachedCamera, ask: &dyn Ask) {
     if let Some(usb) = &found.usb {
         found.serial = classify::oak_serial(usb);
@@ -324,7 +325,7 @@ fn known_oak(found: &mut AttachedCamera, ask: &dyn Ask) {
     }
 }
 
-/// Opens a camera that nobody has and takes down what it says.
+/// Opens a camera that nobody has and notes its answers.
 fn ask_device(found: &mut AttachedCamera, ask: &dyn Ask) {
     match ask.device(found.family, &found.port) {
         Some(Ok((info, profiles))) => {

@@ -1,14 +1,14 @@
-//! One camera of a rig: its configuration, what is known of it now, and what all cameras share.
+//! One camera of a rig: its configuration, its present state, and the state that all cameras share.
 
 use crate::Error;
 use crate::config::{CameraConfig, SupervisorConfig};
-use crate::stage::{Entrance, Lane};
+use crate::stage::{Intake, Refinement};
 use crate::status::CameraState;
 use crate::stream::Stream;
 use crate::wake::Wake;
 use depthrig_bus::{Bus, HostTime, StreamId};
 use depthrig_drivers::DeviceInfo;
-use depthrig_drivers::stereo::{Descriptions, EYES, Notice, PREFIXES};
+use depthrig_drivers::stereo::{Descriptions, Notice, PREFIXES, SIDES};
 use depthrig_drivers::synthetic::Drawing;
 use depthrig_recorder::Computed;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -23,14 +23,14 @@ pub use supervisor::Supervisor;
 pub struct Camera {
     /// Its part of the configuration.
     pub config: CameraConfig,
-    /// What computes each mode of its stereo, once it was open.
+    /// The algorithm of each mode of its stereo, once it was open.
     pub computed: Descriptions,
-    /// What is wrong with its eyes although it streams.
+    /// A problem with its stereo images although it streams.
     pub notice: Notice,
     state: Mutex<State>,
 }
 
-/// What is known of a camera now.
+/// The present state of a camera.
 #[derive(Debug)]
 pub struct State {
     /// Where its supervisor stands.
@@ -41,14 +41,14 @@ pub struct State {
     pub message: Option<String>,
     /// The error behind the message, for whoever waits for the first opening.
     pub error: Option<Error>,
-    /// What the device says of itself, once it was open.
+    /// The device's facts about itself, once it was open.
     pub info: Option<DeviceInfo>,
     /// Its streams, once it was open; they stay the same over reconnects.
     pub streams: Vec<Arc<Stream>>,
-    /// Those that are made of them.
-    pub made: Vec<Arc<Stream>>,
-    /// How they are made.
-    pub lane: Option<Arc<Lane>>,
+    /// The computed ones.
+    pub derived: Vec<Arc<Stream>>,
+    /// Refinement of its depth.
+    pub refinement: Option<Arc<Refinement>>,
     /// Bytes of one frame of every stream, once it was open.
     pub set_bytes: u64,
     /// Shared memory is too small for it.
@@ -67,8 +67,8 @@ impl Camera {
             error: None,
             info: None,
             streams: Vec::new(),
-            made: Vec::new(),
-            lane: None,
+            derived: Vec::new(),
+            refinement: None,
             set_bytes: 0,
             short_of_memory: false,
             reconnects: 0,
@@ -81,35 +81,35 @@ impl Camera {
         }
     }
 
-    /// What computed `stream`, if it is made of the eyes: for the dataset that it is recorded in.
+    /// The algorithm behind `stream`, if it is computed from left and right: for the dataset that it is recorded in.
     pub fn computed(&self, stream: &StreamId) -> Option<Computed> {
         let all = self.computed.lock().unwrap_or_else(PoisonError::into_inner);
         let mode = PREFIXES.iter().find_map(|p| stream.stream.as_str().strip_prefix(p))?;
         let d = all.get(mode)?;
-        let eye = |name: &&str| StreamId::new(stream.camera.as_str(), name).ok();
+        let side = |name: &&str| StreamId::new(stream.camera.as_str(), name).ok();
         Some(Computed {
             stream: stream.clone(),
             // It is nobody's closed algorithm, and says so.
             name: format!("mimic_{mode}"),
             producer: d.producer.clone(),
             parameters: d.parameters.clone(),
-            from: EYES.iter().filter_map(eye).collect(),
+            from: SIDES.iter().filter_map(side).collect(),
         })
     }
 
-    /// What is known of it now.
+    /// Its present state.
     pub fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl State {
-    /// Its streams and those that are made of them.
+    /// Its streams, those of the device and the computed ones.
     pub fn all_streams(&self) -> impl Iterator<Item = &Arc<Stream>> {
-        self.streams.iter().chain(&self.made)
+        self.streams.iter().chain(&self.derived)
     }
 
-    /// It is `state` now, because of `message`; told once.
+    /// Enters `state`, because of `message`, which is logged once.
     fn enter(&mut self, camera: &str, state: CameraState, message: Option<String>) {
         if self.phase == state && self.message == message {
             return;
@@ -126,11 +126,11 @@ impl State {
     }
 }
 
-/// What every camera of a rig shares.
+/// Everything that the cameras of a rig share.
 pub struct Shared {
     /// The rig's bus.
     pub bus: Bus,
-    /// Rung after every frame.
+    /// Raised after every frame.
     pub frames: Arc<Wake>,
     /// Bytes of shared memory that one camera may plan with.
     pub memory_share: u64,
@@ -143,5 +143,5 @@ pub struct Shared {
     /// Renders the scenes of simulated cameras while they stream, if they are to stream at once.
     pub drawing: Option<Arc<Drawing>>,
     /// Where depth is refined.
-    pub stage: Arc<Entrance>,
+    pub stage: Arc<Intake>,
 }

@@ -1,4 +1,4 @@
-//! The client of the control API: what the command line speaks to a running daemon with.
+//! The client of the control API, with which the command line talks to a running daemon.
 //!
 //! Calls block. Each one is a connection of its own, so a client may be kept for hours over restarts of the daemon.
 
@@ -17,9 +17,9 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 /// How long a call may take.
-const PATIENCE: Duration = Duration::from_secs(10);
+const TIMEOUT: Duration = Duration::from_secs(10);
 /// How long closing a recording may take: the disk decides.
-const STOP_PATIENCE: Duration = Duration::from_mins(10);
+const STOP_TIMEOUT: Duration = Duration::from_mins(10);
 
 /// A client of one rig's daemon. Not for use inside an async runtime: its calls block.
 #[derive(Debug)]
@@ -64,7 +64,7 @@ impl Client {
         let connector = Connector::new(runtime.socket_path(&rig))?;
         let client = Self { rig, runtime: runtime.clone(), connector };
         // A daemon that does not answer is better said now than in the middle of something.
-        client.send("GET", "/v1/config", None, PATIENCE)?;
+        client.send("GET", "/v1/config", None, TIMEOUT)?;
         Ok(client)
     }
 
@@ -76,7 +76,7 @@ impl Client {
     /// Everything there is to know about the rig now.
     ///
     /// # Errors
-    /// `Unreachable` when the daemon has gone, and what the daemon says.
+    /// `Unreachable` when the daemon has gone, and errors that the daemon returns.
     pub fn status(&self) -> Result<RigStatus> {
         self.get("/v1/status")
     }
@@ -86,7 +86,7 @@ impl Client {
     /// # Errors
     /// As [`Self::status`].
     pub fn config(&self) -> Result<String> {
-        let answer = self.send("GET", "/v1/config", None, PATIENCE)?;
+        let answer = self.send("GET", "/v1/config", None, TIMEOUT)?;
         String::from_utf8(answer.body).map_err(|e| self.garbled("/v1/config", &e).with_source(e))
     }
 
@@ -95,7 +95,7 @@ impl Client {
     /// # Errors
     /// As [`Self::status`] and [`crate::control::Control::record_start`].
     pub fn record_start(&self, request: &RecordRequest) -> Result<RecordingStatus> {
-        self.post("/v1/record/start", request, PATIENCE)
+        self.post("/v1/record/start", request, TIMEOUT)
     }
 
     /// Ends the recording; returns when its files are closed.
@@ -103,7 +103,7 @@ impl Client {
     /// # Errors
     /// As [`Self::status`] and [`crate::control::Control::record_stop`].
     pub fn record_stop(&self) -> Result<RecordingStatus> {
-        self.post("/v1/record/stop", &serde_json::Map::new(), STOP_PATIENCE)
+        self.post("/v1/record/stop", &serde_json::Map::new(), STOP_TIMEOUT)
     }
 
     /// The recording in progress, or the last one.
@@ -120,13 +120,13 @@ impl Client {
     /// As [`Self::status`] and [`crate::control::Control::record_note`].
     pub fn record_note(&self, text: &str) -> Result<()> {
         let body = self.encode(&NoteRequest { text: text.to_owned() })?;
-        self.send("POST", "/v1/record/note", Some(body), PATIENCE).map(drop)
+        self.send("POST", "/v1/record/note", Some(body), TIMEOUT).map(drop)
     }
 
     /// How far the replay has come.
     ///
     /// # Errors
-    /// As [`Self::status`], `WrongState` when the rig is no replay.
+    /// As [`Self::status`], `WrongState` when the rig is not a replay.
     pub fn replay(&self) -> Result<ReplayStatus> {
         self.get("/v1/replay")
     }
@@ -136,7 +136,7 @@ impl Client {
     /// # Errors
     /// As [`Self::replay`] and [`crate::control::ReplayControl::pause`].
     pub fn replay_pause(&self) -> Result<ReplayStatus> {
-        self.post("/v1/replay/pause", &serde_json::Map::new(), PATIENCE)
+        self.post("/v1/replay/pause", &serde_json::Map::new(), TIMEOUT)
     }
 
     /// Plays on.
@@ -144,7 +144,7 @@ impl Client {
     /// # Errors
     /// As [`Self::replay`] and [`crate::control::ReplayControl::resume`].
     pub fn replay_resume(&self) -> Result<ReplayStatus> {
-        self.post("/v1/replay/resume", &serde_json::Map::new(), PATIENCE)
+        self.post("/v1/replay/resume", &serde_json::Map::new(), TIMEOUT)
     }
 
     /// Goes to a set and publishes it.
@@ -152,7 +152,7 @@ impl Client {
     /// # Errors
     /// As [`Self::replay`] and [`crate::control::ReplayControl::seek`].
     pub fn replay_seek(&self, to: &SeekRequest) -> Result<ReplayStatus> {
-        self.post("/v1/replay/seek", to, PATIENCE)
+        self.post("/v1/replay/seek", to, TIMEOUT)
     }
 
     /// Plays so many sets and pauses; a negative number goes back.
@@ -160,7 +160,7 @@ impl Client {
     /// # Errors
     /// As [`Self::replay`] and [`crate::control::ReplayControl::step`].
     pub fn replay_step(&self, sets: i64) -> Result<ReplayStatus> {
-        self.post("/v1/replay/step", &StepRequest { sets }, PATIENCE)
+        self.post("/v1/replay/step", &StepRequest { sets }, TIMEOUT)
     }
 
     /// Changes the speed of the replay.
@@ -168,7 +168,7 @@ impl Client {
     /// # Errors
     /// As [`Self::replay`] and [`crate::control::ReplayControl::set_rate`].
     pub fn replay_rate(&self, rate: f64) -> Result<ReplayStatus> {
-        self.post("/v1/replay/rate", &RateRequest { rate }, PATIENCE)
+        self.post("/v1/replay/rate", &RateRequest { rate }, TIMEOUT)
     }
 
     /// Whether the replay begins again at its end.
@@ -176,7 +176,7 @@ impl Client {
     /// # Errors
     /// As [`Self::replay`] and [`crate::control::ReplayControl::set_loop`].
     pub fn replay_loop(&self, on: bool) -> Result<ReplayStatus> {
-        self.post("/v1/replay/loop", &LoopRequest { on }, PATIENCE)
+        self.post("/v1/replay/loop", &LoopRequest { on }, TIMEOUT)
     }
 
     /// Asks the daemon to end; it closes a recording before it does.
@@ -184,16 +184,16 @@ impl Client {
     /// # Errors
     /// As [`Self::status`].
     pub fn stop(&self) -> Result<()> {
-        self.send("POST", "/v1/stop", Some(b"{}".to_vec()), PATIENCE).map(drop)
+        self.send("POST", "/v1/stop", Some(b"{}".to_vec()), TIMEOUT).map(drop)
     }
 
     fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T> {
-        let answer = self.send("GET", path, None, PATIENCE)?;
+        let answer = self.send("GET", path, None, TIMEOUT)?;
         serde_json::from_slice(&answer.body).map_err(|e| self.garbled(path, &e).with_source(e))
     }
 
-    fn post<T: DeserializeOwned>(&self, path: &str, body: &impl Serialize, patience: Duration) -> Result<T> {
-        let answer = self.send("POST", path, Some(self.encode(body)?), patience)?;
+    fn post<T: DeserializeOwned>(&self, path: &str, body: &impl Serialize, timeout: Duration) -> Result<T> {
+        let answer = self.send("POST", path, Some(self.encode(body)?), timeout)?;
         serde_json::from_slice(&answer.body).map_err(|e| self.garbled(path, &e).with_source(e))
     }
 
@@ -201,8 +201,8 @@ impl Client {
         serde_json::to_vec(body).map_err(|e| self.garbled("the request", &e).with_source(e))
     }
 
-    fn send(&self, method: &str, path: &str, body: Option<Vec<u8>>, patience: Duration) -> Result<Answer> {
-        let answer = self.connector.send(method, path, body, patience).map_err(|f| self.unreachable(f))?;
+    fn send(&self, method: &str, path: &str, body: Option<Vec<u8>>, timeout: Duration) -> Result<Answer> {
+        let answer = self.connector.send(method, path, body, timeout).map_err(|f| self.unreachable(f))?;
         self.check_version(&answer)?;
         if (200..300).contains(&answer.status) {
             return Ok(answer);
@@ -239,7 +239,8 @@ impl Client {
     }
 
     fn unreachable(&self, failure: Failure) -> Error {
-        let (rig, socket) = (&self.rig, self.connector.path().display());
+        let rig = &self.rig;
+        let socket = self.connector.path().display();
         let holder = self.runtime.holder(rig);
         let (kind, what) = match (&failure, holder) {
             (Failure::Denied(e), _) => {
@@ -263,9 +264,9 @@ impl Client {
                 );
                 (ErrorKind::Unreachable, what)
             }
-            (Failure::Silent(patience), holder) => {
+            (Failure::Silent(timeout), holder) => {
                 let who = holder.unwrap_or_else(|| "ended meanwhile".into());
-                let what = format!("rig \"{rig}\" ({who}) did not answer within {} s", patience.as_secs());
+                let what = format!("rig \"{rig}\" ({who}) did not answer within {} s", timeout.as_secs());
                 (ErrorKind::Unreachable, what)
             }
             (Failure::Broken(e), _) => (
@@ -281,7 +282,8 @@ impl Client {
 fn compatible(a: &str, b: &str) -> bool {
     let parts = |v: &str| {
         let mut numbers = v.split(['.', '-', '+']).map(str::parse::<u64>);
-        let (major, minor) = (numbers.next()?.ok()?, numbers.next()?.ok()?);
+        let major = numbers.next()?.ok()?;
+        let minor = numbers.next()?.ok()?;
         Some((major, if major == 0 { minor } else { 0 }))
     };
     parts(a).is_some() && parts(a) == parts(b)

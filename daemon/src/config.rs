@@ -1,4 +1,4 @@
-//! The rig's configuration: what the TOML file says, checked, with defaults filled in.
+//! The rig's configuration: the TOML file, checked, with defaults filled in.
 //!
 //! `default_rig.toml` explains every key; a test keeps it complete and its defaults true. Every problem of a file
 //! is reported, each with its line, because a rig is edited on a headless computer where each attempt costs a
@@ -32,7 +32,7 @@ pub use depthrig_drivers::realsense::l515::L515Config as L515Settings;
 pub use depthrig_drivers::synthetic::SyntheticConfig as SyntheticSettings;
 pub use depthrig_drivers::v4l2::V4l2Config as V4l2Settings;
 pub use depthrig_drivers::zed::ZedConfig as ZedSettings;
-pub use depthrig_drivers::zed::replay::ReplayConfig as ZedReplaySettings;
+pub use depthrig_drivers::zed::replay::ZedPlaybackConfig as ZedReplaySettings;
 pub use depthrig_recorder::{ColorCodec, DepthCodec};
 pub use error::{ConfigError, Problem};
 
@@ -44,8 +44,8 @@ use std::path::{Path, PathBuf};
 
 /// The highest rate that a camera or the sets may have, Hz.
 pub const MAX_RATE_HZ: f64 = 1000.0;
-/// The most sets that may wait for the encoders: what waits keeps its slots in shared memory, and with the frames
-/// that the set thread holds and those being encoded that must stay below what a subscriber may hold (16).
+/// The most sets that may wait for the encoders: waiting sets keep their slots in shared memory, and with the frames
+/// that the set thread holds and those being encoded they must stay below the 16 that a subscriber may hold.
 pub const MAX_QUEUE_SETS: usize = 6;
 /// The most threads that encode; each may keep one more set's slots.
 pub const MAX_WORKERS: usize = 4;
@@ -67,7 +67,7 @@ pub struct RigConfig {
     pub control: ControlConfig,
     /// Supervision of the cameras.
     pub supervisor: SupervisorConfig,
-    /// What refines depth.
+    /// Settings of depth refinement.
     pub cdm: CdmConfig,
     /// The cameras in the order of the file; at least one, names unique.
     pub cameras: Vec<CameraConfig>,
@@ -108,7 +108,7 @@ pub enum Phase {
 /// Recordings.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RecordingConfig {
-    /// Folder that the folders of the datasets are made in; absolute.
+    /// Folder that holds the folders of the datasets; absolute.
     pub directory: PathBuf,
     /// Folders besides it, absolute, in or below which `record start` may put a dataset.
     pub allow: Vec<PathBuf>,
@@ -165,15 +165,15 @@ pub struct CameraConfig {
     pub streams: Vec<StreamRequest>,
     /// Streams to record; `None`: all.
     pub record: Option<Vec<StreamName>>,
-    /// How depth is made of its two eyes; `None`: not at all.
+    /// How depth is computed from its left and right images; `None`: not at all.
     pub stereo: Option<StereoConfig>,
     /// How its depth is refined; `None`: not at all.
     pub refine: Option<RefineConfig>,
-    /// Its driver and what that needs.
+    /// Its driver and that driver's settings.
     pub backend: BackendConfig,
 }
 
-/// What refines the depth of the rig's cameras: settings that they share.
+/// Settings of depth refinement that the cameras of the rig share.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CdmConfig {
     /// CPU threads of all refiners together; 0: all cores but one.
@@ -182,11 +182,11 @@ pub struct CdmConfig {
     pub library: Option<PathBuf>,
     /// Folder of the installed models; `None`: this user's.
     pub models: Option<PathBuf>,
-    /// A refiner that needs longer than this for a picture, and than ten times what it ever needed, hangs, seconds.
+    /// A refinement slower than this, and than ten times the slowest so far, counts as hung, seconds.
     pub hang_s: f64,
 }
 
-/// How depth is made of the two eyes of a camera.
+/// How depth is computed from the left and right images of a camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StereoConfig {
     /// The modes, in the order of their streams.
@@ -211,17 +211,17 @@ pub struct StereoConfig {
 #[derive(Debug, Clone, PartialEq)]
 #[allow(clippy::struct_excessive_bools)] // each is a choice of its own
 pub struct RefineConfig {
-    /// What runs.
+    /// The engine that runs.
     pub engine: EngineChoice,
     /// The model; `None`: the one for this camera, if it is installed.
     pub model: Option<RefineModel>,
-    /// Pairs of pictures a second at most; 0: every one.
+    /// Pairs of images a second at most; 0: every one.
     pub rate_hz: f64,
-    /// Shorter side of the network's input, pixels; `None`: what the model was trained for.
+    /// Shorter side of the network's input, pixels; `None`: the one that the model was trained for.
     pub input_size: Option<u32>,
     /// Precision of the network.
     pub precision: Precision,
-    /// What it runs on: `cpu`, `cuda:0`, `tensorrt:0`, `openvino`.
+    /// Device that it runs on: `cpu`, `cuda:0`, `tensorrt:0`, `openvino`.
     pub device: String,
     /// `Z16` in the unit of the camera's depth, or `DepthF32`.
     pub format: PixelFormat,
@@ -237,7 +237,7 @@ pub struct RefineConfig {
     pub depth: String,
 }
 
-/// What refines depth.
+/// Engine that refines depth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum EngineChoice {
     /// A model for this camera if one is installed and the library is there, else [`Self::Fill`].
@@ -291,29 +291,32 @@ impl CameraConfig {
         self.record.as_ref().is_none_or(|list| list.contains(stream))
     }
 
-    /// Whether frames of `stream` come so much later than those that they are made of that no set waits for them: they
+    /// Whether frames of `stream` come so much later than their source frames that no set waits for them: they
     /// join the set of their pair when it is recorded, as refined depth does.
     pub(crate) fn joins_late(&self, stream: &StreamName) -> bool {
         // Without a stream that comes at once there would be no set to join.
         let at_once = |name: &str| {
-            name == depthrig_drivers::stereo::COLOR || depthrig_drivers::stereo::EYES.contains(&name)
+            name == depthrig_drivers::stereo::COLOR || depthrig_drivers::stereo::SIDES.contains(&name)
         };
         self.stereo.is_some()
             && StereoOptions::is_late(stream.as_str())
             && (self.streams.is_empty() || self.streams.iter().any(|s| at_once(s.stream.as_str())))
     }
 
-    /// Whether `stream` is made of others of the camera here, and does not come from the device.
-    pub(crate) fn is_made_here(&self, stream: &StreamName) -> bool {
+    /// Whether `stream` is computed here from others of the camera, and does not come from the device.
+    pub(crate) fn is_computed_here(&self, stream: &StreamName) -> bool {
         let stereo = self.stereo.as_ref().is_some_and(|s| s.streams().iter().any(|n| n == stream.as_str()));
         stereo || crate::stage::is_derived(stream)
     }
 
-    /// The streams that are made of `profiles`, and whether each is recorded.
+    /// The streams that are computed from `profiles`, and whether each is recorded.
     ///
     /// # Errors
     /// `BadInput` when its depth is to be refined and colour or depth is not among them.
-    pub(crate) fn makes(&self, profiles: &[StreamProfile]) -> crate::Result<Vec<(StreamProfile, bool)>> {
+    pub(crate) fn derived_profiles(
+        &self,
+        profiles: &[StreamProfile],
+    ) -> crate::Result<Vec<(StreamProfile, bool)>> {
         crate::stage::profiles(self.refine.as_ref(), self.record.as_deref(), profiles)
     }
 }
@@ -324,7 +327,7 @@ impl CameraConfig {
 pub enum BackendConfig {
     /// A simulated camera.
     Synthetic(SyntheticSettings),
-    /// A folder of pictures that plays as a camera.
+    /// A folder of images that plays as a camera.
     Files(FilesSettings),
     /// A RealSense D400.
     Realsense(RealsenseSettings),

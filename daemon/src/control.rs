@@ -1,4 +1,4 @@
-//! What can be asked of a running rig, whoever asks: the HTTP API, the command line in process, or a test.
+//! Calls on a running rig, from any side: the HTTP API, the command line in process, or a test.
 
 use crate::Result;
 use crate::status::{RecordingStatus, ReplayStatus, RigStatus};
@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
 /// A running rig, as its control sees it. Every call returns quickly; `record_stop` may take as long as the
-/// disk needs to take what is still queued.
+/// disk needs for the sets that are still queued.
 pub trait Control: Send + Sync {
     /// Everything there is to know about the rig now.
     fn status(&self) -> RigStatus;
@@ -22,7 +22,7 @@ pub trait Control: Send + Sync {
     /// Starts a recording.
     ///
     /// # Errors
-    /// `InUse` when one is going on, `BadInput` for a name that exists or a time that is none, `NoSpace` when the disk
+    /// `InUse` when one is going on, `BadInput` for an existing name or an invalid time, `NoSpace` when the disk
     /// has too little room, now or for as long as it is to last, `PermissionDenied`.
     fn record_start(&self, request: &RecordRequest) -> Result<RecordingStatus>;
 
@@ -47,7 +47,7 @@ pub trait Control: Send + Sync {
     }
 }
 
-/// What can be asked of a replay. A call that publishes a set returns when that was done, or after 3 s.
+/// Calls on a replay. A call that publishes a set returns when that was done, or after 3 s.
 pub trait ReplayControl: Send + Sync {
     /// How far it has come.
     fn status(&self) -> ReplayStatus;
@@ -78,7 +78,7 @@ pub trait ReplayControl: Send + Sync {
     /// `BadInput` for 0, `WrongState` at the end, at the beginning, or backwards while it is recorded.
     fn step(&self, sets: i64) -> Result<ReplayStatus>;
 
-    /// Changes the speed; what was published stays, what comes is neither skipped nor bunched.
+    /// Changes the speed; sets already published stay, later ones are neither skipped nor bunched.
     ///
     /// # Errors
     /// `BadInput` outside of 0.1 to 10, `WrongState` when its subscribers pace it.
@@ -103,7 +103,7 @@ pub struct SeekRequest {
     pub id: Option<u64>,
 }
 
-/// What a recording is to be.
+/// Options of a recording.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RecordRequest {

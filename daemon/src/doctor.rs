@@ -1,7 +1,7 @@
 //! A session before it begins: what would go wrong with this rig on this computer, why it matters and what to do.
 //!
 //! Facts are gathered first ([`Host`], [`crate::attached`]), then judged without touching anything, so that every
-//! finding can be tested on made facts. Nothing is streamed. A camera that somebody has is left alone.
+//! finding can be tested on fake facts. Nothing is streamed. A camera that somebody has is left alone.
 
 mod bandwidth;
 mod cameras;
@@ -31,7 +31,7 @@ use depthrig_bus::RuntimeDir;
 use depthrig_drivers::usb::SysRoot;
 use serde::Serialize;
 
-/// What was found out about a session.
+/// The findings about a session.
 #[derive(Debug, Clone, Serialize)]
 pub struct Report {
     /// The rig's name.
@@ -44,11 +44,11 @@ pub struct Report {
     pub links: Vec<LinkLoad>,
     /// The disk of the recordings.
     pub disk: DiskPlan,
-    /// Shared memory that the streams need with the slots they are to have, bytes; and what is free.
+    /// Shared memory that the streams need with the slots they are to have, bytes.
     pub shm_needed_bytes: u64,
     /// Bytes free in `/dev/shm`.
     pub shm_free_bytes: u64,
-    /// What is wrong or worth knowing, the worst first.
+    /// The findings, the worst first.
     pub findings: Vec<Finding>,
 }
 
@@ -74,7 +74,7 @@ pub fn examine(config: &RigConfig, around: &Surroundings, ask: &dyn Ask) -> crat
     Ok(judge(config, &attached, plans, &host))
 }
 
-/// Judges what was gathered.
+/// Judges the gathered facts.
 fn judge(config: &RigConfig, attached: &Attached, plans: Vec<plan::Planned>, host: &Host) -> Report {
     let mut findings = Vec::new();
     let mut plans: Vec<_> = plans

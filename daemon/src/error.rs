@@ -1,12 +1,12 @@
 //! The error of the daemon: a kind to match on (exit code, HTTP status), what happened and what to do.
 
-/// What went wrong, for callers that decide on it.
+/// Kind of an error, for callers that decide on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum ErrorKind {
-    /// The configuration or a request is not what it must be.
+    /// The configuration or a request is invalid.
     BadInput,
-    /// What was asked for does not exist.
+    /// The requested item does not exist.
     NotFound,
     /// Somebody else holds it, or it is running already.
     InUse,

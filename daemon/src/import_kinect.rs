@@ -1,6 +1,6 @@
 //! Recordings of an Azure Kinect (`.mkv`) as datasets: JPEG, depth and infrared come over as they are.
 //!
-//! Read once, block by block. Pictures of one capture become one set: colour and depth whose times, the delay between
+//! Read once, block by block. Images of one capture become one set: colour and depth whose times, the delay between
 //! them left out, lie within half a period; a capture that lacks one is a set that lacks it. Memory is that of the few
 //! captures that are not complete yet.
 //!
@@ -26,10 +26,10 @@ mod motion;
 
 /// The name of the layout.
 pub const FORMAT: &str = "kinect";
-/// The most captures that may wait for what they lack.
+/// The most incomplete captures that may wait.
 const MOST_OPEN: usize = 8;
-/// Problems that are told in words.
-const MOST_TOLD: u64 = 50;
+/// Problems that are reported in words.
+const MOST_REPORTED: u64 = 50;
 
 /// How to import a recording.
 #[derive(Debug, Clone)]
@@ -51,15 +51,15 @@ pub struct KinectImport {
     /// Captures in the order of their times, the last ones incomplete.
     open: VecDeque<Capture>,
     period_us: u64,
-    /// What is added to the times of colour and of depth, so that those of a capture are equal.
+    /// Delays that are added to the times of colour and of depth, so that those of a capture are equal.
     delays_us: (u64, u64),
     /// UTC at the device's time 0, nanoseconds.
     origin_ns: i64,
     sets: u64,
-    /// The newest set, which may be the last and then takes what is left of motion.
+    /// The newest set, which may be the last and then takes the rest of the IMU batches.
     held: Option<RecordSet>,
     motion: Option<motion::Unit>,
-    /// Blocks of tracks that are no camera's, which were left out.
+    /// Blocks of tracks that belong to no camera, which were left out.
     others: u64,
     ended: bool,
     facts: ImportFacts,
@@ -77,7 +77,7 @@ struct Stream {
     dropped: DropCounts,
 }
 
-/// One capture that may lack pictures yet.
+/// One capture that may lack images yet.
 struct Capture {
     at_us: u64,
     frames: Vec<Option<RecordFrame>>,
@@ -87,8 +87,8 @@ impl KinectImport {
     /// Opens the recording `path`.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`], [`ErrorKind::BadRecording`] when it is no recording of an Azure Kinect, or the calibration is not
-    /// one, [`ErrorKind::BadInput`] when it has none and one is wanted, [`ErrorKind::Io`].
+    /// [`ErrorKind::NotFound`], [`ErrorKind::BadRecording`] when it is not an Azure Kinect `.mkv`, or its calibration
+    /// is unreadable, [`ErrorKind::BadInput`] when it has no calibration and one is wanted, [`ErrorKind::Io`].
     pub fn open(path: &Path, options: KinectOptions) -> Result<Self> {
         let recording = Recording::open(path).map_err(of_driver)?;
         let lacks_calibration =
@@ -127,7 +127,8 @@ impl KinectImport {
                 intrinsics: profile.intrinsics,
                 pose: profile.pose_in_device,
             };
-            let (kind, pixels) = (t.kind, t.pixels);
+            let kind = t.kind;
+            let pixels = t.pixels;
             let dropped = DropCounts::default();
             streams.push(Stream { record, track, kind, pixels, sequence: 0, newest: None, dropped });
         }
@@ -173,7 +174,7 @@ impl KinectImport {
         Ok(import)
     }
 
-    /// What is assumed, before anything was read.
+    /// The assumptions, before anything was read.
     fn state_all(&mut self, calibration: Option<&Calibration>) {
         let facts = self.recording.facts();
         let mut stated = vec![if facts.date_utc_ns.is_some() {
@@ -200,7 +201,7 @@ impl KinectImport {
             stated.extend(rotation.map(|r| r.to_string()));
         }
         for t in facts.tracks.iter().filter(|t| t.kind == TrackKind::Other) {
-            stated.push(format!("the track {} is left out, it is no camera's", t.name));
+            stated.push(format!("the track {} is left out: it belongs to no camera", t.name));
         }
         self.facts.stated = stated;
     }
@@ -208,7 +209,8 @@ impl KinectImport {
     /// Takes one block.
     fn block(&mut self) -> Result<bool> {
         let Some(block) = self.recording.next_block().map_err(of_driver)? else { return Ok(false) };
-        let (device_us, track) = (block.device_us, block.track);
+        let device_us = block.device_us;
+        let track = block.track;
         let Some(at) = self.streams.iter().position(|s| s.track == track) else {
             match &mut self.motion {
                 Some(unit) if unit.track() == track => {
@@ -220,21 +222,21 @@ impl KinectImport {
         };
         let pixels: Vec<_> = block.frames().map(<[u8]>::to_vec).collect();
         for data in pixels {
-            self.picture(at, device_us, &data);
+            self.image(at, device_us, &data);
         }
         Ok(true)
     }
 
-    /// Puts a picture into its capture.
-    fn picture(&mut self, at: usize, device_us: u64, data: &[u8]) {
+    /// Puts an image into its capture.
+    fn image(&mut self, at: usize, device_us: u64, data: &[u8]) {
         let Some(s) = self.streams.get_mut(at) else { return };
-        let made = s.frame(at, device_us, self.origin_ns, self.period_us, data);
-        let frame = match made {
+        let frame = s.frame(at, device_us, self.origin_ns, self.period_us, data);
+        let frame = match frame {
             Ok(frame) => frame,
             Err(reason) => {
                 s.dropped.add(reason, 1);
                 let what =
-                    format!("{}: the picture at {device_us} us is damaged ({})", s.record.id, reason.name());
+                    format!("{}: the image at {device_us} us is damaged ({})", s.record.id, reason.name());
                 self.lose(what);
                 return;
             }
@@ -256,7 +258,7 @@ impl KinectImport {
     }
 
     fn lose(&mut self, what: String) {
-        if self.facts.lost < MOST_TOLD {
+        if self.facts.lost < MOST_REPORTED {
             self.facts.lose(what);
         } else {
             self.facts.lost += 1;
@@ -297,12 +299,13 @@ impl KinectImport {
         }
     }
 
-    /// What is known only at the end.
+    /// Records the facts that are known only at the end.
     fn finish(&mut self) {
         self.ended = true;
         let losses = self.recording.losses();
         if losses.places > 0 {
-            let (places, bytes) = (losses.places, losses.bytes);
+            let places = losses.places;
+            let bytes = losses.bytes;
             let cut = if self.recording.facts().is_cut { "; the file was cut off" } else { "" };
             let places = if places == 1 { "one place".to_owned() } else { format!("{places} places") };
             self.facts.lose(format!(
@@ -312,7 +315,7 @@ impl KinectImport {
         }
     }
 
-    /// How much of what was read a dataset does not hold.
+    /// Counts of data that was read and that a dataset does not hold.
     fn left_out(&self) -> BTreeMap<String, u64> {
         let motion = self.motion.as_ref().map_or(0, motion::Unit::left_out);
         let counts = [("motion_samples", motion), ("blocks_of_other_tracks", self.others)];
@@ -375,7 +378,7 @@ impl Stream {
         };
         header.set_names("rig", &r.id);
         header.set_device(&r.model, &r.serial);
-        header.set_picture(r.format, r.width, r.height);
+        header.set_image(r.format, r.width, r.height);
         if r.format == PixelFormat::Mjpeg {
             header.payload_len = pixels.len() as u32;
         }
@@ -411,7 +414,7 @@ impl Importer for KinectImport {
         put("depth_delay_ns", facts.depth_delay_ns.into());
         put("subordinate_delay_ns", i64::try_from(facts.subordinate_delay_ns).unwrap_or(i64::MAX).into());
         put("start_offset_ns", start_ns.into());
-        // All of it: metric radius, motion sensors and what a later version may want.
+        // All of it: metric radius, motion sensors and fields of later versions.
         if let Some(text) = facts.calibration.as_deref().and_then(|t| core::str::from_utf8(t).ok()) {
             put("calibration_json", text.trim_end_matches('\0').into());
         }

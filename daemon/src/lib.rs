@@ -1,7 +1,7 @@
 //! The daemon: one process that owns every camera of a rig.
 //!
-//! Floor 4. Rig configuration, supervision, set assembly, recording control, replay and the control API. It
-//! contains no device protocol and no codec; those are in the floors below.
+//! Layer 4. Rig configuration, supervision, set assembly, recording control, replay and the control API. It
+//! contains no device protocol and no codec; those are in the layers below.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 pub mod api;
@@ -12,7 +12,7 @@ pub mod config;
 pub mod control;
 pub mod doctor;
 mod error;
-mod house;
+mod housekeeping;
 pub mod import_kinect;
 pub mod metrics;
 mod priority;

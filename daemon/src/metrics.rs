@@ -1,6 +1,6 @@
 //! The rig's status as Prometheus metrics.
 //!
-//! Every scrape is made from one [`RigStatus`], so its numbers belong together and there is no second set of
+//! Every scrape is built from one [`RigStatus`], so its numbers belong together and there are no other
 //! counters that could disagree with `depthrig status`. Units are base units (seconds, bytes, hertz, ratios), as
 //! Prometheus wants; quantiles are gauges over the last frames, because they are computed in the daemon.
 
@@ -124,7 +124,7 @@ fn refined(f: &mut Families, labels: &Labels, r: &RefineStatus) {
     }
 }
 
-const SKIPPED: &str = "Pairs of pictures that were due and not refined, by reason.";
+const SKIPPED: &str = "Pairs of images that were due and not refined, by reason.";
 
 fn frames(f: &mut Families, labels: &Labels, s: &StreamStatus) {
     f.counter(

@@ -1,4 +1,4 @@
-//! What a process may ask of the kernel so that cameras are served in time; refusals are hints, not errors.
+//! Thread priorities, so that cameras are served in time; refusals are hints, not errors.
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::sync::Once;
@@ -24,10 +24,10 @@ pub fn raise_current_thread() {
     }
 }
 
-/// What the kernel gives threads that refine depth: less than to any camera's or subscriber's, more than to reports.
+/// Niceness of threads that refine depth: below any camera or subscriber, above reports.
 const REFINE_NICE: i32 = 10;
 
-/// Puts the calling thread, and what threads it makes from now on, below all others that somebody waits for.
+/// Puts the calling thread, and the threads it starts from now on, below all others that somebody waits for.
 pub fn lower_current_thread() {
     // Of this thread alone on Linux; refused it is merely as urgent as others.
     if let Err(e) = rustix::process::nice(REFINE_NICE) {

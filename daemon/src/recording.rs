@@ -29,22 +29,22 @@ mod texts;
 pub use facts::StreamFacts;
 pub use report::Reports;
 
-/// The recordings of a rig: at most one at a time, and what became of the last.
+/// The recordings of a rig: at most one at a time, and the outcome of the last.
 #[derive(Default)]
 pub struct Recording {
     active: Option<Active>,
     last: Option<RecordingStatus>,
     summary: Option<Summary>,
-    /// What became of motion samples, recorded or not.
+    /// Accounts of IMU batches, recorded or not.
     motion: motion::Books,
 }
 
-/// What recordings have of the computer: its disk and its clocks.
+/// Resources of the computer that recordings use: its disk and its clocks.
 #[derive(Clone)]
 pub struct Outside {
     /// Where datasets are written.
     pub fs: Arc<dyn fs::Fs>,
-    /// What places a recording in UTC.
+    /// Source of UTC for a recording.
     pub utc: UtcSource,
     /// Encoded bytes that may wait for the disk, unless the recorder's own limit is to hold.
     pub backlog_max_bytes: Option<u64>,
@@ -63,7 +63,7 @@ impl Default for Outside {
     }
 }
 
-/// A recording that was made and is not yet handed any set.
+/// A recording that was created and is not yet handed any set.
 pub struct Begun(Active);
 
 struct Active {
@@ -96,11 +96,11 @@ impl Pixels for SharedPixels {
 }
 
 impl Begun {
-    /// Makes the dataset for a recording of `streams`, of about `sets_hz` sets a second.
+    /// Creates the dataset for a recording of `streams`, of about `sets_hz` sets a second.
     ///
     /// # Errors
-    /// `WrongState` without a stream, `BadInput` for a name that is no folder name or exists and for a time that is
-    /// none, `NoSpace` when it does not fit, `PermissionDenied`.
+    /// `WrongState` without a stream, `BadInput` for an invalid or existing folder name and for an invalid time,
+    /// `NoSpace` when it does not fit, `PermissionDenied`.
     pub fn new(
         config: &RigConfig,
         request: &RecordRequest,
@@ -142,12 +142,13 @@ impl Begun {
             budget::bytes_per_s(raw, sets_hz, &config.recording) + budget::motion_bytes_per_s(samples_hz);
         let reserve = reserve_bytes(&config.recording);
         budget::check(&*outside.fs, &path, request, rate, reserve, &config.recording)?;
-        let (fs, clock) = (Arc::clone(&outside.fs), Arc::clone(&outside.utc));
+        let fs = Arc::clone(&outside.fs);
+        let clock = Arc::clone(&outside.utc);
         let recorder = Recorder::create_with(fs, clock, &path, session, options).map_err(of_recorder)?;
         if !request.notes.is_empty() {
             recorder.add_note(request.notes.as_str()).map_err(of_recorder)?;
         }
-        tracing::info!(path = %path.display(), streams = streams.len(), motion_units = units.len(), "recording");
+        tracing::info!(path = %path.display(), streams = streams.len(), imus = units.len(), "recording");
         let status = RecordingStatus {
             active: true,
             path: path.display().to_string(),
@@ -203,13 +204,13 @@ impl Recording {
         self.last.insert(active.status.clone()).clone()
     }
 
-    /// Takes in a batch of the motion unit `id`, before which `missed` batches were replaced on the channel. While a
+    /// Takes in a batch of the IMU `id`, before which `missed` batches were replaced on the channel. While a
     /// recording runs it waits for the next set.
     pub fn hear_motion(&mut self, id: &StreamId, frame: &Frame, missed: u64) {
         self.motion.hear(self.active.as_mut().map(|a| &mut a.motion), id, frame, missed);
     }
 
-    /// What became of the batches of each motion unit that was heard: `used` went with sets, `overflow` waited too long,
+    /// Accounts of the batches of each IMU that was heard: `used` went with sets, `overflow` waited too long,
     /// `decimated` came while nothing was recorded or after a recording's last set.
     pub fn motion_accounts(&self) -> Vec<(StreamId, SetAccount)> {
         self.motion.accounts().map(|(id, account)| (id.clone(), account)).collect()
@@ -223,7 +224,8 @@ impl Recording {
         frames: impl Iterator<Item = (Arc<Stream>, Option<Frame>)>,
     ) {
         let Some(active) = &mut self.active else { return };
-        let (mut present, mut missing) = (Vec::new(), Vec::new());
+        let mut present = Vec::new();
+        let mut missing = Vec::new();
         for (stream, frame) in frames {
             let Some(&index) = active.indices.get(&stream.id) else { continue };
             match frame {
@@ -235,7 +237,7 @@ impl Recording {
                 None => missing.push(index),
             }
         }
-        // Of what is recorded: the set may have streams that are not.
+        // Of recorded streams: the set may have others.
         let times = present.iter().map(|f| f.header.capture_time_ns);
         let spread_ns = times.clone().max().unwrap_or(0) - times.min().unwrap_or(0);
         let utc = (active.utc)();
@@ -243,7 +245,7 @@ impl Recording {
         self.push(RecordSet { id, tick, utc, frames: present, missing, motion, spread_ns });
     }
 
-    /// Hands a set to the recorder, if one is running; its streams and motion units are those that the recording was begun
+    /// Hands a set to the recorder, if one is running; its streams and IMUs are those that the recording was begun
     /// with, in their order. Never blocks.
     pub fn push(&mut self, set: RecordSet) {
         let Some(active) = &mut self.active else { return };
@@ -303,7 +305,7 @@ impl Recording {
         self.last.clone()
     }
 
-    /// What the last finished recording holds.
+    /// Summary of the last finished recording.
     pub fn summary(&self) -> Option<&Summary> {
         self.summary.as_ref()
     }
@@ -342,7 +344,7 @@ impl Active {
         status.warning = progress.disk.warning;
     }
 
-    /// What the cameras delivered and lost since the recording began.
+    /// Hands over the cameras' accounts since the recording began.
     fn hand_over_accounts(&self) {
         let account = |r: &Recorded| {
             let books = r.stream.books();
@@ -373,7 +375,7 @@ impl Finishing {
     /// Waits until everything is on disk.
     ///
     /// # Errors
-    /// `Other` when the dataset could not be closed; the status says what is known all the same.
+    /// `Other` when the dataset could not be closed; the status is as complete as possible all the same.
     pub fn finish(mut self) -> (RecordingStatus, Result<Summary>) {
         self.active.refresh();
         let mut status = self.active.status;
@@ -406,7 +408,7 @@ impl Finishing {
     }
 }
 
-/// Ends the recording and closes its files. What goes on in `recording` meanwhile need not wait for the disk.
+/// Ends the recording and closes its files. Other users of `recording` need not wait for the disk.
 ///
 /// # Errors
 /// `WrongState` when none is going on, `Other` when the dataset could not be closed.
@@ -421,8 +423,7 @@ pub fn is_due(recording: &Mutex<Recording>) -> bool {
 }
 
 /// Ends the recording, as [`stop`] does, if it has lasted as long as it was to. `None`: it is not
-/// over yet, or there is none. The moment it ends is that of its start and its length, however late this is asked the
-/// times before.
+/// over yet, or none is going on. The moment it ends is that of its start and its length, however late the call comes.
 pub fn stop_when_due(recording: &Mutex<Recording>) -> Option<Result<RecordingStatus>> {
     let mut idle = recording.lock().unwrap_or_else(PoisonError::into_inner);
     let finishing = if idle.is_due() { idle.take().ok()? } else { return None };

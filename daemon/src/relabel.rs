@@ -1,8 +1,9 @@
 //! Refined depth for a dataset that was recorded without, in a copy of it.
 //!
-//! First everything is refined, on several threads, into files beside the new dataset: that is what takes hours, and what
-//! a run that was killed goes on with. Then the copy is recorded from the dataset and these files, verified, and gets its
-//! name; the files go. The source is only read, its pictures are kept as they are stored, and OUT is whole or not there.
+//! First everything is refined, on several threads, into files beside the new dataset: this takes hours, and a run that
+//! was killed goes on with these files. Then the copy is recorded from the dataset and these files, verified, and gets
+//! its name; the files go. The source is only read, its images are kept as they are stored, and OUT is complete or
+//! absent.
 
 use crate::config::{CdmConfig, RefineConfig};
 use crate::stage::{Installed, Plan, REFINED, Refiners};
@@ -27,34 +28,34 @@ mod write;
 /// How a dataset is given refined depth.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RelabelOptions {
-    /// What refines, for every camera.
+    /// The refiner, for every camera.
     pub refine: RefineConfig,
     /// Where models and libraries are.
     pub cdm: CdmConfig,
-    /// Pictures that are worked on at once.
+    /// Images that are worked on at once.
     pub workers: usize,
     /// Threads of each refiner.
     pub threads: usize,
 }
 
-/// What is being done.
+/// The step in progress.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Step {
-    /// Pictures are refined.
+    /// Images are refined.
     Refine,
     /// The new dataset is written.
     Write,
 }
 
-/// Is told how far a step is, of how much, and may end the work.
+/// Called with the step, how far it is and of how much; may end the work.
 pub type RelabelProgress<'a> = &'a mut dyn FnMut(Step, u64, u64) -> ControlFlow<()>;
 
-/// What was made.
+/// Result of relabelling.
 #[derive(Debug, Serialize)]
 pub struct RelabelReport {
     /// The new dataset; it is not there when `ended`.
     pub path: PathBuf,
-    /// Each new stream with what made it.
+    /// Each new stream with its engine.
     pub streams: Vec<RelabelledStream>,
     /// Sets of the new dataset.
     pub sets: u64,
@@ -62,13 +63,13 @@ pub struct RelabelReport {
     pub bytes: u64,
     /// Parts that an earlier run had refined.
     pub parts_resumed: u64,
-    /// Sets and pictures of the source that could not be read.
+    /// Sets and images of the source that could not be read.
     pub lost: u64,
     /// The first of them, in words.
     pub problems: Vec<String>,
     /// Whether it was ended from outside; run again, it goes on.
     pub ended: bool,
-    /// Whether the new dataset is whole.
+    /// Verification of the new dataset.
     pub verified: Option<VerifyReport>,
 }
 
@@ -77,11 +78,11 @@ pub struct RelabelReport {
 pub struct RelabelledStream {
     /// Its name.
     pub stream: String,
-    /// What made it.
+    /// The engine that computed it.
     pub engine: String,
     /// The model, if there was one.
     pub model: String,
-    /// What is not as one would expect.
+    /// A remark on the engine, where it is not the expected one.
     pub note: Option<String>,
     /// Frames in the new dataset.
     pub frames: u64,
@@ -93,7 +94,7 @@ struct Camera {
     color: usize,
     depth: usize,
     id: StreamId,
-    /// Index of what refines it.
+    /// Index of its engine.
     engine: usize,
     /// Why this engine and not the one that one would expect.
     note: Option<String>,
@@ -107,12 +108,12 @@ struct Engine {
     free: Mutex<Vec<Box<dyn Refiner>>>,
 }
 
-/// Gives `dataset` refined depth in a copy of it, the new folder `out`. What is needed until then is in `OUT.relabel`.
+/// Gives `dataset` refined depth in a copy of it, the new folder `out`. Intermediate files are in `OUT.relabel`.
 ///
 /// # Errors
-/// [`ErrorKind::BadInput`] when no camera has colour and depth, when there is refined depth already, when depth cannot be
-/// put into the view of colour, and when the refiner cannot be made or fails; [`ErrorKind::AlreadyExists`] when `out` is
-/// there or what is left of another run does not fit; and what reading and writing say.
+/// [`ErrorKind::BadInput`] when no camera has colour and depth, when there is refined depth already, when depth has no
+/// mapping into the view of colour, and when the refiner cannot be created or fails; [`ErrorKind::AlreadyExists`] when
+/// `out` is there or the remains of another run do not fit; and errors of reading and writing.
 pub fn relabel(
     dataset: &Dataset,
     out: &Path,
@@ -143,7 +144,7 @@ pub fn relabel_with(
     }
     let (cameras, engines) = plan(refiners, dataset.session(), options)?;
     let mut refine = Refine { refiners, cameras: &cameras, engines: &engines, options };
-    let made = export(
+    let exported = export(
         &*fs,
         &mut refine,
         vec![dataset.clone()],
@@ -156,16 +157,16 @@ pub fn relabel_with(
         streams: streams(&cameras, &engines),
         sets: 0,
         bytes: 0,
-        parts_resumed: made.parts_resumed,
+        parts_resumed: exported.parts_resumed,
         lost: 0,
         problems: Vec::new(),
-        ended: made.ended,
+        ended: exported.ended,
         verified: None,
     };
-    if made.ended {
+    if exported.ended {
         return Ok(report);
     }
-    // What a killed run left of the copy is not gone on with: copying takes as long as reading.
+    // The unfinished copy of a killed run is not continued: copying takes as long as reading.
     let copy = work.join("dataset");
     let remove = |dir: &Path| {
         std::fs::remove_dir_all(dir)
@@ -194,7 +195,7 @@ pub fn relabel_with(
         let message = format!("the copy in {} does not verify: {}", copy.display(), broken.message);
         return Err(Error::new(ErrorKind::Corrupt, message));
     }
-    // What the source lacks, the copy lacks too.
+    // Data that the source lacks, the copy lacks too.
     for lost in copied.verified.lost() {
         report.lost += 1;
         report.problems.push(lost.message.clone());
@@ -212,7 +213,7 @@ fn work_folder(out: &Path) -> Result<PathBuf> {
     let Some(name) = out.file_name() else {
         return Err(Error::new(
             ErrorKind::BadInput,
-            format!("{} is no name for a new dataset", out.display()),
+            format!("{} is not a valid name for a new dataset", out.display()),
         ));
     };
     let mut name = name.to_os_string();
@@ -220,7 +221,7 @@ fn work_folder(out: &Path) -> Result<PathBuf> {
     Ok(out.with_file_name(name))
 }
 
-/// Which cameras get refined depth, and by what.
+/// The cameras that get refined depth, each with its engine.
 fn plan(
     refiners: &dyn Refiners,
     session: &Session,
@@ -233,14 +234,15 @@ fn plan(
         };
         session.streams.iter().position(is)
     };
-    let (mut cameras, mut engines): (Vec<Camera>, Vec<Engine>) = (Vec::new(), Vec::new());
+    let mut cameras: Vec<Camera> = Vec::new();
+    let mut engines: Vec<Engine> = Vec::new();
     for (color, record) in session.streams.iter().enumerate().filter(|(_, s)| s.id.stream.as_str() == "color")
     {
         let name = record.id.camera.as_str();
         let Some(depth) = find(name, "depth") else { continue };
         if find(name, REFINED).is_some() {
             return Err(bad(format!(
-                "{name}/{REFINED} is in the dataset already; relabel the one that it was made from"
+                "{name}/{REFINED} is in the dataset already; relabel its source dataset"
             )));
         }
         let stream = StreamName::new(REFINED).map_err(|e| bad(e.to_string()))?;
@@ -291,7 +293,7 @@ fn streams(cameras: &[Camera], engines: &[Engine]) -> Vec<RelabelledStream> {
     cameras.iter().map(of).collect()
 }
 
-/// Pictures are stored as they are in the source; the first set that can be read tells how that is.
+/// Images are stored as they are in the source; the first readable set shows how.
 fn recorder_options(dataset: &Dataset) -> Result<RecorderOptions> {
     let mut reader = dataset.set_reader()?;
     let numbers = 0..reader.times().len();

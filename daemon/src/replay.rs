@@ -2,7 +2,7 @@
 //!
 //! Pixels are those of the dataset and every time in a header is the original one; such frames carry
 //! [`FrameFlags::REPLAYED`](depthrig_bus::FrameFlags::REPLAYED). Sequence numbers are counted anew, because a channel's
-//! numbers have no gaps and a dataset holds every sixth frame. What the device counted (`device_sequence`) stays.
+//! numbers have no gaps and a dataset holds every sixth frame. The device's own counter (`device_sequence`) stays.
 //!
 //! ```text
 //! timeline   which sets of which dataset when: built from the segments' indexes
@@ -30,11 +30,11 @@ use crate::config::{
     SupervisorConfig,
 };
 use crate::control::Control;
-use crate::house::House;
+use crate::housekeeping::Housekeeping;
 use crate::recording::{Outside, Recording, Reports};
 use crate::rig::report;
 use crate::sets::SpreadStats;
-use crate::stage::{Entrance, Installed, Lane, Stage};
+use crate::stage::{Installed, Intake, Refinement, Stage};
 use crate::status::{RecordingStatus, ReplayStatus};
 use crate::stream::Stream;
 use crate::wake::Wake;
@@ -106,7 +106,7 @@ pub struct Replay {
     _lock: RigLock,
 }
 
-/// What a replay leaves.
+/// Result of a replay.
 #[derive(Debug, Clone, serde::Serialize)]
 pub struct ReplaySummary {
     /// Its last status.
@@ -119,9 +119,9 @@ pub struct ReplaySummary {
 /// Lines of `lost` that are kept.
 const MAX_LOST: usize = 100;
 
-/// What the threads of a replay share.
+/// State that the threads of a replay share.
 struct Inner {
-    /// What recordings of it are made with.
+    /// The configuration of recordings of it.
     config: RigConfig,
     paths: Vec<PathBuf>,
     options: ReplayOptions,
@@ -139,19 +139,19 @@ struct Inner {
     units: Vec<MotionRecord>,
     /// Their channels.
     unit_streams: Vec<Arc<Stream>>,
-    /// What computed some of them.
+    /// The algorithms behind the computed ones.
     computed: Vec<Computed>,
     streams: Vec<Arc<Stream>>,
     /// Where depth is refined, and whose.
-    entrance: Arc<Entrance>,
-    lanes: Mutex<Vec<Arc<Lane>>>,
+    intake: Arc<Intake>,
+    refinements: Mutex<Vec<Arc<Refinement>>>,
     numbers: Mutex<Numbers>,
     spreads: Mutex<SpreadStats>,
     recording: Mutex<Recording>,
     reports: Reports,
     starting: Mutex<()>,
     outside: Outside,
-    /// The clocks of the dataset at the last moment: what a recording of this replay takes for its own.
+    /// The clocks of the dataset at the last moment: a recording of this replay takes them for its own.
     clock: Arc<Mutex<UtcPair>>,
     started: HostTime,
     cpu_millicores: AtomicU64,
@@ -182,7 +182,7 @@ impl Replay {
     /// the rules for their sets at the top of `replay/timeline.rs`.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`] when one of them is no dataset, when they contradict each other or the options make
+    /// [`ErrorKind::BadInput`] when one of them is not a dataset, when they contradict each other or the options make
     /// no sense, [`ErrorKind::NotFound`], [`ErrorKind::InUse`] when that rig is running, [`ErrorKind::NoSpace`].
     pub fn start(
         datasets: &[PathBuf],
@@ -195,7 +195,7 @@ impl Replay {
         if options.refine.is_some() && options.as_fast_as_possible {
             return Err(Error::new(
                 ErrorKind::BadInput,
-                "refined depth goes with a replay by the clock: of each camera the newest pair of pictures wins, and the \
+                "refined depth goes with a replay by the clock: of each camera the newest pair of images wins, and the \
                  others are skipped; leave out one of the two (depthrig cdm relabel refines every frame)",
             ));
         }
@@ -210,20 +210,21 @@ impl Replay {
         bus.clean_dead();
         let inner = Arc::new(Inner::new(config, datasets, options, timeline, sources));
         let player = Player::new(Arc::clone(&inner), Arc::clone(&bus))?;
-        let lanes = options.refine.map(|engine| refine::lanes(&inner, &bus, engine)).transpose()?;
+        let refinements =
+            options.refine.map(|engine| refine::refinements(&inner, &bus, engine)).transpose()?;
         let mut replay = Self { inner, threads: Vec::new(), api: None, _lock: held };
         if options.serve_api {
             replay.api = Some(api::serve(replay.control(), &runtime.socket_path(&rig), None)?);
         }
         let inner = Arc::clone(&replay.inner);
-        replay.spawn("house", move || keep_house(&inner, &bus))?;
-        if let Some(lanes) = lanes {
+        replay.spawn("housekeeping", move || housekeeping(&inner, &bus))?;
+        if let Some(refinements) = refinements {
             let inner = Arc::clone(&replay.inner);
             let cdm = inner.config.cdm.clone();
             let refiners = Arc::new(Installed::new(cdm.clone()));
-            let stage = Stage::new(Arc::clone(&inner.entrance), refiners, cdm, Arc::default());
-            lanes.iter().cloned().for_each(|lane| inner.entrance.enter(lane));
-            *lock(&inner.lanes) = lanes;
+            let stage = Stage::new(Arc::clone(&inner.intake), refiners, cdm, Arc::default());
+            refinements.iter().cloned().for_each(|refinement| inner.intake.add(refinement));
+            *lock(&inner.refinements) = refinements;
             replay.spawn("stage", move || stage.run(&inner.stop))?;
         }
         replay.spawn("replay", move || player.run())?;
@@ -290,11 +291,12 @@ impl Drop for Replay {
     }
 }
 
-/// What is left after `--from` and `--to`.
+/// The part of the timeline between `--from` and `--to`.
 fn part(all: &Timeline, options: &ReplayOptions) -> Result<Timeline> {
     let bad = |what: String| Err(Error::new(ErrorKind::BadInput, what));
     let usable = |s: &f64| s.is_finite() && *s >= 0.0;
-    let (from, to) = (options.from_s, options.to_s);
+    let from = options.from_s;
+    let to = options.to_s;
     if !from.iter().chain(&to).all(usable) || from > to.or(Some(f64::MAX)) {
         return bad("--from and --to are seconds after the first set, from before to".into());
     }
@@ -307,7 +309,7 @@ fn part(all: &Timeline, options: &ReplayOptions) -> Result<Timeline> {
     Ok(part)
 }
 
-/// The configuration that recordings of the replay are made with: as the defaults, colour and depth as the datasets have it.
+/// The configuration of recordings of the replay: as the defaults, colour and depth as the datasets have it.
 fn recording_config(sources: &mut Sources) -> RigConfig {
     let (color, depth) = sources.codecs();
     let recording = RecordingConfig { color, depth, ..RecordingConfig::default() };
@@ -363,8 +365,8 @@ impl Inner {
             unit_streams: sources.units().iter().map(unit).collect(),
             computed: sources.computed(),
             streams: sources.streams().iter().map(stream).collect(),
-            entrance: Arc::default(),
-            lanes: Mutex::default(),
+            intake: Arc::default(),
+            refinements: Mutex::default(),
             numbers: Mutex::new(Numbers {
                 lost: sources.problems().take(MAX_LOST).cloned().collect(),
                 ..Numbers::default()
@@ -441,7 +443,7 @@ fn profile(r: &StreamRecord) -> StreamProfile {
     }
 }
 
-/// The same of a motion unit.
+/// The same of an IMU.
 fn unit_profile(r: &MotionRecord) -> StreamProfile {
     StreamProfile {
         stream: r.id.stream.clone(),
@@ -458,13 +460,13 @@ fn unit_profile(r: &MotionRecord) -> StreamProfile {
     }
 }
 
-/// The house thread.
-fn keep_house(inner: &Inner, bus: &Bus) {
-    let house = House {
+/// Periodic housekeeping, on a thread of its own.
+fn housekeeping(inner: &Inner, bus: &Bus) {
+    let housekeeping = Housekeeping {
         recording: &inner.recording,
         reports: &inner.reports,
         bus,
         cpu_millicores: &inner.cpu_millicores,
     };
-    house.keep(|| inner.stopping(), || report::diagnostics(&inner.status()));
+    housekeeping.run(|| inner.stopping(), || report::diagnostics(&inner.status()));
 }

@@ -5,7 +5,7 @@
 //! camera threads    ── driver → gate → slot on the bus
 //! stage thread      ── bus → pairs of colour and depth → refine threads → bus
 //! set thread        ── bus → frame sets → bus, recorder
-//! house thread      ── once a second: dead subscribers, accounts into the file, CPU; ends a recording that is due
+//! housekeeping      ── once a second: dead subscribers, accounts into the file, CPU; ends a recording that is due
 //! API thread        ── HTTP on the rig's socket
 //! ```
 
@@ -18,10 +18,10 @@ use crate::api::{self, ServerHandle};
 use crate::camera::{Camera, Shared, Supervisor};
 use crate::config::{BackendConfig, RigConfig};
 use crate::control::{Control, RecordRequest};
-use crate::house::House;
+use crate::housekeeping::Housekeeping;
 use crate::recording::{self, Begun, Outside, Recording, Reports, StreamFacts, recover_left};
 use crate::sets::SpreadStats;
-use crate::stage::{Entrance, Installed, Refiners, Stage};
+use crate::stage::{Installed, Intake, Refiners, Stage};
 use crate::status::{CameraState, RecordingStatus, RigStatus, SetAccount};
 use crate::wake::Wake;
 use crate::{Error, ErrorKind, Result, priority};
@@ -42,16 +42,16 @@ use std::thread::JoinHandle;
 /// How often the supervisors look at their cameras.
 const STEP: Duration = Duration::from_millis(20);
 /// How long the start waits for cameras that answer slowly; they come in later all the same.
-const START_PATIENCE: Duration = Duration::from_secs(10);
+const START_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a recovery of old datasets gets to end; cut off it begins anew at the next start.
 const RECOVER_TIMEOUT: Duration = Duration::from_secs(2);
 /// How long one camera thread gets to end; with it the whole stop stays below a second.
-const STOP_PATIENCE: Duration = Duration::from_millis(500);
+const STOP_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Set to end a thread.
 type StopFlag = Arc<AtomicBool>;
 
-/// Told how far the pictures of synthetic cameras are rendered: camera, pictures done, pictures in all.
+/// Called with how far the images of synthetic cameras are rendered: camera, images done, images in all.
 pub type Progress = Box<dyn Fn(&str, usize, usize) + Send + Sync>;
 
 /// How a rig is to run.
@@ -60,17 +60,17 @@ pub struct RigOptions {
     pub runtime: RuntimeDir,
     /// Whether to serve the control API.
     pub serve_api: bool,
-    /// Where rendered pictures are kept; the configuration's folder when `None`.
+    /// Where rendered images are kept; the configuration's folder when `None`.
     pub cache_dir: Option<PathBuf>,
-    /// Told about long work before the start.
+    /// Called during long work before the start.
     pub progress: Option<Progress>,
     /// The disk that recordings are written to; tests put one that fails or stalls here.
     pub fs: Arc<dyn Fs>,
-    /// What places recordings in UTC; tests step it.
+    /// Source of UTC for recordings; tests step it.
     pub utc: UtcSource,
     /// Encoded bytes that may wait for the disk before sets are refused; the recorder's own limit when `None`.
     pub backlog_max_bytes: Option<u64>,
-    /// Where what refines depth comes from; tests put something that fails or hangs here. The engines and models of this
+    /// Source of refiners; tests put something that fails or hangs here. The engines and models of this
     /// computer when `None`.
     pub refiners: Option<Arc<dyn Refiners>>,
     /// Simulated cameras stream before their scenes are rendered, with coarse images until then.
@@ -94,14 +94,14 @@ impl RigOptions {
     }
 }
 
-/// What a rig says at its end.
+/// Summary of a rig at its end.
 #[derive(Debug, Clone, serde::Serialize)]
 pub struct RigSummary {
     /// Its last status.
     pub status: RigStatus,
-    /// What its last recording holds.
+    /// Summary of its last recording.
     pub recording: Option<depthrig_recorder::Summary>,
-    /// What was lost, in words; empty when nothing was.
+    /// Losses, in words; empty when nothing was lost.
     pub lost: Vec<String>,
 }
 
@@ -110,13 +110,13 @@ pub struct Rig {
     inner: Arc<Inner>,
     /// Each with the flag that ends it.
     threads: Vec<(JoinHandle<()>, StopFlag)>,
-    /// It reads what others put into the recording folder, so that nobody waits for it for long.
+    /// It reads files of others in the recording folder, so that nobody waits for it for long.
     recovery: Option<(JoinHandle<()>, StopFlag)>,
     api: Option<ServerHandle>,
     _lock: RigLock,
 }
 
-/// What the rig's threads share.
+/// State that the rig's threads share.
 pub struct Inner {
     config: RigConfig,
     shared: Arc<Shared>,
@@ -133,7 +133,7 @@ pub struct Inner {
     spreads: Mutex<SpreadStats>,
     set_accounts: Mutex<SetAccounts>,
     cpu_millicores: AtomicU64,
-    /// A recording is about to end: sets made from now on are not part of it.
+    /// A recording is about to end: sets assembled from now on are not part of it.
     closing: AtomicBool,
     /// Sets that wait for refined depth.
     held_sets: AtomicUsize,
@@ -167,7 +167,7 @@ impl Rig {
         let bus = Bus::open(&options.runtime, &config.rig)?;
         bus.clean_dead();
         prepare(&mut config, options)?;
-        let entrance = Arc::new(Entrance::default());
+        let intake = Arc::new(Intake::default());
         let refiners = options.refiners.clone();
         let refiners = refiners.unwrap_or_else(|| Arc::new(Installed::new(config.cdm.clone())));
         let drawing = options.draw_while_running.then(Arc::<Drawing>::default);
@@ -180,8 +180,8 @@ impl Rig {
             slots: config.bus.slots,
             began: HostTime::now(),
             supervisor: config.supervisor.clone(),
-            frames: Arc::new(Wake::with(Arc::clone(&entrance.bell))),
-            stage: entrance,
+            frames: Arc::new(Wake::with(Arc::clone(&intake.wake))),
+            stage: intake,
             bus,
         });
         let late_after_ns = live_late_ns((1e9 / config.sets.rate_hz) as i64);
@@ -210,7 +210,7 @@ impl Rig {
         });
         let assembly = Assembly::new(Arc::clone(&inner))?;
         let mut rig = Self { threads: Vec::new(), recovery: None, api: None, inner, _lock: lock };
-        // Before the cameras: what takes long at their start can be asked for.
+        // Before the cameras: a long start can then be asked about.
         if options.serve_api {
             let socket = options.runtime.socket_path(&rig.inner.config.rig);
             rig.api = Some(api::serve(rig.control(), &socket, rig.inner.config.control.tcp)?);
@@ -218,14 +218,16 @@ impl Rig {
         let inner = Arc::clone(&rig.inner);
         rig.spawn("supervisor", move |stop| supervise(&inner, stop))?;
         if rig.inner.config.cameras.iter().any(|c| c.refine.is_some()) {
-            let (config, shared) = (&rig.inner.config, &rig.inner.shared);
-            let (entrance, frames) = (Arc::clone(&shared.stage), Arc::clone(&shared.frames));
-            let stage = Stage::new(entrance, refiners, config.cdm.clone(), frames);
+            let config = &rig.inner.config;
+            let shared = &rig.inner.shared;
+            let intake = Arc::clone(&shared.stage);
+            let frames = Arc::clone(&shared.frames);
+            let stage = Stage::new(intake, refiners, config.cdm.clone(), frames);
             rig.spawn("stage", move |stop| stage.run(stop))?;
         }
         rig.spawn("sets", move |stop| assembly.run(stop))?;
         let inner = Arc::clone(&rig.inner);
-        rig.spawn("house", move |stop| keep_house(&inner, stop))?;
+        rig.spawn("housekeeping", move |stop| housekeeping(&inner, stop))?;
         if rig.inner.config.recording.recover_on_start {
             let inner = Arc::clone(&rig.inner);
             let recover = move |stop: &AtomicBool| recover_left(&inner.config, &inner.outside.fs, stop);
@@ -270,9 +272,9 @@ impl Rig {
         }
     }
 
-    /// Stops the rig: closes the recording, ends the cameras, and says what was lost.
+    /// Stops the rig: closes the recording, ends the cameras, and reports losses.
     pub fn stop(mut self) -> RigSummary {
-        // The recording first: its last sets are still being made.
+        // The recording first: its last sets are still being assembled.
         let active = lock(&self.inner.recording).is_active();
         if active && let Err(e) = self.inner.record_stop() {
             tracing::error!(error = %e, "the recording could not be closed");
@@ -300,7 +302,7 @@ impl Rig {
         if let Some((_, stop)) = &self.recovery {
             stop.store(true, Ordering::Relaxed);
         }
-        // In the order of `spawn`: the cameras end first, then the set thread reads what they left.
+        // In the order of `spawn`: the cameras end first, then the set thread reads their last frames.
         for (thread, stop) in self.threads.drain(..) {
             stop.store(true, Ordering::Relaxed);
             self.inner.shared.frames.raise();
@@ -324,7 +326,7 @@ impl Rig {
         Ok(())
     }
 
-    /// Says once what each camera that found too little shared memory says of its share.
+    /// Reports too little shared memory once, for all cameras together.
     fn check_memory(&self) -> Result<()> {
         let cameras = &self.inner.cameras;
         if !cameras.iter().any(|c| c.state().short_of_memory) {
@@ -333,13 +335,13 @@ impl Rig {
         let set_bytes: u64 = cameras.iter().map(|c| c.state().set_bytes).sum();
         let free = self.inner.shared.memory_share * cameras.len() as u64;
         shm::slots_that_fit(shm::MIN_SLOTS, set_bytes, free)?;
-        Ok(()) // it would do if the cameras were alike; each says what it lacks
+        Ok(()) // enough if the cameras were alike; each reports its own lack
     }
 
     /// Waits for the first word of every camera. One whose settings cannot work fails the start: better now
     /// than after an hour of recording without it.
     fn wait_for_cameras(&self) -> Result<()> {
-        let deadline = HostTime::now().plus(START_PATIENCE);
+        let deadline = HostTime::now().plus(START_TIMEOUT);
         while !deadline.from_now().is_zero()
             && self.inner.cameras.iter().any(|c| c.state().phase == CameraState::Opening)
         {
@@ -405,7 +407,7 @@ impl Inner {
     /// Waits until the sets that wait for refined depth are with the recorder.
     fn finish_held(&self) {
         self.closing.store(true, Ordering::Relaxed);
-        let deadline = HostTime::now().plus(join::PATIENCE);
+        let deadline = HostTime::now().plus(join::TIMEOUT);
         while self.held_sets.load(Ordering::Relaxed) > 0 && !deadline.from_now().is_zero() {
             std::thread::sleep(Duration::from_millis(5));
         }
@@ -541,19 +543,19 @@ fn supervise(inner: &Arc<Inner>, stop: &AtomicBool) {
     for s in &supervisors {
         s.request_stop();
     }
-    let deadline = HostTime::now().plus(STOP_PATIENCE);
+    let deadline = HostTime::now().plus(STOP_TIMEOUT);
     for s in &mut supervisors {
         s.stop(deadline.from_now());
     }
 }
 
-/// The house thread.
-fn keep_house(inner: &Inner, stop: &AtomicBool) {
-    let house = House {
+/// Periodic housekeeping, on a thread of its own.
+fn housekeeping(inner: &Inner, stop: &AtomicBool) {
+    let housekeeping = Housekeeping {
         recording: &inner.recording,
         reports: &inner.reports,
         bus: &inner.shared.bus,
         cpu_millicores: &inner.cpu_millicores,
     };
-    house.keep(|| stop.load(Ordering::Relaxed), || report::diagnostics(&report::status(inner)));
+    housekeeping.run(|| stop.load(Ordering::Relaxed), || report::diagnostics(&report::status(inner)));
 }

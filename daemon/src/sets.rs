@@ -1,11 +1,11 @@
 //! Frame sets: for every tick of the recording rate, the frame of each stream that lies nearest to it.
 //!
-//! The cameras of a mount run free, so no two frames are of one moment. A set is what comes closest:
+//! The cameras of a mount run free, so no two frames are of one moment. A set is the closest match:
 //! 1. Of each stream the frame nearest to the tick (of two equally near ones the earlier), if it lies within the
 //!    stream's tolerance: half its period and a millisecond, so that a running stream always has one.
 //! 2. A frame is in one set at most, and sets never cross: a later set never has an earlier frame of any stream.
 //! 3. A set is sent as soon as no frame still to come could change it, which is when every active stream has shown
-//!    a frame stamped at the tick or after it; or when `max_wait_ns` have passed since the tick, with what is there.
+//!    a frame stamped at the tick or after it; or when `max_wait_ns` have passed since the tick, with the frames it has.
 //!    A tick for which no stream has a frame makes no set.
 //! 4. Ticks are a period apart. With [`PhasePolicy::MinimiseSpread`] they move, never by more than half a period,
 //!    to where the frames of all streams lie closest together (for seven free cameras at 30 Hz this brings the mean
@@ -37,10 +37,10 @@ pub enum PhasePolicy {
     MinimiseSpread,
 }
 
-/// What sets are made of, and when. Times are nanoseconds.
+/// Rules for building sets. Times are nanoseconds.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AssemblerConfig {
-    /// Time between ticks, 1 ns to 1 h; [`Assembler::new`] moves what lies outside to the nearer end.
+    /// Time between ticks, 1 ns to 1 h; [`Assembler::new`] clamps it.
     pub period_ns: i64,
     /// How long after its tick a set waits for frames, 0 to 1 h, likewise.
     pub max_wait_ns: i64,
@@ -78,7 +78,7 @@ pub struct FrameSet<T> {
     pub tick: HostTime,
     /// One entry per stream; none where the stream is missing.
     pub members: Vec<Option<Member<T>>>,
-    /// Bit `i` is set when stream `i` is missing, for the first 64 streams; `members` tells for any number.
+    /// Bit `i` is set when stream `i` is missing, for the first 64 streams; `members` shows it for any number.
     pub missing: u64,
     /// Latest minus earliest capture time of the members, nanoseconds.
     pub spread_ns: i64,
@@ -102,7 +102,7 @@ pub struct Member<T> {
     pub skew_ns: i64,
 }
 
-/// What became of the frames of one stream: `pushed` is the sum of all the others.
+/// Accounts of the frames of one stream: `pushed` is the sum of all the others.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Account {
     /// Frames taken in.

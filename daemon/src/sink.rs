@@ -20,7 +20,7 @@ pub struct BusSink {
 struct Port {
     stream: Arc<Stream>,
     publisher: Arc<Publisher>,
-    /// The header of every frame; what changes per frame is filled in at commit.
+    /// The header of every frame; fields that change per frame are filled in at commit.
     template: FrameHeader,
     session: u64,
     loan: Option<FrameMut>,
@@ -55,7 +55,7 @@ impl Port {
         let mut template = self.template;
         if self.stream.profile.format.is_motion() {
             // A batch is as wide as it has samples.
-            template.set_picture(PixelFormat::Motion, payload_len / MOTION_SAMPLE_BYTES as u32, 1);
+            template.set_image(PixelFormat::Motion, payload_len / MOTION_SAMPLE_BYTES as u32, 1);
         }
         *frame.header_mut() = FrameHeader {
             sequence: books.delivered + 1,
@@ -115,7 +115,7 @@ impl FrameSink for BusSink {
 
     fn lend(&mut self, stream: usize, len: usize) -> Option<Loan> {
         let port = self.streams.get(stream)?;
-        // Its absence is the kernel's to notice: what it skips for want of memory is a gap in its counter.
+        // Its absence is the kernel's to notice: frames that it skips for want of memory are a gap in its counter.
         let lent = port.publisher.loan(len);
         lent.inspect_err(|e| tracing::debug!(stream = %port.stream.id, error = %e, "no slot"))
             .ok()
@@ -126,7 +126,7 @@ impl FrameSink for BusSink {
         let Some(port) = self.streams.get_mut(stream) else { return };
         match loan {
             Loan::Slot(frame) => port.publish(frame, meta),
-            // Not of this sink; what is not in a slot cannot be published without a copy.
+            // Not of this sink; a frame outside a slot cannot be published without a copy.
             Loan::Memory(_) => self.dropped(stream, DropReason::NoSlot, 1),
         }
         self.wake.raise();
@@ -144,20 +144,22 @@ impl FrameSink for BusSink {
         books.dropped.add(reason, n);
         // A camera that loses every frame must not fill the log: one line a second, the counts say the rest.
         if books.may_log_loss(HostTime::now()) {
-            let (id, total) = (&port.stream.id, books.dropped.total());
+            let id = &port.stream.id;
+            let total = books.dropped.total();
             tracing::error!(stream = %id, reason = reason.name(), frames = n, total, "frames lost");
         }
     }
 
-    fn gave_way(&mut self, stream: usize, n: u64) {
+    fn superseded(&mut self, stream: usize, n: u64) {
         let Some(port) = self.streams.get(stream) else { return };
         let Some(mut books) = port.books() else { return };
         books.dropped.add(DropReason::QueueFull, n);
-        if let Some(Reached { made_hz, of_hz }) = books.gave_way(HostTime::now()) {
-            let (id, reason) = (&port.stream.id, DropReason::QueueFull.name());
+        if let Some(Reached { reached_hz, of_hz }) = books.superseded(HostTime::now()) {
+            let id = &port.stream.id;
+            let reason = DropReason::QueueFull.name();
             tracing::info!(
                 stream = %id,
-                "computed at {made_hz:.1} of {of_hz:.1} Hz, the newest first; what gives way is counted as {reason}"
+                "computed at {reached_hz:.1} of {of_hz:.1} Hz, the newest first; skipped frames are counted as {reason}"
             );
         }
     }

@@ -1,4 +1,4 @@
-//! What the daemon says of itself: the one structure behind `status`, `top`, `/v1/status` and `/metrics`.
+//! Status of the daemon: the one structure behind `status`, `top`, `/v1/status` and `/metrics`.
 
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -51,7 +51,7 @@ pub struct PreparingStatus {
 pub struct ReplayStatus {
     /// The datasets' folders.
     pub datasets: Vec<String>,
-    /// Whether it waits for a command, or plays no more than the sets that it was told.
+    /// Whether it waits for a command, or plays no more than the requested sets.
     pub paused: bool,
     /// Whether everything was published.
     pub done: bool,
@@ -80,7 +80,7 @@ pub struct ReplayStatus {
     pub frames: u64,
     /// The channel whose subscribers keep it waiting for more than a second.
     pub waiting_for: Option<String>,
-    /// What could not be read or published, one line each (100 at most).
+    /// Data that could not be read or published, one line each (100 at most).
     pub lost: Vec<String>,
 }
 
@@ -155,12 +155,12 @@ pub struct CameraStatus {
     pub state_for_s: f64,
     /// Why it is in a state other than streaming.
     pub message: Option<String>,
-    /// What is wrong although it streams, such as a calibration that does not fit.
+    /// Problems although it streams, such as a calibration that does not fit.
     #[serde(default)]
     pub warnings: Vec<String>,
     /// Times it was lost and came back.
     pub reconnects: u64,
-    /// Its streams; those that are made of them come last.
+    /// Its streams; computed ones come last.
     pub streams: Vec<StreamStatus>,
     /// How its depth is refined; `None` when that is not asked for.
     #[serde(default)]
@@ -172,9 +172,9 @@ pub struct CameraStatus {
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum RefineState {
-    /// The engine is being made ready.
+    /// The engine is being started.
     Starting,
-    /// Pairs of pictures are refined as they come.
+    /// Pairs of images are refined as they come.
     Running,
     /// It does not go (the message says why); the engine is tried again with growing pauses.
     Failed,
@@ -204,9 +204,9 @@ pub struct RefineStatus {
     pub state: RefineState,
     /// How long it has been in this state, seconds.
     pub state_for_s: f64,
-    /// Why it does not run, or what of it is not as asked for.
+    /// Why it does not run, or how it differs from the settings.
     pub message: Option<String>,
-    /// What runs, such as `fill` or `onnxruntime 1.31.1 cpu fp32`; empty before anything did.
+    /// The engine that runs, such as `fill` or `onnxruntime 1.31.1 cpu fp32`; empty before any did.
     pub engine: String,
     /// The model; empty when the engine needs none.
     pub model: String,
@@ -214,7 +214,7 @@ pub struct RefineStatus {
     pub nominal_hz: f64,
     /// Rate over the last seconds, Hz.
     pub rate_hz: f64,
-    /// Pairs of pictures that were due and not refined, by reason: `busy`, `no_color`, `unfit`, `engine`, `hung`,
+    /// Pairs of images that were due and not refined, by reason: `busy`, `no_color`, `unfit`, `engine`, `hung`,
     /// `no_slot`; reasons that never were are left out.
     pub skipped: BTreeMap<String, u64>,
     /// Depth frames beyond the rate asked for.
@@ -232,7 +232,7 @@ pub struct RefineStatus {
 pub struct StreamStatus {
     /// `camera/stream`.
     pub id: String,
-    /// Whether it is made of other streams of the camera; captured are then the pairs of pictures that were due.
+    /// Whether it is computed from other streams of the camera; captured are then the pairs of images that were due.
     #[serde(default)]
     pub derived: bool,
     /// Pixel format.
@@ -245,7 +245,7 @@ pub struct StreamStatus {
     pub nominal_hz: f64,
     /// Rate delivered over the last seconds, Hz.
     pub rate_hz: f64,
-    /// Of a motion unit, whose frames are batches: samples a second, over the last seconds. `None` of pictures.
+    /// Of an IMU, whose frames are batches: samples a second, over the last seconds. `None` of images.
     #[serde(default)]
     pub samples_hz: Option<f64>,
     /// Frames the device captured.
@@ -262,7 +262,7 @@ pub struct StreamStatus {
     pub latency_p99_ms: f64,
     /// The clock map.
     pub clock: ClockStatus,
-    /// What became of its delivered frames in the set assembler.
+    /// Accounts of its delivered frames in the set assembler.
     pub in_sets: SetAccount,
 }
 
@@ -271,7 +271,7 @@ pub struct StreamStatus {
 pub struct ClockStatus {
     /// `device`, `kernel` or `arrival`.
     pub domain: String,
-    /// What the times come from: `full`, `header`, `kernel`, `arrival` or `simulated`
+    /// Source of the times: `full`, `header`, `kernel`, `arrival` or `simulated`
     /// ([`depthrig_bus::MetadataLevel`]).
     #[serde(default)]
     pub metadata: String,
@@ -292,13 +292,13 @@ pub struct ClockStatus {
     pub uncertain_frames: u64,
 }
 
-/// What became of a stream's frames in the set assembler; of a motion unit's batches in recordings:
+/// Accounts of a stream's frames in the set assembler; of an IMU's batches in recordings:
 /// `delivered = used + decimated + late + out_of_order + overflow + missed + pending + unread`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct SetAccount {
-    /// Became part of a set. Of a motion unit: went with a recorded set.
+    /// Became part of a set. Of an IMU: went with a recorded set.
     pub used: u64,
-    /// Between two ticks, as most frames are. Of a motion unit: came while nothing was recorded.
+    /// Between two ticks, as most frames are. Of an IMU: came while nothing was recorded.
     pub decimated: u64,
     /// Came after their set had been sent.
     pub late: u64,
@@ -396,7 +396,7 @@ pub struct RecordingStatus {
     pub disk_free_bytes: u64,
     /// Seconds left at the present rate; `None` before a rate is known.
     pub disk_seconds_left: Option<f64>,
-    /// What somebody should look at: little room left, a disk that does not answer.
+    /// A warning that needs attention: little room left, a disk that does not answer.
     #[serde(default)]
     pub warning: Option<String>,
 }

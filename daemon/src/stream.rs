@@ -1,7 +1,7 @@
-//! What the daemon keeps of one stream for as long as it lives, whatever happens to its camera.
+//! State of one stream that the daemon keeps for as long as it lives, whatever happens to its camera.
 //!
-//! The books are double-entry: `captured` is what the device announced, `delivered` and `dropped` are what
-//! became of it, and [`Books::close`] balances them when a hung thread is given up with a frame in its hands.
+//! The books are double-entry: `captured` is the number of frames that the device announced, `delivered` and `dropped`
+//! are their fates, and [`Books::close`] balances them when a hung thread is given up with a frame in its hands.
 
 use depthrig_bus::{
     DropCounts, DropReason, FrameFlags, HostTime, MetadataLevel, Publisher, StreamId, Subscriber,
@@ -13,7 +13,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Frames over which latency and rate are measured.
 const WINDOW: usize = 256;
-/// How long frames of a computed stream give way until the rate that is reached is told.
+/// How long frames of a computed stream are superseded until the rate that is reached is reported.
 const SETTLED_NS: i64 = 10_000_000_000;
 
 /// One stream of a rig.
@@ -43,7 +43,7 @@ pub struct Books {
     pub session: u64,
     /// The channel; it outlives the camera's sessions so that subscribers need not come back.
     pub publisher: Option<Arc<Publisher>>,
-    /// The set thread's end of the channel until that thread takes it. It is made before the first frame: a
+    /// The set thread's end of the channel until that thread takes it. It is created before the first frame: a
     /// publisher that sends while a subscriber is half made waits for it, half a second at worst.
     pub reader: Option<Subscriber>,
     /// When the newest frame was published.
@@ -56,7 +56,7 @@ pub struct Books {
     pub uncertainty_ns: u64,
     /// Frames flagged as uncertain in time.
     pub uncertain: u64,
-    /// What the times of the newest frame that had its metadata come from.
+    /// Source of the times of the newest frame that had its metadata.
     pub metadata: Option<MetadataLevel>,
     /// Frames whose metadata did not come.
     pub metadata_lost: u64,
@@ -65,26 +65,26 @@ pub struct Books {
     /// When the newest frames were published, how long after their capture, and how many samples each has.
     recent: VecDeque<(HostTime, i64, u32)>,
     loss_logged: Option<HostTime>,
-    gives_way: GivesWay,
+    superseding: Superseding,
 }
 
-/// Of a computed stream: since when its frames give way to newer ones, and whether that was said.
+/// Of a computed stream: since when newer frames supersede others, and whether that was reported.
 #[derive(Debug, Clone, Copy, Default)]
-enum GivesWay {
+enum Superseding {
     /// None did.
     #[default]
     Never,
     /// Since this moment, when so many frames were captured and delivered.
     Since(HostTime, u64, u64),
     /// It was said.
-    Said,
+    Reported,
 }
 
-/// How many frames of a computed stream are made, of how many that could be.
+/// How many frames of a computed stream are delivered, of how many that could be.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reached {
     /// Delivered, frames a second.
-    pub made_hz: f64,
+    pub reached_hz: f64,
     /// Captured, frames a second.
     pub of_hz: f64,
 }
@@ -110,9 +110,9 @@ impl Books {
     /// Begins a new opening of the camera and returns its number.
     pub fn begin_session(&mut self) -> u64 {
         self.session += 1;
-        if let GivesWay::Since(..) = self.gives_way {
+        if let Superseding::Since(..) = self.superseding {
             // The time without a camera must not count.
-            self.gives_way = GivesWay::Never;
+            self.superseding = Superseding::Never;
         }
         if self.session > 1 {
             self.epoch_base = self.epoch + 1;
@@ -120,8 +120,8 @@ impl Books {
         self.session
     }
 
-    /// Ends the present session against the will of its thread: the frame it was writing is lost, and what it
-    /// says from now on is not heard. Its publisher stays with it.
+    /// Ends the present session against the will of its thread: the frame it was writing is lost, and its
+    /// later reports are ignored. Its publisher stays with it.
     pub fn close(&mut self) {
         let pending = self.captured - self.delivered - self.dropped.total();
         self.dropped.add(DropReason::Abandoned, pending);
@@ -138,25 +138,25 @@ impl Books {
         may
     }
 
-    /// Notes that a frame of this stream, which is computed, gave way to a newer one at `now`. Returns what to tell of
-    /// it, once: the rate that was reached over the ten seconds since the first one, or a little more.
-    pub fn gave_way(&mut self, now: HostTime) -> Option<Reached> {
-        match self.gives_way {
-            GivesWay::Never => self.gives_way = GivesWay::Since(now, self.captured, self.delivered),
-            GivesWay::Since(since, captured, delivered) if now.since_ns(since) >= SETTLED_NS => {
-                self.gives_way = GivesWay::Said;
+    /// Notes that a frame of this computed stream was superseded by a newer one at `now`. Returns the report, once:
+    /// the rate that was reached over the ten seconds since the first one, or a little more.
+    pub fn superseded(&mut self, now: HostTime) -> Option<Reached> {
+        match self.superseding {
+            Superseding::Never => self.superseding = Superseding::Since(now, self.captured, self.delivered),
+            Superseding::Since(since, captured, delivered) if now.since_ns(since) >= SETTLED_NS => {
+                self.superseding = Superseding::Reported;
                 let hz = |n: u64| n as f64 * 1e9 / now.since_ns(since) as f64;
                 return Some(Reached {
-                    made_hz: hz(self.delivered - delivered),
+                    reached_hz: hz(self.delivered - delivered),
                     of_hz: hz(self.captured - captured),
                 });
             }
-            GivesWay::Since(..) | GivesWay::Said => {}
+            Superseding::Since(..) | Superseding::Reported => {}
         }
         None
     }
 
-    /// Notes a published frame; a batch of a motion unit has more than one sample.
+    /// Notes a published frame; a batch of an IMU has more than one sample.
     pub fn note(&mut self, published: HostTime, latency_ns: i64, samples: u32) {
         if self.recent.len() == WINDOW {
             self.recent.pop_front();
@@ -165,7 +165,7 @@ impl Books {
         self.last_frame = Some(published);
     }
 
-    /// Notes what the times of a published frame come from.
+    /// Notes the source of the times of a published frame.
     pub const fn note_metadata(&mut self, level: MetadataLevel, flags: FrameFlags) {
         if flags.has(FrameFlags::METADATA_LOST) {
             self.metadata_lost += 1;
@@ -188,17 +188,18 @@ impl Books {
         let from = now.plus_ns(-2_000_000_000);
         let mut recent = self.recent.iter().filter(|r| r.0 >= from);
         let (Some((first, ..)), Some((last, ..))) = (recent.next(), self.recent.back()) else { return 0.0 };
-        // Those of the first frame were made before it.
-        let (mut intervals, mut made) = (0.0_f64, 0.0);
+        // The samples of the first frame were taken before it.
+        let mut intervals = 0.0_f64;
+        let mut samples_sum = 0.0;
         for (_, _, samples) in recent {
             intervals += 1.0;
-            made += f64::from(weight(*samples));
+            samples_sum += f64::from(weight(*samples));
         }
         let span_ns = last.since_ns(*first) as f64;
         // A stream that just stopped must not look alive: from two missing frames on the silence counts.
         let silent = now.since_ns(*last) as f64 > 3.0 * span_ns / intervals.max(1.0);
         let span_ns = if silent { now.since_ns(*first) as f64 } else { span_ns };
-        if span_ns > 0.0 { made * 1e9 / span_ns } else { 0.0 }
+        if span_ns > 0.0 { samples_sum * 1e9 / span_ns } else { 0.0 }
     }
 
     /// The latency from capture to publish that a share of `quantile` of the last frames stayed below, ms.
@@ -228,13 +229,14 @@ mod tests {
     }
 
     #[test]
-    fn that_computed_frames_give_way_is_told_once_with_the_rate() {
+    fn superseded_computed_frames_are_reported_once_with_the_rate() {
         let mut books = Books::default();
         let at = |ms: i64| HostTime::from_ns(1_000_000_000 + ms * 1_000_000);
-        assert_eq!(books.gave_way(at(0)), None);
+        assert_eq!(books.superseded(at(0)), None);
         // The camera goes away for an hour, which is no time of computing.
         books.begin_session();
-        let (hour, mut told) = (3_600_000, Vec::new());
+        let hour = 3_600_000;
+        let mut reports = Vec::new();
         for i in 0..600 {
             books.captured += 1;
             if i % 4 == 3 {
@@ -242,10 +244,10 @@ mod tests {
                 continue;
             }
             books.dropped.add(DropReason::QueueFull, 1);
-            told.extend(books.gave_way(at(hour + i * 100 / 3)).map(|r| (i, r)));
+            reports.extend(books.superseded(at(hour + i * 100 / 3)).map(|r| (i, r)));
         }
-        let [(300, Reached { made_hz, of_hz })] = told[..] else { panic!("{told:?}") };
-        assert!((made_hz - 7.5).abs() < 0.1 && (of_hz - 30.0).abs() < 0.1, "{told:?}");
+        let [(300, Reached { reached_hz, of_hz })] = reports[..] else { panic!("{reports:?}") };
+        assert!((reached_hz - 7.5).abs() < 0.1 && (of_hz - 30.0).abs() < 0.1, "{reports:?}");
         assert!(books.may_log_loss(at(hour)), "no loss was logged");
     }
 

@@ -1,42 +1,42 @@
-//! A bell between threads: ringing it many times wakes the sleeper once.
+//! A wake-up signal between threads: raised many times, it wakes the waiter once.
 //!
-//! A mutex and not a lock-free queue, because camera threads ring it at real-time priority: one that met a queue
+//! A mutex and not a lock-free queue, because camera threads raise it at real-time priority: one that met a queue
 //! operation of a preempted ordinary thread would spin until the kernel's real-time throttling ended it, which costs
 //! a second of frames. On a mutex it sleeps, and the other thread runs.
 
 use core::time::Duration;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
-/// A bell.
+/// A wake-up signal.
 #[derive(Debug, Default)]
 pub struct Wake {
-    rung: Mutex<bool>,
-    bell: Condvar,
+    raised: Mutex<bool>,
+    condvar: Condvar,
     next: Option<Arc<Wake>>,
 }
 
 impl Wake {
-    /// A bell that rings `next` as well.
+    /// A signal that raises `next` as well.
     pub fn with(next: Arc<Self>) -> Self {
         Self { next: Some(next), ..Self::default() }
     }
 
-    /// Wakes the sleeper, now or when it next lies down.
+    /// Wakes the waiter; without one, the next `wait` returns at once.
     pub fn raise(&self) {
-        *self.rung.lock().unwrap_or_else(PoisonError::into_inner) = true;
-        self.bell.notify_one();
+        *self.raised.lock().unwrap_or_else(PoisonError::into_inner) = true;
+        self.condvar.notify_one();
         if let Some(next) = &self.next {
             next.raise();
         }
     }
 
-    /// Sleeps until the bell rings or `timeout` has passed.
+    /// Waits until the signal is raised or `timeout` has passed.
     pub fn wait(&self, timeout: Duration) {
-        let rung = self.rung.lock().unwrap_or_else(PoisonError::into_inner);
-        let (mut rung, _) = self
-            .bell
-            .wait_timeout_while(rung, timeout, |rung| !*rung)
+        let raised = self.raised.lock().unwrap_or_else(PoisonError::into_inner);
+        let (mut raised, _) = self
+            .condvar
+            .wait_timeout_while(raised, timeout, |raised| !*raised)
             .unwrap_or_else(PoisonError::into_inner);
-        *rung = false;
+        *raised = false;
     }
 }

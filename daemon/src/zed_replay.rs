@@ -1,9 +1,10 @@
 //! Depth for a recorded stereo camera, in several modes at once: `depthrig zed replay`.
 //!
-//! The raw eyes of a dataset, a folder of side-by-side pictures or an SVO2 file become a new dataset with rectified
-//! colour, and for each mode depth, confidence and, if asked for, disparity. Each pair is read and rectified once. The
-//! dataset grows beside its final name, segment by segment: a run that was killed goes on behind the last finished one.
-//! What the modes are and what they are not: docs/zed-replay.md.
+//! The raw left and right images of a dataset, a folder of side-by-side images or an SVO2 file become a new dataset with
+//! rectified colour, and for each mode depth, confidence and, if asked for, disparity. Each pair is read and rectified
+//! once. The dataset grows beside its final name, segment by segment: a run that was killed goes on behind the last
+//! finished one.
+//! The modes and their limits: docs/zed-replay.md.
 
 use depthrig_calib::stereo::Preset;
 use depthrig_recorder::fs::{Fs, RealFs};
@@ -17,11 +18,11 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+mod alignment;
 mod engine;
-mod eyes;
+mod images;
 mod input;
 mod modes;
-mod pictures;
 mod plan;
 mod record;
 mod work;
@@ -40,7 +41,7 @@ pub struct ZedReplayOptions {
     pub modes: Vec<Mode>,
     /// The network of [`Mode::Neural`].
     pub network: Option<NetworkChoice>,
-    /// Of a dataset with several stereo cameras the one that is meant; for other recordings what it is called.
+    /// Camera to process if the dataset has several; for other recordings the name to give the camera.
     pub camera: Option<String>,
     /// Record disparity as well.
     pub disparity: bool,
@@ -79,19 +80,19 @@ impl Default for ZedReplayOptions {
     }
 }
 
-/// What is being done.
+/// The step in progress.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Step {
-    /// Depth is made and written.
+    /// Depth is computed and written.
     Replay,
     /// The new dataset is proven.
     Verify,
 }
 
-/// Is told how far a step is, of how much, and may end the work.
+/// Called with the step, how far it is and of how much; may end the work.
 pub type ZedReplayProgress<'a> = &'a mut dyn FnMut(Step, u64, u64) -> ControlFlow<()>;
 
-/// What was made.
+/// Result of computing depth.
 #[derive(Debug, Serialize)]
 pub struct ZedReplayReport {
     /// The new dataset; it is not there when `ended`.
@@ -108,9 +109,9 @@ pub struct ZedReplayReport {
     pub lost: u64,
     /// The first of them, in words.
     pub problems: Vec<String>,
-    /// What one should know, in words.
+    /// Remarks, in words.
     pub notes: Vec<String>,
-    /// Sets that an earlier run had made.
+    /// Sets that an earlier run had written.
     pub resumed: u64,
     /// Pairs that this run worked on at once.
     pub jobs: usize,
@@ -120,12 +121,12 @@ pub struct ZedReplayReport {
     pub cpu: CpuReport,
     /// Whether it was ended from outside; run again, it goes on.
     pub ended: bool,
-    /// Whether the new dataset is whole.
+    /// Verification of the new dataset.
     pub verified: Option<VerifyReport>,
 }
 
 impl ZedReplayReport {
-    /// Counts what could not be read, and keeps it in words while there is room.
+    /// Counts unreadable data, and keeps it in words while there is room.
     fn lose(&mut self, problem: String) {
         self.lost += 1;
         if self.problems.len() < MAX_PROBLEMS {
@@ -139,7 +140,7 @@ impl ZedReplayReport {
 pub struct ModeReport {
     /// The end of its streams' names.
     pub mode: String,
-    /// What the recording calls it.
+    /// Its name in the recording.
     pub recorded_as: String,
     /// The program or network with its version.
     pub producer: String,
@@ -171,13 +172,14 @@ pub struct CpuReport {
     pub total_s: f64,
 }
 
-/// Makes depth of `input` in every mode and records it as the new dataset `out`. What is needed until then is in
+/// Computes depth of `input` in every mode and records it as the new dataset `out`. Intermediate files are in
 /// `OUT.zedreplay`.
 ///
 /// # Errors
-/// [`ErrorKind::BadRecording`] when the input is no recording, [`ErrorKind::BadInput`] when it has not two eyes with their
-/// calibration, when the eyes are swapped, and when a mode cannot be made; [`ErrorKind::AlreadyExists`] when `out` is there or what is left of another run does
-/// not fit; [`ErrorKind::InUse`] when another run works on it; and what reading and writing say.
+/// [`ErrorKind::BadRecording`] for an unsupported input, [`ErrorKind::BadInput`] when it has not left and right images
+/// with their calibration, when these are swapped, and when a mode is unavailable; [`ErrorKind::AlreadyExists`] when
+/// `out` is there or the remains of another run do not fit; [`ErrorKind::InUse`] when another run works on it; and
+/// errors of reading and writing.
 pub fn zed_replay(
     input: &Path,
     out: &Path,
@@ -192,14 +194,14 @@ pub fn zed_replay(
     depthrig_recorder::check_outside(out, input)?;
     let mut input = Input::open(input, options.camera.as_deref(), &options.open)?;
     let mut plan = Plan::new(&mut input, out, options)?;
-    let rows = eyes::check(&mut input, &plan.maker)?;
+    let rows = alignment::check(&mut input, &plan.maker)?;
     plan.take_rows(rows.as_ref());
     let fs: Arc<dyn Fs> = Arc::new(RealFs);
     let work = work::Work::open(out, &plan.identity(options))?;
     let mut report = plan.report(out);
     let copy = work.dataset();
-    let whole = Dataset::open(&copy).is_ok_and(|d| d.session().outcome.is_some());
-    if whole {
+    let complete = Dataset::open(&copy).is_ok_and(|d| d.session().outcome.is_some());
+    if complete {
         report.resumed = plan.facts.total;
     } else {
         let summary = record::record(&mut input, &mut plan, &fs, &copy, &mut report, progress)?;
@@ -210,7 +212,7 @@ pub fn zed_replay(
         if !summary.complete {
             let why = summary.lost.join("; ");
             let what =
-                format!("the dataset in {} is not whole: {why}; run it again to go on", copy.display());
+                format!("the dataset in {} is incomplete: {why}; run it again to go on", copy.display());
             return Err(Error::new(ErrorKind::Io, what));
         }
     }
@@ -228,7 +230,7 @@ pub fn zed_replay(
         );
         return Err(Error::new(ErrorKind::Corrupt, what));
     }
-    // What the recording lacks, this one lacks too.
+    // Data that the recording lacks, this one lacks too.
     verified.lost().for_each(|f| report.lose(f.message.clone()));
     let _ = progress(Step::Verify, 1, 1);
     (report.sets, report.bytes) = (verified.sets, verified.bytes);
@@ -244,21 +246,18 @@ fn check(options: &ZedReplayOptions) -> Result<()> {
     let bad = |what: String| Err(Error::new(ErrorKind::BadInput, what));
     let (near, far) = options.range_m;
     if !(near > 0.0 && near < far) {
-        return bad(format!("depth from {near} m to {far} m is no range; write metres, such as 0.3 and 20"));
+        return bad(format!("invalid depth range {near} m to {far} m; write metres, such as 0.3 and 20"));
     }
     if !(1e-6..=1.0).contains(&options.depth_unit_m) {
-        return bad(format!(
-            "a depth unit of {} m makes no sense; write metres, such as 0.001",
-            options.depth_unit_m
-        ));
+        return bad(format!("invalid depth unit {} m; write metres, such as 0.001", options.depth_unit_m));
     }
     for (n, mode) in options.modes.iter().enumerate() {
         if options.modes[..n].contains(mode) {
-            return bad(format!("mode {mode} is asked for twice"));
+            return bad(format!("mode {mode} is given twice"));
         }
     }
     if options.modes.is_empty() {
-        return bad("no mode is asked for; name one, such as quality".to_owned());
+        return bad("no mode is given; name one, such as quality".to_owned());
     }
     Ok(())
 }

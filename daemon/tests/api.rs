@@ -167,10 +167,10 @@ fn every_answer_of_a_live_server_fits_the_document() {
         (ErrorKind::PermissionDenied, 403),
         (ErrorKind::Other, 500),
     ] {
-        served.fake.fail_next(kind, "as told");
+        served.fake.fail_next(kind, "as scripted");
         let answer = served.post("/v1/record/start", "{}");
         check("POST", "/v1/record/start", &answer, wanted);
-        assert_eq!(answer.json()["error"]["message"], "as told");
+        assert_eq!(answer.json()["error"]["message"], "as scripted");
     }
     for call in ["pause", "resume", "seek", "step", "rate", "loop"] {
         let path = format!("/v1/replay/{call}");
@@ -193,11 +193,11 @@ fn every_answer_of_a_live_server_fits_the_document() {
             &served.post(&path, r#"{"unknown": 1}"#),
             if body == "{}" && !["seek", "step"].contains(&call) { 200 } else { 400 },
         );
-        served.fake.fail_next(ErrorKind::WrongState, "as told");
+        served.fake.fail_next(ErrorKind::WrongState, "as scripted");
         check("POST", &path, &served.post(&path, body), 409);
     }
     check("GET", "/v1/replay", &served.get("/v1/replay"), 200);
-    served.fake.fail_next(ErrorKind::NotFound, "as told");
+    served.fake.fail_next(ErrorKind::NotFound, "as scripted");
     check("POST", "/v1/replay/seek", &served.post("/v1/replay/seek", r#"{"id": 9}"#), 404);
     check("POST", "/v1/stop", &served.post("/v1/stop", ""), 202);
     assert!(served.fake.stop_was_asked());
@@ -234,7 +234,7 @@ fn a_client_steers_a_replay() {
     let client = Client::connect(&served.runtime, None).unwrap();
     let e = client.replay().unwrap_err();
     assert_eq!(e.kind(), ErrorKind::WrongState);
-    assert!(e.to_string().contains("is no replay"), "{e}");
+    assert!(e.to_string().contains("is not a replay"), "{e}");
     served.fake.become_replay();
     assert_eq!(client.replay().unwrap().set, None);
     client.replay_pause().unwrap();
@@ -312,7 +312,7 @@ fn web_pages_are_kept_out() {
     assert!(served.on_port(two).status >= 400);
     let none = "GET /v1/status HTTP/1.0\r\n\r\n";
     assert_eq!(served.on_port(none).status, 403);
-    // What a page of another origin may send without being allowed to: these types, and none at all.
+    // Types that a page of another origin may send without permission, and none at all.
     let simple = [
         "text/plain",
         "application/x-www-form-urlencoded",
@@ -367,7 +367,7 @@ fn a_dead_daemons_socket_is_replaced_and_nothing_else_is() {
     second.stop();
     std::fs::write(&path, "precious").unwrap();
     let e = api::serve(fake, &path, None).unwrap_err();
-    assert!(e.to_string().contains("a file that is no socket is in the way"), "{e}");
+    assert!(e.to_string().contains("a file that is not a socket is in the way"), "{e}");
     assert_eq!(std::fs::read_to_string(&path).unwrap(), "precious");
 }
 
@@ -447,9 +447,9 @@ fn the_client_says_and_hears_everything() {
         ErrorKind::Unreachable,
         ErrorKind::Other,
     ] {
-        served.fake.fail_next(kind, "as told");
+        served.fake.fail_next(kind, "as scripted");
         let e: Error = client.record_start(&request).unwrap_err();
-        assert_eq!((e.kind(), e.to_string().as_str()), (kind, "as told"));
+        assert_eq!((e.kind(), e.to_string().as_str()), (kind, "as scripted"));
     }
     client.stop().unwrap();
     assert!(served.fake.stop_was_asked());
@@ -467,7 +467,8 @@ fn the_client_says_and_hears_everything() {
 fn the_client_says_what_is_missing() {
     let tmp = tempfile::Builder::new().prefix("dr").rand_bytes(4).tempdir_in("/tmp").unwrap();
     let runtime = RuntimeDir::at(tmp.path()).unwrap();
-    let (a, b) = (RigName::new("a").unwrap(), RigName::new("b").unwrap());
+    let a = RigName::new("a").unwrap();
+    let b = RigName::new("b").unwrap();
     let fails = |rig: Option<&RigName>, kind: ErrorKind, says: &str| {
         let e = Client::connect(&runtime, rig).unwrap_err();
         assert_eq!(e.kind(), kind, "{e}");

@@ -1,4 +1,4 @@
-//! `depthrig import kinect`: a recording becomes a dataset that is whole, and nothing is decoded on the way.
+//! `depthrig import kinect`: a recording becomes a complete dataset, and nothing is decoded on the way.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{DropReason, Name, PixelFormat};
@@ -6,7 +6,7 @@ use depthrig_daemon::import_kinect::{KinectImport, KinectOptions};
 use depthrig_drivers::kinect::motion::CORRECTED;
 use depthrig_drivers::kinect::playback::CalibrationSource;
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
-use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Lacing, Pattern, Pictures, damage_time, motion};
+use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Images, Lacing, Pattern, damage_time, motion};
 use depthrig_recorder::exchange::{ImportFacts, ImportReport, Importer, import};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{
@@ -26,7 +26,7 @@ fn options(calibration: CalibrationSource) -> KinectOptions {
 
 fn run(path: &Path, out: &Path, calibration: CalibrationSource) -> Result<ImportReport> {
     let mut importer = KinectImport::open(path, options(calibration))?;
-    // As the program does it when it is not told otherwise.
+    // As the program does by default.
     let recorder = RecorderOptions { color: ColorCodec::Raw, ..RecorderOptions::default() };
     import(&mut importer, Arc::new(RealFs), out, recorder, &mut |p| {
         assert!(p.done <= p.total);
@@ -38,13 +38,14 @@ fn run(path: &Path, out: &Path, calibration: CalibrationSource) -> Result<Import
 fn a_recording_becomes_a_dataset_with_its_own_jpeg() {
     let dir = tempfile::tempdir().unwrap();
     let fixture = Fixture { captures: 12, lost: vec![5], depth_delay_ns: 160_000, ..Fixture::default() };
-    let (path, out) = (dir.path().join("a.mkv"), dir.path().join("out"));
+    let path = dir.path().join("a.mkv");
+    let out = dir.path().join("out");
     fixture.write(&path, &mut Pattern::new(&fixture)).unwrap();
     let report = run(&path, &out, CalibrationSource::Recorded).unwrap();
     assert!(report.verified.is_whole(), "{:?}", report.verified);
     assert_eq!((report.facts.lost, report.summary.complete), (0, true), "{:?}", report.facts);
-    let of_pictures = |a: &&StreamAccount| a.stream.stream.as_str() != "imu";
-    for account in report.facts.accounts.iter().filter(of_pictures) {
+    let of_images = |a: &&StreamAccount| a.stream.stream.as_str() != "imu";
+    for account in report.facts.accounts.iter().filter(of_images) {
         assert_eq!((account.captured, account.delivered), (12, 11), "{}", account.stream);
         assert_eq!(account.dropped.get(DropReason::DeviceGap), 1);
     }
@@ -60,7 +61,7 @@ fn a_recording_becomes_a_dataset_with_its_own_jpeg() {
     assert!((session.streams[1].intrinsics.cx - 332.78128).abs() < 1e-9);
     assert!((session.streams[0].pose.translation_m[0] - 0.032).abs() < 1e-3);
     assert_eq!(session.streams[0].serial, "000123456789");
-    let mut made = Pattern::new(&fixture);
+    let mut pattern = Pattern::new(&fixture);
     let mut reader = dataset.set_reader().unwrap();
     let there: Vec<u32> = (0..12).filter(|n| *n != 5).collect();
     assert_eq!(reader.times().len(), there.len());
@@ -75,10 +76,10 @@ fn a_recording_becomes_a_dataset_with_its_own_jpeg() {
             assert_eq!(f.header.capture_time_ns, BEGAN + (us * 1000 - fixture.start_offset_ns) as i64);
         }
         assert_eq!(set.spread_ns, 160_000);
-        assert!(set.frames[0].pixels == made.color(n), "the JPEG of {n} is not the recorder's own");
+        assert!(set.frames[0].pixels == pattern.color(n), "the JPEG of {n} is not the recorder's own");
         let words = |pixels: Vec<u16>| pixels.into_iter().flat_map(u16::to_le_bytes).collect::<Vec<_>>();
-        assert!(decoded.frames[1].pixels == words(made.depth(n)), "depth {n}");
-        assert!(decoded.frames[2].pixels == words(made.infrared(n)), "infrared {n}");
+        assert!(decoded.frames[1].pixels == words(pattern.depth(n)), "depth {n}");
+        assert!(decoded.frames[2].pixels == words(pattern.infrared(n)), "infrared {n}");
     }
 }
 
@@ -90,15 +91,16 @@ fn a_file_that_was_cut_gives_what_is_whole_and_says_so() {
     // A damaged cluster in the middle, and an end that is missing.
     bytes[written.clusters[3] as usize + 90_000] ^= 1;
     bytes.truncate(written.clusters[7] as usize + 1000);
-    let (path, out) = (dir.path().join("cut.mkv"), dir.path().join("out"));
+    let path = dir.path().join("cut.mkv");
+    let out = dir.path().join("out");
     std::fs::write(&path, bytes).unwrap();
     let report = run(&path, &out, CalibrationSource::Recorded).unwrap();
     assert!(lost_something(&report), "{:?}", report.verified);
     assert_eq!(report.facts.lost, 1);
-    let told = &report.facts.problems[0];
+    let problem = &report.facts.problems[0];
     assert!(
-        told.contains("at 2 places are damaged or cut off") && told.contains("the file was cut off"),
-        "{told}"
+        problem.contains("at 2 places are damaged or cut off") && problem.contains("the file was cut off"),
+        "{problem}"
     );
     let dataset = Dataset::open(&out).unwrap();
     assert_eq!(dataset.set_reader().unwrap().times().len(), 6);
@@ -108,7 +110,8 @@ fn a_file_that_was_cut_gives_what_is_whole_and_says_so() {
 fn without_a_calibration_it_says_what_to_do() {
     let dir = tempfile::tempdir().unwrap();
     let fixture = Fixture { calibration: None, captures: 2, ..Fixture::small() };
-    let (path, out) = (dir.path().join("bare.mkv"), dir.path().join("out"));
+    let path = dir.path().join("bare.mkv");
+    let out = dir.path().join("out");
     std::fs::write(&path, fixture.bytes()).unwrap();
     let e = run(&path, &out, CalibrationSource::Recorded).unwrap_err();
     assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains("no calibration.json"), "{e}");
@@ -117,7 +120,7 @@ fn without_a_calibration_it_says_what_to_do() {
     assert!(report.facts.stated.iter().any(|s| s.contains("no calibration")));
     std::fs::write(&path, b"<html>404</html>").unwrap();
     let e = run(&path, &dir.path().join("b"), CalibrationSource::Recorded).unwrap_err();
-    assert!(e.to_string().contains("no Matroska file"), "{e}");
+    assert!(e.to_string().contains("not a Matroska file"), "{e}");
 }
 
 /// Whether the dataset says itself that something did not come over; broken it never is.
@@ -128,7 +131,8 @@ fn lost_something(report: &ImportReport) -> bool {
 
 /// Writes `fixture` and imports it into a folder of this name.
 fn imported(dir: &Path, name: &str, fixture: &Fixture) -> (ImportReport, Dataset) {
-    let (path, out) = (dir.join(format!("{name}.mkv")), dir.join(name));
+    let path = dir.join(format!("{name}.mkv"));
+    let out = dir.join(name);
     fixture.write(&path, &mut Pattern::new(fixture)).unwrap();
     let report = run(&path, &out, CalibrationSource::Recorded).unwrap();
     assert_eq!(lost_something(&report), report.facts.lost > 0, "{name}: {:?}", report.verified);
@@ -175,19 +179,19 @@ fn every_colour_format_and_every_depth_mode_keeps_its_pixels() {
         let (report, dataset) = imported(dir.path(), name, &fixture);
         let session = dataset.session();
         assert_eq!(session.streams[0].format, first, "{name}");
-        let mut made = Pattern::new(&fixture);
+        let mut pattern = Pattern::new(&fixture);
         let sets = sets(&dataset, PixelMode::Decoded);
         assert_eq!((sets.len(), report.facts.lost), (3, 0), "{name}");
         for (set, n) in sets.iter().zip(0..) {
             assert_eq!(set.frames.len(), session.streams.len(), "{name}");
             for f in &set.frames {
                 let wanted = match session.streams[f.stream].id.to_string().as_str() {
-                    "kinect/depth" => words(made.depth(n)),
-                    "kinect/ir" => words(made.infrared(n)),
+                    "kinect/depth" => words(pattern.depth(n)),
+                    "kinect/ir" => words(pattern.infrared(n)),
                     _ if first == PixelFormat::Bgr8 => {
-                        made.color(n).chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect()
+                        pattern.color(n).chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect()
                     }
-                    _ => made.color(n),
+                    _ => pattern.color(n),
                 };
                 assert!(f.pixels == wanted, "{name}: {} of {n}", session.streams[f.stream].id);
             }
@@ -195,7 +199,7 @@ fn every_colour_format_and_every_depth_mode_keeps_its_pixels() {
     }
 }
 
-/// What the importer gives, before any recorder.
+/// The importer's output, before any recorder.
 fn handed_over(fixture: &Fixture, dir: &Path) -> (Session, Vec<RecordSet>, ImportFacts) {
     let path = dir.join("source.mkv");
     fixture.write(&path, &mut Pattern::new(fixture)).unwrap();
@@ -210,7 +214,7 @@ fn handed_over(fixture: &Fixture, dir: &Path) -> (Session, Vec<RecordSet>, Impor
 
 /// All samples come over, in order, with the values that the file was given, each with the first set that is not earlier.
 #[test]
-fn samples_of_motion_come_over_with_their_sets() {
+fn imu_samples_come_over_with_their_sets() {
     let dir = tempfile::tempdir().unwrap();
     for lacing in [Lacing::None, Lacing::Xiph, Lacing::Fixed, Lacing::Ebml] {
         // Depth is exposed before colour, so that the first samples are earlier than the first set.
@@ -226,7 +230,9 @@ fn samples_of_motion_come_over_with_their_sets() {
         let at = unit.pose.translation_m;
         let want = [-0.0015, -0.051, 0.0034];
         assert!(at.iter().zip(want).all(|(a, b)| (a - b).abs() < 1e-6), "{at:?}");
-        let (mut i, mut batches, mut last_tick) = (0u64, 0u64, i64::MIN);
+        let mut i = 0u64;
+        let mut batches = 0u64;
+        let mut last_tick = i64::MIN;
         for (n, set) in sets.iter().enumerate() {
             let is_last = n + 1 == sets.len();
             for batch in &set.motion {
@@ -277,12 +283,13 @@ fn samples_of_motion_come_over_with_their_sets() {
     assert!(!facts.stated.iter().any(|s| s.contains("gyroscope")) && facts.accounts.len() == 3);
 }
 
-/// A sample of another century is left out; those around it come over, and the dataset is whole.
+/// A sample of another century is left out; those around it come over, and the dataset is complete.
 #[test]
 fn a_sample_whose_time_is_damaged_is_left_out_alone() {
     let dir = tempfile::tempdir().unwrap();
     let fixture = Fixture { checksums: false, captures: 9, ..Fixture::small() };
-    let (path, out) = (dir.path().join("a.mkv"), dir.path().join("out"));
+    let path = dir.path().join("a.mkv");
+    let out = dir.path().join("out");
     fixture.write(&path, &mut Pattern::new(&fixture)).unwrap();
     damage_time(&path, &fixture, 70);
     let mut importer = KinectImport::open(&path, options(CalibrationSource::Recorded)).unwrap();
@@ -295,7 +302,7 @@ fn a_sample_whose_time_is_damaged_is_left_out_alone() {
 
 /// A dataset of a recording says how much of it came over.
 #[test]
-fn samples_of_motion_are_told_in_the_report_and_in_the_dataset() {
+fn imu_samples_are_told_in_the_report_and_in_the_dataset() {
     let dir = tempfile::tempdir().unwrap();
     let (report, dataset) = imported(dir.path(), "moved", &Fixture::small());
     let (_, written) = Fixture::small().bytes_and_places();
@@ -342,7 +349,7 @@ fn depth_that_is_exposed_long_after_colour_is_in_its_set() {
 }
 
 #[test]
-fn pictures_that_are_damaged_or_come_twice_are_in_the_accounts() {
+fn images_that_are_damaged_or_come_twice_are_in_the_accounts() {
     let dir = tempfile::tempdir().unwrap();
     let fixture = Fixture {
         captures: 6,
@@ -361,7 +368,8 @@ fn pictures_that_are_damaged_or_come_twice_are_in_the_accounts() {
     bytes[second] = 0;
     let last = bytes[written.clusters[4] as usize..written.clusters_end as usize].to_vec();
     bytes.splice(written.clusters_end as usize..written.clusters_end as usize, last);
-    let (path, out) = (dir.path().join("a.mkv"), dir.path().join("out"));
+    let path = dir.path().join("a.mkv");
+    let out = dir.path().join("out");
     std::fs::write(&path, bytes).unwrap();
     let report = run(&path, &out, CalibrationSource::Recorded).unwrap();
     assert!(lost_something(&report), "{:?}", report.verified);
@@ -373,9 +381,9 @@ fn pictures_that_are_damaged_or_come_twice_are_in_the_accounts() {
         assert_eq!((a.dropped.get(DropReason::DeviceGap), a.dropped.get(DropReason::OutOfOrder)), (1, 1));
     }
     assert_eq!(color.dropped.get(DropReason::WrongSize), 1);
-    // The damaged one and three repetitions are told, each with its place.
+    // The damaged one and three repetitions are reported, each with its place.
     assert_eq!(report.facts.lost, 4, "{:?}", report.facts.problems);
-    assert!(report.facts.problems[0].contains("kinect/color: the picture at"), "{:?}", report.facts.problems);
+    assert!(report.facts.problems[0].contains("kinect/color: the image at"), "{:?}", report.facts.problems);
     let dataset = Dataset::open(&out).unwrap();
     assert_eq!(dataset.session().extra["import"]["lost"].as_integer(), Some(4));
     let sets = sets(&dataset, PixelMode::Stored);
@@ -390,7 +398,8 @@ fn pictures_that_are_damaged_or_come_twice_are_in_the_accounts() {
 fn what_is_there_is_not_overwritten_and_an_import_may_be_ended() {
     let dir = tempfile::tempdir().unwrap();
     let fixture = Fixture { captures: 30, motion: true, ..Fixture::small() };
-    let (path, out) = (dir.path().join("a.mkv"), dir.path().join("out"));
+    let path = dir.path().join("a.mkv");
+    let out = dir.path().join("out");
     fixture.write(&path, &mut Pattern::new(&fixture)).unwrap();
     let mut importer = KinectImport::open(&path, options(CalibrationSource::Recorded)).unwrap();
     let mut seen = 0;
@@ -401,8 +410,8 @@ fn what_is_there_is_not_overwritten_and_an_import_may_be_ended() {
     .unwrap();
     assert!(report.ended && lost_something(&report), "{:?}", report.verified);
     let dataset = Dataset::open(&out).unwrap();
-    assert_eq!(dataset.set_reader().unwrap().times().len(), 10, "what was read until then");
-    // Accounts are of what is there, and what was read and is not there was left out.
+    assert_eq!(dataset.set_reader().unwrap().times().len(), 10, "as many as were read until then");
+    // Accounts are of the dataset; data that was read and is not in it was left out.
     let delivered: Vec<_> =
         report.facts.accounts.iter().map(|a| (a.stream.to_string(), a.captured, a.delivered)).collect();
     let in_sets = sets(&dataset, PixelMode::None);

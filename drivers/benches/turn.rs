@@ -1,14 +1,15 @@
-//! What unpacking an L515's pictures costs: turned depth against a plain copy and against the two loops of the rule.
+//! Cost of unpacking an L515's images: turned depth against a plain copy and against the two loops of the rule.
 #![allow(missing_docs)]
 
 use core::hint::black_box;
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use depthrig_drivers::unpack::{turn, y411};
 
-/// The rule as it is written: down a column of the picture for each row that came.
+/// The rule as it is written: down a column of the image for each row that came.
 fn two_loops(from: &[u8], columns: usize, to: &mut [u8]) {
     let rows = from.len() / (2 * columns);
-    let ((from, _), (to, _)) = (from.as_chunks::<2>(), to.as_chunks_mut::<2>());
+    let (from, _) = from.as_chunks::<2>();
+    let (to, _) = to.as_chunks_mut::<2>();
     for i in 0..rows {
         for j in 0..columns {
             to[(columns - 1 - j) * rows + rows - 1 - i] = from[i * columns + j];
@@ -25,7 +26,8 @@ fn benches(c: &mut Criterion) {
         group.bench_function("copy", |b| b.iter(|| to.copy_from_slice(black_box(&from))));
         group.bench_function("two loops", |b| b.iter(|| two_loops(black_box(&from), columns, &mut to)));
         group.bench_function("depth", |b| b.iter(|| turn::turn::<2>(black_box(&from), columns, &mut to)));
-        let (grey, out) = (&from[..columns * rows], &mut to[..columns * rows]);
+        let grey = &from[..columns * rows];
+        let out = &mut to[..columns * rows];
         group.bench_function("infrared", |b| b.iter(|| turn::turn::<1>(black_box(grey), columns, out)));
         let half = &from[..columns * rows / 2];
         group.bench_function("confidence", |b| {

@@ -22,7 +22,7 @@ use depthrig_drivers::realsense::protocol::metadata::{
 use depthrig_drivers::realsense::protocol::tables::{
     Coefficients, Header, Pinhole, RectifiedItem, RgbTable, SIZES,
 };
-use depthrig_drivers::zed::replay::made::MadeSvo;
+use depthrig_drivers::zed::replay::fake::FakeSvo;
 use std::path::{Path, PathBuf};
 
 const TURNED: [f32; 9] = [0.8, -0.6, 0.0, 0.6, 0.8, 0.0, 0.0, 0.0, 1.0];
@@ -32,7 +32,8 @@ fn coefficients() -> Coefficients {
         Coefficients { version: [3, 2], baseline_mm: -49.9, distortion_model: 1, ..Coefficients::default() };
     for (entry, size) in c.rectified.iter_mut().zip(SIZES) {
         if let Some((w, h)) = size {
-            let (w, h) = (w as f32, h as f32);
+            let w = w as f32;
+            let h = h as f32;
             *entry = Pinhole { fx: w * 0.5, fy: w * 0.5, ppx: w * 0.51, ppy: h * 0.49 };
         }
     }
@@ -69,7 +70,9 @@ fn headers() -> (Vec<u8>, Vec<u8>, Vec<u8>) {
     let mode =
         Configuration { width: Some(848), height: Some(480), trigger: Some(2), ..Configuration::default() };
     let l515 = L515DepthControl { laser_power: Some(9), ..L515DepthControl::default() };
-    let (timing, stats, mode) = (timing.build(), CaptureStats::default().build(), mode.build());
+    let timing = timing.build();
+    let stats = CaptureStats::default().build();
+    let mode = mode.build();
     let of = |blocks: &[Vec<u8>]| header.build(&blocks.concat()).unwrap();
     (
         of(&[timing.clone(), stats.clone(), depth.build(), mode.clone()]),
@@ -108,15 +111,14 @@ fn odd(mut table: Vec<u8>) -> Vec<u8> {
     table
 }
 
-/// What a process that serves a camera says, as the target `external` takes it: a byte for the kind of message first.
+/// Messages of a process that serves a camera, in the form the target `external` takes: first a byte for the kind.
 fn hand_shake(root: &Path) {
     let of = |kind: u8, bytes: Vec<u8>| [vec![kind], bytes].concat();
     let name = |n: &str| Name::new(n).unwrap();
-    let color = Mode::new(name("color"), PixelFormat::Rgb8, (64, 48), 30.0);
-    let depth =
-        Mode::new(name("depth"), PixelFormat::Z16, (64, 48), 30.0).with_device_clock(32, 1_000_000, 16);
+    let color = Mode::new(name("color"), PixelFormat::Rgb8, 64, 48, 30.0);
+    let depth = Mode::new(name("depth"), PixelFormat::Z16, 64, 48, 30.0).with_device_clock(32, 1_000_000, 16);
     let lens = Intrinsics::pinhole(50.0, 51.0, 31.5, 23.5);
-    let jpeg = Mode { intrinsics: lens, ..Mode::new(name("jpeg"), PixelFormat::Mjpeg, (64, 48), 15.0) };
+    let jpeg = Mode { intrinsics: lens, ..Mode::new(name("jpeg"), PixelFormat::Mjpeg, 64, 48, 15.0) };
     let stamped = Mode { clock: ExternalClock::Host, ..color.clone() };
     let about =
         About { model: "Fake".into(), serial: "7".into(), program: "seed".into(), ..About::default() };
@@ -221,11 +223,11 @@ fn main() {
     let every = r#"{"groups": {"census_radius": [9, 9], "ae_control": [400], "hdad": [26.0, 800.0, 0], "rsm": [0, 3.8, 1, 71]}}"#;
     put(&root, "realsense_preset", "groups", every.as_bytes());
 
-    let svo = MadeSvo { per_chunk: 2, ..MadeSvo::strips((16, 16), 3) };
+    let svo = FakeSvo { per_chunk: 2, ..FakeSvo::strips((16, 16), 3) };
     put(&root, "zed_svo2", "chunks", &svo.build());
-    put(&root, "zed_svo2", "no_index", &MadeSvo { indexed: false, ..svo.clone() }.build());
-    put(&root, "zed_svo2", "loose", &MadeSvo { chunked: false, ..svo }.build());
-    put_found(&root, "zed_svo2", "h264", &MadeSvo::h264((16, 16), 4).build());
+    put(&root, "zed_svo2", "no_index", &FakeSvo { indexed: false, ..svo.clone() }.build());
+    put(&root, "zed_svo2", "loose", &FakeSvo { chunked: false, ..svo }.build());
+    put_found(&root, "zed_svo2", "h264", &FakeSvo::h264((16, 16), 4).build());
 }
 
 /// A seed, which must reach something.

@@ -19,7 +19,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     let configs: Vec<_> = names.iter().enumerate().map(|(i, name)| config(name, i, &out)).collect();
     std::fs::create_dir_all(&out)?;
 
-    let (began, cpu) = (HostTime::now(), depthrig_bus::clock::process_cpu_ns());
+    let began = HostTime::now();
+    let cpu = depthrig_bus::clock::process_cpu_ns();
     prepare_all(&configs, &|_, _| ())?;
     let cpu_s = (depthrig_bus::clock::process_cpu_ns() - cpu) as f64 * 1e-9;
     println!("rendered in {:.1} s, {cpu_s:.1} s of CPU", began.elapsed().as_secs_f64());
@@ -67,7 +68,8 @@ fn paint(z16: &[u8], unit_m: f64) -> Vec<u8> {
         // Even steps of 1/z, as a stereo camera sees them.
         let z = f64::from(counts) * unit_m;
         let far = ((1.0 / 0.3 - 1.0 / z) / (1.0 / 0.3 - 1.0 / 1.8)).clamp(0.0, 1.0) * 4.999;
-        let (a, b) = (anchors[far as usize], anchors[far as usize + 1]);
+        let a = anchors[far as usize];
+        let b = anchors[far as usize + 1];
         core::array::from_fn(|c| (f64::from(a[c]) + (f64::from(b[c]) - f64::from(a[c])) * far.fract()) as u8)
     };
     z16.chunks_exact(2).flat_map(|b| color(u16::from_le_bytes([b[0], b[1]]))).collect()

@@ -1,6 +1,6 @@
 //! One thread per camera: opens it, polls it, and can be given up when the device makes it hang.
 //!
-//! Whatever a device does, [`Capture::stop`] returns within its patience. A thread that does not end by then
+//! Whatever a device does, [`Capture::stop`] returns within its timeout. A thread that does not end by then
 //! is *abandoned*: it is left behind, and if it ever wakes, nothing that it still holds is published.
 
 use crate::clock::ClockQuality;
@@ -15,9 +15,9 @@ use std::thread::JoinHandle;
 /// How long one poll waits; also how late a stop request is noticed at the most.
 const POLL_TIMEOUT: Duration = Duration::from_millis(50);
 
-/// What the opening step of a camera thread yields.
+/// Result of the opening step of a camera thread.
 pub struct Session {
-    /// What the device says of itself.
+    /// Description of the device, as it reports it.
     pub info: DeviceInfo,
     /// The running device.
     pub stream: Box<dyn Stream>,
@@ -36,12 +36,12 @@ pub enum End {
     Failed(Error),
 }
 
-/// What [`Capture::stop`] came to.
+/// Outcome of [`Capture::stop`].
 #[derive(Debug)]
 pub enum StopOutcome {
     /// The thread is gone.
     Ended(End),
-    /// The device made the thread hang; it was left behind and may publish nothing any more.
+    /// The device made the thread hang; it was left behind and can no longer publish anything.
     Abandoned,
 }
 
@@ -107,7 +107,7 @@ impl Capture {
         HostTime::from_ns(self.shared.heartbeat_ns.load(Ordering::Relaxed))
     }
 
-    /// When a frame was last delivered or dropped, of a camera with pictures a picture; `None` before the first.
+    /// When a frame was last delivered or dropped, of a camera with images an image; `None` before the first.
     pub fn last_frame(&self) -> Option<HostTime> {
         match self.shared.last_frame_ns.load(Ordering::Relaxed) {
             0 => None,
@@ -125,10 +125,10 @@ impl Capture {
         self.shared.stop.store(true, Ordering::Relaxed);
     }
 
-    /// Ends the thread, waiting for at most `patience`.
-    pub fn stop(mut self, patience: Duration) -> StopOutcome {
+    /// Ends the thread, waiting for at most `timeout`.
+    pub fn stop(mut self, timeout: Duration) -> StopOutcome {
         self.request_stop();
-        let deadline = HostTime::now().plus(patience);
+        let deadline = HostTime::now().plus(timeout);
         let mut end = self.shared.end.lock().unwrap_or_else(PoisonError::into_inner);
         while end.is_none() {
             let left = deadline.from_now();
@@ -165,9 +165,9 @@ fn run(open: impl FnOnce() -> Result<Session>, shared: &Shared) -> End {
         Ok(session) => session,
         Err(e) => return End::Failed(e),
     };
-    // Of a camera that has pictures these say whether it runs: its motion unit talks on when it sends none.
-    let has_pictures = stream.profiles().iter().any(|p| !p.format.is_motion());
-    let counts = stream.profiles().iter().map(|p| !(has_pictures && p.format.is_motion())).collect();
+    // Of a camera that has images these say whether it runs: its IMU talks on when it sends none.
+    let has_images = stream.profiles().iter().any(|p| !p.format.is_motion());
+    let counts = stream.profiles().iter().map(|p| !(has_images && p.format.is_motion())).collect();
     let mut guarded = Guarded { sink: sink.as_mut(), shared, counts };
     while !shared.stop.load(Ordering::Relaxed) {
         shared.beat();
@@ -242,12 +242,12 @@ impl FrameSink for Guarded<'_> {
         self.sink.dropped(stream, reason, n);
     }
 
-    fn gave_way(&mut self, stream: usize, n: u64) {
+    fn superseded(&mut self, stream: usize, n: u64) {
         self.note_frame(stream);
         if self.is_abandoned() {
             self.sink.dropped(stream, DropReason::Abandoned, n);
         } else {
-            self.sink.gave_way(stream, n);
+            self.sink.superseded(stream, n);
         }
     }
 

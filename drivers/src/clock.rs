@@ -6,19 +6,19 @@
 //! in it. A mean or a least-squares fit would follow the late ones (measured: 1.3 ms to 24 ms at p99, against
 //! 5 µs). The method is that of Moon, Skelly and Towsley (1999) and Zhang, Liu and Xia (2002).
 //!
-//! What one-way stamps can never tell is that least latency itself. Until [`ClockMap::probe`] is called or
+//! One-way stamps cannot reveal that least latency itself. Until [`ClockMap::probe`] is called or
 //! [`ClockConfig::latency_ns`] is set, capture times are late by it (commonly 1 ms to 20 ms with USB, the same for
 //! every frame) and [`ClockQuality::latency_known`] is false. [`Mapped::uncertainty_ns`] leaves it out then, and
-//! covers the truth itself afterwards. For the same reason a latency that changes for good cannot be told from a
-//! clock that stepped: up to 20 ms the map follows within a window, above that it starts a new epoch.
+//! covers the truth itself afterwards. For the same reason a latency that changes for good cannot be distinguished
+//! from a clock that stepped: up to 20 ms the map follows within a window, above that it starts a new epoch.
 //!
 //! Invariants, whatever the device sends:
 //! 1. Within an epoch capture times never run backwards, and no capture time is later than its frame's arrival.
 //! 2. Between frames of a warm epoch the line moves by at most 200 µs per second of time, unless it must fall
 //!    to keep 1.
 //! 3. A frame whose device time is in doubt (clock step, restart, backward stamp) carries
-//!    [`FrameFlags::TIME_UNCERTAIN`]; the decision takes five frames. So does one of a device that is asked for its clock
-//!    ([`ClockMap::expect_probes`]) and has not answered yet.
+//!    [`FrameFlags::TIME_UNCERTAIN`]; the decision takes five frames. So does one of a device that is asked for its
+//!    clock ([`ClockMap::expect_probes`]) and has not answered yet.
 //! 4. Memory is bounded, and a frame costs amortised constant time.
 
 mod hull;
@@ -40,9 +40,9 @@ use unwrap::Counter;
 const STEP_NS: i64 = 20_000_000;
 /// Frames that decide a restart, and frames of a new epoch until its times are called certain.
 const DECIDING_FRAMES: usize = 5;
-/// What two crystals may drift against each other while no frame comes.
+/// Largest drift of two crystals against each other while no frame comes.
 const PAUSE_DRIFT: f64 = 20e-6;
-/// Rates beyond this are no crystal but a bad edge of the hull.
+/// Largest rate of a crystal; beyond it the edge of the hull is bad.
 const MAX_RATE: f64 = 500e-6;
 /// How fast a published line may move to where it should be.
 const SLEW: f64 = 200e-6;
@@ -65,7 +65,7 @@ struct Seen {
     arrival: HostTime,
 }
 
-/// What belongs to the epoch in force and ends with it.
+/// State of the epoch in force; it ends with the epoch.
 #[derive(Debug)]
 struct Epoch {
     first: Seen,
@@ -179,9 +179,9 @@ impl ClockMap {
         mapped
     }
 
-    /// Says that probes of this device will come. Until the first one has, its frames carry
-    /// [`FrameFlags::TIME_UNCERTAIN`]: they may be late by a latency that only a probe can tell, such as the queue of a
-    /// computer that is busy when the camera starts.
+    /// Announces that probes of this device will come. Until the first one, its frames carry
+    /// [`FrameFlags::TIME_UNCERTAIN`]: they may be late by a latency that only a probe can measure, such as the queue
+    /// of a computer that is busy when the camera starts.
     pub const fn expect_probes(&mut self) {
         self.is_asked = true;
     }
@@ -321,7 +321,7 @@ impl ClockMap {
         }
     }
 
-    /// What the line itself may be off by, nanoseconds.
+    /// Largest error of the line itself, nanoseconds.
     fn line_claim_ns(&self, epoch: &Epoch) -> f64 {
         let tick_ns = self.config.tick_ns;
         // A median of exponential jitter is ln 2 of its mean; real jitter has a median, whatever its mean.
@@ -406,7 +406,7 @@ impl ClockMap {
         // While frames pause, the two crystals drift.
         let paused = (dx - 4.0 * period).max(0.0) * PAUSE_DRIFT / 10.0;
         let mut uncertainty = self.claim_ns + owed + forced_ns + suspect_ns + bound + paused;
-        // A stamp not later than the one before is no stamp; the truth may be anywhere up to the arrival.
+        // A stamp not later than the one before is invalid; the truth may be anywhere up to the arrival.
         let backward = dx <= 0.0 && epoch.frames > 1;
         if backward {
             uncertainty += seen.arrival.since_ns(capture) as f64;

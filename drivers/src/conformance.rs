@@ -1,7 +1,7 @@
-//! What every back end must do, as a suite that runs against any of them.
+//! Conformance suite: the behaviour that every backend must have, as tests that run against any of them.
 //!
-//! Implement [`Subject`] for the back end: how to make a device of it, how to make that device fail in each of
-//! the ways that it can, and what the device knows about the frames it sent. Then, in a test of the back end:
+//! Implement [`Subject`] for the backend: how to make a device of it, how to make that device fail in each of
+//! the ways that it can, and the device's own record of the frames it sent. Then, in a test of the backend:
 //!
 //! ```no_run
 //! use depthrig_drivers::conformance::{self, Subject};
@@ -24,31 +24,31 @@ use depthrig_bus::{DropCounts, HostTime};
 mod cases;
 mod probe;
 
-/// A back end under test.
+/// A backend under test.
 pub trait Subject {
-    /// What reports call it.
+    /// Its name in reports.
     fn name(&self) -> String;
 
-    /// A fresh back end with exactly one device, which has not failed yet and will deliver at least some
+    /// A fresh backend with exactly one device, which has not failed yet and will deliver at least some
     /// seconds of frames, with the means to make that device fail.
     fn make(&self) -> Bench;
 }
 
 /// One device of the subject on the bench.
 pub struct Bench {
-    /// The back end.
+    /// The backend.
     pub backend: Box<dyn Backend>,
     /// Serial number of the device.
     pub serial: String,
-    /// What to start; empty for the default modes. A motion unit that is not among them is started for the case `motion`.
+    /// Streams to start; empty for the default modes. An IMU that is not among them is started for the case `motion`.
     pub requests: Vec<StreamRequest>,
-    /// The hands that make it fail, and the eyes that see what it does.
+    /// Fault injection and ground truth for the device.
     pub rig: Box<dyn Rig>,
 }
 
-/// Hands and eyes of a test on a device.
+/// Fault injection and ground truth for a device under test.
 ///
-/// What a subject cannot do says so with `None` or [`Cannot`]; the case is then reported as not applicable.
+/// A subject answers `None` or [`Cannot`] where it has no means; the case is then reported as not applicable.
 pub trait Rig {
     /// Makes `trouble` happen now.
     ///
@@ -56,7 +56,7 @@ pub trait Rig {
     /// [`Cannot`] with the reason when this device cannot fail in this way.
     fn cause(&self, trouble: Trouble) -> Result<(), Cannot>;
 
-    /// What the device knows it did with the frames of a stream since it was last started.
+    /// The device's own record of what it did with the frames of a stream since it was last started.
     fn sent(&self, stream: usize) -> Option<Sent>;
 
     /// True mid-exposure of the frame of a stream that arrived at `arrival`, and by how much the clock map may
@@ -98,7 +98,7 @@ pub enum Trouble {
     Busy(Duration),
 }
 
-/// What a device did with the frames of one stream.
+/// A device's record of the frames of one stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Sent {
     /// Frames that the host could know of.
@@ -120,10 +120,10 @@ pub enum Verdict {
     NotApplicable(String),
 }
 
-/// The verdicts on a back end.
+/// The verdicts on a backend.
 #[derive(Debug)]
 pub struct Report {
-    /// The back end.
+    /// The backend.
     pub subject: String,
     /// Every case with its verdict, in the order of the suite.
     pub verdicts: Vec<(&'static str, Verdict)>,

@@ -25,7 +25,7 @@ pub trait Backend: Send {
 
 /// An open camera that is not streaming.
 pub trait Device: Send {
-    /// What the device says of itself.
+    /// Description of the device, as it reports it.
     fn info(&self) -> &DeviceInfo;
 
     /// Every stream mode the device can deliver.
@@ -41,7 +41,7 @@ pub trait Device: Send {
 
 /// A streaming camera. Dropping it stops the device.
 pub trait Stream: Send {
-    /// What is being delivered; the index into this list is the `stream` of every [`FrameSink`] call.
+    /// The streams that are delivered; the index into this list is the `stream` of every [`FrameSink`] call.
     fn profiles(&self) -> &[StreamProfile];
 
     /// Waits at most `timeout` for the device, then hands every frame that is ready to `sink`.
@@ -51,12 +51,12 @@ pub trait Stream: Send {
     ///
     /// # Errors
     /// [`ErrorKind::Disconnected`], [`ErrorKind::Protocol`], [`ErrorKind::Io`], [`ErrorKind::BadInput`]:
-    /// after any of them the stream is of no more use and must be dropped. A damaged frame is no error, it is
-    /// a counted drop.
+    /// after any of them the stream is unusable and must be dropped. A damaged frame is not an error but a
+    /// counted drop.
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll>;
 }
 
-/// What a [`Stream::poll`] came back with.
+/// Result of [`Stream::poll`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Poll {
     /// At least one frame came, delivered or dropped.
@@ -67,23 +67,23 @@ pub enum Poll {
     End,
 }
 
-/// What a device says of itself.
+/// Description of a device, as it reports it.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct DeviceInfo {
     /// Name of its [`Backend`].
     pub backend: &'static str,
     /// Model, such as `D435`.
     pub model: String,
-    /// Serial number; what tells two cameras of a model apart.
+    /// Serial number; distinguishes two cameras of a model.
     pub serial: String,
-    /// Firmware version; empty when there is none.
+    /// Firmware version; empty if unknown.
     pub firmware: String,
     /// Where it is attached: USB port path, folder, …
     pub port: String,
     /// Where its calibration comes from: `factory`, `simulated`, `file …`, `none`.
     pub calibration: String,
-    /// Whether its IMU's samples are corrected for bias and scale, and with which numbers, in words for a dataset; empty
-    /// when it has no IMU or nothing is known.
+    /// Whether its IMU's samples are corrected for bias and scale, and with which numbers, in words for a dataset;
+    /// empty when it has no IMU or nothing is known.
     pub motion: String,
 }
 
@@ -94,13 +94,13 @@ pub struct StreamProfile {
     pub stream: StreamName,
     /// Pixel format.
     pub format: PixelFormat,
-    /// Pixels per row; of a motion unit the most samples of a batch.
+    /// Pixels per row; of an IMU the most samples of a batch.
     pub width: u32,
-    /// Rows; 1 of a motion unit.
+    /// Rows; 1 of an IMU.
     pub height: u32,
-    /// Nominal frame rate; of a motion unit full batches a second.
+    /// Nominal frame rate; of an IMU full batches a second.
     pub rate_hz: f64,
-    /// Metres per unit of depth; 0 when the pixels are no depth.
+    /// Metres per unit of depth; 0 when the pixels are not depth.
     pub depth_unit_m: f64,
     /// Intrinsics at this size.
     pub intrinsics: Intrinsics,
@@ -110,7 +110,7 @@ pub struct StreamProfile {
     pub clock: DeviceClock,
     /// Width of the device's frame counter in bits.
     pub sequence_bits: u32,
-    /// What the frames' times come from. Of a device that is not started it is the best that can be hoped for; the
+    /// Source of the frames' times. Of a device that is not started it is the best that can be hoped for; the
     /// running stream knows what the kernel granted.
     pub metadata: MetadataLevel,
 }
@@ -126,12 +126,12 @@ impl StreamProfile {
         (1e9 / self.rate_hz).round() as u64
     }
 
-    /// Most samples a second of a motion unit.
+    /// Most samples a second of an IMU.
     pub fn samples_hz(&self) -> f64 {
         self.rate_hz * f64::from(self.width)
     }
 
-    /// `depth 1280x720 z16 30 Hz`, for messages; of a motion unit `imu motion 200 Hz in batches of up to 8`.
+    /// `depth 1280x720 z16 30 Hz`, for messages; of an IMU `imu motion 200 Hz in batches of up to 8`.
     pub fn describe(&self) -> String {
         let Self { stream, width, height, rate_hz, .. } = self;
         if self.format.is_motion() {

@@ -1,10 +1,10 @@
 //! The error of a driver: a kind that the supervisor acts on, what happened, and to which device.
 
-/// What went wrong, as the supervisor needs to know it.
+/// Kind of an error, as the supervisor needs to know it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[non_exhaustive]
 pub enum ErrorKind {
-    /// No such device, file or folder.
+    /// The device, file or folder does not exist.
     NotFound,
     /// Somebody else holds the device.
     Busy,

@@ -1,16 +1,16 @@
 //! Cameras that another process serves over the bus: docs/external.md.
 //!
-//! The process is never believed: its offer is checked field by field, each frame against its mode, and how it stands by
-//! its heart-beat and by a lock that the kernel frees with it. Nothing here waits for it without a limit. What it sends is
-//! copied once, into the slot that subscribers read.
+//! The process is never believed: its offer is checked field by field, each frame against its mode, and its liveness
+//! by its heart-beat and by a lock that the kernel frees with it. Nothing here waits for it without a limit. What it
+//! sends is copied once, into the slot that subscribers read.
 
 mod backend;
 pub(crate) mod device;
 pub(crate) mod facts;
 mod intake;
 mod log;
-mod pace;
 mod process;
+mod rate_limiter;
 mod stream;
 
 pub use backend::ExternalBackend;
@@ -20,13 +20,13 @@ use core::time::Duration;
 use depthrig_bus::external::{Beat, ExternalReason};
 use std::path::PathBuf;
 
-/// The back end's name in a rig file.
+/// The backend's name in a rig file.
 pub const NAME: &str = "external";
 
 /// How a camera is served.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ExternalConfig {
-    /// What to start, with its arguments; empty when somebody else starts it.
+    /// Program to start, with its arguments; empty when somebody else starts it.
     pub command: Vec<String>,
     /// Where it runs.
     pub directory: PathBuf,
@@ -47,7 +47,7 @@ impl Default for ExternalConfig {
     }
 }
 
-/// What the supervisor makes of a reason that the process gives.
+/// Maps a reason that the process gives to an error kind for the supervisor.
 const fn kind_of(reason: ExternalReason) -> crate::ErrorKind {
     use crate::ErrorKind;
     match reason {
@@ -61,9 +61,10 @@ const fn kind_of(reason: ExternalReason) -> crate::ErrorKind {
     }
 }
 
-/// What the process says that it refuses, for a message.
+/// Describes the refusal of a process, for a message.
 fn refusal(beat: &Beat) -> String {
-    let (text, reason) = (beat.text(), beat.reason.name());
+    let text = beat.text();
+    let reason = beat.reason.name();
     if text.is_empty() {
         return format!("its process {} refuses ({reason})", beat.pid);
     }

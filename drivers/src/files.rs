@@ -1,26 +1,26 @@
-//! The `files` backend: a folder of colour and depth pictures that plays as a camera.
+//! The `files` backend: a folder of colour and depth images that plays as a camera.
 //!
-//! A small TOML file, the manifest, says what the pictures are. All of it:
+//! A small TOML file, the manifest, says what the images are. All of it:
 //!
 //! ```toml
 #![doc = include_str!("files/example_camera.toml")]
 //! ```
 //!
-//! **Checked on opening**, for every picture: it exists, is PNG or JPEG to its last byte, has a size and depth
-//! that a frame can have and its stream's other pictures have, and each stream has a partner for it. Damage
-//! *inside* a PNG (its checksums) shows when the picture is decoded, just before it is played; JPEG has no
-//! checksums. Pictures are decoded once and kept while `cache_mb` lasts; from then on, playing costs one copy
+//! **Checked on opening**, for every image: it exists, is PNG or JPEG to its last byte, has a size and depth
+//! that a frame can have and its stream's other images have, and each stream has a partner for it. Damage
+//! *inside* a PNG (its checksums) shows when the image is decoded, just before it is played; JPEG has no
+//! checksums. Images are decoded once and kept while `cache_mb` lasts; from then on, playing costs one copy
 //! into the sink's memory, and files that are kept may be deleted unnoticed.
 //!
-//! **Pixels** are those of the file: no scaling, no colour management, no rotation by EXIF. PNG is exact; JPEG is decoded
-//! to the pixels that libjpeg-turbo gives, which are those of Pillow and OpenCV. Images with an alpha channel or a
-//! palette are refused, because what is under transparent pixels is anybody's guess.
+//! **Pixels** are those of the file: no scaling, no colour management, no rotation by EXIF. PNG is exact; JPEG is
+//! decoded to the pixels that libjpeg-turbo gives, which are those of Pillow and OpenCV. Images with an alpha channel
+//! or a palette are refused, because what is under transparent pixels is anybody's guess.
 //!
-//! **Time**: there is no device clock, and none is pretended. Picture `k` is due at `start + k / rate_hz` on the
+//! **Time**: no device clock exists, and none is simulated. Image `k` is due at `start + k / rate_hz` on the
 //! host's monotonic clock, and that moment is its capture time, the same for all its streams; hence
 //! [`ClockDomain::Kernel`](depthrig_bus::ClockDomain::Kernel), whose counter is host time in nanoseconds, with
 //! no uncertainty. When the host cannot keep the rate, the schedule moves and nothing is skipped: a stream's
-//! frame `n` is always picture `n mod count`.
+//! frame `n` is always image `n mod count`.
 
 use crate::{
     Backend, Device, DeviceInfo, Error, ErrorKind, Result, Stream, StreamProfile, StreamRequest,
@@ -28,9 +28,9 @@ use crate::{
 };
 use std::path::PathBuf;
 
+pub(crate) mod image_file;
 mod manifest;
 pub(crate) mod pattern;
-pub(crate) mod picture;
 mod play;
 mod source;
 

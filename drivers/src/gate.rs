@@ -51,7 +51,7 @@ impl RawFrame {
     }
 }
 
-/// What became of a frame.
+/// Outcome of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
     /// Published.
@@ -64,7 +64,7 @@ pub enum Outcome {
 
 /// How far back a frame counter may step and still be a late or repeated frame rather than a restart.
 const REORDER_WINDOW: u64 = 64;
-/// So many frames behind the newest, each the successor of the last, are no stragglers: the counter restarted.
+/// So many frames behind the newest, each the successor of the last, are not stragglers: the counter restarted.
 const RESTARTING_FRAMES: u32 = 4;
 
 /// No camera loses so many frames in a row; a counter that jumps farther was set anew.
@@ -146,8 +146,8 @@ impl Gate {
     }
 
     /// Passes one frame: checks and counts it, maps its time, and has `fill` write the pixels into memory on
-    /// loan from `sink`. `fill` writes every byte of it or returns the reason for which the frame cannot be
-    /// delivered.
+    /// loan from `sink`. `fill` writes every byte of it or returns the reason why the frame is
+    /// dropped.
     pub fn deliver(
         &mut self,
         raw: &RawFrame,
@@ -157,8 +157,8 @@ impl Gate {
         self.deliver_timed(raw, sink, |memory, _| fill(memory))
     }
 
-    /// As [`Self::deliver`] for what has times in its payload: `fill` is told the frame's facts, and may change those that
-    /// the gate knows nothing of.
+    /// As [`Self::deliver`] for payloads with times in them: `fill` gets the frame's metadata, and may change the
+    /// fields that the gate does not know.
     pub fn deliver_timed(
         &mut self,
         raw: &RawFrame,
@@ -186,7 +186,8 @@ impl Gate {
         sink: &mut dyn FrameSink,
         loan: Loan,
     ) -> (Outcome, Option<Loan>) {
-        let (stream, mut loan) = (self.stream, Some(loan));
+        let stream = self.stream;
+        let mut loan = Some(loan);
         let outcome = self.pass(raw, sink, |meta, sink| {
             if let Some(loan) = loan.take() {
                 sink.commit_lent(stream, loan, meta);
@@ -222,7 +223,7 @@ impl Gate {
         Outcome::Delivered
     }
 
-    /// Whether the frame is whole and undamaged.
+    /// Checks that the frame is complete and undamaged.
     fn check(&self, raw: &RawFrame) -> Result<(), DropReason> {
         if raw.damaged {
             return Err(DropReason::DeviceError);

@@ -1,4 +1,4 @@
-//! The `kinect` backend: Azure Kinect cameras and what was recorded with them.
+//! The `kinect` backend: Azure Kinect cameras, and playback of their recordings.
 //!
 //! [`modes`] is what the device can be set to, [`calibration`] what its factory measured, for every mode; [`live`] is a
 //! camera that is attached, [`recording`] what was recorded with one, and [`playback`] plays that
@@ -17,15 +17,15 @@ pub use calibration::Calibration;
 pub use modes::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
 pub use recording::Recording;
 
-/// The name of the back end, of a camera that is attached and of one that was recorded.
+/// The name of the backend, for an attached camera and for a recording.
 pub const NAME: &str = "kinect";
 
-/// Which Kinect a rig means.
+/// The Kinect that a rig selects.
 #[derive(Debug, Clone, PartialEq)]
 #[allow(clippy::large_enum_variant)] // one per camera of a rig
 pub enum KinectConfig {
-    /// One that is attached.
+    /// An attached camera.
     Live(live::LiveConfig),
-    /// One that was recorded.
+    /// A recording.
     Recorded(playback::PlaybackConfig),
 }

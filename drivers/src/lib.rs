@@ -1,6 +1,6 @@
 //! Camera drivers: one folder per camera family behind the [`Backend`] → [`Device`] → [`Stream`] traits.
 //!
-//! Floor 3. A driver knows its device and nothing else: no rig configuration, no channel, no other camera.
+//! Layer 3. A driver knows its device and nothing else: no rig configuration, no channel, no other camera.
 //! It hands every frame to a [`Gate`], which keeps the accounts (captured = delivered + Σ dropped), maps the
 //! device's clock and asks a [`FrameSink`] for the memory that the pixels are written into, once.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
@@ -22,7 +22,7 @@ pub mod kinect;
 pub mod libusb;
 pub mod moments;
 pub mod motion;
-mod pace;
+mod playback_clock;
 pub mod realsense;
 mod sink;
 pub mod stereo;

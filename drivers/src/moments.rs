@@ -1,10 +1,10 @@
-//! When frame sets are made, and which pictures something is computed of when that is not done of all.
+//! Moments of frame sets, and the selection of frames to compute on when not all are computed.
 
-mod pace;
+mod schedule;
 
 use core::sync::atomic::{AtomicI64, Ordering};
 use depthrig_bus::HostTime;
-pub use pace::Pace;
+pub use schedule::FrameSchedule;
 
 /// The moments of the frame sets: equally spaced, after the newest that is known. Whoever makes sets notes them.
 #[derive(Debug, Default)]
@@ -39,14 +39,14 @@ impl SetTimes {
         self.period_ns.load(Ordering::Relaxed).max(1)
     }
 
-    /// The set that a picture captured at `at` is for when pictures come `frame_ns` apart: the one that it is nearer to
-    /// than its neighbours are. None for a picture between two sets.
+    /// The set that an image captured at `at` is for when images come `frame_ns` apart: the one that it is nearer to
+    /// than its neighbours are. None for an image between two sets.
     pub(crate) fn due(&self, at: HostTime, frame_ns: i64) -> Option<Due> {
         let newest = self.newest()?;
         let period_ns = self.period_ns();
         let since = at.since_ns(newest);
         let moment = since.saturating_add(period_ns / 2).div_euclid(period_ns).saturating_mul(period_ns);
-        // A quarter more, because stamps tremble and moments move: two pictures may be for one set, and the nearer is.
+        // A quarter more, because stamps tremble and moments move: two images may be for one set, and the nearer is.
         let off = (since - moment).abs();
         (off <= frame_ns / 2 + frame_ns / 4).then(|| Due {
             moment: newest.ns().saturating_add(moment),
@@ -57,12 +57,12 @@ impl SetTimes {
 }
 
 impl Due {
-    /// Of a picture that is due for itself.
+    /// Of an image that is due for itself.
     pub(crate) const fn alone(at: HostTime, period_ns: i64) -> Self {
         Self { moment: at.ns(), off: 0, period: period_ns }
     }
 
-    /// Whether a picture that is for this set stays when one comes that is for `newer`.
+    /// Whether an image that is for this set stays when one comes that is for `newer`.
     pub(crate) fn stays(&self, newer: Option<&Self>) -> bool {
         newer.is_none_or(|n| {
             let same = n.moment.abs_diff(self.moment) < self.period as u64 / 2;
@@ -82,24 +82,24 @@ mod tests {
     }
 
     #[test]
-    fn before_the_first_set_no_picture_is_for_one() {
+    fn before_the_first_set_no_image_is_for_one() {
         assert_eq!(SetTimes::default().due(at(1000), 33 * MS), None);
         assert_eq!(SetTimes::default().newest(), None);
     }
 
     #[test]
-    fn pictures_are_for_the_set_that_they_are_nearest_to_however_long_ago_one_was_noted() {
+    fn images_are_for_the_set_that_they_are_nearest_to_however_long_ago_one_was_noted() {
         let sets = SetTimes::default();
         sets.note(at(1000), 200 * MS);
-        // Of pictures 33 ms apart, from before the newest set to long after it.
-        let pictures: Vec<_> = (0..300).map(|i| 711 + 33 * i).collect();
+        // Of images 33 ms apart, from before the newest set to long after it.
+        let images: Vec<_> = (0..300).map(|i| 711 + 33 * i).collect();
         for moment in (800..10_000).step_by(200) {
-            let nearest = pictures.iter().copied().min_by_key(|p: &i64| (p - moment).abs()).unwrap();
+            let nearest = images.iter().copied().min_by_key(|p: &i64| (p - moment).abs()).unwrap();
             let due = sets.due(at(nearest), 33 * MS).unwrap();
             assert_eq!((due.moment, due.off), (moment * MS, (nearest - moment).abs() * MS));
         }
-        let many = pictures.iter().filter(|p| sets.due(at(**p), 33 * MS).is_some()).count();
-        let sets_seen = (pictures[299] - pictures[0]) / 200;
+        let many = images.iter().filter(|p| sets.due(at(**p), 33 * MS).is_some()).count();
+        let sets_seen = (images[299] - images[0]) / 200;
         assert!((sets_seen..=2 * sets_seen).contains(&(many as i64)), "{many} for {sets_seen} sets");
     }
 

@@ -1,12 +1,12 @@
-//! Batches of motion samples: what the drivers of motion units share.
+//! Batches of IMU samples, shared by the drivers of IMUs.
 //!
-//! A unit measures hundreds of times a second, so that its stream carries batches ([`depthrig_bus::MotionSample`]). A driver
-//! maps each sample's time and pushes it; the [`Batcher`] keeps the samples of one batch and hands them on, copied once into
-//! lent memory, when the batch is full, when it is [`LONGEST`] old, or when the clock's map changes, so that a batch has one
-//! epoch. It takes no memory after it was made.
+//! An IMU measures hundreds of times a second, so that its stream carries batches ([`depthrig_bus::MotionSample`]). A
+//! driver maps each sample's time and pushes it; the [`Batcher`] keeps the samples of one batch and hands them on,
+//! copied once into lent memory, when the batch is full, when it is [`LONGEST`] old, or when the clock's map changes,
+//! so that a batch has one epoch. It allocates nothing after its construction.
 //!
-//! **Accounts** count batches, as those of a picture stream count pictures: `captured = delivered + Σ dropped` after every
-//! call. A batch for which there is no memory is dropped (`no_slot`), and its samples are a gap in the samples' numbers.
+//! **Accounts** count batches, as those of an image stream count images: `captured = delivered + Σ dropped` after every
+//! call. A batch without memory for it is dropped (`no_slot`), and its samples are a gap in the samples' numbers.
 
 use crate::{DeviceClock, Error, ErrorKind, FrameMeta, FrameSink, Result, StreamProfile};
 use core::time::Duration;
@@ -15,12 +15,12 @@ use depthrig_bus::{
     MotionSample, Name, PixelFormat, Pose,
 };
 
-/// What motion units' streams are called.
+/// Name of the stream of an IMU.
 pub const IMU: &str = "imu";
 /// The longest that a sample waits for its batch to become full.
 pub const LONGEST: Duration = Duration::from_millis(100);
 
-/// The profile of a motion unit that measures `samples_hz` times a second, `batch` samples to a frame.
+/// The profile of an IMU that measures `samples_hz` times a second, `batch` samples to a frame.
 ///
 /// # Errors
 /// None that can happen: the name is a good one.
@@ -48,7 +48,7 @@ pub fn profile(
     })
 }
 
-/// What is known of a sample beside its bytes.
+/// Metadata of a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mark {
     /// When it had arrived.
@@ -67,7 +67,7 @@ pub struct Batcher {
     domain: ClockDomain,
     /// Flags of every batch.
     flags: FrameFlags,
-    /// The samples of the batch in the making, and how many.
+    /// The samples of the current batch, and how many.
     bytes: Box<[u8]>,
     len: usize,
     capacity: usize,
@@ -109,7 +109,7 @@ impl Batcher {
         self.delivered
     }
 
-    /// When the batch in the making must go; `None` while there is none.
+    /// When the current batch must be handed on; `None` without one.
     pub const fn due(&self) -> Option<HostTime> {
         if self.len == 0 { None } else { Some(self.due) }
     }
@@ -137,12 +137,12 @@ impl Batcher {
         went
     }
 
-    /// Sends the batch in the making if it is [`LONGEST`] old. Whether it went out or was dropped.
+    /// Sends the current batch if it is [`LONGEST`] old. Whether it went out or was dropped.
     pub fn tick(&mut self, now: HostTime, sink: &mut dyn FrameSink) -> bool {
         self.len > 0 && now >= self.due && self.flush(sink)
     }
 
-    /// Sends the batch in the making, whatever its age. Whether there was one.
+    /// Sends the current batch, whatever its age. Whether there was one.
     pub fn flush(&mut self, sink: &mut dyn FrameSink) -> bool {
         if self.len == 0 {
             return false;

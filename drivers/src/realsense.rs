@@ -1,4 +1,4 @@
-//! The `realsense` back end: Intel RealSense D400 cameras, without the vendor's SDK.
+//! The `realsense` backend: Intel RealSense D400 cameras, without the vendor's SDK.
 //!
 //! Layouts and constants: librealsense 2.58 (Apache-2.0), `src/ds` and `src/ds/d400`, unless a line says otherwise.
 
@@ -27,5 +27,5 @@ pub use backend::RealsenseBackend;
 pub use config::RealsenseConfig;
 pub use transport::Transport;
 
-/// Name of the back end in rig files.
+/// Name of the backend in rig files.
 pub const NAME: &str = "realsense";

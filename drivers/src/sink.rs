@@ -8,8 +8,8 @@ use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameFlags, FrameMut, Ho
 /// On the live path the memory is a free slot of the stream's shared-memory channel, so that what a driver
 /// writes is what every subscriber reads.
 pub trait FrameSink {
-    /// Memory for the next frame of `stream`, exactly `len` bytes, with arbitrary contents; `None` when there
-    /// is none free, and the frame must be dropped.
+    /// Memory for the next frame of `stream`, exactly `len` bytes, with arbitrary contents; `None` when
+    /// no slot is free, and the frame must be dropped.
     fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]>;
 
     /// Publishes the memory lent last for `stream`.
@@ -20,7 +20,7 @@ pub trait FrameSink {
 
     /// Memory of exactly `len` bytes for a frame of `stream` that the device itself will write; as many as
     /// [`depthrig_bus::MAX_LENT`] may be out at once, beside what [`Self::loan`] lends. Dropping it gives it back.
-    /// `None` when there is none free, or when the receiver lends none in this way.
+    /// `None` when no slot is free, or when the receiver does not lend in this way.
     fn lend(&mut self, _stream: usize, _len: usize) -> Option<Loan> {
         None
     }
@@ -34,9 +34,9 @@ pub trait FrameSink {
     /// Says that `n` frames of `stream` were lost.
     fn dropped(&mut self, stream: usize, reason: DropReason, n: u64);
 
-    /// Says that `n` frames of `stream`, which is computed, were not made because newer ones came first. That is by
-    /// design and no fault: it is counted as [`DropReason::QueueFull`], and a log need not speak of it again and again.
-    fn gave_way(&mut self, stream: usize, n: u64) {
+    /// Says that `n` frames of `stream`, which is computed, were superseded by newer ones. That is by design and not
+    /// a fault: it is counted as [`DropReason::QueueFull`], and a log need not repeat it.
+    fn superseded(&mut self, stream: usize, n: u64) {
         self.dropped(stream, DropReason::QueueFull, n);
     }
 
@@ -67,7 +67,7 @@ impl Loan {
     }
 }
 
-/// What is known of one frame besides its pixels.
+/// Metadata of one frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FrameMeta {
     /// The device's frame counter, unwrapped.

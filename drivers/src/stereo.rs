@@ -1,22 +1,22 @@
-//! Depth out of two eyes: any camera with streams `left` and `right`, made one that also gives depth by our own stereo.
+//! Depth from stereo: adds depth by our own matchers to any camera with streams `left` and `right`.
 //!
-//! Beside the streams of the camera there are `color` (the left eye, rectified) and for each [`StereoMode`]
-//! `depth_<mode>`, `confidence_<mode>` and, where [`StereoOptions::disparity`] asks for it, `disparity_<mode>`, all in the
-//! rectified left view. Their frames have the time, the sequence number and the exposure of the pair that they are made
-//! of, and the flag `derived`.
+//! Beside the streams of the camera there are `color` (the left image, rectified) and for each [`StereoMode`]
+//! `depth_<mode>`, `confidence_<mode>` and, where [`StereoOptions::disparity`] asks for it, `disparity_<mode>`, all in
+//! the rectified left view. Their frames have the time, the sequence number and the exposure of the pair that they are
+//! made of, and the flag `derived`.
 //!
-//! **Threads.** One rectifies, and each mode has one of its own; the thread that captures only copies pictures. The newest
-//! pair wins, but one of the moment of a frame set ([`StereoOptions::sets`]) waits for its turn: a mode that is slower than
-//! the camera and faster than the sets has depth in each of them. A pair that had to give way counts as dropped
-//! (`queue_full`) in each stream that it is missing from. With [`StereoOptions::rate_hz`] only so many pairs are matched at
-//! all, those of sets where the rates divide each other. One more thread measures now and then whether the eyes' rows
-//! agree, and says so ([`StereoOptions::notice`]) when they do not. With
-//! [`StereoOptions::every_pair`] nothing gives way, and the camera, which must be a recording, is read as fast as the
-//! slowest mode is done.
+//! **Threads.** One rectifies, and each mode has one of its own; the thread that captures only copies images. The
+//! newest pair wins, but one of the moment of a frame set ([`StereoOptions::sets`]) waits for its turn: a mode that is
+//! slower than the camera and faster than the sets has depth in each of them. A superseded pair counts as dropped
+//! (`queue_full`) in each stream that it is missing from. With [`StereoOptions::rate_hz`] only so many pairs are
+//! matched at all, those of sets where the rates divide each other. One more thread measures now and then whether the
+//! rows of left and right agree, and reports it ([`StereoOptions::notice`]) when they do not. With
+//! [`StereoOptions::every_pair`] no pair is superseded, and the camera, which must be a recording, is read as fast as
+//! the slowest mode is done.
 //!
-//! **Accounts.** Each of these streams has captured as many frames as the left eye, or as many as were to be matched, and
-//! `captured = delivered + Σ dropped` holds after every frame, in the order of the pairs: what a slow mode is still to
-//! decide is not counted before.
+//! **Accounts.** Each of these streams has captured as many frames as the left camera, or as many as were to be
+//! matched, and `captured = delivered + Σ dropped` holds after every frame, in the order of the pairs: what a slow mode
+//! is still to decide is not counted before.
 
 use crate::moments::SetTimes;
 use crate::{
@@ -30,26 +30,26 @@ use depthrig_calib::{PoseExt, Rectifier};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
-mod crew;
 mod ledger;
 mod newest;
 mod pair;
 mod rows;
 mod stream;
+mod workers;
 
-use crew::Crew;
 use stream::StereoStream;
+use workers::Workers;
 
-/// The streams that stereo is made of, left first.
-pub const EYES: [&str; 2] = ["left", "right"];
-/// The rectified left picture.
+/// The streams that stereo computes from, left first.
+pub const SIDES: [&str; 2] = ["left", "right"];
+/// The rectified left image.
 pub const COLOR: &str = "color";
 /// Names of the streams of a mode begin with one of these.
 pub const PREFIXES: [&str; 3] = ["depth_", "confidence_", "disparity_"];
 /// Most disparities that the classical matcher can search.
 const MAX_DISPARITY: usize = 256;
 
-/// What a maker of matchers needs to know of the rectified pairs.
+/// Geometry of the rectified pairs, for a maker of matchers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Geometry {
     /// Pixels per row.
@@ -58,7 +58,7 @@ pub struct Geometry {
     pub height: usize,
     /// Focal length of both views, pixels.
     pub focal_px: f64,
-    /// Distance between the eyes, metres.
+    /// Distance between the cameras, metres.
     pub baseline_m: f64,
 }
 
@@ -71,10 +71,10 @@ impl Geometry {
     }
 }
 
-/// What computes each mode, by its name; filled when the camera is started.
+/// Description of each mode's matcher, by the mode's name; filled when the camera is started.
 pub type Descriptions = Arc<Mutex<BTreeMap<String, Description>>>;
 
-/// What is wrong with the eyes and does not end the camera, in words; filled while it runs.
+/// A fault of the stereo pair that does not end the camera, in words; filled while it runs.
 pub type Notice = Arc<Mutex<Option<String>>>;
 
 /// Makes the matcher of a mode, once per start of the camera.
@@ -83,9 +83,9 @@ pub type Maker = Arc<dyn Fn(&Geometry) -> depthrig_calib::Result<Box<dyn Matcher
 /// One way to match, with the streams that it gives.
 #[derive(Clone)]
 pub struct StereoMode {
-    /// What its streams are called after: `depth_<name>`.
+    /// Its name, part of the names of its streams: `depth_<name>`.
     pub name: String,
-    /// Whether its matcher looks at the pictures in colour, as networks do.
+    /// Whether its matcher looks at the images in colour, as networks do.
     pub wants_color: bool,
     /// Makes its matcher.
     pub make: Maker,
@@ -117,7 +117,7 @@ impl StereoMode {
     }
 }
 
-/// What is made of the two eyes.
+/// Options for stereo: the modes and their output.
 #[derive(Debug, Clone)]
 pub struct StereoOptions {
     /// The modes; each has streams and a thread of its own.
@@ -126,15 +126,15 @@ pub struct StereoOptions {
     pub disparity: bool,
     /// Metres per unit of depth.
     pub depth_unit_m: f64,
-    /// Nearest and farthest depth, metres; outside of it there is none.
+    /// Nearest and farthest depth, metres; pixels outside have no depth.
     pub range_m: (f64, f64),
     /// Pairs that are matched, a second at most; 0: every one. Colour is rectified of all.
     pub rate_hz: f64,
-    /// Nothing gives way: for recordings alone, since a camera does not wait.
+    /// Matches every pair, so that none is superseded: for recordings alone, since a camera does not wait.
     pub every_pair: bool,
-    /// Where it is told what computes each mode.
+    /// Receives the description of each mode's matcher.
     pub computed: Descriptions,
-    /// Where it is told that the eyes' rows are apart.
+    /// Receives the notice that the rows of left and right differ.
     pub notice: Notice,
     /// The moments whose pairs are preferred.
     pub sets: Arc<SetTimes>,
@@ -158,7 +158,7 @@ impl Default for StereoOptions {
 }
 
 impl StereoOptions {
-    /// The names of all streams that are made, `color` first.
+    /// The names of all computed streams, `color` first.
     ///
     /// # Errors
     /// [`ErrorKind::BadInput`] when a mode's name cannot be part of a stream's.
@@ -174,7 +174,7 @@ impl StereoOptions {
         Ok(names)
     }
 
-    /// Whether a stream of this name comes after what it is made of, by what matching takes.
+    /// Whether a stream of this name comes later than its input, by the time that matching takes.
     pub fn is_late(name: &str) -> bool {
         PREFIXES.iter().any(|p| name.starts_with(p))
     }
@@ -189,14 +189,14 @@ impl StereoOptions {
         let (near, far) = self.range_m;
         if !(near > 0.0 && near < far && far.is_finite()) {
             return bad(format!(
-                "stereo cannot see from {near} m to {far} m; the nearest depth is above 0 and below the farthest"
+                "invalid depth range {near} m to {far} m; the nearest depth must be above 0 and below the farthest"
             ));
         }
         if !(self.rate_hz >= 0.0 && self.rate_hz.is_finite()) {
-            return bad(format!("stereo cannot be made {} times a second; 0 is of every pair", self.rate_hz));
+            return bad(format!("invalid stereo rate {} Hz; 0 matches every pair", self.rate_hz));
         }
         if !(1e-6..1.0).contains(&self.depth_unit_m) {
-            return bad(format!("{} m is no unit of depth; most use 0.001", self.depth_unit_m));
+            return bad(format!("invalid depth unit {} m; most cameras use 0.001", self.depth_unit_m));
         }
         Ok(())
     }
@@ -232,7 +232,7 @@ impl Backend for StereoBackend {
 /// The camera `device` with the streams that `options` ask for, beside its own.
 ///
 /// # Errors
-/// [`ErrorKind::BadInput`] for options that cannot be, [`ErrorKind::Unsupported`] when the camera has no `left` and
+/// [`ErrorKind::BadInput`] for invalid options, [`ErrorKind::Unsupported`] when the camera has no `left` and
 /// `right` of one size, or a stream of a name that stereo gives.
 pub fn wrap(device: Box<dyn Device>, options: StereoOptions) -> Result<Box<dyn Device>> {
     let name = describe(device.info());
@@ -240,8 +240,8 @@ pub fn wrap(device: Box<dyn Device>, options: StereoOptions) -> Result<Box<dyn D
     Ok(Box::new(StereoDevice { name, inner: device, profiles, options }))
 }
 
-/// The streams `own` of the camera `name` and those that `options` ask for. The intrinsics of what is made are known when
-/// the camera is started.
+/// The streams `own` of the camera `name` and those that `options` ask for. The intrinsics of the computed streams are
+/// known when the camera is started.
 ///
 /// # Errors
 /// As [`wrap`].
@@ -254,8 +254,8 @@ pub fn offered(name: &str, own: &[StreamProfile], options: &StereoOptions) -> Re
         return Err(Error::new(ErrorKind::Unsupported, what));
     }
     let mut profiles = own.to_vec();
-    for left in own.iter().filter(|p| p.stream.as_str() == EYES[0]) {
-        if own.iter().any(|p| p.stream.as_str() == EYES[1] && same_mode(p, left)) {
+    for left in own.iter().filter(|p| p.stream.as_str() == SIDES[0]) {
+        if own.iter().any(|p| p.stream.as_str() == SIDES[1] && same_mode(p, left)) {
             profiles.extend(made(left, options, &Intrinsics::default(), Pose::IDENTITY)?);
         }
     }
@@ -276,7 +276,7 @@ fn describe(info: &DeviceInfo) -> String {
     format!("{} {} ({})", info.model, info.serial, info.port)
 }
 
-/// The profiles of what is made of `left`, `color` first if the eyes have colour.
+/// The profiles of the streams that are computed from `left`, `color` first if the images have colour.
 fn made(
     left: &StreamProfile,
     options: &StereoOptions,
@@ -325,7 +325,7 @@ impl Device for StereoDevice {
 
     fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
         let Self { name, inner, profiles, options } = *self;
-        // All that is asked for is of one mode of the eyes: what one leaves open, it takes from the others.
+        // All requested streams share one mode of the camera: what one leaves open, it takes from the others.
         let all: Vec<StreamRequest>;
         let requests = if requests.is_empty() {
             all = choose_profiles(&name, &profiles, &[])?
@@ -336,12 +336,13 @@ impl Device for StereoDevice {
         } else {
             requests
         };
-        // A motion unit has a mode of its own.
-        let is_picture = |r: &&StreamRequest| r.stream.as_str() != crate::motion::IMU;
-        let pictures = || requests.iter().filter(is_picture);
-        let (size, rate_hz) = (pictures().find_map(|r| r.size), pictures().find_map(|r| r.rate_hz));
+        // An IMU has a mode of its own.
+        let is_image = |r: &&StreamRequest| r.stream.as_str() != crate::motion::IMU;
+        let images = || requests.iter().filter(is_image);
+        let size = images().find_map(|r| r.size);
+        let rate_hz = images().find_map(|r| r.rate_hz);
         let filled = |r: &StreamRequest| {
-            let (size, rate_hz) = if is_picture(&r) { (size, rate_hz) } else { (None, None) };
+            let (size, rate_hz) = if is_image(&r) { (size, rate_hz) } else { (None, None) };
             StreamRequest { size: r.size.or(size), rate_hz: r.rate_hz.or(rate_hz), ..r.clone() }
         };
         let wanted = choose_profiles(&name, &profiles, &requests.iter().map(filled).collect::<Vec<_>>())?;
@@ -349,23 +350,24 @@ impl Device for StereoDevice {
             let names = options.streams()?;
             move |p: &StreamProfile| names.contains(&p.stream)
         };
-        // The eyes in any case, then whatever else of its own the camera is asked for.
+        // Left and right in any case, then whatever else of its own the camera is asked for.
         let mut own = Vec::new();
-        for eye in EYES {
-            let asked = requests.iter().find(|r| r.stream.as_str() == eye).map(filled);
-            let any = profiles.iter().find(|p| p.stream.as_str() == eye);
+        for side in SIDES {
+            let asked = requests.iter().find(|r| r.stream.as_str() == side).map(filled);
+            let any = profiles.iter().find(|p| p.stream.as_str() == side);
             let any = any.map(|p| StreamRequest { size, rate_hz, ..StreamRequest::any(p.stream.clone()) });
             own.extend(asked.or(any));
         }
-        let others = wanted.iter().filter(|p| !is_made(p) && !EYES.contains(&p.stream.as_str()));
+        let others = wanted.iter().filter(|p| !is_made(p) && !SIDES.contains(&p.stream.as_str()));
         own.extend(others.map(|p| StreamRequest::any(p.stream.clone())));
         let inner = inner.start(&own)?;
-        let eyes = EYES.map(|eye| inner.profiles().iter().position(|p| p.stream.as_str() == eye));
-        let [Some(left), Some(right)] = eyes else {
-            let what = format!("{name}: started without one of its eyes");
+        let indices = SIDES.map(|side| inner.profiles().iter().position(|p| p.stream.as_str() == side));
+        let [Some(left), Some(right)] = indices else {
+            let what = format!("{name}: started without its left or right stream");
             return Err(Error::new(ErrorKind::Protocol, what));
         };
-        let (l, r) = (&inner.profiles()[left], &inner.profiles()[right]);
+        let l = &inner.profiles()[left];
+        let r = &inner.profiles()[right];
         let rectifier = rectifier(&name, l, r)?;
         let pose = l.pose_in_device.compose(&rectifier.left_view_in_left());
         let mut running = made(l, &options, rectifier.intrinsics(), pose)?;
@@ -386,21 +388,22 @@ impl Device for StereoDevice {
             chosen.iter().zip(&wanted).find(|(c, w)| (c.width, c.height) != (w.width, w.height))
         {
             let what = format!(
-                "{name}: both eyes and what is made of them have one size; \"{}\" was asked for in another one",
+                "{name}: left, right and the streams computed from them have one size; \"{}\" was requested in another one",
                 other.1.stream
             );
             return Err(Error::new(ErrorKind::Unsupported, what));
         }
-        let crew = Crew::start(&name, rectifier, l.format, &options)?;
-        Ok(Box::new(StereoStream::new(name, inner, [left, right], chosen, crew, &options)))
+        let workers = Workers::start(&name, rectifier, l.format, &options)?;
+        Ok(Box::new(StereoStream::new(name, inner, [left, right], chosen, workers, &options)))
     }
 }
 
-/// The rectifier of two running eyes.
+/// The rectifier of a running stereo pair.
 fn rectifier(name: &str, left: &StreamProfile, right: &StreamProfile) -> Result<Rectifier> {
     let named = |what: String| format!("{name}: no stereo: {what}");
     if !same_mode(left, right) {
-        let what = format!("its eyes have different modes: {} and {}", left.describe(), right.describe());
+        let what =
+            format!("left and right have different modes: {} and {}", left.describe(), right.describe());
         return Err(Error::new(ErrorKind::Unsupported, named(what)));
     }
     match left.format {
@@ -410,13 +413,16 @@ fn rectifier(name: &str, left: &StreamProfile, right: &StreamProfile) -> Result<
         }
         PixelFormat::Yuyv | PixelFormat::Rgb8 | PixelFormat::Mono8 => {}
         other => {
-            let what = format!("its eyes come as {}; yuyv, rgb8 and mono8 can be rectified", other.name());
+            let what = format!(
+                "unsupported format {} of left and right; yuyv, rgb8 and mono8 can be rectified",
+                other.name()
+            );
             return Err(Error::new(ErrorKind::Unsupported, named(what)));
         }
     }
     if !left.intrinsics.is_known() || !right.intrinsics.is_known() {
         let what = format!(
-            "there is no calibration of its eyes at {}x{}; give it the factory calibration, calibration = \"…/SN….conf\"",
+            "no calibration of left and right at {}x{}; give it the factory calibration, calibration = \"…/SN….conf\"",
             left.width, left.height
         );
         return Err(Error::new(ErrorKind::BadInput, named(what)));

@@ -1,4 +1,4 @@
-//! From the bytes of a camera into lent memory: one kernel per way in which cameras lay out their pictures.
+//! From the bytes of a camera into lent memory: one kernel per way in which cameras lay out their images.
 //!
 //! Each kernel writes every byte of `to` or says why it cannot, in words of the gate's ([`DropReason`]), so that it
 //! can be the `fill` of [`crate::Gate::deliver`]. What is copied is counted.
@@ -19,16 +19,16 @@ pub use swap::copy_swapped;
 use core::sync::atomic::{AtomicU64, Ordering};
 use depthrig_bus::DropReason;
 
-/// Bytes of pictures that this process wrote into lent memory.
+/// Bytes of images that this process wrote into lent memory.
 static COPIED: AtomicU64 = AtomicU64::new(0);
 
-/// Bytes of pictures that the kernels of this module wrote since the process began. With the bytes that were
-/// delivered meanwhile, it says how often a picture is copied.
+/// Bytes of images that the kernels of this module wrote since the process began. With the bytes that were
+/// delivered meanwhile, it says how often an image is copied.
 pub fn copied_bytes() -> u64 {
     COPIED.load(Ordering::Relaxed)
 }
 
-/// Counts a write of `bytes` bytes; each kernel calls it once per picture.
+/// Counts a write of `bytes` bytes; each kernel calls it once per image.
 fn count(bytes: usize) {
     COPIED.fetch_add(bytes as u64, Ordering::Relaxed);
 }

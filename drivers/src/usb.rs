@@ -1,9 +1,9 @@
-//! What is on the USB, from what the kernel says in `/sys` and `/proc` alone: no device is opened and none is disturbed.
+//! The devices on the USB, read from `/sys` and `/proc` alone: no device is opened or disturbed.
 
+#[doc(hidden)]
+pub mod fake;
 pub mod health;
 pub mod holder;
-#[doc(hidden)]
-pub mod made;
 mod root;
 mod tree;
 

@@ -1,4 +1,4 @@
-//! What the USB Video Class says, without doing I/O: shared by the kernel path and the libusb path.
+//! The USB Video Class without I/O: shared by the kernel path and the libusb path.
 //!
 //! Everything here reads bytes that a device sent, so every read is checked against the length that is really there.
 
@@ -7,6 +7,6 @@ pub mod descriptors;
 pub mod formats;
 #[doc(hidden)]
 pub mod fuzzing;
+pub mod image_controls;
 pub mod payload;
-pub mod picture;
 pub mod probe;

@@ -1,25 +1,25 @@
 //! Cameras at the kernel's video nodes (V4L2).
 //!
-//! **What is the crate `v4l`'s and what is ours.** `v4l` opens nodes, lists sizes and frame intervals, sets the
+//! **Division between the crate `v4l` and us.** `v4l` opens nodes, lists sizes and frame intervals, sets the
 //! interval, and gives the kernel's structures and request numbers. The rest is a small layer of our own
 //! (`v4l2/ioctl.rs`), because in `v4l` 0.14 the stream panics when a camera fails to stop, holds one buffer at a time,
 //! and cannot set the format of a metadata node; listing controls, formats and capabilities panics on names that are
-//! not UTF-8 and on types newer than itself; and there are no requests to extension units.
+//! not UTF-8 and on types newer than itself; and it lacks requests to extension units.
 //!
-//! **Memory.** A picture is copied once, from the kernel's buffer into the slot that subscribers read
+//! **Memory.** An image is copied once, from the kernel's buffer into the slot that subscribers read
 //! ([`MemoryChoice::Mmap`]), or not at all by us, when the kernel writes into that slot itself
 //! ([`MemoryChoice::UserPointer`]; `uvcvideo` and `vivid` can, drivers whose devices need contiguous memory cannot).
 //! [`crate::unpack::copied_bytes`] counts.
 //!
-//! **Time.** Where the camera's metadata node gives payload headers and their clock ticks as it should (`v4l2/tick.rs`),
-//! frames are stamped by the device: when it began to capture the picture, by USB video's own definition. Else by the
-//! kernel: when the first packet of the picture came, or the last, as its flags say; and where the kernel's stamp is not
-//! of the monotonic clock, when we got the picture. A kernel stamp that lies after that is moved back to it and the
-//! frame is flagged as uncertain in time: `vivid` stamps 30 ms ahead. Streaming into user memory goes by the kernel's
-//! stamps.
+//! **Time.** Where the camera's metadata node gives payload headers and their clock ticks as it should
+//! (`v4l2/tick.rs`), frames are stamped by the device: when it began to capture the image, by USB video's own
+//! definition. Else by the kernel: when the first packet of the image came, or the last, as its flags say; and where
+//! the kernel's stamp is not of the monotonic clock, when we got the image. A kernel stamp that lies after that is
+//! moved back to it and the frame is flagged as uncertain in time: `vivid` stamps 30 ms ahead. Streaming into user
+//! memory goes by the kernel's stamps.
 //!
 //! **Accounts.** A buffer that is flagged as damaged or too short is a counted drop; so is every number that the
-//! kernel's counter skips. `uvcvideo` itself throws damaged pictures away, which shows as such a gap.
+//! kernel's counter skips. `uvcvideo` itself throws damaged images away, which shows as such a gap.
 
 use crate::usb::SysRoot;
 use crate::{Backend, Device, DeviceInfo, Result};
@@ -47,10 +47,10 @@ pub use metadata::{MetadataFormat, payload_header};
 pub use node::{Capability, Interval, Layout, Mode, Node};
 pub use source::{DEFAULT_BUFFERS, Source, Stamp, Wanted};
 
-/// The name of the back end.
+/// The name of the backend.
 const NAME: &str = "v4l2";
 
-/// The back end `v4l2`: any camera at the kernel's video nodes.
+/// The backend `v4l2`: any camera at the kernel's video nodes.
 #[derive(Debug, Clone)]
 pub struct V4l2Backend {
     config: V4l2Config,
@@ -58,12 +58,12 @@ pub struct V4l2Backend {
 }
 
 impl V4l2Backend {
-    /// A back end for the one camera of `config`. Nothing is opened before it is asked for.
+    /// A backend for the one camera of `config`. Nothing is opened before it is asked for.
     pub fn new(config: V4l2Config) -> Self {
         Self { config, root: SysRoot::default() }
     }
 
-    /// The nodes that the camera's pictures come from, for tools that look beside the back end. The numbers change
+    /// The nodes that the camera's images come from, for tools that look beside the backend. The numbers change
     /// with every plug.
     ///
     /// # Errors
@@ -79,7 +79,7 @@ impl Backend for V4l2Backend {
         NAME
     }
 
-    /// Every camera at a video node that no other back end drives.
+    /// Every camera at a video node that no other backend drives.
     fn discover(&self) -> Result<Vec<DeviceInfo>> {
         let found = find::cameras(&self.root)?;
         Ok(found.into_iter().filter(|f| f.family().is_none()).map(|f| f.info).collect())

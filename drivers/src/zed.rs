@@ -1,18 +1,17 @@
 //! Stereolabs ZED 2i as a camera of USB video, without the vendor's SDK.
 //!
-//! **What it is here.** A camera of two streams, `left` and `right`, YUYV, each half of the side-by-side picture as it
-//! comes, *not rectified*; the camera's frame is that of the left eye. Intrinsics and the right eye's pose are those of
-//! the factory calibration, a file that must be there already: nothing is ever downloaded. Without it the camera
-//! streams, its calibration is `none` and its intrinsics are unknown. Its motion unit is a stream `imu` ([`imu`]), where it
-//! can be read.
+//! **Streams.** `left` and `right`, YUYV, each one half of the side-by-side image as the camera sends it,
+//! *not rectified*; the camera's frame is that of the left camera. Intrinsics and the right camera's pose come from the
+//! factory calibration, a file that must exist already: nothing is ever downloaded. Without it the camera
+//! streams, its calibration is `none` and its intrinsics are unknown. The IMU, where it can be read, is the stream
+//! `imu` ([`imu`]).
 //!
-//! **Time.** The camera sends no time that is known, so the frames' time is the kernel's stamp, taken when a picture's
-//! first bytes came ([`depthrig_bus::ClockDomain::Kernel`]). That is later than the middle of the exposure by half of
-//! the exposure and the sensor's readout, which the camera does not tell.
+//! **Time.** No timestamp of the camera is known, so a frame's time is the kernel's timestamp, taken when the image's
+//! first bytes arrived ([`depthrig_bus::ClockDomain::Kernel`]). That is later than the middle of the exposure by half
+//! of the exposure and the sensor's readout, which the camera does not report.
 //!
-//! The camera sends both eyes side by side in one YUYV picture, not rectified. What its bytes mean, and where that
-//! is known from, is in [`conf`] (factory calibration), [`command`] (vendor commands) and [`sensors`] (the motion
-//! unit). Source of all three unless said otherwise: the facts in `zed-open-capture` (stereolabs, BSD-3-Clause).
+//! The formats are documented in [`conf`] (factory calibration), [`command`] (vendor commands) and [`sensors`] (IMU).
+//! Source of all three unless stated otherwise: the facts in `zed-open-capture` (stereolabs, BSD-3-Clause).
 
 pub mod command;
 pub mod conf;

@@ -1,4 +1,4 @@
-//! The conformance suite can fail: for each promise a back end that breaks just it, and the case that says so.
+//! The conformance suite can fail: for each promise a backend that breaks just it, and the case that says so.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{DropReason, HostTime, MOTION_SAMPLE_BYTES, MotionSample, Name};
@@ -13,9 +13,9 @@ use depthrig_drivers::{
 };
 use std::time::Duration;
 
-/// A promise, broken.
+/// A violation of one promise.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Sin {
+enum Violation {
     None,
     LastByteUnwritten,
     FromTheFuture,
@@ -34,23 +34,23 @@ enum Sin {
     NotANumber,
 }
 
-struct Sinner(Sin, Box<dyn Backend>);
+struct ViolatingBackend(Violation, Box<dyn Backend>);
 
-impl Backend for Sinner {
+impl Backend for ViolatingBackend {
     fn name(&self) -> &'static str {
         self.1.name()
     }
     fn discover(&self) -> Result<Vec<DeviceInfo>> {
-        if self.0 == Sin::NotListed { Ok(vec![]) } else { self.1.discover() }
+        if self.0 == Violation::NotListed { Ok(vec![]) } else { self.1.discover() }
     }
     fn open(&self, serial: Option<&str>) -> Result<Box<dyn Device>> {
-        Ok(Box::new(SinfulDevice(self.0, self.1.open(serial)?)))
+        Ok(Box::new(ViolatingDevice(self.0, self.1.open(serial)?)))
     }
 }
 
-struct SinfulDevice(Sin, Box<dyn Device>);
+struct ViolatingDevice(Violation, Box<dyn Device>);
 
-impl Device for SinfulDevice {
+impl Device for ViolatingDevice {
     fn info(&self) -> &DeviceInfo {
         self.1.info()
     }
@@ -58,53 +58,54 @@ impl Device for SinfulDevice {
         self.1.profiles()
     }
     fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
-        let requests = if self.0 == Sin::AnyModeWillDo { &[] } else { requests };
-        Ok(Box::new(SinfulStream { sin: self.0, inner: Some(self.1.start(requests)?), idle: 0 }))
+        let requests = if self.0 == Violation::AnyModeWillDo { &[] } else { requests };
+        Ok(Box::new(ViolatingStream { violation: self.0, inner: Some(self.1.start(requests)?), idle: 0 }))
     }
 }
 
-struct SinfulStream {
-    sin: Sin,
+struct ViolatingStream {
+    violation: Violation,
     inner: Option<Box<dyn Stream>>,
     idle: u32,
 }
 
-impl Stream for SinfulStream {
+impl Stream for ViolatingStream {
     fn profiles(&self) -> &[StreamProfile] {
         self.inner.as_ref().unwrap().profiles()
     }
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
-        if self.sin == Sin::SlowPoll {
+        if self.violation == Violation::SlowPoll {
             std::thread::sleep(Duration::from_millis(150));
         }
-        let got = self.inner.as_mut().unwrap().poll(timeout, &mut Spoiler(self.sin, sink, Vec::new()));
-        match (self.sin, &got) {
-            (Sin::StallIsAnError, Ok(Poll::Idle)) => {
+        let got =
+            self.inner.as_mut().unwrap().poll(timeout, &mut ViolatingSink(self.violation, sink, Vec::new()));
+        match (self.violation, &got) {
+            (Violation::StallIsAnError, Ok(Poll::Idle)) => {
                 self.idle += 1;
                 if self.idle > 3 { Err(Error::new(ErrorKind::Stalled, "no frames")) } else { got }
             }
-            (Sin::LivesOnAfterUnplug, Err(_)) => Ok(Poll::Idle),
+            (Violation::LivesOnAfterUnplug, Err(_)) => Ok(Poll::Idle),
             _ => got,
         }
     }
 }
 
-impl Drop for SinfulStream {
+impl Drop for ViolatingStream {
     fn drop(&mut self) {
-        if self.sin == Sin::KeepsTheDevice {
+        if self.violation == Violation::KeepsTheDevice {
             std::mem::forget(self.inner.take());
         }
     }
 }
 
-/// What a driver of a motion unit might do to a batch of it.
-fn spoil(sin: Sin, batch: &mut [u8], meta: &mut FrameMeta) {
+/// Spoils a batch as a driver of an IMU might.
+fn spoil(violation: Violation, batch: &mut [u8], meta: &mut FrameMeta) {
     let n = batch.len() / MOTION_SAMPLE_BYTES;
     let at = |i: usize| i * MOTION_SAMPLE_BYTES..(i + 1) * MOTION_SAMPLE_BYTES;
-    match sin {
-        Sin::SamplesSwapped => batch[at(0).start..at(1).end].rotate_left(MOTION_SAMPLE_BYTES),
-        // A number is passed over without time: samples that were thrown away would look like the unit's own gaps.
-        Sin::SampleLost => {
+    match violation {
+        Violation::SamplesSwapped => batch[at(0).start..at(1).end].rotate_left(MOTION_SAMPLE_BYTES),
+        // A number is skipped without time: samples that were thrown away would look like the unit's own gaps.
+        Violation::SampleLost => {
             for i in 0..n {
                 let mut s = MotionSample::all_in(&batch[at(i)]).next().unwrap();
                 s.sequence *= 2;
@@ -112,10 +113,10 @@ fn spoil(sin: Sin, batch: &mut [u8], meta: &mut FrameMeta) {
             }
             meta.device_sequence *= 2;
         }
-        Sin::HeaderOfTheOldest => {
+        Violation::HeaderOfTheOldest => {
             meta.capture_time = MotionSample::all_in(batch).next().unwrap().time();
         }
-        Sin::NotANumber => {
+        Violation::NotANumber => {
             let mut s = MotionSample::all_in(batch).next().unwrap();
             s.gyro_rad_s[1] = f32::NAN;
             batch[at(0)].copy_from_slice(&s.to_bytes());
@@ -125,17 +126,17 @@ fn spoil(sin: Sin, batch: &mut [u8], meta: &mut FrameMeta) {
 }
 
 /// Keeps a batch until it is committed, so that it can be spoilt.
-struct Spoiler<'a>(Sin, &'a mut dyn FrameSink, Vec<u8>);
+struct ViolatingSink<'a>(Violation, &'a mut dyn FrameSink, Vec<u8>);
 
-impl FrameSink for Spoiler<'_> {
+impl FrameSink for ViolatingSink<'_> {
     fn loan(&mut self, stream: usize, len: usize) -> Option<&mut [u8]> {
         if is_of_motion(self.0) {
             self.2.resize(len, 0);
             return Some(&mut self.2);
         }
         let memory = self.1.loan(stream, len)?;
-        // What the driver does not get, it does not write.
-        if self.0 == Sin::LastByteUnwritten {
+        // The driver does not write bytes that it does not get.
+        if self.0 == Violation::LastByteUnwritten {
             // A whole frame must be returned, so the driver writes elsewhere.
             return Some(Box::leak(vec![0; memory.len()].into_boxed_slice()));
         }
@@ -148,14 +149,14 @@ impl FrameSink for Spoiler<'_> {
             self.1.loan(stream, self.2.len()).unwrap().copy_from_slice(&self.2);
         }
         match self.0 {
-            Sin::FromTheFuture => meta.capture_time = meta.arrival.plus_ns(1),
-            Sin::TimeGoesBack if meta.device_sequence.is_multiple_of(3) => {
+            Violation::FromTheFuture => meta.capture_time = meta.arrival.plus_ns(1),
+            Violation::TimeGoesBack if meta.device_sequence.is_multiple_of(3) => {
                 meta.capture_time = meta.capture_time.plus_ns(-50_000_000);
             }
             _ => {}
         }
         self.1.commit(stream, &meta);
-        if self.0 == Sin::PublishesTwice {
+        if self.0 == Violation::PublishesTwice {
             self.1.commit(stream, &meta);
         }
     }
@@ -163,7 +164,7 @@ impl FrameSink for Spoiler<'_> {
         self.1.discard(stream);
     }
     fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
-        if self.0 != Sin::HidesDrops {
+        if self.0 != Violation::HidesDrops {
             self.1.dropped(stream, reason, n);
         }
     }
@@ -175,13 +176,19 @@ impl FrameSink for Spoiler<'_> {
     }
 }
 
-const fn is_of_motion(sin: Sin) -> bool {
-    matches!(sin, Sin::SamplesSwapped | Sin::SampleLost | Sin::HeaderOfTheOldest | Sin::NotANumber)
+const fn is_of_motion(violation: Violation) -> bool {
+    matches!(
+        violation,
+        Violation::SamplesSwapped
+            | Violation::SampleLost
+            | Violation::HeaderOfTheOldest
+            | Violation::NotANumber
+    )
 }
 
-struct Sinful(Sin);
+struct ViolatingSubject(Violation);
 
-impl Subject for Sinful {
+impl Subject for ViolatingSubject {
     fn name(&self) -> String {
         format!("{:?}", self.0)
     }
@@ -199,17 +206,22 @@ impl Subject for Sinful {
             ..SyntheticConfig::default()
         };
         let backend = SyntheticBackend::new(vec![config]).unwrap();
-        let rig = Box::new(Hands(backend.truth("s").unwrap()));
+        let rig = Box::new(TestRig(backend.truth("s").unwrap()));
         let wanted = if is_of_motion(self.0) { "imu" } else { "depth" };
         let requests = vec![StreamRequest::any(Name::new(wanted).unwrap())];
-        Bench { backend: Box::new(Sinner(self.0, Box::new(backend))), serial: "s".into(), requests, rig }
+        Bench {
+            backend: Box::new(ViolatingBackend(self.0, Box::new(backend))),
+            serial: "s".into(),
+            requests,
+            rig,
+        }
     }
 }
 
 /// Knows only some tricks, so that the suite's "not applicable" shows too.
-struct Hands(SimTruth);
+struct TestRig(SimTruth);
 
-impl Rig for Hands {
+impl Rig for TestRig {
     fn cause(&self, trouble: Trouble) -> std::result::Result<(), Cannot> {
         let (kind, duration, count) = match trouble {
             Trouble::Unplug(d) => (FaultKind::Unplug, d, 1),
@@ -233,14 +245,14 @@ impl Rig for Hands {
     }
 }
 
-fn caught(sin: Sin, cases: &[&str]) {
-    let report = conformance::run_some(&Sinful(sin), cases);
+fn caught(violation: Violation, cases: &[&str]) {
+    let report = conformance::run_some(&ViolatingSubject(violation), cases);
     assert_eq!(report.failed(), cases, "{report}");
 }
 
 #[test]
 fn an_honest_back_end_passes_and_says_what_it_cannot() {
-    let report = conformance::run(&Sinful(Sin::None));
+    let report = conformance::run(&ViolatingSubject(Violation::None));
     assert!(report.is_good(), "{report}");
     let cannot = [
         "clock",
@@ -260,34 +272,39 @@ fn an_honest_back_end_passes_and_says_what_it_cannot() {
 
 #[test]
 fn frames_that_lie_are_caught() {
-    caught(Sin::LastByteUnwritten, &["every_byte"]);
-    caught(Sin::FromTheFuture, &["frames"]);
-    caught(Sin::TimeGoesBack, &["frames"]);
-    caught(Sin::PublishesTwice, &["frames"]);
+    caught(Violation::LastByteUnwritten, &["every_byte"]);
+    caught(Violation::FromTheFuture, &["frames"]);
+    caught(Violation::TimeGoesBack, &["frames"]);
+    caught(Violation::PublishesTwice, &["frames"]);
 }
 
 #[test]
 fn books_that_are_wrong_are_caught() {
-    caught(Sin::HidesDrops, &["no_slot"]);
+    caught(Violation::HidesDrops, &["no_slot"]);
 }
 
 #[test]
 fn devices_that_are_not_what_they_say_are_caught() {
-    caught(Sin::NotListed, &["discover"]);
-    caught(Sin::AnyModeWillDo, &["profiles", "unsupported"]);
-    caught(Sin::KeepsTheDevice, &["reopen"]);
+    caught(Violation::NotListed, &["discover"]);
+    caught(Violation::AnyModeWillDo, &["profiles", "unsupported"]);
+    caught(Violation::KeepsTheDevice, &["reopen"]);
 }
 
 #[test]
 fn wrong_answers_to_trouble_are_caught() {
-    caught(Sin::StallIsAnError, &["stall"]);
-    caught(Sin::SlowPoll, &["poll_timeout"]);
-    caught(Sin::LivesOnAfterUnplug, &["unplug"]);
+    caught(Violation::StallIsAnError, &["stall"]);
+    caught(Violation::SlowPoll, &["poll_timeout"]);
+    caught(Violation::LivesOnAfterUnplug, &["unplug"]);
 }
 
 #[test]
 fn batches_of_motion_that_lie_are_caught() {
-    for sin in [Sin::SamplesSwapped, Sin::SampleLost, Sin::HeaderOfTheOldest, Sin::NotANumber] {
-        caught(sin, &["motion"]);
+    for violation in [
+        Violation::SamplesSwapped,
+        Violation::SampleLost,
+        Violation::HeaderOfTheOldest,
+        Violation::NotANumber,
+    ] {
+        caught(violation, &["motion"]);
     }
 }

@@ -1,5 +1,5 @@
-//! The external back end keeps every promise of the suite that a camera behind another process can be held to. The
-//! process is a thread here, so that the test can tell exactly what it did; real ones are in `external.rs`.
+//! The external backend keeps every promise of the suite that a camera behind another process can be held to. The
+//! process is a thread here, so that the test knows exactly what it did; real ones are in `external.rs`.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::external::{
@@ -23,7 +23,7 @@ const UNREAD: u64 = 4;
 /// From the true mid-exposure to the arrival.
 const LATENCY_NS: i64 = 3_000_000;
 
-/// What the process knows and is told.
+/// State shared with the process: its record of frames, and the faults to cause.
 #[derive(Default)]
 struct Script {
     sent: [Sent; 2],
@@ -57,12 +57,13 @@ impl Shared {
 
 fn modes() -> [Mode; 2] {
     let mode = |name: &str, format| {
-        Mode::new(Name::new(name).unwrap(), format, SIZE, RATE_HZ).with_device_clock(32, 1_000_000, 32)
+        Mode::new(Name::new(name).unwrap(), format, SIZE.0, SIZE.1, RATE_HZ)
+            .with_device_clock(32, 1_000_000, 32)
     };
     [mode("color", PixelFormat::Rgb8), mode("depth", PixelFormat::Z16)]
 }
 
-fn picture(stream: usize, number: u64) -> Vec<u8> {
+fn image(stream: usize, number: u64) -> Vec<u8> {
     let bytes = modes()[stream].frame_bytes();
     (0..bytes).map(|i| (i as u64 * 7 + number * 31 + stream as u64) as u8).collect()
 }
@@ -161,7 +162,7 @@ fn round(session: &mut Session<'_>, running: &[usize], shared: &Shared, at: Host
             arrival_time_ns: arrival.ns(),
             ..ExternalFrame::default()
         };
-        let pixels = picture(*mode, number);
+        let pixels = image(*mode, number);
         let mut script = shared.script();
         script.truth.push((arrival, truth));
         let sent = &mut script.sent[stream];
@@ -199,7 +200,7 @@ fn round(session: &mut Session<'_>, running: &[usize], shared: &Shared, at: Host
     }
 }
 
-/// The back end with the process beside it, which sends when it is polled: so that nothing is under way when the suite
+/// The backend with the process beside it, which sends when it is polled: so that nothing is under way when the suite
 /// compares accounts.
 struct Lockstep(ExternalBackend, Shared, #[allow(dead_code)] Arc<tempfile::TempDir>);
 
@@ -258,7 +259,8 @@ impl Subject for External {
         let place = Place { runtime, rig: Name::new("rig").unwrap(), camera: Name::new("cam").unwrap() };
         let (orders, theirs) = sync_channel(1024);
         let shared = Shared(Arc::default(), Arc::new(Mutex::new(orders)));
-        let (at, of) = (place.clone(), shared.clone());
+        let at = place.clone();
+        let of = shared.clone();
         // The thread ends when the last sender is gone; it must not keep one itself.
         let script = Shared(of.0, Arc::new(Mutex::new(sync_channel(1).0)));
         std::thread::spawn(move || process(&at, &script, &theirs));
@@ -270,14 +272,14 @@ impl Subject for External {
             backend: Box::new(Lockstep(backend, shared.clone(), dir)),
             serial: "bench".into(),
             requests: vec![],
-            rig: Box::new(Hands(shared)),
+            rig: Box::new(TestRig(shared)),
         }
     }
 }
 
-struct Hands(Shared);
+struct TestRig(Shared);
 
-impl Rig for Hands {
+impl Rig for TestRig {
     fn cause(&self, trouble: Trouble) -> std::result::Result<(), Cannot> {
         let mut script = self.0.script();
         let until = |d| HostTime::now().plus(d);
@@ -319,7 +321,7 @@ impl Rig for Hands {
 
     fn is_genuine(&self, stream: usize, pixels: &[u8]) -> Option<bool> {
         let newest = self.0.script().counter;
-        Some((newest.saturating_sub(200)..=newest).any(|n| picture(stream, n) == pixels))
+        Some((newest.saturating_sub(200)..=newest).any(|n| image(stream, n) == pixels))
     }
 }
 

@@ -1,4 +1,4 @@
-//! The files back end keeps every promise of the suite that a folder of pictures can be held to.
+//! The files backend keeps every promise of the suite that a folder of images can be held to.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::HostTime;
@@ -8,7 +8,7 @@ use image::{ImageBuffer, Luma, Rgb};
 use tempfile::TempDir;
 
 const SIZE: (u32, u32) = (16, 12);
-const PICTURES: u32 = 5;
+const IMAGES: u32 = 5;
 const MANIFEST: &str = r#"
 model = "Folder"
 serial = "bench"
@@ -30,7 +30,7 @@ fn depth(n: u32) -> ImageBuffer<Luma<u16>, Vec<u16>> {
     ImageBuffer::from_fn(SIZE.0, SIZE.1, |x, y| Luma([(1000 * n + 20 * y + x) as u16]))
 }
 
-/// A folder that plays five pairs of pictures without end.
+/// A folder that plays five pairs of images without end.
 struct Folder;
 
 impl Subject for Folder {
@@ -41,7 +41,7 @@ impl Subject for Folder {
     fn make(&self) -> Bench {
         let dir = tempfile::tempdir().unwrap();
         std::fs::write(dir.path().join("camera.toml"), MANIFEST).unwrap();
-        for n in 1..=PICTURES {
+        for n in 1..=IMAGES {
             color(n).save(dir.path().join(format!("color_{n}.png"))).unwrap();
             depth(n).save(dir.path().join(format!("depth_{n}.png"))).unwrap();
         }
@@ -50,30 +50,30 @@ impl Subject for Folder {
             backend: Box::new(backend),
             serial: "bench".into(),
             requests: vec![],
-            rig: Box::new(Eyes(dir)),
+            rig: Box::new(FolderRig(dir)),
         }
     }
 }
 
 /// The folder, kept for as long as the test runs.
-struct Eyes(TempDir);
+struct FolderRig(TempDir);
 
-impl Rig for Eyes {
+impl Rig for FolderRig {
     fn cause(&self, trouble: Trouble) -> Result<(), Cannot> {
         assert!(self.0.path().exists());
         Err(Cannot(match trouble {
             Trouble::Unplug(_) | Trouble::Busy(_) => "a folder is neither plugged in nor held by one process",
             Trouble::Stall(_) | Trouble::Hang(_) => "reading a file cannot be made to wait",
             Trouble::HalfFrame(_) | Trouble::WrongSize(_) | Trouble::Damaged(_) => {
-                "a broken picture is refused at opening or ends the stream, it is no lost frame"
+                "a damaged image is refused at opening or ends the stream, it is not a lost frame"
             }
-            Trouble::Repeated(_) | Trouble::Skip(_) => "the driver itself counts the pictures",
+            Trouble::Repeated(_) | Trouble::Skip(_) => "the driver itself counts the images",
             Trouble::TimeBackwards(_) | Trouble::ClockReset => "there is no device clock",
         }))
     }
 
     fn sent(&self, _: usize) -> Option<Sent> {
-        None // nobody but the driver knows how many pictures it played
+        None // nobody but the driver knows how many images it played
     }
 
     fn true_capture(&self, _: usize, _: HostTime) -> Option<(HostTime, u64)> {
@@ -85,7 +85,7 @@ impl Rig for Eyes {
             0 => color(n).into_raw() == pixels,
             _ => depth(n).iter().flat_map(|d| d.to_le_bytes()).eq(pixels.iter().copied()),
         };
-        Some((1..=PICTURES).any(known))
+        Some((1..=IMAGES).any(known))
     }
 }
 

@@ -1,4 +1,4 @@
-//! The Kinect driver keeps every promise of the suite, against a made libk4a.
+//! The Kinect driver keeps every promise of the suite, against a fake libk4a.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/kinect.rs"]
@@ -8,8 +8,8 @@ use depthrig_bus::{Name, PixelFormat};
 use depthrig_drivers::conformance::{self, Bench, Subject};
 use depthrig_drivers::kinect::live::LiveBackend;
 use depthrig_drivers::{StreamRequest, unpack};
-use fake_k4a::{abi, pictures};
-use kinect::{Fake, Hands};
+use fake_k4a::{abi, images};
+use kinect::{Fake, TestRig};
 use std::sync::Mutex;
 
 const SERIAL: &str = "000123456789";
@@ -47,7 +47,7 @@ impl Subject for Live {
             }
             _ => |s: usize, p: &[u8]| if s == 0 { is_decoded(p) } else { judge(0, s, p) },
         };
-        let rig = Box::new(Hands { fake, serial: SERIAL, streams: vec![0, 1, 2], is_genuine });
+        let rig = Box::new(TestRig { fake, serial: SERIAL, streams: vec![0, 1, 2], is_genuine });
         Bench { backend, serial: SERIAL.into(), requests, rig }
     }
 }
@@ -58,17 +58,17 @@ fn judge(color: u32, stream: usize, pixels: &[u8]) -> bool {
         1 => (abi::DEPTH16, DEPTH),
         _ => (abi::IR16, DEPTH),
     };
-    pictures::is_genuine(format, width, height, pixels)
+    images::is_genuine(format, width, height, pixels)
 }
 
-/// Whether `pixels` are one of the camera's JPEG pictures, decoded.
+/// Whether `pixels` are one of the camera's JPEG images, decoded.
 fn is_decoded(pixels: &[u8]) -> bool {
     static DECODED: Mutex<Vec<Vec<u8>>> = Mutex::new(Vec::new());
     let mut decoded = DECODED.lock().unwrap();
     if decoded.is_empty() {
-        for n in 0..pictures::JPEGS {
+        for n in 0..images::JPEGS {
             let mut rgb = vec![0; PixelFormat::Rgb8.frame_bytes(COLOR.0, COLOR.1)];
-            let jpeg = pictures::picture(abi::MJPG, COLOR.0, COLOR.1, n);
+            let jpeg = images::image(abi::MJPG, COLOR.0, COLOR.1, n);
             unpack::decode_jpeg(&jpeg, COLOR.0, COLOR.1, &mut rgb).unwrap();
             decoded.push(rgb);
         }
@@ -79,8 +79,8 @@ fn is_decoded(pixels: &[u8]) -> bool {
 fn is_without_alpha(pixels: &[u8]) -> bool {
     (0..256).any(|n| {
         (n * 17) as u8 == pixels[0] && {
-            let picture = pictures::picture(abi::BGRA32, COLOR.0, COLOR.1, n);
-            picture.chunks(4).flat_map(|p| &p[..3]).eq(pixels)
+            let image = images::image(abi::BGRA32, COLOR.0, COLOR.1, n);
+            image.chunks(4).flat_map(|p| &p[..3]).eq(pixels)
         }
     })
 }
@@ -98,7 +98,7 @@ fn with_colour_as_it_comes_every_case_passes() {
     passes(PixelFormat::Mjpeg, &conformance::cases());
 }
 
-/// What a format can change.
+/// Cases that the format can affect.
 const CASES: [&str; 7] =
     ["frames", "every_byte", "half_frame", "wrong_size", "damaged", "repeated", "unplug"];
 

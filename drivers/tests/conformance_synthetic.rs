@@ -1,4 +1,4 @@
-//! The synthetic back end keeps every promise of the suite.
+//! The synthetic backend keeps every promise of the suite.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{HostTime, MotionSample, Name, PixelFormat};
@@ -10,7 +10,7 @@ use std::time::Duration;
 
 const SIZE: (u32, u32) = (160, 120);
 
-/// A quick camera with two streams and a motion unit, whose frames can be checked byte by byte.
+/// A quick camera with two streams and an IMU, whose frames can be checked byte by byte.
 struct Cheap;
 
 impl Subject for Cheap {
@@ -39,17 +39,17 @@ impl Subject for Cheap {
         let patterns = [("color", PixelFormat::Rgb8), ("depth", PixelFormat::Z16)]
             .map(|(name, format)| Pattern::new(config.seed, name, format, SIZE.0, SIZE.1));
         let backend = SyntheticBackend::new(vec![config]).unwrap();
-        let rig = Box::new(Hands { truth: backend.truth("bench").unwrap(), patterns });
+        let rig = Box::new(TestRig { truth: backend.truth("bench").unwrap(), patterns });
         Bench { backend: Box::new(backend), serial: "bench".into(), requests: vec![], rig }
     }
 }
 
-struct Hands {
+struct TestRig {
     truth: SimTruth,
     patterns: [Pattern; 2],
 }
 
-impl Rig for Hands {
+impl Rig for TestRig {
     fn cause(&self, trouble: Trouble) -> Result<(), Cannot> {
         let none = Duration::ZERO;
         let (kind, duration, count) = match trouble {

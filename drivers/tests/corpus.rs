@@ -16,7 +16,8 @@ fn mutated(bytes: &[u8], mut seed: u64) -> Vec<u8> {
     };
     let mut out = bytes.to_vec();
     for _ in 0..=next(4) {
-        let (at, value) = (next(out.len()), [0, 0xFF, 0x80, 0x7F, next(256) as u8][next(5)]);
+        let at = next(out.len());
+        let value = [0, 0xFF, 0x80, 0x7F, next(256) as u8][next(5)];
         match next(8) {
             0 => out.truncate(at),
             1 => {

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 const RATE_HZ: f64 = 200.0;
 const FRAMES: u64 = 500;
-/// What a look at a lock takes at most.
+/// Most allocations of one look at a lock.
 const LOOK: u64 = 16;
 
 #[global_allocator]
@@ -38,7 +38,7 @@ fn a_frame_takes_no_memory() {
     let dir = tempfile::tempdir().unwrap();
     let runtime = RuntimeDir::at(dir.path()).unwrap();
     let place = Place { runtime, rig: Name::new("rig").unwrap(), camera: Name::new("cam").unwrap() };
-    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Rgb8, (64, 48), RATE_HZ);
+    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Rgb8, 64, 48, RATE_HZ);
     let mode = mode.with_device_clock(32, 1_000_000, 32);
     let about = About { model: "Bench".into(), ..About::default() };
     let mut camera = ExternalCamera::offer(&place, &about, &[mode]).unwrap();
@@ -80,11 +80,12 @@ fn a_frame_takes_no_memory() {
     };
     // The clock map takes its memory in its first seconds.
     run(&mut stream, &mut sink, 1500);
-    let (before, began) = (of_thread(), HostTime::now());
+    let before = of_thread();
+    let began = HostTime::now();
     let looks = run(&mut stream, &mut sink, FRAMES);
     let taken = of_thread() - before;
-    // Each heart-beat of the daemon's side takes one: what iceoryx2 shares between a loan and its port. Reading the lock of
-    // a silent process takes nine or so. Found by the traces of all that was taken; nothing else was.
+    // Each heart-beat of the daemon's side takes one: what iceoryx2 shares between a loan and its port. Reading the
+    // lock of a silent process takes nine or so. Found by the traces of all that was taken; nothing else was.
     let beats = began.elapsed().as_secs_f64() / HEARTBEAT.as_secs_f64();
     let others = beats as u64 + 1 + LOOK * looks;
     assert!(

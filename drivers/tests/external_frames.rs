@@ -18,7 +18,7 @@ fn place(dir: &tempfile::TempDir) -> Place {
 
 /// Serves sessions in a thread: `play` is called for each.
 fn serve(place: &Place, play: impl Fn(&mut Session<'_>) + Send + 'static) -> std::thread::JoinHandle<()> {
-    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Mono8, (8, 6), 100.0);
+    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Mono8, 8, 6, 100.0);
     let about = About { model: "Bench".into(), ..About::default() };
     let mut camera =
         ExternalCamera::offer(place, &about, &[mode.with_device_clock(32, 1_000_000, 32)]).unwrap();
@@ -75,7 +75,8 @@ fn frames_of_another_session_or_process_are_passed_over() {
             send(session, 200 + value, |h| h.instance ^= 2);
         }
     });
-    let (mut stream, mut sink) = (open(&place(&dir)), MemorySink::default());
+    let mut stream = open(&place(&dir));
+    let mut sink = MemorySink::default();
     take(&mut stream, &mut sink, 6);
     drop(stream);
     assert_eq!(sink.frames.iter().map(|f| f.2[0]).collect::<Vec<_>>(), [1, 2, 3, 4, 5, 6]);
@@ -92,7 +93,8 @@ fn what_the_process_had_and_did_not_send_is_counted() {
         send(session, 5, |_| ());
         send(session, 7, |h| h.device_sequence = 7); // one that the device lost
     });
-    let (mut stream, mut sink) = (open(&place(&dir)), MemorySink::default());
+    let mut stream = open(&place(&dir));
+    let mut sink = MemorySink::default();
     take(&mut stream, &mut sink, 3);
     drop(stream);
     let drops = sink.drops[0];
@@ -111,7 +113,8 @@ fn headers_that_are_none_end_the_session() {
         }
         assert!(session.refusal().unwrap().contains("8 frames in a row are not color 8x6"));
     });
-    let (mut stream, mut sink) = (open(&place(&dir)), MemorySink::default());
+    let mut stream = open(&place(&dir));
+    let mut sink = MemorySink::default();
     let e = end_of(&mut stream, &mut sink);
     assert_eq!((e.kind(), sink.frames.len()), (ErrorKind::Protocol, 1));
     assert!(e.to_string().contains("does not send what it announced"), "{e}");
@@ -143,7 +146,8 @@ fn damaged_and_half_frames_are_counted_and_end_nothing() {
         }
         send(session, 22, |_| ());
     });
-    let (mut stream, mut sink) = (open(&place(&dir)), MemorySink::default());
+    let mut stream = open(&place(&dir));
+    let mut sink = MemorySink::default();
     take(&mut stream, &mut sink, 2);
     drop(stream);
     assert_eq!(sink.frames.iter().map(|f| f.2[0]).collect::<Vec<_>>(), [1, 22]);
@@ -165,14 +169,16 @@ fn a_flood_is_dropped_as_too_much_for_the_queue() {
         std::thread::sleep(Duration::from_millis(200));
         send_at_once(session, SENT, |_| ());
     });
-    let (mut stream, mut sink) = (open(&place(&dir)), MemorySink::default());
+    let mut stream = open(&place(&dir));
+    let mut sink = MemorySink::default();
     let deadline = HostTime::now().plus(WAIT);
     while sink.frames.last().is_none_or(|f| f.2[0] != SENT) {
         assert!(!deadline.from_now().is_zero(), "{} frames, {:?}", sink.frames.len(), sink.drops[0]);
         stream.poll(Duration::from_millis(20), &mut sink).unwrap();
     }
     drop(stream);
-    let (frames, lost) = (sink.frames.len() as u64, sink.drops[0].get(DropReason::QueueFull));
+    let frames = sink.frames.len() as u64;
+    let lost = sink.drops[0].get(DropReason::QueueFull);
     assert_eq!((frames + lost, sink.captured[0]), (SENT.into(), SENT.into()), "{:?}", sink.drops[0]);
     assert!(lost > 50, "{frames} frames at 2 kHz where 100 Hz were announced");
     process.join().unwrap();
@@ -182,7 +188,7 @@ fn a_flood_is_dropped_as_too_much_for_the_queue() {
 fn a_process_that_ends_because_it_is_done_is_no_failure() {
     let dir = tempfile::tempdir().unwrap();
     let place = place(&dir);
-    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Mono8, (8, 6), 100.0);
+    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Mono8, 8, 6, 100.0);
     let about = About { model: "Bench".into(), ..About::default() };
     let mut camera = ExternalCamera::offer(&place, &about, &[mode]).unwrap();
     let process = std::thread::spawn(move || {
@@ -191,7 +197,8 @@ fn a_process_that_ends_because_it_is_done_is_no_failure() {
         drop(session);
         camera.end(ExternalReason::Finished, "that was all");
     });
-    let (mut stream, mut sink) = (open(&place), MemorySink::default());
+    let mut stream = open(&place);
+    let mut sink = MemorySink::default();
     process.join().unwrap();
     while stream.poll(Duration::from_millis(20), &mut sink).unwrap() != Poll::End {}
     assert_eq!(sink.frames.len(), 1);
@@ -201,7 +208,7 @@ fn a_process_that_ends_because_it_is_done_is_no_failure() {
 fn frames_at_the_end_of_files_are_taken_and_the_process_hears_it() {
     let dir = tempfile::tempdir().unwrap();
     let place = place(&dir);
-    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Mono8, (8, 6), 100.0);
+    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Mono8, 8, 6, 100.0);
     let about = About { model: "Bench".into(), ..About::default() };
     let mut camera = ExternalCamera::offer(&place, &about, &[mode]).unwrap();
     let process = std::thread::spawn(move || {
@@ -211,7 +218,8 @@ fn frames_at_the_end_of_files_are_taken_and_the_process_hears_it() {
         }
         session.finish("that was all", WAIT)
     });
-    let (mut stream, mut sink) = (open(&place), MemorySink::default());
+    let mut stream = open(&place);
+    let mut sink = MemorySink::default();
     std::thread::sleep(Duration::from_millis(100));
     while stream.poll(Duration::from_millis(20), &mut sink).unwrap() != Poll::End {}
     assert_eq!(sink.frames.iter().map(|f| f.2[0]).collect::<Vec<_>>(), [1, 2, 3, 4]);
@@ -223,7 +231,7 @@ fn frames_at_the_end_of_files_are_taken_and_the_process_hears_it() {
 fn a_process_that_stops_by_itself_is_disconnected() {
     let dir = tempfile::tempdir().unwrap();
     let place = place(&dir);
-    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Mono8, (8, 6), 100.0);
+    let mode = Mode::new(Name::new("color").unwrap(), PixelFormat::Mono8, 8, 6, 100.0);
     let about = About { model: "Bench".into(), ..About::default() };
     let mut camera = ExternalCamera::offer(&place, &about, &[mode]).unwrap();
     let (done, wait) = std::sync::mpsc::sync_channel::<()>(1);
@@ -233,7 +241,8 @@ fn a_process_that_stops_by_itself_is_disconnected() {
         drop(session);
         let _ = wait.recv(); // it goes on offering
     });
-    let (mut stream, mut sink) = (open(&place), MemorySink::default());
+    let mut stream = open(&place);
+    let mut sink = MemorySink::default();
     let e = end_of(&mut stream, &mut sink);
     assert_eq!((e.kind(), sink.frames.len()), (ErrorKind::Disconnected, 1));
     assert!(e.to_string().contains("stopped the camera by itself"), "{e}");

@@ -1,4 +1,4 @@
-//! The `files` backend: what it plays, and what it says about folders that cannot be played.
+//! The `files` backend: the frames it plays, and its errors for folders that cannot be played.
 //!
 //! Longer than most files: every test builds its folder with the same few helpers.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
@@ -14,7 +14,7 @@ use std::fs;
 use std::path::Path;
 use tempfile::TempDir;
 
-const PATIENCE: Duration = Duration::from_secs(10);
+const TIMEOUT: Duration = Duration::from_secs(10);
 
 const COLOR: &str = "[[stream]]\nname = \"color\"\nfiles = \"color_*.png\"\n";
 const DEPTH: &str = "[[stream]]\nname = \"depth\"\nfiles = \"depth_*.png\"\ndepth_unit_m = 0.001\n";
@@ -23,7 +23,7 @@ fn manifest(top: &str, streams: &[&str]) -> String {
     format!("model = \"test\"\nrate_hz = 500.0\n{top}\n{}", streams.concat())
 }
 
-/// Pixels that differ in every picture and place; as 16-bit little-endian where that matters.
+/// Pixels that differ in every image and place; as 16-bit little-endian where that matters.
 fn pixels(seed: usize, len: usize) -> Vec<u8> {
     (0..len).map(|i| (i * 31 + seed * 97 + i / 7) as u8).collect()
 }
@@ -77,7 +77,7 @@ fn refused(dir: &TempDir) -> Error {
 fn play(stream: &mut dyn Stream, sink: &mut MemorySink, frames: usize) {
     let mut played = 0;
     while played < frames {
-        if stream.poll(PATIENCE, sink).unwrap() == Poll::Frame {
+        if stream.poll(TIMEOUT, sink).unwrap() == Poll::Frame {
             played += 1;
         }
     }
@@ -139,8 +139,8 @@ fn plays_in_natural_order_paired_by_number_and_ends() {
     let mut stream = start(&dir).unwrap();
     let mut sink = MemorySink::default();
     play(&mut *stream, &mut sink, 11);
-    assert_eq!(stream.poll(PATIENCE, &mut sink).unwrap(), Poll::End);
-    assert_eq!(stream.poll(PATIENCE, &mut sink).unwrap(), Poll::End, "it stays at its end");
+    assert_eq!(stream.poll(TIMEOUT, &mut sink).unwrap(), Poll::End);
+    assert_eq!(stream.poll(TIMEOUT, &mut sink).unwrap(), Poll::End, "it stays at its end");
     for (k, pair) in sink.frames.chunks(2).enumerate() {
         let [(0, cm, c), (1, dm, d)] = pair else { panic!("color and depth, in that order") };
         assert_eq!(*c, pixels(k + 1, 36), "color of frame {k}");
@@ -178,15 +178,17 @@ fn looping_can_be_overridden() {
     let mut stream = FilesBackend::new(config).open(None).unwrap().start(&[]).unwrap();
     let mut sink = MemorySink::default();
     play(&mut *stream, &mut sink, 1);
-    assert_eq!(stream.poll(PATIENCE, &mut sink).unwrap(), Poll::End);
+    assert_eq!(stream.poll(TIMEOUT, &mut sink).unwrap(), Poll::End);
 }
 
 #[test]
 fn what_is_not_kept_is_decoded_again_and_a_lost_file_is_named() {
     let kept = folder(&manifest("", &[COLOR, DEPTH]), 3);
     let passing = folder(&manifest("cache_mb = 0", &[COLOR, DEPTH]), 3);
-    let (mut a, mut b) = (start(&kept).unwrap(), start(&passing).unwrap());
-    let (mut in_a, mut in_b) = (MemorySink::default(), MemorySink::default());
+    let mut a = start(&kept).unwrap();
+    let mut b = start(&passing).unwrap();
+    let mut in_a = MemorySink::default();
+    let mut in_b = MemorySink::default();
     play(&mut *a, &mut in_a, 7);
     play(&mut *b, &mut in_b, 7);
     let shown = |s: &MemorySink| s.frames.iter().map(|f| (f.0, f.2.clone())).collect::<Vec<_>>();
@@ -197,7 +199,7 @@ fn what_is_not_kept_is_decoded_again_and_a_lost_file_is_named() {
     }
     play(&mut *a, &mut in_a, 3);
     let error = loop {
-        match b.poll(PATIENCE, &mut in_b) {
+        match b.poll(TIMEOUT, &mut in_b) {
             Ok(_) => assert!(in_b.frames.len() < 20, "the lost file went unnoticed"),
             Err(e) => break e,
         }
@@ -207,12 +209,13 @@ fn what_is_not_kept_is_decoded_again_and_a_lost_file_is_named() {
 }
 
 #[test]
-fn a_picture_that_changes_its_size_while_playing_is_named() {
+fn an_image_that_changes_its_size_while_playing_is_named() {
     let dir = folder(&manifest("cache_mb = 0", &[COLOR, DEPTH]), 1);
-    let (mut stream, mut sink) = (start(&dir).unwrap(), MemorySink::default());
+    let mut stream = start(&dir).unwrap();
+    let mut sink = MemorySink::default();
     play(&mut *stream, &mut sink, 1);
     save(&dir.path().join("color_1.png"), 5, 3, ExtendedColorType::Rgb8, &pixels(1, 45));
-    let error = stream.poll(PATIENCE, &mut sink).unwrap_err();
+    let error = stream.poll(TIMEOUT, &mut sink).unwrap_err();
     assert_eq!(error.kind(), ErrorKind::BadInput);
     for word in ["color_1.png", "was 4x3 8-bit colour", "is 5x3 8-bit colour now"] {
         assert!(error.to_string().contains(word), "{error}");
@@ -236,7 +239,7 @@ fn a_slow_camera_stops_at_once_and_one_at_its_end_says_so() {
         }
         match capture.stop(Duration::from_secs(1)) {
             StopOutcome::Ended(end) => assert_eq!(format!("{end:?}"), wanted),
-            StopOutcome::Abandoned => panic!("it was waiting for its next picture and could not be stopped"),
+            StopOutcome::Abandoned => panic!("it was waiting for its next image and could not be stopped"),
         }
     }
 }
@@ -274,7 +277,8 @@ fn one_stream_of_two_can_be_asked_for() {
 fn sub_folders_order_pairing_and_every_format() {
     let dir = tempfile::tempdir().unwrap();
     fs::create_dir(dir.path().join("grey")).unwrap();
-    let (grey, grey16) = (pixels(1, 12), pixels(2, 24));
+    let grey = pixels(1, 12);
+    let grey16 = pixels(2, 24);
     for (i, stamp) in ["9.25", "10.5"].into_iter().enumerate() {
         save(&dir.path().join(format!("grey/{stamp}.png")), 4, 3, ExtendedColorType::L8, &pixels(i, 12));
         color(&dir, &format!("c{i}.png"), i);
@@ -366,7 +370,7 @@ fn missing_folders_and_manifests() {
         &["camera.toml", "gone", "folder = \"gone\"", "no such folder"],
     );
     let file = manifest("folder = \"color_1.png\"", &[COLOR]);
-    refuses(&file, |_| (), ErrorKind::BadInput, &["color_1.png", "is no folder"]);
+    refuses(&file, |_| (), ErrorKind::BadInput, &["color_1.png", "is not a folder"]);
     let unset = manifest("folder = \"${DEPTHRIG_NO_SUCH_VARIABLE}/x\"", &[COLOR]);
     refuses(&unset, |_| (), ErrorKind::BadInput, &["line 3", "DEPTHRIG_NO_SUCH_VARIABLE", "not set"]);
     refuses(
@@ -393,10 +397,13 @@ fn manifests_that_are_wrong() {
     bad(&good().replace("color_*", "*/color_*"), &["`*` can stand in the file name only"]);
     bad(&good().replace("0.001", "0.001\nunit = 3"), &["unknown field `unit`", "depth_unit_m"]);
     for rate in ["0", "0.0", "-30.0", "nan", "inf", "1e6"] {
-        bad(&good().replace("500.0", rate), &["line 2", "Hz is impossible", "at most 1000"]);
+        bad(&good().replace("500.0", rate), &["line 2", "Hz is out of range", "at most 1000"]);
     }
     let k = |k: &str| manifest("", &[COLOR, k]);
-    bad(&k("intrinsics = { fx = 0.0, fy = 1.0, cx = 1.0, cy = 1.0 }\n"), &["line 4", "no focal lengths"]);
+    bad(
+        &k("intrinsics = { fx = 0.0, fy = 1.0, cx = 1.0, cy = 1.0 }\n"),
+        &["line 4", "invalid focal lengths"],
+    );
     bad(&k("intrinsics = { fx = 1.0, fy = 1.0, cx = 1.0 }\n"), &["missing field `cy`"]);
     bad(
         &k("intrinsics = { fx = 1.0, fy = 1.0, cx = 1.0, cy = 1.0, model = \"fish\" }\n"),
@@ -419,11 +426,11 @@ fn manifests_that_are_wrong() {
     let dir = folder(&good(), 1);
     let config = FilesConfig { rate_hz: Some(0.0), ..FilesConfig::new(dir.path()) };
     let error = FilesBackend::new(config).open(None).err().unwrap();
-    assert!(error.to_string().contains("a rate of 0 Hz is impossible"), "{error}");
+    assert!(error.to_string().contains("a rate of 0 Hz is out of range"), "{error}");
 }
 
 #[test]
-fn pictures_without_partner() {
+fn images_without_partner() {
     let remove = |name: &'static str| move |d: &TempDir| fs::remove_file(d.path().join(name)).unwrap();
     let bad = ErrorKind::BadInput;
     refuses(
@@ -454,7 +461,7 @@ fn pictures_without_partner() {
 }
 
 #[test]
-fn pictures_that_cannot_be_played() {
+fn images_that_cannot_be_played() {
     let bad = |damage: &dyn Fn(&Path), words: &[&str]| {
         refuses(&good(), |d| damage(d.path()), ErrorKind::BadInput, words);
     };
@@ -474,7 +481,7 @@ fn pictures_that_cannot_be_played() {
         &["color_1.png", "16-bit colour is not"],
     );
     bad(
-        &|d| fs::write(d.join("color_1.png"), "hello, I am no picture").unwrap(),
+        &|d| fs::write(d.join("color_1.png"), "hello, I am no image").unwrap(),
         &["color_1.png", "neither PNG nor"],
     );
     bad(&|d| fs::write(d.join("depth_0002.png"), "").unwrap(), &["depth_0002.png", "cut off"]);
@@ -519,7 +526,7 @@ fn damage_inside_a_png_is_found_when_it_is_played() {
     let mut stream = start(&dir).unwrap();
     let mut sink = MemorySink::default();
     play(&mut *stream, &mut sink, 1);
-    let error = stream.poll(PATIENCE, &mut sink).unwrap_err();
+    let error = stream.poll(TIMEOUT, &mut sink).unwrap_err();
     assert_eq!(error.kind(), ErrorKind::BadInput);
     assert!(error.to_string().contains("depth_0002.png: the image is damaged"), "{error}");
     assert_eq!(sink.frames.len(), 2, "nothing of the broken pair was published");
@@ -532,13 +539,13 @@ fn depth_needs_a_unit_and_sixteen_bits() {
     bad("name = \"depth\"\nfiles = \"depth_*.png\"\n", &["line 7", "depth_unit_m is missing", "0.001"]);
     for unit in ["0.0", "-0.001", "1.0", "nan"] {
         let text = format!("name = \"depth\"\nfiles = \"depth_*.png\"\ndepth_unit_m = {unit}\n");
-        bad(&text, &["line 7", "metres per unit"]);
+        bad(&text, &["line 7", "depth_unit_m"]);
     }
     bad("name = \"left\"\nfiles = \"depth_*.png\"\n", &["depth or infrared?", "depth_unit_m", "mono16"]);
     bad("name = \"depth\"\nfiles = \"color_*.png\"\n", &["8-bit colour, but depth is 16-bit"]);
     bad(
         "name = \"rgb\"\nfiles = \"color_*.png\"\ndepth_unit_m = 0.001\n",
-        &["rgb8 pictures have no depth_unit_m"],
+        &["rgb8 images have no depth_unit_m"],
     );
     bad("name = \"rgb\"\nfiles = \"color_*.png\"\nformat = \"z16\"\n", &["cannot be z16", "rgb8"]);
 }

@@ -1,6 +1,6 @@
-//! Real pictures played by the `files` backend are, pixel for pixel, what other decoders see in them.
+//! Real images played by the `files` backend are, pixel for pixel, those of other decoders.
 //!
-//! The witnesses are the tables in `tests/data`, made by Python: see the scripts beside them. The pictures
+//! The references are the tables in `tests/data`, made by Python: see the scripts beside them. The images
 //! themselves are not in the repository; without them these tests fail and say where they look.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
@@ -20,14 +20,14 @@ fn data() -> PathBuf {
         std::env::var_os("DEPTHRIG_TEST_DATA").filter(|v| !v.is_empty()).map_or_else(default, PathBuf::from);
     assert!(
         root.join("lingbot_depth").is_dir() && root.is_absolute(),
-        "the real test pictures are not in {}: set DEPTHRIG_TEST_DATA to the absolute path of a folder that holds \
+        "the real test images are not in {}: set DEPTHRIG_TEST_DATA to the absolute path of a folder that holds \
          lingbot_depth and cdm_d405 (their sources are named in tests/data/*.toml)",
         root.display()
     );
     root
 }
 
-/// What a manifest of `tests/data` plays in its first two rounds.
+/// Plays a manifest of `tests/data` for two rounds.
 fn play(manifest: &str) -> (DeviceInfo, Vec<StreamProfile>, Vec<Vec<u8>>) {
     data();
     let device = FilesBackend::new(FilesConfig::new(tables().join(manifest))).open(None).unwrap();

@@ -1,4 +1,4 @@
-//! What a frame of an attached Kinect costs: one write of its bytes, and no memory.
+//! Cost of a frame of an attached Kinect: one write of its bytes, and no allocation.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/kinect.rs"]
@@ -38,7 +38,7 @@ fn start(config: LiveConfig, requests: &[StreamRequest]) -> Box<dyn Stream> {
 
 /// One test alone: what others copy would be counted too.
 #[test]
-fn a_picture_is_written_once_and_costs_no_memory() {
+fn an_image_is_written_once_and_costs_no_memory() {
     /// Lends the same memory again and again.
     struct Slot(Vec<u8>, u64, u64);
     impl FrameSink for Slot {
@@ -51,7 +51,7 @@ fn a_picture_is_written_once_and_costs_no_memory() {
         }
         fn discard(&mut self, _: usize) {}
         fn dropped(&mut self, _: usize, reason: DropReason, _: u64) {
-            // What a busy machine leaves lying too long is lost in libk4a.
+            // Images that a busy machine fetches too late are lost in libk4a.
             assert_eq!(reason, DropReason::DeviceGap);
         }
         fn captured(&mut self, _: usize, _: u64) {}

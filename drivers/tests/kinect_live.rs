@@ -1,5 +1,5 @@
-//! What the driver of an attached Kinect does beyond the suite: references, times, choices, messages. Long because
-//! they share one made library.
+//! The driver of an attached Kinect beyond the suite: references, times, choices, messages. Long because the tests
+//! share one fake library.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/kinect.rs"]
@@ -11,7 +11,7 @@ use depthrig_bus::{
 use depthrig_drivers::capture::{Capture, Session, StopOutcome};
 use depthrig_drivers::kinect::live::{LiveBackend, LiveConfig, Places};
 use depthrig_drivers::kinect::{DepthMode, WiredSync};
-use depthrig_drivers::usb::made::{MadeDevice, MadeTree};
+use depthrig_drivers::usb::fake::{FakeDevice, FakeTree};
 use depthrig_drivers::v4l2::ControlValue;
 use depthrig_drivers::{
     Backend, DeviceInfo, Error, ErrorKind, MemorySink, Poll, Result, Stream, StreamRequest,
@@ -22,21 +22,20 @@ use std::time::Duration;
 const A: &str = "000111111111";
 const B: &str = "000222222222";
 
-fn wish(stream: &str, size: (u32, u32), format: PixelFormat) -> StreamRequest {
+fn wish(stream: &str, width: u32, height: u32, format: PixelFormat) -> StreamRequest {
     StreamRequest {
         stream: Name::new(stream).unwrap(),
-        size: Some(size),
+        size: Some((width, height)),
         rate_hz: Some(30.0),
         format: Some(format),
     }
 }
 
 fn all_streams(color: PixelFormat) -> [StreamRequest; 3] {
-    let small = (320, 288);
     [
-        wish("color", (1280, 720), color),
-        wish("depth", small, PixelFormat::Z16),
-        wish("ir", small, PixelFormat::Mono16),
+        wish("color", 1280, 720, color),
+        wish("depth", 320, 288, PixelFormat::Z16),
+        wish("ir", 320, 288, PixelFormat::Mono16),
     ]
 }
 
@@ -54,7 +53,8 @@ fn error<T>(result: Result<T>) -> Error {
 /// Polls until stream 0 has `n` more frames, delivered or dropped.
 fn poll_frames(stream: &mut dyn Stream, sink: &mut MemorySink, n: u64) {
     let seen = |sink: &MemorySink| sink.captured.first().copied().unwrap_or(0);
-    let (until, deadline) = (seen(sink) + n, HostTime::now().plus(Duration::from_secs(20)));
+    let until = seen(sink) + n;
+    let deadline = HostTime::now().plus(Duration::from_secs(20));
     while seen(sink) < until {
         assert!(!deadline.from_now().is_zero(), "no frames");
         stream.poll(Duration::from_millis(50), sink).unwrap();
@@ -62,7 +62,7 @@ fn poll_frames(stream: &mut dyn Stream, sink: &mut MemorySink, n: u64) {
 }
 
 #[test]
-fn every_capture_and_every_picture_is_given_back() {
+fn every_capture_and_every_image_is_given_back() {
     let fake = Fake::new(&[A]);
     for color in [PixelFormat::Mjpeg, PixelFormat::Rgb8, PixelFormat::Yuyv] {
         let mut stream = start(fake.config(), A, &all_streams(color)).unwrap();
@@ -141,7 +141,7 @@ fn padded_rows_and_captures_in_part_are_read() {
     assert_eq!(sink.drops_of(0).get(DropReason::DeviceGap), 2);
     assert_eq!(sink.drops_of(1).total(), 0);
     drop(stream);
-    // Pictures of another format than was asked for are none, whatever their size is.
+    // Images of another format than was asked for are dropped, whatever their size.
     for color in [PixelFormat::Yuyv, PixelFormat::Mjpeg, PixelFormat::Bgr8] {
         let mut stream = start(fake.config(), A, &all_streams(color)).unwrap();
         let mut sink = MemorySink::default();
@@ -163,7 +163,8 @@ fn openings_at_the_same_time_do_not_find_each_other_busy() {
         let config = fake.config();
         move || (0..10).all(|_| LiveBackend::new(config.clone()).open(Some(serial)).is_ok())
     };
-    // Whoever comes second must not stay: a camera that is open is busy for the other's asking, too, which is no fault.
+    // Whoever comes second must not stay: a camera that is open is busy for the other's request, too, which is not a
+    // fault.
     let [a, b] = [open(A), open(B)].map(std::thread::spawn);
     assert!(a.join().unwrap() && b.join().unwrap());
     assert_eq!(fake.census().cameras, 0);
@@ -310,9 +311,10 @@ fn the_one_that_is_meant_is_opened_and_the_others_are_let_go() {
     assert_eq!(e.kind(), ErrorKind::Busy, "{e}");
     assert!(e.to_string().contains("libk4a says: "), "{e}");
     poll_frames(stream.as_mut(), &mut sink, 2);
-    // A slow machine may leave pictures lying meanwhile; the camera sent them all, and none came damaged.
+    // A slow machine may leave images lying meanwhile; the camera sent them all, and none came damaged.
     for (i, of) in [(0, 0), (1, 1)] {
-        let (drops, ledger) = (sink.drops_of(i), fake.ledger(A, of));
+        let drops = sink.drops_of(i);
+        let ledger = fake.ledger(A, of);
         assert_eq!((sink.delivered(i), drops.get(DropReason::DeviceGap)), (ledger.good, ledger.lost));
         assert_eq!(drops.total(), ledger.lost);
     }
@@ -327,13 +329,13 @@ fn the_one_that_is_meant_is_opened_and_the_others_are_let_go() {
 fn a_port_is_looked_up_on_the_bus() {
     let fake = Fake::new(&[A, B]);
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
+    let tree = FakeTree::new(home.path());
     for (port, product, serial) in
         [("2-1.1", 0x097c, A), ("2-1.2", 0x097d, A), ("2-3.1", 0x097c, B), ("2-3.2", 0x097d, B)]
     {
         let strings = ["", "", serial];
         let id = (0x045e, product);
-        tree.plug(&MadeDevice { id, strings, interfaces: vec![], ..MadeDevice::new(port, 0) });
+        tree.plug(&FakeDevice { id, strings, interfaces: vec![], ..FakeDevice::new(port, 0) });
     }
     let at = |port: &str| {
         let config = LiveConfig { port: Some(port.into()), ..fake.config() };
@@ -371,7 +373,7 @@ fn without_its_libraries_it_says_what_to_install() {
     let config = LiveConfig { places, ..fake.config() };
     let e = error(start(config.clone(), A, &[]));
     assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains("depth engine"), "{e}");
-    start(config, A, &[wish("color", (1280, 720), PixelFormat::Yuyv)]).unwrap();
+    start(config, A, &[wish("color", 1280, 720, PixelFormat::Yuyv)]).unwrap();
     // libk4a has its own opinion of the engine.
     let fake = Fake::new(&[A]);
     fake.command(A, "engine", 1);
@@ -433,9 +435,9 @@ fn a_dead_camera_stays_dead_and_the_next_opening_works() {
     assert_ne!(again.poll(Duration::ZERO, &mut sink).unwrap(), Poll::End);
 }
 
-/// Every sample that the made library gave, with its values and its times, while pictures come too.
+/// Every sample that the fake library gave, with its values and its times, while images come too.
 #[test]
-fn samples_of_motion_are_those_of_the_device() {
+fn imu_samples_are_those_of_the_device() {
     let fake = Fake::new(&[A]);
     let mut requests = all_streams(PixelFormat::Yuyv).to_vec();
     requests.insert(1, StreamRequest::any(Name::new("imu").unwrap()));
@@ -458,7 +460,8 @@ fn samples_of_motion_are_those_of_the_device() {
         sink.frames.iter().filter(|f| f.0 == 1).flat_map(|f| MotionSample::all_in(&f.2)).collect();
     let mut lost = 0;
     for pair in samples.windows(2) {
-        let (a, b) = (pair[0], pair[1]);
+        let a = pair[0];
+        let b = pair[1];
         assert!(a.time_ns < b.time_ns && a.sequence < b.sequence);
         assert_eq!(
             b.sequence - a.sequence,
@@ -473,7 +476,7 @@ fn samples_of_motion_are_those_of_the_device() {
         let (rotation, acceleration) = fake_k4a::motion(s.device_time);
         assert_eq!((s.gyro_rad_s, s.accel_m_s2), (rotation, acceleration));
         assert_eq!((s.accel_offset_ns, s.temperature_c), (40_000, 33.5));
-        // The unit's clock is that of the pictures, which began at 3 s.
+        // The unit's clock is that of the images, which began at 3 s.
         assert!((3_000_000..60_000_000).contains(&s.device_time));
         assert!(s.time() > began && s.time() < HostTime::now());
     }
@@ -492,7 +495,7 @@ fn samples_of_motion_are_those_of_the_device() {
     assert_eq!(sink.captured[1], sink.delivered(1));
     assert_eq!(sink.drops_of(0).total() + sink.drops_of(2).total(), 0);
 
-    // It breaks off, and pictures go on.
+    // It breaks off, and images go on.
     fake.command(A, "imu_ends", 1);
     poll_frames(stream.as_mut(), &mut sink, 5);
     let before = batches(&sink);
@@ -503,7 +506,7 @@ fn samples_of_motion_are_those_of_the_device() {
 }
 
 #[test]
-fn the_motion_unit_alone_is_refused_and_by_default_it_streams() {
+fn the_imu_alone_is_refused_and_by_default_it_streams() {
     let fake = Fake::new(&[A]);
     let alone = [StreamRequest::any(Name::new("imu").unwrap())];
     let e = error(start(fake.config(), A, &alone));

@@ -1,4 +1,4 @@
-//! A batch of motion samples takes no memory: counted by an allocator.
+//! A batch of IMU samples allocates nothing: counted by an allocator.
 #![allow(missing_docs, clippy::unwrap_used)]
 
 use depthrig_bus::{DropReason, FrameFlags, HostTime, MetadataLevel, MotionSample, Pose};
@@ -32,7 +32,8 @@ impl FrameSink for Slot {
 fn a_batch_takes_no_memory() {
     let unit =
         profile(1600.0, 64, Pose::IDENTITY, DeviceClock::microseconds(64), MetadataLevel::Full).unwrap();
-    let (mut batcher, mut sink) = (Batcher::new(0, &unit), Slot(vec![0; unit.frame_bytes()], 0, 0));
+    let mut batcher = Batcher::new(0, &unit);
+    let mut sink = Slot(vec![0; unit.frame_bytes()], 0, 0);
     let taken = during(|| {
         for n in 0..64_000u64 {
             let arrival = HostTime::from_ns(1_000_000_000 + 625_000 * n as i64);

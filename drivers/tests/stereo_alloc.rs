@@ -26,7 +26,7 @@ struct Wall {
 struct WallStream {
     profiles: Vec<StreamProfile>,
     gates: Vec<Gate>,
-    pictures: [Vec<u8>; 2],
+    images: [Vec<u8>; 2],
     sequence: u64,
 }
 
@@ -42,12 +42,12 @@ impl Device for Wall {
     fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
         let profiles = choose_profiles("wall", &self.profiles, requests)?;
         let gates = profiles.iter().enumerate().map(|(i, p)| Gate::new(i, p)).collect();
-        let eye = |shift: u32| {
+        let image = |shift: u32| {
             let grey = |x: u32, y: u32| ((x + shift) * 7919 + y * 104_729).wrapping_mul(2_654_435_761) >> 7;
             let pixels = (0..SIZE.0 * SIZE.1).map(|i| (i % SIZE.0, i / SIZE.0));
             pixels.flat_map(|(x, y)| [grey(x, y) as u8, 128]).collect()
         };
-        Ok(Box::new(WallStream { profiles, gates, pictures: [eye(0), eye(10)], sequence: 0 }))
+        Ok(Box::new(WallStream { profiles, gates, images: [image(0), image(10)], sequence: 0 }))
     }
 }
 
@@ -59,10 +59,10 @@ impl Stream for WallStream {
     fn poll(&mut self, _: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
         self.sequence += 1;
         let ticks = 1_000_000_000 + self.sequence * 33_333_333;
-        for (gate, picture) in self.gates.iter_mut().zip(&self.pictures) {
-            let raw = RawFrame::new(self.sequence, ticks, HostTime::from_ns(ticks as i64 + 1), picture.len());
+        for (gate, image) in self.gates.iter_mut().zip(&self.images) {
+            let raw = RawFrame::new(self.sequence, ticks, HostTime::from_ns(ticks as i64 + 1), image.len());
             gate.deliver(&raw, sink, |memory| {
-                memory.copy_from_slice(picture);
+                memory.copy_from_slice(image);
                 Ok(())
             });
         }
@@ -121,12 +121,13 @@ fn a_pair_takes_no_memory() {
         }
     };
     until(20);
-    // A thread that the scheduler did not let run before makes its buffers when it does, so the steady state may come late on
-    // a busy computer. Once is enough: what each pair took would be taken in every stretch.
+    // A thread that the scheduler did not let run before makes its buffers when it does, so the steady state may come
+    // late on a busy computer. Once is enough: what each pair took would be taken in every stretch.
     let mut by_threads = Vec::new();
     while by_threads.last().is_none_or(|n| *n > 2) {
         assert!(by_threads.len() < 5, "{by_threads:?} by the threads, in 40 pairs each time");
-        let (own, all) = (of_thread(), of_process());
+        let own = of_thread();
+        let all = of_process();
         until(60 + 40 * by_threads.len() as u64);
         assert_eq!(of_thread() - own, 0, "on the thread that captures");
         by_threads.push(of_process() - all);

@@ -1,4 +1,4 @@
-//! What simulated cameras show and do, seen from outside: one world, honest sensors, a cache that is used and
+//! Simulated cameras, seen from outside: one world, honest sensors, a cache that is used and
 //! repaired, clocks and faults as scheduled.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
@@ -13,8 +13,9 @@ use std::path::Path;
 use std::sync::Mutex;
 use std::time::Duration;
 
-fn camera(model: &str, size: (u32, u32), cache: &Path) -> SyntheticConfig {
-    let depth = StreamOverride { stream: Name::new("depth").unwrap(), size: Some(size), rate_hz: None };
+fn camera(model: &str, width: u32, height: u32, cache: &Path) -> SyntheticConfig {
+    let depth =
+        StreamOverride { stream: Name::new("depth").unwrap(), size: Some((width, height)), rate_hz: None };
     let mut streams = vec![depth.clone()];
     if model == "generic" {
         streams.push(StreamOverride { stream: Name::new("color").unwrap(), ..depth });
@@ -29,7 +30,7 @@ fn camera(model: &str, size: (u32, u32), cache: &Path) -> SyntheticConfig {
     }
 }
 
-/// One picture of a stream.
+/// One image of a stream.
 struct Shot {
     profile: StreamProfile,
     on_mount: Pose,
@@ -61,7 +62,7 @@ impl Shot {
     }
 }
 
-/// Takes one picture of these streams.
+/// Takes one image of these streams.
 fn shoot(config: &SyntheticConfig, streams: &[&str]) -> Vec<Shot> {
     let backend = SyntheticBackend::new(vec![config.clone()]).unwrap();
     let device = backend.open(None).unwrap();
@@ -92,11 +93,13 @@ fn compare(a: &Shot, b: &Shot) -> [u32; 3] {
         let Some(ray) = a.profile.intrinsics.unproject(DVec2::new(x as f64, y as f64)) else { continue };
         let p = a_to_b.transform_point(ray * a.depth_m(x, y));
         let Some(px) = b.profile.intrinsics.project(p) else { continue };
-        let (u, v) = (px.x.round(), px.y.round());
+        let u = px.x.round();
+        let v = px.y.round();
         if u < 1.0 || v < 1.0 || u > w as f64 - 2.0 || v > h as f64 - 2.0 {
             continue;
         }
-        let (u, v) = (u as usize, v as usize);
+        let u = u as usize;
+        let v = v as usize;
         // Half a pixel on a slanted surface is some millimetres: compare with the neighbourhood's range.
         let around = (0..9).map(|i| b.depth_m(u + i % 3 - 1, v + i / 3 - 1)).filter(|z| *z > 0.0);
         let (low, high) = around.fold((f64::INFINITY, 0.0f64), |(l, h), z| (l.min(z), h.max(z)));
@@ -112,8 +115,8 @@ fn compare(a: &Shot, b: &Shot) -> [u32; 3] {
 #[test]
 fn all_cameras_see_one_world() {
     let cache = tempfile::tempdir().unwrap();
-    let mut a = camera("d415", (640, 480), cache.path());
-    let mut b = camera("kinect", (512, 512), cache.path());
+    let mut a = camera("d415", 640, 480, cache.path());
+    let mut b = camera("kinect", 512, 512, cache.path());
     a.pose_on_mount.translation_m = [-0.12, 0.03, 0.0];
     b.pose_on_mount = Pose { translation_m: [0.15, -0.05, 0.02], rotation_xyzw: [0.05, -0.08, 0.02, 0.99] };
     let a = shoot(&a, &["depth_true"]).remove(0);
@@ -138,7 +141,8 @@ fn the_truth_in_colours_view_is_the_same_world_pixel_by_pixel_beside_colour() {
     let cache = tempfile::tempdir().unwrap();
     // Offsets to the side, and a lens that looks elsewhere.
     for (model, size) in [("d455", (640, 480)), ("kinect", (512, 512))] {
-        let shots = shoot(&camera(model, size, cache.path()), &["color", "depth_true", "depth_true_color"]);
+        let shots =
+            shoot(&camera(model, size.0, size.1, cache.path()), &["color", "depth_true", "depth_true_color"]);
         let [color, truth, mut in_color] = shots.try_into().ok().unwrap();
         assert_eq!((in_color.size(), in_color.on_mount), (color.size(), color.on_mount));
         assert_eq!(in_color.profile.intrinsics, color.profile.intrinsics);
@@ -159,20 +163,21 @@ fn the_truth_in_colours_view_is_the_same_world_pixel_by_pixel_beside_colour() {
 fn a_stereo_camera_sees_steps_of_disparity_noise_and_holes() {
     let cache = tempfile::tempdir().unwrap();
     let [depth, truth] =
-        shoot(&camera("d405", (848, 480), cache.path()), &["depth", "depth_true"]).try_into().ok().unwrap();
+        shoot(&camera("d405", 848, 480, cache.path()), &["depth", "depth_true"]).try_into().ok().unwrap();
     assert_eq!(truth.holes(), 0.0, "the truth has no holes");
     let holes = depth.holes();
-    assert!((0.02..0.6).contains(&holes), "{holes} of the picture are holes");
+    assert!((0.02..0.6).contains(&holes), "{holes} of the image are holes");
 
     // Every depth is one of f b / (n / 32), rounded to the unit: equal steps in 1/z.
     let focal_baseline = depth.profile.intrinsics.fx * 0.018;
-    let (mut inliers, mut levels) = (Vec::new(), std::collections::BTreeSet::new());
+    let mut inliers = Vec::new();
+    let mut levels = std::collections::BTreeSet::new();
     for (x, y) in depth.every_pixel().filter(|(x, y)| depth.counts(*x, *y) > 0) {
         let z = depth.depth_m(x, y);
         let n = (focal_baseline / z * 32.0).round();
         let nearest = (focal_baseline * 32.0 / n / 0.0001).round();
         let off = (nearest - f64::from(depth.counts(x, y))).abs();
-        assert!(off <= 1.0, "({x}, {y}): {z} m is no step of disparity");
+        assert!(off <= 1.0, "({x}, {y}): {z} m is not a step of disparity");
         levels.insert(n as u64);
         let wanted = truth.depth_m(x, y);
         if (z / wanted - 1.0).abs() < 0.08 {
@@ -188,7 +193,8 @@ fn a_stereo_camera_sees_steps_of_disparity_noise_and_holes() {
         assert!(of.len() > 2000, "{} pixels between {near} m and {far} m", of.len());
         (of.iter().sum::<f64>() / of.len() as f64).sqrt()
     };
-    let (near, far) = (spread(0.5, 0.65), spread(0.95, 1.2));
+    let near = spread(0.5, 0.65);
+    let far = spread(0.95, 1.2);
     assert!(far > 2.0 * near && far < 6.0 * near, "rms {near} m near, {far} m far");
 }
 
@@ -196,7 +202,7 @@ fn a_stereo_camera_sees_steps_of_disparity_noise_and_holes() {
 fn a_time_of_flight_camera_loses_the_dark_and_the_shiny_and_mixes_edges() {
     let cache = tempfile::tempdir().unwrap();
     let [depth, truth] =
-        shoot(&camera("kinect", (512, 512), cache.path()), &["depth", "depth_true"]).try_into().ok().unwrap();
+        shoot(&camera("kinect", 512, 512, cache.path()), &["depth", "depth_true"]).try_into().ok().unwrap();
     // Outside of the light's circle there is nothing, whatever the truth.
     assert_eq!(
         [depth.counts(3, 3), depth.counts(508, 3), depth.counts(3, 508), depth.counts(508, 508)],
@@ -204,7 +210,9 @@ fn a_time_of_flight_camera_loses_the_dark_and_the_shiny_and_mixes_edges() {
     );
     let holes = depth.holes();
     assert!((0.1..0.4).contains(&holes), "{holes}: the corners are 21 % of a square, the rest are things");
-    let (mut flying, mut seen, mut sum) = (0, 0, 0.0);
+    let mut flying = 0;
+    let mut seen = 0;
+    let mut sum = 0.0;
     for (x, y) in depth.every_pixel().filter(|(x, y)| (1..511).contains(x) && (1..511).contains(y)) {
         let z = depth.depth_m(x, y);
         if z == 0.0 {
@@ -226,12 +234,13 @@ fn a_time_of_flight_camera_loses_the_dark_and_the_shiny_and_mixes_edges() {
 
 #[test]
 fn a_seed_gives_the_same_bytes_with_any_number_of_threads() {
-    let (one, two) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let one = tempfile::tempdir().unwrap();
+    let two = tempfile::tempdir().unwrap();
     let with_threads = |n, config: &SyntheticConfig| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
         pool.install(|| prepare(config, &|_, _| ())).unwrap();
     };
-    let config = |dir: &Path| SyntheticConfig { poses: 2, ..camera("generic", (160, 120), dir) };
+    let config = |dir: &Path| SyntheticConfig { poses: 2, ..camera("generic", 160, 120, dir) };
     with_threads(1, &config(one.path()));
     with_threads(3, &config(two.path()));
     let files = |dir: &Path| {
@@ -245,14 +254,15 @@ fn a_seed_gives_the_same_bytes_with_any_number_of_threads() {
     assert_eq!(files(one.path()).len(), 3, "colour; depth with its truth; the truth in colour's view");
     assert!(files(one.path()) == files(two.path()));
     let seeded = SyntheticConfig { seed: 2, ..config(one.path()) };
-    let (a, b) = (shoot(&config(one.path()), &["depth"]), shoot(&seeded, &["depth"]));
+    let a = shoot(&config(one.path()), &["depth"]);
+    let b = shoot(&seeded, &["depth"]);
     assert_ne!(a[0].pixels, b[0].pixels, "another seed, other noise");
 }
 
 #[test]
 fn the_cache_is_used_and_repaired() {
     let dir = tempfile::tempdir().unwrap();
-    let config = SyntheticConfig { truth: false, ..camera("generic", (160, 120), dir.path()) };
+    let config = SyntheticConfig { truth: false, ..camera("generic", 160, 120, dir.path()) };
     let steps = Mutex::new(Vec::new());
     prepare(&config, &|done, total| steps.lock().unwrap().push((done, total))).unwrap();
     let steps = steps.into_inner().unwrap();
@@ -261,7 +271,8 @@ fn the_cache_is_used_and_repaired() {
 
     let inode = |path: &Path| std::os::unix::fs::MetadataExt::ino(&std::fs::metadata(path).unwrap());
     let path = std::fs::read_dir(dir.path()).unwrap().next().unwrap().unwrap().path();
-    let (made, good) = (inode(&path), std::fs::read(&path).unwrap());
+    let made = inode(&path);
+    let good = std::fs::read(&path).unwrap();
     prepare(&config, &|_, _| ()).unwrap();
     assert_eq!(inode(&path), made, "a good file is used as it is");
     for bad in [
@@ -308,7 +319,7 @@ fn a_wrapping_counter_and_a_fast_clock_still_give_true_times() {
         "the counter wrapped meanwhile"
     );
     assert!(frames.windows(2).all(|w| w[0].device_time < w[1].device_time));
-    assert!(frames.iter().all(|f| f.clock_epoch == frames[0].clock_epoch), "a wrap is no new epoch");
+    assert!(frames.iter().all(|f| f.clock_epoch == frames[0].clock_epoch), "a wrap does not begin an epoch");
     for f in &frames[20..] {
         let true_capture = truth.frame(0, f.arrival).unwrap().capture;
         let off_ns = f.capture_time.since_ns(true_capture);
@@ -366,13 +377,13 @@ fn a_device_is_held_by_one_at_a_time_and_serials_must_differ() {
 }
 
 #[test]
-fn a_colour_picture_tells_its_number_and_the_mount_moves() {
+fn a_colour_image_tells_its_number_and_the_mount_moves() {
     let dir = tempfile::tempdir().unwrap();
     let config = SyntheticConfig {
         poses: 3,
         pose_rate_hz: 30.0,
         truth: false,
-        ..camera("generic", (192, 108), dir.path())
+        ..camera("generic", 192, 108, dir.path())
     };
     let backend = SyntheticBackend::new(vec![config]).unwrap();
     let truth = backend.truth("sim-generic").unwrap();
@@ -396,7 +407,7 @@ fn a_colour_picture_tells_its_number_and_the_mount_moves() {
 
 /// Samples as read against the truth at the time that they claim; the camera is reset and unplugged meanwhile.
 #[test]
-fn a_motion_unit_measures_the_truth_of_the_moment_that_its_samples_claim() {
+fn an_imu_measures_the_truth_of_the_moment_that_its_samples_claim() {
     let fault = |at_s, kind| ScheduledFault { at_s, kind, duration_s: 0.2, count: 2 };
     let mut config = SyntheticConfig {
         motion: true,

@@ -1,4 +1,4 @@
-//! The depth codec: packed pictures from nowhere, and any picture there and back.
+//! The depth codec: decodes arbitrary bytes, and round-trips any image.
 #![no_main]
 
 use depthrig_recorder::fuzzing;

@@ -1,4 +1,4 @@
-//! What a process that serves a camera says to the daemon, and the daemon to it.
+//! Messages between a process that serves a camera and the daemon, both directions.
 #![no_main]
 
 use depthrig_drivers::fuzzing::external;

@@ -1,4 +1,4 @@
-//! A recording of an Azure Kinect.
+//! An Azure Kinect `.mkv`.
 #![no_main]
 
 use depthrig_drivers::fuzzing::kinect;

@@ -3,7 +3,7 @@
 use depthrig_recorder::fuzzing::mcap;
 use libfuzzer_sys::fuzzer_mutate;
 
-/// What `fuzz_mutator!` asks for.
+/// Mutates `data` in place, as `fuzz_mutator!` asks.
 pub fn mutate(data: &mut [u8], size: usize, max_size: usize, seed: u32) -> usize {
     let mut change = |bytes: &[u8]| {
         let mut room = bytes.to_vec();

@@ -1,4 +1,4 @@
-//! An NPY file, as an import of pictures reads it.
+//! An NPY file, as an import of images reads it.
 #![no_main]
 
 use depthrig_recorder::fuzzing;

@@ -1,4 +1,4 @@
-//! What a RealSense camera says of itself.
+//! The description that a RealSense camera gives of itself.
 #![no_main]
 
 use depthrig_drivers::fuzzing::realsense;

@@ -1,4 +1,4 @@
-//! A ZED's factory calibration; also its command blocks and motion records.
+//! A ZED's factory calibration; also its command blocks and IMU records.
 #![no_main]
 
 use depthrig_drivers::zed::fuzzing;

@@ -55,7 +55,7 @@ def main() -> None:
     p50, p99, worst = (float(np.percentile(samples, q)) / 1e3 for q in (50, 99, 100))
     result = {
         "stream": header.stream_id,
-        "picture": f"{header.width}x{header.height} {header.format_name}",
+        "image": f"{header.width}x{header.height} {header.format_name}",
         "frames": options.frames,
         "missed": missed,
         "p50_us": round(p50, 1),
@@ -74,7 +74,7 @@ def main() -> None:
         print(json.dumps(result, indent=2))
         return
     c = result["conditions"]
-    print(f"{result['stream']}, {result['picture']}, {options.frames} frames, {missed} missed")
+    print(f"{result['stream']}, {result['image']}, {options.frames} frames, {missed} missed")
     print(f"publish to readable array: p50 {p50:.1f} us, p99 {p99:.1f} us, max {worst:.1f} us")
     print(f"this process used {cpu_share * 100:.2f} % of a core; {c}")
 

@@ -24,10 +24,10 @@ WIDTH, HEIGHT, RATE_HZ = 640, 480, 30.0
 
 
 def main() -> None:
-    """What a camera can do, then a loop: sessions, and frames for as long as they are wanted."""
+    """Serve sessions, and frames for as long as they are wanted."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--camera", help="the camera's name in the rig file; by default what the daemon says")
-    parser.add_argument("--rig", help="the rig's name; by default what the daemon says, or the only one that runs")
+    parser.add_argument("--camera", help="camera name in the rig file [default: set by the daemon]")
+    parser.add_argument("--rig", help="rig name [default: set by the daemon, else the only one running]")
     options = parser.parse_args()
 
     # The first mode of a stream is its default; here the frames are stamped by this computer's clock.
@@ -46,12 +46,12 @@ def main() -> None:
 
 
 def play(session: depthrig.ExternalSession) -> None:
-    """Start the camera, send what it gives, stop it: here it is drawn."""
+    """Start the camera, send its frames, stop it: here they are drawn."""
     ramp = np.add.outer(np.arange(HEIGHT), np.arange(WIDTH))
     due = time.monotonic()
     number = 0
     while session.wanted:
-        due = max(due + 1 / RATE_HZ, time.monotonic())  # what is late is not made good by a burst
+        due = max(due + 1 / RATE_HZ, time.monotonic())  # delays are not made up by a burst
         time.sleep(max(0.0, due - time.monotonic()))
         number += 1
         facts = {"device_time": time.monotonic_ns(), "device_sequence": number}

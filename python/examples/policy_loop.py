@@ -2,10 +2,10 @@
 
 python policy_loop.py d435/depth_refined [--hz 10] [--seconds 10] [--max-age 0.5] [--device cpu] [--json]
 
-The policy has the form of the paper's: a ResNet whose first layer takes one channel looks at the depth picture, an
+The policy has the form of the paper's: a ResNet whose first layer takes one channel looks at the depth image, an
 MLP at the joints and the gripper, and a diffusion head turns noise into a sequence of actions in a few DDIM steps.
-**Its weights are random** (`--seed`): the arm moves, and it means nothing. What is real is the path: depth from the
-rig, at most `--max-age` old, one copy to the device, the network's arithmetic. It needs PyTorch, and a rig:
+**Its weights are random** (`--seed`): the arm moves, but its motion means nothing. The data path is real: depth
+from the rig, at most `--max-age` old, one copy to the device, the network's arithmetic. It needs PyTorch, and a rig:
 `depthrig run RIG.toml`. Any depth stream will do, such as d435/depth when no stage refines it.
 """
 
@@ -70,7 +70,7 @@ def resnet18() -> nn.Module:
 
 
 class Denoiser(nn.Module):
-    """Says which noise is in a sequence of actions: 1-d convolutions that what was seen shifts and scales (FiLM)."""
+    """Predicts the noise in a sequence of actions: 1-d convolutions that the observation shifts and scales (FiLM)."""
 
     def __init__(self, seen: int, width: int = 128) -> None:
         super().__init__()
@@ -95,11 +95,11 @@ class Denoiser(nn.Module):
 
 
 class Policy(nn.Module):
-    """Depth picture and joints to a sequence of actions."""
+    """Depth image and joints to a sequence of actions."""
 
     def __init__(self, ddim_steps: int) -> None:
         super().__init__()
-        self.eye = resnet18()
+        self.encoder = resnet18()
         self.body = nn.Sequential(nn.Linear(JOINTS, 64), nn.ReLU(), nn.Linear(64, 64))
         self.head = Denoiser(512 + 64)
         # The squared-cosine schedule (Nichol and Dhariwal 2021).
@@ -110,11 +110,11 @@ class Policy(nn.Module):
 
     @torch.inference_mode()
     def forward(self, depth_m: Tensor, joints: Tensor, noise: torch.Generator) -> Tensor:
-        """Return (HORIZON, JOINTS) joint positions, of a (H, W) picture in metres and the joints now."""
-        picture = (depth_m / RANGE_M).clamp_(0, 1)[None, None]
+        """Return (HORIZON, JOINTS) joint positions, of a (H, W) image in metres and the joints now."""
+        image = (depth_m / RANGE_M).clamp_(0, 1)[None, None]
         # Nearest: between depth and no depth lies no depth.
-        picture = nn.functional.interpolate(picture, (SIDE, SIDE), mode="nearest")
-        seen = torch.cat([self.eye(picture), self.body(joints[None])], dim=1)
+        image = nn.functional.interpolate(image, (SIDE, SIDE), mode="nearest")
+        seen = torch.cat([self.encoder(image), self.body(joints[None])], dim=1)
         x = torch.randn(1, JOINTS, HORIZON, generator=noise).to(seen.device)
         for step, following in zip(self.steps, [*self.steps[1:], -1]):
             # DDIM without noise (Song et al. 2021, eq. 12 with sigma 0).
@@ -126,7 +126,7 @@ class Policy(nn.Module):
 
 
 class Arm:
-    """A simulated arm: joints that follow their targets with a lag. What it does is not in the camera's picture."""
+    """A simulated arm: joints that follow their targets with a lag. Its motion does not show in the camera's image."""
 
     def __init__(self) -> None:
         self.joints = torch.zeros(JOINTS)
@@ -179,7 +179,7 @@ def main() -> None:
         start = due = time.monotonic()
         while time.monotonic() - start < options.seconds:
             try:
-                # A newer picture is a reason to plan anew; without one the plan goes on, if its depth is fresh enough.
+                # A newer image is a reason to plan anew; without one the plan goes on, if its depth is fresh enough.
                 frame = stream.wait_fresh(options.max_age, timeout=0 if plan else options.max_age)
             except depthrig.Stale as stale:
                 if not plan or stale.age_s is None or stale.age_s > options.max_age:
@@ -211,7 +211,7 @@ def main() -> None:
                 due += late
             time.sleep(max(0.0, -late))
         missed, restarts = stream.missed, stream.restarts
-    source = {"stream": header.stream_id, "picture": f"{header.width}x{header.height} {header.format_name}"}
+    source = {"stream": header.stream_id, "image": f"{header.width}x{header.height} {header.format_name}"}
     if header.refinement is not None:
         source |= {"engine": header.refinement.engine, "model": header.refinement.model or "none"}
     result = {
@@ -233,7 +233,7 @@ def main() -> None:
     print(", ".join(f"{k} {v}" for k, v in source.items()) + f", on {options.device}")
     explained = {
         "depth_age": "exposure to the policy's input",
-        "feed": "publishing to the frame in hand",
+        "feed": "publishing to the received frame",
         "torch_copy": "the frame to a tensor in metres",
         "policy": f"the network, {options.ddim_steps} DDIM steps",
         "depth_to_action": "exposure to the first action",
@@ -246,7 +246,7 @@ def main() -> None:
 
 
 def synchronise(device: str) -> None:
-    """Wait until the device has done what it was asked, so that a clock tells how long that took."""
+    """Wait until the device has finished, so that the elapsed time can be measured."""
     if device.startswith("cuda"):
         torch.cuda.synchronize()
 

@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def png(frame: depthrig.Frame) -> bytes:
-    """Return the picture as PNG: 8-bit grey or colour, 16-bit grey for depth and infrared."""
+    """Return the image as PNG: 8-bit grey or colour, 16-bit grey for depth and infrared."""
     array = frame.array
     if frame.header.format_name == "bgr8":
         array = array[..., ::-1]

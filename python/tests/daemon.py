@@ -1,6 +1,6 @@
-"""The daemon's side of the hand-shake inside a test, so that a test says what the daemon wants and reads what comes.
+"""The daemon's side of the hand-shake inside a test, so that a test sets the daemon's requests and reads the messages.
 
-The real daemon is in test_external_daemon.py; this one can be told to be silent, rude or of another version.
+The real daemon is in test_external_daemon.py; this one can be silent, faulty or of another version.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ANSWER |= {"size": layout.EXTERNAL_ANSWER_SIZE}
 
 
 class FakeDaemon:
-    """Reads offers and frames, and answers; heart-beats come from a thread while `beating`."""
+    """Reads offers and frames, and answers; heartbeats come from a thread while `beating`."""
 
     def __init__(self, folder: Path, camera: str = "front", rig: str = "mount") -> None:
         self._bus = Bus.at(str(folder))
@@ -67,7 +67,7 @@ class FakeDaemon:
         self._bell.ring()
 
     def read(self) -> None:
-        """Take what was offered."""
+        """Read the offer."""
         while (message := self._offers.take()) is not None:
             self.offer = unpack_fields(layout.EXTERNAL_OFFER_FIELDS, message[0])
             self.offers += 1
@@ -88,7 +88,7 @@ class FakeDaemon:
     def say(
         self, want: int, session: int, modes: bytes | None = None, change: dict[str, Any] | None = None, **fields: Any
     ) -> None:
-        """Answer the camera's offer, and again with every heart-beat; `change` makes it wrong."""
+        """Answer the camera's offer, and again with every heartbeat; `change` makes it wrong."""
         offer = self.until()
         self._payload = bytes([1] * offer["modes"]) if modes is None else modes
         self._said = {

@@ -42,7 +42,7 @@ def child(command: list[str], **options: Any) -> Iterator[subprocess.Popen[str]]
 
 
 class Publisher:
-    """A publisher process that publishes exactly when told to."""
+    """A publisher process that publishes exactly on command."""
 
     def __init__(self, binary: str, folder: Path, *options: str, rig: str = "example") -> None:
         self.folder = folder

@@ -102,7 +102,7 @@ def test_depth_in_metres() -> None:
 
 
 def test_depth_of_what_is_none() -> None:
-    with pytest.raises(TypeError, match="cam/test carries rgb8, which is no depth"):
+    with pytest.raises(TypeError, match="cam/test carries rgb8, which is not depth"):
         frame(header(PixelFormat.RGB8, 2, 2, 6, 12), np.zeros(12, np.uint8)).depth_m()
     with pytest.raises(depthrig.BadFrame, match="states no depth unit"):
         frame(header(PixelFormat.Z16, 2, 2, 4, 8), np.zeros(8, np.uint8)).depth_m()

@@ -1,4 +1,4 @@
-"""The decoder of depth pictures against a slow model, and against pictures that the Rust encoder packed."""
+"""The decoder of depth images against a slow model, and against images that the Rust encoder packed."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ except ImportError:
 PACKED = Path(__file__).parent / "data" / "packed_depth.json"
 
 
-def pack(picture: np.ndarray, pad: int = 0) -> bytes:
+def pack(image: np.ndarray, pad: int = 0) -> bytes:
     """The format page in the plainest code."""
-    height, width = picture.shape
-    palette = sorted({int(v) for v in picture.flat})
-    ranks = [[palette.index(int(v)) for v in row] for row in picture]
+    height, width = image.shape
+    palette = sorted({int(v) for v in image.flat})
+    ranks = [[palette.index(int(v)) for v in row] for row in image]
     steps = [v - (palette[i - 1] if i else 0) for i, v in enumerate(palette)]
 
     def rank(y, x):
@@ -56,7 +56,7 @@ def message(data: bytes, height: int, width: int, step: int, frame_id=b"cam", co
     return out + b"\0" * (-len(out) % 4) + struct.pack("<I", len(data)) + data
 
 
-def pictures(n):
+def images(n):
     rng = random.Random(7)
     for _ in range(n):
         height, width = rng.randint(1, 12), rng.randint(1, 15)
@@ -65,21 +65,21 @@ def pictures(n):
 
 
 def test_what_the_model_packs_is_unpacked() -> None:
-    for i, picture in enumerate(pictures(150)):
-        height, width = picture.shape
+    for i, image in enumerate(images(150)):
+        height, width = image.shape
         pad = i % 3
-        data, step = pack(picture, pad), 2 * width + pad
+        data, step = pack(image, pad), 2 * width + pad
         got = decode_depth(message(data, height, width, step, b"c" * (i % 5)))
         assert got.dtype == np.uint16
-        assert np.array_equal(got, picture), i
-        assert np.array_equal(unpack_depth(list(data), height, width, step), picture)
+        assert np.array_equal(got, image), i
+        assert np.array_equal(unpack_depth(list(data), height, width, step), image)
 
 
 def test_every_value_at_once() -> None:
-    picture = (np.arange(65536, dtype=np.uint32) * 40503).astype(np.uint16).reshape(512, 128)
+    image = (np.arange(65536, dtype=np.uint32) * 40503).astype(np.uint16).reshape(512, 128)
     # The model's palette.index would take minutes here; ranks are the values themselves.
     ranks = np.zeros((513, 129), np.int64)
-    ranks[1:, 1:] = picture
+    ranks[1:, 1:] = image
     west, north, corner = ranks[1:, :-1], ranks[:-1, 1:], ranks[:-1, :-1]
     predicted = np.sort(np.stack([west, north, west + north - corner]), axis=0)[1]
     left = (ranks[1:, 1:] - predicted + 32768) % 65536 - 32768
@@ -87,7 +87,7 @@ def test_every_value_at_once() -> None:
     steps = np.array([0] + [1] * 65535)
     planes = [steps & 255, steps >> 8, folded & 255, folded >> 8]
     data = struct.pack("<I", 65536) + zstd.compress(b"".join(p.astype(np.uint8).tobytes() for p in planes))
-    assert np.array_equal(unpack_depth(data, 512, 128), picture)
+    assert np.array_equal(unpack_depth(data, 512, 128), image)
 
 
 def test_what_rust_packed_is_unpacked() -> None:
@@ -95,16 +95,16 @@ def test_what_rust_packed_is_unpacked() -> None:
     cases = json.loads(PACKED.read_text())
     assert len(cases) >= 4
     for case in cases:
-        picture = np.frombuffer(bytes.fromhex(case["pixels"]), np.uint8).reshape(case["height"], case["step"])
-        expected = np.ascontiguousarray(picture[:, : 2 * case["width"]]).view("<u2")
+        image = np.frombuffer(bytes.fromhex(case["pixels"]), np.uint8).reshape(case["height"], case["step"])
+        expected = np.ascontiguousarray(image[:, : 2 * case["width"]]).view("<u2")
         assert np.array_equal(decode_depth(bytes.fromhex(case["message"])), expected), case["name"]
 
 
 def test_damage_is_a_value_error_and_never_another() -> None:
     rng = random.Random(3)
-    picture = next(iter(pictures(1)))
-    height, width = picture.shape
-    good = message(pack(picture), height, width, 2 * width)
+    image = next(iter(images(1)))
+    height, width = image.shape
+    good = message(pack(image), height, width, 2 * width)
     wrong = 0
     for _ in range(600):
         damaged = bytearray(good)
@@ -120,8 +120,8 @@ def test_damage_is_a_value_error_and_never_another() -> None:
     ("change", "why"),
     [
         (lambda d: (d, 4, 5, 10, b"rank/2"), 'packed with "rank/2"'),
-        (lambda d: (d, 4, 5, 9, b"rank/1"), "is no picture"),
-        (lambda d: (d, 1 << 20, 1 << 20, 1 << 21, b"rank/1"), "is no picture"),
+        (lambda d: (d, 4, 5, 9, b"rank/1"), "invalid 16-bit image"),
+        (lambda d: (d, 1 << 20, 1 << 20, 1 << 21, b"rank/1"), "invalid 16-bit image"),
         (lambda d: (d, 40, 50, 100, b"rank/1"), "unpacks to"),
         (lambda d: (d[:3], 4, 5, 10, b"rank/1"), "cut short"),
         (lambda d: (b"\xff" * 4 + d[4:], 4, 5, 10, b"rank/1"), "does not fit 20 pixels"),

@@ -36,13 +36,13 @@ def test_the_viewer_saves_the_pixels(live: Path, tmp_path: Path, stream: str, dt
     out = run(live, str(PYTHON / "examples" / "view.py"), f"pattern/{stream}", "--count", "3", "--png", str(path))
     sequences = [int(n) for n in re.findall(rf"<Header pattern/{stream} #(\d+) 64x48", out)]
     assert len(sequences) == 3
-    picture = np.asarray(Image.open(path)).astype(dtype)
-    assert picture.shape == shape
+    image = np.asarray(Image.open(path)).astype(dtype)
+    assert image.shape == shape
     # The header as far as the pattern depends on it, for the frame that was saved.
     with depthrig.Stream(f"pattern/{stream}", runtime_dir=live, timeout=WAIT_S) as s:
         values = s.next(WAIT_S).header.to_dict() | {"sequence": sequences[-1]}
     expected = pattern_rows(depthrig.Header(depthrig.Header.pack(values)))
-    np.testing.assert_array_equal(picture.view(np.uint8).reshape(48, -1), expected)
+    np.testing.assert_array_equal(image.view(np.uint8).reshape(48, -1), expected)
 
 
 def test_frames_are_stacked(live: Path) -> None:
@@ -65,13 +65,13 @@ def test_the_benchmark_prints_json(live: Path) -> None:
 def test_the_lines_of_the_readme_run(live: Path) -> None:
     code = re.findall(r"```python\n(.*?)```", (PYTHON / "README.md").read_text(), re.DOTALL)[0]
     assert len([line for line in code.splitlines() if line]) <= 5
-    # On a picture of this size, and not for ever.
+    # On an image of this size, and not for ever.
     code = code.replace("d435/depth_refined", "pattern/z16").replace("[240, 320]", "[24, 32]") + "    break\n"
     out = run(live, "-c", code)
     assert re.fullmatch(r"\d+ [\d.]+ \(48, 64\) [\d.]+\n", out), out
 
 
-def test_the_external_camera_serves_until_it_is_told_to_stop(folder: Path) -> None:
+def test_the_external_camera_serves_until_it_is_stopped(folder: Path) -> None:
     script = str(PYTHON / "examples" / "external_camera.py")
     env = {**os.environ, "DEPTHRIG_RUNTIME_DIR": str(folder)}
     command = [sys.executable, script, "--camera", "front", "--rig", "mount"]

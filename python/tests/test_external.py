@@ -216,9 +216,9 @@ def test_jpegs_have_their_own_lengths(folder: Path) -> None:
     with serve(folder, JPEG) as camera, fake_daemon(folder) as daemon:
         daemon.run(1, ("jpeg",))
         with _session(camera) as session:
-            session.send("jpeg", b"\xff\xd8 a picture")
+            session.send("jpeg", b"\xff\xd8 an image")
             head, payload = daemon.frame("jpeg")
-            assert (payload, head["payload_len"]) == (b"\xff\xd8 a picture", 12)
+            assert (payload, head["payload_len"]) == (b"\xff\xd8 an image", 11)
             for wrong in (b"", bytes(97), np.zeros((2, 2), np.uint8)):
                 with pytest.raises(ValueError, match="a JPEG of stream 'jpeg' is 1 to 96 bytes"):
                     session.send("jpeg", wrong)
@@ -345,7 +345,7 @@ def test_files_at_their_end_lose_nothing(camera: ExternalCamera, daemon: FakeDae
     time.sleep(0.3)
     assert sender.is_alive(), "it waits, because no more than 4 may be unread"
     heads = [daemon.frame("color")[0] for _ in range(20)]
-    assert [h["sequence"] for h in heads] == list(range(1, 21)), "none gave way and none was counted as lost"
+    assert [h["sequence"] for h in heads] == list(range(1, 21)), "none was replaced and none was counted as lost"
     sender.join(WAIT_S)
     assert session.no_slot["color"] == 0
     assert not session.finish("all played", timeout=0.3), "the daemon has not said that it has them"
@@ -506,7 +506,7 @@ def test_heartbeats_come_while_the_program_is_busy(camera: ExternalCamera, daemo
         sum(range(10_000))
     for _ in range(5):
         daemon.read()
-    # Four messages wait unread, so the number tells.
+    # Four messages wait unread, so the number identifies the newest.
     assert daemon.offer is not None
     assert daemon.offers > before
     assert daemon.offer["number"] >= 4
@@ -545,19 +545,19 @@ def test_channels_of_another_version_are_refused(folder: Path) -> None:
     ("change", "text"),
     [
         ({"stream": "Color"}, "cannot be the name of a stream"),
-        ({"width": 0}, "0x6 is no size"),
-        ({"height": 16385}, "8x16385 is no size"),
-        ({"rate_hz": 0.0}, "is no rate"),
-        ({"rate_hz": float("nan")}, "is no rate"),
-        ({"rate_hz": 1001.0}, "is no rate"),
+        ({"width": 0}, "invalid size 0x6"),
+        ({"height": 16385}, "invalid size 8x16385"),
+        ({"rate_hz": 0.0}, "invalid rate"),
+        ({"rate_hz": float("nan")}, "invalid rate"),
+        ({"rate_hz": 1001.0}, "invalid rate"),
         ({"format": PixelFormat.YUYV, "width": 7}, "an even number of columns"),
         ({"format": PixelFormat.NV12, "height": 7}, "an even number of rows"),
         ({"format": PixelFormat.DEPTH_F32, "width": 16384, "height": 16384}, "bytes is too large"),
-        ({"format": PixelFormat.Z16, "depth_unit_m": float("inf")}, "no unit of depth"),
-        ({"format": PixelFormat.Z16, "depth_unit_m": -0.001}, "no unit of depth"),
+        ({"format": PixelFormat.Z16, "depth_unit_m": float("inf")}, "invalid depth unit"),
+        ({"format": PixelFormat.Z16, "depth_unit_m": -0.001}, "invalid depth unit"),
         ({"clock": ExternalClock.HOST, "tick_ps": 1_000_000}, "the host's clock has ticks of 1000 ps"),
         ({"format": 99}, "99 is not a valid PixelFormat"),
-        ({"format": PixelFormat.MOTION, "height": 1}, "motion samples of another process's camera are not taken yet"),
+        ({"format": PixelFormat.MOTION, "height": 1}, "IMU samples of another process's camera are not supported yet"),
     ],
 )
 def test_a_mode_that_cannot_be_is_refused_where_it_is_made(change: dict[str, Any], text: str) -> None:

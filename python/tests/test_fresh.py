@@ -13,7 +13,7 @@ import pytest
 
 import depthrig
 from depthrig import FrameFlags, PixelFormat, SetReader, Stale, Stream
-from maker import Maker
+from fake_rig import FakeRig
 from rig import WAIT_S, Publisher
 
 Start = Callable[..., Publisher]
@@ -21,10 +21,10 @@ MS = 1_000_000
 
 
 @pytest.fixture
-def maker(folder: Path) -> Iterator[Maker]:
+def fake_rig(folder: Path) -> Iterator[FakeRig]:
     """Publishes what a test wants, with the capture times that it wants."""
-    with Maker(folder) as made:
-        yield made
+    with FakeRig(folder) as publisher:
+        yield publisher
 
 
 def stream(folder: Path, name: str = "cam/depth") -> Stream:
@@ -35,8 +35,8 @@ def reader(folder: Path, *names: str, **more: Any) -> SetReader:
     return SetReader(names or ("a/depth", "b/depth"), rig="mount", runtime_dir=folder, timeout=WAIT_S, **more)
 
 
-def test_a_fresh_frame_comes_at_once_and_the_newest_of_them(maker: Maker, folder: Path) -> None:
-    depth = maker.channel("cam/depth")
+def test_a_fresh_frame_comes_at_once_and_the_newest_of_them(fake_rig: FakeRig, folder: Path) -> None:
+    depth = fake_rig.channel("cam/depth")
     s = stream(folder)
     for age_ms in (300, 200, 100):
         depth.send(time.monotonic_ns() - age_ms * MS)
@@ -48,8 +48,8 @@ def test_a_fresh_frame_comes_at_once_and_the_newest_of_them(maker: Maker, folder
         s.wait_fresh(max_age=WAIT_S, timeout=0.05)  # each frame is returned once
 
 
-def test_stale_depth_is_an_error_with_its_age(maker: Maker, folder: Path) -> None:
-    depth = maker.channel("cam/depth")
+def test_stale_depth_is_an_error_with_its_age(fake_rig: FakeRig, folder: Path) -> None:
+    depth = fake_rig.channel("cam/depth")
     s = stream(folder)
     with pytest.raises(Stale, match="no frame has come yet") as none:
         s.wait_fresh(max_age=0.05)
@@ -66,8 +66,8 @@ def test_stale_depth_is_an_error_with_its_age(maker: Maker, folder: Path) -> Non
         s.wait_fresh(max_age=0)
 
 
-def test_waiting_for_a_fresh_frame_skips_stale_ones(maker: Maker, folder: Path) -> None:
-    depth = maker.channel("cam/depth")
+def test_waiting_for_a_fresh_frame_skips_stale_ones(fake_rig: FakeRig, folder: Path) -> None:
+    depth = fake_rig.channel("cam/depth")
     s = stream(folder)
 
     def publish() -> None:
@@ -82,8 +82,8 @@ def test_waiting_for_a_fresh_frame_skips_stale_ones(maker: Maker, folder: Path) 
     assert frame.sequence == 3
 
 
-def test_a_stale_frame_holds_no_slot(maker: Maker, folder: Path) -> None:
-    depth = maker.channel("cam/depth")
+def test_a_stale_frame_holds_no_slot(fake_rig: FakeRig, folder: Path) -> None:
+    depth = fake_rig.channel("cam/depth")
     s = stream(folder)
     for _ in range(50):
         depth.send(time.monotonic_ns() - 60_000 * MS)
@@ -93,8 +93,8 @@ def test_a_stale_frame_holds_no_slot(maker: Maker, folder: Path) -> None:
     assert s.wait_fresh(max_age=WAIT_S).sequence == 51
 
 
-def test_a_replay_has_no_age(maker: Maker, folder: Path) -> None:
-    depth = maker.channel("cam/depth")
+def test_a_replay_has_no_age(fake_rig: FakeRig, folder: Path) -> None:
+    depth = fake_rig.channel("cam/depth")
     s = stream(folder)
     depth.send(time.monotonic_ns(), flags=int(FrameFlags.REPLAYED))
     with pytest.raises(Stale, match="replayed"):
@@ -115,8 +115,8 @@ def test_without_a_publisher_it_is_gone_and_not_stale(start: Start, folder: Path
     assert s.restarts == 1
 
 
-def test_restarts_are_counted(maker: Maker, folder: Path) -> None:
-    depth = maker.channel("cam/depth")
+def test_restarts_are_counted(fake_rig: FakeRig, folder: Path) -> None:
+    depth = fake_rig.channel("cam/depth")
     s = stream(folder)
     for sequence in (5, 6, 9, 1, 2, 2):
         depth.send(0, sequence=sequence)
@@ -128,8 +128,8 @@ def times(group: depthrig.FrameGroup) -> dict[str, int]:
     return {name.split("/")[0]: ns // MS for name, ns in group.capture_times_ns.items()}
 
 
-def test_frames_nearest_in_time_make_a_group(maker: Maker, folder: Path) -> None:
-    a, b = maker.channel("a/depth"), maker.channel("b/depth")
+def test_frames_nearest_in_time_make_a_group(fake_rig: FakeRig, folder: Path) -> None:
+    a, b = fake_rig.channel("a/depth"), fake_rig.channel("b/depth")
     r = reader(folder)
     assert r.latest() is None
     a.send(1000 * MS)
@@ -152,8 +152,8 @@ def test_frames_nearest_in_time_make_a_group(maker: Maker, folder: Path) -> None
     assert r.missed == {"a/depth": 0, "b/depth": 0}
 
 
-def test_the_newest_group_is_given_and_each_once(maker: Maker, folder: Path) -> None:
-    a, b = maker.channel("a/depth"), maker.channel("b/depth")
+def test_the_newest_group_is_given_and_each_once(fake_rig: FakeRig, folder: Path) -> None:
+    a, b = fake_rig.channel("a/depth"), fake_rig.channel("b/depth")
     r = reader(folder)
     for ms in (1000, 1033, 1066):
         a.send(ms * MS)
@@ -163,9 +163,9 @@ def test_the_newest_group_is_given_and_each_once(maker: Maker, folder: Path) -> 
         r.next(timeout=0.05)
 
 
-def test_a_slow_stream_sets_the_pace(maker: Maker, folder: Path) -> None:
+def test_a_slow_stream_sets_the_rate(fake_rig: FakeRig, folder: Path) -> None:
     """Refined depth comes late and seldom: the raw frame that belongs to it must still be there."""
-    raw, refined = maker.channel("a/depth"), maker.channel("a/depth_refined")
+    raw, refined = fake_rig.channel("a/depth"), fake_rig.channel("a/depth_refined")
     r = reader(folder, "a/depth", "a/depth_refined", max_skew=0.001)
     seen = []
     for i in range(40):
@@ -177,8 +177,8 @@ def test_a_slow_stream_sets_the_pace(maker: Maker, folder: Path) -> None:
     assert seen == [1000 + 33 * (i - 4) for i in range(5, 40, 6)]
 
 
-def test_frames_too_far_apart_make_no_group(maker: Maker, folder: Path) -> None:
-    a, b = maker.channel("a/depth"), maker.channel("b/depth")
+def test_frames_too_far_apart_make_no_group(fake_rig: FakeRig, folder: Path) -> None:
+    a, b = fake_rig.channel("a/depth"), fake_rig.channel("b/depth")
     r = reader(folder, max_skew=0.01)
     a.send(1000 * MS)
     b.send(1020 * MS)
@@ -190,8 +190,8 @@ def test_frames_too_far_apart_make_no_group(maker: Maker, folder: Path) -> None:
 
 
 @pytest.mark.many_streams
-def test_partial_groups_are_asked_for_and_say_what_is_missing(maker: Maker, folder: Path) -> None:
-    a, b = maker.channel("a/depth"), maker.channel("b/depth")
+def test_partial_groups_are_asked_for_and_say_what_is_missing(fake_rig: FakeRig, folder: Path) -> None:
+    a, b = fake_rig.channel("a/depth"), fake_rig.channel("b/depth")
     strict, lenient = reader(folder), reader(folder, partial_after=0.05)
     a.send(1000 * MS)
     with pytest.raises(depthrig.Timeout, match="nothing new of b/depth"):
@@ -212,8 +212,8 @@ def test_partial_groups_are_asked_for_and_say_what_is_missing(maker: Maker, fold
 
 
 @pytest.mark.many_streams
-def test_a_waiting_reader_of_groups_is_woken(maker: Maker, folder: Path) -> None:
-    a, b = maker.channel("a/depth"), maker.channel("b/depth")
+def test_a_waiting_reader_of_groups_is_woken(fake_rig: FakeRig, folder: Path) -> None:
+    a, b = fake_rig.channel("a/depth"), fake_rig.channel("b/depth")
     r = reader(folder)
     got: list[dict[str, int]] = []
     thread = threading.Thread(target=lambda: got.extend(times(r.next(WAIT_S)) for _ in range(10)))
@@ -230,8 +230,8 @@ def test_a_waiting_reader_of_groups_is_woken(maker: Maker, folder: Path) -> None
 
 
 @pytest.mark.many_streams
-def test_fresh_groups(maker: Maker, folder: Path) -> None:
-    a, b = maker.channel("a/depth"), maker.channel("b/depth")
+def test_fresh_groups(fake_rig: FakeRig, folder: Path) -> None:
+    a, b = fake_rig.channel("a/depth"), fake_rig.channel("b/depth")
     r = reader(folder, max_skew=10)
     a.send(time.monotonic_ns())
     with pytest.raises(Stale, match="no frame of b/depth has come yet") as none:
@@ -248,8 +248,8 @@ def test_fresh_groups(maker: Maker, folder: Path) -> None:
 
 
 @pytest.mark.many_streams
-def test_a_reader_of_groups_leaves_half_of_the_slots(maker: Maker, folder: Path) -> None:
-    a, b = maker.channel("a/depth"), maker.channel("b/depth")
+def test_a_reader_of_groups_leaves_half_of_the_slots(fake_rig: FakeRig, folder: Path) -> None:
+    a, b = fake_rig.channel("a/depth"), fake_rig.channel("b/depth")
     r = reader(folder)
     held = []
     for i in range(8):
@@ -271,8 +271,8 @@ def test_a_reader_of_groups_leaves_half_of_the_slots(maker: Maker, folder: Path)
 
 
 @pytest.mark.many_streams
-def test_times_that_go_back_begin_anew(maker: Maker, folder: Path) -> None:
-    a, b = maker.channel("a/depth"), maker.channel("b/depth")
+def test_times_that_go_back_begin_anew(fake_rig: FakeRig, folder: Path) -> None:
+    a, b = fake_rig.channel("a/depth"), fake_rig.channel("b/depth")
     r = reader(folder)
     for base in (5000, 1000):
         for i in range(3):

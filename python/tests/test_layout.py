@@ -85,13 +85,13 @@ def test_what_follows_from_the_fields(dumped: tuple[bytes, dict]) -> None:
         [0, -1, 0, 0.033],
         [0, 0, 0, 1],
     ]
-    made = header.refinement
-    assert made is not None
+    refinement = header.refinement
+    assert refinement is not None
     values = dumped[1]
-    assert (made.engine, made.model) == (values["refiner"], values["refiner_model"])
-    assert list(made.steps_s) == ["wait", "register", "prepare", "infer", "finish", "total"]
-    assert list(made.steps_s.values()) == [ns / 1e9 for ns in values["stage_ns"]]
-    assert made[3:] == (
+    assert (refinement.engine, refinement.model) == (values["refiner"], values["refiner_model"])
+    assert list(refinement.steps_s) == ["wait", "register", "prepare", "infer", "finish", "total"]
+    assert list(refinement.steps_s.values()) == [ns / 1e9 for ns in values["stage_ns"]]
+    assert refinement[3:] == (
         values["source_sequence"],
         values["capture_time_ns"],
         values["source_color_sequence"],
@@ -104,9 +104,9 @@ def test_what_follows_from_the_fields(dumped: tuple[bytes, dict]) -> None:
 def test_a_frame_that_nothing_refined_says_so(dumped: tuple[bytes, dict]) -> None:
     values = Header(dumped[0]).to_dict()
     assert Header(Header.pack(values | {"refiner": ""})).refinement is None
-    made = Header(Header.pack(values | {"refiner": "fill", "refiner_model": ""})).refinement
-    assert made is not None
-    assert (made.engine, made.model) == ("fill", None)
+    refinement = Header(Header.pack(values | {"refiner": "fill", "refiner_model": ""})).refinement
+    assert refinement is not None
+    assert (refinement.engine, refinement.model) == ("fill", None)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The writing end in Python: slots that a killed reader held, memory that is really there, limits that are named."""
+"""The writing end in Python: slots that a killed reader held, allocated memory, named limits."""
 
 from __future__ import annotations
 

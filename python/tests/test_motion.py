@@ -1,4 +1,4 @@
-"""Batches of a motion unit: what `Frame.motion` shows of them, on memory of our own and in shared memory."""
+"""Batches of an IMU: `Frame.motion` on them, on memory of our own and in shared memory."""
 
 from __future__ import annotations
 
@@ -46,20 +46,20 @@ def test_a_batch_is_a_structured_array_without_a_copy() -> None:
         _ = f.motion
 
 
-def test_a_picture_has_no_motion_and_a_batch_no_pixels() -> None:
-    picture = frame(header(PixelFormat.Z16, 2, 2, 4, 8), np.zeros(8, np.uint8))
-    assert not picture.is_motion and batch(1).is_motion
-    with pytest.raises(TypeError, match="cam/test carries z16 pictures and no motion samples"):
-        _ = picture.motion
-    with pytest.raises(TypeError, match="no depth"):
+def test_an_image_has_no_motion_and_a_batch_no_pixels() -> None:
+    image = frame(header(PixelFormat.Z16, 2, 2, 4, 8), np.zeros(8, np.uint8))
+    assert not image.is_motion and batch(1).is_motion
+    with pytest.raises(TypeError, match="cam/test carries z16 images, not IMU samples"):
+        _ = image.motion
+    with pytest.raises(TypeError, match="not depth"):
         batch(1).depth_m()
-    with pytest.raises(TypeError, match="carries motion samples"):
+    with pytest.raises(TypeError, match="carries IMU samples"):
         batch(1).torch()
 
 
 @pytest.mark.parametrize(("width", "height", "stride", "length"), [(2, 2, 128, 256), (2, 1, 64, 128), (2, 1, 128, 127)])
 def test_a_header_that_does_not_fit_its_samples_is_refused(width: int, height: int, stride: int, length: int) -> None:
-    with pytest.raises(depthrig.BadFrame, match="motion samples"):
+    with pytest.raises(depthrig.BadFrame, match="IMU samples"):
         frame(header(PixelFormat.MOTION, width, height, stride, length), np.zeros(256, np.uint8))
 
 
@@ -79,10 +79,10 @@ def test_batches_come_out_of_shared_memory_and_sets_know_nothing_of_them(
     assert unit.missed == 0
 
 
-def test_a_motion_unit_is_in_no_group(start: Callable[..., Publisher], folder: Path) -> None:
+def test_a_imu_is_in_no_group(start: Callable[..., Publisher], folder: Path) -> None:
     publisher = start("--formats", "z16,motion")
     reader = depthrig.SetReader(["pattern/z16", "pattern/motion"], runtime_dir=folder, timeout=WAIT_S)
     publisher.publish(1)
-    with pytest.raises(TypeError, match="pattern/motion carries motion samples"):
+    with pytest.raises(TypeError, match="pattern/motion carries IMU samples"):
         reader.next(timeout=WAIT_S)
     reader.close()

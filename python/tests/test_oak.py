@@ -34,32 +34,32 @@ from PIL import Image  # noqa: E402
 from depthrig.oak import __main__ as program  # noqa: E402
 from depthrig.oak import _bridge, _device, _lens, _replay  # noqa: E402
 from depthrig.oak._errors import Exit, OakError  # noqa: E402
-from depthrig.oak._hopper import Hopper  # noqa: E402
+from depthrig.oak._lossless import LosslessQueue  # noqa: E402
 
 SOCKET = dai.CameraBoardSocket
-WIDTH, HEIGHT, PICTURES = 64, 48, 5
+WIDTH, HEIGHT, IMAGES = 64, 48, 5
 K = [[50.5, 0.0, 31.5], [0.0, 51.5, 23.5], [0.0, 0.0, 1.0]]
 
 
 def calibration(coefficients: list[float] | None = None) -> Any:
     """As a camera has it in its EEPROM."""
-    made = dai.CalibrationHandler()
-    made.setBoardInfo("OAK-D", "R1")
-    made.setProductName("OAK-D-TEST")
-    made.setCameraType(SOCKET.CAM_A, dai.CameraModel.Perspective)
-    made.setCameraIntrinsics(SOCKET.CAM_A, K, dai.Size2f(WIDTH, HEIGHT))
-    made.setDistortionCoefficients(SOCKET.CAM_A, coefficients or [0.0] * 14)
-    return made
+    handler = dai.CalibrationHandler()
+    handler.setBoardInfo("OAK-D", "R1")
+    handler.setProductName("OAK-D-TEST")
+    handler.setCameraType(SOCKET.CAM_A, dai.CameraModel.Perspective)
+    handler.setCameraIntrinsics(SOCKET.CAM_A, K, dai.Size2f(WIDTH, HEIGHT))
+    handler.setDistortionCoefficients(SOCKET.CAM_A, coefficients or [0.0] * 14)
+    return handler
 
 
 @pytest.fixture
-def pictures(tmp_path: Path) -> Path:
-    """Five pairs, each pixel of which tells where it is and which picture it is of."""
-    folder = tmp_path / "oak_pictures"
+def images(tmp_path: Path) -> Path:
+    """Five pairs, each pixel of which encodes its position and its image."""
+    folder = tmp_path / "oak_images"
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     for name in ("color", "depth"):
         (folder / name).mkdir(parents=True)
-    for i in range(PICTURES):
+    for i in range(IMAGES):
         color = np.stack([columns + i, rows, np.full_like(rows, 50 * i)], axis=-1).astype(np.uint8)
         Image.fromarray(color).save(folder / "color" / f"{i:03}.png")
         Image.fromarray((columns * 700 + rows + i).astype(np.uint16)).save(folder / "depth" / f"{i:03}.png")
@@ -67,8 +67,8 @@ def pictures(tmp_path: Path) -> Path:
     return folder
 
 
-def picture(folder: Path, stream: str, number: int) -> np.ndarray:
-    return np.asarray(Image.open(folder / stream / f"{number % PICTURES:03}.png"))
+def image(folder: Path, stream: str, number: int) -> np.ndarray:
+    return np.asarray(Image.open(folder / stream / f"{number % IMAGES:03}.png"))
 
 
 @contextmanager
@@ -91,12 +91,12 @@ def pixels(head: dict[str, Any], payload: bytes) -> np.ndarray:
 
 
 def check(daemon: FakeDaemon, folder: Path, stream: str, frames: int, rate_hz: float) -> list[int]:
-    """Take frames of a stream: each is the picture of its number, at the time of its number; returns the numbers."""
+    """Take frames of a stream: each is the image of its number, at the time of its number; returns the numbers."""
     numbers = []
     for _ in range(frames):
         head, payload = daemon.frame(stream)
         number = head["device_sequence"]
-        np.testing.assert_array_equal(pixels(head, payload), picture(folder, stream, number))
+        np.testing.assert_array_equal(pixels(head, payload), image(folder, stream, number))
         assert head["device_time"] == pytest.approx(100e6 + number * 1e6 / rate_hz, abs=1)
         assert 0 <= time.monotonic_ns() - head["arrival_time_ns"] < WAIT_S * 1e9
         numbers.append(number)
@@ -104,15 +104,15 @@ def check(daemon: FakeDaemon, folder: Path, stream: str, frames: int, rate_hz: f
     return numbers
 
 
-def test_pictures_are_served_as_a_camera(folder: Path, pictures: Path) -> None:
+def test_images_are_served_as_a_camera(folder: Path, images: Path) -> None:
     with (
-        bridge(folder, "--replay", str(pictures), "--fps", "50") as process,
+        bridge(folder, "--replay", str(images), "--fps", "50") as process,
         fake_daemon(folder, camera="oak") as daemon,
     ):
         offer = daemon.until(state=ExternalState.IDLE)
-        told = {k: offer[k] for k in ("model", "serial", "calibration", "port")}
-        name = pictures.name
-        assert told == {"model": "OAK-D-TEST", "serial": name, "calibration": "file calibration.json", "port": name}
+        reported = {k: offer[k] for k in ("model", "serial", "calibration", "port")}
+        name = images.name
+        assert reported == {"model": "OAK-D-TEST", "serial": name, "calibration": "file calibration.json", "port": name}
         assert offer["firmware"] == f"depthai {dai.__version__}"
         color, depth = sorted(daemon.modes, key=lambda m: m["stream"])
         for mode, kind in ((color, PixelFormat.BGR8), (depth, PixelFormat.Z16)):
@@ -123,12 +123,12 @@ def test_pictures_are_served_as_a_camera(folder: Path, pictures: Path) -> None:
             assert mode["intrinsics.model"] == Distortion.NONE, "what is aligned is undistorted"
         assert (color["depth_unit_m"], depth["depth_unit_m"]) == (0.0, 0.001)
         daemon.run(1, ("color", "depth"))
-        seen = [check(daemon, pictures, stream, 12, 50.0) for stream in ("color", "depth")]
+        seen = [check(daemon, images, stream, 12, 50.0) for stream in ("color", "depth")]
         assert all(numbers[-1] >= 11 for numbers in seen), "they come round again, and the numbers go on"
         daemon.say(0, 1)
         assert daemon.until(state=ExternalState.IDLE)["session"] == 1
         daemon.run(2, ("color", "depth"))
-        again = check(daemon, pictures, "color", 3, 50.0)
+        again = check(daemon, images, "color", 3, 50.0)
         assert again[0] > seen[0][-1], "a session begins with what is new"
         process.send_signal(signal.SIGTERM)
         assert daemon.until(state=ExternalState.ENDED)["reason"] == 0
@@ -138,10 +138,10 @@ def test_pictures_are_served_as_a_camera(folder: Path, pictures: Path) -> None:
 def play_once(daemon: FakeDaemon, folder: Path, rate_hz: float) -> None:
     """Be the daemon of files that are played once: each frame comes, from the first one to the last."""
     daemon.until(state=ExternalState.IDLE)
-    time.sleep(0.3)  # what nobody wants yet is not lost
+    time.sleep(0.3)  # unwanted frames are not lost
     daemon.run(1, ("color", "depth"))
-    time.sleep(0.3)  # nor what is not read at once
-    for number in range(PICTURES):  # in turn, as a stream that is not read holds up the other
+    time.sleep(0.3)  # nor frames that are not read at once
+    for number in range(IMAGES):  # in turn, as a stream that is not read holds up the other
         for stream in ("color", "depth"):
             assert check(daemon, folder, stream, 1, rate_hz) == [number]
     daemon.until(state=ExternalState.REFUSED, reason=ExternalReason.FINISHED, session=1)
@@ -149,21 +149,21 @@ def play_once(daemon: FakeDaemon, folder: Path, rate_hz: float) -> None:
     daemon.until(state=ExternalState.ENDED, reason=ExternalReason.FINISHED, text="the files are at their end")
 
 
-@pytest.mark.parametrize("kind", ["pictures", "recordings"])
-def test_files_that_are_played_once_come_to_the_last_frame(folder: Path, pictures: Path, tmp_path: Path, kind: str) -> None:
-    played = pictures
+@pytest.mark.parametrize("kind", ["images", "recordings"])
+def test_files_that_are_played_once_come_to_the_last_frame(folder: Path, images: Path, tmp_path: Path, kind: str) -> None:
+    played = images
     if kind == "recordings":
         played = tmp_path / "kept"
-        with bridge(folder, "--replay", str(pictures), "--once", "--fps", "50", "--record", str(played)) as process:
+        with bridge(folder, "--replay", str(images), "--once", "--fps", "50", "--record", str(played)) as process:
             with fake_daemon(folder, camera="oak") as daemon:
-                play_once(daemon, pictures, 50.0)
+                play_once(daemon, images, 50.0)
             assert process.wait(WAIT_S) == Exit.DONE
-        assert _replay._messages(played / "depth.mcap") == PICTURES
+        assert _replay._messages(played / "depth.mcap") == IMAGES
     for _ in range(3):  # the end of two files is a race inside of the SDK
         with bridge(folder, "--replay", str(played), "--once", "--fps", "50") as process:
             with fake_daemon(folder, camera="oak") as daemon:
                 daemon.until(pid=process.pid)
-                play_once(daemon, pictures, 50.0)
+                play_once(daemon, images, 50.0)
             assert process.wait(WAIT_S) == Exit.DONE
 
 
@@ -171,52 +171,52 @@ def test_what_a_daemon_did_not_take_is_no_success(caplog: pytest.LogCaptureFixtu
     done = SimpleNamespace(missing={}, confirmed=True)
     assert program._account(done) is Exit.DONE
     assert program._account(SimpleNamespace(missing={}, confirmed=False)) is Exit.UNDELIVERED
-    assert "did not say that it has taken the last ones" in caplog.text
+    assert "did not confirm the last ones" in caplog.text
     assert program._account(SimpleNamespace(missing={"depth": 2}, confirmed=True)) is Exit.UNDELIVERED
     assert "that the daemon did not get: 2 depth" in caplog.text
 
 
-def test_a_recording_that_was_cut_is_not_played_once(folder: Path, pictures: Path) -> None:
-    shutil.copy(pictures / "calibration.json", pictures / "color.mcap")
-    with bridge(folder, "--replay", str(pictures), "--once") as process:
+def test_a_recording_that_was_cut_is_not_played_once(folder: Path, images: Path) -> None:
+    shutil.copy(images / "calibration.json", images / "color.mcap")
+    with bridge(folder, "--replay", str(images), "--once") as process:
         _, errors = process.communicate(timeout=WAIT_S)
     assert process.returncode == Exit.USAGE
     assert "color.mcap has no summary" in errors
 
 
-def test_a_hopper_lets_no_stream_run_ahead() -> None:
-    hopper = Hopper(["color", "depth"])
+def test_a_lossless_queue_lets_no_stream_run_ahead() -> None:
+    queue = LosslessQueue(["color", "depth"])
     took: list[str] = []
 
     def feed(stream: str, frames: int) -> None:
         for i in range(frames):
-            hopper.put(stream, f"{stream}{i}")
+            queue.put(stream, f"{stream}{i}")
 
     threads = [threading.Thread(target=feed, args=(s, 3), daemon=True) for s in ("color", "depth")]
     threads[0].start()
     time.sleep(0.1)
-    assert [f for _, f in hopper.take(1.0)] == ["color0"]
-    assert hopper.take(0.1) == [], "it waits for depth0"
+    assert [f for _, f in queue.take(1.0)] == ["color0"]
+    assert queue.take(0.1) == [], "it waits for depth0"
     threads[1].start()
     while len(took) < 5:
-        took += [f for _, f in hopper.take(1.0)]
+        took += [f for _, f in queue.take(1.0)]
     assert sorted(took) == ["color1", "color2", "depth0", "depth1", "depth2"]
     for thread in threads:
         thread.join(WAIT_S)
-    assert hopper.came == {"color": 3, "depth": 3}
+    assert queue.came == {"color": 3, "depth": 3}
     last = threading.Thread(target=feed, args=("color", 2), daemon=True)
     last.start()
-    hopper.close()
+    queue.close()
     last.join(WAIT_S)
     assert not last.is_alive(), "its end lets the SDK go"
 
 
-def test_what_was_recorded_is_replayed_as_it_was(folder: Path, pictures: Path, tmp_path: Path) -> None:
+def test_what_was_recorded_is_replayed_as_it_was(folder: Path, images: Path, tmp_path: Path) -> None:
     """The SDK's own writer and player: numbers, times, pixels and calibration come back."""
     kept = tmp_path / "kept"
-    with bridge(folder, "--replay", str(pictures), "--once", "--fps", "20", "--record", str(kept)) as process:
+    with bridge(folder, "--replay", str(images), "--once", "--fps", "20", "--record", str(kept)) as process:
         with fake_daemon(folder, camera="oak") as daemon:
-            play_once(daemon, pictures, 20.0)
+            play_once(daemon, images, 20.0)
         assert process.wait(WAIT_S) == Exit.DONE
     assert sorted(p.name for p in kept.iterdir()) == ["calibration.json", "color.mcap", "depth.mcap"]
     options = ("--replay", str(kept), "--serial", "184430", "--streams", "depth", "color")
@@ -231,26 +231,26 @@ def test_what_was_recorded_is_replayed_as_it_was(folder: Path, pictures: Path, t
                 head, payload = daemon.frame(stream)
                 # The SDK goes on counting, and keeping time, when it begins anew.
                 numbers.append(head["device_sequence"])
-                np.testing.assert_array_equal(pixels(head, payload), picture(pictures, stream, numbers[-1]))
-                assert head["device_time"] == pytest.approx(100e6 + numbers[-1] * 50_000, abs=PICTURES)
+                np.testing.assert_array_equal(pixels(head, payload), image(images, stream, numbers[-1]))
+                assert head["device_time"] == pytest.approx(100e6 + numbers[-1] * 50_000, abs=IMAGES)
             assert numbers == sorted(set(numbers))
-            assert numbers[-1] > 2 * PICTURES
+            assert numbers[-1] > 2 * IMAGES
 
 
-def test_a_recording_is_never_written_over(folder: Path, pictures: Path) -> None:
-    with bridge(folder, "--replay", str(pictures), "--record", str(pictures)) as process:
+def test_a_recording_is_never_written_over(folder: Path, images: Path) -> None:
+    with bridge(folder, "--replay", str(images), "--record", str(images)) as process:
         _, errors = process.communicate(timeout=WAIT_S)
         assert process.returncode == Exit.USAGE
         assert "is not empty; a recording is written into a folder of its own" in errors
 
 
-def test_a_killed_bridge_makes_room_for_the_next(folder: Path, pictures: Path) -> None:
+def test_a_killed_bridge_makes_room_for_the_next(folder: Path, images: Path) -> None:
     with fake_daemon(folder, camera="oak") as daemon:
         for session in (1, 2):
-            with bridge(folder, "--replay", str(pictures), "--fps", "50") as process:
+            with bridge(folder, "--replay", str(images), "--fps", "50") as process:
                 daemon.until(pid=process.pid, state=ExternalState.IDLE)
                 daemon.run(session, ("color", "depth"))
-                check(daemon, pictures, "color", 3, 50.0)
+                check(daemon, images, "color", 3, 50.0)
                 process.kill()
                 process.wait()
 
@@ -258,19 +258,19 @@ def test_a_killed_bridge_makes_room_for_the_next(folder: Path, pictures: Path) -
 @pytest.mark.parametrize(
     ("spoil", "text"),
     [
-        (lambda f: shutil.rmtree(f), "is no folder"),
+        (lambda f: shutil.rmtree(f), "is not a folder"),
         (lambda f: [shutil.rmtree(f / n) for n in ("color", "depth")], "has neither recordings"),
-        (lambda f: (f / "depth" / "000.png").unlink(), "its pictures are no pairs, there are 5 color, 4 depth"),
-        (lambda f: (f / "color" / "001.png").write_bytes(b"no picture"), "color/001.png cannot be read"),
-        (lambda f: Image.new("RGB", (64, 48)).save(f / "depth" / "002.png"), "depth/002.png is no depth: one channel"),
-        (lambda f: (f / "calibration.json").write_text("{"), "calibration.json is no calibration of an OAK camera"),
+        (lambda f: (f / "depth" / "000.png").unlink(), "its images do not form pairs, there are 5 color, 4 depth"),
+        (lambda f: (f / "color" / "001.png").write_bytes(b"no image"), "color/001.png cannot be read"),
+        (lambda f: Image.new("RGB", (64, 48)).save(f / "depth" / "002.png"), "002.png is not a depth image: it needs"),
+        (lambda f: (f / "calibration.json").write_text("{"), "calibration.json is not a calibration of an OAK camera"),
         (lambda f: (f / "color.mcap").write_bytes(b"no recording"), "color"),
     ],
-    ids=["no folder", "empty", "no pairs", "no picture", "no depth", "calibration", "recording"],
+    ids=["no folder", "empty", "no pairs", "no image", "no depth", "calibration", "recording"],
 )
-def test_files_that_cannot_be_played_are_named(folder: Path, pictures: Path, spoil: Any, text: str) -> None:
-    spoil(pictures)
-    with bridge(folder, "--replay", str(pictures)) as process:
+def test_files_that_cannot_be_played_are_named(folder: Path, images: Path, spoil: Any, text: str) -> None:
+    spoil(images)
+    with bridge(folder, "--replay", str(images)) as process:
         _, errors = process.communicate(timeout=WAIT_S)
     assert process.returncode in (Exit.USAGE, Exit.LOST), errors
     assert text in errors
@@ -278,11 +278,11 @@ def test_files_that_cannot_be_played_are_named(folder: Path, pictures: Path, spo
 
 
 def frame(kind: Any, array: np.ndarray, **more: Any) -> Any:
-    made = dai.ImgFrame()
-    made.setCvFrame(array, kind)
+    message = dai.ImgFrame()
+    message.setCvFrame(array, kind)
     for name, value in more.items():
-        getattr(made, f"set{name}")(value)
-    return made
+        getattr(message, f"set{name}")(value)
+    return message
 
 
 def test_pixels_are_seen_where_they_are() -> None:
@@ -312,19 +312,19 @@ def test_padding_of_rows_is_left_out() -> None:
 
 def test_nv12_of_the_sdk_is_nv12() -> None:
     data = np.random.default_rng(4).integers(0, 255, 8 * 9, np.uint8)
-    made = dai.ImgFrame()
-    made.setType(dai.ImgFrame.Type.NV12).setSize(8, 6)
-    made.setData(data)
-    np.testing.assert_array_equal(_bridge.pixels(made), data.reshape(9, 8))
+    message = dai.ImgFrame()
+    message.setType(dai.ImgFrame.Type.NV12).setSize(8, 6)
+    message.setData(data)
+    np.testing.assert_array_equal(_bridge.pixels(message), data.reshape(9, 8))
 
 
 def test_a_stream_of_another_type_is_refused() -> None:
     source = mock.Mock(calibration=None, rate_hz=30.0)
     for stream, kind, shape in (("color", "RAW16", (6, 8)), ("depth", "GRAY8", (6, 8)), ("color", "YUV420p", (9, 8))):
-        made = dai.ImgFrame()
-        made.setType(getattr(dai.ImgFrame.Type, kind)).setSize(8, 6)
+        message = dai.ImgFrame()
+        message.setType(getattr(dai.ImgFrame.Type, kind)).setSize(8, 6)
         with pytest.raises(OakError, match=f"stream {stream} gives frames of type {kind}"):
-            _bridge.mode_of(stream, made, source, True)
+            _bridge.mode_of(stream, message, source, True)
         assert shape
 
 
@@ -348,7 +348,7 @@ def _f32(matrix: list[list[float]]) -> list[list[float]]:
     return [[float(np.float32(v)) for v in row] for row in matrix]
 
 
-# What needs a camera, as near as can be without one: the SDK's real names and values around nodes that are not there.
+# Code that needs a camera, tested without one: the SDK's real names and values around fake nodes.
 
 
 def info(serial: str, name: str = "4.1.2", state: str = "X_LINK_UNBOOTED", protocol: str = "X_LINK_USB_VSC") -> Any:
@@ -403,7 +403,7 @@ def test_a_port_is_written_as_the_kernel_does() -> None:
     assert _device.port(info("1", "192.168.1.44", protocol="X_LINK_TCP_IP")) == "192.168.1.44"
 
 
-class Made:
+class FakeOak:
     """A camera whose methods and nodes have the SDK's names, and nothing behind them."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, sockets: str = "ABC", platform: str = "RVC2") -> None:
@@ -439,10 +439,10 @@ class Made:
 
 
 def test_the_pipeline_of_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = Made(monkeypatch)
-    source = made.build(size=(640, 400), rate_hz=15.0, preset="ROBOTICS", dots=0.5)
-    assert [kind for kind, _ in made.nodes] == ["Camera", "Camera", "Camera", "StereoDepth"]
-    color, left, right, stereo = (node for _, node in made.nodes)
+    fake = FakeOak(monkeypatch)
+    source = fake.build(size=(640, 400), rate_hz=15.0, preset="ROBOTICS", dots=0.5)
+    assert [kind for kind, _ in fake.nodes] == ["Camera", "Camera", "Camera", "StereoDepth"]
+    color, left, right, stereo = (node for _, node in fake.nodes)
     color.build.assert_called_once_with(SOCKET.CAM_A)
     left.build.assert_called_once_with(SOCKET.CAM_B)
     right.build.assert_called_once_with(SOCKET.CAM_C)
@@ -467,59 +467,59 @@ def test_the_pipeline_of_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (identity.model, identity.serial, identity.port) == ("OAK-D-PRO", "1844301041", "4-1.2")
     assert identity.calibration == "factory"
     assert source.notes == ["USB speed SUPER"]
-    made.device.setIrLaserDotProjectorIntensity.assert_called_once_with(0.5)
-    made.device.setIrFloodLightIntensity.assert_not_called()
-    made.device.setMaxReconnectionAttempts.assert_called_once_with(0)
-    made.pipeline.setStopOnDeviceLoss.assert_called_once_with(True)
-    made.pipeline.start.assert_not_called()
+    fake.device.setIrLaserDotProjectorIntensity.assert_called_once_with(0.5)
+    fake.device.setIrFloodLightIntensity.assert_not_called()
+    fake.device.setMaxReconnectionAttempts.assert_called_once_with(0)
+    fake.pipeline.setStopOnDeviceLoss.assert_called_once_with(True)
+    fake.pipeline.start.assert_not_called()
 
 
 def test_an_rvc4_aligns_in_a_node_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = Made(monkeypatch, platform="RVC4")
-    source = made.build()
-    color, _, _, stereo, align = (node for _, node in made.nodes)
+    fake = FakeOak(monkeypatch, platform="RVC4")
+    source = fake.build()
+    color, _, _, stereo, align = (node for _, node in fake.nodes)
     stereo.depth.link.assert_called_once_with(align.input)
     color.requestOutput.return_value.link.assert_called_once_with(align.inputAlignTo)
     assert source.outputs["depth"] is align.outputAligned
 
 
 def test_streams_that_are_not_wanted_are_not_built(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = Made(monkeypatch, sockets="A")
-    assert list(made.build(streams=("color",)).outputs) == ["color"]
-    assert [kind for kind, _ in made.nodes] == ["Camera"]
-    assert list(Made(monkeypatch).build(streams=("depth",)).outputs) == ["depth"], "colour is what it is aligned to"
+    fake = FakeOak(monkeypatch, sockets="A")
+    assert list(fake.build(streams=("color",)).outputs) == ["color"]
+    assert [kind for kind, _ in fake.nodes] == ["Camera"]
+    assert list(FakeOak(monkeypatch).build(streams=("depth",)).outputs) == ["depth"], "colour is what it is aligned to"
 
 
 def test_what_a_camera_cannot_do_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(OakError, match="has no pair of sensors at CAM_B and CAM_C.* --streams color"):
-        Made(monkeypatch, sockets="A").build()
+        FakeOak(monkeypatch, sockets="A").build()
     with pytest.raises(OakError, match="has no colour sensor"):
-        Made(monkeypatch, sockets="BC").build()
+        FakeOak(monkeypatch, sockets="BC").build()
     with pytest.raises(OakError, match="no stereo preset FAST"):
-        Made(monkeypatch).build(preset="FAST")
+        FakeOak(monkeypatch).build(preset="FAST")
     with pytest.raises(OakError, match="has no infrared flood light"):
-        Made(monkeypatch).build(flood=0.1)
-    Made(monkeypatch).build(flood=0.0)
+        FakeOak(monkeypatch).build(flood=0.1)
+    FakeOak(monkeypatch).build(flood=0.0)
 
 
-def test_usb2_and_a_missing_calibration_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = Made(monkeypatch)
-    made.device.getUsbSpeed.return_value = dai.UsbSpeed.HIGH
-    made.device.isCalibrationAvailable.return_value = False
-    source = made.build()
+def test_usb2_and_a_missing_calibration_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = FakeOak(monkeypatch)
+    fake.device.getUsbSpeed.return_value = dai.UsbSpeed.HIGH
+    fake.device.isCalibrationAvailable.return_value = False
+    source = fake.build()
     assert any("it runs as a USB2 device" in note for note in source.notes)
     assert any("no calibration of its own" in note for note in source.notes)
     assert (source.calibration, source.identity.calibration) == (None, "none")
-    assert not any("USB2 device" in note for note in made.build(usb2=True).notes), "it was asked for"
+    assert not any("USB2 device" in note for note in fake.build(usb2=True).notes), "it was asked for"
 
 
 def test_a_camera_that_goes_away_ends_the_bridge(
-    folder: Path, pictures: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    folder: Path, images: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The pipeline of files stands in for a camera's; when it stops by itself, a camera was unplugged."""
 
     def gone(wishes: Any) -> tuple[Any, Any]:
-        source = _replay.open_folder(pictures, serial="1", rate_hz=50.0, loop=False)
+        source = _replay.open_folder(images, serial="1", rate_hz=50.0, loop=False)
         source.frames = None  # a camera's frames do not wait
         return source, SimpleNamespace(close=lambda: closed.append(True))
 

@@ -1,4 +1,4 @@
-"""What of the OAK bridge needs no SDK: lenses, versions, and what is said when the SDK is not there."""
+"""Parts of the OAK bridge that need no SDK: lenses, versions, and the messages without the SDK."""
 
 from __future__ import annotations
 

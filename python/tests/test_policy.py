@@ -28,7 +28,7 @@ def test_the_loop_acts_on_fresh_depth_and_says_where_its_time_goes(live: Path) -
     assert (done.returncode, done.stderr) == (0, "")
     result = json.loads(done.stdout)
     assert "random" in result["weights"]
-    assert (result["stream"], result["picture"], result["stale"]) == ("pattern/z16", "64x48 z16", 0)
+    assert (result["stream"], result["image"], result["stale"]) == ("pattern/z16", "64x48 z16", 0)
     assert result["actions"] >= result["plans"] >= 1
     spent = {name: t["p50"] for name, t in result["milliseconds"].items()}
     assert all(ms >= 0 for ms in spent.values()), spent

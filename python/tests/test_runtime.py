@@ -1,4 +1,4 @@
-"""Finding rigs: locks, folders, names, and what the messages say."""
+"""Finding rigs: locks, folders, names, and the messages."""
 
 from __future__ import annotations
 

@@ -379,7 +379,7 @@ def test_a_reader_can_come_before_its_rig(binary: str, folder: Path) -> None:
         assert whole(found[0].next(WAIT_S)) == 1
 
 
-def test_the_only_rig_is_found_and_two_must_be_told_apart(start: Start, folder: Path) -> None:
+def test_the_only_rig_is_found_and_two_must_be_named(start: Start, folder: Path) -> None:
     first = start(rig="left")
     s = stream(folder)
     assert s.rig == "left"
@@ -393,7 +393,7 @@ def test_the_only_rig_is_found_and_two_must_be_told_apart(start: Start, folder: 
     assert named.latest() is None
 
 
-def test_a_forked_child_is_told_to_open_its_own(start: Start, folder: Path) -> None:
+def test_a_forked_child_must_open_its_own(start: Start, folder: Path) -> None:
     publisher = start()
     publisher.publish(1)
     code = """

@@ -1,4 +1,4 @@
-"""Frames as PyTorch tensors: the right numbers, one copy, memory that stays; without PyTorch, what it says then."""
+"""Frames as PyTorch tensors: the right numbers, one copy, memory that stays; and the message without PyTorch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import depthrig
-from maker import Maker
+from fake_rig import FakeRig
 from rig import WAIT_S
 
 needs_torch = pytest.mark.skipif(importlib.util.find_spec("torch") is None, reason="PyTorch is not installed")
@@ -30,9 +30,9 @@ METRES = RANDOM.random((240, 320), dtype=np.float32)
 
 
 @pytest.fixture
-def maker(folder: Path) -> Iterator[Maker]:
-    with Maker(folder) as made:
-        yield made
+def fake_rig(folder: Path) -> Iterator[FakeRig]:
+    with FakeRig(folder) as publisher:
+        yield publisher
 
 
 def stream(folder: Path) -> depthrig.Stream:
@@ -40,9 +40,9 @@ def stream(folder: Path) -> depthrig.Stream:
 
 
 @pytest.fixture
-def frame_of(maker: Maker, folder: Path) -> Any:
-    """Publishes a picture and returns the frame of it."""
-    channel = maker.channel("cam/depth", slot=LARGE.nbytes)
+def frame_of(fake_rig: FakeRig, folder: Path) -> Any:
+    """Publishes an image and returns the frame of it."""
+    channel = fake_rig.channel("cam/depth", slot=LARGE.nbytes)
     s = stream(folder)
 
     def frame_of(pixels: np.ndarray, **fields: Any) -> depthrig.Frame:
@@ -78,7 +78,7 @@ def test_metres(frame_of: Any) -> None:
     tensor = frame_of(floats).torch(metres=True)
     floats[0, :4] = 0
     np.testing.assert_array_equal(tensor.numpy(), floats)
-    with pytest.raises(TypeError, match="cam/depth carries rgb8, which is no depth"):
+    with pytest.raises(TypeError, match="cam/depth carries rgb8, which is not depth"):
         frame_of(COLOR).torch(metres=True)
     with pytest.raises(depthrig.BadFrame, match="states no depth unit"):
         frame_of(DEPTH, depth_unit_m=0.0).torch(metres=True)
@@ -87,7 +87,7 @@ def test_metres(frame_of: Any) -> None:
 @needs_torch
 @pytest.mark.parametrize("metres", [False, True])
 def test_one_copy_and_no_other_memory(frame_of: Any, metres: bool) -> None:
-    """PyTorch's operations are listed, and NumPy's memory is counted: neither makes a second picture."""
+    """PyTorch's operations are listed, and NumPy's memory is counted: neither makes a second image."""
     import torch
     from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -112,7 +112,7 @@ def test_one_copy_and_no_other_memory(frame_of: Any, metres: bool) -> None:
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    # NumPy multiplies in blocks, which are smaller than a picture by far.
+    # NumPy multiplies in blocks, which are smaller than an image by far.
     assert peak < LARGE.nbytes // 4
 
 
@@ -130,8 +130,8 @@ def test_what_does_not_fit_is_named(frame_of: Any) -> None:
 
 
 @needs_torch
-def test_shared_memory_stays_as_long_as_its_tensor(maker: Maker, folder: Path) -> None:
-    channel = maker.channel("cam/depth")
+def test_shared_memory_stays_as_long_as_its_tensor(fake_rig: FakeRig, folder: Path) -> None:
+    channel = fake_rig.channel("cam/depth")
     s = stream(folder)
     kept = []
     for i in range(16):
@@ -164,10 +164,10 @@ def test_shared_memory_stays_as_long_as_its_tensor(maker: Maker, folder: Path) -
 
 
 @needs_torch
-def test_a_stream_gives_tensors(maker: Maker, folder: Path) -> None:
+def test_a_stream_gives_tensors(fake_rig: FakeRig, folder: Path) -> None:
     import time
 
-    channel = maker.channel("cam/depth")
+    channel = fake_rig.channel("cam/depth")
     s = stream(folder)
     assert s.header is None
     for _ in range(3):
@@ -186,8 +186,8 @@ def test_a_stream_gives_tensors(maker: Maker, folder: Path) -> None:
 
 
 @needs_torch
-def test_groups_give_tensors(maker: Maker, folder: Path) -> None:
-    a, b = maker.channel("a/depth"), maker.channel("b/depth")
+def test_groups_give_tensors(fake_rig: FakeRig, folder: Path) -> None:
+    a, b = fake_rig.channel("a/depth"), fake_rig.channel("b/depth")
     reader = depthrig.SetReader(["a/depth", "b/depth"], rig="mount", runtime_dir=folder, timeout=WAIT_S)
     a.send(5)
     b.send(6)
@@ -206,7 +206,7 @@ def test_another_device_gets_one_transfer(frame_of: Any) -> None:
 
 
 class Recorded:
-    """Stands for PyTorch with a GPU: notes what is asked of it, and keeps what would be on the GPU in NumPy arrays."""
+    """Fake of PyTorch with a GPU: records the calls, and keeps the GPU's data in NumPy arrays."""
 
     def __init__(self) -> None:
         self.calls: list[Any] = []
@@ -261,7 +261,7 @@ class RecordedTensor:
 def test_cuda_goes_through_pinned_memory_in_one_transfer(
     frame_of: Any, monkeypatch: pytest.MonkeyPatch, metres: bool
 ) -> None:
-    """What is asked of PyTorch, with a stand-in for a GPU. That a real one does it is not tested here."""
+    """The calls to PyTorch, with a fake GPU; a real one is not tested here."""
     torch = Recorded()
     monkeypatch.setitem(sys.modules, "torch", torch.module)
     frame = frame_of(DEPTH)

@@ -25,7 +25,7 @@ def header_of(name: str, size: int) -> type[ctypes.Structure]:
 
 
 def make_channel(folder: Path, header: type[ctypes.Structure], schema: str | None, event: bool = True) -> Any:
-    """Makes the channel of cam/depth as another version would; the returned ports keep it alive."""
+    """Creates the channel of cam/depth as another version would; the returned ports keep it alive."""
     bus = _bus.Bus.at(str(folder))
     name = iox2.ServiceName.new("depthrig/mount/cam/depth")
     attributes = iox2.AttributeSpecifier.new()
@@ -76,7 +76,7 @@ def test_a_frame_of_another_header_version_is_refused(folder: Path) -> None:
 
 
 def test_a_corrupted_service_is_another_version_of_iceoryx2(folder: Path) -> None:
-    """What iceoryx2 0.9 and 0.10 say of each other's channels; here the file of the channel is spoilt by hand."""
+    """The errors of iceoryx2 0.9 and 0.10 on each other's channels; here the file of the channel is spoilt by hand."""
     _channel = make_channel(folder, _bus.FRAME_HEADER, _layout.SCHEMA)
     files = list(folder.rglob("*.service"))
     assert files
@@ -84,7 +84,7 @@ def test_a_corrupted_service_is_another_version_of_iceoryx2(folder: Path) -> Non
         mode = file.stat().st_mode
         file.chmod(0o600)
         file.write_bytes(b"another version's bytes")
-        file.chmod(mode)  # a file that its maker may still write counts as one that is being made
+        file.chmod(mode)  # a file that is still writable counts as incomplete
     with pytest.raises(depthrig.VersionMismatch, match="ServiceInCorruptedState"):
         open_stream(folder)
 

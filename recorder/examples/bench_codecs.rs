@@ -1,4 +1,4 @@
-//! The depth codecs side by side on real pictures, one core: `cargo run --release --example bench_codecs -p
+//! The depth codecs side by side on real images, one core: `cargo run --release --example bench_codecs -p
 //! depthrig-recorder -- depth_1.png depth_2.png ...` (16-bit PNG). MB are of raw pixels per second of CPU time.
 #![allow(clippy::print_stdout, clippy::unwrap_used)]
 
@@ -18,24 +18,25 @@ fn speed(bytes: usize, mut work: impl FnMut()) -> f64 {
 }
 
 fn main() {
-    let (mut encoder, mut decoder) = (DepthEncoder::new(), DepthDecoder::new());
+    let mut encoder = DepthEncoder::new();
+    let mut decoder = DepthDecoder::new();
     let mut zstd = zstd::bulk::Compressor::new(1).unwrap();
     let mut unzstd = zstd::bulk::Decompressor::new().unwrap();
     let mut logs = [0.0f64; 6];
     let mut n = 0.0;
     println!(
         "{:<44} {:>6} | {:>6} {:>6} {:>6} | {:>6} {:>6} {:>6}",
-        "depth picture", "levels", "rank", "enc", "dec", "zstd1", "enc", "dec"
+        "depth image", "levels", "rank", "enc", "dec", "zstd1", "enc", "dec"
     );
     for path in std::env::args().skip(1) {
-        let image::DynamicImage::ImageLuma16(picture) = image::open(&path).unwrap() else {
-            println!("{path}: not a 16-bit grey picture");
+        let image::DynamicImage::ImageLuma16(image) = image::open(&path).unwrap() else {
+            println!("{path}: not a 16-bit grey image");
             continue;
         };
-        let shape =
-            DepthShape { width: picture.width(), height: picture.height(), step: 2 * picture.width() };
-        let bytes: Vec<u8> = picture.iter().flat_map(|v| v.to_le_bytes()).collect();
-        let (mut packed, mut back) = (Vec::new(), Vec::new());
+        let shape = DepthShape { width: image.width(), height: image.height(), step: 2 * image.width() };
+        let bytes: Vec<u8> = image.iter().flat_map(|v| v.to_le_bytes()).collect();
+        let mut packed = Vec::new();
+        let mut back = Vec::new();
         let encode = speed(bytes.len(), || {
             packed.clear();
             encoder.encode(&bytes, shape, &mut packed).unwrap();

@@ -1,10 +1,10 @@
-//! Records the pictures of one file and says what that cost; depthrig's part of `make bench-peers`:
+//! Records the images of one file and says what that cost; depthrig's part of `make bench-peers`:
 //! `cargo run --release --example bench_frames -- OPTIONS FRAMES SETS OUT`.
 //!
-//! `OPTIONS` are `RecorderOptions` as JSON; with `"lent": true` the recorder is told that others want the pixels' memory
-//! back, as they do on a rig, so that it may not keep them until the disk has taken them. The file is what `tests/peers/frames.py` writes. Measured is the CPU time
-//! of all threads from before the dataset is created until it is closed. Then every picture is read back, and where
-//! it was stored losslessly it must be the one that went in.
+//! `OPTIONS` are `RecorderOptions` as JSON; with `"lent": true` the pixels' memory is lent, as it is on a rig, so that
+//! the recorder may not keep it until the disk has taken the pixels. The file is what `tests/peers/frames.py` writes.
+//! Measured is the CPU time of all threads from before the dataset is created until it is closed. Then every image is
+//! read back, and where it was stored losslessly it must be the one that went in.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use depthrig_bus::clock::process_cpu_ns;
@@ -25,13 +25,14 @@ const PERIOD_NS: i64 = 200_000_000;
 /// Colour and depth.
 type Pair = [Arc<[u8]>; 2];
 
-fn pictures(path: &Path) -> (u32, u32, Vec<Pair>) {
+fn images(path: &Path) -> (u32, u32, Vec<Pair>) {
     let mut file = BufReader::new(std::fs::File::open(path).unwrap());
     let mut head = String::new();
     file.read_line(&mut head).unwrap();
     let head: Value = serde_json::from_str(&head).unwrap();
     let number = |key: &str| head[key].as_u64().unwrap();
-    let (w, h) = (number("width"), number("height"));
+    let w = number("width");
+    let h = number("height");
     let mut read = |bytes: u64| {
         let mut buf = vec![0; bytes as usize];
         file.read_exact(&mut buf).unwrap();
@@ -57,8 +58,8 @@ fn stream(id: &str, format: PixelFormat, width: u32, height: u32) -> StreamRecor
     }
 }
 
-/// The picture of a stream in a set: cameras take turns at them.
-fn picture(pool: &[Pair], stream: usize, set: u64) -> &Arc<[u8]> {
+/// The image of a stream in a set: cameras take turns at them.
+fn image(pool: &[Pair], stream: usize, set: u64) -> &Arc<[u8]> {
     &pool[(set as usize + stream / 2) % pool.len()][stream % 2]
 }
 
@@ -74,11 +75,11 @@ impl Pixels for Lent {
 fn set(session: &Session, pool: &[Pair], lent: bool, n: u64, begin: HostTime, utc: UtcPair) -> RecordSet {
     let tick = begin.plus_ns(n as i64 * PERIOD_NS);
     let frames = session.streams.iter().enumerate().map(|(stream, s)| {
-        let pixels = Arc::clone(picture(pool, stream, n));
+        let pixels = Arc::clone(image(pool, stream, n));
         let pixels: Box<dyn Pixels> = if lent { Box::new(Lent(pixels)) } else { Box::new(pixels) };
         let mut header = FrameHeader::default();
         header.set_names("bench", &s.id);
-        header.set_picture(s.format, s.width, s.height);
+        header.set_image(s.format, s.width, s.height);
         (header.sequence, header.capture_time_ns) = (n, tick.ns());
         (header.depth_unit_m, header.intrinsics) = (s.depth_unit_m, s.intrinsics);
         RecordFrame { stream, header, pixels }
@@ -104,14 +105,17 @@ fn main() {
     for (key, value) in asked.as_object().unwrap() {
         assert_eq!(known.get(key), Some(value), "option {key} is unknown");
     }
-    let (sets, out): (u64, _) = (sets.parse().unwrap(), Path::new(out));
-    let (width, height, pool) = pictures(Path::new(frames));
+    let sets: u64 = sets.parse().unwrap();
+    let out = Path::new(out);
+    let (width, height, pool) = images(Path::new(frames));
     let mut session = Session::new("bench", "bench");
     for i in 0..CAMERAS {
         session.streams.push(stream(&format!("cam{i}/color"), PixelFormat::Rgb8, width, height));
         session.streams.push(stream(&format!("cam{i}/depth"), PixelFormat::Z16, width, height));
     }
-    let (begin, utc, cpu) = (HostTime::now(), UtcPair::sample(), process_cpu_ns());
+    let begin = HostTime::now();
+    let utc = UtcPair::sample();
+    let cpu = process_cpu_ns();
     let recorder = Recorder::create(Arc::new(RealFs), out, session.clone(), options).unwrap();
     for n in 0..sets {
         while recorder.progress().encode_queue >= 2 || recorder.progress().backlog_bytes > 64 << 20 {
@@ -120,7 +124,8 @@ fn main() {
         recorder.push(set(&session, &pool, lent, n, begin, utc)).unwrap();
     }
     let summary = recorder.finish().unwrap();
-    let (cpu, wall) = (process_cpu_ns() - cpu, HostTime::now().since_ns(begin));
+    let cpu = process_cpu_ns() - cpu;
+    let wall = HostTime::now().since_ns(begin);
     assert!(summary.complete && summary.sets.recorded == sets, "{:?}", summary.lost);
 
     let files = std::fs::read_dir(out).unwrap().map(|f| f.unwrap().metadata().unwrap().len());
@@ -131,8 +136,8 @@ fn main() {
         assert_eq!(s.frames.len(), session.streams.len());
         for f in s.frames {
             lossy |= f.codec == "jpeg";
-            let same = f.pixels[..] == picture(&pool, f.stream, s.id - 1)[..];
-            assert!(same || f.codec == "jpeg", "set {}: {} changed a picture", s.id, f.codec);
+            let same = f.pixels[..] == image(&pool, f.stream, s.id - 1)[..];
+            assert!(same || f.codec == "jpeg", "set {}: {} changed an image", s.id, f.codec);
         }
     }
     let raw_bytes = sets * CAMERAS * u64::from(width * height) * 5;

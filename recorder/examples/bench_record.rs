@@ -1,4 +1,4 @@
-//! What recording costs here: `cargo run --release --example bench_record -- [DIR] [SECONDS] [IMAGES]`.
+//! Measures the cost of recording: `cargo run --release --example bench_record -- [DIR] [SECONDS] [IMAGES]`.
 #![allow(clippy::print_stdout, clippy::unwrap_used)]
 
 use depthrig_recorder::bench::{BenchOptions, run};

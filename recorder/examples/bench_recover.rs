@@ -41,7 +41,7 @@ fn session() -> Session {
 }
 
 /// Depth of a slope with the noise and the holes of a stereo camera; the JPEG is noise behind its first bytes.
-fn pictures() -> [Arc<[u8]>; 2] {
+fn images() -> [Arc<[u8]>; 2] {
     let mut state = 1u32;
     let mut noise = move || {
         state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -67,17 +67,17 @@ const PACE: f64 = 100e6;
 /// Records until the file has `bytes` and leaves it as a killed process does.
 fn record(dir: &Path, bytes: u64) {
     let session = session();
-    let pictures = pictures();
+    let images = images();
     let options =
         RecorderOptions { segment_max_ns: i64::MAX, segment_max_bytes: u64::MAX, ..Default::default() };
     let r = Recorder::create(Arc::new(RealFs), dir, session.clone(), options).unwrap();
     let began = HostTime::now();
     for n in 0.. {
         let frames = (0..session.streams.len()).map(|i| {
-            let pixels = Arc::clone(&pictures[i % 2]);
+            let pixels = Arc::clone(&images[i % 2]);
             let mut header = FrameHeader::default();
             header.set_names("rig", &session.streams[i].id);
-            header.set_picture(session.streams[i].format, WIDTH, HEIGHT);
+            header.set_image(session.streams[i].format, WIDTH, HEIGHT);
             // The recording numbers its frames from 1, and loses none.
             (header.sequence, header.captured) = (n + 1, n + 1);
             header.capture_time_ns = n as i64;
@@ -126,10 +126,12 @@ fn main() {
         file.set_len(bytes).unwrap();
         file.sync_all().unwrap();
         for dry_run in [true, false] {
-            let (cpu, began) = (depthrig_bus::clock::process_cpu_ns(), HostTime::now());
+            let cpu = depthrig_bus::clock::process_cpu_ns();
+            let began = HostTime::now();
             let options = RecoverOptions { dry_run, ..Default::default() };
             let report = recover(&dir, &options, &mut |_| ControlFlow::Continue(())).unwrap();
-            let (wall, cpu) = (began.elapsed().as_secs_f64(), depthrig_bus::clock::process_cpu_ns() - cpu);
+            let wall = began.elapsed().as_secs_f64();
+            let cpu = depthrig_bus::clock::process_cpu_ns() - cpu;
             println!(
                 "{} MB, {tail} bytes cut off, {}: {} sets, {:.0} MB/s, {:.2} s, {:.2} s of CPU",
                 bytes / 1_000_000,

@@ -1,5 +1,5 @@
-//! How fast a dataset is verified: `cargo run --release --example bench_verify -p depthrig-recorder -- DIR PICTURES
-//! [MB] [rank]` records seven cameras of 1280x720 from the pictures of a folder (8-bit PNG or JPEG, 16-bit PNG, tiled)
+//! How fast a dataset is verified: `cargo run --release --example bench_verify -p depthrig-recorder -- DIR IMAGES
+//! [MB] [rank]` records seven cameras of 1280x720 from the images of a folder (8-bit PNG or JPEG, 16-bit PNG, tiled)
 //! into DIR until it has MB (1000), verifies it and removes it. MB are of the file; per core is per second of CPU time.
 #![allow(clippy::print_stdout, clippy::unwrap_used)]
 
@@ -16,16 +16,17 @@ use std::sync::Arc;
 const WIDTH: u32 = 1280;
 const HEIGHT: u32 = 720;
 
-fn pictures(dir: &Path, color: &mut Vec<Arc<[u8]>>, depth: &mut Vec<Arc<[u8]>>) {
+fn images(dir: &Path, color: &mut Vec<Arc<[u8]>>, depth: &mut Vec<Arc<[u8]>>) {
     let mut paths: Vec<_> = std::fs::read_dir(dir).unwrap().map(|e| e.unwrap().path()).collect();
     paths.sort();
     for path in paths {
         if path.is_dir() {
-            pictures(&path, color, depth);
+            images(&path, color, depth);
             continue;
         }
         let Ok(image) = image::open(&path) else { continue };
-        let (w, h) = (image.width(), image.height());
+        let w = image.width();
+        let h = image.height();
         let places = (0..HEIGHT).flat_map(|y| (0..WIDTH).map(move |x| (x % w, y % h)));
         match image {
             image::DynamicImage::ImageLuma16(p) => {
@@ -57,11 +58,12 @@ fn stream(camera: usize, name: &str, format: PixelFormat) -> StreamRecord {
 
 fn main() {
     let args: Vec<String> = std::env::args().skip(1).collect();
-    let [dir, folder, ..] = args.as_slice() else { panic!("usage: bench_verify DIR PICTURES [MB] [rank]") };
+    let [dir, folder, ..] = args.as_slice() else { panic!("usage: bench_verify DIR IMAGES [MB] [rank]") };
     let mb: u64 = args.get(2).map_or(1000, |n| n.parse().unwrap());
     let depth_codec = if args.iter().any(|a| a == "rank") { DepthCodec::Rank } else { DepthCodec::Zstd };
-    let (mut color, mut depth) = (Vec::new(), Vec::new());
-    pictures(Path::new(folder), &mut color, &mut depth);
+    let mut color = Vec::new();
+    let mut depth = Vec::new();
+    images(Path::new(folder), &mut color, &mut depth);
     let dir = PathBuf::from(dir).join(format!("depthrig-bench-verify-{}", std::process::id()));
     let mut session = Session::new("bench", "bench");
     for camera in 0..7 {
@@ -70,7 +72,8 @@ fn main() {
     }
     let options = RecorderOptions { depth: depth_codec, min_free_bytes: 0, ..RecorderOptions::default() };
     let recorder = Recorder::create(Arc::new(RealFs), &dir, session.clone(), options).unwrap();
-    let (start, utc) = (HostTime::now(), UtcPair::sample());
+    let start = HostTime::now();
+    let utc = UtcPair::sample();
     for n in 0.. {
         let tick = start.plus_ns(n as i64 * 200_000_000);
         while recorder.progress().encode_queue >= 3 || recorder.progress().backlog_bytes > 64 << 20 {
@@ -81,15 +84,15 @@ fn main() {
         }
         let frames = session.streams.iter().enumerate().map(|(stream, s)| {
             let pool = if s.format == PixelFormat::Z16 { &depth } else { &color };
-            let picture = &pool[(n as usize + stream) % pool.len()];
+            let image = &pool[(n as usize + stream) % pool.len()];
             let mut header = FrameHeader::default();
             header.set_names("bench", &s.id);
-            header.set_picture(s.format, WIDTH, HEIGHT);
+            header.set_image(s.format, WIDTH, HEIGHT);
             (header.sequence, header.captured) = (6 * n + 1, 6 * n + 1);
             header.capture_time_ns = tick.ns();
             header.depth_unit_m = s.depth_unit_m;
             header.intrinsics = s.intrinsics;
-            RecordFrame { stream, header, pixels: Box::new(Arc::clone(picture)) }
+            RecordFrame { stream, header, pixels: Box::new(Arc::clone(image)) }
         });
         let set = RecordSet {
             id: n + 1,
@@ -112,9 +115,11 @@ fn main() {
         ("verify --decode --threads 1", true, 1),
         ("verify --decode", true, 0),
     ] {
-        let (begin, cpu) = (HostTime::now(), process_cpu_ns());
+        let begin = HostTime::now();
+        let cpu = process_cpu_ns();
         let report = verify(&dir, &VerifyOptions { decode, threads, ..VerifyOptions::default() }).unwrap();
-        let (wall, cpu) = (begin.elapsed().as_secs_f64(), (process_cpu_ns() - cpu) as f64 / 1e9);
+        let wall = begin.elapsed().as_secs_f64();
+        let cpu = (process_cpu_ns() - cpu) as f64 / 1e9;
         assert!(report.is_whole(), "{:?}", report.findings.first());
         let mb = report.bytes as f64 / 1e6;
         println!(

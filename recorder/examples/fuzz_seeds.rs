@@ -49,7 +49,7 @@ fn session(formats: &[PixelFormat]) -> Session {
     session
 }
 
-/// A batch of two samples of a motion unit.
+/// A batch of two samples of an IMU.
 fn batch(session: &Session, unit: usize, n: u64) -> RecordMotion {
     let record: &MotionRecord = &session.motion[unit];
     let sample = |k: u64| MotionSample {
@@ -62,7 +62,7 @@ fn batch(session: &Session, unit: usize, n: u64) -> RecordMotion {
     let samples = vec![sample(2 * n), sample(2 * n + 1)];
     let mut header = FrameHeader::default();
     header.set_names(&session.rig, &record.id);
-    header.set_picture(PixelFormat::Motion, 2, 1);
+    header.set_image(PixelFormat::Motion, 2, 1);
     (header.sequence, header.captured) = (n + 1, n + 1);
     header.capture_time_ns = samples[1].time_ns;
     RecordMotion { unit, header, samples }
@@ -74,7 +74,7 @@ fn set(session: &Session, n: u64, missing: Option<usize>) -> RecordSet {
     let frames = there.map(|(stream, s)| {
         let mut header = FrameHeader::default();
         header.set_names(&session.rig, &s.id);
-        header.set_picture(s.format, s.width, s.height);
+        header.set_image(s.format, s.width, s.height);
         (header.sequence, header.captured) = (6 * n + 1, 6 * n + 1);
         (header.capture_time_ns, header.depth_unit_m) = (tick, s.depth_unit_m);
         (header.intrinsics, header.pose) = (s.intrinsics, s.pose);
@@ -138,7 +138,7 @@ fn of_bag(bytes: &[u8]) -> Vec<u8> {
     [&(bytes.len() as u32).to_le_bytes(), bytes].concat()
 }
 
-/// A bag as librealsense writes one, of `frames` pictures of two streams, with what is said of them.
+/// A bag as librealsense writes one, of `frames` images of two streams, with what is said of them.
 fn bag(frames: u32, lz4: bool) -> Vec<u8> {
     let words = |w: &[u32]| w.iter().flat_map(|w| w.to_le_bytes()).collect::<Vec<u8>>();
     let floats = |w: &[f64]| w.iter().flat_map(|w| w.to_le_bytes()).collect::<Vec<u8>>();
@@ -183,10 +183,11 @@ fn bag(frames: u32, lz4: bool) -> Vec<u8> {
     for n in 0..frames {
         for (stream, encoding, pixel) in [(streams[0], "mono16", 2), (streams[1], "rgb8", 3)] {
             let time_ns = 33_000_000 * n;
-            let (head, step) = (words(&[n, 0, time_ns, 0, 2, 4]), words(&[4 * pixel]));
+            let head = words(&[n, 0, time_ns, 0, 2, 4]);
+            let step = words(&[4 * pixel]);
             let pixels: Vec<u8> = (0..8 * pixel).map(|i| (i + n) as u8).collect();
-            let picture = [head, of_bag(encoding.as_bytes()), vec![0], step, of_bag(&pixels)].concat();
-            let mut messages = vec![(format!("{stream}/image/data"), picture)];
+            let image = [head, of_bag(encoding.as_bytes()), vec![0], step, of_bag(&pixels)].concat();
+            let mut messages = vec![(format!("{stream}/image/data"), image)];
             for (key, value) in [
                 ("Frame Counter", (n + 7).to_string()),
                 ("Sensor Timestamp", (33_000 * u64::from(n) + 4_294_950_000).to_string()),
@@ -208,7 +209,8 @@ fn exported() -> (MemFs, PathBuf) {
     let fs = record(&made, &RecorderOptions::default(), 3, Some(1));
     let dataset = Dataset::open_with(Arc::new(fs.clone()), Path::new("/d")).unwrap();
     let mut exporter = ByteCameraExport::new(CameraNames::Short, None).unwrap();
-    let (to, on) = (Path::new("/e"), &mut |_| ControlFlow::Continue(()));
+    let to = Path::new("/e");
+    let on = &mut |_| ControlFlow::Continue(());
     export(&fs, &mut exporter, vec![dataset], to, ExportOptions { workers: 1 }, on).unwrap();
     let folder = fs.read_dir(to).unwrap().into_iter().find(|e| e.is_dir).unwrap();
     (fs, to.join(folder.name))
@@ -252,7 +254,7 @@ fn main() {
         put("segment", name, &segment);
         // The same without its end, as a killed process leaves it.
         put("segment", &format!("{name}_cut"), &segment[..segment.len() * 2 / 3]);
-        // An odd length is an unfinished one's; enough that two sets are whole.
+        // An unfinished dataset may end at an odd length; this is enough for two complete sets.
         put("recover", name, &segment[..(segment.len() * 7 / 10) | 1]);
         put("session", name, &fs.contents(&dir.join("session.toml")).unwrap());
         assert!(fs.read_dir(dir).unwrap().len() == 2);

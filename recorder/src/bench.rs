@@ -1,7 +1,7 @@
-//! What recording costs on this computer: cores at a steady rate, and the writer's throughput.
+//! Measures the cost of recording on this computer: cores at a steady rate, and the writer's throughput.
 //!
-//! The first part records pictures in real time, as the daemon would, from memory that stands for shared
-//! memory. The second part pushes pictures that are JPEG already as fast as they are taken, so that what is
+//! The first part records images in real time, as the daemon would, from memory that stands for shared
+//! memory. The second part pushes images that are JPEG already as fast as they are taken, so that what is
 //! left is building messages, checksums and writing.
 
 use crate::fs::RealFs;
@@ -16,10 +16,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-mod pictures;
+mod images;
 pub mod soak;
 
-/// What to measure.
+/// Options of a measurement.
 #[derive(Debug, Clone, Serialize)]
 pub struct BenchOptions {
     /// Where datasets are written and removed again.
@@ -34,7 +34,7 @@ pub struct BenchOptions {
     pub rate_hz: f64,
     /// How long to record, seconds.
     pub seconds: f64,
-    /// A folder of pictures to record instead of made ones: 8-bit PNG or JPEG for colour, 16-bit PNG for depth.
+    /// A folder of images to record instead of synthetic ones: 8-bit PNG or JPEG for colour, 16-bit PNG for depth.
     pub images: Option<PathBuf>,
     /// Bytes to write in the throughput part; 0 leaves it out.
     pub writer_bytes: u64,
@@ -58,11 +58,11 @@ impl Default for BenchOptions {
     }
 }
 
-/// What was measured, and where.
+/// Results of a measurement, and its conditions.
 #[derive(Debug, Clone, Serialize)]
 #[non_exhaustive]
 pub struct BenchReport {
-    /// What was asked for.
+    /// The options it ran with.
     pub options: BenchOptions,
     /// The computer.
     pub conditions: Conditions,
@@ -83,8 +83,8 @@ pub struct Conditions {
     pub load: String,
     /// Whether this is an optimised build; other builds measure nothing of interest.
     pub optimised: bool,
-    /// Where the pictures come from.
-    pub pictures: String,
+    /// Where the images come from.
+    pub images: String,
 }
 
 /// Recording at a steady rate.
@@ -120,7 +120,7 @@ pub struct Throughput {
 }
 
 impl Conditions {
-    fn now(pictures: String) -> Self {
+    fn now(images: String) -> Self {
         let read = |path: &str| std::fs::read_to_string(path).unwrap_or_default();
         let cpuinfo = read("/proc/cpuinfo");
         let cpu = cpuinfo.lines().find_map(|l| l.strip_prefix("model name\t: "));
@@ -129,7 +129,7 @@ impl Conditions {
             cores: std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
             load: read("/proc/loadavg").split(' ').next().unwrap_or_default().to_owned(),
             optimised: !cfg!(debug_assertions),
-            pictures,
+            images,
         }
     }
 }
@@ -137,19 +137,19 @@ impl Conditions {
 /// Measures what recording costs.
 ///
 /// # Errors
-/// As recording does; [`ErrorKind::BadInput`] when the pictures cannot be used.
+/// As recording does; [`ErrorKind::BadInput`] when the images cannot be used.
 pub fn run(options: &BenchOptions) -> Result<BenchReport> {
-    let (pool, pictures) = pictures::pool(options.images.as_deref(), options.width, options.height)?;
-    let conditions = Conditions::now(pictures);
+    let (pool, images) = images::pool(options.images.as_deref(), options.width, options.height)?;
+    let conditions = Conditions::now(images);
     let steady = steady(options, &pool)?;
     let writer = (options.writer_bytes > 0).then(|| throughput(options)).transpose()?;
     Ok(BenchReport { options: options.clone(), conditions, steady, writer })
 }
 
-/// A stream of pictures that repeat.
+/// A stream of images that repeat.
 struct Source {
     record: StreamRecord,
-    pictures: Vec<Arc<[u8]>>,
+    images: Vec<Arc<[u8]>>,
 }
 
 fn stream(id: &str, format: PixelFormat, width: u32, height: u32) -> Result<StreamRecord> {
@@ -172,16 +172,16 @@ fn stream(id: &str, format: PixelFormat, width: u32, height: u32) -> Result<Stre
 fn set(sources: &[Source], id: u64, tick: HostTime, utc: UtcPair) -> RecordSet {
     let frames = sources.iter().enumerate().map(|(stream, source)| {
         let record = &source.record;
-        let picture = &source.pictures[id as usize % source.pictures.len()];
+        let image = &source.images[id as usize % source.images.len()];
         let mut header = FrameHeader::default();
         header.set_names("bench", &record.id);
-        header.set_picture(record.format, record.width, record.height);
-        header.payload_len = picture.len() as u32;
+        header.set_image(record.format, record.width, record.height);
+        header.payload_len = image.len() as u32;
         (header.sequence, header.captured) = (id, id);
         header.capture_time_ns = tick.ns();
         header.depth_unit_m = record.depth_unit_m;
         header.intrinsics = record.intrinsics;
-        RecordFrame { stream, header, pixels: Box::new(Arc::clone(picture)) }
+        RecordFrame { stream, header, pixels: Box::new(Arc::clone(image)) }
     });
     RecordSet {
         id,
@@ -194,24 +194,27 @@ fn set(sources: &[Source], id: u64, tick: HostTime, utc: UtcPair) -> RecordSet {
     }
 }
 
-fn steady(options: &BenchOptions, pool: &pictures::Pool) -> Result<Steady> {
+fn steady(options: &BenchOptions, pool: &images::Pool) -> Result<Steady> {
     let mut sources = Vec::new();
     for camera in 0..options.cameras.max(1) {
-        // Each camera begins at another picture.
+        // Each camera begins at another image.
         let turn = |p: &[Arc<[u8]>]| (0..p.len()).map(|i| Arc::clone(&p[(i + camera) % p.len()])).collect();
-        let (w, h) = (options.width, options.height);
+        let w = options.width;
+        let h = options.height;
         sources.push(Source {
             record: stream(&format!("cam{camera}/color"), PixelFormat::Rgb8, w, h)?,
-            pictures: turn(&pool.color),
+            images: turn(&pool.color),
         });
         sources.push(Source {
             record: stream(&format!("cam{camera}/depth"), PixelFormat::Z16, w, h)?,
-            pictures: turn(&pool.depth),
+            images: turn(&pool.depth),
         });
     }
     let period = Duration::from_secs_f64(1.0 / options.rate_hz.clamp(0.01, 1000.0));
     let sets = (options.seconds * options.rate_hz).round().max(1.0) as u64;
-    let (begin, cpu, utc) = (HostTime::now(), process_cpu_ns(), UtcPair::sample());
+    let begin = HostTime::now();
+    let cpu = process_cpu_ns();
+    let utc = UtcPair::sample();
     let mut push_max_ns = 0;
     let feed = |recorder: &Recorder| {
         for n in 0..sets {
@@ -227,8 +230,9 @@ fn steady(options: &BenchOptions, pool: &pictures::Pool) -> Result<Steady> {
     };
     let (measured, ()) = record(&options.dir, &sources, options.recorder.clone(), feed, |_| Ok(()))?;
     let Measured { summary, end, end_cpu_ns } = measured;
-    let (wall, cpu) = (end.since_ns(begin) as f64 / 1e9, (end_cpu_ns - cpu) as f64 / 1e9);
-    let raw: usize = sources.iter().map(|s| s.pictures[0].len()).sum();
+    let wall = end.since_ns(begin) as f64 / 1e9;
+    let cpu = (end_cpu_ns - cpu) as f64 / 1e9;
+    let raw: usize = sources.iter().map(|s| s.images[0].len()).sum();
     let mb = summary.bytes as f64 / 1e6;
     let pairs = summary.sets.recorded * options.cameras as u64;
     Ok(Steady {
@@ -248,10 +252,10 @@ fn throughput(options: &BenchOptions) -> Result<Throughput> {
     const STREAMS: usize = 14;
     let mut sources = Vec::new();
     for i in 0..STREAMS {
-        let bytes = pictures::incompressible(PAYLOAD, i as u64);
+        let bytes = images::incompressible(PAYLOAD, i as u64);
         sources.push(Source {
             record: stream(&format!("cam{i}/color"), PixelFormat::Mjpeg, 1280, 720)?,
-            pictures: vec![bytes],
+            images: vec![bytes],
         });
     }
     let recorder = RecorderOptions {
@@ -263,7 +267,9 @@ fn throughput(options: &BenchOptions) -> Result<Throughput> {
         ..RecorderOptions::default()
     };
     let sets = options.writer_bytes.div_ceil((PAYLOAD * STREAMS) as u64).max(1);
-    let (begin, cpu, utc) = (HostTime::now(), process_cpu_ns(), UtcPair::sample());
+    let begin = HostTime::now();
+    let cpu = process_cpu_ns();
+    let utc = UtcPair::sample();
     let feed = |recorder: &Recorder| {
         for n in 0..sets {
             let tick = begin.plus_ns(n as i64 * 1_000_000);
@@ -275,7 +281,8 @@ fn throughput(options: &BenchOptions) -> Result<Throughput> {
     };
     let (measured, ()) = record(&options.dir, &sources, recorder, feed, |_| Ok(()))?;
     let Measured { summary, end, end_cpu_ns } = measured;
-    let (wall, cpu) = (end.since_ns(begin) as f64 / 1e9, (end_cpu_ns - cpu) as f64 / 1e9);
+    let wall = end.since_ns(begin) as f64 / 1e9;
+    let cpu = (end_cpu_ns - cpu) as f64 / 1e9;
     if summary.sets.recorded != sets {
         let message = format!("the throughput cannot be measured: {}", summary.lost.join("; "));
         return Err(Error::new(ErrorKind::Io, message));
@@ -305,7 +312,8 @@ fn record<T>(
     let recorder = Recorder::create(Arc::new(RealFs), &dir, session, options)?;
     feed(&recorder);
     let summary = recorder.finish();
-    let (end, end_cpu_ns) = (HostTime::now(), process_cpu_ns());
+    let end = HostTime::now();
+    let end_cpu_ns = process_cpu_ns();
     let seen = look(&dir);
     std::fs::remove_dir_all(&dir).map_err(|e| Error::io("remove", &dir, e))?;
     Ok((Measured { summary: summary?, end, end_cpu_ns }, seen?))

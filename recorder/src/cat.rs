@@ -1,4 +1,4 @@
-//! Single frames of a dataset: listed, or written as picture files with `frames.csv` beside them.
+//! Single frames of a dataset: listed, or written as image files with `frames.csv` beside them.
 //!
 //! One set is in memory at a time, so the length of the dataset does not matter. Nothing is ever overwritten:
 //! the folder is new or empty, and while it grows the list is named `frames.csv.part`.
@@ -19,7 +19,7 @@ mod row;
 pub use motion::{MotionForm, MotionRow, export_motion, list_motion};
 pub use row::FrameRow;
 
-/// The list beside the pictures.
+/// The list beside the images.
 pub const FRAMES_FILE: &str = "frames.csv";
 
 /// Which sets.
@@ -67,7 +67,7 @@ pub struct FrameChoice {
     pub streams: Vec<StreamId>,
 }
 
-/// What was listed or written.
+/// Counts of what was listed or written.
 #[derive(Debug, Clone, Default, Serialize)]
 #[non_exhaustive]
 pub struct FramesDone {
@@ -75,7 +75,7 @@ pub struct FramesDone {
     pub sets: u64,
     /// Frames listed or written.
     pub frames: u64,
-    /// Bytes of the picture files.
+    /// Bytes of the image files.
     pub bytes: u64,
     /// Sets and frames that could not be read.
     pub lost: u64,
@@ -97,7 +97,7 @@ impl FramesDone {
     }
 }
 
-/// Calls `each` with a row per chosen frame, in the order of the sets and in a set of the streams. No picture is
+/// Calls `each` with a row per chosen frame, in the order of the sets and in a set of the streams. No image is
 /// read.
 ///
 /// # Errors
@@ -125,12 +125,12 @@ pub fn list_frames(
 }
 
 /// Writes a file per chosen frame below the new folder `out`: `CAM/STREAM/SET.png` (or `.npy`, `.jpg`), and
-/// `frames.csv`. Without `form` a stream's pictures are PNG where PNG holds every bit, else NPY.
+/// `frames.csv`. Without `form` a stream's images are PNG where PNG holds every bit, else NPY.
 ///
-/// `progress` is told how many of how many sets are done, and may end it.
+/// `progress` is called with the sets done and the sets in all, and may end the export.
 ///
 /// # Errors
-/// As [`list_frames`]; [`ErrorKind::BadInput`] also when `form` cannot hold the pictures of a chosen stream;
+/// As [`list_frames`]; [`ErrorKind::BadInput`] also when `form` cannot hold the images of a chosen stream;
 /// [`ErrorKind::AlreadyExists`] when `out` holds anything; and as writing does.
 pub fn export_frames(
     fs: &dyn Fs,
@@ -147,7 +147,7 @@ pub fn export_frames(
     folder.line(&row::COLUMNS.join(","))?;
     let total = chosen.len() as u64;
     let mut done = FramesDone::default();
-    let mut made = vec![false; dataset.session().streams.len()];
+    let mut created = vec![false; dataset.session().streams.len()];
     let mut at = 0;
     while let Some(set) = chosen.next(PixelMode::Stored) {
         if progress(at, total).is_break() {
@@ -167,7 +167,7 @@ pub fn export_frames(
                 }
             };
             let name = chosen.file_name(&set, frame, form);
-            if !std::mem::replace(&mut made[frame.stream], true) {
+            if !std::mem::replace(&mut created[frame.stream], true) {
                 folder.make_parent(&name)?;
             }
             folder.write(&name, &file)?;
@@ -219,11 +219,11 @@ struct Chosen<'a> {
     streams: Vec<bool>,
     /// Digits of a set's id in file names, so that names sort as sets do.
     digits: usize,
-    /// Segments that are not there to be read, told once.
+    /// Segments that cannot be read, reported once.
     problems: Vec<String>,
 }
 
-/// A set, or why it is none.
+/// The next set, or why it cannot be read.
 enum Next {
     Set(Box<DatasetSet>),
     Lost(String),
@@ -251,9 +251,7 @@ impl<'a> Chosen<'a> {
                 let names: Vec<_> = known.iter().map(|s| s.id.to_string()).collect();
                 let unit = dataset.session().motion.iter().any(|u| u.id == *wanted);
                 let what = if unit {
-                    format!(
-                        "{wanted} is a motion unit and has no pictures; ask for motion units by themselves"
-                    )
+                    format!("{wanted} is an IMU and has no images; ask for IMUs by themselves")
                 } else {
                     format!("there is no stream {wanted}; the dataset has {}", names.join(", "))
                 };
@@ -304,7 +302,7 @@ impl<'a> Chosen<'a> {
         format!("{}/{}/{:0digits$}.{}", id.camera, id.stream, set.id, form.extension())
     }
 
-    /// Refuses a form that cannot hold the pictures of a chosen stream, before anything is written.
+    /// Refuses a form that cannot hold the images of a chosen stream, before anything is written.
     fn check_form(&mut self, form: Option<StillFormat>) -> Result<()> {
         let Some(form) = form else { return Ok(()) };
         let first = self.numbers.clone().find_map(|n| match self.sets.read(n, PixelMode::None) {
@@ -391,7 +389,7 @@ impl<'a> Folder<'a> {
         let path = self.dir.join(name);
         let mut file = self.fs.create_new(&path).map_err(|e| Error::io("create", &path, e))?;
         fs::write_all(&mut *file, bytes).map_err(|e| {
-            // Half a picture is worse than none. Where even that fails, the list does not name it.
+            // Half an image is worse than none. Where even that fails, the list does not name it.
             let _ = self.fs.remove_file(&path);
             Error::io("write", &path, e)
         })

@@ -54,7 +54,7 @@ pub struct CatalogEntry {
     pub path: PathBuf,
     /// The session's name; the folder's when the session cannot be read.
     pub name: String,
-    /// What was in front of the cameras.
+    /// The scene in front of the cameras.
     pub scene: String,
     /// Who recorded it.
     pub operator: String,
@@ -76,11 +76,11 @@ pub struct CatalogEntry {
     pub bytes: u64,
     /// How it is.
     pub health: Health,
-    /// Why it is not whole: what was lost, and what to do.
+    /// Why it is not complete: losses, and what to do.
     pub why: Vec<String>,
 }
 
-/// The datasets in `dir`, and in those of its folders that are no datasets themselves; `dir` may be a dataset too.
+/// The datasets in `dir`, and in those of its folders that are not datasets themselves; `dir` may be a dataset too.
 /// Sorted by path. A dataset that cannot be read is in the list and says why.
 ///
 /// # Errors
@@ -114,7 +114,7 @@ fn is_dataset(fs: &dyn Fs, dir: &Path) -> std::io::Result<bool> {
     Ok(entries.iter().any(|e| !e.is_dir && (e.name == SESSION_FILE || segment_number(&e.name).is_some())))
 }
 
-/// What the dataset `dir` says of itself. Whatever is wrong with it is in the answer.
+/// Reads the catalog entry of the dataset `dir`. Errors are part of the entry.
 pub fn look_at(fs: &dyn Fs, dir: &Path) -> CatalogEntry {
     let folder =
         dir.file_name().map_or_else(|| dir.display().to_string(), |n| n.to_string_lossy().into_owned());
@@ -150,7 +150,7 @@ pub fn look_at(fs: &dyn Fs, dir: &Path) -> CatalogEntry {
     let session = match Session::load(fs, dir) {
         Ok(session) => session,
         Err(e) if e.kind() == ErrorKind::NotFound => {
-            entry.is(Health::Damaged, format!("{SESSION_FILE} is missing; the segments tell what was in it"));
+            entry.is(Health::Damaged, format!("{SESSION_FILE} is missing; the segments hold a copy of it"));
             return entry;
         }
         Err(e) => {
@@ -189,7 +189,7 @@ pub fn look_at(fs: &dyn Fs, dir: &Path) -> CatalogEntry {
     entry
 }
 
-/// What a recording that is not complete lost: how many sets, if any were counted, then its own words.
+/// Losses of an incomplete recording: how many sets, if any were counted, then its own words.
 fn losses(sets: u64, outcome: &Outcome) -> Vec<String> {
     let count = (sets > 0).then(|| format!("{sets} sets were not recorded"));
     let mut words: Vec<_> = count.into_iter().chain(outcome.lost.iter().cloned()).collect();

@@ -135,7 +135,8 @@ impl<'a> Reader<'a> {
     pub fn raw(&mut self, n: usize) -> Result<&'a [u8]> {
         let end = self.at.checked_add(n).filter(|end| *end <= self.data.len());
         let end = end.ok_or_else(|| {
-            let (at, len) = (self.at, self.data.len());
+            let at = self.at;
+            let len = self.data.len();
             Error::new(
                 ErrorKind::Corrupt,
                 format!("a message of {len} bytes ends at byte {at} of its fields"),
@@ -184,7 +185,7 @@ impl<'a> Reader<'a> {
     /// Reads a sequence: its length, then each element with `get`.
     ///
     /// # Errors
-    /// Those of `get`, which end a sequence whose length is a lie.
+    /// Those of `get`, which end a sequence with a wrong length.
     pub fn seq<T>(&mut self, mut get: impl FnMut(&mut Self) -> Result<T>) -> Result<Vec<T>> {
         let n = self.u32()?;
         (0..n).map(|_| get(self)).collect()

@@ -1,11 +1,11 @@
-//! The wall clock: its time as text, and its steps, told from its drift by the pairs of readings in a dataset.
+//! The wall clock: its time as text, and its steps, distinguished from drift by the clock pairs in a dataset.
 
 use depthrig_bus::UtcPair;
 use time::OffsetDateTime;
 
 /// The fastest that NTP slews the wall clock (adjtimex(2): 500 ppm).
 const SLEW_PPM: i64 = 500;
-/// Below this a change of the wall clock is no step, whatever its rate, nanoseconds.
+/// A smaller change of the wall clock does not count as a step, whatever its rate, nanoseconds.
 const STEP_MIN_NS: i64 = 100_000;
 
 /// UTC minus the monotonic clock, nanoseconds.
@@ -13,7 +13,7 @@ pub(crate) fn offset_ns(pair: &UtcPair) -> i64 {
     pair.utc_ns.saturating_sub(pair.mono.ns())
 }
 
-/// How far the wall clock was set between two readings, nanoseconds; `None` when what changed can be drift.
+/// Size of a step of the wall clock between two readings, nanoseconds; `None` if the change can be drift.
 pub(crate) fn step_ns(before: &UtcPair, after: &UtcPair) -> Option<i64> {
     let change = offset_ns(after).saturating_sub(offset_ns(before));
     let slewed = after.mono.since_ns(before.mono).max(0) / 1_000_000 * SLEW_PPM;
@@ -23,7 +23,7 @@ pub(crate) fn step_ns(before: &UtcPair, after: &UtcPair) -> Option<i64> {
 
 /// `2026-08-21 14:05:09 UTC` from nanoseconds since 1970.
 pub fn utc_text(ns: i64) -> String {
-    // Every number of 64 bits is a time between the years 1677 and 2262.
+    // Every 64-bit number is a time between the years 1677 and 2262.
     let t = OffsetDateTime::from_unix_timestamp_nanos(i128::from(ns)).unwrap_or(OffsetDateTime::UNIX_EPOCH);
     let (h, m, s) = t.to_hms();
     format!("{:04}-{:02}-{:02} {h:02}:{m:02}:{s:02} UTC", t.year(), u8::from(t.month()), t.day())

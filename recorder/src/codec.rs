@@ -1,8 +1,8 @@
-//! The depth codec of depthrig: small and lossless, for 16-bit pictures. `docs/dataset-format.md`, "Depth codec",
+//! The depth codec of depthrig: small and lossless, for 16-bit images. `docs/dataset-format.md`, "Depth codec",
 //! has it byte by byte.
 //!
 //! A depth camera measures few different distances: a stereo camera some hundred disparities, whatever the depth
-//! unit is. So each value becomes its rank among the values of the picture, the rank is predicted from its
+//! unit is. So each value becomes its rank among the values of the image, the rank is predicted from its
 //! neighbours (the median edge detector of LOCO-I / JPEG-LS: Weinberger, Seroussi, Sapiro, IEEE TIP 9(8), 2000),
 //! and what is left is split into low and high bytes and packed with Zstandard at level 1.
 
@@ -17,15 +17,15 @@ pub use encoder::DepthEncoder;
 /// The codec's name with its version, as a message says it.
 pub const DEPTH_CODEC: &str = "rank/1";
 
-/// Unpacked pictures above this many bytes are refused: 16384x8192 of 16 bit.
-const PICTURE_MAX: u64 = 1 << 28;
+/// Unpacked images above this many bytes are refused: 16384x8192 of 16 bit.
+const IMAGE_MAX: u64 = 1 << 28;
 /// Bytes before the Zstandard frame: the number of values in the palette.
 const HEAD: usize = 4;
 /// A Zstandard block holds at most 128 KiB and takes at least four bytes (RFC 8878, 3.1.1.2), so that a short
 /// input cannot ask for much memory.
 const EXPANSION_MAX: u64 = (128 << 10) / 4;
 
-/// The shape of a 16-bit picture.
+/// The shape of a 16-bit image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DepthShape {
     /// Pixels per row.
@@ -37,7 +37,7 @@ pub struct DepthShape {
 }
 
 impl DepthShape {
-    /// Bytes of the picture, padding included.
+    /// Bytes of the image, padding included.
     pub fn bytes(&self) -> u64 {
         u64::from(self.step) * u64::from(self.height)
     }
@@ -51,7 +51,7 @@ impl DepthShape {
         2 * self.width as usize
     }
 
-    /// Bytes of padding in the picture.
+    /// Bytes of padding in the image.
     const fn padding(&self) -> usize {
         (self.step as usize - self.row()) * self.height as usize
     }
@@ -59,9 +59,11 @@ impl DepthShape {
     fn check(&self) -> Result<()> {
         let Self { width, height, step } = *self;
         if width == 0 || height == 0 || u64::from(step) < 2 * u64::from(width) {
-            return Err(bad(format!("{width}x{height} of 16 bit with {step} bytes per row is no picture")));
+            return Err(bad(format!(
+                "{width}x{height} of 16 bit with {step} bytes per row is not a valid image"
+            )));
         }
-        if self.bytes() > PICTURE_MAX {
+        if self.bytes() > IMAGE_MAX {
             return Err(bad(format!(
                 "{width}x{height} with {step} bytes per row is too large for this codec"
             )));
@@ -71,13 +73,13 @@ impl DepthShape {
 }
 
 fn bad(what: impl core::fmt::Display) -> Error {
-    Error::new(ErrorKind::Codec, format!("a depth picture: {what}"))
+    Error::new(ErrorKind::Codec, format!("a depth image: {what}"))
 }
 
 /// A table with a place for each 16-bit value, so that a value is an index that needs no check.
 type Table<T> = Box<[T; 1 << 16]>;
 
-// Made on the heap: 128 KiB on the stack of a worker thread would be unkind.
+// On the heap: 128 KiB is too much for the stack of a worker thread.
 #[allow(clippy::unnecessary_box_returns)]
 fn table<T: Copy + Default>() -> Table<T> {
     match vec![T::default(); 1 << 16].into_boxed_slice().try_into() {

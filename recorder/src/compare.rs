@@ -2,8 +2,8 @@
 //! in memory.
 //!
 //! Sets are matched by their tick, streams by their name. How something is stored (segments, packing, order of
-//! the frames in a set) is no difference. What a recording of a replay cannot keep is *passage*: numbers that
-//! the way through a channel and a recorder gives anew. All else is *identity*: what the camera saw and when.
+//! the frames in a set) does not count as a difference. Facts that a recording of a replay cannot keep are *passage*:
+//! numbers that channel and recorder assign anew. All others are *identity*: what the camera saw and when.
 //! `PASSAGE` and [`CompareOptions::strict`] say which is which.
 
 use crate::dataset::{Dataset, DatasetFrame, DatasetSet, PixelMode, SetRange, Sets};
@@ -26,13 +26,13 @@ pub enum PixelCheck {
     /// As a replay would publish them, bit by bit. Bytes between the rows are not pixels.
     #[default]
     Exact,
-    /// As they are stored: the codec and every byte of the picture.
+    /// As they are stored: the codec and every byte of the image.
     Stored,
-    /// Not at all; no picture is read.
+    /// Not at all; no image is read.
     None,
 }
 
-/// What is compared.
+/// Options of a comparison.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CompareOptions {
     /// How pixels are compared.
@@ -40,7 +40,7 @@ pub struct CompareOptions {
     /// Compare passage as well: of a set its id and its place in UTC, of a frame `sequence`, `captured`, `set_id`
     /// and the flag `replayed`, of a stream its nominal rate and where its calibration comes from.
     pub strict: bool,
-    /// Differences that are told one by one; all are counted.
+    /// Differences that are listed one by one; all are counted.
     pub listed: usize,
 }
 
@@ -50,7 +50,7 @@ impl Default for CompareOptions {
     }
 }
 
-/// What a comparison found.
+/// Result of a comparison.
 #[derive(Debug, Clone, Serialize)]
 #[non_exhaustive]
 pub struct Comparison {
@@ -72,7 +72,7 @@ pub struct Comparison {
     pub sets: u64,
     /// Frames that are in both.
     pub frames: u64,
-    /// Batches of motion units that are in both.
+    /// Batches of IMUs that are in both.
     pub batches: u64,
     /// How many differences there are, by stream and field.
     pub counts: Vec<FieldCount>,
@@ -87,9 +87,9 @@ pub struct Comparison {
 pub struct FieldCount {
     /// `camera/stream`; empty when it is about whole sets.
     pub stream: String,
-    /// What differs: a field of the header, `pixels`, `codec`, `frame` (it is in one dataset only), `batch` (the same of a
-    /// motion unit's), `samples`, `set` (the
-    /// same of a whole set), `unreadable`, or a field of the set or of the stream's description.
+    /// The field that differs: one of the header, `pixels`, `codec`, `frame` (it is in one dataset only), `batch` (an IMU
+    /// batch that is in one only), `samples`, `set` (a set that is in one only), `unreadable`, or a field of the set or of
+    /// the stream's description.
     pub field: String,
     /// Sets or frames; descriptions count once.
     pub count: u64,
@@ -106,7 +106,7 @@ pub struct Difference {
     pub tick_ns: Option<i64>,
     /// `camera/stream`; empty when it is about a whole set.
     pub stream: String,
-    /// What differs, as in [`FieldCount::field`].
+    /// The field that differs, as in [`FieldCount::field`].
     pub field: String,
     /// The value in the first dataset.
     pub a: String,
@@ -131,7 +131,7 @@ pub fn compare(a: &Dataset, b: &Dataset, options: &CompareOptions) -> Result<Com
     compare_with(a, b, options, &mut |_| ControlFlow::Continue(()))
 }
 
-/// The same, telling `progress` after each set; a break ends it with what was found so far.
+/// The same, calling `progress` after each set; a break ends it with the result so far.
 ///
 /// # Errors
 /// As [`compare`].
@@ -189,8 +189,8 @@ impl<'a> Walk<'a> {
         }
     }
 
-    /// What `session.toml` says of the streams. The name of the session, of the rig, the scene and the like tell
-    /// how somebody filed a recording, not what is in it.
+    /// Compares the streams of both `session.toml`. The name of the session, of the rig, the scene and the like say how
+    /// somebody filed a recording, not what is in it.
     fn descriptions(&mut self) {
         let [a, b] = self.datasets.map(|d| &d.session().streams);
         let ids: BTreeSet<&StreamId> = a.iter().chain(b).map(|s| &s.id).collect();
@@ -206,7 +206,8 @@ impl<'a> Walk<'a> {
                 }
             };
             let mut check = |field: &str, x: &dyn std::fmt::Debug, y: &dyn std::fmt::Debug| {
-                let (x, y) = (format!("{x:?}"), format!("{y:?}"));
+                let x = format!("{x:?}");
+                let y = format!("{y:?}");
                 if x != y {
                     self.add(At::default(), &name, &format!("description.{field}"), x, y);
                 }
@@ -232,7 +233,7 @@ impl<'a> Walk<'a> {
         self.units();
     }
 
-    /// What `session.toml` says of the motion units.
+    /// Compares the IMUs of both `session.toml`.
     fn units(&mut self) {
         let [a, b] = self.datasets.map(|d| &d.session().motion);
         let ids: BTreeSet<&StreamId> = a.iter().chain(b).map(|u| &u.id).collect();
@@ -369,7 +370,8 @@ impl<'a> Walk<'a> {
         });
         let names: BTreeSet<String> = x.keys().chain(y.keys()).cloned().collect();
         for name in names {
-            let (x, y) = (x.remove(&name).unwrap_or_default(), y.remove(&name).unwrap_or_default());
+            let x = x.remove(&name).unwrap_or_default();
+            let y = y.remove(&name).unwrap_or_default();
             for (a, b) in x.iter().zip(&y) {
                 self.batch(at, &name, a, b);
             }
@@ -429,14 +431,13 @@ impl<'a> Walk<'a> {
         let [x, y] = match [a.decoded(), b.decoded()] {
             [Ok(x), Ok(y)] => [x, y],
             results => {
-                let told = results.map(|r| r.map_or_else(|e| e.to_string(), |_| "decodes".to_owned()));
-                let [x, y] = told;
+                let [x, y] = results.map(|r| r.map_or_else(|e| e.to_string(), |_| "decodes".to_owned()));
                 return self.add(at, name, "unreadable", x, y);
             }
         };
         let entry = self.pixels.entry(name.to_owned());
         let total = entry.or_insert_with(|| PixelDifference::new(name));
-        if let Some((x, y)) = total.frame((&a.header, &x), (&b.header, &y)) {
+        if let Some((x, y)) = total.frame(&a.header, &x, &b.header, &y) {
             self.add(at, name, "pixels", x, y);
         }
     }

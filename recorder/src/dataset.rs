@@ -66,7 +66,7 @@ impl Dataset {
                 return Err(Error::new(
                     ErrorKind::NotADataset,
                     format!(
-                        "{} is no dataset: it holds neither {SESSION_FILE} nor seg_0000.mcap",
+                        "{} is not a dataset: it holds neither {SESSION_FILE} nor seg_0000.mcap",
                         path.display()
                     ),
                 ));
@@ -75,7 +75,7 @@ impl Dataset {
         Ok(Self { fs, path: path.to_owned(), session, segments })
     }
 
-    /// What was recorded, by whom, with which rig.
+    /// The session: what was recorded, by whom, with which rig.
     pub const fn session(&self) -> &Session {
         &self.session
     }
@@ -100,7 +100,7 @@ impl Dataset {
         Sets::new(self, range, mode)
     }
 
-    /// Counts, rates, spread, drops. Reads no pictures, so it is fast on datasets of any length.
+    /// Counts, rates, spread, drops. Reads no images, so it is fast on datasets of any length.
     ///
     /// # Errors
     /// As reading the segments does.
@@ -161,7 +161,7 @@ fn ours(reader: &SegmentReader) -> Result<()> {
     ))
 }
 
-/// The session as a segment tells it.
+/// The session from the copy in a segment.
 fn session_of(fs: &dyn Fs, segment: &Path) -> Result<Session> {
     let reader = SegmentReader::open(fs, segment)?;
     ours(&reader)?;

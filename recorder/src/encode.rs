@@ -1,4 +1,4 @@
-//! A frame becomes a chunk: JPEG or lossless pixels in a ROS image message, packed and ready to be appended.
+//! Encodes a frame into a chunk: JPEG or lossless pixels in a ROS image message, packed and ready to be appended.
 
 use crate::codec::{DEPTH_CODEC, DepthEncoder, DepthShape};
 use crate::container::chunk::{Chunk, ChunkBuilder, MessageHead, Tail};
@@ -16,15 +16,15 @@ use std::sync::Arc;
 /// How the pixels of a stream are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Codec {
-    /// As they are, in an `Image`.
+    /// Unchanged, in an `Image`.
     Raw,
-    /// As a JPEG made here.
+    /// As JPEG, encoded by the recorder.
     Jpeg,
-    /// As the JPEG that the camera sent.
+    /// As JPEG, as the camera sent it.
     Mjpeg,
-    /// As a PNG made here.
+    /// As PNG, encoded by the recorder.
     Png,
-    /// With our own depth codec.
+    /// With depthrig's depth codec.
     Rank,
 }
 
@@ -56,16 +56,16 @@ impl Codec {
     }
 }
 
-/// How much an encoder may take for a frame.
+/// How much CPU time an encoder may spend on a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Effort {
-    /// What the options say.
+    /// As configured in the options.
     Full,
-    /// As little as possible: every bit of the image, hardly packed, in a message of the type that its channel has.
+    /// As little as possible: lossless, hardly compressed, in a message of its channel's type.
     Least,
 }
 
-/// What a worker needs to know of a stream and a set to encode one frame.
+/// A frame to encode, with all that a worker needs to know of its stream and its set.
 pub(crate) struct FrameJob<'a> {
     pub(crate) frame: RecordFrame,
     pub(crate) channel: u16,
@@ -104,8 +104,9 @@ impl FrameEncoder {
 
     pub(crate) fn encode(&mut self, job: FrameJob<'_>, effort: Effort) -> Result<EncodedFrame> {
         let h = &job.frame.header;
-        let (pixels, stored) = (job.frame.pixels.bytes(), job.frame.pixels.jpeg());
-        let format = image::check_picture(h, pixels.len())?;
+        let pixels = job.frame.pixels.bytes();
+        let stored = job.frame.pixels.jpeg();
+        let format = image::check_image(h, pixels.len())?;
         let pixels = &pixels[..h.payload_len as usize];
         let mut codec = Codec::of(format, &self.options);
         let mut compress = codec == Codec::Raw && self.options.compression == Compression::Zstd1;
@@ -130,8 +131,11 @@ impl FrameEncoder {
             }
             self.builder.expect(image::room(job.frame_id, pixels));
         }
-        let (quality, repacked) = (self.options.jpeg_quality.clamp(1, 100), &mut self.repacked);
-        let (stamp, frame_id, depth) = (job.stamp_utc_ns, job.frame_id, &mut self.depth);
+        let quality = self.options.jpeg_quality.clamp(1, 100);
+        let repacked = &mut self.repacked;
+        let stamp = job.stamp_utc_ns;
+        let frame_id = job.frame_id;
+        let depth = &mut self.depth;
         let (message_bytes, message_crc32) =
             self.builder.message(head, |buf| match (codec, image::encoding(format)) {
                 (Codec::Raw, Some(encoding)) => {
@@ -175,7 +179,7 @@ impl FrameEncoder {
         let h = &job.frame.header;
         let tail = Tail::new(job.frame.pixels, h.payload_len as usize);
         let tail =
-            tail.ok_or_else(|| Error::new(ErrorKind::BadInput, cannot(h, "message: it is too short")))?;
+            tail.ok_or_else(|| Error::new(ErrorKind::BadInput, cannot(h, "a message: it is too short")))?;
         let (message_bytes, message_crc32) = self.builder.message_with_tail(head, tail, |buf| {
             image::write_image_head(buf, job.stamp_utc_ns, job.frame_id, h, encoding, h.payload_len);
         });
@@ -184,7 +188,7 @@ impl FrameEncoder {
 }
 
 fn as_they_are(format: PixelFormat) -> Error {
-    Error::new(ErrorKind::BadInput, format!("{} pictures cannot be stored as they are", format.name()))
+    Error::new(ErrorKind::BadInput, format!("{} images cannot be stored as they are", format.name()))
 }
 
 /// The pixels without row padding.
@@ -199,10 +203,10 @@ fn tight<'a>(h: &FrameHeader, format: PixelFormat, pixels: &'a [u8], repacked: &
 }
 
 fn cannot(h: &FrameHeader, what: &str) -> String {
-    format!("frame {} of {}/{} cannot be made a {what}", h.sequence, h.camera(), h.stream())
+    format!("frame {} of {}/{} cannot be encoded as {what}", h.sequence, h.camera(), h.stream())
 }
 
-/// Appends the PNG of an RGB or BGR picture, with the quick settings.
+/// Appends the PNG of an RGB or BGR image, with the quick settings.
 fn png(
     out: &mut Vec<u8>,
     h: &FrameHeader,
@@ -230,7 +234,7 @@ fn png(
         .map_err(|e| Error::new(ErrorKind::Codec, cannot(h, "PNG")).with_source(e))
 }
 
-/// Appends the JPEG of an RGB or BGR picture, 4:4:4: colour is not averaged over neighbours, because edges
+/// Appends the JPEG of an RGB or BGR image, 4:4:4: colour is not averaged over neighbours, because edges
 /// are where colour and depth must agree.
 fn jpeg(
     out: &mut Vec<u8>,
@@ -257,7 +261,7 @@ mod tests {
     use super::*;
     use crate::frame::Pixels;
 
-    /// Pixels in a place that others want back.
+    /// Pixels in borrowed memory.
     struct Lent(Vec<u8>);
 
     impl Pixels for Lent {
@@ -272,8 +276,9 @@ mod tests {
         pixels: Box<dyn Pixels>,
     ) -> Result<EncodedFrame> {
         let mut header = FrameHeader::default();
-        header.set_picture(format, 40, 30);
-        (header.sequence, header.depth_unit_m) = (17, 0.001);
+        header.set_image(format, 40, 30);
+        header.sequence = 17;
+        header.depth_unit_m = 0.001;
         let frame = RecordFrame { stream: 0, header, pixels };
         let job = FrameJob { frame, channel: 3, frame_id: "a_frame", log_time: 5, stamp_utc_ns: 4 };
         FrameEncoder::new(options, &Pool::new(1 << 20)).encode(job, Effort::Full)
@@ -288,7 +293,7 @@ mod tests {
         };
         for (options, by_reference) in [(&plain, true), (&RecorderOptions::default(), false)] {
             for format in [PixelFormat::Rgb8, PixelFormat::Z16, PixelFormat::Mono8] {
-                // Three bytes behind the picture are not of it.
+                // The three bytes after the image do not belong to it.
                 let bytes: Vec<u8> = (0..format.frame_bytes(40, 30) + 3).map(|i| (i * 7) as u8).collect();
                 let at = bytes.as_ptr();
                 let lent = encode(options, format, Box::new(Lent(bytes.clone()))).unwrap();
@@ -313,7 +318,7 @@ mod tests {
         }
         let short = encode(&plain, PixelFormat::Z16, Box::new(vec![0; 40])).unwrap_err();
         assert_eq!(short.kind(), ErrorKind::BadInput, "{short}");
-        let no_picture = encode(&plain, PixelFormat::Motion, Box::new(vec![0; 4096 * 64])).unwrap_err();
-        assert_eq!(no_picture.kind(), ErrorKind::BadInput, "{no_picture}");
+        let no_image = encode(&plain, PixelFormat::Motion, Box::new(vec![0; 4096 * 64])).unwrap_err();
+        assert_eq!(no_image.kind(), ErrorKind::BadInput, "{no_image}");
     }
 }

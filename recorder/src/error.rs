@@ -3,7 +3,7 @@
 use std::io;
 use std::path::Path;
 
-/// What went wrong, for callers that decide on it.
+/// The kind of an error, for callers that decide on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
@@ -12,13 +12,13 @@ pub enum ErrorKind {
     AlreadyExists,
     /// The path does not exist.
     NotFound,
-    /// The path is no dataset of depthrig.
+    /// The path is not a depthrig dataset.
     NotADataset,
     /// An MCAP file that depthrig did not write.
     Foreign,
     /// The file ends in the middle: it was cut, or its writer was killed.
     Truncated,
-    /// What is to be imported is not a recording of the format that was asked for, or is damaged beyond use.
+    /// The file to import is not a recording of the requested format, or is damaged beyond use.
     BadRecording,
     /// A checksum or an index does not agree with the data.
     Corrupt,
@@ -32,7 +32,7 @@ pub enum ErrorKind {
     InUse,
     /// The caller asked to end before it was done.
     Interrupted,
-    /// What the caller handed over cannot be recorded as it is.
+    /// The caller's input cannot be recorded as it is.
     BadInput,
     /// The caller ended the work before it was done.
     Cancelled,
@@ -42,7 +42,7 @@ pub enum ErrorKind {
     Io,
 }
 
-/// What Linux says when the device itself fails, as at a sector that cannot be read (`errno(3)`).
+/// The error of Linux when the device itself fails, such as at an unreadable sector (`errno(3)`).
 const EIO: i32 = 5;
 const DISK_FAILS: &str = ": the disk fails there (input/output error); copy what it still gives with `ddrescue` and go on with the copy";
 
@@ -51,7 +51,7 @@ depthrig_bus::error_type! {
 }
 
 impl Error {
-    /// Whether it says that a file is damaged, and not that it cannot be read.
+    /// Whether it means a damaged file, rather than one that cannot be read.
     pub(crate) fn is_damage(&self) -> bool {
         use ErrorKind::{Corrupt, Foreign, NotADataset, Truncated, Version};
         matches!(self.kind(), Corrupt | Truncated | Version | NotADataset | Foreign)

@@ -2,7 +2,7 @@
 //!
 //! An [`Exporter`] writes one layout and is driven by [`export`], which cuts the datasets into [`Part`]s, works on
 //! several at once and keeps in the folder what is done, so that an export that was killed goes on where it was.
-//! Whatever was killed when: a file has its final name only once it is whole and durable, and a resumed export
+//! A kill at any point is safe: a file has its final name only once it is complete and durable, and a resumed export
 //! ends with the same bytes as one that was never interrupted. Memory is bounded by one set for each thread and the
 //! rows of one part.
 //!
@@ -25,7 +25,7 @@ pub use report::{DatasetIdentity, ExportReport, PartRecord, REPORT_FILE, Segment
 pub use rosbag::RosbagImport;
 pub use source::{PART_SETS, Part, Source};
 
-/// What the fuzz targets reach.
+/// Entry points of the fuzz targets.
 pub(crate) mod fuzzing {
     pub(crate) use super::bytecamera::fuzzing::{calibration, npy, row};
     pub(crate) use super::rosbag::fuzzing::fuzz as rosbag;

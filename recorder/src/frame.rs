@@ -1,4 +1,4 @@
-//! What is handed to the recorder: a set of frames whose pixels still lie in shared memory.
+//! The input of the recorder: sets of frames whose pixels still lie in shared memory.
 
 use depthrig_bus::{FrameHeader, HostTime, MOTION_SAMPLE_BYTES, MotionSample, UtcPair};
 
@@ -14,7 +14,7 @@ pub trait Pixels: Send {
         None
     }
 
-    /// Whether these bytes are nobody else's, and may be kept until the disk has taken them: then they are not copied.
+    /// Whether the recorder owns these bytes, and may keep them until they are on the disk: then they are not copied.
     /// Pixels in shared memory may not, because a slow disk would keep their slots from the live feed.
     fn may_wait(&self) -> bool {
         false
@@ -51,10 +51,10 @@ pub struct RecordFrame {
     pub pixels: Box<dyn Pixels>,
 }
 
-/// A batch of samples of a motion unit, as its channel carried it.
+/// A batch of samples of an IMU, as its channel carried it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordMotion {
-    /// Index of the unit in `Session::motion`.
+    /// Index of the IMU in `Session::motion`.
     pub unit: usize,
     /// The batch's header; `set_id` is filled in by the recorder.
     pub header: FrameHeader,
@@ -62,12 +62,12 @@ pub struct RecordMotion {
     pub samples: Vec<MotionSample>,
 }
 
-/// Largest image of a dataset, bytes as its channel carries it. Reading, verifying and recovering take about this much memory
-/// for each thread, whatever a file holds.
+/// Largest image of a dataset, bytes as its channel carries it. Reading, verifying and recovering take about this much
+/// memory per thread, whatever a file holds.
 pub const IMAGE_MAX_BYTES: u64 = 256 << 20;
 
-/// The motion of a set takes at most this many bytes in the file, see [`RecordMotion::stored_bytes`]: some minutes of one
-/// unit. A caller whose sets are further apart leaves out batches, and counts them.
+/// The IMU batches of a set take at most this many bytes in the file, see [`RecordMotion::stored_bytes`]: some minutes
+/// of one IMU. A caller whose sets are further apart leaves out batches, and counts them.
 pub const SET_MOTION_MAX_BYTES: u64 = 64 << 20;
 
 impl RecordMotion {
@@ -99,14 +99,14 @@ pub struct RecordSet {
     pub frames: Vec<RecordFrame>,
     /// Indices of the streams that have no frame in this set.
     pub missing: Vec<usize>,
-    /// What the motion units sent since the set before, in the order in which it came. A set that is not recorded takes
-    /// its motion with it, so that the numbers of batches and samples show the gap.
+    /// The IMU batches since the set before, in order of arrival. They are lost with a set that is not recorded, so
+    /// that the numbers of batches and samples show the gap.
     pub motion: Vec<RecordMotion>,
     /// Latest minus earliest capture time, nanoseconds.
     pub spread_ns: i64,
 }
 
-/// Why a whole set was not recorded. The discriminant is the index into `SetCounts::dropped` and part of
+/// Why a set was not recorded. The discriminant is the index into `SetCounts::dropped` and part of
 /// the file format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -119,7 +119,7 @@ pub enum SetDrop {
     DiskSlow = 1,
     /// The recording had ended after a failed write or for want of disk space.
     WriteFailed = 2,
-    /// A picture of the set could not be encoded.
+    /// An image of the set could not be encoded.
     EncodeFailed = 3,
     /// The set contradicts itself or the session: unknown stream, wrong size, id not greater than the last.
     BadSet = 4,

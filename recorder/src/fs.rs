@@ -76,19 +76,19 @@ pub trait Fs: Send + Sync + fmt::Debug {
     /// Whether this user may create, rename and remove files in `dir`, as far as that is known without doing it.
     ///
     /// # Errors
-    /// What such a change would be answered.
+    /// The error that such a change would return.
     fn may_write(&self, _dir: &Path) -> io::Result<()> {
         Ok(())
     }
-    /// Keeps other processes from locking the folder `dir` until the result is dropped; a process that is killed lets go
-    /// of it. A file system that only one process sees needs none.
+    /// Locks the folder `dir` against other processes until the result is dropped; the end of the process releases it.
+    /// A file system that only one process sees needs no lock.
     ///
     /// # Errors
     /// `WouldBlock` when another one has it, else as the operating system says.
     fn lock(&self, _dir: &Path) -> io::Result<Box<dyn Send + Sync>> {
         Ok(Box::new(()))
     }
-    /// Makes the data of a file durable that somebody else wrote.
+    /// Makes the data of a file durable that another writer wrote.
     ///
     /// # Errors
     /// `Unsupported` where that cannot be done, else as the operating system says.
@@ -119,8 +119,8 @@ pub trait WriteFile: Send {
     /// # Errors
     /// As the operating system says.
     fn sync_all(&mut self) -> io::Result<()>;
-    /// What makes the data written so far durable from another thread, while this one goes on writing; `None` where that
-    /// cannot be done.
+    /// Returns a sync of the data written so far, to run on another thread while this one goes on writing; `None` where
+    /// that is not possible.
     fn sync_beside(&self) -> Option<SyncBeside> {
         None
     }
@@ -156,13 +156,13 @@ pub(crate) fn write_all(file: &mut dyn WriteFile, mut bytes: &[u8]) -> io::Resul
     Ok(())
 }
 
-/// How often a lock that is taken is asked for again, and how long after.
+/// Retries for a lock that is taken, and the wait before each.
 const LOCK_TRIES: u32 = 20;
 const LOCK_WAIT: Duration = Duration::from_millis(25);
 
-/// Locks the folder as [`Fs::lock`]. A process that is being started holds what its parent held until it runs its
-/// own program: a lock that is gone may look taken for a moment, and is waited for.
-pub(crate) fn lock_patiently(fs: &dyn Fs, dir: &Path) -> io::Result<Box<dyn Send + Sync>> {
+/// Locks the folder as [`Fs::lock`]. A child process inherits the locks of its parent until it runs its own
+/// program: a released lock may look taken for a moment, so it is tried again.
+pub(crate) fn lock_with_retries(fs: &dyn Fs, dir: &Path) -> io::Result<Box<dyn Send + Sync>> {
     for _ in 0..LOCK_TRIES {
         match fs.lock(dir) {
             Err(e) if e.kind() == io::ErrorKind::WouldBlock => std::thread::sleep(LOCK_WAIT),
@@ -173,7 +173,7 @@ pub(crate) fn lock_patiently(fs: &dyn Fs, dir: &Path) -> io::Result<Box<dyn Send
 }
 
 /// Replaces the small file `path` so that a crash leaves the old or the new one, never a mixture. Only where a
-/// file of this name with the ending `tmp` can be nobody else's: it is removed.
+/// file of this name with the ending `tmp` cannot belong to others: it is removed.
 pub(crate) fn replace(fs: &dyn Fs, path: &Path, bytes: &[u8]) -> io::Result<()> {
     replace_by(fs, &path.with_extension("tmp"), path, bytes)
 }

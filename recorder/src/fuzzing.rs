@@ -1,7 +1,7 @@
-//! What the fuzz targets in `fuzz/` call, and the test that runs their corpus: bytes that may be anything, through
-//! the ways in that a file has. `docs/fuzzing.md` says how they are run.
+//! Entry points of the fuzz targets in `fuzz/` and of the test that runs their corpus: each feeds arbitrary bytes to a
+//! reader of files. `docs/fuzzing.md` says how to run them.
 //!
-//! A panic is a finding; so is a broken promise, which is why there are assertions here. Each function returns how
+//! A panic is a finding; so is a violated guarantee, which is why there are assertions here. Each function returns how
 //! far its input came, so that a corpus which no longer reaches anything is noticed.
 
 use crate::codec::{DepthDecoder, DepthEncoder, DepthShape};
@@ -22,17 +22,18 @@ pub mod mcap;
 
 /// A folder in memory with one file in it.
 fn folder(name: &str, bytes: &[u8]) -> (Arc<dyn Fs>, &'static Path) {
-    let (fs, dir) = (MemFs::new(), Path::new("/d"));
-    // Cannot fail: nothing fails on this file system unless told to.
+    let fs = MemFs::new();
+    let dir = Path::new("/d");
+    // Cannot fail: no fault is injected into this file system.
     drop(fs.create_dir_all(dir));
     fs.put(&dir.join(name), bytes.to_vec());
     (Arc::new(fs), dir)
 }
 
-/// A segment on its own in a folder, opened, read and verified; the number of its sets that can be decoded.
+/// Opens, reads and verifies a segment on its own in a folder; returns the number of decodable sets.
 ///
 /// # Panics
-/// When what `verify` finds whole cannot be read.
+/// When a segment without a finding of `verify` cannot be read.
 pub fn segment(bytes: &[u8]) -> u64 {
     let (fs, dir) = folder("seg_0000.mcap", bytes);
     let options = VerifyOptions { decode: true, ..VerifyOptions::default() };
@@ -40,20 +41,21 @@ pub fn segment(bytes: &[u8]) -> u64 {
     let Ok(dataset) = Dataset::open_with(fs, dir) else { return 0 };
     drop(dataset.info());
     let good = |mode| dataset.sets_with(SetRange::ALL, mode).filter_map(Result::ok).count() as u64;
-    let (decoded, marked) = (good(PixelMode::Decoded), good(PixelMode::None));
-    // The missing session.toml is always found; anything else that is wrong with the file has a place in it.
+    let decoded = good(PixelMode::Decoded);
+    let marked = good(PixelMode::None);
+    // The missing session.toml is always a finding; every other finding names a place in the file.
     let broken_here = |f: &crate::Finding| f.severity > crate::Severity::Note && f.file != SESSION_FILE;
     if let Some(report) = report.filter(|r| !r.findings.iter().any(broken_here)) {
         let sets = report.sets;
-        assert_eq!((decoded, marked), (sets, sets), "verified as whole, and not all sets can be read");
+        assert_eq!((decoded, marked), (sets, sets), "verified as complete, but not all sets can be read");
     }
     decoded
 }
 
-/// A segment, unfinished by its name when it has an odd number of bytes, recovered; the number of its sets.
+/// Recovers a segment, named as unfinished if it has an odd number of bytes; returns the number of its sets.
 ///
 /// # Panics
-/// When what was recovered cannot be opened or holds more than was said, or recovering it again changes it.
+/// When the recovered segment cannot be opened or holds more than reported, or a second recovery changes it.
 pub fn recover(bytes: &[u8]) -> u64 {
     let name = if bytes.len() % 2 == 1 { "seg_0000.mcap.part" } else { "seg_0000.mcap" };
     let (fs, dir) = folder(name, bytes);
@@ -65,7 +67,7 @@ pub fn recover(bytes: &[u8]) -> u64 {
     let report = verify_with(&fs, dir, &VerifyOptions::default());
     let broken = report.as_ref().ok().and_then(crate::VerifyReport::broken);
     assert!(report.is_ok() && broken.is_none(), "recovered, and verify finds {broken:?}\nafter {first:?}");
-    // Fewer can be: the pixels of a set are not decoded by a recovery.
+    // Fewer are possible: a recovery does not decode the pixels of a set.
     let sets = dataset.sets_with(SetRange::ALL, PixelMode::Stored).flatten().count();
     assert!(sets as u64 <= first.sets, "{first:?}, and then {sets} are read");
     let again = recover();
@@ -73,11 +75,11 @@ pub fn recover(bytes: &[u8]) -> u64 {
     first.sets
 }
 
-/// A `session.toml`, alone in its folder: read, used as a recorder would, written and read again; whether it
-/// could be read.
+/// A `session.toml`, alone in its folder: read, used as by a recorder, written and read again; returns whether it could
+/// be read.
 ///
 /// # Panics
-/// When a session changes by being written and read.
+/// When writing and reading changes a session.
 pub fn session(bytes: &[u8]) -> bool {
     let (fs, dir) = folder(SESSION_FILE, bytes);
     drop(verify_with(&fs, dir, &VerifyOptions::default()));
@@ -95,40 +97,43 @@ pub fn session(bytes: &[u8]) -> bool {
     true
 }
 
-/// The depth codec. The first four bytes say what the rest is and the shape of the picture: a packed picture, the same
-/// before it is compressed (so that mutations reach what is in it), or pixels to be packed. The whole is read as the
-/// message of such a picture too. Whether there is a picture in the end.
+/// The depth codec. The first four bytes select the kind of the rest and the shape of the image: a packed image, the
+/// same before compression (so that mutations reach its contents), or pixels to pack. All bytes are also read as the
+/// message of such an image. Returns whether they give an image.
 ///
 /// # Panics
-/// When a picture is another one after being packed and unpacked.
+/// When packing and unpacking changes an image.
 pub fn depth_codec(bytes: &[u8]) -> bool {
-    let (mut encoder, mut decoder, mut picture) = (DepthEncoder::new(), DepthDecoder::new(), Vec::new());
+    let mut encoder = DepthEncoder::new();
+    let mut decoder = DepthDecoder::new();
+    let mut image = Vec::new();
     let message = image::read_compressed_depth(bytes);
-    let message = message.and_then(|(shape, _, data)| decoder.decode(data, shape, &mut picture));
+    let message = message.and_then(|(shape, _, data)| decoder.decode(data, shape, &mut image));
     let Some((&[kind, width, height, pad], rest)) = bytes.split_first_chunk() else { return message.is_ok() };
     let [width, height] = [width, height].map(u32::from);
     let shape = DepthShape { width, height, step: 2 * width + u32::from(pad) % 8 };
     let decoded = match (kind % 3, rest.split_first_chunk::<4>()) {
-        (0, _) => decoder.decode(rest, shape, &mut picture),
+        (0, _) => decoder.decode(rest, shape, &mut image),
         (1, Some((count, body))) => {
             let Ok(packed) = zstd::bulk::compress(body, 1) else { return false };
-            decoder.decode(&[&count[..], &packed].concat(), shape, &mut picture)
+            decoder.decode(&[&count[..], &packed].concat(), shape, &mut image)
         }
         _ if width * height == 0 => return message.is_ok(),
         _ => {
-            picture.clear();
-            picture.extend(rest.iter().cycle().take(shape.bytes() as usize));
-            picture.resize(shape.bytes() as usize, 0);
+            image.clear();
+            image.extend(rest.iter().cycle().take(shape.bytes() as usize));
+            image.resize(shape.bytes() as usize, 0);
             Ok(())
         }
     };
     if decoded.is_err() {
         return message.is_ok();
     }
-    let (mut packed, mut again) = (Vec::new(), Vec::new());
-    let done = encoder.encode(&picture, shape, &mut packed);
+    let mut packed = Vec::new();
+    let mut again = Vec::new();
+    let done = encoder.encode(&image, shape, &mut packed);
     let done = done.and_then(|()| decoder.decode(&packed, shape, &mut again));
-    assert!(done.is_ok() && again == picture, "a picture changes by being packed: {done:?}");
+    assert!(done.is_ok() && again == image, "an image changes by being packed: {done:?}");
     true
 }
 
@@ -136,14 +141,14 @@ pub fn depth_codec(bytes: &[u8]) -> bool {
 pub fn color_codec(bytes: &[u8]) -> bool {
     let Some(([width, height], data)) = bytes.split_first_chunk::<2>() else { return false };
     let mut h = FrameHeader::default();
-    h.set_picture(PixelFormat::Rgb8, u32::from(*width), u32::from(*height));
+    h.set_image(PixelFormat::Rgb8, u32::from(*width), u32::from(*height));
     color_decodes(data, &h)
 }
 
 /// A line of the `frames.csv` of an export; whether it is one.
 ///
 /// # Panics
-/// When a line changes by being read and written.
+/// When reading and writing changes a line.
 pub fn frames_csv(bytes: &[u8]) -> bool {
     core::str::from_utf8(bytes).is_ok_and(crate::exchange::fuzzing::row)
 }
@@ -158,10 +163,10 @@ pub fn npy(bytes: &[u8]) -> bool {
     crate::exchange::fuzzing::npy(bytes)
 }
 
-/// A rosbag, read to its end; how many frames came out.
+/// A rosbag, read to its end; returns the number of frames.
 ///
 /// # Panics
-/// When the accounts of what came out do not balance.
+/// When the accounts of the frames do not balance.
 pub fn rosbag(bytes: &[u8]) -> u64 {
     let (fs, dir) = folder("fuzz.bag", bytes);
     fs.open(&dir.join("fuzz.bag")).map_or(0, crate::exchange::fuzzing::rosbag)

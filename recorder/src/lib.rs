@@ -9,7 +9,7 @@
 //!  │ never blocks; a refused set is counted       │ owns the file; sets in order; sync each second
 //! ```
 //!
-//! A set is written as one chunk per picture and then one chunk with all that describes them, which ends in
+//! A set is written as one chunk per image and then one chunk with all that describes them, which ends in
 //! the set's commit mark (`FrameSet`). A set without its mark does not count, so no crash leaves half a set.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 

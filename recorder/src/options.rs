@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// How colour pictures are stored.
+/// How colour images are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ColorCodec {
@@ -15,7 +15,7 @@ pub enum ColorCodec {
     Png,
 }
 
-/// How depth pictures of 16 bit are stored; either way every bit.
+/// How depth images of 16 bit are stored; either way every bit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DepthCodec {
@@ -26,7 +26,7 @@ pub enum DepthCodec {
     Rank,
 }
 
-/// How pictures that are not JPEG are packed.
+/// How images that are not JPEG are packed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Compression {
@@ -53,11 +53,11 @@ pub fn live_late_ns(period_ns: i64) -> i64 {
 pub struct RecorderOptions {
     /// JPEG quality, 1 to 100.
     pub jpeg_quality: u8,
-    /// How RGB and BGR pictures are stored; all others are stored losslessly.
+    /// How RGB and BGR images are stored; all others are stored losslessly.
     pub color: ColorCodec,
-    /// How depth pictures of 16 bit are stored.
+    /// How depth images of 16 bit are stored.
     pub depth: DepthCodec,
-    /// How losslessly stored pictures are packed.
+    /// How losslessly stored images are packed.
     pub compression: Compression,
     /// A segment is closed before the set that would begin beyond this size, bytes.
     pub segment_max_bytes: u64,
@@ -69,11 +69,11 @@ pub struct RecorderOptions {
     pub queue_sets: usize,
     /// Encoded bytes that may wait to be written: 256 MiB carry seven cameras over a disk that stalls for 5 s.
     pub backlog_max_bytes: u64,
-    /// How often the file is made durable, nanoseconds: what a power cut can take.
+    /// How often the file is made durable, nanoseconds: the most that a power cut can lose.
     pub sync_interval_ns: i64,
     /// A set that is not in the file this long after its tick, nanoseconds, is given up and counted, and the count is
-    /// written at once: what a kill can take without a trace is younger. For live recordings, whose ticks are times of
-    /// the host's clock ([`LIVE_LATE_NS`]); without it a set waits for as long as encoders and disk take.
+    /// written at once: a kill can lose only younger sets without a trace. For live recordings, whose ticks are times
+    /// of the host's clock ([`LIVE_LATE_NS`]); without it a set waits for as long as encoders and disk take.
     pub late_after_ns: Option<i64>,
     /// The recording ends cleanly when the disk has less than this left, bytes.
     pub min_free_bytes: u64,

@@ -1,9 +1,9 @@
-//! An output must not lie in what is read: a dataset would be changed by being exported.
+//! Keeps outputs out of inputs: an export must not change the dataset that it reads.
 
 use crate::{Error, ErrorKind, Result, SESSION_FILE};
 use std::path::{Path, PathBuf};
 
-/// Refuses an output `out` that is the input `input` or lies in its folder, by whatever path or link. The input may be a
+/// Refuses an output `out` that is the input `input` or lies in its folder, by any path or link. The input may be a
 /// dataset, one of its segments, or a folder of images.
 ///
 /// # Errors

@@ -1,7 +1,7 @@
 //! Writing a dataset while cameras run.
 //!
 //! Invariants: [`Recorder::push`] does a bounded amount of work and never waits for the disk or an encoder;
-//! `offered = recorded + Σ dropped(reason)` once nothing is in flight; sets reach the file in the order in
+//! `offered = recorded + Σ dropped(reason)` once every set is settled; sets reach the file in the order in
 //! which they were pushed; the file is touched by the writer thread alone.
 //!
 //! More than 500 lines, because creating, pushing, closing and abandoning keep these over one shared state.
@@ -36,7 +36,7 @@ use ticket::{Job, Load, Ticket};
 use topics::Topics;
 use writer::Writer;
 
-/// The file whose space is given up for the index when the disk is full.
+/// The file that is deleted to make room for the index when the disk is full.
 pub(crate) const RESERVE_FILE: &str = ".reserve";
 /// Encoded sets that may wait to be written, beside the limit on their bytes.
 const BACKLOG_MAX_SETS: usize = 4096;
@@ -51,14 +51,14 @@ pub struct Recorder {
     shared: Arc<Shared>,
     threads: Vec<JoinHandle<()>>,
     writer: Option<JoinHandle<Summary>>,
-    /// The disk guard, and what ends it when it is dropped.
+    /// The disk guard, and the sender that ends it when dropped.
     guard: Option<(Sender<()>, JoinHandle<()>)>,
 }
 
-/// Where a recording reads both clocks. Tests step its wall clock, a replay gives the times of its dataset.
+/// Reads both clocks for a recording. Tests step its wall clock, a replay gives the times of its dataset.
 pub type UtcSource = Arc<dyn Fn() -> UtcPair + Send + Sync>;
 
-/// What the threads share.
+/// State shared between the threads.
 struct Shared {
     fs: Arc<dyn Fs>,
     utc: UtcSource,
@@ -74,11 +74,11 @@ struct Shared {
     io_since_ns: AtomicI64,
     /// Since when a sync beside the writer has not ended, as the writer knew last; 0 when none goes on.
     sync_since_ns: AtomicI64,
-    /// Tells others that the dataset is being recorded.
+    /// Held while recording: locks the dataset against other processes.
     _lock: Option<Box<dyn Send + Sync>>,
 }
 
-/// What a recorder begins with.
+/// The initial state of a recorder.
 struct Begin {
     fs: Arc<dyn Fs>,
     utc: UtcSource,
@@ -96,7 +96,7 @@ struct State {
     bytes: u64,
     segments: u32,
     last_id: Option<u64>,
-    /// Number of the last batch of each motion unit.
+    /// Number of the last batch of each IMU.
     last_batches: Vec<Option<u64>>,
     /// Places the recording in UTC.
     anchor: Option<UtcPair>,
@@ -144,13 +144,13 @@ impl Recorder {
         let topics = Topics::new(&session, &options);
         let free_bytes = prepare_folder(&*fs, dir, &options)?;
         let lock = lock_folder(&*fs, dir)?;
-        let made = make_reserve(&*fs, dir, options.reserve_bytes)
+        let reserve = make_reserve(&*fs, dir, options.reserve_bytes)
             .and_then(|()| session.save(&*fs, dir))
             .and_then(|()| {
                 let preamble = topics.preamble(&session, 0)?;
                 crate::container::segment::Segment::create(&*fs, dir, 0, &preamble)
             });
-        let segment = made.inspect_err(|_| {
+        let segment = reserve.inspect_err(|_| {
             // Leave nothing behind that would make the next try say "there is a dataset already".
             for name in [RESERVE_FILE, crate::SESSION_FILE, crate::session::SESSION_TMP, "seg_0000.mcap.part"]
             {
@@ -161,12 +161,12 @@ impl Recorder {
         Self::start(begin, dir, options)
     }
 
-    /// Goes on with the dataset `dir` whose recorder was killed: after the sets of its finished segments, which stay as
-    /// they are. What an unfinished segment holds is removed and has to be recorded again, with the same numbers. For
-    /// makers of datasets who can; what a camera gave is not to be had again, that is what [`crate::recover`] is for.
+    /// Resumes the dataset `dir` whose recorder was killed, after the sets of its finished segments, which stay as they
+    /// are. Unfinished segments are removed; their sets must be recorded again, with the same numbers. For sources that
+    /// can repeat their sets; a live recording needs [`crate::recover`].
     ///
     /// # Errors
-    /// [`ErrorKind::AlreadyExists`] when the dataset is whole, [`ErrorKind::InUse`] when somebody else works on it,
+    /// [`ErrorKind::AlreadyExists`] when the dataset is complete, [`ErrorKind::InUse`] when another process uses it,
     /// [`ErrorKind::Corrupt`] when a finished segment cannot be read or is missing, and as [`Recorder::create`].
     pub fn resume(
         fs: Arc<dyn Fs>,
@@ -181,7 +181,7 @@ impl Recorder {
         make_reserve(&*fs, dir, options.reserve_bytes)?;
         let preamble = topics.preamble(&past.session, past.segments)?;
         let segment = crate::container::segment::Segment::create(&*fs, dir, past.segments, &preamble)?;
-        let resumed = past.told();
+        let resumed = past.resumed();
         let begin = Begin { fs, utc, topics, free_bytes, lock, segment, past };
         Ok((Self::start(begin, dir, options)?, resumed))
     }
@@ -234,7 +234,8 @@ impl Recorder {
             Self { shared: Arc::clone(&shared), threads: Vec::new(), writer: None, guard: None };
         let no_thread = |e| Error::new(ErrorKind::Io, "cannot start a thread of the recorder").with_source(e);
         for i in 0..workers {
-            let (shared, queue) = (Arc::clone(&shared), job_queue.clone());
+            let shared = Arc::clone(&shared);
+            let queue = job_queue.clone();
             let thread = std::thread::Builder::new().name(format!("rec-enc-{i}"));
             let run = move || worker::run(&shared, &queue);
             recorder.threads.push(thread.spawn(run).map_err(no_thread)?);
@@ -317,8 +318,8 @@ impl Recorder {
         Ok(())
     }
 
-    /// Whether the next set would find room, for callers that rather wait than lose one. True as well when it would
-    /// be refused for good: waiting does not help then.
+    /// Whether the next set would find room, for callers that would rather wait than lose one. True as well when it
+    /// would be refused for good: waiting does not help then.
     pub fn has_room(&self) -> bool {
         let load = &self.shared.load;
         self.shared.lock().ended.is_some()
@@ -329,8 +330,8 @@ impl Recorder {
     /// Adds a note of the operator, stamped now; it goes into the file and into `session.toml`.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`] when it is longer than [`crate::NOTE_MAX_BYTES`], when the dataset holds as many notes as it
-    /// may, and when more of them wait to be written than anybody types.
+    /// [`ErrorKind::BadInput`] when it is longer than [`crate::NOTE_MAX_BYTES`], when the dataset is at its limit
+    /// of notes, and when too many wait to be written.
     pub fn add_note(&self, text: impl Into<String>) -> Result<()> {
         let note = crate::Note { utc_ns: (self.shared.utc)().utc_ns, text: text.into() };
         let mut state = self.shared.lock();
@@ -484,11 +485,11 @@ fn prepare_folder(fs: &dyn Fs, dir: &Path, options: &RecorderOptions) -> Result<
         }
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
             // A new folder is a name in its parent. Where that is new too, its own name must last as well, or a
-            // power cut takes all that is below it; so look how far up folders are missing before they are made.
+            // power cut takes all that is below it; so look how far up folders are missing before creating them.
             let mut parents = Vec::new();
             for parent in dir.ancestors().skip(1) {
                 parents.push(parent);
-                // An empty one is the working folder, which is there.
+                // An empty path is the working folder, which exists.
                 let missing = |e: std::io::Error| e.kind() == std::io::ErrorKind::NotFound;
                 if parent.as_os_str().is_empty() || !fs.read_dir(parent).is_err_and(missing) {
                     break;
@@ -522,7 +523,7 @@ fn free_space(fs: &dyn Fs, dir: &Path, options: &RecorderOptions) -> Result<u64>
     Ok(free)
 }
 
-/// Locks the dataset against a recovery. A file system that cannot lock a folder is no reason not to record.
+/// Locks the dataset against a recovery. Without locks in the file system the recording goes on.
 fn lock_folder(fs: &dyn Fs, dir: &Path) -> Result<Option<Box<dyn Send + Sync>>> {
     match fs.lock(dir) {
         Ok(lock) => Ok(Some(lock)),
@@ -540,7 +541,7 @@ fn lock_folder(fs: &dyn Fs, dir: &Path) -> Result<Option<Box<dyn Send + Sync>>> 
     }
 }
 
-/// Writes the reserve file, really, so that its blocks are there to be given back.
+/// Writes real data into the reserve file, so that deleting it frees blocks.
 fn make_reserve(fs: &dyn Fs, dir: &Path, bytes: u64) -> Result<()> {
     if bytes == 0 {
         return Ok(());

@@ -1,13 +1,13 @@
-//! Makes a dataset whole again after a crash, a full disk or a damaged sector.
+//! Repairs a dataset after a crash, a full disk or a damaged sector.
 //!
 //! Each segment that is unfinished, torn or damaged is copied, set by whole set, into a new file beside it; the
 //! copy is read back and compared, and only then takes the old one's place, in one rename. Until then nothing
 //! of the old file is touched, so that a crash of the recovery itself costs nothing: the next one begins anew.
-//! What was lost is said in the report, in the file (`depthrig.recovered`) and in `session.toml`.
+//! Losses are listed in the report, in the file (`depthrig.recovered`) and in `session.toml`.
 
 use crate::container::segment::{file_name, sync_folder_of};
 use crate::dataset::{segment_number, segments_in};
-use crate::fs::{DirEntry, Fs, RealFs, lock_patiently};
+use crate::fs::{DirEntry, Fs, RealFs, lock_with_retries};
 use crate::recorder::RESERVE_FILE;
 use crate::session::SESSION_TMP;
 use crate::verify::{Judge, broken_session};
@@ -30,28 +30,28 @@ use facts::Facts;
 use segment::{Before, Choice, Rebuild, Rebuilt};
 use session::Chosen;
 
-/// What a copy is called until it is proven.
+/// Extension of a copy until it is verified.
 const TEMPORARY: &str = "mcap.recovering";
-/// Copies of one segment that are tried at most: each leaves out what the one before showed to be broken.
+/// Copies of one segment at most: each leaves out the parts that the one before showed to be damaged.
 const TRIES: u32 = 8;
-/// Segments at most in the place of which an empty one is put.
+/// Missing segments at most that are replaced by empty ones.
 const GONE_MAX: usize = 1000;
-/// What a dry run cannot know.
+/// The limit of a dry run, for its report.
 const UNKNOWN_IN_DRY_RUN: &str =
     "nothing was written: a disk that fails or fills up meanwhile would stop the recovery";
 
 /// How to recover.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RecoverOptions {
-    /// Do all of it on a copy that is not written, and change nothing: what is said is what a recovery would say, but for
-    /// a disk that fails or fills up meanwhile.
+    /// Work on a copy in memory and change nothing: the report is that of a recovery, except for a disk that fails or
+    /// fills up meanwhile.
     pub dry_run: bool,
-    /// Of segments that have their index and their name, believe that they are whole: nothing that is long
-    /// finished is read.
+    /// Take segments that have their index and their final name as complete, without reading what was finished long
+    /// ago.
     pub unfinished_only: bool,
 }
 
-/// How far a recovery is.
+/// Progress of a recovery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RecoverProgress {
     /// Bytes done.
@@ -60,19 +60,19 @@ pub struct RecoverProgress {
     pub total_bytes: u64,
 }
 
-/// What was done with a segment.
+/// The action taken on a segment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RecoverAction {
-    /// It was whole.
+    /// It was complete.
     None,
-    /// It was whole and got its final name.
+    /// It was complete and got its final name.
     Finished,
     /// It was copied, set by set.
     Rebuilt,
 }
 
-/// Bytes that held nothing whole.
+/// A range of bytes without a complete record.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct LostBytes {
     /// The first one.
@@ -83,13 +83,13 @@ pub struct LostBytes {
     pub why: String,
 }
 
-/// What was found in a segment and done with it.
+/// The state of a segment, and the action taken on it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct RecoveredSegment {
     /// Its name before.
     pub file: String,
-    /// What was done.
+    /// The action taken.
     pub action: RecoverAction,
     /// Whole sets in it.
     pub sets: u64,
@@ -105,31 +105,31 @@ pub struct RecoveredSegment {
     pub sets_missing: Vec<(u64, u64)>,
     /// Sets that are lost, at most: those ids, and what the accounts count beyond them.
     pub sets_lost: u64,
-    /// What was lost, in words.
+    /// Losses in words.
     pub lost: Vec<String>,
 }
 
-/// What a recovery did.
+/// Report of a recovery.
 #[derive(Debug, Clone, Serialize)]
 #[non_exhaustive]
 pub struct RecoverReport {
     /// The dataset.
     pub path: PathBuf,
-    /// Whether it was only said what would be done.
+    /// Whether it was a dry run.
     pub dry_run: bool,
     /// Whether anything was changed, or would be.
     pub changed: bool,
     /// Its segments.
     pub segments: Vec<RecoveredSegment>,
-    /// Whether `session.toml` had to be made anew.
+    /// Whether `session.toml` had to be rebuilt.
     pub session_rebuilt: bool,
     /// Leftovers that were removed.
     pub removed: Vec<String>,
     /// Whole sets in the dataset.
     pub sets: u64,
-    /// What this recovery found lost, in words; empty when it found nothing to do.
+    /// Losses that this recovery found, in words; empty if there was nothing to do.
     pub lost: Vec<String>,
-    /// What was noticed besides.
+    /// Other observations.
     pub notes: Vec<String>,
 }
 
@@ -138,7 +138,7 @@ pub struct RecoverReport {
 /// # Errors
 /// [`ErrorKind::InUse`] when the dataset is being recorded, [`ErrorKind::NotADataset`] when nothing was ever
 /// recorded there, [`ErrorKind::DiskFull`] when a segment's copy finds no room, [`ErrorKind::Interrupted`] when
-/// `progress` breaks, else as the disk says. Whatever the error, all that could be read before still can.
+/// `progress` breaks, else as the disk says. No error makes readable data unreadable.
 pub fn recover(
     path: &Path,
     options: &RecoverOptions,
@@ -161,7 +161,7 @@ pub fn recover_with(
     let entries = fs.read_dir(path).map_err(|e| Error::reading("open the folder", path, e))?;
     check_names(path, &entries)?;
     let mut notes = Vec::new();
-    let lock = lock_patiently(&**fs, path);
+    let lock = lock_with_retries(&**fs, path);
     match &lock {
         Ok(_) => {}
         Err(e) if e.kind() == std::io::ErrorKind::WouldBlock => {
@@ -216,7 +216,7 @@ pub fn unfinished_in(fs: &Arc<dyn Fs>, folder: &Path, rig: &str) -> Result<Vec<P
         entries => entries.map_err(|e| Error::reading("open the folder", folder, e))?,
     };
     let mut found = Vec::new();
-    // `NAME.part` is what `trim` or `merge` has not finished: no recording.
+    // `NAME.part` is an unfinished output of `trim` or `merge`, not a recording.
     for entry in entries.iter().filter(|e| e.is_dir && !is_part(Path::new(&e.name))) {
         let dir = folder.join(&entry.name);
         let Ok(inside) = fs.read_dir(&dir) else { continue };
@@ -227,9 +227,10 @@ pub fn unfinished_in(fs: &Arc<dyn Fs>, folder: &Path, rig: &str) -> Result<Vec<P
             Ok(session) if session.outcome.is_some() && !part => continue,
             Ok(session) => session,
             Err(_) => {
-                let told = segments_in(&inside, &dir).into_iter();
-                let mut told = told.filter_map(|s| crate::Dataset::open_with(Arc::clone(fs), &s).ok());
-                let Some(dataset) = told.next() else { continue };
+                let segments = segments_in(&inside, &dir).into_iter();
+                let mut readable =
+                    segments.filter_map(|s| crate::Dataset::open_with(Arc::clone(fs), &s).ok());
+                let Some(dataset) = readable.next() else { continue };
                 dataset.session().clone()
             }
         };
@@ -241,7 +242,7 @@ pub fn unfinished_in(fs: &Arc<dyn Fs>, folder: &Path, rig: &str) -> Result<Vec<P
     Ok(found)
 }
 
-/// Refuses folders that are no datasets, and ones in which a segment is there twice.
+/// Refuses folders that are not datasets, and ones that have a segment twice.
 fn check_names(path: &Path, entries: &[DirEntry]) -> Result<()> {
     let mut numbers: Vec<_> =
         entries.iter().filter(|e| !e.is_dir).filter_map(|e| segment_number(&e.name)).collect();
@@ -259,7 +260,7 @@ fn check_names(path: &Path, entries: &[DirEntry]) -> Result<()> {
     if numbers.is_empty() && !entries.iter().any(|e| e.name == SESSION_FILE) {
         return Err(Error::new(
             ErrorKind::NotADataset,
-            format!("{} is no dataset: it holds neither {SESSION_FILE} nor a segment", path.display()),
+            format!("{} is not a dataset: it holds neither {SESSION_FILE} nor a segment", path.display()),
         ));
     }
     Ok(())
@@ -270,7 +271,7 @@ fn is_part(path: &Path) -> bool {
     path.extension().is_some_and(|e| e == "part")
 }
 
-/// A recovery on its way.
+/// A running recovery.
 struct Job<'a> {
     fs: &'a Arc<dyn Fs>,
     /// The same, when nothing is to be changed.
@@ -297,7 +298,7 @@ impl Job<'_> {
             before.add(&facts);
             all.push(facts);
         }
-        self.tell(self.total)?;
+        self.report_progress(self.total)?;
         let broken = broken_session(&chosen.session);
         session::settle(self, chosen.session, &all)?;
         match broken.first() {
@@ -317,7 +318,7 @@ impl Job<'_> {
         Ok(())
     }
 
-    /// The segments; an empty one in the place of each that is gone, so that its loss is stated as any other.
+    /// The segments, with an empty one in the place of each missing one, so that its loss is stated like any other.
     fn fill_gaps(&mut self, entries: &[DirEntry]) -> Result<Vec<PathBuf>> {
         let segments = segments_in(entries, self.dir);
         let there: BTreeSet<u32> = entries.iter().filter_map(|e| segment_number(&e.name)).collect();
@@ -345,8 +346,8 @@ impl Job<'_> {
         Ok(segments_in(&entries, self.dir))
     }
 
-    /// Tells how far it is.
-    fn tell(&mut self, done: u64) -> Result<()> {
+    /// Reports the bytes done so far; an error if the caller ends the work.
+    fn report_progress(&mut self, done: u64) -> Result<()> {
         let progress = RecoverProgress { done_bytes: done.min(self.total), total_bytes: self.total };
         match (self.progress)(progress) {
             ControlFlow::Continue(()) => Ok(()),
@@ -375,7 +376,7 @@ impl Job<'_> {
         Ok(())
     }
 
-    /// Makes one segment whole; what is in it then.
+    /// Repairs one segment; returns the facts of the result.
     fn segment(
         &mut self,
         path: &Path,
@@ -406,12 +407,12 @@ impl Job<'_> {
             // The ones after it are judged on their own, as this one was not read.
             *judge = Judge::lone(&chosen.session);
         } else if whole.is_some() {
-            let verdict = judge.look(&*fs, path, &mut |bytes| self.tell(base + bytes))?;
+            let verdict = judge.look(&*fs, path, &mut |bytes| self.report_progress(base + bytes))?;
             whole = whole.filter(|_| verdict.broken.is_empty());
             after = Some(verdict.after);
         }
-        // What an error kept from its final name may be whole in memory and not on the disk, and a later sync that
-        // succeeds says nothing of that: such a one is copied.
+        // A segment that an error kept from its final name may be complete in memory and not on the disk, and a later
+        // sync that succeeds does not prove otherwise: it is copied.
         let doubtful = |f: &Facts| f.error.is_some() || !chosen.stored || chosen.session.outcome.is_some();
         let whole = match whole {
             Some(whole) if !part => Some(whole),
@@ -438,7 +439,7 @@ impl Job<'_> {
             };
             let Rebuilt { facts, lost, .. } = self.rebuild(&job, base, judge)?;
             segment.action = RecoverAction::Rebuilt;
-            lost.tell(&mut segment);
+            lost.fill_in(&mut segment);
             self.replace(path)?;
             facts
         };
@@ -450,16 +451,16 @@ impl Job<'_> {
         Ok(facts)
     }
 
-    /// Copies a segment under its temporary name until `verify` finds nothing broken in the copy: what it does is left out
-    /// of the next one. Chunks may have good checksums and yet contradict each other.
+    /// Copies a segment under its temporary name until `verify` finds no damage in the copy; each copy leaves out the
+    /// findings of the one before. Chunks may have good checksums and yet contradict each other.
     fn rebuild(&mut self, job: &Rebuild<'_>, base: u64, judge: &mut Judge) -> Result<Rebuilt> {
         let fs = Arc::clone(self.fs);
         let mut choice = Choice::default();
         let mut tries = 0;
         loop {
-            let rebuilt = job.run(&choice, &mut |bytes| self.tell(base + bytes))?;
+            let rebuilt = job.run(&choice, &mut |bytes| self.report_progress(base + bytes))?;
             let copy = segment::temporary(job.path);
-            let verdict = judge.look(&*fs, &copy, &mut |_| self.tell(base))?;
+            let verdict = judge.look(&*fs, &copy, &mut |_| self.report_progress(base))?;
             let Some(first) = verdict.broken.first() else {
                 *judge = verdict.after;
                 return Ok(rebuilt);
@@ -479,7 +480,7 @@ impl Job<'_> {
         }
     }
 
-    /// Gives a whole `.part` its name; `false` when this file system cannot make it durable as it is.
+    /// Gives a complete `.part` its final name; `false` when this file system cannot make it durable as it is.
     fn finish(&self, part: &Path) -> Result<bool> {
         match self.fs.sync_file(part) {
             Ok(()) => {}
@@ -490,7 +491,7 @@ impl Job<'_> {
         Ok(true)
     }
 
-    /// Puts the proven copy in the place of `path`, and gives that its final name. Each step is durable before
+    /// Puts the verified copy in the place of `path`, and gives that its final name. Each step is durable before
     /// the next one, and after each the dataset holds every set exactly once.
     fn replace(&self, path: &Path) -> Result<()> {
         self.rename(&segment::temporary(path), path)?;

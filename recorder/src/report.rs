@@ -1,7 +1,7 @@
-//! The quality report of a dataset: what was recorded and how well, on one page that needs nothing but itself.
+//! The quality report of a dataset: what was recorded and how well, in one self-contained HTML file.
 //!
-//! Numbers come from every set; pictures are sampled evenly over the dataset, and the report says how many. Memory is
-//! constant in the length of the dataset but for eight bytes per set. Damage ends nothing: it is in the report.
+//! Numbers come from every set; images are sampled evenly over the dataset, and the report says how many. Memory is
+//! constant in the length of the dataset except for eight bytes per set. Damage does not end it: it is in the report.
 
 use crate::catalog::Health;
 use crate::dataset::Dataset;
@@ -30,10 +30,10 @@ pub use series::{Quantiles, Range, TimeBins};
 /// The name of the report in a dataset's folder.
 pub const REPORT_FILE: &str = "report.html";
 
-/// What a report looks at.
+/// Options of a report.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ReportOptions {
-    /// Sets whose depth pictures are decoded for the fill rate, evenly over the dataset.
+    /// Sets whose depth images are decoded for the fill rate, evenly over the dataset.
     pub fill_sets: usize,
     /// Frames of a set should not lie further apart than this, nanoseconds; `None`: what the session says, and
     /// where that says nothing half a period of the slowest camera, within which a nearest frame always lies.
@@ -46,7 +46,7 @@ impl Default for ReportOptions {
     }
 }
 
-/// Told how far the work is, in thousandths; says whether to go on.
+/// Called with the progress in thousandths; returns whether to go on.
 pub type OnProgress<'a> = &'a mut dyn FnMut(u64) -> ControlFlow<()>;
 
 /// The quality of a dataset. Series are `null` where nothing is known.
@@ -59,7 +59,7 @@ pub struct Report {
     pub name: String,
     /// The rig's name.
     pub rig: String,
-    /// What was in front of the cameras.
+    /// The scene in front of the cameras.
     pub scene: String,
     /// Who recorded it.
     pub operator: String,
@@ -69,22 +69,22 @@ pub struct Report {
     pub depthrig_version: String,
     /// When the recording began, UTC nanoseconds since 1970.
     pub started_utc_ns: i64,
-    /// What the operator noted.
+    /// Notes of the operator.
     pub notes: Vec<Note>,
-    /// What was changed afterwards.
+    /// Changes after the recording.
     pub history: Vec<Edit>,
     /// Streams that no camera gave, with what computed them.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub computed: Vec<crate::Computed>,
-    /// What is to be thought of it.
+    /// The verdict on it.
     pub verdict: Verdict,
     /// Its sets.
     pub sets: SetsReport,
-    /// How the time of the series below is divided.
+    /// The time bins of the series below.
     pub bins: TimeBins,
     /// Its streams.
     pub streams: Vec<StreamReport>,
-    /// Its motion units.
+    /// Its IMUs.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub motion: Vec<MotionReport>,
     /// The two clocks of the host.
@@ -95,33 +95,33 @@ pub struct Report {
     pub segments: usize,
     /// Segments that were not finished, by file name.
     pub unfinished: Vec<String>,
-    /// What could not be read: the first [`PROBLEMS_MAX`].
+    /// Parts that could not be read: the first [`PROBLEMS_MAX`].
     pub problems: Vec<String>,
     /// How much could not be read.
     pub problem_count: u64,
-    /// How many pictures were looked at.
+    /// Images checked.
     pub sampled: Sampled,
     /// First, middle and last set; not in JSON.
     #[serde(skip)]
-    pictures: Vec<SetPictures>,
+    images: Vec<SetImages>,
 }
 
 /// Problems that a report names; the rest is counted.
 pub const PROBLEMS_MAX: usize = 20;
 
-/// Restarts and steps that are told with their time.
-const TOLD_MAX: usize = 32;
+/// Restarts and steps listed with their time, at most.
+const LISTED_MAX: usize = 32;
 
-/// What is to be thought of a dataset.
+/// The verdict on a dataset.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Verdict {
-    /// How it is.
+    /// Its health.
     pub health: Health,
     /// The same in a sentence.
     pub headline: String,
-    /// What makes it so, and what to do.
+    /// The reasons, and what to do.
     pub why: Vec<String>,
-    /// What a careful reader should know although nothing of it is wrong with the dataset.
+    /// Facts worth knowing that are not defects of the dataset.
     pub remarks: Vec<String>,
 }
 
@@ -138,15 +138,15 @@ pub struct SetsReport {
     /// Time from set to set, nanoseconds.
     pub interval_ns: Quantiles,
     /// Sets handed over, recorded and dropped by reason: by the last account in the file, or by the session's
-    /// outcome where that tells of more.
+    /// outcome where that counts more.
     pub counts: Option<SetsAccount>,
     /// Sets per second over time.
     pub per_second: Vec<Option<f64>>,
     /// Latest minus earliest capture time of a set, nanoseconds.
     pub spread_ns: Quantiles,
-    /// How many sets have which spread.
+    /// Histogram of the spreads.
     pub spread_histogram: LinearHistogram,
-    /// Within which a spread should be, nanoseconds.
+    /// Limit of the spread, nanoseconds.
     pub spread_limit_ns: Option<i64>,
     /// Sets beyond that.
     pub beyond_limit: u64,
@@ -167,10 +167,10 @@ pub struct LinearHistogram {
 #[derive(Debug, Clone, Serialize)]
 #[non_exhaustive]
 pub struct StreamReport {
-    /// What the session says of it.
+    /// Its entry in the session.
     #[serde(flatten)]
     pub record: crate::StreamRecord,
-    /// How pixels are stored; empty when there is no frame.
+    /// How pixels are stored; empty without frames.
     pub codec: &'static str,
     /// Frames in the dataset.
     pub frames: u64,
@@ -202,15 +202,15 @@ pub struct StreamReport {
     pub missing_ns: Option<(i64, i64)>,
     /// Its capture clock.
     pub clock: ClockReport,
-    /// How much of its pictures has depth; `None` when it is no depth or none was looked at.
+    /// How much of its images has depth; `None` for a stream without depth, or if no image was checked.
     pub fill: Option<Fill>,
 }
 
-/// One motion unit of a dataset.
+/// One IMU of a dataset.
 #[derive(Debug, Clone, Serialize)]
 #[non_exhaustive]
 pub struct MotionReport {
-    /// What the session says of it.
+    /// Its entry in the session.
     #[serde(flatten)]
     pub record: crate::MotionRecord,
     /// Batches in the dataset.
@@ -223,9 +223,9 @@ pub struct MotionReport {
     pub never_given: u64,
     /// Samples per second between the first and the last.
     pub samples_hz: f64,
-    /// Length of the angular velocity over time, rad/s.
+    /// Magnitude of the angular velocity over time, rad/s.
     pub rotation_series: Vec<Option<Range>>,
-    /// Length of the acceleration over time, m/s².
+    /// Magnitude of the acceleration over time, m/s².
     pub acceleration_series: Vec<Option<Range>>,
     /// `captured = delivered + Σ dropped` of its batches over the recording, from the last account in the file.
     pub account: Option<StreamAccount>,
@@ -234,7 +234,7 @@ pub struct MotionReport {
 /// The capture clock of a stream.
 #[derive(Debug, Clone, Serialize)]
 pub struct ClockReport {
-    /// Where capture times come from: `device`, `kernel` or `arrival`; empty when there is no frame.
+    /// Where capture times come from: `device`, `kernel` or `arrival`; empty without frames.
     pub domain: &'static str,
     /// Arrival minus capture time, nanoseconds: exposure, read-out and transport, and what the clock map missed.
     pub lag_ns: Quantiles,
@@ -250,7 +250,7 @@ pub struct ClockReport {
     pub restarts: u64,
 }
 
-/// How much of the depth pictures has depth.
+/// How much of the depth images has depth.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Fill {
     /// Time since the first set in nanoseconds, and share of the pixels that have a depth, 0 to 1.
@@ -270,7 +270,7 @@ pub struct HostClock {
     pub pairs: u64,
     /// The two were read within this at worst, nanoseconds.
     pub width_ns: i64,
-    /// How much the difference changed from the first reading to the last, nanoseconds; steps included.
+    /// Change of the difference from the first reading to the last, nanoseconds; steps included.
     pub change_ns: i64,
     /// The same without steps, parts per million of the time.
     pub drift_ppm: f64,
@@ -280,27 +280,27 @@ pub struct HostClock {
     pub steps: Vec<(i64, i64)>,
 }
 
-/// How many pictures were looked at.
+/// The number of images checked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 pub struct Sampled {
-    /// Sets whose depth pictures were decoded.
+    /// Sets whose depth images were decoded.
     pub sets: usize,
-    /// Pictures that were decoded, those shown included.
-    pub pictures: usize,
+    /// Images that were decoded, those shown included.
+    pub images: usize,
 }
 
-/// The pictures of a set, by stream.
+/// The images of a set, by stream.
 #[derive(Debug, Clone)]
-struct SetPictures {
+struct SetImages {
     /// `first`, `middle` or `last`.
     title: &'static str,
     number: usize,
     /// Since the first set, nanoseconds.
     at_ns: i64,
-    pictures: BTreeMap<usize, Shown>,
+    images: BTreeMap<usize, Shown>,
 }
 
-/// A small picture as the page carries it.
+/// A small image as the report embeds it.
 #[derive(Debug, Clone)]
 struct Shown {
     data_uri: String,
@@ -319,27 +319,27 @@ impl Report {
         gather::gather(dataset, options, progress)
     }
 
-    /// One page of HTML that needs no script, no network and no other file. It is well-formed XML as well.
+    /// The report as HTML that needs no script, no network and no other file. It is well-formed XML as well.
     pub fn to_html(&self) -> String {
         html::page(self)
     }
 
-    /// Writes the page to `path`, replacing in one step what is there.
+    /// Writes the HTML to `path`, replacing an existing file in one step.
     ///
     /// # Errors
-    /// What the file system says.
+    /// The error of the file system.
     pub fn write(&self, fs: &dyn Fs, path: &Path) -> Result<()> {
         let tmp = temporary(path);
         fs::replace_by(fs, &tmp, path, self.to_html().as_bytes()).map_err(|e| {
-            // Nobody would find a hidden file. One that stays all the same, the next report removes.
+            // Nobody would find a hidden file. If removing it fails, the next report does it.
             let _ = fs.remove_file(&tmp);
             Error::io("write", path, e)
         })
     }
 }
 
-/// What `path` is called while it is written. It may lie among files that are not ours, and a hidden name that
-/// has all of its own in it is none of theirs.
+/// The name of `path` while it is written. It may lie among files of others; a hidden name that contains all of the
+/// final one does not collide with theirs.
 fn temporary(path: &Path) -> PathBuf {
     let mut name = OsString::from(".");
     name.push(path.file_name().unwrap_or_default());

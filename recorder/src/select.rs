@@ -1,4 +1,4 @@
-//! Which sets of a dataset are meant, as a person says it: by time, by the time after the first set, or by id.
+//! Selects sets of a dataset: by time, by the time after the first set, or by id.
 
 use crate::dataset::{PixelMode, SetReader};
 use crate::{Error, ErrorKind, Result};
@@ -22,7 +22,7 @@ impl FromStr for Moment {
     /// Reads `12.5` (seconds after the first set) or an RFC 3339 time such as `2026-11-21T10:15:03.2Z`.
     fn from_str(text: &str) -> Result<Self> {
         if let Ok(s) = text.parse::<f64>() {
-            // Beyond this a float no longer tells one nanosecond from the next.
+            // Beyond this a float cannot resolve single nanoseconds.
             return if (0.0..9e6).contains(&s) {
                 Ok(Self::AfterFirst((s * 1e9).round() as i64))
             } else {
@@ -40,7 +40,7 @@ fn not_a_moment(text: &str) -> Error {
     Error::new(
         ErrorKind::BadInput,
         format!(
-            "\"{text}\" is no moment; write seconds after the first set (12.5) or a time with its zone \
+            "invalid moment \"{text}\"; write seconds after the first set (12.5) or a time with its zone \
              (2026-11-21T10:15:03.2Z)"
         ),
     )
@@ -79,7 +79,7 @@ impl SetSpan {
     }
 }
 
-/// How many sets lie before `edge`, or with `after` not after it.
+/// The number of sets before `edge`, or with `after` the number up to and including it.
 fn lower(sets: &mut SetReader, edge: Edge, after: bool) -> Result<usize> {
     match edge {
         Edge::Moment(m) => {
@@ -97,10 +97,11 @@ fn utc_of(sets: &SetReader, moment: Moment) -> i64 {
     }
 }
 
-/// How many sets have an id below `id`: a search by halves, which reads a few sets and no picture. A set that
-/// cannot be read is passed over.
+/// The number of sets with an id below `id`: a binary search, which reads a few sets and no image. Unreadable sets
+/// are skipped.
 fn before_id(sets: &mut SetReader, id: u64) -> Result<usize> {
-    let (mut low, mut high) = (0, sets.times().len());
+    let mut low = 0;
+    let mut high = sets.times().len();
     while low < high {
         let middle = low + (high - low) / 2;
         match readable(sets, middle..high)? {
@@ -126,7 +127,7 @@ fn readable(sets: &mut SetReader, numbers: Range<usize>) -> Result<Option<(usize
 /// The number of the set with this id.
 ///
 /// # Errors
-/// [`ErrorKind::NotFound`] when there is none, [`ErrorKind::Io`].
+/// [`ErrorKind::NotFound`] when no set has it, [`ErrorKind::Io`].
 pub(crate) fn by_id(sets: &mut SetReader, id: u64) -> Result<usize> {
     let at = before_id(sets, id)?;
     let all = sets.times().len();
@@ -154,7 +155,8 @@ pub(crate) fn last_id(sets: &mut SetReader) -> Result<u64> {
 /// # Errors
 /// [`ErrorKind::NotFound`] when the dataset has no sets.
 pub(crate) fn nearest(sets: &SetReader, moment: Moment) -> Result<usize> {
-    let (times, t) = (sets.times(), utc_of(sets, moment));
+    let times = sets.times();
+    let t = utc_of(sets, moment);
     let at = times.partition_point(|s| *s < t);
     let found = [at.checked_sub(1), Some(at)].into_iter().flatten().filter(|n| *n < times.len());
     found
@@ -162,21 +164,21 @@ pub(crate) fn nearest(sets: &SetReader, moment: Moment) -> Result<usize> {
         .ok_or_else(|| Error::new(ErrorKind::NotFound, "the dataset has no sets"))
 }
 
-/// What there is, for the message to who asked for something else.
+/// The sets of the dataset, for the message of a failed request.
 fn extent(sets: &mut SetReader) -> String {
     let all = sets.times().len();
     let first = readable(sets, 0..all).ok().flatten().map(|(_, id)| id);
     let length = sets.times().last().zip(sets.times().first()).map_or(0, |(b, a)| b.saturating_sub(*a));
     let length = length as f64 / 1e9;
-    let mut told = match (first, last_id(sets)) {
+    let mut text = match (first, last_id(sets)) {
         (Some(first), Ok(last)) => format!("the dataset has sets {first} to {last} over {length:.3} s"),
         _ => format!("the dataset has {all} sets over {length:.3} s"),
     };
     for problem in sets.problems() {
-        told.push_str("; ");
-        told.push_str(problem);
+        text.push_str("; ");
+        text.push_str(problem);
     }
-    told
+    text
 }
 
 #[cfg(test)]

@@ -23,10 +23,10 @@ pub const NOTE_MAX_BYTES: usize = 4096;
 /// Most notes of a dataset, and most bytes of all of them: `session.toml` must stay small enough to be read.
 const NOTES_MAX: usize = 4096;
 const NOTES_MAX_BYTES: usize = 1 << 20;
-/// Streams and motion units at most: each has three tables of a session, and three of the 65535 channels of a file.
+/// Streams and IMUs at most: each has three tables of a session, and three of the 65535 channels of a file.
 const STREAMS_MAX: usize = 4_000;
 
-/// What `session.toml` says.
+/// The contents of `session.toml`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Session {
     /// [`FORMAT`].
@@ -36,7 +36,7 @@ pub struct Session {
     pub name: String,
     /// Name of the rig: the first part of each topic.
     pub rig: String,
-    /// What was in front of the cameras.
+    /// The scene in front of the cameras.
     #[serde(default)]
     pub scene: String,
     /// Who recorded it.
@@ -54,19 +54,19 @@ pub struct Session {
     #[serde(default)]
     pub rig_config: String,
     /// The frames of one set should not be further apart than this, nanoseconds: twice what the rig's set window
-    /// allows. Without it `verify` judges no spread unless it is told a limit.
+    /// allows. Without it `verify` checks the spread only against a limit in its options.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_spread_ns: Option<i64>,
     /// How it ended; absent while it runs and when it was cut off.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub outcome: Option<Outcome>,
-    /// What the operator noted.
+    /// Notes of the operator.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub notes: Vec<Note>,
-    /// What was changed after the recording, oldest first.
+    /// Changes after the recording, oldest first.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub history: Vec<Edit>,
-    /// What it was cut from or joined from, oldest first; empty for a recording as it was made.
+    /// The datasets that it was cut or joined from, oldest first; empty for an original recording.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub derived: Vec<Derived>,
     /// Streams that no camera gave, with what computed them.
@@ -74,7 +74,7 @@ pub struct Session {
     pub computed: Vec<Computed>,
     /// The recorded streams; a frame names its stream by the index here.
     pub streams: Vec<StreamRecord>,
-    /// The recorded motion units, which are no part of sets; a batch names its unit by the index here.
+    /// The recorded IMUs, which are not streams of the sets; a batch names its IMU by the index here.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub motion: Vec<MotionRecord>,
     /// Keys that this version does not know: a user's own, or a later version's. They are kept.
@@ -100,13 +100,13 @@ pub struct Edit {
     pub depthrig_version: String,
 }
 
-/// What computed a stream, such as depth out of two pictures: in `session.toml` under `[[computed]]`, and in the metadata
-/// of the stream's channels.
+/// The producer of a computed stream, such as depth from two images: in `session.toml` under `[[computed]]`, and in the
+/// metadata of the stream's channels.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Computed {
     /// The stream, `camera/stream`.
     pub stream: StreamId,
-    /// What it is called, such as `mimic_quality`.
+    /// Name of the computation, such as `mimic_quality`.
     pub name: String,
     /// The program or network with its version.
     pub producer: String,
@@ -130,7 +130,7 @@ impl core::fmt::Display for Computed {
     }
 }
 
-/// One step of how a dataset came to be after its recording, in `session.toml` under `[[derived]]`.
+/// A step that derived a dataset from others, in `session.toml` under `[[derived]]`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Derived {
     /// `trim` or `merge`.
@@ -139,7 +139,7 @@ pub struct Derived {
     pub utc_ns: i64,
     /// The version of depthrig that did it.
     pub depthrig_version: String,
-    /// File names of what it was made from.
+    /// File names of its sources.
     pub from: Vec<String>,
     /// Log time of the first set, UTC nanoseconds since 1970.
     pub first_utc_ns: i64,
@@ -155,7 +155,7 @@ pub struct Derived {
 pub struct Note {
     /// When, UTC nanoseconds since 1970.
     pub utc_ns: i64,
-    /// What.
+    /// The note.
     pub text: String,
 }
 
@@ -173,7 +173,7 @@ pub struct Outcome {
     /// Sets lost, by reason.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub sets_dropped: BTreeMap<String, u64>,
-    /// What was lost or went wrong, in words.
+    /// Losses and errors in words.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub lost: Vec<String>,
 }
@@ -211,7 +211,7 @@ pub struct StreamRecord {
     /// Nominal frame rate of the live stream, Hz.
     #[serde(default)]
     pub rate_hz: f64,
-    /// Metres per unit of depth; 0 when it is no depth.
+    /// Metres per unit of depth; 0 for a stream without depth.
     #[serde(default)]
     pub depth_unit_m: f64,
     /// Where the calibration comes from: factory, file and date, none.
@@ -224,7 +224,7 @@ pub struct StreamRecord {
     pub pose: Pose,
 }
 
-/// One recorded motion unit.
+/// One recorded IMU.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MotionRecord {
     /// Its stream's name, such as `zed2i/imu`.
@@ -243,7 +243,7 @@ pub struct MotionRecord {
     /// Where its pose comes from: factory, file and date, none.
     #[serde(default)]
     pub calibration: String,
-    /// Pose of the unit on the mount.
+    /// Pose of the IMU on the mount.
     pub pose: Pose,
 }
 
@@ -322,7 +322,7 @@ impl Session {
         Err(Error::new(ErrorKind::BadInput, why))
     }
 
-    /// Checks what the topics and the file are made from.
+    /// Checks the values that topics and file are built from.
     pub(crate) fn check(&self) -> Result<()> {
         let bad = |why: String| Error::new(ErrorKind::BadInput, format!("session \"{}\": {why}", self.name));
         Name::new(self.rig.as_str()).map_err(|e| bad(format!("the rig's name: {e}")))?;
@@ -334,22 +334,22 @@ impl Session {
                 return Err(bad(format!("stream {} is there twice", s.id)));
             }
             if s.format.is_motion() {
-                return Err(bad(format!("{} is a motion unit; it belongs into [[motion]]", s.id)));
+                return Err(bad(format!("{} is an IMU; it belongs into [[motion]]", s.id)));
             }
         }
         for (i, u) in self.motion.iter().enumerate() {
             let mut others = self.motion[..i].iter().map(|u| &u.id).chain(self.streams.iter().map(|s| &s.id));
             if others.any(|other| *other == u.id) {
-                return Err(bad(format!("motion unit {} is there twice", u.id)));
+                return Err(bad(format!("IMU {} is there twice", u.id)));
             }
             if u.batch == 0 {
-                return Err(bad(format!("motion unit {} has batches of no samples", u.id)));
+                return Err(bad(format!("IMU {} has batches of no samples", u.id)));
             }
         }
         self.too_much().map_or(Ok(()), |why| Err(bad(why)))
     }
 
-    /// Whether sets of `other` can be sets of this session: the same rig, streams and motion units, whatever their
+    /// Whether sets of `other` can be sets of this session: the same rig, streams and IMUs, whatever their
     /// calibration.
     pub(crate) fn has_streams_of(&self, other: &Self) -> bool {
         let stream = |s: &StreamRecord| (s.id.clone(), s.format, s.width, s.height);
@@ -359,7 +359,7 @@ impl Session {
             && self.motion.iter().map(unit).eq(other.motion.iter().map(unit))
     }
 
-    /// What an import could not bring over, in words, as the table `import` has it; empty for a recording.
+    /// Losses of an import in words, from the table `import`; empty for a recording.
     pub fn import_losses(&self) -> Vec<String> {
         let Some(table) = self.extra.get("import").and_then(toml::Value::as_table) else { return Vec::new() };
         let lost = table.get("lost").and_then(toml::Value::as_integer).filter(|n| *n > 0);
@@ -371,15 +371,15 @@ impl Session {
         words
     }
 
-    /// What of it is more than a dataset can hold, in words.
+    /// The first limit of a dataset that it exceeds, in words.
     fn too_much(&self) -> Option<String> {
         let listed = self.streams.len() + self.motion.len();
         if listed > STREAMS_MAX {
-            return Some(format!("it lists {listed} streams and motion units, {STREAMS_MAX} is the limit"));
+            return Some(format!("it lists {listed} streams and IMUs, {STREAMS_MAX} is the limit"));
         }
         let fits = |u: &&MotionRecord| RecordMotion::stored_bytes_of(u.batch.into()) <= SET_MOTION_MAX_BYTES;
         let long = self.motion.iter().find(|u| !fits(u))?;
-        Some(format!("motion unit {} has batches of {} samples, no set can hold one", long.id, long.batch))
+        Some(format!("IMU {} has batches of {} samples, no set can hold one", long.id, long.batch))
     }
 
     /// The text of `session.toml`.
@@ -438,7 +438,7 @@ impl Session {
     }
 }
 
-/// Refuses to write what could not be read.
+/// Refuses a text that is too large to be read back.
 pub(crate) fn check_size(text: &str, path: &Path) -> Result<()> {
     let Some(why) = limits::exceeded(text) else { return Ok(()) };
     let message = format!("{} cannot be written: {why}; it is left as it is", path.display());
@@ -450,7 +450,7 @@ fn text_of(fs: &dyn Fs, path: &Path) -> Result<String> {
     let read = || {
         let file = fs.open(path)?;
         let size = file.size()?;
-        // A session with every note of a long day is some kilobytes. What is longer is refused, and not read to the end.
+        // A session with every note of a long day is some kilobytes. Longer files are refused, and not read to the end.
         let mut bytes = vec![0; usize::try_from(size.min(limits::TEXT_MAX_BYTES + 1)).unwrap_or(0)];
         file.read_exact_at(&mut bytes, 0)?;
         Ok((bytes, size))

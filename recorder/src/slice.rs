@@ -5,7 +5,7 @@
 //! reads each input ahead by a set; memory does not grow with the length of the datasets.
 //!
 //! The new dataset grows in a folder named `OUT.part`, which is locked, and gets its name when everything in it
-//! is durable. So `OUT` is whole or not there, and the inputs are only read.
+//! is durable. So `OUT` is complete or not there, and the inputs are only read.
 
 use crate::dataset::Dataset;
 use crate::fs::Fs;
@@ -20,12 +20,12 @@ use std::path::{Path, PathBuf};
 mod books;
 mod folder;
 mod join;
-mod lane;
 mod output;
 mod session;
+mod track;
 
 use join::Join;
-use lane::{Input, Lanes, Piece, lanes};
+use track::{Input, Piece, Tracks, tracks};
 
 /// How the new dataset is divided; the defaults are those of a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -43,7 +43,7 @@ impl Default for SliceOptions {
     }
 }
 
-/// What was made.
+/// Report on the new dataset.
 #[derive(Debug, Clone, Serialize)]
 #[non_exhaustive]
 pub struct SliceReport {
@@ -63,13 +63,13 @@ pub struct SliceReport {
     pub bytes: u64,
     /// Sets that were in several inputs and are in it once.
     pub repeated: u64,
-    /// Whether nothing is missing between its first set and its last, as far as the recording tells.
+    /// Whether nothing is missing between its first set and its last, as far as the recording says.
     pub complete: bool,
-    /// What is missing, in words; empty when `complete`.
+    /// Losses, in words; empty when `complete`.
     pub lost: Vec<String>,
 }
 
-/// Is told how many bytes of how many are read, and may end the work.
+/// Callback with the bytes read and the bytes to read; a break ends the work.
 pub type SliceProgress<'a> = &'a mut dyn FnMut(u64, u64) -> ControlFlow<()>;
 
 /// Writes the sets of `span` as the new dataset `out`.
@@ -90,12 +90,12 @@ pub fn trim(
     let mut sets = dataset.set_reader()?;
     let numbers = span.numbers(&mut sets)?;
     let times = sets.times();
-    let part = lane::Range {
+    let part = track::Range {
         from_utc_ns: times[numbers.start],
         to_utc_ns: times[numbers.end - 1],
         begins: numbers.start == 0,
         ends: numbers.end == times.len(),
-        // What happens after the last set and before the next one belongs to the last set.
+        // Notes after the last set and before the next one belong to the last set.
         notes_from_utc_ns: if numbers.start == 0 { i64::MIN } else { times[numbers.start] },
         notes_to_utc_ns: times.get(numbers.end).map_or(i64::MAX, |next| next - 1),
     };
@@ -103,7 +103,7 @@ pub fn trim(
     let inputs = [Input::new(dataset)];
     let pieces = (0..dataset.segments().len()).map(|segment| Piece { input: 0, segment }).collect();
     let mut session = session::trimmed(dataset.session(), out, &part);
-    session.derived.push(derived("trim", &inputs, (part.from_utc_ns, part.to_utc_ns)));
+    session.derived.push(derived("trim", &inputs, part.from_utc_ns, part.to_utc_ns));
     Join::new(&inputs, part, *options).run(fs, &[pieces], session, out, progress)
 }
 
@@ -127,16 +127,16 @@ pub fn merge(
         session::must_be_one(first, other)?;
     }
     let inputs: Vec<_> = datasets.iter().map(Input::new).collect();
-    let Some(Lanes { all: lanes, times, unread }) = lanes(&inputs)? else {
-        return Err(Error::new(ErrorKind::BadInput, "there is no set in what is to be merged"));
+    let Some(Tracks { all: tracks, times, unread }) = tracks(&inputs)? else {
+        return Err(Error::new(ErrorKind::BadInput, "the inputs to merge hold no set"));
     };
     let mut session = session::merged(datasets, out);
-    session.derived.push(derived("merge", &inputs, times));
-    Join::new(&inputs, lane::Range::ALL, *options).without(unread).run(fs, &lanes, session, out, progress)
+    session.derived.push(derived("merge", &inputs, times.0, times.1));
+    Join::new(&inputs, track::Range::ALL, *options).without(unread).run(fs, &tracks, session, out, progress)
 }
 
 /// The provenance of what is made from `inputs`, with sets from one log time to another.
-fn derived(by: &str, inputs: &[Input<'_>], (first_utc_ns, last_utc_ns): (i64, i64)) -> Derived {
+fn derived(by: &str, inputs: &[Input<'_>], first_utc_ns: i64, last_utc_ns: i64) -> Derived {
     let name = |p: &Path| {
         p.file_name().map_or_else(|| p.display().to_string(), |n| n.to_string_lossy().into_owned())
     };

@@ -1,4 +1,4 @@
-//! One picture as a file: PNG, NPY, or the JPEG as it is stored.
+//! One image as a file: PNG, NPY, or the JPEG as it is stored.
 //!
 //! NPY is written here and not by a crate: its head is one short line of text, while the maintained crates
 //! (`npyz`, `ndarray-npy`) bring about thirty others and 20 s of CPU per clean build, because they also read it.
@@ -12,7 +12,7 @@ use image::{ExtendedColorType, ImageEncoder};
 use serde::Serialize;
 use std::borrow::Cow;
 
-/// The form of a picture file.
+/// The form of an image file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum StillFormat {
@@ -25,7 +25,7 @@ pub enum StillFormat {
 }
 
 impl StillFormat {
-    /// PNG where it holds every bit of such pictures, else NPY.
+    /// PNG where it holds every bit of such images, else NPY.
     pub const fn of(format: PixelFormat) -> Self {
         if png_color(format).is_some() { Self::Png } else { Self::Npy }
     }
@@ -43,8 +43,8 @@ impl StillFormat {
 /// The file of a frame that was read with [`crate::PixelMode::Stored`].
 ///
 /// # Errors
-/// [`ErrorKind::BadInput`] when the format cannot hold such pixels, [`ErrorKind::Codec`] when they cannot be
-/// decoded.
+/// [`ErrorKind::BadInput`] when the format cannot hold such pixels, [`ErrorKind::Codec`] when decoding
+/// fails.
 pub fn still(frame: &DatasetFrame, form: StillFormat) -> Result<Cow<'_, [u8]>> {
     let h = &frame.header;
     if form == StillFormat::Jpeg {
@@ -61,7 +61,7 @@ pub fn still(frame: &DatasetFrame, form: StillFormat) -> Result<Cow<'_, [u8]>> {
     encode(h, format, &tight(h, &pixels, format), form).map(Cow::Owned)
 }
 
-/// The file of a picture whose rows follow each other without padding.
+/// The file of an image whose rows follow each other without padding.
 pub(crate) fn encode(
     h: &FrameHeader,
     format: PixelFormat,
@@ -82,7 +82,7 @@ fn refused(h: &FrameHeader, why: impl core::fmt::Display) -> Error {
     Error::new(ErrorKind::BadInput, format!("frame {} of {}/{} {why}", h.sequence, h.camera(), h.stream()))
 }
 
-/// How a PNG stores such pixels; `None` where it would have to change them.
+/// The PNG colour type of a format; `None` where PNG would have to change the pixels.
 const fn png_color(format: PixelFormat) -> Option<ExtendedColorType> {
     Some(match format {
         PixelFormat::Rgb8 | PixelFormat::Bgr8 | PixelFormat::Mjpeg => ExtendedColorType::Rgb8,
@@ -99,7 +99,7 @@ fn png(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Result<Vec<u8>> {
     };
     let pixels: Cow<'_, [u8]> = match format {
         PixelFormat::Bgr8 => pixels.as_chunks().0.iter().flat_map(|[b, g, r]| [*r, *g, *b]).collect(),
-        // The encoder takes numbers of this computer and writes them as PNG has them, the high byte first.
+        // The encoder takes numbers in native byte order and writes them high byte first, as PNG requires.
         PixelFormat::Mono16 | PixelFormat::Z16 if cfg!(target_endian = "big") => {
             pixels.as_chunks().0.iter().flat_map(|[low, high]| [*high, *low]).collect()
         }
@@ -109,13 +109,14 @@ fn png(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Result<Vec<u8>> {
     let encoder = PngEncoder::new_with_quality(&mut out, CompressionType::Fast, FilterType::Adaptive);
     encoder
         .write_image(&pixels, h.width, h.height, color)
-        .map_err(|e| refused(h, "cannot be made a PNG").with_source(e))?;
+        .map_err(|e| refused(h, "cannot be encoded as PNG").with_source(e))?;
     Ok(out)
 }
 
 /// The pixels of a frame as a NumPy array.
 fn npy(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Vec<u8> {
-    let (height, width) = (h.height as usize, h.width as usize);
+    let height = h.height as usize;
+    let width = h.width as usize;
     let kind = match format {
         PixelFormat::Mono16 | PixelFormat::Z16 => "<u2",
         PixelFormat::DepthF32 | PixelFormat::DisparityF32 => "<f4",
@@ -130,8 +131,8 @@ fn npy(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Vec<u8> {
     }
 }
 
-/// An NPY file (form 1.0) of an array of two or more dimensions, row-major; `kind` is NumPy's name of its numbers, such as
-/// `<f4` for 32-bit floats. <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>.
+/// An NPY file (form 1.0) of an array of two or more dimensions, row-major; `kind` is NumPy's name of its numbers, such
+/// as `<f4` for 32-bit floats. <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>.
 pub fn npy_file(kind: &str, shape: &[usize], data: &[u8]) -> Vec<u8> {
     let shape: Vec<_> = shape.iter().map(ToString::to_string).collect();
     let mut out = npy_head(&format!("'{kind}'"), &shape.join(", "));
@@ -139,8 +140,8 @@ pub fn npy_file(kind: &str, shape: &[usize], data: &[u8]) -> Vec<u8> {
     out
 }
 
-/// The head of an NPY file of `n` records; `fields` are their names, NumPy's name of their numbers, and how many of them. The
-/// records follow without padding.
+/// The head of an NPY file of `n` records; `fields` are their names, NumPy's name of their numbers, and how many of
+/// them. The records follow without padding.
 pub(crate) fn npy_records(fields: &[(&str, &str, usize)], n: u64) -> Vec<u8> {
     let fields = fields.iter().map(|(name, kind, count)| match count {
         1 => format!("('{name}', '{kind}')"),
@@ -162,9 +163,10 @@ fn npy_head(descr: &str, shape: &str) -> Vec<u8> {
     out
 }
 
-/// The rows without what lies between them.
+/// The rows without padding.
 pub(crate) fn tight<'a>(h: &FrameHeader, pixels: &'a [u8], format: PixelFormat) -> Cow<'a, [u8]> {
-    let (row, stride) = (format.row_bytes(h.width) as usize, h.stride as usize);
+    let row = format.row_bytes(h.width) as usize;
+    let stride = h.stride as usize;
     if stride <= row || row == 0 {
         return pixels.into();
     }
@@ -179,7 +181,7 @@ mod tests {
 
     fn header(format: PixelFormat, width: u32, height: u32) -> FrameHeader {
         let mut h = FrameHeader::default();
-        h.set_picture(format, width, height);
+        h.set_image(format, width, height);
         h
     }
 
@@ -214,7 +216,7 @@ mod tests {
             let pixels: Vec<u8> = (0..format.frame_bytes(6, 4)).map(|i| (i * 37) as u8).collect();
             let file = encode(&h, format, &pixels, StillFormat::Png);
             if format == PixelFormat::Mjpeg {
-                file.unwrap_err(); // pictures are decoded to rgb8 before they come here
+                file.unwrap_err(); // images are decoded to rgb8 before they come here
                 continue;
             }
             if StillFormat::of(format) == StillFormat::Npy {

@@ -1,12 +1,12 @@
-//! Proves that a dataset is whole, or says where it is not.
+//! Proves that a dataset is complete and intact, or lists the places where it is not.
 //!
 //! Checked are: the checksums of data, summary, chunks and attachments; the index against the data, record by
 //! record; that every set has what its commit mark lists, of the length and with the checksum that it lists, and
 //! that the mark lists or excuses every stream; order, times and spreads; the accounts, of sets, of streams and in
-//! the header of each frame; what motion units sent; that segments follow each other; calibration; and on request that
-//! every picture decodes and every single sample says what its batch does.
+//! the header of each frame; what IMUs sent; that segments follow each other; calibration; and on request that
+//! every image decodes and every single sample equals that of its batch.
 //!
-//! Without that request a picture is unpacked only where nothing else proves its bytes, see `segment`.
+//! Without that request an image is unpacked only where nothing else proves its bytes, see `segment`.
 
 use crate::dataset::segments_in;
 use crate::fs::{Fs, RealFs};
@@ -16,10 +16,10 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+mod images;
 mod index;
 mod judge;
 mod motion;
-mod pictures;
 mod records;
 mod seen;
 mod segment;
@@ -33,14 +33,14 @@ const FINDINGS_MAX: usize = 10_000;
 /// Bytes between two reports of progress.
 const REPORT_BYTES: u64 = 4 << 20;
 
-/// What to check beyond the usual.
+/// Checks beyond the usual.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct VerifyOptions {
-    /// Decode every picture as well.
+    /// Decode every image as well.
     pub decode: bool,
     /// Report sets whose frames are further apart than this, nanoseconds, whatever the session says.
     pub max_spread_ns: Option<i64>,
-    /// Threads that unpack and decode pictures; 0: as many as there are cores.
+    /// Threads that unpack and decode images; 0: as many as there are cores.
     pub threads: usize,
 }
 
@@ -53,7 +53,7 @@ impl VerifyOptions {
     }
 }
 
-/// How far a verification is.
+/// Progress of a verification.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct VerifyProgress {
@@ -63,11 +63,11 @@ pub struct VerifyProgress {
     pub total_bytes: u64,
 }
 
-/// Tells somebody how far it is, and hears whether to go on.
+/// Reports progress to the caller, who decides whether to go on.
 struct Watch<'a> {
-    tell: &'a mut dyn FnMut(VerifyProgress) -> ControlFlow<()>,
+    on_progress: &'a mut dyn FnMut(VerifyProgress) -> ControlFlow<()>,
     done: u64,
-    told: u64,
+    reported: u64,
     total: u64,
     stopped: bool,
 }
@@ -76,10 +76,10 @@ impl Watch<'_> {
     /// Whether to stop, after `bytes` more.
     fn advance(&mut self, bytes: u64) -> bool {
         self.done += bytes;
-        if self.done.saturating_sub(self.told) >= REPORT_BYTES {
-            self.told = self.done;
+        if self.done.saturating_sub(self.reported) >= REPORT_BYTES {
+            self.reported = self.done;
             let progress = VerifyProgress { bytes: self.done.min(self.total), total_bytes: self.total };
-            self.stopped |= (self.tell)(progress).is_break();
+            self.stopped |= (self.on_progress)(progress).is_break();
         }
         self.stopped
     }
@@ -91,13 +91,13 @@ impl Watch<'_> {
 pub enum Severity {
     /// Good to know; nothing is wrong with the data.
     Note,
-    /// The dataset says itself that something was not recorded.
+    /// A loss that the dataset itself records.
     Lost,
-    /// The dataset is not what it says it is.
+    /// Damage: the data contradicts itself or the session.
     Broken,
 }
 
-/// One thing that was found.
+/// One finding of a verification.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Finding {
     /// How bad it is.
@@ -106,29 +106,29 @@ pub struct Finding {
     pub file: String,
     /// At which byte, where there is one.
     pub offset: Option<u64>,
-    /// What it is.
+    /// The finding in words.
     pub message: String,
 }
 
-/// What a verification found and how much it looked at.
+/// Report of a verification: findings, and how much was checked.
 #[derive(Debug, Clone, Serialize)]
 #[non_exhaustive]
 pub struct VerifyReport {
     /// The dataset.
     pub path: PathBuf,
-    /// What was found, worst first.
+    /// Findings, worst first.
     pub findings: Vec<Finding>,
     /// Whole sets.
     pub sets: u64,
     /// Their frames.
     pub frames: u64,
-    /// Samples of motion units.
+    /// Samples of IMUs.
     pub motion_samples: u64,
     /// Bytes read.
     pub bytes: u64,
     /// Segments read.
     pub segments: u32,
-    /// Whether the pictures were decoded.
+    /// Whether the images were decoded.
     pub decoded: bool,
     /// Whether it was stopped before the end; the rest was not looked at.
     pub stopped: bool,
@@ -138,22 +138,22 @@ pub struct VerifyReport {
 }
 
 impl VerifyReport {
-    /// The worst that was found; `None` when there is nothing at all.
+    /// The worst severity; `None` without findings.
     pub fn worst(&self) -> Option<Severity> {
         self.findings.iter().map(|f| f.severity).max()
     }
 
-    /// The first that is not what it should be; `None` when all of the dataset is what it says it is.
+    /// The first finding of damage; `None` if the dataset is intact.
     pub fn broken(&self) -> Option<&Finding> {
         self.findings.iter().find(|f| f.severity == Severity::Broken)
     }
 
-    /// What was lost.
+    /// The losses.
     pub fn lost(&self) -> impl Iterator<Item = &Finding> {
         self.findings.iter().filter(|f| f.severity == Severity::Lost)
     }
 
-    /// Whether the dataset is what it says it is and lost nothing.
+    /// Whether the dataset is intact and lost nothing.
     pub fn is_whole(&self) -> bool {
         self.worst() < Some(Severity::Lost)
     }
@@ -162,7 +162,7 @@ impl VerifyReport {
 /// Verifies the dataset `path`.
 ///
 /// # Errors
-/// As [`Dataset::open`]: what is no dataset cannot be verified. Damage is a finding, not an error.
+/// As [`Dataset::open`] if the path is not a dataset. Damage is a finding, not an error.
 pub fn verify(path: &Path, options: &VerifyOptions) -> Result<VerifyReport> {
     let fs: Arc<dyn Fs> = Arc::new(RealFs);
     verify_with(&fs, path, options)
@@ -176,7 +176,7 @@ pub fn verify_with(fs: &Arc<dyn Fs>, path: &Path, options: &VerifyOptions) -> Re
     verify_watched(fs, path, options, &mut |_| ControlFlow::Continue(()))
 }
 
-/// The same while telling how far it is, and as long as `tell` says so.
+/// The same with progress reports, until `on_progress` breaks.
 ///
 /// # Errors
 /// As [`verify`].
@@ -184,14 +184,14 @@ pub fn verify_watched(
     fs: &Arc<dyn Fs>,
     path: &Path,
     options: &VerifyOptions,
-    tell: &mut dyn FnMut(VerifyProgress) -> ControlFlow<()>,
+    on_progress: &mut dyn FnMut(VerifyProgress) -> ControlFlow<()>,
 ) -> Result<VerifyReport> {
     let mut findings = Findings::default();
     let (session, segments, outcome) = open(fs, path, &mut findings)?;
     check_session(&session, &mut findings);
     check_names(&segments, path, &mut findings);
     let sizes = segments.iter().filter_map(|s| fs.open(s).and_then(|f| f.size()).ok());
-    let mut watch = Watch { tell, done: 0, told: 0, total: sizes.sum(), stopped: false };
+    let mut watch = Watch { on_progress, done: 0, reported: 0, total: sizes.sum(), stopped: false };
     let mut walk = Walk::new(&session, *options);
     for path in &segments {
         segment::segment(&mut walk, &**fs, path, &mut findings, &mut watch);
@@ -272,7 +272,7 @@ fn open(fs: &Arc<dyn Fs>, path: &Path, findings: &mut Findings) -> Result<(Sessi
                     Severity::Broken,
                     SESSION_FILE,
                     None,
-                    format!("{SESSION_FILE} is missing; the segments tell what was in it"),
+                    format!("{SESSION_FILE} is missing; the session is read from the segments"),
                 );
                 return Ok((d.session().clone(), d.segments().to_vec(), false));
             }
@@ -299,8 +299,9 @@ fn open(fs: &Arc<dyn Fs>, path: &Path, findings: &mut Findings) -> Result<(Sessi
 
 fn check_session(session: &Session, findings: &mut Findings) {
     let is_there = |id: &depthrig_bus::StreamId| session.streams.iter().any(|s| s.id == *id);
-    for made in session.computed.iter().filter(|made| !is_there(&made.stream)) {
-        let what = format!("{} is said to be {}, but there is no such stream", made.stream, made.name);
+    for computed in session.computed.iter().filter(|c| !is_there(&c.stream)) {
+        let what =
+            format!("{} is said to be {}, but there is no such stream", computed.stream, computed.name);
         findings.add(Severity::Broken, SESSION_FILE, None, what);
     }
     for u in session.motion.iter().filter(|u| u.calibration.is_empty()) {

@@ -1,4 +1,4 @@
-//! How much memory a file can make its reader take, by an allocator that counts it.
+//! Limits the memory that a file can make its reader allocate, by a counting allocator.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
@@ -42,8 +42,10 @@ fn recorded() -> MemFs {
     for n in 0..2 {
         let mut header = FrameHeader::default();
         header.set_names("rig", &session.streams[0].id);
-        header.set_picture(PixelFormat::Z16, 64, 48);
-        (header.sequence, header.captured, header.depth_unit_m) = (n + 1, n + 1, 0.001);
+        header.set_image(PixelFormat::Z16, 64, 48);
+        header.sequence = n + 1;
+        header.captured = n + 1;
+        header.depth_unit_m = 0.001;
         header.capture_time_ns = n as i64 * 200_000_000;
         let pixels = Box::new(vec![7; 64 * 48 * 2]);
         let tick = HostTime::from_ns(header.capture_time_ns);
@@ -84,7 +86,7 @@ fn read_all(fs: &MemFs) {
     let _ = recover_with(&fs, dir, &RecoverOptions::default(), &mut |_| ControlFlow::Continue(()));
 }
 
-/// One test, because what others take at the same time would be counted as well.
+/// One test, because concurrent tests would be counted as well.
 #[test]
 fn no_file_takes_more_memory_than_its_limits_say() {
     let whole = recorded();

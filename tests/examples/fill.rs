@@ -1,6 +1,6 @@
-//! Prints how good the depth of the simulated cameras is, raw and filled, and writes pictures of it.
+//! Prints how good the depth of the simulated cameras is, raw and filled, and writes images of it.
 //!
-//! `cargo run --release -p depthrig-tests --example fill [-- FOLDER [MODEL...]]`; without a folder no pictures are written.
+//! `cargo run --release -p depthrig-tests --example fill [-- FOLDER [MODEL...]]`; without a folder no images are written.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stdout)] // a measuring program: any failure ends it
 
 use depthrig_cdm::metrics::{Dataset, Depth, DepthRange, Measured};
@@ -21,9 +21,12 @@ fn main() {
         "model   depth  strict: L1 m  RMSE m  AbsRel   d0.5     d1 | plain: L1 m  RMSE m  AbsRel   d0.5     d1 | filled % | where raw has depth: L1 m  better %  worse %   CPU ms (steps on the wall clock)"
     );
     for model in models {
-        let (mut raw_set, mut fill_set) = (Dataset::new(RANGE), Dataset::new(RANGE));
-        let (mut raw_all, mut fill_all) = (Measured::nothing(0.25, 16), Measured::nothing(0.25, 16));
-        let (mut best, mut same) = (u64::MAX, SameSpots::default());
+        let mut raw_set = Dataset::new(RANGE);
+        let mut fill_set = Dataset::new(RANGE);
+        let mut raw_all = Measured::nothing(0.25, 16);
+        let mut fill_all = Measured::nothing(0.25, 16);
+        let mut best = u64::MAX;
+        let mut same = SameSpots::default();
         let mut steps = StepTimes::default();
         for (i, place) in places().into_iter().enumerate() {
             let scene = shoot(model, Size::Default, place, &cache);
@@ -41,18 +44,19 @@ fn main() {
                 [(&scene.raw, &mut raw_set, &mut raw_all), (&filled, &mut fill_set, &mut fill_all)]
             {
                 let unit_m = scene.unit_m;
-                let (p, t) = (Depth::Units { pixels, unit_m }, Depth::Units { pixels: &scene.truth, unit_m });
+                let p = Depth::Units { pixels, unit_m };
+                let t = Depth::Units { pixels: &scene.truth, unit_m };
                 let m = Measured::of(&p, &t, RANGE, (0.25, 16)).unwrap();
                 set.push(&m);
                 all.plus(&m);
             }
             same.add(&scene, &filled);
             if let Some(folder) = &folder {
-                pictures(folder, &format!("{model}-{i}"), &scene, &filled);
+                images(folder, &format!("{model}-{i}"), &scene, &filled);
             }
         }
         for (name, set, all) in [("raw", &raw_set, &raw_all), ("fill", &fill_set, &fill_all)] {
-            let m = set.metrics().mean_of_pictures;
+            let m = set.metrics().mean_of_images;
             print!(
                 "{model:7} {name:5}  {:12.4}  {:6.4}  {:6.4}  {:5.4} {:6.4}",
                 m.strict_l1_m, m.strict_rmse_m, m.strict_abs_rel, m.strict_delta_05, m.strict_delta_1
@@ -119,7 +123,8 @@ impl SameSpots {
         for ((raw, fill), truth) in scene.raw.iter().zip(filled).zip(&scene.truth) {
             if *raw > 0 && *truth > 0 && *fill > 0 {
                 let error = |d: u16| (f64::from(d) - f64::from(*truth)).abs() * scene.unit_m;
-                let (a, b) = (error(*raw), error(*fill));
+                let a = error(*raw);
+                let b = error(*fill);
                 self.pixels += 1;
                 self.raw_m += a;
                 self.fill_m += b;
@@ -147,7 +152,7 @@ fn job<'a>(scene: &'a Scene, out: &'a mut [u16]) -> Job<'a> {
 }
 
 /// Colour, raw, filled and true depth, and the errors of both, on one sheet.
-fn pictures(folder: &Path, name: &str, scene: &Scene, filled: &[u16]) {
+fn images(folder: &Path, name: &str, scene: &Scene, filled: &[u16]) {
     let (w, h) = scene.size;
     let mut sheet = image::RgbImage::new(2 * w as u32, 3 * h as u32);
     let depth = |d: u16| {
@@ -167,9 +172,11 @@ fn pictures(folder: &Path, name: &str, scene: &Scene, filled: &[u16]) {
         if e > 0.0 { [255, pale, pale] } else { [pale, pale, 255] }
     };
     for (i, filled) in filled.iter().enumerate() {
-        let (x, y) = ((i % w) as u32, (i / w) as u32);
+        let x = (i % w) as u32;
+        let y = (i / w) as u32;
         let c = [scene.color[3 * i], scene.color[3 * i + 1], scene.color[3 * i + 2]];
-        let (w, h) = (w as u32, h as u32);
+        let w = w as u32;
+        let h = h as u32;
         sheet.put_pixel(x, y, image::Rgb(c));
         sheet.put_pixel(x + w, y, image::Rgb(depth(scene.truth[i])));
         sheet.put_pixel(x, y + h, image::Rgb(depth(scene.raw[i])));

@@ -63,7 +63,7 @@ fn pixels(s: &StreamRecord, n: u64) -> Vec<u8> {
     out
 }
 
-/// What the motion unit sends between set `n` and the one before: two batches, of five samples and of three.
+/// The two batches that the IMU sends between set `n` and the one before, of five and of three samples.
 fn motion(unit: &MotionRecord, n: u64) -> Vec<RecordMotion> {
     let sample = |k: u64| {
         let v = k as f32;
@@ -85,7 +85,7 @@ fn motion(unit: &MotionRecord, n: u64) -> Vec<RecordMotion> {
         let mut header = FrameHeader::default();
         header.set_names("golden", &unit.id);
         header.set_device(&unit.model, &unit.serial);
-        header.set_picture(PixelFormat::Motion, samples.len() as u32, 1);
+        header.set_image(PixelFormat::Motion, samples.len() as u32, 1);
         (header.sequence, header.captured) = (2 * n + b, 2 * n + b);
         header.device_sequence = 8 * n + to;
         header.capture_time_ns = samples[samples.len() - 1].time_ns;
@@ -158,7 +158,7 @@ fn write(dir: &Path, color: ColorCodec, depth: DepthCodec, stereo: bool) {
                 let mut header = FrameHeader::default();
                 header.set_names("golden", &s.id);
                 header.set_device(&s.model, &s.serial);
-                header.set_picture(s.format, s.width, s.height);
+                header.set_image(s.format, s.width, s.height);
                 header.sequence = 6 * n + 1;
                 header.captured = header.sequence;
                 header.capture_time_ns = tick - 4_000_000 + 1_000_000 * stream as i64;

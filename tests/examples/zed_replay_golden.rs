@@ -1,4 +1,4 @@
-//! Depth of `zed replay` for readers that are not ours: a dataset, and what they must find in it.
+//! Depth of `zed replay` for third-party readers: a dataset and its expected contents.
 //!
 //! `cargo run -p depthrig-tests --example zed_replay_golden -- DATASET EXPECTED`; EXPECTED is as
 //! `depthrig_tests::expected` writes it.
@@ -8,7 +8,7 @@ use core::ops::ControlFlow;
 use depthrig_daemon::zed_replay::{ZedReplayOptions, zed_replay};
 use depthrig_recorder::Dataset;
 use depthrig_tests::expected;
-use depthrig_tests::eyes::Eyes;
+use depthrig_tests::synthetic_stereo::SyntheticStereo;
 use std::path::Path;
 
 fn main() {
@@ -20,7 +20,7 @@ fn main() {
     let dataset = Path::new(dataset);
     let source = tempfile::tempdir().unwrap();
     let source = source.path().join("source");
-    Eyes { size: (96, 54), focal: 75.0, sets: 3, ..Eyes::default() }.record(&source);
+    SyntheticStereo { size: (96, 54), focal: 75.0, sets: 3, ..SyntheticStereo::default() }.record(&source);
     let options = ZedReplayOptions { disparity: true, ..ZedReplayOptions::default() };
     zed_replay(&source, dataset, &options, &mut |_, _, _| ControlFlow::Continue(())).unwrap();
     assert_eq!(

@@ -1,4 +1,4 @@
-//! What a pass of `zed replay` costs beside the stereo in it, in processor time.
+//! Measures the processor time of a pass of `zed replay` against the stereo matching in it.
 //!
 //! `cargo run --release -p depthrig-tests --example zed_replay_ratio [PAIRS [WIDTH HEIGHT [RUNS [JOBS]]]]`
 //!
@@ -12,7 +12,7 @@
 use core::ops::ControlFlow;
 use depthrig_calib::stereo::Preset;
 use depthrig_daemon::zed_replay::{CpuReport, Mode, ZedReplayOptions, ZedReplayReport, zed_replay};
-use depthrig_tests::eyes::Eyes;
+use depthrig_tests::synthetic_stereo::SyntheticStereo;
 use std::path::Path;
 
 /// The most that a pass may cost, in sums of the parts' matching.
@@ -37,16 +37,20 @@ fn replay(dir: &Path, modes: &[Mode], jobs: usize, disparity: bool) -> ZedReplay
 fn main() {
     let args: Vec<u64> = std::env::args().skip(1).map(|a| a.parse().unwrap()).collect();
     let arg = |i: usize, default: u64| args.get(i).copied().unwrap_or(default);
-    let (pairs, width, height, runs, jobs) =
-        (arg(0, 10), arg(1, 1280), arg(2, 720), arg(3, 3), arg(4, 1) as usize);
+    let pairs = arg(0, 10);
+    let width = arg(1, 1280);
+    let height = arg(2, 720);
+    let runs = arg(3, 3);
+    let jobs = arg(4, 1) as usize;
     let dir = tempfile::tempdir().unwrap();
     let size = (width as u32, height as u32);
     // The ZED 2i's 2.1 mm lens at 720p.
     let focal = 525.0 * width as f64 / 1280.0;
-    Eyes { size, focal, sets: pairs, ..Eyes::default() }.record(&dir.path().join("source"));
+    SyntheticStereo { size, focal, sets: pairs, ..SyntheticStereo::default() }
+        .record(&dir.path().join("source"));
     let modes = [Preset::Performance, Preset::Ultra, Preset::Quality].map(Mode::Preset);
-    let (mut parts, mut pass) =
-        ([f64::INFINITY; 3], CpuReport { total_s: f64::INFINITY, ..CpuReport::default() });
+    let mut parts = [f64::INFINITY; 3];
+    let mut pass = CpuReport { total_s: f64::INFINITY, ..CpuReport::default() };
     let mut memory = 0;
     for _ in 0..runs {
         for (mode, best) in modes.iter().zip(&mut parts) {

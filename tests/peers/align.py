@@ -4,8 +4,8 @@
     python tests/peers/align.py --depthrig target/release/examples/align_frames
 
 Each pair of modes is played through a software device of librealsense, so that `align` has intrinsics and extrinsics as
-from a camera. Printed are the best CPU time of a frame on each side, from rounds that take turns on one core, how many
-pixels have depth on each side, and how many are covered by ours of those that `align` covers. The values differ by
+from a camera. It prints the best CPU time of a frame on each side, from rounds that alternate on one core, how many
+pixels have depth on each side, and how many of the pixels that `align` covers are covered by ours. The values differ by
 design: `align` keeps depth along depth's axis as the pixel beside the ray measured it. With cameras that are not turned
 against each other (the last rows) both axes are one, and depth must agree within what it changes from pixel to pixel.
 librealsense honours the distortion of colour for one lens model only, MODIFIED_BROWN_CONRADY; where a lens is named it is

@@ -8,8 +8,8 @@ this repository); WEIGHTS a .safetensors file of it, trained or not; PROGRAM the
 (cargo build --release -p depthrig-cdm --example network). An engine is DEVICE/PRECISION[/LIBRARY]. Needs torch, numpy,
 safetensors, and what the official code imports (opencv, torchvision).
 
-Everyone takes turns: in each round every engine runs once at every size, so that a busy computer is busy for all. What
-is compared is CPU time of all threads, best of the rounds, and time on the clock, best and median.
+The engines alternate: in each round every engine runs once at every size, so that load on the computer affects all. It
+compares CPU time of all threads, best of the rounds, and wall time, best and median.
 """
 import argparse, json, pathlib, statistics, subprocess, sys, tempfile, time
 import numpy as np
@@ -61,7 +61,7 @@ class Ours:
         return np.fromfile(result, "<f4").reshape(height, width), float(wall), float(cpu), int(peak)
 
 
-def picture(size):
+def image(size):
     """A network's input of a 1280x720 camera at this size, of smooth colour and depth with holes."""
     height = round(size / 14) * 14
     width = round(1280 / 720 * size / 14) * 14
@@ -94,7 +94,7 @@ def main():
         for engine in args.engine or ["cpu/fp32"]:
             engines.append(Ours(args.network, args.weights, engine, args.threads, folder))
         for size in map(int, args.sizes.split(",")):
-            x, times, outputs, peaks = picture(size), {}, {}, {}
+            x, times, outputs, peaks = image(size), {}, {}, {}
             for _ in range(args.rounds):
                 for engine in engines:
                     y, wall, cpu, peak = engine.run(x)

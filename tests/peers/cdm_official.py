@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
-"""Runs the official camera depth model on one pair of pictures and writes what it saw and gave, for `cargo run -p depthrig-cdm
---example parity`.
+"""Runs the official camera depth model on one pair of images and writes its input and output, for
+`cargo run -p depthrig-cdm --example parity`.
 
 usage: PYTHONPATH=.../manip-as-in-sim-suite/cdm cdm_official.py ENCODER WEIGHTS.safetensors RGB.png DEPTH.png UNITS_PER_METRE INPUT_SIZE
        OUT.safetensors [--crop X,Y,WIDTH,HEIGHT] [--turn]
@@ -30,7 +30,7 @@ def main():
     parser.add_argument("units_per_metre", type=float)
     parser.add_argument("input_size", type=int)
     parser.add_argument("out")
-    parser.add_argument("--crop", help="this part of the pictures: X,Y,WIDTH,HEIGHT")
+    parser.add_argument("--crop", help="this part of the images: X,Y,WIDTH,HEIGHT")
     parser.add_argument("--turn", action="store_true", help="rows become columns")
     args = parser.parse_args()
 

@@ -1,6 +1,6 @@
-"""depthrig beside other recorders: the same pictures, taking turns. `make bench-peers` runs it.
+"""Compares depthrig with other recorders on the same images. `make bench-peers` runs it.
 
-Every round runs every writer once, each in a process of its own and in another order each time. Said are medians over
+Every round runs every writer once, each in a process of its own and in another order each time. It prints medians over
 the rounds, and for each other writer the medians of the ratios inside the rounds: a busy computer slows both sides.
 """
 
@@ -48,22 +48,22 @@ def lossy(writer: str) -> bool:
     return "JPEG" in writer
 
 
-def measure(writer: str, args: argparse.Namespace, pictures: Path, sets: int) -> dict:
+def measure(writer: str, args: argparse.Namespace, images: Path, sets: int) -> dict:
     """One run; the files it wrote are removed."""
     with tempfile.TemporaryDirectory(dir=args.dir) as tmp:
         out = str(Path(tmp) / "out")
         if writer in DEPTHRIG:
-            command = [args.depthrig, json.dumps(DEPTHRIG[writer]), str(pictures), str(sets), out]
+            command = [args.depthrig, json.dumps(DEPTHRIG[writer]), str(images), str(sets), out]
         else:
-            command = [sys.executable, str(HERE / "writers.py"), writer, str(pictures), str(sets), out]
+            command = [sys.executable, str(HERE / "writers.py"), writer, str(images), str(sets), out]
         done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
         if done.returncode:
             raise SystemExit(f"{writer} failed:\n{done.stderr[-2000:]}")
         return json.loads(done.stdout.splitlines()[-1])
 
 
-def compare(args: argparse.Namespace, pictures: Path, source: str) -> dict:
-    """All writers on one set of pictures."""
+def compare(args: argparse.Namespace, images: Path, source: str) -> dict:
+    """All writers on one set of images."""
     writers = list(DEPTHRIG) + PEERS
     runs: dict[str, list[dict]] = {w: [] for w in writers}
     for n in range(args.rounds):
@@ -71,7 +71,7 @@ def compare(args: argparse.Namespace, pictures: Path, source: str) -> dict:
         for writer in writers[turn:] + writers[:turn]:
             if sys.stderr.isatty():
                 print(f"\rround {n + 1} of {args.rounds}, {writer:<40}", end="\r", file=sys.stderr)
-            runs[writer].append(measure(writer, args, pictures, args.sets))
+            runs[writer].append(measure(writer, args, images, args.sets))
     median = lambda writer, f: statistics.median(map(f, runs[writer]))  # noqa: E731
     rows = {
         w: {
@@ -91,12 +91,12 @@ def compare(args: argparse.Namespace, pictures: Path, source: str) -> dict:
             cpu = statistics.median(p["cpu_s"] / o["cpu_s"] for p, o in rounds)
             size = statistics.median(p["disk_bytes"] / o["disk_bytes"] for p, o in rounds)
             against[peer][ours] = {"speed": cpu, "size": size, "ahead": cpu > 1 and size * SAME_BYTES >= 1}
-    return {"pictures": source, "rows": rows, "against": against, "runs": runs}
+    return {"images": source, "rows": rows, "against": against, "runs": runs}
 
 
 def text(result: dict) -> str:
-    """The tables of one set of pictures."""
-    lines = [f"\nPictures: {result['pictures']}", f"{'':<34}{'MB/CPU s':>10}{'CPU ms/pair':>13}{'MB/pair':>9}{'ratio':>7}"]
+    """The tables of one set of images."""
+    lines = [f"\nPictures: {result['images']}", f"{'':<34}{'MB/CPU s':>10}{'CPU ms/pair':>13}{'MB/pair':>9}{'ratio':>7}"]
     for group in (False, True):
         lines.append("Colour as JPEG quality 95 4:4:4, depth lossless" if group else "Lossless")
         for writer, r in sorted(result["rows"].items(), key=lambda x: -x[1]["mb_per_cpu_s"]):
@@ -116,15 +116,15 @@ def main() -> None:
     parser.add_argument("--depthrig", required=True, help="the built example bench_frames")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--sets", type=int, default=6, help="sets of seven pairs in each run")
-    # Memory: how much CPU time a page costs on its way to a disk depends on what the disk does for others.
+    # In memory: the CPU time of writing a page to a disk depends on the disk's other load.
     memory = "/dev/shm" if Path("/dev/shm").is_dir() and shutil.disk_usage("/dev/shm").free > 2 << 30 else None
-    parser.add_argument("--dir", default=memory, help="where files are written and removed (default: %(default)s)")
-    parser.add_argument("--json", type=Path, help="write everything measured here")
+    parser.add_argument("--dir", default=memory, help="folder for temporary files [default: %(default)s]")
+    parser.add_argument("--json", type=Path, help="write all measurements to this file")
     parser.add_argument("--check", action="store_true", help="exit code 1 when a writer is not beaten on both")
     args = parser.parse_args()
     data = Path(os.environ.get("DEPTHRIG_TEST_DATA", HERE.parents[2] / "shared/data"))
     if not data.is_dir():
-        raise SystemExit(f"the real pictures are not at {data}; set DEPTHRIG_TEST_DATA to their folder")
+        raise SystemExit(f"the real images are not at {data}; set DEPTHRIG_TEST_DATA to their folder")
     if shutil.disk_usage(args.dir or tempfile.gettempdir()).free < 2 << 30:
         raise SystemExit("less than 2 GiB of disk left; free some or choose another --dir")
     load = Path("/proc/loadavg").read_text().split()[0]
@@ -132,7 +132,7 @@ def main() -> None:
     print(f"{os.cpu_count()} x {model}, load average {load} before; {args.rounds} rounds of {7 * args.sets} pairs in {args.dir}")
     results = []
     with tempfile.TemporaryDirectory(dir=args.dir) as tmp:
-        for name, (pairs, source) in (("real", frames.real(data)), ("made", frames.made())):
+        for name, (pairs, source) in (("real", frames.real(data)), ("synthetic", frames.synthetic())):
             path = Path(tmp) / name
             frames.save(path, pairs, source)
             results.append(compare(args, path, source))

@@ -1,13 +1,13 @@
-"""Pictures from one process to a NumPy array in another: depthrig beside pyzmq, zenoh and dora-rs. `make bench-feed`.
+"""Compares sending images to a NumPy array in another process: depthrig, pyzmq, zenoh and dora-rs. `make bench-feed`.
 
-Every round runs every way once, a sender and a receiver in processes of their own, in another order each time. For each
-way the medians over the rounds of p50 and p99 are said, and the medians of the ratios inside the rounds, so that a busy
-computer slows both sides.
+Every round runs every transport once, a sender and a receiver in processes of their own, in another order each time.
+For each it prints the medians over the rounds of p50 and p99, and the medians of the ratios inside the rounds, so that
+a busy computer slows both sides.
 
-`publish` is from right before the call that sends a picture until the receiver has a NumPy array of it (the Rust
-subscriber: its header and pixels). `total` begins with the picture in the sender's own memory, so it contains the copy
+`publish` is from right before the call that sends an image until the receiver has a NumPy array of it (the Rust
+subscriber: its header and pixels). `total` begins with the image in the sender's own memory, so it contains the copy
 into shared memory where there is one. pyzmq sends a NumPy array as it is, through a Unix socket; dora-rs makes its copy
-inside the call that sends. depthrig's reader wakes shortly before a frame is due; `prepare=False` is without that.
+inside the call that sends. depthrig's reader wakes shortly before a frame is due; `prepare=False` disables that.
 Everything stays on this computer: shared memory and Unix sockets; dora's own daemon
 listens on the loopback interface.
 """
@@ -33,7 +33,7 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 ENDS = str(HERE / "feed_ends.py")
 SIZE = (1280, 720)
-PICTURES = {"z16": ("<u2", 2), "rgb8": ("|u1", 3)}
+IMAGES = {"z16": ("<u2", 2), "rgb8": ("|u1", 3)}
 PEERS = {
     "pyzmq": ("zmq", "ipc PUB/SUB, copy=False, high-water mark 4"),
     "zenoh": ("zenoh", "shared memory over a Unix socket, no scouting"),
@@ -43,17 +43,17 @@ OURS, RUST, PLAIN = "depthrig, Python", "depthrig, Rust", "... prepare=False"
 
 
 class Failed(Exception):
-    """A way did not carry its pictures."""
+    """A transport did not deliver its images."""
 
 
 def commands(way: str, args: argparse.Namespace, config: dict[str, Any], path: str) -> list[list[str]]:
-    """The processes of a way, the sender first."""
+    """The processes of a transport, the sender first."""
     python = [sys.executable, ENDS]
     if way in (RUST, OURS, PLAIN):
         folder, shape = config["folder"], f"{SIZE[0]}x{SIZE[1]}"
         send = [args.latency, "send", folder, config["format"], shape, str(args.fps)]
         frames = [str(args.frames), str(args.warm_up)]
-        receive = [args.latency, "receive", folder, "feed/picture", *frames]
+        receive = [args.latency, "receive", folder, "feed/image", *frames]
         ours = "depthrig" if way == OURS else "plain"
         return [send, receive if way == RUST else [*python, ours, "receive", path]]
     name = PEERS[way][0]
@@ -62,9 +62,9 @@ def commands(way: str, args: argparse.Namespace, config: dict[str, Any], path: s
         node = {e: f"{ENDS} dora {e} {path}" for e in ("send", "receive")}
         flow.write_text(
             f"nodes:\n"
-            f"  - id: sender\n    path: {sys.executable}\n    args: {node['send']}\n    outputs: [picture]\n"
+            f"  - id: sender\n    path: {sys.executable}\n    args: {node['send']}\n    outputs: [image]\n"
             f"  - id: receiver\n    path: {sys.executable}\n    args: {node['receive']}\n"
-            f"    inputs:\n      picture:\n        source: sender/picture\n        queue_size: 4\n"
+            f"    inputs:\n      image:\n        source: sender/image\n        queue_size: 4\n"
         )
         return [[str(Path(sys.executable).parent / "dora"), "run", str(flow)]]
     return [[*python, name, "send", path], [*python, name, "receive", path]]
@@ -84,14 +84,14 @@ def end(process: subprocess.Popen[bytes]) -> None:
                 continue
 
 
-def run(way: str, picture: str, args: argparse.Namespace) -> dict[str, list[int]]:
-    """One run of one way."""
-    dtype, size = PICTURES[picture]
-    shape = [SIZE[1], SIZE[0], 3] if picture == "rgb8" else [SIZE[1], SIZE[0]]
+def run(way: str, image: str, args: argparse.Namespace) -> dict[str, list[int]]:
+    """One run of one transport."""
+    dtype, size = IMAGES[image]
+    shape = [SIZE[1], SIZE[0], 3] if image == "rgb8" else [SIZE[1], SIZE[0]]
     folder = tempfile.mkdtemp(prefix="feed", dir="/tmp")  # short, because sockets live below it
     result = Path(folder) / "result.json"
     config = {
-        "format": picture,
+        "format": image,
         "bytes": SIZE[0] * SIZE[1] * size,
         "shape": shape,
         "dtype": dtype,
@@ -104,7 +104,7 @@ def run(way: str, picture: str, args: argparse.Namespace) -> dict[str, list[int]
     path = Path(folder) / "config.json"
     path.write_text(json.dumps(config))
     first = ["chrt", "--fifo", "10"] if args.fifo else []
-    quiet = {**os.environ, "RUST_LOG": "error", "DORA_LOG_LEVEL": "error"}  # dora says something for each picture
+    quiet = {**os.environ, "RUST_LOG": "error", "DORA_LOG_LEVEL": "error"}  # dora logs a line for each image
     processes: list[subprocess.Popen[bytes]] = []
     log = Path(folder) / "stderr.txt"
     out = Path(folder) / "stdout.txt"
@@ -142,21 +142,21 @@ def percentile(samples: list[int], share: float) -> float:
     return sorted(samples)[min(len(samples) - 1, int(len(samples) * share))] / 1e3
 
 
-def compare(picture: str, args: argparse.Namespace) -> dict[str, Any]:
-    """All rounds with one kind of picture."""
+def compare(image: str, args: argparse.Namespace) -> dict[str, Any]:
+    """All rounds with one kind of image."""
     ways = [RUST, OURS, PLAIN, *args.peers]
     rounds: list[dict[str, dict[str, float]]] = []
     for number in range(args.rounds):
         order = random.Random(number).sample(ways, len(ways))
         this: dict[str, dict[str, float]] = {}
         for way in order:
-            samples = run(way, picture, args)
+            samples = run(way, image, args)
             this[way] = {
                 f"{name}_p{q}": percentile(samples[name], q / 100) for name in ("publish", "total") for q in (50, 99)
             }
         rounds.append(this)
         print(
-            f"  {picture} round {number + 1}: " + ", ".join(f"{w} {this[w]['publish_p50']:.0f}" for w in ways),
+            f"  {image} round {number + 1}: " + ", ".join(f"{w} {this[w]['publish_p50']:.0f}" for w in ways),
             flush=True,
         )
     rows = {way: {k: statistics.median(r[way][k] for r in rounds) for k in rounds[0][way]} for way in ways}
@@ -164,12 +164,12 @@ def compare(picture: str, args: argparse.Namespace) -> dict[str, Any]:
         rows[way]["to_rust"] = statistics.median(r[way]["publish_p50"] / r[RUST]["publish_p50"] for r in rounds)
         rows[way]["to_ours"] = statistics.median(r[way]["publish_p50"] / r[OURS]["publish_p50"] for r in rounds)
         rows[way]["total_to_ours"] = statistics.median(r[way]["total_p50"] / r[OURS]["total_p50"] for r in rounds)
-    return {"picture": picture, "bytes": SIZE[0] * SIZE[1] * PICTURES[picture][1], "rows": rows, "rounds": rounds}
+    return {"image": image, "bytes": SIZE[0] * SIZE[1] * IMAGES[image][1], "rows": rows, "rounds": rounds}
 
 
 def text(result: dict[str, Any]) -> str:
     lines = [
-        f"\n{SIZE[0]}x{SIZE[1]} {result['picture']}, {result['bytes']} bytes a picture; microseconds, medians of the rounds",
+        f"\n{SIZE[0]}x{SIZE[1]} {result['image']}, {result['bytes']} bytes an image; microseconds, medians of the rounds",
         f"{'':<20}{'publish p50':>12}{'p99':>9}{'total p50':>11}{'p99':>9}{'p50 / Rust':>12}{'p50 / ours':>12}{'total / ours':>14}",
     ]
     for way, r in result["rows"].items():
@@ -183,16 +183,16 @@ def text(result: dict[str, Any]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--latency", required=True, help="the built example `latency` of depthrig-bus")
-    parser.add_argument("--pictures", nargs="+", default=list(PICTURES), choices=list(PICTURES))
+    parser.add_argument("--images", nargs="+", default=list(IMAGES), choices=list(IMAGES))
     parser.add_argument("--peers", nargs="*", default=list(PEERS), choices=list(PEERS))
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--frames", type=int, default=150)
     parser.add_argument("--warm-up", type=int, default=20)
     parser.add_argument("--fps", type=float, default=30)
-    parser.add_argument("--fifo", action="store_true", help="real-time priority for every process of every way")
-    parser.add_argument("--pin", type=int, nargs="*", help="cores of sender and receiver, of every way; default: none")
-    parser.add_argument("--json", type=Path, help="write everything measured here")
-    parser.add_argument("--check", action="store_true", help="exit code 1 when a promise is not kept")
+    parser.add_argument("--fifo", action="store_true", help="real-time priority for every process of every transport")
+    parser.add_argument("--pin", type=int, nargs="*", help="cores of each sender and receiver [default: none]")
+    parser.add_argument("--json", type=Path, help="write all measurements to this file")
+    parser.add_argument("--check", action="store_true", help="exit code 1 when a target is missed")
     args = parser.parse_args()
     args.latency = str(Path(args.latency).resolve())
     load = os.getloadavg()[0]
@@ -207,8 +207,8 @@ def main() -> None:
     packages = {"pyzmq": "pyzmq", "zenoh": "eclipse-zenoh", "dora-rs": "dora-rs"}
     for way in args.peers:
         print(f"{way} {version(packages[way])}: {PEERS[way][1]}")
-    print(f"{args.rounds} rounds of {args.frames} pictures at {args.fps:g} Hz after {args.warm_up}", flush=True)
-    results = [compare(picture, args) for picture in args.pictures]
+    print(f"{args.rounds} rounds of {args.frames} images at {args.fps:g} Hz after {args.warm_up}", flush=True)
+    results = [compare(image, args) for image in args.images]
     for result in results:
         print(text(result))
     kept = True
@@ -223,7 +223,7 @@ def main() -> None:
         ]
         for what, measured, ok in promises:
             kept &= ok
-            print(f"  {'ok    ' if ok else 'MISSED'} {result['picture']}, {what}: measured {measured:.2f}")
+            print(f"  {'ok    ' if ok else 'MISSED'} {result['image']}, {what}: measured {measured:.2f}")
     if args.json:
         args.json.write_text(json.dumps({"cpu": model, "load_before": load, "results": results}, indent=1) + "\n")
     sys.exit(1 if args.check and not kept else 0)

@@ -1,10 +1,10 @@
-"""One end of a transport that carries pictures: `feed.py` runs two of these at a time.
+"""One end of a transport that carries images: `feed.py` runs two of these at a time.
 
 feed_ends.py WAY send|receive CONFIG.json
 
-Every sender has the pictures in memory of its own, as a driver has, and sends one every 1/fps seconds. Every receiver
-notes the time when a NumPy array of the picture exists; reading the pixels is not part of it. Two times travel with each
-picture: `begin`, when the sender turned to the picture, and `publish`, right before the call that sends it. Where a
+Every sender has the images in memory of its own, as a driver has, and sends one every 1/fps seconds. Every receiver
+notes the time when a NumPy array of the image exists; reading the pixels is not part of it. Two times travel with each
+image: `begin`, when the sender turned to the image, and `publish`, right before the call that sends it. Where a
 transport has shared memory, its buffer is filled between the two.
 """
 
@@ -24,22 +24,22 @@ now = time.monotonic_ns
 TIMES = struct.Struct("<qq")
 
 
-def pictures(config: dict[str, Any]) -> list[np.ndarray]:
+def images(config: dict[str, Any]) -> list[np.ndarray]:
     random = np.random.default_rng(1)
     return [random.integers(0, 256, config["bytes"], np.uint8) for _ in range(8)]
 
 
 def paced(config: dict[str, Any]) -> Iterator[np.ndarray]:
-    """The pictures in turns, each at its time."""
-    turns = pictures(config)
+    """The images in turns, each at its time."""
+    turns = images(config)
     start = time.monotonic()
-    for i in range(1, config["frames"] + config["warm_up"] + 31):  # some more for a receiver that comes late
+    for i in range(1, config["frames"] + config["warm_up"] + 31):  # some more for a receiver that joins late
         time.sleep(max(0.0, start + i / config["fps"] - time.monotonic()))
         yield turns[i % len(turns)]
 
 
 class Samples:
-    """What a receiver has measured."""
+    """A receiver's measurements."""
 
     def __init__(self, config: dict[str, Any]) -> None:
         self.config = config
@@ -48,7 +48,7 @@ class Samples:
         self.seen = 0
 
     def add(self, array: np.ndarray, begin: int, published: int) -> bool:
-        """Note the time now, for an array that exists; whether that was the last one."""
+        """Record the current time for an array that exists; return whether that was the last one."""
         at = now()
         assert array.nbytes == self.config["bytes"], array.nbytes
         assert array.shape == tuple(self.config["shape"]), array.shape
@@ -69,7 +69,7 @@ def depthrig_receive(config: dict[str, Any], prepare: bool = True) -> None:
     import depthrig
 
     samples = Samples(config)
-    with depthrig.Stream("feed/picture", runtime_dir=config["folder"], timeout=10, prepare=prepare) as stream:
+    with depthrig.Stream("feed/image", runtime_dir=config["folder"], timeout=10, prepare=prepare) as stream:
         while True:
             frame = stream.next(timeout=10)
             array = frame.array
@@ -93,9 +93,9 @@ def zmq_send(config: dict[str, Any]) -> None:
     socket = zmq.Context().socket(zmq.PUB)
     socket.sndhwm = 4
     socket.bind(f"ipc://{config['folder']}/zmq")
-    for picture in paced(config):
+    for image in paced(config):
         t = now()
-        socket.send_multipart([TIMES.pack(t, t), picture], copy=False)
+        socket.send_multipart([TIMES.pack(t, t), image], copy=False)
 
 
 def zmq_receive(config: dict[str, Any]) -> None:
@@ -134,12 +134,12 @@ def zenoh_send(config: dict[str, Any]) -> None:
 
     session = zenoh_session(config, "listen")
     publisher = session.declare_publisher(
-        "feed/picture", congestion_control=zenoh.CongestionControl.BLOCK, priority=zenoh.Priority.REAL_TIME
+        "feed/image", congestion_control=zenoh.CongestionControl.BLOCK, priority=zenoh.Priority.REAL_TIME
     )
     provider = zenoh.shm.ShmProvider.default_backend(config["bytes"] * 16)
     policy = zenoh.shm.BlockOn(zenoh.shm.GarbageCollect())
-    # Its buffers take `bytes` only: the picture is that already, as a driver would have it for zenoh.
-    turns = {id(p): bytes(p) for p in pictures(config)}
+    # Its buffers take `bytes` only: the image is that already, as a driver would have it for zenoh.
+    turns = {id(p): bytes(p) for p in images(config)}
     ready = list(turns.values())
     for i, _ in enumerate(paced(config)):
         begin = now()
@@ -150,7 +150,7 @@ def zenoh_send(config: dict[str, Any]) -> None:
 
 def zenoh_receive(config: dict[str, Any]) -> None:
     session = zenoh_session(config, "connect")
-    subscriber = session.declare_subscriber("feed/picture")
+    subscriber = session.declare_subscriber("feed/image")
     samples = Samples(config)
     shared = True
     for sample in subscriber:
@@ -168,11 +168,11 @@ def dora_send(config: dict[str, Any]) -> None:
     import pyarrow
 
     node = dora.Node()
-    for picture in paced(config):
-        array = pyarrow.array(picture)
+    for image in paced(config):
+        array = pyarrow.array(image)
         t = now()
         # The copy into its shared memory happens in here, so its `publish` contains that copy.
-        node.send_output("picture", array, {"begin": str(t), "publish": str(t)})
+        node.send_output("image", array, {"begin": str(t), "publish": str(t)})
 
 
 def dora_receive(config: dict[str, Any]) -> None:

@@ -1,7 +1,7 @@
-"""Colour and depth pictures that every recorder is given: 1280x720, real ones and made ones.
+"""Colour and depth images that every recorder is given: 1280x720, real and synthetic.
 
-A set of pictures is one file: a line of JSON (`width`, `height`, `pairs`, `source`), then for each pair the RGB8
-pixels and the little-endian 16-bit depth. Real pictures of 640x480 are put together four to a picture, each another
+A set of images is one file: a line of JSON (`width`, `height`, `pairs`, `source`), then for each pair the RGB8
+pixels and the little-endian 16-bit depth. Real images of 640x480 are put together four to an image, each another
 one: scaling would smooth them, and tiling one would let a compressor find its repetition.
 """
 
@@ -18,7 +18,7 @@ def _load(color: Path, depth: Path) -> tuple[np.ndarray, np.ndarray]:
     rgb = cv2.imread(str(color), cv2.IMREAD_COLOR)
     z = cv2.imread(str(depth), cv2.IMREAD_UNCHANGED)
     if rgb is None or z is None or z.dtype != np.uint16:
-        raise SystemExit(f"{color} and {depth} cannot be read as a colour and a 16-bit depth picture")
+        raise SystemExit(f"{color} and {depth} cannot be read as a colour and a 16-bit depth image")
     return np.ascontiguousarray(rgb[..., ::-1]), z
 
 
@@ -40,7 +40,7 @@ def real(data: Path) -> tuple[list, str]:
     return pairs, "cdm_d405 as it is, two mosaics of lingbot_depth 0 to 3"
 
 
-def made() -> tuple[list, str]:
+def synthetic() -> tuple[list, str]:
     """Rooms of planes and balls with texture, sensor noise, holes, and depth from whole steps of disparity."""
     rng = np.random.default_rng(1)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
@@ -66,11 +66,11 @@ def made() -> tuple[list, str]:
         edges = cv2.dilate((np.abs(np.diff(depth, axis=1, prepend=depth[:, :1])) > 0.05).astype(np.uint8), np.ones((9, 9)))
         z16[(edges > 0) | (rng.random(depth.shape) < 0.01)] = 0
         pairs.append((np.clip(noisy, 0, 255).astype(np.uint8), z16.astype(np.uint16)))
-    return pairs, "three made rooms"
+    return pairs, "three synthetic rooms"
 
 
 def save(path: Path, pairs: list, source: str) -> None:
-    """Writes a set of pictures."""
+    """Writes a set of images."""
     head = {"width": WIDTH, "height": HEIGHT, "pairs": len(pairs), "source": source}
     with path.open("wb") as f:
         f.write(json.dumps(head).encode() + b"\n")
@@ -80,7 +80,7 @@ def save(path: Path, pairs: list, source: str) -> None:
 
 
 def load(path: Path) -> tuple[dict, list[tuple[bytes, bytes]]]:
-    """The head and the pairs of a set of pictures."""
+    """The head and the pairs of a set of images."""
     with path.open("rb") as f:
         head = json.loads(f.readline())
         pixels = head["width"] * head["height"]

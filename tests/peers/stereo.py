@@ -1,24 +1,24 @@
-"""depthrig's stereo beside OpenCV's semi-global matching: the same pairs, taking turns. Needs OpenCV and NumPy.
+"""Compares depthrig's stereo with OpenCV's semi-global matching on the same pairs. Needs OpenCV and NumPy.
 
     cargo build --release -p depthrig
     python tests/peers/stereo.py --depthrig target/release/depthrig --pair ALOE_L ALOE_R ALOE_GT 1 224 [--pair ...]
 
-Each --pair is: left picture, right picture, true disparity of the left one (a picture of 8 or 16 bits, .pfm or .npy), the
-number that its values are divided by, how many disparities to search, and if there is one a sixth: mask:FILE, a picture that is
-255 where both eyes see (Middlebury's mask0nocc.png), or right:FILE, the true disparity of the right picture. 0 and what is not
-finite is unknown. Pairs that need more than 256 disparities are halved first. For example, of Middlebury's:
+Each --pair is: left image, right image, true disparity of the left one (an image of 8 or 16 bits, .pfm or .npy), the
+number that its values are divided by, how many disparities to search, and optionally mask:FILE, an image that is 255
+where both cameras see (Middlebury's mask0nocc.png), or right:FILE, the true disparity of the right image. 0 and
+non-finite values are unknown. Pairs that need more than 256 disparities are halved first. For example, of Middlebury's:
 
     --pair view1.png view5.png disp1.png 1 240 right:disp5.png       2005, 2006, full size (half: 2, third: 3)
     --pair im2.ppm im6.ppm disp2.pgm 8 32                             2001
     --pair im0.png im1.png disp0GT.pfm 1 144 mask:mask0nocc.png       2014, evaluation 3
 
-Said for each pair are bad-2.0 (share of the pixels whose disparity
-is wrong by more than two), invalid (share that has none), and their sum, over the pixels with a true disparity that the right eye
-sees too: those of the mask; else those whose disparity the right truth repeats within one; else those that no nearer one of the
-left truth hides. And for pictures of 1280x720 with 128 disparities the CPU time on one core, the best of rounds that take turns. OpenCV's
-pictures are made wider on the left by as many pixels as disparities are searched, so that it gives no pixel up; its speed is
-measured without that, which it gains a tenth by. With --rows 0.5 1 ... nothing is compared: it is said what depthrig makes of
-the pairs when the right picture lies so many pixels lower than it should. Exit code 1 when one of these is not kept:
+It prints for each pair bad-2.0 (share of the pixels whose disparity is wrong by more than two), invalid (share without
+a disparity), and their sum, over the pixels with a true disparity that the right camera sees too: those of the mask;
+else those whose disparity the right truth repeats within one; else those that no nearer one of the left truth hides.
+For images of 1280x720 with 128 disparities it prints the CPU time on one core, the best of alternating rounds. OpenCV's
+images are padded on the left by as many pixels as disparities are searched, so that it loses no pixel; its speed is
+measured without that, which makes it a tenth faster. With --rows 0.5 1 ... nothing is compared: it prints depthrig's
+result when the right image lies so many pixels lower than it should. Exit code 1 when one of these targets is missed:
 
 - quality: at most 0.25 of MODE_HH's and 0.6 of MODE_SGBM_3WAY's CPU time,
 - performance: at most 1/2.5 of quality's,
@@ -51,7 +51,7 @@ def opencv(mode: str, disparities: int) -> cv2.StereoSGBM:
 
 
 def seen_by_both(truth: np.ndarray) -> np.ndarray:
-    """Pixels with a true disparity that no nearer one hides from the right eye."""
+    """Pixels with a true disparity that no nearer one hides from the right camera."""
     height, width = truth.shape
     seen = np.zeros(truth.shape, bool)
     columns = np.arange(width)
@@ -67,7 +67,7 @@ def seen_by_both(truth: np.ndarray) -> np.ndarray:
 
 
 def seen_by_right_truth(truth: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Pixels whose true disparity is that of the right picture's pixel too, within one."""
+    """Pixels whose true disparity is that of the right image's pixel too, within one."""
     rows, columns = np.indices(truth.shape)
     known = np.isfinite(truth)
     there = np.where(known, np.round(columns - np.where(known, truth, 0)), -1).astype(int)
@@ -85,7 +85,7 @@ def score(disparity: np.ndarray, truth: np.ndarray, seen: np.ndarray) -> tuple[f
 def read(path: str, how: int) -> np.ndarray:
     found = cv2.imread(path, how)
     if found is None:
-        sys.exit(f"{path}: there is no picture that OpenCV can read")
+        sys.exit(f"{path}: OpenCV cannot read it as an image")
     return found
 
 
@@ -93,7 +93,7 @@ def pfm(path: str) -> np.ndarray:
     """One channel of floats, rows from the bottom; a scale below 0 means little-endian."""
     kind, size, scale, data = Path(path).read_bytes().split(b"\n", 3)
     if kind.strip() != b"Pf":
-        sys.exit(f"{path}: is no PFM of one channel")
+        sys.exit(f"{path} is not a PFM file of one channel")
     width, height = (int(n) for n in size.split())
     return np.frombuffer(data, "<f4" if float(scale) < 0 else ">f4", width * height).reshape(height, width)[::-1]
 
@@ -112,7 +112,7 @@ def true_disparity(path: str, scale: float) -> np.ndarray:
 
 
 def seen_by(sixth: str | None, truth: np.ndarray, scale: float) -> np.ndarray:
-    """The pixels that count, by what a --pair says or does not say of them."""
+    """The pixels that count, by the optional part of a --pair."""
     if sixth is None:
         return seen_by_both(truth)
     kind, _, path = sixth.partition(":")
@@ -156,14 +156,14 @@ def pair_of(pair: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     return left, right, truth, seen, disparities
 
 
-def lowered(picture: np.ndarray, by: float) -> np.ndarray:
-    """The picture moved down by so many pixels, parts of them by cubic interpolation."""
-    rows, columns = np.indices(picture.shape, np.float32)
-    return cv2.remap(picture, columns, rows - np.float32(by), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+def lowered(image: np.ndarray, by: float) -> np.ndarray:
+    """The image moved down by so many pixels, parts of them by cubic interpolation."""
+    rows, columns = np.indices(image.shape, np.float32)
+    return cv2.remap(image, columns, rows - np.float32(by), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 def apart(args: argparse.Namespace, folder: Path) -> None:
-    """What rows that are apart cost."""
+    """Print the effect of rows that are apart."""
     files = [folder / "left.png", folder / "right.png"]
     for pair in args.pair:
         left, right, truth, seen, disparities = pair_of(pair)
@@ -185,10 +185,10 @@ def quality(args: argparse.Namespace, folder: Path) -> bool:
     kept = True
     for pair in args.pair:
         left, right, truth, seen, disparities = pair_of(pair)
-        # Both sides get the same grey pictures.
+        # Both sides get the same grey images.
         files = [folder / "left.png", folder / "right.png"]
-        for file, picture in zip(files, (left, right), strict=True):
-            cv2.imwrite(str(file), picture)
+        for file, image in zip(files, (left, right), strict=True):
+            cv2.imwrite(str(file), image)
         print(f"{pair[0]} ({left.shape[1]}x{left.shape[0]}, {disparities} disparities)")
         sums = {}
         for mode in MODES:
@@ -218,8 +218,8 @@ def speed(args: argparse.Namespace, folder: Path) -> bool:
         left, right = (np.vstack([p] * (720 // size[1] + 1)) for p in (left, right))
     left, right = (np.ascontiguousarray(p[:720]) for p in (left, right))
     files = [folder / "left.png", folder / "right.png"]
-    for file, picture in zip(files, (left, right), strict=True):
-        cv2.imwrite(str(file), picture)
+    for file, image in zip(files, (left, right), strict=True):
+        cv2.imwrite(str(file), image)
     times: dict[str, list[float]] = {}
     for _ in range(args.rounds):
         command = [args.depthrig, "bench", "stereo", "--left", files[0], "--right", files[1], "--rounds", 3, "--json"]
@@ -258,9 +258,9 @@ def main() -> None:
         help="LEFT RIGHT TRUTH SCALE DISPARITIES [mask:FILE | right:FILE]",
     )
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--rows", nargs="+", type=float, metavar="PX", help="only what rows cost that are so far apart")
+    parser.add_argument("--rows", nargs="+", type=float, metavar="PX", help="measure only the effect of row offsets")
     parser.add_argument("--correct-rows", action="store_true", help="with --rows: with the offset corrected")
-    parser.add_argument("--no-speed", action="store_true", help="only the disparities, not what they cost")
+    parser.add_argument("--no-speed", action="store_true", help="compare only the disparities, not the CPU time")
     args = parser.parse_args()
     for pair in args.pair or []:
         if len(pair) not in (5, 6):

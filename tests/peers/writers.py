@@ -1,8 +1,8 @@
 """One measurement in a process of its own: `writers.py WRITER FRAMES SETS OUT` prints JSON.
 
-What is measured is the CPU time, user and system, of all threads, from before the file is created until it is
-closed, with the pictures in memory before. Seven cameras take turns at the pictures, five times a second.
-Everything is done to be kind to the writer: messages are put together from bytes without a copy more than its
+It measures the CPU time, user and system, of all threads, from before the file is created until it is
+closed, with the images in memory before. Seven cameras take turns at the images, five times a second.
+The measurement favours the writer: messages are put together from bytes without a copy more than its
 interface asks for, and nothing is synced.
 """
 
@@ -117,7 +117,7 @@ def rosbag_python(compression: str):
 
 
 def png_files():
-    """The way of the paper's recorder: `cv2.imwrite` of one PNG per picture, numbered, in a folder per camera."""
+    """The method of the paper's recorder: `cv2.imwrite` of one PNG per image, numbered, in a folder per camera."""
     import cv2
 
     def write(_head, sets, out):
@@ -175,7 +175,7 @@ def main() -> None:
     disk = sum(f.stat().st_size for f in out.rglob("*") if f.is_file())
     if writer.startswith("PNG"):
         read = cv2.imread(str(out / "camera_1/color_0.png")), cv2.imread(str(out / "camera_1/depth_0.png"), -1)
-        assert all(np.array_equal(a, b) for a, b in zip(read, sets[0][1][2])), "PNG changed a picture"
+        assert all(np.array_equal(a, b) for a, b in zip(read, sets[0][1][2])), "PNG changed an image"
     pairs = count * CAMERAS
     raw = pairs * sum(len(p) for p in pool[0][:2])
     print(json.dumps({"cpu_s": cpu, "wall_s": wall, "raw_bytes": raw, "disk_bytes": disk, "pairs": pairs}))

@@ -1,10 +1,10 @@
-"""Opens an exported dataset with LeRobot's own loader and compares what it delivers.
+"""Opens an exported dataset with LeRobot's own loader and compares the result.
 
 usage: python lerobot_loader.py (DATASET EXPECTED)...
 
 Runs in the environment of the package `lerobot` (`make test` installs it), called by test_lerobot.py. EXPECTED holds
 `STREAM.npy` (every row is this) or `STREAM.ROW.npy` / `STREAM.ROW.jpg` (rows of each episode). For each dataset it
-prints a line of JSON: frames, episodes, fps, pictures compared. Statistics are compared with those that the package's
+prints a line of JSON: frames, episodes, fps, images compared. Statistics are compared with those that the package's
 own functions compute.
 """
 
@@ -22,7 +22,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 
 KNOWS_DEPTH = tuple(map(int, lerobot.__version__.split(".")[:2])) >= (0, 6)
-"""Earlier versions hand 16-bit pictures over as signed numbers, and know nothing of depth."""
+"""Earlier versions hand 16-bit images over as signed numbers, and know nothing of depth."""
 
 
 def expectations(folder: Path) -> dict[tuple[str, int | None], np.ndarray]:
@@ -35,7 +35,7 @@ def expectations(folder: Path) -> dict[tuple[str, int | None], np.ndarray]:
 
 
 def tensor(pixels: np.ndarray) -> np.ndarray:
-    """What the loader makes of a picture: channels first; 0 to 1 of bytes, 16 bits as they are."""
+    """An image as the loader returns it: channels first; bytes as 0 to 1, 16 bits unchanged."""
     planes = np.moveaxis(pixels, -1, 0) if pixels.ndim == 3 else pixels[None]
     if pixels.dtype == np.uint16:
         return planes.astype(np.float32) if KNOWS_DEPTH else planes.astype(np.int16)
@@ -107,9 +107,9 @@ def check(root: Path, expected: dict[tuple[str, int | None], np.ndarray]) -> Non
     assert len(last) == ds.meta.episodes[ds.num_episodes - 1]["length"]
     if KNOWS_DEPTH:
         check_stats(ds)
-    said = {"frames": len(ds), "episodes": ds.num_episodes, "fps": ds.fps, "pictures_compared": compared}
+    said = {"frames": len(ds), "episodes": ds.num_episodes, "fps": ds.fps, "images_compared": compared}
     print(json.dumps({**said, "lerobot": lerobot.__version__}))
 
 
-for dataset, pictures in zip(sys.argv[1::2], sys.argv[2::2], strict=True):
-    check(Path(dataset), expectations(Path(pictures)))
+for dataset, images in zip(sys.argv[1::2], sys.argv[2::2], strict=True):
+    check(Path(dataset), expectations(Path(images)))

@@ -1,4 +1,4 @@
-"""Real pictures recorded, cut, joined, compared and written out again, with Pillow and NumPy as the judges.
+"""Real images recorded, cut, joined, compared and written out again, with Pillow and NumPy as the judges.
 
 Configuration, cameras and the running of the binary are those of `test_daemon`.
 """
@@ -21,7 +21,7 @@ __all__ = ["binary", "rig_file", "runtime"]
 
 @pytest.fixture(scope="module")
 def dataset(binary: str, runtime: Path, rig_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two seconds of all real pictures."""
+    """Two seconds of all real images."""
     folder = tmp_path_factory.mktemp("recorded")
     arguments = ("run", str(rig_file), "--record", str(folder), "--seconds", "2")
     with running(binary, runtime, folder / "log", *arguments) as daemon:
@@ -51,7 +51,7 @@ def fingerprint(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("form", ["png", "npy"])
-def test_cat_writes_the_pictures_that_the_cameras_saw(
+def test_cat_writes_the_images_that_the_cameras_saw(
     binary: str, runtime: Path, dataset: Path, tmp_path: Path, form: str
 ) -> None:
     out = tmp_path / "frames"
@@ -63,17 +63,17 @@ def test_cat_writes_the_pictures_that_the_cameras_saw(
         camera, stream = row["stream"].split("/")
         source = by_name(camera).source(stream)
         path = out / row["file"]
-        picture = np.load(path) if form == "npy" else np.asarray(Image.open(path))
-        assert picture.shape == source.shape
+        image = np.load(path) if form == "npy" else np.asarray(Image.open(path))
+        assert image.shape == source.shape
         if stream == "depth":
-            assert picture.dtype == np.uint16 or picture.dtype == np.int32  # Pillow's name of 16 bits
+            assert image.dtype == np.uint16 or image.dtype == np.int32  # Pillow's name of 16 bits
             assert float(row["depth_unit_m"]) == by_name(camera).depth_unit_m
-            np.testing.assert_array_equal(picture, source)
+            np.testing.assert_array_equal(image, source)
         elif by_name(camera).color.endswith(".png"):
-            assert picture.dtype == np.uint8
-            np.testing.assert_array_equal(picture, source)
+            assert image.dtype == np.uint8
+            np.testing.assert_array_equal(image, source)
         else:  # two JPEG decoders may round differently
-            assert np.abs(picture.astype(np.int16) - source).mean() < 2
+            assert np.abs(image.astype(np.int16) - source).mean() < 2
     returned, text = code(binary, runtime, "cat", str(dataset), "--out", str(out))
     assert returned == 1
     assert "is not empty" in text
@@ -100,8 +100,8 @@ def test_cut_and_joined_it_is_the_same_recording(
     report = json.loads(command(binary, runtime, "merge", joined, second, first, "--json"))
     assert report["sets"] == len(ids)
     assert report["repeated"] > 0
-    for made in (first, second, joined):
-        command(binary, runtime, "verify", made, "--decode")
+    for part in (first, second, joined):
+        command(binary, runtime, "verify", part, "--decode")
     equal = json.loads(
         command(binary, runtime, "compare", str(dataset), joined, "--strict", "--pixels", "stored", "--json")
     )
@@ -110,7 +110,7 @@ def test_cut_and_joined_it_is_the_same_recording(
     returned, text = code(binary, runtime, "compare", str(dataset), first)
     assert returned == 1
     assert "DIFFERENT" in text
-    # A part missing in the middle is said, by an exit code of its own.
+    # A part missing in the middle is reported with an exit code of its own.
     command(binary, runtime, "trim", str(dataset), str(tmp_path / "end"), "--first-set", str(middle + 2))
     command(binary, runtime, "trim", str(dataset), str(tmp_path / "begin"), "--last-set", str(middle))
     parts = (str(tmp_path / "begin"), str(tmp_path / "end"))
@@ -118,7 +118,7 @@ def test_cut_and_joined_it_is_the_same_recording(
     assert returned == 3, text
     assert "1 sets between set" in text
     assert code(binary, runtime, "verify", str(tmp_path / "gap"))[0] == 3
-    # What is there is not touched, and neither is the source.
+    # Existing files are not touched, and neither is the source.
     assert code(binary, runtime, "trim", str(dataset), first)[0] == 1
     assert code(binary, runtime, "trim", str(dataset), str(tmp_path / "none"), "--from", "99")[0] == 2
     assert code(binary, runtime, "trim", str(dataset), str(tmp_path / "none"), "--from", "yesterday")[0] == 2

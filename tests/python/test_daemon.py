@@ -1,6 +1,6 @@
-"""The main job end to end: real pictures through the real daemon, into a dataset, and out again, bit by bit.
+"""The main job end to end: real images through the real daemon, into a dataset, and out again, bit by bit.
 
-The daemon is the binary `DEPTHRIG_BIN`, else cargo's; the pictures are below `DEPTHRIG_TEST_DATA`, else in
+The daemon is the binary `DEPTHRIG_BIN`, else cargo's; the images are below `DEPTHRIG_TEST_DATA`, else in
 `shared/data` beside the checkout. The source files are decoded with Pillow, which shares no code with depthrig.
 """
 
@@ -75,8 +75,8 @@ def runtime() -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def rig_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rig of all real pictures. Colour is recorded raw, so that it can be compared bit by bit as well."""
-    lines = ['rig = "pictures"', "[recording]", 'color = "raw"', "reserve_mb = 64"]
+    """A rig of all real images. Colour is recorded raw, so that it can be compared bit by bit as well."""
+    lines = ['rig = "images"', "[recording]", 'color = "raw"', "reserve_mb = 64"]
     for camera in CAMERAS:
         manifest = ROOT / "tests" / "data" / f"{camera.name}.toml"
         lines += [
@@ -129,10 +129,10 @@ def open_stream(runtime: Path, camera: Camera, stream: str) -> depthrig.Stream:
     return depthrig.Stream(f"{camera.name}/{stream}", runtime_dir=runtime, timeout=WAIT_S)
 
 
-def check_picture(frame: depthrig.Frame, camera: Camera, stream: str) -> None:
+def check_image(frame: depthrig.Frame, camera: Camera, stream: str) -> None:
     source = camera.source(stream)
     header = frame.header
-    assert (header.rig, header.stream_id) == ("pictures", f"{camera.name}/{stream}")
+    assert (header.rig, header.stream_id) == ("images", f"{camera.name}/{stream}")
     assert (header.height, header.width) == source.shape[:2]
     assert header.intrinsics.is_known
     if stream == "color":
@@ -149,16 +149,16 @@ def check_picture(frame: depthrig.Frame, camera: Camera, stream: str) -> None:
     np.testing.assert_allclose(np.nan_to_num(metres), source * camera.depth_unit_m, rtol=1e-6)
 
 
-def test_live_arrays_equal_the_source_pictures(binary: str, runtime: Path, rig_file: Path, tmp_path: Path) -> None:
+def test_live_arrays_equal_the_source_images(binary: str, runtime: Path, rig_file: Path, tmp_path: Path) -> None:
     with running(binary, runtime, tmp_path / "log", "run", str(rig_file)):
         streams = [(open_stream(runtime, camera, stream), camera, stream) for camera, stream in STREAMS]
-        assert depthrig.running_rigs(runtime) == ["pictures"]
+        assert depthrig.running_rigs(runtime) == ["images"]
         assert set(depthrig.streams(runtime_dir=runtime)) == {f"{c.name}/{s}" for c, s in STREAMS}
         for reader, camera, stream in streams:
             previous = None
             for _ in range(3):
                 frame = reader.next(timeout=WAIT_S)
-                check_picture(frame, camera, stream)
+                check_image(frame, camera, stream)
                 h = frame.header
                 assert not h.replayed
                 assert h.captured == h.sequence + sum(h.drops.values())
@@ -205,8 +205,8 @@ def test_record_verify_replay(binary: str, runtime: Path, rig_file: Path, tmp_pa
             for _ in range(3):
                 frame = reader.next(timeout=WAIT_S)
                 assert frame.header.replayed
-                check_picture(frame, camera, stream)
-        # A whole round and more: every picture of the recording, with its original time.
+                check_image(frame, camera, stream)
+        # More than one full round: every image of the recording, with its original time.
         for _ in range(25):
             for reader, _, _ in readers:
                 header = reader.next(timeout=WAIT_S).header

@@ -1,4 +1,4 @@
-"""Real pictures to the folders of ByteCameraDepth and back, a real bag against another reader, exports that are killed."""
+"""Real images to the folders of ByteCameraDepth and back, a real bag against another reader, exports that are killed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = ["binary", "rig_file", "runtime"]
 BAG = DATA / "librealsense_bag" / "single_depth_color_640x480.bag"
 
 
-def test_real_pictures_come_back_as_they_were(binary: str, runtime: Path, rig_file: Path, tmp_path: Path) -> None:
+def test_real_images_come_back_as_they_were(binary: str, runtime: Path, rig_file: Path, tmp_path: Path) -> None:
     arguments = ("run", str(rig_file), "--record", str(tmp_path / "recorded"), "--seconds", "1")
     with running(binary, runtime, tmp_path / "log", *arguments) as daemon:
         daemon.wait(WAIT_S)
@@ -44,17 +44,17 @@ def test_real_pictures_come_back_as_they_were(binary: str, runtime: Path, rig_fi
     with (session / "frames.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == report["frames"]
-    # The pictures of the first and the last set, as another decoder sees them.
+    # The images of the first and the last set, as another decoder sees them.
     for row in (r for r in rows if r["n"] in {"0", str(report["sets"] - 1)}):
         name, stream = row["stream"].split("/")
         camera = next(c for c in CAMERAS if c.name == name)
         with Image.open(session / row["file"]) as file:
             assert file.mode == ("RGB" if stream == "color" else "I;16")
-            picture = np.asarray(file)
+            image = np.asarray(file)
         source = camera.source(stream)
         if stream == "depth":
             assert float(row["depth_unit_m"]) == described[row["stream"]]["depth_unit_m"] == camera.depth_unit_m
-        np.testing.assert_array_equal(picture, source)
+        np.testing.assert_array_equal(image, source)
     back = str(tmp_path / "back")
     report = json.loads(command(binary, runtime, "import", "bytecameradepth", str(session), back, "--json"))
     assert report["facts"]["lost"] == 0
@@ -87,22 +87,22 @@ def messages(dataset: Path, topic: str) -> Iterator[Any]:
 
 @pytest.mark.parametrize(("stream", "topic"), [("depth", "sensor_0/Depth_0"), ("color", "sensor_1/Color_0")])
 def test_a_bag_is_what_another_reader_says(dataset: Path, stream: str, topic: str) -> None:
-    images, metadata = [], []
+    originals, metadata = [], []
     with AnyReader([BAG], default_typestore=get_typestore(Stores.ROS1_NOETIC)) as reader:
         wanted = [c for c in reader.connections if c.topic.startswith(f"/device_0/{topic}/image/")]
         for connection, _, raw in reader.messages(wanted):
             message = reader.deserialize(raw, connection.msgtype)
             if connection.topic.endswith("/image/data"):
-                images.append(message)
+                originals.append(message)
                 metadata.append({})
             else:
                 metadata[-1][message.key] = message.value
-    pictures = list(messages(dataset, f"/rig/d435/{stream}/image_raw"))
+    images = list(messages(dataset, f"/rig/d435/{stream}/image_raw"))
     infos = list(messages(dataset, f"/rig/d435/{stream}/frame_info"))
-    assert len(pictures) == len(infos) == len(images) > 0
-    for picture, info, image, facts in zip(pictures, infos, images, metadata, strict=True):
-        assert (picture.width, picture.height, picture.step) == (image.width, image.height, image.step)
-        assert bytes(picture.data) == image.data.tobytes()
+    assert len(images) == len(infos) == len(originals) > 0
+    for image, info, original, facts in zip(images, infos, originals, metadata, strict=True):
+        assert (image.width, image.height, image.step) == (original.width, original.height, original.step)
+        assert bytes(image.data) == original.data.tobytes()
         assert info.device_sequence == int(facts["Frame Counter"])
         assert info.device_time == int(facts.get("Sensor Timestamp", facts["Frame Timestamp"]))
         whole, part = facts["system_time"].split(".")

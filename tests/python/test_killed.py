@@ -41,7 +41,7 @@ with depthrig.Stream("cam/color", "killed", sys.argv[1], timeout=60) as stream:
     while True:
         try:
             held.append(stream.next(timeout=60))
-        except depthrig.DepthrigError:  # it holds all that it may, or nothing comes any more
+        except depthrig.DepthrigError:  # it holds all that it may, or no frame comes any more
             print("holding", flush=True)
             time.sleep(0.5)
 """

@@ -1,6 +1,6 @@
-"""`depthrig export lerobot`: every row, picture and number of the result, and the real LeRobot loader on it.
+"""`depthrig export lerobot`: every row, image and number of the result, and the real LeRobot loader on it.
 
-The tables are read with pyarrow, the pictures with Pillow; what must be in them comes from the source pictures, from
+The tables are read with pyarrow, the images with Pillow; what must be in them comes from the source images, from
 the golden dataset's bare pixels, and from the recording as Python's mcap reads it. The loader is that of the package
 `lerobot`, which lives in an environment of its own (`make test` installs it) because it brings PyTorch.
 """
@@ -41,8 +41,8 @@ class Golden:
     expected: Path
 
     def pixels(self, stream: str, row: int) -> np.ndarray:
-        """What a lossless stream holds in a set."""
-        for p in json.loads((self.expected / "index.json").read_text())["pictures"]:
+        """The pixels of a lossless stream in a set."""
+        for p in json.loads((self.expected / "index.json").read_text())["images"]:
             if p["set"] == row + 1 and p["base"].removeprefix("/golden/").replace("/", "_") == stream:
                 data = (self.expected / p["file"]).read_bytes()
                 kind = {"16UC1": "<u2", "mono8": "u1", "rgb8": "u1"}[p["encoding"]]
@@ -75,7 +75,7 @@ def golden(binary: str, tmp_path_factory: pytest.TempPathFactory) -> Golden:  # 
 
 @pytest.fixture(scope="module")
 def recorded(binary: str, runtime: Path, rig_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
-    """Two seconds of the real pictures, colour without loss."""
+    """Two seconds of the real images, colour without loss."""
     folder = tmp_path_factory.mktemp("real")
     command = [binary, "run", str(rig_file), "--record", str(folder), "--seconds", "2"]
     subprocess.run(command, env=environment(runtime), check=True, timeout=WAIT_S, capture_output=True)
@@ -96,8 +96,8 @@ def rows(out: Path) -> list[dict]:
     return [row for file in files for row in pq.read_table(file).to_pylist()]
 
 
-def picture(cell: dict) -> np.ndarray:
-    """A picture as Pillow decodes it, after a look at what its name says it is."""
+def image(cell: dict) -> np.ndarray:
+    """An image as Pillow decodes it, after a check against its file name."""
     magic = {".jpg": b"\xff\xd8", ".png": b"\x89PNG", ".tiff": b"II*\0"}[Path(cell["path"]).suffix]
     assert cell["bytes"].startswith(magic)
     return np.asarray(Image.open(io.BytesIO(cell["bytes"])))
@@ -146,7 +146,7 @@ def test_two_episodes_of_a_dataset_with_a_missing_camera(binary: str, golden: Go
             missing = (stream, n) == MISSING
             assert row[f"missing.{stream}"] is missing
             assert (row[f"capture.utc_ns.{stream}"] == 0) is missing
-            pixels = picture(cell)
+            pixels = image(cell)
             if missing:
                 assert pixels.shape == (72, 128)
                 assert not pixels.any()
@@ -170,8 +170,8 @@ def test_two_episodes_of_a_dataset_with_a_missing_camera(binary: str, golden: Go
     episodes = pq.read_table(out / "meta" / "episodes" / "chunk-000" / "file-000.parquet").to_pylist()
     assert [(e["length"], e["dataset_from_index"], e["dataset_to_index"]) for e in episodes] == [(6, 0, 6), (6, 6, 12)]
     assert [e["tasks"] for e in episodes] == [["a gradient with an edge"]] * 2
-    assert episodes[0]["stats/observation.images.near_depth/count"] == [5], "a blank picture is in no statistics"
-    # For the libraries that know pictures by the footer alone.
+    assert episodes[0]["stats/observation.images.near_depth/count"] == [5], "a blank image is in no statistics"
+    # For the libraries that know images by the footer alone.
     footer = pq.read_metadata(out / "data" / "chunk-000" / "file-000.parquet").metadata
     assert json.loads(footer[b"huggingface"])["info"]["features"]["observation.images.near_depth"]["_type"] == "Image"
 
@@ -188,7 +188,7 @@ def test_incomplete_sets_can_be_left_out(binary: str, golden: Golden, tmp_path: 
     found = rows(out)
     assert [row["capture.set_id"] for row in found] == [1, 2, 4, 5, 6]
     assert [row["frame_index"] for row in found] == [0, 1, 2, 3, 4]
-    # A set that lacks only what is not exported is whole.
+    # A set that lacks only streams that are not exported is complete.
     arguments = ["--incomplete", "leave-out", "--stream", "front/depth"]
     report = export(binary, *arguments, golden.dataset, tmp_path / "one")
     assert len(rows(tmp_path / "one")) == report["sets"] == 6
@@ -196,7 +196,7 @@ def test_incomplete_sets_can_be_left_out(binary: str, golden: Golden, tmp_path: 
     assert [k for k in rows(tmp_path / "one")[0] if k.startswith("observation")] == ["observation.images.front_depth"]
 
 
-def test_real_pictures_are_bit_equal(binary: str, recorded: Path, tmp_path: Path) -> None:  # noqa: F811
+def test_real_images_are_bit_equal(binary: str, recorded: Path, tmp_path: Path) -> None:  # noqa: F811
     out = tmp_path / "out"
     # On a busy machine a set may lack a frame.
     report = export(binary, "--incomplete", "leave-out", recorded, out)
@@ -206,10 +206,10 @@ def test_real_pictures_are_bit_equal(binary: str, recorded: Path, tmp_path: Path
     assert sum(dataset["sets"] for dataset in report["datasets"]) == report["sets"] + lost
     for row in found:
         for camera in CAMERAS:
-            depth = picture(row[f"observation.images.{camera.name}_depth"])
+            depth = image(row[f"observation.images.{camera.name}_depth"])
             np.testing.assert_array_equal(depth, camera.source("depth"))
             if camera.color.endswith(".png"):
-                color = picture(row[f"observation.images.{camera.name}_color"])
+                color = image(row[f"observation.images.{camera.name}_color"])
                 np.testing.assert_array_equal(color, camera.source("color"))
 
 
@@ -232,11 +232,11 @@ def test_a_set_that_cannot_be_read_is_blank_and_told(binary: str, golden: Golden
         lost = [row[f"missing.{stream}"] for stream in GOLDEN]
         assert lost == [n == 1 or (stream, n) == MISSING for stream in GOLDEN]
         assert row["capture.utc_ns"] == 1_700_000_000_000_000_000 + n * 200_000_000
-        blank = picture(row["observation.images.front_color"])
+        blank = image(row["observation.images.front_color"])
         assert blank.shape == (120, 160, 3)
         assert blank.any() != (n == 1)
         if n != 1:
-            depth = picture(row["observation.images.front_depth"])
+            depth = image(row["observation.images.front_depth"])
             np.testing.assert_array_equal(depth, golden.pixels("front_depth", n))
 
 
@@ -250,7 +250,7 @@ def test_nothing_is_overwritten(binary: str, golden: Golden, tmp_path: Path) -> 
     export(binary, golden.dataset, done)
     before = {name: (done / name).stat().st_mtime_ns for name in tree(done)}
     export(binary, golden.dataset, done)
-    assert {name: (done / name).stat().st_mtime_ns for name in tree(done)} == before, "it was whole already"
+    assert {name: (done / name).stat().st_mtime_ns for name in tree(done)} == before, "it was complete already"
     assert "differs in its options" in export(binary, "--task", "another", golden.dataset, done, code=1)["error"]
     assert {name: (done / name).stat().st_mtime_ns for name in tree(done)} == before
 
@@ -266,7 +266,7 @@ def test_datasets_that_do_not_fit_are_refused(binary: str, golden: Golden, recor
 
 
 def test_a_killed_export_goes_on(binary: str, golden: Golden, recorded: Path, tmp_path: Path) -> None:  # noqa: F811
-    """Killed at many moments; what comes out in the end is what comes out at once."""
+    """Killed at many moments, the export ends with the same result as in one run."""
     arguments = ["--stream", "lingbot_1/color", "--stream", "lingbot_1/depth", recorded, recorded]
     whole = tmp_path / "whole"
     started = time.monotonic()
@@ -323,4 +323,4 @@ def test_the_real_loader_finds_the_same(binary: str, golden: Golden, recorded: P
     for found, episodes in zip(said, lengths, strict=True):
         assert (found["frames"], found["episodes"], found["fps"]) == (sum(episodes), len(episodes), 5)
     # All but the two blank ones; four of each row.
-    assert [s["pictures_compared"] for s in said] == [2 * 6 * 4 - 2, 4 * sum(lengths[1])]
+    assert [s["images_compared"] for s in said] == [2 * 6 * 4 - 2, 4 * sum(lengths[1])]

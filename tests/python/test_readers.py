@@ -1,6 +1,6 @@
-"""Real pictures, recorded by the real daemon, read by readers that are not ours: mcap, rosbags, rerun, @mcap/core.
+"""Real images, recorded by the real daemon, read by readers that are not ours: mcap, rosbags, rerun, @mcap/core.
 
-What they find is compared with the source files, decoded by Pillow: no code of depthrig stands on either side.
+Their results are compared with the source files, decoded by Pillow: no code of depthrig stands on either side.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from test_daemon import CAMERAS, ROOT, WAIT_S, binary, environment, rig_file, ru
 
 TYPES = {"rgb8": np.dtype("u1"), "16UC1": np.dtype("<u2")}
 SOURCES = {
-    f"/pictures/{camera.name}/{stream}/image_raw": camera.source(stream)
+    f"/images/{camera.name}/{stream}/image_raw": camera.source(stream)
     for camera in CAMERAS
     for stream in ("color", "depth")
 }
@@ -88,7 +88,7 @@ def test_rerun_sees_depth_as_depth(segments: list[Path]) -> None:
 
 
 def test_node(segments: list[Path], tmp_path: Path) -> None:
-    pictures, sets = [], []
+    images, sets = [], []
     for topic, message, decoded in messages(segments):
         if topic.endswith("/frame_set"):
             sets.append(decoded.id)
@@ -96,7 +96,7 @@ def test_node(segments: list[Path], tmp_path: Path) -> None:
             continue
         file = topic.replace("/", "_")
         (tmp_path / file).write_bytes(SOURCES[topic].tobytes())
-        pictures.append(
+        images.append(
             {
                 "topic": topic,
                 "log_time": str(message.log_time),
@@ -109,9 +109,9 @@ def test_node(segments: list[Path], tmp_path: Path) -> None:
                 "file": file,
             }
         )
-    index = {"sets": len(sets), "first_set": sets[0], "pictures": pictures, "motion": []}
+    index = {"sets": len(sets), "first_set": sets[0], "images": images, "motion": []}
     (tmp_path / "index.json").write_text(json.dumps(index))
     command = ["node", "check_node.mjs", str(segments[0].parent), str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT / "tests" / "readers", capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("pictures agree") == 2, done.stdout
+    assert done.stdout.count("images agree") == 2, done.stdout

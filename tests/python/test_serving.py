@@ -52,7 +52,7 @@ def rig_file(folder: Path, name: str, program: list[str]) -> Path:
 def camera(binary: str, runtime: Path, name: str) -> dict[str, Any]:
     asked = [binary, "status", "--json"]
     done = subprocess.run(asked, env=environment(runtime), capture_output=True, text=True, timeout=WAIT_S, check=False)
-    assert done.returncode in (0, 3), done.stderr  # 3: a camera has lost something, as it is made to here
+    assert done.returncode in (0, 3), done.stderr  # 3: a camera has lost frames, as this test provokes
     status = json.loads(done.stdout)
     return next(c for c in status["cameras"] if c["name"] == name)
 
@@ -74,7 +74,7 @@ def pid_of(runtime: Path, name: str) -> int:
 
 @contextmanager
 def rig(binary: str, runtime: Path, log: Path, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """As `running`, for rigs that lose frames on a loaded computer, or because they are made to."""
+    """As `running`, for rigs that lose frames on a loaded computer, or because the test provokes it."""
     with log.open("wb") as out:
         process = subprocess.Popen([binary, *arguments], env=environment(runtime), stdout=out, stderr=out)
     try:
@@ -118,7 +118,7 @@ def test_the_example_is_a_camera_of_the_rig(binary: str, runtime: Path, tmp_path
             until(lambda: pid_of(runtime, "front") != first)
             until(lambda: camera(binary, runtime, "front")["state"] == "streaming")
             assert camera(binary, runtime, "front")["reconnects"] >= 1
-            # Stopped: its heart-beat is missed, it is killed and started again.
+            # Stopped: its heartbeat is missed, it is killed and started again.
             second = pid_of(runtime, "front")
             os.kill(second, signal.SIGSTOP)
             until(lambda: pid_of(runtime, "front") != second)
@@ -156,9 +156,9 @@ def test_a_program_started_by_hand_outlives_the_daemon(binary: str, runtime: Pat
 
 
 @pytest.mark.skipif(not OAK_PYTHON.exists(), reason="the OAK SDK is not in .venv-oak; make test puts it there")
-def test_an_oak_of_real_pictures_is_recorded_as_it_is(binary: str, runtime: Path, tmp_path: Path) -> None:
+def test_an_oak_of_real_images_is_recorded_as_it_is(binary: str, runtime: Path, tmp_path: Path) -> None:
     source = [c for c in CAMERAS if c.name in ("lingbot_0", "lingbot_2")]
-    folder = tmp_path / "oak_pictures"
+    folder = tmp_path / "oak_images"
     for stream in ("color", "depth"):
         (folder / stream).mkdir(parents=True)
         for i, c in enumerate(source):
@@ -178,11 +178,11 @@ def test_an_oak_of_real_pictures_is_recorded_as_it_is(binary: str, runtime: Path
                 header = frame.header
                 assert (header.model, header.serial, header.format_name) == ("OAK-D-TEST", "184430", "bgr8")
                 assert header.clock is depthrig.ClockDomain.DEVICE
-                picture = source[header.device_sequence % 2].source("color")
-                np.testing.assert_array_equal(frame.array[..., ::-1], picture)
+                image = source[header.device_sequence % 2].source("color")
+                np.testing.assert_array_equal(frame.array[..., ::-1], image)
                 frame = depth.next(WAIT_S)
-                picture = source[frame.header.device_sequence % 2].source("depth")
-                np.testing.assert_array_equal(frame.array, picture)
+                image = source[frame.header.device_sequence % 2].source("depth")
+                np.testing.assert_array_equal(frame.array, image)
                 assert frame.header.intrinsics.fx == pytest.approx(500.5)
         daemon.wait(WAIT_S)
     (dataset,) = sorted(p.parent for p in recordings.rglob("session.toml"))

@@ -4,8 +4,8 @@
 // usage: node check_node.mjs DATASET EXPECTED
 //
 // EXPECTED is a folder with index.json and bare pixels as `tests/src/expected.rs` writes it. Lossless
-// pictures must agree bit by bit, JPEGs within 35 dB of what depthrig itself decodes (jpeg-js rounds more
-// coarsely than the decoders in common use). Exits with 1 and says which picture differs otherwise.
+// images must agree bit by bit, JPEGs within 35 dB of what depthrig itself decodes (jpeg-js rounds more
+// coarsely than the decoders in common use). Exits with 1 and names the image that differs otherwise.
 
 import assert from "node:assert/strict";
 import { open, readFile, readdir } from "node:fs/promises";
@@ -24,9 +24,9 @@ if (dataset == undefined || expected == undefined) {
 }
 
 const index = JSON.parse(await readFile(join(expected, "index.json"), "utf8"));
-const pictures = new Map();
-for (const p of index.pictures) {
-  pictures.set(`${p.topic} ${p.log_time}`, { ...p, pixels: await readFile(join(expected, p.file)) });
+const images = new Map();
+for (const p of index.images) {
+  images.set(`${p.topic} ${p.log_time}`, { ...p, pixels: await readFile(join(expected, p.file)) });
 }
 const names = (await readdir(dataset)).filter((n) => /^seg_\d+\.mcap$/.test(n)).sort();
 assert(names.length > 0, `${dataset} has no segments`);
@@ -81,7 +81,7 @@ class Check {
       }
     }
     const key = `${channel.topic} ${message.logTime}`;
-    const p = pictures.get(key);
+    const p = images.get(key);
     if (p == undefined) {
       return;
     }
@@ -106,7 +106,7 @@ class Check {
     this.seen.add(key);
   }
 
-  /** A sample of a motion unit by itself. */
+  /** A sample of an IMU by itself. */
   sample(channel, message, ros) {
     const want = motion[this.samples++];
     assert.equal(`${channel.topic} ${message.logTime}`, `${want.base}/data_raw ${want.log_time}`);
@@ -117,11 +117,11 @@ class Check {
   }
 
   done() {
-    assert.deepEqual([this.samples, this.batched], [motion.length, motion.length], `${this.reader}: motion samples`);
-    const missing = [...pictures.keys()].filter((k) => !this.seen.has(k));
-    assert.deepEqual(missing, [], `${this.reader}: pictures are missing`);
+    assert.deepEqual([this.samples, this.batched], [motion.length, motion.length], `${this.reader}: IMU samples`);
+    const missing = [...images.keys()].filter((k) => !this.seen.has(k));
+    assert.deepEqual(missing, [], `${this.reader}: images are missing`);
     assert.equal(this.sets, BigInt(index.sets));
-    console.log(`${this.reader}: ${this.seen.size} pictures agree`);
+    console.log(`${this.reader}: ${this.seen.size} images agree`);
   }
 }
 

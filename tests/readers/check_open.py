@@ -2,10 +2,10 @@
 
 usage: python check_open.py DATASET [EXPECTED]
 
-Each reader must open every segment, get through every message with its checksum, and find pictures of every stream that
-session.toml names, all of the same number. EXPECTED is a JSON list of the pictures as depthrig itself read them, each with
+Each reader must open every segment, read every message and verify its checksum, and find images of every stream that
+session.toml names, all of the same number. EXPECTED is a JSON list of the images as depthrig itself read them, each with
 `topic`, `log_time` (UTC, nanoseconds, as text), `width`, `height`, `encoding` and `crc32` of its pixels: then each reader must
-find exactly these, bit by bit. A picture that is stored as a JPEG or PNG has the `crc32` of that file, and must be one.
+find exactly these, bit by bit. An image that is stored as a JPEG or PNG has the `crc32` of that file, and must be one.
 Prints a line for each reader; exits with 1 when one of them finds something else.
 """
 
@@ -23,21 +23,21 @@ from PIL import Image
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
-PICTURES = ("/image_raw", "/image_compressed", "/depth_compressed")
+IMAGES = ("/image_raw", "/image_compressed", "/depth_compressed")
 DEPTH = ("16UC1", "32FC1")
 
 
 def found(topic, log_time, message):
-    """A picture as EXPECTED has it."""
+    """An image as EXPECTED has it."""
     data = bytes(message.data)
-    picture = {"topic": topic, "log_time": str(log_time), "crc32": zlib.crc32(data)}
+    image = {"topic": topic, "log_time": str(log_time), "crc32": zlib.crc32(data)}
     if topic.endswith("/image_raw"):
         assert not message.is_bigendian
-        return {**picture, "width": message.width, "height": message.height, "encoding": message.encoding}
+        return {**image, "width": message.width, "height": message.height, "encoding": message.encoding}
     if topic.endswith("/image_compressed"):
         size = Image.open(io.BytesIO(data)).convert("RGB").size
-        return {**picture, "width": size[0], "height": size[1], "encoding": message.format}
-    return {**picture, "width": message.width, "height": message.height, "encoding": "rank"}
+        return {**image, "width": size[0], "height": size[1], "encoding": message.format}
+    return {**image, "width": message.width, "height": message.height, "encoding": "rank"}
 
 
 def by_mcap(segments, kind):
@@ -45,7 +45,7 @@ def by_mcap(segments, kind):
         with segment.open("rb") as file:
             reader = kind(file, decoder_factories=[DecoderFactory()], validate_crcs=True)
             for _, channel, message, decoded in reader.iter_decoded_messages():
-                if channel.topic.endswith(PICTURES):
+                if channel.topic.endswith(IMAGES):
                     yield found(channel.topic, message.log_time, decoded)
 
 
@@ -54,12 +54,12 @@ def by_rosbags(segments):
         with AnyReader([segment]) as reader:
             for connection, log_time, raw in reader.messages():
                 message = reader.deserialize(raw, connection.msgtype)
-                if connection.topic.endswith(PICTURES):
+                if connection.topic.endswith(IMAGES):
                     yield found(connection.topic, log_time, message)
 
 
 def by_rerun(segments):
-    """The pictures that rerun shows. It has no sizes beside the bytes, and calls depth depth."""
+    """The images that rerun shows. It gives only the bytes, without sizes, and marks depth as depth."""
     for segment in segments:
         for chunk in McapReader(str(segment)).stream():
             batch, topic = chunk.to_record_batch(), str(chunk.entity_path)
@@ -70,25 +70,25 @@ def by_rerun(segments):
                     yield {"topic": topic, "log_time": str(log_time), "crc32": zlib.crc32(data), "kind": kind.split(":")[0]}
 
 
-def check(pictures, streams, expected):
-    """What a reader found; returns how much that is, in words."""
-    counts = Counter(p["topic"].rpartition("/")[0] for p in pictures)
+def check(images, streams, expected):
+    """Check the images that a reader found; return a summary."""
+    counts = Counter(p["topic"].rpartition("/")[0] for p in images)
     missing = streams - counts.keys()
-    assert not missing, f"no picture of {', '.join(sorted(missing))}"
+    assert not missing, f"no image of {', '.join(sorted(missing))}"
     if expected is not None:
         key = lambda p: (p["topic"], p["log_time"])  # noqa: E731
-        got = {key(p): p for p in pictures}
-        assert len(got) == len(pictures), "a picture came twice"
-        for picture in expected:
-            one = got.pop(key(picture), None)
-            assert one, f"{picture['topic']} at {picture['log_time']} is missing"
-            wrong = {k for k in picture.keys() & one.keys() if picture[k] != one[k]}
-            assert not wrong, f"{picture['topic']} at {picture['log_time']}: other {', '.join(sorted(wrong))}"
-            depth = picture["encoding"] in DEPTH
-            assert one.get("kind", "DepthImage") == "DepthImage" or not depth, f"{picture['topic']}: not seen as depth"
-        assert not got, f"{len(got)} pictures too many, {next(iter(got))} for one"
+        got = {key(p): p for p in images}
+        assert len(got) == len(images), "an image came twice"
+        for image in expected:
+            one = got.pop(key(image), None)
+            assert one, f"{image['topic']} at {image['log_time']} is missing"
+            wrong = {k for k in image.keys() & one.keys() if image[k] != one[k]}
+            assert not wrong, f"{image['topic']} at {image['log_time']}: other {', '.join(sorted(wrong))}"
+            depth = image["encoding"] in DEPTH
+            assert one.get("kind", "DepthImage") == "DepthImage" or not depth, f"{image['topic']}: not seen as depth"
+        assert not got, f"{len(got)} images too many, {next(iter(got))} for one"
     equal = "" if expected is None else ", each bit by bit"
-    return f"{len(pictures)} pictures of {len(counts)} streams{equal}"
+    return f"{len(images)} images of {len(counts)} streams{equal}"
 
 
 def main():
@@ -100,7 +100,7 @@ def main():
     assert segments, f"{dataset} has no segments"
     session = tomllib.loads((dataset / "session.toml").read_text())
     streams = {f"/{session['rig']}/{s['id']}" for s in session["streams"]}
-    # Formats that rerun has no picture for are not its fault, and packed depth is for our own package.
+    # Formats that rerun has no image for are not its fault, and packed depth is for our own package.
     skipped = ("rank", "mono16")
     readers = {
         "mcap, by its index": lambda: by_mcap(segments, make_reader),

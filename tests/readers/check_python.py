@@ -3,9 +3,9 @@
 usage: python check_python.py DATASET EXPECTED
 
 DATASET is a dataset of depthrig, EXPECTED a folder with index.json and bare pixels as
-`tests/src/expected.rs` writes it. Each reader must find every picture: lossless ones bit by bit, JPEGs
+`tests/src/expected.rs` writes it. Each reader must find every image: lossless ones bit by bit, JPEGs
 within 40 dB of what depthrig itself decodes; depth in our own codec by way of the Python package depthrig, which
-only rerun cannot ask. Exits with 1 and says which picture differs otherwise.
+only rerun cannot ask. Exits with 1 and says which image differs otherwise.
 """
 
 import io
@@ -35,25 +35,25 @@ DTYPES = {
 CHANNELS = {"rgb8": (3,), "yuv422_yuy2": (2,)}
 
 
-def shape(picture):
-    return (picture["height"], picture["width"], *CHANNELS.get(picture["encoding"], ()))
+def shape(image):
+    return (image["height"], image["width"], *CHANNELS.get(image["encoding"], ()))
 
 
 def load(expected):
-    """The expected pictures by (topic, log time in nanoseconds)."""
+    """The expected images by (topic, log time in nanoseconds)."""
     index = json.loads((expected / "index.json").read_text())
-    pictures = {}
-    for p in index["pictures"]:
+    images = {}
+    for p in index["images"]:
         data = (expected / p["file"]).read_bytes()
         p["pixels"] = np.frombuffer(data, DTYPES[p["encoding"]]).reshape(shape(p))
-        pictures[p["topic"], int(p["log_time"])] = p
-    return index, pictures
+        images[p["topic"], int(p["log_time"])] = p
+    return index, images
 
 
-def compare(reader, picture, got):
-    want, name = picture["pixels"], f"{reader}: {picture['topic']} of set {picture['set']}"
+def compare(reader, image, got):
+    want, name = image["pixels"], f"{reader}: {image['topic']} of set {image['set']}"
     assert got.shape == want.shape, f"{name}: shape {got.shape}, expected {want.shape}"
-    if picture["compare"] == "exact":
+    if image["compare"] == "exact":
         # As bytes: a hole of a disparity is NaN, which equals nothing.
         wrong = np.count_nonzero(np.ascontiguousarray(got).view(np.uint8) != np.ascontiguousarray(want).view(np.uint8))
         assert wrong == 0, f"{name}: {wrong} of {want.size} values differ"
@@ -67,16 +67,16 @@ def decode_color(data):
     return np.asarray(Image.open(io.BytesIO(bytes(data))).convert("RGB"))
 
 
-def from_message(picture, message):
+def from_message(image, message):
     """The pixels in a decoded sensor_msgs Image or CompressedImage."""
-    if picture["codec"] in ("jpeg", "png"):
-        assert message.format == picture["codec"], message.format
+    if image["codec"] in ("jpeg", "png"):
+        assert message.format == image["codec"], message.format
         return decode_color(message.data)
-    if picture["codec"] == "rank":
+    if image["codec"] == "rank":
         return unpack_depth(message.data, message.height, message.width, message.step)
-    assert message.encoding == picture["encoding"], f"{picture['topic']}: encoding {message.encoding}"
+    assert message.encoding == image["encoding"], f"{image['topic']}: encoding {message.encoding}"
     assert not message.is_bigendian
-    return np.frombuffer(bytes(message.data), DTYPES[message.encoding]).reshape(shape(picture))
+    return np.frombuffer(bytes(message.data), DTYPES[message.encoding]).reshape(shape(image))
 
 
 def nanoseconds(stamp):
@@ -86,7 +86,7 @@ def nanoseconds(stamp):
 def check_poses(transforms, index):
     """Every stream's optical frame is on the mount, where the session says."""
     poses = {t.child_frame_id: t for t in transforms}
-    for p in index["pictures"]:
+    for p in index["images"]:
         _, _, camera, stream = p["base"].split("/")
         t = poses[f"{camera}_{stream}_optical_frame"]
         assert t.header.frame_id == f"{index['rig']}_mount", t.header.frame_id
@@ -99,7 +99,7 @@ def check_poses(transforms, index):
 
 
 def check_motion(reader, index, singles, batches):
-    """Every sample of a motion unit, one by one and in its batch. Numbers are compared exactly; None is no number."""
+    """Every sample of an IMU, one by one and in its batch. Numbers are compared exactly; None stands for NaN."""
 
     def same(want, got):
         return all((w is None and np.isnan(g)) or w == g for w, g in zip(want, got, strict=True))
@@ -130,17 +130,17 @@ def check_motion(reader, index, singles, batches):
         assert same(want["gyro"], s.gyro_rad_s) and same(want["accel"], s.accel_m_s2), what
         assert same([want["temperature_c"]], [s.temperature_c]), what
     if wanted:
-        print(f"{reader}: {len(wanted)} motion samples agree")
+        print(f"{reader}: {len(wanted)} IMU samples agree")
 
 
 def check_projection(info):
-    """Pictures are as the camera sent them: nothing is rectified, and a baseline is in the poses alone."""
+    """Images are as the camera sent them: nothing is rectified, and a baseline is in the poses alone."""
     k = list(info.k)
     assert list(info.r) == [1, 0, 0, 0, 1, 0, 0, 0, 1], info.r
     assert list(info.p) == [*k[0:3], 0, *k[3:6], 0, *k[6:9], 0], info.p
 
 
-def check_mcap(segments, index, pictures):
+def check_mcap(segments, index, images):
     """mcap + mcap-ros2-support: through the index and as a stream, with every checksum."""
     for kind in (make_reader, NonSeekingReader):
         seen, infos, sets, notes, frames = set(), {}, [], [], set()
@@ -152,8 +152,8 @@ def check_mcap(segments, index, pictures):
                     assert reader.get_header().profile == "ros2"
                 for _, channel, message, ros in reader.iter_decoded_messages():
                     topic, key = channel.topic, (channel.topic, message.log_time)
-                    if key in pictures:
-                        p = pictures[key]
+                    if key in images:
+                        p = images[key]
                         compare("mcap", p, from_message(p, ros))
                         if p["codec"] == "rank":
                             compare("mcap, undecoded", p, decode_depth(message.data))
@@ -180,19 +180,19 @@ def check_mcap(segments, index, pictures):
                         assert disk.name == "golden/disk" and disk.level in (0, 1), disk
                         assert status.level == 0 and status.message == "streaming", status
                         assert [(v.key, v.value) for v in status.values] == [("drift_ppm", "1.5")]
-        assert seen == pictures.keys(), f"mcap: {len(pictures.keys() - seen)} pictures are missing"
+        assert seen == images.keys(), f"mcap: {len(images.keys() - seen)} images are missing"
         wanted = [index["note"]] if index["note"] is not None else []
         assert len(sets) == index["sets"] and notes == wanted, (len(sets), notes)
-        for (_, time), p in pictures.items():
+        for (_, time), p in images.items():
             assert list(infos[p["base"], time].k) == p["k"], f"intrinsics of {p['base']}"
             assert list(infos[p["base"], time].d) == p["d"], f"distortion of {p['base']}"
             check_projection(infos[p["base"], time])
             assert (p["base"], time, p["sequence"], p["set"]) in frames, f"frame_info of {p['base']}"
-        print(f"mcap {kind.__name__}: {len(seen)} pictures agree")
+        print(f"mcap {kind.__name__}: {len(seen)} images agree")
         check_motion(f"mcap {kind.__name__}", index, singles, batches)
 
 
-def check_rosbags(segments, index, pictures):
+def check_rosbags(segments, index, images):
     """rosbags: ROS 2 types, our own included, taken from the file alone."""
     seen, ours, singles, batches = set(), 0, [], []
     for segment in segments:
@@ -201,22 +201,22 @@ def check_rosbags(segments, index, pictures):
                 message = reader.deserialize(raw, connection.msgtype)
                 ours += connection.msgtype.startswith("depthrig_msgs/")
                 key = (connection.topic, time)
-                if key in pictures:
-                    compare("rosbags", pictures[key], from_message(pictures[key], message))
+                if key in images:
+                    compare("rosbags", images[key], from_message(images[key], message))
                     seen.add(key)
                 elif connection.topic.endswith("/data_raw"):
                     singles.append((connection.topic, time, message))
                 elif connection.topic.endswith("/samples"):
                     batches.append((connection.topic, time, message))
     check_motion("rosbags", index, singles, batches)
-    assert seen == pictures.keys(), f"rosbags: {len(pictures.keys() - seen)} pictures are missing"
+    assert seen == images.keys(), f"rosbags: {len(images.keys() - seen)} images are missing"
     assert ours > 0
-    print(f"rosbags: {len(seen)} pictures agree, {ours} messages of our own types")
+    print(f"rosbags: {len(seen)} images agree, {ours} messages of our own types")
 
 
-def check_rerun(segments, pictures):
+def check_rerun(segments, images):
     """rerun's MCAP loader: depth must be a DepthImage in front of a Pinhole, not just numbers."""
-    known = {k: p for k, p in pictures.items() if p["codec"] != "rank"}
+    known = {k: p for k, p in images.items() if p["codec"] != "rank"}
     seen, pinholes = set(), set()
     for segment in segments:
         for chunk in McapReader(str(segment)).stream():
@@ -229,7 +229,7 @@ def check_rerun(segments, pictures):
                     continue
                 times = batch.column("message_log_time").cast("int64").to_pylist()
                 for time, data in zip(times, batch.column(kind), strict=True):
-                    p = pictures[entity, time]
+                    p = images[entity, time]
                     data = data.values[0].values.to_numpy()
                     if p["codec"] in ("jpeg", "png"):
                         assert kind == "EncodedImage:blob", kind
@@ -240,10 +240,10 @@ def check_rerun(segments, pictures):
                         got = np.frombuffer(data.tobytes(), DTYPES[p["encoding"]]).reshape(shape(p))
                     compare("rerun", p, got)
                     seen.add((entity, time))
-    assert seen == known.keys(), f"rerun: {len(known.keys() - seen)} pictures are missing"
-    bases = {p["base"] for p in pictures.values()}
+    assert seen == known.keys(), f"rerun: {len(known.keys() - seen)} images are missing"
+    bases = {p["base"] for p in images.values()}
     assert pinholes == bases, f"rerun: no Pinhole for {bases - pinholes}"
-    print(f"rerun: {len(seen)} pictures agree, {len(pinholes)} cameras are pinholes")
+    print(f"rerun: {len(seen)} images agree, {len(pinholes)} cameras are pinholes")
     # The command line's converter takes the file as well.
     command = shutil.which("rerun", path=str(Path(sys.executable).parent)) or shutil.which("rerun")
     with tempfile.TemporaryDirectory() as folder:
@@ -252,7 +252,7 @@ def check_rerun(segments, pictures):
             subprocess.run([command, "mcap", "convert", str(segment), "-o", str(out)], check=True, capture_output=True)
             printed = subprocess.run([command, "rrd", "print", "-v", str(out)], check=True, capture_output=True, text=True)
             assert "@Pinhole:image_from_camera" in printed.stdout
-            assert len(known) < len(pictures) or "@DepthImage:buffer" in printed.stdout
+            assert len(known) < len(images) or "@DepthImage:buffer" in printed.stdout
     print("rerun mcap convert: depth images and pinholes")
 
 
@@ -262,10 +262,10 @@ def main():
     dataset, expected = map(Path, sys.argv[1:])
     segments = sorted(dataset.glob("seg_*.mcap"))
     assert segments, f"{dataset} has no segments"
-    index, pictures = load(expected)
-    check_mcap(segments, index, pictures)
-    check_rosbags(segments, index, pictures)
-    check_rerun(segments, pictures)
+    index, images = load(expected)
+    check_mcap(segments, index, images)
+    check_rosbags(segments, index, images)
+    check_rerun(segments, images)
 
 
 if __name__ == "__main__":

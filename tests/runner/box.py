@@ -33,7 +33,7 @@ PR_SET_CHILD_SUBREAPER = 36
 TIMED_OUT = 124
 """The exit status of a command that ran past its limit, as timeout(1) has it."""
 CHECK_S = 0.2
-"""How often the time limits are looked at."""
+"""How often the time limits are checked."""
 NO_RIGHTS = ["--inh-caps=-all", "--ambient-caps=-all"]
 ONLY_MOUNTS = ["--inh-caps=-all,+sys_admin", "--ambient-caps=-all,+sys_admin", "--bounding-set=-all,+sys_admin"]
 BUSY: set[int] = set()
@@ -42,7 +42,7 @@ BUSY: set[int] = set()
 
 @dataclass
 class User:
-    """Who a command runs as."""
+    """The user that a command runs as."""
 
     uid: int
     gid: int
@@ -60,7 +60,7 @@ class User:
 
 @dataclass
 class Box:
-    """How to run a command."""
+    """Settings of a command's run."""
 
     user: User | None = field(default_factory=User.from_environment)
     mounts: bool = False
@@ -130,7 +130,7 @@ class Box:
     ) -> int:
         """Runs `argv` and returns its exit status, `TIMED_OUT` if it was killed for its time.
 
-        `limit_s` is for the whole command; `idle_s` is the longest between two lines of its output for which `line`,
+        `limit_s` is for the entire command; `idle_s` is the longest between two lines of its output for which `line`,
         that is given each of them, returns True.
         """
         become_subreaper()
@@ -162,7 +162,7 @@ class Box:
                 left = kill_descendants(process.pid)
                 status = process.wait()
                 if line:
-                    # Nobody holds the other end of the pipe any more.
+                    # The other end of the pipe is closed.
                     reader.join()
             if in_time and left:
                 print(f"box: killed what {argv[0]} left running: {'; '.join(left)}", file=sys.stderr)
@@ -265,7 +265,7 @@ def closed_ancestor(folder: Path, user: User) -> Path | None:
 
 def open_up(folders: list[Path], user: User) -> list[str]:
     """Shell commands that make `folders` reachable: a closed folder above them is covered by an empty one with only these
-    in it. The rest of what it holds cannot be seen in the box at all."""
+    in it. Its other contents are invisible in the box."""
     above = {folder.resolve(): closed_ancestor(folder, user) for folder in folders if folder.exists()}
     wanted = {folder: closed for folder, closed in above.items() if closed}
     if not wanted:
@@ -285,7 +285,7 @@ def open_up(folders: list[Path], user: User) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--limit", type=float, metavar="SECONDS", help="for the whole command")
+    parser.add_argument("--limit", type=float, metavar="SECONDS", help="time limit of the command")
     parser.add_argument("--as-root", action="store_true", help="stay root, if this is root")
     parser.add_argument("--mounts", action="store_true", help="the command may mount file systems")
     parser.add_argument("--shm", type=int, metavar="MIB", help="a /dev/shm of its own of this size")

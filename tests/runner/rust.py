@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Runs test executables that cargo has built, each in a box (box.py), and counts what they say.
+"""Runs test executables that cargo has built, each in a box (box.py), and counts their results.
 
     cargo test --workspace --no-run --message-format=json >MESSAGES
     tests/runner/rust.py MESSAGES [--only CRATE[:TARGET][=FILTER]]... [--shm MIB] [--nofile N] [--busy N]
@@ -52,7 +52,7 @@ class Executable:
         return f"{self.crate} {self.kind} {self.target}"
 
     def environment(self, programs: dict[str, str]) -> dict[str, str]:
-        """What cargo would have set."""
+        """The environment that cargo would have set."""
         env = dict(os.environ)
         env["CARGO_MANIFEST_DIR"] = str(self.folder)
         env["CARGO_MANIFEST_PATH"] = str(self.folder / "Cargo.toml")
@@ -62,7 +62,7 @@ class Executable:
 
 @dataclass
 class Outcome:
-    """What an executable's output says."""
+    """The results in an executable's output."""
 
     results: dict[str, str] = field(default_factory=dict)
     output: dict[str, list[str]] = field(default_factory=dict)
@@ -72,7 +72,7 @@ class Outcome:
     _inside: str | None = None
 
     def take(self, line: str) -> bool:
-        """Takes a line of output; whether it is a sign of progress."""
+        """Takes a line of output; returns whether it is a sign of progress."""
         if found := RESULT.match(line):
             self.results[found["name"]] = found["result"]
             return True
@@ -131,7 +131,7 @@ def names_of(executable: Executable, box: Box, filters: list[str], env: dict[str
 
 
 def run(executable: Executable, box: Box, filters: list[str], programs: dict[str, str], totals: Totals) -> bool:
-    """Runs an executable and prints how it went; whether it went well."""
+    """Runs an executable and prints its results; returns whether it passed."""
     env = executable.environment(programs)
     box.mounts = (executable.crate, executable.target) in NEEDS_MOUNTS
     outcome = Outcome()
@@ -152,7 +152,7 @@ def run(executable: Executable, box: Box, filters: list[str], programs: dict[str
     )
     ignored = sum(result.startswith("ignored") for result in outcome.results.values())
     if not outcome.ended:
-        # It was killed, or died; what has no result was running, or never began.
+        # It was killed, or died; tests without a result were running, or never began.
         unfinished = [name for name in names_of(executable, box, filters, env) if name not in outcome.results]
         why = f"killed after {LIMIT_S:.0f} s without a result" if status == TIMED_OUT else f"died with status {status}"
         print(f"{executable.name}: {why}; without a result: {', '.join(unfinished) or 'none'}")

@@ -1,4 +1,4 @@
-"""The runner itself: time limits end what hangs with all that it started, and what is missing is counted by name."""
+"""The runner itself: time limits kill hanging tests with all that they started; skipped tests are counted by name."""
 
 from __future__ import annotations
 

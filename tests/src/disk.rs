@@ -11,16 +11,16 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-/// What is wrong with a [`Disk`] now.
+/// Faults that a [`Disk`] has now.
 #[derive(Debug, Default)]
 struct Trouble {
-    /// Writes and syncs wait until then.
+    /// Writes and syncs wait until this time.
     stalled_until: Option<HostTime>,
-    /// Writes and syncs fail so.
+    /// Writes and syncs fail with this error.
     fails: Option<io::ErrorKind>,
 }
 
-/// This computer's disk, with trouble that a test switches on and off; clones share it.
+/// This computer's disk with faults that a test switches on and off; clones share them.
 #[derive(Debug, Clone, Default)]
 pub struct Disk {
     trouble: Arc<Mutex<Trouble>>,
@@ -30,12 +30,12 @@ pub struct Disk {
 }
 
 impl Disk {
-    /// From now on nothing is written for so long.
+    /// Stalls all writes for `length` from now on.
     pub fn stall(&self, length: Duration) {
         self.trouble.lock().unwrap().stalled_until = Some(HostTime::now().plus(length));
     }
 
-    /// From now on it takes so many bytes a second; 0: as many as come.
+    /// Limits writing to `bytes_per_s` from now on; 0 removes the limit.
     pub fn slow_down(&self, bytes_per_s: u64) {
         self.speed.store(bytes_per_s, Ordering::SeqCst);
     }
@@ -212,7 +212,7 @@ impl Tmpfs {
     /// Fills it up with one file, all but `left` bytes.
     pub fn fill(&self, left: u64) {
         let free = RealFs.available_space(&self.0).unwrap();
-        // Who else writes meanwhile may take what is left.
+        // Another writer may take the remaining space.
         match std::fs::write(self.0.join("filler"), vec![0; free.saturating_sub(left) as usize]) {
             Err(e) if e.kind() == io::ErrorKind::StorageFull => {}
             written => written.unwrap(),

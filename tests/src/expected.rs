@@ -1,7 +1,7 @@
-//! What readers that are not ours must find in a dataset: bare pixels, and a list of pictures and motion samples.
+//! Expected contents of a dataset for third-party readers: bare pixels, and a list of images and IMU samples.
 //!
-//! `index.json` lists each picture: topic, log time, size, encoding, the file with its pixels, how they are to be
-//! compared (`exact` or `jpeg`) and the intrinsics; each sample of a motion unit; and where the units sit. The files
+//! `index.json` lists each image: topic, log time, size, encoding, the file with its pixels, how they are to be
+//! compared (`exact` or `jpeg`) and the intrinsics; each sample of an IMU; and the poses of the IMUs. The files
 //! hold bare pixels, row by row.
 
 use depthrig_bus::PixelFormat;
@@ -9,7 +9,7 @@ use depthrig_recorder::{Dataset, DatasetSet, Session, SetRange, StreamRecord};
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// ROS's encoding of a format, and the last part of the topic of pictures stored as they came.
+/// ROS's encoding of a format, and the last part of the topic of images stored as they came.
 fn encoding(format: PixelFormat) -> &'static str {
     match format {
         PixelFormat::Z16 => "16UC1",
@@ -42,7 +42,7 @@ fn motion(session: &Session, set: &DatasetSet) -> Vec<Value> {
 
 /// Writes what our own reader finds in `dataset` to `expected`.
 ///
-/// `check` is given each picture that is stored losslessly: its stream, its set's id and its pixels. `note` is the
+/// `check` is given each image that is stored losslessly: its stream, its set's id and its pixels. `note` is the
 /// note of the session, where it has one.
 ///
 /// # Panics
@@ -56,8 +56,10 @@ pub fn write(
     std::fs::create_dir_all(expected).unwrap();
     let made = Dataset::open(dataset).unwrap();
     let session = made.session();
-    let (mut pictures, mut samples) = (Vec::new(), Vec::new());
-    let (mut sets, mut first_set) = (0, None);
+    let mut images = Vec::new();
+    let mut samples = Vec::new();
+    let mut sets = 0;
+    let mut first_set = None;
     for set in made.sets(SetRange::ALL) {
         let set = set.unwrap();
         sets += 1;
@@ -78,7 +80,7 @@ pub fn write(
             };
             let base = format!("/{}/{}/{}", session.rig, s.id.camera, s.id.stream);
             let i = &f.header.intrinsics;
-            pictures.push(json!({
+            images.push(json!({
                 "topic": format!("{base}/{last}"), "base": base, "set": set.id, "file": file,
                 // As text: 64-bit times do not survive JavaScript's numbers.
                 "log_time": set.utc_ns.to_string(),
@@ -103,7 +105,7 @@ pub fn write(
         .collect();
     let index = json!({
         "rig": session.rig, "sets": sets, "first_set": first_set, "note": note,
-        "pictures": pictures, "motion": samples, "units": units,
+        "images": images, "motion": samples, "units": units,
     });
     std::fs::write(expected.join("index.json"), serde_json::to_vec_pretty(&index).unwrap()).unwrap();
 }

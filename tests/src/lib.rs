@@ -3,10 +3,10 @@
 
 pub mod disk;
 pub mod expected;
-pub mod eyes;
-pub mod made;
+pub mod fixture;
 pub mod pairs;
 pub mod scene;
+pub mod synthetic_stereo;
 
 pub use depthrig_kinect_fixture as kinect;
 
@@ -18,14 +18,14 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// A folder that a test's rigs live in; removed at the end.
+/// A temporary folder for a test's rigs; removed at the end.
 pub struct Home {
     dir: tempfile::TempDir,
 }
 
 impl Default for Home {
     fn default() -> Self {
-        // Short, because Unix sockets are made below it.
+        // Short, because Unix sockets live below it.
         Self { dir: tempfile::Builder::new().prefix("dr").tempdir_in("/tmp").unwrap() }
     }
 }
@@ -91,7 +91,7 @@ impl RigText {
         self
     }
 
-    /// Adds a camera of the pictures that `manifest` names, with `extra` lines of TOML in its table.
+    /// Adds a camera of the images that `manifest` names, with `extra` lines of TOML in its table.
     pub fn files(mut self, name: &str, manifest: &Path, extra: &str) -> Self {
         let manifest = manifest.display();
         write!(
@@ -120,20 +120,30 @@ impl RigText {
     }
 }
 
-/// Writes the pictures of a camera without any calibration into `dir`: colour and depth of these sizes, the first row of
-/// depth without any, the second saturated. Returns its manifest.
-pub fn uncalibrated_camera(dir: &Path, color: (u32, u32), depth: (u32, u32)) -> PathBuf {
+/// Width and height of an image, in pixels.
+#[derive(Debug, Clone, Copy)]
+pub struct ImageSize {
+    /// Pixels per row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
+/// Writes the images of a camera without calibration into `dir` and returns its manifest. The first row of depth has no
+/// depth, the second is saturated.
+pub fn uncalibrated_camera(dir: &Path, color: ImageSize, depth: ImageSize) -> PathBuf {
     for i in 0..4u8 {
-        let picture = image::RgbImage::from_fn(color.0, color.1, |x, y| image::Rgb([x as u8, y as u8, i]));
-        picture.save(dir.join(format!("color_{i}.png"))).unwrap();
-        let picture = image::ImageBuffer::<image::Luma<u16>, _>::from_fn(depth.0, depth.1, |x, y| {
+        let image =
+            image::RgbImage::from_fn(color.width, color.height, |x, y| image::Rgb([x as u8, y as u8, i]));
+        image.save(dir.join(format!("color_{i}.png"))).unwrap();
+        let image = image::ImageBuffer::<image::Luma<u16>, _>::from_fn(depth.width, depth.height, |x, y| {
             image::Luma([match y {
                 0 => 0,
                 1 => u16::MAX,
                 _ => 500 + x as u16,
             }])
         });
-        picture.save(dir.join(format!("depth_{i}.png"))).unwrap();
+        image.save(dir.join(format!("depth_{i}.png"))).unwrap();
     }
     let manifest = dir.join("camera.toml");
     let text = "model = \"test\"\nrate_hz = 30.0\n[[stream]]\nname = \"color\"\nfiles = \"color_*.png\"\n\
@@ -142,7 +152,7 @@ pub fn uncalibrated_camera(dir: &Path, color: (u32, u32), depth: (u32, u32)) -> 
     manifest
 }
 
-/// Waits until `done` says so; panics with the last status after 20 s.
+/// Waits until `done` holds; panics with the last status after 20 s.
 pub fn wait_until(rig: &Rig, what: &str, mut done: impl FnMut(&RigStatus) -> bool) -> RigStatus {
     let deadline = HostTime::now().plus(Duration::from_secs(20));
     loop {

@@ -1,4 +1,4 @@
-//! Rectified pairs of pictures: made ones whose truth is known, and a real one.
+//! Rectified pairs of images: synthetic ones whose truth is known, and a real one.
 
 use depthrig_calib::stereo::{Gray, StereoPair};
 use std::path::PathBuf;
@@ -6,25 +6,25 @@ use std::path::PathBuf;
 /// Pixels per row, and rows.
 pub type Size = (usize, usize);
 
-/// Both pictures of a pair, grey.
+/// Both images of a pair, grey.
 pub struct Pair {
-    /// What it is, for messages.
+    /// Name of the pair in messages.
     pub name: String,
-    /// Of each of the two.
+    /// Size of each image.
     pub size: Size,
     /// Left and right, rows without padding.
-    pub eyes: [Vec<u8>; 2],
+    pub images: [Vec<u8>; 2],
 }
 
 impl Pair {
-    /// As matchers take it.
+    /// The pair as matchers take it.
     pub fn pair(&self) -> StereoPair<'_> {
         let (w, h) = self.size;
-        let [left, right] = self.eyes.each_ref().map(|e| Gray::packed(e, w, h));
+        let [left, right] = self.images.each_ref().map(|e| Gray::packed(e, w, h));
         StereoPair::new(left, right)
     }
 
-    /// OpenCV's picture of aloe plants, a part of its size.
+    /// OpenCV's image of aloe plants, a part of its size.
     ///
     /// # Panics
     /// When it is not there: `DEPTHRIG_TEST_DATA` names the folder that holds it.
@@ -33,7 +33,7 @@ impl Pair {
             || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"),
             PathBuf::from,
         );
-        let eyes = ["aloeL.jpg", "aloeR.jpg"].map(|name| {
+        let images = ["aloeL.jpg", "aloeR.jpg"].map(|name| {
             let path = data.join("opencv_aloe_stereo").join(name);
             let bytes = std::fs::read(&path)
                 .unwrap_or_else(|e| panic!("{}: {e}; set DEPTHRIG_TEST_DATA", path.display()));
@@ -48,11 +48,12 @@ impl Pair {
             };
             image::GrayImage::from_fn(e.width(), e.height(), |x, y| luma(e.get_pixel(x, y)))
         };
-        let eyes = eyes.each_ref().map(grey);
-        let (w, h) = (eyes[0].width() / parts, eyes[0].height() / parts);
+        let images = images.each_ref().map(grey);
+        let w = images[0].width() / parts;
+        let h = images[0].height() / parts;
         let small =
-            eyes.each_ref().map(|e| image::imageops::resize(e, w, h, image::imageops::Triangle).into_raw());
-        Self { name: format!("aloe of {w}x{h}"), size: (w as usize, h as usize), eyes: small }
+            images.each_ref().map(|e| image::imageops::resize(e, w, h, image::imageops::Triangle).into_raw());
+        Self { name: format!("aloe of {w}x{h}"), size: (w as usize, h as usize), images: small }
     }
 }
 
@@ -69,8 +70,10 @@ pub fn hash(a: i64, b: i64, seed: u64) -> f64 {
 
 /// Noise that is smooth between whole numbers, 0 to 1.
 pub fn smooth(u: f64, v: f64, seed: u64) -> f64 {
-    let (i, j) = (u.floor(), v.floor());
-    let (fu, fv) = (u - i, v - j);
+    let i = u.floor();
+    let j = v.floor();
+    let fu = u - i;
+    let fv = v - j;
     let at = |i: f64, j: f64| hash(i as i64, j as i64, seed);
     let row = |j| at(i, j) * (1.0 - fu) + at(i + 1.0, j) * fu;
     row(j) * (1.0 - fv) + row(j + 1.0) * fv
@@ -84,13 +87,13 @@ pub fn stripe(u: f64) -> f64 {
 /// A value at a place of the left view.
 pub type Field<'a> = &'a dyn Fn(f64, f64) -> f64;
 
-/// A surface as both eyes see it: its disparity and its brightness (0 to 1) at a pixel of the left view. The right eye is
-/// darker than the left one by a fifth, and both have noise of three grey levels.
+/// Renders a surface from its disparity and brightness (0 to 1) at a pixel of the left view. The right image is a fifth
+/// darker than the left one; both have noise of three grey levels.
 pub fn seen(name: String, size: Size, disparity: Field<'_>, brightness: Field<'_>) -> Pair {
     seen_apart(name, size, disparity, &|_, _| 0.0, brightness)
 }
 
-/// The same, where what is at a pixel of the left view lies so many `rows` lower in the right one.
+/// Like [`seen`], with the right image's content `rows` lower than the left one's.
 pub fn seen_apart(
     name: String,
     size: Size,
@@ -98,9 +101,10 @@ pub fn seen_apart(
     rows: Field<'_>,
     brightness: Field<'_>,
 ) -> Pair {
-    let eye = |right: bool| -> Vec<u8> {
+    let image = |right: bool| -> Vec<u8> {
         let pixel = |i: usize| {
-            let (x, y) = ((i % size.0) as f64, (i / size.0) as f64);
+            let x = (i % size.0) as f64;
+            let y = (i / size.0) as f64;
             let mut left = (x, y);
             for _ in 0..if right { 8 } else { 0 } {
                 left = (x + disparity(left.0, left.1), y - rows(left.0, left.1));
@@ -111,5 +115,5 @@ pub fn seen_apart(
         };
         (0..size.0 * size.1).map(pixel).collect()
     };
-    Pair { name, size, eyes: [eye(false), eye(true)] }
+    Pair { name, size, images: [image(false), image(true)] }
 }

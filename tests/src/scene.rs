@@ -1,4 +1,4 @@
-//! Pictures of the simulated cameras as a refiner is given them: colour, raw depth in its view, and the truth.
+//! Images of the simulated cameras as a refiner is given them: colour, raw depth in its view, and the truth.
 
 use depthrig_bus::{Name, Pose};
 use depthrig_calib::{PoseExt, Registration};
@@ -12,19 +12,19 @@ pub const MODELS: [&str; 7] = ["d405", "d415", "d435", "d455", "zed2i", "l515", 
 
 /// One view of a camera.
 pub struct Scene {
-    /// Width and height of all pictures.
+    /// Width and height of all images.
     pub size: (usize, usize),
     /// Red, green, blue.
     pub color: Vec<u8>,
-    /// What the camera measured, put into colour's view.
+    /// Measured depth, registered to colour.
     pub raw: Vec<u16>,
-    /// What is there.
+    /// True depth.
     pub truth: Vec<u16>,
     /// Metres per unit of both.
     pub unit_m: f64,
 }
 
-/// Which sizes to ask a camera for.
+/// Image sizes to request from a camera.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Size {
     /// Those of its default modes.
@@ -33,7 +33,7 @@ pub enum Size {
     Small,
 }
 
-/// What `model` sees from a place and direction on the mount.
+/// Renders the view of `model` from a pose on the mount.
 pub fn shoot(model: &str, size: Size, pose_on_mount: Pose, cache: &Path) -> Scene {
     let mut config = SyntheticConfig {
         model: model.into(),
@@ -76,7 +76,8 @@ pub fn shoot(model: &str, size: Size, pose_on_mount: Pose, cache: &Path) -> Scen
 fn register(depth: &StreamProfile, color: &StreamProfile, from: &[u16], to: &mut [u16]) {
     let color_from_depth = color.pose_in_device.inverse().compose(&depth.pose_in_device);
     let size = |p: &StreamProfile| (p.width, p.height);
-    let (d, c) = (&depth.intrinsics, &color.intrinsics);
+    let d = &depth.intrinsics;
+    let c = &color.intrinsics;
     let mut registration = Registration::new(d, size(depth), c, size(color), &color_from_depth).unwrap();
     registration.depth_to_color(from, depth.depth_unit_m, to).unwrap();
 }

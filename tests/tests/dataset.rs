@@ -1,4 +1,4 @@
-//! From camera to disk and back: what a subscriber saw live is what the dataset and its replay hold.
+//! From camera to disk and back: the dataset and its replay equal the frames that a subscriber received live.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{Bus, Frame, FrameFlags, FrameHeader, HostTime, RigName, StreamId};
@@ -7,7 +7,7 @@ use depthrig_daemon::control::RecordRequest;
 use depthrig_daemon::replay::{Replay, ReplayOptions};
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{Dataset, SetRange};
-use depthrig_tests::made::Made;
+use depthrig_tests::fixture::Fixture;
 use depthrig_tests::{Home, RigText, all_stream, assert_balanced, wait_until};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -197,7 +197,7 @@ fn a_camera_that_is_lost_leaves_marked_sets() {
 }
 
 #[test]
-fn what_is_no_dataset_is_said() {
+fn a_folder_without_a_dataset_is_reported() {
     let home = Home::default();
     let start = |name: &str, options| Replay::start(&[home.path(name)], &home.runtime(), None, options);
     let Err(e) = start("nowhere", ReplayOptions::default()) else { panic!() };
@@ -205,7 +205,7 @@ fn what_is_no_dataset_is_said() {
     std::fs::create_dir(home.path("empty")).unwrap();
     let Err(e) = start("empty", ReplayOptions::default()) else { panic!() };
     assert_eq!(e.kind(), ErrorKind::Other);
-    assert!(e.to_string().contains("is no dataset"), "{e}");
+    assert!(e.to_string().contains("is not a dataset"), "{e}");
     let options = ReplayOptions { rate: 0.0, ..ReplayOptions::default() };
     let Err(e) = start("empty", options) else { panic!() };
     assert!(e.to_string().contains("from 0.1 to 10"), "{e}");
@@ -227,11 +227,11 @@ fn a_rig_finishes_at_its_start_what_a_crash_left_of_its_own() {
     let data = home.path("data");
     // In the order in which they are looked at: what must not be touched comes first.
     let [foreign, held, cut] = ["1_foreign", "2_held", "3_cut"].map(|name| data.join(name));
-    let made = Made { rig: "test", ..Made::default() };
-    Made { rig: "another", ..Made::default() }.record_and_crash(&foreign);
+    let made = Fixture { rig: "test", ..Fixture::default() };
+    Fixture { rig: "another", ..Fixture::default() }.record_and_crash(&foreign);
     made.record_and_crash(&held);
     made.record_and_crash(&cut);
-    // As whoever records into it does.
+    // As a recorder does.
     let lock = RealFs.lock(&held).unwrap();
     let before = [files(&foreign), files(&held)];
     let unfinished = files(&cut);
@@ -239,7 +239,7 @@ fn a_rig_finishes_at_its_start_what_a_crash_left_of_its_own() {
 
     let config = |more: &str| text() + &format!("directory = \"{}\"\n{more}", data.display());
     home.start(&config("recover_on_start = false\n")).unwrap().stop();
-    assert!(files(&cut) == unfinished, "it was told not to");
+    assert!(files(&cut) == unfinished, "the options forbid it");
 
     let rig = home.start(&config("")).unwrap();
     wait_until(&rig, "the recovery", |_| Dataset::open(&cut).unwrap().session().outcome.is_some());

@@ -23,7 +23,7 @@ fn request(home: &Home) -> RecordRequest {
     RecordRequest { directory: Some(home.path("data")), ..RecordRequest::default() }
 }
 
-/// 240 poses take minutes: none of what is asked here waits for them.
+/// 240 poses take minutes: no request here waits for them.
 #[test]
 fn a_rig_answers_and_streams_while_its_scenes_are_rendered() {
     let home = Home::default();

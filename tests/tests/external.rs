@@ -31,8 +31,8 @@ impl Process {
             .spawn()
             .unwrap();
         let out = BufReader::new(child.stdout.take().unwrap());
-        let (tell, lines) = sync_channel(1024);
-        std::thread::spawn(move || out.lines().map_while(Result::ok).all(|line| tell.send(line).is_ok()));
+        let (sender, lines) = sync_channel(1024);
+        std::thread::spawn(move || out.lines().map_while(Result::ok).all(|line| sender.send(line).is_ok()));
         Self { child, lines }
     }
 
@@ -98,7 +98,7 @@ fn lost(status: &RigStatus, reason: &str) -> u64 {
     ext(status).streams.iter().map(|s| s.dropped.get(reason).copied().unwrap_or(0)).sum()
 }
 
-/// The number of the process that serves the camera, as its device tells.
+/// ID of the process that serves the camera, from its port name.
 fn pid(status: &RigStatus) -> u32 {
     ext(status).port.strip_prefix("process ").unwrap().parse().unwrap()
 }
@@ -150,7 +150,7 @@ fn a_killed_process_is_seen_at_once_and_its_successor_streams_with_a_new_clock()
     wait_until(&rig, "streaming", all_stream);
     std::thread::sleep(Duration::from_millis(500));
     process.signal("KILL");
-    // Its lock says so; its silence would be noticed later, and said in other words.
+    // Its lock reveals it; its silence would be noticed later, with another message.
     wait_until(&rig, "the loss", |s| says(s, "ended without a word"));
     drop(process);
     let _process = Process::start(&home, "normal");
@@ -179,7 +179,7 @@ fn a_stopped_process_is_hung_and_goes_on_when_it_wakes() {
 }
 
 #[test]
-fn what_is_announced_and_not_sent_ends_the_session_and_is_said_to_both_sides() {
+fn a_frame_announced_and_not_sent_ends_the_session_and_both_sides_report_it() {
     let home = Home::default();
     let process = Process::start(&home, "other_size");
     let rig = home.start(&text("")).unwrap();
@@ -271,7 +271,7 @@ fn offers_that_cannot_be_are_refused_by_name() {
         process.says(part);
         stop(rig);
     }
-    // The same offer without a lie is good, so that each of the above was refused for what it says.
+    // The same offer without a lie is good, so each of the above was refused for its error.
     let home = Home::default();
     let _process = Process::start(&home, "offers_nothing_wrong");
     let rig = home.start(&text("")).unwrap();
@@ -305,7 +305,7 @@ fn a_process_without_frames_is_stalled_and_opened_again() {
     let _process = Process::start(&home, "mute");
     let rig = home.start(&text("start_timeout_s = 0.5")).unwrap();
     let status = wait_until(&rig, "the silence", |s| says(s, "sent no frame within 0.5 s"));
-    assert!(says(&status, "(it says \"starting\")"), "{:?}", ext(&status).message);
+    assert!(says(&status, "(its state is \"starting\")"), "{:?}", ext(&status).message);
     stop(rig);
 }
 

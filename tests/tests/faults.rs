@@ -1,4 +1,4 @@
-//! A rig whose cameras fail: each failure is seen for what it is, and the other cameras do not notice.
+//! A rig whose cameras fail: each failure is reported as such, and the other cameras are not affected.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::HostTime;

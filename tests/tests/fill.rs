@@ -1,12 +1,12 @@
-//! `fill` against raw depth, on every simulated camera: what is promised of it where nothing is installed.
+//! `fill` against raw depth, on every simulated camera: its promises without an installed model.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_cdm::metrics::{Depth, DepthRange, compare};
 use depthrig_cdm::{Color, ColorFormat, FillRefiner, Job, Output, RawDepth, Refiner, StepTimes};
 use depthrig_tests::scene::{MODELS, Size, places, shoot};
 
-/// Strict measures: a pixel without depth counts as 0 m. L1 shrinks in every picture. RMSE does in the mean of a camera's
-/// pictures; it weighs the few large errors that filling makes, and grew in 4 of these 42 pictures, by a tenth at the
+/// Strict measures: a pixel without depth counts as 0 m. L1 shrinks in every image. RMSE does in the mean of a camera's
+/// images; it weighs the few large errors that filling makes, and grew in 4 of these 42 images, by a tenth at the
 /// most (D435, L515). `tests/examples/fill.rs` prints all there is to say.
 #[test]
 fn filled_depth_is_nearer_to_the_truth_than_raw_for_stereo_and_time_of_flight() {
@@ -17,7 +17,8 @@ fn filled_depth_is_nearer_to_the_truth_than_raw_for_stereo_and_time_of_flight() 
         let mut rmse_m = [0.0; 2];
         for place in places() {
             let scene = shoot(model, size, place, &cache);
-            let ((width, height), unit_m) = (scene.size, scene.unit_m);
+            let (width, height) = scene.size;
+            let unit_m = scene.unit_m;
             let mut filled = vec![0; scene.raw.len()];
             let job = Job {
                 color: Color {
@@ -34,7 +35,8 @@ fn filled_depth_is_nearer_to_the_truth_than_raw_for_stereo_and_time_of_flight() 
             refiner.refine(&mut [job]).unwrap();
             let truth = Depth::Units { pixels: &scene.truth, unit_m };
             let measure = |pixels| compare(&Depth::Units { pixels, unit_m }, &truth, range).unwrap();
-            let (raw, fill) = (measure(&scene.raw), measure(&filled));
+            let raw = measure(&scene.raw);
+            let fill = measure(&filled);
             let what = format!("{model} {size:?}: {raw:?} raw, {fill:?} filled");
             assert!(fill.strict_l1_m < raw.strict_l1_m, "{what}");
             assert!(fill.strict_rmse_m < 1.15 * raw.strict_rmse_m, "{what}");

@@ -1,9 +1,9 @@
-//! Attached Kinects in a running rig, through a made libk4a that the configuration names: what reaches the bus and a
+//! Attached Kinects in a running rig, through a fake libk4a that the configuration names: what reaches the bus and a
 //! recording; cameras that are pulled out, held by others, wired together, without a library or a depth engine.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "../../drivers/tests/support/kinect.rs"]
-mod made;
+mod fake;
 
 use depthrig_bus::{Bus, FrameFlags, PixelFormat, RigName};
 use depthrig_daemon::control::RecordRequest;
@@ -11,7 +11,7 @@ use depthrig_daemon::rig::Rig;
 use depthrig_daemon::status::{CameraState, CameraStatus, RigStatus};
 use depthrig_recorder::{Dataset, PixelMode, VerifyOptions, verify};
 use depthrig_tests::{Home, RigText, all_stream, assert_balanced, camera, wait_until};
-use made::Fake;
+use fake::Fake;
 use std::path::Path;
 use std::time::Duration;
 
@@ -19,7 +19,7 @@ const A: &str = "000111111111";
 const B: &str = "000222222222";
 const SECOND: u64 = 1_000_000_000;
 
-/// The table of a Kinect `name` of the library at `library`: small pictures at 15 Hz.
+/// The table of a Kinect `name` of the library at `library`: small images at 15 Hz.
 fn kinect(name: &str, library: &Path, extra: &str) -> String {
     let library = library.display();
     format!(
@@ -64,17 +64,18 @@ fn stop(rig: Rig, fakes: &[&Fake]) -> RigStatus {
 
 #[test]
 fn a_kinect_reaches_the_bus_and_a_recording_that_verifies() {
-    let (home, fake) = (Home::default(), Fake::new(&[A]));
+    let home = Home::default();
+    let fake = Fake::new(&[A]);
     let rig = home.start(&rig_text(&fake, &format!("serial = \"{A}\""))).unwrap();
     let status = wait_until(&rig, "frames", |s| all_stream(s) && delivered(s, "k") > 2);
     let c = k(&status);
     assert_eq!((c.model.as_str(), c.serial.as_str()), ("Azure Kinect", A));
     assert_eq!((c.firmware.as_str(), c.calibration.as_str()), ("color 1.6.110, depth 1.6.79", "factory"));
-    // A subscriber reads a picture that the camera made.
+    // A subscriber reads an image that the camera made.
     let bus = Bus::open(&home.runtime(), &RigName::new("test").unwrap()).unwrap();
     let mut depth = bus.subscriber(&"k/depth".parse().unwrap()).unwrap();
     let frame = depth.next_timeout(Duration::from_secs(20)).unwrap().unwrap();
-    assert!(fake_k4a::pictures::is_genuine(fake_k4a::abi::DEPTH16, 320, 288, frame.pixels()));
+    assert!(fake_k4a::images::is_genuine(fake_k4a::abi::DEPTH16, 320, 288, frame.pixels()));
     assert!((frame.header().depth_unit_m - 0.001).abs() < 1e-9);
     drop((frame, depth));
     let request = RecordRequest {
@@ -102,17 +103,18 @@ fn a_kinect_reaches_the_bus_and_a_recording_that_verifies() {
     for i in 0..reader.times().len() {
         for f in reader.read(i, PixelMode::Decoded).unwrap().frames {
             if dataset.session().streams[f.stream].id.to_string() == "k/depth" {
-                assert!(fake_k4a::pictures::is_genuine(fake_k4a::abi::DEPTH16, 320, 288, &f.pixels));
+                assert!(fake_k4a::images::is_genuine(fake_k4a::abi::DEPTH16, 320, 288, &f.pixels));
                 genuine += 1;
             }
         }
     }
-    assert!(genuine >= 5, "{genuine} pictures of depth");
+    assert!(genuine >= 5, "{genuine} images of depth");
 }
 
 #[test]
-fn one_that_is_pulled_out_is_told_and_streams_again_when_it_is_back() {
-    let (home, fake) = (Home::default(), Fake::new(&[A]));
+fn an_unplugged_camera_is_reported_and_streams_again_when_it_is_back() {
+    let home = Home::default();
+    let fake = Fake::new(&[A]);
     let rig = home.start(&rig_text(&fake, "")).unwrap();
     wait_until(&rig, "frames", |s| all_stream(s) && delivered(s, "k") > 5);
     fake.command(A, "unplug", 1500 * SECOND / 1000);
@@ -128,7 +130,8 @@ fn one_that_is_pulled_out_is_told_and_streams_again_when_it_is_back() {
 
 #[test]
 fn captures_that_are_damaged_on_their_way_are_counted_and_nothing_is_held() {
-    let (home, fake) = (Home::default(), Fake::new(&[A]));
+    let home = Home::default();
+    let fake = Fake::new(&[A]);
     let rig = home.start(&rig_text(&fake, "")).unwrap();
     wait_until(&rig, "frames", |s| all_stream(s) && delivered(s, "k") > 2);
     let lost = |s: &RigStatus, reason: &str| {
@@ -165,7 +168,8 @@ fn without_libk4a_the_rig_says_what_to_install() {
 
 #[test]
 fn without_a_depth_engine_there_is_colour_or_a_word_of_what_is_missing() {
-    let (home, fake) = (Home::default(), Fake::without_engine(&[A]));
+    let home = Home::default();
+    let fake = Fake::without_engine(&[A]);
     let nowhere = home.path("nowhere");
     std::fs::create_dir_all(&nowhere).unwrap();
     let engine = format!("depth_engine = \"{}\"", nowhere.display());
@@ -186,7 +190,8 @@ fn without_a_depth_engine_there_is_colour_or_a_word_of_what_is_missing() {
 
 #[test]
 fn an_engine_that_gets_no_display_is_tried_again_while_the_others_stream() {
-    let (home, fake) = (Home::default(), Fake::new(&[A]));
+    let home = Home::default();
+    let fake = Fake::new(&[A]);
     fake.command(A, "engine", 2);
     let rig = home.start(&rig_text(&fake, "")).unwrap();
     let status = wait_until(&rig, "why", |s| says(s, "k", "set DISPLAY"));
@@ -201,7 +206,8 @@ fn an_engine_that_gets_no_display_is_tried_again_while_the_others_stream() {
 
 #[test]
 fn one_that_another_program_has_is_waited_for() {
-    let (home, fake) = (Home::default(), Fake::new(&[A]));
+    let home = Home::default();
+    let fake = Fake::new(&[A]);
     fake.command(A, "busy", 3600 * SECOND);
     let rig = home.start(&rig_text(&fake, "")).unwrap();
     let status = wait_until(&rig, "why", |s| says(s, "k", "another program has it"));
@@ -211,7 +217,7 @@ fn one_that_another_program_has_is_waited_for() {
     );
     fake.command(A, "busy", 0);
     wait_until(&rig, "frames", |s| all_stream(s) && delivered(s, "k") > 2);
-    // This user may not open it: told with the cure.
+    // This user may not open it: the message has the cure.
     drop(stop(rig, &[&fake]));
     fake.command(A, "denied", 1);
     let rig = home.start(&rig_text(&fake, "")).unwrap();
@@ -221,7 +227,8 @@ fn one_that_another_program_has_is_waited_for() {
 
 #[test]
 fn two_wired_kinects_are_told_apart_and_come_back_together() {
-    let (home, fake) = (Home::default(), Fake::new(&[A, B]));
+    let home = Home::default();
+    let fake = Fake::new(&[A, B]);
     let folder = fake.folder();
     let master = kinect("m", &folder, &format!("serial = \"{A}\"\nsync = \"master\""));
     let follower = "sync = \"subordinate\"\nsubordinate_delay_us = 160\ndepth_delay_us = -80";

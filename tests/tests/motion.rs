@@ -1,4 +1,4 @@
-//! Motion units from the bus into datasets: every batch of a recording once and in order, whatever happens meanwhile.
+//! IMUs from the bus into datasets: every batch of a recording once and in order, whatever happens meanwhile.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{Bus, FrameHeader, HostTime, MotionSample, RigName, StreamId, UtcPair};
@@ -16,7 +16,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// Asks for the camera's motion unit beside its pictures.
+/// Asks for the camera's IMU beside its images.
 const IMU: &str = "[[camera.stream]]\nname = \"imu\"\n";
 const UNITS: [&str; 2] = ["left/imu", "right/imu"];
 
@@ -80,7 +80,7 @@ fn sets(data: &Path) -> Vec<DatasetSet> {
     dataset.sets(SetRange::ALL).map(Result::unwrap).collect()
 }
 
-/// Checks what is recorded of each unit against what a subscriber saw; the numbers of its batches.
+/// Compares the recorded batches of each IMU with those that a subscriber received. Returns their numbers.
 fn check(sets: &[DatasetSet], seen: &[Vec<Seen>; 2], began: HostTime) -> [Vec<u64>; 2] {
     let end_ns = sets.last().unwrap().tick.ns();
     core::array::from_fn(|unit| {
@@ -214,7 +214,7 @@ fn rare_sets_lose_no_batch() {
     }
 }
 
-/// The set thread is held up for longer than the channel keeps batches: they are lost, and every count says so.
+/// The set thread is blocked for longer than the channel keeps batches: they are lost, and every count includes them.
 #[test]
 fn what_a_set_thread_that_is_behind_does_not_read_is_counted() {
     let home = Home::default();
@@ -253,9 +253,9 @@ fn what_a_set_thread_that_is_behind_does_not_read_is_counted() {
         let missed = unit(&summary.status, id).in_sets.missed - before[i];
         assert!(lost > 5, "{id}: the channel keeps four of some twenty: {lost}");
         assert_eq!((lost, info.motion[i].lost_batches), (missed, missed), "{id}");
-        let told =
+        let reported =
             report.findings.iter().any(|f| f.message.contains(id) && f.message.contains(&lost.to_string()));
-        assert!(told, "{id}: {lost} lost: {:#?}", report.findings);
+        assert!(reported, "{id}: {lost} lost: {:#?}", report.findings);
     }
 }
 

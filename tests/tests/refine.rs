@@ -1,7 +1,6 @@
-//! Refined depth in a running rig: what is published, what it says of itself, and what happens when something fails. Long
-//! because all of it shares one rig.
+//! Refined depth in a running rig: published frames, their metadata, and failures. Long because all tests share one rig.
 //!
-//! Faults come from a refiner of these tests, through the one place where a rig takes its refiners from.
+//! Faults come from a scripted refiner, injected where a rig takes its refiners from.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{Bus, Frame, FrameFlags, HostTime, PixelFormat, RigName, StageStep, Subscriber};
@@ -10,12 +9,12 @@ use depthrig_daemon::config::RefineConfig;
 use depthrig_daemon::rig::Rig;
 use depthrig_daemon::stage::{Opened, Plan, Refiners};
 use depthrig_daemon::status::{RefineState, RefineStatus, RigStatus, StreamStatus};
-use depthrig_tests::{Home, RigText, all_stream, assert_balanced, camera, wait_until};
+use depthrig_tests::{Home, ImageSize, RigText, all_stream, assert_balanced, camera, wait_until};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::time::Duration;
 
-/// What the refiner of these tests does: a pixel is its raw depth and 7 units.
+/// Behaviour of the scripted refiner, which adds 7 units to each raw depth.
 #[derive(Debug, Default)]
 struct Script {
     /// Milliseconds that a batch takes.
@@ -28,7 +27,7 @@ struct Script {
     hang: AtomicBool,
     /// Opening hangs while this is set.
     hang_open: AtomicBool,
-    /// Colour of this width is refused; 0 is none.
+    /// Colour of this width is refused; 0 accepts every width.
     refused_width: AtomicUsize,
     /// Pairs of a batch; 0 is 1.
     batch: AtomicUsize,
@@ -39,6 +38,9 @@ struct Script {
 
 /// How long refining took by its own account when it hung.
 const HUNG_NS: u64 = 77_000_000;
+
+const LARGE: ImageSize = ImageSize { width: 64, height: 48 };
+const SMALL: ImageSize = ImageSize { width: 32, height: 24 };
 
 #[derive(Clone)]
 struct Scripted(Arc<Script>);
@@ -73,7 +75,7 @@ impl Refiners for Scripted {
     }
 }
 
-/// Takes one of what is left, if anything is.
+/// Decrements the counter unless it is 0.
 fn take_one(n: &AtomicUsize) -> bool {
     n.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok()
 }
@@ -163,7 +165,9 @@ fn a_refined_frame_says_what_it_is_made_of() {
     let bus = bus(&home);
     let [mut color, mut depth, mut out, mut aligned] = ["color", "depth", "depth_refined", "depth_aligned"]
         .map(|s| bus.subscriber(&format!("cam/{s}").parse().unwrap()).unwrap());
-    let (mut colors, mut depths, mut views) = (Vec::new(), Vec::new(), Vec::new());
+    let mut colors = Vec::new();
+    let mut depths = Vec::new();
+    let mut views = Vec::new();
     let mut checked = 0;
     let mut before: Option<depthrig_bus::FrameHeader> = None;
     while checked < 20 {
@@ -215,7 +219,8 @@ fn a_refined_frame_says_what_it_is_made_of() {
         assert_eq!((v.refiner(), v.stream(), v.intrinsics), ("", "depth_aligned", c.intrinsics));
         let words =
             |b: &[u8]| b.as_chunks::<2>().0.iter().map(|b| u16::from_le_bytes(*b)).collect::<Vec<_>>();
-        let (seen, was) = (words(frame.pixels()), words(view));
+        let seen = words(frame.pixels());
+        let was = words(view);
         assert!(seen.iter().zip(&was).all(|(s, w)| *s == if *w == 0 || *w == u16::MAX { 0 } else { w + 7 }));
         assert_eq!(was.len(), words(raw).len());
         checked += 1;
@@ -240,7 +245,7 @@ fn the_newest_pair_wins_and_the_others_are_counted() {
     let busy = state.skipped["busy"];
     assert!(busy >= 2 * stream.delivered, "{busy} skipped, {} refined", stream.delivered);
     assert_eq!(stream.dropped.get("queue_full"), Some(&busy));
-    // What is published is of the newest pair: no older than one refining and what a frame takes.
+    // Published frames are of the newest pair: no older than one refining plus the delay of a frame.
     assert!(stream.latency_p50_ms < 300.0, "{}", stream.latency_p50_ms);
     // Pairs come every 33 ms: the newest has waited for less than that, the oldest for nearly all of the 150 ms.
     let wait = state.steps_p50_ms["wait"];
@@ -259,7 +264,8 @@ fn the_rate_asked_for_is_kept() {
     let before = rig.control().status();
     std::thread::sleep(Duration::from_secs(3));
     let after = rig.stop().status;
-    let (n, m) = (refined(&before, "cam").1.delivered, refined(&after, "cam").1.delivered);
+    let n = refined(&before, "cam").1.delivered;
+    let m = refined(&after, "cam").1.delivered;
     assert!((13..=17).contains(&(m - n)), "{} in three seconds", m - n);
     assert!(refined(&after, "cam").0.not_due > 60);
     assert_balanced(&after);
@@ -359,7 +365,7 @@ fn what_an_engine_refuses_of_one_camera_costs_the_others_nothing() {
     });
     let dir = home.path("narrow");
     std::fs::create_dir_all(&dir).unwrap();
-    let manifest = depthrig_tests::uncalibrated_camera(&dir, (64, 48), (64, 48));
+    let manifest = depthrig_tests::uncalibrated_camera(&dir, LARGE, LARGE);
     let text = RigText::default().camera("good", "[camera.refine]\nrate_hz = 0").files(
         "bad",
         &manifest,
@@ -375,7 +381,6 @@ fn what_an_engine_refuses_of_one_camera_costs_the_others_nothing() {
     assert!(state.message.as_deref().unwrap().contains("64 pixels wide"), "{:?}", state.message);
     assert_eq!(refined(&status, "good").0.state, RefineState::Running);
     assert_eq!(script.largest.load(Ordering::SeqCst), 2, "they were never in one batch");
-    // Once it takes them it is told so.
     script.refused_width.store(0, Ordering::SeqCst);
     let status = wait_until(&rig, "both", |s| refined(s, "bad").1.delivered > 3);
     assert_eq!(refined(&status, "bad").0.state, RefineState::Running);
@@ -434,7 +439,8 @@ fn cameras_share_an_engine_in_turn_and_in_batches() {
         wait_until(&rig, "all", |s| ["a", "b", "c"].iter().all(|n| refined(s, n).1.delivered >= 5));
         let summary = rig.stop();
         let counts = ["a", "b", "c"].map(|n| refined(&summary.status, n).1.delivered);
-        let (least, most) = (counts.iter().min().unwrap(), counts.iter().max().unwrap());
+        let least = counts.iter().min().unwrap();
+        let most = counts.iter().max().unwrap();
         assert!(most - least <= 4, "not in turn: {counts:?}");
         assert_eq!(script.opened.load(Ordering::SeqCst), 1, "one engine for all of them");
         assert_eq!(script.largest.load(Ordering::SeqCst), batch);
@@ -504,13 +510,13 @@ fn a_reader_that_holds_its_frames_costs_nobody_anything() {
 }
 
 #[test]
-fn what_cannot_be_registered_is_said_and_the_raw_streams_go_on() {
+fn depth_that_cannot_be_registered_is_reported_and_the_raw_streams_go_on() {
     let home = Home::default();
     let script = Arc::new(Script::default());
     let table = "uncalibrated";
     let dir = home.path(table);
     std::fs::create_dir_all(&dir).unwrap();
-    let manifest = depthrig_tests::uncalibrated_camera(&dir, (64, 48), (32, 24));
+    let manifest = depthrig_tests::uncalibrated_camera(&dir, LARGE, SMALL);
     let text = RigText::default().files("cam", &manifest, "[camera.refine]\nrate_hz = 0");
     let rig = start(&home, &text, &script);
     let status = wait_until(&rig, "failed", |s| refined(s, "cam").0.state == RefineState::Failed);
@@ -529,7 +535,7 @@ fn what_cannot_be_registered_is_said_and_the_raw_streams_go_on() {
     // Of one size the camera may be believed.
     let dir = home.path("one_size");
     std::fs::create_dir_all(&dir).unwrap();
-    let manifest = depthrig_tests::uncalibrated_camera(&dir, (64, 48), (64, 48));
+    let manifest = depthrig_tests::uncalibrated_camera(&dir, LARGE, LARGE);
     let text = RigText::default().files("cam", &manifest, "[camera.refine]\nrate_hz = 0");
     let rig = start(&home, &text, &script);
     let status = wait_until(&rig, "failed", |s| refined(s, "cam").0.state == RefineState::Failed);
@@ -539,7 +545,7 @@ fn what_cannot_be_registered_is_said_and_the_raw_streams_go_on() {
     let text = RigText::default().files("cam", &manifest, "[camera.refine]\nrate_hz = 0\nis_aligned = true");
     let rig = start(&home, &text, &script);
     wait_until(&rig, "refined", |s| refined(s, "cam").1.delivered > 3);
-    // The first row has no depth, the second is saturated: no value is made of either.
+    // The first row has no depth, the second is saturated: neither gets a value.
     let frame = next(&mut bus(&home).subscriber(&"cam/depth_refined".parse().unwrap()).unwrap());
     assert!(frame.pixels()[..64 * 2 * 2].iter().all(|b| *b == 0));
     assert!(frame.pixels()[64 * 2 * 2..].iter().any(|b| *b != 0));
@@ -574,15 +580,19 @@ fn refined_depth_is_recorded_with_the_depth_that_it_is_made_of() {
     let opened = depthrig_recorder::Dataset::open(&dataset).unwrap();
     let streams = &opened.session().streams;
     let at = |name: &str| streams.iter().position(|s| s.id.to_string() == name).unwrap();
-    let (depth, made) = (at("cam/depth"), at("cam/depth_refined"));
-    let (mut sets, mut whole, mut own) = (0, 0, 0);
+    let depth = at("cam/depth");
+    let made = at("cam/depth_refined");
+    let mut sets = 0;
+    let mut whole = 0;
+    let mut own = 0;
     for set in opened.sets(depthrig_recorder::SetRange::ALL) {
         let set = set.unwrap();
         sets += 1;
         let find = |stream| set.frames.iter().find(|f| f.stream == stream);
         let (Some(raw), Some(refined)) = (find(depth), find(made)) else { continue };
         whole += 1;
-        let (r, d) = (refined.header, raw.header);
+        let r = refined.header;
+        let d = raw.header;
         assert!((r.capture_time_ns - d.capture_time_ns).abs() < 90_000_000);
         own += usize::from(r.capture_time_ns == d.capture_time_ns);
         assert_eq!((r.refiner(), r.has(FrameFlags::DERIVED)), ("fake 1.0", true));

@@ -1,4 +1,4 @@
-//! A network in a running rig, from the cameras' pictures to the refined stream: what it gives, and its model's file that
+//! A network in a running rig, from the cameras' images to the refined stream: what it gives, and its model's file that
 //! goes away.
 //!
 //! Its weights are random. It runs in ONNX Runtime where that is installed; `make test` fetches it and sets
@@ -20,7 +20,7 @@ use std::time::Duration;
 /// The smallest input that a rig file may ask for.
 const INPUT: u32 = 56;
 
-/// Whether the library is there; says so when not, and fails when it has to be.
+/// Whether the library is installed; prints a line if not, and fails if it is required.
 fn has_library() -> bool {
     match find_library(None, "cpu", Precision::Fp32) {
         Ok(_) => true,
@@ -72,7 +72,7 @@ fn words(bytes: &[u8]) -> Vec<u16> {
     bytes.as_chunks::<2>().0.iter().map(|b| u16::from_le_bytes(*b)).collect()
 }
 
-/// What the network makes of two frames, without a rig.
+/// Refines two frames with the network, without a rig.
 fn expected(path: &Path, color: &Frame, depth: &Frame) -> Vec<u16> {
     let mut refiner = refiner(&RefinerOptions {
         engine: Some(EngineKind::OnnxRuntime),
@@ -82,10 +82,13 @@ fn expected(path: &Path, color: &Frame, depth: &Frame) -> Vec<u16> {
         ..RefinerOptions::default()
     })
     .unwrap();
-    let (c, unit_m) = (color.header(), depth.header().depth_unit_m);
+    let c = color.header();
+    let unit_m = depth.header().depth_unit_m;
     let raw = words(depth.pixels());
     let mut out = vec![0; raw.len()];
-    let (width, height, stride) = (c.width as usize, c.height as usize, c.stride as usize);
+    let width = c.width as usize;
+    let height = c.height as usize;
+    let stride = c.stride as usize;
     let color = Color { pixels: color.pixels(), format: ColorFormat::Rgb8, width, height, stride };
     let depth = RawDepth { pixels: &raw, unit_m };
     let to = Output::Units { pixels: &mut out, unit_m };
@@ -109,7 +112,8 @@ fn the_network_refines_what_the_camera_sees_and_outlives_its_file() {
     let bus = Bus::open(&home.runtime(), &RigName::new("test").unwrap()).unwrap();
     let [mut color, mut aligned, mut out] = ["color", "depth_aligned", "depth_refined"]
         .map(|s| bus.subscriber(&format!("cam/{s}").parse().unwrap()).unwrap());
-    let (mut colors, mut views) = (Vec::new(), Vec::new());
+    let mut colors = Vec::new();
+    let mut views = Vec::new();
     let (seen, of) = loop {
         let frame = next(&mut out);
         let h = *frame.header();

@@ -9,7 +9,7 @@ use depthrig_recorder::{
     CompareOptions, Dataset, DatasetSet, ErrorKind, PixelMode, RecordMotion, SetRange, VerifyOptions,
     compare, verify,
 };
-use depthrig_tests::made::Made;
+use depthrig_tests::fixture::Fixture;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -18,7 +18,7 @@ fn options(workers: usize) -> RelabelOptions {
     RelabelOptions { refine, cdm: CdmConfig::default(), workers, threads: 1 }
 }
 
-/// Every file of a folder with what is in it.
+/// Every file of a folder with its contents.
 fn bytes_of(dir: &Path) -> BTreeMap<String, Vec<u8>> {
     std::fs::read_dir(dir)
         .unwrap()
@@ -51,8 +51,9 @@ fn motion(set: &DatasetSet) -> Vec<(usize, FrameHeader, Vec<[u8; MOTION_SAMPLE_B
 #[test]
 fn a_copy_with_refined_depth() {
     let dir = tempfile::tempdir().unwrap();
-    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
-    Made { sets: 25, motion: true, ..Made::default() }.record(&source);
+    let source = dir.path().join("source");
+    let out = dir.path().join("out");
+    Fixture { sets: 25, motion: true, ..Fixture::default() }.record(&source);
     let before = bytes_of(&source);
     let report = relabel(&Dataset::open(&source).unwrap(), &out, &options(2), &mut go_on).unwrap();
     assert_eq!((report.sets, report.lost, report.ended, report.streams.len()), (25, 0, false, 2));
@@ -67,7 +68,8 @@ fn a_copy_with_refined_depth() {
     let sets = (copy.sets_with(SetRange::ALL, PixelMode::Decoded), Dataset::open(&source).unwrap());
     let of_source = sets.1.sets_with(SetRange::ALL, PixelMode::Decoded);
     for (number, (new, old)) in sets.0.zip(of_source).enumerate() {
-        let (new, old) = (new.unwrap(), old.unwrap());
+        let new = new.unwrap();
+        let old = old.unwrap();
         assert_eq!((new.id, new.tick, new.utc_ns, new.frames.len()), (old.id, old.tick, old.utc_ns, 6));
         assert_eq!((new.motion.len(), motion(&new)), (2, motion(&old)));
         for (a, b) in new.frames.iter().zip(&old.frames) {
@@ -103,19 +105,21 @@ fn a_copy_with_refined_depth() {
     assert_eq!(over.kind(), ErrorKind::AlreadyExists);
 }
 
-/// What a recording lacks cannot be made up: the copy lacks it too, and says so.
+/// Sets that are missing in a recording are missing in the copy, which reports them.
 #[test]
 fn a_recording_that_lost_something_is_copied_with_its_gaps() {
     let dir = tempfile::tempdir().unwrap();
-    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
-    Made { sets: 9, lost: vec![3, 4], motion: true, ..Made::default() }.record(&source);
+    let source = dir.path().join("source");
+    let out = dir.path().join("out");
+    Fixture { sets: 9, lost: vec![3, 4], motion: true, ..Fixture::default() }.record(&source);
     let report = relabel(&Dataset::open(&source).unwrap(), &out, &options(2), &mut go_on).unwrap();
     assert_eq!((report.sets, report.lost), (7, 0), "{:?}", report.problems);
     let gap = "4 batches of left/imu were not recorded";
     assert!(verify(&out, &VerifyOptions::default()).unwrap().findings.iter().any(|f| f.message == gap));
 
-    let (source, out) = (dir.path().join("wide"), dir.path().join("wide_out"));
-    Made { sets: 3, max_spread_ns: Some(1_000_000), ..Made::default() }.record(&source);
+    let source = dir.path().join("wide");
+    let out = dir.path().join("wide_out");
+    Fixture { sets: 3, max_spread_ns: Some(1_000_000), ..Fixture::default() }.record(&source);
     let report = relabel(&Dataset::open(&source).unwrap(), &out, &options(2), &mut go_on).unwrap();
     assert_eq!((report.sets, report.lost, report.problems.len()), (3, 3, 3));
     assert!(report.problems[0].contains("is the limit"), "{:?}", report.problems);
@@ -125,7 +129,7 @@ fn a_recording_that_lost_something_is_copied_with_its_gaps() {
 fn a_run_that_was_ended_goes_on() {
     let dir = tempfile::tempdir().unwrap();
     let source = dir.path().join("source");
-    Made { sets: 45, ..Made::default() }.record(&source);
+    Fixture { sets: 45, ..Fixture::default() }.record(&source);
     let dataset = Dataset::open(&source).unwrap();
     let whole = dir.path().join("whole");
     relabel(&dataset, &whole, &options(1), &mut go_on).unwrap();
@@ -136,7 +140,7 @@ fn a_run_that_was_ended_goes_on() {
             if step == last_step && done >= at { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         });
         assert!(ended.unwrap().ended && !out.exists());
-        // Another engine's pictures are not mixed in.
+        // Another engine's images are not mixed in.
         let mut other = options(1);
         other.refine.is_aligned = true;
         assert_eq!(relabel(&dataset, &out, &other, &mut go_on).unwrap_err().kind(), ErrorKind::AlreadyExists);
@@ -146,7 +150,7 @@ fn a_run_that_was_ended_goes_on() {
             ControlFlow::Continue(())
         })
         .unwrap();
-        // What was refined is not refined again; when all was, there is nothing to tell of.
+        // Nothing is refined twice; when all of it was refined, there is no progress to report.
         let done = if last_step == Step::Refine { first.unwrap().0 } else { 45 };
         assert!(report.parts_resumed >= 1 && done >= 10, "{} {first:?}", report.parts_resumed);
         assert_eq!(refined(&out), refined(&whole));

@@ -1,5 +1,5 @@
-//! Replay as a bench for whatever reads it: the same bytes each time, nothing missed, and every control does what it
-//! says. Long because a rig, its recording and two readers are set up for all of it.
+//! Replay as a test bench for its readers: the same bytes each time, nothing missed, and working controls. Long because
+//! all tests share the setup of a rig, its recording and two readers.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use core::ops::ControlFlow;
@@ -17,8 +17,8 @@ use depthrig_recorder::{
 };
 use depthrig_tests::Home;
 use depthrig_tests::disk::Tmpfs;
-use depthrig_tests::eyes::Eyes;
-use depthrig_tests::made::{Made, SECOND};
+use depthrig_tests::fixture::{Fixture, SECOND};
+use depthrig_tests::synthetic_stereo::SyntheticStereo;
 use std::fmt::Write;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -27,7 +27,7 @@ use std::time::Duration;
 /// Nothing comes any more when nothing came for so long after the end.
 const SILENCE: Duration = Duration::from_millis(150);
 /// For what would otherwise hang.
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 const FAST: ReplayOptions = ReplayOptions {
     rate: 1.0,
     looped: false,
@@ -41,9 +41,9 @@ const FAST: ReplayOptions = ReplayOptions {
 };
 
 /// A dataset at `home`/`name`.
-fn made(home: &Home, name: &str, made: &Made) -> PathBuf {
+fn write_dataset(home: &Home, name: &str, fixture: &Fixture) -> PathBuf {
     let path = home.path(name);
-    made.record(&path);
+    fixture.record(&path);
     path
 }
 
@@ -104,18 +104,18 @@ fn whole(h: &FrameHeader) -> String {
     } = *h;
     let names = (rig, camera, stream, model, serial, refiner, refiner_model, reserved);
     let made = (source_color_sequence, source_color_capture_time_ns, stage_ns);
-    let picture = (flags, format, width, height, stride, payload_len, gain, temperature_c.to_bits());
+    let image = (flags, format, width, height, stride, payload_len, gain, temperature_c.to_bits());
     let times = (capture_time_ns, capture_uncertainty_ns, arrival_time_ns, publish_time_ns, exposure_ns);
     let device = (sequence, device_sequence, set_id, device_time, device_tick_ns, captured, dropped);
     let geometry = (depth_unit_m, intrinsics, pose, clock_domain, clock_epoch, source_sequence);
-    format!("{magic:?}{version}{size}{names:?}{picture:?}{times:?}{device:?}{geometry:?}{made:?}")
+    format!("{magic:?}{version}{size}{names:?}{image:?}{times:?}{device:?}{geometry:?}{made:?}")
 }
 
 /// A reader of every channel of a rig.
 struct Bench {
     streams: Vec<(StreamId, Subscriber)>,
     sets: SetSubscriber,
-    /// What was read of each channel, in order; the sets last.
+    /// Items read from each channel, in order; the sets last.
     seen: Vec<Vec<String>>,
     /// Capture times of the first stream.
     first: Vec<i64>,
@@ -138,7 +138,7 @@ impl Bench {
         }
     }
 
-    /// Reads what is there; `slow` sleeps for a while over every so-manieth frame.
+    /// Reads all available items; `slow` sleeps for a while at every n-th frame.
     fn pump(&mut self, slow: Option<u64>) -> usize {
         let mut came = 0;
         for (i, (_, subscriber)) in self.streams.iter_mut().enumerate() {
@@ -164,7 +164,7 @@ impl Bench {
 
     /// Reads until the replay is done and nothing comes any more.
     fn read_all(&mut self, replay: &Replay, slow: Option<u64>) {
-        let deadline = HostTime::now().plus(PATIENCE);
+        let deadline = HostTime::now().plus(TIMEOUT);
         let mut last = HostTime::now();
         loop {
             if self.pump(slow) > 0 || !replay.progress().done {
@@ -185,7 +185,7 @@ impl Bench {
 
     /// Reads until `n` sets were seen.
     fn read_sets(&mut self, n: usize) {
-        let deadline = HostTime::now().plus(PATIENCE);
+        let deadline = HostTime::now().plus(TIMEOUT);
         while self.ticks.len() < n {
             self.pump(None);
             assert!(!deadline.from_now().is_zero(), "{} of {n} sets came", self.ticks.len());
@@ -212,8 +212,8 @@ fn resume(replay: &Replay) {
 #[test]
 fn two_runs_give_a_subscriber_the_same_bytes_and_a_slow_one_misses_nothing() {
     let home = Home::default();
-    let dataset = Made { sets: 40, ..Made::default() };
-    let path = made(&home, "a", &dataset);
+    let dataset = Fixture { sets: 40, ..Fixture::default() };
+    let path = write_dataset(&home, "a", &dataset);
     let run = |slow| {
         let replay = start(&home, std::slice::from_ref(&path), FAST);
         let mut bench = Bench::new(&home, "bench", dataset.streams());
@@ -238,8 +238,8 @@ fn two_runs_give_a_subscriber_the_same_bytes_and_a_slow_one_misses_nothing() {
 #[test]
 fn motion_comes_with_its_set_and_a_slow_reader_misses_none_of_it() {
     let home = Home::default();
-    let dataset = Made { sets: 12, motion: true, ..Made::default() };
-    let path = made(&home, "a", &dataset);
+    let dataset = Fixture { sets: 12, motion: true, ..Fixture::default() };
+    let path = write_dataset(&home, "a", &dataset);
     let original = Dataset::open(&path).unwrap().sets(SetRange::ALL).map(|s| s.unwrap().motion);
     let original: Vec<_> = original.flatten().collect();
     assert_eq!(original.len(), 24);
@@ -249,7 +249,7 @@ fn motion_comes_with_its_set_and_a_slow_reader_misses_none_of_it() {
     let status = replay.control().status();
     assert!(status.cameras[0].streams.iter().any(|s| s.id == "left/imu"), "{:?}", status.cameras);
     let mut bench = Bench::new(&home, "bench", channels);
-    // A step shows a set, and what the unit sent before it.
+    // A step publishes a set and the IMU batches before it.
     steer(&replay, |r| r.step(1)).unwrap();
     bench.read_sets(1);
     assert_eq!(bench.seen.iter().map(Vec::len).collect::<Vec<_>>(), [2, 1, 1, 1, 1, 1]);
@@ -273,12 +273,12 @@ fn motion_comes_with_its_set_and_a_slow_reader_misses_none_of_it() {
 #[test]
 fn a_subscriber_that_does_not_read_is_waited_for_and_named() {
     let home = Home::default();
-    let dataset = Made { sets: 9, ..Made::default() };
-    let path = made(&home, "a", &dataset);
+    let dataset = Fixture { sets: 9, ..Fixture::default() };
+    let path = write_dataset(&home, "a", &dataset);
     let replay = start(&home, &[path], FAST);
     let mut bench = Bench::new(&home, "bench", dataset.streams());
     resume(&replay);
-    let deadline = HostTime::now().plus(PATIENCE);
+    let deadline = HostTime::now().plus(TIMEOUT);
     while replay.progress().waiting_for.as_deref() != Some("left/color") {
         assert!(!deadline.from_now().is_zero(), "{:?}", replay.progress());
         std::thread::sleep(Duration::from_millis(20));
@@ -300,7 +300,7 @@ fn record_again(home: &Home, path: PathBuf, name: &str, options: ReplayOptions) 
     };
     replay.control().record_start(&request).unwrap();
     resume(&replay);
-    let deadline = HostTime::now().plus(PATIENCE);
+    let deadline = HostTime::now().plus(TIMEOUT);
     while !replay.wait(Duration::from_millis(20)) {
         assert!(!deadline.from_now().is_zero(), "{:?}", replay.progress());
     }
@@ -321,10 +321,11 @@ fn a_recorded_replay_is_the_dataset_that_was_replayed() {
         ("png", ColorCodec::Png, DepthCodec::default(), FAST),
         ("by_clock", ColorCodec::Jpeg, DepthCodec::default(), by_clock),
     ] {
-        let path = made(&home, name, &Made { color, depth, motion: true, ..Made::default() });
+        let path = write_dataset(&home, name, &Fixture { color, depth, motion: true, ..Fixture::default() });
         let again = record_again(&home, path.clone(), name, options);
-        let (a, b) = (Dataset::open(&path).unwrap(), Dataset::open(&again).unwrap());
-        // Stored pictures byte by byte: a JPEG is kept and not encoded a second time.
+        let a = Dataset::open(&path).unwrap();
+        let b = Dataset::open(&again).unwrap();
+        // Stored images byte by byte: a JPEG is kept and not encoded a second time.
         let exact = CompareOptions { pixels: PixelCheck::Stored, ..CompareOptions::default() };
         let c = compare(&a, &b, &exact).unwrap();
         assert!(c.equal, "{name}: {:#?}", c.differences);
@@ -332,7 +333,7 @@ fn a_recorded_replay_is_the_dataset_that_was_replayed() {
         let info = b.info().unwrap();
         let unit = info.accounts.iter().find(|a| a.stream.to_string() == "left/imu").unwrap();
         assert_eq!((unit.captured, unit.delivered), (24, 24), "{name}");
-        // What the way gives anew, and nothing else.
+        // Only fields that a channel assigns again.
         let c = compare(&a, &b, &CompareOptions { strict: true, ..exact }).unwrap();
         let mut fields: Vec<_> = c.counts.iter().map(|c| c.field.as_str()).collect();
         fields.sort_unstable();
@@ -349,7 +350,7 @@ fn a_recorded_replay_is_the_dataset_that_was_replayed() {
 #[test]
 fn a_recorded_replay_says_what_computed_its_streams() {
     let home = Home::default();
-    let path = made(&home, "computed", &Made::default());
+    let path = write_dataset(&home, "computed", &Fixture::default());
     let session = path.join("session.toml");
     let mut text = std::fs::read_to_string(&session).unwrap();
     let id = Dataset::open(&path).unwrap().session().streams[1].id.to_string();
@@ -369,7 +370,7 @@ fn a_recorded_replay_says_what_computed_its_streams() {
 #[test]
 fn a_recording_never_goes_back_in_time() {
     let home = Home::default();
-    let path = made(&home, "a", &Made::default());
+    let path = write_dataset(&home, "a", &Fixture::default());
     let replay =
         start(&home, &[path], ReplayOptions { paused: true, looped: true, ..ReplayOptions::default() });
     let request = RecordRequest { directory: Some(home.path("again")), ..RecordRequest::default() };
@@ -400,13 +401,13 @@ fn a_recording_never_goes_back_in_time() {
         .sets(depthrig_recorder::SetRange::ALL)
         .map(|s| s.unwrap().tick)
         .collect();
-    assert_eq!(sets, [Made::default().tick(9), Made::default().tick(10)]);
+    assert_eq!(sets, [Fixture::default().tick(9), Fixture::default().tick(10)]);
 }
 
 #[test]
 fn a_recording_of_a_replay_ends_by_itself_and_begins_only_where_it_fits() {
     let home = Home::default();
-    let path = made(&home, "a", &Made { sets: 300, ..Made::default() });
+    let path = write_dataset(&home, "a", &Fixture { sets: 300, ..Fixture::default() });
     let replay = start(&home, &[path], ReplayOptions { paused: true, ..ReplayOptions::default() });
     let control = replay.control();
     let asks = |directory, max_duration_s: f64| RecordRequest {
@@ -423,7 +424,7 @@ fn a_recording_of_a_replay_ends_by_itself_and_begins_only_where_it_fits() {
     }
     control.record_start(&asks(home.path("again"), 1.0)).unwrap();
     resume(&replay);
-    let end = HostTime::now().plus(PATIENCE);
+    let end = HostTime::now().plus(TIMEOUT);
     let recorded = loop {
         let recorded = control.status().recording.unwrap();
         if !recorded.active {
@@ -446,17 +447,17 @@ fn a_recording_of_a_replay_ends_by_itself_and_begins_only_where_it_fits() {
 #[test]
 fn a_client_finds_a_replay_and_steers_it_to_the_set() {
     let home = Home::default();
-    let dataset = Made { sets: 30, ..Made::default() };
-    let path = made(&home, "a", &dataset);
+    let dataset = Fixture { sets: 30, ..Fixture::default() };
+    let path = write_dataset(&home, "a", &dataset);
     let options = ReplayOptions { paused: true, serve_api: true, ..ReplayOptions::default() };
     let replay = start(&home, std::slice::from_ref(&path), options);
     let client = Client::connect(&home.runtime(), None).unwrap();
     let status = client.status().unwrap();
     assert_eq!(status.cameras.iter().map(|c| c.name.as_str()).collect::<Vec<_>>(), ["left", "right"]);
     assert!(status.cameras.iter().all(|c| c.state == CameraState::Streaming && c.backend == "replay"));
-    let told = status.replay.unwrap();
-    assert_eq!((told.paused, told.set, told.length_sets), (true, None, 30));
-    assert_eq!((told.length_s, told.datasets), (5.8, vec![path.display().to_string()]));
+    let position = status.replay.unwrap();
+    assert_eq!((position.paused, position.set, position.length_sets), (true, None, 30));
+    assert_eq!((position.length_s, position.datasets), (5.8, vec![path.display().to_string()]));
 
     let mut bench = Bench::new(&home, "bench", dataset.streams());
     bench.read_nothing();
@@ -471,9 +472,13 @@ fn a_client_finds_a_replay_and_steers_it_to_the_set() {
         (seconds(5.8), 29),
         (seconds(0.0), 0),
     ] {
-        let told = client.replay_seek(&to).unwrap();
-        assert_eq!((told.set, told.set_id, told.paused), (Some(set), Some(3 * set + 5), true), "{to:?}");
-        assert_eq!(told.position_s, (200 * set) as f64 / 1e3, "{to:?}");
+        let position = client.replay_seek(&to).unwrap();
+        assert_eq!(
+            (position.set, position.set_id, position.paused),
+            (Some(set), Some(3 * set + 5), true),
+            "{to:?}"
+        );
+        assert_eq!(position.position_s, (200 * set) as f64 / 1e3, "{to:?}");
         expected.push(dataset.tick(set).ns());
         bench.read_sets(expected.len());
     }
@@ -513,8 +518,8 @@ fn a_client_finds_a_replay_and_steers_it_to_the_set() {
 #[test]
 fn after_a_pause_or_a_new_rate_sets_come_at_their_pace() {
     let home = Home::default();
-    let dataset = Made { sets: 40, ..Made::default() };
-    let path = made(&home, "a", &dataset);
+    let dataset = Fixture { sets: 40, ..Fixture::default() };
+    let path = write_dataset(&home, "a", &dataset);
     let replay = start(&home, &[path], ReplayOptions { rate: 4.0, paused: true, ..ReplayOptions::default() });
     let mut bench = Bench::new(&home, "bench", dataset.streams());
     resume(&replay);
@@ -527,7 +532,7 @@ fn after_a_pause_or_a_new_rate_sets_come_at_their_pace() {
     std::thread::sleep(Duration::from_millis(800));
     bench.pump(None);
     assert_eq!(bench.ticks.len(), before, "paused");
-    // The gaps are at least what the rate says, whatever the computer does beside: what comes late moves the rest.
+    // The gaps are at least the period, however busy the computer is: a late set delays the rest.
     let took = |bench: &mut Bench, n: usize| {
         let begin = bench.ticks.len();
         bench.read_sets(begin + n);
@@ -556,8 +561,8 @@ fn after_a_pause_or_a_new_rate_sets_come_at_their_pace() {
 #[test]
 fn rounds_go_on_until_they_are_ended() {
     let home = Home::default();
-    let dataset = Made { sets: 3, ..Made::default() };
-    let path = made(&home, "a", &dataset);
+    let dataset = Fixture { sets: 3, ..Fixture::default() };
+    let path = write_dataset(&home, "a", &dataset);
     let options = ReplayOptions { rate: 10.0, looped: true, paused: true, ..ReplayOptions::default() };
     let replay = start(&home, &[path], options);
     let mut bench = Bench::new(&home, "bench", dataset.streams());
@@ -575,12 +580,17 @@ fn rounds_go_on_until_they_are_ended() {
 #[test]
 fn datasets_of_different_cameras_are_one_rig() {
     let home = Home::default();
-    let a = Made { cameras: vec!["left"], sets: 6, ..Made::default() };
+    let a = Fixture { cameras: vec!["left"], sets: 6, ..Fixture::default() };
     // Begins one set later, 30 ms beside the ticks of the other, on a computer with another clock.
     let later = SECOND / 5 + SECOND * 3 / 100;
-    let b =
-        Made { cameras: vec!["right"], sets: 6, at_ns: later, mono_ns: 9_000 * SECOND, ..Made::default() };
-    let paths = [made(&home, "a", &a), made(&home, "b", &b)];
+    let b = Fixture {
+        cameras: vec!["right"],
+        sets: 6,
+        at_ns: later,
+        mono_ns: 9_000 * SECOND,
+        ..Fixture::default()
+    };
+    let paths = [write_dataset(&home, "a", &a), write_dataset(&home, "b", &b)];
     let replay = start(&home, &paths, FAST);
     let streams: Vec<_> = a.streams().into_iter().chain(b.streams()).collect();
     let mut bench = Bench::new(&home, "bench", streams.clone());
@@ -602,13 +612,14 @@ fn datasets_of_different_cameras_are_one_rig() {
     assert!(streams.iter().all(|s| members.contains(&format!("{:?}", s.camera))), "{members}");
 }
 
-/// A recording beside the depth that was made of it: both have the unit's samples, and they come once.
+/// A recording beside the depth computed from it: both have the IMU's samples, which are published once.
 #[test]
 fn motion_that_two_datasets_have_comes_once() {
     let home = Home::default();
-    let (raw, depth) = (home.path("raw"), home.path("depth"));
-    let eyes = Eyes::default();
-    eyes.record(&raw);
+    let raw = home.path("raw");
+    let depth = home.path("depth");
+    let stereo = SyntheticStereo::default();
+    stereo.record(&raw);
     let modes = vec![Mode::Preset(Preset::Performance)];
     let options = ZedReplayOptions { modes, ..ZedReplayOptions::default() };
     zed_replay(&raw, &depth, &options, &mut |_, _, _| ControlFlow::Continue(())).unwrap();
@@ -618,16 +629,18 @@ fn motion_that_two_datasets_have_comes_once() {
     resume(&replay);
     bench.read_all(&replay, None);
     let status = replay.stop().status;
-    assert_eq!((status.sets, status.lost.len()), (eyes.sets, 0), "{:?}", status.lost);
-    assert_eq!(bench.seen.iter().map(Vec::len).collect::<Vec<_>>()[..3], [eyes.sets as usize; 3]);
+    assert_eq!((status.sets, status.lost.len()), (stereo.sets, 0), "{:?}", status.lost);
+    assert_eq!(bench.seen.iter().map(Vec::len).collect::<Vec<_>>()[..3], [stereo.sets as usize; 3]);
 }
 
 #[test]
 fn datasets_of_one_rig_are_replayed_one_after_the_other() {
     let home = Home::default();
-    let a = Made { sets: 4, ..Made::default() };
-    let b = Made { sets: 3, at_ns: 7200 * SECOND, mono_ns: 50 * SECOND + 7200 * SECOND, ..Made::default() };
-    let (one, two) = (made(&home, "a", &a), made(&home, "b", &b));
+    let a = Fixture { sets: 4, ..Fixture::default() };
+    let b =
+        Fixture { sets: 3, at_ns: 7200 * SECOND, mono_ns: 50 * SECOND + 7200 * SECOND, ..Fixture::default() };
+    let one = write_dataset(&home, "a", &a);
+    let two = write_dataset(&home, "b", &b);
     // The order in which they are named does not matter, and nobody waits two hours.
     let replay = start(&home, &[two.clone(), one.clone()], FAST);
     assert_eq!(replay.progress().length_s, 1.2);
@@ -642,11 +655,12 @@ fn datasets_of_one_rig_are_replayed_one_after_the_other() {
 
     let e = refused(&home, &[one.clone(), one.clone()], FAST);
     assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains("both hold left/color"), "{e}");
-    let other = made(&home, "c", &Made { size: (32, 24), at_ns: 9000 * SECOND, ..Made::default() });
+    let other =
+        write_dataset(&home, "c", &Fixture { size: (32, 24), at_ns: 9000 * SECOND, ..Fixture::default() });
     let e = refused(&home, &[one.clone(), other], FAST);
     assert!(e.kind() == ErrorKind::BadInput && e.to_string().contains("32x24"), "{e}");
-    let of_other = Made { rig: "other", at_ns: 9000 * SECOND, ..Made::default() };
-    let e = refused(&home, &[one.clone(), made(&home, "d", &of_other)], FAST);
+    let of_other = Fixture { rig: "other", at_ns: 9000 * SECOND, ..Fixture::default() };
+    let e = refused(&home, &[one.clone(), write_dataset(&home, "d", &of_other)], FAST);
     assert!(e.to_string().contains("bench, other") && e.to_string().contains("--rig"), "{e}");
     let from = ReplayOptions { from_s: Some(0.61), ..FAST };
     let e = refused(&home, std::slice::from_ref(&one), from);
@@ -658,11 +672,11 @@ fn datasets_of_one_rig_are_replayed_one_after_the_other() {
 #[test]
 fn a_damaged_set_is_lost_and_named_and_the_others_come() {
     let home = Home::default();
-    let dataset = Made { color: ColorCodec::Jpeg, ..Made::default() };
-    let path = made(&home, "a", &dataset);
+    let dataset = Fixture { color: ColorCodec::Jpeg, ..Fixture::default() };
+    let path = write_dataset(&home, "a", &dataset);
     let segment = path.join("seg_0001.mcap");
     let mut bytes = std::fs::read(&segment).unwrap();
-    // The third JPEG: the first colour picture of the segment's second set.
+    // The third JPEG: the first colour image of the segment's second set.
     let at = bytes.windows(3).enumerate().filter(|(_, w)| *w == [0xff, 0xd8, 0xff]).nth(2).unwrap().0;
     bytes[at + 200] ^= 0x20;
     std::fs::write(&segment, bytes).unwrap();
@@ -684,7 +698,7 @@ fn damage_first_set(dataset: &std::path::Path) {
         let reader = Dataset::open(dataset).and_then(|d| d.set_reader());
         reader.is_ok_and(|mut r| r.read(0, PixelMode::None).is_err())
     };
-    // Behind the magic there are records: what it is, the length, and as many bytes.
+    // After the magic there are records: opcode, length, and as many bytes.
     let mut at = 8;
     loop {
         let end = at + 9 + u64::from_le_bytes(whole[at + 1..at + 9].try_into().unwrap()) as usize;
@@ -703,8 +717,8 @@ fn damage_first_set(dataset: &std::path::Path) {
 #[test]
 fn times_stay_where_they_are_when_the_first_set_is_lost() {
     let home = Home::default();
-    let dataset = Made::default();
-    let path = made(&home, "a", &dataset);
+    let dataset = Fixture::default();
+    let path = write_dataset(&home, "a", &dataset);
     damage_first_set(&path);
     let replay = start(&home, &[path], FAST);
     let mut bench = Bench::new(&home, "bench", dataset.streams());
@@ -718,14 +732,14 @@ fn times_stay_where_they_are_when_the_first_set_is_lost() {
 #[test]
 fn replayed_frames_say_so() {
     let home = Home::default();
-    let dataset = Made { sets: 2, ..Made::default() };
-    let path = made(&home, "a", &dataset);
+    let dataset = Fixture { sets: 2, ..Fixture::default() };
+    let path = write_dataset(&home, "a", &dataset);
     let replay = start(&home, &[path], FAST);
     let bus = Bus::open(&home.runtime(), &RigName::new("bench").unwrap()).unwrap();
     let mut subscriber = bus.subscriber(&dataset.streams()[1]).unwrap();
     resume(&replay);
     for n in 0..2 {
-        let frame = subscriber.next_timeout(PATIENCE).unwrap().unwrap();
+        let frame = subscriber.next_timeout(TIMEOUT).unwrap().unwrap();
         assert!(frame.header().has(FrameFlags::REPLAYED));
         assert_eq!((frame.header().sequence, frame.header().device_sequence), (n + 1, 6 * n + 100));
     }

@@ -1,4 +1,4 @@
-//! The report's fill rate against that of the depth metrics, on real pictures: the two crates share no code.
+//! The report's fill rate against that of the depth metrics, on real images: the two crates share no code.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use core::ops::ControlFlow;
@@ -11,8 +11,8 @@ use depthrig_recorder::{
 use std::path::Path;
 use std::sync::Arc;
 
-/// Depth pictures and their units, metres.
-const PICTURES: [(&str, f64); 3] = [
+/// Depth images and their units, metres.
+const IMAGES: [(&str, f64); 3] = [
     ("cdm_d405/depth_26.png", 0.0001),
     ("lingbot_depth/0/raw_depth.png", 0.001),
     ("lingbot_depth/3/raw_depth.png", 0.001),
@@ -22,23 +22,23 @@ const PICTURES: [(&str, f64); 3] = [
 fn the_fill_rate_of_a_report_is_that_of_the_metrics() {
     let data = std::env::var_os("DEPTHRIG_TEST_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"), Into::into);
-    let pictures = PICTURES.map(|(file, unit_m)| {
+    let images = IMAGES.map(|(file, unit_m)| {
         let path = data.join(file);
-        let picture =
+        let image =
             image::open(&path).unwrap_or_else(|e| panic!("{}: {e}; set DEPTHRIG_TEST_DATA", path.display()));
-        (picture.into_luma16(), unit_m)
+        (image.into_luma16(), unit_m)
     });
     let mut session = Session::new("fill", "rig");
-    session.streams = pictures
+    session.streams = images
         .iter()
         .enumerate()
-        .map(|(i, (picture, unit_m))| StreamRecord {
+        .map(|(i, (image, unit_m))| StreamRecord {
             id: format!("cam{i}/depth").parse().unwrap(),
             model: String::new(),
             serial: String::new(),
             format: PixelFormat::Z16,
-            width: picture.width(),
-            height: picture.height(),
+            width: image.width(),
+            height: image.height(),
             rate_hz: 30.0,
             depth_unit_m: *unit_m,
             calibration: String::new(),
@@ -50,12 +50,12 @@ fn the_fill_rate_of_a_report_is_that_of_the_metrics() {
     let dir = home.path().join("fill");
     let options = RecorderOptions { min_free_bytes: 0, ..RecorderOptions::default() };
     let recorder = Recorder::create(Arc::new(RealFs), &dir, session.clone(), options).unwrap();
-    let frames = pictures.iter().zip(&session.streams).enumerate().map(|(stream, ((picture, unit_m), s))| {
+    let frames = images.iter().zip(&session.streams).enumerate().map(|(stream, ((image, unit_m), s))| {
         let mut header = FrameHeader::default();
         header.set_names("rig", &s.id);
-        header.set_picture(PixelFormat::Z16, picture.width(), picture.height());
+        header.set_image(PixelFormat::Z16, image.width(), image.height());
         header.depth_unit_m = *unit_m;
-        let pixels: Vec<u8> = picture.as_raw().iter().flat_map(|v| v.to_le_bytes()).collect();
+        let pixels: Vec<u8> = image.as_raw().iter().flat_map(|v| v.to_le_bytes()).collect();
         RecordFrame { stream, header, pixels: Box::new(pixels) }
     });
     let utc = UtcPair { mono: HostTime::from_ns(1), utc_ns: 1_700_000_000_000_000_000, width_ns: 1 };
@@ -76,9 +76,9 @@ fn the_fill_rate_of_a_report_is_that_of_the_metrics() {
     let dataset = Dataset::open(&dir).unwrap();
     let report = Report::of(&dataset, &ReportOptions::default(), &mut |_| ControlFlow::Continue(()));
     let report = report.unwrap().unwrap();
-    for ((picture, unit_m), s) in pictures.iter().zip(&report.streams) {
-        let truth = fill_rate(&Depth::Units { pixels: picture.as_raw(), unit_m: *unit_m });
-        assert!((0.5..1.0).contains(&truth), "a picture with holes: {truth}");
+    for ((image, unit_m), s) in images.iter().zip(&report.streams) {
+        let truth = fill_rate(&Depth::Units { pixels: image.as_raw(), unit_m: *unit_m });
+        assert!((0.5..1.0).contains(&truth), "an image with holes: {truth}");
         assert!(
             (s.fill.as_ref().unwrap().mean - truth).abs() < 1e-12,
             "{}: {:?}, not {truth}",

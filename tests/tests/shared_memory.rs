@@ -113,7 +113,7 @@ fn inside_full_memory() {
     drop(held);
     let before = delivered(&rig.control().status(), "cam");
     wait_until(&rig, "frames while the memory is full", |s| delivered(s, "cam") > before + 30);
-    // What is new is refused.
+    // New channels are refused.
     for e in [
         bus.subscriber(&id).unwrap_err(),
         bus.publisher(&"other/color".parse().unwrap(), 1000, 16).unwrap_err(),

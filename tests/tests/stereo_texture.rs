@@ -1,4 +1,4 @@
-//! What is refused for want of texture costs a textured scene next to nothing: on a real pair, in every preset.
+//! Rejecting pixels without texture costs a textured scene next to nothing: on a real pair, in every preset.
 //!
 //! Missing real images make it fail: `DEPTHRIG_TEST_DATA` names the folder that holds them.
 #![allow(missing_docs, clippy::unwrap_used)]

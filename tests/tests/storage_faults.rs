@@ -1,4 +1,4 @@
-//! A rig whose disk fails: the recording ends or loses sets and says so; the live feed does not notice.
+//! A rig whose disk fails: the recording ends or reports lost sets; the live feed is not affected.
 //!
 //! Each test watches every stream with a subscriber of its own, before the fault and during it. No frame may be lost,
 //! and frames may not come much later than before. `DEPTHRIG_LONG=1` makes the faults last three times as long.
@@ -45,7 +45,7 @@ fn text() -> String {
         + "[sets]\nrate_hz = 15.0\n[recording]\ncolor = \"raw\"\nreserve_mb = 0\nmin_minutes = 0\nqueue_sets = 4\n"
 }
 
-/// What a subscriber saw of all streams: how long after its capture each frame came, ns.
+/// Frames that a subscriber received of all streams, with the delay from capture to arrival, ns.
 #[derive(Default)]
 struct Seen {
     late_ns: Vec<i64>,
@@ -62,7 +62,7 @@ impl Seen {
     }
 }
 
-/// Watches every stream until `stop`: what came while the rig warmed up, before the fault, and since.
+/// Watches every stream until `stop`: while the rig warms up, before the fault, and since.
 fn watch(home: &Home, phase: &AtomicUsize, stop: &AtomicBool) -> [Seen; 3] {
     let bus = Bus::open(&home.runtime(), &RigName::new("test").unwrap()).unwrap();
     let ids = ["left", "right"].iter().flat_map(|c| ["color", "depth"].map(|s| StreamId::new(c, s).unwrap()));
@@ -89,14 +89,14 @@ fn resident_bytes() -> u64 {
     pages.split(' ').nth(1).unwrap().parse::<u64>().unwrap() * 4096
 }
 
-/// What a fault left.
+/// State after a fault.
 struct Left {
     recording: RecordingStatus,
-    /// What `record stop` said.
+    /// Result of `record stop`.
     stopped: depthrig_daemon::Result<RecordingStatus>,
-    /// The most that waited for the disk.
+    /// Most bytes that waited for the disk.
     backlog_bytes: u64,
-    /// The most sets that waited for an encoder.
+    /// Most sets that waited for an encoder.
     encode_queue: u64,
     grown_bytes: u64,
 }
@@ -116,7 +116,8 @@ fn run(
         })
         .unwrap();
     wait_until(&rig, "streaming", all_stream);
-    let (phase, stop) = (AtomicUsize::new(0), AtomicBool::new(false));
+    let phase = AtomicUsize::new(0);
+    let stop = AtomicBool::new(false);
     let control = rig.control();
     let (left, seen) = std::thread::scope(|s| {
         let watcher = s.spawn(|| watch(home, &phase, &stop));
@@ -130,7 +131,9 @@ fn run(
             fault(&rig, &recording);
             phase.store(2, Ordering::SeqCst);
             let end = HostTime::now().plus(length);
-            let (mut backlog_bytes, mut encode_queue, mut resident) = (0, 0, 0);
+            let mut backlog_bytes = 0;
+            let mut encode_queue = 0;
+            let mut resident = 0;
             let mut recording = recording;
             while !end.from_now().is_zero() {
                 std::thread::sleep(Duration::from_millis(20));
@@ -170,7 +173,8 @@ fn unaffected(status: &depthrig_daemon::status::RigStatus, [_, before, during]: 
     assert_eq!((during.missed, before.out_of_order, during.out_of_order), (0, 0, 0));
     // Far apart from noise: a feed that waits for a stalled disk comes seconds late.
     for (quantile, times, floor_ms) in [(0.5, 4.0, 5.0), (0.99, 10.0, 20.0)] {
-        let (b, d) = (before.quantile_ms(quantile), during.quantile_ms(quantile));
+        let b = before.quantile_ms(quantile);
+        let d = during.quantile_ms(quantile);
         eprintln!("latency p{:.0}: {b:.2} ms before, {d:.2} ms during", quantile * 100.0);
         assert!(
             d < times * b.max(floor_ms),
@@ -179,7 +183,7 @@ fn unaffected(status: &depthrig_daemon::status::RigStatus, [_, before, during]: 
     }
 }
 
-/// Every set of the dataset, which must be whole as far as it goes: `lost` says whether it may say that it lost sets.
+/// Every set of the dataset, which must be intact up to its end; `lost` permits it to report lost sets.
 fn sets_of(path: &str, lost: bool) -> Vec<DatasetSet> {
     let report =
         verify(Path::new(path), &VerifyOptions { decode: true, ..VerifyOptions::default() }).unwrap();
@@ -260,13 +264,13 @@ fn a_disk_that_becomes_read_only_ends_the_recording() {
     let home = Home::default();
     let disk = Disk::default();
     let fs = Arc::new(disk.clone());
-    // As a kernel does it after an error of the medium: what is open fails as well. A remount by hand is refused then.
+    // As a kernel does it after an error of the medium: open files fail as well. A remount by hand is refused then.
     let fault = |_: &Rig, _: &RecordingStatus| disk.fail(std::io::ErrorKind::ReadOnlyFilesystem);
     let left = run(&home, &home.path("data"), |o| o.fs = fs, fault, seconds(2.0));
     assert!(left.recording.error.as_ref().is_some_and(|e| e.contains("read-only")), "{:?}", left.recording);
     let stopped = left.stopped.unwrap();
     assert!(stopped.dropped.contains_key("write_failed"), "{:?}", stopped.dropped);
-    // Nothing more could be written, an index least of all; what is there can be read.
+    // Nothing more could be written, not even an index; the written part can be read.
     let sets =
         Dataset::open(Path::new(&stopped.path)).unwrap().sets(SetRange::ALL).filter_map(Result::ok).count();
     assert!(sets as u64 >= stopped.sets && stopped.sets > 10, "{sets} of {} sets", stopped.sets);
@@ -365,7 +369,7 @@ fn a_folder_deleted_under_the_recorder_ends_the_recording() {
     );
     let stopped = left.stopped.map_or_else(|e| e.to_string(), |s| s.error.unwrap_or_default());
     assert!(!stopped.is_empty(), "`record stop` says so");
-    assert!(!Path::new(&left.recording.path).exists(), "it is not made anew behind the user's back");
+    assert!(!Path::new(&left.recording.path).exists(), "it is not created again behind the user's back");
 }
 
 /// How UTC minus the monotonic clock changed from each `clock` message to the next, nanoseconds, read with the `mcap`

@@ -9,7 +9,7 @@ fn now() -> u32 {
     u32::from_str_radix(text.trim(), 8).unwrap()
 }
 
-/// Whoever changed it: with 0177 nobody but root enters new folders, and the next recording would be refused.
+/// Whatever changed it: with 0177 only root can enter new folders, and the next recording would be refused.
 #[test]
 fn a_umask_that_keeps_the_owner_out_is_mended_while_the_rig_runs() {
     let home = Home::default();

@@ -1,16 +1,16 @@
-//! `zed replay`: depth in several modes out of raw eyes, whatever happens to the run that makes it.
+//! `zed replay`: depth in several modes from raw stereo, also when the run is killed and resumed.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use core::ops::ControlFlow;
 use depthrig_bus::{FrameFlags, FrameHeader, MotionSample, PixelFormat};
 use depthrig_calib::stereo::Preset;
 use depthrig_daemon::zed_replay::{Mode, NetworkChoice, Step, ZedReplayOptions, zed_replay};
-use depthrig_drivers::zed::replay::made;
+use depthrig_drivers::zed::replay::fake;
 use depthrig_recorder::{
     CompareOptions, Dataset, DatasetSet, ErrorKind, PixelMode, RecordMotion, Session, SetRange,
     VerifyOptions, compare, verify,
 };
-use depthrig_tests::eyes::Eyes;
+use depthrig_tests::synthetic_stereo::SyntheticStereo;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -33,7 +33,8 @@ fn u16s(bytes: &[u8]) -> Vec<u16> {
 /// A set has what the camera's unit, the second of the original, sent before it, and nothing of the other camera's.
 fn check_motion(set: &DatasetSet, old: &DatasetSet, session: &Session, original: &Dataset) {
     assert_eq!(original.session().motion[1..], session.motion);
-    let (mine, theirs) = (&set.motion[0], &old.motion[1]);
+    let mine = &set.motion[0];
+    let theirs = &old.motion[1];
     let samples = |m: &RecordMotion| m.samples.iter().map(MotionSample::to_bytes).collect::<Vec<_>>();
     assert_eq!((set.motion.len(), mine.unit, samples(mine)), (1, 0, samples(theirs)));
     let times = |h: &FrameHeader| (h.sequence, h.device_sequence, h.capture_time_ns, h.captured);
@@ -41,11 +42,13 @@ fn check_motion(set: &DatasetSet, old: &DatasetSet, session: &Session, original:
 }
 
 #[test]
+#[allow(clippy::too_many_lines)] // one run of all modes, looked at in turn
 fn every_mode_has_depth_that_is_right() {
     let dir = tempfile::tempdir().unwrap();
-    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
-    let eyes = Eyes { one_eyed: vec![2, 5], ..Eyes::default() };
-    eyes.record(&source);
+    let source = dir.path().join("source");
+    let out = dir.path().join("out");
+    let stereo = SyntheticStereo { without_right: vec![2, 5], ..SyntheticStereo::default() };
+    stereo.record(&source);
     let options = ZedReplayOptions { disparity: true, ..options(&CLASSICAL, 3) };
     let report = zed_replay(&source, &out, &options, &mut go_on).unwrap();
     assert_eq!((report.sets, report.lost, report.ended, report.modes.len()), (6, 0, false, 3), "{report:?}");
@@ -75,19 +78,19 @@ fn every_mode_has_depth_that_is_right() {
             ["zed2i/left", "zed2i/right"]
         );
     }
-    // The view is the left eye's, because the eyes look the same way.
+    // The view is the left camera's, because the cameras' axes are parallel.
     let view = &session.streams[1];
-    assert!((view.intrinsics.fx - eyes.focal).abs() < 0.5, "{:?}", view.intrinsics);
+    assert!((view.intrinsics.fx - stereo.focal).abs() < 0.5, "{:?}", view.intrinsics);
     assert!((view.pose.translation_m[0] - 0.5).abs() < 1e-9, "{:?}", view.pose);
 
-    let truth = eyes.truth_m();
+    let truth = stereo.truth_m();
     let original = Dataset::open(&source).unwrap();
     let sets = dataset.sets_with(SetRange::ALL, PixelMode::Decoded).map(Result::unwrap);
     let before = original.sets_with(SetRange::ALL, PixelMode::None).map(Result::unwrap);
     for (n, (set, old)) in sets.zip(before).enumerate() {
         assert_eq!((set.id, set.tick, set.utc_ns), (old.id, old.tick, old.utc_ns));
         check_motion(&set, &old, session, &original);
-        if eyes.one_eyed.contains(&(n as u64)) {
+        if stereo.without_right.contains(&(n as u64)) {
             assert_eq!(
                 (set.frames.len(), set.missing.len()),
                 (0, 10),
@@ -98,14 +101,15 @@ fn every_mode_has_depth_that_is_right() {
         assert_eq!(set.frames.len(), 10);
         let number = if n < 2 { n as u64 + 1 } else { n as u64 };
         for frame in &set.frames {
-            let (h, l) = (&frame.header, &old.frames[0].header);
+            let h = &frame.header;
+            let l = &old.frames[0].header;
             assert_eq!(
                 (h.capture_time_ns, h.capture_uncertainty_ns, h.device_sequence),
                 (l.capture_time_ns, 12_000, 100 + n as u64)
             );
             assert_eq!((h.sequence, h.captured, h.source_sequence), (number, number, l.sequence));
             assert!(h.has(FrameFlags::DERIVED));
-            assert_eq!((h.width, h.height), eyes.size);
+            assert_eq!((h.width, h.height), stereo.size);
             assert_eq!(h.camera(), "zed2i");
         }
         for mode in set.frames[1..].chunks(3) {
@@ -117,12 +121,13 @@ fn every_mode_has_depth_that_is_right() {
             assert_eq!(disparity.header.pixel_format(), Some(PixelFormat::DisparityF32));
             let z = u16s(&depth.pixels);
             let d: Vec<f32> = disparity.pixels.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
-            let (mut valid, mut right) = (0, 0);
+            let mut valid = 0;
+            let mut right = 0;
             for (i, z) in z.iter().enumerate() {
                 assert_eq!(*z > 0, d[i] > 0.0 && u32::from(*z) > 0, "a hole is a hole in both");
                 assert_eq!(d[i].is_nan(), confidence.pixels[i] == 0);
                 if *z > 0 {
-                    let from_disparity = eyes.focal * eyes.baseline_m / f64::from(d[i]);
+                    let from_disparity = stereo.focal * stereo.baseline_m / f64::from(d[i]);
                     assert!((f64::from(*z) * 1e-3 - from_disparity).abs() < 0.003, "{z} {}", d[i]);
                     valid += 1;
                     right += u32::from((f64::from(*z) * 1e-3 / truth[i] - 1.0).abs() < 0.05);
@@ -148,10 +153,10 @@ fn every_mode_has_depth_that_is_right() {
 }
 
 #[test]
-fn what_cannot_be_replayed_is_said() {
+fn invalid_input_is_reported() {
     let dir = tempfile::tempdir().unwrap();
     let source = dir.path().join("source");
-    Eyes { sets: 1, ..Eyes::default() }.record(&source);
+    SyntheticStereo { sets: 1, ..SyntheticStereo::default() }.record(&source);
     let out = dir.path().join("out");
     let fails = |options: &ZedReplayOptions| zed_replay(&source, &out, options, &mut go_on).unwrap_err();
     let quality = options(&CLASSICAL[2..], 1);
@@ -160,7 +165,7 @@ fn what_cannot_be_replayed_is_said() {
     let e = fails(&ZedReplayOptions { camera: Some("front".into()), ..quality.clone() });
     assert!(e.to_string().contains("of its cameras have: zed2i"), "{e}");
     let e = fails(&ZedReplayOptions { range_m: (2.0, 1.0), ..quality.clone() });
-    assert!(e.to_string().contains("no range"), "{e}");
+    assert!(e.to_string().contains("invalid depth range"), "{e}");
     let e = fails(&ZedReplayOptions { modes: [CLASSICAL[0], CLASSICAL[0]].to_vec(), ..quality.clone() });
     assert!(e.to_string().contains("twice"), "{e}");
     assert!(!out.exists() && !dir.path().join("out.zedreplay").exists(), "nothing is left of a refusal");
@@ -172,30 +177,32 @@ fn what_cannot_be_replayed_is_said() {
     assert!(session.extra["zed_replay"].to_string().contains("unavailable, because"), "{:?}", session.extra);
 }
 
-/// Eyes that were exchanged are found out, and only they.
+/// Swapped left and right images are refused, and nothing else is.
 #[test]
-fn swapped_eyes_are_said() {
+fn swapped_images_are_refused() {
     let dir = tempfile::tempdir().unwrap();
-    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
-    Eyes { sets: 3, one_eyed: vec![0], swapped: true, ..Eyes::default() }.record(&source);
+    let source = dir.path().join("source");
+    let out = dir.path().join("out");
+    SyntheticStereo { sets: 3, without_right: vec![0], swapped: true, ..SyntheticStereo::default() }
+        .record(&source);
     let e = zed_replay(&source, &out, &options(&CLASSICAL, 1), &mut go_on).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::BadInput);
     assert!(e.to_string().starts_with("left and right are swapped"), "{e}");
     assert!(!out.exists() && !dir.path().join("out.zedreplay").exists());
     // A wall without a pattern matches in neither order, and that is no reason to refuse it.
     let plain = dir.path().join("plain");
-    Eyes { sets: 1, contrast: 0.0, ..Eyes::default() }.record(&plain);
+    SyntheticStereo { sets: 1, contrast: 0.0, ..SyntheticStereo::default() }.record(&plain);
     zed_replay(&plain, &out, &options(&CLASSICAL[..1], 1), &mut go_on).unwrap();
 }
 
-/// A calibration that leaves rows apart is said, and kept with what was made by it.
+/// A calibration that leaves rows apart is reported and kept in the dataset.
 #[test]
-fn rows_that_are_apart_are_said() {
+fn rows_that_are_apart_are_reported() {
     let dir = tempfile::tempdir().unwrap();
     for (rows_apart, is_bad) in [(0.0, false), (-1.5, true)] {
         let [source, out] = ["source", "out"].map(|name| dir.path().join(format!("{name}{is_bad}")));
         // Two looks at the rows: the first pair and the fifth.
-        Eyes { rows_apart, ..Eyes::default() }.record(&source);
+        SyntheticStereo { rows_apart, ..SyntheticStereo::default() }.record(&source);
         let report = zed_replay(&source, &out, &options(&CLASSICAL[..1], 1), &mut go_on).unwrap();
         let noted = report
             .notes
@@ -216,13 +223,14 @@ fn rows_that_are_apart_are_said() {
     }
 }
 
-/// A folder of side-by-side pictures: depth by the factory calibration, times by the names.
+/// A folder of side-by-side images: depth by the factory calibration, times by the names.
 #[test]
-fn a_folder_of_pictures() {
+fn a_folder_of_images() {
     let dir = tempfile::tempdir().unwrap();
-    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
-    let eyes = Eyes { size: (672, 376), focal: 300.0, sets: 3, ..Eyes::default() };
-    eyes.write_folder(&source);
+    let source = dir.path().join("source");
+    let out = dir.path().join("out");
+    let stereo = SyntheticStereo { size: (672, 376), focal: 300.0, sets: 3, ..SyntheticStereo::default() };
+    stereo.write_folder(&source);
     let options = options(&CLASSICAL[..1], 2);
     let report = zed_replay(&source, &out, &options, &mut go_on).unwrap();
     assert_eq!((report.sets, report.lost, report.notes.len()), (3, 0, 0), "{report:?}");
@@ -230,17 +238,17 @@ fn a_folder_of_pictures() {
     let s = &dataset.session().streams[1];
     assert_eq!((s.id.to_string().as_str(), s.serial.as_str()), ("zed2i/depth_performance", "20267155"));
     assert!(s.calibration.contains("SN20267155.conf"), "{}", s.calibration);
-    assert_eq!(dataset.session().started_utc_ns, depthrig_tests::eyes::T0);
-    let truth = eyes.truth_m();
+    assert_eq!(dataset.session().started_utc_ns, depthrig_tests::synthetic_stereo::T0);
+    let truth = stereo.truth_m();
     for (n, set) in dataset.sets_with(SetRange::ALL, PixelMode::Decoded).map(Result::unwrap).enumerate() {
-        assert_eq!(set.utc_ns, depthrig_tests::eyes::T0 + n as i64 * eyes.period_ns);
+        assert_eq!(set.utc_ns, depthrig_tests::synthetic_stereo::T0 + n as i64 * stereo.period_ns);
         assert_eq!(set.frames[1].header.device_sequence, n as u64);
         let z = u16s(&set.frames[1].pixels);
         let right =
             z.iter().zip(&truth).filter(|(z, t)| (f64::from(**z) * 1e-3 / **t - 1.0).abs() < 0.05).count();
         assert!(right * 10 > truth.len() * 6, "{right} of {}", truth.len());
     }
-    // Pixels of an odd width are no two eyes, and a folder without calibration gives no depth.
+    // A folder without calibration gives no depth.
     std::fs::remove_file(source.join("SN20267155.conf")).unwrap();
     let e = zed_replay(&source, &dir.path().join("second"), &options, &mut go_on).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::BadInput, "{e}");
@@ -255,20 +263,20 @@ fn a_folder_of_pictures() {
 fn an_svo2_file() {
     let dir = tempfile::tempdir().unwrap();
     let source = dir.path().join("kitchen.svo2");
-    let eyes = Eyes { size: (672, 376), focal: 300.0, ..Eyes::default() };
-    let bytes = made::MadeSvo::strips(eyes.size, 4).build();
+    let stereo = SyntheticStereo { size: (672, 376), focal: 300.0, ..SyntheticStereo::default() };
+    let bytes = fake::FakeSvo::strips(stereo.size, 4).build();
     std::fs::write(&source, &bytes).unwrap();
-    std::fs::write(dir.path().join(format!("SN{}.conf", made::SERIAL)), eyes.conf()).unwrap();
+    std::fs::write(dir.path().join(format!("SN{}.conf", fake::SERIAL)), stereo.conf()).unwrap();
     let options = options(&CLASSICAL[..1], 2);
     let out = dir.path().join("out");
     let report = zed_replay(&source, &out, &options, &mut go_on).unwrap();
     assert_eq!((report.sets, report.lost), (4, 0), "{report:?}");
     let dataset = Dataset::open(&out).unwrap();
     assert_eq!(dataset.session().derived.last().unwrap().from, ["kitchen.svo2"]);
-    assert_eq!(dataset.session().streams[0].serial, made::SERIAL.to_string());
+    assert_eq!(dataset.session().streams[0].serial, fake::SERIAL.to_string());
     let times: Vec<_> = dataset.sets(SetRange::ALL).map(|s| s.unwrap().utc_ns).collect();
-    assert_eq!(times, (0..4).map(made::time_of).collect::<Vec<_>>());
-    // What is no recording is refused.
+    assert_eq!(times, (0..4).map(fake::time_of).collect::<Vec<_>>());
+    // Other files are refused.
     std::fs::write(&source, &bytes[..40]).unwrap();
     let e = zed_replay(&source, &dir.path().join("cut"), &options, &mut go_on).unwrap_err();
     assert!(e.to_string().contains("kitchen.svo2"), "{e}");
@@ -300,8 +308,9 @@ fn modes_are_those_alone(source: &Path, at_once: &Dataset, options: &ZedReplayOp
 #[test]
 fn presets_share_their_matching_and_stay_what_they_are_alone() {
     let dir = tempfile::tempdir().unwrap();
-    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
-    Eyes { sets: 3, one_eyed: vec![1], ..Eyes::default() }.record(&source);
+    let source = dir.path().join("source");
+    let out = dir.path().join("out");
+    SyntheticStereo { sets: 3, without_right: vec![1], ..SyntheticStereo::default() }.record(&source);
     let options = options(&CLASSICAL, 2);
     let report = zed_replay(&source, &out, &options, &mut go_on).unwrap();
     assert_eq!(report.modes[1].shared_with, ["performance", "quality"]);
@@ -314,11 +323,12 @@ fn presets_share_their_matching_and_stay_what_they_are_alone() {
 #[test]
 fn a_network_is_a_mode_like_any_other() {
     let dir = tempfile::tempdir().unwrap();
-    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
-    let eyes = Eyes { sets: 3, ..Eyes::default() };
-    eyes.record(&source);
+    let source = dir.path().join("source");
+    let out = dir.path().join("out");
+    let stereo = SyntheticStereo { sets: 3, ..SyntheticStereo::default() };
+    stereo.record(&source);
     let file = dir.path().join("made.onnx");
-    let made = depthrig_cdm::MadeNetwork { disparities: 24, confidence: true, ..Default::default() };
+    let made = depthrig_cdm::FakeNetwork { disparities: 24, confidence: true, ..Default::default() };
     std::fs::write(&file, made.file()).unwrap();
     let network = NetworkChoice {
         file: file.clone(),
@@ -341,7 +351,7 @@ fn a_network_is_a_mode_like_any_other() {
     assert_eq!(report.modes[1].recorded_as, "mimic_neural");
     assert!(report.modes[1].parameters.contains("network=made.onnx sha256="), "{:?}", report.modes[1]);
     let dataset = Dataset::open(&out).unwrap();
-    let truth = eyes.truth_m();
+    let truth = stereo.truth_m();
     for set in dataset.sets_with(SetRange::ALL, PixelMode::Decoded).map(Result::unwrap) {
         let depth = set.frames.iter().find(|f| f.header.stream() == "depth_neural").unwrap();
         assert!(depth.header.refiner().starts_with("onnxruntime"), "{}", depth.header.refiner());
@@ -352,7 +362,7 @@ fn a_network_is_a_mode_like_any_other() {
     }
     modes_are_those_alone(&source, &dataset, &options, dir.path());
     // One with other inputs is refused before anything is written.
-    let wrong = depthrig_cdm::MadeNetwork { channels: 4, ..Default::default() };
+    let wrong = depthrig_cdm::FakeNetwork { channels: 4, ..Default::default() };
     std::fs::write(&file, wrong.file()).unwrap();
     let second = dir.path().join("second");
     let e = zed_replay(&source, &second, &options, &mut go_on).unwrap_err();
@@ -365,11 +375,17 @@ fn a_network_is_a_mode_like_any_other() {
 const KILL: &str = "DEPTHRIG_TEST_ZED_KILL";
 
 /// Long enough for several segments: a set each 2.5 s of recorded time.
-fn long() -> Eyes {
-    Eyes { sets: 40, period_ns: 2_500_000_000, size: (128, 72), focal: 100.0, ..Eyes::default() }
+fn long() -> SyntheticStereo {
+    SyntheticStereo {
+        sets: 40,
+        period_ns: 2_500_000_000,
+        size: (128, 72),
+        focal: 100.0,
+        ..SyntheticStereo::default()
+    }
 }
 
-/// Not a test of its own: what the test below starts and kills. It says how far it is.
+/// Not a test of its own: the child that the test below starts and kills. It prints its progress.
 #[test]
 fn child() {
     let Some(dir) = std::env::var_os(KILL).map(PathBuf::from) else { return };
@@ -383,7 +399,7 @@ fn child() {
     println!("resumed {}", report.unwrap().resumed);
 }
 
-/// Starts the child and kills it (SIGKILL) when it has told of `after` sets; whether it was killed, and what it resumed.
+/// Starts the child and kills it (SIGKILL) once it has reported `after` sets. Returns the sets that it resumed.
 fn run_child(dir: &Path, after: u64) -> Option<u64> {
     let mut child = Command::new(std::env::current_exe().unwrap())
         .args(["--exact", "child", "--nocapture"])
@@ -409,8 +425,9 @@ fn run_child(dir: &Path, after: u64) -> Option<u64> {
 #[test]
 fn a_recording_that_lost_sets_is_replayed_with_its_gaps() {
     let dir = tempfile::tempdir().unwrap();
-    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
-    Eyes { lost: vec![2], ..Eyes::default() }.record(&source);
+    let source = dir.path().join("source");
+    let out = dir.path().join("out");
+    SyntheticStereo { lost: vec![2], ..SyntheticStereo::default() }.record(&source);
     let report = zed_replay(&source, &out, &options(&CLASSICAL[..1], 1), &mut go_on).unwrap();
     assert_eq!((report.sets, report.lost), (5, 0), "{:?}", report.problems);
     let accounts = |path: &Path| Dataset::open(path).unwrap().info().unwrap().accounts;
@@ -432,7 +449,7 @@ fn a_killed_run_goes_on() {
         assert_eq!(run_child(dir, after), None, "it was killed");
         assert!(!dir.join("out").exists() && dir.join("out.zedreplay").exists());
     }
-    // Other options are refused and what is there is left alone.
+    // Other options are refused, and the existing folder is not changed.
     let other = ZedReplayOptions { depth_unit_m: 0.0001, ..options(&CLASSICAL[..1], 1) };
     let e = zed_replay(&dir.join("source"), &dir.join("out"), &other, &mut go_on).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::AlreadyExists, "{e}");
@@ -441,7 +458,8 @@ fn a_killed_run_goes_on() {
     assert!(resumed >= 12, "{resumed}: segments that were finished before the last kill are kept");
     assert!(!dir.join("out.zedreplay").exists());
     assert!(verify(&dir.join("out"), &VerifyOptions::default()).unwrap().is_whole());
-    let (a, b) = (Dataset::open(&dir.join("out")).unwrap(), Dataset::open(&whole).unwrap());
+    let a = Dataset::open(&dir.join("out")).unwrap();
+    let b = Dataset::open(&whole).unwrap();
     let same = compare(&a, &b, &CompareOptions { strict: true, ..CompareOptions::default() }).unwrap();
     assert!(same.equal, "{same:?}");
 }
@@ -449,7 +467,8 @@ fn a_killed_run_goes_on() {
 #[test]
 fn a_run_that_was_ended_goes_on() {
     let dir = tempfile::tempdir().unwrap();
-    let (source, out) = (dir.path().join("source"), dir.path().join("out"));
+    let source = dir.path().join("source");
+    let out = dir.path().join("out");
     long().record(&source);
     let options = options(&CLASSICAL[..1], 2);
     let ended = zed_replay(&source, &out, &options, &mut |_, done, _| {

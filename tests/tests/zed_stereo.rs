@@ -1,4 +1,4 @@
-//! A recording of a ZED as a camera of a running rig, with depth in three modes: from raw pictures of lenses that bend, in
+//! A recording of a ZED as a camera of a running rig, with depth in three modes: from raw images of lenses that bend, in
 //! front of a wall whose distance is known, to a dataset that verifies.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
@@ -6,8 +6,8 @@ use depthrig_bus::{FrameFlags, PixelFormat};
 use depthrig_calib::{Camera, PoseExt, Rectifier, View};
 use depthrig_daemon::control::RecordRequest;
 use depthrig_drivers::zed::conf::{FactoryCalibration, StereoCalibration};
-use depthrig_drivers::zed::mode::{Eye, Mode};
-use depthrig_drivers::zed::replay::made::{self, MadeSvo};
+use depthrig_drivers::zed::mode::{Mode, Side};
+use depthrig_drivers::zed::replay::fake::{self, FakeSvo};
 use depthrig_recorder::{Dataset, SetRange, VerifyOptions, verify};
 use depthrig_tests::{Home, all_stream, assert_balanced, camera, wait_until};
 use std::path::Path;
@@ -15,7 +15,7 @@ use std::time::Duration;
 
 const CONF: &str = include_str!("../../drivers/src/zed/conf/sample.conf");
 const SIZE: (u32, u32) = (672, 376);
-/// The wall stands across the left eye's axis, metres.
+/// Distance of the wall along the left camera's axis, metres.
 const WALL_M: f64 = 1.5;
 const MODES: [&str; 3] = ["performance", "quality", "ultra"];
 
@@ -32,20 +32,22 @@ fn pattern(u: f64, v: f64) -> u8 {
         x = x.wrapping_mul(0xBF58_476D_1CE4_E5B9);
         ((x >> 40) & 0xFF) as f64
     };
-    let (i, j) = (u.floor(), v.floor());
+    let i = u.floor();
+    let j = v.floor();
     let row = |j| at(i, j) * (1.0 - (u - i)) + at(i + 1.0, j) * (u - i);
     (row(j) * (1.0 - (v - j)) + row(j + 1.0) * (v - j)) as u8
 }
 
-/// What `eye` sees of the wall, grey.
-fn seen(c: &StereoCalibration, eye: Eye) -> Vec<u8> {
-    let lens = Camera::new(&c.intrinsics(eye)).unwrap();
-    let pose = c.pose(eye).to_affine();
+/// Renders the wall in grey for the camera on `side`.
+fn seen(c: &StereoCalibration, side: Side) -> Vec<u8> {
+    let lens = Camera::new(&c.intrinsics(side)).unwrap();
+    let pose = c.pose(side).to_affine();
     let pixels = (0..SIZE.1).flat_map(|y| (0..SIZE.0).map(move |x| (x, y)));
     pixels
         .map(|(x, y)| {
             let Some(ray) = lens.unproject((f64::from(x), f64::from(y)).into()) else { return 0 };
-            let (from, ray) = (pose.translation, pose.matrix3 * ray);
+            let from = pose.translation;
+            let ray = pose.matrix3 * ray;
             let at = from + ray * ((WALL_M - from.z) / ray.z);
             // A spot is as large as three pixels.
             pattern(at.x * 60.0, at.y * 60.0)
@@ -56,7 +58,8 @@ fn seen(c: &StereoCalibration, eye: Eye) -> Vec<u8> {
 /// Depth of the wall in the rectified left view, metres.
 fn truth(c: &StereoCalibration) -> Vec<f64> {
     let r = Rectifier::new(&c.left, &c.right, &c.right_in_left, SIZE).unwrap();
-    let (k, turn) = (*r.intrinsics(), r.rotation(View::Left).transpose());
+    let k = *r.intrinsics();
+    let turn = r.rotation(View::Left).transpose();
     let pixels = (0..SIZE.1).flat_map(|y| (0..SIZE.0).map(move |x| (x, y)));
     pixels
         .map(|(x, y)| {
@@ -71,10 +74,11 @@ fn folder(dir: &Path, n: usize) {
     std::fs::create_dir_all(dir).unwrap();
     std::fs::write(dir.join("SN12345678.conf"), CONF).unwrap();
     let c = calibration();
-    let eyes = Eye::BOTH.map(|eye| seen(&c, eye));
+    let images = Side::BOTH.map(|side| seen(&c, side));
     let image = image::GrayImage::from_fn(2 * SIZE.0, SIZE.1, |x, y| {
-        let (eye, x) = (usize::from(x >= SIZE.0), x % SIZE.0);
-        image::Luma([eyes[eye][(y * SIZE.0 + x) as usize]])
+        let side = usize::from(x >= SIZE.0);
+        let x = x % SIZE.0;
+        image::Luma([images[side][(y * SIZE.0 + x) as usize]])
     });
     let image = image::DynamicImage::ImageLuma8(image).to_rgb8();
     (0..n).for_each(|i| image.save(dir.join(format!("{i:04}.png"))).unwrap());
@@ -114,7 +118,7 @@ fn a_folder_of_raw_pairs_is_recorded_in_three_modes() {
     let summary = rig.stop();
     assert_balanced(&summary.status);
     for s in &camera(&summary.status, "zed").streams {
-        assert!(s.dropped.values().all(|n| *n == 0), "nothing gives way: {s:?}");
+        assert!(s.dropped.values().all(|n| *n == 0), "nothing is superseded: {s:?}");
     }
 
     let path = home.path("made");
@@ -123,7 +127,7 @@ fn a_folder_of_raw_pairs_is_recorded_in_three_modes() {
     let dataset = Dataset::open(&path).unwrap();
     let streams = &dataset.session().streams;
     let names: Vec<_> = streams.iter().map(|s| s.id.stream.to_string()).collect();
-    assert_eq!(names.len(), 9, "two eyes, colour, depth and confidence of three modes: {names:?}");
+    assert_eq!(names.len(), 9, "left, right, colour, depth and confidence of three modes: {names:?}");
     assert!(streams.iter().all(|s| s.serial == "12345678"));
     let computed = &dataset.session().computed;
     assert_eq!(computed.len(), 6, "{computed:?}");
@@ -159,7 +163,8 @@ fn a_folder_of_raw_pairs_is_recorded_in_three_modes() {
                 .collect();
             let seen = errors.len() as f64 / truth.len() as f64;
             errors.sort_by(f64::total_cmp);
-            let (middle, most) = (errors[errors.len() / 2], errors[errors.len() * 9 / 10]);
+            let middle = errors[errors.len() / 2];
+            let most = errors[errors.len() * 9 / 10];
             assert!(seen > 0.7, "{name}: {seen} of the wall");
             // A quarter of a pixel at 1.5 m is 1.2 %; the performance preset matches at half the resolution.
             let limit = if name.ends_with("performance") { 0.024 } else { 0.012 };
@@ -182,8 +187,8 @@ fn an_svo2_file_is_a_camera_whose_chosen_depth_is_refined() {
     let home = Home::default();
     std::fs::create_dir_all(home.path("svo")).unwrap();
     let file = home.path("svo").join("a.svo2");
-    std::fs::write(&file, MadeSvo::strips(SIZE, 4).build()).unwrap();
-    std::fs::write(home.path("svo").join(format!("SN{}.conf", made::SERIAL)), CONF).unwrap();
+    std::fs::write(&file, FakeSvo::strips(SIZE, 4).build()).unwrap();
+    std::fs::write(home.path("svo").join(format!("SN{}.conf", fake::SERIAL)), CONF).unwrap();
     let more = "[camera.stereo]\nmodes = [\"performance\", \"quality\"]\nmin_depth_m = 1.0\n[camera.refine]\nengine = \"fill\"\n\
                 depth = \"depth_performance\"\nrate_hz = 0\n[[camera.stream]]\nname = \"color\"\n[[camera.stream]]\nname = \"depth_performance\"";
     let rig = home.start(&rig(&file, more)).unwrap();
@@ -209,7 +214,7 @@ fn a_recording_that_cannot_be_played_stops_the_rig_with_why() {
     std::fs::remove_file(home.path("pairs").join("SN12345678.conf")).unwrap();
     said(
         &rig(&home.path("pairs"), "[camera.stereo]\nmin_depth_m = 1.0"),
-        "no calibration of its eyes at 672x376",
+        "no calibration of left and right at 672x376",
     );
     std::fs::write(home.path("pairs").join("SN1.conf"), CONF.replace("[STEREO]", "[STEREOS]")).unwrap();
     said(&rig(&home.path("pairs"), "[camera.stereo]\nmin_depth_m = 1.0"), "STEREO");

@@ -1,4 +1,4 @@
-//! Global options, and parsers of option values that several commands share.
+//! Global options, and parsers for option values that several commands share.
 
 use clap::{ArgAction, ValueEnum};
 use depthrig_bus::RigName;
@@ -8,22 +8,22 @@ use std::path::PathBuf;
 /// Options of every command.
 #[derive(Debug, Clone, clap::Args)]
 pub struct Global {
-    /// The rig that is meant; without it the only one that is running
+    /// Rig to use [default: the only one running]
     #[arg(long, global = true, value_name = "NAME", help_heading = "Global options")]
     pub rig: Option<RigName>,
-    /// Folder of the locks, sockets and names of your rigs [env: DEPTHRIG_RUNTIME_DIR]
+    /// Folder with the locks and sockets of your rigs [env: DEPTHRIG_RUNTIME_DIR]
     #[arg(long, global = true, value_name = "DIR", help_heading = "Global options")]
     pub runtime_dir: Option<PathBuf>,
-    /// Log more (twice: everything)
+    /// Log more (-vv: everything)
     #[arg(short, long, global = true, action = ArgAction::Count, help_heading = "Global options")]
     pub verbose: u8,
-    /// Log less, and show no progress
+    /// Log less, without progress bars
     #[arg(short, long, global = true, action = ArgAction::Count, help_heading = "Global options")]
     pub quiet: u8,
-    /// Form of the log lines on stderr
+    /// Format of the log lines on stderr
     #[arg(long, global = true, value_enum, default_value = "text", help_heading = "Global options")]
     pub log_format: LogFormat,
-    /// When to use colour; NO_COLOR is honoured
+    /// When to use colour; NO_COLOR is respected
     #[arg(
         long,
         global = true,
@@ -35,27 +35,27 @@ pub struct Global {
     pub color: ColorChoice,
 }
 
-/// Form of the log lines.
+/// Format of the log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum LogFormat {
-    /// For people.
+    /// Text for people
     Text,
-    /// One JSON object a line.
+    /// One JSON object per line
     Json,
 }
 
 /// When to use colour.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum ColorChoice {
-    /// On a terminal.
+    /// On a terminal
     Auto,
-    /// In any case.
+    /// Always
     Always,
-    /// In no case.
+    /// Never
     Never,
 }
 
-/// A number within `range`, in `unit`; infinity and what is not a number are out of every range.
+/// Parses a number within `range`, in `unit`; infinity and NaN are out of every range.
 ///
 /// # Errors
 /// When `text` is not a number, or out of `range`.
@@ -67,7 +67,7 @@ fn number_within(text: &str, unit: &str, range: RangeInclusive<f64>) -> Result<f
     Err(format!("{text} {unit} is out of range {}..={}", range.start(), range.end()))
 }
 
-/// How far apart frames of a set may be captured, milliseconds.
+/// Parses the largest allowed spread of the capture times in a set, milliseconds.
 ///
 /// # Errors
 /// When `text` is out of range 0..=3600000.
@@ -75,7 +75,7 @@ pub fn spread_ms(text: &str) -> Result<f64, String> {
     number_within(text, "ms", 0.0..=3.6e6)
 }
 
-/// A distance, metres.
+/// Parses a distance, metres.
 ///
 /// # Errors
 /// When `text` is out of range 0..=1000000.
@@ -83,7 +83,7 @@ pub fn distance_m(text: &str) -> Result<f64, String> {
     number_within(text, "m", 0.0..=1e6)
 }
 
-/// A distance that is not 0, metres.
+/// Parses a non-zero distance, metres.
 ///
 /// # Errors
 /// When `text` is out of range 0.001..=1000000.
@@ -91,7 +91,7 @@ pub fn range_limit_m(text: &str) -> Result<f64, String> {
     number_within(text, "m", 1e-3..=1e6)
 }
 
-/// A rate of frames, sets or pairs.
+/// Parses a rate of frames, sets or pairs, Hz.
 ///
 /// # Errors
 /// When `text` is out of range 0.001..=10000.
@@ -99,7 +99,7 @@ pub fn rate_hz(text: &str) -> Result<f64, String> {
     number_within(text, "Hz", 1e-3..=1e4)
 }
 
-/// Memory, GB.
+/// Parses an amount of memory, GB.
 ///
 /// # Errors
 /// When `text` is out of range 0..=1000000.
@@ -107,7 +107,7 @@ pub fn memory_gb(text: &str) -> Result<f64, String> {
     number_within(text, "GB", 0.0..=1e6)
 }
 
-/// Speed of a replay against the original.
+/// Parses the speed of a replay relative to the original.
 ///
 /// # Errors
 /// When `text` is out of range 0.1..=10.
@@ -115,7 +115,7 @@ pub fn replay_rate(text: &str) -> Result<f64, String> {
     number_within(text, "times", depthrig_daemon::replay::RATES)
 }
 
-/// A number of seconds, such as after the first set.
+/// Parses a number of seconds, such as the time after the first set.
 ///
 /// # Errors
 /// When `text` is out of range 0..=9000000.
@@ -123,18 +123,18 @@ pub fn seconds(text: &str) -> Result<f64, String> {
     number_within(text, "s", 0.0..=9e6)
 }
 
-/// How far the engine `fill` fills holes, as a part of the image's width.
+/// Parses the distance over which the engine `fill` fills holes, as a fraction of the image width.
 ///
 /// # Errors
-/// When it is out of range 0..=1.
+/// When `text` is out of range 0..=1.
 pub fn fill_reach(text: &str) -> Result<f64, String> {
     number_within(text, "image widths", 0.0..=1.0)
 }
 
-/// Metres per unit of depth, as cameras and files have it.
+/// Parses the metres per depth unit of a camera or file.
 ///
 /// # Errors
-/// When `text` is none, or out of a micrometre to a metre.
+/// When `text` is not a number or out of range 0.000001..=1.
 pub fn depth_unit_m(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(unit) if (1e-6..=1.0).contains(&unit) => Ok(unit),
@@ -143,10 +143,10 @@ pub fn depth_unit_m(text: &str) -> Result<f64, String> {
     }
 }
 
-/// A number of seconds above 0 and below ten years.
+/// Parses a number of seconds above 0 and below ten years.
 ///
 /// # Errors
-/// When `text` is none.
+/// When `text` is not a number or out of that range.
 pub fn positive_seconds(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(s) if s > 0.0 && s < 3.2e8 => Ok(s),
@@ -154,17 +154,18 @@ pub fn positive_seconds(text: &str) -> Result<f64, String> {
     }
 }
 
-/// A time as people write it, in seconds: hours, minutes and seconds, each once at most and in this order, such as
+/// Parses a duration into seconds: hours, minutes and seconds, each at most once and in this order, such as
 /// `90s`, `10m`, `1h30m` or `1.5h`.
 ///
 /// # Errors
-/// When `text` is none, is 0 or is ten years.
+/// When `text` has another form, is 0, or is ten years or more.
 pub fn duration_s(text: &str) -> Result<f64, String> {
     let wrong = || format!("write a time such as 90s, 10m or 1h30m, not \"{text}\"");
-    let (mut rest, mut total_s) = (text, 0.0);
+    let mut rest = text;
+    let mut total_s = 0.0;
     for (unit, seconds) in [('h', 3600.0), ('m', 60.0), ('s', 1.0)] {
         let Some((number, after)) = rest.split_once(unit) else { continue };
-        // No sign, exponent or word for infinity, which a float may have.
+        // `f64::from_str` would also take signs, exponents and "inf".
         if !number.bytes().all(|b| b.is_ascii_digit() || b == b'.') {
             return Err(wrong());
         }

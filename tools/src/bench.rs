@@ -1,4 +1,4 @@
-//! Benches of the command line: what a promise about speed is measured with.
+//! Benchmarks of the command line, which check the promises about performance.
 
 pub mod bus;
 pub mod capture;

@@ -1,4 +1,4 @@
-//! The commands and options, and what `--help` says of them.
+//! The commands and options, with their `--help` texts.
 
 use crate::args::Global;
 use crate::commands::{
@@ -8,130 +8,130 @@ use crate::commands::{
 };
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
-/// Captures, stamps, groups, shares, records and replays the cameras of a multi-camera RGB-D mount.
+/// Capture, timestamp, group, share, record and replay the cameras of an RGB-D rig
 #[derive(Debug, Parser)]
 #[command(name = "depthrig", version, max_term_width = 100, after_help = EXIT_CODES)]
 pub struct Cli {
     /// Options of every command.
     #[command(flatten)]
     pub global: Global,
-    /// What to do.
+    /// The subcommand.
     #[command(subcommand)]
     pub command: Command,
 }
 
 const EXIT_CODES: &str = "\
 Exit codes:
-  0  good
-  1  failed
+  0  success
+  1  failure
   2  wrong usage or configuration
   3  finished, but something was lost (the output says what)
 
 Examples:
-  depthrig demo                          see everything once, without a camera
-  depthrig config show > rig.toml        a commented configuration that runs as it is
-  depthrig run rig.toml                  the daemon, in the foreground
+  depthrig demo                          full pipeline once, without a camera
+  depthrig config show > rig.toml        commented configuration that runs as it is
+  depthrig run rig.toml                  daemon in the foreground
   depthrig top                           watch it from another terminal
   depthrig record start --scene kitchen  record until `depthrig record stop`";
 
 /// The commands.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Run the seven-camera mount with synthetic cameras once through: capture, record, verify, replay, report
+    /// Capture, record, verify, replay and report seven synthetic cameras
     #[command(after_help = demo::EXAMPLES)]
     Demo(demo::DemoArgs),
-    /// List the cameras that are attached: model, serial number, port, speed, who has it, what is wrong
+    /// List attached cameras: model, serial number, port, speed, user, problems
     #[command(after_help = cameras::EXAMPLES)]
     Cameras(cameras::CamerasArgs),
-    /// Examine a session before it begins: cameras, modes, USB, permissions, memory, disk; each finding with its cure
+    /// Check cameras, USB, permissions, memory and disk before a session
     #[command(after_help = doctor::EXAMPLES)]
     Doctor(doctor::DoctorArgs),
-    /// Run the daemon in the foreground; Ctrl-C ends it cleanly, twice ends it at once
+    /// Run the daemon in the foreground until Ctrl-C
     #[command(after_help = run::EXAMPLES)]
     Run(run::RunArgs),
     /// Start, stop and annotate recordings of the running daemon
     #[command(subcommand, after_help = record::EXAMPLES)]
     Record(record::RecordCommand),
-    /// Show cameras, rates, losses, clocks, sets, recording and disk of the running daemon
+    /// Show cameras, rates, losses, clocks, recording and disk of the running daemon
     #[command(after_help = status::EXAMPLES)]
     Status(status::StatusArgs),
-    /// Watch the running daemon, refreshed in place; q or Ctrl-C leaves
+    /// Watch the running daemon, refreshed in place; q or Ctrl-C quits
     Top(top::TopArgs),
-    /// Publish datasets on the same channels as if the cameras were there, and steer that
+    /// Replay datasets on the live channels, and control a running replay
     #[command(after_help = replay::EXAMPLES)]
     Replay(replay::ReplayArgs),
-    /// Say what is in a dataset
+    /// Show the contents of a dataset
     Info(info::InfoArgs),
-    /// Write the quality report of a dataset: verdict, rates, losses, spreads, clocks, fill rate, pictures
+    /// Write the quality report of a dataset: rates, losses, spreads, clocks, images
     #[command(after_help = report::EXAMPLES)]
     Report(report::ReportArgs),
-    /// List the datasets of a folder: scene, start, length, sets, size, health
+    /// List the datasets in a folder: scene, start, length, sets, size, health
     #[command(after_help = sessions::EXAMPLES)]
     Sessions(sessions::SessionsArgs),
-    /// Change scene, operator, notes or name of a dataset; what it said before stays in its history
+    /// Change scene, operator, notes or name of a dataset, with a history of edits
     #[command(after_help = edit::EXAMPLES)]
     Edit(edit::EditArgs),
-    /// Tell how good depth is against a reference: a table as in papers, and a page
+    /// Evaluate depth against a reference (metrics table, HTML report)
     #[command(after_help = eval::EXAMPLES)]
     Eval(eval::EvalArgs),
-    /// Write datasets in the layouts of others: ByteCameraDepth, LeRobot
+    /// Export datasets to other layouts: ByteCameraDepth, LeRobot
     #[command(subcommand, after_help = export::EXAMPLES)]
     Export(export::ExportCommand),
-    /// Make a dataset of what others recorded
+    /// Import recordings of other programs as datasets
     #[command(subcommand, after_help = import::EXAMPLES)]
     Import(import::ImportCommand),
-    /// Check that a dataset is whole
+    /// Check that a dataset is complete and undamaged
     #[command(after_help = verify::EXAMPLES)]
     Verify(verify::VerifyArgs),
-    /// List single frames of a dataset, or write them as PNG, NPY or JPEG files
+    /// List frames of a dataset, or write them as PNG, NPY or JPEG files
     #[command(after_help = cat::EXAMPLES)]
     Cat(cat::CatArgs),
     /// Install camera depth models, and refine depth with them
     #[command(subcommand, after_help = cdm::EXAMPLES)]
     Cdm(cdm::CdmCommand),
-    /// Make depth of recorded raw stereo
+    /// Recompute depth from recorded raw stereo
     #[command(subcommand, after_help = zed::EXAMPLES)]
     Zed(zed::ZedCommand),
-    /// Find the disparity of a rectified pair of pictures
+    /// Compute the disparity of a rectified image pair
     #[command(after_help = stereo::EXAMPLES)]
     Stereo(stereo::StereoArgs),
-    /// Write a part of a dataset as a dataset of its own
+    /// Cut a part of a dataset into a new dataset
     #[command(after_help = trim::EXAMPLES)]
     Trim(trim::TrimArgs),
-    /// Join parts of one recording again
+    /// Join parts of one recording into one dataset
     #[command(after_help = merge::EXAMPLES)]
     Merge(merge::MergeArgs),
-    /// Make a dataset whole again after a crash, a full disk or a damaged sector
+    /// Repair a dataset after a crash, a full disk or a damaged sector
     #[command(after_help = recover::EXAMPLES)]
     Recover(recover::RecoverArgs),
-    /// Say whether two datasets hold the same, and where they differ
+    /// Compare two datasets and list their differences
     #[command(after_help = compare::EXAMPLES)]
     Compare(compare::CompareArgs),
     /// Check a rig configuration, or print the commented default
     #[command(subcommand, after_help = config::EXAMPLES)]
     Config(config::ConfigCommand),
-    /// Show, write or remove the udev rules and the service that a computer with cameras needs
+    /// Show, install or remove the udev rules and the systemd service
     #[command(after_help = install::EXAMPLES)]
     Install(install::InstallArgs),
-    /// Look at one live stream: a line per frame, or pictures
+    /// Watch one live stream: a line per frame, or image files
     #[command(after_help = tap::EXAMPLES)]
     Tap(tap::TapArgs),
-    /// Measure what depthrig promises about speed
+    /// Measure performance and check it against depthrig's promises
     #[command(subcommand, after_help = bench::EXAMPLES)]
     Bench(bench::BenchCommand),
-    /// Print completions for a shell
+    /// Print shell completions
     #[command(after_help = completions::EXAMPLES)]
     Completions(completions::CompletionsArgs),
     /// Print the manual page, or write one page per command
     Man(man::ManArgs),
-    /// The subscribing process of `bench bus`
+    /// Run the subscriber process of `bench bus`
     #[command(hide = true)]
     BenchReader(crate::bench::bus::reader::ReaderArgs),
 }
 
 impl Command {
-    /// By how much its log is louder than others': what runs until somebody ends it shows itself by its log, and what
-    /// tells all that is wrong in its output does not tell it twice.
+    /// Log level relative to the default: one level more for the daemon, whose log is its output; one less for commands
+    /// whose output already lists every problem.
     pub const fn loudness(&self) -> i32 {
         match self {
             Self::Run(_) => 1,
@@ -141,13 +141,14 @@ impl Command {
     }
 }
 
-/// The command line of this process. Ends it with 2 and a hint when the usage is wrong.
+/// Parses the command line of this process; on wrong usage prints a hint and exits with code 2.
 pub fn parse() -> Cli {
     let matches = with_negative_numbers(Cli::command()).get_matches();
     Cli::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
 }
 
-/// Lets each option take a negative number as its value, to be refused for what it is and not as an unknown option.
+/// Lets every option take a negative number as its value, so that it is rejected as a value and not as an unknown
+/// option.
 fn with_negative_numbers(mut command: clap::Command) -> clap::Command {
     let names: Vec<_> = command.get_subcommands().map(|c| c.get_name().to_owned()).collect();
     for name in names {
@@ -189,10 +190,11 @@ mod tests {
         assert_eq!(parse("verify ds --nothing").unwrap_err().kind(), ErrorKind::UnknownArgument);
     }
 
-    /// Every option and argument of every command that is a number with a fraction.
+    /// Covers every `f64` option and argument of every command.
     #[test]
     fn no_number_of_any_command_is_negative_infinite_or_not_a_number() {
-        /// The words before the value of each such argument of `command`, whose own words are `path`.
+        /// Collects the words before the value of each such argument of `command`; `path` holds the command's own
+        /// words.
         fn fractions(command: &clap::Command, path: &[String], found: &mut Vec<Vec<String>>) {
             for arg in command.get_arguments() {
                 if arg.get_value_parser().type_id() == std::any::TypeId::of::<f64>() {
@@ -211,7 +213,7 @@ mod tests {
         assert!(found.len() >= 25, "{found:?}");
         for words in found {
             for value in ["-3", "nan", "inf", "-inf", "1e308", "ten"] {
-                // Of an option the value may begin with a minus in any form behind `=`.
+                // Behind `=` an option's value may begin with a minus in any form.
                 let mut words = words.clone();
                 match words.last_mut().filter(|last| last.starts_with("--")) {
                     Some(option) => {

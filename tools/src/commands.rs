@@ -40,7 +40,7 @@ use clap::CommandFactory;
 /// Runs the command that was asked for.
 ///
 /// # Errors
-/// What kept it from working; [`crate::exit::report`] tells it.
+/// The command's error; [`crate::exit::report`] prints it.
 pub fn run(cli: Cli) -> Result<Exit> {
     let context = Context { global: cli.global };
     match cli.command {

@@ -1,4 +1,4 @@
-//! Which rig a command is about, and how it may write.
+//! The rig that a command works on, and its output settings.
 
 use crate::args::{ColorChoice, Global};
 use crate::exit::UsageError;
@@ -6,7 +6,7 @@ use anyhow::Result;
 use depthrig_bus::{RigName, RuntimeDir};
 use std::io::IsTerminal;
 
-/// What every command is given.
+/// Settings passed to every command.
 #[derive(Debug, Clone)]
 pub struct Context {
     /// The global options.
@@ -58,7 +58,7 @@ impl Context {
     }
 }
 
-/// A folder for a rig that nobody else is to see; it goes when the value is dropped. Its path is short, because
+/// Creates a folder for a private rig, removed when the value is dropped. Its path is short, because
 /// sockets below it must fit into 107 bytes.
 ///
 /// # Errors
@@ -67,7 +67,7 @@ pub fn private_folder() -> Result<tempfile::TempDir> {
     Ok(tempfile::Builder::new().prefix("depthrig-").tempdir_in("/tmp")?)
 }
 
-/// The option decides, then `NO_COLOR`, then whether somebody looks.
+/// Decides by the option, then `NO_COLOR`, then whether stdout is a terminal.
 pub const fn wants_color(choice: ColorChoice, no_color: bool, terminal: bool) -> bool {
     match choice {
         ColorChoice::Always => true,

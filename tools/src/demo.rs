@@ -1,4 +1,4 @@
-//! The demo: the whole way of a frame once, and a report that a person can judge.
+//! The demo: the full pipeline once, and a report to judge it by.
 
 pub mod live;
 pub mod replayed;
@@ -9,21 +9,22 @@ pub mod sheet;
 use depthrig_bus::StreamId;
 use std::collections::BTreeMap;
 
-/// Checksums of depth pictures as they were live, by stream and capture time: what a replay must give back.
+/// Checksums of depth images as they were live, by stream and capture time: which a replay must reproduce.
 pub type Checksums = BTreeMap<(StreamId, i64), u32>;
 
-/// Whether a stream is depth that a camera measured: not made of it, and not the truth of a simulation.
+/// Returns whether a stream is depth that a camera measured, neither derived from it nor the ground truth of a
+/// simulation.
 pub fn is_depth(stream: &str) -> bool {
-    const MADE: [&str; 4] = ["depth_refined", "depth_aligned", "depth_true", "depth_true_color"];
-    stream == "depth" || (stream.starts_with("depth_") && !MADE.contains(&stream))
+    const COMPUTED: [&str; 4] = ["depth_refined", "depth_aligned", "depth_true", "depth_true_color"];
+    stream == "depth" || (stream.starts_with("depth_") && !COMPUTED.contains(&stream))
 }
 
-/// What the depth mode that a stream gives is called: the camera, and which of its modes when it has several.
+/// Names the depth mode of a stream: the camera, and the mode if it has several.
 pub fn mode_name(camera: &str, stream: &str) -> String {
     stream.strip_prefix("depth_").map_or_else(|| camera.to_owned(), |mode| format!("{camera} {mode}"))
 }
 
-/// Checksum of a picture (CRC-32, as in PNG).
+/// Checksum of an image (CRC-32, as in PNG).
 pub fn checksum(pixels: &[u8]) -> u32 {
     crc32fast::hash(pixels)
 }

@@ -1,4 +1,4 @@
-//! What `depthrig eval` is made of: where pictures come from, how they are read, and the page that shows the result.
+//! The parts of `depthrig eval`: sources of images, their readers, and the HTML report.
 
 pub mod dataset;
 pub mod files;
@@ -15,42 +15,42 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::sync::Mutex;
 
-/// Pictures of each row that are kept to be shown.
+/// Number of worst images of each row that the report shows.
 const SHOWN: usize = 3;
 
-/// One reference with what was predicted of it.
+/// One reference with its predictions.
 pub struct Loaded {
     /// Rows of the table are by group and prediction: a camera, or nothing.
     pub group: String,
-    /// What to call it.
+    /// Name of the image.
     pub name: String,
     /// The reference.
     pub truth: Metres,
-    /// Predictions by the number of their name; what has none is left out.
+    /// Predictions by the index of their name; missing ones are left out.
     pub predictions: Vec<(usize, Metres)>,
-    /// Colour, to be shown.
+    /// Colour image for the report.
     pub color: Option<(FrameHeader, Vec<u8>)>,
 }
 
-/// Reads what it was made for; runs on any thread.
+/// Reads the images of one job; runs on any thread.
 pub type Job = Box<dyn FnOnce() -> Result<Vec<Loaded>> + Send>;
 
-/// Where pictures come from.
+/// A source of images.
 pub trait Source {
-    /// What the predictions are called.
+    /// Names of the predictions.
     fn names(&self) -> &[String];
-    /// How many jobs there will be.
+    /// Number of jobs.
     fn total(&self) -> u64;
-    /// The next one; an error does not end it.
+    /// Returns the next job; an error does not end the iteration.
     fn next(&mut self) -> Option<Result<Job>>;
-    /// References without a prediction, and other things left out, in words.
+    /// Describes references without a prediction and other omissions.
     fn left_out(&self) -> Vec<String>;
 }
 
-/// How to measure.
+/// Options of the measurement.
 #[derive(Debug, Clone, Copy)]
 pub struct Options {
-    /// References that count.
+    /// Range of valid references.
     pub range: DepthRange,
     /// Width of a bin of distance in metres, and their number.
     pub bins: (f64, usize),
@@ -65,7 +65,7 @@ pub struct Row {
     pub group: String,
     /// Prediction.
     pub name: String,
-    /// Means over pictures, and over all pixels.
+    /// Means over images, and over all pixels.
     #[serde(flatten)]
     pub metrics: DatasetMetrics,
     /// Share of the pixels of the prediction that have a depth.
@@ -74,9 +74,9 @@ pub struct Row {
     pub by_distance: Vec<Bin>,
     /// Bounds of the classes of errors, metres.
     pub error_bounds_m: Vec<f64>,
-    /// How many errors lie where.
+    /// Histogram of the errors.
     pub errors: ErrorHistogram,
-    /// Its worst pictures by strict L1, worst first.
+    /// Its worst images by strict L1, worst first.
     pub worst: Vec<Worst>,
 }
 
@@ -98,26 +98,26 @@ impl From<DistanceBin> for Bin {
     }
 }
 
-/// A picture that did badly.
+/// One of the worst images.
 #[derive(Serialize)]
 pub struct Worst {
-    /// What it is called.
+    /// Name of the image.
     pub name: String,
     /// Its own strict L1, metres.
     pub strict_l1_m: f64,
-    /// Elements of the page: colour, reference, prediction, error.
+    /// Elements of the HTML report: colour, reference, prediction, error.
     #[serde(skip)]
     pub html: Vec<(&'static str, String)>,
 }
 
-/// Everything that was found.
+/// Result of the evaluation.
 #[derive(Serialize)]
 pub struct Evaluation {
     /// The rows.
     pub rows: Vec<Row>,
-    /// What could not be read, in words.
+    /// Descriptions of unreadable images.
     pub failed: Vec<String>,
-    /// What was left out, in words.
+    /// Descriptions of omissions.
     pub left_out: Vec<String>,
 }
 
@@ -127,18 +127,19 @@ struct Sum {
     worst: Vec<Worst>,
 }
 
-/// What a worker hands back of one job.
+/// Result of one job.
 type Done = Result<Vec<(Loaded, Vec<(usize, Measured)>)>>;
 
-/// Measures everything that `source` has; `go_on` is told how far it is and says whether to go on. Memory does not grow
-/// with the number of pictures, and the result does not depend on the number of threads.
+/// Measures all images of `source`; `go_on` receives the progress and decides whether to continue. Memory does not grow
+/// with the number of images, and the result does not depend on the number of threads.
 pub fn run(
     source: &mut dyn Source,
     options: &Options,
     mut go_on: impl FnMut(u64, u64) -> bool,
 ) -> Result<Option<Evaluation>> {
     let mut sums: BTreeMap<(String, usize), Sum> = BTreeMap::new();
-    let (mut failed, mut done) = (Vec::new(), 0);
+    let mut failed = Vec::new();
+    let mut done = 0;
     loop {
         if !go_on(done, source.total()) {
             return Ok(None);
@@ -157,8 +158,8 @@ pub fn run(
         done += jobs.len() as u64;
         for result in all(jobs, options) {
             match result {
-                Ok(pictures) => {
-                    for (loaded, measured) in pictures {
+                Ok(images) => {
+                    for (loaded, measured) in images {
                         add(&mut sums, &loaded, measured, options)?;
                     }
                 }
@@ -180,12 +181,13 @@ pub fn run(
     Ok(Some(Evaluation { rows: rows.collect(), failed, left_out: source.left_out() }))
 }
 
-/// Does the jobs side by side; results are in their order.
+/// Runs the jobs in parallel; results are in the order of the jobs.
 fn all(jobs: Vec<Job>, options: &Options) -> Vec<Done> {
     let work = |job: Job| -> Done {
         let measure = |loaded: Loaded| {
             let of = |(k, p): &(usize, Metres)| {
-                let (p, t) = (Depth::Metres(&p.pixels), Depth::Metres(&loaded.truth.pixels));
+                let p = Depth::Metres(&p.pixels);
+                let t = Depth::Metres(&loaded.truth.pixels);
                 let m = Measured::of(&p, &t, options.range, options.bins);
                 m.map(|m| (*k, m)).map_err(|e| anyhow::Error::new(e).context(loaded.name.clone()))
             };
@@ -211,7 +213,7 @@ fn all(jobs: Vec<Job>, options: &Options) -> Vec<Done> {
     });
     let taken = results.into_iter().map(|r| r.into_inner().ok().flatten());
     taken
-        .map(|r| r.unwrap_or_else(|| Err(anyhow::anyhow!("a thread that compares pictures panicked"))))
+        .map(|r| r.unwrap_or_else(|| Err(anyhow::anyhow!("a thread that compares images panicked"))))
         .collect()
 }
 
@@ -227,14 +229,14 @@ fn add(
             all: Measured::nothing(options.bins.0, options.bins.1),
             worst: Vec::new(),
         });
-        let of_picture = sum.set.push(&m);
+        let of_image = sum.set.push(&m);
         sum.all.plus(&m);
-        let bad = of_picture.strict_l1_m;
+        let bad = of_image.strict_l1_m;
         let place = sum.worst.partition_point(|w| w.strict_l1_m >= bad);
         if bad.is_finite() && place < SHOWN {
             let prediction = loaded.predictions.iter().find(|(p, _)| *p == k);
             let html = match prediction {
-                Some((_, p)) => page::pictures(loaded, p)?,
+                Some((_, p)) => page::images(loaded, p)?,
                 None => Vec::new(),
             };
             sum.worst.insert(place, Worst { name: loaded.name.clone(), strict_l1_m: bad, html });

@@ -1,4 +1,4 @@
-//! Exit codes, how an error is told, and how the process ends.
+//! Exit codes, the printing of errors, and the end of the process.
 #![allow(unsafe_code)] // `_exit`, which the standard library does not have
 
 use crate::printable;
@@ -12,7 +12,7 @@ pub enum Exit {
     /// It did not work: 1. A dataset, recording or calibration that is missing, unreadable, empty,
     /// damaged or not one fails.
     Failed,
-    /// Wrong usage or configuration: 2. Inputs that are readable and do not fit what was asked for are wrong usage.
+    /// Wrong usage or configuration: 2. Readable inputs that do not fit the request are wrong usage.
     Usage,
     /// It worked, but something was lost on the way: 3.
     Lost,
@@ -30,18 +30,18 @@ impl Exit {
     }
 }
 
-/// Ends the process with the code of `exit`, everything that was written to the standard output being out.
+/// Flushes stdout and ends the process with the code of `exit`.
 ///
-/// Without the handlers that libraries have put to its end: a refiner that hangs is left behind in its thread, and ONNX
-/// Runtime under it must not be taken apart while it runs.
+/// Skips the exit handlers of libraries: a hung refiner is left behind in its thread, and ONNX Runtime under it must
+/// not be destroyed while it runs.
 pub fn leave(exit: Exit) -> ! {
-    // A closed pipe has nobody to be told.
+    // A closed pipe has no reader.
     let _ = std::io::Write::flush(&mut std::io::stdout());
     // SAFETY: `_exit` takes any number and does not return; what must not be left undone was dropped before.
     unsafe { libc::_exit(exit.code().into()) }
 }
 
-/// An error of the person at the keyboard: exit code 2.
+/// A usage error: exit code 2.
 #[derive(Debug)]
 pub struct UsageError(pub String);
 
@@ -53,18 +53,18 @@ impl fmt::Display for UsageError {
 
 impl std::error::Error for UsageError {}
 
-/// Tells `error` on the standard error output, and says which code it is.
+/// Prints `error` to stderr, and returns its exit code.
 pub fn report(error: &anyhow::Error) -> Exit {
     if is_broken_pipe(error) {
         return Exit::Good; // `depthrig tap … | head` has seen enough
     }
     let mut out = std::io::stderr().lock();
-    // When even the standard error output is gone, the exit code has to do.
+    // If stderr is closed too, only the exit code remains.
     let _ = std::io::Write::write_all(&mut out, printable::lines(&text(error)).as_bytes());
     of(error)
 }
 
-/// The code of `error`: 2 when the person has to change the command or a file, else 1.
+/// Exit code of `error`: 2 if the user has to change the command or a file, else 1.
 fn of(error: &anyhow::Error) -> Exit {
     let usage = error.chain().any(|cause| {
         cause.is::<UsageError>()
@@ -80,17 +80,17 @@ fn of(error: &anyhow::Error) -> Exit {
 
 /// The error in one line, then each cause that adds something.
 fn text(error: &anyhow::Error) -> String {
-    let mut told = format!("depthrig: error: {error}");
+    let mut message = format!("depthrig: error: {error}");
     for cause in error.chain().skip(1).map(ToString::to_string) {
         // Errors of TOML end with a line break, which a message that quotes them leaves out.
         let cause = cause.trim_end();
-        if !told.contains(cause) {
-            told.push_str("\n  cause: ");
-            told.push_str(cause);
+        if !message.contains(cause) {
+            message.push_str("\n  cause: ");
+            message.push_str(cause);
         }
     }
-    told.push('\n');
-    told
+    message.push('\n');
+    message
 }
 
 fn is_broken_pipe(error: &anyhow::Error) -> bool {
@@ -113,11 +113,11 @@ mod tests {
     }
 
     #[test]
-    fn a_cause_that_ends_with_a_line_break_is_told_once() {
+    fn a_cause_that_ends_with_a_line_break_is_printed_once() {
         let inner = std::io::Error::other("TOML parse error at line 2\n  expected a value\n");
         let outer = "camera.toml: TOML parse error at line 2\n  expected a value";
-        let told = text(&anyhow::Error::new(inner).context(outer));
-        assert_eq!(told, format!("depthrig: error: {outer}\n"));
+        let message = text(&anyhow::Error::new(inner).context(outer));
+        assert_eq!(message, format!("depthrig: error: {outer}\n"));
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Letters of 3x5 pixels, enough for labels in a picture: no font need be there.
+//! Letters of 3x5 pixels, enough for labels in an image: no font need be there.
 
 use image::{Rgb, RgbImage};
 
@@ -63,7 +63,8 @@ pub fn text(image: &mut RgbImage, (x, y): (u32, u32), size: u32, color: Rgb<u8>,
     for (n, c) in text.chars().enumerate() {
         let bits = glyph(c.to_ascii_uppercase());
         for at in (0..15u32).filter(|at| bits >> (14 - at) & 1 == 1) {
-            let (left, top) = (x + (n as u32 * ADVANCE + at % 3) * size, y + at / 3 * size);
+            let left = x + (n as u32 * ADVANCE + at % 3) * size;
+            let top = y + at / 3 * size;
             for py in top..(top + size).min(image.height()) {
                 for px in left..(left + size).min(image.width()) {
                     image.put_pixel(px, py, color);

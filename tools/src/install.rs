@@ -1,7 +1,7 @@
 //! The files that depthrig puts into a system: the udev rules, the limit of USB transfers, the service.
 //!
-//! Each begins with a line that holds a checksum of the rest. So a file that somebody changed is told from one that an
-//! earlier version wrote: the second is replaced, the first only when that is asked for.
+//! Each begins with a line that holds a checksum of the rest. It distinguishes a file changed by hand from one that an
+//! earlier version wrote: the second is replaced, the first only with `--overwrite`.
 
 use anyhow::{Context, Result};
 use std::io;
@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 const MARK: &str = "# Written by `depthrig install`, checksum ";
 
-/// What the service is to run.
+/// Settings of the service.
 #[derive(Debug, Clone)]
 pub struct Service {
     /// The user it runs as.
@@ -27,7 +27,7 @@ pub struct Service {
 pub struct SystemFile {
     /// Where it goes, absolute.
     pub path: PathBuf,
-    /// What it is for, in a few words.
+    /// Its purpose, in a few words.
     pub what: &'static str,
     /// All of it, the first line included.
     pub text: String,
@@ -42,18 +42,18 @@ pub enum State {
     Current,
     /// There, as depthrig wrote it once.
     Older,
-    /// There, and somebody else wrote or changed it.
+    /// There, but changed by hand.
     Changed,
 }
 
-/// What became of a file.
+/// Outcome for a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Done {
     /// It is new, or replaced.
     Written,
     /// It was as it should be already.
     Unchanged,
-    /// It is somebody's, so it was left alone.
+    /// Changed by hand, so it was kept.
     Refused,
     /// It is gone.
     Removed,
@@ -119,7 +119,7 @@ impl SystemFile {
     /// How it stands below `root`.
     ///
     /// # Errors
-    /// When what is there cannot be read.
+    /// When the existing file cannot be read.
     pub fn state(&self, root: &Path) -> Result<State> {
         let path = self.below(root);
         match depthrig_bus::files::read(&path, depthrig_bus::files::TEXT_MAX_BYTES) {
@@ -131,10 +131,10 @@ impl SystemFile {
         }
     }
 
-    /// Puts it in place; what somebody wrote or changed only with `overwrite`.
+    /// Installs the file; replaces one changed by hand only with `overwrite`.
     ///
     /// # Errors
-    /// When it cannot be written; what was there is then as it was.
+    /// When it cannot be written; an existing file is then unchanged.
     pub fn install(&self, root: &Path, overwrite: bool) -> Result<Done> {
         let state = self.state(root)?;
         match state {
@@ -146,14 +146,14 @@ impl SystemFile {
         let write = || -> io::Result<()> {
             let folder = path.parent().unwrap_or(root);
             std::fs::create_dir_all(folder)?;
-            // Beside it and then moved, so that nobody ever reads half a rule.
+            // Written beside it and then renamed, so that no one reads a partial file.
             let mut beside = tempfile::Builder::new().prefix(".depthrig").tempfile_in(folder)?;
             io::Write::write_all(&mut beside, self.text.as_bytes())?;
             let mode = std::os::unix::fs::PermissionsExt::from_mode(0o644);
             beside.as_file().set_permissions(mode)?;
             beside.as_file().sync_all()?;
             if state == State::Missing {
-                // What came into being since is somebody's.
+                // A file created since the check is not ours.
                 beside.persist_noclobber(&path)?;
             } else {
                 beside.persist(&path)?;
@@ -164,7 +164,7 @@ impl SystemFile {
         Ok(Done::Written)
     }
 
-    /// Takes it away; what somebody wrote or changed only with `overwrite`.
+    /// Removes the file; one changed by hand only with `overwrite`.
     ///
     /// # Errors
     /// When it cannot be removed.

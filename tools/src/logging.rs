@@ -10,7 +10,7 @@ use tracing_subscriber::field::MakeExt;
 use tracing_subscriber::fmt;
 use tracing_subscriber::fmt::format::{Writer, debug_fn};
 
-/// Starts logging as `global` asks, by `loudness` steps louder than usual.
+/// Starts logging with the options of `global`, at `loudness` levels above the default.
 pub fn start(global: &Global, loudness: i32) {
     let level = level(i32::from(global.verbose) - i32::from(global.quiet) + loudness);
     let no_color = std::env::var_os("NO_COLOR").is_some_and(|v| !v.is_empty());
@@ -22,8 +22,8 @@ pub fn start(global: &Global, loudness: i32) {
     }
 }
 
-/// Writes the fields of an event so that texts of others (the API, datasets, file names) neither look like events of their
-/// own nor reach the terminal as commands.
+/// Writes the fields of an event so that untrusted texts (the API, datasets, file names) neither look like events nor
+/// reach the terminal as control sequences.
 fn field(writer: &mut Writer<'_>, field: &Field, value: &dyn Debug) -> core::fmt::Result {
     let value = escaped(&format!("{value:?}"));
     match field.name() {
@@ -59,7 +59,7 @@ mod tests {
     use super::*;
     use std::io::Write;
 
-    /// What an event looks like that quotes a text of somebody else, with colours and without.
+    /// Formats an event that quotes untrusted text, with colours and without.
     fn logged(quoted: &str, color: bool) -> String {
         use std::sync::{Arc, Mutex};
         #[derive(Clone, Default)]

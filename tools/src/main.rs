@@ -1,6 +1,6 @@
-//! The command line of depthrig: one binary that runs the rig, looks at it, and looks after its datasets.
+//! The command line of depthrig: one binary that runs the rig, shows its state, and manages its datasets.
 //!
-//! Exit codes: 0 good, 1 failed, 2 wrong usage or configuration, 3 finished but something was lost.
+//! Exit codes: 0 success, 1 failure, 2 wrong usage or configuration, 3 finished but something was lost.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
 
 mod args;
@@ -12,11 +12,11 @@ mod demo;
 mod eval;
 mod exit;
 mod font;
+mod image_file;
 mod install;
 mod logging;
 mod out;
 mod outfile;
-mod picture;
 mod printable;
 mod progress;
 mod screen;

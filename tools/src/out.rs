@@ -1,4 +1,4 @@
-//! What is written to the standard output: lines, JSON, tables, and numbers as people read them.
+//! Output on stdout: lines, JSON, tables, and human-readable numbers.
 
 use crate::printable;
 use anyhow::Result;
@@ -6,7 +6,7 @@ use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use serde::Serialize;
 use std::io::Write;
 
-/// Writes `text`, which may have several lines, and a newline; what would steer the terminal is shown and not sent.
+/// Writes `text`, which may have several lines, and a newline; control sequences are escaped.
 ///
 /// # Errors
 /// When the output is closed; a closed pipe ends a command quietly (see [`crate::exit`]).
@@ -14,7 +14,7 @@ pub fn line(text: impl core::fmt::Display) -> Result<()> {
     raw(&printable::lines(&text.to_string()))
 }
 
-/// The same of a text with depthrig's own colours.
+/// Like [`line`], for text with depthrig's own colours.
 ///
 /// # Errors
 /// As [`line`].
@@ -22,7 +22,7 @@ pub fn styled(text: impl core::fmt::Display) -> Result<()> {
     raw(&printable::styled(&text.to_string()))
 }
 
-/// Writes `text` and a newline to the standard error output, as [`line`]; where that is closed, nobody reads it.
+/// Writes `text` and a newline to the standard error output, as [`line`]; a closed stream is ignored.
 pub fn note(text: impl core::fmt::Display) {
     let text = printable::lines(&text.to_string());
     let _ = writeln!(std::io::stderr().lock(), "{text}");
@@ -119,8 +119,8 @@ pub fn seconds(s: f64) -> String {
 
 /// Reasons and counts: `device_gap 3, no_slot 1`; `0` when nothing was lost.
 pub fn reasons(counts: &std::collections::BTreeMap<String, u64>) -> String {
-    let told: Vec<_> = counts.iter().filter(|(_, n)| **n > 0).map(|(why, n)| format!("{why} {n}")).collect();
-    if told.is_empty() { "0".to_owned() } else { told.join(", ") }
+    let parts: Vec<_> = counts.iter().filter(|(_, n)| **n > 0).map(|(why, n)| format!("{why} {n}")).collect();
+    if parts.is_empty() { "0".to_owned() } else { parts.join(", ") }
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
-//! Files that commands write: nothing that exists is lost by writing one.
+//! Output files of commands, written without losing existing files.
 //!
-//! What exists is replaced with `--overwrite` alone, and an input never, by whatever name or link it is reached. Bytes go to
-//! a new file beside it first, which gets the name when it is complete.
+//! An existing file is replaced only with `--overwrite`, and an input never, whatever name or link leads to it. Bytes
+//! go to a new file beside it first, which gets the name when it is complete.
 
 use crate::exit::UsageError;
 use anyhow::{Context as _, Result};
@@ -15,12 +15,12 @@ use std::path::{Path, PathBuf};
 /// The option of every command that writes files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::Args)]
 pub struct Overwrite {
-    /// Replace files that exist; inputs never are
+    /// Replace existing files, but never an input
     #[arg(long)]
     pub overwrite: bool,
 }
 
-/// A file that is to be written, after it was checked that this destroys nothing.
+/// An output file that was checked to destroy nothing.
 #[derive(Debug)]
 pub struct OutFile {
     path: PathBuf,
@@ -31,12 +31,12 @@ impl OutFile {
     /// Checks that `path` can be written without loss. Commands call this before they begin their work.
     ///
     /// # Errors
-    /// A usage error when `path` is one of `inputs`, exists and may not be replaced, or is no regular file.
+    /// A usage error when `path` is one of `inputs`, exists and may not be replaced, or is not a regular file.
     pub fn new(path: &Path, overwrite: Overwrite, inputs: &[&Path]) -> Result<Self> {
         let refused = |what: String| Err(UsageError(format!("{}: {what}", path.display())).into());
         let out = Self { path: path.to_owned(), overwrite: overwrite.overwrite };
         if path.file_name().is_none() {
-            return refused("invalid name of a file".into());
+            return refused("invalid file name".into());
         }
         if path.symlink_metadata().is_err() {
             return Ok(out);
@@ -46,7 +46,7 @@ impl OutFile {
         }
         match path.metadata() {
             Ok(meta) if meta.is_dir() => refused("is a folder; name a file".into()),
-            Ok(meta) if !meta.is_file() => refused("is no regular file; name another".into()),
+            Ok(meta) if !meta.is_file() => refused("is not a regular file; name another".into()),
             _ if !out.overwrite => refused(EXISTS.into()),
             _ => Ok(out),
         }
@@ -57,7 +57,7 @@ impl OutFile {
         &self.path
     }
 
-    /// Refuses another file that would be the same one.
+    /// Checks that `other` is a different file.
     ///
     /// # Errors
     /// A usage error that names both.
@@ -82,7 +82,7 @@ impl OutFile {
         let mut part = Part::beside(&self.path).with_context(unwritable)?;
         part.file.write_all(bytes).with_context(unwritable)?;
         if self.overwrite {
-            // The name changes hands, not the file behind it: what a link points to stays as it is.
+            // Replaces the name, not the file behind it: the target of a link is unchanged.
             return std::fs::rename(&part.path, &self.path).with_context(unwritable);
         }
         match publish(&part.path, &self.path) {
@@ -123,7 +123,7 @@ impl Part {
         let mut taken = io::ErrorKind::AlreadyExists.into();
         for n in 0..100 {
             let part = path.with_file_name(format!(".{name}.{}-{n}.part", std::process::id()));
-            // `create_new` neither follows a link nor opens what somebody else has put there.
+            // `create_new` neither follows a link nor opens an existing file.
             match OpenOptions::new().write(true).create_new(true).open(&part) {
                 Ok(file) => return Ok(Self { path: part, file }),
                 Err(e) if e.kind() == io::ErrorKind::AlreadyExists => taken = e,
@@ -201,7 +201,7 @@ mod tests {
         OutFile::new(&path, REPLACE, &[]).unwrap().write(b"new").unwrap();
         assert_eq!(std::fs::read(&target).unwrap(), b"precious");
         assert_eq!(std::fs::read(&path).unwrap(), b"new");
-        // One that points nowhere is somebody's as well.
+        // A dangling link counts as existing too.
         let loose = dir.path().join("loose");
         symlink(dir.path().join("nowhere"), &loose).unwrap();
         assert!(refused(&loose, KEEP, &[]).contains("exists"));
@@ -211,8 +211,8 @@ mod tests {
     fn folders_and_devices_are_refused() {
         let dir = tempfile::tempdir().unwrap();
         assert!(refused(dir.path(), REPLACE, &[]).contains("is a folder"));
-        assert!(refused(Path::new("/dev/null"), REPLACE, &[]).contains("no regular file"));
-        assert!(refused(Path::new("/"), REPLACE, &[]).contains("invalid name"));
+        assert!(refused(Path::new("/dev/null"), REPLACE, &[]).contains("not a regular file"));
+        assert!(refused(Path::new("/"), REPLACE, &[]).contains("invalid file name"));
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Text of others, made printable: what stands in a dataset, comes from a daemon or is a file's name may hold escape
+//! Makes untrusted text printable: text from a dataset, a daemon or a file name may hold escape
 //! sequences that move the cursor, change the terminal's title or hide what follows.
 //!
 //! Everything that is printed for people passes here: [`crate::out`] on the standard output, [`crate::exit`] and

@@ -1,4 +1,4 @@
-//! How long work shows that it goes on: a bar on a terminal, plain lines otherwise, both on stderr.
+//! Progress of long work: a bar on a terminal, plain lines otherwise, both on stderr.
 
 use core::time::Duration;
 use depthrig_bus::HostTime;
@@ -14,14 +14,14 @@ pub struct Progress {
     bar: Option<ProgressBar>,
     what: String,
     /// When the last plain line was written.
-    told: Option<HostTime>,
+    printed_at: Option<HostTime>,
     quiet: bool,
 }
 
 impl Progress {
     /// Nothing shown yet. `quiet` keeps it so.
     pub fn new(quiet: bool) -> Self {
-        Self { bar: None, what: String::new(), told: None, quiet }
+        Self { bar: None, what: String::new(), printed_at: None, quiet }
     }
 
     /// Shows that `done` of `total` parts of `what` are done; another `what` begins another bar.
@@ -32,7 +32,7 @@ impl Progress {
         if self.what != what {
             self.clear();
             what.clone_into(&mut self.what);
-            self.told = None;
+            self.printed_at = None;
             self.bar = std::io::stderr().is_terminal().then(|| bar(total));
         }
         match &self.bar {
@@ -41,16 +41,16 @@ impl Progress {
                 bar.set_position(done);
                 bar.set_message(what.to_owned());
             }
-            None => self.tell(done, total),
+            None => self.print_line(done, total),
         }
     }
 
     /// A plain line at the start, every few seconds, and at the end.
-    fn tell(&mut self, done: u64, total: u64) {
-        if done == total || self.told.is_none_or(|told| told.elapsed() >= PLAIN_INTERVAL) {
+    fn print_line(&mut self, done: u64, total: u64) {
+        if done == total || self.printed_at.is_none_or(|at| at.elapsed() >= PLAIN_INTERVAL) {
             let percent = (done * 100).checked_div(total).unwrap_or(100);
             eprintln!("{}: {percent} %", self.what);
-            self.told = Some(HostTime::now());
+            self.printed_at = Some(HostTime::now());
         }
     }
 

@@ -24,7 +24,7 @@ impl Screen {
     /// Takes the terminal.
     ///
     /// # Errors
-    /// When the output is no terminal.
+    /// When the output is not a terminal.
     pub fn enter() -> Result<Self> {
         let out = std::io::stdout();
         if !out.is_terminal() {

@@ -7,7 +7,7 @@ use crossbeam::channel::{Receiver, RecvTimeoutError, Sender, bounded};
 use std::sync::Arc;
 use tokio::signal::unix::{SignalKind, signal};
 
-/// Exit code of a process that was told to end at once: 128 + SIGINT, as shells have it.
+/// Exit code after the second signal: 128 + SIGINT, as in shells.
 const AT_ONCE: i32 = 130;
 
 /// A request to end, from a signal or from within.

@@ -1,4 +1,4 @@
-//! Depth as colour: the turbo map, near is red and far is blue, no depth is black.
+//! Depth as colour: the turbo map, near is red, far is blue, missing depth is black.
 //!
 //! Polynomial approximation by A. Mikhailov, "Turbo, An Improved Rainbow Colormap for Visualization" (Google AI
 //! blog, 2019; Apache-2.0): fifth degree in `x` per channel, within 20 levels of the published table, within 33
@@ -17,7 +17,7 @@ pub fn turbo(x: f32) -> [u8; 3] {
     })
 }
 
-/// The colour of a depth of `metres` between `near` and `far`; black where there is none.
+/// The colour of a depth of `metres` between `near` and `far`; black where depth is missing.
 pub fn depth_color(metres: f32, near: f32, far: f32) -> [u8; 3] {
     if !metres.is_finite() || metres <= 0.0 {
         return [0; 3];

@@ -10,7 +10,7 @@ use depthrig_daemon::status::{
 };
 use std::collections::BTreeMap;
 
-/// How to draw.
+/// Style of the output.
 #[derive(Debug, Clone, Copy)]
 pub struct Style {
     /// Columns of the terminal; narrow ones get fewer columns of numbers.
@@ -40,7 +40,7 @@ fn preparing(p: &PreparingStatus, style: Style) -> String {
     format!("{}  {state}", style.paint(BOLD, "preparing"))
 }
 
-/// The whole status, without a newline at the end.
+/// Formats the complete status, without a newline at the end.
 pub fn status(rig: &RigStatus, style: Style) -> String {
     let mut lines = vec![
         format!(
@@ -82,7 +82,7 @@ pub fn status(rig: &RigStatus, style: Style) -> String {
     lines.join("\n")
 }
 
-/// Where a replay is, in one line.
+/// Describes the state of a replay on one line.
 pub fn replay(r: &ReplayStatus) -> String {
     let state = match (r.done, r.paused) {
         (true, _) => "at its end",
@@ -140,7 +140,7 @@ fn streams(rig: &RigStatus, style: Style) -> Vec<String> {
     let (header, cells): (&[&str], Row) = if style.is_wide() {
         (
             &[
-                "stream", "state", "picture", "format", "Hz", "frames", "lost", "p50 ms", "p99 ms", "clock",
+                "stream", "state", "image", "format", "Hz", "frames", "lost", "p50 ms", "p99 ms", "clock",
                 "metadata", "ppm", "±us",
             ],
             |c, s| {
@@ -154,7 +154,7 @@ fn streams(rig: &RigStatus, style: Style) -> Vec<String> {
             },
         )
     } else {
-        (&["stream", "state", "picture", "Hz", "lost", "p99 ms", "ppm", "±us"], narrow)
+        (&["stream", "state", "image", "Hz", "lost", "p99 ms", "ppm", "±us"], narrow)
     };
     let cameras: Vec<_> = rows.clone().map(|(c, _)| c).collect();
     let table = out::table(header, if style.is_wide() { 4 } else { 3 }, rows.map(|(c, s)| cells(c, s)));
@@ -169,22 +169,22 @@ fn streams(rig: &RigStatus, style: Style) -> Vec<String> {
     table.lines().enumerate().map(paint).collect()
 }
 
-/// The streams whose times do not come from the device's own account of each frame.
+/// Lists streams whose times do not come from the device's metadata.
 fn poor_metadata(rig: &RigStatus) -> Option<String> {
     let is_poor = |s: &&StreamStatus| !matches!(s.clock.metadata.as_str(), "" | "full" | "simulated");
-    // Pictures from files have no device that could say more.
+    // Images from files have no device that could say more.
     let cameras = rig.cameras.iter().filter(|c| c.backend != "files");
     let poor = cameras.flat_map(|c| c.streams.iter()).filter(is_poor);
     let mut by_level = BTreeMap::<&str, Vec<&str>>::new();
     for s in poor {
         by_level.entry(s.clock.metadata.as_str()).or_default().push(&s.id);
     }
-    let told: Vec<_> =
+    let facts: Vec<_> =
         by_level.into_iter().map(|(level, ids)| format!("{level} only: {}", ids.join(", "))).collect();
-    (!told.is_empty()).then(|| format!("metadata  {}", told.join("; ")))
+    (!facts.is_empty()).then(|| format!("metadata  {}", facts.join("; ")))
 }
 
-/// How a camera's depth is refined, in one line.
+/// Describes a camera's depth refinement on one line.
 fn refined(camera: &CameraStatus, style: Style) -> Option<String> {
     let r = camera.refine.as_ref()?;
     let color = match r.state {
@@ -193,34 +193,34 @@ fn refined(camera: &CameraStatus, style: Style) -> Option<String> {
         _ => Some(YELLOW),
     };
     let state = color.map_or_else(|| r.state.name().to_owned(), |color| style.paint(color, r.state.name()));
-    let mut told = format!("refined   {}: {state}", camera.name);
+    let mut line = format!("refined   {}: {state}", camera.name);
     if !r.engine.is_empty() {
-        let _ = write!(told, ", {}", r.engine);
+        let _ = write!(line, ", {}", r.engine);
     }
     if !r.model.is_empty() {
-        let _ = write!(told, " with {}", r.model);
+        let _ = write!(line, " with {}", r.model);
     }
     if r.state == RefineState::Running {
-        let _ = write!(told, ", {:.1} of {:.1} Hz", r.rate_hz, r.nominal_hz);
+        let _ = write!(line, ", {:.1} of {:.1} Hz", r.rate_hz, r.nominal_hz);
         let camera_hz = camera.streams.iter().filter(|s| !s.derived && s.samples_hz.is_none());
         let camera_hz = camera_hz.map(|s| s.nominal_hz).fold(f64::INFINITY, f64::min);
         if camera_hz.is_finite() && r.nominal_hz < camera_hz {
-            let _ = write!(told, " (limited by rate_hz of [camera.refine]; camera {camera_hz:.1} Hz)");
+            let _ = write!(line, " (limited by rate_hz of [camera.refine]; camera {camera_hz:.1} Hz)");
         }
         let step = |name: &str| r.steps_p50_ms.get(name).copied().unwrap_or(0.0);
         let steps = ["wait", "register", "prepare", "infer", "finish"].map(|s| format!("{s} {:.1}", step(s)));
-        let _ = write!(told, ", {:.1} ms ({})", step("total"), steps.join(", "));
+        let _ = write!(line, ", {:.1} ms ({})", step("total"), steps.join(", "));
     }
     if !r.skipped.is_empty() {
-        let _ = write!(told, ", skipped {}", out::reasons(&r.skipped));
+        let _ = write!(line, ", skipped {}", out::reasons(&r.skipped));
     }
     if let Some(why) = &r.message {
-        let _ = write!(told, ": {why}");
+        let _ = write!(line, ": {why}");
     }
-    Some(told)
+    Some(line)
 }
 
-/// Frames that a stream lost. Of a stream that the rig makes, a frame that a newer one superseded is none: that is how it
+/// Frames that a stream lost. Superseded frames of a stream that the rig computes do not count: skipping them is how it
 /// keeps up.
 fn lost(stream: &StreamStatus) -> u64 {
     let superseded = DropReason::QueueFull.name();
@@ -235,7 +235,7 @@ fn narrow(camera: &CameraStatus, stream: &StreamStatus) -> Vec<String> {
             Some(refine) if stream.derived => refine.state.name().to_owned(),
             _ => camera.state.name().to_owned(),
         },
-        // A motion unit has no picture; its rate is that of its samples, its frames are batches.
+        // An IMU has no image; its rate is that of its samples, its frames are batches.
         stream
             .samples_hz
             .map_or_else(|| format!("{}x{}", stream.width, stream.height), |_| "motion".to_owned()),
@@ -247,27 +247,27 @@ fn narrow(camera: &CameraStatus, stream: &StreamStatus) -> Vec<String> {
     ]
 }
 
-/// Why a camera is not streaming, or what its streams have lost.
+/// Describes why a camera is not streaming, or the losses of its streams.
 fn trouble(camera: &CameraStatus, style: Style) -> Option<String> {
-    let mut told = Vec::new();
+    let mut notes = Vec::new();
     if camera.state != CameraState::Streaming {
         let why = camera.message.as_deref().map_or_else(String::new, |why| format!(": {why}"));
         let text = format!("{} for {}{why}", camera.state.name(), out::seconds(camera.state_for_s));
-        told.push(color_of(camera.state).map_or_else(|| text.clone(), |color| style.paint(color, &text)));
+        notes.push(color_of(camera.state).map_or_else(|| text.clone(), |color| style.paint(color, &text)));
     }
-    told.extend(camera.warnings.iter().map(|w| style.paint(YELLOW, w)));
+    notes.extend(camera.warnings.iter().map(|w| style.paint(YELLOW, w)));
     for stream in camera.streams.iter().filter(|s| s.clock.metadata_lost > 0) {
-        told.push(format!("{} had {} frames without metadata", stream.id, stream.clock.metadata_lost));
+        notes.push(format!("{} had {} frames without metadata", stream.id, stream.clock.metadata_lost));
     }
     match camera.reconnects {
         0 => {}
-        1 => told.push("came back once".to_owned()),
-        n => told.push(format!("came back {n} times")),
+        1 => notes.push("came back once".to_owned()),
+        n => notes.push(format!("came back {n} times")),
     }
     for stream in camera.streams.iter().filter(|s| !s.derived && s.dropped.values().any(|n| *n > 0)) {
-        told.push(format!("{} lost {}", stream.id, out::reasons(&stream.dropped)));
+        notes.push(format!("{} lost {}", stream.id, out::reasons(&stream.dropped)));
     }
-    (!told.is_empty()).then(|| format!("{}: {}", camera.name, told.join("; ")))
+    (!notes.is_empty()).then(|| format!("{}: {}", camera.name, notes.join("; ")))
 }
 
 const fn color_of(state: CameraState) -> Option<&'static str> {

@@ -1,4 +1,4 @@
-//! Work on datasets that is told of while it runs and that a signal ends, and what is told when it has.
+//! Work on datasets with a progress bar that a signal can interrupt, and the report at its end.
 
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
@@ -11,16 +11,16 @@ use depthrig_recorder::ErrorKind;
 use serde::Serialize;
 use std::path::Path;
 
-/// Is told what is being done, how far it is and of how much, and says whether to go on.
-pub type Tell<'a> = &'a mut dyn FnMut(&str, u64, u64) -> ControlFlow<()>;
+/// Receives step, amount done and total, and decides whether to continue.
+pub type OnProgress<'a> = &'a mut dyn FnMut(&str, u64, u64) -> ControlFlow<()>;
 
-/// Runs work that shows how far it is and that a signal ends.
+/// Runs `work` with a progress bar until a signal interrupts it.
 ///
 /// # Errors
-/// What `work` says; bad input is an error of usage.
+/// Those of `work`; bad input is a usage error.
 pub fn watched<T>(
     context: &Context,
-    work: impl FnOnce(Tell<'_>) -> depthrig_recorder::Result<T>,
+    work: impl FnOnce(OnProgress<'_>) -> depthrig_recorder::Result<T>,
 ) -> Result<T> {
     let stop = Stop::on_signals()?;
     let mut bar = Progress::new(context.global.quiet > 0);
@@ -35,31 +35,31 @@ pub fn watched<T>(
     })
 }
 
-/// What is left of a run that made a dataset out of another, and that goes on where it was ended.
-pub struct Remade<'a> {
+/// Result of a resumable run that derives a dataset from another.
+pub struct DerivedDataset<'a> {
     /// The new dataset.
     pub path: &'a Path,
-    /// Its sets.
+    /// Number of sets.
     pub sets: u64,
-    /// Its bytes.
+    /// Size in bytes.
     pub bytes: u64,
-    /// It was ended before all was done.
+    /// Whether the run was interrupted.
     pub ended: bool,
-    /// What could not be read.
+    /// Number of unreadable parts of the input.
     pub lost: u64,
-    /// The first of it, in words.
+    /// Descriptions of the first of them.
     pub problems: &'a [String],
-    /// Something else that was asked for is not there.
+    /// Whether anything else that was requested is missing.
     pub lacks: bool,
 }
 
-impl Remade<'_> {
-    /// Prints `report` as JSON if that is asked for, else a line and what `more` prints; what was lost goes to the standard
-    /// error output either way. Which exit code it is.
+impl DerivedDataset<'_> {
+    /// Prints the report as JSON if given, else a line and the output of `more`; losses go to stderr either way.
+    /// Returns the exit code.
     ///
     /// # Errors
     /// When the standard output cannot be written.
-    pub fn told(
+    pub fn print(
         &self,
         context: &Context,
         json: Option<&impl Serialize>,
@@ -69,9 +69,10 @@ impl Remade<'_> {
         if let Some(report) = json {
             out::json(report)?;
         } else if context.global.quiet == 0 && self.ended {
-            out::line(format_args!("{path}: ended; run it again to go on"))?;
+            out::line(format_args!("{path}: interrupted; run it again to resume"))?;
         } else if context.global.quiet == 0 {
-            let (sets, bytes) = (out::count(self.sets, "set"), out::bytes(self.bytes));
+            let sets = out::count(self.sets, "set");
+            let bytes = out::bytes(self.bytes);
             out::line(format_args!("{path}: {sets}, {bytes}"))?;
             more()?;
         }

@@ -23,7 +23,7 @@ fn the_bus_bench_measures_and_counts_one_copy() {
     assert_eq!(report["conditions"]["build"], if cfg!(debug_assertions) { "debug" } else { "release" });
 }
 
-/// The short form of the ten-minute recording in docs/performance.md: five minutes of small pictures.
+/// The short form of the ten-minute recording in docs/performance.md: five minutes of small images.
 #[test]
 fn memory_stays_where_it_is_in_a_long_recording() {
     let dir = tempfile::tempdir().unwrap();

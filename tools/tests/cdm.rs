@@ -1,4 +1,4 @@
-//! Camera depth models as a person meets them: install, list, refine a pair of pictures, remove; and what goes wrong.
+//! Camera depth models as a person meets them: install, list, refine a pair of images, remove; and what goes wrong.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[allow(dead_code)] // the tests of the library use all of it
@@ -29,8 +29,9 @@ fn npy(path: &Path) -> (String, Vec<f32>) {
 }
 
 #[test]
-fn a_pair_of_pictures_gives_the_official_numbers() {
-    let (home, weights) = (Home::new(), seeded_weights(Encoder::Vits));
+fn a_pair_of_images_gives_the_official_numbers() {
+    let home = Home::new();
+    let weights = seeded_weights(Encoder::Vits);
     for (rgb, depth, unit, size, shape, numbers, limit) in [
         (
             "cdm_d405/color_26.png",
@@ -96,10 +97,10 @@ fn a_model_is_made_installed_listed_and_removed() {
     let with = |args: &[&str]| home.run(&[&["cdm"], args, &["--models", &models]].concat());
     assert!(with(&["list"]).good().contains("no model is installed"));
     let ran = with(&["import", &file, "--name", "demo", "--camera", "D405", "--input-size", "252", "--json"]);
-    let told = json(&ran.good());
-    assert_eq!((&told["encoder"], &told["trained"]), (&"vits".into(), &false.into()));
-    assert_eq!((&told["source"]["kind"], &told["input_size"]), (&"file".into(), &252.into()));
-    assert!(told["id"].as_str().unwrap().starts_with("untrained-demo@"), "{told}");
+    let report = json(&ran.good());
+    assert_eq!((&report["encoder"], &report["trained"]), (&"vits".into(), &false.into()));
+    assert_eq!((&report["source"]["kind"], &report["input_size"]), (&"file".into(), &252.into()));
+    assert!(report["id"].as_str().unwrap().starts_with("untrained-demo@"), "{report}");
     // Without a name it is that of the file.
     with(&["import", &file]).good();
     let listed = json(&with(&["list", "--json"]).good());
@@ -135,9 +136,9 @@ fn a_bad_checkpoint_is_refused_with_all_that_is_wrong() {
     let ran = with(&[&file("plain.pth")]);
     assert!(ran.code == 1 && ran.err.contains("the weights of another network"), "{}", ran.err);
     let ran = with(&[&file("legacy.pth"), "--json"]);
-    let told = json(&ran.out);
-    assert_eq!((ran.code, &told["installed"]), (1, &false.into()));
-    assert!(told["error"].as_str().unwrap().contains("torch.save(torch.load"), "{told}");
+    let report = json(&ran.out);
+    assert_eq!((ran.code, &report["installed"]), (1, &false.into()));
+    assert!(report["error"].as_str().unwrap().contains("torch.save(torch.load"), "{report}");
     // Cut short, with its sizes.
     let good = made_up(&home);
     let whole = std::fs::read(&good).unwrap();
@@ -155,18 +156,19 @@ fn a_bad_checkpoint_is_refused_with_all_that_is_wrong() {
     let nan = home.path().join("nan.safetensors");
     std::fs::write(&nan, &bad).unwrap();
     let ran = with(&[nan.to_str().unwrap(), "--json"]);
-    let told = json(&ran.out);
-    assert_eq!((ran.code, &told["report"]["not_finite"][0]["nan"]), (1, &1.into()), "{told}");
+    let report = json(&ran.out);
+    assert_eq!((ran.code, &report["report"]["not_finite"][0]["nan"]), (1, &1.into()), "{report}");
     assert!(with(&[&file("nothing.pth"), "--name", "a"]).err.contains("there is no such file"));
     assert_eq!(with(&["x.pth", "--name", "a b"]).code, 1, "the file comes first");
     assert!(!Path::new(&models).join("a").exists());
 }
 
-/// However an import is killed, a model is whole or not there.
+/// However an import is killed, a model is complete or absent.
 #[test]
 fn a_killed_import_leaves_nothing_that_counts() {
     let home = Home::new();
-    let (models, weights) = (home.path().join("models"), made_up(&home));
+    let models = home.path().join("models");
+    let weights = made_up(&home);
     let mut left_behind = 0;
     for ms in [0, 5, 20, 60, 150, 400] {
         let name = format!("killed-{ms}");
@@ -203,7 +205,7 @@ fn a_killed_import_leaves_nothing_that_counts() {
 }
 
 #[test]
-fn pictures_that_do_not_fit_are_wrong_usage() {
+fn images_that_do_not_fit_are_wrong_usage() {
     let home = Home::new();
     let [rgb, depth] = ["cdm_d405/color_26.png", "lingbot_depth/0/raw_depth.png"].map(|n| data().join(n));
     let [rgb, other] = [&rgb, &depth].map(|p| p.to_str().unwrap());
@@ -217,19 +219,22 @@ fn pictures_that_do_not_fit_are_wrong_usage() {
     let ran = run(other, &out, &["--engine", "fill"]);
     assert!(ran.code == 2 && ran.err.contains("Depth must be registered to colour first"), "{}", ran.err);
     let ran = run(rgb, &out, &["--engine", "fill"]);
-    assert!(ran.code == 2 && ran.err.contains("one channel of 16 bits"), "{}", ran.err);
+    assert!(ran.code == 2 && ran.err.contains("16-bit PNG with one channel"), "{}", ran.err);
     let ran = run(depth, &out, &["--engine", "fill", "--inverse"]);
-    assert!(ran.code == 2 && ran.err.contains("write a .npy"), "{}", ran.err);
+    assert!(ran.code == 2 && ran.err.contains("use .npy"), "{}", ran.err);
     let ran = run(depth, Path::new("out.tiff"), &["--engine", "fill"]);
-    assert!(ran.code == 2 && ran.err.contains(".npy or a .png"), "{}", ran.err);
+    assert!(ran.code == 2 && ran.err.contains("use .npy or .png"), "{}", ran.err);
     assert_eq!(run(depth, &out, &[]).code, 2, "neither model nor engine");
     let ran = run(depth, &out, &["--model", "no-such"]);
     assert!(ran.code == 1 && ran.err.contains("no model no-such is installed"), "{}", ran.err);
     assert!(!out.exists());
     // Fill needs no model, and is called what it is.
-    let told = json(&run(depth, &out, &["--engine", "fill", "--out-unit", "0.0001", "--json"]).good());
-    assert!(told["engine"].as_str().unwrap().starts_with("fill") && told["trained"].is_null(), "{told}");
-    assert!(told["refined_percent"].as_f64() > told["raw_percent"].as_f64(), "{told}");
+    let report = json(&run(depth, &out, &["--engine", "fill", "--out-unit", "0.0001", "--json"]).good());
+    assert!(
+        report["engine"].as_str().unwrap().starts_with("fill") && report["trained"].is_null(),
+        "{report}"
+    );
+    assert!(report["refined_percent"].as_f64() > report["raw_percent"].as_f64(), "{report}");
     let [raw, filled] = [Path::new(depth), &out].map(|p| image::open(p).unwrap().into_luma16());
     assert_eq!(raw.dimensions(), filled.dimensions());
     let same = raw.iter().zip(filled.iter()).filter(|(a, b)| **a > 0 && a.abs_diff(**b) < **a / 10).count();
@@ -240,7 +245,9 @@ fn pictures_that_do_not_fit_are_wrong_usage() {
 fn an_input_without_use_is_said_and_never_overwritten() {
     let home = Home::new();
     let file = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
-    let (rgb, depth, out) = (file("c.png"), file("z.png"), file("out.png"));
+    let rgb = file("c.png");
+    let depth = file("z.png");
+    let out = file("out.png");
     image::RgbImage::from_pixel(32, 24, image::Rgb([90, 120, 60])).save(&rgb).unwrap();
     image::ImageBuffer::from_pixel(32, 24, image::Luma([0u16])).save(&depth).unwrap();
     let run = |depth: &str, out: &str| {
@@ -264,7 +271,7 @@ fn an_input_without_use_is_said_and_never_overwritten() {
     let shallow = file("z8.png");
     image::GrayImage::from_pixel(32, 24, image::Luma([80])).save(&shallow).unwrap();
     let ran = run(&shallow, &out);
-    assert!(ran.code == 2 && ran.err.contains("has 8 bits a pixel"), "{}", ran.err);
+    assert!(ran.code == 2 && ran.err.contains("has 8 bits per pixel"), "{}", ran.err);
 }
 
 /// A checkpoint of random numbers whose last layer is `louder` times what it was, as damage or another training leaves it:
@@ -288,11 +295,13 @@ fn louder(home: &Home, louder: f32) -> PathBuf {
 fn weights_that_give_numbers_and_no_depth_are_a_warning_with_its_cure() {
     let home = Home::new();
     let file = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
-    let (rgb, depth, out) = (file("c.png"), file("z.png"), file("out.npy"));
+    let rgb = file("c.png");
+    let depth = file("z.png");
+    let out = file("out.npy");
     image::RgbImage::from_fn(112, 84, |x, y| image::Rgb([(x * 2) as u8, (y * 3) as u8, (x * y % 251) as u8]))
         .save(&rgb)
         .unwrap();
-    // What the network gives without damage is about 0.8 m.
+    // The undamaged network outputs about 0.8 m.
     image::ImageBuffer::from_fn(112, 84, |x, y| image::Luma([(800 + x + y) as u16])).save(&depth).unwrap();
     let run = |weights: &Path| {
         let weights = weights.to_str().unwrap();
@@ -306,13 +315,14 @@ fn weights_that_give_numbers_and_no_depth_are_a_warning_with_its_cure() {
         println!("skipped: {}", ran.err);
         return;
     }
-    let told = json(&ran.good());
-    assert_eq!(told["warnings"].as_array().map(Vec::len), Some(0), "{told}");
+    let report = json(&ran.good());
+    assert_eq!(report["warnings"].as_array().map(Vec::len), Some(0), "{report}");
     for (by, warned) in [(4.0, "differs from the result"), (6.0, "of the result is missing or beyond 20 m")] {
         let ran = run(&louder(&home, by));
-        let (code, err) = (ran.code, ran.err.clone());
-        let told = json(&ran.good());
-        let warnings = told["warnings"].to_string();
+        let code = ran.code;
+        let err = ran.err.clone();
+        let report = json(&ran.good());
+        let warnings = report["warnings"].to_string();
         println!("{by}: {warnings}");
         assert!(warnings.contains(warned), "{by}: {warnings}");
         assert!(warnings.contains("cdm info NAME --check"), "{by}: {warnings}");

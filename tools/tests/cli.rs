@@ -162,7 +162,7 @@ fn a_closed_pipe_ends_quietly() {
 #[test]
 fn the_whole_way_of_a_small_rig() {
     let home = Home::new();
-    home.pictures(6);
+    home.images(6);
     let rig = home.rig_file("small");
     let running = home.start(&["run", &rig, "-q"]);
     home.wait_for_rig("small");
@@ -181,13 +181,13 @@ fn the_whole_way_of_a_small_rig() {
         again.err
     );
 
-    let pictures = home.path().join("tapped");
-    let said = home.run(&["tap", "desk/depth", "--count", "2", "--png", pictures.to_str().unwrap()]).good();
+    let images = home.path().join("tapped");
+    let said = home.run(&["tap", "desk/depth", "--count", "2", "--png", images.to_str().unwrap()]).good();
     assert_eq!(said.lines().filter(|l| l.starts_with("desk/depth #")).count(), 2, "{said}");
-    let files: Vec<_> = std::fs::read_dir(&pictures).unwrap().map(|e| e.unwrap().path()).collect();
+    let files: Vec<_> = std::fs::read_dir(&images).unwrap().map(|e| e.unwrap().path()).collect();
     assert_eq!(files.len(), 4, "{files:?}");
     let depth = files.iter().find(|f| !f.to_str().unwrap().contains("preview")).unwrap();
-    assert!(home.is_a_source(depth), "the tapped depth is none of the pictures that the camera plays");
+    assert!(home.is_a_source(depth), "the tapped depth is none of the images that the camera plays");
     let unknown = home.run(&["tap", "desk/infrared"]);
     assert_eq!(unknown.code, 1);
     assert!(unknown.err.contains("desk/depth"), "it names the streams that there are: {}", unknown.err);
@@ -199,7 +199,7 @@ fn the_whole_way_of_a_small_rig() {
     let refused = home.run(&["record", "start", "--out", elsewhere.to_str().unwrap()]);
     assert!(refused.code != 0 && refused.err.contains("recording.allow"), "{}", refused.err);
     assert!(!elsewhere.exists());
-    // Nine years of these small pictures are 5 TB, more than a disk for temporary files has.
+    // Nine years of these small images are 5 TB, more than a disk for temporary files has.
     let first = ["record", "start", "--out", out.to_str().unwrap(), "--name", "first", "--scene", "desk"];
     let long = [&first[..], &["--for", "80000h"]].concat();
     let refused = home.run(&long);
@@ -246,7 +246,7 @@ fn check_dataset(home: &Home, dataset: &Path) {
             .unwrap();
     assert_eq!(replay["sets"].as_u64(), Some(sets));
 
-    // One byte in the middle of a picture.
+    // One byte in the middle of an image.
     let segment = dataset.join("seg_0000.mcap");
     let mut bytes = std::fs::read(&segment).unwrap();
     let middle = bytes.len() / 2;
@@ -263,9 +263,9 @@ fn check_dataset(home: &Home, dataset: &Path) {
 }
 
 #[test]
-fn run_ends_after_its_time_and_records_what_it_was_told() {
+fn run_ends_after_its_time_and_records_with_the_given_labels() {
     let home = Home::new();
-    home.pictures(4);
+    home.images(4);
     let rig = home.rig_file("timed");
     let out = home.path().join("data");
     let said = home
@@ -292,7 +292,7 @@ fn run_ends_after_its_time_and_records_what_it_was_told() {
 #[test]
 fn sigterm_closes_the_recording() {
     let home = Home::new();
-    home.pictures(4);
+    home.images(4);
     let rig = home.rig_file("term");
     let out = home.path().join("data");
     let running = home.start(&["run", &rig, "--record", out.to_str().unwrap(), "-q"]);
@@ -307,7 +307,7 @@ fn sigterm_closes_the_recording() {
 #[test]
 fn an_output_that_cannot_be_written_is_named() {
     let home = Home::new();
-    home.pictures(2);
+    home.images(2);
     let rig = home.rig_file("blocked");
     let file = home.write("in_the_way", "a file, no folder");
     let ran = home.run(&["run", &rig, "--record", &file, "--seconds", "1"]);
@@ -328,7 +328,7 @@ fn a_run_that_lost_frames_ends_with_3_and_says_which() {
     assert!(ran.out.contains("lost: cam/color: 3 of") && ran.out.contains("3 device_gap"), "{}", ran.out);
 }
 
-/// What a refusal advises must be there to be done: `run --record` says `--force`, and takes it.
+/// The option that a refusal advises exists: `run --record` suggests `--force`, and accepts it.
 #[test]
 fn a_run_that_will_not_fit_is_recorded_with_force() {
     let home = Home::new();

@@ -1,4 +1,4 @@
-//! `depthrig demo` as a person meets it, with a rig of one small camera.
+//! `depthrig demo` from the command line, with a rig of one small camera.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/home.rs"]
@@ -29,16 +29,16 @@ fn lines<'a>(text: &'a str, start: &str) -> Vec<&'a str> {
 fn a_loss_is_one_line_a_missing_library_is_named_and_both_are_no_failure() {
     let home = Home::new();
     let ran = demo(&home, "[[camera.fault]]\nkind = \"skip\"\nat_s = 1.0\ncount = 3\n");
-    let told = ran.good();
-    let lost = lines(&told, "note lost");
-    assert!(lost.len() == 1 && lost[0].contains("frames of cam"), "{told}");
-    let model = lines(&told, "--   model");
-    assert!(model.len() == 1 && model[0].contains("is not shown: ONNX Runtime was not found"), "{told}");
-    assert_eq!(lines(&told, "LOOK wrong").len(), 0, "{told}");
+    let text = ran.good();
+    let lost = lines(&text, "note lost");
+    assert!(lost.len() == 1 && lost[0].contains("frames of cam"), "{text}");
+    let model = lines(&text, "--   model");
+    assert!(model.len() == 1 && model[0].contains("is not shown: ONNX Runtime was not found"), "{text}");
+    assert_eq!(lines(&text, "LOOK wrong").len(), 0, "{text}");
     for name in ["dataset/session.toml", "dataset/report.html", "contact-sheet.png", "report.json"] {
         assert!(home.path().join("demo").join(name).exists(), "{name}");
     }
-    // What is there stays.
+    // Existing files are kept.
     let again = demo(&home, "");
     assert!(again.code == 1 && again.err.contains("name another folder with --out"), "{}", again.err);
 }

@@ -1,10 +1,10 @@
-//! `depthrig cameras` and `depthrig doctor` as a person meets them, on this computer and on made ones.
+//! `depthrig cameras` and `depthrig doctor` from the command line, on this computer and on fake ones.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/home.rs"]
 mod support;
 
-use depthrig_drivers::usb::made::{MadeDevice, MadeTree};
+use depthrig_drivers::usb::fake::{FakeDevice, FakeTree};
 use serde_json::Value;
 use support::{Home, Ran};
 
@@ -18,9 +18,9 @@ fn ids(report: &Value) -> Vec<&str> {
 
 /// Whatever this computer is like, the exit code follows the verdict, and the rig's own cameras are fine.
 #[test]
-fn a_rig_of_pictures_is_examined_and_nothing_is_left_behind() {
+fn a_rig_of_images_is_examined_and_nothing_is_left_behind() {
     let home = Home::new();
-    home.pictures(3);
+    home.images(3);
     let rig = home.rig_file("pics");
     let before = std::fs::read_dir(home.path()).unwrap().count();
     let ran = home.run(&["doctor", &rig, "--json"]);
@@ -50,7 +50,7 @@ fn a_rig_of_pictures_is_examined_and_nothing_is_left_behind() {
 #[test]
 fn a_rig_that_runs_is_found_running() {
     let home = Home::new();
-    home.pictures(3);
+    home.images(3);
     let rig = home.rig_file("pics");
     let running = home.start(&["run", &rig]);
     home.wait_for_rig("pics");
@@ -63,7 +63,7 @@ fn a_rig_that_runs_is_found_running() {
 }
 
 #[test]
-fn a_wrong_file_is_2_and_missing_pictures_are_1() {
+fn a_wrong_file_is_2_and_missing_images_are_1() {
     let home = Home::new();
     let wrong = home.write("wrong.toml", "rig = 7\n");
     assert_eq!(home.run(&["doctor", &wrong]).code, 2);
@@ -77,13 +77,13 @@ fn a_wrong_file_is_2_and_missing_pictures_are_1() {
 #[test]
 fn what_is_attached_is_listed_with_port_speed_and_holder() {
     let home = Home::new();
-    let tree = MadeTree::new(&home.path().join("computer"));
-    tree.plug(&MadeDevice::new("4-1.2", 0));
-    tree.plug(&MadeDevice {
+    let tree = FakeTree::new(&home.path().join("computer"));
+    tree.plug(&FakeDevice::new("4-1.2", 0));
+    tree.plug(&FakeDevice {
         id: (0x8086, 0x0b5b),
         speed: 480,
         version: " 2.10",
-        ..MadeDevice::new("3-4", 10)
+        ..FakeDevice::new("3-4", 10)
     });
     tree.process(4711, "obs", &["/dev/video4"]);
     let root = home.path().join("computer");
@@ -113,7 +113,7 @@ fn what_is_attached_is_listed_with_port_speed_and_holder() {
 fn where_nothing_is_attached_that_is_said() {
     let home = Home::new();
     let tree = home.path().join("computer");
-    MadeTree::new(&tree);
+    FakeTree::new(&tree);
     let said = home.run(&["cameras", "--sys-root", tree.to_str().unwrap()]).good();
     assert_eq!(said.trim(), "no camera is attached");
 }

@@ -1,4 +1,4 @@
-//! `depthrig eval`: against NumPy, on folders, on HAMMER's layout, and on a recording of cameras that know the truth.
+//! `depthrig eval`: against NumPy, on folders, on HAMMER's layout, and on a recording with ground truth.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/home.rs"]
@@ -23,7 +23,7 @@ fn save(path: &Path, of: impl Fn(u32) -> u16) {
     Depth::from_fn(40, 30, |x, y| image::Luma([of(y * 40 + x)])).save(path).unwrap();
 }
 
-/// Millimetres, with holes; in picture 3 all of it.
+/// Millimetres, with holes; in image 3 all of it.
 fn truth(i: u32, p: u32) -> u16 {
     if i == 3 || roll(i, p).is_multiple_of(17) { 0 } else { 300 + (roll(i + 9, p) % 4000) as u16 }
 }
@@ -48,7 +48,7 @@ fn npy(path: &Path, of: impl Fn(u32) -> f32) {
     std::fs::write(path, bytes).unwrap();
 }
 
-/// Folders `truth`, `raw` (16-bit units) and `model` (metres), five pictures each, the last in a folder below.
+/// Folders `truth`, `raw` (16-bit units) and `model` (metres), five images each, the last in a folder below.
 fn folders(home: &Home) {
     for i in 0..5 {
         let name = if i == 4 { "deeper/4".to_owned() } else { i.to_string() };
@@ -118,7 +118,7 @@ fn numbers_are_those_of_numpy() {
     }
     let home = Home::new();
     folders(&home);
-    // What NumPy is given comes from the functions above and not through any file format.
+    // NumPy gets its input from the functions above and not through any file format.
     let dump = |name: &str, of: &dyn Fn(u32, u32) -> f64| {
         let bytes: Vec<u8> = (0..5)
             .flat_map(|i| (0..1200).flat_map(move |p| [(i, p)]))
@@ -157,21 +157,22 @@ fn numbers_are_those_of_numpy() {
         let got = evaluate(&home, &[&args[..], &["--threads", threads]].concat());
         for row in got["rows"].as_array().unwrap() {
             let name = row["name"].as_str().unwrap();
-            for (ours, theirs) in [("mean_of_pictures", "mean"), ("pixel_pooled", "pooled")] {
+            for (ours, theirs) in [("mean_of_images", "mean"), ("pixel_pooled", "pooled")] {
                 let theirs = &wanted[name][theirs];
                 for (key, value) in theirs.as_object().unwrap() {
-                    if ours == "mean_of_pictures" && (key == "counted" || key == "valid") {
+                    if ours == "mean_of_images" && (key == "counted" || key == "valid") {
                         continue; // sums there
                     }
-                    let (a, b) = (row[ours][key].as_f64().unwrap(), value.as_f64().unwrap());
+                    let a = row[ours][key].as_f64().unwrap();
+                    let b = value.as_f64().unwrap();
                     assert!(
                         (a - b).abs() <= 1e-9 * (1.0 + b.abs()),
                         "{name} {ours} {key}: {a}, NumPy has {b}"
                     );
                 }
             }
-            assert_eq!(row["pictures"], 5);
-            assert_eq!(row["empty_pictures"], 1, "the picture without a reference");
+            assert_eq!(row["images"], 5);
+            assert_eq!(row["empty_images"], 1, "the image without a reference");
         }
     }
 }
@@ -182,7 +183,9 @@ fn folders_are_paired_and_the_page_stands_alone() {
     folders(&home);
     let page = home.path().join("page.html");
     let at = |name: &str| home.path().join(name).to_str().unwrap().to_owned();
-    let (truth, model, page_text) = (at("truth"), at("model"), page.to_str().unwrap().to_owned());
+    let truth = at("truth");
+    let model = at("model");
+    let page_text = page.to_str().unwrap().to_owned();
     let raw = format!("sensor <raw>={}", at("raw"));
     let inputs = ["eval", "-q", "--truth", &truth, "--pred", &raw, "--pred", &model];
     let args = [&inputs[..], &["--overwrite", "--out", &page_text]].concat();
@@ -195,10 +198,10 @@ fn folders_are_paired_and_the_page_stands_alone() {
     assert_eq!(
         html.matches("src=\"data:image/jpeg").count(),
         2 * 3 * 3,
-        "the worst three of each, three pictures each"
+        "the worst three of each, three images each"
     );
 
-    // A prediction that is missing is said, and what can be compared is.
+    // A missing prediction is reported, and the others are compared.
     std::fs::remove_file(home.path().join("raw/2.png")).unwrap();
     let said = home.run(&args);
     assert_eq!(said.code, 3, "{}", said.err);
@@ -208,7 +211,7 @@ fn folders_are_paired_and_the_page_stands_alone() {
     let said = home.run(&args);
     assert_eq!(said.code, 3);
     assert!(said.err.contains("raw/1.png: it has 41x30 pixels and its reference 40x30"), "{}", said.err);
-    // And when nothing can be compared it has failed.
+    // If nothing can be compared, the command fails.
     let said =
         home.run(&["eval", "-q", "--truth", &truth, "--pred", home.path().join("run").to_str().unwrap()]);
     assert_eq!(said.code, 1, "{}", said.err);
@@ -240,13 +243,13 @@ fn hammers_folders_are_known() {
         rows.iter().find(|r| r["name"] == name).unwrap_or_else(|| panic!("{name} in {got}")).clone()
     };
     assert_eq!(got["rows"].as_array().unwrap().len(), 3, "no depth_tof was there");
-    assert_eq!(row("depth_l515")["mean_of_pictures"]["strict_l1_m"], 0.0);
-    assert!(row("depth_d435")["mean_of_pictures"]["strict_l1_m"].as_f64().unwrap() > 0.1);
+    assert_eq!(row("depth_l515")["mean_of_images"]["strict_l1_m"], 0.0);
+    assert!(row("depth_d435")["mean_of_images"]["strict_l1_m"].as_f64().unwrap() > 0.1);
     let twice = row("twice")["pixel_pooled"]["abs_rel"].as_f64().unwrap();
     assert!((twice - 1.0).abs() < 1e-6, "{twice}");
     let none = home.run(&["eval", home.path().join("out").to_str().unwrap()]);
     assert_eq!(none.code, 1);
-    assert!(none.err.contains("not laid out as HAMMER"), "{}", none.err);
+    assert!(none.err.contains("not in the layout of HAMMER"), "{}", none.err);
 }
 
 #[test]
@@ -279,15 +282,16 @@ fn a_recording_with_truth_is_compared_in_one_view() {
         rows.iter().find(|r| r["name"] == name).unwrap_or_else(|| panic!("{name} in {got}")).clone()
     };
     // The true depth, moved into colour's view, is the truth but for what only one of the two sees.
-    let (raw, moved) = (row("depth"), row("depth_true"));
-    assert_eq!((raw["group"].as_str(), raw["empty_pictures"].as_u64()), (Some("cam"), Some(0)));
-    assert!(raw["pictures"].as_u64().unwrap() >= 3);
-    let value = |r: &Value, key: &str| r["mean_of_pictures"][key].as_f64().unwrap();
-    assert!(value(&moved, "delta_1") > 0.98 && value(&moved, "l1_m") < 0.02, "{}", moved["mean_of_pictures"]);
+    let raw = row("depth");
+    let moved = row("depth_true");
+    assert_eq!((raw["group"].as_str(), raw["empty_images"].as_u64()), (Some("cam"), Some(0)));
+    assert!(raw["images"].as_u64().unwrap() >= 3);
+    let value = |r: &Value, key: &str| r["mean_of_images"][key].as_f64().unwrap();
+    assert!(value(&moved, "delta_1") > 0.98 && value(&moved, "l1_m") < 0.02, "{}", moved["mean_of_images"]);
     assert!(value(&raw, "strict_l1_m") > 2.0 * value(&moved, "strict_l1_m"), "{got}");
     // In depth's own view nothing moves, and the truth is perfect.
     let own = evaluate_recorded(&home, &[&path, "--pred", "depth_true", "--truth", "depth_true"]);
-    assert_eq!(own["rows"][0]["mean_of_pictures"]["strict_l1_m"], 0.0);
+    assert_eq!(own["rows"][0]["mean_of_images"]["strict_l1_m"], 0.0);
 
     let without = record("without", false);
     let said = home.run(&["eval", "-q", &without]);

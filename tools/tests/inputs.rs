@@ -1,4 +1,5 @@
-//! What is no dataset or recording, or cannot be read: every command that takes one fails with 1, names it, and makes nothing.
+//! Invalid or unreadable datasets and recordings: every command that takes one fails with 1, names it, and writes
+//! nothing.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/home.rs"]
@@ -8,7 +9,7 @@ use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt as _;
 use support::{Home, Ran};
 
-/// The commands, with IN for their input and OUT for what they make.
+/// The commands, with IN for their input and OUT for their output.
 const COMMANDS: [&str; 19] = [
     "info IN",
     "verify IN",
@@ -42,7 +43,7 @@ fn run(home: &Home, command: &str, input: &str) -> Ran {
     home.run(&words.iter().map(String::as_str).collect::<Vec<_>>())
 }
 
-/// Holds what is promised of every command with this input.
+/// Asserts this for every command with this input.
 #[track_caller]
 fn refused(home: &Home, input: &str, said: &[&str], commands: impl IntoIterator<Item = &'static str>) {
     for command in commands {

@@ -1,4 +1,4 @@
-//! `depthrig install` as a person meets it, into a made root.
+//! `depthrig install` from the command line, into a temporary root.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/home.rs"]
@@ -27,7 +27,7 @@ fn what_is_shown_is_what_is_written_and_a_change_by_hand_survives() {
         assert!(shown.contains(&text), "{name} is not what was shown");
     }
     assert!(!run("--print", &[]).good().contains("not installed"));
-    assert!(run("--apply", &[]).good().matches("is as it should be").count() == 3);
+    assert!(run("--apply", &[]).good().matches("already up to date").count() == 3);
 
     let rules = home.path().join("root/etc/udev/rules.d/70-depthrig.rules");
     std::fs::write(&rules, "# mine\n").unwrap();
@@ -71,7 +71,7 @@ fn systemd_finds_nothing_wrong_with_the_service() {
     assert!(ours.is_empty(), "{ours:#?}");
 }
 
-/// Root without sudo is nobody who uses a rig.
+/// Root without sudo is not a user of a rig.
 #[test]
 fn root_is_not_taken_for_the_rigs_user_unless_it_is_named() {
     let home = Home::new();

@@ -1,5 +1,5 @@
-//! Azure Kinects as a person meets them: recordings that are imported, verified, reported and replayed, or cannot be; and
-//! attached ones through a made libk4a.
+//! Azure Kinects from the command line: recordings that are imported, verified, reported, replayed or rejected; and
+//! attached cameras through a fake libk4a.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/home.rs"]
@@ -7,7 +7,7 @@ mod support;
 
 use depthrig_bus::HostTime;
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode};
-use depthrig_drivers::usb::made::{MadeDevice, MadeTree};
+use depthrig_drivers::usb::fake::{FakeDevice, FakeTree};
 use depthrig_kinect_fixture::{Fixture, Pattern};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -57,14 +57,15 @@ fn recordings_of_every_mode_are_imported_verified_reported_and_replayed() {
     forms.push(("colour_only".into(), Fixture { depth: None, ..small() }, 1));
     let home = Home::new();
     for (name, fixture, streams) in forms {
-        let (file, out) = (written(&home, "a.mkv", &fixture), at(&home, &name));
+        let file = written(&home, "a.mkv", &fixture);
+        let out = at(&home, &name);
         let said = home.run(&["import", "kinect", &file, &out, "-q", "--json"]);
         assert_eq!((said.code, said.err.as_str()), (0, ""), "{name}");
         let report = json(&said);
         let accounts = report["facts"]["accounts"].as_array().unwrap();
-        let (units, pictures): (Vec<_>, Vec<_>) = accounts.iter().partition(|a| a["stream"] == "kinect/imu");
-        assert_eq!((pictures.len(), units.len()), (streams, usize::from(fixture.motion)), "{name}");
-        assert!(pictures.iter().all(|a| a["delivered"] == fixture.captures), "{name}: {accounts:?}");
+        let (units, images): (Vec<_>, Vec<_>) = accounts.iter().partition(|a| a["stream"] == "kinect/imu");
+        assert_eq!((images.len(), units.len()), (streams, usize::from(fixture.motion)), "{name}");
+        assert!(images.iter().all(|a| a["delivered"] == fixture.captures), "{name}: {accounts:?}");
         assert!(report["facts"]["left_out"].get("motion_samples").is_none(), "{name}");
         let verified = json(&home.run(&["verify", "--decode", "--json", &out, "-q"]));
         assert_eq!(verified["findings"].as_array().map(Vec::len), Some(0), "{name}: {verified}");
@@ -80,7 +81,8 @@ fn recordings_of_every_mode_are_imported_verified_reported_and_replayed() {
 #[test]
 fn what_comes_over_of_motion_is_said_to_the_person_and_in_the_dataset() {
     let home = Home::new();
-    let (file, out) = (written(&home, "a.mkv", &Fixture::small()), at(&home, "out"));
+    let file = written(&home, "a.mkv", &Fixture::small());
+    let out = at(&home, "out");
     let said = home.run(&["import", "kinect", &file, &out]).good();
     let line = said.lines().find(|l| l.contains("samples of accelerometer and gyroscope came over")).unwrap();
     let n: u64 = line.split(' ').find_map(|word| word.parse().ok()).unwrap();
@@ -113,9 +115,9 @@ fn recordings_that_cannot_be_imported_say_why_and_what_to_do() {
     let elsewhere = Home::new();
     for (file, code, parts) in [
         (write("empty.mkv", b""), 1, &["the file is empty"][..]),
-        (write("text.mkv", b"hello"), 1, &["this is no Matroska file (.mkv)"]),
+        (write("text.mkv", b"hello"), 1, &["not a Matroska file (.mkv)"]),
         (write("other.mkv", &foreign), 1, &["no recording of an Azure Kinect", "\"COLOR\""]),
-        (write("head.mkv", &bytes[..2000]), 1, &["cut off or damaged before its first picture"]),
+        (write("head.mkv", &bytes[..2000]), 1, &["cut off or damaged before its first image"]),
         (at(&home, "nowhere.mkv"), 1, &["nowhere.mkv cannot be opened: No such file"]),
         (at(&home, ""), 1, &["cannot be opened: it is a folder; a regular file is needed"]),
         (bare.clone(), 2, &["no calibration.json", "`calibration`", "\"none\""]),
@@ -129,7 +131,7 @@ fn recordings_that_cannot_be_imported_say_why_and_what_to_do() {
         }
         assert!(!Path::new(&out).exists(), "{file}: nothing is left behind");
     }
-    // What is whole of a file that was cut comes over, and the exit code says that it is not all.
+    // The complete clusters of a truncated file are imported, and the exit code reports the loss.
     let ran = home.run(&["import", "kinect", &write("cut.mkv", &bytes[..cut]), &at(&home, "cut")]);
     assert_eq!(ran.code, 3, "{}", ran.err);
     assert!(
@@ -138,19 +140,19 @@ fn recordings_that_cannot_be_imported_say_why_and_what_to_do() {
         ran.err
     );
     assert!(ran.out.contains("4 sets"), "{}", ran.out);
-    // What is there is sound, and it is not all.
+    // The imported part is sound but incomplete.
     assert_eq!(home.run(&["verify", "--decode", &at(&home, "cut"), "-q"]).code, 3);
     // With a calibration of its own, or without any, it goes.
     let calibration = home.write("device.json", depthrig_kinect_fixture::CALIBRATION);
     home.run(&["import", "kinect", &bare, &at(&home, "given"), "--calibration", &calibration]).good();
     let said = home.run(&["import", "kinect", &bare, &at(&home, "none"), "--calibration", "none"]).good();
     assert!(said.contains("there is no calibration: intrinsics are unknown"), "{said}");
-    // What is there stays.
+    // An existing dataset is kept.
     let ran = home.run(&["import", "kinect", &file, &at(&home, "given")]);
     assert!(ran.code == 1 && ran.err.contains("holds a dataset already"), "{}", ran.err);
 }
 
-/// A computer with a made libk4a and, where that is wanted, a depth engine beside it.
+/// A computer with a fake libk4a and optionally a depth engine beside it.
 struct Computer {
     home: Home,
 }
@@ -166,13 +168,13 @@ impl Computer {
         if with_engine {
             std::fs::copy(&built, home.path().join("k4a/libdepthengine.so.2.0")).unwrap();
         }
-        let tree = MadeTree::new(&home.path().join("computer"));
+        let tree = FakeTree::new(&home.path().join("computer"));
         for (port, product, interfaces) in [
             ("2-1.1", 0x097c, vec![(0, 0xff, 0, "", vec![], vec![])]),
             ("2-1.2", 0x097d, vec![(0, 0x0e, 1, "uvcvideo", vec![0, 1], vec![])]),
         ] {
             let strings = ["Microsoft Corp.", "Azure Kinect", SERIAL];
-            tree.plug(&MadeDevice { id: (0x045e, product), strings, interfaces, ..MadeDevice::new(port, 0) });
+            tree.plug(&FakeDevice { id: (0x045e, product), strings, interfaces, ..FakeDevice::new(port, 0) });
         }
         Self { home }
     }
@@ -185,7 +187,7 @@ impl Computer {
     }
 
     fn run(&self, args: &[&str]) -> (i32, String, String) {
-        told(&self.command(args).output().unwrap())
+        outcome(&self.command(args).output().unwrap())
     }
 
     /// A rig of the Kinect; `library` is a folder below the home.
@@ -198,7 +200,7 @@ impl Computer {
     }
 }
 
-fn told(output: &Output) -> (i32, String, String) {
+fn outcome(output: &Output) -> (i32, String, String) {
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
     (output.status.code().unwrap_or(-1), text(&output.stdout), text(&output.stderr))
 }
@@ -214,7 +216,7 @@ fn a_kinect_is_listed_with_and_without_its_library() {
     let root = computer.home.path().join("computer");
     let args = ["cameras", "--json", "--sys-root", root.to_str().unwrap()];
     let asked = computer.command(&args).env("DEPTHRIG_LIBK4A", computer.home.path().join("k4a")).output();
-    let (code, out, err) = told(&asked.unwrap());
+    let (code, out, err) = outcome(&asked.unwrap());
     let found: Value = serde_json::from_str(&out).unwrap_or_else(|e| panic!("{e}: {out} {err}"));
     let camera = &found["cameras"][0];
     for (key, value) in [
@@ -230,10 +232,10 @@ fn a_kinect_is_listed_with_and_without_its_library() {
     }
     assert_eq!((code, found["cameras"].as_array().unwrap().len()), (0, 1), "{out}");
     assert!(camera["modes"].as_array().unwrap().len() > 30, "{camera}");
-    // Without the library the bus tells that it is there, and the message what to install.
+    // Without the library the camera is still found on the bus, and the message says what to install.
     let empty = computer.home.path().join("computer");
     let asked = computer.command(&args).env("DEPTHRIG_LIBK4A", empty).output().unwrap();
-    let (code, out, _) = told(&asked);
+    let (code, out, _) = outcome(&asked);
     let found: Value = serde_json::from_str(&out).unwrap();
     assert_eq!((code, &found["cameras"][0]["serial"]), (3, &Value::from(SERIAL)), "{out}");
     let problems = found["cameras"][0]["problems"].to_string();

@@ -1,4 +1,4 @@
-//! A motion unit as a person meets it: tapped, in the status, in a dataset.
+//! An IMU from the command line: in `tap`, in the status, in a dataset.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/home.rs"]
@@ -7,7 +7,7 @@ mod support;
 use support::Home;
 
 #[test]
-fn a_motion_unit_is_tapped_shown_and_recorded() {
+fn an_imu_is_tapped_shown_and_recorded() {
     let home = Home::new();
     let rig = home.path().join("rig.toml");
     let text = "rig = \"moved\"\n[recording]\nallow = [\"data\"]\nreserve_mb = 0\nmin_minutes = 0\n[[camera]]\nname = \"cam\"\n\
@@ -34,18 +34,18 @@ fn a_motion_unit_is_tapped_shown_and_recorded() {
         .map(|s| s["sequence"].as_u64().unwrap())
         .collect();
     assert!(numbers.len() == 16 && numbers.windows(2).all(|w| w[1] == w[0] + 1), "{numbers:?}");
-    let pictures = home.path().join("pictures");
+    let images = home.path().join("images");
     for (wrong, why) in [
         (
-            &["tap", "cam/imu", "--count", "1", "--png", pictures.to_str().unwrap()][..],
-            "cam/imu gives motion samples and no pictures",
+            &["tap", "cam/imu", "--count", "1", "--png", images.to_str().unwrap()][..],
+            "cam/imu is an IMU and has no images",
         ),
-        (&["tap", "cam/color", "--count", "1", "--json"], "cam/color gives pictures"),
+        (&["tap", "cam/color", "--count", "1", "--json"], "cam/color is an image stream"),
     ] {
         let refused = home.run(wrong);
         assert!(refused.code == 1 && refused.err.contains(why), "{}", refused.err);
     }
-    assert!(!pictures.exists(), "what is refused leaves nothing");
+    assert!(!images.exists(), "what is refused leaves nothing");
     let status = home.run(&["status"]).good();
     let row = status.lines().find(|l| l.starts_with("cam/imu")).unwrap();
     assert!(row.contains("motion") && !row.contains("8x1"), "{row}");
@@ -59,6 +59,6 @@ fn a_motion_unit_is_tapped_shown_and_recorded() {
     let row = info.lines().find(|l| l.starts_with("cam/imu")).unwrap();
     assert!(row.split_whitespace().last() == Some("0"), "no batch is lost: {info}");
     home.run(&["verify", data.to_str().unwrap(), "--decode"]).good();
-    // 3: on a busy machine a picture is lost now and then.
+    // 3: on a busy machine an image is lost now and then.
     assert!(matches!(running.signal("TERM").code, 0 | 3));
 }

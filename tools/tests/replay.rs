@@ -1,4 +1,4 @@
-//! `depthrig replay` as a person uses it: one terminal replays, another one steers.
+//! `depthrig replay` from the command line: one process replays, another one controls it.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/home.rs"]
@@ -8,7 +8,7 @@ use support::Home;
 
 /// A dataset of the `files` camera, about two seconds long.
 fn dataset(home: &Home) -> String {
-    home.pictures(4);
+    home.images(4);
     let rig = home.rig_file("desk");
     let out = home.path().join("data");
     let said = home.run(&["run", &rig, "--record", out.to_str().unwrap(), "--seconds", "2", "--json", "-q"]);
@@ -31,9 +31,9 @@ fn one_terminal_replays_and_another_one_steers() {
     assert!(said.starts_with("paused at 0.000 of ") && said.contains("no set yet"), "{said}");
     let said = home.run(&["status"]).good();
     assert!(said.contains("replay  paused") && said.contains("desk/depth"), "{said}");
-    let told = json(&home, &["replay", "seek", "0.5", "--json"]);
-    let at = told["set"].as_u64().unwrap();
-    assert!(told["position_s"].as_f64().unwrap() >= 0.5 && at > 0);
+    let status = json(&home, &["replay", "seek", "0.5", "--json"]);
+    let at = status["set"].as_u64().unwrap();
+    assert!(status["position_s"].as_f64().unwrap() >= 0.5 && at > 0);
     assert_eq!(json(&home, &["replay", "step", "--json"])["set"], at + 1);
     assert_eq!(json(&home, &["replay", "step", "-1", "--json"])["set"], at);
     assert_eq!(json(&home, &["replay", "seek", "--set", "0", "--json"])["position_s"], 0.0);
@@ -56,7 +56,7 @@ fn one_terminal_replays_and_another_one_steers() {
     let tapped = home.run(&["tap", "desk/depth", "--count", "1"]).good();
     assert!(tapped.contains("replayed"), "who comes late gets the last frame: {tapped}");
 
-    // Recording what is replayed: by a command, as of cameras.
+    // A replay is recorded by a command, like cameras.
     let again = home.path().join("again");
     home.run(&["replay", "seek", "--set", "0"]).good();
     home.run(&["record", "start", "--out", again.to_str().unwrap(), "--name", "a"]).good();

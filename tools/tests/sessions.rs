@@ -17,7 +17,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 use support::Home;
 
-/// One set of one small picture.
+/// One set of one small image.
 fn write(dir: &Path, scene: &str, started_utc_ns: i64) {
     record(dir, scene, started_utc_ns).finish().unwrap();
 }
@@ -49,7 +49,7 @@ fn record(dir: &Path, scene: &str, started_utc_ns: i64) -> Recorder {
 /// The set that [`record`] pushes.
 fn set(started_utc_ns: i64) -> RecordSet {
     let mut header = FrameHeader::default();
-    header.set_picture(PixelFormat::Z16, 8, 8);
+    header.set_image(PixelFormat::Z16, 8, 8);
     header.set_names("rig", &"desk/depth".parse().unwrap());
     let utc = UtcPair { mono: HostTime::from_ns(1), utc_ns: started_utc_ns, width_ns: 1 };
     let frame = RecordFrame { stream: 0, header, pixels: Box::new(vec![1; 128]) };
@@ -176,7 +176,7 @@ fn a_report_is_a_page_or_json_and_its_exit_code_says_how_it_is() {
     let segment = dir.join("seg_0000.mcap");
     assert_eq!(home.run(&["report", segment.to_str().unwrap(), "-q"]).code, 2, "where should the page be?");
     std::fs::rename(&segment, dir.join("seg_0000.mcap.part")).unwrap();
-    // What exists is somebody's, whatever it is called.
+    // An existing file is kept, whatever its name.
     std::fs::write(dir.join("report.html"), "mine").unwrap();
     let ran = home.run(&["report", at, "-q"]);
     assert!(ran.code == 2 && ran.err.contains("report.html: exists"), "{}: {}", ran.code, ran.err);
@@ -210,7 +210,7 @@ fn a_crash_is_recovered_once_and_the_exit_code_says_what_it_cost() {
     if rustix::process::geteuid().is_root() {
         println!("skipped: root may write into every folder");
     } else {
-        // What the folder does not take is known without writing into it.
+        // A read-only folder is detected without writing to it.
         let set_mode = |mode| std::fs::set_permissions(&dir, Permissions::from_mode(mode)).unwrap();
         set_mode(0o555);
         let refused = [&["recover", at, "-q"][..], &["recover", at, "--dry-run", "-q"]].map(|c| home.run(c));
@@ -239,9 +239,9 @@ fn a_crash_is_recovered_once_and_the_exit_code_says_what_it_cost() {
     assert!(done["lost"][0].as_str().unwrap().contains("cut off"), "{done}");
     let recovered = files(&dir);
     assert_eq!(recovered.keys().collect::<Vec<_>>(), ["seg_0000.mcap", "session.toml"]);
-    let told = json(home.run(&["info", at, "--json"]), 3);
-    assert_eq!((&told["sets"], &told["scene"]), (&1.into(), &"sink".into()));
-    assert_eq!(told["lost"][0], done["lost"][0], "{told}");
+    let info = json(home.run(&["info", at, "--json"]), 3);
+    assert_eq!((&info["sets"], &info["scene"]), (&1.into(), &"sink".into()));
+    assert_eq!(info["lost"][0], done["lost"][0], "{info}");
 
     let again = json(home.run(&["recover", at, "--json", "-q"]), 0);
     assert_eq!((&again["changed"], &again["lost"]), (&false.into(), &serde_json::json!([])));

@@ -1,4 +1,4 @@
-//! `depthrig stereo` and `depthrig bench stereo` as a person meets them.
+//! `depthrig stereo` and `depthrig bench stereo` from the command line.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/home.rs"]
@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use support::Home;
 
 /// Noise as seen `shift` pixels further to the right.
-fn picture(path: &Path, width: u32, height: u32, shift: u32) {
+fn image(path: &Path, width: u32, height: u32, shift: u32) {
     let noise = |x: u32, y: u32| {
         let v = (x / 2).wrapping_mul(7919) ^ (y / 2).wrapping_mul(104_729);
         (v.wrapping_mul(2_654_435_761) >> 13) as u8
@@ -18,8 +18,8 @@ fn picture(path: &Path, width: u32, height: u32, shift: u32) {
 
 fn pair(folder: &Path) -> [String; 2] {
     let [left, right] = ["left.png", "right.png"].map(|f| folder.join(f));
-    picture(&left, 241, 90, 0);
-    picture(&right, 241, 90, 14);
+    image(&left, 241, 90, 0);
+    image(&right, 241, 90, 14);
     [left, right].map(|p: PathBuf| p.to_str().unwrap().to_owned())
 }
 
@@ -28,15 +28,20 @@ fn a_pair_becomes_floats_or_sixteen_bits() {
     let folder = tempfile::tempdir().unwrap();
     let [left, right] = pair(folder.path());
     let file = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
-    let (npy, png, sure) = (file("d.npy"), file("d.png"), file("sure.png"));
+    let npy = file("d.npy");
+    let png = file("d.png");
+    let sure = file("sure.png");
     for preset in ["performance", "quality", "ultra"] {
         let common =
             ["stereo", &left, &right, "--preset", preset, "--max-disparity", "64", "--overwrite", "--out"];
         Home::new().run(&[&common[..], &[&npy]].concat()).good();
-        let told = Home::new().run(&[&common[..], &[&png, "--confidence", &sure, "--json"]].concat()).good();
-        let told: serde_json::Value = serde_json::from_str(&told).unwrap();
-        assert!(told["parameters"].as_str().unwrap().contains(&format!("preset={preset} max_disparity=64")));
-        assert!(told["memory_bytes"].as_u64().unwrap() > 0);
+        let report =
+            Home::new().run(&[&common[..], &[&png, "--confidence", &sure, "--json"]].concat()).good();
+        let report: serde_json::Value = serde_json::from_str(&report).unwrap();
+        assert!(
+            report["parameters"].as_str().unwrap().contains(&format!("preset={preset} max_disparity=64"))
+        );
+        assert!(report["memory_bytes"].as_u64().unwrap() > 0);
         let bytes = std::fs::read(&npy).unwrap();
         let data = &bytes[bytes.len() - 4 * 241 * 90..];
         assert!(
@@ -50,7 +55,7 @@ fn a_pair_becomes_floats_or_sixteen_bits() {
             assert_eq!((d.is_nan(), d.is_nan()), (*u == 0, *c == 0));
             assert!(d.is_nan() || (d * 256.0 - f32::from(*u)).abs() < 1.0, "{d} {u}");
         }
-        // All of it lies at 14, but for what the right eye does not see.
+        // All of it lies at 14, except for areas that the right camera does not see.
         let right_ones = floats.iter().filter(|d| (**d - 14.0).abs() < 0.5).count();
         assert!(right_ones * 10 > 8 * floats.len(), "{preset}: {right_ones} of {}", floats.len());
     }
@@ -61,21 +66,21 @@ fn rows_that_are_apart_are_said() {
     let folder = tempfile::tempdir().unwrap();
     let [left, right] = pair(folder.path());
     let low = folder.path().join("low.png").to_str().unwrap().to_owned();
-    let picture = image::open(&right).unwrap().into_luma8();
-    image::GrayImage::from_fn(241, 90, |x, y| *picture.get_pixel(x, y.saturating_sub(2))).save(&low).unwrap();
+    let image = image::open(&right).unwrap().into_luma8();
+    image::GrayImage::from_fn(241, 90, |x, y| *image.get_pixel(x, y.saturating_sub(2))).save(&low).unwrap();
     let out = folder.path().join("d.npy").to_str().unwrap().to_owned();
     for (right, rows) in [(&right, 0.0), (&low, 2.0)] {
         let common =
             ["stereo", &left, right, "--max-disparity", "64", "--overwrite", "--out", &out, "--json"];
         let ran = Home::new().run(&common);
-        let told: serde_json::Value = serde_json::from_str(&ran.out).unwrap();
-        let middle = told["rows"]["middle_px"].as_f64().unwrap();
-        assert!((middle - rows).abs() < 0.1, "{told}");
-        let warnings = told["warnings"].as_array().unwrap();
-        assert_eq!(warnings.len(), usize::from(rows > 0.0), "{told}");
+        let report: serde_json::Value = serde_json::from_str(&ran.out).unwrap();
+        let middle = report["rows"]["middle_px"].as_f64().unwrap();
+        assert!((middle - rows).abs() < 0.1, "{report}");
+        let warnings = report["warnings"].as_array().unwrap();
+        assert_eq!(warnings.len(), usize::from(rows > 0.0), "{report}");
         assert_eq!(ran.err.contains("not rectified to the same rows"), rows > 0.0, "{}", ran.err);
-        assert_eq!(told["rows_corrected"], rows > 0.0, "{told}");
-        assert_eq!(told["parameters"].as_str().unwrap().contains("rows_moved_px="), rows > 0.0, "{told}");
+        assert_eq!(report["rows_corrected"], rows > 0.0, "{report}");
+        assert_eq!(report["parameters"].as_str().unwrap().contains("rows_moved_px="), rows > 0.0, "{report}");
         ran.good();
         // All of it lies at 14, in rows that were moved too.
         let right_ones = || {
@@ -86,8 +91,8 @@ fn rows_that_are_apart_are_said() {
         let moved = right_ones();
         assert!(moved * 10 > 8 * 241 * 90, "{moved}");
         let kept = [&common[..], &["--keep-rows"]].concat();
-        let told: serde_json::Value = serde_json::from_str(&Home::new().run(&kept).good()).unwrap();
-        assert_eq!(told["rows_corrected"], false, "{told}");
+        let report: serde_json::Value = serde_json::from_str(&Home::new().run(&kept).good()).unwrap();
+        assert_eq!(report["rows_corrected"], false, "{report}");
         if rows > 0.0 {
             assert!(
                 right_ones() * 2 < moved,
@@ -101,12 +106,12 @@ fn rows_that_are_apart_are_said() {
 #[test]
 fn a_pair_is_the_same_in_every_lossless_form() {
     let folder = tempfile::tempdir().unwrap();
-    let pictures = pair(folder.path()).map(|p| image::open(p).unwrap().into_luma8());
+    let images = pair(folder.path()).map(|p| image::open(p).unwrap().into_luma8());
     let out = folder.path().join("d.npy");
     let matched = |name: &str, save: &dyn Fn(&image::GrayImage, &Path)| {
         let files = ["left", "right"].map(|side| folder.path().join(format!("{side}-{name}")));
-        for (picture, file) in pictures.iter().zip(&files) {
-            save(picture, file);
+        for (image, file) in images.iter().zip(&files) {
+            save(image, file);
         }
         let [left, right] = files.each_ref().map(|f| f.to_str().unwrap());
         let common =
@@ -136,14 +141,16 @@ fn a_pair_is_the_same_in_every_lossless_form() {
 }
 
 #[test]
-fn pictures_of_every_size_are_matched() {
+fn images_of_every_size_are_matched() {
     let folder = tempfile::tempdir().unwrap();
     let file = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
-    let (left, right, out) = (file("l.png"), file("r.png"), file("d.npy"));
+    let left = file("l.png");
+    let right = file("r.png");
+    let out = file("d.npy");
     // Narrower than the search is wide, and smaller than what describes a pixel.
     for (width, height) in [(1, 1), (5, 3), (1, 90), (99, 1), (67, 31)] {
-        picture(Path::new(&left), width, height, 0);
-        picture(Path::new(&right), width, height, 3);
+        image(Path::new(&left), width, height, 0);
+        image(Path::new(&right), width, height, 3);
         for preset in ["performance", "quality", "ultra"] {
             let common = ["stereo", &left, &right, "--max-disparity", "201", "--preset", preset];
             let args = [&common[..], &["--overwrite", "--out", &out]].concat();
@@ -160,13 +167,13 @@ fn what_is_no_pair_is_said() {
     let folder = tempfile::tempdir().unwrap();
     let [left, right] = pair(folder.path());
     let small = folder.path().join("small.png");
-    picture(&small, 120, 90, 0);
+    image(&small, 120, 90, 0);
     let out = folder.path().join("d.npy").to_str().unwrap().to_owned();
     let small = small.to_str().unwrap();
     for (args, said) in [
         (vec!["stereo", &left, small, "--out", &out], "241x90"),
         (vec!["stereo", &right, &left, "--max-disparity", "64", "--out", &out], "swapped"),
-        (vec!["stereo", &left, &right, "--out", "d.tiff"], ".npy or a .png"),
+        (vec!["stereo", &left, &right, "--out", "d.tiff"], "use .npy or .png"),
         (vec!["stereo", &left, &right, "--preset", "best", "--out", &out], "performance, quality or ultra"),
         (vec!["stereo", &left, &right, "--max-disparity", "300", "--out", &out], "256"),
         (vec!["bench", "stereo", "--left", &left], "--right"),
@@ -189,9 +196,9 @@ fn the_bench_says_what_each_preset_costs() {
     let [left, right] = pair(folder.path());
     let args =
         ["bench", "stereo", "--left", &left, "--right", &right, "--rounds", "2", "--threads", "2", "--json"];
-    let told: serde_json::Value = serde_json::from_str(&Home::new().run(&args).good()).unwrap();
-    assert_eq!((told["width"].as_u64(), told["threads"].as_u64()), (Some(241), Some(2)));
-    let costs = told["costs"].as_array().unwrap();
+    let report: serde_json::Value = serde_json::from_str(&Home::new().run(&args).good()).unwrap();
+    assert_eq!((report["width"].as_u64(), report["threads"].as_u64()), (Some(241), Some(2)));
+    let costs = report["costs"].as_array().unwrap();
     assert_eq!(costs.len(), 3);
     assert!(costs.iter().all(|c| c["cpu_ms_best"].as_f64().unwrap() > 0.0 && c["filled_percent"].as_f64().unwrap() > 50.0));
 }

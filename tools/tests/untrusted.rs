@@ -1,5 +1,5 @@
-//! Paths and texts of others at the command line: what is no regular file is refused and never waited for, what would
-//! steer a terminal is shown, and what is read is not written to.
+//! Untrusted paths and texts at the command line: special files are refused without blocking on them, terminal control
+//! sequences are escaped, and inputs are not written to.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_kinect_fixture::{Fixture, Pattern};
@@ -71,12 +71,12 @@ fn a_fifo_or_a_device_in_the_place_of_a_file_is_refused_and_not_waited_for() {
     fifo(&dir.join("session/session.toml"));
     dataset(dir, "endless", "", "");
     std::os::unix::fs::symlink("/dev/zero", dir.join("endless/seg_0000.mcap")).unwrap();
-    for name in ["pictures", "camera"] {
+    for name in ["images", "camera"] {
         fs::create_dir(dir.join(name)).unwrap();
     }
-    fifo(&dir.join("pictures/a.png"));
-    fs::create_dir(dir.join("pictures/camera_d435")).unwrap();
-    fifo(&dir.join("pictures/camera_d435/depth_0.png"));
+    fifo(&dir.join("images/a.png"));
+    fs::create_dir(dir.join("images/camera_d435")).unwrap();
+    fifo(&dir.join("images/camera_d435/depth_0.png"));
     fifo(&dir.join("camera/camera.toml"));
     let rig = "rig = \"r\"\n[[camera]]\nname = \"a\"\nbackend = \"files\"\nmanifest = \"camera\"\n";
     fs::write(dir.join("files.toml"), rig).unwrap();
@@ -112,10 +112,10 @@ fn a_fifo_or_a_device_in_the_place_of_a_file_is_refused_and_not_waited_for() {
         "import kinect f.mkv out",
         "import kinect f.mkv out --calibration f.json",
         "import rosbag f.bag out",
-        "import bytecameradepth pictures out",
+        "import bytecameradepth images out",
         "zed replay f.svo2 --out out --modes quality",
         "zed replay f --out out --modes quality",
-        "zed replay pictures --out out --modes quality --calibration f.conf",
+        "zed replay images --out out --modes quality --calibration f.conf",
         "config check f",
         "config check f.toml",
         "config check files.toml",
@@ -123,7 +123,7 @@ fn a_fifo_or_a_device_in_the_place_of_a_file_is_refused_and_not_waited_for() {
         "doctor f.toml",
         "stereo f.png f.png --out o.png",
         "eval --truth f.png --pred f.png",
-        "eval --truth pictures --pred pictures",
+        "eval --truth images --pred images",
         "cdm run --rgb f.png --depth f.png --depth-unit 0.001 --engine fill --out o.png",
         "cdm import f --name x",
         "cdm verify f",
@@ -135,7 +135,7 @@ fn a_fifo_or_a_device_in_the_place_of_a_file_is_refused_and_not_waited_for() {
         named += usize::from(said.contains("it is a FIFO") || said.contains("it is a device"));
     }
     // The others end at something else first, such as an argument that they need.
-    assert!(named >= 25, "{named} say what it is");
+    assert!(named >= 25, "{named} name the file type");
     let said = text(&run(dir, &["recover", "segment"]));
     assert!(said.contains("it is a FIFO; a regular file is needed"), "{said}");
 }
@@ -148,10 +148,10 @@ fn a_fifo_beside_what_is_good_is_refused_by_name() {
     for name in ["f.conf", "f.json", "f.npy"] {
         fifo(&dir.join(name));
     }
-    for name in ["eyes", "lens", "models/x", "root/etc/udev/rules.d"] {
+    for name in ["pairs", "lens", "models/x", "root/etc/udev/rules.d"] {
         fs::create_dir_all(dir.join(name)).unwrap();
     }
-    image::GrayImage::new(2 * 672, 376).save(dir.join("eyes/1.png")).unwrap();
+    image::GrayImage::new(2 * 672, 376).save(dir.join("pairs/1.png")).unwrap();
     image::RgbImage::new(8, 6).save(dir.join("c.png")).unwrap();
     image::ImageBuffer::<image::Luma<u16>, _>::new(8, 6).save(dir.join("z.png")).unwrap();
     let recording = Fixture::small();
@@ -165,7 +165,7 @@ fn a_fifo_beside_what_is_good_is_refused_by_name() {
     fifo(&dir.join("models/x/model.toml"));
     fifo(&dir.join("root/etc/udev/rules.d/70-depthrig.rules"));
     for line in [
-        "zed replay eyes --out out --modes quality --calibration f.conf",
+        "zed replay pairs --out out --modes quality --calibration f.conf",
         "import kinect good.mkv out --calibration f.json",
         "cdm list --models models",
         "config check lens.toml",
@@ -214,10 +214,10 @@ fn nothing_is_written_into_what_is_read() {
     let home = tempfile::tempdir().unwrap();
     let dir = home.path();
     dataset(dir, "ds", "", "");
-    fs::create_dir(dir.join("pictures")).unwrap();
-    fs::create_dir(dir.join("pictures/camera_d435")).unwrap();
+    fs::create_dir(dir.join("images")).unwrap();
+    fs::create_dir(dir.join("images/camera_d435")).unwrap();
     let listed = |name: &str| fs::read_dir(dir.join(name)).unwrap().count();
-    let before = [listed("ds"), listed("pictures")];
+    let before = [listed("ds"), listed("images")];
     for line in [
         "export lerobot ds ds/inner",
         "export lerobot ds ds",
@@ -228,14 +228,14 @@ fn nothing_is_written_into_what_is_read() {
         "cat ds --stream a/imu --out ds/inner",
         "cdm relabel ds ds/inner --engine fill",
         "zed replay ds --out ds/inner --modes quality",
-        "zed replay pictures --out pictures/inner --modes quality",
-        "import bytecameradepth pictures pictures/inner",
+        "zed replay images --out images/inner --modes quality",
+        "import bytecameradepth images images/inner",
     ] {
         let args: Vec<_> = line.split_whitespace().collect();
         let output = run(dir, &args);
         let said = text(&output);
         assert!(!output.status.success(), "{line}: {said}");
-        assert_eq!([listed("ds"), listed("pictures")], before, "{line}: {said}");
+        assert_eq!([listed("ds"), listed("images")], before, "{line}: {said}");
         assert!(said.contains("which is read and must stay as it is"), "{line}: {said}");
     }
 }

@@ -1,11 +1,11 @@
-//! `depthrig zed replay` as a person meets it: what it prints, its exit codes, and what it says of input that will not do.
+//! `depthrig zed replay` from the command line: its output, its exit codes, and its messages for invalid input.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 #[path = "support/home.rs"]
 mod support;
 
-use depthrig_cdm::MadeNetwork;
-use depthrig_drivers::zed::replay::made::{MadeSvo, SERIAL, noise};
+use depthrig_cdm::FakeNetwork;
+use depthrig_drivers::zed::replay::fake::{FakeSvo, SERIAL, noise};
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -13,39 +13,41 @@ use std::process::Command;
 use std::time::Duration;
 use support::Home;
 
-/// One eye of a ZED in VGA.
-const EYE: (u32, u32) = (672, 376);
-/// Disparity of the wall, pixels; with 300 pixels of focal length and 0.12 m between the eyes it is 1.8 m away.
+/// Size of one image of a ZED in VGA.
+const IMAGE_SIZE: (u32, u32) = (672, 376);
+/// Disparity of the wall, pixels; with 300 pixels of focal length and a baseline of 0.12 m it is 1.8 m away.
 const DISPARITY: u32 = 20;
 
-/// A factory calibration of straight eyes, without the lines that begin with one of `without`.
+/// A factory calibration of aligned cameras, without the lines that begin with one of `without`.
 fn conf(without: &[&str]) -> String {
-    let eye =
+    let side =
         |e: &str| format!("[{e}_CAM_VGA]\nfx=300\nfy=300\ncx=336\ncy=188\nk1=0\nk2=0\np1=0\np2=0\nk3=0\n");
     let stereo = "[STEREO]\nBaseline=120\nTY=0\nTZ=0\nCV_VGA=0\nRX_VGA=0\nRZ_VGA=0\n";
-    let text = format!("{stereo}{}{}", eye("LEFT"), eye("RIGHT"));
+    let text = format!("{stereo}{}{}", side("LEFT"), side("RIGHT"));
     text.split_inclusive('\n').filter(|l| !without.iter().any(|w| l.starts_with(w))).collect()
 }
 
-/// Both eyes beside each other: a wall of noise, another one for each `n`, in `width` pixels.
+/// Left and right image side by side: a wall of noise, different for each `n`, `width` pixels wide.
 fn side_by_side((width, height): (u32, u32), n: u32, swapped: bool) -> image::GrayImage {
-    let eye = width / 2;
+    let side = width / 2;
     let spot = |x: u32, y: u32| {
         let v = (x / 2).wrapping_mul(7919) ^ (y / 2).wrapping_mul(104_729) ^ n.wrapping_mul(15_485_863);
         (v.wrapping_mul(2_654_435_761) >> 13) as u8
     };
     image::GrayImage::from_fn(width, height, |x, y| {
-        let is_right = (x >= eye) != swapped;
-        image::Luma([spot(x % eye.max(1) + if is_right { DISPARITY } else { 0 }, y)])
+        let is_right = (x >= side) != swapped;
+        image::Luma([spot(x % side.max(1) + if is_right { DISPARITY } else { 0 }, y)])
     })
 }
 
-/// A folder with so many pairs and the camera's calibration.
+/// A folder with `pairs` pairs and the camera's calibration.
 fn folder(home: &Home, name: &str, pairs: u32, swapped: bool) -> String {
     let dir = home.path().join(name);
     std::fs::create_dir_all(&dir).unwrap();
     for n in 0..pairs {
-        side_by_side((2 * EYE.0, EYE.1), n, swapped).save(dir.join(format!("pair_{n:03}.png"))).unwrap();
+        side_by_side((2 * IMAGE_SIZE.0, IMAGE_SIZE.1), n, swapped)
+            .save(dir.join(format!("pair_{n:03}.png")))
+            .unwrap();
     }
     std::fs::write(dir.join("SN123.conf"), conf(&[])).unwrap();
     dir.to_str().unwrap().to_owned()
@@ -55,13 +57,13 @@ fn path(home: &Home, name: &str) -> String {
     home.path().join(name).to_str().unwrap().to_owned()
 }
 
-/// It is refused as wrong usage with these words, and nothing is left of it.
+/// Asserts that it is refused as wrong usage with these words, and leaves nothing behind.
 #[track_caller]
 fn refused(home: &Home, input: &str, more: &[&str], words: &[&str]) {
     ends(2, home, input, more, words);
 }
 
-/// It fails with these words, because a file is not what it must be, and nothing is left of it.
+/// Asserts that it fails with these words because of an invalid file, and leaves nothing behind.
 #[track_caller]
 fn failed(home: &Home, input: &str, more: &[&str], words: &[&str]) {
     ends(1, home, input, more, words);
@@ -84,20 +86,21 @@ fn ends(code: i32, home: &Home, input: &str, more: &[&str], words: &[&str]) {
 #[test]
 fn what_it_prints_and_that_nothing_is_overwritten() {
     let home = Home::new();
-    let (input, out) = (folder(&home, "in", 3, false), path(&home, "out"));
+    let input = folder(&home, "in", 3, false);
+    let out = path(&home, "out");
     // The order of the modes is the one that was asked for.
     let args = ["zed", "replay", &input, "--out", &out, "--modes", "quality,performance"];
     let ran = home.run(&[&args[..], &["--json"]].concat());
     assert_eq!(ran.code, 0, "{}", ran.err);
-    let told: Value = serde_json::from_str(&ran.out).expect("nothing but JSON on the standard output");
+    let report: Value = serde_json::from_str(&ran.out).expect("nothing but JSON on the standard output");
     let names = |key: &str| -> Vec<String> {
-        told["modes"].as_array().unwrap().iter().map(|m| m[key].as_str().unwrap().to_owned()).collect()
+        report["modes"].as_array().unwrap().iter().map(|m| m[key].as_str().unwrap().to_owned()).collect()
     };
     assert_eq!(names("mode"), ["quality", "performance"]);
     assert_eq!(names("recorded_as"), ["mimic_quality", "mimic_performance"]);
-    assert_eq!((&told["sets"], &told["lost"], &told["ended"]), (&3.into(), &0.into(), &false.into()));
-    assert_eq!(told["modes"][0]["frames"], 3);
-    assert!(told["cpu"]["stereo_s"].as_f64().unwrap() > 0.0 && told["verified"].is_object(), "{told}");
+    assert_eq!((&report["sets"], &report["lost"], &report["ended"]), (&3.into(), &0.into(), &false.into()));
+    assert_eq!(report["modes"][0]["frames"], 3);
+    assert!(report["cpu"]["stereo_s"].as_f64().unwrap() > 0.0 && report["verified"].is_object(), "{report}");
     // Not a terminal: plain lines, no codes.
     assert!(ran.err.contains("depth: 100 %") && ran.err.contains("verify: 100 %"), "{}", ran.err);
     assert!(!ran.err.contains('\x1b') && !ran.err.contains('\r'), "{:?}", ran.err);
@@ -133,7 +136,8 @@ fn what_it_prints_and_that_nothing_is_overwritten() {
 #[test]
 fn a_terminal_gets_a_bar() {
     let home = Home::new();
-    let (input, out) = (folder(&home, "in", 2, false), path(&home, "out"));
+    let input = folder(&home, "in", 2, false);
+    let out = path(&home, "out");
     let line = format!(
         "'{}' zed replay '{input}' --out '{out}' --modes performance > '{}'",
         env!("CARGO_BIN_EXE_depthrig"),
@@ -149,14 +153,15 @@ fn a_terminal_gets_a_bar() {
     assert!(ran.status.success(), "{shown}");
     assert!(shown.contains('\x1b') && shown.contains("depth") && shown.contains('['), "{shown:?}");
     assert!(!shown.contains("depth: 100 %"), "no plain lines beside the bar: {shown:?}");
-    let told = std::fs::read_to_string(home.path().join("stdout")).unwrap();
-    assert!(told.contains("2 sets") && !told.contains('\x1b'), "{told:?}");
+    let report = std::fs::read_to_string(home.path().join("stdout")).unwrap();
+    assert!(report.contains("2 sets") && !report.contains('\x1b'), "{report:?}");
 }
 
 #[test]
 fn modes_that_are_not_there() {
     let home = Home::new();
-    let (input, out) = (folder(&home, "in", 1, false), path(&home, "out"));
+    let input = folder(&home, "in", 1, false);
+    let out = path(&home, "out");
     refused(
         &home,
         &input,
@@ -174,9 +179,9 @@ fn modes_that_are_not_there() {
     let ran =
         home.run(&["zed", "replay", &input, "--out", &out, "--modes", "performance,neural", "--json", "-q"]);
     assert_eq!(ran.code, 3, "{}", ran.err);
-    let told: Value = serde_json::from_str(&ran.out).unwrap();
-    assert_eq!(told["modes"].as_array().unwrap().len(), 1);
-    assert!(told["unavailable"][0].as_str().unwrap().contains("unavailable, because"), "{told}");
+    let report: Value = serde_json::from_str(&ran.out).unwrap();
+    assert_eq!(report["modes"].as_array().unwrap().len(), 1);
+    assert!(report["unavailable"][0].as_str().unwrap().contains("unavailable, because"), "{report}");
     home.run(&["verify", &out]).good();
 }
 
@@ -185,7 +190,7 @@ fn a_network_of_another_kind() {
     let home = Home::new();
     let input = folder(&home, "in", 1, false);
     let file = home.path().join("net.onnx");
-    let wrong = MadeNetwork { channels: 4, ..MadeNetwork::default() };
+    let wrong = FakeNetwork { channels: 4, ..FakeNetwork::default() };
     std::fs::write(&file, wrong.file()).unwrap();
     let args = ["--modes", "neural", "--network", file.to_str().unwrap()];
     let ran = home.run(&[&["zed", "replay", &input, "--out", &path(&home, "out")], &args[..]].concat());
@@ -204,15 +209,15 @@ fn a_network_of_another_kind() {
 }
 
 #[test]
-fn pictures_that_will_not_do() {
+fn images_that_will_not_do() {
     let home = Home::new();
     let swapped = folder(&home, "swapped", 2, true);
     refused(&home, &swapped, &[], &["left and right are swapped"]);
     let odd = home.path().join("odd");
     std::fs::create_dir(&odd).unwrap();
-    side_by_side((2 * EYE.0 - 1, EYE.1), 0, false).save(odd.join("1.png")).unwrap();
+    side_by_side((2 * IMAGE_SIZE.0 - 1, IMAGE_SIZE.1), 0, false).save(odd.join("1.png")).unwrap();
     std::fs::write(odd.join("SN123.conf"), conf(&[])).unwrap();
-    failed(&home, odd.to_str().unwrap(), &[], &["an odd width is no two eyes", "1343x376"]);
+    failed(&home, odd.to_str().unwrap(), &[], &["a side-by-side image has an even width", "1343x376"]);
     let empty = home.path().join("empty");
     std::fs::create_dir(&empty).unwrap();
     failed(&home, empty.to_str().unwrap(), &[], &["no side-by-side images"]);
@@ -224,7 +229,8 @@ fn pictures_that_will_not_do() {
 #[test]
 fn a_pair_that_cannot_be_read_is_lost_and_said() {
     let home = Home::new();
-    let (input, out) = (folder(&home, "in", 3, false), path(&home, "out"));
+    let input = folder(&home, "in", 3, false);
+    let out = path(&home, "out");
     let damaged = Path::new(&input).join("pair_001.png");
     let mut bytes = std::fs::read(&damaged).unwrap();
     // One that is cut off is seen at once, when all of them are looked at.
@@ -236,9 +242,9 @@ fn a_pair_that_cannot_be_read_is_lost_and_said() {
     let ran = home.run(&["zed", "replay", &input, "--out", &out, "--modes", "performance", "--json", "-q"]);
     assert_eq!(ran.code, 3, "{}", ran.err);
     assert!(ran.err.contains("lost: pair 1 of") && ran.err.contains("pair_001.png"), "{}", ran.err);
-    let told: Value = serde_json::from_str(&ran.out).unwrap();
+    let report: Value = serde_json::from_str(&ran.out).unwrap();
     assert_eq!(
-        (&told["sets"], &told["lost"], &told["modes"][0]["frames"]),
+        (&report["sets"], &report["lost"], &report["modes"][0]["frames"]),
         (&3.into(), &1.into(), &2.into())
     );
 }
@@ -260,7 +266,7 @@ fn calibrations_that_will_not_do() {
     // Half as large: the file has nothing for it.
     let small = home.path().join("small");
     std::fs::create_dir(&small).unwrap();
-    side_by_side((EYE.0, EYE.1 / 2), 0, false).save(small.join("1.png")).unwrap();
+    side_by_side((IMAGE_SIZE.0, IMAGE_SIZE.1 / 2), 0, false).save(small.join("1.png")).unwrap();
     let whole = home.write("whole.conf", &conf(&[]));
     let args = ["--calibration", whole.as_str()];
     failed(&home, small.to_str().unwrap(), &args, &["336x188", "672x376", "must not be resized"]);
@@ -278,15 +284,15 @@ fn svo2_files_that_will_not_do() {
         file.to_str().unwrap().to_owned()
     };
     home.write(&format!("SN{SERIAL}.conf"), &conf(&[]));
-    let mut secret = MadeSvo::new(EYE, (0..3).map(|_| noise(3000)).collect());
-    secret.header = Some(MadeSvo::header_of(EYE, "5.0.1", true));
+    let mut secret = FakeSvo::new(IMAGE_SIZE, (0..3).map(|_| noise(3000)).collect());
+    secret.header = Some(FakeSvo::header_of(IMAGE_SIZE, "5.0.1", true));
     failed(
         &home,
         &write("secret.svo2", &secret.build()),
         &[],
         &["secret.svo2", "it is encrypted", "convert it"],
     );
-    let whole = MadeSvo::strips(EYE, 3).build();
+    let whole = FakeSvo::strips(IMAGE_SIZE, 3).build();
     failed(&home, &write("cut.svo2", &whole[..40]), &[], &["cut.svo2"]);
     failed(&home, &write("text.svo2", b"not a recording"), &[], &["text.svo2"]);
     let good = write("good.svo2", &whole);
@@ -305,7 +311,9 @@ fn segments(out: &str) -> usize {
 #[test]
 fn it_goes_on_where_it_was_killed() {
     let home = Home::new();
-    let (input, out, whole) = (folder(&home, "in", 12, false), path(&home, "out"), path(&home, "whole"));
+    let input = folder(&home, "in", 12, false);
+    let out = path(&home, "out");
+    let whole = path(&home, "whole");
     // A segment for each pair: they are 20 s apart.
     let with = |out: &str| -> Vec<String> {
         let args = [
@@ -340,10 +348,10 @@ fn it_goes_on_where_it_was_killed() {
     let other = run(&[with(&out), vec!["--depth-unit".into(), "0.0001".into()]].concat());
     assert_eq!(other.code, 1, "{}", other.err);
     assert!(other.err.contains("begun with another depth_unit_m"), "{}", other.err);
-    let told: Value =
+    let report: Value =
         serde_json::from_str(&run(&[with(&out), vec!["--json".into()]].concat()).good()).unwrap();
-    assert_eq!(told["sets"], 12);
-    assert!(told["resumed"].as_u64().unwrap() >= 4, "finished segments are kept: {told}");
+    assert_eq!(report["sets"], 12);
+    assert!(report["resumed"].as_u64().unwrap() >= 4, "finished segments are kept: {report}");
     assert!(!Path::new(&format!("{out}.zedreplay")).exists());
     home.run(&["compare", &whole, &out, "--strict"]).good();
     // Ctrl-C instead: exit code 1, and the way to go on is said.
@@ -355,6 +363,6 @@ fn it_goes_on_where_it_was_killed() {
     }
     let ended = running.interrupt();
     assert_eq!(ended.code, 1, "{}{}", ended.out, ended.err);
-    assert!(ended.out.contains("run it again to go on"), "{}", ended.out);
+    assert!(ended.out.contains("run it again to resume"), "{}", ended.out);
     run(&args).good();
 }

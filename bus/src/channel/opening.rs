@@ -1,4 +1,4 @@
-//! Opening or creating the services of a channel, while other processes do the same, or were killed doing it.
+//! Opens or creates the services of a channel while other processes do the same, or were killed doing it.
 
 use crate::HostTime;
 use crate::channel::IoxService;
@@ -17,7 +17,7 @@ use iceoryx2::service::service_name::ServiceName;
 
 const RETRIES: u32 = 20;
 const RETRY_PAUSE: Duration = Duration::from_millis(20);
-/// Making or removing a service takes microseconds; one that is half made or half removed for so long stays so.
+/// Creating or removing a service takes microseconds; one that stays incomplete for this long is abandoned.
 const HALF: Duration = Duration::from_secs(1);
 
 /// Why a service cannot be opened or created now.
@@ -25,7 +25,7 @@ pub(super) trait Failure {
     /// Whether it passes by itself: another process is just making or removing the service.
     fn is_passing(&self) -> bool;
 
-    /// Whether the service is half made or half removed, and nobody can use it.
+    /// Whether the service is half created or half removed, and nobody can use it.
     fn is_half(&self) -> bool;
 }
 
@@ -87,7 +87,7 @@ impl Failure for EventOpenOrCreateError {
 }
 
 /// Opens or creates the service `name` of `node` with `open`, again while it is in a state that passes. Removes it first
-/// if it stays half made or half removed.
+/// if it stays half created or half removed.
 ///
 /// Whoever leaves a service last locks it, forgets that it had it, and only then removes its files. A process that is
 /// killed in between leaves files of which no dead process knows, and a channel that nobody can open any more.
@@ -108,7 +108,7 @@ pub(super) fn opened<T, E: Failure>(
     if !matches!(removed, Ok(true)) {
         return Err(failure);
     }
-    tracing::warn!(channel = %name, "removed what a killed process had left of the channel, half made or half removed");
+    tracing::warn!(channel = %name, "removed the incomplete channel that a killed process had left behind");
     retry(open)
 }
 

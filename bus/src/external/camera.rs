@@ -1,4 +1,4 @@
-//! The side of the process: a camera that it serves.
+//! The process's side: a camera that it serves.
 
 use super::mode::{check_all, invalid};
 use super::{
@@ -14,7 +14,7 @@ use iceoryx2::port::notifier::Notifier;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
-/// How often the heart-beat's thread looks whether it is to end.
+/// How often the heartbeat thread checks whether it must end.
 const LOOK: Duration = Duration::from_millis(50);
 /// Answers that are read at a time; the channel keeps no more.
 const MOST_AT_A_TIME: usize = 64;
@@ -26,7 +26,7 @@ const OFFER_SLOTS: usize = 24;
 /// ```no_run
 /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
 /// use depthrig_bus::{Name, PixelFormat, external::{About, ExternalCamera, ExternalFrame, Mode, Place}};
-/// let modes = [Mode::new(Name::new("color")?, PixelFormat::Rgb8, (640, 480), 30.0)];
+/// let modes = [Mode::new(Name::new("color")?, PixelFormat::Rgb8, 640, 480, 30.0)];
 /// let about = About { model: "Webcam".into(), serial: "1".into(), ..About::default() };
 /// let mut camera = ExternalCamera::offer(&Place::from_environment()?, &about, &modes)?;
 /// loop {
@@ -34,16 +34,16 @@ const OFFER_SLOTS: usize = 24;
 ///     // Start the device in the modes of `session.modes()`; on failure: `session.refuse(reason, "…")`.
 ///     session.started();
 ///     while session.is_wanted() {
-///         let picture = [0; 640 * 480 * 3]; // from the device
-///         session.send_copy(0, &ExternalFrame { device_time: 0, ..ExternalFrame::default() }, &picture)?;
+///         let image = [0; 640 * 480 * 3]; // from the device
+///         session.send_copy(0, &ExternalFrame { device_time: 0, ..ExternalFrame::default() }, &image)?;
 ///     }
 ///     // Stop the device.
 /// }
 /// # }
 /// ```
 ///
-/// Its heart-beat has a thread of its own, so that an SDK may take as long as it likes for a call. Dropping it ends the
-/// camera and frees its place.
+/// The heartbeat has a thread of its own, so an SDK call may take any time. Dropping the value ends the camera and
+/// frees its place.
 #[derive(Debug)]
 pub struct ExternalCamera {
     pub(super) shared: Arc<Shared>,
@@ -54,27 +54,27 @@ pub struct ExternalCamera {
     _lock: ExternalLock,
 }
 
-/// What the process's threads share.
+/// State shared by the process's threads.
 #[derive(Debug)]
 pub(super) struct Shared {
     pub(super) modes: Vec<Mode>,
     pub(super) instance: u64,
     pub(super) bell: Notifier<IoxService>,
-    station: Mutex<Station>,
+    offers: Mutex<OfferSender>,
     wanted: Mutex<Wanted>,
     pub(super) changed: Condvar,
     end: AtomicBool,
 }
 
-/// What is said, and the port to say it.
+/// The current offer, and the port that sends it.
 #[derive(Debug)]
-struct Station {
+struct OfferSender {
     out: Outlet<ExternalOffer>,
     offer: ExternalOffer,
     records: Vec<u8>,
 }
 
-/// What the daemon wants now.
+/// The daemon's current request.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Wanted {
     pub(super) session: u64,
@@ -88,7 +88,7 @@ impl ExternalCamera {
     /// Offers a camera at `place` in these modes; the first of each stream is its default.
     ///
     /// # Errors
-    /// [`ErrorKind::InUse`] naming the process that serves it already, [`ErrorKind::Other`] for modes that cannot be,
+    /// [`ErrorKind::InUse`] naming the process that serves it already, [`ErrorKind::Other`] for invalid modes,
     /// [`ErrorKind::VersionMismatch`] when the daemon runs with another version, else as [`Bus::open`].
     pub fn offer(place: &Place, about: &About, modes: &[Mode]) -> Result<Self> {
         let in_camera = |e: Error| {
@@ -106,7 +106,7 @@ impl ExternalCamera {
         Self::offer_unchecked(place, modes, offer, records)
     }
 
-    /// Offers what need not be what it says, for tests of the other side.
+    /// Offers unchecked content, for tests of the other side.
     #[doc(hidden)]
     pub fn offer_unchecked(
         place: &Place,
@@ -121,18 +121,21 @@ impl ExternalCamera {
         let lock = lock(&place.runtime, &place.rig, &place.camera, &who)?;
         let bus = Bus::open(&place.runtime, &place.rig)?;
         bus.clean_dead();
-        let (offers, answers) = (place.offers(), place.answers());
-        let station = Station { out: offers.outlet(bus.node(), records.len(), OFFER_SLOTS)?, offer, records };
+        let offers = place.offers();
+        let answers = place.answers();
+        let sender =
+            OfferSender { out: offers.outlet(bus.node(), records.len(), OFFER_SLOTS)?, offer, records };
         let shared = Arc::new(Shared {
             modes: modes.to_vec(),
             instance: offer.instance,
             bell: offers.notifier(bus.node())?,
-            station: Mutex::new(station),
+            offers: Mutex::new(sender),
             wanted: Mutex::default(),
             changed: Condvar::new(),
             end: AtomicBool::new(false),
         });
-        let (inlet, listener) = (answers.inlet(bus.node(), true)?, answers.listener(bus.node())?);
+        let inlet = answers.inlet(bus.node(), true)?;
+        let listener = answers.listener(bus.node())?;
         shared.say()?;
         let theirs = Arc::clone(&shared);
         let thread = std::thread::Builder::new()
@@ -147,15 +150,16 @@ impl ExternalCamera {
         &self.shared.modes
     }
 
-    /// Says that the camera cannot be had now, and why: it is unplugged, or somebody else holds it. The process stays.
+    /// Reports that the camera is unavailable, and why: it is unplugged, or another process holds it. The process
+    /// stays.
     ///
     /// # Errors
-    /// [`ErrorKind::Other`] when the daemon cannot be told.
+    /// [`ErrorKind::Other`] when the message cannot be sent.
     pub fn unavailable(&mut self, reason: ExternalReason, why: &str) -> Result<()> {
         self.shared.stand(0, ExternalState::Refused, reason, why)
     }
 
-    /// Says that the camera can be had again.
+    /// Reports that the camera is available again.
     ///
     /// # Errors
     /// As [`Self::unavailable`].
@@ -163,7 +167,7 @@ impl ExternalCamera {
         self.shared.stand(0, ExternalState::Idle, ExternalReason::None, "")
     }
 
-    /// Ends the camera and says why.
+    /// Ends the camera and reports why.
     pub fn end(self, reason: ExternalReason, why: &str) {
         self.shared.last_words(reason, why);
     }
@@ -196,12 +200,12 @@ impl Shared {
         wanted.refusal.clone().filter(|_| wanted.session == session)
     }
 
-    /// Waits until the daemon says that `session` is to stop; whether it did.
-    pub(super) fn wait_for_stop(&self, session: u64, patience: Duration) -> bool {
-        let deadline = HostTime::now().plus(patience);
+    /// Waits until the daemon ends `session`; returns whether it did.
+    pub(super) fn wait_for_stop(&self, session: u64, timeout: Duration) -> bool {
+        let deadline = HostTime::now().plus(timeout);
         let mut wanted = self.wanted();
         loop {
-            // Of a daemon that is gone nothing was heard, and nothing is wanted either.
+            // A daemon that is gone sends nothing and wants nothing.
             if wanted.session == session && wanted.modes.is_empty() && wanted.heard.is_some() {
                 return wanted.refusal.is_none();
             }
@@ -214,7 +218,7 @@ impl Shared {
         }
     }
 
-    /// Says how the process stands from now on.
+    /// Sends the process's new state.
     pub(super) fn stand(
         &self,
         session: u64,
@@ -223,11 +227,11 @@ impl Shared {
         why: &str,
     ) -> Result<()> {
         {
-            let mut station = self.station.lock().unwrap_or_else(PoisonError::into_inner);
-            if station.offer.state == ExternalState::Ended as u32 {
+            let mut sender = self.offers.lock().unwrap_or_else(PoisonError::into_inner);
+            if sender.offer.state == ExternalState::Ended as u32 {
                 return Ok(());
             }
-            let offer = &mut station.offer;
+            let offer = &mut sender.offer;
             (offer.session, offer.state, offer.reason) = (session, state as u32, reason as u32);
             text::set(&mut offer.text, why);
         }
@@ -242,18 +246,18 @@ impl Shared {
 
     /// Sends the offer as it is now.
     fn say(&self) -> Result<()> {
-        let mut station = self.station.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut loan = station.out.loan(station.records.len())?;
-        channel::bytes_mut(&mut loan).copy_from_slice(&station.records);
-        station.offer.number += 1;
-        station.offer.sent_ns = HostTime::now().ns();
-        *loan.user_header_mut() = station.offer;
-        station.out.send(loan)?;
-        channel::ring(&self.bell, station.out.what());
+        let mut sender = self.offers.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut loan = sender.out.loan(sender.records.len())?;
+        channel::bytes_mut(&mut loan).copy_from_slice(&sender.records);
+        sender.offer.number += 1;
+        sender.offer.sent_ns = HostTime::now().ns();
+        *loan.user_header_mut() = sender.offer;
+        sender.out.send(loan)?;
+        channel::ring(&self.bell, sender.out.what());
         Ok(())
     }
 
-    /// The thread of the heart-beat: says that the process is there, and hears what the daemon wants.
+    /// Heartbeat thread: sends the offer and reads the daemon's answers.
     fn beat(&self, inlet: &Inlet<ExternalAnswer>, listener: &Listener<IoxService>) {
         let mut due = HostTime::now().plus(HEARTBEAT);
         while !self.end.load(Ordering::Relaxed) {
@@ -271,10 +275,10 @@ impl Shared {
         }
     }
 
-    /// Takes in what the daemon said since.
+    /// Reads the daemon's answers since the last call.
     fn hear(&self, inlet: &Inlet<ExternalAnswer>) {
         let mut newest: Option<Wanted> = None;
-        // No more than that at a time: whoever floods the channel must not keep the heart-beat from being sent.
+        // No more than that at a time: a flooded channel must not delay the heartbeat.
         for _ in 0..MOST_AT_A_TIME {
             match inlet.try_receive() {
                 Ok(Some(sample)) => {
@@ -296,7 +300,7 @@ impl Shared {
             }
         }
         let mut wanted = self.wanted();
-        // Of two that answer, such as a thread of the daemon that was given up, the later session counts.
+        // If two answer, such as an abandoned thread of the daemon, the later session counts.
         if let Some(newest) = newest.filter(|n| n.session == 0 || n.session >= wanted.session) {
             let changed = (wanted.session, &wanted.modes, &wanted.refusal)
                 != (newest.session, &newest.modes, &newest.refusal);
@@ -305,7 +309,7 @@ impl Shared {
                 self.changed.notify_all();
             }
         } else if wanted.heard.is_some_and(|t| t.elapsed() > SILENCE) {
-            // The daemon is gone. A session is not taken up twice, so what was wanted then is wanted no more.
+            // The daemon is gone. A session is never resumed, so its request is cleared.
             wanted.modes.clear();
             wanted.heard = None;
             self.changed.notify_all();
@@ -314,7 +318,8 @@ impl Shared {
 }
 
 impl Wanted {
-    /// What an answer that may hold anything says, if it is one to start `instance` of a process with so many modes.
+    /// Decodes an answer with arbitrary content, if it is addressed to start `instance` of a process with so many
+    /// modes.
     pub(super) fn decode(
         answer: &ExternalAnswer,
         payload: &[u8],
@@ -335,7 +340,7 @@ impl Wanted {
             );
             return Some(Self { refusal: Some(why), ..wanted });
         }
-        // An answer of before must not stop what runs now.
+        // An old answer must not stop the current session.
         if HostTime::from_ns(answer.sent_ns).elapsed() > SILENCE {
             return None;
         }
@@ -345,7 +350,8 @@ impl Wanted {
         };
         let counted = (payload.len(), answer.modes as usize) == (modes, modes);
         if want == ExternalWant::Run && !counted {
-            let (says, bytes) = (answer.modes, payload.len());
+            let says = answer.modes;
+            let bytes = payload.len();
             let why = format!("it answers for {says} modes in {bytes} bytes, and this camera has {modes}");
             return Some(Self { refusal: Some(why), ..wanted });
         }
@@ -367,7 +373,7 @@ impl Wanted {
     }
 }
 
-/// What cannot be offered, and what has no such mode.
+/// The error for a mode that the session does not run.
 pub(super) fn no_such_mode(mode: usize) -> Error {
     invalid(&format!("mode {mode} is not one that the session runs"))
 }

@@ -1,4 +1,4 @@
-//! The layouts of the hand-shake as data: what mirrors in other languages are generated from and tested against.
+//! The layouts of the hand-shake as data, from which mirrors in other languages are generated and tested.
 
 use super::{ExternalAnswer, ExternalFrame, ExternalMode, ExternalOffer};
 use crate::Field;
@@ -100,7 +100,8 @@ pub const FRAME_FIELDS: &[Field] = fields! { ExternalFrame;
 };
 
 const fn total(fields: &[Field]) -> usize {
-    let (mut sum, mut i) = (0, 0);
+    let mut sum = 0;
+    let mut i = 0;
     while i < fields.len() {
         assert!(fields[i].offset == sum, "a gap between two fields");
         sum += fields[i].bytes();

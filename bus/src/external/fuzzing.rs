@@ -1,7 +1,6 @@
-//! What the fuzz target `external` calls for the messages of the hand-shake: bytes that another process may have written,
-//! through the code that reads them. `docs/fuzzing.md` says how it is run.
-//!
-//! A panic is a finding; so is a broken promise, which is why there are assertions here.
+//! Entry points of the fuzz target `external` for the messages of the hand-shake: passes bytes that another process may
+//! have written through the code that reads them. `docs/fuzzing.md` says how to run it.
+//! A panic is a finding; so is a violated contract, hence the assertions.
 
 use super::camera::Wanted;
 use super::{
@@ -10,11 +9,10 @@ use super::{
 };
 use crate::HostTime;
 
-/// Bytes as an offer: its header, and what comes behind it as its modes. What is offered, if it is taken.
+/// Decodes bytes as an offer: the header, then the modes. Returns the offer if it is accepted.
 ///
 /// # Panics
-/// When an offer is taken that has no or too many modes, numbers that cannot be, or another meaning when it is written
-/// again.
+/// When an accepted offer has no or too many modes, invalid numbers, or another meaning once re-encoded.
 pub fn offer(bytes: &[u8]) -> Option<Offer> {
     let (header, payload) = bytes.split_first_chunk()?;
     let header = plain::offer_of(header);
@@ -43,17 +41,17 @@ pub fn offer(bytes: &[u8]) -> Option<Offer> {
     Some(offer)
 }
 
-/// Bytes as an answer: a byte that says how many modes the process has, the header, the payload. How many modes are to
-/// run, and 1; 0 for what is no answer.
+/// Decodes bytes as an answer: the process's number of modes in one byte, the header, the payload. Returns the number
+/// of modes to run plus 1; 0 if the bytes are not an answer.
 ///
 /// # Panics
-/// When a mode is to run that the process does not have, or a refusal is longer than its field.
+/// When the answer runs a mode that the process does not have, or a refusal is longer than its field.
 pub fn answer(bytes: &[u8]) -> u64 {
     let Some((modes, rest)) = bytes.split_first() else { return 0 };
     let Some((header, payload)) = rest.split_first_chunk() else { return 0 };
     let mut header = plain::answer_of(header);
     let modes = usize::from(*modes).min(MAX_MODES);
-    // One that is of before is passed over, so it is made one of now; as it came it is read too.
+    // Outdated answers are skipped: decode it as it is, then with a current time.
     let _ = Wanted::decode(&header, payload, header.instance, modes);
     header.sent_ns = HostTime::now().ns();
     let Some(wanted) = Wanted::decode(&header, payload, header.instance, modes) else { return 0 };
@@ -62,17 +60,17 @@ pub fn answer(bytes: &[u8]) -> u64 {
     1 + wanted.modes.len() as u64
 }
 
-/// Bytes as a mode; `None` when it cannot be one.
+/// Decodes bytes as a mode; `None` when they are invalid.
 pub fn mode(bytes: &[u8; MODE_BYTES]) -> Option<Mode> {
     Mode::decode(&plain::mode_of(bytes)).ok()
 }
 
-/// Bytes as a frame's header, whatever they are.
+/// Decodes arbitrary bytes as a frame header.
 pub const fn frame(bytes: &[u8; size_of::<ExternalFrame>()]) -> ExternalFrame {
     plain::frame_of(bytes)
 }
 
-/// What `about` and `modes` are on the bus, for seeds: an offer as [`offer`] takes it.
+/// Encodes `about` and `modes` as the offer that [`offer`] takes, for seeds.
 pub fn offer_bytes(about: &About, modes: &[Mode]) -> Vec<u8> {
     let mut header =
         ExternalOffer { instance: 7, number: 1, modes: modes.len() as u32, ..ExternalOffer::default() };
@@ -82,17 +80,17 @@ pub fn offer_bytes(about: &About, modes: &[Mode]) -> Vec<u8> {
     bytes
 }
 
-/// An answer as [`answer`] takes it, for seeds.
+/// Encodes an answer as [`answer`] takes it, for seeds.
 pub fn answer_bytes(header: &ExternalAnswer, payload: &[u8]) -> Vec<u8> {
     [&[payload.len() as u8], &plain::bytes_of_answer(header)[..], payload].concat()
 }
 
-/// What a mode is on the bus, for seeds.
+/// Encodes a mode, for seeds.
 pub fn mode_bytes(mode: &Mode) -> [u8; MODE_BYTES] {
     plain::bytes_of_mode(&mode.encode())
 }
 
-/// What a frame's header is on the bus, for seeds.
+/// Encodes a frame header, for seeds.
 pub const fn frame_bytes(header: &ExternalFrame) -> [u8; size_of::<ExternalFrame>()] {
     plain::bytes_of_frame(header)
 }

@@ -1,13 +1,13 @@
-//! The bytes of the hand-shake with a camera that another process serves. docs/external.md says what they mean together.
+//! The bytes of the hand-shake with a camera that another process serves. docs/external.md defines the protocol.
 //!
 //! As in [`crate::FrameHeader`]: a field is never moved or given another meaning within one [`VERSION`], new fields take
-//! space from `reserved`, and every field lies at a multiple of its size, so there is no hidden padding.
+//! space from `reserved`, and every field lies at a multiple of its size, so nothing is padded implicitly.
 
 use super::{OFFER_MAGIC, TEXT_BYTES, VERSION};
 use crate::{Intrinsics, Pose};
 use iceoryx2::prelude::ZeroCopySend;
 
-/// What the process says: what it serves, and how it stands. Sent with every change and with every heart-beat; the
+/// The process's message: the camera that it serves, and its state. Sent with every change and every heartbeat; the
 /// payload is [`ExternalOffer::modes`] records of [`ExternalMode`].
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
@@ -21,13 +21,13 @@ pub struct ExternalOffer {
     pub size: u16,
     /// A number that every start of the process chooses anew; never 0.
     pub instance: u64,
-    /// Number of this message: 1, 2, 3, … A heart-beat is a message with a higher number.
+    /// Number of this message: 1, 2, 3, … A heartbeat is a message with a higher number.
     pub number: u64,
     /// When it was sent, nanoseconds of the host's `CLOCK_MONOTONIC`.
     pub sent_ns: i64,
     /// The session that `state` is about: the last one that the process has taken up; 0 before the first.
     pub session: u64,
-    /// How the process stands: an `ExternalState` code.
+    /// State of the process: an `ExternalState` code.
     pub state: u32,
     /// Why it refuses or ends: an `ExternalReason` code; 0 otherwise.
     pub reason: u32,
@@ -39,9 +39,9 @@ pub struct ExternalOffer {
     pub model: [u8; 32],
     /// Camera serial number, zero-padded UTF-8.
     pub serial: [u8; 32],
-    /// Firmware version, zero-padded UTF-8; empty when there is none.
+    /// Firmware version, zero-padded UTF-8; empty if the camera has none.
     pub firmware: [u8; 32],
-    /// Where the camera is attached, such as a USB port path, zero-padded UTF-8; empty when nobody knows.
+    /// Where the camera is attached, such as a USB port path, zero-padded UTF-8; empty if unknown.
     pub port: [u8; 32],
     /// Where the calibration comes from, such as `factory` or `none`, zero-padded UTF-8.
     pub calibration: [u8; 32],
@@ -62,9 +62,9 @@ pub struct ExternalMode {
     pub stream: [u8; 32],
     /// Frames per second, above 0, at most 1000.
     pub rate_hz: f64,
-    /// Metres per unit of `z16` depth; 1 for `depth_f32`, 0 when the pixels are no depth.
+    /// Metres per unit of `z16` depth; 1 for `depth_f32`, 0 when the pixels are not depth.
     pub depth_unit_m: f64,
-    /// Intrinsics of this picture at this size; all zero when no calibration is known.
+    /// Intrinsics of this image at this size; all zero when no calibration is known.
     pub intrinsics: Intrinsics,
     /// Pose of this stream's optical frame in the camera's frame: `p_device = R p_stream + t`.
     pub pose: Pose,
@@ -90,8 +90,8 @@ pub struct ExternalMode {
     pub reserved: [u64; 9],
 }
 
-/// What the daemon wants of the process. Sent with every change and with every heart-beat while it uses the camera; the
-/// payload has one byte for each mode of the offer, 1 for a mode that is to run and else 0.
+/// The daemon's message to the process. Sent with every change and every heartbeat while the daemon uses the camera;
+/// the payload has one byte for each mode of the offer, 1 for a mode to run and 0 otherwise.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
 #[type_name("depthrig.ExternalAnswer.v1")]
@@ -111,7 +111,7 @@ pub struct ExternalAnswer {
     /// Number of the session: a new one, higher than all before it, for every start of the camera. 0 when the offer itself
     /// is refused.
     pub session: u64,
-    /// What is wanted: an `ExternalWant` code.
+    /// The request: an `ExternalWant` code.
     pub want: u32,
     /// Why the offer or its frames are refused: an `ExternalReason` code; 0 otherwise.
     pub reason: u32,
@@ -138,19 +138,19 @@ pub struct ExternalFrame {
     pub size: u16,
     /// The `instance` of the process's offer.
     pub instance: u64,
-    /// The session that it is of; the daemon ignores frames of another one.
+    /// The session of the frame; the daemon ignores frames of another one.
     pub session: u64,
-    /// Number of this frame of the stream in the session: 1, 2, 3, … counting every frame that the process had in its
-    /// hands, also those that it could not send. A gap is counted as `queue_full`.
+    /// Number of this frame of the stream in the session: 1, 2, 3, … counting every frame that the process received
+    /// from the device, including those that it could not send. A gap is counted as `queue_full`.
     pub sequence: u64,
-    /// The device's own frame counter as it came; ignored when the mode has none. A gap that `sequence` does not explain
-    /// is counted as `device_gap`.
+    /// The device's own frame counter, unmodified; ignored when the mode has none. A gap that `sequence` does not
+    /// explain is counted as `device_gap`.
     pub device_sequence: u64,
-    /// Time of mid-exposure: ticks of the device's clock as they came, or nanoseconds of `CLOCK_MONOTONIC`, as the mode
-    /// says.
+    /// Time of mid-exposure: unmodified ticks of the device's clock, or nanoseconds of `CLOCK_MONOTONIC`, by the mode's
+    /// clock.
     pub device_time: u64,
-    /// When the process had the last byte, nanoseconds of `CLOCK_MONOTONIC`; 0 when it does not say, then the time of
-    /// the daemon's reading counts.
+    /// When the process had the last byte, nanoseconds of `CLOCK_MONOTONIC`; 0 if unknown, then the time at which the
+    /// daemon read it counts.
     pub arrival_time_ns: i64,
     /// Exposure time, nanoseconds; 0 when unknown.
     pub exposure_ns: u64,

@@ -1,4 +1,4 @@
-//! The side of the daemon: hears the process, tells it what is wanted, reads its frames.
+//! The daemon's side: reads the process's messages and frames, and answers them.
 
 use super::mode::{check_all, check_count, invalid};
 use super::{
@@ -28,28 +28,28 @@ pub struct ExternalLink {
     bus: Bus,
 }
 
-/// What a process said last.
+/// State and times of a process's last message.
 #[derive(Debug, Clone, Copy)]
 pub struct Beat {
-    /// Which start of the process.
+    /// Identifies this start of the process.
     pub instance: u64,
     /// Number of the message.
     pub number: u64,
     /// The session that the state is about.
     pub session: u64,
-    /// How it stands; `None` for a state of a later version.
+    /// State of the process; `None` for a state of a later version.
     pub state: Option<ExternalState>,
-    /// Why.
+    /// Reason of a refusal or an end.
     pub reason: ExternalReason,
     /// Process number.
     pub pid: u32,
-    /// When it was sent, at the latest now.
+    /// When it was sent; at most the current time.
     pub sent: HostTime,
     text: [u8; TEXT_BYTES],
 }
 
 impl Beat {
-    /// Why, in words; what is not text is left out.
+    /// The reason in words; bytes that are not text are left out.
     pub fn text(&self) -> String {
         text::shown(&self.text)
     }
@@ -68,20 +68,20 @@ impl Beat {
     }
 }
 
-/// What a process offers.
+/// A process's offer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Offer {
-    /// What it says of the camera.
+    /// Description of the camera.
     pub about: About,
     /// The modes, in the order that answers refer to.
     pub modes: Vec<Mode>,
 }
 
 impl Offer {
-    /// The offer of a header and a payload that may hold anything.
+    /// Decodes an offer from a header and payload with arbitrary content.
     ///
     /// # Errors
-    /// As [`Said::offer`].
+    /// As [`OfferMessage::offer`].
     pub fn decode(header: &ExternalOffer, payload: &[u8]) -> Result<Self> {
         let header = *header; // a copy, which the process cannot change any more
         if header.magic != OFFER_MAGIC {
@@ -99,10 +99,11 @@ impl Offer {
             ));
         }
         let (records, rest) = payload.as_chunks::<MODE_BYTES>();
-        // Before any is read: a process may send as much as the computer has memory.
+        // Checked before decoding: the payload may be as large as the computer's memory.
         check_count(header.modes as usize)?;
         if records.len() != header.modes as usize || !rest.is_empty() {
-            let (n, bytes) = (header.modes, payload.len());
+            let n = header.modes;
+            let bytes = payload.len();
             return Err(invalid(&format!(
                 "it says {n} modes of {MODE_BYTES} bytes, and sends {bytes} bytes"
             )));
@@ -117,38 +118,38 @@ impl Offer {
     }
 }
 
-/// A message of the process: what it says at a glance, and the whole of it.
+/// A message of the process: its state, and the offer still to be decoded.
 #[derive(Debug)]
-pub struct Said {
-    /// What it says of itself.
+pub struct OfferMessage {
+    /// State and times of the process.
     pub beat: Beat,
     sample: Received<ExternalOffer>,
 }
 
-impl Said {
-    /// What it offers, checked.
+impl OfferMessage {
+    /// Decodes and checks the offer.
     ///
     /// # Errors
-    /// [`ErrorKind::VersionMismatch`] naming both versions, [`ErrorKind::Other`] naming what of it cannot be.
+    /// [`ErrorKind::VersionMismatch`] naming both versions, [`ErrorKind::Other`] naming the invalid part.
     pub fn offer(&self) -> Result<Offer> {
         Offer::decode(self.sample.user_header(), self.sample.payload())
     }
 }
 
-/// What to tell a process.
+/// The daemon's answer to a process.
 #[derive(Debug, Clone, Copy)]
 pub struct Answer<'a> {
-    /// The start of the process that is meant.
+    /// The start of the process that it is addressed to.
     pub instance: u64,
     /// The session.
     pub session: u64,
-    /// What is wanted.
+    /// The request.
     pub want: ExternalWant,
-    /// Why it is refused.
+    /// Reason of a refusal.
     pub reason: ExternalReason,
-    /// The same in words.
+    /// The reason in words.
     pub text: &'a str,
-    /// One byte for each mode of the offer: 1 when it is to run.
+    /// One byte for each mode of the offer: 1 to run it.
     pub modes: &'a [u8],
 }
 
@@ -160,7 +161,8 @@ impl ExternalLink {
     /// [`Bus::subscriber`].
     pub fn open(place: &Place) -> Result<Self> {
         let bus = Bus::open(&place.runtime, &place.rig)?;
-        let (offers, answers) = (place.offers(), place.answers());
+        let offers = place.offers();
+        let answers = place.answers();
         Ok(Self {
             offers: offers.inlet(bus.node(), true)?,
             bell: offers.listener(bus.node())?,
@@ -172,23 +174,23 @@ impl ExternalLink {
         })
     }
 
-    /// The newest message of the process since the last call. `wanted` says of which messages; others are passed over.
+    /// The newest message of the process since the last call among those that `wanted` accepts; others are skipped.
     ///
     /// # Errors
     /// [`ErrorKind::Other`] when the process's memory cannot be mapped.
-    pub fn newest(&self, wanted: impl Fn(&Beat) -> bool) -> Result<Option<Said>> {
+    pub fn newest(&self, wanted: impl Fn(&Beat) -> bool) -> Result<Option<OfferMessage>> {
         let mut newest = None;
         for _ in 0..MOST_AT_A_TIME {
             let Some(sample) = self.offers.try_receive()? else { break };
             let beat = Beat::of(sample.user_header());
             if wanted(&beat) {
-                newest = Some(Said { beat, sample });
+                newest = Some(OfferMessage { beat, sample });
             }
         }
         Ok(newest)
     }
 
-    /// Sleeps until the process sent something or `timeout` has passed.
+    /// Waits until the process has sent a message or `timeout` has passed.
     ///
     /// # Errors
     /// [`ErrorKind::Other`] when the event cannot be waited for.
@@ -196,11 +198,11 @@ impl ExternalLink {
         channel::sleep(&self.bell, timeout, "the process's event")
     }
 
-    /// Tells the process what is wanted.
+    /// Sends an answer to the process.
     ///
     /// # Errors
     /// [`ErrorKind::NoSpace`] or [`ErrorKind::Other`] when it cannot be sent.
-    pub fn tell(&mut self, answer: &Answer<'_>) -> Result<()> {
+    pub fn answer(&mut self, answer: &Answer<'_>) -> Result<()> {
         let mut loan = self.out.loan(answer.modes.len())?;
         channel::bytes_mut(&mut loan).copy_from_slice(answer.modes);
         self.number += 1;
@@ -260,7 +262,7 @@ pub struct SentFrame {
 }
 
 impl SentFrame {
-    /// What it said of itself when it was read; the process cannot change this any more.
+    /// The header, copied when the frame was read; the process can no longer change it.
     pub const fn header(&self) -> &ExternalFrame {
         &self.header
     }

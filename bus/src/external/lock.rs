@@ -1,4 +1,4 @@
-//! Who serves a camera: a lock that the kernel frees with the process, however that ends.
+//! Lock of a served camera, which the kernel frees when the process ends, however it ends.
 
 use super::LOCK_SUFFIX;
 use crate::{CameraName, ErrorKind, Result, RigName, RuntimeDir};
@@ -17,8 +17,8 @@ fn path(runtime: &RuntimeDir, rig: &RigName, camera: &CameraName) -> PathBuf {
 /// Takes the right to serve `camera` of `rig`. `who` is shown to others that want it.
 ///
 /// # Errors
-/// [`ErrorKind::InUse`] naming the process that serves it, [`ErrorKind::PermissionDenied`] when the file cannot be
-/// opened.
+/// [`ErrorKind::InUse`] naming the process that serves it, [`ErrorKind::PermissionDenied`] when the file
+/// cannot be opened.
 pub fn lock(runtime: &RuntimeDir, rig: &RigName, camera: &CameraName, who: &str) -> Result<ExternalLock> {
     let path = path(runtime, rig, camera);
     let Some(file) = crate::runtime::take(&path, who)? else {
@@ -33,7 +33,7 @@ pub fn lock(runtime: &RuntimeDir, rig: &RigName, camera: &CameraName, who: &str)
     Ok(ExternalLock { _file: file })
 }
 
-/// Who serves `camera` of `rig` now, as that process described itself; `None` when nobody does.
+/// The process that serves `camera` of `rig` now, in its own words; `None` without one.
 pub fn holder(runtime: &RuntimeDir, rig: &RigName, camera: &CameraName) -> Option<String> {
     crate::runtime::holder_of(&path(runtime, rig, camera))
 }
@@ -49,7 +49,9 @@ mod tests {
         let tmp = tempfile::tempdir().unwrap();
         let runtime = RuntimeDir::at(tmp.path()).unwrap();
         let name = |n: &str| Name::new(n).unwrap();
-        let (rig, front, back) = (name("mount"), name("front"), name("back"));
+        let rig = name("mount");
+        let front = name("front");
+        let back = name("back");
         assert_eq!(holder(&runtime, &rig, &front), None);
         let first = lock(&runtime, &rig, &front, "process 42 (cam)").unwrap();
         let e = lock(&runtime, &rig, &front, "process 43 (cam)").unwrap_err();
@@ -63,7 +65,7 @@ mod tests {
             all,
             ["a/front process 44 (cam)", "mount/back process 43 (cam)", "mount/front process 42 (cam)"]
         );
-        assert!(runtime.running_rigs().is_empty(), "a camera's lock is no rig's");
+        assert!(runtime.running_rigs().is_empty(), "a camera's lock is not a rig's");
         drop(first);
         assert_eq!(holder(&runtime, &rig, &front), None);
         lock(&runtime, &rig, &front, "process 43 (cam)").unwrap();

@@ -1,4 +1,4 @@
-//! Which camera of which rig a process serves, and the channels that it shares with the daemon.
+//! The camera and rig that a process serves, and the channels that it shares with the daemon.
 
 use super::{
     BUFFER, CAMERA_VARIABLE, ExternalAnswer, ExternalFrame, ExternalOffer, LOCK_SUFFIX, MAX_EVENT_PORTS,
@@ -19,7 +19,7 @@ const TALK: Form = Form {
     listeners: MAX_EVENT_PORTS,
     loans: 2,
 };
-/// No history: a frame of before is nothing that anybody waits for.
+/// No history: nobody waits for an old frame.
 const FRAMES: Form = Form { history: 0, loans: 4, ..TALK };
 
 /// A camera of a rig of this user.
@@ -38,7 +38,7 @@ impl Place {
     /// `DEPTHRIG_CAMERA`, and the runtime folder.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`] when one of the variables is not set, [`ErrorKind::BadName`] when it is no name, else
+    /// [`ErrorKind::NotFound`] when one of the variables is not set, [`ErrorKind::BadName`] for an invalid name, else
     /// as [`RuntimeDir::of_user`].
     pub fn from_environment() -> Result<Self> {
         let name = |variable: &str| {
@@ -53,7 +53,7 @@ impl Place {
         Ok(Self { runtime: RuntimeDir::of_user()?, rig: name(RIG_VARIABLE)?, camera: name(CAMERA_VARIABLE)? })
     }
 
-    /// Who serves the camera now, as that process described itself; `None` when nobody does.
+    /// The process that serves the camera now, in its own words; `None` without one.
     pub fn holder(&self) -> Option<String> {
         super::holder(&self.runtime, &self.rig, &self.camera)
     }
@@ -88,7 +88,8 @@ pub fn served(runtime: &RuntimeDir) -> Vec<(Place, String)> {
     let Ok(entries) = std::fs::read_dir(runtime.path()) else { return Vec::new() };
     let place = |name: &str| {
         let (rig, camera) = name.strip_suffix(LOCK_SUFFIX)?.split_once('.')?;
-        let (rig, camera) = (Name::new(rig).ok()?, Name::new(camera).ok()?);
+        let rig = Name::new(rig).ok()?;
+        let camera = Name::new(camera).ok()?;
         Some(Place { runtime: runtime.clone(), rig, camera })
     };
     let mut served: Vec<_> = entries

@@ -1,5 +1,4 @@
-//! Records of the hand-shake as bytes and back: what another process wrote is bytes, and each record is checked before it is
-//! used.
+//! Converts records of the hand-shake to bytes and back; each record from another process is checked before use.
 #![allow(unsafe_code)] // transmutes between a record and its bytes
 
 use super::{ExternalAnswer, ExternalFrame, ExternalMode, ExternalOffer};

@@ -1,4 +1,4 @@
-//! The side of the process: frames of one session.
+//! The process's side: frames of one session.
 
 use super::camera::no_such_mode;
 use super::{ExternalCamera, ExternalFrame, ExternalReason, ExternalState, FRAME_SLOTS, Mode};
@@ -18,7 +18,7 @@ pub struct Session<'a> {
     refused: bool,
 }
 
-/// The way of one stream to the daemon.
+/// One stream's channel to the daemon.
 #[derive(Debug)]
 struct Port {
     mode: usize,
@@ -81,7 +81,7 @@ impl<'a> Session<'a> {
         self.modes.iter().filter_map(|i| Some((*i, self.camera.shared.modes.get(*i)?)))
     }
 
-    /// Says that the device streams. Sending a frame says it as well.
+    /// Reports that the device streams. Sending a frame implies it.
     pub fn started(&mut self) {
         if !self.running && !self.refused {
             self.running = true;
@@ -89,19 +89,19 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Says that the device cannot stream, and why; `why` is shown to the user as it is.
+    /// Reports that the device cannot stream, and why; `why` is shown to the user unchanged.
     pub fn refuse(mut self, reason: ExternalReason, why: &str) {
         self.refused = true;
         self.stand(ExternalState::Refused, reason, why);
     }
 
-    /// Says that there are no more frames, as files at their end have it, and waits up to `patience` until the daemon has
-    /// taken those that were sent; returns whether it says so. `why` is shown to the user.
-    pub fn finish(mut self, why: &str, patience: Duration) -> bool {
+    /// Reports that there are no more frames, such as at the end of a file, and waits up to `timeout` until the daemon
+    /// confirms that it has taken those that were sent; returns whether it did. `why` is shown to the user.
+    pub fn finish(mut self, why: &str, timeout: Duration) -> bool {
         self.refused = true;
         self.stand(ExternalState::Refused, ExternalReason::Finished, why);
-        // The channels stay until then, for a daemon that has not looked into them yet.
-        self.camera.shared.wait_for_stop(self.number, patience)
+        // The channels stay until then, for a daemon that has not read them yet.
+        self.camera.shared.wait_for_stop(self.number, timeout)
     }
 
     /// Whether the daemon still wants frames.
@@ -173,7 +173,7 @@ impl<'a> Session<'a> {
         Ok(true)
     }
 
-    /// Says that `n` frames of `mode` were lost before they could be sent.
+    /// Reports that `n` frames of `mode` were lost before they could be sent.
     pub fn lost(&mut self, mode: usize, n: u64) {
         if let Some(port) = self.ports.iter_mut().find(|p| p.mode == mode) {
             port.sequence = port.sequence.saturating_add(n);
@@ -182,7 +182,7 @@ impl<'a> Session<'a> {
 
     fn stand(&self, state: ExternalState, reason: ExternalReason, why: &str) {
         if let Err(e) = self.camera.shared.stand(self.number, state, reason, why) {
-            tracing::warn!(error = %e, "the daemon could not be told how the camera stands");
+            tracing::warn!(error = %e, "cannot send the camera's state to the daemon");
         }
     }
 }

@@ -29,7 +29,7 @@ pub fn get<'a, const N: usize>(field: &'a [u8; N], name: &str) -> Result<&'a str
     Ok(text)
 }
 
-/// The text of a field as far as it is one, for a sentence that is shown: what is not text is left out.
+/// The text of a field for display; bytes that are not text are left out.
 pub fn shown<const N: usize>(field: &[u8; N]) -> String {
     let len = field.iter().position(|b| *b == 0).unwrap_or(N);
     String::from_utf8_lossy(&field[..len]).chars().filter(|c| !c.is_control()).collect()

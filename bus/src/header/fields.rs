@@ -1,4 +1,4 @@
-//! The layout of the header as data: what mirrors in other languages are generated from and tested against.
+//! The layout of the header as data, from which mirrors in other languages are generated and tested.
 
 use super::{FrameHeader, StageStep};
 use crate::{Intrinsics, Pose};

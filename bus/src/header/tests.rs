@@ -47,9 +47,9 @@ fn a_default_header_is_valid_and_another_version_is_not() {
 }
 
 #[test]
-fn picture_sizes() {
+fn image_sizes() {
     let mut h = FrameHeader::default();
-    h.set_picture(PixelFormat::Rgb8, 640, 480);
+    h.set_image(PixelFormat::Rgb8, 640, 480);
     assert_eq!((h.stride, h.payload_len), (1920, 921_600));
     assert_eq!(h.pixel_format(), Some(PixelFormat::Rgb8));
 }

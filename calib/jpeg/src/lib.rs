@@ -1,9 +1,9 @@
 //! JPEG images to pixels, byte for byte as libjpeg-turbo decodes them.
 //!
-//! Floor 2. Pillow, OpenCV, ROS and PyTorch's loaders all decode with libjpeg-turbo: the accurate integer transform, and
+//! Layer 2. Pillow, OpenCV, ROS and PyTorch's loaders all decode with libjpeg-turbo: the accurate integer transform, and
 //! chroma upsampled by its triangle filter. A decoder that rounds otherwise shifts colour by up to four levels and not
-//! evenly to both sides, which a depth network trained on the others' pixels turns into other depth. Every crate of depthrig
-//! decodes JPEG here, and `image` is built without its own decoder.
+//! evenly to both sides, from which a depth network trained on the others' pixels computes different depth. Every crate
+//! of depthrig decodes JPEG here, and `image` is built without its own decoder.
 //!
 //! A damaged image is an error: nothing is filled in for data that is missing.
 #![cfg_attr(test, allow(clippy::unwrap_used, clippy::expect_used))]
@@ -95,7 +95,7 @@ impl fmt::Display for Error {
 
 impl core::error::Error for Error {}
 
-/// What decoding gives.
+/// Result of decoding.
 pub type Result<T> = core::result::Result<T, Error>;
 
 /// Size and channels of an image, read from its header.
@@ -111,7 +111,7 @@ pub fn info(jpeg: &[u8]) -> Result<Info> {
 /// Images without Huffman tables, as cameras send them, are decoded with those of ITU-T T.81, annex K.
 ///
 /// # Errors
-/// When the image is damaged or cut short, or is not what `expected` says. `out` holds nothing of use then.
+/// When the image is damaged or cut short, or differs from `expected`. The contents of `out` are then unspecified.
 pub fn decode_into(jpeg: &[u8], expected: Info, out: &mut [u8]) -> Result<()> {
     guarded(|| {
         let Opened { info, decoder } = open(jpeg)?;
@@ -175,7 +175,7 @@ fn open(jpeg: &[u8]) -> Result<Opened<'_>> {
 fn decode_opened(decoder: &Decoder<'_>, info: Info, out: &mut [u8]) -> Result<()> {
     if out.len() != info.bytes() {
         return Err(Error(format!(
-            "{} bytes are no room for {info}, which needs {}",
+            "a buffer of {} bytes cannot hold {info}, which needs {}",
             out.len(),
             info.bytes()
         )));
@@ -191,7 +191,7 @@ fn damaged(e: &libjpeg_turbo_rs::JpegError) -> Error {
     Error(format!("the JPEG is damaged or not supported ({e})"))
 }
 
-/// Makes a panic of the decoder an error: it reads what strangers wrote.
+/// Turns a panic of the decoder into an error: it reads untrusted data.
 fn guarded<T>(work: impl FnOnce() -> Result<T>) -> Result<T> {
     catch_unwind(AssertUnwindSafe(work))
         .unwrap_or_else(|_| Err(Error("the JPEG is damaged: the decoder gave up".into())))

@@ -33,14 +33,14 @@ def encode(image: np.ndarray, form: str, progressive: bool, restarts: int, quali
     options = {"quality": quality, "progressive": progressive}
     if restarts:
         options["restart_marker_blocks"] = restarts
-    picture = Image.fromarray(image)
+    image = Image.fromarray(image)
     if form == "grey":
-        picture = picture.convert("L")
+        image = image.convert("L")
     elif form == "rgb":
         options["keep_rgb"] = True
     else:
         options["subsampling"] = SUBSAMPLING[form]
-    picture.save(out, "JPEG", **options)
+    image.save(out, "JPEG", **options)
     return out.getvalue()
 
 

@@ -10,7 +10,8 @@ pub(super) fn monotone(lens: &Lens) -> f64 {
     match lens {
         Lens::None => f64::INFINITY,
         Lens::Rational([k1, k2, _, _, k3, k4, k5, k6]) => {
-            let (top, bottom) = ([1.0, *k1, *k2, *k3], [1.0, *k4, *k5, *k6]);
+            let top = [1.0, *k1, *k2, *k3];
+            let bottom = [1.0, *k4, *k5, *k6];
             // With q = r²: d(r N/D)/dr = 0 where N D + 2 q (N' D − N D') = 0.
             let mut slope = [0.0; 7];
             for (i, n) in top.iter().enumerate() {
@@ -53,7 +54,8 @@ fn roots_of(polynomial: &[f64], end: f64, roots: &mut [f64; 8]) -> usize {
     let mut found = 0;
     let mut low = 0.0;
     for high in bounds[..n].iter().copied().chain([end]) {
-        let (a, b) = (value(low), value(high));
+        let a = value(low);
+        let b = value(high);
         if a != 0.0 && (b == 0.0 || (a > 0.0) != (b > 0.0)) {
             roots[found] = bisect(value, low, high);
             found += 1;

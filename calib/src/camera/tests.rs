@@ -58,13 +58,14 @@ fn brown_conrady_by_hand() {
     assert!((px - DVec2::new(600.0 * x + 320.5, 610.0 * y + 239.0)).length() < 1e-6, "{px}");
 }
 
-/// `tests/lenses.csv` is what OpenCV and librealsense say; `tests/reference_lenses.py` wrote it.
+/// `tests/lenses.csv` has the results of OpenCV and librealsense; `tests/reference_lenses.py` wrote it.
 #[test]
 fn other_libraries_see_the_same() {
     let mut rows = 0;
     for line in include_str!("../../tests/lenses.csv").lines() {
         let mut words = line.split(',');
-        let (library, model) = (words.next().unwrap(), words.next().unwrap());
+        let library = words.next().unwrap();
+        let model = words.next().unwrap();
         let n: Vec<f64> = words.map(|w| w.parse().unwrap()).collect();
         let model = match model {
             "brown_conrady" => Distortion::BrownConrady,
@@ -75,7 +76,8 @@ fn other_libraries_see_the_same() {
         };
         let coeffs = n[4..12].try_into().unwrap();
         let k = Intrinsics { coeffs, model: model as u32, ..Intrinsics::pinhole(n[0], n[1], n[2], n[3]) };
-        let (point, pixel) = (DVec3::new(n[12], n[13], n[14]), DVec2::new(n[15], n[16]));
+        let point = DVec3::new(n[12], n[13], n[14]);
+        let pixel = DVec2::new(n[15], n[16]);
         let off = (k.project(point).unwrap() - pixel).length();
         let within = if library == "opencv" { 1e-9 } else { 3e-4 };
         assert!(off < within, "{line}: {off}");
@@ -94,7 +96,8 @@ fn pixels() -> impl Strategy<Value = DVec2> {
 fn differences(f: impl Fn(f64) -> Option<DVec2>) -> Option<DVec2> {
     // Of the fourth order: right to about 1e-8 with this step.
     let h = 1e-3;
-    let (a, b) = (f(h)? - f(-h)?, f(2.0 * h)? - f(-2.0 * h)?);
+    let a = f(h)? - f(-h)?;
+    let b = f(2.0 * h)? - f(-2.0 * h)?;
     Some((8.0 * a - b) / (12.0 * h))
 }
 
@@ -219,7 +222,7 @@ proptest! {
 
 #[test]
 fn beyond_the_image_circle_there_is_no_ray() {
-    // A barrel so strong that the picture folds back at r = 0.91 on the plane z = 1: 1 − 1.2 r² = 0.
+    // A barrel so strong that the image folds back at r = 0.91 on the plane z = 1: 1 − 1.2 r² = 0.
     let k = with(Distortion::BrownConrady, [-0.4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
     let camera = Camera::new(&k).unwrap();
     assert!((camera.max_radius() - (1.0f64 / 1.2).sqrt()).abs() < 1e-12);

@@ -8,7 +8,8 @@ use std::io::Write;
 /// and Blender read it.
 ///
 /// # Errors
-/// [`ErrorKind::Io`] as `out` says; [`ErrorKind::BadInput`] when the cloud has another number of colours than points.
+/// [`ErrorKind::Io`] as `out` reports; [`ErrorKind::BadInput`] when the cloud has another number of colours than
+/// points.
 pub fn write_ply(cloud: &PointCloud, out: &mut impl Write) -> Result<()> {
     let has_color = has_color(cloud)?;
     let colors =
@@ -66,7 +67,8 @@ pub fn write_pcd(cloud: &PointCloud, out: &mut impl Write) -> Result<()> {
 }
 
 fn has_color(cloud: &PointCloud) -> Result<bool> {
-    let (points, colors) = (cloud.points.len(), cloud.colors.len());
+    let points = cloud.points.len();
+    let colors = cloud.colors.len();
     if colors != 0 && colors != points {
         return Err(Error::new(
             ErrorKind::BadInput,

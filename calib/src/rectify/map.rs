@@ -1,7 +1,6 @@
-//! Where each pixel of a rectified view comes from, computed once, and the passes over a picture.
-//!
-//! A pass goes in pieces: what lies anywhere in the picture is fetched into rows of words, and the arithmetic on those is
-//! compiled for the processor's vectors.
+//! The source of each pixel of a rectified view, computed once, and the loops that apply it to an image.
+//! A loop works in pieces: pixels from anywhere in the image are gathered into rows of words, and the arithmetic on
+//! those is compiled for the processor's vectors.
 
 use crate::Camera;
 use crate::simd::for_every_processor;
@@ -24,7 +23,7 @@ pub(super) struct Map {
     right: Vec<u16>,
     /// Weight of the lower ones, 0 to 256.
     below: Vec<u16>,
-    /// Pixels that the eye does not see, rising. Their places are 0.
+    /// Pixels that the camera does not see, rising. Their places are 0.
     outside: Vec<u32>,
 }
 
@@ -40,7 +39,7 @@ impl Channel {
 }
 
 impl Map {
-    /// For the eye `camera`, which `rotation` turns into a view with the intrinsics `view`; both have `size`, whose sides
+    /// For `camera`, which `rotation` turns into a view with the intrinsics `view`; both have `size`, whose sides
     /// are at least 2. What lies lower in that view by `rows` is moved up.
     pub(super) fn new(
         camera: &Camera,
@@ -50,13 +49,14 @@ impl Map {
         rows: Option<&RowOffset>,
     ) -> Self {
         let back = rotation.transpose();
-        let (w, h) = (f64::from(size.0), f64::from(size.1));
+        let w = f64::from(size.0);
+        let h = f64::from(size.1);
         let entry = |x: u32, y: u32| {
             let lower = rows.map_or(0.0, |rows| rows.at(f64::from(x) / w, f64::from(y) / h));
             let row = f64::from(y) + lower;
             let ray = DVec3::new((f64::from(x) - view.cx) / view.fx, (row - view.cy) / view.fy, 1.0);
             let at = camera.project(back * ray)?;
-            // What is seen ends half a part outside of the last pixel's centre, which then rounds to it.
+            // The visible area ends half a part outside of the last pixel's centre, which then rounds to it.
             let near = 0.5 / PARTS;
             let inside = at.x >= -near && at.y >= -near && at.x <= w - 1.0 + near && at.y <= h - 1.0 + near;
             if !inside {
@@ -68,7 +68,8 @@ impl Map {
                 let first = (parts / 256).min(size - 2);
                 (first, (parts - first * 256).min(256) as u16)
             };
-            let ((x, right), (y, below)) = (split(at.x, size.0), split(at.y, size.1));
+            let (x, right) = split(at.x, size.0);
+            let (y, below) = split(at.y, size.1);
             Some((y * size.0 + x, right, below))
         };
         let none = Vec::new();
@@ -100,13 +101,13 @@ impl Map {
         Some(((at % self.width) as f64 + part(&self.right), (at / self.width) as f64 + part(&self.below)))
     }
 
-    /// A grey picture out of one.
-    pub(super) fn grey(&self, picture: &[u8], grey: &mut [u8]) {
+    /// A grey image out of one.
+    pub(super) fn grey(&self, image: &[u8], grey: &mut [u8]) {
         let mut words = Channel::EMPTY;
         for (from, out) in self.pieces().zip(grey.chunks_mut(PIECE)) {
             from.fetch([&mut words], |at| {
                 [[at, at + self.width].map(|at| {
-                    let two = bytes::<2>(picture, at);
+                    let two = bytes::<2>(image, at);
                     u32::from(two[0]) | u32::from(two[1]) << 16
                 })]
             });
@@ -115,15 +116,15 @@ impl Map {
         self.blank::<1>(grey);
     }
 
-    /// Grey and, where it is wanted, red, green, blue, out of red, green, blue.
-    pub(super) fn rgb(&self, picture: &[u8], grey: &mut [u8], mut rgb: Option<&mut [u8]>) {
+    /// Grey and, if requested, red, green, blue, out of red, green, blue.
+    pub(super) fn rgb(&self, image: &[u8], grey: &mut [u8], mut rgb: Option<&mut [u8]>) {
         let row = 3 * self.width;
         let mut words = [Channel::EMPTY; 3];
         let mut planes = [[0; PIECE]; 3];
         for (i, (from, out)) in self.pieces().zip(grey.chunks_mut(PIECE)).enumerate() {
             let n = out.len();
             from.fetch(words.each_mut(), |at| {
-                let [top, bottom] = [3 * at, 3 * at + row].map(|at| bytes::<6>(picture, at));
+                let [top, bottom] = [3 * at, 3 * at + row].map(|at| bytes::<6>(image, at));
                 [0, 1, 2].map(|c| [top, bottom].map(|p| u32::from(p[c]) | u32::from(p[c + 3]) << 16))
             });
             for (words, plane) in words.iter().zip(&mut planes) {
@@ -141,15 +142,15 @@ impl Map {
         }
     }
 
-    /// Grey and, where it is wanted, red, green, blue, out of YUYV, whose width is even. Both pixels of a pair have its
+    /// Grey and, if requested, red, green, blue, out of YUYV, whose width is even. Both pixels of a pair have its
     /// colour, as in `OpenCV`; mixing before or after the change to red, green, blue is the same but for what is cut off at
     /// 0 and 255.
-    pub(super) fn yuyv(&self, picture: &[u8], grey: &mut [u8], mut rgb: Option<&mut [u8]>) {
+    pub(super) fn yuyv(&self, image: &[u8], grey: &mut [u8], mut rgb: Option<&mut [u8]>) {
         let row = 2 * self.width;
         let mut words = [Channel::EMPTY; 3];
         let mut planes = [[0; PIECE]; 3];
         let mut chroma = [[0; PIECE]; 2];
-        let four = |at: usize| u32::from_le_bytes(bytes(picture, at));
+        let four = |at: usize| u32::from_le_bytes(bytes(image, at));
         for (i, (from, out)) in self.pieces().zip(grey.chunks_mut(PIECE)).enumerate() {
             let n = out.len();
             let luminance = |at: usize| four(at) & 0x00ff_00ff;
@@ -181,7 +182,7 @@ impl Map {
         }
     }
 
-    /// Makes what the eye does not see black.
+    /// Blackens the pixels that the camera does not see.
     fn blank<const N: usize>(&self, out: &mut [u8]) {
         let (pixels, _) = out.as_chunks_mut::<N>();
         for i in &self.outside {
@@ -221,11 +222,11 @@ impl Piece<'_> {
     }
 }
 
-/// The `N` bytes of a picture from `at` on. The table has no place behind the last square of a picture of its size.
+/// The `N` bytes of an image from `at` on. The table has no place behind the last square of an image of its size.
 #[inline]
-fn bytes<const N: usize>(picture: &[u8], at: usize) -> [u8; N] {
+fn bytes<const N: usize>(image: &[u8], at: usize) -> [u8; N] {
     let mut out = [0; N];
-    out.copy_from_slice(&picture[at..at + N]);
+    out.copy_from_slice(&image[at..at + N]);
     out
 }
 
@@ -233,7 +234,8 @@ for_every_processor! {
     fn mix(top: &[u32], bottom: &[u32], right: &[u16], below: &[u16], out: &mut [u8]) {
         let weights = right.iter().zip(below);
         for (((out, t), b), (r, below)) in out.iter_mut().zip(top).zip(bottom).zip(weights) {
-            let (r, below) = (u32::from(*r), u32::from(*below));
+            let r = u32::from(*r);
+            let below = u32::from(*below);
             let t = (t & 0xffff) * (256 - r) + (t >> 16) * r;
             let b = (b & 0xffff) * (256 - r) + (b >> 16) * r;
             *out = ((t * (256 - below) + b * below + (1 << 15)) >> 16) as u8;
@@ -258,7 +260,8 @@ for_every_processor! {
         let outs = red.iter_mut().zip(green).zip(blue);
         for (((red, green), blue), ((y, u), v)) in outs.zip(y.iter().zip(u).zip(v)) {
             let y = (i32::from(*y) - 16).max(0) * 1_220_542 + HALF;
-            let (u, v) = (i32::from(*u) - 128, i32::from(*v) - 128);
+            let u = i32::from(*u) - 128;
+            let v = i32::from(*v) - 128;
             *red = ((y + 1_673_527 * v) >> 20).clamp(0, 255) as u8;
             *green = ((y - 852_492 * v - 409_993 * u) >> 20).clamp(0, 255) as u8;
             *blue = ((y + 2_116_026 * u) >> 20).clamp(0, 255) as u8;
@@ -279,11 +282,13 @@ mod tests {
     use crate::simd::in_every_width;
     use proptest::prelude::*;
 
-    /// The pixel out of its four, one channel at a time. `byte(x, y)` is that of the picture.
+    /// The pixel out of its four, one channel at a time. `byte(x, y)` is that of the image.
     fn one(map: &Map, i: usize, byte: impl Fn(usize, usize) -> u8) -> Option<u8> {
         let at = Some(map.at[i]).filter(|_| !map.outside.contains(&(i as u32)))? as usize;
-        let (x, y) = (at % map.width, at / map.width);
-        let (r, b) = (u64::from(map.right[i]), u64::from(map.below[i]));
+        let x = at % map.width;
+        let y = at / map.width;
+        let r = u64::from(map.right[i]);
+        let b = u64::from(map.below[i]);
         let of = |x, y, weight: u64| u64::from(byte(x, y)) * weight;
         let sum = of(x, y, (256 - r) * (256 - b))
             + of(x + 1, y, r * (256 - b))
@@ -294,7 +299,8 @@ mod tests {
 
     fn rgb_of([y, u, v]: [u8; 3]) -> [u8; 3] {
         let y = (i64::from(y) - 16).max(0) * 1_220_542;
-        let (u, v) = (i64::from(u) - 128, i64::from(v) - 128);
+        let u = i64::from(u) - 128;
+        let v = i64::from(v) - 128;
         [y + 1_673_527 * v, y - 852_492 * v - 409_993 * u, y + 2_116_026 * u]
             .map(|c| ((c + (1 << 19)) >> 20).clamp(0, 255) as u8)
     }
@@ -308,7 +314,8 @@ mod tests {
             (w, h) in (1..200_usize, 2..12_usize),
             seed in 1..u64::MAX,
         ) {
-            let (w, mut state) = (2 * w, seed);
+            let w = 2 * w;
+            let mut state = seed;
             let mut below = |n: u32| {
                 state ^= state << 13;
                 state ^= state >> 7;
@@ -322,10 +329,13 @@ mod tests {
             let weights: [Vec<u16>; 2] = [0, 1].map(|_| at.iter().map(|_| below(257) as u16).collect());
             let [right, lower] = weights;
             let map = Map { width: w, at, right, below: lower, outside };
-            let picture: Vec<u8> = (0..3 * w * h).map(|_| below(256) as u8).collect();
-            let (grey, yuyv, rgb) = (&picture[..w * h], &picture[..2 * w * h], &picture);
+            let image: Vec<u8> = (0..3 * w * h).map(|_| below(256) as u8).collect();
+            let grey = &image[..w * h];
+            let yuyv = &image[..2 * w * h];
+            let rgb = &image;
             in_every_width(|width| {
-                let (mut got, mut got_rgb) = (vec![7; w * h], vec![7; 3 * w * h]);
+                let mut got = vec![7; w * h];
+                let mut got_rgb = vec![7; 3 * w * h];
                 map.grey(grey, &mut got);
                 for (i, got) in got.iter().enumerate() {
                     assert_eq!(*got, one(&map, i, |x, y| grey[y * w + x]).unwrap_or(0), "grey {i} {width:?}");

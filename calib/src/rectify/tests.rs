@@ -1,4 +1,4 @@
-//! Against `OpenCV`, against the eyes' own projection, and with what is no stereo camera.
+//! Rectification against `OpenCV`, against the cameras' own projection, and with invalid stereo cameras.
 
 use super::*;
 use depthrig_bus::{Distortion, PixelFormat};
@@ -22,11 +22,11 @@ struct Theirs {
     focal: f64,
     center: [f64; 2],
     baseline: f64,
-    eyes: [TheirEye; 2],
+    eyes: [TheirCamera; 2],
 }
 
 #[derive(Deserialize)]
-struct TheirEye {
+struct TheirCamera {
     intrinsics: [f64; 4],
     coeffs: [f64; 8],
     rational: bool,
@@ -36,11 +36,11 @@ struct TheirEye {
 }
 
 impl Theirs {
-    fn eye(&self, view: View) -> Intrinsics {
-        let eye = &self.eyes[view as usize];
-        let [fx, fy, cx, cy] = eye.intrinsics;
-        let model = if eye.rational { Distortion::Rational } else { Distortion::BrownConrady };
-        Intrinsics { coeffs: eye.coeffs, model: model as u32, ..Intrinsics::pinhole(fx, fy, cx, cy) }
+    fn intrinsics(&self, view: View) -> Intrinsics {
+        let camera = &self.eyes[view as usize];
+        let [fx, fy, cx, cy] = camera.intrinsics;
+        let model = if camera.rational { Distortion::Rational } else { Distortion::BrownConrady };
+        Intrinsics { coeffs: camera.coeffs, model: model as u32, ..Intrinsics::pinhole(fx, fy, cx, cy) }
     }
 
     fn right_in_left(&self) -> Pose {
@@ -50,7 +50,8 @@ impl Theirs {
     }
 
     fn rectifier(&self) -> Rectifier {
-        let (left, right) = (self.eye(View::Left), self.eye(View::Right));
+        let left = self.intrinsics(View::Left);
+        let right = self.intrinsics(View::Right);
         Rectifier::new(&left, &right, &self.right_in_left(), self.size).unwrap()
     }
 }
@@ -63,7 +64,8 @@ fn reference() -> Vec<Theirs> {
 #[test]
 fn views_and_maps_are_those_of_opencv() {
     for theirs in reference() {
-        let (own, name) = (theirs.rectifier(), &theirs.name);
+        let own = theirs.rectifier();
+        let name = &theirs.name;
         let k = own.intrinsics();
         // `OpenCV` keeps the points from which it finds focal length and centre in single precision.
         let near =
@@ -74,12 +76,13 @@ fn views_and_maps_are_those_of_opencv() {
         near(k.cy, theirs.center[1], 1e-3);
         near(own.baseline_m(), theirs.baseline, 1e-9);
         for view in View::BOTH {
-            let eye = &theirs.eyes[view as usize];
-            for (a, b) in own.rotation(view).transpose().to_cols_array().iter().zip(eye.rotation) {
+            let camera = &theirs.eyes[view as usize];
+            for (a, b) in own.rotation(view).transpose().to_cols_array().iter().zip(camera.rotation) {
                 near(*a, b, 1e-9);
             }
-            for &(x, y, u, v) in &eye.map {
-                let (w, h) = (f64::from(theirs.size.0) - 1.0, f64::from(theirs.size.1) - 1.0);
+            for &(x, y, u, v) in &camera.map {
+                let w = f64::from(theirs.size.0) - 1.0;
+                let h = f64::from(theirs.size.1) - 1.0;
                 let Some(at) = own.source(view, x, y) else {
                     let edge = u.min(v).min(w - u).min(h - v);
                     assert!(edge < 1e-3, "{name} {view:?}: nothing at {x}, {y}; theirs is {u}, {v}");
@@ -92,30 +95,32 @@ fn views_and_maps_are_those_of_opencv() {
     }
 }
 
-/// The picture of `opencv.py`.
-fn picture((width, height): (u32, u32)) -> Vec<[u8; 3]> {
+/// The image of `opencv.py`.
+fn image((width, height): (u32, u32)) -> Vec<[u8; 3]> {
     let at = |x: u32, y: u32, c: f64| {
-        let (x, y) = (f64::from(x), f64::from(y));
+        let x = f64::from(x);
+        let y = f64::from(y);
         (128.0 + 100.0 * (x / (11.0 + c) + y / (17.0 - c)).sin()).floor() as u8
     };
     (0..height).flat_map(|y| (0..width).map(move |x| [0.0, 1.0, 2.0].map(|c| at(x, y, c)))).collect()
 }
 
 #[test]
-fn pictures_are_those_of_opencv() {
+fn images_are_those_of_opencv() {
     for theirs in reference() {
-        let (own, n) = (theirs.rectifier(), (theirs.size.0 * theirs.size.1) as usize);
-        let rgb = picture(theirs.size);
+        let own = theirs.rectifier();
+        let n = (theirs.size.0 * theirs.size.1) as usize;
+        let rgb = image(theirs.size);
         let yuyv: Vec<u8> =
             rgb.chunks(2).flat_map(|p| [p[0][0], p[0][1] / 4 + 96, p[1][0], p[0][2] / 4 + 96]).collect();
         let grey: Vec<u8> = rgb.iter().map(|p| p[0]).collect();
         let rgb = rgb.concat();
         for view in View::BOTH {
-            let eye = &theirs.eyes[view as usize];
+            let camera = &theirs.eyes[view as usize];
             let same = |what: &str, ours: &[u8], channels: usize| {
                 let mut most = 0;
-                for ((x, y, ..), want) in eye.map.iter().zip(&eye.pixels[what]) {
-                    // At the outermost pixels `OpenCV` mixes in what lies outside of the picture, which is black.
+                for ((x, y, ..), want) in camera.map.iter().zip(&camera.pixels[what]) {
+                    // At the outermost pixels `OpenCV` mixes in what lies outside of the image, which is black.
                     if *x == 0 || *y == 0 || *x == theirs.size.0 - 1 || *y == theirs.size.1 - 1 {
                         continue;
                     }
@@ -127,7 +132,8 @@ fn pictures_are_those_of_opencv() {
                 // It knows places to 1/32 pixel, this module to 1/256.
                 assert!(most <= 2, "{} {view:?} {what}: {most} levels apart", theirs.name);
             };
-            let (mut one, mut three) = (vec![7; n], vec![7; 3 * n]);
+            let mut one = vec![7; n];
+            let mut three = vec![7; 3 * n];
             own.rectify(view, PixelFormat::Mono8, &grey, &mut one, None).unwrap();
             same("grey", &one, 1);
             own.rectify(view, PixelFormat::Rgb8, &rgb, &mut one, Some(&mut three)).unwrap();
@@ -141,7 +147,7 @@ fn pictures_are_those_of_opencv() {
 }
 
 proptest! {
-    /// A point that both eyes see lies in one row of both views, at the disparity of its depth: by the eyes' own
+    /// A point that both cameras see lies in one row of both views, at the disparity of its depth: by the cameras' own
     /// projection, which knows nothing of rectification.
     #[test]
     fn points_have_one_row_and_the_disparity_of_their_depth(
@@ -156,15 +162,17 @@ proptest! {
         let p = DVec3::new((at.x - k.cx) / k.fx, (at.y - k.cy) / k.fy, 1.0) * z;
         let in_left = own.rotation(View::Left).transpose() * p;
         let in_right = theirs.right_in_left().to_affine().inverse().transform_point3(in_left);
-        let left = Camera::new(&theirs.eye(View::Left)).unwrap().project(in_left).unwrap();
+        let left = Camera::new(&theirs.intrinsics(View::Left)).unwrap().project(in_left).unwrap();
         let seen = own.source(View::Left, at.x as u32, at.y as u32).unwrap();
         prop_assert!((left - DVec2::from(seen)).length() < 0.004);
         let x = at.x - disparity;
         prop_assume!(x >= 1.0);
-        let right = Camera::new(&theirs.eye(View::Right)).unwrap().project(in_right).unwrap();
-        // Between the two pixels of the row, since the disparity is no whole number.
-        let (a, b) = (x.floor() as u32, x.floor() as u32 + 1);
-        let (a, b) = (own.source(View::Right, a, at.y as u32).unwrap(), own.source(View::Right, b, at.y as u32).unwrap());
+        let right = Camera::new(&theirs.intrinsics(View::Right)).unwrap().project(in_right).unwrap();
+        // Between the two pixels of the row, since the disparity is fractional.
+        let a = x.floor() as u32;
+        let b = x.floor() as u32 + 1;
+        let a = own.source(View::Right, a, at.y as u32).unwrap();
+        let b = own.source(View::Right, b, at.y as u32).unwrap();
         let between = DVec2::from(a).lerp(DVec2::from(b), x.fract());
         prop_assert!((right - between).length() < 0.006, "{right} is not {between}");
     }
@@ -181,10 +189,12 @@ fn the_pose_of_the_left_view_is_a_rotation_alone() {
 }
 
 #[test]
-fn what_is_no_stereo_camera_is_refused() {
+fn invalid_stereo_cameras_are_refused() {
     let theirs = reference().remove(0);
-    let (left, right, pose, size) =
-        (theirs.eye(View::Left), theirs.eye(View::Right), theirs.right_in_left(), theirs.size);
+    let left = theirs.intrinsics(View::Left);
+    let right = theirs.intrinsics(View::Right);
+    let pose = theirs.right_in_left();
+    let size = theirs.size;
     let message = |left: &Intrinsics, pose: &Pose, size| {
         let e = Rectifier::new(left, &right, pose, size).unwrap_err();
         (e.kind(), e.to_string())
@@ -192,17 +202,18 @@ fn what_is_no_stereo_camera_is_refused() {
     let said = |(kind, text): (ErrorKind, String), wanted: &str| {
         assert!(kind == ErrorKind::BadInput && text.contains(wanted), "{kind:?}: {text}");
     };
-    said(message(&left, &pose.inverse(), size), "left and right are swapped: the right eye is 120.");
+    said(message(&left, &pose.inverse(), size), "left and right are swapped: the right camera is 120.");
     let above = Pose { translation_m: [0.001, 0.12, 0.0], ..pose };
     said(message(&left, &above, size), "above each other");
-    said(message(&left, &Pose::IDENTITY, size), "no baseline");
-    said(message(&left, &pose, (1, 720)), "1x720 is no size");
-    said(message(&left, &pose, (1_000_000, 720)), "is no size");
+    said(message(&left, &Pose::IDENTITY, size), "invalid baseline");
+    said(message(&left, &pose, (1, 720)), "invalid stereo image size 1x720");
+    said(message(&left, &pose, (1_000_000, 720)), "invalid stereo image size");
     assert_eq!(message(&Intrinsics::default(), &pose, size).0, ErrorKind::NoCalibration);
     let own = theirs.rectifier();
     let n = 1280 * 720;
     let refused = |format, bytes: usize, grey: usize, rgb: usize| {
-        let (mut grey, mut rgb) = (vec![0; grey], vec![0; rgb]);
+        let mut grey = vec![0; grey];
+        let mut rgb = vec![0; rgb];
         own.rectify(View::Left, format, &vec![0; bytes], &mut grey, Some(&mut rgb)).unwrap_err().kind()
     };
     for (bytes, grey, rgb) in [(100, n, 3 * n), (n, n - 1, 3 * n), (n, n, 3 * n + 1)] {
@@ -212,6 +223,6 @@ fn what_is_no_stereo_camera_is_refused() {
     let odd = Rectifier::new(&left, &right, &pose, (1279, 720)).unwrap();
     let n = 1279 * 720;
     let e = odd.rectify(View::Left, PixelFormat::Yuyv, &vec![0; n * 2], &mut vec![0; n], None).unwrap_err();
-    assert!(e.to_string().contains("its width is odd"), "{e}");
+    assert!(e.to_string().contains("the width is odd"), "{e}");
     odd.rectify(View::Left, PixelFormat::Mono8, &vec![9; n], &mut vec![0; n], None).unwrap();
 }

@@ -1,4 +1,4 @@
-//! What a row of depth covers in colour: each pixel is a small piece of a plane, seen by colour.
+//! Computes the area of colour that a row of depth covers: each pixel is a small piece of a plane, seen by colour.
 //!
 //! The plane goes through the pixel's point and follows its neighbours above, below, left and right as far as they lie on
 //! the same surface, so that depth is right on the whole piece and pieces of one surface meet. The piece is projected to
@@ -28,7 +28,7 @@ const MAX_SPAN: i32 = 128;
 /// The columns and rows of a pixel that is not seen.
 pub(super) const NOWHERE: u32 = u32::MAX;
 
-/// What the pixels of a row cover.
+/// The areas that the pixels of a row cover.
 #[derive(Debug)]
 pub(super) struct Cover {
     /// First and last column of colour, in the upper and lower half.
@@ -68,7 +68,8 @@ impl Cover {
         }
     }
 
-    /// Finds what row `row` covers. With `is_point` each pixel covers one of colour's: colour is the coarser image.
+    /// Computes the areas that row `row` covers. With `is_point` each pixel covers one of colour's: colour is the
+    /// coarser image.
     pub(super) fn find(&mut self, warp: &Warp, is_point: bool, depth: &[u16], unit: f32, row: usize) {
         let w = self.columns.len();
         let of = |row: usize| depth.get(row * w..(row + 1) * w);
@@ -93,7 +94,7 @@ impl Cover {
     }
 }
 
-/// What a depth pixel covers in colour. A type and not a number: a loop for one of them alone is a tenth faster.
+/// The rule for the area that a depth pixel covers. A type and not a number: a loop for one of them is a tenth faster.
 trait Shape {
     /// One pixel, where its middle is seen.
     const IS_POINT: bool;
@@ -154,13 +155,24 @@ for_every_processor! {
         z: &mut [f32], by_u: &mut [f32], by_v: &mut [f32],
     ) {
         let n = columns.len();
-        let (left, right, here) = (&here[..n], &here[2..n + 2], &here[1..=n]);
-        let (above, below) = (&above[..n], &below[..n]);
+        let left = &here[..n];
+        let right = &here[2..n + 2];
+        let here = &here[1..=n];
+        let above = &above[..n];
+        let below = &below[..n];
         // Corners: a is the first, c the one below it, d the last.
-        let (ax, cx, dx) = (&x0[..n], &x1[..n], &x1[1..=n]);
-        let (ay, cy, dy) = (y0.cut(0..n), y1.cut(0..n), y1.cut(1..n + 1));
-        let (columns, rows, keys) = (&mut columns[..n], &mut rows[..n], &mut keys[..n]);
-        let (z, by_u, by_v) = (&mut z[..n], &mut by_u[..n], &mut by_v[..n]);
+        let ax = &x0[..n];
+        let cx = &x1[..n];
+        let dx = &x1[1..=n];
+        let ay = y0.cut(0..n);
+        let cy = y1.cut(0..n);
+        let dy = y1.cut(1..n + 1);
+        let columns = &mut columns[..n];
+        let rows = &mut rows[..n];
+        let keys = &mut keys[..n];
+        let z = &mut z[..n];
+        let by_u = &mut by_u[..n];
+        let by_v = &mut by_v[..n];
         let Numbers { r, t, k: [fx, fy, px, py], max_radius2, size: [width, height] } = *numbers;
         let per_unit = 1.0 / unit;
         let t = [t[0] * per_unit, t[1] * per_unit, t[2] * per_unit];
@@ -177,26 +189,37 @@ for_every_processor! {
                 d, limit, f32::from(left[i]), f32::from(right[i]), f32::from(above[i]), f32::from(below[i]),
             );
             // The ray of the middle, and its change from column to column and from row to row.
-            let (rx, ry) = ((ax[i] + dx[i]) * 0.5, (ay.at(i) + dy.at(i)) * 0.5);
-            let (rx_i, ry_i) = (dx[i] - cx[i], dy.at(i) - cy.at(i));
-            let (rx_j, ry_j) = (cx[i] - ax[i], cy.at(i) - ay.at(i));
+            let rx = (ax[i] + dx[i]) * 0.5;
+            let ry = (ay.at(i) + dy.at(i)) * 0.5;
+            let rx_i = dx[i] - cx[i];
+            let ry_i = dy.at(i) - cy.at(i);
+            let rx_j = cx[i] - ax[i];
+            let ry_j = cy.at(i) - ay.at(i);
             let ray = [turn(r[0], rx, ry), turn(r[1], rx, ry), turn(r[2], rx, ry)];
             let m = piece.depth;
             let q = [ray[0] * m + t[0], ray[1] * m + t[1], ray[2] * m + t[2]];
             let q_i = moved(rx_i * m, ry_i * m, piece.by_column, ray);
             let q_j = moved(rx_j * m, ry_j * m, piece.by_row, ray);
             let scale = 1.0 / q[2];
-            let (a, b) = (q[0] * scale, q[1] * scale);
-            let (a_i, b_i) = ((q_i[0] - a * q_i[2]) * scale, (q_i[1] - b * q_i[2]) * scale);
-            let (a_j, b_j) = ((q_j[0] - a * q_j[2]) * scale, (q_j[1] - b * q_j[2]) * scale);
+            let a = q[0] * scale;
+            let b = q[1] * scale;
+            let a_i = (q_i[0] - a * q_i[2]) * scale;
+            let b_i = (q_i[1] - b * q_i[2]) * scale;
+            let a_j = (q_j[0] - a * q_j[2]) * scale;
+            let b_j = (q_j[1] - b * q_j[2]) * scale;
             let middle = lens.shown(a, b);
-            let next = lens.beside(a, b, middle, a_i, b_i);
-            let under = lens.beside(a, b, middle, a_j, b_j);
-            let (at_u, at_v) = (middle.0 * fx + px, middle.1 * fy + py);
-            let (u_i, v_i, u_j, v_j) = (next.0 * fx, next.1 * fy, under.0 * fx, under.1 * fy);
+            let next = lens.beside(a, b, middle.0, middle.1, a_i, b_i);
+            let under = lens.beside(a, b, middle.0, middle.1, a_j, b_j);
+            let at_u = middle.0 * fx + px;
+            let at_v = middle.1 * fy + py;
+            let u_i = next.0 * fx;
+            let v_i = next.1 * fy;
+            let u_j = under.0 * fx;
+            let v_j = under.1 * fy;
             let cross = u_i * v_j - u_j * v_i;
             let over = 1.0 / cross;
-            let (z_u, z_v) = ((q_i[2] * v_j - q_j[2] * v_i) * over, (q_j[2] * u_i - q_i[2] * u_j) * over);
+            let z_u = (q_i[2] * v_j - q_j[2] * v_i) * over;
+            let z_v = (q_j[2] * u_i - q_i[2] * u_j) * over;
             // A piece that is seen edge-on has no gradient to trust.
             let steep = z_u.abs() + z_v.abs();
             let flat = if steep < MAX_JUMP * q[2] { 1.0 } else { 0.0 };
@@ -216,7 +239,8 @@ for_every_processor! {
             rows[i] = if seen { down.0 } else { NOWHERE };
             keys[i] = key;
             if !S::IS_POINT {
-                let (first_u, first_v) = ((across.0 >> 16) as f32, (down.0 >> 16) as f32);
+                let first_u = (across.0 >> 16) as f32;
+                let first_v = (down.0 >> 16) as f32;
                 z[i] = q[2] + (z_u * (first_u - at_u) + z_v * (first_v - at_v));
                 by_u[i] = z_u;
                 by_v[i] = z_v;
@@ -242,7 +266,10 @@ struct Piece {
 fn piece(d: f32, limit: f32, left: f32, right: f32, above: f32, below: f32) -> Piece {
     // False for holes.
     let fits = |other: f32| (other - d).abs() <= limit;
-    let (has_left, has_right, has_above, has_below) = (fits(left), fits(right), fits(above), fits(below));
+    let has_left = fits(left);
+    let has_right = fits(right);
+    let has_above = fits(above);
+    let has_below = fits(below);
     let step = |has: bool, difference: f32| if has { difference } else { 0.0 };
     let weight = |one: bool, other: bool| if one & other { 0.5 } else { 1.0 };
     let by_column = (step(has_left, d - left) + step(has_right, right - d)) * weight(has_left, has_right);
@@ -262,7 +289,8 @@ fn span(first: f32, last: f32, end: f32) -> (u32, bool) {
         if at < end { at } else { end }
     };
     // Halves below 0 belong to no pixel; truncation would put them on the first one.
-    let (first, last_whole) = (whole(cut(first)), whole(cut(last)));
+    let first = whole(cut(first));
+    let last_whole = whole(cut(last));
     let inside =
         (last >= 0.0) & (first < whole(end)) & (first <= last_whole) & (last_whole - first <= MAX_SPAN);
     let last_inside = last_whole.min(whole(end) - 1);

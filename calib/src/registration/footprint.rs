@@ -1,4 +1,4 @@
-//! Whether a pixel of depth covers more than one of colour: decided once for a pair of cameras.
+//! Decides once for a pair of cameras whether a depth pixel covers more than one colour pixel.
 
 use crate::Camera;
 use glam::{DAffine3, DVec2};

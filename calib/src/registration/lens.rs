@@ -5,11 +5,11 @@
 pub(super) trait Lens32: Copy {
     fn shown(self, x: f32, y: f32) -> (f32, f32);
 
-    /// How far from `here`, where it shows (x, y), it shows what is (dx, dy) beside it.
+    /// How far from (`u`, `v`), where it shows (x, y), it shows the point that is (dx, dy) beside it.
     #[inline(always)]
-    fn beside(self, x: f32, y: f32, here: (f32, f32), dx: f32, dy: f32) -> (f32, f32) {
+    fn beside(self, x: f32, y: f32, u: f32, v: f32, dx: f32, dy: f32) -> (f32, f32) {
         let there = self.shown(x + dx, y + dy);
-        (there.0 - here.0, there.1 - here.1)
+        (there.0 - u, there.1 - v)
     }
 }
 
@@ -24,7 +24,7 @@ impl Lens32 for Straight {
     }
 
     #[inline(always)]
-    fn beside(self, _: f32, _: f32, _: (f32, f32), dx: f32, dy: f32) -> (f32, f32) {
+    fn beside(self, _: f32, _: f32, _: f32, _: f32, dx: f32, dy: f32) -> (f32, f32) {
         (dx, dy)
     }
 }
@@ -46,7 +46,7 @@ impl Lens32 for Rational {
 
     /// By the derivative, whose divisions are those of [`Self::shown`].
     #[inline(always)]
-    fn beside(self, x: f32, y: f32, _: (f32, f32), dx: f32, dy: f32) -> (f32, f32) {
+    fn beside(self, x: f32, y: f32, _: f32, _: f32, dx: f32, dy: f32) -> (f32, f32) {
         let [k1, k2, p1, p2, k3, k4, k5, k6] = self.0;
         let r2 = x * x + y * y;
         let top = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
@@ -73,7 +73,8 @@ impl Lens32 for InverseBrownConrady {
         let [k1, k2, p1, p2, k3] = self.0;
         let r2 = x * x + y * y;
         let s = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
-        let (x, y) = (x * s, y * s);
+        let x = x * s;
+        let y = y * s;
         let xy = 2.0 * x * y;
         (x + (p1 * xy + p2 * (r2 + 2.0 * x * x)), y + (p1 * (r2 + 2.0 * y * y) + p2 * xy))
     }

@@ -53,8 +53,10 @@ impl PaintRows {
                 let weight_x = (u % PARTS) as u32;
                 let weight_y = (v % PARTS) as u32;
                 let pixel = |x: usize, y: usize| &color[(y * color_width + x) * 3..][..3];
-                let (a, b) = (pixel(x, y), pixel(right, y));
-                let (c, d) = (pixel(x, below), pixel(right, below));
+                let a = pixel(x, y);
+                let b = pixel(right, y);
+                let c = pixel(x, below);
+                let d = pixel(right, below);
                 for i in 0..3 {
                     let mix = |a: u8, b: u8| (256 - weight_x) * u32::from(a) + weight_x * u32::from(b);
                     let sum = (256 - weight_y) * mix(a[i], b[i]) + weight_y * mix(c[i], d[i]);
@@ -85,8 +87,13 @@ for_every_processor! {
         u: &mut [i32], v: &mut [i32],
     ) {
         let n = depth.len();
-        let (x0, y0, x1, y1) = (&x0[..n], y0.cut(0..n), &x1[1..=n], y1.cut(1..n + 1));
-        let (u, v, numbers) = (&mut u[..n], &mut v[..n], *numbers);
+        let x0 = &x0[..n];
+        let y0 = y0.cut(0..n);
+        let x1 = &x1[1..=n];
+        let y1 = y1.cut(1..n + 1);
+        let u = &mut u[..n];
+        let v = &mut v[..n];
+        let numbers = *numbers;
         let [w, h] = numbers.size;
         for i in 0..n {
             let z = f32::from(depth[i]) * unit;

@@ -23,7 +23,7 @@ pub(super) struct SplatRows {
     line: Vec<Slot>,
 }
 
-/// What a run of depth pixels draws into one column of colour. One store writes it whole.
+/// The depth that a run of depth pixels draws into one column of colour. One store writes all of it.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(16))]
 struct Slot {
@@ -91,8 +91,11 @@ for_every_processor! {
         line: &mut [Slot], pixels: &mut [u16], width: usize,
     ) {
         let n = rows.len();
-        let (columns, keys) = (&columns[..n], &keys[..n]);
-        let (z, by_u, by_v) = (&planes.z[..n], &planes.by_u[..n], &planes.by_v[..n]);
+        let columns = &columns[..n];
+        let keys = &keys[..n];
+        let z = &planes.z[..n];
+        let by_u = &planes.by_u[..n];
+        let by_v = &planes.by_v[..n];
         let mut i = 0;
         while i < n {
             let run = rows[i];
@@ -100,10 +103,13 @@ for_every_processor! {
                 i += 1;
                 continue;
             }
-            let (top, bottom) = ((run >> 16) as usize, (run & 0xffff) as usize);
-            let (mut from, mut to) = (width, 0);
+            let top = (run >> 16) as usize;
+            let bottom = (run & 0xffff) as usize;
+            let mut from = width;
+            let mut to = 0;
             while i < n && rows[i] == run {
-                let (l, r) = ((columns[i] >> 16) as usize, (columns[i] & 0xffff) as usize);
+                let l = (columns[i] >> 16) as usize;
+                let r = (columns[i] & 0xffff) as usize;
                 (from, to) = (from.min(l), to.max(r + 1));
                 put(keys[i], z[i], by_u[i], by_v[i], line.get_mut(l..=r));
                 i += 1;
@@ -115,7 +121,8 @@ for_every_processor! {
             let mut at = top * width + from;
             let (chunks, rest) = line.as_chunks_mut::<CHUNK>();
             for chunk in chunks {
-                let (mut first, mut by_row) = ([0.0; CHUNK], [0.0; CHUNK]);
+                let mut first = [0.0; CHUNK];
+                let mut by_row = [0.0; CHUNK];
                 for k in 0..CHUNK {
                     first[k] = chunk[k].first;
                     by_row[k] = chunk[k].by_row;

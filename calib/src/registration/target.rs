@@ -3,10 +3,10 @@
 //! While it is drawn, a pixel holds `depth − 1`, so that nothing (0) is larger than everything: one unsigned minimum
 //! decides, and the order of drawing does not matter.
 
-/// What an empty pixel holds while an image is drawn.
+/// Value of an empty pixel while an image is drawn.
 pub(super) const EMPTY: u16 = u16::MAX;
 
-/// What is compared for a depth value; [`EMPTY`] for a hole.
+/// The key that is compared for a depth value; [`EMPTY`] for a hole.
 pub(super) const fn key(depth: u16) -> u16 {
     depth.wrapping_sub(1)
 }

@@ -44,7 +44,8 @@ fn lens() -> impl Strategy<Value = (u32, [f64; 8])> {
 fn cases() -> impl Strategy<Value = Case> {
     let camera = |f: std::ops::Range<f64>| {
         (4u32..40, 3u32..30, f, lens(), -2.0f64..2.0).prop_map(|(w, h, f, (model, coeffs), off)| {
-            let (cx, cy) = (f64::from(w) / 2.0 - 0.5 + off, f64::from(h) / 2.0 - 0.5 - off);
+            let cx = f64::from(w) / 2.0 - 0.5 + off;
+            let cy = f64::from(h) / 2.0 - 0.5 - off;
             (Intrinsics { coeffs, model, ..Intrinsics::pinhole(f, f * 1.01, cx, cy) }, (w, h))
         })
     };
@@ -109,15 +110,18 @@ impl Case {
     /// The pieces that cover each pixel of colour, written down as their rule says, with every edge moved outwards by
     /// `slack` pixels: depth there and in the middle of the piece.
     fn pieces(&self, slack: f64) -> Vec<Vec<(f64, f64)>> {
-        let (w, h) = (self.color_size.0 as i64, self.color_size.1 as i64);
+        let w = self.color_size.0 as i64;
+        let h = self.color_size.1 as i64;
         let mut out = vec![Vec::new(); (w * h) as usize];
         let depth_camera = Camera::new(&self.depth).unwrap();
         let color_camera = Camera::new(&self.color).unwrap();
-        let (dw, dh) = (self.depth_size.0 as i64, self.depth_size.1 as i64);
+        let dw = self.depth_size.0 as i64;
+        let dh = self.depth_size.1 as i64;
         let pose = self.pose.to_affine();
         let is_point = footprint::is_point(&depth_camera, (dw as usize, dh as usize), &color_camera, &pose);
         for i in 0..dw * dh {
-            let (x, y) = (i % dw, i / dw);
+            let x = i % dw;
+            let y = i / dw;
             let at = |dx: i64, dy: i64| {
                 let inside = (0..dw).contains(&(x + dx)) && (0..dh).contains(&(y + dy));
                 if inside { f64::from(self.pixels[((y + dy) * dw + x + dx) as usize]) } else { 0.0 }
@@ -127,14 +131,18 @@ impl Case {
                 continue;
             }
             let near = |dx, dy| Some(at(dx, dy)).filter(|z| (z - d).abs() <= 0.046_934_42 * d);
-            let (left, right, above, below) = (near(-1, 0), near(1, 0), near(0, -1), near(0, 1));
+            let left = near(-1, 0);
+            let right = near(1, 0);
+            let above = near(0, -1);
+            let below = near(0, 1);
             let slope = |before: Option<f64>, after: Option<f64>| match (before, after) {
                 (Some(a), Some(b)) => (b - a) / 2.0,
                 (Some(a), None) => d - a,
                 (None, Some(b)) => b - d,
                 (None, None) => 0.0,
             };
-            let (by_column, by_row) = (slope(left, right), slope(above, below));
+            let by_column = slope(left, right);
+            let by_row = slope(above, below);
             let all = [left, right, above, below].into_iter().sum::<Option<f64>>();
             let middle = all.map_or(d, |sum| (sum + d) / 5.0);
             // Derivatives by small steps.
@@ -152,8 +160,10 @@ impl Case {
             else {
                 continue;
             };
-            let (to_next, to_under) = ((next.0 - at) / step, (under.0 - at) / step);
-            let (z_next, z_under) = ((next.1 - z) / step, (under.1 - z) / step);
+            let to_next = (next.0 - at) / step;
+            let to_under = (under.0 - at) / step;
+            let z_next = (next.1 - z) / step;
+            let z_under = (under.1 - z) / step;
             let cross = to_next.perp_dot(to_under);
             let mut by_u = (z_next * to_under.y - z_under * to_next.y) / cross;
             let mut by_v = (z_under * to_next.x - z_next * to_under.x) / cross;
@@ -163,7 +173,8 @@ impl Case {
             let beyond = if all.is_some() { 0.15 } else { 0.49 };
             let half = (to_next.abs() + to_under.abs()) / 2.0 + beyond + slack;
             let half = if is_point { DVec2::splat(0.5 + slack) } else { half };
-            let (first, last) = ((at - half).ceil(), (at + half).floor());
+            let first = (at - half).ceil();
+            let last = (at + half).floor();
             let in_range = |z: f64| (0.5 - slack..65_535.5 + slack.signum()).contains(&z);
             if (last - first).max_element() > 128.0 || !is_point && !in_range(z) {
                 continue;
@@ -191,7 +202,8 @@ proptest! {
     fn depth_is_that_of_the_nearest_piece(case in cases()) {
         let case = Case { depth: case.depth.straight(), color: case.color.straight(), ..case };
         let out = case.run(&mut case.registration());
-        let (most, least) = (case.pieces(0.03), case.pieces(-0.03));
+        let most = case.pieces(0.03);
+        let least = case.pieces(-0.03);
         for (i, z) in out.iter().enumerate() {
             if *z == 0 {
                 // Depth beyond 16 bits is out of range.
@@ -235,7 +247,8 @@ proptest! {
     #[test]
     fn painting_mixes_the_four_pixels_around(case in cases()) {
         let case = Case { depth: case.depth.straight(), ..case };
-        let (w, h) = (case.color_size.0 as usize, case.color_size.1 as usize);
+        let w = case.color_size.0 as usize;
+        let h = case.color_size.1 as usize;
         let value = |x: usize, y: usize| ((x * 7 + y * 5) % 200) as u8;
         let color: Vec<u8> = (0..w * h).flat_map(|i| [value(i % w, i / w), 9, 200]).collect();
         let mut out = vec![1; case.pixels.len() * 3];
@@ -249,14 +262,17 @@ proptest! {
                 prop_assert!(*z != 0 || got == [0; 3], "{got:?} for a hole");
                 continue;
             };
-            let (right, bottom) = (w as f64 - 1.0, h as f64 - 1.0);
+            let right = w as f64 - 1.0;
+            let bottom = h as f64 - 1.0;
             if at.x < -0.75 || at.y < -0.75 || at.x > right + 0.75 || at.y > bottom + 0.75 {
                 prop_assert_eq!(got, [0; 3], "outside at {}", at);
             } else if at.x > -0.25 && at.y > -0.25 && at.x < right + 0.25 && at.y < bottom + 0.25 {
                 let at = at.clamp(DVec2::ZERO, DVec2::new(right, bottom));
-                let (x, y) = (at.x as usize, at.y as usize);
+                let x = at.x as usize;
+                let y = at.y as usize;
                 let near = |dx: usize, dy: usize| f64::from(value((x + dx).min(w - 1), (y + dy).min(h - 1)));
-                let (a, b) = (at.x.fract(), at.y.fract());
+                let a = at.x.fract();
+                let b = at.y.fract();
                 let want = (near(0, 0) * (1.0 - a) + near(1, 0) * a) * (1.0 - b)
                     + (near(0, 1) * (1.0 - a) + near(1, 1) * a) * b;
                 let range = [near(0, 0), near(1, 0), near(0, 1), near(1, 1)];
@@ -395,7 +411,8 @@ fn what_cannot_be_registered_is_refused() {
 #[test]
 fn the_same_view_needs_no_registration() {
     let k = Intrinsics::pinhole(60.0, 60.0, 31.5, 23.5);
-    let (size, here) = ((64, 48), Pose::IDENTITY);
+    let size = (64, 48);
+    let here = Pose::IDENTITY;
     let turned = Pose { rotation_xyzw: [0.0, 0.001, 0.0, 1.0], ..here };
     let moved = Pose { translation_m: [0.0, 0.0001, 0.0], ..here };
     let other = Intrinsics { cx: 31.6, ..k };

@@ -61,12 +61,16 @@ impl Numbers {
     /// librealsense's `get_texture_map_sse`, so that roundings agree.
     #[inline(always)]
     pub(super) fn project(&self, z: f32, x: f32, y: f32, lens: impl Lens32) -> Point {
-        let ([rx, ry, rz], [tx, ty, tz], [fx, fy, cx, cy]) = (self.r, self.t, self.k);
-        let (px, py) = (z * x, z * y);
+        let [rx, ry, rz] = self.r;
+        let [tx, ty, tz] = self.t;
+        let [fx, fy, cx, cy] = self.k;
+        let px = z * x;
+        let py = z * y;
         let qx = rx[0] * px + (rx[1] * py + (rx[2] * z + tx));
         let qy = ry[0] * px + (ry[1] * py + (ry[2] * z + ty));
         let qz = rz[0] * px + (rz[1] * py + (rz[2] * z + tz));
-        let (a, b) = (qx / qz, qy / qz);
+        let a = qx / qz;
+        let b = qy / qz;
         let (dx, dy) = lens.shown(a, b);
         // NaN, of a ray that depth's lens does not form, is not in front either.
         let seen = (qz > 0.0) & (a * a + b * b <= self.max_radius2);

@@ -29,11 +29,12 @@ pub fn depth_from_disparity(
     if !(unit_m > 0.0 && unit_m.is_finite()) {
         return Err(Error::new(
             ErrorKind::BadInput,
-            format!("a depth unit of {unit_m} m is none; 0.001 is a millimetre"),
+            format!("invalid depth unit {unit_m} m; 0.001 is a millimetre"),
         ));
     }
     let units = (focal_px * baseline_m / unit_m) as f32;
-    let (near, far) = (((range_m.0 / unit_m) as f32).max(1.0), (range_m.1 / unit_m).min(65_535.0) as f32);
+    let near = ((range_m.0 / unit_m) as f32).max(1.0);
+    let far = (range_m.1 / unit_m).min(65_535.0) as f32;
     to_units(disparity, units, near, far, out);
     Ok(())
 }
@@ -50,8 +51,8 @@ for_every_processor! {
     }
 }
 
-/// Depth in metres from disparity in pixels: `focal_px * baseline_m / disparity`; NaN where there is none and where
-/// depth is outside `range_m`.
+/// Depth in metres from disparity in pixels: `focal_px * baseline_m / disparity`; NaN for no disparity and where depth
+/// is outside `range_m`.
 ///
 /// # Errors
 /// As [`depth_from_disparity`].
@@ -65,7 +66,8 @@ pub fn metres_from_disparity(
     check_len("depth", out.len(), (disparity.len(), 1), 1)?;
     check_geometry(focal_px, baseline_m)?;
     let product = (focal_px * baseline_m) as f32;
-    let (near, far) = (range_m.0 as f32, range_m.1 as f32);
+    let near = range_m.0 as f32;
+    let far = range_m.1 as f32;
     for (z, d) in out.iter_mut().zip(disparity) {
         let depth = product / d;
         *z = if *d > 0.0 && depth >= near && depth <= far { depth } else { f32::NAN };

@@ -4,8 +4,8 @@ use crate::{Error, ErrorKind, Result};
 use core::fmt;
 use core::str::FromStr;
 
-/// A point of the curve between fast and good. Recordings that stand in for a vendor's mode of the same name call them
-/// `mimic_performance` and so on: they are nobody's closed algorithm.
+/// A trade-off between speed and quality. Recordings that stand in for a vendor's mode of the same name call them
+/// `mimic_performance` and so on: they are not the vendor's closed algorithm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Preset {
     /// Matched at half the resolution.
@@ -43,13 +43,13 @@ impl FromStr for Preset {
         Self::ALL.into_iter().find(|p| p.name() == text).ok_or_else(|| {
             Error::new(
                 ErrorKind::BadInput,
-                format!("\"{text}\" is no preset of the stereo engine; write performance, quality or ultra"),
+                format!("unknown stereo preset \"{text}\"; write performance, quality or ultra"),
             )
         })
     }
 }
 
-/// At which resolutions pictures are matched.
+/// At which resolutions images are matched.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Resolution {
     /// Their own.
@@ -79,16 +79,16 @@ pub const MAX_DISPARITIES: usize = 256;
 pub struct Parameters {
     /// The preset that they come from; what a recording calls them.
     pub preset: Preset,
-    /// Disparities that are searched, in pixels of the full picture: 0 to this number less one. 1 to 256; nearer things
+    /// Disparities that are searched, in pixels of the full image: 0 to this number less one. 1 to 256; nearer things
     /// than `focal_px * baseline_m / max_disparity` get none.
     pub max_disparity: usize,
-    /// At which resolutions the pictures are matched.
+    /// At which resolutions the images are matched.
     pub resolution: Resolution,
     /// Penalty of a step of one disparity between neighbours along a path, in census bits.
     pub p1: u8,
     /// Penalty of a larger step where grey does not change along the path, in census bits; at most 63.
     pub p2: u8,
-    /// What `p2` comes down to where grey changes; at least `p1`.
+    /// Lower bound of `p2` where grey changes; at least `p1`.
     pub p2_least: u8,
     /// Change of grey from which on `p2` comes down, by 1 for each level of grey.
     pub p2_slack: u8,
@@ -143,7 +143,7 @@ impl Parameters {
         }
     }
 
-    /// Every number as `key=value` words, for the metadata of what is made with them.
+    /// Every number as `key=value` words, for the metadata of the result.
     pub fn describe(&self) -> String {
         let Self { preset, max_disparity, resolution, p1, p2, p2_least, p2_slack, .. } = self;
         let Self { uniqueness_percent, left_right_px, speckle_px, speckle_step_px, .. } = self;
@@ -158,19 +158,21 @@ impl Parameters {
         )
     }
 
-    /// Refuses numbers that the engine cannot have.
+    /// Refuses invalid numbers.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`], and it says which.
+    /// [`ErrorKind::BadInput`], naming the parameter.
     pub(crate) fn check(&self) -> Result<()> {
         let wrong = |text: String| Err(Error::new(ErrorKind::BadInput, text));
         if self.max_disparity == 0 || self.max_disparity > MAX_DISPARITIES {
             return wrong(format!(
-                "a search of {} disparities is not possible; choose 1 to {MAX_DISPARITIES}, and shrink the pictures when things are nearer",
+                "a search of {} disparities is not possible; choose 1 to {MAX_DISPARITIES}, and shrink the images when things are nearer",
                 self.max_disparity
             ));
         }
-        let (p1, least, p2) = (self.p1, self.p2_least, self.p2);
+        let p1 = self.p1;
+        let least = self.p2_least;
+        let p2 = self.p2;
         if p1 == 0 || p1 > least || least > p2 || p2 > 63 {
             return wrong(format!(
                 "penalties of p1 {p1}, p2_least {least} and p2 {p2} do not go together: 0 < p1 <= p2_least <= p2 <= 63"
@@ -178,7 +180,7 @@ impl Parameters {
         }
         for (what, step) in [("speckle_step_px", self.speckle_step_px), ("gap_step_px", self.gap_step_px)] {
             if !(step >= 0.0 && step.is_finite()) {
-                return wrong(format!("a {what} of {step} pixels is none"));
+                return wrong(format!("invalid {what} = {step}; it must be finite and at least 0"));
             }
         }
         Ok(())

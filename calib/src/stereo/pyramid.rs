@@ -1,19 +1,19 @@
-//! Both pictures of a pair, halved until they are small.
+//! Both images of a pair, halved until they are small.
 
 use super::sgm::halve;
 use super::{Gray, StereoPair};
 
-/// Both pictures in some size.
+/// Both images in some size.
 #[derive(Debug)]
 struct Level {
     size: (usize, usize),
-    eyes: [Vec<u8>; 2],
+    images: [Vec<u8>; 2],
 }
 
 impl Level {
     fn both(&self) -> [Gray<'_>; 2] {
         let (w, h) = self.size;
-        [Gray::packed(&self.eyes[0], w, h), Gray::packed(&self.eyes[1], w, h)]
+        [Gray::packed(&self.images[0], w, h), Gray::packed(&self.images[1], w, h)]
     }
 }
 
@@ -29,7 +29,7 @@ impl Pyramid {
         let mut levels = Vec::new();
         while w > most {
             (w, h) = (w.div_ceil(2), h.div_ceil(2));
-            levels.push(Level { size: (w, h), eyes: [vec![0; w * h], vec![0; w * h]] });
+            levels.push(Level { size: (w, h), images: [vec![0; w * h], vec![0; w * h]] });
         }
         Self { levels }
     }
@@ -40,8 +40,8 @@ impl Pyramid {
     }
 
     /// Width and height of the smallest copies of pairs of this size.
-    pub fn smallest(&self, size: (usize, usize)) -> (usize, usize) {
-        self.levels.last().map_or(size, |l| l.size)
+    pub fn smallest(&self, width: usize, height: usize) -> (usize, usize) {
+        self.levels.last().map_or((width, height), |l| l.size)
     }
 
     /// Halves a pair of the size that it was made for.
@@ -50,13 +50,13 @@ impl Pyramid {
             let (before, here) = self.levels.split_at_mut(i);
             let Some(level) = here.first_mut() else { break };
             let from = before.last().map_or([pair.left, pair.right], Level::both);
-            for (from, to) in from.iter().zip(&mut level.eyes) {
+            for (from, to) in from.iter().zip(&mut level.images) {
                 halve(from, to);
             }
         }
     }
 
-    /// Both pictures after so many halvings; of the pair itself for 0.
+    /// Both images after so many halvings; of the pair itself for 0.
     pub fn level<'a>(&'a self, pair: &StereoPair<'a>, halvings: usize) -> [Gray<'a>; 2] {
         let level = halvings.checked_sub(1).and_then(|i| self.levels.get(i));
         level.map_or([pair.left, pair.right], Level::both)

@@ -1,9 +1,10 @@
-//! Whether rows of the left picture are rows of the right one, as matching takes for granted.
+//! Checks that rows of the left image are rows of the right one, as matching assumes.
 //!
-//! After rectification with a calibration that fits, what both eyes see lies in one row. One that is stale, or of another
-//! camera, leaves them tenths to several pixels apart: matching then finds less and less, and what it finds is wrong. Here
-//! many distinctive places are searched for in other rows too. Their offsets are a plane over the picture: pitch moves all
-//! rows, roll more on one side than on the other, another focal length more at the bottom than at the top.
+//! After rectification with the right calibration, a point lies in the same row of both images. A calibration that is
+//! stale, or of another camera, leaves them tenths to several pixels apart: matching then finds less, and finds wrong
+//! disparities. Here many distinctive places are searched for in other rows too. Their offsets are a plane over the
+//! image: pitch moves all rows, roll more on one side than on the other, another focal length more at the bottom than
+//! at the top.
 
 use super::pyramid::Pyramid;
 use super::{Gray, StereoPair};
@@ -15,25 +16,25 @@ use track::Reach;
 mod fit;
 mod track;
 
-/// Pictures are halved until they are no wider than this.
+/// Images are halved until they are no wider than this.
 const WIDTH: usize = 360;
 /// Rows that are searched up and down, pixels of the full size, at least.
 const ROWS_PX: usize = 6;
-/// Fewer places say nothing.
+/// Fewer places give no result.
 const POINTS: usize = 40;
-/// So few squares of the picture say nothing of it.
+/// Fewer squares of the image give no result.
 const SQUARES: usize = 8;
 /// Share of the places that must agree.
 const AGREE: f64 = 0.6;
-/// An offset that is less certain than this is none.
+/// An offset that is less certain than this is discarded.
 const UNSURE_PX: f64 = 0.25;
-/// A slope counts when it is so many standard deviations from none.
+/// A slope counts when it is this many standard deviations from 0.
 const SHOWN: f64 = 3.0;
 /// Standard deviations that are stated, for 95 %.
 const STATED: f64 = 2.0;
-/// What is beyond the scatter of the places: interpolation, and what the eyes see differently.
+/// Error beyond the scatter of the places: interpolation, and differences between the two images.
 const FLOOR_PX: f64 = 0.05;
-/// Rows that are further apart than this on the whole are worth a word: see docs/stereo.md for what they cost.
+/// Rows further apart than this overall cause a warning: docs/stereo.md lists the cost.
 const LIMIT_PX: f64 = 0.4;
 
 /// An offset is corrected when it is larger than this many times what is uncertain of it,
@@ -41,41 +42,42 @@ const SIGNIFICANT: f64 = 2.0;
 /// and by more than this beyond that: less costs matching nothing that can be measured, and moving rows blurs them a little.
 const WORTH_PX: f64 = 0.15;
 
-/// How far the eyes' rows are apart. A positive number is for what lies lower in the right picture.
+/// Row offset between the two images; positive if the content lies lower in the right image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RowOffset {
-    /// In the middle of the picture, pixels.
+    /// In the middle of the image, pixels.
     pub middle_px: f64,
-    /// How much more it is at the right side than at the left one, pixels; 0 when neither this nor the next can be shown.
+    /// How much more it is at the right side than at the left one, pixels; 0 when neither this nor the next is
+    /// significant.
     pub across_px: f64,
     /// How much more it is at the bottom than at the top, pixels; likewise.
     pub down_px: f64,
     /// How far each of them may be off, pixels: in 95 of 100 cases it is less.
     pub unsure_px: [f64; 3],
-    /// Places that were found in both pictures.
+    /// Places that were found in both images.
     pub places: usize,
-    /// Pairs that they are of.
+    /// Pairs that they come from.
     pub pairs: usize,
 }
 
 impl RowOffset {
-    /// The offset at a place of the picture, given as shares of its width and height.
+    /// The offset at a place of the image, given as shares of its width and height.
     pub fn at(&self, across: f64, down: f64) -> f64 {
         self.middle_px + self.across_px * (across - 0.5) + self.down_px * (down - 0.5)
     }
 
-    /// The root of the mean square over the picture, pixels.
+    /// The root of the mean square over the image, pixels.
     pub fn overall_px(&self) -> f64 {
         overall([self.middle_px, self.across_px, self.down_px])
     }
 
-    /// Whether rows are so far apart that depth suffers, beyond what is uncertain of it.
+    /// Whether the offset exceeds, beyond its uncertainty, the limit at which depth suffers.
     pub fn is_bad(&self) -> bool {
         self.overall_px() - overall(self.unsure_px) > LIMIT_PX
     }
 
-    /// Whether the offset is shown beyond what is uncertain of it, so that moving the right image's rows by it brings them
-    /// nearer to the left image's. Every offset that [`RowOffset::is_bad`] is.
+    /// Whether the offset is significant beyond its uncertainty, so that moving the right image's rows by it brings
+    /// them nearer to the left image's. Every offset that [`RowOffset::is_bad`] is.
     pub fn is_significant(&self) -> bool {
         let px = self.overall_px();
         let unsure_px = overall(self.unsure_px);
@@ -93,19 +95,19 @@ impl RowOffset {
         }
     }
 
-    /// What was corrected as a `key=value` word, for the metadata of what is made of corrected images.
+    /// The correction as a `key=value` word, for the metadata of results from corrected images.
     pub fn describe_correction(&self) -> String {
         format!("rows_moved_px={:.3},{:.3},{:.3}", self.middle_px, self.across_px, self.down_px)
     }
 
-    /// What to say of it where something is wrong: what was measured, what it does and what to do about it. The camera is
-    /// the caller's to name. `is_corrected`: the right image's rows are moved by it before they are matched.
+    /// The warning for a bad offset: the measurement, its effect and the remedy. The caller names the camera.
+    /// `is_corrected`: the right image's rows are moved by it before they are matched.
     pub fn warning(&self, is_corrected: bool) -> Option<String> {
         let done = if is_corrected {
-            "The right image is moved by that before it is matched; where the offset is no plane over the image, depth has \
+            "The right image is moved by that before it is matched; where the offset is not a plane over the image, depth has \
              holes and errors"
         } else {
-            "Depth has holes and errors that grow with this; from 1 px on little of it can be used"
+            "Depth has holes and errors that grow with this; from 1 px on most of it is unusable"
         };
         self.is_bad().then(|| {
             format!(
@@ -116,14 +118,15 @@ impl RowOffset {
     }
 }
 
-/// Of a plane's terms.
+/// Root mean square over the image of a plane with these terms.
 fn overall([middle, across, down]: [f64; 3]) -> f64 {
     (middle * middle + (across * across + down * down) / 12.0).sqrt()
 }
 
 impl fmt::Display for RowOffset {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (side, middle) = (if self.middle_px < 0.0 { "higher" } else { "lower" }, self.middle_px.abs());
+        let side = if self.middle_px < 0.0 { "higher" } else { "lower" };
+        let middle = self.middle_px.abs();
         let unsure = self.unsure_px[0];
         write!(f, "what both see lies {middle:.2} ± {unsure:.2} px {side} in the right one")?;
         let sign = if self.middle_px < 0.0 { -1.0 } else { 1.0 };
@@ -149,9 +152,9 @@ pub struct RowCheck {
     reach: Reach,
     places: Vec<(u16, u16)>,
     scores: Vec<f32>,
-    /// Those of the last pairs, oldest first.
+    /// Places of the last pairs, oldest first.
     points: Vec<Point>,
-    /// How many of each pair.
+    /// Number of places of each pair.
     counts: [usize; PAIRS],
     pairs: usize,
     scratch: Vec<f64>,
@@ -165,7 +168,7 @@ impl RowCheck {
     pub fn new(width: usize, height: usize) -> Self {
         let pyramid = Pyramid::new((width, height), WIDTH);
         let scale = 1_usize << pyramid.halvings();
-        let (w, h) = pyramid.smallest((width, height));
+        let (w, h) = pyramid.smallest(width, height);
         let places = track::most_places(w, h);
         // The outermost rows are searched only to know that the best is not beyond them.
         let rows = ROWS_PX.div_ceil(scale).max(3) as isize + 1;
@@ -184,10 +187,10 @@ impl RowCheck {
         }
     }
 
-    /// Measures in one more pair, and returns in how many places that could be done.
+    /// Measures one more pair and returns the number of places measured.
     ///
     /// # Errors
-    /// [`crate::ErrorKind::SizeMismatch`] for pictures of another size.
+    /// [`crate::ErrorKind::SizeMismatch`] for images of another size.
     pub fn look(&mut self, pair: &StereoPair<'_>) -> Result<usize> {
         pair.left.check("left", self.size.0, self.size.1)?;
         pair.right.check("right", self.size.0, self.size.1)?;
@@ -196,7 +199,8 @@ impl RowCheck {
             self.points.drain(..self.counts[slot]);
         }
         let before = self.points.len();
-        let (number, (width, height)) = (self.pairs, self.size);
+        let number = self.pairs;
+        let (width, height) = self.size;
         let Self { pyramid, reach, places, scores, points, .. } = self;
         pyramid.fill(pair);
         let last = pyramid.halvings();
@@ -226,8 +230,8 @@ impl RowCheck {
         Ok(found)
     }
 
-    /// What the pairs say together; `None` when that is too little: pictures without texture, of patterns that repeat, of
-    /// nothing that both eyes see.
+    /// The offset over all pairs; `None` for too few places: images without texture, with repeating patterns, or
+    /// without common content.
     pub fn offset(&mut self) -> Option<RowOffset> {
         let Self { points, scratch, .. } = self;
         if points.len() < POINTS {
@@ -236,7 +240,8 @@ impl RowCheck {
         let flat = fit::fit(points, true, scratch)?;
         let sloping = fit::fit(points, false, scratch)?;
         let is_shown = |term: f64, deviation: f64| term.abs() > SHOWN * deviation.max(FLOOR_PX);
-        let (terms, deviations) = (sloping.terms, sloping.deviations);
+        let terms = sloping.terms;
+        let deviations = sloping.deviations;
         let is_sloping = is_shown(terms.y, deviations.y) || is_shown(terms.z, deviations.z);
         let plane = if is_sloping { sloping } else { flat };
         let stated = |deviation: f64| (STATED * deviation).hypot(FLOOR_PX);
@@ -273,7 +278,7 @@ mod tests {
         (mixed >> 40) as f64 / f64::from(1 << 23) - 1.0
     }
 
-    /// What is made of `n` places in a grid over `part` of the picture, of four pairs.
+    /// Fits `n` places in a grid over `part` of the image, from four pairs.
     fn offset(n: usize, part: f64, rows: impl Fn(usize, usize) -> f64) -> Option<RowOffset> {
         let mut check = RowCheck::new(400, 240);
         check.pairs = 4;
@@ -356,10 +361,11 @@ mod tests {
         assert_eq!(total.describe_correction(), "rows_moved_px=0.750,0.500,0.000");
     }
 
-    /// A camera that was put right says so after as many pairs as count at once.
+    /// A corrected camera is recognised after as many pairs as count at once.
     #[test]
     fn old_pairs_are_forgotten() {
-        let (w, h) = (240, 160);
+        let w = 240;
+        let h = 160;
         let left: Vec<u8> = (0..w * h).map(|i| (127.0 + 120.0 * noise(i, 3)) as u8).collect();
         let mut low = left.clone();
         low.rotate_right(2 * w);

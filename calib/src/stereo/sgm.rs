@@ -1,4 +1,4 @@
-//! Semi-global matching: census, eight paths, the best sum, and what removes the doubtful.
+//! Semi-global matching: census, eight paths, the best sum, and the filters that remove doubtful disparities.
 
 use super::{Description, DisparityMap, Gray, Matcher, Parameters, Resolution, StereoPair};
 use crate::{Error, ErrorKind, Result};
@@ -30,16 +30,16 @@ mod volume;
 pub(super) use filter::halve;
 pub use presets::SgmPresets;
 
-/// Largest side of a picture.
+/// Largest side of an image.
 const MAX_SIDE: usize = 16_384;
 
-/// Matches pictures of one size, and removes what is doubtful.
+/// Matches images of one size, and removes doubtful disparities.
 #[derive(Debug)]
 struct Engine {
     size: (usize, usize),
     passes: Passes,
     texture: Texture,
-    /// Disparities in 256ths of a pixel, and what the median makes of them.
+    /// Disparities in 256ths of a pixel, before and after the median.
     maps: [Vec<u16>; 2],
     speckle: Speckle,
     columns: Vec<u32>,
@@ -83,7 +83,8 @@ impl Engine {
         confidence: &mut [u8],
     ) -> &mut [u16] {
         let Self { size: (width, height), passes, texture, maps: [map, other], speckle, columns } = self;
-        let (width, height) = (*width, *height);
+        let width = *width;
+        let height = *height;
         let last = (passes.disparities() - 1) as u8;
         let (winners, mirrored) = passes.run(pair, pool);
         let rows = height.div_ceil(pool.map_or(1, rayon::ThreadPool::current_num_threads)) * width;
@@ -91,7 +92,8 @@ impl Engine {
             let all = out.chunks_exact_mut(width).zip(sure.chunks_exact_mut(width));
             for (y, (out, sure)) in all.enumerate() {
                 let of = i * rows + y * width..i * rows + (y + 1) * width;
-                let (winners, mirrored) = (&winners[of.clone()], &mirrored[of]);
+                let winners = &winners[of.clone()];
+                let mirrored = &mirrored[of];
                 choose::choose(winners, mirrored, parameters, last, out, sure);
                 if parameters.rematch {
                     choose::rematch(winners, mirrored, parameters.left_right_px, out, sure);
@@ -136,7 +138,7 @@ struct Half {
     engine: Engine,
     /// With the lengths and steps of gaps in its own pixels.
     parameters: Parameters,
-    pictures: [Vec<u8>; 2],
+    images: [Vec<u8>; 2],
     confidence: Vec<u8>,
     /// At full resolution again.
     map: Vec<u16>,
@@ -156,7 +158,7 @@ impl Half {
         Self {
             engine: Engine::new(form, size, parameters.max_disparity.div_ceil(2), &parameters, threads),
             parameters,
-            pictures: [vec![0; pixels], vec![0; pixels]],
+            images: [vec![0; pixels], vec![0; pixels]],
             confidence: vec![0; pixels],
             map: vec![NONE; width * height],
             sure: vec![0; width * height],
@@ -169,9 +171,9 @@ impl Half {
 
     fn run(&mut self, pair: &StereoPair<'_>, pool: Option<&rayon::ThreadPool>) {
         let (w, h) = self.engine.size;
-        filter::halve(&pair.left, &mut self.pictures[0]);
-        filter::halve(&pair.right, &mut self.pictures[1]);
-        let [left, right] = self.pictures.each_ref().map(|p| Gray::packed(p, w, h));
+        filter::halve(&pair.left, &mut self.images[0]);
+        filter::halve(&pair.right, &mut self.images[1]);
+        let [left, right] = self.images.each_ref().map(|p| Gray::packed(p, w, h));
         let Self { engine, parameters, confidence, .. } = self;
         let map = engine.run(&StereoPair::new(left, right), parameters, pool, confidence);
         let full = (pair.left.width, pair.left.height);
@@ -214,7 +216,7 @@ impl SgmMatcher {
         if !(1..=MAX_SIDE).contains(&width) || !(1..=MAX_SIDE).contains(&height) {
             return Err(Error::new(
                 ErrorKind::BadInput,
-                format!("pictures of {width}x{height} pixels cannot be matched: sides are 1 to {MAX_SIDE}"),
+                format!("images of {width}x{height} pixels cannot be matched: sides are 1 to {MAX_SIDE}"),
             ));
         }
         let threads = threads.clamp(1, height.div_ceil(2).min(64));
@@ -276,7 +278,8 @@ impl SgmMatcher {
     fn run_into(&mut self, pair: &StereoPair<'_>, outs: Outs<'_>) -> Result<()> {
         pair.left.check("left", self.width, self.height)?;
         pair.right.check("right", self.width, self.height)?;
-        let (parameters, pool) = (&self.parameters, self.pool.as_ref());
+        let parameters = &self.parameters;
+        let pool = self.pool.as_ref();
         let Outs { mut full, mut half, mut both } = outs;
         for out in [&mut full, &mut half, &mut both].into_iter().flatten() {
             out.resize(self.width, self.height);

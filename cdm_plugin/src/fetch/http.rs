@@ -1,4 +1,4 @@
-//! One request for a part of a file, through redirects, and what the server says of the file on the way.
+//! One request for a part of a file, through redirects, with the servers' metadata of the file.
 
 use crate::{Error, ErrorKind};
 use core::time::Duration;
@@ -16,7 +16,7 @@ pub(super) struct Client {
     token: Option<String>,
 }
 
-/// What a server answered.
+/// Answer of a server.
 pub(super) struct Answer {
     pub status: u16,
     /// The place in the file where the body begins, when it is a part of it.
@@ -24,14 +24,14 @@ pub(super) struct Answer {
     /// Bytes of the whole file.
     pub total: Option<u64>,
     pub etag: Option<String>,
-    /// The hash that the server told, in hexadecimal.
+    /// The hash that the server reported, in hexadecimal.
     pub sha256: Option<String>,
     /// The version of the repository.
     pub revision: Option<String>,
     pub body: Box<dyn Read>,
 }
 
-/// Why there is no answer of use.
+/// Failure to get a usable answer.
 pub(super) enum Failure {
     /// The server could not be reached.
     NoWay(Error),
@@ -68,7 +68,7 @@ impl Client {
 
     /// Asks for the file from byte `from` on; when its mark is still `etag`, if there is one.
     pub(super) fn get(&self, url: &str, from: u64, etag: Option<&str>) -> Result<Answer, Failure> {
-        let mut told = Told::default();
+        let mut reported = Reported::default();
         let mut at = url.to_owned();
         for _ in 0..REDIRECTS {
             let mut request = self.agent.get(&at).header("Accept-Encoding", "identity");
@@ -83,10 +83,10 @@ impl Client {
                 }
             }
             let response = request.call().map_err(|e| failure(&at, e))?;
-            told.learn(response.headers());
+            reported.learn(response.headers());
             match response.status().as_u16() {
                 301 | 302 | 303 | 307 | 308 => at = next(&at, response.headers())?,
-                _ => return told.answer(&at, response, self.token.is_some()),
+                _ => return reported.answer(&at, response, self.token.is_some()),
             }
         }
         let message = format!("{url}: the server points from place to place without end");
@@ -94,15 +94,15 @@ impl Client {
     }
 }
 
-/// What servers told on the way.
+/// Metadata from the headers of all redirects.
 #[derive(Default)]
-struct Told {
+struct Reported {
     size: Option<u64>,
     sha256: Option<String>,
     revision: Option<String>,
 }
 
-impl Told {
+impl Reported {
     fn learn(&mut self, headers: &HeaderMap) {
         self.size = self.size.or_else(|| text(headers, "x-linked-size")?.parse().ok());
         if self.sha256.is_none() {
@@ -156,7 +156,7 @@ impl Told {
             }
             other => return Err(fail(format!("the server answers with status {other}"))),
         };
-        // A size that the file's own server tells is the better one only when nobody told before.
+        // The size of the final server counts only if no earlier one reported a size.
         let total = self.size.or(total);
         let etag = text(headers, "etag").map(str::to_owned);
         let body = Box::new(response.into_body().into_reader());
@@ -203,7 +203,7 @@ fn next(from: &str, headers: &HeaderMap) -> Result<String, Failure> {
     } else if to.starts_with('/') {
         format!("{}{to}", origin(from))
     } else {
-        return Err(fail(&format!("the server points to {to:?}, which is no address")));
+        return Err(fail(&format!("the server redirects to the invalid address {to:?}")));
     };
     if from.starts_with("https://") && !to.starts_with("https://") {
         return Err(fail("the server points to a place without encryption; it is not followed"));
@@ -237,7 +237,7 @@ fn failure(url: &str, e: ureq::Error) -> Failure {
             no_way(format!("{} cannot be reached: {e}", host(url)))
         }
         ureq::Error::ConnectProxyFailed(e) => no_way(format!("the proxy does not let it through: {e}")),
-        ureq::Error::InvalidProxyUrl => no_way("the proxy in HTTPS_PROXY is no address".into()),
+        ureq::Error::InvalidProxyUrl => no_way("invalid proxy address in HTTPS_PROXY".into()),
         ureq::Error::Rustls(e) => {
             let message = format!(
                 "{url}: {} does not prove who it is: {e}; a proxy of the network may stand in between (its certificate must be \

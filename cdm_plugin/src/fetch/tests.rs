@@ -40,7 +40,8 @@ impl Server {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = format!("http://{}", listener.local_addr().unwrap());
         let requests = Arc::new(Mutex::new(Vec::new()));
-        let (seen, handler): (_, Arc<Handler>) = (Arc::clone(&requests), Arc::new(handler));
+        let seen = Arc::clone(&requests);
+        let handler: Arc<Handler> = Arc::new(handler);
         let count = AtomicUsize::new(0);
         std::thread::spawn(move || {
             for stream in listener.incoming().flatten() {
@@ -135,7 +136,8 @@ const NAME: &str = "cdm-d435";
 /// off three times.
 #[test]
 fn a_cut_download_goes_on_where_it_ended() {
-    let (s, file) = (setup(), made_up(1_000_000));
+    let s = setup();
+    let file = made_up(1_000_000);
     let copy = file.clone();
     let files = Server::new(move |_, r| part(r, &copy, "\"v1\"", 300_000));
     let linked = [
@@ -170,7 +172,8 @@ fn a_cut_download_goes_on_where_it_ended() {
 
 #[test]
 fn what_was_fetched_before_the_program_ended_is_not_fetched_again() {
-    let (s, file) = (setup(), made_up(500_000));
+    let s = setup();
+    let file = made_up(500_000);
     let copy = file.clone();
     // Nothing after the first connection until the third.
     let server = Server::new(move |n, r| match n {
@@ -191,7 +194,8 @@ fn what_was_fetched_before_the_program_ended_is_not_fetched_again() {
 #[test]
 fn a_server_that_ignores_ranges_or_has_another_version_sends_all() {
     for etag in ["\"v1\"", "\"v2\""] {
-        let (s, file) = (setup(), made_up(300_000));
+        let s = setup();
+        let file = made_up(300_000);
         let copy = file.clone();
         let server = Server::new(move |n, r| match n {
             0 => part(r, &made_up(300_001), "\"v1\"", 100_000),
@@ -208,7 +212,8 @@ fn a_server_that_ignores_ranges_or_has_another_version_sends_all() {
 
 #[test]
 fn a_wrong_hash_is_found_before_or_after_and_nothing_is_kept() {
-    let (s, file) = (setup(), made_up(10_000));
+    let s = setup();
+    let file = made_up(10_000);
     let copy = file.clone();
     let server = Server::new(move |_, r| part(r, &copy, "\"v\"", usize::MAX));
     let options_ = FetchOptions { sha256: Some(hash(b"other")), ..options(&server) };
@@ -219,7 +224,7 @@ fn a_wrong_hash_is_found_before_or_after_and_nothing_is_kept() {
     assert!(failed(&s, "cdm-kinect", &options(&server)).contains("ba2b8899a683876f"), "known");
     let good = FetchOptions { sha256: Some(hash(&file).to_uppercase()), ..options(&server) };
     assert!(fetch(&s.store, NAME, &good, &mut quiet).is_ok());
-    // Told by the server before anything came.
+    // Reported by the server before the first byte.
     let tag = ("X-Linked-Etag", format!("\"{}\"", hash(b"newer")));
     let server =
         Server::new(move |_, _| reply("200 OK", &[tag.clone(), ("Content-Length", "3".into())], b"abc"));
@@ -230,7 +235,7 @@ fn a_wrong_hash_is_found_before_or_after_and_nothing_is_kept() {
 }
 
 #[test]
-fn a_server_that_lies_about_the_length_is_told() {
+fn a_wrong_length_from_a_server_is_reported() {
     // Always one byte short of what it says: nothing more comes in three attempts.
     let s = setup();
     let server = Server::new(|_, r| match r.from() {
@@ -271,7 +276,7 @@ fn refusals_say_what_to_do_and_are_not_repeated() {
         ("418 Teapot", vec![], "status 418"),
         ("200 OK", vec![("Content-Type", "text/html; charset=utf-8".to_owned())], "a page, not a file"),
         ("302 Found", vec![], "does not say where"),
-        ("302 Found", vec![("Location", "ftp://x".to_owned())], "which is no address"),
+        ("302 Found", vec![("Location", "ftp://x".to_owned())], "redirects to the invalid address"),
     ] {
         let s = setup();
         let server = Server::new(move |_, _| reply(status, &headers, b""));
@@ -295,7 +300,8 @@ fn refusals_say_what_to_do_and_are_not_repeated() {
 
 #[test]
 fn whoever_watches_may_end_it_and_what_came_is_kept() {
-    let (s, file) = (setup(), made_up(2_000_000));
+    let s = setup();
+    let file = made_up(2_000_000);
     let copy = file.clone();
     let server = Server::new(move |_, r| part(r, &copy, "\"v\"", usize::MAX));
     let mut stop = |_: &'static str, done: u64, total: u64| {

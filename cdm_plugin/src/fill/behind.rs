@@ -1,11 +1,11 @@
-//! Taking out what was seen in a mirror or through glass: scattered depth in the middle of nearer surfaces.
+//! Removes depth seen in a mirror or through glass: scattered depth in the middle of nearer surfaces.
 //!
-//! The picture is looked at in blocks. Blocks that touch and have about the same depth are a patch. A patch that is full
-//! of holes, smaller than a tenth of the picture and surrounded by nearer surfaces is taken for a reflection or a view
+//! The image is looked at in blocks. Blocks that touch and have about the same depth are a patch. A patch that is full
+//! of holes, smaller than a tenth of the image and surrounded by nearer surfaces is taken for a reflection or a view
 //! through glass, and becomes a hole; it is then filled from its frame. A dark opening that a camera hardly sees into is
 //! closed by the same rule.
 
-/// Blocks per row of the picture.
+/// Blocks per row of the image.
 const BLOCKS: usize = 160;
 /// Inverse depth of blocks of one patch differs less than this, relative to the nearer one.
 const STEP: f32 = 0.12;
@@ -15,10 +15,10 @@ const EDGE: f32 = 1.2;
 const DENSE: f64 = 0.85;
 /// So much of a patch's border must be nearer.
 const ENCLOSED: f64 = 0.8;
-/// The largest patch that is taken out, a part of the picture.
+/// The largest patch that is taken out, a part of the image.
 const LARGEST: f64 = 0.1;
 
-/// What is in a block.
+/// Contents of a block.
 #[derive(Debug, Clone, Copy, Default)]
 struct Block {
     /// Pixels with depth.
@@ -40,7 +40,7 @@ enum Patch {
     Number(u32),
 }
 
-/// Finds such patches; keeps its memory from picture to picture.
+/// Finds such patches; keeps its memory from image to image.
 #[derive(Debug, Default)]
 pub(super) struct Behind {
     blocks: Vec<Block>,
@@ -49,7 +49,7 @@ pub(super) struct Behind {
 }
 
 impl Behind {
-    /// Makes room for pictures of this size.
+    /// Makes room for images of this size.
     pub(super) fn resize(&mut self, w: usize, h: usize) {
         let side = side(w);
         let n = w.div_ceil(side) * h.div_ceil(side);
@@ -71,7 +71,8 @@ impl Behind {
                 self.grow(start, columns);
                 if self.is_behind(columns, q.len() as f64) {
                     for i in &self.members {
-                        let (bx, by) = (*i as usize % columns, *i as usize / columns);
+                        let bx = *i as usize % columns;
+                        let by = *i as usize / columns;
                         for row in q[by * side * w..].chunks_mut(w).take(side) {
                             row[bx * side..((bx + 1) * side).min(w)].fill(0.0);
                         }
@@ -124,7 +125,10 @@ impl Behind {
     /// Whether the patch in `members` lies behind what surrounds it.
     fn is_behind(&self, columns: usize, whole: f64) -> bool {
         let number = self.members.first().map(|i| self.blocks[*i as usize].patch);
-        let (mut nearer, mut not, mut pixels, mut area) = (0.0, 0.0, 0.0, 0.0);
+        let mut nearer = 0.0;
+        let mut not = 0.0;
+        let mut pixels = 0.0;
+        let mut area = 0.0;
         for i in &self.members {
             let here = self.blocks[*i as usize];
             pixels += f64::from(here.pixels);

@@ -3,18 +3,18 @@
 //!
 //! Depth is compared as inverse depth `q` (1/m) and relative to itself, so that the same rule holds near and far.
 
-use super::lanes::wide;
+use super::workers::wide;
 
 /// How much two neighbours on one surface may differ, relative to their inverse depth: noise and slant of ordinary
 /// cameras stay below, flying pixels beyond.
 pub(super) const SAME: f32 = 0.035;
-/// Of a pixel's eight neighbours so many must lie on its surface. Two keep a line one pixel wide.
+/// Number of a pixel's eight neighbours that must lie on its surface. Two keep a line one pixel wide.
 const SUPPORT: f32 = 2.0;
 
 wide! {
 /// Writes row `y` of `q`, without the pixels that too few of their eight neighbours support, to `out`; 0 is a hole.
 ///
-/// At the edge of the picture the neighbours that are missing support nothing.
+/// At the edge of the image the neighbours that are missing support nothing.
 pub(super) fn keep_supported(q: &[f32], w: usize, y: usize, out: &mut [f32]) {
     let h = q.len() / w;
     let row = |y: usize| &q[y * w..(y + 1) * w];
@@ -23,7 +23,8 @@ pub(super) fn keep_supported(q: &[f32], w: usize, y: usize, out: &mut [f32]) {
     let (up, up_weight) = if y > 0 { (row(y - 1), 1.0) } else { (here, 0.0) };
     let (down, down_weight) = if y + 1 < h { (row(y + 1), 1.0) } else { (here, 0.0) };
     for x in [0, w - 1] {
-        let (from, to) = (x.saturating_sub(1), (x + 1).min(w - 1));
+        let from = x.saturating_sub(1);
+        let to = (x + 1).min(w - 1);
         let mut n = 0.0;
         for nx in from..=to {
             let side = if nx == x { 0.0 } else { same(here[nx], here[x]) };
@@ -35,9 +36,15 @@ pub(super) fn keep_supported(q: &[f32], w: usize, y: usize, out: &mut [f32]) {
         return;
     }
     let n = w - 2;
-    let (u0, u1, u2) = (&up[..n], &up[1..=n], &up[2..]);
-    let (d0, d1, d2) = (&down[..n], &down[1..=n], &down[2..]);
-    let (m0, m1, m2) = (&here[..n], &here[1..=n], &here[2..]);
+    let u0 = &up[..n];
+    let u1 = &up[1..=n];
+    let u2 = &up[2..];
+    let d0 = &down[..n];
+    let d1 = &down[1..=n];
+    let d2 = &down[2..];
+    let m0 = &here[..n];
+    let m1 = &here[1..=n];
+    let m2 = &here[2..];
     let out = &mut out[1..=n];
     for i in 0..n {
         let c = m1[i];
@@ -81,7 +88,7 @@ pub(super) struct Islands {
 }
 
 impl Islands {
-    /// Makes room for every picture of `pixels` pixels, so that none needs more later.
+    /// Makes room for every image of `pixels` pixels, so that none needs more later.
     pub(super) fn reserve(&mut self, pixels: usize) {
         self.runs.clear();
         self.runs.reserve(pixels);
@@ -157,16 +164,18 @@ impl Islands {
     }
 
     fn unite(&mut self, a: u32, b: u32) {
-        let (a, b) = (self.root(a), self.root(b));
+        let a = self.root(a);
+        let b = self.root(b);
         if a != b {
-            let (keep, give) = (a.min(b) as usize, a.max(b) as usize);
+            let keep = a.min(b) as usize;
+            let give = a.max(b) as usize;
             self.runs[give].parent = keep as u32;
             self.runs[keep].pixels += self.runs[give].pixels;
         }
     }
 }
 
-/// What is within this part of an island's inverse depth may belong to the same thing.
+/// Relative difference in inverse depth within which pixels may belong to the same object as an island.
 const ABOUT: f32 = 0.12;
 /// Pixels between those that are looked at around an island.
 const STEP: usize = 3;
@@ -203,7 +212,8 @@ fn find_runs(row: &[f32], y: u32, runs: &mut Vec<Run>) {
             x += 1;
         }
         let parent = runs.len() as u32;
-        let (from, to) = (from as u32, x as u32);
+        let from = from as u32;
+        let to = x as u32;
         runs.push(Run {
             from,
             to,

@@ -1,21 +1,27 @@
-//! From pictures as cameras give them to the form in which they are worked on, and back.
+//! From images as cameras give them to the form in which they are worked on, and back.
 
-use super::lanes::{Crew, wide};
+use super::workers::{Workers, wide};
 use crate::{Color, ColorFormat, Output, RawDepth};
 
-/// What cameras give where their range ends.
+/// Value that cameras report beyond their range.
 const SATURATED: u16 = u16::MAX;
 
 /// Inverse depth in 1/m to `q`, 0 in holes, and colour to `packed`.
-pub(super) fn load(crew: &Crew, color: &Color<'_>, depth: &RawDepth<'_>, q: &mut [f32], packed: &mut [u32]) {
+pub(super) fn load(
+    workers: &Workers,
+    color: &Color<'_>,
+    depth: &RawDepth<'_>,
+    q: &mut [f32],
+    packed: &mut [u32],
+) {
     let w = color.width;
     let per_unit = (1.0 / depth.unit_m) as f32;
-    crew.rows2((q, packed), w, |y, q, packed| {
-        inverse_row(crew.wide, &depth.pixels[y * w..(y + 1) * w], per_unit, q);
+    workers.rows2(q, packed, w, |y, q, packed| {
+        inverse_row(workers.wide, &depth.pixels[y * w..(y + 1) * w], per_unit, q);
         let row = &color.pixels[y * color.stride..y * color.stride + 3 * w];
         match color.format {
-            ColorFormat::Rgb8 => pack_row(crew.wide, row, 0, packed),
-            ColorFormat::Bgr8 => pack_row(crew.wide, row, 2, packed),
+            ColorFormat::Rgb8 => pack_row(workers.wide, row, 0, packed),
+            ColorFormat::Bgr8 => pack_row(workers.wide, row, 2, packed),
         }
     });
 }
@@ -51,17 +57,17 @@ pub(super) fn share(q: &[f32], share: &mut [f32]) {
 }
 
 /// Writes inverse depth as it was asked for; what cannot be expressed is 0.
-pub(super) fn store(crew: &Crew, q: &[f32], w: usize, out: &mut Output<'_>) {
+pub(super) fn store(workers: &Workers, q: &[f32], w: usize, out: &mut Output<'_>) {
     match out {
         Output::Units { pixels, unit_m } => {
             let per_unit = (1.0 / *unit_m) as f32;
-            crew.rows(pixels, w, |y, row| units_row(crew.wide, &q[y * w..(y + 1) * w], per_unit, row));
+            workers.rows(pixels, w, |y, row| units_row(workers.wide, &q[y * w..(y + 1) * w], per_unit, row));
         }
         Output::Metres(pixels) => {
-            crew.rows(pixels, w, |y, row| metres_row(crew.wide, &q[y * w..(y + 1) * w], row));
+            workers.rows(pixels, w, |y, row| metres_row(workers.wide, &q[y * w..(y + 1) * w], row));
         }
         Output::Inverse(pixels) => {
-            crew.rows(pixels, w, |y, row| row.copy_from_slice(&q[y * w..(y + 1) * w]));
+            workers.rows(pixels, w, |y, row| row.copy_from_slice(&q[y * w..(y + 1) * w]));
         }
     }
 }
@@ -70,7 +76,7 @@ wide! {
 fn units_row(q: &[f32], per_unit: f32, out: &mut [u16]) {
     for (out, q) in out.iter_mut().zip(q) {
         let units = per_unit / q + 0.5;
-        // 65535 says that a range ended, so it is no depth. A hole is infinite here.
+        // 65535 marks the end of the range and is not depth. A hole is infinite here.
         let fits = units >= 1.0 && units < f32::from(SATURATED);
         *out = if fits { units as i32 as u16 } else { 0 };
     }

@@ -1,8 +1,8 @@
 //! From coarse to fine: holes take the depth of the coarse cells around them that look like them, and what has depth is
 //! rid of noise.
 
-use super::lanes::{Crew, wide};
 use super::pyramid::Level;
+use super::workers::{Workers, wide};
 
 /// The difference of colours (root of the sum of squares, of 255) at which a cell counts a quarter.
 const COLOR: f32 = 18.0;
@@ -12,30 +12,33 @@ const LEAST: f32 = 1e-2;
 const SPREAD: f32 = 0.08;
 
 /// Fills the holes of `fine` from `coarse`, which has none.
-pub(super) fn fill(crew: &Crew, coarse: &Level, fine: &mut Level) {
-    let (w, h) = (fine.w, fine.h);
+pub(super) fn fill(workers: &Workers, coarse: &Level, fine: &mut Level) {
+    let w = fine.w;
     let color = &fine.color;
-    crew.rows(&mut fine.q, w, |y, row| {
-        fill_row(crew.wide, coarse, (y, h), &color[y * w..(y + 1) * w], row);
+    workers.rows(&mut fine.q, w, |y, row| {
+        fill_row(workers.wide, coarse, y, &color[y * w..(y + 1) * w], row);
     });
 }
 
-/// How often what was filled is smoothed at each size.
+/// Number of smoothing passes at each size.
 const ROUNDS: usize = 2;
 /// Relative difference of inverse depth up to which neighbours are smoothed together.
 const SURFACE: f32 = 0.1;
 
-/// Smooths what was filled, so that a large hole in a surface becomes a surface; what was measured stays. `spare` is as
+/// Smooths filled pixels, so that a large hole in a surface becomes a surface; measured pixels stay. `spare` is as
 /// large as the level at least.
-pub(super) fn smooth(crew: &Crew, level: &mut Level, spare: &mut [f32]) {
-    let (w, h) = (level.w, level.h);
+pub(super) fn smooth(workers: &Workers, level: &mut Level, spare: &mut [f32]) {
+    let w = level.w;
+    let h = level.h;
     let spare = &mut spare[..w * h];
     for _ in 0..ROUNDS {
-        let (q, share) = (&level.q, &level.share);
-        crew.rows(spare, w, |y, row| {
-            let (above, below) = (y.saturating_sub(1) * w, (y + 1).min(h - 1) * w);
+        let q = &level.q;
+        let share = &level.share;
+        workers.rows(spare, w, |y, row| {
+            let above = y.saturating_sub(1) * w;
+            let below = (y + 1).min(h - 1) * w;
             let at = |start: usize| &q[start..start + w];
-            smooth_row(crew.wide, at(above), at(y * w), at(below), &share[y * w..(y + 1) * w], row);
+            smooth_row(workers.wide, at(above), at(y * w), at(below), &share[y * w..(y + 1) * w], row);
         });
         level.q.copy_from_slice(spare);
     }
@@ -44,7 +47,10 @@ pub(super) fn smooth(crew: &Crew, level: &mut Level, spare: &mut [f32]) {
 wide! {
 fn smooth_row(above: &[f32], here: &[f32], below: &[f32], share: &[f32], out: &mut [f32]) {
     let w = here.len();
-    let (above, below, share, out) = (&above[..w], &below[..w], &share[..w], &mut out[..w]);
+    let above = &above[..w];
+    let below = &below[..w];
+    let share = &share[..w];
+    let out = &mut out[..w];
     let mean = |left: f32, right: f32, x: usize| {
         let q = here[x];
         let weight = |other: f32| if (other - q).abs() < SURFACE * q { 1.0 } else { 0.0 };
@@ -77,8 +83,8 @@ const CELLS: usize = CHUNK / 2 + 2;
 
 wide! {
 /// Pixels are worked on in chunks without a condition in them, so that processors do eight at a time.
-fn fill_row(coarse: &Level, at: (usize, usize), color: &[u32], q: &mut [f32]) {
-    let (own, other) = parents(at.0, coarse.h);
+fn fill_row(coarse: &Level, y: usize, color: &[u32], q: &mut [f32]) {
+    let (own, other) = parents(y, coarse.h);
     for (i, (q, color)) in q.chunks_mut(CHUNK).zip(color.chunks(CHUNK)).enumerate() {
         if q.iter().all(|q| *q > 0.0) {
             continue;
@@ -118,7 +124,9 @@ fn fill_row(coarse: &Level, at: (usize, usize), color: &[u32], q: &mut [f32]) {
 #[inline(always)]
 fn cells(coarse: &Level, start: usize, first: usize) -> ([f32; CELLS], [f32; CELLS], [u32; CELLS]) {
     let row = start..start + coarse.w;
-    let (q, share, color) = (&coarse.q[row.clone()], &coarse.share[row.clone()], &coarse.color[row]);
+    let q = &coarse.q[row.clone()];
+    let share = &coarse.share[row.clone()];
+    let color = &coarse.color[row];
     let mut out = ([0.0; CELLS], [0.0; CELLS], [0; CELLS]);
     for m in 0..CELLS {
         let at = (first + m).saturating_sub(1).min(coarse.w - 1);
@@ -131,7 +139,9 @@ fn cells(coarse: &Level, start: usize, first: usize) -> ([f32; CELLS], [f32; CEL
 #[inline(always)]
 fn likeness(a: u32, b: u32) -> f32 {
     let channel = |shift: u32| ((a >> shift) & 255) as i32 as f32 - ((b >> shift) & 255) as i32 as f32;
-    let (r, g, b) = (channel(0), channel(8), channel(16));
+    let r = channel(0);
+    let g = channel(8);
+    let b = channel(16);
     let square = (r * r + g * g) + b * b;
     let near = 1.0 / (1.0 + square * (1.0 / (COLOR * COLOR)));
     near * near + LEAST
@@ -145,7 +155,10 @@ fn choose(values: [f32; 4], weights: [f32; 4]) -> f32 {
     let high = values[0].max(values[1]).max(values[2].max(values[3]));
     let middle = 0.5 * (low + high);
     let is_split = high - low > SPREAD * low;
-    let (mut far, mut far_sum, mut near, mut near_sum) = (0.0f32, 0.0f32, 0.0f32, 0.0f32);
+    let mut far = 0.0f32;
+    let mut far_sum = 0.0f32;
+    let mut near = 0.0f32;
+    let mut near_sum = 0.0f32;
     for i in 0..4 {
         let is_near = values[i] > middle;
         let (n, f) = if is_near { (weights[i], 0.0) } else { (0.0, weights[i]) };

@@ -1,16 +1,17 @@
-//! The same picture ever smaller: inverse depth where there is some, the colour it was seen with, and how much of each
+//! The same image ever smaller: inverse depth where there is some, the colour it was seen with, and how much of each
 //! cell it covers.
 
-use super::lanes::{Crew, wide};
+use super::workers::{Workers, wide};
 
-/// A picture at one size. `q` is inverse depth in 1/m, 0 in a hole; `share` is how much of the cell had depth, 0 to 1.
+/// An image at one size. `q` is inverse depth in 1/m, 0 in a hole; `share` is how much of the cell had depth, 0 to 1.
 #[derive(Debug, Default)]
 pub(super) struct Level {
     pub(super) w: usize,
     pub(super) h: usize,
     pub(super) q: Vec<f32>,
     pub(super) share: Vec<f32>,
-    /// Red, green, blue and 0 from the lowest byte on: of what gave the depth, and of all where there is none.
+    /// Red, green, blue and 0 from the lowest byte on: of the pixels that gave the depth, or of all pixels without
+    /// depth.
     pub(super) color: Vec<u32>,
 }
 
@@ -24,13 +25,12 @@ impl Level {
 }
 
 /// Makes `coarse` of `fine`, which has twice its size, rounded up.
-pub(super) fn shrink(crew: &Crew, fine: &Level, coarse: &mut Level) {
-    let planes = (&mut coarse.q[..], &mut coarse.share[..], &mut coarse.color[..]);
-    crew.rows3(planes, coarse.w, |y, q, share, color| {
+pub(super) fn shrink(workers: &Workers, fine: &Level, coarse: &mut Level) {
+    workers.rows3(&mut coarse.q, &mut coarse.share, &mut coarse.color, coarse.w, |y, q, share, color| {
         let rows = [2 * y, (2 * y + 1).min(fine.h - 1)].map(|y| y * fine.w..(y + 1) * fine.w);
         let [a, b] = rows;
         shrink_row(
-            crew.wide,
+            workers.wide,
             [&fine.q[a.clone()], &fine.q[b.clone()]],
             [&fine.share[a.clone()], &fine.share[b.clone()]],
             [&fine.color[a], &fine.color[b]],
@@ -56,7 +56,9 @@ fn shrink_row(
     let [qa, qb] = q.map(|r| &r.as_chunks::<2>().0[..whole]);
     let [sa, sb] = share.map(|r| &r.as_chunks::<2>().0[..whole]);
     let [ca, cb] = color.map(|r| &r.as_chunks::<2>().0[..whole]);
-    let (to_q, to_share, to_color) = (&mut out_q[..whole], &mut out_share[..whole], &mut out_color[..whole]);
+    let to_q = &mut out_q[..whole];
+    let to_share = &mut out_share[..whole];
+    let to_color = &mut out_color[..whole];
     for x in 0..whole {
         let q = [qa[x][0], qa[x][1], qb[x][0], qb[x][1]];
         let share = [sa[x][0], sa[x][1], sb[x][0], sb[x][1]];

@@ -1,4 +1,4 @@
-//! How far from what was measured a hole is filled: beyond, depth is unknown.
+//! Limits the distance from measured pixels over which holes are filled: beyond, depth is unknown.
 //!
 //! Distances are measured between the cells of 4x4 pixels of the third pyramid level, with 3 to a neighbour and 4 across
 //! a corner, which is within a twelfth of the straight way.
@@ -12,7 +12,7 @@ const SIDE: u16 = 3;
 /// Steps across a corner.
 const CORNER: u16 = 4;
 
-/// Finds what is out of reach; keeps its memory from image to image.
+/// Finds pixels out of reach; keeps its buffers from image to image.
 #[derive(Debug, Default)]
 pub(super) struct Reach {
     /// Steps from each cell to the next one with depth.
@@ -27,7 +27,8 @@ impl Reach {
 
     /// Measures the way from every cell to the nearest with depth.
     pub(super) fn measure(&mut self, cells: &Level) {
-        let (w, h) = (cells.w, cells.h);
+        let w = cells.w;
+        let h = cells.h;
         let steps = &mut self.steps[..w * h];
         for (steps, share) in steps.iter_mut().zip(&cells.share) {
             *steps = if *share > 0.0 { 0 } else { u16::MAX };

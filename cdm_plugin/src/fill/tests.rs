@@ -4,7 +4,7 @@ use super::*;
 use crate::{Color, ColorFormat, RawDepth};
 use proptest::prelude::*;
 
-/// A grey picture with depth in millimetres.
+/// A grey image with depth in millimetres.
 fn run(w: usize, h: usize, color: &[u8], depth: &[u16]) -> Vec<u16> {
     let mut out = vec![7; w * h];
     let mut job = Job {
@@ -19,12 +19,14 @@ fn run(w: usize, h: usize, color: &[u8], depth: &[u16]) -> Vec<u16> {
 
 #[test]
 fn a_plane_stays_and_its_holes_are_filled() {
-    let (w, h) = (64, 48);
+    let w = 64;
+    let h = 48;
     // Inverse depth grows from left to right, as on a wall seen at an angle.
     let truth = |i: usize| (1000.0 / (1.0 + 0.01 * (i % w) as f64)).round() as u16;
     let mut depth: Vec<u16> = (0..w * h).map(truth).collect();
     for (i, d) in depth.iter_mut().enumerate() {
-        let (x, y) = (i % w, i / w);
+        let x = i % w;
+        let y = i / w;
         if (20..30).contains(&x) && (10..25).contains(&y) {
             *d = if x % 2 == 0 { 0 } else { u16::MAX };
         }
@@ -38,7 +40,8 @@ fn a_plane_stays_and_its_holes_are_filled() {
 
 #[test]
 fn colour_decides_what_a_hole_between_two_surfaces_is() {
-    let (w, h) = (64, 64);
+    let w = 64;
+    let h = 64;
     // Near and red on the left, far and blue on the right; depth is missing on both sides of the edge.
     let is_near = |i: usize| i % w < 30;
     let color: Vec<u8> =
@@ -65,7 +68,8 @@ fn without_any_depth_there_is_none() {
 
 #[test]
 fn flying_pixels_and_islands_go() {
-    let (w, h) = (160, 120);
+    let w = 160;
+    let h = 120;
     let mut depth = vec![1000u16; w * h];
     depth[20 * w + 30] = 500; // alone
     for y in 60..62 {
@@ -80,7 +84,8 @@ fn flying_pixels_and_islands_go() {
 fn with_discs(discs: &[(i32, i32, i32, u16)]) -> Vec<u16> {
     let mut depth = vec![2940; 640 * 480];
     for (i, d) in depth.iter_mut().enumerate() {
-        let (x, y) = (i as i32 % 640, i as i32 / 640);
+        let x = i as i32 % 640;
+        let y = i as i32 / 640;
         for (cx, cy, r, z) in discs {
             let square = (x - cx).pow(2) + (y - cy).pow(2);
             if square <= r * r {
@@ -100,7 +105,7 @@ fn specks_that_hang_in_the_air_go_and_things_stay() {
     let discs =
         [(100, 100, 5, 360), (300, 80, 7, 360), (500, 300, 3, 360), (200, 350, 4, 6000), (420, 200, 5, 5200)];
     assert!(run(640, 480, &grey, &with_discs(&discs)) == vec![2940; 640 * 480]);
-    // A hand, and a bump of the wall, are none.
+    // A hand and a bump of the wall are not islands.
     for (r, z) in [(14, 360), (5, 2700), (5, 3200)] {
         let depth = with_discs(&[(320, 240, r, z)]);
         let out = run(640, 480, &grey, &depth);
@@ -111,7 +116,8 @@ fn specks_that_hang_in_the_air_go_and_things_stay() {
 
 #[test]
 fn depth_far_from_what_was_measured_is_unknown() {
-    let (w, h) = (640, 480);
+    let w = 640;
+    let h = 480;
     // Depth on the left 300 columns; an eighth of 640 is 80.
     let depth: Vec<u16> = (0..w * h).map(|i| if i % w < 300 { 1000 } else { 0 }).collect();
     let grey = vec![90; w * h * 3];
@@ -126,7 +132,7 @@ fn depth_far_from_what_was_measured_is_unknown() {
     assert!(refined(&mut all, (w, h), &grey, &depth).iter().all(|d| (d - 1.0).abs() < 1e-6));
 }
 
-/// A small generator, so that pictures are the same everywhere.
+/// A small generator, so that images are the same everywhere.
 struct Rolls(u64);
 
 impl Rolls {
@@ -139,7 +145,8 @@ impl Rolls {
 /// Surfaces at a few depths with noise, holes, flying pixels and saturated ones.
 fn scene(seed: u64, w: usize, h: usize) -> (Vec<u8>, Vec<u16>) {
     let mut rolls = Rolls(seed);
-    let (cell, base) = (1 + rolls.next() as usize % 12, 400 + rolls.next() % 500);
+    let cell = 1 + rolls.next() as usize % 12;
+    let base = 400 + rolls.next() % 500;
     let mut depth = Vec::new();
     let mut color = Vec::new();
     for i in 0..w * h {
@@ -177,17 +184,17 @@ proptest! {
 
     /// The same bits with any number of threads, with and without AVX2, whatever was refined before.
     #[test]
-    fn bits_depend_on_the_picture_alone(seed in any::<u64>(), w in 1usize..90, h in 1usize..70) {
+    fn bits_depend_on_the_image_alone(seed in any::<u64>(), w in 1usize..90, h in 1usize..70) {
         let (color, depth) = scene(seed, w, h);
         let mut one = FillRefiner::new(1).unwrap();
         let first = refined(&mut one, (w, h), &color, &depth);
         let (other_color, other_depth) = scene(!seed, 50, 40);
         refined(&mut one, (50, 40), &other_color, &other_depth);
-        prop_assert!(bits(&refined(&mut one, (w, h), &color, &depth)) == bits(&first), "a picture before it");
+        prop_assert!(bits(&refined(&mut one, (w, h), &color, &depth)) == bits(&first), "an image before it");
         let mut three = FillRefiner::new(3).unwrap();
         prop_assert!(bits(&refined(&mut three, (w, h), &color, &depth)) == bits(&first), "three threads");
         let mut plain = FillRefiner::new(1).unwrap();
-        plain.crew.wide = lanes::Wide::none();
+        plain.workers.wide = workers::Wide::none();
         prop_assert!(bits(&refined(&mut plain, (w, h), &color, &depth)) == bits(&first), "without AVX2");
     }
 
@@ -243,12 +250,13 @@ proptest! {
         let q: Vec<f32> = depth.iter().map(|d| if *d == 0 { 0.0 } else { 1000.0 / f32::from(*d) }).collect();
         for y in 0..h {
             let mut row = vec![9.0; w];
-            clean::keep_supported(lanes::Wide::detect(), &q, w, y, &mut row);
+            clean::keep_supported(workers::Wide::detect(), &q, w, y, &mut row);
             for x in 0..w {
                 let here = q[y * w + x];
                 let mut n = 0;
                 for (dx, dy) in [(-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)] {
-                    let (nx, ny) = (x as i32 + dx, y as i32 + dy);
+                    let nx = x as i32 + dx;
+                    let ny = y as i32 + dy;
                     if nx >= 0 && ny >= 0 && nx < w as i32 && ny < h as i32 {
                         n += u32::from((q[ny as usize * w + nx as usize] - here).abs() < clean::SAME * here);
                     }
@@ -274,12 +282,14 @@ proptest! {
         };
         let mut size = vec![0; w * h];
         for start in 0..w * h {
-            let (mut seen, mut todo) = (vec![false; w * h], vec![start]);
+            let mut seen = vec![false; w * h];
+            let mut todo = vec![start];
             seen[start] = true;
             let mut n = 0;
             while let Some(i) = todo.pop() {
                 n += 1;
-                let (x, y) = (i % w, i / w);
+                let x = i % w;
+                let y = i / w;
                 let next = [(x > 0).then(|| i - 1), (x + 1 < w).then(|| i + 1), (y > 0).then(|| i - w), (y + 1 < h).then(|| i + w)];
                 for j in next.into_iter().flatten() {
                     if !seen[j] && joined(i, j) {
@@ -299,7 +309,8 @@ proptest! {
 #[test]
 fn what_cannot_be_used_is_refused_by_name() {
     let refine = |w: usize, h: usize, stride: usize, bytes: usize, depth: usize, out: usize, unit_m: f64| {
-        let (pixels, depth) = (vec![0; bytes], vec![0; depth]);
+        let pixels = vec![0; bytes];
+        let depth = vec![0; depth];
         let mut out = vec![0u16; out];
         let mut job = Job {
             color: Color { pixels: &pixels, format: ColorFormat::Rgb8, width: w, height: h, stride },

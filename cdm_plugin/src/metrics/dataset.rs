@@ -1,61 +1,61 @@
-//! The measures over many pictures: their mean, and all pixels pooled.
+//! The measures over many images: their mean, and all pixels pooled.
 
 use super::sums::{Sums, each};
 use super::{Depth, DepthMetrics, DepthRange, Measured};
 use crate::Result;
 
-/// Collects pictures one at a time; memory does not grow with their number.
+/// Collects images one at a time; memory does not grow with their number.
 #[derive(Debug, Clone)]
 pub struct Dataset {
     range: DepthRange,
     pooled: Sums,
-    /// Sums over the pictures of the plain measures, and over those that have a strict one.
+    /// Sums over the images of the plain measures, and over those that have a strict one.
     plain: [f64; 5],
     strict: [f64; 6],
-    pictures: u64,
+    images: u64,
     compared: u64,
     counted: u64,
 }
 
-/// What a [`Dataset`] came to.
+/// Metrics of a [`Dataset`].
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct DatasetMetrics {
-    /// Mean over pictures of each picture's value; `counted` and `valid` are sums. A picture without a valid
+    /// Mean over images of each image's value; `counted` and `valid` are sums. An image without a valid
     /// pixel takes no part in the plain measures, one without a pixel that counts in none.
-    pub mean_of_pictures: DepthMetrics,
-    /// As if all pictures were one: every pixel weighs the same.
+    pub mean_of_images: DepthMetrics,
+    /// As if all images were one: every pixel weighs the same.
     pub pixel_pooled: DepthMetrics,
-    /// Pictures that were added.
-    pub pictures: u64,
+    /// Images that were added.
+    pub images: u64,
     /// Of these, the ones in which no pixel could be compared.
-    pub empty_pictures: u64,
+    pub empty_images: u64,
 }
 
 impl Dataset {
-    /// No pictures yet; `range` as in [`super::compare`].
+    /// No images yet; `range` as in [`super::compare`].
     pub fn new(range: DepthRange) -> Self {
         Self {
             range,
             pooled: Sums::default(),
             plain: [0.0; 5],
             strict: [0.0; 6],
-            pictures: 0,
+            images: 0,
             compared: 0,
             counted: 0,
         }
     }
 
-    /// Adds one picture and returns its own measures.
+    /// Adds one image and returns its own measures.
     ///
     /// # Errors
-    /// Those of [`super::compare`]; the picture is left out then.
+    /// Those of [`super::compare`]; the image is left out then.
     pub fn add(&mut self, prediction: &Depth<'_>, reference: &Depth<'_>) -> Result<DepthMetrics> {
         let mut sums = Sums::default();
         each(prediction, reference, self.range, |_, seen, truth| sums.add(seen, truth))?;
         Ok(self.include(sums))
     }
 
-    /// Adds one picture that was measured elsewhere.
+    /// Adds one image that was measured elsewhere.
     pub fn push(&mut self, measured: &Measured) -> DepthMetrics {
         self.include(measured.sums)
     }
@@ -63,7 +63,7 @@ impl Dataset {
     fn include(&mut self, sums: Sums) -> DepthMetrics {
         let m = sums.metrics();
         self.pooled = self.pooled.plus(sums);
-        self.pictures += 1;
+        self.images += 1;
         if m.valid > 0 {
             self.compared += 1;
             for (sum, value) in
@@ -92,7 +92,7 @@ impl Dataset {
         let [strict_l1_m, strict_rmse_m, strict_abs_rel, strict_delta_05, strict_delta_1, missing_percent] =
             strict;
         DatasetMetrics {
-            mean_of_pictures: DepthMetrics {
+            mean_of_images: DepthMetrics {
                 counted: pixel_pooled.counted,
                 valid: pixel_pooled.valid,
                 l1_m,
@@ -108,8 +108,8 @@ impl Dataset {
                 missing_percent,
             },
             pixel_pooled,
-            pictures: self.pictures,
-            empty_pictures: self.pictures - self.compared,
+            images: self.images,
+            empty_images: self.images - self.compared,
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The measures by distance, and how large errors are: what a single number cannot say.
+//! Metrics by distance, and the histogram of errors.
 
 use super::sums::{Sums, each};
 use super::{Depth, DepthMetrics, DepthRange};
@@ -37,7 +37,7 @@ impl ErrorHistogram {
     }
 }
 
-/// Everything that is measured of one picture, or of several.
+/// Everything that is measured of one image, or of several.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Measured {
     pub(super) sums: Sums,
@@ -94,7 +94,7 @@ impl Measured {
         Ok(m)
     }
 
-    /// Both together, as if all pixels were of one picture. The bins must be the same.
+    /// Both together, as if all pixels were of one image. The bins must be the same.
     pub fn plus(&mut self, other: &Self) {
         self.sums = self.sums.plus(other.sums);
         for (a, b) in self.bins.iter_mut().zip(&other.bins) {

@@ -8,7 +8,7 @@ const DELTA_05: f64 = 1.118_033_988_749_895;
 /// The threshold of δ1.
 const DELTA_1: f64 = 1.25;
 
-/// The sums that every measure is made of; those of several pictures add up.
+/// The sums that every measure is made of; those of several images add up.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Sums {
     pub(super) counted: u64,
@@ -58,7 +58,8 @@ impl Sums {
 
     /// Division by no pixels is 0/0, and that is NaN as it should be.
     pub(super) fn metrics(&self) -> DepthMetrics {
-        let (n, counted) = (self.valid as f64, self.counted as f64);
+        let n = self.valid as f64;
+        let counted = self.counted as f64;
         let missing = (self.counted - self.valid) as f64;
         DepthMetrics {
             counted: self.counted,
@@ -86,16 +87,17 @@ pub(super) fn each(
     mut pixel: impl FnMut(usize, Option<f64>, f64),
 ) -> Result<()> {
     if prediction.len() != reference.len() {
-        let (p, r) = (prediction.len(), reference.len());
+        let p = prediction.len();
+        let r = reference.len();
         let message =
-            format!("the prediction has {p} pixels and its reference {r}; compare pictures of one size");
+            format!("the prediction has {p} pixels and its reference {r}; compare images of one size");
         return Err(Error::new(ErrorKind::SizeMismatch, message));
     }
     prediction.check("prediction")?;
     reference.check("reference")?;
     let DepthRange { min_m, max_m } = range;
     if min_m.is_nan() || max_m.is_nan() || min_m > max_m {
-        let message = format!("{min_m} m to {max_m} m is no range of depth; the nearest comes first");
+        let message = format!("invalid depth range {min_m}..={max_m} m; the nearest comes first");
         return Err(Error::new(ErrorKind::BadInput, message));
     }
     for i in 0..reference.len() {

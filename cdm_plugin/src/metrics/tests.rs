@@ -10,7 +10,7 @@ fn near(a: f64, b: f64) -> bool {
 const MM: f64 = 0.001;
 
 #[test]
-fn a_picture_worked_out_by_hand() {
+fn an_image_worked_out_by_hand() {
     // reference  1.0   2.0   4.0   1.0   hole  1.0   10.0 (out of range)
     // prediction 1.0   2.2   5.0   hole  1.0   1.2   10.0
     // error      0     0.2   1.0                0.2
@@ -100,23 +100,23 @@ fn what_is_refused() {
 fn the_two_means_of_a_dataset_differ() {
     let mut set = Dataset::new(DepthRange::ALL);
     let one = [1.0f32; 4];
-    // Four pixels off by 0.1, then one pixel off by 0.3 beside three holes; then a picture of holes only.
+    // Four pixels off by 0.1, then one pixel off by 0.3 beside three holes; then an image of holes only.
     set.add(&Depth::Metres(&[1.1; 4]), &Depth::Metres(&one)).unwrap();
     set.add(&Depth::Metres(&[1.3, 0.0, 0.0, 0.0]), &Depth::Metres(&one)).unwrap();
     set.add(&Depth::Metres(&[0.0; 4]), &Depth::Metres(&one)).unwrap();
     set.add(&Depth::Metres(&one), &Depth::Metres(&[0.0; 4])).unwrap();
     assert!(set.add(&Depth::Metres(&one), &Depth::Metres(&[])).is_err());
     let m = set.metrics();
-    assert_eq!((m.pictures, m.empty_pictures), (4, 2));
+    assert_eq!((m.images, m.empty_images), (4, 2));
     let close = |a: f64, b: f64| (a - b).abs() < 1e-6; // 1.1 and 1.3 are f32
-    assert!(close(m.mean_of_pictures.l1_m, 0.2) && close(m.pixel_pooled.l1_m, 0.7 / 5.0), "{m:?}");
-    assert!(close(m.mean_of_pictures.rmse_m, 0.2), "{m:?}");
+    assert!(close(m.mean_of_images.l1_m, 0.2) && close(m.pixel_pooled.l1_m, 0.7 / 5.0), "{m:?}");
+    assert!(close(m.mean_of_images.rmse_m, 0.2), "{m:?}");
     assert!(close(m.pixel_pooled.rmse_m, ((4.0 * 0.01 + 0.09) / 5.0f64).sqrt()), "{m:?}");
-    assert!(close(m.mean_of_pictures.missing_percent, 175.0 / 3.0), "{m:?}");
+    assert!(close(m.mean_of_images.missing_percent, 175.0 / 3.0), "{m:?}");
     assert!(close(m.pixel_pooled.missing_percent, 700.0 / 12.0), "{m:?}");
-    assert!(close(m.mean_of_pictures.delta_1, 0.5) && close(m.pixel_pooled.delta_1, 0.8), "{m:?}");
-    assert!(close(m.mean_of_pictures.strict_delta_1, 1.0 / 3.0), "{m:?}");
-    assert!(Dataset::new(DepthRange::ALL).metrics().mean_of_pictures.l1_m.is_nan());
+    assert!(close(m.mean_of_images.delta_1, 0.5) && close(m.pixel_pooled.delta_1, 0.8), "{m:?}");
+    assert!(close(m.mean_of_images.strict_delta_1, 1.0 / 3.0), "{m:?}");
+    assert!(Dataset::new(DepthRange::ALL).metrics().mean_of_images.l1_m.is_nan());
 }
 
 /// The formulas one by one over lists, as they stand in the documentation.
@@ -133,7 +133,7 @@ fn slow(prediction: &[f32], reference: &[f32], range: DepthRange) -> DepthMetric
     let mean = |f: &dyn Fn(f64, f64) -> f64| valid.iter().map(|(d, t)| f(*d, *t)).sum::<f64>() / n;
     let hits = |t: f64| valid.iter().filter(|(d, r)| (d / r).max(r / d) < 1.25f64.powf(t)).count() as f64;
     let all = counted.len() as f64;
-    // Strict: what is missing is a prediction of 0.
+    // Strict: a missing pixel is a prediction of 0.
     let or_zero = |p: f32| if p.is_finite() && p > 0.0 { f64::from(p) } else { 0.0 };
     let all_errors: Vec<(f64, f64)> =
         counted.iter().map(|(p, r)| ((or_zero(**p) - f64::from(**r)).abs(), f64::from(**r))).collect();
@@ -155,7 +155,8 @@ fn slow(prediction: &[f32], reference: &[f32], range: DepthRange) -> DepthMetric
 }
 
 fn values(m: &DepthMetrics) -> [f64; 13] {
-    let (counted, valid) = (m.counted as f64, m.valid as f64);
+    let counted = m.counted as f64;
+    let valid = m.valid as f64;
     let plain = [m.l1_m, m.rmse_m, m.abs_rel, m.delta_05, m.delta_1];
     let [a, b, c, d, e] = plain;
     let [f, g, h] = [m.strict_l1_m, m.strict_rmse_m, m.strict_abs_rel];
@@ -185,7 +186,8 @@ proptest! {
             prop_assert!(near(a, b), "{:?}\n{:?}", fast, slow);
         }
         // By distance: each bin is the measure of a range, and all of them together are the whole.
-        let (p, r) = (Depth::Metres(&prediction), Depth::Metres(&reference));
+        let p = Depth::Metres(&prediction);
+        let r = Depth::Metres(&reference);
         let measured = Measured::of(&p, &r, range, (0.5, 9)).unwrap();
         prop_assert_eq!(values(&measured.metrics()).map(f64::to_bits), values(&fast).map(f64::to_bits));
         let bins = measured.by_distance();
@@ -193,7 +195,8 @@ proptest! {
         for bin in &bins {
             // The end of a bin belongs to the next one; the last one has none.
             let below = if bin.to_m < 4.5 { f64::from_bits(bin.to_m.to_bits() - 1) } else { f64::INFINITY };
-            let (min_m, max_m) = (bin.from_m.max(range.min_m), below.min(range.max_m));
+            let min_m = bin.from_m.max(range.min_m);
+            let max_m = below.min(range.max_m);
             let wanted = if min_m > max_m { 0 } else {
                 compare(&p, &r, DepthRange { min_m, max_m }).unwrap().counted
             };
@@ -211,8 +214,10 @@ proptest! {
         let unit_m = 1.0 / 1024.0;
         let (p, r): (Vec<u16>, Vec<u16>) = pixels.into_iter().unzip();
         let metres = |v: &[u16]| v.iter().map(|d| f32::from(*d) / 1024.0).collect::<Vec<_>>();
-        let (pm, rm) = (metres(&p), metres(&r));
-        let (p, r) = (Depth::Units { pixels: &p, unit_m }, Depth::Units { pixels: &r, unit_m });
+        let pm = metres(&p);
+        let rm = metres(&r);
+        let p = Depth::Units { pixels: &p, unit_m };
+        let r = Depth::Units { pixels: &r, unit_m };
         let a = compare(&p, &r, DepthRange::ALL).unwrap();
         let b = compare(&Depth::Metres(&pm), &Depth::Metres(&rm), DepthRange::ALL).unwrap();
         for (a, b) in values(&a).into_iter().zip(values(&b)) {

@@ -252,7 +252,10 @@ impl Builder {
 
 fn attribute(name: &str, value: Attribute<'_>) -> AttributeProto {
     // AttributeProto.AttributeType
-    let (float, int, string, several) = (1, 2, 3, 7);
+    let float = 1;
+    let int = 2;
+    let string = 3;
+    let several = 7;
     let base = AttributeProto { name: Some(name.into()), ..Default::default() };
     match value {
         Attribute::Float(f) => AttributeProto { f: Some(f), kind: Some(float), ..base },

@@ -8,9 +8,9 @@
 //! - What follows is linear up to the head's first projection, so that the part of `v_r` goes into the weights that
 //!   the colour token meets there; the product of the weights is of constants, and the engine computes it while it
 //!   loads.
-//! - A 1x1 convolution and an interpolation whose weights add up to 1 may change places; the smaller picture comes
+//! - A 1x1 convolution and an interpolation whose weights add up to 1 may change places; the smaller image comes
 //!   first.
-//! - The depth encoder's three input channels are the same picture, so that its kernel can be summed over them.
+//! - The depth encoder's three input channels are the same image, so that its kernel can be summed over them.
 
 use super::builder::{Attribute, Builder, CONTRIB, Dimension, Value};
 use super::{Attention, Graph, Style};
@@ -38,7 +38,8 @@ pub fn build(arch: Architecture, style: Style) -> Graph {
 impl Net {
     fn whole(&mut self) {
         use Dimension::{Fixed, Named};
-        let (height, width) = (Named("height"), Named("width"));
+        let height = Named("height");
+        let width = Named("width");
         let x = self.g.input("x", &[Named("batch"), Fixed(4), height, width]);
         let rgb_positions = self.g.input("pos_rgb", &[Named("tokens"), Fixed(self.arch.width)]);
         let depth_positions = self.g.input("pos_depth", &[Named("tokens"), Fixed(self.arch.width)]);
@@ -76,7 +77,9 @@ impl Net {
 
     /// `value` along dimension 1, from `from` to `to`.
     fn columns(&mut self, value: &Value, from: i64, to: i64) -> Value {
-        let (from, to, axis) = (self.g.ints(&[from]), self.g.ints(&[to]), self.g.ints(&[1]));
+        let from = self.g.ints(&[from]);
+        let to = self.g.ints(&[to]);
+        let axis = self.g.ints(&[1]);
         self.g.op("Slice", &[value, &from, &to, &axis], &[])
     }
 
@@ -119,8 +122,8 @@ impl Net {
     }
 
     fn linear(&mut self, x: &Value, name: &str) -> Value {
-        let (weight, bias) =
-            (self.g.weight(&format!("{name}.weight")), self.g.weight(&format!("{name}.bias")));
+        let weight = self.g.weight(&format!("{name}.weight"));
+        let bias = self.g.weight(&format!("{name}.bias"));
         self.gemm(x, &weight, Some(&bias))
     }
 
@@ -144,8 +147,8 @@ impl Net {
     }
 
     fn norm(&mut self, x: &Value, name: &str) -> Value {
-        let (weight, bias) =
-            (self.g.weight(&format!("{name}.weight")), self.g.weight(&format!("{name}.bias")));
+        let weight = self.g.weight(&format!("{name}.weight"));
+        let bias = self.g.weight(&format!("{name}.bias"));
         let attributes = [("axis", Int(-1)), ("epsilon", Float(NORM_EPS as f32))];
         self.g.op("LayerNormalization", &[x, &weight, &bias], &attributes)
     }
@@ -153,9 +156,9 @@ impl Net {
     // The encoders.
 
     /// The tokens of the tapped blocks, normalised and without the class token, `[batch * places, width]`.
-    fn encoder(&mut self, picture: &Value, positions: Value, which: usize, batch: &Value) -> Vec<Value> {
+    fn encoder(&mut self, image: &Value, positions: Value, which: usize, batch: &Value) -> Vec<Value> {
         let name = ENCODERS[which];
-        let x = self.tokens(picture, positions, name, which == 1, batch);
+        let x = self.tokens(image, positions, name, which == 1, batch);
         let shape = self.dims(&x, 0, 3);
         let head_shape = match self.style.attention {
             Attention::Fused => Value::none(),
@@ -195,7 +198,7 @@ impl Net {
     /// One token for each patch and the class token before them, with their positions: `[batch, tokens, width]`.
     fn tokens(
         &mut self,
-        picture: &Value,
+        image: &Value,
         positions: Value,
         name: &str,
         one_channel: bool,
@@ -210,7 +213,7 @@ impl Net {
         let bias = self.g.weight(&format!("{name}.patch_embed.proj.bias"));
         let edge = [PATCH as i64; 2];
         let attributes = [("kernel_shape", Ints(&edge)), ("strides", Ints(&edge))];
-        let patches = self.g.op("Conv", &[picture, &kernel, &bias], &attributes);
+        let patches = self.g.op("Conv", &[image, &kernel, &bias], &attributes);
         let flat = self.g.ints(&[0, 0, -1]);
         let patches = self.reshape(&patches, &flat);
         let patches = self.transpose(&patches, &[0, 2, 1]);
@@ -224,10 +227,11 @@ impl Net {
         self.add(&tokens, &positions)
     }
 
-    /// Attention over all tokens of a picture. `shape` is `[batch, tokens, width]`, `head_shape` the same with the
+    /// Attention over all tokens of an image. `shape` is `[batch, tokens, width]`, `head_shape` the same with the
     /// width in heads.
     fn attention(&mut self, x: &Value, name: &str, shape: &Value, head_shape: &Value) -> Value {
-        let (weight, bias) = (format!("{name}.qkv.weight"), format!("{name}.qkv.bias"));
+        let weight = format!("{name}.qkv.weight");
+        let bias = format!("{name}.qkv.bias");
         let [q, k, v] =
             [0, 1, 2].map(|part| self.linear_part(x, &weight, Some(&bias), part, self.arch.width));
         let scale = (self.arch.head_width() as f64).powf(-0.5);
@@ -240,7 +244,8 @@ impl Net {
             Attention::Standard => {
                 let q = self.scale(&q, scale);
                 let [q, k, v] = [q, k, v].map(|t| self.reshape(&t, head_shape));
-                let (q, v) = (self.transpose(&q, &[0, 2, 1, 3]), self.transpose(&v, &[0, 2, 1, 3]));
+                let q = self.transpose(&q, &[0, 2, 1, 3]);
+                let v = self.transpose(&v, &[0, 2, 1, 3]);
                 let k = self.transpose(&k, &[0, 2, 3, 1]);
                 let scores = self.g.op("MatMul", &[&q, &k], &[]);
                 let shares = self.g.op("Softmax", &[&scores], &[("axis", Int(-1))]);
@@ -260,7 +265,8 @@ impl Net {
                 self.linear(&y, &format!("{name}.fc2"))
             }
             FeedForward::SwiGlu { hidden } => {
-                let (weight, bias) = (format!("{name}.w12.weight"), format!("{name}.w12.bias"));
+                let weight = format!("{name}.w12.weight");
+                let bias = format!("{name}.w12.bias");
                 let [a, b] = [0, 1].map(|part| self.linear_part(x, &weight, Some(&bias), part, hidden));
                 let gate = self.g.op("Sigmoid", &[&a], &[]);
                 let a = self.mul(&a, &gate);
@@ -276,7 +282,8 @@ impl Net {
     fn fuse(&mut self, level: usize, rgb: &Value, depth: &Value) -> Value {
         let width = self.arch.width;
         let name = format!("crossAtts.{level}");
-        let (weight, bias) = (format!("{name}.in_proj_weight"), format!("{name}.in_proj_bias"));
+        let weight = format!("{name}.in_proj_weight");
+        let bias = format!("{name}.in_proj_bias");
         let head = width / FUSION_HEADS;
         let heads = self.g.ints(&[-1, FUSION_HEADS as i64, head as i64]);
 
@@ -308,7 +315,8 @@ impl Net {
     /// `P_f`, `O` and `o` the output projection of the attention and `V` and `v` its value projection, the weight of
     /// the colour token `P_r + 2 P_f O V`, that of the mixed values `P_f O`, and the bias `b + 2 P_f (O v + o)`.
     fn fused_projection(&mut self, level: usize) -> [Value; 3] {
-        let (width, channels) = (self.arch.width, self.arch.levels[level]);
+        let width = self.arch.width;
+        let channels = self.arch.levels[level];
         let name = format!("crossAtts.{level}");
         let values = 2 * width..3 * width;
         let projection = self.g.raw_as(&format!("{HEAD}.projects.{level}.weight"), &[channels, 2 * width]);
@@ -339,7 +347,9 @@ impl Net {
     fn conv(&mut self, x: &Value, name: &str, edge: i64, stride: i64, bias: bool) -> Value {
         let weight = self.g.weight(&format!("{name}.weight"));
         let bias = bias.then(|| self.g.weight(&format!("{name}.bias")));
-        let (kernel, strides, pads) = ([edge; 2], [stride; 2], [edge / 2; 4]);
+        let kernel = [edge; 2];
+        let strides = [stride; 2];
+        let pads = [edge / 2; 4];
         let attributes =
             [("kernel_shape", Ints(&kernel)), ("strides", Ints(&strides)), ("pads", Ints(&pads))];
         let inputs: Vec<&Value> = [x, &weight].into_iter().chain(&bias).collect();

@@ -68,7 +68,7 @@ pub struct NodeProto {
     pub domain: Option<String>,
 }
 
-/// A setting of an operation; `kind` says which of the fields is meant.
+/// An attribute of an operation; `kind` selects the field in use.
 #[derive(Clone, PartialEq, Message)]
 pub struct AttributeProto {
     #[prost(string, optional, tag = "1")]
@@ -120,7 +120,7 @@ pub struct ValueInfoProto {
     pub r#type: Option<TypeProto>,
 }
 
-/// What an input or output is; only tensors here.
+/// Type of an input or output; only tensors here.
 #[derive(Clone, PartialEq, Message)]
 pub struct TypeProto {
     #[prost(message, optional, tag = "1")]

@@ -39,8 +39,8 @@ fn every_value_is_made_once_and_before_it_is_used() {
     }
 }
 
-/// What the network computes with is in the graph, whole; what has no effect is not, nor are the position embeddings,
-/// which are inputs.
+/// The graph holds all weights that the network computes with; unused ones are left out, as are the position
+/// embeddings, which are inputs.
 #[test]
 fn every_row_of_every_tensor_that_counts() {
     for encoder in Encoder::ALL {

@@ -120,7 +120,7 @@ impl FromStr for Device {
         };
         device.ok_or_else(|| {
             let message = format!(
-                "there is no device {s:?}: it is cpu, cuda, cuda:1, tensorrt, tensorrt:1, openvino (on the CPU) or \
+                "unknown device {s:?}; use cpu, cuda, cuda:1, tensorrt, tensorrt:1, openvino (on the CPU) or \
                  openvino:GPU"
             );
             Error::new(ErrorKind::BadInput, message)

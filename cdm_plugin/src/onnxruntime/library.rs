@@ -35,7 +35,7 @@ const SYSTEM: [&str; 8] = [
 /// `wanted` and `variable` (of the environment) may be the file or a folder that holds it.
 ///
 /// # Errors
-/// [`ErrorKind::NoEngine`] when there is none, with what to install.
+/// [`ErrorKind::NoEngine`] when no library is found, with what to install.
 pub fn find(wanted: Option<&Path>, variable: Option<&OsStr>, device: &Device) -> Result<PathBuf> {
     if let Some(path) = wanted {
         return inside(path)
@@ -102,7 +102,7 @@ fn inside(path: &Path) -> Option<PathBuf> {
 /// Loads the library at `path` and asks for its version, such as `1.31.1`.
 ///
 /// # Errors
-/// [`ErrorKind::NoEngine`] for a file that is damaged, is no ONNX Runtime, or is of a version that is not understood.
+/// [`ErrorKind::NoEngine`] for a file that is damaged, not ONNX Runtime, or of an unsupported version.
 pub fn version(path: &Path) -> Result<String> {
     let refuse = |what: String| {
         let message = format!(
@@ -112,10 +112,10 @@ pub fn version(path: &Path) -> Result<String> {
         );
         Error::new(ErrorKind::NoEngine, message)
     };
-    whole(path).map_err(|what| refuse(what.into()))?;
+    check_complete(path).map_err(|what| refuse(what.into()))?;
 
-    // SAFETY: the file is a whole library (checked above), named by who runs this program or found where programs are
-    // installed; its initialisers run, as they would if this program were linked to it.
+    // SAFETY: the file is a complete library (checked above), named by who runs this program or found where programs
+    // are installed; its initialisers run, as they would if this program were linked to it.
     let library =
         unsafe { libloading::Library::new(path) }.map_err(|e| refuse(format!("cannot be loaded: {e}")))?;
     // SAFETY: a library with this symbol is ONNX Runtime, of which every version has this function with this type
@@ -127,7 +127,7 @@ pub fn version(path: &Path) -> Result<String> {
     // SAFETY: the second function of that constant gives a string that lives as long as the library.
     let text = unsafe { (base.version)() };
     if text.is_null() {
-        return Err(refuse("does not tell its version".into()));
+        return Err(refuse("does not report its version".into()));
     }
     // SAFETY: it is not null and ends with a zero byte; the library is still loaded.
     let text = unsafe { CStr::from_ptr(text) }.to_string_lossy().into_owned();
@@ -150,7 +150,7 @@ struct ApiBase {
 }
 
 /// Whether every part of a 64-bit ELF file that is to be mapped is there.
-fn whole(path: &Path) -> Result<(), &'static str> {
+fn check_complete(path: &Path) -> Result<(), &'static str> {
     const CUT: &str = "is cut short";
     let file = depthrig_bus::files::open(path).map_err(|_| "cannot be read")?;
     let length = file.metadata().map_err(|_| "cannot be read")?.len();
@@ -166,7 +166,9 @@ fn whole(path: &Path) -> Result<(), &'static str> {
         u64::from_le_bytes(bytes)
     };
     // e_phoff, e_phentsize, e_phnum of the header; p_offset and p_filesz of each program header.
-    let (table, size, count) = (u64_at(&head, 32), u16_at(&head, 54), u16_at(&head, 56));
+    let table = u64_at(&head, 32);
+    let size = u16_at(&head, 54);
+    let count = u16_at(&head, 56);
     if size < 56 {
         return Err("has a damaged header");
     }

@@ -15,18 +15,18 @@ pub struct Runtime {
     pub path: PathBuf,
     /// Its version, such as `1.31.1`.
     pub version: String,
-    /// What sessions are made in. `ort` allows one per process, and none after it is gone: one is kept for good.
+    /// Environment of all sessions. `ort` allows one per process, and none after it is dropped: it is kept forever.
     pub environment: ort::environment::Environment,
 }
 
-/// What this process has loaded. Nothing can be unloaded or loaded twice.
+/// The library that this process has loaded. It can neither be unloaded nor loaded twice.
 static LOADED: Mutex<Option<Result<Runtime>>> = Mutex::new(None);
 
 impl Runtime {
     /// The library for `device`, loaded now unless one is already.
     ///
     /// # Errors
-    /// [`ErrorKind::NoEngine`] when there is none that can be used, [`ErrorKind::Unsupported`] when the one that this
+    /// [`ErrorKind::NoEngine`] when no usable library is found, [`ErrorKind::Unsupported`] when the one that this
     /// process runs is another than `wanted` or does not have the device.
     pub fn get(wanted: Option<&Path>, device: &Device) -> Result<Self> {
         let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
@@ -109,7 +109,7 @@ fn start(path: PathBuf, version: String) -> Result<Runtime> {
     Ok(Runtime { path, version, environment })
 }
 
-/// The library's messages, at one level below what it takes them for: what matters comes back as an error.
+/// Logs the library's messages one level lower than it does: important ones also come back as an error.
 fn log(level: LogLevel, _category: &str, _id: &str, _place: &str, message: &str) {
     match level {
         LogLevel::Error | LogLevel::Fatal => tracing::warn!(target: "onnxruntime", "{message}"),

@@ -1,4 +1,4 @@
-//! A session: the graph with its weights on a device, and what the library is told about threads and memory.
+//! A session: the graph with its weights on a device, and its options for threads and memory.
 
 use super::device::Device;
 use super::runtime::Runtime;
@@ -33,11 +33,11 @@ pub fn open(
         builder = builder.with_execution_providers([provider]).map_err(plain).map_err(error)?;
     }
     if matches!(device, Device::OpenVino(_)) {
-        // Of weights in memory it makes one message, which cannot have more than 2 GB; a file it maps.
+        // OpenVINO copies weights in memory into one message of at most 2 GB, but maps a file.
         let file = weights.in_file()?;
         tracing::debug!(
             folder = file.folder(),
-            made = file.is_made(),
+            temporary = file.is_temporary(),
             "the engine opens the weights in a file"
         );
         let model = graph.in_file(file.name(), file.places());

@@ -38,7 +38,7 @@ fn weights_in_a_file_are_those_in_memory() {
         rows,
         shape: shape.to_vec(),
     };
-    for (file, slices, made) in [
+    for (file, slices, temporary) in [
         ("plain.pth", vec![slice("head.weight", 0..2, &[2, 3]), slice("head.weight", 1..2, &[1, 3])], false),
         ("halves.pth", vec![slice("half", 1..3, &[2]), slice("double", 0..2, &[2])], true),
         ("not_contiguous.pth", vec![slice("transposed", 1..3, &[2, 2])], true),
@@ -46,7 +46,7 @@ fn weights_in_a_file_are_those_in_memory() {
         let weights = Arc::new(Weights::open(fixtures.join(file)).unwrap());
         let bound = BoundWeights::new(&weights, &slices).unwrap();
         let in_file = bound.in_file().unwrap();
-        assert_eq!(in_file.is_made(), made, "{file}");
+        assert_eq!(in_file.is_temporary(), temporary, "{file}");
         let bytes = std::fs::read(std::path::Path::new(in_file.folder()).join(in_file.name())).unwrap();
         for (slice, place) in slices.iter().zip(in_file.places()) {
             let row = slice.shape.iter().skip(1).product::<usize>();
@@ -58,6 +58,6 @@ fn weights_in_a_file_are_those_in_memory() {
         }
         let folder = in_file.folder().to_owned();
         drop(in_file);
-        assert_eq!(std::path::Path::new(&folder).exists(), !made, "what was made is removed");
+        assert_eq!(std::path::Path::new(&folder).exists(), !temporary, "a temporary file is removed");
     }
 }

@@ -25,12 +25,12 @@ pub struct BoundWeights {
     weights: Arc<Weights>,
     /// Tensors that do not lie in the file as they are needed: of 16-bit floats, or at an odd address.
     converted: BTreeMap<String, Vec<f32>>,
-    /// What the graph needs.
+    /// Slices that the graph needs.
     slices: Vec<WeightSlice>,
 }
 
 impl BoundWeights {
-    /// Finds every one of `slices` in `weights`; converts what is stored as something else.
+    /// Finds all `slices` in `weights`; converts other number types.
     ///
     /// # Errors
     /// [`ErrorKind::BadModel`] for a tensor that is not there or has another size.
@@ -68,8 +68,8 @@ impl BoundWeights {
         Ok(tensor.and_then(|bytes| bytes.get(rows)).map(<[u8]>::as_ptr))
     }
 
-    /// Where each slice lies in a file: the weights' own, or, where that does not have them as they are needed, one
-    /// that is made for the time until the session is open.
+    /// Locates each slice in a file: the weights' own, or, if that lacks the required form, a temporary one that exists
+    /// until the session is open.
     ///
     /// # Errors
     /// [`ErrorKind::Io`] when the file is gone, or cannot be made.
@@ -186,35 +186,35 @@ impl WeightsFile {
         self.path.parent().and_then(Path::to_str).unwrap_or_default()
     }
 
-    /// Where each slice lies, in the order in which they were given.
+    /// Byte ranges of the slices, in the given order.
     pub fn places(&self) -> &[Range<usize>] {
         &self.places
     }
 
-    /// Whether it was made for this.
-    pub const fn is_made(&self) -> bool {
+    /// Returns whether the file is temporary.
+    pub const fn is_temporary(&self) -> bool {
         self.temporary.is_some()
     }
 }
 
-/// A folder that nobody else can enter, removed with this.
+/// A private folder, removed when dropped.
 #[derive(Debug)]
 struct TemporaryFolder(PathBuf);
 
 impl TemporaryFolder {
     fn new() -> Result<Self> {
-        static MADE: AtomicU32 = AtomicU32::new(0);
-        let name = format!("depthrig-{}-{}", std::process::id(), MADE.fetch_add(1, Ordering::Relaxed));
+        static CREATED: AtomicU32 = AtomicU32::new(0);
+        let name = format!("depthrig-{}-{}", std::process::id(), CREATED.fetch_add(1, Ordering::Relaxed));
         let path = std::env::temp_dir().join(name);
-        // Fails where somebody else has put something of that name.
-        let made = std::fs::DirBuilder::new().mode(0o700).create(&path);
-        made.map_err(|e| durable::cannot_write(&path, e))?;
+        // Fails if the name exists.
+        let created = std::fs::DirBuilder::new().mode(0o700).create(&path);
+        created.map_err(|e| durable::cannot_write(&path, e))?;
         Ok(Self(path))
     }
 }
 
 impl Drop for TemporaryFolder {
     fn drop(&mut self) {
-        drop(std::fs::remove_dir_all(&self.0)); // what is left is in the folder of temporary files
+        drop(std::fs::remove_dir_all(&self.0)); // leftovers stay in the temporary folder
     }
 }

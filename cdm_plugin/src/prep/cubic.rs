@@ -1,4 +1,4 @@
-//! Colour to the network's first three planes: bicubic resize and normalising in one pass over the picture.
+//! Colour to the network's first three planes: bicubic resize and normalising in one pass over the image.
 //!
 //! The kernel is OpenCV's `INTER_CUBIC` (modules/imgproc/src/resize.cpp, Apache-2.0): a = -0.75, coordinates and weights
 //! in `f32`, the border repeated, no smoothing when it shrinks. Rows first, then columns; OpenCV does columns first, and the
@@ -44,24 +44,24 @@ pub(super) fn weights(t: f32) -> [f32; 4] {
     [w0, w1, w2, 1.0 - w0 - w1 - w2]
 }
 
-/// Tables for one size of picture and of input, and one row of scratch memory.
+/// Tables for one size of image and of input, and one row of scratch memory.
 #[derive(Debug)]
 pub(super) struct CubicResize {
     rows: Taps,
     columns: Taps,
     height: usize,
-    /// One row of the picture's width with its border, three numbers a pixel, and one more so that four can be read at
+    /// One row of the image's width with its border, three numbers a pixel, and one more so that four can be read at
     /// the last.
     line: Vec<f32>,
 }
 
 impl CubicResize {
-    pub(super) fn new(picture: (usize, usize), net: (usize, usize)) -> Self {
+    pub(super) fn new(width: usize, height: usize, net_width: usize, net_height: usize) -> Self {
         Self {
-            rows: Taps::new(picture.1, net.1),
-            columns: Taps::new(picture.0, net.0),
-            height: picture.1,
-            line: vec![0.0; 3 * (picture.0 + 2 * BORDER) + 1],
+            rows: Taps::new(height, net_height),
+            columns: Taps::new(width, net_width),
+            height,
+            line: vec![0.0; 3 * (width + 2 * BORDER) + 1],
         }
     }
 
@@ -84,7 +84,7 @@ impl CubicResize {
     }
 }
 
-/// What a blended value of 0 to 255 is multiplied by and what is added, by byte of a pixel.
+/// Factor and offset applied to a blended value of 0 to 255, by byte of a pixel.
 struct Normalise {
     factor: [f32; 3],
     offset: [f32; 3],
@@ -121,7 +121,8 @@ fn blend_rows(rows: [&[u8]; 4], w: &[f32; 4], line: &mut [f32]) {
             + f32::from(r3[i]) * w[3];
     }
     for k in 0..3 {
-        let (first, last) = (line[3 * BORDER + k], line[n + 3 * BORDER - 3 + k]);
+        let first = line[3 * BORDER + k];
+        let last = line[n + 3 * BORDER - 3 + k];
         for border in 0..BORDER {
             line[3 * border + k] = first;
             line[n + 3 * BORDER + 3 * border + k] = last;

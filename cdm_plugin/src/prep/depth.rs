@@ -31,7 +31,7 @@ impl DepthTable {
         for (raw, inverse) in self.inverse.iter_mut().enumerate() {
             let metres = raw as f64 / per_metre;
             let hole = raw == 0 || raw == usize::from(u16::MAX) || metres > self.max_depth_m;
-            // A unit can be so small that the inverse of a reading is no number of 32 bits.
+            // A unit can be so small that the inverse of a reading exceeds `f32`.
             *inverse = if hole { 0.0 } else { (1.0 / metres).min(f64::from(f32::MAX)) as f32 };
         }
     }

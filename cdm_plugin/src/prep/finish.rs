@@ -1,4 +1,4 @@
-//! The network's output to depth at the picture's size.
+//! The network's output to depth at the image's size.
 
 use super::depth::units_per_metre;
 use crate::Output;
@@ -15,7 +15,7 @@ fn positive(v: f32) -> f32 {
     if v > 0.0 && v < f32::INFINITY { v } else { 0.0 }
 }
 
-/// Metres from inverse depth; 0 where there is none and where 1/m is so small that metres are infinite.
+/// Converts inverse depth to metres; 0 where depth is missing or 1/m is so small that metres are infinite.
 fn metres(inverse: f32) -> f32 {
     positive(1.0 / positive(inverse))
 }
@@ -44,7 +44,7 @@ impl Row {
     }
 }
 
-/// Converts each row of `y` once, takes its columns once, and repeats what several rows of the picture share.
+/// Converts each row of `y` once, takes its columns once, and repeats what several rows of the image share.
 fn spread<T: Copy>(
     y: &[f32],
     converted: &mut [T],
@@ -53,7 +53,8 @@ fn spread<T: Copy>(
     out: &mut [T],
     convert: impl Fn(f32) -> T,
 ) {
-    let (width, net_width) = (columns.len(), converted.len());
+    let width = columns.len();
+    let net_width = converted.len();
     let mut last = None;
     for (i, row) in rows.iter().enumerate() {
         if last == Some(*row) {

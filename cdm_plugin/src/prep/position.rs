@@ -7,7 +7,7 @@
 use crate::arch::{Architecture, ENCODERS, PATCH};
 use crate::{NetShape, PositionEmbeddings, Result, Weights};
 
-/// What DINOv2 adds to the size before it divides.
+/// Offset that DINOv2 adds to the size before the division.
 const OFFSET: f64 = 0.1;
 
 /// The position embeddings as they were learnt.
@@ -31,21 +31,24 @@ impl Positions {
 
     /// For inputs of the size of `shape`; its batch has no effect.
     pub fn at(&self, shape: NetShape) -> PositionEmbeddings {
-        let to = (shape.height / PATCH, shape.width / PATCH);
-        let [rgb, depth] = self.learnt.each_ref().map(|learnt| resize(learnt, self.grid, self.width, to));
+        let rows = shape.height / PATCH;
+        let columns = shape.width / PATCH;
+        let [rgb, depth] =
+            self.learnt.each_ref().map(|learnt| resize(learnt, self.grid, self.width, rows, columns));
         PositionEmbeddings { rgb, depth }
     }
 }
 
-/// `learnt` is `[1 + grid * grid, channels]`, the class token's first; so is the result, for `to` (rows, columns).
-pub(super) fn resize(learnt: &[f32], grid: usize, channels: usize, to: (usize, usize)) -> Vec<f32> {
-    if to == (grid, grid) {
+/// `learnt` is `[1 + grid * grid, channels]`, the class token's first; so is the result, for `rows` and `columns`.
+pub(super) fn resize(learnt: &[f32], grid: usize, channels: usize, rows: usize, columns: usize) -> Vec<f32> {
+    if rows == grid && columns == grid {
         return learnt.to_vec();
     }
     let (class, grid_values) = learnt.split_at(channels);
-    let mut out = Vec::with_capacity((1 + to.0 * to.1) * channels);
+    let mut out = Vec::with_capacity((1 + rows * columns) * channels);
     out.extend_from_slice(class);
-    let (rows, columns) = (taps(grid, to.0), taps(grid, to.1));
+    let rows = taps(grid, rows);
+    let columns = taps(grid, columns);
     let mut line = vec![0.0f32; grid * channels];
     for (row_sources, row_weights) in &rows {
         line.fill(0.0);

@@ -1,4 +1,4 @@
-//! The size of the network's input, and whether pictures are as large as they say.
+//! The size of the network's input, and whether images are as large as they say.
 
 use crate::arch::PATCH;
 use crate::{Color, Error, ErrorKind, Output, RawDepth, Result};
@@ -24,18 +24,17 @@ pub fn check_input_size(input_size: u32) -> Result<()> {
     Err(Error::new(ErrorKind::BadInput, message))
 }
 
-/// Width and height of the network's input for pictures of `picture` (width, height): both scaled alike, so that the
+/// Width and height of the network's input for images of `image` (width, height): both scaled alike, so that the
 /// shorter becomes `input_size`, then to the nearest multiple of 14 (halves to the even one), but not below `input_size`.
 ///
 /// The official `Resize(…, keep_aspect_ratio=True, ensure_multiple_of=14, resize_method="lower_bound")`.
 ///
 /// # Errors
-/// [`ErrorKind::BadInput`] for an empty picture, an input size that cannot be used, and an image so long and narrow that
+/// [`ErrorKind::BadInput`] for an empty image, an input size that cannot be used, and an image so long and narrow that
 /// the network's time and memory would not do.
-pub fn net_size(picture: (usize, usize), input_size: u32) -> Result<(usize, usize)> {
-    let (width, height) = picture;
+pub fn net_size(width: usize, height: usize, input_size: u32) -> Result<(usize, usize)> {
     if width == 0 || height == 0 {
-        return Err(Error::new(ErrorKind::BadInput, format!("a picture of {width}x{height} has no pixels")));
+        return Err(Error::new(ErrorKind::BadInput, format!("an image of {width}x{height} has no pixels")));
     }
     check_input_size(input_size)?;
     if width.max(height) > MAX_ASPECT.saturating_mul(width.min(height)) {
@@ -52,11 +51,12 @@ pub fn net_size(picture: (usize, usize), input_size: u32) -> Result<(usize, usiz
         let nearest = (wanted / patch).round_ties_even() * patch;
         (if nearest < least { (wanted / patch).ceil() * patch } else { nearest }) as usize
     };
-    let (w, h) = (side(width), side(height));
+    let w = side(width);
+    let h = side(height);
     if (w / PATCH).saturating_mul(h / PATCH) > MAX_PATCHES {
         let message = format!(
-            "a picture of {width}x{height} at input size {input_size} is {w}x{h} for the network, which is too large; \
-             use a smaller input size, or cut the picture"
+            "an image of {width}x{height} at input size {input_size} is {w}x{h} for the network, which is too large; \
+             use a smaller input size, or cut the image"
         );
         return Err(Error::new(ErrorKind::BadInput, message));
     }
@@ -71,13 +71,13 @@ pub(super) fn check_len(what: &str, is: usize, should: usize) -> Result<()> {
     Err(Error::new(ErrorKind::SizeMismatch, message))
 }
 
-pub(super) fn check_picture(prepared: (usize, usize), color: &Color<'_>) -> Result<()> {
-    if prepared == (color.width, color.height) {
+pub(super) fn check_image(width: usize, height: usize, color: &Color<'_>) -> Result<()> {
+    if (width, height) == (color.width, color.height) {
         return Ok(());
     }
     let message = format!(
-        "the colour picture is {}x{} and {}x{} was prepared for; prepare for the size that is used",
-        color.width, color.height, prepared.0, prepared.1
+        "the colour image is {}x{} and {width}x{height} was prepared for; prepare for the size that is used",
+        color.width, color.height
     );
     Err(Error::new(ErrorKind::SizeMismatch, message))
 }
@@ -86,7 +86,7 @@ fn check_unit(what: &str, unit_m: f64) -> Result<()> {
     if unit_m.is_finite() && unit_m > 0.0 {
         return Ok(());
     }
-    let message = format!("{what}: {unit_m} metres is no unit of depth; it must be above 0, such as 0.001");
+    let message = format!("{what}: invalid depth unit {unit_m} m; it must be above 0, such as 0.001");
     Err(Error::new(ErrorKind::BadInput, message))
 }
 
@@ -94,19 +94,19 @@ impl Color<'_> {
     /// Whether the bytes are as many as the size says.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`] for a picture without pixels, a stride below the width, and bytes that are missing.
+    /// [`ErrorKind::BadInput`] for an image without pixels, a stride below the width, and bytes that are missing.
     pub fn check(&self) -> Result<()> {
         let Self { width, height, stride, .. } = *self;
         let line = width.saturating_mul(3);
         let needed = stride.checked_mul(height.saturating_sub(1)).and_then(|n| n.checked_add(line));
         let message = if width == 0 || height == 0 {
-            format!("the colour picture is {width}x{height}: it has no pixels")
+            format!("the colour image is {width}x{height}: it has no pixels")
         } else if stride < line {
-            format!("the colour picture's rows are {stride} bytes apart, but {width} pixels need {line}")
+            format!("the colour image's rows are {stride} bytes apart, but {width} pixels need {line}")
         } else if needed.is_none_or(|n| self.pixels.len() < n) {
             let is = self.pixels.len();
             format!(
-                "the colour picture of {width}x{height}, rows {stride} bytes apart, is cut short at {is} bytes"
+                "the colour image of {width}x{height}, rows {stride} bytes apart, is cut short at {is} bytes"
             )
         } else {
             return Ok(());
@@ -126,7 +126,8 @@ impl RawDepth<'_> {
     /// # Errors
     /// [`ErrorKind::SizeMismatch`] and [`ErrorKind::BadInput`].
     pub fn check(&self, color: &Color<'_>) -> Result<()> {
-        let (is, should) = (self.pixels.len(), color.width * color.height);
+        let is = self.pixels.len();
+        let should = color.width * color.height;
         if is != should {
             let message = format!(
                 "raw depth has {is} pixels and colour {}x{}, {should}; register depth to the colour camera's view first",
@@ -147,21 +148,22 @@ impl Output<'_> {
         }
     }
 
-    /// Whether there is no room for any pixel.
+    /// Returns whether the buffer is empty.
     pub const fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Whether it has room for pictures of `picture` (width, height), and its unit is one.
+    /// Checks that it has room for images of `width` and `height`, and that its unit is valid.
     ///
     /// # Errors
     /// [`ErrorKind::SizeMismatch`] and [`ErrorKind::BadInput`].
-    pub fn check(&self, picture: (usize, usize)) -> Result<()> {
-        let (is, should) = (self.len(), picture.0 * picture.1);
+    pub fn check(&self, width: usize, height: usize) -> Result<()> {
+        let is = self.len();
+        let should = width * height;
         if is != should {
-            let (w, h) = picture;
-            let message =
-                format!("the output has room for {is} pixels, and the colour picture is {w}x{h}, {should}");
+            let message = format!(
+                "the output has room for {is} pixels, and the colour image is {width}x{height}, {should}"
+            );
             return Err(Error::new(ErrorKind::SizeMismatch, message));
         }
         match self {

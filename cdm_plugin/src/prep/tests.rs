@@ -7,7 +7,7 @@ use proptest::prelude::*;
 
 #[test]
 fn sizes_of_the_network() {
-    for (picture, input_size, net) in [
+    for (image, input_size, net) in [
         ((1280, 720), 252, (448, 252)),
         ((1280, 720), 518, (924, 518)),
         ((640, 480), 308, (406, 308)),
@@ -22,9 +22,9 @@ fn sizes_of_the_network() {
         ((500, 500), 510, (518, 518)),
         ((1280, 120), 518, (5530, 518)),
     ] {
-        assert_eq!(net_size(picture, input_size).unwrap(), net, "{picture:?} {input_size}");
+        assert_eq!(net_size(image.0, image.1, input_size).unwrap(), net, "{image:?} {input_size}");
     }
-    for (picture, input_size, text) in [
+    for (image, input_size, text) in [
         ((0, 720), 518, "0x720"),
         ((1280, 0), 518, "1280x0"),
         ((640, 480), 13, "13"),
@@ -34,13 +34,13 @@ fn sizes_of_the_network() {
         ((640, 480), u32::MAX, "out of range 14..=1792"),
         ((640, 480), 4000, "input size 4000 is out of range"),
     ] {
-        let error = net_size(picture, input_size).unwrap_err();
+        let error = net_size(image.0, image.1, input_size).unwrap_err();
         assert!(error.kind() == ErrorKind::BadInput && error.to_string().contains(text), "{error}");
     }
 }
 
 /// The definition in `f64`: columns and rows of the kernel with the border repeated.
-fn slow_cubic(color: &Color<'_>, net: (usize, usize)) -> Vec<[f64; 3]> {
+fn slow_cubic(color: &Color<'_>, net_width: usize, net_height: usize) -> Vec<[f64; 3]> {
     let taps = |i: usize, from: usize, to: usize| {
         let at = (i as f64 + 0.5) * from as f64 / to as f64 - 0.5;
         [-1.0, 0.0, 1.0, 2.0].map(|k| {
@@ -55,11 +55,11 @@ fn slow_cubic(color: &Color<'_>, net: (usize, usize)) -> Vec<[f64; 3]> {
         })
     };
     let mut out = Vec::new();
-    for y in 0..net.1 {
-        for x in 0..net.0 {
+    for y in 0..net_height {
+        for x in 0..net_width {
             let mut sum = [0.0; 3];
-            for (row, wy) in taps(y, color.height, net.1) {
-                for (column, wx) in taps(x, color.width, net.0) {
+            for (row, wy) in taps(y, color.height, net_height) {
+                for (column, wx) in taps(x, color.width, net_width) {
                     for (c, s) in sum.iter_mut().enumerate() {
                         *s += wx * wy * f64::from(color.row(row)[3 * column + c]) / 255.0;
                     }
@@ -81,7 +81,7 @@ proptest! {
         input_size in 14u32..50,
     ) {
         let color = Color { pixels: &pixels, format: ColorFormat::Rgb8, width, height, stride: 3 * width };
-        let Ok(mut prep) = Prep::new((width, height), input_size, 6.0) else { return Ok(()) };
+        let Ok(mut prep) = Prep::new(width, height, input_size, 6.0) else { return Ok(()) };
         let net = prep.net();
         prop_assume!(net.0 * net.1 < 20_000);
         let mut x = vec![f32::NAN; 4 * net.0 * net.1];
@@ -89,7 +89,7 @@ proptest! {
         let raw = RawDepth { pixels: &depth, unit_m: 0.001 };
         prop_assert!(!prep.prepare(&color, &raw, ChannelOrder::Rgb, &mut x).unwrap());
         let plane = net.0 * net.1;
-        for (i, expected) in slow_cubic(&color, net).into_iter().enumerate() {
+        for (i, expected) in slow_cubic(&color, net.0, net.1).into_iter().enumerate() {
             for c in 0..3 {
                 let want = (expected[c] - [0.485, 0.456, 0.406][c]) / [0.229, 0.224, 0.225][c];
                 let got = f64::from(x[c * plane + i]);
@@ -100,7 +100,7 @@ proptest! {
     }
 }
 
-/// What the network would see of every reading: a picture of 256x256 at its own size would lose some, so the table itself.
+/// The network's input for every reading: an image of 256x256 at its own size would lose some, so this reads the table.
 fn inverse_of(unit_m: f64, max_depth_m: f64) -> Vec<f32> {
     let mut table = DepthTable::new(max_depth_m);
     table.use_unit(unit_m);
@@ -131,9 +131,11 @@ fn inverse_depth_is_the_official_one_for_every_reading() {
 }
 
 fn finish(y: f32, unit_m: f64) -> (u16, f32, f32) {
-    let mut prep = Prep::new((1, 1), 14, 6.0).unwrap();
+    let mut prep = Prep::new(1, 1, 14, 6.0).unwrap();
     let y = vec![y; 14 * 14];
-    let (mut units, mut metres, mut inverse) = ([7u16], [7.0f32], [7.0f32]);
+    let mut units = [7u16];
+    let mut metres = [7.0f32];
+    let mut inverse = [7.0f32];
     prep.finish(&y, &mut Output::Units { pixels: &mut units, unit_m }).unwrap();
     prep.finish(&y, &mut Output::Metres(&mut metres)).unwrap();
     prep.finish(&y, &mut Output::Inverse(&mut inverse)).unwrap();
@@ -150,7 +152,8 @@ fn what_cannot_be_expressed_is_a_hole() {
     // Metres that are infinite; inverse depth itself is a number.
     assert_eq!(finish(1e-45, 0.001), (0, 0.0, 1e-45));
     // The last unit that fits, and the first that would be 65535.
-    let (last, first) = (1.0 / 65.534, 1.0 / 65.535);
+    let last = 1.0 / 65.534;
+    let first = 1.0 / 65.535;
     assert_eq!((finish(last, 0.001).0, finish(first, 0.001).0), (65534, 0));
     assert_eq!(finish(1e-3, 0.001).0, 0);
     // Less than half a unit.
@@ -158,11 +161,12 @@ fn what_cannot_be_expressed_is_a_hole() {
 }
 
 #[test]
-fn pictures_that_do_not_fit_are_refused() {
-    let (pixels, depth) = ([0u8; 3 * 20], [0u16; 20]);
+fn images_that_do_not_fit_are_refused() {
+    let pixels = [0u8; 3 * 20];
+    let depth = [0u16; 20];
     let color = Color { pixels: &pixels, format: ColorFormat::Rgb8, width: 5, height: 4, stride: 15 };
     let raw = RawDepth { pixels: &depth, unit_m: 0.001 };
-    let mut prep = Prep::new((5, 4), 14, 6.0).unwrap();
+    let mut prep = Prep::new(5, 4, 14, 6.0).unwrap();
     let mut x = vec![0.0; 4 * prep.net().0 * prep.net().1];
     let mut refused = |color: Color<'_>, raw: RawDepth<'_>, kind, text: &str| {
         let error = prep.prepare(&color, &raw, ChannelOrder::Bgr, &mut x).unwrap_err();
@@ -175,7 +179,7 @@ fn pictures_that_do_not_fit_are_refused() {
     refused(Color { width: 4, height: 5, stride: 12, ..color }, raw, SizeMismatch, "4x5");
     refused(color, RawDepth { pixels: &depth[1..], ..raw }, SizeMismatch, "19 pixels");
     for unit_m in [0.0, -1.0, f64::NAN, f64::INFINITY] {
-        refused(color, RawDepth { unit_m, ..raw }, BadInput, "no unit");
+        refused(color, RawDepth { unit_m, ..raw }, BadInput, "invalid depth unit");
     }
     let error = prep.prepare(&color, &raw, ChannelOrder::Bgr, &mut x[1..]).unwrap_err();
     assert_eq!(error.kind(), SizeMismatch);
@@ -192,13 +196,13 @@ fn pictures_that_do_not_fit_are_refused() {
 fn embeddings_keep_what_they_must() {
     let channels = 3;
     let learnt: Vec<f32> = (0..(1 + 37 * 37) * channels).map(|i| (i as f32 * 0.37).sin()).collect();
-    let same = position::resize(&learnt, 37, channels, (37, 37));
+    let same = position::resize(&learnt, 37, channels, 37, 37);
     assert_eq!(same, learnt);
     // As many places, but of another form: these are resized.
-    assert_ne!(position::resize(&learnt, 37, channels, (37 * 37, 1))[channels..], learnt[channels..]);
-    let other = position::resize(&learnt, 37, channels, (18, 32));
+    assert_ne!(position::resize(&learnt, 37, channels, 37 * 37, 1)[channels..], learnt[channels..]);
+    let other = position::resize(&learnt, 37, channels, 18, 32);
     assert_eq!(other.len(), (1 + 18 * 32) * channels);
     assert_eq!(other[..channels], learnt[..channels], "the class token has no place");
-    let flat = position::resize(&vec![0.25; learnt.len()], 37, channels, (50, 7));
+    let flat = position::resize(&vec![0.25; learnt.len()], 37, channels, 50, 7);
     assert!(flat.iter().all(|v| (v - 0.25).abs() < 1e-6));
 }

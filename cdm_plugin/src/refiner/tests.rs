@@ -1,4 +1,4 @@
-//! With a network that gives back what it was shown.
+//! Tests with a network that returns its input.
 
 use super::*;
 use crate::{Color, ColorFormat, Encoder, ErrorKind, Output, RawDepth, Weights};
@@ -6,14 +6,14 @@ use safetensors::tensor::{Dtype, TensorView};
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
-/// What the network was asked, in order.
+/// Inputs of the network, in order.
 #[derive(Default)]
 struct Log {
     prepared: Vec<NetShape>,
     runs: Vec<NetShape>,
 }
 
-/// Gives back inverse depth as it came, or what it is told to.
+/// Returns its inverse depth unchanged, or a preset result.
 struct Mirror {
     log: Arc<Mutex<Log>>,
     shape: Option<NetShape>,
@@ -62,7 +62,8 @@ impl Network for Mirror {
 /// Weights that hold the position embeddings and nothing else.
 fn model(folder: &Path) -> Model {
     let numbers = |v: f32| v.to_le_bytes().repeat(1370 * 384);
-    let (rgb, depth) = (numbers(1.0), numbers(2.0));
+    let rgb = numbers(1.0);
+    let depth = numbers(2.0);
     let view = |bytes| TensorView::new(Dtype::F32, vec![1, 1370, 384], bytes).unwrap();
     let path = folder.join("positions.safetensors");
     let tensors = [("pretrained.pos_embed", view(&rgb)), ("depth_pretrained.pos_embed", view(&depth))];
@@ -94,9 +95,9 @@ struct Pair {
 }
 
 impl Pair {
-    fn new(size: (usize, usize), depth_mm: u16) -> Self {
-        let n = size.0 * size.1;
-        Self { color: vec![90; 3 * n], depth: vec![depth_mm; n], size, out: vec![1; n] }
+    fn new(width: usize, height: usize, depth_mm: u16) -> Self {
+        let n = width * height;
+        Self { color: vec![90; 3 * n], depth: vec![depth_mm; n], size: (width, height), out: vec![1; n] }
     }
 
     fn job(&mut self) -> Job<'_> {
@@ -119,10 +120,10 @@ fn jobs_of_one_size_run_together_and_each_gets_its_own() {
     let (mut refiner, log) = refiner(2, |_| ());
     assert_eq!(refiner.describe().engine, "mirror 1.0 cpu fp32");
     assert_eq!((refiner.describe().model.as_str(), refiner.best_batch()), ("mirror@00000000", 2));
-    // Three of 28x28, two of 56x28; one of these is a larger picture that becomes an input of the same size.
+    // Three of 28x28, two of 56x28; one of these is a larger image that becomes an input of the same size.
     let sizes = [(20, 20), (40, 20), (28, 28), (80, 40), (56, 56)];
     let mut pairs: Vec<Pair> =
-        sizes.iter().enumerate().map(|(i, size)| Pair::new(*size, 1000 + 100 * i as u16)).collect();
+        sizes.iter().enumerate().map(|(i, size)| Pair::new(size.0, size.1, 1000 + 100 * i as u16)).collect();
     for round in 0..2 {
         for pair in &mut pairs {
             pair.out.fill(1);
@@ -142,9 +143,9 @@ fn jobs_of_one_size_run_together_and_each_gets_its_own() {
         assert_eq!(runs, [shape(2, 28, 28), shape(1, 28, 28), shape(2, 28, 56)]);
     }
     refiner.refine(&mut []).unwrap();
-    // One size after the other: what is prepared stays so.
+    // One size after the other: the tables are kept.
     let before = log.lock().unwrap().prepared.len();
-    let mut pair = Pair::new((40, 20), 500);
+    let mut pair = Pair::new(40, 20, 500);
     for _ in 0..3 {
         refiner.refine(&mut [pair.job()]).unwrap();
     }
@@ -155,7 +156,7 @@ fn jobs_of_one_size_run_together_and_each_gets_its_own() {
 fn nothing_measured_is_nothing_refined() {
     let (mut refiner, log) = refiner(4, |mirror| mirror.answer = Some(0.5));
     // Holes, full scale, beyond 6 m; and one that has depth.
-    let mut pairs = [0, u16::MAX, 6001, 6000].map(|d| Pair::new((20, 20), d));
+    let mut pairs = [0, u16::MAX, 6001, 6000].map(|d| Pair::new(20, 20, d));
     let mut jobs: Vec<Job<'_>> = pairs.iter_mut().map(Pair::job).collect();
     refiner.refine(&mut jobs).unwrap();
     assert!(jobs[0].steps.prepare_ns > 0 && jobs[0].steps.infer_ns == 0 && jobs[0].steps.finish_ns == 0);
@@ -163,7 +164,7 @@ fn nothing_measured_is_nothing_refined() {
     assert_eq!(pairs.each_ref().map(|p| p.out[7]), [0, 0, 0, 2000]);
     assert!(pairs[..3].iter().all(|p| p.out.iter().all(|d| *d == 0)));
     assert_eq!(log.lock().unwrap().runs, [shape(1, 28, 28)], "one job of four was worth a run");
-    let mut hole = Pair::new((20, 20), 0);
+    let mut hole = Pair::new(20, 20, 0);
     refiner.refine(&mut [hole.job()]).unwrap();
     assert_eq!(log.lock().unwrap().runs.len(), 1);
 }
@@ -172,22 +173,22 @@ fn nothing_measured_is_nothing_refined() {
 fn what_is_not_finite_is_a_hole() {
     for answer in [f32::NAN, f32::INFINITY, 0.0, 1e-9] {
         let (mut refiner, _) = refiner(1, |mirror| mirror.answer = Some(answer));
-        let mut pair = Pair::new((20, 20), 1000);
+        let mut pair = Pair::new(20, 20, 1000);
         refiner.refine(&mut [pair.job()]).unwrap();
         assert!(pair.out.iter().all(|d| *d == 0), "{answer}");
     }
 }
 
 #[test]
-fn tiny_and_long_pictures() {
+fn tiny_and_long_images() {
     let (mut refiner, log) = refiner(1, |_| ());
     for (size, net) in [((1, 1), (28, 28)), ((3, 2), (28, 42)), ((2, 32), (448, 28))] {
-        let mut pair = Pair::new(size, 700);
+        let mut pair = Pair::new(size.0, size.1, 700);
         refiner.refine(&mut [pair.job()]).unwrap();
         assert!(pair.out.iter().all(|d| *d == 700), "{size:?}");
         assert_eq!(log.lock().unwrap().runs.pop(), Some(shape(1, net.0, net.1)));
     }
-    let mut long = Pair::new((1, 20_000), 700);
+    let mut long = Pair::new(1, 20_000, 700);
     let error = refiner.refine(&mut [long.job()]).unwrap_err();
     assert!(error.kind() == ErrorKind::BadInput && error.to_string().contains("1x20000"), "{error}");
 }
@@ -195,7 +196,8 @@ fn tiny_and_long_pictures() {
 #[test]
 fn errors_name_the_pair_and_leave_the_refiner_usable() {
     let (mut refiner, log) = refiner(2, |_| ());
-    let (mut good, mut bad) = (Pair::new((20, 20), 1000), Pair::new((20, 20), 1000));
+    let mut good = Pair::new(20, 20, 1000);
+    let mut bad = Pair::new(20, 20, 1000);
     bad.depth.pop();
     let error = refiner.refine(&mut [good.job(), bad.job()]).unwrap_err();
     assert_eq!(error.kind(), ErrorKind::SizeMismatch);
@@ -211,14 +213,14 @@ fn errors_name_the_pair_and_leave_the_refiner_usable() {
 #[test]
 fn errors_of_the_engine_are_passed_on() {
     let (mut refiner, _) = refiner(1, |mirror| mirror.fails = true);
-    let error = refiner.refine(&mut [Pair::new((20, 20), 1000).job()]).unwrap_err();
+    let error = refiner.refine(&mut [Pair::new(20, 20, 1000).job()]).unwrap_err();
     assert_eq!((error.kind(), error.to_string().as_str()), (ErrorKind::OutOfMemory, "the mirror is full"));
 }
 
 #[test]
 fn more_sizes_than_are_kept() {
     let (mut refiner, _) = refiner(64, |_| ());
-    let mut pairs: Vec<Pair> = (0..40).map(|i| Pair::new((20 + i, 20), 300 + i as u16)).collect();
+    let mut pairs: Vec<Pair> = (0..40).map(|i| Pair::new(20 + i, 20, 300 + i as u16)).collect();
     for _ in 0..2 {
         let mut jobs: Vec<Job<'_>> = pairs.iter_mut().map(Pair::job).collect();
         refiner.refine(&mut jobs).unwrap();

@@ -1,4 +1,4 @@
-//! What a network takes and gives, as far as its inputs and outputs say.
+//! Form of a network's inputs and outputs, as far as the file describes them.
 
 use core::fmt;
 
@@ -10,7 +10,7 @@ pub struct Outlet {
     pub kind: String,
     /// They are 32-bit floats.
     pub is_float: bool,
-    /// `None` when it is no tensor; -1 for a size that is known when it runs.
+    /// `None` when it is not a tensor; -1 for a size that is only known at run time.
     pub shape: Option<Vec<i64>>,
 }
 
@@ -23,16 +23,16 @@ impl fmt::Display for Outlet {
     }
 }
 
-/// How both pictures go in.
+/// How both images go in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Pictures {
+pub enum Images {
     /// Each in an input.
     Two,
     /// In one input, the channels of the left one first.
     Stacked,
 }
 
-impl Pictures {
+impl Images {
     pub const fn inputs(self) -> usize {
         match self {
             Self::Two => 2,
@@ -50,14 +50,14 @@ pub enum Layout {
     ChannelsLast,
 }
 
-/// What a network takes and gives.
+/// Form of a network's inputs and outputs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Form {
-    pub pictures: Pictures,
+    pub images: Images,
     pub layout: Layout,
-    /// Channels of one picture: 1 or 3.
+    /// Channels of one image: 1 or 3.
     pub channels: usize,
-    /// Size of its pictures, where it has one.
+    /// Size of its images, where it has one.
     pub width: Option<usize>,
     pub height: Option<usize>,
     /// Names of the inputs, left first.
@@ -76,7 +76,7 @@ impl fmt::Display for Form {
     }
 }
 
-const TAKEN: &str = "taken are two inputs [1, 3 or 1, height, width], left and right, or one input with both pictures \
+const TAKEN: &str = "taken are two inputs [1, 3 or 1, height, width], left and right, or one input with both images \
     one behind the other as 6 or 2 channels, in 32-bit floats, with the channels second or last";
 
 fn list(of: &[Outlet]) -> String {
@@ -84,21 +84,21 @@ fn list(of: &[Outlet]) -> String {
 }
 
 impl Form {
-    /// The form of a network with these inputs and outputs; else what is wrong with them.
+    /// Determines the form of a network from its inputs and outputs, or describes why it is unsupported.
     pub fn of(inputs: &[Outlet], outputs: &[Outlet]) -> Result<Self, String> {
         let refuse = |why: &str| format!("its inputs are {}: {why}; {TAKEN}", list(inputs));
-        let (pictures, per_eye) = match inputs.len() {
-            1 => (Pictures::Stacked, 2),
-            2 => (Pictures::Two, 1),
+        let (images, per_eye) = match inputs.len() {
+            1 => (Images::Stacked, 2),
+            2 => (Images::Two, 1),
             n => return Err(refuse(&format!("there are {n} of them"))),
         };
         let mut found: Option<(Layout, usize, Option<usize>, Option<usize>)> = None;
         for input in inputs {
             let Some(&[batch, b, c, d]) = input.shape.as_deref().filter(|_| input.is_float) else {
-                return Err(refuse(&format!("{} is no picture in 32-bit floats", input.name)));
+                return Err(refuse(&format!("{} is not an image in 32-bit floats", input.name)));
             };
             if batch > 1 {
-                return Err(refuse(&format!("{} takes {batch} pictures at once", input.name)));
+                return Err(refuse(&format!("{} takes {batch} images at once", input.name)));
             }
             let colors = |n: i64| [1, 3].into_iter().find(|k| n == k * per_eye);
             let side = |n: i64| usize::try_from(n).ok();
@@ -124,12 +124,12 @@ impl Form {
             names.reverse();
         }
         let (output, confidence) = output(outputs)?;
-        Ok(Self { pictures, layout, channels, width, height, names, output, confidence })
+        Ok(Self { images, layout, channels, width, height, names, output, confidence })
     }
 
-    /// The shape of each input for pictures of this width and height.
+    /// The shape of each input for images of this width and height.
     pub fn shape(&self, (width, height): (usize, usize)) -> Vec<usize> {
-        let channels = self.channels * if self.pictures == Pictures::Stacked { 2 } else { 1 };
+        let channels = self.channels * if self.images == Images::Stacked { 2 } else { 1 };
         match self.layout {
             Layout::ChannelsFirst => vec![1, channels, height, width],
             Layout::ChannelsLast => vec![1, height, width, channels],
@@ -162,20 +162,19 @@ fn output(outputs: &[Outlet]) -> Result<(String, Option<String>), String> {
     Ok((one.name.clone(), confidence.map(|o| o.name.clone())))
 }
 
-/// Where the numbers of a picture lie in an output.
+/// Where the numbers of an image lie in an output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Plane {
     /// From one pixel to the next.
     pub step: usize,
 }
 
-/// The plane of an output of this shape with `len` numbers, for pictures of `inner` width and height. Of the two channels
-/// of a network that gives shifts in x and y it is the first.
-pub fn plane(shape: &[i64], len: usize, inner: (usize, usize)) -> Result<Plane, String> {
+/// The plane of an output of this shape with `len` numbers, for images of `width` and `height`. Of the two channels of
+/// a network that outputs shifts in x and y it is the first.
+pub fn plane(shape: &[i64], len: usize, width: usize, height: usize) -> Result<Plane, String> {
     let wanted = |n: i64, side: usize| usize::try_from(n).is_ok_and(|n| n == side);
     let sizes: Vec<i64> = shape.iter().copied().filter(|n| *n != 1).collect();
     // A side of one pixel would be left out above; no camera has one.
-    let (width, height) = inner;
     let is = |h: i64, w: i64| wanted(h, height) && wanted(w, width);
     let (step, planes) = match *sizes.as_slice() {
         [h, w] if is(h, w) => (1, 1),
@@ -183,7 +182,7 @@ pub fn plane(shape: &[i64], len: usize, inner: (usize, usize)) -> Result<Plane, 
         [h, w, 2] if is(h, w) => (2, 2),
         _ => {
             return Err(format!(
-                "is {shape:?} where the pictures are {width}x{height}; a disparity for each pixel is needed"
+                "is {shape:?} where the images are {width}x{height}; a disparity for each pixel is needed"
             ));
         }
     };

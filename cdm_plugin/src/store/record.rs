@@ -1,4 +1,4 @@
-//! `model.toml`: what is known of an installed model.
+//! `model.toml`: the record of an installed model.
 
 use super::Import;
 use crate::durable::Written;
@@ -12,7 +12,7 @@ use time::format_description::well_known::Rfc3339;
 /// The form of the file that is written and read here.
 const FORMAT: u32 = 1;
 
-/// What is known of an installed model.
+/// Record of an installed model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Record {
     /// The form of this file: 1.
@@ -34,7 +34,7 @@ pub struct Record {
     pub installed: String,
     /// The program that installed it.
     pub installed_by: String,
-    /// What the file had beside the network, by name.
+    /// Names of superfluous tensors in the file.
     #[serde(default)]
     pub left_out: Vec<String>,
     /// The weights as they lie here.
@@ -71,16 +71,16 @@ pub enum Source {
     Fetched {
         /// The address that was asked for.
         url: String,
-        /// The version of the repository that it was of, if the server told.
+        /// Revision of the repository, if the server reported it.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         revision: Option<String>,
         /// SHA-256 of the file, in hexadecimal.
         sha256: String,
-        /// What the hash was compared with: `given`, `known`, `server` or `nothing`.
+        /// Reference of the hash: `given`, `known`, `server` or `nothing`.
         compared_with: String,
         /// Its size.
         bytes: u64,
-        /// Under what it may be used, as far as known.
+        /// Its licence, as far as known.
         licence: String,
     },
 }

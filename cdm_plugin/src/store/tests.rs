@@ -45,7 +45,7 @@ fn a_model_is_installed_listed_used_and_removed() {
     assert!(model.id.starts_with("untrained-demo@") && !model.is_trained() && model.id == installed.id());
     assert!(model.id.ends_with(&record.weights.sha256[..8]));
     assert!(store.check("demo").unwrap().is_good());
-    // What a file said of itself, and its numbers, are kept.
+    // The file's metadata and numbers are kept.
     let original = Weights::open(seeded()).unwrap();
     assert_eq!(model.weights.metadata(), original.metadata());
     for name in ["pretrained.pos_embed", "crossAtts.3.out_proj.bias"] {

@@ -22,7 +22,7 @@ const MAX_DIMENSIONS: usize = 8;
 /// The place of a value in [`Pickle::values`].
 pub(super) type Id = u32;
 
-/// What the numbers of a storage are.
+/// Type of the numbers in a storage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Element {
     /// Numbers that a network can use.
@@ -88,7 +88,7 @@ pub(super) enum Value<'a> {
 }
 
 impl Value<'_> {
-    /// What it is, in Python's words.
+    /// Name of the type in Python.
     pub(super) const fn kind(&self) -> &'static str {
         match self {
             Self::None => "None",
@@ -236,11 +236,13 @@ impl<'a> Machine<'a> {
             b'h' => self.recall(1)?,
             b'j' => self.recall(4)?,
             b'c' => {
-                let (module, name) = (self.line()?, self.line()?);
+                let module = self.line()?;
+                let name = self.line()?;
                 self.global(module, name)?;
             }
             0x93 => {
-                let (name, module) = (self.pop_text()?, self.pop_text()?);
+                let name = self.pop_text()?;
+                let module = self.pop_text()?;
                 self.global(module, name)?;
             }
             b'Q' => self.persistent()?,
@@ -371,7 +373,7 @@ impl<'a> Machine<'a> {
         let list = self.top()?;
         match self.values.get_mut(list as usize) {
             Some(Value::List(list)) => list.append(&mut items),
-            _ => return Err("something is appended to what is no list".into()),
+            _ => return Err("something is appended to a value that is not a list".into()),
         }
         Ok(())
     }
@@ -384,7 +386,7 @@ impl<'a> Machine<'a> {
         let dict = self.top()?;
         match self.values.get_mut(dict as usize) {
             Some(Value::Dict(dict)) => dict.extend(pairs.iter().map(|[key, value]| (*key, *value))),
-            _ => return Err("something is set in what is no dict".into()),
+            _ => return Err("something is set in a value that is not a dict".into()),
         }
         Ok(())
     }
@@ -423,7 +425,7 @@ impl<'a> Machine<'a> {
                 Value::Int(len),
                 ..,
             ] => Storage { element: *element, key, len: u64::try_from(*len).map_err(|e| e.to_string())? },
-            _ => return Err("it refers to something outside that is no storage of numbers".into()),
+            _ => return Err("it refers to an external object that is not a storage of numbers".into()),
         };
         self.push(Value::Storage(storage))
     }
@@ -432,17 +434,17 @@ impl<'a> Machine<'a> {
         let arguments = self.pop_tuple()?;
         let function = self.pop()?;
         let Value::Global(function) = *self.value(function) else {
-            return Err("it calls what is no function".into());
+            return Err("it calls a value that is not a function".into());
         };
         let first = arguments.first().map(|id| self.value(*id).clone());
-        let made = match (function, first) {
+        let value = match (function, first) {
             (Global::OrderedDict, None) => Value::Dict(Vec::new()),
             (Global::Size, Some(tuple @ Value::Tuple(_))) => tuple,
             (Global::RebuildParameter, Some(tensor @ Value::Tensor(_))) => tensor,
             (Global::RebuildTensor, Some(Value::Storage(storage))) => self.tensor(storage, &arguments)?,
             _ => return Err(format!("{function:?} is called with what it does not take")),
         };
-        self.push(made)
+        self.push(value)
     }
 
     fn tensor(&self, storage: Storage<'a>, arguments: &[Id]) -> Parsed<Value<'a>> {
@@ -450,10 +452,11 @@ impl<'a> Machine<'a> {
             return Err("a tensor lacks its shape".into());
         };
         let Value::Int(offset) = *self.value(*offset) else {
-            return Err("the place of a tensor is no number".into());
+            return Err("the offset of a tensor is not a number".into());
         };
         let offset = u64::try_from(offset).map_err(|_| "a tensor begins before its storage")?;
-        let (shape, strides) = (self.sizes(*shape)?, self.sizes(*strides)?);
+        let shape = self.sizes(*shape)?;
+        let strides = self.sizes(*strides)?;
         if shape.len() != strides.len() {
             return Err("a tensor has more dimensions than strides, or fewer".into());
         }
@@ -463,7 +466,7 @@ impl<'a> Machine<'a> {
 
     fn sizes(&self, id: Id) -> Parsed<Vec<u64>> {
         let Value::Tuple(items) = self.value(id) else {
-            return Err("the shape of a tensor is no tuple".into());
+            return Err("the shape of a tensor is not a tuple".into());
         };
         if items.len() > MAX_DIMENSIONS {
             return Err(format!("a tensor has {} dimensions", items.len()));
@@ -509,8 +512,8 @@ fn known_global(module: &str, name: &str) -> Parsed<Global> {
 
 fn unknown(op: u8) -> String {
     if op.is_ascii_graphic() {
-        format!("operation {:?} is not one of those that state dicts are made of", char::from(op))
+        format!("operation {:?} is not allowed in a state dict", char::from(op))
     } else {
-        format!("operation {op:#04x} is not one of those that state dicts are made of")
+        format!("operation {op:#04x} is not allowed in a state dict")
     }
 }

@@ -11,9 +11,9 @@ use std::collections::HashMap;
 use std::io::BufReader;
 use zip::{CompressionMethod, ZipArchive};
 
-/// What to do about the form that PyTorch had before 1.6.
-pub(super) const LEGACY: &str = "is a checkpoint in the form that PyTorch had before 1.6, which is not read here; \
-    write it anew: python -c 'import torch; torch.save(torch.load(\"OLD.pth\", map_location=\"cpu\"), \"NEW.pth\")'";
+/// Cure for the format of PyTorch before 1.6.
+pub(super) const LEGACY: &str = "is a checkpoint in the format of PyTorch before 1.6, which is not supported; \
+    convert it: python -c 'import torch; torch.save(torch.load(\"OLD.pth\", map_location=\"cpu\"), \"NEW.pth\")'";
 
 /// The key that wrapped checkpoints keep their tensors under.
 const WRAPPED: &str = "model";
@@ -29,7 +29,7 @@ pub(super) fn is_legacy(file: &[u8]) -> bool {
     pickled || (file.get(257..262) == Some(b"ustar") && file.starts_with(b"sys_info"))
 }
 
-/// What the file holds.
+/// Reads the contents of the file.
 pub(super) fn read(file: &dyn ReadAt) -> Parsed<Contents> {
     let members = members(file)?;
     let list = members.keys().filter_map(|name| Some((name.strip_suffix("data.pkl")?, name)));
@@ -38,7 +38,7 @@ pub(super) fn read(file: &dyn ReadAt) -> Parsed<Contents> {
     let [(folder, list)] = lists.as_slice() else {
         return Err(match lists.len() {
             0 => "is a zip archive, but no checkpoint of PyTorch: it has no data.pkl".into(),
-            n => format!("is no checkpoint of PyTorch: it has {n} files data.pkl"),
+            n => format!("is not a checkpoint of PyTorch: it has {n} files data.pkl"),
         });
     };
     if members.contains_key(&format!("{folder}constants.pkl")) {
@@ -65,7 +65,7 @@ pub(super) fn read(file: &dyn ReadAt) -> Parsed<Contents> {
 fn members(file: &dyn ReadAt) -> Parsed<HashMap<String, Range<usize>>> {
     let mut zip = ZipArchive::new(BufReader::new(Stream::new(file))).map_err(|e| {
         format!(
-            "has {} bytes and is no whole zip archive ({e}): it was probably cut short; download or copy it again",
+            "has {} bytes and is not a complete zip archive ({e}): it was probably truncated; download or copy it again",
             file.len()
         )
     })?;
@@ -82,7 +82,8 @@ fn members(file: &dyn ReadAt) -> Parsed<HashMap<String, Range<usize>>> {
                 "its member {shown:?} is compressed or encrypted; checkpoints are stored as they are (was it packed anew?)"
             ));
         }
-        let (start, len) = (member.data_start(), member.compressed_size());
+        let start = member.data_start();
+        let len = member.compressed_size();
         let range = start.and_then(|start| {
             let end = start.checked_add(len)?;
             Some(usize::try_from(start).ok()?..usize::try_from(end).ok()?)

@@ -4,10 +4,10 @@ use super::stored::{ReadAt, part};
 use super::{Contents, Dtype, Entry, Parsed, unreadable, without_module};
 use ::safetensors::tensor::{Dtype as FileDtype, Metadata};
 
-/// The head of the largest network is 200 kB; a file that claims more than this is none.
+/// The head of the largest network is 200 kB; a file that claims more than this is invalid.
 const MAX_HEAD: usize = 16 << 20;
 
-/// What the file holds.
+/// Reads the contents of the file.
 pub(super) fn read(file: &dyn ReadAt) -> Parsed<Contents> {
     let not_one = "is neither a .safetensors file nor a checkpoint of PyTorch (a zip archive); \
                    give the file that holds the model's weights";

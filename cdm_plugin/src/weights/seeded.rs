@@ -1,7 +1,7 @@
 //! A model without training: random numbers of the right names and shapes, for demonstrations and tests.
 //!
-//! What it gives is no depth. It exists because real weights cannot be shipped, and so that everything around a model
-//! can be seen at work; its file, its name in headers and what prints it say so.
+//! Its output is not depth. It exists because real weights cannot be shipped, so that everything around a model can be
+//! demonstrated; its file, its name in headers and every report say so.
 
 use super::write::{Planned, write};
 use super::{Dtype, Weights};
@@ -12,7 +12,7 @@ use std::path::Path;
 
 /// The key in a file's metadata that says how it was trained.
 pub(crate) const TRAINING: &str = "depthrig.training";
-/// What stands there when it was not.
+/// Value for an untrained model.
 const NONE: &str = "none";
 
 impl Weights {

@@ -160,7 +160,7 @@ pub(crate) fn failed(path: &Path, e: io::Error) -> Error {
 mod tests {
     use super::*;
 
-    /// Reading what a map has no file behind would end the process.
+    /// Reading a map beyond the end of its file would end the process.
     #[test]
     fn a_file_that_became_shorter_is_not_mapped() {
         let dir = tempfile::tempdir().unwrap();

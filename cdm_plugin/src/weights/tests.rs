@@ -21,7 +21,7 @@ fn refused(name: &str) -> String {
 }
 
 /// Names, shapes and first numbers.
-fn told(w: &Weights) -> Vec<(&str, Vec<usize>, Vec<f32>)> {
+fn contents(w: &Weights) -> Vec<(&str, Vec<usize>, Vec<f32>)> {
     w.entries().iter().map(|(n, e)| (n.as_str(), e.shape.clone(), w.to_f32(n).unwrap())).collect()
 }
 
@@ -31,7 +31,8 @@ fn count(start: usize, n: usize) -> Vec<f32> {
 
 /// A `.safetensors` file of 32-bit floats that count up from 1, and what else is in the head.
 fn safetensors(tensors: &[(&str, &[usize])], more: &str) -> Vec<u8> {
-    let (mut head, mut data) = (Vec::new(), Vec::new());
+    let mut head = Vec::new();
+    let mut data = Vec::new();
     for (name, shape) in tensors {
         let from = data.len();
         for i in 0..shape.iter().product::<usize>() {
@@ -55,10 +56,13 @@ fn open_bytes(bytes: &[u8]) -> Result<Weights> {
 #[test]
 fn a_wrapped_checkpoint_is_read_with_and_without_the_prefix_of_a_wrapper() {
     let w = open("wrapped.pth");
-    assert_eq!(told(&w), [("head.bias", vec![2], count(20, 2)), ("head.weight", vec![2, 3], count(10, 6))]);
+    assert_eq!(
+        contents(&w),
+        [("head.bias", vec![2], count(20, 2)), ("head.weight", vec![2, 3], count(10, 6))]
+    );
     assert_eq!((w.format(), w.others().len()), (Format::PyTorch, 0));
     let w = open("without_prefix.pth");
-    assert_eq!(told(&w), told(&open("plain.pth")));
+    assert_eq!(contents(&w), contents(&open("plain.pth")));
 }
 
 #[test]
@@ -69,9 +73,9 @@ fn plain_state_dicts_keep_their_names() {
         ("token", vec![1, 1, 4], count(30, 4)),
     ];
     for name in ["plain.pth", "parallel.pth", "protocol4.pth"] {
-        assert_eq!(told(&open(name)), expected, "{name}");
+        assert_eq!(contents(&open(name)), expected, "{name}");
     }
-    assert_eq!(told(&open("parameters.pth")), [("p", vec![2, 2], count(5, 4))]);
+    assert_eq!(contents(&open("parameters.pth")), [("p", vec![2, 2], count(5, 4))]);
 }
 
 #[test]
@@ -79,7 +83,7 @@ fn other_floats_are_converted_and_other_types_are_named() {
     let w = open("halves.pth");
     let expected =
         [("brain", vec![4], count(1, 4)), ("double", vec![2], count(1, 2)), ("half", vec![4], count(1, 4))];
-    assert_eq!(told(&w), expected);
+    assert_eq!(contents(&w), expected);
     let others: Vec<_> = w.others().iter().map(|(n, what)| format!("{n}: {what}")).collect();
     assert_eq!(others, ["steps: a tensor of int64, shape []"]);
 }
@@ -94,9 +98,9 @@ fn views_of_one_storage_are_read_in_the_order_of_their_shape() {
         ("scalar", vec![], vec![2.5]),
         ("whole", vec![4, 3], count(0, 12)),
     ];
-    assert_eq!(told(&w), expected);
+    assert_eq!(contents(&w), expected);
     let transposed = vec![0.0, 3.0, 1.0, 4.0, 2.0, 5.0];
-    assert_eq!(told(&open("not_contiguous.pth")), [("transposed", vec![3, 2], transposed)]);
+    assert_eq!(contents(&open("not_contiguous.pth")), [("transposed", vec![3, 2], transposed)]);
 }
 
 #[test]
@@ -115,7 +119,7 @@ fn what_is_no_state_dict_is_refused_with_a_cure() {
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 12\n", "git lfs pull"),
         (b"<!DOCTYPE html><html></html>", "page of HTML"),
         (b"some words that are no weights at all", "neither a .safetensors file nor"),
-        (b"PK\x03\x04 and then nothing that fits", "cut short"),
+        (b"PK\x03\x04 and then nothing that fits", "truncated"),
     ] {
         let e = open_bytes(bytes).unwrap_err();
         assert!(e.kind() == ErrorKind::BadModel && e.to_string().contains(said), "{e}");
@@ -161,10 +165,10 @@ fn a_pickle_can_neither_nest_the_stack_away_nor_grow_without_end() {
 }
 
 #[test]
-fn safetensors_are_read_and_their_size_is_told() {
+fn safetensors_are_read_and_a_wrong_size_is_reported() {
     let whole = safetensors(&[("module.a", &[2, 2]), ("module.b", &[3])], ",\"__metadata__\":{\"k\":\"v\"}");
     let w = open_bytes(&whole).unwrap();
-    assert_eq!(told(&w), [("a", vec![2, 2], count(1, 4)), ("b", vec![3], count(1, 3))]);
+    assert_eq!(contents(&w), [("a", vec![2, 2], count(1, 4)), ("b", vec![3], count(1, 3))]);
     assert_eq!((w.format(), w.metadata()["k"].as_str()), (Format::Safetensors, "v"));
     // One name without the prefix: then it is none.
     let w = open_bytes(&safetensors(&[("module.a", &[1]), ("b", &[1])], "")).unwrap();

@@ -24,7 +24,7 @@ pub struct Missing {
 pub struct Extra {
     /// Its name.
     pub name: String,
-    /// What it is, such as `a tensor of F32, shape [2, 3]`.
+    /// Description, such as `a tensor of F32, shape [2, 3]`.
     pub what: String,
 }
 
@@ -33,13 +33,13 @@ pub struct Extra {
 pub struct Misshaped {
     /// Its name.
     pub name: String,
-    /// What it is.
+    /// Shape and type that were found.
     pub found: String,
     /// The shape that it should have.
     pub shape: Vec<usize>,
 }
 
-/// A tensor with numbers that are none.
+/// A tensor with NaN or infinite numbers.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct NotFinite {
     /// Its name.
@@ -50,7 +50,7 @@ pub struct NotFinite {
     pub infinite: u64,
 }
 
-/// What is right and wrong with weights; nothing that was found is left out.
+/// Result of checking weights, with every finding.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Report {
     /// The network that they are compared with: the one asked for, else the nearest.
@@ -59,7 +59,7 @@ pub struct Report {
     pub good: usize,
     /// Tensors that should be there and are not.
     pub missing: Vec<Missing>,
-    /// What is there and not of the network.
+    /// Tensors that the network does not have.
     pub extra: Vec<Extra>,
     /// Tensors of another shape or type.
     pub misshaped: Vec<Misshaped>,
@@ -87,7 +87,7 @@ impl Report {
         list(&mut text, "of another shape or type", self.misshaped.iter().map(misshaped));
         list(&mut text, "not of the network", self.extra.iter().map(|e| format!("{} ({})", e.name, e.what)));
         let numbers = |n: &NotFinite| format!("{}: {} NaN, {} infinite", n.name, n.nan, n.infinite);
-        list(&mut text, "with numbers that are none", self.not_finite.iter().map(numbers));
+        list(&mut text, "with NaN or infinite numbers", self.not_finite.iter().map(numbers));
         text
     }
 
@@ -176,7 +176,8 @@ fn examine_names(weights: &Weights, encoder: Option<Encoder>) -> Result<Report> 
     let nearest = nearest.filter(|report| report.good > 0);
     match (encoder, nearest) {
         (Some(encoder), Some(near)) if near.encoder != encoder && near.missing.is_empty() => {
-            let (path, has) = (weights.path().display(), near.encoder);
+            let path = weights.path().display();
+            let has = near.encoder;
             let message =
                 format!("{path}: has the weights of the encoder {has}, and {encoder} was asked for");
             Err(Error::new(ErrorKind::BadModel, message))
@@ -212,7 +213,8 @@ fn compare(weights: &Weights, encoder: Encoder) -> Report {
     let expected: BTreeMap<_, _> =
         encoder.architecture().tensors().into_iter().map(|t| (t.name, t.shape)).collect();
     for (name, shape) in &expected {
-        let (name, shape) = (name.clone(), shape.clone());
+        let name = name.clone();
+        let shape = shape.clone();
         let found = match (weights.entries().get(&name), weights.others().get(&name)) {
             (Some(entry), _) if entry.shape == shape => {
                 report.good += 1;

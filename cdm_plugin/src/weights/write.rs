@@ -50,7 +50,7 @@ pub(crate) fn write(
     tensors.iter().try_for_each(|tensor| fill(tensor, out))
 }
 
-/// What numbers are stored as in a copy. Engines compute with 32 bits at the most, and read those where they lie.
+/// Type of the numbers in a copy. Engines compute with 32 bits at the most, and read those where they lie.
 pub(crate) const fn kept_as(dtype: Dtype) -> Dtype {
     match dtype {
         Dtype::F64 => Dtype::F32,
@@ -61,7 +61,7 @@ pub(crate) const fn kept_as(dtype: Dtype) -> Dtype {
 /// Writes the tensors of `weights` that `keep` wants.
 ///
 /// # Errors
-/// Those of `out`, and `Interrupted` when `go_on` (which is told how many bytes were written) says no.
+/// Those of `out`, and `Interrupted` when `go_on` (which receives the number of bytes written) returns false.
 pub(crate) fn copy(
     out: &mut dyn Write,
     weights: &Weights,

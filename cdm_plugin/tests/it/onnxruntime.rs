@@ -35,8 +35,8 @@ fn run(network: &mut dyn Network, positions: &Positions, shape: NetShape, x: &[f
     y
 }
 
-/// A picture whose patches all differ.
-fn picture(shape: NetShape, seed: usize) -> Vec<f32> {
+/// An image whose patches all differ.
+fn image(shape: NetShape, seed: usize) -> Vec<f32> {
     let wave = |i: usize| ((i * 37 + seed * 101) % 1009) as f32 / 1009.0;
     let plane = shape.height * shape.width;
     (0..shape.input_len())
@@ -72,7 +72,7 @@ fn sizes_and_aspects_one_after_the_other() {
     let mut first = Vec::new();
     for (i, (height, width)) in shapes.into_iter().enumerate() {
         let shape = NetShape { batch: 1, height, width };
-        let y = run(&mut network, &positions, shape, &picture(shape, 1));
+        let y = run(&mut network, &positions, shape, &image(shape, 1));
         assert!(y.iter().all(|d| d.is_finite() && *d >= 0.0) && y.iter().any(|d| *d > 0.0));
         match i {
             0 | 1 => first.push(y),
@@ -83,18 +83,16 @@ fn sizes_and_aspects_one_after_the_other() {
 }
 
 #[test]
-fn pictures_of_a_batch_do_not_meet() {
+fn images_of_a_batch_do_not_meet() {
     let model = seeded_model(Encoder::Vits);
     let Some(mut network) = open(&model) else { return };
     let positions = Positions::read(&model.encoder.architecture(), &model.weights).unwrap();
     let one = NetShape { batch: 1, height: 42, width: 70 };
-    let (a, b) = (picture(one, 1), picture(one, 2));
+    let a = image(one, 1);
+    let b = image(one, 2);
     let alone = [run(&mut network, &positions, one, &a), run(&mut network, &positions, one, &b)].concat();
     let y = run(&mut network, &positions, NetShape { batch: 2, ..one }, &[a, b].concat());
-    assert!(
-        max_abs(&alone[..one.output_len()], &alone[one.output_len()..]) > 1e-3,
-        "the two pictures differ"
-    );
+    assert!(max_abs(&alone[..one.output_len()], &alone[one.output_len()..]) > 1e-3, "the two images differ");
     let difference = max_abs(&y, &alone);
     assert!(difference <= 2e-6, "{difference:e}");
 }
@@ -110,7 +108,7 @@ fn a_model_removed_while_in_use() {
     let Some(mut network) = open(&model) else { return };
     let positions = Positions::read(&model.encoder.architecture(), &model.weights).unwrap();
     let shape = NetShape { batch: 1, height: 28, width: 28 };
-    let x = picture(shape, 3);
+    let x = image(shape, 3);
     let before = run(&mut network, &positions, shape, &x);
     std::fs::remove_file(&copy).unwrap();
     drop(model);
@@ -123,7 +121,8 @@ fn what_does_not_fit_is_refused_and_the_network_goes_on() {
     let Some(mut network) = open(&model) else { return };
     let positions = Positions::read(&model.encoder.architecture(), &model.weights).unwrap();
     let shape = NetShape { batch: 1, height: 28, width: 28 };
-    let (x, mut y) = (picture(shape, 4), vec![0.0; shape.output_len()]);
+    let x = image(shape, 4);
+    let mut y = vec![0.0; shape.output_len()];
     let kind = |r: depthrig_cdm::Result<()>| r.unwrap_err().kind();
     assert_eq!(kind(network.run(&x, &mut y)), ErrorKind::BadInput, "not prepared");
     let embeddings = positions.at(shape);
@@ -208,7 +207,7 @@ fn openvino_at_several_sizes_and_with_16_bits() {
     let positions = Positions::read(&model.encoder.architecture(), &model.weights).unwrap();
     for (height, width) in [(14, 14), (28, 98), (112, 70), (154, 196), (518, 126)] {
         let shape = NetShape { batch: 1, height, width };
-        let x = picture(shape, 7);
+        let x = image(shape, 7);
         let expected = run(&mut reference, &positions, shape, &x);
         let difference = max_abs(&run(&mut exact, &positions, shape, &x), &expected);
         println!("openvino fp32 {height}x{width}: {difference:e}");
@@ -224,7 +223,8 @@ fn openvino_at_several_sizes_and_with_16_bits() {
     };
     for file in ["vits_252_d405.safetensors", "vits_308_lingbot0.safetensors"] {
         let tensors = Tensors::open(file);
-        let ((shape, x), (_, expected)) = (tensors.get("x"), tensors.get("y"));
+        let (shape, x) = tensors.get("x");
+        let (_, expected) = tensors.get("y");
         let y = run(&mut short, &positions, shape_of(&shape), &x);
         let deviation = mean_relative(&y, &expected);
         println!("{}: {file}: {:.3} % on average", short.describe(), 100.0 * deviation);

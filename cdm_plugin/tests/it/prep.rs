@@ -17,9 +17,9 @@ fn cases() -> [(Pair, &'static str, u32); 2] {
 fn the_network_sees_what_the_official_one_sees() {
     for (pair, file, input_size) in cases() {
         let (shape, expected) = Tensors::open(file).get("x");
-        let (width, height) = net_size((pair.width, pair.height), input_size).unwrap();
+        let (width, height) = net_size(pair.width, pair.height, input_size).unwrap();
         assert_eq!(shape, [1, 4, height, width]);
-        let mut prep = Prep::new((pair.width, pair.height), input_size, MAX_DEPTH_M).unwrap();
+        let mut prep = Prep::new(pair.width, pair.height, input_size, MAX_DEPTH_M).unwrap();
         let mut x = vec![f32::NAN; expected.len()];
         let any = prep.prepare(&pair.color(), &pair.depth(), ChannelOrder::Bgr, &mut x).unwrap();
         assert!(any);
@@ -38,7 +38,7 @@ fn the_way_back_is_the_official_one() {
         let (_, y) = tensors.get("y");
         let (shape, expected) = tensors.get("inv_full");
         assert_eq!(shape, [pair.height, pair.width]);
-        let mut prep = Prep::new((pair.width, pair.height), input_size, MAX_DEPTH_M).unwrap();
+        let mut prep = Prep::new(pair.width, pair.height, input_size, MAX_DEPTH_M).unwrap();
         let mut inverse = vec![f32::NAN; expected.len()];
         prep.finish(&y, &mut Output::Inverse(&mut inverse)).unwrap();
         assert!(inverse == expected, "{file}: the same to the bit");
@@ -53,12 +53,12 @@ fn the_way_back_is_the_official_one() {
     }
 }
 
-/// Blue-green-red pictures, padded rows and the other channel order give the same planes, in the order asked for.
+/// Blue-green-red images, padded rows and the other channel order give the same planes, in the order asked for.
 #[test]
 fn formats_strides_and_orders() {
     let pair = Pair::lingbot(0);
     let size = (pair.width, pair.height);
-    let mut prep = Prep::new(size, 252, MAX_DEPTH_M).unwrap();
+    let mut prep = Prep::new(size.0, size.1, 252, MAX_DEPTH_M).unwrap();
     let (w, h) = prep.net();
     let mut run = |color: &Color<'_>, order| {
         let mut x = vec![f32::NAN; 4 * w * h];

@@ -1,4 +1,4 @@
-//! Real pairs of pictures, the official code's numbers for them, and seeded weights.
+//! Real pairs of images, the official code's numbers for them, and seeded weights.
 
 use depthrig_cdm::{ChannelOrder, Color, ColorFormat, Encoder, Model, RawDepth, Weights};
 use safetensors::SafeTensors;
@@ -38,7 +38,8 @@ impl Pair {
         let color = open(color).into_rgb8();
         let depth = open(depth).into_luma16();
         assert_eq!(color.dimensions(), depth.dimensions());
-        let (width, height) = (color.width() as usize, color.height() as usize);
+        let width = color.width() as usize;
+        let height = color.height() as usize;
         Self { color: color.into_raw(), depth: depth.into_raw(), unit_m, width, height }
     }
 

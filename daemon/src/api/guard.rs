@@ -1,4 +1,4 @@
-//! What keeps web pages and other strangers out.
+//! Request checks that keep web pages and other strangers out.
 
 use super::reply::Refusal;
 use axum::extract::Request;
@@ -17,7 +17,7 @@ pub(super) async fn loopback_host(request: Request, next: Next) -> Response {
         return next.run(request).await;
     }
     let host = host.unwrap_or_default();
-    let message = format!("Host \"{host}\" is no loopback name; use localhost, 127.0.0.1 or [::1]");
+    let message = format!("Host \"{host}\" is not a loopback name; use localhost, 127.0.0.1 or [::1]");
     Refusal::new(StatusCode::FORBIDDEN, message).into_response()
 }
 

@@ -1,7 +1,7 @@
 //! Time limits of a connection: a client that stops half way holds nothing for long.
 //!
-//! hyper limits the time for a request's head. The body is read here, whole, before the call sees it; what a client does
-//! not read of an answer is limited in [`Limited`].
+//! hyper limits the time for a request's head. The body is read here in full before the call sees it; an
+//! answer that the client does not read is limited in [`Limited`].
 
 use super::MAX_BODY_BYTES;
 use super::reply::Refusal;
@@ -22,7 +22,7 @@ use tokio::time::Sleep;
 pub(super) const HEAD_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a client may take to send the body of a request.
 const BODY_TIMEOUT: Duration = Duration::from_secs(5);
-/// How long a client may take to read what is sent.
+/// How long a client may take to read an answer.
 pub(super) const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Reads the body within its limits of time and size.
@@ -43,8 +43,8 @@ pub(super) async fn whole_body(request: Request, next: Next) -> Response {
     refusal.into_response()
 }
 
-/// A stream whose peer must take what is written in time: the clock runs from the first byte that it does not take until
-/// it has taken all.
+/// A stream whose peer must read in time: the clock runs from the first byte that it does not take until it has taken
+/// all.
 pub(super) struct Limited<S> {
     stream: S,
     timeout: Duration,

@@ -1,4 +1,4 @@
-//! Errors as the API tells them: a fitting HTTP status and `{"error": {"kind", "message"}}`.
+//! Errors as the API returns them: a fitting HTTP status and `{"error": {"kind", "message"}}`.
 
 use crate::{Error, ErrorKind};
 use axum::Json;
@@ -18,7 +18,7 @@ const KINDS: [(ErrorKind, &str, StatusCode); 8] = [
     (ErrorKind::Other, "other", StatusCode::INTERNAL_SERVER_ERROR),
 ];
 
-/// The body of an answer that is no success.
+/// The body of an error answer.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct ErrorBody {
     pub(crate) error: ErrorDetail,
@@ -35,7 +35,7 @@ pub(crate) fn kind_of_name(name: &str) -> ErrorKind {
     KINDS.iter().find(|(_, n, _)| *n == name).map_or(ErrorKind::Other, |(kind, ..)| *kind)
 }
 
-/// An answer that is no success.
+/// An error answer.
 #[derive(Debug)]
 pub(super) struct Refusal {
     status: StatusCode,
@@ -44,7 +44,7 @@ pub(super) struct Refusal {
 }
 
 impl Refusal {
-    /// What the request itself did wrong.
+    /// A request that is itself wrong.
     pub(super) fn new(status: StatusCode, message: impl Into<String>) -> Self {
         let named = KINDS.iter().find(|(_, _, s)| *s == status);
         let kind = named.map_or("bad_input", |(_, name, _)| name);

@@ -58,7 +58,7 @@ pub const ROUTES: [Route; 17] = [
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NoteRequest {
-    /// What to note.
+    /// The text to note.
     pub text: String,
 }
 
@@ -137,7 +137,7 @@ pub(super) fn router(control: Rig) -> Router {
         .layer(middleware::from_fn(name_server))
 }
 
-/// Says in every answer which version made it, so that a client of another one can say so.
+/// Names the version in every answer, so that a client of another version can report it.
 async fn name_server(request: Request, next: Next) -> Response {
     let mut response = next.run(request).await;
     let name = HeaderValue::from_static(concat!("depthrig/", env!("CARGO_PKG_VERSION")));
@@ -225,7 +225,7 @@ async fn of_replay(
 ) -> Answer<Json<ReplayStatus>> {
     let on_replay = move |rig: &dyn Control| {
         let none = || {
-            let why = "this rig has cameras and is no replay; start one with: depthrig replay DATASET";
+            let why = "this rig has cameras and is not a replay; start one with: depthrig replay DATASET";
             Error::new(ErrorKind::WrongState, why)
         };
         what(rig.replay().ok_or_else(none)?)

@@ -19,7 +19,7 @@ use tokio::net::{TcpListener, UnixListener};
 use tokio::sync::{Semaphore, watch};
 
 /// How long requests that are under way when the service ends get.
-const STOP_PATIENCE: Duration = Duration::from_millis(300);
+const STOP_TIMEOUT: Duration = Duration::from_millis(300);
 /// The pause after a connection could not be accepted, which is when the process is out of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// Threads for calls of `Control`.
@@ -126,7 +126,7 @@ async fn run(
         let _ = places.acquire_many(MAX_CONNECTIONS as u32).await;
         let _ = port_places.acquire_many(MAX_CONNECTIONS as u32).await;
     };
-    if tokio::time::timeout(STOP_PATIENCE, all).await.is_err() {
+    if tokio::time::timeout(STOP_TIMEOUT, all).await.is_err() {
         tracing::debug!("requests under way were cut off because the rig ends");
     }
 }
@@ -156,7 +156,8 @@ impl Acceptor {
                 tokio::time::sleep(ACCEPT_PAUSE).await;
                 continue;
             };
-            let (router, stopped) = (self.router.clone(), self.stopped.clone());
+            let router = self.router.clone();
+            let stopped = self.stopped.clone();
             tokio::spawn(async move {
                 converse(stream, router, stopped).await;
                 drop(place);

@@ -29,7 +29,7 @@ pub(super) fn bind_unix(path: &Path) -> Result<(UnixListener, SocketFile)> {
         Error::new(kind, format!("control socket {}: {what}: {e}", path.display())).with_source(e)
     };
     // Between these two calls the folder's mode (0700) is what keeps others out.
-    let listener = UnixListener::bind(path).map_err(|e| failed("it cannot be made", e))?;
+    let listener = UnixListener::bind(path).map_err(|e| failed("it cannot be created", e))?;
     rustix::fs::chmod(path, Mode::RUSR | Mode::WUSR)
         .map_err(|e| failed("its mode cannot be set", e.into()))?;
     let stat = rustix::fs::lstat(path).map_err(|e| failed("it cannot be read", e.into()))?;
@@ -43,7 +43,7 @@ fn make_way(path: &Path) -> Result<()> {
     let Ok(stat) = rustix::fs::lstat(path) else { return Ok(()) };
     if FileType::from_raw_mode(stat.st_mode) != FileType::Socket {
         let message =
-            format!("control socket {shown}: a file that is no socket is in the way; move it elsewhere");
+            format!("control socket {shown}: a file that is not a socket is in the way; move it elsewhere");
         return Err(Error::new(ErrorKind::InUse, message));
     }
     if UnixStream::connect(path).is_ok() {

@@ -16,10 +16,10 @@ use depthrig_drivers::{Backend, Device, DeviceInfo, Result, StreamProfile};
 use rustix::fs::Access;
 use std::path::Path;
 
-/// What is learned of a node by asking the kernel.
+/// Facts about a video node, asked of the kernel.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NodeFacts {
-    /// `pictures`, `metadata` or `other`.
+    /// `images`, `metadata` or `other`.
     pub role: &'static str,
     /// Its formats as V4L2 names them.
     pub formats: Vec<String>,
@@ -36,7 +36,7 @@ pub struct Served {
     pub place: Place,
     /// The process, as it described itself.
     pub holder: String,
-    /// What it offers.
+    /// The device and the streams that it offers.
     pub offered: Result<(DeviceInfo, Vec<StreamProfile>)>,
 }
 
@@ -48,8 +48,8 @@ pub trait Ask {
     /// Those of opening it.
     fn node(&self, path: &Path) -> Result<NodeFacts>;
 
-    /// Opens the camera at a port, which nobody has, and asks what it is and can. `None` when there is no driver for
-    /// its family.
+    /// Opens the camera at a port, which nobody has, and asks for its description and modes. `None` without a
+    /// driver for its family.
     fn device(&self, family: Family, port: &str) -> Option<Result<(DeviceInfo, Vec<StreamProfile>)>>;
 
     /// The cameras that other processes serve now, and what these say of them.
@@ -91,7 +91,7 @@ impl Ask for System {
         let node = Node::open(path)?;
         let c = node.capability();
         let role = match (c.is_capture(), c.is_metadata()) {
-            (true, _) => "pictures",
+            (true, _) => "images",
             (false, true) => "metadata",
             (false, false) => "other",
         };
@@ -124,8 +124,8 @@ impl Ask for System {
             // The one is driven by another process, the other is at no port; see `served`.
             Family::Oak | Family::External => return None,
         };
-        let told = |device: Box<dyn Device>| (device.info().clone(), device.profiles().to_vec());
-        Some(backend.open(None).map(told))
+        let facts = |device: Box<dyn Device>| (device.info().clone(), device.profiles().to_vec());
+        Some(backend.open(None).map(facts))
     }
 
     fn served(&self) -> Vec<Served> {
@@ -143,7 +143,8 @@ impl Ask for System {
 
     fn rigs(&self) -> (Vec<RigStatus>, Vec<String>) {
         let Some(runtime) = &self.runtime else { return (Vec::new(), Vec::new()) };
-        let (mut rigs, mut silent) = (Vec::new(), Vec::new());
+        let mut rigs = Vec::new();
+        let mut silent = Vec::new();
         for rig in runtime.running_rigs() {
             match Client::connect(runtime, Some(&rig)).and_then(|c| c.status()) {
                 Ok(status) => rigs.push(status),

@@ -20,7 +20,7 @@ const MOVIDIUS: u16 = 0x03e7;
 const OAK_UNBOOTED: u16 = 0x2485;
 const OAK_BOOTED: [u16; 3] = [0xf63b, 0xf63c, 0xf63d];
 
-/// A family of cameras: what is common to how they are driven.
+/// A family of cameras that are driven alike.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Family {
     /// RealSense D400.
@@ -37,7 +37,7 @@ pub enum Family {
     Platform,
     /// OAK, which another process drives.
     Oak,
-    /// What another process serves.
+    /// A camera that another process serves.
     External,
 }
 
@@ -63,13 +63,13 @@ pub(super) struct Candidate {
     pub(super) usb: Option<UsbDevice>,
     pub(super) nodes: Vec<VideoNode>,
     pub(super) hidraw: Vec<PathBuf>,
-    /// The serial number as rig files have it, where the bus already tells it.
+    /// The serial number as rig files have it, where the bus already shows it.
     pub(super) serial: Option<String>,
-    /// What is wrong with how it is attached.
+    /// The problem with how it is attached.
     pub(super) problem: Option<String>,
 }
 
-/// The cameras among `devices` and `platform` nodes, each with where it is, and what is attached and of no use.
+/// The cameras among `devices` and `platform` nodes, each with its port, and attached devices that are unusable.
 pub(super) fn cameras(
     devices: &[UsbDevice],
     platform: impl Iterator<Item = (String, VideoNode)>,
@@ -119,7 +119,7 @@ pub(super) fn cameras(
     (cameras, unusable)
 }
 
-fn kinect_camera(found: &kinect::Found) -> Candidate {
+fn kinect_camera(found: &kinect::FoundCamera) -> Candidate {
     let color = found.color.as_ref();
     Candidate {
         family: Family::Kinect,
@@ -137,7 +137,7 @@ fn kinect_camera(found: &kinect::Found) -> Candidate {
     }
 }
 
-/// The family of a device with its model; `None` when it is no camera, an error when it is one of no use.
+/// The family of a device with its model; `None` when it is not a camera, an error when it is an unusable one.
 fn family(d: &UsbDevice) -> Result<Option<(Family, String)>, &'static str> {
     if d.vendor_id == d400::VENDOR {
         if let Some(model) = d400::of_product(d.product_id) {

@@ -4,7 +4,7 @@ use super::{Camera, Shared};
 use crate::Result;
 use crate::config::BackendConfig;
 use crate::sink::BusSink;
-use crate::stage::Lane;
+use crate::stage::{Readers, Refinement, Setup};
 use crate::stream::Stream;
 use depthrig_bus::{FrameHeader, StreamId, StreamName, shm};
 use depthrig_calib::PoseExt;
@@ -13,7 +13,7 @@ use depthrig_drivers::stereo::StereoOptions;
 use depthrig_drivers::{Backend, DeviceInfo, ErrorKind as DriverErrorKind, StreamProfile, StreamRequest};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// A camera's driver, made at the first opening and kept for the later ones.
+/// A camera's driver, created at the first opening and kept for the later ones.
 pub(super) type SharedBackend = Arc<Mutex<Option<Box<dyn Backend>>>>;
 
 /// Opens the device and its channels; runs on the camera's own thread.
@@ -42,7 +42,7 @@ pub(super) fn open_session(
     let mut ports = Vec::new();
     for s in streams {
         let mut header = FrameHeader::default();
-        header.set_picture(s.profile.format, s.profile.width, s.profile.height);
+        header.set_image(s.profile.format, s.profile.width, s.profile.height);
         header.set_names(shared.bus.rig().as_str(), &s.id);
         header.set_device(&info.model, &info.serial);
         header.depth_unit_m = s.profile.depth_unit_m;
@@ -58,14 +58,14 @@ pub(super) fn open_session(
         })?;
         ports.push((s, publisher, header));
     }
-    open_lane(camera, shared, &info).map_err(|e| {
+    open_refinement(camera, shared, &info).map_err(|e| {
         in_camera(depthrig_drivers::Error::new(DriverErrorKind::Io, e.to_string()).with_source(e))
     })?;
     Ok(Session { info, stream, sink: Box::new(BusSink::new(ports, Arc::clone(&shared.frames))) })
 }
 
-/// What is asked of the device: what the rig lists. Without a list it is every stream, at later openings but for a motion
-/// unit that was not there at the first: its stream would be one that nobody knows of.
+/// The streams to request of the device: those that the rig lists. Without a list it is every stream, at later openings
+/// except an IMU that was not there at the first: its stream would be one that nobody knows of.
 fn requests(camera: &Camera, offered: &[StreamProfile]) -> Vec<StreamRequest> {
     let state = camera.state();
     let known = |name: &StreamName| state.streams.iter().any(|s| s.id.stream == *name);
@@ -76,35 +76,40 @@ fn requests(camera: &Camera, offered: &[StreamProfile]) -> Vec<StreamRequest> {
     camera.config.streams.clone()
 }
 
-/// Opens the way from the camera's streams to those that are made of them, at its first opening. All of it is there
+/// Connects the camera's streams with those computed from them, at its first opening. All of it is there
 /// before the first frame, so that no publisher waits for a subscriber that is half made.
-fn open_lane(camera: &Camera, shared: &Shared, info: &DeviceInfo) -> Result<()> {
+fn open_refinement(camera: &Camera, shared: &Shared, info: &DeviceInfo) -> Result<()> {
     let Some(config) = &camera.config.refine else { return Ok(()) };
-    let (streams, made, begun) = {
-        let state = camera.state();
-        (state.streams.clone(), state.made.clone(), state.lane.is_some())
-    };
+    let state = camera.state();
+    let streams = state.streams.clone();
+    let derived = state.derived.clone();
+    let begun = state.refinement.is_some();
+    drop(state);
     let find = |name: &str| streams.iter().find(|s| s.id.stream.as_str() == name);
     let (Some(color), Some(depth)) = (find("color"), find(&config.depth)) else { return Ok(()) };
-    let [refined, aligned @ ..] = made.as_slice() else { return Ok(()) };
+    let [refined, aligned @ ..] = derived.as_slice() else { return Ok(()) };
     if begun {
         return Ok(());
     }
-    for stream in &made {
+    for stream in &derived {
         publisher_of(shared, stream)?;
     }
-    let readers = (shared.bus.subscriber(&color.id)?, shared.bus.subscriber(&depth.id)?);
+    let readers =
+        Readers { color: shared.bus.subscriber(&color.id)?, depth: shared.bus.subscriber(&depth.id)? };
     let color_ns = color.profile.period_ns() as i64;
-    let lane = Arc::new(Lane::new(
-        (camera.config.name.clone(), info.model.clone()),
-        config.clone(),
-        (Arc::clone(refined), aligned.first().cloned()),
-        (color_ns, depth.profile.period_ns() as i64),
-        color_ns / 2 + 1_000_000,
+    let refinement = Arc::new(Refinement::new(Setup {
+        camera: camera.config.name.clone(),
+        device_model: info.model.clone(),
+        config: config.clone(),
+        refined: Arc::clone(refined),
+        aligned: aligned.first().cloned(),
+        color_ns,
+        frame_ns: depth.profile.period_ns() as i64,
+        tolerance_ns: color_ns / 2 + 1_000_000,
         readers,
-    ));
-    camera.state().lane = Some(Arc::clone(&lane));
-    shared.stage.enter(lane);
+    }));
+    camera.state().refinement = Some(Arc::clone(&refinement));
+    shared.stage.add(refinement);
     Ok(())
 }
 
@@ -119,7 +124,7 @@ fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, de
         stereo::StereoBackend,
         synthetic::SyntheticBackend,
         v4l2::V4l2Backend,
-        zed::{ZedBackend, replay::ReplayBackend},
+        zed::{ZedBackend, replay::ZedPlaybackBackend},
     };
     let backend: Box<dyn Backend> = match &camera.config.backend {
         // One beginning for all cameras of the rig, or each would see the world at another moment.
@@ -131,9 +136,10 @@ fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, de
         BackendConfig::Realsense(c) => Box::new(RealsenseBackend::new(c.clone())),
         BackendConfig::V4l2(c) => Box::new(V4l2Backend::new(c.clone())),
         BackendConfig::Zed(c) => Box::new(ZedBackend::new(c.clone())),
-        BackendConfig::ZedReplay(c) => Box::new(ReplayBackend::new(c.clone())),
+        BackendConfig::ZedReplay(c) => Box::new(ZedPlaybackBackend::new(c.clone())),
         BackendConfig::External(c) => {
-            let (runtime, rig) = (shared.bus.runtime().clone(), shared.bus.rig().clone());
+            let runtime = shared.bus.runtime().clone();
+            let rig = shared.bus.rig().clone();
             let place = Place { runtime, rig, camera: camera.config.name.clone() };
             Box::new(ExternalBackend::new(c.clone(), place))
         }
@@ -177,10 +183,10 @@ fn adopt(
     let mut state = camera.state();
     state.info = Some(info.clone());
     if state.streams.is_empty() {
-        let made = camera.config.makes(profiles).map_err(|e| {
+        let derived = camera.config.derived_profiles(profiles).map_err(|e| {
             depthrig_drivers::Error::new(DriverErrorKind::BadInput, e.to_string()).with_source(e)
         })?;
-        let all = profiles.iter().chain(made.iter().map(|(p, _)| p));
+        let all = profiles.iter().chain(derived.iter().map(|(p, _)| p));
         state.set_bytes = all.map(|p| p.frame_bytes() as u64).sum();
         let slots = shm::slots_that_fit(shared.slots, state.set_bytes, shared.memory_share);
         state.short_of_memory = slots.is_err();
@@ -192,10 +198,10 @@ fn adopt(
             Arc::new(Stream::new(id, p.clone(), record, slots))
         };
         state.streams = profiles.iter().map(|p| stream(p, camera.config.records(&p.stream))).collect();
-        state.made = made.iter().map(|(p, record)| stream(p, *record)).collect();
+        state.derived = derived.iter().map(|(p, record)| stream(p, *record)).collect();
         return Ok(state.streams.clone());
     }
-    // A motion unit that did not come back with its camera is silent; its pictures matter more.
+    // An IMU that did not come back with its camera is silent; its images matter more.
     let is_back =
         |s: &&Arc<Stream>| !s.profile.format.is_motion() || profiles.iter().any(|p| p.stream == s.id.stream);
     let back: Vec<_> = state.streams.iter().filter(is_back).cloned().collect();

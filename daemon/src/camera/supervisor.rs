@@ -22,7 +22,7 @@ use depthrig_drivers::capture::{Capture, End, StopOutcome};
 use std::sync::Arc;
 
 /// How long an opening may take before its thread is given up for hung.
-const OPEN_PATIENCE: Duration = Duration::from_secs(15);
+const OPEN_TIMEOUT: Duration = Duration::from_secs(15);
 /// How long a recording may be silent that waits for its modes.
 const WAITS_FOR_MODES: Duration = Duration::from_mins(1);
 /// A supervisor that steps so late after its last step did not run meanwhile, and neither did the cameras' threads: the process
@@ -73,7 +73,7 @@ impl Supervisor {
         }
     }
 
-    /// Looks at the camera and does what is due. Never blocks on the device.
+    /// Looks at the camera and takes the steps that are due. Never blocks on the device.
     pub fn step(&mut self, now: HostTime) {
         let name = self.camera.config.name.clone();
         // Noted at every step, also while the camera is away, which is no sign of a supervisor that did not run.
@@ -105,7 +105,7 @@ impl Supervisor {
             // Not a frame yet: opening, or open and silent.
             let open = !self.camera.state().streams.is_empty();
             let silence = Duration::from_nanos(now.since_ns(self.opened_at).max(0) as u64);
-            if heartbeat_age > open_patience(&self.camera.config.backend) {
+            if heartbeat_age > open_timeout(&self.camera.config.backend) {
                 self.give_up(now, "the device did not come back from being opened");
             } else if open && silence > stall * STALLS_UNTIL_RESTART && heartbeat_age < stall {
                 self.restart(now, &format!("open, but not one frame in {:.1} s", silence.as_secs_f64()));
@@ -156,10 +156,10 @@ impl Supervisor {
         }
     }
 
-    /// Ends the camera thread, waiting for at most `patience`.
-    pub fn stop(&mut self, patience: Duration) {
+    /// Ends the camera thread, waiting for at most `timeout`.
+    pub fn stop(&mut self, timeout: Duration) {
         let name = self.camera.config.name.clone();
-        if self.end_capture(patience) {
+        if self.end_capture(timeout) {
             tracing::warn!(camera = %name, "the device hangs; its thread is left behind");
         }
         let mut state = self.camera.state();
@@ -175,8 +175,8 @@ impl Supervisor {
         self.heard.resize(state.streams.len(), unheard);
         let mut longest = None;
         for (stream, heard) in state.streams.iter().zip(&mut self.heard) {
-            // How long matching takes says nothing of the device. A motion unit that is silent alone is told of in the
-            // status: to open the camera again would cost its pictures, which matter more.
+            // How long matching takes says nothing of the device. An IMU that is silent alone is reported in the
+            // status: to open the camera again would cost its images, which matter more.
             if self.camera.config.joins_late(&stream.id.stream) || stream.profile.format.is_motion() {
                 continue;
             }
@@ -199,8 +199,8 @@ impl Supervisor {
             return WAITS_FOR_MODES;
         }
         let state = self.camera.state();
-        let pictures = state.streams.iter().filter(|s| !s.profile.format.is_motion());
-        let slowest = pictures.map(|s| s.profile.period_ns()).max().unwrap_or(0);
+        let images = state.streams.iter().filter(|s| !s.profile.format.is_motion());
+        let slowest = images.map(|s| s.profile.period_ns()).max().unwrap_or(0);
         Duration::from_secs_f64(self.shared.supervisor.stall_s).max(Duration::from_nanos(3 * slowest))
     }
 
@@ -262,9 +262,9 @@ impl Supervisor {
     }
 
     /// Ends the camera thread if there is one; whether it had to be left behind.
-    fn end_capture(&mut self, patience: Duration) -> bool {
+    fn end_capture(&mut self, timeout: Duration) -> bool {
         let abandoned =
-            self.capture.take().is_some_and(|c| matches!(c.stop(patience), StopOutcome::Abandoned));
+            self.capture.take().is_some_and(|c| matches!(c.stop(timeout), StopOutcome::Abandoned));
         if abandoned {
             for stream in &self.camera.state().streams {
                 stream.books().close();
@@ -275,7 +275,8 @@ impl Supervisor {
 
     fn open(&mut self, now: HostTime) {
         self.opened_at = now;
-        let (camera, shared) = (Arc::clone(&self.camera), Arc::clone(&self.shared));
+        let camera = Arc::clone(&self.camera);
+        let shared = Arc::clone(&self.shared);
         let backend = Arc::clone(&self.backend);
         let opening = Capture::spawn(self.camera.config.name.as_str(), move || {
             // Ordinary until it streams: opening is work, and must not keep other cameras' threads from theirs.
@@ -294,9 +295,9 @@ impl Supervisor {
 
 /// How long opening this camera may take. The driver of another process's camera waits for the process, for its first
 /// message and for its first frame, each with a limit of its own that the rig file sets.
-fn open_patience(backend: &BackendConfig) -> Duration {
+fn open_timeout(backend: &BackendConfig) -> Duration {
     match backend {
-        BackendConfig::External(c) => OPEN_PATIENCE + c.start_timeout * 2 + c.heartbeat_timeout,
-        _ => OPEN_PATIENCE,
+        BackendConfig::External(c) => OPEN_TIMEOUT + c.start_timeout * 2 + c.heartbeat_timeout,
+        _ => OPEN_TIMEOUT,
     }
 }

@@ -20,7 +20,7 @@ pub(super) struct Connector {
     runtime: tokio::runtime::Runtime,
 }
 
-/// What came back.
+/// The answer of the daemon.
 #[derive(Debug)]
 pub(super) struct Answer {
     pub(super) status: u16,
@@ -32,7 +32,7 @@ pub(super) struct Answer {
 /// Why nothing came back.
 #[derive(Debug)]
 pub(super) enum Failure {
-    /// There is no socket.
+    /// The socket does not exist.
     Absent(io::Error),
     /// There is a socket and nobody behind it.
     Refused(io::Error),
@@ -48,7 +48,7 @@ impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Absent(e) | Self::Refused(e) | Self::Denied(e) => e.fmt(f),
-            Self::Silent(patience) => write!(f, "no answer within {} s", patience.as_secs()),
+            Self::Silent(timeout) => write!(f, "no answer within {} s", timeout.as_secs()),
             Self::Broken(e) => e.fmt(f),
         }
     }
@@ -74,11 +74,11 @@ impl Connector {
         method: &str,
         path: &str,
         body: Option<Vec<u8>>,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Answer, Failure> {
         self.runtime.block_on(async {
-            let exchange = tokio::time::timeout(patience, self.exchange(method, path, body)).await;
-            exchange.unwrap_or(Err(Failure::Silent(patience)))
+            let exchange = tokio::time::timeout(timeout, self.exchange(method, path, body)).await;
+            exchange.unwrap_or(Err(Failure::Silent(timeout)))
         })
     }
 

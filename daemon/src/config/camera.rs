@@ -1,6 +1,6 @@
-//! From a `[[camera]]` table to [`CameraConfig`]: what all drivers share, and the `files` driver.
+//! From a `[[camera]]` table to [`CameraConfig`]: the keys that all drivers share, and the `files` driver.
 
-use super::read::{Found, Section};
+use super::read::{Located, Section};
 use super::value::{not_empty, rate, resolve};
 use super::wanted::WantedStream;
 use super::{
@@ -23,10 +23,10 @@ enum Driver {
     Kinect,
 }
 
-/// Reads one camera; `None` after a problem without which there is no camera. `taken` are the names so far.
+/// Reads one camera; `None` after a problem that leaves nothing to build on. `taken` are the names so far.
 pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraName>) -> Option<CameraConfig> {
     let name = s.required::<CameraName>("name", "\"d435\"");
-    if let Some(Found { value: name, at }) = &name {
+    if let Some(Located { value: name, at }) = &name {
         s.set_name(name.as_str());
         if taken.contains(name) {
             s.problem(
@@ -53,9 +53,9 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
     let pose = pose(&s);
     let wanted = streams(&s);
     let streams: Vec<_> = wanted.iter().map(|w| w.request.clone()).collect();
-    // Those that may have a left and a right eye.
-    let has_eyes = matches!(driver, Some(Driver::Zed | Driver::External));
-    let stereo = if has_eyes { stereo::read(&s, base) } else { None };
+    // Backends that may have left and right images.
+    let has_stereo = matches!(driver, Some(Driver::Zed | Driver::External));
+    let stereo = if has_stereo { stereo::read(&s, base) } else { None };
     let depth = stereo.as_ref().map_or_else(|| "depth".to_owned(), StereoConfig::first_depth);
     let refine = refine::read(&s, base, &wanted, &depth);
     let record = record(&s, &streams, refine.is_some());
@@ -99,7 +99,7 @@ pub(super) fn fastest_rate_hz(camera: &CameraConfig) -> Option<f64> {
     }
 }
 
-/// The highest rate of `streams` if each of them says one: what a camera does otherwise, it alone knows.
+/// The highest rate of `streams` if each of them names one: otherwise only the camera knows it.
 fn fastest_given_rate(streams: &[StreamRequest]) -> Option<f64> {
     let rates = streams.iter().map(|s| s.rate_hz).collect::<Option<Vec<_>>>()?;
     rates.into_iter().reduce(f64::max)
@@ -147,7 +147,7 @@ fn streams(camera: &Section<'_, '_>) -> Vec<WantedStream> {
     let mut wanted: Vec<WantedStream> = Vec::new();
     for mut s in camera.tables("stream", "[[camera.stream]]").unwrap_or_default() {
         let name = s.required::<StreamName>("name", "\"depth\"");
-        if let Some(Found { value, at }) = &name {
+        if let Some(Located { value, at }) = &name {
             s.set_name(value.as_str());
             if wanted.iter().any(|w| w.request.stream == *value) {
                 s.problem(*at, format!("stream \"{value}\" is listed twice; keep one"));
@@ -177,14 +177,14 @@ fn streams(camera: &Section<'_, '_>) -> Vec<WantedStream> {
 }
 
 fn record(camera: &Section<'_, '_>, streams: &[StreamRequest], refined: bool) -> Option<Vec<StreamName>> {
-    let Found { value, at } = camera.get::<Vec<Name>>("record")?;
-    let made = |r: &Name| refine::MADE.contains(&r.as_str());
-    if let Some(name) = value.iter().find(|r| made(r) && !refined) {
+    let Located { value, at } = camera.get::<Vec<Name>>("record")?;
+    let computed = |r: &Name| refine::COMPUTED.contains(&r.as_str());
+    if let Some(name) = value.iter().find(|r| computed(r) && !refined) {
         let why = format!("names \"{name}\", which only a camera with {} has", refine::TABLE);
         camera.problem(at, format!("{} {why}", camera.key_of("record")));
     }
     let unknown =
-        value.iter().find(|r| !streams.is_empty() && !made(r) && streams.iter().all(|s| s.stream != **r));
+        value.iter().find(|r| !streams.is_empty() && !computed(r) && streams.iter().all(|s| s.stream != **r));
     if let Some(name) = unknown {
         let why = format!("names \"{name}\", which is not among the streams of its [[camera.stream]] tables");
         camera.problem(at, format!("{} {why}", camera.key_of("record")));
@@ -193,7 +193,7 @@ fn record(camera: &Section<'_, '_>, streams: &[StreamRequest], refined: bool) ->
 }
 
 fn files(s: &Section<'_, '_>, base: &Path) -> Option<FilesSettings> {
-    let manifest = s.required::<PathBuf>("manifest", "\"pictures/camera.toml\"");
+    let manifest = s.required::<PathBuf>("manifest", "\"images/camera.toml\"");
     if let Some(Err(why)) = manifest.as_ref().map(|m| not_empty(&m.value)) {
         s.problem(manifest.as_ref()?.at, format!("{} {why}", s.key_of("manifest")));
     }

@@ -1,4 +1,4 @@
-//! What is wrong with a configuration: every problem with its place, in the order of the file.
+//! Problems of a configuration, each with its place, in the order of the file.
 
 use crate::{Error, ErrorKind};
 use core::fmt;
@@ -11,7 +11,7 @@ pub struct Problem {
     pub line: usize,
     /// Character of that line, from 1.
     pub column: usize,
-    /// What is wrong, and what to write instead.
+    /// The problem, and how to correct it.
     pub message: String,
 }
 
@@ -38,7 +38,7 @@ impl ConfigError {
         &self.problems
     }
 
-    /// What to do about it, for callers that decide on it.
+    /// The kind, for callers that decide on it.
     pub fn kind(&self) -> ErrorKind {
         match self.unreadable.as_ref().map(std::io::Error::kind) {
             Some(std::io::ErrorKind::NotFound) => ErrorKind::NotFound,
@@ -58,7 +58,7 @@ impl fmt::Display for ConfigError {
                 }
                 std::io::ErrorKind::PermissionDenied => "you may not read it",
                 std::io::ErrorKind::IsADirectory => "it is a folder; name the TOML file in it",
-                std::io::ErrorKind::InvalidData => "it is no text (a rig configuration is a TOML file)",
+                std::io::ErrorKind::InvalidData => "it is not text (a rig configuration is a TOML file)",
                 _ => return write!(f, "{}: cannot be read: {e}", self.file),
             };
             return write!(f, "{}: {what}", self.file);

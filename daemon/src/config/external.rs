@@ -1,4 +1,4 @@
-//! The keys of an `external` camera. What the process offers is checked when it is heard.
+//! The keys of an `external` camera. The streams of the process are checked when it offers them.
 
 use super::ExternalSettings;
 use super::read::Section;
@@ -6,7 +6,7 @@ use super::value::{not_empty, resolve, shown};
 use core::time::Duration;
 use std::path::{Path, PathBuf};
 
-/// The longest that a process may be waited for, seconds: what boots longer is better started before the rig.
+/// The longest that a process may be waited for, seconds: one that boots longer is better started before the rig.
 const LONGEST_START_S: f64 = 120.0;
 /// The longest silence, seconds: a process that hangs keeps its camera from the rig for so long.
 const LONGEST_SILENCE_S: f64 = 14.0;

@@ -1,5 +1,5 @@
-//! The keys of a `kinect` camera. What the camera itself decides (the range of its controls, its jacks) is checked when it
-//! is started.
+//! The keys of a `kinect` camera. Limits that only the camera knows (the range of its controls, its jacks) are checked
+//! when it is started.
 
 use super::KinectSettings;
 use super::controls;
@@ -12,7 +12,7 @@ use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackConfig};
 use depthrig_drivers::kinect::{DepthMode, WiredSync};
 use std::path::{Path, PathBuf};
 
-/// The longest period of pictures, microseconds; at a faster rate the camera is refused when it is started.
+/// The longest period of images, microseconds; at a faster rate the camera is refused when it is started.
 const LONGEST_PERIOD_US: i32 = 200_000;
 
 /// How fast a recording may play, seconds of it per second.

@@ -42,7 +42,7 @@ pub(super) fn read(s: &Section<'_, '_>, streams: &[WantedStream]) -> L515Setting
     settings
 }
 
-/// What is started when the file names no stream.
+/// The streams that are started when the file names none.
 pub(super) fn default_streams() -> Vec<StreamRequest> {
     super::realsense::default_streams()
 }

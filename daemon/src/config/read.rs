@@ -6,12 +6,12 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 use toml::de::{DeTable, DeValue};
 
-/// What is gathered while a text is read.
+/// Problems and known keys, gathered while a text is read.
 pub(super) struct Report<'t> {
     text: &'t str,
     problems: RefCell<Vec<Problem>>,
     unknown: RefCell<Vec<Unknown>>,
-    /// Every key that was asked for, as (table, key): what the configuration knows.
+    /// Every key that was asked for, as (table, key): the keys that the configuration knows.
     asked: RefCell<BTreeSet<(&'static str, &'static str)>>,
 }
 
@@ -76,7 +76,7 @@ pub(super) fn nearest<'c>(word: &str, candidates: impl Iterator<Item = &'c str>)
 }
 
 /// A value and where it stands, in bytes.
-pub(super) struct Found<T> {
+pub(super) struct Located<T> {
     pub(super) value: T,
     pub(super) at: usize,
 }
@@ -129,11 +129,11 @@ impl<'r, 't> Section<'r, 't> {
     }
 
     /// The value of `key`, if it is there and of its type.
-    pub(super) fn get<T: FromToml>(&self, key: &'static str) -> Option<Found<T>> {
+    pub(super) fn get<T: FromToml>(&self, key: &'static str) -> Option<Located<T>> {
         let (_, value) = self.find(key)?;
         let at = value.span().start;
         match T::from_toml(value.get_ref()) {
-            Ok(value) => Some(Found { value, at }),
+            Ok(value) => Some(Located { value, at }),
             Err(why) => {
                 self.problem(at, format!("{} {why}", self.key_of(key)));
                 None
@@ -142,7 +142,7 @@ impl<'r, 't> Section<'r, 't> {
     }
 
     /// As [`Self::get`]; that the key is missing is a problem. `example` shows what to write.
-    pub(super) fn required<T: FromToml>(&self, key: &'static str, example: &str) -> Option<Found<T>> {
+    pub(super) fn required<T: FromToml>(&self, key: &'static str, example: &str) -> Option<Located<T>> {
         let missing = self.table.is_none_or(|t| t.keys().all(|k| k.get_ref() != key));
         if missing {
             let place = if self.shown.is_empty() { "the top of the file" } else { &self.shown };
@@ -154,7 +154,7 @@ impl<'r, 't> Section<'r, 't> {
         self.get(key)
     }
 
-    /// The value of `key` when it passes `check`, else `default`; `check` says what is wrong.
+    /// The value of `key` when it passes `check`, else `default`; `check` returns the problem.
     pub(super) fn or<T: FromToml>(
         &self,
         key: &'static str,
@@ -178,7 +178,7 @@ impl<'r, 't> Section<'r, 't> {
 
     /// The value of `key` out of `choices`.
     pub(super) fn choose<T: Copy>(&self, key: &'static str, choices: &[(&str, T)]) -> Option<T> {
-        let Found { value, at } = self.get::<String>(key)?;
+        let Located { value, at } = self.get::<String>(key)?;
         let chosen = choices.iter().find(|(name, _)| *name == value).map(|(_, v)| *v);
         if chosen.is_none() {
             let names = || choices.iter().map(|(name, _)| *name);
@@ -186,7 +186,7 @@ impl<'r, 't> Section<'r, 't> {
                 Some(near) => format!("did you mean \"{near}\"?"),
                 None => format!("it is one of: {}", names().collect::<Vec<_>>().join(", ")),
             };
-            self.problem(at, format!("{} cannot be \"{value}\"; {advice}", self.key_of(key)));
+            self.problem(at, format!("{} has the invalid value \"{value}\"; {advice}", self.key_of(key)));
         }
         chosen
     }
@@ -208,7 +208,7 @@ impl<'r, 't> Section<'r, 't> {
         &self,
         key: &'static str,
         kind: &'static str,
-    ) -> Vec<(String, Found<T>)> {
+    ) -> Vec<(String, Located<T>)> {
         let Some((_, value)) = self.find(key) else { return Vec::new() };
         let Some(table) = value.get_ref().as_table() else {
             let is = describe(value.get_ref());
@@ -220,7 +220,7 @@ impl<'r, 't> Section<'r, 't> {
         for (name, value) in table {
             let at = value.span().start;
             match T::from_toml(value.get_ref()) {
-                Ok(value) => entries.push((name.get_ref().to_string(), Found { value, at })),
+                Ok(value) => entries.push((name.get_ref().to_string(), Located { value, at })),
                 Err(why) => {
                     self.problem(at, format!("\"{}\" of {} {why}", name.get_ref(), self.key_of(key)));
                 }
@@ -267,8 +267,11 @@ impl<'r, 't> Section<'r, 't> {
         let known = self.known.into_inner();
         for (key, _) in self.table.into_iter().flatten() {
             if !known.iter().any(|k| k == key.get_ref()) {
-                let (at, name) = (key.span().start, key.get_ref().to_string());
-                let (table, shown, known) = (self.kind, self.shown.clone(), known.clone());
+                let at = key.span().start;
+                let name = key.get_ref().to_string();
+                let table = self.kind;
+                let shown = self.shown.clone();
+                let known = known.clone();
                 let unknown = Unknown { at, key: name, table, shown, known };
                 self.report.unknown.borrow_mut().push(unknown);
             }
@@ -290,7 +293,7 @@ pub(super) fn describe(value: &DeValue<'_>) -> String {
 
 /// A type that a TOML value can be.
 pub(super) trait FromToml: Sized {
-    /// The value, or what is wrong with it as the end of a sentence that begins with the key.
+    /// The value, or the problem as the end of a sentence that begins with the key.
     fn from_toml(value: &DeValue<'_>) -> Result<Self, String>;
 }
 
@@ -329,7 +332,8 @@ macro_rules! integers {
         impl FromToml for $int {
             fn from_toml(value: &DeValue<'_>) -> Result<Self, String> {
                 let DeValue::Integer(i) = value else { return wanted("a whole number", value) };
-                let (least, most) = (<$int>::MIN, <$int>::MAX);
+                let least = <$int>::MIN;
+                let most = <$int>::MAX;
                 let number = <$int>::from_str_radix(i.as_str(), i.radix()).ok();
                 number.map_or_else(|| wanted(&format!("a whole number within {least}..={most}"), value), Ok)
             }
@@ -340,7 +344,7 @@ integers!(u8, u16, u32, u64, usize, i32);
 
 impl FromToml for depthrig_bus::Name {
     fn from_toml(value: &DeValue<'_>) -> Result<Self, String> {
-        Self::new(String::from_toml(value)?).map_err(|e| format!("is no good name: {e}"))
+        Self::new(String::from_toml(value)?).map_err(|e| format!("is not a valid name: {e}"))
     }
 }
 

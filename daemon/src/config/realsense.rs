@@ -1,5 +1,5 @@
-//! The keys of a `realsense` camera. What a camera itself decides (the range of its laser, its controls' names) is
-//! checked when it is started; here is what can be known without it.
+//! The keys of a `realsense` camera. Limits that only the camera knows (the range of its laser, its controls' names)
+//! are checked when it is started; the rest is checked here.
 
 use super::RealsenseSettings;
 use super::controls;
@@ -82,7 +82,7 @@ pub(super) fn read(s: &Section<'_, '_>, base: &Path, streams: &[WantedStream]) -
     config
 }
 
-/// What is started when the file names no stream.
+/// The streams that are started when the file names none.
 pub(super) fn default_streams() -> Vec<StreamRequest> {
     let request = |name| StreamName::new(name).ok().map(StreamRequest::any);
     ["depth", "color"].into_iter().filter_map(request).collect()

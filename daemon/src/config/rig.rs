@@ -26,7 +26,7 @@ pub(super) fn parse(text: &str, path: Option<&Path>) -> Result<RigConfig, Config
 /// As [`parse`], for callers that look at the report. `None` only after a problem was noted.
 pub(super) fn read(report: &Report<'_>, text: &str, path: Option<&Path>) -> Option<RigConfig> {
     let (document, errors) = DeTable::parse_recoverable(text);
-    // What the parser made of a damaged text is guesswork; checking that would only add noise.
+    // A table parsed from damaged text is guesswork; checking it would only add noise.
     if !errors.is_empty() {
         for e in errors {
             report.problem(e.span().map_or(0, |s| s.start), e.message().replace('\n', ", "));

@@ -1,4 +1,4 @@
-//! `[camera.stereo]`: depth that is made of the two eyes of a camera.
+//! `[camera.stereo]`: depth that is computed from the left and right images of a camera.
 
 use super::StereoConfig;
 use super::read::Section;
@@ -96,7 +96,7 @@ pub(super) fn check_streams(
 }
 
 impl StereoConfig {
-    /// Names of the streams that are made.
+    /// Names of the computed streams.
     pub fn streams(&self) -> Vec<String> {
         // The modes' names are good ones.
         let names = self.options().streams().unwrap_or_default();
@@ -112,7 +112,7 @@ impl StereoConfig {
         )
     }
 
-    /// What the driver needs to know.
+    /// The options for the driver.
     pub fn options(&self) -> StereoOptions {
         let mode = |m: &Mode| match m {
             Mode::Preset(preset) => StereoMode::preset(*preset, self.range_m.0, self.threads),
@@ -129,7 +129,9 @@ impl StereoConfig {
     }
 
     fn neural(&self) -> StereoMode {
-        let (file, library, threads) = (self.network.clone(), self.library.clone(), self.threads);
+        let file = self.network.clone();
+        let library = self.library.clone();
+        let threads = self.threads;
         let make: Maker = Arc::new(move |g: &Geometry| {
             let bad = |what: String| depthrig_calib::Error::new(depthrig_calib::ErrorKind::BadInput, what);
             let file = file.as_deref().ok_or_else(|| bad("no network was given".to_owned()))?;
@@ -140,7 +142,7 @@ impl StereoConfig {
                 pixels: None,
                 negative: false,
             };
-            let network = StereoNetwork::open(file, (g.width, g.height), &options);
+            let network = StereoNetwork::open(file, g.width, g.height, &options);
             let network = network.map_err(|e| bad(format!("unavailable, because {e}")).with_source(e))?;
             Ok(Box::new(network) as Box<dyn Matcher>)
         });

@@ -1,10 +1,10 @@
 //! The keys of a `synthetic` camera.
 //!
-//! The driver knows what its numbers may be, so it is the one that is asked, key by key: each value is put into an
-//! otherwise default configuration, and what the driver says of that is reported at the key's own line.
+//! The driver knows the limits of its numbers, so it is the one that is asked, key by key: each value is put into an
+//! otherwise default configuration, and the driver's error is reported at the key's own line.
 
 use super::SyntheticSettings;
-use super::read::{Found, FromToml, Section, nearest};
+use super::read::{FromToml, Located, Section, nearest};
 use super::value::resolve;
 use super::wanted::WantedStream;
 use depthrig_bus::Pose;
@@ -46,7 +46,7 @@ pub(super) fn read(
     for wanted in streams {
         let StreamRequest { stream, size, rate_hz, .. } = wanted.request.clone();
         config.streams.push(StreamOverride { stream, size, rate_hz });
-        // Each alone, so that each has its own problem; what is wrong elsewhere was reported already.
+        // Each alone, so that each has its own problem; problems elsewhere were reported already.
         let problem = problem_of(|c| {
             (c.model, c.truth, c.cheap) = (config.model.clone(), config.truth, config.cheap);
             c.motion = config.motion;
@@ -66,12 +66,12 @@ pub(super) fn read(
 /// The highest rate among the streams that `config` starts on `requests`, Hz.
 pub(super) fn fastest_rate_hz(config: &SyntheticSettings, requests: &[StreamRequest]) -> Result<f64> {
     let chosen = choose_profiles("", &profiles(config)?, requests)?;
-    let pictures = chosen.iter().filter(|p| !p.format.is_motion());
-    Ok(pictures.map(|p| p.rate_hz).fold(0.0, f64::max))
+    let images = chosen.iter().filter(|p| !p.format.is_motion());
+    Ok(images.map(|p| p.rate_hz).fold(0.0, f64::max))
 }
 
 fn model(s: &Section<'_, '_>, default: String) -> String {
-    let Some(Found { value, at }) = s.get::<String>("model") else { return default };
+    let Some(Located { value, at }) = s.get::<String>("model") else { return default };
     if let Some(why) = problem_of(|c| c.model.clone_from(&value)) {
         let near = nearest(&value, MODELS.iter().map(|m| m.name));
         let advice = near.map(|near| format!("; did you mean \"{near}\"?")).unwrap_or_default();
@@ -83,7 +83,8 @@ fn model(s: &Section<'_, '_>, default: String) -> String {
 
 fn clock(camera: &Section<'_, '_>) -> ClockSim {
     let table = camera.table("clock", "[camera.clock]");
-    let (s, d) = (&table, ClockSim::default());
+    let s = &table;
+    let d = ClockSim::default();
     let config = ClockSim {
         start_ticks: field(s, "start_ticks", d.start_ticks, |c, v| c.clock.start_ticks = v),
         counter_bits: field(s, "counter_bits", d.counter_bits, |c, v| c.clock.counter_bits = v),
@@ -140,7 +141,7 @@ fn field<T: FromToml + Clone>(
     default: T,
     set: impl FnOnce(&mut SyntheticSettings, T),
 ) -> T {
-    let Some(Found { value, at }) = s.get::<T>(key) else { return default };
+    let Some(Located { value, at }) = s.get::<T>(key) else { return default };
     match problem_of(|c| set(c, value.clone())) {
         None => value,
         Some(why) => {
@@ -150,7 +151,7 @@ fn field<T: FromToml + Clone>(
     }
 }
 
-/// What the driver says of a default configuration that `change` was made to.
+/// The driver's error for a default configuration after `change`.
 fn problem_of(change: impl FnOnce(&mut SyntheticSettings)) -> Option<String> {
     let mut config = SyntheticSettings::default();
     change(&mut config);

@@ -1,6 +1,6 @@
 //! The default file is complete and true, and every problem of a bad one is named with its place. Long because every
-//! back end's keys are in it.
-#![allow(clippy::items_after_statements)] // each test names what it is about
+//! backend's keys are in it.
+#![allow(clippy::items_after_statements)] // each test names its subject
 
 use super::read::Report;
 use super::*;
@@ -137,7 +137,7 @@ fn what_a_file_says_is_what_comes_out() {
         [[camera]]
         name = "a"
         backend = "files"
-        manifest = "pictures"
+        manifest = "images"
         rate_hz = 15
         loop = false
         record = ["depth"]
@@ -161,7 +161,7 @@ fn what_a_file_says_is_what_comes_out() {
     assert_eq!(rig.control.tcp, Some("[::1]:8000".parse().unwrap()));
     let a = rig.camera("a").unwrap();
     let settings =
-        FilesSettings { manifest: "/rigs/pictures".into(), rate_hz: Some(15.0), looped: Some(false) };
+        FilesSettings { manifest: "/rigs/images".into(), rate_hz: Some(15.0), looped: Some(false) };
     assert_eq!(a.backend, BackendConfig::Files(settings));
     assert_eq!(a.pose.translation_m, [1.0, 2.5, -3.0]);
     assert!((a.pose.rotation_xyzw[1] - 0.5f64.sqrt()).abs() < 1e-12, "made unit length: {:?}", a.pose);
@@ -397,15 +397,15 @@ fn a_recording_of_a_zed_and_its_stereo_are_set_as_the_file_says() {
         library: Some("/rigs/libonnxruntime.so".into()),
     };
     assert_eq!(rig.cameras[0].stereo, Some(wanted.clone()));
-    let made = ["color", "depth_performance", "confidence_performance", "disparity_performance"];
-    assert_eq!(wanted.streams()[..4], made);
+    let derived = ["color", "depth_performance", "confidence_performance", "disparity_performance"];
+    assert_eq!(wanted.streams()[..4], derived);
     assert_eq!(rig.cameras[0].refine.as_ref().unwrap().depth, "depth_performance", "the first mode");
     assert_eq!(rig.cameras[1].refine.as_ref().unwrap().depth, "depth_quality");
     assert_eq!(
         rig.cameras[1].stereo,
         Some(StereoConfig { library: wanted.library, ..StereoConfig::default() })
     );
-    // What comes late is in no set that is waited for; without anything else there would be none.
+    // Late streams are in no set that is waited for; with nothing else there would be no set.
     let late = |camera: usize, name: &str| rig.cameras[camera].joins_late(&StreamName::new(name).unwrap());
     assert!(
         late(0, "depth_neural") && late(1, "confidence_quality") && !late(0, "color") && !late(0, "left")
@@ -432,7 +432,7 @@ fn a_recorded_kinect_is_played_as_the_file_says() {
     assert_eq!(backend("calibration = \"none\""), recorded(none));
     let problem = |keys: &str| RigConfig::parse(&text(keys), None).unwrap_err().to_string();
     assert!(problem("rate = 0").contains("it must be within 0.05 and 20"), "{}", problem("rate = 0"));
-    // What only an attached one has.
+    // Keys of attached cameras alone.
     assert!(problem("sync = \"master\"").contains("sync"), "{}", problem("sync = \"master\""));
 }
 
@@ -474,7 +474,7 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (camera("seed = -1"), "5:8: \"seed\" in [[camera]] \"d435\" must be a whole number within 0..="),
         (camera("truth = 1"), "must be true or false; it is the number 1"),
         (camera("phase = nan"), "must be a finite number"),
-        (camera("phase = 1.5"), "5:9: \"phase\" in [[camera]] \"d435\": phase = 1.5 is not within 0..1"),
+        (camera("phase = 1.5"), "5:9: \"phase\" in [[camera]] \"d435\": phase = 1.5 is out of range 0..1"),
         (camera("clock.counter_bits = 8"), "5:22: \"counter_bits\" in [camera.clock] of camera \"d435\": clock.counter_bits = 8"),
         (camera("model = \"d436\""), "5:9: \"model\" in [[camera]] \"d435\": there is no model \"d436\"; there are d405,"),
         (camera("stream = [{ name = \"ir\" }]"), "it has no stream \"ir\""),
@@ -484,10 +484,10 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (camera("stream = [{ name = \"color\", width = 640, height = 99999 }]"), "is 99999 pixels"),
         (camera("stream = [{ name = \"color\", rate_hz = 1e300 }]"), "is 1e300; it must be above 0"),
         (camera("stream = [{ name = \"color\", width = 3 }]"), "\"width\" in [[camera.stream]] \"color\" needs height as well"),
-        (camera("stream = [{ name = \"color\", format = \"rbg8\" }]"), "cannot be \"rbg8\"; did you mean \"rgb8\"?"),
+        (camera("stream = [{ name = \"color\", format = \"rbg8\" }]"), "has the invalid value \"rbg8\"; did you mean \"rgb8\"?"),
         (camera("stream = [{ name = \"color\" }, { name = \"color\" }]"), "stream \"color\" is listed twice"),
         (camera("stream = [{ name = \"color\" }]\nrecord = [\"depth\"]"), "6:10: \"record\" in [[camera]] \"d435\" names \"depth\", which is not among"),
-        (camera("fault = [{ at_s = 1, kind = \"fire\" }]"), "5:29: \"kind\" in [[camera.fault]] of camera \"d435\" cannot be \"fire\"; it is one of: unplug, stall"),
+        (camera("fault = [{ at_s = 1, kind = \"fire\" }]"), "5:29: \"kind\" in [[camera.fault]] of camera \"d435\" has the invalid value \"fire\"; it is one of: unplug, stall"),
         (camera("fault = [{ at_s = -1, kind = \"hang\" }]"), "at_s and duration_s must be 0 or more"),
         (camera("fault = [{ kind = \"hang\" }]"), "\"at_s\" is missing in [[camera.fault]]"),
         (camera("pose = { rotation_xyzw = [0, 0, 0, 2] }"), "5:26: \"rotation_xyzw\" in pose = { } of camera \"d435\" must be a quaternion x, y, z, w of length 1; its length is 2.0000"),
@@ -496,14 +496,14 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (camera("pose = { translation_m = [0, 1] }"), "must have 3 values; it has 2"),
         (camera("pose = { rotation_xyzw = [0, 0, 0, 1], rotation_rpy_deg = [0, 0, 0] }"), "keep one"),
         (second("name = \"d435\"\nbackend = \"synthetic\""), "6:8: camera name \"d435\" is taken by an earlier camera"),
-        (second("name = \"D435\"\nbackend = \"synthetic\""), "6:8: \"name\" in [[camera]] is no good name: \"D435\" cannot be a name: it begins with 'D'"),
+        (second("name = \"D435\"\nbackend = \"synthetic\""), "6:8: \"name\" in [[camera]] is not a valid name: \"D435\" cannot be a name: it begins with 'D'"),
         (second("backend = \"synthetic\""), "5:1: \"name\" is missing in [[camera]]"),
         (second("name = \"b\""), "5:1: \"backend\" is missing in [[camera]] \"b\""),
-        (second("name = \"b\"\nbackend = \"file\""), "7:11: \"backend\" in [[camera]] \"b\" cannot be \"file\"; did you mean \"files\"?"),
+        (second("name = \"b\"\nbackend = \"file\""), "7:11: \"backend\" in [[camera]] \"b\" has the invalid value \"file\"; did you mean \"files\"?"),
         (second("name = \"b\"\nbackend = \"files\""), "\"manifest\" is missing in [[camera]] \"b\"; write, for example, manifest = "),
         (second("name = \"b\"\nbackend = \"files\"\nmanifest = \"x\"\nrate_hz = -3"), "9:11: \"rate_hz\" in [[camera]] \"b\" is -3; it must be above 0"),
         (second("name = \"b\"\nbackend = \"files\"\nmanifest = \"x\"\nmodel = \"d405\""), "only another backend has it"),
-        (second("name = \"b\"\nbackend = \"realsense\"\nemitter = \"lazer\""), "8:11: \"emitter\" in [[camera]] \"b\" cannot be \"lazer\"; did you mean \"laser\"?"),
+        (second("name = \"b\"\nbackend = \"realsense\"\nemitter = \"lazer\""), "8:11: \"emitter\" in [[camera]] \"b\" has the invalid value \"lazer\"; did you mean \"laser\"?"),
         (second("name = \"b\"\nbackend = \"realsense\"\nlaser_power_mw = 361"), "\"laser_power_mw\" in [[camera]] \"b\" is 361; it must be within 0 and 360"),
         (second("name = \"b\"\nbackend = \"realsense\"\nexposure_us = 0"), "is 0; it must be within 1 and 200000"),
         (second("name = \"b\"\nbackend = \"realsense\"\nauto_exposure = true\ngain = 16"), "9:8: \"gain\" in [[camera]] \"b\" cannot be set while auto_exposure is true"),
@@ -531,7 +531,7 @@ fn each_problem_has_its_place_and_says_what_to_write() {
         (second("name = \"b\"\nbackend = \"realsense\"\nstereo = { }"), "unknown key \"stereo\" in [[camera]] \"b\""),
         (second("name = \"b\"\nbackend = \"zed\"\nstream = [{ name = \"depth\" }]"), "8:11: a ZED has no stream \"depth\"; it has: left, right, imu"),
         (second("name = \"b\"\nbackend = \"zed\"\nmodel = \"zed2i\""), "only another backend has it"),
-        (second("name = \"b\"\nbackend = \"kinect\"\ndepth_mode = \"wfov\""), "cannot be \"wfov\"; did you mean \"wfov_"),
+        (second("name = \"b\"\nbackend = \"kinect\"\ndepth_mode = \"wfov\""), "has the invalid value \"wfov\"; did you mean \"wfov_"),
         (second("name = \"b\"\nbackend = \"kinect\"\nsubordinate_delay_us = 160"), "only sync = \"subordinate\" has it"),
         (second("name = \"b\"\nbackend = \"kinect\"\ncolor_controls = { exposure = 5 }"), "has \"exposure\", which a Kinect has not; it has: exposure_us, "),
         (second("name = \"b\"\nbackend = \"kinect\"\nstream = [{ name = \"left\" }]"), "8:11: a Kinect has no stream \"left\"; it has: color, depth, ir, imu"),
@@ -592,7 +592,7 @@ fn files_that_cannot_be_read_say_why() {
     assert!(e.to_string().contains("depthrig config show"), "{e}");
     assert!(RigConfig::load(tmp.path()).unwrap_err().to_string().contains("it is a folder"));
     std::fs::write(&path, [0xff, 0xfe, 0x00]).unwrap();
-    assert!(RigConfig::load(&path).unwrap_err().to_string().contains("it is no text"));
+    assert!(RigConfig::load(&path).unwrap_err().to_string().contains("it is not text"));
     std::fs::write(&path, RigConfig::default_text()).unwrap();
     let rig = RigConfig::load(&path).unwrap();
     assert_eq!(rig.recording.directory, tmp.path().join("datasets"));
@@ -803,7 +803,7 @@ fn what_is_wrong_with_refining_is_named_at_its_line() {
         (
             "engine = \"onnx\"",
             6,
-            "\"engine\" in [camera.refine] of camera \"a\" cannot be \"onnx\"; did you mean \"onnxruntime\"?",
+            "\"engine\" in [camera.refine] of camera \"a\" has the invalid value \"onnx\"; did you mean \"onnxruntime\"?",
         ),
         (
             "engnie = \"fill\"",

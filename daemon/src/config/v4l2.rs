@@ -1,7 +1,7 @@
 //! The keys of a `v4l2` camera.
 
 use super::V4l2Settings;
-use super::read::{Found, Section};
+use super::read::{Located, Section};
 use super::value::within;
 use depthrig_bus::{Distortion, Intrinsics, StreamName};
 use depthrig_drivers::v4l2::{
@@ -29,7 +29,7 @@ pub(super) fn read(s: &Section<'_, '_>) -> V4l2Settings {
         memory: s.choice("memory", &MEMORY, d.memory),
         mjpeg: s.choice("mjpeg", &MJPEG, d.mjpeg),
         clock: s.choice("clock", &CLOCK, d.clock),
-        // A slower clock could not tell frames apart, and no camera has a faster one.
+        // A slower clock could not distinguish frames, and no camera has a faster one.
         device_clock_hz: s.or("device_clock_hz", None, |v: &Option<u32>| {
             v.map_or(Ok(()), |hz| within(1000..=1_000_000_000)(&hz))
         }),
@@ -44,7 +44,7 @@ pub(super) fn read(s: &Section<'_, '_>) -> V4l2Settings {
     }
 }
 
-/// The controls by name. What a name may be only the camera knows.
+/// The controls by name. Only the camera knows which names there are.
 fn controls(camera: &Section<'_, '_>) -> Vec<(String, ControlValue)> {
     let entries = camera.entries::<Value>("controls", "[camera.controls]");
     entries.into_iter().map(|(name, found)| (name, found.value.0)).collect()
@@ -87,13 +87,16 @@ fn intrinsics(s: Section<'_, '_>) -> Option<GivenIntrinsics> {
         let found = s.required::<u32>(key, example);
         found.filter(|f| check(&s, key, f, &within(1..=16_384)(&f.value))).map(|f| f.value)
     };
-    let (width, height) = (side("width", "1280"), side("height", "720"));
+    let width = side("width", "1280");
+    let height = side("height", "720");
     let pixels = |key, example| {
         let found = s.required::<f64>(key, example);
         found.filter(|f| check(&s, key, f, &super::value::above_zero(1e5)(&f.value))).map(|f| f.value)
     };
-    let (fx, fy) = (pixels("fx", "910.5"), pixels("fy", "909.8"));
-    let (cx, cy) = (pixels("cx", "640.2"), pixels("cy", "361.7"));
+    let fx = pixels("fx", "910.5");
+    let fy = pixels("fy", "909.8");
+    let cx = pixels("cx", "640.2");
+    let cy = pixels("cy", "361.7");
     let model = s.choice("model", &MODELS, Distortion::None);
     let most = match model {
         Distortion::Unknown | Distortion::None => 0,
@@ -113,7 +116,7 @@ fn intrinsics(s: Section<'_, '_>) -> Option<GivenIntrinsics> {
 }
 
 /// Whether `outcome` is good; if not, it is noted.
-fn check<T>(s: &Section<'_, '_>, key: &str, found: &Found<T>, outcome: &Result<(), String>) -> bool {
+fn check<T>(s: &Section<'_, '_>, key: &str, found: &Located<T>, outcome: &Result<(), String>) -> bool {
     if let Err(why) = outcome {
         s.problem(found.at, format!("{} {why}", s.key_of(key)));
     }

@@ -35,7 +35,8 @@ pub(super) fn within<T: PartialOrd + Display + LowerExp>(
     range: RangeInclusive<T>,
 ) -> impl FnOnce(&T) -> Result<(), String> {
     move |v| {
-        let (least, most) = (range.start(), range.end());
+        let least = range.start();
+        let most = range.end();
         if range.contains(v) {
             Ok(())
         } else {

@@ -1,5 +1,5 @@
-//! The keys of a `zed` camera: one that is attached, or a recording of one (`input`). What the camera itself decides (its
-//! modes, its controls) is checked when it is started.
+//! The keys of a `zed` camera: one that is attached, or a recording of one (`input`). Limits that only the camera knows
+//! (its modes, its controls) are checked when it is started.
 
 use super::read::Section;
 use super::value::{not_empty, rate, resolve, within};
@@ -28,7 +28,7 @@ pub(super) fn read(
         Some(none) if none.as_os_str() == "none" => CalibrationFile::None,
         Some(path) => CalibrationFile::At(resolve(base, &path)),
     };
-    // A recording is of the eyes alone.
+    // A recording has the left and right images alone.
     let own: &[&str] = if s.has("input") { &STREAMS } else { &[STREAMS[0], STREAMS[1], IMU] };
     stereo::check_streams(s, "a ZED", own, depth, streams);
     if depth.is_some() && calibration == CalibrationFile::None {

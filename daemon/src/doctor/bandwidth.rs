@@ -1,6 +1,6 @@
-//! What the cameras of a rig take of the USB, link by link.
+//! USB load of the cameras of a rig, link by link.
 //!
-//! A camera's pictures go over its own link, over the link of every hub above it, and through its controller; each has a
+//! A camera's images go over its own link, over the link of every hub above it, and through its controller; each has a
 //! limit of its own.
 
 use super::finding::{Finding, Severity};
@@ -16,20 +16,20 @@ use depthrig_drivers::usb::health;
 use serde::Serialize;
 use std::collections::BTreeMap;
 
-/// What is planned with at most of a USB2 bus, Mbit/s of video: a rule of thumb of multi-camera set-ups, which leaves
-/// room for what hubs and retries take.
+/// Most of a USB2 bus to plan with, Mbit/s of video: a rule of thumb of multi-camera set-ups, which leaves
+/// room for hubs and retries.
 const USB2_PLAN_MBIT_S: f64 = 300.0;
-/// What is planned with at most of a USB3 link or controller: 3 of its 5 Gbit/s, and the same share of faster ones.
+/// Most of a USB3 link or controller to plan with: 3 of its 5 Gbit/s, and the same share of faster ones.
 const USB3_PLAN_SHARE: f64 = 0.6;
-/// What a USB2 bus can carry of bulk data: 13 packets of 512 bytes in each of 8000 microframes a second (USB 2.0
+/// Bulk data that a USB2 bus can carry: 13 packets of 512 bytes in each of 8000 microframes a second (USB 2.0
 /// specification, table 5-10).
 const USB2_MOST_MBIT_S: f64 = 13.0 * 512.0 * 8.0 * 8000.0 / 1e6;
-/// What the coding leaves of 5 Gbit/s: 8 bits of 10 (USB 3.2 specification, section 6.3.1.3).
+/// Share of 5 Gbit/s that the coding leaves: 8 bits of 10 (USB 3.2 specification, section 6.3.1.3).
 const GEN1_CODING: f64 = 0.8;
-/// What the coding leaves of 10 Gbit/s and more: 128 bits of 132 (same, section 6.3.2.1).
+/// Share of 10 Gbit/s and more that the coding leaves: 128 bits of 132 (same, section 6.3.2.1).
 const GEN2_CODING: f64 = 128.0 / 132.0;
 
-/// What a Kinect takes of the kernel's memory for USB transfers: libk4a keeps up to 10 MB for depth (`usbstreaming.c`), and
+/// Kernel memory that a Kinect's USB transfers take: libk4a keeps up to 10 MB for depth (`usbstreaming.c`), and
 /// colour has its own; one camera gets by with the kernel's 16 MB, two need 32 (Azure-Kinect-Sensor-SDK issue 485).
 const KINECT_TRANSFERS: u64 = 16 << 20;
 
@@ -45,15 +45,15 @@ pub struct LinkLoad {
     pub cameras: Vec<String>,
     /// Its speed, Mbit/s.
     pub speed_mbps: u32,
-    /// What they send, Mbit/s.
+    /// The load that they send, Mbit/s.
     pub load_mbit_s: f64,
-    /// What may be planned with, Mbit/s.
+    /// The load that may be planned with, Mbit/s.
     pub plan_mbit_s: f64,
-    /// What it can carry, Mbit/s.
+    /// The load that it can carry, Mbit/s.
     pub most_mbit_s: f64,
 }
 
-/// What a stream takes of the USB, bits a second. Colour is sent as YUYV or UYVY, 2 bytes a pixel, whatever it is turned
+/// USB load of a stream, bits a second. Colour is sent as YUYV or UYVY, 2 bytes a pixel, whatever it is turned
 /// into afterwards; the rest is sent as it is delivered.
 pub fn wire_bits_per_s(p: &StreamProfile) -> f64 {
     // Its reports are some kilobytes a second on an endpoint of their own.
@@ -70,7 +70,7 @@ pub fn wire_bits_per_s(p: &StreamProfile) -> f64 {
     f64::from(p.width) * f64::from(p.height) * bits * p.rate_hz
 }
 
-/// What may be planned with and what can be carried at a speed, Mbit/s.
+/// The load to plan with and the load that can be carried at a speed, Mbit/s.
 fn limits(speed_mbps: u32) -> (f64, f64) {
     let speed = f64::from(speed_mbps);
     match speed_mbps {
@@ -182,8 +182,8 @@ pub(super) fn check_usbfs(plans: &[CameraPlan], host: &Host, findings: &mut Vec<
     }
 }
 
-/// What the kernel counts for the transfers of one stream over libusb: each holds a picture with its header.
+/// Bytes that the kernel counts for the transfers of one stream over libusb: each holds an image with its header.
 fn transfer_bytes(p: &StreamProfile) -> u64 {
-    let picture = (wire_bits_per_s(p) / p.rate_hz / 8.0) as usize;
-    libusb::transfer_memory(libusb::Settings::default().transfers(), picture + 1024)
+    let image = (wire_bits_per_s(p) / p.rate_hz / 8.0) as usize;
+    libusb::transfer_memory(libusb::Settings::default().transfers(), image + 1024)
 }

@@ -1,4 +1,4 @@
-//! The cameras of the rig file against what is attached: found or not, with which modes, in which state.
+//! The cameras of the rig file against the attached ones: found or not, with which modes, in which state.
 
 use super::external;
 use super::finding::{Finding, Severity};
@@ -10,7 +10,7 @@ use depthrig_drivers::kinect::KinectConfig;
 use depthrig_drivers::kinect::playback::PlaybackBackend;
 use depthrig_drivers::realsense::config::TransportChoice;
 use depthrig_drivers::usb::health::{self, RULE_CURE};
-use depthrig_drivers::zed::replay::ReplayBackend;
+use depthrig_drivers::zed::replay::ZedPlaybackBackend;
 use depthrig_drivers::{Backend, Result, StreamProfile, choose_profiles, synthetic};
 
 /// Which device a camera of the rig means.
@@ -23,7 +23,7 @@ pub(super) struct Wanted<'c> {
     pub(super) needs_calibration: bool,
 }
 
-/// What of a plan is read from the rig file alone; `None` for cameras that are on no bus.
+/// The part of a plan that the rig file alone decides; `None` for cameras that are on no bus.
 fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
     match backend {
         BackendConfig::Synthetic(_)
@@ -65,7 +65,7 @@ fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
     }
 }
 
-/// What the camera gives when the rig runs: its own streams, and those that are made of its eyes.
+/// The camera's streams when the rig runs: its own, and those computed from its left and right images.
 fn with_stereo(camera: &CameraConfig, device: &str, own: Vec<StreamProfile>) -> Result<Vec<StreamProfile>> {
     match &camera.stereo {
         Some(stereo) => depthrig_drivers::stereo::offered(device, &own, &stereo.options()),
@@ -109,7 +109,7 @@ pub(super) fn plan_device(
     Planned { plan, findings }
 }
 
-/// A camera that is no device: synthetic, a folder of pictures, or a recording.
+/// The plan of a camera without a device: synthetic, a folder of images, or a recording.
 fn plan_made(camera: &CameraConfig) -> Planned {
     let mut plan = no_plan(camera, camera.backend.name());
     let profiles = || -> Result<(String, Vec<StreamProfile>)> {
@@ -119,18 +119,19 @@ fn plan_made(camera: &CameraConfig) -> Planned {
             }
             BackendConfig::Files(c) => {
                 let device = FilesBackend::new(c.clone()).open(None)?;
-                (format!("pictures of {}", device.info().port), device.profiles().to_vec())
+                (format!("images of {}", device.info().port), device.profiles().to_vec())
             }
             BackendConfig::ZedReplay(c) => {
-                let device = ReplayBackend::new(c.clone()).open(None)?;
+                let device = ZedPlaybackBackend::new(c.clone()).open(None)?;
                 (format!("recording {}", device.info().port), device.profiles().to_vec())
             }
             BackendConfig::Kinect(KinectConfig::Recorded(c)) => {
                 let device = PlaybackBackend::new(c.clone()).open(None)?;
-                let (serial, port) = (&device.info().serial, &device.info().port);
+                let serial = &device.info().serial;
+                let port = &device.info().port;
                 (format!("Azure Kinect {serial} as recorded in {port}"), device.profiles().to_vec())
             }
-            // Devices are planned with what is attached.
+            // Devices are planned with the attached camera.
             BackendConfig::Realsense(_)
             | BackendConfig::L515(_)
             | BackendConfig::V4l2(_)
@@ -163,7 +164,7 @@ fn plan_made(camera: &CameraConfig) -> Planned {
     Planned { plan, findings }
 }
 
-/// The attached camera that is meant, or what to say when there is none.
+/// The attached camera that `wanted` selects; adds a finding when it is missing or ambiguous.
 fn find<'a>(
     backend: &str,
     wanted: &Wanted<'_>,
@@ -232,7 +233,7 @@ fn nearest<'a>(serial: &str, family: &[&'a AttachedCamera]) -> Option<&'a str> {
     distances.filter(|(d, _)| *d <= 2).min().map(|(_, s)| s)
 }
 
-/// What is wrong with the device itself.
+/// Checks the device itself.
 fn check_device(device: &AttachedCamera, wanted: &Wanted<'_>, findings: &mut Vec<Finding>) {
     match device.state {
         UseState::Free => {}
@@ -323,7 +324,7 @@ pub(super) fn check_named_twice(plans: &[CameraPlan], findings: &mut Vec<Finding
     }
 }
 
-/// What is attached and of no use, or in no camera of the rig.
+/// Checks attached devices that are unusable, or in no camera of the rig.
 pub(super) fn check_unnamed(attached: &Attached, plans: &[CameraPlan], findings: &mut Vec<Finding>) {
     for line in &attached.unusable {
         findings.push(Finding::new(
@@ -334,7 +335,7 @@ pub(super) fn check_unnamed(attached: &Attached, plans: &[CameraPlan], findings:
             "do what the message says, or unplug it",
         ));
     }
-    // A rig of made cameras alone says nothing of the real ones.
+    // A rig of synthetic or recorded cameras alone says nothing of the real ones.
     if plans.iter().all(|p| p.port.is_none()) {
         return;
     }

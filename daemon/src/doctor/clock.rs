@@ -3,7 +3,7 @@
 
 use core::mem;
 
-/// What the kernel knows of its clock.
+/// Synchronisation of the computer's clock, as the kernel has it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ClockSync {
     /// A program (chrony, systemd-timesyncd, ntpd, ptp4l) keeps it right.

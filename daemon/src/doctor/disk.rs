@@ -1,4 +1,4 @@
-//! The disk of the recordings: room, and how fast it takes what the rig writes.
+//! The disk of the recordings: room, and whether it is fast enough for the rig.
 
 use super::finding::{Finding, Severity};
 use super::plan::CameraPlan;
@@ -17,12 +17,12 @@ const MEASURE_BYTES: u64 = 256 << 20;
 /// … for at most about this long.
 const MEASURE_TIME: Duration = Duration::from_millis(1500);
 const CHUNK: usize = 4 << 20;
-/// A disk that is measured at less than so many times what the rig writes gets slower than it when it is busy or full.
+/// A disk that is measured at less than so many times the rig's rate gets slower than it when it is busy or full.
 const RATE_MARGIN: f64 = 2.0;
 /// Less than this much time left is worth a warning, minutes.
 const SHORT_MIN: f64 = 30.0;
 
-/// What is known of the disk.
+/// Measured facts about the disk.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DiskFacts {
     /// The folder that is there: the recordings' own, or the nearest above it.
@@ -35,14 +35,14 @@ pub struct DiskFacts {
     pub refusal: Option<String>,
 }
 
-/// The disk against what the rig writes.
+/// The disk against the rate that the rig writes at.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct DiskPlan {
     /// The folder of the recordings.
     pub directory: String,
-    /// What a recording of the rig is expected to write, bytes a second.
+    /// The rate that a recording of the rig is expected to write at, bytes a second.
     pub needed_bytes_per_s: f64,
-    /// What the disk took, bytes a second.
+    /// The rate that the disk took, bytes a second.
     pub measured_bytes_per_s: Option<f64>,
     /// Bytes free.
     pub free_bytes: Option<u64>,
@@ -111,7 +111,7 @@ fn write_rate(mut file: File) -> io::Result<f64> {
     Ok(written as f64 / start.elapsed().as_secs_f64())
 }
 
-/// The plan for the disk; notes what is wrong with it.
+/// The plan for the disk; notes its problems.
 pub(super) fn check(
     config: &RigConfig,
     plans: &[CameraPlan],
@@ -119,8 +119,8 @@ pub(super) fn check(
     findings: &mut Vec<Finding>,
 ) -> DiskPlan {
     let recorded = plans.iter().flat_map(|p| &p.profiles).filter(|(_, recorded)| *recorded).map(|(p, _)| p);
-    let (units, pictures): (Vec<_>, Vec<_>) = recorded.partition(|p| p.format.is_motion());
-    let streams = pictures.iter().map(|p| (p.format, p.frame_bytes()));
+    let (units, images): (Vec<_>, Vec<_>) = recorded.partition(|p| p.format.is_motion());
+    let streams = images.iter().map(|p| (p.format, p.frame_bytes()));
     let needed = budget::bytes_per_s(streams, config.sets.rate_hz, &config.recording)
         + budget::motion_bytes_per_s(units.iter().map(|p| p.samples_hz()).sum());
     let directory = config.recording.directory.display();

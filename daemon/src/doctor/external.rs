@@ -1,4 +1,4 @@
-//! Cameras that another process serves: whether it does, what it offers, and whether the daemon could start it.
+//! Cameras that another process serves: whether it does, its streams, and whether the daemon could start it.
 
 use super::finding::{Finding, Severity};
 use super::plan::{Planned, mode_missing, no_plan, set_streams};
@@ -56,7 +56,7 @@ fn finish(plan: super::CameraPlan, findings: Vec<Finding>) -> Planned {
     Planned { plan, findings }
 }
 
-/// What to say when no process serves the camera now.
+/// The finding that no process serves the camera now.
 fn not_served(settings: &ExternalSettings) -> Finding {
     let Some(program) = settings.command.first() else {
         return Finding::new(
@@ -80,7 +80,7 @@ fn not_served(settings: &ExternalSettings) -> Finding {
         Severity::Error,
         "command_missing",
         format!(
-            "`command` names {program}, which is no program that this user can run from {}",
+            "`command` names {program}, which this user cannot run from {}",
             settings.directory.display()
         ),
         "the rig does not start with a camera that cannot work",

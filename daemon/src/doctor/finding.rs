@@ -1,4 +1,4 @@
-//! One thing that is wrong or worth knowing.
+//! One problem, or fact worth knowing.
 
 use serde::Serialize;
 
@@ -31,17 +31,17 @@ impl Severity {
 /// A finding.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// What kind it is, for programs: `usb2`, `mode_missing`, …
+    /// Its kind, for programs: `usb2`, `mode_missing`, …
     pub id: &'static str,
     /// How bad it is.
     pub severity: Severity,
     /// The camera of the rig that it concerns, if it is one.
     pub camera: Option<String>,
-    /// What was found.
+    /// The finding itself.
     pub what: String,
     /// Why it matters.
     pub why: String,
-    /// What to do.
+    /// How to correct it.
     pub cure: String,
 }
 

@@ -1,4 +1,4 @@
-//! What is asked of the computer itself.
+//! Facts about the computer itself.
 
 use super::clock::{ClockSync, clock_sync};
 use super::disk::DiskFacts;
@@ -27,7 +27,7 @@ pub struct Host {
     pub rig_holder: Option<String>,
     /// The disk of the recordings.
     pub disk: DiskFacts,
-    /// What attached Kinects would miss.
+    /// Requirements of attached Kinects that are missing.
     pub kinect: KinectFacts,
 }
 
@@ -52,7 +52,7 @@ impl Host {
         }
     }
 
-    /// What is wrong with the computer, apart from disk and shared memory.
+    /// Checks the computer, apart from disk and shared memory.
     pub(super) fn check(&self, config: &RigConfig, findings: &mut Vec<Finding>) {
         if let Some(holder) = &self.rig_holder {
             findings.push(Finding::new(

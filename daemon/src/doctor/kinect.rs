@@ -4,10 +4,10 @@ use super::finding::{Finding, Severity};
 use crate::config::{BackendConfig, CameraConfig, KinectSettings, RigConfig};
 use depthrig_drivers::kinect::live::{CURE, LiveConfig, check_libraries};
 
-/// What a session with attached Kinects needs of the computer, as far as it is missing.
+/// Requirements of a session with attached Kinects that the computer does not meet.
 #[derive(Debug, Clone, Default)]
 pub struct KinectFacts {
-    /// By camera of the rig: what is missing, in words.
+    /// By camera of the rig: the missing requirement, in words.
     pub missing: Vec<(String, Missing, String)>,
     /// Whether programs of this user have a display.
     pub has_display: bool,
@@ -40,7 +40,7 @@ impl KinectFacts {
         Self { missing, has_display: is_set("DISPLAY") }
     }
 
-    /// Notes what is missing, and takes back what was noted of a camera because of it.
+    /// Notes the missing requirements, and takes back findings about a camera that follow from them.
     pub(super) fn check(&self, config: &RigConfig, findings: &mut Vec<Finding>) {
         for (camera, missing, what) in &self.missing {
             let of_camera = |f: &Finding| f.camera.as_deref() == Some(camera) && f.id == "camera_failed";

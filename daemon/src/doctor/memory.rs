@@ -6,7 +6,7 @@ use super::plan::CameraPlan;
 use crate::config::RigConfig;
 use depthrig_bus::shm;
 
-/// Bytes that every stream's slots take together; notes what does not fit.
+/// Bytes that every stream's slots take together; notes streams that do not fit.
 pub(super) fn check(
     config: &RigConfig,
     plans: &[CameraPlan],

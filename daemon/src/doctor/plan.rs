@@ -36,13 +36,13 @@ pub struct PlannedStream {
     /// Its mode.
     #[serde(flatten)]
     pub mode: ModeReport,
-    /// What it takes of the USB, Mbit/s; 0 when it is on none.
+    /// Its USB load, Mbit/s; 0 when it is on none.
     pub usb_mbit_s: f64,
     /// Whether it is recorded.
     pub recorded: bool,
 }
 
-/// A plan with what is wrong with it.
+/// A plan with its problems.
 pub(super) struct Planned {
     pub(super) plan: CameraPlan,
     pub(super) findings: Vec<Finding>,
@@ -77,7 +77,7 @@ pub(super) fn mode_missing(device: &AttachedCamera, what: &str) -> Finding {
     )
 }
 
-/// Sets the streams of `plan` to the `chosen` ones and what is computed from them.
+/// Sets the streams of `plan` to the `chosen` ones and those computed from them.
 pub(super) fn set_streams(
     plan: &mut CameraPlan,
     camera: &CameraConfig,
@@ -85,9 +85,9 @@ pub(super) fn set_streams(
     on_usb: bool,
     findings: &mut Vec<Finding>,
 ) {
-    let made = camera.makes(&chosen).unwrap_or_else(|e| {
-        let (why, cure) =
-            ("the camera does not start: its depth cannot be refined", "correct what the message names");
+    let derived = camera.derived_profiles(&chosen).unwrap_or_else(|e| {
+        let why = "the camera does not start: its depth cannot be refined";
+        let cure = "correct what the message names";
         let finding = Finding::new(Severity::Error, "refine_impossible", e.to_string(), why, cure);
         findings.push(finding.of(camera.name.as_str()));
         Vec::new()
@@ -98,8 +98,8 @@ pub(super) fn set_streams(
     });
     let captured: Vec<_> = captured.collect();
     let with_depth = captured.iter().any(|(p, _)| p.stream.as_str() == "depth");
-    for (p, recorded) in captured.into_iter().chain(made) {
-        let on_usb = on_usb && !camera.is_made_here(&p.stream);
+    for (p, recorded) in captured.into_iter().chain(derived) {
+        let on_usb = on_usb && !camera.is_computed_here(&p.stream);
         let bits_per_s = match plan.backend {
             kinect::NAME => kinect::live::wire_bits_per_s(&p, with_depth),
             _ => super::wire_bits_per_s(&p),

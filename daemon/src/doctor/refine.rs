@@ -10,7 +10,7 @@ use depthrig_cdm::{Encoder, EngineKind, find_library};
 /// rough figure, so that only rates that are far off are spoken of.
 const CORE_FLOPS: f64 = 60e9;
 
-/// Notes what keeps the cameras' depth from being refined as the rig file has it.
+/// Notes obstacles to refining the cameras' depth as the rig file has it.
 pub(super) fn check(config: &RigConfig, plans: &[CameraPlan], findings: &mut Vec<Finding>) {
     let refiners = Installed::new(config.cdm.clone());
     let mut needed = 0.0;
@@ -33,7 +33,7 @@ pub(super) fn check(config: &RigConfig, plans: &[CameraPlan], findings: &mut Vec
                 "refining depth as asked for is about {:.0} times what {threads} threads of this CPU do",
                 needed / has
             ),
-            "pairs of pictures are skipped and counted, and what is refined is older than it need be",
+            "pairs of images are skipped and counted, and what is refined is older than it need be",
             "lower rate_hz or input_size in [camera.refine], name fewer cameras, or give it a GPU (device = \"cuda:0\")",
         ));
     }
@@ -41,7 +41,7 @@ pub(super) fn check(config: &RigConfig, plans: &[CameraPlan], findings: &mut Vec
 
 fn of_camera(config: &RigConfig, refine: &RefineConfig, plan: &Plan) -> Vec<Finding> {
     let mut findings = Vec::new();
-    // What stands in is worth knowing; what is missing altogether is an error.
+    // A stand-in is worth knowing; an engine that is missing altogether is an error.
     let (severity, then) = if plan.may_fill {
         (Severity::Warning, "the engine fill stands in: it closes holes and corrects nothing")
     } else {
@@ -81,7 +81,7 @@ fn of_camera(config: &RigConfig, refine: &RefineConfig, plan: &Plan) -> Vec<Find
     findings
 }
 
-/// What the network takes of a CPU for this camera, multiplications and additions a second; 0 when it does not run there.
+/// The network's CPU load for this camera, multiplications and additions a second; 0 when it does not run there.
 fn flops_a_second(config: &RigConfig, camera: &CameraConfig, refine: &RefineConfig, plan: &Plan) -> f64 {
     if !plan.engine.needs_model() || plan.device != "cpu" {
         return 0.0;
@@ -89,13 +89,13 @@ fn flops_a_second(config: &RigConfig, camera: &CameraConfig, refine: &RefineConf
     let looked = plan.model.as_ref().and_then(|m| models::look(&config.cdm, m).ok().flatten());
     let Some((encoder, size)) = looked else { return 0.0 };
     let side = f64::from(refine.input_size.unwrap_or(size));
-    // Pictures are 16:9 where nothing else is known.
+    // Images are 16:9 where nothing else is known.
     let tokens = (side / 14.0) * (side * 16.0 / 9.0 / 14.0);
     let rate = if refine.rate_hz > 0.0 { refine.rate_hz } else { fastest(camera) };
     rate * flops(encoder, tokens)
 }
 
-/// Of one picture: two encoders of `blocks` blocks, each with 12 width² weights and attention over all tokens, and about
+/// Of one image: two encoders of `blocks` blocks, each with 12 width² weights and attention over all tokens, and about
 /// half as much again for the head.
 fn flops(encoder: Encoder, tokens: f64) -> f64 {
     let (width, blocks) = match encoder {

@@ -6,11 +6,11 @@ use super::cameras;
 use super::plan::Planned;
 use super::*;
 use crate::attached::look;
-use crate::attached::tests::{Made, kinect_half, profile, rig_with};
+use crate::attached::tests::{FakeAnswers, kinect_half, profile, rig_with};
 use crate::attached::{Attached, UseState};
 use depthrig_bus::PixelFormat;
 use depthrig_drivers::ErrorKind;
-use depthrig_drivers::usb::made::{MadeDevice, MadeTree};
+use depthrig_drivers::usb::fake::{FakeDevice, FakeTree};
 use std::path::PathBuf;
 
 mod external;
@@ -58,7 +58,7 @@ fn nothing_attached() -> Attached {
     Attached { cameras: Vec::new(), unusable: Vec::new(), not_asked: Vec::new() }
 }
 
-/// The report of a synthetic rig on a computer that `change` was made to.
+/// The report of a synthetic rig on a computer after `change`.
 fn host_report(text: &str, change: impl FnOnce(&mut Host)) -> Report {
     let home = tempfile::tempdir().unwrap();
     let config = config(text);
@@ -139,35 +139,36 @@ fn planned(port: Option<&str>, serial: Option<&str>, attached: &Attached) -> Pla
 }
 
 struct Bus {
-    devices: Vec<MadeDevice>,
-    made: Made,
+    devices: Vec<FakeDevice>,
+    fake: FakeAnswers,
     holder: Option<&'static str>,
 }
 
 impl Default for Bus {
     fn default() -> Self {
-        Self { devices: vec![MadeDevice::new("4-1", 0)], made: Made::default(), holder: None }
+        Self { devices: vec![FakeDevice::new("4-1", 0)], fake: FakeAnswers::default(), holder: None }
     }
 }
 
 fn device_findings(bus: &Bus, port: Option<&str>, serial: Option<&str>) -> Vec<Finding> {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
+    let tree = FakeTree::new(home.path());
     bus.devices.iter().for_each(|d| tree.plug(d));
     if let Some(node) = bus.holder {
         tree.process(4711, "obs", &[node]);
     }
-    let attached = look(tree.root(), &bus.made).unwrap();
+    let attached = look(tree.root(), &bus.fake).unwrap();
     planned(port, serial, &attached).findings
 }
 
 #[test]
 fn every_fault_of_a_camera_has_its_finding() {
     use Severity::{Error, Info, Warning};
-    let two = || vec![MadeDevice::new("4-1", 0), MadeDevice::new("4-2", 10)];
-    let d435 = || MadeDevice::new("4-1", 0);
-    let denied = || Made { denied: (0..6).map(|n| format!("video{n}")).collect(), ..Made::default() };
-    let failing = |kind| Made { failing: vec![("4-1".into(), kind)], ..Made::default() };
+    let two = || vec![FakeDevice::new("4-1", 0), FakeDevice::new("4-2", 10)];
+    let d435 = || FakeDevice::new("4-1", 0);
+    let denied =
+        || FakeAnswers { denied: (0..6).map(|n| format!("video{n}")).collect(), ..FakeAnswers::default() };
+    let failing = |kind| FakeAnswers { failing: vec![("4-1".into(), kind)], ..FakeAnswers::default() };
     let cases: Vec<(&str, Bus, Option<&str>, Option<&str>, &[(&str, Severity)], &str)> = vec![
         ("well", Bus::default(), None, None, &[], ""),
         ("by port", Bus { devices: two(), ..Bus::default() }, Some("4-2"), None, &[], ""),
@@ -223,7 +224,10 @@ fn every_fault_of_a_camera_has_its_finding() {
         ),
         (
             "rig's",
-            Bus { made: Made { rigs: vec![rig_with("4-1")], ..Made::default() }, ..Bus::default() },
+            Bus {
+                fake: FakeAnswers { rigs: vec![rig_with("4-1")], ..FakeAnswers::default() },
+                ..Bus::default()
+            },
             None,
             Some("012345"),
             &[("camera_in_use", Error)],
@@ -231,7 +235,7 @@ fn every_fault_of_a_camera_has_its_finding() {
         ),
         (
             "denied",
-            Bus { made: denied(), ..Bus::default() },
+            Bus { fake: denied(), ..Bus::default() },
             None,
             None,
             &[("permission_denied", Error)],
@@ -239,7 +243,7 @@ fn every_fault_of_a_camera_has_its_finding() {
         ),
         (
             "silent",
-            Bus { made: failing(ErrorKind::Io), ..Bus::default() },
+            Bus { fake: failing(ErrorKind::Io), ..Bus::default() },
             None,
             None,
             &[("camera_failed", Error)],
@@ -247,7 +251,7 @@ fn every_fault_of_a_camera_has_its_finding() {
         ),
         (
             "uncalibrated",
-            Bus { made: Made { uncalibrated: true, ..Made::default() }, ..Bus::default() },
+            Bus { fake: FakeAnswers { uncalibrated: true, ..FakeAnswers::default() }, ..Bus::default() },
             None,
             None,
             &[("calibration_missing", Error)],
@@ -255,7 +259,7 @@ fn every_fault_of_a_camera_has_its_finding() {
         ),
         (
             "no D4XX",
-            Bus { made: Made { no_d4xx: true, ..Made::default() }, ..Bus::default() },
+            Bus { fake: FakeAnswers { no_d4xx: true, ..FakeAnswers::default() }, ..Bus::default() },
             None,
             None,
             &[("metadata_header", Info)],
@@ -263,7 +267,7 @@ fn every_fault_of_a_camera_has_its_finding() {
         ),
         (
             "USB2",
-            Bus { devices: vec![MadeDevice { speed: 480, version: " 2.10", ..d435() }], ..Bus::default() },
+            Bus { devices: vec![FakeDevice { speed: 480, version: " 2.10", ..d435() }], ..Bus::default() },
             None,
             None,
             &[("usb2", Warning)],
@@ -271,7 +275,7 @@ fn every_fault_of_a_camera_has_its_finding() {
         ),
         (
             "sleepy",
-            Bus { devices: vec![MadeDevice { power: "auto", ..d435() }], ..Bus::default() },
+            Bus { devices: vec![FakeDevice { power: "auto", ..d435() }], ..Bus::default() },
             None,
             None,
             &[("autosuspend", Info)],
@@ -280,8 +284,8 @@ fn every_fault_of_a_camera_has_its_finding() {
     ];
     for (name, bus, port, serial, expected, part) in cases {
         let found = device_findings(&bus, port, serial);
-        let told: Vec<_> = found.iter().map(|f| (f.id, f.severity)).collect();
-        assert_eq!(told, expected, "{name}");
+        let seen: Vec<_> = found.iter().map(|f| (f.id, f.severity)).collect();
+        assert_eq!(seen, expected, "{name}");
         let text = all_text(&found);
         assert!(text.contains(part), "{name}: {part} in {text}");
         assert!(found.iter().all(|f| f.camera.as_deref() == Some("front")), "{name}");
@@ -291,9 +295,9 @@ fn every_fault_of_a_camera_has_its_finding() {
 #[test]
 fn a_mode_that_is_missing_is_listed_with_those_there_are() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
-    tree.plug(&MadeDevice { speed: 480, version: " 2.10", ..MadeDevice::new("3-1", 0) });
-    let attached = look(tree.root(), &Made::default()).unwrap();
+    let tree = FakeTree::new(home.path());
+    tree.plug(&FakeDevice { speed: 480, version: " 2.10", ..FakeDevice::new("3-1", 0) });
+    let attached = look(tree.root(), &FakeAnswers::default()).unwrap();
     let text = format!("{FILES}[[camera.stream]]\nname = \"depth\"\n");
     let mut camera = config(&text).cameras.remove(0);
     camera.streams[0].size = Some((848, 480));
@@ -305,18 +309,23 @@ fn a_mode_that_is_missing_is_listed_with_those_there_are() {
 }
 
 /// Plans of cameras at `ports`, each sending depth and colour at this size and rate.
-fn loads_of(ports: &[&str], speed: u32, size: (u32, u32), rate_hz: f64) -> (Vec<LinkLoad>, Vec<Finding>) {
+fn loads_of(
+    ports: &[&str],
+    speed: u32,
+    width: u32,
+    height: u32,
+    rate_hz: f64,
+) -> (Vec<LinkLoad>, Vec<Finding>) {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
+    let tree = FakeTree::new(home.path());
     for (i, port) in ports.iter().enumerate() {
-        tree.plug(&MadeDevice { speed, ..MadeDevice::new(port, 10 * i as u32) });
+        tree.plug(&FakeDevice { speed, ..FakeDevice::new(port, 10 * i as u32) });
     }
-    let attached = look(tree.root(), &Made::default()).unwrap();
+    let attached = look(tree.root(), &FakeAnswers::default()).unwrap();
     let streams = || {
-        let (w, h) = size;
         [
-            profile("depth", PixelFormat::Z16, w, h, rate_hz),
-            profile("color", PixelFormat::Rgb8, w, h, rate_hz),
+            profile("depth", PixelFormat::Z16, width, height, rate_hz),
+            profile("color", PixelFormat::Rgb8, width, height, rate_hz),
         ]
     };
     let plans: Vec<_> = ports
@@ -355,7 +364,7 @@ fn what_streams_take_of_the_bus_is_that_of_the_notes() {
 #[test]
 fn seven_cameras_at_30_need_a_second_controller_and_at_15_one_will_do() {
     let ports = ["4-1", "4-2", "4-3.1", "4-3.2", "4-3.3", "4-4", "4-5"];
-    let (links, findings) = loads_of(&ports, 5000, (1280, 720), 30.0);
+    let (links, findings) = loads_of(&ports, 5000, 1280, 720, 30.0);
     let worst = &links[0];
     assert_eq!(worst.link, "USB3 of controller 0000:00:14.0");
     assert_eq!(
@@ -368,18 +377,18 @@ fn seven_cameras_at_30_need_a_second_controller_and_at_15_one_will_do() {
     let hub = links.iter().find(|l| l.link == "hub at USB port 4-3").unwrap();
     assert_eq!(hub.cameras, ["at 4-3.1", "at 4-3.2", "at 4-3.3"]);
 
-    let (_, findings) = loads_of(&ports, 5000, (640, 480), 15.0);
+    let (_, findings) = loads_of(&ports, 5000, 640, 480, 15.0);
     assert_eq!(findings, []);
-    let (_, findings) = loads_of(&ports, 5000, (1280, 720), 15.0);
+    let (_, findings) = loads_of(&ports, 5000, 1280, 720, 15.0);
     assert_eq!(findings[0].id, "bandwidth_tight");
 }
 
 #[test]
 fn two_buses_of_a_controller_are_two_and_two_controllers_are_two() {
-    let (links, _) = loads_of(&["4-1"], 480, (640, 480), 30.0);
-    assert_eq!(links.len(), 1, "a link with the same cameras is told once: {links:?}");
+    let (links, _) = loads_of(&["4-1"], 480, 640, 480, 30.0);
+    assert_eq!(links.len(), 1, "a link with the same cameras is reported once: {links:?}");
     assert_eq!((links[0].link.as_str(), links[0].plan_mbit_s), ("USB port 4-1", 300.0));
-    let (_, findings) = loads_of(&["4-1"], 480, (1280, 720), 15.0);
+    let (_, findings) = loads_of(&["4-1"], 480, 1280, 720, 15.0);
     assert_eq!((findings[0].id, findings[0].severity), ("bandwidth_exceeded", Severity::Error));
     assert_eq!(findings[0].camera.as_deref(), Some("at 4-1"));
 }
@@ -387,9 +396,9 @@ fn two_buses_of_a_controller_are_two_and_two_controllers_are_two() {
 #[test]
 fn transfers_over_libusb_are_held_against_the_limit() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
-    tree.plug(&MadeDevice::new("4-1", 0));
-    let attached = look(tree.root(), &Made::default()).unwrap();
+    let tree = FakeTree::new(home.path());
+    tree.plug(&FakeDevice::new("4-1", 0));
+    let attached = look(tree.root(), &FakeAnswers::default()).unwrap();
     let mut plan = planned(None, None, &attached).plan;
     let found = |limit: &str, plan: &CameraPlan| {
         tree.file("sys/module/usbcore/parameters/usbfs_memory_mb", limit);
@@ -407,10 +416,10 @@ fn transfers_over_libusb_are_held_against_the_limit() {
 #[test]
 fn what_is_attached_and_not_named_is_told_only_to_a_rig_of_real_cameras() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
-    tree.plug(&MadeDevice::new("4-1", 0));
-    tree.plug(&MadeDevice::new("4-2", 10));
-    let attached = look(tree.root(), &Made::default()).unwrap();
+    let tree = FakeTree::new(home.path());
+    tree.plug(&FakeDevice::new("4-1", 0));
+    tree.plug(&FakeDevice::new("4-2", 10));
+    let attached = look(tree.root(), &FakeAnswers::default()).unwrap();
     assert!(attached.cameras.iter().all(|c| c.state == UseState::Free));
     let config = config(FILES);
     let report = judge(&config, &attached, cameras::plan(&config, &attached), &well(tree.root().clone()));
@@ -463,7 +472,7 @@ fn what_keeps_depth_from_being_refined_is_found() {
         ("d435", "engine = \"off\"", &[], ""),
         ("d435", "", &[("refine_fill", Info)], "cdm-d435"),
         ("generic", "", &[("refine_fill", Info)], "no camera depth model is known for"),
-        // The library stands in a place where there is none.
+        // The library is set to a path that does not exist.
         ("d415", "rate_hz = 0.01", &[("engine_missing", Warning)], "fill stands in"),
         ("d415", "engine = \"onnxruntime\"\nrate_hz = 0.01", &[engine], "/none/such.so"),
         ("d415", "engine = \"onnxruntime\"\nrate_hz = 0.01\nmodel = \"lab\"", &[engine], "stays silent"),
@@ -503,49 +512,49 @@ serial = "000123456789"
 "#;
 
 /// The report of [`KINECT`] with a Kinect attached.
-fn kinect_report(text: &str, made: &Made, change: impl FnOnce(&mut Host)) -> Report {
+fn kinect_report(text: &str, fake: &FakeAnswers, change: impl FnOnce(&mut Host)) -> Report {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
+    let tree = FakeTree::new(home.path());
     tree.plug(&kinect_half("2-1.1", 0x097c, "000123456789", 0));
     tree.plug(&kinect_half("2-1.2", 0x097d, "000123456789", 10));
     let config = config(text);
     let mut host = well(tree.root().clone());
     change(&mut host);
-    let attached = look(tree.root(), made).unwrap();
+    let attached = look(tree.root(), fake).unwrap();
     judge(&config, &attached, cameras::plan(&config, &attached), &host)
 }
 
 #[test]
 fn what_a_kinect_misses_is_said_once() {
     let named = KINECT.replace("serial = \"000123456789\"", "port = \"2-1.1\"");
-    assert_eq!(ids(&kinect_report(&named, &Made::default(), |_| {})), []);
+    assert_eq!(ids(&kinect_report(&named, &FakeAnswers::default(), |_| {})), []);
     let failing = vec![("2-1.1".to_owned(), ErrorKind::BadInput)];
-    let made = Made { failing, ..Made::default() };
+    let fake = FakeAnswers { failing, ..FakeAnswers::default() };
     let no_library = |h: &mut Host| {
         h.kinect.missing = vec![("overhead".into(), Missing::Library, "libk4a is not installed".into())];
         h.kinect.has_display = false;
     };
-    let report = kinect_report(KINECT, &made, no_library);
+    let report = kinect_report(KINECT, &fake, no_library);
     assert_eq!(ids(&report), [("kinect_library", Severity::Error)], "neither that it failed nor a display");
     assert!(report.findings[0].cure.contains("packages.microsoft.com"));
     assert_eq!(report.cameras[0].device.as_deref(), Some("Azure Kinect 000123456789 at USB port 2-1.1"));
     let no_engine =
         |h: &mut Host| h.kinect.missing = vec![("overhead".into(), Missing::Engine, "no engine".into())];
     assert_eq!(
-        ids(&kinect_report(&named, &Made::default(), no_engine)),
+        ids(&kinect_report(&named, &FakeAnswers::default(), no_engine)),
         [("kinect_engine", Severity::Error)]
     );
-    let report = kinect_report(&named, &Made::default(), |h| h.kinect.has_display = false);
+    let report = kinect_report(&named, &FakeAnswers::default(), |h| h.kinect.has_display = false);
     assert_eq!(ids(&report), [("kinect_display", Severity::Warning)]);
     let color = format!("{named}[[camera.stream]]\nname = \"color\"\n");
-    assert_eq!(ids(&kinect_report(&color, &Made::default(), |h| h.kinect.has_display = false)), []);
+    assert_eq!(ids(&kinect_report(&color, &FakeAnswers::default(), |h| h.kinect.has_display = false)), []);
 }
 
 #[test]
 fn depth_of_a_kinect_takes_of_the_bus_what_its_raw_phases_take() {
     let named = KINECT.replace("serial = \"000123456789\"", "port = \"2-1.1\"");
     let depth = format!("{named}[[camera.stream]]\nname = \"depth\"\nwidth = 640\nheight = 480\n");
-    let report = kinect_report(&depth, &Made::default(), |_| {});
+    let report = kinect_report(&depth, &FakeAnswers::default(), |_| {});
     let load = report.cameras[0].streams[0].usb_mbit_s;
     assert!((load - 5_310_760.0 * 8.0 * 30.0 / 1e6).abs() < 0.1, "{load}");
 }
@@ -553,7 +562,7 @@ fn depth_of_a_kinect_takes_of_the_bus_what_its_raw_phases_take() {
 #[test]
 fn two_kinects_need_more_memory_for_transfers_than_the_kernel_gives() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
+    let tree = FakeTree::new(home.path());
     tree.file("sys/module/usbcore/parameters/usbfs_memory_mb", "16");
     let plan = |port: &str| CameraPlan {
         name: port.into(),

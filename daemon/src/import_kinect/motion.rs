@@ -1,7 +1,7 @@
-//! The motion unit of a recording that is imported: its samples in batches, each with its set.
+//! The IMU of a recording that is imported: its samples in batches, each with its set.
 //!
-//! A batch goes with the first set that is not earlier than its newest sample and was not handed on yet, and what comes
-//! after the last set with the last. So nothing is left out but of a file without a picture, or with a minute without one.
+//! A batch goes with the first set that is not earlier than its newest sample and was not handed on yet, and batches
+//! after the last set with the last. So nothing is left out, unless a file has no image at all or none for a minute.
 
 use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameHeader, MotionSample, PixelFormat};
 use depthrig_drivers::kinect::motion::{Measured, Samples, is_plausible};
@@ -15,7 +15,7 @@ const MOST_WAITING: usize = 1500;
 /// The device's clock counts microseconds.
 const UNCERTAINTY_NS: u32 = 1000;
 
-/// The unit, its account and what waits for a set.
+/// The IMU, its account and the batches that wait for a set.
 pub(super) struct Unit {
     record: MotionRecord,
     track: usize,
@@ -72,7 +72,7 @@ impl Unit {
         self.waiting.iter().map(|b| b.samples.len() as u64).sum()
     }
 
-    /// What became of its batches.
+    /// Account of its batches.
     pub(super) fn account(&self) -> StreamAccount {
         let delivered = self.batches - self.waiting.len() as u64;
         StreamAccount {
@@ -86,7 +86,7 @@ impl Unit {
     /// Takes the samples of a frame of the block at `device_us`; UTC at the device's time 0 is `origin_ns`.
     pub(super) fn take(&mut self, frame: &[u8], device_us: u64, origin_ns: i64) {
         for raw in motion_samples(frame) {
-            // As pictures: what is not later than the one before has no place, nor what cannot be its time.
+            // As images: a sample not later than the one before is left out, and one with an implausible time.
             let is_late = self.newest_ns.is_some_and(|newest| raw.gyroscope_ns < newest);
             if is_late || !is_plausible(raw.gyroscope_ns, device_us) {
                 self.left_out += 1;
@@ -138,7 +138,7 @@ impl Unit {
         };
         header.set_names("rig", &self.record.id);
         header.set_device(&self.record.model, &self.record.serial);
-        header.set_picture(PixelFormat::Motion, samples.len() as u32, 1);
+        header.set_image(PixelFormat::Motion, samples.len() as u32, 1);
         self.waiting.push_back(RecordMotion { unit: 0, header, samples });
     }
 
@@ -150,7 +150,7 @@ impl Unit {
         }
     }
 
-    /// Gives the last set what is left; without one it is left out.
+    /// Gives the last set the remaining batches; without one they are left out.
     pub(super) fn end(&mut self, last: Option<&mut RecordSet>) {
         self.close();
         let rest = core::mem::take(&mut self.waiting);

@@ -11,13 +11,13 @@ use std::path::Path;
 /// The longest time that can be asked for, seconds: ten years.
 const MAX_DURATION_S: f64 = 3.2e8;
 
-/// What a motion sample takes on the disk, bytes: its 64 exact ones, and the message for other readers (about 330 bytes, most
+/// Bytes of an IMU sample on the disk: its 64 exact ones, and the message for other readers (about 330 bytes, most
 /// of them zero).
 const SAMPLE_BYTES: f64 = 160.0;
 
-/// By how much a codec is taken to shrink a picture. Each is about two thirds of what was measured on recordings of
+/// By how much a codec is taken to shrink an image. Each is about two thirds of the ratio measured on recordings of
 /// real cameras (depth: zstd 3.5, rank 7.0; colour: JPEG of quality 95 with 4:4:4 11, PNG 2.4, zstd 2.0): a busier
-/// scene packs worse, and to have been told too little costs a recording. Above quality 95 JPEG grows fast.
+/// scene packs worse, and an estimate that is too low costs a recording. Above quality 95 JPEG grows fast.
 fn ratio(format: PixelFormat, config: &RecordingConfig) -> f64 {
     match (format, config.color, config.depth) {
         (PixelFormat::Z16, _, DepthCodec::Zstd) => 2.5,
@@ -25,7 +25,7 @@ fn ratio(format: PixelFormat, config: &RecordingConfig) -> f64 {
         (PixelFormat::Rgb8 | PixelFormat::Bgr8, ColorCodec::Jpeg, _) if config.jpeg_quality > 95 => 3.0,
         (PixelFormat::Rgb8 | PixelFormat::Bgr8, ColorCodec::Jpeg, _) => 7.0,
         (PixelFormat::Rgb8 | PixelFormat::Bgr8, ColorCodec::Png, _) => 1.6,
-        // Cameras send a JPEG of 2 bits a pixel or so; the driver's bound on it is what is counted here.
+        // Cameras send a JPEG of 2 bits a pixel or so; this is the driver's bound on it.
         (PixelFormat::Mjpeg, ..) => 4.0,
         // Infrared, floats and packed colour were not measured; noise in the low bits packs badly.
         _ => 1.4,
@@ -42,7 +42,7 @@ pub fn bytes_per_s(
     streams.map(|(format, bytes)| bytes as f64 / ratio(format, config)).sum::<f64>() * sets_hz
 }
 
-/// About how many bytes a second the motion units write that measure `samples_hz` times a second together.
+/// About how many bytes a second the IMUs write that measure `samples_hz` times a second together.
 pub fn motion_bytes_per_s(samples_hz: f64) -> f64 {
     samples_hz * SAMPLE_BYTES
 }
@@ -50,7 +50,7 @@ pub fn motion_bytes_per_s(samples_hz: f64) -> f64 {
 /// Refuses a time that no recording can have.
 ///
 /// # Errors
-/// `BadInput` for what is not above 0 and below ten years.
+/// `BadInput` for a time that is not above 0 and below ten years.
 pub fn check_duration(request: &RecordRequest) -> Result<()> {
     match request.max_duration_s {
         Some(s) if !(s > 0.0 && s < MAX_DURATION_S) => Err(Error::new(
@@ -78,7 +78,7 @@ pub fn check(
     if request.force || wanted_s <= 0.0 || bytes_per_s <= 0.0 {
         return Ok(());
     }
-    // What the disk does not say cannot be compared; the recorder says what is wrong with the folder.
+    // Free space that the disk does not report cannot be compared; the recorder reports problems of the folder.
     let Some(free) = free_above(fs, dir) else { return Ok(()) };
     let room = free.saturating_sub(reserve) as f64;
     let needed = wanted_s * bytes_per_s;

@@ -1,11 +1,11 @@
-//! What a recording needs to know of the streams that it is made of, and how `session.toml` lists them.
+//! Facts about the streams of a recording, and how `session.toml` lists them.
 
 use crate::stream::Stream;
 use depthrig_calib::PoseExt;
 use depthrig_recorder::StreamRecord;
 use std::sync::Arc;
 
-/// What a recording needs to know of a camera's stream.
+/// Facts about a camera's stream that a recording needs.
 pub struct StreamFacts {
     /// The stream.
     pub stream: Arc<Stream>,
@@ -17,11 +17,11 @@ pub struct StreamFacts {
     pub calibration: String,
     /// Pose of its camera on the mount.
     pub camera_pose: depthrig_bus::Pose,
-    /// What computed it, if it is no camera's.
+    /// The algorithm that computed it; `None` for a camera's own stream.
     pub computed: Option<depthrig_recorder::Computed>,
 }
 
-/// How `session.toml` lists a stream of pictures.
+/// How `session.toml` lists a stream of images.
 pub(super) fn record_of(s: &StreamFacts) -> StreamRecord {
     let p = &s.stream.profile;
     StreamRecord {

@@ -1,8 +1,9 @@
-//! Motion samples on their way into a recording: batches wait for the next set that is handed over, in the order in which
+//! IMU batches on their way into a recording: they wait for the next set that is handed over, in the order in which
 //! they came.
 //!
-//! Of a unit at most [`PATIENCE_S`] of batches wait, or those of two sets where sets are rarer than that, but no more than
-//! its share of what one set may hold; the oldest go first, and are counted. What still waits when a recording ends came after its last set and is no part of it.
+//! Of an IMU at most [`TIMEOUT_S`] of batches wait, or those of two sets where sets are rarer than that, but no more
+//! than its share of what one set may hold; the oldest go first, and are counted. Batches that still wait when a
+//! recording ends came after its last set and are not recorded.
 
 use super::StreamFacts;
 use crate::status::SetAccount;
@@ -14,11 +15,11 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 /// How long batches wait for a set, seconds.
-const PATIENCE_S: f64 = 4.0;
+const TIMEOUT_S: f64 = 4.0;
 /// Batches a second of a unit whose batches are sent before they are full: none waits for more than 100 ms.
 const LEAST_HZ: f64 = 10.0;
 
-/// The motion units of one recording.
+/// The IMUs of one recording.
 pub(super) struct Units {
     units: Vec<Unit>,
     waiting: VecDeque<RecordMotion>,
@@ -33,11 +34,11 @@ struct Unit {
     handed: u64,
     /// Batches that were lost on the way here: replaced on the channel, or pushed out while they waited.
     lost: u64,
-    /// What had been lost before the recording.
+    /// Losses before the recording.
     dropped: DropCounts,
 }
 
-/// What became of a batch.
+/// Fate of a batch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Heard {
     /// It waits for the next set.
@@ -54,7 +55,7 @@ impl Units {
         let share = SET_MOTION_MAX_BYTES / units.len().max(1) as u64;
         let most = |s: &StreamFacts| {
             let profile = &s.stream.profile;
-            let of_sets = (profile.rate_hz.max(LEAST_HZ) * PATIENCE_S.max(2.0 / sets_hz)).ceil();
+            let of_sets = (profile.rate_hz.max(LEAST_HZ) * TIMEOUT_S.max(2.0 / sets_hz)).ceil();
             let fit = share / RecordMotion::stored_bytes_of(profile.width.into());
             (of_sets as u64).min(fit).max(1) as usize
         };
@@ -69,7 +70,7 @@ impl Units {
         Self { units: units.iter().map(unit).collect(), waiting: VecDeque::new() }
     }
 
-    /// The recording begins now: what is lost from here on is its loss.
+    /// The recording begins now: losses from here on are its own.
     pub(super) fn begin(&mut self) {
         for unit in &mut self.units {
             unit.dropped = unit.stream.books().dropped;
@@ -104,7 +105,7 @@ impl Units {
         self.waiting.drain(..).collect()
     }
 
-    /// Counts what goes to the recorder with a set.
+    /// Counts the batches that go to the recorder with a set.
     pub(super) fn hand_over(&mut self, motion: &[RecordMotion]) {
         for batch in motion {
             if let Some(unit) = self.units.get_mut(batch.unit) {
@@ -113,7 +114,7 @@ impl Units {
         }
     }
 
-    /// What the units delivered and lost since the recording began, but for what waits.
+    /// Accounts of the IMUs since the recording began, except for batches that wait.
     pub(super) fn accounts(&self) -> impl Iterator<Item = StreamAccount> + '_ {
         self.units.iter().map(|u| {
             let mut dropped = u.stream.books().dropped;
@@ -131,7 +132,7 @@ impl Units {
     }
 }
 
-/// What became of every unit's batches over all recordings and between them.
+/// Accounts of every IMU's batches over all recordings and between them.
 #[derive(Default)]
 pub(super) struct Books(BTreeMap<StreamId, SetAccount>);
 
@@ -161,7 +162,7 @@ impl Books {
         units.take()
     }
 
-    /// The recording of `units` ends: what waits there came after its last set.
+    /// The recording of `units` ends: waiting batches came after its last set.
     pub(super) fn end(&mut self, units: &mut Units) {
         for unit in &mut units.units {
             let left = core::mem::take(&mut unit.waiting) as u64;

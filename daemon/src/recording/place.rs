@@ -7,7 +7,7 @@ use depthrig_recorder::check_name;
 use std::path::PathBuf;
 use time::OffsetDateTime;
 
-/// What of a scene's label goes into a folder's name, bytes. With date and suffix a name stays far below the 255
+/// Bytes of a scene's label that go into a folder's name. With date and suffix a name stays far below the 255
 /// that file systems allow.
 const SCENE_MAX_BYTES: usize = 80;
 
@@ -35,7 +35,8 @@ pub fn place(config: &RecordingConfig, request: &RecordRequest, utc_ns: i64) -> 
 fn default_name(scene: &str, utc_ns: i64) -> String {
     let t =
         OffsetDateTime::from_unix_timestamp_nanos(i128::from(utc_ns)).unwrap_or(OffsetDateTime::UNIX_EPOCH);
-    let (date, clock) = (t.date(), t.time());
+    let date = t.date();
+    let clock = t.time();
     let mut name = format!(
         "{:04}{:02}{:02}_{:02}{:02}",
         date.year(),
@@ -108,7 +109,7 @@ mod tests {
             place(&config, &request, UTC_NS)
         };
         std::fs::create_dir(home.path().join("mine")).unwrap();
-        // The recorder refuses a folder that holds anything; another name would not be what was asked for.
+        // The recorder refuses a folder that holds anything; another name would not be the requested one.
         assert_eq!(asked("mine").unwrap().1, home.path().join("mine"));
         for bad in ["../up", "", ".hidden", &"x".repeat(300)] {
             assert_eq!(asked(bad).unwrap_err().kind(), ErrorKind::BadInput, "{bad}");

@@ -1,4 +1,4 @@
-//! What a crash left unfinished is recovered when the rig starts, beside its work.
+//! Recovers recordings that a crash left unfinished, when the rig starts and beside its work.
 
 use crate::config::RigConfig;
 use core::ops::ControlFlow;
@@ -7,8 +7,8 @@ use depthrig_recorder::{RecoverOptions, recover_with, unfinished_in};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Recovers this rig's unfinished datasets in its recording folder, one after the other, until `stop`. What goes
-/// wrong is logged and costs nothing; `depthrig recover` can be run by hand.
+/// Recovers this rig's unfinished datasets in its recording folder, one after the other, until `stop`. Errors
+/// are logged and cost nothing; `depthrig recover` can be run by hand.
 pub fn recover_left(config: &RigConfig, fs: &Arc<dyn Fs>, stop: &AtomicBool) {
     let folder = &config.recording.directory;
     let found = match unfinished_in(fs, folder, config.rig.as_str()) {
@@ -18,7 +18,7 @@ pub fn recover_left(config: &RigConfig, fs: &Arc<dyn Fs>, stop: &AtomicBool) {
             return;
         }
     };
-    // What is long finished is not read: that takes hours on a full disk.
+    // Datasets that were finished long ago are not read: that takes hours on a full disk.
     let options = RecoverOptions { unfinished_only: true, ..RecoverOptions::default() };
     for path in found {
         let dataset = path.display();

@@ -1,4 +1,4 @@
-//! The quality reports of finished recordings, made beside whatever comes next and never in its way.
+//! The quality reports of finished recordings, written in the background.
 
 use core::ops::ControlFlow;
 use core::time::Duration;
@@ -12,9 +12,9 @@ use std::thread::JoinHandle;
 
 /// Reports that may be in work at once; a further one is left to `depthrig report`.
 const MAX: usize = 4;
-/// How long the end of the daemon waits for reports; what is not written then is left to `depthrig report`.
-const PATIENCE: Duration = Duration::from_secs(10);
-/// What the kernel gives such a thread: what nobody else wants.
+/// How long the end of the daemon waits for reports; one not written then is left to `depthrig report`.
+const TIMEOUT: Duration = Duration::from_secs(10);
+/// Niceness of such a thread: it runs when no other wants to.
 const NICE: i32 = 19;
 
 /// The reports in work.
@@ -25,8 +25,8 @@ pub struct Reports {
 }
 
 impl Reports {
-    /// Begins the report of the finished dataset `path` and returns at once. A report that cannot be made is a
-    /// line in the log; the recording is what it is without it.
+    /// Begins the report of the finished dataset `path` and returns at once. A report that fails is a
+    /// line in the log; the recording is the same without it.
     pub fn begin(&self, path: PathBuf) {
         let mut threads = self.threads.lock().unwrap_or_else(PoisonError::into_inner);
         threads.retain(|t| !t.is_finished());
@@ -44,9 +44,9 @@ impl Reports {
         }
     }
 
-    /// Waits for the reports in work, for some seconds at most; what is not done then is left out.
+    /// Waits for the reports in work, for some seconds at most; reports not done then are left out.
     pub fn finish(&self) {
-        let deadline = HostTime::now().plus(PATIENCE);
+        let deadline = HostTime::now().plus(TIMEOUT);
         let threads = std::mem::take(&mut *self.threads.lock().unwrap_or_else(PoisonError::into_inner));
         for thread in threads {
             while !thread.is_finished() && !deadline.from_now().is_zero() {
@@ -65,15 +65,15 @@ fn write(path: &Path, stop: &AtomicBool) {
     let _ = rustix::process::nice(NICE);
     let mut go_on =
         |_| if stop.load(Ordering::Relaxed) { ControlFlow::Break(()) } else { ControlFlow::Continue(()) };
-    let made = Dataset::open(path).and_then(|dataset| {
+    let written = Dataset::open(path).and_then(|dataset| {
         let report = Report::of(&dataset, &ReportOptions::default(), &mut go_on)?;
         let page = path.join(REPORT_FILE);
         report.map(|report| report.write(&fs::RealFs, &page).map(|()| page)).transpose()
     });
-    match made {
+    match written {
         Ok(Some(page)) => tracing::info!(report = %page.display(), "the report is written"),
         Ok(None) => tracing::info!(
-            "stopped before the report was made; make it with: depthrig report {}",
+            "stopped before the report was written; write it with: depthrig report {}",
             path.display()
         ),
         Err(e) => tracing::warn!("the report of {} could not be written: {e}", path.display()),

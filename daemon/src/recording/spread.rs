@@ -2,7 +2,7 @@
 
 use super::StreamFacts;
 use crate::rig::near_pair_ns;
-use depthrig_drivers::stereo::{COLOR, EYES, StereoOptions};
+use depthrig_drivers::stereo::{COLOR, SIDES, StereoOptions};
 
 /// How far from the tick the frame of a stream may be: half of its period and a millisecond (see `sets`). Depth by stereo is
 /// of the set's pair or of one that stands in for it. `None` when the stream does not say how fast it is.
@@ -13,8 +13,9 @@ pub(super) fn reach_ns<'s>(
 ) -> Option<i64> {
     let half = |hz: f64| (hz > 0.0).then(|| (0.5e9 / hz).ceil() as i64 + 1_000_000);
     let is_source = |s: &&StreamFacts| {
-        let (id, name) = (&s.stream.id, s.stream.id.stream.as_str());
-        id.camera == of.stream.id.camera && (name == COLOR || EYES.contains(&name))
+        let id = &s.stream.id;
+        let name = s.stream.id.stream.as_str();
+        id.camera == of.stream.id.camera && (name == COLOR || SIDES.contains(&name))
     };
     let late = StereoOptions::is_late(of.stream.id.stream.as_str());
     let Some(pairs) = streams.find(is_source).filter(|_| late) else {

@@ -1,4 +1,4 @@
-//! Refines every picture of a dataset into files, a few sets in each: what a killed run goes on with.
+//! Refines every image of a dataset into files, a few sets in each: a killed run goes on with them.
 
 use super::{Camera, Engine, RelabelOptions, cannot};
 use crate::stage::Refiners;
@@ -14,9 +14,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::PoisonError;
 
-/// Sets of a file: what a killed run repeats at most, for each thread.
+/// Sets of a file: a killed run repeats at most these, for each thread.
 const PART_SETS: usize = 10;
-/// Bytes before each picture: number of the set, index of the camera, length.
+/// Bytes before each image: number of the set, index of the camera, length.
 const HEAD: usize = 16;
 
 pub(super) struct Refine<'a> {
@@ -38,8 +38,8 @@ impl Exporter for Refine<'_> {
 
     fn options(&self) -> Value {
         let describe = |camera: &Camera| {
-            let made = &self.engines[camera.engine].description;
-            json!({ "stream": camera.id.to_string(), "engine": made.engine, "model": made.model })
+            let used = &self.engines[camera.engine].description;
+            json!({ "stream": camera.id.to_string(), "engine": used.engine, "model": used.model })
         };
         let cameras: Vec<_> = self.cameras.iter().map(describe).collect();
         let refine = &self.options.refine;
@@ -86,7 +86,7 @@ pub(super) fn pair<'a>(set: &'a DatasetSet, camera: &Camera) -> Option<(&'a Data
     Some((of(camera.color)?, of(camera.depth)?))
 }
 
-/// The unit of what is refined from depth of this header, metres.
+/// The unit of depth that is refined from depth of this header, metres.
 pub(super) fn unit_of(depth: &FrameHeader) -> f64 {
     if depth.format == depthrig_bus::PixelFormat::DepthF32 as u32 {
         pixels::UNIT_OF_METRES
@@ -108,17 +108,17 @@ impl Refine<'_> {
             let id = &camera.id;
             Error::new(
                 ErrorKind::BadInput,
-                format!("{id} cannot be made of frame {}: {why}", depth.header.sequence),
+                format!("{id} cannot be computed from frame {}: {why}", depth.header.sequence),
             )
         };
         let (registered, unit_m) =
             view.depth(&self.options.refine, &color.header, &depth.header, &depth.pixels).map_err(bad)?;
-        let picture = pixels::color(&color.header, &color.pixels).map_err(|e| bad(e.to_string()))?;
-        let mut out = vec![0; picture.width * picture.height];
+        let image = pixels::color(&color.header, &color.pixels).map_err(|e| bad(e.to_string()))?;
+        let mut out = vec![0; image.width * image.height];
         let engine = &self.engines[camera.engine];
         let mut refiner = self.take(engine)?;
         let mut job = [Job {
-            color: picture,
+            color: image,
             depth: RawDepth { pixels: registered, unit_m },
             out: Refined::Units { pixels: &mut out, unit_m },
             steps: StepTimes::default(),
@@ -138,27 +138,27 @@ impl Refine<'_> {
     }
 }
 
-/// What was refined, by number of the set and index of the camera; read a file at a time, in order.
+/// Refined images, by number of the set and index of the camera; read a file at a time, in order.
 pub(super) struct Store {
     dir: std::path::PathBuf,
-    pictures: BTreeMap<(usize, usize), Vec<u8>>,
+    images: BTreeMap<(usize, usize), Vec<u8>>,
 }
 
 impl Store {
     pub(super) fn new(dir: &Path) -> Self {
-        Self { dir: dir.to_owned(), pictures: BTreeMap::new() }
+        Self { dir: dir.to_owned(), images: BTreeMap::new() }
     }
 
-    /// The packed picture of a set and a camera; `None` when there is none.
+    /// The packed image of a set and a camera; `None` when the file has no such image.
     pub(super) fn take(&mut self, number: usize, camera: usize) -> Result<Option<Vec<u8>>> {
         self.begin(number)?;
-        Ok(self.pictures.remove(&(number, camera)))
+        Ok(self.images.remove(&(number, camera)))
     }
 
     /// Reads the file that begins with this set, if one does.
     fn begin(&mut self, number: usize) -> Result<()> {
         let path = self.dir.join(file_name(number));
-        if self.pictures.keys().next().is_some_and(|(first, _)| *first >= number) {
+        if self.images.keys().next().is_some_and(|(first, _)| *first >= number) {
             return Ok(());
         }
         let bytes = match files::read(&path, files::IMAGE_MAX_BYTES) {
@@ -170,10 +170,10 @@ impl Store {
                 );
             }
         };
-        self.pictures.clear();
+        self.images.clear();
         let mut rest = bytes.as_slice();
         while !rest.is_empty() {
-            let picture = record(rest).ok_or_else(|| {
+            let image = record(rest).ok_or_else(|| {
                 let what = format!(
                     "{} is not as it was written; remove {} and begin anew",
                     path.display(),
@@ -181,19 +181,19 @@ impl Store {
                 );
                 Error::new(ErrorKind::Corrupt, what)
             })?;
-            rest = &rest[HEAD + picture.1.len()..];
-            self.pictures.insert(picture.0, picture.1.to_vec());
+            rest = &rest[HEAD + image.1.len()..];
+            self.images.insert(image.0, image.1.to_vec());
         }
         Ok(())
     }
 }
 
-/// The first picture in `bytes` with its number and camera.
+/// The first image in `bytes` with its number and camera.
 fn record(bytes: &[u8]) -> Option<((usize, usize), &[u8])> {
     let (head, rest) = bytes.split_first_chunk::<HEAD>()?;
     let number = u64::from_le_bytes(*head.first_chunk()?);
     let camera = u32::from_le_bytes(*head[8..].first_chunk()?);
     let len = u32::from_le_bytes(*head[12..].first_chunk()?);
-    let picture = rest.get(..len as usize)?;
-    Some(((usize::try_from(number).ok()?, camera as usize), picture))
+    let image = rest.get(..len as usize)?;
+    Some(((usize::try_from(number).ok()?, camera as usize), image))
 }

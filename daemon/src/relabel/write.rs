@@ -57,7 +57,8 @@ impl<'a> Write<'a> {
         session.name = out.file_name().unwrap_or_default().to_string_lossy().into_owned();
         session.outcome = None;
         for camera in cameras {
-            let (color, depth) = (&source.streams[camera.color], &source.streams[camera.depth]);
+            let color = &source.streams[camera.color];
+            let depth = &source.streams[camera.depth];
             session.streams.push(StreamRecord {
                 id: camera.id.clone(),
                 format: PixelFormat::Z16,
@@ -103,7 +104,7 @@ impl<'a> Write<'a> {
         &self.written
     }
 
-    /// The refined frame of a camera, if its set has what it is made of.
+    /// The refined frame of a camera, if its set has its colour and depth.
     fn refined(&mut self, number: usize, set: &DatasetSet, at: usize) -> Result<Option<RecordFrame>> {
         let camera = &self.cameras[at];
         let Some((color, depth)) = pair(set, camera) else { return Ok(None) };
@@ -153,16 +154,18 @@ impl Importer for Write<'_> {
                     continue;
                 }
             };
-            let mut made = Vec::new();
+            let mut refined = Vec::new();
             let mut missing = set.missing.clone();
             for at in 0..self.cameras.len() {
                 match self.refined(number, &set, at)? {
-                    Some(frame) => made.push(frame),
+                    Some(frame) => refined.push(frame),
                     None => missing.push(self.streams + at),
                 }
             }
             let utc_ns = set.tick.ns().saturating_add(set.utc_offset_ns);
-            let (id, tick, spread_ns) = (set.id, set.tick, set.spread_ns);
+            let id = set.id;
+            let tick = set.tick;
+            let spread_ns = set.spread_ns;
             let mut frames: Vec<_> = set
                 .frames
                 .into_iter()
@@ -171,7 +174,7 @@ impl Importer for Write<'_> {
                     RecordFrame { stream: f.stream, header: f.header, pixels }
                 })
                 .collect();
-            frames.append(&mut made);
+            frames.append(&mut refined);
             let utc = UtcPair { mono: tick, utc_ns, width_ns: 0 };
             let motion = set.motion;
             return Ok(Some(RecordSet { id, tick, utc, frames, missing, motion, spread_ns }));

@@ -17,13 +17,16 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 /// How long a command waits for its set to be published; it will be, later.
-const PATIENCE: Duration = Duration::from_secs(3);
+const TIMEOUT: Duration = Duration::from_secs(3);
 
 impl Inner {
     /// How far the replay has come.
     pub(super) fn replay_status(&self) -> ReplayStatus {
         let t = lock(&self.transport);
-        let (paused, rate, looped, rounds) = (t.is_paused(), t.rate(), t.is_looped(), t.rounds());
+        let paused = t.is_paused();
+        let rate = t.rate();
+        let looped = t.is_looped();
+        let rounds = t.rounds();
         drop(t);
         let n = lock(&self.numbers);
         let seconds = |ns: i64| ns as f64 / 1e9;
@@ -48,19 +51,19 @@ impl Inner {
         }
     }
 
-    /// Waits until what a command asked for was published.
+    /// Waits until the effect of a command was published.
     fn settle(&self) -> ReplayStatus {
         self.wake.raise();
         let transport = lock(&self.transport);
         let waited = self
             .acted
-            .wait_timeout_while(transport, PATIENCE, |t| t.is_showing() && !self.stopping())
+            .wait_timeout_while(transport, TIMEOUT, |t| t.is_showing() && !self.stopping())
             .unwrap_or_else(std::sync::PoisonError::into_inner);
         drop(waited);
         self.replay_status()
     }
 
-    /// Refuses what would make the time of a recording go backwards.
+    /// Refuses commands that would make the time of a recording go backwards.
     fn must_not_be_recorded(&self, what: &str) -> Result<()> {
         if lock(&self.recording).is_active() {
             return Err(Error::new(
@@ -99,17 +102,17 @@ impl Inner {
 
     fn cameras(&self) -> Vec<CameraStatus> {
         let now = HostTime::now();
-        let status = self.replay_status();
+        let replay = self.replay_status();
         let mut cameras: Vec<CameraStatus> = Vec::new();
-        let pictures = self.records.iter().map(|r| (&r.id, &r.model, &r.serial, &r.calibration));
+        let images = self.records.iter().map(|r| (&r.id, &r.model, &r.serial, &r.calibration));
         let units = self.units.iter().map(|r| (&r.id, &r.model, &r.serial, &r.calibration));
         let streams = self.streams.iter().chain(&self.unit_streams);
-        for ((id, model, serial, calibration), stream) in pictures.chain(units).zip(streams) {
+        for ((id, model, serial, calibration), stream) in images.chain(units).zip(streams) {
             let name = id.camera.to_string();
             let used = stream.books().delivered;
-            let told = report::stream(stream, SetAccount { used, ..SetAccount::default() }, now);
+            let status = report::stream(stream, SetAccount { used, ..SetAccount::default() }, now);
             if let Some(camera) = cameras.iter_mut().find(|c| c.name == name) {
-                camera.streams.push(told);
+                camera.streams.push(status);
                 continue;
             }
             cameras.push(CameraStatus {
@@ -120,21 +123,21 @@ impl Inner {
                 firmware: String::new(),
                 port: String::new(),
                 calibration: calibration.clone(),
-                state: if status.done { CameraState::Finished } else { CameraState::Streaming },
+                state: if replay.done { CameraState::Finished } else { CameraState::Streaming },
                 state_for_s: self.started.elapsed().as_secs_f64(),
-                message: status.paused.then(|| format!("paused at {:.3} s", status.position_s)),
+                message: replay.paused.then(|| format!("paused at {:.3} s", replay.position_s)),
                 warnings: Vec::new(),
                 reconnects: 0,
-                streams: vec![told],
+                streams: vec![status],
                 refine: None,
             });
         }
-        for lane in lock(&self.lanes).iter() {
-            let name = lane.camera.to_string();
+        for refinement in lock(&self.refinements).iter() {
+            let name = refinement.camera.to_string();
             let Some(camera) = cameras.iter_mut().find(|c| c.name == name) else { continue };
-            camera.refine = Some(lane.status());
-            let told = |s: &Arc<crate::stream::Stream>| report::stream(s, SetAccount::default(), now);
-            camera.streams.extend(lane.streams().map(told));
+            camera.refine = Some(refinement.status());
+            let status = |s: &Arc<crate::stream::Stream>| report::stream(s, SetAccount::default(), now);
+            camera.streams.extend(refinement.streams().map(status));
         }
         cameras
     }
@@ -242,7 +245,7 @@ impl Control for Inner {
         }
         drop(sources);
         *lock(&self.clock) = pair;
-        // As fast as possible is as fast as the disk takes it; then this is what a second of the original takes.
+        // As fast as possible is as fast as the disk takes it; then a second of the original takes this much.
         let sets_hz = self.nominal_hz() * lock(&self.transport).rate();
         let begun = Begun::new(&self.config, &request, self.stream_facts(), sets_hz, &self.outside)?;
         Ok(lock(&self.recording).begin(begun))
@@ -308,7 +311,7 @@ impl ReplayControl for Inner {
     }
 
     fn set_loop(&self, on: bool) -> Result<ReplayStatus> {
-        // A recording that is being made has looked at the loop, and is not there to be seen yet.
+        // A recording that is being started has looked at the loop, and is not there to be seen yet.
         let one_at_a_time = lock(&self.starting);
         if on {
             self.must_not_be_recorded("beginning again")?;

@@ -20,14 +20,14 @@ const CLEAN: Duration = Duration::from_secs(1);
 /// How often a replay that waits for a subscriber or the recorder asks again.
 const ASK: Duration = Duration::from_millis(1);
 /// A subscriber that keeps a replay waiting this long is worth a line in the log.
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The replay thread's state.
 pub struct Player {
     inner: Arc<Inner>,
     bus: Arc<Bus>,
     outputs: Vec<Output>,
-    /// The channels of the motion units.
+    /// The channels of the IMUs.
     units: Vec<Output>,
     /// Batches that were published, and go into the next set that is recorded.
     carried: Vec<RecordMotion>,
@@ -155,7 +155,7 @@ impl Player {
             incomplete: id.incomplete,
             ..SetHeader::default()
         };
-        let sent = patiently(
+        let sent = when_free(
             &self.inner,
             &self.bus,
             "the frame sets",
@@ -168,7 +168,7 @@ impl Player {
         self.record(id.set, &moment, recorded);
     }
 
-    /// Publishes what the motion units sent before a set; `false` when the replay was stopped while it waited.
+    /// Publishes the IMU batches before a set; `false` when the replay was stopped while it waited.
     fn publish_motion(&mut self, moment: &mut Moment) -> bool {
         let mut bytes = Vec::new();
         for mut batch in std::mem::take(&mut moment.motion) {
@@ -204,7 +204,8 @@ impl Player {
         let utc_ns = lock(&inner.sources).utc_ns(moment.tick);
         let utc = UtcPair { mono: moment.tick, utc_ns, width_ns: 0 };
         *lock(&inner.clock) = utc;
-        let (tick, spread_ns) = (moment.tick, moment.spread_ns);
+        let tick = moment.tick;
+        let spread_ns = moment.spread_ns;
         lock(&inner.recording).push(RecordSet { id, tick, utc, frames, missing, motion, spread_ns });
     }
 }
@@ -223,7 +224,7 @@ fn send(
     drop(books);
     let name = stream.id.to_string();
     let loan =
-        patiently(inner, bus, &name, || output.publisher.loan(payload.len()), || output.publisher.welcome());
+        when_free(inner, bus, &name, || output.publisher.loan(payload.len()), || output.publisher.welcome());
     let sent = loan.and_then(|slot| {
         let Some(mut slot) = slot else { return Ok(None) };
         slot.pixels_mut().copy_from_slice(payload);
@@ -240,7 +241,7 @@ fn send(
         output.sequence = sequence;
         Ok(Some(header))
     });
-    inner.entrance.bell.raise();
+    inner.intake.wake.raise();
     let mut books = stream.books();
     match &sent {
         Ok(Some(h)) => {
@@ -257,23 +258,24 @@ fn send(
     sent
 }
 
-/// Does `what` on a channel. A replay that its subscribers pace waits until they have let go of a slot; `None` when
-/// it was stopped meanwhile. `refresh` has the channel look at who is still there: only then does it take back what a
-/// killed subscriber held.
-fn patiently<T>(
+/// Runs `action` on a channel. A replay that its subscribers pace waits until they have let go of a slot; `None` when
+/// it was stopped meanwhile. `refresh` has the channel look at who is still there: only then does it take back slots
+/// that a killed subscriber held.
+fn when_free<T>(
     inner: &Inner,
     bus: &Bus,
     channel: &str,
-    mut what: impl FnMut() -> depthrig_bus::Result<T>,
+    mut action: impl FnMut() -> depthrig_bus::Result<T>,
     refresh: impl Fn(),
 ) -> depthrig_bus::Result<Option<T>> {
     let began = HostTime::now();
-    let (mut told, mut looked) = (false, began);
+    let mut warned = false;
+    let mut looked = began;
     loop {
-        match what() {
+        match action() {
             Err(e) if e.kind() == ErrorKind::NoSpace && inner.lossless() => {}
             done => {
-                if looked != began || told {
+                if looked != began || warned {
                     inner.set_waiting_for(None);
                 }
                 return done.map(Some);
@@ -289,11 +291,11 @@ fn patiently<T>(
             bus.clean_dead();
             refresh();
         }
-        if began.elapsed() > PATIENCE && !told {
-            told = true;
+        if began.elapsed() > TIMEOUT && !warned {
+            warned = true;
             tracing::warn!(
                 channel,
-                "the replay waits: a subscriber reads no further, or holds more than {} frames (a motion unit sends more \
+                "the replay waits: a subscriber reads no further, or holds more than {} frames (an IMU sends more \
                  batches than that before a set: whoever waits for the set must read it meanwhile)",
                 SUBSCRIBER_BUFFER - 1
             );

@@ -2,18 +2,18 @@
 
 use super::Inner;
 use crate::config::{EngineChoice, RefineConfig};
-use crate::stage::{self, Lane};
+use crate::stage::{self, Readers, Refinement, Setup};
 use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{Bus, StreamId};
 use depthrig_recorder::StreamRecord;
 use std::sync::Arc;
 
-/// The ways from colour and depth of the dataset's cameras to refined depth by `engine`; their channels are made here.
+/// The refinement by `engine` of every camera of the dataset that has colour and depth; creates their channels.
 ///
 /// # Errors
-/// `BadInput` when no camera has both, or when the dataset has refined depth of its own, and those of making channels.
-pub fn lanes(inner: &Inner, bus: &Bus, engine: EngineChoice) -> Result<Vec<Arc<Lane>>> {
+/// `BadInput` when no camera has both, or when the dataset has refined depth of its own; errors of creating channels.
+pub fn refinements(inner: &Inner, bus: &Bus, engine: EngineChoice) -> Result<Vec<Arc<Refinement>>> {
     let config = RefineConfig { engine, rate_hz: 0.0, ..RefineConfig::default() };
     let bad = |what: String| Error::new(ErrorKind::BadInput, what);
     if let Some(had) = inner.records.iter().find(|r| stage::is_derived(&r.id.stream)) {
@@ -22,36 +22,37 @@ pub fn lanes(inner: &Inner, bus: &Bus, engine: EngineChoice) -> Result<Vec<Arc<L
     let of = |camera: &StreamRecord, name: &str| {
         inner.streams.iter().find(|s| s.id.camera == camera.id.camera && s.id.stream.as_str() == name)
     };
-    let mut lanes = Vec::new();
+    let mut refinements = Vec::new();
     for record in inner.records.iter().filter(|r| r.id.stream.as_str() == "depth") {
         let (Some(color), Some(depth)) = (of(record, "color"), of(record, "depth")) else { continue };
         let profiles = [color.profile.clone(), depth.profile.clone()];
-        let made = stage::profiles(Some(&config), None, &profiles)?;
-        let Some((profile, _)) = made.into_iter().next() else { continue };
+        let derived = stage::profiles(Some(&config), None, &profiles)?;
+        let Some((profile, _)) = derived.into_iter().next() else { continue };
         let id = StreamId { camera: record.id.camera.clone(), stream: profile.stream.clone() };
         let stream = Arc::new(Stream::new(id, profile, false, inner.slots()));
         let publisher = bus.publisher(&stream.id, stream.profile.frame_bytes(), stream.slots)?;
         stream.books().publisher = Some(Arc::new(publisher));
-        let readers = (bus.subscriber(&color.id)?, bus.subscriber(&depth.id)?);
-        let (color_ns, depth_ns) =
-            (color.profile.period_ns().max(1) as i64, depth.profile.period_ns().max(1) as i64);
+        let readers = Readers { color: bus.subscriber(&color.id)?, depth: bus.subscriber(&depth.id)? };
+        let color_ns = color.profile.period_ns().max(1) as i64;
+        let depth_ns = depth.profile.period_ns().max(1) as i64;
         // The frames of a set lie within half a period of its tick, on either side.
         let tolerance_ns = color_ns.max(depth_ns) + 1_000_000;
-        let camera = (record.id.camera.clone(), record.model.clone());
-        let periods = (color_ns, depth_ns);
-        lanes.push(Arc::new(Lane::new(
-            camera,
-            config.clone(),
-            (stream, None),
-            periods,
+        refinements.push(Arc::new(Refinement::new(Setup {
+            camera: record.id.camera.clone(),
+            device_model: record.model.clone(),
+            config: config.clone(),
+            refined: stream,
+            aligned: None,
+            color_ns,
+            frame_ns: depth_ns,
             tolerance_ns,
             readers,
-        )));
+        })));
     }
-    if lanes.is_empty() {
+    if refinements.is_empty() {
         return Err(bad(
             "no camera of the dataset has the streams color and depth; replay it without --refine".into(),
         ));
     }
-    Ok(lanes)
+    Ok(refinements)
 }

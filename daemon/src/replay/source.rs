@@ -13,7 +13,7 @@ use std::path::PathBuf;
 /// Clocks of two datasets that agree within this are one clock of one computer: two boots, or two computers, differ
 /// by hours.
 const SAME_CLOCK_NS: i64 = 1_000_000_000;
-/// Sets that are looked at to learn how pictures are stored.
+/// Sets that are looked at to learn how images are stored.
 const LOOK_AT: usize = 8;
 
 /// Datasets that are replayed as one rig.
@@ -31,8 +31,8 @@ struct Source {
     reader: SetReader,
     /// The rig's stream of each stream of this dataset.
     streams: Vec<usize>,
-    /// The rig's motion unit of each of this dataset; `None` where a dataset before it gives the same unit at the same
-    /// times, as a recording beside what was computed of it does.
+    /// The rig's IMU of each of this dataset; `None` where a dataset before it gives the same unit at the same
+    /// times, as a recording and a dataset computed from it do.
     units: Vec<Option<usize>>,
 }
 
@@ -47,7 +47,7 @@ pub struct Moment {
     pub spread_ns: i64,
     /// The frames; `stream` is the rig's stream.
     pub frames: Vec<DatasetFrame>,
-    /// What its motion units sent since the moment before; `unit` is the rig's unit.
+    /// IMU batches since the moment before; `unit` is the rig's IMU.
     pub motion: Vec<RecordMotion>,
     /// Sets of this moment that could not be read.
     pub problems: Vec<String>,
@@ -58,7 +58,7 @@ impl Sources {
     ///
     /// # Errors
     /// [`ErrorKind::NotFound`], [`ErrorKind::PermissionDenied`], [`ErrorKind::BadInput`] when they are not of one rig,
-    /// [`ErrorKind::Other`] when one of them is no dataset or has no set, or the disk fails.
+    /// [`ErrorKind::Other`] when one of them is not a dataset or has no set, or the disk fails.
     pub fn open(paths: &[PathBuf], rig: Option<RigName>) -> Result<Self> {
         let mut sources = Vec::new();
         let mut streams: Vec<StreamRecord> = Vec::new();
@@ -124,12 +124,12 @@ impl Sources {
         &self.streams
     }
 
-    /// The motion units of all of them.
+    /// The IMUs of all of them.
     pub fn units(&self) -> &[MotionRecord] {
         &self.units
     }
 
-    /// What computed those streams that no camera gave.
+    /// The algorithms behind the streams that no camera gave.
     pub fn computed(&self) -> Vec<Computed> {
         self.list.iter().flat_map(|s| &s.dataset.session().computed).cloned().collect()
     }
@@ -139,14 +139,15 @@ impl Sources {
         self.list[0].dataset.session()
     }
 
-    /// What cannot be read, one line per segment.
+    /// Unreadable parts, one line per segment.
     pub fn problems(&self) -> impl Iterator<Item = &String> {
         self.list.iter().flat_map(|s| s.reader.problems())
     }
 
     /// How colour and depth must be stored for nothing to be lost: as in the datasets where they agree.
     pub fn codecs(&mut self) -> (ColorCodec, DepthCodec) {
-        let (mut color, mut depth) = (BTreeSet::new(), BTreeSet::new());
+        let mut color = BTreeSet::new();
+        let mut depth = BTreeSet::new();
         for source in &mut self.list {
             for n in 0..source.reader.times().len().min(LOOK_AT) {
                 let Ok(set) = source.reader.read(n, PixelMode::None) else { continue };
@@ -179,7 +180,7 @@ impl Sources {
             match source.reader.read(member.set as usize, mode) {
                 Ok(set) => {
                     let shift_ns = shift(set.utc_offset_ns, self.utc_offset_ns);
-                    take(&mut read, set, (&source.streams, &source.units), shift_ns, sets == 0);
+                    take(&mut read, set, &source.streams, &source.units, shift_ns, sets == 0);
                     sets += 1;
                 }
                 Err(e) => read.problems.push(e.to_string()),
@@ -207,8 +208,9 @@ impl Sources {
         let [source] = self.list.as_mut_slice() else {
             return Err(bad("ids name sets of one dataset, and this replay has several; seek by time"));
         };
-        // Ids increase, so the index need not have them: a dozen sets are looked at, their pictures not read.
-        let (mut low, mut high) = (0, source.reader.times().len());
+        // Ids increase, so the index need not have them: a dozen sets are looked at, their images not read.
+        let mut low = 0;
+        let mut high = source.reader.times().len();
         while low < high {
             let middle = low + (high - low) / 2;
             let readable = (middle..high)
@@ -231,7 +233,8 @@ fn join(streams: &mut Vec<StreamRecord>, record: &StreamRecord, dataset: &Datase
         return Ok(streams.len() - 1);
     };
     let mode = |r: &StreamRecord| format!("{}x{} {}", r.width, r.height, r.format.name());
-    let (before, now) = (mode(&streams[i]), mode(record));
+    let before = mode(&streams[i]);
+    let now = mode(record);
     if before == now {
         return Ok(i);
     }
@@ -281,7 +284,7 @@ fn rig_of(sources: &[Source]) -> Result<RigName> {
     }
 }
 
-/// What moves a time of a clock with `offset_ns` to UTC onto the clock with `base_ns`.
+/// The shift of a time on a clock with `offset_ns` to UTC onto the clock with `base_ns`.
 fn shift(offset_ns: i64, base_ns: i64) -> i64 {
     let shift = offset_ns.saturating_sub(base_ns);
     if shift.saturating_abs() < SAME_CLOCK_NS { 0 } else { shift }
@@ -297,7 +300,8 @@ fn overlap(a: &[i64], b: &[i64]) -> bool {
 fn take(
     moment: &mut Moment,
     set: DatasetSet,
-    (streams, units): (&[usize], &[Option<usize>]),
+    streams: &[usize],
+    units: &[Option<usize>],
     shift_ns: i64,
     first: bool,
 ) {

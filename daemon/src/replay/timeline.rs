@@ -2,8 +2,8 @@
 //!
 //! Datasets without a common stream are replayed side by side, by UTC. A set leads a moment when no earlier set took
 //! it along; it takes along the next set of every other dataset that is at most half the time between sets away (the
-//! median of the dataset in which sets follow each other faster). What no set takes along is a moment of its own, and
-//! the streams of the other datasets are missing from it. So each set is in one moment, and moments never cross.
+//! median of the dataset in which sets follow each other faster). A set that no other takes along is a moment of its own,
+//! and the streams of the other datasets are missing from it. So each set is in one moment, and moments never cross.
 //!
 //! Datasets with a common stream must follow each other. Time that no dataset covers is not waited for: the first set
 //! after it comes as long after the last one before it as sets usually do.
@@ -14,7 +14,7 @@ use depthrig_bus::StreamId;
 /// Time between sets of a dataset that has one set only: 5 Hz.
 const LONE_PERIOD_NS: i64 = 200_000_000;
 
-/// What a timeline needs to know of a dataset.
+/// Facts about a dataset for the timeline.
 pub struct Part<'a> {
     /// Its name for messages.
     pub name: String,

@@ -19,7 +19,7 @@ const SLACK_NS: i64 = 100_000_000;
 /// Time from one round of a single set to the next.
 const LONE_PERIOD_NS: i64 = 200_000_000;
 
-/// What the player has to do.
+/// The player's next action.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
     /// Publish the moment of this number when it is due. `turn` goes back to [`Transport::published`].
@@ -69,7 +69,7 @@ pub struct Begin {
     pub looped: bool,
     /// Pause at the end, and do not end.
     pub hold: bool,
-    /// Do not play before it is told to.
+    /// Begin paused.
     pub paused: bool,
 }
 
@@ -81,7 +81,8 @@ pub fn check_rate(rate: f64) -> Result<()> {
     if RATES.contains(&rate) {
         return Ok(());
     }
-    let (least, most) = (RATES.start(), RATES.end());
+    let least = RATES.start();
+    let most = RATES.end();
     Err(Error::new(
         ErrorKind::BadInput,
         format!("a replay cannot run at {rate} times its speed; choose a rate from {least} to {most}"),
@@ -108,7 +109,7 @@ impl Transport {
         }
     }
 
-    /// What is to be done at `now`.
+    /// The next action at `now`.
     pub fn order(&mut self, now: HostTime) -> Order {
         if self.paused && !self.show {
             return Order::Idle;
@@ -253,7 +254,7 @@ impl Transport {
         self.show
     }
 
-    /// Whether it is paused, or will be after the steps that it was told.
+    /// Whether it is paused, or will be after the requested steps.
     pub const fn is_paused(&self) -> bool {
         self.paused || self.steps.is_some()
     }
@@ -304,7 +305,7 @@ impl Transport {
         (ns as f64 / self.rate).round() as i64
     }
 
-    /// Where the line is at `now`; never beyond what is still to be published, or it would be skipped.
+    /// Where the line is at `now`; never beyond the next moment to publish, or it would be skipped.
     fn position(&self, now: HostTime) -> i64 {
         if self.paused {
             return self.anchor.1;

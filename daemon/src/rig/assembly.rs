@@ -3,7 +3,7 @@
 //! It is a subscriber like any other, so that nothing it does can hold up a camera.
 
 use super::Inner;
-use super::join::{Held, Joints};
+use super::join::{Held, LateStreams};
 use super::motion::Units;
 use crate::camera::Camera;
 use crate::config::Phase;
@@ -38,9 +38,9 @@ pub struct Assembly {
     inputs: Vec<Input>,
     assembler: Option<Assembler<Frame>>,
     publisher: SetPublisher,
-    /// Streams that are made of others join the sets that are recorded.
-    joints: Joints,
-    /// Motion units, which are no part of sets.
+    /// Computed streams, which join the sets that are recorded.
+    late_streams: LateStreams,
+    /// IMUs, which are not in sets.
     motion: Units,
     next_id: u64,
     incomplete: u64,
@@ -53,13 +53,13 @@ impl Assembly {
     /// Those of opening the channel of sets.
     pub fn new(inner: Arc<Inner>) -> crate::Result<Self> {
         let publisher = inner.shared.bus.set_publisher()?;
-        let joints = Joints::new(&inner.config);
+        let late_streams = LateStreams::new(&inner.config);
         Ok(Self {
             inner,
             inputs: Vec::new(),
             assembler: None,
             publisher,
-            joints,
+            late_streams,
             motion: Units::default(),
             next_id: 1,
             incomplete: 0,
@@ -75,17 +75,17 @@ impl Assembly {
             self.inner.shared.frames.wait(sleep);
             self.read_frames();
             self.motion.read(&self.inner);
-            self.joints.read();
+            self.late_streams.read();
             // While the cameras are being stopped, sets would miss those that ended first.
             if !self.inner.ending.load(Ordering::Relaxed) {
                 self.send_sets();
             }
-            self.joints.release(&self.inner);
+            self.late_streams.release(&self.inner);
         }
         // Frames that were on their way when the cameras stopped still count.
         self.read_frames();
         self.motion.read(&self.inner);
-        self.joints.read();
+        self.late_streams.read();
         self.report();
     }
 
@@ -101,7 +101,7 @@ impl Assembly {
                 .filter(|s| !camera.config.joins_late(&s.id.stream) && !s.profile.format.is_motion());
             for stream in at_once.skip(known) {
                 let Some(subscriber) = stream.books().reader.take() else {
-                    break; // its channel is just being made
+                    break; // its channel is just being created
                 };
                 self.inputs.push(Input {
                     stream: Arc::clone(stream),
@@ -112,7 +112,7 @@ impl Assembly {
                 });
                 found = true;
             }
-            self.joints.find(camera, &state);
+            self.late_streams.find(camera, &state);
             self.motion.find(&state);
         }
         if found {
@@ -166,7 +166,7 @@ impl Assembly {
                     }
                     Ok(None) => break,
                     Err(e) => {
-                        // All sixteen are held: the recorder is behind. What is replaced meanwhile counts as missed.
+                        // All sixteen are held: the recorder is behind. Frames replaced meanwhile count as missed.
                         tracing::debug!(stream = %input.stream.id, error = %e, "cannot read");
                         break;
                     }
@@ -212,9 +212,9 @@ impl Assembly {
         let frames =
             self.inputs.iter().zip(set.members).map(|(i, m)| (Arc::clone(&i.stream), m.map(|m| m.item)));
         let closing = self.inner.closing.load(Ordering::Relaxed);
-        if self.joints.are_awaited() && self.inner.recording().is_active() {
+        if self.late_streams.are_awaited() && self.inner.recording().is_active() {
             if !closing {
-                self.joints.hold(Held::new(id, set.tick, frames.collect()));
+                self.late_streams.hold(Held::new(id, set.tick, frames.collect()));
             }
         } else {
             self.inner.recording().offer(id, set.tick, frames);
@@ -234,7 +234,7 @@ impl Assembly {
             sum.missed = input.before.unwrap_or(0) + input.subscriber.missed();
             accounts.streams.insert(input.stream.id.clone(), sum);
         }
-        accounts.streams.extend(self.joints.accounts());
+        accounts.streams.extend(self.late_streams.accounts());
     }
 }
 

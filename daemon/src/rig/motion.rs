@@ -1,8 +1,8 @@
-//! The motion units of a rig, as the set thread reads them.
+//! The IMUs of a rig, as the set thread reads them.
 //!
-//! Their batches are no part of sets. They are read on the set thread all the same, because it is the one that hands sets to
-//! the recording: a batch that was read before a set was handed over is in that set or in an earlier one, so that nothing has
-//! to be put in order afterwards. A batch is copied where it is recorded and its slot let go at once.
+//! Their batches are not in frame sets. They are read on the set thread all the same, because it is the one that hands
+//! sets to the recording: a batch that was read before a set was handed over is in that set or in an earlier one, so
+//! that nothing has to be put in order afterwards. A batch is copied where it is recorded and its slot let go at once.
 
 use super::Inner;
 use crate::camera::State;
@@ -34,7 +34,7 @@ impl Units {
         }
     }
 
-    /// Reads what came.
+    /// Reads new batches.
     pub fn read(&mut self, inner: &Inner) {
         for input in &mut self.0 {
             loop {
@@ -56,7 +56,7 @@ impl Units {
         }
     }
 
-    /// What became of the batches of each unit.
+    /// Accounts of the batches of each IMU.
     pub fn accounts(&self, inner: &Inner) -> Vec<(StreamId, SetAccount)> {
         if self.0.is_empty() { Vec::new() } else { inner.recording().motion_accounts() }
     }

@@ -1,4 +1,4 @@
-//! The rig in numbers: its status, the diagnostics that go into a recording, and what was lost.
+//! The rig in numbers: its status, the diagnostics that go into a recording, and losses.
 
 use super::{Inner, lock};
 use crate::camera::{Camera, State};
@@ -86,20 +86,20 @@ fn camera(inner: &Inner, camera: &Camera, now: HostTime) -> CameraStatus {
             notice.iter().cloned().chain(silent_units(inner, &state, now)).collect()
         },
         reconnects: state.reconnects,
-        refine: state.lane.as_ref().map(|lane| lane.status()),
+        refine: state.refinement.as_ref().map(|refinement| refinement.status()),
         streams: state
             .all_streams()
             .map(|s| {
                 // The account is older than the books that are read here, and never ahead of them.
-                let mut told = stream(s, accounts.streams.get(&s.id).copied().unwrap_or_default(), now);
-                told.in_sets = told.in_sets.with_delivered(told.delivered);
-                told
+                let mut status = stream(s, accounts.streams.get(&s.id).copied().unwrap_or_default(), now);
+                status.in_sets = status.in_sets.with_delivered(status.delivered);
+                status
             })
             .collect(),
     }
 }
 
-/// What to say of motion units that are silent while their camera streams.
+/// Warnings about IMUs that are silent while their camera streams.
 fn silent_units<'s>(inner: &'s Inner, state: &'s State, now: HostTime) -> impl Iterator<Item = String> + 's {
     let stall_s = inner.config.supervisor.stall_s;
     let streaming = state.phase == CameraState::Streaming;
@@ -108,7 +108,7 @@ fn silent_units<'s>(inner: &'s Inner, state: &'s State, now: HostTime) -> impl I
         let since = s.books().last_frame.map_or(state.since, |t| t.max(state.since));
         let silent_s = now.since_ns(since) as f64 * 1e-9;
         (silent_s > stall_s.max(3.0 / s.profile.rate_hz))
-            .then(|| format!("no motion samples of {} for {silent_s:.1} s; its pictures go on", s.id.stream))
+            .then(|| format!("no motion samples of {} for {silent_s:.1} s; its images go on", s.id.stream))
     })
 }
 
@@ -221,7 +221,7 @@ pub fn silent(status: &RigStatus) -> Vec<String> {
     status.cameras.iter().filter(away).filter(silent).filter_map(line).collect()
 }
 
-/// What was lost over the rig's life, one line each.
+/// Losses over the rig's life, one line each.
 pub fn lost(status: &RigStatus) -> Vec<String> {
     let mut lost = Vec::new();
     for camera in &status.cameras {
@@ -233,7 +233,7 @@ pub fn lost(status: &RigStatus) -> Vec<String> {
             let why = refine.message.as_deref().unwrap_or("no reason known");
             lost.push(format!("camera {}: no refined depth: {why}", camera.name));
         }
-        // A pair that gave way to a newer one is no loss: that is how the stage keeps up.
+        // A pair superseded by a newer one is no loss: that is how the stage keeps up.
         for s in camera.streams.iter().filter(|s| !s.derived && !s.dropped.is_empty()) {
             let reasons: Vec<_> = s.dropped.iter().map(|(r, n)| format!("{n} {r}")).collect();
             let what = if s.samples_hz.is_some() { "batches" } else { "frames" };

@@ -72,7 +72,7 @@ impl<T> Assembler<T> {
         self.accounts[stream] = s.account;
     }
 
-    /// The next set that is ripe at `now`; call it until there is none.
+    /// The next set that is ripe at `now`; call it until it returns `None`.
     pub fn poll(&mut self, now: HostTime) -> Option<FrameSet<T>> {
         loop {
             let tick = self.tick?;
@@ -107,7 +107,7 @@ impl<T> Assembler<T> {
         }
     }
 
-    /// What became of the frames, per stream.
+    /// Accounts of the frames, per stream.
     pub fn accounts(&self) -> &[Account] {
         &self.accounts
     }
@@ -119,7 +119,9 @@ impl<T> Assembler<T> {
 
     fn assemble(&mut self, tick: i64) -> FrameSet<T> {
         let mut members = Vec::with_capacity(self.streams.len());
-        let (mut missing, mut low, mut high) = (0u64, i64::MAX, i64::MIN);
+        let mut missing = 0u64;
+        let mut low = i64::MAX;
+        let mut high = i64::MIN;
         for (i, s) in self.streams.iter_mut().enumerate() {
             let taken = s.take(tick);
             s.sent(tick, taken.as_ref().map(|p| p.stamp));
@@ -154,7 +156,7 @@ impl<T> Assembler<T> {
         self.advance(tick, passed);
     }
 
-    /// Moves on by `ticks` periods and what the phase owes.
+    /// Moves on by `ticks` periods and by the phase correction that is due.
     fn advance(&mut self, tick: i64, ticks: i64) {
         self.ticks += 1;
         let next = tick.saturating_add(self.config.period_ns.saturating_mul(ticks));
@@ -177,7 +179,7 @@ impl<T> Assembler<T> {
             let rhythms: Vec<Rhythm> = active()
                 .filter_map(|s| Some(Rhythm { newest: s.newest?, period: s.period, tolerance: s.tolerance }))
                 .collect();
-            // All phases of the slowest stream, so that the best stretch of them is seen whole.
+            // All phases of the slowest stream, so that the best stretch of them is seen in full.
             let range = slowest(&self.config).min(self.config.period_ns);
             self.owed = best_shift(next, self.config.period_ns, range, &rhythms);
             self.settled = true;

@@ -2,7 +2,7 @@
 //!
 //! For streams of one rate the best tick is opposite the widest gap between their phases: then the frames around
 //! the circle are all but that gap. For mixed rates there is no such formula, so the spread is simply predicted for
-//! shifts all over the range. Of a whole stretch of equally good shifts the middle is taken: it is furthest from
+//! shifts all over the range. Of a stretch of equally good shifts the middle is taken: it is furthest from
 //! where jitter would move a frame to the other side.
 
 /// A stream as it is expected to go on.
@@ -53,7 +53,8 @@ pub(super) fn best_shift(tick: i64, period: i64, range: i64, streams: &[Rhythm])
         match (good, start) {
             (true, None) => start = Some(i),
             (false, Some(from)) => {
-                let (middle, cut) = ((from + i - 1) as i64 / 2 - TRIED, from == 0 || i == costs.len());
+                let middle = (from + i - 1) as i64 / 2 - TRIED;
+                let cut = from == 0 || i == costs.len();
                 if best.is_none_or(|b| (cut, middle.abs()) < (b.0, b.1.abs())) {
                     best = Some((cut, middle));
                 }
@@ -67,7 +68,9 @@ pub(super) fn best_shift(tick: i64, period: i64, range: i64, streams: &[Rhythm])
 
 /// Predicted spread of the set at `tick`; a stream that would be missing costs a whole period.
 fn spread(tick: f64, period: i64, streams: &[Rhythm]) -> f64 {
-    let (mut low, mut high, mut missing) = (f64::INFINITY, f64::NEG_INFINITY, 0.0);
+    let mut low = f64::INFINITY;
+    let mut high = f64::NEG_INFINITY;
+    let mut missing = 0.0;
     for s in streams {
         let at = s.nearest(tick);
         if at.abs() > s.tolerance as f64 {

@@ -21,17 +21,17 @@ fn fixed(period_ms: i64, streams_ms: &[i64]) -> AssemblerConfig {
 /// An item that knows whether it is still held.
 type Tracked = Rc<()>;
 
-/// What the assembler made of the events: sets as (tick, stamps), and the accounts.
-struct Made {
+/// Results of the assembler for the events: sets as (tick, stamps), and the accounts.
+struct Outcome {
     sets: Vec<(i64, Vec<Option<i64>>)>,
     accounts: Vec<Account>,
     most_held: u64,
 }
 
-fn play(config: &AssemblerConfig, events: &[Event]) -> Made {
+fn play(config: &AssemblerConfig, events: &[Event]) -> Outcome {
     let alive: Tracked = Rc::new(());
     let mut assembler: Assembler<Tracked> = Assembler::new(config.clone());
-    let mut made = Made { sets: Vec::new(), accounts: Vec::new(), most_held: 0 };
+    let mut outcome = Outcome { sets: Vec::new(), accounts: Vec::new(), most_held: 0 };
     for event in events {
         match *event {
             Event::Push { stream, stamp } => {
@@ -40,10 +40,10 @@ fn play(config: &AssemblerConfig, events: &[Event]) -> Made {
             Event::Active { stream, active } => assembler.set_stream_active(stream, active),
             Event::Poll { now } => {
                 while let Some(set) = assembler.poll(HostTime::from_ns(now)) {
-                    assert_eq!(set.id, made.sets.len() as u64 + 1);
+                    assert_eq!(set.id, outcome.sets.len() as u64 + 1);
                     check_set(&set);
                     let stamps = set.members.iter().map(|m| m.as_ref().map(|m| m.capture.ns())).collect();
-                    made.sets.push((set.tick.ns(), stamps));
+                    outcome.sets.push((set.tick.ns(), stamps));
                 }
             }
         }
@@ -55,13 +55,13 @@ fn play(config: &AssemblerConfig, events: &[Event]) -> Made {
                 "{a:?}"
             );
             assert!(a.pending <= config.max_pending as u64);
-            made.most_held = made.most_held.max(a.pending);
+            outcome.most_held = outcome.most_held.max(a.pending);
         }
         let held: u64 = accounts.iter().map(|a| a.pending).sum();
-        assert_eq!(Rc::strong_count(&alive) as u64 - 1, held, "what is not pending must be let go");
+        assert_eq!(Rc::strong_count(&alive) as u64 - 1, held, "frames that are not pending must be let go");
     }
-    made.accounts = assembler.accounts().to_vec();
-    made
+    outcome.accounts = assembler.accounts().to_vec();
+    outcome
 }
 
 fn check_set(set: &FrameSet<Tracked>) {
@@ -106,7 +106,8 @@ fn events() -> impl Strategy<Value = (Vec<i64>, Vec<Event>)> {
 }
 
 fn shoot(stream: usize, period: i64, phase: i64, shots: &[Shot], out: &mut Vec<(i64, usize, Event)>) {
-    let (mut stalled, mut last) = (0, 0);
+    let mut stalled = 0;
+    let mut last = 0;
     for (i, &(jitter, kind, delivery)) in shots.iter().enumerate() {
         let mut stamp = (phase + i as i64 * period) * MS + jitter * period * MS / 100;
         let active = |active| Event::Active { stream, active };
@@ -145,10 +146,10 @@ proptest! {
         if let Some(ms) = tolerance {
             config.tolerance_ns = vec![ms * MS];
         }
-        let made = play(&config, &events);
+        let outcome = play(&config, &events);
         let (sets, fates) = model(&config, &events);
-        prop_assert_eq!(&made.sets, &sets);
-        for (i, a) in made.accounts.iter().enumerate() {
+        prop_assert_eq!(&outcome.sets, &sets);
+        for (i, a) in outcome.accounts.iter().enumerate() {
             let count = |fate| fates.iter().filter(|(s, f)| *s == i && *f == fate).count() as u64;
             let want = Account {
                 pushed: fates.iter().filter(|(s, _)| *s == i).count() as u64,
@@ -167,20 +168,20 @@ proptest! {
     #[test]
     fn keeps_its_promises_while_the_phase_moves((streams, events) in events(), max_pending in 1usize..4) {
         let config = AssemblerConfig { max_pending, ..AssemblerConfig::new(200 * MS, streams) };
-        let made = play(&config, &events);
-        for pair in made.sets.windows(2) {
+        let outcome = play(&config, &events);
+        for pair in outcome.sets.windows(2) {
             prop_assert!(pair[1].0 - pair[0].0 >= 100 * MS, "sets {} and {} ns", pair[0].0, pair[1].0);
         }
         for i in 0..config.stream_period_ns.len() {
-            let stamps: Vec<i64> = made.sets.iter().filter_map(|(_, s)| s[i]).collect();
+            let stamps: Vec<i64> = outcome.sets.iter().filter_map(|(_, s)| s[i]).collect();
             prop_assert!(stamps.windows(2).all(|w| w[1] > w[0]), "stream {i} crosses or is used twice");
             let tolerance = config.stream_period_ns[i] / 2 + MS;
-            for (tick, set) in &made.sets {
+            for (tick, set) in &outcome.sets {
                 prop_assert!(set[i].is_none_or(|s| (s - tick).abs() <= tolerance));
             }
         }
         let again = play(&config, &events);
-        prop_assert_eq!((made.sets, made.accounts), (again.sets, again.accounts), "must be deterministic");
+        prop_assert_eq!((outcome.sets, outcome.accounts), (again.sets, again.accounts), "must be deterministic");
     }
 
     #[test]
@@ -310,9 +311,12 @@ fn free_running(rates: &[f64], seed: u64, phase: PhasePolicy) -> (f64, u64, Vec<
         state ^= state << 17;
         (state >> 11) as f64 / (1u64 << 53) as f64
     };
-    let (seconds, mut frames) = (60.0, Vec::new());
+    let seconds = 60.0;
+    let mut frames = Vec::new();
     for (stream, rate) in rates.iter().enumerate() {
-        let (period, offset, ppm) = (1e9 / rate, random(), (random() - 0.5) * 100.0);
+        let period = 1e9 / rate;
+        let offset = random();
+        let ppm = (random() - 0.5) * 100.0;
         for i in 0..(seconds * rate) as i64 {
             let stamp = (i as f64 + offset) * period * (1.0 + ppm * 1e-6) + random() * 20_000.0;
             frames.push((stamp as i64 + 5 * MS + (random() * 1e6) as i64, stream, stamp as i64));
@@ -321,7 +325,8 @@ fn free_running(rates: &[f64], seed: u64, phase: PhasePolicy) -> (f64, u64, Vec<
     frames.sort_unstable();
     let periods = rates.iter().map(|r| (1e9 / r) as i64).collect();
     let mut a = Assembler::new(AssemblerConfig { phase, ..AssemblerConfig::new(200 * MS, periods) });
-    let (mut spreads, mut most_held) = (Vec::new(), 0);
+    let mut spreads = Vec::new();
+    let mut most_held = 0;
     for (arrival, stream, stamp) in frames {
         a.push(stream, HostTime::from_ns(stamp), ());
         while let Some(set) = a.poll(HostTime::from_ns(arrival)) {

@@ -1,11 +1,11 @@
-//! Which refiner a camera's settings come to, and the refiner itself: models, engines and what stands in for them.
+//! Selects the refiner for a camera's settings and opens it: models, engines and their stand-ins.
 
 use crate::config::{CdmConfig, EngineChoice, Precision, RefineConfig, RefineModel};
 use depthrig_cdm::{EngineKind, ErrorKind, Refiner, RefinerOptions, Result};
 
 /// Where refiners come from. A rig has the installed ones; tests put others here.
 pub trait Refiners: Send + Sync {
-    /// What the settings of a camera come to, `device_model` being the device's own name. Cameras whose plans are equal
+    /// The plan for the settings of a camera, `device_model` being the device's own name. Cameras whose plans are equal
     /// share a refiner.
     fn plan(&self, config: &RefineConfig, device_model: &str) -> Plan;
 
@@ -16,10 +16,10 @@ pub trait Refiners: Send + Sync {
     fn open(&self, plan: &Plan, threads: usize) -> Result<Opened>;
 }
 
-/// What settings come to.
+/// The refiner that settings select.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
-    /// What runs.
+    /// The engine.
     pub engine: EngineKind,
     /// The model, for engines that need one.
     pub model: Option<RefineModel>,
@@ -27,13 +27,13 @@ pub struct Plan {
     pub input_size: Option<u32>,
     /// Precision of the network.
     pub precision: Precision,
-    /// What it runs on.
+    /// The device that it runs on.
     pub device: String,
     /// How far `fill` fills, as in [`RefineConfig`].
     pub fill_reach: f64,
     /// Whether `fill` may stand in when this cannot be had.
     pub may_fill: bool,
-    /// Why this and not what one would expect.
+    /// Why this plan, where it is not the expected one.
     pub note: Option<String>,
 }
 
@@ -41,7 +41,7 @@ pub struct Plan {
 pub struct Opened {
     /// The refiner.
     pub refiner: Box<dyn Refiner>,
-    /// What is not as asked for.
+    /// How it differs from the settings.
     pub note: Option<String>,
 }
 
@@ -77,7 +77,7 @@ impl Plan {
         Self { note: None, ..self.clone() } == Self { note: None, ..other.clone() }
     }
 
-    /// What it is, in words: `onnxruntime on cpu with cdm-d435`.
+    /// Describes it in words: `onnxruntime on cpu with cdm-d435`.
     pub fn describe(&self) -> String {
         let with = match &self.model {
             None => String::new(),
@@ -101,7 +101,7 @@ impl Refiners for Installed {
             may_fill,
             note: None,
         };
-        // The published name when none is installed, so that the error names what is missing.
+        // The published name when none is installed, so that the error names the missing model.
         let usual = || {
             let published = || super::models::for_camera(device_model).map(str::to_owned);
             super::models::installed_for(&self.cdm, device_model).or_else(published)
@@ -123,15 +123,15 @@ impl Refiners for Installed {
     }
 
     fn open(&self, plan: &Plan, threads: usize) -> Result<Opened> {
-        let made = self.make(plan, threads);
-        match made {
+        let opened = self.make(plan, threads);
+        match opened {
             Err(e) if plan.may_fill && stands_in(e.kind()) => {
                 let note = format!("fill stands in for {}: {e}", plan.describe());
                 let refiner = self.make(&fill(plan.fill_reach, None), threads)?;
                 Ok(Opened { refiner, note: Some(note) })
             }
-            // Cameras that share it may have come to it for different reasons; their plans tell those.
-            made => made.map(|refiner| Opened { refiner, note: None }),
+            // Cameras that share it may have different reasons for it; these are in their plans.
+            opened => opened.map(|refiner| Opened { refiner, note: None }),
         }
     }
 }
@@ -146,7 +146,7 @@ pub fn missing(device_model: &str) -> String {
     }
 }
 
-/// Whether `fill` stands in after such an error: what is missing, and not what is broken or full.
+/// Whether `fill` stands in after such an error: for something missing, not for something damaged or full.
 const fn stands_in(kind: ErrorKind) -> bool {
     matches!(kind, ErrorKind::NotFound | ErrorKind::NoEngine | ErrorKind::Unsupported)
 }

@@ -11,7 +11,7 @@ pub fn for_camera(device_model: &str) -> Option<&'static str> {
 /// The name of the installed model that serves a device, if there is one: the published one, or one that names the device
 /// among its cameras.
 pub fn installed_for(config: &CdmConfig, device_model: &str) -> Option<String> {
-    // What keeps the folder from being read is said when a model of it is asked for by name.
+    // An unreadable folder is reported when a model of it is asked for by name.
     store(config).and_then(|s| s.for_camera(device_model)).ok().flatten()
 }
 

@@ -15,7 +15,7 @@ const DEPTHS: usize = 2;
 #[derive(Debug)]
 pub struct Pairer<T> {
     tolerance_ns: i64,
-    patience_ns: i64,
+    timeout_ns: i64,
     colors: VecDeque<(i64, T)>,
     depths: VecDeque<Waiting<T>>,
 }
@@ -28,7 +28,7 @@ struct Waiting<T> {
     item: T,
 }
 
-/// What became of a depth frame.
+/// Fate of a depth frame.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Paired<T> {
     /// It has its colour.
@@ -43,10 +43,11 @@ pub enum Paired<T> {
 }
 
 impl<T> Pairer<T> {
-    /// Pairs frames that are at most `tolerance_ns` apart; a depth frame waits for `patience_ns` at most.
-    pub fn new(tolerance_ns: i64, patience_ns: i64) -> Self {
-        let (colors, depths) = (VecDeque::with_capacity(COLORS + 1), VecDeque::with_capacity(DEPTHS + 1));
-        Self { tolerance_ns, patience_ns, colors, depths }
+    /// Pairs frames that are at most `tolerance_ns` apart; a depth frame waits for `timeout_ns` at most.
+    pub fn new(tolerance_ns: i64, timeout_ns: i64) -> Self {
+        let colors = VecDeque::with_capacity(COLORS + 1);
+        let depths = VecDeque::with_capacity(DEPTHS + 1);
+        Self { tolerance_ns, timeout_ns, colors, depths }
     }
 
     /// Takes a colour frame.
@@ -69,11 +70,11 @@ impl<T> Pairer<T> {
         out
     }
 
-    /// The fate of the oldest depth frame, if that is decided at `now`; to be called until there is none.
+    /// The fate of the oldest depth frame, if that is decided at `now`; call it until it returns `None`.
     pub fn poll(&mut self, now: i64) -> Option<Paired<T>> {
         let first = self.depths.front()?;
         let seen = self.colors.back().is_some_and(|(newest, _)| *newest >= first.stamp);
-        let late = now.saturating_sub(first.since) >= self.patience_ns;
+        let late = now.saturating_sub(first.since) >= self.timeout_ns;
         if seen || late { self.decide() } else { None }
     }
 

@@ -8,7 +8,7 @@ use depthrig_cdm::{Color, ColorFormat};
 /// models take depth for a hole.
 pub const UNIT_OF_METRES: f64 = 0.0001;
 
-/// What makes a frame unfit for the stage, if anything does.
+/// Why a frame is unfit for the stage, if it is.
 pub fn unfit(color: &FrameHeader, depth: &FrameHeader) -> Option<String> {
     let name = |h: &FrameHeader| h.pixel_format().map_or("an unknown format", PixelFormat::name);
     if !matches!(color.pixel_format(), Some(PixelFormat::Rgb8 | PixelFormat::Bgr8)) {
@@ -19,15 +19,17 @@ pub fn unfit(color: &FrameHeader, depth: &FrameHeader) -> Option<String> {
         ));
     }
     if !depth.pixel_format().is_some_and(PixelFormat::is_depth) {
-        return Some(format!("its depth is {}, which is no depth", name(depth)));
+        return Some(format!("its depth has the format {}, which is not a depth format", name(depth)));
     }
     None
 }
 
-/// The colour picture of a frame.
+/// The colour image of a frame.
 pub fn color<'a>(h: &FrameHeader, pixels: &'a [u8]) -> Result<Color<'a>> {
     let format = if h.format == PixelFormat::Bgr8 as u32 { ColorFormat::Bgr8 } else { ColorFormat::Rgb8 };
-    let (width, height, stride) = (h.width as usize, h.height as usize, h.stride as usize);
+    let width = h.width as usize;
+    let height = h.height as usize;
+    let stride = h.stride as usize;
     let rows = stride.checked_mul(height.saturating_sub(1)).and_then(|n| n.checked_add(width * 3));
     if stride < width * 3 || rows.is_none_or(|n| n > pixels.len()) {
         return Err(short("colour"));
@@ -37,7 +39,8 @@ pub fn color<'a>(h: &FrameHeader, pixels: &'a [u8]) -> Result<Color<'a>> {
 
 /// 16-bit depth where it lies, when nothing need be changed about it.
 pub fn in_place<'a>(h: &FrameHeader, pixels: &'a [u8]) -> Option<&'a [u16]> {
-    let (row, bytes) = (h.width as usize * 2, h.width as usize * 2 * h.height as usize);
+    let row = h.width as usize * 2;
+    let bytes = h.width as usize * 2 * h.height as usize;
     if h.format != PixelFormat::Z16 as u32 || h.stride as usize != row {
         return None;
     }
@@ -47,15 +50,17 @@ pub fn in_place<'a>(h: &FrameHeader, pixels: &'a [u8]) -> Option<&'a [u16]> {
 /// The depth of a frame, without padding, and its unit in metres. Where it lies as it is wanted it is not copied;
 /// `scratch` is used otherwise.
 pub fn depth<'a>(h: &FrameHeader, pixels: &'a [u8], scratch: &'a mut Vec<u16>) -> Result<(&'a [u16], f64)> {
-    let (width, height, stride) = (h.width as usize, h.height as usize, h.stride as usize);
+    let width = h.width as usize;
+    let height = h.height as usize;
+    let stride = h.stride as usize;
     let metres = h.format == PixelFormat::DepthF32 as u32;
     let row = width * if metres { 4 } else { 2 };
     let rows = stride.checked_mul(height.saturating_sub(1)).and_then(|n| n.checked_add(row));
     if stride < row || rows.is_none_or(|n| n > pixels.len()) {
         return Err(short("depth"));
     }
-    if let Some(whole) = in_place(h, pixels) {
-        return Ok((whole, h.depth_unit_m));
+    if let Some(unpadded) = in_place(h, pixels) {
+        return Ok((unpadded, h.depth_unit_m));
     }
     scratch.clear();
     for line in pixels.chunks(stride.max(1)).take(height) {
@@ -63,7 +68,7 @@ pub fn depth<'a>(h: &FrameHeader, pixels: &'a [u8], scratch: &'a mut Vec<u16>) -
         if metres {
             let units = |b: &[u8; 4]| {
                 let v = f64::from(f32::from_le_bytes(*b)) / UNIT_OF_METRES;
-                // NaN and what is not above 0 become 0, and what is too far away does.
+                // NaN and values not above 0 become 0, and values beyond the range do.
                 if v > 0.0 && v < 65534.5 { (v + 0.5) as u16 } else { 0 }
             };
             scratch.extend(line.as_chunks::<4>().0.iter().map(units));
@@ -84,7 +89,7 @@ mod tests {
 
     fn header(format: PixelFormat, width: u32, height: u32) -> FrameHeader {
         let mut h = FrameHeader { depth_unit_m: 0.001, ..FrameHeader::default() };
-        h.set_picture(format, width, height);
+        h.set_image(format, width, height);
         h
     }
 

@@ -1,11 +1,11 @@
-//! Depth in the view of colour: tables made once, and again when what a camera says of itself changes.
+//! Depth in the view of colour: tables built once, and again when a camera's calibration or mode changes.
 
 use super::pixels;
 use crate::config::RefineConfig;
 use depthrig_bus::{FrameHeader, Intrinsics, Pose};
 use depthrig_calib::{PoseExt, Registration, same_view};
 
-/// What registration depends on.
+/// Inputs of registration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Key {
     depth: Side,
@@ -34,14 +34,14 @@ enum How {
     AsItIs,
     /// It is registered.
     Registered(Box<Registration>),
-    /// It cannot be, and why.
+    /// It is impossible, and why.
     Not(String),
 }
 
 /// How the depth of one camera comes into the view of its colour.
 #[derive(Debug, Default)]
 pub struct View {
-    made: Option<(Key, How)>,
+    built: Option<(Key, How)>,
     /// Where registered depth is put.
     registered: Vec<u16>,
     /// Where depth is put that does not lie as it is wanted.
@@ -49,7 +49,7 @@ pub struct View {
 }
 
 impl View {
-    /// Depth in the view of colour and its unit in metres, or why there is none. `config` says whether it is there
+    /// Depth in the view of colour and its unit in metres, or why it is impossible. `config` says whether it is there
     /// already, `color` and `depth` are the headers.
     pub fn depth<'a>(
         &'a mut self,
@@ -59,13 +59,13 @@ impl View {
         depth_pixels: &'a [u8],
     ) -> Result<(&'a [u16], f64), String> {
         let key = Key { depth: Side::of(depth), color: Side::of(color) };
-        if self.made.as_ref().is_none_or(|(old, _)| *old != key) {
+        if self.built.as_ref().is_none_or(|(old, _)| *old != key) {
             let how = pixels::unfit(color, depth).map_or_else(|| how(config, &key), How::Not);
-            self.made = Some((key, how));
+            self.built = Some((key, how));
         }
         let (raw, unit_m) =
             pixels::depth(depth, depth_pixels, &mut self.packed).map_err(|e| e.to_string())?;
-        match &mut self.made {
+        match &mut self.built {
             Some((_, How::Registered(registration))) => {
                 let pixels = color.width as usize * color.height as usize;
                 self.registered.resize(pixels, 0);
@@ -77,9 +77,9 @@ impl View {
         }
     }
 
-    /// What the last [`Self::depth`] that succeeded gave, unless it lies in the frame that it was asked of.
+    /// The result of the last [`Self::depth`] that succeeded, unless it lies in that call's own frame.
     pub fn last<'a>(&'a self, depth: &FrameHeader, depth_pixels: &'a [u8]) -> Option<&'a [u16]> {
-        match &self.made {
+        match &self.built {
             Some((_, How::Registered(_))) => Some(&self.registered),
             Some((_, How::AsItIs)) => pixels::in_place(depth, depth_pixels).or(Some(&self.packed)),
             _ => None,
@@ -90,7 +90,8 @@ impl View {
 fn how(config: &RefineConfig, key: &Key) -> How {
     let Key { depth, color } = key;
     let sizes = || {
-        let ((dw, dh), (cw, ch)) = (depth.size, color.size);
+        let (dw, dh) = depth.size;
+        let (cw, ch) = color.size;
         format!("depth is {dw}x{dh} and colour {cw}x{ch}")
     };
     if config.is_aligned {
@@ -121,9 +122,9 @@ fn how(config: &RefineConfig, key: &Key) -> How {
         return How::AsItIs;
     }
     let color_from_depth = color.pose.inverse().compose(&depth.pose);
-    let made =
+    let registration =
         Registration::new(&depth.intrinsics, depth.size, &color.intrinsics, color.size, &color_from_depth);
-    match made {
+    match registration {
         Ok(registration) => How::Registered(Box::new(registration)),
         Err(e) => How::Not(e.to_string()),
     }

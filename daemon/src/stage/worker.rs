@@ -1,10 +1,10 @@
-//! The thread of one refiner: takes the newest pairs of its cameras in turn, refines them, publishes what comes out.
+//! The thread of one refiner: takes the newest pairs of its cameras in turn, refines them, publishes the results.
 //!
-//! Nothing is allocated per frame once every camera has had one, but for the counter that iceoryx2 makes for each slot
+//! Nothing is allocated per frame once every camera has had one, except the counter that iceoryx2 makes for each slot
 //! that it lends: scratch memory is kept, and pixels are written where subscribers read them.
 
-use super::lane::{Lane, Pair, Skip};
 use super::pixels;
+use super::refinement::{Pair, Refinement, Skip};
 use super::view::View;
 use crate::stream::Stream;
 use crate::wake::Wake;
@@ -18,26 +18,26 @@ use std::sync::{Arc, Mutex, PoisonError};
 const IDLE: Duration = Duration::from_millis(100);
 /// Pairs of one batch at most.
 pub const MAX_BATCH: usize = 8;
-/// Flags of the source frames that hold for what is made of them, too.
+/// Flags of the source frames that hold for the refined frame, too.
 const INHERITED: u32 = FrameFlags::REPLAYED
     .with(FrameFlags::SYNTHETIC)
     .with(FrameFlags::TIME_UNCERTAIN)
     .with(FrameFlags::CLOCK_WARMUP)
     .0;
 
-/// What a worker shares with the thread that supervises it. Each worker has its own, so that one that was given up can
+/// State that a worker shares with its supervisor. Each worker has its own, so that one that was given up can
 /// do no harm.
 #[derive(Debug, Default)]
 pub struct Shared {
-    /// Rung when a pair or a lane is there.
-    pub bell: Wake,
+    /// Raised when a pair or a camera is there.
+    pub wake: Wake,
     /// Ends the worker after the work in hand.
     pub stop: AtomicBool,
     /// The refiner is ready.
     pub open: AtomicBool,
     /// The cameras; the worker takes in those that are new.
-    pub lanes: Mutex<Vec<Arc<Lane>>>,
-    /// When the work in hand began, nanoseconds of the host clock; 0 when there is none.
+    pub refinements: Mutex<Vec<Arc<Refinement>>>,
+    /// When the work in hand began, nanoseconds of the host clock; 0 without work.
     pub busy_since: AtomicI64,
     /// The longest that work on a batch has taken, nanoseconds; 0 before the first was done.
     pub slowest_ns: AtomicU64,
@@ -56,8 +56,8 @@ impl Shared {
 }
 
 /// One camera at the worker.
-struct Seat {
-    lane: Arc<Lane>,
+struct WorkerCamera {
+    refinement: Arc<Refinement>,
     view: View,
     session: u64,
     aligned_session: u64,
@@ -67,7 +67,7 @@ struct Seat {
 
 /// A pair in work.
 struct InWork {
-    seat: usize,
+    camera: usize,
     pair: Pair,
     out: FrameMut,
     publisher: Arc<Publisher>,
@@ -80,13 +80,13 @@ struct InWork {
 pub struct Worker {
     shared: Arc<Shared>,
     refiner: Box<dyn Refiner>,
-    /// What of it is not as asked for.
+    /// How the refiner differs from the settings.
     note: Option<String>,
-    /// Rung after each frame: the set thread's.
+    /// Raised after each frame: the set thread's.
     frames: Arc<Wake>,
     batch: usize,
-    seats: Vec<Seat>,
-    /// The seat whose turn is next.
+    cameras: Vec<WorkerCamera>,
+    /// The camera whose turn is next.
     turn: usize,
     work: Vec<InWork>,
     steps: Vec<StepTimes>,
@@ -95,7 +95,7 @@ pub struct Worker {
 }
 
 impl Worker {
-    /// A worker of `refiner`, of which `note` says what is not as asked for.
+    /// A worker of `refiner`; `note` states how it differs from the settings.
     pub fn new(
         shared: Arc<Shared>,
         refiner: Box<dyn Refiner>,
@@ -109,7 +109,7 @@ impl Worker {
             note,
             frames,
             batch,
-            seats: Vec::new(),
+            cameras: Vec::new(),
             turn: 0,
             work: Vec::with_capacity(batch),
             steps: Vec::with_capacity(batch),
@@ -123,16 +123,16 @@ impl Worker {
     /// The refiner's.
     pub fn run(mut self) -> Result<(), Error> {
         while !self.shared.stop.load(Ordering::Relaxed) {
-            self.take_seats();
+            self.take_cameras();
             self.shared.begin();
             self.collect();
             if self.work.is_empty() {
                 self.shared.busy_since.store(0, Ordering::Relaxed);
-                self.shared.bell.wait(IDLE);
+                self.shared.wake.wait(IDLE);
                 continue;
             }
             let mut done = self.refine();
-            if done.as_ref().is_err_and(is_of_a_picture) {
+            if done.as_ref().is_err_and(is_of_an_image) {
                 done = self.refine_one_by_one();
             }
             self.publish(done.is_ok());
@@ -142,59 +142,65 @@ impl Worker {
         Ok(())
     }
 
-    fn take_seats(&mut self) {
-        let lanes = self.shared.lanes.lock().unwrap_or_else(PoisonError::into_inner);
-        for lane in lanes.iter().skip(self.seats.len()) {
+    fn take_cameras(&mut self) {
+        let refinements = self.shared.refinements.lock().unwrap_or_else(PoisonError::into_inner);
+        for refinement in refinements.iter().skip(self.cameras.len()) {
             let description = self.refiner.describe();
-            lane.runs(&description.engine, &description.model, self.note.as_deref());
-            let session = lane.refined.books().begin_session();
-            let aligned_session = lane.aligned.as_ref().map_or(0, |s| s.books().begin_session());
+            refinement.runs(&description.engine, &description.model, self.note.as_deref());
+            let session = refinement.refined.books().begin_session();
+            let aligned_session = refinement.aligned.as_ref().map_or(0, |s| s.books().begin_session());
             let view = View::default();
-            self.seats.push(Seat { lane: Arc::clone(lane), view, session, aligned_session, epoch: None });
+            self.cameras.push(WorkerCamera {
+                refinement: Arc::clone(refinement),
+                view,
+                session,
+                aligned_session,
+                epoch: None,
+            });
         }
     }
 
     /// Takes pairs, one of each camera at most, beginning with the one whose turn it is.
     fn collect(&mut self) {
-        let seats = self.seats.len();
-        for i in 0..seats {
+        let cameras = self.cameras.len();
+        for i in 0..cameras {
             if self.work.len() == self.batch {
                 break;
             }
-            let at = (self.turn + i) % seats;
-            let seat = &mut self.seats[at];
-            let Some(pair) = seat.lane.take() else { continue };
-            match seat.prepare(at, pair) {
+            let at = (self.turn + i) % cameras;
+            let camera = &mut self.cameras[at];
+            let Some(pair) = camera.refinement.take() else { continue };
+            match camera.prepare(at, pair) {
                 Ok(work) => self.work.push(work),
-                Err(why) => seat.finished(Some(why)),
+                Err(why) => camera.finished(Some(why)),
             }
         }
         // Whoever was served last comes last.
         if let Some(last) = self.work.last() {
-            self.turn = (last.seat + 1) % seats.max(1);
+            self.turn = (last.camera + 1) % cameras.max(1);
         }
     }
 
     fn refine(&mut self) -> Result<(), Error> {
-        let Self { refiner, seats, work, steps, jobs, .. } = self;
+        let Self { refiner, cameras, work, steps, jobs, .. } = self;
         let mut list: Vec<Job<'_>> = recycle(core::mem::take(jobs));
-        let made = work.iter_mut().try_for_each(|w| w.job(&seats[w.seat]).map(|job| list.push(job)));
-        let done = made.and_then(|()| refiner.refine(&mut list));
+        let listed = work.iter_mut().try_for_each(|w| w.job(&cameras[w.camera]).map(|job| list.push(job)));
+        let done = listed.and_then(|()| refiner.refine(&mut list));
         steps.clear();
         steps.extend(list.iter().map(|j| j.steps));
         *jobs = recycle(list);
         done
     }
 
-    /// Refines what a refiner refused as a batch. The pictures of one camera must not cost the others theirs, so that
-    /// only the pairs that are refused alone, too, are out of the work then.
+    /// Refines one by one the pairs of a batch that the refiner refused. The images of one camera must not cost the
+    /// others theirs: only pairs that are refused alone, too, leave the work.
     fn refine_one_by_one(&mut self) -> Result<(), Error> {
-        let Self { refiner, seats, work, steps, .. } = self;
+        let Self { refiner, cameras, work, steps, .. } = self;
         steps.clear();
         let mut at = 0;
         while let Some(w) = work.get_mut(at) {
-            let seat = &seats[w.seat];
-            let done = w.job(seat).and_then(|mut job| {
+            let camera = &cameras[w.camera];
+            let done = w.job(camera).and_then(|mut job| {
                 refiner.refine(core::slice::from_mut(&mut job))?;
                 Ok(job.steps)
             });
@@ -203,9 +209,9 @@ impl Worker {
                     steps.push(took);
                     at += 1;
                 }
-                Err(e) if is_of_a_picture(&e) => {
-                    seat.lane.obstacle(Some(&e.to_string()));
-                    seat.finished(Some(Skip::Unfit));
+                Err(e) if is_of_an_image(&e) => {
+                    camera.refinement.obstacle(Some(&e.to_string()));
+                    camera.finished(Some(Skip::Unfit));
                     work.remove(at);
                 }
                 Err(e) => return Err(e),
@@ -217,21 +223,21 @@ impl Worker {
     fn publish(&mut self, good: bool) {
         let description = self.refiner.describe();
         for (i, work) in self.work.drain(..).enumerate() {
-            let seat = &mut self.seats[work.seat];
+            let camera = &mut self.cameras[work.camera];
             let steps = self.steps.get(i).copied().unwrap_or_default();
             let skipped = if good {
-                seat.publish(work, steps, &description.engine, &description.model).err().flatten()
+                camera.publish(work, steps, &description.engine, &description.model).err().flatten()
             } else {
                 Some(Skip::Engine)
             };
-            seat.finished(skipped);
+            camera.finished(skipped);
         }
         self.frames.raise();
     }
 }
 
-/// Whether it is a pair of pictures that a refiner cannot use, and not the refiner itself that failed.
-const fn is_of_a_picture(e: &Error) -> bool {
+/// Whether it is a pair of images that a refiner cannot use, and not the refiner itself that failed.
+const fn is_of_an_image(e: &Error) -> bool {
     matches!(e.kind(), ErrorKind::BadInput | ErrorKind::SizeMismatch)
 }
 
@@ -243,16 +249,17 @@ fn recycle<'b>(mut list: Vec<Job<'_>>) -> Vec<Job<'b>> {
 }
 
 impl InWork {
-    fn job<'a>(&'a mut self, seat: &'a Seat) -> Result<Job<'a>, Error> {
+    fn job<'a>(&'a mut self, camera: &'a WorkerCamera) -> Result<Job<'a>, Error> {
         let bad = |what: String| Error::new(ErrorKind::BadInput, what);
-        let (color, depth) = (&self.pair.color, &self.pair.depth);
+        let color = &self.pair.color;
+        let depth = &self.pair.depth;
         let color: Color<'_> =
             pixels::color(color.header(), color.pixels()).map_err(|e| bad(e.to_string()))?;
-        let registered = seat.view.last(depth.header(), depth.pixels());
+        let registered = camera.view.last(depth.header(), depth.pixels());
         let registered = registered.ok_or_else(|| bad("depth is not in the view of colour".to_owned()))?;
         let out = self.out.pixels_mut();
         let unaligned = |_| bad("a slot of shared memory is not aligned".to_owned());
-        let out = if seat.lane.config.format == PixelFormat::DepthF32 {
+        let out = if camera.refinement.config.format == PixelFormat::DepthF32 {
             Output::Metres(bytemuck::try_cast_slice_mut(out).map_err(unaligned)?)
         } else {
             let pixels = bytemuck::try_cast_slice_mut(out).map_err(unaligned)?;
@@ -263,26 +270,27 @@ impl InWork {
     }
 }
 
-impl Seat {
+impl WorkerCamera {
     /// Puts depth into the view of colour and gets the memory for the result.
     fn prepare(&mut self, at: usize, pair: Pair) -> Result<InWork, Skip> {
         let began = HostTime::now();
-        let (color, depth) = (*pair.color.header(), *pair.depth.header());
-        let profile = &self.lane.refined.profile;
+        let color = *pair.color.header();
+        let depth = *pair.depth.header();
+        let profile = &self.refinement.refined.profile;
         let seen = if (profile.width, profile.height) == (color.width, color.height) {
-            self.view.depth(&self.lane.config, &color, &depth, pair.depth.pixels())
+            self.view.depth(&self.refinement.config, &color, &depth, pair.depth.pixels())
         } else {
             Err(format!("colour became {}x{}; restart the daemon", color.width, color.height))
         };
         let (registered, unit_m) = match seen {
             Ok(seen) => seen,
             Err(why) => {
-                self.lane.obstacle(Some(&why));
+                self.refinement.obstacle(Some(&why));
                 return Err(Skip::Unfit);
             }
         };
         let register_ns = began.elapsed().as_nanos() as u64;
-        if let Some(stream) = &self.lane.aligned {
+        if let Some(stream) = &self.refinement.aligned {
             let steps = [began.since_ns(pair.ready).max(0) as u64, register_ns, 0, 0, 0, 0];
             let header = derived(&pair, PixelFormat::Z16, unit_m, steps, self.epoch);
             let publisher = stream.books().publisher.clone();
@@ -297,15 +305,15 @@ impl Seat {
                 books.dropped.add(why.reason(), 1);
             }
         }
-        let publisher = self.lane.refined.books().publisher.clone().ok_or(Skip::NoSlot)?;
-        let out = publisher.loan(self.lane.refined.profile.frame_bytes()).map_err(|e| {
-            tracing::debug!(stream = %self.lane.refined.id, error = %e, "no slot");
+        let publisher = self.refinement.refined.books().publisher.clone().ok_or(Skip::NoSlot)?;
+        let out = publisher.loan(self.refinement.refined.profile.frame_bytes()).map_err(|e| {
+            tracing::debug!(stream = %self.refinement.refined.id, error = %e, "no slot");
             Skip::NoSlot
         })?;
-        Ok(InWork { seat: at, pair, out, publisher, unit_m, began, register_ns })
+        Ok(InWork { camera: at, pair, out, publisher, unit_m, began, register_ns })
     }
 
-    /// Publishes what was made of a pair; why it was not, if that is still to be counted.
+    /// Publishes the refined pair; returns why it was not, if that is still to be counted.
     fn publish(
         &mut self,
         work: InWork,
@@ -314,35 +322,35 @@ impl Seat {
         model: &str,
     ) -> Result<(), Option<Skip>> {
         let InWork { pair, out, publisher, unit_m, began, register_ns, .. } = work;
-        // Not before: what the refiner refuses is an obstacle as well.
-        self.lane.obstacle(None);
+        // Not before: a pair that the refiner refuses is an obstacle as well.
+        self.refinement.obstacle(None);
         let wait_ns = began.since_ns(pair.ready).max(0) as u64;
         let steps = [wait_ns, register_ns, steps.prepare_ns, steps.infer_ns, steps.finish_ns, 0];
-        let format = self.lane.refined.profile.format;
+        let format = self.refinement.refined.profile.format;
         let unit_m = if format == PixelFormat::DepthF32 { 1.0 } else { unit_m };
         let mut header = derived(&pair, format, unit_m, steps, self.epoch);
         header.set_refiner(engine, model);
-        let total = publish_on(&self.lane.refined, self.session, &publisher, out, header, pair.ready)?;
+        let total = publish_on(&self.refinement.refined, self.session, &publisher, out, header, pair.ready)?;
         self.epoch = Some(header.clock_epoch);
         let [wait, register, prepare, infer, finish, _] = steps;
-        self.lane.measured([wait, register, prepare, infer, finish, total]);
+        self.refinement.measured([wait, register, prepare, infer, finish, total]);
         Ok(())
     }
 
     /// A pair has met its fate; `skipped` says why it was not refined.
     fn finished(&self, skipped: Option<Skip>) {
         // Of a worker that was given up everything is counted already.
-        if self.lane.refined.books().session != self.session {
+        if self.refinement.refined.books().session != self.session {
             return;
         }
-        self.lane.finished();
+        self.refinement.finished();
         if let Some(why) = skipped {
-            self.lane.skip(why);
+            self.refinement.skip(why);
         }
     }
 }
 
-/// The header of what is made of `pair`, but for its numbers on the channel and its times there. `epoch` is the clock map
+/// The header of the refined frame of `pair`, without its numbers and times on the channel. `epoch` is the clock map
 /// of the frame before.
 fn derived(
     pair: &Pair,
@@ -379,7 +387,7 @@ pub(crate) fn derived_header(
         stage_ns,
         ..*depth
     };
-    header.set_picture(format, color.width, color.height);
+    header.set_image(format, color.width, color.height);
     header
 }
 
@@ -405,7 +413,7 @@ fn publish_on(
     header.captured = header.sequence + books.dropped.total();
     let total = ready.elapsed().as_nanos() as u64;
     header.stage_ns[StageStep::Total as usize] = total;
-    // Of a replay everything is as long ago as it was; what was made of it is so, too.
+    // Of a replay everything is as long ago as it was; so is the refined frame.
     let replayed = header.has(FrameFlags::REPLAYED);
     let published =
         if replayed { header.publish_time_ns.saturating_add(total as i64) } else { HostTime::now().ns() };

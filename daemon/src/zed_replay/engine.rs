@@ -1,11 +1,11 @@
-//! Many pairs and many modes at once: each thread takes what is to be done next, and what is done comes out in order.
+//! Many pairs and many modes at once: each thread takes the next task, and pairs come out in order.
 //!
 //! A pair is read and rectified once, whatever number of modes work on it, and presets share their matching. The pairs between reading and handing on are
 //! bounded, and so are the matchers, which hold most of the memory.
 
+use super::images::{Maker, ModeFrames, Views};
 use super::input::{Head, Input, Next};
 use super::modes::{Group, Worker};
-use super::pictures::{Made, Maker, Views};
 use depthrig_bus::clock::thread_cpu_ns;
 use depthrig_calib::stereo::DisparityMap;
 use depthrig_recorder::{Error, ErrorKind, Result};
@@ -16,13 +16,13 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 /// How long the caller waits before it is asked whether to go on.
-const PATIENCE: Duration = Duration::from_millis(100);
+const TIMEOUT: Duration = Duration::from_millis(100);
 
-/// A pair with all that was made of it.
+/// A pair with all frames computed from it.
 pub(super) struct Done {
     pub(super) head: Head,
     /// `None` when the pair is not there or cannot be decoded.
-    pub(super) made: Option<(Arc<Views>, Vec<Made>)>,
+    pub(super) computed: Option<(Arc<Views>, Vec<ModeFrames>)>,
     /// Why there is nothing, if it should be there.
     pub(super) problem: Option<String>,
 }
@@ -62,12 +62,12 @@ struct Item {
     /// Groups that nobody has begun.
     todo: Vec<bool>,
     /// By mode.
-    made: Vec<Option<Made>>,
+    computed: Vec<Option<ModeFrames>>,
 }
 
 impl Item {
     fn is_done(&self, modes: usize) -> bool {
-        self.problem.is_some() || self.head.left.is_none() || self.made.iter().flatten().count() == modes
+        self.problem.is_some() || self.head.left.is_none() || self.computed.iter().flatten().count() == modes
     }
 }
 
@@ -108,7 +108,7 @@ impl State {
     }
 }
 
-/// What a thread does next.
+/// A thread's next task.
 enum Task {
     Match { number: u64, group: usize, views: Arc<Views>, worker: Option<Worker> },
     Read,
@@ -121,7 +121,7 @@ impl Engine<'_> {
     /// while there is nothing. `false` when it broke.
     ///
     /// # Errors
-    /// What reading, matching and `sink` say.
+    /// Errors of reading, matching and `sink`.
     pub(super) fn run(&self, sink: &mut dyn FnMut(Option<Done>) -> Result<ControlFlow<()>>) -> Result<bool> {
         std::thread::scope(|scope| {
             for n in 0..self.jobs {
@@ -138,7 +138,7 @@ impl Engine<'_> {
         })
     }
 
-    /// What it cost.
+    /// The processor time that it took.
     pub(super) fn into_cpu(self) -> Cpu {
         self.state.into_inner().unwrap_or_else(PoisonError::into_inner).cpu
     }
@@ -152,15 +152,17 @@ impl Engine<'_> {
             let done = if state.items.front().is_some_and(|i| i.is_done(self.modes)) {
                 state.first += 1;
                 state.items.pop_front().map(|item| {
-                    let whole = item.problem.is_none();
-                    let made =
-                        item.views.filter(|_| whole).map(|v| (v, item.made.into_iter().flatten().collect()));
-                    Done { head: item.head, made, problem: item.problem }
+                    let intact = item.problem.is_none();
+                    let computed = item
+                        .views
+                        .filter(|_| intact)
+                        .map(|v| (v, item.computed.into_iter().flatten().collect()));
+                    Done { head: item.head, computed, problem: item.problem }
                 })
             } else if state.ended && state.items.is_empty() {
                 return Ok(true);
             } else {
-                drop(self.wake.wait_timeout(state, PATIENCE).unwrap_or_else(PoisonError::into_inner));
+                drop(self.wake.wait_timeout(state, TIMEOUT).unwrap_or_else(PoisonError::into_inner));
                 None
             };
             self.wake.notify_all();
@@ -250,8 +252,8 @@ impl Engine<'_> {
         };
         let number = state.first + state.items.len() as u64;
         let todo = vec![raw.is_some(); self.groups.len()];
-        let made = (0..self.modes).map(|_| None).collect();
-        state.items.push_back(Item { head, views: None, problem, todo, made });
+        let computed = (0..self.modes).map(|_| None).collect();
+        state.items.push_back(Item { head, views: None, problem, todo, computed });
         drop(state);
         self.wake.notify_all();
         let Some(raw) = raw else { return Ok(true) };
@@ -288,15 +290,15 @@ impl Engine<'_> {
         };
         worker.run(&views.pair(), maps).map_err(failed)?;
         let matched = thread_cpu_ns();
-        let made = maps.iter().map(|map| self.maker.depth(map)).collect::<Result<Vec<_>>>()?;
+        let computed = maps.iter().map(|map| self.maker.depth(map)).collect::<Result<Vec<_>>>()?;
         let end = thread_cpu_ns();
         let mut state = self.lock();
         state.cpu.stereo[group] += matched - begin;
         state.cpu.depth += end - matched;
         state.free[group].push(worker);
         if let Some(item) = state.item(number) {
-            for (mode, made) in of.modes.iter().zip(made) {
-                item.made[*mode] = Some(made);
+            for (mode, frames) in of.modes.iter().zip(computed) {
+                item.computed[*mode] = Some(frames);
             }
         }
         Ok(true)

@@ -1,6 +1,6 @@
-//! What is replayed: the raw eyes of a recorded dataset, or the pairs of another recording.
+//! Inputs: the raw left and right images of a recorded dataset, or the pairs of another recording.
 
-use super::pictures::Raw;
+use super::images::Raw;
 use depthrig_bus::{
     ClockDomain, FrameFlags, FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, StreamId, UtcPair,
 };
@@ -16,21 +16,21 @@ use std::path::Path;
 
 /// The moment on the monotonic clock that the first pair of a recording without such a clock gets, nanoseconds.
 const FIRST_NS: i64 = 1_000_000_000;
-/// Times before this are no UTC but count from some start: the year 2000, nanoseconds since 1970.
+/// Times before this are not UTC but count from some start: the year 2000, nanoseconds since 1970.
 const EARLIEST_UTC_NS: i64 = 946_684_800_000_000_000;
 
-/// What the frames of a pair have in common.
+/// Facts common to the frames of a pair.
 pub(super) struct Head {
     pub(super) set: u64,
     pub(super) tick: HostTime,
     pub(super) utc: UtcPair,
-    /// Header of the left eye's frame; `None` when there is no pair.
+    /// Header of the left image's frame; `None` in a set without a pair.
     pub(super) left: Option<Box<FrameHeader>>,
-    /// What the camera's motion unit sent since the set before.
+    /// IMU batches of the camera since the set before.
     pub(super) motion: Vec<RecordMotion>,
 }
 
-/// What comes next.
+/// The next item of an input.
 pub(super) enum Next {
     /// A pair, or a set that has none.
     Pair(Head, Option<Raw>),
@@ -39,7 +39,7 @@ pub(super) enum Next {
     End,
 }
 
-/// What is known before the first pair.
+/// Facts known before the first pair.
 #[derive(Clone)]
 pub(super) struct Facts {
     /// Name of the camera.
@@ -50,15 +50,15 @@ pub(super) struct Facts {
     pub(super) rate_hz: f64,
     pub(super) calibration: StereoCalibration,
     pub(super) calibration_origin: String,
-    /// Pose of the left eye on the mount.
+    /// Pose of the left camera on the mount.
     pub(super) pose: Pose,
     /// The session that the output's begins as: without streams.
     pub(super) session: Session,
-    /// What became of the batches of its motion units, as the recording says.
+    /// Accounts of the batches of its IMUs, as the recording has them.
     pub(super) accounts: Vec<StreamAccount>,
     /// Streams that depth is computed from.
     pub(super) from: Vec<StreamId>,
-    /// What tells this input from any other, and from itself after a change.
+    /// Identifies this input among others, and shows that it changed.
     pub(super) identity: Value,
     pub(super) total: u64,
 }
@@ -68,7 +68,7 @@ enum Kind {
         reader: Box<SetReader>,
         left: usize,
         right: usize,
-        /// The motion unit of what is made that each unit of the dataset is, if it is one.
+        /// The output's IMU for each IMU of the dataset, if it has one.
         units: Vec<Option<usize>>,
         number: usize,
         lost: Vec<String>,
@@ -107,10 +107,10 @@ fn name_of(path: &Path) -> String {
 }
 
 impl Input {
-    /// Opens a dataset with the raw eyes of a stereo camera, a folder of side-by-side pictures, or an SVO2 file.
+    /// Opens a dataset with raw left and right images, a folder of side-by-side images, or an SVO2 file.
     pub(super) fn open(path: &Path, camera: Option<&str>, options: &replay::OpenOptions) -> Result<Self> {
         let recording = || Self::recording(replay::open(path, options).map_err(driver)?, camera);
-        // An SVO2 file is an MCAP file, as a segment of a dataset is; its name tells even when it is damaged.
+        // An SVO2 file is an MCAP file, as a segment of a dataset is; its name identifies it even when it is damaged.
         if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("svo2") || e.eq_ignore_ascii_case("svo")) {
             return recording();
         }
@@ -123,9 +123,10 @@ impl Input {
 
     fn dataset(dataset: &Dataset, camera: Option<&str>) -> Result<Self> {
         let session = dataset.session();
-        let (left, right) = eyes(session, camera)?;
-        let (l, r) = (&session.streams[left], &session.streams[right]);
-        same_picture(l, r)?;
+        let (left, right) = left_and_right(session, camera)?;
+        let l = &session.streams[left];
+        let r = &session.streams[right];
+        same_image(l, r)?;
         let reader = dataset.set_reader()?;
         let size = |p: &std::path::PathBuf| p.metadata().map_or(0, |m| m.len());
         let identity = json!({
@@ -137,16 +138,16 @@ impl Input {
             "first_utc_ns": reader.times().first(),
             "segment_bytes": dataset.segments().iter().map(size).collect::<Vec<_>>(),
         });
-        let mut made = session.clone();
-        made.outcome = None;
-        made.streams.clear();
-        // Of other cameras there will be nothing that their motion belongs to.
-        made.motion.retain(|u| u.id.camera == l.id.camera);
-        let units = session.motion.iter().map(|u| made.motion.iter().position(|m| m.id == u.id)).collect();
-        let mut accounts = if made.motion.is_empty() { Vec::new() } else { dataset.info()?.accounts };
-        accounts.retain(|a| made.motion.iter().any(|u| u.id == a.stream));
-        made.computed.clear();
-        made.derived.push(derived(
+        let mut output = session.clone();
+        output.outcome = None;
+        output.streams.clear();
+        // Motion of other cameras would have no frames to belong to.
+        output.motion.retain(|u| u.id.camera == l.id.camera);
+        let units = session.motion.iter().map(|u| output.motion.iter().position(|m| m.id == u.id)).collect();
+        let mut accounts = if output.motion.is_empty() { Vec::new() } else { dataset.info()?.accounts };
+        accounts.retain(|a| output.motion.iter().any(|u| u.id == a.stream));
+        output.computed.clear();
+        output.derived.push(derived(
             dataset.path(),
             reader.times().first().copied().unwrap_or_default(),
             reader.times().last().copied().unwrap_or_default(),
@@ -164,7 +165,7 @@ impl Input {
             },
             calibration_origin: l.calibration.clone(),
             pose: l.pose,
-            session: made,
+            session: output,
             accounts,
             from: vec![l.id.clone(), r.id.clone()],
             identity,
@@ -184,7 +185,7 @@ impl Input {
         let info = source.info().clone();
         let Some(calibration) = info.calibration else {
             return Err(bad(format!(
-                "{} has no calibration, and without one there is no depth: put the camera's SN<serial>.conf beside it or \
+                "{} has no calibration, which depth needs: put the camera's SN<serial>.conf beside it or \
                  name the file with --calibration",
                 info.path.display()
             )));
@@ -198,7 +199,7 @@ impl Input {
         let mut session = Session::new(name_of(&info.path), "zed");
         session.started_utc_ns = started;
         session.derived.push(derived(&info.path, started, started));
-        let id = |eye: &str| StreamId::new(camera, eye).map_err(|e| bad(format!("--camera {camera}: {e}")));
+        let id = |side: &str| StreamId::new(camera, side).map_err(|e| bad(format!("--camera {camera}: {e}")));
         let facts = Facts {
             camera: camera.to_owned(),
             model: if info.model.is_empty() { "ZED".to_owned() } else { info.model.clone() },
@@ -250,7 +251,7 @@ impl Input {
         }
     }
 
-    /// Goes to what follows set `last` of the output; how many sets lie before.
+    /// Goes to the pair after set `last` of the output; returns how many sets lie before.
     pub(super) fn go_behind(&mut self, last: u64) -> Result<u64> {
         match &mut self.kind {
             Kind::Recording { source, .. } => {
@@ -350,9 +351,10 @@ impl Input {
                     ..FrameHeader::default()
                 };
                 h.set_device(&self.facts.model, &self.facts.serial);
-                h.set_picture(info.format, info.width, info.height);
+                h.set_image(info.format, info.width, info.height);
                 head.left = Some(Box::new(h));
-                let (left, right) = (std::mem::take(&mut pair.left), std::mem::take(&mut pair.right));
+                let left = std::mem::take(&mut pair.left);
+                let right = std::mem::take(&mut pair.right);
                 Ok(Next::Pair(head, Some(Raw { format: info.format, left, right })))
             }
         }
@@ -371,10 +373,10 @@ fn derived(path: &Path, first_utc_ns: i64, last_utc_ns: i64) -> Derived {
     }
 }
 
-/// Indices of the raw eyes of the stereo camera that is meant.
-fn eyes(session: &Session, camera: Option<&str>) -> Result<(usize, usize)> {
-    let find = |camera: &str, eye: &str| {
-        let is = |s: &StreamRecord| s.id.camera.as_str() == camera && s.id.stream.as_str() == eye;
+/// Indices of the raw left and right streams of the selected stereo camera.
+fn left_and_right(session: &Session, camera: Option<&str>) -> Result<(usize, usize)> {
+    let find = |camera: &str, side: &str| {
+        let is = |s: &StreamRecord| s.id.camera.as_str() == camera && s.id.stream.as_str() == side;
         session.streams.iter().position(is)
     };
     let all = session.streams.iter().map(|s| s.id.camera.as_str());
@@ -384,7 +386,7 @@ fn eyes(session: &Session, camera: Option<&str>) -> Result<(usize, usize)> {
     let names = || found.iter().map(|(c, _)| *c).collect::<std::collections::BTreeSet<_>>();
     let list = |names: std::collections::BTreeSet<&str>| names.into_iter().collect::<Vec<_>>().join(", ");
     if let Some(camera) = camera {
-        let one = found.iter().find(|(c, _)| *c == camera).map(|(_, eyes)| *eyes);
+        let one = found.iter().find(|(c, _)| *c == camera).map(|(_, pair)| *pair);
         return one.ok_or_else(|| {
             let rest = if found.is_empty() { "none".to_owned() } else { list(names()) };
             bad(format!(
@@ -398,17 +400,17 @@ fn eyes(session: &Session, camera: Option<&str>) -> Result<(usize, usize)> {
             list(names())
         )));
     }
-    found.first().map(|(_, eyes)| *eyes).ok_or_else(|| {
+    found.first().map(|(_, pair)| *pair).ok_or_else(|| {
         let ids: Vec<_> = session.streams.iter().map(|s| s.id.to_string()).collect();
         bad(format!("no camera of the dataset has both left and right; it has {}", ids.join(", ")))
     })
 }
 
-/// Refuses eyes with different pictures, and pictures that are not read.
-fn same_picture(l: &StreamRecord, r: &StreamRecord) -> Result<()> {
+/// Refuses left and right images that differ in size or format, and unsupported formats.
+fn same_image(l: &StreamRecord, r: &StreamRecord) -> Result<()> {
     if (l.format, l.width, l.height) != (r.format, r.width, r.height) {
         return Err(bad(format!(
-            "{} is {}x{} {} and {} is {}x{} {}; both eyes must have the same pictures",
+            "{} is {}x{} {} and {} is {}x{} {}; left and right must have the same size and format",
             l.id,
             l.width,
             l.height,
@@ -420,7 +422,8 @@ fn same_picture(l: &StreamRecord, r: &StreamRecord) -> Result<()> {
         )));
     }
     if !matches!(l.format, PixelFormat::Yuyv | PixelFormat::Rgb8 | PixelFormat::Bgr8 | PixelFormat::Mono8) {
-        let (id, format) = (&l.id, l.format.name());
+        let id = &l.id;
+        let format = l.format.name();
         return Err(bad(format!("{id} is {format}; depth is computed from yuyv, rgb8, bgr8 and mono8")));
     }
     Ok(())
@@ -430,7 +433,7 @@ fn known(left: &Intrinsics, right: &Intrinsics, path: &Path) -> Result<()> {
     if left.is_known() && right.is_known() {
         return Ok(());
     }
-    let what = "its eyes have no calibration, and without one there is no depth: record again with the camera's \
+    let what = "left and right have no calibration, which depth needs: record again with the camera's \
                 SN<serial>.conf in place";
     Err(bad(format!("{}: {what}", path.display())))
 }
@@ -440,7 +443,8 @@ fn packed(frame: &DatasetFrame) -> Result<(PixelFormat, Vec<u8>)> {
     let h = &frame.header;
     let mut pixels = frame.decoded()?;
     let format = h.pixel_format().unwrap_or(PixelFormat::Mjpeg);
-    let (row, stride) = (format.row_bytes(h.width) as usize, h.stride as usize);
+    let row = format.row_bytes(h.width) as usize;
+    let stride = h.stride as usize;
     if stride != row && row > 0 && stride > row {
         pixels = pixels.chunks(stride).flat_map(|r| r.iter().take(row).copied()).collect();
     }

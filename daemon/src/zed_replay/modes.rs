@@ -1,4 +1,4 @@
-//! The modes that depth is made in: presets of the repository's own matching, and a network that the user has.
+//! The modes that depth is computed in: presets of the repository's own matching, and a network that the user has.
 
 use super::ZedReplayOptions;
 use core::fmt;
@@ -38,7 +38,7 @@ impl Mode {
         }
     }
 
-    /// What recordings call it: it is nobody's closed algorithm.
+    /// Its name in recordings: it is nobody's closed algorithm.
     pub fn recorded_name(self) -> String {
         format!("mimic_{}", self.name())
     }
@@ -69,15 +69,15 @@ pub struct NetworkChoice {
     pub file: PathBuf,
     /// The library of ONNX Runtime or its folder; looked for without.
     pub library: Option<PathBuf>,
-    /// What it runs on, such as `cpu` or `cuda:0`.
+    /// Device that it runs on, such as `cpu` or `cuda:0`.
     pub device: String,
-    /// The numbers that it takes pixels as; what the file says without, and 0 to 255 when it says nothing.
+    /// Range of pixel values that it takes; without it the one of the file, or 0 to 255 when the file names none.
     pub pixels: Option<NetworkPixels>,
     /// It gives disparity as a negative number.
     pub negative: bool,
 }
 
-/// What makes depth of one pair at a time, in one mode or in several at once.
+/// Computes depth of one pair at a time, in one mode or in several at once.
 pub(super) enum Worker {
     /// One mode.
     One(Box<dyn Matcher>),
@@ -112,11 +112,11 @@ impl Worker {
 
 type Make = Box<dyn Fn() -> Result<Worker> + Send + Sync>;
 
-/// What is known of a mode.
+/// Facts about a mode.
 pub(super) struct ModeFacts {
     /// The end of its streams' names.
     pub(super) name: &'static str,
-    /// What recordings call it.
+    /// Its name in recordings.
     pub(super) recorded: String,
     pub(super) description: Description,
 }
@@ -140,23 +140,23 @@ impl Group {
     }
 }
 
-/// All modes that can be made, and how.
+/// All modes that are available, and how to run them.
 pub(super) struct Modes {
     /// In the order in which they were asked for.
     pub(super) facts: Vec<ModeFacts>,
     pub(super) groups: Vec<Group>,
     /// The first worker of each group.
     pub(super) first: Vec<Worker>,
-    /// Modes that cannot be made, each with why.
+    /// Modes that are unavailable, each with why.
     pub(super) unavailable: Vec<String>,
 }
 
 impl Modes {
-    /// The modes that `options` ask for, for pictures of the rectifier's size. The first workers are made, so that what
-    /// cannot be made is found out before anything is written.
+    /// The modes that `options` ask for, for images of the rectifier's size. The first workers are created, so that
+    /// unavailable modes are found before anything is written.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`] when a mode cannot be made or none is left.
+    /// [`ErrorKind::BadInput`] when a mode is unavailable or none is left.
     pub(super) fn open(rectifier: &Rectifier, options: &ZedReplayOptions) -> Result<Self> {
         let network = options.network.as_ref();
         let (there, missing): (Vec<Mode>, Vec<Mode>) =
@@ -171,26 +171,28 @@ impl Modes {
         let mut groups = vec![presets(&there, numbers(true), rectifier, options)];
         groups.extend(network.map(|n| neural(n.clone(), numbers(false), rectifier, options)));
         groups.retain(|g| !g.modes.is_empty());
-        let (mut first, mut descriptions) = (Vec::new(), vec![None; there.len()]);
+        let mut first = Vec::new();
+        let mut descriptions = vec![None; there.len()];
         for group in &mut groups {
             let worker = group.make()?;
-            for (i, told) in group.modes.iter().zip(worker.describe()) {
-                group.memory_bytes = told.memory_bytes;
-                descriptions[*i] = Some(told);
+            for (i, description) in group.modes.iter().zip(worker.describe()) {
+                group.memory_bytes = description.memory_bytes;
+                descriptions[*i] = Some(description);
             }
             first.push(worker);
         }
-        let facts = |(mode, told): (&Mode, Option<Description>)| {
-            Some(ModeFacts { name: mode.name(), recorded: mode.recorded_name(), description: told? })
+        let facts = |(mode, description): (&Mode, Option<Description>)| {
+            Some(ModeFacts { name: mode.name(), recorded: mode.recorded_name(), description: description? })
         };
         let facts = there.iter().zip(descriptions).filter_map(facts).collect();
         Ok(Self { facts, groups, first, unavailable })
     }
 }
 
-/// What matchers need to know of the rectified pairs.
+/// The facts about rectified pairs that matchers need.
 pub(super) fn geometry(rectifier: &Rectifier) -> Geometry {
-    let ((width, height), focal_px) = (rectifier.size(), rectifier.intrinsics().fx);
+    let (width, height) = rectifier.size();
+    let focal_px = rectifier.intrinsics().fx;
     Geometry { width: width as usize, height: height as usize, focal_px, baseline_m: rectifier.baseline_m() }
 }
 
@@ -209,8 +211,8 @@ fn presets(all: &[Mode], modes: Vec<usize>, rectifier: &Rectifier, options: &Zed
     let make: Make = {
         let name = name.clone();
         Box::new(move || {
-            let made = SgmPresets::new(g.width, g.height, &wanted, threads);
-            made.map(|m| Worker::Presets(Box::new(m))).map_err(|e| failed(&name, e))
+            let opened = SgmPresets::new(g.width, g.height, &wanted, threads);
+            opened.map(|m| Worker::Presets(Box::new(m))).map_err(|e| failed(&name, e))
         })
     };
     Group { modes, name, most: usize::MAX, memory_bytes: 0, make }
@@ -224,8 +226,9 @@ fn neural(
     options: &ZedReplayOptions,
 ) -> Group {
     let Geometry { width, height, .. } = geometry(rectifier);
-    // A network keeps its threads busy with one picture; a second one would take as much memory again.
-    let (most, threads) = (1, options.jobs.max(1) * options.threads.max(1));
+    // A network keeps its threads busy with one image; a second one would take as much memory again.
+    let most = 1;
+    let threads = options.jobs.max(1) * options.threads.max(1);
     let make = move || {
         let options = StereoNetworkOptions {
             library: choice.library.clone(),
@@ -234,12 +237,12 @@ fn neural(
             pixels: choice.pixels,
             negative: choice.negative,
         };
-        let opened = StereoNetwork::open(&choice.file, (width, height), &options);
+        let opened = StereoNetwork::open(&choice.file, width, height, &options);
         opened.map(|m| Worker::One(Box::new(m))).map_err(|e| failed(Mode::Neural.name(), e))
     };
     Group { modes, name: Mode::Neural.name().to_owned(), most, memory_bytes: 0, make: Box::new(make) }
 }
 
-/// Why there is no mode `neural`.
+/// Why the mode `neural` is unavailable.
 pub(super) const NO_NETWORK: &str = "unavailable, because no network was given: the vendor's is closed and is not \
     here. Give a stereo network of your own in ONNX form with --network FILE.onnx";

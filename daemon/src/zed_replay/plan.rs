@@ -1,7 +1,7 @@
-//! What is settled before the first pair is matched: modes, streams, the session, and how many pairs at once.
+//! Decisions before the first pair is matched: modes, streams, the session, and how many pairs at once.
 
+use super::images::Maker;
 use super::input::{Facts, Input};
-use super::pictures::Maker;
 use super::{CpuReport, Mode, ModeReport, ZedReplayOptions, ZedReplayReport, modes};
 use depthrig_bus::{PixelFormat, StreamId};
 use depthrig_calib::stereo::{Description, RowOffset};
@@ -34,7 +34,7 @@ pub(super) struct Plan {
 }
 
 impl Plan {
-    /// Makes every matcher once, so that what cannot be made is found out before anything is written.
+    /// Creates every matcher once, so that unavailable ones are found before anything is written.
     pub(super) fn new(input: &mut Input, out: &Path, options: &ZedReplayOptions) -> Result<Self> {
         let facts = input.facts().clone();
         let c = &facts.calibration;
@@ -152,8 +152,8 @@ impl Plan {
         Ok(())
     }
 
-    /// Keeps with the session how far the eyes' rows were found to be apart, corrects that where it is significant, and says so
-    /// where it is too far.
+    /// Keeps the row offset of left and right in the session, corrects it where it is significant, and reports it
+    /// where it is too large.
     pub(super) fn take_rows(&mut self, rows: Option<&RowOffset>) {
         let Some(rows) = rows else { return };
         // Before the work begins nobody else has the maker.
@@ -175,7 +175,7 @@ impl Plan {
         self.notes.extend(warning.map(|w| format!("{}: {w}", self.facts.camera)));
     }
 
-    /// What decides the pixels: a run goes on only with the same.
+    /// The settings that decide the pixels: a run goes on only with the same.
     pub(super) fn identity(&self, options: &ZedReplayOptions) -> serde_json::Value {
         let mode = |m: &modes::ModeFacts| {
             let d = &m.description;

@@ -1,9 +1,9 @@
 //! One run over the pairs that are not recorded yet: from the engine, in order, into the dataset that grows.
 
 use super::engine::{Cpu, Done, Engine, State};
+use super::images::{Color, Numbers};
 use super::input::Input;
 use super::modes::Group;
-use super::pictures::{Color, Numbers};
 use super::plan::{AHEAD, Plan, QUEUE_SETS};
 use super::work::{self, RecordedClock};
 use super::{CpuReport, Step, ZedReplayProgress, ZedReplayReport};
@@ -18,7 +18,7 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-/// What a killed run repeats at most: the pairs of this much recorded time.
+/// A killed run repeats at most this: the pairs of this much recorded time.
 const SEGMENT_NS: i64 = 10_000_000_000;
 /// Time between looks at a recorder that has no room.
 const PAUSE: Duration = Duration::from_millis(2);
@@ -43,7 +43,8 @@ pub(super) fn record(
     if resumed.sets > written {
         report.notes.push(format!("{} sets of earlier runs are without a pair", resumed.sets - written));
     }
-    let (begin, began) = (process_cpu_ns(), HostTime::now());
+    let begin = process_cpu_ns();
+    let began = HostTime::now();
     let first = std::mem::take(&mut plan.first);
     let plan = &*plan;
     let engine = Engine {
@@ -84,7 +85,11 @@ pub(super) fn record(
         report.lose(problem);
     }
     tell_cost(report, &plan.groups, &cpu, pairs.1, process_cpu_ns() - begin);
-    tracing::info!(sets = summary.sets.recorded, after_s = began.elapsed().as_secs_f64(), "depth is made");
+    tracing::info!(
+        sets = summary.sets.recorded,
+        after_s = began.elapsed().as_secs_f64(),
+        "depth is computed"
+    );
     Ok(Some(summary))
 }
 
@@ -128,7 +133,7 @@ fn tell_cost(report: &mut ZedReplayReport, groups: &[Group], cpu: &Cpu, pairs: u
     };
 }
 
-/// Takes what the engine hands on, pair by pair.
+/// Takes the pairs of the engine, one by one.
 struct Sink<'a> {
     plan: &'a Plan,
     recorder: &'a Recorder,
@@ -163,7 +168,7 @@ impl Sink<'_> {
     /// The frames of a pair as a set.
     fn set(&mut self, done: Done) -> RecordSet {
         let head = done.head;
-        let (Some(left), Some((views, made))) = (head.left, done.made) else {
+        let (Some(left), Some((views, computed))) = (head.left, done.computed) else {
             let missing = (0..self.plan.streams.len()).collect();
             return RecordSet {
                 id: head.set,
@@ -185,8 +190,8 @@ impl Sink<'_> {
             let mut h =
                 crate::stage::worker::derived_header(&view, &view, record.format, unit, steps, self.epoch);
             h.set_names(&self.plan.session.rig, &record.id);
-            let made = &self.plan.session.computed[stream];
-            h.set_refiner(&made.producer, &made.name);
+            let source = &self.plan.session.computed[stream];
+            h.set_refiner(&source.producer, &source.name);
             (h.sequence, h.captured) = (self.written, self.written);
             h.dropped = [0; 8];
             h
@@ -197,10 +202,10 @@ impl Sink<'_> {
             frames.push(RecordFrame { stream, header: header(stream), pixels });
         };
         add(Box::new(Color(views)));
-        for made in made {
-            add(Box::new(Numbers(made.depth)));
-            add(Box::new(made.confidence));
-            if let Some(disparity) = made.disparity {
+        for mode_frames in computed {
+            add(Box::new(Numbers(mode_frames.depth)));
+            add(Box::new(mode_frames.confidence));
+            if let Some(disparity) = mode_frames.disparity {
                 add(Box::new(Numbers(disparity)));
             }
         }

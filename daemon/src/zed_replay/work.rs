@@ -1,4 +1,4 @@
-//! The folder beside the output in which it grows, and what a later run needs to know of this one.
+//! The folder beside the output in which it grows, and the facts that a later run needs about this one.
 
 use depthrig_bus::{UtcPair, files};
 use depthrig_recorder::fs::{Fs, RealFs};
@@ -29,7 +29,7 @@ impl Work {
     /// Makes the folder or finds that of a run with the same `plan`.
     pub(super) fn open(out: &Path, plan: &Value) -> Result<Self> {
         let Some(name) = out.file_name() else {
-            let what = format!("{} is no name for a new dataset", out.display());
+            let what = format!("{} is not a valid name for a new dataset", out.display());
             return Err(Error::new(ErrorKind::BadInput, what));
         };
         let mut name = name.to_os_string();
@@ -74,7 +74,7 @@ impl Work {
 
     fn stranger(&self, why: &str) -> Error {
         let what = format!(
-            "{} is what is left of another run ({why}): run that one to its end, remove the folder, or choose another name",
+            "{} holds the remains of another run ({why}): finish that run, remove the folder, or choose another name",
             self.dir.display()
         );
         Error::new(ErrorKind::AlreadyExists, what)
@@ -120,7 +120,7 @@ pub(super) fn remove(dir: &Path) -> Result<()> {
     }
 }
 
-/// The clock of what is recorded: the recorder's own readings must be of the recorded time, not of today's.
+/// The clock of the recording: the recorder's own readings must be of the recorded time, not of today's.
 pub(super) struct RecordedClock(Arc<Mutex<UtcPair>>);
 
 impl RecordedClock {
@@ -140,7 +140,7 @@ impl RecordedClock {
     }
 }
 
-/// Memory that can be had without swapping, bytes; 4 GiB where the system does not tell.
+/// Memory that can be had without swapping, bytes; 4 GiB where the system does not report it.
 pub(super) fn available_memory() -> u64 {
     let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
     let line = text.lines().find_map(|l| l.strip_prefix("MemAvailable:"));

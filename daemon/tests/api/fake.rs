@@ -1,4 +1,4 @@
-//! A rig that does as the test tells it.
+//! A scripted rig.
 
 use depthrig_daemon::control::{Control, RecordRequest, ReplayControl, SeekRequest};
 use depthrig_daemon::status::{
@@ -47,7 +47,7 @@ struct Inner {
     calls: u32,
     stop: bool,
     roots: Vec<std::path::PathBuf>,
-    /// What a replay was asked for; none when this is a rig of cameras.
+    /// Calls on the replay; `None` when this is a rig of cameras.
     replay: Option<Vec<String>>,
 }
 
@@ -192,10 +192,12 @@ impl Control for Fake {
         let mut inner = self.inner.lock().unwrap();
         inner.calls += 1;
         self.called.notify_all();
-        let (delay, panic, fail) = (inner.delay, std::mem::take(&mut inner.panic), inner.fail.take());
+        let delay = inner.delay;
+        let panic = std::mem::take(&mut inner.panic);
+        let fail = inner.fail.take();
         drop(inner);
         std::thread::sleep(delay);
-        assert!(!panic, "as told");
+        assert!(!panic, "as scripted");
         if let Some((kind, message)) = fail {
             return Err(Error::new(kind, message));
         }

@@ -13,7 +13,7 @@ impl Document {
         Self(document)
     }
 
-    /// Every reference leads somewhere, every schema is used, every call has what a description needs.
+    /// Every reference leads somewhere, every schema is used, every call is described in full.
     pub fn check_itself(&self) {
         let schemas = self.0["components"]["schemas"].as_object().unwrap();
         let text = self.0.to_string();
@@ -76,7 +76,7 @@ impl Document {
     }
 
     fn fits(&self, schema: &Value, value: &Value) -> Result<(), String> {
-        for (keyword, wanted) in schema.as_object().ok_or("a schema that is no object")? {
+        for (keyword, wanted) in schema.as_object().ok_or("a schema that is not an object")? {
             match keyword.as_str() {
                 "$ref" => self.fits(self.resolve(wanted), value)?,
                 "anyOf" => {
@@ -89,11 +89,11 @@ impl Document {
                 "type" => {
                     let types = wanted.as_array().cloned().unwrap_or_else(|| vec![wanted.clone()]);
                     if !types.iter().any(|t| is_of(t.as_str().unwrap(), value)) {
-                        return Err(format!("{value} is no {wanted}"));
+                        return Err(format!("{value} is not of type {wanted}"));
                     }
                 }
                 "enum" if !wanted.as_array().unwrap().contains(value) => {
-                    return Err(format!("{value} is none of {wanted}"));
+                    return Err(format!("{value} is not one of {wanted}"));
                 }
                 "minimum" if value.as_f64().is_some_and(|v| v < wanted.as_f64().unwrap()) => {
                     return Err(format!("{value} is below {wanted}"));

@@ -37,7 +37,7 @@ fn half_sent_bodies_on_the_port_do_not_keep_the_socket_waiting() {
     assert_eq!(served.on_port(&request("GET", "/v1/status", "localhost", None, "")).status, 200);
 }
 
-/// What still comes on a connection.
+/// Reads the rest of a connection.
 fn exchange_rest(stream: TcpStream) -> Answer {
     exchange(stream, b"")
 }

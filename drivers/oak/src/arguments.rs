@@ -1,4 +1,4 @@
-//! What the command line asks for.
+//! Parses the command line.
 
 use crate::Error;
 
@@ -6,10 +6,10 @@ use crate::Error;
 const USAGE: &str = "usage: depthrig-oak [--serial SERIAL] [--size 1280x720] [--fps 30] [--dots 0..1] [--no-depth]; which \
                      camera of which rig it is, the daemon says (DEPTHRIG_RIG, DEPTHRIG_CAMERA)";
 
-/// What is wanted of the camera.
+/// The requested camera settings.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Wishes {
-    /// Which camera; `None` is the only one there is.
+    /// Serial number; `None` selects the only camera.
     pub serial: Option<String>,
     /// Width and height of colour, and so of depth, which is aligned to it.
     pub size: (u32, u32),
@@ -30,7 +30,7 @@ impl Default for Wishes {
 /// Reads the arguments behind the program's name.
 ///
 /// # Errors
-/// For an argument that is unknown, lacks its value, or has one that cannot be.
+/// For an argument that is unknown, lacks its value, or has an invalid one.
 pub fn read(mut arguments: impl Iterator<Item = String>) -> Result<Wishes, Error> {
     let mut wishes = Wishes::default();
     while let Some(name) = arguments.next() {
@@ -50,7 +50,7 @@ pub fn read(mut arguments: impl Iterator<Item = String>) -> Result<Wishes, Error
 fn size(text: &str) -> Result<(u32, u32), Error> {
     let parts = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     let possible = |(w, h): &(u32, u32)| (1..=16_384).contains(w) && (1..=16_384).contains(h);
-    parts.filter(possible).ok_or_else(|| format!("{text} is no size: write 1280x720").into())
+    parts.filter(possible).ok_or_else(|| format!("invalid size {text}; write 1280x720").into())
 }
 
 fn number(text: &str, range: std::ops::RangeInclusive<f32>) -> Result<f32, Error> {
@@ -83,9 +83,9 @@ mod tests {
     #[test]
     fn what_cannot_be_is_refused() {
         for (text, why) in [
-            ("--size 640", "is no size"),
-            ("--size 0x400", "is no size"),
-            ("--size 640x20000", "is no size"),
+            ("--size 640", "invalid size 640"),
+            ("--size 0x400", "invalid size 0x400"),
+            ("--size 640x20000", "invalid size 640x20000"),
             ("--fps 0", "is not a number from 0.1 to 240"),
             ("--fps NaN", "is not a number"),
             ("--dots 2", "from 0 to 1"),

@@ -10,9 +10,9 @@ use depthai::pipeline::Pipeline;
 use depthai::stereo_depth::{PresetMode, StereoDepthNode};
 use depthrig_bus::PixelFormat;
 
-/// Frames that may wait in a queue of the SDK; the oldest gives way, and nobody is told.
+/// Frames that may wait in a queue of the SDK, which drops the oldest without a report.
 const QUEUE: u32 = 4;
-/// What the mono sensors of every OAK-D can give.
+/// A size that the mono sensors of every OAK-D support.
 const STEREO_SIZE: (u32, u32) = (640, 400);
 
 /// A running camera.
@@ -27,7 +27,7 @@ pub struct Camera {
 pub struct Stream {
     /// `color` or `depth`.
     pub name: &'static str,
-    /// What its frames are.
+    /// Format of its frames.
     pub format: PixelFormat,
     /// As the SDK calls that.
     kind: ImageFrameType,
@@ -120,7 +120,7 @@ impl Stream {
     }
 
     /// Whether a frame is what the stream was announced as.
-    pub fn fits(&self, frame: &ImageFrame, size: (u32, u32)) -> bool {
-        frame.format() == Some(self.kind) && (frame.width(), frame.height()) == size
+    pub fn fits(&self, frame: &ImageFrame, width: u32, height: u32) -> bool {
+        frame.format() == Some(self.kind) && (frame.width(), frame.height()) == (width, height)
     }
 }

@@ -11,7 +11,7 @@ mod serve;
 
 use std::process::ExitCode;
 
-/// What ends the program, in words for the user.
+/// An error that ends the program, with a message for the user.
 type Error = Box<dyn std::error::Error>;
 
 fn main() -> ExitCode {

@@ -8,7 +8,8 @@ use depthrig_bus::external::{About, ExternalCamera, ExternalFrame, ExternalReaso
 use depthrig_bus::{HostTime, Name};
 use std::os::unix::process::CommandExt;
 
-/// The variable that makes the SDK see these cameras alone (depthai-core `README.md`): the crate itself takes the first.
+/// The variable that makes the SDK see these cameras alone (depthai-core `README.md`): the crate itself takes the
+/// first.
 const DEVICES: &str = "DEPTHAI_DEVICE_ID_LIST";
 /// How often the queues of the SDK are looked into: what a time of arrival may be late by.
 const LOOK: Duration = Duration::from_millis(1);
@@ -23,14 +24,13 @@ pub fn run(wishes: &Wishes) -> Result<(), Error> {
     only(wishes.serial.as_deref())?;
     let place = Place::from_environment()?;
     let camera = Camera::start(wishes)?;
-    let modes = camera
-        .streams()
-        .iter()
-        .map(|s| Ok(Mode::new(Name::new(s.name)?, s.format, wishes.size, f64::from(wishes.rate_hz))));
+    let modes = camera.streams().iter().map(|s| {
+        Ok(Mode::new(Name::new(s.name)?, s.format, wishes.size.0, wishes.size.1, f64::from(wishes.rate_hz)))
+    });
     let modes = modes.collect::<Result<Vec<_>, Error>>()?;
     let about = About {
         model: "OAK".into(),
-        // The crate does not tell what it has opened.
+        // The crate does not report which camera it opened.
         serial: wishes.serial.clone().unwrap_or_default(),
         calibration: "none".into(),
         program: "depthrig-oak".into(),
@@ -38,7 +38,7 @@ pub fn run(wishes: &Wishes) -> Result<(), Error> {
     };
     let mut offered = ExternalCamera::offer(&place, &about, &modes)?;
     let gone = loop {
-        match pass_on(&camera, &mut offered, wishes.size) {
+        match forward(&camera, &mut offered, wishes) {
             Ok(()) if camera.is_there() => {}
             Ok(()) => break "it is unplugged, or its firmware stopped".to_owned(),
             Err(e) => break e.to_string(),
@@ -56,8 +56,9 @@ fn only(serial: Option<&str>) -> Result<(), Error> {
     Err(again.args(std::env::args_os().skip(1)).env(DEVICES, serial).exec().into())
 }
 
-/// One session, or a moment without one, in which frames are taken all the same: the next session begins with new ones.
-fn pass_on(camera: &Camera, offered: &mut ExternalCamera, size: (u32, u32)) -> Result<(), Error> {
+/// Serves one session, or a short while without one, in which frames are discarded: the next session begins with new
+/// ones.
+fn forward(camera: &Camera, offered: &mut ExternalCamera, wishes: &Wishes) -> Result<(), Error> {
     let Some(mut session) = offered.next_session(PAUSE)? else {
         for stream in camera.streams() {
             while stream.next()?.is_some() {}
@@ -77,7 +78,7 @@ fn pass_on(camera: &Camera, offered: &mut ExternalCamera, size: (u32, u32)) -> R
                 continue;
             }
             let arrived = ExternalFrame { arrival_time_ns: HostTime::now().ns(), ..ExternalFrame::default() };
-            if !stream.fits(&frame, size) {
+            if !stream.fits(&frame, wishes.size.0, wishes.size.1) {
                 return Err(
                     format!("{} gives {}, which was not asked for", stream.name, frame.describe()).into()
                 );

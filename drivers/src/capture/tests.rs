@@ -15,7 +15,7 @@ impl<F: FnMut(Duration, &mut dyn FrameSink) -> Result<Poll> + Send> Stream for A
     }
 }
 
-/// Counts commits, remembers what was dropped and counts what gave way.
+/// Counts commits and superseded frames, and remembers the reasons of drops.
 #[derive(Clone, Default)]
 struct Counting(Arc<Mutex<(u64, Vec<DropReason>, u64)>>);
 
@@ -30,7 +30,7 @@ impl FrameSink for Counting {
     fn dropped(&mut self, _: usize, reason: DropReason, _: u64) {
         self.0.lock().unwrap().1.push(reason);
     }
-    fn gave_way(&mut self, _: usize, n: u64) {
+    fn superseded(&mut self, _: usize, n: u64) {
         self.0.lock().unwrap().2 += n;
     }
     fn captured(&mut self, _: usize, _: u64) {}
@@ -60,16 +60,18 @@ fn start_with(
     .unwrap()
 }
 
-/// A unit that talks says nothing of whether the pictures come, unless there are none.
+/// Samples of an IMU do not prove that images arrive, unless there are no image streams.
 #[test]
-fn motion_is_no_sign_of_pictures() {
+fn motion_is_no_sign_of_images() {
     let clock = crate::DeviceClock::microseconds(64);
     let pose = depthrig_bus::Pose::IDENTITY;
     let unit = crate::motion::profile(100.0, 8, pose, clock, depthrig_bus::MetadataLevel::Simulated).unwrap();
-    let picture = StreamProfile { format: depthrig_bus::PixelFormat::Mono8, ..unit.clone() };
-    for (profiles, is_seen) in [(vec![unit.clone()], true), (vec![picture, unit], false)] {
-        let (sink, motion) = (Counting::default(), profiles.len() - 1);
-        let (go, shown) = (Arc::new(AtomicBool::new(false)), Arc::clone(&sink.0));
+    let image = StreamProfile { format: depthrig_bus::PixelFormat::Mono8, ..unit.clone() };
+    for (profiles, is_seen) in [(vec![unit.clone()], true), (vec![image, unit], false)] {
+        let sink = Counting::default();
+        let motion = profiles.len() - 1;
+        let go = Arc::new(AtomicBool::new(false));
+        let shown = Arc::clone(&sink.0);
         let gone = Arc::clone(&go);
         let capture = start_with(profiles, &sink, move |_, sink| {
             let stream = if gone.load(Ordering::SeqCst) { 0 } else { motion };
@@ -119,7 +121,7 @@ fn a_quiet_device_stops_at_once() {
 fn what_gives_way_is_no_loss_while_somebody_listens() {
     let sink = Counting::default();
     let capture = start(&sink, |_, sink| {
-        sink.gave_way(0, 1);
+        sink.superseded(0, 1);
         std::thread::sleep(Duration::from_millis(1));
         Ok(Poll::Idle)
     });
@@ -149,8 +151,10 @@ fn a_failing_and_a_panicking_driver_end_with_their_reason() {
 #[test]
 fn a_hung_device_is_abandoned_and_publishes_nothing_when_it_wakes() {
     let sink = Counting::default();
-    let (wake, hanging) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(false)));
-    let (woken, hangs) = (Arc::clone(&wake), Arc::clone(&hanging));
+    let wake = Arc::new(AtomicBool::new(false));
+    let hanging = Arc::new(AtomicBool::new(false));
+    let woken = Arc::clone(&wake);
+    let hangs = Arc::clone(&hanging);
     let capture = start(&sink, move |_, sink| {
         hangs.store(true, Ordering::SeqCst);
         while !woken.load(Ordering::SeqCst) {

@@ -162,7 +162,8 @@ impl Hull {
     /// The edge over `x`, as a line; none while the hull is a single point.
     pub(super) fn edge(&self, x: i64) -> Option<Line> {
         let after = self.vertices.partition_point(|v| v.x <= x).clamp(1, self.vertices.len().max(2) - 1);
-        let (a, b) = (self.vertices.get(after - 1)?, self.vertices.get(after)?);
+        let a = self.vertices.get(after - 1)?;
+        let b = self.vertices.get(after)?;
         Some(Line { x0: a.x, d0: a.d, slope: (b.d - a.d) as f64 / (b.x - a.x) as f64 })
     }
 
@@ -221,7 +222,8 @@ mod tests {
             steps in prop::collection::vec((1i64..50, -40i64..40), 1..60)
         ) {
             let mut hull = Hull::new(1_000_000, 0);
-            let (mut x, mut points) = (0, Vec::new());
+            let mut x = 0;
+            let mut points = Vec::new();
             for (dx, d) in steps {
                 x += dx;
                 points.push(Point { x, d });
@@ -235,7 +237,9 @@ mod tests {
             steps in prop::collection::vec((0i64..4, -40i64..40), 1..80)
         ) {
             // Slices of 10 and at most one point in each: the window's hull must be exact.
-            let (mut hull, mut x, mut points) = (Hull::new(2560, 0), 0, Vec::new());
+            let mut hull = Hull::new(2560, 0);
+            let mut x = 0;
+            let mut points = Vec::new();
             for (skip, d) in steps {
                 x += 10 + 170 * skip;
                 points.push(Point { x, d });

@@ -1,4 +1,5 @@
-//! Whether a frame belongs on the line: clock steps, restarted devices, and what their frames are told meanwhile.
+//! Decides whether a frame belongs on the line: clock steps, restarted devices, and the times of their frames
+//! meanwhile.
 
 use super::{ClockMap, DECIDING_FRAMES, Epoch, Mapped, PAUSE_DRIFT, STEP_NS, Seen, WARM_NS, arrival_y};
 use depthrig_bus::FrameFlags;
@@ -8,7 +9,7 @@ const WARM_UP_STEP_NS: i64 = 500_000_000;
 /// Arrivals this far above the line, with a jump in device time, may be a device that restarted.
 const RESET_NS: i64 = 500_000_000;
 
-/// What [`ClockMap::judge`] makes of a frame.
+/// Verdict of [`ClockMap::judge`] on a frame.
 pub(super) enum Verdict {
     /// On the line, with its ticks since the epoch's first frame.
     Follows(Seen),

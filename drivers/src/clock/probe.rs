@@ -1,4 +1,4 @@
-//! Two-way probes of a device clock: what one-way arrivals can never tell, the least latency itself.
+//! Two-way probes of a device clock: they measure the least latency, which one-way arrivals cannot reveal.
 
 use super::hull::Line;
 use std::collections::VecDeque;
@@ -44,12 +44,12 @@ impl Probes {
         self.latency()
     }
 
-    /// Whether there is no probe.
+    /// Whether no probe was taken.
     pub(super) fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// Measures every probe against a line that has moved since; `None` when there is no probe. While the line's slope
+    /// Measures every probe against a line that has moved since; `None` without a probe. While the line's slope
     /// is a guess, the newest probes alone are near enough to now, and how they differ says how wrong the slope is.
     pub(super) fn measure_again(&mut self, line: Line) -> Option<Latency> {
         for p in &mut self.0 {
@@ -72,7 +72,9 @@ impl Probes {
     fn median_of(&self, most: usize) -> Median {
         let tightest = self.0.iter().map(|p| p.width_ns).min().unwrap_or(0);
         let limit = tightest.saturating_add(tightest / 2);
-        let (mut good, mut n, mut widest) = ([0; KEPT], 0, 0);
+        let mut good = [0; KEPT];
+        let mut n = 0;
+        let mut widest = 0;
         for p in self.0.iter().rev().filter(|p| p.width_ns <= limit).take(most.min(KEPT)) {
             good[n] = p.latency_ns;
             n += 1;
@@ -86,7 +88,7 @@ impl Probes {
     }
 }
 
-/// What some probes agree on, and how far the one that agrees least is off.
+/// The value that some probes agree on, and how far the one that agrees least is off.
 struct Median {
     latency: Latency,
     spread_ns: i64,

@@ -8,7 +8,7 @@
 
 use std::collections::VecDeque;
 
-/// Least residual told apart, as a power of two of nanoseconds (1 µs).
+/// Least residual that is resolved, as a power of two of nanoseconds (1 µs).
 const FIRST_OCTAVE: u32 = 10;
 /// Octaves of the histogram: 1 µs to 8.6 s.
 const OCTAVES: u32 = 23;
@@ -54,7 +54,8 @@ impl Residuals {
         for (i, count) in self.buckets.iter().enumerate() {
             seen += count;
             if seen >= rank {
-                let (octave, fine) = (i as u32 / FINE + FIRST_OCTAVE, i as u64 % u64::from(FINE));
+                let octave = i as u32 / FINE + FIRST_OCTAVE;
+                let fine = i as u64 % u64::from(FINE);
                 return ((u64::from(FINE) + fine + 1) << (octave - 3)) as i64;
             }
         }
@@ -156,7 +157,8 @@ mod tests {
             r.add(i * 10_000);
         }
         for q in [0.1, 0.5, 0.9, 0.99] {
-            let (got, want) = (r.quantile_ns(q) as f64, q * 1e7);
+            let got = r.quantile_ns(q) as f64;
+            let want = q * 1e7;
             assert!(got >= want && got < want * 1.13, "p{q}: {got} against {want}");
         }
     }

@@ -1,10 +1,11 @@
-//! What the clock map is told and what it says.
+//! Input and output types of the clock map.
 
 use depthrig_bus::{FrameFlags, HostTime};
 
-/// What the map must know of a device.
+/// Properties of a device that the map needs.
 ///
-/// Values out of range are moved into it by [`ClockMap::new`](super::ClockMap::new); [`ClockMap::config`] shows the result.
+/// Values out of range are moved into it by [`ClockMap::new`](super::ClockMap::new); [`ClockMap::config`] shows the
+/// result.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ClockConfig {
     /// Bits of the device's counter, 8 to 64.
@@ -18,13 +19,13 @@ pub struct ClockConfig {
     /// Least time from the device's stamp to the arrival, when it is known from elsewhere, nanoseconds; 0 when it
     /// is not.
     pub latency_ns: i64,
-    /// How many frames commonly come together, of which the newest alone is observed; 1 to 4096. What is late, and how far
-    /// the line may move from one to the next, is reckoned by so many periods.
+    /// How many frames commonly come together, of which the newest alone is observed; 1 to 4096. What is late, and how
+    /// far the line may move from one to the next, is reckoned by so many periods.
     pub bunch: u32,
 }
 
 impl ClockConfig {
-    /// A window of 60 s, frames that come one by one, and a latency that nobody knows.
+    /// A window of 60 s, frames that come one by one, and an unknown latency.
     pub fn new(counter_bits: u32, tick_ns: f64, period_ns: u64) -> Self {
         Self { counter_bits, tick_ns, period_ns, window_ns: 60_000_000_000, latency_ns: 0, bunch: 1 }
     }
@@ -70,7 +71,7 @@ pub struct ClockQuality {
     pub residual_p50_ns: i64,
     /// Lateness that 99 % of frames stay below, nanoseconds.
     pub residual_p99_ns: i64,
-    /// What frames claim now, nanoseconds.
+    /// The uncertainty that frames claim now, nanoseconds.
     pub uncertainty_ns: u64,
     /// Epochs so far; 0 before the first frame.
     pub epochs: u32,

@@ -2,7 +2,7 @@
 //!
 //! More than 500 lines, because all cases lie side by side in one table with what each does.
 
-use super::probe::{Books, Probe, Published, wait_for};
+use super::probe::{Observed, Probe, Published, wait_for};
 use super::{Bench, Cannot, Trouble};
 use crate::capture::{Capture, End, Session, StopOutcome};
 use crate::motion::LONGEST;
@@ -55,9 +55,9 @@ pub(super) const ALL: &[(&str, Case)] = &[
 ];
 
 /// How long a device may take for what takes it no time.
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 const POLL: Duration = Duration::from_millis(50);
-/// What a stop may take, whatever the device does.
+/// Longest time for a stop, whatever the device does.
 const STOP: Duration = Duration::from_secs(1);
 
 fn fail<T>(why: impl Into<String>) -> Result<T, Stop> {
@@ -90,15 +90,15 @@ impl Running {
         Ok(Self { stream, probe })
     }
 
-    /// Polls until the books satisfy `is_done`; the device must do that in time.
-    fn poll_until(&mut self, what: &str, mut is_done: impl FnMut(&mut Books) -> bool) -> Outcome {
-        let deadline = HostTime::now().plus(PATIENCE);
+    /// Polls until the observations satisfy `is_done`; the device must do that in time.
+    fn poll_until(&mut self, what: &str, mut is_done: impl FnMut(&mut Observed) -> bool) -> Outcome {
+        let deadline = HostTime::now().plus(TIMEOUT);
         while !self.probe.with(|b| is_done(b)) {
             let mut sink = self.probe.clone();
             if self.stream.poll(POLL, &mut sink).map_err(failed("poll"))? == Poll::End {
                 return fail(format!("the source came to its end while waiting for {what}"));
             }
-            check(!deadline.from_now().is_zero(), || format!("waited {PATIENCE:?} in vain for {what}"))?;
+            check(!deadline.from_now().is_zero(), || format!("waited {TIMEOUT:?} in vain for {what}"))?;
         }
         Ok(())
     }
@@ -148,9 +148,7 @@ fn discover(bench: &Bench) -> Outcome {
     let Some(info) = found.iter().find(|i| i.serial == bench.serial) else {
         return fail(format!("discover does not list {}: {found:?}", bench.serial));
     };
-    check(info.backend == bench.backend.name(), || {
-        format!("it is listed for the back end {}", info.backend)
-    })?;
+    check(info.backend == bench.backend.name(), || format!("it is listed for the backend {}", info.backend))?;
     let device = bench.backend.open(None).map_err(failed("open without a serial number"))?;
     check(device.info() == info, || format!("{:?} is not what discover said: {info:?}", device.info()))
 }
@@ -168,9 +166,9 @@ fn open_unknown(bench: &Bench) -> Outcome {
 fn profiles(bench: &Bench) -> Outcome {
     let device = bench.backend.open(Some(&bench.serial)).map_err(failed("open"))?;
     let all = device.profiles().to_vec();
-    // A motion unit may need a camera that runs.
-    let pictures = || all.iter().filter(|p| !p.format.is_motion());
-    let Some(wanted) = pictures().next_back().or(all.last()).cloned() else {
+    // An IMU may need a camera that runs.
+    let images = || all.iter().filter(|p| !p.format.is_motion());
+    let Some(wanted) = images().next_back().or(all.last()).cloned() else {
         return fail("the device has no mode");
     };
     let request = StreamRequest {
@@ -226,7 +224,7 @@ fn every_byte(bench: &Bench) -> Outcome {
         let judged: Vec<_> =
             b.published.iter().filter_map(|p| bench.rig.is_genuine(p.stream, &p.pixels)).collect();
         if judged.is_empty() {
-            return Err(Stop::NotApplicable("the subject cannot tell its own frames".to_owned()));
+            return Err(Stop::NotApplicable("the subject cannot recognise its own frames".to_owned()));
         }
         check(judged.iter().all(|g| *g), || "a published frame is not one that the device sent".to_owned())
     })
@@ -266,7 +264,7 @@ fn reopen(bench: &Bench) -> Outcome {
     bench.backend.open(Some(&bench.serial)).map_err(failed("open after the device was dropped")).map(drop)
 }
 
-/// A camera thread, and the books of what it publishes.
+/// A camera thread, and the observations of what it publishes.
 fn spawn(bench: &Bench) -> Result<(Capture, Probe), Stop> {
     let Running { stream, probe } = Running::start(bench)?;
     let theirs = probe.clone();
@@ -277,7 +275,7 @@ fn spawn(bench: &Bench) -> Result<(Capture, Probe), Stop> {
 
 fn stop(bench: &Bench) -> Outcome {
     let (capture, probe) = spawn(bench)?;
-    check(wait_for(PATIENCE, || probe.with(|b| b.least_delivered() >= 2)), || "no frames came".to_owned())?;
+    check(wait_for(TIMEOUT, || probe.with(|b| b.least_delivered() >= 2)), || "no frames came".to_owned())?;
     let began = HostTime::now();
     let outcome = capture.stop(STOP);
     check(matches!(outcome, StopOutcome::Ended(End::Stopped)), || format!("stopping came to {outcome:?}"))?;
@@ -360,7 +358,8 @@ fn stall(bench: &Bench) -> Outcome {
     let mut running = Running::start(bench)?;
     running.poll_frames(2)?;
     bench.rig.cause(Trouble::Stall(Duration::from_millis(700)))?;
-    let (mut idle, deadline) = (0, HostTime::now().plus(PATIENCE));
+    let mut idle = 0;
+    let deadline = HostTime::now().plus(TIMEOUT);
     while idle < 5 {
         let mut sink = running.probe.clone();
         idle += u32::from(
@@ -396,7 +395,7 @@ fn unplug(bench: &Bench) -> Outcome {
     running.poll_frames(2)?;
     let absent = Duration::from_millis(600);
     bench.rig.cause(Trouble::Unplug(absent))?;
-    let deadline = HostTime::now().plus(PATIENCE);
+    let deadline = HostTime::now().plus(TIMEOUT);
     let e = loop {
         let mut sink = running.probe.clone();
         match running.stream.poll(POLL, &mut sink) {
@@ -416,7 +415,7 @@ fn unplug(bench: &Bench) -> Outcome {
             format!("open while absent: {:?}: {e}", e.kind())
         })?;
     }
-    let is_back = wait_for(PATIENCE, || bench.backend.open(Some(&bench.serial)).is_ok());
+    let is_back = wait_for(TIMEOUT, || bench.backend.open(Some(&bench.serial)).is_ok());
     check(is_back, || "it cannot be opened after it was plugged in again".to_owned())?;
     let mut again = Running::start(bench)?;
     again.poll_frames(3)?;
@@ -429,17 +428,17 @@ fn busy(bench: &Bench) -> Outcome {
         Ok(_) => return fail("a device that somebody else holds was opened"),
         Err(e) => check(e.kind() == ErrorKind::Busy, || format!("{:?}: {e}", e.kind()))?,
     }
-    let is_free = wait_for(PATIENCE, || bench.backend.open(Some(&bench.serial)).is_ok());
+    let is_free = wait_for(TIMEOUT, || bench.backend.open(Some(&bench.serial)).is_ok());
     check(is_free, || "it cannot be opened after the other let go".to_owned())
 }
 
 fn hang(bench: &Bench) -> Outcome {
     let (capture, probe) = spawn(bench)?;
-    check(wait_for(PATIENCE, || probe.with(|b| b.least_delivered() >= 2)), || "no frames came".to_owned())?;
+    check(wait_for(TIMEOUT, || probe.with(|b| b.least_delivered() >= 2)), || "no frames came".to_owned())?;
     let hang = Duration::from_millis(2500);
     bench.rig.cause(Trouble::Hang(hang))?;
     // It hangs when its thread no longer comes back from the device.
-    let is_stuck = wait_for(PATIENCE, || capture.heartbeat().elapsed() > POLL * 6);
+    let is_stuck = wait_for(TIMEOUT, || capture.heartbeat().elapsed() > POLL * 6);
     check(is_stuck, || "the device never hung".to_owned())?;
     let began = HostTime::now();
     let outcome = capture.stop(STOP);
@@ -452,12 +451,12 @@ fn hang(bench: &Bench) -> Outcome {
     check(probe.with(|b| b.delivered == delivered), || "the abandoned thread published a frame".to_owned())
 }
 
-/// Batches of a motion unit: as many samples as its rate says, in order, with rising times that the header repeats.
+/// Batches of an IMU: as many samples as its rate says, in order, with rising times that the header repeats.
 fn motion(bench: &Bench) -> Outcome {
     const BATCHES: usize = 12;
     let device = bench.backend.open(Some(&bench.serial)).map_err(failed("open"))?;
     let Some(unit) = device.profiles().iter().find(|p| p.format.is_motion()).cloned() else {
-        return Err(Stop::NotApplicable("the device has no motion unit".to_owned()));
+        return Err(Stop::NotApplicable("the device has no IMU".to_owned()));
     };
     drop(device);
     check((1..=1024).contains(&unit.width) && unit.height == 1, || {
@@ -469,7 +468,7 @@ fn motion(bench: &Bench) -> Outcome {
     }
     let mut running = Running::start_with(bench, &requests)?;
     let Some(stream) = running.stream.profiles().iter().position(|p| p.format.is_motion()) else {
-        return fail("the motion unit was not started");
+        return fail("the IMU was not started");
     };
     let mut batches: Vec<Published> = Vec::new();
     running.poll_until("batches of motion", |b| {
@@ -480,7 +479,8 @@ fn motion(bench: &Bench) -> Outcome {
     })?;
     running.check_books(bench)?;
     let mut last: Option<(u32, MotionSample)> = None;
-    let (mut count, mut first) = (0u64, None);
+    let mut count = 0u64;
+    let mut first = None;
     for (n, batch) in batches.iter().enumerate() {
         let wrong = |what: String| Stop::Failed(format!("batch {n}: {what}"));
         let samples: Vec<_> = MotionSample::all_in(&batch.pixels).collect();
@@ -498,16 +498,16 @@ fn motion(bench: &Bench) -> Outcome {
             }
             let is_measured = |v: &[f32; 3]| v.iter().all(|v| v.is_finite()) || v.iter().all(|v| v.is_nan());
             if !is_measured(&s.gyro_rad_s) || !is_measured(&s.accel_m_s2) {
-                return Err(wrong(format!("sample {} is no measurement: {s:?}", s.sequence)));
+                return Err(wrong(format!("sample {} is not a measurement: {s:?}", s.sequence)));
             }
             last = Some((batch.meta.clock_epoch, *s));
             first.get_or_insert(s.sequence);
             count += 1;
         }
         let m = &batch.meta;
-        let told = (m.device_sequence, m.device_time, m.capture_time);
-        if told != (newest.sequence, newest.device_time, newest.time()) {
-            return Err(wrong(format!("its header says {told:?}, its newest sample is {newest:?}")));
+        let stated = (m.device_sequence, m.device_time, m.capture_time);
+        if stated != (newest.sequence, newest.device_time, newest.time()) {
+            return Err(wrong(format!("its header says {stated:?}, its newest sample is {newest:?}")));
         }
         if m.capture_uncertainty_ns < u64::from(newest.uncertainty_ns) {
             return Err(wrong("its header claims more than its newest sample".to_owned()));
@@ -522,7 +522,7 @@ fn motion(bench: &Bench) -> Outcome {
     let (Some(begin), Some((_, end))) =
         (batches.first().and_then(|b| MotionSample::all_in(&b.pixels).next()), last)
     else {
-        return fail("there are no samples");
+        return fail("no samples arrived");
     };
     let numbers = end.sequence - first.unwrap_or_default() + 1;
     check(count <= numbers, || format!("{count} samples with {numbers} numbers"))?;

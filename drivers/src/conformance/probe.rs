@@ -1,4 +1,4 @@
-//! A sink that checks every promise about a single frame as it comes, and keeps the books.
+//! A sink that checks every promise about a single frame as it comes, and records the observations.
 
 use crate::clock::ClockQuality;
 use crate::{FrameMeta, FrameSink, StreamProfile};
@@ -8,7 +8,7 @@ use depthrig_bus::{
 };
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// What memory on loan holds before the driver writes: two different fills in turn, so that a byte that a
+/// Contents of memory on loan before the driver writes: two different fills in turn, so that a byte that a
 /// driver leaves alone cannot look right every time.
 const FILLS: [u8; 2] = [0xA5, 0x5A];
 
@@ -18,13 +18,13 @@ pub(super) struct Published {
     pub(super) stream: usize,
     pub(super) meta: FrameMeta,
     pub(super) pixels: Vec<u8>,
-    /// What the memory held before.
+    /// The byte that the memory held before.
     pub(super) fill: u8,
 }
 
-/// What came out of a driver.
+/// Everything that a driver delivered.
 #[derive(Debug, Default)]
-pub(super) struct Books {
+pub(super) struct Observed {
     pub(super) published: Vec<Published>,
     pub(super) delivered: Vec<u64>,
     pub(super) drops: Vec<DropCounts>,
@@ -37,10 +37,10 @@ pub(super) struct Books {
     loans: usize,
 }
 
-/// The probe; clones share the books.
+/// The probe; clones share the observations.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Probe {
-    books: Arc<Mutex<Books>>,
+    observed: Arc<Mutex<Observed>>,
     lent: Vec<u8>,
     lent_of: usize,
 }
@@ -48,25 +48,25 @@ pub(super) struct Probe {
 impl Probe {
     pub(super) fn new(profiles: &[StreamProfile]) -> Self {
         let n = profiles.len();
-        let books = Books {
+        let observed = Observed {
             delivered: vec![0; n],
             drops: vec![DropCounts::default(); n],
             captured: vec![0; n],
             last: vec![None; n],
             on_loan: (0..n).map(|_| None).collect(),
             profiles: profiles.to_vec(),
-            ..Books::default()
+            ..Observed::default()
         };
-        Self { books: Arc::new(Mutex::new(books)), ..Self::default() }
+        Self { observed: Arc::new(Mutex::new(observed)), ..Self::default() }
     }
 
-    /// Looks into the books.
-    pub(super) fn with<T>(&self, look: impl FnOnce(&mut Books) -> T) -> T {
-        look(&mut self.books.lock().unwrap_or_else(PoisonError::into_inner))
+    /// Reads the observations.
+    pub(super) fn with<T>(&self, look: impl FnOnce(&mut Observed) -> T) -> T {
+        look(&mut self.observed.lock().unwrap_or_else(PoisonError::into_inner))
     }
 }
 
-impl Books {
+impl Observed {
     /// Frames published on the stream that has the fewest.
     pub(super) fn least_delivered(&self) -> u64 {
         self.delivered.iter().copied().min().unwrap_or_default()
@@ -200,15 +200,15 @@ impl FrameSink for Probe {
         let is_number = quality.rate_ppm.is_finite();
         self.with(|b| {
             if stream >= b.delivered.len() || !is_number {
-                b.broken.push(format!("stream {stream}: a clock quality that is none: {quality:?}"));
+                b.broken.push(format!("stream {stream}: an invalid clock quality: {quality:?}"));
             }
         });
     }
 }
 
-/// Waits until `is_done`, at most `patience`.
-pub(super) fn wait_for(patience: Duration, mut is_done: impl FnMut() -> bool) -> bool {
-    let deadline = HostTime::now().plus(patience);
+/// Waits until `is_done`, at most `timeout`.
+pub(super) fn wait_for(timeout: Duration, mut is_done: impl FnMut() -> bool) -> bool {
+    let deadline = HostTime::now().plus(timeout);
     while !is_done() {
         if deadline.from_now().is_zero() {
             return false;

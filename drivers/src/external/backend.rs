@@ -1,4 +1,4 @@
-//! The back end: finds the process of its camera, or starts it.
+//! The backend: finds the process of its camera, or starts it.
 
 use super::device::ExternalDevice;
 use super::process::{Keeper, SharedKeeper, kill, stalled};
@@ -15,7 +15,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 /// How often a process that has just been started is looked for.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// The back end of one camera that another process serves.
+/// The backend of one camera that another process serves.
 #[derive(Debug)]
 pub struct ExternalBackend {
     config: ExternalConfig,
@@ -103,11 +103,11 @@ impl ExternalBackend {
         }
     }
 
-    /// What the process offers now. It is asked nothing and told nothing, so whoever uses the camera is not disturbed.
+    /// Reads what the process offers now. Nothing is sent to it, so whoever uses the camera is not disturbed.
     ///
     /// # Errors
     /// [`ErrorKind::NotFound`] when no process serves it, [`ErrorKind::Disconnected`] when that says nothing,
-    /// [`ErrorKind::Protocol`] when its offer cannot be, else the reason for which it says that there is no camera.
+    /// [`ErrorKind::Protocol`] when its offer is invalid, else the reason for which it reports no camera.
     pub fn offered(&self) -> Result<(DeviceInfo, Vec<StreamProfile>)> {
         if self.place.holder().is_none() {
             return Err(Error::new(ErrorKind::NotFound, "no process serves it"));
@@ -116,8 +116,8 @@ impl ExternalBackend {
         Ok((device.info().clone(), device.profiles().to_vec()))
     }
 
-    /// Hears what is offered. An offer that cannot be is refused, with the reason to the process too if `tell`.
-    fn meet(&self, tell: bool) -> Result<(ExternalLink, Beat, Offer)> {
+    /// Reads the offer. An invalid one is refused; with `answers` the reason goes to the process too.
+    fn meet(&self, answers: bool) -> Result<(ExternalLink, Beat, Offer)> {
         let mut link = ExternalLink::open(&self.place).map_err(of_bus)?;
         let (beat, offer) = self.hear(&link)?;
         let why = match offer {
@@ -137,16 +137,16 @@ impl ExternalBackend {
             text: &text,
             modes: &[0],
         };
-        if tell && let Err(e) = link.tell(&refusal) {
-            tracing::debug!(error = %e, "the process could not be told");
+        if answers && let Err(e) = link.answer(&refusal) {
+            tracing::debug!(error = %e, "the refusal could not be sent to the process");
         }
-        let what = format!("what its process {} offers cannot be used: {text}", beat.pid);
+        let what = format!("the offer of its process {} is invalid: {text}", beat.pid);
         Err(Error::new(ErrorKind::Protocol, what).with_source(why))
     }
 
-    fn device(&self, tell: bool) -> Result<ExternalDevice> {
-        let (link, beat, offer) = self.meet(tell)?;
-        ExternalDevice::new((&self.config, &self.place, self.keeper.clone()), link, beat, offer)
+    fn device(&self, answers: bool) -> Result<ExternalDevice> {
+        let (link, beat, offer) = self.meet(answers)?;
+        ExternalDevice::new(&self.config, &self.place, self.keeper.clone(), link, beat, offer)
     }
 }
 

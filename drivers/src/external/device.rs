@@ -29,7 +29,9 @@ impl ExternalDevice {
     /// The reason of the process when it says that its camera cannot be had now.
     #[allow(clippy::large_types_passed_by_value)] // it is kept, once for each opening
     pub(super) fn new(
-        (config, place, keeper): (&ExternalConfig, &Place, SharedKeeper),
+        config: &ExternalConfig,
+        place: &Place,
+        keeper: SharedKeeper,
         link: ExternalLink,
         beat: Beat,
         offer: Offer,
@@ -52,7 +54,8 @@ impl ExternalDevice {
             motion: String::new(),
         };
         let profiles = offer.modes.iter().map(profile).collect();
-        let (config, place) = (config.clone(), place.clone());
+        let config = config.clone();
+        let place = place.clone();
         Ok(Self { config, place, keeper, link, beat, modes: offer.modes, info, profiles })
     }
 }
@@ -104,7 +107,7 @@ impl Device for ExternalDevice {
                 *flag = 1;
             }
             let has_counter = self.modes.get(mode).is_some_and(|m| m.sequence_bits > 0);
-            // Before the process is told to run, so that its first frame has somebody to go to.
+            // Before the process is asked to run, so that its first frame has a reader.
             inlets.push((self.link.frames(&profile.stream).map_err(of_bus)?, has_counter));
         }
         let started = Started {

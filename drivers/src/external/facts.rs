@@ -1,4 +1,4 @@
-//! What a frame's header says, made harmless: whatever cannot be becomes what is known, or nothing.
+//! Sanitises a frame's header: an invalid value becomes the known one, or nothing.
 
 use crate::{RawFrame, StreamProfile};
 use depthrig_bus::external::{ExternalFrame, ExternalFrameFlags, FRAME_MAGIC, VERSION};
@@ -11,7 +11,7 @@ const LONGEST_EXPOSURE_NS: u64 = 3_600_000_000_000;
 /// Temperatures that a sensor can have, °C.
 const TEMPERATURES: core::ops::RangeInclusive<f32> = -100.0..=250.0;
 
-/// What is known of the frames of one stream so far.
+/// State of the frames of one stream so far.
 #[derive(Debug)]
 pub(crate) struct Facts {
     profile: StreamProfile,
@@ -50,7 +50,7 @@ impl Facts {
         gap
     }
 
-    /// What the gate is told of a frame of which `sent` bytes came, and which is read at `now`.
+    /// The gate's input for a frame of which `sent` bytes came and which is read at `now`.
     pub(crate) fn raw(&mut self, header: &ExternalFrame, sent: usize, now: HostTime) -> RawFrame {
         let said = HostTime::from_ns(header.arrival_time_ns);
         let believed = said <= now && now.since_ns(said) < OLDEST_NS && said >= self.last_arrival;

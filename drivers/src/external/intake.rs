@@ -1,15 +1,22 @@
 //! The frames of one stream on their way in: checked against the mode that was announced, counted, copied once.
 
 use super::facts::{Facts, is_header};
-use super::pace::Pace;
+use super::rate_limiter::RateLimiter;
 use crate::{FrameSink, Gate, Outcome, StreamProfile};
 use depthrig_bus::external::{ExternalFrame, FrameInlet, SentFrame};
 use depthrig_bus::{DropReason, HostTime, PixelFormat, Result};
 
-/// Frames in a row that are not what was announced, after which the process is told.
+/// Frames in a row that are not what was announced, after which the session is refused.
 pub(super) const STRANGE_IN_A_ROW: u32 = 8;
-/// Frames that one look passes over at most: those of a session that is over, from a process that does not stop.
-const PASSED_OVER: u32 = 64;
+/// Frames that one look skips at most: those of a session that is over, from a process that does not stop.
+const MAX_SKIPPED: u32 = 64;
+
+/// Identifies a session: which start of the process, and its number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct SessionId {
+    pub(super) instance: u64,
+    pub(super) number: u64,
+}
 
 /// One stream.
 #[derive(Debug)]
@@ -17,7 +24,7 @@ pub(super) struct Intake {
     index: usize,
     inlet: FrameInlet,
     gate: Gate,
-    pace: Pace,
+    limiter: RateLimiter,
     profile: StreamProfile,
     facts: Facts,
     pending: Option<SentFrame>,
@@ -25,7 +32,7 @@ pub(super) struct Intake {
     warned: bool,
 }
 
-/// What became of one look.
+/// Result of one look.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Look {
     /// Nothing was there.
@@ -43,7 +50,7 @@ impl Intake {
             index,
             inlet,
             gate: Gate::new(index, profile),
-            pace: Pace::new(profile.rate_hz),
+            limiter: RateLimiter::new(profile.rate_hz),
             profile: profile.clone(),
             facts: Facts::new(profile, has_counter),
             pending: None,
@@ -53,7 +60,7 @@ impl Intake {
     }
 
     /// Whether a frame of `session` waits.
-    pub(super) fn has_frame(&mut self, session: (u64, u64)) -> Result<bool> {
+    pub(super) fn has_frame(&mut self, session: SessionId) -> Result<bool> {
         if self.pending.is_none() {
             self.pending = self.next(session)?;
         }
@@ -62,7 +69,7 @@ impl Intake {
 
     /// How long to leave a flood alone.
     pub(super) fn wait(&self) -> core::time::Duration {
-        self.pace.wait()
+        self.limiter.wait()
     }
 
     /// Why the frames cannot be used, once there were too many that are not what was announced.
@@ -71,8 +78,8 @@ impl Intake {
             .then(|| format!("{STRANGE_IN_A_ROW} frames in a row are not {}", self.profile.describe()))
     }
 
-    /// Takes the next frame of `session` (instance and number), if there is one.
-    pub(super) fn take(&mut self, session: (u64, u64), sink: &mut dyn FrameSink) -> Result<Look> {
+    /// Takes the next frame of `session`, if there is one.
+    pub(super) fn take(&mut self, session: SessionId, sink: &mut dyn FrameSink) -> Result<Look> {
         let frame = match self.pending.take() {
             Some(frame) => frame,
             None => match self.next(session)? {
@@ -84,7 +91,7 @@ impl Intake {
         let now = HostTime::now();
         let raw = self.facts.raw(&header, frame.pixels().len(), now);
         self.gate.explain_gap(self.facts.lost_before(&header), DropReason::QueueFull);
-        let takes = self.pace.takes(now);
+        let takes = self.limiter.takes(now);
         let outcome = self.gate.deliver(&raw, sink, |memory| {
             if !takes {
                 return Err(DropReason::QueueFull);
@@ -98,17 +105,18 @@ impl Intake {
         Ok(if takes { Look::Frame } else { Look::Flood })
     }
 
-    /// The next frame of `session`; those of others are passed over.
-    fn next(&mut self, session: (u64, u64)) -> Result<Option<SentFrame>> {
-        for _ in 0..PASSED_OVER {
+    /// The next frame of `session`; frames of other sessions are skipped.
+    fn next(&mut self, session: SessionId) -> Result<Option<SentFrame>> {
+        for _ in 0..MAX_SKIPPED {
             let Some(frame) = self.inlet.try_next()? else { break };
             let header = frame.header();
             if !is_header(header) {
                 self.strange = self.strange.saturating_add(1);
-                self.warn(|| "the header of a frame is none of this version".to_owned());
+                self.warn(|| "the header of a frame has an unsupported version".to_owned());
                 return Ok(None);
             }
-            if (header.instance, header.session) == session && header.sequence > 0 {
+            let id = SessionId { instance: header.instance, number: header.session };
+            if id == session && header.sequence > 0 {
                 return Ok(Some(frame));
             }
         }
@@ -128,7 +136,9 @@ impl Intake {
         }
         self.strange = self.strange.saturating_add(1);
         let format = PixelFormat::from_code(header.format).map_or("unknown", PixelFormat::name);
-        let (width, height, says) = (header.width, header.height, header.payload_len);
+        let width = header.width;
+        let height = header.height;
+        let says = header.payload_len;
         self.warn(|| {
             format!("the process sends {width}x{height} {format}, says {says} bytes and gives {sent}")
         });
@@ -136,7 +146,8 @@ impl Intake {
 
     fn warn(&mut self, what: impl FnOnce() -> String) {
         if !core::mem::replace(&mut self.warned, true) {
-            let (announced, bytes) = (self.profile.describe(), self.profile.frame_bytes());
+            let announced = self.profile.describe();
+            let bytes = self.profile.frame_bytes();
             tracing::warn!(
                 stream = self.index,
                 announced,

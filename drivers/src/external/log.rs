@@ -1,4 +1,4 @@
-//! What a process prints, as lines of the daemon's log: of bounded length, and no more of them than a log can use.
+//! Copies a process's output into the daemon's log: lines of bounded length, and no more of them than a log can use.
 
 use depthrig_bus::HostTime;
 use std::io::Read;

@@ -1,4 +1,4 @@
-//! The process of a camera that the daemon starts itself: started, started again, ended with its whole group.
+//! The process of a camera that the daemon starts itself: start, restart, and end with its whole group.
 #![allow(unsafe_code)] // `pre_exec` runs between fork and exec, where only some calls are allowed
 
 use super::{ExternalConfig, Place, log};
@@ -83,7 +83,7 @@ impl Keeper {
     ///
     /// # Errors
     /// [`ErrorKind::NotFound`] while it pauses before the next try, saying how it ended; [`ErrorKind::BadInput`] when
-    /// there is no such program.
+    /// the program does not exist.
     pub(super) fn ensure(&mut self) -> Result<()> {
         self.notice_end();
         if self.running.is_some() {
@@ -131,14 +131,16 @@ impl Keeper {
 
     fn start(&self) -> Result<Running> {
         let shared = Arc::new(Shared::default());
-        let (tell, told) = sync_channel(1);
-        let (config, place, theirs) = (self.config.clone(), self.place.clone(), Arc::clone(&shared));
+        let (report, reported) = sync_channel(1);
+        let config = self.config.clone();
+        let place = self.place.clone();
+        let theirs = Arc::clone(&shared);
         let thread = std::thread::Builder::new()
             .name(format!("proc-{}", self.place.camera))
-            .spawn(move || keep(&config, &place, &theirs, &tell))
+            .spawn(move || keep(&config, &place, &theirs, &report))
             .map_err(|e| Error::new(ErrorKind::Io, "no thread for its process").with_source(e))?;
         let program = self.config.command.first().map_or("", String::as_str);
-        let pid = told
+        let pid = reported
             .recv()
             .map_err(|e| {
                 Error::new(ErrorKind::Io, format!("\"{program}\" could not be started")).with_source(e)
@@ -169,17 +171,17 @@ impl Drop for Keeper {
 }
 
 /// The thread of a process: starts it, waits for its end, ends it when asked to.
-fn keep(config: &ExternalConfig, place: &Place, shared: &Shared, tell: &SyncSender<std::io::Result<u32>>) {
+fn keep(config: &ExternalConfig, place: &Place, shared: &Shared, report: &SyncSender<std::io::Result<u32>>) {
     let mut child = match spawn(config, place) {
         Ok(child) => child,
         Err(e) => {
-            let _ = tell.send(Err(e));
+            let _ = report.send(Err(e));
             return;
         }
     };
     let pid = child.id();
     copy_output(&mut child, place, pid);
-    let _ = tell.send(Ok(pid));
+    let _ = report.send(Ok(pid));
     let mut term_until = None;
     let end = loop {
         match child.try_wait() {
@@ -197,14 +199,14 @@ fn keep(config: &ExternalConfig, place: &Place, shared: &Shared, tell: &SyncSend
         }
         std::thread::sleep(LOOK);
     };
-    // What it left behind in its group would keep the camera.
+    // Processes that it left behind in its group would keep the camera.
     signal(pid, Signal::KILL);
     *shared.ended.lock().unwrap_or_else(PoisonError::into_inner) = Some(end);
 }
 
 fn signal(pid: u32, signal: Signal) {
     if let Some(group) = i32::try_from(pid).ok().and_then(Pid::from_raw) {
-        // No such group: all of it has ended.
+        // The group does not exist: all of it has ended.
         let _ = kill_process_group(group, signal);
     }
 }
@@ -234,16 +236,16 @@ fn spawn(config: &ExternalConfig, place: &Place) -> std::io::Result<Child> {
         .process_group(0);
     let end_with_daemon = move || {
         rustix::process::set_parent_process_death_signal(Some(Signal::KILL))?;
-        // Sockets of iceoryx2 are not closed by exec; a camera's process would keep the daemon's open after its end. Older
-        // kernels lack the call, and inherit them as before.
-        // SAFETY: it takes numbers alone, and marks descriptors of this process, which is about to call exec.
+        // Sockets of iceoryx2 are not closed by exec; a camera's process would keep the daemon's open after its end.
+        // Older kernels lack the call, and inherit them as before. SAFETY: it takes numbers alone, and marks
+        // descriptors of this process, which is about to call exec.
         unsafe { libc::close_range(3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC.cast_signed()) };
         // The daemon may have ended before that call; nobody would send the signal then.
         let parent = rustix::process::getppid().map(|p| p.as_raw_nonzero().get().cast_unsigned());
         if parent == Some(daemon) { Ok(()) } else { Err(std::io::ErrorKind::Interrupted.into()) }
     };
-    // SAFETY: between fork and exec the closure makes three system calls and neither allocates nor takes a lock; an error
-    // without a message allocates nothing either.
+    // SAFETY: between fork and exec the closure makes three system calls and neither allocates nor takes a lock; an
+    // error without a message allocates nothing either.
     unsafe { command.pre_exec(end_with_daemon) };
     // It inherits the umask.
     let _steady = umask::steady();

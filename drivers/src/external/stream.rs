@@ -1,6 +1,6 @@
 //! A camera that streams out of another process.
 
-use super::intake::{Intake, Look};
+use super::intake::{Intake, Look, SessionId};
 use super::process::{SharedKeeper, kill, stalled};
 use super::{Place, kind_of, of_bus, refusal};
 use crate::{Error, ErrorKind, FrameSink, Poll, Result, Stream, StreamProfile};
@@ -17,9 +17,9 @@ const LOCK_AFTER: Duration = Duration::from_millis(100);
 const LOCK_EVERY: Duration = Duration::from_millis(50);
 /// A process that wakes the daemon without a frame more often than this is not listened to for a moment.
 const IDLE_WAKES: u32 = 16;
-const SHUT_EARS: Duration = Duration::from_millis(2);
+const WAKE_PAUSE: Duration = Duration::from_millis(2);
 
-/// What was asked of the process.
+/// The session that the process was asked for.
 #[derive(Debug)]
 pub(super) struct Started {
     /// Which start of the process.
@@ -45,7 +45,8 @@ pub(super) struct ExternalStream {
     intakes: Vec<Intake>,
     /// The last sign of life.
     alive: HostTime,
-    told: HostTime,
+    /// When the request was last sent.
+    asked: HostTime,
     looked: HostTime,
     state: ExternalState,
     over: Option<Over>,
@@ -74,16 +75,17 @@ impl ExternalStream {
             .enumerate()
             .map(|(i, ((inlet, has_counter), profile))| Intake::new(i, inlet, profile, has_counter))
             .collect();
-        let (alive, looked) = (now, now);
-        let told = HostTime::from_ns(0);
+        let alive = now;
+        let looked = now;
+        let asked = HostTime::from_ns(0);
         let state = ExternalState::Idle;
-        Self { place, link, keeper, started, profiles, intakes, alive, told, looked, state, over: None }
+        Self { place, link, keeper, started, profiles, intakes, alive, asked, looked, state, over: None }
     }
 
-    /// Tells the process to run, and waits for its first frame: cameras may take seconds to start, and until then a
+    /// Asks the process to run, and waits for its first frame: cameras may take seconds to start, and until then a
     /// supervisor must not take this one for silent.
-    pub(super) fn wait_for_first_frame(&mut self, patience: Duration) -> Result<()> {
-        let deadline = HostTime::now().plus(patience);
+    pub(super) fn wait_for_first_frame(&mut self, timeout: Duration) -> Result<()> {
+        let deadline = HostTime::now().plus(timeout);
         let session = self.session();
         loop {
             self.attend()?;
@@ -99,8 +101,10 @@ impl ExternalStream {
                 }
             }
             if deadline.from_now().is_zero() {
-                let (s, state) = (patience.as_secs_f64(), self.state.name());
-                let what = format!("was told to run and sent no frame within {s:.1} s (it says \"{state}\")");
+                let s = timeout.as_secs_f64();
+                let state = self.state.name();
+                let what =
+                    format!("was asked to run and sent no frame within {s:.1} s (its state is \"{state}\")");
                 let e = stalled(ErrorKind::Stalled, &self.keeper, self.started.pid, &what);
                 kill(&self.keeper, &what);
                 self.over = Some(Over::Failed(e.clone()));
@@ -110,18 +114,18 @@ impl ExternalStream {
         }
     }
 
-    const fn session(&self) -> (u64, u64) {
-        (self.started.instance, self.started.session)
+    const fn session(&self) -> SessionId {
+        SessionId { instance: self.started.instance, number: self.started.session }
     }
 
-    /// Hears the process, keeps it told, and finds out whether it is still there.
+    /// Reads the process's messages, repeats the request, and checks whether the process still runs.
     fn attend(&mut self) -> Result<()> {
         match &self.over {
             Some(Over::Failed(e)) => return Err(e.clone()),
             Some(Over::Finished) => return Ok(()),
             None => {}
         }
-        let result = self.hear().and_then(|()| self.keep_told()).and_then(|()| self.look());
+        let result = self.hear().and_then(|()| self.repeat_request()).and_then(|()| self.look());
         if let Err(e) = &result {
             self.over = Some(Over::Failed(e.clone()));
         }
@@ -136,7 +140,7 @@ impl ExternalStream {
         self.judge(&said.beat)
     }
 
-    /// What the process's state means for the stream.
+    /// Applies the process's state to the stream.
     fn judge(&mut self, beat: &Beat) -> Result<()> {
         let ours = beat.session == self.started.session;
         let Some(state) = beat.state else { return Ok(()) };
@@ -171,20 +175,21 @@ impl ExternalStream {
         }
     }
 
-    /// Says again what is wanted, when that is due.
-    fn keep_told(&mut self) -> Result<()> {
-        if self.told.elapsed() < HEARTBEAT {
+    /// Sends the request again when that is due.
+    fn repeat_request(&mut self) -> Result<()> {
+        if self.asked.elapsed() < HEARTBEAT {
             return Ok(());
         }
-        self.tell(ExternalWant::Run, ExternalReason::None, "").map_err(of_bus)?;
-        self.told = HostTime::now();
+        self.answer(ExternalWant::Run, ExternalReason::None, "").map_err(of_bus)?;
+        self.asked = HostTime::now();
         Ok(())
     }
 
-    fn tell(&mut self, want: ExternalWant, reason: ExternalReason, text: &str) -> depthrig_bus::Result<()> {
+    fn answer(&mut self, want: ExternalWant, reason: ExternalReason, text: &str) -> depthrig_bus::Result<()> {
         let Started { instance, session, wanted, .. } = &self.started;
-        let (instance, session) = (*instance, *session);
-        self.link.tell(&Answer { instance, session, want, reason, text, modes: wanted })
+        let instance = *instance;
+        let session = *session;
+        self.link.answer(&Answer { instance, session, want, reason, text, modes: wanted })
     }
 
     /// Whether a process that says nothing is still there.
@@ -218,8 +223,8 @@ impl ExternalStream {
 
     /// Ends the session because its frames cannot be used, and says why to both sides.
     fn refuse(&mut self, why: &str) -> Error {
-        if let Err(e) = self.tell(ExternalWant::Refused, ExternalReason::Invalid, why) {
-            tracing::debug!(error = %e, "the process could not be told");
+        if let Err(e) = self.answer(ExternalWant::Refused, ExternalReason::Invalid, why) {
+            tracing::debug!(error = %e, "the refusal could not be sent to the process");
         }
         let e = Error::new(
             ErrorKind::Protocol,
@@ -232,7 +237,8 @@ impl ExternalStream {
     /// Takes the frames that wait, a few of each stream. How long a flood is to be left alone, if any came.
     fn take(&mut self, sink: &mut dyn FrameSink) -> Result<Option<Duration>> {
         let session = self.session();
-        let (mut came, mut flood) = (false, Duration::ZERO);
+        let mut came = false;
+        let mut flood = Duration::ZERO;
         let mut wrong = None;
         for intake in &mut self.intakes {
             for _ in 0..FRAMES_PER_POLL {
@@ -277,7 +283,7 @@ impl Stream for ExternalStream {
             }
             if let Some(flood) = self.take(sink)? {
                 self.attend()?;
-                // What comes meanwhile the channel throws away, at the cost of the process.
+                // The channel discards frames that come meanwhile, at the cost of the process.
                 std::thread::sleep(flood.min(deadline.from_now()));
                 return Ok(Poll::Frame);
             }
@@ -294,7 +300,7 @@ impl Stream for ExternalStream {
             }
             wakes += 1;
             if wakes > IDLE_WAKES {
-                std::thread::sleep(SHUT_EARS.min(left));
+                std::thread::sleep(WAKE_PAUSE.min(left));
             }
             self.link.sleep(left.min(LOCK_EVERY)).map_err(of_bus)?;
         }
@@ -305,9 +311,9 @@ impl Drop for ExternalStream {
     fn drop(&mut self) {
         // At the end of files too: it is how the process learns that its last frames were taken.
         if !matches!(self.over, Some(Over::Failed(_)))
-            && let Err(e) = self.tell(ExternalWant::Stop, ExternalReason::None, "")
+            && let Err(e) = self.answer(ExternalWant::Stop, ExternalReason::None, "")
         {
-            tracing::debug!(error = %e, "the process could not be told to stop");
+            tracing::debug!(error = %e, "the request to stop could not be sent to the process");
         }
     }
 }

@@ -1,13 +1,13 @@
-//! The manifest of a folder: its TOML, and the checks that need no picture.
+//! The manifest of a folder: its TOML, and the checks that need no image.
 
-use super::picture::io_error;
+use super::image_file::io_error;
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{Distortion, Intrinsics, PixelFormat, Pose, StreamName, files};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use toml::Spanned;
 
-/// What the TOML says, key by key; `example_camera.toml` explains each.
+/// The manifest's TOML, key by key; `example_camera.toml` explains each.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Manifest {
@@ -98,7 +98,7 @@ impl Loaded {
             let error = io_error(&path, e);
             let message =
                 format!("the manifest of the files camera cannot be read: {error}; it is a TOML file");
-            Error::new(error.kind(), message + " that says what the pictures are").with_source(error)
+            Error::new(error.kind(), message + " that says what the images are").with_source(error)
         })?;
         let manifest = toml::from_str(&text).map_err(|e| {
             let message = format!("{}: {}", path.display(), e.to_string().trim_end());
@@ -113,7 +113,7 @@ impl Loaded {
         Error::new(ErrorKind::BadInput, format!("{}, line {line}: {what}", self.path.display()))
     }
 
-    /// The folder of the pictures.
+    /// The folder of the images.
     pub(super) fn folder(&self) -> Result<PathBuf> {
         let base = self.path.parent().unwrap_or(Path::new(""));
         let base = if base.as_os_str().is_empty() { Path::new(".") } else { base };
@@ -126,7 +126,7 @@ impl Loaded {
         };
         match std::fs::metadata(&folder) {
             Ok(m) if m.is_dir() => Ok(folder),
-            Ok(_) => Err(self.about_folder(ErrorKind::BadInput, &folder, "is no folder")),
+            Ok(_) => Err(self.about_folder(ErrorKind::BadInput, &folder, "is not a folder")),
             Err(e) => {
                 let kind = io_error(&folder, e).kind();
                 Err(self.about_folder(kind, &folder, "cannot be opened: no such folder, or no permission"))
@@ -136,15 +136,16 @@ impl Loaded {
 
     fn about_folder(&self, kind: ErrorKind, folder: &Path, what: &str) -> Error {
         let said = self.manifest.folder.as_ref().map_or(".", |f| f.get_ref().as_str());
-        let (manifest, folder) = (self.path.display(), folder.display());
-        let message =
-            format!("{manifest}: the folder of the pictures, {folder} (folder = \"{said}\"), {what}");
+        let manifest = self.path.display();
+        let folder = folder.display();
+        let message = format!("{manifest}: the folder of the images, {folder} (folder = \"{said}\"), {what}");
         Error::new(kind, message)
     }
 
     /// The intrinsics of a stream; those of nobody when the manifest gives none.
     pub(super) fn intrinsics(&self, stream: &Spanned<StreamEntry>, folder: &Path) -> Result<Intrinsics> {
-        let (at, entry) = (stream.span().start, stream.get_ref());
+        let at = stream.span().start;
+        let entry = stream.get_ref();
         let name = &entry.name;
         match (&entry.intrinsics, &entry.intrinsics_file) {
             (None, None) => Ok(Intrinsics::default()),
@@ -198,7 +199,7 @@ impl IntrinsicsEntry {
             return Err(format!("{n} coefficients, but this distortion model has at most {most}"));
         }
         if let Some(c) = self.coeffs.iter().find(|c| !c.is_finite()) {
-            return Err(format!("{c} is no coefficient"));
+            return Err(format!("invalid coefficient {c}; coefficients are finite numbers"));
         }
         let mut k = pinhole(self.fx, self.fy, self.cx, self.cy)?;
         k.model = self.model as u32;
@@ -212,7 +213,9 @@ fn pinhole(fx: f64, fy: f64, cx: f64, cy: f64) -> Result<Intrinsics, String> {
     if good {
         Ok(Intrinsics::pinhole(fx, fy, cx, cy))
     } else {
-        Err(format!("fx {fx}, fy {fy}, cx {cx}, cy {cy} are no focal lengths and centre in pixels"))
+        Err(format!(
+            "invalid focal lengths or centre: fx {fx}, fy {fy}, cx {cx}, cy {cy}; they are in pixels, fx and fy above 0"
+        ))
     }
 }
 
@@ -221,7 +224,7 @@ fn parse_matrix(text: &str) -> Result<Intrinsics, String> {
     const WANTED: &str = "expected a 3x3 matrix `fx 0 cx / 0 fy cy / 0 0 1`";
     let words = text.split(|c: char| c.is_whitespace() || c == ',').filter(|w| !w.is_empty());
     let numbers = words
-        .map(|w| w.parse::<f64>().map_err(|_| format!("\"{w}\" is no number; {WANTED}")))
+        .map(|w| w.parse::<f64>().map_err(|_| format!("\"{w}\" is not a number; {WANTED}")))
         .collect::<Result<Vec<_>, _>>()?;
     match numbers[..] {
         [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0] => pinhole(fx, fy, cx, cy),
@@ -280,10 +283,10 @@ mod tests {
         assert_eq!(parse_matrix("460.5, 0, 319.5, 0, 461, 237, 0, 0, 1").unwrap(), k);
         for (text, wanted) in [
             ("1 0 2 0 1 3 0 0", "8 numbers"),
-            ("1 0 2 0 1 3 0 0 x", "\"x\" is no number"),
+            ("1 0 2 0 1 3 0 0 x", "\"x\" is not a number"),
             ("1 0.1 2 0 1 3 0 0 1", "other numbers"),
-            ("0 0 2 0 1 3 0 0 1", "no focal lengths"),
-            ("nan 0 2 0 1 3 0 0 1", "no focal lengths"),
+            ("0 0 2 0 1 3 0 0 1", "invalid focal lengths"),
+            ("nan 0 2 0 1 3 0 0 1", "invalid focal lengths"),
         ] {
             let error = parse_matrix(text).unwrap_err();
             assert!(error.contains(wanted), "{text}: {error}");

@@ -1,7 +1,7 @@
 //! File names by pattern, in the order that a person would put them.
 
-/// What each `*` of `pattern` stands for in `name`; `None` when the name does not match. A `*` in front takes
-/// as little as it can.
+/// Matches `name` and returns the text of each `*` of `pattern`; `None` when the name does not match. A `*` in front
+/// takes as little as it can.
 pub(super) fn captures<'a>(pattern: &str, name: &'a str) -> Option<Vec<&'a str>> {
     let Some((prefix, rest)) = pattern.split_once('*') else {
         return (pattern == name).then(Vec::new);
@@ -26,7 +26,7 @@ enum Part {
     Text(String),
 }
 
-/// What a file is sorted and paired by: the text that the `*` of its pattern stand for, read as people read it.
+/// Key by which files are sorted and paired: the text that the `*` of its pattern stand for, read as people read it.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) struct Key(Vec<Part>);
 
@@ -100,7 +100,8 @@ mod tests {
     proptest! {
         #[test]
         fn matches_what_the_slow_matcher_matches(p in "[ab*]{0,6}", n in "[ab]{0,8}") {
-            let (pc, nc): (Vec<_>, Vec<_>) = (p.chars().collect(), n.chars().collect());
+            let pc: Vec<_> = p.chars().collect();
+            let nc: Vec<_> = n.chars().collect();
             let found = captures(&p, &n);
             prop_assert_eq!(found.is_some(), slow_match(&pc, &nc));
             if let Some(found) = found {
@@ -117,7 +118,8 @@ mod tests {
         #[test]
         fn plain_numbers_order_like_integers(a in any::<u64>(), b in any::<u64>(), zeros in 0usize..4) {
             let padded = format!("{}{a}", "0".repeat(zeros));
-            let (ka, kb) = (Key::new(&[&padded]), Key::new(&[&b.to_string()]));
+            let ka = Key::new(&[&padded]);
+            let kb = Key::new(&[&b.to_string()]);
             prop_assert_eq!(ka.cmp(&kb), a.cmp(&b));
         }
     }

@@ -1,8 +1,8 @@
-//! Playing the pictures: decode ahead, wait for the moment, copy once into the sink's memory.
+//! Playing the images: decode ahead, wait for the moment, copy once into the sink's memory.
 
-use super::picture::{Info, decode};
+use super::image_file::{Info, decode};
 use super::source::{Playing, SourceStream};
-use crate::pace::Pace;
+use crate::playback_clock::PlaybackClock;
 use crate::{Error, ErrorKind, FrameSink, Gate, Poll, RawFrame, Result, Stream, StreamProfile};
 use core::time::Duration;
 use depthrig_bus::{DropReason, HostTime};
@@ -14,53 +14,53 @@ pub(super) struct Player {
     name: String,
     profiles: Vec<StreamProfile>,
     tracks: Vec<Track>,
-    /// Pictures per stream.
+    /// Images per stream.
     count: usize,
     looped: bool,
     /// Bytes that may still be kept decoded.
     cache_left: u64,
     /// Running number of the next frame.
     next: u64,
-    /// Its pictures are decoded.
+    /// Its images are decoded.
     ready: bool,
-    pace: Pace,
+    clock: PlaybackClock,
 }
 
 /// One stream of it.
 struct Track {
-    picture: Info,
+    image: Info,
     paths: Vec<PathBuf>,
-    /// Decoded pictures that are kept.
+    /// Decoded images that are kept.
     kept: Vec<Option<Box<[u8]>>>,
-    /// The decoded next picture, when it is not kept.
+    /// The decoded next image, when it is not kept.
     passing: Vec<u8>,
     gate: Gate,
 }
 
 impl Track {
-    /// Decodes picture `i`, for good or for once.
+    /// Decodes image `i`, for good or for once.
     fn decode(&mut self, i: usize, keep: bool) -> Result<()> {
-        let bytes = self.picture.bytes() as usize;
+        let bytes = self.image.bytes() as usize;
         if keep {
             let mut pixels = vec![0; bytes].into_boxed_slice();
-            decode(&self.paths[i], &self.picture, &mut pixels)?;
+            decode(&self.paths[i], &self.image, &mut pixels)?;
             self.kept[i] = Some(pixels);
             Ok(())
         } else {
             self.passing.resize(bytes, 0);
-            decode(&self.paths[i], &self.picture, &mut self.passing)
+            decode(&self.paths[i], &self.image, &mut self.passing)
         }
     }
 }
 
 impl Player {
-    /// A player at its first picture, which is decoded already.
+    /// A player at its first image, which is decoded already.
     pub(super) fn new(name: String, streams: Vec<SourceStream>, playing: Playing) -> Result<Self> {
         let count = streams.first().map_or(0, |s| s.paths.len());
         let profiles: Vec<_> = streams.iter().map(|s| s.profile.clone()).collect();
         let tracks = streams.into_iter().enumerate().map(|(i, s)| Track {
             gate: Gate::new(i, &s.profile),
-            picture: s.picture,
+            image: s.image,
             kept: s.paths.iter().map(|_| None).collect(),
             paths: s.paths,
             passing: Vec::new(),
@@ -74,21 +74,21 @@ impl Player {
             cache_left: playing.cache_bytes,
             next: 0,
             ready: false,
-            pace: Pace::new(playing.rate_hz),
+            clock: PlaybackClock::new(playing.rate_hz),
         };
         player.prepare()?;
         Ok(player)
     }
 
-    fn picture(&self) -> usize {
+    fn image(&self) -> usize {
         (self.next % (self.count as u64).max(1)) as usize
     }
 
-    /// Decodes the pictures of the next frame, unless they are kept.
+    /// Decodes the images of the next frame, unless they are kept.
     fn prepare(&mut self) -> Result<()> {
-        let i = self.picture();
+        let i = self.image();
         if !self.ready && self.tracks.iter().any(|t| t.kept[i].is_none()) {
-            let bytes = self.tracks.iter().map(|t| t.picture.bytes()).sum();
+            let bytes = self.tracks.iter().map(|t| t.image.bytes()).sum();
             let left = self.cache_left.checked_sub(bytes);
             self.tracks.par_iter_mut().try_for_each(|t| t.decode(i, left.is_some())).map_err(|e| {
                 // A file that was there on opening and is not now: no other camera could be meant.
@@ -108,9 +108,9 @@ impl Stream for Player {
     }
 
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
-        self.pace.attendance.enter(HostTime::now());
+        self.clock.attendance.enter(HostTime::now());
         let polled = self.play(timeout, sink);
-        self.pace.attendance.leave(HostTime::now());
+        self.clock.attendance.leave(HostTime::now());
         polled
     }
 }
@@ -123,14 +123,14 @@ impl Player {
         let deadline = HostTime::now().plus(timeout);
         self.prepare()?;
         let now = HostTime::now();
-        let due = self.pace.due(self.next, now);
+        let due = self.clock.due(self.next, now);
         std::thread::sleep(due.min(deadline).from_now());
         if due > deadline.max(now) {
             return Ok(Poll::Idle);
         }
-        self.pace.attendance.delivered();
-        let i = self.picture();
-        let number = self.next + self.pace.missed();
+        self.clock.attendance.delivered();
+        let i = self.image();
+        let number = self.next + self.clock.missed();
         for track in &mut self.tracks {
             let pixels: &[u8] = track.kept[i].as_deref().unwrap_or(&track.passing);
             let ticks = u64::try_from(due.ns()).unwrap_or(0);

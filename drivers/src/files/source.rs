@@ -1,22 +1,22 @@
-//! From a manifest to a checked list of pictures, stream by stream.
+//! From a manifest to a checked list of images, stream by stream.
 
 use super::FilesConfig;
+use super::image_file::{Info, Kind, io_error, probe};
 use super::manifest::{Loaded, PairBy, StreamEntry};
 use super::pattern::{Key, captures};
-use super::picture::{Info, Kind, io_error, probe};
 use crate::{DeviceClock, DeviceInfo, Error, ErrorKind, Result, StreamProfile};
 use depthrig_bus::{ClockDomain, MetadataLevel, PixelFormat};
 use std::path::{Path, PathBuf};
 use toml::Spanned;
 
-/// A camera made of files.
+/// A camera from image files.
 pub(super) struct Source {
     pub(super) info: DeviceInfo,
     pub(super) streams: Vec<SourceStream>,
     pub(super) playing: Playing,
 }
 
-/// How the pictures are played.
+/// How the images are played.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Playing {
     pub(super) rate_hz: f64,
@@ -24,32 +24,33 @@ pub(super) struct Playing {
     pub(super) cache_bytes: u64,
 }
 
-/// One stream: all its pictures are what `picture` says.
+/// One stream: all its images are what `image` says.
 pub(super) struct SourceStream {
     pub(super) profile: StreamProfile,
-    pub(super) picture: Info,
+    pub(super) image: Info,
     pub(super) paths: Vec<PathBuf>,
 }
 
 /// The fastest rate that is believed.
 const MAX_RATE_HZ: f64 = 1000.0;
 
-/// Reads the manifest, finds the pictures and checks them.
+/// Reads the manifest, finds the images and checks them.
 pub(super) fn load(config: &FilesConfig) -> Result<Source> {
     let loaded = Loaded::read(&config.manifest)?;
     let manifest = &loaded.manifest;
     let rate = &manifest.rate_hz;
     let rate_hz = config.rate_hz.unwrap_or(*rate.get_ref());
     if !(rate_hz > 0.0 && rate_hz <= MAX_RATE_HZ) {
-        let what =
-            format!("a rate of {rate_hz} Hz is impossible: choose rate_hz above 0 and at most {MAX_RATE_HZ}");
+        let what = format!(
+            "a rate of {rate_hz} Hz is out of range: choose rate_hz above 0 and at most {MAX_RATE_HZ}"
+        );
         return Err(match config.rate_hz {
             None => loaded.bad(rate.span().start, what),
             Some(_) => Error::new(ErrorKind::BadInput, format!("{}: {what}", loaded.path.display())),
         });
     }
     if manifest.streams.is_empty() {
-        return Err(loaded.bad(0, "no [[stream]]: say which pictures there are"));
+        return Err(loaded.bad(0, "no [[stream]]: say which images there are"));
     }
     let folder = loaded.folder()?;
     let mut found = Vec::new();
@@ -67,9 +68,9 @@ pub(super) fn load(config: &FilesConfig) -> Result<Source> {
     let mut streams = Vec::new();
     for (stream, found) in manifest.streams.iter().zip(found) {
         let paths: Vec<_> = found.files.into_iter().map(|f| f.path).collect();
-        let picture = check_pictures(stream.get_ref(), &paths)?;
-        let profile = profile(&loaded, stream, &folder, picture, rate_hz)?;
-        streams.push(SourceStream { profile, picture, paths });
+        let image = check_images(stream.get_ref(), &paths)?;
+        let profile = profile(&loaded, stream, &folder, image, rate_hz)?;
+        streams.push(SourceStream { profile, image, paths });
     }
     let place = std::fs::canonicalize(&folder).unwrap_or(folder);
     let of_folder = || place.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
@@ -88,7 +89,7 @@ pub(super) fn load(config: &FilesConfig) -> Result<Source> {
 }
 
 /// The files of one stream, sorted.
-struct Found<'a> {
+struct StreamFiles<'a> {
     entry: &'a StreamEntry,
     files: Vec<FoundFile>,
 }
@@ -101,7 +102,7 @@ struct FoundFile {
 }
 
 /// Lists the files that fit the pattern of `stream`.
-fn find<'a>(loaded: &Loaded, stream: &'a Spanned<StreamEntry>, folder: &Path) -> Result<Found<'a>> {
+fn find<'a>(loaded: &Loaded, stream: &'a Spanned<StreamEntry>, folder: &Path) -> Result<StreamFiles<'a>> {
     let entry = stream.get_ref();
     let (below, pattern) = entry.files.rsplit_once('/').unwrap_or(("", &entry.files));
     if below.contains('*') {
@@ -123,22 +124,24 @@ fn find<'a>(loaded: &Loaded, stream: &'a Spanned<StreamEntry>, folder: &Path) ->
         }
     }
     if files.is_empty() {
-        let (name, place) = (&entry.name, place.display());
+        let name = &entry.name;
+        let place = place.display();
         let what =
             format!("stream \"{name}\": no file in {place} fits files = \"{pattern}\"; correct either");
         return Err(loaded.bad(stream.span().start, what));
     }
     files.sort();
-    Ok(Found { entry, files })
+    Ok(StreamFiles { entry, files })
 }
 
-/// Checks that every picture of one stream has its partner in all the others.
-fn check_partners(by: PairBy, found: &[Found<'_>], folder: &Path) -> Result<()> {
+/// Checks that every image of one stream has its partner in all the others.
+fn check_partners(by: PairBy, found: &[StreamFiles<'_>], folder: &Path) -> Result<()> {
     if by == PairBy::Number {
         for f in found {
             let mut neighbours = f.files.iter().zip(f.files.iter().skip(1));
             if let Some((a, b)) = neighbours.find(|(a, b)| a.key == b.key) {
-                let (a, b) = (file_name(&a.path), file_name(&b.path));
+                let a = file_name(&a.path);
+                let b = file_name(&b.path);
                 let message = format!("{a} and {b} in {} have the same number; remove one", folder.display());
                 return Err(Error::new(ErrorKind::BadInput, message));
             }
@@ -155,11 +158,11 @@ fn check_partners(by: PairBy, found: &[Found<'_>], folder: &Path) -> Result<()> 
         let Some(lonely) = lonely else { continue };
         let partner = match by {
             PairBy::Number => format!("{} is not there", partner_name(&b.entry.files, &lonely.captures)),
-            PairBy::Order => "pictures are paired by their order".to_owned(),
+            PairBy::Order => "images are paired by their order".to_owned(),
         };
         let message = format!(
             "{}: {} has no partner in stream \"{}\": {partner} ({} of \"{}\", {} of \"{}\"); add the missing \
-             picture or remove this one",
+             image or remove this one",
             folder.display(),
             file_name(&lonely.path),
             b.entry.name,
@@ -191,58 +194,58 @@ fn file_name(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Looks at every picture of a stream: whole, and all alike.
-fn check_pictures(entry: &StreamEntry, paths: &[PathBuf]) -> Result<Info> {
+/// Checks every image of a stream: complete, and of the same size and format as the others.
+fn check_images(entry: &StreamEntry, paths: &[PathBuf]) -> Result<Info> {
     let mut first = None;
     for path in paths {
         let info = probe(path)?;
         let (first_path, first) = *first.get_or_insert((path, info));
         if info != first {
-            let (a, b) = (first_path.display(), path.display());
+            let a = first_path.display();
+            let b = path.display();
             let what = format!("stream \"{}\": {a} is {first}, but {b} is {info}", entry.name);
-            return Err(Error::new(ErrorKind::BadInput, what + "; the pictures of a stream must be alike"));
+            return Err(Error::new(ErrorKind::BadInput, what + "; the images of a stream must be alike"));
         }
     }
-    let nothing = || Error::new(ErrorKind::BadInput, format!("stream \"{}\" has no pictures", entry.name));
+    let nothing = || Error::new(ErrorKind::BadInput, format!("stream \"{}\" has no images", entry.name));
     first.map(|f| f.1).ok_or_else(nothing)
 }
 
-/// What the pictures of a stream are as frames.
+/// The profile of a stream's images.
 fn profile(
     loaded: &Loaded,
     stream: &Spanned<StreamEntry>,
     folder: &Path,
-    picture: Info,
+    image: Info,
     rate_hz: f64,
 ) -> Result<StreamProfile> {
     let entry = stream.get_ref();
     let name = &entry.name;
     let bad = |what: String| loaded.bad(stream.span().start, format!("stream \"{name}\": {what}"));
-    let format = format_of(entry, picture.kind).map_err(bad)?;
+    let format = format_of(entry, image.kind).map_err(bad)?;
     let depth_unit_m = match (format.is_depth(), entry.depth_unit_m) {
         (true, None) => {
-            let what = format!("the pictures are {picture} depth, but depth_unit_m is missing");
+            let what = format!("the images are {image} depth, but depth_unit_m is missing");
             return Err(bad(what + "; say how many metres one unit is, such as 0.001"));
         }
-        // From a micrometre to a metre: 1 (a forgotten unit) is no camera's, nor is anything negative.
+        // From a micrometre to a metre: no camera has 1 (a forgotten unit) or a negative unit.
         (true, Some(unit)) if !(1e-6..1.0).contains(&unit) => {
             return Err(bad(format!(
-                "depth_unit_m = {unit} is no number of metres per unit; most use 0.001"
+                "depth_unit_m = {unit} is out of range 0.000001..1; most cameras use 0.001"
             )));
         }
         (true, Some(unit)) => unit,
         (false, Some(_)) => {
-            return Err(bad(format!("{} pictures have no depth_unit_m; remove it", format.name())));
+            return Err(bad(format!("{} images have no depth_unit_m; remove it", format.name())));
         }
         (false, None) => 0.0,
     };
     let intrinsics = loaded.intrinsics(stream, folder)?;
     let outside = |c: f64, size: u32| !(0.0..f64::from(size)).contains(&c);
-    if intrinsics.is_known()
-        && (outside(intrinsics.cx, picture.width) || outside(intrinsics.cy, picture.height))
+    if intrinsics.is_known() && (outside(intrinsics.cx, image.width) || outside(intrinsics.cy, image.height))
     {
         tracing::warn!(
-            "{}: stream \"{name}\": the principal point ({}, {}) lies outside the {picture} pictures; are the \
+            "{}: stream \"{name}\": the principal point ({}, {}) lies outside the {image} images; are the \
              intrinsics for another size?",
             loaded.path.display(),
             intrinsics.cx,
@@ -252,8 +255,8 @@ fn profile(
     Ok(StreamProfile {
         stream: name.clone(),
         format,
-        width: picture.width,
-        height: picture.height,
+        width: image.width,
+        height: image.height,
         rate_hz,
         depth_unit_m,
         intrinsics,
@@ -265,7 +268,7 @@ fn profile(
     })
 }
 
-/// The pixel format of pictures of `kind`, as wished for or by the name of the stream.
+/// The pixel format of images of `kind`, as wished for or by the name of the stream.
 fn format_of(entry: &StreamEntry, kind: Kind) -> Result<PixelFormat, String> {
     let name = entry.name.as_str();
     let (fitting, default): (&[PixelFormat], _) = match kind {
@@ -285,10 +288,10 @@ fn format_of(entry: &StreamEntry, kind: Kind) -> Result<PixelFormat, String> {
         Some(wish) if fitting.contains(&wish) => Ok(wish),
         Some(wish) => {
             let names: Vec<_> = fitting.iter().map(|f| f.name()).collect();
-            Err(format!("{kind} pictures cannot be {}, they can be {}", wish.name(), names.join(" or ")))
+            Err(format!("{kind} images cannot be {}, they can be {}", wish.name(), names.join(" or ")))
         }
         None if name.starts_with("depth") && kind != Kind::Grey16 => Err(format!(
-            "the pictures are {kind}, but depth is 16-bit grey PNG; was a preview picked by `files`?"
+            "the images are {kind}, but depth is 16-bit grey PNG; was a preview picked by `files`?"
         )),
         None => default.ok_or_else(|| {
             format!("is {kind} depth or infrared? Give it depth_unit_m = …, or format = \"mono16\"")

@@ -1,4 +1,4 @@
-//! What the fuzz target `external` calls: what a process that serves a camera may write on the bus.
+//! Entry point of the fuzz target `external`: bytes that a process that serves a camera may write on the bus.
 
 use crate::external::{device, facts};
 use crate::{FrameMeta, FrameSink, Gate, choose_profiles};
@@ -7,7 +7,7 @@ use depthrig_bus::{DropCounts, DropReason, HostTime};
 
 /// Bytes of a frame's header.
 const HEADER: usize = size_of::<ExternalFrame>();
-/// Pictures that are larger find no memory here.
+/// Images that are larger find no memory here.
 const MOST_BYTES: usize = 1 << 16;
 /// When the first frame is read.
 const BEGIN_NS: i64 = 1_000_000_000_000;
@@ -16,7 +16,7 @@ const BEGIN_NS: i64 = 1_000_000_000_000;
 /// far they came.
 ///
 /// # Panics
-/// When something is taken that cannot be, or the account of the frames does not balance.
+/// When something invalid is accepted, or the account of the frames does not balance.
 pub fn handshake(bytes: &[u8]) -> u64 {
     let Some((kind, rest)) = bytes.split_first() else { return 0 };
     match kind % 3 {
@@ -39,7 +39,7 @@ fn offer(bytes: &[u8]) -> u64 {
     profiles.len() as u64
 }
 
-/// A sink with memory for small pictures, and the account that it is told.
+/// A sink with memory for small images, and the account that it receives.
 #[derive(Default)]
 struct Account {
     memory: Vec<u8>,

@@ -1,11 +1,11 @@
-//! What the fuzz targets of Azure Kinect recordings and calibrations call.
+//! Entry points of the fuzz targets of Azure Kinect recordings and calibrations.
 
 use crate::kinect::recording::{Recording, motion_samples};
 use crate::kinect::{Calibration, ColorResolution, DepthMode};
 use depthrig_calib::Camera;
 
-/// Bytes as a recording: opened, read from front to back, and from the middle. Returns the blocks that were found, and 1
-/// for a recording that has none.
+/// Bytes as a recording: opened, read from front to back, and from the middle. Returns the blocks that were found, and
+/// 1 for a recording that has none.
 ///
 /// # Panics
 /// When frames have more bytes than the file, memory is more than the file's, seeking finds what is earlier, or what is
@@ -13,7 +13,9 @@ use depthrig_calib::Camera;
 pub fn recording(bytes: &[u8]) -> u64 {
     let Ok(mut recording) = Recording::read(Box::new(bytes.to_vec()), "fuzz") else { return 0 };
     let _ = recording.calibration();
-    let (mut blocks, mut inside, mut last_us) = (0, 0, 0);
+    let mut blocks = 0;
+    let mut inside = 0;
+    let mut last_us = 0;
     while let Ok(Some(block)) = recording.next_block() {
         blocks += 1;
         last_us = block.device_us;
@@ -41,7 +43,7 @@ pub fn recording(bytes: &[u8]) -> u64 {
 /// Bytes as a calibration; whether they are one.
 ///
 /// # Panics
-/// When one that is taken gives intrinsics that are none, a pose that is none, or changes by being written and read.
+/// When an accepted calibration gives invalid intrinsics or an invalid pose, or changes by being written and read.
 pub fn calibration(bytes: &[u8]) -> u64 {
     let Ok(read) = Calibration::parse(bytes) else { return 0 };
     let depth = DepthMode::ALL.map(|m| read.depth_intrinsics(m));

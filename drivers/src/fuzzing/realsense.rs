@@ -1,4 +1,4 @@
-//! What a RealSense camera sends.
+//! Entry points of the fuzz targets of data from a RealSense camera.
 
 use crate::Result;
 use crate::bytes::put;
@@ -24,9 +24,9 @@ const SIZES: [(u32, u32); 8] =
     [(1280, 720), (640, 480), (848, 480), (848, 100), (256, 144), (960, 540), (1, 1), (u32::MAX, u32::MAX)];
 
 /// A camera that answers every request with the same data.
-struct Parrot<'a>(&'a [u8]);
+struct FixedReply<'a>(&'a [u8]);
 
-impl HardwareMonitor for Parrot<'_> {
+impl HardwareMonitor for FixedReply<'_> {
     fn command(&mut self, request: &Request) -> Result<Vec<u8>> {
         let reply = build_reply(request.opcode(), self.0);
         let frame = build_unit_frame(reply.get(..1020).unwrap_or(&reply))?;
@@ -77,16 +77,17 @@ pub fn hwm(bytes: &[u8]) -> u64 {
         came += 1;
     }
     // Everything that asks once and makes sense of the data.
-    let mut parrot = Parrot(bytes);
-    let _ = (SyncMode::read(&mut parrot), health::temperature_c(&mut parrot), advanced::is_on(&mut parrot));
-    if let Ok((unit, _)) = advanced::depth_unit_m(&mut parrot, 0x0B07) {
+    let mut monitor = FixedReply(bytes);
+    let _ =
+        (SyncMode::read(&mut monitor), health::temperature_c(&mut monitor), advanced::is_on(&mut monitor));
+    if let Ok((unit, _)) = advanced::depth_unit_m(&mut monitor, 0x0B07) {
         assert!(unit > 0.0 && unit <= 1.0);
     }
-    let _ = advanced::set_depth_unit_m(&mut parrot, 0.001);
+    let _ = advanced::set_depth_unit_m(&mut monitor, 0.001);
     came
 }
 
-/// What a camera says of itself; how many families take it.
+/// A camera's description of itself; returns how many families accept it.
 ///
 /// # Panics
 /// When an account changes by being built and read.
@@ -100,7 +101,7 @@ pub fn gvd(bytes: &[u8]) -> u64 {
 /// without which nearly nothing is read. Returns how many results came of it.
 ///
 /// # Panics
-/// When intrinsics or a pose that are given out are no numbers, or a table changes by being built and read.
+/// When intrinsics or a pose that are returned are not finite, or a table changes by being built and read.
 pub fn tables(bytes: &[u8]) -> u64 {
     let mut table = bytes.to_vec();
     if let (1, Some(payload)) = (bytes.len() % 2, bytes.get(tables::HEADER..)) {
@@ -165,7 +166,7 @@ pub fn metadata(bytes: &[u8]) -> u64 {
 /// The tables of an L515, and its other replies; how many results came of it.
 ///
 /// # Panics
-/// When intrinsics, a unit or a pose that are given out are no numbers.
+/// When intrinsics, a unit or a pose that are returned are not finite.
 pub fn l515(bytes: &[u8]) -> u64 {
     let mut came = 0;
     if let Ok(t) = DepthIntrinsics::parse(bytes) {
@@ -195,16 +196,16 @@ pub fn l515(bytes: &[u8]) -> u64 {
         assert!(good_pose(&pose), "{pose:?}");
         came += 1;
     }
-    let mut parrot = Parrot(bytes);
-    let _ = (Temperatures::parse(bytes), Control::LaserPower.range(&mut parrot));
-    let _ = Control::LaserPower.set(&mut parrot, 50);
+    let mut monitor = FixedReply(bytes);
+    let _ = (Temperatures::parse(bytes), Control::LaserPower.range(&mut monitor));
+    let _ = Control::LaserPower.set(&mut monitor, 50);
     came
 }
 
 /// The IMU's table of a D400 or an L515. Of an odd number of bytes it gets its checksum put right. Whether it is taken.
 ///
 /// # Panics
-/// When a pose, a sample or what is stated of the correction is no number.
+/// When a pose, a sample or a stated value of the correction is not finite.
 pub fn imu(bytes: &[u8]) -> u64 {
     let mut table = bytes.to_vec();
     if let (1, Some(payload)) = (bytes.len() % 2, bytes.get(tables::HEADER..)) {

@@ -38,8 +38,9 @@ fn feed(gate: &mut Gate, sink: &mut MemorySink, raw: &RawFrame) -> Outcome {
 
 #[test]
 fn a_gap_whose_reason_is_known_is_counted_for_it() {
-    let (mut gate, mut sink) = (Gate::new(0, &profile(32, ClockDomain::Device)), MemorySink::default());
-    gate.explain_gap(2, DropReason::QueueFull); // before the first, which the counter alone cannot tell
+    let mut gate = Gate::new(0, &profile(32, ClockDomain::Device));
+    let mut sink = MemorySink::default();
+    gate.explain_gap(2, DropReason::QueueFull); // before the first, which the counter alone cannot show
     feed(&mut gate, &mut sink, &raw(10, 0));
     gate.explain_gap(1, DropReason::QueueFull);
     feed(&mut gate, &mut sink, &raw(14, 1)); // 11 to 13 are missing, one of them by the host
@@ -56,7 +57,8 @@ fn a_gap_whose_reason_is_known_is_counted_for_it() {
 
 #[test]
 fn a_counter_that_jumps_by_more_than_any_camera_loses_was_set_anew() {
-    let (mut gate, mut sink) = (Gate::new(0, &profile(64, ClockDomain::Device)), MemorySink::default());
+    let mut gate = Gate::new(0, &profile(64, ClockDomain::Device));
+    let mut sink = MemorySink::default();
     for (i, sequence) in [1, 2, u64::MAX / 2, u64::MAX - 1, u64::MAX, 3].into_iter().enumerate() {
         feed(&mut gate, &mut sink, &raw(sequence, i as i64));
     }
@@ -65,8 +67,9 @@ fn a_counter_that_jumps_by_more_than_any_camera_loses_was_set_anew() {
 }
 
 #[test]
-fn gaps_duplicates_and_late_frames_are_told_apart() {
-    let (mut gate, mut sink) = (Gate::new(0, &profile(8, ClockDomain::Device)), MemorySink::default());
+fn gaps_duplicates_and_late_frames_are_distinguished() {
+    let mut gate = Gate::new(0, &profile(8, ClockDomain::Device));
+    let mut sink = MemorySink::default();
     let outcomes: Vec<_> = [250, 251, 251, 255, 253, 1, 1]
         .into_iter()
         .enumerate()
@@ -82,7 +85,8 @@ fn gaps_duplicates_and_late_frames_are_told_apart() {
 
 #[test]
 fn a_reset_counter_is_no_gap() {
-    let (mut gate, mut sink) = (Gate::new(0, &profile(32, ClockDomain::Device)), MemorySink::default());
+    let mut gate = Gate::new(0, &profile(32, ClockDomain::Device));
+    let mut sink = MemorySink::default();
     for (i, s) in [5000, 5001, 1, 2].into_iter().enumerate() {
         assert_eq!(feed(&mut gate, &mut sink, &raw(s, i as i64)), Outcome::Delivered);
     }
@@ -91,7 +95,8 @@ fn a_reset_counter_is_no_gap() {
 
 #[test]
 fn a_counter_reset_soon_after_the_start_costs_three_frames() {
-    let (mut gate, mut sink) = (Gate::new(0, &profile(32, ClockDomain::Device)), MemorySink::default());
+    let mut gate = Gate::new(0, &profile(32, ClockDomain::Device));
+    let mut sink = MemorySink::default();
     let sequence = (1..=30).chain(1..=30);
     let delivered = sequence
         .enumerate()
@@ -103,7 +108,8 @@ fn a_counter_reset_soon_after_the_start_costs_three_frames() {
 
 #[test]
 fn broken_frames_are_dropped_with_their_reason() {
-    let (mut gate, mut sink) = (Gate::new(0, &profile(32, ClockDomain::Device)), MemorySink::default());
+    let mut gate = Gate::new(0, &profile(32, ClockDomain::Device));
+    let mut sink = MemorySink::default();
     let mut frame = raw(1, 0);
     let mut outcome = |gate: &mut Gate, sink: &mut MemorySink, change: &dyn Fn(&mut RawFrame)| {
         frame = raw(frame.device_sequence + 1, frame.device_sequence as i64);
@@ -124,7 +130,8 @@ fn broken_frames_are_dropped_with_their_reason() {
 
 #[test]
 fn a_kernel_stamp_is_used_as_it_is() {
-    let (mut gate, mut sink) = (Gate::new(0, &profile(32, ClockDomain::Kernel)), MemorySink::default());
+    let mut gate = Gate::new(0, &profile(32, ClockDomain::Kernel));
+    let mut sink = MemorySink::default();
     let mut frame = raw(1, 0);
     frame.device_ticks = 999_000_000;
     feed(&mut gate, &mut sink, &frame);
@@ -157,10 +164,12 @@ proptest! {
     #[test]
     fn captured_is_delivered_plus_dropped(steps in steps(), start in any::<u64>(), bits in 8u32..=64) {
         let mask = if bits == 64 { u64::MAX } else { (1 << bits) - 1 };
-        let (mut gate, mut sink) = (Gate::new(0, &profile(bits, ClockDomain::Device)), MemorySink::default());
+        let mut gate = Gate::new(0, &profile(bits, ClockDomain::Device));
+        let mut sink = MemorySink::default();
         let mut counter = start & mask;
         feed(&mut gate, &mut sink, &raw(counter, 0));
-        let (mut made, mut out) = (1u64, 1u64);
+        let mut made = 1u64;
+        let mut out = 1u64;
         for (i, step) in steps.iter().enumerate() {
             let skipped = match step { Step::Skip(n) => *n, _ => 0 };
             let advance = u64::from(!matches!(step, Step::Repeat)) + skipped;

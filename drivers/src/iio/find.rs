@@ -5,8 +5,8 @@ use std::path::PathBuf;
 
 /// A sensor of the industrial I/O.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Found {
-    /// What its driver calls it: `accel_3d`, `gyro_3d`.
+pub struct FoundSensor {
+    /// Its driver's name for it: `accel_3d`, `gyro_3d`.
     pub name: String,
     /// Its folder in sysfs.
     pub folder: PathBuf,
@@ -14,7 +14,7 @@ pub struct Found {
     pub node: PathBuf,
 }
 
-impl Found {
+impl FoundSensor {
     /// The files that have to be written to switch it on.
     pub fn switches(&self) -> [PathBuf; 2] {
         [self.folder.join("buffer/enable"), self.folder.join("buffer/length")]
@@ -22,9 +22,9 @@ impl Found {
 }
 
 /// The sensors of the USB device at `port`, such as `4-1.2`, by their numbers.
-pub fn on_port(root: &SysRoot, port: &str) -> Vec<Found> {
+pub fn on_port(root: &SysRoot, port: &str) -> Vec<FoundSensor> {
     let entries = std::fs::read_dir(root.join("sys/bus/iio/devices"));
-    let mut found: Vec<(u32, Found)> = entries
+    let mut found: Vec<(u32, FoundSensor)> = entries
         .into_iter()
         .flatten()
         .flatten()
@@ -36,7 +36,7 @@ pub fn on_port(root: &SysRoot, port: &str) -> Vec<Found> {
             let is_here = folder.ancestors().any(|dir| dir.file_name().is_some_and(|name| name == port));
             let name = std::fs::read_to_string(folder.join("name")).ok()?.trim().to_owned();
             let node = root.join("dev").join(file_name);
-            is_here.then_some((number, Found { name, folder, node }))
+            is_here.then_some((number, FoundSensor { name, folder, node }))
         })
         .collect();
     found.sort_by_key(|(number, _)| *number);

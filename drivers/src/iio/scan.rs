@@ -1,5 +1,5 @@
-//! How a scan lies in memory: one number for each element that is on, in the order of their indices, each at a multiple of its
-//! own size.
+//! How a scan lies in memory: one number for each element that is on, in the order of their indices, each at a multiple
+//! of its own size.
 
 use crate::{Error, ErrorKind, Result};
 
@@ -21,7 +21,7 @@ impl Element {
     /// Reads the file `_type` of an element.
     ///
     /// # Errors
-    /// [`ErrorKind::Protocol`] when it is none that the kernel's ABI describes.
+    /// [`ErrorKind::Protocol`] for a type that the kernel's ABI does not describe.
     pub fn parse(text: &str) -> Result<Self> {
         Self::parsed(text.trim()).ok_or_else(|| {
             Error::new(ErrorKind::Protocol, format!("invalid type \"{}\" of a sensor's number", text.trim()))

@@ -1,6 +1,6 @@
 //! One sensor: what it measures with, switching it on and off, and its measurements.
 
-use super::find::Found;
+use super::find::FoundSensor;
 use super::scan::{Element, Layout, Scan};
 use crate::usb::SysRoot;
 use crate::usb::holder::{Holders, holders_of};
@@ -16,7 +16,7 @@ const LENGTH: usize = 1024;
 /// Scans that one read takes.
 const CHUNK: usize = 64;
 
-/// What switches a sensor on and off. Every call may take seconds: the kernel waits for the device.
+/// Switches a sensor on and off. Every call may take seconds: the kernel waits for the device.
 #[derive(Debug)]
 pub struct Switch {
     folder: PathBuf,
@@ -69,16 +69,17 @@ fn in_use(node: &Path, holders: &Holders, e: std::io::Error) -> Error {
 
 impl Switch {
     /// The switch of `found`, which it leaves as it is.
-    pub fn of(found: &Found) -> Self {
+    pub fn of(found: &FoundSensor) -> Self {
         Self { folder: found.folder.clone() }
     }
 
-    /// Switches the sensor `found` off, so that it can be set, and lets every element of `axes` (`in_accel_x`, …) into its
-    /// scans, with their time.
+    /// Switches the sensor `found` off, so that it can be set, and lets every element of `axes` (`in_accel_x`, …) into
+    /// its scans, with their time.
     ///
     /// # Errors
-    /// [`ErrorKind::PermissionDenied`] and [`ErrorKind::Busy`] with the cure, [`ErrorKind::Disconnected`], [`ErrorKind::Io`].
-    pub fn prepare(found: &Found, axes: [&str; 3]) -> Result<Self> {
+    /// [`ErrorKind::PermissionDenied`] and [`ErrorKind::Busy`] with the cure, [`ErrorKind::Disconnected`],
+    /// [`ErrorKind::Io`].
+    pub fn prepare(found: &FoundSensor, axes: [&str; 3]) -> Result<Self> {
         let switch = Self::of(found);
         switch.off()?;
         for element in axes.into_iter().chain(["in_timestamp"]) {
@@ -118,9 +119,9 @@ impl Sensor {
     /// Opens the node of a sensor that measures `axes`. Nobody else can read it as long as it is open.
     ///
     /// # Errors
-    /// Those of [`Switch::prepare`], where [`ErrorKind::Busy`] names the program that has it; [`ErrorKind::Protocol`] when
-    /// its scans are of a kind that is not known.
-    pub fn open(root: &SysRoot, found: &Found, axes: [&str; 3]) -> Result<Self> {
+    /// Those of [`Switch::prepare`], where [`ErrorKind::Busy`] names the program that has it; [`ErrorKind::Protocol`]
+    /// when its scans are of a kind that is not known.
+    pub fn open(root: &SysRoot, found: &FoundSensor, axes: [&str; 3]) -> Result<Self> {
         let read = |element: &str, what: &str| {
             let path = found.folder.join(format!("scan_elements/{element}_{what}"));
             std::fs::read_to_string(&path).map_err(|e| failed(&path, "read", e))

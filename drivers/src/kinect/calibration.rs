@@ -54,10 +54,10 @@ pub struct Calibration {
 
 impl Calibration {
     /// Reads and checks the JSON text of a device (`READ_CALIBRATION`, `calibration.json` in a recording). A zero byte
-    /// at its end, as the device sends it, is no part of it.
+    /// at its end, as the device sends it, is ignored.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`] with the key when something is missing, no number, or not what a Kinect can have.
+    /// [`ErrorKind::BadInput`] with the key of a value that is missing, not a number, or out of range for a Kinect.
     pub fn parse(text: &[u8]) -> Result<Self> {
         json::parse(text)
     }
@@ -118,12 +118,12 @@ impl Calibration {
 /// A pose out of nine numbers, row after row, and three.
 ///
 /// # Errors
-/// The reason when the nine are no rotation or the device would be larger than a metre.
+/// The reason if the nine are not a rotation, or the device would be larger than a metre.
 fn pose(rotation: [f64; 9], translation_m: [f64; 3]) -> core::result::Result<Pose, String> {
     let matrix = DMat3::from_cols_array(&rotation).transpose();
     let off = (matrix * matrix.transpose() - DMat3::IDENTITY).to_cols_array();
     if off.iter().any(|e| e.is_nan() || e.abs() > 1e-3) || matrix.determinant() < 0.0 {
-        return Err(format!("Rotation {rotation:?} is no rotation"));
+        return Err(format!("Rotation {rotation:?} is not a rotation"));
     }
     let t = DVec3::from_array(translation_m);
     if t.length().is_nan() || t.length() > 1.0 {
@@ -134,9 +134,10 @@ fn pose(rotation: [f64; 9], translation_m: [f64; 3]) -> core::result::Result<Pos
 }
 
 impl RawIntrinsics {
-    /// The intrinsics of a picture that is `cut` out of the sensor.
+    /// The intrinsics of an image that is `cut` out of the sensor.
     fn at(&self, cut: Cut) -> Intrinsics {
-        let (width, height) = (f64::from(cut.sensor.0), f64::from(cut.sensor.1));
+        let width = f64::from(cut.sensor.0);
+        let height = f64::from(cut.sensor.1);
         let pinhole = Intrinsics::pinhole(
             self.fx * width,
             self.fy * height,

@@ -67,7 +67,7 @@ pub struct Head {
     pub size: Option<u64>,
 }
 
-/// The head at the start of `bytes`; `None` when it is not whole or cannot be one.
+/// The head at the start of `bytes`; `None` if it is incomplete or invalid.
 pub fn head(bytes: &[u8]) -> Option<Head> {
     let id_len = bytes.first()?.leading_zeros() as usize + 1;
     if id_len > 4 {
@@ -87,23 +87,23 @@ pub fn vint(bytes: &[u8]) -> Option<(Option<u64>, usize)> {
     Some((Some(value).filter(|v| *v != all), len))
 }
 
-/// The elements in the body of another, as far as they are whole.
+/// The elements in the body of another, up to the first incomplete one.
 #[derive(Debug, Clone)]
 pub struct Children<'a> {
     rest: &'a [u8],
-    is_whole: bool,
+    is_complete: bool,
 }
 
 /// The elements in `body`.
 pub const fn children(body: &[u8]) -> Children<'_> {
-    Children { rest: body, is_whole: true }
+    Children { rest: body, is_complete: true }
 }
 
 impl Children<'_> {
-    /// Whether all elements so far were whole: false after an iteration that an element ended which claims more than
+    /// Whether all elements so far were complete: false after an iteration that an element ended which claims more than
     /// there is.
-    pub const fn is_whole(&self) -> bool {
-        self.is_whole
+    pub const fn is_complete(&self) -> bool {
+        self.is_complete
     }
 }
 
@@ -111,7 +111,7 @@ impl<'a> Iterator for Children<'a> {
     type Item = (u32, &'a [u8]);
 
     fn next(&mut self) -> Option<Self::Item> {
-        if self.rest.is_empty() || !self.is_whole {
+        if self.rest.is_empty() || !self.is_complete {
             return None;
         }
         let found = head(self.rest).and_then(|h| {
@@ -120,7 +120,7 @@ impl<'a> Iterator for Children<'a> {
             Some((h.id, body, rest))
         });
         let Some((id, body, rest)) = found else {
-            self.is_whole = false;
+            self.is_complete = false;
             return None;
         };
         self.rest = rest;
@@ -152,7 +152,7 @@ pub fn float(body: &[u8]) -> Option<f64> {
     }
 }
 
-/// Text, which ends at a zero byte if it has one; what is no UTF-8 is replaced.
+/// Text, which ends at a zero byte if it has one; invalid UTF-8 is replaced.
 pub fn text(body: &[u8]) -> String {
     String::from_utf8_lossy(body.split(|b| *b == 0).next().unwrap_or_default()).into_owned()
 }

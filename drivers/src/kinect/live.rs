@@ -1,17 +1,17 @@
 //! A Kinect that is attached, through Microsoft's own library, which is loaded when the first one is opened.
 //!
-//! **Why a library.** A Kinect sends the raw phases of its depth sensor. What turns them into depth, the depth engine, is
-//! closed, runs on the graphics card, and has no open stand-in. It comes with `libk4a` 1.4 ([`CURE`] says from where).
-//! Nothing of it is needed to build or to run without a Kinect.
+//! **Why a library.** A Kinect sends the raw phases of its depth sensor. What turns them into depth, the depth engine,
+//! is closed, runs on the graphics card, and has no open stand-in. It comes with `libk4a` 1.4 ([`CURE`] says from
+//! where). Nothing of it is needed to build or to run without a Kinect.
 //!
 //! **Streams.** `color`, `depth` (Z16, millimetres) and `ir` (16-bit grey), all at one rate; what each is asked for
-//! chooses the mode. Every picture is written once: copied or decoded out of libk4a's memory into the receiver's.
+//! chooses the mode. Every image is written once: copied or decoded out of libk4a's memory into the receiver's.
 //!
-//! **Time.** Each picture has the device's clock at mid-exposure, microseconds, and `CLOCK_MONOTONIC` at the end of its
-//! transfer. There is no frame counter: numbers are reckoned from the device's times.
+//! **Time.** Each image has the device's clock at mid-exposure, microseconds, and `CLOCK_MONOTONIC` at the end of its
+//! transfer. The device has no frame counter: numbers are derived from its times.
 //!
-//! **Threads.** All calls are made by the camera's own thread. libk4a has threads of its own, so that the library is never
-//! unloaded; one that hangs takes the camera's thread with it, which [`crate::capture::Capture`] then gives up.
+//! **Threads.** All calls are made by the camera's own thread. libk4a has threads of its own, so that the library is
+//! never unloaded; one that hangs takes the camera's thread with it, which [`crate::capture::Capture`] then gives up.
 
 mod backend;
 mod config;
@@ -34,7 +34,8 @@ pub use profiles::{STREAMS, wire_bits_per_s};
 use crate::Result;
 use std::path::PathBuf;
 
-/// Loads libk4a and, unless colour is all that is wanted, the depth engine, as a camera would; says which files they are.
+/// Loads libk4a and, unless colour is all that is wanted, the depth engine, as a camera would; says which files they
+/// are.
 ///
 /// # Errors
 /// [`crate::ErrorKind::BadInput`] with what to install.

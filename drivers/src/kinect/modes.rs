@@ -18,14 +18,14 @@ pub enum DepthMode {
     PassiveIr,
 }
 
-/// A picture cut out of a sensor that was read whole or binned.
+/// An image cut out of a sensor that was read whole or binned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Cut {
-    /// Size of the whole sensor in pixels of the picture.
+    /// Size of the whole sensor in pixels of the image.
     pub sensor: (u32, u32),
-    /// First column and first row that the picture shows.
+    /// First column and first row that the image shows.
     pub offset: (u32, u32),
-    /// Size of the picture.
+    /// Size of the image.
     pub size: (u32, u32),
 }
 
@@ -61,7 +61,7 @@ impl DepthMode {
         }
     }
 
-    /// What of the sensor its pictures show.
+    /// The part of the sensor that its images show.
     pub const fn cut(self) -> Cut {
         match self {
             Self::Nfov2x2Binned => Cut { sensor: (512, 512), offset: (96, 90), size: (320, 288) },
@@ -73,7 +73,7 @@ impl DepthMode {
         }
     }
 
-    /// Width and height of its pictures.
+    /// Width and height of its images.
     pub const fn size(self) -> (u32, u32) {
         self.cut().size
     }
@@ -83,7 +83,7 @@ impl DepthMode {
         !matches!(self, Self::PassiveIr)
     }
 
-    /// The fastest rate, pictures per second.
+    /// The fastest rate, images per second.
     pub const fn max_rate_hz(self) -> u32 {
         if matches!(self, Self::WfovUnbinned) { 15 } else { 30 }
     }
@@ -127,9 +127,9 @@ impl ColorResolution {
         Self::ALL.into_iter().find(|r| r.name().eq_ignore_ascii_case(name))
     }
 
-    /// The resolution of pictures of this size.
-    pub fn from_size(size: (u32, u32)) -> Option<Self> {
-        Self::ALL.into_iter().find(|r| r.size() == size)
+    /// The resolution of images of this size.
+    pub fn from_size(width: u32, height: u32) -> Option<Self> {
+        Self::ALL.into_iter().find(|r| r.size() == (width, height))
     }
 
     /// The SDK's `k4a_color_resolution_t`.
@@ -144,7 +144,7 @@ impl ColorResolution {
         }
     }
 
-    /// What of the sensor its pictures show: all of it in width, and in height too where they are 4:3.
+    /// The part of the sensor that its images show: all of it in width, and in height too where they are 4:3.
     pub const fn cut(self) -> Cut {
         match self {
             Self::P720 => Cut { sensor: (1280, 960), offset: (0, 120), size: (1280, 720) },
@@ -156,21 +156,21 @@ impl ColorResolution {
         }
     }
 
-    /// Width and height of its pictures.
+    /// Width and height of its images.
     pub const fn size(self) -> (u32, u32) {
         self.cut().size
     }
 
-    /// The fastest rate, pictures per second.
+    /// The fastest rate, images per second.
     pub const fn max_rate_hz(self) -> u32 {
         if matches!(self, Self::P3072) { 15 } else { 30 }
     }
 }
 
-/// How the colour camera sends its pictures.
+/// How the colour camera sends its images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ColorFormat {
-    /// JPEG pictures, at every resolution.
+    /// JPEG images, at every resolution.
     Mjpg,
     /// Planar 4:2:0, at 720p.
     Nv12,
@@ -210,10 +210,10 @@ impl ColorFormat {
     }
 }
 
-/// What the colour camera is set to.
+/// The mode of the colour camera.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ColorMode {
-    /// How pictures are sent.
+    /// How images are sent.
     pub format: ColorFormat,
     /// Their size.
     pub resolution: ColorResolution,
@@ -286,8 +286,9 @@ mod tests {
             "early recordings"
         );
         for r in ColorResolution::ALL {
+            let (width, height) = r.size();
             assert_eq!(
-                (ColorResolution::from_name(r.name()), ColorResolution::from_size(r.size())),
+                (ColorResolution::from_name(r.name()), ColorResolution::from_size(width, height)),
                 (Some(r), Some(r))
             );
         }

@@ -1,16 +1,16 @@
-//! The motion unit of a Kinect, attached or recorded, as the stream `imu`.
+//! The IMU of a Kinect, attached or recorded, as the stream `imu`.
 //!
 //! **Frame.** Gyroscope and accelerometer have extrinsics of their own in the calibration; that of the gyroscope has no
-//! place, since a rotation has none. The unit's frame is the accelerometer's. Both are passed on bit by bit, each along its
-//! own axes; how the gyroscope's are rotated in the unit's frame is stated where the calibration is, see
+//! place, since a rotation has none. The IMU's frame is the accelerometer's. Both are passed on bit by bit, each along
+//! its own axes; how the gyroscope's are rotated in the IMU's frame is stated where the calibration is, see
 //! [`gyroscope_in_unit`].
 //!
-//! **Time.** A sample's time is the gyroscope's, on the clock that also stamps the pictures, so that `device_time` of both
-//! can be compared. The map to the host's clock is the unit's own: a sample comes tens of milliseconds sooner than a
-//! picture of the same moment, and no time may be later than its arrival. Samples that came together are mapped by their
-//! newest.
+//! **Time.** A sample's time is the gyroscope's, on the clock that also stamps the images, so that `device_time` of
+//! both can be compared. The map to the host's clock is the IMU's own: a sample comes tens of milliseconds sooner than
+//! an image of the same moment, and no time may be later than its arrival. Samples that came together are mapped by
+//! their newest.
 //!
-//! **Numbers** are reckoned from the times, as those of the pictures are.
+//! **Numbers** are reckoned from the times, as those of the images are.
 
 use super::calibration::Calibration;
 use super::live::counter::FrameCounter;
@@ -33,7 +33,7 @@ pub const BATCH: u32 = 64;
 const PERIOD_US: u64 = 625;
 /// Rotations that differ by less than this are one, radians.
 const SAME_RAD: f64 = 1e-9;
-/// What two crystals may differ by, of the time between a sample and the newest that came with it.
+/// Largest rate difference of two crystals, applied to the time between a sample and the newest of its batch.
 const CRYSTALS: f64 = 100e-6;
 
 /// A sample as the device gave it.
@@ -41,7 +41,7 @@ const CRYSTALS: f64 = 100e-6;
 pub struct Measured {
     /// When the rotation was measured, nanoseconds of the device's clock.
     pub gyroscope_ns: u64,
-    /// When the acceleration was.
+    /// When the acceleration was measured.
     pub accelerometer_ns: u64,
     /// Rate of rotation, rad/s, along the gyroscope's axes.
     pub rotation: [f32; 3],
@@ -63,7 +63,7 @@ impl From<super::recording::MotionSample> for Measured {
     }
 }
 
-/// The stream's one mode; at `speed` times its own pace, on `clock`.
+/// The stream's one mode; at `speed` times its own rate, on `clock`.
 ///
 /// # Errors
 /// None that can happen: the name is a good one.
@@ -76,20 +76,20 @@ pub fn profile(
     motion::profile(RATE_HZ * speed, BATCH, pose(calibration), clock, metadata)
 }
 
-/// Pose of the unit in the device; identity when the calibration does not know it.
+/// Pose of the IMU in the device; identity when the calibration does not know it.
 pub fn pose(calibration: Option<&Calibration>) -> Pose {
     use depthrig_calib::PoseExt as _;
     let sensor = calibration.and_then(|c| c.accelerometer.or(c.gyroscope));
     sensor.map_or(Pose::IDENTITY, |s| s.sensor_from_device.inverse())
 }
 
-/// Whether a sample of a recorded block at `device_us` can have been measured at `gyroscope_ns`: blocks hold some milliseconds,
-/// and what lies a minute later is damaged. Believed, it would hold up all samples after it.
+/// Whether a sample of a recorded block at `device_us` can have been measured at `gyroscope_ns`: blocks hold some
+/// milliseconds, and what lies a minute later is damaged. Believed, it would hold up all samples after it.
 pub const fn is_plausible(gyroscope_ns: u64, device_us: u64) -> bool {
     gyroscope_ns <= device_us.saturating_mul(1000).saturating_add(60_000_000_000)
 }
 
-/// The rotation of a gyroscope's axes in its unit's frame.
+/// The rotation of a gyroscope's axes in its IMU's frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GyroscopeRotation {
     /// Unit quaternion x, y, z, w: `v_unit = q v_gyroscope`.
@@ -108,7 +108,7 @@ impl core::fmt::Display for GyroscopeRotation {
     }
 }
 
-/// How the gyroscope's axes lie in the unit's frame; `None` where they are its own, or nobody knows.
+/// How the gyroscope's axes lie in the IMU's frame; `None` if they coincide or the rotation is unknown.
 pub fn gyroscope_in_unit(calibration: Option<&Calibration>) -> Option<GyroscopeRotation> {
     let rotation = |p: Pose| DQuat::from_array(p.rotation_xyzw);
     let calibration = calibration?;
@@ -167,13 +167,13 @@ pub struct Unit {
     domain: ClockDomain,
     /// Seconds of the device per second.
     speed: f64,
-    /// What the newest sample of the epoch in force was told to be.
+    /// Epoch and reported time of the newest sample of the current epoch.
     last: Option<(u32, HostTime)>,
     tell_at: HostTime,
 }
 
 impl Unit {
-    /// As stream number `stream`, which is `profile`, at `speed` times its own pace.
+    /// As stream number `stream`, which is `profile`, at `speed` times its own rate.
     pub fn new(stream: usize, profile: &StreamProfile, speed: f64) -> Self {
         let period_ns = (PERIOD_US * 1000) as f64 / speed;
         let clock = ClockConfig {
@@ -192,8 +192,8 @@ impl Unit {
         }
     }
 
-    /// Takes samples in the order in which they were measured, all of which had arrived at `arrival`. `ticks` is the device's
-    /// clock as the stream has it, of microseconds of the device's own. Whether a batch went.
+    /// Takes samples in the order in which they were measured, all of which had arrived at `arrival`. `ticks` is the
+    /// device's clock as the stream has it, of microseconds of the device's own. Whether a batch went.
     pub fn take(
         &mut self,
         measured: &[Measured],
@@ -201,9 +201,10 @@ impl Unit {
         ticks: impl Fn(u64) -> u64,
         sink: &mut dyn FrameSink,
     ) -> bool {
-        let (mut rest, mut went) = (measured, false);
+        let mut rest = measured;
+        let mut went = false;
         while !rest.is_empty() {
-            // A clock that was set back begins anew.
+            // A clock that was set back starts a new count.
             let ends = rest.windows(2).position(|w| w[1].gyroscope_ns < w[0].gyroscope_ns);
             let (run, later) = rest.split_at(ends.map_or(rest.len(), |last| last + 1));
             went |= self.take_run(run, arrival, &ticks, sink);
@@ -228,8 +229,9 @@ impl Unit {
     ) -> bool {
         let Some(newest) = run.last() else { return false };
         let newest_ticks = ticks(newest.gyroscope_ns / 1000);
-        let (mut mark, mut base, mut uncertainty_ns) =
-            (Mark { arrival, epoch: 0, flags: FrameFlags(0) }, arrival, 0);
+        let mut mark = Mark { arrival, epoch: 0, flags: FrameFlags(0) };
+        let mut base = arrival;
+        let mut uncertainty_ns = 0;
         let mut newest_time = newest_ticks;
         let mut rate = 1.0;
         if self.domain == ClockDomain::Device {

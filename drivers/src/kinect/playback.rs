@@ -1,16 +1,16 @@
-//! A recording of an Azure Kinect as a camera: played at the pace of its own clock, once or without end.
+//! Plays an Azure Kinect `.mkv` as a camera: at the rate of its own clock, once or in a loop.
 //!
-//! **Streams** are `color`, `depth` (Z16, millimetres) and `ir` (16-bit grey), as of the camera itself. Colour recorded as
-//! JPEG is decoded to `rgb8`, or kept as `mjpeg` where that is asked for; NV12 and YUY2 stay what they are; of BGRA the
-//! unused byte is left out. Depth and infrared are written once, with their bytes swapped, into the receiver's memory.
-//! Decoding has threads and a reader of its own, which are a few pictures ahead. A track of motion is the stream `imu`
-//! ([`super::motion`]), played by the same clock.
+//! **Streams** are `color`, `depth` (Z16, millimetres) and `ir` (16-bit grey), as of the camera itself. Colour recorded
+//! as JPEG is decoded to `rgb8`, or kept as `mjpeg` where that is asked for; NV12 and YUY2 stay what they are; of BGRA
+//! the unused byte is left out. Depth and infrared are written once, with their bytes swapped, into the receiver's
+//! memory. Decoding has threads and a reader of its own, which are a few images ahead. An IMU track is the stream
+//! `imu` ([`super::motion`]), played by the same clock.
 //!
-//! **Time.** Frames carry the device's clock of the recording, microseconds at mid-exposure, and come when that clock says,
-//! counted from the first; so capture times have the spacing of the recording. There is no frame counter in the file:
-//! numbers are reckoned from those times, so that what the recorder lost is counted as lost. At another
-//! [`rate`](PlaybackConfig::rate) the clock is stretched. Each further round of a loop follows the last frame by a period,
-//! and the clock goes on.
+//! **Time.** Frames carry the device's clock of the recording, microseconds at mid-exposure, and come when that clock
+//! says, counted from the first; so capture times have the spacing of the recording. The file has no frame counter:
+//! numbers are derived from those times, so that frames the recorder lost are counted as lost. At another
+//! [`rate`](PlaybackConfig::rate) the clock is stretched. Each further round of a loop follows the last frame by a
+//! period, and the clock goes on.
 
 use super::calibration::Calibration;
 use super::modes::WiredSync;
@@ -44,10 +44,10 @@ pub enum CalibrationSource {
 }
 
 impl CalibrationSource {
-    /// The calibration of `recording`; `None` when none is wanted.
+    /// The calibration of `recording`; `None` if none is requested.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`] when there is none, or it cannot be; those of reading a file.
+    /// [`ErrorKind::BadInput`] if it is missing or invalid; those of reading a file.
     pub fn load(&self, recording: &Recording) -> Result<Option<Calibration>> {
         match self {
             Self::None => Ok(None),
@@ -87,7 +87,7 @@ pub struct PlaybackConfig {
 }
 
 impl PlaybackConfig {
-    /// Plays `recording` once at its own pace.
+    /// Plays `recording` once at its own rate.
     pub fn new(recording: impl Into<PathBuf>) -> Self {
         let calibration = CalibrationSource::Recorded;
         Self { recording: recording.into(), looped: false, rate: 1.0, calibration }
@@ -111,7 +111,7 @@ pub fn recorded_profiles(
     Ok(all.into_iter().filter(|(_, p)| is_stored(p)).collect())
 }
 
-/// The motion unit of a recording with its track, if it has one.
+/// The IMU of a recording with its track, if it has one.
 ///
 /// # Errors
 /// None that can happen: the name is a good one.
@@ -172,11 +172,12 @@ fn profiles(
     Ok(all)
 }
 
-/// Intrinsics and pose of a track. Colour of a size that is no Kinect's has none: nobody knows what it shows.
+/// Intrinsics and pose of a track. Colour of a size that Kinects do not have has none: which part of the sensor it
+/// shows is unknown.
 fn geometry(facts: &Facts, track: &Track, calibration: Option<&Calibration>) -> (Intrinsics, Pose) {
     let Some(c) = calibration else { return (Intrinsics::default(), Pose::IDENTITY) };
     if track.kind == TrackKind::Color {
-        let resolution = super::ColorResolution::from_size((track.width, track.height));
+        let resolution = super::ColorResolution::from_size(track.width, track.height);
         (resolution.map(|r| c.color_intrinsics(r)).unwrap_or_default(), c.color_in_device())
     } else {
         (facts.depth_mode.map(|m| c.depth_intrinsics(m)).unwrap_or_default(), c.depth_in_device())
@@ -190,7 +191,7 @@ pub struct PlaybackBackend {
 }
 
 impl PlaybackBackend {
-    /// A back end for the one recording of `config`. Nothing is read before it is opened.
+    /// A backend for the one recording of `config`. Nothing is read before it is opened.
     pub const fn new(config: PlaybackConfig) -> Self {
         Self { config }
     }
@@ -198,7 +199,7 @@ impl PlaybackBackend {
     fn load(&self) -> Result<RecordedDevice> {
         let config = self.config.clone();
         if config.rate.is_nan() || config.rate <= 0.0 {
-            let what = format!("a rate of {} is impossible: choose one above 0", config.rate);
+            let what = format!("invalid rate {}; choose one above 0", config.rate);
             return Err(Error::new(ErrorKind::BadInput, what));
         }
         let recording = Recording::open(&config.recording)?;
@@ -228,7 +229,7 @@ impl PlaybackBackend {
     }
 }
 
-/// What a recording says of its device.
+/// The device as the recording describes it.
 fn info(facts: &Facts, config: &PlaybackConfig) -> DeviceInfo {
     let place = std::fs::canonicalize(&config.recording).unwrap_or_else(|_| config.recording.clone());
     let firmware = match (facts.color_firmware.as_str(), facts.depth_firmware.as_str()) {
@@ -250,7 +251,7 @@ fn info(facts: &Facts, config: &PlaybackConfig) -> DeviceInfo {
     }
 }
 
-/// The serial number of a recording's device; if the file does not say it, the file's name, so that two can be told apart.
+/// The serial number of a recording's device; without one in the file, the file's name, so that two recordings differ.
 pub fn serial(facts: &Facts, path: &Path) -> String {
     let named = || path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     if facts.serial.is_empty() { named() } else { facts.serial.clone() }

@@ -1,17 +1,16 @@
 //! A recording of an Azure Kinect (`.mkv`), read from its start or from any time, in constant memory.
 //!
-//! What such a file holds is described by the Azure Kinect Sensor SDK (MIT), `src/record`; the container is Matroska
+//! The contents are described by the Azure Kinect Sensor SDK (MIT), `src/record`; the container is Matroska
 //! (RFC 9559). The file is read cluster by cluster, a cluster being at most 32 ms of everything. Memory is that of the
 //! largest cluster, whatever the length of the recording.
 //!
-//! **Damage.** A cluster counts when all of it is there, everything in it is whole, and its checksum, if it has one, is
-//! right. One that is not good is left out and counted ([`Losses`]); reading goes on at the next good one. So a file that
-//! was cut plays up to its last whole cluster. Nothing that a file says of sizes is believed beyond its end, nor beyond
+//! **Damage.** A cluster is valid if it and everything in it is complete, and its checksum, if it has one, matches.
+//! An invalid one is skipped and counted ([`Losses`]); reading goes on at the next valid one. So a file that was cut
+//! off plays up to its last complete cluster. No size that a file states is trusted beyond its end, nor beyond
 //! [`MAX_CLUSTER`].
 //!
-//! `matroska-demuxer` reads such files too, and tests hold the two against each other. It is not what reads here,
-//! because it gives up on files whose end is missing, has no attachments, and takes the bytes of a damaged cluster for
-//! what they look like.
+//! `matroska-demuxer` reads such files too, and tests compare the two. It is not used here because it gives up on files
+//! whose end is missing, has no attachments, and accepts the bytes of a damaged cluster as they are.
 
 use super::calibration::Calibration;
 use super::ebml::{self, id};
@@ -29,10 +28,10 @@ pub use cluster::MAX_CLUSTER;
 pub use motion::{MotionSample, motion_samples};
 pub use source::ReadAt;
 
-/// What a track holds.
+/// Contents of a track.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TrackKind {
-    /// Pictures of the colour camera.
+    /// Images of the colour camera.
     Color,
     /// Depth in millimetres.
     Depth,
@@ -44,7 +43,7 @@ pub enum TrackKind {
     Other,
 }
 
-/// How the pictures of a track are stored.
+/// How the images of a track are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Pixels {
     /// JPEG.
@@ -62,7 +61,7 @@ pub enum Pixels {
 }
 
 impl Pixels {
-    /// Bytes of a picture; `None` for those of JPEG, which vary.
+    /// Bytes of an image; `None` for those of JPEG, which vary.
     pub const fn frame_bytes(self, width: u32, height: u32) -> Option<usize> {
         let pixels = width as usize * height as usize;
         match self {
@@ -83,19 +82,19 @@ pub struct Track {
     pub uid: u64,
     /// Its name, such as `COLOR`.
     pub name: String,
-    /// What it holds.
+    /// Its contents.
     pub kind: TrackKind,
-    /// How its pictures are stored; `None` when it holds none.
+    /// How its images are stored; `None` when it holds none.
     pub pixels: Option<Pixels>,
-    /// Width of its pictures.
+    /// Width of its images.
     pub width: u32,
-    /// Height of its pictures.
+    /// Height of its images.
     pub height: u32,
-    /// Nominal time from picture to picture, nanoseconds.
+    /// Nominal time from image to image, nanoseconds.
     pub period_ns: Option<u64>,
 }
 
-/// What a recording says of itself.
+/// The facts that a recording states about itself.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Facts {
     /// Serial number of the device; empty when the file does not say it.
@@ -130,7 +129,7 @@ pub struct Facts {
     pub is_cut: bool,
 }
 
-/// What was left out so far because it was damaged.
+/// Counts of what was skipped so far because it was damaged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Losses {
     /// Places at which something was left out.
@@ -139,18 +138,18 @@ pub struct Losses {
     pub bytes: u64,
 }
 
-/// One block: one picture, or some samples of motion.
+/// One block: one image, or some IMU samples.
 #[derive(Debug, Clone)]
 pub struct Block<'a> {
     /// Index into [`Facts::tracks`].
     pub track: usize,
-    /// The device's clock, microseconds; the middle of the exposure. Samples of motion have times of their own.
+    /// The device's clock, microseconds; the middle of the exposure. IMU samples have times of their own.
     pub device_us: u64,
     frames: ebml::Frames<'a>,
 }
 
 impl<'a> Block<'a> {
-    /// The frames that share the block; pictures never do in what the SDK writes.
+    /// The frames that share the block; images never do in what the SDK writes.
     pub fn frames(&self) -> ebml::Frames<'a> {
         self.frames.clone()
     }
@@ -174,12 +173,12 @@ pub struct Recording {
     name: String,
     facts: Facts,
     clusters: cluster::Clusters,
-    /// Blocks before this time are passed over.
+    /// Blocks before this time are skipped.
     from_us: u64,
 }
 
 impl Recording {
-    /// Opens the recording at `path` and reads all but its pictures.
+    /// Opens the recording at `path` and reads all but its images.
     ///
     /// # Errors
     /// [`ErrorKind::NotFound`], [`ErrorKind::PermissionDenied`], [`ErrorKind::Io`], and those of [`Self::read`].
@@ -190,8 +189,8 @@ impl Recording {
     /// A recording out of `source`; messages call it `name`.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`] when it is no Matroska file, none of an Azure Kinect, damaged before its first picture,
-    /// or when its pictures are stored in no way that is known.
+    /// [`ErrorKind::BadInput`] if it is not a Matroska file, not from an Azure Kinect, damaged before its first image,
+    /// or if its images are stored in an unsupported format.
     pub fn read(source: Box<dyn ReadAt>, name: &str) -> Result<Self> {
         let head = head::read(source.as_ref(), name)?;
         let facts = facts::facts(&head, name)?;
@@ -199,7 +198,7 @@ impl Recording {
         Ok(Self { name: name.to_owned(), facts, clusters, from_us: 0 })
     }
 
-    /// What the recording says of itself.
+    /// The facts that the recording states about itself.
     pub const fn facts(&self) -> &Facts {
         &self.facts
     }
@@ -231,7 +230,7 @@ impl Recording {
     /// The next block in the order of the file; `None` at the end.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] when the file cannot be read. Damage is no error, see [`Self::losses`].
+    /// [`ErrorKind::Io`] when the file cannot be read. Damage is not an error, see [`Self::losses`].
     pub fn next_block(&mut self) -> Result<Option<Block<'_>>> {
         let Some(found) = self.advance()? else { return Ok(None) };
         let Pending { track, device_us, .. } = found;
@@ -240,7 +239,8 @@ impl Recording {
 
     /// [`Self::next_block`] without its frames, which stay where they are until it is called again.
     pub(super) fn advance(&mut self) -> Result<Option<Pending>> {
-        let (scale, offset) = (self.clusters.scale_ns(), self.facts.start_offset_ns);
+        let scale = self.clusters.scale_ns();
+        let offset = self.facts.start_offset_ns;
         loop {
             let Some(place) = self.clusters.advance()? else { return Ok(None) };
             let device_us = (place.time.saturating_mul(scale)).saturating_add(offset) / 1000;
@@ -268,7 +268,7 @@ impl Recording {
         Ok(())
     }
 
-    /// What was left out so far because it was damaged.
+    /// Counts of what was skipped so far because it was damaged.
     pub const fn losses(&self) -> Losses {
         self.clusters.losses()
     }
@@ -298,7 +298,7 @@ const fn block_time(cluster: u64, block: i16) -> u64 {
     cluster.saturating_add_signed(block as i64)
 }
 
-/// What messages call an element.
+/// Name of an element, for messages.
 fn element_name(of: u32) -> String {
     let known = [
         (id::SEEK_HEAD, "SeekHead"),

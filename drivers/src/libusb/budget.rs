@@ -4,16 +4,16 @@ use crate::usb::{SysRoot, health};
 use crate::{Error, ErrorKind, Result};
 use core::sync::atomic::{AtomicU64, Ordering};
 
-/// What all sources of this process have in flight.
+/// Memory of the submitted transfers of all sources of this process, bytes.
 static RESERVED: AtomicU64 = AtomicU64::new(0);
 
 /// Bytes of one piece of a transfer in the kernel (`USB_SG_SIZE`, kernel `drivers/usb/core/devio.c`).
 const PIECE: u64 = 16 * 1024;
-/// What the kernel counts for a piece beside its bytes, and for a transfer; rounded up.
+/// Overhead that the kernel counts for a piece beside its bytes, and for a transfer; rounded up.
 const PIECE_OVERHEAD: u64 = 64;
 const TRANSFER_OVERHEAD: u64 = 1024;
 
-/// What the kernel counts for `transfers` transfers of `length` bytes.
+/// Memory that the kernel counts for `transfers` transfers of `length` bytes.
 pub(super) const fn needed(transfers: usize, length: usize) -> u64 {
     let length = length as u64;
     transfers as u64 * (length + length.div_ceil(PIECE) * PIECE_OVERHEAD + TRANSFER_OVERHEAD)
@@ -27,7 +27,7 @@ impl Reservation {
     /// Takes `bytes` of the limit.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] with the cure, when this process would have more in flight than the kernel allows.
+    /// [`ErrorKind::Io`] with the cure, when this process would submit more than the kernel allows.
     pub(super) fn take(root: &SysRoot, label: &str, bytes: u64) -> Result<Self> {
         let total = RESERVED.fetch_add(bytes, Ordering::SeqCst) + bytes;
         let taken = Self(bytes);
@@ -73,13 +73,13 @@ fn megabytes(bytes: u64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::usb::made::MadeTree;
+    use crate::usb::fake::FakeTree;
 
     #[test]
-    fn a_limit_that_is_too_low_is_told_before_the_start_with_its_cure() {
+    fn a_limit_that_is_too_low_is_reported_before_the_start_with_its_cure() {
         // One test alone uses the process-wide sum: parallel tests would count each other's bytes.
         let dir = tempfile::tempdir().unwrap();
-        let tree = MadeTree::new(dir.path());
+        let tree = FakeTree::new(dir.path());
         let limit = |mb: &str| tree.file(health::USBFS_LIMIT, mb);
         limit("16");
         let stream = needed(4, 615_424);
@@ -93,7 +93,7 @@ mod tests {
         );
         assert!(text.contains("have 16 MB") && text.contains("17 MB are needed"), "{text}");
         assert!(text.contains("echo 64 > /sys/module/usbcore/parameters/usbfs_memory_mb"), "{text}");
-        // What was refused counts no longer, and neither does what was given back.
+        // Neither a refused reservation nor a returned one counts.
         drop(six);
         assert_eq!(RESERVED.load(Ordering::SeqCst), 0);
         limit("0");

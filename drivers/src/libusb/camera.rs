@@ -30,7 +30,7 @@ pub struct Camera {
     pub(super) inner: Arc<Inner>,
 }
 
-/// What all ways to an open device share.
+/// State that all handles of an open device share.
 #[derive(Debug)]
 pub(super) struct Inner {
     /// Dropped, and so closed, before the event thread ends.
@@ -49,7 +49,7 @@ impl Camera {
     ///
     /// # Errors
     /// [`ErrorKind::Busy`] naming the holder, [`ErrorKind::PermissionDenied`] with the udev rule,
-    /// [`ErrorKind::NotFound`] when it is no longer there, [`ErrorKind::Disconnected`],
+    /// [`ErrorKind::NotFound`] when it is gone, [`ErrorKind::Disconnected`],
     /// [`ErrorKind::Protocol`] when its descriptor cannot be read, [`ErrorKind::Io`].
     pub fn open(root: &SysRoot, device: &UsbDevice) -> Result<Self> {
         for node in device.video_nodes() {
@@ -69,7 +69,7 @@ impl Camera {
         Ok(Self { inner: Arc::new(inner) })
     }
 
-    /// What its configuration descriptor says.
+    /// Its configuration descriptor.
     pub fn configuration(&self) -> &Configuration {
         &self.inner.configuration
     }
@@ -229,7 +229,8 @@ struct EventThread {
 impl EventThread {
     fn start(context: &Context, port: &str) -> Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
-        let (theirs, stopped) = (context.clone(), Arc::clone(&stop));
+        let theirs = context.clone();
+        let stopped = Arc::clone(&stop);
         let thread = std::thread::Builder::new()
             .name(format!("usb-{port}"))
             .spawn(move || {

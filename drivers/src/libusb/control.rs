@@ -25,7 +25,7 @@ impl Port {
     /// The units of control interface `interface`.
     ///
     /// # Errors
-    /// [`ErrorKind::Unsupported`] when the camera has no such control interface.
+    /// [`ErrorKind::Unsupported`] when the camera does not have the control interface.
     pub fn new(camera: &Camera, interface: u8) -> Result<Self> {
         let camera = Arc::clone(&camera.inner);
         if camera.configuration().controls.iter().all(|c| c.number != interface) {

@@ -1,4 +1,4 @@
-//! What libusb's errors mean for a camera, in words that say what to do.
+//! Maps libusb's errors to errors of a camera that say what to do.
 
 use crate::usb::{SysRoot, UsbDevice, health};
 use crate::{Error, ErrorKind};

@@ -12,13 +12,13 @@ pub(super) struct Assembled<'a> {
     pub bytes: &'a [u8],
     /// The header of its first payload; `None` when it had none.
     pub header: Option<&'a [u8]>,
-    /// The device flagged it, or what came is no frame.
+    /// The device flagged it, or the bytes do not form a frame.
     pub damaged: bool,
-    /// Counts the frames of the device, as far as their identifier bit tells.
+    /// Counts the frames of the device, as far as their identifier bit shows.
     pub sequence: u64,
 }
 
-/// What a stream's payloads are like.
+/// Layout of a stream's payloads.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Layout {
     /// The most bytes of a frame.
@@ -183,7 +183,8 @@ impl Assembler {
 
     fn finish(&mut self, each: &mut dyn FnMut(&Assembled<'_>)) {
         let Some(open) = self.open.take() else { return };
-        let (bytes, header) = (self.frame.as_slice(), Some(self.header.as_slice()));
+        let bytes = self.frame.as_slice();
+        let header = Some(self.header.as_slice());
         each(&Assembled { bytes, header, damaged: open.damaged, sequence: open.sequence });
     }
 }

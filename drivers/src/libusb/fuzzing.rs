@@ -1,4 +1,4 @@
-//! What the fuzz target `uvc_payload` calls beside the header itself: transfers of a stream with any bytes.
+//! Entry point of the fuzz target `uvc_payload` beside the header itself: transfers of a stream with any bytes.
 
 use super::frames::{Assembler, Layout};
 
@@ -14,7 +14,8 @@ pub fn transfers(bytes: &[u8]) -> u64 {
     let layout =
         Layout { frame_bytes: FRAME, fixed: kind & 1 == 1, payload_bytes: usize::from(kind >> 1) + 12 };
     let mut assembler = Assembler::new(layout);
-    let (mut frames, mut last) = (0, None);
+    let mut frames = 0;
+    let mut last = None;
     while let [length, flags, tail @ ..] = rest {
         let (transfer, next) = tail.split_at(usize::from(*length).min(tail.len()));
         rest = next;

@@ -10,7 +10,7 @@ use crate::{Error, ErrorKind, Result};
 /// Tries of the whole exchange; a camera that has just been stopped may refuse the first.
 const TRIES: u32 = 3;
 
-/// What was agreed.
+/// The streaming parameters that camera and driver agreed on.
 #[derive(Debug, Clone)]
 pub(super) struct Agreement {
     /// The streaming interface.
@@ -36,7 +36,7 @@ pub(super) fn probe(
     let exchange = || -> rusb::Result<Vec<u8>> {
         let mut block = vec![0; probe::bytes_of_version(version)];
         let ask = |query, block: &mut [u8]| request(camera, interface, 0, probe::PROBE, query, block);
-        // What the camera would do at most; an older one answers with an older, shorter block.
+        // The camera's maximum; an older camera answers with an older, shorter block.
         let n = ask(Query::GetMax, &mut block)?;
         block.truncate(n);
         let start = Probe::parse(&block).map_err(|_| rusb::Error::BadDescriptor)?;

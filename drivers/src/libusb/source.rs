@@ -1,4 +1,4 @@
-//! The pictures of a camera's streaming interfaces, over several bulk transfers in flight for each.
+//! The images of a camera's streaming interfaces, over several submitted bulk transfers for each.
 
 use super::budget::{self, Reservation};
 use super::camera::{Camera, Inner};
@@ -6,10 +6,10 @@ use super::errors::failed;
 use super::frames::{Assembled, Layout};
 use super::negotiate::{self, Agreement};
 use super::stream::{Stream, Todo};
-use super::transfers::{Board, Event, Pool};
+use super::transfers::{CompletionQueue, Event, TransferPool};
 use crate::uvc::descriptors::{Endpoint, Format, FrameSize, Interval, TransferKind};
 use crate::uvc::formats::FourCc;
-use crate::video::{Picture, PictureSource};
+use crate::video::{Image, ImageSource};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::HostTime;
@@ -20,7 +20,7 @@ use std::thread::JoinHandle;
 const HEADER_ROOM: usize = 1024;
 /// The most bytes of a frame that a transfer is made for. A descriptor that asks for more is wrong.
 const MAX_FRAME_BYTES: usize = 64 << 20;
-/// A payload that a device announces with fewer bytes than this is no announcement.
+/// Least payload size, bytes; a device that announces less announced nothing.
 const LEAST_PAYLOAD: usize = 64;
 /// How often the streams are looked after while nothing comes.
 const TICK: Duration = Duration::from_millis(50);
@@ -55,7 +55,7 @@ impl Settings {
     /// The most transfers of a stream; more only cost memory.
     pub const MOST_TRANSFERS: usize = 32;
 
-    /// `transfers` of each stream in flight, one for each frame that may wait. Cut to the bounds above.
+    /// `transfers` submitted for each stream, one for each frame that may wait. Cut to the bounds above.
     pub fn with_transfers(transfers: usize) -> Self {
         Self { transfers: transfers.clamp(Self::FEWEST_TRANSFERS, Self::MOST_TRANSFERS) }
     }
@@ -73,7 +73,7 @@ impl Default for Settings {
     }
 }
 
-/// What a source has done since it was started.
+/// Counters of a source since it was started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Statistics {
     /// Transfers that came back.
@@ -84,25 +84,25 @@ pub struct Statistics {
     pub overflows: u64,
     /// Transfers with another error.
     pub failures: u64,
-    /// Transfers that ended because the end point was halted.
+    /// Transfers that ended because the endpoint was halted.
     pub stalls: u64,
-    /// How often an end point was cleared.
+    /// How often an endpoint was cleared.
     pub clearings: u64,
-    /// What the kernel counts for the transfers in flight.
+    /// Memory that the kernel counts for the submitted transfers.
     pub kernel_bytes: u64,
 }
 
 /// A camera that is streaming. Dropping it takes all transfers back and stops the camera.
 pub struct Source {
     streams: Vec<Running>,
-    board: Arc<Board>,
+    queue: Arc<CompletionQueue>,
     camera: Arc<Inner>,
     reservation: Reservation,
     kernel_bytes: u64,
 }
 
 struct Running {
-    stream: Stream<Pool>,
+    stream: Stream<TransferPool>,
     agreement: Agreement,
     endpoint: u8,
     clearing: Option<JoinHandle<()>>,
@@ -121,16 +121,16 @@ impl Source {
     /// Starts the streams of `modes` together.
     ///
     /// # Errors
-    /// [`ErrorKind::Unsupported`] when the camera has no such mode or sends it isochronously, [`ErrorKind::Io`] when
-    /// the kernel allows too little memory for transfers (with the cure), [`ErrorKind::Disconnected`].
+    /// [`ErrorKind::Unsupported`] when the camera does not have the mode or sends it isochronously, [`ErrorKind::Io`]
+    /// when the kernel allows too little memory for transfers (with the cure), [`ErrorKind::Disconnected`].
     pub fn start(camera: &Camera, modes: &[StreamMode], settings: Settings) -> Result<Self> {
         let inner = Arc::clone(&camera.inner);
         let plans: Vec<_> = modes.iter().map(|m| plan(&inner, m)).collect::<Result<_>>()?;
         let bytes = |p: &Plan| budget::needed(settings.transfers, p.transfer_bytes);
         let kernel_bytes = plans.iter().map(bytes).sum();
         let reservation = Reservation::take(inner.root(), inner.label(), kernel_bytes)?;
-        let board = Board::new(plans.len() * (settings.transfers + 1));
-        let mut source = Self { streams: Vec::new(), board, camera: inner, reservation, kernel_bytes };
+        let queue = CompletionQueue::new(plans.len() * (settings.transfers + 1));
+        let mut source = Self { streams: Vec::new(), queue, camera: inner, reservation, kernel_bytes };
         for plan in plans {
             source.add(plan, settings)?;
         }
@@ -146,8 +146,14 @@ impl Source {
         camera.handle().clear_halt(address).map_err(|e| failed(camera.label(), &what, e))?;
         negotiate::commit(&camera, &agreement).map_err(|e| failed(camera.label(), &what, e))?;
         let index = self.streams.len();
-        let pool =
-            Pool::new(Arc::clone(&camera), address, &self.board, index, settings.transfers, transfer_bytes);
+        let pool = TransferPool::new(
+            Arc::clone(&camera),
+            address,
+            &self.queue,
+            index,
+            settings.transfers,
+            transfer_bytes,
+        );
         let Some(pool) = pool else {
             return Err(failed(camera.label(), &what, rusb::Error::NoMem));
         };
@@ -159,7 +165,7 @@ impl Source {
         }
     }
 
-    /// What was done so far.
+    /// Counters so far.
     pub fn statistics(&self) -> Statistics {
         let mut sum = Statistics { kernel_bytes: self.kernel_bytes, ..Statistics::default() };
         for running in &self.streams {
@@ -182,14 +188,14 @@ impl Source {
     }
 
     /// Attends to one event; `each` gets the frames that it brings.
-    fn attend(&mut self, event: &Event, each: &mut dyn FnMut(&Picture<'_>)) -> Result<()> {
+    fn attend(&mut self, event: &Event, each: &mut dyn FnMut(&Image<'_>)) -> Result<()> {
         let (index, at) = match *event {
-            Event::Landed { stream, at, .. } => (stream, at),
+            Event::Completed { stream, at, .. } => (stream, at),
             Event::Cleared { stream, .. } => (stream, HostTime::now()),
         };
         let Some(running) = self.streams.get_mut(index) else { return Ok(()) };
         let mut hand_on = |frame: &Assembled<'_>| {
-            each(&Picture {
+            each(&Image {
                 source: index,
                 bytes: frame.bytes,
                 damaged: frame.damaged,
@@ -200,11 +206,11 @@ impl Source {
             });
         };
         let result = match *event {
-            Event::Landed { slot, .. } => running.stream.landed(slot, at, &mut hand_on),
+            Event::Completed { slot, .. } => running.stream.completed(slot, at, &mut hand_on),
             Event::Cleared { result, .. } => {
                 join(&mut running.clearing);
                 if let Err(e) = result {
-                    tracing::warn!(camera = self.camera.label(), endpoint = running.endpoint, %e, "clearing an end point failed");
+                    tracing::warn!(camera = self.camera.label(), endpoint = running.endpoint, %e, "clearing an endpoint failed");
                 }
                 running.stream.cleared(result, at, &mut hand_on)
             }
@@ -212,7 +218,7 @@ impl Source {
         result.map_err(|e| self.error(e, "streaming"))
     }
 
-    /// Looks after silent and halted end points.
+    /// Looks after silent and halted endpoints.
     fn tick(&mut self) -> Result<()> {
         let now = HostTime::now();
         for (index, running) in self.streams.iter_mut().enumerate() {
@@ -220,34 +226,36 @@ impl Source {
                 tracing::warn!(
                     camera = self.camera.label(),
                     endpoint = running.endpoint,
-                    "an end point is silent or halted; it is cleared and the stream started again"
+                    "an endpoint is silent or halted; it is cleared and the stream started again"
                 );
-                running.clearing = Some(spawn_clearing(&self.camera, running, &self.board, index)?);
+                running.clearing = Some(spawn_clearing(&self.camera, running, &self.queue, index)?);
             }
         }
         Ok(())
     }
 }
 
-/// Clears the end point of a stream and commits it again on a thread of its own: both are requests to the camera, which
+/// Clears the endpoint of a stream and commits it again on a thread of its own: both are requests to the camera, which
 /// may take seconds that the other streams do not have.
 fn spawn_clearing(
     camera: &Arc<Inner>,
     running: &Running,
-    board: &Arc<Board>,
+    queue: &Arc<CompletionQueue>,
     stream: usize,
 ) -> Result<JoinHandle<()>> {
-    let (theirs, board) = (Arc::clone(camera), Arc::clone(board));
-    let (agreement, endpoint) = (running.agreement.clone(), running.endpoint);
+    let theirs = Arc::clone(camera);
+    let queue = Arc::clone(queue);
+    let agreement = running.agreement.clone();
+    let endpoint = running.endpoint;
     let name = format!("usb-clear-{endpoint:02x}");
     let clear = move || {
         let result =
             theirs.handle().clear_halt(endpoint).and_then(|()| negotiate::commit(&theirs, &agreement));
         drop(theirs); // before the event is read, so that this thread is never the last to hold the camera
-        board.post(Event::Cleared { stream, result });
+        queue.post(Event::Cleared { stream, result });
     };
     std::thread::Builder::new().name(name).spawn(clear).map_err(|e| {
-        let text = format!("{}: no thread to clear an end point", camera.label());
+        let text = format!("{}: no thread to clear an endpoint could be started", camera.label());
         Error::new(ErrorKind::Io, text).with_source(e)
     })
 }
@@ -259,16 +267,16 @@ fn join(thread: &mut Option<JoinHandle<()>>) {
     }
 }
 
-impl PictureSource for Source {
-    fn poll(&mut self, timeout: Duration, each: &mut dyn FnMut(&Picture<'_>)) -> Result<bool> {
+impl ImageSource for Source {
+    fn poll(&mut self, timeout: Duration, each: &mut dyn FnMut(&Image<'_>)) -> Result<bool> {
         let end = HostTime::now().plus(timeout);
         let mut any = false;
         loop {
             let mut wait = end.min(HostTime::now().plus(TICK));
-            while let Some(event) = Arc::clone(&self.board).next(wait) {
-                self.attend(&event, &mut |picture| {
+            while let Some(event) = Arc::clone(&self.queue).next(wait) {
+                self.attend(&event, &mut |image| {
                     any = true;
-                    each(picture);
+                    each(image);
                 })?;
                 wait = HostTime::from_ns(0); // what else is there, without waiting
             }
@@ -287,8 +295,8 @@ impl Drop for Source {
             running.stream.stop();
         }
         let deadline = HostTime::now().plus(STOP_WAIT);
-        while self.streams.iter().any(|r| r.stream.flying() > 0) {
-            let Some(event) = self.board.next(deadline) else { break };
+        while self.streams.iter().any(|r| r.stream.pending() > 0) {
+            let Some(event) = self.queue.next(deadline) else { break };
             // Errors change nothing here: a device that is gone gives its transfers back as well.
             let _ = self.attend(&event, &mut |_| {});
         }
@@ -317,7 +325,7 @@ fn plan(camera: &Inner, mode: &StreamMode) -> Result<Plan> {
     let Some((format, size, interval)) = found else {
         return Err(unsupported(format!("no mode {code} {width}x{height} {rate_hz} Hz")));
     };
-    let Some((_, endpoint)) = stream.picture_endpoint().filter(|(_, e)| e.kind == TransferKind::Bulk) else {
+    let Some((_, endpoint)) = stream.image_endpoint().filter(|(_, e)| e.kind == TransferKind::Bulk) else {
         return Err(unsupported(format!(
             "interface {interface} does not send by bulk transfers; use the kernel's driver (transport = \"kernel\")"
         )));

@@ -1,4 +1,4 @@
-//! One stream of bulk transfers: what is done with each transfer that comes back, and when the end point is cleared.
+//! One stream of bulk transfers: handles each completed transfer and decides when the endpoint is cleared.
 //!
 //! It knows neither libusb nor threads, so that its tests need no device.
 
@@ -6,14 +6,14 @@ use super::frames::{Assembled, Assembler, Layout};
 use core::time::Duration;
 use depthrig_bus::HostTime;
 
-/// How a transfer came back.
+/// How a transfer completed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Status {
     /// With data.
     Completed,
     /// Because it was cancelled.
     Cancelled,
-    /// The end point is halted.
+    /// The endpoint is halted.
     Stalled,
     /// The device is gone.
     Gone,
@@ -23,28 +23,28 @@ pub(super) enum Status {
     Failed,
 }
 
-/// A transfer that came back.
+/// A completed transfer.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Landing<'a> {
+pub(super) struct Completion<'a> {
     pub status: Status,
     pub bytes: &'a [u8],
-    /// There was room for more.
+    /// The transfer had room for more.
     pub short: bool,
 }
 
-/// The transfers of one end point, by number.
-pub(super) trait Lane: Send {
-    /// How many there are.
+/// The transfers of one endpoint, by number.
+pub(super) trait Transfers: Send {
+    /// Number of transfers.
     fn slots(&self) -> usize;
-    /// Gives a transfer that is at rest to the device.
+    /// Submits a transfer that is not pending.
     fn submit(&mut self, slot: usize) -> rusb::Result<()>;
-    /// Asks for a transfer back. It lands as any other.
+    /// Cancels a transfer. It completes like any other.
     fn cancel(&mut self, slot: usize);
-    /// Takes a transfer whose end was posted; `None` when it was not under way.
-    fn land(&mut self, slot: usize) -> Option<Landing<'_>>;
+    /// Takes a transfer whose completion was posted; `None` when it was not pending.
+    fn take_completed(&mut self, slot: usize) -> Option<Completion<'_>>;
 }
 
-/// Frame periods of silence after which the end point is cleared (librealsense `src/uvc/uvc-streamer.cpp`).
+/// Frame periods of silence after which the endpoint is cleared (librealsense `src/uvc/uvc-streamer.cpp`).
 const SILENT_PERIODS: u32 = 10;
 /// But not sooner than this: short intervals are late by more than ten of them on a busy computer.
 const SILENT_AT_LEAST: Duration = Duration::from_millis(500);
@@ -53,28 +53,28 @@ const SILENT_AT_START: Duration = Duration::from_secs(2);
 /// Clearings without a frame in between, after which silence is left alone: a camera that waits for its
 /// synchronisation pulse has nothing to send, and one that hangs is the supervisor's business.
 const MAX_CLEARINGS: u32 = 3;
-/// Failed transfers in a row that are taken for a halted end point.
+/// Failed transfers in a row that are taken for a halted endpoint.
 const MAX_FAILURES: u32 = 8;
 
-/// What the owner of a stream is to do next.
+/// Next step for the owner of a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Todo {
     Nothing,
-    /// No transfer is under way: clear the end point, commit the stream again, and call [`Stream::cleared`].
+    /// No transfer is pending: clear the endpoint, commit the stream again, and call [`Stream::cleared`].
     Clear,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum State {
     Running,
-    /// Transfers are being called back.
+    /// Transfers are being cancelled.
     Draining,
-    /// Somebody clears the end point.
+    /// The owner clears the endpoint.
     Clearing,
     Stopping,
 }
 
-/// What became of a stream's transfers.
+/// Counts of a stream's transfers by outcome.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Counts {
     pub transfers: u64,
@@ -85,10 +85,10 @@ pub(super) struct Counts {
 }
 
 pub(super) struct Stream<L> {
-    lane: L,
+    transfers: L,
     frames: Assembler,
     state: State,
-    flying: usize,
+    pending: usize,
     failures_in_a_row: u32,
     clearings_in_a_row: u32,
     silent_after: Duration,
@@ -97,14 +97,14 @@ pub(super) struct Stream<L> {
     counts: Counts,
 }
 
-impl<L: Lane> Stream<L> {
+impl<L: Transfers> Stream<L> {
     /// A stream with frames every `period`.
-    pub(super) fn new(lane: L, layout: Layout, period: Duration, now: HostTime) -> Self {
+    pub(super) fn new(transfers: L, layout: Layout, period: Duration, now: HostTime) -> Self {
         Self {
-            lane,
+            transfers,
             frames: Assembler::new(layout),
             state: State::Running,
-            flying: 0,
+            pending: 0,
             failures_in_a_row: 0,
             clearings_in_a_row: 0,
             silent_after: (period * SILENT_PERIODS).max(SILENT_AT_LEAST),
@@ -114,8 +114,8 @@ impl<L: Lane> Stream<L> {
         }
     }
 
-    pub(super) const fn flying(&self) -> usize {
-        self.flying
+    pub(super) const fn pending(&self) -> usize {
+        self.pending
     }
 
     pub(super) const fn counts(&self) -> Counts {
@@ -126,41 +126,41 @@ impl<L: Lane> Stream<L> {
         self.frames.copied()
     }
 
-    /// Gives every transfer to the device.
+    /// Submits every transfer.
     ///
     /// # Errors
-    /// libusb's. Transfers that were accepted are under way all the same.
+    /// libusb's. Transfers that were accepted stay pending.
     pub(super) fn submit_all(&mut self) -> rusb::Result<()> {
-        for slot in 0..self.lane.slots() {
+        for slot in 0..self.transfers.slots() {
             self.submit(slot)?;
         }
         Ok(())
     }
 
-    /// A transfer came back at `at`.
+    /// Handles the transfer that completed at `at`.
     ///
     /// # Errors
     /// [`rusb::Error::NoDevice`], and what a submit fails with.
-    pub(super) fn landed(
+    pub(super) fn completed(
         &mut self,
         slot: usize,
         at: HostTime,
         each: &mut dyn FnMut(&Assembled<'_>),
     ) -> rusb::Result<()> {
-        let Some(landing) = self.lane.land(slot) else { return Ok(()) };
-        self.flying = self.flying.saturating_sub(1);
+        let Some(completion) = self.transfers.take_completed(slot) else { return Ok(()) };
+        self.pending = self.pending.saturating_sub(1);
         self.counts.transfers += 1;
-        if landing.status == Status::Gone {
+        if completion.status == Status::Gone {
             return Err(rusb::Error::NoDevice);
         }
         if self.state != State::Running {
             return Ok(());
         }
-        match landing.status {
+        match completion.status {
             Status::Completed => {
-                self.frames.take(landing.bytes, landing.short, each);
+                self.frames.take(completion.bytes, completion.short, each);
                 self.failures_in_a_row = 0;
-                if !landing.bytes.is_empty() {
+                if !completion.bytes.is_empty() {
                     self.last_data = at;
                     self.started = true;
                     self.clearings_in_a_row = 0;
@@ -168,7 +168,7 @@ impl<L: Lane> Stream<L> {
             }
             Status::Overflow | Status::Failed => {
                 self.frames.broken(each);
-                if landing.status == Status::Overflow {
+                if completion.status == Status::Overflow {
                     self.counts.overflows += 1;
                 } else {
                     self.counts.failures += 1;
@@ -189,16 +189,16 @@ impl<L: Lane> Stream<L> {
         self.submit(slot)
     }
 
-    /// To be called now and then: whether the end point must be cleared.
+    /// Reports whether the endpoint must be cleared; to be called regularly.
     pub(super) fn tick(&mut self, now: HostTime) -> Todo {
-        let patience = if self.started { self.silent_after } else { self.silent_after.max(SILENT_AT_START) };
+        let timeout = if self.started { self.silent_after } else { self.silent_after.max(SILENT_AT_START) };
         if self.state == State::Running
             && self.clearings_in_a_row < MAX_CLEARINGS
-            && now.since_ns(self.last_data) > patience.as_nanos() as i64
+            && now.since_ns(self.last_data) > timeout.as_nanos() as i64
         {
             self.drain();
         }
-        if self.state == State::Draining && self.flying == 0 {
+        if self.state == State::Draining && self.pending == 0 {
             self.state = State::Clearing;
             self.clearings_in_a_row += 1;
             self.counts.clearings += 1;
@@ -207,7 +207,7 @@ impl<L: Lane> Stream<L> {
         Todo::Nothing
     }
 
-    /// The end point was cleared and the stream committed again, or not: in both cases it is tried again.
+    /// Starts again after the endpoint was cleared and the stream committed, whether or not that succeeded.
     ///
     /// # Errors
     /// [`rusb::Error::NoDevice`], and what a submit fails with.
@@ -230,7 +230,7 @@ impl<L: Lane> Stream<L> {
         self.submit_all()
     }
 
-    /// Calls every transfer back for good.
+    /// Cancels every transfer for good.
     pub(super) fn stop(&mut self) {
         self.state = State::Stopping;
         self.cancel_all();
@@ -243,14 +243,14 @@ impl<L: Lane> Stream<L> {
 
     fn cancel_all(&mut self) {
         // From the last to the first, so that none fills up because the one before was taken away.
-        for slot in (0..self.lane.slots()).rev() {
-            self.lane.cancel(slot);
+        for slot in (0..self.transfers.slots()).rev() {
+            self.transfers.cancel(slot);
         }
     }
 
     fn submit(&mut self, slot: usize) -> rusb::Result<()> {
-        self.lane.submit(slot)?;
-        self.flying += 1;
+        self.transfers.submit(slot)?;
+        self.pending += 1;
         Ok(())
     }
 }

@@ -14,7 +14,7 @@ const STALE_WAIT: Duration = Duration::from_millis(1);
 /// The most replies that are thrown away.
 const MAX_STALE: u32 = 4;
 
-/// The hardware monitor behind the vendor's bulk end points (0x01 out and 0x81 in on a D400).
+/// The hardware monitor behind the vendor's bulk endpoints (0x01 out and 0x81 in on a D400).
 #[derive(Debug)]
 pub struct VendorBulk {
     camera: Arc<Inner>,
@@ -32,7 +32,7 @@ impl VendorBulk {
     pub fn new(camera: &Camera) -> Result<Self> {
         let inner = Arc::clone(&camera.inner);
         let Some((number, out, back)) = inner.configuration().vendor_channel() else {
-            let text = format!("{}: it has no vendor interface with bulk end points", inner.label());
+            let text = format!("{}: it has no vendor interface with bulk endpoints", inner.label());
             return Err(Error::new(ErrorKind::Unsupported, text));
         };
         inner.claim(number)?;

@@ -45,7 +45,7 @@ fn sample(n: u64, time: HostTime) -> MotionSample {
     }
 }
 
-/// What the batcher must do, by looking at the whole past: batches as lists of numbers with their epoch and the time at
+/// Model of the batcher that looks at the whole past: batches as lists of numbers with their epoch and the time at
 /// which each must have gone; `None` for one that was lost.
 #[derive(Default)]
 struct Model {
@@ -79,13 +79,16 @@ impl Model {
 }
 
 proptest! {
-    /// Every sample is in exactly one batch or in one that was counted as lost, in order, and none is kept longer than it
-    /// may be, as far as time was told to pass.
+    /// Every sample is in exactly one batch or in one that was counted as lost, in order, and none is kept longer than
+    /// it may be, as far as the test let time pass.
     #[test]
     fn batches_are_those_of_a_slow_model(events in prop::collection::vec(event(), 1..200)) {
-        let (mut model, mut sink) = (Model::default(), MemorySink::default());
+        let mut model = Model::default();
+        let mut sink = MemorySink::default();
         let mut batcher = Batcher::new(0, &unit());
-        let (mut now, mut n, mut epoch) = (HostTime::from_ns(5_000_000_000), 0u64, 0u32);
+        let mut now = HostTime::from_ns(5_000_000_000);
+        let mut n = 0u64;
+        let mut epoch = 0u32;
         for e in events {
             match e {
                 Event::Sample(ms) => {
@@ -168,7 +171,8 @@ fn a_profile_is_a_row_of_samples() {
 /// A time that may be off by more than the sample can say is not said to be right within 4 s.
 #[test]
 fn an_uncertainty_that_does_not_fit_is_no_small_one() {
-    let (mut b, mut sink) = (Batcher::new(0, &unit()), MemorySink::default());
+    let mut b = Batcher::new(0, &unit());
+    let mut sink = MemorySink::default();
     let now = HostTime::from_ns(1_000_000_000);
     let mark = Mark { arrival: now, epoch: 0, flags: FrameFlags(0) };
     b.push(&MotionSample { uncertainty_ns: u32::MAX, ..sample(1, now) }, mark, &mut sink);

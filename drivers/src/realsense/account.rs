@@ -1,19 +1,19 @@
-//! From what a picture brings along to the frame number and the device time that the gate needs.
+//! From what an image brings along to the frame number and the device time that the gate needs.
 //!
 //! With the whole header both are the device's own: its frame counter, and the time of mid-exposure, which is the
 //! presentation time minus the "sensor timestamp" (wrapping 32-bit microseconds). With the standard header the number
 //! is the transport's and the time is the presentation time. Without a header the time is the kernel's stamp, or the
 //! arrival.
 //!
-//! A single picture whose metadata did not come is reckoned from the last one that had it, and flagged. Pictures that
+//! A single image whose metadata did not come is reckoned from the last one that had it, and flagged. Images that
 //! come before any metadata has no place in time yet: they are kept in mind, and booked as incomplete as soon as the
 //! first number is known. So no frame is lost without an account of it.
 
 use super::protocol::metadata::{Metadata, Trigger};
-use crate::video::Picture;
+use crate::video::Image;
 use depthrig_bus::{FrameFlags, HostTime, MetadataLevel};
 
-/// What the metadata of one picture says.
+/// The metadata of one image.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Facts {
     /// Presentation time stamp, microseconds.
@@ -31,7 +31,7 @@ pub(super) struct Facts {
 }
 
 impl Facts {
-    /// What a payload header says, with the vendor's blocks if they are there.
+    /// Reads a payload header, with the vendor's blocks if it has them.
     pub(super) fn of(header: &[u8]) -> Self {
         let Some(all) = Metadata::parse(header) else { return Self::default() };
         Self {
@@ -45,7 +45,7 @@ impl Facts {
     }
 }
 
-/// Number and time of a picture.
+/// Number and time of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Stamp {
     pub(super) sequence: u64,
@@ -53,7 +53,7 @@ pub(super) struct Stamp {
     pub(super) flags: FrameFlags,
 }
 
-/// Pictures without any metadata before any had some, after which the camera is taken for one that sends none.
+/// Images without any metadata before any had some, after which the camera is taken for one that sends none.
 const MAX_ORPHANS: usize = 30;
 
 /// The account of one source.
@@ -64,7 +64,7 @@ pub(super) struct Account {
     orphans: Vec<u64>,
 }
 
-/// The last picture that had its metadata.
+/// The last image that had its metadata.
 #[derive(Debug, Clone, Copy)]
 struct Last {
     transport: u64,
@@ -73,19 +73,19 @@ struct Last {
     at: HostTime,
 }
 
-/// What [`Account::stamp`] makes of a picture.
+/// Result of [`Account::stamp`] for an image.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Stamped {
     /// Its number and time.
     Yes(Stamp),
-    /// It has no place in time yet and is kept in mind.
+    /// Its time is not known yet; it is remembered.
     NotYet,
-    /// It has none, and by now it is clear that none will come.
+    /// It has no time, and will not get one.
     Never,
 }
 
 impl Account {
-    /// The account of a source whose pictures bring along `level`.
+    /// The account of a source whose images bring along `level`.
     pub(super) const fn new(level: MetadataLevel) -> Self {
         Self { level, last: None, orphans: Vec::new() }
     }
@@ -95,10 +95,10 @@ impl Account {
         if matches!(level, MetadataLevel::Full) { 32 } else { 64 }
     }
 
-    /// Number and time of `picture`.
-    pub(super) fn stamp(&mut self, picture: &Picture<'_>, facts: &Facts) -> Stamped {
-        let at = picture.kernel_time.unwrap_or(picture.arrival);
-        let by_transport = |ticks: u64| Stamp { sequence: picture.sequence, ticks, flags: FrameFlags(0) };
+    /// Number and time of `image`.
+    pub(super) fn stamp(&mut self, image: &Image<'_>, facts: &Facts) -> Stamped {
+        let at = image.kernel_time.unwrap_or(image.arrival);
+        let by_transport = |ticks: u64| Stamp { sequence: image.sequence, ticks, flags: FrameFlags(0) };
         match self.level {
             MetadataLevel::Full | MetadataLevel::Header => {}
             // The counter is host time in nanoseconds and used as it is.
@@ -111,23 +111,23 @@ impl Account {
                 Some(ago) => (presentation.wrapping_sub(ago), FrameFlags(0)),
                 None => (presentation, FrameFlags::HEADER_TIME),
             };
-            self.last = Some(Last { transport: picture.sequence, counter, ticks, at });
-            let sequence = if is_full { counter.into() } else { picture.sequence };
+            self.last = Some(Last { transport: image.sequence, counter, ticks, at });
+            let sequence = if is_full { counter.into() } else { image.sequence };
             return Stamped::Yes(Stamp { sequence, ticks: ticks.into(), flags });
         }
         let Some(last) = self.last else {
-            self.orphans.push(picture.sequence);
+            self.orphans.push(image.sequence);
             return if self.orphans.len() < MAX_ORPHANS { Stamped::NotYet } else { Stamped::Never };
         };
         let microseconds = at.since_ns(last.at) / 1000;
         let ticks = last.ticks.wrapping_add(microseconds as u32);
-        let step = picture.sequence.wrapping_sub(last.transport) as u32;
-        let sequence = if is_full { last.counter.wrapping_add(step).into() } else { picture.sequence };
+        let step = image.sequence.wrapping_sub(last.transport) as u32;
+        let sequence = if is_full { last.counter.wrapping_add(step).into() } else { image.sequence };
         let flags = FrameFlags::METADATA_LOST.with(FrameFlags::TIME_UNCERTAIN);
         Stamped::Yes(Stamp { sequence, ticks: ticks.into(), flags })
     }
 
-    /// The numbers of the pictures that came before the one just stamped and had no place in time, oldest first.
+    /// The numbers of the images that came before the one just stamped and had no place in time, oldest first.
     pub(super) fn take_orphans(&mut self) -> Vec<u64> {
         let Some(last) = self.last else { return Vec::new() };
         let is_full = self.level == MetadataLevel::Full;
@@ -146,9 +146,9 @@ impl Account {
 mod tests {
     use super::*;
 
-    fn picture(sequence: u64, arrival_ms: i64) -> Picture<'static> {
+    fn image(sequence: u64, arrival_ms: i64) -> Image<'static> {
         let arrival = HostTime::from_ns(1_000_000_000 + arrival_ms * 1_000_000);
-        Picture {
+        Image {
             source: 0,
             bytes: &[],
             damaged: false,
@@ -180,9 +180,9 @@ mod tests {
     #[test]
     fn mid_exposure_is_the_presentation_time_minus_the_sensor_timestamp_also_across_the_wrap() {
         let mut account = Account::new(MetadataLevel::Full);
-        assert_eq!(yes(account.stamp(&picture(5, 0), &facts(1_000_000, 77))), (77, 991_000, PLAIN));
+        assert_eq!(yes(account.stamp(&image(5, 0), &facts(1_000_000, 77))), (77, 991_000, PLAIN));
         assert_eq!(
-            yes(account.stamp(&picture(6, 33), &facts(4_000, 78))),
+            yes(account.stamp(&image(6, 33), &facts(4_000, 78))),
             (78, u64::from(u32::MAX) - 4_999, PLAIN)
         );
     }
@@ -191,24 +191,24 @@ mod tests {
     fn with_the_standard_header_the_number_is_the_transports() {
         let mut account = Account::new(MetadataLevel::Header);
         let header = Facts { presentation_us: Some(500), ..Facts::default() };
-        assert_eq!(yes(account.stamp(&picture(9, 0), &header)), (9, 500, FrameFlags::HEADER_TIME));
+        assert_eq!(yes(account.stamp(&image(9, 0), &header)), (9, 500, FrameFlags::HEADER_TIME));
     }
 
     #[test]
     fn without_a_header_the_kernels_stamp_is_the_time_else_the_arrival() {
         let mut account = Account::new(MetadataLevel::Kernel);
-        assert_eq!(yes(account.stamp(&picture(3, 10), &Facts::default())), (3, 1_009_000_000, PLAIN));
+        assert_eq!(yes(account.stamp(&image(3, 10), &Facts::default())), (3, 1_009_000_000, PLAIN));
         let mut account = Account::new(MetadataLevel::Arrival);
-        let bare = Picture { kernel_time: None, ..picture(3, 10) };
+        let bare = Image { kernel_time: None, ..image(3, 10) };
         assert_eq!(yes(account.stamp(&bare, &Facts::default())), (3, 1_010_000_000, PLAIN));
     }
 
     #[test]
-    fn a_picture_whose_metadata_is_lost_is_reckoned_and_flagged() {
+    fn an_image_whose_metadata_is_lost_is_reckoned_and_flagged() {
         let mut account = Account::new(MetadataLevel::Full);
-        account.stamp(&picture(5, 0), &facts(u32::MAX, u32::MAX));
-        // Two pictures later, one of which never came.
-        let (sequence, ticks, flags) = yes(account.stamp(&picture(7, 66), &Facts::default()));
+        account.stamp(&image(5, 0), &facts(u32::MAX, u32::MAX));
+        // Two images later, one of which never came.
+        let (sequence, ticks, flags) = yes(account.stamp(&image(7, 66), &Facts::default()));
         assert_eq!((sequence, ticks), (1, 66_000 - 9_000 - 1));
         assert!(flags.has(FrameFlags::METADATA_LOST) && flags.has(FrameFlags::TIME_UNCERTAIN));
         assert_eq!(
@@ -219,12 +219,12 @@ mod tests {
     }
 
     #[test]
-    fn pictures_before_the_first_metadata_are_numbered_backwards_from_it() {
+    fn images_before_the_first_metadata_are_numbered_backwards_from_it() {
         let mut account = Account::new(MetadataLevel::Full);
-        assert_eq!(account.stamp(&picture(0, 0), &Facts::default()), Stamped::NotYet);
-        assert_eq!(account.stamp(&picture(1, 33), &Facts::default()), Stamped::NotYet);
+        assert_eq!(account.stamp(&image(0, 0), &Facts::default()), Stamped::NotYet);
+        assert_eq!(account.stamp(&image(1, 33), &Facts::default()), Stamped::NotYet);
         assert!(account.take_orphans().is_empty(), "nothing is known yet");
-        assert_eq!(yes(account.stamp(&picture(3, 99), &facts(50, 1))).0, 1);
+        assert_eq!(yes(account.stamp(&image(3, 99), &facts(50, 1))).0, 1);
         assert_eq!(account.take_orphans(), [u64::from(u32::MAX) - 1, u64::from(u32::MAX)]);
         assert!(account.take_orphans().is_empty(), "each is booked once");
     }
@@ -233,8 +233,8 @@ mod tests {
     fn a_camera_that_never_sends_metadata_is_found_out() {
         let mut account = Account::new(MetadataLevel::Header);
         for i in 1..MAX_ORPHANS as u64 {
-            assert_eq!(account.stamp(&picture(i, 0), &Facts::default()), Stamped::NotYet);
+            assert_eq!(account.stamp(&image(i, 0), &Facts::default()), Stamped::NotYet);
         }
-        assert_eq!(account.stamp(&picture(99, 0), &Facts::default()), Stamped::Never);
+        assert_eq!(account.stamp(&image(99, 0), &Facts::default()), Stamped::Never);
     }
 }

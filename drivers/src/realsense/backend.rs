@@ -1,9 +1,9 @@
-//! The back end: finds D400 cameras on the USB, opens the one that the rig means, restarts one on request.
+//! The backend: finds D400 cameras on the USB, opens the one that the rig selects, restarts one on request.
 
 use super::calibration::Calibration;
 use super::config::{MetadataWish, RealsenseConfig, TransportChoice};
 use super::device::{Opened, RealsenseDevice};
-use super::find::{self, Found};
+use super::find::{self, FoundCamera};
 use super::kernel::Kernel;
 use super::memory::Memory;
 use super::protocol::hwm::{HardwareMonitor, Request};
@@ -13,7 +13,7 @@ use crate::usb::{self, SysRoot};
 use crate::{Backend, Device, DeviceInfo, Error, ErrorKind, Result};
 use std::sync::Arc;
 
-/// The back end `realsense`: one rig camera each.
+/// The backend `realsense`: one rig camera each.
 #[derive(Debug, Default)]
 pub struct RealsenseBackend {
     config: RealsenseConfig,
@@ -22,13 +22,13 @@ pub struct RealsenseBackend {
 }
 
 impl RealsenseBackend {
-    /// A back end for the camera that `config` means. Nothing is touched before it is opened.
+    /// A backend for the camera that `config` selects. Nothing is touched before it is opened.
     pub fn new(config: RealsenseConfig) -> Self {
         Self { config, ..Self::default() }
     }
 
-    /// Restarts the camera that the configuration and `serial` mean, also one that streams: it leaves the bus and comes back after
-    /// some seconds.
+    /// Restarts the camera that the configuration and `serial` mean, also one that streams: it leaves the bus and comes
+    /// back after some seconds.
     ///
     /// # Errors
     /// Those of [`Backend::open`].
@@ -38,7 +38,7 @@ impl RealsenseBackend {
         Ok(opened.info(""))
     }
 
-    /// The opened camera that is meant.
+    /// Opens the selected camera.
     fn find(&self, serial: Option<&str>) -> Result<Opened> {
         let wanted = serial.or(self.config.serial.as_deref());
         let is_other = |s: &str| wanted.is_some_and(|w| !w.eq_ignore_ascii_case(s));
@@ -51,7 +51,8 @@ impl RealsenseBackend {
             wanted,
             &unusable,
         )?;
-        let (mut others, mut failed) = (Vec::new(), Vec::new());
+        let mut others = Vec::new();
+        let mut failed = Vec::new();
         for found in candidates {
             // A camera that is known to be another one is not disturbed; it may be streaming.
             if let Some(serial) = identity::of(&found.usb).filter(|s| is_other(s)) {
@@ -82,13 +83,13 @@ impl RealsenseBackend {
     }
 
     /// Opens a camera and has it say who it is.
-    fn ask(&self, found: &Found) -> Result<Opened> {
+    fn ask(&self, found: &FoundCamera) -> Result<Opened> {
         let opened = Opened::new(found.clone(), self.connect(found)?)?;
         identity::note(&found.usb, &opened.gvd.serial);
         Ok(opened)
     }
 
-    fn connect(&self, found: &Found) -> Result<Box<dyn Transport>> {
+    fn connect(&self, found: &FoundCamera) -> Result<Box<dyn Transport>> {
         if found.usb.interfaces.is_empty() {
             let text = format!("{}: the kernel has not configured it yet", found.describe());
             return Err(Error::new(ErrorKind::NotFound, text));
@@ -109,7 +110,7 @@ impl RealsenseBackend {
     }
 
     /// The camera with its nodes. A program that had it through libusb and was killed leaves it without a driver.
-    fn bound(&self, found: &Found) -> Found {
+    fn bound(&self, found: &FoundCamera) -> FoundCamera {
         let mut found = found.clone();
         if !Kernel::has_bound(&found) {
             match crate::libusb::give_to_kernel(&self.root, &found.usb) {
@@ -186,7 +187,7 @@ impl Backend for RealsenseBackend {
             let label = opened.label();
             opened.monitor.command(&Request::reset())?;
             let text = format!(
-                "{label}: it sent no picture although its streams were started twice; it is restarted (hardware reset)"
+                "{label}: it sent no image although its streams were started twice; it is restarted (hardware reset)"
             );
             tracing::warn!("{text}");
             return Err(Error::new(ErrorKind::Disconnected, text));

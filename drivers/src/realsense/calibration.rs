@@ -83,8 +83,8 @@ impl Calibration {
     /// Reads the tables of a camera of `model`; `None` when it has none and `config` allows that.
     ///
     /// # Errors
-    /// [`ErrorKind::Unsupported`] when it is not calibrated, [`ErrorKind::Protocol`] when its tables are damaged, with what to do
-    /// about either; those of the hardware monitor.
+    /// [`ErrorKind::Unsupported`] when it is not calibrated, [`ErrorKind::Protocol`] when its tables are damaged, with
+    /// what to do about either; those of the hardware monitor.
     pub(super) fn read(
         monitor: &mut dyn HardwareMonitor,
         model: &Model,
@@ -93,7 +93,7 @@ impl Calibration {
     ) -> Result<Option<Self>> {
         match Self::read_all(monitor, model) {
             Ok(calibration) => Ok(Some(calibration)),
-            // The camera went away, or does not answer at all: that is no lack of calibration.
+            // The camera went away, or does not answer at all: not a missing calibration.
             Err(e)
                 if !matches!(
                     e.kind(),
@@ -135,7 +135,7 @@ impl Calibration {
         };
         let rgb = until_sound(|| RgbTable::read(monitor))?;
         let read = Self { stereo, sizes, rgb, color_module: model.color_module };
-        // A camera that was never calibrated has tables too; the sizes that it is used at tell.
+        // A camera that was never calibrated has tables too; the sizes that it is used at show it.
         for (view, (width, height)) in
             [(View::Left, model.depth_size), (View::Right, model.depth_size), (View::Color, model.color_size)]
         {

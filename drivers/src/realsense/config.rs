@@ -1,4 +1,4 @@
-//! What a rig may ask of a D400.
+//! The configuration of a D400 in a rig.
 
 use super::protocol::sync::SyncMode;
 use crate::v4l2::ControlValue;
@@ -30,7 +30,7 @@ pub struct RealsenseConfig {
     pub preset: Option<PathBuf>,
     /// Synchronisation between cameras, by cable.
     pub sync: Option<SyncMode>,
-    /// Controls of the colour picture by their V4L2 names.
+    /// Controls of the colour image by their V4L2 names.
     pub color_controls: BTreeMap<String, ControlValue>,
     /// Metres per unit of depth. It is written to the camera, which must be in advanced mode.
     pub depth_unit_m: Option<f64>,

@@ -22,7 +22,7 @@ const SLOW: Duration = Duration::from_secs(1);
 const QUEUE: usize = 32;
 /// After a request that failed the camera is left alone for this long.
 const AFTER_FAILURE: Duration = Duration::from_secs(5);
-/// What the end of the thread is waited for. A request in flight may take longer; the thread ends after it.
+/// How long the end of the thread is waited for. A pending request may take longer; the thread ends after it.
 const FAREWELL: Duration = Duration::from_millis(200);
 
 /// A reading of the device's clock between two of the host's.
@@ -33,7 +33,7 @@ pub(super) struct Probe {
     pub(super) after: HostTime,
 }
 
-/// What the thread has done so far.
+/// Counts of what the thread has done so far.
 #[derive(Debug, Default)]
 struct Shared {
     /// Bits of the temperature in °C; NaN while it is unknown.
@@ -83,7 +83,7 @@ impl Control {
                 failing: false,
             }
             .run(&stopped);
-            // Nobody listens when the stream is gone already.
+            // The receiver is gone if the stream has ended already.
             let _ = end.send(());
         });
         let thread = thread.map_err(|e| {
@@ -103,7 +103,7 @@ impl Control {
         f32::from_bits(self.shared.temperature.load(Ordering::Relaxed))
     }
 
-    /// Requests that failed, and probes that nobody took.
+    /// Failed requests, and probes that were not taken.
     #[cfg(test)]
     fn failed_and_overrun(&self) -> (u64, u64) {
         (self.shared.failed.load(Ordering::Relaxed), self.shared.overrun.load(Ordering::Relaxed))
@@ -121,7 +121,7 @@ impl Drop for Control {
     }
 }
 
-/// What runs on the thread.
+/// The state of the thread.
 struct Worker {
     label: String,
     family: Family,

@@ -3,7 +3,7 @@
 use super::calibration::{Calibration, FACTORY, NONE, View};
 use super::config::RealsenseConfig;
 use super::family::Family;
-use super::find::Found;
+use super::find::FoundCamera;
 use super::imu::{Unit, choose_imu, separated};
 use super::launch::{Launch, in_camera};
 use super::memory::Memory;
@@ -24,7 +24,7 @@ pub(super) struct RealsenseDevice {
     transport: Box<dyn Transport>,
     monitor: Box<dyn HardwareMonitor>,
     config: RealsenseConfig,
-    found: Found,
+    found: FoundCamera,
     gvd: Gvd,
     info: DeviceInfo,
     modes: Vec<Mode>,
@@ -35,11 +35,11 @@ pub(super) struct RealsenseDevice {
     unit: Option<Result<Unit>>,
 }
 
-/// What a camera says of itself, and the link to it.
+/// A camera's identity, and the link to it.
 pub(super) struct Opened {
     pub(super) transport: Box<dyn Transport>,
     pub(super) monitor: Box<dyn HardwareMonitor>,
-    pub(super) found: Found,
+    pub(super) found: FoundCamera,
     pub(super) gvd: Gvd,
 }
 
@@ -48,14 +48,14 @@ impl Opened {
     ///
     /// # Errors
     /// Those of the hardware monitor.
-    pub(super) fn new(found: Found, mut transport: Box<dyn Transport>) -> Result<Self> {
+    pub(super) fn new(found: FoundCamera, mut transport: Box<dyn Transport>) -> Result<Self> {
         let mut monitor = transport.monitor()?;
         let gvd = Gvd::read(&mut monitor)
             .map_err(|e| Error::new(e.kind(), format!("{}: {e}", found.describe())).with_source(e))?;
         Ok(Self { transport, monitor, found, gvd })
     }
 
-    /// What the camera says of itself.
+    /// The camera's identity.
     pub(super) fn info(&self, calibration: &str) -> DeviceInfo {
         DeviceInfo {
             backend: NAME,
@@ -78,7 +78,8 @@ impl RealsenseDevice {
     /// Reads calibration and modes of an opened camera.
     ///
     /// # Errors
-    /// [`ErrorKind::Unsupported`] when it is not calibrated and `config` does not allow that; those of the hardware monitor.
+    /// [`ErrorKind::Unsupported`] when it is not calibrated and `config` does not allow that; those of the hardware
+    /// monitor.
     pub(super) fn new(
         mut opened: Opened,
         config: RealsenseConfig,
@@ -87,7 +88,8 @@ impl RealsenseDevice {
     ) -> Result<Self> {
         let label = opened.label();
         let in_camera = |e: Error| Error::new(e.kind(), format!("{label}: {e}")).with_source(e);
-        let (model, gvd) = (opened.found.model, &opened.gvd);
+        let model = opened.found.model;
+        let gvd = &opened.gvd;
         if gvd.firmware < model.least_firmware {
             tracing::warn!(
                 camera = %label,
@@ -160,7 +162,7 @@ impl RealsenseDevice {
         }
         let mut port = transport.control(Function::Stereo)?;
         let mut stereo = match config.gain {
-            Some(_) => Some(transport.picture_controls(Function::Stereo)?),
+            Some(_) => Some(transport.image_controls(Function::Stereo)?),
             None => None,
         };
         let mut color = None;
@@ -172,7 +174,7 @@ impl RealsenseDevice {
                 ));
             }
             let function = if found.model.color_module { Function::Color } else { Function::Stereo };
-            color = Some(transport.picture_controls(function)?);
+            color = Some(transport.image_controls(function)?);
         }
         options::apply(
             config,

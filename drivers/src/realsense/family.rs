@@ -1,4 +1,4 @@
-//! What a D400 and an L515 are asked in different ways while they stream.
+//! Requests that differ between a D400 and an L515 while they stream.
 
 use super::protocol::health::{self, Temperatures};
 use super::protocol::hwm::{HardwareMonitor, Request, UNIT_ID};
@@ -16,7 +16,7 @@ pub(super) enum Family {
 }
 
 impl Family {
-    /// What its clock is asked with: 32 bits of microseconds.
+    /// The request for its clock: 32 bits of microseconds.
     pub(super) fn clock(self) -> Request {
         match self {
             Self::D4xx => Request::clock(),
@@ -32,7 +32,7 @@ impl Family {
         }
     }
 
-    /// What a code of it means; `None` for 0.
+    /// The meaning of one of its error codes; `None` for 0.
     pub(super) fn error_report(self, code: u8) -> Option<String> {
         match self {
             Self::D4xx => health::error_report(code),

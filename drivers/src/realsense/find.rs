@@ -1,22 +1,22 @@
-//! Which cameras are attached, and which of them a rig means.
+//! Lists the attached cameras and selects those that match a rig.
 
 use super::models::{self, Model};
 use crate::usb::UsbDevice;
 use crate::{Error, ErrorKind, Result};
 
-/// What [`candidates`] calls the cameras of [`cameras`].
+/// Name of the family of [`cameras`], for the messages of [`candidates`].
 pub const D400: &str = "RealSense D400";
 
 /// An attached camera.
 #[derive(Debug, Clone)]
-pub struct Found {
+pub struct FoundCamera {
     /// Its model.
     pub model: &'static Model,
     /// Its place on the USB.
     pub usb: UsbDevice,
 }
 
-impl Found {
+impl FoundCamera {
     /// `D435 at USB port 4-1.2`, for messages.
     pub fn describe(&self) -> String {
         format!("{} at USB port {}", self.model.name, self.usb.port)
@@ -24,15 +24,15 @@ impl Found {
 }
 
 /// The D400 among `devices`, in the order of their ports.
-pub fn cameras(devices: Vec<UsbDevice>) -> Vec<Found> {
+pub fn cameras(devices: Vec<UsbDevice>) -> Vec<FoundCamera> {
     let camera = |usb: UsbDevice| {
         let model = (usb.vendor_id == models::VENDOR).then(|| models::of_product(usb.product_id))??;
-        Some(Found { model, usb })
+        Some(FoundCamera { model, usb })
     };
     devices.into_iter().filter_map(camera).collect()
 }
 
-/// What is attached of RealSense and cannot be used, one line each with the cure.
+/// The attached RealSense devices that cannot be used, one line each with the cure.
 pub fn unusable(devices: &[UsbDevice]) -> Vec<String> {
     let intel = devices.iter().filter(|d| d.vendor_id == models::VENDOR);
     intel
@@ -45,17 +45,17 @@ pub fn unusable(devices: &[UsbDevice]) -> Vec<String> {
 /// only after it was opened, so with one there may be several candidates.
 ///
 /// # Errors
-/// [`ErrorKind::NotFound`] when nothing is at the port, or nothing is attached, or more than one camera is and none was named; the
-/// message lists what there is, and what of `unusable` explains it.
+/// [`ErrorKind::NotFound`] when nothing is at the port, or nothing is attached, or more than one camera is and none was
+/// named; the message lists what there is, and what of `unusable` explains it.
 pub fn candidates(
     what: &str,
-    found: Vec<Found>,
+    found: Vec<FoundCamera>,
     port: Option<&str>,
     serial: Option<&str>,
     unusable: &[String],
-) -> Result<Vec<Found>> {
-    let list = |found: &[Found]| found.iter().map(Found::describe).collect::<Vec<_>>().join(", ");
-    let not_found = |said: String, there_are: &[Found]| {
+) -> Result<Vec<FoundCamera>> {
+    let list = |found: &[FoundCamera]| found.iter().map(FoundCamera::describe).collect::<Vec<_>>().join(", ");
+    let not_found = |said: String, there_are: &[FoundCamera]| {
         let mut text = match there_are {
             [] => format!("{said}; no {what} is attached"),
             some => format!("{said}; there are: {}", list(some)),
@@ -117,7 +117,7 @@ mod tests {
     #[test]
     fn a_port_names_one_camera_and_a_serial_number_leaves_all() {
         let found = || cameras(vec![usb(0x0B07, "4-1"), usb(0x0B5B, "4-2"), usb(0x0B64, "4-3")]);
-        assert_eq!(found().len(), 2, "an L515 is none of them");
+        assert_eq!(found().len(), 2, "an L515 is not among them");
         let ports = |c: &RealsenseConfig, s| -> Vec<String> {
             candidates(D400, found(), c.port.as_deref(), s, &[])
                 .unwrap()

@@ -1,20 +1,20 @@
 //! The stream `imu` of a D435i, a D455 or an L515: accelerometer and gyroscope behind the kernel's industrial I/O.
 //!
-//! **Samples.** Each sample of rotation is one of the stream's; a sample of acceleration goes along with the first sample of
-//! rotation that is not before it, and says by how much it was earlier. Acceleration is never measured more often, so
-//! none is lost. Both are corrected by the camera's calibration and turned to the axes of the depth camera, as the
-//! vendor's software does it.
+//! **Samples.** Each sample of rotation is one of the stream's; a sample of acceleration goes along with the first
+//! sample of rotation that is not before it, and says by how much it was earlier. Acceleration is never measured more
+//! often, so none is lost. Both are corrected by the camera's calibration and turned to the axes of the depth camera,
+//! as the vendor's software does it.
 //!
-//! **Time.** Both sensors have the microseconds of the camera's clock, whose two-way readings reach this map as they reach
-//! those of the images.
+//! **Time.** Both sensors have the microseconds of the camera's clock, whose two-way readings reach this map as they
+//! reach those of the images.
 //!
-//! **Numbers.** There is no counter. Samples are numbered by the clock, so that one that never came is a gap.
+//! **Numbers.** The sensors have no counter. Samples are numbered by the clock, so that a missing one is a gap.
 //!
-//! **Switching.** The kernel takes seconds to switch a sensor on, so a thread does it while images come already, and switches it
-//! off when the stream has ended.
+//! **Switching.** The kernel takes seconds to switch a sensor on, so a thread does it while images come already, and
+//! switches it off when the stream has ended.
 //!
-//! **Silence.** When a sensor falls silent, both are switched off and on again, with growing pauses, and are given up after a
-//! number of tries. Images go on meanwhile.
+//! **Silence.** When a sensor falls silent, both are switched off and on again, with growing pauses, and are given up
+//! after a number of tries. Images go on meanwhile.
 
 #[cfg(test)]
 pub(super) mod fake;
@@ -40,7 +40,7 @@ pub(super) const BATCH: u32 = 16;
 /// Between two statements of how the clock's map is doing.
 const QUALITY: core::time::Duration = core::time::Duration::from_secs(1);
 
-/// The sensors, which nobody else can read.
+/// The sensors, which only one process can read.
 #[derive(Debug)]
 pub(super) struct Sensors {
     accelerometer: Sensor,
@@ -55,7 +55,7 @@ struct Running {
     revival: Revival,
     /// They are being switched on or off.
     is_switching: bool,
-    /// They were on at least once: before that, what they hold was left unread by somebody else.
+    /// They were on at least once: before that, they hold samples that another process left unread.
     was_on: bool,
     /// When the accelerometer and the gyroscope last measured.
     heard: [HostTime; 2],

@@ -1,13 +1,13 @@
 //! A D400 through the kernel's video driver: its nodes found by interface and by what they offer.
 //!
-//! `uvcvideo` hangs the nodes of a function on its control interface, number 0 for the stereo module and another one for the
-//! colour module, and puts a metadata node right behind each capture node. Which node is which follows from that and
-//! from the formats, never from the numbers of the nodes.
+//! `uvcvideo` hangs the nodes of a function on its control interface, number 0 for the stereo module and another one
+//! for the colour module, and puts a metadata node right behind each capture node. Which node is which follows from
+//! that and from the formats, never from the numbers of the nodes.
 
 use super::config::MetadataWish;
-use super::find::Found;
+use super::find::FoundCamera;
 use super::protocol::hwm::{HardwareMonitor, Retry, UNIT_ID, UnitMonitor};
-use super::transport::{Function, HeaderPart, Mode, PictureControls, Sensor, Started, Transport};
+use super::transport::{Function, HeaderPart, ImageControls, Mode, Sensor, Started, Transport};
 use crate::usb::{SysRoot, holder};
 use crate::uvc::control::ControlPort;
 use crate::v4l2::{self, Control, ControlValue, DEFAULT_BUFFERS, MetadataFormat, Node, Wanted};
@@ -41,9 +41,9 @@ impl Kernel {
     /// Opens the nodes of `found`, without taking them from anybody.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`] when the kernel's driver has not bound the camera, with the cure; [`ErrorKind::PermissionDenied`],
-    /// [`ErrorKind::Disconnected`], [`ErrorKind::Io`].
-    pub(super) fn open(root: &SysRoot, found: &Found, wish: MetadataWish) -> Result<Self> {
+    /// [`ErrorKind::NotFound`] when the kernel's driver has not bound the camera, with the cure;
+    /// [`ErrorKind::PermissionDenied`], [`ErrorKind::Disconnected`], [`ErrorKind::Io`].
+    pub(super) fn open(root: &SysRoot, found: &FoundCamera, wish: MetadataWish) -> Result<Self> {
         let label = found.describe();
         let mut ports: Vec<Port> = Vec::new();
         for interface in &found.usb.interfaces {
@@ -78,7 +78,7 @@ impl Kernel {
     }
 
     /// Whether the nodes of `found` are there at all.
-    pub(super) fn has_bound(found: &Found) -> bool {
+    pub(super) fn has_bound(found: &FoundCamera) -> bool {
         found.usb.video_nodes().next().is_some()
     }
 
@@ -90,7 +90,7 @@ impl Kernel {
         Error::new(e.kind(), format!("{}: {e}", self.label))
     }
 
-    /// A node that is busy has somebody who holds it.
+    /// Adds the process that holds a busy node.
     fn name_holder(&self, path: &std::path::Path, e: Error) -> Error {
         if e.kind() != ErrorKind::Busy {
             return self.in_camera(&e);
@@ -123,7 +123,7 @@ impl Transport for Kernel {
         Ok(Box::new(self.node(self.path_of(function)?)?))
     }
 
-    fn picture_controls(&mut self, function: Function) -> Result<Box<dyn PictureControls>> {
+    fn image_controls(&mut self, function: Function) -> Result<Box<dyn ImageControls>> {
         Ok(Box::new(NodeControls(self.node(self.path_of(function)?)?)))
     }
 
@@ -172,7 +172,7 @@ impl Transport for Kernel {
             MetadataFormat::None => HeaderPart::Nothing,
         };
         let headers = (0..modes.len()).map(part).collect();
-        Ok(Started { pictures: Box::new(source), headers })
+        Ok(Started { images: Box::new(source), headers })
     }
 }
 
@@ -199,10 +199,10 @@ fn mode_of(sensor: Sensor, mode: &v4l2::Mode) -> Mode {
     Mode { sensor, fourcc: format.0, width, height, rate_hz }
 }
 
-/// The picture controls of a node.
+/// The image controls of a node.
 struct NodeControls(Node);
 
-impl PictureControls for NodeControls {
+impl ImageControls for NodeControls {
     fn list(&mut self) -> Result<Vec<Control>> {
         self.0.controls()
     }
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn nodes_are_told_apart_by_what_they_offer() {
+    fn nodes_are_identified_by_what_they_offer() {
         let stereo = |codes: &[&[u8; 4]]| sensor_of(Function::Stereo, &modes(codes));
         assert_eq!(stereo(&[b"Z16 "]), Some(Sensor::Depth));
         assert_eq!(stereo(&[b"GREY", b"UYVY", b"Y8I "]), Some(Sensor::Infrared));

@@ -1,6 +1,6 @@
-//! The `l515` back end: the RealSense L515, a camera that scans with a laser, through the kernel's video driver.
+//! The `l515` backend: the RealSense L515, a camera that scans with a laser, through the kernel's video driver.
 //!
-//! It is no D400: depth and infrared come turned, its tables are its own, and only the kernel reaches it here. What
+//! It is not a D400: depth and infrared come turned, its tables are its own, and only the kernel reaches it here. What
 //! is the same is shared with the D400: transport, account of the metadata, control thread, streams. It is out of
 //! production and its firmware is frozen. Source: librealsense v2.54, `src/l500` (Apache-2.0).
 
@@ -15,9 +15,9 @@ use super::protocol::firmware::Firmware;
 use crate::v4l2::ControlValue;
 use std::collections::BTreeMap;
 
-/// Name of the back end in rig files.
+/// Name of the backend in rig files.
 pub const NAME: &str = "l515";
-/// What messages call the family.
+/// Name of the family, for messages.
 const FAMILY: &str = "RealSense L515";
 
 /// An L515 and how it is to be set. What is left out stays as the camera has it after power-on.
@@ -29,7 +29,7 @@ pub struct L515Config {
     pub port: Option<String>,
     /// Controls of depth by the names of [`super::protocol::l515::Control`].
     pub controls: BTreeMap<String, i32>,
-    /// Controls of the colour picture by their V4L2 names.
+    /// Controls of the colour image by their V4L2 names.
     pub color_controls: BTreeMap<String, ControlValue>,
 }
 

@@ -1,4 +1,4 @@
-//! From a plan to a running stream: the pictures started, a gate for each stream, the control thread.
+//! From a plan to a running stream: the images started, a gate for each stream, the control thread.
 
 use super::control::Control;
 use super::family::Family;
@@ -6,9 +6,9 @@ use super::imu::Unit;
 use super::memory::Memory;
 use super::profiles::{self, Plan};
 use super::protocol::hwm::HardwareMonitor;
-use super::stream::{Lane, Parts, RealsenseStream};
+use super::stream::{Parts, RealsenseStream, StreamState};
 use super::transport::{Function, Started, Transport};
-use crate::video::{Picture, PictureSource};
+use crate::video::{Image, ImageSource};
 use crate::{Error, Gate, Result, Stream, StreamProfile};
 use core::time::Duration;
 use std::sync::Arc;
@@ -16,7 +16,7 @@ use std::sync::Arc;
 /// How long is waited for images that do not come before the IMU is looked at again.
 const SLICE: Duration = Duration::from_millis(20);
 
-/// What is to be started.
+/// Everything needed to start the chosen streams.
 pub(super) struct Launch {
     pub(super) family: Family,
     /// Model, serial number and port, for messages.
@@ -47,7 +47,7 @@ impl Launch {
             None => None,
         };
         let started = if plan.modes.is_empty() {
-            Started { pictures: Box::new(NoImages), headers: Vec::new() }
+            Started { images: Box::new(NoImages), headers: Vec::new() }
         } else {
             transport.start(&plan.modes)?
         };
@@ -62,18 +62,18 @@ impl Launch {
                 p.describe()
             );
         }
-        let lanes = profiles.iter().zip(&plan.lanes).enumerate().map(|(i, (p, (source, unpack)))| Lane {
-            gate: Gate::new(i, p),
-            source: *source,
-            unpack: *unpack,
-            frame_bytes: p.frame_bytes(),
-        });
-        let lanes = lanes.collect();
+        let streams =
+            profiles.iter().zip(&plan.streams).enumerate().map(|(i, (p, (source, unpack)))| StreamState {
+                gate: Gate::new(i, p),
+                source: *source,
+                unpack: *unpack,
+                frame_bytes: p.frame_bytes(),
+            });
+        let streams = streams.collect();
         profiles.extend(imu_profile);
         let port = transport.control(Function::Stereo)?;
         let control = Control::spawn(label.clone(), family, monitor, port)?;
-        let parts =
-            Parts { label, pictures: started.pictures, profiles, lanes, sources, control, memory, imu };
+        let parts = Parts { label, images: started.images, profiles, streams, sources, control, memory, imu };
         Ok(Box::new(RealsenseStream::new(parts)))
     }
 }
@@ -81,8 +81,8 @@ impl Launch {
 /// The images of a camera that delivers its IMU alone.
 struct NoImages;
 
-impl PictureSource for NoImages {
-    fn poll(&mut self, timeout: Duration, _: &mut dyn FnMut(&Picture<'_>)) -> Result<bool> {
+impl ImageSource for NoImages {
+    fn poll(&mut self, timeout: Duration, _: &mut dyn FnMut(&Image<'_>)) -> Result<bool> {
         std::thread::sleep(timeout.min(SLICE));
         Ok(false)
     }

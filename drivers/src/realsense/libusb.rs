@@ -1,16 +1,16 @@
 //! A D400 through libusb, for computers whose kernel has no driver for it or gives no metadata.
 //!
-//! The payload header is seen whole, so the metadata are always complete, whatever the kernel's version.
+//! The complete payload header is seen, so the metadata are always complete, whatever the kernel's version.
 
-use super::find::Found;
+use super::find::FoundCamera;
 use super::protocol::hwm::{HardwareMonitor, Retry, UNIT_GUID, UnitMonitor};
-use super::transport::{Function, HeaderPart, Mode, PictureControls, Sensor, Started, Transport};
+use super::transport::{Function, HeaderPart, ImageControls, Mode, Sensor, Started, Transport};
 use crate::libusb::{Camera, Port, Settings, Source, StreamMode, VendorBulk};
 use crate::usb::SysRoot;
 use crate::uvc::control::ControlPort;
 use crate::uvc::descriptors::{Configuration, ControlInterface, Intervals, StreamingInterface};
 use crate::uvc::formats::{FourCc, Guid};
-use crate::uvc::picture::PictureUnits;
+use crate::uvc::image_controls::ImageUnits;
 use crate::v4l2::Control;
 use crate::{Error, ErrorKind, Result};
 
@@ -18,7 +18,7 @@ use crate::{Error, ErrorKind, Result};
 ///
 /// # Errors
 /// [`ErrorKind::Busy`], [`ErrorKind::PermissionDenied`], [`ErrorKind::Disconnected`], [`ErrorKind::Io`].
-pub(super) fn open(root: &SysRoot, found: &Found) -> Result<Box<dyn Transport>> {
+pub(super) fn open(root: &SysRoot, found: &FoundCamera) -> Result<Box<dyn Transport>> {
     let camera = Camera::open(root, &found.usb)?;
     let streams = streams(camera.configuration());
     if !streams.iter().any(|s| s.sensor == Sensor::Depth) {
@@ -37,7 +37,7 @@ struct Libusb {
     modes: Vec<Mode>,
 }
 
-/// What a streaming interface offers.
+/// A streaming interface and what it offers.
 #[derive(Debug, PartialEq)]
 struct Offer {
     interface: u8,
@@ -73,7 +73,8 @@ fn streams(configuration: &Configuration) -> Vec<Offer> {
                 let exact = interval.rate_hz();
                 // The descriptor's thirtieth is 333333 of ten millions; it means 30.
                 let rate_hz = (exact * 100.0).round() / 100.0;
-                let (width, height) = (size.width.into(), size.height.into());
+                let width = size.width.into();
+                let height = size.height.into();
                 let mode = Mode { sensor, fourcc: format.format().0, width, height, rate_hz };
                 // One format may be announced under two names; the first one is taken.
                 if modes.iter().all(|(known, _)| *known != mode) {
@@ -125,10 +126,10 @@ impl Transport for Libusb {
         Ok(Box::new(Port::new(&self.camera, self.function(function)?.number)?))
     }
 
-    fn picture_controls(&mut self, function: Function) -> Result<Box<dyn PictureControls>> {
+    fn image_controls(&mut self, function: Function) -> Result<Box<dyn ImageControls>> {
         let function = self.function(function)?;
         let port = Port::new(&self.camera, function.number)?;
-        Ok(Box::new(PictureUnits::new(port, function)))
+        Ok(Box::new(ImageUnits::new(port, function)))
     }
 
     fn monitor(&mut self) -> Result<Box<dyn HardwareMonitor>> {
@@ -158,11 +159,11 @@ impl Transport for Libusb {
         };
         let wishes = modes.iter().map(wish).collect::<Result<Vec<_>>>()?;
         let source = Source::start(&self.camera, &wishes, Settings::default())?;
-        Ok(Started { pictures: Box::new(source), headers: vec![HeaderPart::Whole; modes.len()] })
+        Ok(Started { images: Box::new(source), headers: vec![HeaderPart::Whole; modes.len()] })
     }
 }
 
-impl PictureControls for PictureUnits<Port> {
+impl ImageControls for ImageUnits<Port> {
     fn list(&mut self) -> Result<Vec<Control>> {
         Self::list(self)
     }
@@ -224,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn sensors_are_told_by_what_they_offer() {
+    fn sensors_are_identified_by_what_they_offer() {
         let thirty_and_fifteen = [333_333, 666_666];
         // D16 (80) is depth under a second name: the same modes, once.
         let depth = stream(1, &[*b"Z16 ", [80, 0, 0, 0]], &thirty_and_fifteen);

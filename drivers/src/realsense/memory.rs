@@ -1,18 +1,18 @@
-//! What a back end remembers of its camera from one opening to the next.
+//! Remembers facts about a camera from one opening to the next.
 //!
-//! A camera that sends no picture is first opened again, which stops and starts its streams; the supervisor does that.
+//! A camera that sends no image is first opened again, which stops and starts its streams; the supervisor does that.
 //! When that did not help and the rig allows it, the next opening restarts the camera (librealsense's own recipe for
-//! "frames didn't arrive": streams off and on, then a hardware reset, then anew).
+//! "frames didn't arrive": streams off and on, then a hardware reset, then a new start).
 
 use core::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use core::time::Duration;
 
-/// A stream that ends after this long without a picture ended because of it. Supervisors wait longer.
+/// A stream that ends after this long without an image ended because of it. Supervisors wait longer.
 const SILENCE: Duration = Duration::from_secs(2);
 /// Silent openings in a row after which a restart of the camera is due.
 const SILENT_OPENINGS: u32 = 2;
 
-/// What is remembered; shared between the back end and its streams.
+/// The remembered facts, shared between the backend and its streams.
 #[derive(Debug, Default)]
 pub(super) struct Memory {
     silent: AtomicU32,
@@ -20,19 +20,19 @@ pub(super) struct Memory {
 }
 
 impl Memory {
-    /// A picture came.
-    pub(super) fn note_picture(&self) {
+    /// An image came.
+    pub(super) fn note_image(&self) {
         self.silent.store(0, Ordering::Relaxed);
     }
 
-    /// A stream was ended that had no picture for `silence`.
+    /// A stream was ended that had no image for `silence`.
     pub(super) fn note_end(&self, silence: Duration) {
         if silence >= SILENCE {
             self.silent.fetch_add(1, Ordering::Relaxed);
         }
     }
 
-    /// The camera sends pictures without the metadata that the kernel offers.
+    /// The camera sends images without the metadata that the kernel offers.
     pub(super) fn note_mute(&self) {
         self.mute.store(true, Ordering::Relaxed);
     }
@@ -61,7 +61,7 @@ mod tests {
         let memory = Memory::default();
         memory.note_end(Duration::from_secs(4));
         assert!(!memory.take_reset(), "first the streams are started again");
-        memory.note_picture();
+        memory.note_image();
         memory.note_end(Duration::from_secs(4));
         assert!(!memory.take_reset(), "they helped in between");
         memory.note_end(Duration::from_secs(1));

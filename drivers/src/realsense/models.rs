@@ -69,7 +69,7 @@ pub fn of_product(product: u16) -> Option<&'static Model> {
     MODELS.iter().find(|m| m.product == product)
 }
 
-/// What a D400 of Intel is that is not driven, and what to do about it.
+/// Why a D400 of this product number is not supported, and what to do about it.
 pub const fn undriven(product: u16) -> Option<&'static str> {
     Some(match product {
         0x0ADB | 0x0ADC => {

@@ -2,7 +2,7 @@
 
 use super::config::RealsenseConfig;
 use super::protocol::hwm::UNIT_ID;
-use super::transport::PictureControls;
+use super::transport::ImageControls;
 use crate::uvc::control::{ControlPort, Query};
 use crate::v4l2::{Control, ControlKind, ControlValue};
 use crate::{Error, ErrorKind, Result};
@@ -26,17 +26,17 @@ const TRIES: u32 = 5;
 const BETWEEN_TRIES: Duration = Duration::from_millis(20);
 
 /// Applies the settings of `config` that concern exposure, projector and colour. `color` is `None` where nothing is
-/// asked of the colour picture.
+/// asked of the colour image.
 ///
 /// # Errors
-/// [`ErrorKind::BadInput`] naming the key and what the camera takes; [`ErrorKind::Unsupported`] when it has no such control;
-/// [`ErrorKind::Protocol`] when it keeps another value than it was given; those of the ports.
+/// [`ErrorKind::BadInput`] naming the key and what the camera takes; [`ErrorKind::Unsupported`] when it has no such
+/// control; [`ErrorKind::Protocol`] when it keeps another value than it was given; those of the ports.
 pub(super) fn apply(
     config: &RealsenseConfig,
     label: &str,
     port: &mut dyn ControlPort,
-    stereo: Option<&mut dyn PictureControls>,
-    color: Option<&mut dyn PictureControls>,
+    stereo: Option<&mut dyn ImageControls>,
+    color: Option<&mut dyn ImageControls>,
 ) -> Result<()> {
     let manual = config.exposure_us.is_some() || config.gain.is_some();
     // By hand means by hand: the camera ignores a value while its automatic is on.
@@ -80,7 +80,7 @@ impl UnitControl {
         if !(1..=4).contains(&length) {
             return Err(Error::new(
                 ErrorKind::Protocol,
-                format!("{key}: the camera says that its value has {length} bytes"),
+                format!("{key}: the camera reports a value of {length} bytes"),
             ));
         }
         let mut read = |query: Query| -> Result<u32> {
@@ -89,7 +89,8 @@ impl UnitControl {
             patiently(|| port.query(UNIT_ID, self.selector, query, value))?;
             Ok(u32::from_le_bytes(bytes))
         };
-        let (least, most) = (read(Query::GetMin)?, read(Query::GetMax)?);
+        let least = read(Query::GetMin)?;
+        let most = read(Query::GetMax)?;
         let step = read(Query::GetRes)?.max(1);
         if !(least..=most).contains(&value) || !(value - least).is_multiple_of(step) {
             let steps = if step > 1 { format!(" in steps of {step}") } else { String::new() };
@@ -109,14 +110,14 @@ impl UnitControl {
     }
 }
 
-/// Sets picture controls by name.
+/// Sets image controls by name.
 ///
 /// # Errors
 /// As [`apply`].
 pub(super) fn set_named<'a>(
     label: &str,
     key: &str,
-    controls: &mut dyn PictureControls,
+    controls: &mut dyn ImageControls,
     values: impl Iterator<Item = (&'a String, &'a ControlValue)>,
 ) -> Result<()> {
     let mut values = values.peekable();
@@ -142,8 +143,7 @@ fn kept(key: &str, asked: i64, now: i64) -> Result<()> {
     if asked == now {
         return Ok(());
     }
-    let text =
-        format!("{key}: the camera was given {asked} and says that it has {now}; choose another value");
+    let text = format!("{key}: set to {asked} and the camera reports {now}; choose another value");
     Err(Error::new(ErrorKind::Protocol, text))
 }
 

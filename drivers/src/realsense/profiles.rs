@@ -1,7 +1,7 @@
 //! From the modes of the device's descriptors to the streams that it offers, and from chosen streams to what has to be
 //! started for them.
 //!
-//! `depth` is Z16, `color` YUYV or UYVY, `ir_left` the grey picture of the left imager. With `ir_right` both imagers
+//! `depth` is Z16, `color` YUYV or UYVY, `ir_left` the grey image of the left imager. With `ir_right` both imagers
 //! come interleaved (Y8I) and are taken apart, so they have one mode. Y12I is not offered: it is not rectified and made
 //! for the vendor's calibration tools.
 
@@ -21,7 +21,7 @@ const STREAMS: [(&str, Sensor, View); 4] = [
     ("ir_right", Sensor::Infrared, View::Right),
 ];
 
-/// What the profiles of a device are made from.
+/// The inputs for the profiles of a device.
 pub(super) struct Basis<'a> {
     pub(super) model: &'a Model,
     pub(super) modes: &'a [Mode],
@@ -41,7 +41,7 @@ pub(super) fn offered(basis: &Basis<'_>) -> Result<Vec<StreamProfile>> {
         let mut fitting: Vec<_> =
             basis.modes.iter().filter(|m| m.sensor == sensor && format_of(name, m).is_some()).collect();
         let preferred = if sensor == Sensor::Color { basis.model.color_size } else { basis.model.depth_size };
-        fitting.sort_by_key(|m| (size_rank(preferred, (m.width, m.height)), rate_rank(m.rate_hz)));
+        fitting.sort_by_key(|m| (size_rank(m.width, m.height, preferred), rate_rank(m.rate_hz)));
         for mode in fitting {
             let Some(format) = format_of(name, mode) else { continue };
             let geometry = match basis.calibration {
@@ -64,7 +64,7 @@ pub(super) fn offered(basis: &Basis<'_>) -> Result<Vec<StreamProfile>> {
                 sequence_bits: Account::sequence_bits(MetadataLevel::Full),
                 metadata: MetadataLevel::Full,
             };
-            // The left imager has one mode for its own picture and for the left half of both.
+            // The left imager has one mode for its own image and for the left half of both.
             if !all.iter().any(|p| p.describe() == profile.describe()) {
                 all.push(profile);
             }
@@ -103,13 +103,13 @@ pub(super) fn completed(requests: &[StreamRequest], offered: &[StreamProfile]) -
         .collect())
 }
 
-/// What has to be started for a choice of streams; nothing by default.
+/// The modes to start for the chosen streams; none by default.
 #[derive(Debug, PartialEq, Default)]
 pub(super) struct Plan {
     /// One mode for each sensor.
     pub(super) modes: Vec<Mode>,
     /// For each chosen profile the index of its mode, and how it is made from it.
-    pub(super) lanes: Vec<(usize, Unpack)>,
+    pub(super) streams: Vec<(usize, Unpack)>,
 }
 
 /// Chooses among `offered` and plans what has to be started.
@@ -124,7 +124,7 @@ pub(super) fn plan(
 ) -> Result<(Vec<StreamProfile>, Plan)> {
     let chosen = choose_profiles(label, offered, &completed(requests, offered)?)?;
     let both = chosen.iter().any(|p| p.stream.as_str() == "ir_right");
-    let mut plan = Plan { modes: Vec::new(), lanes: Vec::new() };
+    let mut plan = Plan { modes: Vec::new(), streams: Vec::new() };
     for p in &chosen {
         let (_, sensor, _) = STREAMS
             .into_iter()
@@ -137,7 +137,7 @@ pub(super) fn plan(
                 && format_of(p.stream.as_str(), m) == Some(p.format)
                 && !(sensor == Sensor::Infrared && both && m.fourcc != *b"Y8I ")
         };
-        // Of the left imager alone its own picture is half the bytes.
+        // Of the left imager alone its own image is half the bytes.
         let mode = modes.iter().filter(fits).min_by_key(|m| m.wire_bytes()).ok_or_else(|| {
             unsupported(format!("{label} cannot send {} together with the right imager", p.describe()))
         })?;
@@ -149,7 +149,7 @@ pub(super) fn plan(
         };
         if plan.modes.get(at) != Some(mode) {
             return Err(unsupported(format!(
-                "{label}: ir_left and ir_right are two halves of one picture; give them the same size and rate"
+                "{label}: ir_left and ir_right are two halves of one image; give them the same size and rate"
             )));
         }
         let unpack = match (&mode.fourcc, p.stream.as_str()) {
@@ -157,7 +157,7 @@ pub(super) fn plan(
             (b"Y8I ", _) => Unpack::Left,
             _ => Unpack::Copy,
         };
-        plan.lanes.push((at, unpack));
+        plan.streams.push((at, unpack));
     }
     let pace = |sensor: Sensor| plan.modes.iter().find(|m| m.sensor == sensor);
     if let (Some(d), Some(i)) = (pace(Sensor::Depth), pace(Sensor::Infrared))
@@ -177,7 +177,7 @@ pub(super) fn granted(profiles: &mut [StreamProfile], plan: &Plan, headers: &[He
         Some(HeaderPart::Standard) => MetadataLevel::Header,
         _ => MetadataLevel::Kernel,
     };
-    for (p, (at, _)) in profiles.iter_mut().zip(&plan.lanes) {
+    for (p, (at, _)) in profiles.iter_mut().zip(&plan.streams) {
         p.metadata = level(*at);
         p.sequence_bits = Account::sequence_bits(p.metadata);
         if p.metadata == MetadataLevel::Kernel {
@@ -191,7 +191,7 @@ pub(super) fn granted(profiles: &mut [StreamProfile], plan: &Plan, headers: &[He
     plan.modes.iter().enumerate().map(source).collect()
 }
 
-/// What the pixels of stream `name` are in `mode`; `None` when it cannot be made from it.
+/// The pixel format of stream `name` in `mode`; `None` if the mode cannot deliver it.
 fn format_of(name: &str, mode: &Mode) -> Option<PixelFormat> {
     Some(match (name, &mode.fourcc) {
         ("depth", b"Z16 ") => PixelFormat::Z16,
@@ -202,13 +202,13 @@ fn format_of(name: &str, mode: &Mode) -> Option<PixelFormat> {
     })
 }
 
-fn size_rank(preferred: (u32, u32), size: (u32, u32)) -> u32 {
-    if size == preferred {
+fn size_rank(width: u32, height: u32, preferred: (u32, u32)) -> u32 {
+    if (width, height) == preferred {
         return 0;
     }
-    // What is in no list comes last, the smaller the later.
-    let listed = SIZES.iter().position(|s| *s == size).map(|at| at as u32 + 1);
-    listed.unwrap_or_else(|| u32::MAX - (size.0 * size.1).min(u32::MAX / 2))
+    // Unlisted sizes come last, the smaller the later.
+    let listed = SIZES.iter().position(|s| *s == (width, height)).map(|at| at as u32 + 1);
+    listed.unwrap_or_else(|| u32::MAX - (width * height).min(u32::MAX / 2))
 }
 
 fn rate_rank(rate_hz: f64) -> u32 {

@@ -1,7 +1,7 @@
-//! What a RealSense camera says and is told, as bytes: parsed and built without any I/O of its own.
+//! Requests to and replies of a RealSense camera as bytes, parsed and built without any I/O.
 //!
 //! Everything that comes from a device is read with checks: short, damaged and contradictory bytes are errors, never
-//! a panic. What the emulator in `tests/vm` answers with is built by the same types.
+//! a panic. The replies of the emulator in `tests/vm` are built by the same types.
 
 pub mod advanced;
 #[cfg(test)]

@@ -1,10 +1,10 @@
-//! A streaming D400: pictures from the transport, through the account of their metadata, into the gates.
+//! A streaming D400: images from the transport, through the account of their metadata, into the gates.
 
 use super::account::{Account, Facts, Stamped};
 use super::control::Control;
 use super::imu::Imu;
 use super::memory::Memory;
-use crate::video::{Picture, PictureSource};
+use crate::video::{Image, ImageSource};
 use crate::{Error, ErrorKind, FrameSink, Gate, Poll, RawFrame, Result, Stream, StreamProfile, unpack};
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime};
@@ -29,16 +29,16 @@ pub(super) enum Unpack {
     Y411(usize),
 }
 
-/// One stream: its gate, and how it is made from its source.
+/// One stream: its gate, and how its frames are unpacked from its source.
 #[derive(Debug)]
-pub(super) struct Lane {
+pub(super) struct StreamState {
     pub(super) gate: Gate,
     pub(super) source: usize,
     pub(super) unpack: Unpack,
     pub(super) frame_bytes: usize,
 }
 
-/// What was started of one sensor.
+/// A started sensor.
 #[derive(Debug)]
 pub(super) struct Source {
     pub(super) account: Account,
@@ -48,9 +48,9 @@ pub(super) struct Source {
 /// Everything that a stream is made of.
 pub(super) struct Parts {
     pub(super) label: String,
-    pub(super) pictures: Box<dyn PictureSource>,
+    pub(super) images: Box<dyn ImageSource>,
     pub(super) profiles: Vec<StreamProfile>,
-    pub(super) lanes: Vec<Lane>,
+    pub(super) streams: Vec<StreamState>,
     pub(super) sources: Vec<Source>,
     pub(super) control: Control,
     pub(super) memory: Arc<Memory>,
@@ -60,35 +60,35 @@ pub(super) struct Parts {
 /// A streaming D400.
 pub(super) struct RealsenseStream {
     /// First, so that the device stops before the control thread is waited for.
-    pictures: Option<Box<dyn PictureSource>>,
+    images: Option<Box<dyn ImageSource>>,
     label: String,
     profiles: Vec<StreamProfile>,
-    lanes: Vec<Lane>,
+    streams: Vec<StreamState>,
     sources: Vec<Source>,
     control: Control,
     memory: Arc<Memory>,
     imu: Option<Imu>,
     began: HostTime,
-    last_picture: Option<HostTime>,
+    last_image: Option<HostTime>,
 }
 
 impl RealsenseStream {
     pub(super) fn new(parts: Parts) -> Self {
-        let Parts { label, pictures, profiles, mut lanes, sources, control, memory, imu } = parts;
-        for lane in &mut lanes {
-            lane.gate.clock().expect_probes();
+        let Parts { label, images, profiles, mut streams, sources, control, memory, imu } = parts;
+        for stream in &mut streams {
+            stream.gate.clock().expect_probes();
         }
         Self {
-            pictures: Some(pictures),
+            images: Some(images),
             label,
             profiles,
-            lanes,
+            streams,
             sources,
             control,
             memory,
             imu,
             began: HostTime::now(),
-            last_picture: None,
+            last_image: None,
         }
     }
 }
@@ -99,25 +99,26 @@ impl Stream for RealsenseStream {
     }
 
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
-        let Self { pictures, label, lanes, sources, control, last_picture, imu, .. } = self;
-        let Some(running) = pictures.as_mut() else {
+        let Self { images, label, streams, sources, control, last_image, imu, .. } = self;
+        let Some(running) = images.as_mut() else {
             return Err(Error::new(ErrorKind::Disconnected, format!("{label} failed before; open it anew")));
         };
         for probe in control.probes() {
-            for lane in lanes.iter_mut() {
-                lane.gate.clock().probe(probe.before, probe.ticks.into(), probe.after);
+            for stream in streams.iter_mut() {
+                stream.gate.clock().probe(probe.before, probe.ticks.into(), probe.after);
             }
             if let Some(imu) = imu {
                 imu.probe(probe);
             }
         }
         let temperature_c = control.temperature_c();
-        let (mut any, mut is_mute) = (false, false);
-        let polled = running.poll(timeout, &mut |picture| {
-            *last_picture = Some(picture.arrival);
+        let mut any = false;
+        let mut is_mute = false;
+        let polled = running.poll(timeout, &mut |image| {
+            *last_image = Some(image.arrival);
             any = true;
-            if let Some(source) = sources.get_mut(picture.source) {
-                let stamped = hand_over(lanes, source, picture, temperature_c, sink);
+            if let Some(source) = sources.get_mut(image.source) {
+                let stamped = hand_over(streams, source, image, temperature_c, sink);
                 is_mute |= stamped == Stamped::Never;
             }
         });
@@ -132,18 +133,18 @@ impl Stream for RealsenseStream {
         };
         if let Some(e) = failed {
             // Whatever failed, the device is let go at once.
-            self.pictures = None;
+            self.images = None;
             self.imu = None;
             return Err(Error::new(e.kind(), format!("{}: {e}", self.label)).with_source(e));
         }
         if any {
-            self.memory.note_picture();
+            self.memory.note_image();
         }
-        // A batch is no sign that images come.
+        // A batch does not show that images come.
         let batch = self.imu.as_mut().is_some_and(|imu| imu.drain(sink));
         // Of a camera that delivers nothing else, the end of its IMU is the end.
-        if let Some(e) = self.imu.as_mut().filter(|_| self.lanes.is_empty()).and_then(Imu::take_end) {
-            self.pictures = None;
+        if let Some(e) = self.imu.as_mut().filter(|_| self.streams.is_empty()).and_then(Imu::take_end) {
+            self.images = None;
             self.imu = None;
             return Err(Error::new(e.kind(), format!("{}: its IMU is no longer read: {e}", self.label))
                 .with_source(e));
@@ -154,40 +155,40 @@ impl Stream for RealsenseStream {
 
 impl Drop for RealsenseStream {
     fn drop(&mut self) {
-        // What failed was no silence, and an IMU says nothing of images.
-        if self.pictures.take().is_some() && !self.lanes.is_empty() {
-            self.memory.note_end(self.last_picture.unwrap_or(self.began).elapsed());
+        // A failure is not silence, and an IMU says nothing about images.
+        if self.images.take().is_some() && !self.streams.is_empty() {
+            self.memory.note_end(self.last_image.unwrap_or(self.began).elapsed());
         }
     }
 }
 
-/// Passes one picture to every stream that is made from it.
+/// Passes one image to every stream that is made from it.
 fn hand_over(
-    lanes: &mut [Lane],
+    streams: &mut [StreamState],
     source: &mut Source,
-    picture: &Picture<'_>,
+    image: &Image<'_>,
     temperature_c: f32,
     sink: &mut dyn FrameSink,
 ) -> Stamped {
-    let facts = picture.header.map_or_else(Facts::default, Facts::of);
-    let stamped = source.account.stamp(picture, &facts);
+    let facts = image.header.map_or_else(Facts::default, Facts::of);
+    let stamped = source.account.stamp(image, &facts);
     let Stamped::Yes(stamp) = &stamped else { return stamped };
     let missed = source.account.take_orphans();
-    for lane in lanes.iter_mut().filter(|l| l.source == picture.source) {
+    for stream in streams.iter_mut().filter(|s| s.source == image.source) {
         for sequence in &missed {
             // Its pixels are long gone and its time was never known.
-            lane.gate.deliver(&RawFrame::new(*sequence, stamp.ticks, picture.arrival, 0), sink, |_| {
+            stream.gate.deliver(&RawFrame::new(*sequence, stamp.ticks, image.arrival, 0), sink, |_| {
                 Err(DropReason::Incomplete)
             });
         }
         // As many bytes of the stream's as came of the source's; one too many is too many.
-        let bytes = match picture.bytes.len() {
-            n if n == source.wire_bytes => lane.frame_bytes,
-            n if n > source.wire_bytes => lane.frame_bytes + 1,
-            n => n * lane.frame_bytes / source.wire_bytes.max(1),
+        let bytes = match image.bytes.len() {
+            n if n == source.wire_bytes => stream.frame_bytes,
+            n if n > source.wire_bytes => stream.frame_bytes + 1,
+            n => n * stream.frame_bytes / source.wire_bytes.max(1),
         };
-        let mut raw = RawFrame::new(stamp.sequence, stamp.ticks, picture.arrival, bytes);
-        raw.damaged = picture.damaged;
+        let mut raw = RawFrame::new(stamp.sequence, stamp.ticks, image.arrival, bytes);
+        raw.damaged = image.damaged;
         raw.exposure_ns = facts.exposure_us.map_or(0, |us| u64::from(us) * 1000);
         raw.gain = facts.gain.map_or(0.0, |g| g as f32);
         raw.temperature_c = temperature_c;
@@ -195,14 +196,14 @@ fn hand_over(
         if facts.is_triggered {
             raw.flags = raw.flags.with(FrameFlags::HARDWARE_TRIGGERED);
         }
-        lane.gate.deliver(&raw, sink, |memory| match lane.unpack {
-            Unpack::Copy => unpack::copy_rows(picture.bytes, memory.len(), memory.len(), memory),
-            Unpack::Left => unpack::y8i::left(picture.bytes, memory),
-            Unpack::Right => unpack::y8i::right(picture.bytes, memory),
-            Unpack::Turn8(columns) => unpack::turn::turn::<1>(picture.bytes, columns, memory),
-            Unpack::Turn16(columns) => unpack::turn::turn::<2>(picture.bytes, columns, memory),
-            Unpack::Confidence(columns) => unpack::turn::confidence(picture.bytes, columns, memory),
-            Unpack::Y411(width) => unpack::y411::to_nv12(picture.bytes, width, memory),
+        stream.gate.deliver(&raw, sink, |memory| match stream.unpack {
+            Unpack::Copy => unpack::copy_rows(image.bytes, memory.len(), memory.len(), memory),
+            Unpack::Left => unpack::y8i::left(image.bytes, memory),
+            Unpack::Right => unpack::y8i::right(image.bytes, memory),
+            Unpack::Turn8(columns) => unpack::turn::turn::<1>(image.bytes, columns, memory),
+            Unpack::Turn16(columns) => unpack::turn::turn::<2>(image.bytes, columns, memory),
+            Unpack::Confidence(columns) => unpack::turn::confidence(image.bytes, columns, memory),
+            Unpack::Y411(width) => unpack::y411::to_nv12(image.bytes, width, memory),
         });
     }
     stamped

@@ -1,13 +1,13 @@
-//! What a D400 is reached through: the kernel's video driver or libusb, behind one trait.
+//! The transport to a D400: the kernel's video driver or libusb, behind one trait.
 //!
-//! The back end does not know which one it has. A transport lists what the device offers, hands out the ways to its
-//! controls, and starts the pictures; what their bytes and headers mean is not its business.
+//! The backend does not depend on which one it has. A transport lists what the device offers, hands out the ways to its
+//! controls, and starts the images; it does not interpret their bytes and headers.
 
 use super::protocol::hwm::HardwareMonitor;
 use crate::Result;
 use crate::uvc::control::ControlPort;
 use crate::v4l2::Control;
-use crate::video::PictureSource;
+use crate::video::ImageSource;
 
 /// One of the video streaming interfaces of a D400.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -48,7 +48,7 @@ pub struct Mode {
 }
 
 impl Mode {
-    /// Bytes of one picture on the wire; `None` for an encoding that is not known here.
+    /// Bytes of one image on the wire; `None` for an encoding that is not known here.
     pub const fn wire_bytes(&self) -> Option<usize> {
         let pixels = self.width as usize * self.height as usize;
         match &self.fourcc {
@@ -62,10 +62,10 @@ impl Mode {
     }
 }
 
-/// How much of the payload header the pictures of a source bring along.
+/// How much of the payload header the images of a source bring along.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum HeaderPart {
-    /// None of it: [`crate::video::Picture::header`] is `None`.
+    /// None of it: [`crate::video::Image::header`] is `None`.
     Nothing,
     /// Its standard part of 12 bytes: the device's time stamp and clock sample.
     Standard,
@@ -73,18 +73,18 @@ pub enum HeaderPart {
     Whole,
 }
 
-/// What was started.
+/// The started streams.
 pub struct Started {
-    /// The pictures; [`crate::video::Picture::source`] is the index into the modes that were asked for.
-    pub pictures: Box<dyn PictureSource>,
-    /// What the kernel or the library really grants of the header, for each of the modes.
+    /// The images; [`crate::video::Image::source`] is the index into the modes that were asked for.
+    pub images: Box<dyn ImageSource>,
+    /// The part of the header that the kernel or the library really grants, for each of the modes.
     pub headers: Vec<HeaderPart>,
 }
 
-/// The picture controls of one function (camera terminal and processing unit), by the names that V4L2 gives them
+/// The image controls of one function (camera terminal and processing unit), by the names that V4L2 gives them
 /// ([`Control`]). Every call may take as long as the kernel's control time-out (5 s), so none belongs on a capture
 /// thread.
-pub trait PictureControls: Send {
+pub trait ImageControls: Send {
     /// All that there are.
     ///
     /// # Errors
@@ -105,15 +105,15 @@ pub trait PictureControls: Send {
     fn set(&mut self, control: &Control, value: i64) -> Result<()>;
 }
 
-/// An open D400, however it is reached. Dropping it, and what it handed out, lets go of the device.
+/// An open D400. Dropping it and everything it handed out releases the device.
 pub trait Transport: Send {
     /// `kernel` or `libusb`, for messages.
     fn name(&self) -> &'static str;
 
-    /// Every mode that the device's descriptors list, also such as the back end cannot use.
+    /// Every mode that the device's descriptors list, also such as the backend cannot use.
     fn modes(&self) -> &[Mode];
 
-    /// A way to the extension units of a function. It is independent of the pictures: what is handed out may be used
+    /// A way to the extension units of a function. It is independent of the images: what is handed out may be used
     /// on another thread while they stream.
     ///
     /// # Errors
@@ -121,11 +121,11 @@ pub trait Transport: Send {
     /// [`crate::ErrorKind::Io`].
     fn control(&mut self, function: Function) -> Result<Box<dyn ControlPort>>;
 
-    /// A way to the picture controls of a function, as independent.
+    /// A way to the image controls of a function, as independent.
     ///
     /// # Errors
     /// Those of [`Self::control`].
-    fn picture_controls(&mut self, function: Function) -> Result<Box<dyn PictureControls>>;
+    fn image_controls(&mut self, function: Function) -> Result<Box<dyn ImageControls>>;
 
     /// A way to the hardware monitor, as independent. It goes by the extension unit through the kernel and by the
     /// vendor's bulk interface through libusb.
@@ -134,8 +134,8 @@ pub trait Transport: Send {
     /// Those of [`Self::control`].
     fn monitor(&mut self) -> Result<Box<dyn HardwareMonitor>>;
 
-    /// Checks that nobody else streams from the camera, as far as that shows before it is started. A transport that takes
-    /// the camera for itself when it is opened need not.
+    /// Checks that no other process streams from the camera, as far as that shows before it is started. A transport
+    /// that holds the camera exclusively once opened need not.
     ///
     /// # Errors
     /// [`crate::ErrorKind::Busy`] naming the process, [`crate::ErrorKind::Disconnected`], [`crate::ErrorKind::Io`].

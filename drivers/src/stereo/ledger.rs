@@ -1,4 +1,4 @@
-//! The account of what is made of pairs: what became of each, in the order of the pairs.
+//! The account of pairs: the outcome of each, in their order.
 //!
 //! A pair is lost at once or decided later. What comes after one that is still open waits for it, so that whoever reads
 //! the counts of a frame reads those of the pairs up to it.
@@ -15,7 +15,7 @@ enum Entry<M> {
     Open(u64, M),
 }
 
-/// What is to be said of pairs, in their order.
+/// Accounting step for pairs, in their order.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Step<M> {
     /// So many are lost, for this reason.
@@ -31,7 +31,8 @@ pub(super) struct Ledger<M> {
     captured: u64,
 }
 
-/// Pairs that may be open at once: one that waits for each of the two threads, one that each works on, two that are done.
+/// Pairs that may be open at once: one that waits for each of the two threads, one that each works on, two that are
+/// done.
 pub(super) const MOST_OPEN: usize = 6;
 
 impl<M: Copy> Ledger<M> {
@@ -71,8 +72,8 @@ impl<M: Copy> Ledger<M> {
         self.release(say);
     }
 
-    /// The open pair `ticket` is done: those before it are announced, then it counts as captured and is said to be done. A
-    /// pair that is not open is not.
+    /// The open pair `ticket` is done: those before it are announced, then it counts as captured and is announced as
+    /// done. A pair that is not open is ignored.
     pub(super) fn settle(&mut self, ticket: u64, say: &mut dyn FnMut(Step<M>)) {
         if !self.entries.iter().any(|e| matches!(e, Entry::Open(t, _) if *t == ticket)) {
             return;
@@ -153,7 +154,10 @@ mod tests {
         #[test]
         fn each_pair_counts_once(steps in proptest::collection::vec(0u8..5, 1..400)) {
             let mut l = Ledger::new();
-            let (mut ticket, mut pairs, mut delivered, mut dropped) = (0u64, 0u64, Vec::new(), 0);
+            let mut ticket = 0u64;
+            let mut pairs = 0u64;
+            let mut delivered = Vec::new();
+            let mut dropped = 0;
             let mut open = VecDeque::new();
             let room = l.entries.capacity();
             for step in steps {

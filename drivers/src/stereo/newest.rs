@@ -3,7 +3,7 @@
 use crate::moments::Due;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
-/// What a box can hold.
+/// An item that a box can hold.
 pub(super) trait ForSet {
     /// The set that it is for, if it is for one.
     fn due(&self) -> Option<&Due>;
@@ -38,8 +38,8 @@ impl<T: ForSet> Newest<T> {
         self.slot.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Puts `item` in and returns what has to give way: what lies there, or the item itself where that is for a set and
-    /// the item is for none, or is further from it.
+    /// Puts `item` in and returns the one that is superseded: the item that lies there, or `item` itself if the other
+    /// is for a set and `item` is for none or is further from it.
     pub(super) fn put(&self, item: T) -> Option<T> {
         let mut slot = self.slot();
         while self.keeps_all && slot.item.is_some() && !slot.closed {
@@ -101,8 +101,8 @@ mod tests {
     }
 
     proptest! {
-        /// Pairs come all the time, and are taken now and then: what is taken is the pair nearest to the newest set since
-        /// the last time, and where there was none, the newest.
+        /// Pairs come all the time, and are taken now and then: what is taken is the pair nearest to the newest set
+        /// since the last time, and where there was none, the newest.
         #[test]
         fn what_is_taken_is_for_the_newest_set_or_the_newest(
             first in 0..SETS,
@@ -117,10 +117,10 @@ mod tests {
             for gap in gaps {
                 let Some((since, rest)) = stamps.split_at_checked(gap) else { break };
                 stamps = rest;
-                let mut gave_way = 0;
+                let mut superseded = 0;
                 for at in since {
                     let due = sets.due(HostTime::from_ns(*at), FRAME);
-                    gave_way += usize::from(newest.put(Pair { at: *at, due }).is_some());
+                    superseded += usize::from(newest.put(Pair { at: *at, due }).is_some());
                 }
                 // The slow and plain way: by set, the newest one first.
                 let off = |at: i64| (at + SETS / 2).rem_euclid(SETS) - SETS / 2;
@@ -130,7 +130,7 @@ mod tests {
                 let best = best.and_then(|s| near.filter(|at| set(*at) == s).min_by_key(|at| off(*at).abs()));
                 let expected = best.unwrap_or(since[since.len() - 1]);
                 prop_assert_eq!(newest.take().unwrap().at, expected);
-                prop_assert_eq!(gave_way, since.len() - 1);
+                prop_assert_eq!(superseded, since.len() - 1);
             }
         }
     }

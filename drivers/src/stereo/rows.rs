@@ -1,5 +1,5 @@
-//! The thread that measures now and then whether the rows of the rectified eyes agree, beside those that have to be in time, and
-//! has them moved where they do not.
+//! The thread that measures now and then whether the rows of the rectified images agree, and has them moved where they
+//! do not. It runs beside the threads with deadlines.
 
 use super::newest::Newest;
 use super::pair::Views;
@@ -12,8 +12,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 const FIRST_EVERY: u64 = 10;
 /// The same from then on: ten seconds of 30 Hz. Heat and a knock change rows, and neither is in a hurry.
 const EVERY: u64 = 300;
-/// Pairs that must have been looked at before anything is said: two eyes that do not expose at one moment differ in rows when
-/// the camera moves, in one pair up and in the next one down.
+/// Pairs that must have been looked at before anything is reported: two cameras that do not expose at one moment differ
+/// in rows when the rig moves, in one pair up and in the next one down.
 const LOOKS: usize = 3;
 
 /// Whether pair number `pair`, from 1, is looked at.
@@ -78,7 +78,7 @@ impl Rows {
             computed: Arc::clone(&options.computed),
             said: false,
         };
-        rows.tell(None);
+        rows.report(None);
         rows
     }
 
@@ -89,13 +89,13 @@ impl Rows {
                 // Rectified before the correction that is in force now.
                 continue;
             }
-            let eye = |picture| Gray::packed(picture, self.size.0, self.size.1);
-            let pair = StereoPair::new(eye(&views.left), eye(&views.right));
+            let gray = |image| Gray::packed(image, self.size.0, self.size.1);
+            let pair = StereoPair::new(gray(&views.left), gray(&views.right));
             if let Err(e) = self.check.look(&pair) {
                 tracing::debug!(camera = self.camera, error = %e, "the rows of a pair were not looked at");
             }
             drop(views);
-            // Pictures that say nothing take back nothing.
+            // Images that say nothing take back nothing.
             let Some(offset) = self.check.offset().filter(|o| o.pairs >= LOOKS) else { continue };
             tracing::debug!(camera = self.camera, "rows: {offset}");
             if offset.is_significant() {
@@ -111,7 +111,7 @@ impl Rows {
         self.corrected.put(self.rectifier.clone());
         self.corrections += 1;
         self.moved = Some(total);
-        // What was measured before is of other rows.
+        // Earlier measurements are of other rows.
         self.check = RowCheck::new(self.size.0, self.size.1);
         self.describe(&total);
         tracing::info!(camera = self.camera, "the right image's rows are moved: {total}");
@@ -120,7 +120,7 @@ impl Rows {
             self.said = true;
             tracing::warn!(camera = self.camera, "{text}");
         }
-        self.tell(warning);
+        self.report(warning);
     }
 
     /// States the correction with what is computed, for the datasets that are recorded from now on.
@@ -133,7 +133,7 @@ impl Rows {
         }
     }
 
-    fn tell(&self, warning: Option<String>) {
+    fn report(&self, warning: Option<String>) {
         *self.notice.lock().unwrap_or_else(PoisonError::into_inner) = warning;
     }
 }

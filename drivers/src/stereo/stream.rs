@@ -1,11 +1,11 @@
-//! A running camera with stereo: its own frames go their way and are copied for the threads, what these make comes after.
+//! A running camera with stereo: its own frames are delivered and copied for the workers, whose results come after.
 
-use super::crew::{Crew, Event, Product};
 use super::ledger::{Ledger, Step};
 use super::pair::{Raw, Views};
+use super::workers::{Event, Product, Workers};
 use super::{COLOR, PREFIXES, StereoOptions};
 use crate::clock::ClockQuality;
-use crate::moments::{Due, Pace, SetTimes};
+use crate::moments::{Due, FrameSchedule, SetTimes};
 use crate::{Error, ErrorKind, FrameMeta, FrameSink, Poll, Result, Stream, StreamProfile};
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime};
@@ -13,7 +13,7 @@ use std::sync::Arc;
 
 /// How often the threads' results are looked for while the camera is waited for.
 const SLICE: Duration = Duration::from_millis(2);
-/// Pairs that may be on their way in a group of streams when nothing is to give way.
+/// Pairs that may be on their way in a group of streams when no pair may be superseded.
 const AHEAD: usize = 2;
 
 /// A running camera with stereo.
@@ -40,39 +40,40 @@ struct Group {
 /// Where the camera's frames are gathered into pairs.
 struct Pairing {
     name: String,
-    /// Numbers of the eyes among the camera's streams.
-    eyes: [usize; 2],
+    /// Indices of left and right among the camera's streams.
+    sides: [usize; 2],
     /// Where each of the camera's streams is delivered, if it is.
     own: Vec<Option<usize>>,
     /// Memory that the camera writes into.
     lent: Vec<Vec<u8>>,
-    /// The pair that is being gathered, and of which eyes there is a picture.
+    /// The pair that is being gathered.
     raw: Raw,
+    /// Metadata of its left and right image, where it has come.
     have: [Option<FrameMeta>; 2],
     /// From one pair to the next.
     frame_ns: i64,
-    /// How far apart both eyes' pictures may be.
+    /// How far apart the images of a pair may be.
     near_ns: i64,
     /// Moments whose pairs are preferred.
     sets: Arc<SetTimes>,
     /// Which pairs are matched.
-    pace: Pace,
+    schedule: FrameSchedule,
     ticket: u64,
     /// `color`, then the modes.
     groups: Vec<Group>,
-    crew: Crew,
-    /// The pictures show that the eyes are exchanged.
+    workers: Workers,
+    /// The images show that left and right are swapped.
     swapped: bool,
 }
 
 impl StereoStream {
-    /// Of `inner`, whose streams number `eyes` are left and right; `profiles` are delivered.
+    /// Of `inner`, whose streams number `sides` are left and right; `profiles` are delivered.
     pub(super) fn new(
         name: String,
         inner: Box<dyn Stream>,
-        eyes: [usize; 2],
+        sides: [usize; 2],
         profiles: Vec<StreamProfile>,
-        mut crew: Crew,
+        mut workers: Workers,
         options: &StereoOptions,
     ) -> Self {
         let find = |name: &str| profiles.iter().position(|p| p.stream.as_str() == name);
@@ -83,12 +84,12 @@ impl StereoStream {
         for mode in &options.modes {
             groups.push(group(PREFIXES.map(|prefix| outlet(&format!("{prefix}{}", mode.name)))));
         }
-        let frame_ns = inner.profiles().get(eyes[0]).map_or(0, |p| p.period_ns() as i64);
-        let raw = crew.blank();
+        let frame_ns = inner.profiles().get(sides[0]).map_or(0, |p| p.period_ns() as i64);
+        let raw = workers.blank();
         let lent: Vec<_> = own.iter().map(|_| Vec::new()).collect();
         let pairing = Pairing {
             name,
-            eyes,
+            sides,
             own,
             lent,
             raw,
@@ -96,10 +97,10 @@ impl StereoStream {
             frame_ns,
             near_ns: frame_ns / 4,
             sets: Arc::clone(&options.sets),
-            pace: Pace::new(options.rate_hz, frame_ns),
+            schedule: FrameSchedule::new(options.rate_hz, frame_ns),
             ticket: 0,
             groups,
-            crew,
+            workers,
             swapped: false,
         };
         Self { profiles, inner, pairing, every_pair: options.every_pair, ended: false }
@@ -115,14 +116,16 @@ impl Stream for StereoStream {
         let deadline = HostTime::now().plus(timeout);
         let mut came = false;
         loop {
-            let (left, open) = (deadline.from_now(), self.pairing.open());
+            let left = deadline.from_now();
+            let open = self.pairing.open();
             if self.ended && open == 0 {
                 return Ok(if came { Poll::Frame } else { Poll::End });
             }
             let wait = if self.ended || (self.every_pair && open >= AHEAD) {
                 left
             } else {
-                // While threads are at work the camera is waited for in short pieces, so that results do not wait for it.
+                // While threads are at work the camera is waited for in short pieces, so that results do not wait for
+                // it.
                 let slice = if open > 0 { left.min(SLICE) } else { left };
                 match self.inner.poll(slice, &mut Tee { pairing: &mut self.pairing, sink })? {
                     Poll::Frame => came = true,
@@ -134,15 +137,15 @@ impl Stream for StereoStream {
                 }
                 Duration::ZERO
             };
-            let mut event = self.pairing.crew.next(wait);
+            let mut event = self.pairing.workers.next(wait);
             while let Some(e) = event {
                 came = true;
                 self.pairing.take(e, sink);
-                event = self.pairing.crew.next(Duration::ZERO);
+                event = self.pairing.workers.next(Duration::ZERO);
             }
             if self.pairing.swapped {
                 let what = format!(
-                    "{}: its pictures show that left and right are swapped: what is near lies further right in the right one. \
+                    "{}: its images show that left and right are swapped: what is near lies further right in the right one. \
                      Exchange the halves of the images, or the names of the streams",
                     self.pairing.name
                 );
@@ -168,15 +171,15 @@ impl Pairing {
         self.groups.iter().map(|g| g.ledger.open()).max().unwrap_or(0)
     }
 
-    /// A picture of eye number `eye` is in the memory that was lent for it.
-    fn gathered(&mut self, eye: usize, meta: &FrameMeta, sink: &mut dyn FrameSink) {
-        if eye == 0 && self.have[0].is_some() {
-            // The left picture before never met its partner.
+    /// Takes the image of `side` (0 left, 1 right) from the memory that was lent for it.
+    fn gathered(&mut self, side: usize, meta: &FrameMeta, sink: &mut dyn FrameSink) {
+        if side == 0 && self.have[0].is_some() {
+            // The left image before never met its partner.
             self.lose(DropReason::Incomplete, 1, sink);
         }
-        let place = if eye == 0 { &mut self.raw.left } else { &mut self.raw.right };
-        core::mem::swap(place, &mut self.lent[self.eyes[eye]]);
-        self.have[eye] = Some(*meta);
+        let place = if side == 0 { &mut self.raw.left } else { &mut self.raw.right };
+        core::mem::swap(place, &mut self.lent[self.sides[side]]);
+        self.have[side] = Some(*meta);
         let [Some(left), Some(right)] = self.have else { return };
         let apart = left.capture_time.since_ns(right.capture_time);
         if apart < -self.near_ns {
@@ -192,37 +195,37 @@ impl Pairing {
 
     fn submit(&mut self, meta: &FrameMeta, sink: &mut dyn FrameSink) {
         self.ticket += 1;
-        let blank = self.crew.blank();
+        let blank = self.workers.blank();
         let mut raw = core::mem::replace(&mut self.raw, blank);
         raw.ticket = self.ticket;
         let at = meta.capture_time;
-        raw.matched = self.pace.is_due(at.ns(), &self.sets);
+        raw.matched = self.schedule.is_due(at.ns(), &self.sets);
         raw.due = self.sets.due(at, self.frame_ns);
-        if let Some(period_ns) = self.pace.period_ns() {
+        if let Some(period_ns) = self.schedule.period_ns() {
             raw.due = raw.due.filter(|_| raw.matched).or(raw.matched.then(|| Due::alone(at, period_ns)));
         }
-        // Pairs that are not to be matched are pictures of colour alone.
+        // Pairs that are not to be matched are images of colour alone.
         let groups = if raw.matched { self.groups.len() } else { 1 };
         for group in self.groups.iter_mut().take(groups) {
             group.ledger.begin(self.ticket, *meta);
         }
-        if let Some(old) = self.crew.offer(raw) {
+        if let Some(old) = self.workers.offer(raw) {
             for group in &mut self.groups {
                 group.fail(old, DropReason::QueueFull, sink);
             }
         }
     }
 
-    /// Pairs of which the left eye gives nothing. Where not all are matched, the next one is instead of one of these.
+    /// Counts pairs without a left image. Where not all are matched, the next one is instead of one of these.
     fn lose(&mut self, reason: DropReason, n: u64, sink: &mut dyn FrameSink) {
-        let groups = if self.pace.period_ns().is_none() { self.groups.len() } else { 1 };
+        let groups = if self.schedule.period_ns().is_none() { self.groups.len() } else { 1 };
         for group in self.groups.iter_mut().take(groups) {
             let streams = group.streams;
             group.ledger.lose(reason, n, &mut |step| announce(streams, step, sink));
         }
     }
 
-    /// The left picture that waits, if one does, will have no partner.
+    /// The left image that waits, if one does, will have no partner.
     fn give_up_left(&mut self, sink: &mut dyn FrameSink) {
         if self.have[0].take().is_some() {
             self.lose(DropReason::Incomplete, 1, sink);
@@ -246,7 +249,7 @@ impl Pairing {
                 if let Some(group) = self.groups.get_mut(mode + 1) {
                     group.deliver_depth(&product, sink);
                 }
-                self.crew.give_back(mode, product);
+                self.workers.give_back(mode, product);
             }
             Event::Skipped(mode, ticket) => {
                 if let Some(group) = self.groups.get_mut(mode + 1) {
@@ -298,7 +301,7 @@ impl Group {
         });
     }
 
-    /// Delivers the pair `ticket` on each stream of the group; `fill` writes the picture of the stream of a kind.
+    /// Delivers the pair `ticket` on each stream of the group; `fill` writes the image of the stream of a kind.
     fn deliver(
         &mut self,
         ticket: u64,
@@ -351,13 +354,13 @@ fn announce(streams: Outlets, step: Step<FrameMeta>, sink: &mut dyn FrameSink) {
     for (stream, _) in streams.into_iter().flatten() {
         sink.captured(stream, n);
         match reason {
-            DropReason::QueueFull => sink.gave_way(stream, n),
+            DropReason::QueueFull => sink.superseded(stream, n),
             reason => sink.dropped(stream, reason, n),
         }
     }
 }
 
-/// What the camera's frames go to: on their way, and into pairs.
+/// Sink of the camera's frames: delivers them and gathers them into pairs.
 struct Tee<'a> {
     pairing: &'a mut Pairing,
     sink: &'a mut dyn FrameSink,
@@ -380,18 +383,18 @@ impl FrameSink for Tee<'_> {
     fn commit(&mut self, stream: usize, meta: &FrameMeta) {
         let own = self.own(stream);
         let Self { pairing, sink } = self;
-        let Some(picture) = pairing.lent.get(stream) else { return };
+        let Some(image) = pairing.lent.get(stream) else { return };
         if let Some(own) = own {
-            // A slot is asked for now and not before the picture came, since the picture is needed either way.
-            if let Some(memory) = sink.loan(own, picture.len()) {
-                memory.copy_from_slice(picture);
+            // A slot is asked for now and not before the image came, since the image is needed either way.
+            if let Some(memory) = sink.loan(own, image.len()) {
+                memory.copy_from_slice(image);
                 sink.commit(own, meta);
             } else {
                 sink.dropped(own, DropReason::NoSlot, 1);
             }
         }
-        if let Some(eye) = pairing.eyes.iter().position(|e| *e == stream) {
-            pairing.gathered(eye, meta, *sink);
+        if let Some(side) = pairing.sides.iter().position(|s| *s == stream) {
+            pairing.gathered(side, meta, *sink);
         }
     }
 
@@ -401,9 +404,9 @@ impl FrameSink for Tee<'_> {
         if let Some(own) = self.own(stream) {
             self.sink.dropped(own, reason, n);
         }
-        if stream == self.pairing.eyes[0] {
-            // A left picture that still waits came before these. A right one may belong to the next left one, of which
-            // a gap before it is told first.
+        if stream == self.pairing.sides[0] {
+            // A left image that still waits came before these. A right one may belong to the next left one, of which
+            // a gap before it is reported first.
             self.pairing.give_up_left(self.sink);
             self.pairing.lose(reason, n, self.sink);
         }
@@ -419,7 +422,7 @@ impl FrameSink for Tee<'_> {
         if let Some(own) = self.own(stream) {
             self.sink.clock_quality(own, quality);
         }
-        if stream == self.pairing.eyes[0] {
+        if stream == self.pairing.sides[0] {
             for (made, _) in self.pairing.groups.iter().flat_map(|g| g.streams).flatten() {
                 self.sink.clock_quality(made, quality);
             }

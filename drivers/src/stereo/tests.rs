@@ -1,5 +1,4 @@
-//! A camera of two eyes that is made by hand, and matchers that are slow, hang and fail. Long because all cases
-//! share both.
+//! A fake stereo camera, and matchers that are slow, hang and fail. Long because all cases share both.
 
 use super::*;
 use crate::clock::ClockQuality;
@@ -18,25 +17,25 @@ const H: u32 = 96;
 const FOCAL: f64 = 200.0;
 const BASELINE: f64 = 0.12;
 
-/// What the made camera sends with one poll.
+/// Output of the fake camera at one poll.
 #[derive(Debug, Clone, Copy)]
 enum Shot {
-    /// Both eyes see a wall at this disparity.
+    /// Both cameras see a wall at this disparity.
     Wall(usize),
-    /// The same, and the right eye sees it so many rows lower.
+    /// The same, and the right camera sees it so many rows lower.
     LowWall(usize, usize),
-    /// Only this eye's picture comes.
+    /// Only the image of this side comes.
     Only(usize),
-    /// The left picture comes damaged, the right one is whole.
+    /// The left image comes damaged, the right one is complete.
     LeftDamaged,
-    /// So many pictures of both eyes are skipped.
+    /// So many images of both sides are skipped.
     Gap(u64),
-    /// One eye's picture of this number alone, so much later than others of its number, whole or damaged; its pixels
+    /// One side's image of this number alone, so much later than others of its number, complete or damaged; its pixels
     /// are its number.
     One(usize, u64, i64, bool),
 }
 
-struct Made {
+struct FakeCamera {
     info: DeviceInfo,
     profiles: Vec<StreamProfile>,
     shots: Vec<Shot>,
@@ -44,7 +43,7 @@ struct Made {
     swapped: bool,
 }
 
-impl Made {
+impl FakeCamera {
     fn new(format: PixelFormat, shots: &[Shot]) -> Self {
         let profile = |name: &str, x: f64| StreamProfile {
             stream: Name::new(name).unwrap(),
@@ -59,13 +58,13 @@ impl Made {
             sequence_bits: 64,
             metadata: MetadataLevel::Kernel,
         };
-        let info = DeviceInfo { backend: "made", model: "Made".into(), ..DeviceInfo::default() };
+        let info = DeviceInfo { backend: "fake", model: "Fake".into(), ..DeviceInfo::default() };
         let profiles = vec![profile("left", 0.0), profile("right", BASELINE)];
         Self { info, profiles, shots: shots.to_vec(), pause: Duration::ZERO, swapped: false }
     }
 }
 
-impl Device for Made {
+impl Device for FakeCamera {
     fn info(&self) -> &DeviceInfo {
         &self.info
     }
@@ -75,9 +74,9 @@ impl Device for Made {
     }
 
     fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
-        let profiles = choose_profiles("made", &self.profiles, requests)?;
+        let profiles = choose_profiles("fake", &self.profiles, requests)?;
         let gates = profiles.iter().enumerate().map(|(i, p)| Gate::new(i, p)).collect();
-        Ok(Box::new(MadeStream {
+        Ok(Box::new(FakeStream {
             profiles,
             gates,
             shots: self.shots,
@@ -89,7 +88,7 @@ impl Device for Made {
     }
 }
 
-struct MadeStream {
+struct FakeStream {
     profiles: Vec<StreamProfile>,
     gates: Vec<Gate>,
     shots: Vec<Shot>,
@@ -99,7 +98,7 @@ struct MadeStream {
     swapped: bool,
 }
 
-/// A picture of noise, `shift` pixels to the left.
+/// An image of noise, `shift` pixels to the left.
 fn noise(format: PixelFormat, shift: usize) -> Vec<u8> {
     // Not a sum, which would repeat along a row.
     let grey = |x: usize, y: usize| ((((x * 7919) ^ (y * 104_729)) * 2_654_435_761) >> 13) as u8;
@@ -113,7 +112,7 @@ fn noise(format: PixelFormat, shift: usize) -> Vec<u8> {
         .collect()
 }
 
-impl Stream for MadeStream {
+impl Stream for FakeStream {
     fn profiles(&self) -> &[StreamProfile] {
         &self.profiles
     }
@@ -122,14 +121,14 @@ impl Stream for MadeStream {
         let Some(shot) = self.shots.get(self.at).copied() else { return Ok(Poll::End) };
         std::thread::sleep(self.pause.min(timeout));
         self.at += 1;
-        if let Shot::One(eye, number, late_ns, is_whole) = shot {
+        if let Shot::One(side, number, late_ns, is_whole) = shot {
             let ticks = (1_000_000_000 + number * 33_333_333).saturating_add_signed(late_ns);
-            let picture = vec![number as u8; self.profiles[eye].frame_bytes()];
+            let image = vec![number as u8; self.profiles[side].frame_bytes()];
             let arrival = HostTime::from_ns(ticks as i64 + 1000);
-            let mut raw = RawFrame::new(number, ticks, arrival, picture.len());
+            let mut raw = RawFrame::new(number, ticks, arrival, image.len());
             raw.damaged = !is_whole;
-            self.gates[eye].deliver(&raw, sink, |memory| {
-                memory.copy_from_slice(&picture);
+            self.gates[side].deliver(&raw, sink, |memory| {
+                memory.copy_from_slice(&image);
                 Ok(())
             });
             return Ok(Poll::Frame);
@@ -139,24 +138,24 @@ impl Stream for MadeStream {
         let ticks = 1_000_000_000 + self.sequence * 33_333_333;
         for (i, gate) in self.gates.iter_mut().enumerate() {
             let format = self.profiles[i].format;
-            let picture = match shot {
+            let image = match shot {
                 Shot::Gap(_) | Shot::One(..) => continue,
-                Shot::Only(eye) if eye != i => continue,
+                Shot::Only(side) if side != i => continue,
                 Shot::Wall(d) if (i == 1) != self.swapped => noise(format, d),
                 Shot::LowWall(d, rows) if i == 1 => {
-                    let mut picture = noise(format, d);
-                    let row = picture.len() / H as usize;
-                    picture.rotate_right(rows * row);
-                    picture
+                    let mut image = noise(format, d);
+                    let row = image.len() / H as usize;
+                    image.rotate_right(rows * row);
+                    image
                 }
                 _ => noise(format, 0),
             };
             let arrival = HostTime::from_ns(ticks as i64 + 1000);
-            let mut raw = RawFrame::new(self.sequence, ticks, arrival, picture.len());
+            let mut raw = RawFrame::new(self.sequence, ticks, arrival, image.len());
             raw.damaged = i == 0 && matches!(shot, Shot::LeftDamaged);
             raw.exposure_ns = 5000;
             gate.deliver(&raw, sink, |memory| {
-                memory.copy_from_slice(&picture);
+                memory.copy_from_slice(&image);
                 Ok(())
             });
         }
@@ -164,7 +163,7 @@ impl Stream for MadeStream {
     }
 }
 
-/// A sink that holds the accounts of every frame to the rule, and counts what gave way by design.
+/// A sink that holds the accounts of every frame to the rule, and counts superseded frames.
 #[derive(Default)]
 struct Strict(MemorySink, u64);
 
@@ -185,7 +184,7 @@ impl FrameSink for Strict {
     fn dropped(&mut self, stream: usize, reason: DropReason, n: u64) {
         self.0.dropped(stream, reason, n);
     }
-    fn gave_way(&mut self, stream: usize, n: u64) {
+    fn superseded(&mut self, stream: usize, n: u64) {
         self.1 += n;
         self.0.dropped(stream, DropReason::QueueFull, n);
     }
@@ -196,7 +195,7 @@ impl FrameSink for Strict {
 }
 
 /// Runs to the end and returns what came, with the delivered profiles.
-fn play(device: Made, options: StereoOptions, requests: &[&str]) -> (MemorySink, Vec<StreamProfile>) {
+fn play(device: FakeCamera, options: StereoOptions, requests: &[&str]) -> (MemorySink, Vec<StreamProfile>) {
     let requests: Vec<_> = requests.iter().map(|r| StreamRequest::any(Name::new(*r).unwrap())).collect();
     let mut stream = wrap(Box::new(device), options).unwrap().start(&requests).unwrap();
     let mut sink = Strict::default();
@@ -221,12 +220,12 @@ fn presets() -> Vec<StereoMode> {
     Preset::ALL.map(|p| StereoMode::preset(p, 0.5, 1)).into()
 }
 
-/// A matcher that does what it is told to.
-struct Puppet {
+/// A matcher that follows a script.
+struct ScriptedMatcher {
     work: Box<dyn FnMut() -> depthrig_calib::Result<()> + Send>,
 }
 
-impl Matcher for Puppet {
+impl Matcher for ScriptedMatcher {
     fn describe(&self) -> Description {
         let text = String::new;
         Description { producer: text(), name: text(), parameters: text(), memory_bytes: 0 }
@@ -241,12 +240,12 @@ impl Matcher for Puppet {
     }
 }
 
-fn puppet<W: FnMut() -> depthrig_calib::Result<()> + Send + 'static>(
+fn scripted<W: FnMut() -> depthrig_calib::Result<()> + Send + 'static>(
     name: &str,
     make: impl Fn() -> W + Send + Sync + 'static,
 ) -> StereoMode {
     let make = move |_: &Geometry| -> depthrig_calib::Result<Box<dyn Matcher>> {
-        Ok(Box::new(Puppet { work: Box::new(make()) }))
+        Ok(Box::new(ScriptedMatcher { work: Box::new(make()) }))
     };
     StereoMode { name: name.to_owned(), wants_color: false, make: Arc::new(make) }
 }
@@ -259,9 +258,9 @@ fn index(profiles: &[StreamProfile], name: &str) -> usize {
 fn a_wall_has_its_depth_in_every_preset_and_format() {
     for format in [PixelFormat::Yuyv, PixelFormat::Rgb8, PixelFormat::Mono8] {
         let shots = [Shot::Wall(20), Shot::Wall(24), Shot::Wall(16)];
-        let (sink, profiles) = play(Made::new(format, &shots), options(presets()), &[]);
+        let (sink, profiles) = play(FakeCamera::new(format, &shots), options(presets()), &[]);
         let expected = if format == PixelFormat::Mono8 { 11 } else { 12 };
-        assert_eq!(profiles.len(), expected, "{format:?}: two eyes, colour, three times three");
+        assert_eq!(profiles.len(), expected, "{format:?}: left, right, colour, three times three");
         for mode in ["performance", "quality", "ultra"] {
             let i = index(&profiles, &format!("depth_{mode}"));
             assert_eq!((profiles[i].format, profiles[i].depth_unit_m), (PixelFormat::Z16, 0.001));
@@ -273,7 +272,8 @@ fn a_wall_has_its_depth_in_every_preset_and_format() {
                 depth.retain(|z| *z > 0);
                 let seen = depth.len() as f64 / f64::from(W * H);
                 depth.sort_unstable();
-                let (middle, want) = (f64::from(depth[depth.len() / 2]), FOCAL * BASELINE / d * 1000.0);
+                let middle = f64::from(depth[depth.len() / 2]);
+                let want = FOCAL * BASELINE / d * 1000.0;
                 assert!(seen > 0.6, "{mode}: {seen} of the wall is seen");
                 assert!(
                     (middle - want).abs() < 0.02 * want,
@@ -281,10 +281,8 @@ fn a_wall_has_its_depth_in_every_preset_and_format() {
                 );
                 assert!(meta.flags.has(FrameFlags::DERIVED) && meta.exposure_ns == 5000);
             }
-            let (c, d) = (
-                index(&profiles, &format!("confidence_{mode}")),
-                index(&profiles, &format!("disparity_{mode}")),
-            );
+            let c = index(&profiles, &format!("confidence_{mode}"));
+            let d = index(&profiles, &format!("disparity_{mode}"));
             let of = |i: usize| sink.frames.iter().find(|f| f.0 == i).map(|f| &f.2).unwrap();
             for ((z, c), d) in walls[0].2.chunks(2).zip(of(c)).zip(of(d).chunks(4)) {
                 let d = f32::from_le_bytes(d.try_into().unwrap());
@@ -312,10 +310,10 @@ fn a_wall_has_its_depth_in_every_preset_and_format() {
 }
 
 #[test]
-fn it_is_told_what_computes_each_mode() {
+fn each_modes_matcher_is_described() {
     let options = options(presets());
     let computed = Arc::clone(&options.computed);
-    let _ = play(Made::new(PixelFormat::Yuyv, &[Shot::Wall(20)]), options, &["depth_quality"]);
+    let _ = play(FakeCamera::new(PixelFormat::Yuyv, &[Shot::Wall(20)]), options, &["depth_quality"]);
     let computed = computed.lock().unwrap();
     let names: Vec<_> = computed.iter().map(|(mode, d)| (mode.as_str(), d.name.as_str())).collect();
     assert_eq!(names, [("performance", "performance"), ("quality", "quality"), ("ultra", "ultra")]);
@@ -323,9 +321,9 @@ fn it_is_told_what_computes_each_mode() {
 }
 
 #[test]
-fn only_what_is_asked_for_comes_and_the_eyes_are_read_all_the_same() {
-    let made = Made::new(PixelFormat::Yuyv, &[Shot::Wall(20); 2]);
-    let (sink, profiles) = play(made, options(presets()), &["depth_quality", "left"]);
+fn only_requested_streams_come_and_left_and_right_are_read_all_the_same() {
+    let camera = FakeCamera::new(PixelFormat::Yuyv, &[Shot::Wall(20); 2]);
+    let (sink, profiles) = play(camera, options(presets()), &["depth_quality", "left"]);
     let names: Vec<_> = profiles.iter().map(|p| p.stream.as_str()).collect();
     assert_eq!(names, ["depth_quality", "left"], "in the order in which they were asked for");
     assert_eq!((sink.delivered(0), sink.delivered(1), sink.frames.len()), (2, 2, 4));
@@ -335,7 +333,7 @@ fn only_what_is_asked_for_comes_and_the_eyes_are_read_all_the_same() {
 fn waits(name: &str) -> (StereoMode, SyncSender<()>) {
     let (release, gate): (SyncSender<()>, Receiver<()>) = sync_channel(1024);
     let gate = Arc::new(Mutex::new(gate));
-    let mode = puppet(name, move || {
+    let mode = scripted(name, move || {
         let gate = Arc::clone(&gate);
         move || {
             let _ = gate.lock().unwrap().recv();
@@ -348,10 +346,10 @@ fn waits(name: &str) -> (StereoMode, SyncSender<()>) {
 #[test]
 fn a_slow_mode_skips_pairs_counts_them_and_holds_up_nobody() {
     let (slow, release) = waits("slow");
-    let mut made = Made::new(PixelFormat::Yuyv, &[Shot::Wall(3); 60]);
-    made.pause = Duration::from_millis(2);
-    let options = StereoOptions { every_pair: false, ..options(vec![slow, puppet("quick", || || Ok(()))]) };
-    let mut stream = wrap(Box::new(made), options).unwrap().start(&[]).unwrap();
+    let mut camera = FakeCamera::new(PixelFormat::Yuyv, &[Shot::Wall(3); 60]);
+    camera.pause = Duration::from_millis(2);
+    let options = StereoOptions { every_pair: false, ..options(vec![slow, scripted("quick", || || Ok(()))]) };
+    let mut stream = wrap(Box::new(camera), options).unwrap().start(&[]).unwrap();
     let profiles = stream.profiles().to_vec();
     let i = |name| index(&profiles, name);
     let mut sink = Strict::default();
@@ -380,15 +378,15 @@ fn a_slow_mode_skips_pairs_counts_them_and_holds_up_nobody() {
 
 #[test]
 fn with_every_pair_nothing_gives_way() {
-    let slow = puppet("slow", || {
+    let slow = scripted("slow", || {
         || {
             std::thread::sleep(Duration::from_millis(5));
             Ok(())
         }
     });
     let (sink, profiles) = play(
-        Made::new(PixelFormat::Yuyv, &[Shot::Wall(3); 30]),
-        options(vec![slow, puppet("quick", || || Ok(()))]),
+        FakeCamera::new(PixelFormat::Yuyv, &[Shot::Wall(3); 30]),
+        options(vec![slow, scripted("quick", || || Ok(()))]),
         &[],
     );
     for (i, profile) in profiles.iter().enumerate() {
@@ -397,7 +395,7 @@ fn with_every_pair_nothing_gives_way() {
 }
 
 #[test]
-fn pairs_that_lack_an_eye_are_counted() {
+fn pairs_that_lack_an_image_are_counted() {
     let shots = [
         Shot::Wall(3),
         Shot::Only(0),
@@ -410,17 +408,18 @@ fn pairs_that_lack_an_eye_are_counted() {
         Shot::Only(0),
     ];
     let (sink, profiles) =
-        play(Made::new(PixelFormat::Yuyv, &shots), options(vec![puppet("quick", || || Ok(()))]), &[]);
-    let (left, depth) = (index(&profiles, "left"), index(&profiles, "depth_quick"));
+        play(FakeCamera::new(PixelFormat::Yuyv, &shots), options(vec![scripted("quick", || || Ok(()))]), &[]);
+    let left = index(&profiles, "left");
+    let depth = index(&profiles, "depth_quick");
     assert_eq!(sink.delivered(depth), 4);
     let drops = sink.drops_of(depth);
-    assert_eq!(drops.get(DropReason::Incomplete), 2, "the two that have no right picture");
+    assert_eq!(drops.get(DropReason::Incomplete), 2, "the two that have no right image");
     assert_eq!(drops.get(DropReason::DeviceError), 1);
-    assert_eq!(drops.get(DropReason::DeviceGap), 5, "four, and the one of which only the right picture came");
-    assert_eq!(sink.captured[depth], sink.captured[left], "one for every left picture");
+    assert_eq!(drops.get(DropReason::DeviceGap), 5, "four, and the one of which only the right image came");
+    assert_eq!(sink.captured[depth], sink.captured[left], "one for every left image");
 }
 
-/// A matcher that fails unless both pictures have the same number.
+/// A matcher that fails unless both images have the same number.
 struct SameNumber;
 
 impl Matcher for SameNumber {
@@ -433,23 +432,23 @@ impl Matcher for SameNumber {
         let middle = pair.left.pixels.len() / 2 + 80;
         if pair.left.pixels[middle] != pair.right.pixels[middle] {
             let e = depthrig_calib::ErrorKind::BadInput;
-            return Err(depthrig_calib::Error::new(e, "pictures of two pairs"));
+            return Err(depthrig_calib::Error::new(e, "images of two pairs"));
         }
         out.resize(pair.left.width, pair.left.height);
         Ok(())
     }
 }
 
-/// Plays `shots`; the numbers of the pairs that depth was made of, each with its time after the left picture's, and
-/// what was lost.
+/// Plays `shots`; returns the numbers of the pairs with depth, each with its time after the left image's, and the
+/// drops.
 fn pairs(shots: &[Shot]) -> (Vec<(u64, i64)>, depthrig_bus::DropCounts) {
     let make: Maker = Arc::new(|_| Ok(Box::new(SameNumber)));
     let mode = StereoMode { name: "same".into(), wants_color: false, make };
-    let (sink, profiles) = play(Made::new(PixelFormat::Mono8, shots), options(vec![mode]), &[]);
+    let (sink, profiles) = play(FakeCamera::new(PixelFormat::Mono8, shots), options(vec![mode]), &[]);
     let depth = index(&profiles, "depth_same");
     let drops = sink.drops_of(depth);
     assert_eq!(drops.get(DropReason::DeviceError), shots.iter().filter(|s| is_bad_left(s)).count() as u64);
-    assert_eq!(sink.captured[depth], sink.captured[index(&profiles, "left")], "one for every left picture");
+    assert_eq!(sink.captured[depth], sink.captured[index(&profiles, "left")], "one for every left image");
     let made = sink.frames.iter().filter(|f| f.0 == depth).map(|(_, meta, _)| {
         let n = meta.device_sequence;
         (n, meta.capture_time.ns() - (1_000_000_000 + n as i64 * 33_333_333))
@@ -464,13 +463,13 @@ fn is_bad_left(shot: &Shot) -> bool {
 const L: usize = 0;
 const R: usize = 1;
 
-/// The picture `n` of an eye.
-fn one(eye: usize, n: u64) -> Shot {
-    Shot::One(eye, n, 0, true)
+/// The image `n` of a side.
+fn one(side: usize, n: u64) -> Shot {
+    Shot::One(side, n, 0, true)
 }
 
 #[test]
-fn either_eye_may_come_first() {
+fn either_side_may_come_first() {
     let left_first = (1..6).flat_map(|n| [one(L, n), one(R, n)]).collect::<Vec<_>>();
     let right_first = (1..6).flat_map(|n| [one(R, n), one(L, n)]).collect::<Vec<_>>();
     let in_turn =
@@ -483,11 +482,11 @@ fn either_eye_may_come_first() {
 }
 
 #[test]
-fn an_eye_that_is_lost_costs_its_own_pair_alone() {
+fn a_lost_image_costs_its_own_pair_alone() {
     // The right one of the second, then the left one of the fourth, in either order of arrival.
     for order in [[L, R], [R, L]] {
         let shots: Vec<_> = (1..7)
-            .flat_map(|n| order.map(|eye| one(eye, n)))
+            .flat_map(|n| order.map(|side| one(side, n)))
             .filter(|s| !matches!(s, Shot::One(R, 2, ..) | Shot::One(L, 4, ..)))
             .collect();
         let (made, drops) = pairs(&shots);
@@ -495,7 +494,7 @@ fn an_eye_that_is_lost_costs_its_own_pair_alone() {
         let counts = [DropReason::Incomplete, DropReason::DeviceGap].map(|r| drops.get(r));
         assert_eq!(counts, [1, 1], "{order:?}");
     }
-    // A left picture whose partner is still to come gives way to what is known of the next one.
+    // A left image whose partner is still to come is superseded by the next one.
     let late = [one(L, 1), Shot::One(L, 2, 0, false), one(R, 1), one(R, 2), one(L, 3), one(R, 3)];
     let (made, drops) = pairs(&late);
     assert_eq!((made.as_slice(), drops.get(DropReason::Incomplete)), (&[(3, 0)][..], 1));
@@ -505,11 +504,11 @@ fn an_eye_that_is_lost_costs_its_own_pair_alone() {
 }
 
 #[test]
-fn a_pair_is_two_pictures_within_a_quarter_of_a_period() {
+fn a_pair_is_two_images_within_a_quarter_of_a_period() {
     for order in [[L, R], [R, L]] {
         for late_ns in [-8_300_000, -1, 1, 8_300_000, -8_400_000, 8_400_000, 16_000_000] {
-            let at = |eye, n| Shot::One(eye, n, if eye == R { late_ns } else { 0 }, true);
-            let shots: Vec<_> = (1..5).flat_map(|n| order.map(|eye| at(eye, n))).collect();
+            let at = |side, n| Shot::One(side, n, if side == R { late_ns } else { 0 }, true);
+            let shots: Vec<_> = (1..5).flat_map(|n| order.map(|side| at(side, n))).collect();
             let (made, drops) = pairs(&shots);
             // Its time is the left one's, and its number.
             let whole = [(1, 0), (2, 0), (3, 0), (4, 0)];
@@ -526,7 +525,7 @@ fn a_pair_is_two_pictures_within_a_quarter_of_a_period() {
 
 #[test]
 fn a_mode_that_fails_loses_its_frames_alone() {
-    let flaky = puppet("flaky", || {
+    let flaky = scripted("flaky", || {
         let mut n = 0;
         move || {
             n += 1;
@@ -538,8 +537,8 @@ fn a_mode_that_fails_loses_its_frames_alone() {
         }
     });
     let (sink, profiles) = play(
-        Made::new(PixelFormat::Yuyv, &[Shot::Wall(3); 9]),
-        options(vec![flaky, puppet("quick", || || Ok(()))]),
+        FakeCamera::new(PixelFormat::Yuyv, &[Shot::Wall(3); 9]),
+        options(vec![flaky, scripted("quick", || || Ok(()))]),
         &[],
     );
     let i = |name| index(&profiles, name);
@@ -552,9 +551,9 @@ fn a_mode_that_fails_loses_its_frames_alone() {
 #[test]
 fn a_mode_that_hangs_is_left_behind() {
     let (hangs, release) = waits("hangs");
-    let made = Made::new(PixelFormat::Yuyv, &[Shot::Wall(3); 40]);
+    let camera = FakeCamera::new(PixelFormat::Yuyv, &[Shot::Wall(3); 40]);
     let options = StereoOptions { every_pair: false, ..options(vec![hangs]) };
-    let mut stream = wrap(Box::new(made), options).unwrap().start(&[]).unwrap();
+    let mut stream = wrap(Box::new(camera), options).unwrap().start(&[]).unwrap();
     let mut sink = Strict::default();
     let limit = HostTime::now().plus(Duration::from_mins(1));
     while sink.0.delivered(0) < 40 || sink.0.delivered(2) < 1 {
@@ -571,11 +570,11 @@ fn a_mode_that_hangs_is_left_behind() {
 }
 
 #[test]
-fn eyes_that_are_exchanged_are_found_in_the_pictures() {
-    let mut made = Made::new(PixelFormat::Yuyv, &[Shot::Wall(12); 200]);
-    // The pictures of a wall, but each eye's under the other's name: the pose is that of eyes in order.
-    made.swapped = true;
-    let mut stream = wrap(Box::new(made), options(presets())).unwrap().start(&[]).unwrap();
+fn swapped_sides_are_found_in_the_images() {
+    let mut camera = FakeCamera::new(PixelFormat::Yuyv, &[Shot::Wall(12); 200]);
+    // The images of a wall, but each under the other's name: the pose is that of the right order.
+    camera.swapped = true;
+    let mut stream = wrap(Box::new(camera), options(presets())).unwrap().start(&[]).unwrap();
     let mut sink = Strict::default();
     let said = loop {
         match stream.poll(Duration::from_millis(20), &mut sink) {
@@ -592,15 +591,15 @@ fn eyes_that_are_exchanged_are_found_in_the_pictures() {
 }
 
 #[test]
-fn rows_that_are_apart_are_told_once_there_are_enough_pairs() {
-    let told = |shots: &[Shot]| {
+fn rows_that_differ_are_reported_once_there_are_enough_pairs() {
+    let reported = |shots: &[Shot]| {
         let options = options(vec![StereoMode::preset(Preset::Performance, 0.5, 1)]);
         let notice = Arc::clone(&options.notice);
         let computed = Arc::clone(&options.computed);
         // Of an earlier start, and no longer true.
         *notice.lock().unwrap() = Some("old".to_owned());
         let mut stream =
-            wrap(Box::new(Made::new(PixelFormat::Yuyv, shots)), options).unwrap().start(&[]).unwrap();
+            wrap(Box::new(FakeCamera::new(PixelFormat::Yuyv, shots)), options).unwrap().start(&[]).unwrap();
         let mut sink = Strict::default();
         while stream.poll(Duration::from_millis(20), &mut sink).unwrap() != Poll::End {}
         // The last look may still be under way.
@@ -610,7 +609,7 @@ fn rows_that_are_apart_are_told_once_there_are_enough_pairs() {
             && shots.len() >= 40
             && text().is_none_or(|t| t == "old")
         {
-            assert!(!limit.from_now().is_zero(), "nothing was told");
+            assert!(!limit.from_now().is_zero(), "nothing was reported");
             std::thread::sleep(Duration::from_millis(5));
         }
         // Datasets say that rows were moved, and by how much.
@@ -620,44 +619,47 @@ fn rows_that_are_apart_are_told_once_there_are_enough_pairs() {
         assert_eq!(all.values().all(moved), text().is_some(), "{all:?}");
         text()
     };
-    let text = told(&[Shot::LowWall(12, 2); 60]).unwrap();
+    let text = reported(&[Shot::LowWall(12, 2); 60]).unwrap();
     assert!(text.contains("2.00 ± 0.05 px lower"), "{text}");
     assert!(text.contains("calibrate it anew"), "{text}");
-    assert_eq!(told(&[Shot::LowWall(12, 2); 29]), None, "two looks are too few");
-    assert_eq!(told(&[Shot::Wall(12); 60]), None);
+    assert_eq!(reported(&[Shot::LowWall(12, 2); 29]), None, "two looks are too few");
+    assert_eq!(reported(&[Shot::Wall(12); 60]), None);
 }
 
 #[test]
 fn what_cannot_be_is_said() {
-    let refused = |device: Made, options: StereoOptions| match wrap(Box::new(device), options) {
+    let refused = |device: FakeCamera, options: StereoOptions| match wrap(Box::new(device), options) {
         Err(e) => e.to_string(),
         Ok(d) => d.start(&[]).err().map(|e| e.to_string()).unwrap_or_default(),
     };
-    let made = || Made::new(PixelFormat::Yuyv, &[]);
+    let camera = || FakeCamera::new(PixelFormat::Yuyv, &[]);
     let said = |text: String, wanted: &str| assert!(text.contains(wanted), "{text}");
-    let mut uncalibrated = made();
+    let mut uncalibrated = camera();
     uncalibrated.profiles.iter_mut().for_each(|p| p.intrinsics = Intrinsics::default());
-    said(refused(uncalibrated, options(presets())), "no calibration of its eyes at 160x96");
-    let mut swapped = made();
+    said(refused(uncalibrated, options(presets())), "no calibration of left and right at 160x96");
+    let mut swapped = camera();
     swapped.profiles[1].pose_in_device.translation_m[0] = -BASELINE;
     said(refused(swapped, options(presets())), "left and right are swapped");
-    let mut one_eyed = made();
-    one_eyed.profiles.truncate(1);
-    said(refused(one_eyed, options(presets())), "no streams \"left\" and \"right\"");
-    let mut odd = made();
+    let mut one_sided = camera();
+    one_sided.profiles.truncate(1);
+    said(refused(one_sided, options(presets())), "no streams \"left\" and \"right\"");
+    let mut odd = camera();
     odd.profiles.iter_mut().for_each(|p| p.width = 161);
     said(refused(odd, options(presets())), "161 is odd");
-    let mut colored = made();
+    let mut colored = camera();
     let color = StreamProfile { stream: Name::new("color").unwrap(), ..colored.profiles[0].clone() };
     colored.profiles.push(color);
     said(refused(colored, options(presets())), "has a stream \"color\" itself");
-    said(refused(Made::new(PixelFormat::Nv12, &[]), options(presets())), "its eyes come as nv12");
-    let quick = || puppet("quick", || || Ok(()));
-    said(refused(made(), options(vec![quick(), quick()])), "\"quick\" is listed twice");
-    said(refused(made(), options(vec![puppet("No!", || || Ok(()))])), "cannot be called \"No!\"");
     said(
-        refused(made(), StereoOptions { range_m: (2.0, 1.0), ..options(presets()) }),
-        "cannot see from 2 m to 1 m",
+        refused(FakeCamera::new(PixelFormat::Nv12, &[]), options(presets())),
+        "unsupported format nv12 of left and right",
+    );
+    let quick = || scripted("quick", || || Ok(()));
+    said(refused(camera(), options(vec![quick(), quick()])), "\"quick\" is listed twice");
+    said(refused(camera(), options(vec![scripted("No!", || || Ok(()))])), "cannot be called \"No!\"");
+    said(
+        refused(camera(), StereoOptions { range_m: (2.0, 1.0), ..options(presets()) }),
+        "invalid depth range 2 m to 1 m",
     );
     let broken = StereoMode {
         make: Arc::new(|_| {
@@ -665,7 +667,7 @@ fn what_cannot_be_is_said() {
         }),
         ..quick()
     };
-    said(refused(made(), options(vec![broken])), "\"quick\" cannot be made: no such file");
+    said(refused(camera(), options(vec![broken])), "\"quick\" cannot be made: no such file");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! The synthetic back end: simulated cameras behind the traits of every other one.
+//! The synthetic backend: simulated cameras behind the traits of every other one.
 
 use super::config::{FaultKind, SyntheticConfig};
 use super::drawing::Drawing;
@@ -6,7 +6,7 @@ use super::imu::{Batch, Filler};
 use super::pattern::Pattern;
 use super::profiles::Content;
 use super::queue::{Queue, Waiting};
-use super::render::{self, Pictures};
+use super::render::{self, Images};
 use super::unit::{DueFault, SimFrame, SimTruth, Unit};
 use super::{NAME, motion, overlay};
 use crate::{
@@ -36,7 +36,7 @@ impl SyntheticBackend {
         Self::starting_at(configs, HostTime::now())
     }
 
-    /// The same with the moment at which the mount begins to move, which makes cameras of several back ends
+    /// The same with the moment at which the mount begins to move, which makes cameras of several backends
     /// show one world.
     ///
     /// # Errors
@@ -69,7 +69,7 @@ impl SyntheticBackend {
         Ok(Self { units })
     }
 
-    /// What the camera with this serial number knows about itself.
+    /// Ground truth of the camera with this serial number.
     pub fn truth(&self, serial: &str) -> Option<SimTruth> {
         self.units.iter().find(|u| u.info.serial == serial).map(|u| SimTruth(Arc::clone(u)))
     }
@@ -141,19 +141,19 @@ impl Device for SyntheticDevice {
             } else if config.cheap {
                 Source::Pattern(Pattern::new(config.seed, p.stream.as_str(), p.format, p.width, p.height))
             } else if let Some(drawing) = &unit.drawing {
-                Source::Pictures(drawing.pictures(config, p)?)
+                Source::Images(drawing.images(config, p)?)
             } else {
-                Source::Pictures(render::pictures(config, p, &|_, _| ())?)
+                Source::Images(render::images(config, p, &|_, _| ())?)
             });
         }
         let began = unit.begin_session(profiles.len());
         let boot = unit.state().boot;
-        let lanes = profiles.iter().zip(sources).enumerate().map(|(i, (p, source))| {
+        let streams = profiles.iter().zip(sources).enumerate().map(|(i, (p, source))| {
             let content = Content::of(&p.stream).unwrap_or(Content::Color);
             let motion = p.format.is_motion();
             let exposure_ns =
                 if motion { 0 } else { unit.model.exposure_ns[usize::from(!content.is_color_view())] };
-            Lane {
+            StreamState {
                 gate: Gate::new(i, p),
                 queue: Queue::new(
                     i,
@@ -170,8 +170,8 @@ impl Device for SyntheticDevice {
                 has_strip: content == Content::Color && !motion,
             }
         });
-        let lanes = lanes.collect();
-        Ok(Box::new(SyntheticStream { lanes, profiles, hold: self.hold, is_gone: false }))
+        let streams = streams.collect();
+        Ok(Box::new(SyntheticStream { streams, profiles, hold: self.hold, is_gone: false }))
     }
 }
 
@@ -179,13 +179,13 @@ impl Device for SyntheticDevice {
 #[derive(Debug)]
 enum Source {
     Pattern(Pattern),
-    Pictures(Pictures),
+    Images(Images),
     Motion(Filler),
 }
 
 /// One stream of a running camera.
 #[derive(Debug)]
-struct Lane {
+struct StreamState {
     gate: Gate,
     queue: Queue,
     source: Source,
@@ -196,7 +196,7 @@ struct Lane {
 
 #[derive(Debug)]
 struct SyntheticStream {
-    lanes: Vec<Lane>,
+    streams: Vec<StreamState>,
     profiles: Vec<StreamProfile>,
     hold: Hold,
     is_gone: bool,
@@ -230,7 +230,7 @@ impl Stream for SyntheticStream {
             }
             let unit = &self.hold.0;
             let next = self
-                .lanes
+                .streams
                 .iter()
                 .map(|l| l.queue.next_arrival(&unit.timeline))
                 .chain(unit.state().next_fault());
@@ -258,8 +258,8 @@ impl SyntheticStream {
             let mut state = unit.state();
             let due = state.take_due(now);
             let until = due.as_ref().map_or(now, |f| f.at);
-            for lane in &mut self.lanes {
-                lane.queue.expose_until(until, &unit.timeline, state.boot);
+            for stream in &mut self.streams {
+                stream.queue.expose_until(until, &unit.timeline, state.boot);
             }
             let Some(fault) = due else { return Ok(None) };
             state.apply_to_unit(&fault);
@@ -267,31 +267,31 @@ impl SyntheticStream {
             match fault.kind {
                 FaultKind::Unplug => self.is_gone = true,
                 FaultKind::Hang => return Ok(Some(fault.until)),
-                _ => self.lanes.iter_mut().for_each(|lane| suffer(&mut lane.queue, &fault)),
+                _ => self.streams.iter_mut().for_each(|stream| suffer(&mut stream.queue, &fault)),
             }
         }
     }
 
     /// Takes the frame that arrived first of all that have arrived.
     fn next_arrived(&mut self, now: HostTime) -> Option<(usize, Waiting)> {
-        let first = |(i, l): (usize, &Lane)| l.queue.front_arrival(now).map(|at| (at, i));
-        let (_, i) = self.lanes.iter().enumerate().filter_map(first).min()?;
-        Some((i, self.lanes[i].queue.pop()?))
+        let first = |(i, l): (usize, &StreamState)| l.queue.front_arrival(now).map(|at| (at, i));
+        let (_, i) = self.streams.iter().enumerate().filter_map(first).min()?;
+        Some((i, self.streams[i].queue.pop()?))
     }
 
     /// Passes a frame through the gate, as a driver does with what its device sent.
     fn hand_over(&mut self, i: usize, waiting: &Waiting, sink: &mut dyn FrameSink) {
         let unit = &self.hold.0;
-        let lane = &mut self.lanes[i];
+        let stream = &mut self.streams[i];
         let config = &unit.config;
         let steps = motion::steps(unit.world_start, waiting.capture, config.pose_rate_hz);
         let pose = motion::to_and_fro(steps, config.poses);
-        let counted = match &mut lane.source {
+        let counted = match &mut stream.source {
             Source::Motion(filler) => filler.count(waiting.k, &waiting.boot),
             _ => waiting.k,
         };
         let sequence = counted & 0xFFFF_FFFF;
-        let whole = lane.frame_bytes;
+        let whole = stream.frame_bytes;
         let bytes = match waiting.fault {
             Some(FaultKind::HalfFrame) => whole / 2,
             Some(FaultKind::WrongSize) => whole + 64,
@@ -300,13 +300,14 @@ impl SyntheticStream {
         let mut raw = RawFrame::new(sequence, waiting.ticks, waiting.arrival, bytes);
         raw.damaged = waiting.fault == Some(FaultKind::Damaged);
         raw.exposure_ns = waiting.exposure_ns;
-        raw.gain = if matches!(lane.source, Source::Motion(_)) { 0.0 } else { 16.0 };
+        raw.gain = if matches!(stream.source, Source::Motion(_)) { 0.0 } else { 16.0 };
         let warm_s = waiting.capture.since_ns(unit.world_start) as f32 * 1e-9;
         raw.temperature_c = 38.0 - 8.0 * (-warm_s / 300.0).exp();
         raw.flags = FrameFlags::SYNTHETIC;
         let Waiting { capture, arrival, fault, lost_before, .. } = *waiting;
         unit.state().book(SimFrame { stream: i, sequence, capture, arrival, pose, fault }, lost_before);
-        let (width, has_strip) = (lane.width, lane.has_strip);
+        let width = stream.width;
+        let has_strip = stream.has_strip;
         let batch = Batch {
             k: waiting.k,
             boot: waiting.boot,
@@ -314,17 +315,17 @@ impl SyntheticStream {
             world_start: unit.world_start,
             drift_ppm: config.clock.drift_ppm,
         };
-        let source = &mut lane.source;
-        lane.gate.deliver_timed(&raw, sink, |memory, meta| {
+        let source = &mut stream.source;
+        stream.gate.deliver_timed(&raw, sink, |memory, meta| {
             match source {
                 Source::Motion(filler) => filler.fill(&batch, meta, memory),
                 Source::Pattern(pattern) => pattern.fill(sequence, memory),
-                Source::Pictures(pictures) => {
-                    let picture = pictures.get(pose);
-                    if picture.len() != memory.len() {
+                Source::Images(images) => {
+                    let image = images.get(pose);
+                    if image.len() != memory.len() {
                         return Err(DropReason::WrongSize);
                     }
-                    memory.copy_from_slice(picture);
+                    memory.copy_from_slice(image);
                     if has_strip {
                         overlay::draw(memory, width, sequence as u32);
                     }

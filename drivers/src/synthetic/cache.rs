@@ -1,9 +1,9 @@
-//! A file of rendered pictures, mapped into memory.
+//! A file of rendered images, mapped into memory.
 //!
-//! Layout, little-endian: the magic `DRSYNTH1`; u32 offset of the first picture (a multiple of 4096), u32
-//! planes, u32 poses, u32 length of the key; u64 bytes per picture, u64 bytes of the file; the key, which is
-//! everything that the pictures depend on as text; a u64 checksum per picture; a u64 checksum of all that.
-//! Then the pictures, plane by plane. A file is written under another name and renamed when it is whole, so
+//! Layout, little-endian: the magic `DRSYNTH1`; u32 offset of the first image (a multiple of 4096), u32
+//! planes, u32 poses, u32 length of the key; u64 bytes per image, u64 bytes of the file; the key, which is
+//! everything that the images depend on as text; a u64 checksum per image; a u64 checksum of all that.
+//! Then the images, plane by plane. A file is written under another name and renamed when it is complete, so
 //! one that can be opened under its name was finished; length and checksums guard against what happens later.
 #![allow(unsafe_code)] // memory-mapping a file, with the reason at the call
 
@@ -18,16 +18,16 @@ const MAGIC: &[u8; 8] = b"DRSYNTH1";
 const FIXED: usize = 40;
 const PAGE: usize = 4096;
 
-/// A set of pictures of one size: `planes` kinds, `poses` of each.
+/// A set of images of one size: `planes` kinds, `poses` of each.
 #[derive(Debug)]
-pub(crate) struct PictureFile {
+pub(crate) struct ImageFile {
     map: Mmap,
     first: usize,
     poses: u32,
     bytes: usize,
 }
 
-/// What a file must hold.
+/// Expected contents of a file.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Wanted<'a> {
     pub(crate) key: &'a str,
@@ -37,16 +37,16 @@ pub(crate) struct Wanted<'a> {
 }
 
 impl Wanted<'_> {
-    fn pictures(&self) -> usize {
+    fn images(&self) -> usize {
         self.planes as usize * self.poses as usize
     }
 
     fn first(&self) -> usize {
-        (FIXED + self.key.len() + 8 * self.pictures() + 8).next_multiple_of(PAGE)
+        (FIXED + self.key.len() + 8 * self.images() + 8).next_multiple_of(PAGE)
     }
 
     fn file_bytes(&self) -> usize {
-        self.first() + self.bytes * self.pictures()
+        self.first() + self.bytes * self.images()
     }
 
     /// The head of the file with these checksums.
@@ -69,7 +69,7 @@ impl Wanted<'_> {
     }
 }
 
-impl PictureFile {
+impl ImageFile {
     /// Opens `path` if it holds what is wanted; `None` when it does not exist or must be made anew.
     pub(crate) fn open(path: &Path, wanted: &Wanted<'_>) -> Option<Self> {
         let file = depthrig_bus::files::open(path).ok()?;
@@ -82,7 +82,7 @@ impl PictureFile {
         let map = unsafe { Mmap::map(&file) }.ok()?;
         let sums_at = FIXED + wanted.key.len();
         let sums: Vec<u64> = map
-            .get(sums_at..sums_at + 8 * wanted.pictures())?
+            .get(sums_at..sums_at + 8 * wanted.images())?
             .chunks_exact(8)
             .filter_map(|b| b.try_into().ok().map(u64::from_le_bytes))
             .collect();
@@ -91,19 +91,19 @@ impl PictureFile {
         }
         let opened = Self { map, first: wanted.first(), poses: wanted.poses, bytes: wanted.bytes };
         // The ends, where a disk that was full or a power cut leaves zeros.
-        let last = wanted.pictures() - 1;
-        let is_whole = [0, last].iter().all(|i| checksum(opened.picture(*i)) == sums[*i]);
+        let last = wanted.images() - 1;
+        let is_whole = [0, last].iter().all(|i| checksum(opened.image(*i)) == sums[*i]);
         is_whole.then_some(opened)
     }
 
-    /// Makes `path` of pictures that `picture(plane, pose)` yields, in that order, and opens it.
+    /// Makes `path` of images that `image(plane, pose)` yields, in that order, and opens it.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] naming the file when it cannot be written, and those of `picture`; no file is left then.
+    /// [`ErrorKind::Io`] naming the file when it cannot be written, and those of `image`; no file is left then.
     pub(crate) fn create(
         path: &Path,
         wanted: &Wanted<'_>,
-        mut picture: impl FnMut(u32) -> Result<Vec<Vec<u8>>>,
+        mut image: impl FnMut(u32) -> Result<Vec<Vec<u8>>>,
     ) -> Result<Self> {
         let io = |e: std::io::Error| {
             let what =
@@ -121,11 +121,11 @@ impl PictureFile {
         }
         let mut temporary = Temporary::beside(path);
         let mut file = File::create(&temporary.path).map_err(io)?;
-        let mut sums = vec![0; wanted.pictures()];
+        let mut sums = vec![0; wanted.images()];
         for pose in 0..wanted.poses {
-            for (plane, bytes) in picture(pose)?.iter().enumerate() {
+            for (plane, bytes) in image(pose)?.iter().enumerate() {
                 if bytes.len() != wanted.bytes || plane >= wanted.planes as usize {
-                    let message = format!("{}: a rendered picture has the wrong size", path.display());
+                    let message = format!("{}: a rendered image has the wrong size", path.display());
                     return Err(Error::new(ErrorKind::Io, message));
                 }
                 let i = plane * wanted.poses as usize + pose as usize;
@@ -146,12 +146,12 @@ impl PictureFile {
         })
     }
 
-    /// The picture of `plane` at `pose`; poses beyond the last show the last.
+    /// The image of `plane` at `pose`; poses beyond the last show the last.
     pub(crate) fn get(&self, plane: u32, pose: u32) -> &[u8] {
-        self.picture((plane * self.poses + pose.min(self.poses - 1)) as usize)
+        self.image((plane * self.poses + pose.min(self.poses - 1)) as usize)
     }
 
-    fn picture(&self, i: usize) -> &[u8] {
+    fn image(&self, i: usize) -> &[u8] {
         let start = self.first + i * self.bytes;
         self.map.get(start..start + self.bytes).unwrap_or_default()
     }
@@ -195,42 +195,42 @@ mod tests {
 
     const WANTED: Wanted<'static> = Wanted { key: "a key", planes: 2, poses: 3, bytes: 5000 };
 
-    fn picture(pose: u32) -> Vec<Vec<u8>> {
+    fn image(pose: u32) -> Vec<Vec<u8>> {
         (0..2).map(|plane| (0..5000u32).map(|i| (i * 7 + plane * 11 + pose * 13) as u8).collect()).collect()
     }
 
     #[test]
     fn what_is_written_is_read_and_anything_else_is_refused() {
         let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("deep/er/file.pictures");
-        assert!(PictureFile::open(&path, &WANTED).is_none());
-        let made = PictureFile::create(&path, &WANTED, |pose| Ok(picture(pose))).unwrap();
+        let path = dir.path().join("deep/er/file.images");
+        assert!(ImageFile::open(&path, &WANTED).is_none());
+        let made = ImageFile::create(&path, &WANTED, |pose| Ok(image(pose))).unwrap();
         for pose in 0..3 {
-            assert_eq!(made.get(0, pose), picture(pose)[0]);
-            assert_eq!(made.get(1, pose), picture(pose)[1]);
+            assert_eq!(made.get(0, pose), image(pose)[0]);
+            assert_eq!(made.get(1, pose), image(pose)[1]);
         }
         assert_eq!(made.get(0, 99), made.get(0, 2));
-        assert!(PictureFile::open(&path, &WANTED).is_some());
+        assert!(ImageFile::open(&path, &WANTED).is_some());
         for other in [
             Wanted { key: "b key", ..WANTED },
             Wanted { poses: 2, ..WANTED },
             Wanted { planes: 3, poses: 2, ..WANTED },
             Wanted { bytes: 4999, ..WANTED },
         ] {
-            assert!(PictureFile::open(&path, &other).is_none(), "{other:?}");
+            assert!(ImageFile::open(&path, &other).is_none(), "{other:?}");
         }
         let good = std::fs::read(&path).unwrap();
-        // One byte of the head, of the index, of the first and of the last picture; and a cut.
+        // One byte of the head, of the index, of the first and of the last image; and a cut.
         for at in [3, 41, 60, 4096 + 17, good.len() - 1] {
             let mut bad = good.clone();
             bad[at] ^= 0x10;
             std::fs::write(&path, &bad).unwrap();
-            assert!(PictureFile::open(&path, &WANTED).is_none(), "byte {at}");
+            assert!(ImageFile::open(&path, &WANTED).is_none(), "byte {at}");
         }
         std::fs::write(&path, &good[..good.len() - 1]).unwrap();
-        assert!(PictureFile::open(&path, &WANTED).is_none());
+        assert!(ImageFile::open(&path, &WANTED).is_none());
         std::fs::write(&path, &good).unwrap();
-        assert!(PictureFile::open(&path, &WANTED).is_some());
+        assert!(ImageFile::open(&path, &WANTED).is_some());
         assert_eq!(
             std::fs::read_dir(path.parent().unwrap()).unwrap().count(),
             1,
@@ -243,7 +243,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("in_the_way");
         std::fs::write(&file, b"x").unwrap();
-        let e = PictureFile::create(&file.join("a.pictures"), &WANTED, |pose| Ok(picture(pose)));
+        let e = ImageFile::create(&file.join("a.images"), &WANTED, |pose| Ok(image(pose)));
         let e = e.unwrap_err();
         assert!(e.to_string().contains("in_the_way") && e.to_string().contains("cache_dir"), "{e}");
         assert_eq!(e.kind(), ErrorKind::Io);

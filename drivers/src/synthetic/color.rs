@@ -1,4 +1,4 @@
-//! The colour picture: one lamp with a soft shadow, light from all around, mirrors, glass, and the noise of a
+//! The colour image: one lamp with a soft shadow, light from all around, mirrors, glass, and the noise of a
 //! real sensor.
 
 use super::noise::{Rolls, normal_of};
@@ -15,14 +15,15 @@ const NOISE: f32 = 1.3;
 /// Bayer's 4x4 matrix.
 const DITHER: [usize; 16] = [0, 8, 2, 10, 12, 4, 14, 6, 3, 11, 1, 9, 15, 7, 13, 5];
 
-/// Renders an RGB8 picture.
+/// Renders an RGB8 image.
 pub(crate) fn render(world: &World, view: &View<'_>, white: [f32; 3], seed: u64) -> Vec<u8> {
     let mets = view.cast(world);
-    let (w, h) = (view.rays.width, view.rays.height);
-    let mut picture = vec![0; w * h * 3];
+    let w = view.rays.width;
+    let h = view.rays.height;
+    let mut image = vec![0; w * h * 3];
     let tone = Tone::new(white);
     let lamp = places_on_lamp();
-    picture.par_chunks_mut(w * TILE * 3).enumerate().for_each(|(band, out)| {
+    image.par_chunks_mut(w * TILE * 3).enumerate().for_each(|(band, out)| {
         for tile in view.tiles(band * TILE) {
             let Some(shader) = Shader::new(world, view, &mets, &tile, &lamp) else { continue };
             for y in tile.ys.clone() {
@@ -38,13 +39,14 @@ pub(crate) fn render(world: &World, view: &View<'_>, white: [f32; 3], seed: u64)
             }
         }
     });
-    picture
+    image
 }
 
 /// Four places on the lamp's disc, spread evenly, for each of 16 phases: in metres from its middle.
 fn places_on_lamp() -> [[f32; 2]; 64] {
     core::array::from_fn(|n| {
-        let (i, phase) = ((n / 16) as f32, (n % 16) as f32);
+        let i = (n / 16) as f32;
+        let phase = (n % 16) as f32;
         let (sin, cos) = ((i * 0.618 + phase / 16.0) * core::f32::consts::TAU).sin_cos();
         let radius = LAMP.1 * ((i + 0.2 + phase / 20.0) / 4.0).sqrt();
         [radius * cos, radius * sin]
@@ -93,11 +95,13 @@ impl<'a> Shader<'a> {
         })
     }
 
-    /// The light that a pixel gets; with four rays where the picture has an edge.
+    /// The light that a pixel gets; with four rays where the image has an edge.
     fn pixel(&self, mets: &[Met], x: usize, y: usize, met: Met) -> Vec3 {
-        let (eye, dir) = (self.view.eye, self.view.dir(x, y));
-        let spot = self.world.spot(eye, dir, met);
-        let (w, h) = (self.view.rays.width, self.view.rays.height);
+        let origin = self.view.origin;
+        let dir = self.view.dir(x, y);
+        let spot = self.world.spot(origin, dir, met);
+        let w = self.view.rays.width;
+        let h = self.view.rays.height;
         let key = |x: usize, y: usize| mets[y * w + x].key;
         let is_edge = (x > 0 && key(x - 1, y) != met.key)
             || (x + 1 < w && key(x + 1, y) != met.key)
@@ -114,8 +118,8 @@ impl<'a> Shader<'a> {
             [(-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375)].into_iter().enumerate()
         {
             let dir = self.view.dir_between(x, y, dx, dy);
-            let met = self.world.meet(&self.seen, eye, dir);
-            let spot = self.world.spot(eye, dir, met);
+            let met = self.world.meet(&self.seen, origin, dir);
+            let spot = self.world.spot(origin, dir, met);
             // The spots between pixels of an edge may lie outside what the tile's lists were made for.
             let is_outside = (spot.p - self.extent.center).length() > self.extent.radius;
             let around = if is_outside { Around { shading: &self.all, near: &self.all } } else { around };
@@ -177,7 +181,7 @@ impl<'a> Shader<'a> {
         }
     }
 
-    /// What comes along a ray that leaves a spot.
+    /// Light along a ray that leaves a spot.
     fn follow(&self, spot: &Spot, dir: Vec3, bounces: u32) -> Vec3 {
         if bounces == 0 {
             return Vec3::new(0.3, 0.3, 0.3);
@@ -231,7 +235,7 @@ impl Tone {
         let light = light * self.white * 0.78;
         core::array::from_fn(|c| {
             let at = (light[c] * 1023.75).clamp(0.0, 4095.0) as usize;
-            // One draw serves three channels: bits are taken at other places, and eyes do not mind.
+            // One draw serves three channels: bits are taken at other places, and that is not visible.
             let noise = normal_of(rolls.rotate_left(c as u32 * 21).wrapping_mul(0x9E37_79B9_7F4A_7C15));
             (self.curve[at] + noise * NOISE + 0.5).clamp(0.0, 255.0) as u8
         })

@@ -13,21 +13,21 @@ use std::path::PathBuf;
 pub struct SyntheticConfig {
     /// `d405`, `d415`, `d435`, `d455`, `l515`, `zed2i`, `kinect` or `generic`; see [`super::models`].
     pub model: String,
-    /// Serial number; what tells two cameras of a model apart. Empty: made up from the model.
+    /// Serial number; distinguishes two cameras of a model. Empty: derived from the model.
     pub serial: String,
     /// Seed of everything random: sensor noise, jitter, stalls.
     pub seed: u64,
     /// Pose of the camera on the mount (x right, y down, z forward, as an optical frame).
     pub pose_on_mount: Pose,
-    /// What differs from the model's default modes.
+    /// Overrides of the model's default modes.
     pub streams: Vec<StreamOverride>,
     /// Whether the true depth is given too: `depth_true` in the view of `depth`, `depth_true_color` in that of `color`.
     pub truth: bool,
-    /// Whether it has a motion unit, as the stream `imu`: see [`super::imu`].
+    /// Whether it has an IMU, as the stream `imu`: see [`super::imu`].
     pub motion: bool,
     /// The device's clock and its transport.
     pub clock: ClockSim,
-    /// What goes wrong, and when.
+    /// Scheduled faults.
     pub faults: Vec<ScheduledFault>,
     /// Poses of the mount that are rendered; they are shown to and fro.
     pub poses: u32,
@@ -37,7 +37,7 @@ pub struct SyntheticConfig {
     pub phase: f64,
     /// Folder of the render cache.
     pub cache_dir: PathBuf,
-    /// No pictures: a pattern that costs one memory copy per frame and can be checked. Any size is allowed.
+    /// No images: a pattern that costs one memory copy per frame and can be checked. Any size is allowed.
     pub cheap: bool,
     /// Frames that the device keeps while nobody fetches them; older ones are lost.
     pub ring_frames: u32,
@@ -65,7 +65,7 @@ impl Default for SyntheticConfig {
     }
 }
 
-/// Where rendered pictures are kept when nothing is said: `$XDG_CACHE_HOME/depthrig/synthetic`, else
+/// Where rendered images are kept when nothing is said: `$XDG_CACHE_HOME/depthrig/synthetic`, else
 /// `~/.cache/depthrig/synthetic`, else a folder of the system's temporary directory.
 pub fn default_cache_dir() -> PathBuf {
     let absolute = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|p| p.is_absolute());
@@ -94,7 +94,7 @@ pub struct StreamOverride {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ClockSim {
-    /// What the counter (of microseconds) shows when the device is switched on; near `2^counter_bits` it
+    /// Value of the counter (of microseconds) when the device is switched on; near `2^counter_bits` it
     /// wraps soon.
     pub start_ticks: u64,
     /// Width of the counter in bits.
@@ -143,7 +143,7 @@ impl Default for ClockSim {
 pub struct ScheduledFault {
     /// When, in seconds after the device first began to stream.
     pub at_s: f64,
-    /// What.
+    /// Kind of the fault.
     pub kind: FaultKind,
     /// For how long, where that matters: until the replug, the end of the stall, …; how far for
     /// `time_backwards`.
@@ -162,7 +162,7 @@ const fn one() -> u32 {
     1
 }
 
-/// What can go wrong with a camera.
+/// Kind of a fault of a camera.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
@@ -228,30 +228,30 @@ impl SyntheticConfig {
         let pose = self.pose_on_mount.translation_m.iter().chain(&self.pose_on_mount.rotation_xyzw);
         let finite = |values: &[f64]| values.iter().all(|v| v.is_finite() && (0.0..1e9).contains(v));
         let problem = if !(1..=240).contains(&self.poses) {
-            Some(format!("poses = {} is not within 1..=240", self.poses))
+            Some(format!("poses = {} is out of range 1..=240", self.poses))
         } else if !(self.pose_rate_hz > 0.0 && self.pose_rate_hz <= 1000.0) {
-            Some(format!("pose_rate_hz = {} is not within 0..=1000 (and above 0)", self.pose_rate_hz))
+            Some(format!("pose_rate_hz = {} is out of range 0..=1000 (and above 0)", self.pose_rate_hz))
         } else if !(0.0..1.0).contains(&self.phase) {
-            Some(format!("phase = {} is not within 0..1 of a frame period", self.phase))
+            Some(format!("phase = {} is out of range 0..1 of a frame period", self.phase))
         } else if !pose.clone().all(|v| v.is_finite()) {
             Some("pose_on_mount has a value that is not finite".to_owned())
         } else if !(2..=1024).contains(&self.ring_frames) {
-            Some(format!("ring_frames = {} is not within 2..=1024", self.ring_frames))
+            Some(format!("ring_frames = {} is out of range 2..=1024", self.ring_frames))
         } else if !(16..=64).contains(&c.counter_bits) {
-            Some(format!("clock.counter_bits = {} is not within 16..=64", c.counter_bits))
+            Some(format!("clock.counter_bits = {} is out of range 16..=64", c.counter_bits))
         } else if !(c.drift_ppm.abs() <= 10_000.0 && c.thermal_ppm.abs() <= 10_000.0) {
             Some("clock.drift_ppm and clock.thermal_ppm must be within ±10000".to_owned())
         } else if !(c.thermal_period_s >= 1.0 && c.thermal_period_s.is_finite()) {
             Some(format!("clock.thermal_period_s = {} is below 1", c.thermal_period_s))
         } else if !finite(&[c.stamp_jitter_us, c.latency_ms, c.latency_jitter_ms, c.stall_ms.0, c.stall_ms.1])
         {
-            Some("clock has a latency, jitter or stall that is negative or no number".to_owned())
+            Some("clock has a latency, jitter or stall that is negative or not a number".to_owned())
         } else if !(0.0..=1.0).contains(&c.stall_probability) || c.stall_ms.0 > c.stall_ms.1 {
             Some(
                 "clock.stall_probability must be within 0..=1 and clock.stall_ms be [least, most]".to_owned(),
             )
         } else if !finite(&c.reset_at_s) {
-            Some("clock.reset_at_s has a moment that is negative or no number".to_owned())
+            Some("clock.reset_at_s has a moment that is negative or not a number".to_owned())
         } else {
             self.faults.iter().find(|f| !finite(&[f.at_s, f.duration_s]) || f.count == 0).map(|f| {
                 format!(

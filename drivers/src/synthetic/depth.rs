@@ -1,7 +1,7 @@
-//! Depth pictures: the true one, and what a sensor would report.
+//! Depth images: the true one, and what a sensor would report.
 //!
 //! The truth is the depth (z of the optical frame) of the first surface, glass and mirrors included. The
-//! sensor's picture begins with what the light really did (through the glass, off the mirror) and then goes
+//! sensor's image begins with what the light really did (through the glass, off the mirror) and then goes
 //! the way of its principle: [`stereo`] or [`tof`].
 
 use super::models::{DepthPrinciple, Model};
@@ -14,7 +14,7 @@ use rayon::prelude::*;
 mod stereo;
 mod tof;
 
-/// What a sensor's pixel has to work with, before noise.
+/// Input of a sensor's pixel, before noise.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Sample {
     /// Depth at which the light seems to come from; 0 when none comes back.
@@ -43,13 +43,13 @@ const NO_SAMPLE: Sample = Sample {
     is_hidden: false,
 };
 
-/// A sensor's picture and the truth, both in counts of the model's depth unit.
+/// A sensor's image and the truth, both in counts of the model's depth unit.
 pub(crate) struct DepthPair {
     pub(crate) sensed: Vec<u16>,
     pub(crate) truth: Vec<u16>,
 }
 
-/// Renders both pictures.
+/// Renders both images.
 pub(crate) fn render(world: &World, view: &View<'_>, model: &Model, seed: u64) -> DepthPair {
     let mets = view.cast(world);
     let samples = sample(world, view, &mets, model.depth);
@@ -77,20 +77,20 @@ fn counts(z_m: f32, unit_m: f64) -> u16 {
 /// Follows the light of every pixel.
 fn sample(world: &World, view: &View<'_>, mets: &[Met], principle: DepthPrinciple) -> Vec<Sample> {
     let w = view.rays.width;
-    let second_eye = match principle {
-        DepthPrinciple::Stereo { baseline_m, .. } => Some(view.eye + view.axes.x_axis * baseline_m),
+    let second_camera = match principle {
+        DepthPrinciple::Stereo { baseline_m, .. } => Some(view.origin + view.axes.x_axis * baseline_m),
         DepthPrinciple::TimeOfFlight { .. } => None,
     };
     let all = world.all();
     let mut samples = vec![NO_SAMPLE; mets.len()];
     samples.par_chunks_mut(w * TILE).enumerate().for_each(|(band, out)| {
         for tile in view.tiles(band * TILE) {
-            let Some(lists) = Lists::new(world, view, mets, &tile, second_eye) else { continue };
+            let Some(lists) = Lists::new(world, view, mets, &tile, second_camera) else { continue };
             for y in tile.ys.clone() {
                 for x in tile.xs.clone() {
                     let met = mets[y * w + x];
                     if met != NOTHING {
-                        let one = trace(world, view.eye, view.dir(x, y), met, &all);
+                        let one = trace(world, view.origin, view.dir(x, y), met, &all);
                         out[(y - band * TILE) * w + x] = lists.finish(world, one);
                     }
                 }
@@ -102,7 +102,7 @@ fn sample(world: &World, view: &View<'_>, mets: &[Met], principle: DepthPrincipl
 
 /// The solids that matter to a tile.
 struct Lists {
-    second_eye: Option<Vec3>,
+    second_camera: Option<Vec3>,
     hiding: Vec<u16>,
     near: Vec<u16>,
 }
@@ -113,21 +113,21 @@ impl Lists {
         view: &View<'_>,
         mets: &[Met],
         tile: &Tile,
-        second_eye: Option<Vec3>,
+        second_camera: Option<Vec3>,
     ) -> Option<Self> {
         let extent = view.extent(mets, tile)?;
-        let hiding = second_eye
-            .map(|eye| between(world, extent, Ball { center: eye, radius: 0.0 }))
+        let hiding = second_camera
+            .map(|origin| between(world, extent, Ball { center: origin, radius: 0.0 }))
             .unwrap_or_default();
         let reach = Ball { center: extent.center, radius: extent.radius + 0.17 };
-        let near = if second_eye.is_none() { between(world, reach, reach) } else { Vec::new() };
-        Some(Self { second_eye, hiding, near })
+        let near = if second_camera.is_none() { between(world, reach, reach) } else { Vec::new() };
+        Some(Self { second_camera, hiding, near })
     }
 
     /// Adds what depends on the surroundings of the first surface.
     fn finish(&self, world: &World, (mut sample, spot): (Sample, super::scene::Spot)) -> Sample {
-        match self.second_eye {
-            Some(eye) => sample.is_hidden = world.is_blocked(&self.hiding, &spot, eye),
+        match self.second_camera {
+            Some(origin) => sample.is_hidden = world.is_blocked(&self.hiding, &spot, origin),
             None => sample.open = world.openness(&self.near, &spot),
         }
         sample
@@ -135,8 +135,8 @@ impl Lists {
 }
 
 /// Follows one ray until something sends its light back.
-fn trace(world: &World, eye: Vec3, dir: Vec3, met: Met, all: &[u16]) -> (Sample, super::scene::Spot) {
-    let spot = world.spot(eye, dir, met);
+fn trace(world: &World, origin: Vec3, dir: Vec3, met: Met, all: &[u16]) -> (Sample, super::scene::Spot) {
+    let spot = world.spot(origin, dir, met);
     let surface = spot.paint.surface();
     let facing = -spot.n.dot(dir.normalize());
     let own = spot.paint.infrared();
@@ -156,7 +156,8 @@ fn trace(world: &World, eye: Vec3, dir: Vec3, met: Met, all: &[u16]) -> (Sample,
         _ => None,
     };
     if let Some(mut onward) = onward {
-        let (mut from, mut z) = (spot.p, met.t);
+        let mut from = spot.p;
+        let mut z = met.t;
         for _ in 0..4 {
             let next = world.meet(all, from + onward * 5e-4, onward);
             z += next.t + 5e-4;
@@ -204,7 +205,8 @@ mod tests {
             let (k, pair) = pair(name, 3);
             let camera = motion::mount(3, 12);
             for (i, counts) in pair.truth.iter().enumerate() {
-                let (x, y) = ((i % 240) as f64, (i / 240) as f64);
+                let x = (i % 240) as f64;
+                let y = (i / 240) as f64;
                 let ray = glam::DVec3::new((x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.0);
                 let p = camera.transform_point3(ray * f64::from(*counts) * unit).as_vec3();
                 let off = world.distance(p).abs();

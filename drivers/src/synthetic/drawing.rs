@@ -1,9 +1,9 @@
-//! Rendering beside the cameras: they stream at once, coarse images of a standing mount first, and show the moving scene
-//! as soon as it is rendered. What is in the cache is not rendered.
+//! Rendering beside the cameras: they stream at once, coarse images of a standing mount first, and show the moving
+//! scene as soon as it is rendered. What is in the cache is not rendered.
 
 use super::config::SyntheticConfig;
 use super::profiles::default_profiles;
-use super::render::{Album, Pictures, Scene};
+use super::render::{Album, Images, Scene};
 use crate::{Error, ErrorKind, Result, StreamProfile};
 use core::time::Duration;
 use std::collections::{HashMap, HashSet, VecDeque};
@@ -51,7 +51,8 @@ impl Drawing {
         (progress.done < progress.total).then_some(progress)
     }
 
-    /// Plans the scenes of the camera's usual streams, so that [`Self::progress`] knows of them before the camera opens.
+    /// Plans the scenes of the camera's usual streams, so that [`Self::progress`] knows of them before the camera
+    /// opens.
     ///
     /// # Errors
     /// Those of a wrong configuration.
@@ -68,28 +69,28 @@ impl Drawing {
         Ok(())
     }
 
-    /// What a stream shows: out of the cache, or a sketch until [`Self::run`] has rendered it.
-    pub(crate) fn pictures(&self, config: &SyntheticConfig, profile: &StreamProfile) -> Result<Pictures> {
+    /// The images of a stream: out of the cache, or a sketch until [`Self::run`] has rendered it.
+    pub(crate) fn images(&self, config: &SyntheticConfig, profile: &StreamProfile) -> Result<Images> {
         let scene = Scene::new(config, profile)?;
         if let Some(album) = self.lock().albums.get(&scene.path) {
-            return Ok(scene.pictures(album));
+            return Ok(scene.images(album));
         }
         if let Some(file) = scene.cached() {
             let album = Album::default();
             album.finish(file);
-            return Ok(scene.pictures(&Arc::new(album)));
+            return Ok(scene.images(&Arc::new(album)));
         }
         let album = Arc::new(Album::sketched(scene.sketch()));
-        let pictures = scene.pictures(&album);
+        let images = scene.images(&album);
         let mut state = self.lock();
         // It may have been rendered meanwhile.
         if let Some(file) = scene.cached() {
             album.finish(file);
-            return Ok(pictures);
+            return Ok(images);
         }
         state.albums.insert(scene.path.clone(), album);
         want(&mut state, scene);
-        Ok(pictures)
+        Ok(images)
     }
 
     /// Renders what cameras ask for, until `stop`; for a thread of its own.
@@ -172,7 +173,8 @@ mod tests {
                 bytes.iter().map(|v| f64::from(*v)).collect()
             }
         };
-        let (a, b) = (values(a), values(b));
+        let a = values(a);
+        let b = values(b);
         a.iter().zip(&b).map(|(a, b)| (a - b).abs()).sum::<f64>() / a.len() as f64
     }
 
@@ -184,7 +186,7 @@ mod tests {
         drawing.plan(&config_beside).unwrap();
         let planned = drawing.progress().unwrap();
         let profiles: Vec<_> = default_profiles(&config_beside).unwrap();
-        let shown: Vec<_> = profiles.iter().map(|p| drawing.pictures(&config_beside, p).unwrap()).collect();
+        let shown: Vec<_> = profiles.iter().map(|p| drawing.images(&config_beside, p).unwrap()).collect();
         let progress = drawing.progress().unwrap();
         assert_eq!(progress, planned, "opening the camera adds nothing to the plan");
         assert_eq!((progress.done, progress.error), (0, None));
@@ -199,7 +201,7 @@ mod tests {
             stop.store(true, Ordering::Relaxed);
         });
         for ((profile, shown), coarse) in profiles.iter().zip(&shown).zip(&coarse) {
-            let fine = render::pictures(&config(before.path()), profile, &|_, _| ()).unwrap();
+            let fine = render::images(&config(before.path()), profile, &|_, _| ()).unwrap();
             for pose in 0..3 {
                 assert_eq!(shown.get(pose), fine.get(pose), "{} at pose {pose}", profile.stream);
             }
@@ -215,7 +217,7 @@ mod tests {
         }
         // Another start finds all of it in the cache.
         let again = Drawing::default();
-        let found = again.pictures(&config_beside, &profiles[0]).unwrap();
+        let found = again.images(&config_beside, &profiles[0]).unwrap();
         assert!(again.progress().is_none() && found.get(1) == shown[0].get(1));
     }
 
@@ -225,7 +227,7 @@ mod tests {
         let config = config(cache.path());
         let drawing = Drawing::default();
         let profiles = default_profiles(&config).unwrap();
-        drawing.pictures(&config, &profiles[0]).unwrap();
+        drawing.images(&config, &profiles[0]).unwrap();
         let scene = drawing.lock().to_do.pop_front().unwrap();
         drawing.draw(&scene, &AtomicBool::new(true));
         assert_eq!(std::fs::read_dir(cache.path()).unwrap().count(), 0);
@@ -240,7 +242,7 @@ mod tests {
         let config = config(&file.join("deeper"));
         let drawing = Drawing::default();
         let profiles = default_profiles(&config).unwrap();
-        let shown = drawing.pictures(&config, &profiles[0]).unwrap();
+        let shown = drawing.images(&config, &profiles[0]).unwrap();
         let scene = drawing.lock().to_do.pop_front().unwrap();
         drawing.draw(&scene, &AtomicBool::new(false));
         let error = drawing.progress().unwrap().error.unwrap();

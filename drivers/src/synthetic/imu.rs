@@ -1,10 +1,11 @@
-//! The motion unit of a simulated camera: a swing that is known to the last digit at every moment.
+//! The IMU of a simulated camera: a swing that is known to the last digit at every moment.
 //!
-//! The unit turns to and fro about one axis that stays where it is, `θ(t) = A sin(2π t / T)` with `t` from the moment at
-//! which the mount began to move, so that everything follows from the time alone ([`truth`]). It is not the motion that the
-//! pictures show, whose mount steps from pose to pose: a step has no angular velocity.
+//! The unit turns to and fro about one axis that stays where it is, `θ(t) = A sin(2π t / T)` with `t` from the moment
+//! at which the mount began to move, so that everything follows from the time alone ([`truth`]). It is not the motion
+//! that the images show, whose mount steps from pose to pose: a step has no angular velocity.
 //!
-//! Its batches travel as the camera's frames do, with the same clock, transport and faults; a batch counts as one frame.
+//! Its batches travel as the camera's frames do, with the same clock, transport and faults; a batch counts as one
+//! frame.
 
 use super::timeline::Boot;
 use crate::{DeviceClock, FrameMeta, StreamProfile};
@@ -27,12 +28,13 @@ const AXIS: [f64; 3] = [1.0 / 3.0, 2.0 / 3.0, 2.0 / 3.0];
 const SWING_RAD: f64 = 0.3;
 /// From one end of the swing to the same end, seconds.
 const SWING_S: f64 = 4.0;
-/// What a unit at rest measures, along -y when it lies level as an optical frame does (ISO 80000-3: standard gravity).
+/// Acceleration that an IMU at rest measures, along -y when it lies level as an optical frame does (ISO 80000-3:
+/// standard gravity).
 const UP_M_S2: [f64; 3] = [0.0, -9.806_65, 0.0];
 /// Where it sits in the camera.
 const POSE: Pose = Pose { translation_m: [0.012, -0.004, 0.006], ..Pose::IDENTITY };
 
-/// What the unit measures `t_s` seconds after the mount began to move, without an error: angular velocity (rad/s) and
+/// True values `t_s` seconds after the mount began to move: angular velocity (rad/s) and
 /// acceleration (m/s²) in its own frame.
 pub fn truth(t_s: f64) -> ([f64; 3], [f64; 3]) {
     let (sin, cos) = (TAU * t_s / SWING_S).sin_cos();
@@ -78,7 +80,7 @@ pub(crate) struct Batch {
     pub(crate) drift_ppm: f64,
 }
 
-/// What the driver keeps of the batches before.
+/// State that the driver keeps between batches.
 #[derive(Debug, Default)]
 pub(crate) struct Filler {
     /// The last batch that was delivered: number of its newest sample, its mapped time, and its epoch.
@@ -88,8 +90,8 @@ pub(crate) struct Filler {
 }
 
 impl Filler {
-    /// Number of batch `k` of a boot as the driver counts them: they go on when the device starts afresh. Batches are rare,
-    /// and a counter that went back by a few of them would look like stragglers to the gate.
+    /// Number of batch `k` of a boot as the driver counts them: they go on when the device starts afresh. Batches are
+    /// rare, and a counter that went back by a few of them would look like stragglers to the gate.
     pub(crate) fn count(&mut self, k: u64, boot: &Boot) -> u64 {
         let (counted, added, newest) = &mut self.counted;
         if *counted != boot.number {
@@ -157,9 +159,11 @@ mod tests {
     fn the_truth_is_a_turn_that_gravity_agrees_with() {
         // d/dt of a constant vector seen from a frame that turns with ω is -ω × it.
         for i in 0..400 {
-            let (t, h) = (f64::from(i) * 0.01, 1e-5);
+            let t = f64::from(i) * 0.01;
+            let h = 1e-5;
             let (w, a) = truth(t);
-            let (before, after) = (truth(t - h).1, truth(t + h).1);
+            let before = truth(t - h).1;
+            let after = truth(t + h).1;
             let turned = [w[1] * a[2] - w[2] * a[1], w[2] * a[0] - w[0] * a[2], w[0] * a[1] - w[1] * a[0]];
             for c in 0..3 {
                 let slope = (after[c] - before[c]) / (2.0 * h);
@@ -180,7 +184,7 @@ mod tests {
                 let life_ns = 130_777_777;
                 let at = world_start.plus_ns(i64::from(number) * life_ns);
                 let boot = Boot { number, at, set_back_us: 0 };
-                // What is exposed before the next start.
+                // Samples until the next start.
                 for k in 0..(life_ns as f64 * (1.0 + drift_ppm * 1e-6) / PERIOD_NS / 8.0) as u64 {
                     let batch = Batch { k, boot, capture: at, world_start, drift_ppm };
                     let oldest = batch.newest() + 1 - u64::from(BATCH);

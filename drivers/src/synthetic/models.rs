@@ -27,7 +27,7 @@ pub struct Model {
     pub color_in_device: Pose,
     /// Exposure time of colour and of depth, nanoseconds.
     pub exposure_ns: [u64; 2],
-    /// What the colour sensor does to white: factors of red, green, blue.
+    /// White balance of the colour sensor: factors of red, green, blue.
     pub white: [f32; 3],
 }
 
@@ -51,12 +51,12 @@ pub enum DepthPrinciple {
         sigma_m: f32,
         /// Depth added in a deep corner by light that took a detour, metres.
         multipath_m: f32,
-        /// The light's field ends at this angle from the axis, degrees: a circle in the picture.
+        /// The light's field ends at this angle from the axis, degrees: a circle in the image.
         half_angle_deg: f32,
     },
 }
 
-/// One picture size.
+/// One image size.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Mode {
     /// Pixels per row.
@@ -81,14 +81,16 @@ pub enum Lens {
 }
 
 /// Rational coefficients `k1 k2 p1 p2 k3 k4 k5 k6` of the size that the Azure Kinect's depth cameras carry;
-/// they put 60° off axis at 522 px for a focal length of 504 px, the edge of the 1024-px picture.
+/// they put 60° off axis at 522 px for a focal length of 504 px, the edge of the 1024-px image.
 const KINECT_DEPTH: [f64; 8] = [1.147, 0.2557, 2.5e-5, 7.5e-5, 0.00358, 1.4849, 0.5187, 0.0451];
 
 impl Mode {
     /// Intrinsics with the principal point `off` (a fraction of width and height) from the centre.
     pub fn intrinsics(&self, off: [f64; 2]) -> Intrinsics {
-        let (w, h) = (f64::from(self.width), f64::from(self.height));
-        let (cx, cy) = ((w - 1.0) / 2.0 + off[0] * w, (h - 1.0) / 2.0 + off[1] * h);
+        let w = f64::from(self.width);
+        let h = f64::from(self.height);
+        let cx = (w - 1.0) / 2.0 + off[0] * w;
+        let cy = (h - 1.0) / 2.0 + off[1] * h;
         let k = Intrinsics::pinhole(self.focal_px, self.focal_px, cx, cy);
         match self.lens {
             Lens::Pinhole => k,

@@ -27,16 +27,16 @@ pub(crate) fn steps(world_start: HostTime, t: HostTime, pose_rate_hz: f64) -> u6
 pub(crate) fn mount(index: u32, poses: u32) -> DAffine3 {
     let s = if poses < 2 { 0.5 } else { f64::from(index) / f64::from(poses - 1) };
     let swing = -(s * TAU / 2.0).cos(); // -1 … 1, at rest at both ends
-    let eye = DVec3::new(0.02 + 0.075 * swing, -0.60 + 0.015 * swing * swing, 0.47 + 0.02 * swing);
+    let position = DVec3::new(0.02 + 0.075 * swing, -0.60 + 0.015 * swing * swing, 0.47 + 0.02 * swing);
     let target = DVec3::new(-0.01 - 0.01 * swing, 0.09, 0.07);
-    look_at(eye, target)
+    look_at(position, target)
 }
 
-/// The frame at `eye` whose z axis points at `target` and whose x axis is level.
-pub(crate) fn look_at(eye: DVec3, target: DVec3) -> DAffine3 {
-    let forward = (target - eye).normalize();
+/// The frame at `position` whose z axis points at `target` and whose x axis is level.
+pub(crate) fn look_at(position: DVec3, target: DVec3) -> DAffine3 {
+    let forward = (target - position).normalize();
     let right = forward.cross(DVec3::Z).normalize();
-    DAffine3::from_mat3_translation(DMat3::from_cols(right, forward.cross(right), forward), eye)
+    DAffine3::from_mat3_translation(DMat3::from_cols(right, forward.cross(right), forward), position)
 }
 
 #[cfg(test)]
@@ -62,7 +62,7 @@ mod tests {
         for m in all {
             assert!((m.matrix3.determinant() - 1.0).abs() < 1e-12);
             let down = m.transform_vector3(DVec3::Y);
-            assert!(down.z < -0.5, "the picture's down is the world's down");
+            assert!(down.z < -0.5, "the image's down is the world's down");
             assert!(m.inverse().transform_point3(DVec3::ZERO).z > 0.5, "the table is in front");
         }
     }

@@ -1,4 +1,4 @@
-//! Randomness that depends on nothing but its inputs, so that a seed gives the same pictures on every
+//! Randomness that depends on nothing but its inputs, so that a seed gives the same images on every
 //! machine and with any number of threads.
 
 /// Mixes 64 bits well (the finaliser of `SplitMix64`, Steele, Lea and Flood 2014).
@@ -69,10 +69,13 @@ pub(crate) fn lattice(x: i32, y: i32, z: i32) -> f32 {
 
 /// Smooth noise in the plane, 0..1, features about 1 wide; `layer` picks another field.
 pub(crate) fn smooth2(x: f32, y: f32, layer: i32) -> f32 {
-    let (fx, fy) = (x.floor(), y.floor());
-    let (i, j) = (fx as i32, fy as i32);
+    let fx = x.floor();
+    let fy = y.floor();
+    let i = fx as i32;
+    let j = fy as i32;
     let ease = |t: f32| t * t * (3.0 - 2.0 * t);
-    let (u, v) = (ease(x - fx), ease(y - fy));
+    let u = ease(x - fx);
+    let v = ease(y - fy);
     let top = lattice(i, j, layer) * (1.0 - u) + lattice(i + 1, j, layer) * u;
     let bottom = lattice(i, j + 1, layer) * (1.0 - u) + lattice(i + 1, j + 1, layer) * u;
     top * (1.0 - v) + bottom * v

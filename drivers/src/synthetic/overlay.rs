@@ -1,12 +1,12 @@
-//! The frame counter as a strip of black and white blocks in the top-left corner of colour pictures, so that
-//! whoever gets a picture, through whatever codec, can tell which frame it is.
+//! The frame counter as a strip of black and white blocks in the top-left corner of colour images, so that
+//! whoever gets an image, through whatever codec, can identify its frame.
 //!
 //! Blocks are 4x4 pixels: white, black, the counter's low 32 bits with the highest first (white = 1), four
 //! bits of checksum (the XOR of the counter's eight half-bytes), white, black.
 
 const BLOCK: usize = 4;
 const BITS: usize = 40;
-/// Pixels per row below which a picture gets no strip.
+/// Pixels per row below which an image gets no strip.
 pub const MIN_WIDTH: u32 = (BLOCK * BITS) as u32;
 
 fn encode(counter: u32) -> u64 {
@@ -14,7 +14,7 @@ fn encode(counter: u32) -> u64 {
     (0b10 << 38) | (u64::from(counter) << 6) | (u64::from(check) << 2) | 0b10
 }
 
-/// Draws the strip into an RGB8 picture without row padding; a picture that is too small is left alone.
+/// Draws the strip into an RGB8 image without row padding; an image that is too small is left alone.
 pub fn draw(rgb: &mut [u8], width: u32, counter: u32) {
     let row_bytes = width as usize * 3;
     if width < MIN_WIDTH || rgb.len() < row_bytes * BLOCK {
@@ -30,7 +30,7 @@ pub fn draw(rgb: &mut [u8], width: u32, counter: u32) {
     }
 }
 
-/// The counter in the strip of an RGB8 picture; `None` when there is no strip or it is damaged.
+/// The counter in the strip of an RGB8 image; `None` when the strip is missing or damaged.
 pub fn read(rgb: &[u8], width: u32) -> Option<u32> {
     let row_bytes = width as usize * 3;
     if width < MIN_WIDTH || rgb.len() < row_bytes * BLOCK {
@@ -69,7 +69,7 @@ mod tests {
     }
 
     #[test]
-    fn a_small_picture_is_left_alone() {
+    fn a_small_image_is_left_alone() {
         let mut rgb = vec![7; 159 * 8 * 3];
         draw(&mut rgb, 159, 5);
         assert!(rgb.iter().all(|b| *b == 7));

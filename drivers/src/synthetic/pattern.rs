@@ -2,7 +2,7 @@
 //!
 //! A stream has one long strip of bytes, made when it starts; frame `n` is the window that begins `n mod 32`
 //! steps into it, with `n` itself written over the first eight bytes. The strip is a smooth ramp with a little
-//! noise, so that compressing it costs about what a camera's picture does.
+//! noise, so that compressing it costs about what a camera's image does.
 
 use super::noise::{Rolls, mix, normal_of, text_seed};
 use depthrig_bus::PixelFormat;
@@ -19,7 +19,7 @@ pub struct Pattern {
 }
 
 impl Pattern {
-    /// The pattern of the stream called `stream`, for pictures of this format and size.
+    /// The pattern of the stream called `stream`, for images of this format and size.
     pub fn new(seed: u64, stream: &str, format: PixelFormat, width: u32, height: u32) -> Self {
         let len = format.frame_bytes(width, height);
         let total = len + STEP * (WINDOWS as usize - 1);
@@ -28,7 +28,8 @@ impl Pattern {
         let mut strip = Vec::with_capacity(total + 8);
         if format == PixelFormat::Z16 {
             for i in 0..total.div_ceil(2) as u64 {
-                let (x, y) = (i as usize % width, i as usize / width);
+                let x = i as usize % width;
+                let y = i as usize / width;
                 let bits = mix(seed ^ i);
                 // One pixel in 64 is a hole, as in a camera's depth.
                 let z = 600.0 + x as f32 * 0.25 + y as f32 * 0.5 + normal_of(bits);
@@ -38,7 +39,8 @@ impl Pattern {
         } else {
             let base = Rolls::new(seed, 0, 0, 0).bits(0).to_le_bytes();
             for i in 0..total.div_ceil(3) as u64 {
-                let (x, y) = (i as usize % width, i as usize / width);
+                let x = i as usize % width;
+                let y = i as usize / width;
                 let noise = mix(seed ^ i).to_le_bytes();
                 for c in 0..3 {
                     let ramp = usize::from(base[c]) + (x + y * (c + 1)) / 8;

@@ -6,7 +6,7 @@ use super::{imu, noise};
 use crate::{DeviceClock, Error, ErrorKind, Result, StreamProfile, StreamRequest, choose_profiles};
 use depthrig_bus::{MetadataLevel, Name, PixelFormat, Pose};
 
-/// What a stream shows.
+/// Content of a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) enum Content {
     Color,
@@ -19,7 +19,7 @@ pub(crate) enum Content {
 impl Content {
     const ALL: [Self; 4] = [Self::Color, Self::Depth, Self::DepthTrue, Self::DepthTrueColor];
 
-    /// What a camera shows, with or without its truth.
+    /// Contents of a camera's streams, with or without its truth.
     fn of_camera(truth: bool) -> &'static [Self] {
         if truth { &Self::ALL } else { &Self::ALL[..2] }
     }
@@ -47,7 +47,7 @@ impl Content {
         }
     }
 
-    /// What the stream called `name` shows.
+    /// Content of the stream called `name`.
     pub(crate) fn of(name: &Name) -> Option<Self> {
         Self::ALL.into_iter().find(|c| c.name() == name.as_str())
     }
@@ -73,7 +73,7 @@ pub(crate) fn model_of(config: &SyntheticConfig) -> Result<&'static Model> {
 ///
 /// # Errors
 /// [`ErrorKind::BadInput`] for an unknown model or an impossible number, [`ErrorKind::Unsupported`] for an
-/// override that is no mode of the model, naming the modes there are.
+/// override that is not a mode of the model, naming its modes.
 pub fn profiles(config: &SyntheticConfig) -> Result<Vec<StreamProfile>> {
     config.validate()?;
     let model = model_of(config)?;
@@ -164,7 +164,7 @@ fn profile(
     mode: &Mode,
     rate_hz: f64,
 ) -> Result<StreamProfile> {
-    // Up to 1 % of the picture; a truth has the lens of the sensor whose view it has.
+    // Up to 1 % of the image; a truth has the lens of the sensor whose view it has.
     let sensor = u32::from(!content.is_color_view());
     let rolls = noise::Rolls::new(noise::text_seed(config.seed, &config.serial_or_default()), sensor, 0, 0);
     let off = [0, 1].map(|i| (f64::from(rolls.unit(i)) - 0.5) * 0.02);
@@ -243,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn a_motion_unit_is_there_when_it_is_asked_for() {
+    fn an_imu_is_there_when_it_is_asked_for() {
         let mut c = config("d435");
         assert!(profiles(&c).unwrap().iter().all(|p| !p.format.is_motion()));
         c.streams.push(StreamOverride { stream: Name::new("imu").unwrap(), size: None, rate_hz: None });

@@ -1,4 +1,4 @@
-//! The frames of one stream between exposure and the driver: in flight, or waiting in the device's ring.
+//! The frames of one stream between exposure and the driver: under way, or waiting in the device's ring.
 //!
 //! Invariants: arrivals rise strictly; at most the ring's size of arrived frames wait, the oldest are lost
 //! first; `lost_before` of every frame says how many frames of the same boot were lost since the one before.
@@ -8,8 +8,8 @@ use super::timeline::{Boot, Timeline};
 use depthrig_bus::HostTime;
 use std::collections::VecDeque;
 
-/// Frames in flight at the most, besides those in the ring; further ones are lost.
-const IN_FLIGHT: usize = 64;
+/// Frames under way at the most, besides those in the ring; further ones are lost.
+const UNDER_WAY: usize = 64;
 
 /// A frame on its way to the driver.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -110,7 +110,7 @@ impl Queue {
         let arrival = arrival.max(self.halted_until).max(self.last_arrival.plus_ns(1000));
         let spoil = self.next_spoil();
         let is_stalled = self.stalls.iter().any(|(from, until)| (*from..*until).contains(&arrival));
-        if spoil == Some(FaultKind::Skip) || is_stalled || self.waiting.len() >= self.ring + IN_FLIGHT {
+        if spoil == Some(FaultKind::Skip) || is_stalled || self.waiting.len() >= self.ring + UNDER_WAY {
             self.lost += 1;
             return;
         }
@@ -184,7 +184,7 @@ impl Queue {
     pub(crate) fn pop(&mut self) -> Option<Waiting> {
         let mut frame = self.waiting.pop_front()?;
         if !self.handed_any {
-            // What was lost before the first frame of a session nobody on the host can know.
+            // The host cannot know of frames lost before the first frame of a session.
             frame.lost_before = 0;
             self.handed_any = true;
         }
@@ -238,7 +238,8 @@ mod tests {
             got.extend(drain(&mut q, ms(now)));
         }
         let seen: Vec<_> = got.iter().map(|w| (w.k, w.fault, w.lost_before)).collect();
-        let (damaged, again) = (Some(FaultKind::Damaged), Some(FaultKind::Repeated));
+        let damaged = Some(FaultKind::Damaged);
+        let again = Some(FaultKind::Repeated);
         assert_eq!(seen[..5], [(0, None, 0), (1, damaged, 0), (4, None, 2), (4, again, 0), (5, None, 0)]);
         assert!(got.windows(2).all(|w| w[0].arrival < w[1].arrival));
     }

@@ -1,6 +1,6 @@
-//! Rendering a camera's loop of pictures once, and finding it again in the cache.
+//! Rendering a camera's loop of images once, and finding it again in the cache.
 
-use super::cache::{PictureFile, Wanted};
+use super::cache::{ImageFile, Wanted};
 use super::config::SyntheticConfig;
 use super::models::Model;
 use super::noise::{mix, text_seed};
@@ -16,18 +16,18 @@ use std::sync::{Arc, OnceLock};
 /// Goes up with every change of what is rendered, so that older caches are not used.
 const RENDER_VERSION: u32 = 2;
 
-/// Says how many of how many pictures are ready.
+/// Says how many of how many images are ready.
 pub type Progress<'a> = &'a (dyn Fn(usize, usize) + Sync);
 
 /// A sketch has this many times fewer pixels per row and column: a sixteenth of the work.
 const COARSE: u32 = 4;
 
-/// The pictures of one file: sketches until all are drawn.
+/// The images of one file: sketches until all are drawn.
 #[derive(Debug, Default)]
 pub(crate) struct Album {
     /// By plane; empty where nobody looks before the file is there.
     sketches: Vec<Vec<u8>>,
-    file: OnceLock<PictureFile>,
+    file: OnceLock<ImageFile>,
 }
 
 impl Album {
@@ -36,21 +36,21 @@ impl Album {
     }
 
     /// From now on these are shown.
-    pub(crate) fn finish(&self, file: PictureFile) {
+    pub(crate) fn finish(&self, file: ImageFile) {
         // Of two files of one scene either will do.
         let _ = self.file.set(file);
     }
 }
 
-/// The pictures of one stream, by pose.
+/// The images of one stream, by pose.
 #[derive(Debug, Clone)]
-pub(crate) struct Pictures {
+pub(crate) struct Images {
     album: Arc<Album>,
     plane: u32,
 }
 
-impl Pictures {
-    /// The picture at `pose`.
+impl Images {
+    /// The image at `pose`.
     pub(crate) fn get(&self, pose: u32) -> &[u8] {
         match self.album.file.get() {
             Some(file) => file.get(self.plane, pose),
@@ -68,7 +68,7 @@ pub fn prepare(config: &SyntheticConfig, progress: Progress<'_>) -> Result<()> {
     prepare_all(core::slice::from_ref(config), progress)
 }
 
-/// [`prepare`] for several cameras, with one count of all their pictures.
+/// [`prepare`] for several cameras, with one count of all their images.
 ///
 /// # Errors
 /// As [`prepare`].
@@ -93,19 +93,19 @@ pub fn prepare_all(configs: &[SyntheticConfig], progress: Progress<'_>) -> Resul
     let mut done = 0;
     progress(0, total);
     for (config, profile) in jobs {
-        pictures(config, &profile, &|n, _| progress(done + n, total))?;
+        images(config, &profile, &|n, _| progress(done + n, total))?;
         done += config.poses as usize;
         progress(done, total);
     }
     Ok(())
 }
 
-/// The pictures of one stream, rendered if they are not in the cache.
-pub(crate) fn pictures(
+/// The images of one stream, rendered if they are not in the cache.
+pub(crate) fn images(
     config: &SyntheticConfig,
     profile: &StreamProfile,
     progress: Progress<'_>,
-) -> Result<Pictures> {
+) -> Result<Images> {
     let scene = Scene::new(config, profile)?;
     let file = match scene.cached() {
         Some(file) => file,
@@ -113,10 +113,10 @@ pub(crate) fn pictures(
     };
     let album = Album::default();
     album.finish(file);
-    Ok(scene.pictures(&Arc::new(album)))
+    Ok(scene.images(&Arc::new(album)))
 }
 
-/// What a stream shows, and the file where it is kept.
+/// The images of a stream, and the file that keeps them.
 #[derive(Debug)]
 pub(crate) struct Scene {
     config: SyntheticConfig,
@@ -148,17 +148,17 @@ impl Scene {
         Wanted { key: &self.key, planes: self.planes, poses: self.config.poses, bytes }
     }
 
-    /// The pictures of `album` that this stream shows.
-    pub(crate) fn pictures(&self, album: &Arc<Album>) -> Pictures {
-        Pictures { album: Arc::clone(album), plane: u32::from(self.content == Content::DepthTrue) }
+    /// The images of `album` that this stream shows.
+    pub(crate) fn images(&self, album: &Arc<Album>) -> Images {
+        Images { album: Arc::clone(album), plane: u32::from(self.content == Content::DepthTrue) }
     }
 
-    pub(crate) fn cached(&self) -> Option<PictureFile> {
-        PictureFile::open(&self.path, &self.wanted())
+    pub(crate) fn cached(&self) -> Option<ImageFile> {
+        ImageFile::open(&self.path, &self.wanted())
     }
 
     /// Renders every pose into the cache, until `go_on` is false.
-    pub(crate) fn draw(&self, progress: Progress<'_>, go_on: &dyn Fn() -> bool) -> Result<PictureFile> {
+    pub(crate) fn draw(&self, progress: Progress<'_>, go_on: &dyn Fn() -> bool) -> Result<ImageFile> {
         if self.path.exists() {
             tracing::warn!(file = %self.path.display(), "the render cache of a synthetic camera is damaged or cannot be read; it is made anew");
         }
@@ -166,7 +166,7 @@ impl Scene {
         let rays = Rays::new(&profile.intrinsics, profile.width, profile.height);
         let world = World::new();
         progress(0, self.poses());
-        PictureFile::create(&self.path, &self.wanted(), |pose| {
+        ImageFile::create(&self.path, &self.wanted(), |pose| {
             if !go_on() {
                 return Err(Error::new(ErrorKind::Io, "rendering was stopped"));
             }
@@ -223,7 +223,7 @@ fn enlarge(small: &[u8], bytes: usize, width: usize, height: usize) -> Vec<u8> {
     large
 }
 
-/// Everything that the pictures depend on, as text.
+/// Everything that the images depend on, as text.
 fn key(config: &SyntheticConfig, model: &Model, p: &StreamProfile, planes: u32) -> String {
     let stream = file_of(p);
     format!(
@@ -245,7 +245,7 @@ fn key(config: &SyntheticConfig, model: &Model, p: &StreamProfile, planes: u32) 
     )
 }
 
-/// What the file of a stream's pictures is called: depth and its truth share one.
+/// Name of the file of a stream's images: depth and its truth share one.
 fn file_of(p: &StreamProfile) -> &'static str {
     match Content::of(&p.stream) {
         Some(Content::Depth | Content::DepthTrue) => "depth",
@@ -258,6 +258,6 @@ fn path(config: &SyntheticConfig, p: &StreamProfile, key: &str) -> PathBuf {
     let stream = file_of(p);
     let hash = text_seed(0, key);
     let name =
-        format!("{}-{stream}-{}x{}-{hash:016x}.pictures", config.model.to_lowercase(), p.width, p.height);
+        format!("{}-{stream}-{}x{}-{hash:016x}.images", config.model.to_lowercase(), p.width, p.height);
     config.cache_dir.join(name)
 }

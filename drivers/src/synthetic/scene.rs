@@ -113,7 +113,7 @@ impl World {
         self.things.iter().map(|t| t.solid.distance(p)).fold(room_distance(p), f32::min)
     }
 
-    /// Adds the face to what was met, so that two faces of a block are told apart.
+    /// Adds the face to what was met, so that two faces of a block differ.
     pub(crate) fn with_face(&self, from: Vec3, dir: Vec3, met: Met) -> Met {
         match self.things.get(usize::from(met.key >> 3)) {
             Some(thing) => {
@@ -292,7 +292,7 @@ mod tests {
             let met = world.meet(&all, from, dir);
             assert!(met.t > 0.0 && met.t < 6.0);
             let spot = world.spot(from, dir, met);
-            assert!(spot.n.dot(dir) <= 1e-3, "surfaces face the eye: {met:?}");
+            assert!(spot.n.dot(dir) <= 1e-3, "surfaces face the camera: {met:?}");
             assert!(room_distance(spot.p) > -1e-4);
         }
         // Along the axes, where quotients are infinite.

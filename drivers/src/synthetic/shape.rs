@@ -57,7 +57,9 @@ impl Solid {
     pub(crate) fn meet(&self, from: Vec3, dir: Vec3, near: f32, far: f32) -> Option<f32> {
         // Most rays miss the sphere around the solid: this is where rendering spends its time.
         let to = self.center - from;
-        let (along, dd, tt) = (to.dot(dir), dir.dot(dir), to.dot(to));
+        let along = to.dot(dir);
+        let dd = dir.dot(dir);
+        let tt = to.dot(to);
         let outside = tt - self.bound_squared;
         if outside > 0.0 && (along < 0.0 || (outside - 1e-6 * tt) * dd > along * along) {
             return None;
@@ -75,7 +77,8 @@ impl Solid {
                     sphere(o - Vec3::Z * half, d, radius),
                     sphere(o + Vec3::Z * half, d, radius),
                 ];
-                let (mut enter, mut leave) = (f32::INFINITY, f32::NEG_INFINITY);
+                let mut enter = f32::INFINITY;
+                let mut leave = f32::NEG_INFINITY;
                 for (a, b) in pieces.into_iter().flatten() {
                     (enter, leave) = (enter.min(a), leave.max(b));
                 }
@@ -128,7 +131,8 @@ impl Solid {
             }
             Shape::Capsule { half, radius } => (q - Vec3::Z * q.z.clamp(-half, half)).length() - radius,
             Shape::Cylinder { half, radius } => {
-                let (r, h) = (q.x.hypot(q.y) - radius, q.z.abs() - half);
+                let r = q.x.hypot(q.y) - radius;
+                let h = q.z.abs() - half;
                 r.max(0.0).hypot(h.max(0.0)) + r.max(h).min(0.0)
             }
         }
@@ -155,15 +159,18 @@ fn sphere(o: Vec3, d: Vec3, radius: f32) -> Option<(f32, f32)> {
 
 fn slabs(o: Vec3, d: Vec3, half: Vec3) -> Option<(f32, f32)> {
     let inverse = d.recip();
-    let (a, b) = ((-half - o) * inverse, (half - o) * inverse);
-    let (enter, leave) = (a.min(b).max_element(), a.max(b).min_element());
+    let a = (-half - o) * inverse;
+    let b = (half - o) * inverse;
+    let enter = a.min(b).max_element();
+    let leave = a.max(b).min_element();
     (enter <= leave).then_some((enter, leave))
 }
 
 fn cylinder(o: Vec3, d: Vec3, half: f32, radius: f32) -> Option<(f32, f32)> {
     let a = d.x * d.x + d.y * d.y;
     let (low, high) = {
-        let (s, t) = ((-half - o.z) / d.z, (half - o.z) / d.z);
+        let s = (-half - o.z) / d.z;
+        let t = (half - o.z) / d.z;
         if s < t { (s, t) } else { (t, s) }
     };
     if a < 1e-12 {
@@ -176,7 +183,8 @@ fn cylinder(o: Vec3, d: Vec3, half: f32, radius: f32) -> Option<(f32, f32)> {
         return None;
     }
     let root = rest.sqrt();
-    let (mut enter, mut leave) = ((-b - root) / a, (-b + root) / a);
+    let mut enter = (-b - root) / a;
+    let mut leave = (-b + root) / a;
     if d.z.abs() < 1e-9 {
         return (o.z.abs() < half).then_some((enter, leave));
     }
@@ -238,7 +246,7 @@ mod tests {
                     prop_assert!(solid.distance(p).abs() < 1e-4);
                     prop_assert!((p - center).length() <= solid.bound + 1e-4);
                     let n = solid.axes * solid.normal_local(solid.to_local(p)).0;
-                    prop_assert!(n.dot(dir) < 0.02, "the side that is seen faces the eye");
+                    prop_assert!(n.dot(dir) < 0.02, "the side that is seen faces the camera");
                     // Half a millimetre outside along the normal is half a millimetre from the surface.
                     prop_assert!((solid.distance(p + n * 5e-4) - 5e-4).abs() < 1e-4);
                 }

@@ -1,4 +1,4 @@
-//! What surfaces look like, in colour and to a depth camera.
+//! Appearance of surfaces, in colour and to a depth camera.
 
 use super::noise::{fractal2, lattice, smooth2};
 use glam::Vec3;
@@ -45,12 +45,12 @@ pub(crate) enum Paint {
     Cutlery,
 }
 
-/// What a depth camera finds at a spot.
+/// Infrared properties of a spot, for a depth camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Infrared {
     /// Part of the light that comes back, 0..1.
     pub(crate) albedo: f32,
-    /// How well two pictures of it can be matched, 0..1.
+    /// How well two images of it can be matched, 0..1.
     pub(crate) texture: f32,
 }
 
@@ -75,7 +75,7 @@ impl Paint {
         )
     }
 
-    /// What a depth camera finds.
+    /// Its infrared properties, for a depth camera.
     pub(crate) const fn infrared(self) -> Infrared {
         let (albedo, texture) = match self {
             Self::Wood => (0.55, 0.8),
@@ -200,7 +200,8 @@ fn floor(p: Vec3) -> Vec3 {
 /// 8 x 6 squares of 30 mm with a white border: inner corners 7 x 5.
 fn checker(p: Vec3, n: Vec3) -> Vec3 {
     let white = Vec3::splat(0.82);
-    let (u, v) = (p.x / 0.03 + 4.0, p.z / 0.03 + 3.0);
+    let u = p.x / 0.03 + 4.0;
+    let v = p.z / 0.03 + 3.0;
     if n.y > -0.5 || !(0.0..8.0).contains(&u) || !(0.0..6.0).contains(&v) {
         return white;
     }
@@ -229,7 +230,8 @@ fn book(p: Vec3, n: Vec3, cover: Vec3) -> Vec3 {
 
 /// Hills in the evening.
 fn poster(p: Vec3) -> Vec3 {
-    let (x, y) = (p.x / 0.42, p.z / 0.27);
+    let x = p.x / 0.42;
+    let y = p.z / 0.27;
     if x.abs() > 0.94 || y.abs() > 0.91 {
         return Vec3::splat(0.8);
     }

@@ -8,7 +8,7 @@ use super::noise::{Rolls, text_seed};
 use core::f64::consts::TAU;
 use depthrig_bus::HostTime;
 
-/// What a device that rebooted counts from, microseconds: its firmware took a moment.
+/// Counter of a rebooted device at its start, microseconds: its firmware took a moment.
 const REBOOT_TICKS: u64 = 250_000;
 
 /// One life of a device, from power to the next loss of it or reset.
@@ -65,10 +65,11 @@ impl Timeline {
         k
     }
 
-    /// What the device's counter shows for frame `k` that was exposed at `t`.
+    /// Value of the device's counter for frame `k` that was exposed at `t`.
     pub(crate) fn ticks(&self, boot: Boot, stream: usize, k: u64, t: HostTime) -> u64 {
         let since_us = t.since_ns(boot.at) as f64 / 1000.0;
-        let (size, period_us) = (self.sim.thermal_ppm * 1e-6, self.sim.thermal_period_s * 1e6);
+        let size = self.sim.thermal_ppm * 1e-6;
+        let period_us = self.sim.thermal_period_s * 1e6;
         // The integral of a rate that is off by drift + thermal · sin(2π t / period).
         let wander = size * period_us / TAU * (1.0 - (TAU * since_us / period_us).cos());
         let jitter = f64::from(self.rolls(boot, stream, k).normal(0)) * self.sim.stamp_jitter_us;

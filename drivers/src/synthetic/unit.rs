@@ -33,7 +33,7 @@ pub(crate) struct Unit {
     state: Mutex<State>,
 }
 
-/// What changes about a unit.
+/// Mutable state of a unit.
 #[derive(Debug)]
 pub(crate) struct State {
     pub(crate) boot: Boot,
@@ -46,12 +46,12 @@ pub(crate) struct State {
     first_stream: Option<HostTime>,
     /// Faults to come, the next one last.
     to_come: Vec<(HostTime, ScheduledFault)>,
-    /// What the simulation knows of the current or last session, by stream.
+    /// The simulation's record of the current or last session, by stream.
     pub(crate) ledgers: Vec<Ledger>,
     history: VecDeque<SimFrame>,
 }
 
-/// What the device did with the frames of one stream since streaming was last started; every driver's
+/// The device's record of the frames of one stream since streaming was last started; every driver's
 /// accounts must equal it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Ledger {
@@ -76,7 +76,7 @@ pub struct SimFrame {
     pub arrival: HostTime,
     /// Pose of the mount that it shows.
     pub pose: u32,
-    /// What was wrong with it.
+    /// Its fault.
     pub fault: Option<FaultKind>,
 }
 
@@ -235,12 +235,12 @@ pub(crate) struct DueFault {
     pub(crate) count: u32,
 }
 
-/// What a simulated device knows about itself and a driver cannot see; also lets a test make it fail.
+/// Ground truth of a simulated device, which a driver cannot see; also lets a test make it fail.
 #[derive(Debug, Clone)]
 pub struct SimTruth(pub(crate) Arc<Unit>);
 
 impl SimTruth {
-    /// What the device did with the frames of `stream` since streaming was last started.
+    /// The device's record of the frames of `stream` since streaming was last started.
     pub fn ledger(&self, stream: usize) -> Ledger {
         self.0.state().ledgers.get(stream).copied().unwrap_or_default()
     }

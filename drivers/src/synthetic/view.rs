@@ -1,6 +1,6 @@
 //! A camera in the world, and where the ray of every pixel ends.
 //!
-//! Pictures are worked on in square tiles. For each tile the few solids that can matter (that its rays can
+//! Images are worked on in square tiles. For each tile the few solids that can matter (that its rays can
 //! meet; that can stand between it and the lamp) are found first by their bounding spheres; this is what makes
 //! ray casting affordable without a tree.
 
@@ -28,7 +28,8 @@ pub(crate) struct Rays {
 
 impl Rays {
     pub(crate) fn new(k: &Intrinsics, width: u32, height: u32) -> Self {
-        let (width, height) = (width as usize, height as usize);
+        let width = width as usize;
+        let height = height as usize;
         let camera = Camera::new(k).ok();
         let mut dirs = vec![Vec3::ZERO; width * height];
         dirs.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
@@ -49,7 +50,7 @@ impl Rays {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct View<'a> {
     pub(crate) rays: &'a Rays,
-    pub(crate) eye: Vec3,
+    pub(crate) origin: Vec3,
     pub(crate) axes: Mat3,
 }
 
@@ -69,7 +70,7 @@ pub(crate) struct Ball {
 
 impl<'a> View<'a> {
     pub(crate) fn new(rays: &'a Rays, camera_in_world: &DAffine3) -> Self {
-        Self { rays, eye: camera_in_world.translation.as_vec3(), axes: camera_in_world.matrix3.as_mat3() }
+        Self { rays, origin: camera_in_world.translation.as_vec3(), axes: camera_in_world.matrix3.as_mat3() }
     }
 
     /// The ray of a pixel in the world; its length per unit of depth is not 1 but what z = 1 needs.
@@ -80,7 +81,8 @@ impl<'a> View<'a> {
     /// The ray of a place between pixels, `dx` and `dy` of a pixel off; good enough for smoothing edges.
     pub(crate) fn dir_between(&self, x: usize, y: usize, dx: f32, dy: f32) -> Vec3 {
         let here = self.rays.dir(x, y);
-        let (w, h) = (self.rays.width, self.rays.height);
+        let w = self.rays.width;
+        let h = self.rays.height;
         let next_x = if x + 1 < w { self.rays.dir(x + 1, y) - here } else { here - self.rays.dir(x - 1, y) };
         let next_y = if y + 1 < h { self.rays.dir(x, y + 1) - here } else { here - self.rays.dir(x, y - 1) };
         self.axes * (here + next_x * dx + next_y * dy)
@@ -88,13 +90,15 @@ impl<'a> View<'a> {
 
     /// The tiles of a band of [`TILE`] rows that begins at row `top`.
     pub(crate) fn tiles(&self, top: usize) -> impl Iterator<Item = Tile> + use<> {
-        let (w, bottom) = (self.rays.width, (top + TILE).min(self.rays.height));
+        let w = self.rays.width;
+        let bottom = (top + TILE).min(self.rays.height);
         (0..w).step_by(TILE).map(move |left| Tile { xs: left..(left + TILE).min(w), ys: top..bottom })
     }
 
     /// Where the ray of every pixel ends, row by row; `t` is the depth (z in the optical frame).
     pub(crate) fn cast(&self, world: &World) -> Vec<Met> {
-        let (w, h) = (self.rays.width, self.rays.height);
+        let w = self.rays.width;
+        let h = self.rays.height;
         let mut mets = vec![NOTHING; w * h];
         mets.par_chunks_mut(w * TILE).enumerate().for_each(|(band, out)| {
             for tile in self.tiles(band * TILE) {
@@ -103,8 +107,8 @@ impl<'a> View<'a> {
                     for x in tile.xs.clone() {
                         if self.rays.dir(x, y).z > 0.0 {
                             let dir = self.dir(x, y);
-                            let met = world.meet(&among, self.eye, dir);
-                            out[(y - band * TILE) * w + x] = world.with_face(self.eye, dir, met);
+                            let met = world.meet(&among, self.origin, dir);
+                            out[(y - band * TILE) * w + x] = world.with_face(self.origin, dir, met);
                         }
                     }
                 }
@@ -135,7 +139,7 @@ impl<'a> View<'a> {
             dirs.iter().map(|d| axis.dot(*d).min(1.0).acos()).fold(0.0, f32::max) + 2.0 * self.rays.pixel_rad;
         let sees = |i: &u16| {
             let solid = &world.things[usize::from(*i)].solid;
-            let to = solid.center - self.eye;
+            let to = solid.center - self.origin;
             let far = to.length();
             far <= solid.bound
                 || (axis.dot(to) / far).clamp(-1.0, 1.0).acos() <= spread + (solid.bound / far).asin()
@@ -145,12 +149,13 @@ impl<'a> View<'a> {
 
     /// A sphere that holds every spot that a tile shows.
     pub(crate) fn extent(&self, mets: &[Met], tile: &Tile) -> Option<Ball> {
-        let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+        let mut low = Vec3::INFINITY;
+        let mut high = Vec3::NEG_INFINITY;
         for y in tile.ys.clone() {
             for x in tile.xs.clone() {
                 let met = mets[y * self.rays.width + x];
                 if met != NOTHING {
-                    let p = self.eye + self.dir(x, y) * met.t;
+                    let p = self.origin + self.dir(x, y) * met.t;
                     (low, high) = (low.min(p), high.max(p));
                 }
             }
@@ -193,7 +198,7 @@ mod tests {
             for y in 0..121 {
                 for x in 0..200 {
                     let dir = view.dir(x, y);
-                    let met = world.with_face(view.eye, dir, world.meet(&all, view.eye, dir));
+                    let met = world.with_face(view.origin, dir, world.meet(&all, view.origin, dir));
                     assert_eq!(met, mets[y * 200 + x], "{x} {y}");
                 }
             }

@@ -45,7 +45,9 @@ mod tests {
             let done = drop_alpha(&from, stride, width, &mut to);
             let model: Option<Vec<u8>> = (0..rows * width * 3)
                 .map(|i| {
-                    let (y, x, c) = (i / (width * 3), i / 3 % width, i % 3);
+                    let y = i / (width * 3);
+                    let x = i / 3 % width;
+                    let c = i % 3;
                     from.get(y * stride + x * 4 + c).copied()
                 })
                 .collect();

@@ -7,10 +7,10 @@ use depthrig_jpeg::{Form, Info, START};
 /// End of a JPEG image (ITU-T T.81, table B.1).
 const END: [u8; 2] = [0xFF, 0xD9];
 
-/// The picture in what a camera sent: from its start mark to its last end mark. Cameras pad behind it.
+/// The image in what a camera sent: from its start mark to its last end mark. Cameras pad behind it.
 ///
 /// # Errors
-/// [`DropReason::Incomplete`] without an end mark, [`DropReason::WrongSize`] when it is no JPEG.
+/// [`DropReason::Incomplete`] without an end mark, [`DropReason::WrongSize`] when the bytes are not a JPEG.
 pub fn jpeg_span(from: &[u8]) -> Result<&[u8], DropReason> {
     if !from.starts_with(&START) {
         return Err(if from.is_empty() { DropReason::Incomplete } else { DropReason::WrongSize });
@@ -19,15 +19,15 @@ pub fn jpeg_span(from: &[u8]) -> Result<&[u8], DropReason> {
     from.get(..end + 2).ok_or(DropReason::Incomplete)
 }
 
-/// Copies the picture, as [`jpeg_span`] found it, to `to`, which has its length.
+/// Copies the image, as [`jpeg_span`] found it, to `to`, which has its length.
 ///
 /// # Errors
 /// [`DropReason::WrongSize`] when the lengths differ.
-pub fn keep_jpeg(picture: &[u8], to: &mut [u8]) -> Result<(), DropReason> {
-    if picture.len() != to.len() {
+pub fn keep_jpeg(image: &[u8], to: &mut [u8]) -> Result<(), DropReason> {
+    if image.len() != to.len() {
         return Err(DropReason::WrongSize);
     }
-    to.copy_from_slice(picture);
+    to.copy_from_slice(image);
     count(to.len());
     Ok(())
 }
@@ -38,25 +38,25 @@ pub fn keep_jpeg(picture: &[u8], to: &mut [u8]) -> Result<(), DropReason> {
 ///
 /// # Errors
 /// [`DropReason::WrongSize`] when it is damaged, of another size, or not in colour.
-pub fn decode_jpeg(picture: &[u8], width: u32, height: u32, to: &mut [u8]) -> Result<(), DropReason> {
-    decode(picture, Info { width, height, form: Form::Rgb }, to)
+pub fn decode_jpeg(image: &[u8], width: u32, height: u32, to: &mut [u8]) -> Result<(), DropReason> {
+    decode(image, Info { width, height, form: Form::Rgb }, to)
 }
 
 /// Decodes a grey image of `width` x `height` pixels into `to`, one byte a pixel.
 ///
 /// # Errors
 /// [`DropReason::WrongSize`] when it is damaged, of another size, or in colour.
-pub fn decode_grey_jpeg(picture: &[u8], width: u32, height: u32, to: &mut [u8]) -> Result<(), DropReason> {
-    decode(picture, Info { width, height, form: Form::Grey }, to)
+pub fn decode_grey_jpeg(image: &[u8], width: u32, height: u32, to: &mut [u8]) -> Result<(), DropReason> {
+    decode(image, Info { width, height, form: Form::Grey }, to)
 }
 
 /// Width and height of an image, as its header has them.
-pub fn jpeg_size(picture: &[u8]) -> Option<(u32, u32)> {
-    depthrig_jpeg::info(picture).ok().map(|info| (info.width, info.height))
+pub fn jpeg_size(image: &[u8]) -> Option<(u32, u32)> {
+    depthrig_jpeg::info(image).ok().map(|info| (info.width, info.height))
 }
 
-fn decode(picture: &[u8], expected: Info, to: &mut [u8]) -> Result<(), DropReason> {
-    depthrig_jpeg::decode_into(picture, expected, to).map_err(|_| DropReason::WrongSize)?;
+fn decode(image: &[u8], expected: Info, to: &mut [u8]) -> Result<(), DropReason> {
+    depthrig_jpeg::decode_into(image, expected, to).map_err(|_| DropReason::WrongSize)?;
     count(to.len());
     Ok(())
 }
@@ -69,7 +69,7 @@ mod tests {
 
     const SIZE: (u32, u32) = (32, 16);
 
-    fn picture(color: [u8; 3]) -> Vec<u8> {
+    fn image(color: [u8; 3]) -> Vec<u8> {
         let pixels: Vec<u8> = color.into_iter().cycle().take((SIZE.0 * SIZE.1 * 3) as usize).collect();
         let mut out = Vec::new();
         Encoder::new(&mut out, 95).encode(&pixels, SIZE.0 as u16, SIZE.1 as u16, ColorType::Rgb).unwrap();
@@ -82,8 +82,8 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_is_decoded_to_its_pixels() {
-        let pixels = decoded(&picture([200, 40, 90])).unwrap();
+    fn an_image_is_decoded_to_its_pixels() {
+        let pixels = decoded(&image([200, 40, 90])).unwrap();
         let near = |at: usize, want: u8| pixels[at].abs_diff(want) <= 3;
         assert!(
             pixels.chunks(3).count() == 512 && near(0, 200) && near(1, 40) && near(2, 90),
@@ -94,8 +94,8 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_without_its_tables_is_decoded_when_it_is_marked_so() {
-        let whole = picture([10, 220, 60]);
+    fn an_image_without_its_tables_is_decoded_when_it_is_marked_so() {
+        let whole = image([10, 220, 60]);
         let mut bare = vec![0xFF, 0xD8, 0xFF, 0xE0, 0, 16];
         bare.extend(*b"AVI1\0\0\0\0\0\0\0\0\0\0");
         let mut at = 2;
@@ -112,8 +112,8 @@ mod tests {
     }
 
     #[test]
-    fn padding_is_cut_off_and_a_cut_picture_is_incomplete() {
-        let whole = picture([1, 2, 3]);
+    fn padding_is_cut_off_and_a_cut_image_is_incomplete() {
+        let whole = image([1, 2, 3]);
         let padded = [&whole[..], &[0; 100]].concat();
         assert_eq!(jpeg_span(&padded), Ok(&whole[..]));
         assert_eq!(jpeg_span(&whole[..whole.len() - 1]), Err(DropReason::Incomplete));
@@ -128,21 +128,21 @@ mod tests {
     #[test]
     fn another_size_and_grey_are_refused() {
         let mut to = vec![0; 31 * 16 * 3];
-        assert_eq!(decode_jpeg(&picture([9; 3]), 31, 16, &mut to), Err(DropReason::WrongSize));
+        assert_eq!(decode_jpeg(&image([9; 3]), 31, 16, &mut to), Err(DropReason::WrongSize));
         let mut grey = Vec::new();
         Encoder::new(&mut grey, 90).encode(&[7; 512], SIZE.0 as u16, SIZE.1 as u16, ColorType::Luma).unwrap();
         assert_eq!(decoded(&grey), Err(DropReason::WrongSize));
         let mut one = vec![0xA5; 512];
         decode_grey_jpeg(&grey, SIZE.0, SIZE.1, &mut one).unwrap();
         assert!(one.iter().all(|v| v.abs_diff(7) <= 1) && jpeg_size(&grey) == Some(SIZE));
-        assert_eq!(decode_grey_jpeg(&picture([9; 3]), 32, 16, &mut one), Err(DropReason::WrongSize));
-        assert_eq!(jpeg_size(b"no picture"), None);
+        assert_eq!(decode_grey_jpeg(&image([9; 3]), 32, 16, &mut one), Err(DropReason::WrongSize));
+        assert_eq!(jpeg_size(b"no image"), None);
     }
 
     proptest! {
         #[test]
         fn damage_is_refused_or_decoded_but_never_a_panic(at in 0usize..2000, value: u8, cut in 0usize..2000) {
-            let mut jpeg = picture([128, 64, 32]);
+            let mut jpeg = image([128, 64, 32]);
             let n = jpeg.len();
             jpeg[at % n] = value;
             jpeg.truncate(cut % n);

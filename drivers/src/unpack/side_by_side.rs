@@ -1,9 +1,9 @@
-//! Stereo pictures with both eyes beside each other: each half goes straight into its own memory.
+//! Side-by-side stereo images: each half goes straight into its own memory.
 
 use super::copy_rows;
 use depthrig_bus::DropReason;
 
-/// Half of a picture.
+/// Half of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Half {
     /// The left one.
@@ -12,8 +12,8 @@ pub enum Half {
     Right,
 }
 
-/// Copies one half of a picture whose rows begin every `stride` bytes of `from` to `to`, where rows of `half_bytes`
-/// follow each other. Both halves of a picture together read each of its bytes once and write it once.
+/// Copies one half of an image whose rows begin every `stride` bytes of `from` to `to`, where rows of `half_bytes`
+/// follow each other. Both halves of an image together read each of its bytes once and write it once.
 ///
 /// # Errors
 /// [`DropReason::Incomplete`] when `from` ends before the last row does, [`DropReason::WrongSize`] when two halves do
@@ -71,12 +71,12 @@ mod tests {
     }
 
     #[test]
-    fn both_halves_are_the_picture_in_yuyv() {
-        // Two rows of 4 pixels of YUYV, eyes of 2 pixels.
-        let picture: Vec<u8> = (0..16).collect();
+    fn both_halves_are_the_image_in_yuyv() {
+        // Two rows of 4 pixels of YUYV, halves of 2 pixels.
+        let image: Vec<u8> = (0..16).collect();
         let half = |h| {
             let mut to = [0; 8];
-            copy_half(&picture, 8, 4, h, &mut to).unwrap();
+            copy_half(&image, 8, 4, h, &mut to).unwrap();
             to
         };
         assert_eq!(half(Half::Left), [0, 1, 2, 3, 8, 9, 10, 11]);

@@ -6,13 +6,14 @@ use depthrig_bus::DropReason;
 /// Copies `from` to `to` with the two bytes of every pixel swapped.
 ///
 /// # Errors
-/// [`DropReason::Incomplete`] when `from` has fewer bytes than `to`, [`DropReason::WrongSize`] when it has more, or when
-/// they are no whole pixels.
+/// [`DropReason::Incomplete`] when `from` has fewer bytes than `to`, [`DropReason::WrongSize`] when it has more, or
+/// when its length is not a multiple of a pixel.
 pub fn copy_swapped(from: &[u8], to: &mut [u8]) -> Result<(), DropReason> {
     if from.len() < to.len() {
         return Err(DropReason::Incomplete);
     }
-    let ((pixels, rest), (targets, left)) = (from.as_chunks::<2>(), to.as_chunks_mut::<2>());
+    let (pixels, rest) = from.as_chunks::<2>();
+    let (targets, left) = to.as_chunks_mut::<2>();
     if pixels.len() != targets.len() || !rest.is_empty() || !left.is_empty() {
         return Err(DropReason::WrongSize);
     }

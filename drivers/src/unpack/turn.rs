@@ -1,7 +1,7 @@
 //! The L515's depth and infrared, which come transposed and flipped both ways.
 //!
 //! The pixel in row `i`, column `j` of what comes is the pixel at x = rows - 1 - i, y = columns - 1 - j of the
-//! picture (librealsense v2.54 `src/proc/rotation-transform.cpp`, Apache-2.0). Both sides are walked in blocks that
+//! image (librealsense v2.54 `src/proc/rotation-transform.cpp`, Apache-2.0). Both sides are walked in blocks that
 //! stay in the first-level cache, because one of them goes down columns.
 
 use super::count;
@@ -10,11 +10,11 @@ use depthrig_bus::DropReason;
 /// Pixels along a side of a block. Two blocks of 16-bit pixels are 16 KiB of the 32 KiB that a core has.
 const BLOCK: usize = 64;
 
-/// Turns a picture of pixels of `N` bytes that came in rows of `columns` pixels.
+/// Turns an image of pixels of `N` bytes that came in rows of `columns` pixels.
 ///
 /// # Errors
 /// [`DropReason::Incomplete`] when `from` has less bytes than `to`, [`DropReason::WrongSize`] when more, or when they
-/// are no whole number of rows.
+/// are not a whole number of rows.
 pub fn turn<const N: usize>(from: &[u8], columns: usize, to: &mut [u8]) -> Result<(), DropReason> {
     check(from.len(), to.len(), columns * N)?;
     let rows = from.len() / (columns * N);
@@ -24,7 +24,7 @@ pub fn turn<const N: usize>(from: &[u8], columns: usize, to: &mut [u8]) -> Resul
         let bottom = (top + BLOCK).min(rows);
         for left in (0..columns).step_by(BLOCK) {
             for j in left..(left + BLOCK).min(columns) {
-                // Row `columns - 1 - j` of the picture, from the right to the left.
+                // Row `columns - 1 - j` of the image, from the right to the left.
                 let start = (columns - 1 - j) * rows;
                 let Some(out) = target.get_mut(start + rows - bottom..start + rows - top) else { continue };
                 let column = source.iter().skip(top * columns + j).step_by(columns);
@@ -38,7 +38,7 @@ pub fn turn<const N: usize>(from: &[u8], columns: usize, to: &mut [u8]) -> Resul
     Ok(())
 }
 
-/// The confidence picture: two pixels of 4 bits a byte, turned like depth. A byte becomes two pixels one below the
+/// The confidence image: two pixels of 4 bits a byte, turned like depth. A byte becomes two pixels one below the
 /// other, the low half above.
 ///
 /// # Errors
@@ -81,7 +81,8 @@ mod tests {
         let mut to = vec![0xA5; from.len()];
         for i in 0..rows {
             for j in 0..columns {
-                let (x, y) = (rows - 1 - i, columns - 1 - j);
+                let x = rows - 1 - i;
+                let y = columns - 1 - j;
                 for b in 0..N {
                     to[(y * rows + x) * N + b] = from[(i * columns + j) * N + b];
                 }
@@ -95,8 +96,8 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_of_2_by_3_by_hand() {
-        // Comes as 3 rows of 2: a b / c d / e f. The picture is 3 wide and 2 high.
+    fn an_image_of_2_by_3_by_hand() {
+        // Comes as 3 rows of 2: a b / c d / e f. The image is 3 wide and 2 high.
         let mut to = [0; 6];
         turn::<1>(b"abcdef", 2, &mut to).unwrap();
         assert_eq!(&to, b"fdbeca");
@@ -117,7 +118,7 @@ mod tests {
 
     #[test]
     fn confidence_by_hand() {
-        // 2 rows of 2 bytes: the picture is 2 wide and 4 high.
+        // 2 rows of 2 bytes: the image is 2 wide and 4 high.
         let mut to = [0; 8];
         confidence(&[0x12, 0x34, 0x56, 0x78], 2, &mut to).unwrap();
         assert_eq!(to, [0x80, 0x40, 0x70, 0x30, 0x60, 0x20, 0x50, 0x10]);

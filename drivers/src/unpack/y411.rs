@@ -6,11 +6,11 @@
 use super::count;
 use depthrig_bus::DropReason;
 
-/// Takes blocks apart into an NV12 picture of rows of `width` pixels.
+/// Takes blocks apart into an NV12 image of rows of `width` pixels.
 ///
 /// # Errors
 /// [`DropReason::Incomplete`] when `from` has less bytes than `to`, [`DropReason::WrongSize`] when more, or when they
-/// are no whole number of pairs of rows.
+/// are not a whole number of pairs of rows.
 pub fn to_nv12(from: &[u8], width: usize, to: &mut [u8]) -> Result<(), DropReason> {
     let pair = width * 3; // two rows
     match from.len().cmp(&to.len()) {
@@ -45,7 +45,7 @@ mod tests {
     use proptest::prelude::*;
 
     #[test]
-    fn a_picture_of_4_by_2_by_hand() {
+    fn an_image_of_4_by_2_by_hand() {
         let mut to = [0; 12];
         to_nv12(b"uABvCDwEFxGH", 4, &mut to).unwrap();
         assert_eq!(&to, b"ABEFCDGHuvwx");
@@ -63,7 +63,8 @@ mod tests {
     proptest! {
         #[test]
         fn every_sample_is_where_its_pixel_is(w in 1usize..40, h in 1usize..40, seed in any::<u8>()) {
-            let (width, height) = (2 * w, 2 * h);
+            let width = 2 * w;
+            let height = 2 * h;
             let from: Vec<u8> = (0..w * h * 6).map(|i| (i as u8).wrapping_mul(31) ^ seed).collect();
             let mut to = vec![0xA5; from.len()];
             to_nv12(&from, width, &mut to).unwrap();

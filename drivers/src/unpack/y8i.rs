@@ -1,11 +1,11 @@
-//! Y8I: the bytes of two imagers in turn, left first, taken apart into two grey pictures.
+//! Y8I: the bytes of two imagers in turn, left first, taken apart into two grey images.
 //!
 //! Order of the bytes: librealsense `src/proc/y8i-to-y8y8.cpp` (Apache-2.0).
 
 use super::count;
 use depthrig_bus::DropReason;
 
-/// The left picture.
+/// The left image.
 ///
 /// # Errors
 /// [`DropReason::Incomplete`] when `from` has less than twice the bytes of `to`, [`DropReason::WrongSize`] when more.
@@ -13,7 +13,7 @@ pub fn left(from: &[u8], to: &mut [u8]) -> Result<(), DropReason> {
     half(from, to, 0)
 }
 
-/// The right picture.
+/// The right image.
 ///
 /// # Errors
 /// As those of [`left`].
@@ -41,7 +41,8 @@ mod tests {
 
     #[test]
     fn left_is_first() {
-        let (mut l, mut r) = ([0; 3], [0; 3]);
+        let mut l = [0; 3];
+        let mut r = [0; 3];
         left(&[1, 2, 3, 4, 5, 6], &mut l).unwrap();
         right(&[1, 2, 3, 4, 5, 6], &mut r).unwrap();
         assert_eq!((l, r), ([1, 3, 5], [2, 4, 6]));

@@ -1,4 +1,4 @@
-//! What is wrong with how a camera is attached or may be used, in words that say what to do.
+//! Faults of a camera's connection and permissions, in messages that say what to do.
 //!
 //! The drivers put these into their errors and `depthrig doctor` prints them, so that both say the same.
 
@@ -8,10 +8,10 @@ use crate::{Error, ErrorKind};
 use std::io;
 use std::path::Path;
 
-/// What prints and writes the udev rule.
+/// How to print and write the udev rule.
 pub const RULE_CURE: &str = "install depthrig's udev rule (`depthrig install --print` shows it, `sudo depthrig install --apply` writes it)";
 
-/// What the kernel lets all programs together have in USB transfers at a time when nobody has changed it, MB.
+/// The kernel's default limit for the USB transfers of all programs together, MB.
 /// Source: the kernel's `Documentation/admin-guide/kernel-parameters.txt`, `usbcore.usbfs_memory_mb`.
 pub const USBFS_DEFAULT_MB: u32 = 16;
 
@@ -52,9 +52,7 @@ pub fn open_error(root: &SysRoot, device: &str, node: &Path, e: io::Error) -> Er
     let error = match e.kind() {
         io::ErrorKind::ResourceBusy => busy(root, device, node),
         io::ErrorKind::PermissionDenied => denied(device, node),
-        io::ErrorKind::NotFound => {
-            plain(ErrorKind::NotFound, "there is no such node; is the camera attached?")
-        }
+        io::ErrorKind::NotFound => plain(ErrorKind::NotFound, "no such node; is the camera attached?"),
         // ENODEV and ENXIO: the node is still there, the device behind it is not.
         _ if matches!(e.raw_os_error(), Some(19 | 6)) => plain(ErrorKind::Disconnected, "the camera is gone"),
         _ => plain(ErrorKind::Io, &e.to_string()),
@@ -62,7 +60,7 @@ pub fn open_error(root: &SysRoot, device: &str, node: &Path, e: io::Error) -> Er
     error.with_source(e)
 }
 
-/// What to say when a camera made for USB3 runs as a USB2 device; `None` when it does not.
+/// Warning for a USB3 camera that runs as a USB2 device; `None` for any other.
 pub fn slow_link(device: &UsbDevice) -> Option<String> {
     (is_usb3_device(device) && (1..SUPERSPEED_MBPS).contains(&device.speed_mbps)).then(|| {
         format!(
@@ -102,7 +100,7 @@ pub fn is_usb3_device(device: &UsbDevice) -> bool {
     device.usb_version >= 0x0210 || KNOWN.contains(&(device.vendor_id, device.product_id))
 }
 
-/// What to say when the kernel may put the camera to sleep; `None` when it may not.
+/// Warning when the kernel is allowed to put the camera to sleep; `None` when it is not.
 pub fn may_sleep(device: &UsbDevice) -> Option<String> {
     (device.power_control == PowerControl::Auto).then(|| {
         format!(
@@ -113,13 +111,12 @@ pub fn may_sleep(device: &UsbDevice) -> Option<String> {
     })
 }
 
-/// How much all programs together may have in USB transfers at a time, MB; 0 is no limit. `None` when the kernel does
-/// not say.
+/// Limit for the USB transfers of all programs together, MB; 0 means unlimited. `None` when the kernel does not say.
 pub fn usbfs_limit_mb(root: &SysRoot) -> Option<u32> {
     root.read(USBFS_LIMIT)?.parse().ok()
 }
 
-/// What to say when the transfers of the libusb path, `needed` bytes, do not fit below the kernel's limit; `None` when
+/// Warning when the transfers of the libusb path, `needed` bytes, do not fit below the kernel's limit; `None` when
 /// they do, or when the kernel does not say.
 pub fn usbfs_too_small(root: &SysRoot, needed: u64) -> Option<String> {
     let limit = usbfs_limit_mb(root)?;

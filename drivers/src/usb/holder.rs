@@ -100,12 +100,12 @@ fn is_node(file: &Path, node: &Path, device: Option<u64>) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::usb::made::MadeTree;
+    use crate::usb::fake::FakeTree;
 
     #[test]
     fn the_process_that_has_the_node_open_is_named() {
         let home = tempfile::tempdir().unwrap();
-        let tree = MadeTree::new(home.path());
+        let tree = FakeTree::new(home.path());
         tree.process(4711, "obs", &["/dev/null", "/dev/video2"]);
         tree.process(80, "cheese", &["/dev/video2"]);
         tree.process(81, "bystander", &["/dev/video20"]);
@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn the_own_hold_is_told_apart() {
+    fn the_own_hold_is_recognised() {
         let file = fs::File::open("/dev/urandom").unwrap();
         assert!(holders_of(&SysRoot::default(), Path::new("/dev/urandom")).own);
         drop(file);

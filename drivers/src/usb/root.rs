@@ -1,4 +1,4 @@
-//! Where `/sys`, `/proc` and `/dev` are: the running system's, or a made tree's.
+//! Where `/sys`, `/proc` and `/dev` are: the running system's, or a fake tree's.
 
 use std::path::{Path, PathBuf};
 

@@ -1,4 +1,5 @@
-//! The devices on the USB with their interfaces and nodes, found by topology: what `/dev/videoN` is called never matters.
+//! The devices on the USB with their interfaces and nodes, found by topology: what `/dev/videoN` is called never
+//! matters.
 //!
 //! Sources: the kernel's `Documentation/ABI/{stable/sysfs-bus-usb,testing/sysfs-bus-usb}` for the files, and
 //! `Documentation/ABI/stable/sysfs-class-video4linux`'s `index` and `name`.
@@ -26,11 +27,11 @@ pub struct UsbDevice {
     pub device_version: u16,
     /// Class of the device; 9 is a hub.
     pub class: u8,
-    /// What the device calls its maker; empty when it does not say.
+    /// Manufacturer, as the device reports it; empty if unknown.
     pub manufacturer: String,
-    /// What the device calls itself; empty when it does not say.
+    /// Product name, as the device reports it; empty if unknown.
     pub product: String,
-    /// `iSerial`; empty when there is none. On a RealSense it is not the printed serial number.
+    /// `iSerial`; empty if unknown. On a RealSense it is not the printed serial number.
     pub serial: String,
     /// Speed of the link, Mbit/s: 12, 480, 5000, 10000, 20000. 0 when unknown.
     pub speed_mbps: u32,
@@ -77,7 +78,7 @@ pub struct UsbInterface {
     pub hidraw_nodes: Vec<PathBuf>,
 }
 
-/// A node of V4L2. Whether pictures or metadata come out of it, only the node itself says.
+/// A node of V4L2. Whether images or metadata come out of it, only the node itself says.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct VideoNode {
     /// `/dev/video4`, below the root that was asked.
@@ -86,7 +87,7 @@ pub struct VideoNode {
     pub number: u32,
     /// Place among the nodes of its device, from 0.
     pub index: u32,
-    /// What the driver calls it.
+    /// The driver's name for it.
     pub name: String,
     /// The kernel's name of the device it belongs to: `4-1.2:1.0`, `vivid.0`.
     pub parent: String,
@@ -114,7 +115,7 @@ impl UsbDevice {
 ///
 /// # Errors
 /// [`ErrorKind::PermissionDenied`] or [`ErrorKind::Io`] when `/sys/bus/usb/devices` is there and cannot be listed. A
-/// computer without USB has no such folder and no devices.
+/// computer without USB has neither the folder nor devices.
 pub fn scan(root: &SysRoot) -> Result<Vec<UsbDevice>> {
     let mut devices: Vec<_> = list(&root.join("sys/bus/usb/devices"))?
         .into_iter()
@@ -228,7 +229,7 @@ fn video_node(root: &SysRoot, name: &str, path: &Path, parent: &str) -> Option<V
     })
 }
 
-/// Names and paths of what is in a folder; nothing when there is no such folder.
+/// Names and paths of the entries of a folder; empty when the folder does not exist.
 fn list(dir: &Path) -> Result<Vec<(String, PathBuf)>> {
     let failed = |e: io::Error| {
         let denied = e.kind() == io::ErrorKind::PermissionDenied;

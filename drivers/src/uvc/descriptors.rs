@@ -1,9 +1,9 @@
-//! A configuration descriptor of a video camera: control units, streaming interfaces, formats, frame sizes, end points.
+//! A configuration descriptor of a video camera: control units, streaming interfaces, formats, frame sizes, endpoints.
 //!
 //! Layouts are those of the USB Video Class 1.5 specification (sections 3.5 to 3.9) and of the USB 3.2 specification
-//! (section 9.6). What is not of video is kept as far as its end points; descriptors of unknown kinds are passed over,
-//! as the specifications ask. A known descriptor that is too short for its fields is an error, because everything
-//! behind it could be misread.
+//! (section 9.6). Interfaces other than video are kept as far as their endpoints; descriptors of unknown kinds are
+//! skipped, as the specifications ask. A known descriptor that is too short for its fields is an error, because
+//! everything behind it could be misread.
 
 mod read;
 
@@ -43,7 +43,7 @@ pub struct ControlInterface {
 pub struct Unit {
     /// The number by which requests name it.
     pub id: u8,
-    /// What it is.
+    /// Its kind.
     pub kind: UnitKind,
     /// Which controls it has: bit 0 of byte 0 is the first.
     pub controls: Vec<u8>,
@@ -59,7 +59,7 @@ pub enum UnitKind {
         /// `wTerminalType`.
         terminal: u16,
     },
-    /// Where pictures leave: a streaming interface links to it.
+    /// Where images leave: a streaming interface links to it.
     Output {
         /// `wTerminalType`.
         terminal: u16,
@@ -80,13 +80,13 @@ pub enum UnitKind {
 pub struct StreamingInterface {
     /// `bInterfaceNumber`.
     pub number: u8,
-    /// Address of the end point that carries the pictures, as the input header names it.
+    /// Address of the endpoint that carries the images, as the input header names it.
     pub endpoint: u8,
     /// The output terminal that it shows.
     pub terminal: u8,
     /// Its formats.
     pub formats: Vec<Format>,
-    /// The end points of each alternate setting. A camera that sends by bulk transfers has one setting.
+    /// The endpoints of each alternate setting. A camera that sends by bulk transfers has one setting.
     pub settings: Vec<Setting>,
 }
 
@@ -95,7 +95,7 @@ pub struct StreamingInterface {
 pub struct Setting {
     /// `bAlternateSetting`.
     pub number: u8,
-    /// Its end points.
+    /// Its endpoints.
     pub endpoints: Vec<Endpoint>,
 }
 
@@ -112,7 +112,7 @@ pub struct OtherInterface {
     pub settings: Vec<Setting>,
 }
 
-/// How an end point transfers.
+/// How an endpoint transfers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TransferKind {
     /// Requests.
@@ -125,7 +125,7 @@ pub enum TransferKind {
     Interrupt,
 }
 
-/// An end point.
+/// An endpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Endpoint {
     /// Its address; bit 7 is set when it sends to the host.
@@ -134,22 +134,22 @@ pub struct Endpoint {
     pub kind: TransferKind,
     /// Bytes of a packet.
     pub packet_bytes: u16,
-    /// Packets in a micro-frame, of high-speed isochronous end points: 1 to 3.
+    /// Packets in a micro-frame, of high-speed isochronous endpoints: 1 to 3.
     pub packets: u8,
     /// `bInterval`.
     pub interval: u8,
-    /// What a USB 3 device says more.
+    /// Further parameters of a USB 3 device.
     pub companion: Option<Companion>,
 }
 
-/// The companion of an end point of a USB 3 device.
+/// The companion of an endpoint of a USB 3 device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Companion {
     /// Packets in a burst, less one.
     pub max_burst: u8,
     /// `bmAttributes`.
     pub attributes: u8,
-    /// Bytes in a service interval, of periodic end points.
+    /// Bytes in a service interval, of periodic endpoints.
     pub bytes_per_interval: u16,
 }
 
@@ -160,7 +160,7 @@ pub enum FormatKind {
     Uncompressed,
     /// Frame-based (subtypes 0x10 and 0x11): what a D400 uses for its depth, uncompressed all the same.
     FrameBased,
-    /// JPEG pictures (subtypes 6 and 7).
+    /// JPEG images (subtypes 6 and 7).
     Mjpeg,
 }
 
@@ -275,8 +275,8 @@ impl Format {
 }
 
 impl StreamingInterface {
-    /// The end point that carries the pictures, with the number of the setting it is in: the first in which it is.
-    pub fn picture_endpoint(&self) -> Option<(u8, Endpoint)> {
+    /// The endpoint that carries the images, with the number of the setting it is in: the first in which it is.
+    pub fn image_endpoint(&self) -> Option<(u8, Endpoint)> {
         self.settings
             .iter()
             .find_map(|s| Some((s.number, *s.endpoints.iter().find(|e| e.address == self.endpoint)?)))
@@ -318,7 +318,7 @@ impl Configuration {
         })
     }
 
-    /// The vendor's own interface with one bulk end point each way: its number, the one out and the one in.
+    /// The vendor's own interface with one bulk endpoint each way: its number, the one out and the one in.
     pub fn vendor_channel(&self) -> Option<(u8, Endpoint, Endpoint)> {
         self.others.iter().rev().filter(|i| i.class == 0xFF).find_map(|i| {
             let points = &i.settings.first()?.endpoints;

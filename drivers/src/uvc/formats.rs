@@ -104,9 +104,9 @@ impl FourCc {
     pub const Y12I: Self = Self(*b"Y12I");
     /// 16-bit Bayer pattern.
     pub const BYR2: Self = Self(*b"BYR2");
-    /// JPEG pictures.
+    /// JPEG images.
     pub const MJPG: Self = Self(*b"MJPG");
-    /// JPEG pictures by the name that some kernel drivers give them.
+    /// JPEG images by the name that some kernel drivers give them.
     pub const JPEG: Self = Self(*b"JPEG");
     /// Payload headers of USB video: a format of metadata nodes.
     pub const UVCH: Self = Self(*b"UVCH");

@@ -1,4 +1,4 @@
-//! What the fuzz targets `uvc_*` call: bytes that may be anything, as a device could send them.
+//! Entry points of the fuzz targets `uvc_*`: bytes that may be anything, as a device could send them.
 //!
 //! A panic is a finding; so is a broken promise, which is why there are assertions here. Each function returns how
 //! far its input came, so that a corpus which no longer reaches anything is noticed.
@@ -19,7 +19,7 @@ pub fn descriptors(bytes: &[u8]) -> u64 {
     for stream in &configuration.streams {
         let owner = configuration.control_of(stream.number);
         assert!(owner.is_none_or(|c| c.streams.contains(&stream.number)));
-        if let Some((setting, endpoint)) = stream.picture_endpoint() {
+        if let Some((setting, endpoint)) = stream.image_endpoint() {
             assert_eq!(endpoint.address, stream.endpoint);
             assert!(stream.settings.iter().any(|s| s.number == setting));
         }

@@ -21,7 +21,7 @@ impl Flags {
     pub const PTS: u8 = 0x04;
     /// The header has a source clock reference.
     pub const SCR: u8 = 0x08;
-    /// A still picture.
+    /// A still image.
     pub const STILL: u8 = 0x20;
     /// The device had an error with this frame.
     pub const ERROR: u8 = 0x40;
@@ -59,7 +59,7 @@ pub struct PayloadHeader<'a> {
     pub pts: Option<u32>,
     /// The device's clock when the payload was sent.
     pub source_clock: Option<SourceClock>,
-    /// What the vendor put behind the fields of the standard.
+    /// The vendor's bytes behind the fields of the standard.
     pub vendor: &'a [u8],
 }
 

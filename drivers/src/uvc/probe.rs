@@ -48,7 +48,7 @@ pub struct Probe {
     pub max_frame_bytes: u32,
     /// The most bytes that the device sends in one payload, its header included.
     pub max_payload_bytes: u32,
-    /// What follows in 1.1 and 1.5: clock frequency and more, as it came.
+    /// Further fields of 1.1 and 1.5: clock frequency and more, as it came.
     pub rest: Vec<u8>,
 }
 

@@ -1,4 +1,4 @@
-//! What a rig may ask of a camera at the kernel's video nodes.
+//! Configuration of a camera at the kernel's video nodes.
 
 use super::controls::ControlValue;
 use depthrig_bus::{Intrinsics, MAX_LENT, StreamName};
@@ -14,9 +14,9 @@ pub struct V4l2Config {
     /// Controls by name. Switches and menus are written before numbers, so that an automatic is off when its value
     /// comes.
     pub controls: Vec<(String, ControlValue)>,
-    /// Whose memory pictures arrive in.
+    /// Whose memory images arrive in.
     pub memory: MemoryChoice,
-    /// What becomes of Motion JPEG.
+    /// Handling of Motion JPEG.
     pub mjpeg: MjpegChoice,
     /// Which clock stamps the frames.
     pub clock: ClockChoice,
@@ -50,18 +50,18 @@ impl Default for V4l2Config {
 /// The fewest and the most buffers that a stream may have.
 pub const BUFFERS: core::ops::RangeInclusive<u32> = 2..=MAX_LENT as u32;
 
-/// Whose memory pictures arrive in.
+/// Whose memory images arrive in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum MemoryChoice {
-    /// The kernel's; a picture is copied once, into shared memory.
+    /// The kernel's; an image is copied once, into shared memory.
     #[default]
     Mmap,
-    /// Shared memory itself, where the kernel can; a picture is not copied by us. Else as `Mmap`, with a line in the
+    /// Shared memory itself, where the kernel can; an image is not copied by us. Else as `Mmap`, with a line in the
     /// log.
     UserPointer,
 }
 
-/// What becomes of Motion JPEG.
+/// Handling of Motion JPEG.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum MjpegChoice {
     /// Decoded to red, green, blue.

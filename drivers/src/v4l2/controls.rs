@@ -8,7 +8,7 @@ use std::io;
 use std::os::fd::RawFd;
 use v4l::v4l_sys as sys;
 
-/// What kind of value a control has (`enum v4l2_ctrl_type`).
+/// Kind of a control's value (`enum v4l2_ctrl_type`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ControlKind {
     /// A number.
@@ -36,7 +36,7 @@ pub struct Control {
     pub id: u32,
     /// The name in rig files: that of the kernel in lower case, with `_` between words (as `v4l2-ctl` has it).
     pub name: String,
-    /// What kind of value it has.
+    /// Kind of its value.
     pub kind: ControlKind,
     /// The least value.
     pub minimum: i64,
@@ -77,7 +77,7 @@ impl fmt::Display for ControlValue {
     }
 }
 
-/// A name as rig files write it: lower case, whatever is no letter or digit as one `_` between words.
+/// A name as rig files write it: lower case, one `_` for each run of other characters than letters and digits.
 pub fn plain_name(name: &str) -> String {
     let words = name.split(|c: char| !c.is_ascii_alphanumeric()).filter(|w| !w.is_empty());
     words.map(str::to_ascii_lowercase).collect::<Vec<_>>().join("_")
@@ -118,7 +118,7 @@ impl Control {
         number.ok_or_else(|| self.refuse(value, &format!("takes {}", self.takes())))
     }
 
-    /// What can be written into it, for messages.
+    /// Describes the values that can be written, for messages.
     pub fn takes(&self) -> String {
         match self.kind {
             ControlKind::Boolean => "true or false".to_owned(),
@@ -130,7 +130,9 @@ impl Control {
             ControlKind::Button => "anything; it acts when written".to_owned(),
             ControlKind::Other => "nothing".to_owned(),
             ControlKind::Integer | ControlKind::Integer64 => {
-                let (least, most, step) = (self.minimum, self.maximum, self.step.max(1));
+                let least = self.minimum;
+                let most = self.maximum;
+                let step = self.step.max(1);
                 let steps =
                     if step > 1 { format!(" in steps of {step} from {least}") } else { String::new() };
                 format!("{least} to {most}{steps}, {} after power-on", self.default)
@@ -153,7 +155,7 @@ pub fn find<'c>(controls: &'c [Control], name: &str) -> Result<&'c Control> {
         let names: Vec<_> = controls.iter().map(|c| c.name.as_str()).collect();
         let has =
             if names.is_empty() { "it has none".to_owned() } else { format!("it has: {}", names.join(", ")) };
-        Error::new(ErrorKind::BadInput, format!("there is no control \"{name}\"; {has}"))
+        Error::new(ErrorKind::BadInput, format!("unknown control \"{name}\"; {has}"))
     })
 }
 
@@ -172,7 +174,8 @@ impl FromStr for ControlValue {
 
 /// Every control of the node that can be written or read one by one.
 pub(super) fn enumerate(fd: RawFd) -> io::Result<Vec<Control>> {
-    let (mut controls, mut id) = (Vec::new(), 0);
+    let mut controls = Vec::new();
+    let mut id = 0;
     // Bounded, should a driver not end its list.
     while controls.len() < 1024 {
         let next = match ioctl::next_control(fd, id) {

@@ -2,7 +2,7 @@
 
 use super::config::V4l2Config;
 use super::controls::{ControlKind, ControlValue, find as find_control};
-use super::find::{Found, NodePair};
+use super::find::{FoundCamera, NodePair};
 use super::node::{Mode, Node};
 use super::offer::{Offer, offers};
 use super::stream::{Ready, V4l2Stream};
@@ -15,7 +15,7 @@ use crate::{
 pub(super) struct V4l2Device {
     config: V4l2Config,
     root: SysRoot,
-    found: Found,
+    found: FoundCamera,
     info: DeviceInfo,
     nodes: Vec<NodePair>,
     offers: Vec<Offer>,
@@ -23,13 +23,13 @@ pub(super) struct V4l2Device {
 }
 
 impl V4l2Device {
-    pub(super) fn open(found: Found, config: V4l2Config, root: SysRoot) -> Result<Self> {
+    pub(super) fn open(found: FoundCamera, config: V4l2Config, root: SysRoot) -> Result<Self> {
         let nodes = found.open(&root)?;
         let mut modes: Vec<Vec<Mode>> = Vec::new();
         for pair in &nodes {
             let offered = pair.video.modes(super::offer::is_offered)?;
-            // Only one may set the mode of a node: who streams already keeps everybody else from it. Better said now than
-            // at the start.
+            // Only one may set the mode of a node: who streams already keeps everybody else from it. Better said now
+            // than at the start.
             if let Some(mode) = offered.first() {
                 pair.video.set_mode(mode).map_err(|e| named(&root, &found, e))?;
             }
@@ -41,7 +41,8 @@ impl V4l2Device {
             for pair in &nodes {
                 formats.extend(pair.video.formats()?.iter().map(ToString::to_string));
             }
-            let (camera, has) = (found.describe(), formats.join(", "));
+            let camera = found.describe();
+            let has = formats.join(", ");
             let what = format!("{camera} has no format that depthrig knows; it has: {has}");
             return Err(Error::new(ErrorKind::Unsupported, what));
         }
@@ -62,7 +63,7 @@ impl V4l2Device {
             let offer = offers.iter().find(|o| o.profile == *profile);
             let taken = offer.and_then(|o| Some((o, nodes.get_mut(o.node)?.take()?)));
             let Some((offer, pair)) = taken else {
-                let what = format!("{}: {} is no mode of it", found.describe(), profile.describe());
+                let what = format!("{}: unsupported mode {}", found.describe(), profile.describe());
                 return Err(Error::new(ErrorKind::Unsupported, what));
             };
             let layout = pair.video.set_mode(&offer.mode).map_err(|e| named(&root, &found, e))?;
@@ -105,12 +106,13 @@ fn apply_controls(config: &V4l2Config, nodes: &[&Node]) -> Result<()> {
     Ok(())
 }
 
-/// A camera may take another value than it was given; that is said, and no error.
+/// A camera may take another value than it was given; that is logged, and not an error.
 fn read_back(node: &Node, control: &super::controls::Control, value: &ControlValue) -> Result<()> {
     if control.kind == ControlKind::Button || control.write_only {
         return Ok(());
     }
-    let (wanted, got) = (control.check(value)?, node.read_control(control)?);
+    let wanted = control.check(value)?;
+    let got = node.read_control(control)?;
     if wanted != got {
         let camera = &node.capability().card;
         tracing::warn!(
@@ -118,14 +120,14 @@ fn read_back(node: &Node, control: &super::controls::Control, value: &ControlVal
             control = control.name,
             wanted,
             got,
-            "the camera made something else of a control"
+            "the camera changed the value of a control"
         );
     }
     Ok(())
 }
 
 /// The error with the process that holds the camera, when one does.
-fn named(root: &SysRoot, found: &Found, e: Error) -> Error {
+fn named(root: &SysRoot, found: &FoundCamera, e: Error) -> Error {
     if e.kind() != ErrorKind::Busy {
         return e;
     }
@@ -147,7 +149,9 @@ impl Device for V4l2Device {
     fn start(self: Box<Self>, requests: &[StreamRequest]) -> Result<Box<dyn Stream>> {
         let name = format!("camera {}", self.found.describe());
         let chosen = choose_profiles(&name, &self.profiles, requests)?;
-        let (config, root, found) = (self.config.clone(), self.root.clone(), self.found.clone());
+        let config = self.config.clone();
+        let root = self.root.clone();
+        let found = self.found.clone();
         let ready = self.prepare(&chosen)?;
         let clock_hz = config.device_clock_hz.or_else(|| found.clock_hz(&root));
         let stream =

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 
 /// An attached camera, not opened.
 #[derive(Debug, Clone)]
-pub(super) struct Found {
+pub(super) struct FoundCamera {
     pub(super) info: DeviceInfo,
     /// Its nodes by interface and number, whatever they are.
     nodes: Vec<VideoNode>,
@@ -32,10 +32,10 @@ pub(super) const fn family(vendor_id: u16) -> Option<&'static str> {
 }
 
 /// Every camera at a video node: those on USB, without being opened, and those elsewhere, which must be asked.
-pub(super) fn cameras(root: &SysRoot) -> Result<Vec<Found>> {
-    let mut found: Vec<Found> = scan(root)?.into_iter().filter_map(on_usb).collect();
+pub(super) fn cameras(root: &SysRoot) -> Result<Vec<FoundCamera>> {
+    let mut found: Vec<FoundCamera> = scan(root)?.into_iter().filter_map(on_usb).collect();
     for node in video_nodes(root)? {
-        // What cannot be opened cannot be told from anything else.
+        // A node that cannot be opened cannot be identified.
         let capability = match Node::open(&node.path) {
             Ok(opened) => opened.capability().clone(),
             Err(e) => {
@@ -54,7 +54,7 @@ pub(super) fn cameras(root: &SysRoot) -> Result<Vec<Found>> {
     Ok(found)
 }
 
-fn on_usb(usb: UsbDevice) -> Option<Found> {
+fn on_usb(usb: UsbDevice) -> Option<FoundCamera> {
     let nodes: Vec<_> = usb.video_nodes().cloned().collect();
     let name = nodes.first()?.name.clone();
     // uvcvideo: "HD Webcam C920: HD Webcam C920", cut off where the field ends.
@@ -68,10 +68,10 @@ fn on_usb(usb: UsbDevice) -> Option<Found> {
         calibration: "none".to_owned(),
         motion: String::new(),
     };
-    Some(Found { info, nodes, usb: Some(usb) })
+    Some(FoundCamera { info, nodes, usb: Some(usb) })
 }
 
-fn elsewhere(capability: &Capability, node: VideoNode) -> Found {
+fn elsewhere(capability: &Capability, node: VideoNode) -> FoundCamera {
     let info = DeviceInfo {
         backend: super::NAME,
         model: capability.card.clone(),
@@ -81,10 +81,10 @@ fn elsewhere(capability: &Capability, node: VideoNode) -> Found {
         calibration: "none".to_owned(),
         motion: String::new(),
     };
-    Found { info, nodes: vec![node], usb: None }
+    FoundCamera { info, nodes: vec![node], usb: None }
 }
 
-impl Found {
+impl FoundCamera {
     /// `HD Webcam (serial 1234) at 4-1.2`, for messages.
     pub(super) fn describe(&self) -> String {
         let DeviceInfo { model, serial, port, .. } = &self.info;
@@ -115,11 +115,11 @@ impl Found {
         configuration.controls.first().map(|c| c.clock_hz).filter(|hz| *hz > 0)
     }
 
-    /// Opens its nodes: those that give pictures, each with the metadata node that follows it on its interface.
+    /// Opens its nodes: those that give images, each with the metadata node that follows it on its interface.
     ///
     /// # Errors
     /// [`ErrorKind::PermissionDenied`] (with the cure), [`ErrorKind::Busy`] (naming the holder),
-    /// [`ErrorKind::Disconnected`], [`ErrorKind::Unsupported`] when it gives no pictures.
+    /// [`ErrorKind::Disconnected`], [`ErrorKind::Unsupported`] when it gives no images.
     pub(super) fn open(&self, root: &SysRoot) -> Result<Vec<NodePair>> {
         let mut pairs: Vec<(String, NodePair)> = Vec::new();
         for node in &self.nodes {
@@ -139,7 +139,7 @@ impl Found {
             }
         }
         if pairs.is_empty() {
-            let what = format!("{} gives no pictures: none of its nodes captures video", self.describe());
+            let what = format!("{} gives no images: none of its nodes captures video", self.describe());
             return Err(Error::new(ErrorKind::Unsupported, what));
         }
         Ok(pairs.into_iter().map(|(_, pair)| pair).collect())
@@ -155,11 +155,15 @@ impl Found {
 ///
 /// # Errors
 /// [`ErrorKind::NotFound`] with what there is.
-pub(super) fn choose(found: &[Found], config: &V4l2Config, serial: Option<&str>) -> Result<Found> {
+pub(super) fn choose(
+    found: &[FoundCamera],
+    config: &V4l2Config,
+    serial: Option<&str>,
+) -> Result<FoundCamera> {
     let serial = serial.or(config.serial.as_deref());
     let port = config.port.as_deref();
     let named = serial.is_some() || port.is_some();
-    let fits = |f: &Found| {
+    let fits = |f: &FoundCamera| {
         serial.is_none_or(|s| f.info.serial == s)
             && port.is_none_or(|p| f.is_at(p))
             && (named || f.family().is_none())
@@ -172,12 +176,12 @@ pub(super) fn choose(found: &[Found], config: &V4l2Config, serial: Option<&str>)
         (Some(s), Some(p)) => format!("no camera with serial number \"{s}\" at port {p}"),
         (Some(s), None) => format!("no camera, or more than one, with serial number \"{s}\""),
         (None, Some(p)) => format!("no camera at port {p}"),
-        (None, None) => "it is not said which camera is meant (serial or port)".to_owned(),
+        (None, None) => "set serial or port: no camera, or more than one, fits without them".to_owned(),
     };
     let list: Vec<_> = found
         .iter()
         .map(|f| match f.family() {
-            Some(family) => format!("{} (driven by the back end {family})", f.describe()),
+            Some(family) => format!("{} (driven by the backend {family})", f.describe()),
             None => f.describe(),
         })
         .collect();

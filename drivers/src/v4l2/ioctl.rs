@@ -44,7 +44,8 @@ pub(super) struct Buffer {
 /// Plain C data for which all bytes zero is a value.
 ///
 /// # Safety
-/// Only for structures of the kernel's interface, which hold integers, arrays of them, raw pointers and unions of those.
+/// Only for structures of the kernel's interface, which hold integers, arrays of them, raw pointers and unions of
+/// those.
 unsafe trait Plain: Copy {
     fn zeroed() -> Self {
         // SAFETY: the trait's own condition.
@@ -138,7 +139,7 @@ fn none_if_invalid<T>(result: io::Result<T>) -> io::Result<Option<T>> {
     }
 }
 
-/// A picture format as the kernel has it after `VIDIOC_S_FMT`.
+/// An image format as the kernel has it after `VIDIOC_S_FMT`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct PixFormat {
     pub(super) width: u32,
@@ -148,7 +149,7 @@ pub(super) struct PixFormat {
     pub(super) size_image: u32,
 }
 
-/// `VIDIOC_S_FMT` on a capture node: asks for progressive pictures without row padding; the driver answers what it
+/// `VIDIOC_S_FMT` on a capture node: asks for progressive images without row padding; the driver answers what it
 /// will give.
 pub(super) fn set_pix_format(fd: RawFd, width: u32, height: u32, fourcc: u32) -> io::Result<PixFormat> {
     let mut f: sys::v4l2_format = Plain::zeroed();
@@ -260,7 +261,7 @@ pub(super) fn next_control(fd: RawFd, id: u32) -> io::Result<Option<sys::v4l2_qu
     none_if_invalid(plain_call(fd, vidioc::VIDIOC_QUERY_EXT_CTRL, &mut q).map(|()| q))
 }
 
-/// `VIDIOC_QUERYMENU`: what item `index` of a menu is called, or the number it stands for; `None` when there is none.
+/// `VIDIOC_QUERYMENU`: the name of item `index` of a menu, or its number; `None` when the item does not exist.
 pub(super) fn menu_item(fd: RawFd, id: u32, index: u32, numeric: bool) -> io::Result<Option<String>> {
     let mut m = sys::v4l2_querymenu { id, index, ..Plain::zeroed() };
     none_if_invalid(plain_call(fd, vidioc::VIDIOC_QUERYMENU, &mut m).map(|()| {

@@ -1,8 +1,8 @@
-//! Streaming into the receiver's own memory (user pointers): the kernel writes each picture into a loan, and no byte
+//! Streaming into the receiver's own memory (user pointers): the kernel writes each image into a loan, and no byte
 //! of it is copied by this process.
 //!
 //! Several loans are out at once, one for each buffer of the queue. A loan that was filled is published and another
-//! takes its place; one that was filled with a damaged picture is handed to the kernel again.
+//! takes its place; one that was filled with a damaged image is handed to the kernel again.
 #![allow(unsafe_code)] // Giving the kernel the address of memory to write into.
 
 use super::ioctl::{self, Buffer, Memory, QueueKind};
@@ -14,7 +14,7 @@ use core::time::Duration;
 use depthrig_bus::HostTime;
 use v4l::v4l_sys as sys;
 
-/// A picture that lies in a loan already.
+/// An image that lies in a loan already.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Filled {
     pub(super) bytes: usize,
@@ -29,7 +29,7 @@ pub(super) struct Refused {
     pub(super) why: String,
 }
 
-/// What takes a filled loan of a queue, and gives it back when it was not published.
+/// Callback that takes a filled loan of a queue, and gives it back when it was not published.
 pub(super) type Take<'t> = dyn FnMut(usize, &Filled, Loan, &mut dyn FrameSink) -> Option<Loan> + 't;
 
 /// The queues of one camera, one for each of its streams.
@@ -58,7 +58,7 @@ impl LentSource {
         for (stream, (node, layout, frame_bytes)) in nodes.into_iter().enumerate() {
             if layout.size_image as usize != frame_bytes {
                 let why = format!(
-                    "{}: a buffer has {} bytes and a frame {frame_bytes}: rows are padded, or pictures are packed",
+                    "{}: a buffer has {} bytes and a frame {frame_bytes}: rows are padded, or images are packed",
                     node.path().display(),
                     layout.size_image
                 );
@@ -86,7 +86,7 @@ impl LentSource {
         Self { queues: Vec::new(), on: false }
     }
 
-    /// What the stamps of stream `stream` are.
+    /// Meaning of the stamps of stream `stream`.
     pub(super) fn stamp(&self, stream: usize) -> Stamp {
         let flags = self.queues.get(stream).and_then(|q| {
             ioctl::query_buffer(q.node.fd(), QueueKind::Video, Memory::UserPointer, 0).ok().map(|b| b.flags)

@@ -1,4 +1,5 @@
-//! What the kernel hands over beside a picture: the payload headers of USB video, and finding those of a picture.
+//! Metadata that the kernel delivers beside an image: the payload headers of USB video, and how to find those of an
+//! image.
 
 use crate::uvc::formats::FourCc;
 
@@ -9,7 +10,7 @@ pub enum MetadataFormat {
     D4xx,
     /// Payload headers of 2 to 12 bytes.
     Uvch,
-    /// There is no metadata node, or it gives something else.
+    /// No metadata node, or one with another format.
     #[default]
     None,
 }
@@ -24,7 +25,7 @@ impl MetadataFormat {
         }
     }
 
-    /// What the kernel set.
+    /// The format that the kernel set.
     pub fn from_fourcc(code: FourCc) -> Self {
         match code {
             FourCc::D4XX => Self::D4xx,
@@ -41,12 +42,13 @@ const PREFIX: usize = 10;
 /// The payload header in a buffer of a metadata node: its first block without the kernel's prefix, from the byte
 /// with its own length to its end. `None` when the buffer is too short for what it claims.
 ///
-/// The kernel writes one block per payload; a picture that came in several has the same stamp in each. With
+/// The kernel writes one block per payload; an image that came in several has the same stamp in each. With
 /// [`MetadataFormat::Uvch`] it leaves out what the vendor put behind the standard part, yet the length stays that of
 /// the whole.
 pub fn payload_header(record: &[u8], format: MetadataFormat) -> Option<&[u8]> {
     let block = record.get(PREFIX..)?;
-    let (length, flags) = (usize::from(*block.first()?), *block.get(1)?);
+    let length = usize::from(*block.first()?);
+    let flags = *block.get(1)?;
     if length < 2 {
         return None;
     }
@@ -58,9 +60,9 @@ pub fn payload_header(record: &[u8], format: MetadataFormat) -> Option<&[u8]> {
 /// The longest record that is kept: prefix and a header of 255 bytes.
 pub(super) const RECORD_BYTES: usize = PREFIX + 255;
 
-/// Two stamps of one picture, taken at two moments, are no further apart than this (5 ms).
+/// Two stamps of one image, taken at two moments, are no further apart than this (5 ms).
 const NEAR_NS: i64 = 5_000_000;
-/// Records that wait for their pictures; more are never on their way, as there are no more buffers.
+/// Records that wait for their images; more are never on their way, as there are no more buffers.
 const KEPT: usize = 16;
 
 /// One record of a metadata node.
@@ -87,17 +89,17 @@ impl Record {
         self.bytes.get(..self.length).unwrap_or_default()
     }
 
-    /// Whether this belongs to the picture with that number and stamp.
+    /// Whether this belongs to the image with that number and stamp.
     ///
-    /// `uvcvideo` gives both to the record; with its parameter `hwtimestamps` the picture's stamp is moved a little
-    /// afterwards. `vivid` counts the records by themselves and gives them the picture's stamp.
+    /// `uvcvideo` gives both to the record; with its parameter `hwtimestamps` the image's stamp is moved a little
+    /// afterwards. `vivid` counts the records by themselves and gives them the image's stamp.
     fn belongs_to(&self, sequence: u32, stamp_ns: i64) -> bool {
         self.stamp_ns == stamp_ns
             || (self.sequence == sequence && self.stamp_ns.abs_diff(stamp_ns) < NEAR_NS.unsigned_abs())
     }
 }
 
-/// Records that wait for their pictures.
+/// Records that wait for their images.
 #[derive(Default)]
 pub(super) struct Waiting {
     records: Vec<Record>,
@@ -112,12 +114,12 @@ impl Waiting {
         self.records.push(*record);
     }
 
-    /// Whether the record of that picture has come.
+    /// Whether the record of that image has come.
     pub(super) fn has(&self, sequence: u32, stamp_ns: i64) -> bool {
         self.records.iter().any(|r| r.belongs_to(sequence, stamp_ns))
     }
 
-    /// The record of that picture. Those that came before it are dropped: their pictures will not come any more.
+    /// The record of that image. Those that came before it are dropped: their images will not come any more.
     pub(super) fn take(&mut self, sequence: u32, stamp_ns: i64) -> Option<Record> {
         let at = self.records.iter().position(|r| r.belongs_to(sequence, stamp_ns))?;
         let record = self.records.get(at).copied();
@@ -145,12 +147,16 @@ mod tests {
 
     #[test]
     fn the_standard_header_of_a_longer_one_is_told_by_its_flags() {
-        // What uvcvideo makes of the header of a D435: 232 bytes long, of which it hands over 12.
+        // uvcvideo's record of the header of a D435: 232 bytes long, of which it hands over 12.
         let mut record = vec![0; PREFIX];
         record.extend([232, 0x8F, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10]);
         assert_eq!(payload_header(&record, Uvch), Some(&record[10..22]));
         record.extend([0; 250]);
-        assert_eq!(payload_header(&record, Uvch), Some(&record[10..22]), "the next record is none of it");
+        assert_eq!(
+            payload_header(&record, Uvch),
+            Some(&record[10..22]),
+            "the next record does not belong to it"
+        );
         record[11] = 0x86;
         assert_eq!(payload_header(&record, Uvch), Some(&record[10..16]), "presentation time alone");
         record[10] = 2;
@@ -168,22 +174,22 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_gets_its_own_record_and_no_other() {
+    fn an_image_gets_its_own_record_and_no_other() {
         let mut waiting = Waiting::default();
         for (sequence, stamp) in [(7, 100_000_000), (8, 133_000_000), (9, 166_000_000)] {
             waiting.keep(&Record::new(sequence, stamp, &[sequence as u8]));
         }
         assert!(waiting.has(8, 133_000_000));
-        assert!(!waiting.has(12, 133_000_001), "another picture, a moment later");
+        assert!(!waiting.has(12, 133_000_001), "another image, a moment later");
         assert!(!waiting.has(8, 150_000_000), "that number, but long after: the counter began anew");
         assert_eq!(waiting.take(8, 134_000_000).unwrap().bytes(), [8], "stamp moved by the kernel");
-        assert!(!waiting.has(7, 100_000_000), "its picture was lost before");
+        assert!(!waiting.has(7, 100_000_000), "its image was lost before");
         assert_eq!(waiting.take(30, 166_000_000).unwrap().bytes(), [9], "records counted by themselves");
         assert!(waiting.take(9, 166_000_000).is_none());
     }
 
     #[test]
-    fn records_without_pictures_do_not_pile_up() {
+    fn records_without_images_do_not_pile_up() {
         let mut waiting = Waiting::default();
         for i in 0..100 {
             waiting.keep(&Record::new(i, i64::from(i) * 33_000_000, &[0; 400]));

@@ -16,7 +16,7 @@ use v4l::framesize::FrameSizeEnum;
 use v4l::v4l_sys as sys;
 use v4l::video::Capture as _;
 
-/// What a node says of itself.
+/// Capabilities of a node, as the driver reports them.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Capability {
     /// Its driver: `uvcvideo`, `vivid`, …
@@ -25,12 +25,12 @@ pub struct Capability {
     pub card: String,
     /// Where it is attached, as the kernel has it: `usb-0000:00:14.0-1`, `platform:vivid-000`.
     pub bus: String,
-    /// What this very node can do (`device_caps`, not what all nodes of the device can).
+    /// Capabilities of this very node (`device_caps`, not those of all nodes of the device).
     pub flags: u32,
 }
 
 impl Capability {
-    /// Whether pictures come from it.
+    /// Whether images come from it.
     pub const fn is_capture(&self) -> bool {
         self.flags & sys::V4L2_CAP_VIDEO_CAPTURE != 0
     }
@@ -56,7 +56,7 @@ pub struct Interval {
 }
 
 impl Interval {
-    /// Frames a second; 0 for a fraction that is none.
+    /// Frames a second; 0 for an invalid fraction.
     pub fn rate_hz(self) -> f64 {
         if self.numerator == 0 { 0.0 } else { f64::from(self.denominator) / f64::from(self.numerator) }
     }
@@ -65,7 +65,7 @@ impl Interval {
 /// A format, a size and a frame interval.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mode {
-    /// The format of its pictures.
+    /// The format of its images.
     pub format: FourCc,
     /// Pixels per row.
     pub width: u32,
@@ -82,10 +82,10 @@ impl fmt::Display for Mode {
     }
 }
 
-/// How a picture lies in a buffer of the kernel.
+/// How an image lies in a buffer of the kernel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Layout {
-    /// Bytes from one row to the next; 0 for compressed pictures.
+    /// Bytes from one row to the next; 0 for compressed images.
     pub bytes_per_line: u32,
     /// Bytes that a buffer needs at most.
     pub size_image: u32,
@@ -132,7 +132,7 @@ impl Node {
     ///
     /// # Errors
     /// [`ErrorKind::NotFound`], [`ErrorKind::PermissionDenied`] (with the cure), [`ErrorKind::Disconnected`],
-    /// [`ErrorKind::Unsupported`] when it is no video node, [`ErrorKind::Io`].
+    /// [`ErrorKind::Unsupported`] when it is not a video node, [`ErrorKind::Io`].
     pub fn open(path: &Path) -> Result<Self> {
         let device = v4l::Device::with_path(path).map_err(|e| node_error(path, "cannot be opened", e))?;
         let c = ioctl::capability(device.handle().fd())
@@ -149,7 +149,7 @@ impl Node {
         &self.path
     }
 
-    /// What it says of itself.
+    /// Its capabilities.
     pub const fn capability(&self) -> &Capability {
         &self.capability
     }
@@ -211,7 +211,7 @@ impl Node {
     fn sizes(&self, format: FourCc) -> Result<Vec<(u32, u32)>> {
         let listed = match self.device.enum_framesizes(v4l::FourCC::new(&format.0)) {
             Ok(listed) => listed,
-            Err(e) => return self.none_listed("does not list its picture sizes (VIDIOC_ENUM_FRAMESIZES)", e),
+            Err(e) => return self.none_listed("does not list its image sizes (VIDIOC_ENUM_FRAMESIZES)", e),
         };
         let mut sizes = Vec::new();
         for s in listed {
@@ -246,7 +246,8 @@ impl Node {
                         Interval { numerator: f.numerator, denominator: f.denominator }.rate_hz()
                     };
                     // The longest interval is the slowest rate.
-                    let (slowest, fastest) = (rate(s.max), rate(s.min));
+                    let slowest = rate(s.max);
+                    let fastest = rate(s.min);
                     let within = |hz: &u32| (slowest..=fastest).contains(&f64::from(*hz));
                     intervals.extend(
                         COMMON_RATES
@@ -269,7 +270,7 @@ impl Node {
         }
     }
 
-    /// Sets the mode and says how its pictures will lie in the buffers.
+    /// Sets the mode and says how its images will lie in the buffers.
     ///
     /// # Errors
     /// [`ErrorKind::Unsupported`] when the driver gives another mode, naming it; [`ErrorKind::Busy`],
@@ -377,7 +378,7 @@ impl ControlPort for Node {
             let (kind, why) = match e.raw_os_error().map(Errno::from_raw_os_error) {
                 Some(Errno::NOENT) => (ErrorKind::Unsupported, "the camera has no such unit or selector"),
                 Some(Errno::BADRQC) => (ErrorKind::Unsupported, "the selector cannot do that"),
-                Some(Errno::NOTTY) => (ErrorKind::Unsupported, "this is no node of a USB camera"),
+                Some(Errno::NOTTY) => (ErrorKind::Unsupported, "this is not a node of a USB camera"),
                 Some(Errno::NOBUFS) => (ErrorKind::Protocol, "the value has another length"),
                 Some(Errno::INVAL | Errno::PIPE | Errno::RANGE | Errno::ILSEQ) => {
                     (ErrorKind::Protocol, "the camera refused")

@@ -14,7 +14,7 @@ pub(super) struct Offer {
     pub(super) mode: Mode,
 }
 
-/// The formats that are offered, in the order in which one is chosen when the rig names none. A decoded picture comes
+/// The formats that are offered, in the order in which one is chosen when the rig names none. A decoded image comes
 /// before a grey one, and before both what needs no decoding.
 const PREFERRED: [FourCc; 8] = [
     FourCc::Z16,
@@ -27,7 +27,7 @@ const PREFERRED: [FourCc; 8] = [
     FourCc::GREY,
 ];
 
-/// What a picture of `format` is delivered as; `None` when we cannot.
+/// Pixel format in which an image of `format` is delivered; `None` if unsupported.
 pub(super) fn delivered(format: FourCc, mjpeg: MjpegChoice) -> Option<PixelFormat> {
     match format.pixel_format().filter(|_| PREFERRED.contains(&format)) {
         Some(PixelFormat::Mjpeg) if mjpeg == MjpegChoice::Decode => Some(PixelFormat::Rgb8),
@@ -35,7 +35,7 @@ pub(super) fn delivered(format: FourCc, mjpeg: MjpegChoice) -> Option<PixelForma
     }
 }
 
-/// Whether a node's pictures are of any use to us.
+/// Whether a node's images are of any use to us.
 pub(super) fn is_offered(format: FourCc) -> bool {
     PREFERRED.contains(&format)
 }

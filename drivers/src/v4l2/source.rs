@@ -1,10 +1,10 @@
-//! Pictures from the kernel's nodes, several of one camera in one thread, each with its metadata if there is any.
+//! Images from the kernel's nodes, several of one camera in one thread, each with its metadata if there is any.
 
 use super::ioctl::{Buffer, QueueKind};
 use super::metadata::{MetadataFormat, RECORD_BYTES, Record, Waiting, payload_header};
 use super::node::Node;
 use super::queue::MappedQueue;
-use crate::video::{Picture, PictureSource};
+use crate::video::{Image, ImageSource};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::HostTime;
@@ -14,31 +14,31 @@ use v4l::v4l_sys as sys;
 
 /// Buffers of each queue. A thread may be away for three frame times before frames are lost.
 pub const DEFAULT_BUFFERS: u32 = 4;
-/// How long a picture waits for metadata that the kernel hands over after it. `uvcvideo` hands it over before.
-const METADATA_PATIENCE: Duration = Duration::from_millis(2);
+/// How long an image waits for metadata that the kernel hands over after it. `uvcvideo` hands it over before.
+const METADATA_TIMEOUT: Duration = Duration::from_millis(2);
 /// A sequence number that is this far behind the last one began anew.
 const SEQUENCE_BACK: u32 = 1 << 31;
 
 /// A node to stream from. Its mode was set with [`Node::set_mode`].
 #[derive(Debug)]
 pub struct Wanted {
-    /// Where pictures come from.
+    /// Where images come from.
     pub video: Node,
     /// The metadata node of the same interface, and the format that is wanted of it.
     pub metadata: Option<(Node, MetadataFormat)>,
 }
 
 impl Wanted {
-    /// Pictures alone.
+    /// Images alone.
     pub const fn plain(video: Node) -> Self {
         Self { video, metadata: None }
     }
 }
 
-/// What the stamps of a node are.
+/// Meaning of the stamps of a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stamp {
-    /// Of `CLOCK_MONOTONIC`, taken when the first bytes of the picture came (`TSTAMP_SRC_SOE`).
+    /// Of `CLOCK_MONOTONIC`, taken when the first bytes of the image came (`TSTAMP_SRC_SOE`).
     Start,
     /// Of `CLOCK_MONOTONIC`, taken when the last bytes had come (`TSTAMP_SRC_EOF`).
     End,
@@ -47,7 +47,7 @@ pub enum Stamp {
 }
 
 impl Stamp {
-    /// What the flags of a buffer say.
+    /// Reads the flags of a buffer.
     pub const fn from_flags(flags: u32) -> Self {
         if flags & sys::V4L2_BUF_FLAG_TIMESTAMP_MASK != sys::V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC {
             Self::Unknown
@@ -79,7 +79,7 @@ struct MetadataPort {
 
 impl Source {
     /// Starts streaming from all of `nodes` with `buffers` buffers each. Metadata queues begin before the video
-    /// queues and end after them, so that no picture is without its own.
+    /// queues and end after them, so that no image is without its own.
     ///
     /// A metadata node that gives neither of the formats we know is left alone.
     ///
@@ -110,7 +110,7 @@ impl Source {
         self.ports.get(source).and_then(|p| p.metadata.as_ref()).map_or(MetadataFormat::None, |m| m.format)
     }
 
-    /// What the stamps of source number `source` are.
+    /// Meaning of the stamps of source number `source`.
     pub fn stamp(&self, source: usize) -> Stamp {
         self.ports.get(source).map_or(Stamp::Unknown, |p| Stamp::from_flags(p.video.flags))
     }
@@ -128,7 +128,7 @@ impl MetadataPort {
         if format == MetadataFormat::None {
             return Ok(None);
         }
-        // Twice as many as pictures: a record is given back at once, but a picture may keep us from it.
+        // Twice as many as images: a record is given back at once, but an image may keep us from it.
         let queue = MappedQueue::new(node, QueueKind::Metadata, 2 * buffers)?;
         Ok(Some(Self { queue, format, waiting: Waiting::default() }))
     }
@@ -136,7 +136,8 @@ impl MetadataPort {
     /// Takes over whatever the kernel has.
     fn drain(&mut self) -> Result<()> {
         for _ in 0..self.queue.depth() {
-            let (queue, waiting) = (&mut self.queue, &mut self.waiting);
+            let queue = &mut self.queue;
+            let waiting = &mut self.waiting;
             let came = queue.next(|b, bytes| {
                 let bytes = bytes.get(..RECORD_BYTES.min(bytes.len())).unwrap_or_default();
                 waiting.keep(&Record::new(b.sequence, b.stamp_ns, bytes));
@@ -148,9 +149,9 @@ impl MetadataPort {
         Ok(())
     }
 
-    /// The record of the picture in `b`, waiting for it a little.
+    /// The record of the image in `b`, waiting for it a little.
     fn record_of(&mut self, b: &Buffer) -> Result<Option<Record>> {
-        let until = HostTime::now().plus(METADATA_PATIENCE);
+        let until = HostTime::now().plus(METADATA_TIMEOUT);
         loop {
             self.drain()?;
             if self.waiting.has(b.sequence, b.stamp_ns) {
@@ -164,8 +165,8 @@ impl MetadataPort {
     }
 }
 
-impl PictureSource for Source {
-    fn poll(&mut self, timeout: Duration, each: &mut dyn FnMut(&Picture<'_>)) -> Result<bool> {
+impl ImageSource for Source {
+    fn poll(&mut self, timeout: Duration, each: &mut dyn FnMut(&Image<'_>)) -> Result<bool> {
         let ready = {
             let nodes: Vec<&Node> = self.ports.iter().map(|p| p.video.node()).collect();
             wait(&nodes, timeout)?
@@ -179,7 +180,7 @@ impl PictureSource for Source {
             }
             any |= came > 0;
             if failed && came == 0 {
-                // Nothing to take and no error from taking: there is no other way to learn what is wrong.
+                // Taking an image yields neither an image nor an error, so the cause is unknown.
                 let path = port.video.node().path().display();
                 return Err(Error::new(
                     ErrorKind::Io,
@@ -192,8 +193,8 @@ impl PictureSource for Source {
 }
 
 impl Port {
-    /// Hands the oldest picture to `each`; whether there was one.
-    fn next(&mut self, index: usize, each: &mut dyn FnMut(&Picture<'_>)) -> Result<bool> {
+    /// Hands the oldest image to `each`; whether there was one.
+    fn next(&mut self, index: usize, each: &mut dyn FnMut(&Image<'_>)) -> Result<bool> {
         let Self { video, metadata, sequence } = self;
         let format = metadata.as_ref().map_or(MetadataFormat::None, |m| m.format);
         let came = video.next(|b, bytes| {
@@ -208,7 +209,7 @@ impl Port {
             };
             let kernel_time =
                 (Stamp::from_flags(b.flags) != Stamp::Unknown).then(|| HostTime::from_ns(b.stamp_ns));
-            each(&Picture {
+            each(&Image {
                 source: index,
                 bytes,
                 damaged: b.flags & sys::V4L2_BUF_FLAG_ERROR != 0,

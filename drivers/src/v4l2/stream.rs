@@ -1,4 +1,4 @@
-//! A streaming camera: each picture through its stream's gate, into shared memory.
+//! A streaming camera: each image through its stream's gate, into shared memory.
 
 use super::config::{ClockChoice, MemoryChoice, V4l2Config};
 use super::lent::{Filled, LentSource, Refused};
@@ -8,7 +8,7 @@ use super::offer::{Offer, kernel_clock};
 use super::source::{Source, Stamp, Wanted};
 use super::tick::{self, Sample};
 use crate::uvc::payload::PayloadHeader;
-use crate::video::{Picture, PictureSource};
+use crate::video::{Image, ImageSource};
 use crate::{
     DeviceClock, FrameSink, Gate, Loan, Outcome, Poll, RawFrame, Result, Stream, StreamProfile, unpack,
 };
@@ -16,8 +16,8 @@ use core::time::Duration;
 use depthrig_bus::{ClockDomain, DropReason, FrameFlags, HostTime, MetadataLevel, PixelFormat};
 use std::path::PathBuf;
 
-/// How long the pictures for [`tick`] may take to come, together.
-const TICK_PATIENCE: Duration = Duration::from_secs(1);
+/// How long the images for [`tick`] may take to come, together.
+const TICK_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// A node with the mode that was set on it.
 pub(super) struct Ready {
@@ -31,16 +31,16 @@ pub(super) struct Ready {
 pub(super) struct V4l2Stream {
     name: String,
     profiles: Vec<StreamProfile>,
-    lanes: Vec<Lane>,
+    streams: Vec<StreamState>,
     way: Way,
     buffers: u32,
 }
 
-/// How pictures come.
+/// How images are received.
 enum Way {
     /// In the kernel's buffers.
     Mapped(Source),
-    /// In the receiver's memory; the nodes, should the first poll show that this cannot be.
+    /// In the receiver's memory; the nodes to reopen if the first poll shows that this is unsupported.
     Lent(LentSource, Vec<Spot>),
 }
 
@@ -51,29 +51,29 @@ struct Spot {
 }
 
 /// One stream.
-struct Lane {
+struct StreamState {
     name: String,
     gate: Gate,
     unpack: Unpack,
-    clock: LaneClock,
+    clock: StreamClock,
 }
 
-/// How the pictures of a stream get into the receiver's memory.
+/// How the images of a stream get into the receiver's memory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Unpack {
     /// Rows that may be padded.
     Rows { stride: usize, row: usize, rows: usize },
-    /// A JPEG picture as it came.
+    /// A JPEG image as it came.
     Keep,
-    /// A JPEG picture, decoded.
+    /// A JPEG image, decoded.
     Decode { width: u32, height: u32 },
 }
 
 /// Where the times of a stream come from.
-enum LaneClock {
+enum StreamClock {
     /// The stamps of the kernel; whether one ahead of us was seen and said.
     Kernel { said: bool },
-    /// When we got the picture.
+    /// When we got the image.
     Arrival,
     /// The device's counter, which ticks so often a second; its last stamp and the host's.
     Device { hz: u32, last: Option<(u32, HostTime)> },
@@ -93,20 +93,21 @@ impl V4l2Stream {
             MemoryChoice::Mmap => mapped(&name, ready, &profiles, config, clock_hz)?,
             MemoryChoice::UserPointer => lent(&name, ready, &profiles, config)?,
         };
-        let mut lanes = Vec::new();
+        let mut streams = Vec::new();
         for (i, (profile, clock)) in profiles.iter_mut().zip(clocks).enumerate() {
             (profile.clock, profile.metadata) = clock.of_profile();
             let unpack = unpacks.get(i).copied().unwrap_or(Unpack::Keep);
-            let (stream, times) = (&profile.stream, profile.metadata.name());
+            let stream = &profile.stream;
+            let times = profile.metadata.name();
             tracing::info!(camera = name, %stream, times, memory = way.name(), "streaming from the kernel's node");
-            lanes.push(Lane {
+            streams.push(StreamState {
                 name: format!("{name}, {stream}"),
                 gate: Gate::new(i, profile),
                 unpack,
                 clock,
             });
         }
-        Ok(Self { name, profiles, lanes, way, buffers: config.buffers })
+        Ok(Self { name, profiles, streams, way, buffers: config.buffers })
     }
 
     /// Goes over to the kernel's buffers, for the reason given.
@@ -133,7 +134,7 @@ impl Way {
 fn say_fall_back(name: &str, why: &str) {
     tracing::warn!(
         camera = name,
-        "pictures are copied once, because the kernel cannot write them itself: {why}"
+        "images are copied once, because the kernel cannot write them itself: {why}"
     );
 }
 
@@ -154,7 +155,7 @@ fn mapped(
     profiles: &[StreamProfile],
     config: &V4l2Config,
     clock_hz: Option<u32>,
-) -> Result<(Way, Vec<LaneClock>)> {
+) -> Result<(Way, Vec<StreamClock>)> {
     let wants_headers = config.clock == ClockChoice::Auto;
     let wanted = ready.into_iter().map(|r| Wanted {
         video: r.video,
@@ -169,13 +170,13 @@ fn mapped(
     let clock = |i: usize| {
         let seen = samples.get(i).map(Vec::as_slice).unwrap_or_default();
         match tick::frequency_hz(seen, clock_hz) {
-            Some(hz) => LaneClock::Device { hz, last: None },
-            None => LaneClock::of_host(source.stamp(i)),
+            Some(hz) => StreamClock::Device { hz, last: None },
+            None => StreamClock::of_host(source.stamp(i)),
         }
     };
-    let clocks: Vec<LaneClock> = (0..profiles.len()).map(clock).collect();
+    let clocks: Vec<StreamClock> = (0..profiles.len()).map(clock).collect();
     let is_unused =
-        |(c, s): &(&LaneClock, &Vec<Sample>)| !matches!(c, LaneClock::Device { .. }) && !s.is_empty();
+        |(c, s): &(&StreamClock, &Vec<Sample>)| !matches!(c, StreamClock::Device { .. }) && !s.is_empty();
     if let Some((_, seen)) = clocks.iter().zip(&samples).find(is_unused) {
         let measured_hz = tick::measured_hz(seen).unwrap_or(f64::NAN).round();
         tracing::info!(
@@ -188,10 +189,10 @@ fn mapped(
     Ok((Way::Mapped(source), clocks))
 }
 
-/// The time stamps in the first payload headers of each stream. The pictures themselves are not captured yet.
+/// The time stamps in the first payload headers of each stream. The images themselves are not captured yet.
 fn first_stamps(source: &mut Source, streams: usize, clock_hz: Option<u32>) -> Result<Vec<Vec<Sample>>> {
     let mut samples: Vec<Vec<Sample>> = vec![Vec::new(); streams];
-    let until = HostTime::now().plus(TICK_PATIENCE);
+    let until = HostTime::now().plus(TICK_TIMEOUT);
     while !samples.iter().all(|s| tick::is_settled(s, clock_hz)) && !until.from_now().is_zero() {
         source.poll(until.from_now(), &mut |p| {
             let sample = pts(p).map(|ticks| Sample { ticks, host: p.kernel_time.unwrap_or(p.arrival) });
@@ -203,8 +204,8 @@ fn first_stamps(source: &mut Source, streams: usize, clock_hz: Option<u32>) -> R
     Ok(samples)
 }
 
-/// The presentation time stamp in the payload header of a picture.
-fn pts(p: &Picture<'_>) -> Option<u32> {
+/// The presentation time stamp in the payload header of an image.
+fn pts(p: &Image<'_>) -> Option<u32> {
     PayloadHeader::parse(p.header?).ok()?.pts
 }
 
@@ -214,7 +215,7 @@ fn lent(
     ready: Vec<Ready>,
     profiles: &[StreamProfile],
     config: &V4l2Config,
-) -> Result<(Way, Vec<LaneClock>)> {
+) -> Result<(Way, Vec<StreamClock>)> {
     let spots: Vec<Spot> =
         ready.iter().map(|r| Spot { path: r.video.path().to_owned(), mode: r.offer.mode }).collect();
     let varies = |p: &StreamProfile| matches!(p.format, PixelFormat::Mjpeg | PixelFormat::Rgb8);
@@ -226,13 +227,13 @@ fn lent(
     };
     match prepared {
         Ok(source) => {
-            let clocks = (0..profiles.len()).map(|i| LaneClock::of_host(source.stamp(i))).collect();
+            let clocks = (0..profiles.len()).map(|i| StreamClock::of_host(source.stamp(i))).collect();
             Ok((Way::Lent(source, spots), clocks))
         }
         Err(Refused { why }) => {
             say_fall_back(name, &why);
             let source = reopen(&spots, config.buffers)?;
-            let clocks = (0..profiles.len()).map(|i| LaneClock::of_host(source.stamp(i))).collect();
+            let clocks = (0..profiles.len()).map(|i| StreamClock::of_host(source.stamp(i))).collect();
             Ok((Way::Mapped(source), clocks))
         }
     }
@@ -250,24 +251,24 @@ impl Stream for V4l2Stream {
         {
             self.fall_back(&why)?;
         }
-        let lanes = &mut self.lanes;
+        let streams = &mut self.streams;
         let any = match &mut self.way {
             Way::Mapped(source) => source.poll(timeout, &mut |p| {
-                if let Some(lane) = lanes.get_mut(p.source) {
-                    lane.copy(p, sink);
+                if let Some(stream) = streams.get_mut(p.source) {
+                    stream.copy(p, sink);
                 }
             })?,
-            Way::Lent(source, _) => source.poll(timeout, sink, &mut |stream, filled, loan, sink| {
-                lanes.get_mut(stream).and_then(|lane| lane.publish(filled, loan, sink))
+            Way::Lent(source, _) => source.poll(timeout, sink, &mut |index, filled, loan, sink| {
+                streams.get_mut(index).and_then(|stream| stream.publish(filled, loan, sink))
             })?,
         };
         Ok(if any { Poll::Frame } else { Poll::Idle })
     }
 }
 
-impl Lane {
-    /// A picture in the kernel's buffer: copied once.
-    fn copy(&mut self, p: &Picture<'_>, sink: &mut dyn FrameSink) {
+impl StreamState {
+    /// An image in the kernel's buffer: copied once.
+    fn copy(&mut self, p: &Image<'_>, sink: &mut dyn FrameSink) {
         let Self { gate, unpack, clock, name } = self;
         let (bytes, arrived) = unpack.measure(p.bytes);
         let mut raw = RawFrame::new(p.sequence, 0, p.arrival, arrived);
@@ -276,7 +277,7 @@ impl Lane {
         gate.deliver(&raw, sink, |to| unpack.fill(bytes, to));
     }
 
-    /// A picture in the receiver's memory already. The loan comes back when it is not published.
+    /// An image in the receiver's memory already. The loan comes back when it is not published.
     fn publish(&mut self, filled: &Filled, loan: Loan, sink: &mut dyn FrameSink) -> Option<Loan> {
         let Self { gate, clock, name, .. } = self;
         let mut raw = RawFrame::new(filled.sequence, 0, filled.arrival, filled.bytes);
@@ -304,7 +305,7 @@ impl Unpack {
         }
     }
 
-    /// What of the bytes is the picture, and how many bytes of a delivered frame that stands for.
+    /// The image within `bytes`, and how many bytes of a delivered frame it stands for.
     fn measure(self, bytes: &[u8]) -> (&[u8], usize) {
         match self {
             Self::Rows { stride, row, rows } => {
@@ -315,27 +316,27 @@ impl Unpack {
                 (bytes, arrived)
             }
             Self::Keep => {
-                let picture = unpack::jpeg_span(bytes).unwrap_or_default();
-                (picture, picture.len())
+                let image = unpack::jpeg_span(bytes).unwrap_or_default();
+                (image, image.len())
             }
             Self::Decode { width, height } => {
-                let picture = unpack::jpeg_span(bytes).unwrap_or_default();
+                let image = unpack::jpeg_span(bytes).unwrap_or_default();
                 let whole = PixelFormat::Rgb8.frame_bytes(width, height);
-                (picture, if picture.is_empty() { 0 } else { whole })
+                (image, if image.is_empty() { 0 } else { whole })
             }
         }
     }
 
-    fn fill(self, picture: &[u8], to: &mut [u8]) -> Result<(), DropReason> {
+    fn fill(self, image: &[u8], to: &mut [u8]) -> Result<(), DropReason> {
         match self {
-            Self::Rows { stride, row, .. } => unpack::copy_rows(picture, stride, row, to),
-            Self::Keep => unpack::keep_jpeg(picture, to),
-            Self::Decode { width, height } => unpack::decode_jpeg(picture, width, height, to),
+            Self::Rows { stride, row, .. } => unpack::copy_rows(image, stride, row, to),
+            Self::Keep => unpack::keep_jpeg(image, to),
+            Self::Decode { width, height } => unpack::decode_jpeg(image, width, height, to),
         }
     }
 }
 
-impl LaneClock {
+impl StreamClock {
     const fn of_host(stamp: Stamp) -> Self {
         match stamp {
             Stamp::Start | Stamp::End => Self::Kernel { said: false },
@@ -355,7 +356,7 @@ impl LaneClock {
         }
     }
 
-    /// Puts the time of a picture into `raw`.
+    /// Puts the time of an image into `raw`.
     fn stamp(&mut self, raw: &mut RawFrame, kernel: Option<HostTime>, pts: Option<u32>, name: &str) {
         let uncertain = |raw: &mut RawFrame| raw.flags = raw.flags.with(FrameFlags::TIME_UNCERTAIN);
         match self {
@@ -391,7 +392,7 @@ impl LaneClock {
     }
 }
 
-/// The device's counter at `host`, from its last stamp: for a picture whose header was lost.
+/// The device's counter at `host`, from its last stamp: for an image whose header was lost.
 fn reckoned(last: Option<(u32, HostTime)>, host: HostTime, hz: u32) -> u32 {
     let Some((ticks, then)) = last else { return 0 };
     let since = i128::from(host.since_ns(then)) * i128::from(hz) / 1_000_000_000;

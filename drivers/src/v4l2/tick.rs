@@ -2,13 +2,13 @@
 //!
 //! A camera names the frequency of its clock in its descriptor (`dwClockFrequency`, UVC 1.5 class specification, table
 //! 3-3), but not every camera keeps to it: a D400 names 48 MHz and stamps in microseconds. Mapping a clock with a wrong
-//! tick would give wrong times with a good conscience. So the first few pictures are looked at before the stream begins,
+//! tick would give wrong times with a good conscience. So the first few images are looked at before the stream begins,
 //! and the header's clock is used only when it ticks, within a tenth, as the descriptor says or in microseconds.
 
 use depthrig_bus::HostTime;
 
-/// Pictures that are looked at, and how many where these do not tell: while cameras open, the host may be so busy that it
-/// stamps a picture 10 ms late, which is a tenth of the time between the first and the last of a few.
+/// Images that are looked at, and how many where these do not suffice: while cameras open, the host may be so busy that
+/// it stamps an image 10 ms late, which is a tenth of the time between the first and the last of a few.
 const SAMPLES: usize = 5;
 const SAMPLES_MOST: usize = 15;
 /// The least time between the first and the last of them.
@@ -24,14 +24,15 @@ pub(super) struct Sample {
     pub(super) host: HostTime,
 }
 
-/// Whether looking at more pictures than `samples` would not help.
+/// Whether looking at more images than `samples` would not help.
 pub(super) fn is_settled(samples: &[Sample], named: Option<u32>) -> bool {
     samples.len() >= SAMPLES_MOST || (samples.len() >= SAMPLES && frequency_hz(samples, named).is_some())
 }
 
-/// Ticks a second in `samples`; `None` when there is too little to tell.
+/// Ticks a second in `samples`; `None` when they do not suffice.
 pub(super) fn measured_hz(samples: &[Sample]) -> Option<f64> {
-    let (first, last) = (samples.first()?, samples.last()?);
+    let first = samples.first()?;
+    let last = samples.last()?;
     let span_ns = last.host.since_ns(first.host);
     if samples.len() < 3 || span_ns < SPAN_NS {
         return None;
@@ -43,7 +44,7 @@ pub(super) fn measured_hz(samples: &[Sample]) -> Option<f64> {
 }
 
 /// The frequency of the clock that gave `samples`, out of `named` and a million; `None` when it is neither, or when
-/// there is too little to tell.
+/// the samples do not suffice.
 pub(super) fn frequency_hz(samples: &[Sample], named: Option<u32>) -> Option<u32> {
     let measured = measured_hz(samples)?;
     let near = |hz: &u32| (measured / f64::from(*hz) - 1.0).abs() <= TOLERANCE;
@@ -90,12 +91,13 @@ mod tests {
     }
 
     proptest! {
-        /// What `first_stamps` does with a busy host's stamps.
+        /// The frequency is found in spite of a busy host's stamps, as in `first_stamps`.
         #[test]
         fn stamps_that_are_20_ms_late_at_random_are_seen_through(
             start: u32, jitter in proptest::array::uniform15(0i64..20_000_000), true_hz in prop_oneof![Just(48e6), Just(1e6), Just(27e6), Just(90e3)]
         ) {
-            let (named, all) = (Some(48_000_000), samples(start, true_hz, jitter));
+            let named = Some(48_000_000);
+            let all = samples(start, true_hz, jitter);
             let enough = (0..=all.len()).find(|n| is_settled(&all[..*n], named)).unwrap();
             let found = frequency_hz(&all[..enough], named);
             prop_assert_eq!(found, [48_000_000, 1_000_000].into_iter().find(|hz| f64::from(*hz) == true_hz));

@@ -4,7 +4,7 @@
 //! byte 1 is the command; what is read comes from byte 17 on. Behind it are the flash, the registers of the bridge
 //! chip (OV580) and, over its I2C bus, those of the two image sensors (OV4689).
 
-use super::mode::Eye;
+use super::mode::Side;
 use crate::uvc::control::{ControlPort, Query};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
@@ -58,14 +58,14 @@ pub enum Command {
     /// Reads a register of an image sensor.
     ReadSensor {
         /// Which sensor.
-        eye: Eye,
+        side: Side,
         /// Its address.
         address: u16,
     },
     /// Writes a register of an image sensor.
     WriteSensor {
         /// Which sensor.
-        eye: Eye,
+        side: Side,
         /// Its address.
         address: u16,
         /// Its new value.
@@ -118,10 +118,10 @@ impl Command {
                 b[5..9].copy_from_slice(&address.to_be_bytes());
                 b[9..13].copy_from_slice(&[0x00, 0x01, 0x00, 0x01]);
             }
-            Self::ReadSensor { eye, address } | Self::WriteSensor { eye, address, .. } => {
-                b[1] = match eye {
-                    Eye::Left => 0xA3,
-                    Eye::Right => 0xA5,
+            Self::ReadSensor { side, address } | Self::WriteSensor { side, address, .. } => {
+                b[1] = match side {
+                    Side::Left => 0xA3,
+                    Side::Right => 0xA5,
                 };
                 b[2..5].copy_from_slice(&[SENSOR, 0x02, 0x01]);
                 b[5..9].copy_from_slice(&u32::from(address).to_be_bytes());
@@ -137,20 +137,20 @@ impl Command {
         b
     }
 
-    /// The command in a block, as a camera that is emulated understands it; `None` when it is none of these.
+    /// Parses the command in a block, for an emulated camera; `None` if it is not one of these.
     pub fn parse(block: &[u8]) -> Option<Self> {
         let b: [u8; 17] = block.get(..17)?.try_into().ok()?;
         let address = u32::from_be_bytes([b[5], b[6], b[7], b[8]]);
-        let eye = |code| if code == 0xA3 { Eye::Left } else { Eye::Right };
+        let side = |code| if code == 0xA3 { Side::Left } else { Side::Right };
         Some(match (b[0], b[1]) {
             (0x51, 0xA1) => Self::ReadFlash { address, length: u16::from_be_bytes([b[11], b[12]]) },
             (0x51, 0xA2) => Self::ReadSystem { address },
             (0x50, 0xA2) => Self::WriteSystem { address, value: b[VALUE] },
             (0x51, code @ (0xA3 | 0xA5)) => {
-                Self::ReadSensor { eye: eye(code), address: u16::try_from(address).ok()? }
+                Self::ReadSensor { side: side(code), address: u16::try_from(address).ok()? }
             }
             (0x50, code @ (0xA3 | 0xA5)) => {
-                Self::WriteSensor { eye: eye(code), address: u16::try_from(address).ok()?, value: b[VALUE] }
+                Self::WriteSensor { side: side(code), address: u16::try_from(address).ok()?, value: b[VALUE] }
             }
             (0x50, 0x10) => Self::PinDirection { pin: b[2], output: b[3] == 0 },
             (0x50, 0x12) => Self::SetPin { pin: b[2], high: b[3] != 0 },
@@ -167,16 +167,19 @@ pub fn answer(block: &mut [u8], data: &[u8]) {
     }
 }
 
-/// The bytes of the flash at the serial number's address, for a camera that is emulated.
+/// The flash's bytes at the serial number's address, for an emulated camera.
 ///
 /// # Errors
-/// [`ErrorKind::BadInput`] when `serial` is no decimal number of at most eight digits.
+/// [`ErrorKind::BadInput`] unless `serial` is a decimal number of at most eight digits.
 pub fn serial_bytes(serial: &str) -> Result<[u8; 6]> {
     let digits = (serial.len() <= 8 && serial.bytes().all(|c| c.is_ascii_digit()))
         .then(|| u32::from_str_radix(serial, 16).ok())
         .flatten()
         .ok_or_else(|| {
-            Error::new(ErrorKind::BadInput, format!("\"{serial}\" is no serial number of a ZED"))
+            Error::new(
+                ErrorKind::BadInput,
+                format!("invalid ZED serial number \"{serial}\"; it has up to 8 decimal digits"),
+            )
         })?;
     let [a, b, c, d] = digits.to_be_bytes();
     Ok([b'O', b'V', a, b, c, d])
@@ -252,10 +255,10 @@ pub fn gain_percent(raw: u32) -> Option<u8> {
 }
 
 /// Bridge register with the switch of automatic exposure and gain.
-const fn isp_control(eye: Eye) -> u32 {
-    match eye {
-        Eye::Left => 0x8018_1033,
-        Eye::Right => 0x8018_1833,
+const fn isp_control(side: Side) -> u32 {
+    match side {
+        Side::Left => 0x8018_1033,
+        Side::Right => 0x8018_1833,
     }
 }
 
@@ -322,25 +325,25 @@ impl<P: ControlPort> Vendor<P> {
         parse_serial(&flash)
     }
 
-    /// Whether the bridge regulates exposure and gain of both eyes.
+    /// Whether the bridge regulates exposure and gain of both image sensors.
     ///
     /// # Errors
     /// Those of [`Self::send`].
     pub fn auto_exposure(&mut self) -> Result<bool> {
         let mut both = true;
-        for eye in Eye::BOTH {
-            both &= self.byte(Command::ReadSystem { address: isp_control(eye) })? & AUTO_EXPOSURE != 0;
+        for side in Side::BOTH {
+            both &= self.byte(Command::ReadSystem { address: isp_control(side) })? & AUTO_EXPOSURE != 0;
         }
         Ok(both)
     }
 
-    /// Has the bridge regulate exposure and gain of both eyes, or not.
+    /// Turns the bridge's regulation of exposure and gain of both image sensors on or off.
     ///
     /// # Errors
     /// Those of [`Self::send`]; [`ErrorKind::Protocol`] when the camera does not take it.
     pub fn set_auto_exposure(&mut self, on: bool) -> Result<()> {
-        for eye in Eye::BOTH {
-            let address = isp_control(eye);
+        for side in Side::BOTH {
+            let address = isp_control(side);
             let is = self.byte(Command::ReadSystem { address })?;
             let value = if on { is | AUTO_EXPOSURE } else { is & !AUTO_EXPOSURE };
             self.send(Command::WriteSystem { address, value })?;
@@ -351,37 +354,37 @@ impl<P: ControlPort> Vendor<P> {
         Err(self.refused(format_args!("automatic exposure {}", if on { "on" } else { "off" })))
     }
 
-    /// Exposure of `eye` in percent of the longest at this frame rate.
+    /// Exposure of the image sensor on `side` in percent of the longest at this frame rate.
     ///
     /// # Errors
     /// Those of [`Self::send`].
-    pub fn exposure(&mut self, eye: Eye, rate_hz: f64) -> Result<u8> {
-        Ok(exposure_percent(self.registers(eye, EXPOSURE)? >> 4, rate_hz))
+    pub fn exposure(&mut self, side: Side, rate_hz: f64) -> Result<u8> {
+        Ok(exposure_percent(self.registers(side, EXPOSURE)? >> 4, rate_hz))
     }
 
-    /// Sets the exposure of `eye`, percent of the longest at this frame rate. The regulation must be off, else it
-    /// sets it anew.
+    /// Sets the exposure of the image sensor on `side`, percent of the longest at this frame rate. The regulation must
+    /// be off, else it overwrites it.
     ///
     /// # Errors
     /// Those of [`Self::send`]; [`ErrorKind::Protocol`] when the camera does not take it.
-    pub fn set_exposure(&mut self, eye: Eye, percent: u8, rate_hz: f64) -> Result<()> {
-        self.set_registers(eye, EXPOSURE, raw_exposure(percent, rate_hz) << 4, "exposure")
+    pub fn set_exposure(&mut self, side: Side, percent: u8, rate_hz: f64) -> Result<()> {
+        self.set_registers(side, EXPOSURE, raw_exposure(percent, rate_hz) << 4, "exposure")
     }
 
-    /// Gain of `eye` in percent; `None` when the camera has one that percent cannot say.
+    /// Gain of the image sensor on `side` in percent; `None` if the camera's value has no percentage.
     ///
     /// # Errors
     /// Those of [`Self::send`].
-    pub fn gain(&mut self, eye: Eye) -> Result<Option<u8>> {
-        Ok(gain_percent(self.registers(eye, GAIN)?))
+    pub fn gain(&mut self, side: Side) -> Result<Option<u8>> {
+        Ok(gain_percent(self.registers(side, GAIN)?))
     }
 
-    /// Sets the gain of `eye`, percent. The regulation must be off.
+    /// Sets the gain of the image sensor on `side`, percent. The regulation must be off.
     ///
     /// # Errors
     /// Those of [`Self::send`]; [`ErrorKind::Protocol`] when the camera does not take it.
-    pub fn set_gain(&mut self, eye: Eye, percent: u8) -> Result<()> {
-        self.set_registers(eye, GAIN, raw_gain(percent), "gain")
+    pub fn set_gain(&mut self, side: Side, percent: u8) -> Result<()> {
+        self.set_registers(side, GAIN, raw_gain(percent), "gain")
     }
 
     /// Switches the light on the front.
@@ -393,23 +396,23 @@ impl<P: ControlPort> Vendor<P> {
         self.send(Command::SetPin { pin: LED_PIN, high: on }).map(drop)
     }
 
-    fn registers(&mut self, eye: Eye, addresses: [u16; 3]) -> Result<u32> {
+    fn registers(&mut self, side: Side, addresses: [u16; 3]) -> Result<u32> {
         let mut value = 0;
         for address in addresses {
-            value = value << 8 | u32::from(self.byte(Command::ReadSensor { eye, address })?);
+            value = value << 8 | u32::from(self.byte(Command::ReadSensor { side, address })?);
         }
         Ok(value)
     }
 
-    fn set_registers(&mut self, eye: Eye, addresses: [u16; 3], value: u32, what: &str) -> Result<()> {
+    fn set_registers(&mut self, side: Side, addresses: [u16; 3], value: u32, what: &str) -> Result<()> {
         let [_, high, middle, low] = value.to_be_bytes();
         for (address, value) in addresses.into_iter().zip([high, middle, low]) {
-            self.send(Command::WriteSensor { eye, address, value })?;
+            self.send(Command::WriteSensor { side, address, value })?;
         }
-        if self.registers(eye, addresses)? == value {
+        if self.registers(side, addresses)? == value {
             return Ok(());
         }
-        Err(self.refused(format_args!("the {what} of its {eye:?} eye")))
+        Err(self.refused(format_args!("the {what} of its {side:?} image sensor")))
     }
 
     fn refused(&self, what: core::fmt::Arguments<'_>) -> Error {

@@ -1,4 +1,5 @@
-//! The factory calibration, a file `SN<serial>.conf`: intrinsics of both eyes in each mode, and the right eye's pose.
+//! The factory calibration, a file `SN<serial>.conf`: intrinsics of both cameras in each mode, and the right camera's
+//! pose.
 //!
 //! Lengths in the file are millimetres and become metres; angles are radians. Distortion is Brown-Conrady in
 //! `OpenCV`'s order `k1 k2 p1 p2 k3`, and the pixel convention is `OpenCV`'s too, so intrinsics are taken as they are.
@@ -7,11 +8,11 @@
 //! The vendor's open code hands `R = exp(r)` and `t` to `OpenCV`'s `stereoRectify`, whose `R` turns left coordinates
 //! into right ones. There a right camera to the right has a negative `t.x`; the file's baseline is positive, and
 //! `stereoRectify` gives the same rectification for `t` and `-t`. A point therefore moves from left to right by
-//! `p_right = R p_left - t`, and the pose that is given here, that of the right eye in the left one, is its inverse:
-//! `p_left = Rᵀ p_right + Rᵀ t`.
+//! `p_right = R p_left - t`, and the pose that is returned here, that of the right camera in the left one, is its
+//! inverse: `p_left = Rᵀ p_right + Rᵀ t`.
 
 use super::ini::{Ini, Number};
-use super::mode::{Eye, Mode};
+use super::mode::{Mode, Side};
 use crate::{Error, ErrorKind, Result};
 use core::fmt::Write as _;
 use core::ops::RangeInclusive;
@@ -23,38 +24,38 @@ use std::path::{Path, PathBuf};
 const MAX_FILE_BYTES: u64 = 1 << 20;
 /// Baselines of the family lie between 50 mm (ZED X Mini) and 120 mm (ZED 2i).
 const BASELINE_MM: RangeInclusive<f64> = 20.0..=300.0;
-/// The eyes look in the same direction but for what assembly leaves; the largest angles seen are below 0.02.
+/// Largest angle between the cameras, which assembly leaves nearly parallel; the largest angles seen are below 0.02.
 const MAX_ANGLE_RAD: f64 = 0.2;
 
-/// Both eyes in one mode.
+/// Both cameras in one mode.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StereoCalibration {
-    /// Intrinsics of the left eye at the mode's size.
+    /// Intrinsics of the left camera at the mode's size.
     pub left: Intrinsics,
-    /// Intrinsics of the right eye at the mode's size.
+    /// Intrinsics of the right camera at the mode's size.
     pub right: Intrinsics,
-    /// Pose of the right eye in the left one, metres: `p_left = R p_right + t`, so that `t.x` is the baseline.
+    /// Pose of the right camera in the left one, metres: `p_left = R p_right + t`, so that `t.x` is the baseline.
     pub right_in_left: Pose,
 }
 
 impl StereoCalibration {
-    /// Intrinsics of `eye`.
-    pub const fn intrinsics(&self, eye: Eye) -> Intrinsics {
-        match eye {
-            Eye::Left => self.left,
-            Eye::Right => self.right,
+    /// Intrinsics of the camera on `side`.
+    pub const fn intrinsics(&self, side: Side) -> Intrinsics {
+        match side {
+            Side::Left => self.left,
+            Side::Right => self.right,
         }
     }
 
-    /// Pose of `eye` in the camera's frame, which is that of the left eye.
-    pub const fn pose(&self, eye: Eye) -> Pose {
-        match eye {
-            Eye::Left => Pose::IDENTITY,
-            Eye::Right => self.right_in_left,
+    /// Pose of the camera on `side` in the ZED's frame, which is that of the left camera.
+    pub const fn pose(&self, side: Side) -> Pose {
+        match side {
+            Side::Left => Pose::IDENTITY,
+            Side::Right => self.right_in_left,
         }
     }
 
-    /// Distance between the eyes, metres.
+    /// Distance between the two cameras, metres.
     pub fn baseline_m(&self) -> f64 {
         DVec3::from_array(self.right_in_left.translation_m).length()
     }
@@ -71,13 +72,13 @@ impl FactoryCalibration {
     /// Reads and checks `text`; `origin` names its file in messages.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`] with the line when something is no number, missing, or not what a camera of this
-    /// family can have.
+    /// [`ErrorKind::BadInput`] with the line for a value that is missing, not a number, or out of range for this
+    /// family.
     pub fn parse(text: &str, origin: &str) -> Result<Self> {
         let ini = Ini::parse(text, origin)?;
         let mut modes = [None; 4];
         for (slot, mode) in modes.iter_mut().zip(Mode::ALL) {
-            let [left, right] = ["LEFT", "RIGHT"].map(|eye| format!("{eye}_CAM_{}", mode.suffix()));
+            let [left, right] = ["LEFT", "RIGHT"].map(|side| format!("{side}_CAM_{}", mode.suffix()));
             match (ini.section(&left), ini.section(&right)) {
                 (None, None) => {}
                 (Some(_), Some(_)) => *slot = Some(stereo(&ini, mode, &left, &right)?),
@@ -116,7 +117,7 @@ impl FactoryCalibration {
         }
         let bytes = depthrig_bus::files::read(path, MAX_FILE_BYTES).map_err(unreadable)?;
         let text = String::from_utf8(bytes).map_err(|e| {
-            Error::new(ErrorKind::BadInput, format!("{shown} is no text: {e}")).with_source(e)
+            Error::new(ErrorKind::BadInput, format!("{shown} is not UTF-8 text: {e}")).with_source(e)
         })?;
         Self::parse(&text, &shown)
     }
@@ -131,12 +132,15 @@ impl FactoryCalibration {
         let mut text = String::new();
         let known = || Mode::ALL.into_iter().filter_map(|m| Some((m.suffix(), self.at(m)?)));
         for (name, c) in known() {
-            for (eye, i) in [("LEFT", &c.left), ("RIGHT", &c.right)] {
+            for (side, i) in [("LEFT", &c.left), ("RIGHT", &c.right)] {
                 let [k1, k2, p1, p2, k3, ..] = i.coeffs;
-                let (fx, fy, cx, cy) = (i.fx, i.fy, i.cx, i.cy);
+                let fx = i.fx;
+                let fy = i.fy;
+                let cx = i.cx;
+                let cy = i.cy;
                 let _ = writeln!(
                     text,
-                    "[{eye}_CAM_{name}]\nfx={fx}\nfy={fy}\ncx={cx}\ncy={cy}\nk1={k1}\nk2={k2}\np1={p1}\np2={p2}\nk3={k3}\n"
+                    "[{side}_CAM_{name}]\nfx={fx}\nfy={fy}\ncx={cx}\ncy={cy}\nk1={k1}\nk2={k2}\np1={p1}\np2={p2}\nk3={k3}\n"
                 );
             }
         }
@@ -144,7 +148,8 @@ impl FactoryCalibration {
         for (i, (name, c)) in known().enumerate() {
             let to_right = DQuat::from_array(c.right_in_left.rotation_xyzw).inverse();
             let t = to_right * DVec3::from_array(c.right_in_left.translation_m) * 1000.0;
-            // To picometres and picoradians: what turning them left of rounding would put a number at its limit beyond it.
+            // To picometres and picoradians: what turning them left of rounding would put a number at its limit beyond
+            // it.
             let r = (to_right.to_scaled_axis() * 1e12).round() / 1e12;
             if i == 0 {
                 let t = (t * 1e9).round() / 1e9;
@@ -164,7 +169,7 @@ pub fn known_paths(serial: &str, home: Option<&Path>) -> Vec<PathBuf> {
     [Some(Path::new("/usr/local/zed/settings").join(&name)), own].into_iter().flatten().collect()
 }
 
-/// What to do when there is no factory calibration for the camera `serial`. It is never fetched by itself.
+/// How to get the factory calibration of the camera `serial`, for messages. It is never downloaded automatically.
 pub fn how_to_get(serial: &str) -> String {
     format!(
         "fetch https://calib.stereolabs.com/?SN={serial} on a computer with internet, save it as SN{serial}.conf in \
@@ -174,15 +179,16 @@ pub fn how_to_get(serial: &str) -> String {
 
 fn stereo(ini: &Ini<'_>, mode: Mode, left: &str, right: &str) -> Result<StereoCalibration> {
     Ok(StereoCalibration {
-        left: eye(ini, mode, left)?,
-        right: eye(ini, mode, right)?,
+        left: intrinsics(ini, mode, left)?,
+        right: intrinsics(ini, mode, right)?,
         right_in_left: right_in_left(ini, mode)?,
     })
 }
 
-fn eye(ini: &Ini<'_>, mode: Mode, section: &str) -> Result<Intrinsics> {
-    let (width, height) = mode.eye_size();
-    let (width, height) = (f64::from(width), f64::from(height));
+fn intrinsics(ini: &Ini<'_>, mode: Mode, section: &str) -> Result<Intrinsics> {
+    let (width, height) = mode.image_size();
+    let width = f64::from(width);
+    let height = f64::from(height);
     let required = |key: &str, low: f64, high: f64| -> Result<f64> {
         let Some(n) = ini.number(section, key)? else {
             let line = ini.section(section).unwrap_or(1);
@@ -221,7 +227,7 @@ fn right_in_left(ini: &Ini<'_>, mode: Mode) -> Result<Pose> {
     let baseline = value("Baseline")?.ok_or_else(|| missing("Baseline"))?;
     if baseline.value < 0.0 {
         let what = format_args!(
-            "[STEREO] Baseline = {} is negative; it is the distance from the left eye to the right one, millimetres",
+            "[STEREO] Baseline = {} is negative; it is the distance from the left camera to the right one, millimetres",
             baseline.value
         );
         return Err(ini.at(baseline.line, what));
@@ -259,8 +265,7 @@ fn within(
         return Ok(());
     }
     let (low, high) = range.into_inner();
-    let message =
-        format_args!("[{section}] {} = {} cannot be; {what} within {low} and {high}", n.key, n.value);
+    let message = format_args!("[{section}] {} = {} is out of range {low}..={high} ({what})", n.key, n.value);
     Err(ini.at(n.line, message))
 }
 

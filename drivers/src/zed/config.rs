@@ -1,10 +1,10 @@
-//! What a rig may ask of a ZED.
+//! The configuration of a ZED in a rig.
 
 use crate::v4l2::ControlValue;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// A ZED and how it is to be set. What is `None` stays as the camera has it.
+/// A ZED and its settings. A setting that is `None` stays as the camera has it.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ZedConfig {
     /// Serial number; `None`: the one at `port`, or the only one.
@@ -15,15 +15,15 @@ pub struct ZedConfig {
     pub calibration: CalibrationFile,
     /// Whether the camera regulates exposure and gain.
     pub auto_exposure: Option<bool>,
-    /// Exposure of both eyes, percent of the longest at the frame rate; the regulation is switched off for it.
+    /// Exposure of both cameras, percent of the longest at the frame rate; setting it switches the regulation off.
     pub exposure_percent: Option<u8>,
-    /// Gain of both eyes, percent; the regulation is switched off for it.
+    /// Gain of both cameras, percent; setting it switches the regulation off.
     pub gain_percent: Option<u8>,
     /// The light on the front.
     pub led: Option<bool>,
     /// Controls of the kernel by their names: `white_balance_temperature`, …
     pub controls: BTreeMap<String, ControlValue>,
-    /// Do without the motion unit.
+    /// Do without the IMU.
     pub without_motion: bool,
 }
 

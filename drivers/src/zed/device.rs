@@ -2,9 +2,9 @@
 
 use super::command::Vendor;
 use super::conf::{FactoryCalibration, how_to_get, known_paths};
-use super::find::{self, Found};
+use super::find::{self, FoundCamera};
 use super::hid::HidNode;
-use super::mode::Eye;
+use super::mode::Side;
 use super::motion::{Motion, Sample};
 use super::stream::ZedStream;
 use super::{CalibrationFile, ZedConfig, imu, profiles, settings};
@@ -30,7 +30,7 @@ pub struct ZedBackend {
 }
 
 impl ZedBackend {
-    /// A backend for the camera that `config` means.
+    /// A backend for the camera that `config` selects.
     pub fn new(config: ZedConfig) -> Self {
         Self { config, root: SysRoot::default() }
     }
@@ -42,7 +42,7 @@ impl ZedBackend {
         self
     }
 
-    fn found(&self) -> Result<Vec<Found>> {
+    fn found(&self) -> Result<Vec<FoundCamera>> {
         Ok(find::cameras(&self.root, &scan(&self.root)?))
     }
 }
@@ -52,10 +52,10 @@ impl Backend for ZedBackend {
         "zed"
     }
 
-    /// Every ZED that is attached. One whose motion unit is not seen is asked for its serial number; where that fails,
+    /// Every ZED that is attached. One whose IMU is not seen is asked for its serial number; where that fails,
     /// the number is left empty.
     fn discover(&self) -> Result<Vec<DeviceInfo>> {
-        let info = |f: Found| {
+        let info = |f: FoundCamera| {
             let serial = f.serial().map_or_else(|| flash_serial(&f).unwrap_or_default(), str::to_owned);
             let calibration = calibration(&self.config.calibration, &serial)
                 .map_or_else(|e| format!("unusable: {e}"), |(_, source)| source);
@@ -91,20 +91,20 @@ struct ZedDevice {
     node: Node,
     modes: Vec<Mode>,
     profiles: Vec<StreamProfile>,
-    /// The motion unit, or why it cannot be read.
+    /// The IMU, or why it cannot be read.
     unit: Result<HidNode>,
     config: ZedConfig,
     root: SysRoot,
 }
 
 impl ZedDevice {
-    fn open(mut found: Found, config: &ZedConfig, root: &SysRoot) -> Result<Self> {
+    fn open(mut found: FoundCamera, config: &ZedConfig, root: &SysRoot) -> Result<Self> {
         let node = capture_node(&found)?;
         let serial = match vendor(node.path(), &found.describe()).and_then(|mut v| v.serial()) {
             Ok(flash) => flash,
             Err(e) => match found.serial() {
                 Some(unit) => {
-                    tracing::warn!(error = %e, serial = unit, "the ZED's flash gives no serial number; its motion unit does");
+                    tracing::warn!(error = %e, serial = unit, "the ZED's flash gives no serial number; its IMU does");
                     unit.to_owned()
                 }
                 None => return Err(e),
@@ -132,7 +132,7 @@ impl ZedDevice {
         match &unit {
             Ok(_) => profiles.push(imu::profile()?),
             Err(_) if config.without_motion || found.model.motion.is_none() => {}
-            Err(e) => tracing::warn!(camera = name, error = %e, "the motion unit is not read"),
+            Err(e) => tracing::warn!(camera = name, error = %e, "the IMU is not read"),
         }
         let info = info(&found, serial, source);
         Ok(Self { info, node, modes, profiles, unit, config: config.clone(), root: root.clone() })
@@ -159,16 +159,16 @@ impl Device for ZedDevice {
             return Err(Error::new(e.kind(), format!("{name}: there is no stream \"{IMU}\": {e}")));
         }
         let chosen = profiles::choose(&name, &profiles, requests)?;
-        let (imu, mut eyes): (Vec<_>, Vec<_>) = chosen.into_iter().partition(|p| p.format.is_motion());
+        let (imu, mut halves): (Vec<_>, Vec<_>) = chosen.into_iter().partition(|p| p.format.is_motion());
         let imu = imu.into_iter().next();
-        let Some(eye) = eyes.first() else {
+        let Some(half) = halves.first() else {
             let (Some(motion), Some((profile, samples))) = start_unit(&name, unit, imu)? else {
                 return Err(Error::new(ErrorKind::Unsupported, format!("{name}: no stream was asked for")));
             };
-            return Ok(Box::new(ZedStream::without_pictures(name, motion).with_imu(profile, samples)));
+            return Ok(Box::new(ZedStream::without_images(name, motion).with_imu(profile, samples)));
         };
-        let Some(mode) = modes.iter().find(|m| is_mode_of(m, eye)) else {
-            return Err(Error::new(ErrorKind::Unsupported, format!("{name}: has no {}", eye.describe())));
+        let Some(mode) = modes.iter().find(|m| is_mode_of(m, half)) else {
+            return Err(Error::new(ErrorKind::Unsupported, format!("{name}: has no {}", half.describe())));
         };
         let path = node.path().to_owned();
         let named = |e: Error| named(&name, &root, &path, e);
@@ -176,18 +176,18 @@ impl Device for ZedDevice {
         let layout = node.set_mode(mode).map_err(named)?;
         // Nothing is asked of the camera on this thread once it streams.
         let vendor = settings::has_commands(&config).then(|| vendor(&path, &name)).transpose()?;
-        // Not before it is clear that nobody else has the pictures: who has them has the unit too.
+        // Only once the images are ours: the process that has them has the IMU too.
         let (motion, imu) = start_unit(&name, unit, imu)?;
         let stride = (layout.bytes_per_line as usize).max(2 * mode.width as usize);
-        let pictures = Source::start(vec![Wanted::plain(node)], DEFAULT_BUFFERS).map_err(named)?;
-        if pictures.stamp(0) == Stamp::Unknown {
-            for p in &mut eyes {
+        let images = Source::start(vec![Wanted::plain(node)], DEFAULT_BUFFERS).map_err(named)?;
+        if images.stamp(0) == Stamp::Unknown {
+            for p in &mut halves {
                 (p.clock, p.metadata) = (profiles::clock(ClockDomain::Arrival), MetadataLevel::Arrival);
             }
         }
         let settled = vendor.map(|v| settle(&name, v, &config, mode)).transpose()?;
-        let eyes = eyes.into_iter().map(|p| (eye_of(&p), p)).collect();
-        let stream = ZedStream::new(name, eyes, Box::new(pictures), stride, motion, settled);
+        let halves = halves.into_iter().map(|p| (side_of(&p), p)).collect();
+        let stream = ZedStream::new(name, halves, Box::new(images), stride, motion, settled);
         Ok(Box::new(match imu {
             Some((profile, samples)) => stream.with_imu(profile, samples),
             None => stream,
@@ -200,11 +200,11 @@ fn is_mode_of(mode: &Mode, profile: &StreamProfile) -> bool {
         && (mode.interval.rate_hz() - profile.rate_hz).abs() < 0.01
 }
 
-fn eye_of(profile: &StreamProfile) -> Eye {
-    if profile.stream.as_str() == profiles::STREAMS[1] { Eye::Right } else { Eye::Left }
+fn side_of(profile: &StreamProfile) -> Side {
+    if profile.stream.as_str() == profiles::STREAMS[1] { Side::Right } else { Side::Left }
 }
 
-fn info(found: &Found, serial: String, mut calibration: String) -> DeviceInfo {
+fn info(found: &FoundCamera, serial: String, mut calibration: String) -> DeviceInfo {
     if calibration.starts_with(FACTORY) && found.model.motion.is_some() {
         calibration += imu::NO_POSE;
     }
@@ -219,8 +219,8 @@ fn info(found: &Found, serial: String, mut calibration: String) -> DeviceInfo {
     }
 }
 
-/// The node that pictures come from; the video half has a metadata node as well.
-fn capture_node(found: &Found) -> Result<Node> {
+/// The node that images come from; the video half has a metadata node as well.
+fn capture_node(found: &FoundCamera) -> Result<Node> {
     let mut last = None;
     for n in found.video.video_nodes() {
         match Node::open(&n.path) {
@@ -241,12 +241,12 @@ fn capture_node(found: &Found) -> Result<Node> {
     ))
 }
 
-/// The vendor commands by a node of their own, so that they are nobody's who captures.
+/// Opens the vendor commands on a node of their own, apart from the one that captures.
 fn vendor(path: &Path, device: &str) -> Result<Vendor<Node>> {
     Vendor::new(Node::open(path)?, device)
 }
 
-fn flash_serial(found: &Found) -> Result<String> {
+fn flash_serial(found: &FoundCamera) -> Result<String> {
     vendor(capture_node(found)?.path(), &found.describe())?.serial()
 }
 
@@ -284,7 +284,7 @@ fn calibration(wanted: &CalibrationFile, serial: &str) -> Result<(Option<Factory
     Ok((Some(loaded), format!("{FACTORY}{}", path.display())))
 }
 
-/// Sets the camera on a thread of its own, after it began to stream, because starting may set it anew and because
+/// Sets the camera on a thread of its own, after it began to stream, because starting may reset it and because
 /// each command may take seconds. The thread is not waited for; it ends by itself.
 fn settle(
     name: &str,
@@ -293,11 +293,12 @@ fn settle(
     mode: &Mode,
 ) -> Result<Receiver<Result<()>>> {
     let (send, receive) = sync_channel(1);
-    let (config, rate_hz) = (config.clone(), mode.interval.rate_hz());
+    let config = config.clone();
+    let rate_hz = mode.interval.rate_hz();
     std::thread::Builder::new()
         .name("zed-settings".to_owned())
         .spawn(move || {
-            // Nobody listens any more when the stream ended first.
+            // The receiver is gone if the stream ended first.
             let _ = send.send(settings::apply(&mut vendor, &config, rate_hz));
         })
         .map_err(|e| {
@@ -306,7 +307,7 @@ fn settle(
     Ok(receive)
 }
 
-/// Starts the motion unit: with a queue of its samples when `imu` is delivered, else for the temperatures alone, without
+/// Starts the IMU: with a queue of its samples when `imu` is delivered, else for the temperatures alone, without
 /// which the camera is as good.
 #[allow(clippy::type_complexity)] // a stream and what feeds it
 fn start_unit(
@@ -320,7 +321,7 @@ fn start_unit(
         return Ok((Some(motion), Some((profile, samples))));
     }
     let started = Motion::start(Box::new(hid), name);
-    let warn = |e: &Error| tracing::warn!(camera = name, error = %e, "the motion unit is not read");
+    let warn = |e: &Error| tracing::warn!(camera = name, error = %e, "the IMU is not read");
     Ok((started.inspect_err(warn).ok(), None))
 }
 

@@ -1,7 +1,7 @@
-//! Which cameras are attached: the video half, and the motion unit that is in the same housing.
+//! Finds the attached cameras: the video half, and the IMU in the same housing.
 //!
 //! The two are devices of their own. On USB 2 both are behind the camera's hub. On USB 3 the video half is on the fast
-//! lines and the motion unit behind the hub on the slow ones, so that they have different buses; the kernel knows
+//! lines and the IMU behind the hub on the slow ones, so that they have different buses; the kernel knows
 //! which two ports are one socket and links them (`port/peer`, Documentation/ABI/testing/sysfs-bus-usb).
 
 use crate::usb::{SysRoot, UsbDevice};
@@ -17,7 +17,7 @@ pub struct Model {
     pub name: &'static str,
     /// Product of the video half.
     pub video: u16,
-    /// Product of the motion unit; the first ZED has none.
+    /// Product of the IMU; the first ZED has none.
     pub motion: Option<u16>,
 }
 
@@ -31,17 +31,17 @@ pub const MODELS: [Model; 4] = [
 
 /// An attached camera.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Found {
-    /// What it is.
+pub struct FoundCamera {
+    /// Its model.
     pub model: Model,
     /// The video half.
     pub video: UsbDevice,
-    /// The motion unit, if it was found.
+    /// The IMU, if it was found.
     pub motion: Option<UsbDevice>,
 }
 
-impl Found {
-    /// The serial number as far as it is known without opening the camera: that of the motion unit.
+impl FoundCamera {
+    /// The serial number as far as it is known without opening the camera: that of the IMU.
     pub fn serial(&self) -> Option<&str> {
         self.motion.as_ref().map(|m| m.serial.as_str()).filter(|s| !s.is_empty())
     }
@@ -55,24 +55,24 @@ impl Found {
     pub fn firmware(&self) -> String {
         let version = |d: &UsbDevice| format!("{}.{}", d.device_version >> 8, d.device_version & 0xFF);
         match &self.motion {
-            Some(motion) => format!("{} (motion unit {})", version(&self.video), version(motion)),
+            Some(motion) => format!("{} (IMU {})", version(&self.video), version(motion)),
             None => version(&self.video),
         }
     }
 }
 
-/// How messages call a camera.
+/// Name of a camera, for messages.
 pub fn describe(model: &str, serial: &str, port: &str) -> String {
     let space = if serial.is_empty() { "" } else { " " };
     format!("{model}{space}{serial} at USB port {port}")
 }
 
 /// The cameras among `devices`, which is what [`crate::usb::scan`] gave for `root`, by port.
-pub fn cameras(root: &SysRoot, devices: &[UsbDevice]) -> Vec<Found> {
+pub fn cameras(root: &SysRoot, devices: &[UsbDevice]) -> Vec<FoundCamera> {
     let mut found = Vec::new();
     for video in devices.iter().filter(|d| d.vendor_id == VENDOR_ID) {
         let Some(model) = MODELS.into_iter().find(|m| m.video == video.product_id) else { continue };
-        found.push(Found { model, video: video.clone(), motion: None });
+        found.push(FoundCamera { model, video: video.clone(), motion: None });
     }
     let places: Vec<Vec<String>> = found.iter().map(|f| hubs(root, &f.video.port)).collect();
     let mut motions: Vec<&UsbDevice> =
@@ -97,8 +97,8 @@ pub fn cameras(root: &SysRoot, devices: &[UsbDevice]) -> Vec<Found> {
     found
 }
 
-/// The motion unit of `model` with this serial number: that of the camera, wherever it is.
-pub fn motion_unit<'d>(devices: &'d [UsbDevice], model: Model, serial: &str) -> Option<&'d UsbDevice> {
+/// The IMU of `model` with this serial number: that of the camera, wherever it is.
+pub fn imu<'d>(devices: &'d [UsbDevice], model: Model, serial: &str) -> Option<&'d UsbDevice> {
     devices.iter().find(|d| {
         d.vendor_id == VENDOR_ID
             && Some(d.product_id) == model.motion
@@ -131,17 +131,21 @@ fn peer(root: &SysRoot, port: &str) -> Option<String> {
     })
 }
 
-/// The cameras that a rig may mean by a port and a serial number, either of which may be left open. Those whose serial
-/// number is not known yet are among them.
+/// The cameras that match a port and a serial number, either of which may be left open. A camera whose serial number
+/// is not known yet matches any.
 ///
 /// # Errors
-/// [`ErrorKind::NotFound`] listing what is attached when there is none, or when it is not said which of several.
-pub fn candidates(found: Vec<Found>, port: Option<&str>, serial: Option<&str>) -> Result<Vec<Found>> {
-    let list = found.iter().map(Found::describe).collect::<Vec<_>>().join(", ");
+/// [`ErrorKind::NotFound`] listing what is attached if no camera matches, or if several do and none is named.
+pub fn candidates(
+    found: Vec<FoundCamera>,
+    port: Option<&str>,
+    serial: Option<&str>,
+) -> Result<Vec<FoundCamera>> {
+    let list = found.iter().map(FoundCamera::describe).collect::<Vec<_>>().join(", ");
     let attached =
         if list.is_empty() { "no ZED is attached".to_owned() } else { format!("attached: {list}") };
     let not_found = |what: String| Err(Error::new(ErrorKind::NotFound, format!("{what}; {attached}")));
-    let wanted: Vec<Found> = found
+    let wanted: Vec<FoundCamera> = found
         .into_iter()
         .filter(|f| port.is_none_or(|p| p == f.video.port))
         .filter(|f| serial.is_none_or(|s| f.serial().is_none_or(|known| known == s)))
@@ -151,7 +155,7 @@ pub fn candidates(found: Vec<Found>, port: Option<&str>, serial: Option<&str>) -
         (0, None, Some(s)) => not_found(format!("there is no ZED with serial number {s}")),
         (0, None, None) => not_found("there is no ZED; is it plugged in?".to_owned()),
         (n, None, None) if n > 1 => {
-            not_found("which ZED is meant? Name it with serial = \"…\" or port = \"…\"".to_owned())
+            not_found("several ZEDs are attached; select one with serial = \"…\" or port = \"…\"".to_owned())
         }
         _ => Ok(wanted),
     }

@@ -1,8 +1,8 @@
-//! What the fuzz target `zed_conf` calls, and the test that runs its corpus.
+//! The body of the fuzz target `zed_conf`, which the test of its corpus also calls.
 
 use super::command::{Command, parse_serial};
 use super::conf::FactoryCalibration;
-use super::mode::{Eye, Mode};
+use super::mode::{Mode, Side};
 use super::sensors::Record;
 
 /// Bytes as a factory calibration, and as a command block, flash and motion record; whether they are a calibration.
@@ -16,9 +16,9 @@ pub fn conf(bytes: &[u8]) -> bool {
     let known: Vec<_> = Mode::ALL.into_iter().filter_map(|m| Some((m, read.at(m)?))).collect();
     assert!(!known.is_empty(), "a calibration of no mode");
     for (mode, c) in &known {
-        let (width, height) = mode.eye_size();
-        for eye in Eye::BOTH {
-            let i = c.intrinsics(eye);
+        let (width, height) = mode.image_size();
+        for side in Side::BOTH {
+            let i = c.intrinsics(side);
             let inside = i.cx > 0.0 && i.cx < f64::from(width) && i.cy > 0.0 && i.cy < f64::from(height);
             assert!(i.fx > 0.0 && i.fy > 0.0 && inside && i.coeffs.iter().all(|k| k.is_finite()), "{i:?}");
         }
@@ -61,7 +61,7 @@ mod tests {
             let is_one = super::conf(&bytes);
             if name.starts_with("seed_") {
                 seeds += 1;
-                assert!(is_one, "{name} is no calibration any more");
+                assert!(is_one, "{name} is no longer a valid calibration");
             }
         }
         assert!(seeds >= 3, "{seeds} seeds");

@@ -12,7 +12,7 @@ use std::io::Read as _;
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 
-/// What carries the reports of a HID device.
+/// A transport of a HID device's reports.
 pub trait Reports: Send {
     /// Sends a feature report of two bytes, its number first.
     ///

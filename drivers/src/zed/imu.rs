@@ -1,4 +1,4 @@
-//! The stream `imu`: the motion unit's samples out of its thread's queue, in batches.
+//! The stream `imu`: the IMU's samples out of its thread's queue, in batches.
 
 use super::motion::{Motion, Sample};
 use super::sensors::{RECORD_RATE_HZ, TICK_PS};
@@ -10,15 +10,15 @@ use std::sync::mpsc::Receiver;
 
 /// Samples of a batch: 40 ms of them.
 pub const BATCH: u32 = 16;
-/// What is said of a calibration that knows the eyes and not where the unit sits.
-pub const NO_POSE: &str = " (without the motion unit's pose)";
+/// Suffix of a calibration that covers the cameras and not the IMU's pose.
+pub const NO_POSE: &str = " (without the IMU's pose)";
 
 /// For [`crate::DeviceInfo::motion`].
 pub const NOT_CORRECTED: &str =
     "accel_m_s2 and gyro_rad_s are as the unit measures them, not corrected for bias and scale";
 
-/// The stream's one mode. Where the unit sits in the camera is not in the factory's file, so that its pose is that of the
-/// camera.
+/// The stream's one mode. Where the IMU sits in the camera is not in the factory's file, so that its pose is that of
+/// the camera.
 ///
 /// # Errors
 /// None that can happen: the name is a good one.
@@ -27,19 +27,19 @@ pub fn profile() -> Result<StreamProfile> {
     motion::profile(RECORD_RATE_HZ, BATCH, Pose::IDENTITY, clock, MetadataLevel::Full)
 }
 
-/// A motion unit that is delivered.
+/// An IMU that is delivered.
 pub struct Imu {
     stream: usize,
     samples: Receiver<Sample>,
     batcher: Batcher,
-    /// When the clock's quality is told again.
-    tell_at: HostTime,
+    /// When the clock's quality is reported again.
+    report_at: HostTime,
 }
 
 impl Imu {
     /// As stream number `stream`, of what [`Motion::start_streaming`] gives.
     pub fn new(stream: usize, profile: &StreamProfile, samples: Receiver<Sample>) -> Self {
-        Self { stream, samples, batcher: Batcher::new(stream, profile), tell_at: HostTime::from_ns(0) }
+        Self { stream, samples, batcher: Batcher::new(stream, profile), report_at: HostTime::from_ns(0) }
     }
 
     /// Hands on what has come, and what waited long enough. Whether a batch went.
@@ -51,18 +51,18 @@ impl Imu {
         let now = HostTime::now();
         went |= self.batcher.tick(now, sink);
         if went
-            && now >= self.tell_at
+            && now >= self.report_at
             && let Some(quality) = unit.and_then(Motion::quality)
         {
             sink.clock_quality(self.stream, &quality);
-            self.tell_at = now.plus(Duration::from_secs(1));
+            self.report_at = now.plus(Duration::from_secs(1));
         }
         went
     }
 
-    /// Waits at most `patience` for a sample, for a camera of which nothing else is delivered.
-    pub fn wait(&mut self, patience: Duration, sink: &mut dyn FrameSink) -> bool {
-        self.samples.recv_timeout(patience).is_ok_and(|sample| self.take(&sample, sink))
+    /// Waits at most `timeout` for a sample, for a camera of which nothing else is delivered.
+    pub fn wait(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> bool {
+        self.samples.recv_timeout(timeout).is_ok_and(|sample| self.take(&sample, sink))
     }
 
     fn take(&mut self, sample: &Sample, sink: &mut dyn FrameSink) -> bool {

@@ -36,7 +36,8 @@ impl<'t> Ini<'t> {
         let mut ini = Self { origin: origin.to_owned(), sections: Vec::new(), entries: Vec::new() };
         let mut section = "";
         for (i, raw) in text.trim_start_matches('\u{feff}').lines().enumerate() {
-            let (line, text) = (i + 1, raw.trim());
+            let line = i + 1;
+            let text = raw.trim();
             if text.is_empty() || text.starts_with([';', '#']) {
                 continue;
             }
@@ -55,7 +56,8 @@ impl<'t> Ini<'t> {
                 let what = format_args!("neither a section, nor \"key = value\", nor a comment: {text:?}");
                 return Err(ini.at(line, what));
             };
-            let (key, value) = (key.trim(), without_comment(value));
+            let key = key.trim();
+            let value = without_comment(value);
             if let Some(first) = ini.find(section, key)
                 && first.value != value
             {
@@ -88,7 +90,7 @@ impl<'t> Ini<'t> {
             Ok(value) if value.is_finite() => Ok(Some(Number { key: e.key, value, line: e.line })),
             _ => {
                 let hint = if e.value.contains(',') { "; decimals have a point, not a comma" } else { "" };
-                let what = format_args!("[{section}] {key} = {:?} is no number{hint}", e.value);
+                let what = format_args!("[{section}] {key} = {:?} is not a number{hint}", e.value);
                 Err(self.at(e.line, what))
             }
         }
@@ -144,10 +146,10 @@ mod tests {
             ("[s\nk=1", "a.conf, line 1: the section's \"]\" is missing"),
             ("[s] x\nk=1", "a.conf, line 1: something follows"),
             ("[s]\n\nk 1", "a.conf, line 3: neither a section"),
-            ("[s]\nk=1,5", "a.conf, line 2: [s] k = \"1,5\" is no number; decimals have a point"),
-            ("[s]\nk=", "a.conf, line 2: [s] k = \"\" is no number"),
-            ("[s]\nk=nan", "is no number"),
-            ("[s]\nk=1e999", "is no number"),
+            ("[s]\nk=1,5", "a.conf, line 2: [s] k = \"1,5\" is not a number; decimals have a point"),
+            ("[s]\nk=", "a.conf, line 2: [s] k = \"\" is not a number"),
+            ("[s]\nk=nan", "is not a number"),
+            ("[s]\nk=1e999", "is not a number"),
             ("[s]\nk=1\nK=2", "a.conf, line 3: [s] K is \"2\" here and \"1\" on line 2"),
         ] {
             assert!(message(text).contains(wanted), "{text:?}: {}", message(text));

@@ -1,15 +1,15 @@
-//! The motion unit of a camera that streams: a thread of its own reads its records and keeps it awake.
+//! The IMU of a camera that streams: a thread of its own reads its records and keeps it awake.
 //!
-//! It gives the temperatures of both image sensors for the frames' headers, the samples of the stream `imu` through a queue
-//! of [`QUEUE`] of them, and, for a program that links this crate, the latest sample.
+//! It gives the temperatures of both image sensors for the frames' headers, the samples of the stream `imu` through a
+//! queue of [`QUEUE`] of them, and, for a program that links this crate, the latest sample.
 //!
-//! **Time.** The unit counts 25600 ticks a second. Each record's ticks and arrival go into a [`ClockMap`], as those of a
+//! **Time.** The IMU counts 25600 ticks a second. Each record's ticks and arrival go into a [`ClockMap`], as those of a
 //! camera do. A record that says `frame_sync` is the first after an exposure began, so its time is that of the
 //! exposure's start, late by at most the 2.5 ms between records.
 //!
-//! **Numbers.** The unit has no counter. Samples are numbered by its clock, so that a record that never came is a gap. A
-//! sample for which the queue has no room is a gap too, and the next one tells of it ([`Sample::lost_before`]), so that
-//! whoever reads the queue can count it as lost here and not by the unit.
+//! **Numbers.** The IMU has no counter. Samples are numbered by its clock, so that a record that never came is a gap. A
+//! sample for which the queue has no room is a gap too, and the next one reports it ([`Sample::lost_before`]), so that
+//! the reader of the queue can count it as lost here and not by the IMU.
 
 use super::hid::Reports;
 use super::sensors::{self, Record};
@@ -21,15 +21,15 @@ use depthrig_bus::{FrameFlags, HostTime, MotionFlags, MotionSample};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// How often the unit is told that somebody listens. It stops after a few seconds without.
+/// Period of the keep-alive report. The IMU stops a few seconds after the last one.
 const KEEP_ALIVE: Duration = Duration::from_secs(1);
 /// How long one read waits; also how late the thread notices that it is to end.
 const WAIT: Duration = Duration::from_millis(50);
-/// After so long without a record the unit is started anew: whoever had it before may have stopped it just now.
+/// After so long without a record the IMU is restarted: its previous user may have stopped it just now.
 const SILENCE: Duration = Duration::from_millis(500);
 /// Nanoseconds from one record to the next.
 const PERIOD_NS: u64 = 2_500_000;
-/// Samples that may wait for whoever reads them: 2.5 s of them.
+/// Capacity of the sample queue: 2.5 s of samples.
 pub const QUEUE: usize = 1024;
 /// Records that may be missing at once: an hour of them.
 const JUMP: u64 = 3600 * 400;
@@ -39,15 +39,15 @@ const QUALITY_EVERY: u64 = 400;
 /// A record and when it was measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sample {
-    /// What the unit measured.
+    /// The measured record.
     pub record: Record,
-    /// Its number by the unit's clock, from 1.
+    /// Its number by the IMU's clock, from 1.
     pub number: u64,
     /// When, on the host's clock.
     pub time: HostTime,
-    /// The time is right within this much, but for the constant least latency of the transport, which nobody knows.
+    /// The time is right within this much, apart from the constant least latency of the transport, which is unknown.
     pub uncertainty_ns: u64,
-    /// The unit's clock, ticks, unwrapped.
+    /// The IMU's clock, ticks, unwrapped.
     pub device_time: u64,
     /// Number of the clock's map.
     pub epoch: u32,
@@ -60,11 +60,11 @@ pub struct Sample {
 }
 
 impl Sample {
-    /// It as the bus carries samples: rad/s and m/s² along the unit's own axes.
+    /// Converts it to the bus's format: rad/s and m/s² along the IMU's own axes.
     pub fn for_bus(&self) -> MotionSample {
         let Record { motion_valid, gyro_raw, acceleration_raw, frame_sync, .. } = self.record;
         let three = |v: [f64; 3]| if motion_valid { v.map(|v| v as f32) } else { [f32::NAN; 3] };
-        // An end of the range of 16 bits is said for all that lies beyond it.
+        // The sensor reports the end of the 16-bit range for every value beyond it.
         let clipped = |raw: [i16; 3]| motion_valid && raw.iter().any(|v| matches!(*v, i16::MIN | i16::MAX));
         let flag = |is: bool, flag: MotionFlags| if is { flag.0 } else { 0 };
         MotionSample {
@@ -83,16 +83,16 @@ impl Sample {
     }
 }
 
-/// What came so far.
+/// Counts of what has arrived so far.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Tally {
     /// Records.
     pub records: u64,
-    /// Reports that were none.
+    /// Reports that were not valid records.
     pub rejected: u64,
     /// Records that began an exposure.
     pub frame_syncs: u64,
-    /// Records that the unit's clock says should have come in between and did not.
+    /// Records that the IMU's clock says should have come in between and did not.
     pub missed: u64,
     /// Samples for which the queue had no room.
     pub overflowed: u64,
@@ -104,7 +104,7 @@ struct State {
     latest: Option<Sample>,
     /// The last record that began an exposure.
     exposure: Option<Sample>,
-    eyes_c: [Option<f64>; 2],
+    image_sensors_c: [Option<f64>; 2],
     quality: Option<ClockQuality>,
     ended: Option<String>,
 }
@@ -115,13 +115,13 @@ struct Shared {
     state: Mutex<State>,
 }
 
-/// The running reader. Dropping it stops the unit.
+/// The running reader. Dropping it stops the IMU.
 pub struct Motion {
     shared: Arc<Shared>,
 }
 
 impl Motion {
-    /// Starts the thread that starts the unit and reads it; `device` names the camera. What the unit says against it is
+    /// Starts the thread that starts the IMU and reads it; `device` names the camera. What the IMU says against it is
     /// in [`Self::problem`].
     ///
     /// # Errors
@@ -148,12 +148,12 @@ impl Motion {
             .spawn(move || {
                 let end = run(reports.as_mut(), &theirs, send.as_ref());
                 if let Err(e) = &end {
-                    tracing::warn!(camera = name, error = %e, "the motion unit is no longer read");
+                    tracing::warn!(camera = name, error = %e, "the IMU is no longer read");
                 }
                 lock(&theirs.state).ended = end.err().map(|e| e.to_string());
             })
             .map_err(|e| {
-                Error::new(ErrorKind::Io, format!("{device}: no thread for the motion unit")).with_source(e)
+                Error::new(ErrorKind::Io, format!("{device}: no thread for the IMU")).with_source(e)
             })?;
         Ok(Self { shared })
     }
@@ -168,14 +168,14 @@ impl Motion {
         lock(&self.shared.state).exposure
     }
 
-    /// What came so far.
+    /// Counts of what has arrived so far.
     pub fn tally(&self) -> Tally {
         lock(&self.shared.state).tally
     }
 
     /// Temperatures of the left and the right image sensor, °C, as last said.
-    pub fn eyes_c(&self) -> [Option<f64>; 2] {
-        lock(&self.shared.state).eyes_c
+    pub fn image_sensors_c(&self) -> [Option<f64>; 2] {
+        lock(&self.shared.state).image_sensors_c
     }
 
     /// How the map of its clock was doing, a second ago at the most.
@@ -183,7 +183,7 @@ impl Motion {
         lock(&self.shared.state).quality
     }
 
-    /// Why the unit is no longer read, if so.
+    /// Why the IMU is no longer read, if so.
     pub fn problem(&self) -> Option<String> {
         lock(&self.shared.state).ended.clone()
     }
@@ -209,7 +209,8 @@ fn run(reports: &mut dyn Reports, shared: &Shared, queue: Option<&SyncSender<Sam
     let mut buffer = [0; 64];
     let mut last_ticks: Option<u64> = None;
     let mut last: Option<(u32, HostTime)> = None;
-    let (mut sequence, mut lost_before) = (0, 0);
+    let mut sequence = 0;
+    let mut lost_before = 0;
     while !shared.stop.load(Ordering::Relaxed) {
         if awake_until.from_now().is_zero() {
             reports.send_feature(sensors::keep_alive())?;
@@ -226,11 +227,11 @@ fn run(reports: &mut dyn Reports, shared: &Shared, queue: Option<&SyncSender<Sam
             lock(&shared.state).tally.rejected += 1;
             continue;
         };
-        // The unit has no counter; how many records there should have been follows from its clock.
+        // The IMU has no counter; how many records there should have been follows from its clock.
         let steps = last_ticks.map_or(1, |last| {
             let ticks = record.ticks.saturating_sub(last);
             let steps = (ticks as f64 * tick_ns / PERIOD_NS as f64).round().max(1.0) as u64;
-            // So much is no gap, its clock jumped.
+            // More is not a gap: the clock jumped.
             if steps > JUMP { 1 } else { steps }
         });
         last_ticks = Some(record.ticks);
@@ -267,7 +268,7 @@ fn run(reports: &mut dyn Reports, shared: &Shared, queue: Option<&SyncSender<Sam
             state.tally.frame_syncs += 1;
             state.exposure = Some(sample);
         }
-        for (kept, new) in state.eyes_c.iter_mut().zip(record.eyes_c()) {
+        for (kept, new) in state.image_sensors_c.iter_mut().zip(record.image_sensors_c()) {
             *kept = new.or(*kept);
         }
     }
@@ -279,15 +280,15 @@ mod tests {
     use super::*;
     use std::sync::mpsc;
 
-    /// A unit that sends what it is given and notes what it is told.
+    /// A fake IMU that sends the given records and notes the reports it receives.
     struct Unit {
         records: mpsc::Receiver<Vec<u8>>,
-        told: Arc<Mutex<Vec<[u8; 2]>>>,
+        sent: Arc<Mutex<Vec<[u8; 2]>>>,
     }
 
     impl Reports for Unit {
         fn send_feature(&mut self, report: [u8; 2]) -> Result<()> {
-            self.told.lock().unwrap().push(report);
+            self.sent.lock().unwrap().push(report);
             Ok(())
         }
 
@@ -316,9 +317,9 @@ mod tests {
     #[test]
     fn records_are_counted_stamped_and_the_unit_is_kept_awake() {
         let (send, records) = mpsc::sync_channel(64);
-        let told = Arc::<Mutex<Vec<[u8; 2]>>>::default();
+        let sent = Arc::<Mutex<Vec<[u8; 2]>>>::default();
         let motion =
-            Motion::start(Box::new(Unit { records, told: Arc::clone(&told) }), "ZED 2i at 1-1").unwrap();
+            Motion::start(Box::new(Unit { records, sent: Arc::clone(&sent) }), "ZED 2i at 1-1").unwrap();
         let began = HostTime::now();
         for i in 0..10u64 {
             // Three records are missing after the fifth.
@@ -329,7 +330,7 @@ mod tests {
                 frame_sync: i == 6,
                 frame_count: 77,
                 air_raw,
-                eyes_raw: [4100, 4250],
+                image_sensors_raw: [4100, 4250],
                 ..Record::default()
             };
             send.send(record.build().to_vec()).unwrap();
@@ -340,25 +341,26 @@ mod tests {
             motion.tally(),
             Tally { records: 10, rejected: 1, frame_syncs: 1, missed: 3, overflowed: 0 }
         );
-        assert_eq!(motion.eyes_c(), [Some(41.0), Some(42.5)], "said once, kept since");
-        let (latest, exposure) = (motion.latest().unwrap(), motion.exposure().unwrap());
+        assert_eq!(motion.image_sensors_c(), [Some(41.0), Some(42.5)], "said once, kept since");
+        let latest = motion.latest().unwrap();
+        let exposure = motion.exposure().unwrap();
         assert_eq!((latest.record.ticks, exposure.record.frame_count), (1000 + 64 * 12, 77));
         assert!(latest.time >= began.plus(Duration::ZERO) && latest.time <= HostTime::now());
         assert!(latest.time > exposure.time);
-        wait_for(|| told.lock().unwrap().contains(&[0x21, 0xF2]));
-        let starts = told.lock().unwrap().iter().filter(|t| **t == [0x32, 1]).count();
+        wait_for(|| sent.lock().unwrap().contains(&[0x21, 0xF2]));
+        let starts = sent.lock().unwrap().iter().filter(|t| **t == [0x32, 1]).count();
         assert!(
-            told.lock().unwrap()[0] == [0x32, 1] && starts > 1,
+            sent.lock().unwrap()[0] == [0x32, 1] && starts > 1,
             "silent for a second, it is started anew"
         );
         drop(motion);
-        wait_for(|| told.lock().unwrap().last() == Some(&[0x32, 0]));
+        wait_for(|| sent.lock().unwrap().last() == Some(&[0x32, 0]));
     }
 
     #[test]
     fn a_unit_that_goes_away_says_so_and_hurts_nobody() {
         let (send, records) = mpsc::sync_channel(64);
-        let motion = Motion::start(Box::new(Unit { records, told: Arc::default() }), "ZED 2i").unwrap();
+        let motion = Motion::start(Box::new(Unit { records, sent: Arc::default() }), "ZED 2i").unwrap();
         drop(send);
         wait_for(|| motion.problem().is_some());
         assert_eq!((motion.problem().as_deref(), motion.latest()), (Some("pulled"), None));

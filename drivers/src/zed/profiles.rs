@@ -1,7 +1,7 @@
 //! The modes of an attached camera as streams: two of each, left and right.
 
 use super::conf::FactoryCalibration;
-use super::mode::{Eye, Mode as SensorMode};
+use super::mode::{Mode as SensorMode, Side};
 use crate::motion::IMU;
 use crate::v4l2::Mode;
 use crate::{DeviceClock, Error, ErrorKind, Result, StreamProfile, StreamRequest, choose_profiles};
@@ -10,12 +10,12 @@ use depthrig_bus::{ClockDomain, Intrinsics, MetadataLevel, Name, PixelFormat, Po
 /// Names of the streams, left first.
 pub const STREAMS: [&str; 2] = ["left", "right"];
 
-/// The name of the stream of `eye`.
+/// The name of the stream of `side`.
 ///
 /// # Errors
 /// None that can happen: the names are good ones.
-pub fn stream_name(eye: Eye) -> Result<StreamName> {
-    let name = STREAMS[usize::from(eye == Eye::Right)];
+pub fn stream_name(side: Side) -> Result<StreamName> {
+    let name = STREAMS[usize::from(side == Side::Right)];
     Name::new(name).map_err(|e| Error::new(ErrorKind::BadInput, format!("stream {name}")).with_source(e))
 }
 
@@ -34,7 +34,7 @@ pub fn profiles(
     modes: &[Mode],
     calibration: Option<&FactoryCalibration>,
 ) -> Result<Vec<StreamProfile>> {
-    // Pixels of YUYV come in pairs, so each eye has an even number of columns.
+    // Pixels of YUYV come in pairs, so each image has an even number of columns.
     let mut usable: Vec<&Mode> =
         modes.iter().filter(|m| m.width > 0 && m.width.is_multiple_of(4) && m.height > 0).collect();
     let is_default = |m: &Mode| {
@@ -46,11 +46,12 @@ pub fn profiles(
         return Err(Error::new(ErrorKind::Protocol, what));
     }
     let mut profiles = Vec::new();
-    for eye in Eye::BOTH {
-        let stream = stream_name(eye)?;
+    for side in Side::BOTH {
+        let stream = stream_name(side)?;
         for m in &usable {
-            let (width, height) = (m.width / 2, m.height);
-            let known = SensorMode::of_eye(width, height).and_then(|mode| calibration?.at(mode));
+            let width = m.width / 2;
+            let height = m.height;
+            let known = SensorMode::of_size(width, height).and_then(|mode| calibration?.at(mode));
             profiles.push(StreamProfile {
                 stream: stream.clone(),
                 format: PixelFormat::Yuyv,
@@ -59,8 +60,8 @@ pub fn profiles(
                 // As `StreamRequest` names rates: a thirtieth that comes as 333333 of ten millions is 30 Hz.
                 rate_hz: (m.interval.rate_hz() * 100.0).round() / 100.0,
                 depth_unit_m: 0.0,
-                intrinsics: known.map_or_else(Intrinsics::default, |c| c.intrinsics(eye)),
-                pose_in_device: known.map_or(Pose::IDENTITY, |c| c.pose(eye)),
+                intrinsics: known.map_or_else(Intrinsics::default, |c| c.intrinsics(side)),
+                pose_in_device: known.map_or(Pose::IDENTITY, |c| c.pose(side)),
                 clock: clock(ClockDomain::Kernel),
                 sequence_bits: 64,
                 metadata: MetadataLevel::Kernel,
@@ -70,32 +71,32 @@ pub fn profiles(
     Ok(profiles)
 }
 
-/// The profiles that are asked for; the eyes' are of one mode, because both eyes come in one picture: what one of their
-/// requests leaves open, it takes from the other.
+/// The requested profiles. Both images arrive in one frame and so have one mode: a property that one of their
+/// requests leaves open is taken from the other.
 ///
 /// # Errors
-/// [`ErrorKind::Unsupported`] when there is no such mode, or when the eyes are asked for in different ones.
+/// [`ErrorKind::Unsupported`] if there is no such mode, or if the images are requested in different ones.
 pub fn choose(
     device: &str,
     available: &[StreamProfile],
     requests: &[StreamRequest],
 ) -> Result<Vec<StreamProfile>> {
-    let is_eye = |r: &&StreamRequest| r.stream.as_str() != IMU;
-    let size = requests.iter().filter(is_eye).find_map(|r| r.size);
-    let rate_hz = requests.iter().filter(is_eye).find_map(|r| r.rate_hz);
+    let is_image = |r: &&StreamRequest| r.stream.as_str() != IMU;
+    let size = requests.iter().filter(is_image).find_map(|r| r.size);
+    let rate_hz = requests.iter().filter(is_image).find_map(|r| r.rate_hz);
     let fill = |r: &StreamRequest| StreamRequest {
         size: r.size.or(size),
         rate_hz: r.rate_hz.or(rate_hz),
         ..r.clone()
     };
-    let filled: Vec<_> = requests.iter().map(|r| if is_eye(&r) { fill(r) } else { r.clone() }).collect();
+    let filled: Vec<_> = requests.iter().map(|r| if is_image(&r) { fill(r) } else { r.clone() }).collect();
     let chosen = choose_profiles(device, available, &filled)?;
-    let eyes: Vec<_> = chosen.iter().filter(|p| !p.format.is_motion()).collect();
-    if let [a, b] = eyes.as_slice()
+    let images: Vec<_> = chosen.iter().filter(|p| !p.format.is_motion()).collect();
+    if let [a, b] = images.as_slice()
         && (a.width, a.height, a.rate_hz) != (b.width, b.height, b.rate_hz)
     {
         let what = format!(
-            "{device}: both eyes come in one picture and have one mode; asked for {} and {}",
+            "{device}: left and right come in one frame and have one mode; requested were {} and {}",
             a.describe(),
             b.describe()
         );

@@ -1,106 +1,107 @@
-//! Recordings of a ZED's two eyes: pairs of pictures out of a folder of side-by-side images or an SVO2 file.
+//! Playback of ZED recordings: pairs of images from a folder of side-by-side images or an SVO2 file.
 //!
 //! A [`Source`] gives pairs in the order of the recording, as they were recorded: not rectified, not resized. [`open`]
-//! finds out what a path is. The same trait is what other recordings (a dataset with raw `left` and `right`) implement.
+//! detects what kind of recording a path is. Other recordings (a dataset with raw `left` and `right`) implement the
+//! same trait.
 
 use super::CalibrationFile;
 use super::conf::{FactoryCalibration, StereoCalibration, how_to_get, known_paths};
-use super::mode::{Eye, Mode};
-use crate::files::picture::io_error;
+use super::mode::{Mode, Side};
+use crate::files::image_file::io_error;
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::PixelFormat;
 use std::path::{Path, PathBuf};
 
 mod backend;
-mod folder;
 #[doc(hidden)]
-pub mod made;
+pub mod fake;
+mod folder;
 pub mod svo2;
 
-pub use backend::{ReplayBackend, ReplayConfig};
+pub use backend::{ZedPlaybackBackend, ZedPlaybackConfig};
 
 /// Rate of pairs whose recording says nothing of it.
 const DEFAULT_RATE_HZ: f64 = 30.0;
 /// The fastest rate that is believed.
 const MAX_RATE_HZ: f64 = 1000.0;
 
-/// What a recording is, known once it is open.
+/// Properties of an open recording.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SourceInfo {
     /// The folder or file, for messages.
     pub path: PathBuf,
-    /// `folder`, `svo2`, `dataset`: which kind of recording it is.
+    /// Kind of recording: `folder`, `svo2`, `dataset`.
     pub kind: &'static str,
     /// Model, such as `ZED 2i`; empty when the recording does not say.
     pub model: String,
     /// Serial number of the camera; empty when nothing says it.
     pub serial: String,
-    /// Pixels per row of one eye.
+    /// Pixels per row of the left or right image.
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// Pixels of both eyes: [`PixelFormat::Yuyv`], [`PixelFormat::Rgb8`] or [`PixelFormat::Mono8`].
+    /// Format of both images: [`PixelFormat::Yuyv`], [`PixelFormat::Rgb8`] or [`PixelFormat::Mono8`].
     pub format: PixelFormat,
     /// Nominal rate of the pairs.
     pub rate_hz: f64,
     /// Whether the pairs' times are those of the recording; else they are `index / rate_hz`.
     pub timed: bool,
-    /// Intrinsics of both eyes at this size and the right eye's pose; `None` when there is no calibration.
+    /// Intrinsics of both cameras at this size and the right camera's pose; `None` without a calibration.
     pub calibration: Option<StereoCalibration>,
     /// Where the calibration comes from, as in [`crate::DeviceInfo::calibration`].
     pub calibration_origin: String,
 }
 
 impl SourceInfo {
-    /// Bytes of the picture of one eye.
-    pub const fn eye_bytes(&self) -> usize {
+    /// Bytes of the left or right image.
+    pub const fn image_bytes(&self) -> usize {
         self.format.frame_bytes(self.width, self.height)
     }
 }
 
-/// Both eyes at one moment. The caller keeps one and has it filled again and again, so that nothing is allocated.
+/// The left and right image of one moment. The caller reuses it for every pair, so that nothing is allocated.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Pair {
     /// Number of the pair in the recording, from 0.
     pub index: u64,
     /// When it was taken, nanoseconds on the recording's own clock (UTC for SVO2).
     pub capture_time_ns: i64,
-    /// The left eye's picture in [`SourceInfo::format`], [`SourceInfo::eye_bytes`] long.
+    /// The left image in [`SourceInfo::format`], [`SourceInfo::image_bytes`] long.
     pub left: Vec<u8>,
-    /// The right eye's.
+    /// The right image, likewise.
     pub right: Vec<u8>,
 }
 
 impl Pair {
-    /// The picture of `eye`.
-    pub fn eye(&self, eye: Eye) -> &[u8] {
-        match eye {
-            Eye::Left => &self.left,
-            Eye::Right => &self.right,
+    /// The image of `side`.
+    pub fn image(&self, side: Side) -> &[u8] {
+        match side {
+            Side::Left => &self.left,
+            Side::Right => &self.right,
         }
     }
 }
 
-/// What [`Source::next`] found.
+/// Result of [`Source::next`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Next {
     /// A pair.
     Pair,
-    /// Pair [`Pair::index`] cannot be decoded, because of this; the ones after it may be whole.
+    /// Pair [`Pair::index`] cannot be decoded, because of this; the ones after it may be complete.
     Damaged(String),
     /// There are no more.
     End,
 }
 
-/// Pairs of pictures in the order of a recording.
+/// Pairs of images in the order of a recording.
 pub trait Source: Send {
-    /// What the recording is.
+    /// Properties of the recording.
     fn info(&self) -> &SourceInfo;
 
     /// How many pairs there are, when that is known without reading them all.
     fn len_hint(&self) -> Option<u64>;
 
-    /// Fills `pair` with the next pair. After [`Next::Damaged`] its index and time are right and its pictures are not.
+    /// Fills `pair` with the next pair. After [`Next::Damaged`] its index and time are right and its images are not.
     ///
     /// # Errors
     /// [`ErrorKind::Io`](crate::ErrorKind::Io) when the recording cannot be read, and
@@ -114,7 +115,7 @@ pub trait Source: Send {
     fn seek(&mut self, index: u64) -> Result<()>;
 }
 
-/// What is not in the recording itself.
+/// Options for what the recording itself does not state.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct OpenOptions {
     /// Where the factory calibration is. With [`CalibrationFile::Known`], beside the recording as well.
@@ -129,14 +130,15 @@ pub struct OpenOptions {
 ///
 /// # Errors
 /// [`ErrorKind::NotFound`], [`ErrorKind::PermissionDenied`], [`ErrorKind::Io`]; [`ErrorKind::Unsupported`] for a
-/// recording whose pictures cannot be decoded here (H.265, encrypted); [`ErrorKind::BadInput`] for what is no recording,
-/// pictures that are no two eyes, and a calibration that is another camera's or has not their size.
+/// recording whose images cannot be decoded here (H.265, encrypted); [`ErrorKind::BadInput`] for
+/// anything that is not a recording, for images that are not side by side, and for a calibration of another camera or
+/// another size.
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn Source>> {
     let what = std::fs::metadata(path).map_err(|e| io_error(path, e))?;
     if let Some(rate) = options.rate_hz
         && !(rate > 0.0 && rate <= MAX_RATE_HZ)
     {
-        let what = format!("a rate of {rate} Hz is impossible: choose one above 0 and at most {MAX_RATE_HZ}");
+        let what = format!("invalid rate {rate} Hz; choose one above 0 and at most {MAX_RATE_HZ}");
         return Err(Error::new(ErrorKind::BadInput, what));
     }
     Ok(if what.is_dir() {
@@ -146,13 +148,14 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Box<dyn Source>> {
     })
 }
 
-/// The calibration of the camera `serial` (empty when it is not known) for eyes of `size`, where it comes from, and the
-/// serial number that its name says.
+/// The calibration of the camera `serial` (empty when it is not known) for images of this size, where it comes from,
+/// and the serial number that its name states.
 fn calibration(
     path: &Path,
     options: &OpenOptions,
     serial: &str,
-    (width, height): (u32, u32),
+    width: u32,
+    height: u32,
 ) -> Result<(Option<StereoCalibration>, String, Option<String>)> {
     let found = match &options.calibration {
         CalibrationFile::None => None,
@@ -181,13 +184,13 @@ fn calibration(
         let what = format!("{e}; {} needs it for rectification", path.display());
         Error::new(ErrorKind::BadInput, what).with_source(e)
     })?;
-    let fitting = Mode::of_eye(width, height).and_then(|m| all.at(m));
+    let fitting = Mode::of_size(width, height).and_then(|m| all.at(m));
     let Some(fitting) = fitting else {
         let sizes: Vec<_> =
-            Mode::ALL.into_iter().filter(|m| all.at(*m).is_some()).map(Mode::eye_size).collect();
+            Mode::ALL.into_iter().filter(|m| all.at(*m).is_some()).map(Mode::image_size).collect();
         let sizes: Vec<_> = sizes.into_iter().map(|(w, h)| format!("{w}x{h}")).collect();
         let what = format!(
-            "{}: each eye has {width}x{height} pixels, and {} is for {}; pictures must not be resized, or give \
+            "{}: left and right have {width}x{height} pixels, and {} is for {}; images must not be resized, or give \
              calibration = \"none\" to play them as they are",
             path.display(),
             file.display(),

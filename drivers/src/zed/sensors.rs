@@ -1,4 +1,4 @@
-//! Reports of the motion unit, a HID device of its own behind the camera's hub.
+//! Reports of the IMU, a HID device of its own behind the camera's hub.
 //!
 //! Layout and scales are those of `zed-open-capture`'s `sensorcapture_def.hpp`; all numbers are little-endian.
 
@@ -36,24 +36,24 @@ pub const fn keep_alive() -> [u8; 2] {
     [REQUEST_REPORT, 0xF2]
 }
 
-/// One record of the motion unit, as it is sent 400 times a second.
+/// One record of the IMU, as it is sent 400 times a second.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Record {
     /// Acceleration and turning rate are valid.
     pub motion_valid: bool,
-    /// The unit's clock, ticks of 39.0625 µs.
+    /// The IMU's clock, ticks of 39.0625 µs.
     pub ticks: u64,
-    /// Turning rate about the unit's axes as it came.
+    /// Turning rate about the IMU's axes as it came.
     pub gyro_raw: [i16; 3],
-    /// Acceleration along the unit's axes as it came.
+    /// Acceleration along the IMU's axes as it came.
     pub acceleration_raw: [i16; 3],
-    /// This record is the first after a picture's exposure began.
+    /// This record is the first after an image's exposure began.
     pub frame_sync: bool,
     /// The two are coupled at all.
     pub can_sync: bool,
-    /// Pictures whose exposure began so far.
+    /// Images whose exposure began so far.
     pub frame_count: u32,
-    /// Temperature of the motion unit, 0.01 °C.
+    /// Temperature of the IMU, 0.01 °C.
     pub temperature_raw: i16,
     /// Magnetic field as it came, 1/16 µT; `None` between its readings.
     pub field_raw: Option<[i16; 3]>,
@@ -61,7 +61,7 @@ pub struct Record {
     /// readings.
     pub air_raw: Option<(i16, u32, u32)>,
     /// Temperatures of the left and the right image sensor, 0.01 °C; −27315 when not known.
-    pub eyes_raw: [i16; 2],
+    pub image_sensors_raw: [i16; 2],
 }
 
 impl Record {
@@ -71,8 +71,9 @@ impl Record {
     /// [`ErrorKind::Protocol`] when it is another report or too short.
     pub fn parse(report: &[u8]) -> Result<Self> {
         let Some(b) = report.first_chunk::<RECORD_BYTES>().filter(|b| b[0] == RECORD_REPORT) else {
-            let (first, n) = (report.first().copied().unwrap_or_default(), report.len());
-            let what = format!("report {first:#04x} of {n} bytes is no record of the motion unit");
+            let first = report.first().copied().unwrap_or_default();
+            let n = report.len();
+            let what = format!("report {first:#04x} of {n} bytes is not a record of the IMU");
             return Err(Error::new(ErrorKind::Protocol, what));
         };
         let i16_at = |i: usize| i16::from_le_bytes([b[i], b[i + 1]]);
@@ -89,7 +90,7 @@ impl Record {
             temperature_raw: i16_at(28),
             field_raw: (b[30] == 1).then(|| three(31)),
             air_raw: (b[47] == 1).then(|| (i16_at(48), u32_at(50), u32_at(54))),
-            eyes_raw: [i16_at(58), i16_at(60)],
+            image_sensors_raw: [i16_at(58), i16_at(60)],
         })
     }
 
@@ -117,17 +118,17 @@ impl Record {
             put(50, &pressure.to_le_bytes());
             put(54, &humidity.to_le_bytes());
         }
-        put(58, &self.eyes_raw[0].to_le_bytes());
-        put(60, &self.eyes_raw[1].to_le_bytes());
+        put(58, &self.image_sensors_raw[0].to_le_bytes());
+        put(60, &self.image_sensors_raw[1].to_le_bytes());
         b
     }
 
-    /// Turning rate about the unit's axes, rad/s.
+    /// Turning rate about the IMU's axes, rad/s.
     pub fn gyro_rad_s(&self) -> [f64; 3] {
         self.gyro_raw.map(|v| (f64::from(v) * GYRO_UNIT_DEG_S).to_radians())
     }
 
-    /// Acceleration along the unit's axes, gravity included, m/s².
+    /// Acceleration along the IMU's axes, gravity included, m/s².
     pub fn acceleration_m_s2(&self) -> [f64; 3] {
         self.acceleration_raw.map(|v| f64::from(v) * ACCELERATION_UNIT)
     }
@@ -137,7 +138,7 @@ impl Record {
         self.field_raw.map(|f| f.map(|v| f64::from(v) / 16.0 * 1e-6))
     }
 
-    /// Temperature of the motion unit, °C.
+    /// Temperature of the IMU, °C.
     pub fn temperature_c(&self) -> f64 {
         f64::from(self.temperature_raw) / 100.0
     }
@@ -148,8 +149,9 @@ impl Record {
     }
 
     /// Temperatures of the left and the right image sensor, °C, where known.
-    pub fn eyes_c(&self) -> [Option<f64>; 2] {
-        self.eyes_raw.map(|v| (v != NO_TEMPERATURE && self.air_raw.is_some()).then(|| f64::from(v) / 100.0))
+    pub fn image_sensors_c(&self) -> [Option<f64>; 2] {
+        self.image_sensors_raw
+            .map(|v| (v != NO_TEMPERATURE && self.air_raw.is_some()).then(|| f64::from(v) / 100.0))
     }
 }
 
@@ -187,12 +189,12 @@ mod tests {
         near(r.field_t().unwrap()[1], -50e-6);
         near(r.temperature_c(), 25.0);
         assert_eq!(r.air_raw, Some((-200, 0x0403_0201, 0x0807_0605)));
-        assert_eq!(r.eyes_c(), [Some(36.0), None]);
+        assert_eq!(r.image_sensors_c(), [Some(36.0), None]);
         assert_eq!(TICK_PS * 25_600, 1_000_000_000_000, "25600 ticks are a second");
     }
 
     #[test]
-    fn requests_and_what_is_no_record() {
+    fn requests_and_invalid_records() {
         assert_eq!(
             (stream_report(true), stream_report(false), keep_alive()),
             ([0x32, 1], [0x32, 0], [0x21, 0xF2])
@@ -207,7 +209,7 @@ mod tests {
         (invalid[1], invalid[30], invalid[47]) = (1, 2, 0);
         let r = Record::parse(&invalid).unwrap();
         assert!(!r.motion_valid && r.field_raw.is_none() && r.air_raw.is_none());
-        assert_eq!(r.eyes_c(), [None, None]);
+        assert_eq!(r.image_sensors_c(), [None, None]);
     }
 
     proptest! {

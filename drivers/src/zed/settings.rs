@@ -1,8 +1,8 @@
-//! What a rig asks of the camera's picture, written and read back.
+//! Writes a rig's image settings to the camera and reads them back.
 
 use super::ZedConfig;
 use super::command::Vendor;
-use super::mode::Eye;
+use super::mode::Side;
 use crate::uvc::control::ControlPort;
 use crate::v4l2::Node;
 use crate::{Error, ErrorKind, Result};
@@ -47,12 +47,12 @@ pub fn apply<P: ControlPort>(vendor: &mut Vendor<P>, config: &ZedConfig, rate_hz
     if let Some(on) = config.auto_exposure.or(fixed.then_some(false)) {
         vendor.set_auto_exposure(on)?;
     }
-    for eye in Eye::BOTH {
+    for side in Side::BOTH {
         if let Some(percent) = config.exposure_percent {
-            vendor.set_exposure(eye, percent, rate_hz)?;
+            vendor.set_exposure(side, percent, rate_hz)?;
         }
         if let Some(percent) = config.gain_percent {
-            vendor.set_gain(eye, percent)?;
+            vendor.set_gain(side, percent)?;
         }
     }
     config.led.map_or(Ok(()), |on| vendor.set_led(on))

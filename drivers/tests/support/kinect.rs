@@ -1,4 +1,4 @@
-//! A made libk4a that was loaded from a file of its own, with the hands to command it.
+//! A fake libk4a that was loaded from a file of its own, with the means to command it.
 #![allow(unsafe_code, dead_code)] // foreign functions; each test file uses some of them
 
 use depthrig_bus::{DropCounts, DropReason, HostTime};
@@ -60,7 +60,7 @@ impl Fake {
         let file = home.path().join("libk4a.so.1.4");
         // A copy and not a link: the loader takes one file for one library.
         std::fs::copy(built(), &file).unwrap();
-        // SAFETY: the library is the made one, whose loading runs nothing.
+        // SAFETY: the library is the fake one, whose loading runs nothing.
         let library = unsafe { Library::new(file.canonicalize().unwrap()) }.unwrap();
         let fake = Self { home, library };
         for serial in serials {
@@ -87,19 +87,20 @@ impl Fake {
     /// See `fake_k4a_command`.
     pub fn command(&self, serial: &str, what: &str, n: u64) {
         type Command = unsafe extern "C" fn(*const c_char, *const c_char, u64) -> u32;
-        let (serial, text) = (CString::new(serial).unwrap(), CString::new(what).unwrap());
-        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        let serial = CString::new(serial).unwrap();
+        let text = CString::new(what).unwrap();
+        // SAFETY: the type is the one that the fake library declares; what is pointed to outlives the call.
         let done = unsafe {
             self.library.get::<Command>(b"fake_k4a_command\0").unwrap()(serial.as_ptr(), text.as_ptr(), n)
         };
         assert_eq!(done, 0, "{what}");
     }
 
-    /// Has the camera tell this as its calibration.
+    /// Has the camera return `text` as its calibration.
     pub fn calibration(&self, serial: &str, text: &[u8]) {
         type Set = unsafe extern "C" fn(*const c_char, *const u8, usize) -> u32;
         let serial = CString::new(serial).unwrap();
-        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        // SAFETY: the type is the one that the fake library declares; what is pointed to outlives the call.
         let done = unsafe {
             self.library.get::<Set>(b"fake_k4a_calibration\0").unwrap()(
                 serial.as_ptr(),
@@ -110,25 +111,25 @@ impl Fake {
         assert_eq!(done, 0);
     }
 
-    /// What the camera did with the pictures of `stream`: 0 colour, 1 depth, 2 infrared.
+    /// The camera's record of the images of `stream`: 0 colour, 1 depth, 2 infrared.
     pub fn ledger(&self, serial: &str, stream: usize) -> Ledger {
         type Ask = unsafe extern "C" fn(*const c_char, usize, *mut Ledger) -> u32;
         let serial = CString::new(serial).unwrap();
         let mut ledger = Ledger::default();
-        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        // SAFETY: the type is the one that the fake library declares; what is pointed to outlives the call.
         let ask = unsafe { self.library.get::<Ask>(b"fake_k4a_ledger\0") }.unwrap();
-        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        // SAFETY: the type is the one that the fake library declares; what is pointed to outlives the call.
         assert_eq!(unsafe { ask(serial.as_ptr(), stream, &raw mut ledger) }, 0);
         ledger
     }
 
-    /// What was handed out and what came back.
+    /// Handles handed out and returned.
     pub fn census(&self) -> Census {
         let mut census = Census::default();
         let ask =
-            // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+            // SAFETY: the type is the one that the fake library declares; what is pointed to outlives the call.
             unsafe { self.library.get::<unsafe extern "C" fn(*mut Census)>(b"fake_k4a_census\0") }.unwrap();
-        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        // SAFETY: the type is the one that the fake library declares; what is pointed to outlives the call.
         unsafe { ask(&raw mut census) };
         census
     }
@@ -137,7 +138,7 @@ impl Fake {
     pub fn control(&self, serial: &str, command: u32) -> i32 {
         type Ask = unsafe extern "C" fn(*const c_char, u32) -> i32;
         let serial = CString::new(serial).unwrap();
-        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        // SAFETY: the type is the one that the fake library declares; what is pointed to outlives the call.
         unsafe { self.library.get::<Ask>(b"fake_k4a_control\0").unwrap()(serial.as_ptr(), command) }
     }
 
@@ -145,42 +146,43 @@ impl Fake {
     pub fn set(&self, serial: &str) -> Vec<i32> {
         type Ask = unsafe extern "C" fn(*const c_char, usize) -> i32;
         let serial = CString::new(serial).unwrap();
-        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        // SAFETY: the type is the one that the fake library declares; what is pointed to outlives the call.
         let ask = unsafe { self.library.get::<Ask>(b"fake_k4a_set\0") }.unwrap();
-        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        // SAFETY: the type is the one that the fake library declares; what is pointed to outlives the call.
         (0..4096).map(|i| unsafe { ask(serial.as_ptr(), i) }).take_while(|c| *c >= 0).collect()
     }
 
-    /// What the camera streams with.
+    /// The configuration that the camera streams with.
     pub fn configuration(&self, serial: &str) -> Option<fake_k4a::abi::Configuration> {
         type Ask = unsafe extern "C" fn(*const c_char, *mut fake_k4a::abi::Configuration) -> u32;
         let serial = CString::new(serial).unwrap();
         let mut to = core::mem::MaybeUninit::uninit();
-        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        // SAFETY: the type is the one that the fake library declares; what is pointed to outlives the call.
         let ask = unsafe { self.library.get::<Ask>(b"fake_k4a_configuration\0") }.unwrap();
         // SAFETY: the same; it is written to when the result is 0.
         unsafe { (ask(serial.as_ptr(), to.as_mut_ptr()) == 0).then(|| to.assume_init()) }
     }
 
-    /// True mid-exposure of the newest picture that had arrived at `at`.
+    /// True mid-exposure of the newest image that had arrived at `at`.
     pub fn exposed(&self, serial: &str, at: HostTime) -> Option<HostTime> {
         type Ask = unsafe extern "C" fn(*const c_char, i64) -> i64;
         let serial = CString::new(serial).unwrap();
-        // SAFETY: the type is the one that the made library declares; what is pointed to outlives the call.
+        // SAFETY: the type is the one that the fake library declares; what is pointed to outlives the call.
         let ns = unsafe { self.library.get::<Ask>(b"fake_k4a_exposed\0").unwrap()(serial.as_ptr(), at.ns()) };
         (ns != 0).then(|| HostTime::from_ns(ns))
     }
 }
 
-/// Hands and eyes of the conformance suite. `streams` are the numbers of what is started, in its order.
-pub struct Hands {
+/// Fault injection and ground truth for the conformance suite. `streams` are the numbers of what is started, in its
+/// order.
+pub struct TestRig {
     pub fake: Fake,
     pub serial: &'static str,
     pub streams: Vec<usize>,
     pub is_genuine: fn(usize, &[u8]) -> bool,
 }
 
-impl Rig for Hands {
+impl Rig for TestRig {
     fn cause(&self, trouble: Trouble) -> Result<(), Cannot> {
         let ns = |d: Duration| d.as_nanos() as u64;
         let (what, n) = match trouble {

@@ -1,4 +1,4 @@
-"""Opens channels for reading, and turns errors of iceoryx2 into ours. Only this module and _ports.py speak to it."""
+"""Opens channels for reading and maps errors of iceoryx2 to ours. Only this module and _ports.py use it."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ except ImportError as e:
 # iceoryx2 changes the umask of the whole process while it binds the socket of a listener: two threads that do it at
 # once could leave a umask with which new folders cannot be entered.
 BINDING = threading.Lock()
-# How long another process may take to make a channel that it has begun to make.
-_PATIENCE_S = 1.0
+# How long another process may take to finish creating a channel.
+_TIMEOUT_S = 1.0
 _PASSING = ("IsMarkedForDestruction", "HangsInCreation", "InternalFailure")
 _OTHER_VERSION = (
     "IncompatibleTypes",
@@ -42,8 +42,8 @@ _OTHER_VERSION = (
 def _header_type(name: str, size: int, align: int) -> type[ctypes.Structure]:
     """Make the type that iceoryx2 compares with Rust's header: name, size and alignment.
 
-    Who opens a channel may ask for a smaller alignment than it has, and gets samples as they lie there. ctypes cannot ask
-    for more than a field has before Python 3.13.
+    A channel may be opened with a smaller alignment than it has; samples then lie as they were written. ctypes cannot
+    ask for more than a field has before Python 3.13.
     """
 
     class HeaderType(ctypes.Structure):
@@ -63,7 +63,7 @@ SET_HEADER = _header_type(_layout.SET_HEADER_TYPE, _layout.SET_HEADER_SIZE, _lay
 
 
 def check_wheel(version: str) -> None:
-    """Raise VersionMismatch unless the installed iceoryx2 is one that the daemon can be talked to with."""
+    """Raise VersionMismatch unless the installed iceoryx2 is compatible with the daemon's."""
     if not version.startswith(_WHEEL):
         raise VersionMismatch(
             f"the installed iceoryx2 wheel is version {version}, depthrig {_layout.SCHEMA} needs 0.10: {_PIP}"
@@ -131,7 +131,7 @@ class Bus:
         return bus
 
     def streams(self, rig: str) -> list[str]:
-        """List the streams of `rig` that somebody publishes or reads now, sorted."""
+        """List the streams of `rig` that have a publisher or a subscriber now, sorted."""
         prefix = f"depthrig/{rig}/"
         found = []
         for details in iox2.Service.list(self.config, iox2.ServiceType.Ipc):
@@ -168,7 +168,7 @@ class Receiver:
         except iox2.PublishSubscribeOpenError as e:
             raise self._open_error(str(e), rig, channel) from e
         check_room()
-        # The publisher makes the channel first and its event right after.
+        # The publisher creates the channel first and its event right after.
         event_passing = (*_PASSING, "DoesNotExist")
         try:
             events = _retry(lambda: bus.node.service_builder(name).event().open(), iox2.EventOpenError, event_passing)
@@ -227,7 +227,7 @@ class Receiver:
         return self._subscriber is not None and bool(self._subscriber.has_samples())
 
     def wait(self, seconds: float) -> None:
-        """Sleep until something was sent or `seconds` have passed, without Python's lock."""
+        """Wait until a sample is sent or `seconds` have passed, without Python's lock."""
         if self._listener is None:
             raise ValueError(f"{self.what} was closed")
         try:
@@ -237,7 +237,7 @@ class Receiver:
                 raise BusError(f"{self.what}: waiting for a frame failed ({e})") from e
 
     def rest(self, nanoseconds: int) -> bool:
-        """Sleep for so long, to a tenth of a millisecond; whether nothing was sent meanwhile.
+        """Sleep for so long, to a tenth of a millisecond; return whether nothing was sent meanwhile.
 
         :meth:`wait` rounds up to the kernel's ticks of 4 ms, this to milliseconds; what is over a millisecond is slept
         first, when a frame is least likely.
@@ -265,7 +265,7 @@ class Receiver:
             return False  # a signal, whose handler runs when this returns; the next wait reports all else
 
     def has_publisher(self) -> bool:
-        """Whether anybody publishes the channel now; cleans up after killed publishers first."""
+        """Whether the channel has a publisher now; cleans up after killed publishers first."""
         self.bus.clean_dead()
         return bool(self._service.dynamic_config.number_of_publishers > 0)
 
@@ -282,8 +282,8 @@ class Receiver:
 
 
 def _retry(attempt: Any, error: type[Exception], passing: tuple[str, ...]) -> Any:
-    """Try again while another process is just making or removing the service."""
-    deadline = time.monotonic() + _PATIENCE_S
+    """Try again while another process is creating or removing the service."""
+    deadline = time.monotonic() + _TIMEOUT_S
     while True:
         try:
             return attempt()

@@ -1,7 +1,7 @@
 """Serving a camera to the daemon from this process: the Python side of docs/external.md.
 
-A thread of its own exchanges heart-beats with the daemon; the program asks for sessions and sends frames. A session is
-one start of the camera: which modes are to run, until the daemon wants no more, or is gone.
+A thread of its own exchanges heartbeats with the daemon; the program asks for sessions and sends frames. A session is
+one start of the camera in given modes, until the daemon stops it or is gone.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ._ports import ANSWER, OFFER, Bell, Letters, Sender
 from ._runtime import PathLike, check_name, pick_rig, runtime_dir
 from .errors import BusError, CameraRefused, CameraServed, RigNotRunning
 
-# Who looks whether the lock is held holds it for an instant, so one refusal proves nothing.
+# A process that checks the lock holds it for an instant, so one refusal proves nothing.
 _LOCK_ATTEMPTS, _LOCK_PAUSE_S = 20, 0.01
 # A channel whose other end was just killed may need to be cleaned up first.
 _ENDED_GRACE_S = 0.05
@@ -46,12 +46,12 @@ class ExternalCamera:
     ...     for session in camera.sessions():
     ...         with session, sdk.start() as device:
     ...             while session.wanted:
-    ...                 session.send("color", device.picture())
+    ...                 session.send("color", device.image())
 
-    `name` is the camera's name in the rig file and `rig` that of the rig: by default what the daemon said when it
-    started this process, else the only rig that runs. `modes` are what the camera can do; the first one of a stream is
+    `name` is the camera's name in the rig file and `rig` that of the rig: by default those that the daemon set when
+    it started this process, else the only running rig. `modes` are the camera's modes; the first one of a stream is
     its default. `calibration` says where it comes from (`factory`, `file x.json`, `none`), `port` where the camera is
-    attached. One process serves a camera; CameraServed says which.
+    attached. One process serves a camera; CameraServed names it.
 
     The daemon may come and go: this object goes on offering, and :meth:`sessions` has the next session when it is
     back. The methods are for one thread, but for :meth:`stop`, which any thread and any signal handler may call.
@@ -90,7 +90,7 @@ class ExternalCamera:
         self._lock = _lock(folder, self.rig, self.name, self._program)
         try:
             self._bus = Bus.at(folder)
-            # What a killed process left behind counts against the limits of the channels.
+            # Remains of killed processes count against the limits of the channels.
             self._bus.clean_dead()
             prefix = f"{layout.EXTERNAL_PREFIX}/{self.rig}/{self.name}"
             self._prefix = prefix
@@ -127,10 +127,10 @@ class ExternalCamera:
         self._thread.start()
         self._send_offer()
 
-    # The thread that keeps in touch.
+    # The heartbeat thread.
 
     def _beat(self) -> None:
-        """Exchange heart-beats until the camera is closed."""
+        """Exchange heartbeats until the camera is closed."""
         due = time.monotonic() + layout.EXTERNAL_HEARTBEAT_S
         try:
             while not self._closed:
@@ -146,7 +146,7 @@ class ExternalCamera:
 
     def _read_answers(self) -> None:
         newest = None
-        # No more than that at a time: whoever floods the channel must not keep the heart-beat from being sent.
+        # No more than that at a time: a flooded channel must not delay the heartbeat.
         for _ in range(_ANSWERS_AT_A_TIME):
             message = self._letters.take()
             if message is None:
@@ -154,7 +154,7 @@ class ExternalCamera:
             newest = read_answer(message, self._instance, len(self.modes)) or newest
         if newest is not None:
             with self._changed:
-                # Of two that answer, such as a thread of the daemon that was given up, the later session counts.
+                # If two answer, such as an abandoned thread of the daemon, the later session counts.
                 known = self._answer.session if self._answer is not None else 0
                 if 0 < newest.session < known:
                     return
@@ -162,11 +162,11 @@ class ExternalCamera:
                 self._changed.notify_all()
 
     def _send_offer(self) -> None:
-        """Say how this process stands. Any thread may."""
+        """Send this process's state, from any thread."""
         with self._changed:
             slot = self._offers.loan(len(self._payload))
             if slot is None:
-                return  # the next heart-beat says it
+                return  # the next heartbeat carries it
             self._number += 1
             state, reason, text = self._state
             values = {
@@ -203,13 +203,13 @@ class ExternalCamera:
             self._about = self._taken if session is None else session
         self._send_offer()
 
-    # What the program asks for.
+    # The program's side.
 
     def wait(self, timeout: float | None = None) -> ExternalSession | None:
         """Wait up to `timeout` seconds (None: as long as it takes) for a session.
 
         Returns None when none came, or after :meth:`stop`.
-        Raises CameraRefused, with what the daemon says, when it does not take what this camera offers.
+        Raises CameraRefused, with the daemon's message, when it refuses this camera's offer.
         """
         self._check()
         if self._current is not None:
@@ -242,7 +242,7 @@ class ExternalCamera:
         return self._current
 
     def _wait_for_stop(self, number: int, timeout: float) -> bool:
-        """Wait until the daemon says that session `number` is over; whether it did."""
+        """Wait until the daemon ends session `number`; return whether it did."""
         deadline = time.monotonic() + timeout
         with self._changed:
             while self._failure is None and not self._stopped:
@@ -267,17 +267,17 @@ class ExternalCamera:
                 session.close()
 
     def unavailable(self, text: str, reason: ExternalReason = ExternalReason.NOT_FOUND) -> None:
-        """Say that the camera cannot be had now, and why: unplugged, or held by another. The process stays."""
+        """Report that the camera is unavailable, and why: unplugged, or held by another process. The process stays."""
         self._check()
         self._set_state(ExternalState.REFUSED, reason, text, 0)
 
     def available(self) -> None:
-        """Say that the camera can be had again."""
+        """Report that the camera is available again."""
         self._check()
         self._set_state(ExternalState.IDLE, session=0)
 
     def stop(self) -> None:
-        """Let :meth:`wait` and :meth:`sessions` end, and the session be no longer wanted. Safe in a signal handler."""
+        """End :meth:`wait`, :meth:`sessions` and the session. Safe in a signal handler."""
         self._stopped = True
 
     @property
@@ -286,7 +286,7 @@ class ExternalCamera:
         return self._stopped
 
     def close(self, reason: ExternalReason = ExternalReason.NONE, text: str = "") -> None:
-        """Say good-bye with a reason, which the daemon shows, and free the camera. FINISHED is for files at an end."""
+        """Free the camera and report why, which the daemon shows. FINISHED is for files at their end."""
         if self._closed:
             return
         if self._current is not None:
@@ -299,7 +299,7 @@ class ExternalCamera:
         self._thread.join(1.0)
         with contextlib.suppress(BusError):
             self._set_state(ExternalState.ENDED, reason, text)
-            # The daemon takes the message before its sender is gone with its memory.
+            # The daemon must read the message before its sender and the memory are gone.
             time.sleep(_ENDED_GRACE_S)
         os.close(self._lock)
 
@@ -328,7 +328,7 @@ class ExternalCamera:
 
 
 def _checked(modes: Sequence[ExternalMode]) -> tuple[ExternalMode, ...]:
-    """Return the modes, unless the daemon could not take so many."""
+    """Return the modes, unless there are more than the daemon accepts."""
     streams = {mode.stream for mode in modes}
     if not 0 < len(modes) <= layout.EXTERNAL_MAX_MODES or len(streams) > layout.EXTERNAL_MAX_STREAMS:
         raise ValueError(

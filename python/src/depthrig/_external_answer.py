@@ -1,4 +1,4 @@
-"""What the daemon says to a process that serves a camera, read and checked."""
+"""Reads and checks the daemon's answers to a process that serves a camera."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ._layout import ExternalReason, ExternalWant
 
 
 class Answer:
-    """What the daemon wants, as it was read."""
+    """A decoded answer of the daemon."""
 
     __slots__ = ("heard", "modes", "reason", "session", "text", "want")
 
@@ -35,9 +35,9 @@ class Answer:
 
 
 def read_answer(message: tuple[bytes, bytes], instance: int, modes: int) -> Answer | None:
-    """Read an answer that may hold anything; None for one that is not meant for this process, or is of before.
+    """Decode an answer with arbitrary content; None for one that is addressed to another process, or outdated.
 
-    One of another version, or that cannot be, is a refusal: nobody will understand the other.
+    An answer of another version, or an invalid one, counts as a refusal: the two sides cannot communicate.
     """
     head, payload = message
     values = unpack_fields(layout.EXTERNAL_ANSWER_FIELDS, head)
@@ -67,5 +67,5 @@ def read_answer(message: tuple[bytes, bytes], instance: int, modes: int) -> Answ
 
 
 def _refusal(reason: ExternalReason, text: str) -> Answer:
-    """Return what stands for an answer that cannot be used: it is about no session, so that whoever waits hears it."""
+    """Return the refusal for an unusable answer: it belongs to no session, so that every waiting caller gets it."""
     return Answer({"session": 0, "want": ExternalWant.REFUSED, "reason": int(reason), "text": text}, b"")

@@ -21,7 +21,7 @@ from ._ports import FRAME, Sender, Slot
 if TYPE_CHECKING:
     from ._external import ExternalCamera
 
-# How often a slot is looked for that the daemon has not given back yet.
+# How often to check for a slot that the daemon has given back.
 _SLOT_PAUSE_S = 0.002
 _FRAME_HEAD = struct.Struct("<4sHHQQQQQqQff5II32x")
 assert _FRAME_HEAD.size == layout.EXTERNAL_FRAME_SIZE
@@ -30,7 +30,7 @@ assert _FRAME_HEAD.size == layout.EXTERNAL_FRAME_SIZE
 class ExternalSession:
     """One start of the camera: frames of `streams` are wanted until :attr:`wanted` is false.
 
-    Made by :meth:`ExternalCamera.wait`; over with :meth:`close` or the end of its `with` block.
+    Returned by :meth:`ExternalCamera.wait`; ends with :meth:`close` or its `with` block.
     """
 
     def __init__(self, camera: ExternalCamera, answer: Answer) -> None:
@@ -48,7 +48,7 @@ class ExternalSession:
 
     @property
     def wanted(self) -> bool:
-        """Whether the daemon still wants frames of this session, and is there to have them."""
+        """Whether the daemon is there and still wants frames of this session."""
         camera = self._camera
         answer = camera._answer
         return (
@@ -61,10 +61,10 @@ class ExternalSession:
         )
 
     def start(self, *, lossless: bool = False) -> None:
-        """Say that the camera runs, and make the channels; the first :meth:`send` does it as well.
+        """Report that the camera runs, and create the channels; the first :meth:`send` does it as well.
 
-        A live camera cannot wait: a frame that nobody has read gives way to newer ones. With `lossless`, for files,
-        :meth:`send` and :meth:`lend` wait until the daemon has read earlier ones, and none gives way.
+        A live camera cannot wait: newer frames replace a frame that nobody has read. With `lossless`, for files,
+        :meth:`send` and :meth:`lend` wait until the daemon has read earlier ones, and none is replaced.
         """
         self._camera._check()
         if self._over:
@@ -80,12 +80,12 @@ class ExternalSession:
             self._camera._set_state(ExternalState.RUNNING)
 
     def send(self, stream: str, pixels: Any, **facts: Any) -> bool:
-        """Copy a frame into shared memory and send it; false when it was not sent, which the daemon learns.
+        """Copy a frame into shared memory and send it; return false when it was not sent, which the daemon counts.
 
         `pixels` is an array of the mode's shape and type (as :attr:`Frame.array` has it; rows may be padded), or its
         bytes. The facts are:
 
-        * `device_time`: mid-exposure in ticks of the clock that the mode names; None when it did not come.
+        * `device_time`: mid-exposure in ticks of the clock that the mode names; None when unknown.
         * `device_sequence`: the device's own frame counter.
         * `arrival_ns`: when the frame had come, on the clock of :func:`time.monotonic_ns`; now by default.
         * `exposure_ns`, `gain`, `temperature_c`: as far as they are known.
@@ -111,7 +111,7 @@ class ExternalSession:
         return self._lend(channel, channel.length if length is None else length)
 
     def skip(self, stream: str, frames: int = 1) -> None:
-        """Count frames that the camera gave and that are not sent, such as those of a full queue."""
+        """Count frames of the camera that are not sent, such as those of a full queue."""
         self._channel(stream).sequence += frames
 
     def _channel(self, stream: str) -> _Channel:
@@ -136,31 +136,31 @@ class ExternalSession:
         return Lent(self, channel, slot, length)
 
     def refuse(self, text: str, reason: ExternalReason = ExternalReason.UNSUPPORTED) -> None:
-        """Say that the session cannot run; `text` is shown to the user. It is over then.
+        """Report that the session cannot run, and end it; `text` is shown to the user.
 
         After UNSUPPORTED and INVALID the camera is `failed`, after other reasons it is tried again.
         """
         self._finish(ExternalState.REFUSED, reason, text)
 
     def finish(self, text: str, timeout: float = 10.0) -> bool:
-        """Say that there are no more frames, and wait until the daemon has taken those that were sent.
+        """Report that there are no more frames, and wait until the daemon has taken those that were sent.
 
-        For files at their end; `text` is shown to the user. Returns whether the daemon said within `timeout` seconds
-        that it has them all. The session is over then; close the camera with `ExternalReason.FINISHED`.
+        For files at their end; `text` is shown to the user. Returns whether the daemon confirmed within `timeout`
+        seconds that it has them all. The session is over then; close the camera with `ExternalReason.FINISHED`.
         """
         if self._over:
             return False
         self._over = True
         camera = self._camera
         camera._set_state(ExternalState.REFUSED, ExternalReason.FINISHED, text)
-        # The channels stay until then, for a daemon that has not looked into them yet.
+        # The channels stay until then, for a daemon that has not read them yet.
         taken = camera._wait_for_stop(self.number, timeout)
         camera._current = None
         self._channels.clear()
         return taken
 
     def close(self) -> None:
-        """Say that the camera has stopped."""
+        """Report that the camera has stopped."""
         self._finish(ExternalState.IDLE, ExternalReason.NONE, "")
 
     def _finish(self, state: ExternalState, reason: ExternalReason, text: str) -> None:
@@ -224,7 +224,7 @@ class Lent:
     __slots__ = ("_channel", "_session", "_slot", "array")
 
     array: npt.NDArray[Any]
-    """The pixels, to be written to until :meth:`send`; what they are before is arbitrary."""
+    """The pixels, to be written to until :meth:`send`; their initial content is arbitrary."""
 
     def __init__(self, session: ExternalSession, channel: _Channel, slot: Slot, length: int) -> None:
         self._session, self._channel, self._slot = session, channel, slot
@@ -245,7 +245,7 @@ class Lent:
         damaged: bool = False,
         triggered: bool = False,
     ) -> bool:
-        """Send the frame with what :meth:`ExternalSession.send` says of it; false when nobody has received it."""
+        """Send the frame with the facts of :meth:`ExternalSession.send`; return false when nobody has received it."""
         session, channel, slot = self._session, self._channel, self._slot
         if session._over:
             return False

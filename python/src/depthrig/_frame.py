@@ -3,7 +3,7 @@
 The array that iceoryx2 itself offers is writable memory whose slot is reused as soon as the sample object is gone:
 the pixels change under the reader, and writing to them kills the process. Here every array has, at the end of its
 chain of bases, an `_Owner` that holds the sample, and it is read-only for NumPy as it is for the hardware. (A read-only
-`memoryview` at that place would not do: NumPy looks through it and lets itself be told to write.)
+`memoryview` at that place would not do: NumPy looks through it and can be made writable again.)
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ MOTION_DTYPE = np.dtype(
         "itemsize": _layout.MOTION_SAMPLE_SIZE,
     }
 )
-"""A sample of a motion unit as NumPy sees it; `MotionSample` in bus/src/motion.rs says what its fields are."""
+"""A sample of an IMU as NumPy sees it; `MotionSample` in bus/src/motion.rs documents its fields."""
 
 
 class _Owner:
@@ -64,7 +64,7 @@ class _Owner:
 
 
 class Shape(NamedTuple):
-    """How NumPy sees pixels of one format and size."""
+    """NumPy's view of pixels of one format and size."""
 
     typestr: str
     shape: tuple[int, ...]
@@ -75,10 +75,10 @@ class Shape(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def shape_of(code: int, width: int, height: int, stride: int, length: int) -> Shape:
-    """Return how NumPy sees such pixels. Worked out once: a stream's frames are alike.
+    """Return NumPy's view of such pixels, computed once: a stream's frames are alike.
 
-    Raises BadFrame when the picture does not fit into `length` bytes, VersionMismatch for an unknown format; neither
-    text says which frame it is.
+    Raises BadFrame when the image does not fit into `length` bytes, VersionMismatch for an unknown format; neither
+    message names the frame.
     """
     if code not in _FORMATS:
         raise VersionMismatch(
@@ -90,7 +90,7 @@ def shape_of(code: int, width: int, height: int, stride: int, length: int) -> Sh
     if pixel_format is PixelFormat.MOTION:
         needed = width * _layout.MOTION_SAMPLE_SIZE
         if (height, stride, length) != (1, needed, needed):
-            raise BadFrame(f"{width} motion samples in {height} rows of {stride} bytes are not its {length} bytes")
+            raise BadFrame(f"{width} IMU samples in {height} rows of {stride} bytes are not its {length} bytes")
         return Shape(f"|V{_layout.MOTION_SAMPLE_SIZE}", (width,), None, length)
     typestr, size, channels = _ELEMENTS[pixel_format]
     rows = height * 3 // 2 if pixel_format is PixelFormat.NV12 else height
@@ -132,9 +132,9 @@ class Frame:
         self._raw = raw
         self._header: Header | None = None
         self._address = address
-        _, self.sequence, self.capture_time_ns, _, self._flags, *picture = fields
+        _, self.sequence, self.capture_time_ns, _, self._flags, *image = fields
         try:
-            shape = self._shape = shape_of(*picture)
+            shape = self._shape = shape_of(*image)
         except (BadFrame, VersionMismatch) as e:
             raise type(e)(f"{self._where}: {e}") from None
         if shape.length > available:
@@ -142,7 +142,7 @@ class Frame:
 
     @property
     def header(self) -> Header:
-        """What the frame says of itself; valid also without the frame."""
+        """The frame's header; stays valid without the frame."""
         if self._header is None:
             self._header = Header(bytes(self._raw))
             self._raw = None
@@ -153,7 +153,7 @@ class Frame:
         return f"{self.header.stream_id} frame {self.sequence}"
 
     def _array(self, read_only: bool) -> npt.NDArray[Any]:
-        """Return the pixels as an array that keeps the slot. One that can be written to is not for others' hands."""
+        """Return the pixels as an array that keeps the slot. A writable one must not leave this package."""
         if self._sample is None:
             raise ValueError(f"frame {self.sequence} of {self.header.stream_id} was released")
         typestr, shape, strides, _ = self._shape
@@ -174,19 +174,19 @@ class Frame:
 
     @property
     def is_motion(self) -> bool:
-        """Whether it is a batch of a motion unit, and no picture."""
+        """Whether it is a batch of an IMU instead of an image."""
         return self._shape.typestr[1] == "V"
 
     @property
     def motion(self) -> npt.NDArray[Any]:
-        """The samples of a motion unit's batch as a read-only structured array without a copy, oldest first.
+        """The samples of an IMU's batch as a read-only structured array without a copy, oldest first.
 
         `frame.motion["gyro_rad_s"]` is `(n, 3)` f32; the other fields are `time_ns`, `device_time`, `sequence` (a gap
         is samples that the device never gave, or that were lost with a batch), `uncertainty_ns`, `accel_offset_ns`,
-        `accel_m_s2`, `temperature_c` and `flags` (:class:`depthrig.MotionFlags`); NaN is "not measured". Raises TypeError for a picture.
+        `accel_m_s2`, `temperature_c` and `flags` (:class:`depthrig.MotionFlags`); NaN is "not measured". Raises TypeError for an image.
         """
         if not self.is_motion:
-            raise TypeError(f"{self.header.stream_id} carries {self.header.format_name} pictures and no motion samples")
+            raise TypeError(f"{self.header.stream_id} carries {self.header.format_name} images, not IMU samples")
         return self.array
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
@@ -198,7 +198,7 @@ class Frame:
         return array.copy() if copy else array
 
     def copy(self) -> npt.NDArray[Any]:
-        """Return the pixels as an array of one's own, writable and without rows' padding."""
+        """Return the pixels as a new array, writable and without row padding."""
         return self.array.copy()
 
     def depth_m(self) -> npt.NDArray[np.float32]:
@@ -210,7 +210,7 @@ class Frame:
                 metres[~(metres > 0)] = np.nan
             return metres
         if self.header.pixel_format is not PixelFormat.Z16:
-            raise TypeError(f"{self.header.stream_id} carries {self.header.format_name}, which is no depth")
+            raise TypeError(f"{self.header.stream_id} carries {self.header.format_name}, which is not depth")
         unit = self.header.depth_unit_m
         if not unit > 0:
             raise BadFrame(f"{self.header.stream_id}: its header states no depth unit")
@@ -234,16 +234,16 @@ class Frame:
         * With CUDA they are copied into pinned memory and from there to the GPU in one asynchronous transfer, ordered
           on the current stream like every operation of PyTorch; the frame may be let go at once.
         * `out` is a tensor to write into in place of a new one: its shape, type and device must fit.
-        * `metres` gives float32 metres of a depth picture, 0 where there is no depth (:meth:`depth_m` has NaN there).
+        * `metres` gives float32 metres of a depth image, 0 where there is no depth (:meth:`depth_m` has NaN there).
           On the CPU that is the same single pass; elsewhere the pixels travel as they are and are converted there.
         * `copy=False` (CPU only) shares the memory: it holds the frame's slot as an array does, and PyTorch knows no
           read-only tensors, so **writing to such a tensor ends the process** with a segmentation fault.
 
         16-bit pixels are `torch.uint16`, which PyTorch has since 2.3. Raises ImportError without PyTorch, and TypeError
-        for a batch of motion samples, which are no pixels: take a field of :attr:`motion`.
+        for a batch of IMU samples, which has no pixels: take a field of :attr:`motion`.
         """
         if self.is_motion:
-            raise TypeError(f"{self.header.stream_id} carries motion samples: use torch.tensor(frame.motion[FIELD])")
+            raise TypeError(f"{self.header.stream_id} carries IMU samples: use torch.tensor(frame.motion[FIELD])")
         return _torch.tensor(self, device, metres, out, copy)
 
     @property
@@ -257,7 +257,7 @@ class Frame:
         return bool(self._flags & FrameFlags.REPLAYED)
 
     def release(self) -> None:
-        """Let go of the pixels now. Arrays made before stay valid, and keep the slot until they are gone."""
+        """Release the pixels now. Arrays made before stay valid, and keep the slot until they are gone."""
         _ = self.header  # its bytes go with the slot
         self._sample = None
 

@@ -62,7 +62,7 @@ class FrameGroup(Mapping[str, Frame]):
         return {name: f.torch(device, metres=metres) for name, f in self._frames.items()}
 
     def release(self) -> None:
-        """Let go of the pixels of all frames now; see :meth:`Frame.release`."""
+        """Release the pixels of all frames now; see :meth:`Frame.release`."""
         for frame in self._frames.values():
             frame.release()
 
@@ -91,8 +91,8 @@ class FrameGroup(Mapping[str, Frame]):
 class SetReader:
     """Several streams at one time: `SetReader(["d435/depth_refined", "d405/depth_refined"])`.
 
-    A group is made for the newest moment that every stream has reached: of each stream the frame whose capture time is
-    nearest to it. Groups are the newest there are; moments that a slow reader has missed are skipped. Every group is
+    A group is formed for the newest moment that every stream has reached: of each stream the frame whose capture time
+    is nearest to it. Groups are the newest there are; moments that a slow reader has missed are skipped. Every group is
     newer than the one before.
 
     `max_skew`: seconds that the frames of a group may lie apart at most; frames that are further apart make no group.
@@ -163,8 +163,8 @@ class SetReader:
     def next(self, timeout: float | None = None) -> FrameGroup:
         """Return the newest group that is newer than the last one, waiting for it up to `timeout` seconds.
 
-        Raises Timeout, which says which streams were missing, and StreamGone when nobody publishes one of them any
-        more (with `partial_after`: any of them). After either, the same object can be asked again.
+        Raises Timeout, which names the missing streams, and StreamGone when one of them (with `partial_after`: each of
+        them) has no publisher any more. After either, the same object can be asked again.
         """
         return self._wait(timeout, None)
 
@@ -207,7 +207,7 @@ class SetReader:
             self._laggard()._pause(until)
 
     def _drain(self) -> None:
-        """Take what came, and keep the newest frames of each stream."""
+        """Read new frames, and keep the newest of each stream."""
         if not self._streams:
             raise ValueError("it was closed")
         for name, stream in self._streams.items():
@@ -224,7 +224,7 @@ class SetReader:
                     break
                 if frame.is_motion:
                     raise TypeError(
-                        f"{name} carries motion samples, which belong to no moment: read it with depthrig.Stream, and "
+                        f"{name} carries IMU samples, which belong to no moment: read it with depthrig.Stream, and "
                         "choose samples by their time_ns"
                     )
                 if frame.capture_time_ns <= self._reached.get(name, _NEVER):

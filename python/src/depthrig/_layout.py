@@ -110,7 +110,7 @@ class ClockDomain(enum.IntEnum):
 
 
 class StageStep(enum.IntEnum):
-    """A step of making a derived frame, by its place in `stage_ns`."""
+    """A step of computing a derived frame, by its place in `stage_ns`."""
 
     WAIT = 0
     REGISTER = 1
@@ -136,7 +136,7 @@ class FrameFlags(enum.IntFlag):
 
 
 class MotionFlags(enum.IntFlag):
-    """Facts about a motion sample, one bit each."""
+    """Facts about an IMU sample, one bit each."""
 
     FRAME_SYNC = 1
     ACCEL_CLIPPED = 2
@@ -144,7 +144,7 @@ class MotionFlags(enum.IntFlag):
 
 
 class ExternalState(enum.IntEnum):
-    """How a process that serves a camera stands."""
+    """State of a process that serves a camera."""
 
     IDLE = 0
     STARTING = 1
@@ -154,7 +154,7 @@ class ExternalState(enum.IntEnum):
 
 
 class ExternalWant(enum.IntEnum):
-    """What the daemon wants of a process that serves a camera."""
+    """The daemon's request to a process that serves a camera."""
 
     STOP = 0
     RUN = 1
@@ -432,7 +432,7 @@ class HeaderFields:
 
     @property
     def set_id(self) -> int:
-        """The frame set this frame belongs to; 0 on the live path, where sets are made after publishing."""
+        """The frame set this frame belongs to; 0 on the live path, where sets are assembled after publishing."""
         return int(struct.unpack_from("<Q", self._raw, 24)[0])
 
     @property
@@ -482,12 +482,12 @@ class HeaderFields:
 
     @property
     def source_sequence(self) -> int:
-        """For a derived stream, `sequence` of the frame that it was made from (the depth frame where there are several); else 0."""
+        """For a derived stream, `sequence` of its source frame (the depth frame where there are several); else 0."""
         return int(struct.unpack_from("<Q", self._raw, 160)[0])
 
     @property
     def depth_unit_m(self) -> float:
-        """Metres per unit of depth; 0 when the pixels are no depth."""
+        """Metres per unit of depth; 0 when the pixels are not depth."""
         return float(struct.unpack_from("<d", self._raw, 168)[0])
 
     @property
@@ -567,7 +567,7 @@ class HeaderFields:
 
     @property
     def source_color_sequence(self) -> int:
-        """For depth that was made from depth and colour, `sequence` of the colour frame; else 0."""
+        """For depth computed from depth and colour, `sequence` of the colour frame; else 0."""
         return int(struct.unpack_from("<Q", self._raw, 536)[0])
 
     @property
@@ -577,12 +577,12 @@ class HeaderFields:
 
     @property
     def stage_ns(self) -> tuple[int, ...]:
-        """How long each step of making a derived frame took, nanoseconds, indexed by `StageStep`; else 0."""
+        """Duration of each step of computing a derived frame, nanoseconds, indexed by `StageStep`; else 0."""
         return struct.unpack_from("<6Q", self._raw, 552)
 
     @property
     def refiner(self) -> str:
-        """What made a derived frame, such as `fill` or `onnxruntime 1.31.1 cpu fp32`, zero-padded UTF-8."""
+        """Method that computed a derived frame, such as `fill` or `onnxruntime 1.31.1 cpu fp32`, zero-padded UTF-8."""
         return _text(self._raw[600:632])
 
     @property
@@ -647,7 +647,7 @@ class SetHeaderFields:
 
     @property
     def incomplete(self) -> int:
-        """Sets so far that missed a stream."""
+        """Sets so far that lacked a stream."""
         return int(struct.unpack_from("<Q", self._raw, 24)[0])
 
     @property

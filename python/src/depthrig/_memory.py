@@ -1,4 +1,4 @@
-"""Shared memory that is really there: writing where none is left kills the process (SIGBUS)."""
+"""Allocates shared memory in advance: writing where none is left kills the process (SIGBUS)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from ._layout import SHM_PREFIX
 from .errors import BusError
 
 _SHM = "/dev/shm"
-# Free bytes that nothing is begun without: what iceoryx2 makes besides the slots is some KiB, written when it is made.
+# Free bytes without which nothing is created: iceoryx2 writes some KiB besides the slots when it creates a port.
 _ROOM = 1 << 20
-# Free bytes that the slots of a channel leave to the rest.
+# Free bytes that a channel's slots leave for everything else.
 _LEFT_OVER = 4 * _ROOM
 # A port opens some descriptors at a time, and closes them again when one of them fails.
 _DESCRIPTORS = 16
@@ -28,23 +28,23 @@ def _free() -> int | None:
 
 
 def check_room() -> None:
-    """Raise BusError where beginning something could kill the process."""
+    """Raise BusError if there is too little memory to create a port safely."""
     free = _free()
     if free is not None and free < _ROOM:
         raise BusError(f"{_SHM} is full ({free >> 10} KiB are free); delete what fills it, or {_ENLARGE}")
 
 
 def back(port: int, slots: int, channel: str) -> None:
-    """Put memory behind every slot of the port that writes a channel."""
+    """Allocate the memory of every slot of the port that writes a channel."""
     ending = f"_{port}.data"
     names = [n for n in os.listdir(_SHM) if n.startswith(SHM_PREFIX) and n.endswith(ending)]
     if not names:
-        raise BusError(f"channel {channel}: {_SHM} has no memory of it although it was just made")
+        raise BusError(f"channel {channel}: {_SHM} has no memory for it although it was just created")
     file = os.open(os.path.join(_SHM, names[0]), os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW)
     size = os.fstat(file).st_size
     try:
         free = _free()
-        if free is not None and size > free:  # the kernel would first take all there is
+        if free is not None and size > free:  # the kernel would first take all free memory
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         os.posix_fallocate(file, 0, size)
     except OSError as e:
@@ -65,7 +65,7 @@ def back(port: int, slots: int, channel: str) -> None:
 
 
 def out_of_descriptors() -> str | None:
-    """Say what to do when so few file descriptors are left that opening a port can fail for it, else None."""
+    """Return advice when so few file descriptors are left that opening a port can fail, else None."""
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     try:
         used = len(os.listdir("/proc/self/fd"))

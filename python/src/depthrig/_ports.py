@@ -1,4 +1,4 @@
-"""The channels of the hand-shake with the daemon, opened or made: the second module that speaks to iceoryx2.
+"""The channels of the hand-shake with the daemon, opened or created: the second module that uses iceoryx2.
 
 docs/external.md has the settings; either side may come first, so they are the same on both.
 """
@@ -19,12 +19,12 @@ OFFER = _header_type(layout.EXTERNAL_OFFER_TYPE, layout.EXTERNAL_OFFER_SIZE, lay
 ANSWER = _header_type(layout.EXTERNAL_ANSWER_TYPE, layout.EXTERNAL_ANSWER_SIZE, layout.EXTERNAL_ALIGN)
 FRAME = _header_type(layout.EXTERNAL_FRAME_TYPE, layout.EXTERNAL_FRAME_SIZE, layout.EXTERNAL_ALIGN)
 
-# A frame that is being written, and two that are lent out at the same time.
+# One frame being written, and two on loan at the same time.
 _LOANS = 3
 
 
 def _service(bus: Bus, name: str, header: type[ctypes.Structure], history: int) -> Any:
-    """Open or make a channel of the hand-shake."""
+    """Open or create a channel of the hand-shake."""
     check_room()
     schema = iox2.AttributeVerifier.new().require(
         iox2.AttributeKey.new("schema"), iox2.AttributeValue.new(layout.EXTERNAL_SCHEMA)
@@ -47,7 +47,7 @@ def _service(bus: Bus, name: str, header: type[ctypes.Structure], history: int) 
 
 
 def _events(bus: Bus, name: str) -> Any:
-    """Open or make the event of a channel."""
+    """Open or create the event of a channel."""
     check_room()
 
     def attempt() -> Any:
@@ -84,7 +84,7 @@ class Slot:
         self.length = length
 
     def send(self) -> int:
-        """Send it; returns how many received it. It is of no more use then."""
+        """Send it and return how many received it. The slot is unusable afterwards."""
         sample, self._sample = self._sample, None
         if sample is None:
             raise ValueError("this slot was sent already")
@@ -107,7 +107,7 @@ class Sender:
         back(self._publisher.id.value, slots, name)
 
     def loan(self, length: int) -> Slot | None:
-        """Lend a slot of `length` bytes; None when the other side holds them all."""
+        """Lend a slot of `length` bytes; return None when the other side holds them all."""
         try:
             try:
                 sample = self._publisher.loan_slice_uninit(length)
@@ -123,11 +123,11 @@ class Sender:
                 return None
             raise BusError(f"channel {self.name}: no slot of {length} bytes can be had ({e})") from e
         except iox2.ConnectionFailure:
-            return None  # a reader that is half made; the next frame tries again
+            return None  # a reader that is not yet complete; the next frame tries again
 
 
 class Bell:
-    """Wakes those who wait for a channel."""
+    """Wakes the readers that wait for a channel."""
 
     def __init__(self, bus: Bus, name: str) -> None:
         self._events = _events(bus, name)
@@ -138,7 +138,7 @@ class Bell:
             raise BusError(f"the event of channel {name} cannot be raised ({e})") from e
 
     def ring(self) -> None:
-        """Wake them. That nobody is there, or somebody's queue is full, is no error: then it is awake."""
+        """Wake them. No reader, or a reader with a full queue, is not an error: then it is awake."""
         try:
             self._notifier.notify()
         except iox2.NotifierNotifyError:
@@ -146,7 +146,7 @@ class Bell:
 
 
 class Letters:
-    """The reading end of a channel of messages: the newest one counts."""
+    """The reading end of a channel of messages, of which the newest one counts."""
 
     def __init__(self, bus: Bus, name: str, header: type[ctypes.Structure], header_size: int) -> None:
         self.name = name
@@ -172,7 +172,7 @@ class Letters:
         return header, ctypes.string_at(sample.payload_ptr, sample.header.number_of_elements)
 
     def wait(self, seconds: float) -> None:
-        """Sleep until something was sent or `seconds` have passed, without Python's lock."""
+        """Wait until a message is sent or `seconds` have passed, without Python's lock."""
         try:
             self._listener.timed_wait(iox2.Duration.from_nanos(max(0, int(seconds * 1e9))))
         except iox2.ListenerWaitError as e:

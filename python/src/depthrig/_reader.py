@@ -1,4 +1,4 @@
-"""What streams and sets have in common: finding the channel, waiting, iterating."""
+"""Common base of streams and sets: finding the channel, waiting, iterating."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .errors import RigNotRunning, StreamGone, StreamNotFound, Timeout
 T = TypeVar("T")
 Self = TypeVar("Self", bound="Reader")  # type: ignore[type-arg]
 
-# How often a waiting reader lets Python handle signals, and looks whether anybody still publishes.
+# How often a waiting reader lets Python handle signals, and checks for a publisher.
 SLICE_S = 0.1
 LIVENESS_S = 0.5
 
@@ -56,7 +56,7 @@ class Reader(Generic[T]):
         raise NotImplementedError
 
     def _pause(self, seconds: float) -> None:
-        """Wait until something was published, or up to `seconds`; may return early."""
+        """Wait until a frame is published, or up to `seconds`; may return early."""
         self._open.wait(seconds)
 
     def latest(self) -> T | None:
@@ -70,7 +70,7 @@ class Reader(Generic[T]):
     def next(self, timeout: float | None = None) -> T:
         """Return the oldest unread frame, waiting for one up to `timeout` seconds (None: as long as it takes).
 
-        Raises Timeout when none came in time, and StreamGone when nobody publishes any more. After StreamGone the
+        Raises Timeout when none came in time, and StreamGone when the publisher has gone. After StreamGone the
         same object can be asked again: it goes on with the frames of a publisher that came back.
         """
         started = time.monotonic()
@@ -92,7 +92,7 @@ class Reader(Generic[T]):
             self._pause(min(SLICE_S, deadline - now, look - now))
 
     def _check_publisher(self) -> None:
-        """Raise StreamGone when nobody publishes the channel any more."""
+        """Raise StreamGone when the channel has no publisher any more."""
         if not self._open.has_publisher():
             raise StreamGone(
                 f"{self._open.what}: nobody publishes it any more; is the daemon running (`depthrig status`)?"
@@ -100,7 +100,7 @@ class Reader(Generic[T]):
 
     @property
     def is_live(self) -> bool:
-        """Whether anybody publishes now."""
+        """Whether there is a publisher now."""
         return self._open.has_publisher()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Where rigs are found: the user's runtime folder, with one lock file for each rig that runs."""
+"""Finds rigs in the user's runtime folder, which has one lock file for each running rig."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NAME = re.compile(r"[a-z][a-z0-9_]{0,30}", re.ASCII)
 
 
 def check_name(name: str, what: str) -> str:
-    """Return `name` if it can be the name of a rig, camera or stream, else raise ValueError."""
+    """Return `name` if it is a valid name of a rig, camera or stream, else raise ValueError."""
     if not _NAME.fullmatch(name):
         raise ValueError(f"{name!r} cannot be the name of a {what}: 1 to 31 of a-z, 0-9 and _, beginning with a letter")
     return name
@@ -47,7 +47,7 @@ def runtime_dir(path: PathLike | None = None) -> str:
 
 
 def holder(folder: str, rig: str) -> str | None:
-    """Say who runs `rig` now, as that process described itself; None when nobody does."""
+    """Return the process that runs `rig` now, in its own words; None without one."""
     try:
         with open(os.path.join(folder, f"{rig}.lock"), encoding="utf-8", errors="replace") as file:
             try:
@@ -60,7 +60,7 @@ def holder(folder: str, rig: str) -> str | None:
 
 
 def running_rigs(runtime_dir: PathLike | None = None) -> list[str]:
-    """List the rigs that run now, sorted: those whose lock is held."""
+    """List the running rigs, sorted: those whose lock is held."""
     return _running(_runtime_dir(runtime_dir))
 
 
@@ -76,7 +76,7 @@ def _running(folder: str) -> list[str]:
 
 
 def not_running(folder: str, rig: str) -> RigNotRunning:
-    """Make the error for a rig that does not run."""
+    """Return the error for a rig that does not run."""
     rigs = _running(folder)
     there = f"running there: {', '.join(rigs)}" if rigs else "no rig runs there"
     return RigNotRunning(f"rig {rig!r} is not running in {folder}; {there}. {_HOW_TO_START}")

@@ -28,7 +28,7 @@ class FrameSet:
     spread_ns: int
     """Latest minus earliest capture time of its frames."""
     incomplete: int
-    """Sets so far that missed a stream."""
+    """Sets so far that lacked a stream."""
     members: dict[str, int | None]
     """For each stream the `sequence` of its frame, None when it is missing, in the rig's order."""
     capture_times_ns: dict[str, int]

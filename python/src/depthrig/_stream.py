@@ -13,14 +13,14 @@ from ._frame import Frame
 from ._header import VERSION_BYTES, Header, HeaderBytes, essentials
 from ._layout import PixelFormat
 from ._reader import SLICE_S, Reader
-from ._rhythm import Rhythm
+from ._period import FramePeriod
 from ._runtime import PathLike, check_name, not_running, pick_rig, runtime_dir
 from .errors import Stale
 
 if TYPE_CHECKING:
     import torch
 
-# Shorter rests are not worth their effort.
+# Shorter rests are not worth it.
 _SHORTEST_REST_NS = 3_000_000
 
 
@@ -36,7 +36,7 @@ class Stream(Reader[Frame]):
     `prepare`: a reader that waits for a steady stream wakes half a millisecond before the next frame is due, so that it
     has its code in the caches when the frame comes, and reads it in half the time. It costs some CPU for each frame.
 
-    Iterating yields each frame as it comes and raises StreamGone when nobody publishes any more.
+    Iterating yields each frame as it comes and raises StreamGone when the publisher has gone.
     """
 
     def __init__(
@@ -50,17 +50,17 @@ class Stream(Reader[Frame]):
     ) -> None:
         camera, slash, name = stream.partition("/")
         if not slash:
-            raise ValueError(f"{stream!r} is no stream: write CAMERA/STREAM, such as d435/depth")
+            raise ValueError(f"invalid stream name {stream!r}: write CAMERA/STREAM, such as d435/depth")
         check_name(camera, "camera")
         check_name(name, "stream")
         self.name = stream
         self._last_sequence = 0
         self._missed = 0
         self._restarts = 0
-        self._rhythm = Rhythm() if prepare else None
+        self._period = FramePeriod() if prepare else None
         self._newest_ns: int | None = None
         self.header: Header | None = None
-        """Header of the frame that :meth:`torch` gave last."""
+        """Header of the frame that :meth:`torch` returned last."""
         super().__init__(stream, FRAME_HEADER, rig, runtime_dir, timeout)
 
     @property
@@ -77,8 +77,8 @@ class Stream(Reader[Frame]):
         """Return the newest unread frame whose exposure is at most `max_age` seconds ago, waiting for one if need be.
 
         Waits up to `timeout` seconds, by default `max_age`: a policy that asks for each frame so never acts on older
-        depth. Raises Stale, which has the age of the newest frame there was, when none came that is fresh; StreamGone
-        instead when nobody publishes any more. The age counts from the middle of the exposure, so that of refined depth
+        depth. Raises Stale, with the age of the newest frame, when no fresh one came; StreamGone instead when the
+        publisher has gone. The age counts from the middle of the exposure, so that of refined depth
         contains the time that refining took. A frame is returned once: between two of them, look at the `age_s` of
         the one you have. Frames of a replay carry the times of their recording, have no age, and raise Stale at once.
         """
@@ -150,20 +150,20 @@ class Stream(Reader[Frame]):
         if fields[0] != VERSION_BYTES:
             Header(bytes(raw)).check_version(receiver.what)
         sequence, last = fields[1], self._last_sequence
-        if sequence != last + 1 and last > 0:  # the first frame sets the mark
+        if sequence != last + 1 and last > 0:  # the first frame sets the reference
             if sequence > last:
                 self._missed += sequence - last - 1
             else:  # a smaller number means that the publisher was restarted
                 self._restarts += 1
         self._last_sequence = sequence
         self._newest_ns = fields[2]
-        if self._rhythm is not None:
-            self._rhythm.heard(sequence, fields[3])
+        if self._period is not None:
+            self._period.observe(sequence, fields[3])
         return Frame(sample, raw, fields, sample.payload_ptr, sample.header.number_of_elements)
 
     def _pause(self, seconds: float) -> None:
-        if self._rhythm is not None:
-            rest_ns = self._rhythm.rest_ns(time.monotonic_ns())
+        if self._period is not None:
+            rest_ns = self._period.rest_ns(time.monotonic_ns())
             if _SHORTEST_REST_NS < rest_ns < seconds * 1e9:
                 if self._open.rest(rest_ns):
                     _walk()
@@ -175,7 +175,7 @@ class Stream(Reader[Frame]):
         return f"<Stream {self.name} of rig {self.rig!r}, {state}>"
 
 
-# A frame of one pixel in memory of our own, to walk through what a frame goes through.
+# A frame of one pixel in our own memory, for warming up the code path.
 _PIXEL = ctypes.create_string_buffer(2)
 _HEADER = HeaderBytes.from_buffer_copy(
     Header.pack(
@@ -187,7 +187,7 @@ _HEADER = HeaderBytes.from_buffer_copy(
 
 
 def _walk() -> None:
-    """Make an array as :meth:`Stream._take` does, for the sake of the caches."""
+    """Create an array as :meth:`Stream._take` does, to warm the caches."""
     raw = HeaderBytes.from_address(ctypes.addressof(_HEADER))
     fields = essentials(raw)
     if fields[0] == VERSION_BYTES:

@@ -55,7 +55,7 @@ def tensor(
         pixels = pixels.view(np.int16)
     host = pt.empty(shape, dtype=_dtype(pt, pixels.dtype), pin_memory=target.type == "cuda")
     np.copyto(host.numpy(), pixels)
-    # PyTorch gives the pinned memory to nobody else before the transfer has ended.
+    # PyTorch does not reuse the pinned memory before the transfer has ended.
     if unit is None:
         if out is None:
             return host.to(target, non_blocking=True)
@@ -74,14 +74,14 @@ def _unit(frame: Frame) -> float:
     if header.pixel_format is PixelFormat.DEPTH_F32:
         return 1.0
     if header.pixel_format is not PixelFormat.Z16:
-        raise TypeError(f"{header.stream_id} carries {header.format_name}, which is no depth")
+        raise TypeError(f"{header.stream_id} carries {header.format_name}, which is not depth")
     if not header.depth_unit_m > 0:
         raise BadFrame(f"{header.stream_id}: its header states no depth unit")
     return header.depth_unit_m
 
 
 def _without_holes(metres: Any) -> Any:
-    """Make what is no depth 0, in place: NaN, infinite and negative."""
+    """Set invalid depth to 0, in place: NaN, infinite and negative."""
     return metres.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0).clamp_(min=0.0)
 
 

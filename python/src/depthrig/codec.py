@@ -1,4 +1,4 @@
-"""Depth pictures from a dataset that was recorded with ``depth = "rank"``: NumPy and a Zstandard package, no Rust.
+"""Depth images from a dataset that was recorded with ``depth = "rank"``: NumPy and a Zstandard package, no Rust.
 
 The format is in ``docs/dataset-format.md``, "Depth codec". With Python's ``mcap`` a dataset reads like this:
 
@@ -22,12 +22,12 @@ __all__ = ["decode_depth", "unpack_depth"]
 Buffer = Union[bytes, bytearray, memoryview]
 
 _CODEC = "rank/1"
-_PICTURE_MAX = 1 << 28
-"""Larger pictures are refused, as depthrig itself does."""
+_IMAGE_MAX = 1 << 28
+"""Larger images are refused, as depthrig itself does."""
 
 
 def decode_depth(message: Buffer) -> npt.NDArray[np.uint16]:
-    """Return the picture in a ``depthrig_msgs/msg/CompressedDepth`` message (CDR), without row padding.
+    """Return the image in a ``depthrig_msgs/msg/CompressedDepth`` message (CDR), without row padding.
 
     :returns: ``(height, width)``, ``uint16``, in units of ``depth_unit_m``; 0 is "no depth".
     :raises ValueError: when the message is damaged, or of a later version of the codec.
@@ -63,17 +63,17 @@ def decode_depth(message: Buffer) -> npt.NDArray[np.uint16]:
 
 
 def unpack_depth(data: Any, height: int, width: int, step: int | None = None) -> npt.NDArray[np.uint16]:
-    """Return the picture in the field ``data`` of such a message, as other decoders of ROS 2 messages give it.
+    """Return the image in the field ``data`` of such a message, as other decoders of ROS 2 messages give it.
 
     :param data: bytes or anything that gives them, a list of numbers as well.
-    :param step: bytes from row to row in the live picture; ``2 * width`` when not given.
+    :param step: bytes from row to row in the live image; ``2 * width`` when not given.
     :returns: ``(height, width)``, ``uint16``, without row padding.
-    :raises ValueError: when the data is damaged or is no picture of this size.
+    :raises ValueError: when the data is damaged or does not fit this size.
     """
     packed = bytes(data)
     step = 2 * width if step is None else step
-    if height < 1 or width < 1 or step < 2 * width or step * height > _PICTURE_MAX:
-        raise ValueError(f"{width}x{height} of 16 bit with {step} bytes per row is no picture")
+    if height < 1 or width < 1 or step < 2 * width or step * height > _IMAGE_MAX:
+        raise ValueError(f"invalid 16-bit image of {width}x{height} with {step} bytes per row")
     if len(packed) < 4:
         raise ValueError("the data is cut short")
     (count,) = struct.unpack_from("<I", packed)
@@ -101,7 +101,7 @@ def _unpredict(residuals: npt.NDArray[np.uint16]) -> npt.NDArray[np.int32]:
     """Add to each residual the median of west, north and west + north - northwest.
 
     A pixel needs its west neighbour, so rows cannot be done at once; the pixels of an anti-diagonal can. In a
-    picture sheared by one pixel per row, anti-diagonals are columns; here they are rows, for speed.
+    image sheared by one pixel per row, anti-diagonals are columns; here they are rows, for speed.
     """
     height, width = residuals.shape
     diagonals = width + height - 1

@@ -1,4 +1,4 @@
-"""What can go wrong; every message says what happened, to which stream, and what to do."""
+"""The package's errors; every message names the stream, what happened and what to do."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class StreamNotFound(DepthrigError):
 
 
 class StreamGone(DepthrigError):
-    """Nobody publishes the stream any more. The same object goes on when somebody does again."""
+    """The stream has no publisher any more. The same object goes on when there is one again."""
 
 
 class Timeout(DepthrigError, TimeoutError):
@@ -28,7 +28,7 @@ class Timeout(DepthrigError, TimeoutError):
 
 
 class Stale(DepthrigError):
-    """The newest depth there is, is older than the reader allows; the message says by how much, and of which stream."""
+    """The newest depth is older than the reader allows; the message names the age and the stream."""
 
     def __init__(self, message: str, age_s: float | None = None, max_age_s: float | None = None) -> None:
         super().__init__(message)
@@ -59,4 +59,4 @@ class CameraServed(DepthrigError):
 
 
 class CameraRefused(DepthrigError):
-    """The daemon does not take the camera that this process offers; the message is the daemon's."""
+    """The daemon refuses the camera that this process offers; the message is the daemon's."""

@@ -3,7 +3,7 @@
 //! Sets come as fast as the recorder takes them, with the times of a real recording, so that everything which
 //! grows with a recording's length grows here too: segments, indexes, accounts.
 
-use super::{Conditions, Measured, Source, pictures, record, set, stream};
+use super::{Conditions, Measured, Source, images, record, set, stream};
 use crate::{Progress, RecorderOptions, Result, Severity, VerifyOptions, verify};
 use depthrig_bus::clock::process_cpu_ns;
 use depthrig_bus::{HostTime, PixelFormat, UtcPair};
@@ -11,7 +11,7 @@ use serde::Serialize;
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// What to record.
+/// Options of a soak run.
 #[derive(Debug, Clone, Serialize)]
 pub struct SoakOptions {
     /// Where the dataset is written and removed again.
@@ -31,7 +31,7 @@ pub struct SoakOptions {
     /// Sets wait while this many encoded bytes are on their way to the disk: memory that comes and goes with them
     /// would hide memory that stays.
     pub backlog_bytes: u64,
-    /// A folder of pictures to record instead of made ones.
+    /// A folder of images to record instead of synthetic ones.
     pub images: Option<PathBuf>,
     /// How to record.
     pub recorder: RecorderOptions,
@@ -63,11 +63,11 @@ pub struct Sample {
     pub rss_mb: f64,
 }
 
-/// What was measured, and where.
+/// Results of a soak run, and its conditions.
 #[derive(Debug, Clone, Serialize)]
 #[non_exhaustive]
 pub struct SoakReport {
-    /// What was asked for.
+    /// The options it ran with.
     pub options: SoakOptions,
     /// The computer.
     pub conditions: Conditions,
@@ -87,7 +87,7 @@ pub struct SoakReport {
     pub dropped: u64,
     /// Sets that are neither recorded nor dropped by the accounts: must be 0.
     pub unexplained: i64,
-    /// What `verify` finds beyond notes; no finding is a whole dataset.
+    /// Findings of `verify` beyond notes; empty for a complete dataset.
     pub findings: Vec<String>,
     /// Bytes written.
     pub bytes: u64,
@@ -99,7 +99,7 @@ pub struct SoakReport {
     pub cpu_s: f64,
 }
 
-/// Resident memory of this process, MB; 0 when the system does not tell.
+/// Resident memory of this process, MB; 0 when the system does not report it.
 fn rss_mb() -> f64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:"));
@@ -110,7 +110,8 @@ fn rss_mb() -> f64 {
 /// Slope of the line with the least squared distance to the points (x, y); 0 for fewer than two places of x.
 fn slope(points: &[(f64, f64)]) -> f64 {
     let n = points.len().max(1) as f64;
-    let (mx, my) = (points.iter().map(|p| p.0).sum::<f64>() / n, points.iter().map(|p| p.1).sum::<f64>() / n);
+    let mx = points.iter().map(|p| p.0).sum::<f64>() / n;
+    let my = points.iter().map(|p| p.1).sum::<f64>() / n;
     let var: f64 = points.iter().map(|p| (p.0 - mx).powi(2)).sum();
     let cov: f64 = points.iter().map(|p| (p.0 - mx) * (p.1 - my)).sum();
     if var > 0.0 { cov / var } else { 0.0 }
@@ -121,22 +122,26 @@ fn slope(points: &[(f64, f64)]) -> f64 {
 /// # Errors
 /// As recording and verifying do.
 pub fn run(options: &SoakOptions, mut progress: impl FnMut(u64, u64)) -> Result<SoakReport> {
-    let (pool, from) = pictures::pool(options.images.as_deref(), options.width, options.height)?;
+    let (pool, from) = images::pool(options.images.as_deref(), options.width, options.height)?;
     let conditions = Conditions::now(from);
     let mut sources = Vec::new();
     for camera in 0..options.cameras.max(1) {
-        let (w, h) = (options.width, options.height);
+        let w = options.width;
+        let h = options.height;
         let color = stream(&format!("cam{camera}/color"), PixelFormat::Rgb8, w, h)?;
-        sources.push(Source { record: color, pictures: pool.color.clone() });
+        sources.push(Source { record: color, images: pool.color.clone() });
         let depth = stream(&format!("cam{camera}/depth"), PixelFormat::Z16, w, h)?;
-        sources.push(Source { record: depth, pictures: pool.depth.clone() });
+        sources.push(Source { record: depth, images: pool.depth.clone() });
     }
     let rate = options.rate_hz.clamp(0.01, 1000.0);
     let period_ns = (1e9 / rate) as i64;
     let sets = (options.recorded_s * rate).round().max(1.0) as u64;
     let sample_every = rate.round().max(1.0) as u64;
-    let (begin, cpu, utc) = (HostTime::now(), process_cpu_ns(), UtcPair::sample());
-    let (mut samples, mut refused) = (Vec::with_capacity((sets / sample_every + 1) as usize), 0);
+    let begin = HostTime::now();
+    let cpu = process_cpu_ns();
+    let utc = UtcPair::sample();
+    let mut samples = Vec::with_capacity((sets / sample_every + 1) as usize);
+    let mut refused = 0;
     let (measured, report) = record(
         &options.dir,
         &sources,

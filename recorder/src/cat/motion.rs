@@ -1,4 +1,4 @@
-//! Samples of motion units: listed, or written as a CSV or NPY file per unit.
+//! Samples of IMUs: listed, or written as a CSV or NPY file per unit.
 
 use super::{FramesDone, LINES, SetChoice, new_folder};
 use crate::dataset::{Dataset, DatasetSet, PixelMode, SetReader};
@@ -10,7 +10,7 @@ use serde::Serialize;
 use std::ops::{ControlFlow, Range};
 use std::path::{Path, PathBuf};
 
-/// What a motion file is.
+/// Format of a motion file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum MotionForm {
     /// A line a sample under one line of names; empty where the sample has no such number.
@@ -87,7 +87,8 @@ impl MotionRow {
 
     fn new(set: &DatasetSet, s: &MotionSample) -> Self {
         let known = |v: f32| v.is_finite().then_some(v);
-        let ([gx, gy, gz], [ax, ay, az]) = (s.gyro_rad_s.map(known), s.accel_m_s2.map(known));
+        let [gx, gy, gz] = s.gyro_rad_s.map(known);
+        let [ax, ay, az] = s.accel_m_s2.map(known);
         Self {
             set: set.id,
             utc_ns: s.time_ns.saturating_add(set.utc_offset_ns),
@@ -143,7 +144,7 @@ impl Chosen {
         let Some(index) = units.iter().position(|u| u.id == *unit) else {
             let names: Vec<_> = units.iter().map(|u| u.id.to_string()).collect();
             let has = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
-            let what = format!("there is no motion unit {unit}; the dataset has {has}");
+            let what = format!("there is no IMU {unit}; the dataset has {has}");
             return Err(Error::new(ErrorKind::BadInput, what));
         };
         let mut sets = dataset.set_reader()?;
@@ -180,7 +181,7 @@ impl Chosen {
     }
 }
 
-/// Calls `each` with a row per sample of the motion unit `unit` in the chosen sets; what is counted are samples.
+/// Calls `each` with a row per sample of the IMU `unit` in the chosen sets; what is counted are samples.
 ///
 /// # Errors
 /// [`ErrorKind::BadInput`] for a unit that is not there, and as [`list_frames`](super::list_frames).
@@ -237,7 +238,7 @@ pub fn export_motion(
                 }
             }
             total.frames += 1;
-            // Told now and then: a call a sample would cost more than the sample.
+            // Not for each sample: the call would cost more than the sample.
             Ok(if total.frames % 1024 == 0 { progress(total.frames) } else { ControlFlow::Continue(()) })
         })?;
         total.sets = total.sets.max(done.sets);
@@ -272,13 +273,13 @@ fn columns() -> Vec<(&'static str, &'static str, usize)> {
     [("set", "<u8", 1), ("utc_ns", "<i8", 1)].into_iter().chain(MOTION_FIELDS.iter().map(of)).collect()
 }
 
-/// A file that gets its name when it is whole.
+/// A file that gets its name when it is complete.
 struct File<'a> {
     fs: &'a dyn Fs,
     out: Box<dyn WriteFile>,
     path: PathBuf,
     part: PathBuf,
-    /// What is not written yet.
+    /// Bytes that are not written yet.
     waiting: Vec<u8>,
     bytes: u64,
 }

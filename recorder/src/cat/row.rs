@@ -1,4 +1,4 @@
-//! What is told of one frame: a line of `frames.csv`, or a JSON object with the same names.
+//! Description of one frame: a line of `frames.csv`, or a JSON object with the same names.
 
 use crate::dataset::{DatasetFrame, DatasetSet};
 use depthrig_bus::{FrameFlags, PixelFormat};
@@ -45,7 +45,7 @@ pub struct FrameRow {
     pub set_utc_ns: i64,
     /// `camera/stream`.
     pub stream: String,
-    /// The file of its picture, below the folder of `frames.csv`.
+    /// The file of its image, below the folder of `frames.csv`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub file: Option<String>,
     /// Pixel format on the camera's channel.
@@ -54,7 +54,7 @@ pub struct FrameRow {
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// Metres per unit of depth; 0 when it is no depth.
+    /// Metres per unit of depth; 0 without depth.
     pub depth_unit_m: f64,
     /// How it is stored in the dataset.
     pub codec: &'static str,
@@ -170,7 +170,7 @@ mod tests {
             gain: 1.5,
             ..FrameHeader::default()
         };
-        header.set_picture(PixelFormat::Z16, 6, 7);
+        header.set_image(PixelFormat::Z16, 6, 7);
         header.capture_time_ns = -8;
         header.capture_uncertainty_ns = 9;
         (header.arrival_time_ns, header.publish_time_ns, header.exposure_ns) = (10, 11, 12);

@@ -1,4 +1,4 @@
-//! What a finished segment says of itself in its last kilobyte: footer, summary offsets, statistics.
+//! The last kilobyte of a finished segment: footer, summary offsets, statistics.
 
 use crate::container::MAGIC;
 use crate::container::record::op;
@@ -15,7 +15,7 @@ const FOOTER: u64 = HEAD + 20 + 8;
 /// Neither the offsets nor the statistics of 64 cameras come near.
 const GROUP_MAX: u64 = 1 << 20;
 
-/// What the statistics of a segment say.
+/// Sets and times from the statistics of a segment.
 pub(super) struct SegmentFacts {
     pub(super) sets: u64,
     /// First and last log time, UTC nanoseconds.

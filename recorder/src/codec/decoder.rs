@@ -1,10 +1,10 @@
-//! From the packed form back to the picture. The input may be anything: every length is checked, and nothing is
+//! From the packed form back to the image. The input may be anything: every length is checked, and nothing is
 //! allocated that the input cannot fill.
 
 use super::{DepthShape, EXPANSION_MAX, HEAD, Table, bad, table};
 use crate::Result;
 
-/// Unpacks depth pictures; its buffers are reused.
+/// Unpacks depth images; its buffers are reused.
 pub struct DepthDecoder {
     palette: Table<u16>,
     rows: [Vec<u16>; 2],
@@ -24,10 +24,10 @@ impl DepthDecoder {
         Self { palette: table(), rows: Default::default(), body: Vec::new(), zstd: None }
     }
 
-    /// Replaces `out` by the picture of which `data` is the packed form.
+    /// Replaces `out` by the image of which `data` is the packed form.
     ///
     /// # Errors
-    /// [`crate::ErrorKind::Codec`] when `data` is damaged or is no picture of this shape.
+    /// [`crate::ErrorKind::Codec`] when `data` is damaged or is not an image of this shape.
     pub fn decode(&mut self, data: &[u8], shape: DepthShape, out: &mut Vec<u8>) -> Result<()> {
         shape.check()?;
         let (head, packed) = data.split_first_chunk::<HEAD>().ok_or_else(|| bad("it is cut short"))?;
@@ -74,7 +74,8 @@ impl DepthDecoder {
     }
 
     fn pixels(&mut self, count: usize, shape: DepthShape, out: &mut [u8]) -> Result<()> {
-        let (width, pixels) = (shape.width as usize, shape.pixels());
+        let width = shape.width as usize;
+        let pixels = shape.pixels();
         let (low, rest) = self.body[2 * count..].split_at(pixels);
         let (high, mut padding) = rest.split_at(pixels);
         for row in &mut self.rows {
@@ -90,10 +91,13 @@ impl DepthDecoder {
                 let folded = u16::from(*low) | u16::from(*high) << 8;
                 *here = (folded >> 1) ^ 0u16.wrapping_sub(folded & 1);
             }
-            let (mut west, mut most) = (0u16, 0u16);
+            let mut west = 0u16;
+            let mut most = 0u16;
             for (here, above) in here[1..].iter_mut().zip(above.windows(2)) {
-                let (north_west, north) = (above[0], above[1]);
-                let (least, greatest) = (north.min(west), north.max(west));
+                let north_west = above[0];
+                let north = above[1];
+                let least = north.min(west);
+                let greatest = north.max(west);
                 let predicted = north.wrapping_add(west).wrapping_sub(north_west.max(least).min(greatest));
                 west = predicted.wrapping_add(*here);
                 *here = west;

@@ -1,10 +1,10 @@
-//! From a picture to its packed form.
+//! From an image to its packed form.
 
 use super::{DepthShape, Table, bad, table};
 use crate::Result;
 use zstd::zstd_safe::{CParameter, ParamSwitch};
 
-/// Packs depth pictures; its buffers are reused, so that only the first picture of a size allocates.
+/// Packs depth images; its buffers are reused, so that only the first image of a size allocates.
 pub struct DepthEncoder {
     seen: Table<u8>,
     ranks: Table<u16>,
@@ -22,10 +22,10 @@ impl Default for DepthEncoder {
     }
 }
 
-/// What is left of a prediction is noise, in which a compressor's search finds little but chance. So it looks at every
-/// seventeenth place, and remembers 64 of them: runs and rows that repeat are found, and the rest is Huffman coded, which
-/// the library would leave out at such steps unless told. On real pictures that is 2.4 times as fast as level 1, and a
-/// twentieth smaller (`examples/bench_codecs.rs`).
+/// The compressor of prediction residuals. These are noise, in which a compressor's search finds little but chance. So
+/// it looks at every seventeenth place, and remembers 64 of them: runs and rows that repeat are found, and the rest is
+/// Huffman coded, which the library by default leaves out at such steps. On real images that is 2.4 times as fast as
+/// level 1, and a twentieth smaller (`examples/bench_codecs.rs`).
 fn compressor() -> std::io::Result<zstd::bulk::Compressor<'static>> {
     let mut zstd = zstd::bulk::Compressor::new(1)?;
     for parameter in [
@@ -55,7 +55,7 @@ impl DepthEncoder {
     /// Appends the packed form of `pixels`, little-endian and padded as `shape` says, to `out`.
     ///
     /// # Errors
-    /// [`crate::ErrorKind::Codec`] when `shape` is no picture, is none of the size of `pixels` or is above 256 MiB.
+    /// [`crate::ErrorKind::Codec`] when `shape` is invalid, does not have the size of `pixels` or is above 256 MiB.
     pub fn encode(&mut self, pixels: &[u8], shape: DepthShape, out: &mut Vec<u8>) -> Result<()> {
         shape.check()?;
         if pixels.len() as u64 != shape.bytes() {
@@ -82,7 +82,7 @@ impl DepthEncoder {
         Ok(())
     }
 
-    /// Gives each value in the picture its rank and writes the sorted values as differences; returns their number.
+    /// Gives each value in the image its rank and writes the sorted values as differences; returns their number.
     fn palette(&mut self, pixels: &[u8], shape: DepthShape) -> u32 {
         self.seen.fill(0);
         for row in pixels.chunks_exact(shape.step as usize) {
@@ -90,7 +90,8 @@ impl DepthEncoder {
                 self.seen[usize::from(u16::from_le_bytes([p[0], p[1]]))] = 1;
             }
         }
-        let (mut count, mut last) = (0u32, 0u16);
+        let mut count = 0u32;
+        let mut last = 0u16;
         // Low bytes first; the high bytes wait in the table of rows, which is free now.
         let high = &mut self.rows[0];
         high.clear();
@@ -124,12 +125,17 @@ impl DepthEncoder {
                 *rank = self.ranks[usize::from(u16::from_le_bytes([p[0], p[1]]))];
             }
             // Slices of one length, so that the loop is vectorised without a bounds check.
-            let (north_west, north) = (&above[..width], &above[1..=width]);
-            let (west, this) = (&here[..width], &here[1..=width]);
-            let (low, high) = (&mut low[..width], &mut high[..width]);
+            let north_west = &above[..width];
+            let north = &above[1..=width];
+            let west = &here[..width];
+            let this = &here[1..=width];
+            let low = &mut low[..width];
+            let high = &mut high[..width];
             for i in 0..width {
-                let (n, w) = (north[i], west[i]);
-                let (least, most) = (n.min(w), n.max(w));
+                let n = north[i];
+                let w = west[i];
+                let least = n.min(w);
+                let most = n.max(w);
                 // The median of n, w and n + w - nw, without leaving 16 bits.
                 let predicted = n.wrapping_add(w).wrapping_sub(north_west[i].max(least).min(most));
                 let left = this[i].wrapping_sub(predicted);

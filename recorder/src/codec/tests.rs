@@ -5,7 +5,9 @@ use proptest::prelude::*;
 
 /// The head and the body before it is packed, in the plainest code: one pixel at a time, in wide integers.
 fn model(pixels: &[u8], s: DepthShape) -> (Vec<u8>, Vec<u8>) {
-    let (w, h, step) = (s.width as usize, s.height as usize, s.step as usize);
+    let w = s.width as usize;
+    let h = s.height as usize;
+    let step = s.step as usize;
     let value = |x: usize, y: usize| {
         i64::from(pixels[y * step + 2 * x]) + 256 * i64::from(pixels[y * step + 2 * x + 1])
     };
@@ -18,7 +20,8 @@ fn model(pixels: &[u8], s: DepthShape) -> (Vec<u8>, Vec<u8>) {
         }
         palette.binary_search(&value(x as usize, y as usize)).unwrap() as i64
     };
-    let (mut low, mut high) = (Vec::new(), Vec::new());
+    let mut low = Vec::new();
+    let mut high = Vec::new();
     let mut put = |v: i64| {
         low.push((v % 256) as u8);
         high.push((v / 256) as u8);
@@ -29,7 +32,9 @@ fn model(pixels: &[u8], s: DepthShape) -> (Vec<u8>, Vec<u8>) {
     }
     for y in 0..h as isize {
         for x in 0..w as isize {
-            let (a, b, c) = (rank(x - 1, y), rank(x, y - 1), rank(x - 1, y - 1));
+            let a = rank(x - 1, y);
+            let b = rank(x, y - 1);
+            let c = rank(x - 1, y - 1);
             let predicted = if c >= a.max(b) {
                 a.min(b)
             } else if c <= a.min(b) {
@@ -51,7 +56,7 @@ fn model(pixels: &[u8], s: DepthShape) -> (Vec<u8>, Vec<u8>) {
     ((palette.len() as u32).to_le_bytes().to_vec(), body)
 }
 
-/// The head of a packed picture and its body unpacked.
+/// The head of a packed image and its body unpacked.
 fn unpacked(packed: &[u8]) -> (Vec<u8>, Vec<u8>) {
     (packed[..HEAD].to_vec(), zstd::bulk::decompress(&packed[HEAD..], 1 << 24).unwrap())
 }
@@ -68,8 +73,8 @@ fn decode(data: &[u8], shape: DepthShape) -> Result<Vec<u8>> {
     DepthDecoder::new().decode(data, shape, &mut out).map(|()| out)
 }
 
-/// Pictures from flat to random, with holes, and with padding that is not zero.
-fn picture() -> impl Strategy<Value = (Vec<u8>, DepthShape)> {
+/// Images from flat to random, with holes, and with padding that is not zero.
+fn image() -> impl Strategy<Value = (Vec<u8>, DepthShape)> {
     let value = prop_oneof![Just(any::<u16>().boxed()), Just((0u16..4).boxed()), Just((700u16..760).boxed())];
     (1u32..40, 1u32..12, 0u32..5, value).prop_flat_map(|(width, height, pad, value)| {
         let shape = DepthShape { width, height, step: 2 * width + pad };
@@ -90,15 +95,15 @@ fn picture() -> impl Strategy<Value = (Vec<u8>, DepthShape)> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(400))]
     #[test]
-    fn what_is_packed_is_what_the_format_page_says_and_comes_back((bytes, shape) in picture()) {
+    fn what_is_packed_is_what_the_format_page_says_and_comes_back((bytes, shape) in image()) {
         let packed = encode(&bytes, shape);
         prop_assert_eq!(unpacked(&packed), model(&bytes, shape));
         prop_assert_eq!(decode(&packed, shape).unwrap(), bytes);
     }
 
     #[test]
-    fn damage_is_an_error_or_another_picture_and_never_a_panic(
-        (bytes, shape) in picture(), at in any::<prop::sample::Index>(), new in any::<u8>(), cut in any::<prop::sample::Index>()
+    fn damage_is_an_error_or_another_image_and_never_a_panic(
+        (bytes, shape) in image(), at in any::<prop::sample::Index>(), new in any::<u8>(), cut in any::<prop::sample::Index>()
     ) {
         let mut packed = encode(&bytes, shape);
         let at = at.index(packed.len());
@@ -162,9 +167,11 @@ fn every_value_at_once_is_packed() {
 }
 
 #[test]
-fn one_encoder_and_one_decoder_take_pictures_of_any_size_in_turn() {
-    let (mut encoder, mut decoder) = (DepthEncoder::new(), DepthDecoder::new());
-    let (mut packed, mut back) = (Vec::new(), Vec::new());
+fn one_encoder_and_one_decoder_take_images_of_any_size_in_turn() {
+    let mut encoder = DepthEncoder::new();
+    let mut decoder = DepthDecoder::new();
+    let mut packed = Vec::new();
+    let mut back = Vec::new();
     for (width, height) in [(64, 48), (5, 3), (100, 2), (64, 48)] {
         let shape = DepthShape { width, height, step: 2 * width };
         let bytes: Vec<u8> = (0..width * height).flat_map(|i| ((i * i) as u16 / 3).to_le_bytes()).collect();
@@ -185,8 +192,12 @@ fn lies_are_refused_before_memory_is_taken() {
     };
     refused(&packed, DepthShape { width: 16000, height: 8000, step: 32000 }, "cannot hold");
     refused(&packed, DepthShape { width: 1 << 20, height: 1 << 20, step: 1 << 21 }, "too large");
-    refused(&packed, DepthShape { width: u32::MAX, height: u32::MAX, step: u32::MAX }, "is no picture");
-    refused(&packed, DepthShape { width: 4, height: 0, step: 8 }, "is no picture");
+    refused(
+        &packed,
+        DepthShape { width: u32::MAX, height: u32::MAX, step: u32::MAX },
+        "is not a valid image",
+    );
+    refused(&packed, DepthShape { width: 4, height: 0, step: 8 }, "is not a valid image");
     refused(&packed, DepthShape { width: 4, height: 5, step: 8 }, "it unpacks to 34 bytes, 42 are wanted");
     refused(&packed[..3], small, "cut short");
     for count in [0u32, 17, u32::MAX] {

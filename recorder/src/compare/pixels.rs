@@ -1,4 +1,4 @@
-//! How far apart two pictures are, sample by sample, summed over a stream.
+//! How far apart two images are, sample by sample, summed over a stream.
 
 use crate::dataset::jpeg_pixels;
 use crate::still::tight;
@@ -7,7 +7,7 @@ use serde::Serialize;
 
 /// How far the pixels of a stream are apart, over the frames whose pixels differ.
 ///
-/// A sample is one number of a picture: a byte of an 8-bit picture, a 16-bit value, a float; of a camera's JPEG a
+/// A sample is one number of an image: a byte of an 8-bit image, a 16-bit value, a float; of a camera's JPEG a
 /// byte of its decoded colours.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 #[non_exhaustive]
@@ -60,11 +60,13 @@ impl PixelDifference {
         }
     }
 
-    /// Takes two decoded pictures of the same moment; where they differ, what is to be told of each.
+    /// Compares two decoded images of the same moment; if they differ, returns a description of each.
     pub(super) fn frame(
         &mut self,
-        (ha, a): (&FrameHeader, &[u8]),
-        (hb, b): (&FrameHeader, &[u8]),
+        ha: &FrameHeader,
+        a: &[u8],
+        hb: &FrameHeader,
+        b: &[u8],
     ) -> Option<(String, String)> {
         self.frames_decoded += 1;
         let size = |h: &FrameHeader| (h.format, h.width, h.height);
@@ -74,11 +76,11 @@ impl PixelDifference {
             Some((x, y))
         };
         let Some(format) = ha.pixel_format().filter(|_| size(ha) == size(hb)) else {
-            let told = |h: &FrameHeader| {
+            let shape = |h: &FrameHeader| {
                 let format = h.pixel_format().map_or("unknown", PixelFormat::name);
                 format!("{}x{} {format}", h.width, h.height)
             };
-            return incomparable(self, told(ha), told(hb));
+            return incomparable(self, shape(ha), shape(hb));
         };
         if format == PixelFormat::Mjpeg {
             if a == b {
@@ -93,7 +95,8 @@ impl PixelDifference {
                 }
             };
         }
-        let (a, b) = (tight(ha, a, format), tight(hb, b, format));
+        let a = tight(ha, a, format);
+        let b = tight(hb, b, format);
         if a == b {
             return None;
         }
@@ -123,14 +126,14 @@ impl PixelDifference {
         (self.samples, self.samples_differing, self.max_abs) = (t.samples, t.differing, t.max);
         self.mean_abs = t.mean();
         self.psnr_db = sums.eight_bit.then(|| t.psnr_db());
-        let told = format!(
+        let difference = format!(
             "{} of {} samples differ, by {} at most, {:.3} in the mean",
             sums.differing,
             sums.samples,
             sums.max,
             sums.mean()
         );
-        ("as recorded".to_owned(), told)
+        ("as recorded".to_owned(), difference)
     }
 }
 
@@ -170,7 +173,7 @@ mod tests {
 
     fn header(format: PixelFormat, width: u32, height: u32) -> FrameHeader {
         let mut h = FrameHeader::default();
-        h.set_picture(format, width, height);
+        h.set_image(format, width, height);
         h
     }
 
@@ -178,9 +181,9 @@ mod tests {
     fn eight_bit_differences_are_measured() {
         let h = header(PixelFormat::Mono8, 4, 1);
         let mut d = PixelDifference::new("c/s");
-        assert_eq!(d.frame((&h, &[1, 2, 3, 4]), (&h, &[1, 2, 3, 4])), None);
-        assert!(d.frame((&h, &[0, 10, 20, 30]), (&h, &[0, 13, 20, 29])).is_some());
-        assert!(d.frame((&h, &[0, 0, 0, 0]), (&h, &[0, 0, 0, 4])).is_some());
+        assert_eq!(d.frame(&h, &[1, 2, 3, 4], &h, &[1, 2, 3, 4]), None);
+        assert!(d.frame(&h, &[0, 10, 20, 30], &h, &[0, 13, 20, 29]).is_some());
+        assert!(d.frame(&h, &[0, 0, 0, 0], &h, &[0, 0, 0, 4]).is_some());
         assert_eq!((d.frames_decoded, d.frames_differing, d.frames_incomparable), (3, 2, 0));
         assert_eq!((d.samples, d.samples_differing, d.max_abs, d.mean_abs), (8, 3, 4.0, 1.0));
         let mse: f64 = (9.0 + 1.0 + 16.0) / 8.0;
@@ -193,12 +196,12 @@ mod tests {
         let h = header(PixelFormat::Z16, 2, 1);
         let mut d = PixelDifference::new("c/s");
         let bytes = |v: [u16; 2]| v.map(u16::to_le_bytes).concat();
-        d.frame((&h, &bytes([256, 7])), (&h, &bytes([255, 7]))).unwrap();
+        d.frame(&h, &bytes([256, 7]), &h, &bytes([255, 7])).unwrap();
         assert_eq!((d.samples, d.samples_differing, d.max_abs, d.psnr_db), (2, 1, 1.0, None));
         let h = header(PixelFormat::DepthF32, 2, 1);
         let mut d = PixelDifference::new("c/s");
         let bytes = |v: [f32; 2]| v.map(f32::to_le_bytes).concat();
-        d.frame((&h, &bytes([1.5, f32::NAN])), (&h, &bytes([1.0, 2.0]))).unwrap();
+        d.frame(&h, &bytes([1.5, f32::NAN]), &h, &bytes([1.0, 2.0])).unwrap();
         assert_eq!((d.samples, d.samples_differing, d.max_abs, d.mean_abs), (2, 2, 0.5, 0.25));
     }
 
@@ -208,16 +211,17 @@ mod tests {
         let mut padded = tight;
         (padded.stride, padded.payload_len) = (4, 8);
         let mut d = PixelDifference::new("c/s");
-        assert_eq!(d.frame((&padded, &[1, 2, 3, 9, 4, 5, 6, 9]), (&tight, &[1, 2, 3, 4, 5, 6])), None);
-        assert!(d.frame((&padded, &[1, 2, 3, 9, 4, 5, 7, 9]), (&tight, &[1, 2, 3, 4, 5, 6])).is_some());
+        assert_eq!(d.frame(&padded, &[1, 2, 3, 9, 4, 5, 6, 9], &tight, &[1, 2, 3, 4, 5, 6]), None);
+        assert!(d.frame(&padded, &[1, 2, 3, 9, 4, 5, 7, 9], &tight, &[1, 2, 3, 4, 5, 6]).is_some());
     }
 
     #[test]
     fn other_sizes_have_no_common_samples() {
-        let (a, b) = (header(PixelFormat::Mono8, 2, 1), header(PixelFormat::Mono8, 1, 2));
+        let a = header(PixelFormat::Mono8, 2, 1);
+        let b = header(PixelFormat::Mono8, 1, 2);
         let mut d = PixelDifference::new("c/s");
-        let told = d.frame((&a, &[1, 2]), (&b, &[1, 2])).unwrap();
-        assert_eq!(told, ("2x1 mono8".to_owned(), "1x2 mono8".to_owned()));
+        let shapes = d.frame(&a, &[1, 2], &b, &[1, 2]).unwrap();
+        assert_eq!(shapes, ("2x1 mono8".to_owned(), "1x2 mono8".to_owned()));
         assert_eq!((d.frames_differing, d.frames_incomparable, d.samples), (1, 1, 0));
     }
 }

@@ -51,7 +51,7 @@ impl core::fmt::Debug for Tail {
     }
 }
 
-/// What goes before a message's data.
+/// Head of a message, before its data.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct MessageHead {
     pub(crate) channel: u16,
@@ -148,7 +148,7 @@ impl ChunkBuilder {
             Ok(())
         });
         match begun {
-            Ok(told) => told,
+            Ok(content) => content,
             Err(never) => match never {},
         }
     }
@@ -291,7 +291,7 @@ impl Chunk {
     }
 }
 
-/// What a chunk record says before its data.
+/// Head of a chunk record, before its data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct ChunkHead {
     pub(crate) start_time: u64,

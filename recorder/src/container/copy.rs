@@ -1,8 +1,8 @@
-//! Copying from one segment to another: whole sets and what lies between them, each chunk proven and then
+//! Copying from one segment to another: complete sets and what lies between them, each chunk proven and then
 //! appended as it lies there, never packed anew.
 //!
 //! [`Groups`] walks a file in constant memory, one set at a time. It needs no index and survives damage: what
-//! cannot be proven is passed over, said as [`Group::Damage`], and the walk goes on at the next good chunk.
+//! cannot be proven is skipped, reported as [`Group::Damage`], and the walk goes on at the next good chunk.
 //! Bytes that a checkpoint (or the checksum of the whole data) vouches for are not unpacked; all others are.
 
 use super::chunk::{Chunk, ChunkHead};
@@ -22,20 +22,20 @@ mod tests;
 /// Bytes read at a time where they are only looked at.
 const WINDOW: u64 = 1 << 20;
 
-/// What a segment consists of after its head.
+/// A part of a segment after its head.
 #[derive(Debug)]
 pub(crate) enum Group {
-    /// A whole set.
+    /// A complete set.
     Set(SetGroup),
     /// A chunk between two sets: clock, accounts, notes, diagnostics, `/tf_static`.
     Between(BetweenGroup),
     /// A metadata record after the first chunk.
     Metadata(String, BTreeMap<String, String>),
-    /// Bytes that belong to no whole set.
+    /// Bytes that belong to no complete set.
     Damage(Damage),
 }
 
-/// A set: its pictures, and last the chunk with its commit mark.
+/// A set: its images, and last the chunk with its commit mark.
 #[derive(Debug)]
 pub(crate) struct SetGroup {
     pub(crate) mark: FrameSetMsg,
@@ -55,7 +55,7 @@ pub(crate) struct BetweenGroup {
     pub(crate) head: bool,
 }
 
-/// What was passed over.
+/// Bytes that were skipped.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Damage {
     /// The first byte, and the one after the last.
@@ -64,7 +64,7 @@ pub(crate) struct Damage {
     pub(crate) kind: DamageKind,
     /// The set that it was, where its mark can still be read.
     pub(crate) set: Option<u64>,
-    /// What is wrong, in words.
+    /// The fault, in words.
     pub(crate) why: String,
 }
 
@@ -72,25 +72,25 @@ pub(crate) struct Damage {
 pub(crate) enum DamageKind {
     /// The file ends here, in the middle of a record.
     Tail,
-    /// Pictures without a commit mark, or a mark without its pictures.
+    /// Images without a commit mark, or a mark without its images.
     Torn,
-    /// Bytes that are no good record, with good ones after them.
+    /// Bytes that are not a good record, with good ones after them.
     Bytes,
     /// The file holds nothing at all.
     Empty,
 }
 
-/// What a channel is to the walk.
+/// Meaning of a channel for the walk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Role {
-    Picture,
+    Image,
     Set,
     TfStatic,
     Checkpoint,
 }
 
-/// A picture whose set is not complete yet.
-struct Picture {
+/// An image whose set is not complete yet.
+struct Image {
     chunk: Chunk,
     offset: u64,
     channel: u16,
@@ -103,19 +103,19 @@ struct Picture {
 pub(crate) struct Groups<'a> {
     reader: &'a SegmentReader,
     roles: BTreeMap<u16, Role>,
-    /// The picture channel of each stream.
-    pictures: BTreeMap<String, u16>,
+    /// The image channel of each stream.
+    images: BTreeMap<String, u16>,
     /// Where the next record begins.
     at: u64,
     /// The bytes before this are proven by a checksum over all of them.
     proven: u64,
-    pending: Vec<Picture>,
+    pending: Vec<Image>,
     ready: VecDeque<Group>,
     ended: bool,
 }
 
-/// What stands before the first chunk, and where that begins or what is damaged begins: once schemas, channels
-/// and metadata are there, the rest can be done without.
+/// The preamble before the first chunk, and the offset of that chunk or of the damage before it: once schemas,
+/// channels and metadata are there, the rest can be done without.
 ///
 /// # Errors
 /// [`ErrorKind::Corrupt`] or [`ErrorKind::Truncated`] when a record before them is damaged, [`ErrorKind::Io`].
@@ -172,14 +172,14 @@ impl<'a> Groups<'a> {
     /// reader needs no index.
     pub(crate) fn new(reader: &'a SegmentReader, preamble: &Preamble, first: u64) -> Result<Self> {
         let mut roles = BTreeMap::new();
-        let mut pictures = BTreeMap::new();
+        let mut images = BTreeMap::new();
         let schemas: BTreeMap<_, _> = preamble.schemas.iter().map(|s| (s.id, s.name.as_str())).collect();
         for c in &preamble.channels {
             let is = |s: Schema| schemas.get(&c.schema) == Some(&s.name());
-            let role = if Schema::PICTURES.into_iter().any(is) {
+            let role = if Schema::IMAGES.into_iter().any(is) {
                 let Some(stream) = c.metadata.get("stream") else { continue };
-                pictures.insert(stream.clone(), c.id);
-                Role::Picture
+                images.insert(stream.clone(), c.id);
+                Role::Image
             } else if is(Schema::FrameSet) {
                 Role::Set
             } else if is(Schema::TfMessage) {
@@ -194,7 +194,7 @@ impl<'a> Groups<'a> {
         let mut groups = Self {
             reader,
             roles,
-            pictures,
+            images,
             at: first,
             proven: 0,
             pending: Vec::new(),
@@ -218,7 +218,7 @@ impl<'a> Groups<'a> {
     /// The next group; `None` at the end of the data.
     ///
     /// # Errors
-    /// When the operating system cannot read the file. Damage is no error.
+    /// When the operating system cannot read the file. Damage is not an error.
     pub(crate) fn next(&mut self) -> Result<Option<Group>> {
         loop {
             if let Some(group) = self.ready.pop_front() {
@@ -287,12 +287,12 @@ impl<'a> Groups<'a> {
         })?;
         if next < self.proven {
             let after = self.listed(&mut chunk, next)?;
-            // A picture is alone in its chunk and gives it its times. Where the index says otherwise, the chunk itself is
+            // An image is alone in its chunk and gives it its times. Where the index says otherwise, the chunk itself is
             // asked: what else it is said to hold would be looked for in it later.
             let alone =
                 matches!(chunk.messages[..], [(_, t, _)] if (t, t) == (chunk.start_time, chunk.end_time));
-            if alone && self.role(&chunk) == Some(Role::Picture) {
-                self.picture(chunk, at, None);
+            if alone && self.role(&chunk) == Some(Role::Image) {
+                self.image(chunk, at, None);
                 return Ok(after);
             }
         }
@@ -304,7 +304,7 @@ impl<'a> Groups<'a> {
         self.reader.chunk_messages(chunk.body(), at, |m| {
             messages.push((m.channel, m.log_time, m.offset));
             match self.roles.get(&m.channel) {
-                Some(Role::Picture) => content = Some((m.data.len() as u64, crc32fast::hash(m.data))),
+                Some(Role::Image) => content = Some((m.data.len() as u64, crc32fast::hash(m.data))),
                 Some(Role::Set) => mark = Some((FrameSetMsg::read(m.data)?, m.log_time)),
                 Some(Role::Checkpoint) => checkpoint = Some(Checkpoint::read(m.data)?),
                 _ => {}
@@ -323,7 +323,7 @@ impl<'a> Groups<'a> {
         chunk.messages = messages;
         match (self.role(&chunk), mark) {
             (_, Some((mark, log_time))) => self.commit(chunk, at, mark, log_time),
-            (Some(Role::Picture), _) => self.picture(chunk, at, content),
+            (Some(Role::Image), _) => self.image(chunk, at, content),
             (role, _) => {
                 self.tear();
                 let head = role == Some(Role::TfStatic);
@@ -336,11 +336,11 @@ impl<'a> Groups<'a> {
         Ok(next)
     }
 
-    /// What a chunk is for: a commit mark outweighs pictures, these outweigh the rest.
+    /// The role of a chunk: a commit mark outweighs images, these outweigh the rest.
     fn role(&self, chunk: &Chunk) -> Option<Role> {
         let rank = |r: &Role| match r {
             Role::Set => 3,
-            Role::Picture => 2,
+            Role::Image => 2,
             Role::TfStatic => 1,
             Role::Checkpoint => 0,
         };
@@ -365,25 +365,25 @@ impl<'a> Groups<'a> {
         Ok(at)
     }
 
-    fn picture(&mut self, chunk: Chunk, offset: u64, content: Option<(u64, u32)>) {
-        let Some(&(channel, log_time, _)) = chunk.messages.iter().find(|m| self.is_picture(m.0)) else {
+    fn image(&mut self, chunk: Chunk, offset: u64, content: Option<(u64, u32)>) {
+        let Some(&(channel, log_time, _)) = chunk.messages.iter().find(|m| self.is_image(m.0)) else {
             return;
         };
-        // Pictures of one set have one time and one stream each; so at most one set waits in memory.
-        let other = |p: &Picture| p.log_time != log_time || p.channel == channel;
+        // Images of one set have one time and one stream each; so at most one set waits in memory.
+        let other = |p: &Image| p.log_time != log_time || p.channel == channel;
         if self.pending.iter().any(other) {
             self.tear();
         }
-        self.pending.push(Picture { chunk, offset, channel, log_time, content });
+        self.pending.push(Image { chunk, offset, channel, log_time, content });
     }
 
-    fn is_picture(&self, channel: u16) -> bool {
-        self.roles.get(&channel) == Some(&Role::Picture)
+    fn is_image(&self, channel: u16) -> bool {
+        self.roles.get(&channel) == Some(&Role::Image)
     }
 
     fn commit(&mut self, chunk: Chunk, offset: u64, mark: FrameSetMsg, log_time: u64) {
         let lacks = mark.members.iter().find(|member| {
-            let channel = self.pictures.get(&member.stream);
+            let channel = self.images.get(&member.stream);
             !self.pending.iter().any(|p| {
                 Some(&p.channel) == channel
                     && p.log_time == log_time
@@ -391,9 +391,9 @@ impl<'a> Groups<'a> {
             })
         });
         let why = match lacks {
-            Some(member) => Some(format!("set {} lacks the picture of {}", mark.id, member.stream)),
+            Some(member) => Some(format!("set {} lacks the image of {}", mark.id, member.stream)),
             None if self.pending.len() > mark.members.len() => {
-                Some(format!("set {} has pictures that its mark does not list", mark.id))
+                Some(format!("set {} has images that its mark does not list", mark.id))
             }
             None => None,
         };
@@ -401,7 +401,8 @@ impl<'a> Groups<'a> {
             self.torn(Some((offset, &chunk)), Some(mark.id), why);
             return;
         }
-        let (mut chunks, mut offsets) = (Vec::new(), Vec::new());
+        let mut chunks = Vec::new();
+        let mut offsets = Vec::new();
         for p in self.pending.drain(..) {
             chunks.push(p.chunk);
             offsets.push(p.offset);
@@ -411,10 +412,10 @@ impl<'a> Groups<'a> {
         self.ready.push_back(Group::Set(SetGroup { mark, log_time, chunks, offsets }));
     }
 
-    /// Gives up the pictures that wait for their mark.
+    /// Gives up the images that wait for their mark.
     fn tear(&mut self) {
         if !self.pending.is_empty() {
-            let why = format!("{} pictures of a set without its commit mark", self.pending.len());
+            let why = format!("{} images of a set without its commit mark", self.pending.len());
             self.torn(None, None, why);
         }
     }

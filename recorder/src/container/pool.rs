@@ -100,7 +100,8 @@ mod tests {
     fn the_last_buffer_that_fits_comes_back_and_no_more_is_kept_than_was_said() {
         let pool = Pool::new(5 * MB);
         let [a, b] = [pool.take(MB), pool.take(MB)];
-        let (at_a, at_b) = (a.as_ptr(), b.as_ptr());
+        let at_a = a.as_ptr();
+        let at_b = b.as_ptr();
         drop(b);
         drop(a);
         let mut again = pool.take(3 * MB / 4);

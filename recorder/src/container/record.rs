@@ -104,7 +104,7 @@ pub(crate) fn message_index(buf: &mut Vec<u8>, channel: u16, entries: &[(u64, u6
     });
 }
 
-/// What the summary says of a chunk.
+/// A chunk's entry in the summary.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub(crate) struct ChunkIndex {
     pub(crate) start_time: u64,
@@ -148,7 +148,7 @@ pub(crate) fn attachment(buf: &mut Vec<u8>, time: u64, name: &str, media_type: &
     });
 }
 
-/// What the summary says of an attachment.
+/// An attachment's entry in the summary.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct AttachmentIndex {
     pub(crate) offset: u64,

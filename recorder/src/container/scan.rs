@@ -1,4 +1,4 @@
-//! Reading a segment: its index from the summary, or by walking the records when there is none.
+//! Reading a segment: its index from the summary, or by walking the records of a file without a summary.
 
 use super::MAGIC;
 use super::record::op;
@@ -74,7 +74,7 @@ fn attachment_head(body: &[u8]) -> Option<usize> {
     text(text(16)?)?.checked_add(8)
 }
 
-/// What a walk collects before schemas and channels are put together.
+/// Records collected by a walk, before schemas and channels are put together.
 #[derive(Default)]
 struct Collected {
     chunks: Vec<ChunkEntry>,
@@ -103,7 +103,7 @@ impl SegmentReader {
         if magic != MAGIC {
             return Err(Error::new(
                 ErrorKind::NotADataset,
-                format!("{} is no MCAP file: it does not begin with the MCAP magic", path.display()),
+                format!("{} is not an MCAP file: it does not begin with the MCAP magic", path.display()),
             ));
         }
         Ok(reader)
@@ -233,7 +233,7 @@ impl SegmentReader {
     ) -> Result<()> {
         let corrupt = |what: String| self.error(ErrorKind::Corrupt, offset, what);
         let Record::Chunk { header, data } = self.parse(op::CHUNK, body, offset)? else {
-            return Err(corrupt("this is no chunk".to_owned()));
+            return Err(corrupt("this is not a chunk".to_owned()));
         };
         if header.uncompressed_size > RECORD_MAX {
             return Err(corrupt(format!("a chunk of {} bytes is too large", header.uncompressed_size)));
@@ -312,7 +312,8 @@ impl SegmentReader {
             ));
         }
         let mut c = Collected::default();
-        let (mut offset, mut rest) = (start, summary.as_slice());
+        let mut offset = start;
+        let mut rest = summary.as_slice();
         while !rest.is_empty() {
             let cut = || self.error(ErrorKind::Corrupt, offset, "the summary ends in the middle of a record");
             let (head, after) = rest.split_at_checked(HEAD as usize).ok_or_else(cut)?;
@@ -338,7 +339,7 @@ impl SegmentReader {
         Ok(Some(c))
     }
 
-    /// The index from the records themselves, as far as they are whole.
+    /// The index from the records themselves, as far as they are complete.
     fn walk(&mut self) -> Result<Collected> {
         let mut c = Collected::default();
         let mut offset = 8;

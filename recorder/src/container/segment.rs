@@ -1,6 +1,6 @@
-//! One segment file: `seg_0003.mcap.part` while it grows, `seg_0003.mcap` once it is whole and durable.
+//! One segment file: `seg_0003.mcap.part` while it grows, `seg_0003.mcap` once it is complete and durable.
 //!
-//! Invariant: what the index lists is what lies before `len`. A group of chunks is listed after all of it was
+//! Invariant: the index lists exactly the chunks before `len`. A group of chunks is listed after all of it was
 //! written; when a write fails, the file is cut back to `len`, and index and data agree again.
 
 use super::MAGIC;
@@ -20,7 +20,7 @@ pub(crate) fn file_name(index: u32) -> String {
     format!("seg_{index:04}.mcap")
 }
 
-/// What stands at the head of each segment so that it stands alone.
+/// Records at the head of each segment, which make it readable on its own.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Preamble {
     pub(crate) schemas: Vec<SchemaRecord>,
@@ -76,7 +76,7 @@ impl Segment {
         let file = fs.create_new(part).map_err(|e| Error::io("create", part, e))?;
         let created = Self::begin(fs, file, part.to_owned(), path, preamble);
         if created.is_err() {
-            // A file without a head is no segment, and would be in the way of one.
+            // A file without a head is not a segment, and would be in the way of one.
             let _ = fs.remove_file(part);
         }
         created
@@ -299,7 +299,7 @@ impl Segment {
         self.durable()
     }
 
-    /// Writes index and footer: all of it, or, when there is no room, nothing, so that it can be tried again.
+    /// Writes index and footer: all of it, or nothing when the disk is full, so that it can be tried again.
     pub(crate) fn write_index(&mut self) -> Result<()> {
         let tail = self.tail();
         self.append(&[([&tail, &[]], 0)])
@@ -314,7 +314,7 @@ impl Segment {
         if self.doubtful {
             return Err(Error::new(
                 crate::ErrorKind::Io,
-                format!("{} may not be on the disk whole: a sync of it failed", self.part.display()),
+                format!("{} may not be completely on the disk: a sync of it failed", self.part.display()),
             ));
         }
         Ok(self.part)

@@ -1,4 +1,4 @@
-//! A stored picture becomes the pixels that the camera's channel carried.
+//! A stored image becomes the pixels that the camera's channel carried.
 
 use crate::codec::{DEPTH_CODEC, DepthDecoder, DepthShape};
 use crate::encode::Codec;
@@ -16,7 +16,7 @@ thread_local! {
     static DEPTH: RefCell<Option<DepthDecoder>> = const { RefCell::new(None) };
 }
 
-/// The bytes in a picture's message, as stored.
+/// The bytes in an image's message, as stored.
 pub(crate) fn stored(message: &[u8], codec: Codec) -> Result<&[u8]> {
     match codec {
         Codec::Raw => image::read_image(message),
@@ -32,7 +32,7 @@ pub(crate) fn stored(message: &[u8], codec: Codec) -> Result<&[u8]> {
     }
 }
 
-/// Whether the picture of a whole image message can be decoded to what its header says. A camera's own JPEG,
+/// Whether the image of a whole image message can be decoded to what its header says. A camera's own JPEG,
 /// which a replay hands on as it came, is decoded here as well.
 pub(crate) fn check_stored(message: &[u8], codec: Codec, h: &FrameHeader) -> Result<()> {
     let stored = stored(message, codec)?;
@@ -123,16 +123,18 @@ pub(super) fn decode(stored: &[u8], codec: Codec, h: &FrameHeader) -> Result<Vec
     if pixels.len() == h.payload_len as usize {
         return Ok(pixels);
     }
-    let (len, said) = (pixels.len(), h.payload_len);
+    let len = pixels.len();
+    let said = h.payload_len;
     Err(wrong(h, format_args!("{len} bytes are stored, its header says {said}")))
 }
 
-/// RGB pixels in the channel order and with the row padding of the live picture; the padding is zero.
+/// RGB pixels in the channel order and with the row padding of the live image; the padding is zero.
 fn padded(mut pixels: Vec<u8>, h: &FrameHeader) -> Result<Vec<u8>> {
     if h.pixel_format() == Some(PixelFormat::Bgr8) {
         pixels.chunks_exact_mut(3).for_each(|p| p.swap(0, 2));
     }
-    let (row, stride) = (3 * h.width as usize, h.stride as usize);
+    let row = 3 * h.width as usize;
+    let stride = h.stride as usize;
     if stride == row {
         return Ok(pixels);
     }

@@ -28,7 +28,7 @@ struct Place {
     first: usize,
 }
 
-/// The chunks of one set: from the first picture to the one that ends in the commit mark.
+/// The chunks of one set: from the first image to the one that ends in the commit mark.
 #[derive(Clone, Copy)]
 struct Span {
     first: usize,
@@ -82,7 +82,7 @@ impl SetReader {
         &self.times
     }
 
-    /// What of the dataset cannot be read, one line per segment.
+    /// Segments that cannot be read, one line each.
     pub fn problems(&self) -> &[String] {
         &self.problems
     }
@@ -116,7 +116,8 @@ impl SetReader {
                 format!("{} has {} sets, not a set {number}", self.dataset.path.display(), self.times.len());
             return Err(Error::new(ErrorKind::NotFound, what));
         };
-        let (segment, first) = (place.segment, place.first);
+        let segment = place.segment;
+        let first = place.first;
         if self.open.as_ref().is_none_or(|(open, ..)| *open != segment) {
             self.open = None;
             let (open, spans) = self.open_segment(segment)?;

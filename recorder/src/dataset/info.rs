@@ -1,4 +1,4 @@
-//! What is in a dataset, without reading a picture.
+//! Content of a dataset, without reading an image.
 
 use super::{Dataset, PixelMode, SetRange};
 use crate::container::scan::{ChunkEntry, SegmentReader};
@@ -11,7 +11,7 @@ use depthrig_bus::FrameFlags;
 use serde::Serialize;
 use std::path::PathBuf;
 
-/// What is in a dataset.
+/// Content of a dataset.
 #[derive(Debug, Clone, Serialize)]
 #[non_exhaustive]
 pub struct DatasetInfo {
@@ -21,7 +21,7 @@ pub struct DatasetInfo {
     pub name: String,
     /// The rig's name.
     pub rig: String,
-    /// What was in front of the cameras.
+    /// The scene in front of the cameras.
     pub scene: String,
     /// Who recorded it.
     pub operator: String,
@@ -39,13 +39,13 @@ pub struct DatasetInfo {
     pub segments: u32,
     /// Segments that were not finished, by file name.
     pub unfinished: Vec<String>,
-    /// What could not be read.
+    /// Parts that could not be read.
     pub problems: Vec<String>,
     /// Latest minus earliest capture time over the sets.
     pub spread: SpreadStats,
     /// Per stream.
     pub streams: Vec<StreamInfo>,
-    /// Per motion unit.
+    /// Per IMU.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub motion: Vec<MotionInfo>,
     /// Streams that no camera gave, with what computed them.
@@ -92,9 +92,9 @@ pub struct StreamInfo {
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// How pixels are stored; empty when there is no frame.
+    /// How pixels are stored; empty without a frame.
     pub codec: &'static str,
-    /// Metres per unit of depth; 0 when it is no depth.
+    /// Metres per unit of depth; 0 without depth.
     pub depth_unit_m: f64,
     /// Frames in the dataset.
     pub frames: u64,
@@ -112,7 +112,7 @@ pub struct StreamInfo {
     pub rate_hz: f64,
 }
 
-/// One motion unit of a dataset.
+/// One IMU of a dataset.
 #[derive(Debug, Clone, Serialize)]
 #[non_exhaustive]
 pub struct MotionInfo {
@@ -130,7 +130,7 @@ pub struct MotionInfo {
     pub rate_hz: f64,
 }
 
-/// What is counted of a motion unit while its batches pass.
+/// Counts of an IMU while its batches are read.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct MotionCount {
     /// Batches that passed.
@@ -283,7 +283,7 @@ pub(super) fn gather(dataset: &Dataset) -> Result<DatasetInfo> {
     info.spread = SpreadStats::of(spreads);
     info.duration_ns = ticks.map_or(0, |(first, last)| last.since_ns(first));
     for i in 0..dataset.segments().len() {
-        // What cannot be opened is among the problems already.
+        // A segment that cannot be opened is among the problems already.
         let Some(Ok(reader)) = dataset.open_segment(i) else { continue };
         info.bytes += reader.size;
         if !reader.finished {
@@ -323,7 +323,7 @@ pub(crate) fn image_chunks(reader: &SegmentReader) -> impl Iterator<Item = (&str
     reader.chunks.iter().filter_map(|chunk| {
         let [channel] = chunk.channels[..] else { return None };
         let channel = reader.channels.get(&channel)?;
-        let is_image = Schema::PICTURES.iter().any(|s| channel.schema == s.name());
+        let is_image = Schema::IMAGES.iter().any(|s| channel.schema == s.name());
         let stream = channel.metadata.get("stream").filter(|_| is_image)?;
         Some((stream.as_str(), chunk))
     })

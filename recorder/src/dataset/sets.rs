@@ -47,16 +47,16 @@ impl<R: RangeBounds<i64>> From<R> for SetRange {
     }
 }
 
-/// What to do about pixels.
+/// How pixels are delivered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PixelMode {
     /// Deliver them as the camera's channel did.
     Decoded,
-    /// Deliver what is stored: the JPEG, or the pixels of a picture stored losslessly.
+    /// Deliver what is stored: the JPEG, or the pixels of an image stored losslessly.
     Stored,
     /// As `Decoded`, and where that was a JPEG, deliver it as well.
     DecodedAndStored,
-    /// Deliver none; the pictures are not even read.
+    /// Deliver none; the images are not even read.
     None,
 }
 
@@ -78,7 +78,7 @@ pub struct DatasetSet {
     pub frames: Vec<DatasetFrame>,
     /// Indices of the streams without a frame.
     pub missing: Vec<usize>,
-    /// What the motion units sent since the set before.
+    /// IMU batches since the set before.
     pub motion: Vec<RecordMotion>,
 }
 
@@ -114,7 +114,7 @@ impl DatasetFrame {
 /// Iterator over the sets of a dataset; it holds one set in memory.
 ///
 /// A set that cannot be read is an error of its own and the next one follows. A file that was cut delivers
-/// what is whole, then the error.
+/// its complete sets, then the error.
 pub struct Sets {
     dataset: Dataset,
     range: SetRange,
@@ -132,12 +132,12 @@ pub(super) struct Open {
     partial: Partial,
 }
 
-/// What a channel carries, of what sets are made of.
+/// Content of a channel that sets are made of.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Kind {
-    Picture(StreamId),
+    Image(StreamId),
     Info(StreamId),
-    /// The header of a batch of a motion unit.
+    /// The header of a batch of an IMU.
     UnitInfo(StreamId),
     /// The samples of a batch.
     Samples(StreamId),
@@ -147,7 +147,7 @@ pub(crate) enum Kind {
 }
 
 impl Kind {
-    /// Whether it is of a motion unit.
+    /// Whether it is of an IMU.
     pub(crate) const fn is_motion(&self) -> bool {
         matches!(self, Self::UnitInfo(_) | Self::Samples(_) | Self::Imu(_))
     }
@@ -156,14 +156,14 @@ impl Kind {
 /// The messages since the last set's end.
 #[derive(Default)]
 struct Partial {
-    pictures: BTreeMap<StreamId, (u64, Vec<u8>)>,
+    images: BTreeMap<StreamId, (u64, Vec<u8>)>,
     infos: BTreeMap<StreamId, (u64, Vec<u8>)>,
     batches: Vec<PartialBatch>,
     /// Bytes of these.
     motion_bytes: u64,
 }
 
-/// A batch of a motion unit, as far as it was read.
+/// A batch of an IMU, as far as it was read.
 struct PartialBatch {
     unit: StreamId,
     log_time: u64,
@@ -233,7 +233,7 @@ impl Open {
     /// Whether a chunk holds anything that sets read in this mode are made of.
     pub(super) fn wants(&self, entry: &ChunkEntry, mode: PixelMode) -> bool {
         let wanted = |id: &u16| match self.kinds.get(id) {
-            Some(Kind::Picture(_)) => mode != PixelMode::None,
+            Some(Kind::Image(_)) => mode != PixelMode::None,
             Some(_) => true,
             None => false,
         };
@@ -244,7 +244,7 @@ impl Open {
     /// The error that says where the segment was cut, if it was.
     pub(super) fn cut_error(&self) -> Option<Error> {
         let (offset, why) = self.reader.cut.as_ref()?;
-        let what = format!("{why}; the sets before it are whole");
+        let what = format!("{why}; the sets before it are complete");
         Some(self.reader.error(ErrorKind::Truncated, *offset, what))
     }
 
@@ -269,8 +269,8 @@ impl Open {
                 }
             }
             match kind {
-                Some(Kind::Picture(id)) if mode != PixelMode::None => {
-                    partial.pictures.insert(id.clone(), (m.log_time, m.data.to_vec()));
+                Some(Kind::Image(id)) if mode != PixelMode::None => {
+                    partial.images.insert(id.clone(), (m.log_time, m.data.to_vec()));
                 }
                 Some(Kind::Info(id)) => {
                     partial.infos.insert(id.clone(), (m.log_time, m.data.to_vec()));
@@ -339,12 +339,12 @@ fn assemble(
         let pixels = if mode == PixelMode::None {
             Vec::new()
         } else {
-            let picture = partial.pictures.remove(id).filter(|(t, _)| *t == log_time);
-            let (_, picture) = picture.ok_or_else(|| lacks(&member.stream, "picture"))?;
-            if crc32fast::hash(&picture) != member.message_crc32 {
-                return Err(lacks(&member.stream, "right picture: another one is in its place, that"));
+            let image = partial.images.remove(id).filter(|(t, _)| *t == log_time);
+            let (_, image) = image.ok_or_else(|| lacks(&member.stream, "image"))?;
+            if crc32fast::hash(&image) != member.message_crc32 {
+                return Err(lacks(&member.stream, "right image: another one is in its place, that"));
             }
-            let stored = decode::stored(&picture, codec)?;
+            let stored = decode::stored(&image, codec)?;
             jpeg = (mode == PixelMode::DecodedAndStored && codec == Codec::Jpeg).then(|| stored.to_vec());
             match mode {
                 PixelMode::Stored => stored.to_vec(),
@@ -373,25 +373,27 @@ fn batch(partial: PartialBatch, set: u64, dataset: &Dataset) -> Result<RecordMot
     let PartialBatch { unit, info, samples, .. } = partial;
     let corrupt = |what: String| Error::new(ErrorKind::Corrupt, format!("set {set}: {what}"));
     let index = dataset.session().motion.iter().position(|u| u.id == unit);
-    let index = index.ok_or_else(|| corrupt(format!("{unit} is no motion unit of the session")))?;
+    let index = index.ok_or_else(|| corrupt(format!("{unit} is not an IMU of the session")))?;
     let (header, _) = frame_info::read(&info)?;
     let n = header.sequence;
     let samples = samples.ok_or_else(|| corrupt(format!("batch {n} of {unit} has no samples")))?;
     let samples = motion::read_samples(&samples)?;
     if samples.sequence != n || samples.samples.len() != header.width as usize {
-        let (has, of, width) = (samples.samples.len(), samples.sequence, header.width);
+        let has = samples.samples.len();
+        let of = samples.sequence;
+        let width = header.width;
         let what = format!("batch {n} of {unit} has {width} samples, {has} of batch {of} are there");
         return Err(corrupt(what));
     }
     Ok(RecordMotion { unit: index, header, samples: samples.samples })
 }
 
-/// What the channels of a segment carry, by type and by the `stream` in their metadata.
+/// Contents of a segment's channels, by type and by the `stream` in their metadata.
 pub(crate) fn kinds(reader: &SegmentReader) -> BTreeMap<u16, Kind> {
     reader.channels.iter().filter_map(|(id, channel)| Some((*id, kind_of(channel)?))).collect()
 }
 
-/// What a channel carries, of what sets are made of.
+/// Content of a channel; `None` for one that sets are not made of.
 pub(crate) fn kind_of(channel: &ChannelInfo) -> Option<Kind> {
     let is = |s: Schema| channel.schema == s.name();
     if is(Schema::FrameSet) {
@@ -408,5 +410,5 @@ pub(crate) fn kind_of(channel: &ChannelInfo) -> Option<Kind> {
     if is(Schema::Imu) {
         return Some(Kind::Imu(stream));
     }
-    Schema::PICTURES.into_iter().any(is).then_some(Kind::Picture(stream))
+    Schema::IMAGES.into_iter().any(is).then_some(Kind::Image(stream))
 }

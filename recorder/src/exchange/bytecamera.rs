@@ -6,9 +6,9 @@
 
 mod calibration;
 mod export;
+mod images;
 mod import;
 mod names;
-mod pictures;
 mod rows;
 
 pub use export::{ByteCameraExport, CameraNames};
@@ -35,7 +35,7 @@ const FRAMES_FILE: &str = "frames.csv";
 /// Streams, their calibration and where it comes from.
 const CALIBRATION_FILE: &str = "calibration.json";
 
-/// What the fuzz targets reach.
+/// Entry points of the fuzz targets.
 pub(crate) mod fuzzing {
     /// Whether a `frames.csv` line is one.
     pub(crate) fn row(line: &str) -> bool {
@@ -47,7 +47,7 @@ pub(crate) mod fuzzing {
     }
 
     use super::calibration::Calibration;
-    use super::pictures::{Want, npy as array, read};
+    use super::images::{Want, npy as array, read};
 
     /// Whether a `calibration.json` is one; what it says of the files is used on a small one.
     pub(crate) fn calibration(text: &[u8]) -> bool {
@@ -66,16 +66,16 @@ pub(crate) mod fuzzing {
     const NPY_OF_ONE: &[u8] =
         b"\x93NUMPY\x01\x00\x3c\x00{'descr': '|u1', 'fortran_order': False, 'shape': (1, 1)}  \n\x07";
 
-    /// Whether an NPY file is an array that can be imported; a picture has the size that the array has.
+    /// Whether an NPY file is an array that can be imported; an image has the size that the array has.
     pub(crate) fn npy(bytes: &[u8]) -> bool {
         let Ok((_, shape, _)) = array(bytes) else {
-            assert!(read(bytes, "npy", Want::Metres).is_err(), "a picture from no array");
+            assert!(read(bytes, "npy", Want::Metres).is_err(), "an image from no array");
             return false;
         };
-        if let Ok(picture) = read(bytes, "npy", Want::Metres) {
-            assert_eq!([picture.height, picture.width], shape[..], "a picture of another size");
-            let size = picture.format.frame_bytes(picture.width, picture.height);
-            assert_eq!(picture.pixels.len(), size, "pixels of another size");
+        if let Ok(image) = read(bytes, "npy", Want::Metres) {
+            assert_eq!([image.height, image.width], shape[..], "an image of another size");
+            let size = image.format.frame_bytes(image.width, image.height);
+            assert_eq!(image.pixels.len(), size, "pixels of another size");
         }
         true
     }

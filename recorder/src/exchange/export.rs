@@ -1,6 +1,6 @@
 //! Drives an [`Exporter`]: cuts the work into parts, works on several at once, and goes on where a run was killed.
 
-use super::folder::{Found, OutFile, Output};
+use super::folder::{FolderState, OutFile, Output};
 use super::report::{ExportReport, PartRecord, StreamCount};
 use super::source::{PART_SETS, Part, Source};
 use crate::dataset::{Dataset, DatasetSet, PixelMode, SetReader};
@@ -16,13 +16,13 @@ use std::sync::{Mutex, PoisonError};
 
 /// One layout that datasets can be exported to.
 ///
-/// What it writes must follow from the datasets and [`Exporter::options`] alone, and the files of a part must be
-/// those of no other part: then an export that was interrupted ends as one that was not.
+/// The files must follow from the datasets and [`Exporter::options`] alone, and no two parts may share a file: then
+/// an export that was interrupted ends as one that was not.
 pub trait Exporter: Sync {
     /// The name of the layout.
     fn format(&self) -> &'static str;
 
-    /// The options that decide what is written, as told in `export.json`. A folder is resumed with equal ones only.
+    /// The options that decide what is written, as recorded in `export.json`. A folder is resumed with equal ones only.
     fn options(&self) -> Value;
 
     /// Checks whether these datasets can be exported and says how. Nothing is written yet.
@@ -34,7 +34,7 @@ pub trait Exporter: Sync {
     /// Exports one part. Called on several threads at once.
     ///
     /// # Errors
-    /// What ends the whole export. A frame that cannot be exported is [`PartOut::lose`], not an error.
+    /// Failures that end the export. A frame that cannot be exported is [`PartOut::lose`], not an error.
     fn part(
         &self,
         source: &Source,
@@ -46,7 +46,7 @@ pub trait Exporter: Sync {
     /// Writes what needs all parts, such as lists of all frames. Called again when it was interrupted.
     ///
     /// # Errors
-    /// What ends the whole export.
+    /// Failures that end the export.
     fn finish(&self, sources: &[Source], parts: &Parts<'_>, out: &Output<'_>) -> Result<()>;
 }
 
@@ -57,7 +57,7 @@ pub struct Plan {
     pub parts: Vec<Part>,
     /// Folders that are needed, paths below the folder of the export.
     pub folders: Vec<String>,
-    /// What the layout or the options change or leave out, a sentence each.
+    /// Changes and omissions by the layout or the options, a sentence each.
     pub losses: Vec<String>,
 }
 
@@ -148,7 +148,7 @@ impl PartSets<'_> {
 }
 
 impl<'a> PartOut<'a> {
-    /// Begins a file that is removed before the export is whole, as [`Output::scratch`].
+    /// Begins a file that is removed before the export is complete, as [`Output::scratch`].
     pub(super) fn scratch(&self, name: &str) -> Result<OutFile<'a>> {
         self.out.scratch(name)
     }
@@ -211,13 +211,13 @@ impl PartOut<'_> {
         }
     }
 
-    /// What [`Exporter::finish`] gets of this part as bytes, in the order of the parts. Kept on disk until then, in
-    /// memory only while the part is worked on.
+    /// Bytes of this part for [`Exporter::finish`], in the order of the parts. Kept on disk until then, in memory only
+    /// while the part is worked on.
     pub const fn rows(&mut self) -> &mut Vec<u8> {
         &mut self.rows
     }
 
-    /// What [`Exporter::finish`] gets of this part as a small value; all of them are in memory then.
+    /// Small value of this part for [`Exporter::finish`]; all of them are in memory then.
     pub const fn extra(&mut self) -> &mut Value {
         &mut self.record.extra
     }
@@ -237,9 +237,9 @@ impl Parts<'_> {
 }
 
 /// Exports `datasets` into the folder `out`, which is new or holds an unfinished export of the same datasets with the
-/// same options. An export that is whole already is left as it is.
+/// same options. An export that is complete already is left as it is.
 ///
-/// `progress` is told how far it is, and may end it; running it again goes on from there.
+/// `progress` is called with the progress so far and may end the export; running it again goes on from there.
 ///
 /// # Errors
 /// [`ErrorKind::AlreadyExists`] when `out` holds anything else or another export is writing to it,
@@ -280,13 +280,17 @@ pub fn export(
         "datasets": report.datasets,
     });
     let (out, found) = Output::open(fs, out, &state)?;
-    if let Found::Whole(found) = found {
+    if let FolderState::Complete(found) = found {
         out.clean()?;
-        let whole = serde_json::from_value(found).map_err(|e| {
+        let complete = serde_json::from_value(found).map_err(|e| {
             let what = format!("the report in {} is not as depthrig wrote it", out.dir().display());
             Error::new(ErrorKind::Corrupt, what).with_source(e)
         });
-        return whole.map(|whole| ExportReport { parts_resumed: report.parts, parts: report.parts, ..whole });
+        return complete.map(|done| ExportReport {
+            parts_resumed: report.parts,
+            parts: report.parts,
+            ..done
+        });
     }
     for folder in &plan.folders {
         out.folder(folder)?;
@@ -314,17 +318,18 @@ pub fn export(
     for folder in &plan.folders {
         out.sync_dir(&out.dir().join(folder))?;
     }
-    let told = serde_json::to_value(&report)
+    let json = serde_json::to_value(&report)
         .map_err(|e| Error::new(ErrorKind::BadInput, "the report cannot be written").with_source(e))?;
-    out.close(&told)?;
+    out.close(&json)?;
     Ok(report)
 }
 
-/// What no layout takes of a dataset with motion units.
+/// The loss of a dataset with IMUs, whose samples no layout takes.
 fn motion(source: &Source) -> Option<String> {
     let units: Vec<_> = source.session().motion.iter().map(|u| u.id.to_string()).collect();
     (!units.is_empty()).then(|| {
-        let (name, units) = (&source.session().name, units.join(", "));
+        let name = &source.session().name;
+        let units = units.join(", ");
         format!("{name}: the motion samples of {units} are left out; `depthrig cat --stream` writes them")
     })
 }
@@ -355,7 +360,7 @@ struct Work<'a> {
     out: &'a Output<'a>,
 }
 
-/// What the threads share.
+/// State shared by the threads.
 struct Shared {
     next: AtomicUsize,
     stop: AtomicBool,
@@ -393,11 +398,12 @@ impl Work<'_> {
         let mut ended = progress(at).is_break();
         if !ended {
             let workers = options.workers.clamp(1, parts.len().max(1));
-            // No room: who is told of a set may end the work before the next one but one.
+            // No room: `progress` may end the work before the next set but one.
             let (tick, ticks) = bounded(0);
             std::thread::scope(|scope| {
                 for _ in 0..workers {
-                    let (tick, shared) = (tick.clone(), &shared);
+                    let tick = tick.clone();
+                    let shared = &shared;
                     scope.spawn(move || self.worker(shared, &tick));
                 }
                 drop(tick);
@@ -440,7 +446,7 @@ impl Work<'_> {
                 Ok(done) => *lock() = Some(done),
                 Err(e) => {
                     shared.stop.store(true, Ordering::Relaxed);
-                    // The first one tells why; the others were only ended.
+                    // The first error is the reason; the other workers were only stopped.
                     shared.failed.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(e);
                     return;
                 }

@@ -1,4 +1,4 @@
-//! The folder of an export: files that get their name when they are whole, and the marks of what is done.
+//! The folder of an export: files that get their name when they are complete, and the marks of what is done.
 //!
 //! While it grows it holds `.export.json` (what is being exported), and for each part that is done
 //! `.part_NNNNN.rows` and then `.part_NNNNN.json`. When all is done `export.json` is written and these go.
@@ -12,7 +12,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// What is being exported into the folder.
+/// The file that says what is being exported into the folder.
 const STATE_FILE: &str = ".export.json";
 /// The largest mark or report that is read back, bytes.
 const JSON_MAX: u64 = 256 << 20;
@@ -37,12 +37,12 @@ pub struct OutFile<'a> {
     count: Option<(&'a AtomicU64, &'a AtomicU64)>,
 }
 
-/// What was found in the folder.
-pub(super) enum Found {
-    /// Nothing, or an export that was not finished: work on.
+/// State of the export in a folder.
+pub(super) enum FolderState {
+    /// No export, or one that was not finished: work on.
     Open,
-    /// The same export, whole.
-    Whole(Value),
+    /// The same export, complete.
+    Complete(Value),
 }
 
 fn json_error(path: &Path, e: serde_json::Error) -> Error {
@@ -52,7 +52,7 @@ fn json_error(path: &Path, e: serde_json::Error) -> Error {
 
 impl<'a> Output<'a> {
     /// Creates the folder, or finds an export of exactly `state` in it.
-    pub(super) fn open(fs: &'a dyn Fs, dir: &Path, state: &Value) -> Result<(Self, Found)> {
+    pub(super) fn open(fs: &'a dyn Fs, dir: &Path, state: &Value) -> Result<(Self, FolderState)> {
         let entries = match fs.read_dir(dir) {
             Ok(entries) => entries,
             Err(e) if e.kind() == io::ErrorKind::NotFound => {
@@ -68,14 +68,15 @@ impl<'a> Output<'a> {
             }
             _ => Error::io("lock the folder", dir, e),
         })?;
-        let (files, bytes) = (AtomicU64::new(0), AtomicU64::new(0));
+        let files = AtomicU64::new(0);
+        let bytes = AtomicU64::new(0);
         let out = Self { fs, dir: dir.to_owned(), files, bytes, _lock: lock };
         let has = |name: &str| entries.iter().any(|e| e.name == name);
         // The first file of an export is `.export.json`; when even that was cut off, its unnamed part is all there is.
         let unborn = entries.iter().all(|e| e.name == part_name(STATE_FILE));
         if unborn {
             out.write(STATE_FILE, &pretty(state)?)?;
-            return Ok((out, Found::Open));
+            return Ok((out, FolderState::Open));
         }
         let known = if has(REPORT_FILE) { REPORT_FILE } else { STATE_FILE };
         if !has(known) {
@@ -91,8 +92,8 @@ impl<'a> Output<'a> {
             );
             return Err(Error::new(ErrorKind::AlreadyExists, what));
         }
-        let found = if known == REPORT_FILE { Found::Whole(found) } else { Found::Open };
-        Ok((out, found))
+        let state = if known == REPORT_FILE { FolderState::Complete(found) } else { FolderState::Open };
+        Ok((out, state))
     }
 
     /// The folder.
@@ -120,8 +121,8 @@ impl<'a> Output<'a> {
         Ok(file)
     }
 
-    /// Begins a file that is not of the layout: needed until the export is whole, removed then because its name begins
-    /// with `.part_`.
+    /// Begins a file that is not of the layout: needed until the export is complete, removed then because its name
+    /// begins with `.part_`.
     pub(super) fn scratch(&self, name: &str) -> Result<OutFile<'_>> {
         debug_assert!(name.starts_with(".part_"));
         self.begin(name)
@@ -137,7 +138,7 @@ impl<'a> Output<'a> {
         }
     }
 
-    /// Counts a file of the layout that an earlier run made whole.
+    /// Counts a file of the layout that an earlier run completed.
     pub(super) fn keep(&self, bytes: u64) {
         self.files.fetch_add(1, Ordering::Relaxed);
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
@@ -293,7 +294,7 @@ impl io::Write for OutFile<'_> {
     }
 }
 
-/// The name of a file that is not whole yet; hidden, so that no pattern for pictures finds it.
+/// The name of a file that is not complete yet; hidden, so that no pattern for images finds it.
 fn part_name(name: &str) -> String {
     format!(".{}.tmp", name.trim_start_matches('.'))
 }

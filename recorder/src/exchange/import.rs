@@ -25,16 +25,16 @@ pub trait Importer {
     /// [`ErrorKind::BadInput`] when it cannot be a dataset.
     fn session(&mut self) -> Result<Session>;
 
-    /// The next set; `None` at the end. A picture that cannot be read is counted in [`ImportFacts`].
+    /// The next set; `None` at the end. An image that cannot be read is counted in [`ImportFacts`].
     ///
     /// # Errors
-    /// What ends the whole import.
+    /// Failures that end the import.
     fn next(&mut self) -> Result<Option<RecordSet>>;
 
     /// How much of how much has been read, in any unit.
     fn progress(&self) -> ImportProgress;
 
-    /// What became of what was there, after the last set.
+    /// Counts and losses, after the last set.
     fn facts(&self) -> ImportFacts;
 }
 
@@ -47,17 +47,17 @@ pub struct ImportProgress {
     pub total: u64,
 }
 
-/// What became of what was there.
+/// Counts and losses of an import.
 #[derive(Debug, Clone, Default, Serialize)]
 #[non_exhaustive]
 pub struct ImportFacts {
-    /// `captured = delivered + Σ dropped` of each stream, as far as the source tells.
+    /// `captured = delivered + Σ dropped` of each stream, as far as the source says.
     pub accounts: Vec<StreamAccount>,
-    /// Pictures and sets that could not be imported.
+    /// Images and sets that could not be imported.
     pub lost: u64,
     /// The first of them, in words.
     pub problems: Vec<String>,
-    /// What was assumed, inferred or left out, a sentence each.
+    /// Assumptions, inferences and omissions, a sentence each.
     pub stated: Vec<String>,
     /// How much of what was there a dataset does not hold, by what it is, such as `motion_samples`.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
@@ -74,17 +74,17 @@ impl ImportFacts {
     }
 }
 
-/// What an import made.
+/// Result of an import.
 #[derive(Debug, Serialize)]
 #[non_exhaustive]
 pub struct ImportReport {
     /// The layout.
     pub format: String,
-    /// What was recorded.
+    /// Summary of the recording.
     pub summary: Summary,
-    /// What became of what was there.
+    /// Counts and losses.
     pub facts: ImportFacts,
-    /// Whether the dataset is whole.
+    /// Whether the dataset is complete.
     pub verified: VerifyReport,
     /// Whether it was ended from outside before all was read.
     pub ended: bool,
@@ -106,18 +106,19 @@ pub fn import(
     progress: &mut dyn FnMut(ImportProgress) -> ControlFlow<()>,
 ) -> Result<ImportReport> {
     let session = importer.session()?;
-    let mut told = session.extra.get("import").and_then(toml::Value::as_table).cloned().unwrap_or_default();
+    let mut table = session.extra.get("import").and_then(toml::Value::as_table).cloned().unwrap_or_default();
     let start = UtcPair { utc_ns: session.started_utc_ns, ..UtcPair::default() };
     let pair = Arc::new(Mutex::new(start));
     let clock = {
         let pair = Arc::clone(&pair);
         Arc::new(move || *pair.lock().unwrap_or_else(PoisonError::into_inner))
     };
-    let (queue_sets, backlog) = (options.queue_sets.max(1), options.backlog_max_bytes);
+    let queue_sets = options.queue_sets.max(1);
+    let backlog = options.backlog_max_bytes;
     let recorder = Recorder::create_with(Arc::clone(&fs), clock, out, session, options)?;
     let cut = |e: Error| {
         let what = format!(
-            "{e}; what was read before stays in {} as a dataset that is not whole: remove it",
+            "{e}; what was read before stays in {} as an incomplete dataset: remove it",
             out.display()
         );
         Error::new(e.kind(), what).with_source(e)
@@ -146,8 +147,8 @@ pub fn import(
     }
     let facts = importer.facts();
     recorder.update_accounts(facts.accounts.clone());
-    conclude(&mut told, &facts, ended);
-    recorder.state("import", told);
+    conclude(&mut table, &facts, ended);
+    recorder.state("import", table);
     let summary = recorder.finish()?;
     let verified = verify_with(&fs, out, &VerifyOptions::default())?;
     // A dataset that was verified can be opened.

@@ -1,14 +1,14 @@
-//! LeRobot v3.0: each dataset becomes an episode of one LeRobot dataset, pictures in Parquet, no video.
+//! LeRobot v3.0: each dataset becomes an episode of one LeRobot dataset, images in Parquet, no video.
 //!
 //! ```text
-//! plan (no picture is read) ──▶ a table for each part, in parallel ──▶ data files, an episode in one ──▶ meta/
+//! plan (no image is read) ──▶ a table for each part, in parallel ──▶ data files, an episode in one ──▶ meta/
 //! ```
 //!
 //! `docs/exchange.md` says what LeRobot cannot hold and what becomes of it.
 
+mod encode;
 mod finish;
 mod part;
-mod picture;
 mod plan;
 mod schema;
 mod stats;
@@ -20,11 +20,11 @@ use depthrig_bus::StreamId;
 use serde::Serialize;
 use serde_json::{Value, json};
 
-/// What to do with a set that lacks a frame of some stream: LeRobot wants a picture in every cell.
+/// Treatment of a set that lacks a frame of some stream: LeRobot wants an image in every cell.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Incomplete {
-    /// A blank picture (black, no depth) stands in its place, and the column `missing.<camera>_<stream>` says so.
+    /// A blank image (black, no depth) stands in its place, and the column `missing.<camera>_<stream>` says so.
     #[default]
     Mark,
     /// The set is left out, which leaves a gap in the even grid of times.
@@ -38,7 +38,7 @@ pub struct LerobotOptions {
     pub task: Option<String>,
     /// Sets per second; without it, the rig's configuration or, where that is not what was recorded, the sets' own.
     pub fps: Option<f64>,
-    /// What to do with incomplete sets.
+    /// Treatment of incomplete sets.
     pub incomplete: Incomplete,
     /// The streams to export; none means all.
     pub streams: Vec<StreamId>,

@@ -4,12 +4,12 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
 
-/// The report in the folder of an export; it is there once the export is whole.
+/// The report in the folder of an export; it is there once the export is complete.
 pub const REPORT_FILE: &str = "export.json";
-/// Problems that are told one by one; all are counted.
+/// Problems that are listed one by one; all are counted.
 pub(super) const MAX_PROBLEMS: usize = 100;
 
-/// What was exported. Holds no time and no path, so that the same export gives the same report.
+/// Report of an export. It holds no time and no path, so that the same export gives the same report.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct ExportReport {
@@ -19,9 +19,9 @@ pub struct ExportReport {
     pub depthrig_version: String,
     /// The options that decide what is written.
     pub options: Value,
-    /// What was exported.
+    /// The exported datasets.
     pub datasets: Vec<DatasetIdentity>,
-    /// What became of each stream.
+    /// Frames exported and missing, by stream.
     pub streams: Vec<StreamCount>,
     /// Sets in the export.
     pub sets: u64,
@@ -31,7 +31,7 @@ pub struct ExportReport {
     pub files: u64,
     /// Their bytes.
     pub bytes: u64,
-    /// What the layout or the options change or leave out, known before anything was written.
+    /// Changes and omissions by the layout or the options, known before anything was written.
     pub losses: Vec<String>,
     /// How often something was counted, such as pixels that were rounded.
     pub counters: BTreeMap<String, u64>,
@@ -50,7 +50,7 @@ pub struct ExportReport {
     pub parts: u64,
 }
 
-/// What tells a dataset from another one.
+/// Identity of a dataset.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct DatasetIdentity {
@@ -58,7 +58,7 @@ pub struct DatasetIdentity {
     pub name: String,
     /// Name of the rig.
     pub rig: String,
-    /// What was in front of the cameras.
+    /// The scene in front of the cameras.
     pub scene: String,
     /// When the recording began, UTC nanoseconds since 1970.
     pub started_utc_ns: i64,
@@ -83,7 +83,7 @@ pub struct SegmentIdentity {
     pub bytes: u64,
 }
 
-/// What became of a stream.
+/// Frames of a stream, exported and missing.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StreamCount {
     /// Name of the session.
@@ -96,7 +96,7 @@ pub struct StreamCount {
     pub missing: u64,
 }
 
-/// What became of a part; kept beside the files until the export is whole.
+/// Result of a part; kept beside the files until the export is complete.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct PartRecord {
@@ -116,7 +116,7 @@ pub struct PartRecord {
     pub lost: u64,
     /// As [`ExportReport::problems`].
     pub problems: Vec<String>,
-    /// What the exporter wants to know again in [`super::Exporter::finish`].
+    /// The exporter's value for [`super::Exporter::finish`].
     pub extra: Value,
 }
 

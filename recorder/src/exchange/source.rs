@@ -40,7 +40,7 @@ impl Source {
         &self.dataset
     }
 
-    /// What was recorded, by whom, with which rig.
+    /// The session: what was recorded, by whom, with which rig.
     pub const fn session(&self) -> &Session {
         self.dataset.session()
     }
@@ -50,7 +50,7 @@ impl Source {
         self.reader.times()
     }
 
-    /// What of the dataset cannot be read, one line per segment.
+    /// Segments that cannot be read, one line each.
     pub fn problems(&self) -> &[String] {
         self.reader.problems()
     }
@@ -75,7 +75,7 @@ impl Source {
         self.segments().into_iter().flat_map(cut).collect()
     }
 
-    /// What tells this dataset from any other, and from itself after a change.
+    /// The facts that distinguish this dataset from any other, and from itself after a change.
     pub(super) fn identity(&self, fs: &dyn Fs) -> Result<DatasetIdentity> {
         let session = self.session();
         let segment = |path: &std::path::PathBuf| {

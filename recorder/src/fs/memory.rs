@@ -13,10 +13,10 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-/// What a disk writes or does not write at once, bytes.
+/// The unit that a disk writes completely or not at all, bytes.
 const SECTOR: usize = 512;
 
-/// What goes wrong on a [`MemFs`], and at which operation (numbered from 0, over all files).
+/// A fault injected into a [`MemFs`], with the operation that it hits (numbered from 0, over all files).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
     /// The operation of this number fails, and no other.
@@ -52,7 +52,7 @@ struct Move {
 struct State {
     nodes: BTreeMap<u64, Node>,
     names: BTreeMap<PathBuf, u64>,
-    /// The names that a crash leaves for sure.
+    /// The names that survive every crash.
     durable: BTreeMap<PathBuf, u64>,
     moves: Vec<Move>,
     next: u64,
@@ -71,14 +71,14 @@ struct State {
 #[derive(Debug, Clone, Default)]
 pub struct MemFs(Arc<Mutex<State>>);
 
-/// A file that is open: it stays what it is when its name changes.
+/// An open file: a change of its name does not affect it.
 struct MemFile {
     fs: MemFs,
     path: PathBuf,
     file: u64,
 }
 
-/// Ends the lock of this number, whatever its folder is called by then.
+/// Releases the lock of this number, even if its folder was renamed.
 struct Unlock(MemFs, u64);
 
 impl Drop for Unlock {
@@ -100,7 +100,7 @@ impl State {
         self.nodes.get_mut(&file).ok_or_else(|| io::ErrorKind::NotFound.into())
     }
 
-    /// Gives a folder with all below it another name, unless something is there.
+    /// Renames a folder with all below it, unless the new name exists.
     fn rename_dir(&mut self, from: &Path, to: &Path) -> io::Result<()> {
         if self.names.keys().chain(&self.dirs).any(|p| p.starts_with(to) && p != to) {
             return Err(io::ErrorKind::DirectoryNotEmpty.into());
@@ -111,12 +111,13 @@ impl State {
         self.names = renamed(std::mem::take(&mut self.names));
         self.durable = renamed(std::mem::take(&mut self.durable));
         for m in &mut self.moves {
-            (m.from, m.to) = (m.from.take().map(moved), m.to.take().map(moved));
+            m.from = m.from.take().map(moved);
+            m.to = m.to.take().map(moved);
         }
         // Joining an empty rest leaves a slash at the end, which no path of a folder has here.
         let tidy = |p: PathBuf| -> PathBuf { p.components().collect() };
         self.dirs = std::mem::take(&mut self.dirs).into_iter().map(moved).map(tidy).collect();
-        // A lock is one of the folder and not of its name.
+        // A lock belongs to the folder, not to its name.
         let locks = std::mem::take(&mut self.locks).into_iter();
         self.locks = locks.map(|(p, lock)| (tidy(moved(p)), lock)).collect();
         self.changes += 1;
@@ -128,7 +129,7 @@ impl State {
         self.changes += 1;
     }
 
-    /// Takes over the changes that `keep` says into `names`.
+    /// Applies the changes that `keep` selects to `names`.
     fn settle(&self, names: &mut BTreeMap<PathBuf, u64>, mut keep: impl FnMut(&Move) -> bool) {
         for m in self.moves.iter().filter(|m| keep(m)) {
             if let Some(from) = m.from.as_ref().filter(|from| names.get(*from) == Some(&m.file)) {
@@ -150,10 +151,11 @@ impl State {
 }
 
 impl Node {
-    /// What a crash leaves of it; `choose(n)` is any number below `n`.
+    /// The contents that a crash leaves; `choose(n)` is any number below `n`.
     fn crashed(&self, choose: &mut dyn FnMut(usize) -> usize) -> Vec<u8> {
         let durable_len = self.synced + self.old.len();
-        let (least, most) = (durable_len.min(self.data.len()), durable_len.max(self.data.len()));
+        let least = durable_len.min(self.data.len());
+        let most = durable_len.max(self.data.len());
         let len = match choose(4) {
             0 => least,
             1 => most,
@@ -204,12 +206,12 @@ impl MemFs {
         self
     }
 
-    /// How many operations were asked for so far.
+    /// Operations requested so far.
     pub fn ops(&self) -> u64 {
         self.state().ops
     }
 
-    /// How many changes of names and bytes there were so far; two states with the same number are one.
+    /// Changes of names and bytes so far; states with equal counts are equal.
     pub fn changes(&self) -> u64 {
         self.state().changes
     }
@@ -225,7 +227,7 @@ impl MemFs {
         state.nodes.get(state.names.get(path)?).map(|n| n.data.clone())
     }
 
-    /// How many bytes are durable of the file whose durable name is `path`; 0 when there is none.
+    /// Durable bytes of the file whose durable name is `path`; 0 if it does not exist.
     pub fn synced(&self, path: &Path) -> usize {
         let state = self.state();
         state.durable.get(path).and_then(|file| state.nodes.get(file)).map_or(0, |n| n.synced)
@@ -241,7 +243,7 @@ impl MemFs {
         state.durable.insert(path.to_owned(), file);
     }
 
-    /// What is left when every name is kept: of each file the synced bytes and `keep(unsynced bytes)` of the
+    /// The files after a crash that keeps every name: of each file the synced bytes and `keep(unsynced bytes)` of the
     /// rest. Faults, limits, locks and counts are gone.
     pub fn after_crash(&self, mut keep: impl FnMut(usize) -> usize) -> Self {
         let state = self.state();
@@ -256,8 +258,8 @@ impl MemFs {
         left
     }
 
-    /// What a crash of the whole computer leaves, where `choose(n)`, any number below `n`, decides what the
-    /// disk kept. Faults, limits, locks and counts are gone.
+    /// The files after a crash of the whole computer; `choose(n)`, any number below `n`, decides what the disk kept.
+    /// Faults, limits, locks and counts are gone.
     pub fn crash(&self, choose: &mut dyn FnMut(usize) -> usize) -> Self {
         let state = self.state();
         let mut names = state.durable.clone();
@@ -443,7 +445,8 @@ impl WriteFile for MemFile {
         if len < node.synced {
             let mut old = node.data[len..node.synced].to_vec();
             old.append(&mut node.old);
-            (node.old, node.synced) = (old, len);
+            node.old = old;
+            node.synced = len;
         }
         node.data.truncate(len);
         Ok(())

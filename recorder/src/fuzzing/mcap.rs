@@ -1,11 +1,11 @@
 //! Mutations that know what an MCAP file is: without them nearly every changed byte ends at a checksum or inside a
-//! compressed chunk, and what lies behind is never reached.
+//! compressed chunk, and the code behind is never reached.
 
 use crate::container::MAGIC;
 use crate::container::record::op;
 use std::collections::BTreeMap;
 
-/// No chunk of the seeds comes near; a longer one is left packed.
+/// Far longer than any chunk of the seeds; a longer one stays compressed.
 const CHUNK_MAX: usize = 1 << 16;
 /// Opcode and length.
 const HEAD: usize = 9;
@@ -19,7 +19,7 @@ const MESSAGE_HEAD: usize = 22;
 pub struct File {
     /// Opcodes and fields.
     pub records: Vec<(u8, Vec<u8>)>,
-    /// What follows the last whole record; the magic of a finished file.
+    /// The bytes after the last whole record; the magic of a finished file.
     pub tail: Vec<u8>,
 }
 
@@ -192,15 +192,16 @@ impl File {
     }
 }
 
-/// A mutation of `bytes`: of the fields of a record, of what a chunk holds (stored unpacked afterwards), or of the order
-/// of records. `change` makes other bytes of some. Checksums are put right in seven of eight cases. `None` when
+/// A mutation of `bytes`: of the fields of a record, of the contents of a chunk (stored unpacked afterwards), or of the
+/// order of records. `change` mutates single byte strings. Checksums are put right in seven of eight cases. `None` when
 /// plain bytes should be changed instead.
 pub fn mutate(bytes: &[u8], seed: u64, change: &mut dyn FnMut(&[u8]) -> Vec<u8>) -> Option<Vec<u8>> {
     let mut rng = Rng(seed);
     let kind = rng.below(8);
     let mut file = File::parse(bytes).filter(|f| kind > 0 && !f.records.is_empty())?;
     let records = &mut file.records;
-    let (at, to) = (rng.below(records.len()), rng.below(records.len()));
+    let at = rng.below(records.len());
+    let to = rng.below(records.len());
     match kind {
         1 => drop(records.remove(at)),
         2 => records.insert(to, records[at].clone()),

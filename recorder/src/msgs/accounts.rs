@@ -44,7 +44,7 @@ pub struct SetCounts {
 impl SetCounts {
     /// Sets lost for any reason.
     pub fn dropped_total(&self) -> u64 {
-        // What a damaged file says may not fit.
+        // The numbers of a damaged file may not fit.
         self.dropped.iter().fold(0, |sum, n| sum.saturating_add(*n))
     }
 

@@ -24,7 +24,7 @@ pub enum Level {
 pub struct Diagnostic {
     /// How well it is.
     pub level: Level,
-    /// What it is: `rig/camera`, `rig/clock`, …
+    /// Name of the part: `rig/camera`, `rig/clock`, …
     pub name: String,
     /// Its state in a few words.
     pub message: String,

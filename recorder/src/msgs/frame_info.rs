@@ -7,7 +7,7 @@ use crate::Result;
 use crate::cdr::{Reader, Writer};
 use depthrig_bus::{FrameHeader, Intrinsics, Pose};
 
-/// What a message says beside the header.
+/// Fields of a message beside the header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Extra<'a> {
     pub(crate) stamp_utc_ns: i64,

@@ -5,7 +5,7 @@ use crate::codec::DepthShape;
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{Distortion, FrameHeader, PixelFormat};
 
-/// The `encoding` of `sensor_msgs/msg/Image` for a format; `None` for pictures that are stored compressed.
+/// The `encoding` of `sensor_msgs/msg/Image` for a format; `None` for images that are stored compressed.
 pub(crate) const fn encoding(format: PixelFormat) -> Option<&'static str> {
     Some(match format {
         PixelFormat::Rgb8 => "rgb8",
@@ -66,7 +66,7 @@ pub(crate) fn read_image(message: &[u8]) -> Result<&[u8]> {
     r.bytes()
 }
 
-/// The picture file in a `CompressedImage`.
+/// The image file in a `CompressedImage`.
 pub(crate) fn read_compressed(message: &[u8]) -> Result<&[u8]> {
     let mut r = Reader::new(message)?;
     r.time()?;
@@ -81,7 +81,9 @@ pub(crate) fn read_compressed_depth(message: &[u8]) -> Result<(DepthShape, &str,
     r.time()?;
     r.str()?;
     // Fields in the order of the bytes.
-    let (height, width, step) = (r.u32()?, r.u32()?, r.u32()?);
+    let height = r.u32()?;
+    let width = r.u32()?;
+    let step = r.u32()?;
     Ok((DepthShape { width, height, step }, r.str()?, r.bytes()?))
 }
 
@@ -99,7 +101,7 @@ pub(crate) fn write_compressed_depth(
     w.bytes_with(fill).map(drop)
 }
 
-/// Appends a `CompressedImage` whose picture file, of this format, `fill` writes.
+/// Appends a `CompressedImage` whose image file, of this format, `fill` writes.
 pub(crate) fn write_compressed(
     buf: &mut Vec<u8>,
     stamp_utc_ns: i64,
@@ -131,8 +133,8 @@ pub(crate) fn write_camera_info(buf: &mut Vec<u8>, stamp_utc_ns: i64, frame_id: 
     w.u32(0).u32(0).u32(0).u32(0).u8(0);
 }
 
-/// What is wrong with a picture of `len` bytes under this header, if anything.
-pub(crate) fn check_picture(h: &FrameHeader, len: usize) -> Result<PixelFormat> {
+/// The pixel format of an image of `len` bytes under this header; an error if both do not agree.
+pub(crate) fn check_image(h: &FrameHeader, len: usize) -> Result<PixelFormat> {
     let bad = |why: String| {
         Err(Error::new(
             ErrorKind::BadInput,

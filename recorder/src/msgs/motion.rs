@@ -1,4 +1,4 @@
-//! What a motion unit measured: `depthrig_msgs/msg/MotionSamples`, a batch as its channel carried it, and
+//! IMU measurements: `depthrig_msgs/msg/MotionSamples`, a batch as its channel carried it, and
 //! `sensor_msgs/msg/Imu`, each of its samples for readers that know only that.
 //!
 //! CDR aligns a primitive to its size and so does the sample, therefore the elements of the array are the bytes of the
@@ -70,7 +70,7 @@ impl Imu {
         }
     }
 
-    /// Whether both measured the same; what is no number equals what is none.
+    /// Whether both measured the same; NaN equals NaN.
     pub(crate) fn same_values(&self, other: &Self) -> bool {
         let same = |a: &[f64; 3], b: &[f64; 3]| {
             a.iter().zip(b).all(|(a, b)| a.to_bits() == b.to_bits() || (a.is_nan() && b.is_nan()))
@@ -93,10 +93,11 @@ impl Imu {
         }
     }
 
-    /// What a message says, and the name of its frame.
+    /// Reads a message and the name of its frame.
     pub(crate) fn read(message: &[u8]) -> Result<(Self, &str)> {
         let mut r = Reader::new(message)?;
-        let (stamp_utc_ns, frame_id) = (r.time()?, r.str()?);
+        let stamp_utc_ns = r.time()?;
+        let frame_id = r.str()?;
         r.array::<_, 4>(Reader::f64)?;
         r.array::<_, 9>(Reader::f64)?;
         let gyro_rad_s = r.array(Reader::f64)?;

@@ -43,10 +43,10 @@ impl Schema {
         Self::Imu,
     ];
 
-    /// The types that carry a picture.
-    pub(crate) const PICTURES: [Self; 3] = [Self::Image, Self::CompressedImage, Self::CompressedDepth];
+    /// The types that carry an image.
+    pub(crate) const IMAGES: [Self; 3] = [Self::Image, Self::CompressedImage, Self::CompressedDepth];
 
-    /// The types that only a dataset with a motion unit has.
+    /// The types that only a dataset with an IMU has.
     const MOTION: [Self; 2] = [Self::MotionSamples, Self::Imu];
 
     /// The id of the schema record: 1, 2, … in the order of [`Self::ALL`].
@@ -99,7 +99,7 @@ impl Schema {
         }
     }
 
-    /// The records of all types, as they stand at the head of a segment of a recording that has motion units or not.
+    /// The records of all types, as they stand at the head of a segment of a recording that has IMUs or not.
     pub(crate) fn records(motion: bool) -> Vec<SchemaRecord> {
         let record = |s: Self| SchemaRecord {
             id: s.id(),
@@ -232,7 +232,7 @@ int64 width_ns
 ";
 
 const COMPRESSED_DEPTH: &str = "\
-# A depth picture of 16 bit, without loss. docs/dataset-format.md of depthrig, \"Depth codec\", says how data is read;
+# A depth image of 16 bit, without loss. docs/dataset-format.md of depthrig, \"Depth codec\", says how data is read;
 # the Python package depthrig has decode_depth.
 std_msgs/Header header
 uint32 height
@@ -264,7 +264,7 @@ fn frame_info() -> String {
 }
 
 const MOTION_SAMPLES: &str = "\
-# A batch of samples of a motion unit, oldest first. stamp is the time of the newest as UTC, sequence the number of the
+# A batch of samples of an IMU, oldest first. stamp is the time of the newest as UTC, sequence the number of the
 # batch on its channel; frame_info has the rest. The array is the bytes of the batch.
 builtin_interfaces/Time stamp
 uint64 sequence

@@ -1,4 +1,4 @@
-//! `tf2_msgs/msg/TFMessage` on `/tf_static`: where each optical frame and each motion unit sits on the mount.
+//! `tf2_msgs/msg/TFMessage` on `/tf_static`: where each optical frame and each IMU sits on the mount.
 
 use crate::Session;
 use crate::cdr::Writer;
@@ -14,7 +14,7 @@ pub(crate) fn optical_frame(id: &StreamId) -> String {
     format!("{}_{}_optical_frame", id.camera, id.stream)
 }
 
-/// The name of a motion unit's frame.
+/// The name of an IMU's frame.
 pub(crate) fn unit_frame(id: &StreamId) -> String {
     format!("{}_{}_frame", id.camera, id.stream)
 }

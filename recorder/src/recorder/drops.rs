@@ -1,11 +1,11 @@
 //! Logs sets that are not recorded: the first one of a reason at once, further ones as a count once a minute.
 //!
-//! A full disk or an encoder that is behind refuses every set; a line for each would bury what else the log has.
+//! A full disk or an encoder that is behind refuses every set; a line for each would bury the rest of the log.
 
 use crate::SetDrop;
 use depthrig_bus::HostTime;
 
-/// From one line about a reason to the next.
+/// Interval between two lines about a reason.
 const EVERY_NS: i64 = 60_000_000_000;
 
 /// When each reason was logged last.
@@ -29,7 +29,7 @@ pub(super) struct Counted {
 }
 
 impl DropLog {
-    /// Takes in a set; whether it is to be logged by itself.
+    /// Counts a set; returns whether to log it by itself.
     pub(super) fn add(&mut self, reason: SetDrop, now: HostTime) -> bool {
         let place = &mut self.reasons[reason as usize];
         if let Some(logged) = place {
@@ -40,7 +40,7 @@ impl DropLog {
         true
     }
 
-    /// The counts that are due. A reason that was quiet for a minute begins anew.
+    /// The counts that are due. A reason without drops for a minute starts again.
     pub(super) fn due(&mut self, now: HostTime) -> Vec<Counted> {
         let mut counts = Vec::new();
         for reason in SetDrop::ALL {

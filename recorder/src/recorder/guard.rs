@@ -1,4 +1,4 @@
-//! The disk guard: free space and stalls, looked at each second by a thread that no write can block.
+//! The disk guard: free space and stalls, checked each second by a thread that no write can block.
 
 use super::{Shared, drops};
 use crate::{Diagnostic, Error, ErrorKind, Level};
@@ -9,16 +9,16 @@ use std::collections::VecDeque;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-/// Warned at, once each: minutes that the disk lasts at the present rate.
+/// Levels of a warning, once each: minutes that the disk lasts at the present rate.
 const LEVELS_MIN: [f64; 5] = [30.0, 10.0, 5.0, 2.0, 1.0];
-/// The present rate is that of this long.
+/// The present rate is measured over this time.
 const WINDOW_NS: i64 = 10_000_000_000;
-/// A rate of less than this is no ground for a warning.
+/// A rate measured over less than this does not trigger a warning.
 const KNOWN_NS: i64 = 3_000_000_000;
-/// A write that takes this long is told.
+/// A write that takes this long is reported.
 const STALL_S: f64 = 2.0;
 
-/// How the disk stands.
+/// State of the disk.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct DiskStatus {
@@ -30,7 +30,7 @@ pub struct DiskStatus {
     pub seconds_left: Option<f64>,
     /// How long the disk has not answered, seconds; 0 when it does.
     pub stalled_s: f64,
-    /// What somebody should look at.
+    /// A warning for the operator.
     pub warning: Option<String>,
 }
 
@@ -52,12 +52,12 @@ impl DiskStatus {
     }
 }
 
-/// What is remembered from look to look.
+/// State kept between checks.
 #[derive(Debug, Default)]
 struct Watch {
-    /// When how many bytes had been produced.
+    /// Bytes produced, by time.
     window: VecDeque<(HostTime, u64)>,
-    /// Levels that were warned of.
+    /// Levels already warned about.
     warned: usize,
 }
 
@@ -80,7 +80,7 @@ impl Watch {
             return (rate, Some(left), None);
         }
         let passed = LEVELS_MIN.iter().filter(|m| left < *m * 60.0).count();
-        // Only what is clearly above a level again is warned of a second time.
+        // A second warning needs clearly more room in between.
         let back = LEVELS_MIN.iter().filter(|m| left < *m * 72.0).count();
         let warning = (passed > self.warned).then(|| {
             let free = usable / 1_000_000;
@@ -119,7 +119,7 @@ pub(super) fn run(shared: &Shared, stop: &Receiver<()>) {
                 tracing::info!(%dataset, "the disk answers again");
             }
         }
-        // Known to the status even when the question for the space does not come back.
+        // In the status even if the query for free space never returns.
         {
             let mut state = shared.lock();
             state.disk.stalled_s = if stalls { stalled_s } else { 0.0 };
@@ -158,7 +158,8 @@ impl Hurried {
         if more == 0 || self.at.is_some_and(|at| now.since_ns(at) < EVERY_NS) {
             return None;
         }
-        (self.logged, self.at) = (frames, Some(now));
+        self.logged = frames;
+        self.at = Some(now);
         Some(more)
     }
 }
@@ -168,7 +169,7 @@ fn look(shared: &Shared, watch: &mut Watch, backlog: u64) {
     let dir = shared.dir.display();
     let free = match shared.fs.available_space(&shared.dir) {
         Ok(free) => free,
-        // The file can still be written, but never be given its name: better an end now than an hour for nothing.
+        // The file can still be written, but never get its final name: end now rather than record an hour in vain.
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
             let what =
                 format!("the folder {dir} was removed while it was recorded into; what was in it is lost");
@@ -182,7 +183,9 @@ fn look(shared: &Shared, watch: &mut Watch, backlog: u64) {
     let mut state = shared.lock();
     let (rate, left, warning) =
         watch.look(HostTime::now(), state.bytes + backlog, free.saturating_sub(least));
-    (state.disk.free_bytes, state.disk.bytes_per_s, state.disk.seconds_left) = (free, rate, left);
+    state.disk.free_bytes = free;
+    state.disk.bytes_per_s = rate;
+    state.disk.seconds_left = left;
     if let Some(left) = left.filter(|_| watch.warned > 0 && state.disk.warning.is_none()) {
         state.disk.warning = Some(format!("the disk lasts {:.1} more minutes", left / 60.0));
     }
@@ -192,8 +195,8 @@ fn look(shared: &Shared, watch: &mut Watch, backlog: u64) {
     }
     if free < least {
         let what = format!(
-            "the recording {dir} was ended with {} MB left on the disk (the limit is {} MB); what was recorded is \
-             whole; free some space and start a new one",
+            "the recording {dir} was ended with {} MB left on the disk (the limit is {} MB); the sets recorded \
+             so far are complete; free some space and start a new one",
             free / 1_000_000,
             least / 1_000_000
         );

@@ -1,4 +1,4 @@
-//! How a recording stands, and how it ended.
+//! Progress of a recording, and its summary.
 
 use super::DiskStatus;
 use crate::msgs::SetCounts;
@@ -6,11 +6,11 @@ use crate::{Error, Result};
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// How a recording stands.
+/// Progress of a recording.
 #[derive(Debug, Clone, serde::Serialize)]
 #[non_exhaustive]
 pub struct Progress {
-    /// Sets offered, recorded and dropped by reason; the difference is in flight.
+    /// Sets offered, recorded and dropped by reason; the difference is not settled yet.
     pub sets: SetCounts,
     /// Frames written.
     pub frames: u64,
@@ -24,7 +24,7 @@ pub struct Progress {
     pub backlog_bytes: u64,
     /// Time from the first set to the last, nanoseconds.
     pub duration_ns: i64,
-    /// How the disk stands.
+    /// State of the disk.
     pub disk: DiskStatus,
     /// Why the recording ended before its time, if it did.
     #[serde(serialize_with = "as_text")]
@@ -39,7 +39,7 @@ fn as_text<S: serde::Serializer>(e: &Option<Arc<Error>>, s: S) -> Result<S::Ok, 
     }
 }
 
-/// What a finished recording holds.
+/// Summary of a finished recording.
 #[derive(Debug, Clone, serde::Serialize)]
 #[non_exhaustive]
 pub struct Summary {
@@ -55,8 +55,8 @@ pub struct Summary {
     pub segments: u32,
     /// Time from the first set to the last, nanoseconds.
     pub duration_ns: i64,
-    /// Whether every set handed over is there and every segment is whole.
+    /// Whether every set handed over is there and every segment is complete.
     pub complete: bool,
-    /// What was lost, in words; empty when `complete`.
+    /// Losses in words; empty when `complete`.
     pub lost: Vec<String>,
 }

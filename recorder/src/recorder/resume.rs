@@ -1,4 +1,4 @@
-//! What the finished segments of a recording hold whose recorder was killed.
+//! Reads the finished segments of a recording whose recorder was killed.
 
 use super::RESERVE_FILE;
 use super::topics::SEGMENT_METADATA;
@@ -10,7 +10,7 @@ use depthrig_bus::{HostTime, UtcPair};
 use std::path::Path;
 use std::sync::Arc;
 
-/// What was there when a recording went on.
+/// The part of a recording that was there when it was resumed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Resumed {
     /// Sets in the finished segments.
@@ -30,7 +30,7 @@ pub(super) struct Past {
     pub(super) frames: u64,
     pub(super) bytes: u64,
     pub(super) last_id: Option<u64>,
-    /// Number of the last batch of each motion unit.
+    /// Number of the last batch of each IMU.
     pub(super) last_batches: Vec<Option<u64>>,
     pub(super) anchor: Option<UtcPair>,
     pub(super) last_log_time: i64,
@@ -39,7 +39,7 @@ pub(super) struct Past {
 }
 
 impl Past {
-    /// That of a new dataset: nothing.
+    /// The empty past of a new dataset.
     pub(super) fn new(session: Session) -> Self {
         Self {
             last_batches: vec![None; session.motion.len()],
@@ -56,20 +56,21 @@ impl Past {
         }
     }
 
-    pub(super) const fn told(&self) -> Resumed {
+    pub(super) const fn resumed(&self) -> Resumed {
         Resumed { sets: self.sets, frames: self.frames, last_set: self.last_id }
     }
 }
 
-/// Removes what a killed recorder left unfinished in `dir` and reads what is finished. Pictures are not read.
+/// Removes unfinished files of a killed recorder from `dir` and reads the finished segments, without images.
 pub(super) fn past(fs: &Arc<dyn Fs>, dir: &Path) -> Result<Past> {
     let session = Session::load(&**fs, dir)?;
     if session.outcome.is_some() {
-        let message = format!("{} is whole already; nothing can be recorded into it", dir.display());
+        let message = format!("{} is already complete; nothing can be recorded into it", dir.display());
         return Err(Error::new(ErrorKind::AlreadyExists, message));
     }
     let entries = fs.read_dir(dir).map_err(|e| Error::reading("read the folder", dir, e))?;
-    let (mut numbers, mut bytes) = (Vec::new(), 0);
+    let mut numbers = Vec::new();
+    let mut bytes = 0;
     for entry in entries {
         let number = segment_number(&entry.name);
         let unfinished = number.is_some() && Path::new(&entry.name).extension().is_some_and(|e| e == "part");
@@ -85,7 +86,7 @@ pub(super) fn past(fs: &Arc<dyn Fs>, dir: &Path) -> Result<Past> {
     if let Some(missing) = (0u32..).zip(&numbers).find(|(i, n)| i != *n).map(|(i, _)| i) {
         return Err(Error::new(
             ErrorKind::Corrupt,
-            format!("{} has no segment number {missing}, but later ones; begin anew", dir.display()),
+            format!("{} has no segment number {missing}, but later ones; start over", dir.display()),
         ));
     }
     let mut past = Past { segments: numbers.len() as u32, bytes, ..Past::new(session) };
@@ -99,7 +100,8 @@ pub(super) fn past(fs: &Arc<dyn Fs>, dir: &Path) -> Result<Past> {
         let Some(last) = dataset.segments().last().filter(|_| loses(&dataset)) else { break dataset };
         let size = fs.open(last).and_then(|f| f.size()).unwrap_or(0);
         fs.remove_file(last).map_err(|e| Error::io("remove", last, e))?;
-        (past.segments, past.bytes) = (past.segments - 1, past.bytes - size.min(past.bytes));
+        past.segments -= 1;
+        past.bytes -= size.min(past.bytes);
         if past.segments == 0 {
             return Ok(past);
         }
@@ -121,7 +123,7 @@ pub(super) fn past(fs: &Arc<dyn Fs>, dir: &Path) -> Result<Past> {
     Ok(past)
 }
 
-/// Whether the last segment tells of sets that were not recorded.
+/// Whether the last segment records sets as dropped.
 fn loses(dataset: &Dataset) -> bool {
     let last = dataset.segments().len().checked_sub(1).and_then(|n| dataset.open_segment(n));
     let Some(Ok(last)) = last else { return false };

@@ -1,9 +1,9 @@
 //! A set on its way: the workers fill its slots in any order, the writer takes tickets in order.
 //!
 //! Where a set has a deadline, frames whose turn comes in the second half of the time until then are encoded with the
-//! least effort, which makes encoders that are behind several times faster. When that does not do, they must not spend
-//! themselves on sets that miss their deadline: a set is given up before its first frame is encoded when even so it would
-//! take longer than it has left, and whenever its deadline passes.
+//! least effort, which makes encoders that are behind several times faster. When that is not enough, they must not
+//! work on sets that miss their deadline: a set is given up before its first frame is encoded if even the least effort
+//! would take longer than it has left, and whenever its deadline passes.
 
 use crate::encode::{Effort, EncodedFrame};
 use crate::frame::{RecordFrame, RecordMotion, RecordSet};
@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicI64, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-/// How full the two queues are.
+/// Fill levels of the two queues.
 #[derive(Debug, Default)]
 pub(super) struct Load {
     /// Sets that wait for an encoder.
@@ -22,11 +22,11 @@ pub(super) struct Load {
     pub(super) backlog_bytes: AtomicU64,
     /// How long encoding a set with the least effort takes at present, from its first frame to its last.
     hurried_ns: AtomicI64,
-    /// Frames that were encoded so.
+    /// Frames encoded with the least effort.
     pub(super) hurried: AtomicU64,
 }
 
-/// What the encoders made of a set.
+/// The outcome of encoding a set.
 pub(super) enum Encoded {
     /// Its frames.
     Frames(Vec<EncodedFrame>),
@@ -48,7 +48,7 @@ pub(super) struct Ticket {
     pub(super) missing: Vec<usize>,
     /// Stream and header of each frame, `set_id` filled in.
     pub(super) frames: Vec<(usize, FrameHeader)>,
-    /// The batches of the motion units, `set_id` filled in.
+    /// The batches of the IMUs, `set_id` filled in.
     pub(super) motion: Vec<RecordMotion>,
     /// When it is given up.
     pub(super) due: Option<HostTime>,
@@ -97,7 +97,7 @@ impl Ticket {
         for batch in &mut motion {
             batch.header.set_id = set.id;
         }
-        // Samples wait for the writer as encoded pictures do.
+        // Samples wait for the writer as encoded images do.
         let bytes = motion.iter().map(RecordMotion::stored_bytes).sum();
         load.backlog_bytes.fetch_add(bytes, Ordering::Relaxed);
         let done = frames.iter().map(|_| None).collect();
@@ -126,7 +126,7 @@ impl Ticket {
         mono_ns.saturating_add(self.utc_offset_ns)
     }
 
-    /// What became of its frames; `None` when that is open after `timeout`.
+    /// Waits for its frames to be encoded; `None` if they are not after `timeout`.
     pub(super) fn wait(&self, timeout: Duration) -> Option<Encoded> {
         let slots = self.lock();
         let waited = self.ready.wait_timeout_while(slots, timeout, |s| s.left > 0 && !s.given_up);
@@ -155,13 +155,13 @@ impl Ticket {
 
     fn give_up_locked(&self, slots: &mut Slots) {
         slots.given_up = true;
-        // What was encoded already is of no use any more.
+        // Frames already encoded are of no use any more.
         slots.done.iter_mut().filter(|d| d.is_some()).for_each(|d| *d = Some(Err(given_up())));
         self.ready.notify_all();
     }
 
-    /// How a frame of the set is to be encoded now; `None` when the set is given up. That is decided with its first frame: a
-    /// set that is expected to miss its deadline leaves its turn to the next one.
+    /// How to encode a frame of the set now; `None` if the set is given up. That is decided with its first frame: a set
+    /// that is expected to miss its deadline leaves its turn to the next one.
     fn admit(&self) -> Option<Effort> {
         let mut slots = self.lock();
         if slots.given_up {
@@ -175,7 +175,7 @@ impl Ticket {
         if slots.begun.is_none() {
             let expected = self.load.hurried_ns.load(Ordering::Relaxed);
             if effort == Effort::Least && expected > left {
-                // So that one is tried in the end, however slow the last ones were.
+                // So that a set is tried again in the end, however slow the last ones were.
                 self.load.hurried_ns.store(expected / 8 * 7, Ordering::Relaxed);
                 self.give_up_locked(&mut slots);
                 return None;
@@ -190,7 +190,7 @@ impl Ticket {
         self.slots.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What this set added to [`Load::backlog_bytes`].
+    /// The bytes that this set added to [`Load::backlog_bytes`].
     pub(super) fn taken_bytes(&self) -> u64 {
         self.lock().bytes
     }

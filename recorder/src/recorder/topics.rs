@@ -11,16 +11,16 @@ use crate::{IMAGE_MAX_BYTES, MotionRecord, RecorderOptions, Result, Session};
 use depthrig_bus::{FrameHeader, MOTION_SAMPLE_BYTES, PixelFormat};
 use std::collections::BTreeMap;
 
-/// The metadata record that makes an MCAP file one of ours.
+/// The metadata record that marks an MCAP file as a depthrig segment.
 pub(crate) const SESSION_METADATA: &str = "depthrig.session";
 /// The metadata record at the end of a segment.
 pub(crate) const SEGMENT_METADATA: &str = "depthrig.segment";
-/// What `frame_info` says of how a batch of motion samples is stored.
+/// The codec of an IMU batch in `frame_info`.
 pub(crate) const MOTION_CODEC: &str = "samples";
 /// The attachment with the rig's configuration.
 const RIG_ATTACHMENT: &str = "rig.toml";
 
-/// Channels that a file has once.
+/// Channels that exist once per file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Global {
     FrameSet,
@@ -72,17 +72,17 @@ impl Global {
     }
 }
 
-/// The picture channel of the stream of this index; its camera information and frame information follow.
+/// The image channel of the stream of this index; its camera information and frame information follow.
 pub(crate) const fn image_channel(stream: usize) -> u16 {
     (Global::ALL.len() + 1 + 3 * stream) as u16
 }
 
-/// The frame information of the motion unit of this index; its batches and its samples follow.
+/// The frame information of the IMU of this index; its batches and its samples follow.
 const fn motion_channel(streams: usize, unit: usize) -> u16 {
     image_channel(streams) + 3 * unit as u16
 }
 
-/// A motion unit.
+/// An IMU.
 pub(super) struct Unit {
     name: String,
     pub(super) frame_id: String,
@@ -94,7 +94,7 @@ pub(super) struct Unit {
 
 pub(crate) struct Topics {
     frame_ids: Vec<String>,
-    /// Picture formats as announced, with width and height.
+    /// Image formats as announced, with width and height.
     formats: Vec<PixelFormat>,
     names: Vec<String>,
     codecs: Vec<Codec>,
@@ -132,7 +132,7 @@ impl Topics {
         &self.names[stream]
     }
 
-    /// What makes a set impossible to record, in words; after the set `last_id` and these batches of each motion unit.
+    /// Checks that a set can be recorded after the set `last_id` and these batches of each IMU; the error in words.
     pub(super) fn check(
         &self,
         set: &RecordSet,
@@ -151,10 +151,10 @@ impl Topics {
             }
         }
         for f in &set.frames {
-            let format =
-                image::check_picture(&f.header, f.pixels.bytes().len()).map_err(|e| e.to_string())?;
+            let format = image::check_image(&f.header, f.pixels.bytes().len()).map_err(|e| e.to_string())?;
             if u64::from(f.header.payload_len) > IMAGE_MAX_BYTES {
-                let (name, bytes) = (&self.names[f.stream], f.header.payload_len);
+                let name = &self.names[f.stream];
+                let bytes = f.header.payload_len;
                 return Err(format!("an image of {name} has {bytes} bytes, {IMAGE_MAX_BYTES} is the limit"));
             }
             let announced = self.formats[f.stream];
@@ -170,15 +170,16 @@ impl Topics {
         self.check_motion(&set.motion, last_batches)
     }
 
-    /// What is wrong with the batches of a set, in words.
+    /// Checks the IMU batches of a set; the error in words.
     fn check_motion(&self, motion: &[RecordMotion], last_batches: &[Option<u64>]) -> Result<(), String> {
         let mut last = last_batches.to_vec();
         let mut bytes = 0;
         for batch in motion {
             let Some((unit, last)) = self.units.get(batch.unit).zip(last.get_mut(batch.unit)) else {
-                return Err(format!("motion unit number {} is not in the session", batch.unit));
+                return Err(format!("IMU number {} is not in the session", batch.unit));
             };
-            let (h, name) = (&batch.header, &unit.name);
+            let h = &batch.header;
+            let name = &unit.name;
             check_batch(h, batch.samples.len(), unit.batch)
                 .map_err(|why| format!("batch {} of {name}: {why}", h.sequence))?;
             if let Some(before) = last.filter(|before| h.sequence <= *before) {
@@ -207,8 +208,8 @@ impl Topics {
             .collect();
         for (i, s) in session.streams.iter().enumerate() {
             let base = format!("/{rig}/{}/{}", s.id.camera, s.id.stream);
-            // One folder per stream: viewers match a picture with the camera_info beside it.
-            let (picture, schema) = match self.codecs[i] {
+            // One folder per stream: viewers match an image with the camera_info beside it.
+            let (image, schema) = match self.codecs[i] {
                 Codec::Raw => ("image_raw", Schema::Image),
                 Codec::Jpeg | Codec::Mjpeg | Codec::Png => ("image_compressed", Schema::CompressedImage),
                 Codec::Rank => ("depth_compressed", Schema::CompressedDepth),
@@ -227,17 +228,17 @@ impl Topics {
             ];
             let mut metadata: BTreeMap<_, _> = facts.map(|(k, v)| (k.to_owned(), v)).into();
             metadata.extend([qos(false)]);
-            for made in session.computed.iter().filter(|c| c.stream == s.id) {
+            for computed in session.computed.iter().filter(|c| c.stream == s.id) {
                 let facts = [
-                    ("computed", &made.name),
-                    ("producer", &made.producer),
-                    ("parameters", &made.parameters),
+                    ("computed", &computed.name),
+                    ("producer", &computed.producer),
+                    ("parameters", &computed.parameters),
                 ];
                 metadata.extend(facts.map(|(k, v)| (k.to_owned(), v.clone())));
             }
             let id = image_channel(i);
             let topics =
-                [(picture, schema), ("camera_info", Schema::CameraInfo), ("frame_info", Schema::FrameInfo)];
+                [(image, schema), ("camera_info", Schema::CameraInfo), ("frame_info", Schema::FrameInfo)];
             for (k, (name, schema)) in topics.into_iter().enumerate() {
                 channels.push(Channel {
                     id: id + k as u16,
@@ -273,7 +274,7 @@ impl Topics {
     }
 }
 
-/// What is wrong with a batch of `n` samples under this header, where a batch has `most` at most; in words.
+/// Checks a batch of `n` samples under this header, where a batch has `most` at most; the error in words.
 pub(crate) fn check_batch(header: &FrameHeader, n: usize, most: u32) -> Result<(), String> {
     let FrameHeader { width, height, stride, payload_len, format, .. } = *header;
     if PixelFormat::from_code(format) != Some(PixelFormat::Motion) {
@@ -293,7 +294,7 @@ pub(crate) fn check_batch(header: &FrameHeader, n: usize, most: u32) -> Result<(
     Ok(())
 }
 
-/// The three channels of a motion unit.
+/// The three channels of an IMU.
 fn unit_channels(rig: &str, unit: &MotionRecord, u: &Unit) -> [Channel; 3] {
     let facts = [
         ("stream", u.name.clone()),
@@ -320,7 +321,7 @@ fn unit_channels(rig: &str, unit: &MotionRecord, u: &Unit) -> [Channel; 3] {
 }
 
 /// The QoS profile that profile `ros2` demands, as rosbag2 writes it: keep the last ten, reliable, volatile;
-/// or transient local, which gives `/tf_static` to who comes late.
+/// or transient local, which delivers `/tf_static` to late joiners.
 fn qos(latched: bool) -> (String, String) {
     let durability = if latched { 1 } else { 2 };
     let forever = "\n    sec: 9223372036\n    nsec: 854775807\n";

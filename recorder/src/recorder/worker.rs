@@ -13,7 +13,7 @@ use std::sync::Arc;
 const NICE: i32 = 2;
 
 pub(super) fn run(shared: &Shared, queue: &Receiver<Job>) {
-    // On Linux this is the calling thread. Being refused costs nothing but the politeness.
+    // On Linux this is the calling thread. Failure is harmless: the thread keeps its priority.
     let _ = rustix::process::setpriority_process(None, NICE);
     let mut encoder = FrameEncoder::new(&shared.options, &shared.pool);
     while let Ok(job) = queue.recv() {
@@ -31,7 +31,7 @@ pub(super) fn run(shared: &Shared, queue: &Receiver<Job>) {
                 encoder.encode(job, effort)
             });
         });
-        // A picture that makes an encoder panic must cost one set, not the recording.
+        // An image that makes an encoder panic must cost one set, not the recording.
         if catch_unwind(encode).is_err() {
             encoder = FrameEncoder::new(&shared.options, &shared.pool);
             tracing::error!(set = ticket.id, "an encoder panicked; the set is lost");

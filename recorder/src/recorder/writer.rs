@@ -23,11 +23,11 @@ use std::sync::atomic::Ordering;
 const SAY_EVERY_NS: i64 = 100_000_000;
 /// An operation that took this long was a stall of the disk.
 const STALL_NS: i64 = 300_000_000;
-/// Sets that waited for a stalled disk are written late all the same, but only once in this long: a disk that is slow for
-/// good must not let sets grow older and older.
+/// Interval in which sets that waited for a stalled disk may be written late once: a permanently slow disk must not let
+/// sets grow older and older.
 const FORGIVE_EVERY_NS: i64 = 10_000_000_000;
 
-/// What the present segment holds so far.
+/// The sets in the present segment so far.
 #[derive(Default, Clone, Copy)]
 struct Within {
     sets: u64,
@@ -42,7 +42,7 @@ pub(super) struct Writer {
     segment: Option<Segment>,
     /// Index of the present segment, or of the next one.
     index: u32,
-    /// What is in the present segment once it has its head chunk.
+    /// The sets in the present segment, once it has its head chunk.
     in_segment: Option<Within>,
     builder: ChunkBuilder,
     sequence: u32,
@@ -50,7 +50,7 @@ pub(super) struct Writer {
     next_sync: HostTime,
     /// Dropped sets as the file has them.
     said: u64,
-    /// When they may be written again.
+    /// The next time to write them.
     next_say: HostTime,
     /// Sets with a tick before this are not late: the disk had stalled.
     forgiven: HostTime,
@@ -114,7 +114,7 @@ impl Writer {
         self.summary()
     }
 
-    /// Waits for a set's frames and writes it, or counts why not.
+    /// Waits for a set's frames and writes it, or counts it as dropped.
     fn take(&mut self, ticket: &Ticket) {
         let encoded = loop {
             let until = ticket.due.map_or(self.next_look(), |due| due.min(self.next_look()));
@@ -161,7 +161,7 @@ impl Writer {
         }
     }
 
-    /// When there is something to do besides sets.
+    /// The next time of work besides sets.
     fn next_look(&self) -> HostTime {
         match self.shared.options.late_after_ns {
             Some(_) => self.next_sync.min(HostTime::now().plus_ns(SAY_EVERY_NS)),
@@ -200,7 +200,7 @@ impl Writer {
         Ok(())
     }
 
-    /// Writes a set whole: its pictures, then the chunk that describes them and ends in the commit mark.
+    /// Writes a complete set: its images, then the chunk that describes them and ends in the commit mark.
     fn write_set(&mut self, ticket: &Ticket, frames: Vec<EncodedFrame>) -> Result<()> {
         let options = &self.shared.options;
         let full = self.segment.as_ref().is_some_and(|s| {
@@ -251,7 +251,7 @@ impl Writer {
         Ok(())
     }
 
-    /// What a segment must say once, at the time of its first set.
+    /// The messages that a segment has once, at the time of its first set.
     fn head_chunk(&mut self, ticket: &Ticket) -> Result<Chunk> {
         let session = self.shared.lock().session.clone();
         let log_time = ticket.log_time;
@@ -307,11 +307,12 @@ impl Writer {
         self.builder.pack(true)
     }
 
-    /// What the motion units sent since the set before: a batch as its channel carried it, then its samples one by one.
+    /// Writes the IMU batches since the set before: each batch as its channel carried it, then its samples one by one.
     fn motion(&mut self, ticket: &Ticket) {
         let shared = Arc::clone(&self.shared);
         for batch in &ticket.motion {
-            let (h, unit) = (&batch.header, shared.topics.unit(batch.unit));
+            let h = &batch.header;
+            let unit = shared.topics.unit(batch.unit);
             let stamp_utc_ns = ticket.utc_ns(h.capture_time_ns);
             let extra = Extra { stamp_utc_ns, frame_id: &unit.frame_id, codec: MOTION_CODEC };
             let head = |channel, sequence: u64, stamp_utc_ns: i64| MessageHead {
@@ -358,10 +359,11 @@ impl Writer {
         self.message(Global::Clock, log_time, stamp, |b| frame_set::write_clock_pair(b, stamp, pair));
     }
 
-    /// The accounts of what has been settled: sets in flight are not in them.
+    /// Writes the accounts of settled sets; sets still being encoded or written are not in them.
     fn accounts(&mut self, log_time: i64) {
         let state = self.shared.lock();
-        let (mut counts, streams) = (state.counts, state.accounts.clone());
+        let mut counts = state.counts;
+        let streams = state.accounts.clone();
         drop(state);
         counts.offered = counts.recorded + counts.dropped_total();
         self.said = counts.dropped_total();
@@ -552,7 +554,7 @@ impl Writer {
             lost.push(format!("{n} of {} sets were not recorded: {}", counts.offered, reason.name()));
         }
         for part in &self.unfinished {
-            lost.push(format!("{part} could not be finished; `depthrig recover` makes it whole"));
+            lost.push(format!("{part} could not be finished; `depthrig recover` repairs it"));
         }
         let ended = self.last_log_time.unwrap_or(state.session.started_utc_ns);
         state.session.outcome = Some(Outcome::new(ended, &counts, lost.clone()));

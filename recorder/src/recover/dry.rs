@@ -1,6 +1,6 @@
-//! A file system on which a recovery changes nothing: a dry run is a recovery on it, and so says the same.
+//! A file system on which a recovery changes nothing: a dry run is a recovery on it, so both report the same.
 //!
-//! What is written stays in memory, but for the chunks of a copy: they lie in the original, where
+//! Written data stays in memory, except for the chunks of a copy: they lie in the original, where
 //! [`DryFs::refer`] says they do.
 
 use crate::fs::{DirEntry, Fs, ReadFile, WriteFile};
@@ -13,7 +13,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 /// A file system over another one, which it never changes.
 pub(super) struct DryFs {
     under: Arc<dyn Fs>,
-    /// What names mean here where that is not what they mean below; `None` for one that is gone.
+    /// Names that differ here from the file system below; `None` for a removed one.
     names: Mutex<BTreeMap<PathBuf, Option<Place>>>,
 }
 
@@ -22,11 +22,11 @@ pub(super) struct DryFs {
 enum Place {
     /// In a file of the file system below, by its name there.
     Under(PathBuf),
-    /// Here.
+    /// In memory.
     New(NewFile),
 }
 
-/// A file that was made here.
+/// A file created by the dry run.
 #[derive(Clone, Default)]
 struct NewFile(Arc<Mutex<Pieces>>);
 
@@ -35,7 +35,7 @@ struct NewFile(Arc<Mutex<Pieces>>);
 struct Pieces {
     parts: Vec<Piece>,
     len: u64,
-    /// The file that pieces lie in that are not here.
+    /// The file of the pieces that are not in memory.
     original: Option<Arc<dyn ReadFile>>,
 }
 
@@ -66,7 +66,7 @@ impl DryFs {
         Self { under, names: Mutex::default() }
     }
 
-    /// Forgets bytes of the file `copy` that were just written, as they lie in `original`; in the order of their places.
+    /// Drops bytes of the file `copy` that were just written, as they are in `original`; in the order of their places.
     pub(super) fn refer(&self, copy: &Path, original: &Path, same: &[Same]) -> io::Result<()> {
         let Some(Place::New(file)) = self.place(copy)? else { return Ok(()) };
         let mut pieces = lock(&file.0);
@@ -83,7 +83,7 @@ impl DryFs {
         lock(&self.names)
     }
 
-    /// Where the file `path` is; `None` when there is none.
+    /// The place of the file `path`; `None` if it does not exist.
     fn place(&self, path: &Path) -> io::Result<Option<Place>> {
         if let Some(place) = self.names().get(path) {
             return Ok(place.clone());
@@ -105,7 +105,7 @@ impl DryFs {
         }
     }
 
-    /// Says what a change in the folder of `path` would be answered.
+    /// Returns the error that a change in the folder of `path` would return.
     fn check(&self, path: &Path) -> io::Result<()> {
         self.under.may_write(folder_of(path))
     }
@@ -222,7 +222,7 @@ impl Pieces {
         self.parts.push(Piece { at, len: bytes.len() as u64, bytes: Bytes::Here(bytes.to_vec()) });
     }
 
-    /// Puts a reference in the place of bytes that are here, in one piece.
+    /// Replaces bytes in memory with a reference, in one piece.
     fn refer(&mut self, same: Same) {
         let end = same.at + same.len;
         let holds = |p: &Piece| p.at <= same.at && end <= p.at + p.len;

@@ -1,4 +1,4 @@
-//! Whether a segment is whole, and what it says of itself.
+//! Whether a segment is complete, and the facts that it records about itself.
 
 use crate::container::scan::SegmentReader;
 use crate::fs::Fs;
@@ -11,7 +11,7 @@ use crate::{Result, SetCounts};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// What a whole segment says of itself.
+/// The facts that a complete segment records about itself.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Facts {
     pub(super) bytes: u64,
@@ -25,9 +25,9 @@ pub(super) struct Facts {
     pub(super) counts: Option<SetCounts>,
     /// Whether the recording was closed with this segment.
     pub(super) last: bool,
-    /// What ended the recording before its time.
+    /// The error that ended the recording before its time.
     pub(super) error: Option<String>,
-    /// What a recovery found lost in it.
+    /// Losses that recoveries found in it.
     pub(super) lost: Vec<String>,
     /// Sets that recoveries found lost in it, at most.
     pub(super) sets_lost: u64,
@@ -53,7 +53,7 @@ impl Facts {
     }
 }
 
-/// What the segment says of itself by its index; `None` when it is unfinished or its index is damaged.
+/// The facts of a segment by its index; `None` if it is unfinished or its index is damaged.
 pub(super) fn indexed(fs: &dyn Fs, path: &Path) -> Result<Option<Facts>> {
     let found = (|| {
         let mut reader = SegmentReader::open_bare(fs, path)?;
@@ -69,11 +69,12 @@ pub(super) fn indexed(fs: &dyn Fs, path: &Path) -> Result<Option<Facts>> {
     }
 }
 
-/// What a finished segment says, from its index and its last few chunks.
+/// The facts of a finished segment, from its index and its last few chunks.
 fn facts_of(reader: &SegmentReader) -> Result<Facts> {
     let channel = |s: Schema| reader.channels.iter().find(|(_, c)| c.schema == s.name()).map(|(id, _)| *id);
     let mut facts = Facts { bytes: reader.size, ..Facts::default() };
-    let (marks, counts) = (channel(Schema::FrameSet), channel(Schema::Accounts));
+    let marks = channel(Schema::FrameSet);
+    let counts = channel(Schema::Accounts);
     let with =
         |id: Option<u16>| reader.chunks.iter().filter(move |c| id.is_some_and(|id| c.channels.contains(&id)));
     facts.sets = with(marks).count() as u64;
@@ -86,13 +87,14 @@ fn facts_of(reader: &SegmentReader) -> Result<Facts> {
                 if first {
                     facts.first_set = Some(mark.id);
                 }
-                (facts.last_set, facts.offered) = (Some(mark.id), mark.sets_offered);
+                facts.last_set = Some(mark.id);
+                facts.offered = mark.sets_offered;
                 facts.last_log_time = Some(m.log_time);
             }
             Ok(())
         })?;
     }
-    // One that cannot be read is none; `verify` tells of it.
+    // An unreadable account counts as missing; `verify` reports it.
     for entry in with(counts).rev() {
         reader.messages(entry, |m| {
             if Some(m.channel) == counts

@@ -1,6 +1,6 @@
-//! What stands before the first chunk of a segment: proven, or made anew.
+//! The head of a segment, all before its first chunk: proven, or rebuilt.
 //!
-//! A checksum over all bytes before the first chunk proves a head as it stands. Where there is none, such as after damage
+//! A checksum over all bytes before the first chunk proves a head as it stands. Without one, such as after damage
 //! or in the first second of a recording, the head is compared with the one that the recorder writes for this session,
 //! and that one is taken where they differ.
 
@@ -21,7 +21,7 @@ pub(super) struct Head {
     pub(super) preamble: Preamble,
     /// Where the first chunk begins, or may begin.
     pub(super) first: u64,
-    /// Whether it is another one than stands in the file.
+    /// Whether it differs from the head in the file.
     pub(super) rebuilt: bool,
 }
 
@@ -83,7 +83,7 @@ impl HeadSearch<'_> {
         Ok(Head { preamble, first: own.first, rebuilt })
     }
 
-    /// The head that this segment should have: that of another one, or the one that the recorder writes for this session.
+    /// The head that this segment should have: that of another one, or that which the recorder writes for the session.
     /// Without a set nothing shows how images are stored; its `own` head does.
     fn made_head(
         &self,
@@ -126,9 +126,9 @@ impl HeadSearch<'_> {
     }
 }
 
-/// The head `own` as far as it is that of the recorder, `made`. What only `own` has is kept: another version may say more
-/// in its metadata. The texts of the session differ by what was noted and edited since; `own` has the one of that time, if
-/// it `names` the session.
+/// The head `own`, corrected to that of the recorder, `made`. Extra keys of `own` are kept: another version may have
+/// more metadata. The texts of the session differ by later notes and edits; `own` has the text of its time, if it
+/// `names` the session.
 fn mended(own: &Preamble, made: Preamble, names: bool) -> Preamble {
     let mut mended = made;
     for (name, map) in &mut mended.metadata {
@@ -139,7 +139,7 @@ fn mended(own: &Preamble, made: Preamble, names: bool) -> Preamble {
     mended
 }
 
-/// Finds out how the pictures of a set are stored.
+/// Finds out how the images of a set are stored.
 fn codecs(
     reader: &SegmentReader,
     set: &SetGroup,

@@ -1,11 +1,11 @@
-//! What a recovery could not copy, in numbers and in words.
+//! The losses of a recovery, in numbers and in words.
 
 use super::{LostBytes, RecoveredSegment};
 use crate::container::copy::{Damage, DamageKind};
 use depthrig_bus::UtcPair;
 use std::collections::BTreeMap;
 
-/// What did not make it into the copy.
+/// Everything that is not in the copy.
 #[derive(Debug, Default)]
 pub(super) struct Lost {
     pub(super) bytes: u64,
@@ -41,12 +41,13 @@ impl Lost {
         let mut words = Vec::new();
         let file = &self.file;
         if self.head_rebuilt {
-            words.push(format!("{file}: its head was damaged and was made anew from the session"));
+            words.push(format!("{file}: its head was damaged and was rebuilt from the session"));
         }
         for d in &self.damage {
-            let (n, why) = (d.to - d.from, &d.why);
+            let n = d.to - d.from;
+            let why = &d.why;
             words.push(match d.kind {
-                DamageKind::Tail => format!("{file}: its last {n} bytes are no whole record"),
+                DamageKind::Tail => format!("{file}: its last {n} bytes are an incomplete record"),
                 DamageKind::Torn => format!("{file}: {n} bytes from byte {} are {why}", d.from),
                 DamageKind::Empty => format!("{file}: {why}"),
                 DamageKind::Bytes => format!("{file}: {n} bytes from byte {} are damaged: {why}", d.from),
@@ -64,14 +65,14 @@ impl Lost {
             (n, 0) => words.push(format!("{file}: {n} sets are lost, as the recording counted")),
             (n, _) => words.push(format!("{file}: {n} sets more are lost, as the recording counted")),
         }
-        // A line each, also where a damaged name is quoted: they are compared after they were written and read.
+        // One line each, even with a damaged name quoted: they are compared after being written and read.
         for line in &mut words {
             *line = line.replace(|c: char| c.is_control(), "?");
         }
         words
     }
 
-    pub(super) fn tell(&self, segment: &mut RecoveredSegment) {
+    pub(super) fn fill_in(&self, segment: &mut RecoveredSegment) {
         segment.bytes = self.bytes;
         segment.tail_bytes = self.tail_bytes();
         segment.torn_sets = self.torn_sets();

@@ -1,4 +1,4 @@
-//! One segment: whether it is whole, and if not, a proven copy of what is.
+//! One segment: whether it is complete, and if not, a verified copy of its complete sets.
 
 use super::TEMPORARY;
 use super::dry::{DryFs, Same};
@@ -26,10 +26,10 @@ pub(super) const WINDOW: u64 = 1 << 20;
 /// Room that a copy takes beside what it copies: index, footer, metadata.
 const SPARE: u64 = 1 << 20;
 
-/// Told how many bytes of a segment are done; its error ends the work.
-pub(super) type Tell<'a> = &'a mut dyn FnMut(u64) -> Result<()>;
+/// Called with the bytes of a segment done so far; its error ends the work.
+pub(super) type OnProgress<'a> = &'a mut dyn FnMut(u64) -> Result<()>;
 
-/// The name of the copy of `path` until it is proven.
+/// The name of the copy of `path` until it is verified.
 pub(super) fn temporary(path: &Path) -> PathBuf {
     let segment =
         if path.extension().is_some_and(|e| e == "part") { path.with_extension("") } else { path.into() };
@@ -39,7 +39,7 @@ pub(super) fn temporary(path: &Path) -> PathBuf {
 /// A segment to be copied.
 pub(super) struct Rebuild<'a> {
     pub(super) fs: &'a dyn Fs,
-    /// The same, when nothing is to be changed.
+    /// The same file system, in a dry run.
     pub(super) dry: Option<&'a DryFs>,
     pub(super) dir: &'a Path,
     pub(super) path: &'a Path,
@@ -49,17 +49,17 @@ pub(super) struct Rebuild<'a> {
     pub(super) before: Before,
 }
 
-/// What of a segment is not to be copied.
+/// The parts of a segment to leave out of its copy.
 #[derive(Default)]
 pub(super) struct Choice {
     /// Why, by where its chunks begin in the original.
     refused: BTreeMap<u64, String>,
-    /// Whether its own head is not to be used.
+    /// Whether to replace its own head.
     pub(super) foreign_head: bool,
 }
 
 impl Choice {
-    /// Leaves out what was found broken in a copy; whether that is more than before.
+    /// Leaves out the parts of a copy with findings; returns whether that is more than before.
     pub(super) fn leave_out(&mut self, copy: &Rebuilt, broken: &[Finding]) -> bool {
         let known = self.refused.len();
         for finding in broken {
@@ -68,11 +68,11 @@ impl Choice {
             }
         }
         let more = self.refused.len() > known;
-        // What no chunk is to blame for is in the head.
+        // Damage outside the chunks is in the head.
         more || !std::mem::replace(&mut self.foreign_head, true)
     }
 
-    /// The damage that a group is, if one of its chunks is refused.
+    /// The group as damage, if one of its chunks is refused.
     fn refusal(&self, group: &Group) -> Option<Damage> {
         let (offsets, end, set): (&[u64], _, _) = match group {
             Group::Set(set) => {
@@ -88,7 +88,7 @@ impl Choice {
     }
 }
 
-/// What the segments before one hold.
+/// The state after the segments before one.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Before {
     /// Id of the last set.
@@ -141,15 +141,15 @@ impl Rebuilt {
 }
 
 impl Rebuild<'_> {
-    /// Copies what is whole into the temporary file and proves that.
-    pub(super) fn run(&self, choice: &Choice, tell: Tell<'_>) -> Result<Rebuilt> {
+    /// Copies the complete sets into the temporary file and verifies it.
+    pub(super) fn run(&self, choice: &Choice, on_progress: OnProgress<'_>) -> Result<Rebuilt> {
         let reader = SegmentReader::open_any(self.fs, self.path)?;
         let file = self.path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let mut lost = Lost { bytes: reader.size, file, ..Lost::default() };
         let search =
             HeadSearch { fs: self.fs, path: self.path, segments: self.segments, session: self.session };
         let head = search.run(&reader, choice.foreign_head)?;
-        // A file that was only just created has nothing to lose.
+        // A file that was just created has nothing to lose.
         lost.head_rebuilt = head.rebuilt && reader.size > 0;
         if reader.size == 0 && self.had_content() {
             let why = "the file is empty".to_owned();
@@ -161,10 +161,10 @@ impl Rebuild<'_> {
         let done =
             Segment::create_as(self.fs, &temporary, temporary.clone(), &head.preamble).and_then(|copy| {
                 let mut copy = copy;
-                let done = self.copy(&reader, &head, choice, &mut copy, &mut lost, tell)?;
+                let done = self.copy(&reader, &head, choice, &mut copy, &mut lost, on_progress)?;
                 let (end, crc) = copy.checkpoint();
                 copy.seal()?;
-                // What was not written cannot differ from what was to be.
+                // Nothing was written that could differ.
                 if self.dry.is_none() {
                     self.prove(&reader, &temporary, end, crc, &done.copied)?;
                 }
@@ -213,7 +213,7 @@ impl Rebuild<'_> {
         choice: &Choice,
         copy: &mut Segment,
         lost: &mut Lost,
-        tell: Tell<'_>,
+        on_progress: OnProgress<'_>,
     ) -> Result<Done> {
         let preamble = &own.preamble;
         let accounts_channel = channel_of(preamble, Schema::Accounts);
@@ -223,11 +223,12 @@ impl Rebuild<'_> {
         let checkpoints = channel_of(preamble, Schema::Checkpoint);
         let mut groups = Groups::new(reader, preamble, own.first)?;
         let mut before = self.before.last_set;
-        let (mut last_time, mut recorded) = (None, 0);
+        let mut last_time = None;
+        let mut recorded = 0;
         let mut head = false;
         while let Some(group) = groups.next()? {
             if let (Group::Set(set), false) = (&group, head) {
-                // Damage took the chunk that says where the cameras are.
+                // The chunk with the poses of the cameras is damaged.
                 let chunk = head_chunk(preamble, set.log_time, self.path)?;
                 copied.push(Copied { from: None, same: false, at: copy.len(), len: chunk.len() });
                 copy.append_chunks(&[chunk])?;
@@ -258,7 +259,8 @@ impl Rebuild<'_> {
                         lost.missing.push((before + 1, set.mark.id - 1));
                     }
                     lost.at_end = false;
-                    (before, last_time) = (Some(set.mark.id), Some(set.log_time));
+                    before = Some(set.mark.id);
+                    last_time = Some(set.log_time);
                     facts.set(&set.mark, set.log_time);
                 }
                 Group::Between(between) => {
@@ -285,7 +287,7 @@ impl Rebuild<'_> {
             }
             append(copy, &group, renewed, at, &mut copied)?;
             self.forget(&copied[known..])?;
-            tell(groups.offset())?;
+            on_progress(groups.offset())?;
         }
         if lost.at_end {
             let next = self.next_sets()?;
@@ -306,7 +308,7 @@ impl Rebuild<'_> {
         Ok(Done { facts, copied })
     }
 
-    /// Has a dry run forget what it holds of a copy and the original has as well.
+    /// In a dry run, drops bytes of a copy that the original has as well.
     fn forget(&self, copied: &[Copied]) -> Result<()> {
         let Some(dry) = self.dry else { return Ok(()) };
         let same = copied.iter().filter(|c| c.same);
@@ -315,15 +317,17 @@ impl Rebuild<'_> {
         refer.map_err(|e| Error::reading("read", self.path, e))
     }
 
-    /// What comes after this segment says of the end of this one, as far as it is not damaged itself.
+    /// The end of this segment by the segments after it, as far as they are not damaged themselves.
     fn next_sets(&self) -> Result<Next> {
         let after = self.segments.iter().skip_while(|p| *p != self.path).skip(1);
-        let (mut first, mut sets) = (None, 0);
+        let mut first = None;
+        let mut sets = 0;
         for path in after {
             let unknown = Next { first, recorded_before: None };
             let reader = SegmentReader::open_any(self.fs, path)?;
             let Some(own) = own_head(&reader)? else { return Ok(unknown) };
-            let (preamble, begin) = (own.preamble, own.first);
+            let preamble = own.preamble;
+            let begin = own.first;
             let accounts_channel = channel_of(&preamble, Schema::Accounts);
             let mut groups = Groups::new(&reader, &preamble, begin)?;
             while let Some(group) = groups.next()? {
@@ -351,7 +355,7 @@ impl Rebuild<'_> {
                 }
             }
         }
-        // A recording that was closed says how many sets there were.
+        // A closed recording states the number of its sets.
         let outcome = self.session.outcome.as_ref();
         let recorded = outcome.map(|o| o.sets_recorded.saturating_add(self.before.lost).saturating_sub(sets));
         Ok(Next { first, recorded_before: recorded })
@@ -370,7 +374,8 @@ impl Rebuild<'_> {
         let mut reader = SegmentReader::open_bare(self.fs, copy)?;
         reader.load_index()?;
         let wrong = |at: u64, what: &str| {
-            let what = format!("the recovered copy is not what was written: {what}; is the disk failing?");
+            let what =
+                format!("the recovered copy differs from the written data: {what}; is the disk failing?");
             reader.error(ErrorKind::Corrupt, at, what)
         };
         if !reader.finished
@@ -379,7 +384,8 @@ impl Rebuild<'_> {
             return Err(wrong(end, "its index is another one"));
         }
         let mut hasher = crc32fast::Hasher::new();
-        let (mut ours, mut theirs) = (Vec::new(), Vec::new());
+        let mut ours = Vec::new();
+        let mut theirs = Vec::new();
         let mut at = 0;
         let tail = Copied { from: None, same: false, at: end, len: 0 };
         for &Copied { from, same, at: to, len } in copied.iter().chain([&tail]) {
@@ -408,7 +414,7 @@ impl Rebuild<'_> {
     }
 }
 
-/// Appends a group as it lies in the damaged segment, or its checkpoint `renewed`; `at` is the end of the copy.
+/// Appends a group as it is in the damaged segment, or with its checkpoint `renewed`; `at` is the end of the copy.
 fn append(
     copy: &mut Segment,
     group: &Group,
@@ -435,7 +441,7 @@ fn append(
     Ok(())
 }
 
-/// Appends what was lost, and what the segment has: `said` are the facts that it stated itself.
+/// Appends the losses and the facts of the segment; `said` are the facts that it stated itself.
 fn append_facts(
     copy: &mut Segment,
     facts: &Facts,
@@ -455,7 +461,7 @@ fn append_facts(
     copy.append_metadata(SEGMENT_METADATA, &said)
 }
 
-/// What a copy came to.
+/// The result of a copy.
 struct Done {
     facts: Facts,
     copied: Vec<Copied>,
@@ -465,11 +471,11 @@ struct Done {
 struct Next {
     /// Id of their first set.
     first: Option<u64>,
-    /// Sets that were recorded before them, if an account tells.
+    /// Sets that were recorded before them, if an account says so.
     recorded_before: Option<u64>,
 }
 
-/// The channel of this type, as whoever reads the index finds it: of schemas and channels with one number the last counts.
+/// The channel of this type, as readers of the index find it: of schemas and channels with one number the last counts.
 pub(super) fn channel_of(preamble: &Preamble, schema: Schema) -> Option<u16> {
     let names: BTreeMap<_, _> = preamble.schemas.iter().map(|s| (s.id, s.name.as_str())).collect();
     let channels: BTreeMap<_, _> = preamble.channels.iter().map(|c| (c.id, c.schema)).collect();
@@ -496,8 +502,8 @@ fn head_chunk(preamble: &Preamble, log_time: u64, path: &Path) -> Result<Chunk> 
     builder.pack(true)
 }
 
-/// The chunk of `between` with a checkpoint of the copy in place of its own; `None` where its own is right for both, or it
-/// has none. A checkpoint of another file would pass for damage of this one wherever their lengths agree.
+/// The chunk of `between` with a checkpoint of the copy in place of its own; `None` where its own is right for both, or
+/// it has none. A checkpoint of another file would look like damage of this one wherever their lengths agree.
 fn renew_checkpoint(
     reader: &SegmentReader,
     between: &BetweenGroup,

@@ -1,4 +1,4 @@
-//! What `session.toml` says after a recovery.
+//! Updates `session.toml` after a recovery.
 
 use super::facts::Facts;
 use super::head::{own_head, proven_head, session_in};
@@ -9,10 +9,10 @@ use crate::{Dataset, Error, ErrorKind, Outcome, Result, SESSION_FILE, Session, S
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// The reason under which sets are counted that were handed over and are in no segment.
+/// The drop reason of sets that were handed over and are in no segment.
 const IN_CRASH: &str = "lost_in_crash";
 
-/// The session that a recovery goes by.
+/// The session that a recovery uses.
 pub(super) struct Chosen {
     pub(super) session: Session,
     /// Whether it is that of `session.toml`.
@@ -44,8 +44,10 @@ pub(super) fn choose(job: &mut Job<'_>, segments: &[PathBuf]) -> Result<Chosen> 
             "{SESSION_FILE} named another rig or other streams than its segments and was mended from {}",
             file_name(path)
         );
-        (stored.rig, stored.streams) = (said.rig, said.streams);
-        (stored.motion, stored.computed) = (said.motion, said.computed);
+        stored.rig = said.rig;
+        stored.streams = said.streams;
+        stored.motion = said.motion;
+        stored.computed = said.computed;
         job.report.session_rebuilt = true;
         job.report.lost.push(words);
         break;
@@ -59,12 +61,12 @@ fn file_name(path: &Path) -> String {
     name.strip_suffix(".part").unwrap_or(&name).to_owned()
 }
 
-/// Writes `session.toml` if it is another one now, or does not say how the recording ended.
+/// Writes `session.toml` if it changed, or lacks the outcome of the recording.
 pub(super) fn settle(job: &mut Job<'_>, mut session: Session, all: &[Facts]) -> Result<()> {
     let changed = job.report.segments.iter().any(|s| s.action != RecoverAction::None);
     let mut lost: Vec<String> = all.iter().flat_map(|f| f.lost.iter().cloned()).collect();
     if job.report.session_rebuilt {
-        // What was found so far is of the session; what segments lost follows.
+        // The losses so far are of the session; those of segments follow.
         lost.extend(job.report.lost.first().cloned());
     }
     let as_it_was = !changed && !job.report.session_rebuilt;
@@ -103,7 +105,7 @@ fn from_segments(job: &mut Job<'_>, segments: &[PathBuf]) -> Result<Chosen> {
         };
         let Some(session) = session else { continue };
         let words = format!(
-            "{SESSION_FILE} was gone or damaged and was made anew from {}; notes and changes after its beginning are \
+            "{SESSION_FILE} was gone or damaged and was rebuilt from {}; notes and changes after its beginning are \
              not in it",
             file_name(path)
         );
@@ -133,8 +135,8 @@ fn outcome(session: &Session, all: &[Facts], mut lost: Vec<String>, job: &mut Jo
         None => counts.dropped_by_reason().map(|(r, n)| (r.name().to_owned(), n)).collect(),
     };
     dropped.remove(IN_CRASH);
-    // What a damaged file says may not fit. And where disk or encoders were behind, the last account has sets that were
-    // refused after those that waited, which the marks then count without them.
+    // The counts of a damaged file may not add up. And where disk or encoders were behind, the last account has sets
+    // that were refused after those that waited, which the marks then count without them.
     let known = dropped.values().fold(recorded, |sum, n| sum.saturating_add(*n));
     let offered = offered.max(known);
     let missing = offered.saturating_sub(known);
@@ -175,15 +177,17 @@ fn outcome(session: &Session, all: &[Facts], mut lost: Vec<String>, job: &mut Jo
         }
     }
     let mut outcome = Outcome::new(ended, &SetCounts::default(), lost);
-    (outcome.sets_offered, outcome.sets_recorded, outcome.sets_dropped) = (offered, recorded, dropped);
+    outcome.sets_offered = offered;
+    outcome.sets_recorded = recorded;
+    outcome.sets_dropped = dropped;
     outcome
 }
 
-/// Sets that `session.toml` counts and that segments do not account for themselves, as one that is gone cannot; in words.
+/// Sets that `session.toml` counts and no segment accounts for, such as those of a missing one; in words.
 fn unaccounted(before: Option<&Outcome>, recorded: u64, all: &[Facts]) -> Option<String> {
     let counted = before?.sets_recorded;
     let gone = counted.saturating_sub(recorded);
-    let told = all.iter().fold(0u64, |sum, f| sum.saturating_add(f.sets_lost));
+    let accounted = all.iter().fold(0u64, |sum, f| sum.saturating_add(f.sets_lost));
     let words = format!("{gone} of the {counted} sets that {SESSION_FILE} counts are in no segment");
-    (gone > told).then_some(words)
+    (gone > accounted).then_some(words)
 }

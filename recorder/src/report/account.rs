@@ -16,7 +16,7 @@ pub struct SetsAccount {
 }
 
 impl SetsAccount {
-    /// What is known of the sets: the last account in the file, or how the recording ended where that tells of
+    /// The best account of the sets: the last account in the file, or the outcome of the recording where that counts
     /// more. After a write that failed no account is written, and only a recovery knows what a crash took.
     pub(super) fn known(account: Option<&SetCounts>, outcome: Option<&Outcome>) -> Option<Self> {
         let written = account.map(Self::written);
@@ -35,7 +35,7 @@ impl SetsAccount {
         let dropped = outcome.sets_dropped.iter().filter(|(_, n)| **n > 0);
         let dropped = dropped.map(|(reason, n)| (reason.clone(), *n)).collect();
         let mut ended = Self { offered: 0, recorded: outcome.sets_recorded, dropped };
-        // What somebody wrote into `session.toml` may not fit; no fewer were handed over than it names.
+        // A hand-edited `session.toml` may not add up; at least as many sets were handed over as it names.
         ended.offered = outcome.sets_offered.max(ended.recorded.saturating_add(ended.dropped_total()));
         ended
     }

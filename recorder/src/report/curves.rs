@@ -1,20 +1,20 @@
 //! Plots with several series side by side: curves over a value, and bars by class. Each series has a colour, a dash and
-//! its name, so that nothing is told by colour alone.
+//! its name, so that nothing depends on colour alone.
 
 use super::markup::escape;
-use super::svg::{begin, line, nice_step, number, text};
+use super::svg::{begin, horizontal_line, nice_step, number, text, vertical_line};
 use std::fmt::Write;
 
 /// One series of values, one per place on the axis; `None` where nothing is known.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Series {
-    /// What it is.
+    /// Its name in the legend.
     pub name: String,
     /// Its values.
     pub values: Vec<Option<f64>>,
 }
 
-/// Series that look different; further ones look like the first again.
+/// Distinct styles of series; further series repeat them.
 const LOOKS: usize = 6;
 /// Left, right, top and bottom of a plot.
 const FRAME: (f64, f64, f64, f64) = (64.0, 940.0, 34.0, 250.0);
@@ -27,13 +27,14 @@ pub fn curves(title: &str, x_axis: &str, y_axis: &str, x: &[f64], series: &[Seri
     let mut out = String::new();
     begin(&mut out, bottom + AXIS, title);
     let y_of = frame(&mut out, y_axis, series);
-    let (low, high) = (x.first().copied().unwrap_or(0.0), x.last().copied().unwrap_or(1.0));
+    let low = x.first().copied().unwrap_or(0.0);
+    let high = x.last().copied().unwrap_or(1.0);
     let span = (high - low).max(f64::MIN_POSITIVE);
     let x_of = |v: f64| left + (v - low) / span * (right - left);
     let step = nice_step(span / 10.0);
     let mut tick = (low / step).ceil() * step;
     while tick <= high * (1.0 + 1e-9) {
-        line(&mut out, "grid", (x_of(tick), x_of(tick)), (bottom, bottom + 4.0));
+        vertical_line(&mut out, "grid", x_of(tick), bottom..bottom + 4.0);
         text(&mut out, x_of(tick), bottom + 16.0, "tick mid", &number(tick));
         tick += step;
     }
@@ -77,8 +78,10 @@ pub fn bars(title: &str, x_axis: &str, y_axis: &str, classes: &[String], series:
         text(&mut out, from + width / 2.0, bottom + 16.0, "tick mid", class);
         for (k, one) in series.iter().enumerate() {
             let Some(v) = one.values.get(i).copied().flatten().filter(|v| *v > 0.0) else { continue };
-            let (x, y) = (from + width * 0.08 + k as f64 * bar, y_of(v).min(bottom - 0.5));
-            let (w, h) = ((bar - 1.0).max(0.5), bottom - y);
+            let x = from + width * 0.08 + k as f64 * bar;
+            let y = y_of(v).min(bottom - 0.5);
+            let w = (bar - 1.0).max(0.5);
+            let h = bottom - y;
             let _ = write!(
                 out,
                 "<rect class=\"s{}\" x=\"{x:.1}\" y=\"{y:.1}\" width=\"{w:.1}\" height=\"{h:.1}\"><title>{}, {}: {}</title></rect>",
@@ -94,7 +97,7 @@ pub fn bars(title: &str, x_axis: &str, y_axis: &str, classes: &[String], series:
     out
 }
 
-/// Draws the axis of values with its grid and the names of the series; says where a value lies.
+/// Draws the axis of values with its grid and the names of the series; returns the position of a value.
 fn frame(out: &mut String, y_axis: &str, series: &[Series]) -> impl Fn(f64) -> f64 + use<> {
     let (left, right, top, bottom) = FRAME;
     let most = series
@@ -109,7 +112,7 @@ fn frame(out: &mut String, y_axis: &str, series: &[Series]) -> impl Fn(f64) -> f
     let y_of = move |v: f64| bottom - (v / high).clamp(0.0, 1.0) * (bottom - top);
     let mut v = 0.0;
     while v <= high * (1.0 + 1e-9) {
-        line(out, "grid", (left, right), (y_of(v), y_of(v)));
+        horizontal_line(out, "grid", left..right, y_of(v));
         text(out, left - 6.0, y_of(v) + 4.0, "tick end", &number(v));
         v += step;
     }

@@ -1,26 +1,26 @@
-//! One pass over the numbers of a dataset, and a look at some of its pictures.
+//! One pass over the numbers of a dataset, and a look at some of its images.
 
 use super::series::{Counts, Histogram, TimeBins, Values};
 use super::{
-    ClockReport, Fill, LinearHistogram, OnProgress, PROBLEMS_MAX, Report, ReportOptions, SetsAccount,
-    SetsReport, StreamReport, TOLD_MAX, verdict,
+    ClockReport, Fill, LISTED_MAX, LinearHistogram, OnProgress, PROBLEMS_MAX, Report, ReportOptions,
+    SetsAccount, SetsReport, StreamReport, verdict,
 };
 use crate::catalog::look_at;
 use crate::dataset::{Dataset, DatasetSet, PixelMode, SetRange};
 use crate::{ErrorKind, Result, StreamAccount};
 use depthrig_bus::{FrameFlags, FrameHeader};
-use looked::Looked;
+use images::SampledImages;
+use messages::{MessageSummary, read_messages};
 use std::collections::BTreeMap;
-use told::{Told, read_told};
 
-mod looked;
+mod images;
+mod messages;
 mod motion;
-mod told;
 
 /// Bars of the histogram of spreads.
 const BARS: i64 = 48;
 
-/// What is summed up of a stream while its frames pass.
+/// Sums over the frames of a stream.
 struct Stream {
     codec: &'static str,
     frames: u64,
@@ -88,13 +88,14 @@ impl Stream {
             // A daemon that was started again counts from the beginning.
             if let (Some(n), true) = (h.sequence.checked_sub(before.sequence), t_ns > before_ns) {
                 self.live.spread(bins, before_ns, t_ns, n as f64);
-                (self.delivered, self.over_ns) = (self.delivered + n, self.over_ns + (t_ns - before_ns));
+                self.delivered += n;
+                self.over_ns += t_ns - before_ns;
             }
             let lost = h.drops().total().saturating_sub(before.drops().total());
             self.dropped_at.add(bins, t_ns, lost as f64);
             if h.clock_epoch != before.clock_epoch {
                 self.restarts += 1;
-                if self.restarts_ns.len() < TOLD_MAX {
+                if self.restarts_ns.len() < LISTED_MAX {
                     self.restarts_ns.push(t_ns);
                 }
             }
@@ -103,8 +104,8 @@ impl Stream {
         self.last = Some((t_ns, *h));
     }
 
-    /// A stream that is there at an end of the dataset is measured up to its own frame there; one that is not,
-    /// has no frames until the end.
+    /// A stream present at an end of the dataset is measured up to its own frame there; an absent one has no frames
+    /// until the end.
     fn live_series(&self, bins: TimeBins) -> Vec<Option<f64>> {
         let (Some((first, _)), Some((last, _))) = (self.first, self.last) else {
             return self.live.per_second(bins, 0, bins.span_ns);
@@ -162,7 +163,7 @@ const fn domain(code: u32) -> &'static str {
     }
 }
 
-/// Everything that is summed up while the sets pass.
+/// Sums over the sets.
 struct Pass {
     bins: TimeBins,
     /// Log time of the first set.
@@ -190,7 +191,8 @@ impl Pass {
     }
 
     fn set(&mut self, set: DatasetSet) {
-        let (bins, t_ns) = (self.bins, set.utc_ns - self.t0_ns);
+        let bins = self.bins;
+        let t_ns = set.utc_ns - self.t0_ns;
         self.sets += 1;
         self.incomplete += u64::from(!set.missing.is_empty());
         if set.frames.len() > 1 {
@@ -228,8 +230,8 @@ pub(super) fn gather(
     progress: OnProgress<'_>,
 ) -> Result<Option<Report>> {
     let mut reader = dataset.set_reader()?;
-    let (t0_ns, end_ns) =
-        (reader.times().first().copied().unwrap_or(0), reader.times().last().copied().unwrap_or(0));
+    let t0_ns = reader.times().first().copied().unwrap_or(0);
+    let end_ns = reader.times().last().copied().unwrap_or(0);
     let span_ns = end_ns.saturating_sub(t0_ns);
     let intervals = i64::try_from(reader.times().len()).unwrap_or(i64::MAX) - 1;
     let bins = TimeBins::new(span_ns, span_ns / intervals.max(1));
@@ -254,7 +256,7 @@ pub(super) fn gather(
     for set in dataset.sets_with(SetRange::ALL, PixelMode::None) {
         match set {
             Ok(set) => {
-                // The numbers are half of the work, the pictures the other half.
+                // The numbers are half of the work, the images the other half.
                 let done = set.utc_ns.saturating_sub(t0_ns).saturating_mul(500) / bins.span_ns.max(1);
                 pass.set(set);
                 if progress(done.clamp(0, 500) as u64).is_break() {
@@ -265,18 +267,19 @@ pub(super) fn gather(
             Err(e) => pass.problem(e.to_string()),
         }
     }
-    let told = read_told(dataset, &mut pass)?;
-    let mut looked = Looked::new(&reader, session.streams.len(), options);
-    if looked.look(&mut reader, &mut pass, progress)?.is_break() {
+    let messages = read_messages(dataset, &mut pass)?;
+    let mut sampled = SampledImages::new(&reader, session.streams.len(), options);
+    if sampled.look(&mut reader, &mut pass, progress)?.is_break() {
         return Ok(None);
     }
-    Ok(Some(put_together(dataset, pass, told, looked)))
+    Ok(Some(put_together(dataset, pass, messages, sampled)))
 }
 
-fn put_together(dataset: &Dataset, pass: Pass, told: Told, looked: Looked) -> Report {
-    let (session, bins) = (dataset.session(), pass.bins);
+fn put_together(dataset: &Dataset, pass: Pass, messages: MessageSummary, images: SampledImages) -> Report {
+    let session = dataset.session();
+    let bins = pass.bins;
     let mut accounts: BTreeMap<String, StreamAccount> =
-        told.accounts.into_iter().map(|a| (a.stream.to_string(), a)).collect();
+        messages.accounts.into_iter().map(|a| (a.stream.to_string(), a)).collect();
     let records = session.streams.iter().cloned();
     let mut streams: Vec<_> = (pass.streams.into_iter().zip(records))
         .map(|(s, record)| {
@@ -290,17 +293,17 @@ fn put_together(dataset: &Dataset, pass: Pass, told: Told, looked: Looked) -> Re
             u.report(record.clone(), account)
         })
         .collect();
-    for (s, samples) in streams.iter_mut().zip(looked.fill) {
+    for (s, samples) in streams.iter_mut().zip(images.fill) {
         s.fill = fill_of(samples);
     }
-    // Of one segment the outcome says nothing.
+    // The outcome does not apply to a single segment.
     let outcome = session.outcome.as_ref().filter(|_| dataset.is_folder());
     let sets = SetsReport {
         count: pass.sets,
         incomplete: pass.incomplete,
         duration_ns: bins.span_ns,
         interval_ns: pass.interval.quantiles(),
-        counts: SetsAccount::known(told.counts.as_ref(), outcome),
+        counts: SetsAccount::known(messages.counts.as_ref(), outcome),
         per_second: pass.at.per_second(bins, 0, bins.span_ns),
         spread_ns: pass.spread.quantiles(),
         spread_histogram: linear(&pass.spread, pass.limit_ns),
@@ -324,14 +327,14 @@ fn put_together(dataset: &Dataset, pass: Pass, told: Told, looked: Looked) -> Re
         bins,
         streams,
         motion,
-        host_clock: told.clock.report(),
-        bytes: told.bytes,
+        host_clock: messages.clock.report(),
+        bytes: messages.bytes,
         segments: dataset.segments().len(),
-        unfinished: told.unfinished,
+        unfinished: messages.unfinished,
         problems: pass.problems,
         problem_count: pass.problem_count,
-        sampled: looked.sampled,
-        pictures: looked.pictures,
+        sampled: images.sampled,
+        images: images.images,
     };
     let catalog = dataset.is_folder().then(|| look_at(dataset.fs(), dataset.path()));
     report.verdict = verdict::of(&report, catalog.as_ref());
@@ -340,7 +343,8 @@ fn put_together(dataset: &Dataset, pass: Pass, told: Told, looked: Looked) -> Re
 
 fn fill_of(samples: Vec<(i64, f64)>) -> Option<Fill> {
     let values = samples.iter().map(|(_, share)| *share);
-    let (min, max) = (values.clone().reduce(f64::min)?, values.clone().reduce(f64::max)?);
+    let min = values.clone().reduce(f64::min)?;
+    let max = values.clone().reduce(f64::max)?;
     let mean = values.sum::<f64>() / samples.len() as f64;
     Some(Fill { samples, min, mean, max })
 }

@@ -1,4 +1,4 @@
-//! The report as one page. Every text that somebody could have chosen goes through [`escape`].
+//! The report as HTML. Every text from outside goes through [`escape`].
 
 use super::markup::{END_TABLE, escape, row, table};
 use super::pixels::viridis;
@@ -58,7 +58,7 @@ pub(super) fn page(r: &Report) -> String {
     plots::clocks(&mut out, r);
     plots::fill(&mut out, r);
     plots::motion(&mut out, r);
-    pictures(&mut out, r);
+    images(&mut out, r);
     calibration(&mut out, r);
     footer(&mut out, r);
     super::page::end(&mut out);
@@ -151,7 +151,7 @@ fn streams(out: &mut String, r: &Report) {
     const COLUMNS: [&str; 9] = [
         "stream",
         "camera",
-        "pictures",
+        "images",
         "stored as",
         "#frames",
         "#missing",
@@ -186,16 +186,14 @@ fn streams(out: &mut String, r: &Report) {
     );
 }
 
-fn pictures(out: &mut String, r: &Report) {
+fn images(out: &mut String, r: &Report) {
     let Some(columns) =
         r.streams.chunk_by(|a, b| a.record.id.camera == b.record.id.camera).map(<[_]>::len).max()
     else {
         return;
     };
-    out.push_str(
-        "<section><h2>Pictures</h2><div class=\"wide\"><table class=\"pictures\"><thead><tr><th></th>",
-    );
-    for set in &r.pictures {
+    out.push_str("<section><h2>Images</h2><div class=\"wide\"><table class=\"images\"><thead><tr><th></th>");
+    for set in &r.images {
         let at = length(set.at_ns);
         let _ = write!(out, "<th colspan=\"{columns}\">{} set (no. {}, {at})</th>", set.title, set.number);
     }
@@ -204,17 +202,17 @@ fn pictures(out: &mut String, r: &Report) {
     for camera in r.streams.chunk_by(|a, b| a.record.id.camera == b.record.id.camera) {
         let _ = write!(out, "<tr><th>{}", escape(&camera[0].record.id.camera.to_string()));
         for i in at..at + camera.len() {
-            let range = r.pictures.iter().find_map(|set| set.pictures.get(&i)?.range_m);
+            let range = r.images.iter().find_map(|set| set.images.get(&i)?.range_m);
             if let Some((near, far)) = range {
                 let _ = write!(out, "<br/><span class=\"none\">{} to {} m</span>", metres(near), metres(far));
             }
         }
         out.push_str("</th>");
-        for set in &r.pictures {
+        for set in &r.images {
             for k in 0..columns {
-                let shown = if k < camera.len() { set.pictures.get(&(at + k)) } else { None };
+                let shown = if k < camera.len() { set.images.get(&(at + k)) } else { None };
                 let name = camera.get(k).map(|s| format!("{}, {} set", s.record.id, set.title));
-                picture(out, shown, name.as_deref());
+                image(out, shown, name.as_deref());
             }
         }
         out.push_str("</tr>");
@@ -235,7 +233,7 @@ fn metres(m: f32) -> String {
     if m < 1.0 { format!("{m:.2}") } else { format!("{m:.1}") }
 }
 
-fn picture(out: &mut String, shown: Option<&Shown>, name: Option<&str>) {
+fn image(out: &mut String, shown: Option<&Shown>, name: Option<&str>) {
     let _ = match (shown, name) {
         (Some(p), Some(name)) => write!(
             out,
@@ -264,7 +262,8 @@ fn calibration(out: &mut String, r: &Report) {
     out.push_str("<section><h2>Calibration</h2>");
     table(out, &COLUMNS);
     for s in &r.streams {
-        let (i, record) = (&s.record.intrinsics, &s.record);
+        let i = &s.record.intrinsics;
+        let record = &s.record;
         let known = i.is_known();
         let pair = |a: f64, b: f64| if known { format!("{a:.2},\u{a0}{b:.2}") } else { "unknown".to_owned() };
         let unit = if record.depth_unit_m > 0.0 {
@@ -312,12 +311,12 @@ fn distortion(i: &depthrig_bus::Intrinsics) -> String {
 fn footer(out: &mut String, r: &Report) {
     let _ = write!(
         out,
-        "<footer><p>Made by depthrig {} from every number of {} sets and {} of their pictures ({} sets looked at for \
-         depth). Recorded by depthrig {}. Checksums of pictures that were not looked at are checked by \
+        "<footer><p>Made by depthrig {} from every number of {} sets and {} of their images ({} sets looked at for \
+         depth). Recorded by depthrig {}. Checksums of images that were not looked at are checked by \
          <code>depthrig verify {}</code>.</p></footer>",
         env!("CARGO_PKG_VERSION"),
         r.sets.count,
-        r.sampled.pictures,
+        r.sampled.images,
         r.sampled.sets,
         escape(or_none(&r.depthrig_version)),
         escape(&r.path.display().to_string())

@@ -1,16 +1,17 @@
-//! What pages are made of, for every report that is one: head and look, tables, and pictures that lie in the page.
+//! Building blocks of every HTML report: head and style, tables, and images embedded in the file.
 //!
-//! A page needs no script, no network and no other file, is well-formed XML, and reads well dark and on paper.
+//! A report needs no script, no network and no other file, is well-formed XML, and reads well in dark mode and on
+//! paper.
 
 use super::markup::CSS;
-use super::pixels::{self, Picture, Small};
+use super::pixels::{self, Image, Small};
 use crate::Result;
 use depthrig_bus::FrameHeader;
 
 pub use super::markup::{END_TABLE, escape, row, table};
 pub use super::svg::{nice_end, nice_step, number};
 
-/// The beginning of a page of this title, which is text.
+/// The beginning of an HTML report with this title, which is text.
 pub fn begin(title: &str) -> String {
     let mut out = String::with_capacity(1 << 19);
     out.push_str(
@@ -26,34 +27,35 @@ pub fn begin(title: &str) -> String {
     out
 }
 
-/// The end of a page.
+/// The end of an HTML report.
 pub fn end(out: &mut String) {
     out.push_str("</body></html>\n");
 }
 
-/// A small copy of a picture, to be shown in a page.
+/// A small copy of an image, to embed in a report.
 pub struct Thumbnail(Small);
 
 impl Thumbnail {
-    /// Of the picture that `header` describes: its format, size, stride and depth unit are read.
+    /// Of the image that `header` describes: its format, size, stride and depth unit are read.
     ///
     /// # Errors
-    /// [`crate::ErrorKind::Codec`] when the pixels are not such a picture.
+    /// [`crate::ErrorKind::Codec`] when the pixels are not such an image.
     pub fn of(header: &FrameHeader, pixels: &[u8]) -> Result<Self> {
-        Ok(Self(Picture::new(header, pixels)?.small()))
+        Ok(Self(Image::new(header, pixels)?.small()))
     }
 
-    /// The range of metres that shows most of some depth pictures; `None` when there is no depth.
+    /// The range of metres that shows most of some depth images; `None` without depth.
     pub fn range<'a>(of: impl Iterator<Item = &'a Self>) -> Option<(f32, f32)> {
         pixels::depth_range(of.map(|t| &t.0))
     }
 
-    /// As an element of a page. Depth is shown in colours from `range_m`: near is light, none is black.
+    /// As an HTML element. Depth is shown in colours from `range_m`: near is light, missing is black.
     ///
     /// # Errors
     /// [`crate::ErrorKind::Codec`] when it cannot be packed.
     pub fn html(&self, range_m: Option<(f32, f32)>, name: &str) -> Result<String> {
-        let ((w, h), uri) = (self.0.size(), self.0.data_uri(range_m)?);
+        let (w, h) = self.0.size();
+        let uri = self.0.data_uri(range_m)?;
         let name = escape(name);
         Ok(format!("<img width=\"{w}\" height=\"{h}\" alt=\"{name}\" title=\"{name}\" src=\"{uri}\"/>"))
     }

@@ -1,13 +1,13 @@
-//! Pictures for the report: how much of a depth picture has depth, and small copies that a page can carry.
+//! Images for the report: how much of a depth image has depth, and small copies to embed.
 
 use crate::dataset::{DatasetFrame, jpeg_pixels};
-use crate::msgs::image::check_picture;
+use crate::msgs::image::check_image;
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{FrameHeader, PixelFormat};
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use std::borrow::Cow;
 
-/// Width of a small copy, pixels: twice what a page shows, for screens with fine pixels and for paper.
+/// Width of a small copy, pixels: twice the shown width, for high-resolution screens and for paper.
 const WIDTH: u32 = 240;
 /// Height of a small copy at most, pixels.
 const HEIGHT_MAX: u32 = 320;
@@ -17,7 +17,7 @@ const POINTS: u32 = 3;
 const QUALITY: u8 = 80;
 
 /// Viridis at ten equal steps (matplotlib, S. van der Walt and N. Smith, CC0): its lightness is even, so that it reads
-/// the same on paper and to colour-blind eyes.
+/// the same on paper and with colour blindness.
 const VIRIDIS: [[u8; 3]; 10] = [
     [68, 1, 84],
     [72, 40, 120],
@@ -34,13 +34,15 @@ const VIRIDIS: [[u8; 3]; 10] = [
 /// The colour of `x` from 0 to 1.
 pub(super) fn viridis(x: f32) -> [u8; 3] {
     let at = x.clamp(0.0, 1.0) * (VIRIDIS.len() - 1) as f32;
-    let (i, part) = (at as usize, at.fract());
-    let (a, b) = (VIRIDIS[i], VIRIDIS[(i + 1).min(VIRIDIS.len() - 1)]);
+    let i = at as usize;
+    let part = at.fract();
+    let a = VIRIDIS[i];
+    let b = VIRIDIS[(i + 1).min(VIRIDIS.len() - 1)];
     core::array::from_fn(|k| (f32::from(a[k]) + part * (f32::from(b[k]) - f32::from(a[k]))).round() as u8)
 }
 
-/// The rows of a frame's picture, decoded and checked against its header.
-pub(super) struct Picture<'a> {
+/// The rows of a frame's image, decoded and checked against its header.
+pub(super) struct Image<'a> {
     format: PixelFormat,
     width: u32,
     height: u32,
@@ -58,28 +60,30 @@ pub(super) struct Small {
 
 enum Content {
     Color(Vec<u8>),
-    /// Metres; 0 where there is no depth.
+    /// Metres; 0 without depth.
     Depth(Vec<f32>),
 }
 
-impl<'a> Picture<'a> {
-    /// The picture of a frame that was read as it is stored.
+impl<'a> Image<'a> {
+    /// The image of a frame that was read as it is stored.
     pub(super) fn of(frame: &'a DatasetFrame) -> Result<Self> {
         Self::new(&frame.header, frame.decoded()?)
     }
 
-    /// The picture that `header` describes.
+    /// The image that `header` describes.
     pub(super) fn new(header: &FrameHeader, pixels: impl Into<Cow<'a, [u8]>>) -> Result<Self> {
         let pixels = pixels.into();
-        let (width, height, unit_m) = (header.width, header.height, header.depth_unit_m as f32);
-        let picture = |format, stride, pixels| Self { format, width, height, stride, unit_m, pixels };
+        let width = header.width;
+        let height = header.height;
+        let unit_m = header.depth_unit_m as f32;
+        let image = |format, stride, pixels| Self { format, width, height, stride, unit_m, pixels };
         if header.pixel_format() == Some(PixelFormat::Mjpeg) {
             let rgb = jpeg_pixels(&pixels, header)?;
-            return Ok(picture(PixelFormat::Rgb8, 3 * width as usize, rgb.into()));
+            return Ok(image(PixelFormat::Rgb8, 3 * width as usize, rgb.into()));
         }
-        let format = check_picture(header, pixels.len())?;
+        let format = check_image(header, pixels.len())?;
         let stride = header.stride as usize;
-        Ok(picture(format, stride, pixels))
+        Ok(image(format, stride, pixels))
     }
 
     fn row(&self, y: u32) -> &[u8] {
@@ -87,9 +91,9 @@ impl<'a> Picture<'a> {
         &self.pixels[at..at + self.format.row_bytes(self.width) as usize]
     }
 
-    /// Share of the pixels that have a depth, 0 to 1; `None` when the picture is no depth.
+    /// Share of the pixels that have a depth, 0 to 1; `None` for an image without depth.
     ///
-    /// The rule is that of the format: 0 is no depth in `z16`; what is not above 0 or not finite, in `depth_f32`.
+    /// A pixel without depth is 0 in `z16`, and not above 0 or not finite in `depth_f32`.
     pub(super) fn fill(&self) -> Option<f64> {
         let filled: fn(&[u8]) -> usize = match self.format {
             PixelFormat::Z16 => |row| row.as_chunks::<2>().0.iter().filter(|p| **p != [0, 0]).count(),
@@ -104,7 +108,8 @@ impl<'a> Picture<'a> {
     }
 
     fn depth_at(&self, x: u32, y: u32) -> f32 {
-        let (row, x) = (self.row(y), x as usize);
+        let row = self.row(y);
+        let x = x as usize;
         let metres = match self.format {
             PixelFormat::Z16 => f32::from(u16::from_le_bytes([row[2 * x], row[2 * x + 1]])) * self.unit_m,
             _ => f32::from_le_bytes([row[4 * x], row[4 * x + 1], row[4 * x + 2], row[4 * x + 3]]),
@@ -113,7 +118,8 @@ impl<'a> Picture<'a> {
     }
 
     fn color_at(&self, x: u32, y: u32, brightest: f32) -> [f32; 3] {
-        let (row, i) = (self.row(y), x as usize);
+        let row = self.row(y);
+        let i = x as usize;
         let byte = |at: usize| f32::from(row.get(at).copied().unwrap_or(0));
         match self.format {
             PixelFormat::Rgb8 => [byte(3 * i), byte(3 * i + 1), byte(3 * i + 2)],
@@ -140,7 +146,7 @@ impl<'a> Picture<'a> {
             ((at * u64::from(size)) / (2 * u64::from(POINTS) * u64::from(n))).min(u64::from(size) - 1) as u32
         };
         if self.format.is_depth() {
-            // One of the pixels, because the mean of a near and a far one is a place where nothing is.
+            // One of the pixels: the mean of a near and a far one would be a point in empty space.
             let at = |i: u32| {
                 self.depth_at(
                     along(i % width, width, 1, self.width),
@@ -157,10 +163,8 @@ impl<'a> Picture<'a> {
         for i in 0..width * height {
             let mut sum = [0.0; 3];
             for k in 0..POINTS * POINTS {
-                let (x, y) = (
-                    along(i % width, width, k % POINTS, self.width),
-                    along(i / width, height, k / POINTS, self.height),
-                );
+                let x = along(i % width, width, k % POINTS, self.width);
+                let y = along(i / width, height, k / POINTS, self.height);
                 for (s, v) in sum.iter_mut().zip(self.color_at(x, y, brightest)) {
                     *s += v;
                 }
@@ -183,7 +187,7 @@ impl<'a> Picture<'a> {
     }
 }
 
-/// The disparity of a pixel of a row, 0 where there is none.
+/// The disparity of a pixel of a row, 0 without one.
 fn disparity(row: &[u8], x: usize) -> f32 {
     let value = row.as_chunks().0.get(x).map_or(f32::NAN, |b| f32::from_le_bytes(*b));
     if value.is_finite() { value } else { 0.0 }
@@ -191,14 +195,15 @@ fn disparity(row: &[u8], x: usize) -> f32 {
 
 /// ITU-R BT.601, full range, as webcams send it.
 fn rgb_of(y: f32, u: f32, v: f32) -> [f32; 3] {
-    let (u, v) = (u - 128.0, v - 128.0);
+    let u = u - 128.0;
+    let v = v - 128.0;
     [y + 1.402 * v, y - 0.344_136 * u - 0.714_136 * v, y + 1.772 * u].map(|c| c.clamp(0.0, 255.0))
 }
 
-/// The range of metres that shows most of some small depth pictures: without the 2 % at each end.
-pub(super) fn depth_range<'a>(pictures: impl Iterator<Item = &'a Small>) -> Option<(f32, f32)> {
+/// The range of metres that shows most of some small depth images: without the 2 % at each end.
+pub(super) fn depth_range<'a>(images: impl Iterator<Item = &'a Small>) -> Option<(f32, f32)> {
     let mut depths = Vec::new();
-    for small in pictures {
+    for small in images {
         if let Content::Depth(d) = &small.content {
             depths.extend(d.iter().copied().filter(|d| *d > 0.0));
         }
@@ -210,7 +215,7 @@ pub(super) fn depth_range<'a>(pictures: impl Iterator<Item = &'a Small>) -> Opti
 }
 
 impl Small {
-    /// As a JPEG in a `data:` address; depth in colours from `range` in metres, near is light, none is black.
+    /// As a JPEG in a `data:` URL; depth in colours from `range` in metres, near is light, missing is black.
     pub(super) fn data_uri(&self, range: Option<(f32, f32)>) -> Result<String> {
         let (near, far) = range.unwrap_or((0.0, 1.0));
         let shown: Cow<'_, [u8]> = match &self.content {
@@ -222,7 +227,7 @@ impl Small {
         let color = matches!(self.content, Content::Color(_));
         encoder.set_sampling_factor(if color { SamplingFactor::R_4_2_0 } else { SamplingFactor::R_4_4_4 });
         encoder.encode(&shown, self.width as u16, self.height as u16, ColorType::Rgb).map_err(|e| {
-            Error::new(ErrorKind::Codec, "a small picture cannot be made a JPEG").with_source(e)
+            Error::new(ErrorKind::Codec, "a small image cannot be encoded as JPEG").with_source(e)
         })?;
         Ok(format!("data:image/jpeg;base64,{}", base64(&jpeg)))
     }
@@ -273,7 +278,7 @@ mod tests {
 
     fn header(format: PixelFormat, width: u32, height: u32) -> FrameHeader {
         let mut h = FrameHeader::default();
-        h.set_picture(format, width, height);
+        h.set_image(format, width, height);
         h.depth_unit_m = 0.001;
         h
     }
@@ -284,12 +289,12 @@ mod tests {
         h.stride = 6;
         h.payload_len = 12;
         let pixels = [1, 0, 0, 0, 9, 9, 0, 1, 0, 0, 9, 9];
-        assert_eq!(Picture::new(&h, &pixels[..]).unwrap().fill(), Some(0.5));
+        assert_eq!(Image::new(&h, &pixels[..]).unwrap().fill(), Some(0.5));
         let floats: Vec<u8> =
             [1.0f32, f32::NAN, -1.0, 0.0, f32::INFINITY, 2.0].iter().flat_map(|f| f.to_le_bytes()).collect();
         let h = header(PixelFormat::DepthF32, 6, 1);
-        assert_eq!(Picture::new(&h, floats).unwrap().fill(), Some(2.0 / 6.0));
-        assert_eq!(Picture::new(&header(PixelFormat::Mono8, 1, 1), vec![3]).unwrap().fill(), None);
+        assert_eq!(Image::new(&h, floats).unwrap().fill(), Some(2.0 / 6.0));
+        assert_eq!(Image::new(&header(PixelFormat::Mono8, 1, 1), vec![3]).unwrap().fill(), None);
     }
 
     /// The greatest disparity is white and no match is black.
@@ -297,18 +302,18 @@ mod tests {
     fn disparity_is_shown_as_grey() {
         let row: Vec<f32> = (0..8).map(|i| if i < 4 { 32.0 } else { f32::NAN }).collect();
         let pixels: Vec<u8> = row.repeat(8).iter().flat_map(|f| f.to_le_bytes()).collect();
-        let small = Picture::new(&header(PixelFormat::DisparityF32, 8, 8), pixels).unwrap().small();
+        let small = Image::new(&header(PixelFormat::DisparityF32, 8, 8), pixels).unwrap().small();
         let Content::Color(rgb) = &small.content else { panic!("disparity is no depth") };
         assert_eq!((rgb[0], rgb[3 * 7]), (255, 0));
     }
 
-    /// Every format gives a small picture of the right colour, and damaged headers an error.
+    /// Every format gives a small image of the right colour, and damaged headers an error.
     #[test]
     fn every_format_is_shown() {
         for format in PixelFormat::ALL.into_iter().filter(|f| *f != PixelFormat::Mjpeg) {
             let h = header(format, 640, 360);
             let pixels = vec![128; format.frame_bytes(640, 360)];
-            let small = Picture::new(&h, &pixels[..]).unwrap().small();
+            let small = Image::new(&h, &pixels[..]).unwrap().small();
             assert_eq!(small.size(), (240, 135), "{}", format.name());
             if let Content::Color(rgb) = &small.content {
                 let grey = match format {
@@ -320,11 +325,11 @@ mod tests {
                 assert!(rgb.iter().all(|v| v.abs_diff(grey) <= 1), "{}: {:?}", format.name(), &rgb[..3]);
             }
             assert!(small.data_uri(Some((0.1, 50.0))).unwrap().starts_with("data:image/jpeg;base64,/9j/"));
-            assert!(Picture::new(&h, &pixels[..100]).is_err(), "{}", format.name());
+            assert!(Image::new(&h, &pixels[..100]).is_err(), "{}", format.name());
         }
         for (w, h) in [(1, 1), (1, 5000), (5000, 1)] {
             let pixels = vec![7; PixelFormat::Rgb8.frame_bytes(w, h)];
-            Picture::new(&header(PixelFormat::Rgb8, w, h), pixels).unwrap().small().data_uri(None).unwrap();
+            Image::new(&header(PixelFormat::Rgb8, w, h), pixels).unwrap().small().data_uri(None).unwrap();
         }
     }
 
@@ -335,7 +340,7 @@ mod tests {
         assert_eq!(depth_color(9.0, 0.5, 2.0), VIRIDIS[0]);
         let h = header(PixelFormat::Z16, 100, 1);
         let pixels: Vec<u8> = (0..100u16).flat_map(|d| (d * 10).to_le_bytes()).collect();
-        let small = Picture::new(&h, pixels).unwrap().small();
+        let small = Image::new(&h, pixels).unwrap().small();
         let (near, far) = depth_range([small].iter()).unwrap();
         assert!((near - 0.02).abs() < 0.011 && (far - 0.98).abs() < 0.011, "{near} {far}");
     }

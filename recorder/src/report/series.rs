@@ -3,7 +3,7 @@
 
 use serde::Serialize;
 
-/// Most bins of a series: about what a plot can show.
+/// Most bins of a series: about as many as a plot can show.
 const BINS_MAX: i64 = 160;
 /// Widths that people read well, nanoseconds: 0.1 s to a day.
 const WIDTHS_S: [f64; 19] = [
@@ -11,12 +11,12 @@ const WIDTHS_S: [f64; 19] = [
     7200.0, 21_600.0, 86_400.0,
 ];
 
-/// How the time of a dataset is divided.
+/// The time bins of a dataset.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct TimeBins {
     /// Width of a bin, nanoseconds.
     pub width_ns: i64,
-    /// How many there are; the last one may end after the dataset.
+    /// Number of bins; the last one may end after the dataset.
     pub count: usize,
     /// From the first set to the last, nanoseconds.
     pub span_ns: i64,
@@ -148,7 +148,8 @@ impl Histogram {
 
     /// The least value of a bin.
     fn low(bin: usize) -> u64 {
-        let (octave, rest) = (bin as u64 / SUB, bin as u64 % SUB);
+        let octave = bin as u64 / SUB;
+        let rest = bin as u64 % SUB;
         if octave == 0 { rest } else { (SUB + rest) << (octave - 1) }
     }
 
@@ -172,7 +173,8 @@ impl Histogram {
         for (bin, n) in self.counts.iter().enumerate() {
             seen += n;
             if seen >= rank {
-                let (low, high) = (Self::low(bin), Self::low(bin + 1));
+                let low = Self::low(bin);
+                let high = Self::low(bin + 1);
                 return (low.midpoint(high - 1) as i64).min(self.max);
             }
         }
@@ -181,7 +183,8 @@ impl Histogram {
 
     /// The counts in `count` bins of equal width from 0, and how many lie beyond.
     pub(super) fn linear(&self, width: i64, count: usize) -> (Vec<u64>, u64) {
-        let (mut bins, mut beyond) = (vec![0; count], 0);
+        let mut bins = vec![0; count];
+        let mut beyond = 0;
         for (bin, n) in self.counts.iter().enumerate().filter(|(_, n)| **n > 0) {
             let middle = Self::low(bin).midpoint(Self::low(bin + 1) - 1) as i64;
             match bins.get_mut((middle.min(self.max) / width.max(1)) as usize) {
@@ -193,7 +196,7 @@ impl Histogram {
     }
 }
 
-/// How values are distributed; 0 when there are none.
+/// How values are distributed; 0 without values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 pub struct Quantiles {
     /// Half of the values are within.
@@ -240,14 +243,15 @@ mod tests {
             values.sort_unstable();
             for percent in [1u64, 50, 95, 99, 100] {
                 let rank = (values.len() as u64 * percent).div_ceil(100).max(1) as usize - 1;
-                let (truth, said) = (values[rank] as f64, h.quantile(percent, 100) as f64);
+                let truth = values[rank] as f64;
+                let said = h.quantile(percent, 100) as f64;
                 prop_assert!((said - truth).abs() <= truth / 250.0 + 1.0, "{percent} %: {said}, not {truth}");
             }
             let (bins, beyond) = h.linear(1 << 33, 100);
             prop_assert_eq!(bins.iter().sum::<u64>() + beyond, values.len() as u64);
         }
 
-        /// What is spread over time is all there, wherever it begins and ends.
+        /// Spreading a count over time keeps its sum, wherever the span begins and ends.
         #[test]
         fn nothing_is_lost_by_spreading(from in -50i64..3000, len in 0i64..4000, span in 1i64..3000) {
             let bins = TimeBins::new(span * 1_000_000, 0);
@@ -257,7 +261,7 @@ mod tests {
         }
     }
 
-    /// 30 Hz, told every fifth of a second, first before the first set: even in every bin, the last part one too.
+    /// 30 Hz, counted every fifth of a second, first before the first set: even in every bin, the last part one too.
     #[test]
     fn an_even_rate_is_even_in_every_bin() {
         let bins = TimeBins::new(9_730_000_000, 200_000_000);

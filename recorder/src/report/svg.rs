@@ -1,11 +1,12 @@
 //! The few plots of the report as inline SVG: strips over time, a histogram, bars. Colours are CSS variables of the
-//! page, and nothing is told by colour alone.
+//! page, and nothing depends on colour alone.
 //!
-//! Written here because it is short: `plotters` with its SVG back end brings fonts and colours of its own, which
+//! Written here because it is short: `plotters` with its SVG backend brings fonts and colours of its own, which
 //! neither dark mode nor paper could change.
 
 use super::markup::escape;
 use std::fmt::Write;
+use std::ops::Range;
 
 /// Width of every plot; the page scales it.
 const WIDTH: f64 = 960.0;
@@ -17,7 +18,7 @@ const GAP: f64 = 8.0;
 /// Space for an axis with its title.
 const AXIS: f64 = 38.0;
 
-/// What is drawn over time.
+/// Values drawn over time.
 pub(super) enum Trace {
     /// A value per bin, and the range that its values had.
     Steps(Vec<Option<(f64, f64, f64)>>),
@@ -28,11 +29,11 @@ pub(super) enum Trace {
 /// One quantity over time.
 pub(super) struct Strip {
     pub(super) label: String,
-    /// What the plot cannot say, in words, at its right.
+    /// A note in words at the right of the plot.
     pub(super) note: String,
     pub(super) trace: Trace,
     pub(super) y: (f64, f64),
-    /// What the value should be.
+    /// The nominal value.
     pub(super) nominal: Option<f64>,
     /// Bins that are marked below, and above.
     pub(super) marks: [Vec<usize>; 2],
@@ -50,7 +51,7 @@ pub fn nice_step(x: f64) -> f64 {
     above(x, &[1.0, 2.0, 2.5, 5.0])
 }
 
-/// The end of an axis that has `x` on it.
+/// The end of an axis that includes `x`.
 pub fn nice_end(x: f64) -> f64 {
     above(x, &[1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0])
 }
@@ -64,7 +65,7 @@ fn above(x: f64, factors: &[f64]) -> f64 {
     factor.unwrap_or(&10.0) * power
 }
 
-/// A number without digits that say nothing.
+/// A number without insignificant digits.
 pub fn number(x: f64) -> String {
     let digits = match x.abs() {
         0.0 => 0,
@@ -89,13 +90,19 @@ pub(super) fn text(out: &mut String, x: f64, y: f64, class: &str, text: &str) {
     let _ = write!(out, "<text x=\"{x:.1}\" y=\"{y:.1}\" class=\"{class}\">{}</text>", escape(text));
 }
 
-/// `points` are pairs that `line` joins.
-pub(super) fn line(out: &mut String, class: &str, x: (f64, f64), y: (f64, f64)) {
-    let _ = write!(
-        out,
-        "<line class=\"{class}\" x1=\"{:.1}\" x2=\"{:.1}\" y1=\"{:.1}\" y2=\"{:.1}\"/>",
-        x.0, x.1, y.0, y.1
-    );
+pub(super) fn horizontal_line(out: &mut String, class: &str, x: Range<f64>, y: f64) {
+    line(out, class, x, y..y);
+}
+
+pub(super) fn vertical_line(out: &mut String, class: &str, x: f64, y: Range<f64>) {
+    line(out, class, x..x, y);
+}
+
+fn line(out: &mut String, class: &str, x: Range<f64>, y: Range<f64>) {
+    let Range { start: x1, end: x2 } = x;
+    let Range { start: y1, end: y2 } = y;
+    let _ =
+        write!(out, "<line class=\"{class}\" x1=\"{x1:.1}\" x2=\"{x2:.1}\" y1=\"{y1:.1}\" y2=\"{y2:.1}\"/>");
 }
 
 /// Strips one below the other on one axis of time.
@@ -108,7 +115,7 @@ pub(super) fn strips(title: &str, unit: &str, time: Time, strips: &[Strip]) -> S
     let (step, scale, name) = time_axis(span);
     let mut tick = 0.0;
     while tick <= span * (1.0 + 1e-9) {
-        line(&mut out, "grid", (x_of(tick), x_of(tick)), (4.0, bottom));
+        vertical_line(&mut out, "grid", x_of(tick), 4.0..bottom);
         text(&mut out, x_of(tick), bottom + 14.0, "tick mid", &number(tick / scale));
         tick += step;
     }
@@ -116,7 +123,7 @@ pub(super) fn strips(title: &str, unit: &str, time: Time, strips: &[Strip]) -> S
     text(&mut out, middle, bottom + 31.0, "axis mid", &format!("time since the first set, {name}"));
     for (i, strip) in strips.iter().enumerate() {
         let top = 4.0 + i as f64 * (STRIP + GAP);
-        draw(&mut out, strip, (top, top + STRIP), time, &x_of, (unit, i == 0));
+        draw(&mut out, strip, top, time, &x_of, unit, i == 0);
     }
     out.push_str("</svg>");
     out
@@ -135,11 +142,13 @@ fn time_axis(span_ns: f64) -> (f64, f64, &'static str) {
 fn draw(
     out: &mut String,
     strip: &Strip,
-    (top, bottom): (f64, f64),
+    top: f64,
     time: Time,
     x_of: &dyn Fn(f64) -> f64,
-    (unit, first): (&str, bool),
+    unit: &str,
+    first: bool,
 ) {
+    let bottom = top + STRIP;
     let (low, high) = strip.y;
     let y_of =
         |v: f64| bottom - ((v - low) / (high - low).max(f64::MIN_POSITIVE)).clamp(0.0, 1.0) * (bottom - top);
@@ -156,7 +165,7 @@ fn draw(
     text(out, X.0 - 5.0, bottom, "tick end", &number(low));
     text(out, X.1 + 8.0, f64::midpoint(top, bottom) + 4.0, "note", &strip.note);
     if let Some(nominal) = strip.nominal {
-        line(out, "nominal", X, (y_of(nominal), y_of(nominal)));
+        horizontal_line(out, "nominal", X.0..X.1, y_of(nominal));
     }
     match &strip.trace {
         Trace::Steps(bins) => steps(out, bins, time, x_of, &y_of),
@@ -191,10 +200,12 @@ fn steps(
     x_of: &dyn Fn(f64) -> f64,
     y_of: &dyn Fn(f64) -> f64,
 ) {
-    let (mut line, mut band) = (String::new(), String::new());
+    let mut line = String::new();
+    let mut band = String::new();
     let mut joined = false;
     for (i, bin) in bins.iter().enumerate() {
-        let (from, to) = (x_of(i as f64 * time.bin_ns as f64), x_of((i + 1) as f64 * time.bin_ns as f64));
+        let from = x_of(i as f64 * time.bin_ns as f64);
+        let to = x_of((i + 1) as f64 * time.bin_ns as f64);
         let Some((low, value, high)) = bin.filter(|_| to > from) else {
             joined = false;
             continue;
@@ -204,7 +215,8 @@ fn steps(
             if joined { write!(line, "V{y:.1}H{to:.1}") } else { write!(line, "M{from:.1} {y:.1}H{to:.1}") };
         joined = true;
         if high > low {
-            let (a, b) = (y_of(high), y_of(low));
+            let a = y_of(high);
+            let b = y_of(low);
             let _ = write!(band, "M{from:.1} {a:.1}H{to:.1}V{b:.1}H{from:.1}z");
         }
     }
@@ -224,8 +236,10 @@ pub(super) fn histogram(
     counts: &[u64],
     marks: &[(f64, String)],
 ) -> String {
-    let (x0, x1, top, bottom) =
-        (60.0, 930.0, 14.0 + 13.0 * marks.len() as f64, 190.0 + 13.0 * marks.len() as f64);
+    let x0 = 60.0;
+    let x1 = 930.0;
+    let top = 14.0 + 13.0 * marks.len() as f64;
+    let bottom = 190.0 + 13.0 * marks.len() as f64;
     let mut out = String::new();
     begin(&mut out, bottom + AXIS, title);
     let most = counts.iter().copied().max().unwrap_or(0).max(1);
@@ -236,7 +250,7 @@ pub(super) fn histogram(
     let y_of = |n: f64| bottom - n / high * (bottom - top);
     let mut n = 0.0;
     while n <= high * (1.0 + 1e-9) {
-        line(&mut out, "grid", (x0, x1), (y_of(n), y_of(n)));
+        horizontal_line(&mut out, "grid", x0..x1, y_of(n));
         text(&mut out, x0 - 5.0, y_of(n) + 4.0, "tick end", &number(n));
         n += step;
     }
@@ -249,7 +263,8 @@ pub(super) fn histogram(
     }
     text(&mut out, f64::midpoint(x0, x1), bottom + 31.0, "axis mid", axis);
     for (i, n) in counts.iter().enumerate().filter(|(_, n)| **n > 0) {
-        let (from, to) = (x_of(i as f64 * width), x_of((i + 1) as f64 * width));
+        let from = x_of(i as f64 * width);
+        let to = x_of((i + 1) as f64 * width);
         let y = y_of(*n as f64).min(bottom - 1.0);
         let _ = write!(
             out,
@@ -260,8 +275,9 @@ pub(super) fn histogram(
         );
     }
     for (i, (value, name)) in marks.iter().enumerate() {
-        let (x, y) = (x_of(*value), 12.0 + 13.0 * i as f64);
-        line(&mut out, "nominal", (x, x), (y + 3.0, bottom));
+        let x = x_of(*value);
+        let y = 12.0 + 13.0 * i as f64;
+        vertical_line(&mut out, "nominal", x, y + 3.0..bottom);
         let (class, dx) = if x > f64::midpoint(x0, x1) { ("tick end", -4.0) } else { ("tick", 4.0) };
         text(&mut out, x + dx, y + 4.0, class, name);
     }

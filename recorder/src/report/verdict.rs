@@ -1,4 +1,4 @@
-//! What is to be thought of a dataset, in sentences: the first thing that a reader sees.
+//! The verdict on a dataset in sentences: the first thing that a reader sees.
 
 use super::html::count;
 use super::{Report, SetsAccount, StreamReport, Verdict};
@@ -22,7 +22,7 @@ pub(super) fn of(report: &Report, catalog: Option<&CatalogEntry>) -> Verdict {
         health = Health::Unfinished;
     }
     if report.problem_count > 0 {
-        // An unfinished segment ends in the middle, which is no damage.
+        // An unfinished segment ends in the middle, which is not damage.
         if !unfinished {
             health = Health::Damaged;
         }
@@ -50,7 +50,8 @@ pub(super) fn of(report: &Report, catalog: Option<&CatalogEntry>) -> Verdict {
 }
 
 fn headline(report: &Report, health: Health, lost: u64, plain: bool) -> String {
-    let (sets, path) = (report.sets.count, report.path.display());
+    let sets = report.sets.count;
+    let path = report.path.display();
     match health {
         Health::Whole if plain => format!("Whole: all {sets} sets are here, each with every stream."),
         Health::Whole if report.sets.incomplete > 0 => {
@@ -63,7 +64,7 @@ fn headline(report: &Report, health: Health, lost: u64, plain: bool) -> String {
             format!("Whole: all {sets} sets are here, each with every stream. Read the remarks.")
         }
         Health::Recording => format!("Still being recorded: this is what is on disk so far, {sets} sets."),
-        // A crash takes sets that nobody had counted yet.
+        // A crash loses sets that were not counted yet.
         Health::Lost if lost == 0 => {
             format!("Something was lost, although no set is counted as lost: {sets} sets are here.")
         }
@@ -88,16 +89,16 @@ fn remarks(report: &Report) -> Vec<String> {
         remarks.push(format!("{}: {} batches of samples were not recorded.", u.record.id, u.lost_batches));
     }
     let sets = &report.sets;
-    // Streams of one camera tell the same story once.
-    let mut told: Vec<(Vec<String>, String)> = Vec::new();
+    // Streams of one camera with the same losses share a line.
+    let mut lines: Vec<(Vec<String>, String)> = Vec::new();
     for s in report.streams.iter().filter(|s| s.missing > 0) {
         let story = missing(s, sets.count, sets.duration_ns);
-        match told.iter_mut().find(|(_, said)| *said == story) {
+        match lines.iter_mut().find(|(_, said)| *said == story) {
             Some((names, _)) => names.push(s.record.id.to_string()),
-            None => told.push((vec![s.record.id.to_string()], story)),
+            None => lines.push((vec![s.record.id.to_string()], story)),
         }
     }
-    remarks.extend(told.into_iter().map(|(names, story)| format!("{}: {story}.", some_of(&names))));
+    remarks.extend(lines.into_iter().map(|(names, story)| format!("{}: {story}.", some_of(&names))));
     for s in &report.streams {
         if let Some(a) = s.account.as_ref().filter(|a| a.dropped.total() > 0) {
             let reasons: Vec<_> = a.dropped.nonzero().map(|(r, n)| format!("{n} {}", r.name())).collect();
@@ -123,7 +124,8 @@ fn remarks(report: &Report) -> Vec<String> {
         remarks.push(format!("{}: its clock map had {}.", s.record.id, count(s.clock.restarts, "restart")));
     }
     for (at, by) in &report.host_clock.steps {
-        let (at, by) = (*at as f64 / 1e9, *by as f64 / 1e6);
+        let at = *at as f64 / 1e9;
+        let by = *by as f64 / 1e6;
         remarks.push(format!(
             "The wall clock was set by {by:+.1} ms at {at:.1} s; recorded times did not jump."
         ));

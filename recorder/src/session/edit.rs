@@ -1,6 +1,6 @@
-//! Changing what a dataset says of itself after the recording, with a history of what it said before.
+//! Edits the session of a dataset after the recording, with a history of the earlier values.
 //!
-//! Only `session.toml` changes, in one step; the segments keep what was true when they were recorded. The file is
+//! Only `session.toml` changes, in one step; the segments keep the state at recording time. The file is
 //! edited as text: comments, order and keys that depthrig does not know stay as they are.
 
 use super::{Edit, Note, SESSION_FILE, Session, text_of};
@@ -14,10 +14,10 @@ use toml_edit::{ArrayOfTables, DocumentMut, InlineTable, Item, Table, Value};
 /// Longest name of a dataset, bytes: file systems allow 255, and a suffix must fit.
 const NAME_MAX_BYTES: usize = 240;
 
-/// What is to be changed; `None` leaves a key as it is.
+/// Changes to a session; `None` leaves a key as it is.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct SessionChanges {
-    /// What was in front of the cameras.
+    /// The scene in front of the cameras.
     pub scene: Option<String>,
     /// Who recorded it.
     pub operator: Option<String>,
@@ -25,13 +25,13 @@ pub struct SessionChanges {
     pub notes: Vec<String>,
 }
 
-/// Changes the session of the dataset `dir` and returns what was changed; a value that is there already is no
-/// change. Every change goes into the session's history.
+/// Changes the session of the dataset `dir` and returns what was changed; an equal value is not
+/// a change. Every change goes into the session's history.
 ///
 /// # Errors
 /// [`ErrorKind::NotFound`] or [`ErrorKind::NotADataset`] without a session file, [`ErrorKind::BadInput`] while it is
 /// being recorded or unfinished or for an empty note, [`ErrorKind::InUse`] while another process works on it,
-/// [`ErrorKind::Corrupt`] when the file is no session (it is left alone), and what the file system says.
+/// [`ErrorKind::Corrupt`] when the file is not a session (it is left alone), and errors of the file system.
 pub fn edit(fs: &dyn Fs, dir: &Path, changes: &SessionChanges) -> Result<Vec<Edit>> {
     if changes.notes.iter().any(|n| n.trim().is_empty()) {
         return Err(Error::new(ErrorKind::BadInput, "the note is empty"));
@@ -53,10 +53,10 @@ pub fn edit(fs: &dyn Fs, dir: &Path, changes: &SessionChanges) -> Result<Vec<Edi
     file.save()
 }
 
-/// Gives the dataset `dir` another name: its folder, and the name in its session. Returns the new folder.
+/// Renames the dataset `dir`: its folder, and the name in its session. Returns the new folder.
 ///
 /// # Errors
-/// As [`edit`]; [`ErrorKind::BadInput`] for what cannot be a folder's name, [`ErrorKind::AlreadyExists`] when
+/// As [`edit`]; [`ErrorKind::BadInput`] for an invalid folder name, [`ErrorKind::AlreadyExists`] when
 /// something has that name.
 pub fn rename(fs: &dyn Fs, dir: &Path, name: &str) -> Result<(PathBuf, Vec<Edit>)> {
     check_name(name)?;
@@ -68,7 +68,7 @@ pub fn rename(fs: &dyn Fs, dir: &Path, name: &str) -> Result<(PathBuf, Vec<Edit>
         return Err(Error::new(ErrorKind::AlreadyExists, what));
     }
     file.set("name", name)?;
-    // The name first: killed in between, the dataset is whole under its old folder's name.
+    // The name first: if killed in between, the dataset is complete under its old folder's name.
     let edits = file.save()?;
     if !same {
         fs.rename(dir, &target).map_err(|e| Error::io("rename", dir, e))?;
@@ -78,7 +78,7 @@ pub fn rename(fs: &dyn Fs, dir: &Path, name: &str) -> Result<(PathBuf, Vec<Edit>
     Ok((target, edits))
 }
 
-/// Whether `name` can be the name of a dataset's folder.
+/// Checks that `name` is a valid name for a dataset's folder.
 ///
 /// # Errors
 /// [`ErrorKind::BadInput`] when it is empty, hidden, a path, or too long.
@@ -128,7 +128,7 @@ impl<'a> SessionText<'a> {
                 ),
             ));
         }
-        // After the search: who records can be told more than that it is in use.
+        // After the search, which has a better message for a dataset that is being recorded.
         let lock = match lock {
             Err(e) if e.kind() == std::io::ErrorKind::WouldBlock => {
                 let what = format!(
@@ -147,7 +147,8 @@ impl<'a> SessionText<'a> {
         let text = text_of(fs, &path)?;
         let session = Session::from_toml(&text, &path)?;
         let document = text.parse::<DocumentMut>().map_err(|e| {
-            Error::new(ErrorKind::Corrupt, format!("{} is no TOML: {e}", path.display())).with_source(e)
+            Error::new(ErrorKind::Corrupt, format!("{} is not valid TOML: {e}", path.display()))
+                .with_source(e)
         })?;
         Ok(Self { fs, path, document, session, edits: Vec::new(), _lock: lock })
     }
@@ -214,7 +215,7 @@ impl<'a> SessionText<'a> {
             return Ok(());
         }
         let Some(inline) = array.as_array_mut() else {
-            let what = format!("{}: \"{key}\" is no list; nothing was changed", self.path.display());
+            let what = format!("{}: \"{key}\" is not a list; nothing was changed", self.path.display());
             return Err(Error::new(ErrorKind::Corrupt, what));
         };
         inline.push(Value::InlineTable(entries.into_iter().collect::<InlineTable>()));

@@ -1,4 +1,4 @@
-//! How large a `session.toml` may be, looked at before it is parsed: each table takes some kilobytes of memory, and three
+//! Limits on the size of a `session.toml`, checked before parsing: each table takes some kilobytes of memory, and three
 //! bytes of text are enough for one.
 
 /// Bytes of text.
@@ -14,7 +14,7 @@ struct Counts {
     values: usize,
 }
 
-/// What of a text is more than a session may have, in words.
+/// The first limit of a session file that a text exceeds, in words.
 pub(super) fn exceeded(text: &str) -> Option<String> {
     if text.len() as u64 > TEXT_MAX_BYTES {
         return Some(format!("it has {} bytes, {TEXT_MAX_BYTES} is the limit", text.len()));
@@ -26,7 +26,7 @@ pub(super) fn exceeded(text: &str) -> Option<String> {
     (values > VALUES_MAX).then(|| format!("it has {values} values, {VALUES_MAX} is the limit"))
 }
 
-/// Counts what stands outside of strings and comments; of a text that is no TOML, anything.
+/// Counts outside of strings and comments; the counts of invalid TOML are arbitrary.
 fn count(text: &[u8]) -> Counts {
     let mut counts = Counts::default();
     let mut open = Vec::new();
@@ -67,7 +67,7 @@ fn count(text: &[u8]) -> Counts {
     counts
 }
 
-/// Where the string ends whose opening quote is before `at`; an unclosed one ends with its line, or the text.
+/// The end of the string whose opening quote is before `at`; an unclosed one ends with its line, or the text.
 fn string_end(text: &[u8], at: usize, quote: u8) -> usize {
     let long = text[at..].starts_with(&[quote, quote]);
     let mut at = if long { at + 2 } else { at };
@@ -92,7 +92,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Tables and values of parsed TOML, the slow way; a table of the root is none.
+    /// Tables and values of parsed TOML, the slow way; the root table does not count.
     fn parsed(value: &toml::Value) -> usize {
         match value {
             toml::Value::Table(t) => 1 + t.values().map(parsed).sum::<usize>(),
@@ -123,7 +123,7 @@ e = [1.5, { f.g = 2.5, h = 3 }]
     }
 
     proptest! {
-        /// Whatever parses has no more in it than was counted.
+        /// Parsed TOML never has more tables or values than were counted.
         #[test]
         fn no_table_or_value_is_missed(
             lines in proptest::collection::vec(

@@ -1,6 +1,6 @@
 //! Which recorder's losses fall between two sets.
 //!
-//! Two things tell of a loss. The commit marks say exactly how many sets were offered between two sets that are
+//! Two sources report a loss. The commit marks say exactly how many sets were offered between two sets that are
 //! there; the accounts, about once a second, say for which reasons sets were lost. A loss may be in an account
 //! before the set after it is in the file, or long after. So both are kept until they meet.
 
@@ -14,7 +14,7 @@ const REASONS: usize = SetDrop::ALL.len();
 pub(super) struct Books {
     /// Losses by reason as of the last account; `None` before the first one of a segment from the middle.
     seen: Option<[u64; REASONS]>,
-    /// Losses that accounts told of and no gap has shown yet.
+    /// Losses that accounts reported and no gap has shown yet.
     credit: [u64; REASONS],
     /// Gaps for which no account has given a reason yet, and whether they are gaps of the new dataset.
     open: VecDeque<(u64, bool)>,
@@ -43,7 +43,7 @@ impl Books {
     pub(super) fn account(&mut self, account: &SetCounts, losses: &mut [u64; REASONS]) {
         let before = self.seen.replace(account.dropped).unwrap_or(account.dropped);
         for ((credit, now), before) in self.credit.iter_mut().zip(account.dropped).zip(before) {
-            // What somebody wrote into a file may not fit.
+            // The numbers of a damaged file may not fit.
             *credit = credit.saturating_add(now.saturating_sub(before));
         }
         self.settle(losses);
@@ -56,12 +56,12 @@ impl Books {
         }
     }
 
-    /// Losses that accounts told of and no gap has shown: at the end of the input, those after its last set.
+    /// Losses that accounts reported and no gap has shown: at the end of the input, those after its last set.
     pub(super) fn beyond_gaps(&self) -> u64 {
         self.credit.iter().fold(0, |sum, n| sum.saturating_add(*n))
     }
 
-    /// Sets that are missing in the new dataset for a reason that nothing tells.
+    /// Sets that are missing in the new dataset for an unknown reason.
     pub(super) fn unexplained(&self) -> u64 {
         self.open.iter().filter(|(_, counted)| *counted).map(|(n, _)| n).sum()
     }
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn a_loss_is_counted_once_whichever_tells_of_it_first() {
+    fn a_loss_is_counted_once_whichever_reports_it_first() {
         let mut losses = [0; REASONS];
         let mut books = Books::after(Some(&account([5, 0, 0, 0, 0, 0])));
         books.gap(2, true, &mut losses);
@@ -113,26 +113,28 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever the order in which marks and accounts tell of losses, the totals are those of the model.
+        /// In whatever order marks and accounts report losses, the totals are those of the model.
         #[test]
         fn totals_are_exact(events in proptest::collection::vec((0..3u64, 0..REASONS, any::<bool>()), 0..40)) {
-            let (mut books, mut losses) = (Books::from_zero(), [0; REASONS]);
-            let (mut told, mut gaps) = ([0u64; REASONS], 0);
+            let mut books = Books::from_zero();
+            let mut losses = [0; REASONS];
+            let mut reported = [0u64; REASONS];
+            let mut gaps = 0;
             for (n, reason, is_account) in events {
                 if is_account {
-                    told[reason] += n;
-                    books.account(&account(told), &mut losses);
+                    reported[reason] += n;
+                    books.account(&account(reported), &mut losses);
                 } else {
                     gaps += n;
                     books.gap(n, true, &mut losses);
                 }
                 let total: u64 = losses.iter().sum();
-                prop_assert_eq!(total, gaps.min(told.iter().sum()));
+                prop_assert_eq!(total, gaps.min(reported.iter().sum()));
                 prop_assert_eq!(books.unexplained(), gaps - total);
-                prop_assert!(losses.iter().zip(&told).all(|(l, t)| l <= t));
+                prop_assert!(losses.iter().zip(&reported).all(|(l, t)| l <= t));
             }
             books.end(&mut losses);
-            prop_assert_eq!(losses, told);
+            prop_assert_eq!(losses, reported);
         }
     }
 }

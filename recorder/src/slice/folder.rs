@@ -1,6 +1,6 @@
 //! The folder in which a new dataset grows: locked all the while, and renamed when all in it is durable.
 
-use crate::fs::{Fs, lock_patiently};
+use crate::fs::{Fs, lock_with_retries};
 use crate::{Error, ErrorKind, Result};
 use std::io;
 use std::path::{Path, PathBuf};
@@ -21,7 +21,10 @@ impl<'a> Folder<'a> {
     /// Makes `OUT.part`, if there is neither that nor `OUT`, and room for `bytes`.
     pub(super) fn create(fs: &'a dyn Fs, out: &Path, bytes: u64) -> Result<Self> {
         let name = out.file_name().ok_or_else(|| {
-            Error::new(ErrorKind::BadInput, format!("{} is no name for a new dataset", out.display()))
+            Error::new(
+                ErrorKind::BadInput,
+                format!("{} is not a valid name for a new dataset", out.display()),
+            )
         })?;
         let mut part = name.to_os_string();
         part.push(".part");
@@ -70,7 +73,7 @@ impl<'a> Folder<'a> {
 }
 
 impl Drop for Folder<'_> {
-    /// What was not finished goes; it is all of our making. What cannot be removed keeps the name that says so.
+    /// Removes an unfinished output: all of its files are ours. Files that cannot be removed stay in `OUT.part`.
     fn drop(&mut self) {
         if self.done {
             return;
@@ -84,10 +87,10 @@ impl Drop for Folder<'_> {
     }
 }
 
-/// Locks the folder. A file system that cannot lock is no reason not to write.
+/// Locks the folder; goes on without a lock on a file system that has none.
 fn lock(fs: &dyn Fs, part: &Path) -> Result<Option<Box<dyn Send + Sync>>> {
     let shown = part.display();
-    match lock_patiently(fs, part) {
+    match lock_with_retries(fs, part) {
         Ok(lock) => Ok(Some(lock)),
         Err(e) if e.kind() == io::ErrorKind::WouldBlock => {
             let advice = "wait until that has ended, or choose another name";

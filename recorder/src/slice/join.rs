@@ -1,10 +1,10 @@
-//! The sets of all lanes in the order of their times, each once.
+//! The sets of all tracks in the order of their times, each once.
 
 use super::books::Books;
 use super::folder::Folder;
-use super::lane::{self, Input, Item, Lane, Loose, Origin, Range, Source};
 use super::output::{Losses, Output};
 use super::session::{BEFORE, IN_NO_INPUT, NOT_THERE, said};
+use super::track::{self, Input, Item, Loose, Origin, Range, Source, Track};
 use super::{SliceOptions, SliceProgress, SliceReport};
 use crate::container::chunk::Chunk;
 use crate::container::copy::SetGroup;
@@ -18,7 +18,7 @@ use std::sync::Arc;
 
 mod end;
 
-/// Items that a lane reads ahead. A set is one of them, so this bounds the memory.
+/// Items that a track reads ahead. A set is one of them, so this bounds the memory.
 const AHEAD: usize = 1;
 /// Lines of what is missing that are kept one by one.
 const MAX_LOST: usize = 100;
@@ -36,7 +36,7 @@ pub(super) struct Join<'a> {
     unread: Vec<(usize, String)>,
 }
 
-/// Where a lane stands.
+/// Reading position of a track.
 struct Head {
     items: Receiver<Item>,
     source: Option<Arc<Source>>,
@@ -46,7 +46,7 @@ struct Head {
     next: Option<Box<SetGroup>>,
     /// The clock pair that the next set's segment begins with.
     clock: Option<Loose>,
-    /// What could not be read since the set before.
+    /// Damage since the set before, in words.
     damage: Vec<String>,
     /// There are sets beyond the range.
     beyond: bool,
@@ -76,30 +76,31 @@ impl<'a> Join<'a> {
     pub(super) fn run(
         mut self,
         fs: &dyn Fs,
-        lanes: &[Lane],
+        tracks: &[Track],
         session: Session,
         out: &Path,
         progress: SliceProgress<'_>,
     ) -> Result<SliceReport> {
         let mut total = 0;
-        for lane in lanes {
-            total += lane::bytes(self.inputs, lane, &self.range)?;
+        for track in tracks {
+            total += track::bytes(self.inputs, track, &self.range)?;
         }
         let folder = Folder::create(fs, out, total)?;
         let mut output = Output::new(fs, folder.path(), session, self.range, self.options);
-        let (inputs, range) = (self.inputs, self.range);
+        let inputs = self.inputs;
+        let range = self.range;
         let lost = std::thread::scope(|scope| {
             let mut heads = Vec::new();
-            for lane in lanes {
+            for track in tracks {
                 let (sender, items) = bounded(AHEAD);
-                scope.spawn(move || lane::read(inputs, lane, &range, &sender));
+                scope.spawn(move || track::read(inputs, track, &range, &sender));
                 heads.push(Head::new(items));
             }
             // The heads go before the threads are waited for: a thread that has nobody to read for ends.
             self.copy(heads, &mut output, progress, total)
         })?;
         let (Some(first), Some(last)) = (output.first, output.last) else {
-            let what = "no set in what was asked for can be read; `depthrig verify` says why";
+            let what = "no set in the requested range can be read; `depthrig verify` says why";
             return Err(Error::new(ErrorKind::Corrupt, what));
         };
         let report = SliceReport {
@@ -132,7 +133,8 @@ impl<'a> Join<'a> {
                 output.before(source, message);
             }
         }
-        let (mut done, mut last) = (0, None);
+        let mut done = 0;
+        let mut last = None;
         while let Some(at) = heads.iter().filter_map(Head::time).min() {
             if progress(done, total).is_break() {
                 return Err(Error::new(
@@ -141,7 +143,7 @@ impl<'a> Join<'a> {
                 ));
             }
             let due: Vec<_> = (0..heads.len()).filter(|i| heads[*i].time() == Some(at)).collect();
-            // Staying with a lane keeps its accounts together.
+            // Staying with a track keeps its accounts together.
             let chosen = last.filter(|l| due.contains(l)).unwrap_or(due[0]);
             for other in due.iter().filter(|i| **i != chosen) {
                 must_be_same(&heads[chosen], &heads[*other])?;
@@ -166,9 +168,9 @@ impl<'a> Join<'a> {
             last = Some(chosen);
         }
         self.end(&mut heads, output);
-        let lost = self.told();
+        let lost = self.loss_lines();
         let lost = output.finish(&self.losses, lost)?;
-        // What is not read is between sets and outside of the range.
+        // The bytes that are not read are between sets and outside of the range.
         let _ = progress(total, total);
         Ok(lost)
     }
@@ -193,7 +195,7 @@ impl<'a> Join<'a> {
             }
             let session = head.source.as_ref().map(|s| inputs[s.origin.input].dataset.session());
             let Some((id, _)) = output.last else {
-                // What was lost before the first set belongs to a whole recording and not to a part.
+                // Losses before the first set belong to a complete recording, not to a part.
                 let counted = head.before.is_none() && self.range.begins;
                 let own = head.source.as_ref().filter(|s| counted && s.is_first());
                 output.begin(own.map_or(mark.sets_offered.saturating_sub(1), |s| {
@@ -218,7 +220,7 @@ impl<'a> Join<'a> {
                     ),
                 ));
             }
-            // With the set of another input before it, its own accounts do not tell of the gap.
+            // With the set of another input before it, its own accounts do not count the gap.
             let same = head.before.zip(head.source.as_ref()).is_some_and(|((before, _, origin), source)| {
                 before == id && origin.goes_on(source.origin, inputs)
             });
@@ -249,7 +251,7 @@ impl<'a> Join<'a> {
         }
     }
 
-    fn told(&mut self) -> Vec<String> {
+    fn loss_lines(&mut self) -> Vec<String> {
         let mut lost = std::mem::take(&mut self.lost);
         if self.more_lost > 0 {
             lost.push(format!("and {} more like these", self.more_lost));
@@ -343,7 +345,7 @@ impl Head {
         self.source.as_ref().map_or_else(String::new, |s| s.reader.path.display().to_string())
     }
 
-    /// Sets that were offered since the set before and are not in this lane, as far as its accounts go back: what
+    /// Sets that were offered since the set before and are not in this track, as far as its accounts go back: what
     /// lies between two inputs with accounts of their own is in neither.
     fn gap(&self, inputs: &[Input<'_>], offered: u64) -> u64 {
         let Some(source) = &self.source else { return 0 };
@@ -358,8 +360,7 @@ impl Head {
     }
 }
 
-/// The line of what is missing before the first set, where no account tells of it; `knows` when that is `gap`
-/// sets.
+/// The line about sets missing before the first one, where no account counts them; `knows` when these are `gap` sets.
 fn lost_before(
     id: u64,
     gap: u64,
@@ -370,7 +371,7 @@ fn lost_before(
     let sets = format!("{gap} sets before set {id}");
     match (damage.is_empty(), knows) {
         (true, _) => said(session, &format!("{sets} are ")),
-        // Of a beginning that cannot be read nobody knows how long it is.
+        // A beginning that cannot be read has an unknown length.
         (false, false) => Some(format!("{BEFORE}{id} is not there: {}", damage.join("; "))),
         (false, true) => (gap > 0).then(|| format!("{sets} {NOT_THERE}{}", damage.join("; "))),
     }
@@ -401,7 +402,7 @@ fn must_be_same(a: &Head, b: &Head) -> Result<()> {
     ))
 }
 
-/// The messages that describe a set; its pictures are in the mark by length and checksum.
+/// The messages that describe a set; its images are in the mark by length and checksum.
 fn described(set: &SetGroup, source: &Source) -> Result<Vec<(String, Vec<u8>)>> {
     let (Some(chunk), Some(offset)) = (set.chunks.last(), set.offsets.last()) else { return Ok(Vec::new()) };
     let mut messages = Vec::new();

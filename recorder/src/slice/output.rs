@@ -1,8 +1,8 @@
 //! Writing the new dataset: sets as they came, and between them what must be said anew.
 
 use super::SliceOptions;
-use super::lane::{Loose, Range, Source};
 use super::session::count_line;
+use super::track::{Loose, Range, Source};
 use crate::container::chunk::{ChunkBuilder, MessageHead};
 use crate::container::copy::SetGroup;
 use crate::container::segment::{Preamble, Segment};
@@ -39,7 +39,7 @@ pub(super) struct Output<'a> {
     /// Sets offered up to the last one, as its mark says.
     pub(super) offered: u64,
     pub(super) last: Option<(u64, u64)>,
-    /// What came after the last set and is not written yet.
+    /// Messages after the last set that are not written yet.
     held: Vec<(Arc<Source>, Loose)>,
     /// The last reading of both clocks.
     clock: Option<Loose>,
@@ -123,7 +123,7 @@ impl<'a> Output<'a> {
         }
     }
 
-    /// What its marks count from.
+    /// Sets offered before its first one: its marks count from there.
     pub(super) fn offered_before(&self) -> u64 {
         self.session.derived.last().map_or(0, |step| step.offered_before)
     }
@@ -194,7 +194,7 @@ impl<'a> Output<'a> {
         Ok(())
     }
 
-    /// What the source's segments begin with, for this session.
+    /// The preamble of the source's segments, for this session.
     fn preamble(&self, source: &Source) -> Result<Preamble> {
         let mut facts = source.reader.metadata(SESSION_METADATA).cloned().unwrap_or_default();
         let session = &self.session;
@@ -257,7 +257,8 @@ impl<'a> Output<'a> {
             any = true;
         }
         if let Some(channel) = source.channel(Schema::Accounts).filter(|_| account) {
-            let (counts, streams) = (self.counts(losses), &self.streams);
+            let counts = self.counts(losses);
+            let streams = &self.streams;
             message(&mut self.builder, &mut self.sequence, channel, log_time, log_time, |b| {
                 accounts::write(b, log_time as i64, &counts, streams);
             })?;

@@ -1,11 +1,11 @@
 //! `session.toml` of a part, and whether several parts are of one session.
 
-use super::lane::Range;
+use super::track::Range;
 use crate::dataset::Dataset;
 use crate::{Error, ErrorKind, Outcome, Result, Session, SetCounts, SetDrop};
 use std::path::Path;
 
-// Words of the lines that a join itself writes of gaps. These are found anew from the sets each time.
+// Words of the lines that a join itself writes about gaps. These are determined anew from the sets each time.
 
 /// The end of one of a gap between two inputs.
 pub(super) const IN_NO_INPUT: &str = "in none of the inputs";
@@ -54,8 +54,8 @@ fn named(source: &Session, out: &Path) -> Session {
     session
 }
 
-/// What a source says was lost in words of its own, as far as it holds of sets from `first` to `last`. Counts
-/// are counted anew.
+/// Losses that a source states in words of its own, as far as they hold for sets from `first` to `last`. Counts are
+/// counted anew.
 pub(super) fn lost_in_words(source: &Session, first: u64, last: u64) -> Vec<String> {
     let Some(outcome) = &source.outcome else { return Vec::new() };
     let known = |reason: &str| SetDrop::ALL.iter().any(|r| r.name() == reason);
@@ -65,19 +65,19 @@ pub(super) fn lost_in_words(source: &Session, first: u64, last: u64) -> Vec<Stri
     outcome.lost.iter().filter(holds).cloned().collect()
 }
 
-/// Whether a line tells of a gap between sets, or before the first one.
+/// Whether a line is about a gap between sets, or before the first one.
 fn is_gap(line: &str) -> bool {
     let between = [" sets before set ", " sets between set "].iter().any(|words| line.contains(*words));
     (between && line.contains(NOT_THERE)) || line.ends_with(IN_NO_INPUT) || line.ends_with(UNEXPLAINED)
 }
 
-/// Whether a line tells of what is missing before or after a set, where others are now.
+/// Whether a line is about sets missing before or after a set, where others are now.
 fn is_filled(line: &str, first: u64, last: u64) -> bool {
     let set = |begin: &str| line.strip_prefix(begin)?.split(' ').next()?.parse::<u64>().ok();
     set(BEFORE).is_some_and(|id| first < id) || set(AFTER).is_some_and(|id| id < last)
 }
 
-/// Whether two lines tell of the same end.
+/// Whether two lines are about the same end.
 pub(super) fn is_same_end(a: &str, b: &str) -> bool {
     [BEFORE, AFTER].iter().any(|begin| a.starts_with(*begin) && b.starts_with(*begin))
 }
@@ -114,7 +114,8 @@ pub(super) fn count_line(n: u64, offered: u64, reason: &str) -> String {
 
 /// Refuses two datasets of different sessions, and says in what they differ.
 pub(super) fn must_be_one(a: &Dataset, b: &Dataset) -> Result<()> {
-    let (x, y) = (a.session(), b.session());
+    let x = a.session();
+    let y = b.session();
     let mut differ = Vec::new();
     let mut check = |what: String, same: bool| {
         if !same {
@@ -127,26 +128,25 @@ pub(super) fn must_be_one(a: &Dataset, b: &Dataset) -> Result<()> {
         x.started_utc_ns == y.started_utc_ns,
     );
     let names = |s: &Session| s.streams.iter().map(|s| s.id.to_string()).collect::<Vec<_>>();
-    let (xs, ys) = (names(x), names(y));
+    let xs = names(x);
+    let ys = names(y);
     check(format!("the streams are {} and {}", xs.join(", "), ys.join(", ")), xs == ys);
     for (s, t) in x.streams.iter().zip(&y.streams).filter(|(s, t)| s.id == t.id) {
         check(format!("{} has another calibration", s.id), (s.intrinsics, s.pose) == (t.intrinsics, t.pose));
         check(format!("{} has another depth unit", s.id), s.depth_unit_m == t.depth_unit_m);
         let device = (&s.model, &s.serial) == (&t.model, &t.serial);
         check(format!("{} is of another camera", s.id), device);
-        let picture = (s.format, s.width, s.height) == (t.format, t.width, t.height);
-        check(format!("{} has other pictures", s.id), picture);
+        let image = (s.format, s.width, s.height) == (t.format, t.width, t.height);
+        check(format!("{} has other images", s.id), image);
         let rest = (&s.calibration, s.rate_hz) == (&t.calibration, t.rate_hz);
         check(format!("{} is described otherwise", s.id), rest);
     }
     let names = |s: &Session| s.motion.iter().map(|u| u.id.to_string()).collect::<Vec<_>>();
-    let (xs, ys) = (names(x), names(y));
-    check(format!("the motion units are [{}] and [{}]", xs.join(", "), ys.join(", ")), xs == ys);
+    let xs = names(x);
+    let ys = names(y);
+    check(format!("the IMUs are [{}] and [{}]", xs.join(", "), ys.join(", ")), xs == ys);
     for (u, v) in x.motion.iter().zip(&y.motion).filter(|(u, v)| u.id == v.id && u != v) {
-        check(
-            format!("the motion unit {} has another pose or device, or is described otherwise", u.id),
-            u == v,
-        );
+        check(format!("the IMU {} has another pose or device, or is described otherwise", u.id), u == v);
     }
     if differ.is_empty() {
         return Ok(());

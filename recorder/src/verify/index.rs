@@ -1,11 +1,11 @@
-//! The summary of a segment against its data: what a reader that trusts the index would be told.
+//! Compares the summary of a segment, which readers of the index rely on, with its data.
 
 use crate::container::record::op;
 use crate::{ErrorKind, Result};
 use mcap::records::{ChunkIndex, Record, Statistics};
 use std::collections::BTreeMap;
 
-/// What the records of the data say, to be compared with the summary.
+/// The contents of the data, to compare with the summary.
 #[derive(Default)]
 pub(super) struct Contents {
     /// By offset, as an index would describe them.
@@ -21,7 +21,7 @@ pub(super) struct Contents {
     summary: Summary,
 }
 
-/// What the summary said so far.
+/// The contents of the summary so far.
 #[derive(Default)]
 struct Summary {
     chunks: usize,
@@ -30,8 +30,12 @@ struct Summary {
     statistics: Option<Statistics>,
 }
 
-/// Where it is wrong, if there is one place, and what is wrong.
-pub(super) type Wrong = (Option<u64>, String);
+/// A difference between summary and data.
+pub(super) struct Mismatch {
+    /// Where it is, if in one place.
+    pub(super) offset: Option<u64>,
+    pub(super) message: String,
+}
 
 impl Contents {
     pub(super) fn chunk(&mut self, offset: u64, length: u64, header: &mcap::records::ChunkHeader) {
@@ -74,11 +78,14 @@ impl Contents {
     ///
     /// # Errors
     /// [`ErrorKind::Corrupt`] for a record that has no place there.
-    pub(super) fn summary(&mut self, record: &Record<'_>, whole: &[u8]) -> Result<Option<Wrong>> {
+    pub(super) fn summary(&mut self, record: &Record<'_>, whole: &[u8]) -> Result<Option<Mismatch>> {
         let index = |offset, kind: &str, same: bool| {
-            (!same).then(|| (Some(offset), format!("the index of {kind} is not what is at this place")))
+            (!same).then(|| Mismatch {
+                offset: Some(offset),
+                message: format!("the index of {kind} is not what is at this place"),
+            })
         };
-        let wrong = match record {
+        let mismatch = match record {
             Record::ChunkIndex(i) => {
                 self.summary.chunks += 1;
                 let same = self.chunks.get(&i.chunk_start_offset) == Some(i);
@@ -109,19 +116,21 @@ impl Contents {
             Record::Footer(_) | Record::SummaryOffset(_) | Record::Unknown { .. } => None,
             _ => return Err(crate::Error::new(ErrorKind::Corrupt, "a record has no place in the summary")),
         };
-        Ok(wrong)
+        Ok(mismatch)
     }
 
-    /// What the summary lacks, once all of it was taken.
-    pub(super) fn compare(&self) -> Vec<Wrong> {
-        let mut wrong = Vec::new();
-        let mut say = |what: String| wrong.push((None, what));
-        let (said, there) = (self.summary.chunks, self.chunks.len());
+    /// The records that the summary lacks, once all of it was taken.
+    pub(super) fn compare(&self) -> Vec<Mismatch> {
+        let mut mismatches = Vec::new();
+        let mut say = |message: String| mismatches.push(Mismatch { offset: None, message });
+        let said = self.summary.chunks;
+        let there = self.chunks.len();
         if said != there {
             say(format!("the index ({said} chunks) is not that of the data ({there} chunks)"));
         }
         if self.summary.others != self.others.len() {
-            let (said, there) = (self.summary.others, self.others.len());
+            let said = self.summary.others;
+            let there = self.others.len();
             say(format!("{there} attachments and metadata records, the index says {said}"));
         }
         for (key, crc) in &self.definitions {
@@ -133,7 +142,7 @@ impl Contents {
         let messages: u64 = self.messages.values().sum();
         let Some(s) = &self.summary.statistics else {
             say(format!("{messages} messages, and no statistics of them"));
-            return wrong;
+            return mismatches;
         };
         if s.message_count != messages || s.channel_message_counts.iter().any(|(c, n)| self.count(*c) != *n) {
             say(format!("{messages} messages, the statistics say {:?}", s.message_count));
@@ -153,7 +162,7 @@ impl Contents {
         if messages > 0 && (s.message_start_time, s.message_end_time) != (first, last) {
             say(format!("its messages are from {first} to {last}, the statistics say otherwise"));
         }
-        wrong
+        mismatches
     }
 
     fn count(&self, channel: u16) -> u64 {

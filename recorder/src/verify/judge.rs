@@ -1,5 +1,5 @@
-//! Judges segments one at a time with the rules of [`verify`](super::verify), for what writes them: a recovery keeps
-//! only what passes here.
+//! Judges segments one at a time with the rules of [`verify`](super::verify), for their writers: a recovery keeps only
+//! segments that pass here.
 
 use super::sets::Walk;
 use super::{Finding, Findings, Severity, VerifyOptions, Watch, check_session, segment};
@@ -16,7 +16,7 @@ pub(crate) struct Judge {
 
 /// The verdict on a segment.
 pub(crate) struct Verdict {
-    /// What is not what it says it is; empty when nothing is.
+    /// Findings of broken data.
     pub(crate) broken: Vec<Finding>,
     /// The state after it.
     pub(crate) after: Judge,
@@ -31,38 +31,39 @@ impl Judge {
         Self { walk }
     }
 
-    /// Before a segment of which the ones before are not looked at.
+    /// Before a segment whose predecessors are not checked.
     pub(crate) fn lone(session: &Session) -> Self {
         let mut judge = Self::new(session);
         judge.walk.lone = true;
         judge
     }
 
-    /// Reads the segment `path` after those before; `tell` hears how many bytes of it are done.
+    /// Reads the segment `path` after those before; `on_progress` gets the bytes of it done so far.
     ///
     /// # Errors
-    /// When the operating system cannot read it, and what `tell` returns. Damage is a verdict.
+    /// When the operating system cannot read it, and the error of `on_progress`. Damage is a verdict.
     pub(crate) fn look(
         &self,
         fs: &dyn Fs,
         path: &Path,
-        tell: &mut dyn FnMut(u64) -> Result<()>,
+        on_progress: &mut dyn FnMut(u64) -> Result<()>,
     ) -> Result<Verdict> {
         let mut after = self.clone();
         let mut findings = Findings::default();
         let mut ended = Ok(());
-        let mut hear = |progress: super::VerifyProgress| {
-            ended = tell(progress.bytes);
+        let mut forward = |progress: super::VerifyProgress| {
+            ended = on_progress(progress.bytes);
             if ended.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
         };
-        let mut watch = Watch { tell: &mut hear, done: 0, told: 0, total: u64::MAX, stopped: false };
+        let mut watch =
+            Watch { on_progress: &mut forward, done: 0, reported: 0, total: u64::MAX, stopped: false };
         segment::try_segment(&mut after.walk, fs, path, &mut findings, &mut watch)?;
         ended?;
         Ok(Verdict { broken: broken(findings), after })
     }
 }
 
-/// What `session.toml` says that is broken, whatever the segments hold.
+/// Findings of broken data in `session.toml`, whatever the segments hold.
 pub(crate) fn broken_session(session: &Session) -> Vec<Finding> {
     let mut findings = Findings::default();
     check_session(session, &mut findings);

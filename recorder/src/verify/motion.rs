@@ -1,4 +1,4 @@
-//! Motion units: batches whole and in their order, and the single samples beside them.
+//! IMUs: complete batches in their order, and the single samples beside them.
 
 mod set;
 
@@ -15,15 +15,15 @@ use std::collections::BTreeMap;
 
 pub(super) use set::set;
 
-/// The messages of motion units since the last commit mark.
+/// The messages of IMUs since the last commit mark.
 #[derive(Default)]
 pub(super) struct Messages {
     /// Bytes of all of them.
     bytes: u64,
     batches: Vec<Waiting>,
-    /// Samples without a header before them, by unit.
+    /// Samples without a header before them, by IMU.
     stray: BTreeMap<StreamId, u64>,
-    /// Of each unit.
+    /// Of each IMU.
     single: BTreeMap<StreamId, Single>,
 }
 
@@ -33,16 +33,16 @@ struct Waiting {
     log_time: u64,
     header: Box<FrameHeader>,
     stamp_utc_ns: i64,
-    /// Frame and codec are those of a motion unit.
+    /// Frame and codec are those of an IMU.
     is_named: bool,
     samples: Option<Batch>,
 }
 
-/// The single samples of a unit.
+/// The single samples of an IMU.
 #[derive(Default)]
 struct Single {
     count: u64,
-    /// What they say, with the name of their frame and the time that their records have; with decoding only.
+    /// Their values, each with the time of its record; only when decoding.
     values: Vec<(Imu, u64)>,
     frame_id: String,
     /// They are not all of one frame.
@@ -50,7 +50,7 @@ struct Single {
 }
 
 impl Messages {
-    /// Takes a message of a motion unit; whether it is one. More than a set may have is not kept.
+    /// Takes a message of an IMU; whether it is one. More than a set may have is not kept.
     pub(super) fn take(&mut self, kind: &Kind, m: &Message<'_>, decode: bool) -> Result<bool> {
         if kind.is_motion() {
             self.bytes = self.bytes.saturating_add(m.data.len() as u64);
@@ -97,7 +97,7 @@ impl Messages {
     }
 }
 
-/// What is carried from batch to batch of a unit.
+/// State kept from batch to batch of an IMU.
 #[derive(Clone, Default)]
 pub(super) struct Unit {
     /// Most samples of one batch, as the session says.
@@ -115,7 +115,7 @@ struct Last {
     epoch: u32,
 }
 
-/// The motion units of a session.
+/// The IMUs of a session.
 #[derive(Clone, Default)]
 pub(super) struct Units(BTreeMap<StreamId, Unit>);
 
@@ -130,7 +130,7 @@ impl Units {
         self.0.values().map(|u| u.count.samples).sum()
     }
 
-    /// What the channels of a segment have too much or too little.
+    /// IMU channels that a segment has too many or too few.
     pub(super) fn channels<'a>(&self, kinds: &(impl Iterator<Item = &'a Kind> + Clone)) -> Vec<String> {
         let ids = |of: fn(&Kind) -> Option<&StreamId>| kinds.clone().filter_map(of).collect::<Vec<_>>();
         let all: [(&str, Vec<&StreamId>); 3] = [
@@ -141,17 +141,17 @@ impl Units {
         let mut problems = Vec::new();
         for (topic, there) in &all {
             for id in there.iter().filter(|id| !self.0.contains_key(**id)) {
-                problems.push(format!("{id}/{topic} is of a motion unit that is not in the session"));
+                problems.push(format!("{id}/{topic} is of an IMU that is not in the session"));
             }
             for id in self.0.keys().filter(|id| !there.contains(id)) {
-                problems.push(format!("the motion unit {id} has no channel {topic}"));
+                problems.push(format!("the IMU {id} has no channel {topic}"));
             }
         }
         problems
     }
 
-    /// What is to be said at the end. A gap is a note, as frames are that were lost live: the numbers show it, and what was
-    /// handed to the recorder and is not here is said of its set.
+    /// Adds the findings at the end. A gap is a note, like frames lost live: the numbers show it, and losses after the
+    /// hand-over to the recorder are findings of their set.
     pub(super) fn finish(&self, findings: &mut Findings) {
         for (id, unit) in &self.0 {
             if unit.count.lost_batches > 0 {
@@ -170,7 +170,7 @@ impl Units {
 }
 
 impl Unit {
-    /// What is wrong with a batch after the one before, in words.
+    /// Checks a batch against the one before; the problems in words.
     fn follow(&mut self, header: &FrameHeader, batch: Batch) -> Vec<String> {
         let mut problems = Vec::new();
         let replayed = header.flags & FrameFlags::REPLAYED.0 != 0;
@@ -188,7 +188,7 @@ impl Unit {
                 continue;
             }
             let same_epoch = before.epoch == header.clock_epoch;
-            // A unit that was started anew may count anew.
+            // An IMU that was restarted may count from the beginning.
             if sample.sequence <= before.number && same_epoch {
                 problems.push(format!("sample {} follows sample {}", sample.sequence, before.number));
             }

@@ -10,7 +10,7 @@ const WINDOW: usize = 1 << 20;
 pub(super) struct Records<'a> {
     reader: &'a SegmentReader,
     buf: Vec<u8>,
-    /// What of `buf` was read and not yet passed.
+    /// `buf[start..end]` was read and not yet consumed.
     start: usize,
     end: usize,
     /// Where `buf[start]` lies in the file.
@@ -64,7 +64,7 @@ impl<'a> Records<'a> {
         Ok(Some(Raw { opcode: whole[0], whole, after }))
     }
 
-    /// Goes on to what lies `len` bytes further, which were delivered.
+    /// Advances by `len` bytes that were delivered.
     pub(super) fn advance(&mut self, len: usize) {
         self.start += len;
         self.offset += len as u64;
@@ -76,7 +76,7 @@ impl<'a> Records<'a> {
         self.reader.error(ErrorKind::Truncated, self.offset, what)
     }
 
-    /// Sees to it that `want` bytes are in the buffer, or all up to the end of the file; how many there are.
+    /// Fills the buffer with `want` bytes, or all up to the end of the file; returns how many there are.
     fn fill(&mut self, want: usize) -> Result<usize> {
         let there = self.end - self.start;
         let left = self.reader.size - self.offset - there as u64;
@@ -84,7 +84,8 @@ impl<'a> Records<'a> {
             return Ok(there);
         }
         self.buf.copy_within(self.start..self.end, 0);
-        (self.start, self.end) = (0, there);
+        self.start = 0;
+        self.end = there;
         // Not more than the file has: a short file should not cost a window.
         let room = want.max(WINDOW).min(there.saturating_add(usize::try_from(left).unwrap_or(usize::MAX)));
         if self.buf.len() < room {

@@ -15,7 +15,7 @@ pub(super) struct Seen<'a> {
     pub(super) findings: &'a mut Findings,
     /// Images in chunks from here on are unpacked.
     pub(super) unproven: u64,
-    pub(super) pictures: BTreeMap<StreamId, Picture>,
+    pub(super) images: BTreeMap<StreamId, Image>,
     pub(super) infos: BTreeMap<StreamId, (u64, Vec<u8>)>,
     pub(super) calibrated: BTreeSet<StreamId>,
     pub(super) motion: Messages,
@@ -27,7 +27,7 @@ impl<'a> Seen<'a> {
             file: file.to_owned(),
             findings,
             unproven,
-            pictures: BTreeMap::new(),
+            images: BTreeMap::new(),
             infos: BTreeMap::new(),
             calibrated: BTreeSet::new(),
             motion: Messages::default(),
@@ -41,7 +41,7 @@ impl<'a> Seen<'a> {
 }
 
 /// An image that waits for the mark of its set.
-pub(super) struct Picture {
+pub(super) struct Image {
     /// Where its chunk begins.
     pub(super) offset: u64,
     pub(super) channel: u16,

@@ -1,15 +1,15 @@
 //! One pass over a segment's records.
 //!
-//! What proves the bytes: the checksum over the data of a finished segment, or the last good checkpoint of an
-//! unfinished one. Chunks with a picture that lie in proven bytes are not unpacked: their message index says
-//! which picture they are, and from their set's mark follows what the checksum in their head must be. Bytes that
-//! nothing proves, and every picture when it is to be decoded, are unpacked by workers, see `pictures`.
+//! The bytes are proven by the checksum over the data of a finished segment, or the last good checkpoint of an
+//! unfinished one. Chunks with an image that lie in proven bytes are not unpacked: their message index says
+//! which image they are, and from their set's mark follows what the checksum in their head must be. Bytes that
+//! nothing proves, and every image when it is to be decoded, are unpacked by workers, see `images`.
 
+use super::images::{Images, with_workers};
 use super::index::Contents;
 use super::motion;
-use super::pictures::{Pictures, with_workers};
 use super::records::Records;
-use super::seen::{MESSAGE_HEAD, Picture, Proof, Seen};
+use super::seen::{Image, MESSAGE_HEAD, Proof, Seen};
 use super::sets::Walk;
 use super::{Findings, Severity, Watch, file_name};
 use crate::container::record::op;
@@ -26,7 +26,7 @@ use mcap::records::Record;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// What one segment's pass collects.
+/// State of the pass over one segment.
 pub(super) struct Pass<'a> {
     seen: Seen<'a>,
     schemas: BTreeMap<u16, String>,
@@ -41,7 +41,7 @@ pub(super) struct Pass<'a> {
     unlisted: BTreeSet<(u16, u64, u64)>,
     /// Of the bytes before the present record.
     crc: crc32fast::Hasher,
-    /// The bytes before this are what was written.
+    /// The bytes before this are proven.
     proven: u64,
 }
 
@@ -99,28 +99,31 @@ fn read(
     for (_, said) in reader.metadata.iter().filter(|(name, _)| name == RECOVERED_METADATA) {
         walk.lost = walk.lost.saturating_add(sets_lost(said));
     }
-    // With decoding every picture is unpacked anyway. Without, a first pass shows what the checksums prove; where
+    // With decoding every image is unpacked anyway. Without, a first pass shows what the checksums prove; where
     // they do not prove all, a second one takes its place.
     let mut unproven = if walk.options.decode { 0 } else { u64::MAX };
-    let (before, watched) = (walk.clone(), watch.done);
+    let before = walk.clone();
+    let watched = watch.done;
     loop {
         let mut found = Findings::default();
         let threads = if unproven == u64::MAX { 0 } else { walk.options.threads() };
-        let (result, problems) = with_workers(&reader, threads, |pictures| {
+        let (result, damaged) = with_workers(&reader, threads, |images| {
             let mut pass = Pass::new(&file, &mut found, unproven);
             // Another writer may have put them into chunks; those at the head of the data are taken as they come.
             reader.channels.iter().for_each(|(id, info)| pass.channel(*id, info));
-            let result = pass.run(walk, &reader, finished, pictures, watch);
+            let result = pass.run(walk, &reader, finished, images, watch);
             result.map(|()| pass.proven)
         });
         let proven = *result.as_ref().unwrap_or(&0);
         if unproven == u64::MAX && proven < reader.size && !watch.stopped {
-            (*walk, watch.done, unproven) = (before.clone(), watched, proven);
+            *walk = before.clone();
+            watch.done = watched;
+            unproven = proven;
             continue;
         }
         findings.append(found);
-        for (offset, what) in problems {
-            findings.add(Severity::Broken, &file, Some(offset), what);
+        for image in damaged {
+            findings.add(Severity::Broken, &file, Some(image.offset), image.message);
         }
         return result.map(drop);
     }
@@ -149,10 +152,10 @@ impl<'a> Pass<'a> {
         walk: &mut Walk,
         reader: &SegmentReader,
         finished: bool,
-        pictures: &mut Pictures<'_>,
+        images: &mut Images<'_>,
         watch: &mut Watch<'_>,
     ) -> Result<()> {
-        let ended = self.data(walk, reader, pictures, watch);
+        let ended = self.data(walk, reader, images, watch);
         if watch.stopped {
             return Ok(());
         }
@@ -162,10 +165,10 @@ impl<'a> Pass<'a> {
         for what in walk.units.channels(&self.kinds.values()) {
             self.seen.broken(None, what);
         }
-        if !self.seen.pictures.is_empty() {
-            let n = self.seen.pictures.len();
-            let at = self.seen.pictures.values().map(|p| p.offset).min();
-            self.seen.broken(at, format!("a torn set: {n} pictures have no commit mark after them"));
+        if !self.seen.images.is_empty() {
+            let n = self.seen.images.len();
+            let at = self.seen.images.values().map(|p| p.offset).min();
+            self.seen.broken(at, format!("a torn set: {n} images have no commit mark after them"));
         }
         match ended {
             Ok(Some(summary)) => self.summary(reader, summary, finished),
@@ -173,7 +176,7 @@ impl<'a> Pass<'a> {
                 self.seen.broken(None, "the data has no end record");
                 Ok(())
             }
-            // Said already: the file is unfinished and cut here.
+            // A finding already: the file is unfinished and cut here.
             Ok(None) => Ok(()),
             Err(e) if e.kind() == ErrorKind::Truncated && !reader.finished => Ok(()),
             Err(e) => Err(e),
@@ -185,7 +188,7 @@ impl<'a> Pass<'a> {
         &mut self,
         walk: &mut Walk,
         reader: &SegmentReader,
-        pictures: &mut Pictures<'_>,
+        images: &mut Images<'_>,
         watch: &mut Watch<'_>,
     ) -> Result<Option<u64>> {
         self.crc.update(&crate::container::MAGIC);
@@ -203,7 +206,8 @@ impl<'a> Pass<'a> {
             match raw.opcode {
                 op::DATA_END => {
                     if let Record::DataEnd(end) = reader.parse(raw.opcode, raw.body(), offset)? {
-                        let (crc, saved) = (self.crc.clone().finalize(), end.data_section_crc);
+                        let crc = self.crc.clone().finalize();
+                        let saved = end.data_section_crc;
                         if saved == crc {
                             self.proven = reader.size;
                         } else if saved != 0 {
@@ -213,7 +217,7 @@ impl<'a> Pass<'a> {
                     }
                     return Ok(Some(offset + length));
                 }
-                op::CHUNK => self.chunk(walk, reader, pictures, offset, &raw)?,
+                op::CHUNK => self.chunk(walk, reader, images, offset, &raw)?,
                 op::MESSAGE_INDEX => {
                     if let Record::MessageIndex(index) = reader.parse(raw.opcode, raw.body(), offset)? {
                         self.contents.message_index(index.channel_id, offset, length);
@@ -291,18 +295,18 @@ impl<'a> Pass<'a> {
         &mut self,
         walk: &mut Walk,
         reader: &SegmentReader,
-        pictures: &mut Pictures<'_>,
+        images: &mut Images<'_>,
         offset: u64,
         raw: &super::records::Raw<'_>,
     ) -> Result<()> {
         let Record::Chunk { header, .. } = reader.parse(op::CHUNK, raw.body(), offset)? else {
-            return Err(reader.error(ErrorKind::Corrupt, offset, "this is no chunk"));
+            return Err(reader.error(ErrorKind::Corrupt, offset, "this is not a chunk"));
         };
         self.contents.chunk(offset, raw.whole.len() as u64, &header);
-        if let Some((id, picture)) = self.lone_picture(&header, offset, raw.after) {
-            self.contents.message(picture.channel);
-            self.unlisted.insert((picture.channel, picture.log_time, 0));
-            self.seen.pictures.insert(id, picture);
+        if let Some((id, image)) = self.lone_image(&header, offset, raw.after) {
+            self.contents.message(image.channel);
+            self.unlisted.insert((image.channel, image.log_time, 0));
+            self.seen.images.insert(id, image);
             return Ok(());
         }
         let read = reader.chunk_messages(raw.body(), offset, |m| {
@@ -311,31 +315,32 @@ impl<'a> Pass<'a> {
             if m.log_time < header.message_start_time || m.log_time > header.message_end_time {
                 self.seen.broken(Some(offset), "a message lies outside of the times of its chunk");
             }
-            if let Err(e) = self.message(walk, pictures, &m, offset) {
+            if let Err(e) = self.message(walk, images, &m, offset) {
                 self.seen.broken(Some(offset), e.to_string());
             }
             Ok(())
         });
         if let Err(e) = read {
-            // The next chunk may be whole.
+            // The next chunk may be intact.
             self.unlisted.clear();
             self.seen.broken(Some(offset), e.to_string());
         }
         Ok(())
     }
 
-    /// The picture that a packed chunk holds, by its message index alone; `None` when that does not say.
-    fn lone_picture(
+    /// The image that a packed chunk holds, by its message index alone; `None` if that does not identify it.
+    fn lone_image(
         &self,
         header: &mcap::records::ChunkHeader,
         offset: u64,
         after: &[u8],
-    ) -> Option<(StreamId, Picture)> {
+    ) -> Option<(StreamId, Image)> {
         let (index, next) = after.split_at_checked(HEAD as usize + 22)?;
         let number =
             |at: usize, n: usize| index[at..at + n].iter().rev().fold(0, |v, b| v << 8 | u64::from(*b));
         let one = index[0] == op::MESSAGE_INDEX && number(1, 8) == 22 && number(11, 4) == 16;
-        let (channel, log_time) = (number(9, 2) as u16, number(15, 8));
+        let channel = number(9, 2) as u16;
+        let log_time = number(15, 8);
         let times = (header.message_start_time, header.message_end_time);
         if !one
             || next.first() == Some(&op::MESSAGE_INDEX)
@@ -344,18 +349,18 @@ impl<'a> Pass<'a> {
         {
             return None;
         }
-        // What is not packed is checked on the spot: that costs no more than its checksum.
+        // An unpacked image is checked on the spot: that costs no more than its checksum.
         let len =
             header.uncompressed_size.checked_sub(MESSAGE_HEAD).filter(|_| header.compression == "zstd")?;
-        let Some(Kind::Picture(id)) = self.kinds.get(&channel) else { return None };
+        let Some(Kind::Image(id)) = self.kinds.get(&channel) else { return None };
         let proof = Proof::Packed(header.uncompressed_crc);
-        Some((id.clone(), Picture { offset, channel, log_time, len, proof }))
+        Some((id.clone(), Image { offset, channel, log_time, len, proof }))
     }
 
     fn message(
         &mut self,
         walk: &mut Walk,
-        pictures: &mut Pictures<'_>,
+        images: &mut Images<'_>,
         m: &Message<'_>,
         offset: u64,
     ) -> Result<()> {
@@ -375,19 +380,20 @@ impl<'a> Pass<'a> {
         }
         match self.kinds.get(&m.channel) {
             Some(kind) if self.seen.motion.take(kind, m, walk.compares_singles)? => {}
-            Some(Kind::Picture(id)) => {
-                let (len, proof) = (m.data.len() as u64, Proof::Crc(crc32fast::hash(m.data)));
-                let picture = Picture { offset, channel: m.channel, log_time: m.log_time, len, proof };
-                self.seen.pictures.insert(id.clone(), picture);
+            Some(Kind::Image(id)) => {
+                let len = m.data.len() as u64;
+                let proof = Proof::Crc(crc32fast::hash(m.data));
+                let image = Image { offset, channel: m.channel, log_time: m.log_time, len, proof };
+                self.seen.images.insert(id.clone(), image);
             }
             Some(Kind::Info(id)) => {
                 self.seen.infos.insert(id.clone(), (m.log_time, m.data.to_vec()));
             }
             Some(Kind::Set) => {
                 let set = FrameSetMsg::read(m.data)?;
-                walk.set(&mut self.seen, &set, m.log_time, offset, pictures);
+                walk.set(&mut self.seen, &set, m.log_time, offset, images);
                 motion::set(walk, &mut self.seen, &set, m.log_time, offset);
-                (self.seen.pictures, self.seen.infos, self.seen.calibrated) = Default::default();
+                (self.seen.images, self.seen.infos, self.seen.calibrated) = Default::default();
             }
             Some(_) | None => {}
         }
@@ -396,7 +402,7 @@ impl<'a> Pass<'a> {
 
     /// A checkpoint in the chunk at `offset` proves all that lies before that chunk.
     fn checkpoint(&mut self, c: Checkpoint, offset: u64) -> Result<()> {
-        // In a copy of the segment it speaks of another file, and proves nothing of this one.
+        // In a copy of the segment it describes another file, and proves nothing about this one.
         if c.file_bytes != offset {
             return Ok(());
         }
@@ -422,8 +428,8 @@ impl<'a> Pass<'a> {
                 return Ok(());
             };
             let record = reader.parse(raw.opcode, raw.body(), offset)?;
-            if let Some((at, what)) = self.contents.summary(&record, raw.whole)? {
-                self.seen.broken(at, what);
+            if let Some(mismatch) = self.contents.summary(&record, raw.whole)? {
+                self.seen.broken(mismatch.offset, mismatch.message);
             }
             if raw.opcode == op::FOOTER {
                 break;
@@ -431,8 +437,8 @@ impl<'a> Pass<'a> {
             let length = raw.whole.len();
             records.advance(length);
         }
-        for (at, what) in self.contents.compare() {
-            self.seen.broken(at, what);
+        for mismatch in self.contents.compare() {
+            self.seen.broken(mismatch.offset, mismatch.message);
         }
         Ok(())
     }

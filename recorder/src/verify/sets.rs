@@ -1,8 +1,8 @@
-//! What spans segments: sets in their order, the accounts, and the frame headers of each stream.
+//! Checks that span segments: the order of sets, the accounts, and the frame headers of each stream.
 
+use super::images::{Images, Job};
 use super::motion::Units;
-use super::pictures::{Job, Pictures};
-use super::seen::{MESSAGE_HEAD, Picture, Proof, Seen};
+use super::seen::{Image, MESSAGE_HEAD, Proof, Seen};
 use super::{Findings, Severity, VerifyOptions};
 use crate::clock::step_ns;
 use crate::container::record::{op, put_le};
@@ -18,7 +18,7 @@ use std::collections::{BTreeMap, BTreeSet};
 /// waits for its disk is behind.
 const CLOCK_AROUND_NS: i64 = 60_000_000_000;
 
-/// What is carried from segment to segment.
+/// State kept from segment to segment.
 #[derive(Clone)]
 pub(super) struct Walk {
     pub(super) options: VerifyOptions,
@@ -28,9 +28,9 @@ pub(super) struct Walk {
     pub(super) frames: u64,
     pub(super) bytes: u64,
     last: Option<Last>,
-    /// Whether segments before the first one are not looked at: accounts count their sets.
+    /// Whether the segments before the first one are not checked: accounts count their sets.
     pub(super) lone: bool,
-    /// Whether single samples of motion units are compared with their batches.
+    /// Whether single samples of IMUs are compared with their batches.
     pub(super) compares_singles: bool,
     /// Sets counted by the accounts minus those seen, fixed at the first account of a lone segment.
     account_base: Option<u64>,
@@ -38,8 +38,8 @@ pub(super) struct Walk {
     pub(super) lost: u64,
     dropped: Option<crate::SetCounts>,
     accounts: BTreeMap<StreamId, StreamAccount>,
-    /// What the last frame of each stream says was captured and lost.
-    books: BTreeMap<StreamId, Books>,
+    /// Captured and lost frames, by the last frame of each stream.
+    frame_accounts: BTreeMap<StreamId, FrameAccount>,
     pub(super) units: Units,
     /// The first and the last reading of the host's clocks.
     clocks: Option<(UtcPair, UtcPair)>,
@@ -55,7 +55,7 @@ struct Last {
 
 /// A frame's own account.
 #[derive(Clone, Copy)]
-struct Books {
+struct FrameAccount {
     sequence: u64,
     captured: u64,
     dropped: [u64; 8],
@@ -77,7 +77,7 @@ impl Walk {
             lost: 0,
             dropped: None,
             accounts: BTreeMap::new(),
-            books: BTreeMap::new(),
+            frame_accounts: BTreeMap::new(),
             units: Units::new(session),
             clocks: None,
         }
@@ -90,7 +90,7 @@ impl Walk {
         set: &FrameSetMsg,
         log_time: u64,
         offset: u64,
-        pictures: &mut Pictures<'_>,
+        images: &mut Images<'_>,
     ) {
         let mut problems = self.order(set, log_time);
         let mut named: BTreeSet<&str> = set.missing.iter().map(String::as_str).collect();
@@ -105,10 +105,10 @@ impl Walk {
             }
             captures.push(member.capture_time_ns);
             let Ok(id) = name.parse::<StreamId>() else {
-                problems.push(format!("\"{name}\" is no stream"));
+                problems.push(format!("invalid stream \"{name}\""));
                 continue;
             };
-            self.member(seen, set, member, &id, log_time, pictures, &mut problems);
+            self.member(seen, set, member, &id, log_time, images, &mut problems);
         }
         let spread =
             captures.iter().max().zip(captures.iter().min()).map_or(0, |(a, b)| a.saturating_sub(*b));
@@ -134,7 +134,7 @@ impl Walk {
         }
     }
 
-    /// What is wrong with the place of a set among the others.
+    /// Checks the place of a set among the others; the problems in words.
     fn order(&mut self, set: &FrameSetMsg, log_time: u64) -> Vec<String> {
         let mut problems = Vec::new();
         if let Some(last) = &self.last {
@@ -160,7 +160,7 @@ impl Walk {
         member: &Member,
         id: &StreamId,
         log_time: u64,
-        pictures: &mut Pictures<'_>,
+        images: &mut Images<'_>,
         problems: &mut Vec<String>,
     ) {
         let name = &member.stream;
@@ -188,18 +188,18 @@ impl Walk {
                 Some((h, extra))
             }
         };
-        let Some(picture) = seen.pictures.get(id).filter(|p| p.log_time == log_time) else {
-            problems.push(format!("{name} has no picture"));
+        let Some(image) = seen.images.get(id).filter(|p| p.log_time == log_time) else {
+            problems.push(format!("{name} has no image"));
             return;
         };
-        let same = picture.len == member.message_bytes
-            && match picture.proof {
+        let same = image.len == member.message_bytes
+            && match image.proof {
                 Proof::Crc(crc) => crc == member.message_crc32,
-                // The rest is seen when it is unpacked.
+                // The rest is checked when it is unpacked.
                 Proof::Packed(_) => true,
             };
         if !same {
-            problems.push(format!("{name}: its picture is another one"));
+            problems.push(format!("{name}: its image is another one"));
             return;
         }
         let decode = match &info {
@@ -212,17 +212,17 @@ impl Walk {
             }
             _ => None,
         };
-        let unseen = match picture.proof {
+        let unseen = match image.proof {
             Proof::Crc(_) => false,
             Proof::Packed(crc) => {
-                picture.offset >= seen.unproven
-                    || info.as_ref().is_none_or(|(_, extra)| expected(picture, member, extra) != crc)
+                image.offset >= seen.unproven
+                    || info.as_ref().is_none_or(|(_, extra)| expected(image, member, extra) != crc)
             }
         };
         if unseen || decode.is_some() {
-            pictures.look_into(Job {
-                offset: picture.offset,
-                channel: picture.channel,
+            images.look_into(Job {
+                offset: image.offset,
+                channel: image.channel,
                 log_time,
                 len: member.message_bytes,
                 crc: member.message_crc32,
@@ -233,13 +233,14 @@ impl Walk {
         }
     }
 
-    /// What is wrong with the account in a frame's header: `captured = sequence + Σ dropped`, and nothing falls.
+    /// Checks the account in a frame's header: `captured = sequence + Σ dropped`, and no number decreases.
     pub(super) fn header(&mut self, id: &StreamId, h: &FrameHeader) -> Option<String> {
-        let now = Books { sequence: h.sequence, captured: h.captured, dropped: h.dropped };
+        let now = FrameAccount { sequence: h.sequence, captured: h.captured, dropped: h.dropped };
         let lost = h.dropped.iter().fold(0u64, |sum, n| sum.saturating_add(*n));
-        let before = self.books.insert(id.clone(), now);
+        let before = self.frame_accounts.insert(id.clone(), now);
         if h.captured != h.sequence.saturating_add(lost) {
-            let (captured, sequence) = (h.captured, h.sequence);
+            let captured = h.captured;
+            let sequence = h.sequence;
             return Some(format!(
                 "its header does not balance: {captured} captured, {sequence} delivered, {lost} dropped"
             ));
@@ -258,8 +259,8 @@ impl Walk {
         let passed_ns = pair.mono.since_ns(first.mono);
         let log_time = i64::try_from(log_time).unwrap_or(i64::MAX);
         let behind_ns = first.utc_ns.saturating_add(passed_ns).saturating_sub(log_time);
-        // Each segment begins with the first reading again; and a dataset that was made from another may have
-        // readings of the computer that made it, of another time.
+        // Each segment begins with the first reading again; and a derived dataset may have readings of the computer
+        // that derived it, of another time.
         if pair.mono <= last.mono || behind_ns.saturating_abs() > CLOCK_AROUND_NS {
             return;
         }
@@ -325,7 +326,7 @@ impl Walk {
         Ok(())
     }
 
-    /// The whole against what the session says of it.
+    /// Checks the totals against the outcome in the session.
     pub(super) fn finish(&self, whole: Option<&Session>, findings: &mut Findings) {
         for (reason, n) in self.dropped.iter().flat_map(crate::SetCounts::dropped_by_reason) {
             let what = format!("{n} sets were not recorded: {}", reason.name());
@@ -356,7 +357,7 @@ impl Walk {
         for lost in session.import_losses() {
             findings.add(Severity::Lost, file, None, lost);
         }
-        // What its segments say themselves was reported at its place.
+        // Losses that its segments record themselves were reported at their place.
         let said: BTreeSet<String> = findings.kept.iter().map(|f| f.message.clone()).collect();
         for lost in o.lost.iter().filter(|l| !said.contains(*l)) {
             findings.add(Severity::Lost, file, None, lost.clone());
@@ -364,12 +365,12 @@ impl Walk {
     }
 }
 
-/// The CRC-32 that the message record of this picture must have, by its set's mark and its frame's information.
-fn expected(picture: &Picture, member: &Member, extra: &Extra<'_>) -> u32 {
+/// The CRC-32 that the message record of this image must have, by its set's mark and its frame's information.
+fn expected(image: &Image, member: &Member, extra: &Extra<'_>) -> u32 {
     let mut head = Vec::with_capacity(MESSAGE_HEAD as usize);
     head.push(op::MESSAGE);
-    put_le!(head, member.message_bytes + MESSAGE_HEAD - crate::container::scan::HEAD, picture.channel);
-    put_le!(head, member.sequence as u32, picture.log_time, u64::try_from(extra.stamp_utc_ns).unwrap_or(0));
+    put_le!(head, member.message_bytes + MESSAGE_HEAD - crate::container::scan::HEAD, image.channel);
+    put_le!(head, member.sequence as u32, image.log_time, u64::try_from(extra.stamp_utc_ns).unwrap_or(0));
     let mut crc = crc32fast::Hasher::new();
     crc.update(&head);
     crc.combine(&crc32fast::Hasher::new_with_initial_len(member.message_crc32, member.message_bytes));

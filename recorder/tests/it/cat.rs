@@ -1,4 +1,4 @@
-//! Frames listed and written as picture files.
+//! Frames listed and written as image files.
 
 use crate::support::*;
 use depthrig_bus::PixelFormat;
@@ -69,7 +69,8 @@ fn every_frame_becomes_a_file_that_holds_its_pixels() {
     assert_eq!(rows.len(), 21);
     let mut bytes = 0;
     for (i, row) in rows.iter().enumerate() {
-        let (n, stream) = (i as u64 / 3, &session().streams[i % 3]);
+        let n = i as u64 / 3;
+        let stream = &session().streams[i % 3];
         assert_eq!(row["file"], format!("{}/{:06}.png", stream.id, n + 1));
         assert_eq!(
             (row["set"].as_str(), row["stream"].as_str()),
@@ -81,11 +82,11 @@ fn every_frame_becomes_a_file_that_holds_its_pixels() {
         assert_eq!(row["depth_unit_m"], if stream.format.is_depth() { "0.0001" } else { "0" });
         let file = contents(&fs, &out().join(&row["file"]));
         bytes += file.len() as u64;
-        let picture = image::load_from_memory(&file).unwrap();
+        let image = image::load_from_memory(&file).unwrap();
         let got = match stream.format {
-            PixelFormat::Z16 => picture.into_luma16().iter().flat_map(|v| v.to_le_bytes()).collect(),
-            PixelFormat::Rgb8 => picture.into_rgb8().into_raw(),
-            _ => picture.into_luma8().into_raw(),
+            PixelFormat::Z16 => image.into_luma16().iter().flat_map(|v| v.to_le_bytes()).collect(),
+            PixelFormat::Rgb8 => image.into_rgb8().into_raw(),
+            _ => image.into_luma8().into_raw(),
         };
         assert_eq!(got, pixels(stream.format, stream.width, stream.height, n), "{}", row["file"]);
     }
@@ -108,7 +109,7 @@ fn a_stored_jpeg_comes_out_byte_by_byte() {
     }
 }
 
-/// A camera that came late is no reason to refuse its pictures, unless they can be no JPEG at all.
+/// The images of a camera that came late are refused only if they cannot be JPEG.
 #[test]
 fn a_stream_that_is_missing_first_is_judged_by_what_it_can_be() {
     let late = |options: RecorderOptions, first: &[usize]| {
@@ -212,9 +213,9 @@ fn an_end_from_outside_leaves_a_list_that_is_not_finished() {
     assert_eq!(names, ["frames.csv.part", "front", "side"]);
 }
 
-/// Whatever operation fails: an error, no finished list, and no picture that is not whole.
+/// Whichever operation fails: an error, no finished list, and no incomplete image.
 #[test]
-fn any_failing_operation_is_an_error_and_leaves_no_half_picture() {
+fn any_failing_operation_is_an_error_and_leaves_no_half_image() {
     let good = MemFs::new();
     record(&good, 2, raw());
     let whole = copy(&good);
@@ -269,7 +270,8 @@ fn edge() -> impl Strategy<Value = Option<Edge>> {
 fn model() -> impl Strategy<Value = Model> {
     let steps = proptest::collection::vec((1..5u64, 1..5i64), 1..9);
     (steps, edge(), edge(), 0..4usize).prop_map(|(steps, from, to, every)| {
-        let (mut id, mut t) = (0, 0);
+        let mut id = 0;
+        let mut t = 0;
         let mut sets = Vec::new();
         for (i, (step, time)) in steps.into_iter().enumerate() {
             id += step;

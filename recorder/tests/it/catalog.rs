@@ -1,4 +1,4 @@
-//! The list of a folder's datasets: what it says of good ones and of bad ones, and how little it reads.
+//! The list of a folder's datasets: its entries for good and for damaged ones, and how little it reads.
 
 use crate::support::*;
 use depthrig_recorder::fs::{MemFs, RealFs};
@@ -106,9 +106,9 @@ fn good_and_bad_ones_are_listed_with_the_reason() {
     assert_eq!((whole.started_utc_ns, whole.duration_ns, whole.segments), (Some(T0), 4 * PERIOD, 3));
     assert_eq!(entry(&list, "lost").sets_lost, 2);
     assert_eq!(entry(&list, "full").why, ["the disk was full"], "no set is counted as lost");
-    // A dataset may be named itself.
+    // The path may be a dataset itself.
     assert_eq!(&catalog(&RealFs, &at("whole")).unwrap()[..], std::slice::from_ref(whole));
-    // What the list calls whole is whole.
+    // `verify` agrees that it is complete.
     assert!(verify(&at("whole"), &VerifyOptions::default()).unwrap().is_whole());
     assert!(catalog(&RealFs, &at("not there")).is_err());
     assert!(catalog(&RealFs, &at("file.txt")).is_err());

@@ -13,7 +13,7 @@ fn lossless() -> RecorderOptions {
     RecorderOptions { color: ColorCodec::Png, depth: DepthCodec::Rank, ..options() }
 }
 
-/// Records one picture and reads it back, with the dataset verified and every picture decoded.
+/// Records one image and reads it back, with the dataset verified and every image decoded.
 fn there_and_back(
     format: PixelFormat,
     options: RecorderOptions,
@@ -39,7 +39,7 @@ fn there_and_back(
     (fs, got)
 }
 
-/// The only picture message: its channel's metadata and topic, its schema, its bytes.
+/// The only image message: its channel's metadata and topic, its schema, its bytes.
 fn message(fs: &MemFs) -> (mcap::Message<'static>, String) {
     let bytes = contents(fs, &segment(0));
     let found = mcap::MessageStream::new(&bytes).unwrap().map(Result::unwrap).find(|m| {
@@ -101,13 +101,13 @@ fn colour_as_png_comes_back_bit_by_bit() {
         );
         assert_eq!(m.channel.metadata["codec"], "png");
         let png = m.data.windows(8).position(|w| w == b"\x89PNG\r\n\x1a\n").unwrap();
-        let picture = image::load_from_memory(&m.data[png..]).unwrap().into_rgb8();
+        let image = image::load_from_memory(&m.data[png..]).unwrap().into_rgb8();
         let first: Vec<u8> = if format == PixelFormat::Rgb8 {
             plain[..3].to_vec()
         } else {
             vec![plain[2], plain[1], plain[0]]
         };
-        assert_eq!(picture.get_pixel(0, 0).0[..], first, "a PNG is RGB whatever the camera's order is");
+        assert_eq!(image.get_pixel(0, 0).0[..], first, "a PNG is RGB whatever the camera's order is");
         assert!(m.data[..png].windows(4).any(|w| w == b"png\0"), "its format says what it is");
         // Padding is not part of a PNG: it comes back as zeros, as the format page says.
         let (_, got) = there_and_back(format, lossless(), 8, rows(120, 8, &plain));
@@ -165,8 +165,8 @@ fn slow_codecs_cost_sets_that_are_counted() {
     ];
     let r = Recorder::create(Arc::new(fs.clone()), &dir(), session.clone(), limits).unwrap();
     let mut refused = 0;
-    let pictures = set(&session, 0);
-    let bytes: Vec<Arc<[u8]>> = pictures.frames.iter().map(|f| f.pixels.bytes().into()).collect();
+    let images = set(&session, 0);
+    let bytes: Vec<Arc<[u8]>> = images.frames.iter().map(|f| f.pixels.bytes().into()).collect();
     for n in 0..60 {
         let mut next = set_of(&session, n, &[]);
         next.missing.clear();
@@ -189,10 +189,10 @@ fn slow_codecs_cost_sets_that_are_counted() {
     assert_eq!(summary.sets.dropped[SetDrop::EncoderBusy as usize], refused);
 }
 
-/// The pictures that the Python decoder is tested with are what our encoder makes. `DEPTHRIG_BLESS=1` writes them
+/// The images that the Python decoder is tested with are what our encoder makes. `DEPTHRIG_BLESS=1` writes them
 /// anew; their bytes may change with the zstd library, their pixels may not.
 #[test]
-fn the_pictures_of_the_python_tests_are_ours() {
+fn the_images_of_the_python_tests_are_ours() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../python/tests/data/packed_depth.json");
     let hex = |bytes: &[u8]| bytes.iter().fold(String::new(), |all, b| all + &format!("{b:02x}"));
     let mut cases = Vec::new();

@@ -1,4 +1,4 @@
-//! What a comparison of two datasets finds.
+//! Comparisons of two datasets and the differences they find.
 
 use crate::support::*;
 use depthrig_bus::{FrameFlags, HostTime, PixelFormat, UtcPair};
@@ -66,7 +66,10 @@ fn the_loss_of_a_jpeg_is_measured() {
     assert_eq!((d.stream.as_str(), d.frames_differing, d.samples), ("front/color", 4, 4 * 64 * 48 * 3));
     // The same numbers by the decoded pixels, one by one.
     let sets = |d: &Dataset| d.sets(depthrig_recorder::SetRange::ALL).map(Result::unwrap).collect::<Vec<_>>();
-    let (mut max, mut sum, mut squares, mut n) = (0, 0.0, 0.0, 0);
+    let mut max = 0;
+    let mut sum = 0.0;
+    let mut squares = 0.0;
+    let mut n = 0;
     for (x, y) in sets(&a).iter().zip(sets(&b)) {
         for (x, y) in x.frames[0].pixels.iter().zip(&y.frames[0].pixels) {
             let d = x.abs_diff(*y);
@@ -163,7 +166,7 @@ fn what_cannot_be_read_is_a_difference() {
     let good = open(&fs);
     let damaged = copy(&fs);
     let mut bytes = contents(&damaged, &segment(0));
-    // In the middle lies a picture of the second set, or what describes it.
+    // In the middle lies an image of the second set, or what describes it.
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
     damaged.put(&segment(0), bytes);
@@ -202,7 +205,7 @@ fn change() -> impl Strategy<Value = Change> {
     ]
 }
 
-/// What one side of the model holds of a set: streams with the version of each field.
+/// A set on one side of the model: streams with the version of each field.
 type Seen = BTreeMap<&'static str, u64>;
 
 proptest! {

@@ -1,4 +1,4 @@
-//! The corpus of the fuzz targets as tests: what a fuzzer once found interesting or broken stays mended.
+//! The corpus of the fuzz targets as tests: inputs that a fuzzer once found interesting or that failed keep passing.
 
 use depthrig_recorder::fuzzing;
 use proptest::prelude::*;
@@ -16,7 +16,7 @@ fn corpus(target: &str) -> Vec<(String, Vec<u8>)> {
     paths.iter().map(|p| (name(p), std::fs::read(p).unwrap())).collect()
 }
 
-/// Runs each input, and sees that the seeds still reach what they were made for.
+/// Runs each input, and checks that the seeds still reach the code that they were written for.
 fn run<T: PartialOrd + Copy + std::fmt::Debug>(
     target: &str,
     reached: impl Fn(&[u8]) -> T,
@@ -29,7 +29,7 @@ fn run<T: PartialOrd + Copy + std::fmt::Debug>(
         let far = reached(bytes);
         if name.starts_with("seed_") {
             seeds += 1;
-            assert!(far > seeds_reach_more_than, "{target}/{name} reaches {far:?}: make the seeds anew");
+            assert!(far > seeds_reach_more_than, "{target}/{name} reaches {far:?}: rebuild the seeds");
         }
     }
     assert!(seeds > 0, "{target} has no seeds");
@@ -50,12 +50,12 @@ fn recovered_segments() {
 }
 
 #[test]
-fn depth_pictures() {
+fn depth_images() {
     run("depth_codec", fuzzing::depth_codec, false);
 }
 
 #[test]
-fn color_pictures() {
+fn color_images() {
     run("color_codec", fuzzing::color_codec, false);
 }
 
@@ -96,7 +96,8 @@ fn change(bytes: &[u8], seed: u64) -> Vec<u8> {
         (x % n.max(1) as u64) as usize
     };
     for _ in 0..=next(3) {
-        let (at, len) = (next(out.len()), next(9));
+        let at = next(out.len());
+        let len = next(9);
         let end = (at + len).min(out.len());
         match next(5) {
             0 => drop(out.drain(at..end)),
@@ -128,7 +129,7 @@ proptest! {
     }
 }
 
-/// The mutations are worth something: many leave sets to be read, and the checksums really are put right.
+/// The mutations are effective: many leave readable sets, and the checksums are corrected.
 #[test]
 fn mutations_get_behind_the_checksums() {
     let (_, seed) = corpus("segment").into_iter().find(|(name, _)| name == "seed_jpeg").unwrap();

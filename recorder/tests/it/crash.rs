@@ -1,5 +1,5 @@
-//! The whole computer crashes, at any operation of a recording or of its recovery, on a disk that keeps of what
-//! was not synced whatever it likes.
+//! The whole computer crashes, at any operation of a recording or of its recovery, on a disk that keeps an arbitrary
+//! part of the unsynced data.
 
 use crate::recover::{ids, recover};
 use crate::support::*;
@@ -58,7 +58,7 @@ fn record_until(fs: &MemFs, at: u64, sets: u64) -> Vec<(u64, u32, usize)> {
     written
 }
 
-/// The sets that no crash may take now.
+/// The sets that no crash may lose now.
 fn durable(fs: &MemFs, written: &[(u64, u32, usize)]) -> Vec<u64> {
     let synced = |number: u32| {
         let name = segment(number);

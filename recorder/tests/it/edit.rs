@@ -1,4 +1,4 @@
-//! Metadata changed after the recording: what changes, what stays, and what is told of it.
+//! Metadata changed after the recording: what changes, what stays, and what the history says.
 
 use crate::support::*;
 use depthrig_recorder::fs::{Fault, Fs, MemFs, RealFs};
@@ -30,8 +30,8 @@ fn scene(value: &str) -> SessionChanges {
     SessionChanges { scene: Some(value.to_owned()), ..SessionChanges::default() }
 }
 
-/// What a change is, without when and by which version.
-fn told(e: &Edit) -> (&str, &str, &str) {
+/// Field, old and new value of a change, without time and version.
+fn change(e: &Edit) -> (&str, &str, &str) {
     (&e.field, &e.before, &e.after)
 }
 
@@ -50,7 +50,7 @@ fn an_edit_changes_the_session_file_alone_and_is_in_the_history() {
         ("operator", "nobody", ""),
         ("notes", "", "the cup was moved"),
     ];
-    assert_eq!(edits.iter().map(told).collect::<Vec<_>>(), expected);
+    assert_eq!(edits.iter().map(change).collect::<Vec<_>>(), expected);
     let session = open(&fs).session().clone();
     assert_eq!(session.history, edits);
     assert_eq!((session.scene.as_str(), session.operator.as_str()), (expected[0].2, ""));
@@ -73,7 +73,7 @@ fn undone_is_not_forgotten_and_the_same_again_is_no_change() {
     edit(&fs, &dir(), &scene("a table")).unwrap();
     let session = open(&fs).session().clone();
     assert_eq!(session.scene, "a table");
-    let history: Vec<_> = session.history.iter().map(told).collect();
+    let history: Vec<_> = session.history.iter().map(change).collect();
     assert_eq!(history, [("scene", "a table", "a chair"), ("scene", "a chair", "a table")]);
 }
 
@@ -144,7 +144,7 @@ fn renaming_moves_folder_and_name_and_never_onto_something() {
     }
     let (target, edits) = rename(&RealFs, &dir, "Küche 2").unwrap();
     assert_eq!(target, home.path().join("Küche 2"));
-    assert_eq!(edits.iter().map(told).collect::<Vec<_>>(), [("name", "old", "Küche 2")]);
+    assert_eq!(edits.iter().map(change).collect::<Vec<_>>(), [("name", "old", "Küche 2")]);
     assert!(!dir.exists());
     assert_eq!(Dataset::open(&target).unwrap().session().name, "Küche 2");
 }
@@ -156,8 +156,8 @@ fn what_another_process_has_locked_is_not_edited() {
     let r = depthrig_recorder::Recorder::create(Arc::new(RealFs), &dir, session(), options()).unwrap();
     r.push(set(&session(), 0)).unwrap();
     settle(&r);
-    let told = edit(&RealFs, &dir, &scene("x")).unwrap_err().to_string();
-    assert!(told.contains("is being recorded") && told.contains("record note"), "{told}");
+    let e = edit(&RealFs, &dir, &scene("x")).unwrap_err().to_string();
+    assert!(e.contains("is being recorded") && e.contains("record note"), "{e}");
     r.finish().unwrap();
     let before = std::fs::read(dir.join(SESSION_FILE)).unwrap();
     let lock = RealFs.lock(&dir).unwrap();
@@ -207,7 +207,7 @@ fn any_text() -> impl Strategy<Value = String> {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(150))]
-    /// Against a model: a list of edits and two texts. What others wrote stays to the letter.
+    /// Against a model: a list of edits and two texts. Keys of others stay to the letter.
     #[test]
     fn what_others_wrote_survives_every_edit(
         keys in proptest::sample::subsequence(KEYS.to_vec(), 0..=KEYS.len()),
@@ -254,8 +254,8 @@ proptest! {
     }
 }
 
-/// What is taken can be read again: a note is short, and so are all of them together. The worst to write are characters
-/// that TOML escapes.
+/// Accepted notes can be read again: a note is short, and so are all of them together. The longest to write are
+/// characters that TOML escapes.
 #[test]
 fn a_dataset_has_4096_notes_at_most() {
     let fs = recorded();

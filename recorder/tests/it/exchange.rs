@@ -16,7 +16,7 @@ use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// A file per set with the CRC-32 of each picture, and a list of all sets.
+/// A file per set with the CRC-32 of each image, and a list of all sets.
 struct Sums {
     sets_of_a_part: usize,
     flavour: &'static str,
@@ -33,7 +33,7 @@ impl Exporter for Sums {
 
     fn plan(&mut self, sources: &[Source]) -> Result<Plan> {
         let parts = sources.iter().enumerate().flat_map(|(i, s)| s.parts(i, self.sets_of_a_part)).collect();
-        Ok(Plan { parts, folders: vec!["sets".into()], losses: vec!["pictures".into()] })
+        Ok(Plan { parts, folders: vec!["sets".into()], losses: vec!["images".into()] })
     }
 
     fn part(
@@ -97,7 +97,7 @@ fn plain(fs: &MemFs, workers: usize) -> Result<ExportReport> {
 #[test]
 fn an_export_says_that_it_leaves_out_motion() {
     let left_out = "session: the motion samples of front/imu, side/imu are left out; `depthrig cat --stream` writes them";
-    assert_eq!(plain(&dataset(2), 1).unwrap().losses, ["pictures", left_out]);
+    assert_eq!(plain(&dataset(2), 1).unwrap().losses, ["images", left_out]);
 }
 
 /// Every file below the folder of the export.
@@ -130,9 +130,9 @@ fn an_export_says_what_it_did_and_leaves_no_marks() {
     assert!(files.keys().all(|name| !name.contains("/.")), "{:?}", files.keys());
     let bytes: usize = files.iter().filter(|(n, _)| !n.ends_with(REPORT_FILE)).map(|(_, b)| b.len()).sum();
     assert_eq!(report.bytes, bytes as u64);
-    let mut told: ExportReport = serde_json::from_slice(&files["/export/export.json"]).unwrap();
-    told.parts = 3;
-    assert_eq!(told, report);
+    let mut stored: ExportReport = serde_json::from_slice(&files["/export/export.json"]).unwrap();
+    stored.parts = 3;
+    assert_eq!(stored, report);
     assert_eq!(files["/export/list.csv"], b"0,1\n1,2\n2,3\n3,4\n4,5\n5,6\n6,7\n7,8\n");
 }
 
@@ -176,15 +176,15 @@ fn an_export_that_was_ended_goes_on_where_it_was() {
         found.insert("/export/lengths.txt".into(), expected["/export/lengths.txt"].clone());
         let mut report: Value = serde_json::from_slice(&found["/export/export.json"]).unwrap();
         let wanted: Value = serde_json::from_slice(&expected["/export/export.json"]).unwrap();
-        report["bytes"] = wanted["bytes"].clone(); // `lengths.txt` tells of other parts
+        report["bytes"] = wanted["bytes"].clone(); // `lengths.txt` covers other parts
         assert_eq!(report, wanted);
         found.insert("/export/export.json".into(), expected["/export/export.json"].clone());
         assert_eq!(found, expected, "{end_after}");
     }
 }
 
-/// The n-th operation on the disk fails, for every n: a typed error, no file with its final name that is not whole,
-/// and the next run ends as if nothing had been.
+/// The n-th operation on the disk fails, for every n: a typed error, no incomplete file with its final name, and the
+/// next run ends as if nothing had been.
 #[test]
 fn an_export_survives_a_failure_of_any_operation() {
     let source = dataset(7);

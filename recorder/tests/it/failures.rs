@@ -1,4 +1,4 @@
-//! What goes wrong is said, counted and survived. Long because each failure has the same disks, encoders and checks.
+//! Failures are reported, counted and survived. Long because each failure has the same disks, encoders and checks.
 
 use crate::logged::errors;
 use crate::recover::{ids, recover};
@@ -16,7 +16,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 
-/// Something that waits until it is opened.
+/// A gate: callers wait until it is opened.
 #[derive(Debug, Clone, Default)]
 struct Gate(Arc<(Mutex<bool>, Condvar)>);
 
@@ -100,7 +100,8 @@ impl WriteFile for StalledFile {
 
 /// The ids of the sets that can be read, and what stopped the reading.
 fn readable(fs: &MemFs) -> (Vec<u64>, Vec<String>) {
-    let (mut ids, mut errors) = (Vec::new(), Vec::new());
+    let mut ids = Vec::new();
+    let mut errors = Vec::new();
     for set in open(fs).sets(SetRange::ALL) {
         match set {
             Ok(set) => {
@@ -121,7 +122,8 @@ fn worst(fs: &MemFs) -> Option<Severity> {
 
 #[test]
 fn a_busy_encoder_costs_sets_that_are_counted_in_the_file() {
-    let (fs, gate) = (MemFs::new(), Gate::default());
+    let fs = MemFs::new();
+    let gate = Gate::default();
     let r = recorder(&fs, RecorderOptions { workers: 1, queue_sets: 2, ..options() });
     for n in 0..2 {
         let mut held = set(&session(), n);
@@ -148,7 +150,8 @@ fn a_busy_encoder_costs_sets_that_are_counted_in_the_file() {
 
 #[test]
 fn a_stalled_disk_costs_sets_and_never_blocks_nor_grows() {
-    let (fs, gate) = (MemFs::new(), Gate::default());
+    let fs = MemFs::new();
+    let gate = Gate::default();
     let stalled = Arc::new(Stalled(fs.clone(), gate.clone()));
     let limits = RecorderOptions { backlog_max_bytes: 20_000, ..options() };
     let r = Recorder::create(stalled, &dir(), session(), limits).unwrap();
@@ -157,7 +160,7 @@ fn a_stalled_disk_costs_sets_and_never_blocks_nor_grows() {
         if let Err(e) = r.push(set(&session(), n)) {
             refused.push(e.reason);
         }
-        // Until this set is encoded, so that the backlog is what it is refused for.
+        // Until this set is encoded, so that the backlog is the reason of the refusal.
         for _ in 0..400 {
             if r.progress().encode_queue == 0 {
                 break;
@@ -171,7 +174,7 @@ fn a_stalled_disk_costs_sets_and_never_blocks_nor_grows() {
     assert!((200..=300).contains(&taken), "{taken} notes wait");
     assert!(r.add_note("one more").unwrap_err().to_string().contains("wait to be written already"));
     let backlog = r.progress().backlog_bytes;
-    // A set: its pictures, and its motion as it waits.
+    // A set: its images, and its IMU batches as they wait.
     let one = 10_000 + motion(&session(), 0).iter().map(RecordMotion::stored_bytes).sum::<u64>();
     assert!(backlog < 20_000 + one, "{backlog} bytes wait; the limit is exceeded by one set at most");
     gate.open();
@@ -195,7 +198,7 @@ fn a_full_disk_ends_in_a_closed_dataset() {
     let refused = r.push(set(&session(), 40)).unwrap_err();
     assert_eq!(refused.reason, SetDrop::WriteFailed);
     let logged = errors(|| (41..60).for_each(|n| drop(r.push(set(&session(), n)))));
-    assert_eq!(logged, [""; 0], "what is refused was logged with the first one");
+    assert_eq!(logged, [""; 0], "refused sets are logged with the first one");
     assert!(refused.message.contains("the recording had ended: cannot write"), "{refused}");
     let summary = r.finish().unwrap();
     assert!(summary.sets.recorded >= 3 && summary.sets.balances(), "{summary:?}");
@@ -203,7 +206,7 @@ fn a_full_disk_ends_in_a_closed_dataset() {
     assert_eq!(names(&fs), ["seg_0000.mcap", "session.toml"], "closed, with its index, under its final name");
     let (ids, errors) = readable(&fs);
     assert_eq!((ids.len() as u64, errors), (summary.sets.recorded, Vec::new()));
-    assert_eq!(worst(&fs), Some(Severity::Lost), "lossy, and not broken");
+    assert_eq!(worst(&fs), Some(Severity::Lost), "losses, but no damage");
 }
 
 #[test]
@@ -218,13 +221,13 @@ fn a_recording_stops_while_there_is_still_room() {
     }
     let e = r.progress().error.expect("the limit is reached");
     assert_eq!(e.kind(), ErrorKind::DiskFull);
-    assert!(e.to_string().contains("what was recorded is whole"), "{e}");
+    assert!(e.to_string().contains("the sets recorded so far are complete"), "{e}");
     let summary = r.finish().unwrap();
     assert_eq!(readable(&fs), ((1..=summary.sets.recorded).collect(), Vec::new()));
     assert!(names(&fs).contains(&"seg_0000.mcap".to_owned()));
 }
 
-/// What ends because of its limit has room to say everything: the accounts of its last moment, and the notes.
+/// A recording that stops at its limit still has room for the last accounts and the notes.
 #[test]
 fn a_recording_that_stops_at_its_limit_says_how_it_stands() {
     let fs = MemFs::new().with_capacity(300_000);
@@ -259,7 +262,8 @@ fn mcap_messages(bytes: &[u8], topic: &str) -> usize {
 /// waited do not.
 #[test]
 fn what_was_refused_while_others_waited_is_counted_after_a_crash() {
-    let (fs, gate) = (MemFs::new(), Gate::default());
+    let fs = MemFs::new();
+    let gate = Gate::default();
     let sync_interval_ns = 200_000_000;
     let r = recorder(&fs, RecorderOptions { workers: 1, queue_sets: 2, sync_interval_ns, ..options() });
     r.push(set(&session(), 0)).unwrap();
@@ -372,13 +376,16 @@ fn what_is_no_dataset_is_named() {
     fs.create_dir_all(&dir()).unwrap();
     let e = open(&dir());
     assert_eq!(e.kind(), ErrorKind::NotADataset);
-    assert!(e.to_string().contains("is no dataset: it holds neither session.toml nor seg_0000.mcap"), "{e}");
+    assert!(
+        e.to_string().contains("is not a dataset: it holds neither session.toml nor seg_0000.mcap"),
+        "{e}"
+    );
 
     let text = dir().join("notes.txt");
     fs.put(&text, b"these are not the frames you are looking for".to_vec());
     let e = open(&text);
     assert_eq!(e.kind(), ErrorKind::NotADataset);
-    assert!(e.to_string().contains("notes.txt is no MCAP file"), "{e}");
+    assert!(e.to_string().contains("notes.txt is not an MCAP file"), "{e}");
 
     let mut foreign = mcap::Writer::new(io::Cursor::new(Vec::new())).unwrap();
     foreign.add_channel(0, "/chatter", "json", &std::collections::BTreeMap::new()).unwrap();
@@ -418,7 +425,7 @@ fn a_cut_file_gives_its_whole_sets_and_then_the_reason() {
         assert_eq!(ids, (1..=ids.len() as u64).collect::<Vec<_>>(), "cut at {cut}");
         assert_eq!(errors.len(), 1, "cut at {cut}: {errors:?}");
         if !ids.is_empty() {
-            assert!(errors[0].contains("the sets before it are whole"), "{errors:?}");
+            assert!(errors[0].contains("the sets before it are complete"), "{errors:?}");
         }
         assert_eq!(worst(&fs), Some(Severity::Broken), "cut at {cut}");
         counts.push(ids.len());
@@ -445,7 +452,7 @@ fn a_recorder_dropped_unfinished_leaves_a_readable_part() {
     assert!(found.iter().any(|m| m.contains("the recording was not closed")), "{found:?}");
 }
 
-/// What a power cut takes is bounded by the sync interval: once that has passed, all is durable.
+/// The loss of a power cut is bounded by the sync interval: once that has passed, all is durable.
 #[test]
 fn written_sets_become_durable_without_closing_anything() {
     let fs = MemFs::new();
@@ -495,7 +502,7 @@ fn whichever_operation_fails_the_rest_is_whole() {
                     assert!(summary.sets.balances(), "operation {n}: {summary:?}");
                     let clean = copy(&fs);
                     let (ids, _) = readable(&clean);
-                    // Where cutting back failed too, a set that counts as lost may be there all the same.
+                    // Where truncation failed too, a set that counts as lost may be there all the same.
                     let uncut = u64::from(matches!(fault(0, kinds[0]), Fault::FailFrom(..)));
                     let at_most: Vec<u64> = (1..=summary.sets.recorded + uncut).collect();
                     let all = at_most.starts_with(&ids) && ids.len() as u64 >= summary.sets.recorded;
@@ -529,8 +536,8 @@ fn whichever_operation_fails_the_rest_is_whole() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(40))]
-    /// A crash keeps what was synced and any part of what was not: what is read are the first sets, all of
-    /// those that were synced, and each bit by bit.
+    /// A crash keeps the synced data and any part of the rest: readable are the first sets, all of those that were
+    /// synced, and each bit by bit.
     #[test]
     fn a_crash_leaves_the_first_sets(sets in 1u64..8, keep in any::<prop::sample::Index>()) {
         let fs = MemFs::new();

@@ -22,11 +22,11 @@ use std::time::Duration;
 const DIR: &str = "DEPTHRIG_TEST_KILL_DIR";
 /// Milliseconds from set to set; 0: as soon as the one before is written.
 const EVERY_MS: &str = "DEPTHRIG_TEST_KILL_EVERY_MS";
-/// The promise: what a kill may take at most.
+/// The guarantee: the most that a kill may lose.
 const LOSS_MAX_NS: i64 = 1_000_000_000;
 
-/// Not a test of its own: what the test below starts and kills. It says when each set was handed over, and each
-/// that is written.
+/// Not a test of its own: the child that the test below starts and kills. It prints when each set was handed over, and
+/// each that is written.
 #[test]
 fn child() {
     let Some(dir) = std::env::var_os(DIR).map(PathBuf::from) else { return };
@@ -40,7 +40,7 @@ fn child() {
     let r = Recorder::create(Arc::new(RealFs), &dir, session(), limits).unwrap();
     let mut out = std::io::stdout().lock();
     writeln!(out).unwrap();
-    // Far more than it will live to see, and an end should nobody kill it.
+    // Far more than it records before the kill, and an end if the kill never comes.
     for n in 0..3_000 {
         r.push(set(&session(), n)).unwrap();
         writeln!(out, "pushed {} {}", n + 1, HostTime::now().ns()).unwrap();
@@ -54,15 +54,15 @@ fn child() {
     }
 }
 
-/// What a killed child had said.
+/// The output of a child until it was killed.
 #[derive(Default)]
-struct Said {
+struct ChildOutput {
     pushed: Vec<(u64, i64)>,
     written: u64,
     killed_ns: i64,
 }
 
-fn record_and_kill(dir: &Path, every_ms: u64, after: Duration) -> Said {
+fn record_and_kill(dir: &Path, every_ms: u64, after: Duration) -> ChildOutput {
     let mut child = Command::new(std::env::current_exe().unwrap())
         .args(["--exact", "kill::child", "--nocapture"])
         .env(DIR, dir)
@@ -73,7 +73,7 @@ fn record_and_kill(dir: &Path, every_ms: u64, after: Duration) -> Said {
         .unwrap();
     let stdout = child.stdout.take().unwrap();
     let reader = std::thread::spawn(move || {
-        let mut said = Said::default();
+        let mut said = ChildOutput::default();
         for line in BufReader::new(stdout).lines() {
             let Ok(line) = line else { break };
             let mut words = line.split(' ');
@@ -93,10 +93,10 @@ fn record_and_kill(dir: &Path, every_ms: u64, after: Duration) -> Said {
     let killed_ns = HostTime::now().ns();
     child.kill().unwrap();
     child.wait().unwrap();
-    Said { killed_ns, ..reader.join().unwrap() }
+    ChildOutput { killed_ns, ..reader.join().unwrap() }
 }
 
-/// Messages of the commit mark's topic, as the `mcap` crate's own index and its own stream find them.
+/// Messages of the commit mark's topic, by the index and by the stream of the `mcap` crate.
 fn sets_of_the_mcap_crate(dir: &Path) -> u64 {
     let mut sets = 0;
     for entry in std::fs::read_dir(dir).unwrap().map(Result::unwrap) {
@@ -124,7 +124,7 @@ fn python_with_mcap() -> Option<PathBuf> {
     has_mcap.is_ok_and(|out| out.status.success()).then_some(python)
 }
 
-/// The same as Python's `mcap` finds them. A file that it cannot read is a failure.
+/// The same by Python's `mcap`. A file that it cannot read is a failure.
 fn sets_of_python(python: &Path, dir: &Path) -> u64 {
     let program = "import sys, glob\nfrom mcap.reader import make_reader\nn = 0\n\
                    for name in sorted(glob.glob(sys.argv[1] + '/seg_*.mcap')):\n    \
@@ -140,18 +140,19 @@ fn sets_of_python(python: &Path, dir: &Path) -> u64 {
 
 /// Whether a header came back as it was handed over, with the number of its set filled in.
 fn same_header(got: &FrameHeader, handed_over: &FrameHeader, set_id: u64) -> bool {
-    // Not a number where none was measured, and that equals nothing.
+    // NaN where nothing was measured, which equals nothing.
     let clean = |h: &FrameHeader| FrameHeader { temperature_c: 0.0, ..*h };
     clean(got) == FrameHeader { set_id, ..clean(handed_over) }
         && got.temperature_c.to_bits() == handed_over.temperature_c.to_bits()
 }
 
-/// The JPEG that the recorder makes of a colour picture: the same bytes each time.
+/// The JPEG that the recorder makes of a colour image: the same bytes each time.
 fn jpeg(frame: &RecordFrame) -> Vec<u8> {
     let mut out = Vec::new();
     let mut encoder = jpeg_encoder::Encoder::new(&mut out, options().jpeg_quality);
     encoder.set_sampling_factor(jpeg_encoder::SamplingFactor::R_4_4_4);
-    let (width, height) = (frame.header.width as u16, frame.header.height as u16);
+    let width = frame.header.width as u16;
+    let height = frame.header.height as u16;
     encoder.encode(frame.pixels.bytes(), width, height, jpeg_encoder::ColorType::Rgb).unwrap();
     out
 }
@@ -167,13 +168,13 @@ fn check_set(n: u64, got: &DatasetSet) {
         let pixels = want.pixels.bytes();
         match &frame.jpeg {
             Some(stored) => {
-                assert!(*stored == jpeg(want), "{what} is another picture");
+                assert!(*stored == jpeg(want), "{what} is another image");
                 assert_eq!(frame.pixels.len(), pixels.len(), "{what} is decoded to another size");
             }
-            None => assert!(frame.pixels == pixels, "{what} is another picture"),
+            None => assert!(frame.pixels == pixels, "{what} is another image"),
         }
     }
-    // As bytes: samples have fields that are no numbers.
+    // As bytes: samples have fields that are NaN.
     let bytes = |m: &RecordMotion| m.samples.iter().flat_map(MotionSample::to_bytes).collect::<Vec<_>>();
     let same = |(got_one, want): (&RecordMotion, &RecordMotion)| {
         got_one.unit == want.unit
@@ -190,7 +191,7 @@ fn run(n: u64) -> f64 {
     let dir = parent.path().join("killed");
     // Knuth's multiplicative hash: the moments are spread evenly, and a run can be done again.
     let random = n.wrapping_mul(2_654_435_761) % (1 << 32);
-    // Every third lives for more than the promise; of the others each set that it said is written must be there.
+    // Every third lives longer than the guarantee; of the others each set printed as written must be there.
     let (every, after) = match n % 3 {
         0 => (10, 1_100 + random % 500),
         _ => (0, 30 + random % 400),

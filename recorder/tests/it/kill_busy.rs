@@ -1,9 +1,9 @@
-//! A live recording of four 720p cameras, killed beside two busy loops: what is neither in the file nor in its counts
-//! of dropped sets is younger than a second.
+//! A live recording of four 720p cameras, killed beside two busy loops: a set that is neither in the file nor counted
+//! as dropped is younger than a second.
 //!
-//! `DEPTHRIG_LONG=1 cargo test -p depthrig-recorder --test it kill_busy -- --nocapture` kills 200 times instead of 4 and
-//! prints how the losses are spread. `DEPTHRIG_BUSY_LOOPS` sets how many loops run beside it, `DEPTHRIG_KILLS` how often and
-//! `DEPTHRIG_FIRST_KILL` from which number on (each has a moment of its own).
+//! `DEPTHRIG_LONG=1 cargo test -p depthrig-recorder --test it kill_busy -- --nocapture` kills 200 times instead of 4
+//! and prints how the losses are spread. `DEPTHRIG_BUSY_LOOPS` sets how many loops run beside it, `DEPTHRIG_KILLS` the
+//! number of kills and `DEPTHRIG_FIRST_KILL` the number of the first (each has a moment of its own).
 
 use crate::support::stream;
 use core::ops::ControlFlow;
@@ -29,7 +29,7 @@ const CAMERAS: usize = 4;
 const WIDTH: u32 = 1280;
 const HEIGHT: u32 = 720;
 const PERIOD_NS: i64 = 200_000_000;
-/// The promise: what a kill may take without a trace.
+/// The guarantee: the most that a kill may lose without a trace.
 const LOSS_MAX_NS: i64 = 1_000_000_000;
 
 fn session() -> Session {
@@ -76,7 +76,7 @@ impl depthrig_recorder::Pixels for Lent {
     }
 }
 
-/// Not a test of its own: what the test below starts and kills. It says when the first set was due.
+/// Not a test of its own: the child that the test below starts and kills. It prints when the first set was due.
 #[test]
 fn child() {
     let Some(dir) = std::env::var_os(DIR).map(PathBuf::from) else { return };
@@ -95,14 +95,14 @@ fn child() {
     let mut out = std::io::stdout().lock();
     writeln!(out, "\nbegin {}", begin.ns()).unwrap();
     out.flush().unwrap();
-    // Far more than it lives to see, and an end should nobody kill it.
+    // Far more than it records before the kill, and an end if the kill never comes.
     for n in 0..300u64 {
         let tick = begin.plus_ns(n as i64 * PERIOD_NS);
         std::thread::sleep(tick.from_now());
         let frames = session.streams.iter().zip(&images).enumerate().map(|(stream, (record, image))| {
             let mut header = FrameHeader::default();
             header.set_names("rig", &record.id);
-            header.set_picture(record.format, WIDTH, HEIGHT);
+            header.set_image(record.format, WIDTH, HEIGHT);
             header.sequence = n + 1;
             header.captured = n + 1;
             header.capture_time_ns = tick.ns();
@@ -133,7 +133,7 @@ impl Drop for Killed {
     }
 }
 
-/// What a kill left.
+/// The dataset that a kill left.
 struct Left {
     /// How old the oldest set was that is neither there nor counted.
     lost_ns: i64,

@@ -1,4 +1,4 @@
-//! LeRobot exports whose disk fails at each operation, or loses its power. What is in them is checked in
+//! LeRobot exports whose disk fails at each operation, or loses its power. Their content is checked in
 //! `tests/python/test_lerobot.py`, with pyarrow and the real loader.
 
 use crate::support::*;
@@ -97,7 +97,7 @@ fn an_export_to_lerobot_survives_a_power_cut() {
     let mut ended = 0;
     for sets in 1..12 {
         let fs = copy(&source);
-        // The last ones may be over before they are told to end.
+        // The last ones may be over before they are asked to end.
         ended += u32::from(run(&fs, two(&fs), Some(sets)).unwrap().ended);
         // Nothing unsynced is left.
         let fs = fs.after_crash(|_| 0);

@@ -1,4 +1,4 @@
-//! What a recorder logs, from the thread that hands it sets.
+//! Captures the log of a recorder, from the thread that hands it sets.
 
 use core::fmt::{Debug, Write as _};
 use std::sync::{Arc, Mutex};

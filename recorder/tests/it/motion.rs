@@ -1,4 +1,4 @@
-//! Motion units: what they send is in the dataset bit by bit, with the set that it came with. Long because every way
+//! IMUs: what they send is in the dataset bit by bit, with the set that it came with. Long because every way
 //! through a dataset has motion.
 
 use crate::support::*;
@@ -13,14 +13,14 @@ use depthrig_recorder::{
 use std::ops::ControlFlow;
 use std::sync::Arc;
 
-/// Compares bit by bit: samples have fields that are no numbers.
+/// Compares bit by bit: samples have NaN fields.
 fn same(a: &RecordMotion, b: &RecordMotion) -> bool {
     let bytes = |m: &RecordMotion| m.samples.iter().flat_map(MotionSample::to_bytes).collect::<Vec<_>>();
     let clean = |h: &FrameHeader| FrameHeader { temperature_c: 0.0, ..*h };
     a.unit == b.unit && clean(&a.header) == clean(&b.header) && bytes(a) == bytes(b)
 }
 
-/// What a set's batches come back as.
+/// The batches of a set as they are read back.
 fn with_id(batches: Vec<RecordMotion>, set_id: u64) -> Vec<RecordMotion> {
     let filled = |m: RecordMotion| RecordMotion { header: FrameHeader { set_id, ..m.header }, ..m };
     batches.into_iter().map(filled).collect()
@@ -47,12 +47,13 @@ fn every_sample_comes_back_with_its_set() {
         assert!(all_same(&by_number.read(n, mode).unwrap().motion, &sets[n].motion), "{mode:?}");
     }
     let info = dataset.info().unwrap();
-    let told: Vec<_> =
+    let units: Vec<_> =
         info.motion.iter().map(|u| (u.unit.as_str(), u.batches, u.lost_batches, u.samples)).collect();
-    let (batches, samples) = (5 * BATCHES, 5 * BATCHES * SAMPLES);
-    assert_eq!(told, [("front/imu", batches, 0, samples), ("side/imu", batches, 0, samples)]);
+    let batches = 5 * BATCHES;
+    let samples = 5 * BATCHES * SAMPLES;
+    assert_eq!(units, [("front/imu", batches, 0, samples), ("side/imu", batches, 0, samples)]);
     assert!((info.motion[0].rate_hz - 40.0).abs() < 1e-9, "{}", info.motion[0].rate_hz);
-    assert!(info.streams.iter().all(|s| !s.stream.ends_with("imu")), "a unit is no stream of sets");
+    assert!(info.streams.iter().all(|s| !s.stream.ends_with("imu")), "an IMU is not a stream of sets");
 }
 
 #[test]
@@ -63,7 +64,7 @@ fn any_number_of_batches_comes_with_a_set() {
     // None, one of one unit, and the longest there is; the set itself may have no frame.
     let mut longest = batch(&session, 1, 7);
     longest.samples.push(sample(1, 8 * SAMPLES));
-    longest.header.set_picture(PixelFormat::Motion, SAMPLES as u32 + 1, 1);
+    longest.header.set_image(PixelFormat::Motion, SAMPLES as u32 + 1, 1);
     let motions =
         [vec![], vec![batch(&session, 0, 3)], vec![longest, batch(&session, 0, 4), batch(&session, 1, 9)]];
     for (n, motion) in motions.iter().enumerate() {
@@ -81,16 +82,16 @@ fn any_number_of_batches_comes_with_a_set() {
 fn a_batch_that_contradicts_itself_or_the_session_is_refused() {
     type Break = fn(&mut RecordMotion);
     let breaks: [(&str, Break); 9] = [
-        ("motion unit number 2 is not in the session", |m| m.unit = 2),
+        ("IMU number 2 is not in the session", |m| m.unit = 2),
         ("batch 3 of front/imu: its header says 4 x 1 samples, 3 are there", |m| m.samples.truncate(3)),
         ("its header says 4 x 2 samples", |m| m.header.height = 2),
         ("its header says 0 x 1 samples, 0 are there", |m| {
             m.samples.clear();
-            m.header.set_picture(PixelFormat::Motion, 0, 1);
+            m.header.set_image(PixelFormat::Motion, 0, 1);
         }),
         ("at most 5", |m| {
             m.samples = (8..14).map(|k| sample(0, k)).collect();
-            m.header.set_picture(PixelFormat::Motion, 6, 1);
+            m.header.set_image(PixelFormat::Motion, 6, 1);
         }),
         ("4 samples are 256 bytes, its header says 192", |m| m.header.payload_len = 192),
         ("in rows of 250", |m| m.header.stride = 250),
@@ -120,8 +121,8 @@ fn a_batch_that_contradicts_itself_or_the_session_is_refused() {
     };
     let twice = within(|set| set.motion.push(set.motion[0].clone()));
     assert!(twice.contains("batch 1 of front/imu follows batch 2"), "{twice}");
-    let as_picture = within(|set| set.frames[2].header.set_picture(PixelFormat::Motion, 40, 1));
-    assert!(as_picture.contains("side/ir_left"), "{as_picture}");
+    let as_image = within(|set| set.frames[2].header.set_image(PixelFormat::Motion, 40, 1));
+    assert!(as_image.contains("side/ir_left"), "{as_image}");
 }
 
 #[test]
@@ -137,7 +138,7 @@ fn the_motion_of_a_set_has_a_bound() {
     let mut long = set(&session, 0);
     let samples = (0..u64::from(most)).map(|k| sample(0, k)).collect();
     let mut header = long.motion[0].header;
-    header.set_picture(PixelFormat::Motion, most, 1);
+    header.set_image(PixelFormat::Motion, most, 1);
     let whole = RecordMotion { unit: 0, header, samples };
     long.motion = vec![whole, batch(&session, 1, 0)];
     let refused = r.push(long).unwrap_err();
@@ -177,18 +178,18 @@ fn a_session_with_a_unit_in_the_wrong_place_is_refused() {
         Recorder::create(Arc::new(MemFs::new()), &dir(), session, options()).err().unwrap().to_string()
     };
     let twice = create(|s| s.motion.push(unit("front/imu")));
-    assert!(twice.contains("motion unit front/imu is there twice"), "{twice}");
+    assert!(twice.contains("IMU front/imu is there twice"), "{twice}");
     let both = create(|s| s.motion.push(unit("front/depth")));
-    assert!(both.contains("motion unit front/depth is there twice"), "{both}");
-    let among_pictures = create(|s| s.streams.push(stream("top/imu", PixelFormat::Motion, 8, 1)));
-    assert!(among_pictures.contains("top/imu is a motion unit"), "{among_pictures}");
+    assert!(both.contains("IMU front/depth is there twice"), "{both}");
+    let among_images = create(|s| s.streams.push(stream("top/imu", PixelFormat::Motion, 8, 1)));
+    assert!(among_images.contains("top/imu is an IMU"), "{among_images}");
     let empty = create(|s| s.motion[0].batch = 0);
     assert!(empty.contains("batches of no samples"), "{empty}");
     let long = create(|s| s.motion[1].batch = u32::MAX / 64 + 1);
     assert!(long.contains("side/imu has batches of 67108864 samples, no set can hold one"), "{long}");
     let many = create(|s| s.motion = (0..4_100).map(|i| unit(&format!("c{i}/imu"))).collect());
-    assert!(many.contains("4103 streams and motion units, 4000 is the limit"), "{many}");
-    // What another program wrote is read as far as a dataset can hold it.
+    assert!(many.contains("4103 streams and IMUs, 4000 is the limit"), "{many}");
+    // The output of another program is read as far as a dataset can hold it.
     let fs = MemFs::new();
     record(&fs, 1, options());
     let path = dir().join("session.toml");
@@ -259,21 +260,21 @@ fn spoiled(change: impl Fn(u64, &mut Vec<RecordMotion>)) -> MemFs {
     fs
 }
 
-fn told(fs: &MemFs) -> Vec<(Severity, String)> {
+fn verify_findings(fs: &MemFs) -> Vec<(Severity, String)> {
     let report = check(fs, &VerifyOptions::default());
     report.findings.into_iter().map(|f| (f.severity, f.message)).collect()
 }
 
 #[test]
-fn what_is_wrong_with_batches_and_samples_is_found() {
-    assert_eq!(told(&spoiled(|_, _| {})), []);
+fn faults_of_batches_and_samples_are_found() {
+    assert_eq!(verify_findings(&spoiled(|_, _| {})), []);
     let broken = |change: fn(&mut RecordMotion)| {
         let fs = spoiled(|n, motion| {
             if n == 1 {
                 change(&mut motion[2]);
             }
         });
-        let findings = told(&fs);
+        let findings = verify_findings(&fs);
         let broken = findings.into_iter().filter(|(s, _)| *s == Severity::Broken);
         broken.map(|(_, what)| what).collect::<Vec<_>>()
     };
@@ -298,21 +299,24 @@ fn what_is_wrong_with_batches_and_samples_is_found() {
             }
         })
     };
-    assert_eq!(told(&restarted(false)), []);
-    assert_eq!(told(&restarted(true)), []);
+    assert_eq!(verify_findings(&restarted(false)), []);
+    assert_eq!(verify_findings(&restarted(true)), []);
 }
 
 #[test]
-fn what_is_not_there_is_told() {
+fn missing_batches_and_samples_are_reported() {
     let lost = spoiled(|n, motion| motion.retain(|m| n != 1 || m.unit == 0));
-    assert_eq!(told(&lost), [(Severity::Note, "2 batches of side/imu were not recorded".to_owned())]);
-    // The device never gave these; of those that were lost before the channel its account tells.
+    assert_eq!(
+        verify_findings(&lost),
+        [(Severity::Note, "2 batches of side/imu were not recorded".to_owned())]
+    );
+    // The device never gave these; those lost before the channel are in its account.
     let gap = spoiled(|n, motion| {
         let mine = motion.iter_mut().filter(|m| n == 2 && m.unit == 0);
         mine.flat_map(|m| &mut m.samples).for_each(|s| s.sequence += 5);
     });
     let never = "5 samples of front/imu are missing: the device never gave them";
-    assert_eq!(told(&gap), [(Severity::Note, never.to_owned())]);
+    assert_eq!(verify_findings(&gap), [(Severity::Note, never.to_owned())]);
     let before_channel = spoiled(|n, motion| {
         for m in motion.iter_mut().filter(|m| n == 2 && m.unit == 0) {
             m.samples.iter_mut().for_each(|s| s.sequence += 5);
@@ -320,7 +324,7 @@ fn what_is_not_there_is_told() {
             m.header.captured += 2;
         }
     });
-    assert_eq!(told(&before_channel), []);
+    assert_eq!(verify_findings(&before_channel), []);
 }
 
 #[test]
@@ -385,8 +389,7 @@ fn messages_that_lack_or_contradict_are_found() {
         }
         true
     });
-    let named =
-        "set 1: batch 2 of front/imu: its frame_info names another frame or codec than a motion unit's";
+    let named = "set 1: batch 2 of front/imu: its frame_info names another frame or codec than an IMU's";
     assert_eq!(found(&fs), [named]);
     let fs = of("/rig/front/imu/frame_info", &mut |n, m| {
         m.log_time += u64::from(n == 2);
@@ -396,11 +399,11 @@ fn messages_that_lack_or_contradict_are_found() {
     assert!(found(&fs).iter().any(|f| f == late), "{:?}", found(&fs));
     let fs = of("/rig/side/imu/data_raw", &mut |n, _| n != 9);
     assert_eq!(found(&fs), ["set 2: side/imu has 8 samples in its batches, 7 single ones"]);
-    // Nothing else tells of a single sample that says otherwise than its batch: that takes decoding.
+    // Only decoding finds a single sample that differs from its batch.
     let decoded = VerifyOptions { decode: true, ..VerifyOptions::default() };
     for (at, what) in [
-        (4 + 32 + 13 * 8 + 6, "single sample 2 of front/imu says otherwise than its batch"),
-        (4, "single sample 2 of front/imu says otherwise than its batch"),
+        (4 + 32 + 13 * 8 + 6, "single sample 2 of front/imu differs from its batch"),
+        (4, "single sample 2 of front/imu differs from its batch"),
         (4 + 12, "a single sample of front/imu is of another frame than front_imu_frame"),
     ] {
         let fs = of("/rig/front/imu/data_raw", &mut |n, m| {
@@ -428,14 +431,14 @@ fn a_session_and_channels_that_disagree_are_found() {
     let renamed = write(text.replace("side/imu", "top/imu"));
     let findings = found(&renamed);
     for what in [
-        "side/imu/frame_info is of a motion unit that is not in the session",
-        "side/imu/data_raw is of a motion unit that is not in the session",
-        "the motion unit top/imu has no channel samples",
+        "side/imu/frame_info is of an IMU that is not in the session",
+        "side/imu/data_raw is of an IMU that is not in the session",
+        "the IMU top/imu has no channel samples",
     ] {
         assert!(findings.iter().any(|f| f == what), "{what} is not in {findings:?}");
     }
     let error = open(&renamed).sets(SetRange::ALL).find_map(Result::err).unwrap().to_string();
-    assert!(error.contains("side/imu is no motion unit of the session"), "{error}");
+    assert!(error.contains("side/imu is not an IMU of the session"), "{error}");
 }
 
 #[test]
@@ -465,7 +468,7 @@ fn motion_is_compared_bit_by_bit() {
     let short = spoiled(|n, m| {
         if n == 2 {
             m[0].samples.truncate(3);
-            m[0].header.set_picture(PixelFormat::Motion, 3, 1);
+            m[0].header.set_image(PixelFormat::Motion, 3, 1);
             m[0].header.capture_time_ns = m[0].samples[2].time_ns;
         }
     });
@@ -478,7 +481,7 @@ fn motion_is_compared_bit_by_bit() {
         }
     });
     assert_eq!(differing(&lone, &strict), (batches - 1, vec![one("side/imu", "batch", 1)]));
-    // What a recording of a replay gives anew.
+    // Fields that a recording of a replay assigns anew.
     let replayed = spoiled(|_, m| {
         for m in m {
             m.header.sequence += 7;
@@ -524,9 +527,9 @@ fn parts_with_other_units_are_not_merged() {
         merge(&fs, inputs, &out, &SliceOptions::default(), &mut go).map(|_| out)
     };
     let e = join(&[a.clone(), record(&fs, "b", units[..1].to_vec(), 1)], "x").unwrap_err().to_string();
-    assert!(e.contains("the motion units are [front/imu, side/imu] and [front/imu]"), "{e}");
+    assert!(e.contains("the IMUs are [front/imu, side/imu] and [front/imu]"), "{e}");
     let e = join(&[a.clone(), record(&fs, "c", moved, 2)], "x").unwrap_err().to_string();
-    assert!(e.contains("the motion unit side/imu has another pose"), "{e}");
+    assert!(e.contains("the IMU side/imu has another pose"), "{e}");
     let whole = join(&[a, record(&fs, "d", units, 1)], "whole").unwrap();
     let sets = Dataset::open_with(Arc::new(fs.clone()), &whole).unwrap().sets(SetRange::ALL);
     let motions: Vec<_> = sets.map(|s| s.unwrap().motion).collect();
@@ -585,8 +588,8 @@ fn samples_are_listed_and_written() {
 
     let none = "top/imu".parse().unwrap();
     let e = list_motion(&dataset, &none, all, &mut |_| ControlFlow::Continue(())).unwrap_err().to_string();
-    assert_eq!(e, "there is no motion unit top/imu; the dataset has front/imu, side/imu");
-    let pictures = FrameChoice { streams: units.to_vec(), ..FrameChoice::default() };
-    let e = list_frames(&dataset, &pictures, &mut |_| ControlFlow::Continue(())).unwrap_err().to_string();
-    assert!(e.contains("front/imu is a motion unit"), "{e}");
+    assert_eq!(e, "there is no IMU top/imu; the dataset has front/imu, side/imu");
+    let images = FrameChoice { streams: units.to_vec(), ..FrameChoice::default() };
+    let e = list_frames(&dataset, &images, &mut |_| ControlFlow::Continue(())).unwrap_err().to_string();
+    assert!(e.contains("front/imu is an IMU"), "{e}");
 }

@@ -1,4 +1,4 @@
-//! Unfinished, torn and damaged datasets are made whole, and nothing that could be read is lost on the way.
+//! Unfinished, torn and damaged datasets are repaired, and nothing readable is lost on the way.
 
 use crate::support::*;
 use core::ops::ControlFlow;
@@ -14,7 +14,7 @@ pub fn recover(fs: &MemFs) -> depthrig_recorder::Result<RecoverReport> {
     recover_as(fs, RecoverOptions::default())
 }
 
-/// A recovery that was preceded by a dry run, which changes nothing and says the same.
+/// A recovery after a dry run, which changes nothing and reports the same.
 pub fn planned_and_recovered(fs: &MemFs) -> depthrig_recorder::Result<RecoverReport> {
     let changes = fs.changes();
     let plan = recover_as(fs, RecoverOptions { dry_run: true, ..Default::default() });
@@ -27,8 +27,8 @@ pub fn planned_and_recovered(fs: &MemFs) -> depthrig_recorder::Result<RecoverRep
             assert_eq!((&plan.removed, plan.sets, plan.changed), (&done.removed, done.sets, done.changed));
             assert_eq!(plan.session_rebuilt, done.session_rebuilt);
             assert_eq!(plan.notes.iter().any(|n| n.starts_with("nothing was written")), plan.changed);
-            let told = plan.notes.len() - usize::from(plan.changed);
-            assert_eq!(plan.notes[..told], done.notes);
+            let shared = plan.notes.len() - usize::from(plan.changed);
+            assert_eq!(plan.notes[..shared], done.notes);
         }
         (Err(plan), Err(done)) => {
             assert_eq!((plan.kind(), plan.to_string()), (done.kind(), done.to_string()));
@@ -51,7 +51,7 @@ pub fn ids(fs: &MemFs) -> Vec<u64> {
         let want = set(&session(), s.id - 1);
         assert_eq!(s.frames.len(), 3, "set {}", s.id);
         for (frame, want) in s.frames.iter().zip(&want.frames).skip(1) {
-            assert!(frame.pixels == want.pixels.bytes(), "a picture of set {} is another one", s.id);
+            assert!(frame.pixels == want.pixels.bytes(), "an image of set {} is another one", s.id);
         }
         ids.push(s.id);
     }
@@ -80,7 +80,7 @@ fn crashed(sets: u64, n: i64) -> MemFs {
     fs
 }
 
-/// What outside readers make of each segment: the `mcap` crate's own index and its own stream.
+/// Reads each segment with the `mcap` crate, by its own index and its own stream; the number of sets.
 fn read_outside(fs: &MemFs) -> usize {
     let mut sets = 0;
     for name in names(fs).iter().filter(|n| n.starts_with("seg_")) {
@@ -158,7 +158,7 @@ fn damage_in_the_middle_costs_the_sets_it_hits_and_is_said() {
     fs.put(&segment(0), damaged.clone());
     let readable = ids(&fs);
     let shallow = recover_as(&fs, RecoverOptions { unfinished_only: true, ..Default::default() }).unwrap();
-    assert!(!shallow.changed, "what has its index is believed where that is asked for");
+    assert!(!shallow.changed, "segments with an index are trusted on request");
 
     let report = recover(&fs).unwrap();
     let left = ids(&fs);
@@ -213,15 +213,15 @@ fn the_checkpoints_of_a_copy_are_its_own() {
     fs.put(&segment(0), damaged);
     assert!(planned_and_recovered(&fs).unwrap().changed);
     let bytes = contents(&fs, &segment(0));
-    let told = checkpoints(&bytes);
-    assert!(told.len() >= 4, "{told:?}");
-    for (file_bytes, crc32) in told {
+    let checkpoints = checkpoints(&bytes);
+    assert!(checkpoints.len() >= 4, "{checkpoints:?}");
+    for (file_bytes, crc32) in checkpoints {
         let there = crc32fast::hash(&bytes[..file_bytes as usize]);
         assert_eq!(there, crc32, "the checkpoint of the first {file_bytes} bytes");
     }
 }
 
-/// What nothing proves is believed by nobody: the session stays what `session.toml` says.
+/// An unproven head is not trusted: the session stays that of `session.toml`.
 #[test]
 fn a_damaged_head_does_not_change_the_session() {
     let fs = MemFs::new();
@@ -259,9 +259,10 @@ fn a_lost_head_and_a_lost_session_are_made_anew_from_what_is_left() {
         assert_eq!(read_outside(&fs), 4);
         assert!(!recover(&fs).unwrap().changed);
     }
-    // The only segment: how pictures are stored, its own head alone knew.
+    // The only segment: how images are stored, its own head alone knew.
     let fs = MemFs::new();
-    let (color, depth) = (ColorCodec::Raw, DepthCodec::Rank);
+    let color = ColorCodec::Raw;
+    let depth = DepthCodec::Rank;
     record(&fs, 3, RecorderOptions { color, depth, ..options() });
     let mut bytes = contents(&fs, &segment(0));
     bytes[..600].fill(0);
@@ -341,11 +342,11 @@ fn a_recovery_that_finds_no_room_or_is_interrupted_changes_nothing() {
     assert_eq!(ids(&fs), [1, 2, 3, 4, 5]);
 }
 
-/// Whichever operation of a recovery fails, once or from then on: a typed error, what could be read still can,
-/// and the next recovery succeeds.
+/// Whichever operation of a recovery fails, once or from then on: a typed error, readable data stays readable, and the
+/// next recovery succeeds.
 #[test]
 fn whichever_operation_of_a_recovery_fails_nothing_is_lost() {
-    // A torn one, a damaged one and a whole one.
+    // A torn one, a damaged one and a complete one.
     let torn = crashed(5, 2);
     let mut bytes = contents(&torn, &segment(0));
     let middle = bytes.len() / 2;
@@ -434,7 +435,7 @@ fn a_copy_that_is_not_what_was_written_takes_nobodys_place() {
     let before = contents(&fs, &part);
     let theirs: Arc<dyn Fs> = Arc::new(fs.clone());
     let e = recover_with(&theirs, &dir(), &RecoverOptions::default(), &mut |_| {
-        // As a disk that keeps something else than it was given.
+        // As a disk that stores other data than it was given.
         if let Some(mut bytes) = fs.contents(&dir().join("seg_0000.mcap.recovering")) {
             let middle = bytes.len() / 2;
             bytes[middle] ^= 1;
@@ -446,10 +447,10 @@ fn a_copy_that_is_not_what_was_written_takes_nobodys_place() {
     assert!(contents(&fs, &part) == before && ids(&fs) == [1, 2, 3, 4, 5]);
 }
 
-/// A byte of each chunk in turn, and a cut after each: whatever a set's place in its segment, the dataset is whole
-/// afterwards, its losses are as many as they are, and a second recovery changes nothing.
+/// A byte of each chunk in turn, and a cut after each: whatever a set's place in its segment, the dataset is
+/// complete afterwards, its losses are counted exactly, and a second recovery changes nothing.
 #[test]
-fn whichever_chunk_is_damaged_the_dataset_is_whole_again() {
+fn whichever_chunk_is_damaged_the_dataset_is_repaired() {
     for synced_ns in [i64::MAX / 4, 1] {
         let fs = MemFs::new();
         let limits = RecorderOptions { segment_max_ns: 3 * PERIOD, sync_interval_ns: synced_ns, ..options() };
@@ -501,11 +502,11 @@ fn a_segment_that_is_recovered_twice_has_lost_both_times() {
     }
     drop(r);
     recover(&fs).unwrap();
-    for picture in [6, 12] {
+    for image in [6, 12] {
         let mut bytes = contents(&fs, &segment(0));
         let chunks = mcap::Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
-        let mut pictures = chunks.iter().filter(|c| c.message_index_offsets.len() == 1);
-        let hit = pictures.nth(picture).unwrap();
+        let mut images = chunks.iter().filter(|c| c.message_index_offsets.len() == 1);
+        let hit = images.nth(image).unwrap();
         bytes[(hit.chunk_start_offset + hit.chunk_length / 2) as usize] ^= 0x10;
         fs.put(&segment(0), bytes);
         let report = recover(&fs).unwrap();
@@ -540,7 +541,7 @@ fn a_recovery_that_was_ended_between_two_segments_is_told_by_the_next() {
     assert!(!recover(&fs).unwrap().changed);
 }
 
-/// What a failed sync was for may never reach the disk, whatever succeeds later: the file is copied, not renamed.
+/// Data of a failed sync may never reach the disk, whatever succeeds later: the file is copied, not renamed.
 #[test]
 fn a_file_whose_sync_failed_is_copied() {
     let limits =

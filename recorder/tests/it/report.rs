@@ -1,4 +1,4 @@
-//! The quality report: its numbers against what was recorded, its words about what went wrong, and its page.
+//! The quality report: its numbers against the recorded data, its words about failures, and its HTML.
 
 use crate::recover::recover;
 use crate::support::*;
@@ -40,17 +40,23 @@ fn account(stream: &str, captured: u64, delivered: u64, dropped: [u64; 8]) -> St
 #[test]
 fn sizes_are_those_of_the_file() {
     let fs = record_with(&session(), 25, |_| vec![0, 1, 2], &[]);
-    let (r, info) = (report(&fs), open(&fs).info().unwrap());
+    let r = report(&fs);
+    let info = open(&fs).info().unwrap();
     let page = r.to_html();
     assert_eq!(r.streams.iter().filter(|s| s.is_packed).count(), 2);
-    for (s, told) in r.streams.iter().zip(&info.streams) {
-        assert_eq!((s.packed_bytes, s.is_packed), (told.packed_bytes, told.is_packed), "{}", told.stream);
+    for (s, listed) in r.streams.iter().zip(&info.streams) {
+        assert_eq!(
+            (s.packed_bytes, s.is_packed),
+            (listed.packed_bytes, listed.is_packed),
+            "{}",
+            listed.stream
+        );
         let packed = if s.is_packed { " + zstd" } else { "" };
-        let share = (100.0 * told.packed_bytes as f64 / told.raw_bytes as f64).round();
-        let row = page.split("<tr>").find(|row| row.contains(&format!(">{}</td>", told.stream))).unwrap();
-        assert!(row.contains(&format!("<td>{}{packed}</td>", told.codec)), "{row}");
+        let share = (100.0 * listed.packed_bytes as f64 / listed.raw_bytes as f64).round();
+        let row = page.split("<tr>").find(|row| row.contains(&format!(">{}</td>", listed.stream))).unwrap();
+        assert!(row.contains(&format!("<td>{}{packed}</td>", listed.codec)), "{row}");
         assert!(row.contains(&format!(">{share} %</td>")), "{row}");
-        // What would be shown before packing is another number.
+        // The size before packing is another number.
         assert!(s.packed_bytes < s.bytes || !s.is_packed);
     }
 }
@@ -88,7 +94,7 @@ fn the_numbers_are_those_of_the_recording() {
     assert!(r.streams[0].fill.is_none());
     assert_eq!((r.sampled.sets, r.host_clock.steps.len()), (25, 0));
     assert!(r.streams[0].account.as_ref().unwrap().balances() && r.streams[1].account.is_none());
-    // The page shows what the units measured.
+    // The report shows what the IMUs measured.
     let u = &r.motion[0];
     assert_eq!((u.samples, u.lost_batches, u.never_given), (25 * BATCHES * SAMPLES, 0, 0));
     assert!((u.samples_hz - 40.0).abs() < 1e-9, "{}", u.samples_hz);
@@ -96,18 +102,18 @@ fn the_numbers_are_those_of_the_recording() {
     let most = (0..u.samples).map(|k| length(sample(0, k).accel_m_s2)).fold(0.0, f64::max);
     let drawn = u.acceleration_series.iter().flatten().map(|v| v.max).fold(0.0, f64::max);
     assert!((most - drawn).abs() < 1e-9, "{most} {drawn}");
-    assert!(u.rotation_series.iter().flatten().all(|v| v.min.is_finite()), "what is no number is not drawn");
+    assert!(u.rotation_series.iter().flatten().all(|v| v.min.is_finite()), "NaN is not drawn");
     let page = r.to_html();
     assert!(
         page.contains("<h2>Motion</h2>") && page.contains("acceleration, at most"),
         "no motion on the page"
     );
     check_page(&page);
-    // JSON has no pictures and can be read.
+    // JSON has no images and can be read.
     let json = serde_json::to_value(&r).unwrap();
     assert_eq!(json["verdict"]["health"], "whole");
     assert_eq!(json["streams"][1]["id"], "front/depth");
-    assert!(json.get("pictures").is_none());
+    assert!(json.get("images").is_none());
 }
 
 #[test]
@@ -177,9 +183,9 @@ fn every_loss_has_its_reason_and_the_sums_are_checked() {
     assert!(r.to_html().contains("NOT exact"));
 }
 
-/// What the last account in the file does not tell, because nothing more could be written.
+/// The last account in the file lacks these losses, because nothing more could be written.
 #[test]
-fn what_a_full_disk_cost_is_told() {
+fn sets_lost_to_a_full_disk_are_reported() {
     let fs = MemFs::new().with_capacity(110_000);
     let recorder = recorder(&fs, RecorderOptions { reserve_bytes: 30_000, ..options() });
     for n in 0..40 {
@@ -187,7 +193,8 @@ fn what_a_full_disk_cost_is_told() {
         settle(&recorder);
     }
     let summary = recorder.finish().unwrap();
-    let (recorded, lost) = (summary.sets.recorded, summary.sets.dropped_total());
+    let recorded = summary.sets.recorded;
+    let lost = summary.sets.dropped_total();
     assert!(recorded > 0 && lost > 1 && recorded + lost == 40, "{summary:?}");
 
     let r = report(&fs);
@@ -207,7 +214,7 @@ fn what_a_full_disk_cost_is_told() {
     assert!(!page.contains("Nothing was lost"));
     check_page(&page);
 
-    // Of a segment by itself the end of the recording says nothing.
+    // The outcome of the recording does not apply to a single segment.
     let one = Dataset::open_with(Arc::new(fs.clone()), &segment(0)).unwrap();
     let r = Report::of(&one, &ReportOptions::default(), &mut |_| ControlFlow::Continue(())).unwrap().unwrap();
     assert!(r.sets.counts.is_none_or(|c| c.offered < 40));
@@ -234,7 +241,7 @@ fn what_a_crash_cost_is_told() {
     assert!(page.contains("sets · lost_in_crash") && !page.contains("Nothing was lost"));
     check_page(&page);
 
-    // The recorder died; how many sets it still had in memory nobody knows.
+    // The recorder died; the number of sets that it still had in memory is unknown.
     let fs = MemFs::new();
     let recorder = recorder(&fs, options());
     for n in 0..6 {
@@ -279,16 +286,17 @@ fn damage_and_what_is_unfinished_end_no_report() {
     let bytes = contents(&fs, &segment(0));
     for k in 0..60 {
         let at = bytes.len() * k / 60;
-        let (flipped, cut) = (copy(&fs), copy(&fs));
+        let flipped = copy(&fs);
+        let cut = copy(&fs);
         let mut damaged = bytes.clone();
         damaged[at] ^= 0x5a;
         flipped.put(&segment(0), damaged);
         cut.put(&segment(0), bytes[..at].to_vec());
         for (fs, what) in [(flipped, "flipped"), (cut, "cut")] {
-            // What is no MCAP file at all is no dataset either.
+            // A file that is not MCAP at all is not a dataset either.
             let Ok(dataset) = Dataset::open_with(Arc::new(fs.clone()), &dir()) else { continue };
-            let made = Report::of(&dataset, &ReportOptions::default(), &mut |_| ControlFlow::Continue(()));
-            let r = made.unwrap_or_else(|e| panic!("{what} at {at}: {e}")).unwrap();
+            let report = Report::of(&dataset, &ReportOptions::default(), &mut |_| ControlFlow::Continue(()));
+            let r = report.unwrap_or_else(|e| panic!("{what} at {at}: {e}")).unwrap();
             assert!(r.sets.count <= 6);
             if what == "cut" || r.sets.count < 6 {
                 assert!(r.verdict.health.is_bad(), "{what} at {at}: {:?}", r.verdict);
@@ -337,11 +345,15 @@ fn it_can_be_stopped_anywhere_and_progress_grows() {
 fn chosen_text_is_only_ever_text() {
     const EVIL: &str = "</title><script>alert(1)</script><img src=x onerror='x'> & \"quotes\" \u{1}\u{202e}";
     let mut session = session();
-    (session.scene, session.operator, session.host) = (EVIL.into(), EVIL.into(), EVIL.into());
+    session.scene = EVIL.into();
+    session.operator = EVIL.into();
+    session.host = EVIL.into();
     session.name = EVIL.into();
     session.depthrig_version = EVIL.into();
     for s in &mut session.streams {
-        (s.model, s.serial, s.calibration) = (EVIL.into(), EVIL.into(), EVIL.into());
+        s.model = EVIL.into();
+        s.serial = EVIL.into();
+        s.calibration = EVIL.into();
     }
     let fs = MemFs::new();
     let r = Recorder::create(Arc::new(fs.clone()), &dir(), session.clone(), options()).unwrap();
@@ -394,15 +406,15 @@ fn what_lies_beside_the_page_is_left_alone() {
     assert_eq!(contents(&fs, &beside("kitchen.html")), r.to_html().into_bytes());
     assert_eq!(names(&fs), ["kitchen.html", "kitchen.tmp", "seg_0000.mcap", "session.toml"]);
     assert_eq!(contents(&fs, &beside("kitchen.tmp")), b"somebody's");
-    // Where there is no room, the page stays as it was and nothing is left.
+    // Without room on the disk the old report stays as it was, and no temporary file is left.
     let full = copy(&fs).with_capacity(1);
     r.write(&full, &beside("kitchen.html")).unwrap_err();
     assert_eq!(names(&full), names(&fs));
 }
 
-/// Every kind of pixels makes a picture on the page.
+/// Every pixel format gives an image in the report.
 #[test]
-fn pictures_of_every_format_are_shown() {
+fn images_of_every_format_are_shown() {
     let mut session = session();
     session.streams = PixelFormat::ALL
         .into_iter()
@@ -453,7 +465,7 @@ fn check_page(page: &str) {
     }
     check_text(rest);
     assert_eq!(open, Vec::<&str>::new());
-    assert!(!page.contains("NaN") && !page.contains("inf\""), "a number is none");
+    assert!(!page.contains("NaN") && !page.contains("inf\""), "not a number");
 }
 
 #[track_caller]

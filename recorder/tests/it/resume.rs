@@ -1,4 +1,4 @@
-//! Recordings that go on where their recorder was killed.
+//! Recordings resumed after their recorder was killed.
 
 use crate::support::*;
 use depthrig_bus::{StreamId, UtcPair};
@@ -13,7 +13,7 @@ use std::sync::Arc;
 const SETS: u64 = 17;
 
 fn limits() -> RecorderOptions {
-    // Only sets close segments, and the clock of the host is in no file.
+    // Only sets close segments, and no file depends on the host's clock.
     RecorderOptions { segment_max_ns: 4 * PERIOD, sync_interval_ns: i64::MAX / 4, ..options() }
 }
 
@@ -47,7 +47,7 @@ fn begin(fs: &MemFs) -> Recorder {
     Recorder::create_with(Arc::new(fs.clone()), clock(), &dir(), started, limits()).unwrap()
 }
 
-/// Killed anywhere, and as often as one likes, it ends as one that was not.
+/// Killed anywhere and any number of times, it ends like one that was not.
 #[test]
 fn a_resumed_recording_is_the_one_that_was_never_killed() {
     let whole = MemFs::new();
@@ -78,7 +78,7 @@ fn a_resumed_recording_is_the_one_that_was_never_killed() {
                     assert_eq!(summary.duration_ns, (SETS as i64 - 1) * PERIOD);
                 }
             }
-            // Segments end at the same sets; the messages between sets are numbered anew in each run.
+            // Segments end at the same sets; the messages between sets are renumbered in each run.
             assert_eq!(names(&fs), names(&whole), "{first} {second}");
             let same = compare(&open(&fs), &open(&whole), &strict).unwrap();
             assert!(same.equal, "{first} {second}: {:?}", same.differences);
@@ -142,21 +142,21 @@ fn what_cannot_go_on_is_refused() {
     assert_eq!(resume(&fs).kind(), ErrorKind::AlreadyExists);
 }
 
-/// What computed a stream is in the session, in the channels, and in what tells of a dataset.
+/// The producer of a computed stream is in the session, in the channels, in the info and in the verification.
 #[test]
-fn provenance_is_told() {
+fn provenance_is_reported() {
     let fs = MemFs::new();
     let r = begin(&fs);
     push(&r, 0..2);
     r.finish().unwrap();
     let dataset = open(&fs);
-    let made = computed().computed;
-    assert_eq!(dataset.session().computed, made);
-    assert_eq!(dataset.info().unwrap().computed, made);
+    let expected = computed().computed;
+    assert_eq!(dataset.session().computed, expected);
+    assert_eq!(dataset.info().unwrap().computed, expected);
     let shared: Arc<dyn Fs> = Arc::new(fs.clone());
     let report = verify_with(&shared, &dir(), &VerifyOptions::default()).unwrap();
     assert!(report.is_whole());
-    assert_eq!(report.computed, made);
+    assert_eq!(report.computed, expected);
     let bytes = contents(&fs, &segment(0));
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
     let facts = |key: &str| {
@@ -167,8 +167,8 @@ fn provenance_is_told() {
     assert_eq!(facts("computed").len(), 3, "{:?}", facts("computed"));
     assert!(facts("producer").iter().all(|(_, v)| v == "a matcher 1.0"));
     assert!(facts("parameters").iter().all(|(_, v)| v == "paths=8"));
-    let told = made[0].to_string();
-    assert!(told.ends_with("mimic_quality by a matcher 1.0 from zed/left and zed/right: paths=8"), "{told}");
+    let text = expected[0].to_string();
+    assert!(text.ends_with("mimic_quality by a matcher 1.0 from zed/left and zed/right: paths=8"), "{text}");
 
     let mut wrong = computed();
     wrong.computed[0].stream = StreamId::new("no", "stream").unwrap();

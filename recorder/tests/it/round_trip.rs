@@ -1,4 +1,4 @@
-//! What is written is what is read.
+//! Reading returns exactly the data that was written.
 
 use crate::support::*;
 use depthrig_bus::{FrameHeader, PixelFormat};
@@ -98,7 +98,8 @@ fn padded_rows_come_back_with_their_length() {
         let padded: Vec<u8> =
             (0..8).flat_map(|y| (0..64).map(move |x| if x < 60 { 3 * x + y } else { 0 })).collect();
         let header = &mut pushed.frames[0].header;
-        (header.stride, header.payload_len) = (64, 512);
+        header.stride = 64;
+        header.payload_len = 512;
         pushed.frames[0].pixels = Box::new(padded.clone());
         r.push(pushed).unwrap();
         assert!(r.finish().unwrap().complete);
@@ -174,7 +175,7 @@ fn a_tick_that_does_not_advance_still_gets_a_log_time_of_its_own() {
     for n in 0..3 {
         let mut s = set(&session(), n);
         s.tick = depthrig_bus::HostTime::from_ns(M0 - n as i64);
-        // The wall clock was set back an hour: recorded times do not care.
+        // The wall clock was set back an hour: recorded times are not affected.
         s.utc.utc_ns -= n as i64 * 3_600_000_000_000;
         r.push(s).unwrap();
     }

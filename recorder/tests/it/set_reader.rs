@@ -61,7 +61,7 @@ fn opening_reads_indexes_and_a_set_costs_one_set() {
         reads(fs) - before
     };
     chunk_reads(&fs, 31, &mut reader);
-    // Head and body of three picture chunks and the one that describes them, in a segment that is open.
+    // Head and body of three image chunks and the one that describes them, in a segment that is open.
     assert_eq!(chunk_reads(&fs, 34, &mut reader), 8);
     let before = reads(&fs);
     reader.read(35, PixelMode::None).unwrap();

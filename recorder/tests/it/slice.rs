@@ -54,7 +54,7 @@ fn strictly() -> CompareOptions {
 /// A recording that writes accounts as often as it can, with segments of so many sets.
 fn quick(sets_per_segment: i64) -> RecorderOptions {
     RecorderOptions {
-        // Each picture in a message of another type: an image, a picture file, depth in its own codec.
+        // Each image in a message of another type: an image, an image file, depth in its own codec.
         color: if sets_per_segment % 2 == 0 { ColorCodec::Jpeg } else { ColorCodec::Raw },
         depth: if sets_per_segment % 3 == 0 { DepthCodec::Rank } else { DepthCodec::Zstd },
         sync_interval_ns: 1_000_000,
@@ -156,7 +156,7 @@ fn segments_are_cut_at_their_limits() {
         merge(&fs, &[part], &named("again"), &options, &mut |_, _| ControlFlow::Continue(())).unwrap();
     assert_eq!(report.segments, 7);
     assert_eq!(check(&fs, "again").findings, []);
-    // Each is whole on its own.
+    // Each is complete on its own.
     for i in 0..7 {
         assert_eq!(check(&fs, &format!("again/seg_{i:04}.mcap")).findings, [], "segment {i}");
     }
@@ -458,7 +458,7 @@ fn nothing_is_written_over() {
     let before = contents(&fs, &segment(0));
     let e = cut(&fs, "session", ids(1, 2)).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::AlreadyExists);
-    // What a run that was cut off has left stays as well, and is named.
+    // The rest of a run that was cut off stays as well, and is named.
     fs.create_dir_all(&named("part.part")).unwrap();
     fs.put(&named("part.part/seg_0000.mcap.part"), vec![1]);
     let e = cut(&fs, "part", ids(1, 2)).unwrap_err();
@@ -491,7 +491,7 @@ fn a_folder_that_grows_is_left_alone() {
     assert!(made.unwrap().complete && looked);
     drop(fs.lock(&named("part")).unwrap());
 
-    // What somebody writes to is not taken for what somebody left.
+    // A folder that is being written to is not taken for a rest.
     let other = named("other.part");
     fs.create_dir_all(&other).unwrap();
     fs.put(&other.join("seg_0000.mcap.part"), vec![1]);
@@ -510,7 +510,8 @@ fn a_lock_goes_with_its_folder_to_another_name() {
     let memory = MemFs::new();
     let places: [(&dyn Fs, &Path); 2] = [(&RealFs, home.path()), (&memory, Path::new("/data"))];
     for (fs, place) in places {
-        let (from, to) = (place.join("out.part"), place.join("out"));
+        let from = place.join("out.part");
+        let to = place.join("out");
         fs.create_dir_all(&from).unwrap();
         let lock = fs.lock(&from).unwrap();
         fs.rename(&from, &to).unwrap();
@@ -538,18 +539,18 @@ fn a_disk_without_room_is_refused_before_and_leaves_nothing() {
 fn an_end_from_outside_leaves_nothing() {
     let fs = MemFs::new();
     recording(&fs, 6, quick(2), |_| 0);
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     let e = trim(&fs, &open(&fs), &named("part"), ids(2, 6), &SliceOptions::default(), &mut |done, total| {
-        told.push((done, total));
-        if told.len() == 4 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        reported.push((done, total));
+        if reported.len() == 4 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     })
     .unwrap_err();
     assert_eq!(e.kind(), ErrorKind::Cancelled);
-    assert!(told.windows(2).all(|w| w[0].0 < w[1].0 && w[1].0 < w[1].1), "{told:?}");
+    assert!(reported.windows(2).all(|w| w[0].0 < w[1].0 && w[1].0 < w[1].1), "{reported:?}");
     assert_eq!(names_of(&fs), ["session"]);
 }
 
-/// Whatever operation fails: an error, the input as it was, and either the whole or nothing under the new name.
+/// Whichever operation fails: an error, the input as it was, and a complete dataset or nothing under the new name.
 #[test]
 fn any_failing_operation_leaves_the_whole_or_nothing() {
     let good = MemFs::new();
@@ -564,7 +565,9 @@ fn any_failing_operation_leaves_the_whole_or_nothing() {
     let short = |fs: MemFs| fs.with_fault(Fault::ShortWrites(3000));
     let whole = short(copy(&good));
     cut(&whole).unwrap();
-    let (ops, mut failed, mut nothing) = (whole.ops(), 0, 0);
+    let ops = whole.ops();
+    let mut failed = 0;
+    let mut nothing = 0;
     for n in 0..ops {
         for fault in
             [Fault::FailOnce(n, io::ErrorKind::StorageFull), Fault::FailFrom(n, io::ErrorKind::StorageFull)]
@@ -604,7 +607,7 @@ fn a_damaged_set_costs_itself_and_is_named() {
     let reference = copy(&fs);
     let mut bytes = contents(&fs, &segment(0));
     let chunks = mcap::Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
-    // The largest is one of pictures.
+    // The largest is one of images.
     let chunk = chunks.iter().max_by_key(|c| c.chunk_length).unwrap();
     bytes[(chunk.chunk_start_offset + chunk.chunk_length / 2) as usize] ^= 1;
     fs.put(&segment(0), bytes);
@@ -673,10 +676,10 @@ fn the_end_of_a_recording_that_was_cut_off_is_said() {
         said(join(&fs, "loose", &[at(&fs, &part), at(&fs, segment(0))]).unwrap());
         said(cut(&fs, "end", ids(2, 6)).unwrap());
         assert_eq!(check(&fs, "end").worst(), Some(Severity::Lost));
-        // What says so already says it again, and not twice.
+        // A loss that is stated already is repeated, and not twice.
         said(cut_of(&fs, &at(&fs, named("joined")), "part", ids(3, 9)).unwrap());
         said(join(&fs, "again", &[at(&fs, named("end")), open(&fs)]).unwrap());
-        // What is wanted ends before, or comes from elsewhere.
+        // The requested range ends before, or comes from elsewhere.
         let begin = cut(&fs, "begin", ids(1, 4)).unwrap();
         assert!(begin.complete && begin.sets == 4, "{:?}", begin.lost);
         for (name, first) in [("mended", open(&fs)), ("brought", at(&fs, named("joined")))] {
@@ -691,7 +694,7 @@ fn the_end_of_a_recording_that_was_cut_off_is_said() {
     assert!(cut(&whole, "begin", ids(1, 5)).unwrap().complete);
 }
 
-/// After a write that failed no account is written: only the session tells how many sets came after it.
+/// After a write that failed no account is written: only the session says how many sets came after it.
 #[test]
 fn sets_lost_after_a_failed_write_stay_counted() {
     let full = MemFs::new().with_capacity(110_000);
@@ -704,7 +707,7 @@ fn sets_lost_after_a_failed_write_stay_counted() {
     let failed = summary.sets.dropped[SetDrop::WriteFailed as usize];
     assert!(summary.sets.recorded >= 3 && failed > 10, "{summary:?}");
     let fs = copy(&full);
-    let told = |name: &str, report: SliceReport| {
+    let expect_losses = |name: &str, report: SliceReport| {
         let count = format!("{failed} of {} sets were not recorded: write_failed", report.sets + failed);
         let [first, second] = &report.lost[..] else { panic!("{name}: {:?}", report.lost) };
         assert_eq!(*first, count, "{name}");
@@ -714,14 +717,14 @@ fn sets_lost_after_a_failed_write_stay_counted() {
         assert_eq!(verified.worst(), Some(Severity::Lost), "{name}: {:?}", verified.findings);
     };
     let end = SetSpan { from: Some(Edge::Set(2)), to: None };
-    told("end", cut(&fs, "end", end).unwrap());
-    told("again", cut_of(&fs, &at(&fs, named("end")), "again", SetSpan::default()).unwrap());
-    // What came after the end is not of the beginning.
+    expect_losses("end", cut(&fs, "end", end).unwrap());
+    expect_losses("again", cut_of(&fs, &at(&fs, named("end")), "again", SetSpan::default()).unwrap());
+    // Losses after the end do not belong to the beginning.
     assert!(cut(&fs, "begin", ids(1, 2)).unwrap().complete);
     assert_eq!(check(&fs, "begin").findings, []);
     let part = |name: &str| at(&fs, named(name));
-    told("joined", join(&fs, "joined", &[part("begin"), part("end")]).unwrap());
-    told("twice", join(&fs, "twice", &[part("end"), open(&fs)]).unwrap());
+    expect_losses("joined", join(&fs, "joined", &[part("begin"), part("end")]).unwrap());
+    expect_losses("twice", join(&fs, "twice", &[part("end"), open(&fs)]).unwrap());
 }
 
 /// One bit of the index of a segment: another copy has all that is in it.
@@ -782,7 +785,7 @@ fn a_short_part_has_the_accounts_of_its_streams() {
     }
 }
 
-/// What the child processes below work on; without it their tests do nothing.
+/// Variable with the folder of the child processes below; without it their tests do nothing.
 const DIR: &str = "DEPTHRIG_TEST_SLICE_DIR";
 
 /// Starts one of the tests below in a process of its own.
@@ -793,7 +796,7 @@ fn child(test: &str, dir: &Path) -> std::process::Command {
     command
 }
 
-/// Records pictures that no compressor makes smaller, 300 kB a set, on the real file system.
+/// Records images that no compressor makes smaller, 300 kB a set, on the real file system.
 fn big_recording(dir: &Path, sets: u64) {
     let mut session = session();
     session.streams = vec![stream("cam/any", depthrig_bus::PixelFormat::Mono8, 640, 480)];
@@ -838,7 +841,8 @@ fn a_killed_cut_leaves_the_input_and_nothing_that_looks_whole() {
         all
     };
     let before = bytes();
-    let (out, part) = (home.path().join("out"), home.path().join("out.part"));
+    let out = home.path().join("out");
+    let part = home.path().join("out.part");
     let at_once = || {
         trim(
             &RealFs,
@@ -916,7 +920,8 @@ fn memory_does_not_grow_with_the_dataset() {
         line.trim().trim_end_matches(" kB").parse::<i64>().unwrap()
     };
     let long = if std::env::var_os("DEPTHRIG_LONG").is_some() { 2_000 } else { 120 };
-    let (few, many) = (peak(10), peak(long));
+    let few = peak(10);
+    let many = peak(long);
     // The sets that are more take 33 MB in the short form.
     assert!(many - few < 8_000, "{few} kB for 10 sets, {many} kB for {long}");
 }

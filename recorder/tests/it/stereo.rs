@@ -1,5 +1,5 @@
-//! Raw stereo: what both eyes sent is what a reader gets, whatever the rig does with its colour, with all that
-//! rectification needs.
+//! Raw stereo: a reader gets the left and the right image exactly as they were sent, whatever the colour codec, with
+//! all that rectification needs.
 
 use crate::support::*;
 use depthrig_bus::{Distortion, Intrinsics, PixelFormat, Pose};
@@ -10,7 +10,7 @@ use depthrig_recorder::{
 };
 use std::sync::Arc;
 
-/// Both eyes of a camera with a lens, beside a colour stream.
+/// The left and the right stream of a camera with a lens, beside a colour stream.
 fn stereo() -> Session {
     let mut s = session();
     let mut left = stream("zed/left", PixelFormat::Yuyv, 64, 36);
@@ -30,7 +30,7 @@ fn stereo() -> Session {
     s
 }
 
-/// Noise in every bit, other in each eye and set: nothing lossy could bring it back.
+/// Noise in every bit, different in each stream and set: no lossy codec could reproduce it.
 fn noise(stream: usize, n: u64) -> Vec<u8> {
     let mut x = 0x9E37_79B9_7F4A_7C15_u64.wrapping_mul(1 + n * 7 + stream as u64);
     let mut next = || {
@@ -43,10 +43,11 @@ fn noise(stream: usize, n: u64) -> Vec<u8> {
 }
 
 #[test]
-fn both_eyes_come_back_bit_by_bit_under_every_colour_codec() {
+fn left_and_right_images_come_back_bit_by_bit_under_every_colour_codec() {
     for color in [ColorCodec::Jpeg, ColorCodec::Png, ColorCodec::Raw] {
         for depth in [DepthCodec::Zstd, DepthCodec::Rank] {
-            let (fs, session) = (MemFs::new(), stereo());
+            let fs = MemFs::new();
+            let session = stereo();
             let options = RecorderOptions { color, depth, jpeg_quality: 10, ..options() };
             let r = Recorder::create(Arc::new(fs.clone()), &dir(), session.clone(), options).unwrap();
             for n in 0..4 {
@@ -87,8 +88,8 @@ fn set_frame(session: &Session, stream: usize, n: u64) -> RecordFrame {
     RecordFrame { stream, header: header(&session.streams[stream], n), pixels: Box::new(Vec::new()) }
 }
 
-/// What a stereo program needs is in `session.toml` alone: both lenses, and the baseline as the difference of the
-/// eyes' poses.
+/// `session.toml` alone has all that a stereo program needs: both lenses, and the baseline as the difference of the
+/// left and right poses.
 #[test]
 fn the_session_has_both_lenses_and_the_baseline() {
     let session = stereo();

@@ -1,5 +1,5 @@
-//! Damage to each kind of record in each way, with its checksums left as they were and put right: after `recover`, `verify`
-//! never finds anything broken, and what is lost is stated; or the dataset is refused with a reason.
+//! Damage to each kind of record in each way, with stale and with corrected checksums: after `recover`, `verify` finds
+//! no damage, and losses are stated; or the dataset is refused with a reason.
 
 use crate::recover::{findings, ids, outcome, planned_and_recovered, recover};
 use crate::support::*;
@@ -14,7 +14,7 @@ const PER_SEGMENT: i64 = 3;
 /// Opcodes as the MCAP specification numbers them.
 const CHUNK: u8 = 6;
 
-/// What is damaged: its name, its opcode, and which one of that opcode in the file.
+/// Records to damage: name, opcode, and which one of that opcode in the file.
 const PARTS: [(&str, u8, usize); 22] = [
     ("header", 1, 0),
     ("schema of images", 3, 0),
@@ -104,7 +104,7 @@ enum Ended {
     Refused,
 }
 
-/// Recovers and holds what is promised of it.
+/// Recovers and checks the guarantees of a recovery.
 fn check(case: &str, fs: &MemFs) -> Ended {
     let report = match planned_and_recovered(fs) {
         Ok(report) => report,
@@ -165,7 +165,7 @@ fn whatever_record_is_damaged_the_dataset_is_complete_again_or_refused() {
         }
     }
     println!("{cases} cases, {} refused: {refused:#?}, {lossless} without a loss", refused.len());
-    // Most damage is to what is stored twice or can be made anew.
+    // Most damage is to data that is stored twice or can be rebuilt.
     assert!(cases >= 352 && refused.is_empty() && lossless * 100 > cases * 88);
 }
 

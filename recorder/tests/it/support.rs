@@ -1,4 +1,4 @@
-//! A small rig whose pictures and headers follow from the set's number.
+//! A small rig whose images and headers follow from the set's number.
 
 use depthrig_bus::{
     FrameFlags, FrameHeader, HostTime, Intrinsics, MotionFlags, MotionSample, PixelFormat, Pose, UtcPair,
@@ -23,7 +23,7 @@ pub fn dir() -> PathBuf {
     PathBuf::from("/data/session")
 }
 
-/// Nothing reserved, nothing limited: what a test on a small file system wants.
+/// Nothing reserved, nothing limited: for tests on a small file system.
 pub fn options() -> RecorderOptions {
     RecorderOptions { workers: 2, queue_sets: 8, min_free_bytes: 0, reserve_bytes: 0, ..Default::default() }
 }
@@ -60,7 +60,7 @@ pub fn session() -> Session {
     s
 }
 
-/// Samples of one batch of a motion unit, and batches of one set.
+/// Samples of one batch of an IMU, and batches of one set.
 pub const SAMPLES: u64 = 4;
 pub const BATCHES: u64 = 2;
 /// Time from sample to sample.
@@ -78,7 +78,7 @@ pub fn unit(id: &str) -> MotionRecord {
     }
 }
 
-/// Sample number `k` of a unit; now and then it lacks something.
+/// Sample number `k` of an IMU; now and then it lacks something.
 pub fn sample(unit: usize, k: u64) -> MotionSample {
     let v = k as f32 / 8.0 + unit as f32;
     MotionSample {
@@ -94,14 +94,14 @@ pub fn sample(unit: usize, k: u64) -> MotionSample {
     }
 }
 
-/// Batch number `b` of a unit, counted from 0.
+/// Batch number `b` of an IMU, counted from 0.
 pub fn batch(session: &Session, unit: usize, b: u64) -> RecordMotion {
     let record = &session.motion[unit];
     let samples: Vec<_> = (b * SAMPLES..(b + 1) * SAMPLES).map(|k| sample(unit, k)).collect();
     let mut header = FrameHeader::default();
     header.set_names("rig", &record.id);
     header.set_device(&record.model, &record.serial);
-    header.set_picture(PixelFormat::Motion, SAMPLES as u32, 1);
+    header.set_image(PixelFormat::Motion, SAMPLES as u32, 1);
     header.sequence = b + 1;
     header.captured = b + 1;
     header.device_sequence = (b + 1) * SAMPLES;
@@ -110,13 +110,13 @@ pub fn batch(session: &Session, unit: usize, b: u64) -> RecordMotion {
     RecordMotion { unit, header, samples }
 }
 
-/// What the units send between set `n` and the one before.
+/// The batches that the IMUs send between set `n` and the one before.
 pub fn motion(session: &Session, n: u64) -> Vec<RecordMotion> {
     let batches = n * BATCHES..(n + 1) * BATCHES;
     batches.flat_map(|b| (0..session.motion.len()).map(move |u| batch(session, u, b))).collect()
 }
 
-/// Smooth pictures with an edge, as a camera gives them, different for each set.
+/// Smooth images with an edge, as a camera gives them, different for each set.
 pub fn pixels(format: PixelFormat, width: u32, height: u32, n: u64) -> Vec<u8> {
     let mut out = Vec::with_capacity(format.frame_bytes(width, height));
     for y in 0..height {
@@ -144,7 +144,7 @@ pub fn header(s: &StreamRecord, n: u64) -> FrameHeader {
     let mut h = FrameHeader::default();
     h.set_names("rig", &s.id);
     h.set_device(&s.model, &s.serial);
-    h.set_picture(s.format, s.width, s.height);
+    h.set_image(s.format, s.width, s.height);
     h.sequence = 6 * n + 1;
     h.device_sequence = 6 * n + 100;
     h.device_time = 123_456 * n;
@@ -203,10 +203,10 @@ pub fn settle(r: &Recorder) {
         }
         std::thread::sleep(Duration::from_millis(5));
     }
-    panic!("sets are in flight for ten seconds: {:?}", r.progress());
+    panic!("sets are not settled after ten seconds: {:?}", r.progress());
 }
 
-/// Records sets one at a time, so that none is refused for want of room.
+/// Records sets one at a time, so that no set is refused for lack of room.
 pub fn record(fs: &MemFs, sets: u64, options: RecorderOptions) -> Summary {
     let r = recorder(fs, options);
     for n in 0..sets {

@@ -1,4 +1,4 @@
-//! What verification finds. Long because it is a list: each kind of damage with the finding that must name it.
+//! Findings of a verification. Long because it is a list: each kind of damage with the finding that must name it.
 
 use crate::support::*;
 use depthrig_bus::{DropCounts, HostTime, PixelFormat, UtcPair};
@@ -28,7 +28,7 @@ fn a_good_dataset_has_no_findings() {
     assert_eq!(report.findings, []);
     assert!(report.is_whole());
     assert_eq!((report.sets, report.frames, report.segments), (7, 21, 3));
-    // A segment in the middle is whole on its own as well.
+    // A segment in the middle is complete on its own as well.
     let shared: Arc<dyn Fs> = Arc::new(fs.clone());
     let alone = verify_with(&shared, &segment(1), &VerifyOptions::default()).unwrap();
     assert_eq!(alone.findings, []);
@@ -98,19 +98,19 @@ fn another_writers_copy_of_a_segment_is_as_good() {
 fn a_missing_member_is_found() {
     let fs = MemFs::new();
     record(&fs, 3, options());
-    let mut pictures = 0;
+    let mut images = 0;
     rewrite(&fs, |m| {
-        let picture = m.channel.topic == "/rig/front/depth/image_raw";
-        pictures += u32::from(picture);
-        !(picture && pictures == 2)
+        let image = m.channel.topic == "/rig/front/depth/image_raw";
+        images += u32::from(image);
+        !(image && images == 2)
     });
-    assert_eq!(found(&fs), ["set 2: front/depth has no picture"]);
+    assert_eq!(found(&fs), ["set 2: front/depth has no image"]);
     let errors: Vec<_> = open(&fs)
         .sets(depthrig_recorder::SetRange::ALL)
         .filter_map(Result::err)
         .map(|e| e.to_string())
         .collect();
-    assert!(errors.len() == 1 && errors[0].contains("set 2 lacks the picture of front/depth"), "{errors:?}");
+    assert!(errors.len() == 1 && errors[0].contains("set 2 lacks the image of front/depth"), "{errors:?}");
 }
 
 #[test]
@@ -126,7 +126,7 @@ fn missing_descriptions_are_found() {
 }
 
 #[test]
-fn a_picture_swapped_for_another_is_found() {
+fn an_image_swapped_for_another_is_found() {
     let fs = MemFs::new();
     record(&fs, 2, options());
     rewrite(&fs, |m| {
@@ -138,7 +138,7 @@ fn a_picture_swapped_for_another_is_found() {
     });
     assert_eq!(
         found(&fs),
-        ["set 1: front/depth: its picture is another one", "set 2: front/depth: its picture is another one"]
+        ["set 1: front/depth: its image is another one", "set 2: front/depth: its image is another one"]
     );
 }
 
@@ -227,14 +227,14 @@ fn a_damaged_session_file_does_not_hide_the_rest() {
 }
 
 #[test]
-fn a_cameras_damaged_jpeg_is_found_when_pictures_are_decoded() {
+fn a_cameras_damaged_jpeg_is_found_when_images_are_decoded() {
     let jpeg = {
         let mut out = Vec::new();
         let rgb = pixels(PixelFormat::Rgb8, 64, 48, 1);
         jpeg_encoder::Encoder::new(&mut out, 90).encode(&rgb, 64, 48, jpeg_encoder::ColorType::Rgb).unwrap();
         out
     };
-    // The second one is of another size than its header says, the third one no JPEG at all.
+    // The second one is of another size than its header says, the third one is not JPEG at all.
     for (height, damage, expected) in
         [(48, false, None), (32, false, Some("its JPEG is 64x48")), (48, true, Some("its JPEG is damaged"))]
     {
@@ -247,7 +247,8 @@ fn a_cameras_damaged_jpeg_is_found_when_pictures_are_decoded() {
         if damage {
             bytes[..4].fill(0);
         }
-        (pushed.frames[0].header.payload_len, pushed.frames[0].header.stride) = (bytes.len() as u32, 0);
+        pushed.frames[0].header.payload_len = bytes.len() as u32;
+        pushed.frames[0].header.stride = 0;
         pushed.frames[0].pixels = Box::new(bytes);
         r.push(pushed).unwrap();
         r.finish().unwrap();
@@ -262,7 +263,8 @@ fn a_cameras_damaged_jpeg_is_found_when_pictures_are_decoded() {
 
 /// Where a record of a file begins, its opcode and its length with head.
 fn records(bytes: &[u8]) -> Vec<(usize, u8, usize)> {
-    let (mut at, mut found) = (8, Vec::new());
+    let mut at = 8;
+    let mut found = Vec::new();
     while at + 9 <= bytes.len() && bytes[at..] != bytes[..8] {
         let len = 9 + u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap()) as usize;
         found.push((at, bytes[at], len));
@@ -282,7 +284,8 @@ const FOOTER: u8 = 2;
 fn mend(bytes: &mut [u8]) {
     let records = records(bytes);
     let place = |opcode| records.iter().find(|r| r.1 == opcode).unwrap().0;
-    let (data_end, footer) = (place(DATA_END), place(FOOTER));
+    let data_end = place(DATA_END);
+    let footer = place(FOOTER);
     let crc = crc32fast::hash(&bytes[..data_end]);
     bytes[data_end + 9..data_end + 13].copy_from_slice(&crc.to_le_bytes());
     bytes[footer + 9..footer + 17].copy_from_slice(&(data_end as u64 + 13).to_le_bytes());
@@ -306,8 +309,8 @@ fn forged(change: impl FnOnce(&mut Vec<u8>)) -> [Vec<String>; 2] {
     })
 }
 
-/// The packed chunks with a picture: those that verification does not unpack by itself.
-fn packed_pictures(bytes: &[u8]) -> Vec<(usize, usize)> {
+/// The packed chunks with an image: those that verification does not unpack by itself.
+fn packed_images(bytes: &[u8]) -> Vec<(usize, usize)> {
     let all = records(bytes);
     let one_message = |i: usize| all[i + 1].1 == MESSAGE_INDEX && all[i + 2].1 != MESSAGE_INDEX;
     let zstd = |at: usize| &bytes[at + 41..at + 45] == b"zstd";
@@ -329,7 +332,7 @@ fn no_flipped_byte_of_a_finished_segment_stays_unseen() {
         assert_eq!(worst, Some(Severity::Broken), "byte {at} was changed unnoticed");
         changed[at] = bytes[at];
     }
-    assert!(packed_pictures(bytes).len() >= 6, "pictures that are not unpacked were among them");
+    assert!(packed_images(bytes).len() >= 6, "images that are not unpacked were among them");
 }
 
 /// First, middle and last byte of each part of each kind of record.
@@ -353,21 +356,21 @@ fn damage_of_every_kind_of_record_is_found() {
     assert_eq!(kinds.into_iter().collect::<Vec<_>>(), [1, 2, 3, 4, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15]);
 }
 
-/// A picture whose packed bytes were changed and every checksum around it mended is the one thing that only
-/// unpacking shows: this is also the proof that verification by default does not unpack it.
+/// Only unpacking shows an image whose packed bytes were changed with every checksum around it corrected: this also
+/// proves that verification by default does not unpack it.
 #[test]
-fn a_picture_forged_behind_its_checksums_is_found_by_unpacking() {
+fn an_image_forged_behind_its_checksums_is_found_by_unpacking() {
     let (_, bytes) = recorded();
-    for (at, len) in packed_pictures(bytes) {
+    for (at, len) in packed_images(bytes) {
         let [default, decoded] = forged(|b| b[at + len - 20] ^= 0x55);
         assert_eq!(default, Vec::<String>::new());
         assert!(decoded.len() == 1 && decoded[0].starts_with("set "), "{decoded:?}");
-        // What the head of the chunk says of the picture is compared with the mark of its set.
+        // The head of an image's chunk is compared with the mark of its set.
         let [default, _] = forged(|b| b[at + 33] ^= 1);
         assert!(default.len() == 1 && default[0].contains("a chunk's checksum is"), "checksum: {default:?}");
         let [default, _] = forged(|b| b[at + 25] ^= 1);
-        let told = default.iter().any(|m| m.ends_with("its picture is another one"));
-        assert!(told && default.len() == 2, "size: {default:?}");
+        let reported = default.iter().any(|m| m.ends_with("its image is another one"));
+        assert!(reported && default.len() == 2, "size: {default:?}");
         for time in [at + 9, at + 17] {
             let [default, _] = forged(|b| b[time] ^= 1);
             assert!(default.iter().any(|m| m.contains("the index of a chunk")), "times: {default:?}");
@@ -405,13 +408,13 @@ fn an_index_that_lies_is_found_though_every_checksum_is_right() {
 #[test]
 fn a_chunk_taken_out_is_found_though_every_checksum_is_right() {
     let (_, bytes) = recorded();
-    for (at, len) in packed_pictures(bytes) {
+    for (at, len) in packed_images(bytes) {
         let index = u64::from_le_bytes(bytes[at + len + 1..at + len + 9].try_into().unwrap()) as usize + 9;
         let [default, _] = forged(|b| {
             b.drain(at..at + len + index);
         });
         assert!(default.len() >= 2, "the index as well: {default:?}");
-        assert!(default.iter().any(|m| m.ends_with("has no picture")), "{default:?}");
+        assert!(default.iter().any(|m| m.ends_with("has no image")), "{default:?}");
     }
 }
 
@@ -480,13 +483,15 @@ fn frames_whose_own_accounts_are_wrong_are_found() {
     );
     let backwards = |n: usize, h: &mut depthrig_bus::FrameHeader| {
         if n == 2 {
-            (h.sequence, h.captured) = (3, 5);
+            h.sequence = 3;
+            h.captured = 5;
         }
     };
     assert_eq!(found(&backwards), ["set 3: front/depth: the account in its header goes backwards"]);
     let reasons = found(&|n, h| {
         if n == 2 {
-            (h.dropped[1], h.dropped[2]) = (1, 1);
+            h.dropped[1] = 1;
+            h.dropped[2] = 1;
         }
     });
     assert_eq!(reasons, ["set 3: front/depth: the account in its header goes backwards"]);
@@ -515,7 +520,7 @@ fn the_sessions_own_limit_of_the_spread_is_used() {
     assert_eq!(report.worst(), Some(Severity::Lost));
     assert!(report.findings[0].message.ends_with("2000000 is the limit"), "{:?}", report.findings);
     let wider = VerifyOptions { max_spread_ns: Some(9_000_000), ..Default::default() };
-    assert_eq!(check(&fs, &wider).findings, [], "what is asked for goes before what the session says");
+    assert_eq!(check(&fs, &wider).findings, [], "the option overrides the session");
 }
 
 #[test]
@@ -554,13 +559,13 @@ fn a_recovered_segment_says_what_it_lost_alone_and_the_dataset_says_it_once() {
     let words = &said.segments[0].lost;
     assert!(!words.is_empty());
     let alone = verify_with(&shared, &segment(0), &VerifyOptions::default()).unwrap();
-    let told = |f: &Finding| (f.severity, f.file.clone(), f.message.clone());
+    let parts = |f: &Finding| (f.severity, f.file.clone(), f.message.clone());
     let expected: Vec<_> =
         words.iter().map(|w| (Severity::Lost, "seg_0000.mcap".to_owned(), w.clone())).collect();
-    // The sets that are lost took their motion with them, which the numbers around them show.
+    // Lost sets lose their IMU batches, which the numbers around them show.
     let (motion, of_sets): (Vec<_>, Vec<_>) =
         alone.findings.iter().partition(|f| f.severity == Severity::Note);
-    assert_eq!(of_sets.into_iter().map(told).collect::<Vec<_>>(), expected);
+    assert_eq!(of_sets.into_iter().map(parts).collect::<Vec<_>>(), expected);
     let motion: Vec<_> = motion.iter().map(|f| f.message.as_str()).collect();
     assert_eq!(
         motion,
@@ -577,7 +582,8 @@ fn a_recovered_segment_says_what_it_lost_alone_and_the_dataset_says_it_once() {
 fn clocked(sets: u64, off_ns: impl Fn(i64) -> i64) -> MemFs {
     let fs = MemFs::new();
     let now = Arc::new(AtomicI64::new(0));
-    let (theirs, read) = (Arc::clone(&now), Arc::new(AtomicI64::new(-1)));
+    let theirs = Arc::clone(&now);
+    let read = Arc::new(AtomicI64::new(-1));
     let offs: Vec<i64> = (0..sets as i64).map(off_ns).collect();
     let utc = {
         let read = Arc::clone(&read);
@@ -634,8 +640,8 @@ fn unfinished() -> (MemFs, std::path::PathBuf, Vec<u8>) {
     drop(r);
     let part = dir().join("seg_0000.mcap.part");
     let mut bytes = contents(&fs, &part);
-    // The last set is the end of the file: no checkpoint speaks of it.
-    let last = packed_pictures(&bytes).pop().unwrap().0;
+    // The last set is the end of the file: no checkpoint covers it.
+    let last = packed_images(&bytes).pop().unwrap().0;
     let after: Vec<_> = records(&bytes).into_iter().filter(|r| r.1 == CHUNK && r.0 > last).collect();
     if let Some(beyond) = after.get(1) {
         bytes.truncate(beyond.0);
@@ -669,7 +675,7 @@ fn damage_in_an_unfinished_segment_is_found_before_and_after_its_checkpoints() {
 fn findings_do_not_depend_on_the_number_of_threads() {
     let (fs, bytes) = recorded();
     let mut bytes = bytes.clone();
-    for (at, len) in packed_pictures(&bytes) {
+    for (at, len) in packed_images(&bytes) {
         bytes[at + len - 20] ^= 0x55;
     }
     mend(&mut bytes);
@@ -705,7 +711,8 @@ fn verification_tells_how_far_it_is_and_can_be_stopped() {
     let r = Recorder::create(Arc::new(fs.clone()), &dir(), session.clone(), options()).unwrap();
     for n in 0..12 {
         let mut pushed = set_of(&session, n, &[]);
-        (pushed.missing, pushed.spread_ns) = (Vec::new(), 0);
+        pushed.missing = Vec::new();
+        pushed.spread_ns = 0;
         let header = header(&session.streams[0], n);
         pushed.frames =
             vec![depthrig_recorder::RecordFrame { stream: 0, header, pixels: Box::new(Arc::clone(&noise)) }];

@@ -1,6 +1,6 @@
-//! An allocator that counts how often memory is taken, and how much, for tests of what must take none or only so much.
+//! An allocator that counts allocations and bytes, for tests of code that must allocate nothing or a limited amount.
 //!
-//! It depends on nothing, so that the tests of every floor can have it. A test binary of its own says
+//! It has no dependencies, so that tests of every layer can use it. A test binary of its own declares
 //! `#[global_allocator] static COUNTING: depthrig_counting::Counting = depthrig_counting::Counting;`
 #![allow(unsafe_code)] // a global allocator is unsafe to write
 
@@ -24,7 +24,7 @@ thread_local! {
 
 fn count() {
     ALL.fetch_add(1, Ordering::Relaxed);
-    // A thread that is being torn down has no counter any more.
+    // A thread that is being destroyed has no counter any more.
     let _ = OWN.try_with(|n| n.set(n.get() + 1));
     if IS_WATCHED.try_with(Cell::get) == Ok(true) {
         WATCHED.fetch_add(1, Ordering::Relaxed);
@@ -64,7 +64,7 @@ unsafe impl GlobalAlloc for Counting {
     }
 }
 
-/// Most bytes that were taken at once, in the whole process, while `work` ran and beyond those taken before.
+/// Peak bytes allocated in the process while `work` ran, beyond those allocated before.
 pub fn peak_of<R>(work: impl FnOnce() -> R) -> (R, u64) {
     let before = LIVE.load(Ordering::Relaxed);
     PEAK.store(before, Ordering::Relaxed);
@@ -72,34 +72,34 @@ pub fn peak_of<R>(work: impl FnOnce() -> R) -> (R, u64) {
     (result, PEAK.load(Ordering::Relaxed).saturating_sub(before))
 }
 
-/// How often this thread has taken memory.
+/// Allocations of this thread so far.
 pub fn of_thread() -> u64 {
     OWN.with(Cell::get)
 }
 
-/// How often any thread of the process has.
+/// Allocations of all threads of the process so far.
 pub fn of_process() -> u64 {
     ALL.load(Ordering::Relaxed)
 }
 
-/// From now on this thread is one of those that [`of_watched`] counts.
+/// Adds this thread to those that [`of_watched`] counts.
 pub fn watch_thread() {
     IS_WATCHED.set(true);
 }
 
-/// How often threads have taken memory since they were watched.
+/// Allocations of the watched threads since they were added.
 pub fn of_watched() -> u64 {
     WATCHED.load(Ordering::Relaxed)
 }
 
-/// How often `work` takes memory on this thread.
+/// Allocations of `work` on this thread.
 pub fn during(work: impl FnOnce()) -> u64 {
     let before = of_thread();
     work();
     of_thread() - before
 }
 
-/// How often anything takes memory while `work` runs.
+/// Allocations of the process while `work` runs.
 pub fn in_process_during(work: impl FnOnce()) -> u64 {
     let before = of_process();
     work();
@@ -123,7 +123,8 @@ mod tests {
             v.reserve_exact(10_000);
         });
         assert_eq!(grown, 2, "what grows is taken anew");
-        let (own, watched) = (of_thread(), of_watched());
+        let own = of_thread();
+        let watched = of_watched();
         let thread = std::thread::spawn(move || {
             take();
             watch_thread();

@@ -1,8 +1,8 @@
-//! A stereo network that was never trained, in ONNX form: plain block matching, written as a graph. It stands in for the
-//! network that a user brings, so that the mode `neural` can be seen to run.
+//! A stereo network that was never trained, in ONNX form: plain block matching, written as a graph. It stands in for
+//! the network that a user brings, so that the mode `neural` can be seen to run.
 //!
-//! Both pictures are halved twice; the absolute difference at each of [`DISPARITIES`] shifts is averaged over a window, and
-//! the disparity is the mean of the shifts, weighted by how well they fit (a "soft argmin", Kendall et al. 2017,
+//! Both images are halved twice; the absolute difference at each of [`DISPARITIES`] shifts is averaged over a window,
+//! and the disparity is the mean of the shifts, weighted by how well they fit (a "soft argmin", Kendall et al. 2017,
 //! arXiv 1703.04309), brought back to full size.
 
 use prost::Message;
@@ -15,21 +15,28 @@ const SHRINK: i64 = 4;
 const WINDOW: i64 = 7;
 /// How sharply the best shift wins, per grey level.
 const SHARPNESS: f32 = 1.2;
-/// The cost of a shift that leads out of the right picture.
+/// The cost of a shift that leads out of the right image.
 const OUTSIDE: f32 = 64.0;
 
-/// The network for pictures of this width and height: inputs `left` and `right`, grey, 0 to 255; output `disparity`, pixels.
-pub fn block_matching((width, height): (u32, u32)) -> Vec<u8> {
-    let (w, h) = (i64::from(width), i64::from(height));
-    let (small_w, mut g) = (w / SHRINK, Graph::default());
+/// The network for images of this width and height: inputs `left` and `right`, grey, 0 to 255; output `disparity`,
+/// pixels.
+pub fn block_matching(width: u32, height: u32) -> Vec<u8> {
+    let w = i64::from(width);
+    let h = i64::from(height);
+    let small_w = w / SHRINK;
+    let mut g = Graph::default();
     let pool = [ints("kernel_shape", &[SHRINK; 2]), ints("strides", &[SHRINK; 2])];
     let left = g.node("AveragePool", &["left"], &pool);
     let right = g.node("AveragePool", &["right"], &pool);
-    let (axes, zero, outside) = (g.int64s(&[3]), g.int64s(&[0]), g.floats(&[], &[OUTSIDE]));
+    let axes = g.int64s(&[3]);
+    let zero = g.int64s(&[0]);
+    let outside = g.floats(&[], &[OUTSIDE]);
     let mut costs = Vec::new();
     for d in 0..DISPARITIES {
-        // What the right picture shows at x - d belongs to the left one's x; the first d columns have no partner.
-        let (from, to, till) = (g.int64s(&[d]), g.int64s(&[small_w]), g.int64s(&[small_w - d]));
+        // The right image at x - d matches the left one at x; the first d columns have no partner.
+        let from = g.int64s(&[d]);
+        let to = g.int64s(&[small_w]);
+        let till = g.int64s(&[small_w - d]);
         let l = g.node("Slice", &[&left, &from, &to, &axes], &[]);
         let r = g.node("Slice", &[&right, &zero, &till, &axes], &[]);
         let difference = g.node("Sub", &[&l, &r], &[]);
@@ -56,8 +63,8 @@ pub fn block_matching((width, height): (u32, u32)) -> Vec<u8> {
         last.output = vec!["disparity".to_owned()];
     }
     "block_matching".clone_into(&mut graph.name);
-    graph.input = vec![picture("left", w, h), picture("right", w, h)];
-    graph.output = vec![picture("disparity", w, h)];
+    graph.input = vec![image("left", w, h), image("right", w, h)];
+    graph.output = vec![image("disparity", w, h)];
     let model = Model {
         ir_version: 9,
         producer_name: "depthrig demo".to_owned(),
@@ -80,7 +87,8 @@ impl Graph {
     fn node(&mut self, op: &str, inputs: &[&str], attributes: &[Attribute]) -> String {
         let name = self.name();
         let input = inputs.iter().map(|i| (*i).to_owned()).collect();
-        let (output, attribute) = (vec![name.clone()], attributes.to_vec());
+        let output = vec![name.clone()];
+        let attribute = attributes.to_vec();
         self.0.node.push(Node { input, output, name: name.clone(), op_type: op.to_owned(), attribute });
         name
     }
@@ -113,7 +121,7 @@ fn text(name: &str, s: &str) -> Attribute {
     Attribute { name: name.to_owned(), s: s.as_bytes().to_vec(), r#type: 3, ..Attribute::default() }
 }
 
-fn picture(name: &str, width: i64, height: i64) -> ValueInfo {
+fn image(name: &str, width: i64, height: i64) -> ValueInfo {
     let dim = [1, 1, height, width].map(|dim_value| Dimension { dim_value }).to_vec();
     let tensor_type = Some(TensorType { elem_type: FLOAT, shape: Some(Shape { dim }) });
     ValueInfo { name: name.to_owned(), r#type: Some(Type { tensor_type }) }

@@ -1,4 +1,4 @@
-//! A folder of pictures as the OAK bridge replays it: `color/` and `depth/`, of one view, depth in millimetres.
+//! A folder of images as the OAK bridge plays it: `color/` and `depth/`, of one view, depth in millimetres.
 
 use anyhow::{Context, Result};
 use depthrig_bus::{Intrinsics, Name, Pose};
@@ -8,9 +8,10 @@ use image::{ImageBuffer, Luma, RgbImage};
 use std::path::Path;
 use std::time::Duration;
 
-/// Different pictures.
+/// Different images.
 const SHOTS: usize = 12;
-/// What is simulated: stereo without a projector, depth and colour in one view, as an OAK-D gives them when it aligns them.
+/// The simulated model: stereo without a projector, depth and colour in one view, as an OAK-D gives them when it aligns
+/// them.
 const MODEL: &str = "zed2i";
 const SIZE: (u32, u32) = (1280, 720);
 /// Every second pixel is kept, in either direction.
@@ -38,7 +39,7 @@ pub fn intrinsics() -> Result<Intrinsics> {
     Ok(Intrinsics::pinhole(full.fx * scale, full.fy * scale, full.cx * scale, full.cy * scale))
 }
 
-/// Writes the pictures into `folder`.
+/// Writes the images into `folder`.
 pub fn write(folder: &Path) -> Result<()> {
     let requests = [StreamRequest::any(Name::new("color")?), StreamRequest::any(Name::new("depth")?)];
     let mut stream = camera()?.start(&requests)?;
@@ -60,7 +61,8 @@ pub fn write(folder: &Path) -> Result<()> {
 }
 
 fn save(path: &Path, is_color: bool, pixels: &[u8]) -> Result<()> {
-    let (width, height) = (SIZE.0 / KEPT, SIZE.1 / KEPT);
+    let width = SIZE.0 / KEPT;
+    let height = SIZE.1 / KEPT;
     let at = |x: u32, y: u32| (y * KEPT * SIZE.0 + x * KEPT) as usize;
     let byte = |i: usize| pixels.get(i).copied().unwrap_or_default();
     if is_color {

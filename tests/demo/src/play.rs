@@ -10,7 +10,7 @@ use std::time::Duration;
 
 /// Images a second.
 const RATE_HZ: f64 = 15.0;
-/// What the images' depth is in, metres.
+/// Unit of the images' depth, metres.
 const UNIT_M: f64 = 0.001;
 
 /// The images of one stream.
@@ -51,8 +51,8 @@ pub fn run(folder: &Path) -> Result<()> {
     let mut modes = Vec::new();
     for (name, format) in formats {
         let images = Images::read(&folder.join(name), format)?;
-        let mode =
-            Mode::new(Name::new(name)?, format, images.size, RATE_HZ).with_device_clock(32, 1_000_000, 32);
+        let mode = Mode::new(Name::new(name)?, format, images.size.0, images.size.1, RATE_HZ)
+            .with_device_clock(32, 1_000_000, 32);
         let depth_unit_m = if format == PixelFormat::Z16 { UNIT_M } else { 0.0 };
         modes.push(Mode { intrinsics, depth_unit_m, simulated: true, ..mode });
         streams.push(images);

@@ -1,8 +1,8 @@
-//! A folder of side-by-side images as a ZED 2i sends them: lenses that bend, eyes that are not quite parallel, and the
-//! factory calibration that says so.
+//! A folder of side-by-side images as a ZED 2i sends them: distorting lenses, cameras that are not quite parallel, and
+//! the matching factory calibration.
 //!
-//! Each eye is a simulated camera of its own in the same world. What it sees without a lens is bent by the lens of the
-//! calibration, so that only who rectifies by that calibration finds rows that agree.
+//! Left and right are two simulated cameras in the same world. Their undistorted images are bent by the lens of the
+//! calibration, so that rows agree only after rectification by that calibration.
 
 use anyhow::{Context, Result, ensure};
 use depthrig_bus::{Distortion, HostTime, Intrinsics, Name, Pose};
@@ -15,7 +15,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 use std::time::Duration;
 
-/// Pixels of one eye: the mode VGA.
+/// Pixels of the left or right image: the mode VGA.
 pub const SIZE: (u32, u32) = (672, 376);
 /// Serial number of the camera that does not exist.
 pub const SERIAL: &str = "39999999";
@@ -25,7 +25,7 @@ const POSES: u32 = 12;
 /// Rays for each pixel, in either direction.
 const RAYS: u32 = 2;
 
-/// The lens of an eye. Barrel distortion as these lenses have it.
+/// The lens of one camera. Barrel distortion as these lenses have it.
 fn lens(focal_px: f64, cx: f64, cy: f64, k1: f64) -> Intrinsics {
     let mut lens = Intrinsics::pinhole(focal_px, focal_px, cx, cy);
     lens.coeffs[..5].copy_from_slice(&[k1, 0.004, 0.0002, -0.0001, 0.0]);
@@ -38,7 +38,7 @@ pub fn lenses() -> [Intrinsics; 2] {
     [lens(303.1, 338.4, 186.2, -0.031), lens(302.4, 333.7, 189.9, -0.029)]
 }
 
-/// The right eye in the left one: some tenths of a degree off, as they come out of the factory.
+/// Pose of the right camera in the left one: some tenths of a degree off, as they leave the factory.
 pub fn right_in_left() -> Pose {
     let turn = DQuat::from_scaled_axis(DVec3::new(0.0031, -0.0042, 0.0018));
     Pose { translation_m: [0.1198, 0.0002, -0.0003], rotation_xyzw: turn.to_array() }
@@ -47,18 +47,19 @@ pub fn right_in_left() -> Pose {
 /// The factory calibration's text, in the vendor's units and order (docs of the format: drivers/src/zed/conf.rs).
 pub fn conf() -> Result<String> {
     let mut text = String::new();
-    for (eye, k) in ["LEFT", "RIGHT"].into_iter().zip(lenses()) {
-        let (fx, fy, cx, cy) = (k.fx, k.fy, k.cx, k.cy);
+    for (side, k) in ["LEFT", "RIGHT"].into_iter().zip(lenses()) {
+        let fx = k.fx;
+        let fy = k.fy;
+        let cx = k.cx;
+        let cy = k.cy;
         let [k1, k2, p1, p2, k3, ..] = k.coeffs;
-        writeln!(text, "[{eye}_CAM_VGA]\nfx={fx}\nfy={fy}\ncx={cx}\ncy={cy}")?;
+        writeln!(text, "[{side}_CAM_VGA]\nfx={fx}\nfy={fy}\ncx={cx}\ncy={cy}")?;
         writeln!(text, "k1={k1}\nk2={k2}\np1={p1}\np2={p2}\nk3={k3}\n")?;
     }
     // From left to right a point moves by p_right = R p_left - t, with R = exp(r), t in millimetres.
     let to_right = right_in_left().inverse();
-    let (r, t) = (
-        DQuat::from_array(to_right.rotation_xyzw).to_scaled_axis(),
-        DVec3::from_array(to_right.translation_m) * -1000.0,
-    );
+    let r = DQuat::from_array(to_right.rotation_xyzw).to_scaled_axis();
+    let t = DVec3::from_array(to_right.translation_m) * -1000.0;
     writeln!(text, "[STEREO]\nBaseline={}\nTY={}\nTZ={}", t.x, t.y, t.z)?;
     writeln!(text, "CV_VGA={}\nRX_VGA={}\nRZ_VGA={}", r.y, r.x, r.z)?;
     Ok(text)
@@ -74,9 +75,9 @@ fn write_pairs(folder: &Path, [left, right]: [Seen; 2]) -> Result<()> {
     std::fs::write(folder.join(format!("SN{SERIAL}.conf")), conf()?)?;
     let [left_lens, right_lens] = lenses();
     // Each simulated camera has its own optical centre, as each real one has.
-    let to_left = Warp::new(&left_lens, &left.view).context("a lens that forms no picture")?;
-    let to_right = Warp::new(&right_lens, &right.view).context("a lens that forms no picture")?;
-    for (i, (l, r)) in left.pictures.iter().zip(&right.pictures).enumerate() {
+    let to_left = Warp::new(&left_lens, &left.view).context("a lens that forms no image")?;
+    let to_right = Warp::new(&right_lens, &right.view).context("a lens that forms no image")?;
+    for (i, (l, r)) in left.images.iter().zip(&right.images).enumerate() {
         let mut both = RgbImage::new(2 * SIZE.0, SIZE.1);
         image::imageops::replace(&mut both, &to_left.bend(l), 0, 0);
         image::imageops::replace(&mut both, &to_right.bend(r), SIZE.0.into(), 0);
@@ -86,15 +87,15 @@ fn write_pairs(folder: &Path, [left, right]: [Seen; 2]) -> Result<()> {
     Ok(())
 }
 
-/// What an eye sees without a lens.
+/// The images of one camera without a lens.
 struct Seen {
     view: Intrinsics,
-    pictures: Vec<RgbImage>,
+    images: Vec<RgbImage>,
 }
 
-/// The simulated eyes, `left` and `right`, on a mount that swings through `poses`.
-fn eyes(poses: u32) -> Result<SyntheticBackend> {
-    let eye = |name: &str, pose_on_mount| SyntheticConfig {
+/// The simulated cameras, `left` and `right`, on a mount that swings through `poses`.
+fn cameras(poses: u32) -> Result<SyntheticBackend> {
+    let camera = |name: &str, pose_on_mount| SyntheticConfig {
         model: "zed2i".into(),
         serial: name.into(),
         pose_on_mount,
@@ -104,13 +105,13 @@ fn eyes(poses: u32) -> Result<SyntheticBackend> {
     };
     let mount =
         Pose { translation_m: [0.0, -0.05, 0.0], rotation_xyzw: DQuat::from_rotation_x(-0.0716).to_array() };
-    let configs = vec![eye("left", mount), eye("right", mount.compose(&right_in_left()))];
+    let configs = vec![camera("left", mount), camera("right", mount.compose(&right_in_left()))];
     Ok(SyntheticBackend::starting_at(configs, HostTime::now())?)
 }
 
-/// Both eyes at the same moments, `pairs` times, while the mount swings through `poses`.
+/// Images of both cameras at the same moments, `pairs` times, while the mount swings through `poses`.
 fn shoot(poses: u32, pairs: usize) -> Result<[Seen; 2]> {
-    let backend = eyes(poses)?;
+    let backend = cameras(poses)?;
     let request = StreamRequest {
         rate_hz: Some(30.0),
         size: Some((1280, 720)),
@@ -119,21 +120,21 @@ fn shoot(poses: u32, pairs: usize) -> Result<[Seen; 2]> {
     let start = |name| -> Result<Box<dyn Stream>> {
         Ok(backend.open(Some(name))?.start(std::slice::from_ref(&request))?)
     };
-    let mut eyes = [(start("left")?, MemorySink::default()), (start("right")?, MemorySink::default())];
+    let mut streams = [(start("left")?, MemorySink::default()), (start("right")?, MemorySink::default())];
     // Two frames for each pose, and some that have no partner.
-    while eyes.iter().any(|(_, sink)| sink.frames.len() < 2 * pairs + 12) {
-        for (stream, sink) in &mut eyes {
+    while streams.iter().any(|(_, sink)| sink.frames.len() < 2 * pairs + 12) {
+        for (stream, sink) in &mut streams {
             stream.poll(Duration::from_millis(10), sink)?;
         }
     }
-    let [(left_stream, left), (right_stream, right)] = &eyes;
+    let [(left_stream, left), (right_stream, right)] = &streams;
     let seen_by = |stream: &dyn Stream| -> Result<Seen> {
         let view = stream.profiles().first().context("no colour")?.intrinsics;
-        Ok(Seen { view, pictures: Vec::new() })
+        Ok(Seen { view, images: Vec::new() })
     };
     let mut seen = [seen_by(left_stream.as_ref())?, seen_by(right_stream.as_ref())?];
-    let picture =
-        |pixels: &[u8]| RgbImage::from_raw(1280, 720, pixels.to_vec()).context("a picture of another size");
+    let image =
+        |pixels: &[u8]| RgbImage::from_raw(1280, 720, pixels.to_vec()).context("an image of another size");
     let mut matched = 0;
     for (_, l, pixels) in &left.frames {
         let same =
@@ -141,24 +142,25 @@ fn shoot(poses: u32, pairs: usize) -> Result<[Seen; 2]> {
         let partner = right.frames.iter().find(|(_, r, _)| same(r));
         if let Some((_, _, other)) = partner {
             matched += 1;
-            if matched % 2 == 1 && seen[0].pictures.len() < pairs {
-                seen[0].pictures.push(picture(pixels)?);
-                seen[1].pictures.push(picture(other)?);
+            if matched % 2 == 1 && seen[0].images.len() < pairs {
+                seen[0].images.push(image(pixels)?);
+                seen[1].images.push(image(other)?);
             }
         }
     }
-    ensure!(seen[0].pictures.len() == pairs, "only {} pairs were taken", seen[0].pictures.len());
+    ensure!(seen[0].images.len() == pairs, "only {} pairs were taken", seen[0].images.len());
     Ok(seen)
 }
 
-/// Where each ray of a lens lies in the picture without one.
+/// Where each ray of a lens lies in the image without one.
 struct Warp {
     places: Vec<DVec2>,
 }
 
 impl Warp {
     fn new(lens: &Intrinsics, view: &Intrinsics) -> Option<Self> {
-        let (lens, view) = (Camera::new(lens).ok()?, Camera::new(view).ok()?);
+        let lens = Camera::new(lens).ok()?;
+        let view = Camera::new(view).ok()?;
         let mut places = Vec::with_capacity((SIZE.0 * SIZE.1 * RAYS * RAYS) as usize);
         let part = |i: u32| (f64::from(i % RAYS) + 0.5) / f64::from(RAYS) - 0.5;
         for y in 0..SIZE.1 {
@@ -172,7 +174,7 @@ impl Warp {
         Some(Self { places })
     }
 
-    /// The picture through the lens. Beyond its edge it goes on as at the edge.
+    /// The image through the lens. Beyond its edge it goes on as at the edge.
     fn bend(&self, from: &RgbImage) -> RgbImage {
         let rays = (RAYS * RAYS) as usize;
         let mut out = RgbImage::new(SIZE.0, SIZE.1);
@@ -181,7 +183,10 @@ impl Warp {
             for place in places {
                 let x = place.x.clamp(0.0, f64::from(from.width() - 1) - 1e-3);
                 let y = place.y.clamp(0.0, f64::from(from.height() - 1) - 1e-3);
-                let (u, v, fx, fy) = (x as u32, y as u32, x.fract(), y.fract());
+                let u = x as u32;
+                let v = y as u32;
+                let fx = x.fract();
+                let fy = y.fract();
                 for (dx, dy, share) in [
                     (0, 0, (1.0 - fx) * (1.0 - fy)),
                     (1, 0, fx * (1.0 - fy)),
@@ -207,9 +212,9 @@ mod tests {
     use depthrig_drivers::zed::CalibrationFile;
     use depthrig_drivers::zed::conf::FactoryCalibration;
     use depthrig_drivers::zed::mode::Mode;
-    use depthrig_drivers::zed::replay::{ReplayBackend, ReplayConfig};
+    use depthrig_drivers::zed::replay::{ZedPlaybackBackend, ZedPlaybackConfig};
 
-    /// The text is read as what it was made of.
+    /// The text is read back as the values it was built from.
     #[test]
     fn the_calibration_is_the_cameras() {
         let read = FactoryCalibration::parse(&conf().unwrap(), "it").unwrap();
@@ -220,13 +225,14 @@ mod tests {
                 (made.fx, made.fy, made.cx, made.cy, made.coeffs)
             );
         }
-        let (got, made) = (vga.right_in_left, right_in_left());
+        let got = vga.right_in_left;
+        let made = right_in_left();
         for p in [DVec3::ZERO, DVec3::new(0.3, -0.2, 2.0)] {
             assert!((got.transform_point(p) - made.transform_point(p)).length() < 1e-12);
         }
     }
 
-    /// What the whole way makes of the pair, from the images over rectification to depth, is what the simulation says.
+    /// Depth computed from the pair, through rectification and matching, agrees with the simulation.
     #[test]
     fn depth_by_stereo_is_that_of_the_scene() {
         let folder = tempfile::tempdir().unwrap();
@@ -234,7 +240,7 @@ mod tests {
         let seen = shoot(1, 1).unwrap();
         let view = Camera::new(&seen[0].view).unwrap();
         write_pairs(folder.path(), seen).unwrap();
-        let config = ReplayConfig {
+        let config = ZedPlaybackConfig {
             input: folder.path().to_owned(),
             serial: None,
             calibration: CalibrationFile::Known,
@@ -243,7 +249,7 @@ mod tests {
         };
         let modes = Preset::ALL.map(|p| StereoMode::preset(p, 0.45, 1)).into();
         let options = StereoOptions { modes, every_pair: true, range_m: (0.45, 20.0), ..<_>::default() };
-        let wrapped = StereoBackend::new(Box::new(ReplayBackend::new(config)), options);
+        let wrapped = StereoBackend::new(Box::new(ZedPlaybackBackend::new(config)), options);
         let mut stream = wrapped.open(None).unwrap().start(&[]).unwrap();
         let mut sink = MemorySink::default();
         while stream.poll(Duration::from_millis(20), &mut sink).unwrap() != Poll::End {}
@@ -253,14 +259,15 @@ mod tests {
             rate_hz: Some(30.0),
             ..StreamRequest::any(Name::new("depth_true_color").unwrap())
         };
-        let mut eye = eyes(1).unwrap().open(Some("left")).unwrap().start(&[truth]).unwrap();
+        let mut camera_stream = cameras(1).unwrap().open(Some("left")).unwrap().start(&[truth]).unwrap();
         let mut true_sink = MemorySink::default();
         while true_sink.frames.is_empty() {
-            eye.poll(Duration::from_millis(10), &mut true_sink).unwrap();
+            camera_stream.poll(Duration::from_millis(10), &mut true_sink).unwrap();
         }
         let words =
             |b: &[u8]| -> Vec<u16> { b.chunks(2).map(|z| u16::from_le_bytes([z[0], z[1]])).collect() };
-        let (truth, unit_m) = (words(&true_sink.frames[0].2), eye.profiles()[0].depth_unit_m);
+        let truth = words(&true_sink.frames[0].2);
+        let unit_m = camera_stream.profiles()[0].depth_unit_m;
         for (i, profile) in stream.profiles().iter().enumerate() {
             let name = profile.stream.as_str();
             if !name.starts_with("depth_") {
@@ -269,7 +276,7 @@ mod tests {
             let (_, _, pixels) = sink.frames.iter().find(|f| f.0 == i).unwrap();
             let camera = Camera::new(&profile.intrinsics).unwrap();
             let mut errors = Vec::new();
-            let mut pictured = 0;
+            let mut shown = 0;
             for (n, z) in words(pixels).into_iter().enumerate() {
                 let pixel = DVec2::new(f64::from(n as u32 % SIZE.0), f64::from(n as u32 / SIZE.0));
                 let far = if z == 0 { 1.0 } else { f64::from(z) / 1000.0 };
@@ -280,36 +287,36 @@ mod tests {
                 }
                 let true_m = f64::from(truth[at.y as usize * 1280 + at.x as usize]) * unit_m;
                 if true_m > 0.0 {
-                    pictured += 1;
+                    shown += 1;
                     if z > 0 {
                         errors.push((point.z / true_m - 1.0).abs());
                     }
                 }
             }
             errors.sort_by(f64::total_cmp);
-            let seen = errors.len() as f64 / f64::from(pictured);
+            let seen = errors.len() as f64 / f64::from(shown);
             let near = errors.iter().filter(|e| **e < 0.05).count() as f64 / errors.len() as f64;
             let middle = errors[errors.len() / 2];
             println!("{name}: {seen:.3} of the scene, half within {middle:.4}, {near:.3} within 5 %");
-            // Wood and walls have little for stereo to see: half a pixel of disparity is 1.5 % here, and what has no texture
-            // gets no depth.
+            // Wood and walls have little for stereo to see: half a pixel of disparity is 1.5 % here, and what has no
+            // texture gets no depth.
             assert!(seen > 0.6 && middle < 0.03 && near > 0.8, "{name}: {seen}, {middle}, {near}");
         }
     }
 
-    /// What live stereo says of a folder's pairs, shown again and again.
+    /// The notice of live stereo on a folder's pairs, played in a loop.
     fn said_of(folder: &Path) -> Option<String> {
-        let config = ReplayConfig {
+        let config = ZedPlaybackConfig {
             input: folder.to_owned(),
             serial: None,
             calibration: CalibrationFile::Known,
             rate_hz: Some(15.0),
             looped: true,
         };
-        // It is about the eyes alone: a matcher that does nothing.
+        // Only the two images matter: a matcher that does nothing.
         let options = StereoOptions { every_pair: true, ..<_>::default() };
         let notice = std::sync::Arc::clone(&options.notice);
-        let wrapped = StereoBackend::new(Box::new(ReplayBackend::new(config)), options);
+        let wrapped = StereoBackend::new(Box::new(ZedPlaybackBackend::new(config)), options);
         let mut stream = wrapped.open(None).unwrap().start(&[]).unwrap();
         let mut sink = MemorySink::default();
         // Enough for more looks than are believed.
@@ -321,12 +328,13 @@ mod tests {
         notice.lock().unwrap().clone()
     }
 
-    /// Both eyes were once pictured with the left one's optical centre: 1.5 px between their rows, which only a smaller
-    /// share of filled pixels showed.
+    /// Both images once had the left one's optical centre: 1.5 px between their rows, which showed only as a smaller
+    /// share of filled pixels.
     #[test]
-    fn an_optical_centre_of_the_other_eye_is_said() {
+    fn an_optical_centre_of_the_other_side_is_reported() {
         let folder = tempfile::tempdir().unwrap();
-        let (good, wrong) = (folder.path().join("good"), folder.path().join("wrong"));
+        let good = folder.path().join("good");
+        let wrong = folder.path().join("wrong");
         write_pairs(&good, shoot(4, 4).unwrap()).unwrap();
         let mut seen = shoot(4, 4).unwrap();
         seen[1].view = seen[0].view;
@@ -336,7 +344,7 @@ mod tests {
         assert!(said.contains("1.5") && said.contains("higher in the right one"), "{said}");
     }
 
-    /// A flat picture of columns comes out with the column that the lens sees.
+    /// A flat image of columns comes out with the column that the lens sees.
     #[test]
     fn a_lens_bends_as_it_says() {
         let view = Intrinsics::pinhole(530.0, 530.0, 640.0, 360.0);
@@ -347,7 +355,8 @@ mod tests {
         let camera = Camera::new(&k).unwrap();
         for (x, y) in [(100, 50), (336, 188), (600, 300)] {
             let ray = camera.unproject(DVec2::new(f64::from(x), f64::from(y))).unwrap();
-            let (u, v) = (530.0 * ray.x / ray.z + 640.0, 530.0 * ray.y / ray.z + 360.0);
+            let u = 530.0 * ray.x / ray.z + 640.0;
+            let v = 530.0 * ray.y / ray.z + 360.0;
             let [r, g, _] = bent.get_pixel(x, y).0;
             assert!((f64::from(r) - (u - 2.0) / 5.0).abs() < 1.0, "{r} at {u}");
             assert!((f64::from(g) - (v - 1.0) / 3.0).abs() < 1.0, "{g} at {v}");

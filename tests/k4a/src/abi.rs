@@ -64,7 +64,7 @@ pub fn depth_size(mode: u32) -> Option<(u32, u32)> {
     sizes.get((mode as usize).checked_sub(1)?).copied()
 }
 
-/// Pictures a second of `k4a_fps_t`.
+/// Images a second of `k4a_fps_t`.
 pub fn rate_hz(fps: u32) -> Option<u64> {
     [5, 15, 30].get(fps as usize).copied()
 }

@@ -1,4 +1,4 @@
-//! The calibration that a camera tells: JSON text with the keys of real ones and made numbers.
+//! The calibration that a camera reports: JSON text with the keys of real ones and invented numbers.
 
 /// Parameters in the order cx, cy, fx, fy, k1 to k6, codx, cody, p2, p1.
 pub const DEPTH: [f64; 14] =

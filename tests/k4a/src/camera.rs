@@ -1,4 +1,4 @@
-//! One made camera: its settings, its clock, its pictures, and how it fails.
+//! One fake camera: its settings, its clock, its images, and how it fails.
 
 use crate::abi::{self, Configuration};
 use std::collections::BTreeMap;
@@ -8,7 +8,7 @@ use std::sync::Arc;
 const QUEUE: u64 = 16;
 /// From mid-exposure to the end of the transfer.
 const LATENCY_NS: i64 = 20_000_000;
-/// Samples of motion a second.
+/// IMU samples a second.
 const IMU_HZ: i64 = 1600;
 /// Samples that wait for a late reader, as in the real library (half a second of them).
 const IMU_QUEUE: u64 = 800;
@@ -19,13 +19,13 @@ const ACCEL_LATE_US: u64 = 40;
 /// Microseconds of the device's clock when the first camera starts.
 const CLOCK_START_US: i64 = 3_000_000;
 
-/// What a stream did with its pictures since it was last started.
+/// Counts of a stream's images since it was last started.
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(C)]
 pub struct Ledger {
-    /// Pictures that the host could know of.
+    /// Images that the host could know of.
     pub captured: u64,
-    /// Those that came whole and once.
+    /// Complete images that came once.
     pub good: u64,
     /// Half of their bytes.
     pub half: u64,
@@ -39,7 +39,7 @@ pub struct Ledger {
     pub lost: u64,
 }
 
-/// What is yet to go wrong.
+/// Faults that are still to happen.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Troubles {
     pub half: u64,
@@ -56,23 +56,23 @@ pub struct Troubles {
     /// Only colour comes, or only depth and infrared, of the next captures.
     pub only_color: u64,
     pub only_depth: u64,
-    /// Pictures have no stamp of the host.
+    /// Images have no stamp of the host.
     pub no_host_stamp: u64,
     /// Bytes between the rows.
     pub padding: u64,
     /// It is silent as a subordinate while no master streams.
     pub needs_master: bool,
-    /// Pictures say another format than was asked for.
+    /// Images say another format than was asked for.
     pub wrong_format: u64,
-    /// So many samples of motion never come.
+    /// So many IMU samples never come.
     pub imu_skip: u64,
-    /// The motion unit breaks off and says so.
+    /// The IMU breaks off and says so.
     pub imu_ends: bool,
 }
 
-/// A picture as it is handed over.
+/// An image as it is handed over.
 #[derive(Debug, Clone)]
-pub struct Picture {
+pub struct Image {
     pub format: u32,
     pub size: (u32, u32),
     pub stride: u32,
@@ -83,7 +83,7 @@ pub struct Picture {
     pub exposure_us: u64,
 }
 
-/// What the motion unit measures at this time of the device's clock: rotation (rad/s) and acceleration (m/s²).
+/// The IMU's values at this time of the device's clock: rotation (rad/s) and acceleration (m/s²).
 pub fn motion(device_us: u64) -> ([f32; 3], [f32; 3]) {
     let n = (device_us / 625 % 65_536) as f32;
     ([n / 1024.0, -0.5, 0.25], [0.2, -9.81, n])
@@ -116,21 +116,21 @@ pub struct Running {
     configuration: Configuration,
     began_ns: i64,
     period_ns: i64,
-    /// Number of the next picture.
+    /// Number of the next image.
     next: u64,
-    /// What is added to the device's clock, microseconds.
+    /// Offset of the device's clock, microseconds.
     offset_us: i64,
-    /// Pictures that were lost since the last that was handed over.
+    /// Images that were lost since the last that was handed over.
     lost: u64,
     handed: bool,
-    /// The clock was set since the last picture, so that nobody knows what was lost.
+    /// The clock was set since the last image, so that losses are unknown.
     set: bool,
-    again: Option<Vec<(usize, Picture)>>,
-    /// Number of the next sample of motion, while the unit runs.
+    again: Option<Vec<(usize, Image)>>,
+    /// Number of the next IMU sample, while the IMU runs.
     imu: Option<u64>,
 }
 
-/// What comes of asking for a sample of motion.
+/// Result of a request for an IMU sample.
 pub enum Moved {
     /// This.
     Sample(abi::ImuSample),
@@ -140,10 +140,10 @@ pub enum Moved {
     Over,
 }
 
-/// What comes of asking for a capture.
+/// Result of a request for a capture.
 pub enum Step {
     /// This, by stream.
-    Ready(Vec<(usize, Picture)>),
+    Ready(Vec<(usize, Image)>),
     /// Nothing before this moment.
     Wait(i64),
     /// The call does not come back before this moment.
@@ -174,7 +174,8 @@ impl Camera {
     pub fn start(&mut self, c: &Configuration, now: i64) -> Result<(), String> {
         let rate =
             abi::rate_hz(c.camera_fps).ok_or("The configured camera_fps is not a valid k4a_fps_t value.")?;
-        let (color, depth) = (abi::color_size(c.color_resolution), abi::depth_size(c.depth_mode));
+        let color = abi::color_size(c.color_resolution);
+        let depth = abi::depth_size(c.depth_mode);
         let raw = matches!(c.color_format, abi::NV12 | abi::YUY2);
         let problem = if self.running.is_some() {
             Some("k4a_device_start_cameras called while one of the sensors are running")
@@ -220,16 +221,16 @@ impl Camera {
             imu: None,
         });
         self.ledgers = [Ledger::default(); 3];
-        // JPEG takes a while to make, which is no time of the camera's.
+        // Encoding JPEG takes a while, which is not camera time.
         if let Some(size) = color.filter(|_| c.color_format == abi::MJPG) {
-            for n in 0..crate::pictures::JPEGS {
-                self.jpeg(size, n);
+            for n in 0..crate::images::JPEGS {
+                self.jpeg(size.0, size.1, n);
             }
         }
         Ok(())
     }
 
-    /// Starts the motion unit, or says what is wrong, in the words of the real library.
+    /// Starts the IMU, or says what is wrong, in the words of the real library.
     pub fn start_imu(&mut self, now: i64) -> Result<(), String> {
         let Some(r) = &mut self.running else {
             let why =
@@ -250,7 +251,7 @@ impl Camera {
         }
     }
 
-    /// The next sample of motion, if it is there.
+    /// The next IMU sample, if it is there.
     pub fn imu_step(&mut self, now: i64) -> Option<Moved> {
         let t = &mut self.troubles;
         let r = self.running.as_mut()?;
@@ -266,7 +267,7 @@ impl Camera {
         let at_ns = |n: u64| n as i64 * 1_000_000_000 / IMU_HZ;
         let newest = ((now - r.began_ns - IMU_LATENCY_NS) * IMU_HZ).div_euclid(1_000_000_000);
         *next += core::mem::take(&mut t.imu_skip);
-        // What a late reader loses.
+        // A late reader loses samples.
         *next = (*next).max((newest + 1).max(0) as u64 - IMU_QUEUE.min((newest + 1).max(0) as u64));
         let n = *next;
         if (n as i64) > newest {
@@ -289,7 +290,7 @@ impl Camera {
         self.running.as_ref().is_some_and(|r| r.configuration.wired_sync_mode == part)
     }
 
-    /// What it was last started with.
+    /// The configuration that it was last started with.
     pub fn configuration(&self) -> Option<Configuration> {
         self.running.as_ref().map(|r| r.configuration)
     }
@@ -323,7 +324,7 @@ impl Camera {
         }
         let due = |n: u64| r.began_ns + n as i64 * r.period_ns + LATENCY_NS;
         let newest = ((now - r.began_ns - LATENCY_NS) / r.period_ns).max(0) as u64;
-        // What a late reader or a stall loses.
+        // A late reader or a stall loses images.
         let mut first = r.next.max((newest + 1).saturating_sub(QUEUE));
         if core::mem::take(&mut t.stall_until) != 0 {
             first = first.max(newest);
@@ -340,16 +341,18 @@ impl Camera {
         (r.handed, r.set) = (true, false);
         let repeats = core::mem::take(&mut t.repeated);
         t.repeated = repeats.saturating_sub(1);
-        let pictures = self.pictures(first, lost);
+        let images = self.images(first, lost);
         if let Some(r) = self.running.as_mut().filter(|_| repeats > 0) {
-            r.again = Some(pictures.clone());
+            r.again = Some(images.clone());
         }
-        Some(Step::Ready(pictures))
+        Some(Step::Ready(images))
     }
 
-    fn pictures(&mut self, n: u64, lost: u64) -> Vec<(usize, Picture)> {
+    fn images(&mut self, n: u64, lost: u64) -> Vec<(usize, Image)> {
         let Some(r) = &self.running else { return Vec::new() };
-        let (c, began, period) = (r.configuration, r.began_ns, r.period_ns);
+        let c = r.configuration;
+        let began = r.began_ns;
+        let period = r.period_ns;
         let device_us = (n as i64 * period / 1000 + r.offset_us).max(0) as u64;
         let mut take = |what: fn(&mut Troubles) -> &mut u64| {
             let left = what(&mut self.troubles);
@@ -357,10 +360,12 @@ impl Camera {
             *left = left.saturating_sub(1);
             is
         };
-        let (half, wrong, damaged) =
-            (take(|t| &mut t.half), take(|t| &mut t.wrong_size), take(|t| &mut t.damaged));
-        let (only_color, only_depth, no_stamp) =
-            (take(|t| &mut t.only_color), take(|t| &mut t.only_depth), take(|t| &mut t.no_host_stamp));
+        let half = take(|t| &mut t.half);
+        let wrong = take(|t| &mut t.wrong_size);
+        let damaged = take(|t| &mut t.damaged);
+        let only_color = take(|t| &mut t.only_color);
+        let only_depth = take(|t| &mut t.only_depth);
+        let no_stamp = take(|t| &mut t.no_host_stamp);
         let wrong_format = take(|t| &mut t.wrong_format);
         let padding = self.troubles.padding as u32;
         let mut streams = Vec::new();
@@ -383,8 +388,8 @@ impl Camera {
             ledger.captured += 1 + lost;
             ledger.lost += lost;
             let mut bytes = match format {
-                abi::MJPG => self.jpeg(size, n),
-                _ => Arc::new(crate::pictures::picture(format, size.0, size.1, n)),
+                abi::MJPG => self.jpeg(size.0, size.1, n),
+                _ => Arc::new(crate::images::image(format, size.0, size.1, n)),
             };
             let row = match format {
                 abi::MJPG => 0,
@@ -411,7 +416,7 @@ impl Camera {
                 ledger.wrong_size += 1;
                 if format == abi::MJPG {
                     size = (size.0 + 16, size.1);
-                    bytes = Arc::new(crate::pictures::picture(format, size.0, size.1, n));
+                    bytes = Arc::new(crate::images::image(format, size.0, size.1, n));
                 } else {
                     bytes = Arc::new([&bytes[..], &[0; 640]].concat());
                 }
@@ -423,7 +428,7 @@ impl Camera {
             let arrived = began + n as i64 * period + LATENCY_NS;
             out.push((
                 stream,
-                Picture {
+                Image {
                     format,
                     size,
                     stride,
@@ -437,13 +442,13 @@ impl Camera {
         out
     }
 
-    fn jpeg(&mut self, size: (u32, u32), n: u64) -> Arc<Vec<u8>> {
-        let n = n % crate::pictures::JPEGS;
-        let made = || Arc::new(crate::pictures::picture(abi::MJPG, size.0, size.1, n));
-        Arc::clone(self.jpegs.entry((size.0, size.1, n)).or_insert_with(made))
+    fn jpeg(&mut self, width: u32, height: u32, n: u64) -> Arc<Vec<u8>> {
+        let n = n % crate::images::JPEGS;
+        let encode = || Arc::new(crate::images::image(abi::MJPG, width, height, n));
+        Arc::clone(self.jpegs.entry((width, height, n)).or_insert_with(encode))
     }
 
-    /// True mid-exposure on the host of the newest picture that had arrived by `at`.
+    /// True mid-exposure on the host of the newest image that had arrived by `at`.
     pub fn exposed(&self, at: i64) -> Option<i64> {
         let r = self.running.as_ref()?;
         let n = (at - r.began_ns - LATENCY_NS).div_euclid(r.period_ns);

@@ -1,9 +1,9 @@
-//! The C functions of the header that a program needs which reads pictures.
+//! The C functions of the header that a program needs which reads images.
 //!
 //! More than 500 lines, because they are one interface, function by function as the header has them.
 
 use crate::abi::{self, Configuration, FAILED, ImuSample, LOG_ERROR, SUCCEEDED, TIMEOUT, TOO_SMALL};
-use crate::camera::{Camera, Moved, Picture, Step};
+use crate::camera::{Camera, Image, Moved, Step};
 use crate::world::{MessageHandler, Thing, now, say, world};
 use core::ffi::{c_char, c_int};
 use core::time::Duration;
@@ -82,7 +82,8 @@ pub unsafe extern "C" fn k4a_device_open(index: u32, handle: *mut Handle) -> u32
         drop(world);
         return fails(why);
     }
-    let (serial, takes_ns) = (camera.serial.clone(), camera.open_takes_ns);
+    let serial = camera.serial.clone();
+    let takes_ns = camera.open_takes_ns;
     let new = world.hand_out(Thing::Camera { serial: serial.clone(), is_dead: false });
     world.census.cameras += 1;
     if let Some(camera) = world.cameras.iter_mut().find(|c| c.serial == serial) {
@@ -140,7 +141,7 @@ pub unsafe extern "C" fn k4a_device_get_capture(
         let now = now();
         let has_master = world.cameras.iter().any(|c| c.absent_until <= now && c.plays(1));
         let next = |c: &mut Camera| {
-            // A subordinate takes its pictures by the master's pulse.
+            // A subordinate takes its images by the master's pulse.
             let waits = c.plays(2) && c.troubles.needs_master && !has_master;
             if waits { Some(Step::Wait(now + 5_000_000)) } else { c.step(now) }
         };
@@ -151,10 +152,10 @@ pub unsafe extern "C" fn k4a_device_get_capture(
             );
         };
         match step {
-            Step::Ready(pictures) => {
+            Step::Ready(ready) => {
                 let mut images = [None; 3];
-                for (stream, picture) in pictures {
-                    images[stream] = Some(world.hand_out(Thing::Image { references: 1, picture }));
+                for (stream, image) in ready {
+                    images[stream] = Some(world.hand_out(Thing::Image { references: 1, image }));
                     world.census.images += 1;
                 }
                 let new = world.hand_out(Thing::Capture { references: 1, images });
@@ -477,10 +478,10 @@ pub unsafe extern "C" fn k4a_image_release(handle: Handle) {
     world().release_image(handle as usize);
 }
 
-fn of_image<T>(handle: Handle, otherwise: T, read: impl FnOnce(&Picture) -> T) -> T {
+fn of_image<T>(handle: Handle, otherwise: T, read: impl FnOnce(&Image) -> T) -> T {
     let mut world = world();
-    if let Some(Thing::Image { picture, .. }) = world.things.get(&(handle as usize)) {
-        read(picture)
+    if let Some(Thing::Image { image, .. }) = world.things.get(&(handle as usize)) {
+        read(image)
     } else {
         world.census.misuse += 1;
         otherwise
@@ -488,7 +489,7 @@ fn of_image<T>(handle: Handle, otherwise: T, read: impl FnOnce(&Picture) -> T) -
 }
 
 /// # Safety
-/// What comes may be read for as long as the picture is held.
+/// The result may be read for as long as the image is held.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn k4a_image_get_buffer(handle: Handle) -> *mut u8 {
     of_image(handle, core::ptr::null_mut(), |p| {
@@ -552,7 +553,7 @@ pub unsafe extern "C" fn k4a_image_get_exposure_usec(handle: Handle) -> u64 {
     of_image(handle, 0, |p| p.exposure_us)
 }
 
-/// What a depth engine must have, so that a copy of this file can stand for one. It is never called.
+/// The symbol of a depth engine, so that a copy of this file can stand for one. It is never called.
 ///
 /// # Safety
 /// None is needed.

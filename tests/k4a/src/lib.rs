@@ -1,4 +1,4 @@
-//! A made `libk4a.so`: the C functions of Azure-Kinect-Sensor-SDK 1.4 over cameras that a test commands.
+//! A fake `libk4a.so`: the C functions of Azure-Kinect-Sensor-SDK 1.4 over cameras that a test commands.
 //!
 //! It is built as a library of its own and loaded by the driver under test as the real one would be, so that both sides
 //! meet in the C interface alone. Types and values are declared here once more, from the public header (`k4a.h`,
@@ -18,6 +18,6 @@ mod calibration;
 mod camera;
 pub use camera::motion;
 mod exports;
-pub mod pictures;
+pub mod images;
 mod script;
 mod world;

@@ -5,7 +5,7 @@ use crate::camera::{Camera, Ledger};
 use crate::world::{Census, now, world};
 use core::ffi::{CStr, c_char};
 
-/// The text at `at`; empty when there is none.
+/// The text at `at`; empty if `at` is null.
 ///
 /// # Safety
 /// `at` must be null or end with a zero byte.
@@ -31,7 +31,8 @@ pub unsafe extern "C" fn fake_k4a_command(serial: *const c_char, what: *const c_
         return 0;
     }
     let Some(camera) = world.cameras.iter_mut().find(|c| c.serial == serial) else { return 1 };
-    let (until, t) = (now() + n as i64, &mut camera.troubles);
+    let until = now() + n as i64;
+    let t = &mut camera.troubles;
     match what {
         "unplug" => camera.absent_until = until,
         "busy" => camera.busy_until = until,
@@ -64,7 +65,7 @@ pub unsafe extern "C" fn fake_k4a_command(serial: *const c_char, what: *const c_
     0
 }
 
-/// Has the camera tell `size` bytes at `at` as its calibration.
+/// Has the camera report `size` bytes at `at` as its calibration.
 ///
 /// # Safety
 /// `serial` must end with a zero byte, `at` be readable for `size` bytes.
@@ -78,7 +79,7 @@ pub unsafe extern "C" fn fake_k4a_calibration(serial: *const c_char, at: *const 
     0
 }
 
-/// What the camera did with the pictures of a stream (0 colour, 1 depth, 2 infrared) since it was last started.
+/// Counts of the images of a stream (0 colour, 1 depth, 2 infrared) since it was last started.
 ///
 /// # Safety
 /// `serial` must end with a zero byte, `to` be writable.
@@ -94,7 +95,7 @@ pub unsafe extern "C" fn fake_k4a_ledger(serial: *const c_char, stream: usize, t
     0
 }
 
-/// True mid-exposure, nanoseconds of `CLOCK_MONOTONIC`, of the newest picture that had arrived at `at`; 0 when the
+/// True mid-exposure, nanoseconds of `CLOCK_MONOTONIC`, of the newest image that had arrived at `at`; 0 when the
 /// camera does not stream.
 ///
 /// # Safety
@@ -106,7 +107,7 @@ pub unsafe extern "C" fn fake_k4a_exposed(serial: *const c_char, at: i64) -> i64
     world().cameras.iter().find(|c| c.serial == serial).and_then(|c| c.exposed(at)).unwrap_or(0)
 }
 
-/// The value of a colour control of the camera; -1 when it is automatic, -2 when nobody set it.
+/// The value of a colour control of the camera; -1 when it is automatic, -2 when it was never set.
 ///
 /// # Safety
 /// `serial` must end with a zero byte.
@@ -132,7 +133,7 @@ pub unsafe extern "C" fn fake_k4a_set(serial: *const c_char, i: usize) -> i32 {
     set.map_or(-1, |command| command as i32)
 }
 
-/// What the camera streams with; not 0 when it does not.
+/// Writes the configuration that the camera streams with; returns nonzero if it does not stream.
 ///
 /// # Safety
 /// `serial` must end with a zero byte, `to` be writable.
@@ -148,7 +149,7 @@ pub unsafe extern "C" fn fake_k4a_configuration(serial: *const c_char, to: *mut 
     0
 }
 
-/// What was handed out and what came back.
+/// Counts of what was handed out and what came back.
 ///
 /// # Safety
 /// `to` must be writable.

@@ -1,6 +1,6 @@
 //! Every camera and everything that was handed out, behind one lock.
 
-use crate::camera::{Camera, Picture};
+use crate::camera::{Camera, Image};
 use core::ffi::{c_char, c_int, c_void};
 use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -8,7 +8,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 /// `k4a_logging_message_cb_t`.
 pub type MessageHandler = unsafe extern "C" fn(*mut c_void, u32, *const c_char, c_int, *const c_char);
 
-/// What was handed out and what came back.
+/// Counts of what was handed out and what came back.
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(C)]
 pub struct Census {
@@ -16,21 +16,21 @@ pub struct Census {
     pub cameras: u64,
     /// Captures that are held.
     pub captures: u64,
-    /// Pictures that are held.
+    /// Images that are held.
     pub images: u64,
     /// Captures ever handed out.
     pub all_captures: u64,
-    /// Pictures ever handed out.
+    /// Images ever handed out.
     pub all_images: u64,
-    /// Calls with a handle that is none, or none any more; and stops and closes while pictures are held.
+    /// Calls with an invalid or released handle; and stops and closes while images are held.
     pub misuse: u64,
 }
 
-/// What a handle stands for.
+/// The object of a handle.
 pub enum Thing {
     Camera { serial: String, is_dead: bool },
     Capture { references: u32, images: [Option<usize>; 3] },
-    Image { references: u32, picture: Picture },
+    Image { references: u32, image: Image },
 }
 
 #[derive(Default)]
@@ -72,13 +72,13 @@ pub fn now() -> i64 {
 impl World {
     /// A handle for `thing`.
     pub fn hand_out(&mut self, thing: Thing) -> usize {
-        // Far apart, so that a handle that was computed with is none.
+        // Far apart, so that a handle that was computed with is invalid.
         self.last_handle += 0x1000;
         self.things.insert(self.last_handle, thing);
         self.last_handle
     }
 
-    /// Notes a call with a handle that is none.
+    /// Notes a call with an invalid handle.
     pub fn misuse<T>(&mut self) -> Option<T> {
         self.census.misuse += 1;
         None
@@ -101,7 +101,7 @@ impl World {
         (0..self.cameras.len()).filter(|i| self.cameras[*i].absent_until <= now).collect()
     }
 
-    /// Gives one reference of a picture back.
+    /// Gives one reference of an image back.
     pub fn release_image(&mut self, handle: usize) {
         match self.things.get_mut(&handle) {
             Some(Thing::Image { references, .. }) if *references > 1 => *references -= 1,
@@ -113,7 +113,7 @@ impl World {
         }
     }
 
-    /// Gives one reference of a capture back, and with the last its own of its pictures.
+    /// Gives one reference of a capture back, and with the last its own of its images.
     pub fn release_capture(&mut self, handle: usize) {
         let images = match self.things.get_mut(&handle) {
             Some(Thing::Capture { references, .. }) if *references > 1 => {
@@ -132,7 +132,7 @@ impl World {
     }
 }
 
-/// Says something to whoever listens, as the real library says it: without its own lock on the cameras.
+/// Sends a message to the registered callback, as the real library does: without its own lock on the cameras.
 pub fn say(level: u32, message: &str) {
     let handler = world().handler;
     let Ok(text) = std::ffi::CString::new(message) else { return };

@@ -2,14 +2,14 @@
 //! folder for each target.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a tool for tests: any failure ends it
 
-use depthrig_kinect_fixture::{CALIBRATION, Fixture, Lacing, Pictures};
+use depthrig_kinect_fixture::{CALIBRATION, Fixture, Images, Lacing};
 use std::io::Cursor;
 use std::path::PathBuf;
 
-/// Pictures of a few bytes: the reader of a recording does not look inside of them.
+/// Images of a few bytes: the reader of a recording does not look inside of them.
 struct Tiny;
 
-impl Pictures for Tiny {
+impl Images for Tiny {
     fn color(&mut self, n: u32) -> Vec<u8> {
         vec![0xFF, 0xD8, n as u8, 0xFF, 0xD9]
     }

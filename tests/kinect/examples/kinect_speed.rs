@@ -1,12 +1,12 @@
 //! How fast recordings of an Azure Kinect are played, in multiples of their own length.
 //!
-//! `cargo run --release -p depthrig-kinect-fixture --example kinect_speed [-- FILE.mkv]`; without a file, one of 30 s of
-//! 720p JPEG (150 kB a picture), depth and infrared of the narrow field of view and motion is made first. Frames go into
-//! memory that is used again, as the slots of a channel are. Two numbers each: by the wall clock, which other programs on
-//! the computer spoil, and by the processor time of all threads shared by two cores, which they do not. `taskset -c 0,1`
-//! makes it two cores for the first one too.
+//! `cargo run --release -p depthrig-kinect-fixture --example kinect_speed [-- FILE.mkv]`; without a file, one of 30 s
+//! of 720p JPEG (150 kB an image), depth and infrared of the narrow field of view and IMU is generated first. Frames go
+//! into memory that is used again, as the slots of a channel are. Two numbers each: by the wall clock, which other
+//! programs on the computer spoil, and by the processor time of all threads shared by two cores, which they do not.
+//! `taskset -c 0,1` makes it two cores for the first one too.
 //!
-//! Exit code 1 when frames are lost, or when a made recording is slower by processor time than it must be.
+//! Exit code 1 when frames are lost, or when the generated recording is slower by processor time than it must be.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stdout)] // a measuring program: any failure ends it
 
 use depthrig_bus::{DropReason, HostTime, Name, PixelFormat};
@@ -58,10 +58,10 @@ impl FrameSink for Slots {
 
 fn main() {
     let given = std::env::args().nth(1).map(PathBuf::from);
-    let made = given.is_none().then(|| tempfile::tempdir().unwrap());
+    let generated = given.is_none().then(|| tempfile::tempdir().unwrap());
     let path = given.unwrap_or_else(|| {
         let fixture = Fixture { captures: 900, ..Fixture::default() };
-        let path = made.as_ref().unwrap().path().join("speed.mkv");
+        let path = generated.as_ref().unwrap().path().join("speed.mkv");
         fixture.write(&path, &mut Pattern::new(&fixture)).unwrap();
         path
     });
@@ -80,7 +80,9 @@ fn main() {
         // The best of three: the first also fills the page cache.
         let runs: Vec<_> = (0..3).map(|_| play(&path, &streams(format))).collect();
         let least = |of: fn(&Run) -> f64| runs.iter().map(of).fold(f64::INFINITY, f64::min);
-        let (wall_s, cpu_s, main_s) = (least(|r| r.wall_s), least(|r| r.cpu_s), least(|r| r.main_s));
+        let wall_s = least(|r| r.wall_s);
+        let cpu_s = least(|r| r.cpu_s);
+        let main_s = least(|r| r.main_s);
         // Two cores share the work, and one of them has all of the playing thread's.
         let two_s = (cpu_s / 2.0).max(main_s);
         let slots = &runs[0].slots;
@@ -93,18 +95,18 @@ fn main() {
             slots.bytes as f64 / 1e6,
             slots.lost
         );
-        if runs.iter().any(|r| r.slots.lost > 0) || (made.is_some() && length_s / two_s < least_times) {
+        if runs.iter().any(|r| r.slots.lost > 0) || (generated.is_some() && length_s / two_s < least_times) {
             println!("  that is lost frames, or less than {least_times} x real time");
             good = false;
         }
     }
-    drop(made);
+    drop(generated);
     if !good {
         std::process::exit(1);
     }
 }
 
-/// What one run took.
+/// Times of one run.
 struct Run {
     wall_s: f64,
     cpu_s: f64,
@@ -125,7 +127,8 @@ fn play(path: &Path, streams: &[StreamRequest]) -> Run {
     };
     let mut stream = PlaybackBackend::new(config).open(None).unwrap().start(streams).unwrap();
     let mut slots = Slots::default();
-    let (process, thread) = (cpu_s(ClockId::ProcessCPUTime), cpu_s(ClockId::ThreadCPUTime));
+    let process = cpu_s(ClockId::ProcessCPUTime);
+    let thread = cpu_s(ClockId::ThreadCPUTime);
     let began = HostTime::now();
     while stream.poll(Duration::from_millis(50), &mut slots).unwrap() != Poll::End {}
     Run {
@@ -140,7 +143,8 @@ fn play(path: &Path, streams: &[StreamRequest]) -> Run {
 fn length_s(path: &Path) -> f64 {
     let mut recording = Recording::open(path).unwrap();
     let period_ns = recording.tracks().iter().find_map(|t| t.period_ns).unwrap_or(33_333_333);
-    let (mut first, mut last) = (u64::MAX, 0);
+    let mut first = u64::MAX;
+    let mut last = 0;
     while let Some(block) = recording.next_block().unwrap() {
         (first, last) = (first.min(block.device_us), last.max(block.device_us));
     }

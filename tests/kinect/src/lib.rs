@@ -1,5 +1,6 @@
-//! Recordings of an Azure Kinect, made without one: what the SDK's recorder writes, with pictures that follow from their
-//! number or that a simulated Kinect takes. Also early forms of such files, and forms that other writers give them.
+//! Recordings of an Azure Kinect, generated without one: as the SDK's recorder writes them, with images that follow
+//! from their number or that a simulated Kinect takes. Also early forms of such files, and forms that other writers
+//! give them.
 
 #![allow(clippy::unwrap_used, clippy::expect_used)] // test support: a failure here is a failed test
 
@@ -8,19 +9,19 @@ use std::io::{self, BufWriter, Seek, Write};
 use std::path::Path;
 
 pub mod element;
-mod pictures;
+mod images;
 mod writer;
 
-pub use pictures::{Pattern, Pictures, Simulated};
+pub use images::{Images, Pattern, Simulated};
 
-/// The calibration of a made-up device.
+/// The calibration of a fictitious device.
 pub const CALIBRATION: &str = include_str!("../../data/kinect_calibration.json");
-/// Time from one sample of motion to the next, nanoseconds: 1.6 kHz.
+/// Time from one IMU sample to the next, nanoseconds: 1.6 kHz.
 pub const MOTION_NS: u64 = 625_000;
 /// How much later than the gyroscope the accelerometer is read, nanoseconds.
 pub const ACCEL_LATE_NS: u64 = 12_000;
 
-/// How several samples of motion share a block.
+/// How several IMU samples share a block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Lacing {
     /// Not at all.
@@ -33,15 +34,15 @@ pub enum Lacing {
     Ebml,
 }
 
-/// A recording to be made.
+/// A recording to be generated.
 #[derive(Debug, Clone)]
 #[allow(clippy::struct_excessive_bools)] // each is a form of its own
 pub struct Fixture {
-    /// What the colour camera was set to.
+    /// Mode of the colour camera.
     pub color: Option<ColorMode>,
-    /// What the depth camera was set to.
+    /// Mode of the depth camera.
     pub depth: Option<DepthMode>,
-    /// Pictures per second.
+    /// Images per second.
     pub rate_hz: u32,
     /// Captures, those in [`Self::lost`] included.
     pub captures: u32,
@@ -59,7 +60,7 @@ pub struct Fixture {
     pub depth_delay_ns: i64,
     /// Part of the device among others.
     pub wired_sync: WiredSync,
-    /// How samples of motion share blocks.
+    /// How IMU samples share blocks.
     pub lacing: Lacing,
     /// Whether clusters have checksums, as the SDK gives them.
     pub checksums: bool,
@@ -99,14 +100,14 @@ impl Default for Fixture {
     }
 }
 
-/// What became of a recording that was made.
+/// Summary of a generated recording.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Written {
     /// Where each cluster begins, bytes.
     pub clusters: Vec<u64>,
     /// Where the last one ends.
     pub clusters_end: u64,
-    /// Samples of motion.
+    /// IMU samples.
     pub motion: u64,
 }
 
@@ -130,13 +131,13 @@ impl Fixture {
         f64::from(self.captures) / f64::from(self.rate_hz)
     }
 
-    /// Writes it to `path`, picture by picture.
+    /// Writes it to `path`, image by image.
     ///
     /// # Errors
     /// Those of writing.
-    pub fn write(&self, path: &Path, pictures: &mut dyn Pictures) -> io::Result<Written> {
+    pub fn write(&self, path: &Path, images: &mut dyn Images) -> io::Result<Written> {
         let mut out = BufWriter::new(std::fs::File::create(path)?);
-        let written = self.write_to(&mut out, pictures)?;
+        let written = self.write_to(&mut out, images)?;
         out.flush()?;
         Ok(written)
     }
@@ -145,15 +146,11 @@ impl Fixture {
     ///
     /// # Errors
     /// Those of writing.
-    pub fn write_to(
-        &self,
-        out: &mut (impl Write + Seek),
-        pictures: &mut dyn Pictures,
-    ) -> io::Result<Written> {
-        writer::Writer::new(self, out).run(pictures)
+    pub fn write_to(&self, out: &mut (impl Write + Seek), images: &mut dyn Images) -> io::Result<Written> {
+        writer::Writer::new(self, out).run(images)
     }
 
-    /// Its bytes, with pictures that follow from their number.
+    /// Its bytes, with images that follow from their number.
     pub fn bytes(&self) -> Vec<u8> {
         self.bytes_and_places().0
     }
@@ -165,7 +162,7 @@ impl Fixture {
         (out.into_inner(), written)
     }
 
-    /// A small one: no camera gives pictures so small, and tests that look at every byte are glad of it.
+    /// A small one: no camera gives images so small, and tests that look at every byte are glad of it.
     pub fn small() -> Self {
         Self {
             color: Some(ColorMode { format: ColorFormat::Nv12, resolution: ColorResolution::P720 }),

@@ -1,7 +1,7 @@
 //! Writes the file: headers, clusters of 32 ms, an index. As the SDK's `src/record` does, but for the forms asked for.
 
 use super::element::{element, id as id_bytes, master, size, text, uint, uint8, vint};
-use super::{ACCEL_LATE_NS, Fixture, Lacing, MOTION_NS, Pictures, Written, motion};
+use super::{ACCEL_LATE_NS, Fixture, Images, Lacing, MOTION_NS, Written, motion};
 use depthrig_drivers::kinect::ebml::id;
 use std::io::{self, Seek, SeekFrom, Write};
 
@@ -69,7 +69,7 @@ impl<'a, W: Write + Seek> Writer<'a, W> {
         Self { fixture, out, tracks, origin: 0, cues: Vec::new(), written: Written::default(), last_ns: 0 }
     }
 
-    pub(super) fn run(mut self, pictures: &mut dyn Pictures) -> io::Result<Written> {
+    pub(super) fn run(mut self, images: &mut dyn Images) -> io::Result<Written> {
         let doc: Vec<_> = DOC_HEADER.into_iter().map(|(of, n)| uint(of, n)).collect();
         let header = master(id::EBML, &[doc, vec![text(id::DOC_TYPE, "matroska")]].concat());
         self.out.write_all(&header)?;
@@ -99,7 +99,7 @@ impl<'a, W: Write + Seek> Writer<'a, W> {
         }
         // Where the SDK leaves room for more tags.
         self.out.write_all(&element(id::VOID, &[0; 200]))?;
-        self.clusters(pictures)?;
+        self.clusters(images)?;
         if self.fixture.tags_behind {
             tags_at = self.position()?;
             let tags = self.tags();
@@ -221,7 +221,7 @@ impl<'a, W: Write + Seek> Writer<'a, W> {
     }
 
     /// Writes all clusters: frames in the order of their times, a new cluster after 32 ms.
-    fn clusters(&mut self, pictures: &mut dyn Pictures) -> io::Result<()> {
+    fn clusters(&mut self, images: &mut dyn Images) -> io::Result<()> {
         let f = self.fixture;
         let mut waiting: Vec<Frame> = Vec::new();
         let mut motion_at = 0;
@@ -230,9 +230,9 @@ impl<'a, W: Write + Seek> Writer<'a, W> {
             if !f.lost.contains(&n) {
                 for (track, kind) in self.tracks.iter().enumerate() {
                     let (time_ns, data) = match kind {
-                        Kind::Color => (color_ns, pictures.color(n)),
-                        Kind::Depth => (depth_ns, gray(&pictures.depth(n), f.early)),
-                        Kind::Infrared => (depth_ns, gray(&pictures.infrared(n), f.early)),
+                        Kind::Color => (color_ns, images.color(n)),
+                        Kind::Depth => (depth_ns, gray(&images.depth(n), f.early)),
+                        Kind::Infrared => (depth_ns, gray(&images.infrared(n), f.early)),
                         Kind::Motion => continue,
                     };
                     waiting.push(Frame { time_ns, track, data });

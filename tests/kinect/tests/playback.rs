@@ -6,7 +6,7 @@ use depthrig_drivers::conformance::{self, Bench, Cannot, Rig, Sent, Subject, Tro
 use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackBackend, PlaybackConfig};
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
 use depthrig_drivers::{Backend, DeviceInfo, ErrorKind, MemorySink, Poll, Stream, StreamRequest};
-use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Lacing, Pattern, Pictures, damage_time, motion};
+use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Images, Lacing, Pattern, damage_time, motion};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tempfile::TempDir;
@@ -70,16 +70,16 @@ impl Subject for Recorded {
         Bench {
             backend: Box::new(PlaybackBackend::new(config)),
             serial: "000123456789".into(),
-            // The motion unit has a case of its own.
+            // The IMU has a case of its own.
             requests: ["color", "depth", "ir"].map(|s| StreamRequest::any(Name::new(s).unwrap())).into(),
-            rig: Box::new(Eyes(dir)),
+            rig: Box::new(RecordedRig(dir)),
         }
     }
 }
 
-struct Eyes(TempDir);
+struct RecordedRig(TempDir);
 
-impl Rig for Eyes {
+impl Rig for RecordedRig {
     fn cause(&self, trouble: Trouble) -> Result<(), Cannot> {
         assert!(self.0.path().exists());
         Err(Cannot(match trouble {
@@ -104,11 +104,11 @@ impl Rig for Eyes {
 
     fn is_genuine(&self, stream: usize, pixels: &[u8]) -> Option<bool> {
         let f = bench();
-        let mut made = Pattern::new(&f);
+        let mut pattern = Pattern::new(&f);
         Some((0..BENCH).any(|n| match stream {
             0 => color(&f, n) == pixels,
-            1 => words(&made.depth(n)) == pixels,
-            _ => words(&made.infrared(n)) == pixels,
+            1 => words(&pattern.depth(n)) == pixels,
+            _ => words(&pattern.infrared(n)) == pixels,
         }))
     }
 }
@@ -141,11 +141,11 @@ fn every_format_comes_as_it_was_recorded() {
         drop(stream);
         let sink = all(&path, &[]);
         let of = |stream: usize| sink.frames.iter().filter(move |f| f.0 == stream).zip(0..);
-        let mut made = Pattern::new(&fixture);
+        let mut pattern = Pattern::new(&fixture);
         assert!((0..3).all(|i| sink.delivered(i) == 7), "{format:?}");
         assert!(of(0).all(|(f, n)| f.2 == color(&fixture, n)), "{format:?}");
-        assert!(of(1).all(|(f, n)| f.2 == words(&made.depth(n))), "{format:?}");
-        assert!(of(2).all(|(f, n)| f.2 == words(&made.infrared(n))), "{format:?}");
+        assert!(of(1).all(|(f, n)| f.2 == words(&pattern.depth(n))), "{format:?}");
+        assert!(of(2).all(|(f, n)| f.2 == words(&pattern.infrared(n))), "{format:?}");
     }
 }
 
@@ -157,9 +157,9 @@ fn frames_of_a_recorded_subordinate_were_triggered() {
         let sink = all(&write(dir.path(), &fixture), &[]);
         let is_triggered = |f: &FrameFlags| f.has(FrameFlags::HARDWARE_TRIGGERED);
         let wanted = wired_sync == WiredSync::Subordinate;
-        let pictures: Vec<_> = sink.frames.iter().filter(|f| f.0 < 3).collect();
-        assert!(pictures.iter().all(|f| is_triggered(&f.1.flags) == wanted), "{wired_sync:?}");
-        assert_eq!(pictures.len(), 6);
+        let images: Vec<_> = sink.frames.iter().filter(|f| f.0 < 3).collect();
+        assert!(images.iter().all(|f| is_triggered(&f.1.flags) == wanted), "{wired_sync:?}");
+        assert_eq!(images.len(), 6);
     }
 }
 
@@ -170,9 +170,9 @@ fn jpeg_is_kept_where_that_is_asked_for() {
     let kept =
         StreamRequest { format: Some(PixelFormat::Mjpeg), ..StreamRequest::any(Name::new("color").unwrap()) };
     let sink = all(&write(dir.path(), &fixture), &[kept]);
-    let mut made = Pattern::new(&fixture);
+    let mut pattern = Pattern::new(&fixture);
     assert_eq!(sink.frames.len(), 4);
-    assert!(sink.frames.iter().zip(0..).all(|(f, n)| f.2 == made.color(n)));
+    assert!(sink.frames.iter().zip(0..).all(|(f, n)| f.2 == pattern.color(n)));
 }
 
 #[test]
@@ -225,7 +225,7 @@ fn the_clock_goes_on_from_round_to_round() {
         assert_eq!(f.1.device_sequence, n);
         let wanted = first + n * 33_333 / 8;
         assert!(f.1.device_time.abs_diff(wanted) <= 8, "{n}: {} {wanted}", f.1.device_time);
-        assert!(f.2 == words(&Pattern::new(&fixture).depth(n as u32 % 6)), "picture {n}");
+        assert!(f.2 == words(&Pattern::new(&fixture).depth(n as u32 % 6)), "image {n}");
     }
     assert!(sink.drops.iter().all(|d| d.total() == 0));
 }
@@ -236,7 +236,7 @@ fn intrinsics_and_poses_follow_the_calibration() {
     let fixture = Fixture { depth: Some(DepthMode::NfovUnbinned), captures: 2, ..Fixture::small() };
     let path = write(dir.path(), &fixture);
     let (_, stream) = start(PlaybackConfig::new(&path), &[]);
-    let [color, depth, ir, _imu] = stream.profiles() else { panic!("three cameras and a motion unit") };
+    let [color, depth, ir, _imu] = stream.profiles() else { panic!("three cameras and an IMU") };
     assert!((depth.intrinsics.cx - 332.78128).abs() < 1e-9 && depth.intrinsics == ir.intrinsics);
     assert_eq!((color.intrinsics.distortion(), depth.depth_unit_m), (Distortion::Rational, 0.001));
     assert!((color.pose_in_device.translation_m[0] - 0.032).abs() < 1e-3);
@@ -259,7 +259,7 @@ fn intrinsics_and_poses_follow_the_calibration() {
 }
 
 #[test]
-fn a_picture_that_cannot_be_decoded_is_a_counted_loss() {
+fn an_image_that_cannot_be_decoded_is_a_counted_loss() {
     let dir = tempfile::tempdir().unwrap();
     let fixture = Fixture { captures: 5, checksums: false, motion: false, ..Fixture::default() };
     let (mut bytes, written) = fixture.bytes_and_places();
@@ -292,9 +292,9 @@ fn request(stream: &str) -> StreamRequest {
     StreamRequest::any(Name::new(stream).unwrap())
 }
 
-/// All samples of the file, however they share blocks, at its own pace, as fast as they are taken, and alone.
+/// All samples of the file, however they share blocks, in real time, as fast as they are taken, and alone.
 #[test]
-fn samples_of_motion_are_played_with_the_pictures() {
+fn imu_samples_are_played_with_the_images() {
     let dir = tempfile::tempdir().unwrap();
     for lacing in [Lacing::None, Lacing::Xiph, Lacing::Fixed, Lacing::Ebml] {
         let fixture = Fixture { lacing, captures: 8, lost: vec![3], ..Fixture::small() };
@@ -328,7 +328,7 @@ fn samples_of_motion_are_played_with_the_pictures() {
         assert_eq!(stream.profiles()[1].describe(), "imu motion 1600 Hz in batches of up to 64");
         let sink = play(stream.as_mut(), usize::MAX);
         check(&sink, 1, true);
-        // Samples and pictures of one moment of the device have nearly one time of the host, since both come when they
+        // Samples and images of one moment of the device have nearly one time of the host, since both come when they
         // are due: within a period and what a busy machine adds.
         let depth = &sink.frames.iter().rfind(|f| f.0 == 0).unwrap().1;
         let near = motion_of(&sink, 1)
@@ -357,7 +357,7 @@ fn colour_alone_begins_before_the_file_is_read() {
     let sink = play(stream.as_mut(), 1);
     let read = read_by_me() - before;
     assert_eq!(sink.delivered(0), 1);
-    assert!(read < bytes / 4, "{read} of {bytes} bytes were read for the first picture");
+    assert!(read < bytes / 4, "{read} of {bytes} bytes were read for the first image");
     assert_eq!(all(&path, &[request("color")]).delivered(0), 30);
 }
 
@@ -396,7 +396,7 @@ fn samples_of_a_recording_that_is_played_without_end_never_go_back() {
 }
 
 #[test]
-fn where_the_motion_unit_sits_is_in_the_calibration() {
+fn where_the_imu_sits_is_in_the_calibration() {
     let dir = tempfile::tempdir().unwrap();
     let path = write(dir.path(), &Fixture::small());
     let imu = |calibration| {

@@ -1,10 +1,10 @@
-//! What the writer of recordings makes is what other readers of Matroska take it for: the crate `matroska-demuxer`, and
+//! Other readers of Matroska agree with the writer of recordings: the crate `matroska-demuxer`, and
 //! FFmpeg and MKVToolNix where they are installed (`tools/setup.sh test`).
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_drivers::kinect::recording::TrackKind;
 use depthrig_drivers::kinect::{DepthMode, Recording};
-use depthrig_kinect_fixture::{CALIBRATION, Fixture, Lacing, Pattern, Pictures};
+use depthrig_kinect_fixture::{CALIBRATION, Fixture, Images, Lacing, Pattern};
 use matroska_demuxer::{Frame, MatroskaFile};
 use std::io::Cursor;
 use std::path::Path;
@@ -18,7 +18,8 @@ fn another_reader_finds_the_same_frames() {
         let mut theirs = MatroskaFile::open(Cursor::new(bytes.clone())).unwrap();
         let mut ours = Recording::read(Box::new(bytes), "test.mkv").unwrap();
         let offset_us = fixture.start_offset_ns / 1000;
-        let (mut frame, mut frames) = (Frame::default(), 0);
+        let mut frame = Frame::default();
+        let mut frames = 0;
         while let Some(block) = ours.next_block().unwrap() {
             for data in block.frames() {
                 assert!(theirs.next_frame(&mut frame).unwrap(), "they have fewer than {frames}");
@@ -68,7 +69,8 @@ fn ffmpeg_reads_it_without_a_complaint() {
     let Some(out) = run("ffprobe", &[&args[..], &[streams, "-of", "csv=p=0:nk=0"]].concat(), &path) else {
         return;
     };
-    let (text, complaints) = (String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr));
+    let text = String::from_utf8_lossy(&out.stdout);
+    let complaints = String::from_utf8_lossy(&out.stderr);
     println!("{text}{complaints}");
     assert!(out.status.success());
     // It has no decoder for motion nor for the attachment, and says so of any recording of a Kinect.
@@ -107,8 +109,8 @@ fn ffmpeg_reads_it_without_a_complaint() {
         .output()
         .unwrap();
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
-    let mut made = Pattern::new(&fixture);
-    let wanted: Vec<u8> = (0..6).flat_map(|n| made.depth(n)).flat_map(u16::to_le_bytes).collect();
+    let mut pattern = Pattern::new(&fixture);
+    let wanted: Vec<u8> = (0..6).flat_map(|n| pattern.depth(n)).flat_map(u16::to_le_bytes).collect();
     assert!(std::fs::read(&raw).unwrap() == wanted, "depth as FFmpeg decodes it");
 }
 
@@ -134,8 +136,8 @@ fn mkvtoolnix_lists_all_of_it() {
     }
     assert!(!text.to_lowercase().contains("error") && !text.to_lowercase().contains("invalid"), "{text}");
     let simple = text.matches("SimpleBlock").count() + text.matches("Simple block").count();
-    assert!(simple >= 18, "{simple} of 18 pictures: {text}");
-    // What they take out is what was put in.
+    assert!(simple >= 18, "{simple} of 18 images: {text}");
+    // Their output is what was put in.
     let out = dir.path().join("calibration.json");
     let target = format!("1:{}", out.display());
     let extracted = Command::new("mkvextract").arg(&path).args(["attachments", &target]).output().unwrap();

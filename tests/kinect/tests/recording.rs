@@ -1,12 +1,12 @@
-//! Recordings of an Azure Kinect as they are made, in early forms, from other writers, cut, damaged and lying. Long
-//! because each form is a case.
+//! Recordings of an Azure Kinect as the SDK writes them, in early forms, from other writers, cut, damaged and lying.
+//! Long because each form is a case.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_drivers::ErrorKind;
 use depthrig_drivers::kinect::recording::{Losses, Pixels, ReadAt, TrackKind, motion_samples};
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, Recording, WiredSync};
 use depthrig_kinect_fixture::{
-    ACCEL_LATE_NS, CALIBRATION, Fixture, Lacing, Pattern, Pictures, element, motion,
+    ACCEL_LATE_NS, CALIBRATION, Fixture, Images, Lacing, Pattern, element, motion,
 };
 use std::path::PathBuf;
 
@@ -14,7 +14,7 @@ fn open(bytes: Vec<u8>) -> depthrig_drivers::Result<Recording> {
     Recording::read(Box::new(bytes), "test.mkv")
 }
 
-/// What a recording holds: kind, time and bytes of each frame.
+/// All frames of a recording: kind, time and bytes.
 fn all(recording: &mut Recording) -> Vec<(TrackKind, u64, Vec<u8>)> {
     let kinds: Vec<_> = recording.tracks().iter().map(|t| t.kind).collect();
     let mut out = Vec::new();
@@ -41,14 +41,15 @@ fn of(frames: &[(TrackKind, u64, Vec<u8>)], kind: TrackKind) -> Vec<(u64, &[u8])
 fn check(fixture: &Fixture, bytes: Vec<u8>) {
     let mut recording = open(bytes).unwrap();
     let frames = all(&mut recording);
-    let mut made = Pattern::new(fixture);
+    let mut pattern = Pattern::new(fixture);
     let there: Vec<u32> = (0..fixture.captures).filter(|n| !fixture.lost.contains(n)).collect();
-    let (color, depth) = (of(&frames, TrackKind::Color), of(&frames, TrackKind::Depth));
+    let color = of(&frames, TrackKind::Color);
+    let depth = of(&frames, TrackKind::Depth);
     let infrared = of(&frames, TrackKind::Infrared);
     assert_eq!(color.len(), if fixture.color.is_some() { there.len() } else { 0 });
     for (n, (at, data)) in there.iter().zip(&color) {
         assert_eq!(*at, fixture.times_us(*n).0, "color {n}");
-        assert!(*data == made.color(*n), "color {n}");
+        assert!(*data == pattern.color(*n), "color {n}");
     }
     let words = |data: &[u8]| -> Vec<u16> {
         let pairs = data.as_chunks::<2>().0.iter();
@@ -59,10 +60,10 @@ fn check(fixture: &Fixture, bytes: Vec<u8>) {
     assert_eq!(infrared.len(), if fixture.depth.is_some() { there.len() } else { 0 });
     for (n, (at, data)) in there.iter().zip(&depth) {
         assert_eq!(*at, fixture.times_us(*n).1, "depth {n}");
-        assert!(words(data) == made.depth(*n), "depth {n}");
+        assert!(words(data) == pattern.depth(*n), "depth {n}");
     }
     for (n, (_, data)) in there.iter().zip(&infrared) {
-        assert!(words(data) == made.infrared(*n), "infrared {n}");
+        assert!(words(data) == pattern.infrared(*n), "infrared {n}");
     }
     let samples: Vec<_> =
         frames.iter().filter(|f| f.0 == TrackKind::Motion).flat_map(|f| motion_samples(&f.2)).collect();
@@ -184,7 +185,7 @@ fn seeking_finds_the_first_block_at_or_after_a_time() {
 fn an_index_that_lies_is_not_believed() {
     let fixture = Fixture { captures: 90, motion: false, ..Fixture::small() };
     let (mut bytes, written) = fixture.bytes_and_places();
-    // Every position of the index points into the middle of a picture.
+    // Every position of the index points into the middle of an image.
     let index = written.clusters_end as usize;
     let mark = [0xF1_u8];
     let mut at = index;
@@ -198,7 +199,7 @@ fn an_index_that_lies_is_not_believed() {
 }
 
 #[test]
-fn a_file_that_is_cut_is_read_up_to_its_last_whole_cluster() {
+fn a_file_that_is_cut_is_read_up_to_its_last_complete_cluster() {
     let fixture = Fixture { captures: 8, motion: false, ..Fixture::small() };
     let (bytes, written) = fixture.bytes_and_places();
     let ends: Vec<u64> = written.clusters[1..].iter().copied().chain([written.clusters_end]).collect();
@@ -230,7 +231,7 @@ fn a_file_that_is_cut_is_read_up_to_its_last_whole_cluster() {
 }
 
 #[test]
-fn a_file_that_is_cut_before_its_first_picture_says_so() {
+fn a_file_that_is_cut_before_its_first_image_says_so() {
     let (bytes, written) = Fixture::small().bytes_and_places();
     for cut in [0, 1, 30, 45, 60, 300, 1000, written.clusters[0] as usize - 100, written.clusters[0] as usize]
     {
@@ -238,7 +239,8 @@ fn a_file_that_is_cut_before_its_first_picture_says_so() {
         let text = e.to_string();
         assert_eq!(e.kind(), ErrorKind::BadInput, "{text}");
         assert!(
-            text.starts_with("test.mkv: ") && (text.contains("cut off") || text.contains("no Matroska file")),
+            text.starts_with("test.mkv: ")
+                && (text.contains("cut off") || text.contains("not a Matroska file")),
             "{cut}: {text}"
         );
     }
@@ -263,7 +265,7 @@ fn a_damaged_cluster_is_left_out_and_counted() {
         (all(&mut recording), recording.losses())
     };
     let third = written.clusters[3];
-    // A flipped bit in a picture; a lying size of a block; the cluster's own size, too long and too short; its name.
+    // A flipped bit in an image; a lying size of a block; the cluster's own size, too long and too short; its name.
     let pixel = third + 500_000;
     let (frames, losses) = damage(pixel, &[bytes[pixel as usize] ^ 4]);
     same(&frames, &without(3));
@@ -273,7 +275,7 @@ fn a_damaged_cluster_is_left_out_and_counted() {
         same(&frames, &without(3));
         assert_eq!(losses, Losses { places: 1, bytes: size(3) }, "{with:?} at {at}");
     }
-    // Without checksums what is damaged inside of a picture shows to nobody, but its structure does.
+    // Without checksums, damage inside an image is undetected, but damage to the structure is not.
     let plain = Fixture { checksums: false, ..fixture.clone() };
     let (mut bytes, written) = plain.bytes_and_places();
     let at = written.clusters[2] as usize;
@@ -290,7 +292,7 @@ fn rubbish_between_clusters_is_passed_over() {
     let (bytes, written) = fixture.bytes_and_places();
     let whole = all(&mut open(bytes.clone()).unwrap());
     let at = written.clusters[2] as usize;
-    // Things that begin as a cluster does, and are none.
+    // Bytes that begin like a cluster and are not one.
     let mut rubbish = vec![0x55; 3_000_000];
     for place in (0..3_000_000).step_by(9999) {
         rubbish[place..][..4].copy_from_slice(&[0x1F, 0x43, 0xB6, 0x75]);
@@ -358,7 +360,7 @@ fn a_cluster_is_found_wherever_the_search_is_cut() {
     // The segment gets longer, so that its size must be unknown.
     let segment = bytes.windows(4).position(|w| w == [0x18, 0x53, 0x80, 0x67]).unwrap() + 4;
     bytes[segment..segment + 8].copy_from_slice(&[0x01, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF]);
-    // The search takes pieces of a mebibyte, and begins one byte behind what is no cluster.
+    // The search takes pieces of a mebibyte, and begins one byte behind a false cluster.
     for before in 0..6 {
         let rubbish = vec![0x55; (1 << 20) + 1 - before];
         let mut recording = open([&bytes[..at], &rubbish, &bytes[at..]].concat()).unwrap();
@@ -419,7 +421,7 @@ fn what_no_kinect_could_have_written_is_not_taken_into_memory() {
 
 #[test]
 fn of_two_tracks_of_a_kind_the_first_is_the_cameras() {
-    // An early file, whose tracks are told by their names.
+    // An early file, whose tracks are identified by their names.
     let mut bytes = Fixture { early: true, ..Fixture::small() }.bytes();
     let name = element::text(0x536E, "DEPTH");
     let at = bytes.windows(name.len()).position(|w| w == name).unwrap();
@@ -452,7 +454,7 @@ fn sizes_that_lie_take_no_memory() {
 #[test]
 fn a_file_of_somebody_else_is_refused_by_name() {
     let error = |bytes: Vec<u8>| open(bytes).unwrap_err().to_string();
-    assert!(error(b"RIFF....AVI LIST".to_vec()).contains("this is no Matroska file"));
+    assert!(error(b"RIFF....AVI LIST".to_vec()).contains("not a Matroska file"));
     assert!(error(Vec::new()).contains("the file is empty"));
     let replaced = |from: &str, to: &str| {
         let mut bytes = Fixture::small().bytes();
@@ -476,14 +478,11 @@ fn a_file_of_somebody_else_is_refused_by_name() {
     let e = error(replaced("b16g", "H264"));
     assert!(e.contains("DEPTH are stored as \"H264\""), "{e}");
     let e = error(replaced("NFOV_2X2BINNED", "WFOV_2X2BINNED"));
-    assert!(
-        e.contains("K4A_DEPTH_MODE is \"WFOV_2X2BINNED\", which does not fit pictures of 320x288"),
-        "{e}"
-    );
+    assert!(e.contains("K4A_DEPTH_MODE is \"WFOV_2X2BINNED\", which does not fit images of 320x288"), "{e}");
     let e = error(replaced("STANDALONE", "OUTOFORDER"));
     assert!(e.contains("K4A_WIRED_SYNC_MODE = \"OUTOFORDER\" is unknown"), "{e}");
     let e = error(replaced("336277000", "336277x00"));
-    assert!(e.contains("K4A_START_OFFSET_NS = \"336277x00\" is no number of nanoseconds"), "{e}");
+    assert!(e.contains("K4A_START_OFFSET_NS = \"336277x00\" is not a number of nanoseconds"), "{e}");
 }
 
 #[test]
@@ -502,7 +501,7 @@ fn a_calibration_that_is_missing_or_wrong_is_an_error_of_its_own() {
 }
 
 #[test]
-fn tracks_are_told_by_their_tags_not_by_their_order_or_name() {
+fn tracks_are_identified_by_their_tags_not_by_their_order_or_name() {
     let mut bytes = Fixture { motion: false, ..Fixture::small() }.bytes();
     // A user's own track that is called COLOR, in the place of the real one.
     let name = element::text(0x536E, "COLOR");
@@ -512,8 +511,8 @@ fn tracks_are_told_by_their_tags_not_by_their_order_or_name() {
     assert_eq!(recording.track(TrackKind::Color).map(|(_, t)| t.name.as_str()), Some("RGBRG"));
 }
 
-/// A public recording of an Azure Kinect, if `DEPTHRIG_KINECT_SAMPLE` names it: `tests/assets/recording.mkv` of pyk4a. It
-/// shows somebody's room, so it is not kept here.
+/// A public recording of an Azure Kinect, if `DEPTHRIG_KINECT_SAMPLE` names it: `tests/assets/recording.mkv` of pyk4a.
+/// It shows a private room, so it is not kept here.
 #[test]
 fn a_recording_of_a_real_device() {
     let Some(path) = std::env::var_os("DEPTHRIG_KINECT_SAMPLE").map(PathBuf::from) else {

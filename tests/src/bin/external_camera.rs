@@ -1,5 +1,5 @@
-//! A process that serves a camera and misbehaves as it is told: `external_camera BEHAVIOUR [SERIAL]`, at the place that
-//! the environment names. Tests start it as a lab's own program would be started.
+//! A process that serves a camera and misbehaves on request: `external_camera BEHAVIOUR [SERIAL]`. The environment
+//! names its place. Tests start it like a lab's own program.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // test support: a failure here is a failed test
 
 use depthrig_bus::external::{
@@ -11,7 +11,7 @@ use std::time::Duration;
 const RATE_HZ: f64 = 30.0;
 
 fn mode(name: &str, format: PixelFormat) -> Mode {
-    Mode::new(Name::new(name).unwrap(), format, (160, 120), RATE_HZ).with_device_clock(32, 1_000_000, 32)
+    Mode::new(Name::new(name).unwrap(), format, 160, 120, RATE_HZ).with_device_clock(32, 1_000_000, 32)
 }
 
 fn main() {
@@ -73,7 +73,7 @@ fn main() {
     }
 }
 
-/// Sends frames as `behaviour` says until they are no longer wanted.
+/// Sends frames according to `behaviour` until they are no longer wanted.
 fn serve(mut session: Session<'_>, behaviour: &str, frames: u64) {
     let running: Vec<(usize, Mode)> = session.modes().map(|(i, m)| (i, m.clone())).collect();
     session.started();
@@ -124,14 +124,14 @@ fn serve(mut session: Session<'_>, behaviour: &str, frames: u64) {
     println!("the daemon has it all: {taken}");
 }
 
-/// Offers something that cannot be, and prints what the daemon says to it.
+/// Sends an invalid offer and prints the daemon's answer.
 fn offer_lie(place: &Place, modes: &[Mode], lie: &str) {
     let mut offer = ExternalOffer { modes: 2, ..ExternalOffer::default() };
     offer.model[..4].copy_from_slice(b"Fake");
     let text = "external_camera";
     offer.program[..text.len()].copy_from_slice(text.as_bytes());
     let mut records = vec![0; 640];
-    // What an honest offer holds, by the offsets of docs/external.md.
+    // A valid offer, by the offsets of docs/external.md.
     for (mode, record) in modes.iter().zip(records.chunks_exact_mut(320)) {
         let name = mode.stream.as_str();
         record[..name.len()].copy_from_slice(name.as_bytes());

@@ -94,7 +94,7 @@ def newest_of(cache: Path, pin: dict, mirror: str | None, say) -> Kernel:
 
 
 def unpacked(cache: Path, deb: Path, digest: str, about: str, pinned: bool, say) -> Kernel:
-    """`deb` as a tree of the cache; whole or not there at all."""
+    """`deb` as a tree of the cache; complete or absent."""
     tree = cache / f"kernel-{digest[:16]}"
     if not tree.is_dir():
         say(f"unpacking {deb.name}")

@@ -1,6 +1,6 @@
-//! The bus bench: what sending a frame costs, against the bare transport and against bare memory copies.
+//! The bus benchmark: the cost of sending a frame, against the bare transport and against bare memory copies.
 //!
-//! Everything that is compared alternates within one run, so that both sides meet the same machine.
+//! Compared measurements alternate within one run, so that both sides see the same machine load.
 
 pub mod copies;
 pub mod latency;
@@ -25,7 +25,7 @@ use serde::Serialize;
 pub const RIG: &str = "bench";
 const WIDTH: u32 = 1280;
 const HEIGHT: u32 = 720;
-/// Bytes of a camera's colour and depth picture.
+/// Bytes of a camera's colour and depth image.
 pub const CAMERA_BYTES: [usize; 2] =
     [PixelFormat::Rgb8.frame_bytes(WIDTH, HEIGHT), PixelFormat::Z16.frame_bytes(WIDTH, HEIGHT)];
 /// Bytes of both together.
@@ -41,35 +41,34 @@ impl Channels {
     pub const CAMERAS: usize = 7;
 }
 
-/// A driver that owns its buffers: a few pictures that take turns.
+/// A driver that owns its buffers: a few images that take turns.
 pub struct Source {
-    pictures: Vec<Vec<u8>>,
+    images: Vec<Vec<u8>>,
     turn: usize,
 }
 
 impl Source {
-    /// Pictures of `bytes` bytes; `seed` makes them differ.
+    /// Images of `bytes` bytes; `seed` makes them differ.
     pub fn new(bytes: usize, seed: u8) -> Self {
-        let picture =
-            |i: u8| (0..bytes).map(|at| (at as u8).wrapping_mul(31) ^ seed.wrapping_add(i)).collect();
-        Self { pictures: (0..4).map(picture).collect(), turn: 0 }
+        let image = |i: u8| (0..bytes).map(|at| (at as u8).wrapping_mul(31) ^ seed.wrapping_add(i)).collect();
+        Self { images: (0..4).map(image).collect(), turn: 0 }
     }
 
-    /// The next picture.
+    /// The next image.
     pub fn next(&mut self) -> &[u8] {
-        self.turn = (self.turn + 1) % self.pictures.len();
-        &self.pictures[self.turn]
+        self.turn = (self.turn + 1) % self.images.len();
+        &self.images[self.turn]
     }
 
-    /// Writes the next picture to `slot`; returns how many bytes it wrote.
+    /// Writes the next image to `slot`; returns how many bytes it wrote.
     pub fn write_to(&mut self, slot: &mut [u8]) -> usize {
-        let picture = self.next();
-        slot.copy_from_slice(picture);
-        picture.len()
+        let image = self.next();
+        slot.copy_from_slice(image);
+        image.len()
     }
 }
 
-/// How much is measured.
+/// Amount of measurements.
 #[derive(Debug, Clone, Copy)]
 pub struct Plan {
     /// Pairs of latency blocks of one second.
@@ -85,7 +84,7 @@ pub struct Plan {
 /// The result of the bench.
 #[derive(Debug, Serialize)]
 pub struct BusReport {
-    /// Circumstances.
+    /// Conditions of the measurement.
     pub conditions: Conditions,
     /// Publish-to-receive against a bare loop.
     pub latency: Latency,
@@ -106,7 +105,7 @@ pub struct LoadReport {
     pub slots: usize,
     /// CPU of the publishing process, cores, one value a round.
     pub publish_cores: Vec<f64>,
-    /// CPU of the same process copying the same bytes at the same pace.
+    /// CPU of the same process copying the same bytes at the same rate.
     pub copy_cores: Vec<f64>,
     /// Median over the rounds of publishing over copying.
     pub cpu_ratio: f64,
@@ -128,7 +127,7 @@ pub struct Disturbed {
     /// CPU time of the publishing thread, all rounds together.
     pub cpu: Quantiles,
     /// Wall-clock p99 over that of the normal phases, all rounds together: one round has too few frames in its
-    /// slowest hundredth to tell a tenth apart.
+    /// slowest hundredth to resolve a tenth.
     pub p99_ratio: f64,
     /// The same of CPU time, which other processes of the machine disturb less.
     pub cpu_p99_ratio: f64,
@@ -136,7 +135,7 @@ pub struct Disturbed {
     pub p99_ratio_of_rounds: f64,
 }
 
-/// Runs everything below `runtime`, which must be nobody else's.
+/// Runs the benchmark with its channels in `runtime`, which no other rig may use.
 pub fn run(runtime: &RuntimeDir, plan: Plan, mut progress: impl FnMut(&str, u64, u64)) -> Result<BusReport> {
     let bus = Bus::open(runtime, &depthrig_bus::RigName::new(RIG)?)?;
     let mut conditions = Conditions::now();
@@ -148,7 +147,7 @@ pub fn run(runtime: &RuntimeDir, plan: Plan, mut progress: impl FnMut(&str, u64,
     Ok(BusReport { conditions, latency, copies, load })
 }
 
-/// What one round measured.
+/// Measurements of one round.
 struct Round {
     normal: Phase,
     copy: Phase,
@@ -167,7 +166,7 @@ fn run_load(bus: &Bus, plan: Plan, progress: &mut impl FnMut(&str, u64, u64)) ->
     let mut rounds = Vec::new();
     let mut kills = 0;
     let mut cleaned = HostTime::now();
-    let mut house = || {
+    let mut housekeeping = || {
         if cleaned.elapsed() >= Duration::from_secs(1) {
             bus.clean_dead(); // as the daemon does
             cleaned = HostTime::now();
@@ -176,7 +175,7 @@ fn run_load(bus: &Bus, plan: Plan, progress: &mut impl FnMut(&str, u64, u64)) ->
     for round in 0..plan.rounds {
         let mut step = |i| progress("seven cameras", u64::from(round) * 4 + i, u64::from(plan.rounds) * 4);
         let mut quiet = || {
-            house();
+            housekeeping();
             Ok(())
         };
         let normal = load.phase(Work::Publish, plan.settle, plan.phase, &mut quiet)?;
@@ -195,7 +194,7 @@ fn run_load(bus: &Bus, plan: Plan, progress: &mut impl FnMut(&str, u64, u64)) ->
                 kills += 1;
                 victim = Some((Reader::start_at_once(runtime, Mode::Count, streams)?, HostTime::now()));
             }
-            house();
+            housekeeping();
             Ok(())
         })?;
         drop(victim);
@@ -211,13 +210,15 @@ fn run_load(bus: &Bus, plan: Plan, progress: &mut impl FnMut(&str, u64, u64)) ->
 
 fn summarise(done: &Done, rounds: &[Round], slots: usize, lost: u64, kills: u64) -> LoadReport {
     let cores = |phase: fn(&Round) -> Phase| rounds.iter().map(|r| phase(r).cores).collect::<Vec<_>>();
-    let (publish_cores, copy_cores) = (cores(|r| r.normal), cores(|r| r.copy));
+    let publish_cores = cores(|r| r.normal);
+    let copy_cores = cores(|r| r.copy);
     let ratios: Vec<f64> = publish_cores.iter().zip(&copy_cores).map(|(p, c)| p / c).collect();
     let all = |phase: fn(&Round) -> Phase, of: fn(&Done, Phase) -> Vec<i64>| {
         Quantiles::of_ns(&rounds.iter().flat_map(|r| of(done, phase(r))).collect::<Vec<_>>())
     };
     let disturbed = |phase: fn(&Round) -> Phase| {
-        let (wall, cpu) = (all(phase, Done::wall_ns), all(phase, Done::cpu_ns));
+        let wall = all(phase, Done::wall_ns);
+        let cpu = all(phase, Done::cpu_ns);
         let p99 = |phase| Quantiles::of_ns(&done.wall_ns(phase)).p99_us;
         Disturbed {
             p99_ratio: wall.p99_us / all(|r| r.normal, Done::wall_ns).p99_us,

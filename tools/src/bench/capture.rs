@@ -1,8 +1,8 @@
-//! What taking pictures from a kernel node costs: our path beside a bare loop of the crate `v4l` that copies each picture
-//! once, in turns, on one camera.
+//! The capture benchmark: our V4L2 path against a bare loop of the crate `v4l` that copies each image once, alternating
+//! on one camera.
 //!
-//! Counted is the CPU time of the thread that takes pictures: its own instructions, and the kernel's on its behalf. In
-//! the virtual machine (`tests/vm`), where time is the number of instructions, that is exact.
+//! It measures the CPU time of the capture thread: its own instructions, and the kernel's on its behalf. In the virtual
+//! machine (`tests/vm`), where time is the number of instructions, that is exact.
 
 use anyhow::{Context, Result, bail};
 use core::time::Duration;
@@ -23,7 +23,7 @@ use v4l::video::Capture as _;
 /// CPU of our copying path over that of the bare loop, at most.
 pub const CPU_BAR: f64 = 1.2;
 
-/// What to measure.
+/// Plan of the measurement.
 #[derive(Debug, Clone)]
 pub struct Plan {
     /// The camera, as a rig file names it.
@@ -32,19 +32,19 @@ pub struct Plan {
     pub size: (u32, u32),
     /// Frame rate.
     pub rate_hz: f64,
-    /// Pictures of each way and round that are counted.
-    pub pictures: u32,
-    /// Pictures of each way and round before those, which fault memory in.
+    /// Images of each way and round that are counted.
+    pub images: u32,
+    /// Images of each way and round before those, which fault memory in.
     pub warm_up: u32,
     /// Rounds; every way once in each.
     pub rounds: u32,
 }
 
-/// How pictures were taken.
+/// Capture method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Way {
-    /// The crate `v4l`, and one copy into memory that is always the same.
+    /// The crate `v4l`, with one copy into the same buffer each time.
     Bare,
     /// Copied once, into shared memory, and published.
     Mmap,
@@ -55,17 +55,17 @@ pub enum Way {
 /// One way with one format.
 #[derive(Debug, Clone, Serialize)]
 pub struct Cost {
-    /// The pictures' format.
+    /// The images' format.
     pub format: &'static str,
     /// The way.
     pub way: Way,
-    /// CPU of one picture in each round, microseconds.
+    /// CPU of one image in each round, microseconds.
     pub us: Vec<f64>,
     /// The middle one.
     pub median_us: f64,
     /// Its ratio to the bare loop's.
     pub ratio: f64,
-    /// Bytes that we copied, over the bytes of the pictures.
+    /// Bytes that we copied, over the bytes of the images.
     pub copies: f64,
 }
 
@@ -78,18 +78,18 @@ pub struct CaptureReport {
     pub size: (u32, u32),
     /// Frame rate.
     pub rate_hz: f64,
-    /// Pictures of each way and round.
-    pub pictures: u32,
+    /// Images of each way and round.
+    pub images: u32,
     /// One entry for each format and way.
     pub costs: Vec<Cost>,
-    /// Circumstances.
+    /// Conditions of the measurement.
     pub conditions: super::conditions::Conditions,
 }
 
 /// Measures every format of [16-bit grey or depth, YUYV] that the camera has.
 ///
 /// # Errors
-/// When the camera cannot be opened, lacks both formats, or stops sending pictures.
+/// When the camera cannot be opened, lacks both formats, or stops sending images.
 pub fn run(
     runtime: &RuntimeDir,
     plan: &Plan,
@@ -107,7 +107,8 @@ pub fn run(
         bail!("{camera} has neither z16, mono16 nor yuyv at {:?} and {} Hz", plan.size, plan.rate_hz);
     }
     let mut costs = Vec::new();
-    let (mut done, total) = (0, profiles.len() as u64 * 3 * u64::from(plan.rounds));
+    let mut done = 0;
+    let total = profiles.len() as u64 * 3 * u64::from(plan.rounds);
     for profile in &profiles {
         let mut of: Vec<(Way, Vec<f64>, f64)> =
             [Way::Bare, Way::Mmap, Way::Userptr].into_iter().map(|way| (way, Vec::new(), 0.0)).collect();
@@ -130,7 +131,8 @@ pub fn run(
             if way == Way::Bare {
                 reference = median_us;
             }
-            let (format, ratio) = (profile.format.name(), median_us / reference);
+            let format = profile.format.name();
+            let ratio = median_us / reference;
             costs.push(Cost { format, way, us, median_us, ratio, copies });
         }
     }
@@ -139,7 +141,7 @@ pub fn run(
         camera,
         size: plan.size,
         rate_hz: plan.rate_hz,
-        pictures: plan.pictures,
+        images: plan.images,
         costs,
         conditions,
     })
@@ -165,7 +167,7 @@ fn median(values: &[f64]) -> f64 {
     sorted.get(sorted.len() / 2).copied().unwrap_or(f64::NAN)
 }
 
-/// CPU of one picture in microseconds, and copies of it, with the crate `v4l` alone.
+/// CPU of one image in microseconds, and copies of it, with the crate `v4l` alone.
 fn bare(plan: &Plan, profile: &StreamProfile) -> Result<(f64, f64)> {
     let fourcc = match profile.format {
         PixelFormat::Z16 => FourCc::Z16,
@@ -182,25 +184,25 @@ fn bare(plan: &Plan, profile: &StreamProfile) -> Result<(f64, f64)> {
     device.set_format(&format)?;
     device.set_params(&v4l::video::capture::Parameters::with_fps(plan.rate_hz.round() as u32))?;
     let mut stream = v4l::io::mmap::Stream::with_buffers(&device, Type::VideoCapture, plan.camera.buffers)?;
-    stream.set_timeout(PATIENCE);
+    stream.set_timeout(TIMEOUT);
     let frame_bytes = profile.frame_bytes();
     let mut copy = vec![0; frame_bytes];
     let mut before = 0;
-    for picture in 0..plan.warm_up + plan.pictures {
-        if picture == plan.warm_up {
+    for image in 0..plan.warm_up + plan.images {
+        if image == plan.warm_up {
             before = thread_cpu_ns();
         }
         let (bytes, _) = stream.next()?;
-        copy.copy_from_slice(bytes.get(..frame_bytes).context("a short picture")?);
+        copy.copy_from_slice(bytes.get(..frame_bytes).context("a short image")?);
         core::hint::black_box(&copy);
     }
-    Ok(((thread_cpu_ns() - before) as f64 / 1e3 / f64::from(plan.pictures), 1.0))
+    Ok(((thread_cpu_ns() - before) as f64 / 1e3 / f64::from(plan.images), 1.0))
 }
 
-/// How long a picture may take to come.
-const PATIENCE: Duration = Duration::from_secs(5);
+/// Timeout for an image.
+const TIMEOUT: Duration = Duration::from_secs(5);
 
-/// The same through our back end, into shared memory.
+/// The same through our backend, into shared memory.
 fn ours(
     runtime: &RuntimeDir,
     plan: &Plan,
@@ -215,7 +217,7 @@ fn ours(
     let id = StreamId::new("capture", profile.stream.as_str())?;
     let publisher = bus.publisher(&id, profile.frame_bytes(), depthrig_bus::shm::DEFAULT_SLOTS)?;
     let mut header = FrameHeader::default();
-    header.set_picture(profile.format, profile.width, profile.height);
+    header.set_image(profile.format, profile.width, profile.height);
     let mut sink = Sink { publisher, header, loan: None, published: 0 };
     let mut poll = |sink: &mut Sink, until: u64| -> Result<()> {
         while sink.published < until {
@@ -223,23 +225,25 @@ fn ours(
             let before = sink.published;
             while sink.published == before {
                 stream.poll(Duration::from_millis(100), sink)?;
-                if last.elapsed() > PATIENCE {
-                    bail!("no picture for {PATIENCE:?}");
+                if last.elapsed() > TIMEOUT {
+                    bail!("no image for {TIMEOUT:?}");
                 }
             }
         }
         Ok(())
     };
     poll(&mut sink, plan.warm_up.into())?;
-    let (cpu, copied, first) = (thread_cpu_ns(), unpack::copied_bytes(), sink.published);
-    poll(&mut sink, first + u64::from(plan.pictures))?;
-    let pictures = (sink.published - first) as f64;
-    let us = (thread_cpu_ns() - cpu) as f64 / 1e3 / pictures;
-    let copies = (unpack::copied_bytes() - copied) as f64 / (pictures * profile.frame_bytes() as f64);
+    let cpu = thread_cpu_ns();
+    let copied = unpack::copied_bytes();
+    let first = sink.published;
+    poll(&mut sink, first + u64::from(plan.images))?;
+    let images = (sink.published - first) as f64;
+    let us = (thread_cpu_ns() - cpu) as f64 / 1e3 / images;
+    let copies = (unpack::copied_bytes() - copied) as f64 / (images * profile.frame_bytes() as f64);
     Ok((us, copies))
 }
 
-/// The receiver of the bench: what the daemon's does, without its books.
+/// The benchmark's receiver: the work of the daemon's without its accounting.
 struct Sink {
     publisher: Publisher,
     header: FrameHeader,
@@ -292,32 +296,33 @@ impl FrameSink for Sink {
     fn clock_quality(&mut self, _: usize, _: &ClockQuality) {}
 }
 
-/// What is promised.
+/// Checks every promise.
 pub fn bars(report: &CaptureReport) -> Vec<super::bus::report::Bar> {
     let of = |way: Way| report.costs.iter().filter(move |c| c.way == way);
     let worst = of(Way::Mmap).map(|c| c.ratio).fold(f64::NAN, f64::max);
     let copies = |way: Way| of(way).map(|c| c.copies).fold(0.0, f64::max);
-    let (mapped, user) = (copies(Way::Mmap), copies(Way::Userptr));
+    let mapped = copies(Way::Mmap);
+    let user = copies(Way::Userptr);
     vec![
         super::bus::report::Bar {
-            promise: "CPU of a picture over a bare v4l loop with one copy: at most 1.2",
+            promise: "CPU of an image over a bare v4l loop with one copy: at most 1.2",
             measured: format!("{worst:.3}"),
             kept: worst <= CPU_BAR,
         },
         super::bus::report::Bar {
-            promise: "copies of a picture from the kernel's buffer: exactly 1",
+            promise: "copies of an image from the kernel's buffer: exactly 1",
             measured: format!("{mapped:.3}"),
             kept: mapped == 1.0,
         },
         super::bus::report::Bar {
-            promise: "copies of a picture that the kernel writes into shared memory: 0",
+            promise: "copies of an image that the kernel writes into shared memory: 0",
             measured: format!("{user:.3}"),
             kept: user == 0.0,
         },
     ]
 }
 
-/// The report as a person reads it.
+/// Formats the report as text.
 pub fn text(report: &CaptureReport) -> String {
     let (w, h) = report.size;
     let c = &report.conditions;
@@ -327,8 +332,8 @@ pub fn text(report: &CaptureReport) -> String {
             c.build, c.cores, c.cpu, c.kernel, c.load_before, c.load_after
         ),
         format!(
-            "{}, {w}x{h} at {} Hz, {} pictures of each way and round",
-            report.camera, report.rate_hz, report.pictures
+            "{}, {w}x{h} at {} Hz, {} images of each way and round",
+            report.camera, report.rate_hz, report.images
         ),
     ];
     for cost in &report.costs {
@@ -339,7 +344,7 @@ pub fn text(report: &CaptureReport) -> String {
             Way::Userptr => "depthrig, memory = \"userptr\"",
         };
         lines.push(format!(
-            "  {:7} {way:28} {:8.1} us of CPU a picture ({}), {:.3} x, {:.3} copies",
+            "  {:7} {way:28} {:8.1} us of CPU an image ({}), {:.3} x, {:.3} copies",
             cost.format,
             cost.median_us,
             rounds.join(" "),

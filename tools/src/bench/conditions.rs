@@ -1,4 +1,4 @@
-//! The circumstances of a measurement: a number without them is no number.
+//! Conditions of a measurement: a number means nothing without them.
 
 use serde::Serialize;
 
@@ -24,7 +24,7 @@ pub struct Conditions {
 }
 
 impl Conditions {
-    /// The circumstances now; [`Self::finish`] adds the load at the end.
+    /// Records the conditions now; [`Self::finish`] adds the load at the end.
     pub fn now() -> Self {
         let shm = std::path::Path::new(depthrig_bus::shm::SHM_DIR);
         Self {
@@ -44,7 +44,7 @@ impl Conditions {
         self.load_after = load_average();
     }
 
-    /// One line for people.
+    /// Formats the conditions on one line.
     pub fn line(&self) -> String {
         let warning = if self.build == "debug" { "; DEBUG BUILD, numbers mean nothing" } else { "" };
         format!(

@@ -2,10 +2,10 @@
 
 use serde::Serialize;
 
-/// What is reported of a sample of durations, microseconds.
+/// Quantiles of a sample of durations, microseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct Quantiles {
-    /// How many there were.
+    /// Number of durations.
     pub n: usize,
     /// Median.
     pub p50_us: f64,
@@ -25,13 +25,13 @@ impl Quantiles {
     }
 }
 
-/// The `q`-quantile of a sorted sample by the nearest-rank rule; `None` when there is none.
+/// The `q`-quantile of a sorted sample by the nearest-rank rule; `None` for an empty sample.
 pub fn quantile<T: Copy>(sorted: &[T], q: f64) -> Option<T> {
     let rank = (q * sorted.len() as f64).ceil() as usize;
     sorted.get(rank.max(1) - 1).copied()
 }
 
-/// The median of `values`, the lower one of two; NaN when there is none.
+/// The median of `values`, the lower one of two; NaN for an empty slice.
 pub fn median(values: &[f64]) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_unstable_by(f64::total_cmp);

@@ -1,15 +1,15 @@
-//! What a pair costs with each preset, in turns inside one run.
+//! The stereo benchmark: CPU time per pair with each preset, alternating within one run.
 
 use super::bus::report::Bar;
 use super::conditions::Conditions;
-use crate::commands::stereo::Picture;
+use crate::commands::stereo::Image;
 use crate::out;
 use anyhow::Result;
 use depthrig_bus::clock::{HostTime, process_cpu_ns};
 use depthrig_calib::stereo::{DisparityMap, Matcher, Parameters, Preset, SgmMatcher, StereoPair};
 use serde::Serialize;
 
-/// How much to measure.
+/// Plan of the measurement.
 #[derive(Debug, Clone, Copy)]
 pub struct Plan {
     /// Disparities that are searched.
@@ -31,16 +31,16 @@ pub struct Cost {
     pub cpu_ms_median: f64,
     /// From call to return, the best of the rounds.
     pub wall_ms_best: f64,
-    /// What the matcher keeps.
+    /// Memory that the matcher keeps allocated.
     pub memory_bytes: u64,
     /// Pixels that got a disparity, percent.
     pub filled_percent: f64,
 }
 
-/// What was measured.
+/// Result of the benchmark.
 #[derive(Debug, Serialize)]
 pub struct StereoReport {
-    /// Where.
+    /// Conditions of the measurement.
     pub conditions: Conditions,
     /// Pixels per row.
     pub width: usize,
@@ -58,20 +58,21 @@ pub struct StereoReport {
     pub quality_over_performance: f64,
 }
 
-/// Measures.
+/// Measures every preset.
 ///
 /// # Errors
-/// When the pictures do not fit, or the engine refuses them.
+/// When the images do not fit, or the engine refuses them.
 pub fn run(
-    left: &Picture,
-    right: &Picture,
+    left: &Image,
+    right: &Image,
     plan: Plan,
-    mut told: impl FnMut(&str, u64, u64),
+    mut on_progress: impl FnMut(&str, u64, u64),
 ) -> Result<StereoReport> {
     left.fits(right)?;
     let mut conditions = Conditions::now();
     let pair = StereoPair::new(left.gray(), right.gray());
-    let (width, height) = (pair.left.width, pair.left.height);
+    let width = pair.left.width;
+    let height = pair.left.height;
     let mut matchers = Vec::new();
     for preset in Preset::ALL {
         let parameters = Parameters::preset(preset, plan.max_disparity);
@@ -82,13 +83,15 @@ pub fn run(
     let mut rounds: Vec<Vec<(f64, f64)>> = vec![Vec::new(); matchers.len()];
     let mut filled = vec![0.0; matchers.len()];
     for round in 0..=plan.rounds {
-        told("pairs", round as u64, plan.rounds as u64);
+        on_progress("pairs", round as u64, plan.rounds as u64);
         for (i, matcher) in matchers.iter_mut().enumerate() {
-            let (cpu, start) = (process_cpu_ns(), HostTime::now());
+            let cpu = process_cpu_ns();
+            let start = HostTime::now();
             matcher.run(&pair, &mut map)?;
-            let (cpu, wall) = (process_cpu_ns() - cpu, HostTime::now().since_ns(start));
+            let cpu = process_cpu_ns() - cpu;
+            let wall = HostTime::now().since_ns(start);
             filled[i] = 100.0 * map.fill();
-            // The first touches memory that was never touched.
+            // The first pair touches fresh memory and is not counted.
             if round > 0 {
                 rounds[i].push((cpu as f64 / 1e6, wall as f64 / 1e6));
             }
@@ -122,7 +125,7 @@ fn median(mut values: Vec<f64>) -> f64 {
     super::stats::quantile(&values, 0.5).unwrap_or(f64::NAN)
 }
 
-/// Promises about stereo. What it costs beside others needs them: tests/peers/stereo.py.
+/// Promises about stereo; tests/peers/stereo.py compares it with other libraries.
 pub fn bars(report: &StereoReport) -> [Bar; 1] {
     [Bar {
         promise: "performance is faster than quality: at least 2.5 times",
@@ -131,7 +134,7 @@ pub fn bars(report: &StereoReport) -> [Bar; 1] {
     }]
 }
 
-/// For people.
+/// Formats the report as text.
 pub fn text(report: &StereoReport) -> String {
     let rows = report.costs.iter().map(|c| {
         let ms = |v: f64| format!("{v:.1}");
@@ -162,8 +165,8 @@ pub fn text(report: &StereoReport) -> String {
     lines.join("\n")
 }
 
-/// A made pair: noise on planes that stand at several distances, and what a sensor adds.
-pub fn made(width: usize, height: usize, max_disparity: usize) -> [Picture; 2] {
+/// Generates a synthetic pair: noise on planes at several distances, with sensor noise.
+pub fn synthetic_pair(width: usize, height: usize, max_disparity: usize) -> [Image; 2] {
     let mut state = 0x9e37_79b9_7f4a_7c15_u64;
     let mut next = move || {
         state ^= state << 13;
@@ -172,7 +175,7 @@ pub fn made(width: usize, height: usize, max_disparity: usize) -> [Picture; 2] {
         (state >> 40) as u8
     };
     let margin = max_disparity + 8;
-    // Noise, made smoother along the row, as pictures are.
+    // Noise, made smoother along the row, as images are.
     let mut texture: Vec<u8> = (0..(width + margin) * height).map(|_| next()).collect();
     for row in texture.chunks_exact_mut(width + margin) {
         for x in 1..row.len() {
@@ -195,5 +198,5 @@ pub fn made(width: usize, height: usize, max_disparity: usize) -> [Picture; 2] {
             }
         }
     }
-    [left, right].map(|pixels| Picture::made(pixels, width, height))
+    [left, right].map(|pixels| Image::new(pixels, width, height))
 }

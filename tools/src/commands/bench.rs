@@ -1,9 +1,9 @@
-//! `depthrig bench`: measures what depthrig promises about speed.
+//! `depthrig bench`: measures performance and checks it against depthrig's promises.
 
 use crate::bench::bus::{self, Plan, report};
 use crate::bench::capture;
 use crate::bench::stereo;
-use crate::commands::stereo::Picture;
+use crate::commands::stereo::Image;
 use crate::context::Context;
 use crate::exit::Exit;
 use crate::out;
@@ -18,127 +18,127 @@ use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Every ratio is taken inside one run, with both sides taking turns, so that it holds on a busy machine too.
+Every ratio is measured within one run, alternating between both sides, so that it holds on a busy machine.
 
 Examples:
   depthrig bench bus             about three minutes
-  depthrig bench bus --quick     half a minute, to see that it works
-  depthrig bench bus --check     exit code 1 when a promise is not kept
+  depthrig bench bus --quick     half a minute, as a smoke test
+  depthrig bench bus --check     exit code 1 if a promise is not kept
   depthrig bench record --json
   depthrig bench capture --port 1-2 --check
   depthrig bench stereo --check
-  depthrig bench soak --check    ten minutes of recording as fast as it goes; 12 GB of disk, removed again";
+  depthrig bench soak --check    ten minutes of recording at full speed; 12 GB of disk, deleted afterwards";
 
-/// What to measure.
+/// Subcommands of `depthrig bench`.
 #[derive(Debug, clap::Subcommand)]
 pub enum BenchCommand {
-    /// Sending a frame: latency, copies, CPU, and what bad subscribers do to a publisher
+    /// Measure the bus: latency, copies, CPU, effect of bad subscribers
     Bus(BenchArgs),
-    /// Recording seven cameras at 5 Hz: CPU, lost sets, and how fast the writer can be
+    /// Measure recording seven cameras at 5 Hz: CPU, lost sets, writer throughput
     Record(RecordArgs),
-    /// Taking pictures from a camera at the kernel's nodes: CPU beside a bare loop, and copies
+    /// Measure V4L2 capture from a camera: CPU against a bare loop, and copies
     Capture(CaptureArgs),
-    /// Stereo: what a pair costs with each preset
+    /// Measure stereo matching: CPU time per pair with each preset
     Stereo(StereoArgs),
-    /// A long recording, faster than real time: memory must stay where it is and every set be accounted for
+    /// Run a long recording at full speed: constant memory, every set accounted for
     Soak(SoakArgs),
 }
 
-/// How much, and in which form.
+/// Options of every benchmark.
 #[derive(Debug, clap::Args)]
 pub struct BenchArgs {
-    /// Measure briefly; the numbers are rough
+    /// Measure briefly, with rough numbers
     #[arg(long)]
     quick: bool,
     /// Print JSON
     #[arg(long)]
     json: bool,
-    /// End with exit code 1 when a promise is not kept
+    /// Exit with code 1 if a promise is not kept
     #[arg(long)]
     check: bool,
 }
 
-/// How to record.
+/// Options of `bench record`.
 #[derive(Debug, clap::Args)]
 pub struct RecordArgs {
-    /// Where datasets are written and removed again; the disk that you will record to
+    /// Folder for temporary datasets, on the disk used for recordings
     #[arg(long, value_name = "DIR")]
     dir: Option<PathBuf>,
-    /// Record these pictures instead of made ones (8-bit PNG or JPEG for colour, 16-bit PNG for depth)
+    /// Record the images in DIR (PNG, JPEG; depth: 16-bit PNG) [default: generated]
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
-    /// How long to record
+    /// Recording time, seconds
     #[arg(long, value_name = "N", default_value = "10", value_parser = crate::args::positive_seconds)]
     seconds: f64,
-    /// How much, and in which form
+    /// Options of every benchmark.
     #[command(flatten)]
     bench: BenchArgs,
 }
 
-/// Which camera, and what of it.
+/// Options of `bench capture`.
 #[derive(Debug, clap::Args)]
 pub struct CaptureArgs {
-    /// The camera's serial number; without it and --port, the only one there is
+    /// Serial number of the camera [default: the only one attached]
     #[arg(long)]
     serial: Option<String>,
-    /// The camera's port, as `depthrig cameras` shows it
+    /// USB port of the camera, as `depthrig cameras` lists it
     #[arg(long)]
     port: Option<String>,
-    /// Pixels per row
+    /// Image width, pixels
     #[arg(long, default_value_t = 1280, value_parser = clap::value_parser!(u32).range(1..=16_384))]
     width: u32,
-    /// Rows
+    /// Image height, pixels
     #[arg(long, default_value_t = 720, value_parser = clap::value_parser!(u32).range(1..=16_384))]
     height: u32,
-    /// Frame rate
+    /// Frame rate, Hz
     #[arg(long, value_name = "HZ", default_value_t = 30.0, value_parser = crate::args::rate_hz)]
     rate_hz: f64,
-    /// How much, and in which form
+    /// Options of every benchmark.
     #[command(flatten)]
     bench: BenchArgs,
 }
 
-/// What to match, and how often.
+/// Options of `bench stereo`.
 #[derive(Debug, clap::Args)]
 pub struct StereoArgs {
-    /// The left picture of a rectified pair; without it a made pair of 1280x720
+    /// Left image of a rectified pair [default: a generated pair of 1280x720]
     #[arg(long, value_name = "FILE", requires = "right")]
     left: Option<PathBuf>,
-    /// The right picture
+    /// Right image
     #[arg(long, value_name = "FILE", requires = "left")]
     right: Option<PathBuf>,
-    /// Disparities to search, pixels
+    /// Disparity search range, pixels
     #[arg(long, value_name = "N", default_value_t = 128, value_parser = clap::value_parser!(u16).range(1..=256))]
     max_disparity: u16,
-    /// Threads of a matcher
+    /// Threads per matcher
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64))]
     threads: u16,
-    /// Pairs with each preset
+    /// Pairs per preset; at most 3 with --quick
     #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u16).range(1..=10_000))]
     rounds: u16,
-    /// How much, and in which form; --quick is three rounds
+    /// Options of every benchmark; `--quick` measures three rounds.
     #[command(flatten)]
     bench: BenchArgs,
 }
 
-/// How long to record.
+/// Options of `bench soak`.
 #[derive(Debug, clap::Args)]
 pub struct SoakArgs {
-    /// Where the dataset is written and removed again
+    /// Folder for the temporary dataset
     #[arg(long, value_name = "DIR")]
     dir: Option<PathBuf>,
-    /// Record these pictures instead of made ones (8-bit PNG or JPEG for colour, 16-bit PNG for depth)
+    /// Record the images in DIR (PNG, JPEG; depth: 16-bit PNG) [default: generated]
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
-    /// Recorded time, at 5 sets a second
+    /// Recorded time at 5 sets per second, seconds; at most 300 with --quick
     #[arg(long, value_name = "SECONDS", default_value = "600", value_parser = crate::args::positive_seconds)]
     seconds: f64,
-    /// How much, and in which form; --quick is five minutes of small pictures
+    /// Options of every benchmark; `--quick` records five minutes of small images.
     #[command(flatten)]
     bench: BenchArgs,
 }
 
-/// Runs a bench.
+/// Runs a benchmark.
 pub fn run(command: &BenchCommand, context: &Context) -> Result<Exit> {
     match command {
         BenchCommand::Bus(args) => run_bus(args, context),
@@ -153,9 +153,9 @@ fn run_capture(args: &CaptureArgs, context: &Context) -> Result<Exit> {
     let folder = crate::context::private_folder()?;
     let runtime = RuntimeDir::at(folder.path())?;
     let camera = V4l2Config { serial: args.serial.clone(), port: args.port.clone(), ..V4l2Config::default() };
-    let (pictures, warm_up, rounds) = if args.bench.quick { (20, 10, 1) } else { (150, 30, 5) };
+    let (images, warm_up, rounds) = if args.bench.quick { (20, 10, 1) } else { (150, 30, 5) };
     let size = (args.width, args.height);
-    let plan = capture::Plan { camera, size, rate_hz: args.rate_hz, pictures, warm_up, rounds };
+    let plan = capture::Plan { camera, size, rate_hz: args.rate_hz, images, warm_up, rounds };
     let mut progress = Progress::new(context.global.quiet > 0);
     let result = capture::run(&runtime, &plan, |what, done, total| progress.set(what, done, total))?;
     progress.clear();
@@ -171,8 +171,8 @@ fn run_capture(args: &CaptureArgs, context: &Context) -> Result<Exit> {
 fn run_stereo(args: &StereoArgs, context: &Context) -> Result<Exit> {
     let max_disparity = usize::from(args.max_disparity);
     let [left, right] = match (&args.left, &args.right) {
-        (Some(left), Some(right)) => Picture::pair(left, right)?,
-        _ => stereo::made(1280, 720, max_disparity),
+        (Some(left), Some(right)) => Image::pair(left, right)?,
+        _ => stereo::synthetic_pair(1280, 720, max_disparity),
     };
     let rounds = if args.bench.quick { args.rounds.min(3) } else { args.rounds }.into();
     let plan = stereo::Plan { max_disparity, threads: args.threads.into(), rounds };
@@ -238,7 +238,7 @@ fn run_soak(args: &SoakArgs, context: &Context) -> Result<Exit> {
     if args.bench.quick {
         (options.width, options.height) = (160, 120);
         options.recorded_s = options.recorded_s.min(300.0);
-        // As many segments as the long form has, and as little on its way to the disk beside what is recorded.
+        // As many segments and as small a share of unwritten data as in the long form.
         (options.recorder.segment_max_ns, options.backlog_bytes) = (20_000_000_000, 1 << 20);
     }
     let mut progress = Progress::new(context.global.quiet > 0);
@@ -315,7 +315,7 @@ fn soak_text(report: &SoakReport, bars: &[report::Bar]) -> String {
 /// The computer, in a line.
 fn conditions(c: &Conditions) -> String {
     let warning = if c.optimised { "" } else { "; DEBUG BUILD, numbers mean nothing" };
-    format!("{} x {}, load average {} before; {}{warning}", c.cores, c.cpu, c.load, c.pictures)
+    format!("{} x {}, load average {} before; {}{warning}", c.cores, c.cpu, c.load, c.images)
 }
 
 /// Promises about recording.
@@ -342,7 +342,8 @@ fn record_bars(report: &BenchReport) -> Vec<report::Bar> {
 }
 
 fn record_text(report: &BenchReport, bars: &[report::Bar]) -> String {
-    let (options, steady) = (&report.options, &report.steady);
+    let options = &report.options;
+    let steady = &report.steady;
     let mut lines = vec![
         conditions(&report.conditions),
         format!(

@@ -1,4 +1,4 @@
-//! `depthrig cameras`: what is attached.
+//! `depthrig cameras`: lists the attached cameras.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -12,43 +12,45 @@ use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-A camera that is in use is listed with who has it, and left alone. What it says of itself comes from the running rig.
-Exit code 3 when a camera cannot be used, or something could not be asked.
+A camera that is in use is listed with the process that holds it, and not opened; its data comes from the running rig.
+Exit code 3 if a camera cannot be used or could not be queried.
 
 Examples:
   depthrig cameras
-  depthrig cameras --modes D435        what can be written into [[camera.stream]]
+  depthrig cameras --modes D435        possible entries of [[camera.stream]]
   depthrig cameras --reset 012345678901
   depthrig cameras --json | jq '.cameras[] | {model, serial, port, state}'";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct CamerasArgs {
-    /// Show the cameras whose model, serial number or port has this in it
+    /// Show only cameras whose model, serial number or port contains PART
     #[arg(value_name = "PART")]
     only: Option<String>,
-    /// Show the modes of each
+    /// Show the modes of each camera
     #[arg(long)]
     modes: bool,
-    /// Show nodes, formats and controller of each
+    /// Show device nodes, formats and USB controller of each camera
     #[arg(long)]
     nodes: bool,
-    /// Restart the RealSense D400 with this serial number, also one that is in use; its rig sees it go and come back
+    /// Restart the RealSense D400 with this serial number, even while in use
     #[arg(long, value_name = "SERIAL", conflicts_with_all = ["only", "modes", "nodes", "json"])]
     reset: Option<String>,
     /// Print JSON
     #[arg(long)]
     json: bool,
-    /// The folder that /sys, /proc and /dev are in
+    /// Folder that contains /sys, /proc and /dev
     #[arg(long, value_name = "DIR", default_value = "/", hide = true)]
     sys_root: PathBuf,
 }
 
-/// Looks and tells.
+/// Lists the cameras, or resets one.
 pub fn run(args: &CamerasArgs, context: &Context) -> Result<Exit> {
     if let Some(serial) = &args.reset {
         let camera = RealsenseBackend::new(RealsenseConfig::default()).reset(Some(serial))?;
-        let (model, serial, port) = (camera.model, camera.serial, camera.port);
+        let model = camera.model;
+        let serial = camera.serial;
+        let port = camera.port;
         out::line(format_args!("{model} {serial} at USB port {port} restarts and is back in some seconds"))?;
         return Ok(Exit::Good);
     }
@@ -120,7 +122,7 @@ fn text(attached: &Attached, args: &CamerasArgs, width: usize) -> String {
     lines.join("\n")
 }
 
-/// One line a camera; of the columns as many as fit.
+/// A table with one camera per line and as many columns as fit.
 fn table(cameras: &[AttachedCamera], width: usize) -> String {
     let or_dash = |text: &Option<String>| text.clone().unwrap_or_else(|| "-".to_owned());
     let header = ["model", "serial", "port", "USB", "state", "backend", "calibration", "firmware"];
@@ -136,7 +138,6 @@ fn table(cameras: &[AttachedCamera], width: usize) -> String {
             or_dash(&c.firmware),
         ]
     };
-    // Who has it and how it is attached come first.
     let with = |columns: usize| {
         let rows = cameras.iter().map(|c| row(c).into_iter().take(columns).collect());
         out::table(header.get(..columns).unwrap_or(&header), usize::MAX, rows)

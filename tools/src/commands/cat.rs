@@ -1,4 +1,4 @@
-//! `depthrig cat`: single frames of a dataset, listed or written as picture files.
+//! `depthrig cat`: lists frames of a dataset or writes them as image files.
 
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
@@ -18,21 +18,21 @@ use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Without --out the frames are listed: a line each, with --json an object each with all numbers of the header.
-With --out DIR each frame becomes a file DIR/CAM/STREAM/SET.png (.npy, .jpg), and DIR/frames.csv tells set,
-times, counters and depth unit of each. DIR is new or empty; a list named frames.csv.part was not finished.
+Without --out the frames are listed, one per line; with --json as one object per frame with all header fields.
+With --out DIR each frame becomes a file DIR/CAM/STREAM/SET.png (.npy, .jpg), and DIR/frames.csv lists set,
+times, counters and depth unit of each. DIR is new or empty; a list named frames.csv.part is unfinished.
 
-A moment T is a number of seconds after the first set, or a time such as 2026-11-21T10:15:03.2Z.
-PNG is 8 or 16 bits; depth is in the camera's units (times depth_unit_m of frames.csv gives metres; 0 is no
-depth). NPY is the array as the camera's channel carried it. Without --format each stream gets PNG, or NPY
-where a PNG would lose bits (depth_f32, yuyv, uyvy, nv12).
+A time T is a number of seconds after the first set, or a date and time such as 2026-11-21T10:15:03.2Z.
+PNG has 8 or 16 bits; depth is in the camera's units (multiply by depth_unit_m of frames.csv for metres; 0 is
+no depth). NPY is the array as published on the channel. Without --format each stream becomes PNG, or NPY
+where PNG would lose bits (depth_f32, yuyv, uyvy, nv12).
 
-A motion unit (--stream zed2i/imu) has samples and no pictures: without --out they are printed as CSV (--json: an object
-each), with --out DIR they become DIR/CAM/imu.csv, or .npy, an array of records, with --format npy. The columns are the
-set that they came with, UTC, the time on the host's monotonic clock and on the unit's, number, uncertainty,
-rotation in rad/s, acceleration in m/s2, temperature and flags; what a sample does not have is empty (NaN in NPY).
+An IMU (--stream zed2i/imu) has samples instead of images: without --out they are printed as CSV (--json: one object
+each), with --out DIR they are written to DIR/CAM/imu.csv, or with --format npy to .npy as a record array. Columns: the
+set they belong to, UTC, host monotonic time, device time, number, uncertainty, angular velocity in rad/s, acceleration
+in m/s2, temperature and flags; a missing value is empty (NaN in NPY).
 
-Exit codes: 0 all, 1 failed, 2 wrong usage, 3 written, but some frames of the dataset could not be read.
+Exit codes: 0 success, 1 failure, 2 wrong usage, 3 written, but some frames of the dataset could not be read.
 
 Examples:
   depthrig cat data/20261121_1015_kitchen | head
@@ -44,49 +44,49 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct CatArgs {
-    /// The dataset's folder, or one segment
+    /// Dataset folder, or one segment file
     dataset: PathBuf,
-    /// Only this stream (CAM/STREAM), or this motion unit; may be given several times
+    /// Only this stream or IMU; repeatable
     #[arg(long = "stream", value_name = "CAM/STREAM")]
     streams: Vec<StreamId>,
-    /// The set of this id
+    /// Only the set with this id
     #[arg(long, value_name = "ID", conflicts_with_all = ["from", "to", "at"])]
     set: Option<u64>,
-    /// The set nearest to this moment
+    /// Only the set nearest to this time
     #[arg(long, value_name = "T", conflicts_with_all = ["from", "to"])]
     at: Option<Moment>,
-    /// Sets from this moment on
+    /// Only sets from this time on
     #[arg(long, value_name = "T")]
     from: Option<Moment>,
-    /// Sets up to this moment
+    /// Only sets up to this time
     #[arg(long, value_name = "T")]
     to: Option<Moment>,
-    /// One of every N sets
+    /// Only every Nth set
     #[arg(long, value_name = "N", default_value = "1", value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
-    /// Form of the picture files
+    /// Format of the image files [default: png, or npy where PNG would lose bits]
     #[arg(long, value_enum, requires = "out")]
     format: Option<Form>,
-    /// New folder for the picture files
+    /// New folder for the image files
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Print JSON: without --out one object per frame and line
+    /// Print JSON; without --out one object per frame and line
     #[arg(long)]
     json: bool,
 }
 
-/// Form of the picture files.
+/// Format of the image files.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Form {
-    /// 8 or 16 bits, for what a PNG can hold
+    /// PNG of 8 or 16 bits
     Png,
-    /// NumPy arrays
+    /// NumPy array
     Npy,
-    /// The JPEG as it is stored
+    /// The stored JPEG, byte for byte
     Jpg,
 }
 
-/// Lists or writes.
+/// Lists or writes frames.
 pub fn run(args: &CatArgs, context: &Context) -> Result<Exit> {
     let dataset = Dataset::open(&args.dataset)?;
     let sets = match (args.set, args.at) {
@@ -114,19 +114,19 @@ pub fn run(args: &CatArgs, context: &Context) -> Result<Exit> {
     })
 }
 
-/// Lists or writes samples.
+/// Lists or writes IMU samples.
 fn motion(args: &CatArgs, dataset: &Dataset, units: &[StreamId], sets: SetChoice) -> Result<Exit> {
     let form = match args.format {
         None => MotionForm::Csv,
         Some(Form::Npy) => MotionForm::Npy,
         Some(Form::Png | Form::Jpg) => {
             return Err(
-                UsageError(format!("{} has no pictures; leave out --format or say npy", units[0])).into()
+                UsageError(format!("{} has no images; leave out --format or say npy", units[0])).into()
             );
         }
     };
     if args.every > 1 {
-        return Err(UsageError("--every chooses pictures; a motion unit is listed whole".into()).into());
+        return Err(UsageError("--every chooses images; an IMU is listed whole".into()).into());
     }
     let done = if let Some(dir) = &args.out {
         let stop = Stop::on_signals()?;
@@ -135,15 +135,14 @@ fn motion(args: &CatArgs, dataset: &Dataset, units: &[StreamId], sets: SetChoice
         if args.json {
             out::json(&done)?;
         } else {
-            let (samples, bytes) = (out::count(done.frames, "sample"), out::bytes(done.bytes));
+            let samples = out::count(done.frames, "sample");
+            let bytes = out::bytes(done.bytes);
             out::line(format_args!("{}: {samples}, {bytes}", dir.display()))?;
         }
         done
     } else {
         let [unit] = units else {
-            return Err(
-                UsageError("one motion unit at a time is listed; name a folder with --out".into()).into()
-            );
+            return Err(UsageError("one IMU at a time is listed; name a folder with --out".into()).into());
         };
         list_samples(args, dataset, unit, sets)?
     };
@@ -163,8 +162,8 @@ fn list_samples(args: &CatArgs, dataset: &Dataset, unit: &StreamId, sets: SetCho
     }
     let mut failed = None;
     let done = list_motion(dataset, unit, sets, &mut |row| {
-        let told = if args.json { out::json_line(&row) } else { out::line(row.csv()) };
-        match told {
+        let written = if args.json { out::json_line(&row) } else { out::line(row.csv()) };
+        match written {
             Ok(()) => ControlFlow::Continue(()),
             Err(e) => {
                 failed = Some(e);
@@ -184,14 +183,14 @@ fn list(args: &CatArgs, dataset: &Dataset, choice: &FrameChoice) -> Result<Frame
             "captured (UTC)",
             "device frame",
             "after tick",
-            "picture",
+            "image",
             "stored",
         ))?;
     }
     let mut failed = None;
     let done = list_frames(dataset, choice, &mut |row| {
-        let told = if args.json { out::json_line(&row) } else { out::line(text(&row)) };
-        match told {
+        let written = if args.json { out::json_line(&row) } else { out::line(text(&row)) };
+        match written {
             Ok(()) => ControlFlow::Continue(()),
             Err(e) => {
                 failed = Some(e);
@@ -203,7 +202,7 @@ fn list(args: &CatArgs, dataset: &Dataset, choice: &FrameChoice) -> Result<Frame
     failed.map_or(Ok(done), Err)
 }
 
-/// A row for people. Widths are fixed, because a table of a day's frames cannot wait for its widest row.
+/// A table row. Widths are fixed, so that rows are printed before all of them are known.
 fn text(row: &FrameRow) -> String {
     let late_ms = (row.capture_time_ns - row.tick_ns) as f64 / 1e6;
     columns(
@@ -229,10 +228,10 @@ fn columns(
     time: &str,
     frame: &str,
     offset: &str,
-    picture: &str,
+    image: &str,
     stored: &str,
 ) -> String {
-    format!("{set:>7}  {stream:<20}  {time:<23}  {frame:>12}  {offset:>11}  {picture:<21}  {stored}")
+    format!("{set:>7}  {stream:<20}  {time:<23}  {frame:>12}  {offset:>11}  {image:<21}  {stored}")
 }
 
 fn export(args: &CatArgs, context: &Context, dataset: &Dataset, choice: &FrameChoice) -> Result<FramesDone> {
@@ -266,7 +265,7 @@ fn export(args: &CatArgs, context: &Context, dataset: &Dataset, choice: &FrameCh
     Ok(done)
 }
 
-/// What was asked for cannot be done, or only with other words: exit code 2.
+/// Turns an error about the input into a usage error (exit code 2).
 fn usage(e: depthrig_recorder::Error) -> anyhow::Error {
     use depthrig_recorder::ErrorKind;
     match e.kind() {

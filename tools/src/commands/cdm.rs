@@ -1,4 +1,4 @@
-//! `depthrig cdm`: camera depth models, and refined depth of pictures and datasets.
+//! `depthrig cdm`: camera depth models, and refined depth of images and datasets.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -12,9 +12,9 @@ pub mod store;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-docs/cdm.md tells the way from a downloaded checkpoint to a policy that reads refined depth.
+docs/cdm.md shows the steps from a downloaded checkpoint to a policy that reads refined depth.
 
-Exit codes: 0 good, 1 failed, 2 wrong usage or configuration.
+Exit codes: 0 success, 1 failure, 2 wrong usage or configuration.
 
 Examples:
   depthrig cdm fetch cdm-d435
@@ -23,30 +23,30 @@ Examples:
   depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.001 --model cdm-d435 --out refined.npy
   depthrig cdm relabel data/kitchen data/kitchen_cdm";
 
-/// What to do.
+/// Subcommands of `depthrig cdm`.
 #[derive(Debug, clap::Subcommand)]
 pub enum CdmCommand {
-    /// Install a checkpoint, all of which is verified
+    /// Verify and install a checkpoint
     #[command(after_help = store::IMPORT_EXAMPLES)]
     Import(store::ImportArgs),
-    /// Fetch a published model and install it; what was cut goes on where it ended
+    /// Download and install a published model; resumes an interrupted download
     #[command(after_help = fetch::EXAMPLES)]
     Fetch(fetch::FetchArgs),
-    /// List the installed models, or the published ones
+    /// List the installed or the published models
     #[command(after_help = store::LIST_EXAMPLES)]
     List(store::ListArgs),
-    /// Say where a model came from and what it wants
+    /// Show a model's origin and settings
     #[command(after_help = store::INFO_EXAMPLES)]
     Info(store::InfoArgs),
-    /// Remove an installed model; who uses it keeps it until they let go
+    /// Remove an installed model; running processes keep it until they exit
     Remove(store::RemoveArgs),
-    /// Refine the depth of one pair of pictures
+    /// Refine the depth of one colour and depth image
     #[command(after_help = run::EXAMPLES)]
     Run(run::RunArgs),
-    /// Measure how fast each engine refines, and with what memory
+    /// Measure speed and memory of each engine
     #[command(after_help = bench::EXAMPLES)]
     Bench(bench::BenchArgs),
-    /// Give a dataset refined depth, in a copy of it
+    /// Copy a dataset and add refined depth to the copy
     #[command(after_help = relabel::EXAMPLES)]
     Relabel(relabel::RelabelArgs),
 }

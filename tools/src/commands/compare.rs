@@ -1,4 +1,4 @@
-//! `depthrig compare`: whether two datasets hold the same.
+//! `depthrig compare`: compares two datasets.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -16,9 +16,9 @@ use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Sets are matched by their tick and streams by their name; segments, packing and the order in a set do not
-count. Nor does what a replay changes: sequence, captured, set ids, the flag `replayed`, the place in UTC;
---strict compares these as well.
+Sets are matched by tick and streams by name; segments, packing and the order within a set are ignored. So are
+the fields that a replay changes: sequence, captured, set ids, the flag `replayed`, the offset to UTC; --strict
+compares these as well.
 
 Exit codes: 0 equal, 1 different (or a dataset cannot be opened), 2 wrong usage.
 
@@ -30,17 +30,17 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct CompareArgs {
-    /// A dataset's folder, or one segment
+    /// First dataset folder or segment file
     a: PathBuf,
-    /// Another one
+    /// Second dataset folder or segment file
     b: PathBuf,
-    /// How to compare pixels
+    /// Comparison of pixels
     #[arg(long, value_enum, default_value = "exact", value_name = "HOW")]
     pixels: Pixels,
-    /// Compare what a replay changes as well
+    /// Also compare the fields that a replay changes
     #[arg(long)]
     strict: bool,
-    /// Differences to list one by one
+    /// Number of differences to list
     #[arg(long, value_name = "N", default_value = "20")]
     list: usize,
     /// Print JSON
@@ -48,20 +48,21 @@ pub struct CompareArgs {
     json: bool,
 }
 
-/// How to compare pixels.
+/// Comparison of pixels.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Pixels {
-    /// As a replay would publish them, bit by bit
+    /// Decoded, bit by bit
     Exact,
     /// As stored: codec and bytes
     Stored,
-    /// Not at all; no picture is read
+    /// Not compared; no image is read
     None,
 }
 
 /// Compares and reports.
 pub fn run(args: &CompareArgs, context: &Context) -> Result<Exit> {
-    let (a, b) = (Dataset::open(&args.a)?, Dataset::open(&args.b)?);
+    let a = Dataset::open(&args.a)?;
+    let b = Dataset::open(&args.b)?;
     let pixels = match args.pixels {
         Pixels::Exact => PixelCheck::Exact,
         Pixels::Stored => PixelCheck::Stored,
@@ -80,7 +81,7 @@ pub fn run(args: &CompareArgs, context: &Context) -> Result<Exit> {
     })?;
     bar.clear();
     if stop.is_asked() {
-        bail!("the comparison was ended after {} sets", comparison.sets);
+        bail!("interrupted after comparing {} sets", comparison.sets);
     }
     if args.json {
         out::json(&comparison)?;
@@ -90,7 +91,7 @@ pub fn run(args: &CompareArgs, context: &Context) -> Result<Exit> {
     Ok(if comparison.equal { Exit::Good } else { Exit::Failed })
 }
 
-/// The comparison for people.
+/// Describes the comparison as text.
 fn text(c: &Comparison) -> String {
     let pixels = match c.pixels {
         PixelCheck::Exact => "pixels bit by bit",

@@ -1,4 +1,4 @@
-//! `depthrig completions`: completions for a shell.
+//! `depthrig completions`: prints shell completions.
 
 use crate::exit::Exit;
 use anyhow::Result;
@@ -14,7 +14,7 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct CompletionsArgs {
-    /// The shell
+    /// Shell
     shell: Shell,
 }
 

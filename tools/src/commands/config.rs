@@ -13,21 +13,21 @@ use std::path::PathBuf;
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
 Examples:
-  depthrig config show > rig.toml    the commented default: seven synthetic cameras
-  depthrig config show paper         the rig of the paper: seven real cameras, ten depth modes
-  depthrig config check rig.toml     every problem with its line; exit code 2 when there is one";
+  depthrig config show > rig.toml    commented default: seven synthetic cameras
+  depthrig config show paper         rig of the paper: seven real cameras, ten depth modes
+  depthrig config check rig.toml     list every problem with its line; exit code 2 if there are any";
 
-/// What to do.
+/// Subcommands of `depthrig config`.
 #[derive(Debug, clap::Subcommand)]
 pub enum ConfigCommand {
-    /// Say whether a file is a configuration that can run, or every reason why not
+    /// Check a configuration file and list every problem
     Check {
-        /// The configuration
+        /// Configuration file
         file: PathBuf,
     },
     /// Print a commented configuration
     Show {
-        /// "default" runs as it is; "paper" is for the seven real cameras of the paper's mount
+        /// Configuration to print
         #[arg(value_enum, default_value = "default")]
         which: Shown,
     },
@@ -36,9 +36,9 @@ pub enum ConfigCommand {
 /// A configuration that comes with depthrig.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum Shown {
-    /// Seven synthetic cameras.
+    /// Seven synthetic cameras; runs as it is
     Default,
-    /// The seven cameras of the paper.
+    /// The paper's seven real cameras
     Paper,
 }
 
@@ -49,7 +49,7 @@ pub fn run(command: &ConfigCommand) -> Result<Exit> {
         ConfigCommand::Show { which: Shown::Paper } => out::line(RigConfig::paper_text().trim_end())?,
         ConfigCommand::Check { file } => {
             let config = RigConfig::load(file).map_err(depthrig_daemon::Error::from)?;
-            // Pictures are part of what must be right, and cost little to look at; cameras may be unplugged now.
+            // Checks input files, but no attached cameras: those may be unplugged at this time.
             for camera in &config.cameras {
                 let found = match &camera.backend {
                     BackendConfig::Files(settings) => FilesBackend::new(settings.clone()).discover(),

@@ -1,4 +1,4 @@
-//! `depthrig demo`: the whole way of a frame once, with synthetic cameras, or with those of a rig file.
+//! `depthrig demo`: runs the full pipeline once, with synthetic cameras or those of a rig file.
 
 use crate::commands::run::{self, Started};
 use crate::context::{Context, private_folder};
@@ -28,27 +28,27 @@ use std::path::{Path, PathBuf};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-It needs no camera and no daemon, and leaves a running one alone.
+The demo needs no camera and no daemon, and does not disturb a running one.
 
 Examples:
   depthrig demo
   depthrig demo --seconds 60 --out /data/demo
   depthrig demo --json | jq .replay
-  depthrig demo --config rig.toml      the cameras of a rig file instead; `make demo` makes one with recordings";
+  depthrig demo --config rig.toml      cameras of a rig file; `make demo` creates one with recordings";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct DemoArgs {
-    /// How long to record
+    /// Recording time, seconds
     #[arg(long, value_name = "N", default_value = "10", value_parser = crate::args::positive_seconds)]
     seconds: f64,
-    /// A new folder for the dataset, the pictures and the report [default: demo-data/DATE_TIME]
+    /// New folder for dataset, images and report [default: demo-data/DATE_TIME]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// A rig file, instead of seven simulated cameras
+    /// Rig configuration [default: seven synthetic cameras]
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Print everything as JSON
+    /// Print the result as JSON
     #[arg(long)]
     json: bool,
 }
@@ -61,7 +61,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
     let stop = Stop::on_signals()?;
     let folder = args.out.clone().unwrap_or_else(default_folder);
     if folder.join(DATASET).exists() {
-        bail!("{}: there is a dataset already; name another folder with --out", folder.display());
+        bail!("{}: a dataset exists already; name another folder with --out", folder.display());
     }
     let keep = Overwrite { overwrite: false };
     let contact_sheet = OutFile::new(&folder.join("contact-sheet.png"), keep, &[])?;
@@ -93,7 +93,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
         .iter()
         .filter_map(|c| Some(on_sheet(c, recorded.seen.shots.get(&c.name)?, &untrained)))
         .collect();
-    contact_sheet.write(&crate::picture::png(&sheet::contact_sheet(&cameras))?)?;
+    contact_sheet.write(&crate::image_file::png(&sheet::contact_sheet(&cameras))?)?;
     let report = DemoReport {
         start_s,
         stop_s: recorded.stop_s,
@@ -124,27 +124,27 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Exit> {
     Ok(report.exit())
 }
 
-/// Refined pictures of each camera a second: all seven share what the cores have left.
+/// Refined images per camera and second: all seven share the remaining CPU time.
 const REFINE_HZ: f64 = 2.0;
 
-/// The rig that the demo runs.
+/// Rig of the demo.
 struct Chosen {
     config: RigConfig,
-    /// Depth modes that are taken out of it, with the reason.
+    /// Depth modes that were removed from it, with the reason.
     unavailable: Vec<String>,
-    /// Depth modes whose network was never trained, as the name of its file says.
+    /// Depth modes with an untrained network, by its file name.
     untrained: Vec<String>,
 }
 
-/// The rig of `file`, else the default rig. Simulated cameras give their true depth and, by the engine that needs no model,
-/// refined depth as streams of their own that are not recorded.
+/// Loads the rig of `file`, else the default rig. Simulated cameras also publish true depth and, from the engine that
+/// needs no model, refined depth as streams that are not recorded.
 fn configuration(file: Option<&Path>) -> Result<Chosen> {
     let read = file.map_or_else(|| RigConfig::parse(RigConfig::default_text(), None), RigConfig::load);
     let mut config = read.map_err(depthrig_daemon::Error::from)?;
     for camera in &mut config.cameras {
         if let BackendConfig::Synthetic(settings) = &mut camera.backend {
             settings.truth = true;
-            // Where the rig names streams, those of the truth are among them, in the modes of what they are true of.
+            // If the rig lists streams, add the ground truth of each in the same mode.
             for (of, truth) in [("depth", "depth_true"), ("color", "depth_true_color")] {
                 if let Some(mode) = camera.streams.iter().find(|s| s.stream.as_str() == of).cloned() {
                     camera.streams.push(StreamRequest { stream: Name::new(truth)?, format: None, ..mode });
@@ -153,7 +153,7 @@ fn configuration(file: Option<&Path>) -> Result<Chosen> {
             camera.refine = Some(RefineConfig {
                 engine: EngineChoice::Fill,
                 rate_hz: REFINE_HZ,
-                // What it was before, in the same view.
+                // The raw depth in the same view.
                 align: true,
                 ..RefineConfig::default()
             });
@@ -166,15 +166,15 @@ fn configuration(file: Option<&Path>) -> Result<Chosen> {
     Ok(Chosen { config, unavailable, untrained })
 }
 
-/// Whether the file of the camera's stereo network says that it was never trained, as that of `make demo` does.
+/// Returns whether the camera's stereo network is untrained by its file name, as that of `make demo`.
 fn has_untrained_network(camera: &CameraConfig) -> bool {
     let network = camera.stereo.as_ref().and_then(|s| s.network.as_ref());
     let stem = network.and_then(|file| file.file_stem()).and_then(|stem| stem.to_str());
     stem.is_some_and(|stem| stem.starts_with("untrained"))
 }
 
-/// A camera of the contact sheet: colour, its depth modes in the view of colour where they are there, and filled depth. What an
-/// untrained network gives is left out: it would look like a broken camera.
+/// A row of the contact sheet: colour, the depth modes (in the view of colour if available) and filled depth. The
+/// output of an untrained network is left out: it would look like a defective camera.
 fn on_sheet<'a>(
     camera: &CameraStatus,
     shots: &'a BTreeMap<String, sheet::Shot>,
@@ -209,7 +209,7 @@ fn on_sheet<'a>(
     sheet::Camera { title, tiles }
 }
 
-/// Takes the mode of cameras' stereo that is a network out of a rig that has no library to run it; says so of each.
+/// Removes stereo modes that need a network from a rig without a library to run it, and notes each.
 fn without_library(config: &mut RigConfig) -> Vec<String> {
     let found = depthrig_cdm::find_library(config.cdm.library.as_deref(), "cpu", Precision::Fp32);
     let Err(why) = found else { return Vec::new() };
@@ -232,7 +232,7 @@ struct Recorded {
     summary: RigSummary,
 }
 
-/// Records for the time asked for with a subscriber beside it, and ends the rig.
+/// Records for the requested time with a subscriber attached, then stops the rig.
 fn record(
     rig: Rig,
     runtime: &RuntimeDir,
@@ -273,7 +273,7 @@ fn record(
     })?;
     if stop.is_asked() {
         rig.stop();
-        bail!("interrupted; what was recorded until then is in {}", folder.join(DATASET).display());
+        bail!("interrupted; the recording up to then is in {}", folder.join(DATASET).display());
     }
     rig.finish_reports(); // so that the time to stop is that of the rig
     let began = HostTime::now();
@@ -307,7 +307,7 @@ fn default_folder() -> PathBuf {
 mod tests {
     use super::*;
 
-    /// A computer without the library runs the other modes, and is told which one it does not run and why.
+    /// A computer without the library runs the other modes, and the report names the missing one with the reason.
     #[test]
     fn a_mode_without_its_library_is_taken_out_and_named() {
         let text = r#"

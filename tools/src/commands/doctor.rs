@@ -1,4 +1,4 @@
-//! `depthrig doctor`: a session before it begins.
+//! `depthrig doctor`: checks everything a session needs before it starts.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -13,11 +13,11 @@ use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Nothing is streamed, and a camera that is in use is left alone. The disk is written to for a second, in a file without
-a name, to learn its rate; --no-disk leaves that out.
+Nothing is streamed, and cameras in use are not opened. To measure the disk, doctor writes to an unnamed file for one
+second; --no-disk skips this.
 
-Exit codes: 0 nothing to do, 1 an error (the session does not run as the file has it), 2 the file is no configuration,
-3 a warning (it runs, but something may be lost).
+Exit codes: 0 ready, 1 an error (the session does not run as configured), 2 invalid configuration, 3 a warning (it runs,
+but something may be lost).
 
 Examples:
   depthrig doctor rig.toml
@@ -26,20 +26,20 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct DoctorArgs {
-    /// The rig's configuration
+    /// Rig configuration
     config: PathBuf,
-    /// Do not write to the disk of the recordings
+    /// Skip the write test of the recording disk
     #[arg(long)]
     no_disk: bool,
     /// Print JSON
     #[arg(long)]
     json: bool,
-    /// The folder that /sys, /proc and /dev are in
+    /// Folder that contains /sys, /proc and /dev
     #[arg(long, value_name = "DIR", default_value = "/", hide = true)]
     sys_root: PathBuf,
 }
 
-/// Examines and tells.
+/// Runs the checks and prints the findings.
 pub fn run(args: &DoctorArgs, context: &Context) -> Result<Exit> {
     let mut config = RigConfig::load(&args.config).map_err(depthrig_daemon::Error::from)?;
     if let Some(rig) = &context.global.rig {
@@ -89,7 +89,7 @@ fn text(r: &Report, style: Style) -> String {
         }),
     ));
     lines.push(String::new());
-    // A camera that could not be asked has no load that is known.
+    // The load of a camera that could not be queried is unknown.
     for l in r.links.iter().filter(|l| l.load_mbit_s > 0.0) {
         let share = 100.0 * l.load_mbit_s / l.plan_mbit_s;
         lines.push(format!(
@@ -144,7 +144,7 @@ fn finding(f: &Finding, style: Style) -> Vec<String> {
     lines
 }
 
-/// Streams on one line where there is room, else one a line.
+/// Lists streams on one line if they fit, else one per line.
 fn fold(streams: &[String], width: usize) -> String {
     streams.join(if width >= 110 { ", " } else { "\n" })
 }

@@ -1,4 +1,4 @@
-//! `depthrig edit`: changes what a dataset says of itself, with history.
+//! `depthrig edit`: changes a dataset's description, with history.
 
 use crate::exit::{Exit, UsageError};
 use crate::out;
@@ -11,8 +11,8 @@ use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Only session.toml changes: what was recorded stays as it was recorded. Each change is kept there with its time and \
-the value before it. Without an option the history is shown.
+Only session.toml changes, never the recorded data. It keeps each change with its time and the previous value. \
+Without an option the history is printed.
 
 Examples:
   depthrig edit data/20261121_1015_kitchen --scene \"kitchen, lamp on\" --note \"camera 3 was bumped at 04:10\"
@@ -22,18 +22,18 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct EditArgs {
-    /// The dataset's folder
+    /// Dataset folder
     dataset: PathBuf,
-    /// What was in front of the cameras; an empty text removes it
+    /// Set the scene label; an empty text removes it
     #[arg(long, value_name = "LABEL")]
     scene: Option<String>,
-    /// Who recorded it; an empty text removes it
+    /// Set the operator; an empty text removes it
     #[arg(long, value_name = "NAME")]
     operator: Option<String>,
-    /// Add a note; may be given several times
+    /// Add a note; repeatable
     #[arg(long = "note", value_name = "TEXT")]
     notes: Vec<String>,
-    /// Give the dataset and its folder another name
+    /// Rename the dataset and its folder
     #[arg(long, value_name = "NAME")]
     rename: Option<String>,
     /// Print JSON
@@ -41,7 +41,7 @@ pub struct EditArgs {
     json: bool,
 }
 
-/// What was changed, and everything that ever was.
+/// The new changes and the full history.
 #[derive(Serialize)]
 struct Edited {
     path: PathBuf,
@@ -49,7 +49,7 @@ struct Edited {
     history: Vec<Edit>,
 }
 
-/// Changes what was asked for, or shows the history.
+/// Applies the changes, or prints the history.
 pub fn run(args: &EditArgs) -> Result<Exit> {
     let changes = SessionChanges {
         scene: args.scene.clone(),
@@ -57,7 +57,8 @@ pub fn run(args: &EditArgs) -> Result<Exit> {
         notes: args.notes.clone(),
     };
     let asked = changes != SessionChanges::default() || args.rename.is_some();
-    let (mut path, mut changed) = (args.dataset.clone(), Vec::new());
+    let mut path = args.dataset.clone();
+    let mut changed = Vec::new();
     if asked {
         let usage = |e: depthrig_recorder::Error| match e.kind() {
             depthrig_recorder::ErrorKind::BadInput => anyhow::Error::new(UsageError(e.to_string())),
@@ -65,7 +66,7 @@ pub fn run(args: &EditArgs) -> Result<Exit> {
         };
         changed = edit(&RealFs, &path, &changes).map_err(usage)?;
         if let Some(name) = &args.rename {
-            // A path such as `.` has no name of its own.
+            // A path such as `.` has no file name.
             let (to, edits) = rename(&RealFs, &path.canonicalize()?, name).map_err(usage)?;
             changed.extend(edits);
             path = to;

@@ -1,4 +1,4 @@
-//! `depthrig eval`: how good depth is against a reference.
+//! `depthrig eval`: evaluates depth against a reference.
 
 use crate::context::Context;
 use crate::eval::dataset::FromDataset;
@@ -16,14 +16,14 @@ use std::path::{Path, PathBuf};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-INPUT is a depthrig dataset whose cameras know the truth, or a folder laid out as the HAMMER dataset; without it,
---truth names a folder of references and each --pred one of predictions, whose files have the same paths but for the
-ending (.png and .tiff of 16 bits, .tiff and .npy of metres).
+INPUT is a depthrig dataset with ground truth, or a folder in the layout of the HAMMER dataset. Without it, --truth
+names a folder of references and each --pred a folder of predictions with the same file paths except for the extension
+(.png and .tiff: 16 bits; .tiff and .npy: metres).
 
-Plain measures are over the pixels where both have depth. Strict ones are over all pixels whose reference counts: what
-is missing is a prediction of 0 m. The table has means over pictures; the page and --json have both means.
+Plain metrics use the pixels where both have depth. Strict metrics use all pixels with a valid reference and count
+missing depth as 0 m. The table has means over images; the HTML report and --json also pool all pixels.
 
-Exit codes: 0 compared, 1 nothing could be compared, 2 wrong usage, 3 some pictures could not be compared.
+Exit codes: 0 compared, 1 nothing could be compared, 2 wrong usage, 3 some images could not be compared.
 
 Examples:
   depthrig eval data/20261121_1015_kitchen
@@ -34,51 +34,51 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct EvalArgs {
-    /// A dataset with truth, or a folder laid out as HAMMER
+    /// Dataset with ground truth, or folder in the layout of HAMMER
     input: Option<PathBuf>,
-    /// What to compare, several times: a stream of the dataset, or a folder, as NAME=DIR or DIR
+    /// Stream of the dataset, or folder (NAME=DIR or DIR), to evaluate; repeatable
     #[arg(long, value_name = "STREAM|[NAME=]DIR")]
     pred: Vec<String>,
-    /// What to compare with: a stream of the dataset [default: depth_true_color, else depth_true], or a folder
+    /// Reference stream or folder [default: depth_true_color, else depth_true]
     #[arg(long, value_name = "STREAM|DIR")]
     truth: Option<String>,
-    /// Folder of colour pictures, to be shown beside the worst
+    /// Folder of colour images for the worst cases in the report
     #[arg(long, value_name = "DIR")]
     rgb: Option<PathBuf>,
-    /// Metres per unit of files with whole numbers
+    /// Metres per unit of integer depth files
     #[arg(long, value_name = "M", default_value_t = HAMMER_UNIT_M, value_parser = crate::args::depth_unit_m)]
     unit: f64,
-    /// The same for references [default: as --unit]
+    /// Metres per unit of integer reference files [default: as --unit]
     #[arg(long, value_name = "M", value_parser = crate::args::depth_unit_m)]
     truth_unit: Option<f64>,
-    /// Nearest reference that counts, metres [default: 0; of HAMMER 0.1]
+    /// Nearest valid reference, metres [default: 0; HAMMER: 0.1]
     #[arg(long, value_name = "M", value_parser = crate::args::distance_m)]
     min_m: Option<f64>,
-    /// Farthest reference that counts, metres [default: no limit; of HAMMER 6]
+    /// Farthest valid reference, metres [default: no limit; HAMMER: 6]
     #[arg(long, value_name = "M", value_parser = crate::args::distance_m)]
     max_m: Option<f64>,
-    /// Width of the bins of distance, metres; what is beyond 48 of them is in the last
+    /// Width of a distance bin, metres; the 48th holds everything beyond
     #[arg(long, value_name = "M", default_value = "0.25", value_parser = positive_metres)]
     bin_m: f64,
-    /// Write the page to this file [default: eval.html in the current folder]
+    /// HTML report to write [default: eval.html in the current folder]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
     #[command(flatten)]
     overwrite: Overwrite,
-    /// Print JSON instead of the table and writing a page (with --out, do both)
+    /// Print JSON instead of table and HTML report (with --out: both)
     #[arg(long)]
     json: bool,
-    /// Threads; all cores when not given
+    /// Threads [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
 }
 
-/// Bins of distance.
+/// Number of distance bins.
 const BINS: usize = 48;
-/// The page when nothing is said.
+/// Default path of the HTML report.
 const PAGE: &str = "eval.html";
 
-/// Reads a length above 0.
+/// Parses a length above 0.
 fn positive_metres(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(m) if m > 0.0 && m < 1e6 => Ok(m),
@@ -86,13 +86,17 @@ fn positive_metres(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Compares and reports.
+/// Evaluates and reports.
 pub fn run(args: &EvalArgs, context: &Context) -> Result<Exit> {
     let (mut source, limits, title) = source(args)?;
     let range =
         DepthRange { min_m: args.min_m.unwrap_or(limits.min_m), max_m: args.max_m.unwrap_or(limits.max_m) };
     if range.min_m.is_nan() || range.max_m.is_nan() || range.min_m > range.max_m {
-        return Err(UsageError(format!("{} m to {} m is no range of depth", range.min_m, range.max_m)).into());
+        let text = format!(
+            "invalid depth range {}..={} m; --min-m must not exceed --max-m",
+            range.min_m, range.max_m
+        );
+        return Err(UsageError(text).into());
     }
     let path = match (&args.out, args.json) {
         (Some(path), _) => Some(path.clone()),
@@ -133,7 +137,7 @@ pub fn run(args: &EvalArgs, context: &Context) -> Result<Exit> {
     Ok(if all { Exit::Good } else { Exit::Lost })
 }
 
-/// Where the pictures come from, which references count when nothing is said, and what to call it.
+/// Selects the source of the images, the default range of references, and its title.
 fn source(args: &EvalArgs) -> Result<(Box<dyn Source>, DepthRange, String)> {
     let truth_unit_m = args.truth_unit.unwrap_or(args.unit);
     let Some(input) = &args.input else {
@@ -144,7 +148,7 @@ fn source(args: &EvalArgs) -> Result<(Box<dyn Source>, DepthRange, String)> {
         return Ok((Box::new(files), DepthRange::ALL, truth.clone()));
     };
     let title = input.display().to_string();
-    // A folder that may not be listed is refused as a dataset is, with what makes it readable.
+    // A folder without read permission is refused like a dataset, with the cure.
     let is_closed = input.read_dir().is_err_and(|e| e.kind() == std::io::ErrorKind::PermissionDenied);
     if is_closed || input.join(depthrig_recorder::SESSION_FILE).is_file() || input.is_file() {
         let names = args.pred.iter().map(|p| stream(p)).collect::<Result<Vec<_>>>()?;
@@ -157,7 +161,7 @@ fn source(args: &EvalArgs) -> Result<(Box<dyn Source>, DepthRange, String)> {
 }
 
 fn stream(text: &str) -> Result<StreamName> {
-    StreamName::new(text).map_err(|e| UsageError(format!("{text} is no name of a stream: {e}")).into())
+    StreamName::new(text).map_err(|e| UsageError(format!("invalid stream name {text}: {e}")).into())
 }
 
 fn folders(args: &EvalArgs) -> Vec<Named> {
@@ -175,13 +179,13 @@ fn last_part(path: &str) -> &str {
 fn text(evaluation: &Evaluation) -> String {
     let mut header = vec!["PREDICTION"];
     header.extend(["L1", "RMSE", "AbsRel", "δ0.5", "δ1", "strict L1", "RMSE", "AbsRel", "δ0.5", "δ1"]);
-    header.extend(["missing %", "pictures"]);
+    header.extend(["missing %", "images"]);
     let row = |r: &Row| {
-        let m = &r.metrics.mean_of_pictures;
+        let m = &r.metrics.mean_of_images;
         let mut cells = vec![page::label(r)];
         cells.extend([false, true].iter().flat_map(|s| page::measures(m, *s)).map(|(_, v)| page::value(v)));
         cells.push(format!("{:.2}", m.missing_percent));
-        cells.push(r.metrics.pictures.to_string());
+        cells.push(r.metrics.images.to_string());
         cells
     };
     let mut text = out::table(&header, 1, evaluation.rows.iter().map(row));

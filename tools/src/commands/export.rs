@@ -1,4 +1,4 @@
-//! `depthrig export`: datasets in the layouts of others.
+//! `depthrig export`: exports datasets to other layouts.
 
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
@@ -17,40 +17,40 @@ mod lerobot;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-OUT is new. An export that was ended or killed goes on where it was when it is run again with the
-same datasets and options; the result is the same as without the interruption. Nothing is ever
-overwritten. OUT/export.json, written last, says what was exported and what was lost on the way;
+OUT is a new folder. Run the command again with the same datasets and options to resume an
+interrupted export; the result is the same as without the interruption. Nothing is ever
+overwritten. OUT/export.json, written last, lists what was exported and what was lost;
 docs/exchange.md describes each layout.
 
-Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage, 3 exported, but some sets,
-frames or pixels could not be.
+Exit codes: 0 success, 1 failed or interrupted, 2 wrong usage, 3 exported, but some sets, frames or
+pixels could not be.
 
 Examples:
   depthrig export bytecameradepth data/20261121_1015_kitchen paper
   depthrig export lerobot data/20261121_1015_kitchen lerobot/kitchen
   depthrig export lerobot data/* lerobot/all --task \"put the cup on the shelf\"";
 
-/// The layouts.
+/// Layouts to export to.
 #[derive(Debug, clap::Subcommand)]
 pub enum ExportCommand {
-    /// The folders of the public ByteCameraDepth dataset, with times and calibration
+    /// Export to the layout of ByteCameraDepth, with times and calibration
     #[command(after_help = bytecameradepth::EXAMPLES)]
     Bytecameradepth(bytecameradepth::Args),
-    /// LeRobot v3.0: each dataset is an episode, colour as JPEG or PNG, depth as TIFF
+    /// Export to LeRobot v3.0: an episode per dataset, JPEG/PNG colour, TIFF depth
     #[command(after_help = lerobot::EXAMPLES)]
     Lerobot(lerobot::Args),
 }
 
-/// What every export has.
+/// Options of every export.
 #[derive(Debug, clap::Args)]
 pub struct Common {
-    /// The datasets' folders
+    /// Dataset folders
     #[arg(required = true, value_name = "DATASET")]
     datasets: Vec<PathBuf>,
-    /// The new folder
+    /// New folder for the export
     #[arg(required = true)]
     out: PathBuf,
-    /// Parts of 100 sets that are worked on at once [default: one for each core]
+    /// Parts of 100 sets to process in parallel [default: one per core]
     #[arg(short = 'j', long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     jobs: Option<u16>,
     /// Print the report as JSON
@@ -58,7 +58,7 @@ pub struct Common {
     json: bool,
 }
 
-/// Exports.
+/// Runs the export.
 pub fn run(command: &ExportCommand, context: &Context) -> Result<Exit> {
     match command {
         ExportCommand::Bytecameradepth(args) => {
@@ -72,7 +72,7 @@ pub fn run(command: &ExportCommand, context: &Context) -> Result<Exit> {
     }
 }
 
-/// Runs an exporter, shows how far it is, and tells its report.
+/// Runs an exporter with a progress bar and prints its report.
 fn drive(exporter: &mut dyn Exporter, common: &Common, context: &Context) -> Result<Exit> {
     let dir = &common.out;
     let datasets = common.datasets.iter().map(|d| Dataset::open(d)).collect::<Result<Vec<_>, _>>()?;
@@ -91,7 +91,7 @@ fn drive(exporter: &mut dyn Exporter, common: &Common, context: &Context) -> Res
     if common.json {
         out::json(&report)?;
     } else if context.global.quiet == 0 {
-        tell(&report, dir)?;
+        print_report(&report, dir)?;
     }
     for problem in &report.problems {
         out::note(format_args!("lost: {problem}"));
@@ -103,10 +103,10 @@ fn drive(exporter: &mut dyn Exporter, common: &Common, context: &Context) -> Res
     })
 }
 
-fn tell(report: &ExportReport, dir: &std::path::Path) -> Result<()> {
+fn print_report(report: &ExportReport, dir: &std::path::Path) -> Result<()> {
     let dir = dir.display();
     if report.ended {
-        return out::line(format_args!("{dir}: ended; run it again to go on"));
+        return out::line(format_args!("{dir}: interrupted; run it again to resume"));
     }
     let resumed = match report.parts_resumed {
         0 => String::new(),
@@ -129,7 +129,7 @@ fn tell(report: &ExportReport, dir: &std::path::Path) -> Result<()> {
     Ok(())
 }
 
-/// What was asked for cannot be done, or only with other words: exit code 2.
+/// Turns an error about the input into a usage error (exit code 2).
 pub fn usage(e: depthrig_recorder::Error) -> anyhow::Error {
     match e.kind() {
         ErrorKind::BadInput => UsageError(e.to_string()).into(),

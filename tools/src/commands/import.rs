@@ -1,4 +1,4 @@
-//! `depthrig import`: what others recorded as a dataset.
+//! `depthrig import`: imports recordings of other programs as datasets.
 
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
@@ -21,11 +21,11 @@ use std::sync::Arc;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-OUT is a new dataset, verified at the end. What was assumed or inferred is told, and is in the table
-[import] of its session.toml; docs/exchange.md describes each layout.
+OUT is a new dataset, verified at the end. Assumptions are printed and stored in the table [import]
+of its session.toml; docs/exchange.md describes each layout.
 
-Exit codes: 0 all, 1 failed (also: no such recording) or ended before all was done, 2 wrong usage,
-3 imported, but some of the input could not be.
+Exit codes: 0 success, 1 failed or interrupted, 2 wrong usage, 3 imported, but part of the input
+could not be.
 
 Examples:
   depthrig import bytecameradepth recorded_data/20250314_1512 data/20250314_1512_kitchen
@@ -34,48 +34,48 @@ Examples:
 
 const BYTECAMERA_EXAMPLES: &str = "\
 FOLDER holds camera_<model> folders with depth_N.png, color_N.png, ir_N.png and raw_depth_N.npy. With
-the frames.csv and calibration.json of an export it becomes that dataset again; without them times
-follow from N, and units of depth from the models.
+the frames.csv and calibration.json of an export the original dataset is restored; without them,
+times are derived from N and depth units from the camera models.
 
-Exit codes: 0 all, 1 failed (also: no such recording) or ended before all was done, 2 wrong usage,
-3 imported, but some of the input could not be.
+Exit codes: 0 success, 1 failed or interrupted, 2 wrong usage, 3 imported, but part of the input
+could not be.
 
 Examples:
   depthrig import bytecameradepth recorded_data/20250314_1512 data/20250314_1512_kitchen
   depthrig import bytecameradepth monday data/monday --depth-unit d405=0.0001 --rate 5";
 
 const ROSBAG_EXAMPLES: &str = "\
-Pictures with their counters, device times, exposure and gain, intrinsics, poses and options come
-over; messages of motion sensors do not. A bag that was cut or damaged gives what can be read.
+Images with their counters, device times, exposure and gain, intrinsics, poses and options are
+imported; IMU messages are not. From a truncated or damaged bag, every readable part is imported.
 
-Exit codes: 0 all, 1 failed (also: no such bag) or ended before all was done, 2 wrong usage,
-3 imported, but some of the bag could not be.
+Exit codes: 0 success, 1 failed or interrupted, 2 wrong usage, 3 imported, but part of the bag
+could not be.
 
 Examples:
   depthrig import rosbag 20260314_151200.bag data/20260314_1512_kitchen
   depthrig import rosbag 20260314_151200.bag data/small --color-codec jpeg --json";
 
 const KINECT_EXAMPLES: &str = "\
-JPEG, depth, infrared and samples of motion come over as they are, with the device's times, calibration
-and serial number. A file that was cut or damaged gives every cluster that is whole.
+JPEG, depth, infrared and IMU samples are imported unchanged, with device times, calibration and
+serial number. From a truncated or damaged file, every complete cluster is imported.
 
-Exit codes: 0 all, 1 failed (also: no such recording) or ended before all was done, 2 wrong usage,
-3 imported, but some of the file could not be.
+Exit codes: 0 success, 1 failed or interrupted, 2 wrong usage, 3 imported, but part of the file
+could not be.
 
 Examples:
   depthrig import kinect kitchen.mkv data/kitchen
   depthrig import kinect old.mkv data/old --camera kinect_left --calibration 000123456789.json";
 
-/// The layouts.
+/// Layouts to import from.
 #[derive(Debug, clap::Subcommand)]
 pub enum ImportCommand {
-    /// A session of the public ByteCameraDepth dataset, or one that depthrig exported
+    /// Import a session of ByteCameraDepth, or one that depthrig exported
     #[command(after_help = BYTECAMERA_EXAMPLES)]
     Bytecameradepth(ByteCameraArgs),
-    /// A rosbag (version 2, .bag) that librealsense or the RealSense viewer recorded
+    /// Import a rosbag (version 2, .bag) of librealsense or the RealSense Viewer
     #[command(after_help = ROSBAG_EXAMPLES)]
     Rosbag(RosbagArgs),
-    /// A recording of an Azure Kinect (.mkv) that k4arecorder or another program of its SDK made
+    /// Import an Azure Kinect .mkv of k4arecorder or another program of its SDK
     #[command(after_help = KINECT_EXAMPLES)]
     Kinect(KinectArgs),
 }
@@ -98,12 +98,12 @@ impl ImportCommand {
     }
 }
 
-/// What every import has.
+/// Options of every import.
 #[derive(Debug, clap::Args)]
 struct Common {
-    /// The new dataset's folder
+    /// Folder of the new dataset
     out: PathBuf,
-    /// How colour is stored: every bit, or as JPEG of quality 95
+    /// Storage of colour
     #[arg(long, value_enum, default_value = "raw", value_name = "CODEC")]
     color_codec: Color,
     /// Print the report as JSON
@@ -113,24 +113,24 @@ struct Common {
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Color {
-    /// Every bit
+    /// Lossless
     Raw,
-    /// A tenth of the size, with JPEG's loss
+    /// JPEG of quality 95: a tenth of the size, lossy
     Jpeg,
 }
 
 /// Arguments of `import bytecameradepth`.
 #[derive(Debug, clap::Args)]
 pub struct ByteCameraArgs {
-    /// The folder of one session
+    /// Folder of one session
     #[arg(value_name = "FOLDER")]
     input: PathBuf,
     #[command(flatten)]
     common: Common,
-    /// Metres per unit of depth, of all cameras or of one; may be given several times
+    /// Metres per depth unit, of all cameras or of CAM; repeatable
     #[arg(long = "depth-unit", value_name = "[CAM=]METRES", value_parser = depth_unit)]
     depth_units: Vec<(Option<String>, f64)>,
-    /// Sets in a second, where there is no frames.csv [default: 5]
+    /// Sets per second, without a frames.csv [default: 5]
     #[arg(long, value_name = "HZ", value_parser = crate::args::rate_hz)]
     rate: Option<f64>,
 }
@@ -138,7 +138,7 @@ pub struct ByteCameraArgs {
 /// Arguments of `import rosbag`.
 #[derive(Debug, clap::Args)]
 pub struct RosbagArgs {
-    /// The bag
+    /// Bag file
     #[arg(value_name = "FILE.bag")]
     input: PathBuf,
     #[command(flatten)]
@@ -148,7 +148,7 @@ pub struct RosbagArgs {
 /// Arguments of `import kinect`.
 #[derive(Debug, clap::Args)]
 pub struct KinectArgs {
-    /// The recording
+    /// Azure Kinect recording
     #[arg(value_name = "FILE.mkv")]
     input: PathBuf,
     #[command(flatten)]
@@ -156,7 +156,7 @@ pub struct KinectArgs {
     /// Name of the camera in the dataset
     #[arg(long, default_value = "kinect", value_name = "NAME")]
     camera: CameraName,
-    /// The device's calibration (JSON) in place of the one in the recording, or "none" to do without
+    /// Device calibration (JSON), or "none" [default: the recording's]
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,
 }
@@ -167,7 +167,7 @@ fn depth_unit(text: &str) -> Result<(Option<String>, f64), String> {
     Ok((camera, unit))
 }
 
-/// Imports.
+/// Runs the import.
 pub fn run(command: &ImportCommand, context: &Context) -> Result<Exit> {
     let fs: Arc<dyn Fs> = Arc::new(RealFs);
     check_outside(&command.common().out, command.input()).map_err(super::export::usage)?;
@@ -208,10 +208,10 @@ fn name_of(out: &Path) -> String {
     out.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Runs an importer, shows how far it is, and tells what it made.
+/// Runs an importer with a progress bar and prints its report.
 fn drive(importer: &mut dyn Importer, fs: Arc<dyn Fs>, common: &Common, context: &Context) -> Result<Exit> {
     if name_of(&common.out).is_empty() {
-        return Err(UsageError(format!("{} is no name of a dataset", common.out.display())).into());
+        return Err(UsageError(format!("invalid dataset name: {}", common.out.display())).into());
     }
     let color = match common.color_codec {
         Color::Raw => ColorCodec::Raw,
@@ -237,7 +237,7 @@ fn drive(importer: &mut dyn Importer, fs: Arc<dyn Fs>, common: &Common, context:
     if report.ended {
         let out = common.out.display();
         out::note(format_args!(
-            "ended: {out} holds what was read until then; for all, remove it and import again"
+            "interrupted: {out} holds what was read until then; remove it and import again"
         ));
     }
     for lost in report.facts.problems.iter().chain(&report.summary.lost) {

@@ -1,4 +1,4 @@
-//! `depthrig info`: what is in a dataset.
+//! `depthrig info`: shows the contents of a dataset.
 
 use crate::exit::Exit;
 use crate::out;
@@ -11,28 +11,28 @@ use std::path::PathBuf;
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct InfoArgs {
-    /// The dataset's folder
+    /// Dataset folder
     dataset: PathBuf,
     /// Print JSON
     #[arg(long)]
     json: bool,
 }
 
-/// What is in a dataset, and what it says that it lost.
+/// Contents of a dataset, and its recorded losses.
 #[derive(Serialize)]
-struct Told<'a> {
+struct InfoReport<'a> {
     #[serde(flatten)]
     info: &'a DatasetInfo,
     lost: &'a [String],
 }
 
-/// Prints it. Exit code 3 when the dataset says itself that something is missing.
+/// Prints it. Exit code 3 if the dataset records a loss.
 pub fn run(args: &InfoArgs) -> Result<Exit> {
     let dataset = Dataset::open(&args.dataset)?;
     let info = dataset.info()?;
     let lost = lost(&dataset, &info);
     if args.json {
-        out::json(&Told { info: &info, lost: &lost })?;
+        out::json(&InfoReport { info: &info, lost: &lost })?;
     } else {
         out::line(text(&info, &lost))?;
     }
@@ -40,7 +40,7 @@ pub fn run(args: &InfoArgs) -> Result<Exit> {
     Ok(if good { Exit::Good } else { Exit::Lost })
 }
 
-/// What the dataset says itself that it lost: in the words of its outcome, else by its last account.
+/// Losses that the dataset records: from its outcome, else from its last counters.
 fn lost(dataset: &Dataset, info: &DatasetInfo) -> Vec<String> {
     let outcome = dataset.session().outcome.as_ref().filter(|o| !o.complete);
     let mut lost = outcome.map(|o| o.lost.clone()).unwrap_or_default();
@@ -56,7 +56,7 @@ fn lost(dataset: &Dataset, info: &DatasetInfo) -> Vec<String> {
     lost
 }
 
-/// The dataset for people.
+/// Describes the dataset as text.
 fn text(info: &DatasetInfo, lost: &[String]) -> String {
     let ms = |ns: i64| ns as f64 / 1e6;
     let or_none = |text: &str| if text.is_empty() { "-".to_owned() } else { printable::line(text) };
@@ -88,7 +88,7 @@ fn text(info: &DatasetInfo, lost: &[String]) -> String {
             &[
                 "stream",
                 "model",
-                "picture",
+                "image",
                 "format",
                 "stored as",
                 "frames",
@@ -121,7 +121,7 @@ fn text(info: &DatasetInfo, lost: &[String]) -> String {
     if !info.motion.is_empty() {
         lines.push(String::new());
         lines.push(out::table(
-            &["motion unit", "model", "samples", "Hz", "batches", "lost"],
+            &["IMU", "model", "samples", "Hz", "batches", "lost"],
             2,
             info.motion.iter().map(|m| {
                 vec![
@@ -135,12 +135,12 @@ fn text(info: &DatasetInfo, lost: &[String]) -> String {
             }),
         ));
     }
-    let mut tell = |what: &str, text: &str| lines.push(format!("{what}: {}", printable::line(text)));
-    info.computed.iter().for_each(|made| tell("computed", &made.to_string()));
+    let mut add = |what: &str, text: &str| lines.push(format!("{what}: {}", printable::line(text)));
+    info.computed.iter().for_each(|producer| add("computed", &producer.to_string()));
     for what in lost {
-        tell("lost", what);
+        add("lost", what);
     }
-    info.unfinished.iter().for_each(|file| tell("unfinished", file));
-    info.problems.iter().for_each(|problem| tell("problem", problem));
+    info.unfinished.iter().for_each(|file| add("unfinished", file));
+    info.problems.iter().for_each(|problem| add("problem", problem));
     lines.join("\n")
 }

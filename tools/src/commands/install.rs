@@ -1,4 +1,4 @@
-//! `depthrig install`: the udev rules, the limit of USB transfers and the service of a system.
+//! `depthrig install`: installs udev rules, the USB transfer limit and the systemd service.
 
 use crate::exit::{Exit, UsageError};
 use crate::install::{Done, Service, State, files};
@@ -8,8 +8,9 @@ use std::path::{Path, PathBuf};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-A file that somebody wrote or changed by hand is neither replaced nor removed without --overwrite.
-Exit code 3 when such a file was left as it is.
+Files changed by hand are neither replaced nor removed without --overwrite.
+
+Exit codes: 0 success, 1 failure, 2 wrong usage, 3 a file changed by hand was kept.
 
 Examples:
   depthrig install --print
@@ -21,37 +22,37 @@ Examples:
 #[command(group = clap::ArgGroup::new("action").required(true))]
 #[allow(clippy::struct_excessive_bools)] // each is a flag of the command line
 pub struct InstallArgs {
-    /// Show the files, how each stands on this computer, and the commands that make them work
+    /// Print the files with their state, and the commands that activate them
     #[arg(long, group = "action")]
     print: bool,
-    /// Write the files (as root)
+    /// Install the files (as root)
     #[arg(long, group = "action")]
     apply: bool,
     /// Remove the files (as root)
     #[arg(long, group = "action")]
     remove: bool,
-    /// Replace or remove also what somebody changed by hand
+    /// Also replace or remove files that were changed by hand
     #[arg(long, alias = "force")]
     overwrite: bool,
-    /// The user that the service runs as, which must be the one that uses the rig
+    /// User of the service and of the rig [default: the user who called sudo]
     #[arg(long, value_name = "NAME", value_parser = user_name)]
     user: Option<String>,
-    /// The rig's configuration for the service
+    /// Rig configuration of the service
     #[arg(long, value_name = "FILE", default_value = "/etc/depthrig/rig.toml")]
     rig_file: PathBuf,
-    /// The folder that the service may record into
+    /// Folder that the service may record to
     #[arg(long, value_name = "DIR", default_value = "/var/lib/depthrig")]
     data: PathBuf,
-    /// The folder that the system is in, for images of other computers
+    /// Root folder of the system, for mounted images of other computers
     #[arg(long, value_name = "DIR", default_value = "/")]
     root: PathBuf,
 }
 
-/// Shows, writes or removes.
+/// Prints, installs or removes the files.
 pub fn run(args: &InstallArgs) -> Result<Exit> {
     let service = Service {
         user: service_user(args)?,
-        binary: std::env::current_exe().context("the path of this program is not known")?,
+        binary: std::env::current_exe().context("the path of this program is unknown")?,
         rig_file: absolute(&args.rig_file)?,
         data: absolute(&args.data)?,
     };
@@ -62,7 +63,7 @@ pub fn run(args: &InstallArgs) -> Result<Exit> {
                 Ok(State::Missing) => "not installed".to_owned(),
                 Ok(State::Current) => "installed".to_owned(),
                 Ok(State::Older) => "installed with other contents".to_owned(),
-                Ok(State::Changed) => "there, changed by hand".to_owned(),
+                Ok(State::Changed) => "changed by hand".to_owned(),
                 Err(e) => format!("unknown: {e}"),
             };
             out::line(format_args!("### {} ({}): {state}\n{}", file.path.display(), file.what, file.text))?;
@@ -80,10 +81,10 @@ pub fn run(args: &InstallArgs) -> Result<Exit> {
         refused |= done == Done::Refused;
         let what = match done {
             Done::Written => "written",
-            Done::Unchanged => "is as it should be",
+            Done::Unchanged => "already up to date",
             Done::Removed => "removed",
-            Done::Absent => "was not there",
-            Done::Refused => "was changed by hand and is left as it is (--overwrite takes it all the same)",
+            Done::Absent => "did not exist",
+            Done::Refused => "was changed by hand and is kept; --overwrite replaces or removes it",
         };
         out::line(format_args!("{} ({}): {what}", file.below(&args.root).display(), file.what))?;
     }
@@ -95,13 +96,14 @@ pub fn run(args: &InstallArgs) -> Result<Exit> {
     Ok(if refused { Exit::Lost } else { Exit::Good })
 }
 
-/// The commands that make the files work, in their order.
+/// Commands that activate the files, in order.
 fn next_steps(service: &Service) -> String {
     let Service { user, rig_file, data, .. } = service;
-    let (rig_file, data) = (rig_file.display(), data.display());
+    let rig_file = rig_file.display();
+    let data = data.display();
     format!(
         "\
-  udevadm control --reload && udevadm trigger --settle    (or plug the cameras in again)
+  udevadm control --reload && udevadm trigger --settle    (or replug the cameras)
   systemd-tmpfiles --create /etc/tmpfiles.d/depthrig.conf
   usermod --append --groups video {user}                  (then {user} logs in again)
 
@@ -115,8 +117,8 @@ Then look: depthrig cameras, and depthrig doctor {rig_file}"
     )
 }
 
-/// The user that the service runs as: the one that is named, else who asked for root with sudo, else who asks. Root
-/// itself must be named: a rig and its subscribers are one user's, and cameras need no root.
+/// User of the service: `--user`, else the caller of sudo, else the current user. Root must be named explicitly: a rig
+/// and its subscribers belong to one user, and cameras do not need root.
 fn service_user(args: &InstallArgs) -> Result<String> {
     if let Some(user) = &args.user {
         return Ok(user.clone());
@@ -125,17 +127,16 @@ fn service_user(args: &InstallArgs) -> Result<String> {
     let user = named("SUDO_USER").or_else(|| named("USER")).filter(|name| name != "root");
     match user {
         Some(user) => Ok(user),
-        // What is removed does not depend on it.
+        // Removing does not depend on the user.
         None if args.remove => Ok("root".to_owned()),
         None => Err(UsageError(
-            "the service's user is not known: name the user that uses the rig with --user NAME (root only if it is meant)"
-                .to_owned(),
+            "the user of the service is unknown; name the user of the rig with --user NAME".to_owned(),
         )
         .into()),
     }
 }
 
-/// A user name as systemd takes it (systemd.io, "User/Group Name Syntax"), strict form.
+/// Parses a user name in systemd's strict form (systemd.io, "User/Group Name Syntax").
 fn user_name(name: &str) -> Result<String, String> {
     let mut chars = name.chars();
     let first = chars.next().is_some_and(|c| c.is_ascii_alphabetic() || c == '_');
@@ -143,15 +144,15 @@ fn user_name(name: &str) -> Result<String, String> {
     if first && rest && name.len() <= 31 {
         Ok(name.to_owned())
     } else {
-        Err("write the name of a user: letters, digits, `_` and `-`, no digit first".to_owned())
+        Err("invalid user name; use letters, digits, `_` and `-`, not starting with a digit".to_owned())
     }
 }
 
 fn absolute(path: &Path) -> Result<PathBuf> {
-    let path = std::path::absolute(path).with_context(|| format!("{} is no path", path.display()))?;
+    let path = std::path::absolute(path).with_context(|| format!("invalid path {}", path.display()))?;
     if path.to_string_lossy().contains(char::is_control) {
         let path = path.to_string_lossy().escape_debug().to_string();
-        return Err(UsageError(format!("{path} has a line break or the like in it")).into());
+        return Err(UsageError(format!("invalid path {path}: it contains control characters")).into());
     }
     Ok(path)
 }

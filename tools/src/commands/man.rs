@@ -1,4 +1,4 @@
-//! `depthrig man`: the manual page, made from the same definition as `--help`.
+//! `depthrig man`: generates the manual pages from the same definition as `--help`.
 
 use crate::exit::Exit;
 use crate::outfile::{OutFile, Overwrite};
@@ -8,7 +8,7 @@ use std::path::PathBuf;
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct ManArgs {
-    /// Write depthrig.1, depthrig-run.1 and so on into this folder
+    /// Write depthrig.1, depthrig-run.1 and so on to DIR
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(flatten)]
@@ -18,12 +18,12 @@ pub struct ManArgs {
 /// Prints or writes the manual of `program`.
 pub fn run(args: &ManArgs, program: clap::Command) -> Result<Exit> {
     if let Some(folder) = &args.out {
-        let unwritable = || format!("{}: the manual pages cannot be written there", folder.display());
+        let unwritable = || format!("{}: cannot write the manual pages", folder.display());
         std::fs::create_dir_all(folder).with_context(unwritable)?;
-        let made = tempfile::tempdir().context("no temporary folder can be made")?;
-        clap_mangen::generate_to(program, made.path()).context("the manual pages cannot be made")?;
+        let generated = tempfile::tempdir().context("cannot create a temporary folder")?;
+        clap_mangen::generate_to(program, generated.path()).context("cannot generate the manual pages")?;
         let mut pages = Vec::new();
-        for entry in made.path().read_dir()? {
+        for entry in generated.path().read_dir()? {
             let entry = entry?;
             pages.push((entry.path(), OutFile::new(&folder.join(entry.file_name()), args.overwrite, &[])?));
         }

@@ -1,4 +1,4 @@
-//! `depthrig merge`: parts of one recording as one dataset again.
+//! `depthrig merge`: joins parts of one recording into one dataset.
 
 use super::trim::report;
 use crate::context::Context;
@@ -11,13 +11,13 @@ use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Inputs are datasets or single segments of the same recording (same rig, begin, streams and calibration), in any
-order. Sets are copied as they are stored, in the order of their times. A set that is in several inputs is taken
-once; where it is damaged in one it is taken from another. Inputs that contradict each other are refused. Until
-OUT is whole its folder is named OUT.part; the inputs are only read.
+Inputs are datasets or single segments of the same recording (same rig, start, streams and calibration), in any
+order. Sets are copied as stored, ordered by time. A set in several inputs is copied once; if it is damaged in one
+input, it is taken from another. Contradicting inputs are refused. Until OUT is complete its folder is named
+OUT.part; the inputs are only read.
 
-Exit codes: 0 done, 1 failed (OUT is not there), 2 wrong usage or inputs that do not belong together, 3 done, but
-sets between its first and its last are missing (the output says which).
+Exit codes: 0 success, 1 failed (OUT does not exist), 2 wrong usage or inputs of different recordings, 3 done, but
+sets between its first and last are missing (the output lists them).
 
 Examples:
   depthrig merge data/kitchen data/kitchen_start data/kitchen_end
@@ -26,9 +26,9 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct MergeArgs {
-    /// Folder of the new dataset; must not be there
+    /// Folder of the new dataset; must not exist
     out: PathBuf,
-    /// Datasets or segments
+    /// Dataset folders or segment files
     #[arg(required = true)]
     inputs: Vec<PathBuf>,
     /// Print JSON
@@ -36,12 +36,12 @@ pub struct MergeArgs {
     json: bool,
 }
 
-/// Joins and reports.
+/// Joins the parts and reports the result.
 pub fn run(args: &MergeArgs, context: &Context) -> Result<Exit> {
     let inputs = args.inputs.iter().map(|path| Dataset::open(path)).collect::<Result<Vec<_>, _>>()?;
     report(args.json, || {
-        watched(context, |tell| {
-            let mut progress = |done, total| tell("merge", done, total);
+        watched(context, |progress| {
+            let mut progress = |done, total| progress("merge", done, total);
             merge(&RealFs, &inputs, &args.out, &SliceOptions::default(), &mut progress)
         })
     })

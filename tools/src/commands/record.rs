@@ -1,4 +1,4 @@
-//! `depthrig record`: recordings of the running daemon.
+//! `depthrig record`: controls recordings of the running daemon.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -13,56 +13,56 @@ use std::path::PathBuf;
 pub const EXAMPLES: &str = "\
 Examples:
   depthrig record start --scene kitchen --operator ada
-  depthrig record start --for 10m       ends by itself, and is refused when it would not fit
+  depthrig record start --for 10m       stops by itself; refused if the disk is too small
   depthrig record note \"the cup was moved\"
-  depthrig record stop        exit code 3 when the recording lost anything";
+  depthrig record stop        exit code 3 if the recording lost anything";
 
-/// What to do.
+/// Subcommands of `depthrig record`.
 #[derive(Debug, clap::Subcommand)]
 pub enum RecordCommand {
     /// Start a recording
     Start(StartArgs),
-    /// End the recording and close its files
+    /// Stop the recording and close its files
     Stop {
         /// Print JSON
         #[arg(long)]
         json: bool,
     },
-    /// Say how the recording in progress stands, or what became of the last one
+    /// Show the state of the current or last recording
     Status {
         /// Print JSON
         #[arg(long)]
         json: bool,
     },
-    /// Add a note with its time to the recording
+    /// Add a timestamped note to the recording
     Note {
-        /// The note
+        /// Text of the note
         text: String,
     },
 }
 
-/// What a recording is to be.
+/// Settings of a new recording.
 #[derive(Debug, clap::Args)]
 pub struct StartArgs {
-    /// Folder in which the dataset's folder is made; the rig's own when left out
+    /// Folder to create the dataset in [default: from the rig configuration]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Name of the dataset's folder; made of date, time and scene when left out
+    /// Name of the dataset folder [default: from date, time and scene]
     #[arg(long)]
     name: Option<String>,
-    /// What is in front of the cameras
+    /// Scene label
     #[arg(long, value_name = "LABEL", default_value = "")]
     scene: String,
-    /// Who records
+    /// Operator
     #[arg(long, value_name = "NAME", default_value = "")]
     operator: String,
-    /// Free text that is kept with the dataset
+    /// Notes to store with the dataset
     #[arg(long, value_name = "TEXT", default_value = "")]
     notes: String,
-    /// End by itself after so long, such as 90s, 10m or 1h30m; refused when that is not expected to fit on the disk
+    /// Stop after this time, such as 90s, 10m or 1h30m; refused if it will not fit
     #[arg(long = "for", value_name = "DURATION", value_parser = crate::args::duration_s)]
     duration_s: Option<f64>,
-    /// Begin even when the disk is expected to be full too soon
+    /// Record even if the disk is expected to fill up too soon
     #[arg(long)]
     force: bool,
     /// Print JSON
@@ -70,7 +70,7 @@ pub struct StartArgs {
     json: bool,
 }
 
-/// Talks to the daemon.
+/// Sends the command to the daemon and prints its answer.
 pub fn run(command: &RecordCommand, context: &Context) -> Result<Exit> {
     let client = connect(context)?;
     match command {
@@ -86,11 +86,11 @@ pub fn run(command: &RecordCommand, context: &Context) -> Result<Exit> {
                 max_duration_s: args.duration_s,
                 force: args.force,
             };
-            tell(&client.record_start(&request)?, args.json)
+            print_status(&client.record_start(&request)?, args.json)
         }
         RecordCommand::Stop { json } => {
             let status = client.record_stop()?;
-            tell(&status, *json)?;
+            print_status(&status, *json)?;
             let lost = status.error.is_some() || status.dropped.values().any(|n| *n > 0);
             Ok(if lost { Exit::Lost } else { Exit::Good })
         }
@@ -98,7 +98,7 @@ pub fn run(command: &RecordCommand, context: &Context) -> Result<Exit> {
             let rig = client.status()?;
             let status =
                 rig.recording.with_context(|| format!("rig {} has recorded nothing yet", rig.rig))?;
-            tell(&status, *json)
+            print_status(&status, *json)
         }
         RecordCommand::Note { text } => {
             client.record_note(text)?;
@@ -107,12 +107,12 @@ pub fn run(command: &RecordCommand, context: &Context) -> Result<Exit> {
     }
 }
 
-/// The running daemon that `context` means.
+/// Connects to the running daemon that `context` selects.
 pub fn connect(context: &Context) -> Result<Client> {
     Ok(Client::connect(&context.runtime()?, context.global.rig.as_ref())?)
 }
 
-fn tell(status: &RecordingStatus, json: bool) -> Result<Exit> {
+fn print_status(status: &RecordingStatus, json: bool) -> Result<Exit> {
     if json {
         out::json(status)?;
         return Ok(Exit::Good);

@@ -1,4 +1,4 @@
-//! `depthrig recover`: makes a dataset whole again after a crash.
+//! `depthrig recover`: repairs a dataset after a crash.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -14,12 +14,12 @@ use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Each segment that is unfinished, torn or damaged is copied set by set; the copy is read back and compared, and only
-then takes the old file's place. It may be interrupted at any time and begun again; done twice it changes nothing.
-A segment's copy needs as much free space as the segment. A dry run does the same but for writing: it reads as much,
-and what it refuses or finds lost is what a recovery refuses or finds lost.
+Each unfinished, torn or damaged segment is copied set by set; the copy is read back and compared before it replaces
+the segment. Recovery can be interrupted at any time and started again; a second run changes nothing. The copy of a
+segment needs as much free space as the segment. A dry run reads the same data and reports the same refusals and losses
+without writing.
 
-Exit codes: 0 nothing was lost or nothing to do, 3 recovered and something is lost, 1 not recovered, 2 wrong usage.
+Exit codes: 0 nothing lost or nothing to do, 1 not recovered, 2 wrong usage, 3 recovered, but something is lost.
 
 Examples:
   depthrig recover data/20261121_1015_kitchen
@@ -29,9 +29,9 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct RecoverArgs {
-    /// The dataset's folder
+    /// Dataset folder
     dataset: PathBuf,
-    /// Say what would be done and lost, and change nothing; only a disk that fails or fills up is not foreseen
+    /// Report repairs and losses without changing anything
     #[arg(long)]
     dry_run: bool,
     /// Print JSON
@@ -58,30 +58,29 @@ pub fn run(args: &RecoverArgs, context: &Context) -> Result<Exit> {
 }
 
 fn text(report: &RecoverReport) -> String {
-    let mut told = String::new();
+    let mut text = String::new();
     let path = printable::path(&report.path);
-    // Writing to a string cannot fail.
     let _ = match (report.changed, report.dry_run) {
-        (false, _) => write!(told, "{path}: nothing to do, {}", out::count(report.sets, "set")),
-        (true, false) => write!(told, "{path}: recovered, {}", out::count(report.sets, "set")),
-        (true, true) => write!(told, "{path}: can be recovered, {}", out::count(report.sets, "set")),
+        (false, _) => write!(text, "{path}: nothing to do, {}", out::count(report.sets, "set")),
+        (true, false) => write!(text, "{path}: recovered, {}", out::count(report.sets, "set")),
+        (true, true) => write!(text, "{path}: can be recovered, {}", out::count(report.sets, "set")),
     };
     for s in report.segments.iter().filter(|s| s.action != RecoverAction::None) {
         let done = match s.action {
             RecoverAction::Rebuilt => "copied set by set",
-            _ => "whole, got its final name",
+            _ => "complete, got its final name",
         };
         let _ =
-            write!(told, "\n  {}: {done}, {}, {}", s.file, out::count(s.sets, "set"), out::bytes(s.bytes));
+            write!(text, "\n  {}: {done}, {}, {}", s.file, out::count(s.sets, "set"), out::bytes(s.bytes));
     }
     for name in &report.removed {
-        let _ = write!(told, "\n  {}: a leftover, removed", printable::line(name));
+        let _ = write!(text, "\n  {}: a leftover, removed", printable::line(name));
     }
     for what in &report.lost {
-        let _ = write!(told, "\n  lost: {}", printable::line(what));
+        let _ = write!(text, "\n  lost: {}", printable::line(what));
     }
     for what in &report.notes {
-        let _ = write!(told, "\n  note: {}", printable::line(what));
+        let _ = write!(text, "\n  note: {}", printable::line(what));
     }
-    told
+    text
 }

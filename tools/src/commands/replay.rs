@@ -1,4 +1,4 @@
-//! `depthrig replay`: datasets on the same channels as if the cameras were there, and the controls of a running one.
+//! `depthrig replay`: replays datasets on the live channels and controls a running replay.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -16,23 +16,23 @@ use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Frames carry their original times and the flag `replayed`; nothing else tells them from live ones. Several datasets
-are replayed as one rig: side by side when their cameras differ, one after the other when they are the same.
+Frames carry their original times and the flag `replayed`; otherwise they equal live frames. Several datasets are
+replayed as one rig: in parallel if their cameras differ, one after the other if they are the same.
 
 Examples:
   depthrig replay data/20261121_1015_kitchen
   depthrig replay data/20261121_1015_kitchen --rate 0.5 --from 10 --to 20 --loop
   depthrig replay data/left data/right --rig bench2
-  depthrig replay data/20261121_1015_kitchen --as-fast-as-possible --paused    nothing is missed, nor the first set
+  depthrig replay data/20261121_1015_kitchen --as-fast-as-possible --paused    no set is missed, not even the first
   depthrig replay data/20261121_1015_kitchen --as-fast-as-possible --record data/again
-  depthrig replay data/20261121_1015_kitchen --refine           depth_refined beside the streams of the dataset
+  depthrig replay data/20261121_1015_kitchen --refine           adds depth_refined to the dataset's streams
 
 From another terminal, while it runs:
   depthrig replay pause
-  depthrig replay seek 12.5    the set at, or first after, 12.5 s after the first; published at once
-  depthrig replay step         one more set; -1 goes back
+  depthrig replay seek 12.5    go to the first set at or after 12.5 s and publish it
+  depthrig replay step         one set forward; -1 goes back
   depthrig replay rate 0.1
-  depthrig status              the cameras of the dataset, as if they were there";
+  depthrig status              the dataset's cameras, shown like live ones";
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
@@ -44,45 +44,45 @@ pub struct ReplayArgs {
     start: StartArgs,
 }
 
-/// A replay to be started.
+/// Options of a new replay.
 #[derive(Debug, clap::Args)]
 #[allow(clippy::struct_excessive_bools)] // options of a command line
 struct StartArgs {
-    /// The datasets' folders
+    /// Dataset folders
     #[arg(required = true, value_name = "DATASET")]
     datasets: Vec<PathBuf>,
-    /// Speed against the original, 0.1 to 10
+    /// Speed relative to the original, 0.1 to 10
     #[arg(long, value_name = "R", default_value = "1", value_parser = crate::args::replay_rate,
           conflicts_with = "as_fast_as_possible")]
     rate: f64,
-    /// Begin again at the end
+    /// Restart at the end
     #[arg(long = "loop")]
     looped: bool,
-    /// Begin so many seconds after the first set
+    /// Start T seconds after the first set
     #[arg(long, value_name = "T", value_parser = crate::args::seconds)]
     from: Option<f64>,
-    /// End so many seconds after the first set
+    /// Stop T seconds after the first set
     #[arg(long, value_name = "T", value_parser = crate::args::seconds)]
     to: Option<f64>,
-    /// Wait for the subscribers and not for the clock: none of them misses a frame
+    /// Publish as fast as subscribers read, without loss, instead of by the clock
     #[arg(long)]
     as_fast_as_possible: bool,
     /// Publish nothing until `depthrig replay resume`, `step` or `seek`
     #[arg(long)]
     paused: bool,
-    /// Pause at the end, and do not end
+    /// Pause at the end instead of exiting
     #[arg(long, conflicts_with = "looped")]
     hold: bool,
-    /// Record what is replayed, into a new folder below this one; nothing is encoded a second time
+    /// Record the replay into a new folder in DIR, without encoding again
     #[arg(long, value_name = "DIR", conflicts_with = "looped")]
     record: Option<PathBuf>,
-    /// Record even if the disk is expected to be full too soon
+    /// Record even if the disk is expected to fill up too soon
     #[arg(long, requires = "record")]
     force: bool,
-    /// Name of the recording's folder; made of date, time and scene when left out
+    /// Name of the recording's folder [default: from date, time and scene]
     #[arg(long, requires = "record")]
     name: Option<String>,
-    /// Refine the depth of its cameras, by this engine: auto, fill or onnxruntime
+    /// Refine depth with auto, fill or onnxruntime [default without ENGINE: auto]
     #[arg(long, value_name = "ENGINE", num_args = 0..=1, default_missing_value = "auto", require_equals = true,
           value_parser = engine, conflicts_with = "as_fast_as_possible")]
     refine: Option<EngineChoice>,
@@ -100,46 +100,46 @@ fn engine(text: &str) -> Result<EngineChoice, String> {
     })
 }
 
-/// What to tell a running replay.
+/// Controls of a running replay.
 #[derive(Debug, clap::Subcommand)]
 enum ReplayCommand {
-    /// Say where the running replay is
-    Status(Told),
-    /// Stop it where it is
-    Pause(Told),
-    /// Play on
-    Resume(Told),
+    /// Show the position of the running replay
+    Status(AnswerFormat),
+    /// Pause the replay
+    Pause(AnswerFormat),
+    /// Resume the replay
+    Resume(AnswerFormat),
     /// Go to a set and publish it, paused or not
     Seek(SeekArgs),
-    /// Play one more set, or so many, and pause; negative: go back
+    /// Publish the next set, or N more, then pause; negative: go back
     Step {
-        /// Sets
+        /// Number of sets
         #[arg(default_value = "1", allow_negative_numbers = true)]
         sets: i64,
         #[command(flatten)]
-        told: Told,
+        answer: AnswerFormat,
     },
-    /// Change its speed
+    /// Change the speed
     Rate {
-        /// Against the original, 0.1 to 10
+        /// Speed relative to the original, 0.1 to 10
         #[arg(allow_negative_numbers = true, value_parser = crate::args::replay_rate)]
         rate: f64,
         #[command(flatten)]
-        told: Told,
+        answer: AnswerFormat,
     },
-    /// Begin again at the end, or not
+    /// Turn looping on or off
     Loop {
-        /// `on` or `off`
+        /// Restart at the end
         #[arg(value_enum)]
         on: Switch,
         #[command(flatten)]
-        told: Told,
+        answer: AnswerFormat,
     },
 }
 
-/// How a replay's answer is told.
+/// Format of the printed answer.
 #[derive(Debug, Clone, Copy, clap::Args)]
-struct Told {
+struct AnswerFormat {
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -148,17 +148,17 @@ struct Told {
 #[derive(Debug, clap::Args)]
 #[group(id = "place", required = true, multiple = false, args = ["seconds", "set", "id"])]
 struct SeekArgs {
-    /// The set at, or first after, so many seconds after the first
+    /// Seconds after the first set; selects the first set at or after
     #[arg(allow_negative_numbers = true, value_parser = crate::args::seconds)]
     seconds: Option<f64>,
-    /// The set of this number, from 0
+    /// Number of the set, counted from 0
     #[arg(long, value_name = "N")]
     set: Option<u64>,
-    /// The set with this id in its dataset
+    /// Id of the set in its dataset
     #[arg(long)]
     id: Option<u64>,
     #[command(flatten)]
-    told: Told,
+    answer: AnswerFormat,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -167,28 +167,28 @@ enum Switch {
     Off,
 }
 
-/// Replays, or steers a running replay.
+/// Starts a replay, or controls a running one.
 pub fn run(args: &ReplayArgs, context: &Context) -> Result<Exit> {
     match &args.command {
         None => replay(&args.start, context),
-        Some(command) => steer(command, &super::record::connect(context)?),
+        Some(command) => control(command, &super::record::connect(context)?),
     }
 }
 
-fn steer(command: &ReplayCommand, replay: &Client) -> Result<Exit> {
-    let (status, told) = match command {
-        ReplayCommand::Status(told) => (replay.replay()?, told),
-        ReplayCommand::Pause(told) => (replay.replay_pause()?, told),
-        ReplayCommand::Resume(told) => (replay.replay_resume()?, told),
+fn control(command: &ReplayCommand, replay: &Client) -> Result<Exit> {
+    let (status, answer) = match command {
+        ReplayCommand::Status(answer) => (replay.replay()?, answer),
+        ReplayCommand::Pause(answer) => (replay.replay_pause()?, answer),
+        ReplayCommand::Resume(answer) => (replay.replay_resume()?, answer),
         ReplayCommand::Seek(a) => {
             let place = SeekRequest { seconds: a.seconds, set: a.set, id: a.id };
-            (replay.replay_seek(&place)?, &a.told)
+            (replay.replay_seek(&place)?, &a.answer)
         }
-        ReplayCommand::Step { sets, told } => (replay.replay_step(*sets)?, told),
-        ReplayCommand::Rate { rate, told } => (replay.replay_rate(*rate)?, told),
-        ReplayCommand::Loop { on, told } => (replay.replay_loop(*on == Switch::On)?, told),
+        ReplayCommand::Step { sets, answer } => (replay.replay_step(*sets)?, answer),
+        ReplayCommand::Rate { rate, answer } => (replay.replay_rate(*rate)?, answer),
+        ReplayCommand::Loop { on, answer } => (replay.replay_loop(*on == Switch::On)?, answer),
     };
-    if told.json {
+    if answer.json {
         out::json(&status)?;
     } else {
         out::line(crate::view::replay(&status))?;
@@ -196,7 +196,7 @@ fn steer(command: &ReplayCommand, replay: &Client) -> Result<Exit> {
     Ok(if status.lost.is_empty() { Exit::Good } else { Exit::Lost })
 }
 
-/// Time that subscribers get to read the last frames before the channels go.
+/// Time for subscribers to read the last frames before the channels close.
 const LINGER: Duration = Duration::from_millis(300);
 
 /// Replays until the end or a signal.
@@ -208,7 +208,7 @@ fn replay(args: &StartArgs, context: &Context) -> Result<Exit> {
         from_s: args.from,
         to_s: args.to,
         as_fast_as_possible: args.as_fast_as_possible,
-        // A recording begins before the first set does.
+        // The recording must start before the first set is published.
         paused: args.paused || args.record.is_some(),
         hold: args.hold,
         refine: args.refine,
@@ -245,13 +245,13 @@ fn replay(args: &StartArgs, context: &Context) -> Result<Exit> {
     if args.json {
         out::json(&result)?;
     } else {
-        tell(&result)?;
+        print_summary(&result)?;
     }
     let recorded = result.recording.as_ref().is_none_or(|r| r.error.is_none() && r.dropped.is_empty());
     Ok(if result.status.lost.is_empty() && recorded { Exit::Good } else { Exit::Lost })
 }
 
-/// What the bar says.
+/// Label of the progress bar.
 fn headline(progress: &ReplayStatus) -> String {
     match (&progress.waiting_for, progress.paused) {
         (Some(channel), _) => format!("replay, waiting for {channel}"),
@@ -261,7 +261,7 @@ fn headline(progress: &ReplayStatus) -> String {
     }
 }
 
-fn tell(result: &ReplaySummary) -> Result<()> {
+fn print_summary(result: &ReplaySummary) -> Result<()> {
     let status = &result.status;
     out::line(format_args!(
         "replayed {}, {}, {} of {}",

@@ -1,4 +1,4 @@
-//! `depthrig report`: the quality report of a dataset.
+//! `depthrig report`: writes the quality report of a dataset.
 
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
@@ -14,8 +14,8 @@ use std::path::{Path, PathBuf};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-A recording writes its report at its end; --overwrite writes it anew, for instance after `depthrig recover`.
-Exit codes: 0 the dataset is whole, 1 no report could be made, 2 wrong usage, 3 the report says that it is not whole.
+A recording writes its report when it ends; --overwrite replaces it, for instance after `depthrig recover`.
+Exit codes: 0 the dataset is complete, 1 no report was written, 2 wrong usage, 3 the dataset is incomplete or damaged.
 
 Examples:
   depthrig report data/20261121_1015_kitchen --overwrite
@@ -25,26 +25,25 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct ReportArgs {
-    /// The dataset's folder, or one of its segments
+    /// Dataset folder, or one segment file
     dataset: PathBuf,
-    /// Write the page to this file [default: report.html in the dataset]
+    /// HTML report to write [default: report.html in the dataset]
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
     #[command(flatten)]
     overwrite: Overwrite,
-    /// Frames of a set should not lie further apart [default: the session's limit, else half a period of the
-    /// slowest camera]
+    /// Largest spread in a set [default: the session's, else half the longest period]
     #[arg(long, value_name = "MS", value_parser = crate::args::spread_ms)]
     max_spread_ms: Option<f64>,
-    /// Sets whose depth pictures are decoded for the fill rate
+    /// Number of sets to decode depth images of, for the fill rate
     #[arg(long, value_name = "N", default_value_t = ReportOptions::default().fill_sets)]
     fill_sets: usize,
-    /// Print JSON instead of writing a page (with --out, do both)
+    /// Print JSON instead of writing the HTML report (with --out: both)
     #[arg(long)]
     json: bool,
 }
 
-/// Makes it.
+/// Writes the report.
 pub fn run(args: &ReportArgs, context: &Context) -> Result<Exit> {
     let dataset = Dataset::open(&args.dataset)?;
     let page = match &args.out {
@@ -63,11 +62,11 @@ pub fn run(args: &ReportArgs, context: &Context) -> Result<Exit> {
     };
     let stop = Stop::on_signals()?;
     let mut bar = Progress::new(context.global.quiet > 0);
-    let mut tell = |done: u64| {
+    let mut on_progress = |done: u64| {
         bar.set("looking at the dataset", done, 1000);
         if stop.is_asked() { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     };
-    let Some(report) = Report::of(&dataset, &options, &mut tell)? else {
+    let Some(report) = Report::of(&dataset, &options, &mut on_progress)? else {
         bail!("interrupted; no report was written");
     };
     bar.clear();

@@ -17,7 +17,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-The first Ctrl-C or SIGTERM closes a recording and ends cleanly, a second one ends at once.
+The first Ctrl-C or SIGTERM closes a recording and exits cleanly; a second one exits at once.
 
 Examples:
   depthrig run rig.toml
@@ -27,29 +27,29 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct RunArgs {
-    /// The rig's configuration (`depthrig config show` prints one to begin with)
+    /// Rig configuration (`depthrig config show` prints one to start from)
     config: PathBuf,
-    /// Record from the start, into a new folder below this one
+    /// Record from the start, into a new folder in DIR
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
-    /// What is in front of the cameras, for the recording
+    /// Scene label of the recording
     #[arg(long, value_name = "LABEL", requires = "record", default_value = "")]
     scene: String,
-    /// Who records
+    /// Operator of the recording
     #[arg(long, value_name = "NAME", requires = "record", default_value = "")]
     operator: String,
-    /// Record even if the disk is expected to be full too soon
+    /// Record even if the disk is expected to fill up too soon
     #[arg(long, requires = "record")]
     force: bool,
-    /// End after so many seconds
+    /// Stop after N seconds
     #[arg(long, value_name = "N", value_parser = crate::args::positive_seconds)]
     seconds: Option<f64>,
-    /// At the end, print what happened as JSON
+    /// Print the summary as JSON at the end
     #[arg(long)]
     json: bool,
 }
 
-/// Runs the rig until it is told to end.
+/// Runs the rig until a signal, the time limit or an API request stops it.
 pub fn run(args: &RunArgs, context: &Context) -> Result<Exit> {
     let mut config = RigConfig::load(&args.config).map_err(depthrig_daemon::Error::from)?;
     if let Some(rig) = &context.global.rig {
@@ -78,18 +78,18 @@ pub fn run(args: &RunArgs, context: &Context) -> Result<Exit> {
     if args.json {
         out::json(&summary)?;
     } else {
-        tell(&summary)?;
+        print_summary(&summary)?;
     }
     Ok(if summary.lost.is_empty() { Exit::Good } else { Exit::Lost })
 }
 
-/// Waits until simulated cameras show their scenes as rendered; coarse images are not recorded. Whether it was not asked
-/// to end meanwhile.
+/// Waits until the simulated cameras' scenes are fully rendered; coarse images are not recorded. Returns false when the
+/// rig was asked to stop meanwhile.
 fn wait_until_drawn(rig: &Rig, stop: &Stop, quiet: bool) -> bool {
     const LOOK: Duration = Duration::from_millis(100);
     let mut shown = Progress::new(quiet);
     let mut announced = false;
-    // With an error it goes no further, and the recording is refused with it.
+    // After a rendering error there is no progress; starting the recording then reports that error.
     while let Some(p) = rig.drawing().filter(|p| p.error.is_none()) {
         if quiet && !announced {
             announce_rendering();
@@ -103,7 +103,7 @@ fn wait_until_drawn(rig: &Rig, stop: &Stop, quiet: bool) -> bool {
     true
 }
 
-/// One line also where little is to be said: it can take minutes.
+/// Prints one line even with `--quiet`, because rendering can take minutes.
 fn announce_rendering() {
     eprintln!(
         "rendering the simulated cameras' images, once; minutes on a busy computer, then kept for next time"
@@ -114,11 +114,11 @@ fn announce_rendering() {
 pub struct Started {
     /// The rig.
     pub rig: Rig,
-    /// How long its start took, without the rendering of pictures.
+    /// Duration of the start without rendering, seconds.
     pub start_s: f64,
 }
 
-/// Starts a rig, showing how far its pictures are rendered.
+/// Starts a rig and shows the progress of rendering its images.
 pub fn start(
     config: RigConfig,
     runtime: RuntimeDir,
@@ -146,7 +146,7 @@ pub fn start(
         serve_api,
         cache_dir,
         progress: Some(Box::new(progress)),
-        // Who can be asked how far it is streams at once.
+        // With an API, subscribers can query the rendering progress, so streaming starts at once.
         draw_while_running: serve_api,
         ..RigOptions::new(runtime)
     };
@@ -156,7 +156,7 @@ pub fn start(
     Ok(Started { rig: rig?, start_s: shared.1.elapsed().as_secs_f64() })
 }
 
-/// Waits for a signal, the time limit, or the rig's own end (asked for over its API, or every camera is done).
+/// Waits for a signal, the time limit, or the rig's own end (an API request, or every camera is done).
 pub fn wait(rig: &Rig, stop: &Stop, seconds: Option<f64>) {
     let deadline = seconds.map(|s| HostTime::now().plus(Duration::from_secs_f64(s)));
     let control: Arc<dyn Control> = rig.control();
@@ -176,7 +176,7 @@ pub fn wait(rig: &Rig, stop: &Stop, seconds: Option<f64>) {
     });
 }
 
-fn tell(summary: &RigSummary) -> Result<()> {
+fn print_summary(summary: &RigSummary) -> Result<()> {
     let status = &summary.status;
     let delivered: u64 = status.cameras.iter().flat_map(|c| &c.streams).map(|s| s.delivered).sum();
     out::line(format_args!(

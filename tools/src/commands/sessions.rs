@@ -1,4 +1,4 @@
-//! `depthrig sessions`: the datasets of a folder at a glance.
+//! `depthrig sessions`: lists the datasets in a folder.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -15,8 +15,8 @@ use time::{OffsetDateTime, UtcOffset};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-It reads what each dataset says of itself and no pictures; `depthrig verify` proves a dataset.
-Exit codes: 0 every listed dataset is well, 1 the folder cannot be read, 3 some are lost, unfinished or damaged.
+Only the metadata of each dataset is read, no images; `depthrig verify` checks all data.
+Exit codes: 0 all listed datasets are good, 1 the folder cannot be read, 3 some have losses, are unfinished or damaged.
 
 Examples:
   depthrig sessions
@@ -26,19 +26,19 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct SessionsArgs {
-    /// Folder of datasets; those in its folders are found too [default: where the running rig records, else datasets]
+    /// Folder to search, with subfolders [default: the running rig's, else datasets]
     #[arg(value_name = "DIR")]
     folder: Option<PathBuf>,
-    /// Order of the list
+    /// Sort key
     #[arg(long, value_enum, default_value = "start", value_name = "KEY")]
     sort: Sort,
-    /// Turn the order around
+    /// Reverse the order
     #[arg(long)]
     reverse: bool,
-    /// Only those with this text in name, scene or operator, in any case
+    /// Only datasets with TEXT in name, scene or operator; ignores case
     #[arg(long, value_name = "TEXT")]
     filter: Option<String>,
-    /// Only those with this text in their scene, in any case
+    /// Only datasets with TEXT in their scene; ignores case
     #[arg(long, value_name = "TEXT")]
     scene: Option<String>,
     /// Print JSON
@@ -46,26 +46,26 @@ pub struct SessionsArgs {
     json: bool,
 }
 
-/// What the list is ordered by; equal ones by their path.
+/// Sort key of the list; ties are ordered by path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Sort {
-    /// When they began, the latest last.
+    /// Start time, latest last
     Start,
-    /// Name.
+    /// Name
     Name,
-    /// Scene.
+    /// Scene
     Scene,
-    /// Length, the longest last.
+    /// Length, longest last
     Length,
-    /// Sets, the most last.
+    /// Number of sets, most last
     Sets,
-    /// Bytes, the most last.
+    /// Size, largest last
     Size,
-    /// Health, the worst last.
+    /// Health, worst last
     Health,
 }
 
-/// Lists them.
+/// Lists the datasets.
 pub fn run(args: &SessionsArgs, context: &Context) -> Result<Exit> {
     let folder = args.folder.clone().unwrap_or_else(|| recordings_folder(context));
     let mut entries = catalog(&RealFs, &folder)?;
@@ -83,7 +83,7 @@ pub fn run(args: &SessionsArgs, context: &Context) -> Result<Exit> {
     Ok(if entries.iter().any(|e| e.health.is_bad()) { Exit::Lost } else { Exit::Good })
 }
 
-/// Where the running rig records, as far as it says; else the folder that a configuration names by default.
+/// Recording folder of the running rig, else the default of a configuration.
 fn recordings_folder(context: &Context) -> PathBuf {
     let of_rig = || {
         let client = Client::connect(&context.runtime().ok()?, context.global.rig.as_ref()).ok()?;
@@ -93,7 +93,7 @@ fn recordings_folder(context: &Context) -> PathBuf {
     of_rig().unwrap_or_else(|| RecordingConfig::default().directory)
 }
 
-/// What a running rig records now is unfinished, and well.
+/// Marks the dataset that a running rig records now as good, although it is unfinished.
 fn mark_recordings(entries: &mut [CatalogEntry], context: &Context) {
     let Ok(runtime) = context.runtime() else { return };
     for rig in runtime.running_rigs() {
@@ -168,11 +168,11 @@ fn text(entries: &[CatalogEntry], folder: &str) -> String {
         out::count(sets, "set"),
         out::bytes(bytes)
     );
-    lines.push(if bad.is_empty() { all } else { format!("{all}; to be looked at: {}", bad.len()) });
+    lines.push(if bad.is_empty() { all } else { format!("{all}; to check: {}", bad.len()) });
     lines.join("\n")
 }
 
-/// The text on one line, cut to `most` characters; `-` when there is none.
+/// Puts text on one line of at most `most` characters; `-` for empty text.
 fn short(text: &str, most: usize) -> String {
     let text: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
     match text.trim() {
@@ -182,7 +182,7 @@ fn short(text: &str, most: usize) -> String {
     }
 }
 
-/// `2026-08-21 14:05 +02:00`: in the zone of this computer at that time, in UTC when it has none.
+/// Formats a time as `2026-08-21 14:05 +02:00`, in this computer's time zone at that time, else in UTC.
 fn local(utc_ns: i64) -> String {
     let Ok(utc) = OffsetDateTime::from_unix_timestamp_nanos(i128::from(utc_ns)) else {
         return "-".to_owned();

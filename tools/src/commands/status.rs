@@ -1,4 +1,4 @@
-//! `depthrig status`: how the running rig does.
+//! `depthrig status`: prints the status of the running rig.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -11,7 +11,7 @@ use depthrig_daemon::status::{CameraState, CameraStatus, RefineState, RigStatus}
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Exit code 3 when a camera is not streaming, its depth is to be refined and is not, or the recording has lost anything.
+Exit code 3 if a camera is not streaming, depth that should be refined is not, or the recording lost anything.
 
 Examples:
   depthrig status
@@ -24,12 +24,12 @@ pub struct StatusArgs {
     /// Print again every second until Ctrl-C
     #[arg(long)]
     watch: bool,
-    /// Print JSON; with --watch one object a line
+    /// Print JSON; with --watch one object per line
     #[arg(long)]
     json: bool,
 }
 
-/// Prints the status once or again and again.
+/// Prints the status once, or every second with `--watch`.
 pub fn run(args: &StatusArgs, context: &Context) -> Result<Exit> {
     let client = super::record::connect(context)?;
     let style = Style { width: screen::size().map_or(120, |(width, _)| width), color: context.color() };

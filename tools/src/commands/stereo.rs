@@ -1,8 +1,8 @@
-//! `depthrig stereo`: the disparity of one rectified pair of pictures.
+//! `depthrig stereo`: computes the disparity of a rectified image pair.
 
 use crate::exit::{Exit, UsageError};
 use crate::outfile::{OutFile, Overwrite};
-use crate::{out, picture};
+use crate::{image_file, out};
 use anyhow::Result;
 use depthrig_bus::clock::thread_cpu_ns;
 use depthrig_calib::RowCorrector;
@@ -15,13 +15,13 @@ use std::path::{Path, PathBuf};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-The pictures are rectified: what is seen at (x, y) in the left one is seen at (x - disparity, y) in the right one. Colour
-is made grey; pictures of 16 bits count from the highest bit that one of the two uses.
+The images must be rectified: a point at (x, y) in the left image is at (x - disparity, y) in the right image. Colour is
+converted to grey; of 16-bit images the 8 bits below the highest bit used by either are taken.
 
-OUT.npy holds 32-bit floats, pixels of the left picture, NaN where there is none. OUT.png holds 16 bits, 256 a pixel, 0
-where there is none (as KITTI has it). Confidence is a PNG of 8 bits: 0 where there is none, 255 for the surest.
+OUT.npy holds 32-bit floats: disparity in pixels of the left image, NaN where unknown. OUT.png holds 16 bits: disparity
+times 256, 0 where unknown (as in KITTI). Confidence is an 8-bit PNG: 0 where disparity is unknown, up to 255.
 
-Exit codes: 0 good, 1 failed, 2 wrong usage or pictures that do not fit, or that are swapped.
+Exit codes: 0 success, 1 failure, 2 wrong usage, or mismatched or swapped images.
 
 Examples:
   depthrig stereo left.png right.png --out disparity.npy
@@ -30,20 +30,20 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct StereoArgs {
-    /// The left picture: PNG, JPEG, PGM or PPM
+    /// Left image: PNG, JPEG, PGM or PPM
     left: PathBuf,
-    /// The right picture, of the same size
+    /// Right image, of the same size
     right: PathBuf,
-    /// A point between fast and good: performance, quality or ultra
+    /// Trade-off of speed and quality: performance, quality or ultra
     #[arg(long, value_name = "PRESET", default_value = "quality", value_parser = preset)]
     preset: Preset,
-    /// Disparities to search, pixels; what is nearer gets none
+    /// Disparity search range, pixels; nearer objects get no disparity
     #[arg(long, value_name = "N", default_value_t = 128, value_parser = clap::value_parser!(u16).range(1..=256))]
     max_disparity: u16,
-    /// The file to write, .npy or .png
+    /// Output file, .npy or .png
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// A PNG of how sure each disparity is
+    /// Confidence image to write, a PNG
     #[arg(long, value_name = "FILE")]
     confidence: Option<PathBuf>,
     #[command(flatten)]
@@ -54,7 +54,7 @@ pub struct StereoArgs {
     /// Match even if left and right look swapped
     #[arg(long)]
     even_if_swapped: bool,
-    /// Match rows as they are, even where they are measured to be apart
+    /// Do not correct a measured row offset between the images
     #[arg(long)]
     keep_rows: bool,
     /// Print JSON
@@ -62,37 +62,38 @@ pub struct StereoArgs {
     json: bool,
 }
 
-/// Reads the name of a preset.
+/// Parses the name of a preset.
 ///
 /// # Errors
-/// When there is none of that name.
+/// When the name is unknown.
 pub fn preset(text: &str) -> Result<Preset, String> {
     text.parse().map_err(|e: depthrig_calib::Error| e.to_string())
 }
 
-/// Rec. 709 luma. `image` makes grey of colour in ways that differ from version to version; depth shall not.
+/// Rec. 709 luma. The crate `image` converts colour to grey differently from version to version; depth must not change.
 const fn luma([r, g, b]: [u32; 3]) -> u32 {
     (2126 * r + 7152 * g + 722 * b) / 10_000
 }
 
-/// A grey picture of its own.
-pub struct Picture {
+/// An owned grey image.
+pub struct Image {
     pixels: Vec<u8>,
     width: usize,
     height: usize,
 }
 
-impl Picture {
-    /// Reads a pair of PNG, JPEG, PGM or PPM. Of 16 bits those 8 count that begin with the highest which either picture uses:
-    /// a camera's 10 or 12 bits are mostly kept in the lower ones.
+impl Image {
+    /// Reads a pair of PNG, JPEG, PGM or PPM. Of 16 bits, takes the 8 that begin with the highest bit used by either
+    /// image: a camera's 10 or 12 bits are mostly stored in the lower ones.
     ///
     /// # Errors
-    /// When one cannot be read.
+    /// When an image cannot be read.
     pub fn pair(left: &Path, right: &Path) -> Result<[Self; 2]> {
-        let pictures = [picture::open(left)?, picture::open(right)?];
-        if pictures.iter().all(|p| !wide(p)) {
-            return Ok(pictures.map(|p| {
-                let (width, height) = (p.width() as usize, p.height() as usize);
+        let images = [image_file::open(left)?, image_file::open(right)?];
+        if images.iter().all(|p| !wide(p)) {
+            return Ok(images.map(|p| {
+                let width = p.width() as usize;
+                let height = p.height() as usize;
                 let pixels = match p {
                     DynamicImage::ImageLuma8(p) => p.into_raw(),
                     p => p.into_rgb8().pixels().map(|p| luma(p.0.map(u32::from)) as u8).collect(),
@@ -100,57 +101,59 @@ impl Picture {
                 Self { pixels, width, height }
             }));
         }
-        let most = pictures.iter().map(most).max().unwrap_or(0);
+        let most = images.iter().map(most).max().unwrap_or(0);
         let shift = (u32::BITS - most.leading_zeros()).saturating_sub(u8::BITS);
-        Ok(pictures.map(|p| {
-            let (width, height) = (p.width() as usize, p.height() as usize);
-            // One of 8 bits has been spread to 16.
+        Ok(images.map(|p| {
+            let width = p.width() as usize;
+            let height = p.height() as usize;
+            // An 8-bit image has been spread to 16.
             let shift = if wide(&p) { shift } else { u8::BITS };
             let pixels = p.into_rgb16().pixels().map(|p| (luma(p.0.map(u32::from)) >> shift) as u8).collect();
             Self { pixels, width, height }
         }))
     }
 
-    /// One of these pixels, rows without padding.
-    pub const fn made(pixels: Vec<u8>, width: usize, height: usize) -> Self {
+    /// Makes an image of these pixels, rows without padding.
+    pub const fn new(pixels: Vec<u8>, width: usize, height: usize) -> Self {
         Self { pixels, width, height }
     }
 
-    /// As the engine takes it.
+    /// Borrows the image as the engine's type.
     pub fn gray(&self) -> Gray<'_> {
         Gray::packed(&self.pixels, self.width, self.height)
     }
 
-    /// Refuses another picture that is of another size.
+    /// Checks that both images have the same size.
     ///
     /// # Errors
-    /// A usage error that says both sizes.
+    /// A usage error that names both sizes.
     pub fn fits(&self, other: &Self) -> Result<()> {
         if (self.width, self.height) == (other.width, other.height) {
             return Ok(());
         }
         let text = format!(
-            "the left picture is {}x{} and the right one {}x{}: a rectified pair is of one size",
+            "the left image is {}x{} and the right one {}x{}: a rectified pair is of one size",
             self.width, self.height, other.width, other.height
         );
         Err(UsageError(text).into())
     }
 }
 
-/// Whether it has more than 8 bits.
-fn wide(picture: &DynamicImage) -> bool {
-    matches!(picture.color(), ColorType::L16 | ColorType::La16 | ColorType::Rgb16 | ColorType::Rgba16)
+/// Returns whether the image has more than 8 bits.
+fn wide(image: &DynamicImage) -> bool {
+    matches!(image.color(), ColorType::L16 | ColorType::La16 | ColorType::Rgb16 | ColorType::Rgba16)
 }
 
-/// The largest grey value of one of 16 bits, else 0. It is of the same luma as the pixels: a larger one would not fit in 8 bits.
-fn most(picture: &DynamicImage) -> u32 {
-    if !wide(picture) {
+/// Largest grey value of a 16-bit image, else 0. It uses the same luma as the pixels: a larger one would not fit in 8
+/// bits.
+fn most(image: &DynamicImage) -> u32 {
+    if !wide(image) {
         return 0;
     }
-    picture.to_rgb16().pixels().map(|p| luma(p.0.map(u32::from))).max().unwrap_or(0)
+    image.to_rgb16().pixels().map(|p| luma(p.0.map(u32::from))).max().unwrap_or(0)
 }
 
-/// What was done.
+/// Result of the command, as JSON.
 #[derive(Debug, Serialize)]
 struct Report<'a> {
     out: &'a Path,
@@ -160,18 +163,18 @@ struct Report<'a> {
     parameters: String,
     vectors: &'static str,
     memory_bytes: u64,
-    /// Pixels that have a disparity, percent.
+    /// Pixels with a disparity, percent.
     filled_percent: f64,
-    /// How far the rows of the two are apart, where the pictures say it.
+    /// Row offset between the images, if it could be measured.
     rows: Option<Rows>,
-    /// The right picture's rows were moved by that.
+    /// Whether the right image was shifted by that offset.
     rows_corrected: bool,
     warnings: Vec<String>,
-    /// CPU time of the calling thread, for the first pair of a matcher; `bench stereo` measures properly.
+    /// CPU time of the calling thread for a matcher's first pair; `bench stereo` measures properly.
     cpu_ms: f64,
 }
 
-/// How much lower things lie in the right picture, pixels. Each may be off by `unsure_px`.
+/// Downward offset of the right image, pixels. Each value has the uncertainty `unsure_px`.
 #[derive(Debug, Serialize)]
 struct Rows {
     middle_px: f64,
@@ -198,7 +201,7 @@ pub fn run(args: &StereoArgs) -> Result<Exit> {
     let confidence = args.confidence.as_deref().map(|path| OutFile::new(path, args.overwrite, &inputs));
     let confidence = confidence.transpose()?;
     confidence.as_ref().map_or(Ok(()), |confidence| confidence.differs_from(&out))?;
-    let [left, right] = Picture::pair(&args.left, &args.right)?;
+    let [left, right] = Image::pair(&args.left, &args.right)?;
     left.fits(&right)?;
     let pair = StereoPair::new(left.gray(), right.gray());
     let usage = |e: depthrig_calib::Error| UsageError(e.to_string());
@@ -213,7 +216,7 @@ pub fn run(args: &StereoArgs) -> Result<Exit> {
     let corrected = offset.as_ref().filter(|o| o.is_significant() && !args.keep_rows);
     if let Some(offset) = corrected {
         let size = (left.width as u32, left.height as u32);
-        RowCorrector::new(size, offset).map_err(usage)?.correct(&right.gray(), &mut moved)?;
+        RowCorrector::new(size.0, size.1, offset).map_err(usage)?.correct(&right.gray(), &mut moved)?;
     }
     let is_corrected = corrected.is_some();
     let pair = if is_corrected {
@@ -271,12 +274,12 @@ pub fn run(args: &StereoArgs) -> Result<Exit> {
     Ok(Exit::Good)
 }
 
-/// Whether a PNG is asked for.
+/// Returns whether the output is a PNG.
 fn form(path: &Path) -> Result<bool> {
     match path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase().as_str() {
         "npy" => Ok(false),
         "png" => Ok(true),
-        _ => Err(UsageError(format!("{}: the result is a .npy or a .png", path.display())).into()),
+        _ => Err(UsageError(format!("{}: unsupported extension; use .npy or .png", path.display())).into()),
     }
 }
 
@@ -285,11 +288,11 @@ fn npy(map: &DisparityMap) -> Vec<u8> {
     depthrig_recorder::npy_file("<f4", &[map.height, map.width], &data)
 }
 
-/// 16 bits, 256 a pixel; a disparity of less than half of that becomes the smallest one, for 0 is none.
+/// Encodes disparity times 256 as 16 bits; a disparity that rounds to 0 becomes 1, because 0 means unknown.
 fn png(map: &DisparityMap) -> Result<Vec<u8>> {
     let units =
         map.disparity.iter().map(|d| if d.is_nan() { 0 } else { ((d * 256.0).round() as u16).max(1) });
-    // PNG is big-endian; the encoder takes the order of this computer.
+    // PNG is big-endian; the encoder takes native order.
     let data: Vec<_> = units.flat_map(u16::to_ne_bytes).collect();
     encoded(&data, map, ExtendedColorType::L16)
 }
@@ -304,12 +307,12 @@ fn encoded(data: &[u8], map: &DisparityMap, color: ExtendedColorType) -> Result<
 mod tests {
     use super::*;
 
-    /// The pixels that two files of this picture are read as.
-    fn read(picture: &DynamicImage) -> Vec<u8> {
+    /// The pixels that two files of this image are read as.
+    fn read(image: &DynamicImage) -> Vec<u8> {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("p.png");
-        picture.save(&path).unwrap();
-        let [left, right] = Picture::pair(&path, &path).unwrap();
+        image.save(&path).unwrap();
+        let [left, right] = Image::pair(&path, &path).unwrap();
         assert_eq!(left.pixels, right.pixels);
         left.pixels
     }
@@ -317,8 +320,8 @@ mod tests {
     #[test]
     fn colour_becomes_the_grey_of_rec_709() {
         let colours = [[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255], [200, 100, 50], [77, 77, 77]];
-        let picture = image::RgbImage::from_fn(6, 1, |x, _| image::Rgb(colours[x as usize]));
-        assert_eq!(read(&picture.into()), [54, 182, 18, 255, 117, 77]);
+        let image = image::RgbImage::from_fn(6, 1, |x, _| image::Rgb(colours[x as usize]));
+        assert_eq!(read(&image.into()), [54, 182, 18, 255, 117, 77]);
     }
 
     /// A brightest of 255 takes 8 bits, whatever another formula rounds it to.

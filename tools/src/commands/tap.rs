@@ -1,4 +1,4 @@
-//! `depthrig tap`: looks at one live stream from a terminal.
+//! `depthrig tap`: prints or saves one live stream.
 
 mod motion;
 
@@ -6,7 +6,7 @@ use crate::context::Context;
 use crate::exit::Exit;
 use crate::outfile::Overwrite;
 use crate::signals::Stop;
-use crate::{out, picture};
+use crate::{image_file, out};
 use anyhow::{Context as _, Result};
 use core::time::Duration;
 use depthrig_bus::{Bus, Frame, FrameFlags, FrameHeader, HostTime, PixelFormat, StreamId, Subscriber};
@@ -15,34 +15,34 @@ use std::path::PathBuf;
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
 Examples:
-  depthrig tap d435/depth                          a line per frame until Ctrl-C
-  depthrig tap d435/depth --count 1                the next frame
-  depthrig tap d435/depth --png pictures --count 5 16-bit PNGs, and previews in colours
-  depthrig tap zed/imu --json | jq .samples[].gyro_rad_s  every sample of a motion unit";
+  depthrig tap d435/depth                          one line per frame until Ctrl-C
+  depthrig tap d435/depth --count 1                only the next frame
+  depthrig tap d435/depth --png images --count 5 16-bit PNGs with colour previews
+  depthrig tap zed/imu --json | jq .samples[].gyro_rad_s  every sample of an IMU";
 
-/// How long a stream may be silent before that is worth a line.
+/// Silence of a stream after which a line says so.
 const SILENCE: Duration = Duration::from_secs(2);
 const POLL: Duration = Duration::from_millis(200);
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct TapArgs {
-    /// The stream, such as d435/depth
+    /// Stream, such as d435/depth
     stream: StreamId,
-    /// Write each frame into this folder as PNG; depth as 16 bits with a preview in colours beside it
+    /// Write each frame to DIR as PNG; depth as 16 bits with a colour preview
     #[arg(long, value_name = "DIR")]
     png: Option<PathBuf>,
     #[command(flatten)]
     overwrite: Overwrite,
-    /// Print every sample of a motion unit, one JSON object per batch
+    /// Print every IMU sample, one JSON object per batch
     #[arg(long, conflicts_with = "png")]
     json: bool,
-    /// End after so many frames
+    /// Stop after N frames
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
 }
 
-/// Taps until it is enough, the stream ends or a signal comes.
+/// Prints frames until `--count` is reached, the stream ends or a signal arrives.
 pub fn run(args: &TapArgs, context: &Context) -> Result<Exit> {
     let runtime = context.runtime()?;
     let bus = Bus::open(&runtime, &context.running_rig(&runtime)?)?;
@@ -56,12 +56,12 @@ pub fn run(args: &TapArgs, context: &Context) -> Result<Exit> {
         let is_motion = frame.header().pixel_format().is_some_and(PixelFormat::is_motion);
         anyhow::ensure!(
             is_motion || !args.json,
-            "{} gives pictures; --json prints the samples of motion units",
+            "{} is an image stream; --json prints IMU samples",
             args.stream
         );
         anyhow::ensure!(
             !is_motion || args.png.is_none(),
-            "{} gives motion samples and no pictures; leave --png out, or print them with --json",
+            "{} is an IMU and has no images; leave out --png, or print its samples with --json",
             args.stream
         );
         match (is_motion, args.json) {
@@ -76,7 +76,7 @@ pub fn run(args: &TapArgs, context: &Context) -> Result<Exit> {
             }
             let header = frame.header();
             let stem = format!("{}_{}_{:08}", header.camera(), header.stream(), header.sequence);
-            for path in picture::write_png(header, frame.pixels(), folder, &stem, args.overwrite)? {
+            for path in image_file::write_png(header, frame.pixels(), folder, &stem, args.overwrite)? {
                 out::line(format_args!("  {}", path.display()))?;
             }
         }
@@ -86,15 +86,15 @@ pub fn run(args: &TapArgs, context: &Context) -> Result<Exit> {
         anyhow::bail!("{}: the stream ended after {seen} of {} frames", args.stream, args.count.unwrap_or(0));
     }
     if args.png.is_some() && subscriber.missed() > 0 {
-        tracing::warn!(frames = subscriber.missed(), "pictures were written slower than frames came");
+        tracing::warn!(frames = subscriber.missed(), "images were written slower than frames came");
     }
     Ok(Exit::Good)
 }
 
-/// The next frame; `None` at a signal or when nobody publishes any more.
+/// Returns the next frame; `None` after a signal or when the publisher is gone.
 fn next(subscriber: &mut Subscriber, stop: &Stop, args: &TapArgs) -> Result<Option<Frame>> {
     let began = HostTime::now();
-    let mut told = false;
+    let mut announced = false;
     while !stop.is_asked() {
         if let Some(frame) = subscriber.next_timeout(POLL)? {
             return Ok(Some(frame));
@@ -102,15 +102,15 @@ fn next(subscriber: &mut Subscriber, stop: &Stop, args: &TapArgs) -> Result<Opti
         if !subscriber.is_live() {
             return Ok(None);
         }
-        if began.elapsed() > SILENCE && !told {
+        if began.elapsed() > SILENCE && !announced {
             tracing::warn!(stream = %args.stream, "no frame for {} s; the camera may be lost", SILENCE.as_secs());
-            told = true;
+            announced = true;
         }
     }
     Ok(None)
 }
 
-/// One line: what a person at a camera wants to know of a frame.
+/// Describes a frame on one line: format, capture time, latency, losses, flags.
 fn describe(h: &FrameHeader) -> String {
     let ms = |ns: i64| ns as f64 / 1e6;
     let unit =
@@ -132,13 +132,13 @@ fn describe(h: &FrameHeader) -> String {
     )
 }
 
-/// The reasons for which frames were lost, with their counts; `0` when none was.
+/// Drop reasons with their counts; `0` without losses.
 fn drops(h: &FrameHeader) -> String {
     let drops: Vec<_> = h.drops().nonzero().map(|(why, n)| format!("{} {n}", why.name())).collect();
     if drops.is_empty() { "0".to_owned() } else { drops.join(",") }
 }
 
-/// The flags' names; `-` when there are none.
+/// Names of the flags; `-` without flags.
 fn flags(h: &FrameHeader) -> String {
     let flags: Vec<_> = FrameFlags::ALL.iter().filter(|(_, f)| h.has(*f)).map(|(name, _)| *name).collect();
     if flags.is_empty() { "-".to_owned() } else { flags.join(",") }
@@ -151,7 +151,7 @@ mod tests {
     #[test]
     fn a_line_says_what_matters() {
         let mut h = FrameHeader::default();
-        h.set_picture(PixelFormat::Z16, 640, 480);
+        h.set_image(PixelFormat::Z16, 640, 480);
         h.set_names("mount", &StreamId::new("d405", "depth").unwrap());
         (h.sequence, h.capture_time_ns, h.publish_time_ns) = (7, 1_000_000_000, 1_012_500_000);
         (h.capture_uncertainty_ns, h.depth_unit_m) = (250_000, 0.0001);

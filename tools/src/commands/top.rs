@@ -16,13 +16,13 @@ pub struct TopArgs {
     interval: f64,
 }
 
-/// How often keys and signals are looked at.
+/// Polling interval of keys and signals.
 const LOOK: Duration = Duration::from_millis(100);
 
 /// Refreshes until q, Ctrl-C, or the end of the rig.
 pub fn run(args: &TopArgs, context: &Context) -> Result<Exit> {
     let client = super::record::connect(context)?;
-    client.status()?; // an error is better told before the page is taken over
+    client.status()?; // report an error before taking over the screen
     let stop = Stop::on_signals()?;
     let screen = Screen::enter()?;
     loop {

@@ -1,4 +1,4 @@
-//! `depthrig trim`: a part of a dataset as a dataset of its own.
+//! `depthrig trim`: cuts a part of a dataset into a new dataset.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -11,14 +11,14 @@ use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Sets are copied as they are stored, never packed or coded anew; both ends are part of the range. OUT is a whole
-dataset: it verifies, replays and can be merged again with other parts of the same recording (depthrig merge).
-session.toml says what it was cut from. Until OUT is whole its folder is named OUT.part; the input is only read.
+Sets are copied as stored, without compressing or encoding again; the range includes both ends. OUT is a full
+dataset: it can be verified, replayed and merged with other parts of the same recording (depthrig merge).
+session.toml names its source. Until OUT is complete its folder is named OUT.part; the input is only read.
 
-A moment T is a number of seconds after the first set, or a time such as 2026-11-21T10:15:03.2Z.
+A time T is a number of seconds after the first set, or a date and time such as 2026-11-21T10:15:03.2Z.
 
-Exit codes: 0 done, 1 failed (OUT is not there), 2 wrong usage, 3 done, but sets between its first and its last
-are missing (the output says which).
+Exit codes: 0 success, 1 failed (OUT does not exist), 2 wrong usage, 3 done, but sets between its first and last
+are missing (the output lists them).
 
 Examples:
   depthrig trim data/20261121_1015_kitchen data/kitchen_start --to 30
@@ -28,20 +28,20 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct TrimArgs {
-    /// The dataset's folder, or one segment
+    /// Dataset folder, or one segment file
     dataset: PathBuf,
-    /// Folder of the new dataset; must not be there
+    /// Folder of the new dataset; must not exist
     out: PathBuf,
-    /// From this moment on
+    /// Start at this time
     #[arg(long, value_name = "T", conflicts_with = "first_set")]
     from: Option<Moment>,
-    /// Up to this moment
+    /// End at this time
     #[arg(long, value_name = "T", conflicts_with = "last_set")]
     to: Option<Moment>,
-    /// From the set of this id on
+    /// Start at the set with this id
     #[arg(long, value_name = "ID")]
     first_set: Option<u64>,
-    /// Up to the set of this id
+    /// End at the set with this id
     #[arg(long, value_name = "ID")]
     last_set: Option<u64>,
     /// Print JSON
@@ -49,42 +49,42 @@ pub struct TrimArgs {
     json: bool,
 }
 
-/// Cuts and reports.
+/// Cuts the dataset and reports the result.
 pub fn run(args: &TrimArgs, context: &Context) -> Result<Exit> {
     let edge = |moment: Option<Moment>, id: Option<u64>| moment.map(Edge::Moment).or(id.map(Edge::Set));
     let span = SetSpan { from: edge(args.from, args.first_set), to: edge(args.to, args.last_set) };
     let dataset = Dataset::open(&args.dataset)?;
     report(args.json, || {
-        watched(context, |tell| {
-            let mut progress = |done, total| tell("trim", done, total);
+        watched(context, |progress| {
+            let mut progress = |done, total| progress("trim", done, total);
             trim(&RealFs, &dataset, &args.out, span, &SliceOptions::default(), &mut progress)
         })
     })
 }
 
-/// Tells what was made, and which exit code that is.
+/// Prints the result, and returns its exit code.
 pub(super) fn report(json: bool, make: impl FnOnce() -> Result<SliceReport>) -> Result<Exit> {
-    let made = make()?;
+    let cut = make()?;
     if json {
-        out::json(&made)?;
+        out::json(&cut)?;
     } else {
-        let repeated = match made.repeated {
+        let repeated = match cut.repeated {
             0 => String::new(),
             n => format!(" ({n} were in several inputs)"),
         };
         out::line(format_args!(
             "{}: {}{repeated}, {} to {}, {}, {} in {}",
-            made.path.display(),
-            out::count(made.sets, "set"),
-            made.first_set,
-            made.last_set,
-            out::seconds(made.duration_ns as f64 / 1e9),
-            out::bytes(made.bytes),
-            out::count(made.segments, "segment")
+            cut.path.display(),
+            out::count(cut.sets, "set"),
+            cut.first_set,
+            cut.last_set,
+            out::seconds(cut.duration_ns as f64 / 1e9),
+            out::bytes(cut.bytes),
+            out::count(cut.segments, "segment")
         ))?;
-        for lost in &made.lost {
+        for lost in &cut.lost {
             out::line(format_args!("lost: {lost}"))?;
         }
     }
-    Ok(if made.complete { Exit::Good } else { Exit::Lost })
+    Ok(if cut.complete { Exit::Good } else { Exit::Lost })
 }

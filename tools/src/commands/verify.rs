@@ -1,4 +1,4 @@
-//! `depthrig verify`: proves that a dataset is whole, or says where it is not.
+//! `depthrig verify`: checks that a dataset is complete and undamaged.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -15,10 +15,10 @@ use std::sync::Arc;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Exit codes: 0 it is whole, 1 it is broken or no dataset, 3 it says itself that something was not recorded.
+Without --decode every byte is checked against checksums and every image against its set's mark, at disk speed; with
+--decode every image is decompressed and decoded as well.
 
-Without --decode every byte is proven by checksums and every picture by its set's mark, at the speed of the disk;
-with it every picture is unpacked and decoded too.
+Exit codes: 0 complete, 1 damaged or not a dataset, 2 wrong usage, 3 intact, but not everything was recorded.
 
 Examples:
   depthrig verify data/20261121_1015_kitchen
@@ -27,15 +27,15 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct VerifyArgs {
-    /// The dataset's folder
+    /// Dataset folder
     dataset: PathBuf,
-    /// Decode every picture as well
+    /// Also decode every image
     #[arg(long)]
     decode: bool,
-    /// Threads that unpack and decode; all cores when not given
+    /// Threads for decoding [default: all cores]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     threads: Option<u16>,
-    /// Report sets whose frames were captured further apart than this, in place of the rig's own limit
+    /// Report sets with a larger spread of capture times [default: the rig's limit]
     #[arg(long, value_name = "MS", value_parser = crate::args::spread_ms)]
     max_spread_ms: Option<f64>,
     /// Print JSON
@@ -57,7 +57,7 @@ pub fn run(args: &VerifyArgs, context: &Context) -> Result<Exit> {
     })?;
     bar.clear();
     if report.stopped {
-        bail!("the verification was ended before it had read everything");
+        bail!("interrupted; not everything was verified");
     }
     if args.json {
         out::json(&report)?;
@@ -75,15 +75,15 @@ pub fn run(args: &VerifyArgs, context: &Context) -> Result<Exit> {
         }
         out::line(summary(&report))?;
         if context.global.quiet == 0 {
-            for made in &report.computed {
-                out::line(format_args!("computed: {}", printable::line(&made.to_string())))?;
+            for producer in &report.computed {
+                out::line(format_args!("computed: {}", printable::line(&producer.to_string())))?;
             }
         }
     }
     Ok(exit(&report))
 }
 
-/// One line: how much was looked at, and what came of it.
+/// One line with the verdict and the amount of data.
 pub fn summary(report: &VerifyReport) -> String {
     let count = |severity| report.findings.iter().filter(|f| f.severity == severity).count();
     let verdict = match report.worst() {
@@ -98,13 +98,13 @@ pub fn summary(report: &VerifyReport) -> String {
         printable::path(&report.path),
         out::count(report.sets, "set"),
         out::count(report.frames, "frame"),
-        if report.decoded { " (every picture decoded)" } else { "" },
+        if report.decoded { " (every image decoded)" } else { "" },
         out::bytes(report.bytes),
         out::count(report.segments, "segment")
     )
 }
 
-/// The exit code that the worst finding asks for.
+/// Exit code of the worst finding.
 pub fn exit(report: &VerifyReport) -> Exit {
     match report.worst() {
         Some(Severity::Broken) => Exit::Failed,

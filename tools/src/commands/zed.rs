@@ -1,4 +1,4 @@
-//! `depthrig zed`: what is done with recordings of a ZED's two eyes.
+//! `depthrig zed`: processes recordings of a ZED's left and right images.
 
 use crate::context::Context;
 use crate::exit::Exit;
@@ -8,15 +8,15 @@ pub mod replay;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-docs/zed-replay.md tells what the modes are, and what they are not: the vendor's algorithms are closed and not here.
+docs/zed-replay.md describes the modes. They are not the vendor's algorithms, which are closed source.
 
 Examples:
   depthrig zed replay data/20261121_1015_kitchen --modes performance,ultra,quality --out data/kitchen_depth";
 
-/// What to do.
+/// Subcommands of `depthrig zed`.
 #[derive(Debug, clap::Subcommand)]
 pub enum ZedCommand {
-    /// Make depth of recorded raw stereo, in several modes at once, as a new dataset
+    /// Recompute depth from raw stereo in several modes, as a new dataset
     #[command(after_help = replay::EXAMPLES)]
     Replay(replay::ReplayArgs),
 }

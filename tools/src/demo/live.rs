@@ -1,8 +1,8 @@
-//! A subscriber of the live rig: takes frame sets as a policy would, checks them and looks at their depth.
+//! A subscriber of the live rig: reads frame sets as a policy would, and checks them and their depth.
 
 use super::sheet::Shot;
 use super::{Checksums, checksum, is_depth, mode_name};
-use crate::picture;
+use crate::image_file;
 use anyhow::Result;
 use core::time::Duration;
 use depthrig_bus::{Bus, ErrorKind, Frame, FrameHeader, MemberRecord, SetSubscriber, StreamId, Subscriber};
@@ -12,11 +12,11 @@ use std::collections::{BTreeMap, VecDeque};
 
 /// Frames of a stream that are kept until the set that names them comes; the bus lets a subscriber hold 16.
 const KEEP: usize = 14;
-/// Depth of every so-manieth set is kept, to be compared with the truth at the end: here it would hold up frames.
+/// Every n-th set's depth is kept and compared with the truth at the end: comparing at once would delay frames.
 const COMPARE_EVERY: u64 = 10;
 /// Sets that are compared at most; each is some 25 MB.
 const COMPARE_MOST: usize = 6;
-/// Refined pictures of a camera that are compared at most.
+/// Refined images of a camera that are compared at most.
 const REFINED_MOST: usize = 3;
 /// Frames of one moment are this close.
 const SAME_MOMENT_NS: i64 = 1_000_000;
@@ -25,31 +25,31 @@ const SAME_MOMENT_NS: i64 = 1_000_000;
 const SAME_MOMENT_IN_COLOR_NS: i64 = 5_000_000;
 /// Depths that are compared with the truth, metres.
 const COMPARED_M: core::ops::RangeInclusive<f32> = 0.1..=5.0;
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
-/// What was seen of one camera's depth.
+/// Statistics of one camera's depth.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct DepthSeen {
-    /// Share of pixels with a depth, mean over the pictures looked at, percent.
+    /// Share of pixels with a depth, mean over the images looked at, percent.
     pub fill_percent: f64,
-    /// Mean of |depth - truth| where both are, mean over the pictures, millimetres; `None` without a truth.
+    /// Mean of |depth - truth| where both are, mean over the images, millimetres; `None` without a truth.
     pub l1_mm: Option<f64>,
-    /// The same over every pixel of the truth: what is missing counts as 0, so that its whole depth is its error.
+    /// The same over every pixel of the truth: missing depth counts as 0, so that the true depth is its error.
     pub strict_l1_mm: Option<f64>,
-    /// Pictures looked at.
-    pub pictures: u64,
-    /// Pictures compared with the truth.
+    /// Images looked at.
+    pub images: u64,
+    /// Images compared with the truth.
     pub compared: u64,
 }
 
-/// What was seen of the rig.
+/// Observations of the rig.
 #[derive(Debug, Default)]
 pub struct Seen {
     /// Sets that came.
     pub sets: u64,
     /// Members of sets whose frame was gone before it was read.
     pub unread: u64,
-    /// Checksums of all depth pictures.
+    /// Checksums of all depth images.
     pub checksums: Checksums,
     /// Depth by mode.
     pub depth: BTreeMap<String, DepthSeen>,
@@ -61,10 +61,10 @@ pub struct Seen {
     pub shots: BTreeMap<String, BTreeMap<String, Shot>>,
 }
 
-/// What was seen of one camera's refined depth: before and after, in the same view, on the same pixels.
+/// Statistics of one camera's refined depth: before and after, in the same view, on the same pixels.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct RefinedSeen {
-    /// What refined it, as the frames say.
+    /// Engine, as named in the frames.
     pub engine: String,
     /// Frames that came.
     pub frames: u64,
@@ -99,7 +99,7 @@ struct Sums {
     holes_mm: f64,
 }
 
-/// Refined depth with what it was made of, and the truth if there is one.
+/// Refined depth with its inputs, and the ground truth if available.
 struct Refined {
     before: Copied,
     after: Copied,
@@ -139,7 +139,7 @@ impl Watcher {
     pub fn new(bus: &Bus, streams: &[StreamId]) -> Result<Self> {
         let mut inputs = BTreeMap::new();
         for id in streams {
-            let subscriber = bus.subscriber_within(id, PATIENCE)?;
+            let subscriber = bus.subscriber_within(id, TIMEOUT)?;
             inputs.insert(id.clone(), Input { subscriber, kept: VecDeque::with_capacity(KEEP) });
         }
         Ok(Self {
@@ -156,7 +156,7 @@ impl Watcher {
         while !ended() {
             self.pump()?;
             self.take_refined()?;
-            // Frames come at up to 60 Hz and four wait unread: a look every 20 ms loses none.
+            // Frames come at up to 60 Hz and four are buffered: polling every 20 ms loses none.
             if let Some(set) = self.sets.next_timeout(Duration::from_millis(20))? {
                 let members = set.members()?;
                 self.pump()?;
@@ -164,15 +164,15 @@ impl Watcher {
             }
         }
         self.look_at_late_modes();
-        // Images for the report, from the last frames; nothing waits for this any more.
+        // Images for the report, from the last frames; no frame is delayed any more.
         for (id, input) in &self.inputs {
             let Some(frame) = input.kept.back() else { continue };
             let stream = id.stream.as_str();
             if ["color", "depth_refined", "depth_aligned"].contains(&stream) || is_depth(stream) {
                 let header = frame.header();
-                let shot = match picture::depth_m(header, frame.pixels())? {
+                let shot = match image_file::depth_m(header, frame.pixels())? {
                     Some(metres) => Shot::Depth { width: header.width, height: header.height, metres },
-                    None => Shot::Color(picture::to_rgb(header, frame.pixels())?),
+                    None => Shot::Color(image_file::to_rgb(header, frame.pixels())?),
                 };
                 let shots = self.seen.shots.entry(id.camera.to_string()).or_default();
                 shots.insert(stream.to_owned(), shot);
@@ -188,7 +188,7 @@ impl Watcher {
             seen.add(depth, truth.as_ref(), SAME_MOMENT_NS)?;
         }
         for depth in self.seen.depth.values_mut() {
-            depth.fill_percent /= depth.pictures.max(1) as f64;
+            depth.fill_percent /= depth.images.max(1) as f64;
             let mean = |sum: f64| sum / depth.compared.max(1) as f64;
             depth.l1_mm = depth.l1_mm.map(mean);
             depth.strict_l1_mm = depth.strict_l1_mm.map(mean);
@@ -196,7 +196,7 @@ impl Watcher {
         Ok(self.seen)
     }
 
-    /// Has the newest picture of each depth mode looked at that comes too late for the sets of the bus.
+    /// Examines the newest image of each depth mode that is too late for the sets of the bus.
     fn look_at_late_modes(&mut self) {
         let looked_at = |id: &StreamId| {
             let same = |(depth, _): &(Copied, Option<Copied>)| depth.header.stream_id().as_ref() == Some(id);
@@ -208,8 +208,8 @@ impl Watcher {
         self.to_compare.push(newest);
     }
 
-    /// Takes what has come. Every depth picture is noted at once: a set that waits for a slow mode is told of when the
-    /// frames of fast cameras are gone.
+    /// Reads all pending frames. Every depth image is recorded at once: a set that waits for a slow mode is announced
+    /// only after the frames of fast cameras are gone.
     fn pump(&mut self) -> Result<()> {
         for (id, input) in &mut self.inputs {
             if !is_depth(id.stream.as_str()) {
@@ -226,7 +226,7 @@ impl Watcher {
         Ok(())
     }
 
-    /// Counts refined frames, and keeps some with what they were made of and the truth of their moment.
+    /// Counts refined frames, and keeps some with their inputs and the ground truth at that time.
     fn take_refined(&mut self) -> Result<()> {
         for (id, input) in self.inputs.iter().filter(|(id, _)| id.stream.as_str() == "depth_refined") {
             let Some(frame) = input.kept.back() else { continue };
@@ -248,7 +248,7 @@ impl Watcher {
             }
             if let Some(before) = kept("depth_aligned", SAME_MOMENT_NS)? {
                 let truth = kept("depth_true_color", SAME_MOMENT_IN_COLOR_NS)?;
-                // Where there is a truth it is waited for: a comparison without it says less.
+                // Wait for the ground truth if the camera has one.
                 let has_truth =
                     self.inputs.contains_key(&StreamId::new(id.camera.as_str(), "depth_true_color")?);
                 if truth.is_some() || !has_truth {
@@ -285,7 +285,7 @@ impl Watcher {
 }
 
 impl Input {
-    /// Takes what has come, and shows it to `look`; the oldest are let go.
+    /// Reads all pending frames and passes them to `look`; the oldest are released.
     fn pump(&mut self, mut look: impl FnMut(&Frame)) -> Result<()> {
         loop {
             match self.subscriber.try_next() {
@@ -309,7 +309,7 @@ impl Input {
 impl RefinedSeen {
     /// Adds an image to the sums and brings the means up to date.
     fn add(&mut self, refined: &Refined) -> Result<()> {
-        let metres = |c: &Copied| picture::depth_m(&c.header, &c.pixels);
+        let metres = |c: &Copied| image_file::depth_m(&c.header, &c.pixels);
         let (Some(before), Some(after)) = (metres(&refined.before)?, metres(&refined.after)?) else {
             return Ok(());
         };
@@ -329,7 +329,7 @@ impl RefinedSeen {
 }
 
 impl Sums {
-    /// Adds one image; `truth` is empty when there is none.
+    /// Adds one image; `truth` may be empty.
     fn add(&mut self, before: &[f32], after: &[f32], truth: &[f32]) {
         let is_depth = |z: f32| z.is_finite() && z > 0.0;
         for (i, (before, after)) in before.iter().zip(after).enumerate() {
@@ -353,15 +353,15 @@ impl Sums {
 }
 
 impl DepthSeen {
-    /// Sums are divided by the number of pictures at the end. The truth counts when it is `within` nanoseconds of `depth`.
+    /// Sums are divided by the number of images at the end. The truth counts when it is `within` nanoseconds of `depth`.
     fn add(&mut self, depth: &Copied, truth: Option<&Copied>, within: i64) -> Result<()> {
-        let Some(metres) = picture::depth_m(&depth.header, &depth.pixels)? else { return Ok(()) };
-        self.pictures += 1;
+        let Some(metres) = image_file::depth_m(&depth.header, &depth.pixels)? else { return Ok(()) };
+        self.images += 1;
         self.fill_percent += 100.0 * fill_rate(&Depth::Metres(&metres));
         let same_moment =
             |t: &&Copied| (t.header.capture_time_ns - depth.header.capture_time_ns).abs() < within;
         if let Some(truth) = truth.filter(same_moment)
-            && let Some(true_metres) = picture::depth_m(&truth.header, &truth.pixels)?
+            && let Some(true_metres) = image_file::depth_m(&truth.header, &truth.pixels)?
         {
             let range = DepthRange { min_m: (*COMPARED_M.start()).into(), max_m: (*COMPARED_M.end()).into() };
             let metrics = compare(&Depth::Metres(&metres), &Depth::Metres(&true_metres), range)?;

@@ -8,11 +8,11 @@ use depthrig_daemon::replay::{Replay, ReplayOptions};
 use serde::Serialize;
 use std::path::Path;
 
-const PATIENCE: Duration = Duration::from_secs(10);
-/// How long nothing may come after the end before all that came counts as everything.
+const TIMEOUT: Duration = Duration::from_secs(10);
+/// Silence after the end that counts as the end of the stream.
 const SILENCE: Duration = Duration::from_millis(300);
 
-/// What came out of the replay.
+/// Result of the replay.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Replayed {
     /// Sets that the replay published.
@@ -21,20 +21,20 @@ pub struct Replayed {
     pub published: u64,
     /// Frames that the subscriber read.
     pub received: u64,
-    /// Depth pictures that are bit by bit those of the live rig.
+    /// Depth images that are bit by bit those of the live rig.
     pub depth_equal: u64,
-    /// Depth pictures that are not.
+    /// Depth images that are not.
     pub depth_different: u64,
-    /// Depth pictures of moments that the subscriber of the live rig did not see.
+    /// Depth images that the subscriber of the live rig missed.
     pub depth_unknown: u64,
     /// Frames without the flag `replayed` or with times that go backwards.
     pub wrong_headers: u64,
-    /// What could not be read or published.
+    /// Descriptions of everything that could not be read or published.
     pub lost: Vec<String>,
 }
 
 impl Replayed {
-    /// Whether the replay is what was recorded, as far as it was seen.
+    /// Returns whether the replay equals the recording, as far as it was observed.
     pub const fn is_right(&self) -> bool {
         self.depth_different == 0 && self.wrong_headers == 0 && self.depth_equal > 0
     }
@@ -47,7 +47,7 @@ pub fn run(
     rig: &depthrig_bus::RigName,
     live: &Checksums,
 ) -> Result<Replayed> {
-    // Paused until the subscriber is there: it is to see every frame.
+    // Paused until the subscriber is attached, so that it sees every frame.
     let options = ReplayOptions { as_fast_as_possible: true, paused: true, ..ReplayOptions::default() };
     let streams: Vec<StreamId> =
         depthrig_recorder::Dataset::open(dataset)?.session().streams.iter().map(|s| s.id.clone()).collect();
@@ -55,7 +55,7 @@ pub fn run(
     let bus = Bus::open(runtime, rig)?;
     let mut inputs = Vec::new();
     for id in streams {
-        let subscriber = bus.subscriber_within(&id, PATIENCE)?;
+        let subscriber = bus.subscriber_within(&id, TIMEOUT)?;
         inputs.push(Input { id, subscriber, last_ns: i64::MIN });
     }
     if let Some(replay) = replay.control().replay() {

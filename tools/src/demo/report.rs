@@ -14,7 +14,7 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// Everything that the demo found out.
+/// Results of the demo.
 #[derive(Debug, Serialize)]
 pub struct DemoReport {
     /// From the start of the rig to the first frame of every camera, seconds; rendering not counted.
@@ -31,7 +31,7 @@ pub struct DemoReport {
     pub seeded: Seeded,
     /// Millimetres per unit of depth, by depth mode.
     pub units_mm: BTreeMap<String, f64>,
-    /// Pictures of each depth mode in the recording.
+    /// Images of each depth mode in the recording.
     pub recorded: BTreeMap<String, u64>,
     /// Depth modes that the rig asks for and that are not there, with the reason.
     pub unavailable: Vec<String>,
@@ -41,29 +41,30 @@ pub struct DemoReport {
     pub sets_seen: u64,
     /// Frames of those sets that the subscriber did not have: those of the first set were sent before it subscribed.
     pub frames_unread: u64,
-    /// The rig's last words.
+    /// Final summary of the rig.
     pub summary: RigSummary,
-    /// What `depthrig verify --decode` says of the dataset.
+    /// Result of `depthrig verify --decode`.
     pub verify: VerifyReport,
-    /// What came out of the replay.
+    /// Result of the replay.
     pub replay: Replayed,
     /// The dataset.
     pub dataset: PathBuf,
-    /// Its quality report, a page to look at.
+    /// Its quality report, an HTML file.
     pub quality_report: PathBuf,
     /// Its segments.
     pub segments: Vec<PathBuf>,
-    /// The picture of what the cameras saw.
+    /// Contact sheet of the cameras' images.
     pub contact_sheet: PathBuf,
 }
 
 impl DemoReport {
-    /// 1 when something is wrong. Frames that a busy computer lost are counted and named, and nothing is wrong with that.
+    /// Exit code: 1 if something is wrong. Frames lost on a busy computer are counted and listed, but are not a
+    /// failure.
     pub fn exit(&self) -> Exit {
         if self.wrong().is_empty() { Exit::Good } else { Exit::Failed }
     }
 
-    /// What is wrong, one line each.
+    /// Failures, one line each.
     fn wrong(&self) -> Vec<String> {
         let mut wrong = Vec::new();
         for camera in &self.summary.status.cameras {
@@ -89,7 +90,7 @@ impl DemoReport {
         wrong
     }
 
-    /// Why the recording is not what it should be, unless the computer was only too busy for some of its sets.
+    /// Fault of the recording; sets lost on a busy computer are not a fault.
     fn recording_fault(&self) -> Option<String> {
         let Some(summary) = &self.summary.recording else { return Some("nothing was recorded".to_owned()) };
         let status = self.summary.status.recording.as_ref();
@@ -108,13 +109,13 @@ impl DemoReport {
         ))
     }
 
-    /// What was lost, in one line with what to do; `None` when nothing was. What gives way by design, as computed depth for
-    /// which a pair was too many, is not lost.
+    /// Describes losses and their cure on one line; `None` without losses. Frames dropped by design, such as skipped
+    /// pairs of computed depth, do not count.
     fn losses(&self) -> Option<String> {
         let status = &self.summary.status;
         let mut parts = Vec::new();
         for camera in &status.cameras {
-            // The truth of a simulation is no camera's image.
+            // The ground truth of a simulation is not a camera image.
             let streams = camera.streams.iter().filter(|s| !s.id.contains("/depth_true"));
             let frames: u64 = streams.map(lost_frames).sum();
             if frames > 0 {
@@ -147,7 +148,7 @@ impl DemoReport {
         modes.filter(|mode| self.recorded.get(mode).is_none_or(|images| *images == 0))
     }
 
-    /// The report for people.
+    /// Formats the report as text.
     pub fn text(&self) -> String {
         let ok = |good: bool| if good { "ok  " } else { "LOOK" };
         let sets = &self.live.sets;
@@ -186,7 +187,7 @@ impl DemoReport {
             ),
             format!("{} verify   {}", ok(verify::exit(&self.verify) != Exit::Failed), verify::summary(&self.verify)),
             format!(
-                "{} replay   {} of {} frames received; {} depth pictures equal the live ones bit by bit, {} differ",
+                "{} replay   {} of {} frames received; {} depth images equal the live ones bit by bit, {} differ",
                 ok(self.replay.is_right()),
                 self.replay.received,
                 self.replay.published,
@@ -213,7 +214,7 @@ impl DemoReport {
         lines.join("\n")
     }
 
-    /// What was refined live and by what, and what a model of random weights did.
+    /// Lines about live refinement, and about the model with random weights.
     fn refined_lines(&self) -> Vec<String> {
         let mut lines = vec![String::new()];
         let frames: u64 = self.refined.values().map(|r| r.frames).sum();
@@ -264,7 +265,7 @@ impl DemoReport {
             Some(why) => format!("--   model    a camera depth model is not shown: {why}"),
             None => format!(
                 "ok   model    {} ran {}: first frame after {:.1} s, network {:.0} ms, all steps {:.0} ms; its weights are \
-                 random, so what it gives is no depth",
+                 random, so its output is not depth",
                 s.engine, s.model, s.first_frame_s, s.infer_ms, s.total_ms
             ),
         });
@@ -309,14 +310,14 @@ fn lost_frames(stream: &StreamStatus) -> u64 {
     if stream.derived { 0 } else { lost(&stream.id, &stream.dropped) }
 }
 
-/// Frames of a stream that were lost, of those dropped. What is computed here from other streams gives way when it is too
-/// much, by design.
+/// Frames of a stream that count as lost. Streams computed from others are dropped by design when the computer is too
+/// slow.
 fn lost(id: &str, dropped: &BTreeMap<String, u64>) -> u64 {
     let by_design = |reason: &str| reason == "queue_full" && is_computed(id);
     dropped.iter().filter(|(reason, _)| !by_design(reason)).map(|(_, n)| n).sum()
 }
 
-/// Whether a stream is made by stereo matching.
+/// Returns whether a stream is computed by stereo matching.
 fn is_computed(id: &str) -> bool {
     id.split_once('/').is_some_and(|(_, s)| s.starts_with("depth_") || s.starts_with("confidence_"))
 }
@@ -329,7 +330,7 @@ fn depth_streams(camera: &CameraStatus) -> impl Iterator<Item = (&StreamStatus, 
     })
 }
 
-/// Pictures of each depth mode in a dataset whose streams have so many.
+/// Counts images by depth mode, from the counts by stream.
 pub fn modes<'a>(streams: impl IntoIterator<Item = (&'a str, u64)>) -> BTreeMap<String, u64> {
     let mode = |(id, frames): (&str, u64)| {
         let (camera, stream) = id.split_once('/')?;

@@ -1,6 +1,6 @@
 //! A camera depth model end to end, with random weights: from a checkpoint on disk to a frame that a subscriber reads.
 //!
-//! What comes out is no depth; it shows that the whole way works on this computer, and how long it takes.
+//! The output is not depth; it shows that the full pipeline works on this computer, and how long it takes.
 
 use crate::context::private_folder;
 use anyhow::{Context as _, Result};
@@ -16,15 +16,15 @@ use serde::Serialize;
 const CAMERA: &str = "d435";
 /// Shorter side of the network's input: enough to see it work.
 const INPUT_SIZE: u32 = 252;
-/// How long a computer may take for it.
-const PATIENCE: Duration = Duration::from_mins(1);
+/// Timeout for the first frame.
+const TIMEOUT: Duration = Duration::from_mins(1);
 
-/// What became of it.
+/// Result of the run.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Seeded {
-    /// What ran, as the frame's header says.
+    /// Engine, as named in the frame's header.
     pub engine: String,
-    /// The model, as the frame's header says.
+    /// Model, as named in the frame's header.
     pub model: String,
     /// From the start of the rig to the frame, seconds; weights and engine are made ready in it.
     pub first_frame_s: f64,
@@ -32,13 +32,13 @@ pub struct Seeded {
     pub infer_ms: f64,
     /// All steps of this frame, milliseconds.
     pub total_ms: f64,
-    /// Why it is not shown.
+    /// Reason why it did not run.
     pub missing: Option<String>,
 }
 
 /// Makes a model of random numbers and runs it in a rig of one simulated camera until its first frame.
 pub fn run() -> Result<Seeded> {
-    // Looked for first: a rig that asks for the engine and does not find its library logs an error.
+    // Searched first, because a rig without the engine's library logs an error.
     if let Err(why) = depthrig_cdm::find_library(None, "cpu", Precision::Fp32) {
         return Ok(Seeded { missing: Some(why.to_string()), ..Seeded::default() });
     }
@@ -82,8 +82,8 @@ pub fn run() -> Result<Seeded> {
             seen.missing = Some(why.split("; tried again").next().unwrap_or_default().to_owned());
             break;
         }
-        if began.elapsed() > PATIENCE {
-            seen.missing = Some(format!("no frame came within {} s", PATIENCE.as_secs()));
+        if began.elapsed() > TIMEOUT {
+            seen.missing = Some(format!("no frame came within {} s", TIMEOUT.as_secs()));
             break;
         }
     }

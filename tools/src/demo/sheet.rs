@@ -1,7 +1,7 @@
 //! The contact sheet: a row of labelled images for each camera, depth in one scale, and a bar that says which.
 
 use crate::font;
-use crate::picture::depth_range;
+use crate::image_file::depth_range;
 use crate::turbo::depth_color;
 use image::{Rgb, RgbImage, imageops};
 
@@ -9,7 +9,7 @@ use image::{Rgb, RgbImage, imageops};
 const HEIGHT: u32 = 200;
 /// Space around images.
 const GAP: u32 = 8;
-/// Images side by side; a camera with more goes on in the next row.
+/// Images side by side; further images of a camera are in the next row.
 const ABREAST: usize = 3;
 /// Pixels of a letter's pixel in labels, and in the names of cameras.
 const LABEL: u32 = 2;
@@ -28,7 +28,7 @@ const INK: Rgb<u8> = Rgb([230, 230, 230]);
 pub enum Shot {
     /// As it is.
     Color(RgbImage),
-    /// Depth in metres, row by row; 0 where there is none.
+    /// Depth in metres, row by row; 0 where depth is missing.
     Depth {
         /// Pixels in a row.
         width: u32,
@@ -39,7 +39,7 @@ pub enum Shot {
     },
 }
 
-/// An image and what it is.
+/// An image with its label.
 #[derive(Debug)]
 pub struct Tile<'a> {
     /// Written above it.

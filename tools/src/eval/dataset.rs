@@ -1,8 +1,8 @@
-//! The pictures of a depthrig dataset whose cameras know the truth.
+//! The images of a depthrig dataset with ground truth.
 
 use super::read::Metres;
 use super::{Job, Loaded, Source};
-use crate::picture::depth_m;
+use crate::image_file::depth_m;
 use anyhow::{Context, Result, bail};
 use depthrig_bus::{FrameHeader, PixelFormat, StreamName};
 use depthrig_calib::{PoseExt, Registration, same_view};
@@ -12,9 +12,9 @@ use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// The streams that are compared when nothing is said, as far as they are there.
+/// Streams that are evaluated by default, if present.
 const PREDICTIONS: [&str; 3] = ["depth", "depth_aligned", "depth_refined"];
-/// The streams that are the truth when nothing is said, best first.
+/// Streams that serve as ground truth by default, best first.
 const TRUTHS: [&str; 2] = ["depth_true_color", "depth_true"];
 /// Prediction and truth are of one moment when their capture times are this near: capture times of two streams differ by
 /// half their exposures, and frames of 60 Hz are 16 ms apart.
@@ -27,7 +27,7 @@ pub struct FromDataset {
     total: u64,
 }
 
-/// What all jobs use.
+/// State shared by all jobs.
 struct Shared {
     names: Vec<String>,
     /// Camera and stream by number.
@@ -115,7 +115,7 @@ impl Source for FromDataset {
     fn left_out(&self) -> Vec<String> {
         let said = |n: &AtomicU64, what: &str| {
             let n = n.load(Ordering::Relaxed);
-            (n > 0).then(|| format!("{n} pictures {what}"))
+            (n > 0).then(|| format!("{n} images {what}"))
         };
         let other = said(&self.shared.other_moment, "are of another moment than the truth of their set");
         other.into_iter().chain(said(&self.shared.no_truth, "have no truth in their set")).collect()
@@ -164,13 +164,15 @@ impl Shared {
 
     /// The depth of `frame` where `truth` looks.
     fn in_view_of(&self, frame: &DatasetFrame, truth: &DatasetFrame) -> Result<Metres> {
-        let (a, b) = (&frame.header, &truth.header);
+        let a = &frame.header;
+        let b = &truth.header;
         let view = |h: &FrameHeader| (h.intrinsics, (h.width, h.height), h.pose);
-        let ((ka, sa, pa), (kb, sb, pb)) = (view(a), view(b));
+        let (ka, sa, pa) = view(a);
+        let (kb, sb, pb) = view(b);
         if frame.stream == truth.stream || same_view((&ka, sa, &pa), (&kb, sb, &pb)) {
             return metres(frame);
         }
-        let what = || format!("{}: it cannot be put into the view of its truth", a.camera());
+        let what = || format!("{}: depth cannot be registered to the view of its ground truth", a.camera());
         if a.pixel_format() != Some(PixelFormat::Z16) {
             bail!("{}: only z16 depth can be moved to another view", what());
         }
@@ -197,15 +199,16 @@ impl Shared {
 
 /// 16-bit pixels without padding.
 fn rows(h: &FrameHeader, bytes: &[u8]) -> Result<Vec<u16>> {
-    let (row, stride) = (2 * h.width as usize, h.stride as usize);
+    let row = 2 * h.width as usize;
+    let stride = h.stride as usize;
     let all = (0..h.height as usize).map(|y| bytes.get(y * stride..y * stride + row));
-    let all = all.collect::<Option<Vec<_>>>().context("a picture is shorter than its header says")?;
+    let all = all.collect::<Option<Vec<_>>>().context("an image is shorter than its header says")?;
     Ok(all.into_iter().flat_map(|r| r.as_chunks::<2>().0).map(|b| u16::from_le_bytes(*b)).collect())
 }
 
 fn metres(frame: &DatasetFrame) -> Result<Metres> {
     let h = &frame.header;
     let pixels = depth_m(h, &frame.decoded()?)?;
-    let pixels = pixels.with_context(|| format!("{}: a stream to compare is no depth", h.camera()))?;
+    let pixels = pixels.with_context(|| format!("{}: a stream to compare is not depth", h.camera()))?;
     Ok(Metres { width: h.width as usize, height: h.height as usize, pixels })
 }

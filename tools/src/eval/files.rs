@@ -1,4 +1,4 @@
-//! Folders of depth pictures, and the layout of the HAMMER dataset.
+//! Folders of depth images, and the layout of the HAMMER dataset.
 //!
 //! HAMMER (Jung et al. 2023, arXiv 2303.14840; `_dataset_processed` as released) is a folder per sequence, such as
 //! `scene2_traj1_1`, with `polarization/` in it: `rgb/`, `_gt/`, `depth_d435/`, `depth_l515/` and `depth_tof/`, whose files
@@ -26,14 +26,14 @@ pub const HAMMER_RANGE_M: (f64, f64) = (0.1, 6.0);
 /// How deep folders are searched.
 const DEEPEST: usize = 8;
 
-/// A folder of predictions and what it is called.
+/// A folder of predictions with its name.
 #[derive(Debug, Clone)]
 pub struct Named {
-    /// What it is called.
+    /// Name of the prediction.
     pub name: String,
-    /// Where it is.
+    /// Its path.
     pub folder: PathBuf,
-    /// Metres per unit of its whole numbers.
+    /// Metres per unit of its integer files.
     pub unit_m: f64,
 }
 
@@ -64,7 +64,7 @@ impl Files {
     ) -> Result<Self> {
         let truths = by_stem(truth, &ENDINGS)?;
         if truths.is_empty() {
-            bail!("{}: there are no depth pictures; {} are read", truth.display(), ENDINGS.join(", "));
+            bail!("{}: contains no depth images; supported are {}", truth.display(), ENDINGS.join(", "));
         }
         let found = predictions.iter().map(|p| by_stem(&p.folder, &ENDINGS)).collect::<Result<Vec<_>>>()?;
         let colors = color.map(|c| by_stem(c, &["png", "jpg", "jpeg"])).transpose()?.unwrap_or_default();
@@ -83,7 +83,7 @@ impl Files {
         find_views(root, 0, &mut views)?;
         if views.is_empty() {
             let shape = format!("SEQUENCE/{HAMMER_VIEW}/{HAMMER_TRUTH}/000000.png");
-            bail!("{}: it is not laid out as HAMMER: there is no {shape} in it", root.display());
+            bail!("{}: not in the layout of HAMMER: it contains no {shape}", root.display());
         }
         views.sort();
         let raw = HAMMER_DEPTH.map(|name| Named {
@@ -121,7 +121,8 @@ impl Files {
         let mut left_out = Vec::new();
         for (k, p) in predictions.iter().enumerate() {
             let has = |i: &&Item| i.predictions.iter().any(|(n, _)| *n == k);
-            let (n, first) = (items.iter().filter(has).count(), items.iter().find(|i| !has(i)));
+            let n = items.iter().filter(has).count();
+            let first = items.iter().find(|i| !has(i));
             if let Some(first) = first.filter(|_| n > 0 || !p.folder.as_os_str().is_empty()) {
                 let missing = items.len() - n;
                 left_out.push(format!(
@@ -161,7 +162,9 @@ impl Source for Files {
 
     fn next(&mut self) -> Option<Result<Job>> {
         let item = self.items.next()?;
-        let (units, unit_m, group) = (Arc::clone(&self.units), self.truth_unit_m, self.group.clone());
+        let units = Arc::clone(&self.units);
+        let unit_m = self.truth_unit_m;
+        let group = self.group.clone();
         Some(Ok(Box::new(move || {
             let truth = depth(&item.truth, unit_m)?;
             let mut predictions = Vec::new();
@@ -169,7 +172,7 @@ impl Source for Files {
                 let p = depth(path, units[*k])?;
                 if (p.width, p.height) != (truth.width, truth.height) {
                     bail!(
-                        "{}: it has {}x{} pixels and its reference {}x{}; compare pictures of one view and size",
+                        "{}: it has {}x{} pixels and its reference {}x{}; compare images of one view and size",
                         path.display(),
                         p.width,
                         p.height,
@@ -190,9 +193,9 @@ impl Source for Files {
 }
 
 fn color(path: &Path) -> Result<(FrameHeader, Vec<u8>)> {
-    let image = crate::picture::open(path)?.into_rgb8();
+    let image = crate::image_file::open(path)?.into_rgb8();
     let mut header = FrameHeader::default();
-    header.set_picture(PixelFormat::Rgb8, image.width(), image.height());
+    header.set_image(PixelFormat::Rgb8, image.width(), image.height());
     Ok((header, image.into_raw()))
 }
 

@@ -1,13 +1,13 @@
-//! Depth out of picture files: 16-bit PNG and TIFF in some unit, NPY and TIFF in metres.
+//! Reads depth from image files: 16-bit PNG and TIFF in a given unit, NPY and TIFF in metres.
 
 use anyhow::{Context, Result, bail};
 use depthrig_bus::files;
 use std::path::Path;
 
-/// The largest side of a picture that is read.
+/// The largest side of an image that is read.
 const MAX_SIDE: usize = 32_768;
 
-/// A depth picture in metres, row by row; what is not above 0 or not finite is a hole.
+/// A depth image in metres, row by row; values that are not finite or not above 0 are holes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Metres {
     /// Pixels per row.
@@ -18,7 +18,7 @@ pub struct Metres {
     pub pixels: Vec<f32>,
 }
 
-/// Endings of the files that can be read.
+/// Extensions of supported files.
 pub const ENDINGS: [&str; 4] = ["png", "npy", "tiff", "tif"];
 
 /// Reads `path`. Whole numbers are taken times `unit_m`, floating-point ones are metres; `65535` of 16 bits says that a
@@ -41,7 +41,8 @@ fn units(values: impl Iterator<Item = u16>, unit_m: f64) -> Vec<f32> {
 
 fn png(bytes: &[u8], unit_m: f64) -> Result<Metres> {
     let image = image::load_from_memory_with_format(bytes, image::ImageFormat::Png)?;
-    let (width, height) = (image.width() as usize, image.height() as usize);
+    let width = image.width() as usize;
+    let height = image.height() as usize;
     let image::DynamicImage::ImageLuma16(image) = image else {
         bail!("it is {:?}, not 16-bit grey", image.color());
     };
@@ -52,7 +53,8 @@ fn tiff(bytes: &[u8], unit_m: f64) -> Result<Metres> {
     use tiff::decoder::{Decoder, DecodingResult};
     let mut decoder = Decoder::new(std::io::Cursor::new(bytes))?;
     let (width, height) = decoder.dimensions()?;
-    let (width, height) = (width as usize, height as usize);
+    let width = width as usize;
+    let height = height as usize;
     let pixels = match decoder.read_image()? {
         DecodingResult::U16(v) => units(v.into_iter(), unit_m),
         DecodingResult::F32(v) => v,
@@ -67,14 +69,14 @@ fn tiff(bytes: &[u8], unit_m: f64) -> Result<Metres> {
 
 /// <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>.
 fn npy(bytes: &[u8], unit_m: f64) -> Result<Metres> {
-    let rest = bytes.strip_prefix(b"\x93NUMPY").context("it is no NPY file")?;
+    let rest = bytes.strip_prefix(b"\x93NUMPY").context("not an NPY file")?;
     let (len, rest) = match rest {
         [1, _, a, b, rest @ ..] => (usize::from(u16::from_le_bytes([*a, *b])), rest),
         [2 | 3, _, a, b, c, d, rest @ ..] => (u32::from_le_bytes([*a, *b, *c, *d]) as usize, rest),
-        _ => bail!("it is no NPY file of a known version"),
+        _ => bail!("unsupported version of NPY"),
     };
     let (head, data) = rest.split_at_checked(len).context("its head is cut off")?;
-    let head = core::str::from_utf8(head).context("its head is no text")?;
+    let head = core::str::from_utf8(head).context("invalid NPY header: not text")?;
     let value = |key: &str| {
         let at = head.find(&format!("'{key}'"))? + key.len() + 2;
         Some(head[at..].trim_start().strip_prefix(':')?.trim_start())
@@ -86,17 +88,17 @@ fn npy(bytes: &[u8], unit_m: f64) -> Result<Metres> {
     let shape = value("shape").and_then(|v| v.strip_prefix('(')?.split_once(')')).map(|(shape, _)| shape);
     let shape = shape.context("its head has no shape")?.split(',').map(str::trim).filter(|n| !n.is_empty());
     let shape: Vec<usize> =
-        shape.map(str::parse).collect::<Result<_, _>>().context("its shape is no shape")?;
+        shape.map(str::parse).collect::<Result<_, _>>().context("invalid NPY header: invalid shape")?;
     let ([height, width]
     | [1, height, width]
     | [height, width, 1]
     | [1, height, width, 1]
     | [1, 1, height, width]) = shape[..]
     else {
-        bail!("shape {shape:?} is not that of one picture");
+        bail!("shape {shape:?} is not that of one image");
     };
     if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
-        bail!("shape {shape:?} is no picture");
+        bail!("unsupported shape {shape:?}; an image has two dimensions");
     }
     let pixels: Vec<f32> = match kind {
         Some("<u2") => units(data.as_chunks::<2>().0.iter().map(|b| u16::from_le_bytes(*b)), unit_m),
@@ -113,7 +115,9 @@ fn npy(bytes: &[u8], unit_m: f64) -> Result<Metres> {
 
 /// A 16-bit float of IEEE 754.
 fn half(bits: u16) -> f32 {
-    let (sign, exponent, part) = (bits >> 15, (bits >> 10) & 31, bits & 1023);
+    let sign = bits >> 15;
+    let exponent = (bits >> 10) & 31;
+    let part = bits & 1023;
     let value = match exponent {
         0 => f32::from(part) * 2f32.powi(-24),
         31 => f32::NAN,
@@ -150,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_picture_is_refused() {
+    fn what_is_no_image_is_refused() {
         for (kind, shape, n) in [
             ("<f4", "(2, 2)", 15),
             ("<f4", "(2, 2, 3)", 48),

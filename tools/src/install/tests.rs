@@ -1,4 +1,4 @@
-//! Installing into a made root, and what the files themselves must hold.
+//! Installation into a temporary root, and the contents of the files.
 
 use super::*;
 
@@ -90,7 +90,7 @@ fn the_rules_name_every_camera_that_has_a_driver() {
     for id in ["2485", "f63b", "f63c", "f63d"] {
         assert!(rules.contains(id), "OAK {id}");
     }
-    // Every line that is none of a comment, a label or a jump matches a subsystem first.
+    // Every line except comments, labels and jumps matches a subsystem first.
     let mut continued = false;
     for line in rules.lines().filter(|l| !l.starts_with('#') && !l.is_empty()) {
         let starts = ["SUBSYSTEM==", "ACTION==", "LABEL="].iter().any(|s| line.starts_with(s));

@@ -1,4 +1,4 @@
-//! What a status looks like.
+//! Layout of the status text.
 
 use super::*;
 use depthrig_daemon::status::{ClockStatus, RefineStatus, SetAccount, SetStatus, SharedMemoryStatus};
@@ -70,7 +70,7 @@ fn rig() -> RigStatus {
 }
 
 #[test]
-fn a_motion_unit_has_no_picture_and_the_rate_of_its_samples() {
+fn an_imu_has_no_image_and_the_rate_of_its_samples() {
     let mut rig = rig();
     let imu = StreamStatus {
         format: "motion".into(),
@@ -142,7 +142,7 @@ fn a_wide_one_has_more_columns() {
     let header = text.lines().find(|l| l.starts_with("stream")).unwrap();
     assert_eq!(
         header.split_whitespace().collect::<Vec<_>>().join(" "),
-        "stream state picture format Hz frames lost p50 ms p99 ms clock metadata ppm ±us"
+        "stream state image format Hz frames lost p50 ms p99 ms clock metadata ppm ±us"
     );
     let row = text.lines().find(|l| l.starts_with("l515/depth")).unwrap();
     assert_eq!(

@@ -1,4 +1,4 @@
-//! A home for the binary under test: its own runtime folder, pictures for `files` cameras, and its output.
+//! A home for the binary under test: its own runtime folder, images for `files` cameras, and its output.
 #![allow(dead_code)] // each test binary uses a part of it
 
 use std::path::Path;
@@ -17,7 +17,7 @@ pub fn depthrig() -> Command {
     command
 }
 
-/// What a run left.
+/// Output and exit code of a run.
 pub struct Ran {
     pub code: i32,
     pub out: String,
@@ -92,8 +92,8 @@ impl Home {
         path.to_str().unwrap().to_owned()
     }
 
-    /// Pictures of 64x48 for a `files` camera; no two are alike.
-    pub fn pictures(&self, count: u32) {
+    /// Images of 64x48 for a `files` camera; no two are alike.
+    pub fn images(&self, count: u32) {
         for folder in ["color", "depth"] {
             std::fs::create_dir_all(self.path().join(folder)).unwrap();
         }
@@ -105,19 +105,19 @@ impl Home {
         }
     }
 
-    /// Whether the 16-bit PNG `file` is one of the depth pictures.
+    /// Whether the 16-bit PNG `file` is one of the depth images.
     pub fn is_a_source(&self, file: &Path) -> bool {
         let read = |path: &Path| image::open(path).unwrap().into_luma16();
         let tapped = read(file);
         std::fs::read_dir(self.path().join("depth")).unwrap().any(|e| read(&e.unwrap().path()) == tapped)
     }
 
-    /// A rig with one camera `desk` that plays the pictures.
+    /// A rig with one camera `desk` that plays the images.
     pub fn rig_file(&self, rig: &str) -> String {
         let manifest = include_str!("manifest.toml");
-        self.write("pictures.toml", manifest);
+        self.write("images.toml", manifest);
         let text = format!(
-            "rig = \"{rig}\"\n[recording]\nallow = [\"data\"]\nreserve_mb = 16\n\n[[camera]]\nname = \"desk\"\nbackend = \"files\"\nmanifest = \"pictures.toml\"\n"
+            "rig = \"{rig}\"\n[recording]\nallow = [\"data\"]\nreserve_mb = 16\n\n[[camera]]\nname = \"desk\"\nbackend = \"files\"\nmanifest = \"images.toml\"\n"
         );
         self.write("rig.toml", &text)
     }
@@ -156,7 +156,7 @@ pub fn wait(mut done: impl FnMut() -> bool, what: &str) {
     panic!("{what}");
 }
 
-/// A process that runs until it is told to end. Dropping it kills it.
+/// A process that runs until it is stopped. Dropping it kills it.
 pub struct Running(Option<Child>);
 
 impl Running {
@@ -185,7 +185,7 @@ impl Running {
         }
     }
 
-    /// Waits for its end, and kills it when that does not come.
+    /// Waits for its end, and kills it after a timeout.
     pub fn wait_for_end(mut self) -> Ran {
         let child = self.0.as_mut().unwrap();
         wait(|| child.try_wait().unwrap().is_some(), "it does not end");

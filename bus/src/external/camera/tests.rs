@@ -1,4 +1,4 @@
-//! What an answer of the daemon says, and what of it cannot be.
+//! Decoding of the daemon's answers, valid and invalid.
 
 use super::*;
 

@@ -1,8 +1,8 @@
-//! One plane through what many places say, whatever some of them say, and how far it can be trusted.
+//! Robust fit of one plane through many places, and its uncertainty.
 
 use glam::{DMat3, DVec3};
 
-/// Squares that a picture is divided into, across and down. Places of one square err alike, in one pair and in the next one
+/// Squares that an image is divided into, across and down. Places of one square err alike, in one pair and in the next one
 /// of a scene that stands still.
 const SQUARES: (usize, usize) = (8, 6);
 /// Pairs that count at once at most.
@@ -16,12 +16,12 @@ const MAD: f64 = 1.4826;
 /// Errors are taken to be no smaller than this, pixels.
 const LEAST_PX: f64 = 0.05;
 
-/// What a place says.
+/// Measurement at one place.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Point {
-    /// Column and row, -0.5 to 0.5 of the picture.
+    /// Column and row, -0.5 to 0.5 of the image.
     pub at: (f64, f64),
-    /// Rows by which it lies lower in the right picture, pixels.
+    /// Rows by which it lies lower in the right image, pixels.
     pub rows: f64,
     /// Number of the pair, from 0.
     pub pair: usize,
@@ -43,7 +43,7 @@ pub struct Plane {
     pub deviations: DVec3,
     /// Share of the places that agree.
     pub agree: f64,
-    /// Squares of the picture with places that agree.
+    /// Squares of the image with places that agree.
     pub squares: usize,
 }
 
@@ -52,8 +52,8 @@ fn median(values: &mut [f64]) -> f64 {
     *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
-/// The plane, or its height in the middle alone when `is_flat`. `scratch` holds as many numbers as there are points. `None`
-/// when they lie so that nothing can be said.
+/// The plane, or its height in the middle alone when `is_flat`. `scratch` holds as many numbers as there are points.
+/// `None` when their positions do not determine it.
 pub fn fit(points: &[Point], is_flat: bool, scratch: &mut Vec<f64>) -> Option<Plane> {
     if points.is_empty() {
         return None;
@@ -64,7 +64,8 @@ pub fn fit(points: &[Point], is_flat: bool, scratch: &mut Vec<f64>) -> Option<Pl
     scratch.clear();
     scratch.extend(points.iter().map(|p| p.rows));
     let mut terms = DVec3::new(median(scratch), 0.0, 0.0);
-    let (mut bread, mut scale) = (DMat3::IDENTITY, LEAST_PX);
+    let mut bread = DMat3::IDENTITY;
+    let mut scale = LEAST_PX;
     let weight = |error: f64, scale: f64| {
         let share = error / (TUKEY * scale);
         (1.0 - share * share).max(0.0).powi(2)
@@ -78,7 +79,8 @@ pub fn fit(points: &[Point], is_flat: bool, scratch: &mut Vec<f64>) -> Option<Pl
         scratch.clear();
         scratch.extend(points.iter().map(|p| (p.rows - row(p).dot(terms)).abs()));
         scale = (MAD * median(scratch)).max(LEAST_PX);
-        let (mut normal, mut sums) = (rest, DVec3::ZERO);
+        let mut normal = rest;
+        let mut sums = DVec3::ZERO;
         for p in points {
             let r = row(p);
             let w = weight(p.rows - r.dot(terms), scale);
@@ -100,9 +102,11 @@ pub fn fit(points: &[Point], is_flat: bool, scratch: &mut Vec<f64>) -> Option<Pl
     // kinds of clusters; Cameron, Gelbach and Miller 2011). That of both together is left out, which errs to the safe side.
     let mut by_square = [DVec3::ZERO; SQUARES.0 * SQUARES.1];
     let mut by_pair = [DVec3::ZERO; PAIRS];
-    let (mut used, mut pairs) = ([false; SQUARES.0 * SQUARES.1], [false; PAIRS]);
+    let mut used = [false; SQUARES.0 * SQUARES.1];
+    let mut pairs = [false; PAIRS];
     let mut agree = 0_usize;
-    let (mut weights, mut slopes) = (0.0, 0.0);
+    let mut weights = 0.0;
+    let mut slopes = 0.0;
     for p in points {
         let r = row(p);
         let error = p.rows - r.dot(terms);
@@ -110,7 +114,8 @@ pub fn fit(points: &[Point], is_flat: bool, scratch: &mut Vec<f64>) -> Option<Pl
         if w > 0.0 {
             weights += w;
             slopes += slope(error, scale);
-            let (square, pair) = (p.square(), p.pair % PAIRS);
+            let square = p.square();
+            let pair = p.pair % PAIRS;
             by_square[square] += r * (w * error);
             by_pair[pair] += r * (w * error);
             (used[square], pairs[pair]) = (true, true);
@@ -139,7 +144,8 @@ fn outer(a: DVec3, b: DVec3) -> DMat3 {
 mod tests {
     use super::*;
 
-    /// A grid of places over the picture in several pairs, each with what `rows` says of its place, its pair and its number.
+    /// A grid of places over the image in several pairs; `rows` gives the offset from the place, its pair and its
+    /// number.
     fn grid(pairs: usize, rows: impl Fn(f64, f64, usize, usize) -> f64) -> Vec<Point> {
         let mut points = Vec::new();
         for pair in 0..pairs {
@@ -169,8 +175,8 @@ mod tests {
         assert!(plane.deviations.max_element() < 0.03, "{plane:?}");
     }
 
-    /// Eyes that do not expose at one moment, on a camera that shakes: each pair says something else, and all its places
-    /// the same. Many places must not make that look certain.
+    /// Cameras that expose at different moments on a shaking mount: pairs differ, and all places of a pair agree. Many
+    /// places must not make that look certain.
     #[test]
     fn what_differs_from_pair_to_pair_is_uncertain() {
         let shaking = |n: usize| grid(n, |_, _, pair, i| 0.5 * noise(pair, 3) + 0.02 * noise(i, pair));
@@ -187,7 +193,8 @@ mod tests {
     #[test]
     fn a_scene_that_stands_still_says_no_more_in_more_pairs() {
         let scene = |pairs| fit(&grid(pairs, |_, _, _, i| 0.2 * noise(i, 5)), true, &mut Vec::new()).unwrap();
-        let (one, eight) = (scene(1), scene(8));
+        let one = scene(1);
+        let eight = scene(8);
         assert!((one.terms - eight.terms).abs().max_element() < 1e-6);
         assert!((0.8..1.2).contains(&(eight.deviations.x / one.deviations.x)), "{one:?} {eight:?}");
     }

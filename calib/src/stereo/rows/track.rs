@@ -1,7 +1,7 @@
-//! Where small parts of the left picture lie in the right one, rows included.
+//! Finds small parts of the left image in the right one, rows included.
 //!
 //! Distinctive places of a small copy are searched for across rows and columns, those that look like others of their own
-//! picture or of the right one are left out, and what is left is followed to the full size and there to parts of a pixel
+//! image or of the right one are left out, and what is left is followed to the full size and there to parts of a pixel
 //! (Lucas and Kanade 1981, with brightness, contrast and the slopes of disparity as unknowns).
 
 use super::super::Gray;
@@ -14,26 +14,26 @@ const CELL: usize = 12;
 /// Half of the side of what is compared in the end.
 const RADIUS: isize = 7;
 const COUNT: usize = ((2 * RADIUS + 1) * (2 * RADIUS + 1)) as usize;
-/// Least correlation of a match in the small copy. Pictures of rooms have 0.95.
+/// Least correlation of a match in the small copy. Images of rooms have 0.95.
 const ALIKE: f64 = 0.7;
 /// How much further from 1 the correlation of any other place must be, as a factor.
 const DISTINCT: f64 = 2.0;
 /// The same within the rows of the match, where a wrong disparity does no harm.
 const DISTINCT_IN_ROW: f64 = 1.0;
-/// Two that are this near to the same are the same: pictures without noise match entirely, in every place that repeats.
+/// Two that are this near to the same are the same: images without noise match entirely, in every place that repeats.
 const LEAST_OFF: f64 = 0.01;
 /// Least variance of grey along the worse direction, levels squared for each pixel.
 const TEXTURE: f64 = 6.0;
-/// Least share of the picture's variance that the match in the end explains.
+/// Least share of the image's variance that the match in the end explains.
 const EXPLAINED: f64 = 0.8;
-/// A match whose rows are less certain than this counts for nothing, pixels.
+/// A match whose rows are less certain than this is ignored, pixels.
 const UNSURE_PX: f64 = 0.15;
 /// How far the last step may end from where it began, pixels.
 const STRAYED_PX: f64 = 2.5;
 /// Steps of the last search; four are enough for what converges.
 const STEPS: usize = 8;
 
-/// What is searched in the smallest copies.
+/// Search range in the smallest copies.
 #[derive(Debug, Clone, Copy)]
 pub struct Reach {
     /// Disparities, some of them negative.
@@ -55,24 +55,25 @@ struct Part {
 
 const N: i32 = (PATCH * PATCH) as i32;
 
-/// The part whose middle is at a place, if all of it is in the picture.
-fn patch(picture: &Gray<'_>, x: isize, y: isize) -> Option<Patch> {
+/// The part whose middle is at a place, if all of it is in the image.
+fn patch(image: &Gray<'_>, x: isize, y: isize) -> Option<Patch> {
     let half = PATCH as isize / 2;
-    let (x, y) = (usize::try_from(x - half).ok()?, usize::try_from(y - half).ok()?);
-    if x + PATCH > picture.width || y + PATCH > picture.height {
+    let x = usize::try_from(x - half).ok()?;
+    let y = usize::try_from(y - half).ok()?;
+    if x + PATCH > image.width || y + PATCH > image.height {
         return None;
     }
     let mut out = [0; PATCH * PATCH];
     for (i, out) in out.as_chunks_mut::<PATCH>().0.iter_mut().enumerate() {
-        let row: &[u8; PATCH] = picture.pixels[(y + i) * picture.stride + x..].first_chunk()?;
+        let row: &[u8; PATCH] = image.pixels[(y + i) * image.stride + x..].first_chunk()?;
         *out = row.map(i16::from);
     }
     Some(out)
 }
 
 impl Part {
-    fn at(picture: &Gray<'_>, x: isize, y: isize) -> Option<Self> {
-        let pixels = patch(picture, x, y)?;
+    fn at(image: &Gray<'_>, x: isize, y: isize) -> Option<Self> {
+        let pixels = patch(image, x, y)?;
         let sum = pixels.iter().map(|v| i32::from(*v)).sum();
         let squares: i32 = pixels.iter().map(|v| i32::from(*v) * i32::from(*v)).sum();
         Some(Self { pixels, sum, spread: i64::from(N * squares) - i64::from(sum) * i64::from(sum) })
@@ -80,9 +81,12 @@ impl Part {
 
     /// How well another part fits whatever its brightness and contrast are: 1 for entirely, -1 at worst.
     fn correlation(&self, other: &Patch) -> f64 {
-        let (mut sum, mut squares, mut products) = (0_i32, 0_i32, 0_i32);
+        let mut sum = 0_i32;
+        let mut squares = 0_i32;
+        let mut products = 0_i32;
         for (a, b) in self.pixels.iter().zip(other) {
-            let (a, b) = (i32::from(*a), i32::from(*b));
+            let a = i32::from(*a);
+            let b = i32::from(*b);
             (sum, squares, products) = (sum + b, squares + b * b, products + a * b);
         }
         let spread = i64::from(N * squares) - i64::from(sum) * i64::from(sum);
@@ -107,16 +111,17 @@ pub fn most_places(width: usize, height: usize) -> usize {
 
 /// The most distinctive place of each square of the small copy: where grey changes most along the direction in which it
 /// changes least (Shi and Tomasi 1994). `out` has room for [`most_places`].
-pub fn places(picture: &Gray<'_>, out: &mut Vec<(u16, u16)>) {
+pub fn places(image: &Gray<'_>, out: &mut Vec<(u16, u16)>) {
     out.clear();
     let half = PATCH as isize / 2;
-    let (w, h) = (picture.width as isize, picture.height as isize);
-    for top in squares(picture.height).map(|at| at as isize) {
-        for left in squares(picture.width).map(|at| at as isize) {
+    let w = image.width as isize;
+    let h = image.height as isize;
+    for top in squares(image.height).map(|at| at as isize) {
+        for left in squares(image.width).map(|at| at as isize) {
             let mut best = (TEXTURE, None);
             for y in (top..(top + CELL as isize).min(h - half - 1)).step_by(2) {
                 for x in (left..(left + CELL as isize).min(w - half - 1)).step_by(2) {
-                    let texture = texture(picture, x, y);
+                    let texture = texture(image, x, y);
                     if texture > best.0 {
                         best = (texture, Some((x as u16, y as u16)));
                     }
@@ -128,12 +133,16 @@ pub fn places(picture: &Gray<'_>, out: &mut Vec<(u16, u16)>) {
 }
 
 /// The lesser eigenvalue of the tensor of grey around a place that is one pixel or more inside, for each pixel.
-fn texture(picture: &Gray<'_>, x: isize, y: isize) -> f64 {
+fn texture(image: &Gray<'_>, x: isize, y: isize) -> f64 {
     let half = PATCH as isize / 2;
-    let (mut xx, mut xy, mut yy) = (0_i32, 0_i32, 0_i32);
+    let mut xx = 0_i32;
+    let mut xy = 0_i32;
+    let mut yy = 0_i32;
     for row in y - half..y + half {
-        let at = |row: isize| &picture.row(row as usize)[(x - half - 1) as usize..][..PATCH + 2];
-        let (above, here, below) = (at(row - 1), at(row), at(row + 1));
+        let at = |row: isize| &image.row(row as usize)[(x - half - 1) as usize..][..PATCH + 2];
+        let above = at(row - 1);
+        let here = at(row);
+        let below = at(row + 1);
         for i in 1..=PATCH {
             let dx = i32::from(here[i + 1]) - i32::from(here[i - 1]);
             let dy = i32::from(below[i]) - i32::from(above[i]);
@@ -154,11 +163,11 @@ struct Best {
     down: isize,
 }
 
-/// The best place in `picture` for a part around `(x, y)`, and the best correlations of places that are no neighbours of it:
-/// in other rows, and in its own.
+/// The best place in `image` for a part around `(x, y)`, and the best correlations of places that are not its
+/// neighbours: in other rows, and in its own.
 fn search(
     part: &Part,
-    picture: &Gray<'_>,
+    image: &Gray<'_>,
     (x, y): (isize, isize),
     columns: RangeInclusive<isize>,
     rows: isize,
@@ -169,8 +178,7 @@ fn search(
     let mut best = Best { correlation: -1.0, left: 0, down: 0 };
     for down in -rows..=rows {
         for left in columns.clone() {
-            let correlation =
-                patch(picture, x - left, y + down).map_or(-1.0, |other| part.correlation(&other));
+            let correlation = patch(image, x - left, y + down).map_or(-1.0, |other| part.correlation(&other));
             scores.push(correlation as f32);
             if correlation > best.correlation {
                 best = Best { correlation, left, down };
@@ -182,8 +190,10 @@ fn search(
     }
     let mut others = [-1.0_f64; 2];
     for (i, score) in scores.iter().enumerate() {
-        let (down, left) = ((i / wide) as isize - rows, (i % wide) as isize + columns.start());
-        let (by_rows, by_columns) = ((down - best.down).abs(), (left - best.left).abs());
+        let down = (i / wide) as isize - rows;
+        let left = (i % wide) as isize + columns.start();
+        let by_rows = (down - best.down).abs();
+        let by_columns = (left - best.left).abs();
         if by_rows > 2 || by_columns > 2 {
             let kind = usize::from(by_rows <= 1);
             others[kind] = others[kind].max(f64::from(*score));
@@ -192,8 +202,8 @@ fn search(
     Some((best, others))
 }
 
-/// Where the part around a place of the left picture is in the right one, in whole pixels to the left and down; `None` where
-/// that is not clear.
+/// Where the part around a place of the left image is in the right one, in whole pixels to the left and down; `None`
+/// where that is ambiguous.
 pub fn coarse(
     [left, right]: [&Gray<'_>; 2],
     at: (isize, isize),
@@ -206,7 +216,7 @@ pub fn coarse(
     if best.correlation < ALIKE || 1.0 - elsewhere < DISTINCT * off || 1.0 - in_row < DISTINCT_IN_ROW * off {
         return None;
     }
-    // What its own picture has twice may be found at the wrong one, and the right one be out of reach.
+    // A part that its own image has twice may match the wrong one, with the right one out of reach.
     let (_, [elsewhere, _]) = search(&part, left, at, -reach.far..=reach.far, reach.rows, scores)?;
     (1.0 - elsewhere > DISTINCT * off).then_some((best.left, best.down))
 }
@@ -250,7 +260,8 @@ fn inverse(mut a: Square) -> Option<Square> {
             a[i][k] /= pivot;
             out[i][k] /= pivot;
         }
-        let (from, into) = (a[i], out[i]);
+        let from = a[i];
+        let into = out[i];
         for j in (0..UNKNOWNS).filter(|j| *j != i) {
             let factor = a[j][i];
             for k in 0..UNKNOWNS {
@@ -262,8 +273,8 @@ fn inverse(mut a: Square) -> Option<Square> {
     Some(out)
 }
 
-/// How many rows lower the part around a place lies in the right picture, to parts of a pixel, beginning at what was found in
-/// whole ones; `None` where the picture does not say.
+/// How many rows lower the part around a place lies in the right image, to parts of a pixel, beginning at what was found in
+/// whole ones; `None` where the image does not say.
 pub fn fine(
     [left, right]: [&Gray<'_>; 2],
     (x, y): (isize, isize),
@@ -276,13 +287,14 @@ pub fn fine(
         return None;
     }
     let grey = |p: &Gray<'_>, x: isize, y: isize| f64::from(p.row(y as usize)[x as usize]);
-    // What each unknown does to each pixel, to first order.
+    // The effect of each unknown on each pixel, to first order.
     let mut columns_of = [[0.0; UNKNOWNS]; COUNT];
     let mut normal = [[0.0; UNKNOWNS]; UNKNOWNS];
     let places = || (-RADIUS..=RADIUS).flat_map(|v| (-RADIUS..=RADIUS).map(move |u| (u, v)));
     let mean = places().map(|(u, v)| grey(left, x + u, y + v)).sum::<f64>() / COUNT as f64;
     for ((u, v), row) in places().zip(&mut columns_of) {
-        let (px, py) = (x + u, y + v);
+        let px = x + u;
+        let py = y + v;
         let gx = 0.5 * (grey(left, px + 1, py) - grey(left, px - 1, py));
         let gy = 0.5 * (grey(left, px, py + 1) - grey(left, px, py - 1));
         let [su, sv] = [u, v].map(|n| n as f64 / RADIUS as f64);
@@ -299,14 +311,18 @@ pub fn fine(
     let begin = at;
     for _ in 0..STEPS {
         let mut sums = [0.0; UNKNOWNS];
-        let (mut total, mut squares) = (0.0, 0.0);
+        let mut total = 0.0;
+        let mut squares = 0.0;
         for ((u, v), row) in places().zip(&columns_of) {
             let [su, sv] = [u, v].map(|n| n as f64 / RADIUS as f64);
             let px = (x + u) as f64 + at[0] + at[1] * su + at[2] * sv;
             let py = (y + v) as f64 + at[3];
-            let (ix, iy) = (px.floor(), py.floor());
-            let (fx, fy) = (px - ix, py - iy);
-            let (ix, iy) = (ix as isize, iy as isize);
+            let ix = px.floor();
+            let iy = py.floor();
+            let fx = px - ix;
+            let fy = py - iy;
+            let ix = ix as isize;
+            let iy = iy as isize;
             if !inside(right, ix, iy, 0) || !inside(right, ix + 1, iy + 1, 0) {
                 return None;
             }
@@ -350,16 +366,16 @@ mod tests {
 
     const SIDE: usize = 96;
 
-    fn picture(seed: u32) -> Vec<u8> {
+    fn image(seed: u32) -> Vec<u8> {
         let mix = |i: u32| (i ^ seed.wrapping_mul(0x9E37_79B9)).wrapping_mul(2_654_435_761);
         (0..(SIDE * SIDE) as u32).map(|i| (mix(mix(i) >> 7) >> 24) as u8).collect()
     }
 
-    /// Puts what is 12x12 around a place of `from` around another one of `to`.
-    fn put(from: &[u8], at: (usize, usize), to: &mut [u8], there: (usize, usize)) {
-        for y in 0..12 {
-            let line = (at.1 - 6 + y) * SIDE + at.0 - 6;
-            to[(there.1 - 6 + y) * SIDE + there.0 - 6..][..12].copy_from_slice(&from[line..line + 12]);
+    /// Copies the 12x12 pixels around column `x` and row `y` of `from` to those around `to_x` and `to_y` of `to`.
+    fn put(from: &[u8], x: usize, y: usize, to: &mut [u8], to_x: usize, to_y: usize) {
+        for row in 0..12 {
+            let line = (y - 6 + row) * SIDE + x - 6;
+            to[(to_y - 6 + row) * SIDE + to_x - 6..][..12].copy_from_slice(&from[line..line + 12]);
         }
     }
 
@@ -370,23 +386,25 @@ mod tests {
 
     #[test]
     fn what_there_is_twice_is_not_taken() {
-        let (left, nothing) = (picture(1), picture(2));
+        let left = image(1);
+        let nothing = image(2);
         let mut right = nothing.clone();
-        put(&left, (60, 48), &mut right, (46, 46));
+        put(&left, 60, 48, &mut right, 46, 46);
         assert_eq!(found(&left, &right), Some((14, -2)));
         assert_eq!(found(&left, &nothing), None);
         let mut twice = right.clone();
-        put(&left, (60, 48), &mut twice, (74 - 14, 51));
-        assert_eq!(found(&left, &twice), None, "the right picture has it twice");
+        put(&left, 60, 48, &mut twice, 74 - 14, 51);
+        assert_eq!(found(&left, &twice), None, "the right image has it twice");
         let mut own = left.clone();
-        put(&left, (60, 48), &mut own, (80, 45));
-        assert_eq!(found(&own, &right), None, "the left picture has it twice");
+        put(&left, 60, 48, &mut own, 80, 45);
+        assert_eq!(found(&own, &right), None, "the left image has it twice");
     }
 
-    /// Half of another picture over the right one: it may still be the best place, and says little of where that is.
+    /// Half of another image over the right one: it may still be the best place, and says little of where that is.
     #[test]
     fn what_is_half_something_else_is_not_measured() {
-        let (left, other) = (picture(1), picture(5));
+        let left = image(1);
+        let other = image(5);
         let mixed: Vec<u8> = left.iter().zip(&other).map(|(a, b)| a.midpoint(*b)).collect();
         let fine = |right: &[u8]| {
             let [left, right] = [&left[..], right].map(|p| Gray::packed(p, SIDE, SIDE));

@@ -1,4 +1,4 @@
-//! From the winners of both views to disparities with a fraction, as far as the views agree.
+//! Turns the winners of both views into fractional disparities where the views agree.
 
 use super::kernel::Winner;
 use crate::stereo::Parameters;
@@ -9,7 +9,7 @@ pub const NONE: u16 = u16::MAX;
 /// 256ths of a pixel.
 pub const ONE: u16 = 256;
 
-/// Fills a row: disparities in 256ths of a pixel, [`NONE`] where there is none, and how sure each is.
+/// Fills a row: disparities in 256ths of a pixel, [`NONE`] for no disparity, and the confidence of each.
 ///
 /// A disparity is kept where the right view has one within `left_right_px` of it, and where the best cost that is not
 /// beside it is worse by `uniqueness_percent`. Sureness is 1 plus twice the distance between these two, at most 255.
@@ -37,9 +37,9 @@ pub fn choose(
 }
 
 /// Gives disparities to pixels that [`choose`] left without one because the views disagree: that of the right view's pixel
-/// which has the pixel as its match, the nearest of several, and with the least confidence. What the right eye does not see
-/// has none there (Hirschmueller 2008, section 2.6, tells mismatches from occlusions by this). A pixel whose own winner is the
-/// same was refused for another reason and stays without.
+/// which has the pixel as its match, the nearest of several, and with the least confidence. A point that the right
+/// camera does not see has none there (Hirschmueller 2008, section 2.6, distinguishes mismatches from occlusions by
+/// this). A pixel whose own winner is the same was refused for another reason and stays without.
 pub fn rematch(
     winners: &[Winner],
     mirrored: &[u8],
@@ -63,7 +63,9 @@ fn fraction(w: Winner, last: u8) -> i32 {
     if w.disparity == 0 || w.disparity == last {
         return 0;
     }
-    let (a, b, c) = (i32::from(w.before), i32::from(w.cost), i32::from(w.after));
+    let a = i32::from(w.before);
+    let b = i32::from(w.cost);
+    let c = i32::from(w.after);
     let slope = (a - b).max(c - b).max(1);
     ((a - c) * i32::from(ONE / 2) / slope).clamp(-i32::from(ONE / 2), i32::from(ONE / 2))
 }

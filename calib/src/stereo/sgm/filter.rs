@@ -1,4 +1,4 @@
-//! What is done to disparities afterwards: median, speckle, short gaps, twice the size.
+//! Post-processing of disparities: median, speckle removal, filling of short gaps, doubling of the size.
 #![allow(clippy::inline_always)] // what is not inlined is compiled for the oldest processor
 
 use super::choose::{NONE, ONE};
@@ -8,9 +8,15 @@ for_every_processor! {
     /// A row but for its first and last pixel; each slice is that row's, as long as `out` and two more.
     fn median_row(above: &[u16], row: &[u16], below: &[u16], out: &mut [u16]) {
         let n = out.len();
-        let (a, b, c) = (&above[..n], &above[1..=n], &above[2..n + 2]);
-        let (d, e, f) = (&row[..n], &row[1..=n], &row[2..n + 2]);
-        let (g, h, i) = (&below[..n], &below[1..=n], &below[2..n + 2]);
+        let a = &above[..n];
+        let b = &above[1..=n];
+        let c = &above[2..n + 2];
+        let d = &row[..n];
+        let e = &row[1..=n];
+        let f = &row[2..n + 2];
+        let g = &below[..n];
+        let h = &below[1..=n];
+        let i = &below[2..n + 2];
         for x in 0..n {
             // A hole counts as infinitely far, and is filled when most around it is known.
             let m = if e[x] == NONE { 0 } else { e[x] };
@@ -27,7 +33,7 @@ for_every_processor! {
     }
 }
 
-/// `v`, or `middle` where there is none.
+/// `v`, or `middle` if `v` is [`NONE`].
 #[inline(always)]
 fn or(v: u16, middle: u16) -> u16 {
     if v == NONE { middle } else { v }
@@ -36,7 +42,8 @@ fn or(v: u16, middle: u16) -> u16 {
 /// The three in order.
 #[inline(always)]
 fn sorted(a: u16, b: u16, c: u16) -> [u16; 3] {
-    let (low, high) = (a.min(b), a.max(b));
+    let low = a.min(b);
+    let high = a.max(b);
     [low.min(c), high.min(low.max(c)), high.max(c)]
 }
 
@@ -78,7 +85,7 @@ pub struct Speckle {
 }
 
 impl Speckle {
-    /// For pictures of so many pixels.
+    /// For images of so many pixels.
     pub fn new(pixels: usize) -> Self {
         Self { runs: Vec::with_capacity(pixels) }
     }
@@ -107,7 +114,8 @@ impl Speckle {
                 while x < width && row[x] != NONE && row[x].abs_diff(row[x - 1]) <= step {
                     x += 1;
                 }
-                let (start, end) = (offset + start as u32, offset + x as u32);
+                let start = offset + start as u32;
+                let end = offset + x as u32;
                 runs.push(Run { start, end, parent: runs.len() as u32, pixels: end - start });
             }
             if y > 0 {
@@ -128,13 +136,17 @@ impl Speckle {
 
 /// Joins the runs of the last row, which begin where `above` ends, with those above them.
 fn join(runs: &mut [Run], above: core::ops::Range<usize>, width: u32, map: &[u16], step: u16) {
-    let (mut i, mut j) = (above.start, above.end);
+    let mut i = above.start;
+    let mut j = above.end;
     while i < above.end && j < runs.len() {
-        let (a, b) = (runs[i], runs[j]);
-        let (start, end) = ((a.start + width).max(b.start), (a.end + width).min(b.end));
+        let a = runs[i];
+        let b = runs[j];
+        let start = (a.start + width).max(b.start);
+        let end = (a.end + width).min(b.end);
         let touch = (start..end).any(|at| map[at as usize].abs_diff(map[(at - width) as usize]) <= step);
         if touch {
-            let (p, q) = (root(runs, i), root(runs, j));
+            let p = root(runs, i);
+            let q = root(runs, j);
             if p != q {
                 runs[q].parent = p as u32;
                 runs[p].pixels += runs[q].pixels;
@@ -181,7 +193,8 @@ pub fn fill_gaps(
             if start == 0 || x == width || x - start > most || row[start - 1].abs_diff(row[x]) > step {
                 continue;
             }
-            let (a, b) = (row[start - 1], row[x]);
+            let a = row[start - 1];
+            let b = row[x];
             for i in start..x {
                 row[i] = between(a, b, i - start + 1, x - start + 1);
                 confidence[i] = 1;
@@ -215,7 +228,8 @@ pub fn fill_gaps(
 
 /// `part` of `whole` on the way from `a` to `b`.
 fn between(a: u16, b: u16, part: usize, whole: usize) -> u16 {
-    let (a, b) = (i64::from(a), i64::from(b));
+    let a = i64::from(a);
+    let b = i64::from(b);
     (a + (b - a) * part as i64 / whole as i64) as u16
 }
 
@@ -231,7 +245,8 @@ pub fn double(
     for y in 0..full_height {
         let near_y = (y / 2).min(height - 1);
         let far_y = if y % 2 == 0 { near_y.saturating_sub(1) } else { (near_y + 1).min(height - 1) };
-        let (near, far) = (&map[near_y * width..][..width], &map[far_y * width..][..width]);
+        let near = &map[near_y * width..][..width];
+        let far = &map[far_y * width..][..width];
         let sure = &sure[near_y * width..][..width];
         let out = &mut out[y * full_width..][..full_width];
         let confidence = &mut confidence[y * full_width..][..full_width];
@@ -263,12 +278,14 @@ pub fn fill_from((map, sure): (&mut [u16], &mut [u8]), (other, other_sure): (&[u
     }
 }
 
-/// A picture of half the size: the mean of each 2x2; an odd last row or column counts twice.
-pub fn halve(picture: &crate::stereo::Gray<'_>, out: &mut [u8]) {
-    let width = picture.width.div_ceil(2);
+/// An image of half the size: the mean of each 2x2; an odd last row or column counts twice.
+pub fn halve(image: &crate::stereo::Gray<'_>, out: &mut [u8]) {
+    let width = image.width.div_ceil(2);
     for (y, out) in out.chunks_exact_mut(width).enumerate() {
-        let (a, b) = (picture.row(2 * y), picture.row((2 * y + 1).min(picture.height - 1)));
-        let (pairs_a, pairs_b) = (a.chunks_exact(2), b.chunks_exact(2));
+        let a = image.row(2 * y);
+        let b = image.row((2 * y + 1).min(image.height - 1));
+        let pairs_a = a.chunks_exact(2);
+        let pairs_b = b.chunks_exact(2);
         let odd = (pairs_a.remainder().first(), pairs_b.remainder().first());
         for ((out, a), b) in out.iter_mut().zip(pairs_a).zip(pairs_b) {
             *out = ((u16::from(a[0]) + u16::from(a[1]) + u16::from(b[0]) + u16::from(b[1]) + 2) / 4) as u8;

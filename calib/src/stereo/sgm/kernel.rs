@@ -6,28 +6,28 @@
 use super::lanes::Lanes;
 use core::mem::MaybeUninit;
 
-/// Planes of a picture: three bytes of census and the grey value.
+/// Planes of an image: three bytes of census and the grey value.
 pub const PLANES: usize = 4;
 /// Largest difference of grey that counts, in the cost's units.
 const GREY_MOST: u8 = 7;
 /// Cost of what is beyond the last disparity: a path that crosses it never wins, and no sum of it overflows a byte.
 const BEYOND: u8 = 127;
-/// What lies beside the first and the last disparity; with a penalty it stays below 256.
+/// Cost beside the first and the last disparity; with a penalty it stays below 256.
 const EDGE: u8 = 190;
 
-/// What one row of a pass works on. Steps count pixels in the direction of the pass: from the left in the first, from the
-/// right in the second.
+/// Inputs and outputs of one row of a pass. Steps count pixels in the direction of the pass: from the left in the
+/// first, from the right in the second.
 #[derive(Debug, Clone, Copy)]
 pub struct Row {
     /// Pixels of the row.
     pub width: usize,
-    /// [`PLANES`] of the left picture, together for each pixel.
+    /// [`PLANES`] of the left image, together for each pixel.
     pub left: *const u8,
     /// Penalties of larger steps for the four paths, together for each pixel.
     pub large: *const u8,
-    /// [`PLANES`] of the right picture, mirrored: pixel `width - 1 - k` is byte `k / n` of phase `k % n`, with `n`
+    /// [`PLANES`] of the right image, mirrored: pixel `width - 1 - k` is byte `k / n` of phase `k % n`, with `n`
     /// vectors a pixel. Phase `n + q` is phase `q` one byte on, so that the vectors of a pixel are `reach` apart. Beyond the
-    /// picture's left edge its first column is repeated.
+    /// image's left edge its first column is repeated.
     pub right: [*const u8; PLANES],
     /// Bytes of a phase.
     pub reach: usize,
@@ -45,7 +45,7 @@ pub struct Row {
     pub mirrored: *mut u8,
 }
 
-/// The best disparity of a pixel, and what is around it.
+/// The best disparity of a pixel, and the costs around it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 #[repr(C)]
 pub struct Winner {
@@ -57,11 +57,11 @@ pub struct Winner {
     pub before: u8,
     /// Cost of the disparity after it; 255 when it is the last.
     pub after: u8,
-    /// The least cost of those that are not beside it; 255 when there is none.
+    /// The least cost of those that are not beside it; 255 without one.
     pub second: u8,
 }
 
-/// What goes from one step of a row to the next.
+/// State carried from one step of a row to the next.
 #[derive(Clone, Copy)]
 pub struct Carry<S: Lanes, const N: usize> {
     along: [S; N],
@@ -77,14 +77,15 @@ impl<S: Lanes, const N: usize> Carry<S, N> {
     }
 }
 
-/// What a path adds to the cost: `before` are the path's costs one pixel earlier, the least of which is 0.
+/// The cost that a path adds: `before` are the path's costs one pixel earlier, the least of which is 0.
 #[inline(always)]
 unsafe fn step<S: Lanes, const N: usize>(before: &[S; N], small: S, large: S) -> [S; N] {
     // SAFETY: registers alone, as in `Carry::new`. No sum leaves its byte: costs of a path are at most BEYOND + 63,
     // which is EDGE, and a penalty is at most 63.
     unsafe {
         let edge = S::splat(EDGE);
-        let (first, last) = (before[N - 1].up(edge), before[0].down(edge));
+        let first = before[N - 1].up(edge);
+        let last = before[0].down(edge);
         let mut more = *before;
         for i in 0..N {
             let lower = if i == 0 { first } else { before[i - 1] };
@@ -167,7 +168,8 @@ pub unsafe fn run<S: Lanes, const N: usize, const BACK: bool>(
         let Carry { mut along, mut window } = *carry;
         for s in steps {
             let x = if BACK { w - 1 - s } else { s };
-            let (left, large) = (row.left.add(x * PLANES), row.large.add(x * PLANES));
+            let left = row.left.add(x * PLANES);
+            let large = row.large.add(x * PLANES);
             let bits = [S::splat(*left), S::splat(*left.add(1)), S::splat(*left.add(2))];
             let grey = S::splat(*left.add(3));
             let k = w - 1 - x;
@@ -249,8 +251,10 @@ unsafe fn choose<S: Lanes, const N: usize>(
 
         let key = S::least_key(best);
         let disparity = key as u8;
-        let (low, span) = (disparity.saturating_sub(1), if disparity == 0 { 1 } else { 2 });
-        let (low, span) = (S::splat(low), S::splat(span));
+        let low = disparity.saturating_sub(1);
+        let span = if disparity == 0 { 1 } else { 2 };
+        let low = S::splat(low);
+        let span = S::splat(span);
         let mut other = S::splat(u8::MAX);
         // At most 256 bytes, as MAX_DISPARITIES is; every byte that is read was written.
         let mut costs = MaybeUninit::<[u8; 256]>::uninit();

@@ -1,4 +1,4 @@
-//! What the engine asks of a vector, and its form for every processor.
+//! The vector operations of the engine, and their form for every processor.
 //!
 //! A disparity `d` of `count` vectors lies in lane `d / count` of vector `d % count` (as Farrar 2007 lays out the columns of an
 //! alignment): its neighbours `d - 1` and `d + 1` are then the same lane of the vectors beside it, and only the two at

@@ -1,17 +1,17 @@
-//! What the two passes must find, written as slowly and as plainly as it can be.
+//! Reference model of the two passes, plain and slow.
 
 use super::kernel::Winner;
 use super::pass::Costs;
 
-/// A picture, by pixel; beyond its edges it goes on with the edge.
-pub struct Picture<'a> {
+/// An image, by pixel; beyond its edges it goes on with the edge.
+pub struct Image<'a> {
     pub pixels: &'a [u8],
     pub width: usize,
     pub height: usize,
     pub stride: usize,
 }
 
-impl Picture<'_> {
+impl Image<'_> {
     pub fn at(&self, x: isize, y: isize) -> i32 {
         let x = x.clamp(0, self.width as isize - 1) as usize;
         let y = y.clamp(0, self.height as isize - 1) as usize;
@@ -25,18 +25,22 @@ impl Picture<'_> {
     }
 }
 
-/// What a disparity costs at a pixel: bits of the census that differ, and up to 7 for a quarter of the difference of grey.
-pub fn cost(left: &Picture<'_>, right: &Picture<'_>, (x, y): (usize, usize), d: usize) -> i32 {
-    let (x, y) = (x as isize, y as isize);
-    // There is no pixel of the right picture beyond its left edge: the one at the edge stands for it.
+/// The cost of a disparity at a pixel: bits of the census that differ, and up to 7 for a quarter of the difference of
+/// grey.
+pub fn cost(left: &Image<'_>, right: &Image<'_>, (x, y): (usize, usize), d: usize) -> i32 {
+    let x = x as isize;
+    let y = y as isize;
+    // There is no pixel of the right image beyond its left edge: the one at the edge stands for it.
     let there = (x - d as isize).max(0);
     let bits = left.census(x, y).iter().zip(right.census(there, y)).filter(|(a, b)| **a != *b).count();
     bits as i32 + ((left.at(x, y) - right.at(there, y)).abs() / 4).min(7)
 }
 
 /// The winners of the left view and the disparities of the right one.
-pub fn winners(left: &Picture<'_>, right: &Picture<'_>, costs: &Costs) -> (Vec<Winner>, Vec<u8>) {
-    let (w, h, n) = (left.width, left.height, costs.disparities);
+pub fn winners(left: &Image<'_>, right: &Image<'_>, costs: &Costs) -> (Vec<Winner>, Vec<u8>) {
+    let w = left.width;
+    let h = left.height;
+    let n = costs.disparities;
     let all: Vec<(usize, usize)> = (0..h).flat_map(|y| (0..w).map(move |x| (x, y))).collect();
     let cost: Vec<Vec<i32>> =
         all.iter().map(|at| (0..n).map(|d| cost(left, right, *at, d)).collect()).collect();
@@ -47,7 +51,8 @@ pub fn winners(left: &Picture<'_>, right: &Picture<'_>, costs: &Costs) -> (Vec<W
         for k in 0..w * h {
             let i = if backward { w * h - 1 - k } else { k };
             let (x, y) = all[i];
-            let (bx, by) = (x as isize + dx, y as isize + dy);
+            let bx = x as isize + dx;
+            let by = y as isize + dy;
             path[i] = cost[i].clone();
             if !(0..w as isize).contains(&bx) || !(0..h as isize).contains(&by) {
                 continue;
@@ -69,7 +74,7 @@ pub fn winners(left: &Picture<'_>, right: &Picture<'_>, costs: &Costs) -> (Vec<W
             }
         }
     }
-    // Half of what all eight paths say, in a byte.
+    // Half of the sum of all eight paths, in a byte.
     let total: Vec<Vec<u8>> = cost
         .iter()
         .zip(&more)

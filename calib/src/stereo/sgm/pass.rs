@@ -1,4 +1,4 @@
-//! The two passes over a picture: memory, threads, and the choice of the vectors.
+//! The forward and backward pass of an image: memory, threads, and the choice of the vectors.
 //!
 //! Rows are given to the threads in turn. A row may go on as far as the row before it has come, less one pixel; so every
 //! number of threads computes the same, and no row is computed twice.
@@ -13,7 +13,7 @@ use crate::stereo::{Gray, StereoPair};
 use core::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use rayon::prelude::*;
 
-/// Steps after which a row says how far it is.
+/// Steps after which a row reports its progress.
 const CHUNK: usize = 64;
 
 /// Which vectors a matcher uses.
@@ -72,7 +72,7 @@ impl Form {
     }
 }
 
-/// What a pass needs besides the pictures.
+/// Parameters of a pass.
 #[derive(Debug, Clone, Copy)]
 pub struct Costs {
     /// Number of disparities, 1 to 256.
@@ -83,7 +83,7 @@ pub struct Costs {
     pub large: Penalties,
 }
 
-/// Buffers of both passes, for pictures of one size.
+/// Buffers of both passes, for images of one size.
 #[derive(Debug)]
 pub struct Passes {
     form: Form,
@@ -106,14 +106,14 @@ pub struct Passes {
     done: Vec<AtomicUsize>,
 }
 
-/// What one thread keeps.
+/// Buffers of one thread.
 #[derive(Debug)]
 struct Band {
     planes: Vec<u8>,
     penalties: Vec<u8>,
 }
 
-/// What the rows of a pass write. Rows write their own part; of what they share, [`Order`] keeps them apart.
+/// Memory that the rows of a pass write. Rows write their own part; of what they share, [`Order`] keeps them apart.
 struct Targets {
     cells: *mut u8,
     sums: *mut u8,
@@ -180,11 +180,11 @@ impl Passes {
         let bands = self.bands.len() * self.width * 2 * PLANES;
         let found = self.winners.len() * size_of::<Winner>() + self.mirrored.len();
         let rings = self.cells.bytes();
-        let pictures =
+        let images =
             self.padded.iter().map(Padded::bytes).sum::<usize>() + self.left.len() + self.right.len();
         self.sums.bytes()
             + rings
-            + pictures
+            + images
             + bands
             + found
             + self.lanes.len()
@@ -228,12 +228,14 @@ impl Passes {
         (&self.winners, &self.mirrored)
     }
 
-    /// Prepares the pictures.
+    /// Prepares the images.
     fn look(&mut self, left: &Gray<'_>, right: &Gray<'_>, pool: Option<&rayon::ThreadPool>) {
         self.padded[0].fill(left);
         self.padded[1].fill(right);
         let [left, right] = &self.padded;
-        let (w, vectors, reach) = (self.width, self.vectors, self.reach);
+        let w = self.width;
+        let vectors = self.vectors;
+        let reach = self.reach;
         let part = (PLANES * w, PLANES * self.phases * reach);
         let bands = self.bands.len();
         let rows = self.height.div_ceil(bands);
@@ -258,7 +260,9 @@ impl Passes {
 
     /// Row `r` of a pass, as far as the row before it lets it go.
     fn row(&self, r: usize, back: bool, band: &mut Band, to: &Targets, failed: &AtomicBool) {
-        let (w, cell, ring) = (self.width, self.vectors * self.form.lanes(), self.ring);
+        let w = self.width;
+        let cell = self.vectors * self.form.lanes();
+        let ring = self.ring;
         let y = if back { self.height - 1 - r } else { r };
         self.costs.large.row(&self.padded[0], y, back, &mut band.planes);
         together(&band.planes, w, &mut band.penalties);
@@ -354,7 +358,8 @@ impl Order<'_> {
     fn cells(&self, s: usize, cell: usize) -> ([*mut u8; 3], usize) {
         let mut end = self.width;
         let cells = [0, 1, 2].map(|p| {
-            let (ring, base) = (self.ring, self.base[p]);
+            let ring = self.ring;
+            let base = self.base[p];
             let around = base + s >= ring;
             if !around {
                 end = end.min(ring - base);

@@ -1,7 +1,7 @@
-//! What is compared of a picture: the census of 5x5 pixels around each, and its grey value.
+//! The features that are compared: the census of 5x5 pixels around each pixel, and its grey value.
 //!
 //! Bit `n` of the census says whether the neighbour `n`, counted row by row without the middle, is darker than the middle
-//! (Zabih and Woodfill 1994). Pictures go on beyond their edges with the value of the edge.
+//! (Zabih and Woodfill 1994). Images go on beyond their edges with the value of the edge.
 
 use super::kernel::PLANES;
 use crate::simd::for_every_processor;
@@ -10,7 +10,7 @@ use crate::stereo::Gray;
 /// Pixels around the middle on each side.
 const RADIUS: usize = 2;
 
-/// Rows of a picture, made longer by [`RADIUS`] on both sides.
+/// Rows of an image, made longer by [`RADIUS`] on both sides.
 #[derive(Debug)]
 pub struct Padded {
     rows: Vec<u8>,
@@ -27,9 +27,9 @@ impl Padded {
         self.rows.len()
     }
 
-    pub fn fill(&mut self, picture: &Gray<'_>) {
+    pub fn fill(&mut self, image: &Gray<'_>) {
         for (y, out) in self.rows.chunks_exact_mut(self.width + 2 * RADIUS).enumerate() {
-            let row = picture.row(y);
+            let row = image.row(y);
             out[..RADIUS].fill(row[0]);
             out[RADIUS..RADIUS + self.width].copy_from_slice(row);
             out[RADIUS + self.width..].fill(row[self.width - 1]);
@@ -115,7 +115,10 @@ pub fn together(planes: &[u8], width: usize, out: &mut [u8]) {
 for_every_processor! {
     fn zip(a: &[u8], b: &[u8], c: &[u8], d: &[u8], out: &mut [[u8; PLANES]]) {
         let n = out.len();
-        let (a, b, c, d) = (&a[..n], &b[..n], &c[..n], &d[..n]);
+        let a = &a[..n];
+        let b = &b[..n];
+        let c = &c[..n];
+        let d = &d[..n];
         for x in 0..n {
             out[x] = [a[x], b[x], c[x], d[x]];
         }
@@ -137,7 +140,8 @@ for_every_processor! {
     /// `most - (|here - before| - slack)`, at least `least`.
     fn penalty(here: &[u8], before: &[u8], out: &mut [u8], most: u8, least: u8, slack: u8) {
         let n = out.len();
-        let (here, before) = (&here[..n], &before[..n]);
+        let here = &here[..n];
+        let before = &before[..n];
         for x in 0..n {
             out[x] = most.saturating_sub(here[x].abs_diff(before[x]).saturating_sub(slack)).max(least);
         }
@@ -147,13 +151,14 @@ for_every_processor! {
 impl Penalties {
     /// Of row `y` of a pass, in the order of [`super::kernel::Row`]'s paths: along the row, and from the row before it the
     /// pixel behind, the one beside and the one ahead. `back` is the pass from the right and from below.
-    pub fn row(self, picture: &Padded, y: usize, back: bool, out: &mut [u8]) {
-        let w = picture.width;
-        let (y, side) = (y as isize, if back { 1 } else { -1 });
-        let here = picture.grey(y as usize);
+    pub fn row(self, image: &Padded, y: usize, back: bool, out: &mut [u8]) {
+        let w = image.width;
+        let y = y as isize;
+        let side = if back { 1 } else { -1 };
+        let here = image.grey(y as usize);
         for (p, out) in out.chunks_exact_mut(w).take(PLANES).enumerate() {
             let (row, dx) = [(y, side), (y + side, side), (y + side, 0), (y + side, -side)][p];
-            let before = &picture.row(row)[(RADIUS as isize + dx) as usize..][..w];
+            let before = &image.row(row)[(RADIUS as isize + dx) as usize..][..w];
             penalty(here, before, out, self.most, self.least, self.slack);
         }
     }

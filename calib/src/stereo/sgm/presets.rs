@@ -36,7 +36,7 @@ impl SgmPresets {
         Ok(Self { matcher, wanted: wanted.to_vec() })
     }
 
-    /// What each preset is, in the order in which they were asked for; the memory is that of all.
+    /// Describes each preset, in the requested order; the memory is that of all.
     pub fn describe(&self) -> Vec<Description> {
         let all = self.matcher.describe();
         let of = |p: &Parameters| Description {

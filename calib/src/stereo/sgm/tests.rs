@@ -3,7 +3,7 @@
 
 use super::super::Preset;
 use super::kernel::Winner;
-use super::model::{self, Picture};
+use super::model::{self, Image};
 use super::*;
 use proptest::prelude::*;
 
@@ -31,7 +31,8 @@ fn pair(w: usize, h: usize, stride: usize, seed: u64) -> [Vec<u8>; 2] {
     let mut left = vec![0; stride * h];
     let mut right = vec![0; stride * h];
     for y in 0..h {
-        let (kind, shift) = (next() % 4, usize::from(next()) % w.max(2));
+        let kind = next() % 4;
+        let shift = usize::from(next()) % w.max(2);
         let row: Vec<u8> = (0..2 * w)
             .map(|x| match kind {
                 0 => next(),
@@ -42,7 +43,7 @@ fn pair(w: usize, h: usize, stride: usize, seed: u64) -> [Vec<u8>; 2] {
             .collect();
         left[y * stride..][..w].copy_from_slice(&row[..w]);
         right[y * stride..][..w].copy_from_slice(&row[shift.min(w)..][..w]);
-        // What is between rows is nobody's.
+        // The bytes between rows belong to no image.
         left[y * stride + w..(y + 1) * stride].fill(next());
     }
     [left, right]
@@ -51,8 +52,8 @@ fn pair(w: usize, h: usize, stride: usize, seed: u64) -> [Vec<u8>; 2] {
 fn check_passes(w: usize, h: usize, extra: usize, costs: Costs, threads: usize, seed: u64) {
     let stride = w + extra;
     let [left, right] = pair(w, h, stride, seed);
-    let picture = |pixels| Picture { pixels, width: w, height: h, stride };
-    let want = model::winners(&picture(&left), &picture(&right), &costs);
+    let image = |pixels| Image { pixels, width: w, height: h, stride };
+    let want = model::winners(&image(&left), &image(&right), &costs);
     let gray = |pixels| Gray { pixels, width: w, height: h, stride };
     let pair = StereoPair::new(gray(&left), gray(&right));
     let pool = (threads > 1).then(|| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap());
@@ -130,7 +131,8 @@ proptest! {
         let mut out = vec![0; w * h];
         filter::median(w, &map, &mut out);
         for (i, got) in out.iter().enumerate() {
-            let (x, y) = (i % w, i / w);
+            let x = i % w;
+            let y = i / w;
             let inside = x > 0 && y > 0 && x + 1 < w && y + 1 < h;
             if !inside {
                 prop_assert_eq!(*got, map[i]);
@@ -153,7 +155,8 @@ proptest! {
     #[test]
     fn speckles_are_small_regions(w in 1_usize..40, h in 1_usize..12, seed in any::<u64>(), most in 0_u32..40, step in 0_u16..200) {
         let map = map_of(w, h, seed, 60);
-        let (mut got, mut sure) = (map.clone(), vec![9; w * h]);
+        let mut got = map.clone();
+        let mut sure = vec![9; w * h];
         Speckle::new(w * h).remove(w, &mut got, &mut sure, most, step);
         // A region by flooding from each pixel.
         for i in 0..w * h {
@@ -161,7 +164,8 @@ proptest! {
             let mut todo = vec![i];
             seen[i] = true;
             while let Some(p) = todo.pop() {
-                let (x, y) = (p % w, p / w);
+                let x = p % w;
+                let y = p / w;
                 let beside = [(x > 0, p.wrapping_sub(1)), (x + 1 < w, p + 1), (y > 0, p.wrapping_sub(w)), (y + 1 < h, p + w)];
                 for q in beside.into_iter().filter(|b| b.0).map(|b| b.1) {
                     if map[p] != NONE && map[q] != NONE && map[p].abs_diff(map[q]) <= step && !seen[q] {
@@ -179,13 +183,15 @@ proptest! {
     #[test]
     fn only_short_gaps_between_equals_are_filled(w in 1_usize..40, h in 1_usize..12, seed in any::<u64>(), most in 0_usize..6, step in 0_u16..300) {
         let map = map_of(w, h, seed, 120);
-        let (mut got, mut sure) = (map.clone(), vec![9; w * h]);
+        let mut got = map.clone();
+        let mut sure = vec![9; w * h];
         filter::fill_gaps(w, &mut got, &mut sure, most, step, &mut vec![7; w]);
         // Along one line: the ends of the gap that contains `i`, if it is one.
         let gap = |line: &[u16], i: usize| -> Option<u16> {
             let before = line[..i].iter().rposition(|v| *v != NONE)?;
             let after = i + line[i..].iter().position(|v| *v != NONE)?;
-            let (a, b) = (line[before], line[after]);
+            let a = line[before];
+            let b = line[after];
             (after - before - 1 <= most && a.abs_diff(b) <= step).then(|| {
                 let way = (f64::from(b) - f64::from(a)) * (i - before) as f64 / (after - before) as f64;
                 (f64::from(a) + way.trunc()) as u16
@@ -208,12 +214,13 @@ proptest! {
     fn half_is_the_mean_of_four(w in 1_usize..20, h in 1_usize..9, extra in 0_usize..4, seed in any::<u64>()) {
         let mut next = noise(seed);
         let pixels: Vec<u8> = (0..(w + extra) * h).map(|_| next()).collect();
-        let picture = Picture { pixels: &pixels, width: w, height: h, stride: w + extra };
+        let image = Image { pixels: &pixels, width: w, height: h, stride: w + extra };
         let mut out = vec![0; w.div_ceil(2) * h.div_ceil(2)];
         filter::halve(&Gray { pixels: &pixels, width: w, height: h, stride: w + extra }, &mut out);
         for (i, got) in out.iter().enumerate() {
-            let (x, y) = (2 * (i % w.div_ceil(2)) as isize, 2 * (i / w.div_ceil(2)) as isize);
-            let four = [(0, 0), (1, 0), (0, 1), (1, 1)].iter().map(|(i, j)| picture.at(x + i, y + j)).sum::<i32>();
+            let x = 2 * (i % w.div_ceil(2)) as isize;
+            let y = 2 * (i / w.div_ceil(2)) as isize;
+            let four = [(0, 0), (1, 0), (0, 1), (1, 1)].iter().map(|(i, j)| image.at(x + i, y + j)).sum::<i32>();
             prop_assert_eq!(i32::from(*got), (four + 2) / 4);
         }
     }
@@ -222,7 +229,8 @@ proptest! {
 #[test]
 fn doubling_goes_on_a_plane_and_keeps_edges() {
     // Disparity 10 + x/4 on the left, a step to 40, a hole at the end.
-    let (w, h) = (12, 4);
+    let w = 12;
+    let h = 4;
     let value = |x: usize| {
         if x == 11 {
             NONE
@@ -234,10 +242,11 @@ fn doubling_goes_on_a_plane_and_keeps_edges() {
     };
     let map: Vec<u16> = (0..w * h).map(|i| value(i % w)).collect();
     let sure: Vec<u8> = (0..w * h).map(|i| (i % w) as u8).collect();
-    let (mut out, mut out_sure) = (vec![0; 23 * 7], vec![0; 23 * 7]);
+    let mut out = vec![0; 23 * 7];
+    let mut out_sure = vec![0; 23 * 7];
     filter::double((w, h), (&map, &sure), (23, 7), &mut out, &mut out_sure);
     let row: Vec<f32> = out[3 * 23..4 * 23].iter().map(|d| f32::from(*d) / 256.0).collect();
-    // Pixel 5 of the full picture lies at 2.25 of the half one: twice 10.5625.
+    // Pixel 5 of the full image lies at 2.25 of the half one: twice 10.5625.
     assert_eq!((row[4], row[5]), (20.875, 21.125));
     assert_eq!((row[11], row[12]), (22.5, 80.0));
     assert_eq!(out[3 * 23 + 22], NONE);
@@ -248,12 +257,13 @@ fn doubling_goes_on_a_plane_and_keeps_edges() {
 fn the_fit_meets_between() {
     let parameters = Parameters::preset(Preset::Quality, 64);
     let row = |winner: Winner| {
-        let (mut out, mut sure) = ([0; 30], [0; 30]);
+        let mut out = [0; 30];
+        let mut sure = [0; 30];
         choose::choose(&[winner; 30], &[winner.disparity; 30], &parameters, 63, &mut out, &mut sure);
         (out[29], sure[29], out[19])
     };
     let w = Winner { disparity: 20, cost: 10, before: 30, after: 30, second: 60 };
-    // Left of column 20 it would lead out of the picture.
+    // Left of column 20 it would lead out of the image.
     assert_eq!(row(w), (20 * ONE, 101, NONE));
     // Costs rise by 20 to the left and by 10 to the right: the tip lies a quarter towards the right.
     assert_eq!(row(Winner { after: 20, ..w }).0, 20 * ONE + 64);
@@ -268,7 +278,8 @@ fn views_that_disagree_give_nothing() {
     let winner = Winner { disparity: 3, cost: 10, before: 30, after: 30, second: 20 };
     let mut parameters = Parameters::preset(Preset::Quality, 64);
     let valid = |parameters: &Parameters, mirrored: u8| {
-        let (mut out, mut sure) = ([0; 8], [0; 8]);
+        let mut out = [0; 8];
+        let mut sure = [0; 8];
         choose::choose(&[winner; 8], &[mirrored; 8], parameters, 63, &mut out, &mut sure);
         assert_eq!(out[7] == NONE, sure[7] == 0);
         out[7] != NONE
@@ -289,13 +300,14 @@ fn what_the_right_view_matches_is_taken_where_the_views_disagree() {
     let rematched = |mirrored: [u8; 6], uniqueness: u8| {
         let mut parameters = Parameters::preset(Preset::Quality, 64);
         parameters.uniqueness_percent = uniqueness;
-        let (mut out, mut sure) = ([0; 6], [0; 6]);
+        let mut out = [0; 6];
+        let mut sure = [0; 6];
         choose::choose(&[winner; 6], &mirrored, &parameters, 63, &mut out, &mut sure);
         choose::rematch(&[winner; 6], &mirrored, 2, &mut out, &mut sure);
         (out.map(|d| if d == NONE { None } else { Some(d / ONE) }), sure)
     };
     // Nobody reaches left of column 9, so all disagree. Pixel 0 claims 3 and pixel 1 claims 4 for columns 3 and 5, pixel 2
-    // claims 1 for column 3 too: the nearer stays. What is claimed beyond the picture is nobody's.
+    // claims 1 for column 3 too: the nearer stays. What is claimed beyond the image is nobody's.
     let (found, sure) = rematched([3, 4, 1, 60, 200, 255], 0);
     assert_eq!(found, [None, None, None, Some(3), None, Some(4)]);
     assert_eq!(sure, [0, 0, 0, 1, 0, 1]);
@@ -305,7 +317,8 @@ fn what_the_right_view_matches_is_taken_where_the_views_disagree() {
     let mut parameters = Parameters::preset(Preset::Quality, 64);
     parameters.uniqueness_percent = 50;
     for (claimed, taken) in [(1, false), (3, false), (4, true)] {
-        let (mut out, mut sure) = ([0; 8], [0; 8]);
+        let mut out = [0; 8];
+        let mut sure = [0; 8];
         let mut mirrored = [1; 8];
         mirrored[2] = claimed;
         choose::choose(&[winner; 8], &mirrored, &parameters, 63, &mut out, &mut sure);
@@ -324,7 +337,8 @@ fn the_matcher_rematches_when_told() {
         parameters.rematch = rematch;
         matched(&parameters, (90, 30), 1, Form::best())
     };
-    let (without, with) = (with(false), with(true));
+    let without = with(false);
+    let with = with(true);
     let added: Vec<usize> =
         (0..90 * 30).filter(|i| with.disparity[*i].to_bits() != without.disparity[*i].to_bits()).collect();
     assert!(!added.is_empty());
@@ -335,7 +349,8 @@ fn the_matcher_rematches_when_told() {
 fn doubling_keeps_a_step_of_more_than_a_pixel() {
     for (step, kept) in [(ONE, false), (ONE + 1, true)] {
         let map = [10 * ONE, 10 * ONE + step];
-        let (mut out, mut sure) = ([0; 8], [0; 8]);
+        let mut out = [0; 8];
+        let mut sure = [0; 8];
         filter::double((2, 1), (&map, &[7, 7]), (4, 2), &mut out, &mut sure);
         assert_eq!(out[1] == 20 * ONE, kept, "{step}");
     }
@@ -424,7 +439,8 @@ fn scene(w: usize, h: usize) -> ([Vec<u8>; 2], Vec<f32>) {
 
 #[test]
 fn a_box_before_a_wall_is_found_and_what_it_hides_is_not() {
-    let (w, h) = (180, 80);
+    let w = 180;
+    let h = 80;
     let ([left, right], truth) = scene(w, h);
     let pair = StereoPair::new(Gray::packed(&left, w, h), Gray::packed(&right, w, h));
     for (preset, wrong_most, missing_most) in
@@ -433,7 +449,7 @@ fn a_box_before_a_wall_is_found_and_what_it_hides_is_not() {
         let mut matcher = SgmMatcher::new(w, h, &Parameters::preset(preset, 48), 1).unwrap();
         let mut out = DisparityMap::default();
         matcher.run(&pair, &mut out).unwrap();
-        // What the right eye sees too: not the first columns, and not the strip left of the box.
+        // The part that the right camera sees too: not the first columns, and not the strip left of the box.
         let seen = |i: &usize| i % w >= 10 && !(w / 3 - 20..w / 3).contains(&(i % w));
         let all: Vec<usize> = (0..w * h).filter(seen).collect();
         let share = |f: &dyn Fn(&&usize) -> bool| all.iter().filter(f).count() as f64 / all.len() as f64;
@@ -456,7 +472,7 @@ fn a_box_before_a_wall_is_found_and_what_it_hides_is_not() {
 fn ultra_is_quality_with_what_half_resolution_adds() {
     let size = (150, 40);
     let [quality, half, ultra] = [Preset::Quality, Preset::Performance, Preset::Ultra]
-        // What is random has no texture to the margins, and half resolution would add nothing.
+        // Random images have no texture by the margins, and half resolution would add nothing.
         .map(|p| Parameters { texture_margin: 0, half_texture_margin: 0, ..Parameters::preset(p, 48) })
         .map(|p| matched(&p, size, 1, Form::best()));
     for i in 0..size.0 * size.1 {

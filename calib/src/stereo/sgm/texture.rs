@@ -1,6 +1,6 @@
-//! Refuses disparities of what has no texture.
+//! Removes disparities without texture.
 //!
-//! Where the pictures show nothing but noise, each pixel has a best disparity too, and paths make surfaces of them. One margin
+//! Where the images show nothing but noise, each pixel has a best disparity too, and paths make surfaces of them. One margin
 //! between the best cost and the second says little, since noise has large ones now and then; their mean over a window does:
 //! on noise it stays below a bound, on texture it is several times that.
 
@@ -25,7 +25,7 @@ for_every_processor! {
 }
 
 for_every_processor! {
-    /// Removes what lies in a window whose sum is below `least`; `sums` has [`SIDE`] - 1 columns more than the row.
+    /// Removes disparities in a window whose sum is below `least`; `sums` has [`SIDE`] - 1 columns more than the row.
     fn remove(sums: &[u16], least: u16, map: &mut [u16], confidence: &mut [u8]) {
         let n = map.len();
         for x in 0..n {
@@ -40,7 +40,7 @@ for_every_processor! {
     }
 }
 
-/// Sums of margins in windows of 13x13 pixels; beyond the edges of the picture its outermost pixels are repeated.
+/// Sums of margins in windows of 13x13 pixels; beyond the edges of the image its outermost pixels are repeated.
 #[derive(Debug)]
 pub struct Texture {
     /// Of each column of the window's rows, with those beyond both sides.
@@ -48,7 +48,7 @@ pub struct Texture {
 }
 
 impl Texture {
-    /// For pictures of this width.
+    /// For images of this width.
     pub fn new(width: usize) -> Self {
         Self { sums: vec![0; width + SIDE - 1] }
     }
@@ -122,9 +122,10 @@ mod tests {
             };
             in_every_width(|width| {
                 let mut texture = Texture::new(w);
-                // The second time, the sums are those of another picture.
+                // The second time, the sums are those of another image.
                 for _ in 0..2 {
-                    let (mut map, mut confidence) = (vec![7; w * h], vec![9; w * h]);
+                    let mut map = vec![7; w * h];
+                    let mut confidence = vec![9; w * h];
                     texture.remove(&winners, w, least, &mut map, &mut confidence);
                     for i in 0..w * h {
                         let is_flat = mean(i % w, i / w) < u32::from(least) * (SIDE * SIDE) as u32;
@@ -137,7 +138,7 @@ mod tests {
     }
 
     /// Boxes of plain paint, lit from one side, in front of a wall with texture; with the noise of a sensor. Disparity of the
-    /// left picture, and which pixels are a box.
+    /// left image, and which pixels are a box.
     fn painted_boxes(w: usize, h: usize, noise: f64) -> ([Vec<u8>; 2], Vec<f32>) {
         let hash = |a: usize, b: usize, seed: u64| {
             let mut x = (a as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15)
@@ -154,8 +155,9 @@ mod tests {
             if d > 20.0 { 90.0 + 60.0 * x as f64 / w as f64 } else { 40.0 + 160.0 * hash(x, y, 5) }
         };
         let sensor =
-            |i: usize, eye: u64| noise * ((0..4).map(|k| hash(i, k, 70 + eye)).sum::<f64>() - 2.0) * 1.7;
-        let (mut left, mut right) = (vec![0.0; w * h], vec![0.0; w * h]);
+            |i: usize, side: u64| noise * ((0..4).map(|k| hash(i, k, 70 + side)).sum::<f64>() - 2.0) * 1.7;
+        let mut left = vec![0.0; w * h];
+        let mut right = vec![0.0; w * h];
         for near in [10, 30] {
             for i in (0..w * h).filter(|i| truth[*i] == near as f32) {
                 left[i] = color(i % w, i / w, truth[i]);
@@ -164,16 +166,21 @@ mod tests {
                 }
             }
         }
-        let eyes = [(left, 0), (right, 1)];
-        let seen = eyes.map(|(eye, n)| {
-            eye.iter().enumerate().map(|(i, v)| (v + sensor(i, n)).round().clamp(0.0, 255.0) as u8).collect()
+        let sides = [(left, 0), (right, 1)];
+        let seen = sides.map(|(image, n)| {
+            image
+                .iter()
+                .enumerate()
+                .map(|(i, v)| (v + sensor(i, n)).round().clamp(0.0, 255.0) as u8)
+                .collect()
         });
         (seen, truth)
     }
 
     #[test]
     fn what_has_no_texture_gets_no_disparity_and_texture_keeps_its_own() {
-        let (w, h) = (420, 200);
+        let w = 420;
+        let h = 200;
         for noise in [2.0, 5.0] {
             let ([left, right], truth) = painted_boxes(w, h, noise);
             let pair = StereoPair::new(Gray::packed(&left, w, h), Gray::packed(&right, w, h));
@@ -181,7 +188,7 @@ mod tests {
                 let shares = |parameters: &Parameters| {
                     let mut out = DisparityMap::default();
                     SgmMatcher::new(w, h, parameters, 1).unwrap().run(&pair, &mut out).unwrap();
-                    // Not the first columns, nor what a box hides from the right eye.
+                    // Not the first columns, nor what a box hides from the right camera.
                     let of = |near: bool, f: &dyn Fn(f32, f32) -> bool| {
                         let counts = |i: &usize| {
                             let x = i % w;

@@ -10,7 +10,8 @@ fn device() -> Device {
 
 /// A library made from C.
 fn library(dir: &Path, name: &str, source: &str) -> PathBuf {
-    let (c, so) = (dir.join(format!("{name}.c")), dir.join(name));
+    let c = dir.join(format!("{name}.c"));
+    let so = dir.join(name);
     std::fs::write(&c, source).unwrap();
     let made = Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&so).arg(&c).status().unwrap();
     assert!(made.success());
@@ -40,7 +41,7 @@ fn versions() {
         ("\"2.0.0\"", "\"2.0.0\""),
         ("\"nonsense\"", "nonsense"),
         ("\"\"", "\"\""),
-        ("0", "does not tell its version"),
+        ("0", "does not report its version"),
     ] {
         let error = version(&of_version(dir.path(), text)).unwrap_err();
         assert_eq!(error.kind(), ErrorKind::NoEngine, "{error}");

@@ -61,7 +61,7 @@ fn everything_that_is_wrong_is_named() {
         "2 missing (crossAtts.1.in_proj_bias [1152], pretrained.norm.weight [384])",
         "1 of another shape or type (depth_pretrained.cls_token is [1, 384], must be [1, 1, 384])",
         "2 not of the network (depth_head.extra (a tensor of F32, shape [2]), readout.0",
-        "2 with numbers that are none (depth_pretrained.norm.bias: 0 NaN, 1 infinite, pretrained.norm.bias: 1 NaN",
+        "2 with NaN or infinite numbers (depth_pretrained.norm.bias: 0 NaN, 1 infinite, pretrained.norm.bias: 1 NaN",
     ] {
         assert!(e.to_string().contains(part), "{part}\nnot in\n{e}");
     }

@@ -1,4 +1,4 @@
-//! The rig of the paper is what the paper says.
+//! The rig of the paper matches the paper.
 
 use super::super::{BackendConfig, CameraConfig, RigConfig};
 use super::parse;

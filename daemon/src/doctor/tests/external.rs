@@ -1,4 +1,4 @@
-//! What the doctor says of cameras that other processes serve.
+//! The doctor's findings about cameras that other processes serve.
 
 use super::*;
 use crate::attached::{Ask, Family, NodeFacts, Served};
@@ -18,7 +18,7 @@ name = "front"
 backend = "external"
 "#;
 
-/// Says that a process serves the camera, once, and what it offers; or that none does.
+/// Reports once that a process serves the camera, with its streams; or that none does.
 struct Asked(Cell<Option<Result<PixelFormat>>>, RuntimeDir);
 
 impl Ask for Asked {
@@ -32,7 +32,7 @@ impl Ask for Asked {
         let name = |n: &str| Name::new(n).unwrap();
         let place =
             Place { runtime: self.1.clone(), rig: Name::new("mount").unwrap(), camera: name("front") };
-        let told = |format| {
+        let offer = |format| {
             let info = DeviceInfo { model: "OAK-D".into(), serial: "18".into(), ..DeviceInfo::default() };
             (info, vec![profile("color", format, 640, 480, 30.0)])
         };
@@ -40,7 +40,7 @@ impl Ask for Asked {
         let holder = "process 4711 (oak)".to_owned();
         offered
             .into_iter()
-            .map(|o| Served { place: place.clone(), holder: holder.clone(), offered: o.map(told) })
+            .map(|o| Served { place: place.clone(), holder: holder.clone(), offered: o.map(offer) })
             .collect()
     }
     fn may_open(&self, _: &Path) -> bool {
@@ -54,7 +54,7 @@ impl Ask for Asked {
 /// The report of a rig with a camera that a process serves, or not, as `offered` says.
 fn served_report(text: &str, offered: Option<Result<PixelFormat>>) -> Report {
     let home = tempfile::Builder::new().prefix("dr").tempdir_in("/tmp").unwrap();
-    let tree = MadeTree::new(home.path());
+    let tree = FakeTree::new(home.path());
     let runtime = RuntimeDir::at(home.path()).unwrap();
     let attached = look(tree.root(), &Asked(Cell::new(offered), runtime)).unwrap();
     let config = config(text);

@@ -34,7 +34,7 @@ impl Channel {
         let subscriber = bus.subscriber(&id).unwrap();
         let facts = StreamFacts {
             stream: Arc::new(Stream::new(id, profile, true, 8)),
-            model: "made".into(),
+            model: "fake".into(),
             serial: "7".into(),
             calibration: "none".into(),
             camera_pose: Pose::IDENTITY,
@@ -43,11 +43,11 @@ impl Channel {
         Self { facts, publisher, subscriber, sent: 0 }
     }
 
-    /// The next batch as it comes off the channel; its samples tell its number.
+    /// The next batch as it comes off the channel; its number is in its samples.
     fn next(&mut self) -> Frame {
         self.sent += 1;
         let mut frame = self.publisher.loan(2 * 64).unwrap();
-        frame.header_mut().set_picture(PixelFormat::Motion, 2, 1);
+        frame.header_mut().set_image(PixelFormat::Motion, 2, 1);
         frame.header_mut().sequence = self.sent;
         for (i, bytes) in frame.pixels_mut().as_chunks_mut::<64>().0.iter_mut().enumerate() {
             *bytes =
@@ -78,7 +78,8 @@ fn with_two(rate_hz: f64, test: impl FnOnce(&mut Channel, &mut Channel, &mut Uni
     let dir = tempfile::Builder::new().prefix("dr").tempdir_in("/tmp").unwrap();
     let runtime = RuntimeDir::at(&dir.path().join("r")).unwrap();
     let bus = Bus::open(&runtime, &Name::new("motion").unwrap()).unwrap();
-    let (mut a, mut b) = (Channel::new(&bus, "a", rate_hz), Channel::new(&bus, "b", rate_hz));
+    let mut a = Channel::new(&bus, "a", rate_hz);
+    let mut b = Channel::new(&bus, "b", rate_hz);
     let facts = [&a, &b].map(|c| facts_of(&c.facts.stream));
     let mut units = Units::new(&facts, 5.0);
     units.begin();
@@ -165,7 +166,7 @@ fn between_recordings_nothing_is_kept_and_every_batch_is_counted() {
             books.hear(Some(units), &id, &frame, 0);
         }
         books.end(units);
-        assert!(books.take(units).is_empty(), "what came after the last set is no part of the recording");
+        assert!(books.take(units).is_empty(), "batches after the last set are not in the recording");
         let frame = a.next();
         books.hear(None, &id, &frame, 1);
         let sum = account(books, &id);
@@ -179,13 +180,13 @@ fn between_recordings_nothing_is_kept_and_every_batch_is_counted() {
 }
 
 #[test]
-fn rare_sets_have_patience_for_two_of_them() {
+fn rare_sets_have_timeout_for_two_of_them() {
     with_two(2.0, |a, _, _, _| {
         let facts = [facts_of(&a.facts.stream)];
         // Batches are at most 100 ms old, so that ten a second may come.
         assert_eq!(Units::new(&facts, 5.0).units[0].most, 40);
         assert_eq!(Units::new(&facts, 0.1).units[0].most, 200);
-        // What two sets that are an hour apart would have is more than one may hold.
+        // Two sets that are an hour apart would have more than one may hold.
         let rare = Units::new(&facts, 1.0 / 3600.0).units[0].most;
         let bytes = rare as u64 * RecordMotion::stored_bytes_of(4);
         assert!(

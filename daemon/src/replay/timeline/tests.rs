@@ -19,11 +19,11 @@ fn moments(parts: &[(&[&str], &[i64])]) -> Result<Vec<(i64, String)>> {
         .collect();
     let t = Timeline::new(&parts)?;
     let name = |m: &Member| format!("{}.{}", m.dataset, m.set);
-    let tell = |i| t.members(i).iter().map(name).collect::<Vec<_>>().join("+");
-    Ok((0..t.len()).map(|i| (t.times()[i] / MS, tell(i))).collect())
+    let names = |i| t.members(i).iter().map(name).collect::<Vec<_>>().join("+");
+    Ok((0..t.len()).map(|i| (t.times()[i] / MS, names(i))).collect())
 }
 
-fn told(moments: &[(i64, String)]) -> Vec<(i64, &str)> {
+fn borrowed(moments: &[(i64, String)]) -> Vec<(i64, &str)> {
     moments.iter().map(|(t, names)| (*t, names.as_str())).collect()
 }
 
@@ -33,26 +33,32 @@ fn cameras_recorded_at_once_are_paired_with_their_nearest() {
     let b: &[&str] = &["right/depth"];
     // 90 ms is nearer than 110 ms; exactly half a period still is.
     let m = moments(&[(a, &[0, 200, 400]), (b, &[90, 290, 500])]).unwrap();
-    assert_eq!(told(&m), [(0, "0.0+1.0"), (200, "0.1+1.1"), (400, "0.2+1.2")]);
+    assert_eq!(borrowed(&m), [(0, "0.0+1.0"), (200, "0.1+1.1"), (400, "0.2+1.2")]);
     let m = moments(&[(a, &[0, 200, 400]), (b, &[110, 310, 510])]).unwrap();
-    assert_eq!(told(&m), [(0, "0.0"), (110, "0.1+1.0"), (310, "0.2+1.1"), (510, "1.2")]);
+    assert_eq!(borrowed(&m), [(0, "0.0"), (110, "0.1+1.0"), (310, "0.2+1.1"), (510, "1.2")]);
     // Twice as fast: every second one finds nobody.
     let m = moments(&[(a, &[0, 200, 400]), (b, &[10, 110, 210, 310])]).unwrap();
-    assert_eq!(told(&m), [(0, "0.0+1.0"), (110, "1.1"), (200, "0.1+1.2"), (310, "1.3"), (400, "0.2")]);
+    assert_eq!(borrowed(&m), [(0, "0.0+1.0"), (110, "1.1"), (200, "0.1+1.2"), (310, "1.3"), (400, "0.2")]);
 }
 
 #[test]
 fn datasets_of_one_rig_follow_each_other_without_the_time_between() {
     let s: &[&str] = &["left/color"];
     let m = moments(&[(s, &[0, 200, 400]), (s, &[3_600_000, 3_600_100, 3_600_200])]).unwrap();
-    assert_eq!(told(&m), [(0, "0.0"), (200, "0.1"), (400, "0.2"), (600, "1.0"), (700, "1.1"), (800, "1.2")]);
+    assert_eq!(
+        borrowed(&m),
+        [(0, "0.0"), (200, "0.1"), (400, "0.2"), (600, "1.0"), (700, "1.1"), (800, "1.2")]
+    );
     // In whatever order they are given; and a gap within a dataset is kept.
     let m = moments(&[(s, &[90_000, 90_200]), (s, &[0, 200, 5200])]).unwrap();
-    assert_eq!(told(&m), [(0, "1.0"), (200, "1.1"), (5200, "1.2"), (10_200 - 4800, "0.0"), (5600, "0.1")]);
+    assert_eq!(
+        borrowed(&m),
+        [(0, "1.0"), (200, "1.1"), (5200, "1.2"), (10_200 - 4800, "0.0"), (5600, "0.1")]
+    );
     // A gap that another dataset covers is no gap.
     let other: &[&str] = &["right/color"];
     let m = moments(&[(s, &[0, 200]), (s, &[1000, 1200]), (other, &[0, 600, 1200])]).unwrap();
-    assert_eq!(told(&m), [(0, "0.0+2.0"), (200, "0.1"), (600, "2.1"), (1000, "1.0"), (1200, "1.1+2.2")]);
+    assert_eq!(borrowed(&m), [(0, "0.0+2.0"), (200, "0.1"), (600, "2.1"), (1000, "1.0"), (1200, "1.1+2.2")]);
 }
 
 #[test]

@@ -20,7 +20,7 @@ fn at(ms: i64) -> HostTime {
 
 const PLAY: Begin = Begin { by_clock: true, rate: 1.0, looped: false, hold: false, paused: false };
 
-/// Does what is due at `ms` with a player that takes no time; the moments that were published.
+/// Runs a player that takes no time at `ms`; returns the moments that were published.
 fn play(t: &mut Transport, ms: i64) -> Vec<usize> {
     let mut published = Vec::new();
     while let Order::Publish { moment, due, turn } = t.order(at(ms)) {
@@ -34,7 +34,7 @@ fn play(t: &mut Transport, ms: i64) -> Vec<usize> {
     published
 }
 
-/// Plays every millisecond from `from` to before `to`: when what was published.
+/// Plays every millisecond from `from` to before `to`; returns when each moment was published.
 fn run(t: &mut Transport, from: i64, to: i64) -> Vec<(i64, usize)> {
     (from..to).flat_map(|ms| play(t, ms).into_iter().map(move |m| (ms, m))).collect()
 }
@@ -254,7 +254,8 @@ proptest! {
         let mut coming = commands.next();
         let mut wait = coming.map_or(i64::MAX, |c| c.0);
         for ms in 0..12_000 {
-            let (mut expected, mut got) = (Vec::new(), Vec::new());
+            let mut expected = Vec::new();
+            let mut got = Vec::new();
             model.tick(&mut expected);
             got.extend(play(&mut t, ms));
             if let (Some((_, c)), 0) = (coming, wait) {

@@ -1,8 +1,8 @@
-//! What sets there should be, worked out slowly with every frame kept for ever.
+//! The sets there should be, worked out slowly with every frame kept for ever.
 
 use crate::sets::AssemblerConfig;
 
-/// What is done to the assembler, in order.
+/// One call on the assembler.
 #[derive(Debug, Clone, Copy)]
 pub enum Event {
     Push { stream: usize, stamp: i64 },
@@ -10,7 +10,7 @@ pub enum Event {
     Poll { now: i64 },
 }
 
-/// What becomes of a frame.
+/// Fate of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fate {
     Used,
@@ -23,7 +23,7 @@ pub enum Fate {
 struct Frame {
     stamp: i64,
     fate: Fate,
-    /// Nearer to the tick of a set that was out when it came than what that set has.
+    /// Nearer to the tick of a set that was out when it came than the frame in that set.
     late: bool,
 }
 
@@ -64,7 +64,8 @@ pub fn model(config: &AssemblerConfig, events: &[Event]) -> (Sets, Vec<(usize, F
         .map(|i| config.tolerance_ns.get(i).copied().unwrap_or(config.stream_period_ns[i] / 2 + 1_000_000))
         .collect();
     let mut streams: Vec<Stream> = tolerances.iter().map(|_| Stream::default()).collect();
-    let (mut sets, mut tick) = (Vec::new(), None);
+    let mut sets = Vec::new();
+    let mut tick = None;
     for event in events {
         match *event {
             Event::Active { stream, active } => streams[stream].inactive = !active,

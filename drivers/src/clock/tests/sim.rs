@@ -33,7 +33,7 @@ impl Rng {
     }
 }
 
-/// What kind of camera and bus.
+/// Kind of camera and bus.
 #[derive(Clone, Copy)]
 pub struct Scenario {
     pub seconds: f64,
@@ -90,7 +90,10 @@ pub fn generate(s: &Scenario, seed: u64) -> Vec<Sample> {
     let mut rng = Rng::new(seed);
     let period_ns = 1e9 / s.fps;
     let start_ns = 3.6e12; // the host has been up for an hour
-    let (mut walk, mut device_ns, mut stalled_until, mut last_arrival) = (0.0, 0.0, 0.0, 0.0f64);
+    let mut walk = 0.0;
+    let mut device_ns = 0.0;
+    let mut stalled_until = 0.0;
+    let mut last_arrival = 0.0f64;
     let mut out = Vec::new();
     for i in 0..(s.seconds * s.fps) as u64 {
         let t_s = i as f64 / s.fps;

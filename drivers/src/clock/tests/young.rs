@@ -1,4 +1,4 @@
-//! What is claimed of a device that is asked for its clock, from its very first frame on: frames that all wait for an
+//! Claims about a device that is asked for its clock, from its very first frame on: frames that all wait for an
 //! overloaded computer from the beginning, a crystal that drifts, and answers that come when they come.
 
 use super::sim::{self, NOMINAL, Scenario, generate};
@@ -40,7 +40,7 @@ fn any_case() -> impl Strategy<Value = Case> {
     )
 }
 
-/// What 20 s of it are mapped to.
+/// Maps 20 s of it.
 fn outcomes_of(case: &Case) -> Vec<Outcome> {
     let s = Scenario {
         seconds: 20.0,
@@ -54,7 +54,8 @@ fn outcomes_of(case: &Case) -> Vec<Outcome> {
     let mut map = ClockMap::new(super::config_of(&s));
     map.expect_probes();
     let mut rng = sim::Rng::new(case.seed ^ 0x5eed);
-    let (mut outcomes, mut next_s) = (Vec::new(), case.first_s);
+    let mut outcomes = Vec::new();
+    let mut next_s = case.first_s;
     for (i, frame) in generate(&s, case.seed).iter().enumerate() {
         let at_s = i as f64 / s.fps;
         outcomes.extend(play(&mut map, core::slice::from_ref(frame)));
@@ -62,7 +63,8 @@ fn outcomes_of(case: &Case) -> Vec<Outcome> {
         if at_s >= next_s {
             next_s = at_s + case.every_s;
             let way = |rng: &mut sim::Rng| case.way_ns + rng.exponential(100e3);
-            let (there, back) = (way(&mut rng), way(&mut rng));
+            let there = way(&mut rng);
+            let back = way(&mut rng);
             let read_ns = frame.truth_ns + 5e6;
             let raw = frame.raw.wrapping_add((5e6 / s.tick_ns) as u64) & (u64::MAX >> (64 - s.counter_bits));
             map.probe(host(read_ns - there), raw, host(read_ns + back));
@@ -78,13 +80,13 @@ proptest! {
     #[test]
     fn claims_hold_from_the_first_frame_on(case in any_case()) {
         let outcomes = outcomes_of(&case);
-        let told: Vec<Outcome> =
+        let certain: Vec<Outcome> =
             outcomes.iter().filter(|o| !o.has(FrameFlags::TIME_UNCERTAIN)).copied().collect();
-        prop_assert!(told.iter().all(|o| o.at_s > case.first_s), "claimed before the first answer");
+        prop_assert!(certain.iter().all(|o| o.at_s > case.first_s), "claimed before the first answer");
         let late = case.first_s + 1.0;
-        let untold = outcomes.iter().filter(|o| o.at_s > late && o.has(FrameFlags::TIME_UNCERTAIN)).count();
-        prop_assert!(untold * 100 <= outcomes.len(), "{untold} are still uncertain");
-        let (covered, _) = coverage(&told, 0.0);
+        let uncertain = outcomes.iter().filter(|o| o.at_s > late && o.has(FrameFlags::TIME_UNCERTAIN)).count();
+        prop_assert!(uncertain * 100 <= outcomes.len(), "{uncertain} are still uncertain");
+        let (covered, _) = coverage(&certain, 0.0);
         prop_assert!(covered >= 0.99, "covered {covered}");
     }
 }
@@ -99,7 +101,7 @@ fn without_an_answer_nothing_is_claimed() {
             map.expect_probes();
         }
         let outcomes = play(&mut map, &generate(&s, 1));
-        let told = outcomes[10..].iter().filter(|o| !o.has(FrameFlags::TIME_UNCERTAIN)).count();
-        assert_eq!(told == 0, asked, "{told} of {}", outcomes.len());
+        let certain = outcomes[10..].iter().filter(|o| !o.has(FrameFlags::TIME_UNCERTAIN)).count();
+        assert_eq!(certain == 0, asked, "{certain} of {}", outcomes.len());
     }
 }

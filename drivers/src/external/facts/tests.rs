@@ -1,4 +1,4 @@
-//! Each fact of a frame that cannot be is made harmless, and each that can be is passed on as it is.
+//! Each invalid field of a frame's header is replaced, and each valid one is passed on as it is.
 
 use super::*;
 use crate::DeviceClock;

@@ -37,14 +37,16 @@ pub(super) fn parse(text: &[u8]) -> Result<Calibration> {
         };
         read_camera(&At { what: location.to_owned(), value })
     };
-    let (depth, color) = (camera(DEPTH)?, camera(COLOR)?);
+    let depth = camera(DEPTH)?;
+    let color = camera(COLOR)?;
     if depth.sensor != (1024, 1024) {
         return Err(bad(format_args!(
             "{DEPTH}: a sensor of {:?} pixels; a Kinect's has 1024x1024",
             depth.sensor
         )));
     }
-    let (width, height) = (u64::from(color.sensor.0), u64::from(color.sensor.1));
+    let width = u64::from(color.sensor.0);
+    let height = u64::from(color.sensor.1);
     if width * 3 != height * 4 && width * 9 != height * 16 {
         return Err(bad(format_args!(
             "{COLOR}: a sensor of {width}x{height} pixels is neither 4:3 nor 16:9"
@@ -78,11 +80,7 @@ fn read_camera(camera: &At<'_>) -> Result<CameraCalibration> {
         if range.contains(&value) {
             return Ok(());
         }
-        Err(lens.bad(format_args!(
-            "{name} = {value} cannot be; it lies within {} and {}",
-            range.start(),
-            range.end()
-        )))
+        Err(lens.bad(format_args!("{name} = {value} is out of range {}..={}", range.start(), range.end())))
     };
     for (name, value) in [("cx", cx), ("cy", cy)] {
         within(name, value, 0.2..=0.8)?;
@@ -110,7 +108,7 @@ fn read_camera(camera: &At<'_>) -> Result<CameraCalibration> {
             p2,
             center: [codx, cody],
         },
-        // 0 says that the factory could not tell.
+        // 0 means that the factory did not measure it.
         metric_radius: if radius <= 1e-4 { DEFAULT_RADIUS } else { radius },
         camera_from_device: camera.rt()?,
         sensor: (side("SensorWidth")?, side("SensorHeight")?),
@@ -156,11 +154,7 @@ impl<'a> At<'a> {
         if range.contains(&n) {
             return Ok(n);
         }
-        Err(self.bad(format_args!(
-            "{key} = {n} cannot be; it lies within {} and {}",
-            range.start(),
-            range.end()
-        )))
+        Err(self.bad(format_args!("{key} = {n} is out of range {}..={}", range.start(), range.end())))
     }
 
     /// The first `N` of the `listed` numbers of `key`.
@@ -171,7 +165,7 @@ impl<'a> At<'a> {
         }
         let mut out = [0.0; N];
         for (to, from) in out.iter_mut().zip(list) {
-            *to = from.as_f64().ok_or_else(|| self.bad(format_args!("{from} in {key} is no number")))?;
+            *to = from.as_f64().ok_or_else(|| self.bad(format_args!("{from} in {key} is not a number")))?;
         }
         Ok(out)
     }

@@ -52,7 +52,7 @@ impl RawIntrinsics {
         p * d + tangential + center
     }
 
-    /// How far the same numbers in the model of the sold devices are off within a picture, pixels.
+    /// How far the same numbers in the model of the sold devices are off within an image, pixels.
     pub(super) fn approximation_px(&self, cut: Cut, radius: f64) -> f64 {
         const STEPS: i32 = 16;
         let sold = Self { model: LensModel::BrownConrady, center: [0.0; 2], ..*self };

@@ -91,7 +91,7 @@ fn every_color_resolution_is_a_crop_of_the_same_view() {
         let wanted = (whole + 0.5) * scale - 0.5 - DVec2::new(f64::from(offset.0), f64::from(offset.1));
         near(c.color_intrinsics(resolution).project(p).unwrap(), wanted.to_array());
     }
-    // Rows of the whole sensor at each width, and those above the picture: half of what 16:9 leaves of 4:3.
+    // Rows of the whole sensor at each width, and those above the image: half of what 16:9 leaves of 4:3.
     for (resolution, rows, above) in [
         (ColorResolution::P720, 960.0, 120.0),
         (ColorResolution::P1080, 1440.0, 180.0),
@@ -100,7 +100,8 @@ fn every_color_resolution_is_a_crop_of_the_same_view() {
         (ColorResolution::P2160, 2880.0, 360.0),
         (ColorResolution::P3072, 3072.0, 0.0),
     ] {
-        let (k, raw) = (c.color_intrinsics(resolution), c.color.intrinsics);
+        let k = c.color_intrinsics(resolution);
+        let raw = c.color.intrinsics;
         assert!((k.cy - (raw.cy * rows - above - 0.5)).abs() < 1e-9, "{resolution:?}: {}", k.cy);
         assert!((k.fy - raw.fy * rows).abs() < 1e-9, "{resolution:?}: {}", k.fy);
     }
@@ -126,7 +127,8 @@ fn points_are_seen_where_opencv_sees_them() {
             near(k.project(DVec3::from_array(p)).unwrap(), wanted);
         }
     }
-    let (k, color_from_depth) = (c.color_intrinsics(ColorResolution::P720), c.color_from_depth());
+    let k = c.color_intrinsics(ColorResolution::P720);
+    let color_from_depth = c.color_from_depth();
     for (p, wanted) in POINTS.into_iter().zip(SEEN_COLOR_720P) {
         let p = color_from_depth.transform_point(DVec3::from_array(p));
         near(k.project(p).unwrap(), wanted);
@@ -161,7 +163,8 @@ fn a_device_that_was_calibrated_in_16_to_9_sees_the_same() {
     let c = example();
     let k = c.color.intrinsics;
     // The same lens in the rows 384 to 2688 of 3072.
-    let (cy, fy) = ((k.cy * 3072.0 - 384.0) / 2304.0, k.fy * 3072.0 / 2304.0);
+    let cy = (k.cy * 3072.0 - 384.0) / 2304.0;
+    let fy = k.fy * 3072.0 / 2304.0;
     let early = Calibration {
         color: CameraCalibration {
             intrinsics: RawIntrinsics { cy, fy, ..k },
@@ -172,7 +175,8 @@ fn a_device_that_was_calibrated_in_16_to_9_sees_the_same() {
     };
     let early = Calibration::parse(early.build().as_bytes()).unwrap();
     for resolution in ColorResolution::ALL {
-        let (a, b) = (early.color_intrinsics(resolution), c.color_intrinsics(resolution));
+        let a = early.color_intrinsics(resolution);
+        let b = c.color_intrinsics(resolution);
         for (a, b) in [(a.fx, b.fx), (a.fy, b.fy), (a.cx, b.cx), (a.cy, b.cy)] {
             assert!((a - b).abs() < 1e-9, "{resolution:?}: {a} {b}");
         }
@@ -243,20 +247,20 @@ fn what_cannot_be_is_refused_by_name() {
         "\"Fisheye\" is not one that Kinects have",
     );
     refused(&format!("{D0}/Intrinsics/ModelParameters"), json!([1, 2, 3]), "3 numbers, not 14");
-    refused(&format!("{D0}/Intrinsics/ModelParameters/2"), json!(0), "fx = 0 cannot be");
+    refused(&format!("{D0}/Intrinsics/ModelParameters/2"), json!(0), "fx = 0 is out of range");
     refused(
         &format!("{D0}/Intrinsics/ModelParameters/4"),
         json!("x"),
-        "\"x\" in ModelParameters is no number",
+        "\"x\" in ModelParameters is not a number",
     );
     refused(&format!("{D0}/Intrinsics/ModelParameterCount"), json!(1e9), "ModelParameterCount = 1000000000");
-    refused(&format!("{PV0}/Rt/Rotation/0"), json!(0.5), "is no rotation");
+    refused(&format!("{PV0}/Rt/Rotation/0"), json!(0.5), "is not a rotation");
     refused(&format!("{PV0}/Rt/Translation/2"), json!(32.1), "more than a metre");
     refused(&format!("{PV0}/MetricRadius"), json!(null), "no number MetricRadius");
     refused(&format!("{D0}/SensorWidth"), json!(2048), "(2048, 1024)");
     refused(&format!("{PV0}/SensorWidth"), json!(4000), "neither 4:3 nor 16:9");
     let mirrored = json!([-1, 0, 0, 0, 1, 0, 0, 0, 1]);
-    refused(&format!("{D0}/Rt/Rotation"), mirrored, "is no rotation");
+    refused(&format!("{D0}/Rt/Rotation"), mirrored, "is not a rotation");
     assert!(Calibration::parse(b"<html>").unwrap_err().to_string().contains("no JSON"));
     assert!(Calibration::parse(&vec![b' '; 2 << 20]).unwrap_err().to_string().contains("2097152 bytes"));
 }

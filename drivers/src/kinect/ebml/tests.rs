@@ -20,13 +20,13 @@ fn heads_have_identifier_and_size() {
 }
 
 #[test]
-fn children_end_where_one_is_not_whole() {
+fn children_end_at_an_incomplete_one() {
     let body = [0xEC, 0x82, 1, 2, 0xD7, 0x81, 9, 0x86, 0x84, b'a', b'b'];
     let mut found = children(&body);
     assert_eq!(found.next(), Some((id::VOID, &[1, 2][..])));
     assert_eq!(found.next(), Some((id::TRACK_NUMBER, &[9][..])));
-    assert!(found.is_whole());
-    assert_eq!((found.next(), found.is_whole(), found.next()), (None, false, None));
+    assert!(found.is_complete());
+    assert_eq!((found.next(), found.is_complete(), found.next()), (None, false, None));
     assert_eq!(child_uint(&body, id::TRACK_NUMBER), Some(9));
     assert_eq!(child(&body, id::CODEC_ID), None);
 }

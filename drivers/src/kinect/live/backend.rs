@@ -1,7 +1,7 @@
-//! The back end for attached Kinects: finds the one that is meant, opens it and asks what it is.
+//! The backend for attached Kinects: finds the selected one, opens it and reads its identity.
 
 use super::config::LiveConfig;
-use super::find::{self, Found};
+use super::find::{self, FoundCamera};
 use super::handle::{self, Handle};
 use super::library::{self, Loaded, Places};
 use super::profiles;
@@ -21,7 +21,7 @@ use std::sync::{MutexGuard, TryLockError};
 /// How long another camera's opening is waited for.
 const OPENING: Duration = Duration::from_secs(10);
 
-/// The back end `kinect` for a camera that is attached.
+/// The backend `kinect` for an attached camera.
 #[derive(Debug, Clone, Default)]
 pub struct LiveBackend {
     config: LiveConfig,
@@ -29,7 +29,7 @@ pub struct LiveBackend {
 }
 
 impl LiveBackend {
-    /// A back end for the camera that `config` means. Nothing is loaded before it is asked for.
+    /// A backend for the camera that `config` selects. Nothing is loaded before it is used.
     pub fn new(config: LiveConfig) -> Self {
         Self { config, root: SysRoot::default() }
     }
@@ -41,15 +41,16 @@ impl LiveBackend {
         self
     }
 
-    /// What the bus shows; nothing when it cannot be read, since libk4a has its own way to it.
-    fn on_bus(&self) -> Vec<Found> {
+    /// The cameras on the bus; empty if it cannot be read, since libk4a has its own access to it.
+    fn on_bus(&self) -> Vec<FoundCamera> {
         scan(&self.root).map(|d| find::cameras(&d)).unwrap_or_default()
     }
 
     /// Opens every camera that can be, and says why the others cannot.
     fn open_all(&self, library: &'static Loaded) -> (Vec<(Handle, DeviceInfo)>, Vec<Error>) {
         let on_bus = self.on_bus();
-        let (mut opened, mut failed) = (Vec::new(), Vec::new());
+        let mut opened = Vec::new();
+        let mut failed = Vec::new();
         for index in 0..handle::count(library) {
             let asked = Handle::open(library, index).and_then(|camera| {
                 let info = info(&camera, &camera.serial()?, &on_bus);
@@ -63,7 +64,7 @@ impl LiveBackend {
         (opened, failed)
     }
 
-    /// The serial number that is meant, if any is: given, or that of the camera at the given port.
+    /// The selected serial number, if any: the one given, or that of the camera at the given port.
     fn wanted(&self, serial: Option<&str>) -> Result<Option<String>> {
         if let Some(serial) = serial.or(self.config.serial.as_deref()) {
             return Ok(Some(serial.to_owned()));
@@ -84,11 +85,11 @@ impl LiveBackend {
         }
     }
 
-    /// Why no camera is the one that is meant.
+    /// The error for a selection that no camera matches.
     fn not_found(&self, wanted: Option<&str>, others: &[DeviceInfo], failed: Vec<Error>) -> Error {
         let on_bus = self.on_bus();
         let is_there = |s: &str| on_bus.iter().find(|f| f.serial() == Some(s));
-        let meant = wanted.and_then(is_there).or(if wanted.is_none() { on_bus.first() } else { None });
+        let selected = wanted.and_then(is_there).or(if wanted.is_none() { on_bus.first() } else { None });
         let known_absent =
             wanted.is_some_and(|s| is_there(s).is_none() && on_bus.iter().all(|f| f.serial().is_some()));
         let mut list: Vec<String> = others.iter().map(|i| format!("{MODEL} {}", i.serial)).collect();
@@ -96,8 +97,9 @@ impl LiveBackend {
         // The bus shows every serial number and not this one: those that cannot be opened are others.
         let failure = failed.into_iter().next_back().filter(|_| on_bus.is_empty() || !known_absent);
         if let Some(e) = failure {
-            let name = meant.map_or_else(|| find::describe(wanted.unwrap_or_default(), ""), Found::describe);
-            let held = match (e.kind(), meant) {
+            let name = selected
+                .map_or_else(|| find::describe(wanted.unwrap_or_default(), ""), FoundCamera::describe);
+            let held = match (e.kind(), selected) {
                 (ErrorKind::Busy, Some(f)) => {
                     format!("; it is held by {}", holders_of(&self.root, &f.depth.node).describe())
                 }
@@ -116,7 +118,7 @@ impl LiveBackend {
         let what = match wanted {
             Some(serial) => format!("there is no {MODEL} with serial number {serial}; {attached}"),
             None if list.is_empty() => format!("there is no {MODEL}: {attached}"),
-            None => format!("which {MODEL} is meant? Name it with serial = \"…\"; {attached}"),
+            None => format!("several {MODEL}s are attached; select one with serial = \"…\"; {attached}"),
         };
         Error::new(ErrorKind::NotFound, what)
     }
@@ -139,7 +141,7 @@ fn alone(library: &'static Loaded) -> Result<MutexGuard<'static, ()>> {
     }
 }
 
-fn info(camera: &Handle, serial: &str, on_bus: &[Found]) -> DeviceInfo {
+fn info(camera: &Handle, serial: &str, on_bus: &[FoundCamera]) -> DeviceInfo {
     let found = on_bus.iter().find(|f| f.serial() == Some(serial)).or(match on_bus {
         [one] if one.serial().is_none() => Some(one),
         _ => None,
@@ -164,7 +166,7 @@ impl Backend for LiveBackend {
         NAME
     }
 
-    /// Every Kinect that nobody has. Each is opened for a moment.
+    /// Every Kinect that no process holds. Each is opened briefly.
     fn discover(&self) -> Result<Vec<DeviceInfo>> {
         let library = library::load(&self.config.places)?;
         let _alone = alone(library)?;
@@ -180,13 +182,13 @@ impl Backend for LiveBackend {
         let wanted = self.wanted(serial)?;
         let _alone = alone(library)?;
         let (opened, failed) = self.open_all(library);
-        let is_meant = |i: &DeviceInfo| wanted.as_ref().is_none_or(|w| *w == i.serial);
-        let (mut meant, others): (Vec<_>, Vec<_>) = opened.into_iter().partition(|(_, i)| is_meant(i));
+        let is_selected = |i: &DeviceInfo| wanted.as_ref().is_none_or(|w| *w == i.serial);
+        let (mut selected, others): (Vec<_>, Vec<_>) = opened.into_iter().partition(|(_, i)| is_selected(i));
         let is_only = wanted.is_some() || failed.is_empty();
-        match (meant.len(), meant.pop()) {
+        match (selected.len(), selected.pop()) {
             (1, Some((camera, info))) if is_only => LiveDevice::boxed(camera, info, self),
             (_, last) => {
-                let rest = meant.into_iter().chain(last).chain(others).map(|(_, i)| i).collect::<Vec<_>>();
+                let rest = selected.into_iter().chain(last).chain(others).map(|(_, i)| i).collect::<Vec<_>>();
                 Err(self.not_found(wanted.as_deref(), &rest, failed))
             }
         }

@@ -1,4 +1,4 @@
-//! What a rig may ask of a Kinect that is attached.
+//! The configuration of an attached Kinect in a rig.
 
 use super::library::Places;
 use crate::kinect::modes::{DepthMode, WiredSync};
@@ -14,7 +14,7 @@ pub struct LiveConfig {
     pub port: Option<String>,
     /// Where libk4a and the depth engine are.
     pub places: Places,
-    /// The mode of the depth camera; `None`: the one whose pictures have the size that is asked for.
+    /// The mode of the depth camera; `None`: the one whose images have the size that is asked for.
     pub depth_mode: Option<DepthMode>,
     /// Part among Kinects that are wired together.
     pub sync: WiredSync,

@@ -99,7 +99,7 @@ fn check(
         }
         ControlValue::Item(item) => {
             let auto = if range.has_auto { ", or \"auto\"" } else { "" };
-            return Err(format!("color_controls.{key} = \"{item}\" is no number{auto}"));
+            return Err(format!("color_controls.{key} = \"{item}\" is not a number{auto}"));
         }
         ControlValue::Boolean(on) => i64::from(*on),
         ControlValue::Integer(value) => *value,

@@ -1,33 +1,33 @@
 //! Frame numbers of a camera that has none: reckoned from the device's own times.
 //!
-//! A Kinect takes pictures at a fixed rate and stamps each with its clock, so a step of the clock by several periods is
-//! as many pictures of which all but the last were lost. The same time twice is the same picture twice. A clock that
-//! went back was set anew, and nobody knows how many pictures fell into that.
+//! A Kinect takes images at a fixed rate and stamps each with its clock, so a step of the clock by several periods is
+//! as many images of which all but the last were lost. The same time twice is the same image twice. A clock that
+//! went back was reset, and how many images were lost by that is unknown.
 //!
-//! A camera that exposes for longer than a period takes fewer pictures, as in the dark: its period is then as many of the nominal
-//! ones as the exposure takes, which the camera states with each picture, and none of those between is lost.
+//! A camera that exposes for longer than a period takes fewer images, as in the dark: its period is then as many of the
+//! nominal ones as the exposure takes, which the camera states with each image, and none of those between is lost.
 
 /// Reckons the numbers of one stream.
 #[derive(Debug, Clone)]
 pub struct FrameCounter {
     period_us: u64,
     last: Option<(u64, u64)>,
-    /// Nominal periods that the last picture's exposure took.
+    /// Nominal periods that the last image's exposure took.
     exposed: u64,
 }
 
 impl FrameCounter {
-    /// A counter for pictures every `period_us` microseconds of the device's clock.
+    /// A counter for images every `period_us` microseconds of the device's clock.
     pub const fn new(period_us: u64) -> Self {
         Self { period_us: if period_us == 0 { 1 } else { period_us }, last: None, exposed: 1 }
     }
 
-    /// The number of the picture that was taken at `device_us`, of a camera that keeps its rate.
+    /// The number of the image that was taken at `device_us`, of a camera that keeps its rate.
     pub fn number(&mut self, device_us: u64) -> u64 {
         self.number_exposed(device_us, 0)
     }
 
-    /// The number of the picture that was taken at `device_us` and exposed for `exposure_us`.
+    /// The number of the image that was taken at `device_us` and exposed for `exposure_us`.
     pub fn number_exposed(&mut self, device_us: u64, exposure_us: u64) -> u64 {
         // Exposures are rounded: one of two periods may be stated as a little more.
         let exposed = (exposure_us.saturating_mul(15) / 16).div_ceil(self.period_us).max(1);
@@ -39,7 +39,7 @@ impl FrameCounter {
             Some((number, then)) => {
                 let passed = device_us.checked_sub(then).unwrap_or(period_us);
                 let periods = passed.saturating_add(period_us / 2) / period_us;
-                // A clock that jumped ahead by more than a day tells nothing either.
+                // A clock that jumped ahead by more than a day says nothing either.
                 let is_lost = periods > 86_400 * 30;
                 number + if is_lost { 1 } else { periods.max(1) }
             }
@@ -75,7 +75,8 @@ mod tests {
         assert_eq!(FrameCounter::new(0).number(5), 0);
     }
 
-    /// It gets dark and light again: the colour camera's own exposures, none of which loses a picture; then one is lost at each.
+    /// It gets dark and light again: the colour camera's own exposures, none of which loses an image; then one is lost
+    /// at each.
     #[test]
     fn a_rate_that_long_exposures_lower_is_no_loss() {
         let mut counter = FrameCounter::new(33_333);
@@ -86,7 +87,7 @@ mod tests {
                 // The first short one may come as late as a long one, or at once.
                 at += periods * 33_333 + if i % 2 == 0 { 3_000 } else { 0 };
                 let next = counter.number_exposed(at, exposure);
-                assert_eq!(next, number + 1, "{exposure} us, picture {i}");
+                assert_eq!(next, number + 1, "{exposure} us, image {i}");
                 number = next;
             }
             at += 2 * periods * 33_333;

@@ -9,7 +9,7 @@
 use core::ffi::{c_char, c_int, c_void};
 use libloading::Library;
 
-/// What a handle points to; only libk4a looks inside.
+/// The opaque target of a handle; only libk4a reads it.
 #[repr(C)]
 pub struct Opaque {
     reserved: usize,
@@ -67,7 +67,7 @@ pub struct DeviceConfiguration {
     pub depth_mode: u32,
     /// 0, 1, 2: 5, 15, 30 Hz.
     pub camera_fps: u32,
-    /// Hand over captures with all pictures only.
+    /// Hand over captures with all images only.
     pub synchronized_images_only: bool,
     /// Depth after colour, microseconds.
     pub depth_delay_off_color_usec: i32,

@@ -1,4 +1,4 @@
-//! An open Kinect, its captures and pictures: libk4a's handles, each given back exactly once.
+//! An open Kinect, its captures and images: libk4a's handles, each given back exactly once.
 // Every function of the table is foreign.
 #![allow(unsafe_code)]
 
@@ -28,7 +28,7 @@ pub struct Handle {
 // several); a `Handle` is used by one thread at a time.
 unsafe impl Send for Handle {}
 
-/// What a colour control may be set to.
+/// The range and default of a colour control.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ControlRange {
     /// Whether the camera can regulate it.
@@ -39,7 +39,7 @@ pub struct ControlRange {
     pub max: i32,
     /// From one value to the next.
     pub step: i32,
-    /// What it is when nobody set it.
+    /// Its factory default.
     pub default: i32,
 }
 
@@ -63,7 +63,7 @@ impl Handle {
     ///
     /// # Errors
     /// [`ErrorKind::Busy`], [`ErrorKind::PermissionDenied`], [`ErrorKind::NotFound`], [`ErrorKind::Io`], as far as
-    /// libk4a's messages tell.
+    /// libk4a's messages show it.
     pub fn open(library: &'static Loaded, index: u32) -> Result<Self> {
         library.journal.clear();
         let mut raw = core::ptr::null_mut();
@@ -78,7 +78,7 @@ impl Handle {
     /// The number that is printed on it.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] when it does not say.
+    /// [`ErrorKind::Io`] if the camera does not report it.
     pub fn serial(&self) -> Result<String> {
         let read = |data: *mut c_char, size: &mut usize| {
             // SAFETY: the handle is open; `data` has `size` bytes, or is null where only the size is asked for.
@@ -105,7 +105,7 @@ impl Handle {
     /// The JSON text of the factory calibration.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] when it does not say.
+    /// [`ErrorKind::Io`] if the camera does not report it.
     pub fn raw_calibration(&self) -> Result<Vec<u8>> {
         let read = |data: *mut u8, size: &mut usize| {
             // SAFETY: the handle is open; `data` has `size` bytes, or is null where only the size is asked for.
@@ -114,7 +114,7 @@ impl Handle {
         self.read_sized("its calibration", MAX_CALIBRATION, read)
     }
 
-    /// Reads what libk4a first tells the size of.
+    /// Reads data whose size libk4a reports first.
     fn read_sized(
         &self,
         what: &str,
@@ -137,9 +137,10 @@ impl Handle {
     /// Whether a cable is in "sync in" and in "sync out".
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] when it does not say.
+    /// [`ErrorKind::Io`] if the camera does not report it.
     pub fn sync_jacks(&self) -> Result<(bool, bool)> {
-        let (mut into, mut out) = (0u8, 0u8);
+        let mut into = 0u8;
+        let mut out = 0u8;
         let ask = self.library.functions.device_get_sync_jack;
         // SAFETY: the handle is open; both bytes, of the size of a C `bool`, are written to during the call alone.
         let result = unsafe { ask(self.raw.as_ptr(), &raw mut into, &raw mut out) };
@@ -149,9 +150,14 @@ impl Handle {
         Ok((into != 0, out != 0))
     }
 
-    /// What the colour control `command` may be set to; `None` when the camera has no such control.
+    /// The range of the colour control `command`; `None` if the camera has no such control.
     pub fn control_range(&self, command: u32) -> Option<ControlRange> {
-        let (mut auto, mut min, mut max, mut step, mut default, mut mode) = (0u8, 0, 0, 0, 0, 0u32);
+        let mut auto = 0u8;
+        let mut min = 0;
+        let mut max = 0;
+        let mut step = 0;
+        let mut default = 0;
+        let mut mode = 0u32;
         let ask = self.library.functions.device_get_color_control_capabilities;
         // SAFETY: the handle is open; everything is written to during the call alone, and has the size that k4a.h says.
         let result = unsafe {
@@ -169,12 +175,13 @@ impl Handle {
         (result == ffi::SUCCEEDED).then_some(ControlRange { has_auto: auto != 0, min, max, step, default })
     }
 
-    /// What the colour control `command` is set to.
+    /// The value of the colour control `command`.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] when it does not say.
+    /// [`ErrorKind::Io`] if the camera does not report it.
     pub fn control(&self, command: u32) -> Result<ControlSetting> {
-        let (mut mode, mut value) = (0u32, 0);
+        let mut mode = 0u32;
+        let mut value = 0;
         let ask = self.library.functions.device_get_color_control;
         // SAFETY: the handle is open; both are written to during the call alone.
         let result = unsafe { ask(self.raw.as_ptr(), command, &raw mut mode, &raw mut value) };
@@ -227,7 +234,7 @@ impl Handle {
         unsafe { (self.library.functions.device_stop_cameras)(self.raw.as_ptr()) }
     }
 
-    /// Starts the motion unit; the cameras must run, because that of colour sets the unit's clock when it starts.
+    /// Starts the IMU; the cameras must run, because that of colour sets the unit's clock when it starts.
     ///
     /// # Errors
     /// As [`Self::start`].
@@ -238,17 +245,17 @@ impl Handle {
         if result == ffi::SUCCEEDED {
             Ok(())
         } else {
-            Err(self.failed("its motion unit cannot be started", ErrorKind::Io))
+            Err(self.failed("its IMU cannot be started", ErrorKind::Io))
         }
     }
 
-    /// Stops the motion unit.
+    /// Stops the IMU.
     pub fn stop_imu(&self) {
         // SAFETY: the handle is open; a unit that does not run is left as it is.
         unsafe { (self.library.functions.device_stop_imu)(self.raw.as_ptr()) }
     }
 
-    /// The next sample of motion, if there is one now.
+    /// The next IMU sample, if there is one now.
     ///
     /// # Errors
     /// [`ErrorKind::Disconnected`]: nothing more will come.
@@ -265,17 +272,17 @@ impl Handle {
                 acceleration: sample.acc_sample,
                 temperature_c: sample.temperature,
             })),
-            _ => Err(self.failed("its motion unit stopped sending", ErrorKind::Disconnected)),
+            _ => Err(self.failed("its IMU stopped sending", ErrorKind::Disconnected)),
         }
     }
 
-    /// Waits at most `patience` for the next capture.
+    /// Waits at most `timeout` for the next capture.
     ///
     /// # Errors
     /// [`ErrorKind::Disconnected`]: nothing more will come.
-    pub fn capture(&self, patience: Duration) -> Result<Option<Capture<'_>>> {
+    pub fn capture(&self, timeout: Duration) -> Result<Option<Capture<'_>>> {
         let mut raw = core::ptr::null_mut();
-        let wait_ms = i32::try_from(patience.as_millis()).unwrap_or(i32::MAX);
+        let wait_ms = i32::try_from(timeout.as_millis()).unwrap_or(i32::MAX);
         let get = self.library.functions.device_get_capture;
         // SAFETY: the handle is open, and `raw` is written to during the call alone.
         match unsafe { get(self.raw.as_ptr(), &raw mut raw, wait_ms) } {
@@ -295,12 +302,12 @@ impl Handle {
 
 impl Drop for Handle {
     fn drop(&mut self) {
-        // SAFETY: it is open, and closed here alone; captures and pictures of it borrow it, so there are none.
+        // SAFETY: it is open, and closed here alone; captures and images of it borrow it, so there are none.
         unsafe { (self.library.functions.device_close)(self.raw.as_ptr()) }
     }
 }
 
-/// The error for `what`, with what libk4a's messages tell of it.
+/// The error for `what`, with its cause from libk4a's messages.
 fn failed(library: &Loaded, what: &str, otherwise: ErrorKind) -> Error {
     let lines = library.journal.lines();
     let (kind, cure) = match journal::cause(&lines) {
@@ -329,24 +336,24 @@ fn failed(library: &Loaded, what: &str, otherwise: ErrorKind) -> Error {
     Error::new(kind, format!("{what}{cure}{}", journal::quote(&lines)))
 }
 
-/// What the camera sent at one moment. Dropping it gives it back.
+/// The images that the camera took at one moment. Dropping it releases them.
 pub struct Capture<'h> {
     handle: &'h Handle,
     raw: NonNull<Opaque>,
 }
 
 impl<'h> Capture<'h> {
-    /// The colour picture, if it came.
+    /// The colour image, if it came.
     pub fn color(&self) -> Option<Image<'h>> {
         self.image(self.handle.library.functions.capture_get_color_image)
     }
 
-    /// The depth picture, if it came.
+    /// The depth image, if it came.
     pub fn depth(&self) -> Option<Image<'h>> {
         self.image(self.handle.library.functions.capture_get_depth_image)
     }
 
-    /// The infrared picture, if it came.
+    /// The infrared image, if it came.
     pub fn ir(&self) -> Option<Image<'h>> {
         self.image(self.handle.library.functions.capture_get_ir_image)
     }
@@ -358,7 +365,7 @@ impl<'h> Capture<'h> {
     }
 
     fn image(&self, get: unsafe extern "C" fn(ffi::CaptureHandle) -> ffi::ImageHandle) -> Option<Image<'h>> {
-        // SAFETY: the capture is held. The picture has a reference of its own.
+        // SAFETY: the capture is held. The image has a reference of its own.
         let raw = unsafe { get(self.raw.as_ptr()) };
         NonNull::new(raw).map(|raw| Image { library: self.handle.library, raw, of: PhantomData })
     }
@@ -371,7 +378,7 @@ impl Drop for Capture<'_> {
     }
 }
 
-/// One picture. Dropping it gives it back; it must be gone before the cameras can stop.
+/// One image. Dropping it gives it back; it must be gone before the cameras can stop.
 pub struct Image<'h> {
     library: &'static Loaded,
     raw: NonNull<Opaque>,
@@ -381,7 +388,7 @@ pub struct Image<'h> {
 impl Image<'_> {
     /// Its bytes; `None` when it has no memory.
     pub fn bytes(&self) -> Option<&[u8]> {
-        // SAFETY: the picture is held.
+        // SAFETY: the image is held.
         let (data, size) = unsafe {
             let f = &self.library.functions;
             ((f.image_get_buffer)(self.raw.as_ptr()), (f.image_get_size)(self.raw.as_ptr()))
@@ -389,21 +396,21 @@ impl Image<'_> {
         if data.is_null() || size > isize::MAX as usize {
             return None;
         }
-        // SAFETY: libk4a says that there are `size` bytes at `data`, for as long as the picture is held. It writes them
-        // no more once it has handed the picture over.
+        // SAFETY: libk4a says that there are `size` bytes at `data`, for as long as the image is held. It writes them
+        // no more once it has handed the image over.
         Some(unsafe { core::slice::from_raw_parts(data, size) })
     }
 
     /// `k4a_image_format_t`.
     pub fn format(&self) -> u32 {
-        // SAFETY: the picture is held.
+        // SAFETY: the image is held.
         unsafe { (self.library.functions.image_get_format)(self.raw.as_ptr()) }
     }
 
-    /// Width and height, as the picture says; 0 for what cannot be.
+    /// Width and height of the image's header; 0 for an invalid one.
     pub fn size(&self) -> (u32, u32) {
         let f = &self.library.functions;
-        // SAFETY: the picture is held.
+        // SAFETY: the image is held.
         let (width, height) = unsafe {
             ((f.image_get_width_pixels)(self.raw.as_ptr()), (f.image_get_height_pixels)(self.raw.as_ptr()))
         };
@@ -412,26 +419,26 @@ impl Image<'_> {
 
     /// Bytes from one row to the next; 0 when that means nothing.
     pub fn stride(&self) -> usize {
-        // SAFETY: the picture is held.
+        // SAFETY: the image is held.
         let stride = unsafe { (self.library.functions.image_get_stride_bytes)(self.raw.as_ptr()) };
         usize::try_from(stride).unwrap_or(0)
     }
 
     /// The device's clock at mid-exposure, microseconds.
     pub fn device_us(&self) -> u64 {
-        // SAFETY: the picture is held.
+        // SAFETY: the image is held.
         unsafe { (self.library.functions.image_get_device_timestamp_usec)(self.raw.as_ptr()) }
     }
 
     /// `CLOCK_MONOTONIC` when the last byte had come over the USB, nanoseconds; 0 when it does not say.
     pub fn system_ns(&self) -> u64 {
-        // SAFETY: the picture is held.
+        // SAFETY: the image is held.
         unsafe { (self.library.functions.image_get_system_timestamp_nsec)(self.raw.as_ptr()) }
     }
 
     /// Exposure, microseconds; 0 when it does not say.
     pub fn exposure_us(&self) -> u64 {
-        // SAFETY: the picture is held.
+        // SAFETY: the image is held.
         unsafe { (self.library.functions.image_get_exposure_usec)(self.raw.as_ptr()) }
     }
 }

@@ -1,6 +1,5 @@
-//! What libk4a says while it works: its functions only tell that they failed, its messages tell why.
-// A function of ours is called by foreign code.
-#![allow(unsafe_code)]
+//! Collects libk4a's log messages: its functions only report that they failed, its messages say why.
+#![allow(unsafe_code)] // libk4a calls a function of this module
 
 use super::ffi;
 use core::ffi::{CStr, c_char, c_int, c_void};
@@ -24,7 +23,7 @@ impl Journal {
         self.lines.lock().unwrap_or_else(PoisonError::into_inner).clear();
     }
 
-    /// What was said, the oldest first.
+    /// The messages, the oldest first.
     pub fn lines(&self) -> Vec<String> {
         self.lines.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
     }
@@ -41,7 +40,7 @@ impl Journal {
     }
 }
 
-/// What libk4a calls with each message; `context` is the [`Journal`] that was registered with it.
+/// The callback for libk4a's messages; `context` is the [`Journal`] that was registered with it.
 ///
 /// # Safety
 /// `context` must point to a [`Journal`] that lives for as long as the library, or be null, and `message` to text that
@@ -63,10 +62,10 @@ pub unsafe extern "C" fn on_message(
     journal.note(level, &text.to_string_lossy());
 }
 
-/// What a failure was, as far as libk4a's messages tell.
+/// The cause of a failure, from libk4a's messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Cause {
-    /// Somebody else has claimed the camera.
+    /// Another process has claimed the camera.
     Busy,
     /// This user may not open it.
     Denied,
@@ -82,13 +81,13 @@ pub enum Cause {
     NoSyncCable,
     /// The kernel has no memory for its USB transfers.
     NoUsbMemory,
-    /// The messages do not tell.
+    /// The messages do not say.
     Unknown,
 }
 
-/// What each message tells: a part of it, as the sources of libk4a 1.4 have it (`usbcommand.c`, `usbstreaming.c`,
-/// `deloader.cpp`, `dewrapper.c`, `depth.c`, `k4a.c`). The first that is found counts.
-const TELLING: [(&str, Cause); 14] = [
+/// The causes by a part of the message, as the sources of libk4a 1.4 have it (`usbcommand.c`, `usbstreaming.c`,
+/// `deloader.cpp`, `dewrapper.c`, `depth.c`, `k4a.c`). The first match counts.
+const CAUSES: [(&str, Cause); 14] = [
     ("LIBUSB_ERROR_BUSY", Cause::Busy),
     ("LIBUSB_ERROR_ACCESS", Cause::Denied),
     // Said when every camera refused this user, and spelt like this.
@@ -107,17 +106,16 @@ const TELLING: [(&str, Cause); 14] = [
     ("LIBUSB_TRANSFER_NO_DEVICE", Cause::Gone),
 ];
 
-/// The cause that `lines` tell.
+/// The cause that `lines` show.
 pub fn cause(lines: &[String]) -> Cause {
-    let found = TELLING.iter().find(|(part, _)| lines.iter().any(|l| l.contains(part)));
+    let found = CAUSES.iter().find(|(part, _)| lines.iter().any(|l| l.contains(part)));
     found.map_or(Cause::Unknown, |(_, cause)| *cause)
 }
 
-/// `; libk4a says: …` with the message that tells most: the one that the cause was read from, else the first; empty
-/// when nothing was said.
+/// `; libk4a says: …` with the message that the cause was read from, else the first; empty without messages.
 pub fn quote(lines: &[String]) -> String {
-    let telling = TELLING.iter().find_map(|(part, _)| lines.iter().find(|l| l.contains(part)));
-    telling.or(lines.first()).map_or_else(String::new, |line| format!("; libk4a says: {line}"))
+    let cause_line = CAUSES.iter().find_map(|(part, _)| lines.iter().find(|l| l.contains(part)));
+    cause_line.or(lines.first()).map_or_else(String::new, |line| format!("; libk4a says: {line}"))
 }
 
 #[cfg(test)]

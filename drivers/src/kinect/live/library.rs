@@ -1,8 +1,8 @@
 //! Finds libk4a and the depth engine, and loads them once for good.
 //!
-//! Both are Microsoft's and come in one package, `libk4a1.4`; neither is needed to build. libk4a looks for the engine by
-//! its bare name when the first camera starts depth, so that an engine which lies elsewhere is loaded here before: the
-//! loader of the system then finds it by its name.
+//! Both are Microsoft's and come in one package, `libk4a1.4`; neither is needed to build. libk4a looks for the engine
+//! by its bare name when the first camera starts depth, so that an engine which lies elsewhere is loaded here before:
+//! the loader of the system then finds it by its name.
 // Loading a library runs its initialisers, and its functions can only be promised.
 #![allow(unsafe_code)]
 
@@ -17,13 +17,13 @@ use std::sync::{Mutex, PoisonError};
 
 /// The environment variable that names libk4a: the file, or the folder that holds it.
 pub const VARIABLE: &str = "DEPTHRIG_LIBK4A";
-/// What files of the library are called before their version.
+/// File name of the library, without its version.
 const LIBRARY: &str = "libk4a.so";
 /// The file that libk4a 1.4 asks the loader for (`dynlib_linux.c`, `k4aplugin.h`).
 pub const ENGINE: &str = "libdepthengine.so.2.0";
-/// What a depth engine must have (`k4aplugin.h`).
+/// Symbol of a depth engine (`k4aplugin.h`).
 const ENGINE_SYMBOL: &[u8] = b"k4a_register_plugin\0";
-/// Where distributions and people put libraries.
+/// Usual folders of libraries.
 const SYSTEM: [&str; 7] = [
     "/usr/local/lib/depthrig/k4a",
     "/opt/k4a/lib",
@@ -56,7 +56,7 @@ pub struct Loaded {
     pub functions: Functions,
     /// The file.
     pub path: PathBuf,
-    /// What it says.
+    /// Its messages.
     pub journal: Journal,
     /// One opening at a time: it goes through all cameras, and each must be opened to be asked who it is.
     pub opening: Mutex<()>,
@@ -71,7 +71,7 @@ impl core::fmt::Debug for Loaded {
 /// The file of libk4a: the one asked for, else the first that is there.
 ///
 /// # Errors
-/// [`ErrorKind::BadInput`] when there is none, with what to install.
+/// [`ErrorKind::BadInput`] if there is no such file, with what to install.
 pub fn find(places: &Places) -> Result<PathBuf> {
     find_with(places, std::env::var_os(VARIABLE), &loader_folders())
 }
@@ -119,7 +119,7 @@ static LOADED: Mutex<BTreeMap<PathBuf, &'static Loaded>> = Mutex::new(BTreeMap::
 /// The library that `places` mean, loaded.
 ///
 /// # Errors
-/// [`ErrorKind::BadInput`] when it is not there, is no library, or is no libk4a 1.4.
+/// [`ErrorKind::BadInput`] if it is missing, cannot be loaded, or is not libk4a 1.4.
 pub fn load(places: &Places) -> Result<&'static Loaded> {
     let path = find(places)?;
     let path = path.canonicalize().unwrap_or(path);
@@ -132,10 +132,10 @@ pub fn load(places: &Places) -> Result<&'static Loaded> {
     // SAFETY: the file is named by who runs this program or lies where programs are installed; its initialisers run, as
     // they would if this program were linked to it.
     let library = unsafe { Library::new(&path) }.map_err(|e| refuse(format!("cannot be loaded: {e}")))?;
-    // SAFETY: a library that has every one of these names is libk4a of 1.2 or later, whose interface is that of 1.4 as far
-    // as it is used. It is never unloaded.
+    // SAFETY: a library that has every one of these names is libk4a of 1.2 or later, whose interface is that of 1.4 as
+    // far as it is used. It is never unloaded.
     let functions = unsafe { Functions::load(&library) }
-        .map_err(|name| refuse(format!("has no {name}, so it is no libk4a of version 1.4")))?;
+        .map_err(|name| refuse(format!("has no {name}, so it is not libk4a 1.4")))?;
     core::mem::forget(library);
     let known: &'static Loaded = Box::leak(Box::new(Loaded {
         functions,
@@ -149,15 +149,15 @@ pub fn load(places: &Places) -> Result<&'static Loaded> {
     let is_heard =
         unsafe { (known.functions.set_debug_message_handler)(Some(on_message), context, ffi::LOG_WARNING) };
     if is_heard != ffi::SUCCEEDED {
-        tracing::warn!(library = %path.display(), "libk4a gives its messages to somebody else in this process");
+        tracing::warn!(library = %path.display(), "libk4a gives its messages to other code in this process");
     }
     tracing::info!(library = %path.display(), "libk4a is loaded");
     loaded.insert(path, known);
     Ok(known)
 }
 
-/// The depth engine that a camera of the library at `library` would get; `None` says that the loader of the system found
-/// it by its name.
+/// The depth engine that a camera of the library at `library` would get; `None` says that the loader of the system
+/// found it by its name.
 ///
 /// # Errors
 /// [`ErrorKind::BadInput`] when it is nowhere or cannot be loaded, with what to install.
@@ -220,10 +220,7 @@ mod tests {
         }
         let wrong =
             find_with(&Places::default(), Some("/no/such/place".into()), std::slice::from_ref(&folder));
-        assert!(
-            wrong.unwrap_err().to_string().contains("/no/such/place"),
-            "a wrong place is not passed over"
-        );
+        assert!(wrong.unwrap_err().to_string().contains("/no/such/place"), "a wrong place is an error");
     }
 
     #[test]

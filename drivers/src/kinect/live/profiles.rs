@@ -30,12 +30,12 @@ const COLOR: [(PixelFormat, ColorFormat); 5] = [
     (PixelFormat::Bgr8, ColorFormat::Bgra),
 ];
 
-/// What is started.
+/// The plan of what to start.
 #[derive(Debug, Clone)]
 pub struct Plan {
     /// The streams, in the order that they were asked for.
     pub profiles: Vec<StreamProfile>,
-    /// What libk4a is asked for.
+    /// The configuration for libk4a.
     pub configuration: DeviceConfiguration,
 }
 
@@ -47,19 +47,22 @@ pub struct Plan {
 pub fn profiles(config: &LiveConfig, calibration: Option<&Calibration>) -> Result<Vec<StreamProfile>> {
     let mut all = Vec::new();
     let [color, depth, ir, _] = STREAMS.map(stream_name);
-    let (color, depth, ir) = (color?, depth?, ir?);
+    let color = color?;
+    let depth = depth?;
+    let ir = ir?;
     for resolution in ColorResolution::ALL {
         for (format, wire) in COLOR {
             let is_raw = matches!(wire, ColorFormat::Nv12 | ColorFormat::Yuy2);
             if is_raw && resolution != ColorResolution::P720 {
                 continue;
             }
+            let (width, height) = resolution.size();
             for (rate, _) in RATES.into_iter().filter(|(rate, _)| *rate <= resolution.max_rate_hz()) {
                 all.push(StreamProfile {
                     intrinsics: calibration
                         .map_or_else(Intrinsics::default, |c| c.color_intrinsics(resolution)),
                     pose_in_device: calibration.map_or(Pose::IDENTITY, Calibration::color_in_device),
-                    ..profile(color.clone(), format, resolution.size(), rate)
+                    ..profile(color.clone(), format, width, height, rate)
                 });
             }
         }
@@ -70,12 +73,13 @@ pub fn profiles(config: &LiveConfig, calibration: Option<&Calibration>) -> Resul
     let modes: Vec<_> = if passive { vec![DepthMode::PassiveIr] } else { modes.collect() };
     for (stream, format) in [(&depth, PixelFormat::Z16), (&ir, PixelFormat::Mono16)] {
         for mode in modes.iter().filter(|m| m.has_depth() || stream == &ir) {
+            let (width, height) = mode.size();
             for (rate, _) in RATES.into_iter().filter(|(rate, _)| *rate <= mode.max_rate_hz()) {
                 all.push(StreamProfile {
                     depth_unit_m: if format == PixelFormat::Z16 { 0.001 } else { 0.0 },
                     intrinsics: calibration.map_or_else(Intrinsics::default, |c| c.depth_intrinsics(*mode)),
                     pose_in_device: calibration.map_or(Pose::IDENTITY, Calibration::depth_in_device),
-                    ..profile(stream.clone(), format, mode.size(), rate)
+                    ..profile(stream.clone(), format, width, height, rate)
                 });
             }
         }
@@ -89,26 +93,25 @@ fn stream_name(name: &str) -> Result<StreamName> {
     Name::new(name).map_err(|e| Error::new(ErrorKind::BadInput, format!("stream {name}")).with_source(e))
 }
 
-fn profile(stream: StreamName, format: PixelFormat, size: (u32, u32), rate_hz: u32) -> StreamProfile {
+fn profile(stream: StreamName, format: PixelFormat, width: u32, height: u32, rate_hz: u32) -> StreamProfile {
     StreamProfile {
         stream,
         format,
-        width: size.0,
-        height: size.1,
+        width,
+        height,
         rate_hz: f64::from(rate_hz),
         depth_unit_m: 0.0,
         intrinsics: Intrinsics::default(),
         pose_in_device: Pose::IDENTITY,
         clock: DeviceClock::microseconds(64),
-        // Reckoned from the device's times: see `counter`.
+        // Derived from the device's times: see `counter`.
         sequence_bits: 64,
         metadata: MetadataLevel::Full,
     }
 }
 
-/// What is started for `requests`: all streams have one rate, depth and infrared one size; what a request leaves open it
-/// takes from the others. `name` is the camera's, for messages. Without a request depth, colour and the motion unit are
-/// started.
+/// Plans the streams for `requests`: all have one rate, depth and infrared one size; a request takes what it leaves
+/// open from the others. `name` is the camera's, for messages. Without a request depth, colour and the IMU are started.
 ///
 /// # Errors
 /// [`ErrorKind::Unsupported`] when there is no such mode, when streams do not go together, and when the part in a wired
@@ -127,12 +130,12 @@ pub fn plan(
     };
     let requests = if requests.is_empty() { default()? } else { requests.to_vec() };
     let order: Vec<_> = requests.iter().map(|r| r.stream.clone()).collect();
-    // The motion unit has a mode of its own.
+    // The IMU has a mode of its own.
     let (units, requests): (Vec<_>, Vec<_>) = requests.into_iter().partition(|r| r.stream.as_str() == IMU);
     let units = if units.is_empty() { Vec::new() } else { choose_profiles(name, available, &units)? };
     if requests.is_empty() {
         return Err(refuse(
-            "the motion unit runs only while a camera does: ask for color, depth or ir too".to_owned(),
+            "the IMU runs only while a camera does: ask for color, depth or ir too".to_owned(),
         ));
     }
     let is_color = |r: &StreamRequest| r.stream.as_str() == "color";
@@ -156,14 +159,16 @@ pub fn plan(
     let mut profiles = choose_profiles(name, available, &wishes)?;
     let Some(first) = profiles.first() else { return Err(refuse("no stream was asked for".to_owned())) };
     if let Some(other) = profiles.iter().find(|p| p.rate_hz != first.rate_hz) {
-        let (a, b) = (first.describe(), other.describe());
+        let a = first.describe();
+        let b = other.describe();
         return Err(refuse(format!("its cameras have one rate; asked for {a} and {b}")));
     }
     let find = |stream: &str| profiles.iter().find(|p| p.stream.as_str() == stream);
     if let (Some(depth), Some(ir)) = (find("depth"), find("ir"))
         && (depth.width, depth.height) != (ir.width, ir.height)
     {
-        let (a, b) = (depth.describe(), ir.describe());
+        let a = depth.describe();
+        let b = ir.describe();
         return Err(refuse(format!("depth and infrared come from one sensor; asked for {a} and {b}")));
     }
     let period_us = 1_000_000 / first.rate_hz as u32;
@@ -185,7 +190,7 @@ fn configuration(
         None => (ColorFormat::Mjpg.code(), 0),
         Some(p) => {
             let (_, wire) = COLOR.into_iter().find(|(format, _)| *format == p.format)?;
-            (wire.code(), ColorResolution::from_size((p.width, p.height))?.code())
+            (wire.code(), ColorResolution::from_size(p.width, p.height)?.code())
         }
     };
     let depth_mode = match depth {
@@ -199,7 +204,7 @@ fn configuration(
         color_resolution,
         depth_mode,
         camera_fps,
-        // Sets are put together by whoever wants them; a picture whose partner was lost is a picture.
+        // Sets are formed by their consumers; an image whose partner was lost is delivered.
         synchronized_images_only: false,
         depth_delay_off_color_usec: config.depth_delay_us,
         wired_sync_mode: config.sync.code(),
@@ -208,13 +213,14 @@ fn configuration(
     })
 }
 
-/// What libk4a would refuse without saying which key of the rig file it is (`k4a.c`, `validate_configuration`).
+/// Refuses what libk4a would refuse without naming the key of the rig file (`k4a.c`, `validate_configuration`).
 fn check_sync(
     config: &LiveConfig,
     started: &DeviceConfiguration,
     period_us: u32,
 ) -> core::result::Result<(), String> {
-    let (has_color, has_depth) = (started.color_resolution != 0, started.depth_mode != 0);
+    let has_color = started.color_resolution != 0;
+    let has_depth = started.depth_mode != 0;
     if config.sync == WiredSync::Master && !has_color {
         return Err("a master drives the others by its colour camera: add a color stream".to_owned());
     }
@@ -236,7 +242,7 @@ fn check_sync(
     Ok(())
 }
 
-/// What streams of a Kinect take of the USB together, bits a second: the depth camera sends raw phases, of which depth
+/// USB bandwidth of a Kinect's stream, bits a second: the depth camera sends raw phases, of which depth
 /// and infrared are made on the host, and colour that is delivered decoded comes as JPEG.
 pub fn wire_bits_per_s(profile: &StreamProfile, with_depth: bool) -> f64 {
     // Bytes of a raw frame: K4A `depth_mcu.h`, as listed for each sensor mode.

@@ -1,4 +1,4 @@
-//! A streaming Kinect: each picture of a capture through its stream's gate, written once, and the motion unit's samples in
+//! A streaming Kinect: each image of a capture through its stream's gate, written once, and the IMU's samples in
 //! batches.
 
 use super::counter::FrameCounter;
@@ -10,48 +10,49 @@ use crate::{Error, ErrorKind, FrameSink, Gate, Poll, RawFrame, Result, Stream, S
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime, PixelFormat};
 
-/// So many captures are handed on by one poll: what libk4a may have kept for a reader that was late.
+/// Limit of captures per poll: as many as libk4a may have kept for a late reader.
 const AT_ONCE: usize = 8;
-/// How long pictures are waited for before the motion unit is looked at again.
+/// How long images are waited for before the IMU is looked at again.
 const SLICE: Duration = Duration::from_millis(20);
-/// A stamp of the host that is older than this is none.
+/// A host timestamp older than this is invalid.
 const OLDEST: Duration = Duration::from_secs(5);
 
 /// A camera that streams.
 pub(super) struct LiveStream {
     name: String,
     profiles: Vec<StreamProfile>,
-    lanes: Vec<Lane>,
+    streams: Vec<StreamState>,
     camera: Handle,
     imu: Option<Imu>,
-    /// It sends nothing any more.
+    /// It no longer sends anything.
     is_gone: bool,
 }
 
-/// The motion unit, and room for what one look at it finds.
+/// The IMU, and room for what one look at it finds.
 struct Imu {
     unit: Unit,
     found: Vec<Measured>,
-    /// It says that nothing more will come, which the cameras may not know.
+    /// It reported its end, which the cameras may not have.
     is_over: bool,
 }
 
-/// Samples that one look takes at the most, more than libk4a keeps (half a second of them).
+/// Limit of samples per poll, more than libk4a keeps (half a second of them).
 const MOST_SAMPLES: usize = 1024;
 
 /// One stream.
-struct Lane {
+struct StreamState {
     kind: Kind,
     gate: Gate,
     counter: FrameCounter,
     unpack: Unpack,
-    size: (u32, u32),
+    width: u32,
+    height: u32,
     /// When its last frame arrived.
     last: HostTime,
     flags: FrameFlags,
 }
 
-/// Which picture of a capture.
+/// Which image of a capture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Color,
@@ -59,16 +60,16 @@ enum Kind {
     Ir,
 }
 
-/// How a picture gets into lent memory.
+/// How an image gets into lent memory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Unpack {
     /// Rows that may be padded, in this format of libk4a's.
     Rows { wire: u32, row: usize, rows: usize },
     /// Blue, green, red and an unused byte, of which three are delivered.
     WithoutAlpha { row: usize, rows: usize },
-    /// A JPEG picture as it came.
+    /// A JPEG image as it came.
     Keep,
-    /// A JPEG picture, decoded.
+    /// A JPEG image, decoded.
     Decode { whole: usize },
 }
 
@@ -79,16 +80,16 @@ impl LiveStream {
             let all = profiles.iter().enumerate();
             all.filter(move |(_, p)| p.format.is_motion() == motion)
         };
-        let lanes = of(false).map(|(i, p)| Lane::new(i, p, sync)).collect();
+        let streams = of(false).map(|(i, p)| StreamState::new(i, p, sync)).collect();
         let imu = of(true).next().map(|(i, p)| Imu {
             unit: Unit::new(i, p, 1.0),
             found: Vec::with_capacity(MOST_SAMPLES),
             is_over: false,
         });
-        Self { name, profiles, lanes, camera, imu, is_gone: false }
+        Self { name, profiles, streams, camera, imu, is_gone: false }
     }
 
-    /// Hands on the samples of motion that have come. Whether a batch went.
+    /// Hands on the IMU samples that have come. Whether a batch went.
     fn poll_imu(&mut self, sink: &mut dyn FrameSink) -> bool {
         let Some(imu) = &mut self.imu else { return false };
         imu.found.clear();
@@ -98,7 +99,7 @@ impl LiveStream {
                 Ok(None) => break,
                 Err(e) => {
                     imu.is_over = true;
-                    tracing::warn!(camera = %self.name, error = %e, "no more samples of motion; pictures go on");
+                    tracing::warn!(camera = %self.name, error = %e, "no more IMU samples; images go on");
                 }
             }
         }
@@ -115,7 +116,7 @@ impl Drop for LiveStream {
         if self.imu.is_some() {
             self.camera.stop_imu();
         }
-        // Every picture was given back, for which libk4a would wait. Closing comes after it, with the handle.
+        // Every image was given back, for which libk4a would wait. Closing comes after it, with the handle.
         self.camera.stop();
     }
 }
@@ -129,7 +130,7 @@ impl Stream for LiveStream {
         if self.is_gone {
             return Err(self.gone(&Error::new(ErrorKind::Disconnected, "it is gone")));
         }
-        // Samples that wait for a picture are mapped by the newest alone; they are read at least this often.
+        // Samples that wait for an image are mapped by the newest alone; they are read at least this often.
         let slice = if self.imu.is_some() { timeout.min(SLICE) } else { timeout };
         let deadline = HostTime::now().plus(timeout);
         loop {
@@ -145,22 +146,23 @@ impl Stream for LiveStream {
 }
 
 impl LiveStream {
-    /// Waits for a capture, and hands on what else has come. Whether there was a picture.
+    /// Waits for a capture, and hands on what else has come. Whether there was an image.
     fn poll_captures(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<bool> {
-        let (mut patience, mut any) = (timeout, false);
+        let mut timeout = timeout;
+        let mut any = false;
         for _ in 0..AT_ONCE {
-            match self.camera.capture(patience) {
+            match self.camera.capture(timeout) {
                 Ok(Some(capture)) => {
                     let temperature_c = capture.temperature_c();
-                    for lane in &mut self.lanes {
-                        let image = match lane.kind {
+                    for stream in &mut self.streams {
+                        let image = match stream.kind {
                             Kind::Color => capture.color(),
                             Kind::Depth => capture.depth(),
                             Kind::Ir => capture.ir(),
                         };
                         if let Some(image) = image {
                             any = true;
-                            lane.deliver(&image, temperature_c, sink);
+                            stream.deliver(&image, temperature_c, sink);
                         }
                     }
                 }
@@ -170,27 +172,28 @@ impl LiveStream {
                     return Err(self.gone(&e));
                 }
             }
-            patience = Duration::ZERO;
+            timeout = Duration::ZERO;
         }
         Ok(any)
     }
 }
 
-impl Lane {
+impl StreamState {
     fn new(index: usize, profile: &StreamProfile, sync: WiredSync) -> Self {
         let kind = match profile.stream.as_str() {
             "depth" => Kind::Depth,
             "ir" => Kind::Ir,
             _ => Kind::Color,
         };
-        // The master's pulse is what a subordinate takes its pictures by.
+        // The master's pulse is what a subordinate takes its images by.
         let is_triggered = sync == WiredSync::Subordinate;
         Self {
             kind,
             gate: Gate::new(index, profile),
             counter: FrameCounter::new(profile.period_ns() / 1000),
             unpack: Unpack::of(profile),
-            size: (profile.width, profile.height),
+            width: profile.width,
+            height: profile.height,
             last: HostTime::from_ns(i64::MIN),
             flags: if is_triggered { FrameFlags::HARDWARE_TRIGGERED } else { FrameFlags(0) },
         }
@@ -201,11 +204,11 @@ impl Lane {
         let bytes = image.bytes();
         let arrival = arrival(image.system_ns(), HostTime::now()).max(self.last);
         self.last = arrival;
-        let (picture, arrived) = if image.size() == self.size {
+        let (pixels, arrived) = if image.size() == (self.width, self.height) {
             self.unpack.measure(bytes.unwrap_or_default(), image.stride())
         } else {
-            // A picture of another mode.
-            (&[][..], self.unpack.whole(self.size) + 1)
+            // An image of another mode.
+            (&[][..], self.unpack.frame_bytes(self.width, self.height) + 1)
         };
         let number = self.counter.number_exposed(device_us, image.exposure_us());
         let mut raw = RawFrame::new(number, device_us, arrival, arrived);
@@ -213,12 +216,15 @@ impl Lane {
         raw.exposure_ns = image.exposure_us().saturating_mul(1000);
         raw.temperature_c = temperature_c;
         raw.flags = self.flags;
-        let (unpack, stride, size) = (self.unpack, image.stride(), self.size);
-        self.gate.deliver(&raw, sink, |to| unpack.fill(picture, stride, size, to));
+        let unpack = self.unpack;
+        let stride = image.stride();
+        let width = self.width;
+        let height = self.height;
+        self.gate.deliver(&raw, sink, |to| unpack.fill(pixels, stride, width, height, to));
     }
 }
 
-/// When a picture had arrived: as libk4a stamped it (`CLOCK_MONOTONIC`, before the depth engine works on it), else now.
+/// When an image had arrived: as libk4a stamped it (`CLOCK_MONOTONIC`, before the depth engine works on it), else now.
 fn arrival(system_ns: u64, now: HostTime) -> HostTime {
     let stamp = HostTime::from_ns(i64::try_from(system_ns).unwrap_or(0));
     let age_ns = now.since_ns(stamp);
@@ -228,7 +234,8 @@ fn arrival(system_ns: u64, now: HostTime) -> HostTime {
 
 impl Unpack {
     fn of(profile: &StreamProfile) -> Self {
-        let (row, rows) = (profile.format.row_bytes(profile.width) as usize, profile.height as usize);
+        let row = profile.format.row_bytes(profile.width) as usize;
+        let rows = profile.height as usize;
         match profile.format {
             PixelFormat::Mjpeg => Self::Keep,
             PixelFormat::Rgb8 => Self::Decode { whole: profile.frame_bytes() },
@@ -241,7 +248,7 @@ impl Unpack {
         }
     }
 
-    /// The format that libk4a must say the picture has.
+    /// The format that libk4a must say the image has.
     const fn wire(self) -> u32 {
         match self {
             Self::Rows { wire, .. } => wire,
@@ -250,16 +257,16 @@ impl Unpack {
         }
     }
 
-    /// Bytes of a whole frame as it is delivered; of kept JPEG the most there is room for.
-    const fn whole(self, size: (u32, u32)) -> usize {
+    /// Bytes of a complete frame as it is delivered; of kept JPEG the most that fits.
+    const fn frame_bytes(self, width: u32, height: u32) -> usize {
         match self {
             Self::Rows { row, rows, .. } | Self::WithoutAlpha { row, rows } => row * rows,
-            Self::Keep => PixelFormat::Mjpeg.frame_bytes(size.0, size.1),
+            Self::Keep => PixelFormat::Mjpeg.frame_bytes(width, height),
             Self::Decode { whole } => whole,
         }
     }
 
-    /// What of the bytes is the picture, and how many bytes of a delivered frame that stands for: less than a frame
+    /// The bytes that are the image, and how many bytes of a delivered frame they stand for: less than a frame
     /// has when some are missing, more when there are too many.
     fn measure(self, bytes: &[u8], stride: usize) -> (&[u8], usize) {
         match self {
@@ -269,29 +276,34 @@ impl Unpack {
                 (bytes, scaled(bytes.len(), stride.max(wire_row), wire_row, rows, row))
             }
             Self::Keep | Self::Decode { .. } => match (unpack::jpeg_span(bytes), self) {
-                (Ok(picture), Self::Decode { whole }) => (picture, whole),
-                (Ok(picture), _) => (picture, picture.len()),
+                (Ok(image), Self::Decode { whole }) => (image, whole),
+                (Ok(image), _) => (image, image.len()),
                 (Err(DropReason::Incomplete), _) => (&[], 0),
-                // It is no JPEG at all.
+                // Not a JPEG at all.
                 (Err(_), _) => (&[], usize::MAX),
             },
         }
     }
 
-    fn fill(self, picture: &[u8], stride: usize, size: (u32, u32), to: &mut [u8]) -> Result<(), DropReason> {
+    fn fill(
+        self,
+        image: &[u8],
+        stride: usize,
+        width: u32,
+        height: u32,
+        to: &mut [u8],
+    ) -> Result<(), DropReason> {
         match self {
-            Self::Rows { row, .. } => unpack::copy_rows(picture, stride.max(row), row, to),
-            Self::WithoutAlpha { row, .. } => {
-                unpack::drop_alpha(picture, stride.max(row / 3 * 4), row / 3, to)
-            }
-            Self::Keep => unpack::keep_jpeg(picture, to),
-            Self::Decode { .. } => unpack::decode_jpeg(picture, size.0, size.1, to),
+            Self::Rows { row, .. } => unpack::copy_rows(image, stride.max(row), row, to),
+            Self::WithoutAlpha { row, .. } => unpack::drop_alpha(image, stride.max(row / 3 * 4), row / 3, to),
+            Self::Keep => unpack::keep_jpeg(image, to),
+            Self::Decode { .. } => unpack::decode_jpeg(image, width, height, to),
         }
     }
 }
 
-/// The bytes of a delivered frame of `rows` rows of `row` bytes that `came` bytes stand for, when rows of `wire_row` bytes
-/// begin every `stride`. The last row may lack its padding.
+/// The bytes of a delivered frame of `rows` rows of `row` bytes that `came` bytes stand for, when rows of `wire_row`
+/// bytes begin every `stride`. The last row may lack its padding.
 const fn scaled(came: usize, stride: usize, wire_row: usize, rows: usize, row: usize) -> usize {
     let whole = row * rows;
     let needed = stride * rows.saturating_sub(1) + wire_row;
@@ -302,7 +314,7 @@ const fn scaled(came: usize, stride: usize, wire_row: usize, rows: usize, row: u
     } else if came == 0 {
         0
     } else {
-        // Never as many as a whole frame has, nor none.
+        // Never as many as a complete frame has, and at least one.
         let part = (came as u64 * whole as u64 / needed as u64) as usize;
         if part == 0 {
             1

@@ -29,8 +29,8 @@ fn out(sink: &MemorySink) -> Vec<MotionSample> {
     sink.frames.iter().flat_map(|f| MotionSample::all_in(&f.2)).collect()
 }
 
-/// Bunches of samples, each of which is read some time after its newest one was measured: a device whose clock runs 30 ppm
-/// slow and whose fastest delivery takes 1 ms.
+/// Bunches of samples, each of which is read some time after its newest one was measured: a device whose clock runs 30
+/// ppm slow and whose fastest delivery takes 1 ms.
 #[test]
 fn times_are_right_within_what_they_claim() {
     let (mut u, p) = unit(1.0);
@@ -38,7 +38,8 @@ fn times_are_right_within_what_they_claim() {
     let mut sink = MemorySink::default();
     let t0 = HostTime::from_ns(7_000_000_000);
     let truth = |n: u64| t0.plus_ns((n as f64 * 625_000.0 * 1.000_03).round() as i64);
-    let (mut n, mut state) = (0, 1u64);
+    let mut n = 0;
+    let mut state = 1u64;
     while n < 48_000 {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
         let bunch = 1 + (state >> 59);
@@ -57,7 +58,7 @@ fn times_are_right_within_what_they_claim() {
         assert_eq!((s.sequence, s.device_time), (i, m.gyroscope_ns / 1000));
         assert_eq!((s.gyro_rad_s, s.accel_m_s2, s.accel_offset_ns), (m.rotation, m.acceleration, 12_000));
         assert_eq!(s.temperature_c, 30.0);
-        // What the map cannot know is the least latency.
+        // The map cannot know the least latency.
         let off = s.time().since_ns(truth(i)) - 1_000_000;
         within += u64::from(off.unsigned_abs() <= u64::from(s.uncertainty_ns));
         if i > 16_000 {
@@ -99,7 +100,8 @@ fn a_clock_that_is_set_back_ends_nothing() {
     assert_eq!(all.len(), 40 * 32);
     assert!(all.is_sorted_by(|a, b| a.sequence < b.sequence));
     for pair in sink.frames.windows(2) {
-        let (a, b) = (&pair[0].1, &pair[1].1);
+        let a = &pair[0].1;
+        let b = &pair[1].1;
         assert!(a.clock_epoch < b.clock_epoch || a.capture_time <= b.capture_time);
         assert!(b.capture_time <= b.arrival);
     }
@@ -110,7 +112,8 @@ fn a_clock_that_is_set_back_ends_nothing() {
 fn the_frame_is_the_accelerometers_and_the_rotation_of_the_gyroscope_is_stated() {
     use depthrig_calib::PoseExt as _;
     let mut c = calibration();
-    let (a, g) = (c.accelerometer.unwrap(), c.gyroscope.unwrap());
+    let a = c.accelerometer.unwrap();
+    let g = c.gyroscope.unwrap();
     // A point of the device that the accelerometer sees at its own place.
     let at = pose(Some(&c)).transform_point(DVec3::ZERO);
     assert!(a.sensor_from_device.transform_point(at).length() < 1e-12 && at.length() > 0.01);
@@ -124,7 +127,7 @@ fn the_frame_is_the_accelerometers_and_the_rotation_of_the_gyroscope_is_stated()
     c.gyroscope = Some(MotionCalibration { sensor_from_device: quarter.compose(&g.sensor_from_device) });
     let stated_rotation = gyroscope_in_unit(Some(&c)).unwrap();
     let found = DQuat::from_array(stated_rotation.xyzw) * DVec3::new(3.0, 0.5, -0.25);
-    // What the accelerometer's axes see of a rotation about the gyroscope's: back by the quarter turn.
+    // A rotation about the gyroscope's axes, in those of the accelerometer: back by the quarter turn.
     let within = DQuat::from_array(a.sensor_from_device.rotation_xyzw)
         * DQuat::from_array(g.sensor_from_device.rotation_xyzw).inverse();
     assert!((found - within * DVec3::new(0.5, -3.0, -0.25)).length() < 1e-6, "{found:?}");

@@ -1,6 +1,6 @@
-//! JPEG pictures of a recording, decoded by threads that are a few pictures ahead of the playing.
+//! JPEG images of a recording, decoded by threads that are a few images ahead of the playing.
 //!
-//! Threads take turns, so pictures come back in their order. There are two pictures more than threads: while the oldest is
+//! Threads take turns, so images come back in their order. There are two images more than threads: while the oldest is
 //! given out, its thread has its next one already. Nothing is allocated once each had the largest.
 
 use super::cursor::Cursor;
@@ -14,10 +14,11 @@ use std::thread::JoinHandle;
 /// Threads at the most: four decode 4K at 30 Hz.
 const MOST: usize = 4;
 
-/// Pictures beyond one for each thread. With one the threads of two cores wait a tenth of their time, with two a twentieth.
+/// Images beyond one for each thread. With one the threads of two cores wait a tenth of their time, with two a
+/// twentieth.
 const WAITING: usize = 2;
 
-/// A picture on its way through a thread.
+/// An image on its way through a thread.
 pub(super) struct Job {
     /// Bytes of it in the recording.
     jpeg: Vec<u8>,
@@ -36,21 +37,27 @@ pub(super) struct Ahead {
     cursor: Cursor,
     track: usize,
     workers: Vec<Worker>,
-    /// Who gets the next picture, and who has the oldest.
+    /// Who gets the next image, and who has the oldest.
     give: usize,
     head: usize,
-    /// The times of the pictures in hand, the oldest first.
+    /// The times of the images in hand, the oldest first.
     at_us: VecDeque<u64>,
     spare: Vec<Job>,
     ended: bool,
 }
 
 impl Ahead {
-    /// Decodes the pictures of `track`, of this size, out of `recording`.
+    /// Decodes the images of `track`, of this size, out of `recording`.
     ///
     /// # Errors
     /// [`ErrorKind::Io`] when the system refuses a thread.
-    pub(super) fn new(recording: Recording, looped: bool, track: usize, size: (u32, u32)) -> Result<Self> {
+    pub(super) fn new(
+        recording: Recording,
+        looped: bool,
+        track: usize,
+        width: u32,
+        height: u32,
+    ) -> Result<Self> {
         let count = std::thread::available_parallelism().map_or(2, core::num::NonZero::get).clamp(1, MOST);
         let mut workers = Vec::new();
         for i in 0..count {
@@ -60,7 +67,7 @@ impl Ahead {
                 while let Ok(mut job) = jobs.recv() {
                     let span = unpack::jpeg_span(&job.jpeg);
                     job.outcome =
-                        span.and_then(|jpeg| unpack::decode_jpeg(jpeg, size.0, size.1, &mut job.pixels));
+                        span.and_then(|jpeg| unpack::decode_jpeg(jpeg, width, height, &mut job.pixels));
                     if results.send(job).is_err() {
                         return;
                     }
@@ -75,7 +82,7 @@ impl Ahead {
         let in_hand = count + WAITING;
         let job = || Job {
             jpeg: Vec::new(),
-            pixels: vec![0; size.0 as usize * size.1 as usize * 3],
+            pixels: vec![0; width as usize * height as usize * 3],
             outcome: Ok(()),
         };
         Ok(Self {
@@ -90,7 +97,7 @@ impl Ahead {
         })
     }
 
-    /// The time of the next picture, after every thread was given what it can have in hand; `None` at the end.
+    /// The time of the next image, after every thread was given what it can have in hand; `None` at the end.
     ///
     /// # Errors
     /// Those of reading the file.
@@ -113,7 +120,7 @@ impl Ahead {
         Ok(self.at_us.front().copied())
     }
 
-    /// Hands the next picture to `take`, waiting for it.
+    /// Hands the next image to `take`, waiting for it.
     ///
     /// # Errors
     /// [`ErrorKind::Protocol`] when a thread died.
@@ -130,7 +137,7 @@ impl Ahead {
 }
 
 fn died() -> Error {
-    Error::new(ErrorKind::Protocol, "a thread that decodes the recording's pictures died")
+    Error::new(ErrorKind::Protocol, "a thread that decodes the recording's images died")
 }
 
 impl Drop for Ahead {
@@ -139,7 +146,7 @@ impl Drop for Ahead {
             let Worker { to, from, thread, .. } = worker;
             drop((to, from));
             if let Some(thread) = thread {
-                // It ends with its picture.
+                // It ends with its image.
                 let _ = thread.join();
             }
         }

@@ -1,4 +1,4 @@
-//! Where the playing of a recording stands, round after round.
+//! Position in a recording that is played, round after round.
 
 use crate::Result;
 use crate::kinect::recording::{Pending, Recording, TrackKind};
@@ -9,11 +9,11 @@ pub(super) struct Cursor {
     looped: bool,
     /// Time from frame to frame, microseconds.
     period_us: u64,
-    /// Time of the first picture of the file.
+    /// Time of the first image of the file.
     first_us: Option<u64>,
     /// Time of its last one so far.
     last_us: u64,
-    /// What this round is later than the first.
+    /// Shift of this round against the first.
     shift_us: u64,
     /// Whether this round had anything that was wanted.
     is_fruitful: bool,
@@ -30,8 +30,8 @@ pub(super) struct Next {
 
 impl Cursor {
     pub(super) fn new(recording: Recording, looped: bool) -> Self {
-        let of_pictures = |k| matches!(k, TrackKind::Color | TrackKind::Depth | TrackKind::Infrared);
-        let periods = recording.tracks().iter().filter(|t| of_pictures(t.kind)).filter_map(|t| t.period_ns);
+        let of_images = |k| matches!(k, TrackKind::Color | TrackKind::Depth | TrackKind::Infrared);
+        let periods = recording.tracks().iter().filter(|t| of_images(t.kind)).filter_map(|t| t.period_ns);
         let period_us = periods.max().unwrap_or(super::PERIOD_NS) / 1000;
         Self {
             recording,
@@ -53,7 +53,7 @@ impl Cursor {
         while !self.ended {
             let Some(block) = self.recording.advance()? else {
                 self.ended = !self.looped || !self.is_fruitful;
-                // What another reader of the same file does not want counts too, so that both agree on the length.
+                // Blocks that only another reader of the file wants count too, so that both agree on the length.
                 let length_us = self.last_us.saturating_sub(self.first_us.unwrap_or(0)) + self.period_us;
                 self.shift_us = self.shift_us.saturating_add(length_us);
                 self.recording.seek(0)?;
@@ -62,7 +62,7 @@ impl Cursor {
             };
             let at_us = block.device_us.saturating_add(self.shift_us);
             if self.recording.tracks().get(block.track).is_none_or(|t| t.pixels.is_none()) {
-                // Samples of motion, if they are wanted; how long a round is follows from pictures alone.
+                // IMU samples, if they are wanted; how long a round is follows from images alone.
                 if wanted(block.track) {
                     self.is_fruitful = true;
                     return Ok(Some(Next { block, at_us }));

@@ -1,4 +1,4 @@
-//! Playing a recording: each picture when it is due, written once into the receiver's memory.
+//! Playing a recording: each image when it is due, written once into the receiver's memory.
 
 use super::PlaybackConfig;
 use super::ahead::Ahead;
@@ -6,7 +6,7 @@ use super::cursor::{Cursor, Next};
 use crate::kinect::live::counter::FrameCounter;
 use crate::kinect::motion::{self, Measured, Unit, is_plausible};
 use crate::kinect::recording::{Pixels, Recording, motion_samples};
-use crate::pace::Attendance;
+use crate::playback_clock::Attendance;
 use crate::{FrameSink, Gate, Poll, RawFrame, Result, Stream, StreamProfile, unpack};
 use core::time::Duration;
 use depthrig_bus::{DropReason, FrameFlags, HostTime, PixelFormat};
@@ -14,18 +14,18 @@ use depthrig_bus::{DropReason, FrameFlags, HostTime, PixelFormat};
 /// A recording that plays.
 pub(super) struct Player {
     profiles: Vec<StreamProfile>,
-    lanes: Vec<Lane>,
+    streams: Vec<StreamState>,
     cursor: Cursor,
-    /// The next block of the lanes that `ahead` does not serve.
+    /// The next block of the streams that `ahead` does not serve.
     next: Option<Next>,
-    /// Decoded colour and its lane.
+    /// Decoded colour and its stream.
     ahead: Option<(usize, Ahead)>,
-    /// The motion unit and what of it was read and is not due.
+    /// The IMU, with samples that were read and are not due.
     motion: Option<Motion>,
-    pace: Pace,
+    clock: RecordingClock,
 }
 
-/// The motion unit of a recording.
+/// The IMU of a recording.
 struct Motion {
     track: usize,
     unit: Unit,
@@ -35,22 +35,22 @@ struct Motion {
     newest_ns: u64,
 }
 
-/// What is played next.
+/// The next event of the playback.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Event {
-    /// The picture that was read.
-    Picture,
-    /// The picture that was decoded.
+    /// The image that was read.
+    Image,
+    /// The image that was decoded.
     Decoded,
-    /// So many samples of motion.
+    /// This many IMU samples.
     Motion(usize),
 }
 
-/// Samples that are read ahead at the most while no picture comes.
+/// Limit of samples that are read ahead while no image comes.
 const MOST_WAITING: usize = 8 * motion::BATCH as usize;
 
 /// One stream.
-struct Lane {
+struct StreamState {
     track: usize,
     gate: Gate,
     counter: FrameCounter,
@@ -58,7 +58,7 @@ struct Lane {
     flags: FrameFlags,
 }
 
-/// How a picture gets into lent memory.
+/// How an image gets into lent memory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum How {
     Copy,
@@ -81,8 +81,9 @@ impl Player {
         config: &PlaybackConfig,
     ) -> Result<Self> {
         let flags = if is_triggered { FrameFlags::HARDWARE_TRIGGERED } else { FrameFlags(0) };
-        let mut lanes = Vec::new();
-        let (mut ahead, mut motion) = (None, None);
+        let mut streams = Vec::new();
+        let mut ahead = None;
+        let mut motion = None;
         for (i, (profile, track)) in profiles.iter().zip(tracks).enumerate() {
             if profile.format.is_motion() {
                 let speed = if config.rate.is_finite() { config.rate } else { 1.0 };
@@ -96,31 +97,32 @@ impl Player {
             if how == How::Decode {
                 let again = Recording::open(&config.recording)?;
                 ahead = Some((
-                    lanes.len(),
-                    Ahead::new(again, config.looped, *track, (profile.width, profile.height))?,
+                    streams.len(),
+                    Ahead::new(again, config.looped, *track, profile.width, profile.height)?,
                 ));
             }
             let period_us =
                 recording.tracks().get(*track).and_then(|t| t.period_ns).unwrap_or(super::PERIOD_NS) / 1000;
-            let (gate, counter) = (Gate::new(i, profile), FrameCounter::new(period_us));
-            lanes.push(Lane { track: *track, gate, counter, how, flags });
+            let gate = Gate::new(i, profile);
+            let counter = FrameCounter::new(period_us);
+            streams.push(StreamState { track: *track, gate, counter, how, flags });
         }
-        let pace = Pace::new(name, config.rate, &profiles);
+        let clock = RecordingClock::new(name, config.rate, &profiles);
         let cursor = Cursor::new(recording, config.looped);
-        Ok(Self { profiles, lanes, cursor, next: None, ahead, motion, pace })
+        Ok(Self { profiles, streams, cursor, next: None, ahead, motion, clock })
     }
 
-    /// Reads on until the next picture is known, keeping samples of motion that come before it.
+    /// Reads on until the next image is known, keeping IMU samples that come before it.
     fn read(&mut self) -> Result<()> {
-        if self.motion.is_none() && self.lanes.iter().all(|l| l.how == How::Decode) {
+        if self.motion.is_none() && self.streams.iter().all(|s| s.how == How::Decode) {
             // Nothing is wanted of this pass over the file, which would go on to the end.
             return Ok(());
         }
         while self.next.is_none() && self.motion.as_ref().is_none_or(|m| m.waiting.len() < MOST_WAITING) {
-            let (lanes, motion_track) = (&self.lanes, self.motion.as_ref().map(|m| m.track));
-            let is_picture = |track| lanes.iter().any(|l| l.track == track && l.how != How::Decode);
-            let Some(next) = self.cursor.next(|track| Some(track) == motion_track || is_picture(track))?
-            else {
+            let streams = &self.streams;
+            let motion_track = self.motion.as_ref().map(|m| m.track);
+            let is_image = |track| streams.iter().any(|s| s.track == track && s.how != How::Decode);
+            let Some(next) = self.cursor.next(|track| Some(track) == motion_track || is_image(track))? else {
                 break;
             };
             match &mut self.motion {
@@ -140,33 +142,33 @@ impl Player {
             Some((_, ahead)) => ahead.peek()?,
             None => None,
         };
-        let picture = match (self.next.map(|n| n.at_us), ahead) {
-            (Some(a), Some(b)) if b > a => Some((a, Event::Picture)),
+        let image = match (self.next.map(|n| n.at_us), ahead) {
+            (Some(a), Some(b)) if b > a => Some((a, Event::Image)),
             (_, Some(b)) => Some((b, Event::Decoded)),
-            (a, None) => a.map(|a| (a, Event::Picture)),
+            (a, None) => a.map(|a| (a, Event::Image)),
         };
-        // Samples go with the picture after them, or as a batch that is full when that comes sooner.
-        let full = self.motion.as_ref().and_then(|m| m.full(picture.is_none()));
-        Ok(match (picture, full) {
+        // Samples go with the image after them, or as a batch that is full when that comes sooner.
+        let full = self.motion.as_ref().and_then(|m| m.full(image.is_none()));
+        Ok(match (image, full) {
             (Some((at, _)), Some((full, n))) if full < at => Some((full, Event::Motion(n))),
             (None, Some((full, n))) => Some((full, Event::Motion(n))),
-            (picture, _) => picture,
+            (image, _) => image,
         })
     }
 
     /// Hands on the samples that were measured until `at_us`, or the first `n`. Whether a batch went.
     fn play_motion(&mut self, at_us: u64, n: Option<usize>, now: HostTime, sink: &mut dyn FrameSink) -> bool {
-        let (Some(motion), pace) = (&mut self.motion, &self.pace) else { return false };
+        let (Some(motion), clock) = (&mut self.motion, &self.clock) else { return false };
         let due = motion.waiting.iter().take_while(|m| m.gyroscope_ns / 1000 <= at_us).count();
         let n = n.unwrap_or(due).min(motion.waiting.len());
         for m in &mut motion.waiting[..n] {
-            m.gyroscope_ns = m.gyroscope_ns.saturating_add(pace.stopped_us * 1000);
-            m.accelerometer_ns = m.accelerometer_ns.saturating_add(pace.stopped_us * 1000);
+            m.gyroscope_ns = m.gyroscope_ns.saturating_add(clock.stopped_us * 1000);
+            m.accelerometer_ns = m.accelerometer_ns.saturating_add(clock.stopped_us * 1000);
         }
         let went = motion.unit.take(
             motion.waiting.get(..n).unwrap_or_default(),
             now,
-            |us| pace.ticks(us, now),
+            |us| clock.ticks(us, now),
             sink,
         );
         motion.waiting.drain(..n);
@@ -185,7 +187,7 @@ impl Motion {
             let mut m = Measured::from(s);
             m.gyroscope_ns = m.gyroscope_ns.saturating_add(shift_ns);
             m.accelerometer_ns = m.accelerometer_ns.saturating_add(shift_ns);
-            // A round is as long as its pictures; samples beyond that give way to those of the next.
+            // A round is as long as its images; samples beyond that give way to those of the next.
             if shift_ns > 0 && m.gyroscope_ns <= self.newest_ns {
                 continue;
             }
@@ -208,9 +210,9 @@ impl Stream for Player {
     }
 
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
-        self.pace.attendance.enter(HostTime::now());
+        self.clock.attendance.enter(HostTime::now());
         let polled = self.play(timeout, sink);
-        self.pace.attendance.leave(HostTime::now());
+        self.clock.attendance.leave(HostTime::now());
         polled
     }
 }
@@ -223,7 +225,7 @@ impl Player {
             return Ok(if went { Poll::Frame } else { Poll::End });
         };
         let now = HostTime::now();
-        let due = self.pace.due(at_us, now);
+        let due = self.clock.due(at_us, now);
         if due > now {
             std::thread::sleep(due.min(deadline).from_now());
             if due > deadline.max(now) {
@@ -231,20 +233,20 @@ impl Player {
             }
         }
         let now = HostTime::now();
-        self.pace.attendance.delivered();
+        self.clock.attendance.delivered();
         if let Event::Motion(n) = event {
             self.play_motion(at_us, Some(n), now, sink);
             return Ok(Poll::Frame);
         }
         self.play_motion(at_us, None, now, sink);
-        let device_us = self.pace.device_us(at_us);
-        let ticks = self.pace.ticks(device_us, now);
+        let device_us = self.clock.device_us(at_us);
+        let ticks = self.clock.ticks(device_us, now);
         if event == Event::Decoded {
             let Some((i, ahead)) = &mut self.ahead else { return Ok(Poll::End) };
-            let lane = self.lanes.get_mut(*i);
+            let stream = self.streams.get_mut(*i);
             ahead.take(|job| {
-                let Some(lane) = lane else { return };
-                lane.deliver(device_us, ticks, now, job.pixels.len(), sink, |to| {
+                let Some(stream) = stream else { return };
+                stream.deliver(device_us, ticks, now, job.pixels.len(), sink, |to| {
                     job.outcome?;
                     unpack::copy_rows(&job.pixels, to.len(), to.len(), to)
                 });
@@ -253,17 +255,17 @@ impl Player {
         }
         let Some(next) = self.next.take() else { return Ok(Poll::End) };
         for data in self.cursor.recording.frames(&next.block) {
-            for lane in self.lanes.iter_mut().filter(|l| l.track == next.block.track) {
-                let how = lane.how;
+            for stream in self.streams.iter_mut().filter(|s| s.track == next.block.track) {
+                let how = stream.how;
                 let (data, bytes) = how.measure(data);
-                lane.deliver(device_us, ticks, now, bytes, sink, |to| how.fill(data, to));
+                stream.deliver(device_us, ticks, now, bytes, sink, |to| how.fill(data, to));
             }
         }
         Ok(Poll::Frame)
     }
 }
 
-impl Lane {
+impl StreamState {
     fn deliver(
         &mut self,
         device_us: u64,
@@ -290,15 +292,15 @@ impl How {
         }
     }
 
-    /// What of the bytes is the picture, and how many bytes of a delivered frame that stands for.
+    /// The bytes that are the image, and how many bytes of a delivered frame they stand for.
     fn measure(self, data: &[u8]) -> (&[u8], usize) {
         match self {
             Self::Copy | Self::Swap | Self::Decode => (data, data.len()),
             Self::WithoutAlpha { .. } => (data, data.len() / 4 * 3 + data.len() % 4),
             Self::Keep => match unpack::jpeg_span(data) {
-                Ok(picture) => (picture, picture.len()),
+                Ok(image) => (image, image.len()),
                 Err(DropReason::Incomplete) => (&[], 0),
-                // It is no JPEG at all.
+                // Not a JPEG at all.
                 Err(_) => (&[], usize::MAX),
             },
         }
@@ -314,8 +316,8 @@ impl How {
     }
 }
 
-/// When each frame is due.
-struct Pace {
+/// Schedule of the frames.
+struct RecordingClock {
     name: String,
     rate: f64,
     /// The longest period, nanoseconds: how late the host may be before the times of all that follows move.
@@ -330,7 +332,7 @@ struct Pace {
     stopped_us: u64,
 }
 
-impl Pace {
+impl RecordingClock {
     fn new(name: String, rate: f64, profiles: &[StreamProfile]) -> Self {
         let period_ns =
             profiles.iter().map(StreamProfile::period_ns).max().unwrap_or(super::PERIOD_NS) as i64;
@@ -389,8 +391,8 @@ impl Pace {
         at_us.saturating_add(self.stopped_us)
     }
 
-    /// The device's clock at `at_us` of the device's time: stretched when it plays at another rate; that of the host when it
-    /// plays as fast as it can.
+    /// The device's clock at `at_us` of the device's time: stretched when it plays at another rate; that of the host
+    /// when it plays as fast as it can.
     fn ticks(&self, at_us: u64, now: HostTime) -> u64 {
         if !self.rate.is_finite() {
             return u64::try_from(now.ns()).unwrap_or(0);
@@ -410,13 +412,13 @@ mod tests {
 
     const T0: HostTime = HostTime::from_ns(1_000_000_000);
 
-    fn pace(rate: f64) -> Pace {
-        Pace { period_ns: 33_333_333, ..Pace::new(String::new(), rate, &[]) }
+    fn clock(rate: f64) -> RecordingClock {
+        RecordingClock { period_ns: 33_333_333, ..RecordingClock::new(String::new(), rate, &[]) }
     }
 
     #[test]
     fn frames_are_due_by_the_recordings_clock() {
-        let mut p = pace(1.0);
+        let mut p = clock(1.0);
         assert_eq!(p.due(800_000, T0), T0);
         assert_eq!(p.due(833_340, T0), T0.plus_ns(33_340_000));
         assert_eq!(p.due(799_840, T0), T0.plus_ns(-160_000), "depth before colour");
@@ -426,17 +428,17 @@ mod tests {
 
     #[test]
     fn another_rate_stretches_the_clock() {
-        let mut p = pace(2.0);
+        let mut p = clock(2.0);
         assert_eq!(p.due(800_000, T0), T0);
         assert_eq!(p.due(900_000, T0), T0.plus_ns(50_000_000));
         assert_eq!((p.ticks(800_000, T0), p.ticks(900_000, T0)), (800_000, 850_000));
-        let mut p = pace(f64::INFINITY);
+        let mut p = clock(f64::INFINITY);
         assert_eq!((p.due(800_000, T0), p.ticks(800_000, T0)), (T0, 1_000_000_000));
     }
 
     #[test]
     fn a_late_host_moves_what_follows() {
-        let mut p = pace(1.0);
+        let mut p = clock(1.0);
         p.due(0, T0);
         let late = T0.plus_ns(500_000_000);
         assert_eq!(p.due(33_333, late), late);
@@ -444,12 +446,12 @@ mod tests {
         assert_eq!((p.moved, p.stopped_us), (1, 0));
     }
 
-    /// The device's clock goes on while the process is stopped, at every rate, so that frames are numbered and timed as those of
-    /// an attached camera.
+    /// The device's clock goes on while the process is stopped, at every rate, so that frames are numbered and timed as
+    /// those of an attached camera.
     #[test]
     fn a_stopped_process_is_a_gap_in_the_devices_time() {
         for rate in [1.0, 2.0, 0.5] {
-            let mut p = pace(rate);
+            let mut p = clock(rate);
             let mut counter = FrameCounter::new(33_333);
             p.due(0, T0);
             assert_eq!(counter.number(p.device_us(0)), 0);

@@ -1,4 +1,4 @@
-//! The clusters of a recording, one in memory at a time: found, proven, and passed over when they are damaged.
+//! The clusters of a recording, one in memory at a time: found, checked, and skipped if they are damaged.
 
 use super::head::{Parts, head_at};
 use super::source::ReadAt;
@@ -11,11 +11,11 @@ use crate::{Error, ErrorKind, Result};
 pub const MAX_CLUSTER: u64 = 128 << 20;
 /// The most that an index may have: 18 days at one entry a second.
 const MAX_CUES: u64 = 32 << 20;
-/// Places that look like a cluster and are none, after which the rest of a file is given up.
+/// Limit of false cluster starts, after which the rest of a file is given up.
 const MAX_FALSE_STARTS: u32 = 1000;
 /// Bytes that are searched at a time.
 const SEARCH: usize = 1 << 20;
-/// Bytes of a cluster that tell its time.
+/// Bytes at the start of a cluster that hold its time.
 const PEEK: usize = 60;
 
 /// Elements that may stand between clusters.
@@ -173,7 +173,7 @@ impl Clusters {
         if head.size.is_some() {
             return Ok(end_of(at, head).filter(|next| *next <= self.end));
         }
-        // Of unknown size: it ends before the first element that is none of its own.
+        // Of unknown size: it ends before the first element that does not belong to it.
         let mut next = at + head.len as u64;
         while next < self.end && next - at <= MAX_CLUSTER {
             let Some(child) = self.head(next)? else { return Ok(None) };
@@ -191,7 +191,7 @@ impl Clusters {
     /// Notes that what is at `at` is damaged, and goes to the next thing that looks like a cluster.
     fn pass_over(&mut self, at: u64, head: Option<Head>) -> Result<()> {
         let claimed = head.filter(|h| h.id == id::CLUSTER).and_then(|h| end_of(at, h));
-        // What is damaged inside only says truly where it ends.
+        // The end of a cluster that is damaged only inside can be trusted.
         let follows = match claimed {
             Some(next) if next < self.end => {
                 self.head(next)?.is_some_and(|h| h.id == id::CLUSTER || BETWEEN.contains(&h.id))
@@ -206,7 +206,8 @@ impl Clusters {
         self.losses.places += 1;
         self.losses.bytes += self.at - at;
         if self.losses.places.is_power_of_two() {
-            let (name, bytes) = (&self.name, self.at - at);
+            let name = &self.name;
+            let bytes = self.at - at;
             if self.at >= self.end {
                 tracing::warn!(
                     "{name}: the last {bytes} bytes, from byte {at} on, are cut off or damaged and left out"
@@ -246,7 +247,7 @@ impl Clusters {
         Ok(self.end)
     }
 
-    /// The time of the cluster at `at`, and where it ends if it says so; `None` when there is none.
+    /// The time of the cluster at `at`, and where it ends if it says so; `None` without a cluster there.
     fn peek(&self, at: u64) -> Result<Option<(u64, Option<u64>)>> {
         let mut bytes = [0; PEEK];
         let there = self.end.saturating_sub(at).min(PEEK as u64) as usize;
@@ -320,7 +321,7 @@ fn unreadable(name: &str, e: std::io::Error) -> Error {
     Error::new(ErrorKind::Io, format!("{name}: the recording cannot be read: {e}")).with_source(e)
 }
 
-/// Identifier, start and end of the element at `at` in the first `used` bytes, if it is whole.
+/// Identifier, start and end of the element at `at` in the first `used` bytes, if it is complete.
 fn element(bytes: &[u8], at: usize, used: usize) -> Option<(u32, usize, usize)> {
     let rest = bytes.get(at..used)?;
     let head = ebml::head(rest)?;
@@ -360,5 +361,5 @@ fn prove(body: &[u8]) -> Option<u64> {
         }
         first = false;
     }
-    if elements.is_whole() { time } else { None }
+    if elements.is_complete() { time } else { None }
 }

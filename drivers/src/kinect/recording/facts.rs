@@ -1,4 +1,4 @@
-//! What a recording says of itself, out of its tracks, tags and attachments.
+//! The facts that a recording states about itself in its tracks, tags and attachments.
 
 use super::head::Parts;
 use super::{Facts, Pixels, Track, TrackKind};
@@ -11,7 +11,7 @@ use crate::{Error, ErrorKind, Result};
 const EPOCH_NS: i64 = 978_307_200_000_000_000;
 /// The longest delays and offsets that are believed: 400 days.
 const MAX_NS: u64 = 400 * 86_400 * 1_000_000_000;
-/// Sides of pictures that are believed.
+/// Sides of images that are believed.
 const SIDES: core::ops::RangeInclusive<u32> = 2..=8192;
 
 /// A tag with what it is about.
@@ -42,7 +42,7 @@ pub(super) fn facts(parts: &Parts, name: &str) -> Result<Facts> {
             if names.is_empty() { "none".to_owned() } else { names.join(", ") }
         )));
     }
-    // A second track of a kind is somebody's own.
+    // A second track of a kind is not the SDK's.
     for i in 0..tracks.len() {
         let kind = tracks.get(i).map(|t| t.kind);
         let is_second = tracks.iter().take(i).any(|t| Some(t.kind) == kind);
@@ -51,9 +51,11 @@ pub(super) fn facts(parts: &Parts, name: &str) -> Result<Facts> {
         }
     }
     let of = |kind| tracks.iter().find(|t| t.kind == kind);
-    let (color, depth, infrared) = (of(TrackKind::Color), of(TrackKind::Depth), of(TrackKind::Infrared));
+    let color = of(TrackKind::Color);
+    let depth = of(TrackKind::Depth);
+    let infrared = of(TrackKind::Infrared);
     if color.is_none() && depth.is_none() && infrared.is_none() {
-        return Err(bad("no track COLOR, DEPTH or IR: there are no pictures in it".to_owned()));
+        return Err(bad("no track COLOR, DEPTH or IR: there are no images in it".to_owned()));
     }
     let value = |wanted: &str| tags.iter().find(|t| t.name == wanted).map(|t| t.value.trim());
     let depth_mode = depth_mode(value("K4A_DEPTH_MODE"), depth, infrared).map_err(bad)?;
@@ -61,7 +63,7 @@ pub(super) fn facts(parts: &Parts, name: &str) -> Result<Facts> {
     let number = |wanted: &str| -> Result<i64> {
         let Some(text) = value(wanted) else { return Ok(0) };
         let n = text.parse::<i64>().ok().filter(|n| n.unsigned_abs() <= MAX_NS);
-        n.ok_or_else(|| bad(format!("the tag {wanted} = \"{text}\" is no number of nanoseconds")))
+        n.ok_or_else(|| bad(format!("the tag {wanted} = \"{text}\" is not a number of nanoseconds")))
     };
     let positive = |wanted: &str| -> Result<u64> {
         u64::try_from(number(wanted)?).map_err(|_| bad(format!("the tag {wanted} is negative")))
@@ -141,17 +143,19 @@ fn track(entry: &[u8], tags: &[Tag]) -> core::result::Result<Option<Track>, Stri
         ebml::child_uint(entry, id::DEFAULT_DURATION).filter(|ns| (1_000_000..=10_000_000_000).contains(ns));
     let mut track = Track { number, uid, name, kind, pixels: None, width: 0, height: 0, period_ns };
     if matches!(kind, TrackKind::Color | TrackKind::Depth | TrackKind::Infrared) {
-        pictures(entry, &mut track)?;
+        images(entry, &mut track)?;
     }
     Ok(Some(track))
 }
 
-/// Reads how pictures are stored: a Windows bitmap header, whose four characters say the format.
-fn pictures(entry: &[u8], track: &mut Track) -> core::result::Result<(), String> {
+/// Reads how images are stored: a Windows bitmap header, whose four characters say the format.
+fn images(entry: &[u8], track: &mut Track) -> core::result::Result<(), String> {
     let name = &track.name;
     let codec = ebml::child_text(entry, id::CODEC_ID).unwrap_or_default();
     if codec != "V_MS/VFW/FOURCC" {
-        return Err(format!("the track {name} is stored as \"{codec}\", which is no way of a Kinect's"));
+        return Err(format!(
+            "the track {name} is stored as \"{codec}\", which Azure Kinect recordings do not use"
+        ));
     }
     let header = ebml::child(entry, id::CODEC_PRIVATE).unwrap_or_default();
     let fields = (|| Some((i32_at(header, 4)?, i32_at(header, 8)?, u32_at(header, 16)?)))();
@@ -162,7 +166,7 @@ fn pictures(entry: &[u8], track: &mut Track) -> core::result::Result<(), String>
     };
     let sides = [width, height].map(|side| u32::try_from(side).ok().filter(|side| SIDES.contains(side)));
     let [Some(width), Some(height)] = sides else {
-        return Err(format!("the track {name} says that its pictures have {width}x{height} pixels"));
+        return Err(format!("the track {name} states images of {width}x{height} pixels"));
     };
     let is_color = track.kind == TrackKind::Color;
     let pixels = match (&format.to_le_bytes(), is_color) {
@@ -175,7 +179,7 @@ fn pictures(entry: &[u8], track: &mut Track) -> core::result::Result<(), String>
         (other, _) => {
             let other = String::from_utf8_lossy(other).escape_debug().to_string();
             return Err(format!(
-                "the pictures of the track {name} are stored as \"{other}\", which is no way of a Kinect's"
+                "the images of the track {name} are stored as \"{other}\", which Azure Kinect recordings do not use"
             ));
         }
     };
@@ -188,14 +192,14 @@ fn pictures(entry: &[u8], track: &mut Track) -> core::result::Result<(), String>
     Ok(())
 }
 
-/// The mode of the depth camera, which must be that of its pictures. Without a tag their size tells it.
+/// The mode of the depth camera, which must be that of its images. Without a tag it follows from their size.
 fn depth_mode(
     tag: Option<&str>,
     depth: Option<&Track>,
     infrared: Option<&Track>,
 ) -> core::result::Result<Option<DepthMode>, String> {
-    let Some(pictures) = depth.or(infrared) else { return Ok(None) };
-    let size = (pictures.width, pictures.height);
+    let Some(images) = depth.or(infrared) else { return Ok(None) };
+    let size = (images.width, images.height);
     if let Some(other) = infrared.filter(|t| (t.width, t.height) != size) {
         let (width, height) = size;
         return Err(format!(
@@ -211,7 +215,7 @@ fn depth_mode(
     mode.map(Some).ok_or_else(|| {
         let (width, height) = size;
         let tag = tag.unwrap_or("missing");
-        format!("the tag K4A_DEPTH_MODE is \"{tag}\", which does not fit pictures of {width}x{height} pixels")
+        format!("the tag K4A_DEPTH_MODE is \"{tag}\", which does not fit images of {width}x{height} pixels")
     })
 }
 

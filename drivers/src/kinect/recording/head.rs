@@ -28,7 +28,7 @@ pub(super) struct Parts {
     pub(super) is_cut: bool,
 }
 
-/// Reads the head of the element at `at`; `None` when there is none.
+/// Reads the head of the element at `at`; `None` without an element there.
 pub(super) fn head_at(source: &dyn ReadAt, at: u64, end: u64) -> std::io::Result<Option<Head>> {
     let mut bytes = [0; MAX_HEAD];
     let there = end.saturating_sub(at).min(MAX_HEAD as u64) as usize;
@@ -62,12 +62,13 @@ impl Reader<'_> {
     /// The body of the element at `at` with this head.
     fn body(&self, at: u64, head: Head) -> Result<Vec<u8>> {
         let from = at + head.len as u64;
-        let (size, left) = (head.size.unwrap_or(u64::MAX), self.end.saturating_sub(from));
+        let size = head.size.unwrap_or(u64::MAX);
+        let left = self.end.saturating_sub(from);
         if size > left.min(MAX_ELEMENT) {
             let name = element_name(head.id);
             let what = if size > left { "the file is cut off or damaged" } else { "the file is damaged" };
             return Err(self.bad(format_args!(
-                "{name} at byte {at} claims {size} bytes where {left} are left: {what} before its first picture"
+                "{name} at byte {at} claims {size} bytes where {left} are left: {what} before its first image"
             )));
         }
         let mut body = vec![0; size as usize];
@@ -80,13 +81,15 @@ impl Reader<'_> {
 pub(super) fn read(source: &dyn ReadAt, name: &str) -> Result<Parts> {
     let mut r = Reader { source, name, end: source.size() };
     if r.end == 0 {
-        return Err(r.bad("the file is empty, and so no Matroska file (.mkv)"));
+        return Err(r.bad("the file is empty, and so not a Matroska file (.mkv)"));
     }
     let start = r.head(0)?.filter(|h| h.id == id::EBML);
-    let Some(start) = start else { return Err(r.bad("this is no Matroska file (.mkv)")) };
+    let Some(start) = start else { return Err(r.bad("not a Matroska file (.mkv)")) };
     let doc_type = ebml::child_text(&r.body(0, start)?, id::DOC_TYPE).unwrap_or_default();
     if doc_type != "matroska" && doc_type != "webm" {
-        return Err(r.bad(format_args!("this is a file of type \"{doc_type}\" and no Matroska file")));
+        return Err(r.bad(format_args!(
+            "it has the EBML document type \"{doc_type}\", so it is not a Matroska file"
+        )));
     }
     let at = start.len as u64 + start.size.unwrap_or(0);
     let segment = r.head(at)?.filter(|h| h.id == id::SEGMENT);
@@ -141,13 +144,13 @@ fn before_clusters(r: &Reader<'_>, parts: &mut Parts, elsewhere: &mut Vec<(u32, 
                 let name = element_name(head.id);
                 return Err(r.bad(format_args!(
                     "{name} at byte {at} reaches beyond the end of the file: it is cut off or damaged before its first \
-                     picture"
+                     image"
                 )));
             }
         }
     }
     Err(r.bad(format_args!(
-        "no pictures: from byte {at} on there is no cluster; the file is cut off or damaged before its first one"
+        "no images: from byte {at} on there is no cluster; the file is cut off or damaged before its first one"
     )))
 }
 
@@ -159,7 +162,7 @@ fn table(body: &[u8], origin: u64) -> impl Iterator<Item = (u32, u64)> + '_ {
     })
 }
 
-/// Takes what lies behind the clusters. In a file that was cut it is not there, and that is no error.
+/// Reads the elements behind the clusters. Their absence, as in a file that was cut off, is not an error.
 fn behind_clusters(r: &Reader<'_>, parts: &mut Parts, of: u32, at: u64) {
     if of == id::CUES {
         parts.cues = parts.cues.or(Some(at));

@@ -18,8 +18,8 @@ pub struct MotionSample {
     pub rotation: [f32; 3],
 }
 
-/// The samples of a frame of the track of motion. The SDK writes one to a frame and many frames to a block; a frame of
-/// several is taken apart as well. What is left at its end is no sample.
+/// The samples of a frame of the IMU track. The SDK writes one to a frame and many frames to a block; a frame of
+/// several is taken apart as well. An incomplete sample at its end is ignored.
 pub fn motion_samples(frame: &[u8]) -> impl Iterator<Item = MotionSample> + '_ {
     frame.chunks_exact(SAMPLE_BYTES).filter_map(|s| {
         Some(MotionSample {

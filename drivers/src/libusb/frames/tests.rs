@@ -17,7 +17,7 @@ fn payload(id: usize, flags: u8, data: &[u8]) -> Vec<u8> {
     bytes
 }
 
-fn picture(n: usize) -> Vec<u8> {
+fn image(n: usize) -> Vec<u8> {
     (0..FRAME).map(|i| (i * 7 + n * 31) as u8).collect()
 }
 
@@ -43,12 +43,12 @@ fn run(layout: Layout, transfer: usize, payloads: &[Vec<u8>]) -> (Vec<Seen>, u64
 }
 
 fn good(n: usize) -> Seen {
-    (n as u64, picture(n), Some(6), false)
+    (n as u64, image(n), Some(6), false)
 }
 
 #[test]
 fn one_payload_is_one_frame_and_is_not_copied() {
-    let payloads: Vec<_> = (0..4).map(|n| payload(n, Flags::END_OF_FRAME, &picture(n))).collect();
+    let payloads: Vec<_> = (0..4).map(|n| payload(n, Flags::END_OF_FRAME, &image(n))).collect();
     let (seen, copied) = run(layout(FRAME + 20), 256, &payloads);
     assert_eq!(seen, (0..4).map(good).collect::<Vec<_>>());
     assert_eq!(copied, 0);
@@ -56,7 +56,7 @@ fn one_payload_is_one_frame_and_is_not_copied() {
 
 #[test]
 fn a_whole_frame_needs_no_end_flag() {
-    let payloads: Vec<_> = (0..3).map(|n| payload(n, 0, &picture(n))).collect();
+    let payloads: Vec<_> = (0..3).map(|n| payload(n, 0, &image(n))).collect();
     let (seen, _) = run(layout(FRAME + 20), 256, &payloads);
     assert_eq!(seen, (0..3).map(good).collect::<Vec<_>>());
 }
@@ -64,11 +64,11 @@ fn a_whole_frame_needs_no_end_flag() {
 #[test]
 fn the_same_identifier_twice_is_a_gap() {
     let sent = [0, 1, 2, 4, 5, 7];
-    let payloads: Vec<_> = sent.iter().map(|&n| payload(n, Flags::END_OF_FRAME, &picture(n))).collect();
+    let payloads: Vec<_> = sent.iter().map(|&n| payload(n, Flags::END_OF_FRAME, &image(n))).collect();
     let (seen, _) = run(layout(FRAME + 20), 256, &payloads);
     assert_eq!(seen, sent.map(good));
-    // A device that never changes it has no gaps that could be told.
-    let payloads: Vec<_> = (0..5).map(|n| payload(0, Flags::END_OF_FRAME, &picture(n))).collect();
+    // A device that never changes it shows no gaps.
+    let payloads: Vec<_> = (0..5).map(|n| payload(0, Flags::END_OF_FRAME, &image(n))).collect();
     let (seen, _) = run(layout(FRAME + 20), 256, &payloads);
     assert_eq!(seen, (0..5).map(good).collect::<Vec<_>>());
 }
@@ -76,17 +76,17 @@ fn the_same_identifier_twice_is_a_gap() {
 #[test]
 fn a_flagged_frame_is_damaged_and_a_short_one_short() {
     let payloads = [
-        payload(0, Flags::END_OF_FRAME | Flags::ERROR, &picture(0)),
-        payload(1, Flags::END_OF_FRAME, &picture(1)[..40]),
-        payload(2, Flags::END_OF_FRAME, &[picture(2), vec![1; 9]].concat()),
-        payload(3, Flags::END_OF_FRAME, &picture(3)),
+        payload(0, Flags::END_OF_FRAME | Flags::ERROR, &image(0)),
+        payload(1, Flags::END_OF_FRAME, &image(1)[..40]),
+        payload(2, Flags::END_OF_FRAME, &[image(2), vec![1; 9]].concat()),
+        payload(3, Flags::END_OF_FRAME, &image(3)),
     ];
     let (seen, _) = run(layout(200), 256, &payloads);
-    assert_eq!(seen[0], (0, picture(0), Some(6), true));
-    assert_eq!(seen[1], (1, picture(1)[..40].to_vec(), Some(6), false));
+    assert_eq!(seen[0], (0, image(0), Some(6), true));
+    assert_eq!(seen[1], (1, image(1)[..40].to_vec(), Some(6), false));
     assert_eq!(
         seen[2],
-        (2, [picture(2), vec![1]].concat(), Some(6), false),
+        (2, [image(2), vec![1]].concat(), Some(6), false),
         "too long, by one byte that is kept"
     );
     assert_eq!(seen[3], good(3));
@@ -96,10 +96,10 @@ fn a_flagged_frame_is_damaged_and_a_short_one_short() {
 fn a_frame_over_several_payloads_is_put_together() {
     let mut payloads = Vec::new();
     for n in 0..3 {
-        let picture = picture(n);
-        payloads.push(payload(n, 0, &picture[..30]));
-        payloads.push(payload(n, 0, &picture[30..31]));
-        payloads.push(payload(n, 0, &picture[31..]));
+        let image = image(n);
+        payloads.push(payload(n, 0, &image[..30]));
+        payloads.push(payload(n, 0, &image[30..31]));
+        payloads.push(payload(n, 0, &image[31..]));
         payloads.push(payload(n, Flags::END_OF_FRAME, &[])); // behind the last byte: it says nothing new
     }
     let (seen, copied) = run(layout(90), 128, &payloads);
@@ -109,18 +109,18 @@ fn a_frame_over_several_payloads_is_put_together() {
 
 #[test]
 fn a_frame_that_never_ends_is_handed_on_when_the_next_begins() {
-    let payloads = [payload(0, 0, &picture(0)[..60]), payload(1, Flags::END_OF_FRAME, &picture(1))];
+    let payloads = [payload(0, 0, &image(0)[..60]), payload(1, Flags::END_OF_FRAME, &image(1))];
     let (seen, _) = run(layout(FRAME + 20), 256, &payloads);
-    assert_eq!(seen, [(0, picture(0)[..60].to_vec(), Some(6), false), good(1)]);
+    assert_eq!(seen, [(0, image(0)[..60].to_vec(), Some(6), false), good(1)]);
 }
 
 #[test]
 fn a_broken_header_or_transfer_costs_one_frame() {
     let payloads = [
-        payload(0, Flags::END_OF_FRAME, &picture(0)),
-        payload(1, Flags::END_OF_FRAME, &picture(1)),
-        [&[1, 0][..], &picture(2)].concat(),
-        payload(3, Flags::END_OF_FRAME, &picture(3)),
+        payload(0, Flags::END_OF_FRAME, &image(0)),
+        payload(1, Flags::END_OF_FRAME, &image(1)),
+        [&[1, 0][..], &image(2)].concat(),
+        payload(3, Flags::END_OF_FRAME, &image(3)),
     ];
     let (seen, _) = run(layout(FRAME + 20), 256, &payloads);
     assert_eq!(seen, [good(0), good(1), (2, vec![], None, true), good(3)]);
@@ -128,22 +128,22 @@ fn a_broken_header_or_transfer_costs_one_frame() {
     let mut assembler = Assembler::new(layout(FRAME + 20));
     let mut seen = Vec::new();
     let mut note = |f: &Assembled<'_>| seen.push((f.sequence, f.bytes.len(), f.damaged));
-    assembler.take(&payload(0, 0, &picture(0)[..50]), true, &mut note);
+    assembler.take(&payload(0, 0, &image(0)[..50]), true, &mut note);
     assembler.broken(&mut note);
     assembler.broken(&mut note);
-    assembler.take(&payload(0, Flags::END_OF_FRAME, &picture(2)), true, &mut note);
-    assembler.take(&payload(1, 0, &picture(3)[..9]), true, &mut note);
+    assembler.take(&payload(0, Flags::END_OF_FRAME, &image(2)), true, &mut note);
+    assembler.take(&payload(1, 0, &image(3)[..9]), true, &mut note);
     assembler.restart(&mut note);
-    assembler.take(&payload(1, Flags::END_OF_FRAME, &picture(4)), true, &mut note);
+    assembler.take(&payload(1, Flags::END_OF_FRAME, &image(4)), true, &mut note);
     assert_eq!(seen, [(0, 50, true), (1, 0, true), (2, 100, false), (3, 9, true), (4, 100, false)]);
 }
 
 #[test]
 fn a_broken_payload_over_several_transfers_is_passed_over_whole() {
-    let mut wrong = payload(1, Flags::END_OF_FRAME, &picture(1));
+    let mut wrong = payload(1, Flags::END_OF_FRAME, &image(1));
     wrong[0] = 0;
     let payloads =
-        [payload(0, Flags::END_OF_FRAME, &picture(0)), wrong, payload(2, Flags::END_OF_FRAME, &picture(2))];
+        [payload(0, Flags::END_OF_FRAME, &image(0)), wrong, payload(2, Flags::END_OF_FRAME, &image(2))];
     let (seen, _) = run(layout(FRAME + 20), 32, &payloads);
     assert_eq!(seen, [good(0), (1, vec![], None, true), good(2)]);
 }
@@ -151,12 +151,12 @@ fn a_broken_payload_over_several_transfers_is_passed_over_whole() {
 #[test]
 fn an_error_flag_in_any_payload_damages_the_frame() {
     let payloads = [
-        payload(0, 0, &picture(0)[..30]),
-        payload(0, Flags::ERROR, &picture(0)[30..60]),
-        payload(0, Flags::END_OF_FRAME, &picture(0)[60..]),
+        payload(0, 0, &image(0)[..30]),
+        payload(0, Flags::ERROR, &image(0)[30..60]),
+        payload(0, Flags::END_OF_FRAME, &image(0)[60..]),
     ];
     let (seen, _) = run(layout(90), 128, &payloads);
-    assert_eq!(seen, [(0, picture(0), Some(6), true)]);
+    assert_eq!(seen, [(0, image(0), Some(6), true)]);
 }
 
 #[test]
@@ -164,9 +164,9 @@ fn a_restart_forgets_the_payload_that_was_under_way() {
     let mut assembler = Assembler::new(layout(FRAME + 20));
     let mut seen = Vec::new();
     let mut note = |f: &Assembled<'_>| seen.push((f.bytes.len(), f.damaged));
-    assembler.take(&payload(0, 0, &picture(0))[..32], false, &mut note);
+    assembler.take(&payload(0, 0, &image(0))[..32], false, &mut note);
     assembler.restart(&mut note);
-    assembler.take(&payload(0, Flags::END_OF_FRAME, &picture(1)), true, &mut note);
+    assembler.take(&payload(0, Flags::END_OF_FRAME, &image(1)), true, &mut note);
     assert_eq!(seen, [(26, true), (100, false)]);
 }
 
@@ -189,7 +189,7 @@ proptest! {
             for pair in at.windows(2) {
                 let last = pair[1] == FRAME;
                 let flags = if last && end_flag && !alone { Flags::END_OF_FRAME } else { 0 };
-                let p = payload(n, flags, &picture(n)[pair[0]..pair[1]]);
+                let p = payload(n, flags, &image(n)[pair[0]..pair[1]]);
                 longest = longest.max(p.len());
                 payloads.push(p);
             }

@@ -7,19 +7,19 @@ use crate::realsense::protocol::tables::Pinhole;
 
 /// A camera that answers with these tables, whole.
 #[derive(Clone)]
-struct Made {
+struct FakeCamera {
     stereo: Vec<u8>,
     rgb: Vec<u8>,
     sizes: Option<Vec<u8>>,
     gone: bool,
     /// This reading is refused: with which kind of error.
     refusal: Option<(usize, ErrorKind)>,
-    /// Replies in a row that are damaged before one is whole.
+    /// Damaged replies in a row before an intact one.
     bad_replies: usize,
     asked: usize,
 }
 
-impl HardwareMonitor for Made {
+impl HardwareMonitor for FakeCamera {
     fn command(&mut self, request: &Request) -> Result<Vec<u8>> {
         if self.gone {
             return Err(Error::new(ErrorKind::Disconnected, "gone"));
@@ -48,7 +48,7 @@ impl HardwareMonitor for Made {
     }
 }
 
-fn made() -> Made {
+fn fake() -> FakeCamera {
     let mut stereo = Coefficients { baseline_mm: -50.1, ..Coefficients::default() };
     // 1280x720, then 848x480.
     stereo.rectified[1] = Pinhole { fx: 640.5, fy: 640.25, ppx: 639.0, ppy: 361.0 };
@@ -60,7 +60,7 @@ fn made() -> Made {
         rectified_translation_mm: [14.7, 0.1, 0.2],
         ..RgbTable::default()
     };
-    Made {
+    FakeCamera {
         stereo: stereo.build(),
         rgb: rgb.build(),
         sizes: None,
@@ -71,8 +71,8 @@ fn made() -> Made {
     }
 }
 
-fn read(mut made: Made, config: &RealsenseConfig) -> Result<Option<Calibration>> {
-    Calibration::read(&mut made, models::of_product(0x0B07).unwrap(), config, "D435 1")
+fn read(mut camera: FakeCamera, config: &RealsenseConfig) -> Result<Option<Calibration>> {
+    Calibration::read(&mut camera, models::of_product(0x0B07).unwrap(), config, "D435 1")
 }
 
 fn allowed() -> RealsenseConfig {
@@ -81,7 +81,7 @@ fn allowed() -> RealsenseConfig {
 
 #[test]
 fn each_view_has_its_own_place() {
-    let c = read(made(), &RealsenseConfig::default()).unwrap().unwrap();
+    let c = read(fake(), &RealsenseConfig::default()).unwrap().unwrap();
     let at = |view| c.geometry(view, 848, 480).unwrap();
     assert!((at(View::Left).intrinsics.fx - 424.5).abs() < 1e-6);
     assert_eq!(at(View::Left).pose_in_device, Pose::IDENTITY);
@@ -96,37 +96,37 @@ fn each_view_has_its_own_place() {
 fn newer_firmware_lists_sizes_by_itself() {
     let p = Pinhole { fx: 400.0, fy: 401.0, ppx: 420.0, ppy: 240.0 };
     let items = RectifiedItem::build_all(&[RectifiedItem { width: 848, height: 480, pinhole: p }]);
-    let c = read(Made { sizes: Some(items), ..made() }, &RealsenseConfig::default()).unwrap().unwrap();
+    let c = read(FakeCamera { sizes: Some(items), ..fake() }, &RealsenseConfig::default()).unwrap().unwrap();
     assert!((c.geometry(View::Left, 848, 480).unwrap().intrinsics.fx - 400.0).abs() < 1e-6);
 }
 
 #[test]
 fn a_camera_without_calibration_is_refused_unless_the_rig_allows_it() {
-    let mut damaged = made();
+    let mut damaged = fake();
     damaged.rgb[40] ^= 1;
-    let blank = Made { stereo: Coefficients::default().build(), ..made() };
-    for (made, why) in [(damaged, "checksum"), (blank, "not calibrated")] {
-        let e = read(made.clone(), &RealsenseConfig::default()).unwrap_err();
+    let blank = FakeCamera { stereo: Coefficients::default().build(), ..fake() };
+    for (camera, why) in [(damaged, "checksum"), (blank, "not calibrated")] {
+        let e = read(camera.clone(), &RealsenseConfig::default()).unwrap_err();
         assert_eq!(e.kind(), ErrorKind::Unsupported);
         assert!(e.to_string().contains(why) && e.to_string().contains("allow_uncalibrated = true"), "{e}");
-        assert!(read(made, &allowed()).unwrap().is_none());
+        assert!(read(camera, &allowed()).unwrap().is_none());
     }
 }
 
 #[test]
 fn a_camera_that_went_away_is_no_uncalibrated_one() {
-    let e = read(Made { gone: true, ..made() }, &allowed()).unwrap_err();
+    let e = read(FakeCamera { gone: true, ..fake() }, &allowed()).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::Disconnected);
 }
 
 #[test]
 fn a_damaged_reply_is_asked_for_again_and_a_damaged_table_is_not_for_ever() {
     // Two replies of three are damaged: the first table comes whole the third time, the other one the second time.
-    let camera = |bad_replies| Made { bad_replies, sizes: None, ..made() };
+    let camera = |bad_replies| FakeCamera { bad_replies, sizes: None, ..fake() };
     let whole = read(camera(0), &RealsenseConfig::default()).unwrap().unwrap();
-    let told = read(camera(2), &RealsenseConfig::default());
+    let read_back = read(camera(2), &RealsenseConfig::default());
     assert_eq!(
-        told.unwrap().unwrap().geometry(View::Left, 848, 480).unwrap(),
+        read_back.unwrap().unwrap().geometry(View::Left, 848, 480).unwrap(),
         whole.geometry(View::Left, 848, 480).unwrap()
     );
     let mut damaged = camera(usize::MAX - 1);
@@ -143,13 +143,14 @@ fn a_damaged_reply_is_asked_for_again_and_a_damaged_table_is_not_for_ever() {
 
 #[test]
 fn one_refusal_of_a_table_does_not_make_a_camera_uncalibrated() {
-    // The first request is for the stereo table; the last of five, after three for the sizes that it has not, for colour.
+    // The first request is for the stereo table; the last of five, after three for the sizes that it has not, for
+    // colour.
     for at in [1, 5] {
         for kind in [ErrorKind::Unsupported, ErrorKind::NotFound, ErrorKind::Protocol] {
-            let camera = Made { refusal: Some((at, kind)), ..made() };
+            let camera = FakeCamera { refusal: Some((at, kind)), ..fake() };
             assert!(read(camera, &RealsenseConfig::default()).unwrap().is_some(), "{kind:?} at {at}");
         }
     }
-    let camera = Made { refusal: Some((1, ErrorKind::Busy)), ..made() };
+    let camera = FakeCamera { refusal: Some((1, ErrorKind::Busy)), ..fake() };
     assert_eq!(read(camera, &RealsenseConfig::default()).unwrap_err().kind(), ErrorKind::Busy, "that passes");
 }

@@ -6,9 +6,9 @@ use crate::realsense::protocol::hwm::Request;
 use core::sync::atomic::AtomicBool;
 use std::sync::Mutex;
 
-/// A camera's controls, made up.
+/// Fake controls of a camera.
 #[derive(Clone, Default)]
-struct Made {
+struct FakeCamera {
     /// Every request takes this long, as one that runs into the kernel's time-out.
     hangs: Option<Duration>,
     fails: Option<ErrorKind>,
@@ -17,7 +17,7 @@ struct Made {
     gone: Arc<AtomicBool>,
 }
 
-impl Made {
+impl FakeCamera {
     fn answer(&self, what: &'static str) -> Result<()> {
         self.asked.lock().unwrap().push(what);
         if let Some(time) = self.hangs {
@@ -39,14 +39,14 @@ impl Made {
     }
 }
 
-impl HardwareMonitor for Made {
+impl HardwareMonitor for FakeCamera {
     fn command(&mut self, request: &Request) -> Result<Vec<u8>> {
         assert_eq!(request, &Request::clock());
         self.answer("clock").map(|()| 0x0102_0304_u32.to_le_bytes().to_vec())
     }
 }
 
-impl ControlPort for Made {
+impl ControlPort for FakeCamera {
     fn query(&mut self, unit: u8, selector: u8, query: Query, data: &mut [u8]) -> Result<()> {
         assert_eq!((unit, query), (3, Query::GetCur));
         if selector == ERROR_SELECTOR {
@@ -70,9 +70,9 @@ fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
 
 #[test]
 fn probes_come_fast_at_first_and_bracket_the_answer() {
-    let made = Made::default();
+    let fake = FakeCamera::default();
     let began = HostTime::now();
-    let control = made.spawn();
+    let control = fake.spawn();
     let mut probes = Vec::new();
     wait_until("five probes", || {
         probes.extend(control.probes());
@@ -85,20 +85,20 @@ fn probes_come_fast_at_first_and_bracket_the_answer() {
 
 #[test]
 fn faults_and_temperature_are_looked_at_each_second() {
-    let made = Made::default();
-    *made.fault.lock().unwrap() = 1;
-    let control = made.spawn();
+    let fake = FakeCamera::default();
+    *fake.fault.lock().unwrap() = 1;
+    let control = fake.spawn();
     assert!(control.temperature_c().is_nan());
     wait_until("a temperature", || !control.temperature_c().is_nan());
     assert!((control.temperature_c() - 44.0).abs() < f32::EPSILON);
-    wait_until("two looks", || made.count("fault") >= 2);
+    wait_until("two looks", || fake.count("fault") >= 2);
 }
 
 #[test]
 fn a_camera_whose_controls_hang_delays_nobody() {
-    let made = Made { hangs: Some(Duration::from_secs(2)), ..Made::default() };
-    let control = made.spawn();
-    wait_until("the first request", || made.count("clock") == 1);
+    let fake = FakeCamera { hangs: Some(Duration::from_secs(2)), ..FakeCamera::default() };
+    let control = fake.spawn();
+    wait_until("the first request", || fake.count("clock") == 1);
     let began = HostTime::now();
     assert_eq!(control.probes().count(), 0);
     assert!(control.temperature_c().is_nan());
@@ -108,33 +108,33 @@ fn a_camera_whose_controls_hang_delays_nobody() {
 
 #[test]
 fn after_a_failure_the_camera_is_left_alone_and_asked_again_later() {
-    let made = Made { fails: Some(ErrorKind::Io), ..Made::default() };
-    let control = made.spawn();
+    let fake = FakeCamera { fails: Some(ErrorKind::Io), ..FakeCamera::default() };
+    let control = fake.spawn();
     wait_until("the failure", || control.failed_and_overrun().0 == 1);
     std::thread::sleep(Duration::from_millis(300));
-    assert_eq!(made.count("clock"), 1, "not every 100 ms");
-    assert_eq!(made.count("fault"), 0);
+    assert_eq!(fake.count("clock"), 1, "not every 100 ms");
+    assert_eq!(fake.count("fault"), 0);
 }
 
 #[test]
 fn the_thread_ends_by_itself_when_the_camera_is_gone() {
-    let made = Made::default();
-    made.gone.store(true, Ordering::Relaxed);
-    let control = made.spawn();
+    let fake = FakeCamera::default();
+    fake.gone.store(true, Ordering::Relaxed);
+    let control = fake.spawn();
     wait_until("the end", || control.thread.as_ref().is_some_and(JoinHandle::is_finished));
-    assert_eq!(made.count("clock"), 1);
+    assert_eq!(fake.count("clock"), 1);
 }
 
 #[test]
 fn probes_that_nobody_takes_are_counted_and_bounded() {
-    let made = Made::default();
+    let fake = FakeCamera::default();
     let (send, _keep) = sync_channel(1);
     let shared = Arc::new(Shared::default());
     let mut worker = Worker {
         label: String::new(),
         family: Family::D4xx,
-        monitor: Box::new(made.clone()),
-        port: Box::new(made),
+        monitor: Box::new(fake.clone()),
+        port: Box::new(fake),
         shared: Arc::clone(&shared),
         send,
         fault: 0,

@@ -4,7 +4,7 @@ use super::revival::Revival;
 use super::switch::{ACCELERATION, Pair, ROTATION, Switcher};
 use super::unit::Opening;
 use super::{BATCH, Imu, Sensors};
-use crate::iio::{Found, Sensor};
+use crate::iio::{FoundSensor, Sensor};
 use crate::motion;
 use crate::realsense::protocol::imu::{ImuCalibration, Place, rates_of};
 use crate::usb::SysRoot;
@@ -49,9 +49,9 @@ impl FakeImu {
         Self { folder, pipes: Vec::new(), ticks: 0, cold: COLD }
     }
 
-    fn found(&self, name: &str) -> Found {
+    fn found(&self, name: &str) -> FoundSensor {
         let folder = self.folder.path().join(name);
-        Found { name: name.to_owned(), node: folder.join("node"), folder }
+        FoundSensor { name: name.to_owned(), node: folder.join("node"), folder }
     }
 
     /// Its one mode.
@@ -62,13 +62,14 @@ impl FakeImu {
 
     /// The driver of it, as stream number `stream`.
     pub(in crate::realsense) fn open(&mut self, stream: usize) -> Imu {
-        let (accelerometer, gyroscope) = (self.found("accel_3d"), self.found("gyro_3d"));
+        let accelerometer = self.found("accel_3d");
+        let gyroscope = self.found("gyro_3d");
         let root = SysRoot::new(self.folder.path());
         let sensors = Sensors {
             accelerometer: Sensor::open(&root, &accelerometer, ACCELERATION).unwrap(),
             gyroscope: Sensor::open(&root, &gyroscope, ROTATION).unwrap(),
         };
-        let pipe = |found: &Found| OpenOptions::new().write(true).open(&found.node).unwrap();
+        let pipe = |found: &FoundSensor| OpenOptions::new().write(true).open(&found.node).unwrap();
         self.pipes = vec![pipe(&accelerometer), pipe(&gyroscope)];
         let rates = rates_of(Place::L515, 0)[0];
         let pair = Pair { accelerometer, gyroscope, rates, cold: self.cold };

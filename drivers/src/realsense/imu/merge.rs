@@ -4,10 +4,10 @@ use std::collections::VecDeque;
 
 /// Samples of acceleration that wait for their rotation: half a second of them.
 const WAITING: usize = 256;
-/// Samples that may be missing at once, ten minutes of them; more is no gap but a clock that jumped.
+/// Samples that may be missing at once, ten minutes of them; more means that the clock jumped.
 const JUMP: u64 = 600 * 400;
 
-/// What a sensor measured.
+/// A measurement of a sensor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Reading {
     /// Microseconds of the camera's clock.
@@ -23,7 +23,7 @@ pub(super) struct Beside {
     pub(super) offset_ns: i32,
 }
 
-/// What goes along with a rotation.
+/// The data that accompanies a rotation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Merged {
     /// Its number by the camera's clock, from 1.

@@ -1,4 +1,4 @@
-//! When sensors that fell silent are switched off and on again: a number of times with growing pauses, then no more.
+//! Decides when sensors that fell silent are switched off and on again: a limited number of times, with growing pauses.
 
 use core::time::Duration;
 use depthrig_bus::HostTime;
@@ -12,7 +12,7 @@ const TRIES: u32 = 10;
 /// Time of measuring after which the next silence is another one.
 const SOUND: Duration = Duration::from_secs(10);
 
-/// What is to be done.
+/// The next step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Step {
     /// Nothing.
@@ -53,19 +53,19 @@ impl Revival {
     }
 
     /// Silence that is left alone after so many tries.
-    fn patience(&self) -> Duration {
+    fn timeout(&self) -> Duration {
         let doublings = self.tries.saturating_sub(1).min(16);
         (self.silence * (1 << doublings)).min(LONGEST.max(self.silence))
     }
 
-    /// What is to be done when the sensor that has been silent for longer was last heard at `heard`.
+    /// The next step if the sensor that has been silent for longer was last heard at `heard`.
     pub(super) fn step(&mut self, now: HostTime, heard: HostTime) -> Step {
         let since = |then: HostTime| Duration::from_nanos(now.since_ns(then).max(0) as u64);
         let silence = since(heard.max(self.on_at));
         if silence >= self.silence {
             self.silent_at = now;
         }
-        if silence >= self.patience() {
+        if silence >= self.timeout() {
             if self.tries >= TRIES {
                 return Step::GiveUp(self.tries);
             }
@@ -91,7 +91,8 @@ mod tests {
     fn run(until_s: u32, heard: impl Fn(f64, u32) -> bool) -> Vec<(f64, Step)> {
         let mut revival = Revival::new(at(0.0));
         let mut steps = Vec::new();
-        let (mut last, mut on_at) = (0.0, 0.0);
+        let mut last = 0.0;
+        let mut on_at = 0.0;
         for tick in 0..until_s * 10 {
             let now = f64::from(tick) / 10.0;
             if now < on_at {

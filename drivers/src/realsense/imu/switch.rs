@@ -1,10 +1,11 @@
 //! The thread that switches the sensors of an IMU on and off: the kernel takes seconds for it.
 //!
-//! **Silent sensors.** Only sensors that had no power measure anew when they are switched on. The kernel takes the power away
-//! three to five seconds after a sensor was switched off (the delay of autosuspend in `hid-sensor-trigger.c`, rounded up), so
-//! that sensors that fell silent stay off until it says so, or for [`COLD`] where it says nothing.
+//! **Silent sensors.** Only sensors that had no power measure again when they are switched on. The kernel takes the
+//! power away three to five seconds after a sensor was switched off (the delay of autosuspend in
+//! `hid-sensor-trigger.c`, rounded up), so that sensors that fell silent stay off until it says so, or for [`COLD`]
+//! where it says nothing.
 
-use crate::iio::{Found, Switch};
+use crate::iio::{FoundSensor, Switch};
 use crate::realsense::protocol::imu::Rates;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
@@ -26,8 +27,8 @@ const LOOK: Duration = Duration::from_millis(50);
 /// The sensors of an IMU, and the rates that they are to have.
 #[derive(Debug, Clone)]
 pub(super) struct Pair {
-    pub(super) accelerometer: Found,
-    pub(super) gyroscope: Found,
+    pub(super) accelerometer: FoundSensor,
+    pub(super) gyroscope: FoundSensor,
     pub(super) rates: Rates,
     /// The longest that they stay off when they fell silent.
     pub(super) cold: Duration,
@@ -85,7 +86,7 @@ impl Switcher {
     }
 }
 
-/// Who switched a sensor on last, and since when it may have power again.
+/// The stream that switched a sensor on last, and the time from which it can have power again.
 #[derive(Debug, Default)]
 struct Turn {
     /// A stream that is ended late must not switch off the sensors of the next one.
@@ -121,7 +122,7 @@ impl Worker {
     fn run(self, orders: &Receiver<()>, outcomes: &SyncSender<Result<()>>) {
         let mut outcome = self.on(orders);
         loop {
-            // Nobody listens when the stream has ended meanwhile; then the next order does not come either.
+            // The receiver is gone if the stream has ended meanwhile; then the next order does not come either.
             let _ = outcomes.send(outcome);
             if orders.recv().is_err() {
                 break;

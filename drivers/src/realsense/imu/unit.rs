@@ -3,7 +3,7 @@
 use super::revival::Revival;
 use super::switch::{ACCELERATION, COLD, Pair, ROTATION, Switcher};
 use super::{BATCH, Imu, Sensors};
-use crate::iio::{self, Found, Sensor};
+use crate::iio::{self, FoundSensor, Sensor};
 use crate::motion::{self, IMU};
 use crate::realsense::protocol::hwm::HardwareMonitor;
 use crate::realsense::protocol::imu::{ImuCalibration, Place, Rates, rates_of};
@@ -15,8 +15,8 @@ use depthrig_bus::{HostTime, MetadataLevel};
 #[derive(Debug, Clone)]
 pub(in crate::realsense) struct Unit {
     root: SysRoot,
-    accelerometer: Found,
-    gyroscope: Found,
+    accelerometer: FoundSensor,
+    gyroscope: FoundSensor,
     calibration: ImuCalibration,
     rates: &'static [Rates],
 }
@@ -118,8 +118,8 @@ impl Unit {
     /// Opens the sensors and starts the thread that switches them on, as stream number `stream`.
     ///
     /// # Errors
-    /// [`ErrorKind::PermissionDenied`] with the cure when this user may not read them; [`ErrorKind::Busy`] naming the program
-    /// that does; [`ErrorKind::Io`].
+    /// [`ErrorKind::PermissionDenied`] with the cure when this user may not read them; [`ErrorKind::Busy`] naming the
+    /// program that does; [`ErrorKind::Io`].
     pub(in crate::realsense) fn start(
         self,
         stream: usize,
@@ -135,7 +135,7 @@ impl Unit {
             )
         })?;
         let Self { root, accelerometer, gyroscope, calibration, .. } = self;
-        let open = |found: &Found, axes| {
+        let open = |found: &FoundSensor, axes| {
             Sensor::open(&root, found, axes)
                 .map_err(|e| Error::new(e.kind(), format!("{label}: its IMU: {e}")).with_source(e))
         };

@@ -1,9 +1,9 @@
-//! The back end: finds L515 cameras on the USB and opens the one that the rig means.
+//! The backend: finds L515 cameras on the USB and opens the one that the rig selects.
 
 use super::device::{L515Device, Opened};
 use super::{FAMILY, L515Config, MODELS, NAME};
 use crate::realsense::config::MetadataWish;
-use crate::realsense::find::{self, Found};
+use crate::realsense::find::{self, FoundCamera};
 use crate::realsense::kernel::Kernel;
 use crate::realsense::memory::Memory;
 use crate::realsense::models::VENDOR;
@@ -11,7 +11,7 @@ use crate::usb::{self, SysRoot, UsbDevice};
 use crate::{Backend, Device, DeviceInfo, Error, ErrorKind, Result};
 use std::sync::Arc;
 
-/// The back end `l515`: one rig camera each.
+/// The backend `l515`: one rig camera each.
 #[derive(Debug, Default)]
 pub struct L515Backend {
     config: L515Config,
@@ -20,13 +20,13 @@ pub struct L515Backend {
 }
 
 impl L515Backend {
-    /// A back end for the camera that `config` means. Nothing is touched before it is opened.
+    /// A backend for the camera that `config` selects. Nothing is touched before it is opened.
     pub fn new(config: L515Config) -> Self {
         Self { config, ..Self::default() }
     }
 
     /// Opens the nodes of a camera and has it say who it is.
-    fn ask(&self, found: &Found) -> Result<Opened> {
+    fn ask(&self, found: &FoundCamera) -> Result<Opened> {
         let wish = if self.memory.is_mute() { MetadataWish::None } else { MetadataWish::Full };
         if !Kernel::has_bound(found) {
             let text = format!(
@@ -39,7 +39,7 @@ impl L515Backend {
         Opened::new(found.clone(), Kernel::open(&self.root, found, wish)?)
     }
 
-    /// The opened camera that is meant.
+    /// Opens the selected camera.
     fn find(&self, serial: Option<&str>) -> Result<Opened> {
         let wanted = serial.or(self.config.serial.as_deref());
         let found = cameras(usb::scan(&self.root)?);
@@ -66,10 +66,10 @@ impl L515Backend {
 }
 
 /// The L515 among `devices`.
-fn cameras(devices: Vec<UsbDevice>) -> Vec<Found> {
+fn cameras(devices: Vec<UsbDevice>) -> Vec<FoundCamera> {
     let camera = |usb: UsbDevice| {
         let model = MODELS.iter().find(|m| usb.vendor_id == VENDOR && m.product == usb.product_id)?;
-        Some(Found { model, usb })
+        Some(FoundCamera { model, usb })
     };
     devices.into_iter().filter_map(camera).collect()
 }

@@ -4,7 +4,7 @@ use super::profiles::{self, Tables};
 use super::{L515Config, NAME};
 use crate::realsense::calibration::{FACTORY, NONE};
 use crate::realsense::family::Family;
-use crate::realsense::find::Found;
+use crate::realsense::find::FoundCamera;
 use crate::realsense::imu::{Unit, choose_imu, separated};
 use crate::realsense::launch::{Launch, in_camera};
 use crate::realsense::memory::Memory;
@@ -18,12 +18,12 @@ use crate::usb::SysRoot;
 use crate::{Device, DeviceInfo, Error, ErrorKind, Result, Stream, StreamProfile, StreamRequest};
 use std::sync::Arc;
 
-/// What a camera says of itself, and the link to it.
+/// A camera's identity, and the link to it.
 pub(super) struct Opened {
     pub(super) transport: Box<dyn Transport>,
     pub(super) gvd: L515Gvd,
     monitor: Box<dyn HardwareMonitor>,
-    found: Found,
+    found: FoundCamera,
 }
 
 impl Opened {
@@ -31,7 +31,7 @@ impl Opened {
     ///
     /// # Errors
     /// Those of the hardware monitor.
-    pub(super) fn new(found: Found, transport: impl Transport + 'static) -> Result<Self> {
+    pub(super) fn new(found: FoundCamera, transport: impl Transport + 'static) -> Result<Self> {
         let mut transport: Box<dyn Transport> = Box::new(transport);
         let mut monitor = transport.monitor()?;
         let gvd = L515Gvd::read(&mut monitor)
@@ -44,7 +44,7 @@ impl Opened {
         format!("{} {} (USB port {})", self.found.model.name, self.gvd.serial, self.found.usb.port)
     }
 
-    /// What the camera says of itself.
+    /// The camera's identity.
     pub(super) fn info(&mut self) -> DeviceInfo {
         let calibration = if Tables::read(&mut self.monitor).is_ok() { FACTORY } else { NONE };
         self.info_with(calibration)
@@ -118,8 +118,7 @@ impl L515Device {
             })?;
             let now = control.set(&mut opened.monitor, *value)?;
             if now != *value {
-                let text =
-                    format!("controls: {name} was given {value} and the camera says that it has {now}");
+                let text = format!("controls: {name} was set to {value} and the camera reports {now}");
                 return Err(Error::new(ErrorKind::Protocol, text));
             }
             tracing::info!(camera = %label, "{name} set to {value}");
@@ -131,7 +130,7 @@ impl L515Device {
             let text = "color_controls are set, but colour is not among the streams";
             return Err(Error::new(ErrorKind::BadInput, text));
         }
-        let mut color = opened.transport.picture_controls(Function::Color)?;
+        let mut color = opened.transport.image_controls(Function::Color)?;
         options::set_named(label, "color_controls", color.as_mut(), config.color_controls.iter())
     }
 }

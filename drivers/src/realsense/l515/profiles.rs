@@ -1,8 +1,8 @@
 //! From the modes of an L515's descriptors to its streams, and from chosen streams to what has to be started.
 //!
-//! `depth`, `ir` and `confidence` come turned, so a mode of 480x640 is a picture of 640x480. They share the sensor's
-//! frame and rate. Depth and confidence are computed with the infrared picture: the camera sends them right only while
-//! infrared is streamed too, so it is started with them even when nobody wants it, and then thrown away.
+//! `depth`, `ir` and `confidence` come turned, so a mode of 480x640 is an image of 640x480. They share the sensor's
+//! frame and rate. Depth and confidence are computed with the infrared image: the camera sends them right only while
+//! infrared is streamed too, so it is started with them even if it is not requested, and then discarded.
 
 use crate::realsense::account::Account;
 use crate::realsense::profiles::{Plan, completed};
@@ -44,13 +44,14 @@ impl Tables {
     }
 }
 
-/// What a mode becomes: format, size, and how.
+/// The delivered format and size of a mode, and how to unpack it.
 fn made_of(mode: &Mode) -> Option<(PixelFormat, (u32, u32), Unpack)> {
-    let (w, h) = (mode.width, mode.height);
+    let w = mode.width;
+    let h = mode.height;
     Some(match (mode.sensor, &mode.fourcc) {
         (Sensor::Depth, b"Z16 ") => (PixelFormat::Z16, (h, w), Unpack::Turn16(w as usize)),
         (Sensor::Infrared, b"GREY") => (PixelFormat::Mono8, (h, w), Unpack::Turn8(w as usize)),
-        // Its pixels are bytes with two pixels of the picture, one below the other.
+        // Its pixels are bytes with two pixels of the image, one below the other.
         (Sensor::Confidence, b"CNF4") => {
             (PixelFormat::Confidence8, (h, w.checked_mul(2)?), Unpack::Confidence(w as usize))
         }
@@ -116,7 +117,7 @@ pub(super) fn plan(
 ) -> Result<(Vec<StreamProfile>, Plan)> {
     let unsupported = |text: String| Error::new(ErrorKind::Unsupported, format!("{label}: {text}"));
     let chosen = choose_profiles(label, offered, &completed(requests, offered)?)?;
-    let mut plan = Plan { modes: Vec::new(), lanes: Vec::new() };
+    let mut plan = Plan { modes: Vec::new(), streams: Vec::new() };
     for p in &chosen {
         let fits = |m: &&Mode| {
             let sensor =
@@ -130,7 +131,7 @@ pub(super) fn plan(
             modes.iter().find(fits).ok_or_else(|| unsupported(format!("it has no {}", p.describe())))?;
         let (_, _, unpack) =
             made_of(mode).ok_or_else(|| unsupported(format!("it has no {}", p.describe())))?;
-        plan.lanes.push((plan.modes.len(), unpack));
+        plan.streams.push((plan.modes.len(), unpack));
         plan.modes.push(*mode);
     }
     let mut sensor = chosen.iter().filter(|p| p.stream.as_str() != "color");

@@ -54,14 +54,14 @@ impl ControlPort for Unit {
     }
 }
 
-/// Picture controls in memory.
+/// Image controls in memory.
 #[derive(Default)]
-struct Picture {
+struct Image {
     values: BTreeMap<String, i64>,
     order: Vec<String>,
 }
 
-impl PictureControls for Picture {
+impl ImageControls for Image {
     fn list(&mut self) -> Result<Vec<Control>> {
         let control = |name: &str, maximum| Control {
             id: 1,
@@ -94,8 +94,8 @@ impl PictureControls for Picture {
     }
 }
 
-fn apply_to(config: &RealsenseConfig, unit: &mut Unit, color: &mut Picture) -> Result<Picture> {
-    let mut stereo = Picture::default();
+fn apply_to(config: &RealsenseConfig, unit: &mut Unit, color: &mut Image) -> Result<Image> {
+    let mut stereo = Image::default();
     apply(config, "D435 1", unit, Some(&mut stereo), Some(color))?;
     Ok(stereo)
 }
@@ -109,7 +109,8 @@ fn exposure_by_hand_turns_the_automatic_off_first() {
         laser_power_mw: Some(150),
         ..RealsenseConfig::default()
     };
-    let (mut unit, mut color) = (Unit { busy: 2, ..Unit::default() }, Picture::default());
+    let mut unit = Unit { busy: 2, ..Unit::default() };
+    let mut color = Image::default();
     let stereo = apply_to(&config, &mut unit, &mut color).unwrap();
     assert_eq!(unit.order, [0x0B, 3, 2, 4]);
     assert_eq!(unit.values, [(0x0B, 0), (3, 8500), (2, 1), (4, 150)].into());
@@ -120,7 +121,7 @@ fn exposure_by_hand_turns_the_automatic_off_first() {
 #[test]
 fn what_is_not_asked_for_is_not_touched() {
     let mut unit = Unit::default();
-    apply_to(&RealsenseConfig::default(), &mut unit, &mut Picture::default()).unwrap();
+    apply_to(&RealsenseConfig::default(), &mut unit, &mut Image::default()).unwrap();
     assert!(unit.order.is_empty());
 }
 
@@ -128,7 +129,7 @@ fn what_is_not_asked_for_is_not_touched() {
 fn a_value_that_the_camera_does_not_take_names_what_it_does() {
     let refused = |config: RealsenseConfig| {
         let mut unit = Unit::default();
-        let e = apply_to(&config, &mut unit, &mut Picture::default()).err().unwrap();
+        let e = apply_to(&config, &mut unit, &mut Image::default()).err().unwrap();
         assert_eq!(e.kind(), ErrorKind::BadInput);
         assert!(!unit.order.contains(&4), "it was not sent");
         e.to_string()
@@ -147,9 +148,9 @@ fn a_value_that_the_camera_does_not_take_names_what_it_does() {
 fn a_camera_that_keeps_another_value_is_found_out() {
     let config = RealsenseConfig { laser_power_mw: Some(150), ..RealsenseConfig::default() };
     let mut unit = Unit { stubborn: true, ..Unit::default() };
-    let e = apply_to(&config, &mut unit, &mut Picture::default()).err().unwrap();
+    let e = apply_to(&config, &mut unit, &mut Image::default()).err().unwrap();
     assert_eq!(e.kind(), ErrorKind::Protocol);
-    assert!(e.to_string().contains("given 150 and says that it has 0"), "{e}");
+    assert!(e.to_string().contains("set to 150 and the camera reports 0"), "{e}");
 }
 
 #[test]
@@ -159,20 +160,20 @@ fn automatics_of_colour_are_set_before_what_they_hold() {
         ("white_balance_automatic".to_owned(), ControlValue::Boolean(false)),
     ];
     let config = RealsenseConfig { color_controls: values.into(), ..RealsenseConfig::default() };
-    let mut color = Picture::default();
+    let mut color = Image::default();
     apply_to(&config, &mut Unit::default(), &mut color).unwrap();
     assert_eq!(color.order, ["white_balance_automatic", "white_balance_temperature"]);
     assert_eq!(color.values["white_balance_temperature"], 4600);
     let unknown = [("sharpnes".to_owned(), ControlValue::Integer(1))];
     let config = RealsenseConfig { color_controls: unknown.into(), ..RealsenseConfig::default() };
-    let e = apply_to(&config, &mut Unit::default(), &mut Picture::default()).err().unwrap();
-    assert!(e.to_string().contains("no control \"sharpnes\"; it has: gain"), "{e}");
+    let e = apply_to(&config, &mut Unit::default(), &mut Image::default()).err().unwrap();
+    assert!(e.to_string().contains("unknown control \"sharpnes\"; it has: gain"), "{e}");
 }
 
 #[test]
 fn a_camera_that_stays_busy_is_not_asked_for_ever() {
     let config = RealsenseConfig { laser_power_mw: Some(150), ..RealsenseConfig::default() };
     let mut unit = Unit { busy: u32::MAX, ..Unit::default() };
-    let e = apply_to(&config, &mut unit, &mut Picture::default()).err().unwrap();
+    let e = apply_to(&config, &mut unit, &mut Image::default()).err().unwrap();
     assert_eq!((e.kind(), u32::MAX - unit.busy), (ErrorKind::Busy, TRIES));
 }

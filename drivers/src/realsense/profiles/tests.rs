@@ -32,7 +32,8 @@ fn request(stream: &str, size: Option<(u32, u32)>) -> StreamRequest {
 }
 
 fn planned(requests: &[StreamRequest]) -> Result<(Vec<String>, Plan)> {
-    let (modes, describe) = (d435(), |p: &StreamProfile| p.describe());
+    let modes = d435();
+    let describe = |p: &StreamProfile| p.describe();
     let (chosen, plan) = plan("D435 1", &offer(&modes), &modes, requests)?;
     Ok((chosen.iter().map(describe).collect(), plan))
 }
@@ -41,7 +42,7 @@ fn planned(requests: &[StreamRequest]) -> Result<(Vec<String>, Plan)> {
 fn without_wishes_depth_and_colour_are_started_at_15_hz() {
     let (chosen, plan) = planned(&[]).unwrap();
     assert_eq!(chosen, ["depth 848x480 z16 15 Hz", "color 1280x720 yuyv 15 Hz"]);
-    assert_eq!(plan.lanes, [(0, Unpack::Copy), (1, Unpack::Copy)]);
+    assert_eq!(plan.streams, [(0, Unpack::Copy), (1, Unpack::Copy)]);
 }
 
 #[test]
@@ -61,11 +62,11 @@ fn on_usb_2_the_largest_common_size_is_the_default() {
 fn the_left_imager_alone_is_grey_and_both_come_interleaved() {
     let (chosen, plan) = planned(&[request("ir_left", None)]).unwrap();
     assert_eq!(chosen, ["ir_left 848x480 mono8 15 Hz"]);
-    assert_eq!((&plan.modes[0].fourcc, plan.lanes.as_slice()), (b"GREY", &[(0, Unpack::Copy)][..]));
+    assert_eq!((&plan.modes[0].fourcc, plan.streams.as_slice()), (b"GREY", &[(0, Unpack::Copy)][..]));
     let (chosen, plan) = planned(&[request("ir_right", None), request("ir_left", None)]).unwrap();
     assert_eq!(chosen.len(), 2);
     assert_eq!((plan.modes.len(), &plan.modes[0].fourcc), (1, b"Y8I "));
-    assert_eq!(plan.lanes, [(0, Unpack::Right), (0, Unpack::Left)]);
+    assert_eq!(plan.streams, [(0, Unpack::Right), (0, Unpack::Left)]);
 }
 
 #[test]
@@ -76,7 +77,7 @@ fn infrared_follows_depth() {
     assert_eq!(e.kind(), ErrorKind::Unsupported);
     assert!(e.to_string().contains("the same imagers"), "{e}");
     let e = planned(&[request("ir_right", Some((640, 480))), request("ir_left", Some((848, 480)))]);
-    assert!(e.unwrap_err().to_string().contains("two halves of one picture"));
+    assert!(e.unwrap_err().to_string().contains("two halves of one image"));
 }
 
 #[test]

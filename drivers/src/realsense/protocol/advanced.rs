@@ -147,7 +147,8 @@ pub fn get(monitor: &mut dyn HardwareMonitor, group: Group, bound: Bound) -> Res
 /// Those of [`HardwareMonitor::command`]; [`ErrorKind::BadInput`] when `data` has not the group's length.
 pub fn set(monitor: &mut dyn HardwareMonitor, group: Group, data: &[u8]) -> Result<()> {
     if data.len() != group.bytes() {
-        let (is, must) = (data.len(), group.bytes());
+        let is = data.len();
+        let must = group.bytes();
         let text = format!("advanced-mode group {} has {must} bytes, not {is}", group.name());
         return Err(Error::new(ErrorKind::BadInput, text));
     }
@@ -226,7 +227,7 @@ pub fn depth_unit_m(monitor: &mut dyn HardwareMonitor, product_id: u16) -> Resul
     }
     match DepthTable::read(monitor, Bound::Current)?.unit_um {
         um @ 1..=1_000_000 => Ok((f64::from(um) / 1e6, UnitOrigin::Camera)),
-        um => Err(protocol_error(format!("the camera says that its unit of depth is {um} µm"))),
+        um => Err(protocol_error(format!("the camera reports a depth unit of {um} µm"))),
     }
 }
 
@@ -250,9 +251,10 @@ pub fn set_depth_unit_m(monitor: &mut dyn HardwareMonitor, unit_m: f64) -> Resul
     set(monitor, Group::DepthTable, &table.build())?;
     let after = DepthTable::read(monitor, Bound::Current)?;
     if after.unit_um != table.unit_um {
-        let (is, must) = (after.unit_um, table.unit_um);
+        let is = after.unit_um;
+        let must = table.unit_um;
         return Err(protocol_error(format!(
-            "the unit of depth was set to {must} µm and the camera says {is} µm"
+            "the depth unit was set to {must} µm and the camera reports {is} µm"
         )));
     }
     Ok(f64::from(before.unit_um) / 1e6)

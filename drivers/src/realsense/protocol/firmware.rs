@@ -38,7 +38,7 @@ impl FromStr for Firmware {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let wrong =
-            || format!("\"{text}\" is no firmware version; it has four numbers of 0 to 255, as 5.16.0.1");
+            || format!("invalid firmware version \"{text}\"; it has four numbers of 0 to 255, as 5.16.0.1");
         let parts: Vec<u8> =
             text.split('.').map(str::parse).collect::<Result<_, _>>().map_err(|_| wrong())?;
         parts.try_into().map(Self).map_err(|_| wrong())

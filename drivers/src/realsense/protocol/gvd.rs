@@ -71,7 +71,7 @@ impl Gvd {
     /// there.
     ///
     /// # Errors
-    /// [`crate::ErrorKind::Protocol`] when there is no serial number and firmware in it.
+    /// [`crate::ErrorKind::Protocol`] without a serial number and firmware in it.
     pub fn parse(data: &[u8]) -> Result<Self> {
         let identity = (|| {
             let serial = hex(&array::<6>(data, SERIAL)?);
@@ -83,7 +83,8 @@ impl Gvd {
             ))
         })();
         let (version, firmware, serial, asic_serial) = identity.ok_or_else(|| {
-            let (is, must) = (data.len(), ASIC_SERIAL + 6);
+            let is = data.len();
+            let must = ASIC_SERIAL + 6;
             protocol_error(format!(
                 "the camera's account of itself (GVD) has {is} bytes; at least {must} are needed"
             ))
@@ -170,7 +171,8 @@ impl L515Gvd {
             })
         })();
         all.ok_or_else(|| {
-            let (is, must) = (data.len(), L515_ASIC_SERIAL + 6);
+            let is = data.len();
+            let must = L515_ASIC_SERIAL + 6;
             protocol_error(format!(
                 "the L515's account of itself (GVD) has {is} bytes; at least {must} are needed"
             ))

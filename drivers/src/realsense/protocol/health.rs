@@ -50,7 +50,7 @@ pub fn temperature_c(monitor: &mut dyn HardwareMonitor) -> Result<i8> {
     reply.first().map(|c| *c as i8).ok_or_else(|| protocol_error("the reply about the temperature is empty"))
 }
 
-/// What a code of the error report means; `None` for 0, which is none (librealsense
+/// The meaning of a code of the error report; `None` for 0, no error (librealsense
 /// `src/ds/d400/d400-private.h`, `d400_fw_error_report`).
 pub fn error_report(code: u8) -> Option<String> {
     let text = match code {

@@ -1,5 +1,5 @@
-//! The hardware monitor: requests and replies of at most 1024 bytes, by which a RealSense camera tells its serial
-//! number and calibration and is told its settings.
+//! The hardware monitor: requests and replies of at most 1024 bytes, by which a RealSense camera reports its
+//! serial number and calibration and receives its settings.
 //!
 //! Source of the layout: librealsense `src/hw-monitor.cpp`, `src/ds/ds-private.h`, `src/l500/l500-private.h`
 //! (Apache-2.0), and section 1.7 of the project's notes on camera protocols.
@@ -84,9 +84,7 @@ pub fn reply_data<'a>(request: &Request, reply: &'a [u8]) -> Result<&'a [u8]> {
     }
     match i32::from_le_bytes(echo) {
         code @ ..0 => Err(Code(code).into_error(request)),
-        other => {
-            Err(protocol_error(format!("the reply to {request} says that it answers opcode {other:#04x}")))
-        }
+        other => Err(protocol_error(format!("the reply to {request} is for opcode {other:#04x}"))),
     }
 }
 
@@ -101,7 +99,7 @@ pub fn unit_reply(frame: &[u8]) -> Result<&[u8]> {
     let end = ECHO.saturating_add(length as usize);
     frame.get(..end).filter(|_| end <= UNIT_LENGTH_AT).ok_or_else(|| {
         protocol_error(format!(
-            "the hardware monitor says that it has {length} bytes of data; at most {} fit",
+            "the hardware monitor reports {length} bytes of data; at most {} fit",
             UNIT_LENGTH_AT - ECHO
         ))
     })

@@ -24,7 +24,7 @@ const LARGEST_BIAS: f64 = 100.0;
 const D4XX_VERSION: u16 = 0x0101;
 const L515_VERSION: u16 = 0x0105;
 
-/// What corrects the samples of one sensor: `sensitivity * measured - bias`.
+/// The correction of one sensor's samples: `sensitivity * measured - bias`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Axes {
     /// Without a unit.
@@ -124,7 +124,8 @@ impl ImuCalibration {
     /// Takes the reply of either family apart.
     ///
     /// # Errors
-    /// [`ErrorKind::Protocol`] when it is short, of an unknown version, fails its checksum, or holds numbers that no sensor has.
+    /// [`ErrorKind::Protocol`] when it is short, of an unknown version, fails its checksum, or holds numbers that no
+    /// sensor has.
     pub fn parse(data: &[u8], product: u16) -> Result<Self> {
         let payload = data.get(HEADER..).unwrap_or_default();
         let start = match u16_at(data, 0) {
@@ -216,11 +217,11 @@ fn corrected(axes: &Axes, measured: DVec3) -> [f32; 3] {
 pub struct Rates {
     /// Samples of rotation a second.
     pub gyro_hz: f64,
-    /// What selects them.
+    /// The value that selects this rate.
     pub gyro_selector: &'static str,
     /// Samples of acceleration a second, never more than of rotation.
     pub accel_hz: f64,
-    /// What selects them.
+    /// The value that selects this rate.
     pub accel_selector: &'static str,
 }
 

@@ -35,7 +35,7 @@ pub fn depth(
     height: u32,
 ) -> Result<(Intrinsics, Basis)> {
     if width == 0 || height == 0 {
-        return Err(Error::new(ErrorKind::BadInput, format!("no picture has {width}x{height} pixels")));
+        return Err(Error::new(ErrorKind::BadInput, format!("no image has {width}x{height} pixels")));
     }
     let of_size = |i: &&RectifiedItem| (u32::from(i.width), u32::from(i.height)) == (width, height);
     if let Some(item) = items.iter().find(of_size).filter(|i| is_set(&i.pinhole)) {
@@ -62,7 +62,8 @@ pub fn depth(
         // The middle of 1920x1080, unscaled.
         return Ok((Intrinsics { cx: whole.cx - 832.0, cy: whole.cy - 468.0, ..whole }, Basis::Window));
     }
-    let (sx, sy) = (f64::from(width) / f64::from(w), f64::from(height) / f64::from(h));
+    let sx = f64::from(width) / f64::from(w);
+    let sy = f64::from(height) / f64::from(h);
     let scaled = Intrinsics::pinhole(whole.fx * sx, whole.fy * sy, whole.cx * sx, whole.cy * sy);
     Ok((scaled, Basis::Scaled))
 }
@@ -72,10 +73,10 @@ fn is_set(p: &Pinhole) -> bool {
     [p.fx, p.fy, p.ppx, p.ppy].iter().all(|v| v.is_finite()) && p.fx > 0.0 && p.fy > 0.0
 }
 
-/// An entry as intrinsics; without distortion, because these pictures are rectified.
+/// An entry as intrinsics; without distortion, because these images are rectified.
 fn pinhole(p: Pinhole, width: u32, height: u32) -> Result<Intrinsics> {
     if p.fx == p.fy && p.ppx == p.ppy {
-        // What uncalibrated units have; the vendor's software goes on with an ideal lens.
+        // Uncalibrated units have these; the vendor's software goes on with an ideal lens.
         return Err(uncalibrated("its table holds placeholders", width, height));
     }
     Ok(Intrinsics::pinhole(p.fx.into(), p.fy.into(), p.ppx.into(), p.ppy.into()))
@@ -120,32 +121,33 @@ pub fn d405_color(table: &RgbTable, width: u32, height: u32) -> Result<Intrinsic
     if (width, height) == (1280, 720) {
         return Ok(k.at(1280.0, 720.0, table));
     }
-    let (w, h) = (f64::from(table.calibrated.0), f64::from(table.calibrated.1));
+    let w = f64::from(table.calibrated.0);
+    let h = f64::from(table.calibrated.1);
     if w == 0.0 || h == 0.0 {
         return Err(uncalibrated("its colour table does not say at which size", width, height));
     }
     if (width, height) == (640, 480) {
         // The only one of 4:3: the whole sensor of 1280x800 is scaled to 770x480, then cut to 640.
         k.y(h / 800.0);
-        let scaled = fill(k.at(1280.0, 800.0, table), (1280.0, 800.0), (770.0, 480.0));
+        let scaled = fill(k.at(1280.0, 800.0, table), [1280.0, 800.0], [770.0, 480.0]);
         return Ok(Intrinsics { cx: scaled.cx - 65.0, ..scaled });
     }
-    Ok(fill(k.at(w, h, table), (w, h), (width.into(), height.into())))
+    Ok(fill(k.at(w, h, table), [w, h], [width.into(), height.into()]))
 }
 
-/// Intrinsics of a picture of size `from`, scaled until it fills `to` and cut in its middle.
-fn fill(i: Intrinsics, from: (f64, f64), to: (f64, f64)) -> Intrinsics {
-    let scale = (to.0 / from.0).max(to.1 / from.1);
+/// Intrinsics of an image of size `from`, scaled until it fills `to` and cut in its middle.
+fn fill(i: Intrinsics, from: [f64; 2], to: [f64; 2]) -> Intrinsics {
+    let scale = (to[0] / from[0]).max(to[1] / from[1]);
     Intrinsics {
         fx: i.fx * scale,
         fy: i.fy * scale,
-        cx: i.cx * scale - (from.0 * scale - to.0) / 2.0,
-        cy: i.cy * scale - (from.1 * scale - to.1) / 2.0,
+        cx: i.cx * scale - (from[0] * scale - to[0]) / 2.0,
+        cy: i.cy * scale - (from[1] * scale - to[1]) / 2.0,
         ..i
     }
 }
 
-/// Intrinsics on a picture whose sides go from -1 to 1.
+/// Intrinsics on an image whose sides go from -1 to 1.
 struct Normalised {
     fx: f64,
     fy: f64,
@@ -156,7 +158,7 @@ struct Normalised {
 impl Normalised {
     fn of(table: &RgbTable, width: u32, height: u32) -> Result<Self> {
         if width == 0 || height == 0 {
-            return Err(Error::new(ErrorKind::BadInput, format!("no picture has {width}x{height} pixels")));
+            return Err(Error::new(ErrorKind::BadInput, format!("no image has {width}x{height} pixels")));
         }
         let [fx, _, px, _, fy, py, ..] = table.k.map(f64::from);
         let finite = table.k.iter().chain(&table.distortion).all(|v| v.is_finite());
@@ -176,7 +178,7 @@ impl Normalised {
         self.py *= factor;
     }
 
-    /// In pixels of a picture of `width` x `height`, with the table's distortion.
+    /// In pixels of an image of `width` x `height`, with the table's distortion.
     fn at(&self, width: f64, height: f64, table: &RgbTable) -> Intrinsics {
         let mut i = Intrinsics::pinhole(
             self.fx * width / 2.0,
@@ -199,7 +201,7 @@ const LARGEST_OFFSET_M: f64 = 1.0;
 /// after row, and t = -0.001 times its translation.
 ///
 /// # Errors
-/// [`ErrorKind::Protocol`] when M is no rotation or t is no distance within a camera.
+/// [`ErrorKind::Protocol`] unless M is a rotation and t a distance within a camera.
 pub fn color_in_depth(table: &RgbTable) -> Result<Pose> {
     let rotation = rotation(table.rectified_rotation)?.transpose();
     let translation = DVec3::from_array(table.rectified_translation_mm.map(f64::from)) * -0.001;
@@ -209,7 +211,7 @@ pub fn color_in_depth(table: &RgbTable) -> Result<Pose> {
 /// The pose of the right imager in the depth frame, which is that of the left one.
 ///
 /// # Errors
-/// [`ErrorKind::Protocol`] when the baseline is zero or no distance within a camera.
+/// [`ErrorKind::Protocol`] when the baseline is zero or not a distance within a camera.
 pub fn right_in_depth(table: &Coefficients) -> Result<Pose> {
     // From depth to right the table's sign holds; the pose is its inverse.
     let translation = DVec3::new(-0.001 * f64::from(table.baseline_mm), 0.0, 0.0);
@@ -226,11 +228,11 @@ pub(super) fn rotation(rows: [f32; 9]) -> Result<DMat3> {
     let norm = off.to_cols_array().iter().map(|v| v * v).sum::<f64>().sqrt();
     // Written so that a matrix with a NaN in it does not pass.
     if norm < 1e-3 && m.determinant() > 0.0 {
-        // The table's 32-bit floats are a rotation within 1e-7 or so; the nearest one is found by Newton's iteration for
-        // the polar decomposition, which squares the error in each step.
+        // The table's 32-bit floats are a rotation within 1e-7 or so; the nearest one is found by Newton's iteration
+        // for the polar decomposition, which squares the error in each step.
         Ok((0..3).fold(m, |r, _| (r + r.inverse().transpose()) * 0.5))
     } else {
-        Err(protocol_error(format!("a calibration table holds a rotation that is none (off by {norm:.3})")))
+        Err(protocol_error(format!("a calibration table holds an invalid rotation (off by {norm:.3})")))
     }
 }
 

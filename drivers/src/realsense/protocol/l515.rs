@@ -1,4 +1,4 @@
-//! What an L515 says of itself: intrinsics by size, the pose of its colour sensor, its controls, temperatures, errors.
+//! An L515's reports about itself: intrinsics by size, the pose of its colour sensor, controls, temperatures, errors.
 //!
 //! Sources: librealsense v2.54 `src/l500/l500-private.h`, `l500-color.cpp` and `l500-depth.cpp` (Apache-2.0).
 
@@ -40,7 +40,8 @@ const LENS: usize = 44;
 impl Lens {
     fn parse(bytes: &[u8], at: usize) -> Option<Self> {
         let [fx, fy, ppx, ppy] = f32s_at(bytes, at + 8)?;
-        let (width, height) = (u32_at(bytes, at)?, u32_at(bytes, at + 4)?);
+        let width = u32_at(bytes, at)?;
+        let height = u32_at(bytes, at + 4)?;
         Some(Self { width, height, fx, fy, ppx, ppy, distortion: f32s_at(bytes, at + 24)? })
     }
 
@@ -70,7 +71,7 @@ impl Lens {
 pub struct DepthLens {
     /// Before the correction of the mirror.
     pub raw: DepthPart,
-    /// After it: what the pictures are.
+    /// After it: what the images are.
     pub world: DepthPart,
 }
 
@@ -108,7 +109,7 @@ impl DepthPart {
 pub struct DepthIntrinsics {
     /// Which way the mirror moves, horizontally and vertically.
     pub scan: [u8; 2],
-    /// What is added to each depth, millimetres; the camera does it.
+    /// Offset that the camera adds to each depth, millimetres.
     pub offset: f32,
     /// One entry for each size.
     pub sizes: Vec<DepthLens>,
@@ -162,7 +163,7 @@ impl DepthIntrinsics {
     /// as the vendor's software has it.
     ///
     /// # Errors
-    /// [`ErrorKind::Unsupported`] when there is no entry of that size, or it was never calibrated.
+    /// [`ErrorKind::Unsupported`] without an entry of that size, or if it was never calibrated.
     pub fn at(&self, width: u32, height: u32) -> Result<Intrinsics> {
         let lenses = self.sizes.iter().map(|s| &s.world.lens);
         lens_at("depth", lenses, width, height)?.pinhole()
@@ -172,7 +173,7 @@ impl DepthIntrinsics {
     /// unit known.
     ///
     /// # Errors
-    /// [`ErrorKind::Protocol`] when it is no number of units.
+    /// [`ErrorKind::Protocol`] if the result is not a usable unit.
     pub fn unit_m(&self) -> Result<f64> {
         let z_norm = self.sizes.first().map_or(0.0, |s| f64::from(s.world.z_norm));
         let unit = 0.001 / z_norm;
@@ -180,7 +181,7 @@ impl DepthIntrinsics {
         if z_norm.is_finite() && z_norm > 0.0 && unit < 1.0 {
             return Ok(unit);
         }
-        Err(protocol_error(format!("the L515 says that a millimetre has {z_norm} units of depth")))
+        Err(protocol_error(format!("the L515 reports {z_norm} depth units per millimetre")))
     }
 }
 
@@ -230,7 +231,7 @@ impl ColorIntrinsics {
     /// Intrinsics of colour at `width` x `height`, with the distortion of Brown and Conrady.
     ///
     /// # Errors
-    /// [`ErrorKind::Unsupported`] when there is no entry of that size, or it was never calibrated.
+    /// [`ErrorKind::Unsupported`] without an entry of that size, or if it was never calibrated.
     pub fn at(&self, width: u32, height: u32) -> Result<Intrinsics> {
         let lens = lens_at("colour", self.sizes.iter(), width, height)?;
         let mut intrinsics = lens.pinhole()?;
@@ -246,7 +247,7 @@ fn entries(of: &str, n: Option<u8>, length: usize) -> Result<usize> {
     match n.map(usize::from) {
         Some(n @ 1..=MOST_SIZES) => Ok(n),
         Some(n) => Err(protocol_error(format!(
-            "the L515's table of {of} intrinsics says that it has {n} entries; a camera has 1 to {MOST_SIZES}"
+            "the L515's table of {of} intrinsics states {n} entries; a camera has 1 to {MOST_SIZES}"
         ))),
         None => Err(too_short(of, length, COLOR_HEADER)),
     }
@@ -310,7 +311,7 @@ impl ColorExtrinsics {
     /// The pose of the colour sensor in the depth frame, the inverse of what the camera says.
     ///
     /// # Errors
-    /// [`ErrorKind::Protocol`] when R is no rotation or t is no distance within a camera.
+    /// [`ErrorKind::Protocol`] unless R is a rotation and t a distance within a camera.
     pub fn color_in_depth(&self) -> Result<Pose> {
         let back = rotation(self.rotation)?.transpose();
         let t = DVec3::from_array(self.translation_mm.map(f64::from)) * 0.001;
@@ -364,7 +365,7 @@ impl Temperatures {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(u32)]
 pub enum Control {
-    /// Confidence below which there is no depth.
+    /// Confidence below which depth is invalid.
     ConfidenceThreshold = 0,
     /// Sharpening after the computation of depth.
     PostSharpness = 1,
@@ -380,11 +381,11 @@ pub enum Control {
     MinimumDistance = 6,
     /// Whether pixels of no confidence are kept.
     InvalidationBypass = 7,
-    /// Which infrared picture.
+    /// Which infrared image.
     AlternateIr = 8,
 }
 
-/// What a control allows.
+/// The range of a control.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Range {
     /// Least value.
@@ -444,7 +445,7 @@ impl Control {
         self.ask(monitor, 0)
     }
 
-    /// What it allows.
+    /// Its range.
     ///
     /// # Errors
     /// As [`Self::get`].
@@ -472,7 +473,7 @@ impl Control {
     }
 }
 
-/// What a code of the error report means; `None` for 0, which is none (`l500_fw_error_report`).
+/// The meaning of a code of the error report; `None` for 0, no error (`l500_fw_error_report`).
 pub fn error_report(code: u8) -> Option<String> {
     let text = match code {
         0 => return None,

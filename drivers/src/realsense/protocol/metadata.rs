@@ -1,6 +1,7 @@
-//! What a RealSense camera says of each frame: blocks behind the standard part of the USB video payload header.
+//! Metadata that a RealSense camera sends with each frame: blocks behind the standard part of the USB video payload
+//! header.
 //!
-//! Blocks have an id and a size and are walked by these; a block that is not known is passed over. Source of the
+//! Blocks have an id and a size and are walked by these; an unknown block is skipped. Source of the
 //! layouts: librealsense `src/metadata.h` (Apache-2.0) and the public description of `V4L2_META_FMT_D4XX`.
 
 use crate::bytes::{put, u8_at, u16_at, u32_at};
@@ -26,15 +27,15 @@ pub struct PayloadHeader {
     pub scr: Option<(u32, u16)>,
 }
 
-/// Flag: the picture toggles it.
+/// Flag: the image toggles it.
 pub const FID: u8 = 0x01;
-/// Flag: last payload of the picture.
+/// Flag: last payload of the image.
 pub const EOF: u8 = 0x02;
 /// Flag: there is a presentation time.
 pub const PTS: u8 = 0x04;
 /// Flag: there is a clock sample.
 pub const SCR: u8 = 0x08;
-/// Flag: the picture is damaged.
+/// Flag: the image is damaged.
 pub const ERR: u8 = 0x40;
 /// Flag: the header ends here.
 pub const EOH: u8 = 0x80;
@@ -46,7 +47,8 @@ impl PayloadHeader {
     /// A header that says that it is longer than what is there is cut: the kernel's `UVCH` format keeps the length
     /// and leaves the blocks out.
     pub fn parse(bytes: &[u8]) -> Option<(Self, &[u8])> {
-        let (length, flags) = (u8_at(bytes, 0)?, u8_at(bytes, 1)?);
+        let length = u8_at(bytes, 0)?;
+        let flags = u8_at(bytes, 1)?;
         let mut at = 2;
         let mut header = Self { length, flags, pts: None, scr: None };
         if flags & PTS != 0 {
@@ -102,7 +104,7 @@ pub struct Metadata {
 }
 
 impl Metadata {
-    /// Reads a payload header with its blocks, as [`crate::video::Picture::header`] has it. Blocks that are damaged
+    /// Reads a payload header with its blocks, as [`crate::video::Image::header`] has it. Blocks that are damaged
     /// end the walk; what was read before stays. `None` when even the standard part is cut off.
     pub fn parse(bytes: &[u8]) -> Option<Self> {
         let (header, vendor) = PayloadHeader::parse(bytes)?;

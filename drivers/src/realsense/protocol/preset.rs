@@ -25,7 +25,7 @@ use std::collections::BTreeMap;
 /// Groups with the bytes that they are to have.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Preset {
-    /// What a person calls it.
+    /// Its display name.
     pub name: String,
     /// The groups in the order of their numbers, each with all of its bytes.
     pub groups: Vec<(Group, Vec<u8>)>,
@@ -36,9 +36,9 @@ pub struct Preset {
 pub struct Written {
     /// Which.
     pub group: Group,
-    /// What the camera had.
+    /// The camera's value before.
     pub before: Vec<u8>,
-    /// What it says that it has now: what was written, or the camera changed it.
+    /// The value that the camera reports now: the one written, or the camera's own change.
     pub after: Vec<u8>,
 }
 
@@ -73,7 +73,8 @@ impl Preset {
                 bad(format!("the preset has a group \"{name}\"; there are: {known}"))
             })?;
             if values.len() != group.values() {
-                let (is, must) = (values.len(), group.values());
+                let is = values.len();
+                let must = group.values();
                 return Err(bad(format!("the preset's group {name} has {is} values; the camera has {must}")));
             }
             let mut bytes = Vec::with_capacity(group.bytes());

@@ -131,7 +131,7 @@ impl SyncMode {
             return Ok(());
         }
         Err(protocol_error(format!(
-            "sync mode {self} was set and the camera says {now}; stop its streams first"
+            "sync mode {self} was set and the camera reports {now}; stop its streams first"
         )))
     }
 }

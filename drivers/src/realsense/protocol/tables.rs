@@ -61,7 +61,8 @@ impl Header {
                 header.id
             )));
         }
-        let (is, must) = (crc32fast::hash(payload), header.crc32);
+        let is = crc32fast::hash(payload);
+        let must = header.crc32;
         if is != must {
             return Err(protocol_error(format!(
                 "calibration table {id} is damaged: its checksum is {is:08x} and should be {must:08x}. Read it again; \

@@ -1,4 +1,4 @@
-//! Pictures become frames with the camera's own numbers and times, and none is lost without an account.
+//! Images become frames with the camera's own numbers and times, and none is lost without an account.
 
 use super::*;
 use crate::realsense::family::Family;
@@ -10,40 +10,40 @@ use crate::{DeviceClock, MemorySink};
 use depthrig_bus::{Intrinsics, MetadataLevel, Name, PixelFormat, Pose};
 use std::collections::VecDeque;
 
-/// A picture that the made-up transport hands over.
+/// An image that the fake transport hands over.
 #[derive(Debug, Clone)]
-struct Made {
+struct FakeImage {
     bytes: Vec<u8>,
     header: Option<Vec<u8>>,
     sequence: u64,
     damaged: bool,
 }
 
-/// Hands over one picture at each poll, then fails or is idle.
-struct Pictures {
-    left: VecDeque<Made>,
+/// Hands over one image at each poll, then fails or is idle.
+struct Images {
+    left: VecDeque<FakeImage>,
     end: Option<ErrorKind>,
     polls: i64,
 }
 
-impl PictureSource for Pictures {
-    fn poll(&mut self, _: Duration, each: &mut dyn FnMut(&Picture<'_>)) -> Result<bool> {
+impl ImageSource for Images {
+    fn poll(&mut self, _: Duration, each: &mut dyn FnMut(&Image<'_>)) -> Result<bool> {
         self.polls += 1;
-        let Some(made) = self.left.pop_front() else {
+        let Some(fake) = self.left.pop_front() else {
             return match self.end {
                 Some(kind) => Err(Error::new(kind, "the end")),
                 None => Ok(false),
             };
         };
         let arrival = HostTime::from_ns(1_000_000_000 + self.polls * 33_333_333);
-        each(&Picture {
+        each(&Image {
             source: 0,
-            bytes: &made.bytes,
-            damaged: made.damaged,
-            sequence: made.sequence,
+            bytes: &fake.bytes,
+            damaged: fake.damaged,
+            sequence: fake.sequence,
             kernel_time: Some(arrival.plus_ns(-2_000_000)),
             arrival,
-            header: made.header.as_deref(),
+            header: fake.header.as_deref(),
         });
         Ok(true)
     }
@@ -80,8 +80,8 @@ fn header(counter: u32, pts: u32) -> Vec<u8> {
     standard.build(&vendor).unwrap()
 }
 
-fn made(i: u32) -> Made {
-    Made {
+fn fake(i: u32) -> FakeImage {
+    FakeImage {
         bytes: vec![i as u8; 16],
         header: Some(header(100 + i, 1_000_000 + i * 33_333)),
         sequence: u64::from(i),
@@ -105,10 +105,10 @@ fn profile(stream: &str, format: PixelFormat, level: MetadataLevel) -> StreamPro
     }
 }
 
-/// A stream over `pictures`: depth, or both imagers out of one source.
-fn stream(pictures: Vec<Made>, end: Option<ErrorKind>, both: bool) -> (RealsenseStream, Arc<Memory>) {
+/// A stream over `images`: depth, or both imagers out of one source.
+fn stream(images: Vec<FakeImage>, end: Option<ErrorKind>, both: bool) -> (RealsenseStream, Arc<Memory>) {
     let level = MetadataLevel::Full;
-    let made = if both {
+    let profiles = if both {
         vec![
             (profile("ir_left", PixelFormat::Mono8, level), Unpack::Left),
             (profile("ir_right", PixelFormat::Mono8, level), Unpack::Right),
@@ -116,7 +116,7 @@ fn stream(pictures: Vec<Made>, end: Option<ErrorKind>, both: bool) -> (Realsense
     } else {
         vec![(profile("depth", PixelFormat::Z16, level), Unpack::Copy)]
     };
-    let lane = |(i, (p, unpack)): (usize, &(StreamProfile, Unpack))| Lane {
+    let stream = |(i, (p, unpack)): (usize, &(StreamProfile, Unpack))| StreamState {
         gate: Gate::new(i, p),
         source: 0,
         unpack: *unpack,
@@ -125,9 +125,9 @@ fn stream(pictures: Vec<Made>, end: Option<ErrorKind>, both: bool) -> (Realsense
     let memory = Arc::new(Memory::default());
     let parts = Parts {
         label: "D435 1".to_owned(),
-        pictures: Box::new(Pictures { left: pictures.into(), end, polls: 0 }),
-        lanes: made.iter().enumerate().map(lane).collect(),
-        profiles: made.into_iter().map(|m| m.0).collect(),
+        images: Box::new(Images { left: images.into(), end, polls: 0 }),
+        streams: profiles.iter().enumerate().map(stream).collect(),
+        profiles: profiles.into_iter().map(|m| m.0).collect(),
         sources: vec![Source { account: Account::new(level), wire_bytes: 16 }],
         control: Control::spawn(
             "D435 1".to_owned(),
@@ -155,7 +155,7 @@ fn drain(stream: &mut RealsenseStream) -> (MemorySink, Result<Poll>) {
 
 #[test]
 fn a_frame_has_the_cameras_own_number_time_exposure_and_gain() {
-    let (mut stream, _) = stream((0..3).map(made).collect(), None, false);
+    let (mut stream, _) = stream((0..3).map(fake).collect(), None, false);
     let (sink, _) = drain(&mut stream);
     let (_, meta, pixels) = &sink.frames[1];
     assert_eq!((meta.device_sequence, meta.device_time), (101, 1_000_000 + 33_333 - 9_000));
@@ -165,9 +165,9 @@ fn a_frame_has_the_cameras_own_number_time_exposure_and_gain() {
 }
 
 #[test]
-fn one_interleaved_picture_is_two_frames() {
-    let picture = Made { bytes: (0..16).collect(), ..made(0) };
-    let (mut stream, _) = stream(vec![picture], None, true);
+fn one_interleaved_image_is_two_frames() {
+    let image = FakeImage { bytes: (0..16).collect(), ..fake(0) };
+    let (mut stream, _) = stream(vec![image], None, true);
     let (sink, _) = drain(&mut stream);
     assert_eq!(sink.frames.len(), 2);
     assert_eq!(sink.frames[0].2, [0, 2, 4, 6, 8, 10, 12, 14]);
@@ -177,14 +177,14 @@ fn one_interleaved_picture_is_two_frames() {
 
 #[test]
 fn every_way_of_losing_a_frame_has_its_reason() {
-    let mut pictures: Vec<_> = (0..8).map(made).collect();
-    pictures[1].bytes.truncate(8);
-    pictures[2].bytes.extend([0; 4]);
-    pictures[3].damaged = true;
+    let mut images: Vec<_> = (0..8).map(fake).collect();
+    images[1].bytes.truncate(8);
+    images[2].bytes.extend([0; 4]);
+    images[3].damaged = true;
     // 4 never comes, 5 comes twice.
-    pictures[4] = pictures[5].clone();
+    images[4] = images[5].clone();
     for both in [false, true] {
-        let (mut stream, _) = stream(pictures.clone(), None, both);
+        let (mut stream, _) = stream(images.clone(), None, both);
         let (sink, _) = drain(&mut stream);
         for i in 0..=usize::from(both) {
             let drops = sink.drops_of(i);
@@ -204,11 +204,11 @@ fn every_way_of_losing_a_frame_has_its_reason() {
 
 #[test]
 fn frames_before_the_first_metadata_are_booked_and_later_ones_without_it_delivered() {
-    let mut pictures: Vec<_> = (0..5).map(made).collect();
+    let mut images: Vec<_> = (0..5).map(fake).collect();
     for i in [0, 1, 3] {
-        pictures[i].header = None;
+        images[i].header = None;
     }
-    let (mut stream, _) = stream(pictures, None, false);
+    let (mut stream, _) = stream(images, None, false);
     let (sink, _) = drain(&mut stream);
     assert_eq!(sink.drops_of(0).get(DropReason::Incomplete), 2);
     assert_eq!((sink.delivered(0), sink.captured[0]), (3, 5));
@@ -219,7 +219,7 @@ fn frames_before_the_first_metadata_are_booked_and_later_ones_without_it_deliver
 
 #[test]
 fn a_camera_without_the_metadata_it_promised_is_opened_again_without() {
-    let without = |i| Made { header: None, ..made(i) };
+    let without = |i| FakeImage { header: None, ..fake(i) };
     let (mut stream, memory) = stream((0..40).map(without).collect(), None, false);
     let (_, end) = drain(&mut stream);
     assert_eq!(end.unwrap_err().kind(), ErrorKind::Protocol);
@@ -228,7 +228,7 @@ fn a_camera_without_the_metadata_it_promised_is_opened_again_without() {
 
 #[test]
 fn a_stream_that_failed_stays_dead_and_names_its_camera() {
-    let (mut stream, _) = stream(vec![made(0)], Some(ErrorKind::Disconnected), false);
+    let (mut stream, _) = stream(vec![fake(0)], Some(ErrorKind::Disconnected), false);
     let (sink, end) = drain(&mut stream);
     let e = end.unwrap_err();
     assert_eq!((e.kind(), sink.delivered(0)), (ErrorKind::Disconnected, 1));
@@ -239,7 +239,7 @@ fn a_stream_that_failed_stays_dead_and_names_its_camera() {
 /// A camera that delivers the IMU `fake` alone.
 fn imu_alone(fake: &mut FakeImu) -> (RealsenseStream, Arc<Memory>) {
     let (mut stream, memory) = stream(Vec::new(), None, false);
-    stream.lanes.clear();
+    stream.streams.clear();
     stream.sources.clear();
     stream.profiles = vec![FakeImu::profile()];
     stream.imu = Some(fake.open(0));

@@ -1,7 +1,7 @@
-//! What a stereo camera reports.
+//! Depth as a stereo camera reports it.
 //!
-//! Depth comes from disparity, `z = f b / d`, in steps of 1/32 px, so that noise and steps grow with z². There
-//! is no depth where the second imager does not see the spot, left of where the pictures overlap, where
+//! Depth comes from disparity, `z = f b / d`, in steps of 1/32 px, so that noise and steps grow with z². Depth
+//! is missing where the second imager does not see the spot, left of where the images overlap, where
 //! nothing can be matched, and beyond the search range. The matching window makes near things wider.
 
 use super::super::models::{DepthPrinciple, Model};
@@ -59,12 +59,14 @@ impl Matcher {
     fn row(&self, y: usize, samples: &[Sample], ideal: &[f32], out: &mut [f32]) {
         let layer = (self.seed & 0xFFFF) as i32;
         for (x, z) in out.iter_mut().enumerate() {
-            let (fx, fy) = (x as f32 / self.scale, y as f32 / self.scale);
+            let fx = x as f32 / self.scale;
+            let fy = y as f32 / self.scale;
             let blotch = smooth2(fx / 9.0, fy / 9.0, layer);
-            // How far this window reaches wanders along an edge, as in real pictures.
+            // How far this window reaches wanders along an edge, as in real images.
             let window = (self.window * (0.35 + 1.1 * smooth2(fx / 7.0, fy / 7.0, layer + 1))) as usize;
             let found = self.nearest_in_window((x, y), ideal, window, blotch > 0.5);
-            let (disparity, matched) = (ideal[found], &samples[found]);
+            let disparity = ideal[found];
+            let matched = &samples[found];
             let has_partner = disparity > 0.0 && disparity <= self.search_px && x as f32 >= disparity;
             if matched.is_hidden || !has_partner {
                 continue;
@@ -92,7 +94,8 @@ impl Matcher {
         window: usize,
         is_tall: bool,
     ) -> usize {
-        let (w, h) = (self.w, ideal.len() / self.w);
+        let w = self.w;
+        let h = ideal.len() / self.w;
         let mut best = y * w + x;
         let mut consider = |at: usize| {
             if ideal[at] > ideal[best] + EDGE_PX {

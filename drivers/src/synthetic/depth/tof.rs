@@ -1,6 +1,6 @@
-//! What a time-of-flight camera reports.
+//! Depth as a time-of-flight camera reports it.
 //!
-//! There is no depth where too little light comes back (dark, far or slanted surfaces), where a polished one
+//! Depth is missing where too little light comes back (dark, far or slanted surfaces), where a polished one
 //! sends it elsewhere, and outside the circle that the light fills. At edges a pixel mixes near and far into a
 //! depth at which nothing is ("flying pixels"). In corners, light that took a detour makes things seem farther.
 
@@ -38,7 +38,7 @@ pub(super) fn measure(view: &View<'_>, model: &Model, samples: &[Sample], seed: 
             if signal < LEAST_SIGNAL * (0.7 + 0.6 * blotch) || is_lost(here, blotch) {
                 continue;
             }
-            let mixed = mix_at_edge(samples, (w, h), (x, y), rolls.unit(1));
+            let mixed = mix_at_edge(samples, w, h, x, y, rolls.unit(1));
             let detour = multipath_m * (1.0 - here.open) * (1.0 + here.albedo) * 0.8;
             // Weak light is noisy light.
             let sigma = sigma_m * (0.35 + 0.65 * here.z) * (0.25 / signal.max(0.02)).sqrt().clamp(0.6, 4.0);
@@ -59,7 +59,7 @@ fn is_lost(here: &Sample, blotch: f32) -> bool {
 }
 
 /// The depth of a pixel whose neighbours lie elsewhere: anything between.
-fn mix_at_edge(samples: &[Sample], (w, h): (usize, usize), (x, y): (usize, usize), part: f32) -> f32 {
+fn mix_at_edge(samples: &[Sample], w: usize, h: usize, x: usize, y: usize, part: f32) -> f32 {
     let here = samples[y * w + x].z;
     let neighbours = [
         (x > 0).then(|| y * w + x - 1),

@@ -1,42 +1,42 @@
 //! Each complaint appears when it should, names what it must, and stays away otherwise.
 
 use super::*;
-use crate::usb::made::{MadeDevice, MadeTree};
+use crate::usb::fake::{FakeDevice, FakeTree};
 use crate::usb::scan;
 
-fn only(device: &MadeDevice) -> UsbDevice {
+fn only(device: &FakeDevice) -> UsbDevice {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
+    let tree = FakeTree::new(home.path());
     tree.plug(device);
     scan(tree.root()).unwrap().remove(0)
 }
 
 #[test]
 fn usb2_is_complained_about_for_devices_that_could_do_better() {
-    let d435 = MadeDevice::new("3-2", 0);
-    let slow = MadeDevice { speed: 480, version: " 2.10", ..d435.clone() };
+    let d435 = FakeDevice::new("3-2", 0);
+    let slow = FakeDevice { speed: 480, version: " 2.10", ..d435.clone() };
     let said = slow_link(&only(&slow)).unwrap();
     assert!(said.contains("USB port 3-2") && said.contains("480 Mbit/s") && said.contains("USB3"), "{said}");
     assert_eq!(slow_link(&only(&d435)), None);
-    let webcam = MadeDevice { id: (0x046d, 0x0825), version: " 2.00", ..slow.clone() };
+    let webcam = FakeDevice { id: (0x046d, 0x0825), version: " 2.00", ..slow.clone() };
     assert_eq!(slow_link(&only(&webcam)), None, "a webcam of USB2 is where it belongs");
     // Known by its number, whatever version it claims.
-    assert!(slow_link(&only(&MadeDevice { version: " 2.00", ..slow.clone() })).is_some());
-    assert!(slow_link(&only(&MadeDevice { id: (0x1234, 1), ..slow })).is_some(), "USB 2.1 is a USB3 device");
+    assert!(slow_link(&only(&FakeDevice { version: " 2.00", ..slow.clone() })).is_some());
+    assert!(slow_link(&only(&FakeDevice { id: (0x1234, 1), ..slow })).is_some(), "USB 2.1 is a USB3 device");
 }
 
 #[test]
 fn sleep_is_complained_about_when_the_kernel_may() {
-    let d435 = MadeDevice::new("3-2", 0);
+    let d435 = FakeDevice::new("3-2", 0);
     assert_eq!(may_sleep(&only(&d435)), None);
-    let said = may_sleep(&only(&MadeDevice { power: "auto", ..d435 })).unwrap();
+    let said = may_sleep(&only(&FakeDevice { power: "auto", ..d435 })).unwrap();
     assert!(said.contains("/sys/bus/usb/devices/3-2/power/control"), "{said}");
 }
 
 #[test]
 fn the_limit_of_usbfs_is_held_against_the_need() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
+    let tree = FakeTree::new(home.path());
     let need = |mb: u64| usbfs_too_small(tree.root(), mb << 20);
     assert_eq!(need(1000), None, "the kernel does not say");
     tree.file(USBFS_LIMIT, "16");
@@ -52,7 +52,7 @@ fn the_limit_of_usbfs_is_held_against_the_need() {
 #[test]
 fn an_opening_that_failed_says_why_and_what_to_do() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
+    let tree = FakeTree::new(home.path());
     tree.process(4711, "obs", &["/dev/video2"]);
     let node = tree.root().join("dev/video2");
     for (errno, kind, parts) in [

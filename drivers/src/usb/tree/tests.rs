@@ -1,13 +1,13 @@
-//! Made trees, read back.
+//! Fake trees, read back.
 
 use super::*;
-use crate::usb::made::{MadeDevice, MadeTree};
+use crate::usb::fake::{FakeDevice, FakeTree};
 
 #[test]
 fn a_camera_is_read_with_everything_that_the_kernel_says() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
-    tree.plug(&MadeDevice { power: "auto", ..MadeDevice::new("4-1.2", 10) });
+    let tree = FakeTree::new(home.path());
+    tree.plug(&FakeDevice { power: "auto", ..FakeDevice::new("4-1.2", 10) });
     let found = scan(tree.root()).unwrap();
     let [camera] = found.as_slice() else { panic!("{found:?}") };
     assert_eq!((camera.port.as_str(), camera.bus_number), ("4-1.2", 4));
@@ -30,10 +30,10 @@ fn a_camera_is_read_with_everything_that_the_kernel_says() {
 #[test]
 fn ports_are_sorted_as_numbers_and_hubs_stand_before_what_hangs_on_them() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
-    let hub = MadeDevice { interfaces: vec![(0, 9, 0, "hub", vec![], vec![])], ..MadeDevice::new("2-1", 0) };
+    let tree = FakeTree::new(home.path());
+    let hub = FakeDevice { interfaces: vec![(0, 9, 0, "hub", vec![], vec![])], ..FakeDevice::new("2-1", 0) };
     for (port, node) in [("10-1", 30), ("2-1.10", 20), ("2-1.9", 10)] {
-        tree.plug(&MadeDevice::new(port, node));
+        tree.plug(&FakeDevice::new(port, node));
     }
     tree.plug(&hub);
     let ports: Vec<_> = scan(tree.root()).unwrap().into_iter().map(|d| d.port).collect();
@@ -43,10 +43,10 @@ fn ports_are_sorted_as_numbers_and_hubs_stand_before_what_hangs_on_them() {
 #[test]
 fn two_buses_of_one_controller_have_its_name() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
-    tree.plug(&MadeDevice::new("4-1", 0));
-    tree.plug(&MadeDevice { speed: 480, version: " 2.10", ..MadeDevice::new("3-1", 10) });
-    tree.plug(&MadeDevice { controller: "platform/vhci_hcd.0", ..MadeDevice::new("6-3", 20) });
+    let tree = FakeTree::new(home.path());
+    tree.plug(&FakeDevice::new("4-1", 0));
+    tree.plug(&FakeDevice { speed: 480, version: " 2.10", ..FakeDevice::new("3-1", 10) });
+    tree.plug(&FakeDevice { controller: "platform/vhci_hcd.0", ..FakeDevice::new("6-3", 20) });
     let found = scan(tree.root()).unwrap();
     let controllers: Vec<_> = found.iter().map(|d| d.controller.as_str()).collect();
     assert_eq!(controllers, ["0000:00:14.0", "0000:00:14.0", "vhci_hcd.0"]);
@@ -55,9 +55,9 @@ fn two_buses_of_one_controller_have_its_name() {
 #[test]
 fn raw_hid_nodes_are_found_below_their_interface() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
+    let tree = FakeTree::new(home.path());
     let interfaces = vec![(0, 3, 0, "usbhid", vec![], vec![2])];
-    tree.plug(&MadeDevice { id: (0x2b03, 0xf881), interfaces, ..MadeDevice::new("1-4.2", 0) });
+    tree.plug(&FakeDevice { id: (0x2b03, 0xf881), interfaces, ..FakeDevice::new("1-4.2", 0) });
     let found = scan(tree.root()).unwrap();
     assert_eq!(found[0].interfaces[0].hidraw_nodes, [tree.root().join("dev/hidraw2")]);
 }
@@ -65,8 +65,8 @@ fn raw_hid_nodes_are_found_below_their_interface() {
 #[test]
 fn nodes_on_no_usb_device_are_listed_by_themselves() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
-    tree.plug(&MadeDevice::new("4-1", 0));
+    let tree = FakeTree::new(home.path());
+    tree.plug(&FakeDevice::new("4-1", 0));
     tree.platform_video("platform/vivid.0", 12, "vivid-000-vid-cap");
     tree.platform_video("platform/vivid.1", 7, "vivid-001-vid-cap");
     let nodes = video_nodes(tree.root()).unwrap();
@@ -77,9 +77,9 @@ fn nodes_on_no_usb_device_are_listed_by_themselves() {
 #[test]
 fn a_device_that_is_leaving_is_left_out_and_the_rest_stays() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
-    tree.plug(&MadeDevice::new("4-1", 0));
-    tree.plug(&MadeDevice::new("4-2", 10));
+    let tree = FakeTree::new(home.path());
+    tree.plug(&FakeDevice::new("4-1", 0));
+    tree.plug(&FakeDevice::new("4-2", 10));
     let gone = tree.root().join("sys/devices/pci0000:00/0000:00:14.0/usb4/4-1");
     std::fs::remove_file(gone.join("idVendor")).unwrap();
     std::os::unix::fs::symlink("../nowhere", tree.root().join("sys/bus/usb/devices/4-3")).unwrap();
@@ -90,8 +90,8 @@ fn a_device_that_is_leaving_is_left_out_and_the_rest_stays() {
 #[test]
 fn strings_that_a_device_reports_cannot_move_the_cursor() {
     let home = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(home.path());
-    tree.plug(&MadeDevice { strings: ["", "\u{1b}[2Jcamera\tone", "12\n34"], ..MadeDevice::new("4-1", 0) });
+    let tree = FakeTree::new(home.path());
+    tree.plug(&FakeDevice { strings: ["", "\u{1b}[2Jcamera\tone", "12\n34"], ..FakeDevice::new("4-1", 0) });
     let found = scan(tree.root()).unwrap();
     assert_eq!((found[0].product.as_str(), found[0].serial.as_str()), ("[2Jcamera one", "12 34"));
 }

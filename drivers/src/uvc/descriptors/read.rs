@@ -150,7 +150,8 @@ impl Reader {
     fn interface(&mut self, d: &Descriptor<'_>) -> Result<()> {
         let number = d.u8(2)?;
         let setting = Setting { number: d.u8(3)?, endpoints: Vec::new() };
-        let (class, subclass) = (d.u8(5)?, d.u8(6)?);
+        let class = d.u8(5)?;
+        let subclass = d.u8(6)?;
         let c = &mut self.configuration;
         self.place = match (class, subclass) {
             (CLASS_VIDEO, VIDEO_CONTROL) => {
@@ -183,7 +184,7 @@ impl Reader {
         Ok(())
     }
 
-    /// The setting that end points belong to; a control interface's are of no use here.
+    /// The setting that endpoints belong to; those of a control interface are not needed here.
     fn setting(&mut self) -> Option<&mut Setting> {
         match self.place {
             Place::Stream => self.configuration.streams.last_mut()?.settings.last_mut(),

@@ -110,11 +110,11 @@ fn formats_and_sizes_of_every_kind_are_found() {
 #[test]
 fn end_points_are_found() {
     let c = Configuration::parse(&d435()).unwrap();
-    let (setting, depth) = c.stream(1).unwrap().picture_endpoint().unwrap();
+    let (setting, depth) = c.stream(1).unwrap().image_endpoint().unwrap();
     assert_eq!((setting, depth.address, depth.kind), (0, 0x82, TransferKind::Bulk));
     assert_eq!((depth.packet_bytes, depth.packets), (1024, 1));
     assert_eq!(depth.companion, Some(Companion { max_burst: 15, attributes: 0, bytes_per_interval: 0 }));
-    let (setting, color) = c.stream(4).unwrap().picture_endpoint().unwrap();
+    let (setting, color) = c.stream(4).unwrap().image_endpoint().unwrap();
     assert_eq!((setting, color.kind), (1, TransferKind::Isochronous));
     assert_eq!((color.packet_bytes, color.packets, color.companion), (1024, 3, None));
     let (number, out, back) = c.vendor_channel().unwrap();
@@ -148,7 +148,7 @@ fn a_descriptor_with_too_few_bytes_for_its_fields_is_named() {
     bytes[at + 21] = 3;
     let message = Configuration::parse(&bytes).unwrap_err().to_string();
     assert!(message.contains(&format!("subtype 0x11 at byte {at}")), "{message}");
-    // A frame size of JPEG pictures behind an uncompressed format.
+    // A frame size of JPEG images behind an uncompressed format.
     let mut bytes = d435();
     bytes[at + 2] = 7;
     let message = Configuration::parse(&bytes).unwrap_err().to_string();
@@ -185,7 +185,7 @@ proptest! {
         }
         if let Ok(c) = Configuration::parse(&bytes) {
             for stream in &c.streams {
-                let _ = stream.picture_endpoint();
+                let _ = stream.image_endpoint();
                 for (format, size) in stream.formats.iter().flat_map(|f| f.frames.iter().map(move |s| (f, s))) {
                     let _ = size.bytes(format);
                     if let Some(interval) = size.interval_for(rate) {

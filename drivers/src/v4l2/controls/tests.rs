@@ -1,4 +1,4 @@
-//! What controls take, against a plain model; and that messages say it.
+//! Values that controls accept, against a plain model; and the messages that list them.
 
 use super::*;
 use proptest::prelude::*;
@@ -38,7 +38,7 @@ fn an_unknown_name_lists_those_there_are() {
     assert_eq!(find(&controls, "Gain").unwrap().name, "gain");
     let e = find(&controls, "gian").unwrap_err();
     assert_eq!(e.kind(), ErrorKind::BadInput);
-    assert_eq!(e.to_string(), "there is no control \"gian\"; it has: gain, hue");
+    assert_eq!(e.to_string(), "unknown control \"gian\"; it has: gain, hue");
     assert!(find(&[], "x").unwrap_err().to_string().ends_with("it has none"));
 }
 

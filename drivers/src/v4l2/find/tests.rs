@@ -1,26 +1,26 @@
-//! Cameras in a made tree: what is listed, and which one a rig means.
+//! Cameras in a fake tree: the list, and the choice of a rig's camera.
 
 use super::*;
-use crate::usb::made::{MadeDevice, MadeTree};
+use crate::usb::fake::{FakeDevice, FakeTree};
 
-fn webcam(port: &str, node: u32, serial: &'static str) -> MadeDevice {
-    MadeDevice {
+fn webcam(port: &str, node: u32, serial: &'static str) -> FakeDevice {
+    FakeDevice {
         id: (0x046d, 0x082d),
         strings: ["Logitech", "HD Pro Webcam C920", serial],
         interfaces: vec![
             (0, 0x0e, 1, "uvcvideo", vec![node, node + 1], vec![]),
             (1, 0x0e, 2, "uvcvideo", vec![], vec![]),
         ],
-        ..MadeDevice::new(port, 0)
+        ..FakeDevice::new(port, 0)
     }
 }
 
-fn mount() -> (tempfile::TempDir, Vec<Found>) {
+fn mount() -> (tempfile::TempDir, Vec<FoundCamera>) {
     let folder = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(folder.path());
+    let tree = FakeTree::new(folder.path());
     tree.plug(&webcam("1-2", 0, "A1B2"));
     tree.plug(&webcam("1-3", 2, ""));
-    tree.plug(&MadeDevice::new("4-1", 4));
+    tree.plug(&FakeDevice::new("4-1", 4));
     let found = cameras(tree.root()).unwrap();
     (folder, found)
 }
@@ -61,8 +61,8 @@ fn a_camera_is_meant_by_serial_port_or_by_being_the_only_one() {
     assert_eq!(e.kind(), ErrorKind::NotFound);
     assert_eq!(
         e.to_string(),
-        "it is not said which camera is meant (serial or port); there are: HD Pro Webcam C920 (serial A1B2) at 1-2, HD \
-         Pro Webcam C920 at 1-3, Intel(R) RealSense(TM) 435 at 4-1 (driven by the back end realsense)"
+        "set serial or port: no camera, or more than one, fits without them; there are: HD Pro Webcam C920 (serial A1B2) at 1-2, HD \
+         Pro Webcam C920 at 1-3, Intel(R) RealSense(TM) 435 at 4-1 (driven by the backend realsense)"
     );
     let e = port(&config(Some("A1B2"), Some("1-3")), None).unwrap_err().to_string();
     assert!(e.starts_with("no camera with serial number \"A1B2\" at port 1-3; there are: "), "{e}");
@@ -77,9 +77,9 @@ fn a_camera_is_meant_by_serial_port_or_by_being_the_only_one() {
 }
 
 #[test]
-fn two_of_one_serial_number_are_told_apart_by_port() {
+fn two_of_one_serial_number_are_distinguished_by_port() {
     let folder = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(folder.path());
+    let tree = FakeTree::new(folder.path());
     tree.plug(&webcam("1-2", 0, "0001"));
     tree.plug(&webcam("1-4", 2, "0001"));
     let found = cameras(tree.root()).unwrap();

@@ -1,10 +1,10 @@
-//! Pictures through a lane without a kernel: what is delivered, what is dropped and why, and at which time.
+//! Images through a stream without a kernel: what is delivered, what is dropped and why, and at which time.
 
 use super::*;
 use crate::MemorySink;
 use depthrig_bus::{Intrinsics, Pose, StreamName};
 
-fn profile(format: PixelFormat, clock: &LaneClock) -> StreamProfile {
+fn profile(format: PixelFormat, clock: &StreamClock) -> StreamProfile {
     let (clock, metadata) = clock.of_profile();
     StreamProfile {
         stream: StreamName::new("color").unwrap(),
@@ -21,15 +21,15 @@ fn profile(format: PixelFormat, clock: &LaneClock) -> StreamProfile {
     }
 }
 
-fn lane(format: PixelFormat, stride: u32, clock: LaneClock) -> Lane {
+fn stream(format: PixelFormat, stride: u32, clock: StreamClock) -> StreamState {
     let profile = profile(format, &clock);
     let layout = Layout { bytes_per_line: stride, size_image: 1000 };
     let unpack = Unpack::of(&profile, layout);
-    Lane { name: "test".into(), gate: Gate::new(0, &profile), unpack, clock }
+    StreamState { name: "test".into(), gate: Gate::new(0, &profile), unpack, clock }
 }
 
-fn picture(bytes: &[u8], sequence: u64) -> Picture<'_> {
-    Picture {
+fn image(bytes: &[u8], sequence: u64) -> Image<'_> {
+    Image {
         source: 0,
         bytes,
         damaged: false,
@@ -40,38 +40,38 @@ fn picture(bytes: &[u8], sequence: u64) -> Picture<'_> {
     }
 }
 
-const KERNEL: LaneClock = LaneClock::Kernel { said: false };
+const KERNEL: StreamClock = StreamClock::Kernel { said: false };
 
 #[test]
 fn padded_rows_arrive_without_their_padding() {
-    let mut lane = lane(PixelFormat::Mono8, 11, KERNEL);
+    let mut stream = stream(PixelFormat::Mono8, 11, KERNEL);
     let padded: Vec<u8> = (0..44).collect();
     let mut sink = MemorySink::default();
-    lane.copy(&picture(&padded, 0), &mut sink);
-    lane.copy(&picture(&padded[..41], 1), &mut sink);
+    stream.copy(&image(&padded, 0), &mut sink);
+    stream.copy(&image(&padded[..41], 1), &mut sink);
     let expected: Vec<u8> = [0..8, 11..19, 22..30, 33..41].into_iter().flatten().collect();
     assert_eq!(sink.frames.iter().map(|f| f.2.clone()).collect::<Vec<_>>(), [expected.clone(), expected]);
 }
 
 #[test]
 fn nv12_has_its_second_plane() {
-    let mut lane = lane(PixelFormat::Nv12, 8, KERNEL);
+    let mut stream = stream(PixelFormat::Nv12, 8, KERNEL);
     let mut sink = MemorySink::default();
     let bytes: Vec<u8> = (0..48).collect();
-    lane.copy(&picture(&bytes, 0), &mut sink);
+    stream.copy(&image(&bytes, 0), &mut sink);
     assert_eq!(sink.frames[0].2, bytes);
 }
 
 #[test]
 fn what_is_short_damaged_or_skipped_is_counted_by_its_reason() {
-    let mut lane = lane(PixelFormat::Mono8, 8, KERNEL);
+    let mut stream = stream(PixelFormat::Mono8, 8, KERNEL);
     let mut sink = MemorySink::default();
     let whole = [7; 32];
-    lane.copy(&picture(&whole, 10), &mut sink);
-    lane.copy(&picture(&whole[..31], 11), &mut sink);
-    lane.copy(&picture(&[], 12), &mut sink);
-    lane.copy(&Picture { damaged: true, ..picture(&whole, 13) }, &mut sink);
-    lane.copy(&picture(&whole, 17), &mut sink);
+    stream.copy(&image(&whole, 10), &mut sink);
+    stream.copy(&image(&whole[..31], 11), &mut sink);
+    stream.copy(&image(&[], 12), &mut sink);
+    stream.copy(&Image { damaged: true, ..image(&whole, 13) }, &mut sink);
+    stream.copy(&image(&whole, 17), &mut sink);
     let drops = sink.drops_of(0);
     assert_eq!((sink.captured[0], sink.delivered(0)), (8, 2));
     assert_eq!(drops.get(DropReason::Incomplete), 2);
@@ -82,28 +82,28 @@ fn what_is_short_damaged_or_skipped_is_counted_by_its_reason() {
 
 #[test]
 fn a_lent_frame_is_published_or_given_back_and_never_copied() {
-    let mut lane = lane(PixelFormat::Mono8, 8, KERNEL);
+    let mut stream = stream(PixelFormat::Mono8, 8, KERNEL);
     let mut sink = MemorySink::lending();
     let filled =
         Filled { bytes: 32, damaged: false, sequence: 0, kernel_time: None, arrival: HostTime::from_ns(9) };
     let mut loan = sink.lend(0, 32).unwrap();
     loan.bytes_mut().fill(3);
     let at = loan.bytes_mut().as_ptr();
-    let mut loan = lane.publish(&Filled { damaged: true, ..filled }, loan, &mut sink).unwrap();
+    let mut loan = stream.publish(&Filled { damaged: true, ..filled }, loan, &mut sink).unwrap();
     assert_eq!(loan.bytes_mut().as_ptr(), at, "it stays where it is");
-    assert!(lane.publish(&Filled { sequence: 1, ..filled }, loan, &mut sink).is_none());
+    assert!(stream.publish(&Filled { sequence: 1, ..filled }, loan, &mut sink).is_none());
     assert_eq!(sink.frames[0].2, [3; 32]);
     assert_eq!((sink.delivered(0), sink.drops_of(0).get(DropReason::DeviceError)), (1, 1));
 }
 
 #[test]
 fn a_stamp_ahead_of_time_is_moved_back_and_flagged() {
-    let mut lane = lane(PixelFormat::Mono8, 8, KERNEL);
+    let mut stream = stream(PixelFormat::Mono8, 8, KERNEL);
     let mut sink = MemorySink::default();
-    let ahead = Picture { kernel_time: Some(HostTime::from_ns(35_000_000)), ..picture(&[0; 32], 1) };
-    lane.copy(&picture(&[0; 32], 0), &mut sink);
-    lane.copy(&ahead, &mut sink);
-    lane.copy(&Picture { kernel_time: None, ..picture(&[0; 32], 2) }, &mut sink);
+    let ahead = Image { kernel_time: Some(HostTime::from_ns(35_000_000)), ..image(&[0; 32], 1) };
+    stream.copy(&image(&[0; 32], 0), &mut sink);
+    stream.copy(&ahead, &mut sink);
+    stream.copy(&Image { kernel_time: None, ..image(&[0; 32], 2) }, &mut sink);
     let seen: Vec<_> = sink
         .frames
         .iter()
@@ -114,14 +114,14 @@ fn a_stamp_ahead_of_time_is_moved_back_and_flagged() {
 
 #[test]
 fn a_device_clock_goes_on_over_a_lost_header() {
-    let mut lane = lane(PixelFormat::Mono8, 8, LaneClock::Device { hz: 100_000, last: None });
+    let mut stream = stream(PixelFormat::Mono8, 8, StreamClock::Device { hz: 100_000, last: None });
     let mut sink = MemorySink::default();
     // Length 6, flags PTS and end of header, ticks 4294967290: the counter wraps 5 ticks later.
     let header = [6, 0x84, 0xFA, 0xFF, 0xFF, 0xFF];
-    lane.copy(&Picture { header: Some(&header), ..picture(&[0; 32], 0) }, &mut sink);
+    stream.copy(&Image { header: Some(&header), ..image(&[0; 32], 0) }, &mut sink);
     let later = Some(HostTime::from_ns(1_000_000 + 33_000_000));
-    lane.copy(
-        &Picture { kernel_time: later, arrival: HostTime::from_ns(38_000_000), ..picture(&[0; 32], 1) },
+    stream.copy(
+        &Image { kernel_time: later, arrival: HostTime::from_ns(38_000_000), ..image(&[0; 32], 1) },
         &mut sink,
     );
     let seen: Vec<_> =
@@ -132,12 +132,12 @@ fn a_device_clock_goes_on_over_a_lost_header() {
 }
 
 #[test]
-fn a_jpeg_picture_without_its_end_is_incomplete() {
-    let mut lane = lane(PixelFormat::Mjpeg, 0, KERNEL);
+fn a_jpeg_image_without_its_end_is_incomplete() {
+    let mut stream = stream(PixelFormat::Mjpeg, 0, KERNEL);
     let mut sink = MemorySink::default();
     let jpeg = [0xFF, 0xD8, 1, 2, 3, 0xFF, 0xD9, 0, 0];
-    lane.copy(&picture(&jpeg, 0), &mut sink);
-    lane.copy(&picture(&jpeg[..6], 1), &mut sink);
+    stream.copy(&image(&jpeg, 0), &mut sink);
+    stream.copy(&image(&jpeg[..6], 1), &mut sink);
     assert_eq!(sink.frames[0].2, jpeg[..7], "padding is cut off");
     assert_eq!(sink.drops_of(0).get(DropReason::Incomplete), 1);
 }

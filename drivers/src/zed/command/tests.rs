@@ -19,11 +19,11 @@ fn blocks_are_byte_by_byte_as_documented() {
             &[0x50, 0xA2, 0, 4, 1, 0x80, 0x18, 0x18, 0x33, 0, 1, 0, 1, 0, 0, 0, 0xAB],
         ),
         (
-            Command::ReadSensor { eye: Eye::Left, address: 0x3500 },
+            Command::ReadSensor { side: Side::Left, address: 0x3500 },
             &[0x51, 0xA3, 0x6C, 2, 1, 0, 0, 0x35, 0x00, 0x90, 1, 0, 1],
         ),
         (
-            Command::WriteSensor { eye: Eye::Right, address: 0x3509, value: 0xCD },
+            Command::WriteSensor { side: Side::Right, address: 0x3509, value: 0xCD },
             &[0x50, 0xA5, 0x6C, 2, 1, 0, 0, 0x35, 0x09, 0x90, 1, 0, 1, 0, 0, 0, 0xCD],
         ),
         (Command::PinDirection { pin: 2, output: true }, &[0x50, 0x10, 2, 0]),
@@ -40,7 +40,7 @@ fn blocks_are_byte_by_byte_as_documented() {
     assert_eq!(Command::parse(&[0x52; 64]), None);
 }
 
-/// A camera of registers: what it was told, it says.
+/// A fake camera of registers: reads return what was written.
 struct Registers {
     length: usize,
     flash: [u8; 6],
@@ -84,15 +84,15 @@ impl ControlPort for &mut Registers {
                     }
                     Command::ReadFlash { .. } => vec![0xFF; 6],
                     Command::ReadSystem { address } => get(self.system.get(&address)),
-                    Command::ReadSensor { eye, address } => get(self.sensors[eye as usize].get(&address)),
+                    Command::ReadSensor { side, address } => get(self.sensors[side as usize].get(&address)),
                     Command::GetPin { pin } => vec![self.pins[usize::from(pin)]],
                     _ if self.stuck => vec![],
                     Command::WriteSystem { address, value } => {
                         self.system.insert(address, value);
                         vec![]
                     }
-                    Command::WriteSensor { eye, address, value } => {
-                        self.sensors[eye as usize].insert(address, value);
+                    Command::WriteSensor { side, address, value } => {
+                        self.sensors[side as usize].insert(address, value);
                         vec![]
                     }
                     Command::SetPin { pin, high } => {
@@ -143,11 +143,11 @@ fn exposure_gain_and_regulation_are_set_and_read_back() {
     assert!(vendor.auto_exposure().unwrap());
     vendor.set_auto_exposure(false).unwrap();
     assert!(!vendor.auto_exposure().unwrap());
-    vendor.set_exposure(Eye::Right, 37, 30.0).unwrap();
-    vendor.set_gain(Eye::Right, 80).unwrap();
-    assert_eq!(vendor.exposure(Eye::Right, 30.0).unwrap(), 37);
-    assert_eq!(vendor.gain(Eye::Right).unwrap(), Some(80));
-    assert_eq!(vendor.exposure(Eye::Left, 30.0).unwrap(), 0, "the other eye is as it was");
+    vendor.set_exposure(Side::Right, 37, 30.0).unwrap();
+    vendor.set_gain(Side::Right, 80).unwrap();
+    assert_eq!(vendor.exposure(Side::Right, 30.0).unwrap(), 37);
+    assert_eq!(vendor.gain(Side::Right).unwrap(), Some(80));
+    assert_eq!(vendor.exposure(Side::Left, 30.0).unwrap(), 0, "the other side is as it was");
     vendor.set_led(true).unwrap();
     // Only the switch's own bit changes, and 37 % of 1100 lines is 407 = 0x197, in sixteenths.
     assert_eq!(camera.system, BTreeMap::from([(0x8018_1033, 0xF0), (0x8018_1833, 0x50)]));
@@ -160,8 +160,11 @@ fn a_camera_that_takes_nothing_is_named() {
     let mut camera = Registers::new(384);
     camera.stuck = true;
     let mut vendor = Vendor::new(&mut camera, "ZED 31234 at 4-1").unwrap();
-    let e = vendor.set_exposure(Eye::Left, 50, 15.0).unwrap_err().to_string();
-    assert!(e.contains("ZED 31234 at 4-1: the camera does not take the exposure of its Left eye"), "{e}");
+    let e = vendor.set_exposure(Side::Left, 50, 15.0).unwrap_err().to_string();
+    assert!(
+        e.contains("ZED 31234 at 4-1: the camera does not take the exposure of its Left image sensor"),
+        "{e}"
+    );
     assert_eq!(vendor.set_auto_exposure(false).unwrap_err().kind(), ErrorKind::Protocol);
 }
 

@@ -1,10 +1,10 @@
 use super::*;
-use crate::usb::made::{MadeDevice, MadeTree};
+use crate::usb::fake::{FakeDevice, FakeTree};
 use crate::usb::scan;
 use std::os::unix::fs::symlink;
 
-fn video(port: &str, node: u32, speed: u32) -> MadeDevice {
-    MadeDevice {
+fn video(port: &str, node: u32, speed: u32) -> FakeDevice {
+    FakeDevice {
         id: (0x2b03, 0xf880),
         strings: ["Technologies, Inc.", "ZED 2i", ""],
         speed,
@@ -12,22 +12,22 @@ fn video(port: &str, node: u32, speed: u32) -> MadeDevice {
             (0, 0x0e, 1, "uvcvideo", vec![node, node + 1], vec![]),
             (1, 0x0e, 2, "uvcvideo", vec![], vec![]),
         ],
-        ..MadeDevice::new(port, 0)
+        ..FakeDevice::new(port, 0)
     }
 }
 
-fn motion(port: &str, serial: &'static str, hidraw: u32) -> MadeDevice {
-    MadeDevice {
+fn motion(port: &str, serial: &'static str, hidraw: u32) -> FakeDevice {
+    FakeDevice {
         id: (0x2b03, 0xf881),
         strings: ["STEREOLABS", "ZED-2i HID INTERFACE", serial],
         speed: 12,
         interfaces: vec![(0, 0x03, 0, "usbhid", vec![], vec![hidraw])],
-        ..MadeDevice::new(port, 0)
+        ..FakeDevice::new(port, 0)
     }
 }
 
 /// Makes `a` and `b` one socket, as the kernel links them.
-fn one_socket(tree: &MadeTree, a: &str, b: &str) {
+fn one_socket(tree: &FakeTree, a: &str, b: &str) {
     let folder = |port: &str| {
         let (hub, number) = match port.rsplit_once('.') {
             Some((hub, number)) => (hub.to_owned(), number),
@@ -43,11 +43,11 @@ fn one_socket(tree: &MadeTree, a: &str, b: &str) {
     symlink(at(folder(a)), at(format!("sys/bus/usb/devices/{a}")).join("port")).unwrap();
 }
 
-fn found(tree: &MadeTree) -> Vec<Found> {
+fn found(tree: &FakeTree) -> Vec<FoundCamera> {
     cameras(tree.root(), &scan(tree.root()).unwrap())
 }
 
-fn pairs(tree: &MadeTree) -> Vec<(String, Option<String>)> {
+fn pairs(tree: &FakeTree) -> Vec<(String, Option<String>)> {
     found(tree).into_iter().map(|f| (f.video.port.clone(), f.serial().map(str::to_owned))).collect()
 }
 
@@ -58,24 +58,24 @@ fn pair(port: &str, serial: &str) -> (String, Option<String>) {
 #[test]
 fn on_usb_2_both_halves_are_behind_the_cameras_hub() {
     let dir = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(dir.path());
-    // The motion units come first, and in the other order than the cameras.
+    let tree = FakeTree::new(dir.path());
+    // The IMUs come first, and in the other order than the cameras.
     tree.plug(&motion("1-3.2", "222", 0));
     tree.plug(&motion("1-4.2", "111", 1));
     tree.plug(&video("1-4.1", 4, 480));
     tree.plug(&video("1-3.1", 0, 480));
-    tree.plug(&MadeDevice::new("4-1", 8));
+    tree.plug(&FakeDevice::new("4-1", 8));
     assert_eq!(pairs(&tree), [pair("1-3.1", "222"), pair("1-4.1", "111")]);
     let camera = &found(&tree)[0];
     assert_eq!(camera.describe(), "ZED 2i 222 at USB port 1-3.1");
     assert!(camera.motion.as_ref().unwrap().interfaces[0].hidraw_nodes[0].ends_with("dev/hidraw0"));
-    assert_eq!(camera.firmware(), "80.209 (motion unit 80.209)");
+    assert_eq!(camera.firmware(), "80.209 (IMU 80.209)");
 }
 
 #[test]
 fn on_usb_3_the_kernel_says_which_ports_are_one_socket() {
     let dir = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(dir.path());
+    let tree = FakeTree::new(dir.path());
     tree.plug(&video("2-1", 0, 5000));
     tree.plug(&video("2-2", 4, 5000));
     // Behind a hub, whose two halves are at 1-9 and 2-5.
@@ -93,7 +93,7 @@ fn on_usb_3_the_kernel_says_which_ports_are_one_socket() {
 #[test]
 fn without_that_only_one_of_each_is_a_pair() {
     let dir = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(dir.path());
+    let tree = FakeTree::new(dir.path());
     tree.plug(&video("2-1", 0, 5000));
     assert_eq!(pairs(&tree), [("2-1".to_owned(), None)]);
     tree.plug(&motion("1-7.2", "111", 0));
@@ -101,16 +101,16 @@ fn without_that_only_one_of_each_is_a_pair() {
     tree.plug(&motion("1-8.2", "222", 1));
     assert_eq!(pairs(&tree), [("2-1".to_owned(), None)], "either could be it");
     let devices = scan(tree.root()).unwrap();
-    let port = |serial: &str| motion_unit(&devices, MODELS[0], serial).map(|d| d.port.as_str());
+    let port = |serial: &str| imu(&devices, MODELS[0], serial).map(|d| d.port.as_str());
     assert_eq!(
         [port("222"), port("333"), port("")],
         [Some("1-8.2"), None, None],
         "until the camera says its number"
     );
     // One of another model is not asked for.
-    let other = MadeDevice { id: (0x2b03, 0xf781), ..motion("1-2.2", "333", 2) };
+    let other = FakeDevice { id: (0x2b03, 0xf781), ..motion("1-2.2", "333", 2) };
     let dir = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(dir.path());
+    let tree = FakeTree::new(dir.path());
     tree.plug(&video("2-1", 0, 5000));
     tree.plug(&other);
     assert_eq!(pairs(&tree), [("2-1".to_owned(), None)]);
@@ -119,7 +119,7 @@ fn without_that_only_one_of_each_is_a_pair() {
 #[test]
 fn the_rig_says_which_camera_it_means() {
     let dir = tempfile::tempdir().unwrap();
-    let tree = MadeTree::new(dir.path());
+    let tree = FakeTree::new(dir.path());
     let none = candidates(found(&tree), None, None).unwrap_err();
     assert_eq!(none.kind(), ErrorKind::NotFound);
     assert!(none.to_string().contains("there is no ZED; is it plugged in?; no ZED is attached"), "{none}");
@@ -133,7 +133,8 @@ fn the_rig_says_which_camera_it_means() {
     tree.plug(&video("1-4.1", 4, 480));
     let which = ports(None, None).unwrap_err().to_string();
     assert!(
-        which.contains("which ZED is meant?") && which.contains("ZED 2i 222 at USB port 1-3.1, ZED 2i at"),
+        which.contains("several ZEDs are attached; select one")
+            && which.contains("ZED 2i 222 at USB port 1-3.1, ZED 2i at"),
         "{which}"
     );
     assert_eq!(ports(Some("1-3.1"), None).unwrap(), ["1-3.1"]);

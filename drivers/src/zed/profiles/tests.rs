@@ -38,11 +38,11 @@ fn each_mode_is_two_streams_and_the_default_is_hd720_at_30() {
             "left 1280x720 yuyv 60 Hz",
             "left 672x376 yuyv 100 Hz"
         ],
-        "a mode whose halves are no whole pixel pairs is left out"
+        "a mode whose halves split a pixel pair is left out"
     );
     assert_eq!(described(&all[4..]), left.iter().map(|l| l.replace("left", "right")).collect::<Vec<_>>());
     assert!(all.iter().all(|p| !p.intrinsics.is_known() && p.metadata == MetadataLevel::Kernel));
-    assert_eq!(all[0].frame_bytes() * 2, 3_686_400, "that of the side-by-side picture");
+    assert_eq!(all[0].frame_bytes() * 2, 3_686_400, "that of the side-by-side image");
     let e = profiles("ZED 2i 1 at USB port 1-1", &[], None).unwrap_err();
     assert!(e.to_string().contains("ZED 2i 1 at USB port 1-1: lists no side-by-side"), "{e}");
 }
@@ -67,22 +67,22 @@ fn both_eyes_have_one_mode() {
     let vga = Some((672, 376));
     assert_eq!(chosen(&[]).unwrap(), ["left 1280x720 yuyv 30 Hz", "right 1280x720 yuyv 30 Hz"]);
     assert_eq!(chosen(&[wanted("right", vga, None)]).unwrap(), ["right 672x376 yuyv 100 Hz"]);
-    // What one leaves open it takes from the other.
+    // A property that one leaves open is taken from the other.
     assert_eq!(
         chosen(&[wanted("right", None, None), wanted("left", Some((1280, 720)), Some(60.0))]).unwrap(),
         ["right 1280x720 yuyv 60 Hz", "left 1280x720 yuyv 60 Hz"]
     );
     let e = chosen(&[wanted("left", vga, None), wanted("right", Some((1280, 720)), None)]).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::Unsupported);
-    assert!(e.to_string().contains("both eyes come in one picture"), "{e}");
+    assert!(e.to_string().contains("left and right come in one frame"), "{e}");
     assert!(
         chosen(&[wanted("depth", None, None)]).unwrap_err().to_string().contains("it has: left 1280x720")
     );
 }
 
-/// The motion unit has a mode of its own, which no eye's wish changes, and the other way round.
+/// The IMU has a mode of its own, which no request for an image changes, and the other way round.
 #[test]
-fn the_motion_unit_is_chosen_beside_the_eyes() {
+fn the_imu_is_chosen_beside_the_images() {
     let mut all = profiles("ZED", &modes(), None).unwrap();
     all.push(crate::zed::imu::profile().unwrap());
     let chosen = |r: &[StreamRequest]| choose("ZED", &all, r).map(|c| described(&c));

@@ -1,10 +1,10 @@
-//! A recording as a camera of the rig: the same streams as a camera that is attached, at the recording's pace.
+//! Plays a recording as a camera of the rig: the same streams as an attached camera, at the recording's rate.
 
 use super::super::profiles::{clock, stream_name};
 use super::{Next, OpenOptions, Pair, Source, SourceInfo, open};
-use crate::pace::Pace;
+use crate::playback_clock::PlaybackClock;
 use crate::zed::CalibrationFile;
-use crate::zed::mode::Eye;
+use crate::zed::mode::Side;
 use crate::{
     Backend, Device, DeviceInfo, Error, ErrorKind, FrameSink, Gate, Poll, RawFrame, Result, Stream,
     StreamProfile, StreamRequest, choose_profiles,
@@ -15,7 +15,7 @@ use std::path::PathBuf;
 
 /// Which recording to play, and how.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct ReplayConfig {
+pub struct ZedPlaybackConfig {
     /// The folder or file.
     pub input: PathBuf,
     /// Serial number of the camera, when neither the recording nor the calibration's name says it.
@@ -28,20 +28,20 @@ pub struct ReplayConfig {
     pub looped: bool,
 }
 
-/// The backend `zed` with an input that is a recording.
+/// The backend `zed` with a recording as its input.
 #[derive(Debug, Clone)]
-pub struct ReplayBackend {
-    config: ReplayConfig,
+pub struct ZedPlaybackBackend {
+    config: ZedPlaybackConfig,
 }
 
-impl ReplayBackend {
+impl ZedPlaybackBackend {
     /// A backend for the one camera of `config`. Nothing is read before it is opened.
-    pub const fn new(config: ReplayConfig) -> Self {
+    pub const fn new(config: ZedPlaybackConfig) -> Self {
         Self { config }
     }
 
-    fn device(&self) -> Result<ReplayDevice> {
-        let ReplayConfig { input, serial, calibration, rate_hz, looped } = self.config.clone();
+    fn device(&self) -> Result<PlaybackDevice> {
+        let ZedPlaybackConfig { input, serial, calibration, rate_hz, looped } = self.config.clone();
         let source = open(&input, &OpenOptions { calibration, serial, rate_hz })?;
         let given = rate_hz.is_some();
         let s = source.info();
@@ -54,12 +54,12 @@ impl ReplayBackend {
             calibration: s.calibration_origin.clone(),
             motion: String::new(),
         };
-        let profiles = Eye::BOTH.into_iter().map(|eye| profile(s, eye)).collect::<Result<_>>()?;
-        Ok(ReplayDevice { info, profiles, source, looped, on_grid: given })
+        let profiles = Side::BOTH.into_iter().map(|side| profile(s, side)).collect::<Result<_>>()?;
+        Ok(PlaybackDevice { info, profiles, source, looped, on_grid: given })
     }
 }
 
-impl Backend for ReplayBackend {
+impl Backend for ZedPlaybackBackend {
     fn name(&self) -> &'static str {
         "zed"
     }
@@ -87,17 +87,17 @@ impl Backend for ReplayBackend {
     }
 }
 
-fn profile(s: &SourceInfo, eye: Eye) -> Result<StreamProfile> {
+fn profile(s: &SourceInfo, side: Side) -> Result<StreamProfile> {
     Ok(StreamProfile {
-        stream: stream_name(eye)?,
+        stream: stream_name(side)?,
         format: s.format,
         width: s.width,
         height: s.height,
         rate_hz: s.rate_hz,
         depth_unit_m: 0.0,
-        intrinsics: s.calibration.as_ref().map_or_else(Intrinsics::default, |c| c.intrinsics(eye)),
-        pose_in_device: s.calibration.as_ref().map_or(Pose::IDENTITY, |c| c.pose(eye)),
-        // The schedule is kept on the host's clock, as that of the backend `files`.
+        intrinsics: s.calibration.as_ref().map_or_else(Intrinsics::default, |c| c.intrinsics(side)),
+        pose_in_device: s.calibration.as_ref().map_or(Pose::IDENTITY, |c| c.pose(side)),
+        // The schedule runs on the host's clock, as that of the backend `files`.
         clock: clock(ClockDomain::Kernel),
         sequence_bits: 64,
         metadata: MetadataLevel::Kernel,
@@ -105,7 +105,7 @@ fn profile(s: &SourceInfo, eye: Eye) -> Result<StreamProfile> {
 }
 
 /// A recording that was opened.
-struct ReplayDevice {
+struct PlaybackDevice {
     info: DeviceInfo,
     profiles: Vec<StreamProfile>,
     source: Box<dyn Source>,
@@ -113,7 +113,7 @@ struct ReplayDevice {
     on_grid: bool,
 }
 
-impl Device for ReplayDevice {
+impl Device for PlaybackDevice {
     fn info(&self) -> &DeviceInfo {
         &self.info
     }
@@ -127,14 +127,14 @@ impl Device for ReplayDevice {
         let s = source.info();
         let name = format!("the recording {}", s.path.display());
         let chosen = choose_profiles(&name, &profiles, requests)?;
-        let right = stream_name(Eye::Right)?;
-        let eye_of = |p: &StreamProfile| if p.stream == right { Eye::Right } else { Eye::Left };
-        let ports = chosen.iter().enumerate().map(|(i, p)| (eye_of(p), Gate::new(i, p))).collect();
+        let right = stream_name(Side::Right)?;
+        let side_of = |p: &StreamProfile| if p.stream == right { Side::Right } else { Side::Left };
+        let ports = chosen.iter().enumerate().map(|(i, p)| (side_of(p), Gate::new(i, p))).collect();
         Ok(Box::new(Player {
             name,
             profiles: chosen,
             ports,
-            pace: Pace::new(s.rate_hz),
+            clock: PlaybackClock::new(s.rate_hz),
             period_ns: (1e9 / s.rate_hz) as i64,
             on_grid: on_grid || !s.timed,
             source,
@@ -153,7 +153,7 @@ impl Device for ReplayDevice {
 struct Round {
     /// Time of the recording's first pair.
     first: Option<i64>,
-    /// What the time within this round is added to.
+    /// Offset that is added to times within this round.
     begins: i64,
     /// The newest pair's time since the first one.
     newest: i64,
@@ -163,14 +163,14 @@ struct Round {
 struct Player {
     name: String,
     profiles: Vec<StreamProfile>,
-    ports: Vec<(Eye, Gate)>,
+    ports: Vec<(Side, Gate)>,
     source: Box<dyn Source>,
     looped: bool,
     on_grid: bool,
-    pace: Pace,
+    clock: PlaybackClock,
     period_ns: i64,
     pair: Pair,
-    /// The next pair is read, and whether it is whole.
+    /// `None` until the next pair has been read; then whether it is complete.
     ready: Option<bool>,
     /// Running number of the next pair.
     count: u64,
@@ -195,7 +195,8 @@ impl Player {
             Next::Damaged(why) => {
                 self.damaged += 1;
                 if self.damaged.is_power_of_two() {
-                    let (pair, times) = (self.pair.index, self.damaged);
+                    let pair = self.pair.index;
+                    let times = self.damaged;
                     tracing::warn!(
                         recording = self.name,
                         pair,
@@ -214,12 +215,12 @@ impl Player {
     /// When the pair that was read is due.
     fn due(&mut self, now: HostTime) -> HostTime {
         if self.on_grid {
-            return self.pace.due(self.count, now);
+            return self.clock.due(self.count, now);
         }
         let time = self.pair.capture_time_ns;
         let since = time.saturating_sub(*self.round.first.get_or_insert(time)).max(0);
         self.round.newest = since.max(self.round.newest);
-        self.pace.due_at(self.round.begins.saturating_add(since), now)
+        self.clock.due_at(self.round.begins.saturating_add(since), now)
     }
 }
 
@@ -229,9 +230,9 @@ impl Stream for Player {
     }
 
     fn poll(&mut self, timeout: Duration, sink: &mut dyn FrameSink) -> Result<Poll> {
-        self.pace.attendance.enter(HostTime::now());
+        self.clock.attendance.enter(HostTime::now());
         let polled = self.play(timeout, sink);
-        self.pace.attendance.leave(HostTime::now());
+        self.clock.attendance.leave(HostTime::now());
         polled
     }
 }
@@ -248,19 +249,19 @@ impl Player {
         if due > deadline.max(now) {
             return Ok(Poll::Idle);
         }
-        self.pace.attendance.delivered();
+        self.clock.attendance.delivered();
         let whole = self.ready.take().unwrap_or(false);
-        let number = self.count + self.pace.missed();
+        let number = self.count + self.clock.missed();
         let ticks = u64::try_from(due.ns()).unwrap_or(0);
-        for (eye, gate) in &mut self.ports {
-            let picture = self.pair.eye(*eye);
-            let mut raw = RawFrame::new(number, ticks, HostTime::now(), picture.len().max(1));
+        for (side, gate) in &mut self.ports {
+            let image = self.pair.image(*side);
+            let mut raw = RawFrame::new(number, ticks, HostTime::now(), image.len().max(1));
             raw.damaged = !whole;
             gate.deliver(&raw, sink, |memory| {
-                if memory.len() != picture.len() {
+                if memory.len() != image.len() {
                     return Err(DropReason::WrongSize);
                 }
-                memory.copy_from_slice(picture);
+                memory.copy_from_slice(image);
                 Ok(())
             });
         }

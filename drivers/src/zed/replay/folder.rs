@@ -1,10 +1,11 @@
-//! A folder of side-by-side images: PNG or JPEG, left half the left eye, in the order of the numbers in their names.
+//! A folder of side-by-side images: PNG or JPEG, the left image in the left half, in the order of the numbers in their
+//! names.
 //!
-//! A name whose last number has 19 digits is taken for the pair's time in nanoseconds, where all names have one.
+//! If the last number of every name has 19 digits, it is the pair's time in nanoseconds.
 
 use super::{DEFAULT_RATE_HZ, Next, OpenOptions, Pair, Source, SourceInfo, calibration};
+use crate::files::image_file::{Info, Kind, decode, io_error, probe};
 use crate::files::pattern::Key;
-use crate::files::picture::{Info, Kind, decode, io_error, probe};
 use crate::unpack::{Half, copy_half};
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::PixelFormat;
@@ -16,34 +17,35 @@ const TIME_DIGITS: usize = 19;
 /// An open folder.
 pub(super) struct Folder {
     info: SourceInfo,
-    picture: Info,
+    image: Info,
     images: Vec<PathBuf>,
     times: Vec<i64>,
     next: usize,
-    /// A whole picture of both eyes.
+    /// A complete side-by-side image.
     both: Vec<u8>,
 }
 
 impl Folder {
     pub(super) fn open(path: &Path, options: &OpenOptions) -> Result<Self> {
         let images = images(path)?;
-        let picture = alike(&images)?;
+        let image = alike(&images)?;
         let bad = |what: String| Error::new(ErrorKind::BadInput, format!("{}: {what}", path.display()));
-        if !picture.width.is_multiple_of(2) {
+        if !image.width.is_multiple_of(2) {
             return Err(bad(format!(
-                "the images are {picture}, and an odd width is no two eyes; they must be side by side, the left eye left"
+                "the images are {image}; a side-by-side image has an even width, with the left image in its left half"
             )));
         }
-        let format = match picture.kind {
+        let format = match image.kind {
             Kind::Rgb8 => PixelFormat::Rgb8,
             Kind::Grey8 => PixelFormat::Mono8,
             Kind::Grey16 => {
-                return Err(bad(format!("the images are {picture}; eyes see 8-bit colour or grey")));
+                return Err(bad(format!("the images are {image}; supported are 8-bit colour and grey")));
             }
         };
-        let (width, height) = (picture.width / 2, picture.height);
+        let width = image.width / 2;
+        let height = image.height;
         let wanted = options.serial.clone().unwrap_or_default();
-        let (calibration, calibration_origin, of) = calibration(path, options, &wanted, (width, height))?;
+        let (calibration, calibration_origin, of) = calibration(path, options, &wanted, width, height)?;
         let times = times(&images);
         let recorded = times.as_ref().and_then(|t| rate_of(t));
         let info = SourceInfo {
@@ -59,11 +61,11 @@ impl Folder {
             calibration,
             calibration_origin,
         };
-        let both = vec![0; picture.bytes() as usize];
+        let both = vec![0; image.bytes() as usize];
         let times = times.unwrap_or_else(|| {
             (0..images.len()).map(|i| (i as f64 * 1e9 / info.rate_hz).round() as i64).collect()
         });
-        Ok(Self { info, picture, images, times, next: 0, both })
+        Ok(Self { info, image, images, times, next: 0, both })
     }
 }
 
@@ -81,16 +83,16 @@ impl Source for Folder {
         let Some((image, time)) = self.images.get(i).zip(self.times.get(i)) else { return Ok(Next::End) };
         self.next += 1;
         (pair.index, pair.capture_time_ns) = (i as u64, *time);
-        match decode(image, &self.picture, &mut self.both) {
+        match decode(image, &self.image, &mut self.both) {
             Ok(()) => {}
             Err(e) if e.kind() == ErrorKind::BadInput => return Ok(Next::Damaged(e.to_string())),
             Err(e) => return Err(Error::new(ErrorKind::Io, e.to_string()).with_source(e)),
         }
-        let bytes = self.info.eye_bytes();
-        let stride = self.info.format.row_bytes(self.picture.width) as usize;
-        for (half, eye) in [(Half::Left, &mut pair.left), (Half::Right, &mut pair.right)] {
-            eye.resize(bytes, 0);
-            if let Err(reason) = copy_half(&self.both, stride, stride / 2, half, eye) {
+        let bytes = self.info.image_bytes();
+        let stride = self.info.format.row_bytes(self.image.width) as usize;
+        for (half, pixels) in [(Half::Left, &mut pair.left), (Half::Right, &mut pair.right)] {
+            pixels.resize(bytes, 0);
+            if let Err(reason) = copy_half(&self.both, stride, stride / 2, half, pixels) {
                 return Ok(Next::Damaged(format!("{}: {}", image.display(), reason.name())));
             }
         }
@@ -119,9 +121,9 @@ fn images(folder: &Path) -> Result<Vec<PathBuf>> {
     }
     if found.is_empty() {
         let cure = if dataset {
-            "it is a dataset; replay it with depthrig zed replay, or play it with depthrig replay"
+            "it is a dataset; recompute its depth with depthrig zed replay, or replay it with depthrig replay"
         } else {
-            "write each pair as one PNG or JPEG, the left eye in its left half"
+            "write each pair as one PNG or JPEG, the left image in its left half"
         };
         let what = format!("{} has no side-by-side images (*.png, *.jpg); {cure}", folder.display());
         return Err(Error::new(ErrorKind::BadInput, what));
@@ -130,14 +132,15 @@ fn images(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(found.into_iter().map(|(_, path)| path).collect())
 }
 
-/// What all the images are.
+/// Format of the images, which must be the same in all.
 fn alike(images: &[PathBuf]) -> Result<Info> {
     let mut first: Option<(&Path, Info)> = None;
     for path in images {
         let info = probe(path)?;
         let (first_path, first) = *first.get_or_insert((path, info));
         if info != first {
-            let (a, b) = (first_path.display(), path.display());
+            let a = first_path.display();
+            let b = path.display();
             let what = format!("{a} is {first}, but {b} is {info}; the images of a recording must be alike");
             return Err(Error::new(ErrorKind::BadInput, what));
         }

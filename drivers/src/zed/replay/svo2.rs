@@ -1,14 +1,14 @@
-//! SVO2 files: an MCAP container with both eyes as JPEG strips or H.264.
+//! SVO2 files: an MCAP container with side-by-side images as JPEG strips or H.264.
 //!
-//! There is no official description. What is read here is what others found out about files of SDK 4 and 5
-//! (`RadarML/open-svo2`, `docs/format.md`, and two independent readers), and it is said plainly when a file is not like
-//! that: H.265 is not decoded, encrypted files (SDK 5.3) cannot be. The vendor's own converter turns any of them into
-//! images, which the folder input plays.
+//! The format has no official description. This reader follows what others found out about files of SDK 4 and 5
+//! (`RadarML/open-svo2`, `docs/format.md`, and two independent readers) and reports an error for any other file:
+//! H.265 and encrypted files (SDK 5.3) are unsupported. The vendor's own converter turns any of them into images, which
+//! the folder input plays.
 //!
 //! | topic | holds |
 //! |---|---|
-//! | `svo_header` | JSON; its `header` is 128 bytes in base64: width and height of both eyes, serial number, rate |
-//! | `Camera_SN…/side_by_side` | one message per pair, [`payload`] says in which forms; `log_time` is UTC |
+//! | `svo_header` | JSON; its `header` is 128 bytes in base64: width and height of both images, serial number, rate |
+//! | `Camera_SN…/side_by_side` | one message per pair, in the forms of [`payload`]; `log_time` is UTC |
 
 use super::folder::rate_of;
 use super::{DEFAULT_RATE_HZ, Next, OpenOptions, Pair, Source, SourceInfo, calibration};
@@ -28,11 +28,11 @@ use header::Header;
 use payload::{Footer, Payload};
 use strips::Strips;
 
-/// What the user can do with a file that is not understood.
+/// The cure for a file in an unsupported format.
 const CONVERT: &str = "convert it with the vendor's tools (ZED_SVO_Editor, or their svo-conversion-tool container) to \
                        side-by-side images and play that folder";
 
-/// How the pictures are decoded.
+/// How the images are decoded.
 enum Decoder {
     Strips(Strips),
     H264(Box<H264>),
@@ -55,20 +55,22 @@ impl Svo2 {
         let header = Header::parse(container.header()).map_err(named)?;
         let mut message = Message::default();
         let bad = |kind, what: String| Error::new(kind, format!("{}: {what}", path.display()));
-        let (decoder, (width, height)) =
-            first_picture(&mut container, &mut message, &header).map_err(named)?;
+        let (decoder, (width, height)) = first_image(&mut container, &mut message, &header).map_err(named)?;
         if !header.fits(width, height) {
-            let (w, h) = (header.width, header.height);
+            let w = header.width;
+            let h = header.height;
             return Err(bad(
                 ErrorKind::BadInput,
                 format!(
-                    "its header says {w}x{h} and its pictures have {width}x{height} pixels; the file is damaged"
+                    "its header says {w}x{h} and its images have {width}x{height} pixels; the file is damaged"
                 ),
             ));
         }
-        // Two pixels of YUYV share a colour, in each eye.
+        // Two pixels of YUYV share a colour, in each image.
         if !width.is_multiple_of(4) {
-            let what = format!("its pictures have {width}x{height} pixels, which are no two eyes of YUYV");
+            let what = format!(
+                "its images have {width}x{height} pixels; side-by-side YUYV has a width that is a multiple of 4"
+            );
             return Err(bad(ErrorKind::BadInput, what));
         }
         let serial = options
@@ -77,7 +79,7 @@ impl Svo2 {
             .or_else(|| header.serial())
             .or_else(|| container.serial())
             .unwrap_or_default();
-        let (calibration, calibration_origin, _) = calibration(path, options, &serial, (width / 2, height))?;
+        let (calibration, calibration_origin, _) = calibration(path, options, &serial, width / 2, height)?;
         let own = f64::from(header.rate_hz);
         let recorded = Some(own).filter(|r| *r > 0.0 && *r <= super::MAX_RATE_HZ);
         let mut svo = Self {
@@ -107,8 +109,8 @@ impl Svo2 {
     }
 }
 
-/// The decoder for the file's pictures and their size, both eyes together, from the first of them.
-fn first_picture(
+/// The decoder for the file's images and the size of the side-by-side image, from the first of them.
+fn first_image(
     container: &mut Container,
     message: &mut Message,
     header: &Header,
@@ -126,8 +128,8 @@ fn first_picture(
         }
         match Payload::parse(&message.data) {
             Payload::Strips(s) => match strips::size(&s) {
-                Some(size) => return Ok((Decoder::Strips(Strips::new(size)), size)),
-                None => last = Some(Error::new(ErrorKind::BadInput, "its first pictures are damaged JPEG")),
+                Some(size) => return Ok((Decoder::Strips(Strips::new(size.0, size.1)), size)),
+                None => last = Some(Error::new(ErrorKind::BadInput, "its first images are damaged JPEG")),
             },
             Payload::H264(unit, footer) => {
                 let mut decoder = Box::new(H264::new()?);
@@ -135,12 +137,12 @@ fn first_picture(
                 match size {
                     Some(size) => return Ok((Decoder::H264(decoder), size)),
                     None => {
-                        last = Some(Error::new(ErrorKind::BadInput, "its first pictures are damaged H.264"));
+                        last = Some(Error::new(ErrorKind::BadInput, "its first images are damaged H.264"));
                     }
                 }
             }
             Payload::H265 => {
-                let what = format!("its pictures are H.265, which is not decoded here; {CONVERT}");
+                let what = format!("its images are H.265, which is not decoded here; {CONVERT}");
                 return Err(Error::new(ErrorKind::Unsupported, what));
             }
             Payload::Unknown(why) => {
@@ -149,7 +151,7 @@ fn first_picture(
                     format!("it is encrypted ({of}); only the vendor's SDK has the key: {CONVERT}")
                 } else {
                     format!(
-                        "its pictures are neither JPEG strips nor H.264 ({why}; {of}): it is encrypted, or of an SDK that \
+                        "its images are neither JPEG strips nor H.264 ({why}; {of}): it is encrypted, or of an SDK that \
                          writes them in another way; {CONVERT}"
                     )
                 };
@@ -158,14 +160,15 @@ fn first_picture(
         }
     }
     Err(last.unwrap_or_else(|| {
-        Error::new(ErrorKind::BadInput, "it has no pictures; the recording was not finished, or is damaged")
+        Error::new(ErrorKind::BadInput, "it has no images; the recording was not finished, or is damaged")
     }))
 }
 
-/// What the fuzz target `zed_svo2` calls, and the test that runs its corpus: how many pairs were decoded.
+/// The body of the fuzz target `zed_svo2`, which the test of its corpus also calls; returns the number of decoded
+/// pairs.
 ///
 /// # Panics
-/// When more pairs come than the file says, or a picture has another size than its strips.
+/// When more pairs come than the file says, or an image has another size than its strips.
 #[doc(hidden)]
 pub fn fuzz(bytes: &[u8]) -> u64 {
     const MOST: u64 = 64;
@@ -176,7 +179,9 @@ pub fn fuzz(bytes: &[u8]) -> u64 {
     if let Ok(header) = Header::parse(container.header()) {
         let _ = (header.describe(), header.serial());
     }
-    let (mut message, mut came, mut decoded) = (Message::default(), 0, 0);
+    let mut message = Message::default();
+    let mut came = 0;
+    let mut decoded = 0;
     while came < MOST && container.next(&mut message).unwrap_or(false) {
         came += 1;
         assert!(came <= container.frames(), "more pairs than there are");
@@ -185,9 +190,9 @@ pub fn fuzz(bytes: &[u8]) -> u64 {
             && let Some((width, height)) =
                 strips::size(&parts).filter(|(w, h)| (*w as usize) * (*h as usize) <= SMALL)
         {
-            let eye = vec![0; width as usize * height as usize];
-            let mut pair = Pair { left: eye.clone(), right: eye, ..Pair::default() };
-            decoded += u64::from(Strips::new((width, height)).decode(&parts, &mut pair).is_ok());
+            let image = vec![0; width as usize * height as usize];
+            let mut pair = Pair { left: image.clone(), right: image, ..Pair::default() };
+            decoded += u64::from(Strips::new(width, height).decode(&parts, &mut pair).is_ok());
         }
     }
     // From the middle on there are as many as were left.
@@ -220,13 +225,13 @@ impl Source for Svo2 {
         if let Some(why) = self.message.damaged.take() {
             return Ok(Next::Damaged(why));
         }
-        let bytes = self.info.eye_bytes();
+        let bytes = self.info.image_bytes();
         pair.left.resize(bytes, 0);
         pair.right.resize(bytes, 0);
         let done = match (&mut self.decoder, Payload::parse(&self.message.data)) {
             (Decoder::Strips(decoder), Payload::Strips(strips)) => decoder.decode(&strips, pair),
             (Decoder::H264(decoder), Payload::H264(unit, _)) => decoder.decode(unit, &self.info, pair),
-            (_, other) => Err(format!("it is {}, and the pictures before it are not", other.name())),
+            (_, other) => Err(format!("it is {}, and the images before it are not", other.name())),
         };
         Ok(done.map_or_else(Next::Damaged, |()| Next::Pair))
     }
@@ -237,7 +242,7 @@ impl Source for Svo2 {
             decoder.restart()?;
             from = 0;
             self.container.seek(index)?;
-            // A picture is made of those since its key frame, whose number the file says.
+            // An image depends on those since its key frame, whose number the file states.
             if self.container.next(&mut self.message)?
                 && let Payload::H264(_, Some(footer)) = Payload::parse(&self.message.data)
                 && let Some(key) = footer.key_of(index)

@@ -8,39 +8,39 @@ use crate::{ErrorKind, MemorySink};
 use depthrig_bus::{ClockDomain, DropReason, HostTime, MotionFlags, MotionSample};
 use std::sync::mpsc::{SyncSender, sync_channel};
 
-/// Pictures of 8x3 pixels of both eyes, with two bytes between rows.
+/// Side-by-side images of 8x3 pixels, with two bytes between rows.
 const STRIDE: usize = 18;
 const ROWS: usize = 3;
 
-struct Made {
+struct FakeImage {
     sequence: u64,
     bytes: Vec<u8>,
     damaged: bool,
     kernel: Option<i64>,
 }
 
-impl Made {
+impl FakeImage {
     fn new(sequence: u64) -> Self {
         let bytes = (0..STRIDE * ROWS).map(|i| (i as u8) ^ (sequence as u8).wrapping_mul(0x55)).collect();
         let now = HostTime::now().ns();
         Self { sequence, bytes, damaged: false, kernel: Some(now - 5_000_000 + sequence as i64) }
     }
 
-    fn eye(&self, eye: Eye) -> Vec<u8> {
-        let begin = if eye == Eye::Left { 0 } else { 8 };
+    fn image(&self, side: Side) -> Vec<u8> {
+        let begin = if side == Side::Left { 0 } else { 8 };
         (0..ROWS).flat_map(|y| self.bytes[y * STRIDE + begin..][..8].to_vec()).collect()
     }
 }
 
-struct Pictures(Vec<Made>);
+struct Images(Vec<FakeImage>);
 
-impl PictureSource for Pictures {
-    fn poll(&mut self, _: Duration, each: &mut dyn FnMut(&Picture<'_>)) -> Result<bool> {
+impl ImageSource for Images {
+    fn poll(&mut self, _: Duration, each: &mut dyn FnMut(&Image<'_>)) -> Result<bool> {
         if self.0.is_empty() {
             return Err(Error::new(ErrorKind::Disconnected, "unplugged"));
         }
         for m in self.0.drain(..) {
-            each(&Picture {
+            each(&Image {
                 source: 0,
                 bytes: &m.bytes,
                 damaged: m.damaged,
@@ -54,7 +54,7 @@ impl PictureSource for Pictures {
     }
 }
 
-fn stream(eyes: &[Eye], made: Vec<Made>, settled: Option<Receiver<Result<()>>>) -> ZedStream {
+fn stream(sides: &[Side], images: Vec<FakeImage>, settled: Option<Receiver<Result<()>>>) -> ZedStream {
     let mode = Mode {
         format: FourCc(*b"YUYV"),
         width: 8,
@@ -62,11 +62,11 @@ fn stream(eyes: &[Eye], made: Vec<Made>, settled: Option<Receiver<Result<()>>>) 
         interval: Interval { numerator: 1, denominator: 30 },
     };
     let all = profiles("ZED", &[mode], None).unwrap();
-    let chosen = eyes.iter().map(|e| (*e, all[usize::from(*e == Eye::Right)].clone())).collect();
+    let chosen = sides.iter().map(|s| (*s, all[usize::from(*s == Side::Right)].clone())).collect();
     ZedStream::new(
         "ZED 2i 7 at USB port 1-1".to_owned(),
         chosen,
-        Box::new(Pictures(made)),
+        Box::new(Images(images)),
         STRIDE,
         None,
         settled,
@@ -74,19 +74,20 @@ fn stream(eyes: &[Eye], made: Vec<Made>, settled: Option<Receiver<Result<()>>>) 
 }
 
 #[test]
-fn each_eye_gets_its_half_once_with_the_kernels_time() {
-    let made = || [7, 8, 9].map(Made::new);
-    let (mut sink, source) = (MemorySink::default(), made());
+fn each_side_gets_its_half_once_with_the_kernels_time() {
+    let images = || [7, 8, 9].map(FakeImage::new);
+    let mut sink = MemorySink::default();
+    let source = images();
     let times: Vec<_> = source.iter().map(|m| m.kernel.unwrap()).collect();
     let before = crate::unpack::copied_bytes();
-    let mut s = stream(&Eye::BOTH, source.into(), None);
+    let mut s = stream(&Side::BOTH, source.into(), None);
     assert_eq!(s.poll(Duration::ZERO, &mut sink).unwrap(), Poll::Frame);
     assert!(crate::unpack::copied_bytes() - before >= 3 * 16 * ROWS as u64);
     assert_eq!(sink.frames.len(), 6);
-    for (n, want) in made().iter().enumerate() {
-        for (i, eye) in Eye::BOTH.into_iter().enumerate() {
+    for (n, want) in images().iter().enumerate() {
+        for (i, side) in Side::BOTH.into_iter().enumerate() {
             let (stream, meta, pixels) = &sink.frames[2 * n + i];
-            assert_eq!((*stream, pixels), (i, &want.eye(eye)));
+            assert_eq!((*stream, pixels), (i, &want.image(side)));
             assert_eq!((meta.device_sequence, meta.capture_time.ns()), (want.sequence, times[n]));
             assert_eq!(meta.clock_domain, ClockDomain::Kernel);
             assert!(meta.temperature_c.is_nan());
@@ -98,38 +99,38 @@ fn each_eye_gets_its_half_once_with_the_kernels_time() {
 }
 
 #[test]
-fn one_eye_alone_is_the_first_stream() {
+fn one_side_alone_is_the_first_stream() {
     let mut sink = MemorySink::default();
-    let mut s = stream(&[Eye::Right], vec![Made::new(3)], None);
+    let mut s = stream(&[Side::Right], vec![FakeImage::new(3)], None);
     assert_eq!(s.profiles()[0].stream.as_str(), "right");
     s.poll(Duration::ZERO, &mut sink).unwrap();
     assert_eq!((sink.frames.len(), sink.frames[0].0), (1, 0));
-    assert_eq!(sink.frames[0].2, Made::new(3).eye(Eye::Right));
+    assert_eq!(sink.frames[0].2, FakeImage::new(3).image(Side::Right));
 }
 
-/// Every picture that is not whole costs each eye one frame, with its reason.
+/// Every incomplete image costs each side one frame, with its reason.
 #[test]
-fn pictures_that_are_not_whole_are_counted_for_both_eyes() {
+fn incomplete_images_are_counted_for_both_sides() {
     let cut = |sequence, bytes: usize| {
-        let mut m = Made::new(sequence);
+        let mut m = FakeImage::new(sequence);
         m.bytes.resize(bytes, 0);
         m
     };
-    let damaged = Made { damaged: true, ..Made::new(2) };
+    let damaged = FakeImage { damaged: true, ..FakeImage::new(2) };
     let whole = STRIDE * ROWS;
     // Number 6 never comes.
-    let made = vec![
-        Made::new(1),
+    let images = vec![
+        FakeImage::new(1),
         damaged,
         cut(3, whole - 1),
         cut(4, whole + 1),
         cut(5, 0),
         cut(7, 1),
-        Made::new(8),
-        Made::new(8),
+        FakeImage::new(8),
+        FakeImage::new(8),
     ];
     let mut sink = MemorySink::default();
-    let mut s = stream(&Eye::BOTH, made, None);
+    let mut s = stream(&Side::BOTH, images, None);
     s.poll(Duration::ZERO, &mut sink).unwrap();
     for i in 0..2 {
         let drops = sink.drops_of(i);
@@ -151,7 +152,7 @@ fn pictures_that_are_not_whole_are_counted_for_both_eyes() {
 fn an_eye_without_memory_does_not_cost_the_other() {
     let mut sink = MemorySink::default();
     sink.refuse = 1;
-    let mut s = stream(&Eye::BOTH, vec![Made::new(1)], None);
+    let mut s = stream(&Side::BOTH, vec![FakeImage::new(1)], None);
     s.poll(Duration::ZERO, &mut sink).unwrap();
     assert_eq!(sink.drops_of(0).get(DropReason::NoSlot), 1);
     assert_eq!((sink.delivered(0), sink.delivered(1)), (0, 1));
@@ -160,27 +161,27 @@ fn an_eye_without_memory_does_not_cost_the_other() {
 #[test]
 fn a_camera_that_cannot_be_set_ends_the_stream_with_the_reason() {
     let (send, receive) = sync_channel(1);
-    let mut s = stream(&Eye::BOTH, vec![Made::new(1)], Some(receive));
+    let mut s = stream(&Side::BOTH, vec![FakeImage::new(1)], Some(receive));
     let mut sink = MemorySink::default();
     assert_eq!(s.poll(Duration::ZERO, &mut sink).unwrap(), Poll::Frame, "nothing is known yet");
     send.send(Err(Error::new(ErrorKind::Protocol, "does not take the gain"))).unwrap();
     assert!(s.poll(Duration::ZERO, &mut sink).unwrap_err().to_string().contains("does not take the gain"));
     let (send, receive) = sync_channel(1);
-    let mut s = stream(&Eye::BOTH, vec![Made::new(1)], Some(receive));
+    let mut s = stream(&Side::BOTH, vec![FakeImage::new(1)], Some(receive));
     send.send(Ok(())).unwrap();
     assert_eq!(s.poll(Duration::ZERO, &mut sink).unwrap(), Poll::Frame);
 }
 
 #[test]
-fn sizes_are_told_apart() {
-    // Whole, too long, nothing, and what is short of a whole one whatever it rounds to.
+fn wrong_sizes_stay_wrong_for_each_side() {
+    // Complete, too long, empty, and incomplete whatever it rounds to.
     let sizes = [100, 101, 0, 99, 98, 1].map(|came| own_bytes(came, 100, 50));
     assert_eq!(sizes, [50, 51, 0, 49, 49, 1]);
-    // Rows with much padding: half of what came could be more than an eye has.
+    // Rows with much padding: half of what came could be more than one side has.
     assert_eq!(own_bytes(199, 200, 50), 49);
 }
 
-/// A motion unit that says what it is given, and is gone when nobody gives any more.
+/// A fake IMU that sends the given records, and is gone when the sender is dropped.
 struct Unit(std::sync::mpsc::Receiver<Record>);
 
 impl Reports for Unit {
@@ -215,8 +216,8 @@ fn record(n: u64) -> Record {
     }
 }
 
-/// A camera with a unit that has sent the records in `numbers`, all of which were read from it.
-fn with_unit(made: Vec<Made>, numbers: impl Iterator<Item = u64>) -> (ZedStream, SyncSender<Record>) {
+/// A camera with an IMU that has sent the records in `numbers`, all of which were read from it.
+fn with_unit(images: Vec<FakeImage>, numbers: impl Iterator<Item = u64>) -> (ZedStream, SyncSender<Record>) {
     let (send, records) = sync_channel(4096);
     let wanted = numbers.map(|n| send.send(record(n)).unwrap()).count() as u64;
     let (unit, samples) = Motion::start_streaming(Box::new(Unit(records)), "ZED 2i 7").unwrap();
@@ -225,7 +226,7 @@ fn with_unit(made: Vec<Made>, numbers: impl Iterator<Item = u64>) -> (ZedStream,
         assert!(!until.from_now().is_zero(), "the records are not read");
         std::thread::sleep(Duration::from_millis(1));
     }
-    let mut s = stream(&Eye::BOTH, made, None);
+    let mut s = stream(&Side::BOTH, images, None);
     s.motion = Some(unit);
     (s.with_imu(imu::profile().unwrap(), samples), send)
 }
@@ -237,18 +238,18 @@ fn motion_of(sink: &MemorySink, stream: usize) -> Vec<MotionSample> {
 #[test]
 fn every_sample_of_the_unit_is_in_a_batch_with_its_values() {
     // Numbers 20 to 22 never come.
-    let (mut s, _unit) = with_unit(vec![Made::new(1)], (0..20).chain(23..100));
+    let (mut s, _unit) = with_unit(vec![FakeImage::new(1)], (0..20).chain(23..100));
     assert_eq!(s.profiles()[2].describe(), imu::profile().unwrap().describe());
     let mut sink = MemorySink::default();
     assert_eq!(s.poll(Duration::ZERO, &mut sink).unwrap(), Poll::Frame);
-    // What does not fill a batch goes when it is old.
-    s.pictures = Some(Box::new(Silent));
+    // A batch that does not fill goes when it is old.
+    s.images = Some(Box::new(Silent));
     std::thread::sleep(crate::motion::LONGEST);
     assert_eq!(s.poll(Duration::ZERO, &mut sink).unwrap(), Poll::Frame);
     assert_eq!((sink.delivered(0), sink.delivered(1)), (1, 1));
     let samples = motion_of(&sink, 2);
     let numbers: Vec<_> = samples.iter().map(|m| m.sequence).collect();
-    assert_eq!(numbers, (1..21).chain(24..101).collect::<Vec<_>>(), "a gap where the unit gave none");
+    assert_eq!(numbers, (1..21).chain(24..101).collect::<Vec<_>>(), "a gap where the IMU gave none");
     let sizes: Vec<_> = sink.frames.iter().filter(|f| f.0 == 2).map(|f| f.2.len() / 64).collect();
     assert_eq!(sizes, [16, 16, 16, 16, 16, 16, 1]);
     assert_eq!(sink.drops_of(2).total(), 0);
@@ -277,16 +278,16 @@ fn every_sample_of_the_unit_is_in_a_batch_with_its_values() {
     }
 }
 
-/// Nobody reads for longer than the queue is: what had no room is counted as lost here.
+/// Samples that the full queue has no room for are counted as lost here.
 #[test]
-fn a_queue_that_is_full_costs_whole_batches_that_are_counted() {
+fn a_full_queue_costs_complete_batches_that_are_counted() {
     const SENT: u64 = 1024 + 40;
     let (mut s, unit) = with_unit(Vec::new(), 0..SENT);
-    s.pictures = Some(Box::new(Silent));
+    s.images = Some(Box::new(Silent));
     let mut sink = MemorySink::default();
     s.poll(Duration::ZERO, &mut sink).unwrap();
     assert_eq!(motion_of(&sink, 2).len(), 1024);
-    assert_eq!(sink.drops_of(2).total(), 0, "not known before the next sample tells");
+    assert_eq!(sink.drops_of(2).total(), 0, "not known before the next sample reports it");
     for n in SENT..SENT + 16 {
         unit.send(record(n)).unwrap();
     }
@@ -304,19 +305,19 @@ fn a_queue_that_is_full_costs_whole_batches_that_are_counted() {
     assert_eq!(s.motion().unwrap().tally().overflowed, 40);
 }
 
-/// Pictures that do not come.
+/// Images that do not come.
 struct Silent;
 
-impl PictureSource for Silent {
-    fn poll(&mut self, patience: Duration, _: &mut dyn FnMut(&Picture<'_>)) -> Result<bool> {
-        std::thread::sleep(patience);
+impl ImageSource for Silent {
+    fn poll(&mut self, timeout: Duration, _: &mut dyn FnMut(&Image<'_>)) -> Result<bool> {
+        std::thread::sleep(timeout);
         Ok(false)
     }
 }
 
 #[test]
-fn a_unit_that_is_gone_ends_no_pictures_but_a_camera_of_nothing_else() {
-    let (mut s, unit) = with_unit(vec![Made::new(1)], 0..3);
+fn a_unit_that_is_gone_ends_no_images_but_a_camera_of_nothing_else() {
+    let (mut s, unit) = with_unit(vec![FakeImage::new(1)], 0..3);
     drop(unit);
     let until = HostTime::now().plus(Duration::from_secs(20));
     while s.motion().unwrap().problem().is_none() {
@@ -326,7 +327,7 @@ fn a_unit_that_is_gone_ends_no_pictures_but_a_camera_of_nothing_else() {
     let mut sink = MemorySink::default();
     assert_eq!(s.poll(Duration::ZERO, &mut sink).unwrap(), Poll::Frame);
     assert_eq!((sink.delivered(0), sink.delivered(1)), (1, 1));
-    s.pictures = Some(Box::new(Silent));
+    s.images = Some(Box::new(Silent));
     assert_eq!(s.poll(Duration::from_millis(150), &mut sink).unwrap(), Poll::Frame, "the last three samples");
     assert_eq!(motion_of(&sink, 2).len(), 3);
     assert_eq!(s.poll(Duration::from_millis(5), &mut sink).unwrap(), Poll::Idle);
@@ -334,7 +335,7 @@ fn a_unit_that_is_gone_ends_no_pictures_but_a_camera_of_nothing_else() {
     let (send, records) = sync_channel(64);
     (0..16).for_each(|n| send.send(record(n)).unwrap());
     let (motion, samples) = Motion::start_streaming(Box::new(Unit(records)), "ZED 2i 7").unwrap();
-    let alone = ZedStream::without_pictures("ZED 2i 7 at USB port 1-1".to_owned(), motion);
+    let alone = ZedStream::without_images("ZED 2i 7 at USB port 1-1".to_owned(), motion);
     let mut alone = alone.with_imu(imu::profile().unwrap(), samples);
     assert_eq!(alone.profiles().len(), 1);
     let mut sink = MemorySink::default();
@@ -350,5 +351,5 @@ fn a_unit_that_is_gone_ends_no_pictures_but_a_camera_of_nothing_else() {
         }
     };
     assert_eq!(gone.kind(), ErrorKind::Disconnected);
-    assert!(gone.to_string().contains("its motion unit is no longer read: pulled"), "{gone}");
+    assert!(gone.to_string().contains("its IMU is no longer read: pulled"), "{gone}");
 }

@@ -32,8 +32,8 @@ in a rig file:
   backend = "external"
   command = ["python3", "-m", "depthrig.oak", "--serial", "18443010B1D25A0F00"]
 
-exit codes: 0 asked to stop, or files at their end and all delivered; 2 this cannot work; 3 no such camera; 4 the camera
-is gone; 5 files at their end, and the daemon does not have all of their frames.
+exit codes: 0 stopped, or end of the files and all delivered; 2 invalid arguments or installation; 3 no such camera;
+4 camera gone; 5 end of the files, and the daemon does not have all of their frames.
 """
 
 
@@ -49,8 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (DepthrigError, ValueError) as e:
         log.error("%s", e)
         return int(Exit.USAGE if isinstance(e, ValueError) else Exit.FAILED)
-    except RuntimeError as e:  # what the SDK raises when it loses the camera
-        log.error("the SDK gave up: %s", e)
+    except RuntimeError as e:  # the SDK raises this when it loses the camera
+        log.error("the SDK failed: %s", e)
         return int(Exit.LOST)
     finally:
         # Objects of the SDK that only the interpreter's end would free make it crash there.
@@ -105,13 +105,13 @@ def _run(options: argparse.Namespace) -> Exit:
 
 
 def _account(bridge: Bridge) -> Exit:
-    """Return whether the daemon has all that was played."""
+    """Return whether the daemon has every frame that was played."""
     if bridge.missing:
         what = ", ".join(f"{n} {stream}" for stream, n in bridge.missing.items())
         log.error("frames of the files that the daemon did not get: %s", what)
         return Exit.UNDELIVERED
     if not bridge.confirmed:
-        log.error("every frame was sent, but the daemon did not say that it has taken the last ones")
+        log.error("every frame was sent, but the daemon did not confirm the last ones")
         return Exit.UNDELIVERED
     return Exit.DONE
 
@@ -139,7 +139,7 @@ def _source(options: argparse.Namespace, stack: contextlib.ExitStack) -> Source:
         flood=options.flood,
         undistorted=not options.keep_distortion,
         usb2=options.usb2,
-        patience_s=options.wait,
+        timeout_s=options.wait,
     )
     source, device = _device.open_camera(wishes)
     stack.callback(device.close)
@@ -168,20 +168,20 @@ def _size(text: str) -> tuple[int, int]:
     try:
         return int(width), int(height)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no size: write 1280x720") from None
+        raise argparse.ArgumentTypeError(f"invalid size {text!r}; write it as 1280x720") from None
 
 
 def _share(text: str) -> float:
     value = float(text)
     if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
+        raise argparse.ArgumentTypeError(f"{text} is out of range 0 to 1")
     return value
 
 
 def _rate(text: str) -> float:
     value = float(text)
     if not 0 < value <= 240:
-        raise argparse.ArgumentTypeError(f"{text} is no rate between 0 and 240 Hz")
+        raise argparse.ArgumentTypeError(f"rate {text} is out of range 0 to 240 Hz")
     return value
 
 
@@ -192,15 +192,15 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--camera", help="the camera's name in the rig file; by default what the daemon says")
-    parser.add_argument("--rig", help="the rig's name; by default what the daemon says, or the only one that runs")
-    parser.add_argument("--runtime-dir", help="the runtime folder; by default this user's")
-    parser.add_argument("--serial", help="the camera's serial number; needed when there are several")
+    parser.add_argument("--camera", help="camera name in the rig file [default: set by the daemon]")
+    parser.add_argument("--rig", help="rig name [default: set by the daemon, else the only one running]")
+    parser.add_argument("--runtime-dir", help="runtime folder [default: this user's]")
+    parser.add_argument("--serial", help="serial number of the camera; required with several attached")
     parser.add_argument("--replay", type=Path, metavar="FOLDER", help="play the files of FOLDER in place of a camera")
-    parser.add_argument("--once", action="store_true", help="play them once, from when the daemon wants frames, and end")
+    parser.add_argument("--once", action="store_true", help="play them once, from the first session, and exit")
     parser.add_argument("--record", type=Path, metavar="FOLDER", help="also write every frame into FOLDER for --replay")
     parser.add_argument("--wait", type=float, default=5.0, metavar="SECONDS", help="how long to look for the camera")
-    parser.add_argument("--list", action="store_true", help="list the cameras that are attached, and end")
+    parser.add_argument("--list", action="store_true", help="list the attached cameras and exit")
     parser.add_argument("--streams", nargs="+", choices=("color", "depth"), default=["color", "depth"])
     parser.add_argument("--size", type=_size, default=(1280, 720), metavar="WxH", help="of colour, and so of depth")
     parser.add_argument("--fps", type=_rate, default=30.0, help="frames per second")
@@ -209,7 +209,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--dots", type=_share, metavar="0..1", help="intensity of the infrared dot projector")
     parser.add_argument("--flood", type=_share, metavar="0..1", help="intensity of the infrared flood light")
     parser.add_argument(
-        "--keep-distortion", action="store_true", help="deliver colour as the lens has it; depth then lies beside it"
+        "--keep-distortion", action="store_true", help="keep colour distorted; depth is not aligned to it"
     )
     parser.add_argument("--usb2", action="store_true", help="keep to USB2")
     return parser

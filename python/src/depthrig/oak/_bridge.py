@@ -1,4 +1,4 @@
-"""The loop between the SDK's queues and the daemon: what the frames are, and each on its way."""
+"""The loop from the SDK's queues to the daemon: derives the modes, forwards the frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .._external_session import ExternalSession
 from .._layout import ExternalClock, PixelFormat
 from . import _lens
 from ._errors import Exit, OakError
-from ._hopper import Hopper
+from ._lossless import LosslessQueue
 from ._source import Source
 
 log = logging.getLogger("depthrig.oak")
@@ -45,9 +45,9 @@ def microseconds(value: datetime.timedelta) -> int:
 
 
 def pixels(frame: dai.ImgFrame) -> npt.NDArray[Any]:
-    """Return a frame's pixels where the SDK has them, without a copy: `(H, W, 3)` u8, `(H, W)` u8 or u16, rows padded.
+    """Return a frame's pixels in the SDK's memory, without a copy: `(H, W, 3)` u8, `(H, W)` u8 or u16, rows padded.
 
-    Raises OakError when there are fewer than the frame says.
+    Raises OakError when there are fewer than the frame's header states.
     """
     kind = _FORMATS[frame.getType().name]
     data: npt.NDArray[Any] = np.asarray(frame.getData())
@@ -55,7 +55,7 @@ def pixels(frame: dai.ImgFrame) -> npt.NDArray[Any]:
     size = {PixelFormat.BGR8: 3, PixelFormat.RGB8: 3, PixelFormat.Z16: 2}.get(kind, 1)
     rows = height * 3 // 2 if kind is PixelFormat.NV12 else height
     if kind is PixelFormat.NV12 and frame.getPlaneHeight() != height:
-        # The planes are apart: the one way of storing that is no single array.
+        # The planes are apart: the only layout that is not a single array.
         plane = stride * frame.getPlaneHeight()
         bright, tint = data[: stride * height], data[plane : plane + stride * height // 2]
         data = np.concatenate((bright, tint))
@@ -73,7 +73,7 @@ def pixels(frame: dai.ImgFrame) -> npt.NDArray[Any]:
 
 
 def mode_of(stream: str, frame: dai.ImgFrame, source: Source, undistorted: bool) -> ExternalMode:
-    """Return the mode that a first frame shows."""
+    """Return the mode of a stream from its first frame."""
     name = frame.getType().name
     kind = _FORMATS.get(name)
     if kind is None or (kind is PixelFormat.Z16) != (stream == "depth"):
@@ -100,7 +100,7 @@ def mode_of(stream: str, frame: dai.ImgFrame, source: Source, undistorted: bool)
 
 
 class Bridge:
-    """A running pipeline and what it is served as."""
+    """A running pipeline, and the camera as which it is served."""
 
     def __init__(self, source: Source, *, undistorted: bool) -> None:
         self._source = source
@@ -109,21 +109,21 @@ class Bridge:
         self.sent = dict.fromkeys(source.outputs, 0)
         """Frames that were sent, by stream."""
         self.confirmed = False
-        """Whether the daemon said at the end of the files that it has taken what was sent."""
+        """Whether the daemon confirmed at the end of the files that it has every frame sent."""
         self._wanted: set[str] = set()
-        self._hopper = None if source.frames is None else Hopper(source.outputs)
+        self._lossless = None if source.frames is None else LosslessQueue(source.outputs)
         self._held: list[tuple[str, dai.ImgFrame]] = []
 
     def start(self) -> None:
-        """Start the pipeline and look at a frame of each stream.
+        """Start the pipeline and examine a frame of each stream.
 
         Raises OakError when a stream gives none, or the pipeline cannot start.
         """
         source = self._source
         source.open_queues()
-        if self._hopper is not None:
+        if self._lossless is not None:
             for name, queue in source.queues.items():
-                queue.addCallback(_into(self._hopper, name))
+                queue.addCallback(_into(self._lossless, name))
         try:
             source.pipeline.start()
         except RuntimeError as e:
@@ -133,7 +133,7 @@ class Bridge:
         while len(first) < len(source.queues):
             for stream, frame in self._frames():
                 first.setdefault(stream, frame)
-                if self._hopper is not None:
+                if self._lossless is not None:
                     self._held.append((stream, frame))
             silent = [stream for stream in source.queues if stream not in first]
             if silent and time.monotonic() > deadline:
@@ -146,9 +146,9 @@ class Bridge:
         self.modes = [mode_of(stream, frame, source, self._undistorted) for stream, frame in first.items()]
 
     def _frames(self) -> list[tuple[str, dai.ImgFrame]]:
-        """Wait a moment for frames; return those there are, with their streams."""
-        if self._hopper is not None:
-            return self._hopper.take(_WAIT_S)
+        """Wait a moment for frames; return them with their streams."""
+        if self._lossless is not None:
+            return self._lossless.take(_WAIT_S)
         queues = self._source.queues
         try:
             dai.MessageQueue.waitAny(list(queues.values()), datetime.timedelta(seconds=_WAIT_S))
@@ -164,14 +164,14 @@ class Bridge:
 
     @property
     def missing(self) -> dict[str, int]:
-        """Frames of the files that the daemon did not get, of the streams that it wanted; all of them when it never did."""
+        """Frames of the files that the daemon did not get, of the streams that it wanted; all if it wanted none."""
         frames = self._source.frames or {}
         left = {stream: frames[stream] - self.sent[stream] for stream in self._wanted or frames}
         return {stream: n for stream, n in left.items() if n > 0}
 
     def serve(self, camera: ExternalCamera) -> None:
         """Send frames as long as the daemon wants them, until the camera is stopped or the pipeline ends."""
-        once = self._hopper is not None
+        once = self._lossless is not None
         try:
             while not camera.stopped:
                 session = camera.wait(_WAIT_S if once else 0.0)
@@ -179,16 +179,16 @@ class Bridge:
                     with session:
                         if not self._play(session, once):
                             return
-                # Nobody wants them: they are taken all the same, or a session would begin with old ones. Those of files
-                # that are played once wait for somebody.
+                # Unwanted frames are taken all the same, or a session would begin with old ones. Those of files
+                # that are played once wait for a session.
                 elif not once and not self._frames() and not self.is_running:
                     return
         finally:
-            if self._hopper is not None:
-                self._hopper.close()
+            if self._lossless is not None:
+                self._lossless.close()
 
     def _play(self, session: ExternalSession, once: bool) -> bool:
-        """Send frames while the session lasts; false when no more will come."""
+        """Send frames while the session lasts; return false when no more will come."""
         log.info("session %d: %s", session.number, ", ".join(map(str, session.streams.values())))
         session.start(lossless=once)
         self._wanted |= set(session.streams)
@@ -200,15 +200,15 @@ class Bridge:
         return True
 
     def _pass_on(self, session: ExternalSession) -> bool:
-        """Send what came; false when no more will come."""
-        running = self.is_running  # before looking: what comes at the very end is taken too
+        """Send the frames that came; return false when no more will come."""
+        running = self.is_running  # before reading: the very last frames are taken too
         frames = self._held or self._frames()
         self._held = []
         arrival_ns = time.monotonic_ns()
         for i, (stream, frame) in enumerate(frames):
             if stream not in session.streams:
                 continue
-            if not self._send(session, stream, frame, arrival_ns) and self._hopper is not None:
+            if not self._send(session, stream, frame, arrival_ns) and self._lossless is not None:
                 self._held = frames[i:]  # for the next session
                 break
         return bool(frames) or running
@@ -233,11 +233,11 @@ class Bridge:
         return sent
 
 
-def _into(hopper: Hopper, stream: str) -> Callable[[str, Any], None]:
-    """Return what the SDK calls with each message of a queue."""
+def _into(queue: LosslessQueue, stream: str) -> Callable[[str, Any], None]:
+    """Return the callback for each message of a queue."""
 
     def put(_: str, message: Any) -> None:
         if isinstance(message, dai.ImgFrame):
-            hopper.put(stream, message)
+            queue.put(stream, message)
 
     return put

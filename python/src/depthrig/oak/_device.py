@@ -1,4 +1,4 @@
-"""A real camera: chosen by its serial number, its pipeline, what it says of itself."""
+"""A real camera: its choice by serial number, its pipeline, its description."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from ._source import Identity, Source
 log = logging.getLogger("depthrig.oak")
 
 _STEREO_SIZE = (640, 400)
-"""What the mono sensors of every OAK-D can give, and the depth engine of an RVC2 can work on at 30 Hz."""
+"""A size that the mono sensors of every OAK-D deliver and the depth engine of an RVC2 processes at 30 Hz."""
 
 
 @dataclass(frozen=True)
 class Wishes:
-    """What the user wants of the camera."""
+    """The user's settings for the camera."""
 
     serial: str | None = None
     size: tuple[int, int] = (1280, 720)
@@ -34,16 +34,16 @@ class Wishes:
     undistorted: bool = True
     usb2: bool = False
     """Keep to USB2 also on a USB3 port."""
-    patience_s: float = 5.0
+    timeout_s: float = 5.0
     """How long to look for the camera: after a firmware upload, or a restart, it enumerates anew."""
 
 
-def find(serial: str | None, patience_s: float) -> dai.DeviceInfo:
+def find(serial: str | None, timeout_s: float) -> dai.DeviceInfo:
     """Return the camera with this serial number, or the only one there is; waits for one that is starting up.
 
     Raises OakError, naming those that are there.
     """
-    deadline = time.monotonic() + patience_s
+    deadline = time.monotonic() + timeout_s
     while True:
         free = list(dai.Device.getAllAvailableDevices())
         fitting = [d for d in free if serial is None or d.getDeviceId() == serial]
@@ -92,9 +92,9 @@ def port(device: dai.DeviceInfo) -> str:
 def open_camera(wishes: Wishes) -> tuple[Source, dai.Device]:
     """Open the camera and build its pipeline; nothing streams yet.
 
-    Raises OakError when it is not there, is in use, or cannot do what is wished.
+    Raises OakError when it is not there, is in use, or does not support the settings.
     """
-    info = find(wishes.serial, wishes.patience_s)
+    info = find(wishes.serial, wishes.timeout_s)
     try:
         device = dai.Device(info, dai.UsbSpeed.HIGH if wishes.usb2 else dai.UsbSpeed.SUPER_PLUS)
     except RuntimeError as e:
@@ -113,7 +113,7 @@ def open_camera(wishes: Wishes) -> tuple[Source, dai.Device]:
 
 def build(device: dai.Device, info: dai.DeviceInfo, wishes: Wishes) -> Source:
     """Build the pipeline of an open camera: colour, and depth seen from where colour is taken."""
-    # Both reset the camera's clock without a word to the bridge.
+    # Both reset the camera's clock without notice.
     device.setMaxReconnectionAttempts(0)
     sockets = list(device.getConnectedCameras())
     socket = dai.CameraBoardSocket

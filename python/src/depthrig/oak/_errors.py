@@ -1,4 +1,4 @@
-"""What ends the bridge, and with which exit code."""
+"""The errors that end the bridge, with their exit codes."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from ..errors import DepthrigError
 
 
 class Exit(enum.IntEnum):
-    """Exit codes of the bridge. The daemon starts it again after each; `USAGE` is what only a human can cure."""
+    """Exit codes of the bridge. The daemon starts it again after each; `USAGE` needs a human to fix."""
 
     DONE = 0
-    """It was asked to stop, or its files are at their end and the daemon has every frame."""
+    """It was stopped, or its files are at their end and the daemon has every frame."""
     FAILED = 1
-    """Something else; the message says what."""
+    """Another failure; the message names it."""
     USAGE = 2
     """The command line, the files or the installation cannot work."""
     NO_CAMERA = 3
-    """The camera is not there, or somebody else has it."""
+    """The camera is missing, or another process holds it."""
     LOST = 4
     """The camera was there and is gone: unplugged, or its firmware stopped."""
     UNDELIVERED = 5
@@ -30,4 +30,4 @@ class OakError(DepthrigError):
     def __init__(self, message: str, code: Exit = Exit.FAILED) -> None:
         super().__init__(message)
         self.code = code
-        """What the process ends with."""
+        """Exit code of the process."""

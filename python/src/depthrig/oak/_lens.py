@@ -1,4 +1,4 @@
-"""Intrinsics as depthrig states them, out of what the SDK says of a frame or of the camera's calibration."""
+"""Intrinsics as depthrig states them, from the SDK's metadata of a frame or from the camera's calibration."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def intrinsics(
 
 
 def unknown() -> Intrinsics:
-    """Return what stands for no calibration."""
+    """Return the intrinsics that stand for no calibration."""
     return Intrinsics(0.0, 0.0, 0.0, 0.0, (0.0,) * _KEPT, int(Distortion.UNKNOWN), 0)
 
 
@@ -51,7 +51,7 @@ def distortion(model: str, coefficients: Sequence[float]) -> tuple[Distortion, t
         return Distortion.KANNALA_BRANDT4, tuple(values)
     raise OakError(
         f"its lens is described by a {model} model with {len(values)} coefficients, for which a frame's header has no "
-        "room; leave --keep-distortion out, then the camera itself undistorts its pictures"
+        "room; leave --keep-distortion out, then the camera itself undistorts its images"
     )
 
 
@@ -77,7 +77,7 @@ def of_calibration(
         matrix: Any = calibration.getCameraIntrinsics(socket, width, height)
         model = calibration.getDistortionModel(socket).name
         coefficients = calibration.getDistortionCoefficients(socket)
-    except RuntimeError:  # the SDK's way to say so
+    except RuntimeError:  # the SDK reports it this way
         return None
     if undistorted:
         return intrinsics(matrix)

@@ -1,6 +1,6 @@
-"""Files in place of a camera, through a pipeline of the SDK that runs on this computer alone.
+"""Plays files in place of a camera, through a pipeline of the SDK that runs on this computer alone.
 
-A folder holds either what `--record` wrote, `color.mcap` and `depth.mcap` in the SDK's own format, or pictures:
+A folder holds either the output of `--record`, `color.mcap` and `depth.mcap` in the SDK's own format, or images:
 `color/*.png|jpg` and `depth/*.png` (16 bit, millimetres), paired in the order of their names. `calibration.json` beside
 them is a calibration as the SDK writes it (`CalibrationHandler.eepromToJsonFile`).
 """
@@ -31,10 +31,10 @@ _FOOTER = struct.Struct("<BQQQI8s")
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER_OPCODE, _STATISTICS_OPCODE = 2, 11
 _MOST_OF_A_SUMMARY = 64 << 20
-_PICTURES = (".png", ".jpg", ".jpeg")
+_IMAGES = (".png", ".jpg", ".jpeg")
 _STREAMS = ("color", "depth")
 _CLOCK_BEGINS = 100.0
-"""What the clock of a camera made of pictures shows at its start, seconds: none that the computer's could be."""
+"""Start of the clock of a camera that plays images, seconds: a value that the computer's clock cannot have."""
 
 
 def open_folder(
@@ -45,7 +45,7 @@ def open_folder(
     Raises OakError for a folder that has no frames, or files that cannot be read, naming them.
     """
     if not folder.is_dir():
-        raise OakError(f"{folder} is no folder", Exit.USAGE)
+        raise OakError(f"{folder} is not a folder", Exit.USAGE)
     calibration = _calibration(folder / CALIBRATION)
     pipeline = dai.Pipeline(False)
     files = {name: folder / f"{name}.mcap" for name in streams if (folder / f"{name}.mcap").is_file()}
@@ -53,7 +53,7 @@ def open_folder(
         outputs = _recordings(pipeline, files, loop)
         counts = {} if loop else {name: _messages(path) for name, path in files.items()}
     else:
-        outputs, counts = _pictures(pipeline, folder, streams, calibration, rate_hz, loop)
+        outputs, counts = _images(pipeline, folder, streams, calibration, rate_hz, loop)
     data = calibration.getEepromData() if calibration is not None else None
     model = (data.productName or data.deviceName or data.boardName) if data is not None else ""
     identity = Identity(
@@ -81,7 +81,7 @@ def _calibration(path: Path) -> dai.CalibrationHandler | None:
     try:
         return dai.CalibrationHandler(path)
     except (RuntimeError, ValueError) as e:
-        raise OakError(f"{path} is no calibration of an OAK camera ({e})", Exit.USAGE) from e
+        raise OakError(f"{path} is not a calibration of an OAK camera ({e})", Exit.USAGE) from e
 
 
 def _recordings(pipeline: dai.Pipeline, files: dict[str, Path], loop: bool) -> dict[str, dai.Node.Output]:
@@ -95,7 +95,7 @@ def _recordings(pipeline: dai.Pipeline, files: dict[str, Path], loop: bool) -> d
     return outputs
 
 
-def _pictures(
+def _images(
     pipeline: dai.Pipeline,
     folder: Path,
     streams: tuple[str, ...],
@@ -103,25 +103,25 @@ def _pictures(
     rate_hz: float,
     loop: bool,
 ) -> tuple[dict[str, dai.Node.Output], dict[str, int]]:
-    """Add a node that makes frames of pictures; returns its outputs and how many pictures each has."""
+    """Add a node that turns images into frames; return its outputs and how many images each has."""
     paths = {name: _listed(folder / name) for name in streams}
     paths = {name: found for name, found in paths.items() if found}
     if not paths:
         raise OakError(
-            f"{folder} has neither recordings ({' or '.join(f'{n}.mcap' for n in streams)}) nor pictures "
+            f"{folder} has neither recordings ({' or '.join(f'{n}.mcap' for n in streams)}) nor images "
             f"({' or '.join(f'{n}/*.png' for n in streams)})",
             Exit.USAGE,
         )
     counts = {name: len(found) for name, found in paths.items()}
     if len(set(counts.values())) > 1:
-        told = ", ".join(f"{n} {name}" for name, n in counts.items())
-        raise OakError(f"{folder}: its pictures are no pairs, there are {told}", Exit.USAGE)
+        listed = ", ".join(f"{n} {name}" for name, n in counts.items())
+        raise OakError(f"{folder}: its images do not form pairs, there are {listed}", Exit.USAGE)
     frames = {name: [_read(name, path) for path in found] for name, found in paths.items()}
-    transformations = {name: _transformation(calibration, pictures[0]) for name, pictures in frames.items()}
+    transformations = {name: _transformation(calibration, images[0]) for name, images in frames.items()}
     kinds = {2: dai.ImgFrame.Type.RAW16, 3: dai.ImgFrame.Type.BGR888i}
 
-    class Pictures(dai.node.ThreadedHostNode):
-        """The sensor that is not there: pictures at their time, with numbers and times of a clock of its own."""
+    class Images(dai.node.ThreadedHostNode):
+        """Replaces the sensor: images at their time, with numbers and times of a clock of its own."""
 
         def __init__(self) -> None:
             super().__init__()
@@ -132,14 +132,14 @@ def _pictures(
             number = 0
             while self.isRunning() and (loop or number < next(iter(counts.values()))):
                 due = number / rate_hz
-                if not loop:  # whoever takes the frames may have let this wait: what is late is not made good by a burst
+                if not loop:  # the consumer may have blocked this: delays are not made up by a burst
                     start = max(start, time.monotonic() - due)
                 time.sleep(max(0.0, start + due - time.monotonic()))
                 for name, port in self.ports.items():
-                    pictures = frames[name]
-                    picture = pictures[number % len(pictures)]
+                    images = frames[name]
+                    image = images[number % len(images)]
                     frame = dai.ImgFrame()
-                    frame.setCvFrame(picture, kinds[picture.ndim])
+                    frame.setCvFrame(image, kinds[image.ndim])
                     frame.setSequenceNum(number)
                     frame.setTimestamp(datetime.timedelta(seconds=began + due))
                     frame.setTimestampDevice(datetime.timedelta(seconds=_CLOCK_BEGINS + due))
@@ -151,13 +151,13 @@ def _pictures(
             time.sleep(_LAST_FRAMES_S)
             self.stopPipeline()
 
-    return dict(pipeline.create(Pictures).ports), counts
+    return dict(pipeline.create(Images).ports), counts
 
 
 def _messages(path: Path) -> int:
-    """Return how many messages a recording says it has: the statistics in the summary of an MCAP file (mcap.dev/spec).
+    """Return the number of messages of a recording: the statistics in the summary of an MCAP file (mcap.dev/spec).
 
-    Raises OakError for a file that has none, as one has that was not written to its end.
+    Raises OakError for a file without statistics, such as one that was not written to its end.
     """
     with path.open("rb") as file:
         size = file.seek(0, 2)
@@ -181,34 +181,34 @@ def _messages(path: Path) -> int:
 
 
 def _listed(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in _PICTURES) if folder.is_dir() else []
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in _IMAGES) if folder.is_dir() else []
 
 
 def _read(stream: str, path: Path) -> npt.NDArray[Any]:
-    """Read a picture: blue, green, red for colour, 16 bits for depth."""
+    """Read an image: blue, green, red for colour, 16 bits for depth."""
     try:
-        image = importlib.import_module("PIL.Image")
+        pillow = importlib.import_module("PIL.Image")
     except ImportError as e:
-        raise OakError(f"pictures are read with Pillow, which cannot be imported ({e}); {INSTALL}", Exit.USAGE) from e
+        raise OakError(f"images are read with Pillow, which cannot be imported ({e}); {INSTALL}", Exit.USAGE) from e
     try:
-        with image.open(path) as picture:
+        with pillow.open(path) as image:
             if stream == "color":
-                return np.ascontiguousarray(np.asarray(picture.convert("RGB"))[..., ::-1])
-            depth = np.asarray(picture)
+                return np.ascontiguousarray(np.asarray(image.convert("RGB"))[..., ::-1])
+            depth = np.asarray(image)
     except OSError as e:
         raise OakError(f"{path} cannot be read ({e})", Exit.USAGE) from e
     if depth.ndim != 2 or depth.dtype.kind not in "iu" or depth.min() < 0 or depth.max() > 0xFFFF:
         raise OakError(
-            f"{path} is no depth: one channel of 16 bits is needed, it has {depth.shape} {depth.dtype}", Exit.USAGE
+            f"{path} is not a depth image: it needs one channel of 16 bits, not {depth.shape} {depth.dtype}", Exit.USAGE
         )
     return np.ascontiguousarray(depth.astype(np.uint16))
 
 
 def _transformation(
-    calibration: dai.CalibrationHandler | None, picture: npt.NDArray[Any]
+    calibration: dai.CalibrationHandler | None, image: npt.NDArray[Any]
 ) -> dai.ImgTransformation | None:
-    """Return what the SDK hangs onto a frame to say how it was taken; None without a calibration."""
-    height, width = picture.shape[:2]
+    """Return the SDK's description of how a frame was taken; None without a calibration."""
+    height, width = image.shape[:2]
     socket = dai.CameraBoardSocket.CAM_A
     if calibration is None or _lens.of_calibration(calibration, socket, width, height, True) is None:
         return None

@@ -1,4 +1,4 @@
-"""Looks for `depthai` before it is used: there or not, of a version that this was tested with, told how to behave."""
+"""Imports `depthai`, checks that its version was tested, and configures it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def load() -> Any:
 
     Raises OakError when it is not installed, or older than what the bridge was tested with.
     """
-    # A camera that came back by itself has another clock and another frame counter, which nobody would be told: the
+    # A camera that reconnects by itself has another clock and another frame counter, without any notice: the
     # bridge ends instead, and the daemon starts it again.
     os.environ.setdefault("DEPTHAI_RECONNECT_TIMEOUT", "0")
     os.environ.setdefault("DEPTHAI_LEVEL", "warn")

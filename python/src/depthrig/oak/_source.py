@@ -1,4 +1,4 @@
-"""Where frames come from: a running pipeline of the SDK with a queue for each stream, be it a camera's or of files."""
+"""The source of frames: a running pipeline of the SDK, of a camera or of files, with a queue for each stream."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ if TYPE_CHECKING:
     import depthai as dai
 
 CALIBRATION = "calibration.json"
-"""The file with the calibration, beside recordings and pictures."""
+"""The file with the calibration, beside recordings and images."""
 QUEUE = 4
-"""Frames that may wait for the bridge; the oldest gives way, and its number is missing from the camera's count."""
+"""Frames that may wait for the bridge; the oldest is replaced, and its number is missing from the camera's count."""
 
 
 @dataclass
 class Identity:
-    """What the camera says of itself."""
+    """Description of the camera."""
 
     model: str
     serial: str
@@ -32,17 +32,17 @@ class Source:
 
     pipeline: dai.Pipeline
     outputs: dict[str, dai.Node.Output]
-    """What the queues are fed by, for recording."""
+    """The outputs that feed the queues, for recording."""
     identity: Identity
     rate_hz: float
     calibration: dai.CalibrationHandler | None = None
-    """Of the camera; None when there is none."""
+    """The camera's calibration; None without one."""
     sockets: dict[str, dai.CameraBoardSocket] = field(default_factory=dict)
     """The sensor that each stream looks from."""
     notes: list[str] = field(default_factory=list)
-    """What the user should know, one line each."""
+    """Notes for the user, one line each."""
     frames: dict[str, int] | None = None
-    """Frames of each stream, for files that are played once; None for what never ends."""
+    """Frames of each stream, for files that are played once; None for an endless source."""
     queues: dict[str, dai.MessageQueue] = field(default_factory=dict)
 
     def open_queues(self) -> None:

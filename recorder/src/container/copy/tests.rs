@@ -28,7 +28,7 @@ fn recorded(sets: u64) -> (MemFs, PathBuf) {
         });
     }
     let options = RecorderOptions {
-        // Another type for the picture, and a chunk that is not packed.
+        // Another type for the image, and a chunk that is not packed.
         depth: crate::DepthCodec::Rank,
         min_free_bytes: 0,
         reserve_bytes: 0,
@@ -39,7 +39,7 @@ fn recorded(sets: u64) -> (MemFs, PathBuf) {
     for n in 0..sets {
         let frame = |(i, s): (usize, &StreamRecord)| {
             let mut header = FrameHeader::default();
-            header.set_picture(s.format, s.width, s.height);
+            header.set_image(s.format, s.width, s.height);
             let bytes = s.format.frame_bytes(s.width, s.height);
             let pixels = (0..bytes).map(|k| (k as u64 * (n + 3) % 251) as u8).collect::<Vec<_>>();
             RecordFrame { stream: i, header, pixels: Box::new(pixels) }
@@ -66,7 +66,8 @@ fn copied(bytes: Vec<u8>) -> (Vec<u8>, Vec<u64>, u64, Vec<Damage>) {
     let (preamble, first) = read_preamble(&reader).unwrap();
     let mut copy = Segment::create(&fs, Path::new("/d"), 7, &preamble).unwrap();
     let mut groups = Groups::new(&reader, &preamble, first).unwrap();
-    let (mut ids, mut damage) = (Vec::new(), Vec::new());
+    let mut ids = Vec::new();
+    let mut damage = Vec::new();
     while let Some(group) = groups.next().unwrap() {
         copy.append_group(&group).unwrap();
         match group {

@@ -1,6 +1,6 @@
-//! `calibration.json`: what the pictures are of, and how a pixel becomes a ray and a distance.
+//! `calibration.json`: what the images are of, and how a pixel becomes a ray and a distance.
 
-use super::pictures::MAX_SIDE;
+use super::images::MAX_SIDE;
 use crate::{Error, ErrorKind, Result, Session, StreamRecord};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -34,7 +34,7 @@ pub(super) struct SessionFacts {
     pub rig_config: String,
 }
 
-/// One stream: the pictures `folder/prefix_N.ending`.
+/// One stream: the images `folder/prefix_N.ending`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct StreamFacts {
     pub folder: String,
@@ -49,7 +49,7 @@ pub(super) struct StreamFacts {
     /// Metres per unit in the recording, where the files have another unit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub recorded_depth_unit_m: Option<f64>,
-    /// What the files hold: format, size, `depth_unit_m`, intrinsics with distortion, pose, where they come from.
+    /// Description of the files: format, size, `depth_unit_m`, intrinsics with distortion, pose, where they come from.
     #[serde(flatten)]
     pub stream: StreamRecord,
 }
@@ -104,11 +104,11 @@ impl Calibration {
             }
             let size = [s.stream.width, s.stream.height];
             if !size.iter().all(|side| (1..=MAX_SIDE).contains(side)) {
-                return Err(bad(format!("stream {id} is {}x{}, which is no picture", size[0], size[1])));
+                return Err(bad(format!("stream {id} is {}x{}, an invalid image size", size[0], size[1])));
             }
             let is_folder = |name: &String| !name.contains(['/', ',']) && !name.starts_with('.');
             if !is_folder(&s.folder) || s.prefix.contains(['/', ',']) || !s.copies.iter().all(is_folder) {
-                return Err(bad(format!("stream {id} lies in \"{}\", which is no folder here", s.folder)));
+                return Err(bad(format!("stream {id} lies in \"{}\", an invalid folder name", s.folder)));
             }
         }
         Ok(read)

@@ -44,12 +44,12 @@ impl ByteCameraExport {
     /// With depth PNGs in units of `depth_unit_m`, or as the cameras count when `None`.
     ///
     /// # Errors
-    /// [`ErrorKind::BadInput`] for a unit that is none.
+    /// [`ErrorKind::BadInput`] for an invalid unit.
     pub fn new(names: CameraNames, depth_unit_m: Option<f64>) -> Result<Self> {
         if let Some(unit) = depth_unit_m
             && !(1e-6..=1.0).contains(&unit)
         {
-            let what = format!("a depth unit of {unit} m makes no sense; write metres, such as 0.001");
+            let what = format!("invalid depth unit {unit} m; use metres per unit, such as 0.001");
             return Err(Error::new(ErrorKind::BadInput, what));
         }
         Ok(Self { names, depth_unit_m, sessions: Vec::new() })
@@ -110,7 +110,8 @@ impl ByteCameraExport {
             let prefix = free_prefix(wanted, s.id.stream.as_str(), is_free);
             files.extend(folders().map(|f| (f.clone(), prefix.clone())));
             let mut stream = s.clone();
-            let (mut recorded_format, mut recorded_depth_unit_m) = (None, None);
+            let mut recorded_format = None;
+            let mut recorded_depth_unit_m = None;
             if s.format == PixelFormat::Mjpeg {
                 stream.format = PixelFormat::Rgb8;
                 recorded_format = Some(s.format.name().to_owned());
@@ -139,9 +140,10 @@ impl ByteCameraExport {
                     unit / 2.0
                 ));
             }
-            let (folder, ending) = (of_camera, ending.to_owned());
+            let folder = of_camera;
+            let ending = ending.to_owned();
             if !copies.is_empty() {
-                losses.push(format!("{}: the same pictures are in {folder} and {}", s.id, copies.join(", ")));
+                losses.push(format!("{}: the same images are in {folder} and {}", s.id, copies.join(", ")));
             }
             streams.push(StreamFacts {
                 folder,
@@ -163,7 +165,7 @@ impl ByteCameraExport {
     }
 
     /// The file of a frame.
-    fn picture<'a>(&self, frame: &'a DatasetFrame, set: u64, out: &mut PartOut<'_>) -> Result<Cow<'a, [u8]>> {
+    fn image<'a>(&self, frame: &'a DatasetFrame, set: u64, out: &mut PartOut<'_>) -> Result<Cow<'a, [u8]>> {
         let h = &frame.header;
         let format = h.pixel_format().unwrap_or(PixelFormat::Mjpeg);
         let Some(unit) = self.rescaled(format, h.depth_unit_m) else {
@@ -204,7 +206,7 @@ impl ByteCameraExport {
                 header: FrameHeader::default(),
             };
             if let Some(frame) = set.frames.iter().find(|f| f.stream == stream) {
-                match self.picture(frame, set.id, out) {
+                match self.image(frame, set.id, out) {
                     Ok(file) => {
                         row.file = format!("{}/{}_{n}.{}", facts.folder, facts.prefix, facts.ending);
                         row.header = frame.header;
@@ -251,13 +253,14 @@ fn modes_of<'a>(session: &'a Session, camera: &str) -> Vec<&'a str> {
 
 /// Depth in other units: the pixels, how many were rounded, and how many do not fit.
 fn rescale(pixels: &[u8], factor: f64) -> (Vec<u8>, u64, u64) {
-    let (mut rounded, mut beyond) = (0, 0);
+    let mut rounded = 0;
+    let mut beyond = 0;
     let mut out = Vec::with_capacity(pixels.len());
     for raw in pixels.as_chunks().0 {
         let exact = f64::from(u16::from_le_bytes(*raw)) * factor;
         let nearest = exact.round();
         let fits = nearest <= f64::from(u16::MAX);
-        // Products such as 3 * 0.1 are not what they stand for; a billionth is no loss.
+        // Products such as 3 * 0.1 are not what they stand for; a billionth does not count as a loss.
         rounded += u64::from(fits && (nearest - exact).abs() > 1e-9 * exact.max(1.0));
         beyond += u64::from(!fits);
         out.extend((if fits { nearest as u16 } else { 0 }).to_le_bytes());
@@ -427,7 +430,8 @@ mod tests {
             let pixels: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
             let factor = f64::from(tenths) / 10.0;
             let (out, rounded, beyond) = rescale(&pixels, factor);
-            let (mut r, mut b) = (0, 0);
+            let mut r = 0;
+            let mut b = 0;
             for (v, o) in values.iter().zip(out.chunks(2)) {
                 // Exactly, in tenths.
                 let exact = u32::from(*v) * tenths;

@@ -1,7 +1,7 @@
 //! ByteCameraDepth folders as a dataset, with or without the times and calibration that an export of ours has.
 
 use super::calibration::{Calibration, SessionFacts};
-use super::pictures::{Picture, read};
+use super::images::{Image, read};
 use super::rows::Row;
 use super::{CALIBRATION_FILE, FORMAT, FRAMES_FILE};
 use crate::exchange::{ImportFacts, ImportProgress, Importer};
@@ -24,7 +24,7 @@ mod stream;
 /// Metres per unit of depth that make sense.
 const UNITS_M: core::ops::RangeInclusive<f64> = 1e-6..=1.0;
 
-/// What the folders do not say.
+/// Facts that the folders do not hold.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ByteCameraOptions {
     /// Metres per unit of 16-bit depth, of all cameras.
@@ -64,7 +64,7 @@ fn bad(path: &Path, why: impl core::fmt::Display) -> Error {
 }
 
 impl ByteCameraImport {
-    /// Looks at the folder `dir` of a session, which holds `camera_…` folders. One picture of each kind is read.
+    /// Looks at the folder `dir` of a session, which holds `camera_…` folders. One image of each kind is read.
     ///
     /// # Errors
     /// [`ErrorKind::NotFound`], [`ErrorKind::BadRecording`] when it holds no such folders or they contradict
@@ -76,8 +76,8 @@ impl ByteCameraImport {
                 return Err(Error::new(ErrorKind::BadInput, message));
             }
         }
-        if options.rate_hz.is_some_and(|r| !(1e-3..=1e4).contains(&r)) {
-            let message = "a rate is a number of sets in a second, such as 5";
+        if let Some(rate) = options.rate_hz.filter(|r| !(1e-3..=1e4).contains(r)) {
+            let message = format!("rate {rate} Hz is out of range 0.001..=10000");
             return Err(Error::new(ErrorKind::BadInput, message));
         }
         let found = list(&*fs, dir)?;
@@ -130,7 +130,7 @@ impl ByteCameraImport {
     }
 
     /// The file `n` of a stream; the inner error is of that file alone.
-    fn picture(&self, stream: &Stream, n: u32) -> Result<Result<Picture, String>> {
+    fn image(&self, stream: &Stream, n: u32) -> Result<Result<Image, String>> {
         let path = self.dir.join(stream.path(n));
         match read_file(&*self.fs, &path) {
             Ok(Some(bytes)) => Ok(read(&bytes, &stream.ending, stream.want)),
@@ -180,7 +180,7 @@ impl Importer for ByteCameraImport {
         if self.alpha_dropped > 0 {
             facts
                 .stated
-                .push(format!("{} colour pictures had an opacity, which is left out", self.alpha_dropped));
+                .push(format!("{} colour images had an opacity, which is left out", self.alpha_dropped));
         }
         facts
     }

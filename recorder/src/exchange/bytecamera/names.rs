@@ -74,7 +74,7 @@ pub(super) fn camera_of(part: &str) -> (Name, String) {
     let lower = part.to_lowercase();
     let mut named = lower.clone();
     let mut model = part.to_owned();
-    // The longest spelling first: realsense_435i is no realsense_435.
+    // The longest spelling first: realsense_435i is not a realsense_435.
     let mut spellings: Vec<_> = MODELS.iter().flat_map(|m| [(m.0, m), (m.1, m)]).collect();
     spellings.push(("realsense_l515", &MODELS[5]));
     spellings.sort_by_key(|(s, _)| std::cmp::Reverse(s.len()));
@@ -139,8 +139,8 @@ mod tests {
             ("Mech-Mind 7", "mech_mind_7", "Mech-Mind 7"),
             ("7up", "c7up", "7up"),
         ] {
-            let (name, told) = camera_of(part);
-            assert_eq!((name.as_str(), told.as_str()), (camera, model));
+            let (name, found_model) = camera_of(part);
+            assert_eq!((name.as_str(), found_model.as_str()), (camera, model));
         }
     }
 
@@ -178,7 +178,8 @@ mod tests {
         };
         assert_eq!(found("d455", 2, &["d435"]), "d455");
         assert_eq!(found("d455", 2, &["d455", "d455_2"]), "d455_3");
-        let (long, stem) = ("a".repeat(31), "a".repeat(29));
+        let long = "a".repeat(31);
+        let stem = "a".repeat(29);
         assert_eq!(found(&long, 2, &[&long]), format!("{stem}_2"));
         assert_eq!(found(&long, 2, &[&long, &format!("{stem}_2")]), format!("{stem}_3"));
         let last = format!("{}_4294967295", "a".repeat(20));

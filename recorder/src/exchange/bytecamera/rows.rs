@@ -105,7 +105,8 @@ impl Row {
             header_fields!(values);
             if h.has(FrameFlags::DERIVED) {
                 let steps = h.stage_ns.map(|n| n.to_string()).join("|");
-                let (engine, model) = (plain(h.refiner()), plain(h.refiner_model()));
+                let engine = plain(h.refiner());
+                let model = plain(h.refiner_model());
                 let _ = write!(
                     line,
                     ",{},{},{steps},{engine},{model}",
@@ -123,7 +124,7 @@ impl Row {
     pub(super) fn parse(line: &str) -> Result<Self, String> {
         let mut texts = line.split(',');
         let mut next = |name: &'static str| {
-            texts.next().map(|text| (name, text)).ok_or_else(|| format!("column {name} is missing"))
+            texts.next().map(|text| Column { name, text }).ok_or_else(|| format!("column {name} is missing"))
         };
         let mut row = Self {
             n: number(next("n")?)?,
@@ -132,8 +133,8 @@ impl Row {
             set_utc_ns: number(next("set_utc_ns")?)?,
             utc_offset_ns: number(next("utc_offset_ns")?)?,
             spread_ns: number(next("spread_ns")?)?,
-            stream: next("stream")?.1.to_owned(),
-            file: next("file")?.1.to_owned(),
+            stream: next("stream")?.text.to_owned(),
+            file: next("file")?.text.to_owned(),
             header: FrameHeader::default(),
         };
         if row.file.is_empty() {
@@ -141,33 +142,42 @@ impl Row {
         }
         let h = &mut row.header;
         let _derived: i64 = number(next("capture_utc_ns")?)?;
-        let (name, dropped) = next("dropped")?;
-        let mut counts = dropped.split('|');
+        let dropped = next("dropped")?;
+        let mut counts = dropped.text.split('|');
         for count in &mut h.dropped {
-            *count = number((name, counts.next().unwrap_or_default()))?;
+            *count = number(Column { text: counts.next().unwrap_or_default(), ..dropped })?;
         }
         macro_rules! values {
             ($($field:ident),*) => { $( h.$field = number(next(stringify!($field))?)?; )* };
         }
         header_fields!(values);
         let derived = OF_DERIVED.trim_start_matches(',').split(',').map(|name| (name, texts.next()));
-        let derived: Vec<_> = derived.map(|(name, text)| (name, text.unwrap_or_default())).collect();
+        let derived: Vec<_> =
+            derived.map(|(name, text)| Column { name, text: text.unwrap_or_default() }).collect();
         if let [color, time, steps, engine, model] = derived[..]
-            && !color.1.is_empty()
+            && !color.text.is_empty()
         {
             h.source_color_sequence = number(color)?;
             h.source_color_capture_time_ns = number(time)?;
-            let mut counts = steps.1.split('|');
+            let mut counts = steps.text.split('|');
             for step in &mut h.stage_ns {
-                *step = number((steps.0, counts.next().unwrap_or_default()))?;
+                *step = number(Column { text: counts.next().unwrap_or_default(), ..steps })?;
             }
-            h.set_refiner(engine.1, model.1);
+            h.set_refiner(engine.text, model.text);
         }
         Ok(row)
     }
 }
 
-fn number<T: std::str::FromStr>((name, text): (&str, &str)) -> Result<T, String> {
+/// A value of a line, with the name of its column.
+#[derive(Clone, Copy)]
+struct Column<'a> {
+    name: &'a str,
+    text: &'a str,
+}
+
+fn number<T: std::str::FromStr>(column: Column<'_>) -> Result<T, String> {
+    let Column { name, text } = column;
     text.parse().map_err(|_| format!("column {name} is \"{text}\", not a number that fits"))
 }
 
@@ -226,7 +236,9 @@ mod tests {
             FrameHeader { flags: FrameFlags::DERIVED.0, source_color_sequence: 7, ..FrameHeader::default() };
         header.set_refiner("onnxruntime 1.31.1 cpu fp32", "cdm-d435@1f2e3d4c");
         let file = "camera_a/depth_refined_1.png".to_owned();
-        let (n, set, stream) = (1, 2, "a/depth_refined".to_owned());
+        let n = 1;
+        let set = 2;
+        let stream = "a/depth_refined".to_owned();
         let row =
             Row { n, set, tick_ns: 0, set_utc_ns: 0, utc_offset_ns: 0, spread_ns: 0, stream, file, header };
         let text = row.text();

@@ -3,7 +3,7 @@
 use super::part::{self, PartInfo};
 use super::plan::Plan;
 use super::schema::{Feature, Ordered, Schema, calibration};
-use super::stats::{NumberStats, PictureStats, QUANTILES, Stats};
+use super::stats::{ImageStats, NumberStats, QUANTILES, Stats};
 use super::table::{Kind, Layout, Table, TableWriter, Values, text};
 use crate::exchange::{Output, Parts, Source};
 use crate::{Error, ErrorKind, Result};
@@ -44,7 +44,7 @@ pub(super) fn finish(plan: &Plan, sources: &[Source], parts: &Parts<'_>, out: &O
 fn gather(plan: &Plan, source: usize, parts: &Parts<'_>) -> Result<Whole> {
     let schema = &plan.schema;
     let numbers = schema.numbers();
-    let mut pictures = vec![PictureStats::default(); schema.features.len()];
+    let mut images = vec![ImageStats::default(); schema.features.len()];
     let mut columns = vec![NumberStats::default(); numbers.len()];
     let mut bytes = 0;
     for part in parts.rows(source) {
@@ -53,18 +53,19 @@ fn gather(plan: &Plan, source: usize, parts: &Parts<'_>) -> Result<Whole> {
             Error::new(ErrorKind::Corrupt, what).with_source(e)
         })?;
         bytes += part.bytes;
-        pictures.iter_mut().zip(&part.pictures).for_each(|(to, from)| to.merge(from));
+        images.iter_mut().zip(&part.images).for_each(|(to, from)| to.merge(from));
         columns.iter_mut().zip(&part.numbers).for_each(|(to, from)| to.merge(from));
     }
-    let of_pictures = pictures.iter().zip(&schema.features).map(|(s, f)| s.finish(f.divisor()));
+    let of_images = images.iter().zip(&schema.features).map(|(s, f)| s.finish(f.divisor()));
     let of_columns = columns.iter().zip(&numbers).map(|(s, (name, _))| s.finish(Schema::ordered(name)));
-    Ok(Whole { bytes, file: 0, stats: of_pictures.chain(of_columns).collect() })
+    Ok(Whole { bytes, file: 0, stats: of_images.chain(of_columns).collect() })
 }
 
 /// Decides which file each episode goes into: a file is full when the next episode would exceed the limit. An
 /// episode is never split, because `meta/episodes` can name only one file for it; so a long one makes a long file.
 fn place(episodes: &mut [Whole]) {
-    let (mut file, mut size) = (0, 0);
+    let mut file = 0;
+    let mut size = 0;
     for e in episodes {
         if size > 0 && size + e.bytes > DATA_FILE_MB << 20 {
             (file, size) = (file + 1, 0);
@@ -78,7 +79,7 @@ fn chunk_folder(file: usize) -> String {
     format!("data/chunk-{:03}", file / FILES_PER_CHUNK)
 }
 
-/// Writes one data file from the tables of its parts, which are removed then. One that is there already is whole.
+/// Writes one data file from the tables of its parts, which are removed then. One that is there already is complete.
 fn data_file(
     plan: &Plan,
     parts: &Parts<'_>,
@@ -139,8 +140,8 @@ fn metadata(plan: &Plan, sources: &[Source], out: &Output<'_>, episodes: &[Whole
 
 /// Features, then number columns: the order of `Whole::stats`.
 fn column_names(plan: &Plan) -> Vec<String> {
-    let pictures = plan.schema.features.iter().map(Feature::key);
-    pictures.chain(plan.schema.numbers().into_iter().map(|(name, _)| name)).collect()
+    let images = plan.schema.features.iter().map(Feature::key);
+    images.chain(plan.schema.numbers().into_iter().map(|(name, _)| name)).collect()
 }
 
 #[derive(Serialize)]
@@ -244,8 +245,8 @@ fn episode_table(plan: &Plan, episodes: &[Whole], out: &Output<'_>) -> Result<()
         ("meta/episodes/file_index".to_owned(), Kind::Int64, ints(&|_| 0)),
     ];
     for (i, name) in column_names(plan).iter().enumerate() {
-        let picture = i < plan.schema.features.len();
-        let depth = if picture { 3 } else { 1 };
+        let image = i < plan.schema.features.len();
+        let depth = if image { 3 } else { 1 };
         let of = |e: usize| episodes[e].stats[i].as_ref();
         let statistic = |key: &str| -> Values {
             let value = |s: &Stats| s.entries().find(|(k, _)| *k == key).map(|(_, v)| v.to_vec());

@@ -1,34 +1,34 @@
 //! One part becomes a table of its own and the statistics of what is in it.
 
-use super::picture;
+use super::encode;
 use super::plan::{Episode, Plan};
-use super::stats::{NumberStats, PictureStats, sampled};
+use super::stats::{ImageStats, NumberStats, sampled};
 use super::table::{Kind, TableWriter, Values, text};
 use crate::exchange::{self, PartOut, PartSets, Source};
 use crate::{DatasetSet, Error, ErrorKind, PixelMode, Result};
 use parquet::data_type::ByteArray;
 use serde::{Deserialize, Serialize};
 
-/// A row group is written when its pictures take this much: it is held in memory.
+/// A row group is written when its images take this much: it is held in memory.
 const ROW_GROUP_BYTES: usize = 48 << 20;
 
-/// What the end of the export wants to know of a part.
+/// Size and statistics of a part, for the end of the export.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct PartInfo {
     pub(super) rows: u64,
     pub(super) bytes: u64,
     /// By feature.
-    pub(super) pictures: Vec<PictureStats>,
+    pub(super) images: Vec<ImageStats>,
     /// By column of `Schema::numbers`.
     pub(super) numbers: Vec<NumberStats>,
 }
 
-/// The table of a part, until its episode's data file is whole.
+/// The table of a part, until its episode's data file is complete.
 pub(super) fn table_name(part: &exchange::Part) -> String {
     format!(".part_{:05}_{:08}.parquet", part.source, part.sets.start)
 }
 
-/// Makes the table of a part. A set that cannot be read becomes a row of blank pictures, so that every row stays where
+/// Makes the table of a part. A set that cannot be read becomes a row of blank images, so that every row stays where
 /// the plan has it.
 pub(super) fn write(
     plan: &Plan,
@@ -79,7 +79,7 @@ impl Number {
     }
 }
 
-/// What a set says of its time.
+/// Time and identity of a set.
 struct SetFacts {
     utc_ns: i64,
     set_id: i64,
@@ -99,38 +99,39 @@ struct Rows<'p, 'f> {
     episode: &'p Episode,
     episode_index: usize,
     table: TableWriter<'f>,
-    /// By feature: pictures and their names of the row group in the making.
-    pictures: Vec<(Vec<ByteArray>, Vec<ByteArray>)>,
+    /// By feature: images and their names of the row group in the making.
+    images: Vec<(Vec<ByteArray>, Vec<ByteArray>)>,
     /// By column of `Schema::numbers`.
     numbers: Vec<Vec<Number>>,
     group_bytes: usize,
-    /// A blank picture of each feature, made when it is needed first.
+    /// A blank image of each feature, made when it is needed first.
     blanks: Vec<Option<(ByteArray, &'static str)>>,
     info: PartInfo,
 }
 
 impl<'p, 'f> Rows<'p, 'f> {
     fn new(plan: &'p Plan, episode_index: usize, table: TableWriter<'f>) -> Self {
-        let (features, numbers) = (plan.schema.features.len(), plan.schema.numbers().len());
+        let features = plan.schema.features.len();
+        let numbers = plan.schema.numbers().len();
         Self {
             plan,
             episode: &plan.episodes[episode_index],
             episode_index,
             table,
-            pictures: vec![(Vec::new(), Vec::new()); features],
+            images: vec![(Vec::new(), Vec::new()); features],
             numbers: vec![Vec::new(); numbers],
             group_bytes: 0,
             blanks: vec![None; features],
             info: PartInfo {
                 rows: 0,
                 bytes: 0,
-                pictures: vec![PictureStats::default(); features],
+                images: vec![ImageStats::default(); features],
                 numbers: vec![NumberStats::default(); numbers],
             },
         }
     }
 
-    /// The row of a set whose pictures cannot be read. Its numbers mostly can, because they lie elsewhere.
+    /// The row of a set whose images cannot be read. Its numbers mostly can, because they lie elsewhere.
     fn unreadable(&mut self, number: usize, source: &Source) -> Result<()> {
         let Some(row) = self.episode.row_of(number) else { return Ok(()) };
         let facts = match source.reader().read(number, PixelMode::None) {
@@ -138,10 +139,10 @@ impl<'p, 'f> Rows<'p, 'f> {
             Err(e) if e.kind() == ErrorKind::Io => return Err(e),
             Err(_) => SetFacts { utc_ns: source.times()[number], set_id: 0, spread_ns: 0 },
         };
-        for feature in 0..self.pictures.len() {
+        for feature in 0..self.images.len() {
             self.blank(feature, row)?;
         }
-        self.end_row(row, &facts, &vec![None; self.pictures.len()])
+        self.end_row(row, &facts, &vec![None; self.images.len()])
     }
 
     fn set(
@@ -156,7 +157,7 @@ impl<'p, 'f> Rows<'p, 'f> {
             return Ok(());
         };
         let sample = sampled(row, self.episode.rows);
-        let mut captures = vec![None; self.pictures.len()];
+        let mut captures = vec![None; self.images.len()];
         for (feature, capture) in captures.iter_mut().enumerate() {
             let frame = set.frames.iter().find(|f| place.get(f.stream).copied().flatten() == Some(feature));
             let Some(frame) = frame else {
@@ -164,13 +165,13 @@ impl<'p, 'f> Rows<'p, 'f> {
                 continue;
             };
             let form = self.plan.schema.features[feature].form;
-            match picture::encode(form, frame, sample) {
-                Ok((picture, samples)) => {
+            match encode::encode(form, frame, sample) {
+                Ok((image, samples)) => {
                     if let Some(samples) = samples {
-                        self.info.pictures[feature].add(form.channels(), &samples);
+                        self.info.images[feature].add(form.channels(), &samples);
                     }
                     *capture = Some(frame.header.capture_time_ns.saturating_add(set.utc_offset_ns));
-                    self.picture(feature, row, picture.bytes.into(), picture.extension);
+                    self.image(feature, row, image.bytes.into(), image.extension);
                     out.frame(frame.stream);
                 }
                 Err(e) => {
@@ -187,17 +188,17 @@ impl<'p, 'f> Rows<'p, 'f> {
         let (bytes, extension) = if let Some(blank) = &self.blanks[feature] {
             blank.clone()
         } else {
-            let blank = picture::blank(f.form, f.width, f.height)?;
+            let blank = encode::blank(f.form, f.width, f.height)?;
             self.blanks[feature].insert((blank.bytes.into(), blank.extension)).clone()
         };
-        self.picture(feature, row, bytes, extension);
+        self.image(feature, row, bytes, extension);
         Ok(())
     }
 
-    fn picture(&mut self, feature: usize, row: u64, bytes: ByteArray, extension: &str) {
+    fn image(&mut self, feature: usize, row: u64, bytes: ByteArray, extension: &str) {
         self.group_bytes += bytes.len();
-        let (pictures, names) = &mut self.pictures[feature];
-        pictures.push(bytes);
+        let (images, names) = &mut self.images[feature];
+        images.push(bytes);
         names.push(text(format!("frame-{row:06}.{extension}")));
     }
 
@@ -231,9 +232,9 @@ impl<'p, 'f> Rows<'p, 'f> {
         if self.numbers.first().is_none_or(Vec::is_empty) {
             return Ok(());
         }
-        let mut values = Vec::with_capacity(self.pictures.len() + self.numbers.len());
-        for (bytes, paths) in &mut self.pictures {
-            values.push(Values::Picture { bytes: std::mem::take(bytes), paths: std::mem::take(paths) });
+        let mut values = Vec::with_capacity(self.images.len() + self.numbers.len());
+        for (bytes, paths) in &mut self.images {
+            values.push(Values::Image { bytes: std::mem::take(bytes), paths: std::mem::take(paths) });
         }
         for ((_, kind), column) in self.plan.schema.numbers().iter().zip(&mut self.numbers) {
             values.push(column_values(*kind, &std::mem::take(column)));

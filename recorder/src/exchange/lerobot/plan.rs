@@ -1,4 +1,4 @@
-//! What is decided before a picture is read: how many rows there will be, at which rate, of which tasks.
+//! The plan made before an image is read: how many rows there will be, at which rate, of which tasks.
 
 use super::schema::Schema;
 use super::{Incomplete, LerobotOptions};
@@ -8,7 +8,7 @@ use crate::{Error, ErrorKind, Result};
 use depthrig_bus::StreamId;
 use std::collections::BTreeMap;
 
-/// Everything that is decided before a picture is read.
+/// Everything that is decided before an image is read.
 #[derive(Debug, Clone)]
 pub(super) struct Plan {
     pub(super) schema: Schema,
@@ -16,7 +16,7 @@ pub(super) struct Plan {
     pub(super) episodes: Vec<Episode>,
     /// The tasks in the order of their indices.
     pub(super) tasks: Vec<String>,
-    /// What the format changes or cannot hold, in words.
+    /// Changes and omissions by the format, in words.
     pub(super) losses: Vec<String>,
 }
 
@@ -102,7 +102,7 @@ fn incomplete(source: &Source, schema: &Schema) -> Result<Vec<usize>> {
 }
 
 impl Plan {
-    /// Decides how `sources` are exported; reads sets, without pictures, only where incomplete ones are left out.
+    /// Decides how `sources` are exported; reads sets, without images, only where incomplete ones are left out.
     pub(super) fn make(sources: &[Source], options: &LerobotOptions) -> Result<Self> {
         let bad = |message: String| Error::new(ErrorKind::BadInput, message);
         let wanted = |id: &StreamId| options.streams.is_empty() || options.streams.contains(id);

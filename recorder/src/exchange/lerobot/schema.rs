@@ -1,6 +1,6 @@
-//! What is in the exported dataset: one feature per stream, the columns that LeRobot prescribes, and our own.
+//! Columns of the exported dataset: one feature per stream, the columns that LeRobot prescribes, and our own.
 
-use super::picture::Form;
+use super::encode::Form;
 use super::table::{Kind, Layout};
 use crate::exchange::Source;
 use crate::{Error, ErrorKind, Result, Session, StreamRecord};
@@ -32,12 +32,12 @@ pub(super) struct Feature {
     pub(super) height: u32,
     /// `camera_stream`.
     short: String,
-    /// What `info.json` says of it besides type and shape.
+    /// Its facts in `info.json` besides type and shape.
     info: Value,
 }
 
 impl Feature {
-    /// The name of its pictures.
+    /// The name of its images.
     pub(super) fn key(&self) -> String {
         format!("observation.images.{}", self.short)
     }
@@ -55,7 +55,7 @@ impl Feature {
         self.info.get("depth_unit").is_some()
     }
 
-    /// What the loader divides pixel values by.
+    /// The number that the loader divides pixel values by.
     pub(super) const fn divisor(&self) -> f64 {
         match self.form {
             Form::Color | Form::Grey8 => 255.0,
@@ -82,7 +82,7 @@ impl Schema {
         for s in first.session().streams.iter().filter(|s| wanted(&s.id)) {
             let form = Form::of(s.format).ok_or_else(|| {
                 bad(format!(
-                    "{}: stream {} is {}, for which LeRobot has no picture format; leave it out",
+                    "{}: stream {} is {}, for which LeRobot has no image format; leave it out",
                     first.dataset().path().display(),
                     s.id,
                     s.format.name()
@@ -113,13 +113,13 @@ impl Schema {
         streams.map(|s| self.features.iter().position(|f| f.id == s.id)).collect()
     }
 
-    /// What a reader of the export should know, in words.
+    /// Notes for readers of the export, in words.
     pub(super) fn losses(&self) -> Vec<String> {
         let mut losses = vec![
             "timestamp is frame_index / fps, as LeRobot demands; the true times are in capture.utc_ns and \
              capture.utc_ns.CAMERA_STREAM, nanoseconds since 1970"
                 .to_owned(),
-            "where a stream has no frame there is a blank picture, and missing.CAMERA_STREAM is true"
+            "where a stream has no frame there is a blank image, and missing.CAMERA_STREAM is true"
                 .to_owned(),
         ];
         for f in self.features.iter().filter(|f| f.form.is_depth() && !f.has_lerobot_unit()) {
@@ -132,7 +132,7 @@ impl Schema {
         losses
     }
 
-    /// Name and kind of every column that is no picture, in the order of the rows' values.
+    /// Name and kind of every column that is not an image, in the order of the rows' values.
     pub(super) fn numbers(&self) -> Vec<(String, Kind)> {
         let fixed = PRESCRIBED.iter().chain(&PER_SET).map(|(name, kind)| ((*name).to_owned(), *kind));
         let capture = self.features.iter().map(|f| (f.capture_key(), Kind::Int64));
@@ -145,20 +145,20 @@ impl Schema {
         PRESCRIBED.iter().any(|(n, _)| *n == name) || name == "capture.utc_ns" || name == "capture.set_id"
     }
 
-    /// The data table: pictures, then numbers.
+    /// The data table: images, then numbers.
     pub(super) fn layout(&self) -> Layout {
-        let pictures = self.features.iter().map(|f| {
+        let images = self.features.iter().map(|f| {
             // JPEG and PNG are packed already.
-            (f.key(), Kind::Picture { packed: f.form.is_depth() })
+            (f.key(), Kind::Image { packed: f.form.is_depth() })
         });
-        let columns: Vec<_> = pictures.chain(self.numbers()).collect();
+        let columns: Vec<_> = images.chain(self.numbers()).collect();
         let features: Ordered<Value> = Ordered(
             columns
                 .iter()
                 .map(|(name, kind)| {
                     let dtype = |d: &str| json!({ "dtype": d, "_type": "Value" });
                     let value = match kind {
-                        Kind::Picture { .. } => json!({ "_type": "Image" }),
+                        Kind::Image { .. } => json!({ "_type": "Image" }),
                         Kind::Bool => dtype("bool"),
                         Kind::Float32 => dtype("float32"),
                         _ => dtype("int64"),
@@ -167,7 +167,7 @@ impl Schema {
                 })
                 .collect(),
         );
-        // With this the `datasets` library knows a picture for one, also without `info.json`.
+        // With this the `datasets` library knows an image for one, also without `info.json`.
         let hugging_face = format!(r#"{{"info": {{"features": {}}}}}"#, features.text());
         Layout { columns, footer: vec![("huggingface", hugging_face)] }
     }
@@ -196,7 +196,7 @@ impl Schema {
     }
 }
 
-/// What `info.json` says of a stream. Calibration is there only if it is the same in all datasets.
+/// Facts of a stream for `info.json`. Calibration is there only if it is the same in all datasets.
 fn info<'s>(s: &StreamRecord, sessions: impl Iterator<Item = &'s Session>) -> Value {
     let mut all = sessions.filter_map(|session| session.streams.iter().find(|o| o.id == s.id));
     let same = all.all(|o| o.intrinsics == s.intrinsics && o.pose == s.pose && o.serial == s.serial);
@@ -253,7 +253,8 @@ pub(super) fn calibration(s: &StreamRecord) -> [(&'static str, Value); 4] {
 /// Streams of two datasets can only be in one table if they are alike.
 fn same_streams(a: &Source, b: &Source, wanted: &dyn Fn(&StreamId) -> bool) -> Result<()> {
     let unlike = |why: String| {
-        let (a, b) = (a.dataset().path().display(), b.dataset().path().display());
+        let a = a.dataset().path().display();
+        let b = b.dataset().path().display();
         bad(format!("{a} and {b} cannot be episodes of one LeRobot dataset: {why}; export them separately"))
     };
     let describe =
@@ -261,7 +262,8 @@ fn same_streams(a: &Source, b: &Source, wanted: &dyn Fn(&StreamId) -> bool) -> R
     let streams = |d: &Source| -> Vec<StreamRecord> {
         d.session().streams.iter().filter(|s| wanted(&s.id)).cloned().collect()
     };
-    let (of_a, of_b) = (streams(a), streams(b));
+    let of_a = streams(a);
+    let of_b = streams(b);
     for s in &of_a {
         match of_b.iter().find(|o| o.id == s.id) {
             None => return Err(unlike(format!("only the first has stream {}", s.id))),

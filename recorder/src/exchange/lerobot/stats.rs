@@ -1,5 +1,5 @@
 //! Statistics as LeRobot computes them (`compute_stats.py` of lerobot 0.6.1): minimum, maximum, mean, standard deviation,
-//! count and five quantiles per channel, from a sample of the pictures, in constant memory.
+//! count and five quantiles per channel, from a sample of the images, in constant memory.
 //!
 //! Whole numbers are counted by value, so that everything follows exactly and parts add up. Quantiles are read
 //! from 5,000 equal bins between minimum and maximum, as LeRobot reads them.
@@ -13,7 +13,7 @@ pub(super) const QUANTILES: [(&str, f64); 5] =
     [("q01", 0.01), ("q10", 0.10), ("q50", 0.50), ("q90", 0.90), ("q99", 0.99)];
 const BINS: usize = 5000;
 
-/// Pixel values of one picture, channel by channel within a pixel.
+/// Pixel values of one image, channel by channel within a pixel.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Samples {
     U8(Vec<u8>),
@@ -21,7 +21,7 @@ pub(super) enum Samples {
     F32(Vec<f32>),
 }
 
-/// What is known of one channel so far.
+/// Statistics of one channel so far.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 struct Channel {
     /// How often each value was seen; for floats, the value of the upper 20 bits.
@@ -33,12 +33,12 @@ struct Channel {
     max: f64,
 }
 
-/// Statistics of a picture feature in the making; parts can be added.
+/// Statistics of an image feature in the making; parts can be added.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct PictureStats {
+pub(super) struct ImageStats {
     channels: Vec<Channel>,
     float: bool,
-    pictures: u64,
+    images: u64,
 }
 
 /// Finished statistics, one value per channel.
@@ -49,18 +49,18 @@ pub(super) struct Stats {
     pub(super) max: Vec<f64>,
     pub(super) mean: Vec<f64>,
     pub(super) std: Vec<f64>,
-    /// In the order of [`QUANTILES`]; empty where there are none.
+    /// In the order of [`QUANTILES`]; empty without quantiles.
     pub(super) quantiles: Vec<Vec<f64>>,
 }
 
 /// Positive floats in 2^20 buckets of equal relative width (2^-11): their upper bits, which are in order.
 const FLOAT_SHIFT: u32 = 12;
 
-impl PictureStats {
-    /// Adds one picture of `channels` channels.
+impl ImageStats {
+    /// Adds one image of `channels` channels.
     pub(super) fn add(&mut self, channels: usize, samples: &Samples) {
         self.channels.resize(channels, Channel::default());
-        self.pictures += 1;
+        self.images += 1;
         match samples {
             Samples::U8(v) => self.count_all(channels, v),
             Samples::U16(v) => self.count_all(channels, v),
@@ -85,12 +85,12 @@ impl PictureStats {
 
     /// Adds what another part found.
     pub(super) fn merge(&mut self, other: &Self) {
-        if other.pictures == 0 {
+        if other.images == 0 {
             return;
         }
         self.channels.resize(other.channels.len(), Channel::default());
         self.float |= other.float;
-        self.pictures += other.pictures;
+        self.images += other.images;
         for (to, from) in self.channels.iter_mut().zip(&other.channels) {
             to.merge(from);
         }
@@ -102,7 +102,7 @@ impl PictureStats {
         let channels = channels.collect::<Option<Vec<_>>>().filter(|c| !c.is_empty())?;
         let each = |f: &dyn Fn(&Finished) -> f64| channels.iter().map(|c| f(c) / divisor).collect::<Vec<_>>();
         Some(Stats {
-            count: self.pictures,
+            count: self.images,
             min: each(&|c| c.min),
             max: each(&|c| c.max),
             mean: each(&|c| c.mean),
@@ -150,7 +150,8 @@ impl Channel {
         let value = |key: u32| {
             if float { f64::from(f32::from_bits(key << FLOAT_SHIFT)) } else { f64::from(key) }
         };
-        let (lowest, highest) = (*self.counts.first_key_value()?.0, *self.counts.last_key_value()?.0);
+        let lowest = *self.counts.first_key_value()?.0;
+        let highest = *self.counts.last_key_value()?.0;
         let n: u64 = self.counts.values().sum();
         let (min, max, sum, squares) = if float {
             (self.min, self.max, self.sum, self.sum_of_squares)
@@ -229,7 +230,8 @@ impl NumberStats {
             *self = other.clone();
             return;
         }
-        let (a, b) = (self.n as f64, other.n as f64);
+        let a = self.n as f64;
+        let b = other.n as f64;
         let delta = other.mean - self.mean;
         self.mean += delta * b / (a + b);
         self.m2 += other.m2 + delta * delta * a * b / (a + b);
@@ -300,10 +302,10 @@ impl Stats {
         named.into_iter().chain(quantiles).map(|(name, values)| (name, values.as_slice()))
     }
 
-    /// As `stats.json` has it: shape (channels, 1, 1) for pictures, (1) for numbers.
-    pub(super) fn to_json(&self, picture: bool) -> Value {
+    /// As `stats.json` has it: shape (channels, 1, 1) for images, (1) for numbers.
+    pub(super) fn to_json(&self, image: bool) -> Value {
         let shaped = |values: &[f64]| -> Value {
-            values.iter().map(|v| if picture { json!([[v]]) } else { json!(v) }).collect()
+            values.iter().map(|v| if image { json!([[v]]) } else { json!(v) }).collect()
         };
         let mut out: serde_json::Map<_, _> =
             self.entries().map(|(name, values)| (name.to_owned(), shaped(values))).collect();
@@ -312,7 +314,7 @@ impl Stats {
     }
 }
 
-/// Which rows of an episode of `rows` the picture statistics look at, as LeRobot chooses them: all up to 100, then
+/// Which rows of an episode of `rows` the image statistics look at, as LeRobot chooses them: all up to 100, then
 /// ever fewer of them, evenly spread.
 pub(super) fn sampled(row: u64, rows: u64) -> bool {
     let wanted = ((rows as f64).powf(0.75) as u64).min(10_000).max(100.min(rows));
@@ -353,8 +355,8 @@ mod tests {
         for (q, (name, share)) in QUANTILES.into_iter().enumerate() {
             // Between the two values that have the quantile between them, and within a bin of that.
             let at = share * sorted.len() as f64;
-            let (low, high) =
-                (sorted[(at.ceil() as usize).max(1) - 1], sorted[(at as usize).min(sorted.len() - 1)]);
+            let low = sorted[(at.ceil() as usize).max(1) - 1];
+            let high = sorted[(at as usize).min(sorted.len() - 1)];
             let found = s.quantiles[q][channel];
             assert!(
                 found >= low - bin && found <= high + bin,
@@ -365,25 +367,26 @@ mod tests {
 
     proptest! {
         #[test]
-        fn parts_of_pictures_add_up(
-            pictures in prop::collection::vec(prop::collection::vec(any::<u16>(), 3..60), 1..6),
+        fn parts_of_images_add_up(
+            images in prop::collection::vec(prop::collection::vec(any::<u16>(), 3..60), 1..6),
             at in 0_usize..6,
         ) {
-            let samples: Vec<_> = pictures.iter().map(|p| Samples::U16(p.clone())).collect();
-            let (mut left, mut right) = (PictureStats::default(), PictureStats::default());
+            let samples: Vec<_> = images.iter().map(|p| Samples::U16(p.clone())).collect();
+            let mut left = ImageStats::default();
+            let mut right = ImageStats::default();
             for (i, s) in samples.iter().enumerate() {
                 if i < at { left.add(1, s) } else { right.add(1, s) }
             }
             left.merge(&right);
             let stats = left.finish(1.0).unwrap();
-            prop_assert_eq!(stats.count, pictures.len() as u64);
-            let all: Vec<f64> = pictures.concat().into_iter().map(f64::from).collect();
+            prop_assert_eq!(stats.count, images.len() as u64);
+            let all: Vec<f64> = images.concat().into_iter().map(f64::from).collect();
             check(&stats, 0, &all, 0.0);
         }
 
         #[test]
         fn channels_are_kept_apart(pixels in prop::collection::vec(any::<[u8; 3]>(), 1..200)) {
-            let mut stats = PictureStats::default();
+            let mut stats = ImageStats::default();
             stats.add(3, &Samples::U8(pixels.concat()));
             let stats = stats.finish(1.0).unwrap();
             for c in 0..3 {
@@ -394,7 +397,7 @@ mod tests {
 
         #[test]
         fn floats_are_within_a_bucket(values in prop::collection::vec(0.0_f32..100.0, 1..300)) {
-            let mut stats = PictureStats::default();
+            let mut stats = ImageStats::default();
             let with_holes = values.iter().flat_map(|v| [*v, f32::NAN]).collect();
             stats.add(1, &Samples::F32(with_holes));
             let all: Vec<_> = values.iter().map(|v| f64::from(*v)).collect();
@@ -404,7 +407,8 @@ mod tests {
         #[test]
         fn parts_of_columns_add_up(steps in prop::collection::vec(0_u16..1000, 1..200), at in 0_usize..200) {
             let values: Vec<f64> = steps.iter().scan(1.7e9, |v, s| { *v += f64::from(*s); Some(*v) }).collect();
-            let (mut left, mut right) = (NumberStats::default(), NumberStats::default());
+            let mut left = NumberStats::default();
+            let mut right = NumberStats::default();
             for (i, v) in values.iter().enumerate() {
                 let part = if i < at { &mut left } else { &mut right };
                 part.add(*v, i as u64, values.len() as u64);
@@ -423,15 +427,16 @@ mod tests {
     }
 
     #[test]
-    fn episodes_are_weighted_by_their_pictures() {
+    fn episodes_are_weighted_by_their_images() {
         let of = |values: &[u16]| {
-            let mut s = PictureStats::default();
+            let mut s = ImageStats::default();
             for v in values {
                 s.add(1, &Samples::U16(vec![*v]));
             }
             s.finish(1.0).unwrap()
         };
-        let (a, b) = (of(&[10, 20, 30]), of(&[100]));
+        let a = of(&[10, 20, 30]);
+        let b = of(&[100]);
         let all = Stats::aggregate(&[&a, &b]).unwrap();
         let ([min, max, mean, std], _) = slow(&[10.0, 20.0, 30.0, 100.0]);
         assert_eq!((all.count, all.min[0], all.max[0]), (4, min, max));

@@ -1,4 +1,4 @@
-//! Parquet as LeRobot wants it: flat columns, pictures as a struct of bytes and a name, lists in metadata only.
+//! Parquet as LeRobot wants it: flat columns, images as a struct of bytes and a name, lists in metadata only.
 
 use crate::exchange::{OutFile, Output};
 use crate::fs::ReadFile;
@@ -17,7 +17,7 @@ use std::io::{self, Read};
 use std::path::Path;
 use std::sync::Arc;
 
-/// What a column holds.
+/// Type of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     Bool,
@@ -25,16 +25,16 @@ pub(super) enum Kind {
     Float32,
     Text,
     /// Struct of `bytes` and `path`, as `datasets.Image` stores it; `packed` when zstd gains something.
-    Picture {
+    Image {
         packed: bool,
     },
     /// List of text, not null.
     TextList,
-    /// Lists within lists of doubles, this deep; null where there are none.
+    /// Lists within lists of doubles, this deep; null without values.
     Doubles {
         depth: u8,
     },
-    /// List of integers; null where there is none.
+    /// List of integers; null without a list.
     Int64List,
 }
 
@@ -45,7 +45,7 @@ pub(super) enum Values {
     Int64(Vec<i64>),
     Float32(Vec<f32>),
     Text(Vec<ByteArray>),
-    Picture {
+    Image {
         bytes: Vec<ByteArray>,
         paths: Vec<ByteArray>,
     },
@@ -96,7 +96,7 @@ impl Layout {
                 Kind::Int64 => leaf(name, Physical::INT64, false)?,
                 Kind::Float32 => leaf(name, Physical::FLOAT, false)?,
                 Kind::Text => leaf(name, Physical::BYTE_ARRAY, true)?,
-                Kind::Picture { .. } => {
+                Kind::Image { .. } => {
                     let bytes = leaf("bytes", Physical::BYTE_ARRAY, false)?;
                     let path = leaf("path", Physical::BYTE_ARRAY, true)?;
                     let group = Type::group_type_builder(name).with_repetition(Repetition::OPTIONAL);
@@ -116,7 +116,7 @@ impl Layout {
         Type::group_type_builder("schema").with_fields(fields).build().map(Arc::new)
     }
 
-    /// Dictionaries and statistics are of no use here: pictures are all different and are not searched for.
+    /// Dictionaries and statistics are of no use here: images are all different and are not searched for.
     fn properties(&self) -> parquet::errors::Result<Arc<WriterProperties>> {
         let zstd = Compression::ZSTD(ZstdLevel::try_new(1)?);
         let footer = self.footer.iter().map(|(key, value)| KeyValue::new((*key).to_owned(), value.clone()));
@@ -125,7 +125,7 @@ impl Layout {
             .set_compression(zstd)
             .set_key_value_metadata(Some(footer.collect()));
         for (name, kind) in &self.columns {
-            if let Kind::Picture { packed } = kind {
+            if let Kind::Image { packed } = kind {
                 let bytes = ColumnPath::new(vec![name.clone(), "bytes".to_owned()]);
                 builder = builder.set_column_statistics_enabled(bytes.clone(), EnabledStatistics::None);
                 if !packed {
@@ -196,7 +196,7 @@ impl<'a> TableWriter<'a> {
     /// Writes the footer, makes the file durable, gives it its name and says how long it is.
     pub(super) fn close(self) -> Result<u64> {
         let Self { mut writer, name } = self;
-        // Not `into_inner`: that tells a failed write as text, and a full disk must be known as one.
+        // Not `into_inner`: that reports a failed write as text, and a full disk must be known as one.
         writer.finish().map_err(|e| failed("write", &name, e))?;
         let gone = || Error::new(ErrorKind::Io, format!("cannot write {name}: it is closed already"));
         writer.inner_mut().0.take().ok_or_else(gone)?.finish()
@@ -275,8 +275,8 @@ fn write_group(
             Values::Int64(v) => flat::<Int64Type>(&mut group, v, 1)?,
             Values::Float32(v) => flat::<FloatType>(&mut group, v, 1)?,
             Values::Text(v) => flat::<ByteArrayType>(&mut group, v, 1)?,
-            Values::Picture { bytes, paths } => {
-                pictures(&mut group, bytes)?;
+            Values::Image { bytes, paths } => {
+                images(&mut group, bytes)?;
                 flat::<ByteArrayType>(&mut group, paths, 2)?;
             }
             Values::TextList(rows) => {
@@ -317,8 +317,8 @@ fn flat<T: DataType>(group: &mut Group<'_, '_>, values: &[T::T], level: i16) -> 
     })
 }
 
-/// Pictures one by one: a batch is one page at the least, and pages are held in memory.
-fn pictures(group: &mut Group<'_, '_>, values: &[ByteArray]) -> parquet::errors::Result<()> {
+/// Images one by one: a batch is one page at the least, and pages are held in memory.
+fn images(group: &mut Group<'_, '_>, values: &[ByteArray]) -> parquet::errors::Result<()> {
     write_leaf::<ByteArrayType>(group, |column, deepest| {
         values
             .iter()
@@ -334,7 +334,9 @@ fn lists<'v, T: DataType>(
 where
     T::T: 'v,
 {
-    let (mut values, mut definition, mut repetition) = (Vec::new(), Vec::new(), Vec::new());
+    let mut values = Vec::new();
+    let mut definition = Vec::new();
+    let mut repetition = Vec::new();
     write_leaf::<T>(group, |column, deepest| {
         for row in rows {
             let row = row.unwrap_or_default();

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 const MAGIC: &[u8] = b"#ROSBAG V2.0\n";
 /// The longest header of a record, bytes; ours are a few hundred.
 const HEAD_MAX: u32 = 1 << 20;
-/// The largest chunk, packed or not, bytes: librealsense writes one picture in each.
+/// The largest chunk, packed or not, bytes: librealsense writes one image in each.
 const CHUNK_MAX: u32 = 256 << 20;
 
 const OP_MESSAGE: u8 = 2;
@@ -115,7 +115,7 @@ impl Bag {
             } else if begin.starts_with(b"SQLite") || begin.starts_with(b"\x89MCAP") {
                 "is a recording of ROS 2, not a rosbag of version 2"
             } else {
-                "is no rosbag of version 2"
+                "is not a rosbag of version 2"
             };
             return Err(Error::new(ErrorKind::BadRecording, format!("{} {what}", path.display())));
         }
@@ -206,8 +206,8 @@ impl Bag {
         Ok(())
     }
 
-    /// Calls `each` with every message in the order of the file. Chunks that are damaged are told to `damage`
-    /// and passed over; so is the end of a file that was cut. Messages in no chunk are told and read.
+    /// Calls `each` with every message in the order of the file. Damaged chunks are reported to `damage` and skipped;
+    /// so is the end of a file that was cut. Messages in no chunk are reported and read.
     pub(super) fn messages(
         &self,
         each: &mut dyn FnMut(Message<'_>) -> Result<()>,
@@ -305,13 +305,14 @@ impl Pass<'_> {
             self.damaged(&self.bag.corrupt(place.chunk, "a message of a connection that is not described"));
             return Ok(());
         };
-        let (s, ns) = (u32::from_le_bytes([*a, *b, *c, *d]), u32::from_le_bytes([*e, *f, *g, *h]));
+        let s = u32::from_le_bytes([*a, *b, *c, *d]);
+        let ns = u32::from_le_bytes([*e, *f, *g, *h]);
         let time_ns = i64::from(s) * 1_000_000_000 + i64::from(ns);
         (self.each)(Message { connection, time_ns, data, place })
     }
 }
 
-/// What a connection says of its type is not asked: the topics of librealsense say more.
+/// Notes a connection's topic. Its type is not read: the topics of librealsense say more.
 fn connect(connections: &mut BTreeMap<u32, Connection>, head: &Head<'_>) {
     if let (Some(id), Some(topic)) = (head.u32("conn"), head.text("topic")) {
         connections.entry(id).or_insert_with(|| Connection { topic: topic.to_owned() });

@@ -48,11 +48,11 @@ struct Stream {
 }
 
 impl RosbagImport {
-    /// Reads the bag `path` once from front to back; pictures are read later.
+    /// Reads the bag `path` once from front to back; images are read later.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`], [`ErrorKind::BadRecording`] when it is no rosbag of version 2, is packed with bz2 or holds no
-    /// frames of librealsense, [`ErrorKind::Io`]. Damage is counted in [`ImportFacts`].
+    /// [`ErrorKind::NotFound`], [`ErrorKind::BadRecording`] when it is not a rosbag of version 2, is packed with bz2 or
+    /// holds no frames of librealsense, [`ErrorKind::Io`]. Damage is counted in [`ImportFacts`].
     pub fn open(fs: &dyn Fs, path: &Path, name: String) -> Result<Self> {
         let file = fs.open(path).map_err(|e| Error::reading("open", path, e))?;
         Self::read(file, path, name)
@@ -98,13 +98,13 @@ impl RosbagImport {
         self.facts.stated.push(what);
     }
 
-    /// Counts pictures that cannot be imported, for one reason.
-    fn lose(&mut self, pictures: u64, problem: String) {
-        self.facts.lost = self.facts.lost.saturating_add(pictures.saturating_sub(1));
+    /// Counts images that cannot be imported, for one reason.
+    fn lose(&mut self, images: u64, problem: String) {
+        self.facts.lost = self.facts.lost.saturating_add(images.saturating_sub(1));
         self.facts.lose(problem);
     }
 
-    /// What the first pass found, as streams of cameras.
+    /// Turns the results of the first pass into streams of cameras.
     fn streams(&mut self, scan: Scan) -> Result<()> {
         let mut cameras: BTreeMap<u32, (String, String, String)> = BTreeMap::new();
         for ((device, sensor, kind, index), found) in scan.streams {
@@ -122,16 +122,16 @@ impl RosbagImport {
             let stream = if index == 0 { plain } else { format!("{plain}_{index}") };
             let stream = camera_name("", &stream);
             let topic = format!("/device_{device}/sensor_{sensor}/{kind}_{index}");
-            if let Some(Refused { pictures, first }) = found.refused {
-                let what = format!("{topic}: {pictures} pictures cannot be imported; the first: {first}");
-                self.lose(pictures, what);
+            if let Some(Refused { images, first }) = found.refused {
+                let what = format!("{topic}: {images} images cannot be imported; the first: {first}");
+                self.lose(images, what);
             }
             let (Some(format), Some((width, height))) = (found.format, found.size) else { continue };
             let id = StreamId::new(&camera, stream.as_str())
                 .map_err(|e| Error::new(ErrorKind::BadRecording, format!("{topic}: {e}")).with_source(e))?;
             if self.streams.iter().any(|s| s.record.id == id) {
-                let pictures = found.frames.len() as u64;
-                self.lose(pictures, format!("{topic}: there is a stream {id} already, this one is left out"));
+                let images = found.frames.len() as u64;
+                self.lose(images, format!("{topic}: there is a stream {id} already, this one is left out"));
                 continue;
             }
             let options = scan.options.get(&(device, sensor));
@@ -192,7 +192,7 @@ impl RosbagImport {
             return Err(Error::new(
                 ErrorKind::BadRecording,
                 format!(
-                    "{} holds no pictures of librealsense (topics /device_0/sensor_0/Depth_0/image/data){}",
+                    "{} holds no images of librealsense (topics /device_0/sensor_0/Depth_0/image/data){}",
                     self.bag.path.display(),
                     self.facts.problems.first().map_or_else(String::new, |p| format!("; {p}"))
                 ),
@@ -214,30 +214,31 @@ impl RosbagImport {
         let f = &s.frames[index];
         let name = format!("{}: frame {} of {}", self.bag.path.display(), index, s.record.id);
         let damaged = |why: &str| Error::new(ErrorKind::Corrupt, format!("{name} {why}"));
-        let place = f.place.ok_or_else(|| damaged("has no picture"))?;
+        let place = f.place.ok_or_else(|| damaged("has no image"))?;
         let data = self.bag.message(place, &mut self.chunks[stream])?;
-        let picture = image(data).ok_or_else(|| damaged("ends too early"))?;
+        let image = image(data).ok_or_else(|| damaged("ends too early"))?;
         let r = &s.record;
-        let (format, step) = (r.format, picture.step as usize);
+        let format = r.format;
+        let step = image.step as usize;
         let row = format.row_bytes(r.width) as usize;
-        let whole = step.checked_mul(r.height as usize).is_some_and(|n| n <= picture.data.len());
-        if (picture.width, picture.height) != (r.width, r.height)
-            || picture.format(format.is_depth()) != Some(format)
+        let whole = step.checked_mul(r.height as usize).is_some_and(|n| n <= image.data.len());
+        if (image.width, image.height) != (r.width, r.height)
+            || image.format(format.is_depth()) != Some(format)
             || step < row
             || !whole
         {
             return Err(damaged(&format!(
                 "is {}x{} {} with {step} bytes a row, its stream is {}x{} {}",
-                picture.width,
-                picture.height,
-                picture.encoding,
+                image.width,
+                image.height,
+                image.encoding,
                 r.width,
                 r.height,
                 format.name()
             )));
         }
         let mut pixels = Vec::with_capacity(row * r.height as usize);
-        picture
+        image
             .data
             .chunks(step.max(1))
             .take(r.height as usize)
@@ -278,7 +279,7 @@ impl RosbagImport {
         };
         header.set_names("rig", &r.id);
         header.set_device(&r.model, &r.serial);
-        header.set_picture(format, r.width, r.height);
+        header.set_image(format, r.width, r.height);
         Ok(RecordFrame { stream, header, pixels: Box::new(pixels) })
     }
 }

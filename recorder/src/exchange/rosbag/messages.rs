@@ -3,7 +3,7 @@
 
 use depthrig_bus::{Distortion, Intrinsics, PixelFormat};
 
-/// The longest side of a picture, pixels: a longer one would overflow the size of a picture.
+/// The longest side of an image, pixels: a longer one would overflow the size of an image.
 const MAX_SIDE: u32 = 1 << 16;
 
 /// Reads fields; `None` where the data end too early.
@@ -40,7 +40,8 @@ impl<'a> Fields<'a> {
     /// `std_msgs/Header`; its stamp in nanoseconds.
     fn header(&mut self) -> Option<i64> {
         let _seq = self.u32()?;
-        let (s, ns) = (self.u32()?, self.u32()?);
+        let s = self.u32()?;
+        let ns = self.u32()?;
         self.bytes()?;
         Some(i64::from(s) * 1_000_000_000 + i64::from(ns))
     }
@@ -60,14 +61,16 @@ pub(super) struct Image<'a> {
 pub(super) fn image(data: &[u8]) -> Option<Image<'_>> {
     let mut f = Fields(data);
     let stamp_ns = f.header()?;
-    let (height, width) = (f.u32()?, f.u32()?);
+    let height = f.u32()?;
+    let width = f.u32()?;
     let encoding = f.text()?;
-    let (big_endian, step) = (f.u8()? != 0, f.u32()?);
+    let big_endian = f.u8()? != 0;
+    let step = f.u32()?;
     Some(Image { stamp_ns, width, height, encoding, big_endian, step, data: f.bytes()? })
 }
 
 impl Image<'_> {
-    /// The pixel format, if datasets know it and the size is one of a picture; a depth stream says only how wide its numbers are.
+    /// The pixel format, if datasets know it and the size is one of an image; a depth stream says only how wide its numbers are.
     pub(super) fn format(&self, depth: bool) -> Option<PixelFormat> {
         if ![self.width, self.height].iter().all(|side| (1..=MAX_SIDE).contains(side)) {
             return None;
@@ -88,7 +91,8 @@ impl Image<'_> {
 pub(super) fn camera_info(data: &[u8]) -> Option<(u32, u32, Intrinsics)> {
     let mut f = Fields(data);
     f.header()?;
-    let (height, width) = (f.u32()?, f.u32()?);
+    let height = f.u32()?;
+    let width = f.u32()?;
     let model = f.text()?.to_lowercase();
     let n = f.u32()?;
     let mut coeffs = [0.0; 8];
@@ -115,10 +119,16 @@ pub(super) fn camera_info(data: &[u8]) -> Option<(u32, u32, Intrinsics)> {
 }
 
 /// `geometry_msgs/Transform`: translation and quaternion x, y, z, w.
-pub(super) fn transform(data: &[u8]) -> Option<([f64; 3], [f64; 4])> {
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Transform {
+    pub(super) translation: [f64; 3],
+    pub(super) rotation: [f64; 4],
+}
+
+pub(super) fn transform(data: &[u8]) -> Option<Transform> {
     let mut f = Fields(data);
-    let t = [f.f64()?, f.f64()?, f.f64()?];
-    Some((t, [f.f64()?, f.f64()?, f.f64()?, f.f64()?]))
+    let translation = [f.f64()?, f.f64()?, f.f64()?];
+    Some(Transform { translation, rotation: [f.f64()?, f.f64()?, f.f64()?, f.f64()?] })
 }
 
 /// `diagnostic_msgs/KeyValue`.

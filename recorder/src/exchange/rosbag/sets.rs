@@ -73,9 +73,9 @@ mod tests {
     fn nearest_frames_share_a_set() {
         let sets = group(&[vec![0, 100, 200], vec![10, 140, 195, 400], vec![]]);
         // The second stream has the most frames and gives the ticks.
-        let told: Vec<_> = sets.iter().map(|s| (s.tick_ns, s.frames.clone())).collect();
+        let placed: Vec<_> = sets.iter().map(|s| (s.tick_ns, s.frames.clone())).collect();
         assert_eq!(
-            told,
+            placed,
             [
                 (10, vec![Some(0), Some(0), None]),
                 (140, vec![Some(1), Some(1), None]),

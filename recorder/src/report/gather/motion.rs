@@ -1,4 +1,4 @@
-//! What is summed up of a motion unit while its batches pass.
+//! Sums over the batches of an IMU.
 
 use crate::dataset::MotionCount;
 use crate::report::MotionReport;

@@ -6,7 +6,7 @@ use crate::report::svg::{self, Strip, Time, Trace, nice_end, number};
 use crate::report::{MotionReport, Quantiles, Range, Report, StreamReport};
 use std::fmt::Write;
 
-/// What a unit at rest measures, m/s² (standard gravity).
+/// Acceleration that an IMU at rest measures, m/s² (standard gravity).
 const GRAVITY: f64 = 9.806_65;
 
 fn time(r: &Report) -> Time {
@@ -309,10 +309,10 @@ pub(super) fn motion(out: &mut String, r: &Report) {
             }
         };
         let turns: Vec<_> = r.motion.iter().map(|u| strip(u, "rotation", &u.rotation_series, None)).collect();
-        out.push_str(&svg::strips("Angular velocity over time, per motion unit", "rad/s", time(r), &turns));
+        out.push_str(&svg::strips("Angular velocity over time, per IMU", "rad/s", time(r), &turns));
         let pushes = r.motion.iter().map(|u| strip(u, "acceleration", &u.acceleration_series, Some(GRAVITY)));
         let pushes: Vec<_> = pushes.collect();
-        out.push_str(&svg::strips("Acceleration over time, per motion unit", "m/s²", time(r), &pushes));
+        out.push_str(&svg::strips("Acceleration over time, per IMU", "m/s²", time(r), &pushes));
     }
     out.push_str("</section>");
 }

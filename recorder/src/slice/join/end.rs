@@ -1,18 +1,18 @@
-//! What is to be said at the end: of what came after the last set, and of what nobody can explain.
+//! Losses after the last set, and losses without a known reason.
 
 use super::{Head, Join};
-use crate::slice::lane::Input;
 use crate::slice::output::{Losses, Output};
 use crate::slice::session::{
     AFTER, BEFORE, UNEXPLAINED, is_between, is_same_end, is_whole_end, last_account, lost_in_words,
 };
+use crate::slice::track::Input;
 
 impl Join<'_> {
     /// Takes what happened after the last set, and what the inputs say in words.
     pub(super) fn end(&mut self, heads: &mut [Head], output: &Output<'_>) {
         let Some((first, last)) = output.first.zip(output.last) else { return };
         if self.range.ends {
-            self.after(heads, last);
+            self.after(heads, last.0, last.1);
         }
         self.unexplained += heads.iter().map(|h| h.books.unexplained()).sum::<u64>();
         if self.unexplained > 0 {
@@ -23,14 +23,14 @@ impl Join<'_> {
         self.repeat_words(first.0, last.0);
     }
 
-    /// Takes what happened after the last set, of this id and time, from the lanes that end with it.
-    fn after(&mut self, heads: &mut [Head], (id, log_time): (u64, u64)) {
+    /// Takes what happened after the last set, of this id and time, from the tracks that end with it.
+    fn after(&mut self, heads: &mut [Head], id: u64, log_time: u64) {
         let inputs = self.inputs;
         let mut ended: Vec<_> = heads.iter_mut().filter(|head| head.ends_with(id)).collect();
         for head in &mut ended {
             head.close(inputs, &mut self.losses);
         }
-        // All of them tell of the same losses, but one whose accounts begin late may not know of each.
+        // All of them count the same losses, but one whose accounts begin late may not know of each.
         if let Some(head) = ended.iter_mut().max_by_key(|head| head.books.beyond_gaps()) {
             head.books.end(&mut self.losses);
         }

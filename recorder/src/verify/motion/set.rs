@@ -9,7 +9,7 @@ use crate::verify::sets::Walk;
 use depthrig_bus::StreamId;
 use std::collections::BTreeMap;
 
-/// Takes the motion of a set by its mark, which lies in the chunk at `offset`.
+/// Takes the IMU batches of a set by its mark, which lies in the chunk at `offset`.
 pub(in crate::verify) fn set(
     walk: &mut Walk,
     seen: &mut Seen<'_>,
@@ -31,7 +31,7 @@ pub(in crate::verify) fn set(
             continue;
         }
         if !is_named {
-            say("its frame_info names another frame or codec than a motion unit's");
+            say("its frame_info names another frame or codec than an IMU's");
         }
         if header.set_id != set.id {
             say("its frame_info is of another set");
@@ -47,7 +47,7 @@ pub(in crate::verify) fn set(
             say("it has no samples");
             continue;
         };
-        // Said of its channels already.
+        // Its channels have that finding already.
         let Some(unit) = walk.units.0.get_mut(&id) else { continue };
         if samples.sequence != header.sequence {
             say(&format!("its samples are those of batch {}", samples.sequence));
@@ -71,7 +71,7 @@ pub(in crate::verify) fn set(
     }
 }
 
-/// What the single samples of a unit in a set say otherwise than its batches.
+/// Compares the single samples of an IMU in a set with its batches; the first difference in words.
 fn differing(id: &StreamId, expected: &[Imu], got: &Single, decode: bool) -> Option<String> {
     if got.count != expected.len() as u64 {
         return Some(format!(
@@ -93,5 +93,5 @@ fn differing(id: &StreamId, expected: &[Imu], got: &Single, decode: bool) -> Opt
             e.stamp_utc_ns == g.stamp_utc_ns && u64::try_from(e.stamp_utc_ns).unwrap_or(0) == *time;
         !(same_time && e.same_values(g))
     });
-    at.map(|at| format!("single sample {} of {id} says otherwise than its batch", at + 1))
+    at.map(|at| format!("single sample {} of {id} differs from its batch", at + 1))
 }

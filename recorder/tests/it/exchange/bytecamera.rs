@@ -16,7 +16,7 @@ use depthrig_recorder::{
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Every kind of stream, two cameras of one model, and two infrared pictures of one camera.
+/// Every kind of stream, two cameras of one model, and two infrared images of one camera.
 fn everything() -> Session {
     let mut s = session();
     // The layout has no place for it, which is said: `an_export_says_that_it_leaves_out_motion`.
@@ -156,11 +156,12 @@ fn rescaled_depth_says_its_unit_and_its_loss() {
     assert!(report.counters["pixels of depth that were rounded"] > 100, "{:?}", report.counters);
     assert!(report.losses.iter().any(|l| l.contains("from units of 0.0001 m to 0.001 m")));
     let calibration = contents(&fs, &session_dir().join("calibration.json"));
-    let told: serde_json::Value = serde_json::from_slice(&calibration).unwrap();
-    assert_eq!(told["streams"][1]["depth_unit_m"], 0.001);
-    assert_eq!(told["streams"][1]["recorded_depth_unit_m"], 0.0001);
+    let json: serde_json::Value = serde_json::from_slice(&calibration).unwrap();
+    assert_eq!(json["streams"][1]["depth_unit_m"], 0.001);
+    assert_eq!(json["streams"][1]["recorded_depth_unit_m"], 0.0001);
     imported(&fs, &session_dir(), ByteCameraOptions::default()).unwrap();
-    let (before, after) = (open(&fs), reopened(&fs));
+    let before = open(&fs);
+    let after = reopened(&fs);
     let all = |d: &Dataset| d.sets(SetRange::ALL).map(Result::unwrap).collect::<Vec<_>>();
     for (a, b) in all(&before).iter().zip(all(&after)) {
         assert_eq!(b.frames[1].header.depth_unit_m, 0.001);
@@ -169,7 +170,7 @@ fn rescaled_depth_says_its_unit_and_its_loss() {
             assert!((f64::from(a) * 0.1 - f64::from(b)).abs() <= 0.5 + 1e-9, "{a} became {b}");
         }
     }
-    // A finer unit has no room for far pixels: they are no depth, counted, and told.
+    // A finer unit has no room for far pixels: they become 0, are counted and reported.
     let fs = recorded(&session, 1, ColorCodec::Raw);
     let report = exported(&fs, CameraNames::Short, Some(0.000_001)).unwrap();
     assert_eq!(report.lost, 2);
@@ -207,7 +208,7 @@ fn folders_of_others_come_in_with_everything_stated() {
     foreign(&fs, "camera_zed2i_quality", "R_color", &[0, 1], PixelFormat::Rgb8, name);
     let zed = Path::new("/in").join(name).join("camera_zed2i_quality");
     fs.put(&zed.join("pcd_0.npy"), b"no matter".to_vec());
-    // One picture is damaged, one has another size.
+    // One image is damaged, one has another size.
     let mut cut = contents(&fs, &zed.join("depth_1.png"));
     cut.truncate(100);
     fs.put(&zed.join("depth_1.png"), cut);
@@ -266,7 +267,7 @@ fn depth_units_and_rates_are_as_given() {
         ..Default::default()
     };
     let made = imported(&fs, Path::new("/in/monday"), options).unwrap();
-    assert!(made.facts.stated.iter().any(|s| s.contains("is no date YYYYMMDD_HHMM")));
+    assert!(made.facts.stated.iter().any(|s| s.contains("is not a date YYYYMMDD_HHMM")));
     let dataset = reopened(&fs);
     let units: Vec<_> = dataset.session().streams.iter().map(|s| s.depth_unit_m).collect();
     assert_eq!(units, [0.0005, 0.002]);
@@ -274,7 +275,7 @@ fn depth_units_and_rates_are_as_given() {
     assert_eq!(times, [0, 100_000_000]);
 }
 
-/// The list says the unit where there is no calibration and none is given: session and frames agree.
+/// The list says the unit where neither a calibration nor an option does: session and frames agree.
 #[test]
 fn a_list_without_a_calibration_says_the_unit() {
     let mut session = everything();
@@ -283,7 +284,7 @@ fn a_list_without_a_calibration_says_the_unit() {
     exported(&exports, CameraNames::Short, None).unwrap();
     let list = session_dir().join("frames.csv");
     let rows = String::from_utf8(contents(&exports, &list)).unwrap();
-    assert_eq!(rows.matches(",0.0001,").count(), 2, "the unit of each depth picture");
+    assert_eq!(rows.matches(",0.0001,").count(), 2, "the unit of each depth image");
     for (given, in_list, unit, says) in [
         (None, 0.0001, 0.0001, "depth unit 0.0001 m as frames.csv says"),
         (Some(0.002), 0.0001, 0.002, "depth unit 0.002 m as given, frames.csv says 0.0001"),
@@ -338,9 +339,9 @@ fn folders_with_long_names_are_cameras_of_their_own() {
     assert_eq!(cameras, ["a".repeat(31), format!("{stem}_2"), format!("{stem}_3")]);
 }
 
-/// A list that ends early between two lines is no broken line: the files it does not name tell.
+/// A list that ends early between two lines has no damaged line: the files that it does not name show it.
 #[test]
-fn a_list_that_lost_its_last_lines_is_told() {
+fn a_list_that_lost_its_last_lines_is_reported() {
     let fs = recorded(&everything(), 3, ColorCodec::Raw);
     exported(&fs, CameraNames::Short, None).unwrap();
     let path = session_dir().join("frames.csv");
@@ -368,8 +369,8 @@ fn what_is_no_such_folder_is_refused() {
     // The folder around it is one step off.
     let (_, why) = refused(&fs, "/in", ByteCameraOptions::default());
     assert!(why.contains("import one, such as /in/a"), "{why}");
-    let picture = contents(&fs, Path::new("/in/a/camera_d455/depth_1.png"));
-    fs.put(Path::new("/in/a/camera_d455/depth_001.png"), picture);
+    let image = contents(&fs, Path::new("/in/a/camera_d455/depth_1.png"));
+    fs.put(Path::new("/in/a/camera_d455/depth_001.png"), image);
     let (_, why) = refused(&fs, "/in/a", ByteCameraOptions::default());
     assert!(why.contains("number 1 of depth_N.png is there twice"), "{why}");
     let unit = ByteCameraOptions { depth_unit_m: Some(1000.0), ..Default::default() };
@@ -400,14 +401,14 @@ fn what_is_no_such_folder_is_refused() {
 #[test]
 fn a_folder_for_each_depth_mode() {
     let mut session = everything();
-    let eye = stream("zed/color", PixelFormat::Rgb8, 32, 24);
+    let left = stream("zed/color", PixelFormat::Rgb8, 32, 24);
     let mut of = |name: &str, format| {
         let mut s = stream(&format!("zed/{name}"), format, 32, 24);
         s.model = "ZED 2i".into();
         session.streams.push(s);
     };
     of("left", PixelFormat::Yuyv);
-    of("color", eye.format);
+    of("color", left.format);
     for mode in ["performance", "quality"] {
         of(&format!("depth_{mode}"), PixelFormat::Z16);
         of(&format!("confidence_{mode}"), PixelFormat::Confidence8);

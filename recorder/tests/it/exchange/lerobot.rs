@@ -1,4 +1,4 @@
-//! LeRobot exports that leave sets out. What an export holds is checked in `tests/python/test_lerobot.py`.
+//! LeRobot exports that leave sets out. The content of an export is checked in `tests/python/test_lerobot.py`.
 
 use crate::support::*;
 use core::ops::ControlFlow;
@@ -19,7 +19,8 @@ fn sets_that_are_left_out_are_not_counted_as_exported() {
     r.finish().unwrap();
     let incomplete = Incomplete::LeaveOut;
     let mut lerobot = Lerobot::new(LerobotOptions { incomplete, ..LerobotOptions::default() });
-    let (out, on) = (Path::new("/export"), &mut |_| ControlFlow::Continue(()));
+    let out = Path::new("/export");
+    let on = &mut |_| ControlFlow::Continue(());
     let report = export(&fs, &mut lerobot, vec![open(&fs)], out, ExportOptions::default(), on).unwrap();
     assert_eq!((report.sets, report.frames, report.lost), (4, 12, 0));
     assert_eq!(report.counters["sets that were left out"], 1);

@@ -1,6 +1,6 @@
-//! Bags of librealsense: a real one, the same one damaged everywhere, and small ones made here.
+//! Bags of librealsense: a real one, the same one damaged everywhere, and small synthetic ones.
 
-mod made;
+mod synthetic;
 
 use crate::support::*;
 use core::ops::ControlFlow;
@@ -30,9 +30,9 @@ fn imported(bytes: Vec<u8>) -> (MemFs, Result<ImportReport>) {
     (fs, report)
 }
 
-/// What `rosbag info`, `rosbag echo` and Python's `rosbags` say of the bag.
+/// The expected values are those of `rosbag info`, `rosbag echo` and Python's `rosbags`.
 #[test]
-fn the_real_bag_comes_in_whole() {
+fn the_real_bag_is_imported_completely() {
     let (fs, report) = imported(real_bag());
     let report = report.unwrap();
     assert_eq!((report.facts.lost, report.summary.frames), (0, 3), "{:?}", report.facts);
@@ -76,7 +76,7 @@ fn the_real_bag_comes_in_whole() {
     assert_eq!(h.arrival_time_ns, 1_534_232_519_732_935_547);
     assert_eq!((h.exposure_ns, h.gain, h.device_tick_ns), (6_452_000, 16.0, 1000.0));
     assert_eq!(h.clock_domain, ClockDomain::Device as u32);
-    assert!(h.has(FrameFlags::CLOCK_WARMUP), "two frames are no long history");
+    assert!(h.has(FrameFlags::CLOCK_WARMUP), "two frames are not a long history");
     for h in &depths {
         assert!(h.capture_time_ns <= h.arrival_time_ns);
     }
@@ -92,9 +92,9 @@ fn record(fields: &[(&str, &[u8])], data: &[u8]) -> Vec<u8> {
     [&(head.len() as u32).to_le_bytes(), &head[..], &(data.len() as u32).to_le_bytes(), data].concat()
 }
 
-/// A D435i records its motion unit too: three messages, put in before the pictures.
+/// A D435i records its IMU too: three messages, put in before the images.
 #[test]
-fn motion_of_a_bag_is_told_and_left_out() {
+fn motion_of_a_bag_is_reported_and_left_out() {
     let topic = "/device_0/sensor_2/Gyro_0/imu/data";
     let conn = 9999_u32.to_le_bytes();
     let mut inner = record(&[("op", &[7]), ("conn", &conn), ("topic", topic.as_bytes())], b"");
@@ -108,15 +108,15 @@ fn motion_of_a_bag_is_told_and_left_out() {
     let (fs, report) = imported(bytes);
     let report = report.unwrap();
     assert_eq!((report.facts.lost, report.summary.frames), (0, 3), "{:?}", report.facts);
-    let told = format!("{topic}: 3 messages are left out: motion and poses of a bag are not imported");
+    let statement = format!("{topic}: 3 messages are left out: motion and poses of a bag are not imported");
     let dataset = Dataset::open_with(Arc::new(fs), &dir()).unwrap();
     let stated = dataset.session().extra["import"]["stated"].as_array().unwrap();
-    assert!(stated.iter().any(|s| s.as_str() == Some(&told)), "{stated:?}");
+    assert!(stated.iter().any(|s| s.as_str() == Some(&statement)), "{stated:?}");
 }
 
 /// Cut anywhere: an error that says so, or what is before it with the loss counted; never a panic, never silence.
 #[test]
-fn a_bag_that_was_cut_is_told() {
+fn a_bag_that_was_cut_is_reported() {
     let whole = real_bag();
     let mut with_frames = 0;
     for i in 0..60 {
@@ -140,8 +140,8 @@ fn other_files_are_refused_with_advice() {
         (&b"#ROSBAG V1.2\n"[..], "rosbag fix"),
         (b"SQLite format 3\0", "ROS 2"),
         (b"\x89MCAP0\r\n", "ROS 2"),
-        (b"", "is no rosbag"),
-        (b"#ROSBAG V2.0\n", "holds no pictures"),
+        (b"", "is not a rosbag"),
+        (b"#ROSBAG V2.0\n", "holds no images"),
     ] {
         let e = imported(bytes.to_vec()).1.unwrap_err();
         assert!(e.kind() == ErrorKind::BadRecording && e.to_string().contains(word), "{e}");
@@ -158,7 +158,7 @@ fn other_files_are_refused_with_advice() {
 
 /// A chunk that unpacks to more or less than its header says is damaged, whatever is in it.
 #[test]
-fn a_chunk_of_another_size_is_told() {
+fn a_chunk_of_another_size_is_reported() {
     let whole = real_bag();
     let at = whole.windows(5).rposition(|w| w == b"size=").unwrap() + 5;
     let size = u32::from_le_bytes(whole[at..at + 4].try_into().unwrap());

@@ -1,8 +1,8 @@
-//! What a stream of an emulated camera did, counted.
+//! Frame counts of a stream of an emulated camera.
 
 use serde::Serialize;
 
-/// The frames of one stream since the camera was made. A stop, an unplugging or a reset keeps them.
+/// The frames of one stream since the camera was created. A stop, an unplugging or a reset keeps them.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Accounts {
     /// Frames whose last byte the host took. `good`, `error_bit`, `short`, `long` and `repeated` add up to it.
@@ -17,7 +17,7 @@ pub struct Accounts {
     pub long: u64,
     /// Sent a second time in place of the next one.
     pub repeated: u64,
-    /// Not sent, because a fault said so.
+    /// Not sent, because of a fault.
     pub skipped: u64,
     /// Not sent, because the host did not read.
     pub unread: u64,

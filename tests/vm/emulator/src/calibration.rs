@@ -10,9 +10,9 @@ use crate::model::{Family, Model};
 use depthrig_drivers::realsense::protocol::tables::{Coefficients, Pinhole, RgbTable, SIZES};
 pub use imu::{ImuAxes, ImuCalibration};
 pub use l515::{L515, L515Color, L515Depth};
-pub use zed::{Eye, ZedMode};
+pub use zed::{ZedIntrinsics, ZedMode};
 
-/// What the camera was calibrated to.
+/// Calibration of a camera.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Calibration {
     /// The stereo pair of a D400.
@@ -82,11 +82,13 @@ impl Calibration {
 /// serial.
 fn coefficients(model: &Model, spread: &Spread<'_>) -> Coefficients {
     let focal = 0.66 + 0.01 * spread.at("focal");
-    let (cx, cy) = (0.01 * spread.at("cx"), 0.01 * spread.at("cy"));
+    let cx = 0.01 * spread.at("cx");
+    let cy = 0.01 * spread.at("cy");
     let mut rectified = [Pinhole::default(); 16];
     for (entry, size) in rectified.iter_mut().zip(SIZES) {
         if let Some((width, height)) = size {
-            let (width, height) = (width as f32, height as f32);
+            let width = width as f32;
+            let height = height as f32;
             let fx = focal * width.max(height * 4.0 / 3.0);
             *entry = Pinhole { fx, fy: fx, ppx: width * (0.5 + cx), ppy: height * (0.5 + cy) };
         }

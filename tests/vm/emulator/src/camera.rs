@@ -1,4 +1,4 @@
-//! The handle of an emulated camera: plug it in, unplug it, make it fail, ask what it did.
+//! The handle of an emulated camera: plug it in, unplug it, inject faults, read its accounts.
 
 use crate::calibration::Calibration;
 use crate::content::{self, hash};
@@ -17,10 +17,10 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::thread::JoinHandle;
 
 /// How long a fault may wait for the device's thread, which may be busy sending.
-const FAULT_PATIENCE: Duration = Duration::from_secs(2);
+const FAULT_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// How long a device may take to come or to go.
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// An emulated camera. Dropping it unplugs it.
 pub struct Camera {
@@ -34,10 +34,10 @@ pub struct Camera {
     companion: Option<Box<Camera>>,
 }
 
-static MADE: AtomicU32 = AtomicU32::new(1);
+static CREATED: AtomicU32 = AtomicU32::new(1);
 
 fn new_serial(model: &Model) -> String {
-    let number = MADE.fetch_add(1, Ordering::Relaxed);
+    let number = CREATED.fetch_add(1, Ordering::Relaxed);
     match model.family {
         crate::model::Family::D400 => format!("{:012}", 830_000_000_000 + u64::from(number)),
         crate::model::Family::L515 => format!("f{number:07x}"),
@@ -64,7 +64,7 @@ impl Camera {
         Self::part(model, options, None)
     }
 
-    /// One USB device of a camera; `video` is what a companion follows.
+    /// One USB device of a camera; a companion follows `video`.
     fn part(model: Arc<Model>, options: Options, video: Option<Arc<Shared>>) -> Result<Self> {
         let serial = options.serial.clone().unwrap_or_else(|| new_serial(&model));
         let shared = Arc::new(Shared::new(model.streams().count())?);
@@ -97,17 +97,17 @@ impl Camera {
         let (line, port) = vhci::attach(self.options.hub, self.options.speed, *slot)?;
         *slot = Some(port);
         self.shared.ask(Command::Serve(line, Some(port)))?;
-        self.shared.wait(PATIENCE, |p| matches!(p, Presence::Plugged(_)))?;
+        self.shared.wait(TIMEOUT, |p| matches!(p, Presence::Plugged(_)))?;
         self.companion.as_ref().map_or(Ok(()), |c| c.replug())
     }
 
-    /// Serves a host that is no kernel: `line` is the device's end of a stream that speaks USB/IP.
+    /// Serves a host other than the kernel: `line` is the device's end of a USB/IP stream.
     ///
     /// # Errors
     /// When its thread does not take the line.
     pub fn serve(&self, line: UnixStream) -> Result<()> {
         self.shared.ask(Command::Serve(line, None))?;
-        self.shared.wait(PATIENCE, |p| matches!(p, Presence::Plugged(_)))
+        self.shared.wait(TIMEOUT, |p| matches!(p, Presence::Plugged(_)))
     }
 
     /// Pulls the plug. Returns when the device is off its port.
@@ -116,7 +116,7 @@ impl Camera {
     /// When it does not go.
     pub fn unplug(&self) -> Result<()> {
         self.shared.ask(Command::Unplug(None))?;
-        self.shared.wait(PATIENCE, |p| p == Presence::Unplugged)?;
+        self.shared.wait(TIMEOUT, |p| p == Presence::Unplugged)?;
         self.companion.as_ref().map_or(Ok(()), |c| c.unplug())
     }
 
@@ -129,7 +129,7 @@ impl Camera {
         self.companion.as_ref().map_or(Ok(()), |c| c.unplug_for(time))
     }
 
-    /// Makes something go wrong, from now on: what the host asks after this meets it.
+    /// Injects a fault. Requests that the host sends after this call meet it.
     ///
     /// # Errors
     /// When the fault names a stream that the camera has not.
@@ -137,7 +137,8 @@ impl Camera {
         if let Fault::Frames { stream, .. } | Fault::StallEndpoint { stream } = &fault {
             self.model.stream_index(stream)?;
         }
-        let (name, until) = (fault.name(), HostTime::now().plus(FAULT_PATIENCE));
+        let name = fault.name();
+        let until = HostTime::now().plus(FAULT_TIMEOUT);
         let asked = || self.shared.lock().faults.get(name).copied();
         let before = asked();
         self.shared.ask(Command::Fault(fault))?;
@@ -147,7 +148,7 @@ impl Camera {
         Ok(())
     }
 
-    /// What a stream did.
+    /// Accounts of a stream.
     ///
     /// # Errors
     /// When the camera has no such stream.
@@ -161,7 +162,7 @@ impl Camera {
         self.shared.lock().faults.clone()
     }
 
-    /// The requests of the hardware monitor that came, oldest first, but for readings of the clock; of very many the latest.
+    /// Requests to the hardware monitor without clock readings, oldest first; of very many the latest.
     pub fn asked(&self) -> Vec<Asked> {
         self.shared.lock().asked.iter().cloned().collect()
     }
@@ -196,7 +197,7 @@ impl Camera {
         Ok(self.session(stream, index)?.captured(index))
     }
 
-    /// What the camera's clock showed at the middle of a frame's exposure, microseconds.
+    /// The camera's clock at the middle of a frame's exposure, microseconds.
     ///
     /// # Errors
     /// Those of [`Self::expected`].
@@ -206,7 +207,7 @@ impl Camera {
         Ok(session.clock.shown_us(session.first_ns + k * session.period_ns))
     }
 
-    /// What the IMU measured, oldest first; of very many samples the latest.
+    /// Samples of the IMU, oldest first; of very many the latest.
     pub fn imu_samples(&self) -> Vec<ImuSample> {
         self.shared.lock().imu.iter().copied().collect()
     }
@@ -224,22 +225,22 @@ impl Camera {
         &self.serial
     }
 
-    /// The serial that its USB descriptor has: that of its chip, for a RealSense camera.
+    /// The serial in its USB descriptor: for a RealSense camera that of its chip.
     pub fn usb_serial(&self) -> String {
         Identity::new(&self.model, &self.serial).chip_serial
     }
 
-    /// What its stamps carry in place of its serial.
+    /// Hash that its stamps carry in place of its serial.
     pub fn serial_hash(&self) -> u64 {
         hash(&self.serial)
     }
 
-    /// What it was calibrated to.
+    /// Its calibration.
     pub fn calibration(&self) -> Calibration {
         Calibration::new(&self.model, &self.serial)
     }
 
-    /// The other USB device in the same housing: the motion unit of a ZED 2i.
+    /// The other USB device in the same housing: the IMU of a ZED 2i.
     pub fn companion(&self) -> Option<&Self> {
         self.companion.as_deref()
     }
@@ -275,7 +276,7 @@ impl Drop for Camera {
     }
 }
 
-/// What happens to all cameras of one controller at once.
+/// Events that affect all cameras of one controller at once.
 pub struct Hub;
 
 impl Hub {

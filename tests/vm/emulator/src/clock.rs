@@ -2,13 +2,13 @@
 
 use depthrig_bus::HostTime;
 
-/// A device clock. Its schedule runs evenly; what it *shows* may jump.
+/// A device clock. Its schedule runs evenly; its *reading* may jump.
 #[derive(Debug, Clone, Copy)]
 pub struct DeviceClock {
     powered: HostTime,
     /// Device seconds per host second.
     rate: f64,
-    /// What it showed at power-on, in microseconds, and by how much it was made to jump since.
+    /// Its reading at power-on plus all jumps since, microseconds.
     offset_us: i64,
 }
 
@@ -23,17 +23,17 @@ impl DeviceClock {
         (host.since_ns(self.powered) as f64 * self.rate).round() as i64
     }
 
-    /// When the device had run for so long.
+    /// The host time at which the device had run for `running_ns`.
     pub fn host(&self, running_ns: i64) -> HostTime {
         self.powered.plus_ns((running_ns as f64 / self.rate).round() as i64)
     }
 
-    /// What the clock shows when the device has run for so long: microseconds, wrapping at 2^32.
+    /// The clock's reading after `running_ns` of operation: microseconds, wrapping at 2^32.
     pub fn shown_us(&self, running_ns: i64) -> u32 {
         (running_ns.div_euclid(1000) + self.offset_us) as u32
     }
 
-    /// Makes what it shows jump.
+    /// Makes its reading jump by `us` microseconds.
     pub fn jump(&mut self, us: i64) {
         self.offset_us += us;
     }

@@ -18,7 +18,7 @@ fn seconds(word: &str) -> Result<Duration> {
 /// Reads `key=value` words into options.
 ///
 /// # Errors
-/// When a word is none, or its value does not fit.
+/// When a word is not an option or its value is invalid.
 pub fn options<'a>(words: impl IntoIterator<Item = &'a str>) -> Result<Options> {
     let mut options = Options::default();
     for word in words {
@@ -45,10 +45,10 @@ pub fn options<'a>(words: impl IntoIterator<Item = &'a str>) -> Result<Options> 
 }
 
 impl Console {
-    /// Does what a line says. The reply is a line that begins with `ok`, or the JSON of `status`; `None` is `quit`.
+    /// Executes a command line. The reply is a line that begins with `ok`, or the JSON of `status`; `None` is `quit`.
     ///
     /// # Errors
-    /// When the line is no command, or the command failed.
+    /// When the command is unknown or failed.
     pub fn command(&mut self, line: &str) -> Result<Option<String>> {
         let words: Vec<&str> = line.split_whitespace().collect();
         let Some((name, rest)) = words.split_first() else { return Err(Error::new("an empty line")) };

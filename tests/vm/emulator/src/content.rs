@@ -1,8 +1,8 @@
-//! What frames hold: a pattern made once for each (camera, stream, mode), and a stamp that tells each frame.
+//! Contents of frames: a pattern computed once for each (camera, stream, mode), and a stamp that identifies each frame.
 //!
 //! Software emulation pays for every byte that is computed, so nothing but 32 bytes changes from frame to frame, and
-//! the pattern is smooth, so that compressing it is cheap too. Whoever knows serial, stream, mode and index can make the
-//! same bytes again: [`frame`].
+//! the pattern is smooth, so that compressing it is cheap too. [`frame`]
+//! computes the same bytes again from serial, stream, mode and index.
 
 use crate::model::{Layout, Mode};
 
@@ -10,14 +10,14 @@ use crate::model::{Layout, Mode};
 pub const STAMP: usize = 32;
 const MAGIC: [u8; 4] = *b"DRIG";
 
-/// The first 32 bytes of every picture (of both pictures, in a frame that holds two).
+/// The first 32 bytes of every image (of both images, in a frame that holds two).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Stamp {
     /// [`hash`] of the serial.
     pub serial_hash: u64,
     /// The index of the stream in its model.
     pub stream: u16,
-    /// The index of the frame: it counts every frame that was due since the camera was made, sent or not, and never
+    /// The index of the frame: it counts every frame that was due since the camera was created, sent or not, and never
     /// starts again.
     pub index: u64,
 }
@@ -35,10 +35,10 @@ impl Stamp {
         bytes
     }
 
-    /// Reads the stamp of a picture that has been unpacked (and turned upright), or of a JPEG picture as it came; `None`
-    /// when there is none, or when it is damaged.
-    pub fn read(picture: &[u8]) -> Option<Self> {
-        let bytes: &[u8; STAMP] = picture.strip_prefix(&JPEG_HEAD).unwrap_or(picture).first_chunk()?;
+    /// Reads the stamp of an image that has been unpacked (and turned upright), or of a JPEG image as it came; `None`
+    /// when it is missing or damaged.
+    pub fn read(image: &[u8]) -> Option<Self> {
+        let bytes: &[u8; STAMP] = image.strip_prefix(&JPEG_HEAD).unwrap_or(image).first_chunk()?;
         let long = |at: usize| Some(u64::from_le_bytes(*bytes.get(at..)?.first_chunk()?));
         let crc = u32::from_le_bytes([bytes[24], bytes[25], bytes[26], bytes[27]]);
         if bytes[..4] != MAGIC || crc32fast::hash(&bytes[..24]) != crc {
@@ -54,9 +54,9 @@ pub fn hash(text: &str) -> u64 {
     text.bytes().fold(0xCBF2_9CE4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01B3))
 }
 
-/// What comes before the stamp of a JPEG picture: start of image, then a comment with room for it (ITU-T T.81, B.1.1).
+/// Bytes before the stamp of a JPEG image: start of image, then a comment with room for it (ITU-T T.81, B.1.1).
 const JPEG_HEAD: [u8; 6] = [0xFF, 0xD8, 0xFF, 0xFE, 0, STAMP as u8 + 2];
-/// Of JPEG pictures, percent.
+/// Quality of JPEG images, percent.
 const JPEG_QUALITY: u8 = 95;
 
 /// The bytes of a frame as they travel.
@@ -73,11 +73,12 @@ pub(crate) fn pattern(serial: &str, stream: u16, mode: &Mode) -> Vec<u8> {
         return jpeg(serial, stream, mode);
     }
     let seed = seed(serial, stream);
-    let (row, height) = (mode.row(), usize::from(mode.height));
+    let row = mode.row();
+    let height = usize::from(mode.height);
     let mut bytes = vec![0; row * height];
     let wide = mode.fourcc == *b"Z16 ";
     for (y, line) in bytes.chunks_exact_mut(row.max(1)).enumerate() {
-        // A band of rows differs from the next one, and a column from the next one: a picture that is shifted, turned
+        // A band of rows differs from the next one, and a column from the next one: an image that is shifted, turned
         // or mixed up does not compare equal.
         let base = seed.wrapping_add(y as u32 * 7);
         if wide {
@@ -98,18 +99,19 @@ fn seed(serial: &str, stream: u16) -> u32 {
     (hash(serial) ^ u64::from(stream).wrapping_mul(0x9E37_79B9)) as u32
 }
 
-/// The picture that a JPEG of a stream was made of: red, green, blue, row after row. It is smooth, so that decoding it gives
+/// The image that a JPEG of a stream was made of: red, green, blue, row after row. It is smooth, so that decoding it gives
 /// nearly the same, and no two places of it look alike.
 pub fn painted(serial: &str, stream: u16, mode: &Mode) -> Vec<u8> {
     let seed = seed(serial, stream);
-    let (width, height) = (u32::from(mode.width), u32::from(mode.height));
+    let width = u32::from(mode.width);
+    let height = u32::from(mode.height);
     let ramp = |at: u32, of: u32| (at * 200 / of.max(1)) as u8 + 28;
     let blue = 40 + (seed % 160) as u8;
     let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
     pixels.flat_map(|(x, y)| [ramp(x, width), ramp(y, height), blue]).collect()
 }
 
-/// [`painted`] as a JPEG picture with room for a stamp; empty when it cannot be encoded.
+/// [`painted`] as a JPEG image with room for a stamp; empty when it cannot be encoded.
 fn jpeg(serial: &str, stream: u16, mode: &Mode) -> Vec<u8> {
     let mut coded = Vec::new();
     let encoder = jpeg_encoder::Encoder::new(&mut coded, JPEG_QUALITY);
@@ -152,8 +154,10 @@ pub(crate) fn put_stamp(frame: &mut [u8], mode: &Mode, stamp: &Stamp) {
 /// src/l500, rotation-transform.cpp, Apache-2.0), so upright (x, 0) is row Hs − 1 − x, column Ws − 1.
 fn turned_offset(mode: &Mode, i: usize) -> usize {
     let pixel = (usize::from(mode.bits) / 8).max(1);
-    let (x, part) = (i / pixel, i % pixel);
-    let (width, height) = (usize::from(mode.width), usize::from(mode.height));
+    let x = i / pixel;
+    let part = i % pixel;
+    let width = usize::from(mode.width);
+    let height = usize::from(mode.height);
     ((height - 1 - x.min(height - 1)) * width + width - 1) * pixel + part
 }
 
@@ -180,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn both_pictures_of_a_frame_are_stamped() {
+    fn both_images_of_a_frame_are_stamped() {
         let stamp = Stamp { serial_hash: hash("a"), stream: 1, index: 9 };
         let y8i = frame("a", 1, &mode(Layout::Interleaved, 16), 9);
         let (left, right): (Vec<u8>, Vec<u8>) = y8i.chunks(2).map(|p| (p[0], p[1])).unzip();
@@ -190,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn a_jpeg_has_its_stamp_in_a_comment_and_is_the_picture_that_was_painted() {
+    fn a_jpeg_has_its_stamp_in_a_comment_and_is_the_image_that_was_painted() {
         let mode = Mode { fourcc: *b"MJPG", ..mode(Layout::Jpeg, 16) };
         let sent = frame("a", 1, &mode, 9);
         assert_eq!(Stamp::read(&sent), Some(Stamp { serial_hash: hash("a"), stream: 1, index: 9 }));
@@ -206,7 +210,8 @@ mod tests {
     fn a_turned_frame_has_its_stamp_upright() {
         let mode = mode(Layout::Turned, 16);
         let wire = frame("a", 0, &mode, 3);
-        let (ws, hs) = (64, 48);
+        let ws = 64;
+        let hs = 48;
         let mut upright = vec![0u8; wire.len()];
         for i in 0..hs {
             for j in 0..ws {

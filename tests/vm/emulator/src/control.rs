@@ -16,7 +16,7 @@ pub(crate) mod query {
     pub const GET_DEF: u8 = 0x87;
 }
 
-/// What a request was refused for: the value of the Request Error Code control (UVC 1.5, table 4-7).
+/// Why a request was refused: the value of the Request Error Code control (UVC 1.5, table 4-7).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub(crate) enum Refusal {
@@ -143,7 +143,7 @@ impl Units {
     }
 }
 
-/// A probe or commit block: what the host proposes and what it gets (UVC 1.5, table 4-75).
+/// A probe or commit block: the host's proposal and the answer (UVC 1.5, table 4-75).
 pub(crate) mod probe {
     use super::{Result, Speed, model};
     use crate::Error;
@@ -167,7 +167,7 @@ pub(crate) mod probe {
         bytes
     }
 
-    /// The block and the mode that a stream answers to what the host proposes: the nearest that it has.
+    /// The block and the mode that a stream answers to the host's proposal: the nearest that it has.
     pub(crate) fn negotiate(
         stream: &Stream,
         speed: Speed,

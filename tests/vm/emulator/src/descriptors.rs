@@ -201,7 +201,7 @@ fn format_descriptors(format: &Format, index: u8, speed: Speed) -> Result<Vec<u8
         (false, false) => 0x04,
     };
     let head = Bytes::default().u8(&[CS_INTERFACE, subtype, index, sizes.len() as u8]);
-    // Motion JPEG has a descriptor of its own in place of an identifier; its pictures differ in size.
+    // Motion JPEG has a descriptor of its own in place of an identifier; its images differ in size.
     let head = if jpeg { head.u8(&[0]) } else { head.u8(&format.guid_bytes()?).u8(&[format.bits]) };
     let head = head.u8(&[1, 0, 0, 0, 0]);
     // Frame-based payloads end with bVariableSize: 0, every frame has the same size.
@@ -210,7 +210,8 @@ fn format_descriptors(format: &Format, index: u8, speed: Speed) -> Result<Vec<u8
         let row = u32::from(size.width) * u32::from(format.bits) / 8;
         let frame = row * u32::from(size.height);
         let rates = || size.rates.iter().copied();
-        let (least, most) = (rates().min().unwrap_or(1), rates().max().unwrap_or(1));
+        let least = rates().min().unwrap_or(1);
+        let most = rates().max().unwrap_or(1);
         let intervals: Vec<u32> = size.intervals().collect();
         let first = intervals.first().copied().unwrap_or(0);
         let head = Bytes::default().u8(&[CS_INTERFACE, subtype + 1, at as u8 + 1, 0]);

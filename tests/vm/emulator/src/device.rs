@@ -46,7 +46,7 @@ pub(crate) struct Device {
     port: Option<u32>,
     /// The video half, for the sensor half of a ZED.
     video: Option<Arc<Shared>>,
-    // What follows is as it was at power-on.
+    // From here on: reset at power-on.
     clock: DeviceClock,
     units: Units,
     firmware: Firmware,
@@ -110,7 +110,7 @@ impl Device {
         }
     }
 
-    /// Lives until it is told to end.
+    /// Runs until the command to end.
     pub fn run(mut self) {
         let mut back_at: Option<HostTime> = None;
         loop {
@@ -357,7 +357,7 @@ impl Device {
         self.pumps.get_mut(index)
     }
 
-    /// Reads what the host has sent and acts on it; `false` at the end.
+    /// Reads and executes messages from the host; `false` at the end.
     fn receive(&mut self, input: &mut Input, mut line: &UnixStream) -> io::Result<bool> {
         let free = input.space(HEADER);
         match line.read(free) {
@@ -422,7 +422,7 @@ impl Device {
         Ok(())
     }
 
-    /// A transfer is taken back; says whether it was still there.
+    /// Cancels a transfer. Returns whether it was still queued.
     fn forget(&mut self, victim: u32) -> bool {
         let queues = self.pumps.iter_mut().map(|p| &mut p.urbs).chain([&mut self.vendor_urbs]);
         for queue in queues {
@@ -457,7 +457,7 @@ fn answer(line: &UnixStream, seq: u32, status: i32, data: &[u8], actual: usize) 
     write_all(line, &mut [IoSlice::new(&head), IoSlice::new(data)])
 }
 
-/// What has come from the host and is not yet read.
+/// Buffer of bytes from the host that are not yet read.
 struct Input {
     bytes: Vec<u8>,
     start: usize,

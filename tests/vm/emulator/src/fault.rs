@@ -1,4 +1,4 @@
-//! What can be made to go wrong, and how it is written on the control socket.
+//! Faults that can be injected, and their syntax on the control socket.
 
 use crate::{Error, Result};
 use core::str::FromStr;
@@ -53,7 +53,7 @@ pub enum Fault {
     DamagedTable(u32),
     /// Its tables are those of a unit that was never calibrated.
     Uncalibrated,
-    /// The camera reports this error code until told otherwise.
+    /// The camera reports this error code until the next such command.
     ReportError(u8),
     /// The camera restarts by itself: it drops off the bus and comes back.
     Restart,
@@ -61,7 +61,7 @@ pub enum Fault {
     Clear,
 }
 
-/// What is wrong with a frame.
+/// Damage to a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Damage {
     /// The ERR bit of its header is set.
@@ -76,7 +76,7 @@ pub enum Damage {
     Skip,
 }
 
-/// What is wrong with a reply of the hardware monitor.
+/// Defect of a reply of the hardware monitor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WrongReply {
     /// It names another opcode.
@@ -90,7 +90,7 @@ pub enum WrongReply {
 }
 
 impl Fault {
-    /// What the accounts call it.
+    /// Its name in the accounts.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Frames { damage, .. } => match damage {

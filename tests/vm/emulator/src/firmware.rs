@@ -1,4 +1,4 @@
-//! What answers the vendor's requests: the hardware monitor of RealSense cameras, the registers of a ZED.
+//! Firmware that answers the vendor's requests: the hardware monitor of RealSense cameras, the registers of a ZED.
 
 mod d400;
 pub(crate) mod imu;
@@ -16,10 +16,10 @@ use depthrig_bus::HostTime;
 use monitor::Request;
 use std::collections::BTreeSet;
 
-/// Who a camera is.
+/// Identity of a camera.
 #[derive(Debug, Clone)]
 pub(crate) struct Identity {
-    /// What is printed on it and what its firmware calls its serial.
+    /// The serial that is printed on it and that its firmware reports.
     pub serial: String,
     /// The serial of its chip, which is what USB shows for a RealSense camera.
     pub chip_serial: String,
@@ -41,7 +41,7 @@ impl Identity {
     }
 }
 
-/// What the firmware may look at while it answers.
+/// State that the firmware reads while it answers.
 pub(crate) struct World<'a> {
     pub model: &'a Model,
     pub identity: &'a Identity,
@@ -51,10 +51,10 @@ pub(crate) struct World<'a> {
     pub streaming: bool,
 }
 
-/// The request by which the clock is read.
+/// Opcode that reads the clock.
 const READ_MEMORY: u32 = 0x01;
 
-/// A request of the hardware monitor that came.
+/// A request that the hardware monitor received.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Asked {
     /// Its opcode.
@@ -65,14 +65,14 @@ pub struct Asked {
     pub data: Vec<u8>,
 }
 
-/// What a command of the host leads to.
+/// Answer to a command of the host.
 pub(crate) enum Answer {
     Reply(Vec<u8>),
-    /// None comes: the camera restarts.
+    /// No reply; the camera restarts.
     Restart,
 }
 
-/// Faults of what is in the flash: they outlive a restart.
+/// Faults of the flash contents; they outlive a restart.
 #[derive(Debug, Default)]
 pub(crate) struct Flash {
     pub damaged: BTreeSet<u32>,
@@ -153,7 +153,7 @@ impl Firmware {
         }
     }
 
-    /// The reply to a request, or what it becomes while a fault says so.
+    /// The reply to a request, altered by an active fault.
     fn spoil(&mut self, opcode: Option<u32>, mut reply: Vec<u8>) -> Vec<u8> {
         let Some(wrong) = self.wrong.filter(|w| w.to.is_none() || w.to == opcode) else { return reply };
         let times = wrong.times - 1;

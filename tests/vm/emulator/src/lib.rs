@@ -2,8 +2,8 @@
 //! real `uvcvideo`, `usbhid` and usbfs take it from there.
 //!
 //! A [`Camera`] is plugged in from a [`Model`], which is data (`models/*.toml`). It has a serial, calibration numbers
-//! that follow from it, a clock of its own, and [`Fault`]s on demand; what it sent is in its [`Accounts`], and what each
-//! frame held can be asked for afterwards.
+//! that follow from it, a clock of its own, and [`Fault`]s on demand; its [`Accounts`] count what it sent, and the
+//! contents of each frame can be queried afterwards.
 
 pub mod accounts;
 pub mod calibration;
@@ -34,7 +34,7 @@ pub use firmware::imu::{ImuSample, ImuSensor};
 pub use model::Model;
 pub use options::{Options, Speed};
 
-/// What goes wrong in the emulator itself.
+/// An error of the emulator itself.
 #[derive(Debug)]
 pub struct Error(String);
 
@@ -52,5 +52,5 @@ impl core::fmt::Display for Error {
 
 impl core::error::Error for Error {}
 
-/// Or an [`Error`] of the emulator.
+/// A result with the emulator's [`Error`].
 pub type Result<T> = core::result::Result<T, Error>;

@@ -1,4 +1,4 @@
-//! Models as data: what a camera is on the bus, which streams and controls it has. Read from TOML.
+//! Models as data, read from TOML: a camera's USB descriptors, streams and controls.
 
 mod modes;
 
@@ -33,7 +33,7 @@ pub struct Model {
     /// `bcdUVC`.
     #[serde(default)]
     pub uvc_version: u16,
-    /// What stands in the payload header behind the 12 bytes of the class.
+    /// Metadata in the payload header after the 12 bytes of the class.
     #[serde(default)]
     pub metadata: Metadata,
     /// Counts per metre are 1e6 divided by this: the depth unit in micrometres.
@@ -117,7 +117,7 @@ pub struct Function {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Unit {
-    /// What it is.
+    /// Its kind.
     pub kind: UnitKind,
     /// Its id within the function.
     pub id: u8,
@@ -127,7 +127,7 @@ pub struct Unit {
     /// Which extension it is: 32 hexadecimal digits as on the wire.
     #[serde(default)]
     pub guid: String,
-    /// What can be set.
+    /// Its controls.
     #[serde(default)]
     pub controls: Vec<Control>,
 }
@@ -197,7 +197,7 @@ pub struct Stream {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Format {
-    /// What V4L2 calls it: `Z16 `.
+    /// Its V4L2 name: `Z16 `.
     pub fourcc: String,
     /// The first four bytes of its GUID, eight hexadecimal digits, where they are not those of `fourcc`.
     pub guid: Option<String>,
@@ -206,7 +206,7 @@ pub struct Format {
     /// Described by the descriptors of frame-based payloads.
     #[serde(default)]
     pub frame_based: bool,
-    /// How pictures lie in a frame.
+    /// How images lie in a frame.
     #[serde(default)]
     pub layout: Layout,
     /// Sizes and rates at 5 Gb/s: `640x480@30,15,6`. Empty: the format is not offered.
@@ -217,20 +217,20 @@ pub struct Format {
     pub usb2: Vec<String>,
 }
 
-/// How pictures lie in a frame, which decides where the stamps are.
+/// How images lie in a frame, which decides where the stamps are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Layout {
-    /// One picture.
+    /// One image.
     #[default]
     Plain,
-    /// Two pictures, byte by byte in turn.
+    /// Two images, byte by byte in turn.
     Interleaved,
-    /// Two pictures of half the width.
+    /// Two images of half the width.
     SideBySide,
-    /// One picture, transposed and flipped, as the L515 sends it.
+    /// One image, transposed and flipped, as the L515 sends it.
     Turned,
-    /// One JPEG picture, with its stamp in a comment.
+    /// One JPEG image, with its stamp in a comment.
     Jpeg,
 }
 
@@ -313,7 +313,7 @@ impl Model {
     /// A model that comes with the emulator.
     ///
     /// # Errors
-    /// When there is none of that name.
+    /// When the name is unknown.
     pub fn named(name: &str) -> Result<Self> {
         Self::from_toml(built_in(name)?)
     }
@@ -357,7 +357,7 @@ impl Model {
     /// The index of a stream.
     ///
     /// # Errors
-    /// When there is none of that name.
+    /// When the name is unknown.
     pub fn stream_index(&self, name: &str) -> Result<usize> {
         self.streams().position(|s| s.name == name).ok_or_else(|| {
             let names: Vec<&str> = self.streams().map(|s| s.name.as_str()).collect();
@@ -376,7 +376,7 @@ impl Format {
     /// Its GUID as on the wire: four bytes that name the format, then those that all have in common.
     ///
     /// # Errors
-    /// When the model's text is no GUID.
+    /// When the model's text is not a GUID.
     pub fn guid_bytes(&self) -> Result<[u8; 16]> {
         let mut guid = *b"\0\0\0\0\0\0\x10\0\x80\0\0\xAA\x00\x38\x9B\x71";
         let head = match &self.guid {
@@ -391,7 +391,7 @@ impl Format {
     }
 }
 
-/// Bytes from hexadecimal digits; blanks are passed over.
+/// Bytes from hexadecimal digits; blanks are ignored.
 pub(crate) fn from_hex(text: &str) -> Result<Vec<u8>> {
     let digits: Vec<u32> = text
         .chars()

@@ -11,15 +11,15 @@ pub enum Speed {
     High,
 }
 
-/// What differs between two cameras of one model.
+/// Options that differ between two cameras of one model.
 #[derive(Debug, Clone)]
 pub struct Options {
     /// The serial, in the model's own form: 12 digits for a D400, 8 hexadecimal digits for an L515, decimal for a ZED.
-    /// Without one, one is made up: the next in this process.
+    /// Without one, the next in this process is generated.
     pub serial: Option<String>,
     /// How much its clock gains, in parts per million.
     pub drift_ppm: f64,
-    /// What its clock shows at power-on, in microseconds: near 2^32 for a wrap.
+    /// Reading of its clock at power-on, in microseconds: near 2^32 for a wrap.
     pub start_ticks: u32,
     /// The largest delay of a frame on its way.
     pub jitter: Duration,

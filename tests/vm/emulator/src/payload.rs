@@ -5,7 +5,7 @@
 
 use crate::model::{Metadata, Mode};
 
-/// What the header of a frame tells.
+/// Contents of a payload header.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Header<'a> {
     pub mode: &'a Mode,
@@ -53,7 +53,7 @@ impl Writer<'_> {
 }
 
 impl Header<'_> {
-    /// Writes it and says how long it is.
+    /// Writes the header and returns its length.
     pub(crate) fn write(&self, bytes: &mut [u8; 255]) -> usize {
         let mut w = Writer { bytes, at: 2 };
         w.words(&[self.pts_us, self.sent_us]);
@@ -123,7 +123,7 @@ impl Header<'_> {
         ]);
     }
 
-    /// Which pixel format: 0 depth, 1 the left infrared picture, 2 both, 3 YUYV.
+    /// Which pixel format: 0 depth, 1 the left infrared image, 2 both, 3 YUYV.
     fn format_code(&self) -> u16 {
         match &self.mode.fourcc {
             b"Z16 " => 0,

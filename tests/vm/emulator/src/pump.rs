@@ -14,7 +14,7 @@ use std::os::unix::net::UnixStream;
 
 /// Transfers that are answered in one write.
 const BATCH: usize = 8;
-/// What a frame that is too long has too much.
+/// Extra bytes of a frame that is too long.
 static EXCESS: [u8; 512] = [0xA5; 512];
 /// From the end of a frame in the sensor until it is sent.
 const PIPELINE_NS: i64 = 2_000_000;
@@ -40,7 +40,7 @@ pub(crate) fn write_all(mut line: &UnixStream, mut slices: &mut [IoSlice<'_>]) -
     Ok(())
 }
 
-/// What the firmware knows that frames tell.
+/// Firmware settings that frames carry in their metadata.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Settings {
     pub exposure_us: u32,
@@ -121,7 +121,7 @@ impl Pump {
         let phase = (content::hash(&self.serial) % 1000) as i64 * period_ns / 1000;
         let first_ns = (now - phase).div_euclid(period_ns).saturating_add(1) * period_ns + phase;
         let session = Session { first_index: self.next_index, first_ns, period_ns, mode, clock };
-        let body = match self.patterns.iter().position(|(known, _)| known.same_picture(&mode)) {
+        let body = match self.patterns.iter().position(|(known, _)| known.same_image(&mode)) {
             Some(at) => self.patterns.swap_remove(at).1,
             None => content::pattern(&self.serial, self.stream, &mode),
         };
@@ -272,7 +272,7 @@ impl Pump {
         running.current = Some(Current { header, body, excess, offset: 0, begun: false, damage });
     }
 
-    /// Sends what is ready into the transfers that wait.
+    /// Sends ready frames into waiting transfers.
     ///
     /// # Errors
     /// When the host's end is closed.
@@ -302,7 +302,8 @@ impl Pump {
             let total: usize = parts.iter().map(|p| p.len()).sum();
             let mut heads = [[0; HEADER]; BATCH];
             let mut spans = [(0, 0); BATCH];
-            let (mut count, mut ended) = (0, false);
+            let mut count = 0;
+            let mut ended = false;
             while count < BATCH && !ended {
                 let Some(urb) = self.urbs.pop_front() else { break };
                 let take = urb.length.min(total - current.offset);
@@ -320,7 +321,8 @@ impl Pump {
                 used += 1;
                 let mut start = 0;
                 for part in parts {
-                    let (from, to) = (span.0.max(start), span.1.min(start + part.len()));
+                    let from = span.0.max(start);
+                    let to = span.1.min(start + part.len());
                     if from < to {
                         slices[used] = IoSlice::new(&part[from - start..to - start]);
                         used += 1;

@@ -1,4 +1,4 @@
-//! What a camera's handle and its thread share: commands one way, accounts the other.
+//! State shared by a camera's handle and its thread: commands one way, accounts the other.
 
 use crate::clock::DeviceClock;
 use crate::fault::Fault;
@@ -14,7 +14,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::os::unix::net::UnixStream;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
-/// More commands than this are never waiting: a caller that asks for more is refused.
+/// Most commands that wait; further ones are refused.
 const COMMANDS: usize = 64;
 /// Starts of a stream that are remembered.
 const SESSIONS: usize = 8192;
@@ -27,7 +27,7 @@ const HALF_EXPOSURE_NS: i64 = 4_000_000;
 /// Samples of the IMU that are remembered.
 const IMU_SAMPLES: usize = 1 << 16;
 
-/// What a handle asks of its camera's thread.
+/// A command from a handle to its camera's thread.
 pub(crate) enum Command {
     /// Serve the host at the other end of this socket; the number of its port, when it has one.
     Serve(UnixStream, Option<u32>),
@@ -123,7 +123,7 @@ impl Shared {
         Ok(())
     }
 
-    /// Waits until the camera is where `wanted` says.
+    /// Waits until `wanted` holds for the camera's presence.
     pub fn wait(&self, limit: Duration, wanted: impl Fn(Presence) -> bool) -> Result<()> {
         let end = HostTime::now().plus(limit);
         let mut state = self.lock();

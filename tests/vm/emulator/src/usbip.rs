@@ -43,7 +43,7 @@ fn word(bytes: &[u8; HEADER], at: usize) -> u32 {
     u32::from_be_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
 }
 
-/// Reads a message of the kernel's; `None` when it is none.
+/// Parses a message from the kernel; `None` when it is invalid.
 pub fn parse(bytes: &[u8; HEADER]) -> Option<Command> {
     match word(bytes, 0) {
         1 => Some(Command::Submit(Submit {

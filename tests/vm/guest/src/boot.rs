@@ -43,7 +43,7 @@ fn supervise(scenario: &Scenario, share: &Path) -> anyhow::Result<()> {
         .spawn()?;
     let in_time =
         system::wait_until(Duration::from_secs(scenario.limit_s), || !matches!(child.try_wait(), Ok(None)));
-    // What is left of its process group, a daemon for example, must not disturb the next scenario.
+    // Remaining processes of its group, a daemon for example, must not disturb the next scenario.
     end_group(&child);
     let status = child.wait()?;
     if !in_time {

@@ -52,22 +52,22 @@ impl Report {
     }
 }
 
-/// What a scenario claims, one line each.
+/// Checks of a scenario, one line each.
 pub struct Checks {
     report: Report,
-    made: usize,
+    total: usize,
     failed: usize,
 }
 
 impl Checks {
     /// Checks that go to `report`.
     pub fn new(report: Report) -> Self {
-        Self { report, made: 0, failed: 0 }
+        Self { report, total: 0, failed: 0 }
     }
 
-    /// `what` should hold; `detail` says what was seen. Returns whether it does.
+    /// `what` should hold; `detail` is the observation. Returns whether it does.
     pub fn that(&mut self, what: &str, holds: bool, detail: impl Display) -> bool {
-        self.made += 1;
+        self.total += 1;
         self.failed += usize::from(!holds);
         let detail = detail.to_string();
         println!("{} {what}: {detail}", if holds { "ok  " } else { "FAIL" });
@@ -102,7 +102,7 @@ impl Checks {
         }
     }
 
-    /// A line for whoever watches; claims nothing.
+    /// A line for the log; checks nothing.
     pub fn note(&mut self, text: impl Display) {
         let text = text.to_string();
         println!("     {text}");
@@ -111,6 +111,6 @@ impl Checks {
 
     /// Whether there was a check and none has failed.
     pub fn all_hold(&self) -> bool {
-        self.made > 0 && self.failed == 0
+        self.total > 0 && self.failed == 0
     }
 }

@@ -13,7 +13,7 @@ use std::time::Duration;
 /// The name of every rig here.
 pub const RIG: &str = "vm";
 /// How long a daemon may take to start or to end, guest time.
-const PATIENCE: Duration = Duration::from_secs(30);
+const TIMEOUT: Duration = Duration::from_secs(30);
 
 /// A daemon that runs. Dropped, it is killed.
 pub struct Daemon {
@@ -28,13 +28,13 @@ impl Daemon {
     /// until it answers.
     ///
     /// # Errors
-    /// When it ends at once or never answers; the scenario's log has what it said.
+    /// When it ends at once or never answers; the scenario's log has its output.
     pub fn start(cameras: &str) -> anyhow::Result<Self> {
         let (mut command, runtime) = Self::command(cameras)?;
         let child = command.spawn().context("depthrig run")?;
         let mut daemon = Starting(Some(child));
         let rig = RigName::new(RIG)?;
-        let end = HostTime::now().plus(PATIENCE);
+        let end = HostTime::now().plus(TIMEOUT);
         loop {
             if let Some(status) = daemon.child()?.try_wait()? {
                 bail!("the daemon ended at once: {status}");
@@ -52,7 +52,7 @@ impl Daemon {
         }
     }
 
-    /// Runs a daemon that shall refuse to start; how it ended, and what it said of that.
+    /// Runs a daemon that must refuse to start. Returns its exit status and its message.
     ///
     /// # Errors
     /// When it cannot be run.
@@ -77,7 +77,7 @@ impl Daemon {
         Ok((command, runtime))
     }
 
-    /// Everything it says of itself.
+    /// Its complete status.
     ///
     /// # Errors
     /// When it does not answer.
@@ -85,7 +85,7 @@ impl Daemon {
         Ok(self.client.status()?)
     }
 
-    /// Waits until `holds` for a status, and returns that one; the time it took is measured by whoever asks.
+    /// Waits until `holds` for a status, and returns that one; the caller measures the time it took.
     ///
     /// # Errors
     /// When it does not within `limit`, with how the cameras stand.
@@ -101,7 +101,7 @@ impl Daemon {
             if holds(&status) {
                 return Ok(status);
             }
-            ensure!(HostTime::now() < end, "{what}: not within {limit:?}; {}", told(&status));
+            ensure!(HostTime::now() < end, "{what}: not within {limit:?}; {}", summary(&status));
             // A status costs the guest's one processor milliseconds, on both sides.
             std::thread::sleep(Duration::from_millis(40));
         }
@@ -112,17 +112,17 @@ impl Daemon {
     /// # Errors
     /// As [`Self::wait_for`].
     pub fn wait_until_streaming(&self) -> anyhow::Result<RigStatus> {
-        self.wait_for(PATIENCE, "every camera streams", |status| status.cameras.iter().all(streams))
+        self.wait_for(TIMEOUT, "every camera streams", |status| status.cameras.iter().all(streams))
     }
 
     /// Waits until every camera streams and has captured a dozen frames of each stream. Its first frames come while others
-    /// still open and the guest is busy: those that are not read then are told of by the next ones.
+    /// still open and the guest is busy: the next frames count those that are not read then.
     ///
     /// # Errors
     /// As [`Self::wait_for`].
     pub fn wait_until_settled(&self) -> anyhow::Result<RigStatus> {
         let settled = |c: &CameraStatus| streams(c) && c.streams.iter().all(|s| s.captured >= 12);
-        self.wait_for(PATIENCE, "a dozen frames of every stream", |s| s.cameras.iter().all(settled))
+        self.wait_for(TIMEOUT, "a dozen frames of every stream", |s| s.cameras.iter().all(settled))
     }
 
     /// Starts a recording called `name`.
@@ -163,14 +163,14 @@ impl Daemon {
     pub fn stop(mut self) -> anyhow::Result<(ExitStatus, Duration)> {
         let started = HostTime::now();
         self.signal(Signal::TERM)?;
-        let end = started.plus(PATIENCE);
+        let end = started.plus(TIMEOUT);
         while HostTime::now() < end {
             if let Some(status) = self.child.try_wait()? {
                 return Ok((status, started.elapsed()));
             }
             std::thread::sleep(Duration::from_millis(10));
         }
-        bail!("the daemon did not end within {PATIENCE:?} of SIGTERM")
+        bail!("the daemon did not end within {TIMEOUT:?} of SIGTERM")
     }
 
     /// Kills it, as a crash would.
@@ -220,10 +220,14 @@ pub fn streams(camera: &CameraStatus) -> bool {
 }
 
 /// The cameras of a status in a line.
-pub fn told(status: &RigStatus) -> String {
+pub fn summary(status: &RigStatus) -> String {
     let camera = |c: &CameraStatus| {
         let message = c.message.as_ref().map(|m| format!(" ({m})")).unwrap_or_default();
-        format!("{} {}{message}", c.name, c.state.name())
+        let frames = c
+            .streams
+            .iter()
+            .map(|s| format!(" {} {}", s.id.rsplit('/').next().unwrap_or_default(), s.captured));
+        format!("{} {}{message}:{}", c.name, c.state.name(), frames.collect::<String>())
     };
     status.cameras.iter().map(camera).collect::<Vec<_>>().join(", ")
 }

@@ -10,7 +10,7 @@ use std::time::Duration;
 /// A channel keeps four unread frames; at 30 frames/s that is 130 ms.
 const PAUSE: Duration = Duration::from_millis(10);
 /// How long a channel may take to be made.
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A frame as a subscriber saw it.
 #[derive(Debug, Clone, Copy)]
@@ -21,11 +21,11 @@ pub struct Seen {
     pub captured: u64,
     /// Frames that were lost by then, for any reason.
     pub dropped: u64,
-    /// The index that the emulator stamped into it; `None` when there is no whole stamp.
+    /// The index that the emulator stamped into it; `None` when the stamp is missing or damaged.
     pub index: Option<u64>,
 }
 
-/// What was seen of one stream.
+/// Frames seen of one stream.
 #[derive(Debug, Clone)]
 pub struct Watched {
     /// The stream.
@@ -53,7 +53,7 @@ impl Watched {
     }
 }
 
-/// A thread that reads; [`Feed::end`] returns what it saw.
+/// A thread that reads; [`Feed::end`] returns the frames it read.
 pub struct Feed {
     stop: Arc<AtomicBool>,
     reader: JoinHandle<anyhow::Result<Vec<Watched>>>,
@@ -72,7 +72,7 @@ impl Feed {
         let bus = Bus::open(runtime, &RigName::new(crate::daemon::RIG)?)?;
         let mut channels = Vec::new();
         for id in streams {
-            let subscriber = bus.subscriber_within(id, PATIENCE)?;
+            let subscriber = bus.subscriber_within(id, TIMEOUT)?;
             channels.push((subscriber, Watched { id: id.clone(), frames: Vec::new(), missed: 0 }));
         }
         let stop = Arc::new(AtomicBool::new(false));
@@ -94,7 +94,7 @@ impl Feed {
         Ok(Self { stop, reader })
     }
 
-    /// What was seen until now.
+    /// Frames seen until now.
     ///
     /// # Errors
     /// When a stream could not be read.

@@ -1,7 +1,7 @@
-//! What runs inside the virtual machine: `guest boot` as the child of init, and one process for each scenario.
+//! The program inside the virtual machine: `guest boot` as the child of init, and one process for each scenario.
 //!
 //! A scenario is a file below `scenarios/` with a line in [`SCENARIOS`]; `tests/vm/README.md` says how to write one.
-// A test: what cannot be is a failed scenario.
+// A test: a panic is a failed scenario.
 #![allow(
     clippy::expect_used,
     clippy::default_trait_access,
@@ -12,10 +12,10 @@
 mod boot;
 mod checks;
 mod daemon;
-mod eyes;
 mod feed;
 mod mount;
 mod outside;
+mod stereo_reference;
 mod subject;
 mod system;
 mod tally;
@@ -70,7 +70,7 @@ pub struct Scenario {
     pub limit_s: u64,
     /// An archive of the host's that it needs (`tests/vm/rig/librealsense.py`); empty: none.
     pub needs: &'static str,
-    /// What it does. An error is a failed check.
+    /// Its function. An error is a failed check.
     pub run: fn(&mut Checks) -> anyhow::Result<()>,
 }
 

@@ -18,7 +18,7 @@ use std::time::Duration;
 /// The streams that every camera of a mount sends.
 pub const STREAMS: [&str; 2] = ["depth", "color"];
 
-/// How big the pictures are.
+/// How big the images are.
 #[derive(Debug, Clone, Copy)]
 pub struct Size {
     /// Pixels per row.
@@ -54,7 +54,7 @@ impl Mount {
             };
             cameras.push(Camera::plug(model, options).with_context(|| format!("{model}, camera {i}"))?);
         }
-        // Two nodes for each video stream: pictures and metadata.
+        // Two nodes for each video stream: images and metadata.
         let nodes: usize = cameras.iter().map(|c| 2 * c.model().streams().count()).sum();
         let there = || system::video_nodes().is_ok_and(|there| there.len() == nodes);
         ensure!(
@@ -74,7 +74,8 @@ impl Mount {
     pub fn rig(&self, size: Size) -> String {
         let mut text = String::new();
         for (i, camera) in self.cameras.iter().enumerate() {
-            let (name, serial) = (Self::name(i), camera.serial());
+            let name = Self::name(i);
+            let serial = camera.serial();
             let _ = write!(
                 text,
                 "[[camera]]\nname = \"{name}\"\nbackend = \"realsense\"\nserial = \"{serial}\"\n"
@@ -107,7 +108,7 @@ impl Mount {
     /// The camera with a name in the rig, and its index.
     ///
     /// # Errors
-    /// When there is none.
+    /// When the rig has no such camera.
     pub fn camera(&self, name: &str) -> anyhow::Result<(usize, &Camera)> {
         let found = self.cameras.iter().enumerate().find(|(i, _)| Self::name(*i) == name);
         found.with_context(|| format!("no camera is called {name}"))
@@ -127,7 +128,7 @@ pub fn stamped(_header: &FrameHeader, pixels: &[u8]) -> Option<u64> {
     Stamp::read(pixels).map(|stamp| stamp.index)
 }
 
-/// What the emulator could not send of `streams`, because it came too late or because nobody read.
+/// Frames of `streams` that the emulator could not send, because it was late or because nobody read.
 ///
 /// # Errors
 /// When a stream is not of this mount.
@@ -153,8 +154,8 @@ pub fn check_feed(checks: &mut Checks, feed: &[Watched], at_least: usize) {
     checks.equal(&format!("each stream has at least {at_least}"), few.join(", "), "");
 }
 
-/// Checks that the dataset at `path` is whole and that each frame in it is, byte by byte, the one that the emulator sent.
-/// One that was `recovered` says that its end is missing.
+/// Checks that the dataset at `path` is complete and that each frame equals the one that the emulator sent, byte by byte.
+/// A `recovered` dataset reports that its end is missing.
 ///
 /// # Errors
 /// When it cannot be read.
@@ -167,7 +168,7 @@ pub fn check_dataset(checks: &mut Checks, mount: &Mount, path: &Path, recovered:
         .context("depthrig verify")?;
     let said = String::from_utf8_lossy(&done.stdout).trim().to_owned();
     let code = done.status.code();
-    // 3: intact, and it says itself that not everything was recorded.
+    // 3: intact, and it states itself that not everything was recorded.
     checks.that("depthrig verify passes", code == Some(0) || (recovered && code == Some(3)), said);
     let mut compared = Compared::default();
     for set in Dataset::open(path)?.sets_with(SetRange::ALL, PixelMode::Decoded) {
@@ -187,7 +188,7 @@ fn first(complaints: &[String]) -> String {
         .map_or_else(|| "none differs".into(), |one| format!("{} differ: {one}", complaints.len()))
 }
 
-/// A comparison of recorded frames with what was sent.
+/// A comparison of recorded frames with those sent.
 #[derive(Default)]
 pub struct Compared {
     frames: u64,
@@ -198,14 +199,15 @@ pub struct Compared {
 }
 
 impl Compared {
-    /// Compares one with what `camera` sent. It travels as it is: neither turned, nor two pictures in one.
+    /// Compares one with what `camera` sent. It travels as it is: neither turned, nor two images in one.
     ///
     /// # Errors
     /// When the camera has no such stream.
     pub fn frame(&mut self, camera: &Camera, frame: &DatasetFrame) -> anyhow::Result<()> {
         self.frames += 1;
         let header = &frame.header;
-        let (name, stream) = (header.camera(), header.stream());
+        let name = header.camera();
+        let stream = header.stream();
         let what = || format!("{name}/{stream} {}", header.device_sequence);
         let Some(stamp) = Stamp::read(&frame.pixels) else {
             self.wrong.push(format!("{}: no stamp", what()));
@@ -259,20 +261,25 @@ impl Times {
             self.uncertain += 1;
             return;
         }
-        let (off_ns, claim_ns) = (header.capture_time_ns - truth.ns(), header.capture_uncertainty_ns);
+        let off_ns = header.capture_time_ns - truth.ns();
+        let claim_ns = header.capture_uncertainty_ns;
         self.judged += 1;
         self.off_ns = self.off_ns.max(off_ns.unsigned_abs());
         self.claims_ns.push(claim_ns);
         if off_ns.unsigned_abs() > claim_ns {
-            let (camera, stream, number) = (header.camera(), header.stream(), header.device_sequence);
-            let (off_us, claim_us) = (off_ns / 1000, claim_ns / 1000);
+            let camera = header.camera();
+            let stream = header.stream();
+            let number = header.device_sequence;
+            let off_us = off_ns / 1000;
+            let claim_us = claim_ns / 1000;
             self.beyond.push(format!("{camera}/{stream} {number}: {off_us} of {claim_us} us"));
         }
     }
 
     /// Checks that 99 of 100 frames are right within what they state, which is what the clock map promises.
     fn check(&mut self, checks: &mut Checks, what: &str) {
-        let (judged, wrong) = (self.judged, self.beyond.len());
+        let judged = self.judged;
+        let wrong = self.beyond.len();
         self.claims_ns.sort_unstable();
         let claim = |share: usize| {
             self.claims_ns.get(judged.saturating_sub(1) * share / 100).map_or(0.0, |ns| *ns as f64 / 1e6)
@@ -298,7 +305,8 @@ impl Times {
 pub fn check_no_drops(checks: &mut Checks, before: &RigStatus, after: &RigStatus, except: &[String]) {
     let mut drops = Vec::new();
     for (before, after) in before.cameras.iter().zip(&after.cameras) {
-        let (was, is) = (daemon::drops(before), daemon::drops(after));
+        let was = daemon::drops(before);
+        let is = daemon::drops(after);
         if !except.contains(&after.name) && was != is {
             drops.push(format!("{is} (before: {was})"));
         }

@@ -7,7 +7,7 @@ use depthrig_recorder::{Dataset, PixelMode, SetRange};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// Copies `dataset` to where the host has it read (`tests/vm/rig/outside.py`), with a list of its pictures as depthrig reads
+/// Copies `dataset` to where the host has it read (`tests/vm/rig/outside.py`), with a list of its images as depthrig reads
 /// them here. Returns how many; `None` without a host to bring it to.
 ///
 /// # Errors
@@ -25,7 +25,7 @@ pub fn bring(scenario: &str, dataset: &Path) -> anyhow::Result<Option<usize>> {
     }
     let dataset = Dataset::open(dataset)?;
     let session = dataset.session().clone();
-    let mut pictures = Vec::new();
+    let mut images = Vec::new();
     for set in dataset.sets_with(SetRange::ALL, PixelMode::Stored) {
         let set = set?;
         for frame in &set.frames {
@@ -36,7 +36,7 @@ pub fn bring(scenario: &str, dataset: &Path) -> anyhow::Result<Option<usize>> {
                 "png" => ("image_compressed", "png"),
                 other => bail!("{} is stored as {other}", stream.id),
             };
-            pictures.push(json!({
+            images.push(json!({
                 "topic": format!("/{}/{}/{last}", session.rig, stream.id),
                 "log_time": set.utc_ns.to_string(),
                 "width": stream.width,
@@ -46,11 +46,11 @@ pub fn bring(scenario: &str, dataset: &Path) -> anyhow::Result<Option<usize>> {
             }));
         }
     }
-    std::fs::write(out.join("expected.json"), serde_json::to_vec(&pictures)?)?;
-    Ok(Some(pictures.len()))
+    std::fs::write(out.join("expected.json"), serde_json::to_vec(&images)?)?;
+    Ok(Some(images.len()))
 }
 
-/// What ROS calls a format.
+/// Name of a format in ROS.
 fn encoding(format: PixelFormat) -> anyhow::Result<&'static str> {
     Ok(match format {
         PixelFormat::Rgb8 => "rgb8",

@@ -1,4 +1,4 @@
-//! Emulated cameras as subjects of the conformance suite: a D400 by either transport, a plain USB camera by the back end
+//! Emulated cameras as subjects of the conformance suite: a D400 by either transport, a plain USB camera by the backend
 //! `v4l2`.
 
 use crate::checks::Checks;
@@ -16,26 +16,26 @@ use depthrig_emulator::{Camera, Damage, Fault, Options, Stamp};
 use std::sync::Arc;
 
 /// How long a camera may take to be bound by its drivers.
-const PATIENCE: Duration = Duration::from_secs(10);
+const TIMEOUT: Duration = Duration::from_secs(10);
 /// Streams that are started: by their names in a rig, and by those of the emulator.
 const STREAMS: [(&str, &str); 2] = [("depth", "depth"), ("color", "color")];
 /// From mid-exposure to the last byte at most; capture times are late by it until the clock was probed.
 const LATENCY_NS: u64 = 20_000_000;
 
-/// What drives an emulated camera.
+/// Backend and transport for an emulated camera.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Way {
-    /// The back end `realsense`.
+    /// The backend `realsense`.
     Realsense(TransportChoice),
-    /// The back end `v4l2`.
+    /// The backend `v4l2`.
     V4l2,
 }
 
-/// An emulated camera of one model behind one back end.
+/// An emulated camera of one model behind one backend.
 pub struct Emulated {
     /// The emulator's name of the model.
     pub model: &'static str,
-    /// What drives it.
+    /// Backend and transport.
     pub way: Way,
 }
 
@@ -102,7 +102,7 @@ pub fn plug(model: &str, options: Options) -> anyhow::Result<Camera> {
     let camera = Camera::plug(model, options)?;
     let streams = camera.model().streams().count();
     let ready = || nodes_of(&camera).is_ok_and(|n| n.len() == 2 * streams);
-    anyhow::ensure!(system::wait_until(PATIENCE, ready), "a {model} has {:?}", nodes_of(&camera));
+    anyhow::ensure!(system::wait_until(TIMEOUT, ready), "a {model} has {:?}", nodes_of(&camera));
     Ok(camera)
 }
 
@@ -142,12 +142,12 @@ impl Hands {
         self.camera.fault(fault).map_err(|_| Cannot("the emulated camera does not take the fault"))
     }
 
-    /// Does it only where the back end sees the bytes itself.
+    /// Does it only where the backend sees the bytes itself.
     fn raw_frames(&self, damage: Damage, frames: u32) -> Result<(), Cannot> {
         if self.way == Way::Realsense(TransportChoice::Libusb) {
             self.frames(damage, frames)
         } else {
-            Err(Cannot("uvcvideo drops such frames itself; the back end finds a gap in the frame counter"))
+            Err(Cannot("uvcvideo drops such frames itself; the backend finds a gap in the frame counter"))
         }
     }
 }
@@ -168,7 +168,7 @@ impl Rig for Hands {
                 });
                 Ok(())
             }
-            Trouble::Hang(_) => Err(Cannot("no call of the back end waits for the camera without a limit")),
+            Trouble::Hang(_) => Err(Cannot("no call of the backend waits for the camera without a limit")),
             Trouble::HalfFrame(n) => self.raw_frames(Damage::Short, n),
             Trouble::WrongSize(n) => self.raw_frames(Damage::Long, n),
             Trouble::Damaged(n) => self.raw_frames(Damage::ErrorBit, n),
@@ -193,7 +193,8 @@ impl Rig for Hands {
         let (_, name) = STREAMS.get(stream)?;
         let at = |index: u64| self.camera.true_capture(name, index).ok();
         // The newest frame that was captured before: one is on its way for less than a period.
-        let (mut low, mut high) = (0, 1 << 32);
+        let mut low = 0;
+        let mut high = 1 << 32;
         while high - low > 1 {
             let middle = u64::midpoint(low, high);
             if at(middle)? <= arrival { low = middle } else { high = middle }

@@ -17,7 +17,7 @@ pub fn modprobe(module: &str, options: &[&str]) -> anyhow::Result<()> {
 /// The output of a command that must succeed.
 ///
 /// # Errors
-/// When it cannot be started or fails, with what it said.
+/// When it cannot be started or fails, with its output.
 pub fn run(command: &mut Command) -> anyhow::Result<String> {
     let done = command.output().with_context(|| format!("{}", command.get_program().display()))?;
     if !done.status.success() {
@@ -27,7 +27,7 @@ pub fn run(command: &mut Command) -> anyhow::Result<String> {
     Ok(String::from_utf8_lossy(&done.stdout).into_owned())
 }
 
-/// Waits until `done` says so, or for at most `limit` of guest time; returns whether it did.
+/// Waits until `done` holds, or for at most `limit` of guest time; returns whether it did.
 pub fn wait_until(limit: Duration, mut done: impl FnMut() -> bool) -> bool {
     let end = HostTime::now().plus(limit);
     while !done() {
@@ -39,7 +39,7 @@ pub fn wait_until(limit: Duration, mut done: impl FnMut() -> bool) -> bool {
     true
 }
 
-/// What the kernel has said since this was last called; nothing is said twice.
+/// Kernel messages since the last call.
 ///
 /// # Errors
 /// When `dmesg` fails.

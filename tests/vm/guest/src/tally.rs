@@ -1,4 +1,4 @@
-//! A sink that keeps what is known of each frame and looks at its pixels, instead of keeping them.
+//! A sink that keeps the metadata of each frame and inspects its pixels without keeping them.
 
 use core::time::Duration;
 use depthrig_bus::{DropCounts, DropReason, HostTime};
@@ -11,13 +11,13 @@ use depthrig_emulator::Stamp;
 pub struct Frame {
     /// The stream it belongs to.
     pub stream: usize,
-    /// What the driver says of it.
+    /// The driver's metadata.
     pub meta: FrameMeta,
     /// Index of the emulator's stamp; `None` when its pixels have none.
     pub index: Option<u64>,
 }
 
-/// What came out of a stream.
+/// Frames and losses of a stream.
 #[derive(Debug, Default)]
 pub struct Tally {
     /// Delivered frames in their order.

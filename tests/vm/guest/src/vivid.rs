@@ -1,4 +1,4 @@
-//! The kernel's virtual cameras as scenarios use them: loaded anew, their faults, and frames taken from them.
+//! The kernel's virtual cameras for scenarios: loading, faults, and capturing frames.
 
 use crate::system;
 use anyhow::Context;
@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::process::Command;
 use std::time::Duration;
 
-/// The smallest picture that vivid has.
+/// The smallest image that vivid has.
 pub const SIZE: (u32, u32) = (320, 180);
 
 /// Loads vivid with `n` cameras, each a capture node and a metadata node; whatever was loaded goes.
@@ -35,7 +35,7 @@ pub fn port(n: usize) -> String {
     format!("platform:vivid-{n:03}")
 }
 
-/// Settings that mean camera number `n`, without the counters that it draws into its pictures: they are all alike then.
+/// Settings that mean camera number `n`, without the counters that it draws into its images: they are all alike then.
 pub fn config(n: usize) -> V4l2Config {
     V4l2Config {
         port: Some(port(n)),
@@ -44,12 +44,12 @@ pub fn config(n: usize) -> V4l2Config {
     }
 }
 
-/// The request for one format at 30 Hz.
-pub fn request(format: depthrig_bus::PixelFormat, size: (u32, u32)) -> anyhow::Result<StreamRequest> {
+/// The request for one format at [`SIZE`] and 30 Hz.
+pub fn request(format: depthrig_bus::PixelFormat) -> anyhow::Result<StreamRequest> {
     let stream = StreamName::new("color").context("a stream name")?;
     Ok(StreamRequest {
         format: Some(format),
-        size: Some(size),
+        size: Some(SIZE),
         rate_hz: Some(30.0),
         ..StreamRequest::any(stream)
     })
@@ -63,18 +63,18 @@ pub fn start(config: V4l2Config, request: &StreamRequest) -> Result<Box<dyn Stre
     V4l2Backend::new(config).open(None)?.start(std::slice::from_ref(request))
 }
 
-/// What came of taking frames.
+/// Result of taking frames.
 pub struct Taken {
     /// The frames and the accounts.
     pub sink: MemorySink,
     /// The profile that was streamed.
     pub profile: StreamProfile,
-    /// What ended it, if anything did before there was enough.
+    /// The error that ended it before there were enough frames.
     pub end: Option<Error>,
 }
 
 impl Taken {
-    /// Whether what was captured is what was delivered and dropped.
+    /// Whether captured frames equal delivered plus dropped ones.
     pub fn balances(&self) -> bool {
         let captured = self.sink.captured.first().copied().unwrap_or(0);
         captured > 0 && captured == self.sink.delivered(0) + self.sink.drops_of(0).total()
@@ -119,7 +119,7 @@ pub fn take(
 /// The capture node of camera number `n`, for its faults and for looking beside the driver.
 ///
 /// # Errors
-/// When there is none.
+/// When the node does not exist.
 pub fn capture_node(n: usize) -> anyhow::Result<Node> {
     node(n, |node| node.capability().is_capture())
 }
@@ -127,7 +127,7 @@ pub fn capture_node(n: usize) -> anyhow::Result<Node> {
 /// The metadata node of camera number `n`.
 ///
 /// # Errors
-/// When there is none.
+/// When the node does not exist.
 pub fn metadata_node(n: usize) -> anyhow::Result<Node> {
     node(n, |node| node.capability().is_metadata())
 }

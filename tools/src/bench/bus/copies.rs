@@ -37,7 +37,8 @@ pub fn run(bus: &Bus, frames: u64) -> Result<Copies> {
     let reader = Reader::start(bus.runtime(), Mode::Place, 1)?;
     let mut source = Source::new(bytes, 1);
     let mut written_at: BTreeMap<u64, Place> = BTreeMap::new();
-    let (mut written, mut published) = (0, 0);
+    let mut written = 0;
+    let mut published = 0;
     for sequence in 1..=frames {
         let mut frame = publisher.loan(bytes)?;
         frame.header_mut().sequence = sequence;

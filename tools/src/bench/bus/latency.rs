@@ -83,7 +83,8 @@ fn summarise(ours: &[Timed], bare: &[Timed]) -> Result<Latency> {
         .map(|(o, b)| o.p50_us / b.p50_us)
         .collect();
     ensure!(!ratios.is_empty(), "the subscribing process received nothing to compare");
-    let (o, b) = (Quantiles::of_ns(&wire(ours)), Quantiles::of_ns(&wire(bare)));
+    let o = Quantiles::of_ns(&wire(ours));
+    let b = Quantiles::of_ns(&wire(bare));
     Ok(Latency {
         frame_bytes: FRAME_BYTES,
         ours: o,

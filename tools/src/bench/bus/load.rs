@@ -1,7 +1,7 @@
 //! The load of a mount: seven threads, each a camera with a colour and a depth stream, 30 times a second.
 //!
-//! The same threads at the same pace either publish or only copy the same bytes between buffers of their own,
-//! so that the difference is what publishing costs.
+//! The same threads at the same rate either publish or only copy the same bytes between their own buffers, so that
+//! the difference is the cost of publishing.
 
 use super::{CAMERA_BYTES, Channels, PERIOD, Source};
 use anyhow::{Result, anyhow};
@@ -12,12 +12,12 @@ use depthrig_bus::{Bus, ErrorKind, HostTime, Publisher};
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
-/// What the threads do with their bytes.
+/// Work of the threads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Work {
     /// Lend a slot, write it, send it.
     Publish,
-    /// Copy into a buffer of their own.
+    /// Copy into their own buffer.
     Copy,
 }
 
@@ -54,12 +54,12 @@ pub struct Phase {
     pub cores: f64,
 }
 
-/// What a load did, after its end.
+/// Counts of a finished load.
 pub struct Done {
     samples: Vec<Sample>,
     /// Frames sent.
     pub sent: u64,
-    /// Frames for which there was no free slot.
+    /// Frames dropped for lack of a free slot.
     pub refused: u64,
 }
 
@@ -94,15 +94,17 @@ impl Load {
         self.shared.copying.store(work == Work::Copy, Ordering::Relaxed);
         pause(settle)?;
         self.phases += 1;
-        let (cpu, start) = (process_cpu_ns(), HostTime::now());
+        let cpu = process_cpu_ns();
+        let start = HostTime::now();
         self.shared.phase.store(self.phases, Ordering::Relaxed);
         pause(length)?;
         self.shared.phase.store(0, Ordering::Relaxed);
-        let (cpu, wall) = (process_cpu_ns() - cpu, HostTime::now().since_ns(start));
+        let cpu = process_cpu_ns() - cpu;
+        let wall = HostTime::now().since_ns(start);
         Ok(Phase { number: self.phases, cores: cpu as f64 / wall as f64 })
     }
 
-    /// Ends the frames.
+    /// Stops the threads.
     pub fn finish(self) -> Result<Done> {
         self.shared.stop.store(true, Ordering::Relaxed);
         let mut samples = Vec::new();
@@ -177,7 +179,8 @@ impl Camera {
             tick = tick.plus(PERIOD);
             std::thread::sleep(tick.from_now());
             let phase = shared.phase.load(Ordering::Relaxed);
-            let (wall, cpu) = (HostTime::now(), thread_cpu_ns());
+            let wall = HostTime::now();
+            let cpu = thread_cpu_ns();
             self.sequence += 1;
             for stream in 0..2 {
                 if shared.copying.load(Ordering::Relaxed) {

@@ -26,7 +26,8 @@ fn find(maps: &str, address: u64) -> Option<Place> {
     maps.lines().find_map(|line| {
         let mut fields = line.split_ascii_whitespace();
         let (start, end) = fields.next()?.split_once('-')?;
-        let (start, end) = (hex(start)?, hex(end)?);
+        let start = hex(start)?;
+        let end = hex(end)?;
         let offset = hex(fields.nth(1)?)?;
         let inode = fields.nth(1)?.parse().ok()?;
         (start..end).contains(&address).then(|| Place { inode, offset: offset + (address - start) })

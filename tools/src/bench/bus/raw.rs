@@ -32,9 +32,11 @@ type Events = event::PortFactory<Service>;
 fn service(runtime: &RuntimeDir) -> Result<(Node<Service>, Frames, Events)> {
     let mut config = Config::default();
     let root = runtime.path().join("raw").to_string_lossy().into_owned();
-    let root = Path::new(root.as_bytes()).ok().context("the runtime folder is no path for iceoryx2")?;
+    let root =
+        Path::new(root.as_bytes()).ok().context("the runtime folder is not a valid path for iceoryx2")?;
     config.global.set_root_path(&root);
-    config.global.prefix = FileName::new(b"depthrig_bench_").ok().context("the prefix is no file name")?;
+    config.global.prefix =
+        FileName::new(b"depthrig_bench_").ok().context("the prefix is not a valid file name")?;
     let node = NodeBuilder::new()
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .config(&config)

@@ -1,7 +1,7 @@
-//! The subscribing process of the bus bench: this binary, started again with a hidden command.
+//! The subscriber process of the bus benchmark: this binary, started again with a hidden command.
 //!
-//! It says `ready` on its standard output when every channel is open, reads until its standard input ends
-//! (so it also ends with its parent), and then prints what it saw as one line of JSON.
+//! It prints `ready` to stdout when every channel is open, reads frames until stdin closes (so it also ends with its
+//! parent), and then prints its counts as one line of JSON.
 
 use super::raw::RawReceiver;
 use super::{Channels, RIG};
@@ -14,21 +14,21 @@ use serde::{Deserialize, Serialize};
 use std::io::{BufRead, Read, Write};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 const POLL: Duration = Duration::from_millis(100);
 /// As many frames as the bus lets one subscriber hold.
 const HELD: usize = 16;
 
-/// What a reader does with the frames.
+/// Behaviour of a reader.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub enum Mode {
-    /// Times every frame of the one stream and of the bare channel.
+    /// Time every frame of the one stream and of the bare channel
     Latency,
-    /// Counts frames.
+    /// Count frames
     Count,
-    /// Holds as many frames as it may and never lets go.
+    /// Hold as many frames as allowed and never release them
     Hold,
-    /// Says where in shared memory the frames of the first stream lie.
+    /// Report where in shared memory the frames of the first stream lie
     Place,
 }
 
@@ -46,10 +46,10 @@ impl Mode {
 /// Arguments of the hidden command.
 #[derive(Debug, clap::Args)]
 pub struct ReaderArgs {
-    /// What to do with the frames.
+    /// Behaviour
     #[arg(long, value_enum)]
     mode: Mode,
-    /// How many streams to read.
+    /// Number of streams to read
     #[arg(long)]
     streams: usize,
 }
@@ -65,7 +65,7 @@ pub struct Timed {
     pub total_ns: i64,
 }
 
-/// What a reader saw.
+/// Frames that a reader saw.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Seen {
     /// Frames read.
@@ -76,16 +76,16 @@ pub struct Seen {
     pub ours: Vec<Timed>,
     /// Times of the frames of the bare loop.
     pub bare: Vec<Timed>,
-    /// Where frames lay, by sequence number.
+    /// Locations of frames, by sequence number.
     pub places: Vec<(u64, Place)>,
 }
 
-/// The hidden command.
+/// Runs the hidden command.
 pub fn run(args: &ReaderArgs, runtime: &RuntimeDir) -> Result<()> {
     let bus = Bus::open(runtime, &RigName::new(RIG)?)?;
     let mut subscribers = Vec::new();
     for id in Channels::ids()?.into_iter().take(args.streams) {
-        subscribers.push(bus.subscriber_within(&id, PATIENCE)?);
+        subscribers.push(bus.subscriber_within(&id, TIMEOUT)?);
     }
     let stop = AtomicBool::new(false);
     let seen = std::thread::scope(|scope| -> Result<Seen> {
@@ -136,7 +136,7 @@ fn read(mut subscriber: Subscriber, mode: Mode, stop: &AtomicBool) -> Result<See
         let frame = match subscriber.next_timeout(POLL) {
             Ok(Some(frame)) => frame,
             Ok(None) => continue,
-            // Holding all it may is what this reader is for; it goes on asking, as a careless one would.
+            // This reader holds all frames it may and keeps requesting more, as a careless subscriber would.
             Err(e) if mode == Mode::Hold && e.kind() == ErrorKind::LimitReached => {
                 std::thread::sleep(POLL);
                 continue;
@@ -211,7 +211,7 @@ impl Reader {
         Ok(Self { child, stdin, stdout: std::io::BufReader::new(stdout) })
     }
 
-    /// Asks it to end and returns what it saw.
+    /// Asks it to end and returns the frames that it saw.
     pub fn finish(mut self) -> Result<Seen> {
         self.stdin = None;
         let mut line = String::new();
@@ -231,7 +231,7 @@ impl Reader {
 
 impl Drop for Reader {
     fn drop(&mut self) {
-        // Both fail when it has ended already, which is what is wanted.
+        // Both fail if it has already ended, which is fine.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }

@@ -1,4 +1,4 @@
-//! The result of the bus bench as a person reads it, and whether it keeps what is promised.
+//! The result of the bus benchmark as text, checked against the promises.
 
 use super::{BusReport, Disturbed};
 use crate::bench::stats::Quantiles;
@@ -11,25 +11,25 @@ const CPU_BAR: f64 = 1.3;
 /// Change of the publisher's 99th percentile by bad subscribers.
 const DISTURBANCE_BAR: f64 = 1.1;
 
-/// One promise and what was measured.
+/// One promise with its measured value.
 pub struct Bar {
-    /// What is promised.
+    /// Text of the promise.
     pub promise: &'static str,
-    /// What was measured.
+    /// Measured value.
     pub measured: String,
-    /// Whether it is kept.
+    /// Whether the promise is kept.
     pub kept: bool,
 }
 
 impl Bar {
-    /// One line.
+    /// Formats the promise on one line.
     pub fn line(&self) -> String {
         let word = if self.kept { "ok    " } else { "MISSED" };
         format!("  {word} {}: measured {}", self.promise, self.measured)
     }
 }
 
-/// Every promise.
+/// Checks every promise.
 pub fn bars(report: &BusReport) -> Vec<Bar> {
     let below =
         |promise, value: f64, bar: f64| Bar { promise, measured: format!("{value:.3}"), kept: value <= bar };
@@ -64,7 +64,7 @@ pub fn bars(report: &BusReport) -> Vec<Bar> {
     ]
 }
 
-/// Tables and promises.
+/// Formats tables and promises.
 pub fn text(report: &BusReport) -> String {
     let l = &report.latency;
     let mib = l.frame_bytes as f64 / f64::from(1 << 20);
@@ -117,7 +117,7 @@ pub fn text(report: &BusReport) -> String {
          written; {writes:.2} bytes written per byte published\n\n\
          Seven cameras x 1280x720 (RGB8 + Z16) x 30 Hz, {slots} slots a stream: {sent} frames sent, {lost} lost\n\
          publishing process, cores a round:        {publish}\n\
-         bare copies at the same pace, a round:    {copy}\n\
+         bare copies at the same rate, a round:    {copy}\n\
          ratio (median of the rounds)              {cpu_ratio:.3}\n\n\
          Loan, write and send of one camera's two frames, by what else subscribes\n{publisher}\n\n\
          Promises\n{promises}",

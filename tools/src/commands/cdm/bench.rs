@@ -1,7 +1,7 @@
-//! `depthrig cdm bench`: how fast each engine refines, with what memory, next to each other.
+//! `depthrig cdm bench`: measures speed and memory of each engine, side by side.
 //!
-//! Each combination of engine and size runs in a process of its own: a process loads one ONNX Runtime, the memory it
-//! took is only known of a whole process, and one that fails takes nothing with it.
+//! Each combination of engine and size runs in its own process: a process can load one ONNX Runtime only, peak memory
+//! is measured per process, and a failure does not end the other measurements.
 
 use super::run::{engine as parse_engine, precision as parse_precision};
 use super::store::{Models, usage};
@@ -19,13 +19,13 @@ use std::process::{Command, Stdio};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-The picture is made up, with edges and holes; times do not depend on what it shows. Times are medians, on the clock and
-of the CPU (all threads). A busy computer makes the clock's longer; the CPU's less so.
+The image is synthetic, with edges and holes; times do not depend on its content. Times are medians of wall-clock and
+CPU time (all threads). A busy computer affects wall-clock time more than CPU time.
 
 An engine is fill, or onnxruntime with a device and a precision: onnxruntime/cpu/fp32,
 onnxruntime/openvino/bf16, onnxruntime/cuda:0/fp16.
 
-Exit codes: 0 good, 1 an engine failed, 2 wrong usage.
+Exit codes: 0 success, 1 an engine failed, 2 wrong usage.
 
 Examples:
   depthrig cdm bench
@@ -35,28 +35,28 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct BenchArgs {
-    /// The name of an installed model, or a checkpoint file; without one, only fill can run
+    /// Installed model, or checkpoint file; without one, only fill can run
     #[arg(long, value_name = "NAME|FILE")]
     model: Option<String>,
-    /// What runs, ENGINE[/DEVICE[/PRECISION]] [default: fill, and onnxruntime when there is a model]
+    /// Engines, as ENGINE[/DEVICE[/PRECISION]] [default: fill, onnxruntime]
     #[arg(long = "engine", value_name = "ENGINE", value_delimiter = ',', value_parser = Spec::parse)]
     engines: Vec<Spec>,
-    /// Size of the picture
+    /// Size of the image, pixels
     #[arg(long, value_name = "WxH", default_value = "1280x720", value_parser = size)]
-    picture: (usize, usize),
-    /// The shorter side of the network's input, pixels [default: the model's]
+    image: (usize, usize),
+    /// Shorter side of the network's input, pixels [default: the model's]
     #[arg(long = "input-size", value_name = "PIXELS", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(14..=8192))]
     input_sizes: Vec<u32>,
-    /// Pictures at a time
+    /// Images per batch
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64))]
     batch: u16,
-    /// Threads on the CPU; all cores when not given
+    /// CPU threads [default: all cores]
     #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true, value_parser = clap::value_parser!(u16).range(0..=1024))]
     threads: u16,
-    /// How long to measure each, seconds; at least three times are measured
+    /// Measurement time of each, seconds; at least three runs
     #[arg(long, value_name = "SECONDS", default_value_t = 5.0, value_parser = crate::args::seconds)]
     seconds: f64,
-    /// The library of ONNX Runtime, when it is not to be looked for
+    /// ONNX Runtime library [default: found automatically]
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
     #[command(flatten)]
@@ -93,9 +93,7 @@ impl Spec {
         }
         match parts.next() {
             None => Ok(spec),
-            Some(more) => {
-                Err(format!("after engine, device and precision comes nothing more, and not {more:?}"))
-            }
+            Some(more) => Err(format!("unexpected {more:?} after engine, device and precision")),
         }
     }
 
@@ -115,21 +113,21 @@ fn size(text: &str) -> Result<(usize, usize), String> {
     }
 }
 
-/// What one engine did; times are milliseconds of a picture.
+/// Measurements of one engine; times are milliseconds per image.
 #[derive(Debug, Default, Serialize, Deserialize)]
 struct Measured {
-    /// What was asked for.
+    /// Engine, device and precision as requested.
     asked: String,
-    /// What ran, with version, device and precision.
+    /// Engine that ran, with version, device and precision.
     engine: String,
-    /// Empty when it needs none.
+    /// Empty if the engine needs none.
     model: String,
-    /// The shorter side of the network's input; 0 where there is no network.
+    /// Shorter side of the network's input; 0 without a network.
     input_size: u32,
     threads: usize,
     batch: usize,
     runs: usize,
-    /// Until the engine was ready, and the first batch, which makes room.
+    /// Time to load the engine, and time of the first batch, which allocates.
     load_ms: f64,
     first_ms: f64,
     prepare_ms: f64,
@@ -138,9 +136,9 @@ struct Measured {
     total_ms: f64,
     best_ms: f64,
     cpu_ms: f64,
-    pictures_per_s: f64,
+    images_per_s: f64,
     peak_mb: f64,
-    /// Why there are no numbers.
+    /// Failure, instead of numbers.
     error: Option<String>,
 }
 
@@ -157,33 +155,33 @@ pub fn run(args: &BenchArgs) -> Result<Exit> {
         specs.extend(args.model.is_some().then(|| Spec::of(EngineKind::OnnxRuntime)));
     }
     if let Some(spec) = specs.iter().find(|s| s.engine.needs_model() && args.model.is_none()) {
-        let text = format!("the engine {} needs a model: say which with --model", spec.engine);
+        let text = format!("the engine {} needs a model: name one with --model", spec.engine);
         return Err(UsageError(text).into());
     }
     let mut rows = Vec::new();
     for spec in &specs {
         if !spec.engine.needs_model() || args.input_sizes.is_empty() {
-            rows.push(elsewhere(args, spec, None)?);
+            rows.push(measure_in_child(args, spec, None)?);
         } else {
             for size in &args.input_sizes {
-                rows.push(elsewhere(args, spec, Some(*size))?);
+                rows.push(measure_in_child(args, spec, Some(*size))?);
             }
         }
     }
     if args.json {
         out::json(&rows)?;
     } else {
-        tell(&rows)?;
+        print_rows(&rows)?;
     }
     Ok(if rows.iter().any(|r| r.error.is_some()) { Exit::Failed } else { Exit::Good })
 }
 
-/// Measures in a process of its own.
-fn elsewhere(args: &BenchArgs, spec: &Spec, input_size: Option<u32>) -> Result<Measured> {
+/// Measures in a child process.
+fn measure_in_child(args: &BenchArgs, spec: &Spec, input_size: Option<u32>) -> Result<Measured> {
     let program = std::env::current_exe().context("this program was not found")?;
     let mut command = Command::new(program);
     command.args(["cdm", "bench", "--here", "--engine", &spec.text()]);
-    command.args(["--picture", &format!("{}x{}", args.picture.0, args.picture.1)]);
+    command.args(["--image", &format!("{}x{}", args.image.0, args.image.1)]);
     command.args(["--batch", &args.batch.to_string(), "--threads", &args.threads.to_string()]);
     command.args(["--seconds", &args.seconds.to_string()]);
     let mut option = |name: &str, value: Option<&std::ffi::OsStr>| {
@@ -232,8 +230,8 @@ fn measure(args: &BenchArgs, spec: &Spec) -> Result<Measured> {
     let mut refiner = refiner(&options).map_err(usage)?;
     let load_ms = ms(start);
 
-    let (width, height) = args.picture;
-    let (color, depth) = picture(width, height);
+    let (width, height) = args.image;
+    let (color, depth) = image(width, height);
     let batch = usize::from(args.batch);
     let mut outputs = vec![vec![0u16; width * height]; batch];
     let mut jobs: Vec<Job<'_>> = outputs
@@ -249,13 +247,15 @@ fn measure(args: &BenchArgs, spec: &Spec) -> Result<Measured> {
     refiner.refine(&mut jobs).map_err(usage)?;
     let first_ms = ms(start);
 
-    // One column for each: prepare, infer, finish, all of it, CPU.
+    // Columns: prepare, infer, finish, total, CPU.
     let mut times: [Vec<f64>; 5] = Default::default();
     let begin = HostTime::now();
     while times[0].len() < 3 || begin.elapsed().as_secs_f64() < args.seconds {
-        let (start, cpu) = (HostTime::now(), process_cpu_ns());
+        let start = HostTime::now();
+        let cpu = process_cpu_ns();
         refiner.refine(&mut jobs).map_err(usage)?;
-        let (all, cpu) = (ms(start), (process_cpu_ns() - cpu) as f64 / 1e6);
+        let all = ms(start);
+        let cpu = (process_cpu_ns() - cpu) as f64 / 1e6;
         let mean = |of: fn(&StepTimes) -> u64| {
             jobs.iter().map(|j| of(&j.steps) as f64 / 1e6).sum::<f64>() / batch as f64
         };
@@ -288,7 +288,7 @@ fn measure(args: &BenchArgs, spec: &Spec) -> Result<Measured> {
         total_ms,
         best_ms: times[3].iter().copied().fold(f64::INFINITY, f64::min),
         cpu_ms,
-        pictures_per_s: 1000.0 / total_ms,
+        images_per_s: 1000.0 / total_ms,
         peak_mb: peak_mb().unwrap_or(0.0),
         error: None,
     })
@@ -298,21 +298,24 @@ fn ms(since: HostTime) -> f64 {
     since.elapsed().as_secs_f64() * 1e3
 }
 
-/// The most memory that this process has held, from `/proc/self/status`.
+/// Peak resident memory of this process, from `/proc/self/status`.
 fn peak_mb() -> Option<f64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|l| l.starts_with("VmHWM:"))?;
     Some(line.split_whitespace().nth(1)?.parse::<f64>().ok()? / 1024.0)
 }
 
-/// A slanted floor with boxes on it in millimetres, its holes along the edges of the boxes, and colour to match.
-fn picture(width: usize, height: usize) -> (Vec<u8>, Vec<u16>) {
+/// A synthetic image: depth in millimetres of boxes on a slanted floor with holes along their edges, and matching
+/// colour.
+fn image(width: usize, height: usize) -> (Vec<u8>, Vec<u16>) {
     let mut color = Vec::with_capacity(3 * width * height);
     let mut depth = Vec::with_capacity(width * height);
     for v in 0..height {
         for u in 0..width {
-            let (x, y) = (u as f64 / width as f64, v as f64 / height as f64);
-            let (bx, by) = ((x * 5.0).fract(), (y * 4.0).fract());
+            let x = u as f64 / width as f64;
+            let y = v as f64 / height as f64;
+            let bx = (x * 5.0).fract();
+            let by = (y * 4.0).fract();
             let inside = bx > 0.25 && bx < 0.75 && by > 0.25 && by < 0.75;
             let near_edge = (bx - 0.25).abs() < 0.04 || (bx - 0.75).abs() < 0.03;
             let floor = 2200.0 - 1200.0 * y + 90.0 * (9.0 * x).sin();
@@ -325,7 +328,7 @@ fn picture(width: usize, height: usize) -> (Vec<u8>, Vec<u16>) {
     (color, depth)
 }
 
-fn tell(rows: &[Measured]) -> Result<()> {
+fn print_rows(rows: &[Measured]) -> Result<()> {
     let header = [
         "ENGINE",
         "INPUT",
@@ -350,7 +353,7 @@ fn tell(rows: &[Measured]) -> Result<()> {
             n(r.finish_ms),
             n(r.total_ms),
             n(r.cpu_ms),
-            n(r.pictures_per_s),
+            n(r.images_per_s),
             n(r.peak_mb),
             n(r.load_ms),
         ]
@@ -387,8 +390,8 @@ mod tests {
     }
 
     #[test]
-    fn the_picture_has_holes_and_depth() {
-        let (color, depth) = picture(160, 90);
+    fn the_image_has_holes_and_depth() {
+        let (color, depth) = image(160, 90);
         assert_eq!((color.len(), depth.len()), (3 * 160 * 90, 160 * 90));
         let holes = depth.iter().filter(|d| **d == 0).count();
         assert!(holes > 100 && holes < depth.len() / 3, "{holes}");
@@ -403,22 +406,12 @@ mod tests {
             #[command(flatten)]
             bench: BenchArgs,
         }
-        let words = [
-            "bench",
-            "--here",
-            "--engine",
-            "fill",
-            "--picture",
-            "160x90",
-            "--seconds",
-            "0",
-            "--threads",
-            "1",
-        ];
+        let words =
+            ["bench", "--here", "--engine", "fill", "--image", "160x90", "--seconds", "0", "--threads", "1"];
         let Cli { bench } = Cli::try_parse_from(words).unwrap();
         let measured = measure(&bench, &bench.engines[0]).unwrap();
         assert!(measured.engine.starts_with("fill") && measured.runs == 3 && measured.error.is_none());
-        assert!(measured.total_ms > 0.0 && measured.peak_mb > 1.0 && measured.pictures_per_s > 0.0);
+        assert!(measured.total_ms > 0.0 && measured.peak_mb > 1.0 && measured.images_per_s > 0.0);
         let parts = measured.prepare_ms + measured.infer_ms + measured.finish_ms;
         assert!(parts > 0.0 && measured.threads == 1);
     }

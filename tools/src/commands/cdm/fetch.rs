@@ -1,6 +1,6 @@
-//! `depthrig cdm fetch`: a published checkpoint, fetched, proven and installed.
+//! `depthrig cdm fetch`: downloads, verifies and installs a published checkpoint.
 
-use super::store::{Models, Settings, install, tell_installed, usage};
+use super::store::{Models, Settings, install, print_installed, usage};
 use crate::context::Context;
 use crate::exit::Exit;
 use crate::out;
@@ -14,13 +14,13 @@ use depthrig_cdm::{Error, ErrorKind, Weights, published};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-The published models are large (5.5 GB fetched, 2.6 GB installed). What is cut goes on where it ended when the
-command is run again. The SHA-256 is compared with --sha256, else with the one known here, else with the one that
-the server tells; what it was compared with is written down.
+The published models are large (5.5 GB to download, 2.6 GB installed). Running the command again resumes an
+interrupted download. The SHA-256 is compared with --sha256, else with the one built in, else with the one that the
+server reports; the model's record says which.
 
-Environment: HTTPS_PROXY, NO_PROXY; HF_TOKEN for models that want an account; HF_ENDPOINT for a mirror.
+Environment: HTTPS_PROXY, NO_PROXY; HF_TOKEN for models that require an account; HF_ENDPOINT for a mirror.
 
-Exit codes: 0 installed, 1 it could not be fetched or is not good, 2 wrong usage.
+Exit codes: 0 installed, 1 download failed or invalid checkpoint, 2 wrong usage.
 
 Examples:
   depthrig cdm fetch cdm-d435
@@ -29,15 +29,15 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct FetchArgs {
-    /// A published model (`depthrig cdm list --published`), or the name for the file at --url
+    /// Published model (see `cdm list --published`), or the name for --url
     name: String,
-    /// The address of a checkpoint that is not a published one
+    /// URL of a checkpoint that is not a published one
     #[arg(long, value_name = "URL")]
     url: Option<String>,
-    /// What the SHA-256 of the file must be
+    /// Expected SHA-256 of the file
     #[arg(long, value_name = "HEX")]
     sha256: Option<String>,
-    /// The version of the repository
+    /// Revision of the repository
     #[arg(long, value_name = "REVISION", default_value = "main")]
     revision: String,
     #[command(flatten)]
@@ -49,7 +49,7 @@ pub struct FetchArgs {
     json: bool,
 }
 
-/// Fetches and installs.
+/// Downloads and installs a checkpoint.
 pub fn run(args: &FetchArgs, context: &Context) -> Result<Exit> {
     let store = args.models.store()?;
     let import = args.settings.import(
@@ -90,7 +90,7 @@ pub fn run(args: &FetchArgs, context: &Context) -> Result<Exit> {
     let import = depthrig_cdm::store::Import { source: fetched.source.clone(), ..import };
     let installed = install(&store, &weights, import, &stop, context).map_err(usage)?;
     fetched.discard();
-    tell_installed(&installed, args.json)?;
+    print_installed(&installed, args.json)?;
     if let Source::Fetched { sha256, compared_with, .. } = &fetched.source
         && compared_with == "nothing"
         && !args.json

@@ -1,10 +1,10 @@
-//! `depthrig cdm relabel`: refined depth for a dataset that was recorded without, in a copy of it.
+//! `depthrig cdm relabel`: copies a dataset and adds refined depth to the copy.
 
 use super::store::Models;
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
 use crate::out;
-use crate::watched::{Remade, watched};
+use crate::watched::{DerivedDataset, watched};
 use anyhow::Result;
 use clap::ValueEnum;
 use depthrig_cdm::FillRefiner;
@@ -15,23 +15,23 @@ use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-OUT is DATASET with a stream depth_refined for every camera that has color and depth, in the view and size of colour.
-Every other picture is kept as it is stored, and DATASET is only read. Until OUT is whole, what is done lies in
-OUT.relabel: a run that was ended or killed goes on there when it is started again with the same options.
+OUT is DATASET plus a stream depth_refined for every camera that has color and depth, in the view and size of colour.
+All other images are copied as stored; DATASET is only read. Until OUT is complete, the work is in OUT.relabel: run
+the command again with the same options to resume an interrupted run.
 
-Exit codes: 0 all, 1 failed or ended before all was done (OUT is not there), 2 wrong usage or a dataset that cannot
-be refined, 3 done, but some of DATASET could not be read.
+Exit codes: 0 success, 1 failed or interrupted (OUT does not exist), 2 wrong usage or a dataset that cannot be refined,
+3 done, but parts of DATASET could not be read.
 
 Examples:
   depthrig cdm relabel data/20261121_1015_kitchen data/kitchen_fill --engine fill
   depthrig cdm relabel data/20261121_1015_kitchen --out data/kitchen_cdm --model cdm-d435 -j 2 --threads 4";
 
-/// What refines.
+/// Engine that refines depth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Engine {
-    /// The model for each camera if one is installed, else fill
+    /// Each camera's model if one is installed, else fill
     Auto,
-    /// Hole filling guided by colour; needs no model
+    /// Colour-guided hole filling; needs no model
     Fill,
     /// ONNX Runtime
     Onnxruntime,
@@ -40,39 +40,39 @@ enum Engine {
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct RelabelArgs {
-    /// The dataset's folder
+    /// Dataset folder
     dataset: PathBuf,
-    /// Folder of the new dataset; must not be there
+    /// Folder of the new dataset; must not exist
     #[arg(value_name = "OUT", required_unless_present = "out_option")]
     out: Option<PathBuf>,
-    /// The same as an option
+    /// Folder of the new dataset, as an option
     #[arg(long = "out", value_name = "OUT", id = "out_option", conflicts_with = "out")]
     out_option: Option<PathBuf>,
-    /// What refines
+    /// Engine that refines depth
     #[arg(long, value_enum, default_value = "auto")]
     engine: Engine,
-    /// An installed model or a checkpoint file, for every camera [default: the one for each camera]
+    /// Installed model or checkpoint file for all cameras [default: per camera]
     #[arg(long, value_name = "MODEL")]
     model: Option<String>,
     /// Shorter side of the network's input, pixels [default: the model's]
     #[arg(long, value_name = "N")]
     input_size: Option<u32>,
-    /// What the network runs on: cpu, cuda:0, tensorrt:0, openvino
+    /// Device that runs the network: cpu, cuda:0, tensorrt:0 or openvino
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// The library of ONNX Runtime [default: looked for]
+    /// ONNX Runtime library [default: found automatically]
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
-    /// Depth lies in the view of colour, whatever the dataset says of its calibration
+    /// Treat depth as registered to colour, regardless of the calibration
     #[arg(long)]
     is_aligned: bool,
-    /// How far from measured depth fill fills holes, part of the width; 1: all
+    /// Reach of fill from measured depth, fraction of the width; 1: no limit
     #[arg(long, value_name = "PART", value_parser = crate::args::fill_reach, default_value_t = FillRefiner::REACH)]
     fill_reach: f64,
-    /// Pictures that are worked on at once [default: one for each core; 1 with a network]
+    /// Images to process in parallel [default: one per core; 1 with a network]
     #[arg(short = 'j', long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     jobs: Option<u16>,
-    /// Threads for each picture [default: 1; every core with a network]
+    /// Threads per image [default: 1; all cores with a network]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
     #[command(flatten)]
@@ -118,18 +118,18 @@ impl RelabelArgs {
     }
 }
 
-/// Relabels.
+/// Adds refined depth and reports the result.
 pub fn run(args: &RelabelArgs, context: &Context) -> Result<Exit> {
     let Some(out) = args.out.as_ref().or(args.out_option.as_ref()) else {
-        return Err(UsageError("say where the new dataset is to be: --out OUT".to_owned()).into());
+        return Err(UsageError("name the new dataset with --out OUT".to_owned()).into());
     };
     let dataset = Dataset::open(&args.dataset)?;
-    let report = watched(context, |tell| {
+    let report = watched(context, |progress| {
         relabel(&dataset, out, &args.options(), &mut |step, done, total| {
-            tell(if step == Step::Refine { "refine" } else { "write" }, done, total)
+            progress(if step == Step::Refine { "refine" } else { "write" }, done, total)
         })
     })?;
-    let remade = Remade {
+    let derived = DerivedDataset {
         path: &report.path,
         sets: report.sets,
         bytes: report.bytes,
@@ -138,10 +138,10 @@ pub fn run(args: &RelabelArgs, context: &Context) -> Result<Exit> {
         problems: &report.problems,
         lacks: false,
     };
-    remade.told(context, args.json.then_some(&report), || tell_streams(&report))
+    derived.print(context, args.json.then_some(&report), || print_streams(&report))
 }
 
-fn tell_streams(report: &RelabelReport) -> Result<()> {
+fn print_streams(report: &RelabelReport) -> Result<()> {
     for s in &report.streams {
         let with = if s.model.is_empty() { String::new() } else { format!(" with {}", s.model) };
         out::line(format_args!("  {}: {} by {}{with}", s.stream, out::count(s.frames, "frame"), s.engine))?;

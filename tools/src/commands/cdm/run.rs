@@ -1,9 +1,9 @@
-//! `depthrig cdm run`: refined depth of one pair of pictures.
+//! `depthrig cdm run`: refines the depth of one colour and depth image.
 
 use super::store::{Channels, Models, usage};
 use crate::exit::{Exit, UsageError};
 use crate::outfile::{OutFile, Overwrite};
-use crate::{out, picture};
+use crate::{image_file, out};
 use anyhow::Result;
 use depthrig_cdm::{
     Color, ColorFormat, EngineKind, FillRefiner, Job, Output, Precision, RawDepth, RefinerOptions, StepTimes,
@@ -17,10 +17,10 @@ use std::path::{Path, PathBuf};
 pub const EXAMPLES: &str = "\
 Colour and depth must show the same view at the same size: depth registered to colour.
 
-OUT.npy holds 32-bit floats, metres (0 where there is none), or 1/m as the network gives them with --inverse.
-OUT.png holds 16 bits in units of --out-unit.
+OUT.npy holds 32-bit floats: metres (0 = no depth), or with --inverse the network's output in 1/m. OUT.png holds
+16 bits in units of --out-unit.
 
-Exit codes: 0 good, 1 failed, 2 wrong usage or pictures that do not fit, 3 written, but it holds no depth.
+Exit codes: 0 success, 1 failure, 2 wrong usage or mismatched images, 3 written, but without any depth.
 
 Examples:
   depthrig cdm run --rgb color.png --depth depth.png --depth-unit 0.001 --model cdm-d435 --out refined.npy
@@ -31,54 +31,54 @@ Examples:
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct RunArgs {
-    /// Colour, PNG or JPEG
+    /// Colour image, PNG or JPEG
     #[arg(long, value_name = "FILE")]
     rgb: PathBuf,
-    /// Raw depth in the view of colour, a PNG of 16 bits; 0 is a hole
+    /// Raw depth registered to colour, a 16-bit PNG; 0 is a hole
     #[arg(long, value_name = "FILE")]
     depth: PathBuf,
     /// Metres per unit of the raw depth
     #[arg(long, value_name = "METRES", value_parser = crate::args::depth_unit_m)]
     depth_unit: f64,
-    /// The name of an installed model, or a checkpoint file
+    /// Installed model, or checkpoint file
     #[arg(long, value_name = "NAME|FILE", required_unless_present = "engine")]
     model: Option<String>,
-    /// The shorter side of the network's input, pixels [default: the model's]
+    /// Shorter side of the network's input, pixels [default: the model's]
     #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(14..=8192))]
     input_size: Option<u32>,
-    /// What runs: onnxruntime, or fill (needs no model) [default: onnxruntime]
+    /// Engine: onnxruntime, or fill (needs no model) [default: onnxruntime]
     #[arg(long, value_name = "ENGINE", value_parser = engine)]
     engine: Option<EngineKind>,
-    /// Write what the network gives: inverse depth, 1/m
+    /// Write the network's output: inverse depth, 1/m
     #[arg(long)]
     inverse: bool,
-    /// The file to write, .npy or .png
+    /// Output file, .npy or .png
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     #[command(flatten)]
     overwrite: Overwrite,
-    /// Metres per unit of a PNG that is written
+    /// Metres per unit of an output PNG
     #[arg(long, value_name = "METRES", value_parser = crate::args::depth_unit_m, default_value_t = 0.001)]
     out_unit: f64,
-    /// Order of the colour channels, in place of the model's
+    /// Order of the colour channels [default: the model's]
     #[arg(long, value_enum, value_name = "ORDER")]
     channel_order: Option<Channels>,
-    /// Raw depth beyond this is a hole, metres, in place of the model's
+    /// Farthest raw depth, metres; the rest is a hole [default: the model's]
     #[arg(long, value_name = "METRES", value_parser = crate::args::range_limit_m)]
     max_depth: Option<f64>,
-    /// Numbers that the network computes with: fp32, fp16 or bf16
+    /// Precision of the network: fp32, fp16 or bf16
     #[arg(long, value_name = "PRECISION", default_value = "fp32", value_parser = precision)]
     precision: Precision,
-    /// Where it runs: cpu, cuda:0, tensorrt:0 or openvino
+    /// Device that runs the network: cpu, cuda:0, tensorrt:0 or openvino
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     device: String,
-    /// Threads on the CPU; all cores when not given
+    /// CPU threads [default: all cores]
     #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true, value_parser = clap::value_parser!(u16).range(0..=1024))]
     threads: u16,
-    /// The library of ONNX Runtime, when it is not to be looked for
+    /// ONNX Runtime library [default: found automatically]
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
-    /// How far from measured depth fill fills holes, part of the width; 1: all
+    /// Reach of fill from measured depth, fraction of the width; 1: no limit
     #[arg(long, value_name = "PART", value_parser = crate::args::fill_reach, default_value_t = FillRefiner::REACH)]
     fill_reach: f64,
     #[command(flatten)]
@@ -88,49 +88,49 @@ pub struct RunArgs {
     json: bool,
 }
 
-/// Reads the name of an engine.
+/// Parses the name of an engine.
 ///
 /// # Errors
-/// When there is none of that name.
+/// When the name is unknown.
 pub fn engine(text: &str) -> Result<EngineKind, String> {
     text.parse().map_err(|e: depthrig_cdm::Error| e.to_string())
 }
 
-/// Reads the name of a precision.
+/// Parses the name of a precision.
 ///
 /// # Errors
-/// When there is none of that name.
+/// When the name is unknown.
 pub fn precision(text: &str) -> Result<Precision, String> {
     text.parse().map_err(|e: depthrig_cdm::Error| e.to_string())
 }
 
-/// What was done.
+/// Result of the command, as JSON.
 #[derive(Debug, Serialize)]
 struct Report<'a> {
     out: &'a Path,
     width: usize,
     height: usize,
-    /// What the numbers of the file are: `metres`, `inverse metres`, or `units` of a PNG.
+    /// Unit of the file's numbers: `metres`, `inverse metres`, or `units` of a PNG.
     values: &'static str,
     /// Metres per unit of a PNG.
     unit_m: Option<f64>,
     engine: &'a str,
-    /// Empty when the engine needs none.
+    /// Empty if the engine needs no model.
     model: &'a str,
-    /// Whether the model was ever trained; none when there is no model.
+    /// Whether the model is trained; `None` without a model.
     trained: Option<bool>,
     /// Pixels with raw depth, percent.
     raw_percent: f64,
     /// Pixels with refined depth, percent.
     refined_percent: f64,
-    /// What is wrong with what came out, or with what went in.
+    /// Problems of the output or the input.
     warnings: Vec<String>,
     prepare_ms: f64,
     infer_ms: f64,
     finish_ms: f64,
 }
 
-/// How the result is kept.
+/// Format of the result.
 enum Refined {
     Units(Vec<u16>),
     Floats(Vec<f32>),
@@ -143,7 +143,7 @@ pub fn run(args: &RunArgs) -> Result<Exit> {
     let inputs: Vec<&Path> = [args.rgb.as_path(), &args.depth].into_iter().chain(model).collect();
     let out = OutFile::new(&args.out, args.overwrite, &inputs)?;
     let (color, width, height) = read_color(&args.rgb)?;
-    let depth = read_depth(&args.depth, &args.rgb, (width, height))?;
+    let depth = read_depth(&args.depth, &args.rgb, width, height)?;
     let options = options(args)?;
     let max_depth_m = options.model.as_ref().map_or(f64::INFINITY, |m| m.max_depth_m);
     let trained = options.model.as_ref().map(depthrig_cdm::Model::is_trained);
@@ -201,15 +201,15 @@ pub fn run(args: &RunArgs) -> Result<Exit> {
     for warning in &report.warnings {
         out::note(format_args!("warning: {}: {warning}", args.depth.display()));
     }
-    tell(&report, args.json)?;
+    print_report(&report, args.json)?;
     Ok(if seen == 0 { Exit::Lost } else { Exit::Good })
 }
 
-/// Raw depth by what the refiner makes of it.
+/// Counts of raw depth pixels by their use in the refiner.
 struct InputDepth {
     pixels: usize,
     usable: usize,
-    /// Measured, and farther than the model looks.
+    /// Measured, but beyond the model's range.
     beyond: usize,
     limit_m: f64,
     unit_m: f64,
@@ -237,10 +237,10 @@ impl InputDepth {
         );
         match (usable, beyond) {
             (0, 0) => Some(format!(
-                "none of its {pixels} pixels has depth: 0 and 65535 are holes. Nothing is refined without any; check the file"
+                "none of its {pixels} pixels has depth (0 and 65535 are holes), so nothing is refined; check the file"
             )),
             (0, _) => Some(format!(
-                "all depth in it ({beyond} pixels) lies beyond {limit_m} m, where the model takes it for holes: nothing is \
+                "all its depth ({beyond} pixels) lies beyond {limit_m} m and counts as holes, so nothing is \
                  refined; {cure}"
             )),
             (usable, beyond) if beyond > usable => Some(format!(
@@ -252,16 +252,16 @@ impl InputDepth {
     }
 }
 
-/// The farthest depth that a model for cameras of arm's reach may be right about, metres: that of the official class.
+/// Farthest plausible depth of a model for short-range cameras, metres: that of the official class.
 const FARTHEST_M: f32 = 20.0;
-/// The share of a result without plausible depth that is worth a warning.
+/// Share of implausible depth in a result that causes a warning.
 const IMPLAUSIBLE: f64 = 0.05;
-/// A model mends raw depth; one that is right does not move much of it by this factor.
+/// A correct model does not change much of the raw depth by more than this factor.
 const FACTOR: f32 = 2.0;
-/// The share of raw depth that is moved so far that is worth a warning.
+/// Share of raw depth changed by more than that factor that causes a warning.
 const MOVED: f64 = 0.1;
 
-/// Whether a network's result can be depth. One with damaged weights gives numbers as well.
+/// Plausibility of a network's result: a network with damaged weights outputs numbers as well.
 #[derive(Debug, Default)]
 struct Plausibility {
     pixels: usize,
@@ -277,7 +277,7 @@ impl Plausibility {
     fn of(refined_m: &[f32], raw: &[u16], input: &InputDepth) -> Self {
         let mut seen = Self { pixels: refined_m.len(), ..Self::default() };
         for (refined, raw) in refined_m.iter().zip(raw) {
-            // Not a number is in no range.
+            // NaN is in no range.
             if !(*refined > 0.0 && *refined <= FARTHEST_M) {
                 seen.implausible += 1;
             } else if let Some(raw) = input.metres(*raw) {
@@ -321,7 +321,7 @@ fn metres(refined: &Refined, args: &RunArgs) -> Vec<f32> {
     }
 }
 
-fn tell(r: &Report<'_>, json: bool) -> Result<()> {
+fn print_report(r: &Report<'_>, json: bool) -> Result<()> {
     if json {
         return out::json(r);
     }
@@ -340,22 +340,24 @@ fn tell(r: &Report<'_>, json: bool) -> Result<()> {
         r.finish_ms
     ))?;
     if r.trained == Some(false) {
-        out::line("the model was NEVER TRAINED: its numbers are random, and what it gives is no depth")?;
+        out::line("the model was NEVER TRAINED: its weights are random, and its output is not depth")?;
     }
     Ok(())
 }
 
-/// Whether a PNG is asked for.
+/// Returns whether the output is a PNG.
 fn form(args: &RunArgs) -> Result<bool> {
     let ending = args.out.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
     match ending.as_str() {
         "npy" => Ok(false),
-        "png" if args.inverse => Err(UsageError(
-            "--inverse gives 1/m, which a PNG of whole numbers cannot hold; write a .npy".to_owned(),
-        )
-        .into()),
+        "png" if args.inverse => {
+            Err(UsageError("--inverse writes 1/m, which an integer PNG cannot hold; use .npy".to_owned())
+                .into())
+        }
         "png" => Ok(true),
-        _ => Err(UsageError(format!("{}: the result is a .npy or a .png", args.out.display())).into()),
+        _ => {
+            Err(UsageError(format!("{}: unsupported extension; use .npy or .png", args.out.display())).into())
+        }
     }
 }
 
@@ -386,46 +388,44 @@ fn options(args: &RunArgs) -> Result<RefinerOptions> {
     })
 }
 
-/// Colour as red, green, blue, 8 bits each; grey becomes all three, and transparency is left out.
+/// Reads colour as 8-bit RGB; grey is expanded, and transparency is dropped.
 fn read_color(path: &Path) -> Result<(Vec<u8>, usize, usize)> {
-    let picture = picture::open(path)?;
-    if picture.color().bytes_per_pixel() / picture.color().channel_count() != 1 {
-        let text = format!("{}: colour has more than 8 bits a channel; write it with 8", path.display());
+    let image = image_file::open(path)?;
+    if image.color().bytes_per_pixel() / image.color().channel_count() != 1 {
+        let text = format!("{}: colour has more than 8 bits per channel; convert it to 8", path.display());
         return Err(UsageError(text).into());
     }
-    let (width, height) = (picture.width() as usize, picture.height() as usize);
+    let width = image.width() as usize;
+    let height = image.height() as usize;
     // Dropped, not blended: as OpenCV reads it.
-    Ok((picture.into_rgb8().into_raw(), width, height))
+    Ok((image.into_rgb8().into_raw(), width, height))
 }
 
-/// Depth of the size of its colour.
-fn read_depth(path: &Path, rgb: &Path, size: (usize, usize)) -> Result<Vec<u16>> {
-    let picture = picture::open(path)?;
-    let has = (picture.width() as usize, picture.height() as usize);
-    if has != size {
+/// Reads depth and checks that it has the size of its colour image.
+fn read_depth(path: &Path, rgb: &Path, width: usize, height: usize) -> Result<Vec<u16>> {
+    let image = image_file::open(path)?;
+    let has = (image.width() as usize, image.height() as usize);
+    if has != (width, height) {
         return Err(UsageError(format!(
-            "{} is {}x{} and {} is {}x{}: they do not show one view. Depth must be registered to colour first, for which the \
+            "{} is {}x{} and {} is {width}x{height}: they do not show the same view. Depth must be registered to colour first, for which the \
              calibration of the camera is needed; depthrig does it for the cameras of a rig (refine) and for its datasets \
              (depthrig cdm relabel)",
             path.display(),
             has.0,
             has.1,
-            rgb.display(),
-            size.0,
-            size.1
+            rgb.display()
         ))
         .into());
     }
-    match picture {
+    match image {
         DynamicImage::ImageLuma16(depth) => Ok(depth.into_raw()),
         DynamicImage::ImageLuma8(_) => Err(UsageError(format!(
-            "{}: has 8 bits a pixel, which hold 255 depths at the most and are mostly a preview; depth is a PNG of one channel of \
-             16 bits",
+            "{}: has 8 bits per pixel, which is mostly a preview; use a 16-bit PNG with one channel",
             path.display()
         ))
         .into()),
         other => Err(UsageError(format!(
-            "{}: is a picture in {:?}; depth is a PNG of one channel of 16 bits",
+            "{}: unsupported depth format {:?}; use a 16-bit PNG with one channel",
             path.display(),
             other.color()
         ))
@@ -433,7 +433,7 @@ fn read_depth(path: &Path, rgb: &Path, size: (usize, usize)) -> Result<Vec<u16>>
     }
 }
 
-/// The file that holds the result.
+/// Encodes the output file.
 fn encoded(refined: &Refined, width: usize, height: usize) -> Result<Vec<u8>> {
     Ok(match refined {
         Refined::Floats(pixels) => {
@@ -441,7 +441,7 @@ fn encoded(refined: &Refined, width: usize, height: usize) -> Result<Vec<u8>> {
             depthrig_recorder::npy_file("<f4", &[height, width], &data)
         }
         Refined::Units(pixels) => {
-            // PNG is big-endian; the encoder takes the order of this computer.
+            // PNG is big-endian; the encoder takes native order.
             let data: Vec<_> = pixels.iter().flat_map(|d| d.to_ne_bytes()).collect();
             let mut file = Vec::new();
             png::PngEncoder::new(&mut file).write_image(
@@ -474,24 +474,24 @@ mod tests {
         assert_eq!(warned(|_| 1.0), [""; 0]);
         for bad in [0.0, -1.0, 20.5, f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
             assert_eq!(warned(|i| if i < 5 { bad } else { 1.0 }), [""; 0], "{bad}");
-            let told = warned(|i| if i < 17 { bad } else { 1.0 });
-            let [why] = &told[..] else { panic!("{bad}: {told:?}") };
+            let warnings = warned(|i| if i < 17 { bad } else { 1.0 });
+            let [why] = &warnings[..] else { panic!("{bad}: {warnings:?}") };
             assert!(why.starts_with("17 % of the result is missing or beyond 20 m"), "{why}");
             assert!(why.contains("cdm info NAME --check"), "{why}");
         }
     }
 
-    /// What is in range and nowhere near what the camera measured is no depth either.
+    /// Output in range but far from the measured depth is not depth either.
     #[test]
     fn depth_far_from_the_raw_depth_is_a_warning_with_its_cure() {
-        // What a model that mends depth does.
+        // A model that improves depth.
         assert_eq!(warned(|i| if i < 9 { 3.0 } else { 0.6 }), [""; 0]);
         for bad in [0.3, 3.0] {
-            let told = warned(|i| if i < 49 { bad } else { 1.2 });
-            let [why] = &told[..] else { panic!("{bad}: {told:?}") };
+            let warnings = warned(|i| if i < 49 { bad } else { 1.2 });
+            let [why] = &warnings[..] else { panic!("{bad}: {warnings:?}") };
             let begins = "50 % of the raw depth differs from the result by more than a factor of 2";
             assert!(why.starts_with(begins) && why.contains("cdm info NAME --check"), "{why}");
         }
-        assert_eq!(warned(|i| if i < 98 { 1.0 } else { 15.0 }), [""; 0], "where there is no raw depth");
+        assert_eq!(warned(|i| if i < 98 { 1.0 } else { 15.0 }), [""; 0], "where raw depth is missing");
     }
 }

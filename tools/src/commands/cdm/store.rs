@@ -1,4 +1,4 @@
-//! `depthrig cdm import`, `list`, `info` and `remove`: the models of this computer.
+//! `depthrig cdm import`, `list`, `info` and `remove`: manages the installed models.
 
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
@@ -15,11 +15,11 @@ use std::path::{Path, PathBuf};
 
 /// Examples of `cdm import`.
 pub const IMPORT_EXAMPLES: &str = "\
-FILE is what the official code loads (torch.save of {\"model\": ...} or of a state dict) or a .safetensors file.
-Nothing in it is run. Every tensor that is missing, too much, of another shape or not finite is listed, and then
-nothing is installed.
+FILE is a checkpoint for the official code (torch.save of {\"model\": ...} or of a state dict) or a .safetensors file.
+No code in it is executed. If any tensor is missing, superfluous, of the wrong shape or not finite, all of them are
+listed and nothing is installed.
 
-Exit codes: 0 installed, 1 not a good checkpoint or it could not be installed, 2 wrong usage.
+Exit codes: 0 installed, 1 invalid checkpoint or failed installation, 2 wrong usage.
 
 Examples:
   depthrig cdm import cdm_d435.ckpt --name cdm-d435
@@ -29,39 +29,39 @@ Examples:
 pub const LIST_EXAMPLES: &str = "\
 Examples:
   depthrig cdm list
-  depthrig cdm list --published     what `cdm fetch` knows, and the cameras each is for
+  depthrig cdm list --published     models that `cdm fetch` knows, with their cameras
   depthrig cdm list --json";
 
 /// Examples of `cdm info`.
 pub const INFO_EXAMPLES: &str = "\
-Exit codes: 0 good, 1 there is no such model or it is damaged, 2 wrong usage.
+Exit codes: 0 success, 1 the model is missing or damaged, 2 wrong usage.
 
 Examples:
   depthrig cdm info cdm-d435
-  depthrig cdm info cdm-d435 --check     read every byte again";
+  depthrig cdm info cdm-d435 --check     verify every byte";
 
-/// Which models are meant.
+/// Selects the model folder.
 #[derive(Debug, Clone, clap::Args)]
 pub struct Models {
-    /// Folder of the models [env: DEPTHRIG_MODELS] [default: ~/.local/share/depthrig/models]
+    /// Model folder [env: DEPTHRIG_MODELS] [default: ~/.local/share/depthrig/models]
     #[arg(long = "models", value_name = "DIR")]
     pub dir: Option<PathBuf>,
 }
 
 impl Models {
-    /// The store.
+    /// Opens the store.
     ///
     /// # Errors
-    /// When it is not known where models are.
+    /// When the model folder is unknown.
     pub fn store(&self) -> Result<ModelStore> {
         Ok(ModelStore::open(self.dir.as_deref())?)
     }
 }
 
-/// The order of colour.
+/// Order of the colour channels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Channels {
-    /// As the official inference script feeds the network, which turns the channels around twice
+    /// Blue first, as in the official inference script
     Bgr,
     /// Red first
     Rgb,
@@ -76,31 +76,31 @@ impl From<Channels> for ChannelOrder {
     }
 }
 
-/// How a model is to be installed.
+/// Options of an installation.
 #[derive(Debug, Clone, clap::Args)]
 pub struct Settings {
-    /// Order of the colour channels that the network was trained with
+    /// Colour channel order that the network was trained with
     #[arg(long, value_enum, default_value = "bgr", value_name = "ORDER")]
     channel_order: Channels,
-    /// The shorter side of the network's input, pixels; the rig file may say another
+    /// Shorter side of the network's input, pixels; rig files can override it
     #[arg(long, value_name = "PIXELS", default_value_t = depthrig_cdm::INPUT_SIZE)]
     input_size: u32,
-    /// Raw depth beyond this is a hole, metres
+    /// Farthest raw depth, metres; anything beyond is a hole
     #[arg(long, value_name = "METRES", default_value_t = depthrig_cdm::MAX_DEPTH_M, value_parser = crate::args::range_limit_m)]
     max_depth: f64,
-    /// A camera model that it is for, such as D435; may be given several times
+    /// Camera model that it was trained for, such as D435; repeatable
     #[arg(long = "camera", value_name = "MODEL")]
     cameras: Vec<String>,
-    /// Leave out tensors that are not of the network, and write their names down
+    /// Leave out tensors that the network lacks, and record their names
     #[arg(long)]
     drop_extra: bool,
-    /// Replace an installed model of that name; who uses it keeps the old one
+    /// Replace an installed model of that name; running processes keep the old one
     #[arg(long)]
     replace: bool,
 }
 
 impl Settings {
-    /// What the store wants to know.
+    /// Builds the store's import request.
     pub fn import(&self, name: &str, encoder: Option<Encoder>, source: Source) -> Import {
         let mut import = Import {
             encoder,
@@ -125,19 +125,19 @@ fn encoder(text: &str) -> Result<Encoder, String> {
 /// Arguments of `cdm import`.
 #[derive(Debug, clap::Args)]
 pub struct ImportArgs {
-    /// The checkpoint
+    /// Checkpoint file
     file: PathBuf,
-    /// What the model is to be called [default: the file's name; that of the published model for a published file]
+    /// Name of the model [default: the published model's, else the file's]
     #[arg(long, value_name = "NAME")]
     name: Option<String>,
-    /// The size that it must be of: vits, vitb, vitl or vitg
+    /// Required encoder: vits, vitb, vitl or vitg [default: any]
     #[arg(long, value_name = "ENCODER", value_parser = encoder)]
     encoder: Option<Encoder>,
     #[command(flatten)]
     settings: Settings,
     #[command(flatten)]
     models: Models,
-    /// Print JSON, also of what is wrong with the checkpoint
+    /// Print JSON, including the problems of an invalid checkpoint
     #[arg(long)]
     json: bool,
 }
@@ -145,7 +145,7 @@ pub struct ImportArgs {
 /// Arguments of `cdm list`.
 #[derive(Debug, clap::Args)]
 pub struct ListArgs {
-    /// List the published models in place of the installed ones
+    /// List the published models instead of the installed ones
     #[arg(long)]
     published: bool,
     #[command(flatten)]
@@ -158,9 +158,9 @@ pub struct ListArgs {
 /// Arguments of `cdm info`.
 #[derive(Debug, clap::Args)]
 pub struct InfoArgs {
-    /// The model
+    /// Name of the model
     name: String,
-    /// Read every byte and number again
+    /// Verify every byte and number
     #[arg(long)]
     check: bool,
     #[command(flatten)]
@@ -173,7 +173,7 @@ pub struct InfoArgs {
 /// Arguments of `cdm remove`.
 #[derive(Debug, clap::Args)]
 pub struct RemoveArgs {
-    /// The model
+    /// Name of the model
     name: String,
     #[command(flatten)]
     models: Models,
@@ -184,7 +184,7 @@ pub struct RemoveArgs {
 
 /// A model as JSON.
 #[derive(Serialize)]
-struct Told<'a> {
+struct ModelReport<'a> {
     name: &'a str,
     id: String,
     path: &'a Path,
@@ -192,19 +192,19 @@ struct Told<'a> {
     record: &'a Record,
 }
 
-impl<'a> Told<'a> {
+impl<'a> ModelReport<'a> {
     fn of(model: &'a Installed) -> Self {
         Self { name: &model.name, id: model.id(), path: &model.path, record: &model.record }
     }
 }
 
-/// A checkpoint that was refused, as JSON.
+/// A rejected checkpoint, as JSON.
 #[derive(Serialize)]
-struct Refused<'a> {
+struct Rejected<'a> {
     installed: bool,
     error: String,
     file: &'a Path,
-    /// Everything that is wrong; none when it could not be read at all.
+    /// All problems; `None` when the file could not be read at all.
     report: Option<weights::Report>,
 }
 
@@ -212,7 +212,8 @@ struct Refused<'a> {
 pub fn import(args: &ImportArgs, context: &Context) -> Result<Exit> {
     let ImportArgs { file, name, encoder, settings, models, json } = args;
     let name = name.clone().map_or_else(|| name_of(file), Ok)?;
-    let (store, stop) = (models.store()?, Stop::on_signals()?);
+    let store = models.store()?;
+    let stop = Stop::on_signals()?;
     let installed = Weights::open(file).and_then(|weights| {
         let source = Source::file(&weights)?;
         install(&store, &weights, settings.import(&name, *encoder, source), &stop, context)
@@ -220,16 +221,16 @@ pub fn import(args: &ImportArgs, context: &Context) -> Result<Exit> {
     let installed = match installed {
         Err(e) if *json && e.kind() == ErrorKind::BadModel => {
             let report = Weights::open(file).and_then(|w| weights::examine(&w, *encoder)).ok();
-            out::json(&Refused { installed: false, error: e.to_string(), file, report })?;
+            out::json(&Rejected { installed: false, error: e.to_string(), file, report })?;
             return Ok(Exit::Failed);
         }
         other => other.map_err(usage)?,
     };
-    tell_installed(&installed, *json)?;
+    print_installed(&installed, *json)?;
     Ok(Exit::Good)
 }
 
-/// Installs `weights` with a bar; Ctrl-C ends it and leaves nothing.
+/// Installs `weights` with a progress bar; Ctrl-C cancels it and leaves nothing behind.
 ///
 /// # Errors
 /// Those of [`ModelStore::import`].
@@ -247,31 +248,31 @@ pub fn install(
     })
 }
 
-/// Says what was installed.
+/// Prints the installed model.
 ///
 /// # Errors
 /// When the output is closed.
-pub fn tell_installed(model: &Installed, json: bool) -> Result<()> {
+pub fn print_installed(model: &Installed, json: bool) -> Result<()> {
     if json {
-        return out::json(&Told::of(model));
+        return out::json(&ModelReport::of(model));
     }
     out::line(format_args!("installed {} in {}", model.id(), model.path.display()))?;
     out::line(text(model))
 }
 
-/// What the person at the keyboard has to change is wrong usage.
+/// Turns an error about the input into a usage error.
 pub fn usage(e: depthrig_cdm::Error) -> anyhow::Error {
     if e.kind() == ErrorKind::BadInput { UsageError(e.to_string()).into() } else { e.into() }
 }
 
-/// The name for a file that none was given for.
+/// Derives the model's name from its file.
 fn name_of(file: &Path) -> Result<String> {
     let name = file.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
     if let Some(p) = published::PUBLISHED.iter().find(|p| p.file == name) {
         return Ok(p.name.to_owned());
     }
     let stem = file.file_stem().map_or_else(String::new, |n| n.to_string_lossy().replace([' ', '_'], "-"));
-    check_name(&stem).map_err(|e| UsageError(format!("{e}; say what it is to be called with --name")))?;
+    check_name(&stem).map_err(|e| UsageError(format!("{e}; name the model with --name")))?;
     Ok(stem)
 }
 
@@ -289,7 +290,7 @@ pub fn list(args: &ListArgs) -> Result<Exit> {
             name: &'a str,
             error: String,
         }
-        let good: Vec<_> = models.iter().filter_map(|(_, m)| m.as_ref().ok()).map(Told::of).collect();
+        let good: Vec<_> = models.iter().filter_map(|(_, m)| m.as_ref().ok()).map(ModelReport::of).collect();
         let bad = models
             .iter()
             .filter_map(|(name, m)| Some(Damaged { name, error: m.as_ref().err()?.to_string() }));
@@ -297,7 +298,7 @@ pub fn list(args: &ListArgs) -> Result<Exit> {
         out::json(&serde_json::json!({ "folder": store.dir(), "models": good, "damaged": bad }))?;
     } else if models.is_empty() {
         out::line(format_args!(
-            "no model is installed in {}; `depthrig cdm list --published` shows what there is to fetch",
+            "no model is installed in {}; `depthrig cdm list --published` lists the models to fetch",
             store.dir().display()
         ))?;
     } else {
@@ -355,7 +356,7 @@ fn list_published(json: bool) -> Result<Exit> {
     Ok(Exit::Good)
 }
 
-/// Says what is known of a model.
+/// Prints the record of a model.
 pub fn info(args: &InfoArgs) -> Result<Exit> {
     let store = args.models.store()?;
     let model = store.info(&args.name).map_err(usage)?;
@@ -363,7 +364,7 @@ pub fn info(args: &InfoArgs) -> Result<Exit> {
         store.check(&args.name)?;
     }
     if args.json {
-        out::json(&Told::of(&model))?;
+        out::json(&ModelReport::of(&model))?;
     } else {
         out::line(format_args!("{}  {}", model.id(), model.path.display()))?;
         out::line(text(&model))?;
@@ -374,7 +375,7 @@ pub fn info(args: &InfoArgs) -> Result<Exit> {
     Ok(Exit::Good)
 }
 
-/// A model for people.
+/// Describes a model as text.
 fn text(model: &Installed) -> String {
     let r = &model.record;
     let or_none = |text: String| if text.is_empty() { "-".to_owned() } else { text };
@@ -413,7 +414,7 @@ fn text(model: &Installed) -> String {
         lines.push(format!("  left out      {}", r.left_out.join(", ")));
     }
     if !r.trained {
-        lines.push("  NOT TRAINED   random numbers: what it gives is no depth".to_owned());
+        lines.push("  NOT TRAINED   random weights: the output is not depth".to_owned());
     }
     lines.join("\n")
 }
@@ -424,7 +425,7 @@ pub fn remove(args: &RemoveArgs) -> Result<Exit> {
     if args.json {
         out::json(&serde_json::json!({ "removed": args.name }))?;
     } else {
-        out::line(format_args!("removed {}; who uses it keeps it until they let go", args.name))?;
+        out::line(format_args!("removed {}; running processes keep it until they exit", args.name))?;
     }
     Ok(Exit::Good)
 }

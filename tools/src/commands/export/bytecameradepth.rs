@@ -7,14 +7,14 @@ use depthrig_recorder::exchange::{ByteCameraExport, CameraNames};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-Writes OUT/YYYYMMDD_HHMM/camera_<model>/ with depth_N.png (16 bits, in the unit that
-calibration.json names; 0 is no depth), color_N.png, ir_N.png, raw_depth_N.npy (metres), and
-frames.csv and calibration.json beside the cameras. N counts the sets from 0: the same N is the same
-set in every folder, and a number that is not there is a frame that the set has not. OUT is new, or
-holds the same export unfinished, which then goes on.
+Writes OUT/YYYYMMDD_HHMM/camera_<model>/ with depth_N.png (16 bits, in the unit given in
+calibration.json; 0 is no depth), color_N.png, ir_N.png and raw_depth_N.npy (metres), and
+frames.csv and calibration.json beside the camera folders. N counts the sets from 0: the same N is
+the same set in every folder; a missing number means that the set lacks this frame. OUT is new, or
+an unfinished export with the same options, which is resumed.
 
-Exit codes: 0 all, 1 failed or ended before all was done, 2 wrong usage, 3 exported, but some sets,
-frames or pixels could not be.
+Exit codes: 0 success, 1 failed or interrupted, 2 wrong usage, 3 exported, but some sets, frames or
+pixels could not be.
 
 Examples:
   depthrig export bytecameradepth data/20261121_1015_kitchen paper
@@ -25,10 +25,10 @@ Examples:
 pub struct Args {
     #[command(flatten)]
     common: Common,
-    /// How cameras are spelled: camera_d455 or camera_realsense_455
+    /// Style of the camera folder names
     #[arg(long, value_enum, default_value = "short")]
     names: Names,
-    /// Rescale 16-bit depth to this unit instead of the camera's own; 0.001 is a millimetre
+    /// Rescale 16-bit depth to this unit, metres [default: the camera's unit]
     #[arg(long, value_name = "METRES", value_parser = crate::args::depth_unit_m)]
     depth_unit: Option<f64>,
 }
@@ -42,7 +42,7 @@ enum Names {
 }
 
 impl Args {
-    /// The exporter, and what every export has.
+    /// Builds the exporter, and returns it with the common options.
     pub fn exporter(&self) -> Result<(ByteCameraExport, &Common)> {
         let names = match self.names {
             Names::Short => CameraNames::Short,

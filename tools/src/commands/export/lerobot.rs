@@ -7,8 +7,8 @@ use depthrig_recorder::exchange::lerobot::{Incomplete, Lerobot, LerobotOptions};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-The datasets are episodes in the order given and need the same streams. Colour stays the JPEG that was recorded (PNG
-where it was recorded without loss); depth is TIFF, bit by bit. Missing pictures are blank and marked in the columns
+The datasets become episodes in the given order and must have the same streams. Colour stays the recorded JPEG (PNG if
+it was recorded losslessly); depth is lossless TIFF. Missing images are blank and marked in the columns
 missing.CAMERA_STREAM.
 
 Examples:
@@ -21,31 +21,31 @@ Examples:
 pub struct Args {
     #[command(flatten)]
     common: Common,
-    /// The task of all episodes [default: each session's scene]
+    /// Task of all episodes [default: each session's scene]
     #[arg(long, value_name = "TEXT")]
     task: Option<String>,
-    /// Sets per second [default: as configured and recorded]
+    /// Sets per second [default: as recorded]
     #[arg(long, value_name = "HZ", value_parser = crate::args::rate_hz)]
     fps: Option<f64>,
-    /// What to do with a set that lacks a frame
+    /// Handling of sets that lack a frame
     #[arg(long, value_enum, default_value = "mark", value_name = "HOW")]
     incomplete: HowIncomplete,
-    /// Export only this stream (may be given several times)
+    /// Export only this stream; repeatable
     #[arg(long = "stream", value_name = "CAMERA/STREAM")]
     streams: Vec<StreamId>,
 }
 
-/// What to do with a set that lacks a frame.
+/// Handling of sets that lack a frame.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum HowIncomplete {
-    /// A blank picture, marked as missing
+    /// Insert a blank image, marked as missing
     Mark,
     /// Leave the set out
     LeaveOut,
 }
 
 impl Args {
-    /// The exporter that is asked for, and what every export has.
+    /// Builds the exporter, and returns it with the common options.
     pub fn exporter(&self) -> (Lerobot, &Common) {
         let options = LerobotOptions {
             task: self.task.clone(),

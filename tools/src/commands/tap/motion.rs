@@ -1,9 +1,9 @@
-//! A batch of a motion unit, as a line for people and as JSON.
+//! A batch of an IMU, as a line for people and as JSON.
 
 use depthrig_bus::{Frame, FrameHeader, MotionFlags, MotionSample};
 use serde::Serialize;
 
-/// A batch with all that is in it.
+/// An IMU batch with all of its samples.
 #[derive(Debug, Serialize)]
 pub struct Batch {
     /// `camera/stream`.
@@ -17,7 +17,7 @@ pub struct Batch {
     samples: Vec<Sample>,
 }
 
-/// A sample; what it does not have is `null`.
+/// A sample; a missing value is `null`.
 #[derive(Debug, Serialize)]
 struct Sample {
     sequence: u64,
@@ -34,7 +34,7 @@ struct Sample {
 }
 
 impl Batch {
-    /// The batch of a motion frame.
+    /// Reads the batch of an IMU frame.
     pub fn of(frame: &Frame) -> Self {
         Self::new(frame.header(), frame.motion())
     }
@@ -64,7 +64,7 @@ impl Batch {
     }
 }
 
-/// One line: the newest sample, how fast samples come and how sure their times are. `before` is the sample before this
+/// Describes a batch on one line: newest sample, rate and time uncertainty. `before` is the sample before this
 /// batch, and becomes its newest.
 pub fn describe(frame: &Frame, before: &mut Option<MotionSample>) -> String {
     line(frame.header(), frame.motion(), before)
@@ -76,7 +76,10 @@ fn line(
     before: &mut Option<MotionSample>,
 ) -> String {
     let n = samples.len();
-    let (mut oldest, mut newest, mut worst_ns, mut gaps) = (*before, None::<MotionSample>, 0, 0);
+    let mut oldest = *before;
+    let mut newest = None::<MotionSample>;
+    let mut worst_ns = 0;
+    let mut gaps = 0;
     for s in samples {
         if let Some(last) = newest.or(*before) {
             gaps += s.sequence.saturating_sub(last.sequence + 1);
@@ -90,7 +93,8 @@ fn line(
     };
     *before = Some(newest);
     let rate = oldest.and_then(|first| {
-        let (samples, ns) = (newest.sequence.checked_sub(first.sequence)?, newest.time_ns - first.time_ns);
+        let samples = newest.sequence.checked_sub(first.sequence)?;
+        let ns = newest.time_ns - first.time_ns;
         (samples > 0 && ns > 0).then(|| format!("{:.1} Hz", samples as f64 * 1e9 / ns as f64))
     });
     let three = |v: [f32; 3]| {
@@ -124,7 +128,7 @@ mod tests {
 
     fn batch(first: u64) -> (FrameHeader, Vec<MotionSample>) {
         let mut h = FrameHeader { sequence: 3, captured: 4, ..FrameHeader::default() };
-        h.set_picture(PixelFormat::Motion, 2, 1);
+        h.set_image(PixelFormat::Motion, 2, 1);
         h.set_names("mount", &StreamId::new("zed", "imu").unwrap());
         h.dropped[0] = 1;
         let sample = |i: u64| MotionSample {

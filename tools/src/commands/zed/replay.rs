@@ -1,9 +1,9 @@
-//! `depthrig zed replay`: depth of recorded raw stereo, in several modes at once.
+//! `depthrig zed replay`: recomputes depth from recorded raw stereo, in several modes at once.
 
 use crate::context::Context;
 use crate::exit::{Exit, UsageError};
 use crate::out;
-use crate::watched::{Remade, watched};
+use crate::watched::{DerivedDataset, watched};
 use anyhow::Result;
 use clap::ValueEnum;
 use depthrig_daemon::zed_replay::{
@@ -15,93 +15,92 @@ use std::path::PathBuf;
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
-INPUT is a dataset with the raw streams left and right of a camera, a folder of side-by-side pictures, or an SVO2 file.
-The new dataset has rectified colour, and for each mode depth_MODE and confidence_MODE in the view of the left eye.
-performance, quality and ultra are depthrig's own stereo and are recorded as mimic_performance and so on; neural is a
-stereo network of yours in ONNX form. Until the dataset is whole, what is done lies in DATASET.zedreplay: a run that was
-ended or killed goes on there when it is started again with the same options.
+INPUT is a dataset with the raw streams left and right of a camera, a folder of side-by-side images, or an SVO2 file.
+The new dataset has rectified colour, and for each mode depth_MODE and confidence_MODE in the view of the left camera.
+performance, quality and ultra are depthrig's own stereo, recorded as mimic_performance and so on; neural is your own
+stereo network in ONNX format. Until the dataset is complete, the work is in DATASET.zedreplay: run the command again
+with the same options to resume an interrupted run.
 
-Exit codes: 0 all, 1 failed (also: INPUT is not a recording) or ended before all was done (DATASET is not there), 2 wrong
-usage or a recording without two eyes and their calibration, 3 done, but some pairs could not be read or a mode is
-unavailable.
+Exit codes: 0 success, 1 failed (also: INPUT is not a recording) or interrupted (DATASET does not exist), 2 wrong usage,
+or a recording without stereo pairs or calibration, 3 done, but some pairs could not be read or a mode is unavailable.
 
 Examples:
   depthrig zed replay data/20261121_1015_kitchen --modes performance,ultra,quality --out data/kitchen_depth
   depthrig zed replay kitchen.svo2 --modes quality,neural --network hitnet.onnx --out data/kitchen_depth --disparity
   depthrig zed replay side_by_side/ --calibration SN12345.conf --out data/kitchen_depth -j 4";
 
-/// How colour is stored.
+/// Storage of colour.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Color {
     /// JPEG of quality 95
     Jpeg,
-    /// Every bit
+    /// Lossless PNG
     Png,
-    /// Every bit, not packed as a picture
+    /// Lossless, not encoded as an image
     Raw,
 }
 
 /// Arguments.
 #[derive(Debug, clap::Args)]
 pub struct ReplayArgs {
-    /// The recording
+    /// Dataset, folder of side-by-side images, or SVO2 file
     #[arg(value_name = "INPUT")]
     input: PathBuf,
-    /// Folder of the new dataset; must not be there
+    /// Folder of the new dataset; must not exist
     #[arg(long, value_name = "DATASET")]
     out: PathBuf,
-    /// What depth is made by: performance, ultra, quality, neural
+    /// Depth modes: performance, ultra, quality, neural
     #[arg(long, value_name = "MODES", value_delimiter = ',', default_value = "performance,ultra,quality")]
     modes: Vec<String>,
-    /// The stereo network of the mode neural, an ONNX file
+    /// Stereo network of the mode neural, an ONNX file
     #[arg(long, value_name = "FILE")]
     network: Option<PathBuf>,
-    /// The numbers that the network takes pixels as: 0-255, 0-1, -1-1 or imagenet [default: as its metadata says, else 0-255]
+    /// Pixel range: 0-255, 0-1, -1-1 or imagenet [default: its metadata's, else 0-255]
     #[arg(long, value_name = "PIXELS", requires = "network", allow_hyphen_values = true)]
     network_pixels: Option<String>,
-    /// The network gives disparity as negative numbers
+    /// The network outputs negative disparity
     #[arg(long, requires = "network")]
     network_negative: bool,
-    /// What the network runs on: cpu, cuda:0, tensorrt:0, openvino
+    /// Device that runs the network: cpu, cuda:0, tensorrt:0 or openvino
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// The library of ONNX Runtime [default: looked for]
+    /// ONNX Runtime library [default: found automatically]
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
-    /// Of several stereo cameras of a dataset the one that is meant; for other recordings its name [default: zed2i]
+    /// Camera to process if the dataset has several, else its new name [default: zed2i]
     #[arg(long, value_name = "NAME")]
     camera: Option<String>,
-    /// The camera's SN<serial>.conf [default: beside the recording, or where the vendor's programs keep it]
+    /// The camera's SN<serial>.conf [default: beside the input or in the SDK's folder]
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,
-    /// Serial number of the camera, where the recording does not say it
+    /// Serial number of the camera, if the recording lacks it
     #[arg(long, value_name = "NUMBER")]
     serial: Option<String>,
-    /// Rate of pairs without times of their own, Hz [default: 30]
+    /// Rate of pairs without timestamps, Hz [default: 30]
     #[arg(long, value_name = "HZ", value_parser = crate::args::rate_hz)]
     rate: Option<f64>,
-    /// Record disparity_MODE as well
+    /// Also record disparity_MODE
     #[arg(long)]
     disparity: bool,
-    /// Nearer than this is a hole, metres; half of it takes twice the time
+    /// Nearest depth, metres; half of it takes twice the time
     #[arg(long, value_name = "METRES", default_value_t = 0.3, value_parser = crate::args::range_limit_m)]
     min_depth: f64,
-    /// Farther than this is a hole, metres
+    /// Farthest depth, metres; anything beyond is a hole
     #[arg(long, value_name = "METRES", default_value_t = 20.0, value_parser = crate::args::range_limit_m)]
     max_depth: f64,
-    /// Metres per unit of depth
+    /// Metres per depth unit
     #[arg(long, value_name = "METRES", default_value_t = 0.001, value_parser = crate::args::depth_unit_m)]
     depth_unit: f64,
-    /// How rectified colour is stored
+    /// Storage of rectified colour
     #[arg(long, value_enum, default_value = "jpeg")]
     color_codec: Color,
-    /// Pairs and modes that are worked on at once [default: one for each core]
+    /// Pairs and modes to process in parallel [default: one per core]
     #[arg(short = 'j', long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     jobs: Option<u16>,
-    /// Threads of each
+    /// Threads per job
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
-    /// Memory that this may take, GB; fewer pairs are worked on at once then [default: half of what is free]
+    /// Memory limit, GB; may reduce the parallel jobs [default: half the free memory]
     #[arg(long, value_name = "GB", value_parser = crate::args::memory_gb)]
     memory: Option<f64>,
     /// Print the report as JSON
@@ -155,15 +154,15 @@ impl ReplayArgs {
     }
 }
 
-/// Replays.
+/// Recomputes depth and reports the result.
 pub fn run(args: &ReplayArgs, context: &Context) -> Result<Exit> {
     let options = args.options()?;
-    let report = watched(context, |tell| {
+    let report = watched(context, |progress| {
         zed_replay(&args.input, &args.out, &options, &mut |step, done, total| {
-            tell(if step == Step::Replay { "depth" } else { "verify" }, done, total)
+            progress(if step == Step::Replay { "depth" } else { "verify" }, done, total)
         })
     })?;
-    let remade = Remade {
+    let derived = DerivedDataset {
         path: &report.path,
         sets: report.sets,
         bytes: report.bytes,
@@ -172,10 +171,10 @@ pub fn run(args: &ReplayArgs, context: &Context) -> Result<Exit> {
         problems: &report.problems,
         lacks: !report.unavailable.is_empty(),
     };
-    remade.told(context, args.json.then_some(&report), || tell_modes(&report))
+    derived.print(context, args.json.then_some(&report), || print_modes(&report))
 }
 
-fn tell_modes(report: &ZedReplayReport) -> Result<()> {
+fn print_modes(report: &ZedReplayReport) -> Result<()> {
     if report.resumed > 0 {
         out::line(format_args!("  {} of them by an earlier run", report.resumed))?;
     }

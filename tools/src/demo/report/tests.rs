@@ -1,4 +1,4 @@
-//! What a demo says of itself, and with which exit code, for each way that it can go.
+//! Text and exit code of the demo's report, for each outcome.
 
 use super::*;
 use depthrig_bus::{FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, UtcPair};
@@ -10,7 +10,7 @@ use depthrig_recorder::{
 use std::path::Path;
 use std::sync::Arc;
 
-/// A dataset in `dir` with so many sets of one small depth image.
+/// A dataset in `dir` with `sets` sets of one small depth image.
 fn recorded(dir: &Path, sets: u64) -> Summary {
     let mut session = Session::new("demo", "rig");
     session.streams = vec![StreamRecord {
@@ -30,7 +30,7 @@ fn recorded(dir: &Path, sets: u64) -> Summary {
     let recorder = Recorder::create(Arc::new(RealFs), dir, session, options).unwrap();
     for id in 1..=sets {
         let mut header = FrameHeader::default();
-        header.set_picture(PixelFormat::Z16, 8, 8);
+        header.set_image(PixelFormat::Z16, 8, 8);
         header.set_names("rig", &"d435/depth".parse().unwrap());
         header.sequence = id;
         header.captured = id;
@@ -133,7 +133,7 @@ fn good(dir: &Path) -> DemoReport {
     }
 }
 
-/// Lines of the report that begin so.
+/// Lines of the report that begin with `start`.
 fn lines<'a>(text: &'a str, start: &str) -> Vec<&'a str> {
     text.lines().filter(|line| line.starts_with(start)).collect()
 }
@@ -148,7 +148,7 @@ fn a_demo_without_a_loss_is_good_and_says_nothing_of_one() {
     assert_eq!(lines(&text, "ok   record").len(), 1, "{text}");
 }
 
-/// A busy computer loses frames: each is counted and named, and nothing is wrong.
+/// Frames lost on a busy computer are counted and listed, but are not a failure.
 #[test]
 fn lost_frames_are_one_line_and_no_failure() {
     let dir = tempfile::tempdir().unwrap();
@@ -161,12 +161,12 @@ fn lost_frames_are_one_line_and_no_failure() {
     report.replay.lost.push("a read".to_owned());
     assert_eq!(report.exit(), Exit::Good);
     let text = report.text();
-    let told = lines(&text, "note lost");
-    assert_eq!((told.len(), lines(&text, "LOOK wrong").len()), (1, 0), "{text}");
+    let notes = lines(&text, "note lost");
+    assert_eq!((notes.len(), lines(&text, "LOOK wrong").len()), (1, 0), "{text}");
     for what in
         ["7 frames of d435", "3 sets of the recording", "1 reads of the replay", "close other programs"]
     {
-        assert!(told[0].contains(what), "{what}: {}", told[0]);
+        assert!(notes[0].contains(what), "{what}: {}", notes[0]);
     }
 }
 
@@ -204,14 +204,14 @@ fn a_recording_that_is_not_what_it_should_be_is_a_failure() {
 #[test]
 fn whatever_is_wrong_is_a_line_and_a_failure() {
     let dir = tempfile::tempdir().unwrap();
-    let failed = |change: &dyn Fn(&mut DemoReport), told: &str| {
+    let failed = |change: &dyn Fn(&mut DemoReport), expected: &str| {
         let dir = tempfile::tempdir_in(dir.path()).unwrap();
         let mut report = good(dir.path());
         change(&mut report);
-        assert_eq!(report.exit(), Exit::Failed, "{told}");
+        assert_eq!(report.exit(), Exit::Failed, "{expected}");
         let text = report.text();
         let wrong = lines(&text, "LOOK wrong");
-        assert!(wrong.len() == 1 && wrong[0].contains(told), "{told}: {wrong:?}");
+        assert!(wrong.len() == 1 && wrong[0].contains(expected), "{expected}: {wrong:?}");
     };
     failed(
         &|r| {
@@ -257,7 +257,7 @@ fn whatever_is_wrong_is_a_line_and_a_failure() {
     );
 }
 
-/// What this computer cannot show is named with the reason, and is no failure.
+/// Parts that this computer cannot run are listed with the reason, and are not a failure.
 #[test]
 fn what_cannot_be_shown_is_named_and_is_no_failure() {
     let dir = tempfile::tempdir().unwrap();

@@ -26,7 +26,7 @@ fn described(plan: &Plan) -> Vec<String> {
     plan.profiles.iter().map(StreamProfile::describe).collect()
 }
 
-/// The motion unit, which streams beside whatever else does unless it is not wished for.
+/// The IMU, which streams beside whatever else does unless it is not wished for.
 const IMU: &str = "imu motion 1600 Hz in batches of up to 64";
 
 #[test]
@@ -75,7 +75,8 @@ fn what_does_not_go_together_is_refused() {
         assert!(e.contains(part), "{e}");
     };
     says(&[wish("color", None, Some(30.0), None), wish("depth", None, Some(15.0), None)], "one rate");
-    let (small, large) = (Some((320, 288)), Some((512, 512)));
+    let small = Some((320, 288));
+    let large = Some((512, 512));
     says(&[wish("depth", small, None, None), wish("ir", large, None, None)], "one sensor");
     says(&[wish("depth", Some((1024, 1024)), Some(30.0), None)], "depth 1024x1024 z16 15 Hz");
     says(&[wish("color", Some((1920, 1080)), None, Some(PixelFormat::Nv12))], "color 1280x720 nv12");

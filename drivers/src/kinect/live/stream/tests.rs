@@ -1,4 +1,4 @@
-//! Measures of pictures, without libk4a.
+//! Measures of images, without libk4a.
 
 use super::*;
 

@@ -53,7 +53,7 @@ fn planned(requests: &[StreamRequest]) -> Result<(Vec<StreamProfile>, Plan)> {
 }
 
 #[test]
-fn pictures_have_the_size_that_they_have_after_they_were_turned() {
+fn images_have_the_size_that_they_have_after_they_were_turned() {
     let all = offered(&tables(), &modes()).unwrap();
     let shown: Vec<_> = all.iter().map(StreamProfile::describe).collect();
     assert_eq!(
@@ -86,19 +86,19 @@ fn infrared_goes_along_with_depth() {
     assert_eq!(names, ["depth", "color"]);
     let sensors: Vec<_> = plan.modes.iter().map(|m| (m.sensor, m.width)).collect();
     assert_eq!(sensors, [(Sensor::Depth, 480), (Sensor::Color, 1280), (Sensor::Infrared, 480)]);
-    assert_eq!(plan.lanes, [(0, Unpack::Turn16(480)), (1, Unpack::Copy)], "nobody gets the infrared");
+    assert_eq!(plan.streams, [(0, Unpack::Turn16(480)), (1, Unpack::Copy)], "infrared is not delivered");
 
     // Asked for, it is started once.
     let (_, plan) = planned(&[request("ir", None), request("depth", Some((1024, 768)))]).unwrap();
     assert_eq!(plan.modes.iter().map(|m| m.width).collect::<Vec<_>>(), [768, 768]);
-    assert_eq!(plan.lanes, [(0, Unpack::Turn8(768)), (1, Unpack::Turn16(768))]);
+    assert_eq!(plan.streams, [(0, Unpack::Turn8(768)), (1, Unpack::Turn16(768))]);
 
     let (_, plan) = planned(&[request("confidence", Some((640, 480)))]).unwrap();
-    assert_eq!(plan.lanes, [(0, Unpack::Confidence(240))]);
+    assert_eq!(plan.streams, [(0, Unpack::Confidence(240))]);
     assert_eq!(plan.modes[1], mode(Sensor::Infrared, b"GREY", 480, 640, 30.0));
 
     let (_, plan) = planned(&[request("color", Some((1920, 1080)))]).unwrap();
-    assert_eq!((plan.modes.len(), plan.lanes[0].1), (1, Unpack::Y411(1920)));
+    assert_eq!((plan.modes.len(), plan.streams[0].1), (1, Unpack::Y411(1920)));
 }
 
 #[test]

@@ -36,7 +36,7 @@ opcodes! {
         DeviceInfo = 0x10,
         /// GETINTCAL: the calibration table of parameter 1.
         CalibrationTable = 0x15,
-        /// HWRST: restarts the camera; there is no reply.
+        /// HWRST: restarts the camera, without a reply.
         Reset = 0x20,
         /// GTEMP: temperature of the processor.
         Temperature = 0x2A,
@@ -66,7 +66,7 @@ opcodes! {
         ReadMemory = 0x01,
         /// GVD: what the camera is.
         DeviceInfo = 0x10,
-        /// HW_RESET: restarts the camera; there is no reply.
+        /// HW_RESET: restarts the camera, without a reply.
         Reset = 0x20,
         /// AMCSET: sets the control of parameter 1.
         SetControl = 0x2B,

@@ -38,7 +38,7 @@ impl Request {
         Self::new(opcode.code(), name, params)
     }
 
-    /// What the camera is; the same on both families.
+    /// Asks for the camera's identity; the same on both families.
     pub fn device_info() -> Self {
         Self::d4xx(D4xxOpcode::DeviceInfo, "GVD", [0; 4])
     }

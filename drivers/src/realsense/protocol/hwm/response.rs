@@ -26,7 +26,7 @@ impl Code {
     /// This model cannot do it.
     pub const NOT_SUPPORTED: Self = Self(-58);
 
-    /// What it means; `None` for a number that is not known.
+    /// Its meaning; `None` for an unknown number.
     pub const fn text(self) -> Option<&'static str> {
         Some(match self {
             Self::WRONG_COMMAND => "it does not know this request",
@@ -41,7 +41,7 @@ impl Code {
         })
     }
 
-    /// What a supervisor should make of it.
+    /// The kind of error that it is for a supervisor.
     pub const fn kind(self) -> ErrorKind {
         match self {
             Self::WRONG_COMMAND | Self::NOT_SUPPORTED => ErrorKind::Unsupported,

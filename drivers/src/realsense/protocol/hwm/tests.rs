@@ -91,7 +91,7 @@ fn nothing_that_writes_calibration_flash_or_firmware_can_be_sent() {
             "{request}"
         );
     }
-    // There is no constructor that this test does not know.
+    // This test knows every constructor.
     let source = include_str!("request.rs");
     let made = source.matches("-> Self {").count() + source.matches("-> Result<Self> {").count();
     assert_eq!(made, 20 + 3, "a new constructor of Request belongs into every_request()");
@@ -237,7 +237,7 @@ fn a_reply_to_another_request_is_not_taken() {
 }
 
 #[test]
-fn patience_has_an_end_and_a_refusal_needs_none() {
+fn timeout_has_an_end_and_a_refusal_needs_none() {
     let gets = (0..10_000).map(|_| Err(Error::new(ErrorKind::Io, "EIO"))).collect();
     let retry = Retry { pause: Duration::from_millis(1), limit: Duration::from_millis(30) };
     let (result, script) = run(Script { gets, ..Script::default() }, &Request::clock(), retry);
@@ -279,7 +279,7 @@ fn threads_that_share_a_monitor_get_their_own_replies() {
             if query == Query::SetCur {
                 self.0 = Some(Received::parse(data)?.params[0]);
             } else {
-                let id = self.0.take().expect("a reply that nobody asked for");
+                let id = self.0.take().expect("a reply without a request");
                 data.copy_from_slice(&build_unit_frame(&build_reply(0x15, &id.to_le_bytes()))?);
             }
             Ok(())

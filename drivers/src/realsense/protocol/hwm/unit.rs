@@ -31,7 +31,7 @@ impl Default for Retry {
     }
 }
 
-/// Several answers to other requests in a row are no accident.
+/// Limit of answers in a row to other requests; more are not an accident.
 const MAX_MIX_UPS: u32 = 2;
 
 /// The hardware monitor of one camera by its extension unit. The exclusive borrow of the port keeps a request and

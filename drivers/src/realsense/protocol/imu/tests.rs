@@ -53,7 +53,7 @@ fn a_damaged_table_is_refused_whichever_byte_it_is() {
     for length in 0..whole.len() {
         assert!(ImuCalibration::parse(&whole[..length], 0x0B3A).is_err(), "{length} bytes");
     }
-    // What lies behind the table in the memory is in no checksum.
+    // The bytes behind the table in the memory are in no checksum.
     assert!(ImuCalibration::parse(&[&whole[..], &[0xFF; 200]].concat(), 0x0B3A).is_ok());
 }
 
@@ -88,7 +88,7 @@ fn numbers_that_no_sensor_has_are_refused_and_named() {
     assert!(ImuCalibration::parse(&with_number(12, 1.02), 0x0B64).is_ok());
 }
 
-/// What the statement says is enough to get the measured values back.
+/// The statement holds enough to get the measured values back.
 #[test]
 fn what_is_stated_of_the_correction_undoes_it() {
     let identity = |at: usize| if (at - 12).is_multiple_of(4) { 1.0 } else { 0.01 * at as f32 };

@@ -48,7 +48,7 @@ fn the_newer_list_comes_first() {
     let items = [item(640, 360, 7.0), item(1280, 720, 8.0), item(848, 480, 0.0)];
     near(&depth(&t, &items, 1280, 720).unwrap().0, 8.0, 2.0, 3.0, 4.0);
     near(&depth(&t, &items, 640, 360).unwrap().0, 7.0, 2.0, 3.0, 4.0);
-    // An item of zeros is none.
+    // An item of zeros is ignored.
     near(&depth(&t, &items, 848, 480).unwrap().0, 424.0, 424.5, 425.25, 241.75);
 }
 
@@ -71,7 +71,7 @@ fn an_uncalibrated_camera_is_refused() {
     let items = [RectifiedItem { width: 424, height: 240, pinhole: placeholder }];
     assert!(depth(&t, &items, 424, 240).is_err());
     assert_eq!(depth(&table(), &[], 0, 480).unwrap_err().kind(), ErrorKind::BadInput);
-    // The same focal length along both axes is what rectification gives; it is no placeholder.
+    // The same focal length along both axes is the result of rectification, not a placeholder.
     let same = Pinhole { fx: 383.5, fy: 383.5, ppx: 320.25, ppy: 241.5 };
     t.rectified[2] = same;
     assert!(depth(&t, &[], 640, 480).is_ok());
@@ -93,7 +93,10 @@ fn rgb() -> RgbTable {
 /// By hand from the rules, with the table's numbers as 32-bit floats.
 #[test]
 fn colour_at_three_shapes() {
-    let (fx, px, fy, py) = (f64::from(1.42f32), f64::from(0.02f32), f64::from(2.53f32), f64::from(-0.03f32));
+    let fx = f64::from(1.42f32);
+    let px = f64::from(0.02f32);
+    let fy = f64::from(2.53f32);
+    let py = f64::from(-0.03f32);
     let t = rgb();
     // 16:9, as it was calibrated.
     let i = color(&t, 1280, 720).unwrap();
@@ -134,7 +137,10 @@ fn colour_at_three_shapes() {
 
 #[test]
 fn colour_of_a_d405() {
-    let (fx, px, fy, py) = (f64::from(1.42f32), f64::from(0.02f32), f64::from(2.53f32), f64::from(-0.03f32));
+    let fx = f64::from(1.42f32);
+    let px = f64::from(0.02f32);
+    let fy = f64::from(2.53f32);
+    let py = f64::from(-0.03f32);
     let t = RgbTable { calibrated: (1280, 720), ..rgb() };
     let at = |w, h| d405_color(&t, w, h).unwrap();
     near(&at(1280, 720), fx * 640.0, fy * 360.0, (1.0 + px) * 640.0, (1.0 + py) * 360.0);
@@ -173,14 +179,16 @@ fn colour_without_numbers_is_refused() {
 
 /// 30° about z, row after row.
 fn turned() -> RgbTable {
-    let (s, c) = (0.5f32, 0.75f32.sqrt());
+    let s = 0.5f32;
+    let c = 0.75f32.sqrt();
     RgbTable { rectified_rotation: [c, -s, 0.0, s, c, 0.0, 0.0, 0.0, 1.0], ..rgb() }
 }
 
 #[test]
 fn colour_in_depth_is_the_transpose_and_minus_the_translation() {
     let pose = color_in_depth(&turned()).unwrap();
-    let (s, c) = (0.5, f64::from(0.75f32.sqrt()));
+    let s = 0.5;
+    let c = f64::from(0.75f32.sqrt());
     let t = [f64::from(-14.8f32) * -0.001, f64::from(0.1f32) * -0.001, f64::from(0.2f32) * -0.001];
     assert!((t[0] - 0.0148).abs() < 1e-8, "colour is to the right of depth");
     // p_depth = Mᵀ p + t, written out.
@@ -228,15 +236,17 @@ fn the_right_imager_is_to_the_right() {
 }
 
 proptest! {
-    /// Halving the size of a picture halves its intrinsics, by every rule that scales.
+    /// Halving the size of an image halves its intrinsics, by every rule that scales.
     #[test]
-    fn colour_scales_with_the_picture(w in 64u32..2000, h in 64u32..2000, fx in 0.5f32..3.0, py in -0.2f32..0.2) {
+    fn colour_scales_with_the_image(w in 64u32..2000, h in 64u32..2000, fx in 0.5f32..3.0, py in -0.2f32..0.2) {
         let mut t = rgb();
         (t.k[0], t.k[5]) = (fx, py);
-        let (small, large) = (color(&t, w, h).unwrap(), color(&t, 2 * w, 2 * h).unwrap());
+        let small = color(&t, w, h).unwrap();
+        let large = color(&t, 2 * w, 2 * h).unwrap();
         near(&large, small.fx * 2.0, small.fy * 2.0, small.cx * 2.0, small.cy * 2.0);
         if (w, h) != (640, 480) && (w * 2, h * 2) != (640, 480) && (w, h) != (1280, 720) {
-            let (small, large) = (d405_color(&t, w, h).unwrap(), d405_color(&t, 2 * w, 2 * h).unwrap());
+            let small = d405_color(&t, w, h).unwrap();
+            let large = d405_color(&t, 2 * w, 2 * h).unwrap();
             near(&large, small.fx * 2.0, small.fy * 2.0, small.cx * 2.0, small.cy * 2.0);
         }
     }

@@ -49,7 +49,8 @@ fn depth_field_by_field() {
     let bytes = depth_by_hand();
     let t = DepthIntrinsics::parse(&bytes).unwrap();
     assert_eq!((t.scan, t.offset, t.sizes.len()), ([1, 2], -3.5, 2));
-    let (raw, world) = (t.sizes[1].raw, t.sizes[1].world);
+    let raw = t.sizes[1].raw;
+    let world = t.sizes[1].world;
     let lens = Lens {
         width: 640,
         height: 480,
@@ -85,7 +86,8 @@ fn colour_field_by_field() {
 
 #[test]
 fn cut_off_at_every_length_and_more_than_needed() {
-    let (depth, color) = (depth_by_hand(), color_by_hand());
+    let depth = depth_by_hand();
+    let color = color_by_hand();
     for n in 0..depth.len() {
         assert_eq!(DepthIntrinsics::parse(&depth[..n]).unwrap_err().kind(), ErrorKind::Protocol, "{n}");
     }
@@ -95,7 +97,8 @@ fn cut_off_at_every_length_and_more_than_needed() {
     let more = [&depth[..], &[7; 50]].concat();
     assert_eq!(DepthIntrinsics::parse(&more).unwrap(), DepthIntrinsics::parse(&depth).unwrap());
     for wrong in [0, 6, 255] {
-        let (mut d, mut c) = (depth.clone(), color.clone());
+        let mut d = depth.clone();
+        let mut c = color.clone();
         (d[15], c[11]) = (wrong, wrong);
         d.resize(70_000, 0);
         c.resize(70_000, 0);

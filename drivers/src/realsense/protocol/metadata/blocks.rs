@@ -40,7 +40,8 @@ pub enum Block {
 /// Walks blocks from the start of `bytes` until they end or one does not fit.
 pub(super) fn walk(mut bytes: &[u8]) -> impl Iterator<Item = Block> {
     core::iter::from_fn(move || {
-        let (id, size) = (u32_at(bytes, 0)?, u32_at(bytes, 4)?);
+        let id = u32_at(bytes, 0)?;
+        let size = u32_at(bytes, 4)?;
         // A size below that of its own header would never end the walk.
         let whole = bytes.get(..size as usize).filter(|b| b.len() >= HEADER)?;
         bytes = bytes.get(whole.len()..)?;
@@ -322,7 +323,7 @@ impl ColorControl {
     }
 }
 
-/// What made the camera take the frame.
+/// The trigger of the frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Trigger {
     /// Its own clock.
@@ -378,7 +379,7 @@ impl Configuration {
         })
     }
 
-    /// What made the camera take the frame.
+    /// The trigger of the frame.
     pub fn trigger(&self) -> Option<Trigger> {
         Some(match self.trigger?.to_le_bytes()[0] {
             0 => Trigger::Free,

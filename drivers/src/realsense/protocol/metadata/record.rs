@@ -8,7 +8,7 @@ use crate::bytes::{u8_at, u16_at, u64_at};
 /// Bytes before the payload header: 64 bits of time, 16 bits of bus frame.
 const STAMP: usize = 10;
 
-/// What the kernel keeps of a payload header.
+/// The part of a payload header that the kernel keeps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RecordFormat {
     /// `UVCH`: its standard part. Its first byte is the length that the camera sent all the same.
@@ -32,7 +32,8 @@ pub struct Record<'a> {
 pub fn records(mut buffer: &[u8], format: RecordFormat) -> impl Iterator<Item = Record<'_>> {
     core::iter::from_fn(move || {
         let rest = buffer.get(STAMP..)?;
-        let (length, flags) = (u8_at(rest, 0)?, u8_at(rest, 1)?);
+        let length = u8_at(rest, 0)?;
+        let flags = u8_at(rest, 1)?;
         let standard = 2 + if flags & PTS != 0 { 4 } else { 0 } + if flags & SCR != 0 { 6 } else { 0 };
         let size = match format {
             RecordFormat::Standard => standard,

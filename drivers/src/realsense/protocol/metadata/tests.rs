@@ -182,7 +182,8 @@ fn fields_without_their_flag_are_not_there() {
         u32_to(&mut b, 144, 1 << bit);
         u32_to(&mut b, 24, 1 << bit);
         let all = Metadata::parse(&b).unwrap();
-        let (t, d) = (all.timing.unwrap(), all.depth.unwrap());
+        let t = all.timing.unwrap();
+        let d = all.depth.unwrap();
         assert_eq!(
             [
                 t.frame_counter,
@@ -232,7 +233,7 @@ fn the_standard_part_alone() {
 }
 
 #[test]
-fn cut_off_at_every_length_gives_the_blocks_that_are_whole() {
+fn cut_off_at_every_length_gives_the_complete_blocks() {
     let bytes = depth_by_hand();
     for n in 0..=bytes.len() {
         let Some(all) = Metadata::parse(&bytes[..n]) else {
@@ -253,7 +254,7 @@ fn sizes_that_lie_end_the_walk() {
         let all = Metadata::parse(&b).unwrap();
         assert!(all.timing.is_some() && all.depth.is_none() && all.configuration.is_none(), "{size}");
     }
-    // A block that is not known, and one that is shorter than its kind, are passed over.
+    // An unknown block, and one that is shorter than its kind, are skipped.
     let mut b = depth_by_hand();
     u32_to(&mut b, 52, 0x1234_5678);
     assert!(Metadata::parse(&b).unwrap().configuration.is_some());

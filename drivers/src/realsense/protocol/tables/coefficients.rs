@@ -108,7 +108,8 @@ impl Coefficients {
             })
         };
         fields().ok_or_else(|| {
-            let (is, must) = (table.len(), RECTIFIED + 16 * SIZES.len());
+            let is = table.len();
+            let must = RECTIFIED + 16 * SIZES.len();
             protocol_error(format!("the table of coefficients has {is} bytes; at least {must} are needed"))
         })
     }

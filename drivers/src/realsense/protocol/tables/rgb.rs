@@ -78,7 +78,8 @@ impl RgbTable {
             })
         };
         fields().ok_or_else(|| {
-            let (is, must) = (table.len(), RECTIFIED_TRANSLATION + 12);
+            let is = table.len();
+            let must = RECTIFIED_TRANSLATION + 12;
             protocol_error(format!(
                 "the table of the colour sensor has {is} bytes; at least {must} are needed"
             ))

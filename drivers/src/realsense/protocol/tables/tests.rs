@@ -15,7 +15,8 @@ fn f(b: &mut [u8], at: usize, v: f32) {
 
 /// Puts the header of table `id` before the payload that is there.
 fn seal(b: &mut [u8], id: u8) {
-    let (size, sum) = ((b.len() - 16) as u32, crc(&b[16..]));
+    let size = (b.len() - 16) as u32;
+    let sum = crc(&b[16..]);
     b[0..4].copy_from_slice(&[0x03, 0x02, id, 0]); // version 3.2
     b[4..8].copy_from_slice(&size.to_le_bytes());
     b[8..12].copy_from_slice(&[7, 0, 0, 0]);

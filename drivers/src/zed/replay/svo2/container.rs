@@ -1,12 +1,11 @@
-//! The MCAP container of an SVO2 file: which messages are there, and one after the other.
+//! The MCAP container of an SVO2 file: lists its messages and reads them one after the other.
 //!
-//! The file is walked once by the heads of its records, so that a cut end costs what is cut and nothing else. Chunks are
-//! then read one record at a time by the `mcap` crate, which checks their checksums first. Memory stays that of
-//! one chunk.
-//! The crate's own reader of the index at the end is not used: a file that was not finished has none.
+//! The file is walked once by the heads of its records, so that a cut end costs what is cut and nothing else. Chunks
+//! are then read one record at a time by the `mcap` crate, which checks their checksums first. Memory stays that of one
+//! chunk. The crate's own reader of the index at the end is not used: a file that was not finished has none.
 
 use crate::bytes::{u16_at, u32_at, u64_at};
-use crate::files::picture::io_error;
+use crate::files::image_file::io_error;
 use crate::{Error, ErrorKind, Result};
 use mcap::records::{Record, op};
 use mcap::sans_io::linear_reader::{LinearReadEvent, LinearReader, LinearReaderOptions};
@@ -19,13 +18,13 @@ const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 const HEAD: u64 = 9;
 /// Bytes of a message before its data: channel, sequence and two times.
 const MESSAGE_HEAD: usize = 22;
-/// No pair of pictures is longer, nor a chunk: 2208x1242 twice in YUYV has 22 MB.
+/// No pair of images is longer, nor a chunk: 2208x1242 twice in YUYV has 22 MB.
 const MAX_RECORD: u64 = 256 << 20;
 /// The longest record whose contents are read while walking.
 const MAX_SMALL: u64 = 16 << 20;
 /// Chunks that are searched for a header that no index names.
 const SEARCHED: usize = 64;
-/// Times that are kept to tell the rate by.
+/// Times that are kept to derive the rate from.
 const FIRST_TIMES: usize = 64;
 
 /// A run of records that is read from its beginning.
@@ -43,7 +42,7 @@ struct Stretch {
 pub struct Message {
     /// When it was taken, nanoseconds of UTC.
     pub time_ns: i64,
-    /// What it holds.
+    /// Its payload.
     pub data: Vec<u8>,
     /// Why it could not be read, if so.
     pub damaged: Option<String>,
@@ -79,10 +78,11 @@ struct Reading {
 /// How many messages each channel has, if an index says so.
 type Counts = Option<Vec<(u16, u64)>>;
 
-/// What the walk through the file finds.
+/// Results of the walk through the file.
 #[derive(Default)]
 struct Walk {
-    /// Begin and end of each chunk or run of messages, and how many messages of each channel it has, if an index says so.
+    /// Begin and end of each chunk or run of messages, and how many messages of each channel it has, if an index says
+    /// so.
     runs: Vec<(u64, u64, Counts)>,
     channels: Vec<(u16, String)>,
 }
@@ -91,8 +91,8 @@ impl Container {
     /// Walks through the file at `path` and finds its video and its header.
     ///
     /// # Errors
-    /// [`ErrorKind::NotFound`], [`ErrorKind::PermissionDenied`], [`ErrorKind::Io`]; [`ErrorKind::BadInput`] when it is no
-    /// SVO2, or has neither video nor header.
+    /// [`ErrorKind::NotFound`], [`ErrorKind::PermissionDenied`], [`ErrorKind::Io`]; [`ErrorKind::BadInput`] if it is
+    /// not an SVO2 file, or lacks video or header.
     pub fn open(path: &Path) -> Result<Self> {
         let file = depthrig_bus::files::open(path).map_err(|e| io_error(path, e))?;
         let length = file.metadata().map_err(|e| io_error(path, e))?.len();
@@ -109,7 +109,7 @@ impl Container {
         let whole = length >= 8 && file.read_exact(&mut magic).is_ok();
         if !whole || magic != *MAGIC {
             return Err(bad(
-                "this is no SVO2 (no MCAP file); SVO files of SDK 3 and before have another form: convert it with the \
+                "not an SVO2 file (no MCAP magic); SVO files of SDK 3 and before have another format: convert it with the \
                  vendor's ZED_SVO_Editor",
             ));
         }
@@ -129,12 +129,14 @@ impl Container {
         container.find_header(&mut walk)?;
         let video = walk.channels.iter().find(|(_, topic)| topic.ends_with("/side_by_side"));
         let Some((video, topic)) = video.cloned() else {
-            return Err(bad("it has no topic Camera_SN…/side_by_side: it is an MCAP file, but no SVO2"));
+            return Err(bad(
+                "it has no topic Camera_SN…/side_by_side: it is an MCAP file, but not an SVO2 file",
+            ));
         };
         (container.video, container.topic) = (video, topic);
         if container.header.is_empty() {
             return Err(bad(
-                "it has no message svo_header: it is an MCAP file, but no SVO2, or was cut off at its beginning",
+                "it has no message svo_header: it is an MCAP file, but not an SVO2 file, or was cut off at its beginning",
             ));
         }
         container.count(&walk)?;
@@ -178,8 +180,8 @@ impl Container {
         Ok(())
     }
 
-    /// Fills `message` with the next pair's; `false` at the end. Of a damaged stretch each pair that its index promised is
-    /// said to be damaged, so that those after it keep their numbers.
+    /// Fills `message` with the next pair's; `false` at the end. Of a damaged stretch each pair that its index promised
+    /// is said to be damaged, so that those after it keep their numbers.
     ///
     /// # Errors
     /// [`ErrorKind::Io`].
@@ -205,7 +207,7 @@ impl Container {
                 Err(Fault::Damage(why)) => message.damaged = Some(format!("its chunk is damaged: {why}")),
             }
             if message.damaged.is_some() {
-                // What follows in the stretch cannot be trusted; the reading that failed fails again.
+                // The rest of the stretch cannot be trusted; the reading that failed fails again.
                 self.reading = Some(Reading { end: 0, position: 0, ..Reading::new(&stretch) });
             }
             return Ok(true);
@@ -222,7 +224,7 @@ impl Container {
             if !self.header.is_empty() && has_video {
                 return Ok(());
             }
-            // An index tells which chunks need not be looked into.
+            // An index shows which chunks need not be searched.
             if let (Some(id), Some(counts), true) = (id(walk), counts, has_video)
                 && !counts.iter().any(|(c, n)| *c == id && *n > 0)
             {
@@ -234,7 +236,8 @@ impl Container {
             }
             let mut reading = Reading { position: *begin, end: *end, ..Reading::new(&Stretch::nowhere()) };
             loop {
-                let (channels, header) = (&mut walk.channels, &mut self.header);
+                let channels = &mut walk.channels;
+                let header = &mut self.header;
                 let more = reading.each(self.file.as_mut(), |opcode, data| match opcode {
                     op::CHANNEL => learn(channels, data),
                     op::MESSAGE if header.is_empty() => {
@@ -378,9 +381,10 @@ fn walk(file: &mut dyn Bytes, length: u64) -> std::io::Result<Walk> {
         let mut head = [0; HEAD as usize];
         file.seek(SeekFrom::Start(at))?;
         file.read_exact(&mut head)?;
-        let (opcode, size) = (head[0], u64_at(&head, 1).unwrap_or(u64::MAX));
+        let opcode = head[0];
+        let size = u64_at(&head, 1).unwrap_or(u64::MAX);
         let end = (at + HEAD).checked_add(size).filter(|end| *end <= length);
-        // A record that reaches beyond the end was cut off; what came before it is whole.
+        // A record that reaches beyond the end was cut off; everything before it is complete.
         let Some(end) = end else { break };
         let mut read = |limit: u64, file: &mut dyn Bytes| -> std::io::Result<()> {
             body.clear();
@@ -402,7 +406,8 @@ fn walk(file: &mut dyn Bytes, length: u64) -> std::io::Result<Walk> {
             op::MESSAGE_INDEX if !summary && !loose && size <= MAX_SMALL => {
                 read(MAX_SMALL, file)?;
                 // Channel, then the bytes of its entries, 16 each.
-                let (channel, bytes) = (u16_at(&body, 0), u32_at(&body, 2));
+                let channel = u16_at(&body, 0);
+                let bytes = u32_at(&body, 2);
                 if let (Some(channel), Some(bytes), Some(run)) = (channel, bytes, walk.runs.last_mut()) {
                     let entries = u64::from(bytes).min(size) / 16;
                     run.2.get_or_insert_with(Vec::new).push((channel, entries));

@@ -6,14 +6,14 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 
-/// What the header says, as far as its meaning is known.
+/// Fields of the header, as far as their meaning is known.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Header {
-    /// Pixels per row of both eyes together; of one eye in some files.
+    /// Pixels per row of the side-by-side image; of one half in some files.
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// Serial number; 0 when there is none.
+    /// Serial number; 0 if the file has none.
     pub serial: u32,
     /// Pairs a second.
     pub rate_hz: u32,
@@ -32,11 +32,14 @@ impl Header {
     /// [`ErrorKind::BadInput`] when it is not JSON with those 128 bytes.
     pub fn parse(json: &[u8]) -> Result<Self> {
         let bad = |what: String| {
-            Error::new(ErrorKind::BadInput, format!("its svo_header {what}; the file is damaged, or no SVO2"))
+            Error::new(
+                ErrorKind::BadInput,
+                format!("its svo_header {what}; the file is damaged, or not an SVO2 file"),
+            )
         };
-        let value: Value =
-            serde_json::from_slice(json).map_err(|e| bad(format!("is no JSON ({e})")).with_source(e))?;
-        let Value::Object(map) = &value else { return Err(bad("is no JSON object".to_owned())) };
+        let value: Value = serde_json::from_slice(json)
+            .map_err(|e| bad(format!("is not valid JSON ({e})")).with_source(e))?;
+        let Value::Object(map) = &value else { return Err(bad("is not a JSON object".to_owned())) };
         // Names are spelt in different ways by different SDKs.
         let find = |name: &str| map.iter().find(|(k, _)| k.eq_ignore_ascii_case(name)).map(|(_, v)| v);
         let encrypted = map.iter().any(|(k, v)| k.to_ascii_lowercase().contains("encrypt") && is_true(v));
@@ -49,7 +52,7 @@ impl Header {
         };
         let bytes = STANDARD
             .decode(text.trim())
-            .map_err(|e| bad(format!("has a \"header\" that is no base64 ({e})")))?;
+            .map_err(|e| bad(format!("has a \"header\" that is not base64 ({e})")))?;
         let at = |i| u32_at(&bytes, i);
         let (Some(width), Some(height), Some(serial), Some(rate_hz), Some(code)) =
             (at(0), at(4), at(8), at(0xC), at(0x14))
@@ -59,7 +62,7 @@ impl Header {
         Ok(Self { width, height, serial, rate_hz, code, sdk, encrypted })
     }
 
-    /// Whether pictures of both eyes of this size are those of the header.
+    /// Whether side-by-side images of this size match the header.
     pub const fn fits(&self, width: u32, height: u32) -> bool {
         self.height == height && (self.width == width || self.width.saturating_mul(2) == width)
     }
@@ -69,7 +72,7 @@ impl Header {
         (self.serial != 0).then(|| self.serial.to_string())
     }
 
-    /// For a message about pictures that are not understood.
+    /// For a message about images that are not understood.
     pub fn describe(&self) -> String {
         format!("SDK {}, compression code {}", self.sdk, self.code)
     }

@@ -1,22 +1,22 @@
 //! The forms of a message of `side_by_side`, as others found them. All numbers are little-endian.
 //!
-//! **JPEG strips**: two `u32` of time, four `u64` sizes, then four grey baseline JPEGs. Below each other they are one grey
-//! picture whose bytes are YUYV of both eyes.
+//! **JPEG strips**: two `u32` of time, four `u64` sizes, then four grey baseline JPEGs. Below each other they are one
+//! grey image whose bytes are the side-by-side image in YUYV.
 //!
-//! **H.264, H.265**: `u32` size of what follows, `u32` size of the access unit, the unit in Annex B form, then 56 bytes:
-//! width and height (0, 4), UTC in nanoseconds (0x18), size (0x20), kind (0x24, 3 for a key frame), number of the last
-//! key frame (0x28) and of this one (0x30).
+//! **H.264, H.265**: `u32` size of what follows, `u32` size of the access unit, the unit in Annex B form, then 56
+//! bytes: width and height (0, 4), UTC in nanoseconds (0x18), size (0x20), kind (0x24, 3 for a key frame), number of
+//! the last key frame (0x28) and of this one (0x30).
 
 use crate::bytes::{i32_at, u32_at, u64_at};
 
-/// Strips of a picture.
+/// Strips of an image.
 pub const STRIPS: usize = 4;
 /// Bytes before the strips.
 const STRIPS_HEAD: usize = 8 + 8 * STRIPS;
 /// Bytes after an access unit.
 const FOOTER: usize = 56;
 
-/// What a message holds.
+/// Payload of a message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Payload<'a> {
     /// Four JPEGs, from the top.
@@ -29,10 +29,10 @@ pub enum Payload<'a> {
     Unknown(&'static str),
 }
 
-/// What is written behind an access unit.
+/// The footer behind an access unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Footer {
-    /// Pixels per row of both eyes.
+    /// Pixels per row of the side-by-side image.
     pub width: u32,
     /// Rows.
     pub height: u32,
@@ -61,13 +61,13 @@ impl Footer {
         })
     }
 
-    /// Width and height of both eyes.
+    /// Width and height of the side-by-side image.
     pub const fn size(self) -> (u32, u32) {
         (self.width, self.height)
     }
 
-    /// Number of the key frame that pair `index`, which has this footer, is made of; `None` when the numbers are not those
-    /// of the file's pairs, as in a file that was cut out of another.
+    /// Number of the key frame that pair `index`, which has this footer, depends on; `None` if the numbers are not
+    /// those of the file's pairs, as in a file that was cut out of another.
     pub fn key_of(self, index: u64) -> Option<u64> {
         let own = u64::try_from(self.number).ok().filter(|n| *n == index)?;
         if self.is_key {
@@ -128,7 +128,7 @@ enum Codec {
     H265,
 }
 
-/// Tells the codecs apart by the headers of the first network abstraction layer units (ITU-T H.264 table 7-1, H.265
+/// Identifies the codec by the headers of the first network abstraction layer units (ITU-T H.264 table 7-1, H.265
 /// table 7-1): a unit of H.265 has two bytes of them, and parameter sets with numbers that H.264 does not use.
 fn codec(unit: &[u8]) -> Option<Codec> {
     let mut seen = None;
@@ -140,9 +140,9 @@ fn codec(unit: &[u8]) -> Option<Codec> {
         if first & 0x80 != 0 {
             return None;
         }
-        // H.265: layer 0, temporal number 1; video, sequence and picture parameter sets, delimiter.
+        // H.265: layer 0, temporal number 1; video, sequence and image parameter sets, delimiter.
         let h265_set = *second == 1 && matches!(first >> 1, 32..=35) && first & 1 == 0;
-        // H.264: a reference picture's sets, slices, delimiter; not 0, and nothing that is undefined.
+        // H.264: a reference image's sets, slices, delimiter; not 0, and nothing that is undefined.
         let h264 = matches!(first & 0x1F, 1..=9);
         match (h265_set, h264) {
             (true, _) => return Some(Codec::H265),

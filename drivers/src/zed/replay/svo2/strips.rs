@@ -1,14 +1,14 @@
-//! Pictures in four grey JPEGs whose bytes are YUYV.
+//! Images in four grey JPEGs whose bytes are YUYV.
 
 use super::super::Pair;
 use super::payload::STRIPS;
 use crate::unpack::{Half, copy_half, decode_grey_jpeg, jpeg_size};
 use rayon::prelude::*;
 
-/// Pictures beyond this are no camera's.
+/// Images beyond this come from no camera.
 const MAX_BYTES: usize = 1 << 28;
 
-/// Width and height of both eyes, of a picture in these strips.
+/// Width and height of the side-by-side image in these strips.
 pub(super) fn size(strips: &[&[u8]; STRIPS]) -> Option<(u32, u32)> {
     let mut whole: Option<(u32, u32)> = None;
     for strip in strips {
@@ -32,15 +32,15 @@ pub(super) struct Strips {
 }
 
 impl Strips {
-    /// For pictures of this size, both eyes together.
-    pub(super) fn new(size: (u32, u32)) -> Self {
-        Self { size, both: vec![0; 2 * size.0 as usize * size.1 as usize] }
+    /// For side-by-side images of this size.
+    pub(super) fn new(width: u32, height: u32) -> Self {
+        Self { size: (width, height), both: vec![0; 2 * width as usize * height as usize] }
     }
 
-    /// Decodes a picture into `pair`, whose pictures have their size; why it cannot otherwise.
+    /// Decodes an image into `pair`, whose images have their size; why it cannot otherwise.
     pub(super) fn decode(&mut self, strips: &[&[u8]; STRIPS], pair: &mut Pair) -> Result<(), String> {
         if size(strips) != Some(self.size) {
-            return Err("its strips have another size than the pictures before it".to_owned());
+            return Err("its strips have another size than the images before it".to_owned());
         }
         let row = 2 * self.size.0 as usize;
         let mut rest = self.both.as_mut_slice();
@@ -56,9 +56,9 @@ impl Strips {
         parts
             .into_par_iter()
             .try_for_each(|(strip, (width, height), part)| decode_grey_jpeg(strip, width, height, part))
-            .map_err(|_| "one of its strips is no whole grey JPEG".to_owned())?;
-        for (half, eye) in [(Half::Left, &mut pair.left), (Half::Right, &mut pair.right)] {
-            copy_half(&self.both, row, row / 2, half, eye).map_err(|reason| reason.name().to_owned())?;
+            .map_err(|_| "one of its strips is damaged, or not a grey JPEG".to_owned())?;
+        for (half, image) in [(Half::Left, &mut pair.left), (Half::Right, &mut pair.right)] {
+            copy_half(&self.both, row, row / 2, half, image).map_err(|reason| reason.name().to_owned())?;
         }
         Ok(())
     }

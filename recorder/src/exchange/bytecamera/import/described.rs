@@ -1,17 +1,17 @@
 //! Streams as `calibration.json` describes them.
 
-use super::files::Found;
+use super::files::FoundFiles;
 use super::stream::Stream;
 use super::{ByteCameraImport, bad};
 use crate::Result;
 use crate::exchange::bytecamera::CALIBRATION_FILE;
 use crate::exchange::bytecamera::calibration::Calibration;
-use crate::exchange::bytecamera::pictures::Want;
+use crate::exchange::bytecamera::images::Want;
 use depthrig_bus::PixelFormat;
 
 impl ByteCameraImport {
     /// Streams as `calibration.json` describes them.
-    pub(super) fn described(&mut self, calibration: Calibration, mut found: Found) -> Result<()> {
+    pub(super) fn described(&mut self, calibration: Calibration, mut found: FoundFiles) -> Result<()> {
         for s in calibration.streams {
             let files = found.remove(&(s.folder.clone(), s.prefix.clone(), s.ending.clone()));
             for copy in &s.copies {

@@ -1,8 +1,8 @@
 //! The files of a session's folder.
 
 use super::bad;
+use crate::exchange::bytecamera::images::MAX_FILE;
 use crate::exchange::bytecamera::names;
-use crate::exchange::bytecamera::pictures::MAX_FILE;
 use crate::fs::{Fs, ReadFile};
 use crate::{Error, Result};
 use std::collections::BTreeMap;
@@ -29,17 +29,17 @@ impl Read for Bytes {
 pub(super) type Key = (String, String, String);
 
 /// The files of each folder, prefix and ending by their numbers, with the name where it is not the plain one.
-pub(super) type Found = BTreeMap<Key, BTreeMap<u32, Option<String>>>;
+pub(super) type FoundFiles = BTreeMap<Key, BTreeMap<u32, Option<String>>>;
 
-/// What a file, named from the folder of the session, has in common with the others of its stream.
+/// The part of a path, relative to the session's folder, that all files of a stream share.
 pub(super) fn key_of(file: &str) -> Option<Key> {
     let (folder, name) = file.split_once('/')?;
     let (prefix, _, ending) = names::file_parts(name)?;
     Some((folder.to_owned(), prefix.to_owned(), ending.to_owned()))
 }
 
-pub(super) fn list(fs: &dyn Fs, dir: &Path) -> Result<Found> {
-    let mut found = Found::new();
+pub(super) fn list(fs: &dyn Fs, dir: &Path) -> Result<FoundFiles> {
+    let mut found = FoundFiles::new();
     for folder in fs.read_dir(dir).map_err(|e| Error::reading("list", dir, e))? {
         if !folder.is_dir || !folder.name.starts_with("camera_") {
             continue;
@@ -81,7 +81,7 @@ pub(super) fn read_file(fs: &dyn Fs, path: &Path) -> Result<Option<Vec<u8>>> {
     };
     let size = file.size().map_err(|e| Error::reading("read", path, e))?;
     if size > MAX_FILE {
-        return Err(bad(path, format_args!("it has {size} bytes, more than any picture")));
+        return Err(bad(path, format_args!("it has {size} bytes, more than any image")));
     }
     let mut bytes = vec![0; size as usize];
     file.read_exact_at(&mut bytes, 0).map_err(|e| Error::reading("read", path, e))?;

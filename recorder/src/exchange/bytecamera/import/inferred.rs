@@ -1,15 +1,15 @@
-//! Streams without a `calibration.json`: from the names of folders and files, and the first picture of each.
+//! Streams without a `calibration.json`: from the names of folders and files, and the first image of each.
 
-use super::files::{Found, session_within};
+use super::files::{FoundFiles, session_within};
 use super::stream::Stream;
 use super::{ByteCameraImport, FRAMES_FILE, UNITS_M, bad};
+use crate::exchange::bytecamera::images::{Image, Want};
 use crate::exchange::bytecamera::names;
-use crate::exchange::bytecamera::pictures::{Picture, Want};
 use crate::{Result, StreamRecord};
 use depthrig_bus::{Intrinsics, PixelFormat, Pose, StreamId};
 use std::collections::BTreeMap;
 
-/// What the files of a name hold; `None` where a dataset has no such stream.
+/// Kind of image in the files of a name; `None` where a dataset has no such stream.
 fn want_of(prefix: &str, ending: &str) -> Option<Want> {
     match (prefix, ending) {
         ("raw_depth", "npy") => Some(Want::Metres),
@@ -21,13 +21,13 @@ fn want_of(prefix: &str, ending: &str) -> Option<Want> {
 }
 
 impl ByteCameraImport {
-    /// Streams as the names of folders and files and the first picture of each tell them.
-    pub(super) fn inferred(&mut self, found: Found) -> Result<()> {
+    /// Infers the streams from the names of folders and files and the first image of each.
+    pub(super) fn inferred(&mut self, found: FoundFiles) -> Result<()> {
         let depth = found.keys().filter(|(_, prefix, ending)| want_of(prefix, ending) == Some(Want::Depth));
         let units = self.units_of_rows(depth.cloned().collect())?;
         let mut cameras: BTreeMap<String, String> = BTreeMap::new();
         for (key, files) in found {
-            let told = units.get(&key).copied().filter(|unit| UNITS_M.contains(unit));
+            let listed = units.get(&key).copied().filter(|unit| UNITS_M.contains(unit));
             let (folder, prefix, ending) = key;
             let Some(want) = want_of(&prefix, &ending) else {
                 self.state(format!(
@@ -66,13 +66,13 @@ impl ByteCameraImport {
                 pose: Pose::IDENTITY,
             };
             let mut stream = Stream::new(folder.clone(), prefix, ending, want, files, record);
-            let Some(first) = self.first_picture(&mut stream)? else { continue };
+            let Some(first) = self.first_image(&mut stream)? else { continue };
             let r = &mut stream.record;
             (r.format, r.width, r.height) = (first.format, first.width, first.height);
             if r.format == PixelFormat::Z16 {
                 let given = self.given_unit(id.camera.as_str(), &folder);
-                r.depth_unit_m = self.unit(&id, &model, &first.pixels, (given, told));
-                stream.unit_given = given.is_some() || told.is_none();
+                r.depth_unit_m = self.unit(&id, &model, &first.pixels, given, listed);
+                stream.unit_given = given.is_some() || listed.is_none();
             } else if r.format == PixelFormat::DepthF32 {
                 r.depth_unit_m = 1.0;
             }
@@ -93,12 +93,12 @@ impl ByteCameraImport {
         Ok(())
     }
 
-    /// The first picture of a stream that can be read; it says format and size.
-    fn first_picture(&mut self, stream: &mut Stream) -> Result<Option<Picture>> {
+    /// The first image of a stream that can be read; it says format and size.
+    fn first_image(&mut self, stream: &mut Stream) -> Result<Option<Image>> {
         let numbers: Vec<u32> = stream.files.keys().copied().collect();
         for n in numbers {
-            if let Ok(picture) = self.picture(stream, n)? {
-                return Ok(Some(picture));
+            if let Ok(image) = self.image(stream, n)? {
+                return Ok(Some(image));
             }
         }
         for n in stream.files.keys() {
@@ -108,33 +108,37 @@ impl ByteCameraImport {
         Ok(None)
     }
 
-    /// The depth unit as `given`, else as `frames.csv` has `told` it, else as inferred; it is stated.
+    /// The depth unit as `given`, else as `listed` in `frames.csv`, else as inferred; it is stated.
     fn unit(
         &mut self,
         id: &StreamId,
         model: &str,
         pixels: &[u8],
-        (given, told): (Option<f64>, Option<f64>),
+        given: Option<f64>,
+        listed: Option<f64>,
     ) -> f64 {
         let mut values: Vec<u16> = pixels.as_chunks().0.iter().map(|v| u16::from_le_bytes(*v)).collect();
         values.retain(|v| *v != 0 && *v != u16::MAX);
         let middle = values.len() / 2;
         let median = if values.is_empty() { 0 } else { *values.select_nth_unstable(middle).1 };
         let (unit, why) = if let Some(unit) = given {
-            let other = told.filter(|told| *told != unit);
-            (unit, other.map_or("as given".to_owned(), |told| format!("as given, {FRAMES_FILE} says {told}")))
-        } else if let Some(unit) = told {
+            let other = listed.filter(|listed| *listed != unit);
+            (
+                unit,
+                other.map_or("as given".to_owned(), |other| format!("as given, {FRAMES_FILE} says {other}")),
+            )
+        } else if let Some(unit) = listed {
             (unit, format!("as {FRAMES_FILE} says"))
         } else if let Some(unit) = names::usual_depth_unit_m(model) {
             (unit, format!("inferred from the model {model}, which comes so"))
         } else {
-            // Indoors the middle of a picture is nearer than 8 m; in units of 0.1 mm it is then below 65535.
+            // Indoors the middle of an image is nearer than 8 m; in units of 0.1 mm it is then below 65535.
             let unit = if median > 8000 { 0.0001 } else { 0.001 };
-            (unit, "inferred from the numbers of the first picture".to_owned())
+            (unit, "inferred from the numbers of the first image".to_owned())
         };
         let metres = f64::from(median) * unit;
         self.state(format!(
-            "{id}: depth unit {unit} m {why}; the first picture's median is then {metres:.3} m"
+            "{id}: depth unit {unit} m {why}; the first image's median is then {metres:.3} m"
         ));
         unit
     }

@@ -20,7 +20,9 @@ impl ByteCameraImport {
         let start = start_of(&folder);
         self.state(match start {
             Some(_) => format!("the start is the folder's name {folder}, taken as UTC"),
-            None => format!("the folder's name {folder} is no date YYYYMMDD_HHMM: the start is 1970-01-01"),
+            None => {
+                format!("the folder's name {folder} is not a date YYYYMMDD_HHMM: the start is 1970-01-01")
+            }
         });
         let numbers: Vec<u32> = numbers.into_iter().collect();
         let holes = numbers.windows(2).map(|w| u64::from(w[1] - w[0] - 1)).sum::<u64>();
@@ -62,13 +64,14 @@ impl ByteCameraImport {
         }
     }
 
-    /// A set as the numbers of the files tell it.
+    /// The next set, put together by the numbers of the files.
     pub(super) fn set_of_number(&mut self) -> Result<Option<RecordSet>> {
         let List::Numbers { numbers, at, start_utc_ns, period_ns } = &mut self.list else { return Ok(None) };
         let (Some(n), Some(first)) = (numbers.get(*at).copied(), numbers.first()) else { return Ok(None) };
         *at += 1;
         let tick = i64::from(n - first) * *period_ns;
-        let (period, start) = (*period_ns, *start_utc_ns);
+        let period = *period_ns;
+        let start = *start_utc_ns;
         let mut set = RecordSet {
             id: u64::from(n) + 1,
             tick: HostTime::from_ns(tick),
@@ -83,12 +86,12 @@ impl ByteCameraImport {
                 continue;
             }
             self.done += 1;
-            let read = self.picture(&self.streams[i], n)?.and_then(|p| self.streams[i].check(p));
+            let read = self.image(&self.streams[i], n)?.and_then(|p| self.streams[i].check(p));
             let s = &mut self.streams[i];
             s.dropped.add(DropReason::DeviceGap, s.last.map_or(0, |last| u64::from(n - last - 1)));
             s.last = Some(n);
             match read {
-                Ok(picture) => {
+                Ok(image) => {
                     s.sequence += 1;
                     let mut header = FrameHeader {
                         sequence: s.sequence,
@@ -106,10 +109,10 @@ impl ByteCameraImport {
                         flags: FrameFlags::TIME_UNCERTAIN.0,
                         ..FrameHeader::default()
                     };
-                    s.fill(&mut header, &self.session.rig, &picture);
-                    s.told = Some(header);
-                    self.alpha_dropped += u64::from(picture.alpha_dropped);
-                    set.frames.push(RecordFrame { stream: i, header, pixels: Box::new(picture.pixels) });
+                    s.fill(&mut header, &self.session.rig, &image);
+                    s.last_header = Some(header);
+                    self.alpha_dropped += u64::from(image.alpha_dropped);
+                    set.frames.push(RecordFrame { stream: i, header, pixels: Box::new(image.pixels) });
                 }
                 Err(why) => {
                     s.dropped.add(DropReason::Incomplete, 1);

@@ -28,8 +28,8 @@ impl ByteCameraImport {
         ))
     }
 
-    /// The unit of depth of each of these streams as the first line with a file of it tells it, if there is
-    /// a `frames.csv`. It is read from its begin, no further than is needed.
+    /// The depth unit of each of these streams from the first line with a file of it, if there is a `frames.csv`.
+    /// The list is read from the start, no further than needed.
     pub(super) fn units_of_rows(&mut self, mut wanted: BTreeSet<Key>) -> Result<BTreeMap<Key, f64>> {
         let mut units = BTreeMap::new();
         let path = self.dir.join(FRAMES_FILE);
@@ -82,7 +82,9 @@ impl ByteCameraImport {
             return Err(bad(&path, format_args!("line {line} has no end: the file was cut")));
         }
         bytes.pop_if(|b| *b == b'\r');
-        String::from_utf8(bytes).map(Some).map_err(|_| bad(&path, format_args!("line {line} is no text")))
+        String::from_utf8(bytes)
+            .map(Some)
+            .map_err(|_| bad(&path, format_args!("line {line} is not valid UTF-8")))
     }
 
     fn row(&mut self) -> Result<Option<Box<Row>>> {
@@ -103,7 +105,7 @@ impl ByteCameraImport {
         }
     }
 
-    /// A set as `frames.csv` tells it.
+    /// The next set of `frames.csv`.
     pub(super) fn set_of_rows(&mut self) -> Result<Option<RecordSet>> {
         let Some(first) = self.row()? else {
             let unnamed = self.total.saturating_sub(self.done);
@@ -151,14 +153,14 @@ impl ByteCameraImport {
             ));
         }
         self.done += u64::from(self.streams[i].files.contains_key(&row.n));
-        match self.picture(&self.streams[i], row.n)? {
-            Ok(picture) => {
+        match self.image(&self.streams[i], row.n)? {
+            Ok(image) => {
                 let s = &mut self.streams[i];
                 let mut header = row.header;
-                s.fill(&mut header, &self.session.rig, &picture);
-                s.told = Some(header);
-                self.alpha_dropped += u64::from(picture.alpha_dropped);
-                set.frames.push(RecordFrame { stream: i, header, pixels: Box::new(picture.pixels) });
+                s.fill(&mut header, &self.session.rig, &image);
+                s.last_header = Some(header);
+                self.alpha_dropped += u64::from(image.alpha_dropped);
+                set.frames.push(RecordFrame { stream: i, header, pixels: Box::new(image.pixels) });
             }
             Err(why) => self.facts.lose(format!("{}: {why}", row.file)),
         }

@@ -1,6 +1,6 @@
-//! One stream of pictures while it is imported.
+//! One stream of images while it is imported.
 
-use crate::exchange::bytecamera::pictures::{Picture, Want};
+use crate::exchange::bytecamera::images::{Image, Want};
 use crate::{StreamAccount, StreamRecord};
 use depthrig_bus::{DropCounts, FrameHeader};
 use std::collections::BTreeMap;
@@ -21,7 +21,7 @@ pub(super) struct Stream {
     /// The number of the last frame, to see what is missing between it and the next.
     pub(super) last: Option<u32>,
     /// The header of the last frame, where the files say it.
-    pub(super) told: Option<FrameHeader>,
+    pub(super) last_header: Option<FrameHeader>,
 }
 
 impl Stream {
@@ -45,7 +45,7 @@ impl Stream {
             sequence: 0,
             dropped,
             last: None,
-            told: None,
+            last_header: None,
         }
     }
 
@@ -57,26 +57,21 @@ impl Stream {
         }
     }
 
-    /// Refuses a picture that is not like the first one.
-    pub(super) fn check(&self, picture: Picture) -> Result<Picture, String> {
+    /// Refuses an image that is not like the first one.
+    pub(super) fn check(&self, image: Image) -> Result<Image, String> {
         let r = &self.record;
-        if (picture.format, picture.width, picture.height) == (r.format, r.width, r.height) {
-            return Ok(picture);
+        if (image.format, image.width, image.height) == (r.format, r.width, r.height) {
+            return Ok(image);
         }
         let said = format!("{}x{} {}", r.width, r.height, r.format.name());
-        Err(format!(
-            "it is {}x{} {}, its stream is {said}",
-            picture.width,
-            picture.height,
-            picture.format.name()
-        ))
+        Err(format!("it is {}x{} {}, its stream is {said}", image.width, image.height, image.format.name()))
     }
 
-    /// What the stream says of each of its frames.
-    pub(super) fn fill(&self, header: &mut FrameHeader, rig: &str, picture: &Picture) {
+    /// Fills in the fields that all frames of the stream share.
+    pub(super) fn fill(&self, header: &mut FrameHeader, rig: &str, image: &Image) {
         header.set_names(rig, &self.record.id);
         header.set_device(&self.record.model, &self.record.serial);
-        header.set_picture(picture.format, picture.width, picture.height);
+        header.set_image(image.format, image.width, image.height);
         (header.intrinsics, header.pose) = (self.record.intrinsics, self.record.pose);
         if self.unit_given {
             header.depth_unit_m = self.record.depth_unit_m;
@@ -84,7 +79,7 @@ impl Stream {
     }
 
     pub(super) fn account(&self) -> StreamAccount {
-        let (captured, delivered, dropped) = match &self.told {
+        let (captured, delivered, dropped) = match &self.last_header {
             Some(h) if self.sequence == 0 => {
                 (h.captured, h.captured.saturating_sub(h.drops().total()), h.drops())
             }

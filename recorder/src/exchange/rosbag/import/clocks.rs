@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 /// The device counts microseconds in 32 bits, which is 71 minutes.
 const TURN_US: i64 = 1 << 32;
 
-/// What the frames of a device say of its clock.
+/// Facts about a device's clock, from its frames.
 #[derive(Default)]
 struct Device {
     /// The least and the most that a frame arrived after its device time, nanoseconds.
@@ -41,7 +41,7 @@ pub(super) fn place(streams: &mut [Stream]) -> Vec<String> {
             device.capture_times(&mut s.frames);
         }
     }
-    devices.iter().map(|(camera, device)| device.told(camera)).collect()
+    devices.iter().map(|(camera, device)| device.basis(camera)).collect()
 }
 
 /// A frame that does not say whose clock its stamp is of has that of the frame before it; those at the begin
@@ -56,7 +56,8 @@ fn name_clocks(frames: &mut [Frame]) {
 
 /// The times of a stream's frames without the turns of their counter.
 fn count_on(frames: &mut [Frame]) {
-    let (mut counted, mut stamped) = (None, 0);
+    let mut counted = None;
+    let mut stamped = 0;
     for f in frames {
         f.device_us = after(counted.unwrap_or(stamped), f.raw_us());
         // A stamp may be of another clock: no counter goes on from it, and from one of many years nothing does.
@@ -78,8 +79,8 @@ fn after(last: u64, raw: u64) -> u64 {
     if last.saturating_sub(us) > 1 << 31 { us.saturating_add(1 << 32) } else { us }
 }
 
-/// The streams of a device have one counter. A stream that begins after a turn that another one saw has that
-/// turn added, as arrivals tell.
+/// Aligns the streams of a device, which have one counter: a stream that begins after a turn that another one saw has
+/// that turn added, judged by the arrival times.
 fn align(streams: &mut [Stream]) {
     let mut devices: BTreeMap<CameraName, Vec<(usize, Anchor)>> = BTreeMap::new();
     for (i, s) in streams.iter().enumerate() {
@@ -148,7 +149,7 @@ impl Device {
         }
     }
 
-    fn told(&self, camera: &CameraName) -> String {
+    fn basis(&self, camera: &CameraName) -> String {
         let Some((least, most)) = self.delays else {
             return format!("{camera}: no frame says when it arrived; times are those of the bag");
         };
@@ -181,8 +182,8 @@ mod tests {
         let mut frames =
             [counter(turn - 9), stamp(year_2018), counter(turn - 5), counter(3), stamp(7), counter(8)];
         count_on(&mut frames);
-        let told = frames.map(|f| f.device_us);
-        assert_eq!(told, [turn - 9, year_2018.unsigned_abs(), turn - 5, turn + 3, turn + 7, turn + 8]);
+        let counted = frames.map(|f| f.device_us);
+        assert_eq!(counted, [turn - 9, year_2018.unsigned_abs(), turn - 5, turn + 3, turn + 7, turn + 8]);
     }
 
     #[test]

@@ -1,13 +1,15 @@
 //! Poses of librealsense, which say the way from depth to a stream, as poses of cameras on the mount.
 
+use crate::exchange::rosbag::messages::Transform;
 use depthrig_bus::Pose;
 
-/// Largest rotation that two quaternions of one rotation differ by, to see one that is none.
+/// Norms at which a quaternion counts as a rotation.
 const UNIT: core::ops::Range<f64> = 0.99..1.01;
 
 /// Where the camera is on the mount, whose origin is that of depth: the bag has the way from depth to this stream,
 /// `p_stream = R p_depth + t`, and a pose is the way back.
-pub(super) fn pose_of((t, q): ([f64; 3], [f64; 4])) -> Option<Pose> {
+pub(super) fn pose_of(transform: Transform) -> Option<Pose> {
+    let Transform { translation: t, rotation: q } = transform;
     let norm = q.iter().map(|v| v * v).sum::<f64>().sqrt();
     if !UNIT.contains(&norm) || !t.iter().all(|v| v.is_finite()) {
         return None;
@@ -37,17 +39,19 @@ mod tests {
     fn a_pose_is_the_way_back() {
         let half = core::f64::consts::FRAC_1_SQRT_2;
         // A quarter turn about z, then 1 m along x: the point (0, -1, 0) of depth is the stream's (2, 0, 0).
-        let (t, q) = ([1.0, 0.0, 0.0], [0.0, 0.0, half, half]);
+        let t = [1.0, 0.0, 0.0];
+        let q = [0.0, 0.0, half, half];
         let p = [0.0, -1.0, 0.0];
         let there = rotate(q, p);
         let there = [there[0] + t[0], there[1] + t[1], there[2] + t[2]];
-        let pose = pose_of((t, q)).unwrap();
+        let pose = pose_of(Transform { translation: t, rotation: q }).unwrap();
         let back = rotate(pose.rotation_xyzw, there);
         for (i, v) in p.iter().enumerate() {
             assert!((there[i] - [2.0, 0.0, 0.0][i]).abs() < 1e-12);
             assert!((back[i] + pose.translation_m[i] - v).abs() < 1e-12);
         }
-        assert_eq!(pose_of(([0.0; 3], [0.0, 0.0, 0.0, 1.0])), Some(Pose::IDENTITY));
-        assert_eq!(pose_of(([0.0; 3], [0.0; 4])), None);
+        let identity = Transform { translation: [0.0; 3], rotation: [0.0, 0.0, 0.0, 1.0] };
+        assert_eq!(pose_of(identity), Some(Pose::IDENTITY));
+        assert_eq!(pose_of(Transform { rotation: [0.0; 4], ..identity }), None);
     }
 }

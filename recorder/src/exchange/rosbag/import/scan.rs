@@ -1,14 +1,16 @@
 //! The first pass: what streams, frames and facts are in the bag.
 
 use crate::exchange::rosbag::bag::{Message, Place};
-use crate::exchange::rosbag::messages::{camera_info, float, image, key_value, stream_rate, transform};
+use crate::exchange::rosbag::messages::{
+    Transform, camera_info, float, image, key_value, stream_rate, transform,
+};
 use depthrig_bus::{Intrinsics, PixelFormat};
 use std::collections::BTreeMap;
 
 /// Frames that are imported from one bag: three weeks at 30 Hz with two streams.
 const FRAMES_MAX: usize = 100_000_000;
 
-/// What the bag says of one frame.
+/// Facts about one frame in the bag.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Frame {
     pub(super) place: Option<Place>,
@@ -29,29 +31,29 @@ pub(super) struct Frame {
     pub(super) uncertainty_ns: u64,
 }
 
-/// What is found under a topic's prefix `/device_D/sensor_S/Stream_I`.
+/// Content under a topic's prefix `/device_D/sensor_S/Stream_I`.
 #[derive(Default)]
-pub(super) struct Found {
+pub(super) struct FoundStream {
     pub(super) frames: Vec<Frame>,
     pub(super) size: Option<(u32, u32)>,
     pub(super) format: Option<PixelFormat>,
     pub(super) info: Option<(u32, u32, Intrinsics)>,
-    pub(super) to_color: Option<([f64; 3], [f64; 4])>,
+    pub(super) to_color: Option<Transform>,
     pub(super) rate_hz: f64,
     pub(super) refused: Option<Refused>,
 }
 
-/// Pictures that cannot be imported.
+/// Images that cannot be imported.
 pub(super) struct Refused {
-    pub(super) pictures: u64,
-    /// What the first of them is.
+    pub(super) images: u64,
+    /// Description of the first of them.
     pub(super) first: String,
 }
 
 /// The first pass.
 #[derive(Default)]
 pub(super) struct Scan {
-    pub(super) streams: BTreeMap<Key, Found>,
+    pub(super) streams: BTreeMap<Key, FoundStream>,
     /// Key and value of each device.
     pub(super) devices: BTreeMap<u32, BTreeMap<String, String>>,
     /// Option and value of each sensor, the last one.
@@ -117,7 +119,8 @@ impl Scan {
                     Some(format) if found.frames.len() < FRAMES_MAX => {
                         found.format.get_or_insert(format);
                         found.size.get_or_insert((i.width, i.height));
-                        let (place, bag_ns) = (Some(m.place), m.time_ns);
+                        let place = Some(m.place);
+                        let bag_ns = m.time_ns;
                         found.frames.push(Frame { place, bag_ns, stamp_ns: i.stamp_ns, ..Frame::default() });
                     }
                     _ => found.refuse(|| format!("{}x{} {} pixels", i.width, i.height, i.encoding)),
@@ -125,7 +128,7 @@ impl Scan {
                 None => found.refuse(|| "an image that ends too early".to_owned()),
             },
             "image/metadata" => {
-                // Written after the picture, with the picture's time.
+                // Written after the image, with the image's time.
                 if let (Some(frame), Some((k, v))) = (found.frames.last_mut(), key_value(m.data))
                     && frame.bag_ns == m.time_ns
                 {
@@ -140,20 +143,20 @@ impl Scan {
     }
 }
 
-impl Found {
-    /// Counts a picture that cannot be imported; `what` it is, is asked of the first one.
+impl FoundStream {
+    /// Counts an image that cannot be imported; `what` it is, is asked of the first one.
     fn refuse(&mut self, what: impl FnOnce() -> String) {
-        self.refused.get_or_insert_with(|| Refused { pictures: 0, first: what() }).pictures += 1;
+        self.refused.get_or_insert_with(|| Refused { images: 0, first: what() }).images += 1;
     }
 }
 
 impl Frame {
-    /// What the device counted, microseconds.
+    /// The device's count, microseconds.
     pub(super) fn counted_us(&self) -> Option<u64> {
         self.sensor_us.or(self.sent_us)
     }
 
-    /// The same, or where nothing is told of it the stamp of the picture.
+    /// The device's count, or without one the image's stamp, microseconds.
     pub(super) fn raw_us(&self) -> u64 {
         self.counted_us().unwrap_or_else(|| self.stamp_ns.max(0).unsigned_abs() / 1000)
     }

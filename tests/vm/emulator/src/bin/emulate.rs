@@ -1,7 +1,7 @@
-//! `emulate`: emulated cameras for a shell, told what to do over a Unix socket.
+//! `emulate`: emulated cameras for a shell, controlled over a Unix socket.
 //!
 //! ```text
-//! emulate serve SOCKET [MODEL[,key=value…]]…    serves until it is told to quit
+//! emulate serve SOCKET [MODEL[,key=value…]]…    serves until the command quit
 //! emulate ask SOCKET COMMAND…                   sends one command and prints the reply
 //! ```
 

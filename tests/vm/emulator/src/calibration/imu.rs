@@ -1,13 +1,13 @@
-//! The calibration of an IMU: sensitivity and bias of both sensors, and where it sits.
+//! The calibration of an IMU: sensitivity and bias of both sensors, and its pose.
 
 use super::{Spread, rotation};
 
 /// The calibration of an IMU, along the axes of the depth camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImuCalibration {
-    /// Of acceleration, m/s².
+    /// Correction of acceleration, m/s².
     pub accelerometer: ImuAxes,
-    /// Of rotation, degrees per second.
+    /// Correction of rotation, degrees per second.
     pub gyroscope: ImuAxes,
     /// From the depth camera to the IMU: `p_imu = R p_depth + t`, row after row.
     pub rotation: [f32; 9],
@@ -15,7 +15,7 @@ pub struct ImuCalibration {
     pub translation_m: [f32; 3],
 }
 
-/// What corrects one sensor: `sensitivity * measured - bias`.
+/// Correction of one sensor: `sensitivity * measured - bias`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImuAxes {
     /// Row after row.

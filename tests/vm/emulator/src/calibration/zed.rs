@@ -3,24 +3,24 @@
 use super::Spread;
 use core::fmt::Write;
 
-/// One eye at one mode.
+/// Intrinsics of one side at one mode.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Eye {
+pub struct ZedIntrinsics {
     /// `fx fy cx cy`, pixels.
     pub pinhole: [f64; 4],
     /// `k1 k2 p1 p2 k3`.
     pub distortion: [f64; 5],
 }
 
-/// Both eyes at one mode.
+/// Calibration of both sides at one mode.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ZedMode {
-    /// What the file calls the mode.
+    /// The mode's name in the file.
     pub name: &'static str,
-    /// The left eye.
-    pub left: Eye,
-    /// The right eye.
-    pub right: Eye,
+    /// Intrinsics of the left camera.
+    pub left: ZedIntrinsics,
+    /// Intrinsics of the right camera.
+    pub right: ZedIntrinsics,
     /// `Baseline TY TZ`, millimetres.
     pub translation_mm: [f64; 3],
     /// Rodrigues' vector `RX CV RZ`, radians.
@@ -32,20 +32,20 @@ pub(super) fn modes(spread: &Spread<'_>) -> Vec<ZedMode> {
         [("2K", 2208.0, 1242.0), ("FHD", 1920.0, 1080.0), ("HD", 1280.0, 720.0), ("VGA", 672.0, 376.0)];
     let s = |name: &str| f64::from(spread.at(name));
     let mode = |(name, width, height)| {
-        let eye = |side: &str| {
+        let intrinsics = |side: &str| {
             // 2.1 mm lenses: 1070 pixels at 2208 wide; VGA and HD are binned, FHD is cropped.
             let f = if name == "FHD" { 1070.0 } else { 0.4846 * width } + s(side);
             let cx = width / 2.0 + 8.0 * s(&format!("{side} x"));
             let cy = height / 2.0 + 8.0 * s(&format!("{side} y"));
-            Eye {
+            ZedIntrinsics {
                 pinhole: [f, f, cx, cy],
                 distortion: [-0.05 + 0.01 * s(side), 0.02, 0.0003 * s(side), 0.0, -0.01],
             }
         };
         ZedMode {
             name,
-            left: eye("left"),
-            right: eye("right"),
+            left: intrinsics("left"),
+            right: intrinsics("right"),
             translation_mm: [119.9 + 0.2 * s("baseline"), 0.05 * s("ty"), 0.2 * s("tz")],
             rotation: [0.002 * s("rx"), 0.004 * s("cv"), 0.001 * s("rz")],
         }
@@ -60,9 +60,9 @@ pub(super) fn conf(modes: &[ZedMode]) -> String {
         let _ = writeln!(text, "{text_line}");
     };
     for mode in modes {
-        for (side, eye) in [("LEFT", &mode.left), ("RIGHT", &mode.right)] {
+        for (side, intrinsics) in [("LEFT", &mode.left), ("RIGHT", &mode.right)] {
             line(format!("[{side}_CAM_{}]", mode.name));
-            let values = eye.pinhole.iter().chain(&eye.distortion);
+            let values = intrinsics.pinhole.iter().chain(&intrinsics.distortion);
             for (key, value) in ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"].iter().zip(values) {
                 line(format!("{key}={value}"));
             }

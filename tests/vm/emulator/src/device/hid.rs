@@ -14,7 +14,7 @@ impl Device {
 
     /// GET_REPORT, SET_REPORT, SET_IDLE (Device Class Definition for HID 1.11, section 7.2).
     pub(super) fn hid_request(&mut self, setup: &Setup, data: &[u8]) -> Reply {
-        let of_motion_unit = self.model.family == Family::ZedMcu;
+        let of_imu = self.model.family == Family::ZedMcu;
         if let Some(imu) = &mut self.imu {
             let running_ns = self.clock.running_ns(HostTime::now());
             return match (setup.kind, setup.request, setup.value >> 8) {
@@ -25,8 +25,8 @@ impl Device {
             };
         }
         match (setup.kind, setup.request) {
-            (0xA1, 0x01) if of_motion_unit => Some(self.motion.read_feature(setup.value as u8)),
-            (0x21, 0x09) if of_motion_unit => {
+            (0xA1, 0x01) if of_imu => Some(self.motion.read_feature(setup.value as u8)),
+            (0x21, 0x09) if of_imu => {
                 self.motion.feature(data, HostTime::now());
                 Some(Vec::new())
             }
@@ -35,7 +35,7 @@ impl Device {
         }
     }
 
-    /// Measures with the IMU what is due, and sends its reports into the transfers that wait.
+    /// Takes the IMU samples that are due and sends their reports into waiting transfers.
     pub(super) fn imu_reports(&mut self, line: &UnixStream, now: HostTime) -> io::Result<()> {
         let Some(endpoint) = self.model.hid.as_ref().map(|hid| hid.endpoint) else { return Ok(()) };
         let Some(imu) = &mut self.imu else { return Ok(()) };

@@ -113,8 +113,9 @@ impl Device {
     }
 
     fn class_request(&mut self, setup: &Setup, data: &[u8]) -> Reply {
-        let (interface, unit, selector) =
-            ((setup.index & 0xFF) as u8, (setup.index >> 8) as u8, (setup.value >> 8) as u8);
+        let interface = (setup.index & 0xFF) as u8;
+        let unit = (setup.index >> 8) as u8;
+        let selector = (setup.value >> 8) as u8;
         let stream = self.model.streams().position(|s| s.interface == interface);
         if let Some(at) = stream {
             return self.stream_request(at, selector, setup.request, data);
@@ -172,7 +173,9 @@ impl Device {
 
     fn monitor(&mut self, data: &[u8]) -> Answer {
         let streaming = self.streaming();
-        let (model, identity, clock) = (&*self.model, &self.identity, &self.clock);
+        let model = &*self.model;
+        let identity = &self.identity;
+        let clock = &self.clock;
         let world = World { model, identity, clock, now: HostTime::now(), streaming };
         if let Some(asked) = firmware::asked(data) {
             self.shared.remember(asked);

@@ -25,7 +25,7 @@ pub(crate) struct State {
     sub_preset: Vec<u8>,
 }
 
-/// The limits of auto-exposure; 0 is no limit.
+/// The limits of auto-exposure; 0 means unlimited.
 #[derive(Debug, Clone, Copy, Default)]
 struct Limits {
     least_exposure: u32,
@@ -53,7 +53,7 @@ impl State {
         }
     }
 
-    /// What a request is answered; `None`: with a restart.
+    /// The reply to a request; `None` for a restart.
     pub fn answer(
         &mut self,
         request: &Request<'_>,
@@ -183,7 +183,7 @@ fn table(id: u32, world: &World<'_>, flash: &Flash) -> Result<Vec<u8>, i32> {
     Ok(table)
 }
 
-/// What a unit has that was never calibrated: equal focal lengths, and equal coordinates of the principal point.
+/// Intrinsics of a unit that was never calibrated: equal focal lengths, and equal coordinates of the principal point.
 const UNCALIBRATED: Pinhole = Pinhole { fx: 1.0, fy: 1.0, ppx: 0.0, ppy: 0.0 };
 
 fn rectified(world: &World<'_>, flash: &Flash) -> Vec<RectifiedItem> {
@@ -196,7 +196,7 @@ fn rectified(world: &World<'_>, flash: &Flash) -> Vec<RectifiedItem> {
     SIZES.into_iter().zip(&coefficients.rectified).filter_map(item).collect()
 }
 
-/// GVD: who the camera is and what it has.
+/// GVD: identity and features of the camera.
 fn version_data(world: &World<'_>) -> Vec<u8> {
     let mut data = vec![0; 256];
     let mut put = |at: usize, bytes: &[u8]| {

@@ -35,11 +35,11 @@ pub struct ImuSample {
     pub sensor: ImuSensor,
     /// Its number since power-on, from 0, sent or not.
     pub index: u64,
-    /// What the camera's clock showed, microseconds.
+    /// The camera's clock, microseconds.
     pub ticks: u32,
     /// When it was measured, on the host's clock.
     pub captured: HostTime,
-    /// What the sensor counted along its own axes.
+    /// Counts along the sensor's own axes.
     pub counts: [i32; 3],
     /// It went into a report.
     pub is_sent: bool,

@@ -7,7 +7,7 @@ use super::{Flash, World};
 use crate::calibration::{ImuAxes, ImuCalibration};
 use depthrig_drivers::realsense::protocol::tables::Header;
 
-/// What [`crate::Fault::DamagedTable`] calls it.
+/// Its number in [`crate::Fault::DamagedTable`].
 const IMU: u32 = 34;
 
 fn floats(bytes: &mut Vec<u8>, values: impl IntoIterator<Item = f32>) {

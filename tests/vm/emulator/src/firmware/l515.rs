@@ -34,7 +34,7 @@ impl Default for State {
 }
 
 impl State {
-    /// What a request is answered; `None`: with a restart.
+    /// The reply to a request; `None` for a restart.
     pub fn answer(
         &mut self,
         request: &Request<'_>,

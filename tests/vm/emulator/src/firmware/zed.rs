@@ -1,8 +1,8 @@
-//! The firmware of a ZED 2i: the registers and the flash of its video bridge, and its motion unit.
+//! The firmware of a ZED 2i: the registers and the flash of its video bridge, and its IMU.
 
 use depthrig_bus::HostTime;
 use depthrig_drivers::zed::command::{Command, answer, serial_bytes};
-use depthrig_drivers::zed::mode::Eye;
+use depthrig_drivers::zed::mode::Side;
 use depthrig_drivers::zed::sensors::{REQUEST_REPORT, Record, STREAM_REPORT};
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 pub(crate) const CONTROL: (u8, u8) = (4, 2);
 const SERIAL_ADDRESS: u32 = 0x0001_8000;
 const AUTO_EXPOSURE: [u32; 2] = [0x8018_1033, 0x8018_1833];
-/// Without a word from the host for so long, the motion unit stops.
+/// Without a word from the host for so long, the IMU stops.
 const SILENCE_NS: i64 = 2_000_000_000;
 /// Between two records: 400 a second.
 pub(crate) const PERIOD_NS: i64 = 2_500_000;
@@ -24,10 +24,10 @@ pub(crate) struct Bridge {
 }
 
 impl Bridge {
-    /// What the control holds after a command was written to it.
+    /// Executes a command and returns the value that the control then holds.
     pub fn command(&mut self, block: &[u8], serial: &str) -> Vec<u8> {
         let mut reply = block.to_vec();
-        let eye = |eye: Eye| u8::from(eye == Eye::Right);
+        let index = |side: Side| u8::from(side == Side::Right);
         match Command::parse(block) {
             Some(Command::ReadFlash { address, length }) => {
                 let flash = serial_bytes(serial).unwrap_or_default();
@@ -43,11 +43,11 @@ impl Bridge {
                 answer(&mut reply, &[self.system.get(&address).copied().unwrap_or(default)]);
             }
             Some(Command::WriteSystem { address, value }) => drop(self.system.insert(address, value)),
-            Some(Command::ReadSensor { eye: side, address }) => {
-                answer(&mut reply, &[self.sensors.get(&(eye(side), address)).copied().unwrap_or(0)]);
+            Some(Command::ReadSensor { side, address }) => {
+                answer(&mut reply, &[self.sensors.get(&(index(side), address)).copied().unwrap_or(0)]);
             }
-            Some(Command::WriteSensor { eye: side, address, value }) => {
-                self.sensors.insert((eye(side), address), value);
+            Some(Command::WriteSensor { side, address, value }) => {
+                self.sensors.insert((index(side), address), value);
             }
             Some(Command::SetPin { pin, high }) => drop(self.pins.insert(pin, high)),
             Some(Command::GetPin { pin }) => {
@@ -59,7 +59,7 @@ impl Bridge {
     }
 }
 
-/// The motion unit.
+/// The IMU.
 #[derive(Debug, Default)]
 pub(crate) struct Motion {
     heard: Option<HostTime>,
@@ -97,7 +97,7 @@ impl Motion {
         self.heard.map(|_| self.next)
     }
 
-    /// The record that is due now, if one is. `frames` counts the pictures whose exposure has begun.
+    /// The record that is due now, if one is. `frames` counts the images whose exposure has begun.
     pub fn record(&mut self, now: HostTime, frames: Option<u64>) -> Option<Vec<u8>> {
         let heard = self.heard?;
         if now.since_ns(heard) > SILENCE_NS {
@@ -107,7 +107,7 @@ impl Motion {
         if now < self.next {
             return None;
         }
-        // The unit measures on its own clock, whenever it may speak; what it could not say in time is lost.
+        // The IMU measures on its own clock, whenever it may send; samples not sent in time are lost.
         let behind = now.since_ns(self.next) / PERIOD_NS;
         let measured = self.next.plus_ns(behind * PERIOD_NS);
         self.next = measured.plus_ns(PERIOD_NS);
@@ -127,7 +127,7 @@ impl Motion {
             temperature_raw: 3150,
             field_raw: (self.count.is_multiple_of(8)).then_some([320, -160, 640]),
             air_raw: (self.count.is_multiple_of(16)).then_some((2950, 101_325, 40_000)),
-            eyes_raw: [3820, 3815],
+            image_sensors_raw: [3820, 3815],
         };
         Some(record.build().to_vec())
     }

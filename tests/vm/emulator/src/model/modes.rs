@@ -18,7 +18,7 @@ impl Size {
     /// Reads `640x480@30,15,6`.
     ///
     /// # Errors
-    /// When the text is none.
+    /// When the text is not such a mode.
     pub fn parse(text: &str) -> Result<Self> {
         let read = || {
             let (size, rates) = text.split_once('@')?;
@@ -36,12 +36,12 @@ impl Size {
     }
 }
 
-/// What a stream was set to.
+/// Mode that a stream was set to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mode {
     /// `fourcc` of its format.
     pub fourcc: [u8; 4],
-    /// How its pictures lie.
+    /// How its images lie.
     pub layout: Layout,
     /// Bits of a pixel.
     pub bits: u8,
@@ -64,7 +64,7 @@ impl Mode {
     }
 
     /// Whether frames of the two hold the same pattern.
-    pub fn same_picture(&self, other: &Self) -> bool {
+    pub fn same_image(&self, other: &Self) -> bool {
         Self { interval: other.interval, ..*self } == *other
     }
 

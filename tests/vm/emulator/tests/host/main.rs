@@ -21,7 +21,7 @@ fn camera(model: &str, options: Options) -> (Camera, Host) {
     (camera, host)
 }
 
-/// The parser that the libusb path uses reads every model at both speeds, and finds what the model's file says.
+/// The parser that the libusb path uses reads every model at both speeds, and finds the contents of the model's file.
 #[test]
 fn descriptors_are_what_a_driver_reads() {
     for name in Model::names() {
@@ -64,7 +64,9 @@ fn descriptors_are_what_a_driver_reads() {
 /// Rules that hold for every configuration: lengths add up, interfaces are numbered without a gap, no endpoint is
 /// used twice.
 fn well_formed(name: &str, all: &[u8]) {
-    let (mut at, mut interfaces, mut endpoints) = (0, Vec::new(), Vec::new());
+    let mut at = 0;
+    let mut interfaces = Vec::new();
+    let mut endpoints = Vec::new();
     while at < all.len() {
         let length = usize::from(all[at]);
         assert!(length >= 2 && at + length <= all.len(), "{name}: a descriptor of {length} bytes at {at}");
@@ -159,7 +161,7 @@ fn faults_of_the_flash_and_of_replies() {
     assert_eq!(camera.faults().values().sum::<u64>(), 6);
 }
 
-/// A frame at a time: what it holds, and what the accounts say.
+/// One frame at a time: its contents and the accounts.
 #[test]
 fn frames_and_damage() {
     let (camera, mut host) = camera("d435", Options::default());
@@ -212,7 +214,7 @@ fn the_frame_bit_changes_with_every_frame_that_is_sent() {
     assert_eq!((accounts.skipped, accounts.repeated), (2, 1));
 }
 
-/// USB/IP's own rule: a transfer that is taken back ends with ECONNRESET, one that had ended before with 0.
+/// USB/IP's own rule: a transfer that is taken backends with ECONNRESET, one that had ended before with 0.
 #[test]
 fn a_transfer_that_is_taken_back_is_answered_once() {
     let (_camera, mut host) = camera("d435", Options::default());
@@ -242,7 +244,7 @@ fn a_control_that_times_out_does_not_stop_streams() {
 }
 
 #[test]
-fn a_motion_unit_reports_while_it_hears_from_the_host() {
+fn an_imu_reports_while_it_hears_from_the_host() {
     let (_camera, mut host) = camera("zed2i-mcu", Options { speed: Speed::High, ..Options::default() });
     host.control_out([0x21, 9, 0x32, 3, 0, 0, 2, 0], &[0x32, 1]).unwrap();
     let mut last = 0;
@@ -255,7 +257,7 @@ fn a_motion_unit_reports_while_it_hears_from_the_host() {
     host.control_out([0x21, 9, 0x32, 3, 0, 0, 2, 0], &[0x32, 0]).unwrap();
     let waiting = host.submit(1, true, 64, [0; 8], &[]);
     std::thread::sleep(Duration::from_millis(50));
-    assert!(!host.has_ended(waiting), "it was told to stop");
+    assert!(!host.has_ended(waiting), "it was asked to stop");
 }
 
 #[test]

@@ -35,12 +35,14 @@ impl Host {
         self.seq
     }
 
-    /// Reads the next message; says whether it was of a transfer's end or the status of an unlinking.
+    /// Reads the next message. Returns whether it was the end of a transfer or the status of an unlink.
     fn read(&mut self) -> (u32, u32, i32) {
         let mut head = [0; HEADER];
         self.line.read_exact(&mut head).unwrap();
         let word = |at: usize| u32::from_be_bytes(head[at..at + 4].try_into().unwrap());
-        let (kind, seq, status) = (word(0), word(4), word(20) as i32);
+        let kind = word(0);
+        let seq = word(4);
+        let status = word(20) as i32;
         if kind == 3 {
             let mut data = vec![0; if self.out.contains(&seq) { 0 } else { word(24) as usize }];
             self.line.read_exact(&mut data).unwrap();

@@ -1,7 +1,7 @@
-//! `depthrig cameras`: what it lists, held against what was plugged in; in use, forbidden, on USB2, unplugged.
+//! `depthrig cameras`: its list against the plugged-in cameras; in use, forbidden, on USB2, unplugged.
 
 use crate::checks::Checks;
-use crate::daemon::{Daemon, drops, streams, told};
+use crate::daemon::{Daemon, drops, streams, summary};
 use crate::{Scenario, system};
 use anyhow::Context;
 use depthrig_emulator::{Camera, Options, Speed};
@@ -22,12 +22,12 @@ pub const SCENARIO: Scenario = Scenario {
     run,
 };
 
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 const ENUMERATION: Duration = Duration::from_secs(15);
 /// Any user but root.
 const NOBODY: u32 = 65534;
 
-/// The exit code and what was listed, as `user`.
+/// The exit code and the list, as `user`.
 pub fn listed(user: Option<u32>) -> anyhow::Result<(i32, Value)> {
     let mut command = Command::new("depthrig");
     command.args(["cameras", "--json", "--runtime-dir"]);
@@ -59,7 +59,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let fast = Camera::plug("d435", Options::default())?;
     let slow = Camera::plug("d435", Options { speed: Speed::High, ..Options::default() })?;
     let twelve = || system::video_nodes().is_ok_and(|nodes| nodes.len() == 12);
-    checks.that("two cameras have twelve nodes", system::wait_until(PATIENCE, twelve), "");
+    checks.that("two cameras have twelve nodes", system::wait_until(TIMEOUT, twelve), "");
 
     let (code, both) = listed(None)?;
     checks.equal("both are free: exit code", code, 0);
@@ -80,7 +80,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
 
     fast.unplug()?;
     let six = || system::video_nodes().is_ok_and(|nodes| nodes.len() == 6);
-    checks.that("unplugged, its nodes go", system::wait_until(PATIENCE, six), "");
+    checks.that("unplugged, its nodes go", system::wait_until(TIMEOUT, six), "");
     let (_, rest) = listed(None)?;
     checks.that("unplugged, it is not listed", entry(&rest, &fast).is_none(), &rest);
     checks.equal("the other is", rest["cameras"].as_array().map(Vec::len), Some(1));
@@ -92,7 +92,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
 /// One of each model, as a table and as JSON; one of them in a rig that runs, which notices nothing.
 fn every_model(checks: &mut Checks) -> anyhow::Result<()> {
     let none = || system::video_nodes().is_ok_and(|nodes| nodes.is_empty());
-    checks.that("all are unplugged", system::wait_until(PATIENCE, none), "");
+    checks.that("all are unplugged", system::wait_until(TIMEOUT, none), "");
     let mut cameras = Vec::new();
     for (model, name, backend) in [
         ("d435", "D435", "realsense"),
@@ -147,14 +147,14 @@ fn every_model(checks: &mut Checks) -> anyhow::Result<()> {
     let camera = status.cameras.first().context("no camera in the status")?;
     checks.equal("the rig was not disturbed: frames lost", drops(camera), "");
     checks.equal("the rig was not disturbed: reconnects", camera.reconnects, 0);
-    checks.that("the rig streams", streams(camera), told(&status));
+    checks.that("the rig streams", streams(camera), summary(&status));
     daemon.stop()?;
     drop(cameras);
-    checks.that("all are unplugged again", system::wait_until(PATIENCE, none), "");
+    checks.that("all are unplugged again", system::wait_until(TIMEOUT, none), "");
     Ok(())
 }
 
-/// Everything that is said of a camera that nobody has.
+/// The complete entry of a free camera.
 fn free(checks: &mut Checks, name: &str, listed: &Value, camera: &Camera, mbps: u64) {
     let Some(c) = entry(listed, camera) else {
         checks.that(&format!("{name} is listed at its port"), false, listed);
@@ -175,7 +175,7 @@ fn free(checks: &mut Checks, name: &str, listed: &Value, camera: &Camera, mbps: 
     }
     let count =
         |role: &str| c["nodes"].as_array().map_or(0, |n| n.iter().filter(|n| n["role"] == role).count());
-    checks.equal(&format!("{name}: nodes"), (count("pictures"), count("metadata"), count("usb")), (3, 3, 1));
+    checks.equal(&format!("{name}: nodes"), (count("images"), count("metadata"), count("usb")), (3, 3, 1));
     let has = |stream: &str, format: &str| {
         let is = |m: &Value| {
             m["stream"] == stream && m["format"] == format && m["width"] == 640 && m["height"] == 480
@@ -202,7 +202,7 @@ fn held(checks: &mut Checks, camera: &Camera, other: &Camera, node: &str) -> any
     Ok(())
 }
 
-/// A user who may open no node is told which rule would change that; what `/sys` says is listed all the same.
+/// A user without permission to open a node gets the udev rule that grants it; data of `/sys` is listed all the same.
 fn forbidden(checks: &mut Checks, camera: &Camera, other: &Camera) -> anyhow::Result<()> {
     for node in system::video_nodes()? {
         std::fs::set_permissions(&node, Permissions::from_mode(0o000))?;

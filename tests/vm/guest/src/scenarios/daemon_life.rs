@@ -1,4 +1,4 @@
-//! What happens to a daemon around its cameras: a hub that resets, a camera that comes late, an end, and a crash.
+//! Life of a daemon and its cameras: a hub that resets, a camera that comes late, SIGTERM, and a crash.
 
 use crate::Scenario;
 use crate::checks::Checks;
@@ -83,7 +83,7 @@ fn hub_reset(checks: &mut Checks, daemon: &Daemon, mount: &Mount) -> anyhow::Res
     Ok(())
 }
 
-/// SIGTERM while cameras stream and are recorded: it ends well, the dataset is whole, and the cameras are let go.
+/// SIGTERM while cameras stream and are recorded: it ends well, the dataset is complete, and the cameras are released.
 fn terminated(checks: &mut Checks, daemon: Daemon, mount: &Mount) -> anyhow::Result<()> {
     let path = daemon.record("terminated")?;
     std::thread::sleep(Duration::from_secs(1));

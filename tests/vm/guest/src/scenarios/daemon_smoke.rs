@@ -41,7 +41,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     }
     checks.that("sets are recorded", recording.sets >= 9, recording.sets);
     let report = verify(&path, &VerifyOptions { decode: true, ..VerifyOptions::default() })?;
-    checks.that("the dataset is whole", report.is_whole(), format!("{:?}", report.findings));
+    checks.that("the dataset is complete", report.is_whole(), format!("{:?}", report.findings));
     let (status, took) = daemon.stop()?;
     checks.that("SIGTERM ends it well", status.success(), format!("{status} after {took:?}"));
     Ok(())

@@ -19,7 +19,7 @@ pub const SCENARIO: Scenario = Scenario {
     run,
 };
 
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The exit code and the report on a rig of `cameras`.
 fn examined(cameras: &str) -> anyhow::Result<(i32, Value)> {
@@ -43,8 +43,8 @@ const VGA: &str = "[[camera.stream]]\nname = \"depth\"\nwidth = 640\nheight = 48
 /// The findings about a camera: kind and all of its words.
 fn findings(report: &Value, camera: &str) -> Vec<(String, String)> {
     let of = |f: &&Value| f["camera"] == camera;
-    let told = |f: &Value| (f["id"].as_str().unwrap_or_default().to_owned(), f.to_string());
-    report["findings"].as_array().map_or(Vec::new(), |all| all.iter().filter(of).map(told).collect())
+    let finding = |f: &Value| (f["id"].as_str().unwrap_or_default().to_owned(), f.to_string());
+    report["findings"].as_array().map_or(Vec::new(), |all| all.iter().filter(of).map(finding).collect())
 }
 
 /// Whether `camera` has the finding `id`, whose words have `part`.
@@ -61,7 +61,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let slow = Camera::plug("d435", Options { speed: Speed::High, hub: 1, ..Options::default() })?;
     let taken = Camera::plug("d405", Options::default())?;
     let ready = || system::video_nodes().is_ok_and(|nodes| nodes.len() >= 18);
-    checks.that("three cameras are there", system::wait_until(PATIENCE, ready), "");
+    checks.that("three cameras are there", system::wait_until(TIMEOUT, ready), "");
     let port = |c: &Camera| c.port_path().context("a camera without a port");
 
     let well = camera("front", &format!("serial = \"{}\"\n{VGA}", front.serial()));
@@ -111,7 +111,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
 
     front.unplug()?;
     let gone = || system::video_nodes().is_ok_and(|nodes| nodes.len() < 18);
-    checks.that("unplugged, its nodes go", system::wait_until(PATIENCE, gone), "");
+    checks.that("unplugged, its nodes go", system::wait_until(TIMEOUT, gone), "");
     let (code, report) = examined(&well)?;
     checks.equal("unplugged: exit code", code, 1);
     has(checks, &report, "front", "camera_missing", "plug it in");

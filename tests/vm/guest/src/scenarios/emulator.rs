@@ -6,7 +6,7 @@ use anyhow::Context;
 use depthrig_bus::HostTime;
 use depthrig_drivers::uvc::control::{ControlPort, Query};
 use depthrig_drivers::v4l2::{FourCc, MetadataFormat, Node, Source, Wanted};
-use depthrig_drivers::video::PictureSource;
+use depthrig_drivers::video::ImageSource;
 use depthrig_emulator::{Camera, Damage, Fault, Options, Stamp};
 use std::path::Path;
 use std::time::Duration;
@@ -21,7 +21,7 @@ pub const SCENARIO: Scenario = Scenario {
     run,
 };
 
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 fn run(checks: &mut Checks) -> anyhow::Result<()> {
     system::modprobe("vhci-hcd", &[])?;
@@ -31,7 +31,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let six = || system::video_nodes().is_ok_and(|nodes| nodes.len() == 6);
     checks.that(
         "a D435 has six nodes",
-        system::wait_until(PATIENCE, six),
+        system::wait_until(TIMEOUT, six),
         format!("{:?}", system::video_nodes()?),
     );
 
@@ -57,14 +57,14 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let port = camera.port_path();
     camera.unplug()?;
     let none = || system::video_nodes().is_ok_and(|nodes| nodes.is_empty());
-    checks.that("unplugged, its nodes go", system::wait_until(PATIENCE, none), "");
+    checks.that("unplugged, its nodes go", system::wait_until(TIMEOUT, none), "");
     camera.replug()?;
-    checks.that("plugged in again, they come back", system::wait_until(PATIENCE, six), "");
+    checks.that("plugged in again, they come back", system::wait_until(TIMEOUT, six), "");
     checks.equal("at the same port", camera.port_path(), port);
     stream(checks, &camera, "depth", "/dev/video0", depth, 3, None)?;
     checks.equal("the emulator was never late", camera.accounts("depth")?.late, 0);
     drop(camera);
-    checks.that("dropped, it is gone", system::wait_until(PATIENCE, none), "");
+    checks.that("dropped, it is gone", system::wait_until(TIMEOUT, none), "");
     models(checks)
 }
 
@@ -84,7 +84,7 @@ fn models(checks: &mut Checks) -> anyhow::Result<()> {
     ] {
         let camera = Camera::plug(model, Options { speed, ..Options::default() })?;
         let there = || system::video_nodes().is_ok_and(|found| found.len() == nodes);
-        let settled = system::wait_until(PATIENCE, there);
+        let settled = system::wait_until(TIMEOUT, there);
         checks.that(
             &format!("{model} at {speed:?} speed: nodes"),
             settled,
@@ -92,12 +92,12 @@ fn models(checks: &mut Checks) -> anyhow::Result<()> {
         );
         drop(camera);
         let none = || system::video_nodes().is_ok_and(|found| found.is_empty());
-        system::wait_until(PATIENCE, none);
+        system::wait_until(TIMEOUT, none);
     }
     Ok(())
 }
 
-/// The hardware monitor says who the camera is, through the kernel.
+/// The hardware monitor reports the camera's identity through the kernel.
 fn identity(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
     let mut node = Node::open(Path::new("/dev/video0"))?;
     checks.equal("the hardware monitor takes 1024 bytes", node.length(3, 1)?, 1024);
@@ -117,7 +117,7 @@ struct Seen {
     pts_fell: u32,
 }
 
-/// Takes frames of a stream and compares each with what was sent; the fault happens after the second of them.
+/// Takes frames of a stream and compares each with the one sent; the fault happens after the second of them.
 fn stream(
     checks: &mut Checks,
     camera: &Camera,
@@ -136,27 +136,27 @@ fn stream(
     let metadata = Node::open(Path::new(&format!("/dev/video{}", number + 1)))?;
     let wanted = Wanted { video: node, metadata: Some((metadata, MetadataFormat::D4xx)) };
     let mut source = Source::start(vec![wanted], 4)?;
-    let mut pictures: Vec<(Vec<u8>, Vec<u8>, Option<HostTime>)> = Vec::new();
-    let end = HostTime::now().plus(PATIENCE);
-    while pictures.len() < frames && HostTime::now() < end {
-        source.poll(Duration::from_millis(500), &mut |picture| {
-            pictures.push((
-                picture.bytes.to_vec(),
-                picture.header.unwrap_or_default().to_vec(),
-                picture.kernel_time,
-            ));
+    let mut images: Vec<(Vec<u8>, Vec<u8>, Option<HostTime>)> = Vec::new();
+    let end = HostTime::now().plus(TIMEOUT);
+    while images.len() < frames && HostTime::now() < end {
+        source.poll(Duration::from_millis(500), &mut |image| {
+            images.push((image.bytes.to_vec(), image.header.unwrap_or_default().to_vec(), image.kernel_time));
         })?;
-        if pictures.len() >= 2
+        if images.len() >= 2
             && let Some(fault) = fault.take()
         {
             camera.fault(fault)?;
         }
     }
     drop(source);
-    checks.equal(&format!("{name}: frames"), pictures.len(), frames);
-    let (mut last, mut last_pts, mut seen) = (None, None, Seen { lost: 0, pts_fell: 0 });
-    let (mut equal, mut whole, mut off) = (0, 0, 0);
-    for (bytes, header, kernel_time) in &pictures {
+    checks.equal(&format!("{name}: frames"), images.len(), frames);
+    let mut last = None;
+    let mut last_pts = None;
+    let mut seen = Seen { lost: 0, pts_fell: 0 };
+    let mut equal = 0;
+    let mut whole = 0;
+    let mut off = 0;
+    for (bytes, header, kernel_time) in &images {
         let stamp = Stamp::read(bytes).context("a frame without a stamp")?;
         equal += usize::from(*bytes == camera.expected(name, stamp.index)?);
         if let Some(last) = last {

@@ -1,4 +1,4 @@
-//! What seven emulated cameras cost: fourteen streams at 640x480 and 30 Hz through the kernel, with nobody but a bare
+//! Cost of seven emulated cameras: fourteen streams at 640x480 and 30 Hz through the kernel, with nobody but a bare
 //! reader. The guest has one processor of 1e9 instructions a second, so the share is a count of instructions.
 
 use crate::checks::Checks;
@@ -6,7 +6,7 @@ use crate::{Scenario, system};
 use anyhow::Context;
 use depthrig_bus::HostTime;
 use depthrig_drivers::v4l2::{FourCc, Node, Source, Wanted};
-use depthrig_drivers::video::PictureSource;
+use depthrig_drivers::video::ImageSource;
 use depthrig_emulator::{Camera, Options};
 use std::path::Path;
 use std::time::Duration;
@@ -26,7 +26,8 @@ const TIME: Duration = Duration::from_secs(2);
 
 /// Frames so far that the emulator made too late, and that the kernel did not take.
 fn missed(cameras: &[Camera]) -> anyhow::Result<(u64, u64)> {
-    let (mut late, mut unread) = (0, 0);
+    let mut late = 0;
+    let mut unread = 0;
     for camera in cameras {
         for stream in ["depth", "color"] {
             let accounts = camera.accounts(stream)?;
@@ -59,7 +60,8 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     }
     let (late_before, unread_before) = missed(&cameras)?;
     let before = emulator_ns()?;
-    let (started, end) = (HostTime::now(), HostTime::now().plus(TIME));
+    let started = HostTime::now();
+    let end = HostTime::now().plus(TIME);
     let mut read = 0u64;
     while HostTime::now() < end {
         for source in &mut sources {
@@ -74,7 +76,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
         share * 100.0,
         took.as_secs_f64()
     ));
-    checks.equal("frames that the emulator made too late", late - late_before, 0);
+    checks.equal("frames that the emulator sent too late", late - late_before, 0);
     checks.equal("frames that the kernel did not take", unread - unread_before, 0);
     let full = (2 * CAMERAS as u64 * 30 * took.as_millis() as u64) / 1000;
     checks.that(

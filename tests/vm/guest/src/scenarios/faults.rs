@@ -22,7 +22,7 @@ pub const SCENARIO: Scenario = Scenario {
 
 /// The camera that is hurt, one on the same hub, and one on another.
 const NAMES: [&str; 3] = ["victim", "neighbour", "witness"];
-const PATIENCE: Duration = Duration::from_secs(10);
+const TIMEOUT: Duration = Duration::from_secs(10);
 const AWAY: Duration = Duration::from_millis(600);
 /// More wrong replies than an opening asks for, with all its retries.
 const MANY: u32 = 10_000;
@@ -30,7 +30,7 @@ const MANY: u32 = 10_000;
 const TABLE: u32 = 0x15;
 const SET_GROUP: u32 = 0x2B;
 const SET_SYNC: u32 = 0x69;
-/// What the victim is told at every opening.
+/// Preset that the victim gets at every opening.
 const PRESET: &str = "/tmp/preset.json";
 
 struct Bench {
@@ -73,7 +73,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     usb2(checks)
 }
 
-/// What a stream's table begins with.
+/// First line of a stream's table.
 const STREAM: &str = "[[camera.stream]]";
 
 /// The first camera of `tables` with another key.
@@ -102,7 +102,7 @@ fn message(found: &anyhow::Result<RigStatus>) -> String {
     found.as_ref().err().map_or(String::new(), ToString::to_string)
 }
 
-/// What is checked of a message: each of these words, without regard to case.
+/// Whether a message contains each of these words, regardless of case.
 fn says(message: Option<&String>, words: &[&str]) -> bool {
     let message = message.map(|m| m.to_lowercase()).unwrap_or_default();
     words.iter().all(|word| message.contains(word))
@@ -129,7 +129,7 @@ impl Bench {
         let there = |s: &RigStatus| {
             of(s, "victim").is_ok_and(|c| c.state == state && says(c.message.as_ref(), words))
         };
-        let found = self.daemon.wait_for(PATIENCE, &what, there);
+        let found = self.daemon.wait_for(TIMEOUT, &what, there);
         let now = self.camera("victim")?;
         let detail = format!("{}: {}", now.state.name(), now.message.unwrap_or_default());
         match found {
@@ -153,7 +153,7 @@ impl Bench {
                     && delivered(c).iter().zip(&before).all(|(now, before)| *now > before + 2)
             })
         };
-        let found = self.daemon.wait_for(PATIENCE, "it streams again", more);
+        let found = self.daemon.wait_for(TIMEOUT, "it streams again", more);
         checks.that(&format!("{fault}: the {name} streams again"), found.is_ok(), message(&found));
         Ok(())
     }
@@ -201,7 +201,7 @@ impl Bench {
             self.victim().fault(fault)?;
             let enough =
                 |s: &RigStatus| of(s, "victim").is_ok_and(|c| gaps(c) >= earlier + u64::from(FRAMES));
-            let seen = self.daemon.wait_for(PATIENCE, name, enough);
+            let seen = self.daemon.wait_for(TIMEOUT, name, enough);
             self.streams_again(checks, name, "victim")?;
             let now = self.camera("victim")?;
             let lost = gaps(&now) - earlier;
@@ -261,12 +261,13 @@ impl Bench {
         for wrong in [WrongReply::Code(-1), WrongReply::Truncated] {
             let what = format!("table {wrong:?} once");
             let readings = || self.victim().asked().iter().filter(|a| a.opcode == TABLE).count();
-            let (before, opened) = (readings(), self.camera("victim")?.reconnects);
+            let before = readings();
+            let opened = self.camera("victim")?.reconnects;
             self.victim().unplug()?;
             self.victim().fault(Fault::Reply { wrong, to: Some(TABLE), times: 1 })?;
             self.victim().replug()?;
             let back = |s: &RigStatus| of(s, "victim").is_ok_and(|c| c.reconnects > opened);
-            let found = self.daemon.wait_for(PATIENCE, &what, back);
+            let found = self.daemon.wait_for(TIMEOUT, &what, back);
             checks.that(&format!("{what}: the victim comes back"), found.is_ok(), message(&found));
             self.streams_again(checks, &what, "victim")?;
             checks.equal(&format!("{what}: two tables were read in three readings"), readings() - before, 3);
@@ -289,9 +290,9 @@ impl Bench {
         self.ends_in(checks, what, CameraState::Reconnecting, &words)?;
         self.victim().fault(Fault::Clear)?;
         self.streams_again(checks, what, "victim")?;
-        let told = self.victim().asked();
-        let last = told.iter().rfind(|a| a.opcode == SET_GROUP).map(|a| a.data.clone());
-        checks.equal("and it was told its preset again", last, Some(vec![9, 0, 0, 0, 9, 0, 0, 0]));
+        let asked = self.victim().asked();
+        let last = asked.iter().rfind(|a| a.opcode == SET_GROUP).map(|a| a.data.clone());
+        checks.equal("and it got its preset again", last, Some(vec![9, 0, 0, 0, 9, 0, 0, 0]));
         Ok(())
     }
 

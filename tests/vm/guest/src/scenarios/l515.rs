@@ -1,4 +1,4 @@
-//! The L515 back end against an emulated L515 under `uvcvideo`: who it is, its calibration, its four streams byte by
+//! The L515 backend against an emulated L515 under `uvcvideo`: who it is, its calibration, its four streams byte by
 //! byte after they were turned, infrared that goes along unasked, unplugging.
 
 use crate::checks::Checks;
@@ -15,14 +15,14 @@ use std::time::Duration;
 /// See the module.
 pub const SCENARIO: Scenario = Scenario {
     name: "l515",
-    about: "an emulated L515 by its back end: calibration, turned pictures, confidence, Y411, unplugging",
+    about: "an emulated L515 by its backend: calibration, turned images, confidence, Y411, unplugging",
     cost: 2,
     limit_s: 60,
     needs: "",
     run,
 };
 
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 /// Frames of each stream that are compared.
 const FRAMES: usize = 6;
 
@@ -31,7 +31,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     system::modprobe("uvcvideo", &[])?;
     let camera = Camera::plug("l515", Options { drift_ppm: 30.0, ..Options::default() })?;
     let eight = || system::video_nodes().is_ok_and(|nodes| nodes.len() == 8);
-    checks.that("an L515 has eight nodes", system::wait_until(PATIENCE, eight), "");
+    checks.that("an L515 has eight nodes", system::wait_until(TIMEOUT, eight), "");
 
     let backend = L515Backend::new(L515Config {
         controls: [("laser_power".to_owned(), 60)].into(),
@@ -58,9 +58,10 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     unplugged(checks, &backend, &camera, eight)
 }
 
-fn request(stream: &str, size: (u32, u32), format: Option<PixelFormat>) -> anyhow::Result<StreamRequest> {
+/// The request for a stream at 640x480 and 30 Hz.
+fn request(stream: &str, format: Option<PixelFormat>) -> anyhow::Result<StreamRequest> {
     Ok(StreamRequest {
-        size: Some(size),
+        size: Some((640, 480)),
         rate_hz: Some(30.0),
         format,
         ..StreamRequest::any(Name::new(stream)?)
@@ -70,7 +71,8 @@ fn request(stream: &str, size: (u32, u32), format: Option<PixelFormat>) -> anyho
 /// Intrinsics within 1e-6, the pose of colour within 1e-9 of what the emulator was given.
 fn geometry(checks: &mut Checks, profiles: &[StreamProfile], camera: &Camera) -> anyhow::Result<()> {
     let given = camera.calibration().l515.context("an L515 without tables")?;
-    let (mut off, mut compared) = (0.0f64, 0);
+    let mut off = 0.0f64;
+    let mut compared = 0;
     for p in profiles {
         let size = (p.width, p.height);
         let pinhole = match p.stream.as_str() {
@@ -112,8 +114,9 @@ fn geometry(checks: &mut Checks, profiles: &[StreamProfile], camera: &Camera) ->
 
 /// Polls until every stream has delivered `frames`.
 fn collect(stream: &mut dyn Stream, frames: usize) -> anyhow::Result<MemorySink> {
-    let (mut sink, streams) = (MemorySink::default(), stream.profiles().len());
-    let end = HostTime::now().plus(PATIENCE);
+    let mut sink = MemorySink::default();
+    let streams = stream.profiles().len();
+    let end = HostTime::now().plus(TIMEOUT);
     while (0..streams).any(|s| sink.delivered(s) < frames as u64) && HostTime::now() < end {
         if stream.poll(Duration::from_millis(500), &mut sink)? == Poll::End {
             break;
@@ -123,12 +126,11 @@ fn collect(stream: &mut dyn Stream, frames: usize) -> anyhow::Result<MemorySink>
 }
 
 fn all_streams(checks: &mut Checks, backend: &L515Backend, camera: &Camera) -> anyhow::Result<()> {
-    let size = (640, 480);
     let requests = [
-        request("depth", size, None)?,
-        request("ir", size, None)?,
-        request("confidence", size, None)?,
-        request("color", size, Some(PixelFormat::Yuyv))?,
+        request("depth", None)?,
+        request("ir", None)?,
+        request("confidence", None)?,
+        request("color", Some(PixelFormat::Yuyv))?,
     ];
     let mut stream = backend.open(Some(camera.serial()))?.start(&requests)?;
     let sink = collect(stream.as_mut(), FRAMES)?;
@@ -139,7 +141,9 @@ fn all_streams(checks: &mut Checks, backend: &L515Backend, camera: &Camera) -> a
         // The kernel does not list the L515 among the cameras whose blocks it hands over.
         checks.equal(&format!("{name}: times are those of the header"), p.metadata, MetadataLevel::Header);
         checks.equal(&format!("{name}: nothing is dropped"), sink.drops_of(at).total(), 0);
-        let (mut equal, mut seen, mut off) = (0, 0, 0i64);
+        let mut equal = 0;
+        let mut seen = 0;
+        let mut off = 0i64;
         for (_, meta, pixels) in sink.frames.iter().filter(|(s, ..)| *s == at) {
             let upright = if name == "confidence" { packed(pixels, 640) } else { pixels.clone() };
             let stamp = Stamp::read(&upright).with_context(|| format!("{name}: a frame without a stamp"))?;
@@ -160,7 +164,7 @@ fn all_streams(checks: &mut Checks, backend: &L515Backend, camera: &Camera) -> a
         checks.that(&format!("{name}: capture times"), off < 60_000_000, format!("off by at most {off} ns"));
     }
     let before = camera.accounts("ir")?.sent;
-    let mut stream = backend.open(None)?.start(&[request("depth", size, None)?])?;
+    let mut stream = backend.open(None)?.start(&[request("depth", None)?])?;
     let sink = collect(stream.as_mut(), FRAMES)?;
     drop(stream);
     checks.that("depth alone comes", sink.delivered(0) >= FRAMES as u64, sink.delivered(0));
@@ -170,13 +174,14 @@ fn all_streams(checks: &mut Checks, backend: &L515Backend, camera: &Camera) -> a
     Ok(())
 }
 
-/// Pixel (x, y) of a picture of rows of `width` pixels back to row `width - 1 - x`, column `height - 1 - y`.
+/// Pixel (x, y) of an image of rows of `width` pixels back to row `width - 1 - x`, column `height - 1 - y`.
 pub fn turned_back(upright: &[u8], width: usize, bytes: usize) -> Vec<u8> {
     let height = upright.len() / (width * bytes);
     let mut wire = vec![0; upright.len()];
     for y in 0..height {
         for x in 0..width {
-            let (from, to) = ((y * width + x) * bytes, ((width - 1 - x) * height + height - 1 - y) * bytes);
+            let from = (y * width + x) * bytes;
+            let to = ((width - 1 - x) * height + height - 1 - y) * bytes;
             wire[to..to + bytes].copy_from_slice(&upright[from..from + bytes]);
         }
     }
@@ -193,11 +198,13 @@ pub fn packed(pixels: &[u8], width: usize) -> Vec<u8> {
 
 /// Colour as Y411, which the camera calls NV12.
 fn y411(checks: &mut Checks, backend: &L515Backend, camera: &Camera) -> anyhow::Result<()> {
-    let wanted = request("color", (640, 480), Some(PixelFormat::Nv12))?;
+    let wanted = request("color", Some(PixelFormat::Nv12))?;
     let mut stream = backend.open(None)?.start(&[wanted])?;
     let sink = collect(stream.as_mut(), FRAMES)?;
     drop(stream);
-    let (mut equal, width, height) = (0, 640, 480);
+    let mut equal = 0;
+    let width = 640;
+    let height = 480;
     for (_, _, pixels) in &sink.frames {
         let luma = |x: usize, y: usize| pixels[y * width + x];
         let chroma = |x: usize, y: usize| pixels[width * height + y / 2 * width + x];
@@ -230,7 +237,8 @@ fn unplugged(
     let sink = collect(stream.as_mut(), 2)?;
     checks.that("depth and colour by default", sink.delivered(0) >= 2 && sink.delivered(1) >= 2, "");
     camera.unplug()?;
-    let (mut sink, end) = (MemorySink::default(), HostTime::now().plus(PATIENCE));
+    let mut sink = MemorySink::default();
+    let end = HostTime::now().plus(TIMEOUT);
     let error = loop {
         match stream.poll(Duration::from_millis(200), &mut sink) {
             Err(e) => break Some(e),
@@ -244,7 +252,7 @@ fn unplugged(
     let gone = backend.open(None).map(|_| ()).expect_err("it is not there");
     checks.that("it cannot be opened then", gone.kind() == ErrorKind::NotFound, &gone);
     camera.replug()?;
-    checks.that("plugged in again, its nodes come back", system::wait_until(PATIENCE, &there), "");
+    checks.that("plugged in again, its nodes come back", system::wait_until(TIMEOUT, &there), "");
     let mut stream = backend.open(Some(camera.serial()))?.start(&[])?;
     let sink = collect(stream.as_mut(), 2)?;
     checks.that("and it streams again", sink.delivered(0) >= 2, sink.delivered(0));

@@ -1,5 +1,5 @@
-//! Intel's own library against the emulated cameras: what it reports of one is held against what depthrig's driver reports of
-//! the same camera, and both against what the emulator knows. It is code that nobody of depthrig wrote, so that an assumption
+//! Intel's own library against the emulated cameras: its reports are compared with those of depthrig's driver for
+//! the same camera, and both with the emulator's truth. The library is independent of depthrig, so that an assumption
 //! which emulator and driver share does not go unnoticed.
 
 mod frames;

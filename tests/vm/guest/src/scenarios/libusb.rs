@@ -14,7 +14,7 @@ use depthrig_drivers::realsense::protocol::gvd::Gvd;
 use depthrig_drivers::usb::{self, SysRoot, UsbDevice};
 use depthrig_drivers::uvc::control::ControlPort;
 use depthrig_drivers::uvc::formats::FourCc;
-use depthrig_drivers::video::PictureSource;
+use depthrig_drivers::video::ImageSource;
 use depthrig_drivers::{Error, ErrorKind};
 use depthrig_emulator as emulator;
 use emulator::content::STAMP;
@@ -36,7 +36,7 @@ pub const SCENARIO: Scenario = Scenario {
     run,
 };
 
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Streaming interface, format and the emulator's name of a D435's streams.
 const DEPTH: (u8, FourCc, &str) = (1, FourCc::Z16, "depth");
@@ -59,7 +59,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     faults::unplug(checks, &device, truth, camera)
 }
 
-/// What every scenario here needs of the kernel.
+/// Loads the kernel modules that every scenario here needs.
 fn load() -> anyhow::Result<()> {
     system::modprobe("vhci-hcd", &[])?;
     system::modprobe("uvcvideo", &[])
@@ -72,7 +72,7 @@ fn usb_device(device: &emulator::Camera) -> anyhow::Result<UsbDevice> {
 }
 
 fn nodes_become(count: usize) -> bool {
-    system::wait_until(PATIENCE, || system::video_nodes().is_ok_and(|nodes| nodes.len() == count))
+    system::wait_until(TIMEOUT, || system::video_nodes().is_ok_and(|nodes| nodes.len() == count))
 }
 
 /// The smallest mode of both streams: every byte that moves costs the host.
@@ -80,7 +80,7 @@ const fn small((interface, format, _): (u8, FourCc, &str)) -> StreamMode {
     StreamMode { interface, format, width: 424, height: 240, rate_hz: 30.0 }
 }
 
-/// What the frames of a camera's streams hold behind their stamps, made once for each stream.
+/// Contents of the frames of a camera's streams behind their stamps, computed once for each stream.
 #[derive(Default)]
 struct Truth(BTreeMap<String, Vec<u8>>);
 
@@ -97,7 +97,7 @@ impl Truth {
     }
 }
 
-/// A picture that came: everything but the pixels, which are compared at once.
+/// An image that came: everything but the pixels, which are compared at once.
 struct Seen {
     source: usize,
     sequence: u64,
@@ -108,7 +108,7 @@ struct Seen {
     damaged: bool,
 }
 
-/// Takes pictures of `streams` until `frames` have come of each, or patience ends.
+/// Takes images of `streams` until `frames` have come of each, or timeout ends.
 fn take(
     device: &emulator::Camera,
     truth: &mut Truth,
@@ -117,18 +117,18 @@ fn take(
     frames: usize,
 ) -> Result<Vec<Seen>, Error> {
     let mut seen: Vec<Seen> = Vec::new();
-    let end = HostTime::now().plus(PATIENCE);
+    let end = HostTime::now().plus(TIMEOUT);
     let all_here =
         |seen: &[Seen]| (0..streams.len()).all(|s| seen.iter().filter(|p| p.source == s).count() >= frames);
     while !all_here(&seen) && HostTime::now() < end {
-        source.poll(Duration::from_millis(100), &mut |picture| {
+        source.poll(Duration::from_millis(100), &mut |image| {
             seen.push(Seen {
-                source: picture.source,
-                sequence: picture.sequence,
-                index: truth.index(device, streams[picture.source], picture.bytes),
-                bytes: picture.bytes.len(),
-                header: picture.header.map_or(0, <[u8]>::len),
-                damaged: picture.damaged,
+                source: image.source,
+                sequence: image.sequence,
+                index: truth.index(device, streams[image.source], image.bytes),
+                bytes: image.bytes.len(),
+                header: image.header.map_or(0, <[u8]>::len),
+                damaged: image.damaged,
             });
         })?;
     }
@@ -146,7 +146,7 @@ fn identity(checks: &mut Checks, device: &emulator::Camera, camera: &Camera) -> 
     checks.equal("the extension unit says its length", port.length(3, 1)?, 1024);
     let kind = |result: Result<usize, Error>| result.err().map(|e| e.kind());
     let nothing = port.length(3, 0x7F);
-    checks.that("a control that is not there is told", nothing.is_err(), format!("{nothing:?}"));
+    checks.that("a missing control is reported", nothing.is_err(), format!("{nothing:?}"));
     checks.equal("and its kind", kind(nothing), Some(ErrorKind::Unsupported));
     checks.equal("a unit that is not there", kind(port.length(99, 1)), Some(ErrorKind::Unsupported));
     let second = Camera::open(&SysRoot::default(), &usb_device(device)?);

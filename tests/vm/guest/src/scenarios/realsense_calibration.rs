@@ -1,6 +1,6 @@
 //! The factory calibration as it comes out of the device, against the tables that the emulated camera was given.
 //!
-//! What is expected is computed here, from the tables' own numbers, and not by the functions of the driver.
+//! Expected values are computed here, from the tables' own numbers, and not by the functions of the driver.
 
 use crate::checks::Checks;
 use crate::subject::plug;
@@ -45,7 +45,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     refused(checks)
 }
 
-/// Everything that a camera says of itself when it is opened; `what` begins with its model.
+/// All data that a camera reports when it is opened; `what` begins with its model.
 fn read(
     checks: &mut Checks,
     camera: &Camera,
@@ -59,7 +59,8 @@ fn read(
     let said = (device.info().model.as_str(), device.info().serial.as_str());
     checks.equal(&format!("{what} says its model and serial number"), said, (model, camera.serial()));
     let given = camera.calibration();
-    let (stereo, rgb) = (given.coefficients.context("no table 25")?, given.rgb.context("no table 32")?);
+    let stereo = given.coefficients.context("no table 25")?;
+    let rgb = given.rgb.context("no table 32")?;
     let (depth_unit, depth) = stereo_of(device.profiles(), &stereo);
     let (colors, color) = color_of(device.profiles(), &rgb, model == "D405");
     checks.that(&format!("{what}: depth unit"), (depth_unit - depth_unit_m).abs() < 1e-12, depth_unit);
@@ -79,7 +80,7 @@ fn backend(camera: &Camera, transport: TransportChoice, allow_uncalibrated: bool
     })
 }
 
-/// How far what was read is from what was given at most, pixels, and over how many modes.
+/// The largest difference between read and given values, pixels, and the number of modes.
 #[derive(Default)]
 struct Off {
     pixels: f64,
@@ -111,7 +112,8 @@ impl core::fmt::Display for Off {
 
 /// Depth unit, and depth and infrared at the sizes that the table has an entry for.
 fn stereo_of(profiles: &[StreamProfile], table: &Coefficients) -> (f64, Off) {
-    let (mut unit, mut off) = (f64::NAN, Off::default());
+    let mut unit = f64::NAN;
+    let mut off = Off::default();
     for p in profiles.iter().filter(|p| p.stream.as_str() != "color") {
         if p.stream.as_str() == "depth" {
             unit = p.depth_unit_m;
@@ -129,15 +131,18 @@ fn color_of(profiles: &[StreamProfile], table: &RgbTable, is_d405: bool) -> (u32
     let mut off = Off::default();
     let k = table.k.map(f64::from);
     for p in profiles.iter().filter(|p| p.stream.as_str() == "color") {
-        let (w, h) = (f64::from(p.width), f64::from(p.height));
+        let w = f64::from(p.width);
+        let h = f64::from(p.height);
         let pixels = |[fx, px, fy, py]: [f64; 4], w: f64, h: f64| {
             [fx * w / 2.0, fy * h / 2.0, (1.0 + px) * w / 2.0, (1.0 + py) * h / 2.0]
         };
         let plain = [k[0], k[2], k[4], k[5]];
-        let (cw, ch) = (f64::from(table.calibrated.0), f64::from(table.calibrated.1));
+        let cw = f64::from(table.calibrated.0);
+        let ch = f64::from(table.calibrated.1);
         let wanted = match (is_d405, p.width, p.height) {
             (false, ..) => {
-                let (a, c) = (h / w, ch / cw);
+                let a = h / w;
+                let c = ch / cw;
                 let scaled = if a < c {
                     [k[0], k[2], k[4] * c / a, k[5] * c / a]
                 } else {
@@ -151,7 +156,8 @@ fn color_of(profiles: &[StreamProfile], table: &RgbTable, is_d405: bool) -> (u32
                     pixels([k[0], k[2], k[4] * ch / 800.0, k[5] * ch / 800.0], 1280.0, 800.0);
                 // 1280x800 to a width of 770, which is 481.25 high; the middle 480 rows, then 65 columns less.
                 let s = (770.0_f64 / 1280.0).max(480.0 / 800.0);
-                let (left, top) = ((1280.0 * s - 770.0) / 2.0, (800.0 * s - 480.0) / 2.0);
+                let left = (1280.0 * s - 770.0) / 2.0;
+                let top = (800.0 * s - 480.0) / 2.0;
                 [fx * s, fy * s, cx * s - left - 65.0, cy * s - top]
             }
             (true, ..) => {
@@ -171,10 +177,8 @@ fn color_of(profiles: &[StreamProfile], table: &RgbTable, is_d405: bool) -> (u32
 /// Where colour and the right imager are, seen from depth: `p_depth = Mᵀ p_color − 0.001 T`, with M row after row.
 fn poses(checks: &mut Checks, name: &str, profiles: &[StreamProfile], stereo: &Coefficients, rgb: &RgbTable) {
     let pose = |stream: &str| profiles.iter().find(|p| p.stream.as_str() == stream).map(|p| p.pose_in_device);
-    let (m, t) = (
-        nearest_rotation(rgb.rectified_rotation.map(f64::from)),
-        rgb.rectified_translation_mm.map(f64::from),
-    );
+    let m = nearest_rotation(rgb.rectified_rotation.map(f64::from));
+    let t = rgb.rectified_translation_mm.map(f64::from);
     let color = |p: [f64; 3]| {
         core::array::from_fn(|i| (0..3).map(|j| m[3 * j + i] * p[j]).sum::<f64>() - 0.001 * t[i])
     };
@@ -214,7 +218,8 @@ fn nearest_rotation(m: [f64; 9]) -> [f64; 9] {
 fn farthest(pose: &Pose, wanted: &dyn Fn([f64; 3]) -> [f64; 3]) -> f64 {
     let points = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]];
     let off = |p: [f64; 3]| {
-        let (a, b) = (PoseExt::transform_point(pose, p.into()).to_array(), wanted(p));
+        let a = PoseExt::transform_point(pose, p.into()).to_array();
+        let b = wanted(p);
         a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
     };
     points.into_iter().map(off).fold(0.0, f64::max)

@@ -89,7 +89,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// What the camera's clock shows now: its newest frame's time, and what has gone by since its capture.
+/// The camera's clock now: the time of its newest frame plus the time since its capture.
 fn shown_us(camera: &Camera, stream: &mut dyn Stream) -> anyhow::Result<i64> {
     let mut tally = Tally::default();
     tally.poll_for(stream, Duration::from_millis(400))?;
@@ -103,7 +103,10 @@ fn shown_us(camera: &Camera, stream: &mut dyn Stream) -> anyhow::Result<i64> {
 /// (its own tests hold it to that on simulated clocks), and what a busy host makes of this emulated one.
 fn judge(checks: &mut Checks, camera: &Camera, when: &str, frames: &[Frame]) {
     let claimed = |f: &&Frame| !f.meta.flags.has(FrameFlags::TIME_UNCERTAIN);
-    let (mut judged, mut wrong, mut worst_us, mut claim_us) = (0, 0, 0.0_f64, 0.0_f64);
+    let mut judged = 0;
+    let mut wrong = 0;
+    let mut worst_us = 0.0_f64;
+    let mut claim_us = 0.0_f64;
     let mut which = String::new();
     let began = frames.first().map(|f| f.meta.arrival);
     for f in frames.iter().filter(claimed) {
@@ -114,7 +117,8 @@ fn judge(checks: &mut Checks, camera: &Camera, when: &str, frames: &[Frame]) {
         if off_ns.unsigned_abs() > f.meta.capture_uncertainty_ns {
             wrong += 1;
             let at_ms = began.map_or(0, |b| f.meta.arrival.since_ns(b) / 1_000_000);
-            let (off_us, claim_us) = (off_ns / 1000, f.meta.capture_uncertainty_ns / 1000);
+            let off_us = off_ns / 1000;
+            let claim_us = f.meta.capture_uncertainty_ns / 1000;
             let _ = write!(
                 which,
                 "; {name} at {at_ms} ms, epoch {}: {off_us} of {claim_us} µs",

@@ -1,5 +1,5 @@
 //! The conformance suite on emulated cameras: a D435 behind the kernel's own driver and through libusb, and a camera that is
-//! nothing but a USB video camera by the back end `v4l2`.
+//! nothing but a USB video camera by the backend `v4l2`.
 
 use crate::checks::Checks;
 use crate::subject::{Emulated, Way};
@@ -27,17 +27,17 @@ pub const LIBUSB: Scenario = Scenario {
     run: through_libusb,
 };
 
-/// The same by the back end for any camera.
+/// The same by the backend for any camera.
 pub const V4L2: Scenario = Scenario {
     name: "v4l2-conformance",
-    about: "the conformance suite on a plain USB camera by the back end v4l2: YUYV and Z16",
+    about: "the conformance suite on a plain USB camera by the backend v4l2: YUYV and Z16",
     cost: 6,
     limit_s: 300,
     needs: "",
     run: by_v4l2,
 };
 
-/// What each way cannot show, and no more.
+/// Cases that each transport cannot show; all others must pass.
 const NOT_APPLICABLE: [&str; 6] = ["half_frame", "wrong_size", "damaged", "repeated", "hang", "motion"];
 const NOT_THROUGH_LIBUSB: [&str; 2] = ["hang", "motion"];
 

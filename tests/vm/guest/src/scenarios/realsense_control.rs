@@ -1,4 +1,4 @@
-//! What a rig asks of a D435 reaches it, what the kernel withholds is said, and controls that hang do not stop pictures.
+//! Settings of a rig reach a D435, data that the kernel withholds is reported, and hanging controls do not stop images.
 
 mod presets;
 
@@ -54,7 +54,7 @@ fn start(config: RealsenseConfig) -> depthrig_drivers::Result<Box<dyn Stream>> {
     RealsenseBackend::new(config).open(None)?.start(&requests)
 }
 
-/// The nodes of depth and colour, for looking behind the back end.
+/// The nodes of depth and colour, for looking behind the backend.
 fn nodes(camera: &Camera) -> anyhow::Result<(Node, Node)> {
     let port = camera.port_path();
     let devices = usb::scan(&SysRoot::default())?;
@@ -69,7 +69,7 @@ fn nodes(camera: &Camera) -> anyhow::Result<(Node, Node)> {
     }
 }
 
-/// Settings are in the camera afterwards; impossible ones are refused with what it takes.
+/// Settings are in the camera afterwards; invalid ones are refused with the accepted values.
 fn settings(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
     let color = [
         ("white_balance_automatic".to_owned(), ControlValue::Boolean(false)),
@@ -188,7 +188,7 @@ fn hanging_controls(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> 
     Ok(())
 }
 
-/// What was delivered and lost is what the camera sent, frame by frame.
+/// Delivered and lost frames add up to those that the camera sent, frame by frame.
 fn accounts(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
     const STREAMS: [&str; 2] = ["depth", "color"];
     let at_start: Vec<_> = STREAMS.iter().map(|s| camera.accounts(s)).collect::<Result<_, _>>()?;
@@ -203,7 +203,7 @@ fn accounts(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
         }
         tally.poll_for(stream.as_mut(), SECOND)?;
     }
-    // What it does not send from here on, nobody can miss. An odd number of skipped frames would cost one more: the
+    // Frames not sent from here on are not counted. An odd number of skipped frames would cost one more: the
     // emulator's frame bit follows its counter, and uvcvideo takes two alike for one frame.
     let skipped: Vec<_> =
         STREAMS.iter().map(|s| camera.accounts(s).map(|a| a.skipped)).collect::<Result<_, _>>()?;
@@ -211,9 +211,10 @@ fn accounts(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
     camera.fault(Fault::Silence)?;
     tally.poll_for(stream.as_mut(), SECOND)?;
     for (i, name) in STREAMS.iter().enumerate() {
-        let (now, then) = (camera.accounts(name)?, at_start[i]);
+        let now = camera.accounts(name)?;
+        let then = at_start[i];
         let good = now.good - then.good;
-        checks.equal(&format!("{name}: delivered are all that came whole"), tally.of(i).count() as u64, good);
+        checks.equal(&format!("{name}: all complete frames are delivered"), tally.of(i).count() as u64, good);
         let damaged = (now.error_bit - then.error_bit) + (now.short - then.short) + (now.long - then.long);
         let skipped = skipped[i] - then.skipped;
         checks.equal(&format!("{name}: the camera spoiled and skipped"), (damaged, skipped), (5, 4));

@@ -108,9 +108,9 @@ fn silent(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
     let samples = samples(&sink, 1);
     let gaps: Vec<_> = samples.windows(2).filter(|w| w[1].sequence > w[0].sequence + 1).collect();
     let gap_us = |w: &[MotionSample]| w[1].device_time - w[0].device_time;
-    let told = gaps.iter().map(|w| gap_us(w)).collect::<Vec<_>>();
+    let lengths = gaps.iter().map(|w| gap_us(w)).collect::<Vec<_>>();
     let [gap] = gaps[..] else {
-        checks.that("a silent IMU is switched off and on again", false, format!("gaps of {told:?} us"));
+        checks.that("a silent IMU is switched off and on again", false, format!("gaps of {lengths:?} us"));
         return Ok(());
     };
     // Two seconds of silence, three to five until the kernel has taken their power away, and what it takes to switch them on.
@@ -144,7 +144,8 @@ fn alone(checks: &mut Checks, camera: &Camera, transport: TransportChoice) -> an
     }
     drop(stream);
     let truth = camera.imu_samples();
-    let (mut certain, mut beyond) = (0, 0);
+    let mut certain = 0;
+    let mut beyond = 0;
     for (_, meta, bytes) in &sink.frames {
         for sample in MotionSample::all_in(bytes).filter(|_| !meta.flags.has(FrameFlags::TIME_UNCERTAIN)) {
             let is_it = |s: &&depthrig_emulator::ImuSample| {
@@ -173,7 +174,7 @@ fn rig(camera: &Camera, streams: &str) -> anyhow::Result<String> {
 const DEPTH: &str = "[[camera.stream]]\nname = \"depth\"\nwidth = 424\nheight = 240\nrate_hz = 30.0\n";
 const IMU: &str = "[[camera.stream]]\nname = \"imu\"\n";
 
-/// What the status says of a silence, and what a dataset says of the samples.
+/// The status reports a silent IMU, and a dataset describes its samples.
 fn recorded(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
     let daemon = Daemon::start(&rig(camera, &format!("{DEPTH}{IMU}"))?)?;
     daemon.wait_until_streaming()?;

@@ -1,4 +1,4 @@
-//! Infrared of a D435: the left imager's own picture, and both imagers out of one interleaved frame, beside depth.
+//! Infrared of a D435: the left imager's own image, and both imagers out of one interleaved frame, beside depth.
 
 use crate::checks::Checks;
 use crate::subject::{plug, small};
@@ -22,7 +22,7 @@ pub const SCENARIO: Scenario = Scenario {
 };
 
 const FRAMES: u64 = 5;
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 const STARTS: u32 = 2;
 
 fn run(checks: &mut Checks) -> anyhow::Result<()> {
@@ -52,8 +52,8 @@ fn streams(
         sink = MemorySink::default();
         let mut stream = RealsenseBackend::new(config.clone()).open(None)?.start(&requests)?;
         let grey = stream.profiles().iter().filter(|p| p.format == PixelFormat::Mono8).count();
-        checks.equal(&format!("{what}: grey pictures"), grey, names.len() - 1);
-        let end = HostTime::now().plus(PATIENCE);
+        checks.equal(&format!("{what}: grey images"), grey, names.len() - 1);
+        let end = HostTime::now().plus(TIMEOUT);
         let short = |sink: &MemorySink| (0..names.len()).any(|i| sink.delivered(i) < FRAMES);
         while short(&sink) && HostTime::now() < end {
             stream.poll(Duration::from_millis(100), &mut sink)?;
@@ -63,19 +63,20 @@ fn streams(
             break;
         }
         // The daemon opens a silent stream again, and so does this, which is about the bytes.
-        let told: Vec<_> = (0..names.len()).map(|i| (sink.delivered(i), sink.drops_of(i))).collect();
+        let counts: Vec<_> = (0..names.len()).map(|i| (sink.delivered(i), sink.drops_of(i))).collect();
         let sent: Vec<_> = ["depth", "ir"].iter().map(|s| camera.accounts(s)).collect();
-        checks.note(format!("{what}: start {start} was short: {told:?}; the camera: {sent:?}"));
+        checks.note(format!("{what}: start {start} was short: {counts:?}; the camera: {sent:?}"));
     }
     for (i, name) in names.iter().enumerate() {
         checks.that(&format!("{what}: frames of {name}"), sink.delivered(i) >= FRAMES, sink.delivered(i));
         checks.equal(&format!("{what}: {name} loses none"), sink.drops_of(i).total(), 0);
     }
-    let (mut wrong, mut formats) = (Vec::new(), Vec::new());
+    let mut wrong = Vec::new();
+    let mut formats = Vec::new();
     // Of the first frames of each stream: to make one again costs more than to send it.
     for (i, name) in names.iter().enumerate() {
         for (_, meta, pixels) in sink.frames.iter().filter(|f| f.0 == i).take(FRAMES as usize) {
-            let index = Stamp::read(pixels).context("a picture without a stamp")?.index;
+            let index = Stamp::read(pixels).context("an image without a stamp")?.index;
             let source = if *name == "depth" { "depth" } else { "ir" };
             let sent = camera.expected(source, index)?;
             let mode = camera.mode(source, index)?;
@@ -93,7 +94,7 @@ fn streams(
         }
     }
     checks.equal(&format!("{what}: the imagers send"), formats, vec![format]);
-    checks.equal(&format!("{what}: pictures that differ from what was sent"), wrong.join(", "), "");
+    checks.equal(&format!("{what}: images that differ from what was sent"), wrong.join(", "), "");
     // Halves of one frame have one number and one time; the two imagers do not see the same.
     let of = |i: usize| sink.frames.iter().filter(move |f| f.0 == i);
     if names.len() == 3 {

@@ -55,7 +55,8 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     checks.equal("in the same port", mount.cameras[VICTIM].port_path(), port);
 
     let recording = daemon.record_stop()?;
-    let (feed, victim_feed) = (feed.end()?, victim_feed.end()?);
+    let feed = feed.end()?;
+    let victim_feed = victim_feed.end()?;
     let status = daemon.status()?;
     checks.equal("the daemon counts each return", victim(&status)?.reconnects, TIMES);
     mount::check_feed(checks, &feed, 100);
@@ -103,7 +104,7 @@ fn check_victim(checks: &mut Checks, mount: &Mount, feed: &[Watched]) -> anyhow:
         let accounts = mount.accounts(&watched.id)?;
         let frames = watched.frames.len() as u64;
         let detail = format!("{frames} seen of {} sent", accounts.good);
-        // What was on its way when the plug was pulled is lost: a few frames each time.
+        // Frames on their way when the plug is pulled are lost: a few each time.
         let plausible = frames <= accounts.good && frames + (TIMES + 1) * 5 >= accounts.good;
         checks.that(
             &format!("{}: frames come once, in order", watched.id),

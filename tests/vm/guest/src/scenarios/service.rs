@@ -1,4 +1,4 @@
-//! The service of `depthrig install` under the real systemd, where the host has it: what its sandbox allows and what it does
+//! The service of `depthrig install` under the real systemd, where the host has it: the permissions of its sandbox and its behaviour
 //! not, how it ends, comes back after a crash, and stays away after a configuration that cannot work.
 
 use crate::checks::Checks;
@@ -24,13 +24,13 @@ pub const SCENARIO: Scenario = Scenario {
 
 const SYSTEMD: &str = "/bin/systemd";
 const UDEVADM: &str = "/bin/udevadm";
-const PATIENCE: Duration = Duration::from_secs(20);
+const TIMEOUT: Duration = Duration::from_secs(20);
 /// The user that the service runs as.
 const USER: (&str, u32) = ("robot", 1000);
 const DATA: &str = "/var/lib/depthrig";
 const UNITS: &str = "/etc/systemd/system";
 const UNIT: &str = "depthrig.service";
-/// What a Debian system has of itself and the service refers to; nothing else is started.
+/// Targets of a Debian system that the service refers to; nothing else is started.
 const TARGETS: [&str; 4] = ["basic.target", "sysinit.target", "shutdown.target", "time-sync.target"];
 
 fn run(checks: &mut Checks) -> anyhow::Result<()> {
@@ -45,7 +45,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     rules()?;
     let _camera = Camera::plug("d435", Options::default())?;
     let six = || system::video_nodes().is_ok_and(|nodes| nodes.len() == 6);
-    checks.that("six nodes", system::wait_until(PATIENCE, six), "");
+    checks.that("six nodes", system::wait_until(TIMEOUT, six), "");
     system::run(Command::new(UDEVADM).args(["settle", "--timeout=10"]))?;
 
     let systemd = Systemd::start()?;
@@ -76,7 +76,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     checks.equal("whose the dataset is", fs::metadata(&dataset)?.uid(), USER.1);
     whole(checks, &systemd, "served")?;
 
-    // A crash: it comes back by itself and finishes what it left.
+    // A crash: it restarts by itself and finishes its recording.
     systemd.control(&["start", UNIT])?;
     systemd.streaming()?;
     systemd.depthrig(&["record", "start", "--name", "killed", "--force", "--json"])?;
@@ -86,7 +86,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     checks.that("killed, it is started again", wait_until(back), "");
     systemd.streaming()?;
     let finished = || !Path::new(DATA).join("datasets/killed/seg_0000.mcap.part").exists();
-    checks.that("and has finished what it left", system::wait_until(PATIENCE, finished), "");
+    checks.that("and has finished what it left", system::wait_until(TIMEOUT, finished), "");
     whole(checks, &systemd, "killed")?;
     systemd.control(&["stop", UNIT])?;
 
@@ -123,7 +123,7 @@ fn configure() -> anyhow::Result<()> {
         ),
     )?;
     system::run(Command::new("depthrig").args(["install", "--apply", "--user", name]))?;
-    // Only so that the scenario's log has what it says.
+    // Only for the scenario's log.
     let beside = Path::new(UNITS).join("depthrig.service.d");
     fs::create_dir_all(&beside)?;
     fs::write(beside.join("log.conf"), "[Service]\nStandardOutput=append:/log\nStandardError=append:/log\n")?;
@@ -142,13 +142,13 @@ fn rules() -> anyhow::Result<()> {
 
 /// Waits as `system::wait_until` does, asking less often: each question is a program that starts, which is slow here.
 fn wait_until(mut done: impl FnMut() -> bool) -> bool {
-    system::wait_until(PATIENCE, || {
+    system::wait_until(TIMEOUT, || {
         std::thread::sleep(Duration::from_millis(250));
         done()
     })
 }
 
-/// What the process may and what it may not.
+/// Checks the permissions of the process.
 fn sandbox(checks: &mut Checks, systemd: &Systemd) -> anyhow::Result<()> {
     let pid = served().context("the service has no process")?;
     let status = fs::read_to_string(format!("/proc/{pid}/status"))?;
@@ -221,7 +221,7 @@ fn whole(checks: &mut Checks, systemd: &Systemd, name: &str) -> anyhow::Result<(
         .flatten()
         .filter(|f| !matches!(f["severity"].as_str(), Some("note" | "lost")))
         .collect();
-    checks.that(&format!("\"{name}\" is whole"), broken.is_empty(), format!("{broken:?}"));
+    checks.that(&format!("\"{name}\" is complete"), broken.is_empty(), format!("{broken:?}"));
     Ok(())
 }
 

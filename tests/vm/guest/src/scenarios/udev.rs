@@ -23,7 +23,7 @@ pub const SCENARIO: Scenario = Scenario {
 };
 
 const UDEVADM: &str = "/bin/udevadm";
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 /// The group `video` of Debian.
 const VIDEO: u32 = 44;
 
@@ -39,12 +39,12 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     }
     let camera = Camera::plug("d455", Options::default())?;
     let six = || system::video_nodes().is_ok_and(|nodes| nodes.len() == 6);
-    checks.that("six nodes", system::wait_until(PATIENCE, six), "");
+    checks.that("six nodes", system::wait_until(TIMEOUT, six), "");
     let port = camera.port_path().context("a camera without a port")?;
     let power = format!("/sys/bus/usb/devices/{port}/power/control");
     checks.equal("without rules the kernel may put it to sleep", fs::read_to_string(&power)?.trim(), "auto");
     camera.unplug()?;
-    checks.that("it is gone", system::wait_until(PATIENCE, || !six()), "");
+    checks.that("it is gone", system::wait_until(TIMEOUT, || !six()), "");
 
     fs::create_dir_all("/etc")?;
     fs::write("/etc/group", format!("root:x:0:\nvideo:x:{VIDEO}:\n"))?;
@@ -56,7 +56,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     }
     system::run(Command::new("/bin/systemd-udevd").arg("--daemon"))?;
     camera.replug()?;
-    checks.that("six nodes again", system::wait_until(PATIENCE, six), "");
+    checks.that("six nodes again", system::wait_until(TIMEOUT, six), "");
     system::run(Command::new(UDEVADM).args(["settle", "--timeout=10"]))?;
 
     let modes = |path: &Path| fs::metadata(path).map(|m| (format!("{:o}", m.mode() & 0o777), m.gid()));

@@ -1,5 +1,5 @@
-//! Plain USB cameras under the daemon, by the back end `v4l2` and the kernel's `uvcvideo`: Motion JPEG kept and decoded,
-//! and depth. Every picture in the dataset is the one that was sent.
+//! Plain USB cameras under the daemon, by the backend `v4l2` and the kernel's `uvcvideo`: Motion JPEG kept and decoded,
+//! and depth. Every image in the dataset is the one that was sent.
 
 use crate::checks::Checks;
 use crate::daemon::{Daemon, drops};
@@ -63,9 +63,10 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let (ended, took) = daemon.stop()?;
     checks.that("SIGTERM ends it well", ended.success(), format!("{ended} after {took:?}"));
     let report = verify(&path, &VerifyOptions { decode: true, ..VerifyOptions::default() })?;
-    checks.that("the dataset is whole", report.is_whole(), format!("{:?}", report.findings));
+    checks.that("the dataset is complete", report.is_whole(), format!("{:?}", report.findings));
 
-    let (mut seen, mut off_ns) = (Seen::default(), 0);
+    let mut seen = Seen::default();
+    let mut off_ns = 0;
     for set in Dataset::open(&path)?.sets_with(SetRange::ALL, PixelMode::DecodedAndStored) {
         for frame in &set?.frames {
             let at = CAMERAS.iter().position(|(name, _)| *name == frame.header.camera());
@@ -78,11 +79,9 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
             }
         }
     }
-    for (what, tally) in [
-        ("depth", seen.depth),
-        ("JPEG pictures that are kept", seen.kept),
-        ("decoded pictures", seen.decoded),
-    ] {
+    for (what, tally) in
+        [("depth", seen.depth), ("JPEG images that are kept", seen.kept), ("decoded images", seen.decoded)]
+    {
         checks.that(
             &format!("{what}: each is the one that was sent"),
             tally.1 == 0 && tally.0 >= recording.sets - 2,
@@ -118,7 +117,7 @@ impl Seen {
                 (&mut self.kept, *jpeg == camera.expected("color", index)?, Some(index))
             }
             PixelFormat::Rgb8 => {
-                // The comment with the stamp is gone with the JPEG; all of a camera's pictures are one.
+                // The comment with the stamp is gone with the JPEG; all of a camera's images are one.
                 let mode = camera.mode("color", 0)?;
                 let painted = content::painted(camera.serial(), 0, &mode);
                 let near = frame.pixels.iter().zip(&painted).all(|(a, b)| a.abs_diff(*b) <= NEAR);

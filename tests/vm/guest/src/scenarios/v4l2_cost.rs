@@ -1,4 +1,4 @@
-//! What taking a picture costs, in instructions: `depthrig bench capture` on a virtual camera. One nanosecond of guest
+//! Cost of capturing an image, in instructions: `depthrig bench capture` on a virtual camera. One nanosecond of guest
 //! time is one instruction, so the ratio is the same whatever the host does.
 //!
 //! The guest's processor has neither AVX nor quick string moves (README.md beside `run`), so that glibc takes its copy for
@@ -30,9 +30,12 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let costs = report["costs"].as_array().context("costs")?;
     checks.equal("two formats in three ways are measured", costs.len(), 6);
     for cost in costs {
-        let (format, way) = (cost["format"].as_str().unwrap_or(""), cost["way"].as_str().unwrap_or(""));
-        let (us, ratio, copies) = (&cost["median_us"], &cost["ratio"], &cost["copies"]);
-        checks.note(format!("{format} {way}: {us} us of CPU a picture, {ratio} x, {copies} copies"));
+        let format = cost["format"].as_str().unwrap_or("");
+        let way = cost["way"].as_str().unwrap_or("");
+        let us = &cost["median_us"];
+        let ratio = &cost["ratio"];
+        let copies = &cost["copies"];
+        checks.note(format!("{format} {way}: {us} us of CPU an image, {ratio} x, {copies} copies"));
         let wanted = if way == "userptr" { 0.0 } else { 1.0 };
         checks.equal(&format!("{format} {way}: copies"), copies.as_f64(), Some(wanted));
         let cheap = ratio.as_f64().is_some_and(|r| r > 0.0 && r <= 1.2);

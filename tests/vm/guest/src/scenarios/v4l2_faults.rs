@@ -1,5 +1,4 @@
-//! Every fault that vivid can be told to have, through the back end `v4l2`: what the driver says, and that the accounts are
-//! exact.
+//! Every fault that vivid can inject, through the backend `v4l2`: the driver's report, and exact accounts.
 
 use crate::Scenario;
 use crate::checks::Checks;
@@ -9,14 +8,14 @@ use depthrig_bus::{DropReason, HostTime, PixelFormat};
 use depthrig_drivers::v4l2::{
     DEFAULT_BUFFERS, FourCc, Interval, MemoryChoice, MetadataFormat, Mode, Node, Source, V4l2Config, Wanted,
 };
-use depthrig_drivers::video::PictureSource;
+use depthrig_drivers::video::ImageSource;
 use depthrig_drivers::{Error, ErrorKind, MemorySink};
 use std::time::Duration;
 
 /// See the module.
 pub const SCENARIO: Scenario = Scenario {
     name: "v4l2-faults",
-    about: "vivid's faults through the back end v4l2: error flags, lost buffers, refusals, a fatal error, unplug",
+    about: "vivid's faults through the backend v4l2: error flags, lost buffers, refusals, a fatal error, unplug",
     cost: 2,
     limit_s: 90,
     needs: "",
@@ -42,7 +41,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
 fn take(memory: MemoryChoice, n: usize, count: u64, each: impl FnMut(&MemorySink)) -> anyhow::Result<Taken> {
     let config =
         V4l2Config { memory, clock: depthrig_drivers::v4l2::ClockChoice::Kernel, ..vivid::config(n) };
-    let stream = vivid::start(config, &vivid::request(PixelFormat::Yuyv, SIZE)?)?;
+    let stream = vivid::start(config, &vivid::request(PixelFormat::Yuyv)?)?;
     vivid::take(stream, MemorySink::lending(), count, each)
 }
 
@@ -53,7 +52,7 @@ fn at<'a>(frames: u64, mut then: impl FnMut() -> Result<(), Error> + 'a) -> impl
         if !done && sink.delivered(0) >= frames {
             done = true;
             if let Err(e) = then() {
-                println!("the fault could not be made: {e}");
+                println!("the fault could not be injected: {e}");
             }
         }
     }
@@ -152,7 +151,7 @@ fn refusals(checks: &mut Checks, memory: MemoryChoice) -> anyhow::Result<()> {
     let taken = take(memory, 0, 30, queue)?;
     let said = taken.end.as_ref().map(ToString::to_string).unwrap_or_default();
     checks.that(
-        &format!("{memory:?}: a buffer that is not taken back ends the stream"),
+        &format!("{memory:?}: a buffer that is not taken backends the stream"),
         !said.is_empty(),
         said,
     );
@@ -188,7 +187,7 @@ fn fatal(checks: &mut Checks, memory: MemoryChoice) -> anyhow::Result<()> {
 
 /// A receiver that has no memory for a while, and one that never lends any.
 fn no_memory(checks: &mut Checks) -> anyhow::Result<()> {
-    let request = vivid::request(PixelFormat::Yuyv, SIZE)?;
+    let request = vivid::request(PixelFormat::Yuyv)?;
     let mut sink = MemorySink::lending();
     sink.refuse = 5;
     let taken = vivid::take(vivid::start(vivid::config(0), &request)?, sink, 10, |_| ())?;
@@ -206,7 +205,7 @@ fn no_memory(checks: &mut Checks) -> anyhow::Result<()> {
 }
 
 fn busy(checks: &mut Checks) -> anyhow::Result<()> {
-    let request = vivid::request(PixelFormat::Yuyv, SIZE)?;
+    let request = vivid::request(PixelFormat::Yuyv)?;
     let held = vivid::start(vivid::config(0), &request)?;
     let error = vivid::start(vivid::config(0), &request).err().context("two at once")?;
     checks.equal("a camera in use is busy", error.kind(), ErrorKind::Busy);
@@ -234,11 +233,12 @@ fn two_in_one_thread(checks: &mut Checks) -> anyhow::Result<()> {
     }
     let mut source = Source::start(wanted, DEFAULT_BUFFERS)?;
     checks.equal(
-        "the kernel's own metadata format is told",
+        "the kernel's own metadata format is reported",
         [source.metadata(0), source.metadata(1)],
         [MetadataFormat::Uvch; 2],
     );
-    let (mut seen, mut headers) = ([0u32; 2], [0u32; 2]);
+    let mut seen = [0u32; 2];
+    let mut headers = [0u32; 2];
     let until = HostTime::now().plus(Duration::from_secs(1));
     while !until.from_now().is_zero() {
         source.poll(Duration::from_millis(50), &mut |p| {
@@ -248,7 +248,7 @@ fn two_in_one_thread(checks: &mut Checks) -> anyhow::Result<()> {
     }
     let enough = seen.iter().all(|n| (28..=32).contains(n));
     checks.that("two cameras in one thread", enough, format!("{seen:?} in a second"));
-    checks.equal("each picture has its header", headers, seen);
+    checks.equal("each image has its header", headers, seen);
     Ok(())
 }
 

@@ -1,5 +1,5 @@
-//! The back end `v4l2` against vivid: cameras, formats, controls, times and copies, with the crate `v4l`'s own stream as
-//! the witness of what a picture must be.
+//! The backend `v4l2` against vivid: cameras, formats, controls, times and copies, with the crate `v4l`'s own stream as
+//! the witness of what an image must be.
 
 use crate::Scenario;
 use crate::checks::Checks;
@@ -15,7 +15,7 @@ use v4l::video::Capture;
 /// See the module.
 pub const SCENARIO: Scenario = Scenario {
     name: "v4l2-formats",
-    about: "vivid through the back end v4l2: every format to the byte, controls, clocks, one copy or none",
+    about: "vivid through the backend v4l2: every format to the byte, controls, clocks, one copy or none",
     cost: 1,
     limit_s: 60,
     needs: "",
@@ -53,7 +53,7 @@ fn cameras(checks: &mut Checks) -> anyhow::Result<()> {
     );
     let device = V4l2Backend::new(vivid::config(1)).open(None)?;
     checks.that("its modes are listed", device.profiles().len() > 50, device.profiles().len());
-    let request = vivid::request(PixelFormat::Rgb8, SIZE)?;
+    let request = vivid::request(PixelFormat::Rgb8)?;
     let error = device.start(&[request]).err().context("a format that it lacks")?;
     checks.equal("a mode that it lacks is refused", error.kind(), ErrorKind::Unsupported);
     Ok(())
@@ -87,13 +87,13 @@ fn controls(checks: &mut Checks) -> anyhow::Result<()> {
     set("brightness", ControlValue::Integer(128))?;
     let mut config = vivid::config(0);
     config.controls.push(("no_such".to_owned(), ControlValue::Boolean(true)));
-    let started = vivid::start(config, &vivid::request(PixelFormat::Yuyv, SIZE)?);
+    let started = vivid::start(config, &vivid::request(PixelFormat::Yuyv)?);
     let error = started.err().context("a bad control")?;
     checks.equal("a rig with an unknown control does not start", error.kind(), ErrorKind::BadInput);
     Ok(())
 }
 
-/// The picture that vivid paints, taken by other code than ours.
+/// The image that vivid paints, taken by other code than ours.
 fn witness(fourcc: [u8; 4]) -> anyhow::Result<Vec<u8>> {
     let node = vivid::capture_node(0)?;
     let device = v4l::Device::with_path(node.path())?;
@@ -103,7 +103,7 @@ fn witness(fourcc: [u8; 4]) -> anyhow::Result<Vec<u8>> {
     device.set_format(&format)?;
     let mut stream = v4l::io::mmap::Stream::with_buffers(&device, Type::VideoCapture, 4)?;
     let (bytes, described) = stream.next()?;
-    Ok(bytes.get(..described.bytesused as usize).context("a whole picture")?.to_vec())
+    Ok(bytes.get(..described.bytesused as usize).context("an incomplete image")?.to_vec())
 }
 
 fn formats(checks: &mut Checks) -> anyhow::Result<()> {
@@ -111,19 +111,19 @@ fn formats(checks: &mut Checks) -> anyhow::Result<()> {
     for (format, fourcc) in FORMATS {
         let wanted = witness(*fourcc)?;
         checks.that(
-            &format!("the {} picture is no plain one", format.name()),
+            &format!("the {} image is no plain one", format.name()),
             wanted.iter().any(|b| *b != wanted[0]),
             wanted.len(),
         );
         for memory in [MemoryChoice::Mmap, MemoryChoice::UserPointer] {
             let config = V4l2Config { memory, clock: ClockChoice::Kernel, ..vivid::config(0) };
             let before = unpack::copied_bytes();
-            let stream = vivid::start(config, &vivid::request(format, SIZE)?)?;
+            let stream = vivid::start(config, &vivid::request(format)?)?;
             let taken = vivid::take(stream, MemorySink::lending(), FRAMES, |_| ())?;
             let copied = unpack::copied_bytes() - before;
             let name = format!("{} {memory:?}", format.name());
             let equal = taken.sink.frames.iter().filter(|(_, _, pixels)| *pixels == wanted).count();
-            checks.equal(&format!("{name}: every picture is the witness's"), equal as u64, FRAMES);
+            checks.equal(&format!("{name}: every image is the witness's"), equal as u64, FRAMES);
             checks.that(
                 &format!("{name}: nothing is lost"),
                 taken.balances() && taken.sink.drops_of(0).total() == 0,
@@ -165,7 +165,7 @@ fn times(checks: &mut Checks, name: &str, taken: &Taken, domain: ClockDomain) {
 /// vivid's metadata node gives payload headers, but writes one byte of their time stamps and leaves the rest as it was: a
 /// clock that must not be believed, whatever is said of it.
 fn no_device_clock(checks: &mut Checks) -> anyhow::Result<()> {
-    let request = vivid::request(PixelFormat::Mono8, SIZE)?;
+    let request = vivid::request(PixelFormat::Mono8)?;
     for device_clock_hz in [None, Some(100_000_000)] {
         let config = V4l2Config { device_clock_hz, ..vivid::config(0) };
         let taken = vivid::take(vivid::start(config, &request)?, MemorySink::default(), FRAMES, |_| ())?;

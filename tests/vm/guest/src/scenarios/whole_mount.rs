@@ -4,8 +4,8 @@
 
 use crate::checks::Checks;
 use crate::daemon::{self, Daemon, streams};
-use crate::eyes::Eyes;
 use crate::mount::{Compared, Mount};
+use crate::stereo_reference::StereoReference;
 use crate::{Scenario, outside, system};
 use anyhow::Context;
 use depthrig_bus::{Bus, HostTime, RigName, StreamId};
@@ -14,7 +14,7 @@ use depthrig_daemon::status::RigStatus;
 use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode};
 use depthrig_drivers::zed::mode::Mode;
 use depthrig_emulator::{Camera, Stamp};
-use depthrig_kinect_fixture::{Fixture, Pattern, Pictures};
+use depthrig_kinect_fixture::{Fixture, Images, Pattern};
 use depthrig_recorder::{Dataset, PixelMode, SetRange, Severity, VerifyOptions, verify};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -31,17 +31,17 @@ pub const SCENARIO: Scenario = Scenario {
     run,
 };
 
-/// What is plugged in.
+/// Models that are plugged in.
 const MODELS: [&str; 6] = ["d405", "d415", "d435", "d455", "l515", "zed2i"];
 const KINECT: &str = "/tmp/kinect.mkv";
-/// Pictures of the recording, which is played again and again. To make one takes the guest half a second.
+/// Images of the recording, which is played again and again. To make one takes the guest half a second.
 const PLAYED: u32 = 3;
 /// The nearest that stereo looks for. Few disparities: the guest has one slow processor.
 const NEAR_M: f64 = 3.0;
-/// Depth pictures that are made once more, and pairs of eyes that are kept until theirs comes.
+/// Depth images that are recomputed, and stereo pairs that are kept until their depth comes.
 const COMPARED: usize = 2;
 const KEPT: usize = 24;
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 /// How long is recorded at least, and how many sets a second.
 const SECONDS: u64 = 3;
 /// Recorded sets that shall have depth by stereo, and how long is recorded at most until they do: how many pairs it has time
@@ -55,7 +55,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     system::modprobe("hid-generic", &[])?;
     let mount = Mount::plug(&MODELS, |_| 0)?;
     let cameras: BTreeMap<_, _> = MODELS.into_iter().zip(&mount.cameras).collect();
-    let mut pictures = kinect()?;
+    let mut images = kinect()?;
 
     let daemon = Daemon::start(&rig(&mount)?)?;
     let status = daemon.wait_until_settled()?;
@@ -65,7 +65,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let recording = daemon.record_stop()?;
     let before = status;
     let status = daemon.status()?;
-    checks.that("all of them still do", status.cameras.iter().all(streams), daemon::told(&status));
+    checks.that("all of them still do", status.cameras.iter().all(streams), daemon::summary(&status));
     books(checks, &daemon, &status)?;
     lost(checks, &before, &status);
     checks.that("sets are recorded", recording.sets >= SET_RATE_HZ * SECONDS - 1, recording.sets);
@@ -75,20 +75,20 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
 
     let report = verify(&path, &VerifyOptions { decode: true, ..VerifyOptions::default() })?;
     let broken: Vec<_> = report.findings.iter().filter(|f| f.severity > Severity::Lost).collect();
-    let what = "every picture of the dataset decodes, and it is what it says";
+    let what = "every image of the dataset decodes, and the dataset verifies";
     checks.that(what, broken.is_empty(), format!("{broken:?}"));
     for finding in &report.findings {
         checks.note(&finding.message);
     }
     stereo(checks, cameras["zed2i"], &pairs)?;
-    contents(checks, &cameras, &path, recording.frames, &Shown::new(&mut pictures))?;
-    if let Some(pictures) = outside::bring(SCENARIO.name, &path)? {
-        checks.note(format!("{pictures} pictures are brought to the host"));
+    contents(checks, &cameras, &path, recording.frames, &Shown::new(&mut images))?;
+    if let Some(images) = outside::bring(SCENARIO.name, &path)? {
+        checks.note(format!("{images} images are brought to the host"));
     }
     Ok(())
 }
 
-/// A recording of an Azure Kinect: 720p Motion JPEG and the binned narrow view, 5 Hz. Its pictures.
+/// A recording of an Azure Kinect: 720p Motion JPEG and the binned narrow view, 5 Hz. Its images.
 fn kinect() -> anyhow::Result<Pattern> {
     let color = ColorMode { format: ColorFormat::Mjpg, resolution: ColorResolution::P720 };
     let fixture = Fixture {
@@ -98,9 +98,9 @@ fn kinect() -> anyhow::Result<Pattern> {
         captures: PLAYED,
         ..Fixture::default()
     };
-    let mut pictures = Pattern::new(&fixture);
-    fixture.write(Path::new(KINECT), &mut pictures)?;
-    Ok(pictures)
+    let mut images = Pattern::new(&fixture);
+    fixture.write(Path::new(KINECT), &mut images)?;
+    Ok(images)
 }
 
 /// The rig file's part after the head that every scenario has.
@@ -165,7 +165,7 @@ fn books(checks: &mut Checks, daemon: &Daemon, status: &RigStatus) -> anyhow::Re
     checks.equal(&what, unbalanced.join(", "), "");
 
     let mut unread: BTreeSet<_> = all.into_iter().filter(|s| s.in_sets.unread > 0).map(|s| s.id).collect();
-    let end = HostTime::now().plus(PATIENCE);
+    let end = HostTime::now().plus(TIMEOUT);
     while !unread.is_empty() && HostTime::now() < end {
         std::thread::sleep(Duration::from_millis(20));
         for read in of(&daemon.status()?).iter().filter(|s| s.in_sets.unread == 0) {
@@ -182,26 +182,30 @@ fn lost(checks: &mut Checks, before: &RigStatus, after: &RigStatus) {
         let streams = status.cameras.iter().flat_map(|c| &c.streams);
         streams.map(|s| (s.id.clone(), s.dropped.values().sum())).collect()
     };
-    let (was, mut is) = (drops(before), drops(after));
+    let was = drops(before);
+    let mut is = drops(after);
     is.retain(|id, n| was.get(id) != Some(n));
     let skipped = is.remove("zed2i/depth_performance").unwrap_or_default();
     checks.note(format!("stereo had no time for {skipped} pairs"));
     checks.equal("no other stream has lost a frame since all streamed", is, BTreeMap::new());
 }
 
-/// Both eyes, and the depth that was made of them.
+/// Left and right image, and the depth computed from them.
 type Matched = ([Vec<u8>; 2], Vec<u8>);
 
-/// Takes the ZED's eyes and depth from the bus until enough is recorded; some depth pictures with the pair of each.
+/// Reads the ZED's images and depth from the bus until enough is recorded. Returns some depth images with their pairs.
 fn pairs(daemon: &Daemon) -> anyhow::Result<Vec<Matched>> {
     let bus = Bus::open(&daemon.runtime, &RigName::new(daemon::RIG)?)?;
     let subscribe =
-        |name| -> anyhow::Result<_> { Ok(bus.subscriber_within(&StreamId::new("zed2i", name)?, PATIENCE)?) };
-    let (mut left, mut right, mut depth) =
-        (subscribe("left")?, subscribe("right")?, subscribe("depth_performance")?);
+        |name| -> anyhow::Result<_> { Ok(bus.subscriber_within(&StreamId::new("zed2i", name)?, TIMEOUT)?) };
+    let mut left = subscribe("left")?;
+    let mut right = subscribe("right")?;
+    let mut depth = subscribe("depth_performance")?;
     let before = in_sets(daemon)?;
-    let (began, mut looked) = (HostTime::now(), 0);
-    let (mut eyes, mut pairs) = (BTreeMap::<u64, [Vec<u8>; 2]>::new(), Vec::new());
+    let began = HostTime::now();
+    let mut looked = 0;
+    let mut waiting = BTreeMap::<u64, [Vec<u8>; 2]>::new();
+    let mut pairs = Vec::new();
     loop {
         let passed = began.elapsed().as_secs();
         if passed > looked {
@@ -211,21 +215,21 @@ fn pairs(daemon: &Daemon) -> anyhow::Result<Vec<Matched>> {
                 return Ok(pairs);
             }
         }
-        for (i, eye) in [&mut left, &mut right].into_iter().enumerate() {
-            while let Some(frame) = eye.try_next()? {
-                let both = eyes.entry(frame.header().device_sequence).or_default();
+        for (i, side) in [&mut left, &mut right].into_iter().enumerate() {
+            while let Some(frame) = side.try_next()? {
+                let both = waiting.entry(frame.header().device_sequence).or_default();
                 both[i] = frame.pixels().to_vec();
             }
         }
         while let Some(frame) = depth.try_next()? {
             if let Some(pair) =
-                eyes.remove(&frame.header().device_sequence).filter(|_| pairs.len() < COMPARED)
+                waiting.remove(&frame.header().device_sequence).filter(|_| pairs.len() < COMPARED)
             {
                 pairs.push((pair, frame.pixels().to_vec()));
             }
         }
-        while eyes.len() > KEPT {
-            eyes.pop_first();
+        while waiting.len() > KEPT {
+            waiting.pop_first();
         }
         std::thread::sleep(Duration::from_millis(10));
     }
@@ -239,12 +243,14 @@ fn in_sets(daemon: &Daemon) -> anyhow::Result<u64> {
     Ok(depth.in_sets.used)
 }
 
-/// Makes depth once more of the pairs that it was made of.
+/// Recomputes depth from the pairs and compares it.
 fn stereo(checks: &mut Checks, zed: &Camera, pairs: &[Matched]) -> anyhow::Result<()> {
-    let mut by_hand = Eyes::new(&zed.calibration().zed_conf(), Mode::Vga, Preset::Performance, NEAR_M)?;
-    let (mut matched, mut seen) = (Tally::default(), 0);
+    let mut reference =
+        StereoReference::new(&zed.calibration().zed_conf(), Mode::Vga, Preset::Performance, NEAR_M)?;
+    let mut matched = Tally::default();
+    let mut seen = 0;
     for ([left, right], depth) in pairs {
-        let (wanted, pixels) = by_hand.depth(left, right)?;
+        let (wanted, pixels) = reference.depth(left, right)?;
         matched.add(*depth == wanted);
         seen += pixels;
     }
@@ -263,8 +269,10 @@ fn contents(
 ) -> anyhow::Result<()> {
     let dataset = Dataset::open(path)?;
     let session = dataset.session().clone();
-    let (mut found, mut compared) = (BTreeMap::<String, u64>::new(), Compared::default());
-    let (mut stamped, mut eyes) = (Tally::default(), Tally::default());
+    let mut found = BTreeMap::<String, u64>::new();
+    let mut compared = Compared::default();
+    let mut stamped = Tally::default();
+    let mut halves = Tally::default();
     let mut played = Tally::default();
     let mut beside: Vec<f64> = Vec::new();
     for set in dataset.sets_with(SetRange::ALL, PixelMode::DecodedAndStored) {
@@ -273,21 +281,22 @@ fn contents(
             let frame = set.frames.iter().find(|f| session.streams[f.stream].id.to_string() == name);
             frame.map(|f| f.header.capture_time_ns)
         };
-        if let (Some(eye), Some(depth)) = (captured("zed2i/left"), captured("zed2i/depth_performance")) {
-            beside.push((eye - depth).abs() as f64 / 1e6);
+        if let (Some(left), Some(depth)) = (captured("zed2i/left"), captured("zed2i/depth_performance")) {
+            beside.push((left - depth).abs() as f64 / 1e6);
         }
         for frame in &set.frames {
             let stream = &session.streams[frame.stream].id;
             *found.entry(stream.to_string()).or_default() += 1;
-            let (name, stream) = (stream.camera.as_str(), stream.stream.as_str());
+            let name = stream.camera.as_str();
+            let stream = stream.stream.as_str();
             match (name, stream) {
                 ("zed2i", "left" | "right") => {
-                    let stamp = Stamp::read(&frame.pixels).context("an eye without a stamp")?;
+                    let stamp = Stamp::read(&frame.pixels).context("an image without a stamp")?;
                     let sent = cameras[name].expected("stereo", stamp.index)?;
                     let row = sent.len() / frame.header.height as usize;
                     let at = if stream == "left" { 0 } else { row / 2 };
                     let half = sent.chunks_exact(row).flat_map(|r| &r[at..at + row / 2]);
-                    eyes.add(half.eq(&frame.pixels));
+                    halves.add(half.eq(&frame.pixels));
                 }
                 ("kinect", "depth") => played.add(shown.depth.contains(&frame.pixels)),
                 ("kinect", "color") => {
@@ -313,22 +322,22 @@ fn contents(
     checks.that("of the set's own pair, or of the one beside it", near, format!("{beside:?} ms apart"));
     compared.check(checks, "frames of D405, D415, D435 and D455 are those that were sent, byte by byte");
     stamped.check(checks, "frames of the L515 have their stamps");
-    eyes.check(checks, "both eyes of the ZED are those that were sent, byte by byte");
+    halves.check(checks, "left and right images of the ZED are those that were sent, byte by byte");
     played.check(checks, "depth and JPEGs of the Kinect are those of its recording, byte by byte");
     Ok(())
 }
 
-/// The pictures that the Kinect's recording shows again and again.
+/// The images that the Kinect's recording shows again and again.
 struct Shown {
     color: Vec<Vec<u8>>,
     depth: Vec<Vec<u8>>,
 }
 
 impl Shown {
-    fn new(pictures: &mut Pattern) -> Self {
+    fn new(images: &mut Pattern) -> Self {
         let all = 0..PLAYED;
-        let color = all.clone().map(|n| pictures.color(n)).collect();
-        let depth = all.map(|n| pictures.depth(n).iter().flat_map(|d| d.to_le_bytes()).collect());
+        let color = all.clone().map(|n| images.color(n)).collect();
+        let depth = all.map(|n| images.depth(n).iter().flat_map(|d| d.to_le_bytes()).collect());
         Self { color, depth: depth.collect() }
     }
 }

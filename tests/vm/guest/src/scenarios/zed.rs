@@ -1,4 +1,4 @@
-//! A ZED 2i under the kernel's drivers: serial, calibration, both eyes byte by byte, settings, motion unit, replug.
+//! A ZED 2i under the kernel's drivers: serial, calibration, both images byte by byte, settings, IMU, replug.
 
 use crate::checks::Checks;
 use crate::{Scenario, system};
@@ -10,7 +10,7 @@ use depthrig_drivers::v4l2::{ControlValue, Node};
 use depthrig_drivers::zed::command::Vendor;
 use depthrig_drivers::zed::hid::HidNode;
 use depthrig_drivers::zed::imu::NO_POSE;
-use depthrig_drivers::zed::mode::Eye;
+use depthrig_drivers::zed::mode::Side;
 use depthrig_drivers::zed::motion::Motion;
 use depthrig_drivers::zed::{CalibrationFile, ZedBackend, ZedConfig, find};
 use depthrig_drivers::{Backend, ErrorKind, MemorySink, StreamProfile, StreamRequest};
@@ -23,14 +23,14 @@ use std::time::Duration;
 /// See the module.
 pub const SCENARIO: Scenario = Scenario {
     name: "zed",
-    about: "a ZED 2i: serial, calibration, both eyes byte by byte, exposure and gain, motion unit, replug",
+    about: "a ZED 2i: serial, calibration, both images byte by byte, exposure and gain, IMU, replug",
     cost: 7,
     limit_s: 90,
     needs: "",
     run,
 };
 
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 const SERIAL: &str = "31234567";
 
 fn run(checks: &mut Checks) -> anyhow::Result<()> {
@@ -41,19 +41,19 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let there = || {
         let found = scan(&SysRoot::default()).map(|devices| find::cameras(&SysRoot::default(), &devices));
         found.is_ok_and(|f| {
-            let hidraw = |f: &find::Found| {
+            let hidraw = |f: &find::FoundCamera| {
                 f.motion.as_ref().is_some_and(|m| m.interfaces.iter().any(|i| !i.hidraw_nodes.is_empty()))
             };
             matches!(f.as_slice(), [f] if f.video.video_nodes().count() == 2 && hidraw(f))
         })
     };
-    checks.that("both halves are there and belong together", system::wait_until(PATIENCE, there), "");
+    checks.that("both halves are there and belong together", system::wait_until(TIMEOUT, there), "");
 
     let conf = PathBuf::from(format!("/tmp/SN{SERIAL}.conf"));
     std::fs::write(&conf, camera.calibration().zed_conf())?;
     identity(checks, &camera, &conf)?;
     for (size, frames) in [((672, 376), 12), ((1280, 720), 6)] {
-        eyes(checks, &camera, &conf, size, frames)?;
+        both_streams(checks, &camera, &conf, size, frames)?;
     }
     motion(checks)?;
     replug(checks, &camera, &conf, there)?;
@@ -84,11 +84,12 @@ fn identity(checks: &mut Checks, camera: &Camera, conf: &std::path::Path) -> any
     modes.sort();
     let unit = modes.iter().any(|m| m == "imu motion 400 Hz in batches of up to 16");
     checks.that(
-        "it lists its modes for each eye, and its motion unit",
+        "it lists its modes for left and right, and its IMU",
         unit && modes.len() == 21,
         modes.join(", "),
     );
-    let (mut pixels, mut poses): (f64, f64) = (0.0, 0.0);
+    let mut pixels: f64 = 0.0;
+    let mut poses: f64 = 0.0;
     for mode in camera.calibration().zed {
         let width = match mode.name {
             "2K" => 2208,
@@ -105,7 +106,8 @@ fn identity(checks: &mut Checks, camera: &Camera, conf: &std::path::Path) -> any
             pixels = read.zip(given).map(|(a, b)| (a - b).abs()).fold(pixels, f64::max);
             if name == "right" {
                 // p_right = R p_left − t, with R written out by Rodrigues' formula.
-                let (r, t) = (rodrigues(mode.rotation), DVec3::from_array(mode.translation_mm) / 1000.0);
+                let r = rodrigues(mode.rotation);
+                let t = DVec3::from_array(mode.translation_mm) / 1000.0;
                 for p in [DVec3::ZERO, DVec3::X, DVec3::new(0.3, -0.2, 2.0)] {
                     let in_right = r * p - t;
                     poses = poses.max((profile.pose_in_device.transform_point(in_right) - p).length());
@@ -114,20 +116,21 @@ fn identity(checks: &mut Checks, camera: &Camera, conf: &std::path::Path) -> any
         }
     }
     checks.that("intrinsics and distortion are those that it was given", pixels < 1e-6, pixels);
-    checks.that("and so is the right eye's pose", poses < 1e-9, poses);
+    checks.that("and so is the right camera's pose", poses < 1e-9, poses);
     Ok(())
 }
 
 fn rodrigues(r: [f64; 3]) -> DMat3 {
     let r = DVec3::from_array(r);
-    let (angle, k) = (r.length(), r.normalize_or_zero());
+    let angle = r.length();
+    let k = r.normalize_or_zero();
     let cross =
         DMat3::from_cols(DVec3::new(0.0, k.z, -k.y), DVec3::new(-k.z, 0.0, k.x), DVec3::new(k.y, -k.x, 0.0));
     DMat3::IDENTITY + cross * angle.sin() + cross * cross * (1.0 - angle.cos())
 }
 
-/// Streams both eyes with settings, and compares every frame with what was sent.
-fn eyes(
+/// Streams left and right with settings, and compares every frame with the one that was sent.
+fn both_streams(
     checks: &mut Checks,
     camera: &Camera,
     conf: &std::path::Path,
@@ -144,14 +147,14 @@ fn eyes(
     };
     let backend = backend(config);
     let device = backend.open(None)?;
-    let wanted = ["left", "right"].map(|eye| -> anyhow::Result<_> {
-        Ok(StreamRequest { size: Some(size), rate_hz: Some(30.0), ..StreamRequest::any(Name::new(eye)?) })
+    let wanted = ["left", "right"].map(|side| -> anyhow::Result<_> {
+        Ok(StreamRequest { size: Some(size), rate_hz: Some(30.0), ..StreamRequest::any(Name::new(side)?) })
     });
     let wanted = wanted.into_iter().collect::<anyhow::Result<Vec<_>>>()?;
     let mut stream = device.start(&wanted)?;
     let copied = depthrig_drivers::unpack::copied_bytes();
     let mut sink = MemorySink::default();
-    let end = HostTime::now().plus(PATIENCE);
+    let end = HostTime::now().plus(TIMEOUT);
     while sink.frames.len() < 2 * frames && HostTime::now() < end {
         stream.poll(Duration::from_millis(200), &mut sink)?;
     }
@@ -159,7 +162,7 @@ fn eyes(
     let delivered = sink.frames.iter().map(|f| f.2.len() as u64).sum::<u64>();
     let busy = backend.open(None)?.start(&wanted).err();
     checks.that(
-        &format!("{name}: a second one is told who holds it"),
+        &format!("{name}: a second one gets an error that names the holder"),
         busy.as_ref()
             .is_some_and(|e| e.kind() == ErrorKind::Busy && e.to_string().contains("this process itself")),
         busy.map(|e| e.to_string()).unwrap_or_default(),
@@ -167,12 +170,12 @@ fn eyes(
     // The settings are written on a thread of their own, 2 ms a command.
     let node = node_of_camera()?;
     let mut vendor = Vendor::new(Node::open(&node)?, "ZED")?;
-    let set = system::wait_until(PATIENCE, || vendor.gain(Eye::Right).ok() == Some(Some(80)));
+    let set = system::wait_until(TIMEOUT, || vendor.gain(Side::Right).ok() == Some(Some(80)));
     checks.that(&format!("{name}: gain is read back"), set, "");
-    for eye in Eye::BOTH {
+    for side in Side::BOTH {
         checks.equal(
-            &format!("{name}: exposure of the {eye:?} eye is read back"),
-            vendor.exposure(eye, 30.0)?,
+            &format!("{name}: exposure of the {side:?} image sensor is read back"),
+            vendor.exposure(side, 30.0)?,
             37,
         );
     }
@@ -181,11 +184,13 @@ fn eyes(
     let controls = node.controls()?;
     let brightness = controls.iter().find(|c| c.name == "brightness").context("no brightness")?;
     checks.equal(&format!("{name}: brightness is read back"), node.read_control(brightness)?, 6);
-    let told = stream.poll(Duration::from_millis(200), &mut sink);
-    checks.that(&format!("{name}: and the stream goes on"), told.is_ok(), format!("{told:?}"));
+    let polled = stream.poll(Duration::from_millis(200), &mut sink);
+    checks.that(&format!("{name}: and the stream goes on"), polled.is_ok(), format!("{polled:?}"));
     drop(stream);
 
-    let (mut equal, mut halves, mut pairs) = (0, 0, 0);
+    let mut equal = 0;
+    let mut halves = 0;
+    let mut pairs = 0;
     for pair in sink.frames.chunks_exact(2) {
         let [(0, left, left_pixels), (1, right, right_pixels)] = pair else { continue };
         let stamp = Stamp::read(left_pixels).context("a frame without a stamp")?;
@@ -199,7 +204,7 @@ fn eyes(
         pairs += usize::from(times && left.clock_domain == ClockDomain::Kernel);
     }
     checks.that(&format!("{name}: enough frames"), halves >= 2 * frames, halves);
-    checks.equal(&format!("{name}: eyes that are byte for byte what was sent"), equal, halves);
+    checks.equal(&format!("{name}: images that are byte for byte those that were sent"), equal, halves);
     checks.equal(&format!("{name}: pairs of one time, the kernel's"), pairs, halves / 2);
     checks.equal(&format!("{name}: each byte was copied once"), copied, delivered);
     let lost = [0, 1].map(|i| sink.drops_of(i).total());
@@ -230,7 +235,7 @@ fn node_of_camera() -> anyhow::Result<PathBuf> {
     anyhow::bail!("no capture node")
 }
 
-/// Records of the motion unit for longer than it stays awake by itself.
+/// Records of the IMU for longer than it stays awake by itself.
 fn motion(checks: &mut Checks) -> anyhow::Result<()> {
     let found = find::cameras(&SysRoot::default(), &scan(&SysRoot::default())?);
     let units = found.iter().filter_map(|f| f.motion.as_ref()).flat_map(|m| &m.interfaces);
@@ -238,7 +243,8 @@ fn motion(checks: &mut Checks) -> anyhow::Result<()> {
     let began = HostTime::now();
     let motion = Motion::start(Box::new(HidNode::open(node)?), "ZED")?;
     std::thread::sleep(Duration::from_secs(5));
-    let (tally, latest) = (motion.tally(), motion.latest());
+    let tally = motion.tally();
+    let latest = motion.latest();
     let expected = began.elapsed().as_secs_f64() * 400.0;
     let enough = (tally.records as f64 - expected).abs() < 0.05 * expected;
     checks.that("400 records a second come for 5 s", enough, format!("{tally:?}, {expected:.0} expected"));
@@ -268,7 +274,7 @@ fn replug(
     let port = camera.port_path();
     let mut stream = backend.open(Some(SERIAL))?.start(&small)?;
     let mut sink = MemorySink::default();
-    let first = HostTime::now().plus(PATIENCE);
+    let first = HostTime::now().plus(TIMEOUT);
     while sink.frames.is_empty() && HostTime::now() < first {
         stream.poll(Duration::from_millis(200), &mut sink)?;
     }
@@ -277,7 +283,7 @@ fn replug(
     let error = loop {
         match stream.poll(Duration::from_millis(100), &mut sink) {
             Err(e) => break Some(e),
-            Ok(_) if pulled.elapsed() > PATIENCE => break None,
+            Ok(_) if pulled.elapsed() > TIMEOUT => break None,
             Ok(_) => {}
         }
     };
@@ -290,11 +296,11 @@ fn replug(
     );
     drop(stream);
     camera.replug()?;
-    checks.that("plugged in again, both halves are back", system::wait_until(PATIENCE, there), "");
+    checks.that("plugged in again, both halves are back", system::wait_until(TIMEOUT, there), "");
     checks.equal("at the same port", camera.port_path(), port);
     let mut stream = backend.open(Some(SERIAL))?.start(&small)?;
     let mut sink = MemorySink::default();
-    let end = HostTime::now().plus(PATIENCE);
+    let end = HostTime::now().plus(TIMEOUT);
     while sink.frames.len() < 3 && HostTime::now() < end {
         stream.poll(Duration::from_millis(200), &mut sink)?;
     }
@@ -312,7 +318,7 @@ fn wrong_files(checks: &mut Checks) -> anyhow::Result<()> {
     std::fs::write("/tmp/bench.conf", "[LEFT_CAM_HD]\nfx = x\n[RIGHT_CAM_HD]\n")?;
     for (path, wanted) in [
         ("/tmp/SN4711.conf", "is the calibration of the camera 4711, and this one is 31234567"),
-        ("/tmp/bench.conf", "/tmp/bench.conf, line 2: [LEFT_CAM_HD] fx = \"x\" is no number"),
+        ("/tmp/bench.conf", "/tmp/bench.conf, line 2: [LEFT_CAM_HD] fx = \"x\" is not a number"),
         ("/tmp/none.conf", "https://calib.stereolabs.com/?SN=31234567"),
     ] {
         let got = refused(path);

@@ -1,4 +1,4 @@
-//! The daemon with a ZED 2i: both eyes recorded bit by bit with their calibration, every sample of the motion unit on the
+//! The daemon with a ZED 2i: left and right recorded bit by bit with their calibration, every sample of the IMU on the
 //! bus with its values and its time, and the camera pulled meanwhile.
 
 use crate::checks::Checks;
@@ -24,7 +24,7 @@ pub const SCENARIO: Scenario = Scenario {
 };
 
 const SERIAL: &str = "31234567";
-const PATIENCE: Duration = Duration::from_secs(10);
+const TIMEOUT: Duration = Duration::from_secs(10);
 
 fn run(checks: &mut Checks) -> anyhow::Result<()> {
     for module in ["vhci-hcd", "uvcvideo", "usbhid", "hid-generic"] {
@@ -37,8 +37,8 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
         "[[camera]]\nname = \"zed\"\nbackend = \"zed\"\nserial = \"{SERIAL}\"\ncalibration = \"{conf}\"\n\
          exposure_percent = 40\n"
     );
-    for eye in ["left", "right"] {
-        text += &format!("[[camera.stream]]\nname = \"{eye}\"\nwidth = 672\nheight = 376\nrate_hz = 30.0\n");
+    for side in ["left", "right"] {
+        text += &format!("[[camera.stream]]\nname = \"{side}\"\nwidth = 672\nheight = 376\nrate_hz = 30.0\n");
     }
     text += "[[camera.stream]]\nname = \"imu\"\n";
     let daemon = Daemon::start(&text)?;
@@ -49,19 +49,19 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
         (zed.model.as_str(), zed.serial.as_str()),
         ("ZED 2i", SERIAL),
     );
-    let told: Vec<_> = zed.streams.iter().map(|s| s.id.as_str()).collect();
-    checks.equal("both eyes and the motion unit are streams", told, ["zed/left", "zed/right", "zed/imu"]);
+    let ids: Vec<_> = zed.streams.iter().map(|s| s.id.as_str()).collect();
+    checks.equal("left, right and the IMU are streams", ids, ["zed/left", "zed/right", "zed/imu"]);
     motion(checks, &daemon)?;
 
     let path = daemon.record("stereo")?;
     std::thread::sleep(Duration::from_secs(2));
     camera.unplug()?;
     let gone = |c: CameraState| c != CameraState::Streaming;
-    daemon.wait_for(PATIENCE, "the camera is missed", |s| s.cameras.iter().all(|c| gone(c.state)))?;
+    daemon.wait_for(TIMEOUT, "the camera is missed", |s| s.cameras.iter().all(|c| gone(c.state)))?;
     std::thread::sleep(Duration::from_millis(500));
     camera.replug()?;
     let back = HostTime::now();
-    let again = daemon.wait_for(PATIENCE, "it streams again", |s| s.cameras.iter().all(streams));
+    let again = daemon.wait_for(TIMEOUT, "it streams again", |s| s.cameras.iter().all(streams));
     let took = back.elapsed();
     checks.that(
         "plugged in again, it streams within 2 s",
@@ -83,13 +83,13 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let report = verify(&path, &VerifyOptions { decode: true, ..VerifyOptions::default() })?;
     let broken: Vec<_> =
         report.findings.iter().filter(|f| f.severity > depthrig_recorder::Severity::Lost).collect();
-    checks.that("the dataset is what it says", broken.is_empty(), format!("{:?}", report.findings));
+    checks.that("the dataset verifies", broken.is_empty(), format!("{:?}", report.findings));
     let dataset = Dataset::open(&path)?;
     let session = dataset.session().clone();
     let given = camera.calibration().zed.into_iter().find(|m| m.name == "VGA").context("no VGA")?;
-    for (s, eye) in session.streams.iter().zip([given.left, given.right]) {
+    for (s, lens) in session.streams.iter().zip([given.left, given.right]) {
         let i = s.intrinsics;
-        let same = [i.fx, i.fy, i.cx, i.cy] == eye.pinhole && i.coeffs[..5] == eye.distortion;
+        let same = [i.fx, i.fy, i.cx, i.cy] == lens.pinhole && i.coeffs[..5] == lens.distortion;
         checks.that(&format!("the session has the lens of {}", s.id), same, format!("{i:?}"));
         checks.equal(
             &format!("and its source, of {}", s.id),
@@ -104,7 +104,9 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     let truth = given.translation_mm.iter().map(|v| v * v).sum::<f64>().sqrt() / 1000.0;
     checks.that("and the baseline", (length - truth).abs() < 1e-9, format!("{length} m"));
 
-    let (mut frames, mut equal, mut pairs) = (0, 0, 0);
+    let mut frames = 0;
+    let mut equal = 0;
+    let mut pairs = 0;
     for set in dataset.sets(SetRange::ALL) {
         let set = set?;
         let mut indexes = Vec::new();
@@ -122,19 +124,20 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
     }
     checks.that("frames are in the dataset", frames >= 24, frames);
     checks.equal("each is byte for byte what was sent", equal, frames);
-    checks.equal("both eyes of a set are of one exposure", 2 * pairs, frames);
+    checks.equal("left and right images of a set are of one exposure", 2 * pairs, frames);
     Ok(())
 }
 
-/// What a subscriber of the motion unit gets: every record that the emulated unit made, in order, with its values, its
-/// temperature and its time. The unit's ticks are the guest's own clock, so the truth of each sample is in itself.
+/// A subscriber of the IMU gets every record of the emulated unit, in order, with its values, its temperature and its
+/// time. The unit's ticks are the guest's own clock, so the truth of each sample is in itself.
 fn motion(checks: &mut Checks, running: &Daemon) -> anyhow::Result<()> {
     const SAMPLES: usize = 2000;
     let bus = Bus::open(&running.runtime, &RigName::new(daemon::RIG)?)?;
-    let mut reader = bus.subscriber_within(&StreamId::new("zed", "imu")?, PATIENCE)?;
-    let (mut samples, mut batches, mut headers): (Vec<MotionSample>, Vec<u64>, u64) =
-        (Vec::new(), Vec::new(), 0);
-    let end = HostTime::now().plus(PATIENCE);
+    let mut reader = bus.subscriber_within(&StreamId::new("zed", "imu")?, TIMEOUT)?;
+    let mut samples: Vec<MotionSample> = Vec::new();
+    let mut batches: Vec<u64> = Vec::new();
+    let mut headers: u64 = 0;
+    let end = HostTime::now().plus(TIMEOUT);
     while samples.len() < SAMPLES && HostTime::now() < end {
         while let Some(frame) = reader.try_next()? {
             let h = frame.header();
@@ -149,18 +152,18 @@ fn motion(checks: &mut Checks, running: &Daemon) -> anyhow::Result<()> {
         }
         std::thread::sleep(Duration::from_millis(10));
     }
-    checks.that("samples of the motion unit reach a subscriber", samples.len() >= SAMPLES, samples.len());
+    checks.that("samples of the IMU reach a subscriber", samples.len() >= SAMPLES, samples.len());
     checks.equal("each batch's header is that of its newest sample", headers, batches.len() as u64);
     checks.that("no batch is missed", batches.is_sorted_by(|a, b| a + 1 == *b), "");
     // The unit's wave goes up by one from record to record, from -200 to 199.
     let wave =
         |s: &MotionSample| (f64::from(s.gyro_rad_s[0]).to_degrees() / (1000.0 / 32_768.0)).round() as i64;
     let step = |w: &[MotionSample]| w[1].sequence.wrapping_sub(w[0].sequence);
-    let told = |w: &&[MotionSample]| {
+    let counted = |w: &&[MotionSample]| {
         step(w) >= 1 && (wave(&w[1]) - wave(&w[0])).rem_euclid(400).cast_unsigned() == step(w) % 400
     };
-    let known = samples.windows(2).filter(told).count();
-    checks.equal("none comes twice, and numbers tell of each that is missing", known, samples.len() - 1);
+    let known = samples.windows(2).filter(counted).count();
+    checks.equal("none comes twice, and numbers show each that is missing", known, samples.len() - 1);
     // The kernel keeps 64 records for a reader, 160 ms, which so many processes on one slow processor may not be given in time.
     let missing: u64 = samples.windows(2).map(|w| step(w) - 1).sum();
     checks.that("hardly any is", missing <= SAMPLES as u64 / 100, missing);

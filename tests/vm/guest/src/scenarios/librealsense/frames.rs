@@ -17,7 +17,7 @@ const IMAGES: &str = "/tmp/librealsense-images.bin";
 /// The driver's clock map has no answer of the camera's clock yet when its first frames come.
 const LATENCY_NS: i64 = 60_000_000;
 
-/// What is streamed together.
+/// Streams that run together.
 struct Set {
     what: &'static str,
     /// Names of sensors and their profiles, as the library has them.
@@ -38,7 +38,8 @@ fn sets(model: &str) -> Vec<Set> {
     let color = || profile("color", 0, "yuyv", size);
     let infrared = |index| profile("infrared", index, "y8", size);
     if model == "l515" {
-        let (size, color) = ((320, 240), (640, 360));
+        let size = (320, 240);
+        let color = (640, 360);
         let depth = [
             profile("depth", 0, "z16", size),
             profile("infrared", 0, "y8", size),
@@ -115,7 +116,7 @@ impl Image<'_> {
     }
 }
 
-/// What came of one stream.
+/// Counts of one stream.
 #[derive(Default)]
 struct Tally {
     frames: u64,
@@ -192,7 +193,7 @@ fn library(subject: &mut Subject<'_>, set: &Set) -> anyhow::Result<()> {
     if !subject.is_l515() {
         let has_projector = subject.model != "d405";
         let said = ["frame_laser_power", "frame_emitter_mode"].map(|key| depth.get(key).is_some());
-        subject.that("metadata tells of a projector where there is one", said == [has_projector; 2], depth);
+        subject.that("metadata reports a projector where there is one", said == [has_projector; 2], depth);
     }
     for (name, tally) in tallies {
         judge(subject, &format!("library, {}: {name}", set.what), &tally);

@@ -1,6 +1,6 @@
 //! The IMU: samples of the library and of the driver against what the emulated sensors counted.
 //!
-//! What is expected is computed here from the counts and the calibration that the camera was given.
+//! Expected values are computed here from the counts and the calibration that the camera was given.
 
 use super::Subject;
 use super::vendor::{entries, numbers, text, whole};
@@ -19,7 +19,7 @@ const SAMPLES: u64 = 60;
 /// Numbers of 32 bits through two multiplications.
 const CLOSE: f64 = 2e-5;
 
-/// What a sample is, in m/s² or rad/s along the axes of the depth camera.
+/// The true value of a sample, in m/s² or rad/s along the axes of the depth camera.
 pub fn expected(subject: &Subject<'_>, sample: &ImuSample) -> Option<[f64; 3]> {
     let given = subject.camera.calibration().imu?;
     // Firmware of a D400 counts tenths of a thousandth of a degree per second, that of an L515 tenths.

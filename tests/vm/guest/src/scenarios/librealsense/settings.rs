@@ -25,7 +25,7 @@ const STEREO: &str = "Stereo Module";
 const RGB: &str = "RGB Camera";
 const L515: &str = "L500 Depth Sensor";
 
-/// What the models have in common: extension unit 3 and processing unit 2 (camera-protocol facts of librealsense
+/// Options that the models have in common: extension unit 3 and processing unit 2 (protocol facts of librealsense
 /// `src/ds/ds-private.h`), and the colour module's units 6 and 7.
 const STEREO_OPTIONS: [Option_; 2] = [option(STEREO, "exposure", 3, 0x03), option(STEREO, "gain", 2, 0x04)];
 const PROJECTOR: [Option_; 1] = [option(STEREO, "laser_power", 3, 0x04)];
@@ -126,8 +126,8 @@ fn limits(subject: &mut Subject<'_>) -> anyhow::Result<()> {
     subject.that("and does not disturb the other", kept == Some(50_000.0), format!("{kept:?}"));
     // The library writes back what it read: a reply in another order would be put right by the request.
     let asked = subject.camera.asked();
-    let told = asked.iter().rev().find(|a| a.opcode == SET_AE_LIMITS).map(|a| a.params);
-    subject.that("the camera was given both", told == Some([0, 50_000, 0, 120]), format!("{told:?}"));
+    let limits = asked.iter().rev().find(|a| a.opcode == SET_AE_LIMITS).map(|a| a.params);
+    subject.that("the camera was given both", limits == Some([0, 50_000, 0, 120]), format!("{limits:?}"));
     if subject.model == "d405" {
         return Ok(());
     }

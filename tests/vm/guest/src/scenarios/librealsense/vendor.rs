@@ -16,7 +16,7 @@ impl Vendor {
     /// Starts the library in one of the versions that the archive has.
     ///
     /// # Errors
-    /// When there is no Python, or it does not start.
+    /// When Python is missing or does not start.
     pub fn start(version: &str) -> anyhow::Result<Self> {
         let mut child = Command::new("/usr/bin/python3")
             .args(["-B", "-u", "/opt/librealsense/probe.py"])

@@ -29,7 +29,7 @@ const MODELS: [&str; 4] = ["d405", "d415", "d435", "d455"];
 const VICTIM: usize = 2;
 /// The slowest rate that all models have.
 const SIZE: Size = Size { width: 424, height: 240, rate_hz: 15 };
-const PATIENCE: Duration = Duration::from_secs(10);
+const TIMEOUT: Duration = Duration::from_secs(10);
 const BACK_WITHIN: Duration = Duration::from_secs(2);
 
 fn run(checks: &mut Checks) -> anyhow::Result<()> {
@@ -95,13 +95,13 @@ fn replug(daemon: &Daemon, mount: &Mount) -> anyhow::Result<Duration> {
         victim(s).map(|c| c.streams.iter().map(|s| s.delivered).sum::<u64>()).unwrap_or_default()
     };
     mount.cameras[VICTIM].unplug()?;
-    daemon.wait_for(PATIENCE, "the unplugged camera is missed", |s| {
+    daemon.wait_for(TIMEOUT, "the unplugged camera is missed", |s| {
         victim(s).is_ok_and(|c| c.state == CameraState::Reconnecting)
     })?;
     let before = delivered(&daemon.status()?);
     let plugged = HostTime::now();
     mount.cameras[VICTIM].replug()?;
-    daemon.wait_for(PATIENCE, "the camera comes back", |s| {
+    daemon.wait_for(TIMEOUT, "the camera comes back", |s| {
         victim(s).is_ok_and(streams) && delivered(s) >= before + 2
     })?;
     Ok(plugged.elapsed())
@@ -109,7 +109,9 @@ fn replug(daemon: &Daemon, mount: &Mount) -> anyhow::Result<Duration> {
 
 /// Each recorded frame has the camera's own clock and exposure, and the number of sets is the daemon's.
 fn headers(checks: &mut Checks, path: &Path, sets: u64) -> anyhow::Result<()> {
-    let (mut found, mut frames, mut other) = (0, 0, Vec::new());
+    let mut found = 0;
+    let mut frames = 0;
+    let mut other = Vec::new();
     for set in Dataset::open(path)?.sets_with(SetRange::ALL, PixelMode::None) {
         found += 1;
         for frame in set?.frames {

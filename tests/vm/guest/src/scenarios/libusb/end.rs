@@ -1,7 +1,7 @@
 //! How a camera that was used through libusb comes back to the kernel's driver, also when the program was killed; and
 //! what happens when the kernel has too little memory for transfers.
 
-use super::{COLOR, DEPTH, PATIENCE, Truth, load, nodes_become, small, take, usb_device};
+use super::{COLOR, DEPTH, TIMEOUT, Truth, load, nodes_become, small, take, usb_device};
 use crate::checks::Checks;
 use crate::{Scenario, system};
 use anyhow::Context;
@@ -11,7 +11,7 @@ use depthrig_drivers::realsense::RealsenseBackend;
 use depthrig_drivers::realsense::config::{RealsenseConfig, TransportChoice};
 use depthrig_drivers::usb::{self, SysRoot};
 use depthrig_drivers::v4l2::{FourCc, Node, Source as KernelSource, Wanted};
-use depthrig_drivers::video::PictureSource;
+use depthrig_drivers::video::ImageSource;
 use depthrig_drivers::{Backend, ErrorKind};
 use depthrig_emulator as emulator;
 use emulator::Options;
@@ -73,10 +73,11 @@ fn kernel_streams(
         let mode = modes.iter().find(|m| (m.width, m.height) == (424, 240));
         node.set_mode(mode.context("no 424x240")?)?;
         let mut source = KernelSource::start(vec![Wanted { video: node, metadata: None }], 4)?;
-        let (mut equal, end) = (0, HostTime::now().plus(PATIENCE));
+        let mut equal = 0;
+        let end = HostTime::now().plus(TIMEOUT);
         while equal < 3 && HostTime::now() < end {
-            source.poll(Duration::from_millis(100), &mut |picture| {
-                equal += usize::from(truth.index(device, name, picture.bytes).is_some());
+            source.poll(Duration::from_millis(100), &mut |image| {
+                equal += usize::from(truth.index(device, name, image.bytes).is_some());
             })?;
         }
         checks.that(&format!("{when}: {name} streams through the kernel"), equal >= 3, equal);
@@ -145,14 +146,15 @@ fn killed(checks: &mut Checks, device: &emulator::Camera, truth: &mut Truth) -> 
     checks.that("and the nodes are back without a replug", nodes_become(6), "");
     checks.equal("a second call has nothing to do", give_to_kernel(&root, &usb_device(device)?)?, 0);
     kernel_streams(checks, device, truth, "after kill -9")?;
-    // And by itself, when the back end next opens the camera through the kernel.
+    // And by itself, when the backend next opens the camera through the kernel.
     let mut third = self::child(device)?;
     third.kill()?;
     third.wait()?;
-    let (port, transport) = (device.port_path(), TransportChoice::Kernel);
+    let port = device.port_path();
+    let transport = TransportChoice::Kernel;
     let backend = RealsenseBackend::new(RealsenseConfig { port, transport, ..RealsenseConfig::default() });
     let opened = backend.open(Some(device.serial())).map(|d| d.info().serial.clone());
-    checks.that("the back end binds the driver itself", opened.is_ok(), format!("{opened:?}"));
+    checks.that("the backend binds the driver itself", opened.is_ok(), format!("{opened:?}"));
     nodes_become(6);
     // The same once more, and straight into libusb again.
     let mut again = self::child(device)?;
@@ -180,7 +182,11 @@ fn memory(checks: &mut Checks, device: &emulator::Camera, truth: &mut Truth) -> 
     let camera = Camera::open(&root, &usb_device(device)?)?;
     let error = Source::start(&camera, &[small(DEPTH), small(COLOR)], Settings::default()).err();
     let text = error.as_ref().map_or_else(String::new, ToString::to_string);
-    checks.that("a limit that is too low is told before the start", text.contains("2 MB are needed"), &text);
+    checks.that(
+        "a limit that is too low is reported before the start",
+        text.contains("2 MB are needed"),
+        &text,
+    );
     checks.that("with what to write where", text.contains(&format!("> {LIMIT}")), &text);
     drop(camera);
     nodes_become(6);
@@ -194,7 +200,7 @@ fn memory(checks: &mut Checks, device: &emulator::Camera, truth: &mut Truth) -> 
     let error = Source::start(&camera, &[small(DEPTH), small(COLOR)], Settings::default()).err();
     let text = error.as_ref().map_or_else(String::new, ToString::to_string);
     checks.that(
-        "a limit that another program has used up is told as well",
+        "a limit that another program has used up is reported as well",
         text.contains("the limit is 2 MB for all programs"),
         &text,
     );

@@ -1,11 +1,11 @@
-//! What goes wrong on the bus, and what comes of it.
+//! Faults on the bus, and their effects.
 
 use super::{COLOR, DEPTH, Seen, Truth, nodes_become, small, take};
 use crate::checks::Checks;
 use depthrig_bus::HostTime;
 use depthrig_drivers::ErrorKind;
 use depthrig_drivers::libusb::{Camera, Settings, Source};
-use depthrig_drivers::video::PictureSource;
+use depthrig_drivers::video::ImageSource;
 use depthrig_emulator as emulator;
 use emulator::{Damage, Fault};
 use std::time::Duration;
@@ -39,7 +39,7 @@ pub(super) fn run(
     let whole: Vec<_> = around.iter().filter_map(|p| Some((p.sequence, p.index?))).collect();
     let steps: Vec<_> = whole.windows(2).map(|w| (w[1].0 - w[0].0, w[1].1 - w[0].1)).collect();
     // The identifier bit changes with each frame that is sent. One that the device did not send shows in the frame
-    // counter of its metadata alone, which is the back end's to read (`libusb-conformance` has the case).
+    // counter of its metadata alone, which is the backend's to read (`libusb-conformance` has the case).
     let skipped = steps.iter().filter(|(_, due)| *due == 2).count();
     checks.equal("the device skipped one frame", skipped, 1);
     checks.that(
@@ -75,7 +75,7 @@ pub(super) fn run(
     checks.that(
         "after silence both streams come again",
         whole >= 6,
-        format!("{whole} whole; {came} in the silence"),
+        format!("{whole} complete; {came} in the silence"),
     );
     let counts = source.statistics();
     checks.equal("silence cleared each end point once more", counts.clearings, 3);

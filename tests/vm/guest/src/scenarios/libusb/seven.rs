@@ -7,7 +7,7 @@ use depthrig_bus::HostTime;
 use depthrig_drivers::libusb::{Camera, Settings, Source, StreamMode};
 use depthrig_drivers::usb::SysRoot;
 use depthrig_drivers::uvc::formats::FourCc;
-use depthrig_drivers::video::PictureSource;
+use depthrig_drivers::video::ImageSource;
 use depthrig_emulator as emulator;
 use emulator::{Options, Stamp};
 use std::time::Duration;
@@ -31,7 +31,7 @@ const fn vga((interface, format, _): (u8, FourCc, &str)) -> StreamMode {
     StreamMode { interface, format, width: 640, height: 480, rate_hz: 30.0 }
 }
 
-/// What came of one stream.
+/// Counts of one stream.
 #[derive(Debug, Clone, Copy, Default)]
 struct Tally {
     frames: u64,
@@ -88,18 +88,18 @@ fn stream(device: &emulator::Camera, camera: &Camera) -> anyhow::Result<[Tally; 
     let mut slot = vec![0; 640 * 480 * 2];
     let began = HostTime::now();
     while began.elapsed().as_secs_f64() < SECONDS {
-        source.poll(Duration::from_millis(50), &mut |picture| {
-            let tally = &mut tallies[picture.source];
+        source.poll(Duration::from_millis(50), &mut |image| {
+            let tally = &mut tallies[image.source];
             tally.frames += 1;
             // The one copy of a frame, as a driver makes it.
-            let whole = picture.bytes.len() == slot.len();
+            let whole = image.bytes.len() == slot.len();
             if whole {
-                slot.copy_from_slice(picture.bytes);
+                slot.copy_from_slice(image.bytes);
             }
             let stamp = Stamp::read(&slot).filter(|s| {
-                s.serial_hash == device.serial_hash() && usize::from(s.stream) == [0, 2][picture.source]
+                s.serial_hash == device.serial_hash() && usize::from(s.stream) == [0, 2][image.source]
             });
-            tally.wrong += u64::from(!whole || picture.damaged || stamp.is_none());
+            tally.wrong += u64::from(!whole || image.damaged || stamp.is_none());
             let index = stamp.map(|s| s.index);
             let warm = began.elapsed().as_secs_f64() > WARM_UP_S;
             tally.gaps += u64::from(warm && tally.last.is_some_and(|last| index != Some(last + 1)));

@@ -1,4 +1,4 @@
-//! A preset and a synchronisation mode are in the camera afterwards, and what cannot be is told with its reason.
+//! A preset and a sync mode reach the camera; an unsupported one is refused with the reason.
 
 use super::{config, nodes, start};
 use crate::checks::Checks;
@@ -17,7 +17,7 @@ const PRESET: &str = r#"{
   "name": "near, fine steps",
   "groups": { "depth_table": [500, 100, 60000, 0, 12], "census_radius": [9, 7], "amplitude_factor": [0.08] }
 }"#;
-/// What the groups of [`PRESET`] are on the wire.
+/// The groups of [`PRESET`] on the wire.
 const GROUPS: [(Group, &[u32]); 3] = [
     (Group::DepthTable, &[500, 100, 60_000, 0, 12]),
     (Group::CensusRadius, &[9, 7]),
@@ -47,28 +47,24 @@ pub(super) fn run(checks: &mut Checks, camera: &Camera) -> anyhow::Result<()> {
     else {
         return Ok(());
     };
-    // What it was told, by the camera; and what it has now, by another reader than the driver that streams.
-    let told: Vec<_> = camera.asked().into_iter().skip(before).collect();
+    // Requests as the camera received them; current values through another reader than the driver that streams.
+    let received: Vec<_> = camera.asked().into_iter().skip(before).collect();
     let mut monitor = UnitMonitor::new(nodes(camera)?.0, UNIT_ID, Retry::default());
     for (group, values) in GROUPS {
         let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
         let name = group.name();
-        let times = told
+        let times = received
             .iter()
             .filter(|a| a.opcode == SET_GROUP && a.params[0] == group as u32 && a.data == bytes)
             .count();
-        checks.equal(&format!("the camera was told {name} once, to the byte"), times, 1);
+        checks.equal(&format!("the camera got {name} once, to the byte"), times, 1);
         let now = advanced::get(&mut monitor, group, Bound::Current)?;
         checks.equal(&format!("and has it: {name}"), now, bytes);
     }
-    let groups = told.iter().filter(|a| a.opcode == SET_GROUP).count();
+    let groups = received.iter().filter(|a| a.opcode == SET_GROUP).count();
     checks.equal("no other group was written", groups, GROUPS.len());
-    let sync = told.iter().filter(|a| a.opcode == SET_SYNC).map(|a| a.params[0]).collect::<Vec<_>>();
-    checks.equal(
-        "the camera was told the sync mode once, with its two frames for each pulse",
-        sync,
-        [0x0204],
-    );
+    let sync = received.iter().filter(|a| a.opcode == SET_SYNC).map(|a| a.params[0]).collect::<Vec<_>>();
+    checks.equal("the camera got the sync mode once, with its two frames for each pulse", sync, [0x0204]);
     checks.equal("and has it", SyncMode::read(&mut monitor)?, SyncMode::Genlock(2));
     // A camera that nobody read from goes on streaming, and takes no sync mode then.
     Tally::default().poll_for(stream.as_mut(), Duration::from_millis(300))?;
@@ -134,8 +130,8 @@ fn lacking(checks: &mut Checks) -> anyhow::Result<()> {
         let camera = plug(model, Options::default())?;
         let asked = RealsenseConfig { sync: Some(sync), ..config(&camera) };
         fails(checks, model, asked, ErrorKind::Unsupported, &[words, camera.serial()]);
-        let told = camera.asked().iter().any(|a| a.opcode == SET_SYNC);
-        checks.that(&format!("{model}: and it was not even asked"), !told, "");
+        let received = camera.asked().iter().any(|a| a.opcode == SET_SYNC);
+        checks.that(&format!("{model}: and it was not even asked"), !received, "");
     }
     Ok(())
 }
