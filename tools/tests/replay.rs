@@ -118,3 +118,59 @@ fn a_subscriber_that_is_killed_holds_nobody_up() {
     let result: serde_json::Value = serde_json::from_str(&ended.out).unwrap();
     assert_eq!(result["sets"], result["length_sets"]);
 }
+
+/// `tests/data/golden` was recorded by 0.1.0 of 2026-11-23: JPEG colour, depth in ranks, refined depth and IMU samples. It
+/// is never recorded anew.
+#[test]
+fn a_dataset_of_an_older_build_verifies_decodes_replays_and_compares_equal() {
+    let home = Home::new();
+    let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/golden");
+    let verified = json(&home, &["verify", golden, "--decode", "--json"]);
+    assert_eq!(
+        (&verified["sets"], &verified["frames"], &verified["motion_samples"]),
+        (&20.into(), &100.into(), &784.into())
+    );
+    assert_eq!(verified["findings"].as_array().map(Vec::len), Some(0), "{verified}");
+
+    // The checksums are of the files that the build which recorded it wrote.
+    let checksum = |args: &[&str], out: &std::path::Path| {
+        home.run(&[&["cat", golden, "-q", "--out", out.to_str().unwrap()], args].concat()).good();
+        let mut files = Vec::new();
+        let mut folders = vec![out.to_owned()];
+        while let Some(folder) = folders.pop() {
+            for entry in std::fs::read_dir(folder).unwrap() {
+                let path = entry.unwrap().path();
+                if path.is_dir() {
+                    folders.push(path);
+                } else if path.extension().is_some_and(|e| e == "npy" || e == "csv")
+                    && !path.ends_with("frames.csv")
+                {
+                    files.push(path);
+                }
+            }
+        }
+        files.sort();
+        let mut sum = crc32fast::Hasher::new();
+        for path in &files {
+            sum.update(&std::fs::read(path).unwrap());
+        }
+        (files.len(), sum.finalize())
+    };
+    assert_eq!(checksum(&["--format", "npy"], &home.path().join("images")), (100, 0x937d_7c95));
+    assert_eq!(checksum(&["--stream", "left/imu"], &home.path().join("imu")), (1, 0x2011_7181));
+
+    let again = home.path().join("again");
+    home.run(&[
+        "replay",
+        golden,
+        "--as-fast-as-possible",
+        "--record",
+        again.to_str().unwrap(),
+        "--name",
+        "b",
+        "-q",
+    ])
+    .good();
+    let same = home.run(&["compare", golden, again.join("b").to_str().unwrap()]);
+    assert_eq!(same.code, 0, "{}{}", same.out, same.err);
+}
