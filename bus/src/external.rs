@@ -24,7 +24,7 @@ pub use codes::{
 pub use fields::{ANSWER_FIELDS, FRAME_FIELDS, MODE_FIELDS, OFFER_FIELDS};
 pub use layout::{ExternalAnswer, ExternalFrame, ExternalMode, ExternalOffer};
 pub use link::{Answer, Beat, ExternalLink, FrameInlet, Offer, OfferMessage, SentFrame};
-pub use lock::{ExternalLock, holder, lock};
+pub use lock::{ExternalLock, holder, lock_camera};
 pub use mode::{About, Mode};
 pub use place::{Place, served};
 pub use session::{FrameSlot, Session};

@@ -22,6 +22,7 @@ pub mod runtime;
 mod sets;
 pub mod shm;
 mod subscriber;
+pub mod sync;
 pub mod umask;
 
 pub use channel::{BUFFER as SUBSCRIBER_BUFFER, MAX_LENT};

@@ -6,10 +6,11 @@
 //! time; where the kernel refuses such a thread (containers that forbid `unshare`), whatever creates folders or starts
 //! programs waits for the same lock.
 
+use crate::sync::lock;
 use rustix::fs::Mode;
 use std::io;
 use std::path::Path;
-use std::sync::{Mutex, MutexGuard, Once, OnceLock, PoisonError};
+use std::sync::{Mutex, MutexGuard, Once, OnceLock};
 
 /// Held while the umask may be changed, and by operations that depend on it.
 static CHANGING: Mutex<()> = Mutex::new(());
@@ -25,7 +26,7 @@ pub struct Steady(#[allow(dead_code)] MutexGuard<'static, ()>);
 
 /// Waits until nothing changes the umask, then locks it.
 pub fn steady() -> Steady {
-    Steady(CHANGING.lock().unwrap_or_else(PoisonError::into_inner))
+    Steady(lock(&CHANGING))
 }
 
 /// Runs `bind`, which may change the umask for a moment, where no other thread sees it.

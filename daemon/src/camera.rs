@@ -6,12 +6,13 @@ use crate::stage::{Intake, Refinement};
 use crate::status::CameraState;
 use crate::stream::Stream;
 use crate::wake::Wake;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{Bus, HostTime, StreamId};
 use depthrig_drivers::DeviceInfo;
 use depthrig_drivers::stereo::{Descriptions, Notice, PREFIXES, SIDES};
 use depthrig_drivers::synthetic::Drawing;
 use depthrig_recorder::Computed;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 mod open;
 mod supervisor;
@@ -83,7 +84,7 @@ impl Camera {
 
     /// The algorithm behind `stream`, if it is computed from left and right: for the dataset that it is recorded in.
     pub fn computed(&self, stream: &StreamId) -> Option<Computed> {
-        let all = self.computed.lock().unwrap_or_else(PoisonError::into_inner);
+        let all = lock(&self.computed);
         let mode = PREFIXES.iter().find_map(|p| stream.stream.as_str().strip_prefix(p))?;
         let d = all.get(mode)?;
         let side = |name: &&str| StreamId::new(stream.camera.as_str(), name).ok();
@@ -99,7 +100,7 @@ impl Camera {
 
     /// Its present state.
     pub fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 }
 

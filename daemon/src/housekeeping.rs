@@ -7,7 +7,7 @@ use depthrig_bus::{Bus, HostTime, clock, umask};
 use depthrig_recorder::Diagnostic;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 
 /// How often it looks whether a recording is due to end, or whether it shall stop itself.
 const LOOK: Duration = Duration::from_millis(50);
@@ -73,7 +73,7 @@ impl Housekeeping<'_> {
 }
 
 fn lock(recording: &Mutex<Recording>) -> MutexGuard<'_, Recording> {
-    recording.lock().unwrap_or_else(PoisonError::into_inner)
+    depthrig_bus::sync::lock(recording)
 }
 
 /// Closing takes as long as the disk does, so it has a thread of its own, which is waited for at the end: meanwhile

@@ -6,6 +6,7 @@ use crate::status::{RecordingStatus, SetAccount};
 use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{Frame, HostTime, StreamId, UtcPair};
 use depthrig_recorder::{
     Diagnostic, Pixels, RecordFrame, RecordSet, Recorder, RecorderOptions, Session, StreamAccount, Summary,
@@ -15,7 +16,7 @@ use place::place;
 pub use recovery::recover_left;
 use spread::{max_spread_ns, reach_ns};
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 pub mod budget;
 mod facts;
@@ -413,19 +414,19 @@ impl Finishing {
 /// # Errors
 /// `WrongState` when none is going on, `Other` when the dataset could not be closed.
 pub fn stop(recording: &Mutex<Recording>) -> Result<RecordingStatus> {
-    let finishing = recording.lock().unwrap_or_else(PoisonError::into_inner).take()?;
+    let finishing = lock(recording).take()?;
     finish(recording, finishing)
 }
 
 /// Whether the recording has lasted as long as it was to: to be asked often.
 pub fn is_due(recording: &Mutex<Recording>) -> bool {
-    recording.lock().unwrap_or_else(PoisonError::into_inner).is_due()
+    lock(recording).is_due()
 }
 
 /// Ends the recording, as [`stop`] does, if it has lasted as long as it was to. `None`: it is not
 /// over yet, or none is going on. The moment it ends is that of its start and its length, however late the call comes.
 pub fn stop_when_due(recording: &Mutex<Recording>) -> Option<Result<RecordingStatus>> {
-    let mut idle = recording.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut idle = lock(recording);
     let finishing = if idle.is_due() { idle.take().ok()? } else { return None };
     drop(idle);
     tracing::info!(path = finishing.active.status.path, "the recording has lasted as long as it was to");
@@ -434,7 +435,7 @@ pub fn stop_when_due(recording: &Mutex<Recording>) -> Option<Result<RecordingSta
 
 fn finish(recording: &Mutex<Recording>, finishing: Finishing) -> Result<RecordingStatus> {
     let (status, result) = finishing.finish();
-    let mut recording = recording.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut recording = lock(recording);
     // Another one may have begun while this one was being closed; its numbers are not these.
     if !recording.is_active() {
         recording.keep(status.clone(), result.as_ref().ok().cloned());

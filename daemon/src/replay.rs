@@ -41,6 +41,7 @@ use crate::wake::Wake;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::runtime::RigLock;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{
     Bus, ClockDomain, HostTime, Intrinsics, MetadataLevel, PixelFormat, RigName, RuntimeDir,
     SUBSCRIBER_BUFFER, UtcPair, shm,
@@ -51,7 +52,7 @@ use player::Player;
 use source::{Moment, Sources};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex};
 use std::thread::JoinHandle;
 use timeline::Timeline;
 pub use transport::RATES;
@@ -171,10 +172,6 @@ struct Numbers {
 struct Counted {
     set: u64,
     incomplete: u64,
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Replay {

@@ -28,6 +28,7 @@ use crate::{Error, ErrorKind, Result, priority};
 use assembly::Assembly;
 use core::time::Duration;
 use depthrig_bus::runtime::{RigLock, RuntimeDir};
+use depthrig_bus::sync::lock;
 use depthrig_bus::{Bus, HostTime, StreamId, UtcPair, shm, umask};
 use depthrig_drivers::synthetic::{Drawing, DrawingProgress};
 use depthrig_recorder::fs::{Fs, RealFs};
@@ -36,7 +37,7 @@ pub use join::near_pair_ns;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::JoinHandle;
 
 /// How often the supervisors look at their cameras.
@@ -145,10 +146,6 @@ pub struct SetAccounts {
     sent: u64,
     incomplete: u64,
     streams: BTreeMap<StreamId, SetAccount>,
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Rig {

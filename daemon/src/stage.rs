@@ -30,13 +30,14 @@ use crate::status::RefineState;
 use crate::wake::Wake;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{Frame, HostTime, PixelFormat, StreamName, Subscriber};
 use depthrig_drivers::StreamProfile;
 use depthrig_drivers::moments::{FrameSchedule, SetTimes};
 use pair::{Paired, Pairer};
 use refinement::Pair;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use supervisor::RefinerSupervisor;
 
 /// The name of the stream of refined depth.
@@ -72,7 +73,7 @@ impl Intake {
     }
 
     fn refinements(&self) -> std::sync::MutexGuard<'_, Vec<Arc<Refinement>>> {
-        self.refinements.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.refinements)
     }
 }
 

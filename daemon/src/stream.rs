@@ -3,13 +3,14 @@
 //! The books are double-entry: `captured` is the number of frames that the device announced, `delivered` and `dropped`
 //! are their fates, and [`Books::close`] balances them when a hung thread is given up with a frame in its hands.
 
+use depthrig_bus::sync::lock;
 use depthrig_bus::{
     DropCounts, DropReason, FrameFlags, HostTime, MetadataLevel, Publisher, StreamId, Subscriber,
 };
 use depthrig_drivers::StreamProfile;
 use depthrig_drivers::clock::ClockQuality;
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 /// Frames over which latency and rate are measured.
 const WINDOW: usize = 256;
@@ -102,7 +103,7 @@ impl Stream {
 
     /// The books, for reading or writing.
     pub fn books(&self) -> MutexGuard<'_, Books> {
-        self.books.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.books)
     }
 }
 

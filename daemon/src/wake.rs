@@ -5,6 +5,7 @@
 //! a second of frames. On a mutex it sleeps, and the other thread runs.
 
 use core::time::Duration;
+use depthrig_bus::sync::lock;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
 /// A wake-up signal.
@@ -23,7 +24,7 @@ impl Wake {
 
     /// Wakes the waiter; without one, the next `wait` returns at once.
     pub fn raise(&self) {
-        *self.raised.lock().unwrap_or_else(PoisonError::into_inner) = true;
+        *lock(&self.raised) = true;
         self.condvar.notify_one();
         if let Some(next) = &self.next {
             next.raise();
@@ -32,7 +33,7 @@ impl Wake {
 
     /// Waits until the signal is raised or `timeout` has passed.
     pub fn wait(&self, timeout: Duration) {
-        let raised = self.raised.lock().unwrap_or_else(PoisonError::into_inner);
+        let raised = lock(&self.raised);
         let (mut raised, _) = self
             .condvar
             .wait_timeout_while(raised, timeout, |raised| !*raised)

@@ -7,9 +7,10 @@ use crate::clock::ClockQuality;
 use crate::{DeviceInfo, Error, ErrorKind, FrameMeta, FrameSink, Loan, Poll, Result, Stream};
 use core::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use core::time::Duration;
+use depthrig_bus::sync::{lock, wait_timeout};
 use depthrig_bus::{DropReason, HostTime};
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex};
 use std::thread::JoinHandle;
 
 /// How long one poll waits; also how late a stop request is noticed at the most.
@@ -87,7 +88,7 @@ impl Capture {
                         format!("{label}: the driver panicked: {what}"),
                     ))
                 });
-                *theirs.end.lock().unwrap_or_else(PoisonError::into_inner) = Some(end);
+                *lock(&theirs.end) = Some(end);
                 theirs.ended.notify_all();
             })
             .map_err(|e| {
@@ -117,7 +118,7 @@ impl Capture {
 
     /// Whether the thread has come to its end.
     pub fn has_ended(&self) -> bool {
-        self.shared.end.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+        lock(&self.shared.end).is_some()
     }
 
     /// Asks the thread to end, without waiting. Stop all cameras with this before [`Self::stop`] on each.
@@ -129,7 +130,7 @@ impl Capture {
     pub fn stop(mut self, timeout: Duration) -> StopOutcome {
         self.request_stop();
         let deadline = HostTime::now().plus(timeout);
-        let mut end = self.shared.end.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut end = lock(&self.shared.end);
         while end.is_none() {
             let left = deadline.from_now();
             if left.is_zero() {
@@ -137,7 +138,7 @@ impl Capture {
                 self.shared.abandoned.store(true, Ordering::SeqCst);
                 return StopOutcome::Abandoned;
             }
-            end = self.shared.ended.wait_timeout(end, left).unwrap_or_else(PoisonError::into_inner).0;
+            end = wait_timeout(&self.shared.ended, end, left);
         }
         let end = end.take().unwrap_or(End::Stopped);
         if let Some(thread) = self.thread.take() {
@@ -208,7 +209,7 @@ impl FrameSink for Guarded<'_> {
 
     fn commit(&mut self, stream: usize, meta: &FrameMeta) {
         self.note_frame(stream);
-        let _no_abandoning_meanwhile = self.shared.end.lock().unwrap_or_else(PoisonError::into_inner);
+        let _no_abandoning_meanwhile = lock(&self.shared.end);
         if self.is_abandoned() {
             self.sink.discard(stream);
             self.sink.dropped(stream, DropReason::Abandoned, 1);
@@ -227,7 +228,7 @@ impl FrameSink for Guarded<'_> {
 
     fn commit_lent(&mut self, stream: usize, loan: Loan, meta: &FrameMeta) {
         self.note_frame(stream);
-        let _no_abandoning_meanwhile = self.shared.end.lock().unwrap_or_else(PoisonError::into_inner);
+        let _no_abandoning_meanwhile = lock(&self.shared.end);
         if self.is_abandoned() {
             drop(loan);
             self.sink.dropped(stream, DropReason::Abandoned, 1);

@@ -12,10 +12,11 @@ use crate::fs::{self, Fs};
 use crate::msgs::{Diagnostic, SetCounts, StreamAccount};
 use crate::{Error, ErrorKind, RecorderOptions, Result, Session};
 use crossbeam::channel::{Sender, bounded};
+use depthrig_bus::sync::lock;
 use depthrig_bus::{HostTime, UtcPair};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::JoinHandle;
 
 mod drops;
@@ -432,7 +433,7 @@ impl Drop for Recorder {
 
 impl Shared {
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     /// Whether frames may go to the disk without being packed.

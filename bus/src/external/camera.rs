@@ -3,9 +3,10 @@
 use super::mode::{check_all, invalid};
 use super::{
     About, ExternalAnswer, ExternalLock, ExternalMode, ExternalOffer, ExternalReason, ExternalState,
-    ExternalWant, HEARTBEAT, MAX_MODES, Mode, Place, SILENCE, VERSION, lock, plain, text,
+    ExternalWant, HEARTBEAT, MAX_MODES, Mode, Place, SILENCE, VERSION, lock_camera, plain, text,
 };
 use crate::channel::{self, Inlet, IoxService, Outlet};
+use crate::sync::lock;
 use crate::{Bus, Error, ErrorKind, HostTime, Result};
 use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
@@ -118,7 +119,7 @@ impl ExternalCamera {
         offer.instance = (HostTime::now().ns() as u64) << 16 | u64::from(pid & 0xFFFF) | 1;
         offer.pid = pid;
         let who = format!("process {pid} ({})", text::shown(&offer.program));
-        let lock = lock(&place.runtime, &place.rig, &place.camera, &who)?;
+        let lock = lock_camera(&place.runtime, &place.rig, &place.camera, &who)?;
         let bus = Bus::open(&place.runtime, &place.rig)?;
         bus.clean_dead();
         let offers = place.offers();
@@ -185,7 +186,7 @@ impl Drop for ExternalCamera {
 
 impl Shared {
     pub(super) fn wanted(&self) -> MutexGuard<'_, Wanted> {
-        self.wanted.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.wanted)
     }
 
     /// Whether the daemon still wants frames of `session`.
@@ -227,7 +228,7 @@ impl Shared {
         why: &str,
     ) -> Result<()> {
         {
-            let mut sender = self.offers.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut sender = lock(&self.offers);
             if sender.offer.state == ExternalState::Ended as u32 {
                 return Ok(());
             }
@@ -246,7 +247,7 @@ impl Shared {
 
     /// Sends the offer as it is now.
     fn say(&self) -> Result<()> {
-        let mut sender = self.offers.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut sender = lock(&self.offers);
         let mut loan = sender.out.loan(sender.records.len())?;
         channel::bytes_mut(&mut loan).copy_from_slice(&sender.records);
         sender.offer.number += 1;

@@ -19,7 +19,12 @@ fn path(runtime: &RuntimeDir, rig: &RigName, camera: &CameraName) -> PathBuf {
 /// # Errors
 /// [`ErrorKind::InUse`] naming the process that serves it, [`ErrorKind::PermissionDenied`] when the file
 /// cannot be opened.
-pub fn lock(runtime: &RuntimeDir, rig: &RigName, camera: &CameraName, who: &str) -> Result<ExternalLock> {
+pub fn lock_camera(
+    runtime: &RuntimeDir,
+    rig: &RigName,
+    camera: &CameraName,
+    who: &str,
+) -> Result<ExternalLock> {
     let path = path(runtime, rig, camera);
     let Some(file) = crate::runtime::take(&path, who)? else {
         let holder = crate::runtime::holder_of(&path).unwrap_or_else(|| "another process".to_owned());
@@ -53,12 +58,12 @@ mod tests {
         let front = name("front");
         let back = name("back");
         assert_eq!(holder(&runtime, &rig, &front), None);
-        let first = lock(&runtime, &rig, &front, "process 42 (cam)").unwrap();
-        let e = lock(&runtime, &rig, &front, "process 43 (cam)").unwrap_err();
+        let first = lock_camera(&runtime, &rig, &front, "process 42 (cam)").unwrap();
+        let e = lock_camera(&runtime, &rig, &front, "process 43 (cam)").unwrap_err();
         assert_eq!(e.kind(), ErrorKind::InUse);
         assert!(e.to_string().contains("process 42 (cam)"), "{e}");
-        let _other = lock(&runtime, &rig, &back, "process 43 (cam)").unwrap();
-        let _other_rig = lock(&runtime, &name("a"), &front, "process 44 (cam)").unwrap();
+        let _other = lock_camera(&runtime, &rig, &back, "process 43 (cam)").unwrap();
+        let _other_rig = lock_camera(&runtime, &name("a"), &front, "process 44 (cam)").unwrap();
         let all: Vec<_> =
             served(&runtime).into_iter().map(|(p, who)| format!("{}/{} {who}", p.rig, p.camera)).collect();
         assert_eq!(
@@ -68,6 +73,6 @@ mod tests {
         assert!(runtime.running_rigs().is_empty(), "a camera's lock is not a rig's");
         drop(first);
         assert_eq!(holder(&runtime, &rig, &front), None);
-        lock(&runtime, &rig, &front, "process 43 (cam)").unwrap();
+        lock_camera(&runtime, &rig, &front, "process 43 (cam)").unwrap();
     }
 }

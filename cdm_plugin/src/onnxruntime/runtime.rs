@@ -3,10 +3,11 @@
 use super::device::Device;
 use super::library;
 use crate::{Error, ErrorKind, Result};
+use depthrig_bus::sync::lock;
 use ort::ep::ExecutionProvider;
 use ort::logging::LogLevel;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 /// The library that this process runs.
 #[derive(Debug, Clone)]
@@ -29,7 +30,7 @@ impl Runtime {
     /// [`ErrorKind::NoEngine`] when no usable library is found, [`ErrorKind::Unsupported`] when the one that this
     /// process runs is another than `wanted` or does not have the device.
     pub fn get(wanted: Option<&Path>, device: &Device) -> Result<Self> {
-        let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut loaded = lock(&LOADED);
         let runtime = if let Some(runtime) = &*loaded {
             let runtime = runtime.clone()?;
             if let Some(wanted) = wanted {

@@ -6,12 +6,13 @@ use crate::config::BackendConfig;
 use crate::sink::BusSink;
 use crate::stage::{Readers, Refinement, Setup};
 use crate::stream::Stream;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{FrameHeader, StreamId, StreamName, shm};
 use depthrig_calib::PoseExt;
 use depthrig_drivers::capture::Session;
 use depthrig_drivers::stereo::StereoOptions;
 use depthrig_drivers::{Backend, DeviceInfo, ErrorKind as DriverErrorKind, StreamProfile, StreamRequest};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 /// A camera's driver, created at the first opening and kept for the later ones.
 pub(super) type SharedBackend = Arc<Mutex<Option<Box<dyn Backend>>>>;
@@ -28,7 +29,7 @@ pub(super) fn open_session(
     };
     let device = {
         // Held for the opening alone; a thread that hangs in it keeps its successors waiting, not the rig.
-        let mut backend = backend.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut backend = lock(backend);
         let backend = match backend.as_ref() {
             Some(backend) => backend,
             None => backend.insert(make_backend(camera, shared).map_err(in_camera)?),

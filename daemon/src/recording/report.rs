@@ -3,11 +3,12 @@
 use core::ops::ControlFlow;
 use core::time::Duration;
 use depthrig_bus::HostTime;
+use depthrig_bus::sync::lock;
 use depthrig_recorder::report::{REPORT_FILE, Report, ReportOptions};
 use depthrig_recorder::{Dataset, fs};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
 /// Reports that may be in work at once; a further one is left to `depthrig report`.
@@ -28,7 +29,7 @@ impl Reports {
     /// Begins the report of the finished dataset `path` and returns at once. A report that fails is a
     /// line in the log; the recording is the same without it.
     pub fn begin(&self, path: PathBuf) {
-        let mut threads = self.threads.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut threads = lock(&self.threads);
         threads.retain(|t| !t.is_finished());
         if threads.len() >= MAX {
             tracing::warn!(
@@ -47,7 +48,7 @@ impl Reports {
     /// Waits for the reports in work, for some seconds at most; reports not done then are left out.
     pub fn finish(&self) {
         let deadline = HostTime::now().plus(TIMEOUT);
-        let threads = std::mem::take(&mut *self.threads.lock().unwrap_or_else(PoisonError::into_inner));
+        let threads = std::mem::take(&mut *lock(&self.threads));
         for thread in threads {
             while !thread.is_finished() && !deadline.from_now().is_zero() {
                 std::thread::sleep(Duration::from_millis(10));

@@ -4,6 +4,7 @@ use super::{Camera, Engine, RelabelOptions, cannot};
 use crate::stage::Refiners;
 use crate::stage::pixels;
 use crate::stage::view::View;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{FrameHeader, files};
 use depthrig_cdm::{Job, Output as Refined, RawDepth, Refiner, StepTimes};
 use depthrig_recorder::codec::{DepthEncoder, DepthShape};
@@ -12,7 +13,6 @@ use depthrig_recorder::{DatasetFrame, DatasetSet, Error, ErrorKind, PixelMode, R
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::PoisonError;
 
 /// Sets of a file: a killed run repeats at most these, for each thread.
 const PART_SETS: usize = 10;
@@ -124,13 +124,13 @@ impl Refine<'_> {
             steps: StepTimes::default(),
         }];
         refiner.refine(&mut job).map_err(|e| bad(e.to_string()))?;
-        engine.free.lock().unwrap_or_else(PoisonError::into_inner).push(refiner);
+        lock(&engine.free).push(refiner);
         Ok(out.iter().flat_map(|v| v.to_le_bytes()).collect())
     }
 
     /// A refiner that nobody uses.
     fn take(&self, engine: &Engine) -> Result<Box<dyn Refiner>> {
-        if let Some(refiner) = engine.free.lock().unwrap_or_else(PoisonError::into_inner).pop() {
+        if let Some(refiner) = lock(&engine.free).pop() {
             return Ok(refiner);
         }
         let opened = self.refiners.open(&engine.plan, self.options.threads.max(1));

@@ -1,6 +1,6 @@
 //! The rig in numbers: its status, the diagnostics that go into a recording, and losses.
 
-use super::{Inner, lock};
+use super::Inner;
 use crate::camera::{Camera, State};
 use crate::stage;
 use crate::status::{
@@ -8,10 +8,10 @@ use crate::status::{
     SharedMemoryStatus, StreamStatus,
 };
 use crate::stream::Stream;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{ClockDomain, HostTime, UtcPair, shm};
 use depthrig_drivers::synthetic::DrawingProgress;
 use depthrig_recorder::{Diagnostic, Level};
-use std::sync::PoisonError;
 use std::sync::atomic::Ordering;
 
 /// Everything there is to know about the rig now.
@@ -82,7 +82,7 @@ fn camera(inner: &Inner, camera: &Camera, now: HostTime) -> CameraStatus {
         state_for_s: state.since.elapsed().as_secs_f64(),
         message: state.message.clone(),
         warnings: {
-            let notice = camera.notice.lock().unwrap_or_else(PoisonError::into_inner);
+            let notice = lock(&camera.notice);
             notice.iter().cloned().chain(silent_units(inner, &state, now)).collect()
         },
         reconnects: state.reconnects,

@@ -3,8 +3,9 @@
 use crate::config::RefineConfig;
 use crate::status::{RefineState, RefineStatus};
 use crate::stream::Stream;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{CameraName, DropReason, Frame, HostTime, StageStep, Subscriber};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 /// Frames over which the steps are measured.
 const WINDOW: usize = 128;
@@ -202,11 +203,11 @@ impl Refinement {
 
     /// The state shared by the two threads.
     pub fn work(&self) -> MutexGuard<'_, Work> {
-        self.work.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.work)
     }
 
     fn facts(&self) -> MutexGuard<'_, Facts> {
-        self.facts.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.facts)
     }
 
     /// Puts a pair where the engine finds it; an older one that is still there is skipped.

@@ -8,8 +8,9 @@ use crate::status::RefineState;
 use crate::wake::Wake;
 use core::time::Duration;
 use depthrig_bus::HostTime;
+use depthrig_bus::sync::lock;
 use std::sync::atomic::Ordering;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
 /// The pause before a refiner that failed is opened again; it doubles up to the second.
@@ -68,12 +69,7 @@ impl RefinerSupervisor {
     pub fn add(&mut self, refinement: Arc<Refinement>) {
         refinement.enter(self.state, None);
         if let Some(running) = &self.running {
-            running
-                .shared
-                .refinements
-                .lock()
-                .unwrap_or_else(PoisonError::into_inner)
-                .push(Arc::clone(&refinement));
+            lock(&running.shared.refinements).push(Arc::clone(&refinement));
         }
         self.refinements.push(refinement);
     }
@@ -94,7 +90,7 @@ impl RefinerSupervisor {
             return;
         };
         if running.thread.is_finished() {
-            let ended = running.ended.lock().unwrap_or_else(PoisonError::into_inner).take();
+            let ended = lock(&running.ended).take();
             self.running = None;
             match ended {
                 Some(Ok(())) => {}
@@ -164,11 +160,7 @@ impl RefinerSupervisor {
         let plan = self.plan.clone();
         let refiners = Arc::clone(&self.refiners);
         let frames = Arc::clone(&self.frames);
-        shared
-            .refinements
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .extend(self.refinements.iter().cloned());
+        lock(&shared.refinements).extend(self.refinements.iter().cloned());
         let run = move || {
             // Before the engine makes threads of its own, which inherit it.
             priority::lower_current_thread();
@@ -187,7 +179,7 @@ impl RefinerSupervisor {
                 theirs.open.store(true, Ordering::Relaxed);
                 Worker::new(theirs, refiner, note, frames).run().map_err(|e| e.to_string())
             });
-            *result.lock().unwrap_or_else(PoisonError::into_inner) = Some(worked);
+            *lock(&result) = Some(worked);
         };
         self.enter(RefineState::Starting, None);
         match std::thread::Builder::new().name("refine".into()).spawn(run) {

@@ -9,10 +9,11 @@ use super::view::View;
 use crate::stream::Stream;
 use crate::wake::Wake;
 use core::time::Duration;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{FrameFlags, FrameHeader, FrameMut, HostTime, PixelFormat, Publisher, StageStep};
 use depthrig_cdm::{Color, Error, ErrorKind, Job, Output, RawDepth, Refiner, StepTimes};
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 /// How long an idle worker sleeps at most.
 const IDLE: Duration = Duration::from_millis(100);
@@ -143,7 +144,7 @@ impl Worker {
     }
 
     fn take_cameras(&mut self) {
-        let refinements = self.shared.refinements.lock().unwrap_or_else(PoisonError::into_inner);
+        let refinements = lock(&self.shared.refinements);
         for refinement in refinements.iter().skip(self.cameras.len()) {
             let description = self.refiner.describe();
             refinement.runs(&description.engine, &description.model, self.note.as_deref());

@@ -7,6 +7,7 @@ use super::images::{Maker, ModeFrames, Views};
 use super::input::{Head, Input, Next};
 use super::modes::{Group, Worker};
 use depthrig_bus::clock::thread_cpu_ns;
+use depthrig_bus::sync::{lock, wait};
 use depthrig_calib::stereo::DisparityMap;
 use depthrig_recorder::{Error, ErrorKind, Result};
 use std::collections::VecDeque;
@@ -173,7 +174,7 @@ impl Engine<'_> {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     fn work(&self) {
@@ -183,7 +184,7 @@ impl Engine<'_> {
                 let mut state = self.lock();
                 loop {
                     match self.next_task(&mut state) {
-                        Task::Wait => state = self.wake.wait(state).unwrap_or_else(PoisonError::into_inner),
+                        Task::Wait => state = wait(&self.wake, state),
                         task => break task,
                     }
                 }
@@ -237,7 +238,7 @@ impl Engine<'_> {
 
     fn read(&self) -> Result<bool> {
         let begin = thread_cpu_ns();
-        let next = self.input.lock().unwrap_or_else(PoisonError::into_inner).next();
+        let next = lock(&self.input).next();
         let read = thread_cpu_ns() - begin;
         let mut state = self.lock();
         state.reading = false;

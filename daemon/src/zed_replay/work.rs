@@ -1,12 +1,13 @@
 //! The folder beside the output in which it grows, and the facts that a later run needs about this one.
 
+use depthrig_bus::sync::lock;
 use depthrig_bus::{UtcPair, files};
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{Error, ErrorKind, RecordSet, Result, UtcSource};
 use serde_json::Value;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 const PLAN_FILE: &str = "plan.json";
 
@@ -130,13 +131,13 @@ impl RecordedClock {
 
     pub(super) fn source(&self) -> UtcSource {
         let pair = Arc::clone(&self.0);
-        Arc::new(move || *pair.lock().unwrap_or_else(PoisonError::into_inner))
+        Arc::new(move || *lock(&pair))
     }
 
     /// It is the time of this set.
     pub(super) fn set(&self, set: &RecordSet) {
         let now = UtcPair { mono: set.tick, utc_ns: set.utc.utc_ns(set.tick), width_ns: set.utc.width_ns };
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = now;
+        *lock(&self.0) = now;
     }
 }
 

@@ -3,10 +3,11 @@
 use crate::clock::ClockQuality;
 use crate::{FrameMeta, FrameSink, StreamProfile};
 use core::time::Duration;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{
     DropCounts, DropReason, FrameFlags, HostTime, MOTION_SAMPLE_BYTES, MetadataLevel, PixelFormat,
 };
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 /// Contents of memory on loan before the driver writes: two different fills in turn, so that a byte that a
 /// driver leaves alone cannot look right every time.
@@ -62,7 +63,7 @@ impl Probe {
 
     /// Reads the observations.
     pub(super) fn with<T>(&self, look: impl FnOnce(&mut Observed) -> T) -> T {
-        look(&mut self.observed.lock().unwrap_or_else(PoisonError::into_inner))
+        look(&mut lock(&self.observed))
     }
 }
 

@@ -10,7 +10,8 @@ use depthrig_bus::HostTime;
 use depthrig_bus::external::{
     Answer, Beat, ExternalLink, ExternalReason, ExternalState, ExternalWant, Offer,
 };
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use depthrig_bus::sync::lock;
+use std::sync::{Arc, Mutex, MutexGuard};
 
 /// How often a process that has just been started is looked for.
 const LOOK: Duration = Duration::from_millis(20);
@@ -31,7 +32,7 @@ impl ExternalBackend {
     }
 
     fn keeper(&self) -> Option<MutexGuard<'_, Keeper>> {
-        Some(self.keeper.as_ref()?.lock().unwrap_or_else(PoisonError::into_inner))
+        Some(lock(self.keeper.as_ref()?))
     }
 
     /// Waits until a process serves the camera; only one that the daemon starts is waited for.

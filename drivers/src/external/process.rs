@@ -7,12 +7,13 @@ use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
 use depthrig_bus::external::{CAMERA_VARIABLE, RIG_VARIABLE};
 use depthrig_bus::runtime::RUNTIME_DIR_VARIABLE;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{HostTime, umask};
 use rustix::process::{Pid, Signal, kill_process_group};
 use std::os::unix::process::CommandExt;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
 /// First pause before a process that ended is started again; it doubles up to the second.
@@ -57,7 +58,7 @@ struct Shared {
 
 impl Shared {
     fn ended(&self) -> Option<String> {
-        self.ended.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        lock(&self.ended).clone()
     }
 }
 
@@ -201,7 +202,7 @@ fn keep(config: &ExternalConfig, place: &Place, shared: &Shared, report: &SyncSe
     };
     // Processes that it left behind in its group would keep the camera.
     signal(pid, Signal::KILL);
-    *shared.ended.lock().unwrap_or_else(PoisonError::into_inner) = Some(end);
+    *lock(&shared.ended) = Some(end);
 }
 
 fn signal(pid: u32, signal: Signal) {
@@ -270,7 +271,7 @@ fn copy_output(child: &mut Child, place: &Place, pid: u32) {
 /// A process that does not answer is killed, if it is the daemon's.
 pub(super) fn kill(keeper: &SharedKeeper, why: &str) {
     if let Some(keeper) = keeper {
-        keeper.lock().unwrap_or_else(PoisonError::into_inner).kill(why);
+        lock(keeper).kill(why);
     }
 }
 

@@ -6,9 +6,10 @@ use crate::uvc::descriptors::Configuration;
 use crate::{Error, ErrorKind, Result};
 use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
+use depthrig_bus::sync::lock;
 use rusb::{Context, DeviceHandle, UsbContext};
 use std::collections::BTreeSet;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
 /// How long a control request may take. librealsense waits 100 ms, which its firmware's slow tables exceed.
@@ -151,7 +152,7 @@ impl Inner {
 
     /// Takes an interface, from the kernel's driver if need be.
     pub(super) fn claim(&self, number: u8) -> Result<()> {
-        let mut claimed = self.claimed.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut claimed = lock(&self.claimed);
         if claimed.contains(&number) {
             return Ok(());
         }
@@ -180,7 +181,7 @@ impl Inner {
 
     /// Gives every interface back: streaming first, control last, then the kernel's driver is bound again.
     fn give_back(&self) {
-        let claimed = core::mem::take(&mut *self.claimed.lock().unwrap_or_else(PoisonError::into_inner));
+        let claimed = core::mem::take(&mut *lock(&self.claimed));
         let is_control = |n: &u8| self.configuration.controls.iter().any(|c| c.number == *n);
         let (controls, others): (Vec<_>, Vec<_>) = claimed.into_iter().partition(is_control);
         for &number in others.iter().chain(&controls) {

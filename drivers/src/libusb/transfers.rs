@@ -19,10 +19,11 @@ use core::ffi::c_void;
 use core::ptr::NonNull;
 use core::time::Duration;
 use depthrig_bus::HostTime;
+use depthrig_bus::sync::{lock, wait_timeout};
 use rusb::constants;
 use rusb::ffi::{self, libusb_transfer};
 use std::collections::VecDeque;
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex};
 
 /// Something that a source has to attend to.
 #[derive(Debug)]
@@ -60,13 +61,13 @@ impl CompletionQueue {
     }
 
     pub(super) fn post(&self, event: Event) {
-        self.events.lock().unwrap_or_else(PoisonError::into_inner).push_back(event);
+        lock(&self.events).push_back(event);
         self.came.notify_one();
     }
 
     /// The oldest event, waiting for one until `deadline`.
     pub(super) fn next(&self, deadline: HostTime) -> Option<Event> {
-        let mut events = self.events.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut events = lock(&self.events);
         loop {
             if let Some(event) = events.pop_front() {
                 return Some(event);
@@ -75,7 +76,7 @@ impl CompletionQueue {
             if left == Duration::ZERO {
                 return None;
             }
-            events = self.came.wait_timeout(events, left).unwrap_or_else(PoisonError::into_inner).0;
+            events = wait_timeout(&self.came, events, left);
         }
     }
 }

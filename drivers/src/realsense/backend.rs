@@ -131,8 +131,9 @@ impl RealsenseBackend {
 /// Which serial number is at which place, so that cameras in use need not be asked again.
 mod identity {
     use crate::usb::UsbDevice;
+    use depthrig_bus::sync::lock;
     use std::collections::BTreeMap;
-    use std::sync::{Mutex, PoisonError};
+    use std::sync::Mutex;
 
     /// By bus and number on it, which is another after every replug.
     static KNOWN: Mutex<BTreeMap<(u16, u16), (String, String)>> = Mutex::new(BTreeMap::new());
@@ -140,13 +141,13 @@ mod identity {
     const MOST: usize = 1024;
 
     pub(super) fn of(device: &UsbDevice) -> Option<String> {
-        let known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = lock(&KNOWN);
         let (port, serial) = known.get(&(device.bus_number, device.device_number))?;
         (*port == device.port).then(|| serial.clone())
     }
 
     pub(super) fn note(device: &UsbDevice, serial: &str) {
-        let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut known = lock(&KNOWN);
         if known.len() >= MOST {
             known.clear();
         }

@@ -1,7 +1,8 @@
 //! A box for one item between two threads: the newest wins, unless the one that lies there is for a frame set.
 
 use crate::moments::Due;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use depthrig_bus::sync::{lock, wait};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 
 /// An item that a box can hold.
 pub(super) trait ForSet {
@@ -35,7 +36,7 @@ impl<T: ForSet> Newest<T> {
     }
 
     fn slot(&self) -> MutexGuard<'_, Slot<T>> {
-        self.slot.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.slot)
     }
 
     /// Puts `item` in and returns the one that is superseded: the item that lies there, or `item` itself if the other
@@ -43,7 +44,7 @@ impl<T: ForSet> Newest<T> {
     pub(super) fn put(&self, item: T) -> Option<T> {
         let mut slot = self.slot();
         while self.keeps_all && slot.item.is_some() && !slot.closed {
-            slot = self.changed.wait(slot).unwrap_or_else(PoisonError::into_inner);
+            slot = wait(&self.changed, slot);
         }
         if slot.item.as_ref().and_then(ForSet::due).is_some_and(|there| there.stays(item.due())) {
             return Some(item);
@@ -64,7 +65,7 @@ impl<T: ForSet> Newest<T> {
                 self.changed.notify_all();
                 return Some(item);
             }
-            slot = self.changed.wait(slot).unwrap_or_else(PoisonError::into_inner);
+            slot = wait(&self.changed, slot);
         }
     }
 

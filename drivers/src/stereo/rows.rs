@@ -4,9 +4,10 @@
 use super::newest::Newest;
 use super::pair::Views;
 use super::{Descriptions, Notice, StereoOptions};
+use depthrig_bus::sync::lock;
 use depthrig_calib::Rectifier;
 use depthrig_calib::stereo::{Gray, RowCheck, RowOffset, StereoPair};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 /// Pairs from one look to the next until as many were looked at as count at once.
 const FIRST_EVERY: u64 = 10;
@@ -29,11 +30,11 @@ pub(super) struct Corrected(Mutex<Option<Rectifier>>);
 impl Corrected {
     /// The rectifier that is to be used from now on, if there is a new one.
     pub(super) fn take(&self) -> Option<Rectifier> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).take()
+        lock(&self.0).take()
     }
 
     fn put(&self, rectifier: Rectifier) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(rectifier);
+        *lock(&self.0) = Some(rectifier);
     }
 }
 
@@ -125,7 +126,7 @@ impl Rows {
 
     /// States the correction with what is computed, for the datasets that are recorded from now on.
     fn describe(&self, total: &RowOffset) {
-        let mut all = self.computed.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut all = lock(&self.computed);
         for description in all.values_mut() {
             let words = description.parameters.split(' ').filter(|word| !word.starts_with("rows_moved_px="));
             let kept = words.collect::<Vec<_>>().join(" ");
@@ -134,6 +135,6 @@ impl Rows {
     }
 
     fn report(&self, warning: Option<String>) {
-        *self.notice.lock().unwrap_or_else(PoisonError::into_inner) = warning;
+        *lock(&self.notice) = warning;
     }
 }

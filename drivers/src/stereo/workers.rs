@@ -11,12 +11,13 @@ use super::{Descriptions, Geometry, StereoMode, StereoOptions, has_color};
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::PixelFormat;
+use depthrig_bus::sync::lock;
 use depthrig_calib::stereo::{
     DisparityMap, Gray, Matcher, Order, OrderCheck, StereoPair, depth_from_disparity,
 };
 use depthrig_calib::{Rectifier, View};
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Arc, PoisonError};
 
 /// Nice value of the workers: below the capture threads and threads with deadlines.
 const NICE: i32 = 10;
@@ -183,7 +184,7 @@ fn make(
     let mode = &mode.name;
     let mib = d.memory_bytes / (1 << 20);
     tracing::info!(camera, mode, producer = d.producer, parameters = d.parameters, mib, "stereo");
-    computed.lock().unwrap_or_else(PoisonError::into_inner).insert(mode.clone(), d);
+    lock(computed).insert(mode.clone(), d);
     Ok(matcher)
 }
 

@@ -6,10 +6,11 @@ use super::profiles::default_profiles;
 use super::render::{Album, Images, Scene};
 use crate::{Error, ErrorKind, Result, StreamProfile};
 use core::time::Duration;
+use depthrig_bus::sync::lock;
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 /// Capture and what it serves go first; but beside a busy computer it must come to an end.
 const NICE: i32 = 5;
@@ -137,7 +138,7 @@ impl Drawing {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 }
 

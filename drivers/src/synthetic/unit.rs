@@ -11,9 +11,10 @@ use super::profiles::model_of;
 use super::timeline::{Boot, Timeline};
 use crate::{DeviceInfo, Error, ErrorKind, Result, StreamProfile};
 use core::time::Duration;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{DropCounts, DropReason, HostTime};
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 /// How many frames a unit remembers for [`SimTruth::frame`].
 const HISTORY: usize = 4096;
@@ -112,7 +113,7 @@ impl Unit {
     }
 
     pub(crate) fn state(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.state)
     }
 
     /// Takes the unit for a driver.

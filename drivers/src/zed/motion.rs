@@ -19,7 +19,7 @@ use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
 use depthrig_bus::{FrameFlags, HostTime, MotionFlags, MotionSample};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 /// Period of the keep-alive report. The IMU stops a few seconds after the last one.
 const KEEP_ALIVE: Duration = Duration::from_secs(1);
@@ -197,7 +197,7 @@ impl Drop for Motion {
 }
 
 fn lock(state: &Mutex<State>) -> std::sync::MutexGuard<'_, State> {
-    state.lock().unwrap_or_else(PoisonError::into_inner)
+    depthrig_bus::sync::lock(state)
 }
 
 fn run(reports: &mut dyn Reports, shared: &Shared, queue: Option<&SyncSender<Sample>>) -> Result<()> {

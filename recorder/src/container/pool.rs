@@ -1,7 +1,8 @@
 //! Buffers of chunks that were written, kept for chunks to come: in a fresh one every page is a fault of its own.
 
 use core::ops::{Deref, DerefMut};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use depthrig_bus::sync::lock;
+use std::sync::{Arc, Mutex, MutexGuard};
 
 /// Buffers below this many bytes are the allocator's business.
 const SMALL: usize = 64 << 10;
@@ -47,7 +48,7 @@ impl Pool {
     }
 
     fn lock(&self) -> MutexGuard<'_, Vec<Vec<u8>>> {
-        self.free.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.free)
     }
 }
 

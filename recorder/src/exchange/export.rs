@@ -7,6 +7,7 @@ use crate::dataset::{Dataset, DatasetSet, PixelMode, SetReader};
 use crate::fs::Fs;
 use crate::{Error, ErrorKind, Result};
 use crossbeam::channel::{Sender, bounded};
+use depthrig_bus::sync::lock;
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::ops::{ControlFlow, Range};
@@ -431,11 +432,11 @@ impl Work<'_> {
         loop {
             let i = shared.next.fetch_add(1, Ordering::Relaxed);
             let (Some(part), Some(record)) = (self.plan.parts.get(i), shared.records.get(i)) else { return };
-            let lock = || record.lock().unwrap_or_else(PoisonError::into_inner);
+            let slot = || lock(record);
             if shared.stop.load(Ordering::Relaxed) {
                 return;
             }
-            if lock().is_some() {
+            if slot().is_some() {
                 continue;
             }
             if reader.as_ref().is_none_or(|(source, _)| *source != part.source) {
@@ -443,11 +444,11 @@ impl Work<'_> {
             }
             let Some((_, reader)) = &mut reader else { return };
             match self.part(i, part, reader, shared, tick) {
-                Ok(done) => *lock() = Some(done),
+                Ok(done) => *slot() = Some(done),
                 Err(e) => {
                     shared.stop.store(true, Ordering::Relaxed);
                     // The first error is the reason; the other workers were only stopped.
-                    shared.failed.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(e);
+                    lock(&shared.failed).get_or_insert(e);
                     return;
                 }
             }

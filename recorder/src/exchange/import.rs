@@ -7,11 +7,12 @@ use crate::{
     VerifyOptions, VerifyReport, verify_with,
 };
 use depthrig_bus::UtcPair;
+use depthrig_bus::sync::lock;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 /// One layout that can become a dataset. It reads one set at a time.
@@ -111,7 +112,7 @@ pub fn import(
     let pair = Arc::new(Mutex::new(start));
     let clock = {
         let pair = Arc::clone(&pair);
-        Arc::new(move || *pair.lock().unwrap_or_else(PoisonError::into_inner))
+        Arc::new(move || *lock(&pair))
     };
     let queue_sets = options.queue_sets.max(1);
     let backlog = options.backlog_max_bytes;
@@ -125,7 +126,7 @@ pub fn import(
     };
     let mut ended = false;
     while let Some(set) = importer.next().map_err(cut)? {
-        *pair.lock().unwrap_or_else(PoisonError::into_inner) =
+        *lock(&pair) =
             UtcPair { mono: set.tick, utc_ns: set.utc.utc_ns(set.tick), width_ns: set.utc.width_ns };
         // A set that finds no room would be refused: wait for it, nothing is live here.
         loop {

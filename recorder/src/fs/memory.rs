@@ -8,10 +8,11 @@
 //! (<https://wiki.postgresql.org/wiki/Fsync_Errors>).
 
 use super::{DirEntry, Fs, ReadFile, WriteFile};
+use depthrig_bus::sync::lock;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 /// The unit that a disk writes completely or not at all, bytes.
 const SECTOR: usize = 512;
@@ -275,7 +276,7 @@ impl MemFs {
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.0)
     }
 
     /// Counts an operation, and fails it if a fault says so.

@@ -8,6 +8,7 @@
 use crate::encode::{Effort, EncodedFrame};
 use crate::frame::{RecordFrame, RecordMotion, RecordSet};
 use crate::{Error, ErrorKind, Result};
+use depthrig_bus::sync::lock;
 use depthrig_bus::{FrameHeader, HostTime, UtcPair};
 use std::sync::atomic::{AtomicI64, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -187,7 +188,7 @@ impl Ticket {
     }
 
     fn lock(&self) -> MutexGuard<'_, Slots> {
-        self.slots.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.slots)
     }
 
     /// The bytes that this set added to [`Load::backlog_bytes`].

@@ -4,11 +4,12 @@
 //! [`DryFs::refer`] says they do.
 
 use crate::fs::{DirEntry, Fs, ReadFile, WriteFile};
+use depthrig_bus::sync::lock;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 /// A file system over another one, which it never changes.
 pub(super) struct DryFs {
@@ -113,10 +114,6 @@ impl DryFs {
 
 fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."))
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl fmt::Debug for DryFs {

@@ -5,6 +5,7 @@ use crate::dataset::check_stored;
 use crate::encode::Codec;
 use crossbeam::channel::{Receiver, Sender, bounded};
 use depthrig_bus::FrameHeader;
+use depthrig_bus::sync::lock;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Mutex, PoisonError};
 
@@ -79,7 +80,7 @@ fn note(damaged: &Mutex<Vec<DamagedImage>>, number: u64, job: &Job, damage: Opti
     if let Some(damage) = damage {
         let message = format!("set {}: {}: {damage}", job.set, job.stream);
         let image = DamagedImage { number, offset: job.offset, message };
-        damaged.lock().unwrap_or_else(PoisonError::into_inner).push(image);
+        lock(damaged).push(image);
     }
 }
 

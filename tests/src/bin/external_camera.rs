@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used)] // test support: a failure here is a failed test
 
 use depthrig_bus::external::{
-    About, ExternalCamera, ExternalFrame, ExternalOffer, ExternalReason, Mode, Place, Session, lock,
+    About, ExternalCamera, ExternalFrame, ExternalOffer, ExternalReason, Mode, Place, Session, lock_camera,
 };
 use depthrig_bus::{HostTime, Name, PixelFormat};
 use std::time::Duration;
@@ -31,7 +31,7 @@ fn main() {
         "never_offers" => std::thread::sleep(Duration::from_mins(10)),
         "locked_and_silent" => {
             let who = format!("process {} (external_camera)", std::process::id());
-            let _lock = lock(&place.runtime, &place.rig, &place.camera, &who).unwrap();
+            let _lock = lock_camera(&place.runtime, &place.rig, &place.camera, &who).unwrap();
             std::thread::sleep(Duration::from_mins(10));
         }
         _ => {}

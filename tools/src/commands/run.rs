@@ -8,12 +8,13 @@ use crate::signals::Stop;
 use anyhow::Result;
 use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
+use depthrig_bus::sync::lock;
 use depthrig_bus::{HostTime, RuntimeDir};
 use depthrig_daemon::config::RigConfig;
 use depthrig_daemon::control::{Control, RecordRequest};
 use depthrig_daemon::rig::{Rig, RigOptions, RigSummary};
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\
@@ -127,9 +128,6 @@ pub fn start(
     quiet: bool,
 ) -> Result<Started> {
     let shared = Arc::new(Mutex::new((Progress::new(quiet), HostTime::now())));
-    let lock = |shared: &Mutex<(Progress, HostTime)>, f: &dyn Fn(&mut (Progress, HostTime))| {
-        f(&mut shared.lock().unwrap_or_else(PoisonError::into_inner));
-    };
     let shown = shared.clone();
     let announced = AtomicBool::new(!quiet);
     let progress = move |camera: &str, done: usize, total: usize| {
@@ -137,10 +135,9 @@ pub fn start(
             announce_rendering();
         }
         let what = format!("rendering {camera} (kept for next time)");
-        lock(&shown, &|(bar, rendered)| {
-            bar.set(&what, done as u64, total as u64);
-            *rendered = HostTime::now();
-        });
+        let mut shown = lock(&shown);
+        shown.0.set(&what, done as u64, total as u64);
+        shown.1 = HostTime::now();
     };
     let options = RigOptions {
         serve_api,
@@ -151,7 +148,7 @@ pub fn start(
         ..RigOptions::new(runtime)
     };
     let rig = Rig::start(config, &options);
-    let mut shared = shared.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut shared = lock(&shared);
     shared.0.clear();
     Ok(Started { rig: rig?, start_s: shared.1.elapsed().as_secs_f64() })
 }

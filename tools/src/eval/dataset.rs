@@ -4,13 +4,14 @@ use super::read::Metres;
 use super::{Job, Loaded, Source};
 use crate::image_file::depth_m;
 use anyhow::{Context, Result, bail};
+use depthrig_bus::sync::lock;
 use depthrig_bus::{FrameHeader, PixelFormat, StreamName};
 use depthrig_calib::{PoseExt, Registration, same_view};
 use depthrig_recorder::{Dataset, DatasetFrame, PixelMode, SetRange, Sets};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 /// Streams that are evaluated by default, if present.
 const PREDICTIONS: [&str; 3] = ["depth", "depth_aligned", "depth_refined"];
@@ -193,7 +194,7 @@ impl Shared {
     }
 
     fn pool(&self) -> std::sync::MutexGuard<'_, BTreeMap<(usize, usize), Vec<Registration>>> {
-        self.registrations.lock().unwrap_or_else(PoisonError::into_inner)
+        lock(&self.registrations)
     }
 }
 

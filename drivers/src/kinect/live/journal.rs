@@ -3,8 +3,9 @@
 
 use super::ffi;
 use core::ffi::{CStr, c_char, c_int, c_void};
+use depthrig_bus::sync::lock;
 use std::collections::VecDeque;
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 
 /// So many messages are kept; libk4a says a dozen about one failure.
 const KEPT: usize = 48;
@@ -20,19 +21,19 @@ pub struct Journal {
 impl Journal {
     /// Forgets what was said so far.
     pub fn clear(&self) {
-        self.lines.lock().unwrap_or_else(PoisonError::into_inner).clear();
+        lock(&self.lines).clear();
     }
 
     /// The messages, the oldest first.
     pub fn lines(&self) -> Vec<String> {
-        self.lines.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
+        lock(&self.lines).iter().cloned().collect()
     }
 
     fn note(&self, level: u32, message: &str) {
         let message: String =
             message.trim().chars().map(|c| if c.is_control() { ' ' } else { c }).take(LONGEST).collect();
         tracing::debug!(target: "libk4a", level, "{message}");
-        let mut lines = self.lines.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut lines = lock(&self.lines);
         if lines.len() >= KEPT {
             lines.pop_front();
         }

@@ -9,11 +9,12 @@
 use super::ffi::{self, Functions};
 use super::journal::{Journal, on_message};
 use crate::{Error, ErrorKind, Result};
+use depthrig_bus::sync::lock;
 use libloading::Library;
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 
 /// The environment variable that names libk4a: the file, or the folder that holds it.
 pub const VARIABLE: &str = "DEPTHRIG_LIBK4A";
@@ -123,7 +124,7 @@ static LOADED: Mutex<BTreeMap<PathBuf, &'static Loaded>> = Mutex::new(BTreeMap::
 pub fn load(places: &Places) -> Result<&'static Loaded> {
     let path = find(places)?;
     let path = path.canonicalize().unwrap_or(path);
-    let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut loaded = lock(&LOADED);
     if let Some(known) = loaded.get(&path) {
         return Ok(known);
     }

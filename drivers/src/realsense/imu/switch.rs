@@ -10,10 +10,11 @@ use crate::realsense::protocol::imu::Rates;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::HostTime;
+use depthrig_bus::sync::lock;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TryRecvError, sync_channel};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard};
 
 /// The attributes of an accelerometer and of a gyroscope, by axis.
 pub(super) const ACCELERATION: [&str; 3] = ["in_accel_x", "in_accel_y", "in_accel_z"];
@@ -98,7 +99,7 @@ struct Turn {
 static TURNS: Mutex<BTreeMap<PathBuf, Turn>> = Mutex::new(BTreeMap::new());
 
 fn turns() -> MutexGuard<'static, BTreeMap<PathBuf, Turn>> {
-    TURNS.lock().unwrap_or_else(PoisonError::into_inner)
+    lock(&TURNS)
 }
 
 struct Worker {

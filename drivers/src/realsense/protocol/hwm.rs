@@ -7,7 +7,8 @@
 use super::protocol_error;
 use crate::bytes::{array, u16_at, u32_at};
 use crate::{Error, ErrorKind, Result};
-use std::sync::{Arc, Mutex, PoisonError};
+use depthrig_bus::sync::lock;
+use std::sync::{Arc, Mutex};
 
 mod opcode;
 mod request;
@@ -62,7 +63,7 @@ impl<M: HardwareMonitor + ?Sized> HardwareMonitor for Box<M> {
 impl<M: HardwareMonitor + ?Sized> HardwareMonitor for Arc<Mutex<M>> {
     fn command(&mut self, request: &Request) -> Result<Vec<u8>> {
         // A thread that panicked inside left no half request behind that the next one would not overwrite.
-        self.lock().unwrap_or_else(PoisonError::into_inner).command(request)
+        lock(self).command(request)
     }
 }
 
