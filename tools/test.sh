@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs every test there is and ends with one line that counts them. `make test` prepares what it needs.
+# Runs every test and ends with one line that counts them. `make test` prepares its dependencies.
 #
 # Tests run as an ordinary user. Started by root, this script builds as root (the toolchain may lie where nobody else may
 # enter) and runs what was built as the user `depthrig-test`, which it creates; DEPTHRIG_TEST_USER=UID:GID:HOME names
@@ -16,6 +16,7 @@ runner=tests/runner/rust.py
 logs=target/test-logs
 mkdir -p "$logs"
 rm -f "$logs"/*
+touch "$logs/failed"
 target=${CARGO_TARGET_DIR:-$PWD/target}
 # The longest that a step may take; each test has a limit of its own.
 limit=${DEPTHRIG_STEP_LIMIT_S:-3600}
@@ -36,19 +37,18 @@ fi
 box() { # [OPTION...] -- COMMAND...
     tests/runner/box.py --limit "$limit" "$@"
 }
-# What could not be tested, in a line each, written by whoever runs the tests.
+# Skipped tests, one per line, written by the test runners.
 export DEPTHRIG_TEST_SKIPS=$home/skips
 touch "$DEPTHRIG_TEST_SKIPS"
 chmod 0666 "$DEPTHRIG_TEST_SKIPS"
 
-failed_steps=""
 step() { # NAME COMMAND...: runs it, keeps its output, remembers a failure
     local name=$1
     shift
     printf '\n== %s\n' "$name"
     local start=$SECONDS
     if ! "$@" 2>&1 | tee "$logs/$name.log"; then
-        failed_steps+=" $name"
+        echo "$name" >>"$logs/failed"
         echo "== $name FAILED"
     fi
     echo "$name $((SECONDS - start))" >>"$logs/seconds"
@@ -68,7 +68,7 @@ if [ ! -d "$DEPTHRIG_TEST_DATA/lingbot_depth" ]; then
         exit 1
     fi
     echo "the real images are not at $DEPTHRIG_TEST_DATA (DEPTHRIG_TEST_DATA): tests that need them are skipped"
-    # What a Debian package has of them, fetched by tools/setup.sh.
+    # The images from a Debian package, fetched by tools/setup.sh.
     [ ! -d "$target/test-data" ] || export DEPTHRIG_TEST_DATA=$target/test-data
     export DEPTHRIG_DATA_MISSING=1
 fi
@@ -90,17 +90,10 @@ export DEPTHRIG_TEST_PUBLISHER=$target/debug/examples/publish
 
 tests=("$python" -m pytest --quiet -p no:cacheprovider)
 step runner box -- "${tests[@]}" tests/runner
-step rust "$runner" "$built"
-# rustdoc compiles these into a folder that only its own user can enter.
-step rust-doc box --as-root -- cargo test --workspace --doc --no-fail-fast --quiet
-step binary tools/check_binary.sh "$DEPTHRIG_BIN"
-# What talks to other processes and fills memory, where there is little of everything. A stream takes about ten descriptors in
+
+# Tests that talk to other processes and fill memory, with little of every resource. A stream takes about ten descriptors in
 # the process that publishes it and ten in each that reads it: a rig and its readers in one process have more than 64.
 small=(--shm 256 --busy 2)
-# Left out of 64: what subscribes seventeen times in one process.
-step rust-small "$runner" "$built" "${small[@]}" --nofile 64 --only depthrig-bus:channels \
-    --skip a_dead_process_whose_description_is_gone --skip sixteen_subscribers_find_room
-step rust-busy "$runner" "$built" "${small[@]}" --nofile 256 --only depthrig-tests:dataset --only depthrig-tests:replay
 
 # The OAK program in Rust cannot be linked without a built depthai-core; its types can be looked at.
 oak_crate() {
@@ -109,18 +102,36 @@ oak_crate() {
         "${cargo[@]}" test --manifest-path drivers/oak/Cargo.toml --locked --quiet --no-run \
             --message-format=json-render-diagnostics >"$logs/oak.json" && "$runner" "$logs/oak.json"
 }
-step oak-crate oak_crate
+beside() {
+    step oak-crate oak_crate
 
-step python box -- "${tests[@]}" python/tests
-step python-small box "${small[@]}" --nofile 64 -- "${tests[@]}" -m "not many_streams" \
-    python/tests/test_stream.py python/tests/test_fresh.py python/tests/test_motion.py
-# The wheel on other versions of Python, and with PyTorch.
-step python-versions tools/python.sh versions
-step python-torch optional "tests with PyTorch" tools/python.sh torch
-step python-oak optional "the OAK bridge with its SDK" tools/python.sh oak
+    step python box -- "${tests[@]}" python/tests
+    step python-small box "${small[@]}" --nofile 64 -- "${tests[@]}" -m "not many_streams" \
+        python/tests/test_stream.py python/tests/test_fresh.py python/tests/test_motion.py
+    # The wheel on other versions of Python, and with PyTorch.
+    step python-versions tools/python.sh versions
+    step python-torch optional "tests with PyTorch" tools/python.sh torch
+    step python-oak optional "the OAK bridge with its SDK" tools/python.sh oak
+}
+# These wait more than they compute, so they run beside the tests in Rust; their output is printed when both have ended.
+set -m # in a process group of its own, which ends with this script
+beside >"$logs/beside" 2>&1 &
+beside=$!
+set +m
+trap 'kill -- -"$beside" 2>/dev/null; rm -rf "$home"' EXIT
+
+step rust "$runner" "$built" --without depthrig-tests:storage_faults
+# rustdoc compiles these into a folder that only its own user can enter.
+step rust-doc box --as-root -- cargo test --workspace --doc --no-fail-fast --quiet
+step binary tools/check_binary.sh "$DEPTHRIG_BIN"
+# Left out with 64 descriptors: a test that subscribes seventeen times in one process.
+step rust-small "$runner" "$built" "${small[@]}" --nofile 64 --only depthrig-bus:channels \
+    --skip a_dead_process_whose_description_is_gone --skip sixteen_subscribers_find_room
+step rust-busy "$runner" "$built" "${small[@]}" --nofile 256 --only depthrig-tests:dataset --only depthrig-tests:replay
+
 step daemon box -- "${tests[@]}" tests/python
 
-# Readers that are not ours must find the same pixels.
+# Third-party readers must find the same pixels.
 work=$home/t/readers
 box -- mkdir "$work"
 readers() { # NAME EXAMPLE OPTION READER...
@@ -141,21 +152,28 @@ readers -rank golden rank python
 readers -stereo golden stereo python node
 readers -zed zed_replay_golden "" python node
 
-# The drivers and the daemon on a real kernel.
+wait "$beside"
+trap 'rm -rf "$home"' EXIT
+cat "$logs/beside"
+# Shows that a failing disk does not delay a camera, so nothing else may.
+step rust-quiet "$runner" "$built" --only depthrig-tests:storage_faults
+
+# The drivers and the daemon on a real kernel: alone, because its cameras are as punctual as this computer.
 step vm optional "the virtual machine (tools/setup.sh vm)" \
     box -- tests/vm/run --no-build ${DEPTHRIG_REQUIRE_VM:+--require}
 
 # Every test that cargo and pytest counted, every check of the virtual machine, and one for each of the other steps.
-counted=(runner rust rust-doc rust-small rust-busy oak-crate python python-small python-versions python-torch python-oak daemon vm)
+counted=(runner rust rust-quiet rust-doc rust-small rust-busy oak-crate python python-small python-versions python-torch python-oak daemon vm)
 count() { # WORD
     local name
     for name in "${counted[@]}"; do cat "$logs/$name.log"; done | grep -oE "[0-9]+ $1" | awk '{n += $1} END {print n + 0}'
 }
+failed_steps=$(tr '\n' ' ' 2>/dev/null <"$logs/failed")
 passed=$(count passed)
 failed=$(($(count failed) + $(count 'errors?\b')))
 for log in "$logs"/binary.log "$logs"/golden*.log "$logs"/reader-*.log; do
     name=$(basename "$log" .log)
-    case "$failed_steps " in
+    case " $failed_steps " in
     *" $name "*) failed=$((failed + 1)) ;;
     *) passed=$((passed + 1)) ;;
     esac
@@ -165,7 +183,7 @@ if [ "$skipped" -gt 0 ]; then
     printf '\nskipped:\n'
     sed 's/^/  /' "$DEPTHRIG_TEST_SKIPS"
 fi
-[ -z "$failed_steps" ] || printf '\nfailed:%s\n' "$failed_steps"
+[ -z "$failed_steps" ] || printf '\nfailed: %s\n' "$failed_steps"
 [ -z "$failed_steps" ] || [ "$failed" -gt 0 ] || failed=1
 printf '\n%d passed, %d failed%s\n' "$passed" "$failed" "$([ "$skipped" -eq 0 ] || echo ", $skipped skipped (named above)")"
 [ -z "$failed_steps" ]

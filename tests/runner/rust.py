@@ -2,7 +2,7 @@
 """Runs test executables that cargo has built, each in a box (box.py), and counts their results.
 
     cargo test --workspace --no-run --message-format=json >MESSAGES
-    tests/runner/rust.py MESSAGES [--only CRATE[:TARGET][=FILTER]]... [--shm MIB] [--nofile N] [--busy N]
+    tests/runner/rust.py MESSAGES [--only CRATE[:TARGET][=FILTER]]... [--without CRATE:TARGET]... [--shm MIB] [--nofile N] [--busy N]
 
 A test that has not ended `DEPTHRIG_TEST_LIMIT_S` seconds (600) after the one before it is killed with all that it
 started, and named. A test that says "skipped: why" and passes is counted as skipped, and so is one that fails because it
@@ -175,12 +175,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("messages", type=Path)
     parser.add_argument("--only", action="append", metavar="CRATE[:TARGET][=FILTER]", help="run these alone")
+    parser.add_argument("--without", action="append", default=[], metavar="CRATE:TARGET", help="leave out executables")
     parser.add_argument("--skip", action="append", default=[], metavar="TEST", help="leave out tests of this name")
     parser.add_argument("--shm", type=int, metavar="MIB", help="size of /dev/shm")
     parser.add_argument("--nofile", type=int, metavar="N", help="most descriptors of a process")
     parser.add_argument("--busy", type=int, default=0, metavar="N", help="busy loops beside each executable")
     args = parser.parse_args()
     executables, programs = read_messages(args.messages)
+    executables = [e for e in executables if f"{e.crate}:{e.target}" not in args.without]
     wanted: list[tuple[Executable, list[str]]] = []
     skips = [word for name in args.skip for word in ("--skip", name)]
     for only in args.only or [""]:
