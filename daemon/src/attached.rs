@@ -14,6 +14,7 @@ pub use ask::{Ask, NodeFacts, Served, System};
 pub use classify::Family;
 pub(crate) use served::place as place_of_served;
 
+use crate::family;
 use crate::status::{CameraStatus, RigStatus};
 use classify::Candidate;
 use depthrig_bus::PixelFormat;
@@ -368,8 +369,8 @@ fn holders(root: &SysRoot, c: &Candidate) -> Holders {
 
 /// The camera of a running rig that `c` is.
 fn in_rig<'r>(rig: &'r RigStatus, c: &Candidate) -> Option<&'r CameraStatus> {
-    let driven =
-        |camera: &&CameraStatus| !matches!(camera.backend.as_str(), "synthetic" | "files" | "replay");
+    let has_ports = |name: &str| family::find(name).is_none_or(|f| f.has_ports);
+    let driven = |camera: &&CameraStatus| camera.backend != "replay" && has_ports(&camera.backend);
     rig.cameras.iter().filter(driven).find(|camera| camera.port == c.port && !c.port.is_empty())
 }
 

@@ -5,37 +5,24 @@
 //! restart. Reading a configuration touches no camera and no file but its own.
 
 mod camera;
-mod controls;
+pub(crate) mod controls;
 mod error;
-mod external;
-mod kinect;
-mod l515;
-mod read;
-mod realsense;
+pub(crate) mod read;
 mod refine;
 mod rig;
-mod stereo;
-mod synthetic;
+pub(crate) mod stereo;
 #[cfg(test)]
 mod tests;
-mod v4l2;
-mod value;
-mod wanted;
-mod zed;
+pub(crate) mod value;
+pub(crate) mod wanted;
 
+pub use crate::family::{AnySettings, BackendConfig, CameraSettings};
 pub use depthrig_cdm::Precision;
-pub use depthrig_drivers::external::ExternalConfig as ExternalSettings;
-pub use depthrig_drivers::files::FilesConfig as FilesSettings;
-pub use depthrig_drivers::kinect::KinectConfig as KinectSettings;
-pub use depthrig_drivers::realsense::RealsenseConfig as RealsenseSettings;
-pub use depthrig_drivers::realsense::l515::L515Config as L515Settings;
-pub use depthrig_drivers::synthetic::SyntheticConfig as SyntheticSettings;
-pub use depthrig_drivers::v4l2::V4l2Config as V4l2Settings;
-pub use depthrig_drivers::zed::ZedConfig as ZedSettings;
-pub use depthrig_drivers::zed::replay::ZedPlaybackConfig as ZedReplaySettings;
 pub use depthrig_recorder::{ColorCodec, DepthCodec};
 pub use error::{ConfigError, Problem};
+pub use stereo::StereoConfig;
 
+use crate::family::{FAMILIES, Family};
 use depthrig_bus::{CameraName, PixelFormat, Pose, RigName, StreamName};
 use depthrig_drivers::stereo::StereoOptions;
 use depthrig_drivers::{StreamProfile, StreamRequest};
@@ -169,7 +156,7 @@ pub struct CameraConfig {
     pub stereo: Option<StereoConfig>,
     /// How its depth is refined; `None`: not at all.
     pub refine: Option<RefineConfig>,
-    /// Its driver and that driver's settings.
+    /// Its family and that family's settings.
     pub backend: BackendConfig,
 }
 
@@ -184,27 +171,6 @@ pub struct CdmConfig {
     pub models: Option<PathBuf>,
     /// A refinement slower than this, and than ten times the slowest so far, counts as hung, seconds.
     pub hang_s: f64,
-}
-
-/// How depth is computed from the left and right images of a camera.
-#[derive(Debug, Clone, PartialEq)]
-pub struct StereoConfig {
-    /// The modes, in the order of their streams.
-    pub modes: Vec<crate::zed_replay::Mode>,
-    /// Threads of each mode.
-    pub threads: usize,
-    /// Nearest and farthest depth, metres.
-    pub range_m: (f64, f64),
-    /// Whether disparity is published as well.
-    pub disparity: bool,
-    /// Pairs that are matched, a second at most; 0: every one.
-    pub rate_hz: f64,
-    /// A recording waits for the slowest mode, and nothing is skipped.
-    pub every_pair: bool,
-    /// The network of the mode `neural`; absolute.
-    pub network: Option<PathBuf>,
-    /// The library of ONNX Runtime, as `[cdm]` has it.
-    pub library: Option<PathBuf>,
 }
 
 /// How a camera's depth is refined.
@@ -321,46 +287,6 @@ impl CameraConfig {
     }
 }
 
-/// A driver with its settings.
-#[derive(Debug, Clone, PartialEq)]
-#[allow(clippy::large_enum_variant)] // one per camera of a rig
-pub enum BackendConfig {
-    /// A simulated camera.
-    Synthetic(SyntheticSettings),
-    /// A folder of images that plays as a camera.
-    Files(FilesSettings),
-    /// A RealSense D400.
-    Realsense(RealsenseSettings),
-    /// A RealSense L515.
-    L515(L515Settings),
-    /// A camera at the kernel's video nodes.
-    V4l2(V4l2Settings),
-    /// A Stereolabs ZED.
-    Zed(ZedSettings),
-    /// A recording of one, which plays as that camera.
-    ZedReplay(ZedReplaySettings),
-    /// A camera that another process serves.
-    External(ExternalSettings),
-    /// An Azure Kinect.
-    Kinect(KinectSettings),
-}
-
-impl BackendConfig {
-    /// The driver's name in the configuration.
-    pub const fn name(&self) -> &'static str {
-        match self {
-            Self::Synthetic(_) => "synthetic",
-            Self::Files(_) => "files",
-            Self::Realsense(_) => depthrig_drivers::realsense::NAME,
-            Self::L515(_) => depthrig_drivers::realsense::l515::NAME,
-            Self::V4l2(_) => "v4l2",
-            Self::Zed(_) | Self::ZedReplay(_) => "zed",
-            Self::External(_) => depthrig_drivers::external::NAME,
-            Self::Kinect(_) => depthrig_drivers::kinect::NAME,
-        }
-    }
-}
-
 impl Default for BusConfig {
     fn default() -> Self {
         Self { slots: depthrig_bus::shm::DEFAULT_SLOTS }
@@ -416,7 +342,16 @@ impl RigConfig {
     /// # Errors
     /// [`ConfigError`] with every problem of the text.
     pub fn parse(text: &str, path: Option<&Path>) -> Result<Self, ConfigError> {
-        rig::parse(text, path)
+        Self::parse_with(text, path, FAMILIES)
+    }
+
+    /// As [`Self::parse`], for cameras of `families`.
+    pub(crate) fn parse_with(
+        text: &str,
+        path: Option<&Path>,
+        families: &[Family],
+    ) -> Result<Self, ConfigError> {
+        rig::parse(text, path, families)
     }
 
     /// The commented default configuration: the seven cameras of the mount, simulated. It runs as it is.

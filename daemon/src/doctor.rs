@@ -7,13 +7,12 @@ mod bandwidth;
 mod cameras;
 mod clock;
 mod disk;
-mod external;
 mod finding;
 mod host;
-mod kinect;
 mod memory;
 mod plan;
 mod refine;
+mod served;
 #[cfg(test)]
 mod tests;
 
@@ -22,7 +21,6 @@ pub use clock::ClockSync;
 pub use disk::{DiskFacts, DiskPlan};
 pub use finding::{Finding, Severity};
 pub use host::Host;
-pub use kinect::{KinectFacts, Missing};
 pub use plan::{CameraPlan, PlannedStream};
 
 use crate::attached::{Ask, Attached, look};
@@ -93,7 +91,7 @@ fn judge(config: &RigConfig, attached: &Attached, plans: Vec<plan::Planned>, hos
     let shm_needed_bytes = memory::check(config, &plans, host, &mut findings);
     host.check(config, &mut findings);
     refine::check(config, &plans, &mut findings);
-    host.kinect.check(config, &mut findings);
+    host.check_unmet(&mut findings);
     findings.sort_by_key(|f| (core::cmp::Reverse(f.severity), f.camera.is_some()));
     for p in &mut plans {
         p.worst = findings.iter().filter(|f| f.camera.as_deref() == Some(&*p.name)).map(|f| f.severity).max();

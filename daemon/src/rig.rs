@@ -16,8 +16,9 @@ pub(crate) mod report;
 
 use crate::api::{self, ServerHandle};
 use crate::camera::{Camera, Shared, Supervisor};
-use crate::config::{BackendConfig, RigConfig};
+use crate::config::RigConfig;
 use crate::control::{Control, RecordRequest};
+use crate::family::Preparation;
 use crate::housekeeping::Housekeeping;
 use crate::recording::{self, Begun, Outside, Recording, Reports, StreamFacts, recover_left};
 use crate::sets::SpreadStats;
@@ -481,12 +482,10 @@ impl Control for Inner {
     }
 }
 
-/// Plans the scenes of synthetic cameras.
+/// Adds the scenes of all cameras to the shared drawing.
 fn plan(config: &RigConfig, drawing: &Drawing) -> Result<()> {
     for camera in &config.cameras {
-        if let BackendConfig::Synthetic(c) = &camera.backend {
-            drawing.plan(c)?;
-        }
+        camera.backend.add_to_drawing(drawing)?;
     }
     Ok(())
 }
@@ -504,23 +503,19 @@ fn start_thread(
     Ok((thread, stop))
 }
 
-/// Sets the pose and the cache folder of synthetic cameras, and renders their scenes unless that is to be done while
-/// they stream.
+/// Prepares every camera; scenes are rendered now unless that is to be done while they stream.
 fn prepare(config: &mut RigConfig, options: &RigOptions) -> Result<()> {
     for camera in &mut config.cameras {
-        let BackendConfig::Synthetic(c) = &mut camera.backend else { continue };
-        c.pose_on_mount = camera.pose;
-        if let Some(dir) = &options.cache_dir {
-            c.cache_dir.clone_from(dir);
-        }
-        if options.draw_while_running {
-            continue;
-        }
         let name = camera.name.as_str();
-        depthrig_drivers::synthetic::prepare(c, &|done, total| {
+        let render = |done, total| {
             if let Some(progress) = &options.progress {
                 progress(name, done, total);
             }
+        };
+        camera.backend.prepare(&Preparation {
+            pose: camera.pose,
+            cache_dir: options.cache_dir.as_deref(),
+            render: (!options.draw_while_running).then_some(&render),
         })?;
     }
     Ok(())

@@ -19,13 +19,3 @@ pub use recording::Recording;
 
 /// The name of the backend, for an attached camera and for a recording.
 pub const NAME: &str = "kinect";
-
-/// The Kinect that a rig selects.
-#[derive(Debug, Clone, PartialEq)]
-#[allow(clippy::large_enum_variant)] // one per camera of a rig
-pub enum KinectConfig {
-    /// An attached camera.
-    Live(live::LiveConfig),
-    /// A recording.
-    Recorded(playback::PlaybackConfig),
-}

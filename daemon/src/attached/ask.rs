@@ -2,17 +2,14 @@
 
 use super::Family;
 use crate::client::Client;
-use crate::config::{BackendConfig, KinectSettings, RigConfig};
+use crate::config::{BackendConfig, RigConfig};
+use crate::family::{self, Probe};
 use crate::status::RigStatus;
 use depthrig_bus::RuntimeDir;
 use depthrig_drivers::external::{self, ExternalBackend, ExternalConfig, Place};
-use depthrig_drivers::kinect::live::{LiveBackend, LiveConfig, Places};
-use depthrig_drivers::realsense::l515::{L515Backend, L515Config};
-use depthrig_drivers::realsense::{RealsenseBackend, RealsenseConfig};
 use depthrig_drivers::usb::SysRoot;
-use depthrig_drivers::v4l2::{Node, V4l2Backend, V4l2Config};
-use depthrig_drivers::zed::{ZedBackend, ZedConfig};
-use depthrig_drivers::{Backend, Device, DeviceInfo, Result, StreamProfile};
+use depthrig_drivers::v4l2::Node;
+use depthrig_drivers::{Device, DeviceInfo, Result, StreamProfile};
 use rustix::fs::Access;
 use std::path::Path;
 
@@ -69,20 +66,17 @@ pub trait Ask {
 pub struct System {
     /// Where the rigs of this user are; `None`: none are asked.
     pub runtime: Option<RuntimeDir>,
-    /// Where Microsoft's libraries are, which an Azure Kinect is asked through.
-    pub kinect: Places,
-    /// The folder that `/sys` is in, by which an Azure Kinect is found at its port.
+    /// The cameras of the rig that is examined; empty without one.
+    pub rig: Vec<BackendConfig>,
+    /// The folder that `/sys` is in.
     pub root: SysRoot,
 }
 
 impl System {
-    /// The system for a rig: libraries are those that its first Kinect names.
+    /// The system for a rig.
     pub fn of_rig(config: &RigConfig, runtime: Option<RuntimeDir>) -> Self {
-        let named = config.cameras.iter().find_map(|c| match &c.backend {
-            BackendConfig::Kinect(KinectSettings::Live(live)) => Some(live.places.clone()),
-            _ => None,
-        });
-        Self { runtime, kinect: named.unwrap_or_default(), root: SysRoot::default() }
+        let rig = config.cameras.iter().map(|c| c.backend.clone()).collect();
+        Self { runtime, rig, root: SysRoot::default() }
     }
 }
 
@@ -101,29 +95,8 @@ impl Ask for System {
     }
 
     fn device(&self, family: Family, port: &str) -> Option<Result<(DeviceInfo, Vec<StreamProfile>)>> {
-        let port = Some(port.to_owned());
-        let backend: Box<dyn Backend> = match family {
-            Family::D400 => {
-                Box::new(RealsenseBackend::new(RealsenseConfig {
-                    port,
-                    // Listed all the same, with the calibration `none`.
-                    allow_uncalibrated: true,
-                    ..RealsenseConfig::default()
-                }))
-            }
-            Family::Kinect => {
-                let places = self.kinect.clone();
-                let config = LiveConfig { port, places, ..LiveConfig::default() };
-                Box::new(LiveBackend::new(config).with_root(self.root.clone()))
-            }
-            Family::Zed => Box::new(ZedBackend::new(ZedConfig { port, ..ZedConfig::default() })),
-            Family::Uvc | Family::Platform => {
-                Box::new(V4l2Backend::new(V4l2Config { port, ..V4l2Config::default() }))
-            }
-            Family::L515 => Box::new(L515Backend::new(L515Config { port, ..L515Config::default() })),
-            // The one is driven by another process, the other is at no port; see `served`.
-            Family::Oak | Family::External => return None,
-        };
+        let probe = family::find(family.backend())?.probe?;
+        let backend = probe(&Probe { port, root: &self.root, rig: &self.rig });
         let facts = |device: Box<dyn Device>| (device.info().clone(), device.profiles().to_vec());
         Some(backend.open(None).map(facts))
     }

@@ -2,7 +2,7 @@
 
 use super::{Camera, Shared};
 use crate::Result;
-use crate::config::BackendConfig;
+use crate::family::OpenContext;
 use crate::sink::BusSink;
 use crate::stage::{Readers, Refinement, Setup};
 use crate::stream::Stream;
@@ -10,7 +10,7 @@ use depthrig_bus::sync::lock;
 use depthrig_bus::{FrameHeader, StreamId, StreamName, shm};
 use depthrig_calib::PoseExt;
 use depthrig_drivers::capture::Session;
-use depthrig_drivers::stereo::StereoOptions;
+use depthrig_drivers::stereo::{StereoBackend, StereoOptions};
 use depthrig_drivers::{Backend, DeviceInfo, ErrorKind as DriverErrorKind, StreamProfile, StreamRequest};
 use std::sync::{Arc, Mutex};
 
@@ -116,37 +116,13 @@ fn open_refinement(camera: &Camera, shared: &Shared, info: &DeviceInfo) -> Resul
 
 /// The driver of a camera.
 fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {
-    use depthrig_drivers::{
-        external::{ExternalBackend, Place},
-        files::FilesBackend,
-        kinect::{KinectConfig, live::LiveBackend, playback::PlaybackBackend},
-        realsense::RealsenseBackend,
-        realsense::l515::L515Backend,
-        stereo::StereoBackend,
-        synthetic::SyntheticBackend,
-        v4l2::V4l2Backend,
-        zed::{ZedBackend, replay::ZedPlaybackBackend},
-    };
-    let backend: Box<dyn Backend> = match &camera.config.backend {
-        // One beginning for all cameras of the rig, or each would see the world at another moment.
-        BackendConfig::Synthetic(c) => {
-            Box::new(SyntheticBackend::with_drawing(vec![c.clone()], shared.began, shared.drawing.as_ref())?)
-        }
-        BackendConfig::Files(c) => Box::new(FilesBackend::new(c.clone())),
-        BackendConfig::L515(c) => Box::new(L515Backend::new(c.clone())),
-        BackendConfig::Realsense(c) => Box::new(RealsenseBackend::new(c.clone())),
-        BackendConfig::V4l2(c) => Box::new(V4l2Backend::new(c.clone())),
-        BackendConfig::Zed(c) => Box::new(ZedBackend::new(c.clone())),
-        BackendConfig::ZedReplay(c) => Box::new(ZedPlaybackBackend::new(c.clone())),
-        BackendConfig::External(c) => {
-            let runtime = shared.bus.runtime().clone();
-            let rig = shared.bus.rig().clone();
-            let place = Place { runtime, rig, camera: camera.config.name.clone() };
-            Box::new(ExternalBackend::new(c.clone(), place))
-        }
-        BackendConfig::Kinect(KinectConfig::Live(c)) => Box::new(LiveBackend::new(c.clone())),
-        BackendConfig::Kinect(KinectConfig::Recorded(c)) => Box::new(PlaybackBackend::new(c.clone())),
-    };
+    let backend = camera.config.backend.backend(&OpenContext {
+        runtime: shared.bus.runtime(),
+        rig: shared.bus.rig(),
+        camera: &camera.config.name,
+        began: shared.began,
+        drawing: shared.drawing.as_ref(),
+    })?;
     Ok(match &camera.config.stereo {
         Some(stereo) => {
             let options = StereoOptions {

@@ -12,7 +12,6 @@
 
 use super::open::{SharedBackend, open_session};
 use super::{Camera, Shared};
-use crate::config::{BackendConfig, KinectSettings};
 use crate::priority;
 use crate::status::CameraState;
 use core::time::Duration;
@@ -21,7 +20,7 @@ use depthrig_drivers::ErrorKind as DriverErrorKind;
 use depthrig_drivers::capture::{Capture, End, StopOutcome};
 use std::sync::Arc;
 
-/// How long an opening may take before its thread is given up for hung.
+/// How long opening a device may take before its thread is given up for hung.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(15);
 /// How long a recording may be silent that waits for its modes.
 const WAITS_FOR_MODES: Duration = Duration::from_mins(1);
@@ -105,7 +104,7 @@ impl Supervisor {
             // Not a frame yet: opening, or open and silent.
             let open = !self.camera.state().streams.is_empty();
             let silence = Duration::from_nanos(now.since_ns(self.opened_at).max(0) as u64);
-            if heartbeat_age > open_timeout(&self.camera.config.backend) {
+            if heartbeat_age > OPEN_TIMEOUT + self.camera.config.backend.extra_open_time() {
                 self.give_up(now, "the device did not come back from being opened");
             } else if open && silence > stall * STALLS_UNTIL_RESTART && heartbeat_age < stall {
                 self.restart(now, &format!("open, but not one frame in {:.1} s", silence.as_secs_f64()));
@@ -229,12 +228,7 @@ impl Supervisor {
     /// Whether an opening failed for good: files that are not there are a mistake, not an unplugged camera.
     fn never_will(&self, e: &depthrig_drivers::Error) -> bool {
         e.kind() == DriverErrorKind::NotFound
-            && matches!(
-                self.camera.config.backend,
-                BackendConfig::Files(_)
-                    | BackendConfig::ZedReplay(_)
-                    | BackendConfig::Kinect(KinectSettings::Recorded(_))
-            )
+            && self.camera.config.backend.reads_files()
             && self.camera.state().streams.is_empty()
     }
 
@@ -290,14 +284,5 @@ impl Supervisor {
             Ok(capture) => self.capture = Some(capture),
             Err(e) => self.lose(now, &e.to_string(), Some(e)),
         }
-    }
-}
-
-/// How long opening this camera may take. The driver of another process's camera waits for the process, for its first
-/// message and for its first frame, each with a limit of its own that the rig file sets.
-fn open_timeout(backend: &BackendConfig) -> Duration {
-    match backend {
-        BackendConfig::External(c) => OPEN_TIMEOUT + c.start_timeout * 2 + c.heartbeat_timeout,
-        _ => OPEN_TIMEOUT,
     }
 }

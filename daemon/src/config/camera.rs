@@ -1,30 +1,21 @@
-//! From a `[[camera]]` table to [`CameraConfig`]: the keys that all drivers share, and the `files` driver.
+//! From a `[[camera]]` table to [`CameraConfig`]: the keys that all families share.
 
 use super::read::{Located, Section};
-use super::value::{not_empty, rate, resolve};
+use super::value::rate;
 use super::wanted::WantedStream;
-use super::{
-    BackendConfig, CameraConfig, FilesSettings, StereoConfig, external, kinect, l515, realsense, refine,
-    stereo, synthetic, v4l2, zed,
-};
+use super::{CameraConfig, StereoConfig, refine, stereo};
+use crate::family::{Family, Reader};
 use depthrig_bus::{CameraName, Name, PixelFormat, Pose, StreamName};
 use depthrig_drivers::StreamRequest;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-#[derive(Clone, Copy)]
-enum Driver {
-    Synthetic,
-    Files,
-    Realsense,
-    L515,
-    V4l2,
-    Zed,
-    External,
-    Kinect,
-}
-
-/// Reads one camera; `None` after a problem that leaves nothing to build on. `taken` are the names so far.
-pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraName>) -> Option<CameraConfig> {
+/// Reads one camera of one of `families`; `None` after a problem that leaves nothing to build on. `taken` are the names so far.
+pub(super) fn read(
+    mut s: Section<'_, '_>,
+    base: &Path,
+    families: &[Family],
+    taken: &mut Vec<CameraName>,
+) -> Option<CameraConfig> {
     let name = s.required::<CameraName>("name", "\"d435\"");
     if let Some(Located { value: name, at }) = &name {
         s.set_name(name.as_str());
@@ -36,73 +27,34 @@ pub(super) fn read(mut s: Section<'_, '_>, base: &Path, taken: &mut Vec<CameraNa
         }
         taken.push(name.clone());
     }
-    let drivers = [
-        ("synthetic", Driver::Synthetic),
-        ("files", Driver::Files),
-        ("realsense", Driver::Realsense),
-        ("l515", Driver::L515),
-        ("v4l2", Driver::V4l2),
-        ("zed", Driver::Zed),
-        ("external", Driver::External),
-        ("kinect", Driver::Kinect),
-    ];
     if !s.has("backend") {
         s.required::<String>("backend", "\"synthetic\"");
     }
-    let driver = s.choose("backend", &drivers);
+    let names: Vec<_> = families.iter().map(|f| (f.name, f)).collect();
+    let family = s.choose("backend", &names);
     let pose = pose(&s);
     let wanted = streams(&s);
     let streams: Vec<_> = wanted.iter().map(|w| w.request.clone()).collect();
-    // Backends that may have left and right images.
-    let has_stereo = matches!(driver, Some(Driver::Zed | Driver::External));
+    let has_stereo = family.is_some_and(|f| f.has_stereo);
     let stereo = if has_stereo { stereo::read(&s, base) } else { None };
     let depth = stereo.as_ref().map_or_else(|| "depth".to_owned(), StereoConfig::first_depth);
     let refine = refine::read(&s, base, &wanted, &depth);
     let record = record(&s, &streams, refine.is_some());
-    let backend = match driver {
-        Some(Driver::Synthetic) => {
-            let name = name.as_ref().map_or("", |n| n.value.as_str());
-            Some(BackendConfig::Synthetic(synthetic::read(&s, base, name, pose, &wanted)))
-        }
-        Some(Driver::Files) => files(&s, base).map(BackendConfig::Files),
-        Some(Driver::Realsense) => Some(BackendConfig::Realsense(realsense::read(&s, base, &wanted))),
-        Some(Driver::L515) => Some(BackendConfig::L515(l515::read(&s, &wanted))),
-        Some(Driver::V4l2) => Some(BackendConfig::V4l2(v4l2::read(&s))),
-        Some(Driver::Zed) => Some(zed::read(&s, base, &wanted, stereo.as_ref())),
-        Some(Driver::External) => Some(BackendConfig::External(external::read(&s, base))),
-        Some(Driver::Kinect) => Some(BackendConfig::Kinect(kinect::read(&s, base, &wanted))),
-        // Which keys belong to an unknown driver is unknown too.
-        None => return None,
-    };
+    // Which keys belong to an unknown family is unknown too.
+    let family = family?;
+    let backend = (family.read)(&Reader {
+        section: &s,
+        base,
+        name: name.as_ref().map_or("", |n| n.value.as_str()),
+        pose,
+        streams: &wanted,
+        stereo: stereo.as_ref(),
+    });
     s.finish();
-    let streams = match &backend {
-        // The imagers behind depth are asked for by name.
-        Some(BackendConfig::Realsense(_)) if streams.is_empty() => realsense::default_streams(),
-        Some(BackendConfig::L515(_)) if streams.is_empty() => l515::default_streams(),
-        _ => streams,
-    };
-    Some(CameraConfig { name: name?.value, pose, streams, record, stereo, refine, backend: backend? })
-}
-
-/// The highest rate among the camera's streams, as far as the file says.
-pub(super) fn fastest_rate_hz(camera: &CameraConfig) -> Option<f64> {
-    match &camera.backend {
-        BackendConfig::Files(files) => files.rate_hz,
-        BackendConfig::ZedReplay(replay) => replay.rate_hz,
-        BackendConfig::Realsense(_)
-        | BackendConfig::L515(_)
-        | BackendConfig::V4l2(_)
-        | BackendConfig::Zed(_)
-        | BackendConfig::External(_)
-        | BackendConfig::Kinect(_) => fastest_given_rate(&camera.streams),
-        BackendConfig::Synthetic(config) => synthetic::fastest_rate_hz(config, &camera.streams).ok(),
-    }
-}
-
-/// The highest rate of `streams` if each of them names one: otherwise only the camera knows it.
-fn fastest_given_rate(streams: &[StreamRequest]) -> Option<f64> {
-    let rates = streams.iter().map(|s| s.rate_hz).collect::<Option<Vec<_>>>()?;
-    rates.into_iter().reduce(f64::max)
+    let name = name?.value;
+    let backend = backend?;
+    let streams = if streams.is_empty() { backend.default_streams() } else { streams };
+    Some(CameraConfig { name, pose, streams, record, stereo, refine, backend })
 }
 
 fn pose(camera: &Section<'_, '_>) -> Pose {
@@ -190,14 +142,4 @@ fn record(camera: &Section<'_, '_>, streams: &[StreamRequest], refined: bool) ->
         camera.problem(at, format!("{} {why}", camera.key_of("record")));
     }
     Some(value)
-}
-
-fn files(s: &Section<'_, '_>, base: &Path) -> Option<FilesSettings> {
-    let manifest = s.required::<PathBuf>("manifest", "\"images/camera.toml\"");
-    if let Some(Err(why)) = manifest.as_ref().map(|m| not_empty(&m.value)) {
-        s.problem(manifest.as_ref()?.at, format!("{} {why}", s.key_of("manifest")));
-    }
-    let rate_hz = s.or("rate_hz", None, |r| r.map_or(Ok(()), rate));
-    let looped = s.get::<bool>("loop").map(|f| f.value);
-    Some(FilesSettings { manifest: resolve(base, &manifest?.value), rate_hz, looped })
 }

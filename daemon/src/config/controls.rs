@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use toml::de::DeValue;
 
 /// The table `key`, whose keys are names that only the camera knows.
-pub(super) fn read(
+pub(crate) fn read(
     s: &Section<'_, '_>,
     key: &'static str,
     kind: &'static str,
@@ -27,7 +27,7 @@ impl FromToml for ControlValue {
 }
 
 /// A text that is given says something.
-pub(super) fn not_blank(text: Option<&str>) -> Result<(), String> {
+pub(crate) fn not_blank(text: Option<&str>) -> Result<(), String> {
     match text {
         Some(t) if t.trim().is_empty() => Err("is empty".to_owned()),
         _ => Ok(()),

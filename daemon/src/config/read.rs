@@ -7,7 +7,7 @@ use std::ops::Range;
 use toml::de::{DeTable, DeValue};
 
 /// Problems and known keys, gathered while a text is read.
-pub(super) struct Report<'t> {
+pub(crate) struct Report<'t> {
     text: &'t str,
     problems: RefCell<Vec<Problem>>,
     unknown: RefCell<Vec<Unknown>>,
@@ -24,13 +24,13 @@ struct Unknown {
 }
 
 impl<'t> Report<'t> {
-    pub(super) fn new(text: &'t str) -> Self {
+    pub(crate) fn new(text: &'t str) -> Self {
         let (problems, unknown, asked) = <_>::default();
         Self { text, problems, unknown, asked }
     }
 
     /// Notes a problem at byte `at`.
-    pub(super) fn problem(&self, at: usize, message: impl Into<String>) {
+    pub(crate) fn problem(&self, at: usize, message: impl Into<String>) {
         let before = self.text.get(..at).unwrap_or(self.text);
         let line_start = before.rfind('\n').map_or(0, |i| i + 1);
         self.problems.borrow_mut().push(Problem {
@@ -41,7 +41,7 @@ impl<'t> Report<'t> {
     }
 
     /// Every problem, once all tables were read: only now is known where an unknown key would have belonged.
-    pub(super) fn into_problems(self) -> Vec<Problem> {
+    pub(crate) fn into_problems(self) -> Vec<Problem> {
         for u in self.unknown.take() {
             let asked = self.asked.borrow();
             let elsewhere = asked.iter().find(|(_, key)| *key == u.key).map(|(table, _)| *table);
@@ -61,13 +61,13 @@ impl<'t> Report<'t> {
 
     /// Every key that was asked for so far, as (table, key).
     #[cfg(test)]
-    pub(super) fn asked(&self) -> BTreeSet<(&'static str, &'static str)> {
+    pub(crate) fn asked(&self) -> BTreeSet<(&'static str, &'static str)> {
         self.asked.borrow().clone()
     }
 }
 
 /// The candidate that `word` most likely was to be, if any is near.
-pub(super) fn nearest<'c>(word: &str, candidates: impl Iterator<Item = &'c str>) -> Option<&'c str> {
+pub(crate) fn nearest<'c>(word: &str, candidates: impl Iterator<Item = &'c str>) -> Option<&'c str> {
     candidates
         .map(|c| (strsim::jaro_winkler(word, c), c))
         .filter(|(likeness, _)| *likeness > 0.8)
@@ -76,17 +76,17 @@ pub(super) fn nearest<'c>(word: &str, candidates: impl Iterator<Item = &'c str>)
 }
 
 /// A value and where it stands, in bytes.
-pub(super) struct Located<T> {
-    pub(super) value: T,
-    pub(super) at: usize,
+pub(crate) struct Located<T> {
+    pub(crate) value: T,
+    pub(crate) at: usize,
 }
 
 /// A table of the file, or one that is absent and has its defaults.
-pub(super) struct Section<'r, 't> {
+pub(crate) struct Section<'r, 't> {
     report: &'r Report<'t>,
     table: Option<&'r DeTable<'t>>,
     /// Where problems of the table as a whole are reported.
-    pub(super) at: usize,
+    pub(crate) at: usize,
     /// Its kind: `[[camera]]`.
     kind: &'static str,
     /// How messages name it: `[[camera]] "d435"`.
@@ -95,7 +95,7 @@ pub(super) struct Section<'r, 't> {
 }
 
 impl<'r, 't> Section<'r, 't> {
-    pub(super) fn top(report: &'r Report<'t>, table: &'r DeTable<'t>) -> Self {
+    pub(crate) fn top(report: &'r Report<'t>, table: &'r DeTable<'t>) -> Self {
         Self { report, table: Some(table), at: 0, kind: "", shown: String::new(), known: <_>::default() }
     }
 
@@ -106,7 +106,7 @@ impl<'r, 't> Section<'r, 't> {
     }
 
     /// Adds the table's name to how messages name it.
-    pub(super) fn set_name(&mut self, name: &str) {
+    pub(crate) fn set_name(&mut self, name: &str) {
         self.shown = format!("{} \"{name}\"", self.kind);
     }
 
@@ -119,17 +119,17 @@ impl<'r, 't> Section<'r, 't> {
     }
 
     /// Notes a problem at byte `at`.
-    pub(super) fn problem(&self, at: usize, message: impl Into<String>) {
+    pub(crate) fn problem(&self, at: usize, message: impl Into<String>) {
         self.report.problem(at, message);
     }
 
     /// How messages name `key` of this table.
-    pub(super) fn key_of(&self, key: &str) -> String {
+    pub(crate) fn key_of(&self, key: &str) -> String {
         if self.shown.is_empty() { format!("\"{key}\"") } else { format!("\"{key}\" in {}", self.shown) }
     }
 
     /// The value of `key`, if it is there and of its type.
-    pub(super) fn get<T: FromToml>(&self, key: &'static str) -> Option<Located<T>> {
+    pub(crate) fn get<T: FromToml>(&self, key: &'static str) -> Option<Located<T>> {
         let (_, value) = self.find(key)?;
         let at = value.span().start;
         match T::from_toml(value.get_ref()) {
@@ -142,7 +142,7 @@ impl<'r, 't> Section<'r, 't> {
     }
 
     /// As [`Self::get`]; that the key is missing is a problem. `example` shows what to write.
-    pub(super) fn required<T: FromToml>(&self, key: &'static str, example: &str) -> Option<Located<T>> {
+    pub(crate) fn required<T: FromToml>(&self, key: &'static str, example: &str) -> Option<Located<T>> {
         let missing = self.table.is_none_or(|t| t.keys().all(|k| k.get_ref() != key));
         if missing {
             let place = if self.shown.is_empty() { "the top of the file" } else { &self.shown };
@@ -155,7 +155,7 @@ impl<'r, 't> Section<'r, 't> {
     }
 
     /// The value of `key` when it passes `check`, else `default`; `check` returns the problem.
-    pub(super) fn or<T: FromToml>(
+    pub(crate) fn or<T: FromToml>(
         &self,
         key: &'static str,
         default: T,
@@ -172,12 +172,12 @@ impl<'r, 't> Section<'r, 't> {
     }
 
     /// The value of `key` out of `choices`, else `default`.
-    pub(super) fn choice<T: Copy>(&self, key: &'static str, choices: &[(&str, T)], default: T) -> T {
+    pub(crate) fn choice<T: Copy>(&self, key: &'static str, choices: &[(&str, T)], default: T) -> T {
         self.choose(key, choices).unwrap_or(default)
     }
 
     /// The value of `key` out of `choices`.
-    pub(super) fn choose<T: Copy>(&self, key: &'static str, choices: &[(&str, T)]) -> Option<T> {
+    pub(crate) fn choose<T: Copy>(&self, key: &'static str, choices: &[(&str, T)]) -> Option<T> {
         let Located { value, at } = self.get::<String>(key)?;
         let chosen = choices.iter().find(|(name, _)| *name == value).map(|(_, v)| *v);
         if chosen.is_none() {
@@ -192,7 +192,7 @@ impl<'r, 't> Section<'r, 't> {
     }
 
     /// The table `key`; an absent one is read as empty.
-    pub(super) fn table(&self, key: &'static str, kind: &'static str) -> Self {
+    pub(crate) fn table(&self, key: &'static str, kind: &'static str) -> Self {
         let Some((_, value)) = self.find(key) else { return self.inner(None, self.at, kind) };
         let at = value.span().start;
         let table = value.get_ref().as_table();
@@ -204,7 +204,7 @@ impl<'r, 't> Section<'r, 't> {
     }
 
     /// The entries of the table `key`, whose keys may be any; those with another value than `T` are noted and left out.
-    pub(super) fn entries<T: FromToml>(
+    pub(crate) fn entries<T: FromToml>(
         &self,
         key: &'static str,
         kind: &'static str,
@@ -230,17 +230,17 @@ impl<'r, 't> Section<'r, 't> {
     }
 
     /// Where the value of `key` stands; the table itself when it is absent.
-    pub(super) fn at_key(&self, key: &'static str) -> usize {
+    pub(crate) fn at_key(&self, key: &'static str) -> usize {
         self.find(key).map_or(self.at, |(_, value)| value.span().start)
     }
 
     /// Whether `key` is there, whatever it is.
-    pub(super) fn has(&self, key: &'static str) -> bool {
+    pub(crate) fn has(&self, key: &'static str) -> bool {
         self.find(key).is_some()
     }
 
     /// The tables `[[key]]`, none when the key is absent; `None` when it is something else, which is noted.
-    pub(super) fn tables(&self, key: &'static str, kind: &'static str) -> Option<Vec<Self>> {
+    pub(crate) fn tables(&self, key: &'static str, kind: &'static str) -> Option<Vec<Self>> {
         let Some((_, value)) = self.find(key) else { return Some(Vec::new()) };
         let wrong = |v: &toml::Spanned<DeValue<'t>>| {
             let is = describe(v.get_ref());
@@ -263,7 +263,7 @@ impl<'r, 't> Section<'r, 't> {
     }
 
     /// Notes every key that nobody asked for.
-    pub(super) fn finish(self) {
+    pub(crate) fn finish(self) {
         let known = self.known.into_inner();
         for (key, _) in self.table.into_iter().flatten() {
             if !known.iter().any(|k| k == key.get_ref()) {
@@ -279,7 +279,7 @@ impl<'r, 't> Section<'r, 't> {
     }
 }
 
-pub(super) fn describe(value: &DeValue<'_>) -> String {
+pub(crate) fn describe(value: &DeValue<'_>) -> String {
     match value {
         DeValue::String(s) => format!("the string \"{s}\""),
         DeValue::Integer(i) => format!("the number {i}"),
@@ -292,7 +292,7 @@ pub(super) fn describe(value: &DeValue<'_>) -> String {
 }
 
 /// A type that a TOML value can be.
-pub(super) trait FromToml: Sized {
+pub(crate) trait FromToml: Sized {
     /// The value, or the problem as the end of a sentence that begins with the key.
     fn from_toml(value: &DeValue<'_>) -> Result<Self, String>;
 }

@@ -6,17 +6,18 @@ use super::{
     BusConfig, ColorCodec, ConfigError, ControlConfig, DepthCodec, MAX_CAMERAS, Phase, RecordingConfig,
     RigConfig, SetsConfig, SupervisorConfig, camera, refine,
 };
+use crate::family::Family;
 use depthrig_bus::RigName;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use toml::de::DeTable;
 
-/// Everything that `text` says, or every problem that it has.
-pub(super) fn parse(text: &str, path: Option<&Path>) -> Result<RigConfig, ConfigError> {
+/// Everything that `text` says, or every problem that it has. Its cameras are of `families`.
+pub(super) fn parse(text: &str, path: Option<&Path>, families: &[Family]) -> Result<RigConfig, ConfigError> {
     let shown = path.map_or_else(|| "configuration".to_owned(), |p| p.display().to_string());
     let path = path.map(absolute);
     let report = Report::new(text);
-    let config = read(&report, text, path.as_deref());
+    let config = read(&report, text, path.as_deref(), families);
     match (report.into_problems(), config) {
         (problems, Some(config)) if problems.is_empty() => Ok(config),
         (problems, _) => Err(ConfigError::new(shown, problems)),
@@ -24,7 +25,12 @@ pub(super) fn parse(text: &str, path: Option<&Path>) -> Result<RigConfig, Config
 }
 
 /// As [`parse`], for callers that look at the report. `None` only after a problem was noted.
-pub(super) fn read(report: &Report<'_>, text: &str, path: Option<&Path>) -> Option<RigConfig> {
+pub(super) fn read(
+    report: &Report<'_>,
+    text: &str,
+    path: Option<&Path>,
+    families: &[Family],
+) -> Option<RigConfig> {
     let (document, errors) = DeTable::parse_recoverable(text);
     // A table parsed from damaged text is guesswork; checking it would only add noise.
     if !errors.is_empty() {
@@ -43,7 +49,7 @@ pub(super) fn read(report: &Report<'_>, text: &str, path: Option<&Path>) -> Opti
     let control = control(&top);
     let supervisor = supervisor(&top);
     let cdm = refine::cdm(&top, &base);
-    let cameras = cameras(&top, &base);
+    let cameras = cameras(&top, &base, families);
     check_set_rate(&top, &sets, &cameras);
     top.finish();
     let text = text.to_owned();
@@ -134,7 +140,7 @@ fn supervisor(top: &Section<'_, '_>) -> SupervisorConfig {
 }
 
 /// A camera that has a problem is `None`.
-fn cameras(top: &Section<'_, '_>, base: &Path) -> Vec<Option<super::CameraConfig>> {
+fn cameras(top: &Section<'_, '_>, base: &Path, families: &[Family]) -> Vec<Option<super::CameraConfig>> {
     let Some(sections) = top.tables("camera", "[[camera]]") else { return vec![None] };
     if sections.is_empty() {
         top.problem(top.at, "the rig has no camera; add a [[camera]] table");
@@ -143,12 +149,15 @@ fn cameras(top: &Section<'_, '_>, base: &Path) -> Vec<Option<super::CameraConfig
         s.problem(s.at, format!("a rig has at most {MAX_CAMERAS} cameras"));
     }
     let mut names = Vec::new();
-    sections.into_iter().map(|s| camera::read(s, base, &mut names)).collect()
+    sections.into_iter().map(|s| camera::read(s, base, families, &mut names)).collect()
 }
 
 /// Sets faster than every camera would all be incomplete. Only rates that the file itself gives are known here.
 fn check_set_rate(top: &Section<'_, '_>, sets: &SetsConfig, cameras: &[Option<super::CameraConfig>]) {
-    let fastest = |c: &Option<super::CameraConfig>| camera::fastest_rate_hz(c.as_ref()?);
+    let fastest = |c: &Option<super::CameraConfig>| {
+        let camera = c.as_ref()?;
+        camera.backend.fastest_rate_hz(&camera.streams)
+    };
     let Some(rates) = cameras.iter().map(fastest).collect::<Option<Vec<_>>>() else { return };
     let most = rates.into_iter().fold(0.0, f64::max);
     if most > 0.0 && sets.rate_hz > most {

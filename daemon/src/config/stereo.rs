@@ -1,6 +1,5 @@
 //! `[camera.stereo]`: depth that is computed from the left and right images of a camera.
 
-use super::StereoConfig;
 use super::read::Section;
 use super::value::{above_zero, not_empty, resolve, within};
 use super::wanted::WantedStream;
@@ -16,8 +15,29 @@ const TABLE: &str = "[camera.stereo]";
 /// Farther than a camera of this size sees anything.
 const FARTHEST_M: f64 = 1000.0;
 
+/// How depth is computed from the left and right images of a camera.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StereoConfig {
+    /// The modes, in the order of their streams.
+    pub modes: Vec<Mode>,
+    /// Threads of each mode.
+    pub threads: usize,
+    /// Nearest and farthest depth, metres.
+    pub range_m: (f64, f64),
+    /// Whether disparity is published as well.
+    pub disparity: bool,
+    /// Pairs that are matched, a second at most; 0: every one.
+    pub rate_hz: f64,
+    /// A recording waits for the slowest mode, and nothing is skipped.
+    pub every_pair: bool,
+    /// The network of the mode `neural`; absolute.
+    pub network: Option<PathBuf>,
+    /// The library of ONNX Runtime, as `[cdm]` has it.
+    pub library: Option<PathBuf>,
+}
+
 /// Reads `[camera.stereo]`; `None` when there is no such table.
-pub(super) fn read(camera: &Section<'_, '_>, base: &Path) -> Option<StereoConfig> {
+pub(crate) fn read(camera: &Section<'_, '_>, base: &Path) -> Option<StereoConfig> {
     let present = camera.has("stereo");
     let s = camera.table("stereo", TABLE);
     let d = StereoConfig::default();
@@ -73,7 +93,7 @@ fn parse(list: &[String]) -> Result<Vec<Mode>, String> {
 }
 
 /// Says which of the streams that are asked for there are not. `own` are those of the camera itself.
-pub(super) fn check_streams(
+pub(crate) fn check_streams(
     s: &Section<'_, '_>,
     what: &str,
     own: &[&str],

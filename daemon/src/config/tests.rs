@@ -4,6 +4,14 @@
 
 use super::read::Report;
 use super::*;
+use depthrig_drivers::external::ExternalConfig;
+use depthrig_drivers::files::FilesConfig;
+use depthrig_drivers::realsense::RealsenseConfig;
+use depthrig_drivers::realsense::l515::L515Config;
+use depthrig_drivers::synthetic::SyntheticConfig;
+use depthrig_drivers::v4l2::V4l2Config;
+use depthrig_drivers::zed::ZedConfig;
+use depthrig_drivers::zed::replay::ZedPlaybackConfig;
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
@@ -47,7 +55,7 @@ fn the_defaults_in_the_comments_are_those_of_the_code() {
 fn every_key_is_in_the_default_file() {
     let text = uncommented(true);
     let report = Report::new(&text);
-    super::rig::read(&report, &text, None).unwrap();
+    super::rig::read(&report, &text, None, crate::family::FAMILIES).unwrap();
     let asked = report.asked();
     assert!(asked.contains(&("[[camera.fault]]", "count")), "{asked:?}");
     assert_eq!(report.into_problems(), []);
@@ -90,10 +98,10 @@ fn a_synthetic_camera_can_be_told_everything_that_its_driver_knows() {
         "faults" => "fault".to_owned(),
         _ => key.to_owned(),
     };
-    let driver = toml::Table::try_from(SyntheticSettings::default()).unwrap();
+    let driver = toml::Table::try_from(SyntheticConfig::default()).unwrap();
     let text = uncommented(true);
     let report = Report::new(&text);
-    super::rig::read(&report, &text, None).unwrap();
+    super::rig::read(&report, &text, None, crate::family::FAMILIES).unwrap();
     let asked = report.asked();
     let has = |table: &str, key: &str| asked.iter().any(|(t, k)| *t == table && *k == key);
     for key in driver.keys() {
@@ -110,7 +118,7 @@ fn the_default_rig_is_the_mount_of_seven() {
     let names: Vec<_> = rig.cameras.iter().map(|c| c.name.as_str()).collect();
     assert_eq!(names, ["d405", "d415", "d435", "d455", "l515", "zed2i", "kinect"]);
     for camera in &rig.cameras {
-        let BackendConfig::Synthetic(s) = &camera.backend else { panic!("{}", camera.name) };
+        let s = camera.backend.settings::<SyntheticConfig>().unwrap();
         assert_eq!((s.model.as_str(), s.pose_on_mount), (camera.name.as_str(), camera.pose));
         // The point 0.7 m ahead of the mount lies on the camera's axis, 0.7 m and a little away.
         let there = depthrig_calib::PoseExt::inverse(&camera.pose);
@@ -160,9 +168,8 @@ fn what_a_file_says_is_what_comes_out() {
     );
     assert_eq!(rig.control.tcp, Some("[::1]:8000".parse().unwrap()));
     let a = rig.camera("a").unwrap();
-    let settings =
-        FilesSettings { manifest: "/rigs/images".into(), rate_hz: Some(15.0), looped: Some(false) };
-    assert_eq!(a.backend, BackendConfig::Files(settings));
+    let settings = FilesConfig { manifest: "/rigs/images".into(), rate_hz: Some(15.0), looped: Some(false) };
+    assert_eq!(a.backend, BackendConfig::new(settings));
     assert_eq!(a.pose.translation_m, [1.0, 2.5, -3.0]);
     assert!((a.pose.rotation_xyzw[1] - 0.5f64.sqrt()).abs() < 1e-12, "made unit length: {:?}", a.pose);
     assert_eq!((a.streams[1].size, a.streams[1].rate_hz), (Some((640, 480)), Some(15.0)));
@@ -170,7 +177,7 @@ fn what_a_file_says_is_what_comes_out() {
     assert!(
         a.records(&name("depth")) && !a.records(&name("color")) && rig.cameras[1].records(&name("color"))
     );
-    let BackendConfig::Synthetic(b) = &rig.cameras[1].backend else { panic!() };
+    let b = rig.cameras[1].backend.settings::<SyntheticConfig>().unwrap();
     assert_eq!((b.serial.as_str(), b.faults[0].count, b.faults[0].at_s), ("sim-b", 3, 2.5));
     assert_eq!((b.streams[0].size, b.streams[0].rate_hz), (Some((320, 240)), Some(30.0)));
 }
@@ -211,7 +218,7 @@ fn a_realsense_camera_is_set_as_the_file_says() {
         ("power_line_frequency", Item("50 Hz".into())),
         ("white_balance_automatic", Boolean(false)),
     ];
-    let wanted = RealsenseSettings {
+    let wanted = RealsenseConfig {
         serial: Some("012345678901".into()),
         port: Some("4-1.2".into()),
         transport: TransportChoice::Libusb,
@@ -228,8 +235,8 @@ fn a_realsense_camera_is_set_as_the_file_says() {
         allow_uncalibrated: true,
         reset_when_silent: true,
     };
-    assert_eq!(rig.cameras[0].backend, BackendConfig::Realsense(wanted));
-    assert_eq!(rig.cameras[1].backend, BackendConfig::Realsense(RealsenseSettings::default()));
+    assert_eq!(rig.cameras[0].backend, BackendConfig::new(wanted));
+    assert_eq!(rig.cameras[1].backend, BackendConfig::new(RealsenseConfig::default()));
     let streams: Vec<_> = rig.cameras[1].streams.iter().map(|s| s.stream.as_str()).collect();
     assert_eq!(streams, ["depth", "color"], "the imagers are asked for by name");
 }
@@ -268,7 +275,7 @@ fn a_zed_is_set_as_the_file_says() {
     use depthrig_drivers::v4l2::ControlValue::{Boolean, Integer};
     use depthrig_drivers::zed::CalibrationFile;
     let controls = [("brightness", Integer(4)), ("white_balance_automatic", Boolean(false))];
-    let wanted = ZedSettings {
+    let wanted = ZedConfig {
         serial: Some("31234567".into()),
         port: Some("4-1".into()),
         calibration: CalibrationFile::At("/rigs/SN31234567.conf".into()),
@@ -279,14 +286,11 @@ fn a_zed_is_set_as_the_file_says() {
         controls: controls.map(|(n, v)| (n.to_owned(), v)).into(),
         without_motion: true,
     };
-    assert_eq!(rig.cameras[0].backend, BackendConfig::Zed(wanted));
-    let b = ZedSettings {
-        auto_exposure: Some(true),
-        calibration: CalibrationFile::None,
-        ..ZedSettings::default()
-    };
-    assert_eq!(rig.cameras[1].backend, BackendConfig::Zed(b));
-    assert_eq!(rig.cameras[2].backend, BackendConfig::Zed(ZedSettings::default()));
+    assert_eq!(rig.cameras[0].backend, BackendConfig::new(wanted));
+    let b =
+        ZedConfig { auto_exposure: Some(true), calibration: CalibrationFile::None, ..ZedConfig::default() };
+    assert_eq!(rig.cameras[1].backend, BackendConfig::new(b));
+    assert_eq!(rig.cameras[2].backend, BackendConfig::new(ZedConfig::default()));
 }
 
 #[test]
@@ -333,8 +337,8 @@ fn an_attached_kinect_is_set_as_the_file_says() {
         color_controls: controls.map(|(n, v)| (n.to_owned(), v)).into(),
         dark: true,
     };
-    assert_eq!(rig.cameras[0].backend, BackendConfig::Kinect(KinectSettings::Live(wanted)));
-    assert_eq!(rig.cameras[1].backend, BackendConfig::Kinect(KinectSettings::Live(LiveConfig::default())));
+    assert_eq!(rig.cameras[0].backend, BackendConfig::new(wanted));
+    assert_eq!(rig.cameras[1].backend, BackendConfig::new(LiveConfig::default()));
 }
 
 #[test]
@@ -377,8 +381,8 @@ fn a_recording_of_a_zed_and_its_stereo_are_set_as_the_file_says() {
         "#,
     )
     .unwrap();
-    let BackendConfig::ZedReplay(a) = &rig.cameras[0].backend else { panic!("{:?}", rig.cameras[0].backend) };
-    let b = ZedReplaySettings {
+    let a = rig.cameras[0].backend.settings::<ZedPlaybackConfig>().unwrap();
+    let b = ZedPlaybackConfig {
         input: "/rigs/recordings/a.svo2".into(),
         serial: Some("5".into()),
         calibration: depthrig_drivers::zed::CalibrationFile::At("/rigs/SN5.conf".into()),
@@ -422,7 +426,7 @@ fn a_recorded_kinect_is_played_as_the_file_says() {
         let rig = RigConfig::parse(&text(keys), Some(Path::new("/rigs/kinect.toml"))).unwrap();
         rig.cameras[0].backend.clone()
     };
-    let recorded = |config| BackendConfig::Kinect(KinectSettings::Recorded(config));
+    let recorded = |config: PlaybackConfig| BackendConfig::new(config);
     assert_eq!(backend(""), recorded(PlaybackConfig::new("/rigs/a.mkv")));
     let calibration = CalibrationSource::At("/rigs/device.json".into());
     let wanted =
@@ -649,7 +653,7 @@ fn a_v4l2_camera_is_read_with_all_its_keys() {
         "#,
     )
     .unwrap();
-    let BackendConfig::V4l2(a) = &rig.cameras[0].backend else { panic!("{:?}", rig.cameras[0]) };
+    let a = rig.cameras[0].backend.settings::<V4l2Config>().unwrap();
     let chosen = (a.memory, a.mjpeg, a.clock);
     assert_eq!(chosen, (MemoryChoice::UserPointer, MjpegChoice::Keep, ClockChoice::Kernel));
     assert_eq!((a.serial.as_deref(), a.port.as_deref()), (None, Some("1-2")));
@@ -662,7 +666,7 @@ fn a_v4l2_camera_is_read_with_all_its_keys() {
     assert_eq!((given.width, given.height, given.intrinsics.fy), (640, 480, 501.5));
     assert_eq!(given.intrinsics.coeffs, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]);
     assert_eq!(given.intrinsics.distortion(), depthrig_bus::Distortion::Rational);
-    assert_eq!(rig.cameras[1].backend, BackendConfig::V4l2(V4l2Settings::default()));
+    assert_eq!(rig.cameras[1].backend, BackendConfig::new(V4l2Config::default()));
 }
 
 #[test]
@@ -735,13 +739,13 @@ fn an_l515_and_its_controls() {
         "#,
     )
     .unwrap();
-    let wanted = L515Settings {
+    let wanted = L515Config {
         serial: Some("f0123456".into()),
         port: Some("4-1.2".into()),
         controls: [("laser_power".to_owned(), 60), ("noise_filtering".to_owned(), 4)].into(),
         color_controls: [("gamma".to_owned(), Integer(300))].into(),
     };
-    assert_eq!(rig.cameras[0].backend, BackendConfig::L515(wanted));
+    assert_eq!(rig.cameras[0].backend, BackendConfig::new(wanted));
     let streams: Vec<_> = rig.cameras[0].streams.iter().map(|s| s.stream.as_str()).collect();
     assert_eq!(streams, ["depth", "color"]);
 }
@@ -846,15 +850,15 @@ fn an_external_camera_is_read_with_all_its_keys() {
         "#,
     )
     .unwrap();
-    let wanted = ExternalSettings {
+    let wanted = ExternalConfig {
         command: ["bin/cam", "--serial", "7"].map(str::to_owned).into(),
         directory: "/rigs/oak".into(),
         start_timeout: Duration::from_secs(3),
         heartbeat_timeout: Duration::from_millis(500),
     };
-    assert_eq!(rig.cameras[0].backend, BackendConfig::External(wanted));
-    let plain = ExternalSettings { directory: "/rigs".into(), ..ExternalSettings::default() };
-    assert_eq!(rig.cameras[1].backend, BackendConfig::External(plain));
+    assert_eq!(rig.cameras[0].backend, BackendConfig::new(wanted));
+    let plain = ExternalConfig { directory: "/rigs".into(), ..ExternalConfig::default() };
+    assert_eq!(rig.cameras[1].backend, BackendConfig::new(plain));
     assert_eq!(rig.cameras[1].backend.name(), "external");
 }
 

@@ -6,15 +6,15 @@ use core::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 /// The highest rate of refined depth that can be asked for, Hz; 0 asks for all that the camera gives.
-pub(super) const MAX_REFINE_HZ: f64 = MAX_RATE_HZ;
+pub(crate) const MAX_REFINE_HZ: f64 = MAX_RATE_HZ;
 
 /// A rate that a camera or the sets may have.
-pub(super) fn rate(hz: f64) -> Result<(), String> {
+pub(crate) fn rate(hz: f64) -> Result<(), String> {
     above_zero(MAX_RATE_HZ)(&hz)
 }
 
 /// Accepts numbers above 0 and up to `most`.
-pub(super) fn above_zero(most: f64) -> impl Fn(&f64) -> Result<(), String> {
+pub(crate) fn above_zero(most: f64) -> impl Fn(&f64) -> Result<(), String> {
     move |v| {
         if *v > 0.0 && *v <= most {
             Ok(())
@@ -25,13 +25,13 @@ pub(super) fn above_zero(most: f64) -> impl Fn(&f64) -> Result<(), String> {
 }
 
 /// A number as a message shows it: with an exponent where it would have hundreds of digits.
-pub(super) fn shown<T: Display + LowerExp>(number: &T) -> String {
+pub(crate) fn shown<T: Display + LowerExp>(number: &T) -> String {
     let plain = number.to_string();
     if plain.len() <= 24 { plain } else { format!("{number:e}") }
 }
 
 /// Accepts numbers in `range`.
-pub(super) fn within<T: PartialOrd + Display + LowerExp>(
+pub(crate) fn within<T: PartialOrd + Display + LowerExp>(
     range: RangeInclusive<T>,
 ) -> impl FnOnce(&T) -> Result<(), String> {
     move |v| {
@@ -46,12 +46,12 @@ pub(super) fn within<T: PartialOrd + Display + LowerExp>(
 }
 
 /// Accepts a path that is not empty.
-pub(super) fn not_empty(path: &Path) -> Result<(), String> {
+pub(crate) fn not_empty(path: &Path) -> Result<(), String> {
     if path.as_os_str().is_empty() { Err("is empty".to_owned()) } else { Ok(()) }
 }
 
 /// `path` as the file means it: `~/` is the home folder, anything relative starts at `base`.
-pub(super) fn resolve(base: &Path, path: &Path) -> PathBuf {
+pub(crate) fn resolve(base: &Path, path: &Path) -> PathBuf {
     let home = path
         .strip_prefix("~")
         .ok()

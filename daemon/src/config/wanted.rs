@@ -3,7 +3,7 @@
 use depthrig_drivers::StreamRequest;
 
 /// A `[[camera.stream]]` and where it stands.
-pub(super) struct WantedStream {
-    pub(super) request: StreamRequest,
-    pub(super) at: usize,
+pub(crate) struct WantedStream {
+    pub(crate) request: StreamRequest,
+    pub(crate) at: usize,
 }

@@ -10,7 +10,6 @@ use crate::attached::Attached;
 use crate::stage;
 use depthrig_bus::PixelFormat;
 use depthrig_drivers::StreamProfile;
-use depthrig_drivers::kinect;
 use depthrig_drivers::libusb;
 use depthrig_drivers::usb::health;
 use serde::Serialize;
@@ -28,10 +27,6 @@ const USB2_MOST_MBIT_S: f64 = 13.0 * 512.0 * 8.0 * 8000.0 / 1e6;
 const GEN1_CODING: f64 = 0.8;
 /// Share of 10 Gbit/s and more that the coding leaves: 128 bits of 132 (same, section 6.3.2.1).
 const GEN2_CODING: f64 = 128.0 / 132.0;
-
-/// Kernel memory that a Kinect's USB transfers take: libk4a keeps up to 10 MB for depth (`usbstreaming.c`), and
-/// colour has its own; one camera gets by with the kernel's 16 MB, two need 32 (Azure-Kinect-Sensor-SDK issue 485).
-const KINECT_TRANSFERS: u64 = 16 << 20;
 
 /// Bits of a pixel of MJPEG on the wire, at most, as cameras send it.
 const MJPEG_BITS: f64 = 4.0;
@@ -166,8 +161,7 @@ pub(super) fn check_usbfs(plans: &[CameraPlan], host: &Host, findings: &mut Vec<
     let over: Vec<_> = plans.iter().filter(|p| p.libusb).collect();
     let captured = over.iter().flat_map(|p| &p.profiles).filter(|(p, _)| !stage::is_derived(&p.stream));
     let own: u64 = captured.map(|(p, _)| transfer_bytes(p)).sum();
-    let kinects = plans.iter().filter(|p| p.backend == kinect::NAME && p.port.is_some()).count() as u64;
-    let needed = own + kinects * KINECT_TRANSFERS;
+    let needed = own + plans.iter().map(|p| p.transfer_bytes).sum::<u64>();
     if needed == 0 {
         return;
     }

@@ -1,69 +1,13 @@
 //! The cameras of the rig file against the attached ones: found or not, with which modes, in which state.
 
-use super::external;
 use super::finding::{Finding, Severity};
 use super::plan::{CameraPlan, Planned, mode_missing, no_plan, set_streams};
+use super::served;
 use crate::attached::{Attached, AttachedCamera, Family, UseState};
-use crate::config::{BackendConfig, CameraConfig, RigConfig};
-use depthrig_drivers::files::FilesBackend;
-use depthrig_drivers::kinect::KinectConfig;
-use depthrig_drivers::kinect::playback::PlaybackBackend;
-use depthrig_drivers::realsense::config::TransportChoice;
+use crate::config::{CameraConfig, RigConfig};
+use crate::family::{Offered, Selector, Source};
 use depthrig_drivers::usb::health::{self, RULE_CURE};
-use depthrig_drivers::zed::replay::ZedPlaybackBackend;
-use depthrig_drivers::{Backend, Result, StreamProfile, choose_profiles, synthetic};
-
-/// Which device a camera of the rig means.
-pub(super) struct Wanted<'c> {
-    pub(super) serial: Option<&'c str>,
-    pub(super) port: Option<&'c str>,
-    /// Reads it through libusb whatever the kernel offers.
-    pub(super) libusb: bool,
-    /// Is refused without a calibration.
-    pub(super) needs_calibration: bool,
-}
-
-/// The part of a plan that the rig file alone decides; `None` for cameras that are on no bus.
-fn wanted(backend: &BackendConfig) -> Option<Wanted<'_>> {
-    match backend {
-        BackendConfig::Synthetic(_)
-        | BackendConfig::Files(_)
-        | BackendConfig::ZedReplay(_)
-        | BackendConfig::External(_)
-        | BackendConfig::Kinect(KinectConfig::Recorded(_)) => None,
-        BackendConfig::Realsense(c) => Some(Wanted {
-            serial: c.serial.as_deref(),
-            port: c.port.as_deref(),
-            libusb: c.transport == TransportChoice::Libusb,
-            needs_calibration: !c.allow_uncalibrated,
-        }),
-        BackendConfig::V4l2(c) => Some(Wanted {
-            serial: c.serial.as_deref(),
-            port: c.port.as_deref(),
-            libusb: false,
-            needs_calibration: false,
-        }),
-        BackendConfig::Zed(c) => Some(Wanted {
-            serial: c.serial.as_deref(),
-            port: c.port.as_deref(),
-            libusb: false,
-            needs_calibration: false,
-        }),
-        BackendConfig::Kinect(KinectConfig::Live(c)) => Some(Wanted {
-            serial: c.serial.as_deref(),
-            port: c.port.as_deref(),
-            // Its transfers count against the same limit of the kernel; how large they are, libk4a decides.
-            libusb: false,
-            needs_calibration: false,
-        }),
-        BackendConfig::L515(c) => Some(Wanted {
-            serial: c.serial.as_deref(),
-            port: c.port.as_deref(),
-            libusb: false,
-            needs_calibration: true,
-        }),
-    }
-}
+use depthrig_drivers::{Result, StreamProfile, choose_profiles};
 
 /// The camera's streams when the rig runs: its own, and those computed from its left and right images.
 fn with_stereo(camera: &CameraConfig, device: &str, own: Vec<StreamProfile>) -> Result<Vec<StreamProfile>> {
@@ -75,10 +19,10 @@ fn with_stereo(camera: &CameraConfig, device: &str, own: Vec<StreamProfile>) -> 
 
 /// Plans every camera of `config`.
 pub(super) fn plan(config: &RigConfig, attached: &Attached) -> Vec<Planned> {
-    let plan_one = |camera: &CameraConfig| match (wanted(&camera.backend), &camera.backend) {
-        (Some(wanted), _) => plan_device(camera, camera.backend.name(), &wanted, attached),
-        (None, BackendConfig::External(c)) => external::plan(camera, config.rig.as_str(), c, attached),
-        (None, _) => plan_made(camera),
+    let plan_one = |camera: &CameraConfig| match camera.backend.source() {
+        Source::Attached(selector) => plan_device(camera, camera.backend.name(), &selector, attached),
+        Source::Served(service) => served::plan(camera, config.rig.as_str(), &service, attached),
+        Source::Here(offered) => plan_here(camera, offered),
     };
     config.cameras.iter().map(plan_one).collect()
 }
@@ -87,7 +31,7 @@ pub(super) fn plan(config: &RigConfig, attached: &Attached) -> Vec<Planned> {
 pub(super) fn plan_device(
     camera: &CameraConfig,
     backend: &'static str,
-    wanted: &Wanted<'_>,
+    wanted: &Selector<'_>,
     attached: &Attached,
 ) -> Planned {
     let mut findings = Vec::new();
@@ -95,6 +39,7 @@ pub(super) fn plan_device(
     if let Some(device) = find(backend, wanted, attached, &mut findings) {
         plan.device = Some(device.describe());
         plan.port = Some(device.port.clone());
+        plan.transfer_bytes = wanted.transfer_bytes;
         check_device(device, wanted, &mut findings);
         if !device.profiles.is_empty() {
             let name = device.describe();
@@ -109,39 +54,11 @@ pub(super) fn plan_device(
     Planned { plan, findings }
 }
 
-/// The plan of a camera without a device: synthetic, a folder of images, or a recording.
-fn plan_made(camera: &CameraConfig) -> Planned {
+/// The plan of a camera without a device.
+fn plan_here(camera: &CameraConfig, offered: Result<Offered>) -> Planned {
     let mut plan = no_plan(camera, camera.backend.name());
-    let profiles = || -> Result<(String, Vec<StreamProfile>)> {
-        Ok(match &camera.backend {
-            BackendConfig::Synthetic(c) => {
-                (format!("simulated {} {}", c.model, c.serial), synthetic::profiles(c)?)
-            }
-            BackendConfig::Files(c) => {
-                let device = FilesBackend::new(c.clone()).open(None)?;
-                (format!("images of {}", device.info().port), device.profiles().to_vec())
-            }
-            BackendConfig::ZedReplay(c) => {
-                let device = ZedPlaybackBackend::new(c.clone()).open(None)?;
-                (format!("recording {}", device.info().port), device.profiles().to_vec())
-            }
-            BackendConfig::Kinect(KinectConfig::Recorded(c)) => {
-                let device = PlaybackBackend::new(c.clone()).open(None)?;
-                let serial = &device.info().serial;
-                let port = &device.info().port;
-                (format!("Azure Kinect {serial} as recorded in {port}"), device.profiles().to_vec())
-            }
-            // Devices are planned with the attached camera.
-            BackendConfig::Realsense(_)
-            | BackendConfig::L515(_)
-            | BackendConfig::V4l2(_)
-            | BackendConfig::Zed(_)
-            | BackendConfig::External(_)
-            | BackendConfig::Kinect(KinectConfig::Live(_)) => (camera.backend.name().to_owned(), Vec::new()),
-        })
-    };
-    let chosen = profiles().and_then(|(device, all)| {
-        let chosen = choose_profiles(&device, &with_stereo(camera, &device, all)?, &camera.streams)?;
+    let chosen = offered.and_then(|Offered { device, profiles }| {
+        let chosen = choose_profiles(&device, &with_stereo(camera, &device, profiles)?, &camera.streams)?;
         Ok((device, chosen))
     });
     let mut findings = Vec::new();
@@ -167,7 +84,7 @@ fn plan_made(camera: &CameraConfig) -> Planned {
 /// The attached camera that `wanted` selects; adds a finding when it is missing or ambiguous.
 fn find<'a>(
     backend: &str,
-    wanted: &Wanted<'_>,
+    wanted: &Selector<'_>,
     attached: &'a Attached,
     findings: &mut Vec<Finding>,
 ) -> Option<&'a AttachedCamera> {
@@ -234,7 +151,7 @@ fn nearest<'a>(serial: &str, family: &[&'a AttachedCamera]) -> Option<&'a str> {
 }
 
 /// Checks the device itself.
-fn check_device(device: &AttachedCamera, wanted: &Wanted<'_>, findings: &mut Vec<Finding>) {
+fn check_device(device: &AttachedCamera, wanted: &Selector<'_>, findings: &mut Vec<Finding>) {
     match device.state {
         UseState::Free => {}
         UseState::InUse => findings.push(Finding::new(
@@ -275,7 +192,7 @@ fn check_device(device: &AttachedCamera, wanted: &Wanted<'_>, findings: &mut Vec
             "give the rig file a calibration for it, or have the camera calibrated; `allow_uncalibrated = true` uses a RealSense without",
         ));
     }
-    if device.kernel_metadata == Some("header") && device.family == Family::D400 && !wanted.libusb {
+    if device.kernel_metadata == Some("header") && wanted.kernel_metadata {
         findings.push(Finding::new(
             Severity::Info,
             "metadata_header",

@@ -3,9 +3,9 @@
 use super::clock::{ClockSync, clock_sync};
 use super::disk::DiskFacts;
 use super::finding::{Finding, Severity};
-use super::kinect::KinectFacts;
 use super::{CameraPlan, Surroundings};
-use crate::config::RigConfig;
+use crate::config::{CameraConfig, RigConfig};
+use crate::family::Unmet;
 use crate::priority;
 use crate::recording::reserve_bytes;
 use depthrig_bus::shm;
@@ -27,8 +27,8 @@ pub struct Host {
     pub rig_holder: Option<String>,
     /// The disk of the recordings.
     pub disk: DiskFacts,
-    /// Requirements of attached Kinects that are missing.
-    pub kinect: KinectFacts,
+    /// Requirements of the cameras that it does not meet.
+    pub unmet: Vec<Unmet>,
 }
 
 impl Host {
@@ -48,7 +48,17 @@ impl Host {
             clock: clock_sync(),
             rig_holder: around.runtime.as_ref().and_then(|r| r.holder(&config.rig)),
             disk: DiskFacts::gather(&config.recording.directory, reserve_bytes(&config.recording), measure),
-            kinect: KinectFacts::gather(config),
+            unmet: unmet(config),
+        }
+    }
+
+    /// Notes the requirements of cameras that are not met, and takes back findings about a camera that follow from them.
+    pub(super) fn check_unmet(&self, findings: &mut Vec<Finding>) {
+        for Unmet { finding, explains_failure } in &self.unmet {
+            if *explains_failure {
+                findings.retain(|f| f.id != "camera_failed" || f.camera != finding.camera);
+            }
+            findings.push(finding.clone());
         }
     }
 
@@ -83,4 +93,13 @@ impl Host {
             ));
         }
     }
+}
+
+fn unmet(config: &RigConfig) -> Vec<Unmet> {
+    let of_camera = |camera: &CameraConfig| {
+        let name = camera.name.to_string();
+        let unmet = camera.backend.unmet(&camera.streams);
+        unmet.into_iter().map(move |u| Unmet { finding: u.finding.of(&name), ..u })
+    };
+    config.cameras.iter().flat_map(of_camera).collect()
 }

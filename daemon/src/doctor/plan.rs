@@ -4,7 +4,6 @@ use super::finding::{Finding, Severity};
 use crate::attached::{AttachedCamera, ModeReport};
 use crate::config::CameraConfig;
 use depthrig_drivers::StreamProfile;
-use depthrig_drivers::kinect;
 use depthrig_drivers::usb::health;
 use serde::Serialize;
 
@@ -25,6 +24,9 @@ pub struct CameraPlan {
     pub worst: Option<Severity>,
     /// Whether it would be read through libusb.
     pub libusb: bool,
+    /// Memory that the kernel counts for the transfers of a vendor's library, bytes.
+    #[serde(skip)]
+    pub transfer_bytes: u64,
     /// The modes of `streams`, with whether each is recorded.
     #[serde(skip)]
     pub profiles: Vec<(StreamProfile, bool)>,
@@ -58,6 +60,7 @@ pub(super) fn no_plan(camera: &CameraConfig, backend: &'static str) -> CameraPla
         streams: Vec::new(),
         worst: None,
         libusb: false,
+        transfer_bytes: 0,
         profiles: Vec::new(),
     }
 }
@@ -100,10 +103,8 @@ pub(super) fn set_streams(
     let with_depth = captured.iter().any(|(p, _)| p.stream.as_str() == "depth");
     for (p, recorded) in captured.into_iter().chain(derived) {
         let on_usb = on_usb && !camera.is_computed_here(&p.stream);
-        let bits_per_s = match plan.backend {
-            kinect::NAME => kinect::live::wire_bits_per_s(&p, with_depth),
-            _ => super::wire_bits_per_s(&p),
-        };
+        let own = camera.backend.wire_bits_per_s(&p, with_depth);
+        let bits_per_s = own.unwrap_or_else(|| super::wire_bits_per_s(&p));
         let usb_mbit_s = if on_usb { bits_per_s / 1e6 } else { 0.0 };
         plan.streams.push(PlannedStream { mode: ModeReport::from(&p), usb_mbit_s, recorded });
         plan.profiles.push((p, recorded));

@@ -8,6 +8,7 @@ use super::*;
 use crate::attached::look;
 use crate::attached::tests::{FakeAnswers, kinect_half, profile, rig_with};
 use crate::attached::{Attached, UseState};
+use crate::family::{Selector, Unmet, kinect};
 use depthrig_bus::PixelFormat;
 use depthrig_drivers::ErrorKind;
 use depthrig_drivers::usb::fake::{FakeDevice, FakeTree};
@@ -31,7 +32,7 @@ fn config(text: &str) -> RigConfig {
 /// A computer on which all is well.
 fn well(root: SysRoot) -> Host {
     Host {
-        kinect: KinectFacts { missing: Vec::new(), has_display: true },
+        unmet: Vec::new(),
         root,
         shm_free_bytes: Some(64 << 30),
         realtime_refusal: None,
@@ -133,7 +134,8 @@ fn a_camera_that_cannot_work_is_an_error_of_its_own() {
 
 /// A camera of the rig that means a real device, without the rig file's keys for it.
 fn planned(port: Option<&str>, serial: Option<&str>, attached: &Attached) -> Planned {
-    let wanted = cameras::Wanted { serial, port, libusb: false, needs_calibration: true };
+    let wanted =
+        Selector { serial, port, needs_calibration: true, kernel_metadata: true, ..Selector::default() };
     let config = config(FILES);
     cameras::plan_device(&config.cameras[0], "realsense", &wanted, attached)
 }
@@ -301,7 +303,7 @@ fn a_mode_that_is_missing_is_listed_with_those_there_are() {
     let text = format!("{FILES}[[camera.stream]]\nname = \"depth\"\n");
     let mut camera = config(&text).cameras.remove(0);
     camera.streams[0].size = Some((848, 480));
-    let wanted = cameras::Wanted { serial: None, port: None, libusb: false, needs_calibration: true };
+    let wanted = Selector { needs_calibration: true, ..Selector::default() };
     let found = cameras::plan_device(&camera, "realsense", &wanted, &attached).findings;
     let missing = found.iter().find(|f| f.id == "mode_missing").unwrap();
     assert!(missing.what.contains("depth 640x480 z16 30 Hz"), "{missing:?}");
@@ -530,24 +532,31 @@ fn what_a_kinect_misses_is_said_once() {
     assert_eq!(ids(&kinect_report(&named, &FakeAnswers::default(), |_| {})), []);
     let failing = vec![("2-1.1".to_owned(), ErrorKind::BadInput)];
     let fake = FakeAnswers { failing, ..FakeAnswers::default() };
-    let no_library = |h: &mut Host| {
-        h.kinect.missing = vec![("overhead".into(), Missing::Library, "libk4a is not installed".into())];
-        h.kinect.has_display = false;
+    let good = || kinect::Facts { library: Ok(()), engine: Ok(()), wants_depth: true, has_display: true };
+    let bad = |what: &str| Err(what.to_owned());
+    let report = |text: &str, fake: &FakeAnswers, facts: kinect::Facts| {
+        let of_camera = |u: Unmet| Unmet { finding: u.finding.of("overhead"), ..u };
+        kinect_report(text, fake, |h| h.unmet = facts.unmet().map(of_camera).into_iter().collect())
     };
-    let report = kinect_report(KINECT, &fake, no_library);
-    assert_eq!(ids(&report), [("kinect_library", Severity::Error)], "neither that it failed nor a display");
-    assert!(report.findings[0].cure.contains("packages.microsoft.com"));
-    assert_eq!(report.cameras[0].device.as_deref(), Some("Azure Kinect 000123456789 at USB port 2-1.1"));
-    let no_engine =
-        |h: &mut Host| h.kinect.missing = vec![("overhead".into(), Missing::Engine, "no engine".into())];
-    assert_eq!(
-        ids(&kinect_report(&named, &FakeAnswers::default(), no_engine)),
-        [("kinect_engine", Severity::Error)]
+    let none = FakeAnswers::default();
+    let library = bad("libk4a is not installed");
+    let nothing = kinect::Facts { library, engine: bad("no engine"), has_display: false, ..good() };
+    let without_library = report(KINECT, &fake, nothing);
+    let found = ids(&without_library);
+    assert_eq!(found, [("kinect_library", Severity::Error)], "neither that it failed nor a display");
+    assert!(without_library.findings[0].cure.contains("packages.microsoft.com"));
+    let device = without_library.cameras[0].device.as_deref();
+    assert_eq!(device, Some("Azure Kinect 000123456789 at USB port 2-1.1"));
+    let no_engine = || kinect::Facts { engine: bad("no engine"), ..good() };
+    assert_eq!(ids(&report(&named, &none, no_engine())), [("kinect_engine", Severity::Error)]);
+    let failed = ids(&report(KINECT, &fake, no_engine()));
+    assert!(
+        failed.contains(&("camera_failed", Severity::Error)),
+        "an engine explains no failure: {failed:?}"
     );
-    let report = kinect_report(&named, &FakeAnswers::default(), |h| h.kinect.has_display = false);
-    assert_eq!(ids(&report), [("kinect_display", Severity::Warning)]);
-    let color = format!("{named}[[camera.stream]]\nname = \"color\"\n");
-    assert_eq!(ids(&kinect_report(&color, &FakeAnswers::default(), |h| h.kinect.has_display = false)), []);
+    let no_display = || kinect::Facts { has_display: false, ..good() };
+    assert_eq!(ids(&report(&named, &none, no_display())), [("kinect_display", Severity::Warning)]);
+    assert_eq!(ids(&report(&named, &none, kinect::Facts { wants_depth: false, ..no_display() })), []);
 }
 
 #[test]
@@ -572,6 +581,7 @@ fn two_kinects_need_more_memory_for_transfers_than_the_kernel_gives() {
         streams: Vec::new(),
         worst: None,
         libusb: false,
+        transfer_bytes: kinect::TRANSFERS,
         profiles: Vec::new(),
     };
     let plans = [plan("2-1.1"), plan("2-3.1")];

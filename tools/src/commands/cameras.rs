@@ -5,7 +5,6 @@ use crate::exit::Exit;
 use crate::{out, screen};
 use anyhow::Result;
 use depthrig_daemon::attached::{Attached, AttachedCamera, ModeReport, System, UseState, look};
-use depthrig_drivers::kinect::live::Places;
 use depthrig_drivers::realsense::{RealsenseBackend, RealsenseConfig};
 use depthrig_drivers::usb::SysRoot;
 use std::path::PathBuf;
@@ -55,7 +54,7 @@ pub fn run(args: &CamerasArgs, context: &Context) -> Result<Exit> {
         return Ok(Exit::Good);
     }
     let root = SysRoot::new(&args.sys_root);
-    let ask = System { runtime: context.runtime().ok(), kinect: Places::default(), root: root.clone() };
+    let ask = System { runtime: context.runtime().ok(), rig: Vec::new(), root: root.clone() };
     let mut attached = look(&root, &ask)?;
     if let Some(part) = &args.only {
         let part = part.to_lowercase();

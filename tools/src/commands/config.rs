@@ -4,10 +4,7 @@ use crate::exit::Exit;
 use crate::out;
 use anyhow::Result;
 use depthrig_daemon::ErrorKind;
-use depthrig_daemon::config::{BackendConfig, KinectSettings, RigConfig};
-use depthrig_drivers::Backend;
-use depthrig_drivers::files::FilesBackend;
-use depthrig_drivers::kinect::playback::PlaybackBackend;
+use depthrig_daemon::config::RigConfig;
 use std::path::PathBuf;
 
 /// Examples for `--help`.
@@ -51,14 +48,7 @@ pub fn run(command: &ConfigCommand) -> Result<Exit> {
             let config = RigConfig::load(file).map_err(depthrig_daemon::Error::from)?;
             // Checks input files, but no attached cameras: those may be unplugged at this time.
             for camera in &config.cameras {
-                let found = match &camera.backend {
-                    BackendConfig::Files(settings) => FilesBackend::new(settings.clone()).discover(),
-                    BackendConfig::Kinect(KinectSettings::Recorded(settings)) => {
-                        PlaybackBackend::new(settings.clone()).discover()
-                    }
-                    _ => continue,
-                };
-                found.map_err(|e| {
+                camera.backend.check_input().map_err(|e| {
                     let message = format!("camera \"{}\": {e}", camera.name);
                     depthrig_daemon::Error::new(ErrorKind::BadInput, message).with_source(e)
                 })?;

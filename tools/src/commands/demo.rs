@@ -15,12 +15,13 @@ use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
 use depthrig_bus::{Bus, HostTime, Name, RuntimeDir, StreamId, UtcPair};
 use depthrig_cdm::Precision;
-use depthrig_daemon::config::{BackendConfig, CameraConfig, EngineChoice, RefineConfig, RigConfig};
+use depthrig_daemon::config::{CameraConfig, EngineChoice, RefineConfig, RigConfig};
 use depthrig_daemon::control::RecordRequest;
 use depthrig_daemon::rig::{Rig, RigSummary};
 use depthrig_daemon::status::{CameraStatus, RigStatus};
 use depthrig_daemon::zed_replay::Mode;
 use depthrig_drivers::StreamRequest;
+use depthrig_drivers::synthetic::SyntheticConfig;
 use depthrig_recorder::report::REPORT_FILE;
 use depthrig_recorder::{Dataset, VerifyOptions, verify};
 use std::collections::BTreeMap;
@@ -142,7 +143,7 @@ fn configuration(file: Option<&Path>) -> Result<Chosen> {
     let read = file.map_or_else(|| RigConfig::parse(RigConfig::default_text(), None), RigConfig::load);
     let mut config = read.map_err(depthrig_daemon::Error::from)?;
     for camera in &mut config.cameras {
-        if let BackendConfig::Synthetic(settings) = &mut camera.backend {
+        if let Some(settings) = camera.backend.settings_mut::<SyntheticConfig>() {
             settings.truth = true;
             // If the rig lists streams, add the ground truth of each in the same mode.
             for (of, truth) in [("depth", "depth_true"), ("color", "depth_true_color")] {

@@ -1,7 +1,7 @@
 //! The rig of the paper matches the paper.
 
-use super::super::{BackendConfig, CameraConfig, RigConfig};
-use super::parse;
+use super::super::{CameraConfig, RigConfig};
+use super::{ExternalConfig, parse};
 
 /// Depth modes: one of each camera, or those that its stereo gives.
 fn depth_modes(rig: &RigConfig) -> Vec<String> {
@@ -15,17 +15,7 @@ fn depth_modes(rig: &RigConfig) -> Vec<String> {
 #[test]
 fn the_papers_rig_has_seven_cameras_and_ten_depth_modes() {
     let rig = parse(RigConfig::paper_text()).unwrap();
-    let backends: Vec<_> = rig
-        .cameras
-        .iter()
-        .map(|c| match &c.backend {
-            BackendConfig::Realsense(_) => "realsense",
-            BackendConfig::L515(_) => "l515",
-            BackendConfig::Zed(_) => "zed",
-            BackendConfig::Kinect(_) => "kinect",
-            other => panic!("{}: {other:?}", c.name),
-        })
-        .collect();
+    let backends: Vec<_> = rig.cameras.iter().map(|c| c.backend.name()).collect();
     assert_eq!(backends, ["realsense", "realsense", "realsense", "realsense", "l515", "zed", "kinect"]);
     let stereo = ["performance", "quality", "ultra", "neural"].map(|m| format!("zed2i {m}"));
     let single = ["d405", "d415", "d435", "d455", "l515"].map(str::to_owned);
@@ -49,9 +39,7 @@ fn an_oak_comes_in_by_taking_its_comment_away() {
     let with_oak = RigConfig::paper_text().replace("#e.g. ", "");
     let rig = parse(&with_oak).unwrap();
     assert_eq!(rig.cameras.len(), 8);
-    let BackendConfig::External(oak) = &rig.camera("oak").unwrap().backend else {
-        panic!("{:?}", rig.cameras[7])
-    };
+    let oak = rig.camera("oak").unwrap().backend.settings::<ExternalConfig>().unwrap();
     assert_eq!(oak.command[0], "depthrig-oak");
 }
 

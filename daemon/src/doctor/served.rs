@@ -3,26 +3,22 @@
 use super::finding::{Finding, Severity};
 use super::plan::{Planned, mode_missing, no_plan, set_streams};
 use crate::attached::{Attached, UseState, place_of_served};
-use crate::config::{CameraConfig, ExternalSettings};
+use crate::config::CameraConfig;
+use crate::family::Service;
 use depthrig_drivers::choose_profiles;
 use std::path::{Path, PathBuf};
 
 const INCOMPLETE: &str =
     "the rig runs without the camera and looks for it again and again; its sets are incomplete";
 
-/// Plans the camera of rig `rig` that `settings` describe.
-pub(super) fn plan(
-    camera: &CameraConfig,
-    rig: &str,
-    settings: &ExternalSettings,
-    attached: &Attached,
-) -> Planned {
+/// Plans the camera of rig `rig` that `service` serves.
+pub(super) fn plan(camera: &CameraConfig, rig: &str, service: &Service<'_>, attached: &Attached) -> Planned {
     let mut plan = no_plan(camera, camera.backend.name());
     let mut findings = Vec::new();
     let place = place_of_served(rig, camera.name.as_str());
     let found = attached.cameras.iter().find(|c| c.backend == plan.backend && c.port == place);
     match found {
-        None => findings.push(not_served(settings)),
+        None => findings.push(not_served(service)),
         Some(device) => {
             plan.device = Some(device.describe());
             plan.port = Some(place);
@@ -57,8 +53,8 @@ fn finish(plan: super::CameraPlan, findings: Vec<Finding>) -> Planned {
 }
 
 /// The finding that no process serves the camera now.
-fn not_served(settings: &ExternalSettings) -> Finding {
-    let Some(program) = settings.command.first() else {
+fn not_served(service: &Service<'_>) -> Finding {
+    let Some(program) = service.command.first() else {
         return Finding::new(
             Severity::Error,
             "camera_missing",
@@ -67,7 +63,7 @@ fn not_served(settings: &ExternalSettings) -> Finding {
             "start the process that does (docs/external.md), or name it in the rig file as `command`",
         );
     };
-    if can_run(program, &settings.directory) {
+    if can_run(program, service.directory) {
         return Finding::new(
             Severity::Info,
             "external_not_running",
@@ -79,10 +75,7 @@ fn not_served(settings: &ExternalSettings) -> Finding {
     Finding::new(
         Severity::Error,
         "command_missing",
-        format!(
-            "`command` names {program}, which this user cannot run from {}",
-            settings.directory.display()
-        ),
+        format!("`command` names {program}, which this user cannot run from {}", service.directory.display()),
         "the rig does not start with a camera that cannot work",
         "correct `command` or `directory`, or install the program",
     )

@@ -1,36 +1,36 @@
 //! The keys of a `zed` camera: one that is attached, or a recording of one (`input`). Limits that only the camera knows
 //! (its modes, its controls) are checked when it is started.
 
-use super::read::Section;
-use super::value::{not_empty, rate, resolve, within};
-use super::wanted::WantedStream;
-use super::{BackendConfig, StereoConfig, ZedReplaySettings, ZedSettings};
-use super::{controls, stereo};
+use super::{BackendConfig, CameraSettings, Family, Offered, OpenContext, Probe, Reader, Selector, Source};
+use crate::config::read::Section;
+use crate::config::value::{not_empty, rate, resolve, within};
+use crate::config::{controls, stereo};
 use depthrig_drivers::motion::IMU;
-use depthrig_drivers::zed::{CalibrationFile, STREAMS};
-use std::path::{Path, PathBuf};
+use depthrig_drivers::zed::replay::{ZedPlaybackBackend, ZedPlaybackConfig};
+use depthrig_drivers::zed::{CalibrationFile, STREAMS, ZedBackend, ZedConfig};
+use depthrig_drivers::{Backend, Result, StreamRequest};
+use std::path::PathBuf;
 
 /// Keys that a camera that is attached has and a recording has not.
 const LIVE_KEYS: [&str; 7] =
     ["port", "auto_exposure", "exposure_percent", "gain_percent", "led", "controls", "motion"];
 
-/// Reads the settings of a camera that is asked for `streams`.
-pub(super) fn read(
-    s: &Section<'_, '_>,
-    base: &Path,
-    streams: &[WantedStream],
-    depth: Option<&StereoConfig>,
-) -> BackendConfig {
+pub(super) const FAMILY: Family =
+    Family { name: "zed", has_stereo: true, has_ports: true, read: |r| Some(read(r)), probe: Some(probe) };
+
+fn read(r: &Reader<'_>) -> BackendConfig {
+    let s = r.section;
+    let depth = r.stereo;
     let path = |key| s.or(key, None, |p: &Option<PathBuf>| p.as_deref().map_or(Ok(()), not_empty));
     let serial = s.or("serial", None, |t: &Option<String>| controls::not_blank(t.as_deref()));
     let calibration = match path("calibration") {
         None => CalibrationFile::Known,
         Some(none) if none.as_os_str() == "none" => CalibrationFile::None,
-        Some(path) => CalibrationFile::At(resolve(base, &path)),
+        Some(path) => CalibrationFile::At(resolve(r.base, &path)),
     };
     // A recording has the left and right images alone.
     let own: &[&str] = if s.has("input") { &STREAMS } else { &[STREAMS[0], STREAMS[1], IMU] };
-    stereo::check_streams(s, "a ZED", own, depth, streams);
+    stereo::check_streams(s, "a ZED", own, depth, r.streams);
     if depth.is_some() && calibration == CalibrationFile::None {
         let why = "stereo needs the factory calibration; remove calibration = \"none\", or [camera.stereo]";
         s.problem(s.at_key("calibration"), why);
@@ -45,8 +45,8 @@ pub(super) fn read(
                 ),
             );
         }
-        return BackendConfig::ZedReplay(ZedReplaySettings {
-            input: resolve(base, &input),
+        return BackendConfig::new(ZedPlaybackConfig {
+            input: resolve(r.base, &input),
             serial,
             calibration,
             rate_hz: s.or("rate_hz", None, |r| r.map_or(Ok(()), rate)),
@@ -59,13 +59,13 @@ pub(super) fn read(
             "[camera.stereo] every_pair = true is for a recording (input): a camera does not wait",
         );
     }
-    BackendConfig::Zed(live(s, serial, calibration))
+    BackendConfig::new(live(s, serial, calibration))
 }
 
-fn live(s: &Section<'_, '_>, serial: Option<String>, calibration: CalibrationFile) -> ZedSettings {
+fn live(s: &Section<'_, '_>, serial: Option<String>, calibration: CalibrationFile) -> ZedConfig {
     let percent = |key| s.or(key, None, |p: &Option<u8>| p.as_ref().map_or(Ok(()), within(0..=100)));
     let flag = |key| s.get::<bool>(key).map(|f| f.value);
-    let config = ZedSettings {
+    let config = ZedConfig {
         serial,
         port: s.or("port", None, |t: &Option<String>| controls::not_blank(t.as_deref())),
         calibration,
@@ -84,4 +84,49 @@ fn live(s: &Section<'_, '_>, serial: Option<String>, calibration: CalibrationFil
         }
     }
     config
+}
+
+fn probe(p: &Probe<'_>) -> Box<dyn Backend> {
+    Box::new(ZedBackend::new(ZedConfig { port: Some(p.port.to_owned()), ..ZedConfig::default() }))
+}
+
+impl CameraSettings for ZedConfig {
+    fn name(&self) -> &'static str {
+        FAMILY.name
+    }
+
+    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+        Ok(Box::new(ZedBackend::new(self.clone())))
+    }
+
+    fn source(&self) -> Source<'_> {
+        let serial = self.serial.as_deref();
+        let port = self.port.as_deref();
+        Source::Attached(Selector { serial, port, ..Selector::default() })
+    }
+}
+
+impl CameraSettings for ZedPlaybackConfig {
+    fn name(&self) -> &'static str {
+        FAMILY.name
+    }
+
+    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+        Ok(Box::new(ZedPlaybackBackend::new(self.clone())))
+    }
+
+    fn source(&self) -> Source<'_> {
+        Source::Here(ZedPlaybackBackend::new(self.clone()).open(None).map(|device| Offered {
+            device: format!("recording {}", device.info().port),
+            profiles: device.profiles().to_vec(),
+        }))
+    }
+
+    fn fastest_rate_hz(&self, _: &[StreamRequest]) -> Option<f64> {
+        self.rate_hz
+    }
+
+    fn reads_files(&self) -> bool {
+        true
+    }
 }

@@ -1,9 +1,10 @@
 //! The keys of an `external` camera. The streams of the process are checked when it offers them.
 
-use super::ExternalSettings;
-use super::read::Section;
-use super::value::{not_empty, resolve, shown};
+use super::{BackendConfig, CameraSettings, Family, OpenContext, Reader, Service, Source};
+use crate::config::value::{not_empty, resolve, shown};
 use core::time::Duration;
+use depthrig_drivers::external::{ExternalBackend, ExternalConfig, NAME, Place};
+use depthrig_drivers::{Backend, Result};
 use std::path::{Path, PathBuf};
 
 /// The longest that a process may be waited for, seconds: one that boots longer is better started before the rig.
@@ -11,9 +12,17 @@ const LONGEST_START_S: f64 = 120.0;
 /// The longest silence, seconds: a process that hangs keeps its camera from the rig for so long.
 const LONGEST_SILENCE_S: f64 = 14.0;
 
-/// Reads the settings of a camera that another process serves; relative paths are taken from `base`.
-pub(super) fn read(s: &Section<'_, '_>, base: &Path) -> ExternalSettings {
-    let d = ExternalSettings::default();
+pub(super) const FAMILY: Family = Family {
+    name: NAME,
+    has_stereo: true,
+    has_ports: true,
+    read: |r| Some(BackendConfig::new(read(r))),
+    probe: None,
+};
+
+fn read(r: &Reader<'_>) -> ExternalConfig {
+    let s = r.section;
+    let d = ExternalConfig::default();
     let command = s.or("command", Vec::<String>::new(), |c| match c.first() {
         Some(program) if program.trim().is_empty() => Err("names no program".to_owned()),
         None => Err("is empty; write [\"program\", \"argument\", …], or leave it out".to_owned()),
@@ -35,10 +44,34 @@ pub(super) fn read(s: &Section<'_, '_>, base: &Path) -> ExternalSettings {
         };
         Duration::from_secs_f64(s.or(key, default.as_secs_f64(), check))
     };
-    ExternalSettings {
+    ExternalConfig {
         command,
-        directory: resolve(base, directory.as_deref().unwrap_or(Path::new("."))),
+        directory: resolve(r.base, directory.as_deref().unwrap_or(Path::new("."))),
         start_timeout: seconds("start_timeout_s", d.start_timeout, 0.1, LONGEST_START_S),
         heartbeat_timeout: seconds("heartbeat_timeout_s", d.heartbeat_timeout, 0.5, LONGEST_SILENCE_S),
+    }
+}
+
+impl CameraSettings for ExternalConfig {
+    fn name(&self) -> &'static str {
+        FAMILY.name
+    }
+
+    fn backend(&self, context: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+        let place = Place {
+            runtime: context.runtime.clone(),
+            rig: context.rig.clone(),
+            camera: context.camera.clone(),
+        };
+        Ok(Box::new(ExternalBackend::new(self.clone(), place)))
+    }
+
+    fn source(&self) -> Source<'_> {
+        Source::Served(Service { command: &self.command, directory: &self.directory })
+    }
+
+    /// The driver waits for the process, for its first message and for its first frame, each with a limit of its own.
+    fn extra_open_time(&self) -> Duration {
+        self.start_timeout * 2 + self.heartbeat_timeout
     }
 }

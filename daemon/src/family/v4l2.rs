@@ -1,28 +1,36 @@
 //! The keys of a `v4l2` camera.
 
-use super::V4l2Settings;
-use super::read::{Located, Section};
-use super::value::within;
+use super::{BackendConfig, CameraSettings, Family, OpenContext, Probe, Selector, Source};
+use crate::config::read::{Located, Section};
+use crate::config::value::within;
 use depthrig_bus::{Distortion, Intrinsics, StreamName};
 use depthrig_drivers::v4l2::{
-    BUFFERS, ClockChoice, ControlValue, GivenIntrinsics, MemoryChoice, MjpegChoice,
+    BUFFERS, ClockChoice, ControlValue, GivenIntrinsics, MemoryChoice, MjpegChoice, V4l2Backend, V4l2Config,
 };
+use depthrig_drivers::{Backend, Result};
 
 const MEMORY: [(&str, MemoryChoice); 2] =
     [("mmap", MemoryChoice::Mmap), ("userptr", MemoryChoice::UserPointer)];
 const MJPEG: [(&str, MjpegChoice); 2] = [("decode", MjpegChoice::Decode), ("keep", MjpegChoice::Keep)];
 const CLOCK: [(&str, ClockChoice); 2] = [("auto", ClockChoice::Auto), ("kernel", ClockChoice::Kernel)];
 
-/// Reads the settings of a camera at the kernel's video nodes.
-pub(super) fn read(s: &Section<'_, '_>) -> V4l2Settings {
-    let d = V4l2Settings::default();
+pub(super) const FAMILY: Family = Family {
+    name: "v4l2",
+    has_stereo: false,
+    has_ports: true,
+    read: |r| Some(BackendConfig::new(read(r.section))),
+    probe: Some(probe),
+};
+
+fn read(s: &Section<'_, '_>) -> V4l2Config {
+    let d = V4l2Config::default();
     let text = |key| {
         s.or(key, None, |v: &Option<String>| match v {
             Some(v) if v.is_empty() => Err("is empty".to_owned()),
             _ => Ok(()),
         })
     };
-    V4l2Settings {
+    V4l2Config {
         serial: text("serial"),
         port: text("port"),
         controls: controls(s),
@@ -33,7 +41,7 @@ pub(super) fn read(s: &Section<'_, '_>) -> V4l2Settings {
         device_clock_hz: s.or("device_clock_hz", None, |v: &Option<u32>| {
             v.map_or(Ok(()), |hz| within(1000..=1_000_000_000)(&hz))
         }),
-        depth_unit_m: s.or("depth_unit_m", d.depth_unit_m, super::value::above_zero(1.0)),
+        depth_unit_m: s.or("depth_unit_m", d.depth_unit_m, crate::config::value::above_zero(1.0)),
         intrinsics: s
             .tables("intrinsics", "[[camera.intrinsics]]")
             .into_iter()
@@ -42,6 +50,10 @@ pub(super) fn read(s: &Section<'_, '_>) -> V4l2Settings {
             .collect(),
         buffers: s.or("buffers", d.buffers, within(BUFFERS)),
     }
+}
+
+fn probe(p: &Probe<'_>) -> Box<dyn Backend> {
+    Box::new(V4l2Backend::new(V4l2Config { port: Some(p.port.to_owned()), ..V4l2Config::default() }))
 }
 
 /// The controls by name. Only the camera knows which names there are.
@@ -53,8 +65,8 @@ fn controls(camera: &Section<'_, '_>) -> Vec<(String, ControlValue)> {
 /// A [`ControlValue`] out of a rig file.
 struct Value(ControlValue);
 
-impl super::read::FromToml for Value {
-    fn from_toml(value: &toml::de::DeValue<'_>) -> Result<Self, String> {
+impl crate::config::read::FromToml for Value {
+    fn from_toml(value: &toml::de::DeValue<'_>) -> core::result::Result<Self, String> {
         use toml::de::DeValue;
         Ok(Self(match value {
             DeValue::Boolean(b) => ControlValue::Boolean(*b),
@@ -64,7 +76,7 @@ impl super::read::FromToml for Value {
                 Err(_) => return Err("must be a whole number of 64 bits".to_owned()),
             },
             other => {
-                let is = super::read::describe(other);
+                let is = crate::config::read::describe(other);
                 return Err(format!(
                     "must be a whole number, true, false or the name of an item; it is {is}"
                 ));
@@ -91,7 +103,7 @@ fn intrinsics(s: Section<'_, '_>) -> Option<GivenIntrinsics> {
     let height = side("height", "720");
     let pixels = |key, example| {
         let found = s.required::<f64>(key, example);
-        found.filter(|f| check(&s, key, f, &super::value::above_zero(1e5)(&f.value))).map(|f| f.value)
+        found.filter(|f| check(&s, key, f, &crate::config::value::above_zero(1e5)(&f.value))).map(|f| f.value)
     };
     let fx = pixels("fx", "910.5");
     let fy = pixels("fy", "909.8");
@@ -116,9 +128,30 @@ fn intrinsics(s: Section<'_, '_>) -> Option<GivenIntrinsics> {
 }
 
 /// Whether `outcome` is good; if not, it is noted.
-fn check<T>(s: &Section<'_, '_>, key: &str, found: &Located<T>, outcome: &Result<(), String>) -> bool {
+fn check<T>(
+    s: &Section<'_, '_>,
+    key: &str,
+    found: &Located<T>,
+    outcome: &core::result::Result<(), String>,
+) -> bool {
     if let Err(why) = outcome {
         s.problem(found.at, format!("{} {why}", s.key_of(key)));
     }
     outcome.is_ok()
+}
+
+impl CameraSettings for V4l2Config {
+    fn name(&self) -> &'static str {
+        FAMILY.name
+    }
+
+    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+        Ok(Box::new(V4l2Backend::new(self.clone())))
+    }
+
+    fn source(&self) -> Source<'_> {
+        let serial = self.serial.as_deref();
+        let port = self.port.as_deref();
+        Source::Attached(Selector { serial, port, ..Selector::default() })
+    }
 }

@@ -1,23 +1,32 @@
 //! The keys of an `l515` camera. The range of a control is checked by the camera when it is started.
 
-use super::L515Settings;
-use super::controls;
-use super::read::Section;
-use super::wanted::WantedStream;
-use depthrig_drivers::StreamRequest;
+use super::realsense::default_streams;
+use super::{BackendConfig, CameraSettings, Family, OpenContext, Probe, Reader, Selector, Source};
+use crate::config::controls;
 use depthrig_drivers::motion::IMU;
+use depthrig_drivers::realsense::l515::{L515Backend, L515Config, NAME};
 use depthrig_drivers::realsense::protocol::l515::Control;
+use depthrig_drivers::{Backend, Result, StreamRequest};
 
 const STREAMS: [&str; 5] = ["depth", "color", "ir", "confidence", IMU];
 
-/// Reads the settings of a camera that is asked for `streams`.
-pub(super) fn read(s: &Section<'_, '_>, streams: &[WantedStream]) -> L515Settings {
+pub(super) const FAMILY: Family = Family {
+    name: NAME,
+    has_stereo: false,
+    has_ports: true,
+    read: |r| Some(BackendConfig::new(read(r))),
+    probe: Some(probe),
+};
+
+fn read(r: &Reader<'_>) -> L515Config {
+    let s = r.section;
+    let streams = r.streams;
     let text = |key| s.or(key, None, |t: &Option<String>| controls::not_blank(t.as_deref()));
-    let mut settings = L515Settings {
+    let mut settings = L515Config {
         serial: text("serial"),
         port: text("port"),
         color_controls: controls::read(s, "color_controls", "color_controls = { }"),
-        ..L515Settings::default()
+        ..L515Config::default()
     };
     for (name, found) in s.entries::<i32>("controls", "controls = { }") {
         if Control::from_name(&name).is_none() {
@@ -42,7 +51,26 @@ pub(super) fn read(s: &Section<'_, '_>, streams: &[WantedStream]) -> L515Setting
     settings
 }
 
-/// The streams that are started when the file names none.
-pub(super) fn default_streams() -> Vec<StreamRequest> {
-    super::realsense::default_streams()
+fn probe(p: &Probe<'_>) -> Box<dyn Backend> {
+    Box::new(L515Backend::new(L515Config { port: Some(p.port.to_owned()), ..L515Config::default() }))
+}
+
+impl CameraSettings for L515Config {
+    fn name(&self) -> &'static str {
+        FAMILY.name
+    }
+
+    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+        Ok(Box::new(L515Backend::new(self.clone())))
+    }
+
+    fn source(&self) -> Source<'_> {
+        let serial = self.serial.as_deref();
+        let port = self.port.as_deref();
+        Source::Attached(Selector { serial, port, needs_calibration: true, ..Selector::default() })
+    }
+
+    fn default_streams(&self) -> Vec<StreamRequest> {
+        default_streams()
+    }
 }

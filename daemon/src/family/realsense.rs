@@ -1,17 +1,16 @@
 //! The keys of a `realsense` camera. Limits that only the camera knows (the range of its laser, its controls' names)
 //! are checked when it is started; the rest is checked here.
 
-use super::RealsenseSettings;
-use super::controls;
-use super::read::Section;
-use super::value::{not_empty, resolve, shown, within};
-use super::wanted::WantedStream;
+use super::{BackendConfig, CameraSettings, Family, OpenContext, Probe, Reader, Selector, Source};
+use crate::config::controls;
+use crate::config::value::{not_empty, resolve, shown, within};
 use depthrig_bus::StreamName;
-use depthrig_drivers::StreamRequest;
 use depthrig_drivers::motion::IMU;
 use depthrig_drivers::realsense::config::{Emitter, MetadataWish, TransportChoice};
 use depthrig_drivers::realsense::protocol::sync::SyncMode;
-use std::path::{Path, PathBuf};
+use depthrig_drivers::realsense::{NAME, RealsenseBackend, RealsenseConfig};
+use depthrig_drivers::{Backend, Result, StreamRequest};
+use std::path::PathBuf;
 
 const TRANSPORTS: [(&str, TransportChoice); 3] = [
     ("auto", TransportChoice::Auto),
@@ -36,12 +35,21 @@ const MAX_EXPOSURE_US: u32 = 200_000;
 /// The strongest laser of any model, milliwatts.
 const MAX_LASER_MW: u16 = 360;
 
-/// Reads the settings of a camera that is asked for `streams`.
-pub(super) fn read(s: &Section<'_, '_>, base: &Path, streams: &[WantedStream]) -> RealsenseSettings {
-    let d = RealsenseSettings::default();
+pub(super) const FAMILY: Family = Family {
+    name: NAME,
+    has_stereo: false,
+    has_ports: true,
+    read: |r| Some(BackendConfig::new(read(r))),
+    probe: Some(probe),
+};
+
+fn read(r: &Reader<'_>) -> RealsenseConfig {
+    let s = r.section;
+    let streams = r.streams;
+    let d = RealsenseConfig::default();
     let text = |key| s.or(key, None, |t: &Option<String>| controls::not_blank(t.as_deref()));
     let preset = s.or("preset", None, |p: &Option<PathBuf>| p.as_deref().map_or(Ok(()), not_empty));
-    let config = RealsenseSettings {
+    let config = RealsenseConfig {
         serial: text("serial"),
         port: text("port"),
         transport: s.choice("transport", &TRANSPORTS, d.transport),
@@ -51,7 +59,7 @@ pub(super) fn read(s: &Section<'_, '_>, base: &Path, streams: &[WantedStream]) -
         exposure_us: s.or("exposure_us", None, optional(within(1..=MAX_EXPOSURE_US))),
         auto_exposure: s.get::<bool>("auto_exposure").map(|f| f.value),
         gain: s.or("gain", None, optional(within(1..=1000))),
-        preset: preset.map(|p| resolve(base, &p)),
+        preset: preset.map(|p| resolve(r.base, &p)),
         sync: s.choose("sync", &SYNC),
         color_controls: controls::read(s, "color_controls", "color_controls = { }"),
         depth_unit_m: s.or("depth_unit_m", None, optional(depth_unit)),
@@ -82,7 +90,16 @@ pub(super) fn read(s: &Section<'_, '_>, base: &Path, streams: &[WantedStream]) -
     config
 }
 
-/// The streams that are started when the file names none.
+fn probe(p: &Probe<'_>) -> Box<dyn Backend> {
+    Box::new(RealsenseBackend::new(RealsenseConfig {
+        port: Some(p.port.to_owned()),
+        // Listed all the same, with the calibration `none`.
+        allow_uncalibrated: true,
+        ..RealsenseConfig::default()
+    }))
+}
+
+/// The streams that are started when the file names none: the imagers behind depth are asked for by name.
 pub(super) fn default_streams() -> Vec<StreamRequest> {
     let request = |name| StreamName::new(name).ok().map(StreamRequest::any);
     ["depth", "color"].into_iter().filter_map(request).collect()
@@ -102,5 +119,31 @@ fn depth_unit(unit: &f64) -> Result<(), String> {
         Ok(())
     } else {
         Err(format!("is {}; it must be within 0.000001 and 0.01 (0.001 are millimetres)", shown(unit)))
+    }
+}
+
+impl CameraSettings for RealsenseConfig {
+    fn name(&self) -> &'static str {
+        FAMILY.name
+    }
+
+    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+        Ok(Box::new(RealsenseBackend::new(self.clone())))
+    }
+
+    fn source(&self) -> Source<'_> {
+        let libusb = self.transport == TransportChoice::Libusb;
+        Source::Attached(Selector {
+            serial: self.serial.as_deref(),
+            port: self.port.as_deref(),
+            libusb,
+            needs_calibration: !self.allow_uncalibrated,
+            kernel_metadata: !libusb,
+            ..Selector::default()
+        })
+    }
+
+    fn default_streams(&self) -> Vec<StreamRequest> {
+        default_streams()
     }
 }

@@ -3,32 +3,37 @@
 //! The driver knows the limits of its numbers, so it is the one that is asked, key by key: each value is put into an
 //! otherwise default configuration, and the driver's error is reported at the key's own line.
 
-use super::SyntheticSettings;
-use super::read::{FromToml, Located, Section, nearest};
-use super::value::resolve;
-use super::wanted::WantedStream;
-use depthrig_bus::Pose;
+use super::{BackendConfig, CameraSettings, Family, Offered, OpenContext, Preparation, Reader, Source};
+use crate::config::read::{FromToml, Located, Section, nearest};
+use crate::config::value::resolve;
 use depthrig_drivers::synthetic::models::MODELS;
-use depthrig_drivers::synthetic::{ClockSim, FaultKind, ScheduledFault, StreamOverride, imu, profiles};
-use depthrig_drivers::{Result, StreamRequest, choose_profiles};
-use std::path::{Path, PathBuf};
+use depthrig_drivers::synthetic::{
+    self, ClockSim, Drawing, FaultKind, ScheduledFault, StreamOverride, SyntheticBackend, SyntheticConfig,
+    imu, profiles,
+};
+use depthrig_drivers::{Backend, Result, StreamRequest, choose_profiles};
+use std::path::PathBuf;
 
-/// Reads the settings of the simulated camera `name`, which stands at `pose` and is asked for `streams`.
-pub(super) fn read(
-    s: &Section<'_, '_>,
-    base: &Path,
-    name: &str,
-    pose: Pose,
-    streams: &[WantedStream],
-) -> SyntheticSettings {
-    let d = SyntheticSettings::default();
+pub(super) const FAMILY: Family = Family {
+    name: "synthetic",
+    has_stereo: false,
+    has_ports: false,
+    read: |r| Some(BackendConfig::new(read(r))),
+    probe: None,
+};
+
+fn read(r: &Reader<'_>) -> SyntheticConfig {
+    let s = r.section;
+    let name = r.name;
+    let streams = r.streams;
+    let d = SyntheticConfig::default();
     // Two cameras of one model must differ in their serial numbers, and the name is unique already.
     let serial = s.get::<String>("serial").map_or_else(|| format!("sim-{name}"), |f| f.value);
-    let mut config = SyntheticSettings {
+    let mut config = SyntheticConfig {
         model: model(s, d.model),
         serial,
         seed: field(s, "seed", d.seed, |c, v| c.seed = v),
-        pose_on_mount: pose,
+        pose_on_mount: r.pose,
         streams: Vec::new(),
         truth: field(s, "truth", d.truth, |c, v| c.truth = v),
         // Who asks for its stream by name need not switch it on besides.
@@ -39,7 +44,7 @@ pub(super) fn read(
         poses: field(s, "poses", d.poses, |c, v| c.poses = v),
         pose_rate_hz: field(s, "pose_rate_hz", d.pose_rate_hz, |c, v| c.pose_rate_hz = v),
         phase: field(s, "phase", d.phase, |c, v| c.phase = v),
-        cache_dir: s.get::<PathBuf>("cache_dir").map_or(d.cache_dir, |f| resolve(base, &f.value)),
+        cache_dir: s.get::<PathBuf>("cache_dir").map_or(d.cache_dir, |f| resolve(r.base, &f.value)),
         cheap: field(s, "cheap", d.cheap, |c, v| c.cheap = v),
         ring_frames: field(s, "ring_frames", d.ring_frames, |c, v| c.ring_frames = v),
     };
@@ -64,7 +69,7 @@ pub(super) fn read(
 }
 
 /// The highest rate among the streams that `config` starts on `requests`, Hz.
-pub(super) fn fastest_rate_hz(config: &SyntheticSettings, requests: &[StreamRequest]) -> Result<f64> {
+fn fastest_rate_hz(config: &SyntheticConfig, requests: &[StreamRequest]) -> Result<f64> {
     let chosen = choose_profiles("", &profiles(config)?, requests)?;
     let images = chosen.iter().filter(|p| !p.format.is_motion());
     Ok(images.map(|p| p.rate_hz).fold(0.0, f64::max))
@@ -139,7 +144,7 @@ fn field<T: FromToml + Clone>(
     s: &Section<'_, '_>,
     key: &'static str,
     default: T,
-    set: impl FnOnce(&mut SyntheticSettings, T),
+    set: impl FnOnce(&mut SyntheticConfig, T),
 ) -> T {
     let Some(Located { value, at }) = s.get::<T>(key) else { return default };
     match problem_of(|c| set(c, value.clone())) {
@@ -152,11 +157,43 @@ fn field<T: FromToml + Clone>(
 }
 
 /// The driver's error for a default configuration after `change`.
-fn problem_of(change: impl FnOnce(&mut SyntheticSettings)) -> Option<String> {
-    let mut config = SyntheticSettings::default();
+fn problem_of(change: impl FnOnce(&mut SyntheticConfig)) -> Option<String> {
+    let mut config = SyntheticConfig::default();
     change(&mut config);
     let text = profiles(&config).err()?.to_string();
     // The driver names the camera, which here is the default one; the caller knows the real one.
     let what = text.strip_prefix("synthetic camera ").and_then(|t| t.split_once(": "));
     Some(what.map_or_else(|| text.clone(), |(_, what)| what.to_owned()))
+}
+
+impl CameraSettings for SyntheticConfig {
+    fn name(&self) -> &'static str {
+        FAMILY.name
+    }
+
+    fn backend(&self, context: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+        let backend = SyntheticBackend::with_drawing(vec![self.clone()], context.began, context.drawing)?;
+        Ok(Box::new(backend))
+    }
+
+    fn source(&self) -> Source<'_> {
+        let device = format!("simulated {} {}", self.model, self.serial);
+        Source::Here(profiles(self).map(|profiles| Offered { device, profiles }))
+    }
+
+    fn fastest_rate_hz(&self, streams: &[StreamRequest]) -> Option<f64> {
+        fastest_rate_hz(self, streams).ok()
+    }
+
+    fn prepare(&mut self, given: &Preparation<'_>) -> Result<()> {
+        self.pose_on_mount = given.pose;
+        if let Some(dir) = given.cache_dir {
+            dir.clone_into(&mut self.cache_dir);
+        }
+        given.render.map_or(Ok(()), |progress| synthetic::prepare(self, progress))
+    }
+
+    fn add_to_drawing(&self, drawing: &Drawing) -> Result<()> {
+        drawing.plan(self)
+    }
 }
