@@ -11,10 +11,9 @@ mod served;
 pub(crate) mod tests;
 
 pub use ask::{Ask, NodeFacts, Served, System};
-pub use classify::Family;
 pub(crate) use served::place as place_of_served;
 
-use crate::family;
+use crate::family::{self, Family, ImuFiles};
 use crate::status::{CameraStatus, RigStatus};
 use classify::Candidate;
 use depthrig_bus::PixelFormat;
@@ -76,9 +75,6 @@ pub struct AttachedCamera {
     /// The device on the bus.
     #[serde(skip)]
     pub usb: Option<UsbDevice>,
-    /// Which family it is of.
-    #[serde(skip)]
-    pub family: Family,
     /// Its modes as drivers know them.
     #[serde(skip)]
     pub profiles: Vec<StreamProfile>,
@@ -215,6 +211,7 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
     let mut used_elsewhere = false;
     let mut metadata = None;
     let mut nodes: Vec<NodeReport> = c
+        .found
         .nodes
         .iter()
         .map(|node| match ask.node(&node.path) {
@@ -232,12 +229,12 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
             }
         })
         .collect();
-    let hid = c.hidraw.iter().map(|p| NodeReport { path: shown(p), role: "hid", formats: Vec::new() });
+    let hid = c.found.hidraw.iter().map(|p| NodeReport { path: shown(p), role: "hid", formats: Vec::new() });
     nodes.extend(hid);
-    let unit = match c.family {
-        Family::Zed => unreadable_unit(&c.hidraw, ask),
-        Family::D400 | Family::L515 => unreadable_imu(root, &c.port, ask),
-        _ => None,
+    let imu = match c.family.imu {
+        ImuFiles::Hidraw => unreadable_hidraw(&c.found.hidraw, ask),
+        ImuFiles::Iio => unreadable_iio(root, &c.port, ask),
+        ImuFiles::None => None,
     };
     let holders = holders(root, &c);
     if let Some(usb) = &c.usb {
@@ -247,9 +244,9 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
     // Without the right to see every process, a busy node is the only sign of who streams.
     let in_use = in_rig.is_some() || !holders.others.is_empty() || (holders.hidden > 0 && used_elsewhere);
     let mut found = AttachedCamera {
-        backend: c.family.backend(),
-        model: c.model,
-        serial: c.serial,
+        backend: c.family.name,
+        model: c.found.model,
+        serial: c.found.serial,
         firmware: None,
         calibration: None,
         port: c.port,
@@ -268,11 +265,10 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
             .as_ref()
             .and_then(health::slow_link)
             .into_iter()
-            .chain(unit)
-            .chain(c.problem)
+            .chain(imu)
+            .chain(c.found.problem)
             .collect(),
         usb: c.usb,
-        family: c.family,
         profiles: Vec::new(),
     };
     match in_rig {
@@ -288,14 +284,14 @@ fn camera(root: &SysRoot, ask: &dyn Ask, rigs: &[RigStatus], c: Candidate) -> At
             }
         }
         None if in_use => found.state = UseState::InUse,
-        None if found.family == Family::Oak => known_oak(&mut found, ask),
-        None => ask_device(&mut found, ask),
+        None if c.family.probe.is_none() => known_unasked(&mut found, c.found.idle_serial, ask),
+        None => ask_device(&mut found, c.family, ask),
     }
     found
 }
 
-/// Why the IMU of a ZED cannot be read through its raw HID nodes, if it cannot.
-fn unreadable_unit(nodes: &[PathBuf], ask: &dyn Ask) -> Option<String> {
+/// Why the IMU of a camera cannot be read through its raw HID nodes, if so.
+fn unreadable_hidraw(nodes: &[PathBuf], ask: &dyn Ask) -> Option<String> {
     let denied = nodes.iter().find(|node| !ask.may_open(node))?;
     Some(format!(
         "its IMU {} may not be opened, so that it has no stream imu: {} and plug the camera in again",
@@ -304,8 +300,8 @@ fn unreadable_unit(nodes: &[PathBuf], ask: &dyn Ask) -> Option<String> {
     ))
 }
 
-/// Why this user cannot read or switch on the sensors of a RealSense IMU, if so.
-fn unreadable_imu(root: &SysRoot, port: &str, ask: &dyn Ask) -> Option<String> {
+/// Why this user cannot read or switch on the kernel's sensors of an IMU, if so.
+fn unreadable_iio(root: &SysRoot, port: &str, ask: &dyn Ask) -> Option<String> {
     let sensors = iio::on_port(root, port);
     let files = sensors.iter().flat_map(|s| s.switches().into_iter().chain([s.node.clone()]));
     let denied = files.into_iter().find(|file| !ask.may_open(file))?;
@@ -316,19 +312,17 @@ fn unreadable_imu(root: &SysRoot, port: &str, ask: &dyn Ask) -> Option<String> {
     ))
 }
 
-/// Fills in the facts about an OAK that are known without starting its firmware.
-fn known_oak(found: &mut AttachedCamera, ask: &dyn Ask) {
-    if let Some(usb) = &found.usb {
-        found.serial = classify::oak_serial(usb);
-        if !ask.may_open(&usb.node) {
-            found.state = UseState::Denied;
-        }
+/// Fills in the facts about a camera that are known without asking it, which only the process that drives it may.
+fn known_unasked(found: &mut AttachedCamera, serial: Option<String>, ask: &dyn Ask) {
+    found.serial = serial;
+    if found.usb.as_ref().is_some_and(|usb| !ask.may_open(&usb.node)) {
+        found.state = UseState::Denied;
     }
 }
 
 /// Opens a camera that nobody has and notes its answers.
-fn ask_device(found: &mut AttachedCamera, ask: &dyn Ask) {
-    match ask.device(found.family, &found.port) {
+fn ask_device(found: &mut AttachedCamera, family: &Family, ask: &dyn Ask) {
+    match ask.device(family, &found.port) {
         Some(Ok((info, profiles))) => {
             let DeviceInfo { model, serial, firmware, calibration, .. } = info;
             if !model.is_empty() {
@@ -355,7 +349,7 @@ fn ask_device(found: &mut AttachedCamera, ask: &dyn Ask) {
 /// Who has any of the camera's nodes open.
 fn holders(root: &SysRoot, c: &Candidate) -> Holders {
     let mut all = Holders::default();
-    let video = c.nodes.iter().map(|n| n.path.as_path());
+    let video = c.found.nodes.iter().map(|n| n.path.as_path());
     for node in video.chain(c.usb.as_ref().map(|d| d.node.as_path())) {
         let found = holders_of(root, node);
         all.others.extend(found.others);

@@ -16,7 +16,7 @@ mod tests;
 pub(crate) mod value;
 pub(crate) mod wanted;
 
-pub use crate::family::{AnySettings, BackendConfig, CameraSettings};
+pub use crate::family::BackendConfig;
 pub use depthrig_cdm::Precision;
 pub use depthrig_recorder::{ColorCodec, DepthCodec};
 pub use error::{ConfigError, Problem};

@@ -3,6 +3,7 @@
 //! A family is a type of settings that implements [`CameraSettings`], and a [`Family`] that reads them from a `[[camera]]`
 //! table. Its driver is a folder of `depthrig-drivers`, which knows no configuration.
 
+mod bus;
 mod external;
 mod files;
 pub(crate) mod kinect;
@@ -17,12 +18,12 @@ mod tests;
 mod v4l2;
 mod zed;
 
+pub use bus::{Found, Identified, ImuFiles, Probe, ProbeFn, hidraw, is_video};
 pub use reader::Reader;
 pub use settings::{AnySettings, BackendConfig, CameraSettings, OpenContext, Preparation, Unmet};
 pub use source::{Offered, Selector, Service, Source};
 
-use depthrig_drivers::Backend;
-use depthrig_drivers::usb::SysRoot;
+use depthrig_drivers::usb::UsbDevice;
 
 /// The families, in the order in which messages list them.
 pub const FAMILIES: &[Family] = &[
@@ -35,6 +36,11 @@ pub const FAMILIES: &[Family] = &[
     external::FAMILY,
     kinect::FAMILY,
 ];
+
+/// The family of video devices that are on no USB.
+pub const PLATFORM: &Family = &v4l2::FAMILY;
+/// The family of cameras that other processes serve.
+pub const SERVED: &Family = &external::FAMILY;
 
 /// A family of cameras that one driver reads.
 #[derive(Clone, Copy)]
@@ -49,19 +55,31 @@ pub struct Family {
     pub read: fn(&Reader<'_>) -> Option<BackendConfig>,
     /// Creates a driver that asks an attached camera for its description and modes; `None` for a family that has none.
     pub probe: Option<ProbeFn>,
+    /// Recognises its cameras among all devices on the USB.
+    pub identify: fn(&UsbDevice, &[UsbDevice]) -> Option<Identified>,
+    /// The files that the IMU of an attached camera is read through.
+    pub imu: ImuFiles,
 }
 
-/// Creates the driver of an attached camera.
-pub type ProbeFn = fn(&Probe<'_>) -> Box<dyn Backend>;
+impl Family {
+    /// A family of cameras that are no devices: simulated, or played from files.
+    pub const fn new(name: &'static str, read: fn(&Reader<'_>) -> Option<BackendConfig>) -> Self {
+        Self {
+            name,
+            has_stereo: false,
+            has_ports: false,
+            read,
+            probe: None,
+            identify: |_, _| None,
+            imu: ImuFiles::None,
+        }
+    }
+}
 
-/// The attached camera that is asked.
-pub struct Probe<'c> {
-    /// Its port.
-    pub port: &'c str,
-    /// The folder that `/sys` is in.
-    pub root: &'c SysRoot,
-    /// The cameras of the rig that is examined; empty without one.
-    pub rig: &'c [BackendConfig],
+/// The family that `device` is a camera of, among all `devices` on the USB, with its answer.
+pub fn identify(device: &UsbDevice, devices: &[UsbDevice]) -> Option<(&'static Family, Identified)> {
+    let answers = FAMILIES.iter().filter_map(|f| Some((f, (f.identify)(device, devices)?)));
+    answers.min_by_key(|(_, answer)| matches!(answer, Identified::Generic(_)))
 }
 
 /// The family `name`.

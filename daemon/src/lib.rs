@@ -12,7 +12,7 @@ pub mod config;
 pub mod control;
 pub mod doctor;
 mod error;
-mod family;
+pub mod family;
 mod housekeeping;
 pub mod import_kinect;
 pub mod metrics;

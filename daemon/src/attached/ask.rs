@@ -1,9 +1,8 @@
 //! Asking nodes, cameras and running rigs; behind a trait, because tests have none of them.
 
-use super::Family;
 use crate::client::Client;
 use crate::config::{BackendConfig, RigConfig};
-use crate::family::{self, Probe};
+use crate::family::{Family, Probe};
 use crate::status::RigStatus;
 use depthrig_bus::RuntimeDir;
 use depthrig_drivers::external::{self, ExternalBackend, ExternalConfig, Place};
@@ -47,7 +46,7 @@ pub trait Ask {
 
     /// Opens the camera at a port, which nobody has, and asks for its description and modes. `None` without a
     /// driver for its family.
-    fn device(&self, family: Family, port: &str) -> Option<Result<(DeviceInfo, Vec<StreamProfile>)>>;
+    fn device(&self, family: &Family, port: &str) -> Option<Result<(DeviceInfo, Vec<StreamProfile>)>>;
 
     /// The cameras that other processes serve now, and what these say of them.
     fn served(&self) -> Vec<Served> {
@@ -94,9 +93,8 @@ impl Ask for System {
         Ok(NodeFacts { role, formats, bus: c.bus.clone(), used_elsewhere: node.is_used_elsewhere() })
     }
 
-    fn device(&self, family: Family, port: &str) -> Option<Result<(DeviceInfo, Vec<StreamProfile>)>> {
-        let probe = family::find(family.backend())?.probe?;
-        let backend = probe(&Probe { port, root: &self.root, rig: &self.rig });
+    fn device(&self, family: &Family, port: &str) -> Option<Result<(DeviceInfo, Vec<StreamProfile>)>> {
+        let backend = (family.probe?)(&Probe { port, root: &self.root, rig: &self.rig });
         let facts = |device: Box<dyn Device>| (device.info().clone(), device.profiles().to_vec());
         Some(backend.open(None).map(facts))
     }

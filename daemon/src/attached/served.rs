@@ -1,6 +1,7 @@
 //! Cameras that other processes serve, listed beside those that are attached.
 
-use super::{AttachedCamera, Family, HeldBy, ModeReport, Served, UseState};
+use super::{AttachedCamera, HeldBy, ModeReport, Served, UseState};
+use crate::family;
 use crate::status::{CameraState, RigStatus};
 use depthrig_drivers::ErrorKind;
 
@@ -19,7 +20,7 @@ pub(super) fn camera(served: Served, rigs: &[RigStatus]) -> AttachedCamera {
     };
     let rig = rigs.iter().find(is_used);
     let mut camera = AttachedCamera {
-        backend: Family::External.backend(),
+        backend: family::SERVED.name,
         model: "(not known)".to_owned(),
         serial: None,
         firmware: None,
@@ -37,7 +38,6 @@ pub(super) fn camera(served: Served, rigs: &[RigStatus]) -> AttachedCamera {
         modes: Vec::new(),
         problems: Vec::new(),
         usb: None,
-        family: Family::External,
         profiles: Vec::new(),
     };
     match offered {

@@ -3,9 +3,9 @@
 use super::finding::{Finding, Severity};
 use super::plan::{CameraPlan, Planned, mode_missing, no_plan, set_streams};
 use super::served;
-use crate::attached::{Attached, AttachedCamera, Family, UseState};
+use crate::attached::{Attached, AttachedCamera, UseState};
 use crate::config::{CameraConfig, RigConfig};
-use crate::family::{Offered, Selector, Source};
+use crate::family::{self, Offered, Selector, Source};
 use depthrig_drivers::usb::health::{self, RULE_CURE};
 use depthrig_drivers::{Result, StreamProfile, choose_profiles};
 
@@ -256,11 +256,11 @@ pub(super) fn check_unnamed(attached: &Attached, plans: &[CameraPlan], findings:
     if plans.iter().all(|p| p.port.is_none()) {
         return;
     }
-    // Which OAK a process will open, only that process knows.
-    let served = plans.iter().any(|p| p.backend == Family::Oak.backend());
-    let named = |c: &AttachedCamera| {
-        plans.iter().any(|p| p.port.as_deref() == Some(&*c.port)) || (served && c.family == Family::Oak)
-    };
+    // Which of them a process will open, only that process knows.
+    let may_be_served =
+        |c: &AttachedCamera| c.backend == family::SERVED.name && plans.iter().any(|p| p.backend == c.backend);
+    let named =
+        |c: &AttachedCamera| plans.iter().any(|p| p.port.as_deref() == Some(&*c.port)) || may_be_served(c);
     for c in attached.cameras.iter().filter(|c| !named(c) && c.usb.is_some()) {
         findings.push(Finding::new(
             Severity::Info,

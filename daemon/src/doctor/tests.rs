@@ -566,6 +566,7 @@ fn depth_of_a_kinect_takes_of_the_bus_what_its_raw_phases_take() {
     let report = kinect_report(&depth, &FakeAnswers::default(), |_| {});
     let load = report.cameras[0].streams[0].usb_mbit_s;
     assert!((load - 5_310_760.0 * 8.0 * 30.0 / 1e6).abs() < 0.1, "{load}");
+    assert_eq!(report.cameras[0].transfer_bytes, kinect::TRANSFERS);
 }
 
 #[test]

@@ -1,9 +1,10 @@
-//! The keys of an `external` camera. The streams of the process are checked when it offers them.
+//! Cameras that another process serves (`external`). The streams of the process are checked when it offers them.
 
-use super::{BackendConfig, CameraSettings, Family, OpenContext, Reader, Service, Source};
+use super::{BackendConfig, CameraSettings, Family, Found, Identified, OpenContext, Reader, Service, Source};
 use crate::config::value::{not_empty, resolve, shown};
 use core::time::Duration;
 use depthrig_drivers::external::{ExternalBackend, ExternalConfig, NAME, Place};
+use depthrig_drivers::usb::UsbDevice;
 use depthrig_drivers::{Backend, Result};
 use std::path::{Path, PathBuf};
 
@@ -12,13 +13,32 @@ const LONGEST_START_S: f64 = 120.0;
 /// The longest silence, seconds: a process that hangs keeps its camera from the rig for so long.
 const LONGEST_SILENCE_S: f64 = 14.0;
 
+/// OAK cameras, whose processor is a Movidius Myriad X: before its firmware is uploaded, with it, in its boot loader, and
+/// started from flash (XLink `src/pc/protocols/usb_host.cpp`, Apache-2.0).
+const MOVIDIUS: u16 = 0x03e7;
+const OAK_UNBOOTED: u16 = 0x2485;
+const OAK_BOOTED: [u16; 3] = [0xf63b, 0xf63c, 0xf63d];
+
 pub(super) const FAMILY: Family = Family {
-    name: NAME,
     has_stereo: true,
     has_ports: true,
-    read: |r| Some(BackendConfig::new(read(r))),
-    probe: None,
+    identify,
+    ..Family::new(NAME, |r| Some(BackendConfig::new(read(r))))
 };
+
+/// An OAK, which a process drives: nobody else asks it anything, because that would start its firmware.
+fn identify(d: &UsbDevice, _: &[UsbDevice]) -> Option<Identified> {
+    if d.vendor_id != MOVIDIUS {
+        return None;
+    }
+    if d.product_id == OAK_UNBOOTED {
+        return Some(Identified::Camera(Found::of("OAK, not booted", d)));
+    }
+    // Only its firmware has a serial number.
+    let idle_serial = (!d.serial.is_empty()).then(|| d.serial.clone());
+    let is_oak = OAK_BOOTED.contains(&d.product_id);
+    is_oak.then(|| Identified::Camera(Found { idle_serial, ..Found::of("OAK", d) }))
+}
 
 fn read(r: &Reader<'_>) -> ExternalConfig {
     let s = r.section;

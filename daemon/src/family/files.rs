@@ -1,4 +1,4 @@
-//! A folder of images that plays as a camera.
+//! A folder of images that plays as a camera (`files`).
 
 use super::{BackendConfig, CameraSettings, Family, Offered, OpenContext, Reader, Source};
 use crate::config::value::{not_empty, rate, resolve};
@@ -6,8 +6,7 @@ use depthrig_drivers::files::{FilesBackend, FilesConfig};
 use depthrig_drivers::{Backend, Result, StreamRequest};
 use std::path::PathBuf;
 
-pub(super) const FAMILY: Family =
-    Family { name: "files", has_stereo: false, has_ports: false, read, probe: None };
+pub(super) const FAMILY: Family = Family::new("files", read);
 
 fn read(r: &Reader<'_>) -> Option<BackendConfig> {
     let s = r.section;

@@ -1,20 +1,25 @@
-//! The keys of a `kinect` camera. Limits that only the camera knows (the range of its controls, its jacks) are checked
-//! when it is started.
+//! Azure Kinect (`kinect`), attached or recorded. Limits that only the camera knows (the range of its controls, its jacks)
+//! are checked when it is started.
+
+mod requirements;
+
+pub(crate) use requirements::Facts;
 
 use super::{
-    BackendConfig, CameraSettings, Family, Offered, OpenContext, Probe, Reader, Selector, Source, Unmet,
+    BackendConfig, CameraSettings, Family, Found, Identified, Offered, OpenContext, Probe, Reader, Selector,
+    Source, Unmet,
 };
 use crate::config::controls;
 use crate::config::read::Section;
 use crate::config::value::{not_empty, resolve, within};
 use crate::config::wanted::WantedStream;
-use crate::doctor::{Finding, Severity};
 use core::ops::RangeInclusive;
 use depthrig_drivers::kinect::live::{
-    self, CONTROLS, CURE, LiveBackend, LiveConfig, Places, STREAMS, check_libraries,
+    self, CONTROLS, LiveBackend, LiveConfig, Places, STREAMS, check_libraries, find,
 };
 use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackBackend, PlaybackConfig};
 use depthrig_drivers::kinect::{DepthMode, NAME, WiredSync};
+use depthrig_drivers::usb::UsbDevice;
 use depthrig_drivers::{Backend, Result, StreamProfile, StreamRequest};
 use std::path::{Path, PathBuf};
 
@@ -29,7 +34,35 @@ const RATES: RangeInclusive<f64> = 0.05..=20.0;
 pub(crate) const TRANSFERS: u64 = 16 << 20;
 
 pub(super) const FAMILY: Family =
-    Family { name: NAME, has_stereo: false, has_ports: true, read: |r| Some(read(r)), probe: Some(probe) };
+    Family { has_ports: true, probe: Some(probe), identify, ..Family::new(NAME, |r| Some(read(r))) };
+
+/// The halves of a Kinect are one camera, which goes by its depth half.
+fn identify(d: &UsbDevice, all: &[UsbDevice]) -> Option<Identified> {
+    if d.vendor_id != find::VENDOR {
+        return None;
+    }
+    let cameras = find::cameras(all);
+    if let Some(found) = cameras.iter().find(|k| k.depth == *d) {
+        let color = found.color.as_ref();
+        return Some(Identified::Camera(Found {
+            model: find::MODEL.to_owned(),
+            nodes: color.into_iter().flat_map(|d| d.video_nodes().cloned()).collect(),
+            serial: found.serial().map(str::to_owned),
+            problem: color.is_none().then(|| {
+                "its colour camera is not on the bus, without which libk4a does not open it: plug it in again, with its \
+                 power supply"
+                    .to_owned()
+            }),
+            ..Found::default()
+        }));
+    }
+    if cameras.iter().any(|k| k.color.as_ref() == Some(d)) {
+        return Some(Identified::Part);
+    }
+    (d.product_id == find::COLOR).then_some(Identified::Unusable(
+        "it is an Azure Kinect whose depth camera is not on the bus: plug it in again, with its power supply",
+    ))
+}
 
 fn read(r: &Reader<'_>) -> BackendConfig {
     let s = r.section;
@@ -171,47 +204,5 @@ impl CameraSettings for PlaybackConfig {
 
     fn check_input(&self) -> Result<()> {
         PlaybackBackend::new(self.clone()).discover().map(drop)
-    }
-}
-
-/// Facts about this computer that a session with an attached Kinect depends on.
-pub(crate) struct Facts {
-    /// libk4a, or why it cannot be loaded.
-    pub(crate) library: core::result::Result<(), String>,
-    /// The depth engine, or why it cannot be loaded.
-    pub(crate) engine: core::result::Result<(), String>,
-    /// Whether a stream of depth or infrared is started.
-    pub(crate) wants_depth: bool,
-    /// Whether programs of this user have a display.
-    pub(crate) has_display: bool,
-}
-
-impl Facts {
-    /// The first requirement that is not met; the later ones depend on it.
-    pub(crate) fn unmet(self) -> Option<Unmet> {
-        if let Err(what) = self.library {
-            let why = "an attached Kinect is read through it; without it the rig does not start";
-            let finding = Finding::new(Severity::Error, "kinect_library", what, why, CURE);
-            return Some(Unmet { finding, explains_failure: true });
-        }
-        let finding = match self.engine {
-            Err(what) => Finding::new(
-                Severity::Error,
-                "kinect_engine",
-                what,
-                "it makes depth of what the camera sends; without it the camera does not start",
-                CURE,
-            ),
-            Ok(()) if self.wants_depth && !self.has_display => Finding::new(
-                Severity::Warning,
-                "kinect_display",
-                "the variable DISPLAY is not set, and the Kinect's depth engine needs an X display for OpenGL",
-                "without one the camera does not start, or libk4a hangs in starting it",
-                "set DISPLAY (such as :0) to a display that this user may use, in a service as well; a computer without a \
-                 screen can run an X server on its graphics card all the same",
-            ),
-            Ok(()) => return None,
-        };
-        Some(Unmet { finding, explains_failure: false })
     }
 }

@@ -1,22 +1,41 @@
-//! The keys of an `l515` camera. The range of a control is checked by the camera when it is started.
+//! RealSense L515 (`l515`). The range of a control is checked by the camera when it is started.
 
 use super::realsense::default_streams;
-use super::{BackendConfig, CameraSettings, Family, OpenContext, Probe, Reader, Selector, Source};
+use super::{
+    BackendConfig, CameraSettings, Family, Found, Identified, ImuFiles, OpenContext, Probe, Reader, Selector,
+    Source,
+};
 use crate::config::controls;
 use depthrig_drivers::motion::IMU;
 use depthrig_drivers::realsense::l515::{L515Backend, L515Config, NAME};
+use depthrig_drivers::realsense::models::VENDOR;
 use depthrig_drivers::realsense::protocol::l515::Control;
+use depthrig_drivers::usb::UsbDevice;
 use depthrig_drivers::{Backend, Result, StreamRequest};
 
 const STREAMS: [&str; 5] = ["depth", "color", "ir", "confidence", IMU];
 
+/// L515 and its recovery mode (librealsense 2.54 `src/l500/l500-private.h`).
+const PRODUCT: u16 = 0x0b64;
+const RECOVERY: u16 = 0x0b55;
+
 pub(super) const FAMILY: Family = Family {
-    name: NAME,
-    has_stereo: false,
     has_ports: true,
-    read: |r| Some(BackendConfig::new(read(r))),
     probe: Some(probe),
+    identify,
+    imu: ImuFiles::Iio,
+    ..Family::new(NAME, |r| Some(BackendConfig::new(read(r))))
 };
+
+fn identify(d: &UsbDevice, _: &[UsbDevice]) -> Option<Identified> {
+    match (d.vendor_id, d.product_id) {
+        (VENDOR, PRODUCT) => Some(Identified::Camera(Found::of("L515", d))),
+        (VENDOR, RECOVERY) => Some(Identified::Unusable(
+            "it is in recovery mode: its firmware was lost; write it again with Intel's tools",
+        )),
+        _ => None,
+    }
+}
 
 fn read(r: &Reader<'_>) -> L515Config {
     let s = r.section;

@@ -1,14 +1,18 @@
-//! The keys of a `realsense` camera. Limits that only the camera knows (the range of its laser, its controls' names)
+//! RealSense D400 (`realsense`). Limits that only the camera knows (the range of its laser, its controls' names)
 //! are checked when it is started; the rest is checked here.
 
-use super::{BackendConfig, CameraSettings, Family, OpenContext, Probe, Reader, Selector, Source};
+use super::{
+    BackendConfig, CameraSettings, Family, Found, Identified, ImuFiles, OpenContext, Probe, Reader, Selector,
+    Source,
+};
 use crate::config::controls;
 use crate::config::value::{not_empty, resolve, shown, within};
 use depthrig_bus::StreamName;
 use depthrig_drivers::motion::IMU;
 use depthrig_drivers::realsense::config::{Emitter, MetadataWish, TransportChoice};
 use depthrig_drivers::realsense::protocol::sync::SyncMode;
-use depthrig_drivers::realsense::{NAME, RealsenseBackend, RealsenseConfig};
+use depthrig_drivers::realsense::{NAME, RealsenseBackend, RealsenseConfig, models};
+use depthrig_drivers::usb::UsbDevice;
 use depthrig_drivers::{Backend, Result, StreamRequest};
 use std::path::PathBuf;
 
@@ -36,12 +40,20 @@ const MAX_EXPOSURE_US: u32 = 200_000;
 const MAX_LASER_MW: u16 = 360;
 
 pub(super) const FAMILY: Family = Family {
-    name: NAME,
-    has_stereo: false,
     has_ports: true,
-    read: |r| Some(BackendConfig::new(read(r))),
     probe: Some(probe),
+    identify,
+    imu: ImuFiles::Iio,
+    ..Family::new(NAME, |r| Some(BackendConfig::new(read(r))))
 };
+
+fn identify(d: &UsbDevice, _: &[UsbDevice]) -> Option<Identified> {
+    if d.vendor_id != models::VENDOR {
+        return None;
+    }
+    let model = models::of_product(d.product_id).map(|m| Identified::Camera(Found::of(m.name, d)));
+    model.or_else(|| models::undriven(d.product_id).map(Identified::Unusable))
+}
 
 fn read(r: &Reader<'_>) -> RealsenseConfig {
     let s = r.section;

@@ -1,4 +1,4 @@
-//! The keys of a `synthetic` camera.
+//! Simulated cameras (`synthetic`).
 //!
 //! The driver knows the limits of its numbers, so it is the one that is asked, key by key: each value is put into an
 //! otherwise default configuration, and the driver's error is reported at the key's own line.
@@ -14,13 +14,7 @@ use depthrig_drivers::synthetic::{
 use depthrig_drivers::{Backend, Result, StreamRequest, choose_profiles};
 use std::path::PathBuf;
 
-pub(super) const FAMILY: Family = Family {
-    name: "synthetic",
-    has_stereo: false,
-    has_ports: false,
-    read: |r| Some(BackendConfig::new(read(r))),
-    probe: None,
-};
+pub(super) const FAMILY: Family = Family::new("synthetic", |r| Some(BackendConfig::new(read(r))));
 
 fn read(r: &Reader<'_>) -> SyntheticConfig {
     let s = r.section;

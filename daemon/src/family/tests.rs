@@ -18,8 +18,7 @@ struct Toy {
     rate_hz: f64,
 }
 
-const TOY: Family =
-    Family { name: "toy", has_stereo: false, has_ports: false, read: |r| Some(read(r)), probe: None };
+const TOY: Family = Family::new("toy", |r| Some(read(r)));
 
 fn read(r: &Reader<'_>) -> BackendConfig {
     let table = r.section.table("spring", "[camera.spring]");

@@ -1,9 +1,12 @@
-//! The keys of a `v4l2` camera.
+//! Cameras at the kernel's video nodes (`v4l2`).
 
-use super::{BackendConfig, CameraSettings, Family, OpenContext, Probe, Selector, Source};
+use super::{
+    BackendConfig, CameraSettings, Family, Found, Identified, OpenContext, Probe, Selector, Source, is_video,
+};
 use crate::config::read::{Located, Section};
 use crate::config::value::within;
 use depthrig_bus::{Distortion, Intrinsics, StreamName};
+use depthrig_drivers::usb::UsbDevice;
 use depthrig_drivers::v4l2::{
     BUFFERS, ClockChoice, ControlValue, GivenIntrinsics, MemoryChoice, MjpegChoice, V4l2Backend, V4l2Config,
 };
@@ -15,12 +18,16 @@ const MJPEG: [(&str, MjpegChoice); 2] = [("decode", MjpegChoice::Decode), ("keep
 const CLOCK: [(&str, ClockChoice); 2] = [("auto", ClockChoice::Auto), ("kernel", ClockChoice::Kernel)];
 
 pub(super) const FAMILY: Family = Family {
-    name: "v4l2",
-    has_stereo: false,
     has_ports: true,
-    read: |r| Some(BackendConfig::new(read(r.section))),
     probe: Some(probe),
+    identify,
+    ..Family::new("v4l2", |r| Some(BackendConfig::new(read(r.section))))
 };
+
+fn identify(d: &UsbDevice, _: &[UsbDevice]) -> Option<Identified> {
+    let name = if d.product.is_empty() { d.id() } else { d.product.clone() };
+    is_video(d).then(|| Identified::Generic(Found::of(name, d)))
+}
 
 fn read(s: &Section<'_, '_>) -> V4l2Config {
     let d = V4l2Config::default();

@@ -1,11 +1,15 @@
-//! The keys of a `zed` camera: one that is attached, or a recording of one (`input`). Limits that only the camera knows
+//! ZED (`zed`): one that is attached, or a recording of one (`input`). Limits that only the camera knows
 //! (its modes, its controls) are checked when it is started.
 
-use super::{BackendConfig, CameraSettings, Family, Offered, OpenContext, Probe, Reader, Selector, Source};
+use super::{
+    BackendConfig, CameraSettings, Family, Found, Identified, ImuFiles, Offered, OpenContext, Probe, Reader,
+    Selector, Source, hidraw,
+};
 use crate::config::read::Section;
 use crate::config::value::{not_empty, rate, resolve, within};
 use crate::config::{controls, stereo};
 use depthrig_drivers::motion::IMU;
+use depthrig_drivers::usb::UsbDevice;
 use depthrig_drivers::zed::replay::{ZedPlaybackBackend, ZedPlaybackConfig};
 use depthrig_drivers::zed::{CalibrationFile, STREAMS, ZedBackend, ZedConfig};
 use depthrig_drivers::{Backend, Result, StreamRequest};
@@ -15,8 +19,36 @@ use std::path::PathBuf;
 const LIVE_KEYS: [&str; 7] =
     ["port", "auto_exposure", "exposure_percent", "gain_percent", "led", "controls", "motion"];
 
-pub(super) const FAMILY: Family =
-    Family { name: "zed", has_stereo: true, has_ports: true, read: |r| Some(read(r)), probe: Some(probe) };
+const STEREOLABS: u16 = 0x2b03;
+/// ZED 2i: camera, and the inertial sensor that hangs beside it on one hub (zed-open-capture `include/defines.hpp`).
+const CAMERA: u16 = 0xf880;
+const SENSORS: u16 = 0xf881;
+
+pub(super) const FAMILY: Family = Family {
+    has_stereo: true,
+    has_ports: true,
+    probe: Some(probe),
+    identify,
+    imu: ImuFiles::Hidraw,
+    ..Family::new("zed", |r| Some(read(r)))
+};
+
+fn identify(d: &UsbDevice, all: &[UsbDevice]) -> Option<Identified> {
+    if (d.vendor_id, d.product_id) != (STEREOLABS, CAMERA) {
+        return None;
+    }
+    let hub = |port: &str| port.rsplit_once('.').map(|(hub, _)| without_bus(hub).to_owned());
+    // The hub is one for USB2 and one for USB3, of the same ports below their buses.
+    let beside = |other: &&UsbDevice| {
+        (other.vendor_id, other.product_id) == (STEREOLABS, SENSORS) && hub(&other.port) == hub(&d.port)
+    };
+    let nodes = all.iter().filter(beside).chain([d]).flat_map(hidraw).collect();
+    Some(Identified::Camera(Found { hidraw: nodes, ..Found::of("ZED 2i", d) }))
+}
+
+fn without_bus(port: &str) -> &str {
+    port.split_once('-').map_or(port, |(_, ports)| ports)
+}
 
 fn read(r: &Reader<'_>) -> BackendConfig {
     let s = r.section;

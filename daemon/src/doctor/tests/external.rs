@@ -1,7 +1,8 @@
 //! The doctor's findings about cameras that other processes serve.
 
 use super::*;
-use crate::attached::{Ask, Family, NodeFacts, Served};
+use crate::attached::{Ask, NodeFacts, Served};
+use crate::family::Family;
 use crate::status::RigStatus;
 use core::cell::Cell;
 use depthrig_bus::{Name, RuntimeDir};
@@ -25,7 +26,7 @@ impl Ask for Asked {
     fn node(&self, _: &Path) -> Result<NodeFacts> {
         unreachable!("there is no node")
     }
-    fn device(&self, _: Family, _: &str) -> Option<Result<(DeviceInfo, Vec<StreamProfile>)>> {
+    fn device(&self, _: &Family, _: &str) -> Option<Result<(DeviceInfo, Vec<StreamProfile>)>> {
         None
     }
     fn served(&self) -> Vec<Served> {
