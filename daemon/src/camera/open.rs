@@ -116,7 +116,7 @@ fn open_refinement(camera: &Camera, shared: &Shared, info: &DeviceInfo) -> Resul
 
 /// The driver of a camera.
 fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {
-    let backend = camera.config.backend.backend(&OpenContext {
+    let backend = camera.config.backend.driver(&OpenContext {
         runtime: shared.bus.runtime(),
         rig: shared.bus.rig(),
         camera: &camera.config.name,

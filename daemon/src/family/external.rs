@@ -77,7 +77,7 @@ impl CameraSettings for ExternalConfig {
         FAMILY.name
     }
 
-    fn backend(&self, context: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+    fn driver(&self, context: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
         let place = Place {
             runtime: context.runtime.clone(),
             rig: context.rig.clone(),

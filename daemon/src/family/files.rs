@@ -24,7 +24,7 @@ impl CameraSettings for FilesConfig {
         FAMILY.name
     }
 
-    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+    fn driver(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
         Ok(Box::new(FilesBackend::new(self.clone())))
     }
 

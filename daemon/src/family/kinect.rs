@@ -150,7 +150,7 @@ impl CameraSettings for LiveConfig {
         FAMILY.name
     }
 
-    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+    fn driver(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
         Ok(Box::new(LiveBackend::new(self.clone())))
     }
 
@@ -167,17 +167,11 @@ impl CameraSettings for LiveConfig {
     fn unmet(&self, streams: &[StreamRequest]) -> Vec<Unmet> {
         let is_set = |variable: &str| std::env::var_os(variable).is_some_and(|v| !v.is_empty());
         let wants_depth = streams.is_empty() || streams.iter().any(|s| s.stream.as_str() != "color");
-        let facts = Facts {
-            // Libraries are loaded, as they would be by the session.
-            library: check_libraries(&self.places, false).map(drop).map_err(|e| e.to_string()),
-            engine: if wants_depth {
-                check_libraries(&self.places, true).map(drop).map_err(|e| e.to_string())
-            } else {
-                Ok(())
-            },
-            wants_depth,
-            has_display: is_set("DISPLAY"),
-        };
+        // Libraries are loaded, as they would be by the session.
+        let load = |engine| check_libraries(&self.places, engine).map(drop).map_err(|e| e.to_string());
+        let library = load(false);
+        let engine = if wants_depth && library.is_ok() { load(true) } else { Ok(()) };
+        let facts = Facts { library, engine, wants_depth, has_display: is_set("DISPLAY") };
         facts.unmet().into_iter().collect()
     }
 }
@@ -187,7 +181,7 @@ impl CameraSettings for PlaybackConfig {
         FAMILY.name
     }
 
-    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+    fn driver(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
         Ok(Box::new(PlaybackBackend::new(self.clone())))
     }
 

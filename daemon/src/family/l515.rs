@@ -79,7 +79,7 @@ impl CameraSettings for L515Config {
         FAMILY.name
     }
 
-    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+    fn driver(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
         Ok(Box::new(L515Backend::new(self.clone())))
     }
 

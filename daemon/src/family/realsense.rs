@@ -139,7 +139,7 @@ impl CameraSettings for RealsenseConfig {
         FAMILY.name
     }
 
-    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+    fn driver(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
         Ok(Box::new(RealsenseBackend::new(self.clone())))
     }
 

@@ -22,7 +22,7 @@ pub trait CameraSettings: AnySettings {
     ///
     /// # Errors
     /// Those of settings that the driver refuses.
-    fn backend(&self, context: &OpenContext<'_>) -> Result<Box<dyn Backend>>;
+    fn driver(&self, context: &OpenContext<'_>) -> Result<Box<dyn Backend>>;
 
     /// Returns where the frames come from. Opens files, but no device.
     fn source(&self) -> Source<'_>;

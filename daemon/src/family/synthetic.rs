@@ -165,7 +165,7 @@ impl CameraSettings for SyntheticConfig {
         FAMILY.name
     }
 
-    fn backend(&self, context: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+    fn driver(&self, context: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
         let backend = SyntheticBackend::with_drawing(vec![self.clone()], context.began, context.drawing)?;
         Ok(Box::new(backend))
     }

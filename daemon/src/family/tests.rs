@@ -47,7 +47,7 @@ impl CameraSettings for Toy {
         TOY.name
     }
 
-    fn backend(&self, context: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+    fn driver(&self, context: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
         Ok(Box::new(SyntheticBackend::with_drawing(vec![self.inside()], context.began, None)?))
     }
 
@@ -109,7 +109,7 @@ fn a_new_family_delivers_frames() {
     let home = tempfile::tempdir().unwrap();
     let rig = parse("").unwrap();
     let camera = &rig.cameras[0];
-    let backend = camera.backend.backend(&OpenContext {
+    let backend = camera.backend.driver(&OpenContext {
         runtime: &RuntimeDir::at(home.path()).unwrap(),
         rig: &rig.rig,
         camera: &camera.name,

@@ -152,7 +152,7 @@ impl CameraSettings for V4l2Config {
         FAMILY.name
     }
 
-    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+    fn driver(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
         Ok(Box::new(V4l2Backend::new(self.clone())))
     }
 

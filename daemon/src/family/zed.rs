@@ -127,7 +127,7 @@ impl CameraSettings for ZedConfig {
         FAMILY.name
     }
 
-    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+    fn driver(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
         Ok(Box::new(ZedBackend::new(self.clone())))
     }
 
@@ -143,7 +143,7 @@ impl CameraSettings for ZedPlaybackConfig {
         FAMILY.name
     }
 
-    fn backend(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
+    fn driver(&self, _: &OpenContext<'_>) -> Result<Box<dyn Backend>> {
         Ok(Box::new(ZedPlaybackBackend::new(self.clone())))
     }
 
