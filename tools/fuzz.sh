@@ -31,6 +31,7 @@ done
 binaries=target/$(rustc -vV | sed -n 's/host: //p')/release
 
 mkdir -p logs
+../tools/corpus.py unpack "${targets[@]}"
 if [ "$mode" = keep ]; then
     for target in "${targets[@]}"; do
         merged=$(mktemp --directory)
@@ -43,7 +44,7 @@ if [ "$mode" = keep ]; then
             [ "$total" -gt "$KEEP_BYTES" ] && break
             cmp --silent "$file" "corpus/$target"/seed_* 2>/dev/null || cp "$file" "corpus/$target/"
         done < <(find "$merged" -type f -printf '%s %p\n' | sort -n)
-        echo "$target: $(find "corpus/$target" -type f | wc -l) inputs, $(du -sb "corpus/$target" | cut -f1) bytes"
+        ../tools/corpus.py pack "$target"
         rm -r "$merged"
     done
     exit 0

@@ -39,19 +39,17 @@ pub fn record(bytes: &[u8]) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::path::Path;
+    use depthrig_corpus::inputs;
 
     /// Runs every input that is kept for a target, and sees that the seeds still reach what they were made for.
     fn run(target: &str, reached: impl Fn(&[u8]) -> usize, at_least: usize) {
-        let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus").join(target);
         let mut seeds = 0;
-        for entry in std::fs::read_dir(&dir).unwrap_or_else(|e| panic!("{}: {e}", dir.display())) {
-            let path = entry.unwrap().path();
-            println!("{}", path.display());
-            let far = reached(&std::fs::read(&path).unwrap());
-            if path.file_name().is_some_and(|n| n.to_string_lossy().starts_with("seed_")) {
+        for input in inputs(target) {
+            println!("{target}/{}", input.name);
+            let far = reached(&input.bytes);
+            if input.is_seed() {
                 seeds += 1;
-                assert!(far >= at_least, "{} reaches {far}: make the seeds anew", path.display());
+                assert!(far >= at_least, "{target}/{} reaches {far}: write the seeds again", input.name);
             }
         }
         assert!(seeds > 0, "{target} has no seeds");
@@ -63,8 +61,8 @@ mod tests {
         run("cdm_pickle", pickle, 20);
         run("cdm_record", |bytes| usize::from(record(bytes)), 1);
         // In the archive the storages are larger than the 64 bytes here; these fit.
-        let halves = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus/cdm_pickle/seed_halves");
-        assert_eq!(checkpoint(&std::fs::read(halves).unwrap()), 3);
+        let halves = inputs("cdm_pickle").into_iter().find(|i| i.name == "seed_halves").unwrap();
+        assert_eq!(checkpoint(&halves.bytes), 3);
         run("cdm_pickle", checkpoint, 0);
     }
 }

@@ -2,9 +2,9 @@
 //! mended.
 #![allow(clippy::unwrap_used)]
 
+use depthrig_corpus::inputs;
 use depthrig_drivers::fuzzing::{external, kinect, realsense};
 use depthrig_drivers::zed;
-use std::path::{Path, PathBuf};
 
 /// Changes an input by up to four bytes, by cutting it, or by repeating a part of it.
 fn mutated(bytes: &[u8], mut seed: u64) -> Vec<u8> {
@@ -37,23 +37,16 @@ fn mutations() -> u64 {
 
 /// Runs each input that is kept for `target`, and sees that the seeds still reach what they were made for.
 fn run(target: &str, reached: impl Fn(&[u8]) -> u64) {
-    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus").join(target);
-    let mut paths: Vec<PathBuf> = std::fs::read_dir(&dir)
-        .unwrap_or_else(|e| panic!("{}: {e}", dir.display()))
-        .map(|e| e.unwrap().path())
-        .collect();
-    paths.sort();
     let mut seeds = 0;
-    for path in &paths {
-        println!("{}", path.display());
-        let bytes = std::fs::read(path).unwrap();
-        let far = reached(&bytes);
+    for input in inputs(target) {
+        println!("{target}/{}", input.name);
+        let far = reached(&input.bytes);
         for n in 1..=mutations() {
-            reached(&mutated(&bytes, n.wrapping_mul(0x9E37_79B9_7F4A_7C15)));
+            reached(&mutated(&input.bytes, n.wrapping_mul(0x9E37_79B9_7F4A_7C15)));
         }
-        if path.file_name().unwrap().to_string_lossy().starts_with("seed_") {
+        if input.is_seed() {
             seeds += 1;
-            assert!(far > 0, "{} reaches nothing: make the seeds anew", path.display());
+            assert!(far > 0, "{target}/{} reaches nothing: write the seeds again", input.name);
         }
     }
     assert!(seeds > 0, "{target} has no seeds");

@@ -81,13 +81,11 @@ pub fn probe(bytes: &[u8]) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::path::Path;
 
     fn run(target: &str, fuzz: fn(&[u8]) -> u64, at_least: u64) {
-        let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus").join(target);
-        let files: Vec<_> = std::fs::read_dir(&dir).unwrap().map(|e| e.unwrap().path()).collect();
-        let reached: u64 = files.iter().map(|f| fuzz(&std::fs::read(f).unwrap())).sum();
-        assert!(reached >= at_least, "{target}: {} inputs reach {reached}", files.len());
+        let inputs = depthrig_corpus::inputs(target);
+        let reached: u64 = inputs.iter().map(|input| fuzz(&input.bytes)).sum();
+        assert!(reached >= at_least, "{target}: {} inputs reach {reached}", inputs.len());
     }
 
     #[test]

@@ -41,27 +41,16 @@ pub fn conf(bytes: &[u8]) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use std::path::Path;
-
-    fn corpus() -> Vec<(String, Vec<u8>)> {
-        let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus/zed_conf");
-        let mut found: Vec<_> = std::fs::read_dir(&dir)
-            .unwrap()
-            .map(|e| e.unwrap().path())
-            .map(|p| (p.file_name().unwrap().to_string_lossy().into_owned(), std::fs::read(p).unwrap()))
-            .collect();
-        found.sort();
-        found
-    }
+    use depthrig_corpus::inputs;
 
     #[test]
     fn the_corpus_is_read_or_refused() {
         let mut seeds = 0;
-        for (name, bytes) in corpus() {
-            let is_one = super::conf(&bytes);
-            if name.starts_with("seed_") {
+        for input in inputs("zed_conf") {
+            let is_one = super::conf(&input.bytes);
+            if input.is_seed() {
                 seeds += 1;
-                assert!(is_one, "{name} is no longer a valid calibration");
+                assert!(is_one, "{} is no longer a valid calibration", input.name);
             }
         }
         assert!(seeds >= 3, "{seeds} seeds");
@@ -91,7 +80,7 @@ mod tests {
     #[test]
     fn spoilt_files_are_read_or_refused() {
         let rounds = if std::env::var_os("DEPTHRIG_LONG").is_some() { 2_000_000 } else { 20_000 };
-        let seeds = corpus();
+        let seeds = inputs("zed_conf");
         let mut x = 0x2545_F491_4F6C_DD1D_u64;
         let mut random = |below: usize| {
             x ^= x << 13;
@@ -101,7 +90,7 @@ mod tests {
         };
         let mut still_good = 0;
         for _ in 0..rounds {
-            let mut bytes = seeds[random(seeds.len())].1.clone();
+            let mut bytes = seeds[random(seeds.len())].bytes.clone();
             for _ in 0..=random(4) {
                 let at = random(bytes.len() + 1);
                 let end = (at + random(24)).min(bytes.len());

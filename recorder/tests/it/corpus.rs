@@ -1,20 +1,8 @@
 //! The corpus of the fuzz targets as tests: inputs that a fuzzer once found interesting or that failed keep passing.
 
+use depthrig_corpus::inputs;
 use depthrig_recorder::fuzzing;
 use proptest::prelude::*;
-use std::path::{Path, PathBuf};
-
-/// Every input that is kept for a target, with its name.
-fn corpus(target: &str) -> Vec<(String, Vec<u8>)> {
-    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus").join(target);
-    let mut paths: Vec<PathBuf> = std::fs::read_dir(&dir)
-        .unwrap_or_else(|e| panic!("{}: {e}", dir.display()))
-        .map(|e| e.unwrap().path())
-        .collect();
-    paths.sort();
-    let name = |p: &Path| p.file_name().unwrap().to_string_lossy().into_owned();
-    paths.iter().map(|p| (name(p), std::fs::read(p).unwrap())).collect()
-}
 
 /// Runs each input, and checks that the seeds still reach the code that they were written for.
 fn run<T: PartialOrd + Copy + std::fmt::Debug>(
@@ -22,14 +10,17 @@ fn run<T: PartialOrd + Copy + std::fmt::Debug>(
     reached: impl Fn(&[u8]) -> T,
     seeds_reach_more_than: T,
 ) {
-    let inputs = corpus(target);
     let mut seeds = 0;
-    for (name, bytes) in &inputs {
-        println!("{target}/{name}");
-        let far = reached(bytes);
-        if name.starts_with("seed_") {
+    for input in inputs(target) {
+        println!("{target}/{}", input.name);
+        let far = reached(&input.bytes);
+        if input.is_seed() {
             seeds += 1;
-            assert!(far > seeds_reach_more_than, "{target}/{name} reaches {far:?}: rebuild the seeds");
+            assert!(
+                far > seeds_reach_more_than,
+                "{target}/{} reaches {far:?}: write the seeds again",
+                input.name
+            );
         }
     }
     assert!(seeds > 0, "{target} has no seeds");
@@ -43,9 +34,9 @@ fn segments() {
 #[test]
 fn recovered_segments() {
     run("recover", fuzzing::recover, 1);
-    for (name, bytes) in corpus("segment") {
-        println!("segment/{name}");
-        fuzzing::recover(&bytes);
+    for input in inputs("segment") {
+        println!("segment/{}", input.name);
+        fuzzing::recover(&input.bytes);
     }
 }
 
@@ -118,8 +109,8 @@ proptest! {
     /// Fuzzing in short, with the same mutations: on any computer, without the tools.
     #[test]
     fn damaged_segments_end_in_errors(seeds in proptest::collection::vec(any::<u64>(), 1..4), file in any::<usize>()) {
-        let all = corpus("segment");
-        let mut bytes = all[file % all.len()].1.clone();
+        let all = inputs("segment");
+        let mut bytes = all[file % all.len()].bytes.clone();
         for seed in seeds {
             let mut plain = |b: &[u8]| change(b, seed);
             bytes = fuzzing::mcap::mutate(&bytes, seed, &mut plain).unwrap_or_else(|| change(&bytes, seed));
@@ -132,7 +123,7 @@ proptest! {
 /// The mutations are effective: many leave readable sets, and the checksums are corrected.
 #[test]
 fn mutations_get_behind_the_checksums() {
-    let (_, seed) = corpus("segment").into_iter().find(|(name, _)| name == "seed_jpeg").unwrap();
+    let seed = inputs("segment").into_iter().find(|input| input.name == "seed_jpeg").unwrap().bytes;
     let whole = fuzzing::segment(&seed);
     let mut broken_sets = 0;
     for n in 0..200 {
