@@ -30,6 +30,7 @@ pub mod fs;
 #[doc(hidden)]
 pub mod fuzzing;
 mod msgs;
+pub mod npy;
 mod options;
 mod outside;
 mod recorder;
@@ -74,7 +75,7 @@ pub use session::{
     SessionChanges, StreamRecord, check_name, edit, rename,
 };
 pub use slice::{SliceOptions, SliceProgress, SliceReport, merge, trim};
-pub use still::{StillFormat, npy_file, still};
+pub use still::{StillFormat, still};
 pub use verify::{
     Finding, Severity, VerifyOptions, VerifyProgress, VerifyReport, verify, verify_watched, verify_with,
 };

@@ -1,11 +1,7 @@
 //! One image as a file: PNG, NPY, or the JPEG as it is stored.
-//!
-//! NPY is written here and not by a crate: its head is one short line of text, while the maintained crates
-//! (`npyz`, `ndarray-npy`) bring about thirty others and 20 s of CPU per clean build, because they also read it.
-//! The tests read the files with NumPy.
 
 use crate::dataset::{DatasetFrame, jpeg_pixels};
-use crate::{Error, ErrorKind, Result};
+use crate::{Error, ErrorKind, Result, npy};
 use depthrig_bus::{FrameHeader, PixelFormat};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
@@ -73,7 +69,7 @@ pub(crate) fn encode(
     }
     match form {
         StillFormat::Png => png(h, format, pixels),
-        StillFormat::Npy => Ok(npy(h, format, pixels)),
+        StillFormat::Npy => Ok(array(h, format, pixels)),
         StillFormat::Jpeg => Err(refused(h, "is not written as a JPEG, that would lose bits")),
     }
 }
@@ -114,7 +110,7 @@ fn png(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Result<Vec<u8>> {
 }
 
 /// The pixels of a frame as a NumPy array.
-fn npy(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Vec<u8> {
+fn array(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Vec<u8> {
     let height = h.height as usize;
     let width = h.width as usize;
     let kind = match format {
@@ -123,44 +119,12 @@ fn npy(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Vec<u8> {
         _ => "|u1",
     };
     match format {
-        PixelFormat::Rgb8 | PixelFormat::Bgr8 => npy_file(kind, &[height, width, 3], pixels),
-        PixelFormat::Yuyv | PixelFormat::Uyvy => npy_file(kind, &[height, width, 2], pixels),
+        PixelFormat::Rgb8 | PixelFormat::Bgr8 => npy::file(kind, &[height, width, 3], pixels),
+        PixelFormat::Yuyv | PixelFormat::Uyvy => npy::file(kind, &[height, width, 2], pixels),
         // The rows of both planes: all of Y, then half as many of U and V in turns.
-        PixelFormat::Nv12 => npy_file(kind, &[pixels.len() / width.max(1), width], pixels),
-        _ => npy_file(kind, &[height, width], pixels),
+        PixelFormat::Nv12 => npy::file(kind, &[pixels.len() / width.max(1), width], pixels),
+        _ => npy::file(kind, &[height, width], pixels),
     }
-}
-
-/// An NPY file (form 1.0) of an array of two or more dimensions, row-major; `kind` is NumPy's name of its numbers, such
-/// as `<f4` for 32-bit floats. <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>.
-pub fn npy_file(kind: &str, shape: &[usize], data: &[u8]) -> Vec<u8> {
-    let shape: Vec<_> = shape.iter().map(ToString::to_string).collect();
-    let mut out = npy_head(&format!("'{kind}'"), &shape.join(", "));
-    out.extend_from_slice(data);
-    out
-}
-
-/// The head of an NPY file of `n` records; `fields` are their names, NumPy's name of their numbers, and how many of
-/// them. The records follow without padding.
-pub(crate) fn npy_records(fields: &[(&str, &str, usize)], n: u64) -> Vec<u8> {
-    let fields = fields.iter().map(|(name, kind, count)| match count {
-        1 => format!("('{name}', '{kind}')"),
-        n => format!("('{name}', '{kind}', ({n},))"),
-    });
-    npy_head(&format!("[{}]", fields.collect::<Vec<_>>().join(", ")), &format!("{n},"))
-}
-
-fn npy_head(descr: &str, shape: &str) -> Vec<u8> {
-    let mut text = format!("{{'descr': {descr}, 'fortran_order': False, 'shape': ({shape}), }}");
-    // Magic, version and length are ten bytes; the data begins at a multiple of 64, after a newline.
-    let padding = (64 - (10 + text.len() + 1) % 64) % 64;
-    text.extend(std::iter::repeat_n(' ', padding));
-    text.push('\n');
-    let mut out = Vec::with_capacity(10 + text.len());
-    out.extend_from_slice(b"\x93NUMPY\x01\x00");
-    out.extend_from_slice(&(text.len() as u16).to_le_bytes());
-    out.extend_from_slice(text.as_bytes());
-    out
 }
 
 /// The rows without padding.

@@ -3,7 +3,7 @@
 use super::{FramesDone, LINES, SetChoice, new_folder};
 use crate::dataset::{Dataset, DatasetSet, PixelMode, SetReader};
 use crate::fs::{self, Fs, WriteFile};
-use crate::still::npy_records;
+use crate::npy;
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{MOTION_FIELDS, MotionSample, StreamId};
 use serde::Serialize;
@@ -220,7 +220,7 @@ pub fn export_motion(
             // The length stands at the head: they are counted first.
             MotionForm::Npy => {
                 let n = chosen.walk(&mut |_, _| Ok(ControlFlow::Continue(())))?.frames;
-                file.put(&npy_records(&columns(), n))?;
+                file.put(&npy::records(&columns(), n))?;
             }
         }
         let before = total.frames;

@@ -47,7 +47,7 @@ pub(crate) mod fuzzing {
     }
 
     use super::calibration::Calibration;
-    use super::images::{Want, npy as array, read};
+    use super::images::{Want, array, read};
 
     /// Whether a `calibration.json` is one; what it says of the files is used on a small one.
     pub(crate) fn calibration(text: &[u8]) -> bool {
@@ -68,12 +68,16 @@ pub(crate) mod fuzzing {
 
     /// Whether an NPY file is an array that can be imported; an image has the size that the array has.
     pub(crate) fn npy(bytes: &[u8]) -> bool {
-        let Ok((_, shape, _)) = array(bytes) else {
+        let Ok(array) = array(bytes) else {
             assert!(read(bytes, "npy", Want::Metres).is_err(), "an image from no array");
             return false;
         };
         if let Ok(image) = read(bytes, "npy", Want::Metres) {
-            assert_eq!([image.height, image.width], shape[..], "an image of another size");
+            assert_eq!(
+                [image.height as usize, image.width as usize],
+                array.shape[..],
+                "an image of another size"
+            );
             let size = image.format.frame_bytes(image.width, image.height);
             assert_eq!(image.pixels.len(), size, "pixels of another size");
         }

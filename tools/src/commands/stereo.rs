@@ -285,7 +285,7 @@ fn form(path: &Path) -> Result<bool> {
 
 fn npy(map: &DisparityMap) -> Vec<u8> {
     let data: Vec<_> = map.disparity.iter().flat_map(|d| d.to_le_bytes()).collect();
-    depthrig_recorder::npy_file("<f4", &[map.height, map.width], &data)
+    depthrig_recorder::npy::file("<f4", &[map.height, map.width], &data)
 }
 
 /// Encodes disparity times 256 as 16 bits; a disparity that rounds to 0 becomes 1, because 0 means unknown.

@@ -2,6 +2,7 @@
 
 use anyhow::{Context, Result, bail};
 use depthrig_bus::files;
+use depthrig_recorder::npy::{self, Array};
 use std::path::Path;
 
 /// The largest side of an image that is read.
@@ -67,28 +68,8 @@ fn tiff(bytes: &[u8], unit_m: f64) -> Result<Metres> {
     Ok(Metres { width, height, pixels })
 }
 
-/// <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>.
 fn npy(bytes: &[u8], unit_m: f64) -> Result<Metres> {
-    let rest = bytes.strip_prefix(b"\x93NUMPY").context("not an NPY file")?;
-    let (len, rest) = match rest {
-        [1, _, a, b, rest @ ..] => (usize::from(u16::from_le_bytes([*a, *b])), rest),
-        [2 | 3, _, a, b, c, d, rest @ ..] => (u32::from_le_bytes([*a, *b, *c, *d]) as usize, rest),
-        _ => bail!("unsupported version of NPY"),
-    };
-    let (head, data) = rest.split_at_checked(len).context("its head is cut off")?;
-    let head = core::str::from_utf8(head).context("invalid NPY header: not text")?;
-    let value = |key: &str| {
-        let at = head.find(&format!("'{key}'"))? + key.len() + 2;
-        Some(head[at..].trim_start().strip_prefix(':')?.trim_start())
-    };
-    let kind = value("descr").and_then(|v| v.strip_prefix('\'')?.split_once('\'')).map(|(kind, _)| kind);
-    if !value("fortran_order").is_some_and(|v| v.starts_with("False")) {
-        bail!("it is stored column by column; save it with np.ascontiguousarray");
-    }
-    let shape = value("shape").and_then(|v| v.strip_prefix('(')?.split_once(')')).map(|(shape, _)| shape);
-    let shape = shape.context("its head has no shape")?.split(',').map(str::trim).filter(|n| !n.is_empty());
-    let shape: Vec<usize> =
-        shape.map(str::parse).collect::<Result<_, _>>().context("invalid NPY header: invalid shape")?;
+    let Array { kind, shape, data } = npy::read(bytes).map_err(anyhow::Error::msg)?;
     let ([height, width]
     | [1, height, width]
     | [height, width, 1]
@@ -100,16 +81,13 @@ fn npy(bytes: &[u8], unit_m: f64) -> Result<Metres> {
     if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
         bail!("unsupported shape {shape:?}; an image has two dimensions");
     }
-    let pixels: Vec<f32> = match kind {
-        Some("<u2") => units(data.as_chunks::<2>().0.iter().map(|b| u16::from_le_bytes(*b)), unit_m),
-        Some("<f2") => data.as_chunks::<2>().0.iter().map(|b| half(u16::from_le_bytes(*b))).collect(),
-        Some("<f4") => data.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect(),
-        Some("<f8") => data.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b) as f32).collect(),
-        other => bail!("its numbers are {other:?}; <u2, <f2, <f4 and <f8 can be read"),
+    let pixels = match kind {
+        "<u2" => units(data.as_chunks::<2>().0.iter().map(|b| u16::from_le_bytes(*b)), unit_m),
+        "<f2" => data.as_chunks::<2>().0.iter().map(|b| half(u16::from_le_bytes(*b))).collect(),
+        "<f4" => data.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect(),
+        "<f8" => data.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b) as f32).collect(),
+        other => bail!("its numbers are {other}; <u2, <f2, <f4 and <f8 can be read"),
     };
-    if pixels.len() != width * height {
-        bail!("shape {shape:?} does not fit its {} bytes", data.len());
-    }
     Ok(Metres { width, height, pixels })
 }
 
@@ -130,39 +108,31 @@ fn half(bits: u16) -> f32 {
 mod tests {
     use super::*;
 
-    fn array(kind: &str, shape: &str, data: &[u8]) -> Vec<u8> {
-        let head = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n");
-        let mut out = b"\x93NUMPY\x01\x00".to_vec();
-        out.extend((head.len() as u16).to_le_bytes());
-        out.extend(head.as_bytes());
-        out.extend(data);
-        out
-    }
-
     #[test]
     fn arrays_of_every_kind() {
         let metres = [0.5f32, 1.0, 0.0, 2.0];
-        let of = |kind: &str, shape: &str, data: Vec<u8>| npy(&array(kind, shape, &data), 0.001).unwrap();
+        let of =
+            |kind: &str, shape: &[usize], data: Vec<u8>| npy(&npy::file(kind, shape, &data), 0.001).unwrap();
         let f4 = metres.iter().flat_map(|v| v.to_le_bytes()).collect();
-        assert_eq!(of("<f4", "(2, 2)", f4), Metres { width: 2, height: 2, pixels: metres.to_vec() });
+        assert_eq!(of("<f4", &[2, 2], f4), Metres { width: 2, height: 2, pixels: metres.to_vec() });
         let f8 = metres.iter().flat_map(|v| f64::from(*v).to_le_bytes()).collect();
-        assert_eq!(of("<f8", "(1, 1, 4)", f8).pixels, metres);
+        assert_eq!(of("<f8", &[1, 1, 4], f8).pixels, metres);
         let f2 = [0x3800u16, 0x3c00, 0, 0x4000].iter().flat_map(|v| v.to_le_bytes()).collect();
-        assert_eq!(of("<f2", "(4, 1, 1)", f2).pixels, metres);
+        assert_eq!(of("<f2", &[4, 1, 1], f2).pixels, metres);
         let u2 = [500u16, 1000, 65535, 2000].iter().flat_map(|v| v.to_le_bytes()).collect();
-        assert_eq!(of("<u2", "(1, 4)", u2).pixels, metres);
+        assert_eq!(of("<u2", &[1, 4], u2).pixels, metres);
     }
 
     #[test]
     fn what_is_no_image_is_refused() {
         for (kind, shape, n) in [
-            ("<f4", "(2, 2)", 15),
-            ("<f4", "(2, 2, 3)", 48),
-            ("|u1", "(2, 2)", 4),
-            ("<f4", "(0, 2)", 0),
-            ("<f4", "(9999999, 9999999)", 4),
+            ("<f4", &[2, 2][..], 15),
+            ("<f4", &[2, 2, 3], 48),
+            ("|u1", &[2, 2], 4),
+            ("<f4", &[0, 2], 0),
+            ("<f4", &[9_999_999, 9_999_999], 4),
         ] {
-            assert!(npy(&array(kind, shape, &vec![0; n]), 0.001).is_err(), "{kind} {shape} {n}");
+            assert!(npy(&npy::file(kind, shape, &vec![0; n]), 0.001).is_err(), "{kind} {shape:?} {n}");
         }
         for bytes in [&b""[..], b"\x93NUMPY", b"\x93NUMPY\x01\x00\xff\xff{"] {
             assert!(npy(bytes, 0.001).is_err() && png(bytes, 0.001).is_err() && tiff(bytes, 0.001).is_err());

@@ -1,5 +1,6 @@
 //! Image files of the layout become pixels. The size is checked before memory is taken for it.
 
+use crate::npy::{self, Array};
 use depthrig_bus::PixelFormat;
 use image::codecs::png::PngDecoder;
 use image::{ColorType, ImageDecoder};
@@ -89,9 +90,9 @@ fn png(bytes: &[u8], want: Want) -> Result<Image, String> {
 }
 
 fn npy_image(bytes: &[u8], want: Want) -> Result<Image, String> {
-    let (kind, shape, data) = npy(bytes)?;
+    let Array { kind, shape, data } = array(bytes)?;
     let (format, width, height) = match (want, kind, &shape[..]) {
-        (Want::Metres, "<f4", [h, w]) => (PixelFormat::DepthF32, *w, *h),
+        (Want::Metres, "<f4", [h, w]) => (PixelFormat::DepthF32, *w as u32, *h as u32),
         (Want::Exactly(format, w, h), ..) => {
             let fits = match format {
                 PixelFormat::Z16 | PixelFormat::Mono16 => kind == "<u2",
@@ -111,44 +112,16 @@ fn npy_image(bytes: &[u8], want: Want) -> Result<Image, String> {
     Ok(Image { format, width, height, pixels: data.to_vec(), alpha_dropped: false })
 }
 
-/// Kind of number, shape and data of an array file:
-/// <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>.
-pub(super) fn npy(bytes: &[u8]) -> Result<(&str, Vec<u32>, &[u8]), String> {
-    let none = || "it is not an NPY file".to_owned();
-    let rest = bytes.strip_prefix(b"\x93NUMPY").ok_or_else(none)?;
-    let (len, rest) = match rest {
-        [1, _, a, b, rest @ ..] => (usize::from(u16::from_le_bytes([*a, *b])), rest),
-        [2 | 3, _, a, b, c, d, rest @ ..] => (u32::from_le_bytes([*a, *b, *c, *d]) as usize, rest),
-        _ => return Err(none()),
-    };
-    let (head, data) = rest.split_at_checked(len).ok_or("its head is cut off")?;
-    let head = core::str::from_utf8(head).map_err(|_| none())?;
-    let value = |key: &str| {
-        let at = head.find(&format!("'{key}'"))? + key.len() + 2;
-        Some(head[at..].trim_start().strip_prefix(':')?.trim_start())
-    };
-    let kind = value("descr").and_then(|v| v.strip_prefix('\'')?.split_once('\'')).map(|(kind, _)| kind);
-    let kind = kind.ok_or("its head names no simple kind of number")?;
-    if !value("fortran_order").is_some_and(|v| v.starts_with("False")) {
-        return Err("it is stored column by column; save it with np.ascontiguousarray".to_owned());
+/// An array of numbers that an image may have.
+pub(super) fn array(bytes: &[u8]) -> Result<Array<'_>, String> {
+    let array = npy::read(bytes)?;
+    if !["|u1", "<u2", "<f4"].contains(&array.kind) {
+        return Err(format!("its numbers are {}; |u1, <u2 and <f4 can be read", array.kind));
     }
-    let shape = value("shape").and_then(|v| v.strip_prefix('(')?.split_once(')')).map(|(shape, _)| shape);
-    let numbers = shape.ok_or("its head has no shape")?.split(',').map(str::trim).filter(|n| !n.is_empty());
-    let shape: Vec<u32> = numbers.map(|n| n.parse().map_err(|_| none())).collect::<Result<_, _>>()?;
-    let of_one = match kind {
-        "|u1" => 1,
-        "<u2" => 2,
-        "<f4" => 4,
-        other => return Err(format!("its numbers are {other}; |u1, <u2 and <f4 can be read")),
-    };
-    let elements = shape.iter().try_fold(1u64, |n, d| n.checked_mul(u64::from(*d)));
-    if elements.and_then(|n| n.checked_mul(of_one)) != Some(data.len() as u64) {
-        return Err(format!("shape {shape:?} of {kind} does not fit its {} bytes", data.len()));
+    if array.shape.iter().any(|side| *side > MAX_SIDE as usize) {
+        return Err(format!("invalid image shape {:?}", array.shape));
     }
-    if shape.iter().any(|d| *d > MAX_SIDE) {
-        return Err(format!("invalid image shape {shape:?}"));
-    }
-    Ok((kind, shape, data))
+    Ok(array)
 }
 
 #[cfg(test)]
@@ -184,7 +157,7 @@ mod tests {
         let npy = encode(&h, PixelFormat::Mono8, &[7; 24], StillFormat::Npy).unwrap();
         assert!(read(&npy, "npy", Want::Metres).unwrap_err().contains("not metres"));
         for at in 0..npy.len() {
-            assert!(super::npy(&npy[..at]).is_err());
+            assert!(array(&npy[..at]).is_err());
         }
     }
 }

@@ -438,7 +438,7 @@ fn encoded(refined: &Refined, width: usize, height: usize) -> Result<Vec<u8>> {
     Ok(match refined {
         Refined::Floats(pixels) => {
             let data: Vec<_> = pixels.iter().flat_map(|d| d.to_le_bytes()).collect();
-            depthrig_recorder::npy_file("<f4", &[height, width], &data)
+            depthrig_recorder::npy::file("<f4", &[height, width], &data)
         }
         Refined::Units(pixels) => {
             // PNG is big-endian; the encoder takes native order.
