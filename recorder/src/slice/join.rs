@@ -1,6 +1,6 @@
 //! The sets of all tracks in the order of their times, each once.
 
-use super::books::Books;
+use super::books::{Books, Gap};
 use super::folder::Folder;
 use super::output::{Losses, Output};
 use super::session::{BEFORE, IN_NO_INPUT, NOT_THERE, said};
@@ -188,9 +188,11 @@ impl<'a> Join<'a> {
             let head = &mut heads[*i];
             let Some(mark) = head.next.as_ref().map(|set| &set.mark) else { continue };
             let gap = head.gap(inputs, mark.sets_offered);
+            let offered = mark.sets_offered;
+            let found = |counted: bool| Gap { sets: gap, counted, offered };
             let damage = std::mem::take(&mut head.damage);
             if *i != chosen {
-                head.books.gap(gap, false, &mut self.losses);
+                head.books.gap(found(false), &mut self.losses);
                 continue;
             }
             let session = head.source.as_ref().map(|s| inputs[s.origin.input].dataset.session());
@@ -203,7 +205,7 @@ impl<'a> Join<'a> {
                 }));
                 let knows = own.is_some();
                 let line = lost_before(mark.id, gap, &damage, knows, session).filter(|_| counted);
-                head.books.gap(gap, counted && line.is_none(), &mut self.losses);
+                head.books.gap(found(counted && line.is_none()), &mut self.losses);
                 if let Some(line) = line {
                     self.lose(line);
                 }
@@ -227,9 +229,9 @@ impl<'a> Join<'a> {
             let missing = if same { gap } else { mark.sets_offered.saturating_sub(output.offered + 1) };
             let between = format!("{missing} sets between set {id} and set {}", mark.id);
             if missing == 0 {
-                head.books.gap(gap, false, &mut self.losses);
+                head.books.gap(found(false), &mut self.losses);
             } else if !same {
-                head.books.gap(gap, false, &mut self.losses);
+                head.books.gap(found(false), &mut self.losses);
                 self.lose(format!("{between} are {IN_NO_INPUT}"));
             } else if !damage.is_empty() {
                 self.lose(format!("{between} {NOT_THERE}{}", damage.join("; ")));
@@ -237,7 +239,7 @@ impl<'a> Join<'a> {
                 // The cut or join that it is from gave a reason that no account has.
                 self.lose(line);
             } else {
-                head.books.gap(gap, true, &mut self.losses);
+                head.books.gap(found(true), &mut self.losses);
             }
         }
         Ok(())
@@ -279,8 +281,8 @@ impl<'a> Join<'a> {
                     head.source = Some(source);
                 }
                 Item::Skipped(id, offered) => {
-                    let gap = head.gap(self.inputs, offered);
-                    head.books.gap(gap, false, &mut self.losses);
+                    let sets = head.gap(self.inputs, offered);
+                    head.books.gap(Gap { sets, counted: false, offered }, &mut self.losses);
                     head.before = head.source.as_ref().map(|s| (id, offered, s.origin));
                     head.damage.clear();
                     for (source, message) in messages.drain(..) {
