@@ -48,7 +48,7 @@ FUZZ ?= 3600
 fuzz: setup-fuzz ## an hour for each fuzz target, or FUZZ="SECONDS [TARGET...]"
 	tools/fuzz.sh $(FUZZ)
 
-check-debian13: ## build in a clean Debian 13, as root: make check-debian13 ARGS="test --package depthrig-drivers"
+check-debian13: ## build in a clean Debian 13, as root: make check-debian13 ARGS="test --package depthrig-driver"
 	tools/check_debian13.sh $(ARGS)
 
 lint: ## formatting and lints, as CI runs them

@@ -7,6 +7,7 @@
 mod camera;
 mod codes;
 mod fields;
+#[cfg(any(test, feature = "testing"))]
 pub mod fuzzing;
 mod layout;
 mod link;

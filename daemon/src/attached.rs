@@ -17,10 +17,10 @@ use crate::family::{self, Family, ImuFiles};
 use crate::status::{CameraStatus, RigStatus};
 use classify::Candidate;
 use depthrig_bus::PixelFormat;
-use depthrig_drivers::iio;
-use depthrig_drivers::usb::holder::{Holder, Holders, holders_of};
-use depthrig_drivers::usb::{SysRoot, UsbDevice, VideoNode, health, scan, video_nodes};
-use depthrig_drivers::{DeviceInfo, ErrorKind, StreamProfile};
+use depthrig_driver::{DeviceInfo, ErrorKind, StreamProfile};
+use depthrig_realsense::iio;
+use depthrig_usb::holder::{Holder, Holders, holders_of};
+use depthrig_usb::{SysRoot, UsbDevice, VideoNode, health, scan, video_nodes};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 

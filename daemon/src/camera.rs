@@ -8,10 +8,10 @@ use crate::stream::Stream;
 use crate::wake::Wake;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{Bus, HostTime, StreamId};
-use depthrig_drivers::DeviceInfo;
-use depthrig_drivers::stereo::{Descriptions, Notice, PREFIXES, SIDES};
-use depthrig_drivers::synthetic::Drawing;
+use depthrig_driver::DeviceInfo;
 use depthrig_recorder::Computed;
+use depthrig_sim::synthetic::Drawing;
+use depthrig_stereo::{Descriptions, Notice, PREFIXES, SIDES};
 use std::sync::{Arc, Mutex, MutexGuard};
 
 mod open;

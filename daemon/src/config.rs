@@ -24,8 +24,8 @@ pub use stereo::StereoConfig;
 
 use crate::family::{FAMILIES, Family};
 use depthrig_bus::{CameraName, PixelFormat, Pose, RigName, StreamName};
-use depthrig_drivers::stereo::StereoOptions;
-use depthrig_drivers::{StreamProfile, StreamRequest};
+use depthrig_driver::{StreamProfile, StreamRequest};
+use depthrig_stereo::StereoOptions;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
@@ -261,9 +261,7 @@ impl CameraConfig {
     /// join the set of their pair when it is recorded, as refined depth does.
     pub(crate) fn joins_late(&self, stream: &StreamName) -> bool {
         // Without a stream that comes at once there would be no set to join.
-        let at_once = |name: &str| {
-            name == depthrig_drivers::stereo::COLOR || depthrig_drivers::stereo::SIDES.contains(&name)
-        };
+        let at_once = |name: &str| name == depthrig_stereo::COLOR || depthrig_stereo::SIDES.contains(&name);
         self.stereo.is_some()
             && StereoOptions::is_late(stream.as_str())
             && (self.streams.is_empty() || self.streams.iter().any(|s| at_once(s.stream.as_str())))

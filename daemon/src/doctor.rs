@@ -26,7 +26,7 @@ pub use plan::{CameraPlan, PlannedStream};
 use crate::attached::{Ask, Attached, look};
 use crate::config::RigConfig;
 use depthrig_bus::RuntimeDir;
-use depthrig_drivers::usb::SysRoot;
+use depthrig_usb::SysRoot;
 use serde::Serialize;
 
 /// The findings about a session.

@@ -41,9 +41,9 @@ impl From<depthrig_bus::Error> for Error {
     }
 }
 
-impl From<depthrig_drivers::Error> for Error {
-    fn from(e: depthrig_drivers::Error) -> Self {
-        use depthrig_drivers::ErrorKind as Driver;
+impl From<depthrig_driver::Error> for Error {
+    fn from(e: depthrig_driver::Error) -> Self {
+        use depthrig_driver::ErrorKind as Driver;
         let kind = match e.kind() {
             Driver::NotFound => ErrorKind::NotFound,
             Driver::Busy => ErrorKind::InUse,

@@ -1,7 +1,7 @@
 //! Camera families: all that the daemon knows of one is in its file here, and one line of [`FAMILIES`] adds it.
 //!
 //! A family is a type of settings that implements [`CameraSettings`], and a [`Family`] that reads them from a `[[camera]]`
-//! table. Its driver is a folder of `depthrig-drivers`, which knows no configuration.
+//! table. Its driver is a crate in `drivers/`, which knows no configuration.
 
 mod bus;
 mod external;
@@ -23,7 +23,7 @@ pub use reader::Reader;
 pub use settings::{AnySettings, BackendConfig, CameraSettings, OpenContext, Preparation, Unmet};
 pub use source::{Offered, Selector, Service, Source};
 
-use depthrig_drivers::usb::UsbDevice;
+use depthrig_usb::UsbDevice;
 
 /// The families, in the order in which messages list them.
 pub const FAMILIES: &[Family] = &[

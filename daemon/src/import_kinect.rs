@@ -10,11 +10,11 @@
 use depthrig_bus::{
     CameraName, ClockDomain, DropCounts, DropReason, FrameHeader, HostTime, PixelFormat, StreamId, UtcPair,
 };
-use depthrig_drivers::kinect::motion as kinect_motion;
-use depthrig_drivers::kinect::playback::{CalibrationSource, recorded_motion, recorded_profiles, serial};
-use depthrig_drivers::kinect::recording::{Pixels, Recording, TrackKind};
-use depthrig_drivers::kinect::{Calibration, ColorMode, DepthMode};
-use depthrig_drivers::unpack;
+use depthrig_driver::unpack;
+use depthrig_kinect::motion as kinect_motion;
+use depthrig_kinect::playback::{CalibrationSource, recorded_motion, recorded_profiles, serial};
+use depthrig_kinect::recording::{Pixels, Recording, TrackKind};
+use depthrig_kinect::{Calibration, ColorMode, DepthMode};
 use depthrig_recorder::exchange::{ImportFacts, ImportProgress, Importer};
 use depthrig_recorder::{
     Error, ErrorKind, MotionRecord, RecordFrame, RecordSet, Result, Session, StreamAccount, StreamRecord,
@@ -477,11 +477,11 @@ impl Importer for KinectImport {
     }
 }
 
-fn of_driver(e: depthrig_drivers::Error) -> Error {
+fn of_driver(e: depthrig_driver::Error) -> Error {
     let kind = match e.kind() {
-        depthrig_drivers::ErrorKind::NotFound => ErrorKind::NotFound,
-        depthrig_drivers::ErrorKind::PermissionDenied => ErrorKind::PermissionDenied,
-        depthrig_drivers::ErrorKind::Io => ErrorKind::Io,
+        depthrig_driver::ErrorKind::NotFound => ErrorKind::NotFound,
+        depthrig_driver::ErrorKind::PermissionDenied => ErrorKind::PermissionDenied,
+        depthrig_driver::ErrorKind::Io => ErrorKind::Io,
         _ => ErrorKind::BadRecording,
     };
     Error::new(kind, e.to_string()).with_source(e)

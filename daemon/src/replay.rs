@@ -46,7 +46,7 @@ use depthrig_bus::{
     Bus, ClockDomain, HostTime, Intrinsics, MetadataLevel, PixelFormat, RigName, RuntimeDir,
     SUBSCRIBER_BUFFER, UtcPair, shm,
 };
-use depthrig_drivers::StreamProfile;
+use depthrig_driver::StreamProfile;
 use depthrig_recorder::{Computed, MotionRecord, StreamRecord};
 use player::Player;
 use source::{Moment, Sources};
@@ -434,7 +434,7 @@ fn profile(r: &StreamRecord) -> StreamProfile {
         depth_unit_m: r.depth_unit_m,
         intrinsics: r.intrinsics,
         pose_in_device: r.pose,
-        clock: depthrig_drivers::DeviceClock { counter_bits: 64, tick_ps: 1000, domain: ClockDomain::Device },
+        clock: depthrig_driver::DeviceClock { counter_bits: 64, tick_ps: 1000, domain: ClockDomain::Device },
         sequence_bits: 64,
         metadata: MetadataLevel::Full,
     }
@@ -451,7 +451,7 @@ fn unit_profile(r: &MotionRecord) -> StreamProfile {
         depth_unit_m: 0.0,
         intrinsics: Intrinsics::default(),
         pose_in_device: r.pose,
-        clock: depthrig_drivers::DeviceClock { counter_bits: 64, tick_ps: 1000, domain: ClockDomain::Device },
+        clock: depthrig_driver::DeviceClock { counter_bits: 64, tick_ps: 1000, domain: ClockDomain::Device },
         sequence_bits: 64,
         metadata: MetadataLevel::Full,
     }

@@ -6,8 +6,8 @@ use depthrig_bus::{
     DropReason, FrameFlags, FrameHeader, FrameMut, HostTime, MOTION_SAMPLE_BYTES, MetadataLevel, PixelFormat,
     Publisher,
 };
-use depthrig_drivers::clock::ClockQuality;
-use depthrig_drivers::{FrameMeta, FrameSink, Loan};
+use depthrig_driver::clock::ClockQuality;
+use depthrig_driver::{FrameMeta, FrameSink, Loan};
 use std::sync::{Arc, MutexGuard};
 
 /// The sink of one opening of one camera.

@@ -7,8 +7,8 @@ use depthrig_bus::sync::lock;
 use depthrig_bus::{
     DropCounts, DropReason, FrameFlags, HostTime, MetadataLevel, Publisher, StreamId, Subscriber,
 };
-use depthrig_drivers::StreamProfile;
-use depthrig_drivers::clock::ClockQuality;
+use depthrig_driver::StreamProfile;
+use depthrig_driver::clock::ClockQuality;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};
 

@@ -28,7 +28,7 @@ mod record;
 mod work;
 
 pub use depthrig_cdm::NetworkPixels;
-pub use depthrig_drivers::zed::replay::OpenOptions;
+pub use depthrig_zed::replay::OpenOptions;
 pub use modes::{Mode, NetworkChoice};
 
 /// Problems that a report names; the rest is counted.

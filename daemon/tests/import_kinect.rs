@@ -3,9 +3,9 @@
 
 use depthrig_bus::{DropReason, Name, PixelFormat};
 use depthrig_daemon::import_kinect::{KinectImport, KinectOptions};
-use depthrig_drivers::kinect::motion::CORRECTED;
-use depthrig_drivers::kinect::playback::CalibrationSource;
-use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
+use depthrig_kinect::motion::CORRECTED;
+use depthrig_kinect::playback::CalibrationSource;
+use depthrig_kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
 use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Images, Lacing, Pattern, damage_time, motion};
 use depthrig_recorder::exchange::{ImportFacts, ImportReport, Importer, import};
 use depthrig_recorder::fs::RealFs;

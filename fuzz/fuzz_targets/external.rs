@@ -1,9 +1,9 @@
 //! Messages between a process that serves a camera and the daemon, both directions.
 #![no_main]
 
-use depthrig_drivers::fuzzing::external;
+use depthrig_external::fuzzing;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
-    external::handshake(bytes);
+    fuzzing::handshake(bytes);
 });

@@ -1,9 +1,9 @@
 //! The factory calibration of an Azure Kinect.
 #![no_main]
 
-use depthrig_drivers::fuzzing::kinect;
+use depthrig_kinect::fuzzing;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
-    kinect::calibration(bytes);
+    fuzzing::calibration(bytes);
 });

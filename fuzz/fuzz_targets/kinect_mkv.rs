@@ -1,9 +1,9 @@
 //! An Azure Kinect `.mkv`.
 #![no_main]
 
-use depthrig_drivers::fuzzing::kinect;
+use depthrig_kinect::fuzzing;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
-    kinect::recording(bytes);
+    fuzzing::recording(bytes);
 });

@@ -1,9 +1,9 @@
 //! A reply of the hardware monitor.
 #![no_main]
 
-use depthrig_drivers::fuzzing::realsense;
+use depthrig_realsense::fuzzing;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
-    realsense::hwm(bytes);
+    fuzzing::hwm(bytes);
 });

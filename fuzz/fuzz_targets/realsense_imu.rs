@@ -1,9 +1,9 @@
 //! The table of a RealSense IMU.
 #![no_main]
 
-use depthrig_drivers::fuzzing::realsense;
+use depthrig_realsense::fuzzing;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
-    realsense::imu(bytes);
+    fuzzing::imu(bytes);
 });

@@ -1,9 +1,9 @@
 //! Payload headers and the records of a metadata node.
 #![no_main]
 
-use depthrig_drivers::fuzzing::realsense;
+use depthrig_realsense::fuzzing;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {
-    realsense::metadata(bytes);
+    fuzzing::metadata(bytes);
 });

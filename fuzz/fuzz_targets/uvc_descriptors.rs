@@ -1,7 +1,7 @@
 //! A configuration descriptor of a video camera.
 #![no_main]
 
-use depthrig_drivers::uvc::fuzzing;
+use depthrig_usb::uvc::fuzzing;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {

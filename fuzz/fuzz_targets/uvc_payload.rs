@@ -1,7 +1,7 @@
 //! A payload header of USB video, and transfers of a stream.
 #![no_main]
 
-use depthrig_drivers::uvc::fuzzing;
+use depthrig_libusb::fuzzing;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {

@@ -2,7 +2,7 @@
 """Computes `reference_pixels.csv`: CRC-32 of the pixels of PNGs, decoded with nothing but Python's own library, and of
 JPEGs, decoded by Pillow (libjpeg-turbo).
 
-An independent witness for drivers/tests/files_real.rs: it shares no code with the decoders that the drivers use.
+An independent witness for drivers/sim/tests/files_real.rs: it shares no code with the decoders that the drivers use.
 16-bit pixels count as little-endian, as they travel on the bus.
 
     python3 reference_pixels.py FOLDER_OF_THE_TEST_DATA > reference_pixels.csv

@@ -15,7 +15,7 @@ fn main() {
     let folder = args.first().map(PathBuf::from);
     let models: Vec<&str> =
         if args.len() > 1 { args[1..].iter().map(String::as_str).collect() } else { MODELS.to_vec() };
-    let cache = depthrig_drivers::synthetic::default_cache_dir();
+    let cache = depthrig_sim::synthetic::default_cache_dir();
     let mut refiner = FillRefiner::new(1).unwrap();
     println!(
         "model   depth  strict: L1 m  RMSE m  AbsRel   d0.5     d1 | plain: L1 m  RMSE m  AbsRel   d0.5     d1 | filled % | where raw has depth: L1 m  better %  worse %   CPU ms (steps on the wall clock)"

@@ -2,8 +2,8 @@
 
 use depthrig_bus::{Name, Pose};
 use depthrig_calib::{PoseExt, Registration};
-use depthrig_drivers::synthetic::{StreamOverride, SyntheticBackend, SyntheticConfig};
-use depthrig_drivers::{Backend, MemorySink, StreamProfile, StreamRequest};
+use depthrig_driver::{Backend, MemorySink, StreamProfile, StreamRequest};
+use depthrig_sim::synthetic::{StreamOverride, SyntheticBackend, SyntheticConfig};
 use std::path::Path;
 use std::time::Duration;
 
@@ -44,10 +44,10 @@ pub fn shoot(model: &str, size: Size, pose_on_mount: Pose, cache: &Path) -> Scen
         ..SyntheticConfig::default()
     };
     if size == Size::Small {
-        let smallest = |modes: &[depthrig_drivers::synthetic::models::Mode]| {
+        let smallest = |modes: &[depthrig_sim::synthetic::models::Mode]| {
             modes.iter().map(|m| (m.width, m.height)).min_by_key(|(w, h)| w * h)
         };
-        let model = depthrig_drivers::synthetic::models::find(model).unwrap();
+        let model = depthrig_sim::synthetic::models::find(model).unwrap();
         for (stream, modes) in [("color", model.color_modes), ("depth", model.depth_modes)] {
             let stream = Name::new(stream).unwrap();
             config.streams.push(StreamOverride { stream, size: smallest(modes), rate_hz: None });

@@ -11,7 +11,7 @@ use depthrig_tests::scene::{MODELS, Size, places, shoot};
 #[test]
 fn filled_depth_is_nearer_to_the_truth_than_raw_for_stereo_and_time_of_flight() {
     let range = DepthRange { min_m: 0.1, max_m: 6.0 };
-    let cache = depthrig_drivers::synthetic::default_cache_dir();
+    let cache = depthrig_sim::synthetic::default_cache_dir();
     let mut refiner = FillRefiner::new(1).unwrap();
     for (model, size) in MODELS.iter().flat_map(|m| [(*m, Size::Small), (*m, Size::Default)]) {
         let mut rmse_m = [0.0; 2];

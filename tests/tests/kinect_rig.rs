@@ -2,7 +2,7 @@
 //! recording; cameras that are pulled out, held by others, wired together, without a library or a depth engine.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
-#[path = "../../drivers/tests/support/kinect.rs"]
+#[path = "../../drivers/kinect/tests/support/kinect.rs"]
 mod fake;
 
 use depthrig_bus::{Bus, FrameFlags, PixelFormat, RigName};

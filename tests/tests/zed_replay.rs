@@ -5,12 +5,12 @@ use core::ops::ControlFlow;
 use depthrig_bus::{FrameFlags, FrameHeader, MotionSample, PixelFormat};
 use depthrig_calib::stereo::Preset;
 use depthrig_daemon::zed_replay::{Mode, NetworkChoice, Step, ZedReplayOptions, zed_replay};
-use depthrig_drivers::zed::replay::fake;
 use depthrig_recorder::{
     CompareOptions, Dataset, DatasetSet, ErrorKind, PixelMode, RecordMotion, Session, SetRange,
     VerifyOptions, compare, verify,
 };
 use depthrig_tests::synthetic_stereo::SyntheticStereo;
+use depthrig_zed::replay::fake;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};

@@ -5,15 +5,15 @@
 use depthrig_bus::{FrameFlags, PixelFormat};
 use depthrig_calib::{Camera, PoseExt, Rectifier, View};
 use depthrig_daemon::control::RecordRequest;
-use depthrig_drivers::zed::conf::{FactoryCalibration, StereoCalibration};
-use depthrig_drivers::zed::mode::{Mode, Side};
-use depthrig_drivers::zed::replay::fake::{self, FakeSvo};
 use depthrig_recorder::{Dataset, SetRange, VerifyOptions, verify};
 use depthrig_tests::{Home, all_stream, assert_balanced, camera, wait_until};
+use depthrig_zed::conf::{FactoryCalibration, StereoCalibration};
+use depthrig_zed::mode::{Mode, Side};
+use depthrig_zed::replay::fake::{self, FakeSvo};
 use std::path::Path;
 use std::time::Duration;
 
-const CONF: &str = include_str!("../../drivers/src/zed/conf/sample.conf");
+const CONF: &str = include_str!("../../drivers/zed/src/conf/sample.conf");
 const SIZE: (u32, u32) = (672, 376);
 /// Distance of the wall along the left camera's axis, metres.
 const WALL_M: f64 = 1.5;

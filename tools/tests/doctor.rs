@@ -4,7 +4,7 @@
 #[path = "support/home.rs"]
 mod support;
 
-use depthrig_drivers::usb::fake::{FakeDevice, FakeTree};
+use depthrig_usb::fake::{FakeDevice, FakeTree};
 use serde_json::Value;
 use support::{Home, Ran};
 

@@ -6,9 +6,9 @@
 mod support;
 
 use depthrig_bus::HostTime;
-use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode};
-use depthrig_drivers::usb::fake::{FakeDevice, FakeTree};
+use depthrig_kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode};
 use depthrig_kinect_fixture::{Fixture, Pattern};
+use depthrig_usb::fake::{FakeDevice, FakeTree};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Output, Stdio};

@@ -5,7 +5,7 @@
 mod support;
 
 use depthrig_cdm::FakeNetwork;
-use depthrig_drivers::zed::replay::fake::{FakeSvo, SERIAL, noise};
+use depthrig_zed::replay::fake::{FakeSvo, SERIAL, noise};
 use rustix::fs::{CWD, FileType, Mode, mknodat};
 use serde_json::Value;
 use std::path::{Path, PathBuf};

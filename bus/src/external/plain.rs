@@ -1,7 +1,9 @@
 //! Converts records of the hand-shake to bytes and back; each record from another process is checked before use.
 #![allow(unsafe_code)] // transmutes between a record and its bytes
 
-use super::{ExternalAnswer, ExternalFrame, ExternalMode, ExternalOffer};
+use super::ExternalMode;
+#[cfg(any(test, feature = "testing"))]
+use super::{ExternalAnswer, ExternalFrame, ExternalOffer};
 
 macro_rules! records {
     ($($record:ident: $of_bytes:ident, $bytes_of:ident;)*) => {$(
@@ -23,6 +25,11 @@ macro_rules! records {
 
 records! {
     ExternalMode: mode_of, bytes_of_mode;
+}
+
+// iceoryx2 carries these as they are; fuzz targets make them from bytes.
+#[cfg(any(test, feature = "testing"))]
+records! {
     ExternalOffer: offer_of, bytes_of_offer;
     ExternalAnswer: answer_of, bytes_of_answer;
     ExternalFrame: frame_of, bytes_of_frame;

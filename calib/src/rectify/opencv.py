@@ -14,7 +14,7 @@ import numpy as np
 
 # Left and right as fx fy cx cy, coefficients; then (RX, RY, RZ) and T from left to right, metres; width, height.
 CAMERAS = {
-    # A ZED's HD720 as in drivers/src/zed/conf/sample.conf.
+    # A ZED's HD720 as in drivers/zed/src/conf/sample.conf.
     "zed": (
         ([532.41, 532.53, 636.02, 362.41], [-0.0634518, 0.0401532, -0.000375119, 0.00074809, -0.0161231]),
         ([532.63, 532.67, 641.12, 375.51], [-0.0587747, 0.0322036, 5.85653e-05, -0.000297978, -0.0123602]),

@@ -5,10 +5,11 @@ use crate::config::{BackendConfig, RigConfig};
 use crate::family::{Family, Probe};
 use crate::status::RigStatus;
 use depthrig_bus::RuntimeDir;
-use depthrig_drivers::external::{self, ExternalBackend, ExternalConfig, Place};
-use depthrig_drivers::usb::SysRoot;
-use depthrig_drivers::v4l2::Node;
-use depthrig_drivers::{Device, DeviceInfo, Result, StreamProfile};
+use depthrig_driver::{Device, DeviceInfo, Result, StreamProfile};
+use depthrig_external as external;
+use depthrig_external::{ExternalBackend, ExternalConfig, Place};
+use depthrig_usb::SysRoot;
+use depthrig_v4l2::Node;
 use rustix::fs::Access;
 use std::path::Path;
 

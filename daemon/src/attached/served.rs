@@ -3,7 +3,7 @@
 use super::{AttachedCamera, HeldBy, ModeReport, Served, UseState};
 use crate::family;
 use crate::status::{CameraState, RigStatus};
-use depthrig_drivers::ErrorKind;
+use depthrig_driver::ErrorKind;
 
 /// Where such a camera is, as `port`: RIG/CAMERA.
 pub(crate) fn place(rig: &str, camera: &str) -> String {

@@ -3,8 +3,8 @@
 use super::*;
 use crate::status::CameraState;
 use depthrig_bus::{ClockDomain, Intrinsics, MetadataLevel, PixelFormat, Pose, StreamName};
-use depthrig_drivers::usb::fake::{FakeDevice, FakeTree};
-use depthrig_drivers::{DeviceClock, Error};
+use depthrig_driver::{DeviceClock, Error};
+use depthrig_usb::fake::{FakeDevice, FakeTree};
 use std::cell::RefCell;
 
 /// Answers that a test chooses, and a list of the cameras that were opened.
@@ -42,7 +42,7 @@ pub(crate) fn profile(
 }
 
 impl Ask for FakeAnswers {
-    fn node(&self, path: &Path) -> depthrig_drivers::Result<NodeFacts> {
+    fn node(&self, path: &Path) -> depthrig_driver::Result<NodeFacts> {
         let name = path.file_name().unwrap().to_str().unwrap();
         if self.denied.iter().any(|d| d == name) {
             return Err(Error::new(ErrorKind::PermissionDenied, format!("{name}: no")));
@@ -65,7 +65,7 @@ impl Ask for FakeAnswers {
         &self,
         family: &Family,
         port: &str,
-    ) -> Option<depthrig_drivers::Result<(DeviceInfo, Vec<StreamProfile>)>> {
+    ) -> Option<depthrig_driver::Result<(DeviceInfo, Vec<StreamProfile>)>> {
         self.opened.borrow_mut().push(port.to_owned());
         if let Some((_, kind)) = self.failing.iter().find(|(p, _)| p == port) {
             return Some(Err(Error::new(*kind, format!("{port} does not answer; plug it in again"))));

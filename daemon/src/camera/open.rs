@@ -9,9 +9,9 @@ use crate::stream::Stream;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{FrameHeader, StreamId, StreamName, shm};
 use depthrig_calib::PoseExt;
-use depthrig_drivers::capture::Session;
-use depthrig_drivers::stereo::{StereoBackend, StereoOptions};
-use depthrig_drivers::{Backend, DeviceInfo, ErrorKind as DriverErrorKind, StreamProfile, StreamRequest};
+use depthrig_driver::capture::Session;
+use depthrig_driver::{Backend, DeviceInfo, ErrorKind as DriverErrorKind, StreamProfile, StreamRequest};
+use depthrig_stereo::{StereoBackend, StereoOptions};
 use std::sync::{Arc, Mutex};
 
 /// A camera's driver, created at the first opening and kept for the later ones.
@@ -22,10 +22,10 @@ pub(super) fn open_session(
     camera: &Camera,
     shared: &Shared,
     backend: &Mutex<Option<Box<dyn Backend>>>,
-) -> Result<Session, depthrig_drivers::Error> {
+) -> Result<Session, depthrig_driver::Error> {
     let name = &camera.config.name;
-    let in_camera = |e: depthrig_drivers::Error| {
-        depthrig_drivers::Error::new(e.kind(), format!("camera \"{name}\": {e}")).with_source(e)
+    let in_camera = |e: depthrig_driver::Error| {
+        depthrig_driver::Error::new(e.kind(), format!("camera \"{name}\": {e}")).with_source(e)
     };
     let device = {
         // Held for the opening alone; a thread that hangs in it keeps its successors waiting, not the rig.
@@ -55,12 +55,12 @@ pub(super) fn open_session(
                 crate::ErrorKind::NoSpace => DriverErrorKind::Unsupported,
                 _ => DriverErrorKind::Io,
             };
-            in_camera(depthrig_drivers::Error::new(kind, e.to_string()).with_source(e))
+            in_camera(depthrig_driver::Error::new(kind, e.to_string()).with_source(e))
         })?;
         ports.push((s, publisher, header));
     }
     open_refinement(camera, shared, &info).map_err(|e| {
-        in_camera(depthrig_drivers::Error::new(DriverErrorKind::Io, e.to_string()).with_source(e))
+        in_camera(depthrig_driver::Error::new(DriverErrorKind::Io, e.to_string()).with_source(e))
     })?;
     Ok(Session { info, stream, sink: Box::new(BusSink::new(ports, Arc::clone(&shared.frames))) })
 }
@@ -115,7 +115,7 @@ fn open_refinement(camera: &Camera, shared: &Shared, info: &DeviceInfo) -> Resul
 }
 
 /// The driver of a camera.
-fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, depthrig_drivers::Error> {
+fn make_backend(camera: &Camera, shared: &Shared) -> Result<Box<dyn Backend>, depthrig_driver::Error> {
     let backend = camera.config.backend.driver(&OpenContext {
         runtime: shared.bus.runtime(),
         rig: shared.bus.rig(),
@@ -156,19 +156,19 @@ fn adopt(
     shared: &Shared,
     profiles: &[StreamProfile],
     info: &DeviceInfo,
-) -> Result<Vec<Arc<Stream>>, depthrig_drivers::Error> {
+) -> Result<Vec<Arc<Stream>>, depthrig_driver::Error> {
     let mut state = camera.state();
     state.info = Some(info.clone());
     if state.streams.is_empty() {
         let derived = camera.config.derived_profiles(profiles).map_err(|e| {
-            depthrig_drivers::Error::new(DriverErrorKind::BadInput, e.to_string()).with_source(e)
+            depthrig_driver::Error::new(DriverErrorKind::BadInput, e.to_string()).with_source(e)
         })?;
         let all = profiles.iter().chain(derived.iter().map(|(p, _)| p));
         state.set_bytes = all.map(|p| p.frame_bytes() as u64).sum();
         let slots = shm::slots_that_fit(shared.slots, state.set_bytes, shared.memory_share);
         state.short_of_memory = slots.is_err();
         let slots = slots.map_err(|e| {
-            depthrig_drivers::Error::new(DriverErrorKind::Unsupported, e.to_string()).with_source(e)
+            depthrig_driver::Error::new(DriverErrorKind::Unsupported, e.to_string()).with_source(e)
         })?;
         let stream = |p: &StreamProfile, record: bool| {
             let id = StreamId { camera: camera.config.name.clone(), stream: p.stream.clone() };
@@ -185,7 +185,7 @@ fn adopt(
     if back.len() != profiles.len() || back.iter().zip(profiles).any(|(s, p)| !same_mode(&s.profile, p)) {
         let had: Vec<_> = state.streams.iter().map(|s| s.profile.describe()).collect();
         let has: Vec<_> = profiles.iter().map(StreamProfile::describe).collect();
-        return Err(depthrig_drivers::Error::new(
+        return Err(depthrig_driver::Error::new(
             DriverErrorKind::Unsupported,
             format!(
                 "it came back with other modes: had {}, has {}; restart the daemon to use them",

@@ -16,8 +16,8 @@ use crate::priority;
 use crate::status::CameraState;
 use core::time::Duration;
 use depthrig_bus::HostTime;
-use depthrig_drivers::ErrorKind as DriverErrorKind;
-use depthrig_drivers::capture::{Capture, End, StopOutcome};
+use depthrig_driver::ErrorKind as DriverErrorKind;
+use depthrig_driver::capture::{Capture, End, StopOutcome};
 use std::sync::Arc;
 
 /// How long opening a device may take before its thread is given up for hung.
@@ -226,14 +226,14 @@ impl Supervisor {
     }
 
     /// Whether an opening failed for good: files that are not there are a mistake, not an unplugged camera.
-    fn never_will(&self, e: &depthrig_drivers::Error) -> bool {
+    fn never_will(&self, e: &depthrig_driver::Error) -> bool {
         e.kind() == DriverErrorKind::NotFound
             && self.camera.config.backend.reads_files()
             && self.camera.state().streams.is_empty()
     }
 
     /// The camera is lost; it is tried again after a pause.
-    fn lose(&mut self, now: HostTime, why: &str, error: Option<depthrig_drivers::Error>) {
+    fn lose(&mut self, now: HostTime, why: &str, error: Option<depthrig_driver::Error>) {
         let mut state = self.camera.state();
         self.lost |= state.phase != CameraState::Opening;
         state.enter(self.camera.config.name.as_str(), CameraState::Reconnecting, Some(why.to_owned()));

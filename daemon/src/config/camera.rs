@@ -6,7 +6,7 @@ use super::wanted::WantedStream;
 use super::{CameraConfig, StereoConfig, refine, stereo};
 use crate::family::{Family, Reader};
 use depthrig_bus::{CameraName, Name, PixelFormat, Pose, StreamName};
-use depthrig_drivers::StreamRequest;
+use depthrig_driver::StreamRequest;
 use std::path::Path;
 
 /// Reads one camera of one of `families`; `None` after a problem that leaves nothing to build on. `taken` are the names so far.

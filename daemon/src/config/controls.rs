@@ -1,7 +1,7 @@
 //! Controls of a camera by name, as rig files give them: numbers, on or off, or the name of a menu's item.
 
 use super::read::{FromToml, Section};
-use depthrig_drivers::v4l2::ControlValue;
+use depthrig_usb::controls::ControlValue;
 use std::collections::BTreeMap;
 use toml::de::DeValue;
 

@@ -6,7 +6,7 @@ use super::wanted::WantedStream;
 use crate::zed_replay::Mode;
 use depthrig_calib::stereo::{Matcher, Preset};
 use depthrig_cdm::{StereoNetwork, StereoNetworkOptions};
-use depthrig_drivers::stereo::{Geometry, Maker, StereoMode, StereoOptions};
+use depthrig_stereo::{Geometry, Maker, StereoMode, StereoOptions};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -125,11 +125,7 @@ impl StereoConfig {
 
     /// The stream that is refined where nothing else is said: depth of the first mode.
     pub fn first_depth(&self) -> String {
-        format!(
-            "{}{}",
-            depthrig_drivers::stereo::PREFIXES[0],
-            self.modes.first().map_or("quality", |m| m.name())
-        )
+        format!("{}{}", depthrig_stereo::PREFIXES[0], self.modes.first().map_or("quality", |m| m.name()))
     }
 
     /// The options for the driver.

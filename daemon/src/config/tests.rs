@@ -4,14 +4,14 @@
 
 use super::read::Report;
 use super::*;
-use depthrig_drivers::external::ExternalConfig;
-use depthrig_drivers::files::FilesConfig;
-use depthrig_drivers::realsense::RealsenseConfig;
-use depthrig_drivers::realsense::l515::L515Config;
-use depthrig_drivers::synthetic::SyntheticConfig;
-use depthrig_drivers::v4l2::V4l2Config;
-use depthrig_drivers::zed::ZedConfig;
-use depthrig_drivers::zed::replay::ZedPlaybackConfig;
+use depthrig_external::ExternalConfig;
+use depthrig_realsense::RealsenseConfig;
+use depthrig_realsense::l515::L515Config;
+use depthrig_sim::files::FilesConfig;
+use depthrig_sim::synthetic::SyntheticConfig;
+use depthrig_v4l2::V4l2Config;
+use depthrig_zed::ZedConfig;
+use depthrig_zed::replay::ZedPlaybackConfig;
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
@@ -210,9 +210,9 @@ fn a_realsense_camera_is_set_as_the_file_says() {
         "#,
     )
     .unwrap();
-    use depthrig_drivers::realsense::config::{Emitter, MetadataWish, TransportChoice};
-    use depthrig_drivers::realsense::protocol::sync::SyncMode;
-    use depthrig_drivers::v4l2::ControlValue::{Boolean, Integer, Item};
+    use depthrig_realsense::config::{Emitter, MetadataWish, TransportChoice};
+    use depthrig_realsense::protocol::sync::SyncMode;
+    use depthrig_usb::controls::ControlValue::{Boolean, Integer, Item};
     let color_controls = [
         ("gamma", Integer(300)),
         ("power_line_frequency", Item("50 Hz".into())),
@@ -272,8 +272,8 @@ fn a_zed_is_set_as_the_file_says() {
         "#,
     )
     .unwrap();
-    use depthrig_drivers::v4l2::ControlValue::{Boolean, Integer};
-    use depthrig_drivers::zed::CalibrationFile;
+    use depthrig_usb::controls::ControlValue::{Boolean, Integer};
+    use depthrig_zed::CalibrationFile;
     let controls = [("brightness", Integer(4)), ("white_balance_automatic", Boolean(false))];
     let wanted = ZedConfig {
         serial: Some("31234567".into()),
@@ -322,9 +322,9 @@ fn an_attached_kinect_is_set_as_the_file_says() {
         "#,
     )
     .unwrap();
-    use depthrig_drivers::kinect::live::{LiveConfig, Places};
-    use depthrig_drivers::kinect::{DepthMode, WiredSync};
-    use depthrig_drivers::v4l2::ControlValue::{Integer, Item};
+    use depthrig_kinect::live::{LiveConfig, Places};
+    use depthrig_kinect::{DepthMode, WiredSync};
+    use depthrig_usb::controls::ControlValue::{Integer, Item};
     let controls = [("exposure_us", Integer(8330)), ("white_balance_k", Item("auto".into()))];
     let wanted = LiveConfig {
         serial: Some("000123456789".into()),
@@ -385,7 +385,7 @@ fn a_recording_of_a_zed_and_its_stereo_are_set_as_the_file_says() {
     let b = ZedPlaybackConfig {
         input: "/rigs/recordings/a.svo2".into(),
         serial: Some("5".into()),
-        calibration: depthrig_drivers::zed::CalibrationFile::At("/rigs/SN5.conf".into()),
+        calibration: depthrig_zed::CalibrationFile::At("/rigs/SN5.conf".into()),
         rate_hz: Some(5.0),
         looped: true,
     };
@@ -418,7 +418,7 @@ fn a_recording_of_a_zed_and_its_stereo_are_set_as_the_file_says() {
 
 #[test]
 fn a_recorded_kinect_is_played_as_the_file_says() {
-    use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackConfig};
+    use depthrig_kinect::playback::{CalibrationSource, PlaybackConfig};
     let text = |keys: &str| {
         format!("rig = \"r\"\n[[camera]]\nname = \"a\"\nbackend = \"kinect\"\nrecording = \"a.mkv\"\n{keys}")
     };
@@ -621,7 +621,8 @@ proptest::proptest! {
 
 #[test]
 fn a_v4l2_camera_is_read_with_all_its_keys() {
-    use depthrig_drivers::v4l2::{ClockChoice, ControlValue, MemoryChoice, MjpegChoice};
+    use depthrig_usb::controls::ControlValue;
+    use depthrig_v4l2::{ClockChoice, MemoryChoice, MjpegChoice};
     let rig = parse(
         r#"
         rig = "lab"
@@ -725,7 +726,7 @@ fn a_rig_of_v4l2_cameras_is_not_faster_than_its_streams() {
 
 #[test]
 fn an_l515_and_its_controls() {
-    use depthrig_drivers::v4l2::ControlValue::Integer;
+    use depthrig_usb::controls::ControlValue::Integer;
     let rig = parse(
         r#"
         rig = "mount"

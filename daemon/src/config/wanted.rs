@@ -1,6 +1,6 @@
 //! The streams that a rig file asks a camera for.
 
-use depthrig_drivers::StreamRequest;
+use depthrig_driver::StreamRequest;
 
 /// A `[[camera.stream]]` and where it stands.
 pub(crate) struct WantedStream {

@@ -9,9 +9,9 @@ use super::plan::CameraPlan;
 use crate::attached::Attached;
 use crate::stage;
 use depthrig_bus::PixelFormat;
-use depthrig_drivers::StreamProfile;
-use depthrig_drivers::libusb;
-use depthrig_drivers::usb::health;
+use depthrig_driver::StreamProfile;
+use depthrig_libusb as libusb;
+use depthrig_usb::health;
 use serde::Serialize;
 use std::collections::BTreeMap;
 

@@ -6,13 +6,13 @@ use super::served;
 use crate::attached::{Attached, AttachedCamera, UseState};
 use crate::config::{CameraConfig, RigConfig};
 use crate::family::{self, Offered, Selector, Source};
-use depthrig_drivers::usb::health::{self, RULE_CURE};
-use depthrig_drivers::{Result, StreamProfile, choose_profiles};
+use depthrig_driver::{Result, StreamProfile, choose_profiles};
+use depthrig_usb::health::{self, RULE_CURE};
 
 /// The camera's streams when the rig runs: its own, and those computed from its left and right images.
 fn with_stereo(camera: &CameraConfig, device: &str, own: Vec<StreamProfile>) -> Result<Vec<StreamProfile>> {
     match &camera.stereo {
-        Some(stereo) => depthrig_drivers::stereo::offered(device, &own, &stereo.options()),
+        Some(stereo) => depthrig_stereo::offered(device, &own, &stereo.options()),
         None => Ok(own),
     }
 }

@@ -9,7 +9,7 @@ use crate::family::Unmet;
 use crate::priority;
 use crate::recording::reserve_bytes;
 use depthrig_bus::shm;
-use depthrig_drivers::usb::SysRoot;
+use depthrig_usb::SysRoot;
 use std::path::Path;
 
 /// Facts of the computer.

@@ -3,8 +3,8 @@
 use super::finding::{Finding, Severity};
 use crate::attached::{AttachedCamera, ModeReport};
 use crate::config::CameraConfig;
-use depthrig_drivers::StreamProfile;
-use depthrig_drivers::usb::health;
+use depthrig_driver::StreamProfile;
+use depthrig_usb::health;
 use serde::Serialize;
 
 /// A camera of the rig and the device that it would be.

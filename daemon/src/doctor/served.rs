@@ -5,7 +5,7 @@ use super::plan::{Planned, mode_missing, no_plan, set_streams};
 use crate::attached::{Attached, UseState, place_of_served};
 use crate::config::CameraConfig;
 use crate::family::Service;
-use depthrig_drivers::choose_profiles;
+use depthrig_driver::choose_profiles;
 use std::path::{Path, PathBuf};
 
 const INCOMPLETE: &str =

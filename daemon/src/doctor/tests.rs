@@ -10,8 +10,8 @@ use crate::attached::tests::{FakeAnswers, kinect_half, profile, rig_with};
 use crate::attached::{Attached, UseState};
 use crate::family::{Selector, Unmet, kinect};
 use depthrig_bus::PixelFormat;
-use depthrig_drivers::ErrorKind;
-use depthrig_drivers::usb::fake::{FakeDevice, FakeTree};
+use depthrig_driver::ErrorKind;
+use depthrig_usb::fake::{FakeDevice, FakeTree};
 use std::path::PathBuf;
 
 mod external;

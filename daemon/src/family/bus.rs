@@ -1,7 +1,7 @@
 //! Attached devices as a family recognises them.
 
-use depthrig_drivers::Backend;
-use depthrig_drivers::usb::{SysRoot, UsbDevice, VideoNode};
+use depthrig_driver::Backend;
+use depthrig_usb::{SysRoot, UsbDevice, VideoNode};
 use std::path::PathBuf;
 
 /// USB class of video, and its subclass of controlling interfaces (UVC 1.5 class specification, tables ).

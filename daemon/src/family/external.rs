@@ -3,9 +3,9 @@
 use super::{BackendConfig, CameraSettings, Family, Found, Identified, OpenContext, Reader, Service, Source};
 use crate::config::value::{not_empty, resolve, shown};
 use core::time::Duration;
-use depthrig_drivers::external::{ExternalBackend, ExternalConfig, NAME, Place};
-use depthrig_drivers::usb::UsbDevice;
-use depthrig_drivers::{Backend, Result};
+use depthrig_driver::{Backend, Result};
+use depthrig_external::{ExternalBackend, ExternalConfig, NAME, Place};
+use depthrig_usb::UsbDevice;
 use std::path::{Path, PathBuf};
 
 /// The longest that a process may be waited for, seconds: one that boots longer is better started before the rig.

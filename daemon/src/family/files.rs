@@ -2,8 +2,8 @@
 
 use super::{BackendConfig, CameraSettings, Family, Offered, OpenContext, Reader, Source};
 use crate::config::value::{not_empty, rate, resolve};
-use depthrig_drivers::files::{FilesBackend, FilesConfig};
-use depthrig_drivers::{Backend, Result, StreamRequest};
+use depthrig_driver::{Backend, Result, StreamRequest};
+use depthrig_sim::files::{FilesBackend, FilesConfig};
 use std::path::PathBuf;
 
 pub(super) const FAMILY: Family = Family::new("files", read);

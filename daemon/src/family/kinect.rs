@@ -14,13 +14,13 @@ use crate::config::read::Section;
 use crate::config::value::{not_empty, resolve, within};
 use crate::config::wanted::WantedStream;
 use core::ops::RangeInclusive;
-use depthrig_drivers::kinect::live::{
+use depthrig_driver::{Backend, Result, StreamProfile, StreamRequest};
+use depthrig_kinect::live::{
     self, CONTROLS, LiveBackend, LiveConfig, Places, STREAMS, check_libraries, find,
 };
-use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackBackend, PlaybackConfig};
-use depthrig_drivers::kinect::{DepthMode, NAME, WiredSync};
-use depthrig_drivers::usb::UsbDevice;
-use depthrig_drivers::{Backend, Result, StreamProfile, StreamRequest};
+use depthrig_kinect::playback::{CalibrationSource, PlaybackBackend, PlaybackConfig};
+use depthrig_kinect::{DepthMode, NAME, WiredSync};
+use depthrig_usb::UsbDevice;
 use std::path::{Path, PathBuf};
 
 /// The longest period of images, microseconds; at a faster rate the camera is refused when it is started.

@@ -6,12 +6,12 @@ use super::{
     Source,
 };
 use crate::config::controls;
-use depthrig_drivers::motion::IMU;
-use depthrig_drivers::realsense::l515::{L515Backend, L515Config, NAME};
-use depthrig_drivers::realsense::models::VENDOR;
-use depthrig_drivers::realsense::protocol::l515::Control;
-use depthrig_drivers::usb::UsbDevice;
-use depthrig_drivers::{Backend, Result, StreamRequest};
+use depthrig_driver::motion::IMU;
+use depthrig_driver::{Backend, Result, StreamRequest};
+use depthrig_realsense::l515::{L515Backend, L515Config, NAME};
+use depthrig_realsense::models::VENDOR;
+use depthrig_realsense::protocol::l515::Control;
+use depthrig_usb::UsbDevice;
 
 const STREAMS: [&str; 5] = ["depth", "color", "ir", "confidence", IMU];
 

@@ -8,12 +8,12 @@ use super::{
 use crate::config::controls;
 use crate::config::value::{not_empty, resolve, shown, within};
 use depthrig_bus::StreamName;
-use depthrig_drivers::motion::IMU;
-use depthrig_drivers::realsense::config::{Emitter, MetadataWish, TransportChoice};
-use depthrig_drivers::realsense::protocol::sync::SyncMode;
-use depthrig_drivers::realsense::{NAME, RealsenseBackend, RealsenseConfig, models};
-use depthrig_drivers::usb::UsbDevice;
-use depthrig_drivers::{Backend, Result, StreamRequest};
+use depthrig_driver::motion::IMU;
+use depthrig_driver::{Backend, Result, StreamRequest};
+use depthrig_realsense::config::{Emitter, MetadataWish, TransportChoice};
+use depthrig_realsense::protocol::sync::SyncMode;
+use depthrig_realsense::{NAME, RealsenseBackend, RealsenseConfig, models};
+use depthrig_usb::UsbDevice;
 use std::path::PathBuf;
 
 const TRANSPORTS: [(&str, TransportChoice); 3] = [

@@ -8,8 +8,8 @@ use core::fmt::Debug;
 use core::ops::{Deref, DerefMut};
 use core::time::Duration;
 use depthrig_bus::{CameraName, HostTime, Pose, RigName, RuntimeDir};
-use depthrig_drivers::synthetic::Drawing;
-use depthrig_drivers::{Backend, Result, StreamProfile, StreamRequest};
+use depthrig_driver::{Backend, Result, StreamProfile, StreamRequest};
+use depthrig_sim::synthetic::Drawing;
 use std::path::Path;
 use std::sync::Arc;
 

@@ -1,6 +1,6 @@
 //! Where a camera's frames come from, as far as its settings say: the doctor plans a session by it.
 
-use depthrig_drivers::{Result, StreamProfile};
+use depthrig_driver::{Result, StreamProfile};
 use std::path::Path;
 
 /// Where a camera's frames come from.

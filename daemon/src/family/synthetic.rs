@@ -6,12 +6,12 @@
 use super::{BackendConfig, CameraSettings, Family, Offered, OpenContext, Preparation, Reader, Source};
 use crate::config::read::{FromToml, Located, Section, nearest};
 use crate::config::value::resolve;
-use depthrig_drivers::synthetic::models::MODELS;
-use depthrig_drivers::synthetic::{
+use depthrig_driver::{Backend, Result, StreamRequest, choose_profiles};
+use depthrig_sim::synthetic::models::MODELS;
+use depthrig_sim::synthetic::{
     self, ClockSim, Drawing, FaultKind, ScheduledFault, StreamOverride, SyntheticBackend, SyntheticConfig,
     imu, profiles,
 };
-use depthrig_drivers::{Backend, Result, StreamRequest, choose_profiles};
 use std::path::PathBuf;
 
 pub(super) const FAMILY: Family = Family::new("synthetic", |r| Some(BackendConfig::new(read(r))));

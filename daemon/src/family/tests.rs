@@ -8,9 +8,9 @@ use crate::doctor::{Severity, Surroundings, examine};
 use crate::rig::{Rig, RigOptions};
 use core::time::Duration;
 use depthrig_bus::{HostTime, RuntimeDir};
-use depthrig_drivers::synthetic::{StreamOverride, SyntheticBackend, SyntheticConfig, profiles};
-use depthrig_drivers::usb::SysRoot;
-use depthrig_drivers::{Backend, MemorySink, Result, StreamRequest};
+use depthrig_driver::{Backend, MemorySink, Result, StreamRequest};
+use depthrig_sim::synthetic::{StreamOverride, SyntheticBackend, SyntheticConfig, profiles};
+use depthrig_usb::SysRoot;
 
 /// A toy camera: colour at a rate.
 #[derive(Debug, Clone, PartialEq)]

@@ -6,11 +6,12 @@ use super::{
 use crate::config::read::{Located, Section};
 use crate::config::value::within;
 use depthrig_bus::{Distortion, Intrinsics, StreamName};
-use depthrig_drivers::usb::UsbDevice;
-use depthrig_drivers::v4l2::{
-    BUFFERS, ClockChoice, ControlValue, GivenIntrinsics, MemoryChoice, MjpegChoice, V4l2Backend, V4l2Config,
+use depthrig_driver::{Backend, Result};
+use depthrig_usb::UsbDevice;
+use depthrig_usb::controls::ControlValue;
+use depthrig_v4l2::{
+    BUFFERS, ClockChoice, GivenIntrinsics, MemoryChoice, MjpegChoice, V4l2Backend, V4l2Config,
 };
-use depthrig_drivers::{Backend, Result};
 
 const MEMORY: [(&str, MemoryChoice); 2] =
     [("mmap", MemoryChoice::Mmap), ("userptr", MemoryChoice::UserPointer)];

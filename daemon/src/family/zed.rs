@@ -8,11 +8,11 @@ use super::{
 use crate::config::read::Section;
 use crate::config::value::{not_empty, rate, resolve, within};
 use crate::config::{controls, stereo};
-use depthrig_drivers::motion::IMU;
-use depthrig_drivers::usb::UsbDevice;
-use depthrig_drivers::zed::replay::{ZedPlaybackBackend, ZedPlaybackConfig};
-use depthrig_drivers::zed::{CalibrationFile, STREAMS, ZedBackend, ZedConfig};
-use depthrig_drivers::{Backend, Result, StreamRequest};
+use depthrig_driver::motion::IMU;
+use depthrig_driver::{Backend, Result, StreamRequest};
+use depthrig_usb::UsbDevice;
+use depthrig_zed::replay::{ZedPlaybackBackend, ZedPlaybackConfig};
+use depthrig_zed::{CalibrationFile, STREAMS, ZedBackend, ZedConfig};
 use std::path::PathBuf;
 
 /// Keys that a camera that is attached has and a recording has not.

@@ -4,9 +4,9 @@
 //! after the last set with the last. So nothing is left out, unless a file has no image at all or none for a minute.
 
 use depthrig_bus::{ClockDomain, DropCounts, DropReason, FrameHeader, MotionSample, PixelFormat};
-use depthrig_drivers::kinect::motion::{Measured, Samples, is_plausible};
-use depthrig_drivers::kinect::recording::motion_samples;
-use depthrig_drivers::motion::LONGEST;
+use depthrig_driver::motion::LONGEST;
+use depthrig_kinect::motion::{Measured, Samples, is_plausible};
+use depthrig_kinect::recording::motion_samples;
 use depthrig_recorder::{MotionRecord, RecordMotion, RecordSet, StreamAccount};
 use std::collections::VecDeque;
 

@@ -2,7 +2,7 @@
 
 use super::StreamFacts;
 use crate::rig::near_pair_ns;
-use depthrig_drivers::stereo::{COLOR, SIDES, StereoOptions};
+use depthrig_stereo::{COLOR, SIDES, StereoOptions};
 
 /// How far from the tick the frame of a stream may be: half of its period and a millisecond (see `sets`). Depth by stereo is
 /// of the set's pair or of one that stands in for it. `None` when the stream does not say how fast it is.
@@ -37,7 +37,7 @@ mod tests {
     use super::*;
     use crate::stream::Stream;
     use depthrig_bus::{Intrinsics, MetadataLevel, Name, PixelFormat, Pose};
-    use depthrig_drivers::{DeviceClock, StreamProfile};
+    use depthrig_driver::{DeviceClock, StreamProfile};
     use std::sync::Arc;
 
     fn facts(name: &str, rate_hz: f64) -> StreamFacts {

@@ -10,8 +10,8 @@ use crate::status::{
 use crate::stream::Stream;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{ClockDomain, HostTime, UtcPair, shm};
-use depthrig_drivers::synthetic::DrawingProgress;
 use depthrig_recorder::{Diagnostic, Level};
+use depthrig_sim::synthetic::DrawingProgress;
 use std::sync::atomic::Ordering;
 
 /// Everything there is to know about the rig now.

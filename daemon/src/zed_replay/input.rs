@@ -5,12 +5,12 @@ use depthrig_bus::{
     ClockDomain, FrameFlags, FrameHeader, HostTime, Intrinsics, PixelFormat, Pose, StreamId, UtcPair,
 };
 use depthrig_calib::PoseExt;
-use depthrig_drivers::zed::conf::StereoCalibration;
-use depthrig_drivers::zed::replay::{self, Pair, Source};
 use depthrig_recorder::{
     Dataset, DatasetFrame, Derived, Error, ErrorKind, PixelMode, RecordMotion, Result, Session, SetReader,
     StreamAccount, StreamRecord,
 };
+use depthrig_zed::conf::StereoCalibration;
+use depthrig_zed::replay::{self, Pair, Source};
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -90,11 +90,11 @@ fn bad(message: impl Into<String>) -> Error {
     Error::new(ErrorKind::BadInput, message)
 }
 
-fn driver(e: depthrig_drivers::Error) -> Error {
+fn driver(e: depthrig_driver::Error) -> Error {
     let kind = match e.kind() {
-        depthrig_drivers::ErrorKind::NotFound => ErrorKind::NotFound,
-        depthrig_drivers::ErrorKind::PermissionDenied => ErrorKind::PermissionDenied,
-        depthrig_drivers::ErrorKind::BadInput | depthrig_drivers::ErrorKind::Unsupported => {
+        depthrig_driver::ErrorKind::NotFound => ErrorKind::NotFound,
+        depthrig_driver::ErrorKind::PermissionDenied => ErrorKind::PermissionDenied,
+        depthrig_driver::ErrorKind::BadInput | depthrig_driver::ErrorKind::Unsupported => {
             ErrorKind::BadRecording
         }
         _ => ErrorKind::Io,

@@ -8,8 +8,8 @@ use depthrig_calib::stereo::{
     Description, DisparityMap, Matcher, Parameters, Preset, SgmPresets, StereoPair,
 };
 use depthrig_cdm::{NetworkPixels, StereoNetwork, StereoNetworkOptions};
-use depthrig_drivers::stereo::Geometry;
 use depthrig_recorder::{Error, ErrorKind, Result};
+use depthrig_stereo::Geometry;
 use std::path::PathBuf;
 
 /// A way to make depth, named after the vendor's mode that it stands in for.

@@ -2,8 +2,8 @@
 
 use anyhow::{Context, Result};
 use depthrig_bus::{Intrinsics, Name, Pose};
-use depthrig_drivers::synthetic::{SyntheticBackend, SyntheticConfig};
-use depthrig_drivers::{Backend, Device, MemorySink, StreamRequest};
+use depthrig_driver::{Backend, Device, MemorySink, StreamRequest};
+use depthrig_sim::synthetic::{SyntheticBackend, SyntheticConfig};
 use image::{ImageBuffer, Luma, RgbImage};
 use std::path::Path;
 use std::time::Duration;

@@ -7,8 +7,8 @@
 use anyhow::{Context, Result, ensure};
 use depthrig_bus::{Distortion, HostTime, Intrinsics, Name, Pose};
 use depthrig_calib::{Camera, PoseExt};
-use depthrig_drivers::synthetic::{SyntheticBackend, SyntheticConfig};
-use depthrig_drivers::{Backend, MemorySink, Stream, StreamRequest};
+use depthrig_driver::{Backend, MemorySink, Stream, StreamRequest};
+use depthrig_sim::synthetic::{SyntheticBackend, SyntheticConfig};
 use glam::{DQuat, DVec2, DVec3};
 use image::RgbImage;
 use std::fmt::Write as _;
@@ -44,7 +44,7 @@ pub fn right_in_left() -> Pose {
     Pose { translation_m: [0.1198, 0.0002, -0.0003], rotation_xyzw: turn.to_array() }
 }
 
-/// The factory calibration's text, in the vendor's units and order (docs of the format: drivers/src/zed/conf.rs).
+/// The factory calibration's text, in the vendor's units and order (docs of the format: drivers/zed/src/conf.rs).
 pub fn conf() -> Result<String> {
     let mut text = String::new();
     for (side, k) in ["LEFT", "RIGHT"].into_iter().zip(lenses()) {
@@ -137,8 +137,7 @@ fn shoot(poses: u32, pairs: usize) -> Result<[Seen; 2]> {
         |pixels: &[u8]| RgbImage::from_raw(1280, 720, pixels.to_vec()).context("an image of another size");
     let mut matched = 0;
     for (_, l, pixels) in &left.frames {
-        let same =
-            |r: &depthrig_drivers::FrameMeta| r.capture_time.since_ns(l.capture_time).abs() < 8_000_000;
+        let same = |r: &depthrig_driver::FrameMeta| r.capture_time.since_ns(l.capture_time).abs() < 8_000_000;
         let partner = right.frames.iter().find(|(_, r, _)| same(r));
         if let Some((_, _, other)) = partner {
             matched += 1;
@@ -207,12 +206,12 @@ impl Warp {
 mod tests {
     use super::*;
     use depthrig_calib::stereo::Preset;
-    use depthrig_drivers::Poll;
-    use depthrig_drivers::stereo::{StereoBackend, StereoMode, StereoOptions};
-    use depthrig_drivers::zed::CalibrationFile;
-    use depthrig_drivers::zed::conf::FactoryCalibration;
-    use depthrig_drivers::zed::mode::Mode;
-    use depthrig_drivers::zed::replay::{ZedPlaybackBackend, ZedPlaybackConfig};
+    use depthrig_driver::Poll;
+    use depthrig_stereo::{StereoBackend, StereoMode, StereoOptions};
+    use depthrig_zed::CalibrationFile;
+    use depthrig_zed::conf::FactoryCalibration;
+    use depthrig_zed::mode::Mode;
+    use depthrig_zed::replay::{ZedPlaybackBackend, ZedPlaybackConfig};
 
     /// The text is read back as the values it was built from.
     #[test]

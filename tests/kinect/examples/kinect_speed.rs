@@ -10,10 +10,10 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stdout)] // a measuring program: any failure ends it
 
 use depthrig_bus::{DropReason, HostTime, Name, PixelFormat};
-use depthrig_drivers::clock::ClockQuality;
-use depthrig_drivers::kinect::Recording;
-use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackBackend, PlaybackConfig};
-use depthrig_drivers::{Backend, FrameMeta, FrameSink, Poll, StreamRequest};
+use depthrig_driver::clock::ClockQuality;
+use depthrig_driver::{Backend, FrameMeta, FrameSink, Poll, StreamRequest};
+use depthrig_kinect::Recording;
+use depthrig_kinect::playback::{CalibrationSource, PlaybackBackend, PlaybackConfig};
 use depthrig_kinect_fixture::{Fixture, Pattern};
 use rustix::time::{ClockId, clock_gettime};
 use std::path::{Path, PathBuf};

@@ -3,11 +3,11 @@
 use super::Fixture;
 use depthrig_bus::{Name, PixelFormat, Pose};
 use depthrig_calib::PoseExt;
-use depthrig_drivers::kinect::calibration::{Calibration, CameraCalibration, LensModel, RawIntrinsics};
-use depthrig_drivers::kinect::modes::Cut;
-use depthrig_drivers::kinect::{ColorFormat, ColorMode, DepthMode};
-use depthrig_drivers::synthetic::{SyntheticBackend, SyntheticConfig};
-use depthrig_drivers::{Backend, MemorySink, StreamProfile, StreamRequest};
+use depthrig_driver::{Backend, MemorySink, StreamProfile, StreamRequest};
+use depthrig_kinect::calibration::{Calibration, CameraCalibration, LensModel, RawIntrinsics};
+use depthrig_kinect::modes::Cut;
+use depthrig_kinect::{ColorFormat, ColorMode, DepthMode};
+use depthrig_sim::synthetic::{SyntheticBackend, SyntheticConfig};
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use std::collections::HashMap;
 use std::time::Duration;

@@ -4,7 +4,7 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used)] // test support: a failure here is a failed test
 
-use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
+use depthrig_kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
 use std::io::{self, BufWriter, Seek, Write};
 use std::path::Path;
 

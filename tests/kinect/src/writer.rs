@@ -2,7 +2,7 @@
 
 use super::element::{element, id as id_bytes, master, size, text, uint, uint8, vint};
 use super::{ACCEL_LATE_NS, Fixture, Images, Lacing, MOTION_NS, Written, motion};
-use depthrig_drivers::kinect::ebml::id;
+use depthrig_kinect::ebml::id;
 use std::io::{self, Seek, SeekFrom, Write};
 
 /// The longest cluster, nanoseconds.

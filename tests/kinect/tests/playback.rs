@@ -2,11 +2,11 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{Distortion, DropReason, FrameFlags, HostTime, MotionSample, Name, PixelFormat, Pose};
-use depthrig_drivers::conformance::{self, Bench, Cannot, Rig, Sent, Subject, Trouble};
-use depthrig_drivers::kinect::playback::{CalibrationSource, PlaybackBackend, PlaybackConfig};
-use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
-use depthrig_drivers::{Backend, DeviceInfo, ErrorKind, MemorySink, Poll, Stream, StreamRequest};
+use depthrig_driver::{Backend, DeviceInfo, ErrorKind, MemorySink, Poll, Stream, StreamRequest};
+use depthrig_kinect::playback::{CalibrationSource, PlaybackBackend, PlaybackConfig};
+use depthrig_kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, WiredSync};
 use depthrig_kinect_fixture::{ACCEL_LATE_NS, Fixture, Images, Lacing, Pattern, damage_time, motion};
+use depthrig_sim::conformance::{self, Bench, Cannot, Rig, Sent, Subject, Trouble};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tempfile::TempDir;

@@ -2,8 +2,8 @@
 //! FFmpeg and MKVToolNix where they are installed (`tools/setup.sh test`).
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
-use depthrig_drivers::kinect::recording::TrackKind;
-use depthrig_drivers::kinect::{DepthMode, Recording};
+use depthrig_kinect::recording::TrackKind;
+use depthrig_kinect::{DepthMode, Recording};
 use depthrig_kinect_fixture::{CALIBRATION, Fixture, Images, Lacing, Pattern};
 use matroska_demuxer::{Frame, MatroskaFile};
 use std::io::Cursor;

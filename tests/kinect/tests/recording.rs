@@ -2,15 +2,15 @@
 //! Long because each form is a case.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
-use depthrig_drivers::ErrorKind;
-use depthrig_drivers::kinect::recording::{Losses, Pixels, ReadAt, TrackKind, motion_samples};
-use depthrig_drivers::kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, Recording, WiredSync};
+use depthrig_driver::ErrorKind;
+use depthrig_kinect::recording::{Losses, Pixels, ReadAt, TrackKind, motion_samples};
+use depthrig_kinect::{ColorFormat, ColorMode, ColorResolution, DepthMode, Recording, WiredSync};
 use depthrig_kinect_fixture::{
     ACCEL_LATE_NS, CALIBRATION, Fixture, Images, Lacing, Pattern, element, motion,
 };
 use std::path::PathBuf;
 
-fn open(bytes: Vec<u8>) -> depthrig_drivers::Result<Recording> {
+fn open(bytes: Vec<u8>) -> depthrig_driver::Result<Recording> {
     Recording::read(Box::new(bytes), "test.mkv")
 }
 

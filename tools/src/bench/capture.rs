@@ -10,11 +10,11 @@ use depthrig_bus::clock::thread_cpu_ns;
 use depthrig_bus::{
     Bus, DropReason, FrameHeader, HostTime, PixelFormat, Publisher, RigName, RuntimeDir, StreamId, StreamName,
 };
-use depthrig_drivers::clock::ClockQuality;
-use depthrig_drivers::v4l2::{ClockChoice, FourCc, MemoryChoice, Node, V4l2Backend, V4l2Config};
-use depthrig_drivers::{
+use depthrig_driver::clock::ClockQuality;
+use depthrig_driver::{
     Backend, FrameMeta, FrameSink, Loan, StreamProfile, StreamRequest, choose_profiles, unpack,
 };
+use depthrig_v4l2::{ClockChoice, FourCc, MemoryChoice, Node, V4l2Backend, V4l2Config};
 use serde::Serialize;
 use v4l::buffer::Type;
 use v4l::io::traits::CaptureStream;

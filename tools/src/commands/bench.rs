@@ -11,9 +11,9 @@ use crate::progress::Progress;
 use anyhow::Result;
 use core::time::Duration;
 use depthrig_bus::RuntimeDir;
-use depthrig_drivers::v4l2::V4l2Config;
 use depthrig_recorder::bench::soak::{self, SoakOptions, SoakReport};
 use depthrig_recorder::bench::{BenchOptions, BenchReport, Conditions};
+use depthrig_v4l2::V4l2Config;
 use std::path::PathBuf;
 
 /// Examples for `--help`.

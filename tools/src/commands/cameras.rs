@@ -5,8 +5,8 @@ use crate::exit::Exit;
 use crate::{out, screen};
 use anyhow::Result;
 use depthrig_daemon::attached::{Attached, AttachedCamera, ModeReport, System, UseState, look};
-use depthrig_drivers::realsense::{RealsenseBackend, RealsenseConfig};
-use depthrig_drivers::usb::SysRoot;
+use depthrig_realsense::{RealsenseBackend, RealsenseConfig};
+use depthrig_usb::SysRoot;
 use std::path::PathBuf;
 
 /// Examples for `--help`.

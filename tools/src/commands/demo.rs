@@ -20,10 +20,10 @@ use depthrig_daemon::control::RecordRequest;
 use depthrig_daemon::rig::{Rig, RigSummary};
 use depthrig_daemon::status::{CameraStatus, RigStatus};
 use depthrig_daemon::zed_replay::Mode;
-use depthrig_drivers::StreamRequest;
-use depthrig_drivers::synthetic::SyntheticConfig;
+use depthrig_driver::StreamRequest;
 use depthrig_recorder::report::REPORT_FILE;
 use depthrig_recorder::{Dataset, VerifyOptions, verify};
+use depthrig_sim::synthetic::SyntheticConfig;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 

@@ -8,7 +8,7 @@ use anyhow::Result;
 use depthrig_daemon::attached::System;
 use depthrig_daemon::config::RigConfig;
 use depthrig_daemon::doctor::{Finding, Report, Severity, Surroundings, examine};
-use depthrig_drivers::usb::SysRoot;
+use depthrig_usb::SysRoot;
 use std::path::PathBuf;
 
 /// Examples for `--help`.

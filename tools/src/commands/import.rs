@@ -10,7 +10,7 @@ use clap::ValueEnum;
 use core::ops::ControlFlow;
 use depthrig_bus::CameraName;
 use depthrig_daemon::import_kinect::{KinectImport, KinectOptions};
-use depthrig_drivers::kinect::playback::CalibrationSource;
+use depthrig_kinect::playback::CalibrationSource;
 use depthrig_recorder::exchange::{
     ByteCameraImport, ByteCameraOptions, ImportReport, Importer, RosbagImport, import,
 };

@@ -6,8 +6,8 @@ use crate::family::Family;
 use crate::status::RigStatus;
 use core::cell::Cell;
 use depthrig_bus::{Name, RuntimeDir};
-use depthrig_drivers::external::Place;
-use depthrig_drivers::{DeviceInfo, Result, StreamProfile};
+use depthrig_driver::{DeviceInfo, Result, StreamProfile};
+use depthrig_external::Place;
 use std::path::Path;
 
 const SERVED: &str = r#"
@@ -75,7 +75,7 @@ fn cameras_of_other_processes_are_planned_by_what_those_offer() {
     let report = served_report(&other_mode, Some(Ok(PixelFormat::Rgb8)));
     assert_eq!(ids(&report), [("mode_missing", Severity::Error)]);
 
-    let e = depthrig_drivers::Error::new(ErrorKind::Disconnected, "has said nothing for 2.0 s");
+    let e = depthrig_driver::Error::new(ErrorKind::Disconnected, "has said nothing for 2.0 s");
     let report = served_report(SERVED, Some(Err(e)));
     assert_eq!(ids(&report), [("camera_failed", Severity::Error)]);
     assert!(
@@ -84,7 +84,7 @@ fn cameras_of_other_processes_are_planned_by_what_those_offer() {
         report.findings
     );
     let text = "process 4711 (oak) serves it and has said nothing for 2.0 s";
-    let e = depthrig_drivers::Error::new(ErrorKind::Disconnected, text);
+    let e = depthrig_driver::Error::new(ErrorKind::Disconnected, text);
     let report = served_report(SERVED, Some(Err(e)));
     assert_eq!(report.findings[0].what, text, "it is named once");
 }

@@ -2,7 +2,7 @@
 
 use crate::doctor::{Finding, Severity};
 use crate::family::Unmet;
-use depthrig_drivers::kinect::live::CURE;
+use depthrig_kinect::live::CURE;
 
 /// Facts about this computer that a session with an attached Kinect depends on.
 pub(crate) struct Facts {

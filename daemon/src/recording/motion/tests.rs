@@ -4,7 +4,7 @@ use super::*;
 use depthrig_bus::{
     Bus, Intrinsics, MetadataLevel, MotionSample, Name, PixelFormat, Pose, Publisher, RuntimeDir, Subscriber,
 };
-use depthrig_drivers::{DeviceClock, StreamProfile};
+use depthrig_driver::{DeviceClock, StreamProfile};
 
 /// A unit's channel with both ends.
 struct Channel {

@@ -7,7 +7,7 @@ mod zed;
 
 use crate::content::hash;
 use crate::model::{Family, Model};
-use depthrig_drivers::realsense::protocol::tables::{Coefficients, Pinhole, RgbTable, SIZES};
+use depthrig_realsense::protocol::tables::{Coefficients, Pinhole, RgbTable, SIZES};
 pub use imu::{ImuAxes, ImuCalibration};
 pub use l515::{L515, L515Color, L515Depth};
 pub use zed::{ZedIntrinsics, ZedMode};

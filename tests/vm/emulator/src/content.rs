@@ -200,7 +200,7 @@ mod tests {
         assert_eq!(Stamp::read(&sent), Some(Stamp { serial_hash: hash("a"), stream: 1, index: 9 }));
         assert_eq!(Stamp::read(&sent[2..]), None);
         let mut seen = vec![0; 64 * 48 * 3];
-        depthrig_drivers::unpack::decode_jpeg(&sent, 64, 48, &mut seen).unwrap();
+        depthrig_driver::unpack::decode_jpeg(&sent, 64, 48, &mut seen).unwrap();
         let off = seen.iter().zip(painted("a", 1, &mode)).map(|(a, b)| a.abs_diff(b)).max();
         assert!(off.unwrap() <= 8, "{off:?}");
         assert_ne!(painted("a", 1, &mode), painted("b", 1, &mode));

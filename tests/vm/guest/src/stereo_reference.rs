@@ -4,9 +4,9 @@ use anyhow::Context;
 use depthrig_bus::PixelFormat;
 use depthrig_calib::stereo::{DisparityMap, Gray, Matcher, Preset, StereoPair, depth_from_disparity};
 use depthrig_calib::{Rectifier, View};
-use depthrig_drivers::stereo::{Geometry, StereoMode, StereoOptions};
-use depthrig_drivers::zed::conf::FactoryCalibration;
-use depthrig_drivers::zed::mode::Mode;
+use depthrig_stereo::{Geometry, StereoMode, StereoOptions};
+use depthrig_zed::conf::FactoryCalibration;
+use depthrig_zed::mode::Mode;
 
 /// Computes depth from a ZED's pairs.
 pub struct StereoReference {

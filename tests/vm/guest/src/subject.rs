@@ -6,13 +6,14 @@ use crate::system;
 use anyhow::Context;
 use core::time::Duration;
 use depthrig_bus::{HostTime, PixelFormat};
-use depthrig_drivers::conformance::{Bench, Cannot, Rig, Sent, Subject, Trouble};
-use depthrig_drivers::realsense::RealsenseBackend;
-use depthrig_drivers::realsense::config::{RealsenseConfig, TransportChoice};
-use depthrig_drivers::usb::{self, SysRoot};
-use depthrig_drivers::v4l2::{FourCc, Node, V4l2Backend, V4l2Config};
-use depthrig_drivers::{Backend, StreamRequest};
+use depthrig_driver::{Backend, StreamRequest};
 use depthrig_emulator::{Camera, Damage, Fault, Options, Stamp};
+use depthrig_realsense::RealsenseBackend;
+use depthrig_realsense::config::{RealsenseConfig, TransportChoice};
+use depthrig_sim::conformance::{Bench, Cannot, Rig, Sent, Subject, Trouble};
+use depthrig_usb as usb;
+use depthrig_usb::SysRoot;
+use depthrig_v4l2::{FourCc, Node, V4l2Backend, V4l2Config};
 use std::sync::Arc;
 
 /// How long a camera may take to be bound by its drivers.

@@ -2,8 +2,8 @@
 
 use core::time::Duration;
 use depthrig_bus::{DropCounts, DropReason, HostTime};
-use depthrig_drivers::clock::ClockQuality;
-use depthrig_drivers::{FrameMeta, FrameSink, Poll, Stream};
+use depthrig_driver::clock::ClockQuality;
+use depthrig_driver::{FrameMeta, FrameSink, Poll, Stream};
 use depthrig_emulator::Stamp;
 
 /// A frame that was delivered.
@@ -34,7 +34,7 @@ impl Tally {
     ///
     /// # Errors
     /// Those of the stream.
-    pub fn poll_for(&mut self, stream: &mut dyn Stream, time: Duration) -> depthrig_drivers::Result<()> {
+    pub fn poll_for(&mut self, stream: &mut dyn Stream, time: Duration) -> depthrig_driver::Result<()> {
         let end = HostTime::now().plus(time);
         while !end.from_now().is_zero() {
             if stream.poll(Duration::from_millis(50), self)? == Poll::End {

@@ -3,8 +3,9 @@
 use crate::system;
 use anyhow::Context;
 use depthrig_bus::{HostTime, StreamName};
-use depthrig_drivers::v4l2::{ControlValue, Node, V4l2Backend, V4l2Config};
-use depthrig_drivers::{Backend, Error, MemorySink, Poll, Stream, StreamProfile, StreamRequest};
+use depthrig_driver::{Backend, Error, MemorySink, Poll, Stream, StreamProfile, StreamRequest};
+use depthrig_usb::controls::ControlValue;
+use depthrig_v4l2::{Node, V4l2Backend, V4l2Config};
 use std::path::PathBuf;
 use std::process::Command;
 use std::time::Duration;

@@ -9,8 +9,8 @@ use clap::ValueEnum;
 use depthrig_daemon::zed_replay::{
     Mode, NetworkChoice, NetworkPixels, OpenOptions, Step, ZedReplayOptions, ZedReplayReport, zed_replay,
 };
-use depthrig_drivers::zed::CalibrationFile;
 use depthrig_recorder::ColorCodec;
+use depthrig_zed::CalibrationFile;
 use std::path::PathBuf;
 
 /// Examples for `--help`.

@@ -5,8 +5,8 @@
 use super::monitor::{EMPTY_TABLE, NO_DATA, NOT_READY, Request, UNSUPPORTED, WRONG_COMMAND, WRONG_PARAMETER};
 use super::{Flash, World, imu_table as imu, read_clock};
 use crate::model::{ImuChip, Model, from_hex};
-use depthrig_drivers::realsense::protocol::advanced::Group;
-use depthrig_drivers::realsense::protocol::tables::{self, Pinhole, RectifiedItem, SIZES};
+use depthrig_realsense::protocol::advanced::Group;
+use depthrig_realsense::protocol::tables::{self, Pinhole, RectifiedItem, SIZES};
 
 const CLOCK: u32 = 0x0001_613C;
 const D405: u16 = 0x0B5B;

@@ -5,7 +5,7 @@
 
 use super::{Flash, World};
 use crate::calibration::{ImuAxes, ImuCalibration};
-use depthrig_drivers::realsense::protocol::tables::Header;
+use depthrig_realsense::protocol::tables::Header;
 
 /// Its number in [`crate::Fault::DamagedTable`].
 const IMU: u32 = 34;

@@ -1,9 +1,9 @@
 //! The firmware of a ZED 2i: the registers and the flash of its video bridge, and its IMU.
 
 use depthrig_bus::HostTime;
-use depthrig_drivers::zed::command::{Command, answer, serial_bytes};
-use depthrig_drivers::zed::mode::Side;
-use depthrig_drivers::zed::sensors::{REQUEST_REPORT, Record, STREAM_REPORT};
+use depthrig_zed::command::{Command, answer, serial_bytes};
+use depthrig_zed::mode::Side;
+use depthrig_zed::sensors::{REQUEST_REPORT, Record, STREAM_REPORT};
 use std::collections::BTreeMap;
 
 /// The unit and the selector of the vendor's commands.

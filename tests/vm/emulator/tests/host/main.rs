@@ -4,12 +4,12 @@
 
 mod usb;
 
-use depthrig_drivers::realsense::protocol::gvd::Gvd;
-use depthrig_drivers::realsense::protocol::tables::{Coefficients, RgbTable};
-use depthrig_drivers::uvc::descriptors::{Configuration, TransferKind};
 use depthrig_emulator::model::Size;
 use depthrig_emulator::usbip;
 use depthrig_emulator::{Camera, Damage, Fault, Model, Options, Speed, Stamp};
+use depthrig_realsense::protocol::gvd::Gvd;
+use depthrig_realsense::protocol::tables::{Coefficients, RgbTable};
+use depthrig_usb::uvc::descriptors::{Configuration, TransferKind};
 use std::sync::Arc;
 use std::time::Duration;
 use usb::Host;
@@ -250,7 +250,7 @@ fn an_imu_reports_while_it_hears_from_the_host() {
     let mut last = 0;
     for _ in 0..20 {
         let (_, report) = host.bulk_in(1, 64);
-        let record = depthrig_drivers::zed::sensors::Record::parse(&report).unwrap();
+        let record = depthrig_zed::sensors::Record::parse(&report).unwrap();
         assert!(record.ticks > last && record.motion_valid);
         last = record.ticks;
     }
@@ -262,7 +262,7 @@ fn an_imu_reports_while_it_hears_from_the_host() {
 
 #[test]
 fn a_zed_has_its_serial_in_its_flash() {
-    use depthrig_drivers::zed::command::{Command, parse_serial};
+    use depthrig_zed::command::{Command, parse_serial};
     let (camera, mut host) = camera("zed2i", Options::default());
     assert!(camera.companion().is_some_and(|mcu| mcu.usb_serial() == camera.serial()));
     let block = Command::ReadFlash { address: 0x1_8000, length: 6 }.block();

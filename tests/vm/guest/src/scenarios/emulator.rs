@@ -4,10 +4,10 @@ use crate::checks::Checks;
 use crate::{Scenario, system};
 use anyhow::Context;
 use depthrig_bus::HostTime;
-use depthrig_drivers::uvc::control::{ControlPort, Query};
-use depthrig_drivers::v4l2::{FourCc, MetadataFormat, Node, Source, Wanted};
-use depthrig_drivers::video::ImageSource;
 use depthrig_emulator::{Camera, Damage, Fault, Options, Stamp};
+use depthrig_usb::uvc::control::{ControlPort, Query};
+use depthrig_usb::video::ImageSource;
+use depthrig_v4l2::{FourCc, MetadataFormat, Node, Source, Wanted};
 use std::path::Path;
 use std::time::Duration;
 

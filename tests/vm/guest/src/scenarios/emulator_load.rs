@@ -5,9 +5,9 @@ use crate::checks::Checks;
 use crate::{Scenario, system};
 use anyhow::Context;
 use depthrig_bus::HostTime;
-use depthrig_drivers::v4l2::{FourCc, Node, Source, Wanted};
-use depthrig_drivers::video::ImageSource;
 use depthrig_emulator::{Camera, Options};
+use depthrig_usb::video::ImageSource;
+use depthrig_v4l2::{FourCc, Node, Source, Wanted};
 use std::path::Path;
 use std::time::Duration;
 

@@ -6,9 +6,9 @@ use crate::{Scenario, system};
 use anyhow::Context;
 use depthrig_bus::{HostTime, MetadataLevel, Name, PixelFormat};
 use depthrig_calib::PoseExt;
-use depthrig_drivers::realsense::l515::{L515Backend, L515Config};
-use depthrig_drivers::{Backend, ErrorKind, MemorySink, Poll, Stream, StreamProfile, StreamRequest};
+use depthrig_driver::{Backend, ErrorKind, MemorySink, Poll, Stream, StreamProfile, StreamRequest};
 use depthrig_emulator::{Camera, Options, Stamp};
+use depthrig_realsense::l515::{L515Backend, L515Config};
 use glam::DVec3;
 use std::time::Duration;
 
@@ -246,7 +246,7 @@ fn unplugged(
             Ok(_) => {}
         }
     };
-    let kind = error.as_ref().map(depthrig_drivers::Error::kind);
+    let kind = error.as_ref().map(depthrig_driver::Error::kind);
     checks.equal("unplugged is disconnected", kind, Some(ErrorKind::Disconnected));
     drop(stream);
     let gone = backend.open(None).map(|_| ()).expect_err("it is not there");

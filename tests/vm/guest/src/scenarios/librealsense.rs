@@ -11,11 +11,11 @@ mod vendor;
 use crate::checks::Checks;
 use crate::subject::{plug, wait_for_imu};
 use crate::{Scenario, system};
-use depthrig_drivers::Backend;
-use depthrig_drivers::realsense::RealsenseBackend;
-use depthrig_drivers::realsense::config::{RealsenseConfig, TransportChoice};
-use depthrig_drivers::realsense::l515::{L515Backend, L515Config};
+use depthrig_driver::Backend;
 use depthrig_emulator::{Camera, Options};
+use depthrig_realsense::RealsenseBackend;
+use depthrig_realsense::config::{RealsenseConfig, TransportChoice};
+use depthrig_realsense::l515::{L515Backend, L515Config};
 use serde_json::json;
 use vendor::Vendor;
 

@@ -8,11 +8,11 @@ use crate::{Scenario, system};
 use anyhow::Context;
 use depthrig_bus::{Distortion, Pose};
 use depthrig_calib::PoseExt;
-use depthrig_drivers::realsense::RealsenseBackend;
-use depthrig_drivers::realsense::config::{RealsenseConfig, TransportChoice};
-use depthrig_drivers::realsense::protocol::tables::{Coefficients, RgbTable, SIZES};
-use depthrig_drivers::{Backend, ErrorKind, StreamProfile};
+use depthrig_driver::{Backend, ErrorKind, StreamProfile};
 use depthrig_emulator::{Camera, Fault, Options};
+use depthrig_realsense::RealsenseBackend;
+use depthrig_realsense::config::{RealsenseConfig, TransportChoice};
+use depthrig_realsense::protocol::tables::{Coefficients, RgbTable, SIZES};
 
 /// See the module.
 pub const SCENARIO: Scenario = Scenario {

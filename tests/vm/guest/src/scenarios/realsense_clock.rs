@@ -8,10 +8,10 @@ use crate::{Scenario, system};
 use core::fmt::Write as _;
 use core::time::Duration;
 use depthrig_bus::{FrameFlags, HostTime, MetadataLevel};
-use depthrig_drivers::realsense::RealsenseBackend;
-use depthrig_drivers::realsense::config::{RealsenseConfig, TransportChoice};
-use depthrig_drivers::{Backend, ErrorKind, Stream, StreamRequest};
+use depthrig_driver::{Backend, ErrorKind, Stream, StreamRequest};
 use depthrig_emulator::{Camera, Fault, Options};
+use depthrig_realsense::RealsenseBackend;
+use depthrig_realsense::config::{RealsenseConfig, TransportChoice};
 
 /// See the module.
 pub const SCENARIO: Scenario = Scenario {
@@ -35,7 +35,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
         transport: TransportChoice::Kernel,
         ..RealsenseConfig::default()
     });
-    let start = || -> depthrig_drivers::Result<Box<dyn Stream>> {
+    let start = || -> depthrig_driver::Result<Box<dyn Stream>> {
         let request = |s: &str| small(s).map(|r| StreamRequest { rate_hz: Some(15.0), ..r });
         let requests: Vec<_> = ["depth", "color"].iter().filter_map(|s| request(s)).collect();
         backend.open(None)?.start(&requests)

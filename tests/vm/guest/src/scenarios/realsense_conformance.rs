@@ -4,8 +4,8 @@
 use crate::checks::Checks;
 use crate::subject::{Emulated, Way};
 use crate::{Scenario, system};
-use depthrig_drivers::conformance::{self, Verdict};
-use depthrig_drivers::realsense::config::TransportChoice;
+use depthrig_realsense::config::TransportChoice;
+use depthrig_sim::conformance::{self, Verdict};
 
 /// See the module.
 pub const SCENARIO: Scenario = Scenario {

@@ -8,13 +8,15 @@ use crate::tally::Tally;
 use crate::{Scenario, system};
 use core::time::Duration;
 use depthrig_bus::{DropReason, MetadataLevel};
-use depthrig_drivers::realsense::RealsenseBackend;
-use depthrig_drivers::realsense::config::{Emitter, MetadataWish, RealsenseConfig, TransportChoice};
-use depthrig_drivers::usb::{self, SysRoot};
-use depthrig_drivers::uvc::control::{ControlPort, Query};
-use depthrig_drivers::v4l2::{ControlValue, Node};
-use depthrig_drivers::{Backend, ErrorKind, Stream};
+use depthrig_driver::{Backend, ErrorKind, Stream};
 use depthrig_emulator::{Camera, Damage, Fault, Options};
+use depthrig_realsense::RealsenseBackend;
+use depthrig_realsense::config::{Emitter, MetadataWish, RealsenseConfig, TransportChoice};
+use depthrig_usb as usb;
+use depthrig_usb::SysRoot;
+use depthrig_usb::controls::ControlValue;
+use depthrig_usb::uvc::control::{ControlPort, Query};
+use depthrig_v4l2::Node;
 
 /// See the module.
 pub const SCENARIO: Scenario = Scenario {
@@ -49,7 +51,7 @@ fn config(camera: &Camera) -> RealsenseConfig {
     }
 }
 
-fn start(config: RealsenseConfig) -> depthrig_drivers::Result<Box<dyn Stream>> {
+fn start(config: RealsenseConfig) -> depthrig_driver::Result<Box<dyn Stream>> {
     let requests: Vec<_> = ["depth", "color"].iter().filter_map(|s| small(s)).collect();
     RealsenseBackend::new(config).open(None)?.start(&requests)
 }

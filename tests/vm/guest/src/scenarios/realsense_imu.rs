@@ -8,12 +8,13 @@ use crate::{Scenario, system};
 use anyhow::Context;
 use core::time::Duration;
 use depthrig_bus::{FrameFlags, HostTime, MotionSample, Name};
-use depthrig_drivers::realsense::RealsenseBackend;
-use depthrig_drivers::realsense::config::{RealsenseConfig, TransportChoice};
-use depthrig_drivers::usb::SysRoot;
-use depthrig_drivers::{Backend, ErrorKind, MemorySink, Stream, StreamRequest, iio};
+use depthrig_driver::{Backend, ErrorKind, MemorySink, Stream, StreamRequest};
 use depthrig_emulator::{Camera, Fault, ImuSensor, Options};
+use depthrig_realsense::RealsenseBackend;
+use depthrig_realsense::config::{RealsenseConfig, TransportChoice};
+use depthrig_realsense::iio;
 use depthrig_recorder::Dataset;
+use depthrig_usb::SysRoot;
 use std::process::{Command, Stdio};
 
 /// See the module.
@@ -54,7 +55,7 @@ fn start(
     camera: &Camera,
     transport: TransportChoice,
     requests: &[StreamRequest],
-) -> depthrig_drivers::Result<Box<dyn Stream>> {
+) -> depthrig_driver::Result<Box<dyn Stream>> {
     let port = camera.port_path();
     let config = RealsenseConfig { port, transport, ..RealsenseConfig::default() };
     RealsenseBackend::new(config).open(Some(camera.serial()))?.start(requests)

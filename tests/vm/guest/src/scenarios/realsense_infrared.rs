@@ -6,10 +6,10 @@ use crate::{Scenario, system};
 use anyhow::Context;
 use core::time::Duration;
 use depthrig_bus::{HostTime, PixelFormat};
-use depthrig_drivers::realsense::RealsenseBackend;
-use depthrig_drivers::realsense::config::{RealsenseConfig, TransportChoice};
-use depthrig_drivers::{Backend, MemorySink};
+use depthrig_driver::{Backend, MemorySink};
 use depthrig_emulator::{Camera, Options, Stamp};
+use depthrig_realsense::RealsenseBackend;
+use depthrig_realsense::config::{RealsenseConfig, TransportChoice};
 
 /// See the module.
 pub const SCENARIO: Scenario = Scenario {

@@ -3,9 +3,9 @@
 use crate::checks::Checks;
 use crate::{Scenario, system};
 use anyhow::Context;
-use depthrig_drivers::iio;
-use depthrig_drivers::usb::SysRoot;
 use depthrig_emulator::{Camera, Options};
+use depthrig_realsense::iio;
+use depthrig_usb::SysRoot;
 use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;

@@ -5,11 +5,11 @@ use crate::checks::Checks;
 use crate::vivid::{self, SIZE, Taken};
 use anyhow::Context;
 use depthrig_bus::{DropReason, HostTime, PixelFormat};
-use depthrig_drivers::v4l2::{
+use depthrig_driver::{Error, ErrorKind, MemorySink};
+use depthrig_usb::video::ImageSource;
+use depthrig_v4l2::{
     DEFAULT_BUFFERS, FourCc, Interval, MemoryChoice, MetadataFormat, Mode, Node, Source, V4l2Config, Wanted,
 };
-use depthrig_drivers::video::ImageSource;
-use depthrig_drivers::{Error, ErrorKind, MemorySink};
 use std::time::Duration;
 
 /// See the module.
@@ -39,8 +39,7 @@ fn run(checks: &mut Checks) -> anyhow::Result<()> {
 }
 
 fn take(memory: MemoryChoice, n: usize, count: u64, each: impl FnMut(&MemorySink)) -> anyhow::Result<Taken> {
-    let config =
-        V4l2Config { memory, clock: depthrig_drivers::v4l2::ClockChoice::Kernel, ..vivid::config(n) };
+    let config = V4l2Config { memory, clock: depthrig_v4l2::ClockChoice::Kernel, ..vivid::config(n) };
     let stream = vivid::start(config, &vivid::request(PixelFormat::Yuyv)?)?;
     vivid::take(stream, MemorySink::lending(), count, each)
 }
@@ -61,7 +60,7 @@ fn at<'a>(frames: u64, mut then: impl FnMut() -> Result<(), Error> + 'a) -> impl
 /// Frames that the kernel counted between the first and the last that were delivered, both included.
 fn counted(taken: &Taken) -> u64 {
     let sequence =
-        |f: Option<&(usize, depthrig_drivers::FrameMeta, Vec<u8>)>| f.map_or(0, |f| f.1.device_sequence);
+        |f: Option<&(usize, depthrig_driver::FrameMeta, Vec<u8>)>| f.map_or(0, |f| f.1.device_sequence);
     sequence(taken.sink.frames.last()) + 1 - sequence(taken.sink.frames.first())
 }
 

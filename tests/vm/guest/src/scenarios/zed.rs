@@ -5,16 +5,17 @@ use crate::{Scenario, system};
 use anyhow::Context;
 use depthrig_bus::{ClockDomain, HostTime, Name};
 use depthrig_calib::PoseExt;
-use depthrig_drivers::usb::{SysRoot, scan};
-use depthrig_drivers::v4l2::{ControlValue, Node};
-use depthrig_drivers::zed::command::Vendor;
-use depthrig_drivers::zed::hid::HidNode;
-use depthrig_drivers::zed::imu::NO_POSE;
-use depthrig_drivers::zed::mode::Side;
-use depthrig_drivers::zed::motion::Motion;
-use depthrig_drivers::zed::{CalibrationFile, ZedBackend, ZedConfig, find};
-use depthrig_drivers::{Backend, ErrorKind, MemorySink, StreamProfile, StreamRequest};
+use depthrig_driver::{Backend, ErrorKind, MemorySink, StreamProfile, StreamRequest};
 use depthrig_emulator::{Camera, Options, Stamp};
+use depthrig_usb::controls::ControlValue;
+use depthrig_usb::{SysRoot, scan};
+use depthrig_v4l2::Node;
+use depthrig_zed::command::Vendor;
+use depthrig_zed::hid::HidNode;
+use depthrig_zed::imu::NO_POSE;
+use depthrig_zed::mode::Side;
+use depthrig_zed::motion::Motion;
+use depthrig_zed::{CalibrationFile, ZedBackend, ZedConfig, find};
 use glam::{DMat3, DVec3};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -152,13 +153,13 @@ fn both_streams(
     });
     let wanted = wanted.into_iter().collect::<anyhow::Result<Vec<_>>>()?;
     let mut stream = device.start(&wanted)?;
-    let copied = depthrig_drivers::unpack::copied_bytes();
+    let copied = depthrig_driver::unpack::copied_bytes();
     let mut sink = MemorySink::default();
     let end = HostTime::now().plus(TIMEOUT);
     while sink.frames.len() < 2 * frames && HostTime::now() < end {
         stream.poll(Duration::from_millis(200), &mut sink)?;
     }
-    let copied = depthrig_drivers::unpack::copied_bytes() - copied;
+    let copied = depthrig_driver::unpack::copied_bytes() - copied;
     let delivered = sink.frames.iter().map(|f| f.2.len() as u64).sum::<u64>();
     let busy = backend.open(None)?.start(&wanted).err();
     checks.that(

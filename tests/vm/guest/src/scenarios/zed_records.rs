@@ -7,10 +7,10 @@ use crate::{Scenario, system};
 use anyhow::Context;
 use depthrig_bus::{Bus, HostTime, MotionFlags, MotionSample, RigName, StreamId};
 use depthrig_daemon::status::CameraState;
-use depthrig_drivers::zed::imu::NO_POSE;
-use depthrig_drivers::zed::sensors::Record;
 use depthrig_emulator::{Camera, Options, Stamp};
 use depthrig_recorder::{Dataset, SetRange, VerifyOptions, verify};
+use depthrig_zed::imu::NO_POSE;
+use depthrig_zed::sensors::Record;
 use std::time::Duration;
 
 /// See the module.

@@ -6,7 +6,7 @@ use crate::scenarios::l515::{packed, turned_back};
 use anyhow::Context;
 use core::time::Duration;
 use depthrig_bus::{HostTime, MetadataLevel, Name};
-use depthrig_drivers::{MemorySink, Stream, StreamRequest};
+use depthrig_driver::{MemorySink, Stream, StreamRequest};
 use depthrig_emulator::{Camera, Stamp};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;

@@ -3,7 +3,7 @@
 use super::Subject;
 use super::vendor::{entries, numbers, text, whole};
 use depthrig_calib::PoseExt;
-use depthrig_drivers::{DeviceInfo, StreamProfile};
+use depthrig_driver::{DeviceInfo, StreamProfile};
 use glam::DVec3;
 use serde_json::Value;
 use std::collections::BTreeSet;

@@ -6,11 +6,11 @@ use super::Subject;
 use super::vendor::{entries, numbers, text, whole};
 use core::time::Duration;
 use depthrig_bus::{FrameFlags, HostTime, MotionSample, Name};
-use depthrig_drivers::realsense::RealsenseBackend;
-use depthrig_drivers::realsense::config::{RealsenseConfig, TransportChoice};
-use depthrig_drivers::{Backend, MemorySink, StreamRequest};
+use depthrig_driver::{Backend, MemorySink, StreamRequest};
 use depthrig_emulator::model::ImuChip;
 use depthrig_emulator::{Fault, ImuSample, ImuSensor};
+use depthrig_realsense::RealsenseBackend;
+use depthrig_realsense::config::{RealsenseConfig, TransportChoice};
 use serde_json::{Value, json};
 
 /// Standard gravity, m/s².

@@ -3,10 +3,10 @@
 use super::{COLOR, DEPTH, Seen, Truth, nodes_become, small, take};
 use crate::checks::Checks;
 use depthrig_bus::HostTime;
-use depthrig_drivers::ErrorKind;
-use depthrig_drivers::libusb::{Camera, Settings, Source};
-use depthrig_drivers::video::ImageSource;
+use depthrig_driver::ErrorKind;
 use depthrig_emulator as emulator;
+use depthrig_libusb::{Camera, Settings, Source};
+use depthrig_usb::video::ImageSource;
 use emulator::{Damage, Fault};
 use std::time::Duration;
 

@@ -4,11 +4,11 @@ use super::{COLOR, DEPTH, load, nodes_become, usb_device};
 use crate::Scenario;
 use crate::checks::Checks;
 use depthrig_bus::HostTime;
-use depthrig_drivers::libusb::{Camera, Settings, Source, StreamMode};
-use depthrig_drivers::usb::SysRoot;
-use depthrig_drivers::uvc::formats::FourCc;
-use depthrig_drivers::video::ImageSource;
 use depthrig_emulator as emulator;
+use depthrig_libusb::{Camera, Settings, Source, StreamMode};
+use depthrig_usb::SysRoot;
+use depthrig_usb::uvc::formats::FourCc;
+use depthrig_usb::video::ImageSource;
 use emulator::{Options, Stamp};
 use std::time::Duration;
 

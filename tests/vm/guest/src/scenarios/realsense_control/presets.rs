@@ -5,12 +5,12 @@ use crate::checks::Checks;
 use crate::subject::plug;
 use crate::tally::Tally;
 use core::time::Duration;
-use depthrig_drivers::ErrorKind;
-use depthrig_drivers::realsense::config::RealsenseConfig;
-use depthrig_drivers::realsense::protocol::advanced::{self, Bound, Group};
-use depthrig_drivers::realsense::protocol::hwm::{Retry, UNIT_ID, UnitMonitor};
-use depthrig_drivers::realsense::protocol::sync::SyncMode;
+use depthrig_driver::ErrorKind;
 use depthrig_emulator::{Camera, Fault, Options, WrongReply};
+use depthrig_realsense::config::RealsenseConfig;
+use depthrig_realsense::protocol::advanced::{self, Bound, Group};
+use depthrig_realsense::protocol::hwm::{Retry, UNIT_ID, UnitMonitor};
+use depthrig_realsense::protocol::sync::SyncMode;
 use std::path::PathBuf;
 
 const PRESET: &str = r#"{
