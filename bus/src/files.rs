@@ -1,4 +1,5 @@
-//! Opens files that a user or a dataset names: regular files only, and without waiting.
+//! Opens files that a user or a dataset names: regular files only, and without waiting. Writes small ones: complete or
+//! not at all ([`NewFile`]).
 //!
 //! Opening a FIFO waits for its writer, and reading a device may never end. Every read of a path that depthrig did not
 //! create itself opens it here.
@@ -11,6 +12,10 @@
 //! # Ok(())
 //! # }
 //! ```
+
+mod new_file;
+
+pub use new_file::{NewFile, folder_of, replace, sync_folder_of};
 
 use rustix::fs::{FileType, Mode, OFlags};
 use std::fs::File;

@@ -1,10 +1,10 @@
-//! Files that are complete or absent: written under another name, synced, and renamed.
+//! Files that are complete or absent, with their checksum.
 
 use crate::{Error, ErrorKind, Result};
+use depthrig_bus::files::NewFile;
 use sha2::{Digest, Sha256};
-use std::fs::{File, OpenOptions};
 use std::io::{self, BufWriter, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// A written file.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -41,27 +41,12 @@ impl<W: Write> Write for Hashing<W> {
 /// [`ErrorKind::Io`] naming the file; nothing is left behind then.
 pub(crate) fn create(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<Written> {
     let failed = |e: io::Error| cannot_write(path, e);
-    let name = path.file_name().ok_or_else(|| failed(io::ErrorKind::InvalidInput.into()))?;
-    let mut part = name.to_owned();
-    part.push(format!(".{}.part", std::process::id()));
-    let part = Leftover(Some(path.with_file_name(part)));
-    // A leftover of a killed process under this name is removed; a link is removed and not followed.
-    drop(std::fs::remove_file(part.path()));
-    let file = OpenOptions::new().write(true).create_new(true).open(part.path()).map_err(failed)?;
+    let file = NewFile::beside(path).map_err(failed)?;
     let mut out = Hashing { inner: BufWriter::with_capacity(1 << 20, file), hash: Sha256::new(), bytes: 0 };
     write(&mut out).map_err(failed)?;
-    out.flush().map_err(failed)?;
-    out.inner.get_ref().sync_all().map_err(failed)?;
-    std::fs::rename(part.path(), path).map_err(failed)?;
-    part.done();
-    sync_folder(path).map_err(failed)?;
+    let file = out.inner.into_inner().map_err(|e| failed(e.into_error()))?;
+    file.replace().map_err(failed)?;
     Ok(Written { bytes: out.bytes, sha256: hex(&out.hash.finalize()) })
-}
-
-/// Makes the names in the folder of `path` durable.
-pub(crate) fn sync_folder(path: &Path) -> io::Result<()> {
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    File::open(folder)?.sync_all()
 }
 
 /// That `path` could not be written, and what to do.
@@ -82,27 +67,6 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
         let _ = write!(text, "{b:02x}"); // into a string: cannot fail
         text
     })
-}
-
-/// A file that is removed unless it was finished.
-struct Leftover(Option<PathBuf>);
-
-impl Leftover {
-    fn path(&self) -> &Path {
-        self.0.as_deref().unwrap_or(Path::new(""))
-    }
-
-    fn done(mut self) {
-        self.0 = None;
-    }
-}
-
-impl Drop for Leftover {
-    fn drop(&mut self) {
-        if let Some(path) = &self.0 {
-            drop(std::fs::remove_file(path)); // it may not exist yet
-        }
-    }
 }
 
 #[cfg(test)]

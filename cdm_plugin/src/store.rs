@@ -9,6 +9,7 @@ use crate::durable::{self, Written};
 use crate::weights::{self, Report, verify_names};
 use crate::{ChannelOrder, Encoder, Error, ErrorKind, Model, Result, Weights};
 use core::ops::ControlFlow;
+use depthrig_bus::files;
 use rustix::fs::{CWD, FlockOperation, RenameFlags, flock, renameat_with};
 use rustix::io::Errno;
 use std::fs::File;
@@ -379,7 +380,7 @@ impl ModelStore {
     /// Gives the folder `part` the name `path`, in one step also when there is one already.
     fn put(&self, part: &Path, path: &Path) -> Result<()> {
         let failed = |e: io::Error| durable::cannot_write(path, e);
-        durable::sync_folder(&part.join(RECORD)).map_err(failed)?;
+        files::sync_folder_of(&part.join(RECORD)).map_err(failed)?;
         if path.exists() {
             match renameat_with(CWD, part, CWD, path, RenameFlags::EXCHANGE) {
                 // Some network file systems cannot exchange names: there the name is gone for a moment.
@@ -393,7 +394,7 @@ impl ModelStore {
         } else {
             std::fs::rename(part, path).map_err(failed)?;
         }
-        durable::sync_folder(path).map_err(failed)
+        files::sync_folder_of(path).map_err(failed)
     }
 
     /// Removes a model; who uses it keeps it until they let go.
@@ -412,7 +413,7 @@ impl ModelStore {
             Error::new(ErrorKind::Io, format!("{}: cannot be removed: {e}", path.display())).with_source(e)
         };
         std::fs::rename(&path, &gone).map_err(failed)?;
-        durable::sync_folder(&path).map_err(failed)?;
+        files::sync_folder_of(&path).map_err(failed)?;
         std::fs::remove_dir_all(&gone).map_err(failed)
     }
 

@@ -7,6 +7,7 @@
 
 use crate::config::{CdmConfig, RefineConfig};
 use crate::stage::{Installed, Plan, REFINED, Refiners};
+use depthrig_bus::files::folder_of;
 use depthrig_bus::{StreamId, StreamName};
 use depthrig_cdm::{Description, Refiner};
 use depthrig_recorder::exchange::{ExportOptions, export, import};
@@ -202,7 +203,7 @@ pub fn relabel_with(
     }
     report.verified = Some(copied.verified);
     fs.rename(&copy, out).map_err(|e| failed("rename", &copy, e))?;
-    let parent = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let parent = folder_of(out);
     fs.sync_dir(parent).map_err(|e| failed("sync the folder", parent, e))?;
     remove(&work).map_err(|e| failed("remove", &work, e))?;
     Ok(report)

@@ -4,16 +4,18 @@
 //! the folder is new or empty, and while it grows the list is named `frames.csv.part`.
 
 use crate::dataset::{Dataset, DatasetFrame, DatasetSet, PixelMode, SetReader};
-use crate::fs::{self, Fs, WriteFile};
+use crate::fs::{self, Fs};
 use crate::select::{Moment, SetSpan, by_id, last_id, nearest};
 use crate::still::{StillFormat, still};
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{PixelFormat, StreamId};
+use growing::GrowingFile;
 use serde::Serialize;
 use std::borrow::Cow;
 use std::ops::{ControlFlow, Range};
 use std::path::{Path, PathBuf};
 
+mod growing;
 mod motion;
 mod row;
 pub use motion::{MotionForm, MotionRow, export_motion, list_motion};
@@ -358,31 +360,28 @@ fn new_folder(fs: &dyn Fs, dir: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Creates the folder that `path` lies in.
+fn make_folder_of(fs: &dyn Fs, path: &Path) -> Result<()> {
+    let dir = path.parent().unwrap_or(path);
+    fs.create_dir_all(dir).map_err(|e| Error::io("create the folder", dir, e))
+}
+
 /// The folder being written.
 struct Folder<'a> {
     fs: &'a dyn Fs,
     dir: PathBuf,
-    list: Box<dyn WriteFile>,
-    part: PathBuf,
-    /// Lines that are not written yet.
-    lines: Vec<u8>,
+    list: GrowingFile<'a>,
 }
-
-/// Bytes of lines that are written together.
-const LINES: usize = 64 << 10;
 
 impl<'a> Folder<'a> {
     fn create(fs: &'a dyn Fs, dir: &Path) -> Result<Self> {
         new_folder(fs, dir)?;
-        let part = dir.join(format!("{FRAMES_FILE}.part"));
-        let list = fs.create_new(&part).map_err(|e| Error::io("create", &part, e))?;
-        Ok(Self { fs, dir: dir.to_owned(), list, part, lines: Vec::new() })
+        let list = GrowingFile::create(fs, &dir.join(FRAMES_FILE))?;
+        Ok(Self { fs, dir: dir.to_owned(), list })
     }
 
     fn make_parent(&self, name: &str) -> Result<()> {
-        let path = self.dir.join(name);
-        let dir = path.parent().unwrap_or(&self.dir);
-        self.fs.create_dir_all(dir).map_err(|e| Error::io("create the folder", dir, e))
+        make_folder_of(self.fs, &self.dir.join(name))
     }
 
     fn write(&self, name: &str, bytes: &[u8]) -> Result<()> {
@@ -396,28 +395,17 @@ impl<'a> Folder<'a> {
     }
 
     fn line(&mut self, line: &str) -> Result<()> {
-        self.lines.extend_from_slice(line.as_bytes());
-        self.lines.push(b'\n');
-        if self.lines.len() < LINES { Ok(()) } else { self.flush() }
-    }
-
-    fn flush(&mut self) -> Result<()> {
-        fs::write_all(&mut *self.list, &self.lines).map_err(|e| Error::io("write", &self.part, e))?;
-        self.lines.clear();
-        Ok(())
+        self.list.put(line.as_bytes())?;
+        self.list.put(b"\n")
     }
 
     /// Leaves the folder unfinished, the list with what is there.
     fn leave(mut self, done: FramesDone) -> Result<FramesDone> {
-        self.flush()?;
+        self.list.flush()?;
         Ok(done)
     }
 
-    fn finish(mut self) -> Result<()> {
-        self.flush()?;
-        self.list.sync_all().map_err(|e| Error::io("sync", &self.part, e))?;
-        let path = self.dir.join(FRAMES_FILE);
-        self.fs.rename(&self.part, &path).map_err(|e| Error::io("rename", &self.part, e))?;
-        self.fs.sync_dir(&self.dir).map_err(|e| Error::io("sync the folder", &self.dir, e))
+    fn finish(self) -> Result<()> {
+        self.list.finish()
     }
 }

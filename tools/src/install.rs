@@ -4,6 +4,7 @@
 //! earlier version wrote: the second is replaced, the first only with `--overwrite`.
 
 use anyhow::{Context, Result};
+use depthrig_bus::files::NewFile;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -147,18 +148,12 @@ impl SystemFile {
             let folder = path.parent().unwrap_or(root);
             std::fs::create_dir_all(folder)?;
             // Written beside it and then renamed, so that no one reads a partial file.
-            let mut beside = tempfile::Builder::new().prefix(".depthrig").tempfile_in(folder)?;
-            io::Write::write_all(&mut beside, self.text.as_bytes())?;
+            let mut file = NewFile::beside(&path)?;
+            io::Write::write_all(&mut file, self.text.as_bytes())?;
             let mode = std::os::unix::fs::PermissionsExt::from_mode(0o644);
-            beside.as_file().set_permissions(mode)?;
-            beside.as_file().sync_all()?;
-            if state == State::Missing {
-                // A file created since the check is not ours.
-                beside.persist_noclobber(&path)?;
-            } else {
-                beside.persist(&path)?;
-            }
-            Ok(())
+            file.file().set_permissions(mode)?;
+            // A file created since the check is not ours.
+            if state == State::Missing { file.create() } else { file.replace() }
         };
         write().map_err(|e| refused(e, &path))?;
         Ok(Done::Written)

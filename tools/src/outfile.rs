@@ -5,9 +5,7 @@
 
 use crate::exit::UsageError;
 use anyhow::{Context as _, Result};
-use rustix::fs::{CWD, RenameFlags, renameat_with};
-use rustix::io::Errno;
-use std::fs::{File, OpenOptions};
+use depthrig_bus::files::{NewFile, folder_of};
 use std::io::{self, Write as _};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
@@ -63,8 +61,7 @@ impl OutFile {
     /// A usage error that names both.
     pub fn differs_from(&self, other: &Self) -> Result<()> {
         let place = |path: &Path| {
-            let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-            (folder.canonicalize().ok(), path.file_name().map(std::ffi::OsStr::to_owned))
+            (folder_of(path).canonicalize().ok(), path.file_name().map(std::ffi::OsStr::to_owned))
         };
         if place(&self.path) != place(&other.path) && !is_same(&self.path, &other.path) {
             return Ok(());
@@ -79,17 +76,16 @@ impl OutFile {
     /// When it cannot be written, or exists by now; the message names it.
     pub fn write(&self, bytes: &[u8]) -> Result<()> {
         let unwritable = || format!("{}: cannot be written", self.path.display());
-        let mut part = Part::beside(&self.path).with_context(unwritable)?;
-        part.file.write_all(bytes).with_context(unwritable)?;
+        let mut file = NewFile::beside(&self.path).with_context(unwritable)?;
+        file.write_all(bytes).with_context(unwritable)?;
         if self.overwrite {
-            // Replaces the name, not the file behind it: the target of a link is unchanged.
-            return std::fs::rename(&part.path, &self.path).with_context(unwritable);
+            return file.replace().with_context(unwritable);
         }
-        match publish(&part.path, &self.path) {
+        match file.create() {
             Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {
                 Err(UsageError(format!("{}: {EXISTS}", self.path.display())).into())
             }
-            published => published.with_context(unwritable),
+            created => created.with_context(unwritable),
         }
     }
 }
@@ -100,44 +96,6 @@ const EXISTS: &str = "exists; name another file, or replace it with --overwrite"
 fn is_same(a: &Path, b: &Path) -> bool {
     let identity = |path: &Path| path.metadata().ok().map(|m| (m.dev(), m.ino()));
     identity(a).is_some_and(|a| identity(b) == Some(a))
-}
-
-/// Gives the file `part` the name `path`, which nothing has.
-fn publish(part: &Path, path: &Path) -> io::Result<()> {
-    match renameat_with(CWD, part, CWD, path, RenameFlags::NOREPLACE) {
-        // Some network file systems do not know that flag. A second name is refused as well where there is one already.
-        Err(Errno::INVAL | Errno::NOSYS | Errno::OPNOTSUPP) => std::fs::hard_link(part, path),
-        renamed => renamed.map_err(Into::into),
-    }
-}
-
-/// A new file that is removed unless it got its final name.
-struct Part {
-    path: PathBuf,
-    file: File,
-}
-
-impl Part {
-    fn beside(path: &Path) -> io::Result<Self> {
-        let name = path.file_name().ok_or(io::ErrorKind::InvalidInput)?.to_string_lossy();
-        let mut taken = io::ErrorKind::AlreadyExists.into();
-        for n in 0..100 {
-            let part = path.with_file_name(format!(".{name}.{}-{n}.part", std::process::id()));
-            // `create_new` neither follows a link nor opens an existing file.
-            match OpenOptions::new().write(true).create_new(true).open(&part) {
-                Ok(file) => return Ok(Self { path: part, file }),
-                Err(e) if e.kind() == io::ErrorKind::AlreadyExists => taken = e,
-                Err(e) => return Err(e),
-            }
-        }
-        Err(taken)
-    }
-}
-
-impl Drop for Part {
-    fn drop(&mut self) {
-        drop(std::fs::remove_file(&self.path)); // gone already when it was renamed
-    }
 }
 
 #[cfg(test)]

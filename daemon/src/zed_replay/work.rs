@@ -5,7 +5,6 @@ use depthrig_bus::{UtcPair, files};
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{Error, ErrorKind, RecordSet, Result, UtcSource};
 use serde_json::Value;
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
@@ -82,16 +81,7 @@ impl Work {
     }
 
     fn write(&self, path: &Path, plan: &Value) -> Result<()> {
-        let tmp = path.with_extension("tmp");
-        let text = format!("{plan:#}\n");
-        let write = || {
-            let mut file = std::fs::File::create(&tmp)?;
-            file.write_all(text.as_bytes())?;
-            file.sync_all()?;
-            std::fs::rename(&tmp, path)?;
-            RealFs.sync_dir(&self.dir)
-        };
-        write().map_err(|e| failed("write", path, e))
+        files::replace(path, format!("{plan:#}\n").as_bytes()).map_err(|e| failed("write", path, e))
     }
 
     pub(super) fn path(&self) -> &Path {
@@ -107,8 +97,7 @@ impl Work {
     pub(super) fn finish(self, out: &Path) -> Result<()> {
         let copy = self.dataset();
         RealFs.rename(&copy, out).map_err(|e| failed("rename", &copy, e))?;
-        let parent = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        RealFs.sync_dir(parent).map_err(|e| failed("sync the folder", parent, e))?;
+        files::sync_folder_of(out).map_err(|e| failed("sync the folder of", out, e))?;
         remove(&self.dir)
     }
 }

@@ -1,8 +1,9 @@
 //! Samples of IMUs: listed, or written as a CSV or NPY file per unit.
 
-use super::{FramesDone, LINES, SetChoice, new_folder};
+use super::growing::GrowingFile;
+use super::{FramesDone, SetChoice, make_folder_of, new_folder};
 use crate::dataset::{Dataset, DatasetSet, PixelMode, SetReader};
-use crate::fs::{self, Fs, WriteFile};
+use crate::fs::Fs;
 use crate::npy;
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{MOTION_FIELDS, MotionSample, StreamId};
@@ -214,7 +215,8 @@ pub fn export_motion(
     let mut total = FramesDone::default();
     for (id, chosen) in units.iter().zip(&mut chosen) {
         let path = out.join(id.camera.as_str()).join(format!("{}.{}", id.stream, form.extension()));
-        let mut file = File::create(fs, &path)?;
+        make_folder_of(fs, &path)?;
+        let mut file = GrowingFile::create(fs, &path)?;
         match form {
             MotionForm::Csv => file.put(format!("{}\n", MotionRow::COLUMNS.join(",")).as_bytes())?,
             // The length stands at the head: they are counted first.
@@ -271,47 +273,4 @@ fn columns() -> Vec<(&'static str, &'static str, usize)> {
         (f.name, kind, f.count)
     };
     [("set", "<u8", 1), ("utc_ns", "<i8", 1)].into_iter().chain(MOTION_FIELDS.iter().map(of)).collect()
-}
-
-/// A file that gets its name when it is complete.
-struct File<'a> {
-    fs: &'a dyn Fs,
-    out: Box<dyn WriteFile>,
-    path: PathBuf,
-    part: PathBuf,
-    /// Bytes that are not written yet.
-    waiting: Vec<u8>,
-    bytes: u64,
-}
-
-impl<'a> File<'a> {
-    fn create(fs: &'a dyn Fs, path: &Path) -> Result<Self> {
-        let dir = path.parent().unwrap_or(path);
-        fs.create_dir_all(dir).map_err(|e| Error::io("create the folder", dir, e))?;
-        let mut part = path.as_os_str().to_owned();
-        part.push(".part");
-        let part = PathBuf::from(part);
-        let out = fs.create_new(&part).map_err(|e| Error::io("create", &part, e))?;
-        Ok(Self { fs, out, path: path.to_owned(), part, waiting: Vec::new(), bytes: 0 })
-    }
-
-    fn put(&mut self, bytes: &[u8]) -> Result<()> {
-        self.waiting.extend_from_slice(bytes);
-        self.bytes += bytes.len() as u64;
-        if self.waiting.len() < LINES { Ok(()) } else { self.flush() }
-    }
-
-    fn flush(&mut self) -> Result<()> {
-        fs::write_all(&mut *self.out, &self.waiting).map_err(|e| Error::io("write", &self.part, e))?;
-        self.waiting.clear();
-        Ok(())
-    }
-
-    fn finish(mut self) -> Result<()> {
-        self.flush()?;
-        self.out.sync_all().map_err(|e| Error::io("sync", &self.part, e))?;
-        self.fs.rename(&self.part, &self.path).map_err(|e| Error::io("rename", &self.part, e))?;
-        let dir = self.path.parent().unwrap_or(&self.path);
-        self.fs.sync_dir(dir).map_err(|e| Error::io("sync the folder", dir, e))
-    }
 }

@@ -4,6 +4,7 @@
 //! [`DryFs::refer`] says they do.
 
 use crate::fs::{DirEntry, Fs, ReadFile, WriteFile};
+use depthrig_bus::files::folder_of;
 use depthrig_bus::sync::lock;
 use std::collections::BTreeMap;
 use std::fmt;
@@ -110,10 +111,6 @@ impl DryFs {
     fn check(&self, path: &Path) -> io::Result<()> {
         self.under.may_write(folder_of(path))
     }
-}
-
-fn folder_of(path: &Path) -> &Path {
-    path.parent().filter(|dir| !dir.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 impl fmt::Debug for DryFs {

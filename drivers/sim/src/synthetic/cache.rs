@@ -7,12 +7,12 @@
 //! one that can be opened under its name was finished; length and checksums guard against what happens later.
 #![allow(unsafe_code)] // memory-mapping a file, with the reason at the call
 
+use depthrig_bus::files::NewFile;
 use depthrig_driver::{Error, ErrorKind, Result};
 use memmap2::Mmap;
 use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::path::Path;
 
 const MAGIC: &[u8; 8] = b"DRSYNTH1";
 const FIXED: usize = 40;
@@ -119,8 +119,7 @@ impl ImageFile {
         if let Some(folder) = path.parent() {
             depthrig_bus::umask::create_dir_all(folder).map_err(io)?;
         }
-        let mut temporary = Temporary::beside(path);
-        let mut file = File::create(&temporary.path).map_err(io)?;
+        let mut file = NewFile::beside(path).map_err(io)?;
         let mut sums = vec![0; wanted.images()];
         for pose in 0..wanted.poses {
             for (plane, bytes) in image(pose)?.iter().enumerate() {
@@ -130,15 +129,13 @@ impl ImageFile {
                 }
                 let i = plane * wanted.poses as usize + pose as usize;
                 sums[i] = checksum(bytes);
-                file.seek(SeekFrom::Start((wanted.first() + i * wanted.bytes) as u64)).map_err(io)?;
+                file.file().seek(SeekFrom::Start((wanted.first() + i * wanted.bytes) as u64)).map_err(io)?;
                 file.write_all(bytes).map_err(io)?;
             }
         }
-        file.seek(SeekFrom::Start(0)).map_err(io)?;
+        file.file().seek(SeekFrom::Start(0)).map_err(io)?;
         file.write_all(&wanted.head(&sums)).map_err(io)?;
-        file.sync_data().map_err(io)?;
-        std::fs::rename(&temporary.path, path).map_err(io)?;
-        temporary.is_done = true;
+        file.replace().map_err(io)?;
         Self::open(path, wanted).ok_or_else(|| {
             let message =
                 format!("{}: the render cache does not read back as it was written", path.display());
@@ -154,30 +151,6 @@ impl ImageFile {
     fn image(&self, i: usize) -> &[u8] {
         let start = self.first + i * self.bytes;
         self.map.get(start..start + self.bytes).unwrap_or_default()
-    }
-}
-
-/// A file that is removed unless it was renamed.
-struct Temporary {
-    path: PathBuf,
-    is_done: bool,
-}
-
-impl Temporary {
-    fn beside(path: &Path) -> Self {
-        static COUNT: AtomicU64 = AtomicU64::new(0);
-        let n = COUNT.fetch_add(1, Ordering::Relaxed);
-        let path = path.with_extension(format!("part-{}-{n}", std::process::id()));
-        Self { path, is_done: false }
-    }
-}
-
-impl Drop for Temporary {
-    fn drop(&mut self) {
-        if !self.is_done {
-            // Best effort: what remains is a file that nothing will ever open.
-            let _ = std::fs::remove_file(&self.path);
-        }
     }
 }
 
