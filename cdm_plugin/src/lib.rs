@@ -11,6 +11,7 @@ mod error;
 mod factory;
 pub mod fetch;
 mod fill;
+#[cfg(any(test, feature = "testing"))]
 pub mod fuzzing;
 pub mod metrics;
 mod model;
@@ -22,6 +23,7 @@ pub mod prep;
 pub mod published;
 mod refine;
 mod refiner;
+pub mod stage;
 mod stereo_network;
 pub mod store;
 pub mod weights;
@@ -36,7 +38,7 @@ pub use onnxruntime::{OnnxNetwork, find_library};
 pub use options::{EngineKind, Precision, RefinerOptions};
 pub use refine::{Color, ColorFormat, Description, Job, Output, RawDepth, Refiner, StepTimes};
 pub use refiner::CdmRefiner;
-#[doc(hidden)]
+#[cfg(any(test, feature = "testing"))]
 pub use stereo_network::FakeNetwork;
 pub use stereo_network::{NetworkPixels, StereoNetwork, StereoNetworkOptions};
 pub use store::ModelStore;

@@ -17,13 +17,14 @@ use sha2::{Digest, Sha256};
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
+#[cfg(any(test, feature = "testing"))]
 mod fake;
 mod form;
 mod images;
 #[cfg(test)]
 mod tests;
 
-#[doc(hidden)]
+#[cfg(any(test, feature = "testing"))]
 pub use fake::FakeNetwork;
 
 /// The key of a network's metadata that says which numbers it takes pixels as: a name of [`NetworkPixels`].

@@ -18,6 +18,7 @@ use std::path::{Path, PathBuf};
 
 mod record;
 
+#[cfg(any(test, feature = "testing"))]
 pub(crate) use record::fuzz as fuzz_record;
 pub use record::{Record, Source, WeightsRecord};
 

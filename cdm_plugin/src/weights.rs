@@ -9,6 +9,7 @@ use std::path::Path;
 use stored::{ReadAt, Stored};
 
 mod floats;
+#[cfg(any(test, feature = "testing"))]
 pub(crate) mod fuzzing;
 mod pickle;
 mod pth;

@@ -18,12 +18,13 @@ pub(crate) mod wanted;
 
 pub use crate::family::BackendConfig;
 pub use depthrig_cdm::Precision;
+pub use depthrig_cdm::stage::{CdmConfig, EngineChoice, RefineConfig, RefineModel};
 pub use depthrig_recorder::{ColorCodec, DepthCodec};
 pub use error::{ConfigError, Problem};
 pub use stereo::StereoConfig;
 
 use crate::family::{FAMILIES, Family};
-use depthrig_bus::{CameraName, PixelFormat, Pose, RigName, StreamName};
+use depthrig_bus::{CameraName, Pose, RigName, StreamName};
 use depthrig_driver::{StreamProfile, StreamRequest};
 use depthrig_stereo::StereoOptions;
 use std::net::SocketAddr;
@@ -158,97 +159,6 @@ pub struct CameraConfig {
     pub refine: Option<RefineConfig>,
     /// Its family and that family's settings.
     pub backend: BackendConfig,
-}
-
-/// Settings of depth refinement that the cameras of the rig share.
-#[derive(Debug, Clone, PartialEq)]
-pub struct CdmConfig {
-    /// CPU threads of all refiners together; 0: all cores but one.
-    pub threads: usize,
-    /// The library of ONNX Runtime; `None`: looked for.
-    pub library: Option<PathBuf>,
-    /// Folder of the installed models; `None`: this user's.
-    pub models: Option<PathBuf>,
-    /// A refinement slower than this, and than ten times the slowest so far, counts as hung, seconds.
-    pub hang_s: f64,
-}
-
-/// How a camera's depth is refined.
-#[derive(Debug, Clone, PartialEq)]
-#[allow(clippy::struct_excessive_bools)] // each is a choice of its own
-pub struct RefineConfig {
-    /// The engine that runs.
-    pub engine: EngineChoice,
-    /// The model; `None`: the one for this camera, if it is installed.
-    pub model: Option<RefineModel>,
-    /// Pairs of images a second at most; 0: every one.
-    pub rate_hz: f64,
-    /// Shorter side of the network's input, pixels; `None`: the one that the model was trained for.
-    pub input_size: Option<u32>,
-    /// Precision of the network.
-    pub precision: Precision,
-    /// Device that it runs on: `cpu`, `cuda:0`, `tensorrt:0`, `openvino`.
-    pub device: String,
-    /// `Z16` in the unit of the camera's depth, or `DepthF32`.
-    pub format: PixelFormat,
-    /// How far from measured depth the engine `fill` fills holes, as a part of the image's width, 0 to 1; 1 fills every hole.
-    pub fill_reach: f64,
-    /// Whether refined depth is recorded.
-    pub record: bool,
-    /// Whether depth in the view of colour is published as well, as it was before it was refined.
-    pub align: bool,
-    /// The camera gives depth in the view of colour, whatever calibration says or does not say.
-    pub is_aligned: bool,
-    /// The stream that is refined.
-    pub depth: String,
-}
-
-/// Engine that refines depth.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum EngineChoice {
-    /// A model for this camera if one is installed and the library is there, else [`Self::Fill`].
-    #[default]
-    Auto,
-    /// Hole filling guided by colour; needs no model.
-    Fill,
-    /// ONNX Runtime.
-    OnnxRuntime,
-    /// Nothing: the stream is there and silent.
-    Off,
-}
-
-/// Which model.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum RefineModel {
-    /// An installed one, by name.
-    Installed(String),
-    /// A checkpoint; absolute.
-    File(PathBuf),
-}
-
-impl Default for CdmConfig {
-    fn default() -> Self {
-        Self { threads: 0, library: None, models: None, hang_s: 10.0 }
-    }
-}
-
-impl Default for RefineConfig {
-    fn default() -> Self {
-        Self {
-            engine: EngineChoice::Auto,
-            model: None,
-            rate_hz: 5.0,
-            input_size: None,
-            precision: Precision::Fp32,
-            device: "cpu".to_owned(),
-            format: PixelFormat::Z16,
-            fill_reach: depthrig_cdm::FillRefiner::REACH,
-            record: false,
-            align: false,
-            is_aligned: false,
-            depth: "depth".to_owned(),
-        }
-    }
 }
 
 impl CameraConfig {

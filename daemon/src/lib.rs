@@ -14,11 +14,9 @@ pub mod doctor;
 mod error;
 pub mod family;
 mod housekeeping;
-pub mod import_kinect;
 pub mod metrics;
 mod priority;
 mod recording;
-pub mod relabel;
 pub mod replay;
 pub mod rig;
 pub mod sets;
@@ -27,6 +25,5 @@ pub mod stage;
 pub mod status;
 mod stream;
 mod wake;
-pub mod zed_replay;
 
 pub use error::{Error, ErrorKind, Result};

@@ -25,16 +25,13 @@ mod timeline;
 mod transport;
 
 use crate::api::{self, ServerHandle};
-use crate::config::{
-    BusConfig, CdmConfig, ControlConfig, EngineChoice, RecordingConfig, RigConfig, SetsConfig,
-    SupervisorConfig,
-};
+use crate::config::{BusConfig, ControlConfig, RecordingConfig, RigConfig, SetsConfig, SupervisorConfig};
 use crate::control::Control;
 use crate::housekeeping::Housekeeping;
 use crate::recording::{Outside, Recording, Reports};
 use crate::rig::report;
 use crate::sets::SpreadStats;
-use crate::stage::{Installed, Intake, Refinement, Stage};
+use crate::stage::{Intake, Refinement, Stage};
 use crate::status::{RecordingStatus, ReplayStatus};
 use crate::stream::Stream;
 use crate::wake::Wake;
@@ -46,6 +43,8 @@ use depthrig_bus::{
     Bus, ClockDomain, HostTime, Intrinsics, MetadataLevel, PixelFormat, RigName, RuntimeDir,
     SUBSCRIBER_BUFFER, UtcPair, shm,
 };
+use depthrig_cdm::stage::Installed;
+use depthrig_cdm::stage::{CdmConfig, EngineChoice};
 use depthrig_driver::StreamProfile;
 use depthrig_recorder::{Computed, MotionRecord, StreamRecord};
 use player::Player;

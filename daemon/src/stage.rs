@@ -13,25 +13,21 @@
 //! Colour and depth are a pair when no colour frame lies nearer to the depth frame, and at most half a colour period and
 //! a millisecond apart.
 
-mod engines;
-pub(crate) mod models;
 mod pair;
-pub(crate) mod pixels;
 mod refinement;
 mod supervisor;
-pub(crate) mod view;
-pub(crate) mod worker;
+mod worker;
 
-pub use engines::{Installed, Opened, Plan, Refiners};
 pub use refinement::{Readers, Refinement, Setup, Skip};
 
-use crate::config::{CdmConfig, EngineChoice, RefineConfig};
 use crate::status::RefineState;
 use crate::wake::Wake;
 use crate::{Error, ErrorKind, Result};
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{Frame, HostTime, PixelFormat, StreamName, Subscriber};
+use depthrig_cdm::stage::{ALIGNED, REFINED, Refiners, pixels};
+use depthrig_cdm::stage::{CdmConfig, EngineChoice, RefineConfig};
 use depthrig_driver::StreamProfile;
 use depthrig_driver::moments::{FrameSchedule, SetTimes};
 use pair::{Paired, Pairer};
@@ -39,11 +35,6 @@ use refinement::Pair;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use supervisor::RefinerSupervisor;
-
-/// The name of the stream of refined depth.
-pub const REFINED: &str = "depth_refined";
-/// The name of the stream of depth in the view of colour.
-pub const ALIGNED: &str = "depth_aligned";
 
 /// How long the stage thread sleeps at most: it watches refiners and looks for new cameras.
 const LOOK: Duration = Duration::from_millis(20);

@@ -1,7 +1,7 @@
 //! A line of the `frames.csv` of an export.
 #![no_main]
 
-use depthrig_recorder::fuzzing;
+use depthrig_convert::fuzzing;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {

@@ -1,7 +1,7 @@
 //! A rosbag, read to its end.
 #![no_main]
 
-use depthrig_recorder::fuzzing;
+use depthrig_convert::fuzzing;
 use libfuzzer_sys::fuzz_target;
 
 fuzz_target!(|bytes: &[u8]| {

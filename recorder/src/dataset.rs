@@ -12,7 +12,10 @@ mod index;
 mod info;
 mod sets;
 
-pub(crate) use decode::{check_stored, color_decodes, jpeg_pixels};
+pub(crate) use decode::check_stored;
+#[cfg(any(test, feature = "testing"))]
+pub(crate) use decode::color_decodes;
+pub use decode::jpeg_pixels;
 pub use index::SetReader;
 pub use info::{DatasetInfo, MotionInfo, SpreadStats, StreamInfo};
 pub(crate) use info::{MotionCount, image_chunks};

@@ -58,7 +58,7 @@ impl Error {
     }
 
     /// A failed operation that reads `path`; `what` reads as in "cannot {what} {path}".
-    pub(crate) fn reading(what: &str, path: &Path, e: io::Error) -> Self {
+    pub fn reading(what: &str, path: &Path, e: io::Error) -> Self {
         if e.kind() != io::ErrorKind::PermissionDenied {
             return Self::io(what, path, e);
         }
@@ -71,7 +71,7 @@ impl Error {
     }
 
     /// A failed operation that changes `path`, or needs to; `what` reads as in "cannot {what} {path}".
-    pub(crate) fn io(what: &str, path: &Path, e: io::Error) -> Self {
+    pub fn io(what: &str, path: &Path, e: io::Error) -> Self {
         let (kind, advice) = match e.kind() {
             io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
                 (ErrorKind::DiskFull, ": the disk is full; free some space or record to another disk")

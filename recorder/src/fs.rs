@@ -144,7 +144,10 @@ pub trait ReadFile: Send + Sync {
 }
 
 /// Appends all of `bytes`, however many writes that takes.
-pub(crate) fn write_all(file: &mut dyn WriteFile, mut bytes: &[u8]) -> io::Result<()> {
+///
+/// # Errors
+/// As the operating system reports.
+pub fn write_all(file: &mut dyn WriteFile, mut bytes: &[u8]) -> io::Result<()> {
     while !bytes.is_empty() {
         match file.write(bytes) {
             Ok(0) => return Err(io::ErrorKind::WriteZero.into()),

@@ -144,30 +144,3 @@ pub fn color_codec(bytes: &[u8]) -> bool {
     h.set_image(PixelFormat::Rgb8, u32::from(*width), u32::from(*height));
     color_decodes(data, &h)
 }
-
-/// A line of the `frames.csv` of an export; whether it is one.
-///
-/// # Panics
-/// When reading and writing changes a line.
-pub fn frames_csv(bytes: &[u8]) -> bool {
-    core::str::from_utf8(bytes).is_ok_and(crate::exchange::fuzzing::row)
-}
-
-/// The `calibration.json` of an export; whether it is one.
-pub fn calibration_json(bytes: &[u8]) -> bool {
-    crate::exchange::fuzzing::calibration(bytes)
-}
-
-/// An NPY file; whether it is an array that can be imported.
-pub fn npy(bytes: &[u8]) -> bool {
-    crate::exchange::fuzzing::npy(bytes)
-}
-
-/// A rosbag, read to its end; returns the number of frames.
-///
-/// # Panics
-/// When the accounts of the frames do not balance.
-pub fn rosbag(bytes: &[u8]) -> u64 {
-    let (fs, dir) = folder("fuzz.bag", bytes);
-    fs.open(&dir.join("fuzz.bag")).map_or(0, crate::exchange::fuzzing::rosbag)
-}

@@ -24,10 +24,9 @@ mod container;
 mod dataset;
 mod encode;
 mod error;
-pub mod exchange;
 mod frame;
 pub mod fs;
-#[doc(hidden)]
+#[cfg(any(test, feature = "testing"))]
 pub mod fuzzing;
 mod msgs;
 pub mod npy;
@@ -40,7 +39,9 @@ pub mod report;
 mod select;
 mod session;
 mod slice;
-mod still;
+pub mod still;
+#[cfg(any(test, feature = "testing"))]
+pub mod testing;
 mod verify;
 
 pub use cat::{
@@ -55,7 +56,7 @@ pub use compare::{
 };
 pub use dataset::{
     Dataset, DatasetFrame, DatasetInfo, DatasetSet, MotionInfo, PixelMode, SetRange, SetReader, Sets,
-    SpreadStats, StreamInfo,
+    SpreadStats, StreamInfo, jpeg_pixels,
 };
 pub use error::{Error, ErrorKind, Result};
 pub use frame::{

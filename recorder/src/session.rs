@@ -466,8 +466,9 @@ fn text_of(fs: &dyn Fs, path: &Path) -> Result<String> {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use super::*;
+    use crate::testing::stream;
     use proptest::prelude::*;
 
     proptest! {
@@ -487,23 +488,6 @@ pub(crate) mod tests {
                 (p.translation_m.map(f64::to_bits), p.rotation_xyzw.map(f64::to_bits))
             };
             prop_assert_eq!(bits(&again), bits(&session));
-        }
-    }
-
-    /// A stream of a small camera.
-    pub(crate) fn stream(id: StreamId, model: String, format: PixelFormat) -> StreamRecord {
-        StreamRecord {
-            id,
-            model,
-            serial: "1".to_owned(),
-            format,
-            width: 4,
-            height: 4,
-            rate_hz: 30.0,
-            depth_unit_m: if format.is_depth() { 0.001 } else { 0.0 },
-            calibration: String::new(),
-            intrinsics: Intrinsics::default(),
-            pose: Pose::IDENTITY,
         }
     }
 }

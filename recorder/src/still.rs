@@ -58,12 +58,10 @@ pub fn still(frame: &DatasetFrame, form: StillFormat) -> Result<Cow<'_, [u8]>> {
 }
 
 /// The file of an image whose rows follow each other without padding.
-pub(crate) fn encode(
-    h: &FrameHeader,
-    format: PixelFormat,
-    pixels: &[u8],
-    form: StillFormat,
-) -> Result<Vec<u8>> {
+///
+/// # Errors
+/// [`ErrorKind::Codec`] when the format cannot be stored in this form.
+pub fn encode(h: &FrameHeader, format: PixelFormat, pixels: &[u8], form: StillFormat) -> Result<Vec<u8>> {
     if format == PixelFormat::Mjpeg || pixels.len() != format.frame_bytes(h.width, h.height) {
         return Err(refused(h, format_args!("has {} bytes, not as many as its size says", pixels.len())));
     }
@@ -128,7 +126,7 @@ fn array(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Vec<u8> {
 }
 
 /// The rows without padding.
-pub(crate) fn tight<'a>(h: &FrameHeader, pixels: &'a [u8], format: PixelFormat) -> Cow<'a, [u8]> {
+pub fn tight<'a>(h: &FrameHeader, pixels: &'a [u8], format: PixelFormat) -> Cow<'a, [u8]> {
     let row = format.row_bytes(h.width) as usize;
     let stride = h.stride as usize;
     if stride <= row || row == 0 {

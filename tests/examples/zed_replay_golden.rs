@@ -5,7 +5,7 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::print_stdout)]
 
 use core::ops::ControlFlow;
-use depthrig_daemon::zed_replay::{ZedReplayOptions, zed_replay};
+use depthrig_convert::zed_replay::{ZedReplayOptions, zed_replay};
 use depthrig_recorder::Dataset;
 use depthrig_tests::expected;
 use depthrig_tests::synthetic_stereo::SyntheticStereo;

@@ -11,7 +11,8 @@
 
 use core::ops::ControlFlow;
 use depthrig_calib::stereo::Preset;
-use depthrig_daemon::zed_replay::{CpuReport, Mode, ZedReplayOptions, ZedReplayReport, zed_replay};
+use depthrig_convert::zed_replay::{CpuReport, ZedReplayOptions, ZedReplayReport, zed_replay};
+use depthrig_stereo::Mode;
 use depthrig_tests::synthetic_stereo::SyntheticStereo;
 use std::path::Path;
 

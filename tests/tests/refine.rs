@@ -4,10 +4,10 @@
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
 use depthrig_bus::{Bus, Frame, FrameFlags, HostTime, PixelFormat, RigName, StageStep, Subscriber};
+use depthrig_cdm::stage::RefineConfig;
+use depthrig_cdm::stage::{Opened, Plan, Refiners};
 use depthrig_cdm::{Description, EngineKind, Error, ErrorKind, Job, Output, Precision, Refiner, Result};
-use depthrig_daemon::config::RefineConfig;
 use depthrig_daemon::rig::Rig;
-use depthrig_daemon::stage::{Opened, Plan, Refiners};
 use depthrig_daemon::status::{RefineState, RefineStatus, RigStatus, StreamStatus};
 use depthrig_tests::{Home, ImageSize, RigText, all_stream, assert_balanced, camera, wait_until};
 use std::sync::Arc;

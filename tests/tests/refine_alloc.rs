@@ -5,10 +5,10 @@
 //! A test binary of its own, because its allocator counts.
 #![allow(missing_docs, clippy::unwrap_used, clippy::expect_used)]
 
+use depthrig_cdm::stage::RefineConfig;
+use depthrig_cdm::stage::{Opened, Plan, Refiners};
 use depthrig_cdm::{Description, EngineKind, Job, Output, Precision, Refiner, Result};
 use depthrig_counting::{Counting, of_thread, of_watched, watch_thread};
-use depthrig_daemon::config::RefineConfig;
-use depthrig_daemon::stage::{Opened, Plan, Refiners};
 use depthrig_tests::{Home, RigText, wait_until};
 use std::sync::{Arc, Mutex};
 

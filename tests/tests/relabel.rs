@@ -3,8 +3,8 @@
 
 use core::ops::ControlFlow;
 use depthrig_bus::{FrameFlags, FrameHeader, MOTION_SAMPLE_BYTES, MotionSample};
-use depthrig_daemon::config::{CdmConfig, EngineChoice, RefineConfig};
-use depthrig_daemon::relabel::{RelabelOptions, Step, relabel};
+use depthrig_cdm::stage::{CdmConfig, EngineChoice, RefineConfig};
+use depthrig_convert::relabel::{RelabelOptions, Step, relabel};
 use depthrig_recorder::{
     CompareOptions, Dataset, DatasetSet, ErrorKind, PixelMode, RecordMotion, SetRange, VerifyOptions,
     compare, verify,

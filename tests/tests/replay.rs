@@ -5,16 +5,17 @@
 use core::ops::ControlFlow;
 use depthrig_bus::{Bus, FrameFlags, FrameHeader, HostTime, RigName, SetSubscriber, StreamId, Subscriber};
 use depthrig_calib::stereo::Preset;
+use depthrig_convert::zed_replay::{ZedReplayOptions, zed_replay};
 use depthrig_daemon::ErrorKind;
 use depthrig_daemon::client::Client;
 use depthrig_daemon::control::{Control, RecordRequest, ReplayControl, SeekRequest};
 use depthrig_daemon::replay::{Replay, ReplayOptions};
 use depthrig_daemon::status::CameraState;
-use depthrig_daemon::zed_replay::{Mode, ZedReplayOptions, zed_replay};
 use depthrig_recorder::{
     ColorCodec, CompareOptions, Dataset, DepthCodec, PixelCheck, PixelMode, SetRange, Severity,
     VerifyOptions, compare, verify,
 };
+use depthrig_stereo::Mode;
 use depthrig_tests::Home;
 use depthrig_tests::disk::Tmpfs;
 use depthrig_tests::fixture::{Fixture, SECOND};

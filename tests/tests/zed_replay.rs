@@ -4,11 +4,12 @@
 use core::ops::ControlFlow;
 use depthrig_bus::{FrameFlags, FrameHeader, MotionSample, PixelFormat};
 use depthrig_calib::stereo::Preset;
-use depthrig_daemon::zed_replay::{Mode, NetworkChoice, Step, ZedReplayOptions, zed_replay};
+use depthrig_convert::zed_replay::{NetworkChoice, Step, ZedReplayOptions, zed_replay};
 use depthrig_recorder::{
     CompareOptions, Dataset, DatasetSet, ErrorKind, PixelMode, RecordMotion, Session, SetRange,
     VerifyOptions, compare, verify,
 };
+use depthrig_stereo::Mode;
 use depthrig_tests::synthetic_stereo::SyntheticStereo;
 use depthrig_zed::replay::fake;
 use std::io::{BufRead, BufReader};

@@ -134,6 +134,7 @@ pub(super) fn of(import: &Import, weights: &Weights, report: &Report, written: W
 }
 
 /// For the fuzz target: reads a record, and sees that writing it changes nothing.
+#[cfg(any(test, feature = "testing"))]
 pub(crate) fn fuzz(text: &str) -> bool {
     let Ok(record) = Record::from_toml(text) else { return false };
     let again = Record::from_toml(&record.to_toml());

@@ -32,6 +32,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
 mod ledger;
+mod mode;
 mod newest;
 mod pair;
 mod rows;
@@ -435,3 +436,5 @@ fn rectifier(name: &str, left: &StreamProfile, right: &StreamProfile) -> Result<
 
 #[cfg(test)]
 mod tests;
+
+pub use mode::Mode;

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 /// The table of a camera's refined depth.
 pub(super) const TABLE: &str = "[camera.refine]";
 /// The streams that it makes.
-pub(super) const COMPUTED: [&str; 2] = [crate::stage::REFINED, crate::stage::ALIGNED];
+pub(super) const COMPUTED: [&str; 2] = [depthrig_cdm::stage::REFINED, depthrig_cdm::stage::ALIGNED];
 
 const ENGINES: [(&str, EngineChoice); 4] = [
     ("auto", EngineChoice::Auto),

@@ -3,9 +3,9 @@
 use super::read::Section;
 use super::value::{above_zero, not_empty, resolve, within};
 use super::wanted::WantedStream;
-use crate::zed_replay::Mode;
 use depthrig_calib::stereo::{Matcher, Preset};
 use depthrig_cdm::{StereoNetwork, StereoNetworkOptions};
+use depthrig_stereo::Mode;
 use depthrig_stereo::{Geometry, Maker, StereoMode, StereoOptions};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

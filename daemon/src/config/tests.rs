@@ -4,6 +4,7 @@
 
 use super::read::Report;
 use super::*;
+use depthrig_bus::PixelFormat;
 use depthrig_external::ExternalConfig;
 use depthrig_realsense::RealsenseConfig;
 use depthrig_realsense::l515::L515Config;
@@ -343,8 +344,8 @@ fn an_attached_kinect_is_set_as_the_file_says() {
 
 #[test]
 fn a_recording_of_a_zed_and_its_stereo_are_set_as_the_file_says() {
-    use crate::zed_replay::Mode;
     use depthrig_calib::stereo::Preset;
+    use depthrig_stereo::Mode;
     let rig = parse(
         r#"
         rig = "r"

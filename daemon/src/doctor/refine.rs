@@ -2,8 +2,9 @@
 
 use super::finding::{Finding, Severity};
 use super::plan::CameraPlan;
-use crate::config::{CameraConfig, EngineChoice, RefineConfig, RigConfig};
-use crate::stage::{Installed, Plan, Refiners, models};
+use crate::config::{CameraConfig, RigConfig};
+use depthrig_cdm::stage::{EngineChoice, RefineConfig};
+use depthrig_cdm::stage::{Installed, Plan, Refiners, models};
 use depthrig_cdm::{Encoder, EngineKind, find_library};
 
 /// Multiplications and additions a second that one core of a present computer does in such a network, in 32-bit floats: a

@@ -1,11 +1,11 @@
 //! Refined depth on a replay: the stage of a live rig, between the channels of a dataset.
 
 use super::Inner;
-use crate::config::{EngineChoice, RefineConfig};
 use crate::stage::{self, Readers, Refinement, Setup};
 use crate::stream::Stream;
 use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{Bus, StreamId};
+use depthrig_cdm::stage::{EngineChoice, RefineConfig};
 use depthrig_recorder::StreamRecord;
 use std::sync::Arc;
 

@@ -1,10 +1,10 @@
 //! One camera's refined depth: its streams, the pair that waits for the engine, its accounts and its state.
 
-use crate::config::RefineConfig;
 use crate::status::{RefineState, RefineStatus};
 use crate::stream::Stream;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{CameraName, DropReason, Frame, HostTime, StageStep, Subscriber};
+use depthrig_cdm::stage::RefineConfig;
 use std::sync::{Arc, Mutex, MutexGuard};
 
 /// Frames over which the steps are measured.

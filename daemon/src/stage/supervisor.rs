@@ -1,6 +1,5 @@
 //! One refiner under supervision: opened on its own thread, watched, given up when it hangs, opened again after an error.
 
-use super::engines::{Opened, Plan, Refiners};
 use super::refinement::Refinement;
 use super::worker::{Shared, Worker};
 use crate::priority;
@@ -9,6 +8,7 @@ use crate::wake::Wake;
 use core::time::Duration;
 use depthrig_bus::HostTime;
 use depthrig_bus::sync::lock;
+use depthrig_cdm::stage::{Opened, Plan, Refiners};
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;

@@ -3,14 +3,13 @@
 //! Nothing is allocated per frame once every camera has had one, except the counter that iceoryx2 makes for each slot
 //! that it lends: scratch memory is kept, and pixels are written where subscribers read them.
 
-use super::pixels;
 use super::refinement::{Pair, Refinement, Skip};
-use super::view::View;
 use crate::stream::Stream;
 use crate::wake::Wake;
 use core::time::Duration;
 use depthrig_bus::sync::lock;
 use depthrig_bus::{FrameFlags, FrameHeader, FrameMut, HostTime, PixelFormat, Publisher, StageStep};
+use depthrig_cdm::stage::{View, derived_header, pixels};
 use depthrig_cdm::{Color, Error, ErrorKind, Job, Output, RawDepth, Refiner, StepTimes};
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
@@ -19,13 +18,6 @@ use std::sync::{Arc, Mutex};
 const IDLE: Duration = Duration::from_millis(100);
 /// Pairs of one batch at most.
 pub const MAX_BATCH: usize = 8;
-/// Flags of the source frames that hold for the refined frame, too.
-const INHERITED: u32 = FrameFlags::REPLAYED
-    .with(FrameFlags::SYNTHETIC)
-    .with(FrameFlags::TIME_UNCERTAIN)
-    .with(FrameFlags::CLOCK_WARMUP)
-    .0;
-
 /// State that a worker shares with its supervisor. Each worker has its own, so that one that was given up can
 /// do no harm.
 #[derive(Debug, Default)]
@@ -293,7 +285,14 @@ impl WorkerCamera {
         let register_ns = began.elapsed().as_nanos() as u64;
         if let Some(stream) = &self.refinement.aligned {
             let steps = [began.since_ns(pair.ready).max(0) as u64, register_ns, 0, 0, 0, 0];
-            let header = derived(&pair, PixelFormat::Z16, unit_m, steps, self.epoch);
+            let header = derived_header(
+                pair.color.header(),
+                pair.depth.header(),
+                PixelFormat::Z16,
+                unit_m,
+                steps,
+                self.epoch,
+            );
             let publisher = stream.books().publisher.clone();
             let loan = publisher.and_then(|p| Some((p.loan(registered.len() * 2).ok()?, p)));
             let sent = loan.ok_or(Some(Skip::NoSlot)).and_then(|(mut out, publisher)| {
@@ -329,7 +328,8 @@ impl WorkerCamera {
         let steps = [wait_ns, register_ns, steps.prepare_ns, steps.infer_ns, steps.finish_ns, 0];
         let format = self.refinement.refined.profile.format;
         let unit_m = if format == PixelFormat::DepthF32 { 1.0 } else { unit_m };
-        let mut header = derived(&pair, format, unit_m, steps, self.epoch);
+        let mut header =
+            derived_header(pair.color.header(), pair.depth.header(), format, unit_m, steps, self.epoch);
         header.set_refiner(engine, model);
         let total = publish_on(&self.refinement.refined, self.session, &publisher, out, header, pair.ready)?;
         self.epoch = Some(header.clock_epoch);
@@ -349,47 +349,6 @@ impl WorkerCamera {
             self.refinement.skip(why);
         }
     }
-}
-
-/// The header of the refined frame of `pair`, without its numbers and times on the channel. `epoch` is the clock map
-/// of the frame before.
-fn derived(
-    pair: &Pair,
-    format: PixelFormat,
-    unit_m: f64,
-    stage_ns: [u64; StageStep::ALL.len()],
-    epoch: Option<u32>,
-) -> FrameHeader {
-    derived_header(pair.color.header(), pair.depth.header(), format, unit_m, stage_ns, epoch)
-}
-
-/// The same of the two headers.
-pub(crate) fn derived_header(
-    color: &FrameHeader,
-    depth: &FrameHeader,
-    format: PixelFormat,
-    unit_m: f64,
-    stage_ns: [u64; StageStep::ALL.len()],
-    epoch: Option<u32>,
-) -> FrameHeader {
-    let changed = epoch.is_some_and(|e| e != depth.clock_epoch);
-    let inherited = depth.flags & !(FrameFlags::EPOCH_CHANGED.0) | color.flags & INHERITED;
-    let mut header = FrameHeader {
-        // Everything about the time is depth's, everything about the view is colour's.
-        intrinsics: color.intrinsics,
-        pose: color.pose,
-        depth_unit_m: unit_m,
-        flags: inherited | FrameFlags::DERIVED.0 | if changed { FrameFlags::EPOCH_CHANGED.0 } else { 0 },
-        set_id: 0,
-        source_sequence: depth.sequence,
-        source_color_sequence: color.sequence,
-        source_color_capture_time_ns: color.capture_time_ns,
-        capture_uncertainty_ns: depth.capture_uncertainty_ns,
-        stage_ns,
-        ..*depth
-    };
-    header.set_image(format, color.width, color.height);
-    header
 }
 
 /// Numbers and publishes a frame on `stream` and says how long it took since `ready`, nanoseconds. `Err(None)`: this

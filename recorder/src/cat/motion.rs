@@ -9,7 +9,7 @@ use crate::{Error, ErrorKind, Result};
 use depthrig_bus::{MOTION_FIELDS, MotionSample, StreamId};
 use serde::Serialize;
 use std::ops::{ControlFlow, Range};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Format of a motion file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

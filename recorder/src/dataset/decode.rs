@@ -59,7 +59,10 @@ fn wrong(h: &FrameHeader, what: impl core::fmt::Display) -> Error {
 }
 
 /// The pixels of a colour JPEG, three bytes each without row padding.
-pub(crate) fn jpeg_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
+///
+/// # Errors
+/// [`ErrorKind::Codec`] when the JPEG is damaged or not of the size in the header.
+pub fn jpeg_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
     let damaged = |e: depthrig_jpeg::Error| wrong(h, "its JPEG is damaged").with_source(e);
     let info = depthrig_jpeg::info(stored).map_err(damaged)?;
     let expected = Info { width: h.width, height: h.height, form: Form::Rgb };
@@ -81,6 +84,7 @@ fn png_pixels(stored: &[u8], h: &FrameHeader) -> Result<Vec<u8>> {
 }
 
 /// Whether this is a PNG or a JPEG of the header's size: for the fuzz targets.
+#[cfg(any(test, feature = "testing"))]
 pub(crate) fn color_decodes(stored: &[u8], h: &FrameHeader) -> bool {
     png_pixels(stored, h).is_ok() | jpeg_pixels(stored, h).is_ok()
 }

@@ -88,7 +88,7 @@ impl SetReader {
     }
 
     /// Another reader of the same sets, without reading the indexes again.
-    pub(crate) fn fork(&self) -> Self {
+    pub fn fork(&self) -> Self {
         Self {
             dataset: self.dataset.clone(),
             times: self.times.clone(),
@@ -99,7 +99,7 @@ impl SetReader {
     }
 
     /// The numbers of the sets of each segment that has any.
-    pub(crate) fn segment_numbers(&self) -> Vec<std::ops::Range<usize>> {
+    pub fn segment_numbers(&self) -> Vec<std::ops::Range<usize>> {
         let ends = self.segments.iter().skip(1).map(|p| p.first).chain([self.times.len()]);
         self.segments.iter().zip(ends).map(|(p, end)| p.first..end).collect()
     }

@@ -97,19 +97,12 @@ pub(crate) mod tests {
     use depthrig_bus::HEADER_SIZE;
     use proptest::prelude::*;
 
-    /// The header as it lies in memory. `FrameHeader` is `repr(C)` without padding (asserted in the bus).
-    pub(crate) fn memory(h: &FrameHeader) -> [u8; HEADER_SIZE] {
-        // SAFETY: both are 768 bytes without padding, and any bytes are a valid array.
-        unsafe { core::mem::transmute::<FrameHeader, [u8; HEADER_SIZE]>(*h) }
-    }
+    pub(crate) use crate::testing::header_bytes as memory;
 
     /// A header of any bits at all.
     pub(crate) fn any_header() -> impl Strategy<Value = FrameHeader> {
-        proptest::collection::vec(any::<u8>(), HEADER_SIZE).prop_map(|bytes| {
-            let bytes: [u8; HEADER_SIZE] = bytes.try_into().unwrap();
-            // SAFETY: every field is a plain number or an array of such, valid for all bits.
-            unsafe { core::mem::transmute::<[u8; HEADER_SIZE], FrameHeader>(bytes) }
-        })
+        proptest::collection::vec(any::<u8>(), HEADER_SIZE)
+            .prop_map(|bytes| crate::testing::header_of(bytes.try_into().unwrap()))
     }
 
     proptest! {

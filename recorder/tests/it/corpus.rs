@@ -55,26 +55,6 @@ fn sessions() {
     run("session", fuzzing::session, false);
 }
 
-#[test]
-fn rosbags() {
-    run("rosbag", fuzzing::rosbag, 3);
-}
-
-#[test]
-fn rows_of_frames_csv() {
-    run("frames_csv", fuzzing::frames_csv, false);
-}
-
-#[test]
-fn calibrations() {
-    run("calibration_json", fuzzing::calibration_json, false);
-}
-
-#[test]
-fn arrays() {
-    run("npy", fuzzing::npy, false);
-}
-
 /// Changes a few bytes, or cuts or repeats some.
 fn change(bytes: &[u8], seed: u64) -> Vec<u8> {
     let mut out = bytes.to_vec();

@@ -15,15 +15,16 @@ use core::sync::atomic::{AtomicBool, Ordering};
 use core::time::Duration;
 use depthrig_bus::{Bus, HostTime, Name, RuntimeDir, StreamId, UtcPair};
 use depthrig_cdm::Precision;
-use depthrig_daemon::config::{CameraConfig, EngineChoice, RefineConfig, RigConfig};
+use depthrig_cdm::stage::{EngineChoice, RefineConfig};
+use depthrig_daemon::config::{CameraConfig, RigConfig};
 use depthrig_daemon::control::RecordRequest;
 use depthrig_daemon::rig::{Rig, RigSummary};
 use depthrig_daemon::status::{CameraStatus, RigStatus};
-use depthrig_daemon::zed_replay::Mode;
 use depthrig_driver::StreamRequest;
 use depthrig_recorder::report::REPORT_FILE;
 use depthrig_recorder::{Dataset, VerifyOptions, verify};
 use depthrig_sim::synthetic::SyntheticConfig;
+use depthrig_stereo::Mode;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 

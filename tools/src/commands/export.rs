@@ -7,7 +7,7 @@ use crate::progress::Progress;
 use crate::signals::Stop;
 use anyhow::Result;
 use core::ops::ControlFlow;
-use depthrig_recorder::exchange::{ExportOptions, ExportReport, Exporter, export};
+use depthrig_convert::{ExportOptions, ExportReport, Exporter, export};
 use depthrig_recorder::fs::RealFs;
 use depthrig_recorder::{Dataset, ErrorKind};
 use std::path::PathBuf;

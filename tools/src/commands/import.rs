@@ -9,11 +9,9 @@ use anyhow::Result;
 use clap::ValueEnum;
 use core::ops::ControlFlow;
 use depthrig_bus::CameraName;
-use depthrig_daemon::import_kinect::{KinectImport, KinectOptions};
+use depthrig_convert::kinect::{KinectImport, KinectOptions};
+use depthrig_convert::{ByteCameraImport, ByteCameraOptions, ImportReport, Importer, RosbagImport, import};
 use depthrig_kinect::playback::CalibrationSource;
-use depthrig_recorder::exchange::{
-    ByteCameraImport, ByteCameraOptions, ImportReport, Importer, RosbagImport, import,
-};
 use depthrig_recorder::fs::{Fs, RealFs};
 use depthrig_recorder::{ColorCodec, RecorderOptions, check_outside};
 use std::path::{Path, PathBuf};

@@ -10,7 +10,6 @@
 use depthrig_bus::files::NewFile;
 use depthrig_driver::{Error, ErrorKind, Result};
 use memmap2::Mmap;
-use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
 use std::path::Path;
 

@@ -8,8 +8,8 @@ use crate::watched::{DerivedDataset, watched};
 use anyhow::Result;
 use clap::ValueEnum;
 use depthrig_cdm::FillRefiner;
-use depthrig_daemon::config::{CdmConfig, EngineChoice, RefineConfig, RefineModel};
-use depthrig_daemon::relabel::{RelabelOptions, RelabelReport, Step, relabel};
+use depthrig_cdm::stage::{CdmConfig, EngineChoice, RefineConfig, RefineModel};
+use depthrig_convert::relabel::{RelabelOptions, RelabelReport, Step, relabel};
 use depthrig_recorder::Dataset;
 use std::path::PathBuf;
 

@@ -3,7 +3,7 @@
 use super::Common;
 use anyhow::Result;
 use clap::ValueEnum;
-use depthrig_recorder::exchange::{ByteCameraExport, CameraNames};
+use depthrig_convert::{ByteCameraExport, CameraNames};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\

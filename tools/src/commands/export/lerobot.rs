@@ -3,7 +3,7 @@
 use super::Common;
 use clap::ValueEnum;
 use depthrig_bus::StreamId;
-use depthrig_recorder::exchange::lerobot::{Incomplete, Lerobot, LerobotOptions};
+use depthrig_convert::lerobot::{Incomplete, Lerobot, LerobotOptions};
 
 /// Examples for `--help`.
 pub const EXAMPLES: &str = "\

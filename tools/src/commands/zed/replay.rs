@@ -6,10 +6,11 @@ use crate::out;
 use crate::watched::{DerivedDataset, watched};
 use anyhow::Result;
 use clap::ValueEnum;
-use depthrig_daemon::zed_replay::{
-    Mode, NetworkChoice, NetworkPixels, OpenOptions, Step, ZedReplayOptions, ZedReplayReport, zed_replay,
+use depthrig_convert::zed_replay::{
+    NetworkChoice, NetworkPixels, OpenOptions, Step, ZedReplayOptions, ZedReplayReport, zed_replay,
 };
 use depthrig_recorder::ColorCodec;
+use depthrig_stereo::Mode;
 use depthrig_zed::CalibrationFile;
 use std::path::PathBuf;
 

@@ -1,0 +1,19 @@
+//! The parts of refinement: a camera's settings, the refiner that they select, depth in the view of colour, and the header of the
+//! result. The daemon's stage thread and the relabelling of datasets are made of it.
+
+mod engines;
+mod header;
+pub mod models;
+pub mod pixels;
+mod settings;
+mod view;
+
+pub use engines::{Installed, Opened, Plan, Refiners, missing};
+pub use header::derived_header;
+pub use settings::{CdmConfig, EngineChoice, RefineConfig, RefineModel};
+pub use view::View;
+
+/// The name of the stream of refined depth.
+pub const REFINED: &str = "depth_refined";
+/// The name of the stream of depth in the view of colour.
+pub const ALIGNED: &str = "depth_aligned";

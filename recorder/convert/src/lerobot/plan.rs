@@ -1,0 +1,174 @@
+//! The plan made before an image is read: how many rows there will be, at which rate, of which tasks.
+
+use super::schema::Schema;
+use super::{Incomplete, LerobotOptions};
+use crate::Source;
+use depthrig_bus::StreamId;
+use depthrig_recorder::PixelMode;
+use depthrig_recorder::{Error, ErrorKind, Result};
+use std::collections::BTreeMap;
+
+/// Everything that is decided before an image is read.
+#[derive(Debug, Clone)]
+pub(super) struct Plan {
+    pub(super) schema: Schema,
+    pub(super) fps: f64,
+    pub(super) episodes: Vec<Episode>,
+    /// The tasks in the order of their indices.
+    pub(super) tasks: Vec<String>,
+    /// Changes and omissions by the format, in words.
+    pub(super) losses: Vec<String>,
+}
+
+/// A dataset as an episode.
+#[derive(Debug, Clone)]
+pub(super) struct Episode {
+    pub(super) task: usize,
+    pub(super) first_row: u64,
+    pub(super) rows: u64,
+    /// Numbers of the sets that are left out, in order.
+    left_out: Vec<usize>,
+}
+
+impl Episode {
+    /// The row within the episode of the set with this number; `None` when it is left out.
+    pub(super) fn row_of(&self, number: usize) -> Option<u64> {
+        match self.left_out.binary_search(&number) {
+            Ok(_) => None,
+            Err(before) => Some((number - before) as u64),
+        }
+    }
+}
+
+/// Resolution of the distances between sets: fine enough for a rate, coarse enough that there are few different ones.
+const STEP_NS: i64 = 100_000;
+
+/// How often two rows that follow each other were this far apart, in steps of [`STEP_NS`].
+type Steps = BTreeMap<i64, u64>;
+
+fn steps(times: &[i64], episode: &Episode) -> Steps {
+    let mut steps = Steps::new();
+    let kept = times.iter().enumerate().filter(|(n, _)| episode.row_of(*n).is_some()).map(|(_, t)| *t);
+    let mut last = None;
+    for t in kept {
+        if let Some(last) = last.replace(t) {
+            *steps.entry((t - last) / STEP_NS).or_default() += 1;
+        }
+    }
+    steps
+}
+
+/// The rate of the rig's configuration, or the one that the sets have where that is another one, Hz.
+fn rate(source: &Source, steps: &Steps) -> Option<f64> {
+    let total: u64 = steps.values().sum();
+    let mut seen = 0;
+    let median = steps.iter().find(|(_, n)| {
+        seen += **n;
+        2 * seen >= total
+    });
+    let measured = median.map(|(step, _)| 1e9 / ((*step as f64 + 0.5) * STEP_NS as f64));
+    let nominal = toml::from_str::<toml::Table>(&source.session().rig_config).ok();
+    let nominal = nominal.as_ref().and_then(|t| t.get("sets")?.as_table()?.get("rate_hz"));
+    let nominal = nominal.and_then(|v| v.as_float().or_else(|| v.as_integer().map(|i| i as f64)));
+    match (nominal.filter(|n| *n > 0.0), measured) {
+        // A recording may have been thinned since: then the configuration says nothing of it.
+        (Some(n), Some(m)) if (m / n - 1.0).abs() < 0.1 => Some(n),
+        (_, Some(m)) if (m / m.round() - 1.0).abs() < 0.02 => Some(m.round()),
+        (_, Some(m)) => Some((m * 1e2).round() / 1e2),
+        (n, None) => n,
+    }
+}
+
+/// Places where the next row came later than one and a half periods, and how many rows would have been there.
+fn gaps(steps: &Steps, fps: f64) -> (u64, u64) {
+    let periods = |step: i64| (step as f64 + 0.5) * STEP_NS as f64 * fps / 1e9;
+    let late = steps.iter().map(|(step, n)| (periods(*step), n)).filter(|(periods, _)| *periods > 1.5);
+    late.fold((0, 0), |(gaps, rows), (periods, n)| (gaps + n, rows + n * (periods.round() as u64 - 1)))
+}
+
+/// Numbers of the sets that lack a frame of an exported stream, or that cannot be read at all.
+fn incomplete(source: &Source, schema: &Schema) -> Result<Vec<usize>> {
+    let place = schema.places(source);
+    let mut reader = source.reader();
+    let mut found = Vec::new();
+    for number in 0..source.times().len() {
+        match reader.read(number, PixelMode::None) {
+            Err(e) if e.kind() == ErrorKind::Io => return Err(e),
+            Ok(set) if !set.missing.iter().any(|s| place.get(*s).copied().flatten().is_some()) => {}
+            _ => found.push(number),
+        }
+    }
+    Ok(found)
+}
+
+impl Plan {
+    /// Decides how `sources` are exported; reads sets, without images, only where incomplete ones are left out.
+    pub(super) fn make(sources: &[Source], options: &LerobotOptions) -> Result<Self> {
+        let bad = |message: String| Error::new(ErrorKind::BadInput, message);
+        let wanted = |id: &StreamId| options.streams.is_empty() || options.streams.contains(id);
+        for id in &options.streams {
+            if sources.iter().any(|s| s.session().streams.iter().all(|s| s.id != *id)) {
+                return Err(bad(format!("there is no stream {id} to export, at least not in every dataset")));
+            }
+        }
+        let schema = Schema::of(sources, &wanted)?;
+        let losses = schema.losses();
+        let mut plan = Self { schema, fps: 0.0, episodes: Vec::new(), tasks: Vec::new(), losses };
+        let mut fps = None;
+        let mut first_row = 0;
+        for source in sources {
+            let name = source.dataset().path().display();
+            let left_out = match options.incomplete {
+                Incomplete::Mark => Vec::new(),
+                Incomplete::LeaveOut => incomplete(source, &plan.schema)?,
+            };
+            let rows = (source.times().len() - left_out.len()) as u64;
+            if rows == 0 {
+                return Err(bad(format!("{name}: there is no set to export in it")));
+            }
+            let task = options.task.clone().unwrap_or_else(|| task_of(source));
+            let task = plan.tasks.iter().position(|t| *t == task).unwrap_or_else(|| {
+                plan.tasks.push(task);
+                plan.tasks.len() - 1
+            });
+            let episode = Episode { task, first_row, rows, left_out };
+            let steps = steps(source.times(), &episode);
+            let here = options.fps.or_else(|| rate(source, &steps)).unwrap_or(1.0);
+            let fps = *fps.get_or_insert(here);
+            if (here / fps - 1.0).abs() > 1e-3 {
+                return Err(bad(format!(
+                    "{name} has {here} sets per second, the first dataset {fps}: LeRobot has one rate for all \
+                     episodes; export them separately or give the rate"
+                )));
+            }
+            let session = &source.session().name;
+            if !episode.left_out.is_empty() {
+                let n = episode.left_out.len();
+                plan.losses.push(format!("{session}: {n} sets that lack a frame are left out"));
+            }
+            let (gaps, missing) = gaps(&steps, fps);
+            if gaps > 0 {
+                plan.losses.push(format!(
+                    "{session}: {gaps} gaps in time ({missing} sets) are closed by the even grid of timestamp; \
+                     capture.utc_ns has the true times"
+                ));
+            }
+            first_row += rows;
+            plan.fps = fps;
+            plan.episodes.push(episode);
+        }
+        Ok(plan)
+    }
+
+    /// Rows of all episodes.
+    pub(super) fn rows(&self) -> u64 {
+        self.episodes.iter().map(|e| e.rows).sum()
+    }
+}
+
+/// LeRobot's task is a sentence; the scene is the nearest that a session has.
+fn task_of(source: &Source) -> String {
+    let session = source.session();
+    let scene = session.scene.trim();
+    if scene.is_empty() { session.name.clone() } else { scene.to_owned() }
+}

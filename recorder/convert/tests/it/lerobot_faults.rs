@@ -1,0 +1,108 @@
+//! LeRobot exports whose disk fails at each operation, or loses its power. Their content is checked in
+//! `tests/python/test_lerobot.py`, with pyarrow and the real loader.
+
+use crate::support::*;
+use core::ops::ControlFlow;
+use depthrig_convert::lerobot::{Lerobot, LerobotOptions};
+use depthrig_convert::{ExportOptions, ExportReport, export};
+use depthrig_recorder::fs::{Fault, Fs, MemFs};
+use depthrig_recorder::{Dataset, ErrorKind, RecorderOptions, Result};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+fn out() -> PathBuf {
+    PathBuf::from("/export")
+}
+
+/// Two segments, and the same again as a second episode.
+fn dataset() -> MemFs {
+    let fs = MemFs::new();
+    record(&fs, 6, RecorderOptions { segment_max_ns: 4 * PERIOD, ..options() });
+    fs
+}
+
+/// Twice the same dataset: two episodes.
+fn two(fs: &MemFs) -> Vec<Dataset> {
+    vec![open(fs), open(fs)]
+}
+
+/// Exports until `sets` sets are read; `None` is all of them.
+fn run(fs: &MemFs, datasets: Vec<Dataset>, sets: Option<u64>) -> Result<ExportReport> {
+    let mut lerobot = Lerobot::new(LerobotOptions::default());
+    export(fs, &mut lerobot, datasets, &out(), ExportOptions { workers: 1 }, &mut |p| {
+        if sets.is_some_and(|sets| p.sets >= sets) {
+            ControlFlow::Break(())
+        } else {
+            ControlFlow::Continue(())
+        }
+    })
+}
+
+/// Every file below the folder of the export.
+fn files(fs: &MemFs, dir: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let entries = fs.read_dir(dir).unwrap().into_iter().map(|e| (dir.join(&e.name), e.is_dir));
+    entries
+        .flat_map(|(p, is_dir)| if is_dir { files(fs, &p) } else { [(p.clone(), contents(fs, &p))].into() })
+        .collect()
+}
+
+fn whole(source: &MemFs) -> BTreeMap<PathBuf, Vec<u8>> {
+    let fs = copy(source);
+    let report = run(&fs, two(&fs), None).unwrap();
+    let files = files(&fs, &out());
+    assert_eq!((report.sets, report.lost, report.files as usize), (12, 0, files.len() - 1));
+    assert!(files.keys().all(|p| !p.display().to_string().contains("/.")), "{:?}", files.keys());
+    files
+}
+
+#[test]
+fn an_export_to_lerobot_survives_a_failure_of_any_operation() {
+    let source = dataset();
+    let expected = whole(&source);
+    let mut failures = 0;
+    for n in 0.. {
+        let fs = copy(&source);
+        let datasets = two(&fs);
+        let at = fs.ops() + n;
+        let fs = fs.with_fault(Fault::FailOnce(at, std::io::ErrorKind::Other));
+        let result = run(&fs, datasets, None);
+        if at >= fs.ops() {
+            result.unwrap();
+            break;
+        }
+        failures += 1;
+        if let Err(e) = result {
+            assert!(
+                matches!(e.kind(), ErrorKind::Io | ErrorKind::DiskFull),
+                "operation {n}: {:?} {e}",
+                e.kind()
+            );
+        }
+        if fs.read_dir(&out()).is_ok() {
+            let left = files(&fs, &out());
+            for (path, bytes) in left.iter().filter(|(p, _)| !p.display().to_string().contains("/.")) {
+                assert_eq!(bytes, &expected[path], "operation {n} left {} in pieces", path.display());
+            }
+        }
+        run(&fs, two(&fs), None).unwrap_or_else(|e| panic!("after operation {n} failed: {e}"));
+        assert!(files(&fs, &out()) == expected, "after operation {n} failed");
+    }
+    assert!(failures > 100, "only {failures} operations");
+}
+
+#[test]
+fn an_export_to_lerobot_survives_a_power_cut() {
+    let source = dataset();
+    let expected = whole(&source);
+    let mut ended = 0;
+    for sets in 1..12 {
+        let fs = copy(&source);
+        // The last ones may be over before they are asked to end.
+        ended += u32::from(run(&fs, two(&fs), Some(sets)).unwrap().ended);
+        // Nothing unsynced is left.
+        let fs = fs.after_crash(|_| 0);
+        run(&fs, two(&fs), None).unwrap();
+        assert!(files(&fs, &out()) == expected, "power cut after {sets} sets");
+    }
+    assert!(ended > 5, "{ended} exports were ended");
+}
