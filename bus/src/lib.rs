@@ -29,7 +29,7 @@ pub use channel::{BUFFER as SUBSCRIBER_BUFFER, MAX_LENT};
 pub use clock::{HostTime, UtcPair};
 pub use drops::{DropCounts, DropReason};
 pub use error::{Error, ErrorKind, Result};
-pub use format::PixelFormat;
+pub use format::{Layout, PixelFormat, Sample};
 pub use geometry::{Distortion, Intrinsics, Pose};
 pub use header::{
     ClockDomain, FIELDS, Field, FrameFlags, FrameHeader, HEADER_SIZE, HEADER_VERSION, PIXEL_ALIGN, SCHEMA,

@@ -175,6 +175,14 @@ fn enums(out: &mut String) {
         .map(|d| (format!("{d:?}").to_lowercase(), d as u32));
     let flags = FrameFlags::ALL.map(|(name, flag)| (name.to_owned(), flag.0));
     enumeration(out, "IntEnum", "PixelFormat", "How the pixels of a frame are stored.", &formats);
+    out.push_str("\n\n# Per format: NumPy's element type, its bytes, and how many of them a pixel has.\nELEMENTS = {\n");
+    for f in PixelFormat::ALL.into_iter().filter(|f| f.layout().channels() > 0) {
+        let name = f.name().to_uppercase();
+        let bytes = f.sample().bytes();
+        let channels = f.layout().channels();
+        out.push_str(&format!("    PixelFormat.{name}: (\"{}\", {bytes}, {channels}),\n", f.numpy()));
+    }
+    out.push_str("}\n");
     enumeration(out, "IntEnum", "DropReason", "Why a captured frame never reached its channel.", &reasons);
     enumeration(out, "IntEnum", "Distortion", "The distortion model of a camera.", &models);
     enumeration(out, "IntEnum", "ClockDomain", "Where a capture time comes from.", &domains);

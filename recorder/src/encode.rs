@@ -137,7 +137,7 @@ impl FrameEncoder {
         let frame_id = job.frame_id;
         let depth = &mut self.depth;
         let (message_bytes, message_crc32) =
-            self.builder.message(head, |buf| match (codec, image::encoding(format)) {
+            self.builder.message(head, |buf| match (codec, format.ros_encoding()) {
                 (Codec::Raw, Some(encoding)) => {
                     image::write_image(buf, stamp, frame_id, h, encoding, pixels);
                     Ok(())
@@ -175,7 +175,7 @@ impl FrameEncoder {
         head: MessageHead,
         format: PixelFormat,
     ) -> Result<EncodedFrame> {
-        let encoding = image::encoding(format).ok_or_else(|| as_they_are(format))?;
+        let encoding = format.ros_encoding().ok_or_else(|| as_they_are(format))?;
         let h = &job.frame.header;
         let tail = Tail::new(job.frame.pixels, h.payload_len as usize);
         let tail =

@@ -2,7 +2,7 @@
 
 use crate::dataset::{DatasetFrame, jpeg_pixels};
 use crate::{Error, ErrorKind, Result, npy};
-use depthrig_bus::{FrameHeader, PixelFormat};
+use depthrig_bus::{FrameHeader, Layout, PixelFormat, Sample};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use serde::Serialize;
@@ -51,7 +51,7 @@ pub fn still(frame: &DatasetFrame, form: StillFormat) -> Result<Cow<'_, [u8]>> {
     }
     let format = h.pixel_format().ok_or_else(|| refused(h, "has a pixel format unknown here"))?;
     let pixels = frame.decoded()?;
-    if format == PixelFormat::Mjpeg {
+    if format.layout() == Layout::Jpeg {
         return encode(h, PixelFormat::Rgb8, &jpeg_pixels(&pixels, h)?, form).map(Cow::Owned);
     }
     encode(h, format, &tight(h, &pixels, format), form).map(Cow::Owned)
@@ -62,7 +62,7 @@ pub fn still(frame: &DatasetFrame, form: StillFormat) -> Result<Cow<'_, [u8]>> {
 /// # Errors
 /// [`ErrorKind::Codec`] when the format cannot be stored in this form.
 pub fn encode(h: &FrameHeader, format: PixelFormat, pixels: &[u8], form: StillFormat) -> Result<Vec<u8>> {
-    if format == PixelFormat::Mjpeg || pixels.len() != format.frame_bytes(h.width, h.height) {
+    if format.layout() == Layout::Jpeg || pixels.len() != format.frame_bytes(h.width, h.height) {
         return Err(refused(h, format_args!("has {} bytes, not as many as its size says", pixels.len())));
     }
     match form {
@@ -78,10 +78,10 @@ fn refused(h: &FrameHeader, why: impl core::fmt::Display) -> Error {
 
 /// The PNG colour type of a format; `None` where PNG would have to change the pixels.
 const fn png_color(format: PixelFormat) -> Option<ExtendedColorType> {
-    Some(match format {
-        PixelFormat::Rgb8 | PixelFormat::Bgr8 | PixelFormat::Mjpeg => ExtendedColorType::Rgb8,
-        PixelFormat::Mono8 | PixelFormat::Confidence8 => ExtendedColorType::L8,
-        PixelFormat::Mono16 | PixelFormat::Z16 => ExtendedColorType::L16,
+    Some(match (format.layout(), format.sample()) {
+        (Layout::Rgb | Layout::Bgr | Layout::Jpeg, _) => ExtendedColorType::Rgb8,
+        (Layout::Grey, Sample::U8) => ExtendedColorType::L8,
+        (Layout::Grey, Sample::U16) => ExtendedColorType::L16,
         _ => return None,
     })
 }
@@ -91,10 +91,12 @@ fn png(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Result<Vec<u8>> {
         let what = format_args!("is {}, which a PNG cannot hold; write NPY", format.name());
         return Err(refused(h, what));
     };
-    let pixels: Cow<'_, [u8]> = match format {
-        PixelFormat::Bgr8 => pixels.as_chunks().0.iter().flat_map(|[b, g, r]| [*r, *g, *b]).collect(),
+    let pixels: Cow<'_, [u8]> = match color {
+        _ if format.layout() == Layout::Bgr => {
+            pixels.as_chunks().0.iter().flat_map(|[b, g, r]| [*r, *g, *b]).collect()
+        }
         // The encoder takes numbers in native byte order and writes them high byte first, as PNG requires.
-        PixelFormat::Mono16 | PixelFormat::Z16 if cfg!(target_endian = "big") => {
+        ExtendedColorType::L16 if cfg!(target_endian = "big") => {
             pixels.as_chunks().0.iter().flat_map(|[low, high]| [*high, *low]).collect()
         }
         _ => pixels.into(),
@@ -111,18 +113,13 @@ fn png(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Result<Vec<u8>> {
 fn array(h: &FrameHeader, format: PixelFormat, pixels: &[u8]) -> Vec<u8> {
     let height = h.height as usize;
     let width = h.width as usize;
-    let kind = match format {
-        PixelFormat::Mono16 | PixelFormat::Z16 => "<u2",
-        PixelFormat::DepthF32 | PixelFormat::DisparityF32 => "<f4",
-        _ => "|u1",
-    };
-    match format {
-        PixelFormat::Rgb8 | PixelFormat::Bgr8 => npy::file(kind, &[height, width, 3], pixels),
-        PixelFormat::Yuyv | PixelFormat::Uyvy => npy::file(kind, &[height, width, 2], pixels),
+    let shape = match format.layout() {
         // The rows of both planes: all of Y, then half as many of U and V in turns.
-        PixelFormat::Nv12 => npy::file(kind, &[pixels.len() / width.max(1), width], pixels),
-        _ => npy::file(kind, &[height, width], pixels),
-    }
+        Layout::Nv12 => vec![pixels.len() / width.max(1), width],
+        Layout::Grey => vec![height, width],
+        layout => vec![height, width, layout.channels() as usize],
+    };
+    npy::file(format.numpy(), &shape, pixels)
 }
 
 /// The rows without padding.

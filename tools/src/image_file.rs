@@ -3,7 +3,7 @@
 use crate::outfile::{OutFile, Overwrite};
 use crate::turbo::depth_color;
 use anyhow::{Context, Result, bail};
-use depthrig_bus::{FrameHeader, PixelFormat, files};
+use depthrig_bus::{FrameHeader, Layout, Sample, files};
 use depthrig_jpeg::{Form, Image};
 use image::{
     DynamicImage, ExtendedColorType, GrayImage, ImageEncoder, ImageFormat, ImageReader, RgbImage, codecs::png,
@@ -71,14 +71,15 @@ fn rows<'a>(header: &FrameHeader, pixels: &'a [u8]) -> Result<impl Iterator<Item
 /// frame.
 pub fn depth_m(header: &FrameHeader, pixels: &[u8]) -> Result<Option<Vec<f32>>> {
     let unit = header.depth_unit_m as f32;
-    let read: fn(&[u8], f32) -> Vec<f32> = match header.pixel_format() {
-        Some(PixelFormat::Z16) => |row, unit| {
+    let Some(format) = header.pixel_format().filter(|f| f.is_depth()) else { return Ok(None) };
+    let read: fn(&[u8], f32) -> Vec<f32> = match format.sample() {
+        Sample::U8 => |row, unit| row.iter().map(|v| f32::from(*v) * unit).collect(),
+        Sample::U16 => |row, unit| {
             row.chunks_exact(2).map(|b| f32::from(u16::from_le_bytes([b[0], b[1]])) * unit).collect()
         },
-        Some(PixelFormat::DepthF32) => {
+        Sample::F32 => {
             |row, _| row.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
         }
-        _ => return Ok(None),
     };
     Ok(Some(rows(header, pixels)?.flat_map(|row| read(row, unit)).collect()))
 }
@@ -99,26 +100,26 @@ pub fn to_rgb(header: &FrameHeader, pixels: &[u8]) -> Result<RgbImage> {
         let data = depth.iter().flat_map(|z| depth_color(*z, near, far)).collect();
         return image_of(header, data);
     }
-    let data = match header.pixel_format() {
-        Some(PixelFormat::Mjpeg) => {
+    let format = header.pixel_format().context("the frame's pixel format is unknown to this version")?;
+    let data = match (format.layout(), format.sample()) {
+        (Layout::Jpeg, _) => {
             return Ok(jpeg(pixels).context("the frame's JPEG cannot be decoded")?.into_rgb8());
         }
-        Some(PixelFormat::Rgb8) => rows(header, pixels)?.flatten().copied().collect(),
-        Some(PixelFormat::Bgr8) => {
+        (Layout::Rgb, _) => rows(header, pixels)?.flatten().copied().collect(),
+        (Layout::Bgr, _) => {
             rows(header, pixels)?.flat_map(|r| r.chunks_exact(3).flat_map(|p| [p[2], p[1], p[0]])).collect()
         }
-        Some(PixelFormat::Mono8 | PixelFormat::Confidence8) => {
-            rows(header, pixels)?.flatten().flat_map(|v| [*v; 3]).collect()
-        }
-        Some(PixelFormat::Mono16) => stretched(rows(header, pixels)?),
-        Some(PixelFormat::DisparityF32) => disparity_colors(rows(header, pixels)?),
-        Some(PixelFormat::Motion) => bail!(
+        (Layout::Grey, Sample::U8) => rows(header, pixels)?.flatten().flat_map(|v| [*v; 3]).collect(),
+        (Layout::Grey, Sample::U16) => stretched(rows(header, pixels)?),
+        (Layout::Grey, Sample::F32) => disparity_colors(rows(header, pixels)?),
+        (Layout::Motion, _) => bail!(
             "{}/{} gives motion samples and no images; depthrig tap prints them",
             header.camera(),
             header.stream()
         ),
-        Some(other) => bail!("{} frames cannot be shown yet", other.name()),
-        None => bail!("the frame's pixel format is unknown to this version"),
+        (Layout::Yuyv | Layout::Uyvy | Layout::Nv12, _) => {
+            bail!("{} frames cannot be shown yet", format.name())
+        }
     };
     image_of(header, data)
 }
@@ -169,15 +170,16 @@ pub fn write_png(
         written.push(path);
         Ok(())
     };
-    let format = header.pixel_format();
-    let is_depth = format.is_some_and(PixelFormat::is_depth);
-    if matches!(format, Some(PixelFormat::Z16 | PixelFormat::Mono16)) {
+    let format = header.pixel_format().context("the frame's pixel format is unknown to this version")?;
+    let is_depth = format.is_depth();
+    let has_16_bits = format.sample() == Sample::U16;
+    if has_16_bits {
         let native: Vec<u8> = rows(header, pixels)?
             .flat_map(|r| r.chunks_exact(2).flat_map(|b| u16::from_le_bytes([b[0], b[1]]).to_ne_bytes()))
             .collect();
         write(format!("{stem}.png"), &native, ExtendedColorType::L16)?;
     }
-    if is_depth || format != Some(PixelFormat::Mono16) {
+    if is_depth || !has_16_bits {
         let name = if is_depth { format!("{stem}_preview.png") } else { format!("{stem}.png") };
         write(name, to_rgb(header, pixels)?.as_raw(), ExtendedColorType::Rgb8)?;
     }
@@ -187,6 +189,7 @@ pub fn write_png(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use depthrig_bus::PixelFormat;
 
     fn header(format: PixelFormat, width: u32, height: u32) -> FrameHeader {
         let mut h = FrameHeader::default();

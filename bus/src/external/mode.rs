@@ -4,7 +4,7 @@ use super::{
     ExternalClock, ExternalMode, ExternalModeFlags, ExternalOffer, MAX_FRAME_BYTES, MAX_MODES, MAX_STREAMS,
     text,
 };
-use crate::{Distortion, Error, ErrorKind, Intrinsics, Name, PixelFormat, Pose, Result, StreamName};
+use crate::{Distortion, Error, ErrorKind, Intrinsics, Layout, Name, PixelFormat, Pose, Result, StreamName};
 
 /// The longest side of an image, pixels.
 const MAX_SIDE: u32 = 16_384;
@@ -190,8 +190,8 @@ impl Mode {
                 return Err((field, format!("is {side}; it must be within 1 and {MAX_SIDE}")));
             }
         }
-        let halved = matches!(self.format, PixelFormat::Yuyv | PixelFormat::Uyvy | PixelFormat::Nv12);
-        let odd_height = self.format == PixelFormat::Nv12 && !self.height.is_multiple_of(2);
+        let halved = self.format.is_subsampled();
+        let odd_height = self.format.layout() == Layout::Nv12 && !self.height.is_multiple_of(2);
         if odd_height || halved && !self.width.is_multiple_of(2) {
             return Err(("width", format!("or `height` is odd, which {} cannot be", self.format.name())));
         }

@@ -8,7 +8,7 @@ use super::host::Host;
 use super::plan::CameraPlan;
 use crate::attached::Attached;
 use crate::stage;
-use depthrig_bus::PixelFormat;
+use depthrig_bus::Layout;
 use depthrig_driver::StreamProfile;
 use depthrig_libusb as libusb;
 use depthrig_usb::health;
@@ -55,11 +55,10 @@ pub fn wire_bits_per_s(p: &StreamProfile) -> f64 {
     if p.format.is_motion() {
         return 0.0;
     }
-    let bits = match p.format {
-        PixelFormat::Mono8 | PixelFormat::Confidence8 => 8.0,
-        PixelFormat::Nv12 => 12.0,
-        PixelFormat::Mjpeg => MJPEG_BITS,
-        PixelFormat::DepthF32 | PixelFormat::DisparityF32 => 32.0,
+    let bits = match p.format.layout() {
+        Layout::Grey => f64::from(8 * p.format.sample().bytes()),
+        Layout::Nv12 => 12.0,
+        Layout::Jpeg => MJPEG_BITS,
         _ => 16.0,
     };
     f64::from(p.width) * f64::from(p.height) * bits * p.rate_hz

@@ -23,20 +23,6 @@ from .errors import BadFrame, VersionMismatch
 if TYPE_CHECKING:
     import torch
 
-# Per format: NumPy's element type, its bytes, and how many of them a pixel has.
-_ELEMENTS = {
-    PixelFormat.RGB8: ("|u1", 1, 3),
-    PixelFormat.BGR8: ("|u1", 1, 3),
-    PixelFormat.MONO8: ("|u1", 1, 1),
-    PixelFormat.MONO16: ("<u2", 2, 1),
-    PixelFormat.Z16: ("<u2", 2, 1),
-    PixelFormat.DEPTH_F32: ("<f4", 4, 1),
-    PixelFormat.YUYV: ("|u1", 1, 2),
-    PixelFormat.UYVY: ("|u1", 1, 2),
-    PixelFormat.NV12: ("|u1", 1, 1),
-    PixelFormat.CONFIDENCE8: ("|u1", 1, 1),
-    PixelFormat.DISPARITY_F32: ("<f4", 4, 1),
-}
 _FORMATS = frozenset(int(f) for f in PixelFormat)
 _KINDS = {"u8": "u1", "u16": "<u2", "u32": "<u4", "i32": "<i4", "u64": "<u8", "i64": "<i8", "f32": "<f4", "f64": "<f8"}
 
@@ -92,7 +78,7 @@ def shape_of(code: int, width: int, height: int, stride: int, length: int) -> Sh
         if (height, stride, length) != (1, needed, needed):
             raise BadFrame(f"{width} IMU samples in {height} rows of {stride} bytes are not its {length} bytes")
         return Shape(f"|V{_layout.MOTION_SAMPLE_SIZE}", (width,), None, length)
-    typestr, size, channels = _ELEMENTS[pixel_format]
+    typestr, size, channels = _layout.ELEMENTS[pixel_format]
     rows = height * 3 // 2 if pixel_format is PixelFormat.NV12 else height
     row_bytes = width * size * channels
     needed = (rows - 1) * stride + row_bytes if rows else 0

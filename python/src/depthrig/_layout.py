@@ -77,6 +77,22 @@ class PixelFormat(enum.IntEnum):
     MOTION = 13
 
 
+# Per format: NumPy's element type, its bytes, and how many of them a pixel has.
+ELEMENTS = {
+    PixelFormat.RGB8: ("|u1", 1, 3),
+    PixelFormat.BGR8: ("|u1", 1, 3),
+    PixelFormat.MONO8: ("|u1", 1, 1),
+    PixelFormat.MONO16: ("<u2", 2, 1),
+    PixelFormat.Z16: ("<u2", 2, 1),
+    PixelFormat.DEPTH_F32: ("<f4", 4, 1),
+    PixelFormat.YUYV: ("|u1", 1, 2),
+    PixelFormat.UYVY: ("|u1", 1, 2),
+    PixelFormat.NV12: ("|u1", 1, 1),
+    PixelFormat.CONFIDENCE8: ("|u1", 1, 1),
+    PixelFormat.DISPARITY_F32: ("<f4", 4, 1),
+}
+
+
 class DropReason(enum.IntEnum):
     """Why a captured frame never reached its channel."""
 

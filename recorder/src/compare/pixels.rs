@@ -2,7 +2,7 @@
 
 use crate::dataset::jpeg_pixels;
 use crate::still::tight;
-use depthrig_bus::{FrameHeader, PixelFormat};
+use depthrig_bus::{FrameHeader, Layout, PixelFormat, Sample};
 use serde::Serialize;
 
 /// How far the pixels of a stream are apart, over the frames whose pixels differ.
@@ -82,7 +82,7 @@ impl PixelDifference {
             };
             return incomparable(self, shape(ha), shape(hb));
         };
-        if format == PixelFormat::Mjpeg {
+        if format.layout() == Layout::Jpeg {
             if a == b {
                 return None;
             }
@@ -107,14 +107,10 @@ impl PixelDifference {
     }
 
     fn add(&mut self, format: PixelFormat, a: &[u8], b: &[u8]) -> (String, String) {
-        let sums = match format {
-            PixelFormat::Z16 | PixelFormat::Mono16 => {
-                Sums::of(a, b, |v: [u8; 2]| u16::from_le_bytes(v).into())
-            }
-            PixelFormat::DepthF32 | PixelFormat::DisparityF32 => {
-                Sums::of(a, b, |v: [u8; 4]| f32::from_le_bytes(v).into())
-            }
-            _ => Sums { eight_bit: true, ..Sums::of(a, b, |v: [u8; 1]| v[0].into()) },
+        let sums = match format.sample() {
+            Sample::U16 => Sums::of(a, b, |v: [u8; 2]| u16::from_le_bytes(v).into()),
+            Sample::F32 => Sums::of(a, b, |v: [u8; 4]| f32::from_le_bytes(v).into()),
+            Sample::U8 => Sums { eight_bit: true, ..Sums::of(a, b, |v: [u8; 1]| v[0].into()) },
         };
         let t = &mut self.sums;
         t.samples += sums.samples;

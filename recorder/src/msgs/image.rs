@@ -3,23 +3,7 @@
 use crate::cdr::{Reader, Writer};
 use crate::codec::DepthShape;
 use crate::{Error, ErrorKind, Result};
-use depthrig_bus::{Distortion, FrameHeader, PixelFormat};
-
-/// The `encoding` of `sensor_msgs/msg/Image` for a format; `None` for images that are stored compressed.
-pub(crate) const fn encoding(format: PixelFormat) -> Option<&'static str> {
-    Some(match format {
-        PixelFormat::Rgb8 => "rgb8",
-        PixelFormat::Bgr8 => "bgr8",
-        PixelFormat::Mono8 | PixelFormat::Confidence8 => "mono8",
-        PixelFormat::Mono16 => "mono16",
-        PixelFormat::Z16 => "16UC1",
-        PixelFormat::DepthF32 | PixelFormat::DisparityF32 => "32FC1",
-        PixelFormat::Yuyv => "yuv422_yuy2",
-        PixelFormat::Uyvy => "yuv422",
-        PixelFormat::Nv12 => "nv12",
-        _ => return None,
-    })
-}
+use depthrig_bus::{Distortion, FrameHeader, Layout, PixelFormat};
 
 /// Bytes that are enough for an `Image`, or for a `CompressedImage` of these bytes.
 pub(crate) const fn room(frame_id: &str, pixels: &[u8]) -> usize {
@@ -147,11 +131,12 @@ pub(crate) fn check_image(h: &FrameHeader, len: usize) -> Result<PixelFormat> {
     if len < h.payload_len as usize {
         return bad(format!("its header promises {} bytes, {len} are there", h.payload_len));
     }
-    if format == PixelFormat::Mjpeg {
+    if format.layout() == Layout::Jpeg {
         return if h.payload_len == 0 { bad("it is empty".into()) } else { Ok(format) };
     }
     let row = u64::from(format.row_bytes(1)) * u64::from(h.width);
-    let rows = u64::from(h.height) + if format == PixelFormat::Nv12 { u64::from(h.height) / 2 } else { 0 };
+    let rows =
+        u64::from(h.height) + if format.layout() == Layout::Nv12 { u64::from(h.height) / 2 } else { 0 };
     let whole = u64::from(h.stride) * rows;
     if h.width == 0 || h.height == 0 || u64::from(h.stride) < row || u64::from(h.payload_len) != whole {
         return bad(format!(

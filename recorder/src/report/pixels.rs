@@ -3,7 +3,7 @@
 use crate::dataset::{DatasetFrame, jpeg_pixels};
 use crate::msgs::image::check_image;
 use crate::{Error, ErrorKind, Result};
-use depthrig_bus::{FrameHeader, PixelFormat};
+use depthrig_bus::{FrameHeader, Layout, PixelFormat, Sample};
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use std::borrow::Cow;
 
@@ -77,7 +77,7 @@ impl<'a> Image<'a> {
         let height = header.height;
         let unit_m = header.depth_unit_m as f32;
         let image = |format, stride, pixels| Self { format, width, height, stride, unit_m, pixels };
-        if header.pixel_format() == Some(PixelFormat::Mjpeg) {
+        if header.pixel_format().is_some_and(|f| f.layout() == Layout::Jpeg) {
             let rgb = jpeg_pixels(&pixels, header)?;
             return Ok(image(PixelFormat::Rgb8, 3 * width as usize, rgb.into()));
         }
@@ -95,13 +95,16 @@ impl<'a> Image<'a> {
     ///
     /// A pixel without depth is 0 in `z16`, and not above 0 or not finite in `depth_f32`.
     pub(super) fn fill(&self) -> Option<f64> {
-        let filled: fn(&[u8]) -> usize = match self.format {
-            PixelFormat::Z16 => |row| row.as_chunks::<2>().0.iter().filter(|p| **p != [0, 0]).count(),
-            PixelFormat::DepthF32 => |row| {
+        if !self.format.is_depth() {
+            return None;
+        }
+        let filled: fn(&[u8]) -> usize = match self.format.sample() {
+            Sample::U16 => |row| row.as_chunks::<2>().0.iter().filter(|p| **p != [0, 0]).count(),
+            Sample::F32 => |row| {
                 let depths = row.as_chunks::<4>().0.iter().map(|p| f32::from_le_bytes(*p));
                 depths.filter(|d| d.is_finite() && *d > 0.0).count()
             },
-            _ => return None,
+            Sample::U8 => |row| row.iter().filter(|v| **v != 0).count(),
         };
         let n: usize = (0..self.height).map(|y| filled(self.row(y))).sum();
         Some(n as f64 / (f64::from(self.width) * f64::from(self.height)))
@@ -110,9 +113,10 @@ impl<'a> Image<'a> {
     fn depth_at(&self, x: u32, y: u32) -> f32 {
         let row = self.row(y);
         let x = x as usize;
-        let metres = match self.format {
-            PixelFormat::Z16 => f32::from(u16::from_le_bytes([row[2 * x], row[2 * x + 1]])) * self.unit_m,
-            _ => f32::from_le_bytes([row[4 * x], row[4 * x + 1], row[4 * x + 2], row[4 * x + 3]]),
+        let metres = match self.format.sample() {
+            Sample::U8 => f32::from(row[x]) * self.unit_m,
+            Sample::U16 => f32::from(u16::from_le_bytes([row[2 * x], row[2 * x + 1]])) * self.unit_m,
+            Sample::F32 => f32::from_le_bytes([row[4 * x], row[4 * x + 1], row[4 * x + 2], row[4 * x + 3]]),
         };
         if metres.is_finite() && metres > 0.0 { metres } else { 0.0 }
     }
@@ -121,14 +125,14 @@ impl<'a> Image<'a> {
         let row = self.row(y);
         let i = x as usize;
         let byte = |at: usize| f32::from(row.get(at).copied().unwrap_or(0));
-        match self.format {
-            PixelFormat::Rgb8 => [byte(3 * i), byte(3 * i + 1), byte(3 * i + 2)],
-            PixelFormat::Bgr8 => [byte(3 * i + 2), byte(3 * i + 1), byte(3 * i)],
-            PixelFormat::Mono16 => [(byte(2 * i) + 256.0 * byte(2 * i + 1)) * 255.0 / brightest; 3],
-            PixelFormat::DisparityF32 => [(disparity(row, i) * 255.0 / brightest).clamp(0.0, 255.0); 3],
-            PixelFormat::Yuyv => rgb_of(byte(2 * i), byte(4 * (i / 2) + 1), byte(4 * (i / 2) + 3)),
-            PixelFormat::Uyvy => rgb_of(byte(2 * i + 1), byte(4 * (i / 2)), byte(4 * (i / 2) + 2)),
-            PixelFormat::Nv12 => {
+        match (self.format.layout(), self.format.sample()) {
+            (Layout::Rgb, _) => [byte(3 * i), byte(3 * i + 1), byte(3 * i + 2)],
+            (Layout::Bgr, _) => [byte(3 * i + 2), byte(3 * i + 1), byte(3 * i)],
+            (Layout::Grey, Sample::U16) => [(byte(2 * i) + 256.0 * byte(2 * i + 1)) * 255.0 / brightest; 3],
+            (Layout::Grey, Sample::F32) => [(disparity(row, i) * 255.0 / brightest).clamp(0.0, 255.0); 3],
+            (Layout::Yuyv, _) => rgb_of(byte(2 * i), byte(4 * (i / 2) + 1), byte(4 * (i / 2) + 3)),
+            (Layout::Uyvy, _) => rgb_of(byte(2 * i + 1), byte(4 * (i / 2)), byte(4 * (i / 2) + 2)),
+            (Layout::Nv12, _) => {
                 let at = (self.height + y / 2) as usize * self.stride + 2 * (i / 2);
                 let chroma = |k: usize| f32::from(self.pixels.get(at + k).copied().unwrap_or(128));
                 rgb_of(byte(i), chroma(0), chroma(1))
@@ -155,10 +159,7 @@ impl<'a> Image<'a> {
             };
             return Small { width, height, content: Content::Depth((0..width * height).map(at).collect()) };
         }
-        let brightest = match self.format {
-            PixelFormat::Mono16 | PixelFormat::DisparityF32 => self.brightest(),
-            _ => 255.0,
-        };
+        let brightest = if self.format.sample() == Sample::U8 { 255.0 } else { self.brightest() };
         let mut data = Vec::with_capacity(3 * (width * height) as usize);
         for i in 0..width * height {
             let mut sum = [0.0; 3];
@@ -177,7 +178,7 @@ impl<'a> Image<'a> {
     /// The greatest of some of the pixels of 16-bit grey or disparity, at least 1.
     fn brightest(&self) -> f32 {
         let rows = (0..self.height).step_by(4).map(|y| self.row(y));
-        if self.format == PixelFormat::DisparityF32 {
+        if self.format.sample() == Sample::F32 {
             let xs = || (0..self.width as usize).step_by(4);
             return rows.flat_map(|r| xs().map(|x| disparity(r, x))).fold(1.0, f32::max);
         }

@@ -122,7 +122,7 @@ impl ByteCameraExport {
                 let what =
                     "where it was recorded as JPEG, the PNG holds what JPEG left; nothing more is lost here";
                 losses.push(format!("{}: {what}", s.id));
-            } else if matches!(s.format, PixelFormat::Yuyv | PixelFormat::Uyvy | PixelFormat::Nv12) {
+            } else if s.format.is_subsampled() {
                 losses.push(format!(
                     "{}: {} is written as NPY, because no PNG holds it",
                     s.id,

@@ -1,6 +1,6 @@
 //! Image files of the layout become pixels. The size is checked before memory is taken for it.
 
-use depthrig_bus::PixelFormat;
+use depthrig_bus::{Layout, PixelFormat, Sample};
 use depthrig_recorder::npy::{self, Array};
 use image::codecs::png::PngDecoder;
 use image::{ColorType, ImageDecoder};
@@ -78,10 +78,10 @@ fn png(bytes: &[u8], want: Want) -> Result<Image, String> {
     if alpha_dropped {
         pixels = pixels.as_chunks().0.iter().flat_map(|[r, g, b, _]| [*r, *g, *b]).collect();
     }
-    match format {
-        PixelFormat::Bgr8 => pixels.as_chunks_mut::<3>().0.iter_mut().for_each(|p| p.swap(0, 2)),
+    match (format.layout(), format.sample()) {
+        (Layout::Bgr, _) => pixels.as_chunks_mut::<3>().0.iter_mut().for_each(|p| p.swap(0, 2)),
         // The decoder gives numbers of this computer.
-        PixelFormat::Z16 | PixelFormat::Mono16 if cfg!(target_endian = "big") => {
+        (_, Sample::U16) if cfg!(target_endian = "big") => {
             pixels.as_chunks_mut::<2>().0.iter_mut().for_each(|p| p.swap(0, 1));
         }
         _ => {}
@@ -94,12 +94,7 @@ fn npy_image(bytes: &[u8], want: Want) -> Result<Image, String> {
     let (format, width, height) = match (want, kind, &shape[..]) {
         (Want::Metres, "<f4", [h, w]) => (PixelFormat::DepthF32, *w as u32, *h as u32),
         (Want::Exactly(format, w, h), ..) => {
-            let fits = match format {
-                PixelFormat::Z16 | PixelFormat::Mono16 => kind == "<u2",
-                PixelFormat::DepthF32 | PixelFormat::DisparityF32 => kind == "<f4",
-                _ => kind == "|u1",
-            };
-            if !fits {
+            if kind != format.numpy() {
                 return Err(format!("its numbers are {kind}, the stream is {}", format.name()));
             }
             (format, w, h)

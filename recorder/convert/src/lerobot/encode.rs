@@ -1,7 +1,7 @@
 //! Images as LeRobot reads them: a JPEG as it was stored, other colour and grey as PNG, depth as TIFF.
 
 use super::stats::Samples;
-use depthrig_bus::{FrameHeader, PixelFormat};
+use depthrig_bus::{FrameHeader, Layout, PixelFormat, Sample};
 use depthrig_recorder::jpeg_pixels;
 use depthrig_recorder::still::{self, StillFormat};
 use depthrig_recorder::{DatasetFrame, Error, ErrorKind, Result};
@@ -26,12 +26,12 @@ pub(super) enum Form {
 impl Form {
     /// The form for a pixel format; `None` when LeRobot has none.
     pub(super) const fn of(format: PixelFormat) -> Option<Self> {
-        Some(match format {
-            PixelFormat::Rgb8 | PixelFormat::Bgr8 | PixelFormat::Mjpeg => Self::Color,
-            PixelFormat::Mono8 | PixelFormat::Confidence8 => Self::Grey8,
-            PixelFormat::Mono16 => Self::Grey16,
-            PixelFormat::Z16 => Self::Depth16,
-            PixelFormat::DepthF32 => Self::DepthF32,
+        Some(match (format.layout(), format.sample(), format.is_depth()) {
+            (Layout::Rgb | Layout::Bgr | Layout::Jpeg, ..) => Self::Color,
+            (Layout::Grey, Sample::U8, false) => Self::Grey8,
+            (Layout::Grey, Sample::U16, false) => Self::Grey16,
+            (Layout::Grey, Sample::U16, true) => Self::Depth16,
+            (Layout::Grey, Sample::F32, true) => Self::DepthF32,
             _ => return None,
         })
     }
